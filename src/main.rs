@@ -1,1 +1,54 @@
-fn main() {}
+//! `tandem`: teaches robots with two arms by letting a robot with one arm advise them.
+//!
+//! The only place that reads the clock, the environment and the command line, starts processes and chooses exit
+//! codes. What it starts are libraries: see `ARCHITECTURE.md`.
+
+use std::process::ExitCode;
+
+use clap::Parser as _;
+
+mod bench;
+mod cli;
+mod clock;
+mod eval;
+mod exit;
+mod files;
+mod picture;
+mod run_file;
+mod services;
+mod signals;
+mod train;
+
+use cli::{Cli, Command};
+use exit::Exit;
+
+fn main() -> ExitCode {
+    let cli = match Cli::try_parse() {
+        Ok(cli) => cli,
+        Err(error) => {
+            let asked_for = !error.use_stderr();
+            drop(error.print());
+            return if asked_for { ExitCode::SUCCESS } else { Exit::Usage.into() };
+        }
+    };
+    let _logging = match services::start_logging(&cli) {
+        Ok(guard) => guard,
+        Err(failed) => return failed.report(),
+    };
+    let done = match cli.command {
+        Command::Train(args) => train::train(*args),
+        Command::Eval(args) => eval::eval(&args),
+        Command::Teacher(args) => services::teacher(args),
+        Command::Learner(args) => services::learner(args),
+        Command::Worker(args) => services::worker(args),
+        Command::Bench(args) => bench::bench(&args),
+        Command::Policy(args) => files::policy(&args),
+        Command::Mcap(args) => files::mcap(&args),
+        Command::Replay(args) => files::replay(&args),
+        Command::Picture(args) => picture::picture(&args),
+    };
+    match done {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(failed) => failed.report(),
+    }
+}

@@ -1,1 +1,22 @@
-//! To be written.
+//! Learns a policy from episodes that others play: replay, hindsight experience replay (HER), the DDPG update with
+//! Polyak-averaged target networks, rounds, checkpoints, and the `Learner` service round them.
+//!
+//! It does not know how an episode is simulated, how many workers there are or how a teacher decides.
+//!
+//! Reading order: [`config`] (the run file), [`ddpg`] (the update), [`replay`] and [`her`] (what a batch is made of),
+//! [`trainer`] (a round), [`board`] (who plays what), [`checkpoint`], [`service`] (the gRPC shell and the thread
+//! that learns).
+
+pub mod board;
+pub mod checkpoint;
+pub mod config;
+pub mod ddpg;
+mod drive;
+pub mod her;
+pub mod replay;
+pub mod service;
+mod teacher;
+pub mod trainer;
+
+pub use config::RunConfig;
+pub use service::{LearnerConfig, serve};

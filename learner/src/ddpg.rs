@@ -1,0 +1,442 @@
+//! One update of DDPG (Lillicrap et al. 2016) with a value per arm and behaviour cloning of advice.
+//!
+//! Section 2.1 of the paper, in its order: the critic's target from the target networks, the critic's loss, the
+//! actor's loss, a step of Adam for each, and the targets' slow move after them. Both gradients are taken at the same
+//! parameters, so the critic's half and the actor's half of an update can run side by side.
+
+use rand_chacha::ChaCha8Rng;
+use tandem_core::{Layout, Stream, episode_rng};
+use tandem_policy::{
+    Adam, Matrix, MatrixMut, MlpShape, Workspace, all_finite, backward_input, backward_parameters,
+    forward, polyak_update, tanh,
+};
+
+mod config;
+mod state;
+#[cfg(test)]
+mod tests;
+
+pub use config::DdpgConfig;
+
+/// Transitions as the update takes them, `b` of them; "input" is a normalised observation and goal.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Batch {
+    /// Before the step, shape `[b, n_observation + n_goal]`.
+    pub inputs: Vec<f32>,
+    /// What was executed, in [-1, 1], shape `[b, n_action]`.
+    pub actions: Vec<f32>,
+    /// One reward per head, shape `[b, n_heads]`.
+    pub rewards: Vec<f32>,
+    /// After the step, with the same goal, shape `[b, n_observation + n_goal]`.
+    pub next_inputs: Vec<f32>,
+    /// 1 where the executed component was the teacher's, else 0, shape `[b, n_action]`.
+    pub cloned: Vec<f32>,
+}
+
+impl Batch {
+    /// A batch of zeros, to be filled again and again.
+    #[must_use]
+    pub fn new(layout: Layout, n_heads: usize, batch_size: usize) -> Self {
+        let n_input = layout.n_observation() + layout.n_goal();
+        Self {
+            inputs: vec![0.0; batch_size * n_input],
+            actions: vec![0.0; batch_size * layout.n_action()],
+            rewards: vec![0.0; batch_size * n_heads],
+            next_inputs: vec![0.0; batch_size * n_input],
+            cloned: vec![0.0; batch_size * layout.n_action()],
+        }
+    }
+}
+
+/// What an update measured, before it changed anything.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct UpdateLosses {
+    /// Squared error of the critic: mean over the batch, sum over the heads.
+    pub critic_loss: f64,
+    /// The actor's loss: value, action penalty and cloning together.
+    pub actor_loss: f64,
+    /// Value of the actor's own actions: mean over the batch and the heads.
+    pub mean_q: f64,
+}
+
+/// Why learning cannot go on.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum DdpgError {
+    /// The update gave an infinite number or NaN; the parameters are of no more use.
+    #[error("update {update} left {what} that is not finite")]
+    NotFinite {
+        /// What holds the number.
+        what: &'static str,
+        /// The update, from 1.
+        update: u64,
+    },
+    /// A stored state lacks a vector, or has one of another length.
+    #[error("stored {name:?} has {got:?} numbers, expected {expected}")]
+    Restore {
+        /// The vector.
+        name: &'static str,
+        /// Its length, if there is one.
+        got: Option<usize>,
+        /// The length that the networks have.
+        expected: usize,
+    },
+}
+
+/// Actor, critic, their target networks and optimisers.
+#[derive(Debug, Clone)]
+pub struct Ddpg {
+    config: DdpgConfig,
+    n_threads: usize,
+    n_updates: u64,
+    actor: Network,
+    critic: Network,
+    actor_half: ActorHalf,
+    critic_half: CriticHalf,
+}
+
+/// A network and its slow copy.
+#[derive(Debug, Clone)]
+struct Network {
+    shape: MlpShape,
+    online: Vec<f32>,
+    target: Vec<f32>,
+}
+
+impl Network {
+    fn new(shape: MlpShape, rng: &mut ChaCha8Rng) -> Self {
+        let online = shape.initialise(rng);
+        Self { shape, target: online.clone(), online }
+    }
+}
+
+impl Ddpg {
+    /// Fresh networks for `layout`, drawn from `run_seed`; the critic has `n_heads` values, 1 or one per arm.
+    #[must_use]
+    pub fn new(config: DdpgConfig, layout: Layout, n_heads: usize, run_seed: u64) -> Self {
+        let (n_hidden, n_hidden_layers) = (config.n_hidden, config.n_hidden_layers);
+        let network = |shape, number| {
+            Network::new(shape, &mut episode_rng(run_seed, number, Stream::Initialisation))
+        };
+        let actor = network(MlpShape::actor(layout, n_hidden, n_hidden_layers), 0);
+        let critic = network(MlpShape::critic(layout, n_hidden, n_hidden_layers, n_heads), 1);
+        let actor_half = ActorHalf::new(&config, &actor.shape, &critic.shape);
+        let critic_half = CriticHalf::new(&config, &actor.shape, &critic.shape);
+        Self { config, n_threads: 1, n_updates: 0, actor, critic, actor_half, critic_half }
+    }
+
+    /// One gradient step of critic and actor on `batch`.
+    ///
+    /// # Errors
+    /// When a loss or a parameter is no longer finite.
+    ///
+    /// # Panics
+    /// When the batch is not of the configured size and layout.
+    pub fn update(&mut self, batch: &Batch) -> Result<UpdateLosses, DdpgError> {
+        let Self { config, n_threads, actor, critic, actor_half, critic_half, .. } = self;
+        let (critic_loss, (actor_loss, mean_q)) = join(
+            *n_threads,
+            || critic_half.differentiate(config, actor, critic, batch),
+            || actor_half.differentiate(config, actor, critic, batch),
+        );
+        let (critic_finite, actor_finite) =
+            join(*n_threads, || critic_half.step.apply(critic), || actor_half.step.apply(actor));
+        self.n_updates += 1;
+        let checks = [
+            ("a critic loss", critic_loss.is_finite()),
+            ("an actor loss", actor_loss.is_finite()),
+            ("a critic parameter", critic_finite),
+            ("an actor parameter", actor_finite),
+        ];
+        match checks.into_iter().find(|(_, finite)| !finite) {
+            Some((what, _)) => Err(DdpgError::NotFinite { what, update: self.n_updates }),
+            None => Ok(UpdateLosses { critic_loss, actor_loss, mean_q }),
+        }
+    }
+
+    /// Moves both target networks toward the online ones, keeping the configured share of the old.
+    pub fn polyak(&mut self) {
+        let Self { config, n_threads, actor, critic, .. } = self;
+        let move_target = |network: &mut Network| {
+            polyak_update(&mut network.target, &network.online, config.polyak_keep);
+        };
+        join(*n_threads, || move_target(critic), || move_target(actor));
+    }
+
+    /// Whether the two halves of an update run one after the other (1) or side by side (2); the bits are the same.
+    pub const fn set_threads(&mut self, n_threads: usize) {
+        self.n_threads = n_threads;
+    }
+}
+
+/// The critic's half of an update.
+#[derive(Debug, Clone)]
+struct CriticHalf {
+    /// Input and executed action, shape `[b, n_input + n_action]`.
+    input: Vec<f32>,
+    /// Next input and the target actor's action.
+    next_input: Vec<f32>,
+    /// Value of what was executed, shape `[b, n_heads]`.
+    q: Vec<f32>,
+    /// The target networks' value of what comes next, shape `[b, n_heads]`.
+    next_q: Vec<f32>,
+    /// The loss's gradient by `q`.
+    q_gradient: Vec<f32>,
+    actor_workspace: Workspace,
+    critic_workspace: Workspace,
+    step: Step,
+}
+
+impl CriticHalf {
+    fn new(config: &DdpgConfig, actor: &MlpShape, critic: &MlpShape) -> Self {
+        let b = config.batch_size;
+        Self {
+            input: vec![0.0; b * critic.n_input],
+            next_input: vec![0.0; b * critic.n_input],
+            q: vec![0.0; b * critic.n_output],
+            next_q: vec![0.0; b * critic.n_output],
+            q_gradient: vec![0.0; b * critic.n_output],
+            actor_workspace: Workspace::new(actor, b),
+            critic_workspace: Workspace::new(critic, b),
+            step: Step::new(critic, config.critic_learning_rate),
+        }
+    }
+
+    /// Leaves the gradient of the critic's loss in `step` and gives the loss.
+    fn differentiate(
+        &mut self,
+        config: &DdpgConfig,
+        actor: &Network,
+        critic: &Network,
+        batch: &Batch,
+    ) -> f64 {
+        let b = config.batch_size;
+        let n_input = actor.shape.n_input;
+        let n_joined = critic.shape.n_input;
+
+        // Q'(s', pi'(s')): the target actor writes its actions into the target critic's input.
+        write_columns(&mut self.next_input, n_joined, 0, &batch.next_inputs, n_input);
+        let next_inputs = Matrix::new(&batch.next_inputs, b, n_input);
+        let mut action_columns = action_columns(&mut self.next_input, &actor.shape, n_joined, b);
+        forward(
+            &actor.shape,
+            &actor.target,
+            next_inputs,
+            &mut self.actor_workspace,
+            &mut action_columns,
+        );
+        squash(&mut action_columns);
+        let next_joined = Matrix::new(&self.next_input, b, n_joined);
+        let mut next_q = MatrixMut::new(&mut self.next_q, b, critic.shape.n_output);
+        forward(
+            &critic.shape,
+            &critic.target,
+            next_joined,
+            &mut self.critic_workspace,
+            &mut next_q,
+        );
+
+        // Q(s, a)
+        write_columns(&mut self.input, n_joined, 0, &batch.inputs, n_input);
+        write_columns(&mut self.input, n_joined, n_input, &batch.actions, actor.shape.n_output);
+        let joined = Matrix::new(&self.input, b, n_joined);
+        let mut q = MatrixMut::new(&mut self.q, b, critic.shape.n_output);
+        forward(&critic.shape, &critic.online, joined, &mut self.critic_workspace, &mut q);
+
+        // Mean over the batch of (Q - y)^2, and its gradient.
+        assert_eq!(batch.rewards.len(), self.q.len(), "rewards of another number of heads");
+        let mut loss = 0.0;
+        let values = self.q.iter().zip(&self.next_q).zip(&batch.rewards);
+        for (gradient, ((q, next_q), reward)) in self.q_gradient.iter_mut().zip(values) {
+            let error = q - critic_target(config.discount, *reward, *next_q);
+            loss += f64::from(error) * f64::from(error);
+            *gradient = 2.0 * error / b as f32;
+        }
+        let gradient = &mut self.step.gradient;
+        backward_parameters(
+            &critic.shape,
+            &critic.online,
+            joined,
+            &mut self.critic_workspace,
+            &self.q_gradient,
+            gradient,
+        );
+        loss / b as f64
+    }
+}
+
+/// `y = r + discount * Q'(s', pi'(s'))`, clipped to what rewards of -1 and 0 can add up to.
+///
+/// Episodes end by their time limit only, and the world would have gone on: there is always a next value.
+fn critic_target(discount: f32, reward: f32, next_q: f32) -> f32 {
+    (reward + discount * next_q).clamp(-1.0 / (1.0 - discount), 0.0)
+}
+
+/// The actor's half of an update.
+#[derive(Debug, Clone)]
+struct ActorHalf {
+    /// Input and the actor's action, shape `[b, n_input + n_action]`.
+    input: Vec<f32>,
+    /// The critic's value of it, shape `[b, n_heads]`.
+    q: Vec<f32>,
+    /// The loss's gradient by `q`: the same number everywhere.
+    q_gradient: Vec<f32>,
+    /// The loss's gradient by the action, then by the action before its tanh, shape `[b, n_action]`.
+    action_gradient: Vec<f32>,
+    actor_workspace: Workspace,
+    critic_workspace: Workspace,
+    step: Step,
+}
+
+impl ActorHalf {
+    fn new(config: &DdpgConfig, actor: &MlpShape, critic: &MlpShape) -> Self {
+        let b = config.batch_size;
+        Self {
+            input: vec![0.0; b * critic.n_input],
+            q: vec![0.0; b * critic.n_output],
+            q_gradient: vec![-1.0 / b as f32; b * critic.n_output],
+            action_gradient: vec![0.0; b * actor.n_output],
+            actor_workspace: Workspace::new(actor, b),
+            critic_workspace: Workspace::new(critic, b),
+            step: Step::new(actor, config.actor_learning_rate),
+        }
+    }
+
+    /// Leaves the gradient of the actor's loss in `step` and gives the loss and the mean value.
+    fn differentiate(
+        &mut self,
+        config: &DdpgConfig,
+        actor: &Network,
+        critic: &Network,
+        batch: &Batch,
+    ) -> (f64, f64) {
+        let b = config.batch_size;
+        let n_input = actor.shape.n_input;
+        let n_joined = critic.shape.n_input;
+
+        // Q(s, pi(s)): the actor writes its actions into the critic's input.
+        write_columns(&mut self.input, n_joined, 0, &batch.inputs, n_input);
+        let inputs = Matrix::new(&batch.inputs, b, n_input);
+        let mut action_columns = action_columns(&mut self.input, &actor.shape, n_joined, b);
+        forward(
+            &actor.shape,
+            &actor.online,
+            inputs,
+            &mut self.actor_workspace,
+            &mut action_columns,
+        );
+        squash(&mut action_columns);
+        let joined = Matrix::new(&self.input, b, n_joined);
+        let mut q = MatrixMut::new(&mut self.q, b, critic.shape.n_output);
+        forward(&critic.shape, &critic.online, joined, &mut self.critic_workspace, &mut q);
+
+        // -Q summed over the heads, by the action.
+        backward_input(
+            &critic.shape,
+            &critic.online,
+            &mut self.critic_workspace,
+            &self.q_gradient,
+            n_input..n_joined,
+            &mut self.action_gradient,
+        );
+        let action_loss = self.add_action_terms(config, batch, n_input);
+        let gradient = &mut self.step.gradient;
+        let workspace = &mut self.actor_workspace;
+        backward_parameters(
+            &actor.shape,
+            &actor.online,
+            inputs,
+            workspace,
+            &self.action_gradient,
+            gradient,
+        );
+        let sum_q: f64 = self.q.iter().copied().map(f64::from).sum();
+        (action_loss - sum_q / b as f64, sum_q / self.q.len() as f64)
+    }
+
+    /// Adds what the loss says about the action itself, takes the gradient back through the tanh, and gives that part
+    /// of the loss: the mean squared action, and the squared error to the teacher's where that was executed.
+    fn add_action_terms(&mut self, config: &DdpgConfig, batch: &Batch, n_input: usize) -> f64 {
+        let n_action = self.action_gradient.len() / config.batch_size;
+        let penalty = config.action_penalty / self.action_gradient.len() as f32;
+        let cloning = config.cloning_weight / config.batch_size as f32;
+        let mut loss = 0.0;
+        let executed_rows =
+            batch.actions.chunks_exact(n_action).zip(batch.cloned.chunks_exact(n_action));
+        let rows = self
+            .action_gradient
+            .chunks_exact_mut(n_action)
+            .zip(self.input.chunks_exact(n_input + n_action));
+        for ((gradient, input), (executed, cloned)) in rows.zip(executed_rows) {
+            for i in 0..n_action {
+                let action = input[n_input + i];
+                let error = cloned[i] * (action - executed[i]);
+                gradient[i] += 2.0 * penalty * action + 2.0 * cloning * error;
+                gradient[i] *= 1.0 - action * action;
+                loss += f64::from(penalty * action * action + cloning * error * error);
+            }
+        }
+        loss
+    }
+}
+
+/// A network's gradient and optimiser.
+#[derive(Debug, Clone)]
+struct Step {
+    gradient: Vec<f32>,
+    adam: Adam,
+}
+
+impl Step {
+    fn new(shape: &MlpShape, learning_rate: f32) -> Self {
+        let n_parameters = shape.n_parameters();
+        Self { gradient: vec![0.0; n_parameters], adam: Adam::new(n_parameters, learning_rate) }
+    }
+
+    /// Moves the network against its gradient; whether all parameters are still finite.
+    fn apply(&mut self, network: &mut Network) -> bool {
+        self.adam.step(&mut network.online, &self.gradient);
+        all_finite(&network.online)
+    }
+}
+
+/// Copies rows of `n_columns` into the rows of `table`, `row_stride` long, from column `first_column` on.
+fn write_columns(
+    table: &mut [f32],
+    row_stride: usize,
+    first_column: usize,
+    rows: &[f32],
+    n_columns: usize,
+) {
+    assert_eq!(rows.len() * row_stride, table.len() * n_columns, "a batch of another size");
+    for (row, source) in table.chunks_exact_mut(row_stride).zip(rows.chunks_exact(n_columns)) {
+        row[first_column..first_column + n_columns].copy_from_slice(source);
+    }
+}
+
+/// The columns of a critic's input that hold the action.
+fn action_columns<'a>(
+    input: &'a mut [f32],
+    actor: &MlpShape,
+    n_joined: usize,
+    b: usize,
+) -> MatrixMut<'a> {
+    MatrixMut::with_stride(&mut input[actor.n_input..], b, actor.n_output, n_joined)
+}
+
+/// Takes every action through its tanh.
+fn squash(actions: &mut MatrixMut<'_>) {
+    for row in actions.rows_mut() {
+        for component in row {
+            *component = tanh(*component);
+        }
+    }
+}
+
+/// Runs both, side by side when there are two threads.
+fn join<A: Send, B: Send>(
+    n_threads: usize,
+    a: impl FnOnce() -> A + Send,
+    b: impl FnOnce() -> B + Send,
+) -> (A, B) {
+    if n_threads > 1 { rayon::join(a, b) } else { (a(), b()) }
+}

@@ -1,0 +1,148 @@
+//! What a checkpoint keeps, and what a policy is made of.
+
+use tandem_policy::MlpShape;
+
+use super::{Ddpg, DdpgConfig, DdpgError};
+
+impl Ddpg {
+    /// The settings.
+    #[must_use]
+    pub const fn config(&self) -> &DdpgConfig {
+        &self.config
+    }
+
+    /// Updates so far.
+    #[must_use]
+    pub const fn n_updates(&self) -> u64 {
+        self.n_updates
+    }
+
+    /// The actor's sizes.
+    #[must_use]
+    pub const fn actor_shape(&self) -> &MlpShape {
+        &self.actor.shape
+    }
+
+    /// The critic's sizes.
+    #[must_use]
+    pub const fn critic_shape(&self) -> &MlpShape {
+        &self.critic.shape
+    }
+
+    /// The actor that is being updated, flat.
+    #[must_use]
+    pub fn actor(&self) -> &[f32] {
+        &self.actor.online
+    }
+
+    /// The actor's target network, flat.
+    #[must_use]
+    pub fn target_actor(&self) -> &[f32] {
+        &self.actor.target
+    }
+
+    /// The critic that is being updated, flat.
+    #[must_use]
+    pub fn critic(&self) -> &[f32] {
+        &self.critic.online
+    }
+
+    /// The critic's target network, flat.
+    #[must_use]
+    pub fn target_critic(&self) -> &[f32] {
+        &self.critic.target
+    }
+
+    /// The gradients of the last update: the actor's and the critic's.
+    #[must_use]
+    pub fn gradients(&self) -> [&[f32]; 2] {
+        [&self.actor_half.step.gradient, &self.critic_half.step.gradient]
+    }
+
+    /// Every vector that the next update depends on, by name, in a fixed order. With [`Ddpg::n_updates`] it is the
+    /// whole state.
+    #[must_use]
+    pub fn state(&self) -> [(&'static str, &[f32]); 8] {
+        let [actor_first, actor_second] = self.actor_half.step.adam.moments();
+        let [critic_first, critic_second] = self.critic_half.step.adam.moments();
+        [
+            ("actor.online", &self.actor.online),
+            ("actor.target", &self.actor.target),
+            ("actor.adam.first", actor_first),
+            ("actor.adam.second", actor_second),
+            ("critic.online", &self.critic.online),
+            ("critic.target", &self.critic.target),
+            ("critic.adam.first", critic_first),
+            ("critic.adam.second", critic_second),
+        ]
+    }
+
+    /// Goes on from vectors and a count that [`Ddpg::state`] and [`Ddpg::n_updates`] gave.
+    ///
+    /// # Errors
+    /// When a vector is missing or has another length; nothing has changed then.
+    pub fn restore(
+        &mut self,
+        stored: &[(String, Vec<f32>)],
+        n_updates: u64,
+    ) -> Result<(), DdpgError> {
+        let mut vectors: [&[f32]; 8] = [&[]; 8];
+        for ((name, now), vector) in self.state().into_iter().zip(&mut vectors) {
+            let found = stored
+                .iter()
+                .find(|(stored_name, _)| stored_name == name)
+                .map(|(_, found)| found.as_slice());
+            let (got, expected) = (found.map(<[f32]>::len), now.len());
+            *vector = found.filter(|_| got == Some(expected)).ok_or(DdpgError::Restore {
+                name,
+                got,
+                expected,
+            })?;
+        }
+        let [
+            actor,
+            target_actor,
+            actor_first,
+            actor_second,
+            critic,
+            target_critic,
+            critic_first,
+            critic_second,
+        ] = vectors;
+        self.actor.online.copy_from_slice(actor);
+        self.actor.target.copy_from_slice(target_actor);
+        self.actor_half.step.adam.restore(n_updates, [actor_first, actor_second]);
+        self.critic.online.copy_from_slice(critic);
+        self.critic.target.copy_from_slice(target_critic);
+        self.critic_half.step.adam.restore(n_updates, [critic_first, critic_second]);
+        self.n_updates = n_updates;
+        Ok(())
+    }
+
+    /// Floating-point operations of one update's matrix products, two per multiply-add, counting only what has to
+    /// be done: five forward passes, the critic's and the actor's gradient, and the way through the critic to the
+    /// action.
+    #[must_use]
+    pub const fn flops_per_update(&self) -> u64 {
+        let (actor, critic) = (&self.actor.shape, &self.critic.shape);
+        let critic_above_input = products(critic) - critic.n_input * critic.layer_output(0);
+        let actor_above_input = products(actor) - actor.n_input * actor.layer_output(0);
+        let forward = 2 * products(actor) + 3 * products(critic);
+        let critic_backward = products(critic) + critic_above_input;
+        let action_backward = critic_above_input + actor.n_output * critic.layer_output(0);
+        let actor_backward = products(actor) + actor_above_input;
+        let per_row = forward + critic_backward + action_backward + actor_backward;
+        2 * (self.config.batch_size * per_row) as u64
+    }
+}
+
+/// Multiply-adds of one row's forward pass.
+const fn products(shape: &MlpShape) -> usize {
+    let mut sum = 0;
+    let mut layer = 0;
+    while layer < shape.n_layers() {
+        sum += shape.layer_input(layer) * shape.layer_output(layer);
+        layer += 1;
+    }
+    sum
+}

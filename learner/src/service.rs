@@ -1,0 +1,290 @@
+//! The `Learner` service: a thin shell round the board and the thread that learns.
+
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+use std::pin::Pin;
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
+
+use tandem_core::work::{PublishedActor, RunTerms};
+use tandem_proto::pb;
+use tandem_proto::pb::learner_server::{Learner, LearnerServer};
+use tandem_proto::{decode_episode, encode_actor, encode_slot, encode_terms};
+use tokio::net::TcpListener;
+use tokio::sync::{Notify, watch};
+use tokio_stream::wrappers::{TcpListenerStream, WatchStream};
+use tokio_stream::{Stream, StreamExt as _};
+use tokio_util::sync::CancellationToken;
+use tonic::{Request, Response, Status};
+
+use crate::board::{Board, SubmitError};
+use crate::checkpoint::CheckpointError;
+use crate::config::{ConfigError, RunConfig};
+use crate::ddpg::DdpgError;
+use crate::drive::{self, Ended};
+use crate::teacher::TeacherError;
+
+/// How long a worker's question for work is held before it is told to wait.
+const WORK_POLL: Duration = Duration::from_secs(2);
+/// How long the service stays after the run's end, so that all can hear of it.
+const LINGER: Duration = Duration::from_millis(1500);
+/// Largest message taken in; a slot of 64 two-arm episodes has 1 MB.
+const MAX_MESSAGE_BYTES: usize = 64 << 20;
+/// Parameter versions kept for workers that lag behind.
+const KEPT_VERSIONS: usize = 16;
+
+/// The time since some start; passed in so that nothing here reads a clock.
+pub type Clock = Arc<dyn Fn() -> Duration + Send + Sync>;
+
+/// What a learner needs to run.
+#[derive(Clone)]
+pub struct LearnerConfig {
+    /// The run.
+    pub run: RunConfig,
+    /// The teacher's address, `http://host:port`; needed when the run asks for advice.
+    pub teacher: Option<String>,
+    /// The run directory.
+    pub out: PathBuf,
+    /// Whether to go on from the newest checkpoint.
+    pub resume: bool,
+    /// Threads of the update, 1 or 2.
+    pub n_threads: usize,
+    /// Time since the process started.
+    pub clock: Clock,
+    /// Digest of the program, kept in what it writes.
+    pub version: String,
+}
+
+/// Why a learner gave up.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    /// The run file cannot be used.
+    #[error(transparent)]
+    Config(#[from] ConfigError),
+    /// The state could not be saved or restored.
+    #[error(transparent)]
+    Checkpoint(#[from] CheckpointError),
+    /// Something in the run directory could not be read or written.
+    #[error("cannot {action} {path:?}")]
+    RunDirectory {
+        /// What was attempted.
+        action: &'static str,
+        /// On what.
+        path: PathBuf,
+        /// Why not.
+        source: Box<dyn std::error::Error + Send + Sync>,
+    },
+    /// The teacher declined, or its address is none.
+    #[error(transparent)]
+    Teacher(#[from] TeacherError),
+    /// The run asks for advice and no teacher is named.
+    #[error("strategy {0:?} needs a teacher: give its address")]
+    NoTeacher(String),
+    /// Learning diverged.
+    #[error(transparent)]
+    Diverged(#[from] DdpgError),
+    /// The network refused.
+    #[error("cannot serve")]
+    Serve(#[from] tonic::transport::Error),
+    /// The thread that learns panicked: a bug.
+    #[error("the learning thread panicked")]
+    Panicked,
+}
+
+/// State shared by the service's calls and the thread that learns.
+pub(crate) struct Shared {
+    state: Mutex<State>,
+    /// Signalled whenever episodes come in.
+    pub(crate) arrived: Condvar,
+    /// Signalled whenever there may be work.
+    pub(crate) work: Notify,
+    pub(crate) progress: watch::Sender<pb::Progress>,
+    pub(crate) clock: Clock,
+}
+
+#[derive(Default)]
+pub(crate) struct State {
+    pub(crate) board: Board,
+    pub(crate) terms: Option<RunTerms>,
+    pub(crate) published: BTreeMap<u64, PublishedActor>,
+    pub(crate) finished: Option<String>,
+}
+
+impl Shared {
+    pub(crate) fn new(clock: Clock) -> Self {
+        let (progress, _) = watch::channel(pb::Progress::default());
+        Self { state: Mutex::default(), arrived: Condvar::new(), work: Notify::new(), progress, clock }
+    }
+
+    pub(crate) fn lock(&self) -> MutexGuard<'_, State> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Waits a while for episodes to come in.
+    pub(crate) fn wait<'a>(&self, state: MutexGuard<'a, State>, at_most: Duration) -> MutexGuard<'a, State> {
+        self.arrived.wait_timeout(state, at_most).unwrap_or_else(PoisonError::into_inner).0
+    }
+
+    /// Hands out an actor from now on, and forgets the oldest.
+    pub(crate) fn publish(&self, actor: PublishedActor) {
+        let mut state = self.lock();
+        state.published.insert(actor.version, actor);
+        while state.published.len() > KEPT_VERSIONS {
+            state.published.pop_first();
+        }
+    }
+}
+
+/// Serves a run on `listener` until it ends or `shutdown` is cancelled; the state is saved either way.
+///
+/// # Errors
+/// When the run cannot start, its state cannot be saved, or learning diverges.
+pub async fn serve(config: LearnerConfig, listener: TcpListener, shutdown: CancellationToken) -> Result<Ended, Error> {
+    let shared = Arc::new(Shared::new(config.clock.clone()));
+    let (health, health_service) = tonic_health::server::health_reporter();
+    health.set_serving::<LearnerServer<LearnerService>>().await;
+    let stop_serving = CancellationToken::new();
+    let learning = {
+        let (shared, runtime, stop_serving) = (shared.clone(), tokio::runtime::Handle::current(), stop_serving.clone());
+        std::thread::Builder::new().name("learn".to_owned()).spawn(move || {
+            let _stop = stop_serving.drop_guard();
+            let ended = drive::run(&config, &shared, &runtime, &shutdown);
+            let reason = ended.as_ref().map_or_else(ToString::to_string, |ended| ended.reason.clone());
+            shared.lock().finished = Some(reason.clone());
+            shared.work.notify_waiters();
+            shared.progress.send_modify(|progress| {
+                progress.ended = true;
+                progress.end_reason = reason;
+            });
+            runtime.block_on(tokio::time::sleep(LINGER));
+            // Watchers' streams close at the first message after the one that says so.
+            shared.progress.send_modify(|_| ());
+            ended
+        })
+    };
+    let learner = LearnerServer::new(LearnerService { shared }).max_decoding_message_size(MAX_MESSAGE_BYTES);
+    tonic::transport::Server::builder()
+        .tcp_nodelay(true)
+        .http2_keepalive_interval(Some(Duration::from_secs(10)))
+        .http2_keepalive_timeout(Some(Duration::from_secs(10)))
+        .add_service(learner)
+        .add_service(health_service)
+        .add_service(reflection_v1())
+        .add_service(reflection_v1alpha())
+        .serve_with_incoming_shutdown(TcpListenerStream::new(listener), stop_serving.cancelled())
+        .await?;
+    match learning {
+        Ok(thread) => tokio::task::spawn_blocking(move || thread.join()).await.map_or(Err(Error::Panicked), |joined| {
+            joined.unwrap_or(Err(Error::Panicked))
+        }),
+        Err(source) => Err(Error::RunDirectory { action: "start a thread for", path: PathBuf::from("learning"), source: source.into() }),
+    }
+}
+
+fn reflection_v1() -> tonic_reflection::server::v1::ServerReflectionServer<impl tonic_reflection::server::v1::ServerReflection> {
+    reflection().build_v1().expect("the descriptors are compiled in")
+}
+
+fn reflection_v1alpha()
+-> tonic_reflection::server::v1alpha::ServerReflectionServer<impl tonic_reflection::server::v1alpha::ServerReflection> {
+    reflection().build_v1alpha().expect("the descriptors are compiled in")
+}
+
+fn reflection() -> tonic_reflection::server::Builder<'static> {
+    tonic_reflection::server::Builder::configure()
+        .register_encoded_file_descriptor_set(tandem_proto::FILE_DESCRIPTOR_SET)
+        .register_encoded_file_descriptor_set(tonic_health::pb::FILE_DESCRIPTOR_SET)
+}
+
+struct LearnerService {
+    shared: Arc<Shared>,
+}
+
+#[tonic::async_trait]
+impl Learner for LearnerService {
+    type WatchStream = Pin<Box<dyn Stream<Item = Result<pb::Progress, Status>> + Send>>;
+
+    async fn join(&self, request: Request<pb::JoinRequest>) -> Result<Response<pb::JoinResponse>, Status> {
+        let name = request.into_inner().worker;
+        let now = (self.shared.clock)();
+        let mut state = self.shared.lock();
+        let terms = state.terms.clone().ok_or_else(|| Status::unavailable("the run is starting"))?;
+        let worker_id = state.board.join(name, now);
+        Ok(Response::new(pb::JoinResponse { worker_id, terms: Some(encode_terms(&terms)) }))
+    }
+
+    async fn next_work(&self, request: Request<pb::NextWorkRequest>) -> Result<Response<pb::NextWorkResponse>, Status> {
+        let worker_id = request.into_inner().worker_id;
+        let search = async {
+            loop {
+                let notified = self.shared.work.notified();
+                if let Some(work) = self.work_for(worker_id)? {
+                    return Ok::<_, Status>(work);
+                }
+                notified.await;
+            }
+        };
+        let work = tokio::time::timeout(WORK_POLL, search).await.unwrap_or(Ok(Work::Wait(pb::Wait {})))?;
+        Ok(Response::new(pb::NextWorkResponse { work: Some(work) }))
+    }
+
+    async fn get_parameters(&self, request: Request<pb::GetParametersRequest>) -> Result<Response<pb::Parameters>, Status> {
+        let version = request.into_inner().version;
+        let state = self.shared.lock();
+        let actor = state.published.get(&version);
+        let actor = actor.ok_or_else(|| Status::not_found(format!("parameter version {version} is not kept")))?;
+        Ok(Response::new(encode_actor(actor)))
+    }
+
+    async fn submit_episodes(
+        &self,
+        request: Request<pb::SubmitEpisodesRequest>,
+    ) -> Result<Response<pb::SubmitEpisodesResponse>, Status> {
+        let request = request.into_inner();
+        let now = (self.shared.clock)();
+        let mut state = self.shared.lock();
+        let layout = state.terms.as_ref().ok_or_else(|| Status::unavailable("the run is starting"))?.layout;
+        let episodes: Result<Vec<_>, _> =
+            request.episodes.into_iter().map(|episode| decode_episode(episode, layout)).collect();
+        state.board.submit(request.worker_id, request.slot, episodes?, now).map_err(refusal)?;
+        drop(state);
+        self.shared.arrived.notify_all();
+        Ok(Response::new(pb::SubmitEpisodesResponse {}))
+    }
+
+    async fn status(&self, _: Request<pb::StatusRequest>) -> Result<Response<pb::Progress>, Status> {
+        Ok(Response::new(self.shared.progress.borrow().clone()))
+    }
+
+    async fn watch(&self, _: Request<pb::WatchRequest>) -> Result<Response<Self::WatchStream>, Status> {
+        let mut told_the_end = false;
+        let progress = WatchStream::new(self.shared.progress.subscribe()).take_while(move |progress| {
+            let goes_on = !told_the_end;
+            told_the_end = progress.ended;
+            goes_on
+        });
+        Ok(Response::new(Box::pin(progress.map(Ok))))
+    }
+}
+
+use pb::next_work_response::Work;
+
+impl LearnerService {
+    fn work_for(&self, worker_id: u64) -> Result<Option<Work>, Status> {
+        let now = (self.shared.clock)();
+        let mut state = self.shared.lock();
+        if let Some(reason) = &state.finished {
+            return Ok(Some(Work::Finished(pb::Finished { reason: reason.clone() })));
+        }
+        let order = state.board.next(worker_id, now).map_err(refusal)?;
+        Ok(order.map(|order| Work::Slot(encode_slot(&order))))
+    }
+}
+
+#[expect(clippy::needless_pass_by_value, reason = "used as a function value in map_err")]
+fn refusal(error: SubmitError) -> Status {
+    match error {
+        SubmitError::UnknownWorker(_) => Status::not_found(error.to_string()),
+        SubmitError::WrongEpisodes { .. } => Status::invalid_argument(error.to_string()),
+    }
+}

@@ -1,0 +1,321 @@
+//! The learning state and what happens to it in a round: orders, new episodes, updates, parameters.
+//!
+//! Pure: the result depends on the configuration and the episodes, in their order, and on nothing else.
+
+use std::collections::BTreeMap;
+
+use rand_chacha::ChaCha8Rng;
+use sha2::{Digest as _, Sha256};
+use tandem_core::episode::EpisodeKind;
+use tandem_core::layout::{EPISODE_STEPS, Layout};
+use tandem_core::rng::{Stream, coin, episode_rng, index};
+use tandem_core::work::{EpisodeOrder, PublishedActor, SlotOrder};
+use tandem_core::Episode;
+use tandem_policy::{Normalizer, NormalizerSnapshot, Policy};
+
+use crate::config::{Behaviour, ConfigError, PolyakEvery, RunConfig};
+use crate::ddpg::{Batch, Ddpg, DdpgError};
+use crate::her::{Sampler, Statistics};
+use crate::replay::ReplayBuffer;
+
+/// Episodes of an evaluation slot.
+const EVALUATION_SLOT_EPISODES: usize = 8;
+
+/// How far a run has come.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Counters {
+    /// Rounds learned.
+    pub round: u64,
+    /// Training steps taken in environments.
+    pub env_steps: u64,
+    /// Training episodes.
+    pub episodes: u64,
+    /// Updates.
+    pub updates: u64,
+    /// Units of the advice budget that training episodes were charged.
+    pub advice_spent: u64,
+}
+
+/// What a round showed.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct RoundFigures {
+    /// Mean over the round's updates.
+    pub critic_loss: f64,
+    /// Mean over the round's updates.
+    pub actor_loss: f64,
+    /// Mean value of the policy's own actions over the round's batches, mean over heads.
+    pub mean_q: f64,
+    /// Share of the round's episodes that succeeded.
+    pub training_success: f64,
+    /// Share of the round's episodes in which an object was displaced.
+    pub training_moved: f64,
+}
+
+/// Everything that learning changes.
+#[derive(Debug)]
+pub struct Trainer {
+    pub(crate) config: RunConfig,
+    pub(crate) layout: Layout,
+    pub(crate) counters: Counters,
+    pub(crate) replay: ReplayBuffer,
+    pub(crate) ddpg: Ddpg,
+    pub(crate) observation_normalizer: Normalizer,
+    pub(crate) goal_normalizer: Normalizer,
+    sampler: Sampler,
+    batch: Batch,
+    figures: RoundFigures,
+}
+
+impl Trainer {
+    /// The state before the first round.
+    ///
+    /// # Errors
+    /// When the configuration cannot be used.
+    pub fn new(config: RunConfig) -> Result<Self, ConfigError> {
+        let config = config.checked()?;
+        let layout = config.layout()?;
+        let n_heads = config.replay.reward.n_heads(layout);
+        Ok(Self {
+            layout,
+            counters: Counters::default(),
+            replay: ReplayBuffer::new(layout, config.replay.capacity_transitions),
+            ddpg: Ddpg::new(config.ddpg.clone(), layout, n_heads, config.seed),
+            observation_normalizer: Normalizer::new(layout.n_observation()),
+            goal_normalizer: Normalizer::new(layout.n_goal()),
+            sampler: Sampler::new(&config.replay, layout),
+            batch: Batch::new(layout, n_heads, config.ddpg.batch_size),
+            figures: RoundFigures::default(),
+            config,
+        })
+    }
+
+    /// The configuration of the run.
+    #[must_use]
+    pub const fn config(&self) -> &RunConfig {
+        &self.config
+    }
+
+    /// How far the run has come.
+    #[must_use]
+    pub const fn counters(&self) -> Counters {
+        self.counters
+    }
+
+    /// What the latest round showed.
+    #[must_use]
+    pub const fn figures(&self) -> RoundFigures {
+        self.figures
+    }
+
+    /// Lets the update use `n_threads`, 1 or 2; the results are the same.
+    pub fn set_threads(&mut self, n_threads: usize) {
+        self.ddpg.set_threads(n_threads);
+    }
+
+    /// The training slots of round `round`, to be played with `version`.
+    #[must_use]
+    pub fn training_orders(&self, round: u64, version: u64) -> Vec<SlotOrder> {
+        let per_round = self.config.episodes_per_round();
+        let warmup_episodes = self.config.rounds.warmup_env_steps.div_ceil(EPISODE_STEPS as u64);
+        let orders: Vec<EpisodeOrder> = (round * per_round..(round + 1) * per_round)
+            .map(|number| EpisodeOrder {
+                number,
+                seed: self.config.seed,
+                advised: self.config.advice.asks() && is_advised(number, self.config.advice.share),
+                uniform: number < warmup_episodes,
+                record: false,
+            })
+            .collect();
+        slots(&orders, self.config.rounds.rollouts, EpisodeKind::Training, version)
+    }
+
+    /// The slots of an evaluation of `version` on the run's fixed goals.
+    #[must_use]
+    pub fn evaluation_orders(&self, version: u64) -> Vec<SlotOrder> {
+        let evaluation = &self.config.evaluation;
+        let order = |number| EpisodeOrder {
+            number,
+            seed: evaluation.seed,
+            advised: false,
+            uniform: false,
+            record: number < evaluation.recorded_episodes,
+        };
+        let orders: Vec<EpisodeOrder> = (0..evaluation.episodes).map(order).collect();
+        slots(&orders, EVALUATION_SLOT_EPISODES, EpisodeKind::Evaluation, version)
+    }
+
+    /// Takes in a round's episodes, which must be in episode order.
+    pub fn ingest(&mut self, episodes: &[Episode]) {
+        for episode in episodes {
+            self.replay.push(episode);
+            self.feed_normalizers(episode);
+            self.counters.advice_spent += u64::from(episode.advice_charged);
+        }
+        self.counters.episodes += episodes.len() as u64;
+        self.counters.env_steps += (episodes.len() * EPISODE_STEPS) as u64;
+        let share = |hits: usize| hits as f64 / episodes.len().max(1) as f64;
+        self.figures.training_success = share(episodes.iter().filter(|episode| episode.succeeded()).count());
+        self.figures.training_moved = share(episodes.iter().filter(|episode| episode.moved()).count());
+    }
+
+    /// Makes a round's updates. `on_update` hears how many are done.
+    ///
+    /// # Errors
+    /// When a loss or a parameter is no longer finite.
+    pub fn learn(&mut self, mut on_update: impl FnMut(u64)) -> Result<RoundFigures, DdpgError> {
+        let mut rng = episode_rng(self.config.seed, self.counters.round, Stream::Replay);
+        let statistics = Statistics {
+            observation: self.observation_normalizer.snapshot(),
+            goal: self.goal_normalizer.snapshot(),
+        };
+        let n_updates = self.config.updates_per_round();
+        let mut sums = RoundFigures::default();
+        for update in 1..=n_updates {
+            self.sampler.fill(&self.replay, statistics, &mut rng, &mut self.batch);
+            let losses = self.ddpg.update(&self.batch)?;
+            if self.config.rounds.polyak_every == PolyakEvery::Update {
+                self.ddpg.polyak();
+            }
+            sums.critic_loss += losses.critic_loss;
+            sums.actor_loss += losses.actor_loss;
+            sums.mean_q += losses.mean_q;
+            on_update(update);
+        }
+        if self.config.rounds.polyak_every == PolyakEvery::Round {
+            self.ddpg.polyak();
+        }
+        self.counters.updates += n_updates;
+        self.counters.round += 1;
+        self.figures.critic_loss = sums.critic_loss / n_updates as f64;
+        self.figures.actor_loss = sums.actor_loss / n_updates as f64;
+        self.figures.mean_q = sums.mean_q / n_updates as f64;
+        Ok(self.figures)
+    }
+
+    /// The actor as workers are to use it; its version is the number of rounds learned.
+    #[must_use]
+    pub fn publish(&self) -> PublishedActor {
+        let actor = match self.config.behaviour {
+            Behaviour::Target => self.ddpg.target_actor(),
+            Behaviour::Online => self.ddpg.actor(),
+        };
+        let NormalizerSnapshot { mean: observation_mean, std: observation_std } =
+            self.observation_normalizer.snapshot().clone();
+        let NormalizerSnapshot { mean: goal_mean, std: goal_std } = self.goal_normalizer.snapshot().clone();
+        PublishedActor {
+            version: self.counters.round,
+            n_hidden: self.config.ddpg.n_hidden,
+            n_hidden_layers: self.config.ddpg.n_hidden_layers,
+            actor: actor.to_vec(),
+            observation_mean,
+            observation_std,
+            goal_mean,
+            goal_std,
+        }
+    }
+
+    /// The policy that acts now, with the critic that belongs to it, as it would be shipped.
+    #[must_use]
+    pub fn policy(&self, metadata: BTreeMap<String, String>) -> Policy {
+        let (actor, critic) = match self.config.behaviour {
+            Behaviour::Target => (self.ddpg.target_actor(), self.ddpg.target_critic()),
+            Behaviour::Online => (self.ddpg.actor(), self.ddpg.critic()),
+        };
+        Policy {
+            layout: self.layout,
+            n_hidden: self.config.ddpg.n_hidden,
+            n_hidden_layers: self.config.ddpg.n_hidden_layers,
+            n_heads: self.config.replay.reward.n_heads(self.layout),
+            actor: actor.to_vec(),
+            critic: critic.to_vec(),
+            observation_normalizer: self.observation_normalizer.snapshot().clone(),
+            goal_normalizer: self.goal_normalizer.snapshot().clone(),
+            metadata,
+        }
+    }
+
+    /// SHA-256 over parameters, optimiser, normalisers, replay buffer and counters, in a fixed order, hexadecimal.
+    #[must_use]
+    pub fn digest(&self) -> String {
+        let mut hash = Sha256::new();
+        for (name, values) in self.tensors() {
+            hash.update(name.as_bytes());
+            hash.update(bytemuck::cast_slice::<f32, u8>(values));
+        }
+        for normalizer in [&self.observation_normalizer, &self.goal_normalizer] {
+            let seen = normalizer.parts();
+            hash.update(seen.count.to_le_bytes());
+            seen.sum.iter().chain(&seen.sum_of_squares).for_each(|sum| hash.update(sum.to_le_bytes()));
+        }
+        let (parts, next) = self.replay.parts();
+        hash.update(&parts.advised_arms);
+        hash.update(&parts.moved);
+        let Counters { round, env_steps, episodes, updates, advice_spent } = self.counters;
+        for count in [next as u64, self.ddpg.n_updates(), round, env_steps, episodes, updates, advice_spent] {
+            hash.update(count.to_le_bytes());
+        }
+        hash.finalize().iter().map(|byte| format!("{byte:02x}")).collect()
+    }
+
+    /// Every large float vector of the state, by name, in a fixed order.
+    pub(crate) fn tensors(&self) -> Vec<(String, &[f32])> {
+        let (parts, _) = self.replay.parts();
+        let replay = [
+            ("replay.observations", parts.observations.as_slice()),
+            ("replay.goals", parts.goals.as_slice()),
+            ("replay.actions", parts.actions.as_slice()),
+        ];
+        let ddpg = self.ddpg.state().into_iter().map(|(name, values)| (format!("ddpg.{name}"), values));
+        ddpg.chain(replay.map(|(name, values)| (name.to_owned(), values))).collect()
+    }
+
+    /// Feeds the normalisers with an episode's observations and with goals relabelled as in a batch.
+    fn feed_normalizers(&mut self, episode: &Episode) {
+        let mut rng = episode_rng(self.config.seed, episode.number, Stream::Normaliser);
+        let both_orders = self.config.replay.swap_share > 0.0 && self.layout.n_arms == 2;
+        let (mut observations, mut goals) = (Vec::new(), Vec::new());
+        for step_idx in 0..EPISODE_STEPS {
+            let goal = self.relabelled_goal(episode, step_idx, &mut rng);
+            let observation = episode.observation(step_idx);
+            observations.extend_from_slice(observation);
+            goals.extend_from_slice(&goal);
+            if both_orders {
+                observations.extend(swapped(observation));
+                goals.extend(swapped(&goal));
+            }
+        }
+        self.observation_normalizer.update(&observations);
+        self.goal_normalizer.update(&goals);
+    }
+
+    fn relabelled_goal(&self, episode: &Episode, step_idx: usize, rng: &mut ChaCha8Rng) -> Vec<f32> {
+        let mut goal = episode.goal.clone();
+        for arm in self.layout.arms() {
+            let hindsight = coin(rng, self.config.replay.her_future_share);
+            let moment = step_idx + 1 + index(rng, EPISODE_STEPS - step_idx);
+            if hindsight {
+                goal[self.layout.goal_of(arm)].copy_from_slice(episode.achieved(moment, arm));
+            }
+        }
+        goal
+    }
+}
+
+/// Whether episode `number` is one of the advised ones: a share of any run of episodes, evenly spread.
+#[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "episode numbers stay far below 2^52")]
+fn is_advised(number: u64, share: f64) -> bool {
+    let advised_before = |number: u64| (number as f64 * share).floor() as u64;
+    advised_before(number + 1) > advised_before(number)
+}
+
+/// Cuts orders into slots of `n_episodes`; the board numbers them.
+fn slots(orders: &[EpisodeOrder], n_episodes: usize, kind: EpisodeKind, version: u64) -> Vec<SlotOrder> {
+    let slot = |episodes: &[EpisodeOrder]| SlotOrder { slot: 0, parameter_version: version, kind, episodes: episodes.to_vec() };
+    orders.chunks(n_episodes).map(slot).collect()
+}
+
+/// The two halves of a two-arm vector in the other order.
+fn swapped(vector: &[f32]) -> Vec<f32> {
+    let (first, second) = vector.split_at(vector.len() / 2);
+    [second, first].concat()
+}

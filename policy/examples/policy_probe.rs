@@ -1,0 +1,38 @@
+//! Prints what a policy file computes for arbitrary inputs, for `scripts/check_policy.py` to compare:
+//! `cargo run --release -p tandem-policy --example policy_probe -- FILE > probe.json`.
+
+#![expect(clippy::print_stdout, reason = "its output is its purpose")]
+
+use std::path::Path;
+
+use serde_json::json;
+use tandem_core::rng::uniform;
+use tandem_core::{Stream, episode_rng};
+use tandem_policy::Policy;
+
+const N_ROWS: usize = 64;
+
+fn main() -> Result<(), Box<dyn std::error::Error>> {
+    let file = std::env::args().nth(1).ok_or("usage: policy_probe FILE")?;
+    let policy = Policy::load(Path::new(&file))?;
+    let (mut actor, mut critic) = (policy.actor()?, policy.critic()?);
+    let layout = policy.layout;
+
+    let mut rng = episode_rng(0, 0, Stream::Reset);
+    let mut draw =
+        |n: usize| (0..N_ROWS * n).map(|_| uniform(&mut rng, -0.5, 0.5)).collect::<Vec<f32>>();
+    let (observations, goals) = (draw(layout.n_observation()), draw(layout.n_goal()));
+    let mut actions = vec![0.0; N_ROWS * layout.n_action()];
+    let mut q = vec![0.0; N_ROWS * critic.n_heads()];
+    actor.act(&observations, &goals, &mut actions);
+    critic.q(&observations, &goals, &actions, &mut q);
+    let probe = json!({
+        "digest": policy.digest(),
+        "observations": observations.chunks(layout.n_observation()).collect::<Vec<_>>(),
+        "goals": goals.chunks(layout.n_goal()).collect::<Vec<_>>(),
+        "actions": actions.chunks(layout.n_action()).collect::<Vec<_>>(),
+        "q": q.chunks(critic.n_heads()).collect::<Vec<_>>(),
+    });
+    println!("{probe}");
+    Ok(())
+}

@@ -1,0 +1,271 @@
+//! Actor and critic as workers, teachers and evaluations use them: a few observations at a time.
+
+use tandem_core::Layout;
+use tandem_core::work::PublishedActor;
+
+use crate::elementwise::tanh;
+use crate::error::Error;
+use crate::mlp::MlpShape;
+use crate::normalizer::NormalizerSnapshot;
+use crate::packed::{MAX_ROWS, PackedMlp};
+use crate::policy::{check_network_size, check_normalizer, check_parameters};
+
+/// How observations and goals are normalised before a network sees them.
+#[derive(Debug, Clone)]
+struct Inputs {
+    layout: Layout,
+    observation: NormalizerSnapshot,
+    goal: NormalizerSnapshot,
+}
+
+impl Inputs {
+    fn new(
+        layout: Layout,
+        observation: NormalizerSnapshot,
+        goal: NormalizerSnapshot,
+    ) -> Result<Self, Error> {
+        check_normalizer(
+            ["observation mean", "observation std"],
+            &observation,
+            layout.n_observation(),
+        )?;
+        check_normalizer(["goal mean", "goal std"], &goal, layout.n_goal())?;
+        Ok(Self { layout, observation, goal })
+    }
+
+    /// How many rows `observations` and `goals` have.
+    fn n_rows(&self, observations: &[f32], goals: &[f32]) -> usize {
+        let n_rows = observations.len() / self.layout.n_observation();
+        let expected = (n_rows * self.layout.n_observation(), n_rows * self.layout.n_goal());
+        assert_eq!(
+            (observations.len(), goals.len()),
+            expected,
+            "observations and goals of another layout"
+        );
+        n_rows
+    }
+
+    /// Writes row `row_idx` of `observations` and `goals`, normalised, to the start of `input`.
+    fn write(&self, observations: &[f32], goals: &[f32], row_idx: usize, input: &mut [f32]) {
+        let (n_observation, n_goal) = (self.layout.n_observation(), self.layout.n_goal());
+        let (observation, rest) = input.split_at_mut(n_observation);
+        self.observation
+            .normalize(&observations[row_idx * n_observation..][..n_observation], observation);
+        self.goal.normalize(&goals[row_idx * n_goal..][..n_goal], &mut rest[..n_goal]);
+    }
+}
+
+/// Chooses actions.
+///
+/// An observation gives the same bits whatever batch it stands in, on every machine with fused multiply-add.
+#[derive(Debug, Clone)]
+pub struct Actor {
+    version: u64,
+    inputs: Inputs,
+    network: PackedMlp,
+}
+
+impl Actor {
+    /// The actor that a learner published.
+    ///
+    /// # Errors
+    /// When the parameters do not fit `layout` or are not finite.
+    pub fn new(layout: Layout, published: PublishedActor) -> Result<Self, Error> {
+        let PublishedActor { version, n_hidden, n_hidden_layers, actor, .. } = published;
+        check_network_size(n_hidden, n_hidden_layers)?;
+        let shape = MlpShape::actor(layout, n_hidden, n_hidden_layers);
+        check_parameters("actor", &actor, shape.n_parameters())?;
+        let observation =
+            NormalizerSnapshot { mean: published.observation_mean, std: published.observation_std };
+        let goal = NormalizerSnapshot { mean: published.goal_mean, std: published.goal_std };
+        let inputs = Inputs::new(layout, observation, goal)?;
+        Ok(Self { version, inputs, network: PackedMlp::new(&shape, &actor) })
+    }
+
+    /// The published version that these parameters are.
+    #[must_use]
+    pub const fn version(&self) -> u64 {
+        self.version
+    }
+
+    /// Task and arms that the actor is for.
+    #[must_use]
+    pub const fn layout(&self) -> Layout {
+        self.inputs.layout
+    }
+
+    /// Writes the actions, in [-1, 1], shape `[n, n_action]`, for `observations`, shape `[n, n_observation]`, and
+    /// `goals`, shape `[n, n_goal]`.
+    ///
+    /// # Panics
+    /// When the lengths do not fit the layout or each other.
+    pub fn act(&mut self, observations: &[f32], goals: &[f32], actions: &mut [f32]) {
+        let n_rows = self.inputs.n_rows(observations, goals);
+        let n_action = self.inputs.layout.n_action();
+        assert_eq!(actions.len(), n_rows * n_action, "actions of another layout");
+        for first in (0..n_rows).step_by(MAX_ROWS) {
+            let n_now = MAX_ROWS.min(n_rows - first);
+            for row in 0..n_now {
+                self.inputs.write(observations, goals, first + row, self.network.input_row(row));
+            }
+            self.network.run(n_now);
+            for (row, action) in
+                actions[first * n_action..].chunks_exact_mut(n_action).take(n_now).enumerate()
+            {
+                for (component, raw) in action.iter_mut().zip(self.network.output_row(row)) {
+                    *component = tanh(*raw);
+                }
+            }
+        }
+    }
+}
+
+/// Values actions: expected discounted reward, one number per head.
+///
+/// As for [`Actor`], the batch does not enter a row's bits.
+#[derive(Debug, Clone)]
+pub struct Critic {
+    n_heads: usize,
+    inputs: Inputs,
+    network: PackedMlp,
+}
+
+impl Critic {
+    /// A critic with `shape`'s parameters for inputs normalised by `observation` and `goal`.
+    ///
+    /// # Errors
+    /// When the parameters do not fit `layout` or are not finite.
+    pub fn new(
+        layout: Layout,
+        shape: &MlpShape,
+        parameters: &[f32],
+        observation: NormalizerSnapshot,
+        goal: NormalizerSnapshot,
+    ) -> Result<Self, Error> {
+        check_network_size(shape.n_hidden, shape.n_hidden_layers)?;
+        let fitting =
+            MlpShape::critic(layout, shape.n_hidden, shape.n_hidden_layers, shape.n_output);
+        if fitting.n_input != shape.n_input {
+            return Err(Error::WrongLength {
+                name: "critic input",
+                got: shape.n_input,
+                expected: fitting.n_input,
+            });
+        }
+        check_parameters("critic", parameters, shape.n_parameters())?;
+        let inputs = Inputs::new(layout, observation, goal)?;
+        Ok(Self { n_heads: shape.n_output, inputs, network: PackedMlp::new(shape, parameters) })
+    }
+
+    /// Values per action: 1, or one per arm.
+    #[must_use]
+    pub const fn n_heads(&self) -> usize {
+        self.n_heads
+    }
+
+    /// Writes the values, shape `[n, n_heads]`, of `actions`, shape `[n, n_action]`, for `observations`, shape
+    /// `[n, n_observation]`, and `goals`, shape `[n, n_goal]`.
+    ///
+    /// # Panics
+    /// When the lengths do not fit the layout or each other.
+    pub fn q(&mut self, observations: &[f32], goals: &[f32], actions: &[f32], q: &mut [f32]) {
+        let n_rows = self.inputs.n_rows(observations, goals);
+        let (n_action, n_heads) = (self.inputs.layout.n_action(), self.n_heads);
+        let expected = (n_rows * n_action, n_rows * n_heads);
+        assert_eq!((actions.len(), q.len()), expected, "actions or values of another layout");
+        for first in (0..n_rows).step_by(MAX_ROWS) {
+            let n_now = MAX_ROWS.min(n_rows - first);
+            for row in 0..n_now {
+                let input = self.network.input_row(row);
+                self.inputs.write(observations, goals, first + row, input);
+                let action_start = input.len() - n_action;
+                input[action_start..]
+                    .copy_from_slice(&actions[(first + row) * n_action..][..n_action]);
+            }
+            self.network.run(n_now);
+            for (row, q) in q[first * n_heads..].chunks_exact_mut(n_heads).take(n_now).enumerate() {
+                q.copy_from_slice(self.network.output_row(row));
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use tandem_core::rng::uniform;
+    use tandem_core::{Stream, Task, episode_rng};
+
+    use super::*;
+    use crate::policy::Policy;
+
+    const N_ROWS: usize = 70;
+
+    fn inputs(layout: Layout) -> [Vec<f32>; 3] {
+        let mut rng = episode_rng(5, 0, Stream::Reset);
+        [layout.n_observation(), layout.n_goal(), layout.n_action()]
+            .map(|n| (0..N_ROWS * n).map(|_| uniform(&mut rng, -1.0, 1.0)).collect())
+    }
+
+    #[test]
+    fn a_long_batch_is_the_same_as_its_rows_one_by_one() {
+        let policy = Policy::sample(Layout::new(Task::PickAndPlace, 2), 2);
+        let layout = policy.layout;
+        let (n_observation, n_goal, n_action) =
+            (layout.n_observation(), layout.n_goal(), layout.n_action());
+        let [observations, goals, _] = inputs(layout);
+        let (mut actor, mut critic) = (policy.actor().unwrap(), policy.critic().unwrap());
+        let (mut actions, mut q) = (vec![0.0; N_ROWS * n_action], vec![0.0; N_ROWS * 2]);
+        actor.act(&observations, &goals, &mut actions);
+        critic.q(&observations, &goals, &actions, &mut q);
+        for row in 0..N_ROWS {
+            let (observation, goal) = (
+                &observations[row * n_observation..][..n_observation],
+                &goals[row * n_goal..][..n_goal],
+            );
+            let (mut action, mut values) = (vec![0.0; n_action], [0.0; 2]);
+            actor.act(observation, goal, &mut action);
+            critic.q(observation, goal, &action, &mut values);
+            assert_eq!(action, actions[row * n_action..][..n_action], "action of row {row}");
+            assert_eq!(values, q[row * 2..][..2], "values of row {row}");
+        }
+        assert!(actions.iter().all(|component| component.abs() <= 1.0));
+        assert!(q.chunks(2).any(|values| values[0] != values[1]), "the heads differ");
+    }
+
+    #[test]
+    fn the_critic_sees_the_action() {
+        let policy = Policy::sample(Layout::new(Task::Push, 1), 1);
+        let [observations, goals, mut actions] = inputs(policy.layout);
+        let mut critic = policy.critic().unwrap();
+        let (mut before, mut after) = (vec![0.0; N_ROWS], vec![0.0; N_ROWS]);
+        critic.q(&observations, &goals, &actions, &mut before);
+        actions[3] += 0.5;
+        critic.q(&observations, &goals, &actions, &mut after);
+        assert_ne!(before[1], after[1]);
+        before[1] = after[1];
+        assert_eq!(before, after, "no other row changed");
+    }
+
+    #[test]
+    fn parameters_that_do_not_fit_are_refused() {
+        let policy = Policy::sample(Layout::new(Task::Push, 1), 1);
+        let check = |spoil: fn(&mut PublishedActor), expected: &str| {
+            let mut published = policy.published(3);
+            spoil(&mut published);
+            let error = Actor::new(policy.layout, published).expect_err("must be refused");
+            assert_eq!(error.to_string(), expected);
+        };
+        check(|actor| drop(actor.actor.pop()), "actor has 2178 numbers, expected 2179");
+        check(|actor| actor.n_hidden_layers = 0, "n_hidden_layers is 0, expected 1 to 64");
+        check(|actor| actor.actor[7] = f32::NAN, "actor holds a number that is not finite");
+        check(|actor| actor.goal_mean.push(0.0), "goal mean has 4 numbers, expected 3");
+        check(
+            |actor| actor.observation_std[0] = 0.0,
+            "observation std holds a number that is not above 0",
+        );
+        assert_eq!(
+            Actor::new(policy.layout, policy.published(3)).map(|actor| actor.version()).unwrap(),
+            3
+        );
+    }
+}

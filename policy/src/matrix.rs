@@ -1,0 +1,173 @@
+//! Matrices inside flat slices, and their product.
+
+/// A matrix that reads from a slice; any strides.
+#[derive(Debug, Clone, Copy)]
+pub struct Matrix<'a> {
+    data: &'a [f32],
+    n_rows: usize,
+    n_cols: usize,
+    row_stride: usize,
+    col_stride: usize,
+}
+
+impl<'a> Matrix<'a> {
+    /// A row-major matrix without gaps.
+    ///
+    /// # Panics
+    /// When `data` is too short.
+    #[must_use]
+    pub fn new(data: &'a [f32], n_rows: usize, n_cols: usize) -> Self {
+        Self::with_stride(data, n_rows, n_cols, n_cols)
+    }
+
+    /// A row-major matrix whose rows start `row_stride` apart.
+    ///
+    /// # Panics
+    /// When `data` is too short.
+    #[must_use]
+    pub fn with_stride(data: &'a [f32], n_rows: usize, n_cols: usize, row_stride: usize) -> Self {
+        assert!(fits(data.len(), n_rows, n_cols, row_stride), "a matrix larger than its data");
+        Self { data, n_rows, n_cols, row_stride, col_stride: 1 }
+    }
+
+    /// The same numbers with rows and columns exchanged.
+    #[must_use]
+    pub const fn transposed(self) -> Self {
+        Self {
+            data: self.data,
+            n_rows: self.n_cols,
+            n_cols: self.n_rows,
+            row_stride: self.col_stride,
+            col_stride: self.row_stride,
+        }
+    }
+
+    /// Number of rows.
+    #[must_use]
+    pub const fn n_rows(&self) -> usize {
+        self.n_rows
+    }
+}
+
+/// A row-major matrix that writes into a slice.
+#[derive(Debug)]
+pub struct MatrixMut<'a> {
+    data: &'a mut [f32],
+    n_rows: usize,
+    n_cols: usize,
+    row_stride: usize,
+}
+
+impl<'a> MatrixMut<'a> {
+    /// A matrix without gaps.
+    ///
+    /// # Panics
+    /// When `data` is too short.
+    #[must_use]
+    pub fn new(data: &'a mut [f32], n_rows: usize, n_cols: usize) -> Self {
+        Self::with_stride(data, n_rows, n_cols, n_cols)
+    }
+
+    /// A matrix whose rows start `row_stride` apart.
+    ///
+    /// # Panics
+    /// When `data` is too short or rows overlap.
+    #[must_use]
+    pub fn with_stride(
+        data: &'a mut [f32],
+        n_rows: usize,
+        n_cols: usize,
+        row_stride: usize,
+    ) -> Self {
+        assert!(fits(data.len(), n_rows, n_cols, row_stride), "a matrix larger than its data");
+        assert!(n_cols <= row_stride, "rows overlap");
+        Self { data, n_rows, n_cols, row_stride }
+    }
+
+    /// The rows, in order.
+    pub fn rows_mut(&mut self) -> impl Iterator<Item = &mut [f32]> {
+        let n_cols = self.n_cols;
+        self.data.chunks_mut(self.row_stride).take(self.n_rows).map(move |row| &mut row[..n_cols])
+    }
+}
+
+/// Whether the last element of a row-major matrix lies within `len` numbers.
+fn fits(len: usize, n_rows: usize, n_cols: usize, row_stride: usize) -> bool {
+    n_rows > 0
+        && n_cols > 0
+        && (n_rows - 1)
+            .checked_mul(row_stride)
+            .and_then(|start| start.checked_add(n_cols))
+            .is_some_and(|end| end <= len)
+}
+
+/// `product = lhs · rhs` on one thread.
+///
+/// The kernel is chosen at run time for the processor at hand. On one machine the result depends on nothing but the
+/// operands; another machine may add up in another order.
+///
+/// # Panics
+/// When the shapes do not match.
+pub fn multiply(product: &mut MatrixMut<'_>, lhs: Matrix<'_>, rhs: Matrix<'_>) {
+    let shapes = (product.n_rows, lhs.n_cols, rhs.n_cols);
+    assert_eq!(
+        shapes,
+        (lhs.n_rows, rhs.n_rows, product.n_cols),
+        "shapes of a product do not match"
+    );
+    let (alpha_of_product, beta_of_operands) = (0.0, 1.0);
+    #[expect(unsafe_code, reason = "the matrix product takes pointers")]
+    // SAFETY: the constructors checked that the last element of each matrix lies within its slice, the shapes match,
+    // and `product` is borrowed mutably, with rows that do not overlap.
+    unsafe {
+        gemm::gemm(
+            product.n_rows,
+            product.n_cols,
+            lhs.n_cols,
+            product.data.as_mut_ptr(),
+            1,
+            stride(product.row_stride),
+            false,
+            lhs.data.as_ptr(),
+            stride(lhs.col_stride),
+            stride(lhs.row_stride),
+            rhs.data.as_ptr(),
+            stride(rhs.col_stride),
+            stride(rhs.row_stride),
+            alpha_of_product,
+            beta_of_operands,
+            false,
+            false,
+            false,
+            gemm::Parallelism::None,
+        );
+    }
+}
+
+fn stride(n: usize) -> isize {
+    isize::try_from(n).expect("no slice is longer than isize::MAX")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_product_of_strided_and_transposed_matrices_is_right() {
+        let lhs = [1.0, 2.0, 9.0, 3.0, 4.0, 9.0];
+        let rhs = [1.0, 10.0, 100.0, 1000.0];
+        let mut product = [7.0; 5];
+        multiply(
+            &mut MatrixMut::with_stride(&mut product, 2, 2, 3),
+            Matrix::with_stride(&lhs, 2, 2, 3),
+            Matrix::new(&rhs, 2, 2).transposed(),
+        );
+        assert_eq!(product, [21.0, 2100.0, 7.0, 43.0, 4300.0]);
+    }
+
+    #[test]
+    #[should_panic(expected = "a matrix larger than its data")]
+    fn a_matrix_cannot_reach_beyond_its_slice() {
+        drop(Matrix::with_stride(&[0.0; 5], 2, 3, 3));
+    }
+}

@@ -1,0 +1,361 @@
+//! A multilayer perceptron over batches: ReLU between layers, linear output, gradients by hand.
+
+use std::ops::Range;
+
+use rand_chacha::ChaCha8Rng;
+use tandem_core::Layout;
+use tandem_core::rng::uniform;
+
+use crate::elementwise::{add_bias, add_bias_relu, column_sums, mask, mask_and_sum};
+use crate::matrix::{Matrix, MatrixMut, multiply};
+
+/// Sizes of a network: input, equal hidden layers, output.
+///
+/// Its parameters are one flat vector: per layer the weight, shape `[out, in]`, then the bias, shape `[out]`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct MlpShape {
+    /// Length of an input row.
+    pub n_input: usize,
+    /// Units of each hidden layer.
+    pub n_hidden: usize,
+    /// Hidden layers.
+    pub n_hidden_layers: usize,
+    /// Length of an output row.
+    pub n_output: usize,
+}
+
+impl MlpShape {
+    /// An actor: normalised observation and goal to an action before its tanh.
+    #[must_use]
+    pub const fn actor(layout: Layout, n_hidden: usize, n_hidden_layers: usize) -> Self {
+        let n_input = layout.n_observation() + layout.n_goal();
+        Self { n_input, n_hidden, n_hidden_layers, n_output: layout.n_action() }
+    }
+
+    /// A critic: normalised observation and goal, then the action, to one value per head.
+    #[must_use]
+    pub const fn critic(
+        layout: Layout,
+        n_hidden: usize,
+        n_hidden_layers: usize,
+        n_heads: usize,
+    ) -> Self {
+        let n_input = layout.n_observation() + layout.n_goal() + layout.n_action();
+        Self { n_input, n_hidden, n_hidden_layers, n_output: n_heads }
+    }
+
+    /// Length of the parameter vector.
+    #[must_use]
+    pub const fn n_parameters(&self) -> usize {
+        self.layer_start(self.n_layers())
+    }
+
+    /// Hidden layers and the output layer.
+    #[must_use]
+    pub const fn n_layers(&self) -> usize {
+        self.n_hidden_layers + 1
+    }
+
+    /// Length of the rows that layer `layer` takes.
+    #[must_use]
+    pub const fn layer_input(&self, layer: usize) -> usize {
+        if layer == 0 { self.n_input } else { self.n_hidden }
+    }
+
+    /// Length of the rows that layer `layer` gives.
+    #[must_use]
+    pub const fn layer_output(&self, layer: usize) -> usize {
+        if layer == self.n_hidden_layers { self.n_output } else { self.n_hidden }
+    }
+
+    /// Where the weight of layer `layer`, shape `[out, in]`, stands among the parameters.
+    #[must_use]
+    pub const fn weight(&self, layer: usize) -> Range<usize> {
+        let start = self.layer_start(layer);
+        start..start + self.layer_input(layer) * self.layer_output(layer)
+    }
+
+    /// Where the bias of layer `layer`, shape `[out]`, stands among the parameters.
+    #[must_use]
+    pub const fn bias(&self, layer: usize) -> Range<usize> {
+        let start = self.weight(layer).end;
+        start..start + self.layer_output(layer)
+    }
+
+    /// Fresh parameters: Xavier-uniform weights, zero biases.
+    #[must_use]
+    pub fn initialise(&self, rng: &mut ChaCha8Rng) -> Vec<f32> {
+        let mut parameters = vec![0.0; self.n_parameters()];
+        for layer in 0..self.n_layers() {
+            let bound = (6.0 / (self.layer_input(layer) + self.layer_output(layer)) as f32).sqrt();
+            for weight in &mut parameters[self.weight(layer)] {
+                *weight = uniform(rng, -bound, bound);
+            }
+        }
+        parameters
+    }
+
+    const fn layer_start(&self, layer: usize) -> usize {
+        let mut start = 0;
+        let mut below = 0;
+        while below < layer {
+            start += (self.layer_input(below) + 1) * self.layer_output(below);
+            below += 1;
+        }
+        start
+    }
+
+    fn weight_matrix<'a>(&self, parameters: &'a [f32], layer: usize) -> Matrix<'a> {
+        Matrix::new(
+            &parameters[self.weight(layer)],
+            self.layer_output(layer),
+            self.layer_input(layer),
+        )
+    }
+}
+
+/// Memory for the passes of one network over at most `max_batch` rows.
+///
+/// A forward pass leaves its hidden activations here for the backward pass that follows.
+#[derive(Debug, Clone)]
+pub struct Workspace {
+    /// Per hidden layer, after its ReLU, shape `[max_batch, n_hidden]`.
+    hidden: Vec<Vec<f32>>,
+    /// Gradients by a layer's output and by its input, each `[max_batch, n_hidden or n_output]`.
+    deltas: [Vec<f32>; 2],
+}
+
+impl Workspace {
+    /// Memory for `shape` and batches of up to `max_batch` rows.
+    #[must_use]
+    pub fn new(shape: &MlpShape, max_batch: usize) -> Self {
+        let widest = shape.n_hidden.max(shape.n_output);
+        Self {
+            hidden: vec![vec![0.0; max_batch * shape.n_hidden]; shape.n_hidden_layers],
+            deltas: [vec![0.0; max_batch * widest], vec![0.0; max_batch * widest]],
+        }
+    }
+}
+
+/// Computes `output`, shape `[batch, n_output]`, from `input`, shape `[batch, n_input]`.
+///
+/// # Panics
+/// When a size does not fit `shape` or the batch is larger than the workspace's.
+pub fn forward(
+    shape: &MlpShape,
+    parameters: &[f32],
+    input: Matrix<'_>,
+    workspace: &mut Workspace,
+    output: &mut MatrixMut<'_>,
+) {
+    let n_rows = input.n_rows();
+    for layer in 0..shape.n_hidden_layers {
+        let (below, above) = workspace.hidden.split_at_mut(layer);
+        let layer_input =
+            below.last().map_or(input, |rows| Matrix::new(rows, n_rows, shape.n_hidden));
+        let rows = &mut above[0][..n_rows * shape.n_hidden];
+        let weight = shape.weight_matrix(parameters, layer);
+        multiply(
+            &mut MatrixMut::new(rows, n_rows, shape.n_hidden),
+            layer_input,
+            weight.transposed(),
+        );
+        add_bias_relu(rows, &parameters[shape.bias(layer)]);
+    }
+    let last = shape.n_hidden_layers;
+    let layer_input =
+        workspace.hidden.last().map_or(input, |rows| Matrix::new(rows, n_rows, shape.n_hidden));
+    multiply(output, layer_input, shape.weight_matrix(parameters, last).transposed());
+    add_bias(output, &parameters[shape.bias(last)]);
+}
+
+/// Computes the loss's gradient by the parameters, shape `[n_parameters]`, from its gradient by the output, shape
+/// `[batch, n_output]`. `workspace` comes from the forward pass of the same `input`.
+///
+/// # Panics
+/// When a size does not fit `shape` or the batch is larger than the workspace's.
+pub fn backward_parameters(
+    shape: &MlpShape,
+    parameters: &[f32],
+    input: Matrix<'_>,
+    workspace: &mut Workspace,
+    output_gradient: &[f32],
+    gradient: &mut [f32],
+) {
+    let n_rows = input.n_rows();
+    let Workspace { hidden, deltas: [delta, next_delta] } = workspace;
+    let (mut delta, mut next_delta) = (delta, next_delta);
+    delta[..output_gradient.len()].copy_from_slice(output_gradient);
+    for layer in (0..shape.n_layers()).rev() {
+        let (n_in, n_out) = (shape.layer_input(layer), shape.layer_output(layer));
+        let rows = &mut delta[..n_rows * n_out];
+        match hidden.get(layer) {
+            Some(activations) => mask_and_sum(rows, activations, &mut gradient[shape.bias(layer)]),
+            None => column_sums(rows, &mut gradient[shape.bias(layer)]),
+        }
+        let rows = Matrix::new(rows, n_rows, n_out);
+        let layer_input =
+            if layer == 0 { input } else { Matrix::new(&hidden[layer - 1], n_rows, n_in) };
+        multiply(
+            &mut MatrixMut::new(&mut gradient[shape.weight(layer)], n_out, n_in),
+            rows.transposed(),
+            layer_input,
+        );
+        if layer > 0 {
+            multiply(
+                &mut MatrixMut::new(next_delta, n_rows, n_in),
+                rows,
+                shape.weight_matrix(parameters, layer),
+            );
+            std::mem::swap(&mut delta, &mut next_delta);
+        }
+    }
+}
+
+/// Computes the loss's gradient by the input's `columns`, shape `[batch, columns.len()]`, from its gradient by the
+/// output, shape `[batch, n_output]`. `workspace` comes from the forward pass.
+///
+/// # Panics
+/// When a size does not fit `shape` or the batch is larger than the workspace's.
+pub fn backward_input(
+    shape: &MlpShape,
+    parameters: &[f32],
+    workspace: &mut Workspace,
+    output_gradient: &[f32],
+    columns: Range<usize>,
+    input_gradient: &mut [f32],
+) {
+    let n_rows = output_gradient.len() / shape.n_output;
+    let Workspace { hidden, deltas: [delta, next_delta] } = workspace;
+    let (mut delta, mut next_delta) = (delta, next_delta);
+    delta[..output_gradient.len()].copy_from_slice(output_gradient);
+    for layer in (1..shape.n_layers()).rev() {
+        let (n_in, n_out) = (shape.layer_input(layer), shape.layer_output(layer));
+        let rows = Matrix::new(delta, n_rows, n_out);
+        multiply(
+            &mut MatrixMut::new(next_delta, n_rows, n_in),
+            rows,
+            shape.weight_matrix(parameters, layer),
+        );
+        std::mem::swap(&mut delta, &mut next_delta);
+        mask(&mut delta[..n_rows * n_in], &hidden[layer - 1]);
+    }
+    let n_out = shape.layer_output(0);
+    let weight = &parameters[shape.weight(0)][columns.start..];
+    let weight = Matrix::with_stride(weight, n_out, columns.len(), shape.n_input);
+    multiply(
+        &mut MatrixMut::new(input_gradient, n_rows, columns.len()),
+        Matrix::new(delta, n_rows, n_out),
+        weight,
+    );
+}
+
+#[cfg(test)]
+mod tests {
+    use tandem_core::{Stream, episode_rng};
+
+    use super::*;
+
+    const SHAPE: MlpShape = MlpShape { n_input: 5, n_hidden: 7, n_hidden_layers: 2, n_output: 3 };
+    const N_ROWS: usize = 4;
+
+    #[test]
+    fn the_layers_parts_cover_the_parameters_once() {
+        let parts =
+            (0..SHAPE.n_layers()).flat_map(|layer| [SHAPE.weight(layer), SHAPE.bias(layer)]);
+        assert_eq!(
+            parts.flatten().collect::<Vec<_>>(),
+            (0..SHAPE.n_parameters()).collect::<Vec<_>>()
+        );
+        assert_eq!(SHAPE.n_parameters(), (5 + 1) * 7 + (7 + 1) * 7 + (7 + 1) * 3);
+    }
+
+    #[test]
+    fn fresh_weights_fill_xaviers_range_and_biases_are_zero() {
+        let parameters = SHAPE.initialise(&mut episode_rng(1, 0, Stream::Initialisation));
+        let bound = (6.0_f32 / 12.0).sqrt();
+        let largest = parameters[SHAPE.weight(0)]
+            .iter()
+            .fold(0.0_f32, |largest, weight| largest.max(weight.abs()));
+        assert!((0.8 * bound..bound).contains(&largest), "largest weight {largest}");
+        assert_eq!(parameters[SHAPE.bias(1)], [0.0; 7]);
+    }
+
+    /// The slow, obvious network in double precision.
+    fn reference(parameters: &[f64], input: &[f64]) -> Vec<f64> {
+        let mut row = input.to_vec();
+        for layer in 0..SHAPE.n_layers() {
+            let (weight, bias) = (&parameters[SHAPE.weight(layer)], &parameters[SHAPE.bias(layer)]);
+            let next = weight.chunks(row.len()).zip(bias).map(|(weights, bias)| {
+                let sum =
+                    weights.iter().zip(&row).map(|(weight, x)| weight * x).sum::<f64>() + bias;
+                if layer < SHAPE.n_hidden_layers { sum.max(0.0) } else { sum }
+            });
+            row = next.collect();
+        }
+        row
+    }
+
+    /// A loss that is linear in the output, so that its gradient by the output is `slopes`.
+    fn loss(parameters: &[f64], input: &[f64], slopes: &[f32]) -> f64 {
+        let outputs = input.chunks(SHAPE.n_input).flat_map(|row| reference(parameters, row));
+        outputs.zip(slopes).map(|(output, slope)| output * f64::from(*slope)).sum()
+    }
+
+    /// The loss's slope along each of `at`'s coordinates, by central differences.
+    fn differences(at: &[f64], loss: impl Fn(&[f64]) -> f64) -> Vec<f64> {
+        const STEP: f64 = 1e-6;
+        let along = |i: usize, step: f64| {
+            let mut moved = at.to_vec();
+            moved[i] += step;
+            loss(&moved)
+        };
+        (0..at.len()).map(|i| (along(i, STEP) - along(i, -STEP)) / (2.0 * STEP)).collect()
+    }
+
+    fn assert_close(what: &str, got: &[f32], expected: &[f64]) {
+        assert_eq!(got.len(), expected.len(), "{what}");
+        for (i, (got, expected)) in got.iter().zip(expected).enumerate() {
+            assert!(
+                (f64::from(*got) - expected).abs() < 2e-5,
+                "{what} {i}: {got} against {expected}"
+            );
+        }
+    }
+
+    #[test]
+    fn both_passes_agree_with_double_precision_and_finite_differences() {
+        let mut rng = episode_rng(2, 0, Stream::Initialisation);
+        let mut parameters = SHAPE.initialise(&mut rng);
+        for layer in 0..SHAPE.n_layers() {
+            parameters[SHAPE.bias(layer)].fill_with(|| uniform(&mut rng, -0.3, 0.3));
+        }
+        let mut draw =
+            |n: usize| (0..n).map(|_| uniform(&mut rng, -1.0, 1.0)).collect::<Vec<f32>>();
+        let (input, slopes) = (draw(N_ROWS * SHAPE.n_input), draw(N_ROWS * SHAPE.n_output));
+        let exact = |numbers: &[f32]| numbers.iter().copied().map(f64::from).collect::<Vec<f64>>();
+        let (parameters64, input64) = (exact(&parameters), exact(&input));
+
+        let mut workspace = Workspace::new(&SHAPE, N_ROWS + 2);
+        let mut output = vec![0.0; N_ROWS * SHAPE.n_output];
+        let rows = Matrix::new(&input, N_ROWS, SHAPE.n_input);
+        let mut output_rows = MatrixMut::new(&mut output, N_ROWS, SHAPE.n_output);
+        forward(&SHAPE, &parameters, rows, &mut workspace, &mut output_rows);
+        let outputs: Vec<f64> =
+            input64.chunks(SHAPE.n_input).flat_map(|row| reference(&parameters64, row)).collect();
+        assert_close("output", &output, &outputs);
+
+        let mut input_gradient = vec![0.0; N_ROWS * 3];
+        backward_input(&SHAPE, &parameters, &mut workspace, &slopes, 2..5, &mut input_gradient);
+        let slopes_by_input = differences(&input64, |input| loss(&parameters64, input, &slopes));
+        let by_columns: Vec<f64> =
+            slopes_by_input.chunks(5).flat_map(|row| row[2..].to_vec()).collect();
+        assert_close("input gradient", &input_gradient, &by_columns);
+
+        let mut gradient = vec![f32::NAN; SHAPE.n_parameters()];
+        backward_parameters(&SHAPE, &parameters, rows, &mut workspace, &slopes, &mut gradient);
+        let slopes_by_parameter =
+            differences(&parameters64, |parameters| loss(parameters, &input64, &slopes));
+        assert_close("gradient", &gradient, &slopes_by_parameter);
+    }
+}

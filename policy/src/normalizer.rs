@@ -1,0 +1,191 @@
+//! Running mean and standard deviation of a network's inputs.
+
+/// No standard deviation counts as smaller than this.
+pub const STD_FLOOR: f32 = 0.01;
+/// Normalised numbers are clipped to `[-CLIP, CLIP]`.
+pub const CLIP: f32 = 5.0;
+
+/// Mean and standard deviation as they are at one moment.
+#[derive(Debug, Clone, PartialEq)]
+pub struct NormalizerSnapshot {
+    /// Shape `[size]`.
+    pub mean: Vec<f32>,
+    /// Shape `[size]`, above 0.
+    pub std: Vec<f32>,
+}
+
+impl NormalizerSnapshot {
+    /// Leaves numbers as they are, up to clipping.
+    #[must_use]
+    pub fn identity(size: usize) -> Self {
+        Self { mean: vec![0.0; size], std: vec![1.0; size] }
+    }
+
+    /// `clip((raw - mean) / std)`, shape `[size]`.
+    ///
+    /// # Panics
+    /// When a length differs.
+    pub fn normalize(&self, raw: &[f32], normalized: &mut [f32]) {
+        let size = self.mean.len();
+        assert_eq!((raw.len(), normalized.len()), (size, size), "a row of another size");
+        for (out, ((raw, mean), std)) in
+            normalized.iter_mut().zip(raw.iter().zip(&self.mean).zip(&self.std))
+        {
+            *out = ((raw - mean) / std).clamp(-CLIP, CLIP);
+        }
+    }
+}
+
+/// What a [`Normalizer`] has seen, for checkpoints.
+#[derive(Debug, Clone, PartialEq)]
+pub struct NormalizerParts {
+    /// Rows seen.
+    pub count: u64,
+    /// Sum of each column, shape `[size]`.
+    pub sum: Vec<f64>,
+    /// Sum of each column's squares, shape `[size]`.
+    pub sum_of_squares: Vec<f64>,
+}
+
+/// Mean and standard deviation of every row seen so far.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Normalizer {
+    parts: NormalizerParts,
+    snapshot: NormalizerSnapshot,
+}
+
+impl Normalizer {
+    /// A normaliser for rows of `size` numbers; until it has seen one it only clips.
+    #[must_use]
+    pub fn new(size: usize) -> Self {
+        let parts =
+            NormalizerParts { count: 0, sum: vec![0.0; size], sum_of_squares: vec![0.0; size] };
+        Self { parts, snapshot: NormalizerSnapshot::identity(size) }
+    }
+
+    /// Goes on from stored parts.
+    ///
+    /// # Panics
+    /// When the two sums differ in length.
+    #[must_use]
+    pub fn from_parts(parts: NormalizerParts) -> Self {
+        assert_eq!(parts.sum.len(), parts.sum_of_squares.len(), "sums of different sizes");
+        let snapshot = NormalizerSnapshot::identity(parts.sum.len());
+        let mut normalizer = Self { parts, snapshot };
+        normalizer.refresh();
+        normalizer
+    }
+
+    /// What was seen.
+    #[must_use]
+    pub const fn parts(&self) -> &NormalizerParts {
+        &self.parts
+    }
+
+    /// Takes in rows, shape `[n, size]`.
+    ///
+    /// # Panics
+    /// When the last row is cut short.
+    pub fn update(&mut self, rows: &[f32]) {
+        let size = self.parts.sum.len();
+        assert_eq!(rows.len() % size, 0, "a row of another size");
+        for row in rows.chunks_exact(size) {
+            let sums = self.parts.sum.iter_mut().zip(&mut self.parts.sum_of_squares);
+            for ((sum, sum_of_squares), x) in sums.zip(row) {
+                *sum += f64::from(*x);
+                *sum_of_squares += f64::from(*x) * f64::from(*x);
+            }
+            self.parts.count += 1;
+        }
+        self.refresh();
+    }
+
+    /// Mean and standard deviation now.
+    #[must_use]
+    pub const fn snapshot(&self) -> &NormalizerSnapshot {
+        &self.snapshot
+    }
+
+    /// Normalises one row, shape `[size]`, as [`NormalizerSnapshot::normalize`] does.
+    ///
+    /// # Panics
+    /// When a length differs.
+    pub fn normalize(&self, raw: &[f32], normalized: &mut [f32]) {
+        self.snapshot.normalize(raw, normalized);
+    }
+
+    #[expect(clippy::cast_possible_truncation, reason = "means of f32 numbers are within f32")]
+    fn refresh(&mut self) {
+        if self.parts.count == 0 {
+            return;
+        }
+        let count = self.parts.count as f64;
+        let sums = self.parts.sum.iter().zip(&self.parts.sum_of_squares);
+        for ((mean, std), (sum, sum_of_squares)) in
+            self.snapshot.mean.iter_mut().zip(&mut self.snapshot.std).zip(sums)
+        {
+            let exact_mean = sum / count;
+            let variance = (sum_of_squares / count - exact_mean * exact_mean).max(0.0);
+            *mean = exact_mean as f32;
+            *std = (variance.sqrt() as f32).max(STD_FLOOR);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// 3 columns: spread out, far from zero, constant.
+    fn rows() -> Vec<f32> {
+        (0..500_u16)
+            .flat_map(|i| [f32::from(i % 37) - 11.0, 40.0 + f32::from(i % 5) * 0.25, 0.125])
+            .collect()
+    }
+
+    #[test]
+    fn it_agrees_with_a_two_pass_computation() {
+        let rows = rows();
+        let mut normalizer = Normalizer::new(3);
+        normalizer.update(&rows[..300]);
+        normalizer.update(&rows[300..]);
+        for column in 0..3 {
+            let values: Vec<f64> = rows.chunks(3).map(|row| f64::from(row[column])).collect();
+            let mean = values.iter().sum::<f64>() / 500.0;
+            let std =
+                (values.iter().map(|x| (x - mean).powi(2)).sum::<f64>() / 500.0).sqrt().max(0.01);
+            assert!(
+                (f64::from(normalizer.snapshot().mean[column]) - mean).abs() < 1e-5,
+                "mean of column {column}"
+            );
+            assert!(
+                (f64::from(normalizer.snapshot().std[column]) - std).abs() < 1e-6,
+                "std of column {column}"
+            );
+        }
+    }
+
+    #[test]
+    fn a_constant_column_hits_the_floor_and_outliers_the_clip() {
+        let mut normalizer = Normalizer::new(3);
+        normalizer.update(&rows());
+        let mut normalized = [0.0; 3];
+        normalizer.normalize(&[1e6, -1e6, 0.135], &mut normalized);
+        assert_eq!(normalized[..2], [5.0, -5.0]);
+        assert!((normalized[2] - 1.0).abs() < 1e-5, "one floor away from the mean");
+    }
+
+    #[test]
+    fn a_normalizer_without_data_only_clips() {
+        let mut normalized = [0.0; 2];
+        Normalizer::new(2).normalize(&[0.75, -9.0], &mut normalized);
+        assert_eq!(normalized, [0.75, -5.0]);
+    }
+
+    #[test]
+    fn a_normalizer_survives_being_taken_apart() {
+        let mut normalizer = Normalizer::new(3);
+        normalizer.update(&rows());
+        assert_eq!(Normalizer::from_parts(normalizer.parts().clone()), normalizer);
+    }
+}

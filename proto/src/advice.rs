@@ -1,0 +1,278 @@
+//! `teacher.proto`: what is asked of a teacher and what it answers.
+
+use tandem_core::layout::OBSERVATION_PER_ARM;
+use tandem_core::{ArmAdvice, Layout, StepAdvice, StepQuery, Task};
+
+use crate::error::DecodeError;
+use crate::numbers::{actions, finite, one_finite, one_within};
+use crate::pb;
+
+/// Arms that a layout on the wire may have: an episode keeps one bit an arm.
+pub const MAX_ARMS: usize = 8;
+
+/// Bytes that an account's name may have.
+const MAX_NAME_BYTES: usize = 256;
+
+/// The name of an account, in field `field`, when it is one.
+///
+/// # Errors
+/// When the name is empty or longer than 256 bytes.
+pub fn decode_account_name(field: &str, name: String) -> Result<String, DecodeError> {
+    match name.len() {
+        1..=MAX_NAME_BYTES => Ok(name),
+        n_bytes => {
+            Err(DecodeError::new(field, format_args!("1 to {MAX_NAME_BYTES} bytes"), n_bytes))
+        }
+    }
+}
+
+/// The layout of the student that asks, as far as the length of its observation tells.
+///
+/// # Errors
+/// When no layout of 1 to [`MAX_ARMS`] arms has observations of that length.
+pub fn layout_of_query(query: &pb::StepQuery, task: Task) -> Result<Layout, DecodeError> {
+    let n_numbers = query.observation.len();
+    let n_arms = n_numbers / OBSERVATION_PER_ARM;
+    if n_numbers.is_multiple_of(OBSERVATION_PER_ARM) && (1..=MAX_ARMS).contains(&n_arms) {
+        return Ok(Layout::new(task, n_arms));
+    }
+    let expected =
+        format_args!("{OBSERVATION_PER_ARM} numbers for each of 1 to {MAX_ARMS} arms").to_string();
+    Err(DecodeError::new("observation", expected, format_args!("{n_numbers} numbers")))
+}
+
+/// A query as a message.
+#[must_use]
+pub fn encode_query(query: &StepQuery) -> pb::StepQuery {
+    pb::StepQuery {
+        episode: query.episode,
+        step: query.step,
+        observation: query.observation.clone(),
+        goal: query.goal.clone(),
+        proposed_action: query.proposed_action.clone(),
+    }
+}
+
+/// The query of a student with `layout`.
+///
+/// Any step is taken: how long an episode may be is the matter of whoever keeps its account.
+///
+/// # Errors
+/// When a vector has the wrong length, a number is not finite, or the proposed action leaves [−1, 1].
+pub fn decode_query(query: pb::StepQuery, layout: Layout) -> Result<StepQuery, DecodeError> {
+    Ok(StepQuery {
+        episode: query.episode,
+        step: query.step,
+        observation: finite("observation", query.observation, layout.n_observation())?,
+        goal: finite("goal", query.goal, layout.n_goal())?,
+        proposed_action: actions("proposed_action", query.proposed_action, layout.n_action())?,
+    })
+}
+
+/// Advice as a message.
+#[must_use]
+pub fn encode_advice(advice: &StepAdvice) -> pb::StepAdvice {
+    pb::StepAdvice {
+        action: advice.action.clone(),
+        charged: advice.charged,
+        arms: advice.arms.iter().map(encode_arm).collect(),
+    }
+}
+
+fn encode_arm(arm: &ArmAdvice) -> pb::ArmAdvice {
+    pb::ArmAdvice {
+        teacher_action: arm.teacher_action.clone(),
+        q_teacher: arm.q_teacher,
+        q_student: arm.q_student,
+        importance: arm.importance,
+        distance: arm.distance,
+        overridden: arm.overridden,
+    }
+}
+
+/// The advice to a student with `layout`.
+///
+/// # Errors
+/// When a length is not the layout's, a number is not finite, an action leaves [−1, 1] or a distance is negative.
+pub fn decode_advice(advice: pb::StepAdvice, layout: Layout) -> Result<StepAdvice, DecodeError> {
+    if advice.arms.len() != layout.n_arms {
+        let expected = format_args!("{} arms", layout.n_arms).to_string();
+        return Err(DecodeError::new("arms", expected, format_args!("{} arms", advice.arms.len())));
+    }
+    let decode_indexed = |(arm_idx, arm)| {
+        decode_arm(arm, layout)
+            .map_err(|error: DecodeError| error.within(format_args!("arms[{arm_idx}]")))
+    };
+    Ok(StepAdvice {
+        action: actions("action", advice.action, layout.n_action())?,
+        charged: advice.charged,
+        arms: advice.arms.into_iter().enumerate().map(decode_indexed).collect::<Result<_, _>>()?,
+    })
+}
+
+fn decode_arm(arm: pb::ArmAdvice, layout: Layout) -> Result<ArmAdvice, DecodeError> {
+    Ok(ArmAdvice {
+        teacher_action: actions(
+            "teacher_action",
+            arm.teacher_action,
+            layout.single_arm().n_action(),
+        )?,
+        q_teacher: one_finite("q_teacher", arm.q_teacher)?,
+        q_student: one_finite("q_student", arm.q_student)?,
+        importance: one_finite("importance", arm.importance)?,
+        distance: one_within("distance", arm.distance, &(0.0..=f32::INFINITY))?,
+        overridden: arm.overridden,
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use prost::Message as _;
+
+    use super::*;
+
+    const LAYOUT: Layout = Layout::new(Task::PickAndPlace, 2);
+
+    fn query() -> StepQuery {
+        StepQuery {
+            episode: u64::MAX,
+            step: 49,
+            observation: (0_u8..56).map(|i| f32::from(i) / 7.0).collect(),
+            goal: vec![0.1, -0.2, 0.3, 0.4, 0.5, -0.6],
+            proposed_action: vec![-1.0, 1.0, 0.0, 0.25, 0.5, -0.5, 0.75, -0.75],
+        }
+    }
+
+    fn advice() -> StepAdvice {
+        let arm = |teacher_action: [f32; 4], overridden| ArmAdvice {
+            teacher_action: teacher_action.to_vec(),
+            q_teacher: -1.5,
+            q_student: -2.0,
+            importance: 0.5,
+            distance: 0.75,
+            overridden,
+        };
+        StepAdvice {
+            action: vec![0.1, 0.2, 0.3, 0.4, -0.5, -0.6, -0.7, -0.8],
+            charged: true,
+            arms: vec![arm([0.0, 0.1, 0.2, 0.3], false), arm([-0.5, -0.6, -0.7, -0.8], true)],
+        }
+    }
+
+    /// The message as it is after crossing a wire.
+    fn sent<M: prost::Message + Default>(message: &M) -> M {
+        M::decode(message.encode_to_vec().as_slice()).unwrap()
+    }
+
+    #[test]
+    fn a_query_round_trips() {
+        assert_eq!(decode_query(sent(&encode_query(&query())), LAYOUT), Ok(query()));
+    }
+
+    #[test]
+    fn advice_round_trips() {
+        assert_eq!(decode_advice(sent(&encode_advice(&advice())), LAYOUT), Ok(advice()));
+    }
+
+    #[test]
+    fn a_malformed_query_is_refused_by_name() {
+        let check = |spoil: fn(&mut pb::StepQuery), message: &str| {
+            let mut spoilt = encode_query(&query());
+            spoil(&mut spoilt);
+            assert_eq!(decode_query(spoilt, LAYOUT).unwrap_err().to_string(), message);
+        };
+        check(|q| q.observation.truncate(55), "observation: expected 56 numbers, got 55 numbers");
+        check(|q| q.goal.push(0.0), "goal: expected 6 numbers, got 7 numbers");
+        check(|q| q.proposed_action.clear(), "proposed_action: expected 8 numbers, got 0 numbers");
+        check(
+            |q| q.observation[17] = f32::NAN,
+            "observation[17]: expected a finite number, got NaN",
+        );
+        check(|q| q.goal[0] = f32::INFINITY, "goal[0]: expected a finite number, got inf");
+        check(
+            |q| q.proposed_action[7] = -1.25,
+            "proposed_action[7]: expected a number in [-1, 1], got -1.25",
+        );
+    }
+
+    #[test]
+    fn malformed_advice_is_refused_by_name() {
+        let check = |spoil: fn(&mut pb::StepAdvice), message: &str| {
+            let mut spoilt = encode_advice(&advice());
+            spoil(&mut spoilt);
+            assert_eq!(decode_advice(spoilt, LAYOUT).unwrap_err().to_string(), message);
+        };
+        check(|a| a.arms.truncate(1), "arms: expected 2 arms, got 1 arms");
+        check(|a| a.action[3] = 1.5, "action[3]: expected a number in [-1, 1], got 1.5");
+        check(
+            |a| a.arms[1].teacher_action.truncate(3),
+            "arms[1].teacher_action: expected 4 numbers, got 3 numbers",
+        );
+        check(
+            |a| a.arms[0].q_teacher = f32::NAN,
+            "arms[0].q_teacher: expected a finite number, got NaN",
+        );
+        check(
+            |a| a.arms[0].importance = f32::INFINITY,
+            "arms[0].importance: expected a finite number, got inf",
+        );
+        check(
+            |a| a.arms[1].distance = -0.5,
+            "arms[1].distance: expected a finite number, 0 or more, got -0.5",
+        );
+    }
+
+    #[test]
+    fn the_length_of_an_observation_tells_the_number_of_arms() {
+        let layout_of = |n_numbers| {
+            layout_of_query(
+                &pb::StepQuery { observation: vec![0.0; n_numbers], ..Default::default() },
+                Task::Push,
+            )
+        };
+        for n_arms in 1..=MAX_ARMS {
+            assert_eq!(layout_of(28 * n_arms), Ok(Layout::new(Task::Push, n_arms)));
+        }
+        for n_numbers in [0, 27, 29, 57, 28 * 9] {
+            let message = layout_of(n_numbers).unwrap_err().to_string();
+            let expected = "observation: expected 28 numbers for each of 1 to 8 arms";
+            assert_eq!(message, format!("{expected}, got {n_numbers} numbers"));
+        }
+    }
+
+    #[test]
+    fn an_account_has_a_name() {
+        assert_eq!(decode_account_name("name", "run-7".to_owned()), Ok("run-7".to_owned()));
+        assert!(decode_account_name("name", String::new()).is_err());
+        assert!(decode_account_name("name", "x".repeat(257)).is_err());
+    }
+
+    /// One `AdviseRequest` as the first version of the protocol wrote it.
+    const STORED_REQUEST: &str = "\
+        0a0572756e2d3712930108ac0210071a70000000000000803e0000003f0000403f0000803f0000a03f0000c03f0000e03f00\
+        00004000001040000020400000304000004040000050400000604000007040000080400000884000009040000098400000a0\
+        400000a8400000b0400000b8400000c0400000c8400000d0400000d840220c0000003f000080be000000002a0c0000803f00\
+        0080bf0000003e";
+
+    #[test]
+    fn old_bytes_still_decode() {
+        let bytes: Vec<u8> = (0..STORED_REQUEST.len())
+            .step_by(2)
+            .map(|at| u8::from_str_radix(&STORED_REQUEST[at..at + 2], 16).unwrap())
+            .collect();
+        let request = pb::AdviseRequest::decode(bytes.as_slice()).unwrap();
+        assert_eq!(request.account, "run-7");
+        let expected = StepQuery {
+            episode: 300,
+            step: 7,
+            observation: (0_u8..28).map(|i| f32::from(i) / 4.0).collect(),
+            goal: vec![0.5, -0.25, 0.0],
+            proposed_action: vec![1.0, -1.0, 0.125],
+        };
+        assert_eq!(
+            decode_query(request.steps[0].clone(), Layout::new(Task::Push, 1)),
+            Ok(expected)
+        );
+        assert_eq!(request.encode_to_vec(), bytes);
+    }
+}

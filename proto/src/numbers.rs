@@ -1,0 +1,167 @@
+//! Checked numbers, and float vectors as bytes (little-endian float32).
+
+use std::ops::RangeInclusive;
+
+use crate::error::DecodeError;
+
+/// How far an action may leave [−1, 1]: rounding on the sender's side.
+const ACTION_SLACK: f32 = 1e-6;
+
+/// The bytes of `values`, little-endian.
+pub(crate) fn to_bytes(values: &[f32]) -> Vec<u8> {
+    if cfg!(target_endian = "little") {
+        bytemuck::cast_slice(values).to_vec()
+    } else {
+        values.iter().flat_map(|value| value.to_le_bytes()).collect()
+    }
+}
+
+/// The `n` finite numbers that `bytes` hold.
+pub(crate) fn finite_from_bytes(
+    field: &str,
+    bytes: &[u8],
+    n: usize,
+) -> Result<Vec<f32>, DecodeError> {
+    finite(field, from_bytes(field, bytes, n)?, n)
+}
+
+/// The `n` action components that `bytes` hold.
+pub(crate) fn actions_from_bytes(
+    field: &str,
+    bytes: &[u8],
+    n: usize,
+) -> Result<Vec<f32>, DecodeError> {
+    actions(field, from_bytes(field, bytes, n)?, n)
+}
+
+fn from_bytes(field: &str, bytes: &[u8], n: usize) -> Result<Vec<f32>, DecodeError> {
+    let (words, rest) = bytes.as_chunks::<4>();
+    if !rest.is_empty() {
+        let expected = format_args!("{} bytes, 4 a number", 4 * n).to_string();
+        return Err(DecodeError::new(field, expected, format_args!("{} bytes", bytes.len())));
+    }
+    if words.len() != n {
+        return Err(wrong_length(field, n, words.len()));
+    }
+    Ok(words.iter().map(|word| f32::from_le_bytes(*word)).collect())
+}
+
+/// `values` when they are `n` finite numbers.
+pub(crate) fn finite(field: &str, values: Vec<f32>, n: usize) -> Result<Vec<f32>, DecodeError> {
+    checked(field, values, n, "a finite number", f32::is_finite)
+}
+
+/// `values` when they are `n` finite numbers above 0.
+pub(crate) fn positive(field: &str, values: Vec<f32>, n: usize) -> Result<Vec<f32>, DecodeError> {
+    checked(field, values, n, "a finite number above 0", |value| value.is_finite() && value > 0.0)
+}
+
+/// `values` when they are `n` numbers in [−1, 1].
+pub(crate) fn actions(field: &str, values: Vec<f32>, n: usize) -> Result<Vec<f32>, DecodeError> {
+    checked(field, values, n, "a number in [-1, 1]", |value| value.abs() <= 1.0 + ACTION_SLACK)
+}
+
+fn checked(
+    field: &str,
+    values: Vec<f32>,
+    n: usize,
+    expected: &str,
+    holds: impl Fn(f32) -> bool,
+) -> Result<Vec<f32>, DecodeError> {
+    if values.len() != n {
+        return Err(wrong_length(field, n, values.len()));
+    }
+    match values.iter().position(|value| !holds(*value)) {
+        None => Ok(values),
+        Some(bad) => Err(DecodeError::new(format!("{field}[{bad}]"), expected, values[bad])),
+    }
+}
+
+fn wrong_length(field: &str, expected: usize, got: usize) -> DecodeError {
+    DecodeError::new(field, format_args!("{expected} numbers"), format_args!("{got} numbers"))
+}
+
+/// `value` when it is finite.
+pub(crate) fn one_finite(field: &str, value: f32) -> Result<f32, DecodeError> {
+    if value.is_finite() {
+        Ok(value)
+    } else {
+        Err(DecodeError::new(field, "a finite number", value))
+    }
+}
+
+/// `value` when it is a finite number of `range`.
+pub(crate) fn one_within(
+    field: &str,
+    value: f32,
+    range: &RangeInclusive<f32>,
+) -> Result<f32, DecodeError> {
+    if value.is_finite() && range.contains(&value) {
+        return Ok(value);
+    }
+    let expected = match (range.start(), range.end()) {
+        (low, high) if high.is_infinite() => format!("a finite number, {low} or more"),
+        (low, high) => format!("a number in [{low}, {high}]"),
+    };
+    Err(DecodeError::new(field, expected, value))
+}
+
+/// `value` when it is an integer of `range`.
+pub(crate) fn count_within(
+    field: &str,
+    value: u32,
+    range: &RangeInclusive<u32>,
+) -> Result<u32, DecodeError> {
+    if range.contains(&value) {
+        return Ok(value);
+    }
+    Err(DecodeError::new(field, format_args!("{} to {}", range.start(), range.end()), value))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn floats_travel_as_little_endian_bytes() {
+        assert_eq!(to_bytes(&[1.0, -2.5]), [0, 0, 0x80, 0x3f, 0, 0, 0x20, 0xc0]);
+        assert_eq!(finite_from_bytes("x", &to_bytes(&[1.0, -2.5]), 2), Ok(vec![1.0, -2.5]));
+    }
+
+    #[test]
+    fn what_is_wrong_with_a_vector_is_named() {
+        let check = |outcome: Result<Vec<f32>, DecodeError>, message: &str| {
+            assert_eq!(outcome.unwrap_err().to_string(), message);
+        };
+        check(finite_from_bytes("x", &[0; 9], 2), "x: expected 8 bytes, 4 a number, got 9 bytes");
+        check(finite_from_bytes("x", &[0; 12], 2), "x: expected 2 numbers, got 3 numbers");
+        check(finite("x", vec![0.0, f32::NAN], 2), "x[1]: expected a finite number, got NaN");
+        check(finite("x", vec![f32::NEG_INFINITY], 1), "x[0]: expected a finite number, got -inf");
+        check(positive("x", vec![1.0, 0.0], 2), "x[1]: expected a finite number above 0, got 0");
+        check(actions("x", vec![1.00001], 1), "x[0]: expected a number in [-1, 1], got 1.00001");
+        check(actions("x", vec![f32::NAN], 1), "x[0]: expected a number in [-1, 1], got NaN");
+    }
+
+    #[test]
+    fn an_action_may_leave_its_range_by_rounding_only() {
+        assert!(actions("x", vec![1.0 + 5e-7, -1.0 - 5e-7], 2).is_ok());
+    }
+
+    #[test]
+    fn a_single_number_is_checked_against_its_range() {
+        let check = |outcome: Result<f32, DecodeError>, message: &str| {
+            assert_eq!(outcome.unwrap_err().to_string(), message);
+        };
+        assert_eq!(one_within("x", 1.0, &(0.0..=1.0)), Ok(1.0));
+        check(one_within("x", 1.5, &(0.0..=1.0)), "x: expected a number in [0, 1], got 1.5");
+        check(
+            one_within("x", f32::INFINITY, &(1.0..=f32::INFINITY)),
+            "x: expected a finite number, 1 or more, got inf",
+        );
+        check(one_finite("x", f32::NAN), "x: expected a finite number, got NaN");
+        assert_eq!(
+            count_within("n", 0, &(1..=8)).unwrap_err().to_string(),
+            "n: expected 1 to 8, got 0"
+        );
+    }
+}

@@ -1,0 +1,363 @@
+//! `learner.proto`: what a learner asks of its workers and what they bring back.
+
+mod episode;
+
+use tandem_core::work::{
+    EpisodeOrder, Exploration, PublishedActor, RunTerms, SlotOrder, WorldTerms,
+};
+use tandem_core::{EpisodeKind, Layout, Task};
+
+use crate::advice::{MAX_ARMS, decode_account_name};
+use crate::error::DecodeError;
+use crate::numbers::{count_within, finite_from_bytes, one_within, positive, to_bytes};
+use crate::pb;
+
+pub use episode::{decode_episode, encode_episode};
+
+/// Episodes that one slot may step together.
+const MAX_SLOT_EPISODES: usize = 1024;
+/// Units that a hidden layer may have.
+const MAX_HIDDEN: u32 = 16_384;
+/// Hidden layers that a network may have.
+const MAX_HIDDEN_LAYERS: u32 = 64;
+/// Physics steps that a control step may have.
+const MAX_SUBSTEPS: u32 = 10_000;
+
+/// The kind of an episode as a message's number.
+#[must_use]
+pub const fn encode_kind(kind: EpisodeKind) -> pb::EpisodeKind {
+    match kind {
+        EpisodeKind::Training => pb::EpisodeKind::Training,
+        EpisodeKind::Evaluation => pb::EpisodeKind::Evaluation,
+    }
+}
+
+/// The kind of an episode that a field `kind` holds.
+///
+/// # Errors
+/// When the number stands for no kind.
+pub fn decode_kind(kind: i32) -> Result<EpisodeKind, DecodeError> {
+    match pb::EpisodeKind::try_from(kind) {
+        Ok(pb::EpisodeKind::Training) => Ok(EpisodeKind::Training),
+        Ok(pb::EpisodeKind::Evaluation) => Ok(EpisodeKind::Evaluation),
+        Ok(pb::EpisodeKind::Unspecified) | Err(_) => {
+            Err(DecodeError::new("kind", "1 (training) or 2 (evaluation)", kind))
+        }
+    }
+}
+
+/// A run's terms as a message.
+///
+/// # Panics
+/// When the layout has more than [`MAX_ARMS`] arms.
+#[must_use]
+pub fn encode_terms(terms: &RunTerms) -> pb::RunTerms {
+    pb::RunTerms {
+        task: terms.layout.task.name().to_owned(),
+        n_arms: u32::try_from(terms.layout.n_arms).expect("a layout has few arms"),
+        account: terms.account.clone().unwrap_or_default(),
+        exploration: Some(pb::Exploration {
+            noise_std: terms.exploration.noise_std,
+            random_share: terms.exploration.random_share,
+            random_hold_mean_steps: terms.exploration.random_hold_mean_steps,
+        }),
+        world: Some(pb::WorldTerms {
+            gripped_start_share: terms.world.gripped_start_share,
+            wide_start_share: terms.world.wide_start_share,
+            substeps: terms.world.substeps,
+        }),
+    }
+}
+
+/// The terms of a run.
+///
+/// # Errors
+/// When the task is unknown, a part is missing or a number is out of its range.
+pub fn decode_terms(terms: pb::RunTerms) -> Result<RunTerms, DecodeError> {
+    let exploration = terms.exploration.ok_or_else(|| DecodeError::missing("exploration"))?;
+    let world = terms.world.ok_or_else(|| DecodeError::missing("world"))?;
+    let account = (!terms.account.is_empty()).then_some(terms.account);
+    Ok(RunTerms {
+        layout: decode_layout(&terms.task, terms.n_arms)?,
+        account: account.map(|name| decode_account_name("account", name)).transpose()?,
+        exploration: decode_exploration(exploration)
+            .map_err(|error| error.within("exploration"))?,
+        world: decode_world(world).map_err(|error| error.within("world"))?,
+    })
+}
+
+fn decode_layout(task: &str, n_arms: u32) -> Result<Layout, DecodeError> {
+    let Ok(known_task) = task.parse::<Task>() else {
+        return Err(DecodeError::new("task", "push or pick-and-place", format_args!("{task:?}")));
+    };
+    let n_known_arms =
+        usize::try_from(n_arms).ok().filter(|n_arms| (1..=MAX_ARMS).contains(n_arms));
+    let too_many = || DecodeError::new("n_arms", format_args!("1 to {MAX_ARMS}"), n_arms);
+    Ok(Layout::new(known_task, n_known_arms.ok_or_else(too_many)?))
+}
+
+fn decode_exploration(exploration: pb::Exploration) -> Result<Exploration, DecodeError> {
+    let hold = exploration.random_hold_mean_steps;
+    Ok(Exploration {
+        noise_std: one_within("noise_std", exploration.noise_std, &(0.0..=f32::INFINITY))?,
+        random_share: one_within("random_share", exploration.random_share, &(0.0..=1.0))?,
+        random_hold_mean_steps: one_within("random_hold_mean_steps", hold, &(1.0..=f32::INFINITY))?,
+    })
+}
+
+fn decode_world(world: pb::WorldTerms) -> Result<WorldTerms, DecodeError> {
+    Ok(WorldTerms {
+        gripped_start_share: one_within(
+            "gripped_start_share",
+            world.gripped_start_share,
+            &(0.0..=1.0),
+        )?,
+        wide_start_share: one_within("wide_start_share", world.wide_start_share, &(0.0..=1.0))?,
+        substeps: count_within("substeps", world.substeps, &(1..=MAX_SUBSTEPS))?,
+    })
+}
+
+/// An order for one episode as a message.
+#[must_use]
+pub const fn encode_order(order: &EpisodeOrder) -> pb::EpisodeOrder {
+    pb::EpisodeOrder {
+        number: order.number,
+        seed: order.seed,
+        advised: order.advised,
+        uniform: order.uniform,
+        record: order.record,
+    }
+}
+
+/// An order for one episode; every value of its fields is one.
+#[must_use]
+pub const fn decode_order(order: pb::EpisodeOrder) -> EpisodeOrder {
+    EpisodeOrder {
+        number: order.number,
+        seed: order.seed,
+        advised: order.advised,
+        uniform: order.uniform,
+        record: order.record,
+    }
+}
+
+/// A slot's order as a message.
+#[must_use]
+pub fn encode_slot(slot: &SlotOrder) -> pb::Slot {
+    pb::Slot {
+        slot: slot.slot,
+        parameter_version: slot.parameter_version,
+        kind: encode_kind(slot.kind).into(),
+        episodes: slot.episodes.iter().map(encode_order).collect(),
+    }
+}
+
+/// A slot's order.
+///
+/// # Errors
+/// When the kind is unknown or the slot has no episode or more than 1024.
+pub fn decode_slot(slot: pb::Slot) -> Result<SlotOrder, DecodeError> {
+    if !(1..=MAX_SLOT_EPISODES).contains(&slot.episodes.len()) {
+        let expected = format_args!("1 to {MAX_SLOT_EPISODES} episodes").to_string();
+        return Err(DecodeError::new("episodes", expected, slot.episodes.len()));
+    }
+    Ok(SlotOrder {
+        slot: slot.slot,
+        parameter_version: slot.parameter_version,
+        kind: decode_kind(slot.kind)?,
+        episodes: slot.episodes.into_iter().map(decode_order).collect(),
+    })
+}
+
+/// An actor's parameters as a message.
+///
+/// # Panics
+/// When a size exceeds `u32`.
+#[must_use]
+pub fn encode_actor(actor: &PublishedActor) -> pb::Parameters {
+    pb::Parameters {
+        version: actor.version,
+        n_hidden: u32::try_from(actor.n_hidden).expect("a layer has fewer than 2^32 units"),
+        n_layers: u32::try_from(actor.n_hidden_layers)
+            .expect("a network has fewer than 2^32 layers"),
+        actor: to_bytes(&actor.actor),
+        observation_mean: to_bytes(&actor.observation_mean),
+        observation_std: to_bytes(&actor.observation_std),
+        goal_mean: to_bytes(&actor.goal_mean),
+        goal_std: to_bytes(&actor.goal_std),
+    }
+}
+
+/// The parameters of an actor for `layout`.
+///
+/// # Errors
+/// When a length does not follow from the layout and the network's size, a number is not finite or a standard
+/// deviation is not above 0.
+pub fn decode_actor(
+    parameters: &pb::Parameters,
+    layout: Layout,
+) -> Result<PublishedActor, DecodeError> {
+    let n_hidden = count_within("n_hidden", parameters.n_hidden, &(1..=MAX_HIDDEN))?;
+    let n_layers = count_within("n_layers", parameters.n_layers, &(1..=MAX_HIDDEN_LAYERS))?;
+    let (n_hidden, n_hidden_layers) = (to_usize(n_hidden), to_usize(n_layers));
+    let (n_observation, n_goal) = (layout.n_observation(), layout.n_goal());
+    let std = |field, bytes, n| positive(field, finite_from_bytes(field, bytes, n)?, n);
+    Ok(PublishedActor {
+        version: parameters.version,
+        n_hidden,
+        n_hidden_layers,
+        actor: finite_from_bytes(
+            "actor",
+            &parameters.actor,
+            n_parameters(layout, n_hidden, n_hidden_layers),
+        )?,
+        observation_mean: finite_from_bytes(
+            "observation_mean",
+            &parameters.observation_mean,
+            n_observation,
+        )?,
+        observation_std: std("observation_std", &parameters.observation_std, n_observation)?,
+        goal_mean: finite_from_bytes("goal_mean", &parameters.goal_mean, n_goal)?,
+        goal_std: std("goal_std", &parameters.goal_std, n_goal)?,
+    })
+}
+
+/// Weights and biases of an actor for `layout` with `n_hidden_layers` of `n_hidden` units, 1 or more layers.
+const fn n_parameters(layout: Layout, n_hidden: usize, n_hidden_layers: usize) -> usize {
+    let first = (layout.n_observation() + layout.n_goal() + 1) * n_hidden;
+    let inner = (n_hidden + 1) * n_hidden * (n_hidden_layers - 1);
+    first + inner + (n_hidden + 1) * layout.n_action()
+}
+
+/// A checked small count as an index.
+fn to_usize(count: u32) -> usize {
+    usize::try_from(count).expect("indices have 32 bits or more")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const LAYOUT: Layout = Layout::new(Task::Push, 2);
+
+    fn terms() -> RunTerms {
+        RunTerms {
+            layout: LAYOUT,
+            account: Some("run-7".to_owned()),
+            exploration: Exploration {
+                noise_std: 0.2,
+                random_share: 0.3,
+                random_hold_mean_steps: 4.0,
+            },
+            world: WorldTerms { gripped_start_share: 0.0, wide_start_share: 1.0, substeps: 20 },
+        }
+    }
+
+    fn slot() -> SlotOrder {
+        let order = |number, advised| EpisodeOrder {
+            number,
+            seed: 42,
+            advised,
+            uniform: !advised,
+            record: advised,
+        };
+        SlotOrder {
+            slot: 3,
+            parameter_version: 9,
+            kind: EpisodeKind::Evaluation,
+            episodes: vec![order(64, true), order(65, false)],
+        }
+    }
+
+    fn actor() -> PublishedActor {
+        let ramp = |n: u16| (0..n).map(|i| f32::from(i) / 64.0 - 1.0).collect();
+        PublishedActor {
+            version: 12,
+            n_hidden: 5,
+            n_hidden_layers: 3,
+            actor: ramp(63 * 5 + 2 * 6 * 5 + 6 * 6),
+            observation_mean: ramp(56),
+            observation_std: vec![0.01; 56],
+            goal_mean: ramp(6),
+            goal_std: vec![2.0; 6],
+        }
+    }
+
+    /// The message as it is after crossing a wire.
+    fn sent<M: prost::Message + Default>(message: &M) -> M {
+        M::decode(message.encode_to_vec().as_slice()).unwrap()
+    }
+
+    #[test]
+    fn every_message_round_trips() {
+        assert_eq!(decode_terms(sent(&encode_terms(&terms()))), Ok(terms()));
+        let unadvised = RunTerms { account: None, ..terms() };
+        assert_eq!(decode_terms(sent(&encode_terms(&unadvised))), Ok(unadvised));
+        assert_eq!(decode_slot(sent(&encode_slot(&slot()))), Ok(slot()));
+        assert_eq!(decode_actor(&sent(&encode_actor(&actor())), LAYOUT), Ok(actor()));
+    }
+
+    #[test]
+    fn malformed_terms_are_refused_by_name() {
+        let check = |spoil: fn(&mut pb::RunTerms), message: &str| {
+            let mut spoilt = encode_terms(&terms());
+            spoil(&mut spoilt);
+            assert_eq!(decode_terms(spoilt).unwrap_err().to_string(), message);
+        };
+        check(
+            |t| t.task = "pick".to_owned(),
+            "task: expected push or pick-and-place, got \"pick\"",
+        );
+        check(|t| t.n_arms = 0, "n_arms: expected 1 to 8, got 0");
+        check(|t| t.n_arms = 9, "n_arms: expected 1 to 8, got 9");
+        check(|t| t.exploration = None, "exploration: expected a message, got none");
+        check(|t| t.world = None, "world: expected a message, got none");
+        check(
+            |t| t.world.as_mut().unwrap().substeps = 0,
+            "world.substeps: expected 1 to 10000, got 0",
+        );
+        check(
+            |t| t.world.as_mut().unwrap().wide_start_share = f32::NAN,
+            "world.wide_start_share: expected a number in [0, 1], got NaN",
+        );
+        let mut spoilt = encode_terms(&terms());
+        spoilt.exploration = Some(pb::Exploration {
+            random_hold_mean_steps: 0.5,
+            ..spoilt.exploration.take().unwrap()
+        });
+        let message =
+            "exploration.random_hold_mean_steps: expected a finite number, 1 or more, got 0.5";
+        assert_eq!(decode_terms(spoilt).unwrap_err().to_string(), message);
+    }
+
+    #[test]
+    fn a_malformed_slot_is_refused_by_name() {
+        let check = |spoil: fn(&mut pb::Slot), message: &str| {
+            let mut spoilt = encode_slot(&slot());
+            spoil(&mut spoilt);
+            assert_eq!(decode_slot(spoilt).unwrap_err().to_string(), message);
+        };
+        check(|s| s.kind = 0, "kind: expected 1 (training) or 2 (evaluation), got 0");
+        check(|s| s.kind = 3, "kind: expected 1 (training) or 2 (evaluation), got 3");
+        check(|s| s.episodes.clear(), "episodes: expected 1 to 1024 episodes, got 0");
+    }
+
+    #[test]
+    fn a_malformed_actor_is_refused_by_name() {
+        let check = |spoil: fn(&mut pb::Parameters), message: &str| {
+            let mut spoilt = encode_actor(&actor());
+            spoil(&mut spoilt);
+            assert_eq!(decode_actor(&spoilt, LAYOUT).unwrap_err().to_string(), message);
+        };
+        check(|p| p.n_hidden = 6, "actor: expected 504 numbers, got 411 numbers");
+        check(|p| p.n_hidden = u32::MAX, "n_hidden: expected 1 to 16384, got 4294967295");
+        check(|p| p.n_layers = 0, "n_layers: expected 1 to 64, got 0");
+        check(|p| p.actor.truncate(1643), "actor: expected 1644 bytes, 4 a number, got 1643 bytes");
+        check(|p| p.goal_std[4..8].fill(0), "goal_std[1]: expected a finite number above 0, got 0");
+        check(|p| p.goal_mean[8..12].fill(0xff), "goal_mean[2]: expected a finite number, got NaN");
+        check(
+            |p| p.observation_mean.clear(),
+            "observation_mean: expected 56 numbers, got 0 numbers",
+        );
+    }
+}

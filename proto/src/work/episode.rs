@@ -1,0 +1,163 @@
+//! Whole episodes.
+
+use tandem_core::layout::EPISODE_STEPS;
+use tandem_core::{Contacts, Episode, Layout};
+
+use super::{decode_kind, encode_kind};
+use crate::error::DecodeError;
+use crate::numbers::{actions_from_bytes, count_within, finite_from_bytes, to_bytes};
+use crate::pb;
+
+/// An episode as a message.
+#[must_use]
+pub fn encode_episode(episode: &Episode) -> pb::Episode {
+    pb::Episode {
+        number: episode.number,
+        kind: encode_kind(episode.kind).into(),
+        parameter_version: episode.parameter_version,
+        observations: to_bytes(&episode.observations),
+        goal: to_bytes(&episode.goal),
+        actions: to_bytes(&episode.actions),
+        advised_arms: episode.advised_arms.clone(),
+        contacts: episode.contacts.iter().map(|contacts| contacts.bits()).collect(),
+        advice_charged: episode.advice_charged,
+    }
+}
+
+/// An episode of a run with `layout`.
+///
+/// # Errors
+/// When the kind is unknown, a length is not the layout's, a number is not finite, an action leaves [−1, 1], a bit
+/// stands for no arm or no contact, or more units were charged than the episode has steps.
+pub fn decode_episode(episode: pb::Episode, layout: Layout) -> Result<Episode, DecodeError> {
+    let n_observations = (EPISODE_STEPS + 1) * layout.n_observation();
+    let max_charged = u32::try_from(EPISODE_STEPS).expect("an episode has few steps");
+    Ok(Episode {
+        number: episode.number,
+        kind: decode_kind(episode.kind)?,
+        parameter_version: episode.parameter_version,
+        layout,
+        observations: finite_from_bytes("observations", &episode.observations, n_observations)?,
+        goal: finite_from_bytes("goal", &episode.goal, layout.n_goal())?,
+        actions: actions_from_bytes(
+            "actions",
+            &episode.actions,
+            EPISODE_STEPS * layout.n_action(),
+        )?,
+        advised_arms: decode_advised_arms(episode.advised_arms, layout)?,
+        contacts: decode_contacts(&episode.contacts)?,
+        advice_charged: count_within("advice_charged", episode.advice_charged, &(0..=max_charged))?,
+    })
+}
+
+fn decode_advised_arms(advised_arms: Vec<u8>, layout: Layout) -> Result<Vec<u8>, DecodeError> {
+    check_one_a_step("advised_arms", &advised_arms)?;
+    let names_an_arm = |bits: u8| (u32::from(bits) >> layout.n_arms) == 0;
+    match advised_arms.iter().position(|bits| !names_an_arm(*bits)) {
+        None => Ok(advised_arms),
+        Some(step_idx) => {
+            let expected = format_args!("bits of {} arms", layout.n_arms).to_string();
+            let got = format_args!("{:#010b}", advised_arms[step_idx]).to_string();
+            Err(DecodeError::new(format!("advised_arms[{step_idx}]"), expected, got))
+        }
+    }
+}
+
+fn decode_contacts(contacts: &[u8]) -> Result<Vec<Contacts>, DecodeError> {
+    check_one_a_step("contacts", contacts)?;
+    let decode_step = |(step_idx, bits): (usize, &u8)| {
+        let unknown = || {
+            let got = format_args!("{bits:#010b}").to_string();
+            DecodeError::new(
+                format!("contacts[{step_idx}]"),
+                "bits 0 (arm and arm) and 1 (arm and table)",
+                got,
+            )
+        };
+        Contacts::from_bits(*bits).ok_or_else(unknown)
+    };
+    contacts.iter().enumerate().map(decode_step).collect()
+}
+
+fn check_one_a_step(field: &str, bytes: &[u8]) -> Result<(), DecodeError> {
+    if bytes.len() == EPISODE_STEPS {
+        return Ok(());
+    }
+    let expected = format_args!("{EPISODE_STEPS} bytes, one a step").to_string();
+    Err(DecodeError::new(field, expected, format_args!("{} bytes", bytes.len())))
+}
+
+#[cfg(test)]
+mod tests {
+    use prost::Message as _;
+    use tandem_core::{EpisodeKind, Task};
+
+    use super::*;
+
+    const LAYOUT: Layout = Layout::new(Task::Push, 2);
+
+    fn episode() -> Episode {
+        let ramp = |n: u16| (0..n).map(|i| f32::from(i) / 4096.0).collect();
+        let contact_of =
+            |step_idx: usize| if step_idx == 11 { Contacts::ARM_TABLE } else { Contacts::NONE };
+        Episode {
+            number: 7,
+            kind: EpisodeKind::Training,
+            parameter_version: 3,
+            layout: LAYOUT,
+            observations: ramp(51 * 56),
+            goal: ramp(6),
+            actions: ramp(50 * 6),
+            advised_arms: (0..50).map(|step_idx| step_idx % 4).collect(),
+            contacts: (0..EPISODE_STEPS).map(contact_of).collect(),
+            advice_charged: 38,
+        }
+    }
+
+    #[test]
+    fn an_episode_round_trips() {
+        let bytes = encode_episode(&episode()).encode_to_vec();
+        let message = pb::Episode::decode(bytes.as_slice()).unwrap();
+        assert_eq!(decode_episode(message, LAYOUT), Ok(episode()));
+    }
+
+    #[test]
+    fn a_malformed_episode_is_refused_by_name() {
+        let check = |spoil: fn(&mut pb::Episode), message: &str| {
+            let mut spoilt = encode_episode(&episode());
+            spoil(&mut spoilt);
+            assert_eq!(decode_episode(spoilt, LAYOUT).unwrap_err().to_string(), message);
+        };
+        check(|e| e.kind = -1, "kind: expected 1 (training) or 2 (evaluation), got -1");
+        check(
+            |e| e.observations.truncate(50 * 56 * 4),
+            "observations: expected 2856 numbers, got 2800 numbers",
+        );
+        check(|e| e.goal.push(0), "goal: expected 24 bytes, 4 a number, got 25 bytes");
+        check(
+            |e| e.actions[4..8].copy_from_slice(&2.0_f32.to_le_bytes()),
+            "actions[1]: expected a number in [-1, 1], got 2",
+        );
+        check(
+            |e| e.advised_arms.truncate(49),
+            "advised_arms: expected 50 bytes, one a step, got 49 bytes",
+        );
+        check(
+            |e| e.advised_arms[2] = 4,
+            "advised_arms[2]: expected bits of 2 arms, got 0b00000100",
+        );
+        check(
+            |e| e.contacts[49] = 4,
+            "contacts[49]: expected bits 0 (arm and arm) and 1 (arm and table), got 0b00000100",
+        );
+        check(|e| e.advice_charged = 51, "advice_charged: expected 0 to 50, got 51");
+    }
+
+    #[test]
+    fn an_episode_of_another_layout_is_refused() {
+        assert!(
+            decode_episode(encode_episode(&episode()), Layout::new(Task::PickAndPlace, 2)).is_err()
+        );
+        assert!(decode_episode(encode_episode(&episode()), Layout::new(Task::Push, 1)).is_err());
+    }
+}

@@ -1,0 +1,326 @@
+//! The command line.
+
+use std::net::SocketAddr;
+use std::path::PathBuf;
+
+use clap::{Args, Parser, Subcommand, ValueEnum};
+
+/// Teaches robots with two arms by letting a robot with one arm advise them.
+#[derive(Debug, Parser)]
+#[command(name = "tandem", version, propagate_version = true, after_help = "\
+Examples:
+  tandem train                                  the main job: two arms learn to push, advised
+  tandem train --arms 1 --task push             a one-arm teacher from scratch
+  tandem eval --policy runs/NAME/policy/best.safetensors
+  tandem COMMAND --help                         more examples
+
+Exit codes: 0 done, 64 bad usage or configuration, 65 bad input data, 70 a bug, 75 try again, 130 interrupted.")]
+pub(crate) struct Cli {
+    /// Log filter, such as info or tandem_learner=debug; overrides RUST_LOG.
+    #[arg(long, global = true, value_name = "FILTER")]
+    pub(crate) log: Option<String>,
+    #[command(subcommand)]
+    pub(crate) command: Command,
+}
+
+#[derive(Debug, Subcommand)]
+pub(crate) enum Command {
+    /// Trains a policy: starts learner, teacher and workers on this machine.
+    Train(Box<TrainArgs>),
+    /// Measures a policy on fixed goals: no noise, no advice.
+    Eval(EvalArgs),
+    /// Serves a one-arm policy as a teacher.
+    Teacher(TeacherArgs),
+    /// Serves a run's learner.
+    Learner(LearnerArgs),
+    /// Plays episodes for a learner.
+    Worker(WorkerArgs),
+    /// Measures simulation, networks, updates and the wire on this machine.
+    Bench(BenchArgs),
+    /// Shows what is in a policy file.
+    Policy(PolicyArgs),
+    /// Mends MCAP logs.
+    Mcap(McapArgs),
+    /// Plays a recorded episode again in the simulator.
+    Replay(ReplayArgs),
+    /// Draws the arms at work as an SVG picture.
+    Picture(PictureArgs),
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub(crate) enum TaskName {
+    Push,
+    PickAndPlace,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub(crate) enum RecipeName {
+    /// What learns fastest on two cores.
+    Tandem,
+    /// The paper's DDPG + HER with the reference implementation's values.
+    Paper,
+}
+
+#[derive(Debug, Args)]
+#[command(after_help = "\
+Examples:
+  tandem train                                        two arms, push, strategy mc-q:0.1, shipped teacher
+  tandem train --arms 1 --task push --until-success 0.97
+  tandem train --strategy ea --budget 50000 --seed 2 --max-minutes 20
+  tandem train --set ddpg.discount=0.98 --set rounds.slots=16
+  tandem train --run my-run.toml --out runs/mine
+  tandem train --resume --out runs/mine               goes on where it stopped")]
+pub(crate) struct TrainArgs {
+    /// What the arms do [default: push].
+    #[arg(long, value_enum)]
+    pub(crate) task: Option<TaskName>,
+    /// Arms of the learning policy, 1 or 2 [default: 2].
+    #[arg(long)]
+    pub(crate) arms: Option<usize>,
+    /// When the teacher takes over: none, ea, eamc:T, mc-q:T, mc-act:A or mc-act-abs:A
+    /// [default: mc-q:0.1 with two arms, none with one].
+    #[arg(long, value_name = "NAME[:THRESHOLD]")]
+    pub(crate) strategy: Option<String>,
+    /// The teacher's policy file [default: the one that ships for the task].
+    #[arg(long, value_name = "FILE")]
+    pub(crate) teacher: Option<PathBuf>,
+    /// Pieces of advice for the whole run [default: 500000].
+    #[arg(long, value_name = "N")]
+    pub(crate) budget: Option<u64>,
+    /// Worker processes [default: one a core, at most one a slot].
+    #[arg(long, value_name = "N")]
+    pub(crate) workers: Option<usize>,
+    /// Seed of every random draw [default: 1].
+    #[arg(long, value_name = "N")]
+    pub(crate) seed: Option<u64>,
+    /// Stops once an evaluation succeeds so often, 0 to 1.
+    #[arg(long, value_name = "P")]
+    pub(crate) until_success: Option<f64>,
+    /// Stops after so many environment steps.
+    #[arg(long, value_name = "N")]
+    pub(crate) max_env_steps: Option<u64>,
+    /// Stops after so many minutes [default: 30; 0 for never].
+    #[arg(long, value_name = "N")]
+    pub(crate) max_minutes: Option<f64>,
+    /// Where the settings' defaults come from [default: tandem].
+    #[arg(long, value_enum)]
+    pub(crate) recipe: Option<RecipeName>,
+    /// Run file with any of the settings; unknown keys are refused.
+    #[arg(long, value_name = "FILE.toml")]
+    pub(crate) run: Option<PathBuf>,
+    /// One setting, such as ddpg.discount=0.98; may be repeated.
+    #[arg(long = "set", value_name = "KEY=VALUE")]
+    pub(crate) settings: Vec<String>,
+    /// Run directory [default: runs/TASK-ARMS-STRATEGY-seedN].
+    #[arg(long, value_name = "DIR")]
+    pub(crate) out: Option<PathBuf>,
+    /// Goes on with the run in --out from its newest checkpoint.
+    #[arg(long, requires = "out")]
+    pub(crate) resume: bool,
+    /// Prints the summary as one JSON object on the last line of standard output.
+    #[arg(long)]
+    pub(crate) json: bool,
+}
+
+#[derive(Debug, Args)]
+#[command(group = clap::ArgGroup::new("who").required(true), after_help = "\
+Examples:
+  tandem eval --policy policies/student-push.safetensors
+  tandem eval --policy FILE --episodes 400 --seed 7 --json
+  tandem eval --composed-teachers policies/teacher-push.safetensors
+  tandem eval --policy FILE --episodes 1 --record episode.mcap")]
+pub(crate) struct EvalArgs {
+    /// The policy to measure.
+    #[arg(long, value_name = "FILE", group = "who")]
+    pub(crate) policy: Option<PathBuf>,
+    /// A one-arm policy that drives every arm by itself: the baseline without a student.
+    #[arg(long, value_name = "FILE", group = "who")]
+    pub(crate) composed_teachers: Option<PathBuf>,
+    /// Must be the policy's task, when given.
+    #[arg(long, value_enum)]
+    pub(crate) task: Option<TaskName>,
+    /// Arms [default: the policy's; 2 for composed teachers].
+    #[arg(long)]
+    pub(crate) arms: Option<usize>,
+    /// Fixed goals to try.
+    #[arg(long, default_value_t = 240, value_parser = clap::value_parser!(u64).range(1..=1_000_000))]
+    pub(crate) episodes: u64,
+    /// Which goals; none that a run chooses its best policy by.
+    #[arg(long, default_value_t = 777)]
+    pub(crate) seed: u64,
+    /// Writes the first episode's log there.
+    #[arg(long, value_name = "FILE.mcap")]
+    pub(crate) record: Option<PathBuf>,
+    /// Prints one JSON object on the last line of standard output.
+    #[arg(long)]
+    pub(crate) json: bool,
+}
+
+/// Where a service listens.
+#[derive(Debug, Args)]
+pub(crate) struct ListenArgs {
+    /// Address to listen on; port 0 takes a free one. It is printed as `listening on ADDR`.
+    #[arg(long, default_value = "127.0.0.1:0", value_name = "ADDR")]
+    pub(crate) listen: SocketAddr,
+    /// Ends when standard input closes, as it does when the parent process dies.
+    #[arg(long, hide = true)]
+    pub(crate) exit_with_stdin: bool,
+}
+
+#[derive(Debug, Args)]
+#[command(after_help = "\
+Examples:
+  tandem teacher --policy policies/teacher-push.safetensors --listen 127.0.0.1:7001")]
+pub(crate) struct TeacherArgs {
+    /// The one-arm policy that advises.
+    #[arg(long, value_name = "FILE")]
+    pub(crate) policy: PathBuf,
+    #[command(flatten)]
+    pub(crate) listen: ListenArgs,
+}
+
+#[derive(Debug, Args)]
+#[command(after_help = "\
+Examples:
+  tandem learner --run runs/mine/run.toml --listen 0.0.0.0:7000 --teacher 127.0.0.1:7001 --out runs/mine
+  tandem learner --run runs/mine/run.toml --out runs/mine --resume --teacher 127.0.0.1:7001")]
+pub(crate) struct LearnerArgs {
+    /// Run file; settings that it leaves out take the recipe's values.
+    #[arg(long, value_name = "FILE.toml")]
+    pub(crate) run: PathBuf,
+    /// The teacher's address, when the run asks for advice.
+    #[arg(long, value_name = "ADDR")]
+    pub(crate) teacher: Option<String>,
+    /// Run directory.
+    #[arg(long, value_name = "DIR")]
+    pub(crate) out: PathBuf,
+    /// Goes on from the newest checkpoint.
+    #[arg(long)]
+    pub(crate) resume: bool,
+    /// Threads of the update, 1 or 2; the result is the same.
+    #[arg(long, default_value_t = 2, value_parser = clap::value_parser!(u8).range(1..=2))]
+    pub(crate) threads: u8,
+    #[command(flatten)]
+    pub(crate) listen: ListenArgs,
+}
+
+#[derive(Debug, Args)]
+#[command(after_help = "\
+Examples:
+  tandem worker --connect 127.0.0.1:7000 --teacher 127.0.0.1:7001
+  tandem worker --connect learner:7000 --teacher teacher:7001 --name bench-3")]
+pub(crate) struct WorkerArgs {
+    /// The learner's address.
+    #[arg(long, value_name = "ADDR")]
+    pub(crate) connect: String,
+    /// The teacher's address, when the run asks for advice.
+    #[arg(long, value_name = "ADDR")]
+    pub(crate) teacher: Option<String>,
+    /// A label for logs.
+    #[arg(long, default_value = "worker")]
+    pub(crate) name: String,
+    /// Where recorded episodes are written.
+    #[arg(long, value_name = "DIR")]
+    pub(crate) log_dir: Option<PathBuf>,
+    /// Ends when standard input closes, as it does when the parent process dies.
+    #[arg(long, hide = true)]
+    pub(crate) exit_with_stdin: bool,
+}
+
+#[derive(Debug, Args)]
+#[command(after_help = "\
+Examples:
+  tandem bench                   everything, about a minute
+  tandem bench sim update --json")]
+pub(crate) struct BenchArgs {
+    /// What to measure [default: all].
+    #[arg(value_enum)]
+    pub(crate) what: Vec<BenchName>,
+    /// Prints one JSON object a line: name, value, unit.
+    #[arg(long)]
+    pub(crate) json: bool,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub(crate) enum BenchName {
+    Sim,
+    Inference,
+    Update,
+    Replay,
+    Wire,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct PolicyArgs {
+    #[command(subcommand)]
+    pub(crate) command: PolicyCommand,
+}
+
+#[derive(Debug, Subcommand)]
+pub(crate) enum PolicyCommand {
+    /// Shows sizes, how it was trained and its digest.
+    Show {
+        /// The policy file.
+        file: PathBuf,
+        /// Prints one JSON object.
+        #[arg(long)]
+        json: bool,
+    },
+}
+
+#[derive(Debug, Args)]
+#[command(after_help = "\
+Examples:
+  tandem replay runs/NAME/mcap/eval-000100-000.mcap
+  tandem replay FILE.mcap --verify --json")]
+pub(crate) struct ReplayArgs {
+    /// The recorded episode.
+    pub(crate) file: PathBuf,
+    /// Compares every observation bit for bit; exit code 65 when one differs.
+    #[arg(long)]
+    pub(crate) verify: bool,
+    /// Prints one JSON object on the last line of standard output.
+    #[arg(long)]
+    pub(crate) json: bool,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct McapArgs {
+    #[command(subcommand)]
+    pub(crate) command: McapCommand,
+}
+
+#[derive(Debug, Subcommand)]
+pub(crate) enum McapCommand {
+    /// Makes a whole file of what a killed writer left.
+    Recover {
+        /// What was left.
+        file: PathBuf,
+        /// The whole file [default: FILE with `.recovered.mcap` appended].
+        #[arg(long, value_name = "FILE")]
+        to: Option<PathBuf>,
+    },
+}
+
+#[derive(Debug, Args)]
+#[command(after_help = "\
+Examples:
+  tandem picture --policy policies/student-push.safetensors --out arms.svg
+  tandem picture --composed-teachers policies/teacher-push.safetensors --step 20 --out arms.svg")]
+pub(crate) struct PictureArgs {
+    /// The policy at work.
+    #[arg(long, value_name = "FILE", required_unless_present = "composed_teachers")]
+    pub(crate) policy: Option<PathBuf>,
+    /// A one-arm policy that drives both arms.
+    #[arg(long, value_name = "FILE", conflicts_with = "policy")]
+    pub(crate) composed_teachers: Option<PathBuf>,
+    /// Which episode's start and goal.
+    #[arg(long, default_value_t = 777)]
+    pub(crate) seed: u64,
+    /// The control step that is drawn, 0 to 50.
+    #[arg(long, default_value_t = 12, value_parser = clap::value_parser!(u32).range(0..=50))]
+    pub(crate) step: u32,
+    /// The picture.
+    #[arg(long, value_name = "FILE.svg")]
+    pub(crate) out: PathBuf,
+}

@@ -1,0 +1,182 @@
+//! `tandem eval`: a policy alone on fixed goals.
+
+use std::num::NonZeroUsize;
+use std::path::Path;
+
+use serde_json::{Value, json};
+use tandem_core::work::EpisodeOrder;
+use tandem_core::{Episode, EpisodeOutcome, EvaluationSummary, Layout, Task};
+use tandem_policy::Policy;
+use tandem_sim::WorldConfig;
+use tandem_telemetry::EpisodeMetadata;
+use tandem_worker::{ComposedTeachers, evaluate};
+
+use crate::cli::{EvalArgs, TaskName};
+use crate::clock;
+use crate::exit::{Exit, Failed, OrExit as _};
+use crate::files::load_policy;
+
+/// Who acts in an evaluation.
+#[derive(Debug, Clone)]
+pub(crate) enum Subject {
+    /// A policy for all arms of its layout.
+    Policy(Policy),
+    /// A one-arm policy for each of so many arms.
+    Composed(Policy, usize),
+}
+
+impl Subject {
+    pub(crate) fn layout(&self) -> Layout {
+        match self {
+            Self::Policy(policy) => policy.layout,
+            Self::Composed(policy, n_arms) => Layout::new(policy.layout.task, *n_arms),
+        }
+    }
+
+    pub(crate) const fn policy(&self) -> &Policy {
+        match self {
+            Self::Policy(policy) | Self::Composed(policy, _) => policy,
+        }
+    }
+
+    /// Plays `n_episodes` fixed goals on every core.
+    pub(crate) fn play(&self, n_episodes: u64, seed: u64) -> Result<Vec<Episode>, Failed> {
+        let actor = self.policy().actor().or_exit(Exit::Data, String::new)?;
+        let (layout, world) = (self.layout(), WorldConfig::default());
+        let n_threads = std::thread::available_parallelism().unwrap_or(NonZeroUsize::MIN);
+        let episodes = match self {
+            Self::Policy(_) => evaluate(|| actor.clone(), layout, &world, n_episodes, seed, n_threads),
+            Self::Composed(..) => {
+                evaluate(|| ComposedTeachers(actor.clone()), layout, &world, n_episodes, seed, n_threads)
+            }
+        };
+        episodes.or_exit(Exit::Bug, String::new)
+    }
+}
+
+/// An evaluation's figures and how fast it went.
+pub(crate) struct Measured {
+    pub(crate) layout: Layout,
+    pub(crate) summary: EvaluationSummary,
+    pub(crate) steps_per_s: f64,
+    pub(crate) policy_digest: String,
+}
+
+/// Plays and sums up.
+pub(crate) fn measure(subject: &Subject, n_episodes: u64, seed: u64) -> Result<Measured, Failed> {
+    let start = clock::now();
+    let episodes = subject.play(n_episodes, seed)?;
+    let n_steps = episodes.len() * tandem_core::layout::EPISODE_STEPS;
+    let steps_per_s = n_steps as f64 / start.elapsed().as_secs_f64();
+    let outcomes: Vec<EpisodeOutcome> = episodes.iter().map(EpisodeOutcome::of).collect();
+    let summary = EvaluationSummary::of(&outcomes);
+    Ok(Measured { layout: subject.layout(), summary, steps_per_s, policy_digest: subject.policy().digest() })
+}
+
+impl Measured {
+    pub(crate) fn json(&self) -> Value {
+        json!({
+            "task": self.layout.task.name(),
+            "arms": self.layout.n_arms,
+            "episodes": self.summary.n_episodes,
+            "success": self.summary.success,
+            "success_low": self.summary.interval.low,
+            "success_high": self.summary.interval.high,
+            "success_joint": self.summary.success_joint,
+            "success_per_arm": self.summary.success_per_arm,
+            "collision_rate": self.summary.collision_rate,
+            "collision_rate_before_success": self.summary.collision_rate_before_success,
+            "mean_return": self.summary.mean_return,
+            "steps_per_s": self.steps_per_s,
+            "policy_digest": self.policy_digest,
+        })
+    }
+
+    /// The figures for a person, a line each.
+    pub(crate) fn lines(&self) -> Vec<String> {
+        let summary = &self.summary;
+        let arms: Vec<String> = summary.success_per_arm.iter().map(|share| format!("{share:.3}")).collect();
+        vec![
+            format!(
+                "success       {:.3}   95 % interval {:.3} to {:.3}, {} episodes",
+                summary.success, summary.interval.low, summary.interval.high, summary.n_episodes
+            ),
+            format!("joint norm    {:.3}", summary.success_joint),
+            format!("each arm      {}", arms.join("  ")),
+            format!(
+                "collisions    {:.3} of episodes, {:.3} before success",
+                summary.collision_rate, summary.collision_rate_before_success
+            ),
+            format!("mean return   {:.1}", summary.mean_return),
+        ]
+    }
+}
+
+#[expect(clippy::print_stdout, reason = "what the command is for")]
+pub(crate) fn eval(args: &EvalArgs) -> Result<(), Failed> {
+    let subject = subject(args)?;
+    let measured = measure(&subject, args.episodes, args.seed)?;
+    if let Some(path) = &args.record {
+        record(&subject, args.seed, path)?;
+    }
+    if args.json {
+        println!("{}", measured.json());
+    } else {
+        let layout = measured.layout;
+        println!("task          {}, arms {}, seed {}", layout.task, layout.n_arms, args.seed);
+        measured.lines().iter().for_each(|line| println!("{line}"));
+        println!("speed         {:.0} env steps/s", measured.steps_per_s);
+        if let Some(path) = &args.record {
+            println!("recorded      {}", path.display());
+        }
+    }
+    Ok(())
+}
+
+/// Writes the log of the first fixed goal's episode.
+fn record(subject: &Subject, seed: u64, path: &Path) -> Result<(), Failed> {
+    let episode = subject.play(1, seed)?.remove(0);
+    let order = EpisodeOrder { number: 0, seed, advised: false, uniform: false, record: true };
+    let metadata = EpisodeMetadata {
+        policy_digest: subject.policy().digest(),
+        ..tandem_worker::record::metadata_of(order, &episode, &tandem_worker::evaluation_terms(subject.layout()))
+    };
+    tandem_worker::record::record_episode(&metadata, &episode, path).or_exit(Exit::TryAgain, String::new)?;
+    Ok(())
+}
+
+fn subject(args: &EvalArgs) -> Result<Subject, Failed> {
+    let subject = match (&args.policy, &args.composed_teachers) {
+        (Some(path), _) => Subject::Policy(load_policy(path)?),
+        (None, Some(path)) => composed(load_policy(path)?, args.arms.unwrap_or(2), path)?,
+        (None, None) => return Err(Failed::usage("give --policy or --composed-teachers")),
+    };
+    let layout = subject.layout();
+    let asked_task = args.task.map_or(layout.task, task);
+    let asked_arms = args.arms.unwrap_or(layout.n_arms);
+    if (asked_task, asked_arms) != (layout.task, layout.n_arms) {
+        return Err(Failed::usage(format!(
+            "the policy is for {} with {} arm(s), not {asked_task} with {asked_arms}",
+            layout.task, layout.n_arms
+        )));
+    }
+    Ok(subject)
+}
+
+/// A one-arm policy for `n_arms` arms.
+pub(crate) fn composed(policy: Policy, n_arms: usize, path: &Path) -> Result<Subject, Failed> {
+    if policy.layout.n_arms != 1 {
+        return Err(Failed::usage(format!("{} drives {} arms: a teacher drives one", path.display(), policy.layout.n_arms)));
+    }
+    if !(1..=2).contains(&n_arms) {
+        return Err(Failed::usage(format!("--arms {n_arms}: expected 1 or 2")));
+    }
+    Ok(Subject::Composed(policy, n_arms))
+}
+
+pub(crate) const fn task(name: TaskName) -> Task {
+    match name {
+        TaskName::Push => Task::Push,
+        TaskName::PickAndPlace => Task::PickAndPlace,
+    }
+}

@@ -1,0 +1,92 @@
+//! Exit codes that mean something, and the one line a person reads when something is wrong.
+
+use std::process::ExitCode;
+
+/// How the program ends when it is not done (sysexits.h).
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Exit {
+    /// Wrong command line or configuration.
+    Usage = 64,
+    /// Input that cannot be used: a damaged file, say.
+    Data = 65,
+    /// A bug.
+    Bug = 70,
+    /// A peer cannot be reached, a disk is full: try again.
+    TryAgain = 75,
+    /// Interrupted; the state is saved.
+    Interrupted = 130,
+}
+
+impl From<Exit> for ExitCode {
+    fn from(exit: Exit) -> Self {
+        Self::from(exit as u8)
+    }
+}
+
+/// What went wrong and the exit code that says so.
+#[derive(Debug)]
+pub(crate) struct Failed {
+    exit: Exit,
+    error: anyhow::Error,
+}
+
+impl Failed {
+    pub(crate) fn new(exit: Exit, error: impl Into<anyhow::Error>) -> Self {
+        Self { exit, error: error.into() }
+    }
+
+    pub(crate) fn usage(message: impl std::fmt::Display) -> Self {
+        Self::new(Exit::Usage, anyhow::anyhow!("{message}"))
+    }
+
+    /// Prints the one line and gives the exit code.
+    #[expect(clippy::print_stderr, reason = "the one line that says what is wrong")]
+    pub(crate) fn report(&self) -> ExitCode {
+        if self.exit != Exit::Interrupted {
+            let causes: Vec<String> = self.error.chain().map(ToString::to_string).collect();
+            eprintln!("tandem: {}", one_line(&causes));
+        }
+        self.exit.into()
+    }
+}
+
+/// Joins an error's causes, leaving out those that the one before already says.
+fn one_line(causes: &[String]) -> String {
+    let mut line = String::new();
+    for cause in causes {
+        if !line.contains(cause.as_str()) {
+            if !line.is_empty() {
+                line.push_str(": ");
+            }
+            line.push_str(&cause.replace('\n', " "));
+        }
+    }
+    line
+}
+
+/// Says which exit code an error means.
+pub(crate) trait OrExit<T> {
+    /// Ends with `exit`, saying `what` was attempted.
+    fn or_exit(self, exit: Exit, what: impl FnOnce() -> String) -> Result<T, Failed>;
+}
+
+impl<T, E: Into<anyhow::Error>> OrExit<T> for Result<T, E> {
+    fn or_exit(self, exit: Exit, what: impl FnOnce() -> String) -> Result<T, Failed> {
+        self.map_err(|error| {
+            let what = what();
+            let error = error.into();
+            Failed { exit, error: if what.is_empty() { error } else { error.context(what) } }
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_cause_that_repeats_the_line_is_left_out() {
+        let causes = ["cannot read \"x\": gone".to_owned(), "gone".to_owned(), "two\nlines".to_owned()];
+        assert_eq!(one_line(&causes), "cannot read \"x\": gone: two lines");
+    }
+}

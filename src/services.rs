@@ -1,0 +1,118 @@
+//! The services as subcommands: bind, say where, serve until asked to end.
+
+use std::future::Future;
+use std::net::SocketAddr;
+
+use anyhow::Context as _;
+use tandem_learner::service::Error as LearnerError;
+use tandem_telemetry::logging::{LevelFilter, LogConfig};
+use tokio::net::TcpListener;
+use tokio::runtime::{Builder, Runtime};
+use tokio_util::sync::CancellationToken;
+
+use crate::cli::{Cli, Command, LearnerArgs, ListenArgs, TeacherArgs, WorkerArgs};
+use crate::exit::{Exit, Failed, OrExit as _};
+use crate::{clock, run_file, signals};
+
+/// Version and commit of this program.
+pub(crate) const VERSION: &str = env!("CARGO_PKG_VERSION");
+
+/// Sends log lines to standard error: of services from `info` up, of everything else warnings.
+pub(crate) fn start_logging(cli: &Cli) -> Result<(), Failed> {
+    let level = match cli.command {
+        Command::Teacher(_) | Command::Learner(_) | Command::Worker(_) => LevelFilter::INFO,
+        _ => LevelFilter::WARN,
+    };
+    let directives = cli.log.clone().or_else(rust_log);
+    let config = LogConfig { console: Some(level), file: None, directives };
+    tandem_telemetry::logging::init(&config).or_exit(Exit::Usage, String::new)
+}
+
+#[expect(clippy::disallowed_methods, reason = "RUST_LOG is the one variable that is read")]
+fn rust_log() -> Option<String> {
+    std::env::var("RUST_LOG").ok().filter(|filter| !filter.is_empty())
+}
+
+pub(crate) fn teacher(args: TeacherArgs) -> Result<(), Failed> {
+    let policy = crate::files::load_policy(&args.policy)?;
+    let teacher = tandem_teacher::Teacher::new(&policy)
+        .or_exit(Exit::Data, || format!("{} cannot teach", args.policy.display()))?;
+    run(async move {
+        let shutdown = shutdown(args.listen.exit_with_stdin)?;
+        let listener = listen(&args.listen).await?;
+        tandem_teacher::serve(teacher, listener, shutdown).await.or_exit(Exit::TryAgain, String::new)
+    })
+}
+
+pub(crate) fn learner(args: LearnerArgs) -> Result<(), Failed> {
+    let run_config = run_file::resolve(Some(&args.run), &[])?;
+    run(async move {
+        let shutdown = shutdown(args.listen.exit_with_stdin)?;
+        let listener = listen(&args.listen).await?;
+        let config = tandem_learner::LearnerConfig {
+            run: run_config,
+            teacher: args.teacher.map(|address| uri(&address)),
+            out: args.out,
+            resume: args.resume,
+            n_threads: usize::from(args.threads),
+            clock: clock::since_now(),
+            version: VERSION.to_owned(),
+        };
+        let ended = tandem_learner::serve(config, listener, shutdown).await.map_err(learner_failed)?;
+        if ended.interrupted { Err(Failed::new(Exit::Interrupted, anyhow::anyhow!(ended.reason))) } else { Ok(()) }
+    })
+}
+
+pub(crate) fn worker(args: WorkerArgs) -> Result<(), Failed> {
+    run(async move {
+        let shutdown = shutdown(args.exit_with_stdin)?;
+        let config = tandem_worker::WorkerConfig {
+            learner: args.connect,
+            teacher: args.teacher,
+            name: args.name,
+            log_dir: args.log_dir,
+        };
+        tandem_worker::run(config, shutdown).await.or_exit(Exit::TryAgain, String::new)
+    })
+}
+
+/// `host:port` as the address that gRPC clients take.
+pub(crate) fn uri(address: &str) -> String {
+    if address.contains("://") { address.to_owned() } else { format!("http://{address}") }
+}
+
+/// A runtime for sockets; whatever computes has threads of its own.
+pub(crate) fn runtime() -> anyhow::Result<Runtime> {
+    Builder::new_current_thread().enable_all().build().context("cannot start the runtime")
+}
+
+fn run(service: impl Future<Output = Result<(), Failed>>) -> Result<(), Failed> {
+    runtime().or_exit(Exit::TryAgain, String::new)?.block_on(service)
+}
+
+fn shutdown(exit_with_stdin: bool) -> Result<CancellationToken, Failed> {
+    signals::shutdown_token(exit_with_stdin).or_exit(Exit::TryAgain, || "cannot watch for signals".to_owned())
+}
+
+/// Binds and says where, on one line of standard output.
+#[expect(clippy::print_stdout, reason = "the line that tells others the address")]
+async fn listen(args: &ListenArgs) -> Result<TcpListener, Failed> {
+    let bind = async {
+        let listener = TcpListener::bind(args.listen).await?;
+        let address: SocketAddr = listener.local_addr()?;
+        Ok::<_, std::io::Error>((listener, address))
+    };
+    let (listener, address) = bind.await.or_exit(Exit::TryAgain, || format!("cannot listen on {}", args.listen))?;
+    println!("listening on {address}");
+    Ok(listener)
+}
+
+fn learner_failed(error: LearnerError) -> Failed {
+    let exit = match error {
+        LearnerError::Config(_) | LearnerError::NoTeacher(_) | LearnerError::Teacher(_) => Exit::Usage,
+        LearnerError::Checkpoint(_) => Exit::Data,
+        LearnerError::RunDirectory { .. } | LearnerError::Serve(_) => Exit::TryAgain,
+        LearnerError::Diverged(_) | LearnerError::Panicked => Exit::Bug,
+    };
+    Failed::new(exit, error)
+}

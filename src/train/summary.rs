@@ -1,0 +1,85 @@
+//! What stands at the end of a run.
+
+use std::path::PathBuf;
+
+use serde_json::{Value, json};
+use tandem_proto::pb;
+use tandem_report::{CurveOptions, Series};
+use tandem_telemetry::{MetricsLog, MetricsRow};
+
+use super::display::{clock_text, grouped};
+use super::plan::Plan;
+use crate::eval::{Measured, Subject, measure};
+use crate::exit::{Exit, Failed, OrExit as _};
+use crate::files::load_policy;
+
+/// Held-out goals on which the best policy is judged at the end; no run chooses by them.
+const REPORT_SEED: u64 = 777;
+const REPORT_EPISODES: u64 = 240;
+
+/// Judges the best policy on held-out goals, draws the curve, and prints where everything lies.
+#[expect(clippy::print_stdout, reason = "the result of the command")]
+pub(super) fn print(plan: &Plan, last: &pb::Progress, as_json: bool) -> Result<(), Failed> {
+    let path = plan.best_policy();
+    let measured = measure(&Subject::Policy(load_policy(&path)?), REPORT_EPISODES, REPORT_SEED)?;
+    let rows = MetricsLog::read_all(&plan.out.join("metrics.jsonl")).or_exit(Exit::Data, String::new)?;
+    let curve = draw_curve(plan, rows)?;
+    let report = tandem_report::run_report_html(&plan.out).or_exit(Exit::TryAgain, String::new)?;
+    if as_json {
+        println!("{}", summary_json(plan, last, &measured));
+        return Ok(());
+    }
+    println!("done: {}", last.end_reason);
+    println!("best policy on {REPORT_EPISODES} held-out goals (seed {REPORT_SEED}), alone: no noise, no advice");
+    measured.lines().iter().for_each(|line| println!("  {line}"));
+    println!(
+        "training      {} env steps, {} updates, {} rounds in {}",
+        grouped(last.env_steps),
+        grouped(last.updates),
+        last.round,
+        clock_text(last.wall_s)
+    );
+    println!("advice        {} spent, {} left", grouped(last.advice_spent), grouped(last.budget_left));
+    println!("policy        {}", path.display());
+    println!("curve         {}", curve.display());
+    println!("report        {}", report.display());
+    println!("logs          {}, {}", plan.out.join("mcap").display(), plan.log_path().display());
+    println!("digest        {}", last.digest);
+    Ok(())
+}
+
+/// Says how to go on with an interrupted run.
+#[expect(clippy::print_stderr, reason = "the line that resumes")]
+pub(super) fn interrupted(plan: &Plan, last: &pb::Progress) {
+    let out = plan.out.display();
+    eprintln!("interrupted after round {}; the state is saved. Go on with:", last.round);
+    eprintln!("  tandem train --resume --out {out}");
+}
+
+/// Draws success against environment steps into the run directory.
+fn draw_curve(plan: &Plan, rows: Vec<MetricsRow>) -> Result<PathBuf, Failed> {
+    let label = format!("{} {}", plan.config.task, plan.config.advice.strategy);
+    let options = CurveOptions::default();
+    let svg = tandem_report::curve_svg(&[Series { label, rows }], &options).or_exit(Exit::Bug, String::new)?;
+    let path = plan.out.join("curve.svg");
+    std::fs::write(&path, svg).or_exit(Exit::TryAgain, || format!("cannot write {}", path.display()))?;
+    Ok(path)
+}
+
+fn summary_json(plan: &Plan, last: &pb::Progress, measured: &Measured) -> Value {
+    let mut summary = measured.json();
+    let more = json!({
+        "env_steps": last.env_steps,
+        "updates": last.updates,
+        "wall_s": last.wall_s,
+        "advice_spent": last.advice_spent,
+        "budget_left": last.budget_left,
+        "run_dir": plan.out,
+        "policy": plan.best_policy(),
+        "digest": last.digest,
+    });
+    if let (Some(summary), Value::Object(more)) = (summary.as_object_mut(), more) {
+        summary.extend(more);
+    }
+    summary
+}

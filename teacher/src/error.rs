@@ -1,0 +1,49 @@
+//! What can go wrong in a teacher.
+
+use tandem_proto::DecodeError;
+
+use crate::budget::BudgetError;
+use crate::strategy::UnknownStrategy;
+
+/// Why a teacher cannot start or cannot answer.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    /// The policy cannot be used.
+    #[error("cannot use the teacher's policy")]
+    Policy(#[from] tandem_policy::Error),
+    /// The policy is a student's.
+    #[error(
+        "a teacher needs a policy for 1 arm with 1 value, this one is for {n_arms} with {n_values}"
+    )]
+    NotOneArm {
+        /// Arms that the policy is for.
+        n_arms: usize,
+        /// Values that its critic gives.
+        n_values: usize,
+    },
+    /// A request does not hold what it must.
+    #[error(transparent)]
+    Request(#[from] DecodeError),
+    /// A request names no strategy.
+    #[error("strategy: {0}")]
+    Strategy(#[from] UnknownStrategy),
+    /// An account cannot be opened or found.
+    #[error(transparent)]
+    Budget(#[from] BudgetError),
+    /// The teacher's networks gave infinity or NaN.
+    #[error(
+        "the teacher's networks gave a number that is not finite for step {step} of episode {episode}"
+    )]
+    NotFinite {
+        /// The episode asked about.
+        episode: u64,
+        /// Its step.
+        step: u32,
+    },
+    /// The descriptors for reflection cannot be read.
+    #[error("cannot describe the service")]
+    Reflection(#[from] tonic_reflection::server::Error),
+    /// The server stopped unasked.
+    #[error("cannot serve")]
+    Transport(#[from] tonic::transport::Error),
+}

@@ -1,0 +1,116 @@
+//! Which of a student's numbers belong to which arm (equations 7 to 9 of the paper), as data.
+
+use std::ops::Range;
+
+use tandem_core::Layout;
+
+/// Where one arm's numbers stand in a student's vectors.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct ArmMap {
+    /// In an observation.
+    pub observation: Range<usize>,
+    /// In a goal.
+    pub goal: Range<usize>,
+    /// In an action.
+    pub action: Range<usize>,
+}
+
+/// The maps between a student's layout and the teacher's, arm by arm.
+///
+/// A student with fewer arms uses the first ones: how many there are shows in the length of its vectors.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Maps {
+    arms: Vec<ArmMap>,
+}
+
+impl Maps {
+    /// The maps of students whose vectors are laid out as `largest`'s are.
+    #[must_use]
+    pub fn new(largest: Layout) -> Self {
+        let map_of = |arm| ArmMap {
+            observation: largest.observation_of(arm),
+            goal: largest.goal_of(arm),
+            action: largest.action_of(arm),
+        };
+        Self { arms: largest.arms().map(map_of).collect() }
+    }
+
+    /// Every arm's map, in arm order.
+    #[must_use]
+    pub fn arms(&self) -> &[ArmMap] {
+        &self.arms
+    }
+
+    /// The maps of the arms of a student whose actions have `n_action` numbers, in arm order.
+    pub fn of_student(&self, n_action: usize) -> impl ExactSizeIterator<Item = &ArmMap> {
+        let n_arms = self.arms.partition_point(|arm| arm.action.end <= n_action);
+        self.arms[..n_arms].iter()
+    }
+
+    /// `f^a` (equation 8): the student's action made of the arms' own, shape `[n_action]`.
+    ///
+    /// # Panics
+    /// When an arm's action has not the length of its place.
+    #[must_use]
+    pub fn joint_action<'a>(
+        &self,
+        n_action: usize,
+        arm_actions: impl Iterator<Item = &'a [f32]>,
+    ) -> Vec<f32> {
+        let mut joint = vec![0.0; n_action];
+        for (arm, action) in self.of_student(n_action).zip(arm_actions) {
+            joint[arm.action.clone()].copy_from_slice(action);
+        }
+        joint
+    }
+}
+
+impl ArmMap {
+    /// `f_i^sg` (equation 7): the teacher's observation and goal within the student's.
+    #[must_use]
+    pub fn teacher_state<'a>(
+        &self,
+        observation: &'a [f32],
+        goal: &'a [f32],
+    ) -> (&'a [f32], &'a [f32]) {
+        (&observation[self.observation.clone()], &goal[self.goal.clone()])
+    }
+
+    /// `h_i^a` (equation 9): the arm's own action within the student's.
+    #[must_use]
+    pub fn arm_action<'a>(&self, action: &'a [f32]) -> &'a [f32] {
+        &action[self.action.clone()]
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use tandem_core::Task;
+
+    use super::*;
+
+    fn ramp(n: u8) -> Vec<f32> {
+        (0..n).map(f32::from).collect()
+    }
+
+    #[test]
+    fn the_second_arm_has_the_second_part_of_every_vector() {
+        let maps = Maps::new(Layout::new(Task::PickAndPlace, 3));
+        let (observation, goal, action) = (ramp(84), ramp(9), ramp(12));
+        let (teacher_observation, teacher_goal) = maps.arms()[1].teacher_state(&observation, &goal);
+        assert_eq!((teacher_observation.len(), teacher_observation[0]), (28, 28.0));
+        assert_eq!(teacher_goal, [3.0, 4.0, 5.0]);
+        assert_eq!(maps.arms()[1].arm_action(&action), [4.0, 5.0, 6.0, 7.0]);
+    }
+
+    #[test]
+    fn composing_what_was_taken_apart_gives_the_same_action() {
+        let maps = Maps::new(Layout::new(Task::Push, 8));
+        for n_arms in 1..=8 {
+            let action = ramp(3 * n_arms);
+            let parts = maps.of_student(action.len()).map(|arm| arm.arm_action(&action));
+            assert_eq!(parts.len(), usize::from(n_arms));
+            assert_eq!(maps.joint_action(action.len(), parts), action);
+        }
+    }
+}

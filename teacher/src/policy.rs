@@ -1,0 +1,135 @@
+//! What an advisor needs of its policy.
+
+use std::path::Path;
+
+use tandem_core::Layout;
+use tandem_policy::{Actor, Critic, Policy};
+
+use crate::error::Error;
+
+/// A policy that can advise: it acts, and it values actions. Rows are states of one arm.
+pub trait TeacherPolicy: Send {
+    /// The task, and one arm.
+    fn layout(&self) -> Layout;
+
+    /// Names the policy: SHA-256 of its parameters, hexadecimal.
+    fn digest(&self) -> &str;
+
+    /// `π_tr`: writes the actions, shape `[n, n_action]`, for `observations`, shape `[n, n_observation]`, and
+    /// `goals`, shape `[n, n_goal]`.
+    fn act(&mut self, observations: &[f32], goals: &[f32], actions: &mut [f32]);
+
+    /// `Q_tr`: writes the values, shape `[n]`, of `actions`, shape `[n, n_action]`, in the same states.
+    fn q(&mut self, observations: &[f32], goals: &[f32], actions: &[f32], q: &mut [f32]);
+}
+
+/// A policy for one arm, ready to run.
+pub struct OneArmPolicy {
+    digest: String,
+    actor: Actor,
+    critic: Critic,
+}
+
+impl OneArmPolicy {
+    /// Reads the policy that file `path` holds.
+    ///
+    /// # Errors
+    /// When the file holds no usable policy, or one that cannot teach.
+    pub fn load(path: &Path) -> Result<Self, Error> {
+        Self::new(&Policy::load(path)?)
+    }
+
+    /// Makes `policy` a teacher's.
+    ///
+    /// # Errors
+    /// When it is not for one arm, or its critic gives several values.
+    pub fn new(policy: &Policy) -> Result<Self, Error> {
+        if policy.layout.n_arms != 1 || policy.n_heads != 1 {
+            return Err(Error::NotOneArm {
+                n_arms: policy.layout.n_arms,
+                n_values: policy.n_heads,
+            });
+        }
+        Ok(Self { digest: policy.digest(), actor: policy.actor()?, critic: policy.critic()? })
+    }
+}
+
+impl TeacherPolicy for OneArmPolicy {
+    fn layout(&self) -> Layout {
+        self.actor.layout()
+    }
+
+    fn digest(&self) -> &str {
+        &self.digest
+    }
+
+    fn act(&mut self, observations: &[f32], goals: &[f32], actions: &mut [f32]) {
+        self.actor.act(observations, goals, actions);
+    }
+
+    fn q(&mut self, observations: &[f32], goals: &[f32], actions: &[f32], q: &mut [f32]) {
+        self.critic.q(observations, goals, actions, q);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeMap;
+
+    use tandem_core::Task;
+    use tandem_policy::NormalizerSnapshot;
+
+    use super::*;
+
+    /// A network of one unit whose weights are all `weight`.
+    fn policy(n_arms: usize, n_heads: usize, weight: f32) -> Policy {
+        let layout = Layout::new(Task::Push, n_arms);
+        let identity = |n| NormalizerSnapshot { mean: vec![0.0; n], std: vec![1.0; n] };
+        let mut policy = Policy {
+            layout,
+            n_hidden: 1,
+            n_hidden_layers: 1,
+            n_heads,
+            actor: Vec::new(),
+            critic: Vec::new(),
+            observation_normalizer: identity(layout.n_observation()),
+            goal_normalizer: identity(layout.n_goal()),
+            metadata: BTreeMap::new(),
+        };
+        policy.actor = vec![weight; policy.actor_shape().n_parameters()];
+        policy.critic = vec![weight; policy.critic_shape().n_parameters()];
+        policy
+    }
+
+    #[test]
+    fn a_policy_for_one_arm_acts_and_values_row_by_row() {
+        let weight = 1.0 / 64.0;
+        let mut teacher = OneArmPolicy::new(&policy(1, 1, weight)).unwrap();
+        assert_eq!(teacher.layout(), Layout::new(Task::Push, 1));
+        assert_eq!(teacher.digest(), policy(1, 1, weight).digest());
+
+        let (observations, goals) = ([[0.0; 28], [1.0; 28]].concat(), [0.0; 6]);
+        let (mut actions, mut q) = ([0.0; 6], [0.0; 2]);
+        teacher.act(&observations, &goals, &mut actions);
+        teacher.q(&observations, &goals, &[0.0, 0.0, 0.0, 1.0, 1.0, 1.0], &mut q);
+
+        let raw_of = |sum: f32| (sum * weight + weight) * weight + weight;
+        let near = |got: f32, expected: f32| {
+            assert!((got - expected).abs() < 1e-6, "{got} is not {expected}")
+        };
+        near(actions[0], raw_of(0.0).tanh());
+        near(actions[5], raw_of(28.0).tanh());
+        near(q[0], raw_of(0.0));
+        near(q[1], raw_of(28.0 + 3.0));
+    }
+
+    #[test]
+    fn only_a_policy_for_one_arm_can_teach() {
+        let refusal = OneArmPolicy::new(&policy(2, 1, 0.5)).err().unwrap().to_string();
+        assert_eq!(
+            refusal,
+            "a teacher needs a policy for 1 arm with 1 value, this one is for 2 with 1"
+        );
+        assert!(OneArmPolicy::new(&policy(1, 2, 0.5)).is_err());
+    }
+}

@@ -1,0 +1,85 @@
+//! The teacher's own words as messages.
+
+use std::ops::Range;
+
+use tandem_core::{StepQuery, Task};
+use tandem_proto::{DecodeError, decode_query, layout_of_query, pb};
+
+use crate::advisor::Advisor;
+use crate::budget::{Balance, Lease};
+use crate::maps::ArmMap;
+use crate::strategy::Strategy;
+
+/// Steps that one request may ask about.
+const MAX_STEPS: usize = 1024;
+/// Episodes that one request may name.
+const MAX_EPISODES: usize = 65_536;
+
+/// The queries of a request by students of `task`.
+pub(super) fn decode_queries(
+    steps: Vec<pb::StepQuery>,
+    task: Task,
+) -> Result<Vec<StepQuery>, DecodeError> {
+    check_count("steps", steps.len(), MAX_STEPS)?;
+    let decode_indexed = |(step_idx, query)| {
+        layout_of_query(&query, task)
+            .and_then(|layout| decode_query(query, layout))
+            .map_err(|error| error.within(format_args!("steps[{step_idx}]")))
+    };
+    steps.into_iter().enumerate().map(decode_indexed).collect()
+}
+
+/// Refuses to look at more episodes than a round has.
+pub(super) fn check_episodes(episodes: &[u64]) -> Result<(), DecodeError> {
+    check_count("episodes", episodes.len(), MAX_EPISODES)
+}
+
+fn check_count(field: &str, count: usize, max: usize) -> Result<(), DecodeError> {
+    if count <= max {
+        return Ok(());
+    }
+    Err(DecodeError::new(field, format_args!("at most {max}"), count))
+}
+
+pub(super) fn describe(advisor: &Advisor) -> pb::DescribeResponse {
+    let layout = advisor.layout();
+    pb::DescribeResponse {
+        task: layout.task.name().to_owned(),
+        n_observation_per_arm: index(layout.n_observation()),
+        n_goal_per_arm: index(layout.n_goal()),
+        n_action_per_arm: index(layout.n_action()),
+        arms: advisor.maps().arms().iter().map(encode_map).collect(),
+        strategies: Strategy::NAMES.map(str::to_owned).to_vec(),
+        policy_digest: advisor.digest().to_owned(),
+    }
+}
+
+fn encode_map(map: &ArmMap) -> pb::ArmMap {
+    let range = |range: &Range<usize>| {
+        Some(pb::IndexRange { start: index(range.start), end: index(range.end) })
+    };
+    pb::ArmMap {
+        observation: range(&map.observation),
+        goal: range(&map.goal),
+        action: range(&map.action),
+    }
+}
+
+fn index(index: usize) -> u32 {
+    u32::try_from(index).expect("vectors have some hundred numbers")
+}
+
+pub(super) fn encode_balance(name: String, balance: &Balance) -> pb::Account {
+    pb::Account {
+        name,
+        budget: balance.terms.budget,
+        strategy: balance.terms.strategy.to_string(),
+        spent: balance.spent,
+        leased: balance.leased,
+        left: balance.left,
+    }
+}
+
+pub(super) const fn encode_lease(lease: &Lease) -> pb::Lease {
+    pb::Lease { episode: lease.episode, units: lease.units, early_units: lease.early_units }
+}

@@ -1,0 +1,173 @@
+//! The advising strategies of the paper, by their names on the command line.
+
+use std::fmt;
+use std::str::FromStr;
+
+use crate::budget::Half;
+use crate::procedures::{ActionFilter, Procedure};
+
+/// The threshold of a strategy that is named without one.
+pub const DEFAULT_THRESHOLD: f32 = 0.1;
+
+/// When the teacher advises.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Strategy {
+    /// Never (NA).
+    NoAdvice,
+    /// On every step (EA).
+    EarlyAdvising,
+    /// On every step for the first half of the budget, then as [`Self::MistakeQ`] (EAMC).
+    EarlyThenMistakeQ {
+        /// `t_I` of the second half.
+        threshold: f32,
+    },
+    /// Where the student's action is worth clearly less than the teacher's (MC-Q).
+    MistakeQ {
+        /// `t_I`: units of value.
+        threshold: f32,
+    },
+    /// Where the student's action is far from the teacher's (MC-ACT).
+    MistakeAction {
+        /// `α`: Euclidean distance of actions.
+        alpha: f32,
+    },
+    /// The same, the distance measured in lengths of the teacher's action (MC-ACT-ABS).
+    MistakeActionAbs {
+        /// `α`: share of the teacher's action's length.
+        alpha: f32,
+    },
+}
+
+impl Strategy {
+    /// The strategies as they are written, `T` and `A` standing for a threshold.
+    pub const NAMES: [&str; 6] = ["none", "ea", "eamc:T", "mc-q:T", "mc-act:A", "mc-act-abs:A"];
+
+    /// The procedure that governs a step whose unit would come from `half` of the budget.
+    #[must_use]
+    pub const fn procedure(self, half: Half) -> Option<Procedure> {
+        match (self, half) {
+            (Self::NoAdvice, _) => None,
+            (Self::EarlyAdvising, _) | (Self::EarlyThenMistakeQ { .. }, Half::First) => {
+                Some(Procedure::EarlyAdvising)
+            }
+            (Self::MistakeQ { threshold }, _)
+            | (Self::EarlyThenMistakeQ { threshold }, Half::Second) => {
+                Some(Procedure::MistakeCorrectingQ { threshold })
+            }
+            (Self::MistakeAction { alpha }, _) => {
+                Some(Procedure::MistakeCorrectingAction(ActionFilter::McAct { alpha }))
+            }
+            (Self::MistakeActionAbs { alpha }, _) => {
+                Some(Procedure::MistakeCorrectingAction(ActionFilter::McActAbs { alpha }))
+            }
+        }
+    }
+}
+
+impl fmt::Display for Strategy {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::NoAdvice => f.write_str("none"),
+            Self::EarlyAdvising => f.write_str("ea"),
+            Self::EarlyThenMistakeQ { threshold } => write!(f, "eamc:{threshold}"),
+            Self::MistakeQ { threshold } => write!(f, "mc-q:{threshold}"),
+            Self::MistakeAction { alpha } => write!(f, "mc-act:{alpha}"),
+            Self::MistakeActionAbs { alpha } => write!(f, "mc-act-abs:{alpha}"),
+        }
+    }
+}
+
+/// A text that names no strategy.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("expected {} (thresholds finite, 0 or more, 0.1 when left out), got {0:?}", Strategy::NAMES.join(", "))]
+pub struct UnknownStrategy(pub String);
+
+impl FromStr for Strategy {
+    type Err = UnknownStrategy;
+
+    fn from_str(text: &str) -> Result<Self, UnknownStrategy> {
+        let unknown = || UnknownStrategy(text.to_owned());
+        let (name, threshold_text) = match text.split_once(':') {
+            Some((name, threshold)) => (name, Some(threshold)),
+            None => (text, None),
+        };
+        let threshold =
+            threshold_text.map_or(Some(DEFAULT_THRESHOLD), parse_threshold).ok_or_else(unknown)?;
+        match name {
+            "none" if threshold_text.is_none() => Ok(Self::NoAdvice),
+            "ea" if threshold_text.is_none() => Ok(Self::EarlyAdvising),
+            "eamc" => Ok(Self::EarlyThenMistakeQ { threshold }),
+            "mc-q" => Ok(Self::MistakeQ { threshold }),
+            "mc-act" => Ok(Self::MistakeAction { alpha: threshold }),
+            "mc-act-abs" => Ok(Self::MistakeActionAbs { alpha: threshold }),
+            _ => Err(unknown()),
+        }
+    }
+}
+
+/// A finite number, 0 or more; −0 is read as 0.
+fn parse_threshold(text: &str) -> Option<f32> {
+    text.parse()
+        .ok()
+        .filter(|threshold: &f32| threshold.is_finite() && *threshold >= 0.0)
+        .map(f32::abs)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_strategy_is_read_back_from_its_name() {
+        let check = |text: &str, strategy: Strategy| {
+            assert_eq!(text.parse(), Ok(strategy), "{text}");
+            assert_eq!(strategy.to_string().parse(), Ok(strategy), "{strategy}");
+        };
+        check("none", Strategy::NoAdvice);
+        check("ea", Strategy::EarlyAdvising);
+        check("eamc:0.25", Strategy::EarlyThenMistakeQ { threshold: 0.25 });
+        check("mc-q:0", Strategy::MistakeQ { threshold: 0.0 });
+        check("mc-act:1e-2", Strategy::MistakeAction { alpha: 0.01 });
+        check("mc-act-abs:0.05", Strategy::MistakeActionAbs { alpha: 0.05 });
+        check("eamc", Strategy::EarlyThenMistakeQ { threshold: 0.1 });
+        check("mc-q", Strategy::MistakeQ { threshold: 0.1 });
+        check("mc-act", Strategy::MistakeAction { alpha: 0.1 });
+        check("mc-act-abs", Strategy::MistakeActionAbs { alpha: 0.1 });
+        assert_eq!("mc-q:-0".parse::<Strategy>().unwrap().to_string(), "mc-q:0");
+        assert_eq!("mc-q:0.10".parse::<Strategy>().unwrap().to_string(), "mc-q:0.1");
+    }
+
+    #[test]
+    fn what_is_no_strategy_is_refused_with_the_list_of_those_there_are() {
+        for text in [
+            "",
+            "MC-Q",
+            "mc",
+            "mc-q:",
+            "mc-q:NaN",
+            "mc-q:inf",
+            "mc-q:-0.1",
+            "mc-q:1:2",
+            "ea:0.1",
+            "none:0",
+        ] {
+            let message = text.parse::<Strategy>().unwrap_err().to_string();
+            assert!(
+                message.starts_with("expected none, ea, eamc:T, mc-q:T, mc-act:A, mc-act-abs:A"),
+                "{message}"
+            );
+            assert!(message.ends_with(&format!("got {text:?}")), "{message}");
+        }
+    }
+
+    #[test]
+    fn eamc_changes_its_procedure_with_the_half_of_the_budget() {
+        let eamc = Strategy::EarlyThenMistakeQ { threshold: 0.5 };
+        assert_eq!(eamc.procedure(Half::First), Some(Procedure::EarlyAdvising));
+        assert_eq!(
+            eamc.procedure(Half::Second),
+            Some(Procedure::MistakeCorrectingQ { threshold: 0.5 })
+        );
+        assert_eq!(Strategy::NoAdvice.procedure(Half::First), None);
+    }
+}

@@ -1,0 +1,146 @@
+//! Reads an episode's log back, to play the episode again or to look into it.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use mcap::read::ChannelAccumulator;
+use mcap::records::Record;
+use tandem_core::{ArmAdvice, Contacts, Layout};
+
+use crate::error::Error;
+use crate::messages::{EpisodeMetadata, METADATA_NAME, decode, pb};
+use crate::recorder::{OUTCOME_TOPIC, TRANSITION_TOPIC};
+use crate::records::Records;
+
+/// A recorded episode.
+#[derive(Debug, Clone, PartialEq)]
+pub struct EpisodeLog {
+    /// What is needed to play it again.
+    pub metadata: EpisodeMetadata,
+    /// Its steps, in order from 0. A recovered log may have fewer than a whole episode.
+    pub transitions: Vec<LoggedTransition>,
+    /// After the last step, shape `[n_observation]`; `None` when the log ends before.
+    pub last_observation: Option<Vec<f32>>,
+}
+
+/// One recorded control step.
+#[derive(Debug, Clone, PartialEq)]
+pub struct LoggedTransition {
+    /// Before the step, shape `[n_observation]`.
+    pub observation: Vec<f32>,
+    /// Shape `[n_goal]`.
+    pub goal: Vec<f32>,
+    /// As executed, in [−1, 1], shape `[n_action]`.
+    pub action: Vec<f32>,
+    /// The joint reward.
+    pub reward: f32,
+    /// Each arm's own reward, shape `[n_arms]`.
+    pub rewards_per_arm: Vec<f32>,
+    /// Bit `a` set when arm `a` executed the teacher's action.
+    pub advised_arms: u8,
+    /// What touched what during the step.
+    pub contacts: Contacts,
+    /// What the teacher said, arm by arm; empty when it was not asked.
+    pub advice: Vec<ArmAdvice>,
+}
+
+/// Reads the log `path` of an episode.
+///
+/// # Errors
+/// When the file cannot be read, is not whole, or is no log of an episode.
+pub fn read_episode(path: &Path) -> Result<EpisodeLog, Error> {
+    let bytes = std::fs::read(path).map_err(Error::io("read", path))?;
+    let not_an_episode = |problem| Error::NotAnEpisode { path: path.to_owned(), problem };
+    let raw = read_raw(&bytes).map_err(Error::read_log(path))?;
+    checked(raw).map_err(not_an_episode)
+}
+
+/// The parts of a log that matter here, as bytes.
+#[derive(Default)]
+struct RawLog {
+    metadata: Option<BTreeMap<String, String>>,
+    transitions: Vec<Vec<u8>>,
+    outcomes: Vec<Vec<u8>>,
+}
+
+fn read_raw(bytes: &[u8]) -> mcap::McapResult<RawLog> {
+    let mut raw = RawLog::default();
+    let mut channels = ChannelAccumulator::default();
+    let mut in_summary = false;
+    for record in Records::of_whole(bytes) {
+        match record? {
+            // The summary repeats channels and schemas; it is read on only to be sure that the file is whole.
+            Record::DataEnd(_) => in_summary = true,
+            _ if in_summary => {}
+            Record::Metadata(metadata) if metadata.name == METADATA_NAME => {
+                raw.metadata = Some(metadata.metadata);
+            }
+            Record::Schema { header, data } => {
+                channels.add_schema(header, data.into_owned().into())?;
+            }
+            Record::Channel(channel) => {
+                channels.add_channel(channel)?;
+            }
+            Record::Message { header, data } => {
+                let channel = channels.get(header.channel_id);
+                match channel.as_ref().map(|channel| channel.topic.as_str()) {
+                    Some(TRANSITION_TOPIC) => raw.transitions.push(data.into_owned()),
+                    Some(OUTCOME_TOPIC) => raw.outcomes.push(data.into_owned()),
+                    _ => {}
+                }
+            }
+            _ => {}
+        }
+    }
+    Ok(raw)
+}
+
+fn checked(raw: RawLog) -> Result<EpisodeLog, String> {
+    let metadata =
+        raw.metadata.ok_or_else(|| format!("it has no metadata record {METADATA_NAME:?}"))?;
+    let metadata = EpisodeMetadata::from_map(&metadata)?;
+    let layout = metadata.layout;
+    let transitions = raw.transitions.iter().enumerate();
+    let transitions = transitions
+        .map(|(step_idx, bytes)| {
+            transition(layout, step_idx, bytes)
+                .map_err(|problem| format!("step {step_idx}: {problem}"))
+        })
+        .collect::<Result<_, _>>()?;
+    let last_observation =
+        raw.outcomes.last().map(|bytes| last_observation(layout, bytes)).transpose()?;
+    Ok(EpisodeLog { metadata, transitions, last_observation })
+}
+
+fn transition(layout: Layout, step_idx: usize, bytes: &[u8]) -> Result<LoggedTransition, String> {
+    let message: pb::Transition = decode(bytes).map_err(|error| error.to_string())?;
+    if usize::try_from(message.step) != Ok(step_idx) {
+        return Err(format!("is called step {}", message.step));
+    }
+    let advised_arms =
+        u8::try_from(message.advised_arms).map_err(|error| format!("advised_arms: {error}"))?;
+    let contacts = u8::try_from(message.contacts).ok().and_then(Contacts::from_bits);
+    Ok(LoggedTransition {
+        observation: of_length("observation", message.observation, layout.n_observation())?,
+        goal: of_length("goal", message.goal, layout.n_goal())?,
+        action: of_length("action", message.action, layout.n_action())?,
+        reward: message.reward,
+        rewards_per_arm: of_length("rewards_per_arm", message.rewards_per_arm, layout.n_arms)?,
+        advised_arms,
+        contacts: contacts
+            .ok_or_else(|| format!("contacts {:#b} have no meaning", message.contacts))?,
+        advice: message.advice.into_iter().map(ArmAdvice::from).collect(),
+    })
+}
+
+fn last_observation(layout: Layout, bytes: &[u8]) -> Result<Vec<f32>, String> {
+    let outcome: pb::Outcome = decode(bytes).map_err(|error| format!("outcome: {error}"))?;
+    of_length("last observation", outcome.observation, layout.n_observation())
+}
+
+fn of_length(field: &str, numbers: Vec<f32>, expected: usize) -> Result<Vec<f32>, String> {
+    match numbers.len() {
+        got if got == expected => Ok(numbers),
+        got => Err(format!("{field} has {got} numbers, the layout has {expected}")),
+    }
+}

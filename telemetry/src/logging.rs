@@ -1,0 +1,63 @@
+//! Sets up where log lines go. Only a program calls this; libraries emit.
+
+use std::fs::OpenOptions;
+use std::io::IsTerminal as _;
+use std::path::PathBuf;
+use std::sync::Mutex;
+
+use tracing_subscriber::filter::EnvFilter;
+pub use tracing_subscriber::filter::LevelFilter;
+use tracing_subscriber::fmt;
+use tracing_subscriber::layer::{Layer as _, SubscriberExt as _};
+use tracing_subscriber::util::SubscriberInitExt as _;
+
+use crate::error::Error;
+
+/// Where log lines go and which ones.
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
+pub struct LogConfig {
+    /// The least severe level shown on standard error; `None` for none at all.
+    pub console: Option<LevelFilter>,
+    /// A file that gets everything from `info` up; lines are added to what it has.
+    pub file: Option<PathBuf>,
+    /// Directives that take the place of the levels above, in the syntax of `RUST_LOG`.
+    pub directives: Option<String>,
+}
+
+/// Sends the log lines of this process where `config` says.
+///
+/// # Errors
+/// When the file cannot be opened, the directives are malformed or logging is already set up.
+pub fn init(config: &LogConfig) -> Result<(), Error> {
+    let console = match config.console {
+        Some(level) => {
+            let layer = fmt::layer()
+                .with_writer(std::io::stderr)
+                .with_ansi(std::io::stderr().is_terminal());
+            Some(layer.with_filter(filter(level, config)?))
+        }
+        None => None,
+    };
+    let file = match &config.file {
+        Some(path) => {
+            let file = OpenOptions::new()
+                .append(true)
+                .create(true)
+                .open(path)
+                .map_err(Error::io("open", path))?;
+            let layer = fmt::layer().with_writer(Mutex::new(file)).with_ansi(false);
+            Some(layer.with_filter(filter(LevelFilter::INFO, config)?))
+        }
+        None => None,
+    };
+    tracing_subscriber::registry().with(console).with(file).try_init()?;
+    Ok(())
+}
+
+/// Our own crates from `level` up, others' warnings.
+fn filter(level: LevelFilter, config: &LogConfig) -> Result<EnvFilter, Error> {
+    let directives = config.directives.clone().unwrap_or_else(|| format!("warn,tandem={level}"));
+    EnvFilter::builder()
+        .parse(&directives)
+        .map_err(|source| Error::LogFilter { filter: directives, source })
+}

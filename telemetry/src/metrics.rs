@@ -1,0 +1,254 @@
+//! The metrics of a run: one JSON object a line, one line an evaluation.
+
+use std::fs::{File, OpenOptions};
+use std::io::Write as _;
+use std::path::{Path, PathBuf};
+
+use serde::{Deserialize, Deserializer, Serialize};
+
+use crate::error::Error;
+
+/// What is known after one evaluation. Shares are in [0, 1]; a number that does not exist (no update yet, no training
+/// episode) is NaN here and `null` in the file.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+pub struct MetricsRow {
+    /// The round after which the evaluation took place.
+    pub round: u64,
+    /// Training steps so far, of all episodes.
+    pub env_steps: u64,
+    /// Training episodes so far.
+    pub episodes: u64,
+    /// Updates of the networks so far.
+    pub updates: u64,
+    /// Rounds by the paper's measure, 50 an epoch.
+    pub paper_epochs: f64,
+    /// Wall time of the whole run, seconds, resumed parts added up.
+    pub wall_s: f64,
+    /// Share of evaluation episodes that end with every object at its goal.
+    pub success: f64,
+    /// Share that end with the joint norm within the tolerance.
+    pub success_joint: f64,
+    /// Each arm's share.
+    pub success_per_arm: Vec<f64>,
+    /// Lower end of the 95 % interval of `success`.
+    pub success_low: f64,
+    /// Upper end of the 95 % interval of `success`.
+    pub success_high: f64,
+    /// Share of evaluation episodes with an arm–arm or arm–table contact.
+    pub collision_rate: f64,
+    /// Mean value that the critic gives to the policy's actions.
+    #[serde(deserialize_with = "nan_from_null")]
+    pub mean_q: f64,
+    /// Mean critic loss since the last row.
+    #[serde(deserialize_with = "nan_from_null")]
+    pub critic_loss: f64,
+    /// Mean actor loss since the last row.
+    #[serde(deserialize_with = "nan_from_null")]
+    pub actor_loss: f64,
+    /// Units of advice spent so far.
+    pub advice_spent: u64,
+    /// Units of advice left.
+    pub budget_left: u64,
+    /// Share of evaluation episodes in which an object was displaced.
+    pub moved: f64,
+    /// Share of evaluation episodes with such a contact before every object had arrived for good.
+    pub collision_rate_before_success: f64,
+    /// Success of the training episodes since the last row.
+    #[serde(deserialize_with = "nan_from_null")]
+    pub training_success: f64,
+    /// Share of the training episodes since the last row in which an object was displaced.
+    #[serde(deserialize_with = "nan_from_null")]
+    pub training_moved: f64,
+    /// Mean sum of joint rewards of the evaluation episodes.
+    #[serde(deserialize_with = "nan_from_null")]
+    pub mean_return: f64,
+    /// Evaluation episodes played.
+    pub n_episodes: u64,
+    /// Whether this is the best policy so far.
+    pub best: bool,
+}
+
+fn nan_from_null<'de, D: Deserializer<'de>>(deserializer: D) -> Result<f64, D::Error> {
+    Ok(Option::deserialize(deserializer)?.unwrap_or(f64::NAN))
+}
+
+/// The metrics file of a run, open for appending.
+#[derive(Debug)]
+pub struct MetricsLog {
+    path: PathBuf,
+    file: File,
+}
+
+impl MetricsLog {
+    /// Opens `path`, or creates it. A last line that a killed writer left half written is cut off, with a warning.
+    ///
+    /// # Errors
+    /// When the file cannot be opened or a whole line is no row.
+    pub fn open(path: &Path) -> Result<Self, Error> {
+        let file = OpenOptions::new()
+            .append(true)
+            .create(true)
+            .open(path)
+            .map_err(Error::io("open", path))?;
+        let log = Self { path: path.to_owned(), file };
+        let rows = Rows::read(path)?;
+        log.set_len(rows.whole_bytes())?;
+        Ok(log)
+    }
+
+    /// Adds a row.
+    ///
+    /// # Errors
+    /// When the file cannot be written.
+    pub fn append(&mut self, row: &MetricsRow) -> Result<(), Error> {
+        let write_error = Error::io("append to", &self.path);
+        let mut line = match serde_json::to_vec(row) {
+            Ok(line) => line,
+            Err(source) => return Err(write_error(source.into())),
+        };
+        line.push(b'\n');
+        self.file.write_all(&line).map_err(write_error)
+    }
+
+    /// Every row of the metrics file `path`; a half-written last line is left out, with a warning.
+    ///
+    /// # Errors
+    /// When the file cannot be read or a whole line is no row.
+    pub fn read_all(path: &Path) -> Result<Vec<MetricsRow>, Error> {
+        Ok(Rows::read(path)?.rows.into_iter().map(|(_, row)| row).collect())
+    }
+
+    /// Drops every row after `round`: a run that goes on from that round's checkpoint writes them anew.
+    ///
+    /// # Errors
+    /// When the file cannot be read or cut.
+    pub fn truncate_after(&mut self, round: u64) -> Result<(), Error> {
+        let kept =
+            Rows::read(&self.path)?.rows.into_iter().take_while(|(_, row)| row.round <= round);
+        self.set_len(kept.last().map_or(0, |(end, _)| end))
+    }
+
+    fn set_len(&self, n_bytes: usize) -> Result<(), Error> {
+        self.file.set_len(n_bytes as u64).map_err(Error::io("cut", &self.path))
+    }
+}
+
+/// The rows of a file, each with the offset of the byte after its line.
+struct Rows {
+    rows: Vec<(usize, MetricsRow)>,
+}
+
+impl Rows {
+    fn read(path: &Path) -> Result<Self, Error> {
+        let bytes = std::fs::read(path).map_err(Error::io("read", path))?;
+        let mut rows = Vec::new();
+        let mut end = 0;
+        for (line_idx, line) in bytes.split_inclusive(|byte| *byte == b'\n').enumerate() {
+            if !line.ends_with(b"\n") {
+                tracing::warn!(?path, line = line_idx + 1, "half-written metrics row left out");
+                break;
+            }
+            end += line.len();
+            let row = serde_json::from_slice(line);
+            rows.push((
+                end,
+                row.map_err(|source| Error::MetricsRow {
+                    path: path.to_owned(),
+                    line: line_idx + 1,
+                    source,
+                })?,
+            ));
+        }
+        Ok(Self { rows })
+    }
+
+    fn whole_bytes(&self) -> usize {
+        self.rows.last().map_or(0, |(end, _)| *end)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn row(round: u64) -> MetricsRow {
+        MetricsRow {
+            round,
+            success: 0.25,
+            success_per_arm: vec![0.5, 0.75],
+            critic_loss: 1.5,
+            ..MetricsRow::default()
+        }
+    }
+
+    fn rounds(path: &Path) -> Vec<u64> {
+        MetricsLog::read_all(path).unwrap().iter().map(|row| row.round).collect()
+    }
+
+    fn log_of(rounds: &[u64]) -> (tempfile::TempDir, PathBuf, MetricsLog) {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("metrics.jsonl");
+        let mut log = MetricsLog::open(&path).unwrap();
+        rounds.iter().for_each(|round| log.append(&row(*round)).unwrap());
+        (dir, path, log)
+    }
+
+    #[test]
+    fn rows_are_read_back_as_they_were() {
+        let (_dir, path, log) = log_of(&[5, 10]);
+        drop(log);
+        MetricsLog::open(&path).unwrap().append(&row(15)).unwrap();
+        assert_eq!(MetricsLog::read_all(&path).unwrap(), [row(5), row(10), row(15)]);
+    }
+
+    #[test]
+    fn a_number_that_does_not_exist_is_null_in_the_file_and_nan_again() {
+        let (_dir, path, mut log) = log_of(&[]);
+        log.append(&MetricsRow { mean_q: f64::NAN, ..row(5) }).unwrap();
+        assert!(std::fs::read_to_string(&path).unwrap().contains(r#""mean_q":null"#));
+        assert!(MetricsLog::read_all(&path).unwrap()[0].mean_q.is_nan());
+    }
+
+    #[test]
+    fn a_row_begins_with_the_keys_that_outsiders_rely_on() {
+        let text = serde_json::to_string(&row(5)).unwrap();
+        let keys = "round env_steps episodes updates paper_epochs wall_s success success_joint success_per_arm success_low \
+                    success_high collision_rate mean_q critic_loss actor_loss advice_spent budget_left";
+        let positions: Vec<_> =
+            keys.split_whitespace().map(|key| text.find(&format!("\"{key}\":")).unwrap()).collect();
+        assert!(positions.is_sorted(), "{text}");
+    }
+
+    #[test]
+    fn a_torn_last_line_is_dropped_at_every_length_and_never_glued_to_the_next() {
+        let (_dir, path, _) = log_of(&[5, 10]);
+        let whole = std::fs::read(&path).unwrap();
+        let first = whole.iter().position(|byte| *byte == b'\n').unwrap() + 1;
+        for n_bytes in [first + 1, first + 40, whole.len() - 1] {
+            std::fs::write(&path, &whole[..n_bytes]).unwrap();
+            assert_eq!(rounds(&path), [5]);
+            MetricsLog::open(&path).unwrap().append(&row(20)).unwrap();
+            assert_eq!(rounds(&path), [5, 20]);
+        }
+    }
+
+    #[test]
+    fn a_whole_line_that_is_no_row_is_an_error_that_names_it() {
+        let (_dir, path, _) = log_of(&[5]);
+        OpenOptions::new().append(true).open(&path).unwrap().write_all(b"{\"round\":\n").unwrap();
+        assert!(matches!(MetricsLog::read_all(&path), Err(Error::MetricsRow { line: 2, .. })));
+    }
+
+    #[test]
+    fn a_resumed_run_writes_the_rows_after_its_checkpoint_anew() {
+        let check = |round, expected: &[u64]| {
+            let (_dir, path, mut log) = log_of(&[5, 10, 15]);
+            log.truncate_after(round).unwrap();
+            log.append(&row(99)).unwrap();
+            assert_eq!(rounds(&path), expected);
+        };
+        check(4, &[99]);
+        check(12, &[5, 10, 99]);
+        check(15, &[5, 10, 15, 99]);
+    }
+}

@@ -1,0 +1,362 @@
+//! Writes one episode into one MCAP file.
+
+use std::collections::BTreeMap;
+use std::fs::File;
+use std::io::BufWriter;
+use std::marker::PhantomData;
+use std::path::{Path, PathBuf};
+
+use foxglove::Encode;
+use foxglove::messages::{FrameTransforms, JointStates, Log, SceneUpdate, Timestamp, log::Level};
+use mcap::records::{MessageHeader, Metadata};
+use tandem_core::layout::GOAL_TOLERANCE_M;
+use tandem_core::reward::{distance, sparse_reward};
+use tandem_core::scene::Scene;
+use tandem_core::{ArmAdvice, Contacts, Layout};
+
+use crate::error::Error;
+use crate::messages::{EpisodeMetadata, METADATA_NAME, pb};
+use crate::scene::{frame_transforms, joint_states, scene_update};
+
+/// Steps after which what was logged is on the disk even if the process dies.
+const FLUSH_EVERY_STEPS: u32 = 10;
+
+/// Topics of our own schemas; the recorder writes them and [`crate::read_episode`] looks for them.
+pub(crate) const TRANSITION_TOPIC: &str = "/transition";
+pub(crate) const OUTCOME_TOPIC: &str = "/outcome";
+
+/// One control step, as the recorder takes it.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct TransitionRecord<'a> {
+    /// The step, from 0.
+    pub step: u32,
+    /// Before the step, shape `[n_observation]`.
+    pub observation: &'a [f32],
+    /// Shape `[n_goal]`.
+    pub goal: &'a [f32],
+    /// As executed, in [−1, 1], shape `[n_action]`.
+    pub action: &'a [f32],
+    /// The joint reward.
+    pub reward: f32,
+    /// Each arm's own reward, shape `[n_arms]`.
+    pub rewards_per_arm: &'a [f32],
+    /// Bit `a` set when arm `a` executed the teacher's action.
+    pub advised_arms: u8,
+    /// What touched what during the step.
+    pub contacts: Contacts,
+    /// What the teacher said, arm by arm; empty when it was not asked.
+    pub advice: &'a [ArmAdvice],
+}
+
+/// Writes one episode into one MCAP file.
+///
+/// The file is called `NAME.mcap.part` until [`finish`](Self::finish) gives it its name, so a file without that
+/// ending is always whole. Message times are simulated time since the episode's start.
+pub struct EpisodeRecorder {
+    path: PathBuf,
+    part_path: PathBuf,
+    layout: Layout,
+    file: LogFile,
+    channels: Channels,
+    goal: Vec<f32>,
+    stats: pb::Stats,
+    time_ns: u64,
+}
+
+impl EpisodeRecorder {
+    /// Starts the log `path` of the episode that `metadata` describes; an unfinished one of that name is overwritten.
+    ///
+    /// # Errors
+    /// When the file cannot be written.
+    pub fn create(path: &Path, metadata: &EpisodeMetadata) -> Result<Self, Error> {
+        let part_path = part_path(path);
+        let file = File::create(&part_path).map_err(Error::io("create", &part_path))?;
+        let (file, channels) = start_log(file, metadata).map_err(Error::write_log(&part_path))?;
+        Ok(Self {
+            path: path.to_owned(),
+            part_path,
+            layout: metadata.layout,
+            file,
+            channels,
+            goal: Vec::new(),
+            stats: pb::Stats::default(),
+            time_ns: 0,
+        })
+    }
+
+    /// Logs one control step: the world before it and what was done.
+    ///
+    /// # Errors
+    /// When a vector does not fit the layout, or the file cannot be written.
+    pub fn record_step(
+        &mut self,
+        scene: &Scene,
+        transition: &TransitionRecord<'_>,
+    ) -> Result<(), Error> {
+        self.check_lengths(transition)?;
+        self.time_ns = nanoseconds(scene.time_s)?;
+        self.goal = transition.goal.to_vec();
+        self.count(scene, transition);
+        let caption = step_caption(&self.stats, transition);
+        self.write_step(scene, &caption, transition).map_err(Error::write_log(&self.part_path))
+    }
+
+    /// Logs the world and the observation after the last step, shape `[n_observation]`, and what they amount to.
+    ///
+    /// # Errors
+    /// When the observation does not fit the layout, or the file cannot be written.
+    pub fn record_outcome(&mut self, scene: &Scene, observation: &[f32]) -> Result<(), Error> {
+        check_length("observation", observation.len(), self.layout.n_observation())?;
+        self.time_ns = nanoseconds(scene.time_s)?;
+        self.stats.goal_distance_m = goal_distances_m(scene);
+        let outcome = self.outcome(observation);
+        let verdict = if outcome.success { "success" } else { "failure" };
+        let caption = format!("{verdict}\nreturn {:.0}", self.stats.episode_return);
+        self.write_outcome(scene, &caption, &outcome).map_err(Error::write_log(&self.part_path))
+    }
+
+    /// Adds a line to the episode's log channel, at the time of the latest step.
+    ///
+    /// # Errors
+    /// When the file cannot be written.
+    pub fn log(&mut self, message: &str) -> Result<(), Error> {
+        let entry = Log {
+            timestamp: Some(timestamp(self.time_ns)),
+            level: Level::Info.into(),
+            message: message.to_owned(),
+            name: "tandem".to_owned(),
+            ..Log::default()
+        };
+        self.channels
+            .log
+            .write(&mut self.file, self.time_ns, &entry)
+            .map_err(Error::write_log(&self.part_path))
+    }
+
+    /// Completes the file, gives it its name and returns that.
+    ///
+    /// # Errors
+    /// When the file cannot be written or renamed.
+    pub fn finish(mut self) -> Result<PathBuf, Error> {
+        self.file.writer.finish().map_err(Error::write_log(&self.part_path))?;
+        std::fs::rename(&self.part_path, &self.path)
+            .map_err(Error::io("rename", &self.part_path))?;
+        Ok(self.path)
+    }
+
+    fn check_lengths(&self, transition: &TransitionRecord<'_>) -> Result<(), Error> {
+        check_length("observation", transition.observation.len(), self.layout.n_observation())?;
+        check_length("goal", transition.goal.len(), self.layout.n_goal())?;
+        check_length("action", transition.action.len(), self.layout.n_action())?;
+        check_length("rewards_per_arm", transition.rewards_per_arm.len(), self.layout.n_arms)?;
+        if !transition.advice.is_empty() {
+            check_length("advice", transition.advice.len(), self.layout.n_arms)?;
+        }
+        Ok(())
+    }
+
+    fn count(&mut self, scene: &Scene, transition: &TransitionRecord<'_>) {
+        self.stats.step = transition.step;
+        self.stats.episode_return += f64::from(transition.reward);
+        self.stats.goal_distance_m = goal_distances_m(scene);
+        self.stats.advised_steps += u32::from(transition.advised_arms != 0);
+        self.stats.contact_steps += u32::from(transition.contacts.any());
+    }
+
+    fn outcome(&self, observation: &[f32]) -> pb::Outcome {
+        let at_goal = |arm| match self.goal.get(self.layout.goal_of(arm)) {
+            Some(goal) => {
+                sparse_reward(&observation[self.layout.achieved_goal_of(arm)], goal) > -0.5
+            }
+            None => false,
+        };
+        let success_per_arm: Vec<bool> = self.layout.arms().map(at_goal).collect();
+        pb::Outcome {
+            observation: observation.to_vec(),
+            success: success_per_arm.iter().all(|success| *success),
+            success_per_arm,
+            stats: Some(self.stats.clone()),
+        }
+    }
+
+    fn write_step(
+        &mut self,
+        scene: &Scene,
+        caption: &str,
+        step: &TransitionRecord<'_>,
+    ) -> mcap::McapResult<()> {
+        self.write_world(scene, caption)?;
+        self.channels.transition.write(&mut self.file, self.time_ns, &transition_message(step))?;
+        self.channels.stats.write(&mut self.file, self.time_ns, &self.stats)?;
+        if (step.step + 1).is_multiple_of(FLUSH_EVERY_STEPS) {
+            self.file.writer.flush()?;
+        }
+        Ok(())
+    }
+
+    fn write_outcome(
+        &mut self,
+        scene: &Scene,
+        caption: &str,
+        outcome: &pb::Outcome,
+    ) -> mcap::McapResult<()> {
+        self.write_world(scene, caption)?;
+        self.channels.outcome.write(&mut self.file, self.time_ns, outcome)?;
+        self.file.writer.flush()
+    }
+
+    fn write_world(&mut self, scene: &Scene, caption: &str) -> mcap::McapResult<()> {
+        let (file, now) = (&mut self.file, self.time_ns);
+        let stamp = timestamp(now);
+        self.channels.scene.write(file, now, &scene_update(scene, stamp, caption))?;
+        self.channels.tf.write(file, now, &frame_transforms(scene, stamp))?;
+        self.channels.joint_states.write(file, now, &joint_states(scene, stamp))
+    }
+}
+
+/// The name of `path` while it is being written.
+pub(crate) fn part_path(path: &Path) -> PathBuf {
+    let mut name = path.as_os_str().to_owned();
+    name.push(".part");
+    PathBuf::from(name)
+}
+
+/// The options of every log: no helper threads, as there are as many writers as episodes in flight.
+pub(crate) fn write_options() -> mcap::WriteOptions {
+    mcap::WriteOptions::new()
+        .compression(Some(mcap::Compression::Zstd))
+        .compression_level(0)
+        .compression_threads(0)
+        .library(concat!("tandem/", env!("CARGO_PKG_VERSION")))
+}
+
+/// Puts metadata and channels at the head of `file` and onto the disk.
+fn start_log(file: File, metadata: &EpisodeMetadata) -> mcap::McapResult<(LogFile, Channels)> {
+    let mut writer = write_options().create(BufWriter::new(file))?;
+    writer.write_metadata(&Metadata {
+        name: METADATA_NAME.to_owned(),
+        metadata: metadata.to_map(),
+    })?;
+    let mut file = LogFile { writer, buffer: Vec::new() };
+    let channels = Channels::open(&mut file)?;
+    file.writer.flush()?;
+    Ok((file, channels))
+}
+
+/// An MCAP writer and the buffer in which messages are encoded.
+struct LogFile {
+    writer: mcap::Writer<BufWriter<File>>,
+    buffer: Vec<u8>,
+}
+
+struct Channels {
+    scene: Channel<SceneUpdate>,
+    tf: Channel<FrameTransforms>,
+    joint_states: Channel<JointStates>,
+    log: Channel<Log>,
+    transition: Channel<pb::Transition>,
+    stats: Channel<pb::Stats>,
+    outcome: Channel<pb::Outcome>,
+}
+
+impl Channels {
+    fn open(file: &mut LogFile) -> mcap::McapResult<Self> {
+        Ok(Self {
+            scene: Channel::open(file, "/scene")?,
+            tf: Channel::open(file, "/tf")?,
+            joint_states: Channel::open(file, "/joint_states")?,
+            log: Channel::open(file, "/log")?,
+            transition: Channel::open(file, TRANSITION_TOPIC)?,
+            stats: Channel::open(file, "/stats")?,
+            outcome: Channel::open(file, OUTCOME_TOPIC)?,
+        })
+    }
+}
+
+/// A channel of one log.
+struct Channel<T> {
+    id: u16,
+    n_messages: u32,
+    message: PhantomData<T>,
+}
+
+impl<T: Encode> Channel<T> {
+    fn open(file: &mut LogFile, topic: &str) -> mcap::McapResult<Self> {
+        let schema_id = match T::get_schema() {
+            Some(schema) => file.writer.add_schema(&schema.name, &schema.encoding, &schema.data)?,
+            None => 0,
+        };
+        let id = file.writer.add_channel(
+            schema_id,
+            topic,
+            &T::get_message_encoding(),
+            &BTreeMap::new(),
+        )?;
+        Ok(Self { id, n_messages: 0, message: PhantomData })
+    }
+
+    fn write(&mut self, file: &mut LogFile, time_ns: u64, message: &T) -> mcap::McapResult<()> {
+        file.buffer.clear();
+        message
+            .encode(&mut file.buffer)
+            .map_err(|error| std::io::Error::other(error.to_string()))?;
+        let header = MessageHeader {
+            channel_id: self.id,
+            sequence: self.n_messages,
+            log_time: time_ns,
+            publish_time: time_ns,
+        };
+        self.n_messages += 1;
+        file.writer.write_to_known_channel(&header, &file.buffer)
+    }
+}
+
+fn transition_message(step: &TransitionRecord<'_>) -> pb::Transition {
+    pb::Transition {
+        step: step.step,
+        observation: step.observation.to_vec(),
+        goal: step.goal.to_vec(),
+        action: step.action.to_vec(),
+        reward: step.reward,
+        rewards_per_arm: step.rewards_per_arm.to_vec(),
+        advised_arms: u32::from(step.advised_arms),
+        contacts: u32::from(step.contacts.bits()),
+        advice: step.advice.iter().map(pb::ArmAdvice::from).collect(),
+    }
+}
+
+fn step_caption(stats: &pb::Stats, step: &TransitionRecord<'_>) -> String {
+    let n_reached =
+        stats.goal_distance_m.iter().filter(|distance_m| **distance_m <= GOAL_TOLERANCE_M).count();
+    format!(
+        "step {}   reward {:.0}\nat goal {n_reached} of {}\nadvised steps {}   contact steps {}",
+        stats.step,
+        step.reward,
+        stats.goal_distance_m.len(),
+        stats.advised_steps,
+        stats.contact_steps,
+    )
+}
+
+fn goal_distances_m(scene: &Scene) -> Vec<f32> {
+    scene
+        .objects
+        .iter()
+        .zip(&scene.goals)
+        .map(|(object, goal)| distance(&object.centre, goal))
+        .collect()
+}
+
+fn check_length(field: &'static str, got: usize, expected: usize) -> Result<(), Error> {
+    if got == expected { Ok(()) } else { Err(Error::Length { field, got, expected }) }
+}
+
+/// Simulated seconds as a log's nanoseconds.
+fn nanoseconds(time_s: f64) -> Result<u64, Error> {
+    let time = std::time::Duration::try_from_secs_f64(time_s).ok();
+    time.and_then(|time| u64::try_from(time.as_nanos()).ok()).ok_or(Error::Time { time_s })
+}
+
+fn timestamp(time_ns: u64) -> Timestamp {
+    Timestamp::saturating_from_epoch_secs_f64(time_ns as f64 * 1e-9)
+}

@@ -1,0 +1,118 @@
+//! Makes a whole file of what a killed writer left.
+
+use std::fs::File;
+use std::io::BufWriter;
+use std::path::{Path, PathBuf};
+
+use mcap::McapError;
+use mcap::records::Record;
+
+use crate::error::Error;
+use crate::recorder::write_options;
+use crate::records::Records;
+
+/// What [`recover`] saved.
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
+pub struct RecoveredCounts {
+    /// Messages of all channels.
+    pub messages: u64,
+    /// Metadata records.
+    pub metadata_records: u64,
+    /// Where the source ended, in the reader's words; `None` when it was whole.
+    pub ended_by: Option<String>,
+}
+
+/// Copies everything that is readable of `source`, up to the first damage, into the whole file `destination`.
+///
+/// Works for any MCAP file. `source` is left as it is; `destination` appears when it is complete, so a failure leaves
+/// nothing half done.
+///
+/// # Errors
+/// When `source` cannot be read or does not begin like an MCAP file, or `destination` cannot be written.
+pub fn recover(source: &Path, destination: &Path) -> Result<RecoveredCounts, Error> {
+    let bytes = std::fs::read(source).map_err(Error::io("read", source))?;
+    if !bytes.starts_with(mcap::MAGIC) {
+        return Err(Error::ReadLog { path: source.to_owned(), source: McapError::BadMagic });
+    }
+    let temporary = temporary_path(destination);
+    let file = File::create(&temporary).map_err(Error::io("create", &temporary))?;
+    let counts = copy_readable(&bytes, file).map_err(Error::write_log(&temporary))?;
+    std::fs::rename(&temporary, destination).map_err(Error::io("rename", &temporary))?;
+    Ok(counts)
+}
+
+/// Differs from the recorder's `.part`, which may well be the source.
+fn temporary_path(destination: &Path) -> PathBuf {
+    let mut name = destination.as_os_str().to_owned();
+    name.push(".recovering");
+    PathBuf::from(name)
+}
+
+fn copy_readable(bytes: &[u8], file: File) -> mcap::McapResult<RecoveredCounts> {
+    let mut copy = Copy {
+        writer: write_options().create(BufWriter::new(file))?,
+        counts: RecoveredCounts::default(),
+    };
+    copy.counts.ended_by = Some(McapError::UnexpectedEof.to_string());
+    for record in Records::of_rest(bytes) {
+        let refused = match record {
+            Ok(Record::DataEnd(_)) => {
+                copy.counts.ended_by = None;
+                break;
+            }
+            Ok(record) => copy.write(&record)?,
+            Err(damage) => Some(damage),
+        };
+        if let Some(damage) = refused {
+            copy.counts.ended_by = Some(damage.to_string());
+            break;
+        }
+    }
+    copy.writer.finish()?;
+    Ok(copy.counts)
+}
+
+/// The file that is being made whole.
+struct Copy {
+    writer: mcap::Writer<BufWriter<File>>,
+    counts: RecoveredCounts,
+}
+
+impl Copy {
+    /// Writes a record, or says why it cannot stand after those before it.
+    fn write(&mut self, record: &Record<'_>) -> mcap::McapResult<Option<McapError>> {
+        match self.try_write(record) {
+            Ok(()) => Ok(None),
+            Err(error @ (McapError::Io(_) | McapError::AttemptedWriteAfterFailure)) => Err(error),
+            Err(contradiction) => Ok(Some(contradiction)),
+        }
+    }
+
+    fn try_write(&mut self, record: &Record<'_>) -> mcap::McapResult<()> {
+        match record {
+            Record::Schema { header, data } => {
+                self.writer.add_schema_with_id(header.id, &header.name, &header.encoding, data)?;
+            }
+            Record::Channel(channel) => {
+                let (topic, encoding) = (&channel.topic, &channel.message_encoding);
+                self.writer.add_channel_with_id(
+                    channel.id,
+                    channel.schema_id,
+                    topic,
+                    encoding,
+                    &channel.metadata,
+                )?;
+            }
+            Record::Message { header, data } => {
+                self.writer.write_to_known_channel(header, data)?;
+                self.counts.messages += 1;
+            }
+            Record::Metadata(metadata) => {
+                self.writer.write_metadata(metadata)?;
+                self.counts.metadata_records += 1;
+            }
+            _ => {}
+        }
+        Ok(())
+    }
+}

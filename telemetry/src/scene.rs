@@ -1,0 +1,241 @@
+//! A world as Foxglove's messages: primitives for the 3D panel, frames, joint states.
+
+use foxglove::messages::{
+    Color, CubePrimitive, CylinderPrimitive, FrameTransform, FrameTransforms, JointState,
+    JointStates, Pose, Quaternion, SceneEntity, SceneUpdate, SpherePrimitive, TextPrimitive,
+    Timestamp, Vector3,
+};
+use tandem_core::layout::GOAL_TOLERANCE_M;
+use tandem_core::scene::{ArmScene, Capsule, Cuboid, Point, Scene};
+
+/// The frame in which everything is given.
+const WORLD: &str = "world";
+const NO_ROTATION: Quaternion = Quaternion { x: 0.0, y: 0.0, z: 0.0, w: 1.0 };
+const TABLE_COLOR: Color = rgb(0.82, 0.80, 0.77);
+const TEXT_COLOR: Color = rgb(0.15, 0.17, 0.20);
+/// One colour for each arm and what belongs to it; a further arm starts again.
+const ARM_COLORS: [Color; 3] =
+    [rgb(0.16, 0.44, 0.73), rgb(0.87, 0.46, 0.16), rgb(0.27, 0.60, 0.35)];
+
+/// Everything in `scene` and a caption. Each message is complete, so that a viewer may jump to any time.
+pub(crate) fn scene_update(scene: &Scene, stamp: Timestamp, caption: &str) -> SceneUpdate {
+    let entity = |id: String| SceneEntity {
+        timestamp: Some(stamp),
+        frame_id: WORLD.to_owned(),
+        id,
+        ..Default::default()
+    };
+    let table =
+        SceneEntity { cubes: vec![cube(&scene.table, TABLE_COLOR)], ..entity("table".to_owned()) };
+    let caption = SceneEntity {
+        texts: vec![caption_above(&scene.table, caption)],
+        ..entity("caption".to_owned())
+    };
+    let arms = scene
+        .arms
+        .iter()
+        .enumerate()
+        .map(|(i, arm)| arm_entity(arm, color_of(i), entity(format!("arm{i}"))));
+    let objects = scene.objects.iter().enumerate().map(|(i, object)| SceneEntity {
+        cubes: vec![cube(object, darker(color_of(i)))],
+        ..entity(format!("object{i}"))
+    });
+    let goals = scene.goals.iter().enumerate().map(|(i, goal)| SceneEntity {
+        spheres: vec![sphere(*goal, GOAL_TOLERANCE_M, Color { a: 0.35, ..color_of(i) })],
+        ..entity(format!("goal{i}"))
+    });
+    SceneUpdate {
+        deletions: Vec::new(),
+        entities: [table, caption].into_iter().chain(arms).chain(objects).chain(goals).collect(),
+    }
+}
+
+/// Frames `arm{i}/base` (x toward the middle of the table), `arm{i}/end_effector`, `object{i}` and `goal{i}`.
+pub(crate) fn frame_transforms(scene: &Scene, stamp: Timestamp) -> FrameTransforms {
+    let frame = |name: String, origin: Point, rotation: Quaternion| FrameTransform {
+        timestamp: Some(stamp),
+        parent_frame_id: WORLD.to_owned(),
+        child_frame_id: name,
+        translation: Some(vector(origin)),
+        rotation: Some(rotation),
+    };
+    let arms = scene.arms.iter().enumerate().flat_map(|(i, arm)| {
+        [
+            frame(format!("arm{i}/base"), arm.base, toward_the_middle(arm.base)),
+            frame(format!("arm{i}/end_effector"), arm.end_effector, NO_ROTATION),
+        ]
+    });
+    let objects = scene.objects.iter().enumerate();
+    let objects = objects.map(|(i, object)| {
+        frame(format!("object{i}"), object.centre, quaternion(object.orientation))
+    });
+    let goals = scene
+        .goals
+        .iter()
+        .enumerate()
+        .map(|(i, goal)| frame(format!("goal{i}"), *goal, NO_ROTATION));
+    FrameTransforms { transforms: arms.chain(objects).chain(goals).collect() }
+}
+
+/// Joints `arm{i}/joint{j}`, `j` from 1 as the arm's maker counts, radians.
+pub(crate) fn joint_states(scene: &Scene, stamp: Timestamp) -> JointStates {
+    let joints = scene.arms.iter().enumerate().flat_map(|(i, arm)| {
+        arm.joint_angles_rad.iter().enumerate().map(move |(joint_idx, angle_rad)| JointState {
+            name: format!("arm{i}/joint{}", joint_idx + 1),
+            position: Some(*angle_rad),
+            ..JointState::default()
+        })
+    });
+    JointStates { timestamp: Some(stamp), joints: joints.collect() }
+}
+
+fn arm_entity(arm: &ArmScene, color: Color, entity: SceneEntity) -> SceneEntity {
+    let ends =
+        arm.links.iter().flat_map(|link| [(link.from, link.radius_m), (link.to, link.radius_m)]);
+    SceneEntity {
+        cylinders: arm.links.iter().map(|link| cylinder(link, color)).collect(),
+        spheres: ends.map(|(end, radius_m)| sphere(end, radius_m, color)).collect(),
+        cubes: arm.hand.iter().map(|part| cube(part, darker(color))).collect(),
+        ..entity
+    }
+}
+
+fn caption_above(table: &Cuboid, text: &str) -> TextPrimitive {
+    let [x, y, z] = table.centre;
+    TextPrimitive {
+        pose: Some(Pose {
+            position: Some(vector([x, y, z + table.half_extents_m[2] + 0.85])),
+            orientation: Some(NO_ROTATION),
+        }),
+        billboard: true,
+        font_size: 18.0,
+        scale_invariant: true,
+        color: Some(TEXT_COLOR),
+        text: text.to_owned(),
+    }
+}
+
+fn cube(cuboid: &Cuboid, color: Color) -> CubePrimitive {
+    CubePrimitive {
+        pose: Some(Pose {
+            position: Some(vector(cuboid.centre)),
+            orientation: Some(quaternion(cuboid.orientation)),
+        }),
+        size: Some(vector(cuboid.half_extents_m.map(|half_m| 2.0 * half_m))),
+        color: Some(color),
+    }
+}
+
+fn sphere(centre: Point, radius_m: f32, color: Color) -> SpherePrimitive {
+    SpherePrimitive {
+        pose: Some(Pose { position: Some(vector(centre)), orientation: Some(NO_ROTATION) }),
+        size: Some(vector([2.0 * radius_m; 3])),
+        color: Some(color),
+    }
+}
+
+/// The straight part of a capsule: Foxglove's cylinders stand along their z axis.
+fn cylinder(capsule: &Capsule, color: Color) -> CylinderPrimitive {
+    let (from, to) = (capsule.from.map(f64::from), capsule.to.map(f64::from));
+    let axis: [f64; 3] = std::array::from_fn(|i| to[i] - from[i]);
+    let length_m = axis.iter().map(|x| x * x).sum::<f64>().sqrt();
+    let middle: [f64; 3] = std::array::from_fn(|i| 0.5 * (from[i] + to[i]));
+    let diameter_m = 2.0 * f64::from(capsule.radius_m);
+    CylinderPrimitive {
+        pose: Some(Pose {
+            position: Some(Vector3 { x: middle[0], y: middle[1], z: middle[2] }),
+            orientation: Some(from_z_to(axis.map(|x| x / length_m.max(f64::MIN_POSITIVE)))),
+        }),
+        size: Some(Vector3 { x: diameter_m, y: diameter_m, z: length_m }),
+        bottom_scale: 1.0,
+        top_scale: 1.0,
+        color: Some(color),
+    }
+}
+
+/// The shortest rotation from the z axis to `direction`, a unit vector (or zero, for no rotation).
+fn from_z_to(direction: [f64; 3]) -> Quaternion {
+    let [x, y, z] = direction;
+    let w = 1.0 + z;
+    if w < 1e-9 {
+        return Quaternion { x: 1.0, y: 0.0, z: 0.0, w: 0.0 };
+    }
+    let norm = (x * x + y * y + w * w).sqrt();
+    Quaternion { x: -y / norm, y: x / norm, z: 0.0, w: w / norm }
+}
+
+/// The turn about z that points x from `base` to the world's origin.
+fn toward_the_middle(base: Point) -> Quaternion {
+    let half_yaw_rad = 0.5 * f64::from(-base[1]).atan2(f64::from(-base[0]));
+    Quaternion { x: 0.0, y: 0.0, z: half_yaw_rad.sin(), w: half_yaw_rad.cos() }
+}
+
+fn vector(point: [f32; 3]) -> Vector3 {
+    let [x, y, z] = point.map(f64::from);
+    Vector3 { x, y, z }
+}
+
+fn quaternion(xyzw: [f32; 4]) -> Quaternion {
+    let [x, y, z, w] = xyzw.map(f64::from);
+    Quaternion { x, y, z, w }
+}
+
+const fn rgb(r: f64, g: f64, b: f64) -> Color {
+    Color { r, g, b, a: 1.0 }
+}
+
+const fn color_of(arm: usize) -> Color {
+    ARM_COLORS[arm % ARM_COLORS.len()]
+}
+
+const fn darker(color: Color) -> Color {
+    Color { r: 0.7 * color.r, g: 0.7 * color.g, b: 0.7 * color.b, a: color.a }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// `rotation` applied to the z axis.
+    fn turned_z(q: Quaternion) -> [f64; 3] {
+        [
+            2.0 * (q.x * q.z + q.w * q.y),
+            2.0 * (q.y * q.z - q.w * q.x),
+            1.0 - 2.0 * (q.x * q.x + q.y * q.y),
+        ]
+    }
+
+    #[test]
+    fn a_cylinder_stands_along_its_capsule() {
+        let check = |from: Point, to: Point, direction: [f64; 3]| {
+            let drawn = cylinder(&Capsule { from, to, radius_m: 0.04 }, TABLE_COLOR);
+            let pose = drawn.pose.unwrap();
+            let turned = turned_z(pose.orientation.unwrap());
+            assert!(
+                turned.iter().zip(direction).all(|(a, b)| (a - b).abs() < 1e-6),
+                "{turned:?} {direction:?}"
+            );
+            let size = drawn.size.unwrap();
+            assert!((size.z - 0.5).abs() < 1e-6 && (size.x - 0.08).abs() < 1e-6);
+        };
+        check([0.0; 3], [0.0, 0.0, 0.5], [0.0, 0.0, 1.0]);
+        check([0.0; 3], [0.0, 0.0, -0.5], [0.0, 0.0, -1.0]);
+        check([1.0, 2.0, 3.0], [1.5, 2.0, 3.0], [1.0, 0.0, 0.0]);
+        check([0.0; 3], [0.3, -0.4, 0.0], [0.6, -0.8, 0.0]);
+    }
+
+    #[test]
+    fn a_point_like_capsule_has_finite_numbers() {
+        let drawn =
+            cylinder(&Capsule { from: [1.0; 3], to: [1.0; 3], radius_m: 0.04 }, TABLE_COLOR);
+        let q = drawn.pose.unwrap().orientation.unwrap();
+        assert!([q.x, q.y, q.z, q.w].iter().all(|x| x.is_finite()));
+    }
+
+    #[test]
+    fn the_second_arms_base_faces_the_first() {
+        let q = toward_the_middle([0.52, 0.0, 0.0]);
+        let x_axis = [1.0 - 2.0 * q.z * q.z, 2.0 * q.w * q.z];
+        assert!((x_axis[0] + 1.0).abs() < 1e-9 && x_axis[1].abs() < 1e-9, "{x_axis:?}");
+    }
+}

@@ -1,0 +1,208 @@
+//! An episode's log: written, read back, cut short, mended.
+#![expect(clippy::unwrap_used, reason = "a test that cannot go on may end")]
+
+use std::path::Path;
+
+use tandem_telemetry::{
+    EpisodeLog, EpisodeRecorder, Error, LoggedTransition, read_episode, recover,
+};
+
+#[path = "support/synthetic.rs"]
+mod synthetic;
+
+/// What every MCAP file begins with.
+const MAGIC_BYTES: usize = 8;
+
+/// Every number of a step as bits, so that NaN and −0 count too.
+fn bits(step: &LoggedTransition) -> Vec<u32> {
+    let vectors = [&step.observation, &step.goal, &step.action, &step.rewards_per_arm];
+    vectors.into_iter().flatten().chain([&step.reward]).map(|number| number.to_bits()).collect()
+}
+
+fn written() -> (tempfile::TempDir, Vec<u8>) {
+    let dir = tempfile::tempdir().unwrap();
+    let path = synthetic::write_log(&dir.path().join("whole.mcap")).unwrap();
+    let bytes = std::fs::read(path).unwrap();
+    (dir, bytes)
+}
+
+/// Writes `bytes` as if a killed writer had left them, mends them, and reads what comes out.
+fn mended(dir: &Path, bytes: &[u8]) -> Result<(u64, Result<EpisodeLog, Error>), Error> {
+    let (source, destination) = (dir.join("cut.mcap.part"), dir.join("cut.mcap"));
+    std::fs::write(&source, bytes).unwrap();
+    let counts = recover(&source, &destination)?;
+    Ok((counts.messages, read_episode(&destination)))
+}
+
+#[test]
+fn an_episode_is_read_back_bit_for_bit() {
+    let dir = tempfile::tempdir().unwrap();
+    let mut steps = synthetic::transitions();
+    steps[3].observation[5] = f32::NAN;
+    steps[4].action[0] = -0.0;
+    steps[5].reward = f32::MIN_POSITIVE / 2.0;
+    let mut recorder =
+        EpisodeRecorder::create(&dir.path().join("e.mcap"), &synthetic::metadata()).unwrap();
+    for (step, transition) in (0..).zip(&steps) {
+        recorder
+            .record_step(
+                &synthetic::scene(0.02 * step as f32),
+                &synthetic::record(step, transition),
+            )
+            .unwrap();
+    }
+    recorder.record_outcome(&synthetic::scene(1.0), &synthetic::last_observation()).unwrap();
+    let log = read_episode(&recorder.finish().unwrap()).unwrap();
+    assert_eq!(log.metadata, synthetic::metadata());
+    assert_eq!(log.last_observation, Some(synthetic::last_observation()));
+    assert_eq!(
+        log.transitions.iter().map(bits).collect::<Vec<_>>(),
+        steps.iter().map(bits).collect::<Vec<_>>()
+    );
+    let words = |step: &LoggedTransition| (step.advised_arms, step.contacts, step.advice.clone());
+    assert_eq!(
+        log.transitions.iter().map(words).collect::<Vec<_>>(),
+        steps.iter().map(words).collect::<Vec<_>>()
+    );
+}
+
+#[test]
+fn the_same_episode_gives_the_same_bytes() {
+    assert_eq!(written().1, written().1);
+}
+
+#[test]
+fn a_file_has_its_name_only_when_it_is_whole() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("e.mcap");
+    let recorder = synthetic::recorded(&path).unwrap();
+    assert!(!path.exists() && dir.path().join("e.mcap.part").exists());
+    assert_eq!(recorder.finish().unwrap(), path);
+    assert!(path.exists() && !dir.path().join("e.mcap.part").exists());
+}
+
+#[test]
+fn a_killed_writer_loses_at_most_the_last_steps() {
+    let dir = tempfile::tempdir().unwrap();
+    let mut recorder =
+        EpisodeRecorder::create(&dir.path().join("e.mcap"), &synthetic::metadata()).unwrap();
+    for (step, transition) in (0..37).zip(&synthetic::transitions()) {
+        recorder.record_step(&synthetic::scene(0.0), &synthetic::record(step, transition)).unwrap();
+    }
+    // What is on the disk at this moment is what a kill would leave.
+    let on_disk = std::fs::read(dir.path().join("e.mcap.part")).unwrap();
+    let (_, log) = mended(dir.path(), &on_disk).unwrap();
+    let log = log.unwrap();
+    assert!((30..=37).contains(&log.transitions.len()), "{}", log.transitions.len());
+    assert_eq!(log.transitions, synthetic::transitions()[..log.transitions.len()]);
+}
+
+#[test]
+fn a_file_cut_anywhere_is_mended_and_more_bytes_never_mean_less() {
+    let (dir, bytes) = written();
+    let mut best = 0;
+    for n_bytes in (MAGIC_BYTES..bytes.len()).step_by(307).chain([bytes.len() - 1, bytes.len()]) {
+        let (n_messages, log) = mended(dir.path(), &bytes[..n_bytes]).unwrap();
+        assert!(
+            n_messages >= best,
+            "{n_bytes} bytes gave {n_messages} messages, fewer gave {best}"
+        );
+        best = n_messages;
+        match log {
+            Ok(log) => {
+                assert!(log.transitions == synthetic::transitions()[..log.transitions.len()]);
+            }
+            Err(error) => {
+                assert!(matches!(error, Error::NotAnEpisode { .. }) && n_messages == 0, "{error:?}");
+            }
+        }
+    }
+    assert_eq!(best, 51 * 3 + 50 * 2 + 2);
+}
+
+#[test]
+fn a_damaged_file_is_refused_and_mending_it_never_panics() {
+    let (dir, bytes) = written();
+    for offset in (0..120).chain((120..bytes.len()).step_by(307)) {
+        let mut damaged = bytes.clone();
+        damaged[offset] ^= 0x5a;
+        let path = dir.path().join("damaged.mcap");
+        std::fs::write(&path, &damaged).unwrap();
+        assert!(read_episode(&path).is_err(), "byte {offset}");
+        let mended = mended(dir.path(), &damaged);
+        assert_eq!(mended.is_ok(), offset >= MAGIC_BYTES, "byte {offset}");
+        if let Ok((_, Ok(log))) = mended {
+            assert!(
+                log.transitions == synthetic::transitions()[..log.transitions.len()],
+                "byte {offset}"
+            );
+        }
+    }
+}
+
+#[test]
+fn what_is_no_log_of_an_episode_is_refused_in_one_sentence() {
+    let (dir, bytes) = written();
+    let path = dir.path().join("other.mcap");
+    let refusal = |content: &[u8]| {
+        std::fs::write(&path, content).unwrap();
+        read_episode(&path).unwrap_err().to_string()
+    };
+    for content in
+        [&b""[..], b"not an mcap file at all", &bytes[..bytes.len() / 2], &bytes[..bytes.len() - 3]]
+    {
+        assert!(refusal(content).contains("not a whole MCAP file"), "{}", refusal(content));
+    }
+    assert!(matches!(recover(&path, &dir.path().join("x")), Ok(_) | Err(Error::ReadLog { .. })));
+    assert!(matches!(
+        read_episode(&dir.path().join("absent")),
+        Err(Error::Io { action: "read", .. })
+    ));
+}
+
+#[test]
+fn garbage_is_not_mended_into_an_empty_file() {
+    let dir = tempfile::tempdir().unwrap();
+    std::fs::write(dir.path().join("garbage"), b"garbage").unwrap();
+    let destination = dir.path().join("mended.mcap");
+    assert!(matches!(
+        recover(&dir.path().join("garbage"), &destination),
+        Err(Error::ReadLog { .. })
+    ));
+    assert!(!destination.exists());
+}
+
+#[test]
+fn vectors_that_do_not_fit_the_layout_are_refused() {
+    let dir = tempfile::tempdir().unwrap();
+    let mut recorder =
+        EpisodeRecorder::create(&dir.path().join("e.mcap"), &synthetic::metadata()).unwrap();
+    let step = &synthetic::transitions()[0];
+    let scene = synthetic::scene(0.0);
+    let mut check = |field: &str, spoil: &dyn Fn(&mut LoggedTransition)| {
+        let mut spoilt = step.clone();
+        spoil(&mut spoilt);
+        let error = recorder.record_step(&scene, &synthetic::record(0, &spoilt)).unwrap_err();
+        assert!(error.to_string().starts_with(field), "{error}");
+    };
+    check("observation", &|step| step.observation.truncate(28));
+    check("goal", &|step| step.goal.push(0.0));
+    check("action", &|step| step.action.push(0.0));
+    check("rewards_per_arm", &|step| step.rewards_per_arm.clear());
+    check("advice", &|step| step.advice.truncate(1));
+}
+
+#[test]
+fn time_before_the_start_is_refused() {
+    let dir = tempfile::tempdir().unwrap();
+    let mut recorder =
+        EpisodeRecorder::create(&dir.path().join("e.mcap"), &synthetic::metadata()).unwrap();
+    for time_s in [-0.1, f64::NAN, f64::INFINITY] {
+        let scene = tandem_core::scene::Scene { time_s, ..synthetic::scene(0.0) };
+        let step = &synthetic::transitions()[0];
+        assert!(matches!(
+            recorder.record_step(&scene, &synthetic::record(0, step)),
+            Err(Error::Time { .. })
+        ));
+    }
+}

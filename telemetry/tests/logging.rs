@@ -1,0 +1,39 @@
+//! Where log lines go. One test, because a process sets up logging once.
+
+use std::path::Path;
+
+use tandem_telemetry::Error;
+use tandem_telemetry::events::{BudgetExhausted, ParametersPublished, Reconnecting};
+use tandem_telemetry::logging::{LogConfig, init};
+
+#[test]
+fn the_log_file_gets_events_from_info_up_with_their_fields() {
+    let dir = tempfile::tempdir().expect("a place for the log");
+    let file = dir.path().join("tandem.log");
+    let config = LogConfig { file: Some(file.clone()), ..LogConfig::default() };
+    let malformed = LogConfig { directives: Some("tandem=loud".to_owned()), ..config.clone() };
+    assert!(matches!(init(&malformed), Err(Error::LogFilter { .. })));
+    let nowhere = LogConfig {
+        file: Some(Path::new("/nowhere/tandem.log").to_owned()),
+        ..LogConfig::default()
+    };
+    assert!(matches!(init(&nowhere), Err(Error::Io { action: "open", .. })));
+
+    init(&config).expect("first set-up");
+    assert!(matches!(init(&config), Err(Error::LoggingTwice(_))));
+    BudgetExhausted { account: "run-7", budget: 500 }.emit();
+    Reconnecting { peer: "learner", attempt: 2, wait_millis: 400, reason: "refused" }.emit();
+    ParametersPublished { version: 3 }.emit();
+
+    let text = std::fs::read_to_string(&file).expect("the log");
+    let lines: Vec<&str> = text.lines().collect();
+    assert_eq!(lines.len(), 2, "{text}");
+    assert!(
+        lines[0].contains("INFO")
+            && lines[0].contains("advice budget exhausted account=\"run-7\" budget=500")
+    );
+    assert!(
+        lines[1].contains("WARN") && lines[1].contains("reconnecting peer=\"learner\" attempt=2")
+    );
+    assert!(!text.contains('\u{1b}'), "no colours in a file");
+}

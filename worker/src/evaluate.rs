@@ -1,0 +1,140 @@
+//! Plays a fixed set of evaluation episodes: no exploration, no advice, any number of threads.
+
+use std::num::NonZeroUsize;
+
+use tandem_core::layout::Layout;
+use tandem_core::work::{EpisodeOrder, Exploration, RunTerms, SlotOrder, WorldTerms};
+use tandem_core::{Episode, EpisodeKind};
+use tandem_sim::{Env, WorldConfig};
+
+use crate::ports::{Act, NoAdvisor, World};
+use crate::rollout::{RolloutError, play_slot};
+
+/// The composed teachers `f^a(π_tr(ŝ_1), π_tr(ŝ_2))`: a policy for one arm that acts for every arm of a layout.
+///
+/// Each arm's numbers stand together and in the arm's own frame, so a row of the layout's vectors is `n_arms` rows of
+/// the policy's.
+#[derive(Debug, Clone)]
+pub struct ComposedTeachers<A>(pub A);
+
+impl<A: Act> Act for ComposedTeachers<A> {
+    fn act(&mut self, observations: &[f32], goals: &[f32], actions: &mut [f32]) {
+        self.0.act(observations, goals, actions);
+    }
+}
+
+/// Plays `n_episodes` episodes, numbered from 0, whose starts and goals `seed` fixes; returns them by number.
+///
+/// Each of `n_threads` threads has an actor and a world of its own; the result does not depend on their number.
+///
+/// # Errors
+/// When a world cannot be built or breaks.
+pub fn evaluate<A: Act>(
+    make_actor: impl Fn() -> A + Sync,
+    layout: Layout,
+    world: &WorldConfig,
+    n_episodes: u64,
+    seed: u64,
+    n_threads: NonZeroUsize,
+) -> Result<Vec<Episode>, RolloutError> {
+    let world = Env::new(layout, world).map_err(RolloutError::NoWorld)?;
+    evaluate_in(&world, make_actor, layout, n_episodes, seed, n_threads)
+}
+
+fn evaluate_in<W: World + Sync, A: Act>(
+    world: &W,
+    make_actor: impl Fn() -> A + Sync,
+    layout: Layout,
+    n_episodes: u64,
+    seed: u64,
+    n_threads: NonZeroUsize,
+) -> Result<Vec<Episode>, RolloutError> {
+    let numbers: Vec<u64> = (0..n_episodes).collect();
+    let n_per_thread = numbers.len().div_ceil(n_threads.get()).max(1);
+    let play = |numbers: &[u64]| {
+        let mut actor = make_actor();
+        let play_one = |number: &u64| play_alone(world, &mut actor, layout, seed, *number);
+        numbers.iter().map(play_one).collect::<Result<Vec<Episode>, RolloutError>>()
+    };
+    let parts: Vec<_> = std::thread::scope(|scope| {
+        let threads: Vec<_> =
+            numbers.chunks(n_per_thread).map(|part| scope.spawn(|| play(part))).collect();
+        threads
+            .into_iter()
+            .map(|thread| thread.join().expect("a panicking rollout is a bug"))
+            .collect()
+    });
+    parts.into_iter().collect::<Result<Vec<_>, _>>().map(|parts| parts.concat())
+}
+
+fn play_alone<W: World>(
+    world: &W,
+    actor: &mut impl Act,
+    layout: Layout,
+    seed: u64,
+    number: u64,
+) -> Result<Episode, RolloutError> {
+    let order = EpisodeOrder { number, seed, advised: false, uniform: false, record: false };
+    let slot = SlotOrder {
+        slot: 0,
+        parameter_version: 0,
+        kind: EpisodeKind::Evaluation,
+        episodes: vec![order],
+    };
+    let mut episodes = play_slot(world, &slot, &evaluation_terms(layout), actor, &mut NoAdvisor)?;
+    Ok(episodes.remove(0))
+}
+
+/// Terms of which an evaluation uses the layout alone; the world is built already.
+fn evaluation_terms(layout: Layout) -> RunTerms {
+    RunTerms {
+        layout,
+        account: None,
+        exploration: Exploration { noise_std: 0.0, random_share: 0.0, random_hold_mean_steps: 1.0 },
+        world: WorldTerms { gripped_start_share: 0.0, wide_start_share: 0.0, substeps: 0 },
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::fake::{FakeActor, FakeWorld, LAYOUT};
+
+    fn evaluate_fake(n_episodes: u64, seed: u64, n_threads: usize) -> Vec<Episode> {
+        let n_threads = NonZeroUsize::new(n_threads).expect("1 or more");
+        evaluate_in(&FakeWorld::new(), || FakeActor::Seeker, LAYOUT, n_episodes, seed, n_threads)
+            .expect("nothing breaks")
+    }
+
+    #[test]
+    fn the_number_of_threads_changes_nothing() {
+        let alone = evaluate_fake(7, 5, 1);
+        assert_eq!(
+            alone.iter().map(|episode| episode.number).collect::<Vec<_>>(),
+            [0, 1, 2, 3, 4, 5, 6]
+        );
+        for n_threads in [2, 3, 7, 16] {
+            assert_eq!(evaluate_fake(7, 5, n_threads), alone, "{n_threads} threads");
+        }
+        assert_eq!(
+            evaluate_fake(3, 5, 2),
+            alone[..3],
+            "a smaller set is the beginning of a larger one"
+        );
+        assert_ne!(evaluate_fake(7, 6, 1)[0].goal, alone[0].goal, "another seed has other goals");
+        assert!(evaluate_fake(0, 5, 2).is_empty());
+    }
+
+    #[test]
+    fn composed_teachers_give_each_arm_its_own_teacher() {
+        let (mut observations, mut goals) = (vec![0.0; 2 * 56], vec![0.0; 2 * 6]);
+        for (row, value) in [0.1, 0.2, 0.3, 0.4].into_iter().enumerate() {
+            observations[28 * row] = value;
+            goals[3 * row] = 0.5;
+        }
+        let mut actions = vec![9.0; 2 * 6];
+        ComposedTeachers(FakeActor::Seeker).act(&observations, &goals, &mut actions);
+        let first_components: Vec<f32> = actions.chunks(3).map(|arm| arm[0]).collect();
+        assert_eq!(first_components, [0.5 - 0.1, 0.5 - 0.2, 0.5 - 0.3, 0.5 - 0.4]);
+    }
+}

@@ -1,0 +1,215 @@
+//! How a training episode explores: Gaussian noise on every action, and random actions that are held for a while.
+//!
+//! A random action that lasts one step hardly moves a hand; held for some steps it carries the hand to new places
+//! and objects with it.
+
+use rand_chacha::ChaCha8Rng;
+use tandem_core::layout::Layout;
+use tandem_core::rng::{coin, standard_normal, uniform};
+use tandem_core::work::Exploration;
+
+/// The exploration of one episode.
+///
+/// Every step draws the same numbers whatever they are used for, so neither advice nor a held action shifts what
+/// the following steps draw.
+#[derive(Debug, Clone)]
+pub struct Explorer {
+    layout: Layout,
+    noise_std: f32,
+    hold_mean_steps: f32,
+    start_probability: f32,
+    held: Vec<HeldAction>,
+    rng: ChaCha8Rng,
+}
+
+/// A random action of one arm and how long it still lasts.
+#[derive(Debug, Clone)]
+struct HeldAction {
+    n_steps_left: u32,
+    action: Vec<f32>,
+}
+
+impl Explorer {
+    /// Exploration by `settings`, drawing from `rng`.
+    #[must_use]
+    pub fn new(layout: Layout, settings: Exploration, rng: ChaCha8Rng) -> Self {
+        let idle = HeldAction { n_steps_left: 0, action: vec![0.0; layout.task.action_per_arm()] };
+        Self {
+            layout,
+            noise_std: settings.noise_std,
+            hold_mean_steps: settings.random_hold_mean_steps,
+            start_probability: start_probability(
+                settings.random_share,
+                settings.random_hold_mean_steps,
+            ),
+            held: vec![idle; layout.n_arms],
+            rng,
+        }
+    }
+
+    /// Exploration of a warm-up: every step of every arm takes a random action.
+    #[must_use]
+    pub fn uniform(layout: Layout, settings: Exploration, rng: ChaCha8Rng) -> Self {
+        Self::new(layout, Exploration { random_share: 1.0, ..settings }, rng)
+    }
+
+    /// Turns the policy's action into what is to be executed, shape `[n_action]`, in [−1, 1].
+    pub fn explore(&mut self, action: &mut [f32]) {
+        for arm in self.layout.arms() {
+            self.held[arm.0].advance(&mut self.rng, self.start_probability, self.hold_mean_steps);
+            self.explore_arm(arm.0, &mut action[self.layout.action_of(arm)]);
+        }
+    }
+
+    fn explore_arm(&mut self, arm_idx: usize, action: &mut [f32]) {
+        for component in &mut *action {
+            *component =
+                (*component + self.noise_std * standard_normal(&mut self.rng)).clamp(-1.0, 1.0);
+        }
+        let held = &self.held[arm_idx];
+        if held.n_steps_left > 0 {
+            action.copy_from_slice(&held.action);
+        }
+    }
+}
+
+impl HeldAction {
+    /// Goes on by one step: an action whose time is over may be followed by a new one.
+    fn advance(&mut self, rng: &mut ChaCha8Rng, start_probability: f32, hold_mean_steps: f32) {
+        let starts = coin(rng, start_probability);
+        let n_steps = hold_steps(uniform(rng, 0.0, 1.0), hold_mean_steps);
+        let free = self.n_steps_left <= 1;
+        self.n_steps_left = match (free, starts) {
+            (true, true) => n_steps,
+            (true, false) => 0,
+            (false, _) => self.n_steps_left - 1,
+        };
+        for component in &mut self.action {
+            let drawn = uniform(rng, -1.0, 1.0);
+            if free && starts {
+                *component = drawn;
+            }
+        }
+    }
+}
+
+/// The probability of a start, on a step that is free for one, with which `share` of all steps become random when
+/// each start takes `hold_mean_steps` steps on average.
+fn start_probability(share: f32, hold_mean_steps: f32) -> f32 {
+    share / (hold_mean_steps * (1.0 - share) + share)
+}
+
+/// A length in `1..=2 · mean − 1`, each equally likely, from a draw in [0, 1).
+#[expect(
+    clippy::cast_possible_truncation,
+    clippy::cast_sign_loss,
+    reason = "rounds a number that is not negative down"
+)]
+fn hold_steps(draw: f32, mean_steps: f32) -> u32 {
+    ((draw * (2.0 * mean_steps - 1.0)) as u32).saturating_add(1)
+}
+
+#[cfg(test)]
+mod tests {
+    use tandem_core::layout::Task;
+    use tandem_core::rng::{Stream, episode_rng};
+
+    use super::*;
+
+    const LAYOUT: Layout = Layout::new(Task::Push, 2);
+    const SETTINGS: Exploration =
+        Exploration { noise_std: 0.0, random_share: 0.3, random_hold_mean_steps: 4.0 };
+    /// What the policy does in these tests; no random action equals it.
+    const POLICY_ACTION: [f32; 6] = [0.5; 6];
+
+    /// The actions of `arm_idx` over one long episode.
+    fn arm_actions(mut explorer: Explorer, n_steps: usize, arm_idx: usize) -> Vec<[f32; 3]> {
+        let step = |_| {
+            let mut action = POLICY_ACTION;
+            explorer.explore(&mut action);
+            [action[3 * arm_idx], action[3 * arm_idx + 1], action[3 * arm_idx + 2]]
+        };
+        (0..n_steps).map(step).collect()
+    }
+
+    fn rng(number: u64) -> ChaCha8Rng {
+        episode_rng(3, number, Stream::Exploration)
+    }
+
+    #[test]
+    fn random_actions_take_their_share_of_steps_and_are_held_as_long_as_told() {
+        for arm_idx in 0..2 {
+            let actions = arm_actions(Explorer::new(LAYOUT, SETTINGS, rng(0)), 40_000, arm_idx);
+            let n_random = actions.iter().filter(|action| **action != POLICY_ACTION[..3]).count();
+            let holds: Vec<usize> = actions
+                .chunk_by(|a, b| a == b)
+                .filter(|run| run[0] != POLICY_ACTION[..3])
+                .map(<[_]>::len)
+                .collect();
+            let mean_steps = n_random as f32 / holds.len() as f32;
+            let share = n_random as f32 / actions.len() as f32;
+            assert!((share - 0.3).abs() < 0.02, "share {share}");
+            assert!((mean_steps - 4.0).abs() < 0.1, "mean hold {mean_steps}");
+            assert_eq!((holds.iter().min(), holds.iter().max()), (Some(&1), Some(&7)));
+        }
+    }
+
+    #[test]
+    fn the_share_holds_within_episodes_of_fifty_steps() {
+        let n_random: usize = (0..2_000)
+            .flat_map(|number| arm_actions(Explorer::new(LAYOUT, SETTINGS, rng(number)), 50, 1))
+            .filter(|action| *action != POLICY_ACTION[..3])
+            .count();
+        let share = n_random as f32 / 100_000.0;
+        assert!((share - 0.3).abs() < 0.02, "share {share}");
+    }
+
+    #[test]
+    fn the_arms_draw_their_random_actions_apart() {
+        let random_steps = |arm_idx| {
+            let actions = arm_actions(Explorer::new(LAYOUT, SETTINGS, rng(0)), 2_000, arm_idx);
+            actions.iter().map(|action| *action != POLICY_ACTION[..3]).collect::<Vec<_>>()
+        };
+        let both = random_steps(0)
+            .iter()
+            .zip(random_steps(1))
+            .filter(|(first, second)| **first && *second)
+            .count();
+        assert!((120..240).contains(&both), "{both} of 2,000 steps, 180 expected when independent");
+    }
+
+    #[test]
+    fn a_warm_up_takes_random_actions_only_and_no_share_takes_none() {
+        let all_random = arm_actions(Explorer::uniform(LAYOUT, SETTINGS, rng(0)), 500, 0);
+        assert!(all_random.iter().all(|action| *action != POLICY_ACTION[..3]));
+        let none = Exploration { random_share: 0.0, ..SETTINGS };
+        let policy_only = arm_actions(Explorer::new(LAYOUT, none, rng(0)), 500, 0);
+        assert!(policy_only.iter().all(|action| *action == POLICY_ACTION[..3]));
+    }
+
+    #[test]
+    fn noise_has_its_deviation_and_stays_within_bounds() {
+        let settings =
+            Exploration { noise_std: 0.2, random_share: 0.0, random_hold_mean_steps: 1.0 };
+        let actions = arm_actions(Explorer::new(LAYOUT, settings, rng(0)), 20_000, 0);
+        let offsets: Vec<f32> = actions.iter().map(|action| action[0] - 0.5).collect();
+        let std = (offsets.iter().map(|offset| offset * offset).sum::<f32>() / 20_000.0).sqrt();
+        assert!((std - 0.2).abs() < 0.01, "deviation {std}");
+        assert!(actions.iter().flatten().all(|component| (-1.0..=1.0).contains(component)));
+    }
+
+    #[test]
+    fn what_is_executed_does_not_shift_the_draws() {
+        let settings = Exploration { noise_std: 0.2, ..SETTINGS };
+        let mut undisturbed = Explorer::new(LAYOUT, settings, rng(0));
+        let mut disturbed = undisturbed.clone();
+        for _ in 0..30 {
+            undisturbed.explore(&mut [0.0; 6]);
+            disturbed.explore(&mut [-1.0; 6]);
+        }
+        let (mut here, mut there) = (POLICY_ACTION, POLICY_ACTION);
+        undisturbed.explore(&mut here);
+        disturbed.explore(&mut there);
+        assert_eq!(here, there);
+    }
+}

@@ -1,0 +1,235 @@
+//! Logs of single episodes, and the worlds in which logged episodes are played again.
+//!
+//! An episode is logged after it was played, by playing its actions once more: the simulator repeats itself bit for
+//! bit, which every log proves again.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::str::FromStr;
+
+use tandem_core::layout::EPISODE_STEPS;
+use tandem_core::reward::sparse_reward;
+use tandem_core::rng::{Stream, episode_rng};
+use tandem_core::work::{EpisodeOrder, RunTerms, WorldTerms};
+use tandem_core::{Episode, EpisodeKind};
+use tandem_sim::{Env, SimError, WorldConfig};
+use tandem_telemetry::{EpisodeMetadata, EpisodeRecorder, TransitionRecord};
+
+use crate::rollout::starts;
+
+// Names under which a log's metadata keep the world's set-up.
+const SUBSTEPS: &str = "substeps";
+const GRIPPED_START_SHARE: &str = "gripped_start_share";
+const WIDE_START_SHARE: &str = "wide_start_share";
+
+/// Why an episode has no log or a log has no world.
+#[derive(Debug, thiserror::Error)]
+pub enum RecordError {
+    /// The world cannot be built or broke.
+    #[error(transparent)]
+    World(#[from] SimError),
+    /// The log cannot be written.
+    #[error(transparent)]
+    Log(#[from] tandem_telemetry::Error),
+    /// Played again, the episode took another course.
+    #[error("episode {episode}, played again, differs before step {step}")]
+    Diverged {
+        /// The episode's number.
+        episode: u64,
+        /// The first step before which the observation is another one; 0 is the start.
+        step: usize,
+    },
+    /// The log's metadata do not describe a world.
+    #[error("metadata entry {key:?} of the world is {got:?}, expected a number")]
+    Metadata {
+        /// The entry.
+        key: &'static str,
+        /// Its value, if there is one.
+        got: Option<String>,
+    },
+}
+
+/// Describes an ordered episode of a run, as its log keeps it.
+#[must_use]
+pub fn metadata_of(order: EpisodeOrder, episode: &Episode, terms: &RunTerms) -> EpisodeMetadata {
+    EpisodeMetadata {
+        run: terms.account.clone().unwrap_or_default(),
+        episode: order.number,
+        seed: order.seed,
+        kind: episode.kind,
+        parameter_version: episode.parameter_version,
+        layout: episode.layout,
+        policy_digest: String::new(),
+        world: world_entries(terms.world),
+    }
+}
+
+/// The set-up of a world as entries of a log's metadata.
+#[must_use]
+pub fn world_entries(terms: WorldTerms) -> BTreeMap<String, String> {
+    [
+        (SUBSTEPS, terms.substeps.to_string()),
+        (GRIPPED_START_SHARE, terms.gripped_start_share.to_string()),
+        (WIDE_START_SHARE, terms.wide_start_share.to_string()),
+    ]
+    .map(|(key, value)| (key.to_owned(), value))
+    .into()
+}
+
+/// The world of a logged episode, in the episode's start state.
+///
+/// # Errors
+/// When the metadata lack an entry or the world cannot be built.
+pub fn world_of(metadata: &EpisodeMetadata) -> Result<Env, RecordError> {
+    let terms = WorldTerms {
+        gripped_start_share: entry(metadata, GRIPPED_START_SHARE)?,
+        wide_start_share: entry(metadata, WIDE_START_SHARE)?,
+        substeps: entry(metadata, SUBSTEPS)?,
+    };
+    let config = WorldConfig { substeps: terms.substeps, ..WorldConfig::default() };
+    let mut world = Env::new(metadata.layout, &config)?;
+    let mut rng = episode_rng(metadata.seed, metadata.episode, Stream::Reset);
+    world.reset(&mut rng, starts(metadata.kind, terms));
+    Ok(world)
+}
+
+fn entry<T: FromStr>(metadata: &EpisodeMetadata, key: &'static str) -> Result<T, RecordError> {
+    let got = metadata.world.get(key);
+    let malformed = || RecordError::Metadata { key, got: got.cloned() };
+    got.and_then(|value| value.parse().ok()).ok_or_else(malformed)
+}
+
+/// Name of an episode's log.
+#[must_use]
+pub fn log_name(episode: &Episode) -> String {
+    match episode.kind {
+        EpisodeKind::Training => {
+            format!("train-{:06}-{:06}.mcap", episode.parameter_version, episode.number)
+        }
+        EpisodeKind::Evaluation => {
+            format!("eval-{:06}-{:03}.mcap", episode.parameter_version, episode.number)
+        }
+    }
+}
+
+/// Plays `episode` again in the world that `metadata` describes and logs it as `path`; gives the finished file's name.
+///
+/// # Errors
+/// When the episode does not repeat itself or the log cannot be written; no file of that name is left then.
+pub fn record_episode(
+    metadata: &EpisodeMetadata,
+    episode: &Episode,
+    path: &Path,
+) -> Result<PathBuf, RecordError> {
+    let mut world = world_of(metadata)?;
+    let mut recorder = EpisodeRecorder::create(path, metadata)?;
+    for step_idx in 0..EPISODE_STEPS {
+        check_repeats(&world, episode, step_idx)?;
+        record_step(&mut recorder, &world, episode, step_idx)?;
+        world.step(episode.action(step_idx))?;
+    }
+    check_repeats(&world, episode, EPISODE_STEPS)?;
+    recorder.record_outcome(&world.scene(), episode.observation(EPISODE_STEPS))?;
+    Ok(recorder.finish()?)
+}
+
+fn record_step(
+    recorder: &mut EpisodeRecorder,
+    world: &Env,
+    episode: &Episode,
+    step_idx: usize,
+) -> Result<(), RecordError> {
+    let layout = episode.layout;
+    let arm_reward = |arm| {
+        sparse_reward(episode.achieved(step_idx + 1, arm), &episode.goal[layout.goal_of(arm)])
+    };
+    let rewards_per_arm: Vec<f32> = layout.arms().map(arm_reward).collect();
+    let transition = TransitionRecord {
+        step: u32::try_from(step_idx).expect("an episode's steps are few"),
+        observation: episode.observation(step_idx),
+        goal: &episode.goal,
+        action: episode.action(step_idx),
+        reward: episode.joint_reward_after(step_idx),
+        rewards_per_arm: &rewards_per_arm,
+        advised_arms: episode.advised_arms[step_idx],
+        contacts: episode.contacts[step_idx],
+        advice: &[],
+    };
+    Ok(recorder.record_step(&world.scene(), &transition)?)
+}
+
+/// Checks that the world is, bit for bit, where the episode was before step `step_idx`.
+fn check_repeats(world: &Env, episode: &Episode, step_idx: usize) -> Result<(), RecordError> {
+    let expected = episode.observation(step_idx);
+    let mut observation = vec![0.0; expected.len()];
+    world.observe(&mut observation);
+    let same =
+        observation.iter().zip(expected).all(|(got, expected)| got.to_bits() == expected.to_bits());
+    if same {
+        Ok(())
+    } else {
+        Err(RecordError::Diverged { episode: episode.number, step: step_idx })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use tandem_core::work::SlotOrder;
+    use tandem_telemetry::read_episode;
+
+    use super::*;
+    use crate::fake::{FakeActor, slot, terms};
+    use crate::ports::NoAdvisor;
+    use crate::rollout::play_slot;
+
+    fn played(kind: EpisodeKind) -> (EpisodeMetadata, Episode) {
+        let order = SlotOrder { kind, ..slot(&[3], false) };
+        let terms = terms();
+        let config = WorldConfig { substeps: terms.world.substeps, ..WorldConfig::default() };
+        let world = Env::new(terms.layout, &config).expect("in range");
+        let mut actor = FakeActor::Seeker;
+        let episode = play_slot(&world, &order, &terms, &mut actor, &mut NoAdvisor)
+            .expect("nothing breaks")
+            .remove(0);
+        (metadata_of(order.episodes[0], &episode, &terms), episode)
+    }
+
+    #[test]
+    fn a_log_holds_the_episode_and_its_world() {
+        for kind in [EpisodeKind::Evaluation, EpisodeKind::Training] {
+            let (metadata, episode) = played(kind);
+            let directory = tempfile::tempdir().expect("a directory");
+            let path = directory.path().join(log_name(&episode));
+            assert_eq!(record_episode(&metadata, &episode, &path).expect("recorded"), path);
+            let log = read_episode(&path).expect("whole");
+            assert_eq!(log.metadata, metadata);
+            let actions: Vec<f32> =
+                log.transitions.iter().flat_map(|step| step.action.clone()).collect();
+            assert_eq!(actions, episode.actions);
+            assert_eq!(log.last_observation.as_deref(), Some(episode.observation(EPISODE_STEPS)));
+            let mut start = vec![0.0; episode.layout.n_observation()];
+            world_of(&log.metadata).expect("described").observe(&mut start);
+            assert_eq!(start, episode.observation(0));
+        }
+    }
+
+    #[test]
+    fn an_episode_that_does_not_repeat_itself_gets_no_log() {
+        let (metadata, mut episode) = played(EpisodeKind::Evaluation);
+        let n_observation = episode.layout.n_observation();
+        episode.observations[7 * n_observation] += 1e-3;
+        let directory = tempfile::tempdir().expect("a directory");
+        let path = directory.path().join("eval.mcap");
+        let error = record_episode(&metadata, &episode, &path).expect_err("differs");
+        assert!(matches!(error, RecordError::Diverged { episode: 3, step: 7 }), "{error}");
+        assert!(!path.exists());
+    }
+
+    #[test]
+    fn names_sort_by_version_and_number() {
+        let (_, mut episode) = played(EpisodeKind::Evaluation);
+        assert_eq!(log_name(&episode), "eval-000004-003.mcap");
+        episode.kind = EpisodeKind::Training;
+        assert_eq!(log_name(&episode), "train-000004-000003.mcap");
+    }
+}

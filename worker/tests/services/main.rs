@@ -1,0 +1,178 @@
+//! A worker against a learner and a teacher on the loopback interface that fail in every way they can.
+
+mod support;
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use std::time::Duration;
+
+use tandem_core::{Episode, EpisodeKind};
+use tandem_worker::{Error, Patience, WorkerConfig, run_with};
+use tokio_util::sync::CancellationToken;
+use tonic::Status;
+
+use support::learner::{Call, FakeLearner, Fault};
+use support::teacher::FakeTeacher;
+use support::{Server, orders, terms};
+
+const PATIENCE: Patience = Patience {
+    first_pause: Duration::from_millis(1),
+    longest_pause: Duration::from_millis(10),
+    answer: Duration::from_secs(20),
+    work: Duration::from_secs(20),
+    drain: Duration::from_millis(20),
+};
+
+fn config(learner: &Server, teacher: Option<&Server>) -> WorkerConfig {
+    WorkerConfig {
+        learner: learner.address(),
+        teacher: teacher.map(Server::address),
+        name: "test".to_owned(),
+        log_dir: None,
+    }
+}
+
+/// Works for `learner` until its slots are all in; gives the episodes that it took, by kind and number.
+async fn work_through(
+    learner: &Arc<FakeLearner>,
+    teacher: &Arc<FakeTeacher>,
+) -> BTreeMap<(bool, u64), Episode> {
+    let (learner_server, teacher_server) = (Server::learner(learner), Server::teacher(teacher));
+    let config = config(&learner_server, Some(&teacher_server));
+    run_with(config, PATIENCE, CancellationToken::new()).await.expect("the run ends");
+    learner.episodes()
+}
+
+async fn undisturbed() -> BTreeMap<(bool, u64), Episode> {
+    work_through(&Arc::new(FakeLearner::new(orders())), &Arc::new(FakeTeacher::default())).await
+}
+
+#[tokio::test]
+async fn every_slot_is_played_and_delivered() {
+    let teacher = Arc::new(FakeTeacher::default());
+    let learner = Arc::new(FakeLearner::new(orders()));
+    let episodes = work_through(&learner, &teacher).await;
+    let played: Vec<(bool, u64)> = episodes.keys().copied().collect();
+    assert_eq!(played, [(false, 0), (false, 1), (false, 2), (false, 3), (true, 0), (true, 1)]);
+    for ((is_evaluation, number), episode) in &episodes {
+        let advised = !is_evaluation && *number != 3;
+        let expected = if advised { teacher.n_charged(*number) } else { 0 };
+        assert_eq!(episode.advice_charged, expected, "episode {number}");
+        assert_eq!(episode.advised_arms.iter().any(|arms| *arms != 0), advised, "episode {number}");
+        assert_eq!(episode.kind == EpisodeKind::Evaluation, *is_evaluation);
+    }
+    assert_eq!(learner.n_calls(Call::GetParameters), 2, "once a version");
+    assert_eq!(learner.n_calls(Call::Join), 1);
+}
+
+#[tokio::test]
+async fn a_learner_that_fails_now_and_then_gets_the_same_episodes() {
+    let expected = undisturbed().await;
+    let check = async |call, nth, fault| {
+        let learner = Arc::new(FakeLearner::new(orders()).with_fault(call, nth, fault));
+        let episodes = work_through(&learner, &Arc::new(FakeTeacher::default())).await;
+        assert_eq!(episodes, expected, "{call:?} {nth}");
+        learner
+    };
+    let away = || Fault::Answer(Status::unavailable("starting"));
+    for (call, nth) in
+        [(Call::Join, 0), (Call::NextWork, 1), (Call::GetParameters, 1), (Call::Submit, 1)]
+    {
+        check(call, nth, away()).await;
+    }
+    check(Call::Submit, 0, Fault::AnswerLost).await;
+    check(Call::GetParameters, 0, Fault::Answer(Status::not_found("no such version"))).await;
+    let learner = check(Call::NextWork, 1, Fault::WorkersForgotten).await;
+    assert_eq!(learner.n_calls(Call::Join), 2);
+    let learner = check(Call::Submit, 1, Fault::WorkersForgotten).await;
+    assert_eq!(learner.n_calls(Call::Join), 2);
+}
+
+#[tokio::test]
+async fn a_learner_that_dies_and_comes_back_gets_the_same_episodes() {
+    let expected = undisturbed().await;
+    let (learner, mut at_fault) = FakeLearner::new(orders()).hanging_at(Call::Submit, 1);
+    let (learner, teacher) = (Arc::new(learner), Arc::new(FakeTeacher::default()));
+    let (first_life, teacher_server) = (Server::learner(&learner), Server::teacher(&teacher));
+    let config = config(&first_life, Some(&teacher_server));
+    let worker = tokio::spawn(run_with(config, PATIENCE, CancellationToken::new()));
+    at_fault.recv().await.expect("the learner gets there");
+    let listener = first_life.kill();
+    learner.forget_workers();
+    let _second_life = Server::learner_on(listener, &learner);
+    worker.await.expect("no panic").expect("the run ends");
+    assert_eq!(learner.episodes(), expected);
+}
+
+#[tokio::test]
+async fn a_stream_that_breaks_within_an_episode_costs_nothing() {
+    let expected = undisturbed().await;
+    for fault in [
+        Status::unavailable("restarting"),
+        Status::not_found("no account yet"),
+        Status::ok("closing"),
+    ] {
+        let teacher = Arc::new(FakeTeacher::default().failing_at([0, 7, 8, 60], fault.clone()));
+        let learner = Arc::new(FakeLearner::new(orders()));
+        assert_eq!(work_through(&learner, &teacher).await, expected, "{fault:?}");
+        assert_eq!(learner.n_calls(Call::Join), 1);
+    }
+}
+
+#[tokio::test]
+async fn refusals_end_the_worker_with_one_clear_error() {
+    let learner = Arc::new(FakeLearner::new(orders()).with_fault(
+        Call::Join,
+        0,
+        Fault::Answer(Status::failed_precondition("this run needs version 9")),
+    ));
+    let server = Server::learner(&learner);
+    let error = run_with(config(&server, None), PATIENCE, CancellationToken::new())
+        .await
+        .expect_err("refused");
+    assert!(matches!(error, Error::Protocol { .. }), "{error:?}");
+    assert_eq!(error.to_string(), "cannot join the run");
+    assert_eq!(learner.n_calls(Call::Join), 1, "not asked again");
+}
+
+#[tokio::test]
+async fn an_advised_run_needs_a_teacher() {
+    let server = Server::learner(&Arc::new(FakeLearner::new(orders())));
+    let error = run_with(config(&server, None), PATIENCE, CancellationToken::new())
+        .await
+        .expect_err("no teacher");
+    assert!(
+        matches!(error, Error::NoTeacher { account } if Some(&account) == terms().account.as_ref())
+    );
+}
+
+#[tokio::test]
+async fn a_worker_that_waits_for_its_teacher_can_be_stopped() {
+    let (teacher, mut at_fault) = FakeTeacher::default().hanging_at(3);
+    let (learner, teacher) = (Arc::new(FakeLearner::new(orders())), Arc::new(teacher));
+    let (learner_server, teacher_server) = (Server::learner(&learner), Server::teacher(&teacher));
+    let shutdown = CancellationToken::new();
+    let config = config(&learner_server, Some(&teacher_server));
+    let worker = tokio::spawn(run_with(config, PATIENCE, shutdown.clone()));
+    at_fault.recv().await.expect("the teacher gets there");
+    shutdown.cancel();
+    worker.await.expect("no panic").expect("stops without an error");
+    assert!(learner.episodes().is_empty(), "what was not advised to the end is not delivered");
+}
+
+#[tokio::test]
+async fn a_worker_that_is_told_to_stop_delivers_what_it_plays() {
+    let learner = Arc::new(FakeLearner::new(orders()));
+    let (teacher, mut at_fault) = FakeTeacher::default().telling_at(3);
+    let teacher = Arc::new(teacher);
+    let (learner_server, teacher_server) = (Server::learner(&learner), Server::teacher(&teacher));
+    let shutdown = CancellationToken::new();
+    let config = config(&learner_server, Some(&teacher_server));
+    let patience = Patience { drain: Duration::from_secs(20), ..PATIENCE };
+    let worker = tokio::spawn(run_with(config, patience, shutdown.clone()));
+    at_fault.recv().await.expect("the teacher gets there");
+    shutdown.cancel();
+    worker.await.expect("no panic").expect("stops without an error");
+    assert_eq!(learner.n_calls(Call::NextWork), 1, "no further slot is begun");
+    assert_eq!(learner.episodes().len(), 2);
+}

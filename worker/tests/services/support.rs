@@ -1,0 +1,124 @@
+//! Fake services and the little run that they serve.
+
+pub(crate) mod learner;
+pub(crate) mod teacher;
+
+use std::net::{SocketAddr, TcpListener};
+use std::sync::Arc;
+
+use tandem_core::rng::{Stream, episode_rng, uniform};
+use tandem_core::work::{
+    EpisodeOrder, Exploration, PublishedActor, RunTerms, SlotOrder, WorldTerms,
+};
+use tandem_core::{EpisodeKind, Layout, Task};
+use tandem_proto::pb::learner_server::LearnerServer;
+use tandem_proto::pb::teacher_server::TeacherServer;
+use tokio::runtime::Runtime;
+use tokio_stream::wrappers::TcpListenerStream;
+use tonic::transport::server::Router;
+
+use learner::FakeLearner;
+use teacher::FakeTeacher;
+
+pub(crate) const LAYOUT: Layout = Layout::new(Task::Push, 2);
+
+pub(crate) fn terms() -> RunTerms {
+    RunTerms {
+        layout: LAYOUT,
+        account: Some("run".to_owned()),
+        exploration: Exploration { noise_std: 0.2, random_share: 0.3, random_hold_mean_steps: 4.0 },
+        world: WorldTerms { gripped_start_share: 0.0, wide_start_share: 0.5, substeps: 10 },
+    }
+}
+
+/// Two slots of training, of which episode 3 goes without advice, and one of evaluation with later parameters.
+pub(crate) fn orders() -> Vec<SlotOrder> {
+    let slot = |slot, parameter_version, kind, numbers: [u64; 2]| SlotOrder {
+        slot,
+        parameter_version,
+        kind,
+        episodes: numbers.map(|number| order(number, kind)).to_vec(),
+    };
+    vec![
+        slot(0, 1, EpisodeKind::Training, [0, 1]),
+        slot(1, 1, EpisodeKind::Training, [2, 3]),
+        slot(2, 2, EpisodeKind::Evaluation, [0, 1]),
+    ]
+}
+
+fn order(number: u64, kind: EpisodeKind) -> EpisodeOrder {
+    let advised = kind == EpisodeKind::Training && number != 3;
+    EpisodeOrder { number, seed: 21, advised, uniform: false, record: false }
+}
+
+/// A small network whose weights follow from its version.
+pub(crate) fn actor(version: u64) -> PublishedActor {
+    let (n_inputs, n_hidden) = (LAYOUT.n_observation() + LAYOUT.n_goal(), 8);
+    let n_parameters = (n_inputs + 1) * n_hidden + (n_hidden + 1) * LAYOUT.n_action();
+    let mut rng = episode_rng(0, version, Stream::Initialisation);
+    PublishedActor {
+        version,
+        n_hidden,
+        n_hidden_layers: 1,
+        actor: (0..n_parameters).map(|_| uniform(&mut rng, -0.3, 0.3)).collect(),
+        observation_mean: vec![0.0; LAYOUT.n_observation()],
+        observation_std: vec![1.0; LAYOUT.n_observation()],
+        goal_mean: vec![0.0; LAYOUT.n_goal()],
+        goal_std: vec![1.0; LAYOUT.n_goal()],
+    }
+}
+
+/// A service with threads of its own, so that it can be killed as a process is.
+pub(crate) struct Server {
+    runtime: Option<Runtime>,
+    address: SocketAddr,
+}
+
+impl Server {
+    pub(crate) fn learner(learner: &Arc<FakeLearner>) -> Self {
+        Self::learner_on(TcpListener::bind("127.0.0.1:0").expect("loopback"), learner)
+    }
+
+    pub(crate) fn learner_on(listener: TcpListener, learner: &Arc<FakeLearner>) -> Self {
+        let service = LearnerServer::from_arc(Arc::clone(learner));
+        Self::serve(listener, tonic::transport::Server::builder().add_service(service))
+    }
+
+    pub(crate) fn teacher(teacher: &Arc<FakeTeacher>) -> Self {
+        let service = TeacherServer::from_arc(Arc::clone(teacher));
+        let listener = TcpListener::bind("127.0.0.1:0").expect("loopback");
+        Self::serve(listener, tonic::transport::Server::builder().add_service(service))
+    }
+
+    fn serve(listener: TcpListener, router: Router) -> Self {
+        let address = listener.local_addr().expect("bound");
+        listener.set_nonblocking(true).expect("a socket can be made so");
+        let runtime =
+            tokio::runtime::Builder::new_multi_thread().worker_threads(1).enable_all().build();
+        let runtime = runtime.expect("a runtime");
+        runtime.spawn(async move {
+            let listener = tokio::net::TcpListener::from_std(listener).expect("within a runtime");
+            router.serve_with_incoming(TcpListenerStream::new(listener)).await
+        });
+        Self { runtime: Some(runtime), address }
+    }
+
+    pub(crate) fn address(&self) -> String {
+        self.address.to_string()
+    }
+
+    /// Drops every connection at once; gives a new socket on the same address.
+    pub(crate) fn kill(mut self) -> TcpListener {
+        let runtime = self.runtime.take().expect("taken once, here");
+        std::thread::spawn(move || drop(runtime)).join().expect("no panic");
+        TcpListener::bind(self.address).expect("nobody else has taken the port meanwhile")
+    }
+}
+
+impl Drop for Server {
+    fn drop(&mut self) {
+        if let Some(runtime) = self.runtime.take() {
+            runtime.shutdown_background();
+        }
+    }
+}

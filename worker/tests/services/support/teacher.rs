@@ -1,0 +1,189 @@
+//! A teacher whose verdicts follow from the question alone, on a stream that breaks where it is told to.
+
+use std::collections::BTreeSet;
+use std::sync::Arc;
+use std::sync::Mutex;
+
+use tandem_core::{ArmAdvice, StepAdvice, StepQuery};
+use tandem_proto::pb;
+use tokio::sync::mpsc;
+use tokio_stream::StreamExt as _;
+use tokio_stream::wrappers::ReceiverStream;
+use tonic::{Code, Request, Response, Status, Streaming};
+
+use super::{LAYOUT, terms};
+
+#[derive(Default)]
+pub(crate) struct FakeTeacher(Arc<Inner>);
+
+#[derive(Default)]
+struct Inner {
+    n_questions: Mutex<usize>,
+    charged: Mutex<BTreeSet<(u64, u32)>>,
+    faults: Vec<(usize, Fault)>,
+}
+
+enum Fault {
+    /// The stream ends with this status.
+    End(Status),
+    /// Never answered.
+    Hang(mpsc::Sender<()>),
+    /// Answered, but not before this was told.
+    Tell(mpsc::Sender<()>),
+}
+
+impl FakeTeacher {
+    /// Ends the stream when these questions come, counted from 0 over all streams.
+    pub(crate) fn failing_at(self, questions: [usize; 4], status: Status) -> Self {
+        Self::with_faults(questions.map(|nth| (nth, Fault::End(status.clone()))).into())
+    }
+
+    /// Leaves a question without an answer, and tells when it has come.
+    pub(crate) fn hanging_at(self, nth: usize) -> (Self, mpsc::Receiver<()>) {
+        let (reached, at_fault) = mpsc::channel(1);
+        (Self::with_faults(vec![(nth, Fault::Hang(reached))]), at_fault)
+    }
+
+    /// Tells when a question has come, and answers it.
+    pub(crate) fn telling_at(self, nth: usize) -> (Self, mpsc::Receiver<()>) {
+        let (reached, at_fault) = mpsc::channel(1);
+        (Self::with_faults(vec![(nth, Fault::Tell(reached))]), at_fault)
+    }
+
+    fn with_faults(faults: Vec<(usize, Fault)>) -> Self {
+        Self(Arc::new(Inner { faults, ..Inner::default() }))
+    }
+
+    /// Units charged to an episode.
+    pub(crate) fn n_charged(&self, episode: u64) -> u32 {
+        let charged = self.0.charged.lock().expect("no handler panics");
+        charged.iter().map(|(charged_to, _)| u32::from(*charged_to == episode)).sum()
+    }
+}
+
+impl Inner {
+    fn answer(&self, request: pb::AdviseRequest) -> Result<pb::AdviseResponse, Status> {
+        assert_eq!(Some(request.account), terms().account);
+        let verdict = |query| Ok(self.verdict(&tandem_proto::decode_query(query, LAYOUT)?));
+        let advice: Vec<StepAdvice> =
+            request.steps.into_iter().map(verdict).collect::<Result<_, Status>>()?;
+        Ok(pb::AdviseResponse {
+            steps: advice.iter().map(tandem_proto::encode_advice).collect(),
+            budget_left: 0,
+        })
+    }
+
+    /// Overrides the first arm where its hand is on one side of the workspace, the second on every fifth step.
+    fn verdict(&self, query: &StepQuery) -> StepAdvice {
+        let overrides = [query.observation[0] > 0.0, query.step.is_multiple_of(5)];
+        let mut action = query.proposed_action.clone();
+        for (part, _) in action.chunks_mut(3).zip(overrides).filter(|(_, overridden)| *overridden) {
+            part.copy_from_slice(&[0.5, -0.5, 0.25]);
+        }
+        let arm = |overridden| ArmAdvice {
+            teacher_action: vec![0.5, -0.5, 0.25],
+            q_teacher: -1.0,
+            q_student: -2.0,
+            importance: 1.0,
+            distance: 1.0,
+            overridden,
+        };
+        let charged = overrides.contains(&true);
+        if charged {
+            self.charged.lock().expect("no handler panics").insert((query.episode, query.step));
+        }
+        StepAdvice { action, charged, arms: overrides.map(arm).to_vec() }
+    }
+
+    fn next_fault(&self) -> Option<&Fault> {
+        let mut n_questions = self.n_questions.lock().expect("no handler panics");
+        let nth = *n_questions;
+        *n_questions += 1;
+        self.faults.iter().find(|(at, _)| *at == nth).map(|(_, fault)| fault)
+    }
+
+    async fn serve(
+        &self,
+        mut requests: Streaming<pb::AdviseRequest>,
+        answers: mpsc::Sender<Result<pb::AdviseResponse, Status>>,
+    ) {
+        while let Some(Ok(request)) = requests.next().await {
+            let answer = self.answer(request);
+            match self.next_fault() {
+                None => {}
+                Some(Fault::End(status)) if status.code() == Code::Ok => return,
+                Some(Fault::End(status)) => {
+                    answers.send(Err(status.clone())).await.ok();
+                    return;
+                }
+                Some(Fault::Hang(reached)) => {
+                    reached.send(()).await.ok();
+                    std::future::pending::<()>().await;
+                }
+                Some(Fault::Tell(reached)) => {
+                    reached.send(()).await.ok();
+                }
+            }
+            if answers.send(answer).await.is_err() {
+                return;
+            }
+        }
+    }
+}
+
+#[tonic::async_trait]
+impl pb::teacher_server::Teacher for FakeTeacher {
+    type AdviseStreamStream = ReceiverStream<Result<pb::AdviseResponse, Status>>;
+
+    async fn advise_stream(
+        &self,
+        request: Request<Streaming<pb::AdviseRequest>>,
+    ) -> Result<Response<Self::AdviseStreamStream>, Status> {
+        let (answers, outgoing) = mpsc::channel(1);
+        let inner = Arc::clone(&self.0);
+        tokio::spawn(async move { inner.serve(request.into_inner(), answers).await });
+        Ok(Response::new(ReceiverStream::new(outgoing)))
+    }
+
+    async fn advise(
+        &self,
+        _request: Request<pb::AdviseRequest>,
+    ) -> Result<Response<pb::AdviseResponse>, Status> {
+        Err(Status::unimplemented("not needed here"))
+    }
+
+    async fn describe(
+        &self,
+        _request: Request<pb::DescribeRequest>,
+    ) -> Result<Response<pb::DescribeResponse>, Status> {
+        Err(Status::unimplemented("not needed here"))
+    }
+
+    async fn open_account(
+        &self,
+        _request: Request<pb::OpenAccountRequest>,
+    ) -> Result<Response<pb::Account>, Status> {
+        Err(Status::unimplemented("not needed here"))
+    }
+
+    async fn get_account(
+        &self,
+        _request: Request<pb::GetAccountRequest>,
+    ) -> Result<Response<pb::Account>, Status> {
+        Err(Status::unimplemented("not needed here"))
+    }
+
+    async fn open_leases(
+        &self,
+        _request: Request<pb::OpenLeasesRequest>,
+    ) -> Result<Response<pb::OpenLeasesResponse>, Status> {
+        Err(Status::unimplemented("not needed here"))
+    }
+
+    async fn settle_leases(
+        &self,
+        _request: Request<pb::SettleLeasesRequest>,
+    ) -> Result<Response<pb::Account>, Status> {
+        Err(Status::unimplemented("not needed here"))
+    }
+}
