@@ -7,14 +7,19 @@ use clap::{Args, Parser, Subcommand, ValueEnum};
 
 /// Teaches robots with two arms by letting a robot with one arm advise them.
 #[derive(Debug, Parser)]
-#[command(name = "tandem", version, propagate_version = true, after_help = "\
+#[command(
+    name = "tandem",
+    version,
+    propagate_version = true,
+    after_help = "\
 Examples:
   tandem train                                  the main job: two arms learn to push, advised
   tandem train --arms 1 --task push             a one-arm teacher from scratch
   tandem eval --policy runs/NAME/policy/best.safetensors
   tandem COMMAND --help                         more examples
 
-Exit codes: 0 done, 64 bad usage or configuration, 65 bad input data, 70 a bug, 75 try again, 130 interrupted.")]
+Exit codes: 0 done, 64 bad usage or configuration, 65 bad input data, 70 a bug, 75 try again, 130 interrupted."
+)]
 pub(crate) struct Cli {
     /// Log filter, such as info or tandem_learner=debug; overrides RUST_LOG.
     #[arg(long, global = true, value_name = "FILTER")]
@@ -35,7 +40,7 @@ pub(crate) enum Command {
     Learner(LearnerArgs),
     /// Plays episodes for a learner.
     Worker(WorkerArgs),
-    /// Measures simulation, networks, updates and the wire on this machine.
+    /// Measures simulation, networks, updates and replay on this machine.
     Bench(BenchArgs),
     /// Shows what is in a policy file.
     Policy(PolicyArgs),
@@ -247,7 +252,6 @@ pub(crate) enum BenchName {
     Inference,
     Update,
     Replay,
-    Wire,
 }
 
 #[derive(Debug, Args)]

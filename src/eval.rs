@@ -4,7 +4,7 @@ use std::num::NonZeroUsize;
 use std::path::Path;
 
 use serde_json::{Value, json};
-use tandem_core::work::EpisodeOrder;
+use tandem_core::work::{EpisodeOrder, Exploration, RunTerms, WorldTerms};
 use tandem_core::{Episode, EpisodeOutcome, EvaluationSummary, Layout, Task};
 use tandem_policy::Policy;
 use tandem_sim::WorldConfig;
@@ -45,10 +45,17 @@ impl Subject {
         let (layout, world) = (self.layout(), WorldConfig::default());
         let n_threads = std::thread::available_parallelism().unwrap_or(NonZeroUsize::MIN);
         let episodes = match self {
-            Self::Policy(_) => evaluate(|| actor.clone(), layout, &world, n_episodes, seed, n_threads),
-            Self::Composed(..) => {
-                evaluate(|| ComposedTeachers(actor.clone()), layout, &world, n_episodes, seed, n_threads)
+            Self::Policy(_) => {
+                evaluate(|| actor.clone(), layout, &world, n_episodes, seed, n_threads)
             }
+            Self::Composed(..) => evaluate(
+                || ComposedTeachers(actor.clone()),
+                layout,
+                &world,
+                n_episodes,
+                seed,
+                n_threads,
+            ),
         };
         episodes.or_exit(Exit::Bug, String::new)
     }
@@ -70,7 +77,12 @@ pub(crate) fn measure(subject: &Subject, n_episodes: u64, seed: u64) -> Result<M
     let steps_per_s = n_steps as f64 / start.elapsed().as_secs_f64();
     let outcomes: Vec<EpisodeOutcome> = episodes.iter().map(EpisodeOutcome::of).collect();
     let summary = EvaluationSummary::of(&outcomes);
-    Ok(Measured { layout: subject.layout(), summary, steps_per_s, policy_digest: subject.policy().digest() })
+    Ok(Measured {
+        layout: subject.layout(),
+        summary,
+        steps_per_s,
+        policy_digest: subject.policy().digest(),
+    })
 }
 
 impl Measured {
@@ -95,7 +107,8 @@ impl Measured {
     /// The figures for a person, a line each.
     pub(crate) fn lines(&self) -> Vec<String> {
         let summary = &self.summary;
-        let arms: Vec<String> = summary.success_per_arm.iter().map(|share| format!("{share:.3}")).collect();
+        let arms: Vec<String> =
+            summary.success_per_arm.iter().map(|share| format!("{share:.3}")).collect();
         vec![
             format!(
                 "success       {:.3}   95 % interval {:.3} to {:.3}, {} episodes",
@@ -137,11 +150,20 @@ pub(crate) fn eval(args: &EvalArgs) -> Result<(), Failed> {
 fn record(subject: &Subject, seed: u64, path: &Path) -> Result<(), Failed> {
     let episode = subject.play(1, seed)?.remove(0);
     let order = EpisodeOrder { number: 0, seed, advised: false, uniform: false, record: true };
+    let world = WorldTerms {
+        gripped_start_share: 0.0,
+        wide_start_share: 0.0,
+        substeps: WorldConfig::default().substeps,
+    };
+    let exploration =
+        Exploration { noise_std: 0.0, random_share: 0.0, random_hold_mean_steps: 1.0 };
+    let terms = RunTerms { layout: subject.layout(), account: None, exploration, world };
     let metadata = EpisodeMetadata {
         policy_digest: subject.policy().digest(),
-        ..tandem_worker::record::metadata_of(order, &episode, &tandem_worker::evaluation_terms(subject.layout()))
+        ..tandem_worker::record::metadata_of(order, &episode, &terms)
     };
-    tandem_worker::record::record_episode(&metadata, &episode, path).or_exit(Exit::TryAgain, String::new)?;
+    tandem_worker::record::record_episode(&metadata, &episode, path)
+        .or_exit(Exit::TryAgain, String::new)?;
     Ok(())
 }
 
@@ -166,7 +188,11 @@ fn subject(args: &EvalArgs) -> Result<Subject, Failed> {
 /// A one-arm policy for `n_arms` arms.
 pub(crate) fn composed(policy: Policy, n_arms: usize, path: &Path) -> Result<Subject, Failed> {
     if policy.layout.n_arms != 1 {
-        return Err(Failed::usage(format!("{} drives {} arms: a teacher drives one", path.display(), policy.layout.n_arms)));
+        return Err(Failed::usage(format!(
+            "{} drives {} arms: a teacher drives one",
+            path.display(),
+            policy.layout.n_arms
+        )));
     }
     if !(1..=2).contains(&n_arms) {
         return Err(Failed::usage(format!("--arms {n_arms}: expected 1 or 2")));

@@ -86,7 +86,8 @@ mod tests {
 
     #[test]
     fn a_cause_that_repeats_the_line_is_left_out() {
-        let causes = ["cannot read \"x\": gone".to_owned(), "gone".to_owned(), "two\nlines".to_owned()];
+        let causes =
+            ["cannot read \"x\": gone".to_owned(), "gone".to_owned(), "two\nlines".to_owned()];
         assert_eq!(one_line(&causes), "cannot read \"x\": gone: two lines");
     }
 }

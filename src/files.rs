@@ -30,7 +30,10 @@ pub(crate) fn policy(args: &PolicyArgs) -> Result<(), Failed> {
     }
     println!("task          {}", policy.layout.task);
     println!("arms          {}", policy.layout.n_arms);
-    println!("networks      {} hidden layers of {}, critic heads {}", policy.n_hidden_layers, policy.n_hidden, policy.n_heads);
+    println!(
+        "networks      {} hidden layers of {}, critic heads {}",
+        policy.n_hidden_layers, policy.n_hidden, policy.n_heads
+    );
     println!("parameters    actor {}, critic {}", policy.actor.len(), policy.critic.len());
     println!("digest        {}", policy.digest());
     for (key, value) in metadata {
@@ -42,9 +45,13 @@ pub(crate) fn policy(args: &PolicyArgs) -> Result<(), Failed> {
 #[expect(clippy::print_stdout, reason = "what the command is for")]
 pub(crate) fn mcap(args: &McapArgs) -> Result<(), Failed> {
     let McapCommand::Recover { file, to } = &args.command;
-    let to = to.clone().unwrap_or_else(|| PathBuf::from(format!("{}.recovered.mcap", file.display())));
+    let to =
+        to.clone().unwrap_or_else(|| PathBuf::from(format!("{}.recovered.mcap", file.display())));
     if to.exists() {
-        return Err(Failed::usage(format!("{} exists: choose another file with --to", to.display())));
+        return Err(Failed::usage(format!(
+            "{} exists: choose another file with --to",
+            to.display()
+        )));
     }
     let counts = tandem_telemetry::recover(file, &to).or_exit(Exit::Data, String::new)?;
     println!("recovered {} messages of {} into {}", counts.messages, file.display(), to.display());
@@ -54,7 +61,8 @@ pub(crate) fn mcap(args: &McapArgs) -> Result<(), Failed> {
 #[expect(clippy::print_stdout, reason = "what the command is for")]
 pub(crate) fn replay(args: &ReplayArgs) -> Result<(), Failed> {
     let log = tandem_telemetry::read_episode(&args.file).or_exit(Exit::Data, String::new)?;
-    let mut world = tandem_worker::record::world_of(&log.metadata).or_exit(Exit::Data, String::new)?;
+    let mut world =
+        tandem_worker::record::world_of(&log.metadata).or_exit(Exit::Data, String::new)?;
     let mut observation = vec![0.0; log.metadata.layout.n_observation()];
     let mut differs_before = None;
     for (step_idx, transition) in log.transitions.iter().enumerate() {
@@ -63,20 +71,29 @@ pub(crate) fn replay(args: &ReplayArgs) -> Result<(), Failed> {
             differs_before = Some(step_idx);
         }
         if !args.json && !args.verify {
-            println!("step {step_idx:>2}  reward {:>4.1}  action {:?}", transition.reward, transition.action);
+            println!(
+                "step {step_idx:>2}  reward {:>4.1}  action {:?}",
+                transition.reward, transition.action
+            );
         }
         world.step(&transition.action).or_exit(Exit::Data, || format!("step {step_idx}"))?;
     }
     let n_steps = log.transitions.len();
     if args.json {
-        println!("{}", json!({"file": args.file, "steps": n_steps, "identical": differs_before.is_none()}));
+        println!(
+            "{}",
+            json!({"file": args.file, "steps": n_steps, "identical": differs_before.is_none()})
+        );
     } else {
         println!("{n_steps} steps of episode {} played again", log.metadata.episode);
     }
     match differs_before {
         Some(step_idx) if args.verify => {
             let file = args.file.display();
-            Err(Failed::new(Exit::Data, anyhow::anyhow!("{file}: the observation before step {step_idx} differs")))
+            Err(Failed::new(
+                Exit::Data,
+                anyhow::anyhow!("{file}: the observation before step {step_idx} differs"),
+            ))
         }
         _ => Ok(()),
     }

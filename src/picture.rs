@@ -17,13 +17,15 @@ pub(crate) fn picture(args: &PictureArgs) -> Result<(), Failed> {
         (None, None) => return Err(Failed::usage("give --policy or --composed-teachers")),
     };
     let episode = subject.play(1, args.seed)?.remove(0);
-    let mut world = Env::new(subject.layout(), &WorldConfig::default()).or_exit(Exit::Bug, String::new)?;
+    let mut world =
+        Env::new(subject.layout(), &WorldConfig::default()).or_exit(Exit::Bug, String::new)?;
     world.reset(&mut episode_rng(args.seed, 0, Stream::Reset), Starts::default());
     for step_idx in 0..args.step as usize {
         world.step(episode.action(step_idx)).or_exit(Exit::Bug, String::new)?;
     }
     let svg = tandem_report::scene_svg(&world.scene(), &View::default());
-    std::fs::write(&args.out, svg).or_exit(Exit::TryAgain, || format!("cannot write {}", args.out.display()))?;
+    std::fs::write(&args.out, svg)
+        .or_exit(Exit::TryAgain, || format!("cannot write {}", args.out.display()))?;
     println!("{}", args.out.display());
     Ok(())
 }

@@ -11,7 +11,10 @@ use toml::{Table, Value};
 use crate::exit::{Exit, Failed, OrExit as _};
 
 /// Reads a run file and lays `settings` (`key=value`) over it; what both leave out takes the recipe's values.
-pub(crate) fn resolve(file: Option<&Path>, settings: &[(String, Value)]) -> Result<RunConfig, Failed> {
+pub(crate) fn resolve(
+    file: Option<&Path>,
+    settings: &[(String, Value)],
+) -> Result<RunConfig, Failed> {
     let from_file = match file {
         Some(path) => read(path).or_exit(Exit::Usage, String::new)?,
         None => Table::new(),
@@ -40,7 +43,8 @@ fn parse_value(text: &str) -> Value {
 }
 
 fn read(path: &Path) -> anyhow::Result<Table> {
-    let text = std::fs::read_to_string(path).with_context(|| format!("cannot read run file {path:?}"))?;
+    let text =
+        std::fs::read_to_string(path).with_context(|| format!("cannot read run file {path:?}"))?;
     let table = text.parse::<Table>();
     table.map_err(|error| anyhow!("run file {path:?}: {}", error.to_string().replace('\n', " ")))
 }
@@ -52,7 +56,9 @@ fn overlay(from_file: Table, settings: &[(String, Value)]) -> anyhow::Result<Run
     }
     let mut resolved = Table::try_from(defaults_for(&changes)?)?;
     merge(&mut resolved, changes, "")?;
-    let config: RunConfig = Value::Table(resolved).try_into().map_err(|error: toml::de::Error| anyhow!("{}", error.message()))?;
+    let config: RunConfig = Value::Table(resolved)
+        .try_into()
+        .map_err(|error: toml::de::Error| anyhow!("{}", error.message()))?;
     Ok(config.checked()?)
 }
 
@@ -66,7 +72,11 @@ fn defaults_for(changes: &Table) -> anyhow::Result<RunConfig> {
     let task: Task = changes.get("task").and_then(Value::as_str).unwrap_or("push").parse()?;
     let arms = changes.get("arms").and_then(Value::as_integer).unwrap_or(2);
     let n_arms = usize::try_from(arms).ok().filter(|n_arms| (1..=2).contains(n_arms));
-    Ok(RunConfig::defaults(recipe, task, n_arms.ok_or_else(|| anyhow!("arms is {arms}: expected 1 or 2"))?))
+    Ok(RunConfig::defaults(
+        recipe,
+        task,
+        n_arms.ok_or_else(|| anyhow!("arms is {arms}: expected 1 or 2"))?,
+    ))
 }
 
 /// Sets the value of a dotted key.
@@ -78,7 +88,8 @@ fn set(table: &mut Table, key: &str, value: Value) -> anyhow::Result<()> {
         }
         Some((section, rest)) => {
             let section = table.entry(section).or_insert_with(|| Value::Table(Table::new()));
-            let inner = section.as_table_mut().ok_or_else(|| anyhow!("{key:?} is not a setting"))?;
+            let inner =
+                section.as_table_mut().ok_or_else(|| anyhow!("{key:?} is not a setting"))?;
             set(inner, rest, value)
         }
     }
@@ -93,7 +104,9 @@ fn merge(base: &mut Table, changes: Table, path: &str) -> anyhow::Result<()> {
             (None, _) => bail!("unknown setting {name:?}: expected one of {}", known.join(", ")),
             (Some(Value::Table(inner)), Value::Table(changes)) => merge(inner, changes, &name)?,
             (Some(Value::Table(_)), _) => bail!("{name:?} is a section, not a setting"),
-            (Some(slot @ Value::Float(_)), Value::Integer(whole)) => *slot = Value::Float(whole as f64),
+            (Some(slot @ Value::Float(_)), Value::Integer(whole)) => {
+                *slot = Value::Float(whole as f64)
+            }
             (Some(slot), change) => {
                 if !slot.same_type(&change) {
                     bail!("{name} is {change}: expected a {}", slot.type_str());
@@ -110,7 +123,8 @@ mod tests {
     use super::*;
 
     fn resolved(settings: &[&str]) -> Result<RunConfig, String> {
-        let settings: Vec<_> = settings.iter().map(|setting| parse_setting(setting).expect("KEY=VALUE")).collect();
+        let settings: Vec<_> =
+            settings.iter().map(|setting| parse_setting(setting).expect("KEY=VALUE")).collect();
         overlay(Table::new(), &settings).map_err(|error| error.to_string())
     }
 
@@ -127,7 +141,9 @@ mod tests {
     fn what_is_wrong_is_named() {
         let check = |setting: &str, words: &[&str]| {
             let message = resolved(&[setting]).expect_err("must be refused");
-            words.iter().for_each(|word| assert!(message.contains(word), "{message:?} lacks {word:?}"));
+            words
+                .iter()
+                .for_each(|word| assert!(message.contains(word), "{message:?} lacks {word:?}"));
         };
         check("ddpg.discont=0.9", &["ddpg.discont", "discount"]);
         check("nonsense=1", &["nonsense", "advice"]);

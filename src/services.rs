@@ -34,13 +34,12 @@ fn rust_log() -> Option<String> {
 }
 
 pub(crate) fn teacher(args: TeacherArgs) -> Result<(), Failed> {
-    let policy = crate::files::load_policy(&args.policy)?;
-    let teacher = tandem_teacher::Teacher::new(&policy)
-        .or_exit(Exit::Data, || format!("{} cannot teach", args.policy.display()))?;
+    crate::files::load_policy(&args.policy)?;
     run(async move {
         let shutdown = shutdown(args.listen.exit_with_stdin)?;
         let listener = listen(&args.listen).await?;
-        tandem_teacher::serve(teacher, listener, shutdown).await.or_exit(Exit::TryAgain, String::new)
+        let teacher = tandem_teacher::Config { policy: args.policy };
+        tandem_teacher::serve(teacher, listener, shutdown).await.or_exit(Exit::Data, String::new)
     })
 }
 
@@ -58,8 +57,13 @@ pub(crate) fn learner(args: LearnerArgs) -> Result<(), Failed> {
             clock: clock::since_now(),
             version: VERSION.to_owned(),
         };
-        let ended = tandem_learner::serve(config, listener, shutdown).await.map_err(learner_failed)?;
-        if ended.interrupted { Err(Failed::new(Exit::Interrupted, anyhow::anyhow!(ended.reason))) } else { Ok(()) }
+        let ended =
+            tandem_learner::serve(config, listener, shutdown).await.map_err(learner_failed)?;
+        if ended.interrupted {
+            Err(Failed::new(Exit::Interrupted, anyhow::anyhow!(ended.reason)))
+        } else {
+            Ok(())
+        }
     })
 }
 
@@ -91,7 +95,8 @@ fn run(service: impl Future<Output = Result<(), Failed>>) -> Result<(), Failed> 
 }
 
 fn shutdown(exit_with_stdin: bool) -> Result<CancellationToken, Failed> {
-    signals::shutdown_token(exit_with_stdin).or_exit(Exit::TryAgain, || "cannot watch for signals".to_owned())
+    signals::shutdown_token(exit_with_stdin)
+        .or_exit(Exit::TryAgain, || "cannot watch for signals".to_owned())
 }
 
 /// Binds and says where, on one line of standard output.
@@ -102,14 +107,17 @@ async fn listen(args: &ListenArgs) -> Result<TcpListener, Failed> {
         let address: SocketAddr = listener.local_addr()?;
         Ok::<_, std::io::Error>((listener, address))
     };
-    let (listener, address) = bind.await.or_exit(Exit::TryAgain, || format!("cannot listen on {}", args.listen))?;
+    let (listener, address) =
+        bind.await.or_exit(Exit::TryAgain, || format!("cannot listen on {}", args.listen))?;
     println!("listening on {address}");
     Ok(listener)
 }
 
 fn learner_failed(error: LearnerError) -> Failed {
     let exit = match error {
-        LearnerError::Config(_) | LearnerError::NoTeacher(_) | LearnerError::Teacher(_) => Exit::Usage,
+        LearnerError::Config(_) | LearnerError::NoTeacher(_) | LearnerError::Teacher(_) => {
+            Exit::Usage
+        }
         LearnerError::Checkpoint(_) => Exit::Data,
         LearnerError::RunDirectory { .. } | LearnerError::Serve(_) => Exit::TryAgain,
         LearnerError::Diverged(_) | LearnerError::Panicked => Exit::Bug,

@@ -7,7 +7,8 @@ use tokio_util::sync::CancellationToken;
 /// A token that is cancelled by SIGINT or SIGTERM, and when standard input closes if `exit_with_stdin`.
 pub(crate) fn shutdown_token(exit_with_stdin: bool) -> std::io::Result<CancellationToken> {
     let token = CancellationToken::new();
-    let (mut interrupt, mut terminate) = (signal(SignalKind::interrupt())?, signal(SignalKind::terminate())?);
+    let (mut interrupt, mut terminate) =
+        (signal(SignalKind::interrupt())?, signal(SignalKind::terminate())?);
     let cancel = token.clone();
     tokio::spawn(async move {
         tokio::select! {

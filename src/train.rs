@@ -59,8 +59,14 @@ async fn run(plan: &Plan, interrupted: &CancellationToken) -> Result<pb::Progres
         () = again.cancelled() => (),
     }
     display.close();
-    let last = last.or_exit(Exit::TryAgain, || format!("the run broke off; see {}", plan.log_path().display()))?;
-    if last.ended && !interrupted.is_cancelled() { Ok(last) } else { Ok(pb::Progress { end_reason: "interrupted".to_owned(), ..last }) }
+    let last = last.or_exit(Exit::TryAgain, || {
+        format!("the run broke off; see {}", plan.log_path().display())
+    })?;
+    if last.ended && !interrupted.is_cancelled() {
+        Ok(last)
+    } else {
+        Ok(pb::Progress { end_reason: "interrupted".to_owned(), ..last })
+    }
 }
 
 /// Follows the learner's progress to its end, and keeps the workers alive.

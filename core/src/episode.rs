@@ -130,13 +130,16 @@ impl Episode {
     /// The joint reward of step `step_idx`.
     #[must_use]
     pub fn joint_reward_after(&self, step_idx: usize) -> f32 {
-        let achieved: Vec<f32> = achieved_goal(self.layout, self.observation(step_idx + 1)).collect();
+        let achieved: Vec<f32> =
+            achieved_goal(self.layout, self.observation(step_idx + 1)).collect();
         sparse_reward(&achieved, &self.goal)
     }
 
     /// Whether any object ended more than [`MOVED_M`] from where it started.
     #[must_use]
     pub fn moved(&self) -> bool {
-        self.layout.arms().any(|arm| distance(self.achieved(0, arm), self.achieved(EPISODE_STEPS, arm)) > MOVED_M)
+        self.layout
+            .arms()
+            .any(|arm| distance(self.achieved(0, arm), self.achieved(EPISODE_STEPS, arm)) > MOVED_M)
     }
 }

@@ -36,7 +36,9 @@ impl EpisodeOutcome {
             collided,
             collided_before_success: first_contact.is_some_and(|step_idx| step_idx < settled_after),
             moved: episode.moved(),
-            episode_return: (0..EPISODE_STEPS).map(|step_idx| episode.joint_reward_after(step_idx)).sum(),
+            episode_return: (0..EPISODE_STEPS)
+                .map(|step_idx| episode.joint_reward_after(step_idx))
+                .sum(),
         }
     }
 }
@@ -49,7 +51,10 @@ fn steps_until_settled(episode: &Episode) -> usize {
             crate::reward::sparse_reward(episode.achieved(step_idx, arm), goal) > -0.5
         })
     };
-    (0..EPISODE_STEPS).rev().find(|step_idx| !at_goal(step_idx + 1)).map_or(0, |last_bad| last_bad + 1)
+    (0..EPISODE_STEPS)
+        .rev()
+        .find(|step_idx| !at_goal(step_idx + 1))
+        .map_or(0, |last_bad| last_bad + 1)
 }
 
 /// Wilson's 95 % interval of a share.
@@ -74,7 +79,10 @@ impl Wilson {
         let centre = share + Z * Z / (2.0 * n);
         let spread = Z * (share * (1.0 - share) / n + Z * Z / (4.0 * n * n)).sqrt();
         let scale = 1.0 + Z * Z / n;
-        Self { low: ((centre - spread) / scale).max(0.0), high: ((centre + spread) / scale).min(1.0) }
+        Self {
+            low: ((centre - spread) / scale).max(0.0),
+            high: ((centre + spread) / scale).min(1.0),
+        }
     }
 }
 
@@ -106,7 +114,9 @@ impl EvaluationSummary {
     #[must_use]
     pub fn of(outcomes: &[EpisodeOutcome]) -> Self {
         let n = outcomes.len().max(1) as f64;
-        let count = |holds: &dyn Fn(&EpisodeOutcome) -> bool| outcomes.iter().filter(|outcome| holds(outcome)).count();
+        let count = |holds: &dyn Fn(&EpisodeOutcome) -> bool| {
+            outcomes.iter().filter(|outcome| holds(outcome)).count()
+        };
         let share = |holds: &dyn Fn(&EpisodeOutcome) -> bool| count(holds) as f64 / n;
         let n_arms = outcomes.first().map_or(0, |outcome| outcome.success_per_arm.len());
         Self {
@@ -114,11 +124,17 @@ impl EvaluationSummary {
             success: share(&|outcome| outcome.success),
             interval: Wilson::of(count(&|outcome| outcome.success), outcomes.len()),
             success_joint: share(&|outcome| outcome.success_joint),
-            success_per_arm: (0..n_arms).map(|arm| share(&|outcome| outcome.success_per_arm[arm])).collect(),
+            success_per_arm: (0..n_arms)
+                .map(|arm| share(&|outcome| outcome.success_per_arm[arm]))
+                .collect(),
             collision_rate: share(&|outcome| outcome.collided),
             collision_rate_before_success: share(&|outcome| outcome.collided_before_success),
             moved: share(&|outcome| outcome.moved),
-            mean_return: outcomes.iter().map(|outcome| f64::from(outcome.episode_return)).sum::<f64>() / n,
+            mean_return: outcomes
+                .iter()
+                .map(|outcome| f64::from(outcome.episode_return))
+                .sum::<f64>()
+                / n,
         }
     }
 }
@@ -131,7 +147,10 @@ mod tests {
     fn wilsons_interval_has_the_textbook_values() {
         let check = |hits, trials, low: f64, high: f64| {
             let interval = Wilson::of(hits, trials);
-            assert!((interval.low - low).abs() < 5e-4 && (interval.high - high).abs() < 5e-4, "{interval:?}");
+            assert!(
+                (interval.low - low).abs() < 5e-4 && (interval.high - high).abs() < 5e-4,
+                "{interval:?}"
+            );
         };
         check(0, 10, 0.0, 0.2775);
         check(5, 10, 0.2366, 0.7634);

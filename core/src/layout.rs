@@ -62,7 +62,10 @@ impl FromStr for Task {
     type Err = UnknownTask;
 
     fn from_str(name: &str) -> Result<Self, UnknownTask> {
-        Self::ALL.into_iter().find(|task| task.name() == name).ok_or_else(|| UnknownTask(name.to_owned()))
+        Self::ALL
+            .into_iter()
+            .find(|task| task.name() == name)
+            .ok_or_else(|| UnknownTask(name.to_owned()))
     }
 }
 
@@ -139,7 +142,8 @@ impl Layout {
     /// Where `arm`'s object position, its achieved goal, stands in an observation.
     #[must_use]
     pub const fn achieved_goal_of(self, arm: ArmIndex) -> Range<usize> {
-        arm.0 * OBSERVATION_PER_ARM + OBJECT_POSITION.start..arm.0 * OBSERVATION_PER_ARM + OBJECT_POSITION.end
+        arm.0 * OBSERVATION_PER_ARM + OBJECT_POSITION.start
+            ..arm.0 * OBSERVATION_PER_ARM + OBJECT_POSITION.end
     }
 }
 
@@ -162,7 +166,9 @@ mod tests {
     #[test]
     fn the_arms_parts_cover_every_vector_once() {
         let layout = Layout::new(Task::PickAndPlace, 3);
-        let covered = |part: &dyn Fn(ArmIndex) -> Range<usize>| layout.arms().flat_map(part).collect::<Vec<_>>();
+        let covered = |part: &dyn Fn(ArmIndex) -> Range<usize>| {
+            layout.arms().flat_map(part).collect::<Vec<_>>()
+        };
         assert_eq!(covered(&|arm| layout.observation_of(arm)), (0..84).collect::<Vec<_>>());
         assert_eq!(covered(&|arm| layout.goal_of(arm)), (0..9).collect::<Vec<_>>());
         assert_eq!(covered(&|arm| layout.action_of(arm)), (0..12).collect::<Vec<_>>());

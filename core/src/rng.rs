@@ -71,7 +71,11 @@ mod tests {
         };
         let here = draws(7, 3, Stream::Reset);
         assert_eq!(here, draws(7, 3, Stream::Reset));
-        for other in [draws(8, 3, Stream::Reset), draws(7, 4, Stream::Reset), draws(7, 3, Stream::Exploration)] {
+        for other in [
+            draws(8, 3, Stream::Reset),
+            draws(7, 4, Stream::Reset),
+            draws(7, 3, Stream::Exploration),
+        ] {
             assert_ne!(here, other);
         }
     }
@@ -82,6 +86,9 @@ mod tests {
         let draws: Vec<f32> = (0..20_000).map(|_| standard_normal(&mut rng)).collect();
         let mean = draws.iter().sum::<f32>() / 20_000.0;
         let variance = draws.iter().map(|x| (x - mean).powi(2)).sum::<f32>() / 20_000.0;
-        assert!(mean.abs() < 0.03 && (variance - 1.0).abs() < 0.05, "mean {mean}, variance {variance}");
+        assert!(
+            mean.abs() < 0.03 && (variance - 1.0).abs() < 0.05,
+            "mean {mean}, variance {variance}"
+        );
     }
 }

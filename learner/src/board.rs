@@ -69,7 +69,8 @@ impl Board {
     /// Takes in a worker and gives it a number.
     pub fn join(&mut self, name: String, now: Duration) -> u64 {
         self.next_worker += 1;
-        self.workers.insert(self.next_worker, Worker { name, heard_at: now, n_episodes: 0, slot: None });
+        self.workers
+            .insert(self.next_worker, Worker { name, heard_at: now, n_episodes: 0, slot: None });
         self.next_worker
     }
 
@@ -89,13 +90,19 @@ impl Board {
     ///
     /// # Errors
     /// When the worker has not joined.
-    pub fn next(&mut self, worker_id: u64, now: Duration) -> Result<Option<SlotOrder>, SubmitError> {
-        let worker = self.workers.get_mut(&worker_id).ok_or(SubmitError::UnknownWorker(worker_id))?;
+    pub fn next(
+        &mut self,
+        worker_id: u64,
+        now: Duration,
+    ) -> Result<Option<SlotOrder>, SubmitError> {
+        let worker =
+            self.workers.get_mut(&worker_id).ok_or(SubmitError::UnknownWorker(worker_id))?;
         worker.heard_at = now;
         worker.slot = None;
         let order = self.pop().or_else(|| self.to_cover(worker_id, now));
         if let Some(order) = &order {
-            self.out.insert(order.slot, Out { order: order.clone(), worker: worker_id, since: now });
+            self.out
+                .insert(order.slot, Out { order: order.clone(), worker: worker_id, since: now });
             if let Some(worker) = self.workers.get_mut(&worker_id) {
                 worker.slot = Some(order.slot);
             }
@@ -120,8 +127,15 @@ impl Board {
     ///
     /// # Errors
     /// When the worker is unknown or the episodes are not the slot's.
-    pub fn submit(&mut self, worker_id: u64, slot: u64, episodes: Vec<Episode>, now: Duration) -> Result<bool, SubmitError> {
-        let worker = self.workers.get_mut(&worker_id).ok_or(SubmitError::UnknownWorker(worker_id))?;
+    pub fn submit(
+        &mut self,
+        worker_id: u64,
+        slot: u64,
+        episodes: Vec<Episode>,
+        now: Duration,
+    ) -> Result<bool, SubmitError> {
+        let worker =
+            self.workers.get_mut(&worker_id).ok_or(SubmitError::UnknownWorker(worker_id))?;
         worker.heard_at = now;
         let Some(out) = self.out.get(&slot) else { return Ok(false) };
         let order = &out.order;
@@ -150,12 +164,20 @@ impl Board {
     /// Puts the slots of silent workers back at the head of the queue; gives the workers that fell silent.
     pub fn reclaim(&mut self, now: Duration) -> Vec<u64> {
         let is_silent = |worker: &Worker| now.saturating_sub(worker.heard_at) >= SILENT_AFTER;
-        let silent: Vec<u64> =
-            self.workers.iter().filter(|(_, worker)| is_silent(worker)).map(|(id, _)| *id).collect();
+        let silent: Vec<u64> = self
+            .workers
+            .iter()
+            .filter(|(_, worker)| is_silent(worker))
+            .map(|(id, _)| *id)
+            .collect();
         for id in &silent {
             self.workers.remove(id);
-            let theirs: Vec<u64> =
-                self.out.iter().filter(|(_, out)| out.worker == *id).map(|(slot, _)| *slot).collect();
+            let theirs: Vec<u64> = self
+                .out
+                .iter()
+                .filter(|(_, out)| out.worker == *id)
+                .map(|(slot, _)| *slot)
+                .collect();
             for slot in theirs {
                 self.waiting.extend(self.out.remove(&slot).map(|out| out.order));
             }
@@ -173,7 +195,9 @@ impl Board {
 
     /// Takes out the finished episodes of `kind` played with `version`, in episode order.
     pub fn take(&mut self, kind: EpisodeKind, version: u64) -> Vec<Episode> {
-        let taken = self.finished.extract_if(.., |(order, _)| order.kind == kind && order.parameter_version == version);
+        let taken = self
+            .finished
+            .extract_if(.., |(order, _)| order.kind == kind && order.parameter_version == version);
         let mut episodes: Vec<Episode> = taken.flat_map(|(_, episodes)| episodes).collect();
         episodes.sort_by_key(|episode| episode.number);
         episodes
@@ -198,8 +222,14 @@ mod tests {
     }
 
     fn order(number: u64) -> SlotOrder {
-        let episode = EpisodeOrder { number, seed: 1, advised: false, uniform: false, record: false };
-        SlotOrder { slot: 0, parameter_version: 0, kind: EpisodeKind::Training, episodes: vec![episode] }
+        let episode =
+            EpisodeOrder { number, seed: 1, advised: false, uniform: false, record: false };
+        SlotOrder {
+            slot: 0,
+            parameter_version: 0,
+            kind: EpisodeKind::Training,
+            episodes: vec![episode],
+        }
     }
 
     fn played(number: u64) -> Vec<Episode> {
@@ -222,7 +252,8 @@ mod tests {
         assert!(!board.is_complete(EpisodeKind::Training, 0));
         assert_eq!(board.submit(a, first, played(0), at(1)), Ok(true));
         assert!(board.is_complete(EpisodeKind::Training, 0));
-        let numbers: Vec<u64> = board.take(EpisodeKind::Training, 0).iter().map(|e| e.number).collect();
+        let numbers: Vec<u64> =
+            board.take(EpisodeKind::Training, 0).iter().map(|e| e.number).collect();
         assert_eq!(numbers, [0, 1]);
     }
 
@@ -262,7 +293,10 @@ mod tests {
     fn other_episodes_than_ordered_are_refused() {
         let (mut board, a, _) = board_of(1);
         let slot = board.next(a, at(0)).expect("joined").expect("a slot").slot;
-        assert!(matches!(board.submit(a, slot, played(5), at(0)), Err(SubmitError::WrongEpisodes { .. })));
+        assert!(matches!(
+            board.submit(a, slot, played(5), at(0)),
+            Err(SubmitError::WrongEpisodes { .. })
+        ));
         assert!(!board.is_complete(EpisodeKind::Training, 0));
     }
 }

@@ -60,7 +60,12 @@ pub enum CheckpointError {
 ///
 /// # Errors
 /// When the file system refuses; former checkpoints are then untouched.
-pub fn save(directory: &Path, trainer: &Trainer, resumption: &Resumption, keep: usize) -> Result<PathBuf, CheckpointError> {
+pub fn save(
+    directory: &Path,
+    trainer: &Trainer,
+    resumption: &Resumption,
+    keep: usize,
+) -> Result<PathBuf, CheckpointError> {
     let path = directory.join(format!("{:08}.safetensors", trainer.counters().round));
     let unfinished = path.with_extension("tmp");
     let io = |action: &'static str, path: &Path| {
@@ -72,7 +77,9 @@ pub fn save(directory: &Path, trainer: &Trainer, resumption: &Resumption, keep: 
     let mut tensors = view_all(&owned);
     let (parts, _) = trainer.replay.parts();
     let state = trainer.tensors();
-    tensors.extend(state.iter().map(|(name, values)| view(name, Dtype::F32, bytemuck::cast_slice(values))));
+    tensors.extend(
+        state.iter().map(|(name, values)| view(name, Dtype::F32, bytemuck::cast_slice(values))),
+    );
     tensors.push(view("replay.advised_arms", Dtype::U8, &parts.advised_arms));
     tensors.push(view("replay.moved", Dtype::U8, &parts.moved));
     let metadata = metadata(trainer, resumption).into_iter().collect();
@@ -95,7 +102,8 @@ pub fn save(directory: &Path, trainer: &Trainer, resumption: &Resumption, keep: 
 #[must_use]
 pub fn list(directory: &Path) -> Vec<PathBuf> {
     let entries = fs::read_dir(directory).into_iter().flatten().flatten().map(|entry| entry.path());
-    let mut paths: Vec<PathBuf> = entries.filter(|path| path.extension().is_some_and(|e| e == "safetensors")).collect();
+    let mut paths: Vec<PathBuf> =
+        entries.filter(|path| path.extension().is_some_and(|e| e == "safetensors")).collect();
     paths.sort();
     paths
 }
@@ -104,7 +112,10 @@ pub fn list(directory: &Path) -> Vec<PathBuf> {
 ///
 /// # Errors
 /// When there is none, or it is damaged or of another run's shape; the message names the file and the former one.
-pub fn load_newest(directory: &Path, config: &RunConfig) -> Result<(Trainer, Resumption), CheckpointError> {
+pub fn load_newest(
+    directory: &Path,
+    config: &RunConfig,
+) -> Result<(Trainer, Resumption), CheckpointError> {
     let mut paths = list(directory);
     let newest = paths.pop().ok_or_else(|| CheckpointError::None(directory.to_owned()))?;
     load(&newest, config).map_err(|error| match (error, paths.pop()) {
@@ -122,10 +133,15 @@ pub fn load_newest(directory: &Path, config: &RunConfig) -> Result<(Trainer, Res
 /// When it cannot be read, is damaged, or is of another run's shape.
 pub fn load(path: &Path, config: &RunConfig) -> Result<(Trainer, Resumption), CheckpointError> {
     let damaged = |what: String| CheckpointError::Damaged { path: path.to_owned(), what };
-    let bytes =
-        fs::read(path).map_err(|source| CheckpointError::Io { action: "read", path: path.to_owned(), source })?;
-    let (_, header) = SafeTensors::read_metadata(&bytes).map_err(|error| damaged(error.to_string()))?;
-    let metadata: BTreeMap<String, String> = header.metadata().clone().unwrap_or_default().into_iter().collect();
+    let bytes = fs::read(path).map_err(|source| CheckpointError::Io {
+        action: "read",
+        path: path.to_owned(),
+        source,
+    })?;
+    let (_, header) =
+        SafeTensors::read_metadata(&bytes).map_err(|error| damaged(error.to_string()))?;
+    let metadata: BTreeMap<String, String> =
+        header.metadata().clone().unwrap_or_default().into_iter().collect();
     let tensors = SafeTensors::deserialize(&bytes).map_err(|error| damaged(error.to_string()))?;
     let reader = Reader { metadata, tensors };
     let mut trainer = Trainer::new(config.clone())?;
@@ -150,7 +166,10 @@ impl Reader<'_> {
     }
 
     fn text(&self, key: &str) -> Result<&str, String> {
-        self.metadata.get(key).map(String::as_str).ok_or_else(|| format!("no {key:?} in its metadata"))
+        self.metadata
+            .get(key)
+            .map(String::as_str)
+            .ok_or_else(|| format!("no {key:?} in its metadata"))
     }
 
     fn number<T: std::str::FromStr>(&self, key: &str) -> Result<T, String> {
@@ -160,7 +179,11 @@ impl Reader<'_> {
 
     fn bytes(&self, name: &str, dtype: Dtype) -> Result<&[u8], String> {
         let tensor = self.tensors.tensor(name).map_err(|_| format!("no tensor {name:?}"))?;
-        if tensor.dtype() == dtype { Ok(tensor.data()) } else { Err(format!("tensor {name:?} is not {dtype:?}")) }
+        if tensor.dtype() == dtype {
+            Ok(tensor.data())
+        } else {
+            Err(format!("tensor {name:?} is not {dtype:?}"))
+        }
     }
 
     fn f32s(&self, name: &str) -> Result<Vec<f32>, String> {
@@ -185,8 +208,12 @@ impl Reader<'_> {
             .into_iter()
             .map(|(name, _)| Ok((name.to_owned(), self.f32s(&format!("ddpg.{name}"))?)))
             .collect::<Result<_, String>>()?;
-        trainer.ddpg.restore(&state, self.number("ddpg.n_updates")?).map_err(|error| error.to_string())?;
-        trainer.observation_normalizer = self.normalizer("observation", trainer.layout.n_observation())?;
+        trainer
+            .ddpg
+            .restore(&state, self.number("ddpg.n_updates")?)
+            .map_err(|error| error.to_string())?;
+        trainer.observation_normalizer =
+            self.normalizer("observation", trainer.layout.n_observation())?;
         trainer.goal_normalizer = self.normalizer("goal", trainer.layout.n_goal())?;
         let parts = ReplayParts {
             observations: self.f32s("replay.observations")?,
@@ -196,8 +223,9 @@ impl Reader<'_> {
             moved: self.bytes("replay.moved", Dtype::U8)?.to_vec(),
         };
         let capacity = trainer.config.replay.capacity_transitions;
-        trainer.replay = ReplayBuffer::from_parts(trainer.layout, capacity, parts, self.number("replay.next")?)
-            .ok_or("its replay buffer does not fit the run file")?;
+        trainer.replay =
+            ReplayBuffer::from_parts(trainer.layout, capacity, parts, self.number("replay.next")?)
+                .ok_or("its replay buffer does not fit the run file")?;
         Ok(())
     }
 
@@ -252,7 +280,8 @@ type OwnedTensor = (&'static str, Dtype, Vec<u8>);
 fn small_tensors(trainer: &Trainer, resumption: &Resumption) -> Vec<OwnedTensor> {
     let f32s = |name, values: &[f32]| (name, Dtype::F32, bytemuck::cast_slice(values).to_vec());
     let f64s = |name, values: &[f64]| (name, Dtype::F64, bytemuck::cast_slice(values).to_vec());
-    let (observation, goal) = (trainer.observation_normalizer.parts(), trainer.goal_normalizer.parts());
+    let (observation, goal) =
+        (trainer.observation_normalizer.parts(), trainer.goal_normalizer.parts());
     let acting = &resumption.acting;
     vec![
         f64s("normalizer.observation.sum", &observation.sum),
@@ -273,7 +302,10 @@ fn view_all(tensors: &[OwnedTensor]) -> Vec<(String, TensorView<'_>)> {
 
 fn view<'a>(name: &str, dtype: Dtype, bytes: &'a [u8]) -> (String, TensorView<'a>) {
     let shape = vec![bytes.len() * 8 / dtype.bitsize()];
-    (name.to_owned(), TensorView::new(dtype, shape, bytes).expect("the shape is counted from the bytes"))
+    (
+        name.to_owned(),
+        TensorView::new(dtype, shape, bytes).expect("the shape is counted from the bytes"),
+    )
 }
 
 /// Makes sure that a file is on the disk and not only on its way there.
@@ -333,7 +365,10 @@ mod tests {
             train_round(&mut trainer);
             save(directory.path(), &trainer, &resumption(&trainer), 2).expect("saves");
         }
-        let names: Vec<_> = list(directory.path()).iter().filter_map(|path| path.file_stem()?.to_str().map(str::to_owned)).collect();
+        let names: Vec<_> = list(directory.path())
+            .iter()
+            .filter_map(|path| path.file_stem()?.to_str().map(str::to_owned))
+            .collect();
         assert_eq!(names, ["00000002", "00000003"]);
     }
 
@@ -351,7 +386,9 @@ mod tests {
         *flipped.last_mut().expect("not empty") ^= 1;
         for bytes in [&whole[..whole.len() - 1], &whole[..7], &[], &flipped] {
             fs::write(&newest, bytes).expect("writes");
-            let message = load_newest(directory.path(), &small_config()).expect_err("must be refused").to_string();
+            let message = load_newest(directory.path(), &small_config())
+                .expect_err("must be refused")
+                .to_string();
             assert!(message.contains("00000002") && message.contains("00000001"), "{message}");
         }
     }

@@ -221,7 +221,12 @@ impl RunConfig {
             world: world(recipe, task),
             replay: replay(recipe, n_arms),
             ddpg: ddpg(recipe, n_arms),
-            evaluation: EvaluationConfig { every_env_steps: 20_000, episodes: 240, seed: 240_240, recorded_episodes: 2 },
+            evaluation: EvaluationConfig {
+                every_env_steps: 20_000,
+                episodes: 240,
+                seed: 240_240,
+                recorded_episodes: 2,
+            },
             stop: StopConfig { until_success: 0.0, max_env_steps: 0, max_minutes: 30.0 },
             checkpoint: CheckpointConfig { every_rounds: 50, keep: 2 },
         }
@@ -249,9 +254,14 @@ impl RunConfig {
 
     /// Updates of a round, at least one.
     #[must_use]
-    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "checked: not negative, below 2^32")]
+    #[expect(
+        clippy::cast_possible_truncation,
+        clippy::cast_sign_loss,
+        reason = "checked: not negative, below 2^32"
+    )]
     pub fn updates_per_round(&self) -> u64 {
-        ((self.env_steps_per_round() as f64 * self.rounds.updates_per_env_step).round() as u64).max(1)
+        ((self.env_steps_per_round() as f64 * self.rounds.updates_per_env_step).round() as u64)
+            .max(1)
     }
 
     /// Rounds between two evaluations, at least one.
@@ -263,7 +273,8 @@ impl RunConfig {
     /// How workers explore.
     #[must_use]
     pub const fn exploration(&self) -> Exploration {
-        let ExplorationConfig { noise_std, random_share, random_hold_mean_steps } = self.exploration;
+        let ExplorationConfig { noise_std, random_share, random_hold_mean_steps } =
+            self.exploration;
         Exploration { noise_std, random_share, random_hold_mean_steps }
     }
 
@@ -281,8 +292,18 @@ impl RunConfig {
     pub fn checked(self) -> Result<Self, ConfigError> {
         let layout = self.layout()?;
         check("arms", self.arms, (1..=2).contains(&layout.n_arms), "1 or 2")?;
-        check("name", &self.name, is_name(&self.name), "1 to 100 letters, digits, '-', '_' or '.'")?;
-        check("seed", self.seed, self.seed != self.evaluation.seed, "another than evaluation.seed")?;
+        check(
+            "name",
+            &self.name,
+            is_name(&self.name),
+            "1 to 100 letters, digits, '-', '_' or '.'",
+        )?;
+        check(
+            "seed",
+            self.seed,
+            self.seed != self.evaluation.seed,
+            "another than evaluation.seed",
+        )?;
         let shares = [
             ("advice.share", self.advice.share),
             ("world.gripped_start_share", f64::from(self.world.gripped_start_share)),
@@ -297,9 +318,23 @@ impl RunConfig {
         }
         self.check_rounds()?;
         self.check_exploration()?;
-        check("stop.max_minutes", self.stop.max_minutes, self.stop.max_minutes >= 0.0, "0 (never) or more")?;
-        check("advice.budget", self.advice.budget, self.advice.budget <= 1_000_000_000_000, "at most 10^12")?;
-        self.ddpg.check().map_err(|(key, value, expected)| ConfigError::OutOfRange { key, value, expected })?;
+        check(
+            "stop.max_minutes",
+            self.stop.max_minutes,
+            self.stop.max_minutes >= 0.0,
+            "0 (never) or more",
+        )?;
+        check(
+            "advice.budget",
+            self.advice.budget,
+            self.advice.budget <= 1_000_000_000_000,
+            "at most 10^12",
+        )?;
+        self.ddpg.check().map_err(|(key, value, expected)| ConfigError::OutOfRange {
+            key,
+            value,
+            expected,
+        })?;
         Ok(self)
     }
 
@@ -309,30 +344,66 @@ impl RunConfig {
         check("rounds.rollouts", rounds.rollouts, (1..=64).contains(&rounds.rollouts), "1 to 64")?;
         check("rounds.lag", rounds.lag, rounds.lag <= 1, "0 or 1")?;
         let updates = rounds.updates_per_env_step;
-        check("rounds.updates_per_env_step", updates, updates > 0.0 && updates <= 100.0, "above 0, at most 100")?;
-        check("evaluation.episodes", evaluation.episodes, (1..=100_000).contains(&evaluation.episodes), "1 to 100,000")?;
+        check(
+            "rounds.updates_per_env_step",
+            updates,
+            updates > 0.0 && updates <= 100.0,
+            "above 0, at most 100",
+        )?;
+        check(
+            "evaluation.episodes",
+            evaluation.episodes,
+            (1..=100_000).contains(&evaluation.episodes),
+            "1 to 100,000",
+        )?;
         let kept = self.replay.capacity_transitions;
         check("replay.capacity_transitions", kept, kept >= EPISODE_STEPS, "at least 50")?;
-        check("checkpoint.every_rounds", self.checkpoint.every_rounds, self.checkpoint.every_rounds > 0, "at least 1")?;
+        check(
+            "checkpoint.every_rounds",
+            self.checkpoint.every_rounds,
+            self.checkpoint.every_rounds > 0,
+            "at least 1",
+        )?;
         check("checkpoint.keep", self.checkpoint.keep, self.checkpoint.keep > 0, "at least 1")
     }
 
     fn check_exploration(&self) -> Result<(), ConfigError> {
-        let ExplorationConfig { noise_std, random_share, random_hold_mean_steps } = self.exploration;
+        let ExplorationConfig { noise_std, random_share, random_hold_mean_steps } =
+            self.exploration;
         check("exploration.noise_std", noise_std, (0.0..=10.0).contains(&noise_std), "0 to 10")?;
-        check("exploration.random_share", random_share, (0.0..1.0).contains(&random_share), "a number in [0, 1)")?;
+        check(
+            "exploration.random_share",
+            random_share,
+            (0.0..1.0).contains(&random_share),
+            "a number in [0, 1)",
+        )?;
         let hold = random_hold_mean_steps;
         check("exploration.random_hold_mean_steps", hold, (1.0..=50.0).contains(&hold), "1 to 50")?;
-        check("world.substeps", self.world.substeps, matches!(self.world.substeps, 10 | 20), "10 or 20")
+        check(
+            "world.substeps",
+            self.world.substeps,
+            matches!(self.world.substeps, 10 | 20),
+            "10 or 20",
+        )
     }
 }
 
-fn check(key: &'static str, value: impl ToString, fine: bool, expected: &'static str) -> Result<(), ConfigError> {
-    if fine { Ok(()) } else { Err(ConfigError::OutOfRange { key, value: value.to_string(), expected }) }
+fn check(
+    key: &'static str,
+    value: impl ToString,
+    fine: bool,
+    expected: &'static str,
+) -> Result<(), ConfigError> {
+    if fine {
+        Ok(())
+    } else {
+        Err(ConfigError::OutOfRange { key, value: value.to_string(), expected })
+    }
 }
 
 fn is_name(name: &str) -> bool {
-    (1..=100).contains(&name.len()) && name.chars().all(|c| c.is_ascii_alphanumeric() || "-_.".contains(c))
+    (1..=100).contains(&name.len())
+        && name.chars().all(|c| c.is_ascii_alphanumeric() || "-_.".contains(c))
 }
 
 const fn rounds(recipe: Recipe) -> RoundsConfig {

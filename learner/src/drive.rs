@@ -50,9 +50,11 @@ pub(crate) fn run(
             let reason = drive.rounds()?;
             drive.finish(reason)
         }
-        Err(Error::Teacher(TeacherError::Stopped)) => {
-            Ok(Ended { reason: "stopped before the first round".to_owned(), interrupted: true, digest: String::new() })
-        }
+        Err(Error::Teacher(TeacherError::Stopped)) => Ok(Ended {
+            reason: "stopped before the first round".to_owned(),
+            interrupted: true,
+            digest: String::new(),
+        }),
         Err(error) => Err(error),
     }
 }
@@ -98,7 +100,8 @@ impl<'a> Drive<'a> {
     ) -> Result<Self, Error> {
         let checkpoints = config.out.join("checkpoint");
         let (mut trainer, acting, wall_before_s) = if config.resume {
-            let (trainer, Resumption { acting, wall_s }) = checkpoint::load_newest(&checkpoints, &config.run)?;
+            let (trainer, Resumption { acting, wall_s }) =
+                checkpoint::load_newest(&checkpoints, &config.run)?;
             (trainer, acting, wall_s)
         } else {
             let trainer = Trainer::new(config.run.clone())?;
@@ -165,7 +168,8 @@ impl<'a> Drive<'a> {
                 self.open_round(round + 1, round + 1)?;
             }
             self.judge(&figures)?;
-            if self.trainer.counters().round.is_multiple_of(self.config.run.checkpoint.every_rounds) {
+            if self.trainer.counters().round.is_multiple_of(self.config.run.checkpoint.every_rounds)
+            {
                 self.save();
             }
         }
@@ -262,19 +266,33 @@ impl<'a> Drive<'a> {
     fn start_evaluation(&mut self, figures: &RoundFigures) {
         let version = self.trainer.counters().round;
         let row = self.row(figures);
-        self.pending.push_back(Pending { version, policy: self.trainer.policy(BTreeMap::new()), row });
+        self.pending.push_back(Pending {
+            version,
+            policy: self.trainer.policy(BTreeMap::new()),
+            row,
+        });
         self.add(self.trainer.evaluation_orders(version));
     }
 
     /// Takes in the oldest pending evaluation. Gives whether it could: false when interrupted.
     fn finish_evaluation(&mut self) -> Result<bool, Error> {
         let Some(pending) = self.pending.front() else { return Ok(false) };
-        let Some(episodes) = self.wait_for(EpisodeKind::Evaluation, pending.version) else { return Ok(false) };
-        let Some(Pending { mut policy, mut row, .. }) = self.pending.pop_front() else { return Ok(false) };
+        let Some(episodes) = self.wait_for(EpisodeKind::Evaluation, pending.version) else {
+            return Ok(false);
+        };
+        let Some(Pending { mut policy, mut row, .. }) = self.pending.pop_front() else {
+            return Ok(false);
+        };
         let outcomes: Vec<EpisodeOutcome> = episodes.iter().map(EpisodeOutcome::of).collect();
         judge_into(&mut row, &EvaluationSummary::of(&outcomes));
         row.best = self.best.as_ref().is_none_or(|best| is_better(&row, best));
-        info!(round = row.round, env_steps = row.env_steps, success = row.success, mean_q = row.mean_q, "evaluated");
+        info!(
+            round = row.round,
+            env_steps = row.env_steps,
+            success = row.success,
+            mean_q = row.mean_q,
+            "evaluated"
+        );
         self.metrics.append(&row).map_err(self.in_run_directory("append to", "metrics.jsonl"))?;
         self.judged_round = Some(row.round);
         policy.metadata = self.metadata(&row);
@@ -305,7 +323,10 @@ impl<'a> Drive<'a> {
             return Some(Stop::Reached(format!("success rate {success:.3} reached")));
         }
         if self.is_last(self.trainer.counters().round) {
-            return Some(Stop::Reached(format!("{} environment steps reached", stop.max_env_steps)));
+            return Some(Stop::Reached(format!(
+                "{} environment steps reached",
+                stop.max_env_steps
+            )));
         }
         if stop.max_minutes > 0.0 && self.now_s() >= stop.max_minutes * 60.0 {
             return Some(Stop::Reached(format!("{} minutes are over", stop.max_minutes)));
@@ -344,10 +365,16 @@ impl<'a> Drive<'a> {
     fn save(&self) {
         let resumption = Resumption { acting: self.acting.clone(), wall_s: self.now_s() };
         let directory = self.config.out.join("checkpoint");
-        match checkpoint::save(&directory, &self.trainer, &resumption, self.config.run.checkpoint.keep) {
+        match checkpoint::save(
+            &directory,
+            &self.trainer,
+            &resumption,
+            self.config.run.checkpoint.keep,
+        ) {
             Ok(path) => info!(?path, round = self.trainer.counters().round, "checkpoint saved"),
             Err(error) => {
-                let cause = std::error::Error::source(&error).map(ToString::to_string).unwrap_or_default();
+                let cause =
+                    std::error::Error::source(&error).map(ToString::to_string).unwrap_or_default();
                 warn!(%error, cause, "checkpoint not saved, training goes on");
             }
         }
@@ -357,7 +384,11 @@ impl<'a> Drive<'a> {
         let directory = self.config.out.join("policy");
         let path = directory.join(format!("{name}.safetensors"));
         std::fs::create_dir_all(&directory).map_err(self.in_run_directory("create", "policy"))?;
-        policy.save(&path).map_err(|source| Error::RunDirectory { action: "write", path, source: source.into() })
+        policy.save(&path).map_err(|source| Error::RunDirectory {
+            action: "write",
+            path,
+            source: source.into(),
+        })
     }
 
     fn in_run_directory<E: std::error::Error + Send + Sync + 'static>(
@@ -374,7 +405,11 @@ impl<'a> Drive<'a> {
         let entries = [
             ("run", run.name.clone()),
             ("seed", run.seed.to_string()),
-            ("recipe", if run.recipe == crate::config::Recipe::Tandem { "tandem" } else { "paper" }.to_owned()),
+            (
+                "recipe",
+                if run.recipe == crate::config::Recipe::Tandem { "tandem" } else { "paper" }
+                    .to_owned(),
+            ),
             ("strategy", run.advice.strategy.clone()),
             ("advice_share", run.advice.share.to_string()),
             ("substeps", run.world.substeps.to_string()),
@@ -422,10 +457,13 @@ impl<'a> Drive<'a> {
     /// Publishes the progress.
     fn tell(&self, phase: &str, n_updates: u64, figures: &RoundFigures) {
         let counters = self.trainer.counters();
-        let rate = |count: fn(&(f64, u64, u64)) -> u64| match (self.rates.front(), self.rates.back()) {
-            (Some(first), Some(last)) if last.0 > first.0 => (count(last) - count(first)) as f64 / (last.0 - first.0),
-            _ => 0.0,
-        };
+        let rate =
+            |count: fn(&(f64, u64, u64)) -> u64| match (self.rates.front(), self.rates.back()) {
+                (Some(first), Some(last)) if last.0 > first.0 => {
+                    (count(last) - count(first)) as f64 / (last.0 - first.0)
+                }
+                _ => 0.0,
+            };
         let run = &self.config.run;
         let workers = self.workers();
         self.shared.progress.send_modify(|progress| {
@@ -473,7 +511,8 @@ fn open_ledger(
     if !advice.asks() {
         return Ok(None);
     }
-    let address = config.teacher.as_deref().ok_or_else(|| Error::NoTeacher(advice.strategy.clone()))?;
+    let address =
+        config.teacher.as_deref().ok_or_else(|| Error::NoTeacher(advice.strategy.clone()))?;
     let terms = pb::OpenAccountRequest {
         name: config.run.name.clone(),
         budget: advice.budget,
@@ -484,7 +523,10 @@ fn open_ledger(
 }
 
 /// Opens the metrics of the run directory; what lies after `round` belongs to a lost future and is cut off.
-fn open_metrics(config: &LearnerConfig, round: u64) -> Result<(MetricsLog, Vec<MetricsRow>), Error> {
+fn open_metrics(
+    config: &LearnerConfig,
+    round: u64,
+) -> Result<(MetricsLog, Vec<MetricsRow>), Error> {
     let path: PathBuf = config.out.join("metrics.jsonl");
     let failed = |source| Error::RunDirectory { action: "open", path: path.clone(), source };
     std::fs::create_dir_all(&config.out).map_err(|error| failed(error.into()))?;
@@ -509,7 +551,8 @@ fn judge_into(row: &mut MetricsRow, summary: &EvaluationSummary) {
 
 /// Whether an evaluation beats another: more success, or as much with fewer contacts.
 fn is_better(row: &MetricsRow, than: &MetricsRow) -> bool {
-    row.success > than.success || (row.success >= than.success && row.collision_rate < than.collision_rate)
+    row.success > than.success
+        || (row.success >= than.success && row.collision_rate < than.collision_rate)
 }
 
 fn evaluation_message(row: &MetricsRow) -> pb::Evaluation {

@@ -90,7 +90,8 @@ impl Sampler {
             rewards: vec![0.0; config.reward.n_heads(layout)],
             swapped: false,
         };
-        let (raw_observation, raw_goal) = (vec![0.0; layout.n_observation()], vec![0.0; layout.n_goal()]);
+        let (raw_observation, raw_goal) =
+            (vec![0.0; layout.n_observation()], vec![0.0; layout.n_goal()]);
         Self { config: config.clone(), layout, drawn, raw_observation, raw_goal }
     }
 
@@ -98,7 +99,13 @@ impl Sampler {
     ///
     /// # Panics
     /// When the buffer is empty or the batch is of another layout.
-    pub fn fill(&mut self, buffer: &ReplayBuffer, statistics: Statistics<'_>, rng: &mut ChaCha8Rng, batch: &mut Batch) {
+    pub fn fill(
+        &mut self,
+        buffer: &ReplayBuffer,
+        statistics: Statistics<'_>,
+        rng: &mut ChaCha8Rng,
+        batch: &mut Batch,
+    ) {
         let n_input = self.layout.n_observation() + self.layout.n_goal();
         let (n_action, n_heads) = (self.layout.n_action(), self.drawn.rewards.len());
         for row in 0..batch.rewards.len() / n_heads {
@@ -107,7 +114,11 @@ impl Sampler {
             let (before, after) = (self.drawn.step_idx, self.drawn.step_idx + 1);
             self.write_input(buffer, before, statistics, &mut batch.inputs[row_of(n_input)]);
             self.write_input(buffer, after, statistics, &mut batch.next_inputs[row_of(n_input)]);
-            self.write_action(buffer, &mut batch.actions[row_of(n_action)], &mut batch.cloned[row_of(n_action)]);
+            self.write_action(
+                buffer,
+                &mut batch.actions[row_of(n_action)],
+                &mut batch.cloned[row_of(n_action)],
+            );
             batch.rewards[row_of(n_heads)].copy_from_slice(&self.drawn.rewards);
             if self.drawn.swapped && n_heads == 2 {
                 batch.rewards[row_of(n_heads)].reverse();
@@ -118,8 +129,11 @@ impl Sampler {
     fn draw(&mut self, buffer: &ReplayBuffer, rng: &mut ChaCha8Rng) {
         let moved = buffer.moved_episodes();
         let from_moved = coin(rng, self.config.moved_share) && !moved.is_empty();
-        self.drawn.episode_idx =
-            if from_moved { moved[index(rng, moved.len())] } else { index(rng, buffer.n_episodes()) };
+        self.drawn.episode_idx = if from_moved {
+            moved[index(rng, moved.len())]
+        } else {
+            index(rng, buffer.n_episodes())
+        };
         self.drawn.step_idx = index(rng, EPISODE_STEPS);
         self.drawn.swapped = coin(rng, self.config.swap_share) && self.layout.n_arms == 2;
         match self.config.reward {
@@ -145,7 +159,8 @@ impl Sampler {
             self.take_goal(buffer, arm, moment);
             let achieved = buffer.achieved(self.drawn.episode_idx, self.drawn.step_idx + 1, arm);
             let goal = &self.drawn.goal[self.layout.goal_of(arm)];
-            squared_distance += achieved.iter().zip(goal).map(|(a, g)| (a - g) * (a - g)).sum::<f32>();
+            squared_distance +=
+                achieved.iter().zip(goal).map(|(a, g)| (a - g) * (a - g)).sum::<f32>();
         }
         self.drawn.rewards[0] = sparse_reward(&[squared_distance.sqrt()], &[0.0]);
     }
@@ -167,13 +182,21 @@ impl Sampler {
     }
 
     /// Writes the normalised observation before step `step_idx` and the normalised goal.
-    fn write_input(&mut self, buffer: &ReplayBuffer, step_idx: usize, statistics: Statistics<'_>, input: &mut [f32]) {
-        let (normalized_observation, normalized_goal) = input.split_at_mut(self.layout.n_observation());
+    fn write_input(
+        &mut self,
+        buffer: &ReplayBuffer,
+        step_idx: usize,
+        statistics: Statistics<'_>,
+        input: &mut [f32],
+    ) {
+        let (normalized_observation, normalized_goal) =
+            input.split_at_mut(self.layout.n_observation());
         let observation = buffer.observation(self.drawn.episode_idx, step_idx);
         for (to, from) in self.layout.arms().zip(self.sources()) {
             self.raw_observation[self.layout.observation_of(to)]
                 .copy_from_slice(&observation[self.layout.observation_of(from)]);
-            self.raw_goal[self.layout.goal_of(to)].copy_from_slice(&self.drawn.goal[self.layout.goal_of(from)]);
+            self.raw_goal[self.layout.goal_of(to)]
+                .copy_from_slice(&self.drawn.goal[self.layout.goal_of(from)]);
         }
         statistics.observation.normalize(&self.raw_observation, normalized_observation);
         statistics.goal.normalize(&self.raw_goal, normalized_goal);
@@ -183,7 +206,8 @@ impl Sampler {
         let action = buffer.action(self.drawn.episode_idx, self.drawn.step_idx);
         let advised = buffer.advised_arms(self.drawn.episode_idx, self.drawn.step_idx);
         for (to, from) in self.layout.arms().zip(self.sources()) {
-            actions[self.layout.action_of(to)].copy_from_slice(&action[self.layout.action_of(from)]);
+            actions[self.layout.action_of(to)]
+                .copy_from_slice(&action[self.layout.action_of(from)]);
             let was_advised = advised >> from.0 & 1 == 1;
             cloned[self.layout.action_of(to)].fill(if was_advised { 1.0 } else { 0.0 });
         }
@@ -246,7 +270,10 @@ mod tests {
             let drawn = &sampler.drawn;
             let x = drawn.goal[0];
             if drawn.episode_idx == 0 && x < 9.0 {
-                assert!(x > buffer.achieved(0, drawn.step_idx, ArmIndex(0))[0] + 0.005, "not later: {drawn:?}");
+                assert!(
+                    x > buffer.achieved(0, drawn.step_idx, ArmIndex(0))[0] + 0.005,
+                    "not later: {drawn:?}"
+                );
             }
         });
     }
@@ -255,14 +282,17 @@ mod tests {
     fn rewards_follow_from_the_goal_that_was_drawn() {
         sampled(RewardKind::PerArm, |sampler, buffer| {
             for arm in LAYOUT.arms() {
-                let achieved = buffer.achieved(sampler.drawn.episode_idx, sampler.drawn.step_idx + 1, arm);
+                let achieved =
+                    buffer.achieved(sampler.drawn.episode_idx, sampler.drawn.step_idx + 1, arm);
                 let goal = &sampler.drawn.goal[LAYOUT.goal_of(arm)];
                 assert_eq!(sampler.drawn.rewards[arm.0], sparse_reward(achieved, goal));
             }
         });
         sampled(RewardKind::Joint, |sampler, buffer| {
-            let observation = buffer.observation(sampler.drawn.episode_idx, sampler.drawn.step_idx + 1);
-            let achieved: Vec<f32> = tandem_core::reward::achieved_goal(LAYOUT, observation).collect();
+            let observation =
+                buffer.observation(sampler.drawn.episode_idx, sampler.drawn.step_idx + 1);
+            let achieved: Vec<f32> =
+                tandem_core::reward::achieved_goal(LAYOUT, observation).collect();
             assert_eq!(sampler.drawn.rewards[0], sparse_reward(&achieved, &sampler.drawn.goal));
         });
     }
@@ -274,11 +304,15 @@ mod tests {
             sampled(reward, |sampler, _| hits.set(hits.get() + usize::from(holds(&sampler.drawn))));
             f64::from(hits.get() as u32) / N_DRAWS as f64
         };
-        let near = |share: f64, expected: f64| assert!((share - expected).abs() < 0.03, "{share} is not {expected}");
+        let near = |share: f64, expected: f64| {
+            assert!((share - expected).abs() < 0.03, "{share} is not {expected}")
+        };
         near(count(RewardKind::PerArm, |drawn| drawn.swapped), 0.5);
         near(count(RewardKind::PerArm, |drawn| drawn.episode_idx == 0), 0.75);
         near(count(RewardKind::PerArm, |drawn| drawn.episode_idx == 0 && drawn.goal[0] < 9.0), 0.6);
-        let one_arm_only = |drawn: &Relabelled| drawn.episode_idx == 0 && (drawn.goal[0] < 9.0) != (drawn.goal[3] < 9.0);
+        let one_arm_only = |drawn: &Relabelled| {
+            drawn.episode_idx == 0 && (drawn.goal[0] < 9.0) != (drawn.goal[3] < 9.0)
+        };
         near(count(RewardKind::PerArm, one_arm_only), 0.75 * 2.0 * 0.8 * 0.2);
         near(count(RewardKind::Joint, one_arm_only), 0.0);
     }
@@ -295,17 +329,25 @@ mod tests {
         sampler.fill(&buffer, statistics, &mut episode_rng(3, 0, Stream::Replay), &mut batch);
         let mut n_swapped = 0;
         for row in 0..64 {
-            let (actions, cloned) = (&batch.actions[row * 6..row * 6 + 6], &batch.cloned[row * 6..row * 6 + 6]);
+            let (actions, cloned) =
+                (&batch.actions[row * 6..row * 6 + 6], &batch.cloned[row * 6..row * 6 + 6]);
             let swapped = actions[0] > actions[3];
             n_swapped += usize::from(swapped);
-            let advised_half = if swapped { [0.0, 0.0, 0.0, 1.0, 1.0, 1.0] } else { [1.0, 1.0, 1.0, 0.0, 0.0, 0.0] };
+            let advised_half = if swapped {
+                [0.0, 0.0, 0.0, 1.0, 1.0, 1.0]
+            } else {
+                [1.0, 1.0, 1.0, 0.0, 0.0, 0.0]
+            };
             assert_eq!(cloned, advised_half);
             let input = &batch.inputs[row * 62..row * 62 + 62];
             let drifting_x = if swapped { input[31] } else { input[3] };
             let still_x = if swapped { input[3] } else { input[31] };
             assert!(still_x == 0.0 && drifting_x >= 0.0);
             let steps = actions[if swapped { 3 } else { 0 }] / 6.0;
-            assert!((drifting_x * 10.0 - steps * 0.01).abs() < 1e-5, "observation and action of different steps");
+            assert!(
+                (drifting_x * 10.0 - steps * 0.01).abs() < 1e-5,
+                "observation and action of different steps"
+            );
         }
         assert!((10..54).contains(&n_swapped));
     }

@@ -33,12 +33,23 @@ impl ReplayBuffer {
     #[must_use]
     pub fn new(layout: Layout, capacity_transitions: usize) -> Self {
         let capacity_episodes = (capacity_transitions / EPISODE_STEPS).max(1);
-        Self { layout, capacity_episodes, next: 0, parts: ReplayParts::default(), moved_episodes: Vec::new() }
+        Self {
+            layout,
+            capacity_episodes,
+            next: 0,
+            parts: ReplayParts::default(),
+            moved_episodes: Vec::new(),
+        }
     }
 
     /// A buffer with stored contents; `next` is where the next episode goes.
     #[must_use]
-    pub fn from_parts(layout: Layout, capacity_transitions: usize, parts: ReplayParts, next: usize) -> Option<Self> {
+    pub fn from_parts(
+        layout: Layout,
+        capacity_transitions: usize,
+        parts: ReplayParts,
+        next: usize,
+    ) -> Option<Self> {
         let mut buffer = Self::new(layout, capacity_transitions);
         let n = parts.moved.len();
         let fits = n <= buffer.capacity_episodes
@@ -149,7 +160,13 @@ impl ReplayBuffer {
 
     fn index_moved(&mut self) {
         self.moved_episodes.clear();
-        let moved = self.parts.moved.iter().enumerate().filter(|(_, moved)| **moved == 1).map(|(episode, _)| episode);
+        let moved = self
+            .parts
+            .moved
+            .iter()
+            .enumerate()
+            .filter(|(_, moved)| **moved == 1)
+            .map(|(episode, _)| episode);
         self.moved_episodes.extend(moved);
     }
 }
@@ -199,7 +216,8 @@ mod tests {
             let drift_m = if number % 2 == 0 { 0.0 } else { 0.01 * f32::from(number) };
             buffer.push(&drifting_episode(LAYOUT, u64::from(number), drift_m));
         }
-        let second_x: Vec<f32> = (0..3).map(|episode| buffer.achieved(episode, 1, ArmIndex(0))[0]).collect();
+        let second_x: Vec<f32> =
+            (0..3).map(|episode| buffer.achieved(episode, 1, ArmIndex(0))[0]).collect();
         assert_eq!(second_x, [0.03, 0.0, 0.0], "episodes 3, 4, 2");
         assert_eq!(buffer.moved_episodes(), [0]);
     }
@@ -211,7 +229,10 @@ mod tests {
             buffer.push(&drifting_episode(LAYOUT, number, 0.02));
         }
         let (parts, next) = buffer.parts();
-        assert_eq!(ReplayBuffer::from_parts(LAYOUT, 2 * EPISODE_STEPS, parts.clone(), next), Some(buffer.clone()));
+        assert_eq!(
+            ReplayBuffer::from_parts(LAYOUT, 2 * EPISODE_STEPS, parts.clone(), next),
+            Some(buffer.clone())
+        );
         let mut torn = parts.clone();
         torn.actions.pop();
         assert_eq!(ReplayBuffer::from_parts(LAYOUT, 2 * EPISODE_STEPS, torn, next), None);

@@ -113,7 +113,13 @@ pub(crate) struct State {
 impl Shared {
     pub(crate) fn new(clock: Clock) -> Self {
         let (progress, _) = watch::channel(pb::Progress::default());
-        Self { state: Mutex::default(), arrived: Condvar::new(), work: Notify::new(), progress, clock }
+        Self {
+            state: Mutex::default(),
+            arrived: Condvar::new(),
+            work: Notify::new(),
+            progress,
+            clock,
+        }
     }
 
     pub(crate) fn lock(&self) -> MutexGuard<'_, State> {
@@ -121,7 +127,11 @@ impl Shared {
     }
 
     /// Waits a while for episodes to come in.
-    pub(crate) fn wait<'a>(&self, state: MutexGuard<'a, State>, at_most: Duration) -> MutexGuard<'a, State> {
+    pub(crate) fn wait<'a>(
+        &self,
+        state: MutexGuard<'a, State>,
+        at_most: Duration,
+    ) -> MutexGuard<'a, State> {
         self.arrived.wait_timeout(state, at_most).unwrap_or_else(PoisonError::into_inner).0
     }
 
@@ -139,17 +149,23 @@ impl Shared {
 ///
 /// # Errors
 /// When the run cannot start, its state cannot be saved, or learning diverges.
-pub async fn serve(config: LearnerConfig, listener: TcpListener, shutdown: CancellationToken) -> Result<Ended, Error> {
+pub async fn serve(
+    config: LearnerConfig,
+    listener: TcpListener,
+    shutdown: CancellationToken,
+) -> Result<Ended, Error> {
     let shared = Arc::new(Shared::new(config.clock.clone()));
     let (health, health_service) = tonic_health::server::health_reporter();
     health.set_serving::<LearnerServer<LearnerService>>().await;
     let stop_serving = CancellationToken::new();
     let learning = {
-        let (shared, runtime, stop_serving) = (shared.clone(), tokio::runtime::Handle::current(), stop_serving.clone());
+        let (shared, runtime, stop_serving) =
+            (shared.clone(), tokio::runtime::Handle::current(), stop_serving.clone());
         std::thread::Builder::new().name("learn".to_owned()).spawn(move || {
             let _stop = stop_serving.drop_guard();
             let ended = drive::run(&config, &shared, &runtime, &shutdown);
-            let reason = ended.as_ref().map_or_else(ToString::to_string, |ended| ended.reason.clone());
+            let reason =
+                ended.as_ref().map_or_else(ToString::to_string, |ended| ended.reason.clone());
             shared.lock().finished = Some(reason.clone());
             shared.work.notify_waiters();
             shared.progress.send_modify(|progress| {
@@ -162,7 +178,8 @@ pub async fn serve(config: LearnerConfig, listener: TcpListener, shutdown: Cance
             ended
         })
     };
-    let learner = LearnerServer::new(LearnerService { shared }).max_decoding_message_size(MAX_MESSAGE_BYTES);
+    let learner =
+        LearnerServer::new(LearnerService { shared }).max_decoding_message_size(MAX_MESSAGE_BYTES);
     tonic::transport::Server::builder()
         .tcp_nodelay(true)
         .http2_keepalive_interval(Some(Duration::from_secs(10)))
@@ -174,19 +191,26 @@ pub async fn serve(config: LearnerConfig, listener: TcpListener, shutdown: Cance
         .serve_with_incoming_shutdown(TcpListenerStream::new(listener), stop_serving.cancelled())
         .await?;
     match learning {
-        Ok(thread) => tokio::task::spawn_blocking(move || thread.join()).await.map_or(Err(Error::Panicked), |joined| {
-            joined.unwrap_or(Err(Error::Panicked))
+        Ok(thread) => tokio::task::spawn_blocking(move || thread.join())
+            .await
+            .map_or(Err(Error::Panicked), |joined| joined.unwrap_or(Err(Error::Panicked))),
+        Err(source) => Err(Error::RunDirectory {
+            action: "start a thread for",
+            path: PathBuf::from("learning"),
+            source: source.into(),
         }),
-        Err(source) => Err(Error::RunDirectory { action: "start a thread for", path: PathBuf::from("learning"), source: source.into() }),
     }
 }
 
-fn reflection_v1() -> tonic_reflection::server::v1::ServerReflectionServer<impl tonic_reflection::server::v1::ServerReflection> {
+fn reflection_v1() -> tonic_reflection::server::v1::ServerReflectionServer<
+    impl tonic_reflection::server::v1::ServerReflection,
+> {
     reflection().build_v1().expect("the descriptors are compiled in")
 }
 
-fn reflection_v1alpha()
--> tonic_reflection::server::v1alpha::ServerReflectionServer<impl tonic_reflection::server::v1alpha::ServerReflection> {
+fn reflection_v1alpha() -> tonic_reflection::server::v1alpha::ServerReflectionServer<
+    impl tonic_reflection::server::v1alpha::ServerReflection,
+> {
     reflection().build_v1alpha().expect("the descriptors are compiled in")
 }
 
@@ -204,16 +228,23 @@ struct LearnerService {
 impl Learner for LearnerService {
     type WatchStream = Pin<Box<dyn Stream<Item = Result<pb::Progress, Status>> + Send>>;
 
-    async fn join(&self, request: Request<pb::JoinRequest>) -> Result<Response<pb::JoinResponse>, Status> {
+    async fn join(
+        &self,
+        request: Request<pb::JoinRequest>,
+    ) -> Result<Response<pb::JoinResponse>, Status> {
         let name = request.into_inner().worker;
         let now = (self.shared.clock)();
         let mut state = self.shared.lock();
-        let terms = state.terms.clone().ok_or_else(|| Status::unavailable("the run is starting"))?;
+        let terms =
+            state.terms.clone().ok_or_else(|| Status::unavailable("the run is starting"))?;
         let worker_id = state.board.join(name, now);
         Ok(Response::new(pb::JoinResponse { worker_id, terms: Some(encode_terms(&terms)) }))
     }
 
-    async fn next_work(&self, request: Request<pb::NextWorkRequest>) -> Result<Response<pb::NextWorkResponse>, Status> {
+    async fn next_work(
+        &self,
+        request: Request<pb::NextWorkRequest>,
+    ) -> Result<Response<pb::NextWorkResponse>, Status> {
         let worker_id = request.into_inner().worker_id;
         let search = async {
             loop {
@@ -224,15 +255,20 @@ impl Learner for LearnerService {
                 notified.await;
             }
         };
-        let work = tokio::time::timeout(WORK_POLL, search).await.unwrap_or(Ok(Work::Wait(pb::Wait {})))?;
+        let work =
+            tokio::time::timeout(WORK_POLL, search).await.unwrap_or(Ok(Work::Wait(pb::Wait {})))?;
         Ok(Response::new(pb::NextWorkResponse { work: Some(work) }))
     }
 
-    async fn get_parameters(&self, request: Request<pb::GetParametersRequest>) -> Result<Response<pb::Parameters>, Status> {
+    async fn get_parameters(
+        &self,
+        request: Request<pb::GetParametersRequest>,
+    ) -> Result<Response<pb::Parameters>, Status> {
         let version = request.into_inner().version;
         let state = self.shared.lock();
         let actor = state.published.get(&version);
-        let actor = actor.ok_or_else(|| Status::not_found(format!("parameter version {version} is not kept")))?;
+        let actor = actor
+            .ok_or_else(|| Status::not_found(format!("parameter version {version} is not kept")))?;
         Ok(Response::new(encode_actor(actor)))
     }
 
@@ -243,7 +279,8 @@ impl Learner for LearnerService {
         let request = request.into_inner();
         let now = (self.shared.clock)();
         let mut state = self.shared.lock();
-        let layout = state.terms.as_ref().ok_or_else(|| Status::unavailable("the run is starting"))?.layout;
+        let layout =
+            state.terms.as_ref().ok_or_else(|| Status::unavailable("the run is starting"))?.layout;
         let episodes: Result<Vec<_>, _> =
             request.episodes.into_iter().map(|episode| decode_episode(episode, layout)).collect();
         state.board.submit(request.worker_id, request.slot, episodes?, now).map_err(refusal)?;
@@ -252,17 +289,24 @@ impl Learner for LearnerService {
         Ok(Response::new(pb::SubmitEpisodesResponse {}))
     }
 
-    async fn status(&self, _: Request<pb::StatusRequest>) -> Result<Response<pb::Progress>, Status> {
+    async fn status(
+        &self,
+        _: Request<pb::StatusRequest>,
+    ) -> Result<Response<pb::Progress>, Status> {
         Ok(Response::new(self.shared.progress.borrow().clone()))
     }
 
-    async fn watch(&self, _: Request<pb::WatchRequest>) -> Result<Response<Self::WatchStream>, Status> {
+    async fn watch(
+        &self,
+        _: Request<pb::WatchRequest>,
+    ) -> Result<Response<Self::WatchStream>, Status> {
         let mut told_the_end = false;
-        let progress = WatchStream::new(self.shared.progress.subscribe()).take_while(move |progress| {
-            let goes_on = !told_the_end;
-            told_the_end = progress.ended;
-            goes_on
-        });
+        let progress =
+            WatchStream::new(self.shared.progress.subscribe()).take_while(move |progress| {
+                let goes_on = !told_the_end;
+                told_the_end = progress.ended;
+                goes_on
+            });
         Ok(Response::new(Box::pin(progress.map(Ok))))
     }
 }

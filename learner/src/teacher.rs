@@ -63,7 +63,14 @@ impl Ledger {
             .tcp_nodelay(true);
         let _inside = runtime.enter();
         let client = TeacherClient::new(endpoint.connect_lazy());
-        let mut ledger = Self { client, runtime: runtime.clone(), shutdown, account: terms.clone(), spent_before: 0, left: terms.budget };
+        let mut ledger = Self {
+            client,
+            runtime: runtime.clone(),
+            shutdown,
+            account: terms.clone(),
+            spent_before: 0,
+            left: terms.budget,
+        };
         let account = ledger.open_account(terms.clone())?;
         if account.spent < spent {
             let remaining = pb::OpenAccountRequest {
@@ -89,12 +96,22 @@ impl Ledger {
     }
 
     /// Sets units aside for a round's advised episodes, in their order.
-    pub(crate) fn open_leases(&mut self, episodes: Vec<u64>, units_per_episode: u32) -> Result<(), TeacherError> {
+    pub(crate) fn open_leases(
+        &mut self,
+        episodes: Vec<u64>,
+        units_per_episode: u32,
+    ) -> Result<(), TeacherError> {
         if episodes.is_empty() {
             return Ok(());
         }
-        let request = pb::OpenLeasesRequest { account: self.account.name.clone(), episodes, units_per_episode };
-        let response = self.call(async |mut client: TeacherClient<Channel>| client.open_leases(request.clone()).await)?;
+        let request = pb::OpenLeasesRequest {
+            account: self.account.name.clone(),
+            episodes,
+            units_per_episode,
+        };
+        let response = self.call(async |mut client: TeacherClient<Channel>| {
+            client.open_leases(request.clone()).await
+        })?;
         self.note(response.account.as_ref());
         Ok(())
     }
@@ -102,14 +119,19 @@ impl Ledger {
     /// Returns the unspent units of finished episodes.
     pub(crate) fn settle(&mut self, episodes: &[Episode]) -> Result<(), TeacherError> {
         let numbers: Vec<u64> = episodes.iter().map(|episode| episode.number).collect();
-        let request = pb::SettleLeasesRequest { account: self.account.name.clone(), episodes: numbers };
-        let account = self.call(async |mut client: TeacherClient<Channel>| client.settle_leases(request.clone()).await)?;
+        let request =
+            pb::SettleLeasesRequest { account: self.account.name.clone(), episodes: numbers };
+        let account = self.call(async |mut client: TeacherClient<Channel>| {
+            client.settle_leases(request.clone()).await
+        })?;
         self.note(Some(&account));
         Ok(())
     }
 
     fn open_account(&mut self, terms: pb::OpenAccountRequest) -> Result<pb::Account, TeacherError> {
-        let account = self.call(async |mut client: TeacherClient<Channel>| client.open_account(terms.clone()).await)?;
+        let account = self.call(async |mut client: TeacherClient<Channel>| {
+            client.open_account(terms.clone()).await
+        })?;
         self.note(Some(&account));
         Ok(account)
     }
@@ -128,7 +150,8 @@ impl Ledger {
         let attempts = async {
             let mut pause = FIRST_PAUSE;
             loop {
-                let attempt = tokio::time::timeout(CALL_DEADLINE, request(self.client.clone())).await;
+                let attempt =
+                    tokio::time::timeout(CALL_DEADLINE, request(self.client.clone())).await;
                 let status = match attempt {
                     Ok(Ok(response)) => return Ok(response.into_inner()),
                     Ok(Err(status)) if !is_passing(&status) => {
@@ -155,6 +178,11 @@ impl Ledger {
 fn is_passing(status: &tonic::Status) -> bool {
     matches!(
         status.code(),
-        Code::Unavailable | Code::DeadlineExceeded | Code::Cancelled | Code::Unknown | Code::Aborted | Code::ResourceExhausted
+        Code::Unavailable
+            | Code::DeadlineExceeded
+            | Code::Cancelled
+            | Code::Unknown
+            | Code::Aborted
+            | Code::ResourceExhausted
     )
 }

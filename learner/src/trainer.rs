@@ -6,11 +6,11 @@ use std::collections::BTreeMap;
 
 use rand_chacha::ChaCha8Rng;
 use sha2::{Digest as _, Sha256};
+use tandem_core::Episode;
 use tandem_core::episode::EpisodeKind;
 use tandem_core::layout::{EPISODE_STEPS, Layout};
 use tandem_core::rng::{Stream, coin, episode_rng, index};
 use tandem_core::work::{EpisodeOrder, PublishedActor, SlotOrder};
-use tandem_core::Episode;
 use tandem_policy::{Normalizer, NormalizerSnapshot, Policy};
 
 use crate::config::{Behaviour, ConfigError, PolyakEvery, RunConfig};
@@ -154,8 +154,10 @@ impl Trainer {
         self.counters.episodes += episodes.len() as u64;
         self.counters.env_steps += (episodes.len() * EPISODE_STEPS) as u64;
         let share = |hits: usize| hits as f64 / episodes.len().max(1) as f64;
-        self.figures.training_success = share(episodes.iter().filter(|episode| episode.succeeded()).count());
-        self.figures.training_moved = share(episodes.iter().filter(|episode| episode.moved()).count());
+        self.figures.training_success =
+            share(episodes.iter().filter(|episode| episode.succeeded()).count());
+        self.figures.training_moved =
+            share(episodes.iter().filter(|episode| episode.moved()).count());
     }
 
     /// Makes a round's updates. `on_update` hears how many are done.
@@ -201,7 +203,8 @@ impl Trainer {
         };
         let NormalizerSnapshot { mean: observation_mean, std: observation_std } =
             self.observation_normalizer.snapshot().clone();
-        let NormalizerSnapshot { mean: goal_mean, std: goal_std } = self.goal_normalizer.snapshot().clone();
+        let NormalizerSnapshot { mean: goal_mean, std: goal_std } =
+            self.goal_normalizer.snapshot().clone();
         PublishedActor {
             version: self.counters.round,
             n_hidden: self.config.ddpg.n_hidden,
@@ -245,13 +248,18 @@ impl Trainer {
         for normalizer in [&self.observation_normalizer, &self.goal_normalizer] {
             let seen = normalizer.parts();
             hash.update(seen.count.to_le_bytes());
-            seen.sum.iter().chain(&seen.sum_of_squares).for_each(|sum| hash.update(sum.to_le_bytes()));
+            seen.sum
+                .iter()
+                .chain(&seen.sum_of_squares)
+                .for_each(|sum| hash.update(sum.to_le_bytes()));
         }
         let (parts, next) = self.replay.parts();
         hash.update(&parts.advised_arms);
         hash.update(&parts.moved);
         let Counters { round, env_steps, episodes, updates, advice_spent } = self.counters;
-        for count in [next as u64, self.ddpg.n_updates(), round, env_steps, episodes, updates, advice_spent] {
+        for count in
+            [next as u64, self.ddpg.n_updates(), round, env_steps, episodes, updates, advice_spent]
+        {
             hash.update(count.to_le_bytes());
         }
         hash.finalize().iter().map(|byte| format!("{byte:02x}")).collect()
@@ -265,7 +273,8 @@ impl Trainer {
             ("replay.goals", parts.goals.as_slice()),
             ("replay.actions", parts.actions.as_slice()),
         ];
-        let ddpg = self.ddpg.state().into_iter().map(|(name, values)| (format!("ddpg.{name}"), values));
+        let ddpg =
+            self.ddpg.state().into_iter().map(|(name, values)| (format!("ddpg.{name}"), values));
         ddpg.chain(replay.map(|(name, values)| (name.to_owned(), values))).collect()
     }
 
@@ -288,7 +297,12 @@ impl Trainer {
         self.goal_normalizer.update(&goals);
     }
 
-    fn relabelled_goal(&self, episode: &Episode, step_idx: usize, rng: &mut ChaCha8Rng) -> Vec<f32> {
+    fn relabelled_goal(
+        &self,
+        episode: &Episode,
+        step_idx: usize,
+        rng: &mut ChaCha8Rng,
+    ) -> Vec<f32> {
         let mut goal = episode.goal.clone();
         for arm in self.layout.arms() {
             let hindsight = coin(rng, self.config.replay.her_future_share);
@@ -302,15 +316,29 @@ impl Trainer {
 }
 
 /// Whether episode `number` is one of the advised ones: a share of any run of episodes, evenly spread.
-#[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "episode numbers stay far below 2^52")]
+#[expect(
+    clippy::cast_possible_truncation,
+    clippy::cast_sign_loss,
+    reason = "episode numbers stay far below 2^52"
+)]
 fn is_advised(number: u64, share: f64) -> bool {
     let advised_before = |number: u64| (number as f64 * share).floor() as u64;
     advised_before(number + 1) > advised_before(number)
 }
 
 /// Cuts orders into slots of `n_episodes`; the board numbers them.
-fn slots(orders: &[EpisodeOrder], n_episodes: usize, kind: EpisodeKind, version: u64) -> Vec<SlotOrder> {
-    let slot = |episodes: &[EpisodeOrder]| SlotOrder { slot: 0, parameter_version: version, kind, episodes: episodes.to_vec() };
+fn slots(
+    orders: &[EpisodeOrder],
+    n_episodes: usize,
+    kind: EpisodeKind,
+    version: u64,
+) -> Vec<SlotOrder> {
+    let slot = |episodes: &[EpisodeOrder]| SlotOrder {
+        slot: 0,
+        parameter_version: version,
+        kind,
+        episodes: episodes.to_vec(),
+    };
     orders.chunks(n_episodes).map(slot).collect()
 }
 

@@ -6,6 +6,9 @@ use crate::elementwise::blend;
 
 const FIRST_DECAY: f32 = 0.9;
 const SECOND_DECAY: f32 = 0.999;
+/// What a new gradient counts; `1 - SECOND_DECAY` in single precision would be 1.3e-5 off.
+const FIRST_SHARE: f32 = 0.1;
+const SECOND_SHARE: f32 = 0.001;
 const EPSILON: f32 = 1e-8;
 
 /// Adam (Kingma & Ba 2015) with bias correction; decays 0.9 and 0.999, epsilon 1e-8.
@@ -43,9 +46,9 @@ impl Adam {
         Arch::new().dispatch(|| {
             for i in 0..n {
                 let slope = gradient[i];
-                let first = FIRST_DECAY * first_moments[i] + (1.0 - FIRST_DECAY) * slope;
+                let first = FIRST_DECAY * first_moments[i] + FIRST_SHARE * slope;
                 let second =
-                    SECOND_DECAY * second_moments[i] + (1.0 - SECOND_DECAY) * (slope * slope);
+                    SECOND_DECAY * second_moments[i] + SECOND_SHARE * (slope * slope);
                 first_moments[i] = first;
                 second_moments[i] = second;
                 parameters[i] -= step_size * first / (second.sqrt() * second_scale + EPSILON);
@@ -79,8 +82,8 @@ impl Adam {
     #[expect(clippy::cast_possible_truncation, reason = "both lie well within f32")]
     fn bias_corrected(&self) -> (f32, f32) {
         let n_steps = self.n_steps as f64;
-        let first = 1.0 - libm::pow(f64::from(FIRST_DECAY), n_steps);
-        let second = 1.0 - libm::pow(f64::from(SECOND_DECAY), n_steps);
+        let first = 1.0 - libm::pow(0.9, n_steps);
+        let second = 1.0 - libm::pow(0.999, n_steps);
         ((f64::from(self.learning_rate) / first) as f32, (1.0 / second.sqrt()) as f32)
     }
 }

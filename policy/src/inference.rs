@@ -255,7 +255,7 @@ mod tests {
             let error = Actor::new(policy.layout, published).expect_err("must be refused");
             assert_eq!(error.to_string(), expected);
         };
-        check(|actor| drop(actor.actor.pop()), "actor has 2178 numbers, expected 2179");
+        check(|actor| actor.actor.truncate(2178), "actor has 2178 numbers, expected 2179");
         check(|actor| actor.n_hidden_layers = 0, "n_hidden_layers is 0, expected 1 to 64");
         check(|actor| actor.actor[7] = f32::NAN, "actor holds a number that is not finite");
         check(|actor| actor.goal_mean.push(0.0), "goal mean has 4 numbers, expected 3");

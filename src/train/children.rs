@@ -46,7 +46,12 @@ impl Children {
     pub(crate) async fn start(&mut self, plan: &Plan) -> anyhow::Result<()> {
         if plan.teacher.is_some() {
             let policy = plan.teacher_copy();
-            let args = ["teacher".into(), "--exit-with-stdin".into(), "--policy".into(), policy.into_os_string()];
+            let args = [
+                "teacher".into(),
+                "--exit-with-stdin".into(),
+                "--policy".into(),
+                policy.into_os_string(),
+            ];
             self.teacher = Some(self.service("teacher", &args).await?);
         }
         let mut args: Vec<std::ffi::OsString> = vec!["learner".into(), "--exit-with-stdin".into()];
@@ -91,7 +96,9 @@ impl Children {
         let mut said = Vec::new();
         for idx in 0..self.workers.len() {
             let worker = &mut self.workers[idx];
-            let Some(status) = worker.child.try_wait()?.filter(|_| !worker.finished) else { continue };
+            let Some(status) = worker.child.try_wait()?.filter(|_| !worker.finished) else {
+                continue;
+            };
             worker.finished = status.success();
             if worker.finished {
                 continue;
@@ -133,7 +140,15 @@ impl Children {
 
     fn worker(&self, plan: &Plan, name: &str) -> anyhow::Result<Child> {
         let mut command = self.command()?;
-        command.args(["worker", "--exit-with-stdin", "--name", name, "--connect", self.learner_address(), "--log-dir"]);
+        command.args([
+            "worker",
+            "--exit-with-stdin",
+            "--name",
+            name,
+            "--connect",
+            self.learner_address(),
+            "--log-dir",
+        ]);
         command.arg(plan.out.join("mcap"));
         if let Some((_, address)) = &self.teacher {
             command.args(["--teacher", address]);
@@ -142,18 +157,29 @@ impl Children {
     }
 
     /// Starts a service and waits for the line that says where it listens.
-    async fn service(&self, role: &str, args: &[std::ffi::OsString]) -> anyhow::Result<(Child, String)> {
+    async fn service(
+        &self,
+        role: &str,
+        args: &[std::ffi::OsString],
+    ) -> anyhow::Result<(Child, String)> {
         let mut command = self.command()?;
-        let mut child =
-            command.args(args).stdout(Stdio::piped()).spawn().with_context(|| format!("cannot start the {role}"))?;
-        let output = child.stdout.take().ok_or_else(|| anyhow!("the {role} has no standard output"))?;
+        let mut child = command
+            .args(args)
+            .stdout(Stdio::piped())
+            .spawn()
+            .with_context(|| format!("cannot start the {role}"))?;
+        let output =
+            child.stdout.take().ok_or_else(|| anyhow!("the {role} has no standard output"))?;
         let mut line = String::new();
         BufReader::new(output).read_line(&mut line).await?;
         match line.trim().strip_prefix("listening on ") {
             Some(address) => Ok((child, address.to_owned())),
             None => {
                 let status = child.wait().await?;
-                bail!("the {role} ended ({status}) before it listened: {}", last_words(&self.log_path))
+                bail!(
+                    "the {role} ended ({status}) before it listened: {}",
+                    last_words(&self.log_path)
+                )
             }
         }
     }
@@ -161,7 +187,11 @@ impl Children {
     fn command(&self) -> anyhow::Result<Command> {
         let mut command = Command::new(&self.program);
         // A process group of their own: Ctrl-C reaches this process alone, which then ends them in order.
-        command.process_group(0).kill_on_drop(true).stdin(Stdio::piped()).stderr(self.log.try_clone()?);
+        command
+            .process_group(0)
+            .kill_on_drop(true)
+            .stdin(Stdio::piped())
+            .stderr(self.log.try_clone()?);
         Ok(command)
     }
 }

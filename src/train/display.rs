@@ -39,7 +39,12 @@ impl Display {
             (0, _) => Until::Open,
             (env_steps, _) => Until::EnvSteps(env_steps),
         };
-        let display = Self { live: std::io::stderr().is_terminal().then(Live::new), until, told_at_s: -PLAIN_EVERY_S, told_evaluation: None };
+        let display = Self {
+            live: std::io::stderr().is_terminal().then(Live::new),
+            until,
+            told_at_s: -PLAIN_EVERY_S,
+            told_evaluation: None,
+        };
         let config = &plan.config;
         display.say(&format!(
             "training {} with {} arm(s), strategy {}, seed {}, {} worker process(es); run directory {}",
@@ -110,20 +115,40 @@ impl Live {
         Self { all, bar, lines }
     }
 
-    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to the bar's length")]
+    #[expect(
+        clippy::cast_possible_truncation,
+        clippy::cast_sign_loss,
+        reason = "clamped to the bar's length"
+    )]
     fn show(&self, progress: &pb::Progress, share_done: f64) {
         self.bar.set_position((share_done.clamp(0.0, 1.0) * 1000.0) as u64);
         self.bar.set_message(counts_line(progress));
-        let best = progress.best.as_ref().map_or_else(|| "none yet".to_owned(), |best| format!("{:.3} at {} env steps", best.success, grouped(best.env_steps)));
-        self.lines[0].set_message(format!("best success {best}; latest training episodes {:.2}", progress.training_success));
-        self.lines[1].set_message(format!("advice spent {}, left {}", grouped(progress.advice_spent), grouped(progress.budget_left)));
-        let workers: Vec<String> = progress.workers.iter().map(|worker| format!("{} {}", worker.name, worker.doing)).collect();
+        let best = progress.best.as_ref().map_or_else(
+            || "none yet".to_owned(),
+            |best| format!("{:.3} at {} env steps", best.success, grouped(best.env_steps)),
+        );
+        self.lines[0].set_message(format!(
+            "best success {best}; latest training episodes {:.2}",
+            progress.training_success
+        ));
+        self.lines[1].set_message(format!(
+            "advice spent {}, left {}",
+            grouped(progress.advice_spent),
+            grouped(progress.budget_left)
+        ));
+        let workers: Vec<String> = progress
+            .workers
+            .iter()
+            .map(|worker| format!("{} {}", worker.name, worker.doing))
+            .collect();
         self.lines[2].set_message(format!("learner {}; {}", progress.phase, workers.join("; ")));
     }
 }
 
 fn style(template: &str) -> ProgressStyle {
-    ProgressStyle::with_template(template).unwrap_or_else(|_| ProgressStyle::default_bar()).progress_chars("=> ")
+    ProgressStyle::with_template(template)
+        .unwrap_or_else(|_| ProgressStyle::default_bar())
+        .progress_chars("=> ")
 }
 
 fn counts_line(progress: &pb::Progress) -> String {
@@ -155,7 +180,11 @@ fn evaluation_line(progress: &pb::Progress, evaluation: &pb::Evaluation) -> Stri
 }
 
 /// Minutes and seconds.
-#[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a run's seconds are positive and few")]
+#[expect(
+    clippy::cast_possible_truncation,
+    clippy::cast_sign_loss,
+    reason = "a run's seconds are positive and few"
+)]
 pub(crate) fn clock_text(seconds: f64) -> String {
     let seconds = seconds.max(0.0) as u64;
     format!("{:02}:{:02}", seconds / 60, seconds % 60)
@@ -164,7 +193,12 @@ pub(crate) fn clock_text(seconds: f64) -> String {
 /// A number with its thousands set apart.
 pub(crate) fn grouped(number: u64) -> String {
     let digits = number.to_string();
-    let groups: Vec<&str> = digits.as_bytes().rchunks(3).rev().filter_map(|group| std::str::from_utf8(group).ok()).collect();
+    let groups: Vec<&str> = digits
+        .as_bytes()
+        .rchunks(3)
+        .rev()
+        .filter_map(|group| std::str::from_utf8(group).ok())
+        .collect();
     groups.join(",")
 }
 
@@ -174,7 +208,13 @@ mod tests {
 
     #[test]
     fn numbers_and_times_are_written_for_people() {
-        assert_eq!([grouped(0), grouped(999), grouped(1_000), grouped(12_345_678)], ["0", "999", "1,000", "12,345,678"]);
-        assert_eq!([clock_text(0.0), clock_text(61.9), clock_text(3600.0)], ["00:00", "01:01", "60:00"]);
+        assert_eq!(
+            [grouped(0), grouped(999), grouped(1_000), grouped(12_345_678)],
+            ["0", "999", "1,000", "12,345,678"]
+        );
+        assert_eq!(
+            [clock_text(0.0), clock_text(61.9), clock_text(3600.0)],
+            ["00:00", "01:01", "60:00"]
+        );
     }
 }

@@ -30,7 +30,8 @@ impl Plan {
             Some(out) => out.clone(),
             None => free_run_directory(&config),
         };
-        let teacher = if config.advice.asks() { Some(teacher_path(args, &config, &out)?) } else { None };
+        let teacher =
+            if config.advice.asks() { Some(teacher_path(args, &config, &out)?) } else { None };
         let n_workers = args.workers.unwrap_or_else(|| default_workers(&config));
         if !(1..=1024).contains(&n_workers) {
             return Err(Failed::usage(format!("--workers {n_workers}: expected 1 to 1024")));
@@ -49,7 +50,10 @@ impl Plan {
             )));
         }
         if self.resume && tandem_learner::checkpoint::list(&out.join("checkpoint")).is_empty() {
-            return Err(Failed::usage(format!("{} has no checkpoint to go on from", out.display())));
+            return Err(Failed::usage(format!(
+                "{} has no checkpoint to go on from",
+                out.display()
+            )));
         }
         let failed = || format!("cannot write to {}", out.display());
         std::fs::create_dir_all(out.join("policy")).or_exit(Exit::TryAgain, failed)?;
@@ -88,8 +92,13 @@ fn teacher_copy(out: &Path) -> PathBuf {
 
 /// What the command line says, as settings of the run file; flags come after `--set`.
 fn settings(args: &TrainArgs) -> Result<Vec<(String, Value)>, Failed> {
-    let mut settings = args.settings.iter().map(|setting| run_file::parse_setting(setting)).collect::<Result<Vec<_>, _>>()?;
-    let whole = |n: u64| i64::try_from(n).map_or_else(|_| Value::String(n.to_string()), Value::Integer);
+    let mut settings = args
+        .settings
+        .iter()
+        .map(|setting| run_file::parse_setting(setting))
+        .collect::<Result<Vec<_>, _>>()?;
+    let whole =
+        |n: u64| i64::try_from(n).map_or_else(|_| Value::String(n.to_string()), Value::Integer);
     let recipe = args.recipe.map(|recipe| match recipe {
         RecipeName::Tandem => "tandem",
         RecipeName::Paper => "paper",
@@ -133,10 +142,16 @@ fn teacher_path(args: &TrainArgs, config: &RunConfig, out: &Path) -> Result<Path
     let policy = files::load_policy(&path)?;
     let shown = path.display();
     if policy.layout.n_arms != 1 {
-        return Err(Failed::usage(format!("{shown} drives {} arms: a teacher drives one", policy.layout.n_arms)));
+        return Err(Failed::usage(format!(
+            "{shown} drives {} arms: a teacher drives one",
+            policy.layout.n_arms
+        )));
     }
     if policy.layout.task.name() != config.task {
-        return Err(Failed::usage(format!("{shown} is a teacher for {}, the run is for {}", policy.layout.task, config.task)));
+        return Err(Failed::usage(format!(
+            "{shown} is a teacher for {}, the run is for {}",
+            policy.layout.task, config.task
+        )));
     }
     config
         .advice
@@ -149,8 +164,13 @@ fn teacher_path(args: &TrainArgs, config: &RunConfig, out: &Path) -> Result<Path
 /// The teacher that ships: beside the caller, beside the program, or in the program's source tree.
 fn shipped_teacher(task: &str) -> Result<PathBuf, Failed> {
     let name = format!("policies/teacher-{task}.safetensors");
-    let beside_program = std::env::current_exe().ok().and_then(|exe| Some(exe.parent()?.join(&name)));
-    let places = [Some(PathBuf::from(&name)), beside_program, Some(Path::new(env!("CARGO_MANIFEST_DIR")).join(&name))];
+    let beside_program =
+        std::env::current_exe().ok().and_then(|exe| Some(exe.parent()?.join(&name)));
+    let places = [
+        Some(PathBuf::from(&name)),
+        beside_program,
+        Some(Path::new(env!("CARGO_MANIFEST_DIR")).join(&name)),
+    ];
     places.into_iter().flatten().find(|path| path.exists()).ok_or_else(|| {
         Failed::usage(format!(
             "no teacher for {task} ships at {name}: train one with `tandem train --arms 1 --task {task}` and give its \

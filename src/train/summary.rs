@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use serde_json::{Value, json};
 use tandem_proto::pb;
-use tandem_report::{CurveOptions, Series};
+use tandem_report::{Axis, CurveOptions, Quantity, Series};
 use tandem_telemetry::{MetricsLog, MetricsRow};
 
 use super::display::{clock_text, grouped};
@@ -22,15 +22,18 @@ const REPORT_EPISODES: u64 = 240;
 pub(super) fn print(plan: &Plan, last: &pb::Progress, as_json: bool) -> Result<(), Failed> {
     let path = plan.best_policy();
     let measured = measure(&Subject::Policy(load_policy(&path)?), REPORT_EPISODES, REPORT_SEED)?;
-    let rows = MetricsLog::read_all(&plan.out.join("metrics.jsonl")).or_exit(Exit::Data, String::new)?;
-    let curve = draw_curve(plan, rows)?;
+    let rows =
+        MetricsLog::read_all(&plan.out.join("metrics.jsonl")).or_exit(Exit::Data, String::new)?;
+    let curve = draw_curve(plan, &rows)?;
     let report = tandem_report::run_report_html(&plan.out).or_exit(Exit::TryAgain, String::new)?;
     if as_json {
         println!("{}", summary_json(plan, last, &measured));
         return Ok(());
     }
     println!("done: {}", last.end_reason);
-    println!("best policy on {REPORT_EPISODES} held-out goals (seed {REPORT_SEED}), alone: no noise, no advice");
+    println!(
+        "best policy on {REPORT_EPISODES} held-out goals (seed {REPORT_SEED}), alone: no noise, no advice"
+    );
     measured.lines().iter().for_each(|line| println!("  {line}"));
     println!(
         "training      {} env steps, {} updates, {} rounds in {}",
@@ -39,7 +42,11 @@ pub(super) fn print(plan: &Plan, last: &pb::Progress, as_json: bool) -> Result<(
         last.round,
         clock_text(last.wall_s)
     );
-    println!("advice        {} spent, {} left", grouped(last.advice_spent), grouped(last.budget_left));
+    println!(
+        "advice        {} spent, {} left",
+        grouped(last.advice_spent),
+        grouped(last.budget_left)
+    );
     println!("policy        {}", path.display());
     println!("curve         {}", curve.display());
     println!("report        {}", report.display());
@@ -57,12 +64,15 @@ pub(super) fn interrupted(plan: &Plan, last: &pb::Progress) {
 }
 
 /// Draws success against environment steps into the run directory.
-fn draw_curve(plan: &Plan, rows: Vec<MetricsRow>) -> Result<PathBuf, Failed> {
-    let label = format!("{} {}", plan.config.task, plan.config.advice.strategy);
-    let options = CurveOptions::default();
-    let svg = tandem_report::curve_svg(&[Series { label, rows }], &options).or_exit(Exit::Bug, String::new)?;
+fn draw_curve(plan: &Plan, rows: &[MetricsRow]) -> Result<PathBuf, Failed> {
+    let config = &plan.config;
+    let name = format!("{}, {} arm(s), {}", config.task, config.arms, config.advice.strategy);
+    let series = Series::of(&name, rows, Axis::EnvSteps, Quantity::Success);
+    let options = CurveOptions::shares("Success of the policy alone", Axis::EnvSteps);
+    let svg = tandem_report::curve_svg(&[series], &options).or_exit(Exit::Bug, String::new)?;
     let path = plan.out.join("curve.svg");
-    std::fs::write(&path, svg).or_exit(Exit::TryAgain, || format!("cannot write {}", path.display()))?;
+    std::fs::write(&path, svg)
+        .or_exit(Exit::TryAgain, || format!("cannot write {}", path.display()))?;
     Ok(path)
 }
 

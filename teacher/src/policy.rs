@@ -115,7 +115,7 @@ mod tests {
 
         let raw_of = |sum: f32| (sum * weight + weight) * weight + weight;
         let near = |got: f32, expected: f32| {
-            assert!((got - expected).abs() < 1e-6, "{got} is not {expected}")
+            assert!((got - expected).abs() < 1e-6, "{got} is not {expected}");
         };
         near(actions[0], raw_of(0.0).tanh());
         near(actions[5], raw_of(28.0).tanh());

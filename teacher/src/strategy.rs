@@ -79,7 +79,7 @@ impl fmt::Display for Strategy {
 
 /// A text that names no strategy.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error("expected {} (thresholds finite, 0 or more, 0.1 when left out), got {0:?}", Strategy::NAMES.join(", "))]
+#[error("expected {names} (thresholds finite, 0 or more, 0.1 when left out), got {0:?}", names = Strategy::NAMES.join(", "))]
 pub struct UnknownStrategy(pub String);
 
 impl FromStr for Strategy {

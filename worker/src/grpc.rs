@@ -69,7 +69,7 @@ async fn within<T>(
     call: impl Future<Output = Result<T, Status>>,
 ) -> Result<T, Status> {
     let lapsed = || Status::deadline_exceeded(format!("no answer within {deadline:?}"));
-    tokio::time::timeout(deadline, call).await.unwrap_or_else(|_| Err(lapsed()))
+    tokio::time::timeout(deadline, call).await.unwrap_or_else(|_elapsed| Err(lapsed()))
 }
 
 /// A connection that is made when first used, and made again whenever it is lost.
@@ -219,7 +219,7 @@ impl Teacher {
     ) -> Result<(AdviceStream, pb::AdviseResponse), Status> {
         let mut stream = match stream {
             Some(stream) => {
-                stream.requests.send(request).await.map_err(|_| closed())?;
+                stream.requests.send(request).await.map_err(|_unsent| closed())?;
                 stream
             }
             None => self.open(request).await?,
@@ -231,7 +231,7 @@ impl Teacher {
     /// Opens a stream with its first request: some servers answer nothing at all before they have one.
     async fn open(&mut self, first: pb::AdviseRequest) -> Result<AdviceStream, Status> {
         let (requests, outgoing) = mpsc::channel(STREAM_CAPACITY);
-        requests.send(first).await.map_err(|_| closed())?;
+        requests.send(first).await.map_err(|_unsent| closed())?;
         let answers = self.client.advise_stream(ReceiverStream::new(outgoing)).await?.into_inner();
         Ok(AdviceStream { requests, answers })
     }

@@ -12,10 +12,10 @@ use tandem_core::reward::sparse_reward;
 use tandem_core::rng::{Stream, episode_rng};
 use tandem_core::work::{EpisodeOrder, RunTerms, WorldTerms};
 use tandem_core::{Episode, EpisodeKind};
-use tandem_sim::{Env, SimError, WorldConfig};
+use tandem_sim::{Env, SimError};
 use tandem_telemetry::{EpisodeMetadata, EpisodeRecorder, TransitionRecord};
 
-use crate::rollout::starts;
+use crate::rollout::{starts, world_config};
 
 // Names under which a log's metadata keep the world's set-up.
 const SUBSTEPS: &str = "substeps";
@@ -86,8 +86,7 @@ pub fn world_of(metadata: &EpisodeMetadata) -> Result<Env, RecordError> {
         wide_start_share: entry(metadata, WIDE_START_SHARE)?,
         substeps: entry(metadata, SUBSTEPS)?,
     };
-    let config = WorldConfig { substeps: terms.substeps, ..WorldConfig::default() };
-    let mut world = Env::new(metadata.layout, &config)?;
+    let mut world = Env::new(metadata.layout, &world_config(terms))?;
     let mut rng = episode_rng(metadata.seed, metadata.episode, Stream::Reset);
     world.reset(&mut rng, starts(metadata.kind, terms));
     Ok(world)
@@ -185,8 +184,7 @@ mod tests {
     fn played(kind: EpisodeKind) -> (EpisodeMetadata, Episode) {
         let order = SlotOrder { kind, ..slot(&[3], false) };
         let terms = terms();
-        let config = WorldConfig { substeps: terms.world.substeps, ..WorldConfig::default() };
-        let world = Env::new(terms.layout, &config).expect("in range");
+        let world = Env::new(terms.layout, &world_config(terms.world)).expect("in range");
         let mut actor = FakeActor::Seeker;
         let episode = play_slot(&world, &order, &terms, &mut actor, &mut NoAdvisor)
             .expect("nothing breaks")

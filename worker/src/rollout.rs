@@ -4,7 +4,7 @@ use tandem_core::layout::EPISODE_STEPS;
 use tandem_core::rng::{Stream, episode_rng};
 use tandem_core::work::{EpisodeOrder, RunTerms, SlotOrder, WorldTerms};
 use tandem_core::{Episode, EpisodeKind, StepAdvice, StepQuery};
-use tandem_sim::{SimError, Starts};
+use tandem_sim::{SimError, Starts, WorldConfig};
 use tandem_telemetry::events::StepAdvised;
 
 use crate::explore::Explorer;
@@ -206,6 +206,11 @@ impl<W: World> Rollout<W> {
     }
 }
 
+/// The world that the terms ask for.
+pub(crate) fn world_config(terms: WorldTerms) -> WorldConfig {
+    WorldConfig { substeps: terms.substeps, ..WorldConfig::default() }
+}
+
 /// Evaluation episodes start as the task says, training episodes by the terms.
 pub(crate) fn starts(kind: EpisodeKind, terms: WorldTerms) -> Starts {
     match kind {
@@ -277,7 +282,7 @@ mod tests {
         let mut teacher = FakeTeacher::new(overrides);
         let episode = play(&slot(&[3], true), FakeActor::Seeker, &mut teacher).remove(0);
         for (step_idx, question) in teacher.questions.iter().enumerate() {
-            let expected_arms = (step_idx % 4) as u8;
+            let expected_arms = [0, 1, 2, 3][step_idx % 4];
             assert_eq!(episode.advised_arms[step_idx], expected_arms);
             for arm in LAYOUT.arms() {
                 let executed = &episode.action(step_idx)[LAYOUT.action_of(arm)];

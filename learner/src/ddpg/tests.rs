@@ -1,1 +1,244 @@
-//! Checks of the update.
+//! The update against finite differences of a slow, obvious loss in double precision, and what must repeat.
+
+use tandem_core::rng::{index, uniform};
+use tandem_core::{Layout, Stream, Task, episode_rng};
+use tandem_policy::MlpShape;
+
+use super::{Batch, Ddpg, DdpgConfig, DdpgError};
+
+const LAYOUT: Layout = Layout::new(Task::Push, 1);
+
+fn small(change: impl FnOnce(&mut DdpgConfig)) -> DdpgConfig {
+    let mut config = DdpgConfig {
+        n_hidden: 6,
+        n_hidden_layers: 2,
+        batch_size: 5,
+        action_penalty: 0.0,
+        cloning_weight: 0.0,
+        ..DdpgConfig::default()
+    };
+    change(&mut config);
+    config
+}
+
+fn random_batch(n_heads: usize, batch_size: usize, number: u64) -> Batch {
+    let mut rng = episode_rng(17, number, Stream::Replay);
+    let mut batch = Batch::new(LAYOUT, n_heads, batch_size);
+    for x in batch.inputs.iter_mut().chain(&mut batch.next_inputs).chain(&mut batch.actions) {
+        *x = uniform(&mut rng, -1.0, 1.0);
+    }
+    batch.rewards.fill_with(|| if index(&mut rng, 2) == 0 { -1.0 } else { 0.0 });
+    for row in batch.cloned.chunks_exact_mut(LAYOUT.n_action()) {
+        row.fill(if index(&mut rng, 2) == 0 { 1.0 } else { 0.0 });
+    }
+    batch
+}
+
+fn exact(numbers: &[f32]) -> Vec<f64> {
+    numbers.iter().copied().map(f64::from).collect()
+}
+
+/// One row through a network.
+fn network(shape: &MlpShape, parameters: &[f64], input: Vec<f64>) -> Vec<f64> {
+    (0..shape.n_layers()).fold(input, |row, layer| {
+        let rows =
+            parameters[shape.weight(layer)].chunks(row.len()).zip(&parameters[shape.bias(layer)]);
+        let sums = rows.map(|(weights, bias)| {
+            weights.iter().zip(&row).map(|(w, x)| w * x).sum::<f64>() + bias
+        });
+        if layer < shape.n_hidden_layers {
+            sums.map(|sum| sum.max(0.0)).collect()
+        } else {
+            sums.collect()
+        }
+    })
+}
+
+fn policy(shape: &MlpShape, parameters: &[f64], input: &[f64]) -> Vec<f64> {
+    network(shape, parameters, input.to_vec()).into_iter().map(f64::tanh).collect()
+}
+
+fn critic_loss(ddpg: &Ddpg, critic: &[f64], batch: &Batch) -> f64 {
+    let (actor_shape, critic_shape) = (ddpg.actor_shape(), ddpg.critic_shape());
+    let (target_actor, target_critic) = (exact(ddpg.target_actor()), exact(ddpg.target_critic()));
+    let discount = f64::from(ddpg.config().discount);
+    let rows =
+        exact(&batch.inputs).chunks(actor_shape.n_input).map(<[f64]>::to_vec).collect::<Vec<_>>();
+    let mut loss = 0.0;
+    for (row, input) in rows.iter().enumerate() {
+        let part = |vector: &[f32], n: usize| exact(&vector[row * n..(row + 1) * n]);
+        let next_input = part(&batch.next_inputs, actor_shape.n_input);
+        let next_action = policy(actor_shape, &target_actor, &next_input);
+        let next_q = network(critic_shape, &target_critic, [next_input, next_action].concat());
+        let q = network(critic_shape, critic, [input.clone(), part(&batch.actions, 3)].concat());
+        for ((q, next_q), reward) in
+            q.iter().zip(next_q).zip(part(&batch.rewards, critic_shape.n_output))
+        {
+            let target = (reward + discount * next_q).clamp(-1.0 / (1.0 - discount), 0.0);
+            loss += (q - target).powi(2) / rows.len() as f64;
+        }
+    }
+    loss
+}
+
+fn actor_loss(ddpg: &Ddpg, actor: &[f64], batch: &Batch) -> f64 {
+    let (actor_shape, critic) = (ddpg.actor_shape(), exact(ddpg.critic()));
+    let config = ddpg.config();
+    let b = config.batch_size as f64;
+    let mut loss = 0.0;
+    for (row, input) in exact(&batch.inputs).chunks(actor_shape.n_input).enumerate() {
+        let action = policy(actor_shape, actor, input);
+        let q = network(ddpg.critic_shape(), &critic, [input, &action].concat());
+        loss -= q.iter().sum::<f64>() / b;
+        for (i, action) in action.iter().enumerate() {
+            loss += f64::from(config.action_penalty) * action * action / (b * 3.0);
+            if batch.cloned[row * 3 + i] > 0.0 {
+                let error = action - f64::from(batch.actions[row * 3 + i]);
+                loss += f64::from(config.cloning_weight) * error * error / b;
+            }
+        }
+    }
+    loss
+}
+
+fn assert_is_gradient(what: &str, gradient: &[f32], at: &[f32], loss: impl Fn(&[f64]) -> f64) {
+    const STEP: f64 = 1e-6;
+    let along = |i: usize, step: f64| {
+        let mut moved = exact(at);
+        moved[i] += step;
+        loss(&moved)
+    };
+    assert_eq!(gradient.len(), at.len());
+    for (i, slope) in gradient.iter().enumerate() {
+        let expected = (along(i, STEP) - along(i, -STEP)) / (2.0 * STEP);
+        let tolerance = 2e-5 * expected.abs().max(1.0);
+        assert!(
+            (f64::from(*slope) - expected).abs() < tolerance,
+            "{what} {i}: {slope} against {expected}"
+        );
+    }
+}
+
+#[test]
+fn both_gradients_agree_with_finite_differences() {
+    let check = |n_heads, change: fn(&mut DdpgConfig)| {
+        let mut ddpg = Ddpg::new(small(change), LAYOUT, n_heads, 4);
+        let batch = random_batch(n_heads, 5, 0);
+        let before = ddpg.clone();
+        let losses = ddpg.update(&batch).unwrap();
+        let [actor, critic] = ddpg.gradients();
+        let by_critic = |critic: &[f64]| critic_loss(&before, critic, &batch);
+        let by_actor = |actor: &[f64]| actor_loss(&before, actor, &batch);
+        assert!((losses.critic_loss - by_critic(&exact(before.critic()))).abs() < 1e-5);
+        assert!((losses.actor_loss - by_actor(&exact(before.actor()))).abs() < 1e-5);
+        assert_is_gradient("critic", critic, before.critic(), by_critic);
+        assert_is_gradient("actor", actor, before.actor(), by_actor);
+    };
+    check(1, |_| {});
+    check(2, |_| {});
+    check(1, |config| config.action_penalty = 3.0);
+    check(1, |config| config.cloning_weight = 4.0);
+    check(2, |config| (config.action_penalty, config.cloning_weight) = (0.5, 2.0));
+}
+
+#[test]
+fn one_and_two_threads_give_the_same_bits() {
+    let config = small(|config| (config.n_hidden, config.batch_size) = (64, 32));
+    let learn = |n_threads| {
+        let mut ddpg = Ddpg::new(config.clone(), LAYOUT, 2, 9);
+        ddpg.set_threads(n_threads);
+        let mut losses = Vec::new();
+        for number in 0..20 {
+            losses.push(ddpg.update(&random_batch(2, 32, number)).unwrap());
+            ddpg.polyak();
+        }
+        (ddpg.state().map(|(name, vector)| (name, vector.to_vec())), losses)
+    };
+    assert_eq!(learn(1), learn(2));
+}
+
+#[test]
+fn the_critic_learns_what_its_target_says() {
+    let mut ddpg = Ddpg::new(small(|config| config.n_hidden = 32), LAYOUT, 1, 1);
+    let batch = random_batch(1, 5, 0);
+    let first = ddpg.update(&batch).unwrap().critic_loss;
+    let last = (0..200).map(|_| ddpg.update(&batch).unwrap().critic_loss).last().unwrap();
+    assert!(last < 1e-3 * first, "the targets stand still, the loss went from {first} to {last}");
+}
+
+#[test]
+fn polyak_averaging_moves_only_the_targets() {
+    let mut ddpg = Ddpg::new(small(|config| config.polyak_keep = 0.5), LAYOUT, 1, 1);
+    ddpg.update(&random_batch(1, 5, 0)).unwrap();
+    let before = ddpg.clone();
+    ddpg.polyak();
+    assert_eq!((ddpg.actor(), ddpg.critic()), (before.actor(), before.critic()));
+    for (target, (old, online)) in [
+        (ddpg.target_actor(), (before.target_actor(), before.actor())),
+        (ddpg.target_critic(), (before.target_critic(), before.critic())),
+    ] {
+        let expected: Vec<f32> =
+            old.iter().zip(online).map(|(old, online)| 0.5 * old + 0.5 * online).collect();
+        assert_eq!(target, expected);
+        assert_ne!(target, old);
+    }
+}
+
+#[test]
+fn a_restored_learner_goes_on_alike() {
+    let config = small(|_| {});
+    let mut first = Ddpg::new(config.clone(), LAYOUT, 2, 1);
+    for number in 0..3 {
+        first.update(&random_batch(2, 5, number)).unwrap();
+        first.polyak();
+    }
+    let stored = first.state().map(|(name, vector)| (name.to_owned(), vector.to_vec()));
+    let mut second = Ddpg::new(config, LAYOUT, 2, 2);
+    second.restore(&stored, first.n_updates()).unwrap();
+    let batch = random_batch(2, 5, 3);
+    assert_eq!(first.update(&batch), second.update(&batch));
+    assert_eq!(first.state(), second.state());
+    assert_eq!(second.n_updates(), 4);
+}
+
+#[test]
+fn a_state_that_does_not_fit_is_refused_and_changes_nothing() {
+    let mut ddpg = Ddpg::new(small(|_| {}), LAYOUT, 1, 1);
+    let untouched = ddpg.clone();
+    let mut stored =
+        ddpg.state().map(|(name, vector)| (name.to_owned(), vec![0.5; vector.len()])).to_vec();
+    let expected = stored[7].1.len();
+    stored[7].1.pop();
+    let refusal = |got| Err(DdpgError::Restore { name: "critic.adam.second", got, expected });
+    assert_eq!(ddpg.restore(&stored, 1), refusal(Some(expected - 1)));
+    stored.pop();
+    assert_eq!(ddpg.restore(&stored, 1), refusal(None));
+    assert_eq!((ddpg.state(), ddpg.n_updates()), (untouched.state(), 0));
+}
+
+#[test]
+fn numbers_that_are_not_finite_stop_the_learner() {
+    let check = |spoil: fn(&mut Batch), what| {
+        let mut ddpg = Ddpg::new(small(|_| {}), LAYOUT, 1, 1);
+        let mut batch = random_batch(1, 5, 0);
+        spoil(&mut batch);
+        assert_eq!(ddpg.update(&batch), Err(DdpgError::NotFinite { what, update: 1 }));
+    };
+    check(|batch| batch.rewards[4] = f32::NAN, "a critic loss");
+    check(|batch| batch.actions[0] = f32::INFINITY, "a critic loss");
+}
+
+#[test]
+fn settings_out_of_range_are_named() {
+    assert_eq!(DdpgConfig::default().check(), Ok(()));
+    let check = |change: fn(&mut DdpgConfig), key| {
+        assert_eq!(small(change).check().map_err(|(key, _, _)| key), Err(key));
+    };
+    check(|config| config.discount = 1.0, "ddpg.discount");
+    check(|config| config.polyak_keep = f32::NAN, "ddpg.polyak_keep");
+    check(|config| config.cloning_weight = -1.0, "ddpg.cloning_weight");
+    check(|config| config.action_penalty = f32::INFINITY, "ddpg.action_penalty");
+    check(|config| config.actor_learning_rate = 0.0, "ddpg.actor_learning_rate");
+    check(|config| config.batch_size = 0, "ddpg.batch_size");
+    check(|config| config.n_hidden_layers = 0, "ddpg.n_hidden_layers");
+}

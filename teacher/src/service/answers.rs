@@ -83,24 +83,15 @@ impl Stream for UntilCancelled {
     type Item = Result<pb::AdviseResponse, Status>;
 
     fn poll_next(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<Option<Self::Item>> {
+        if self.answers.is_some() && self.cancelled.as_mut().poll(context).is_ready() {
+            self.answers = None;
+            return Poll::Ready(Some(Err(Status::unavailable("the teacher is shutting down"))));
+        }
         let Some(answers) = self.answers.as_mut() else {
             return Poll::Ready(None);
         };
         let next = answers.as_mut().poll_next(context);
-        let ends = match &next {
-            Poll::Ready(Some(Ok(_))) => false,
-            Poll::Ready(_) => true,
-            Poll::Pending => match self.cancelled.as_mut().poll(context) {
-                Poll::Ready(()) => {
-                    self.answers = None;
-                    return Poll::Ready(Some(Err(Status::unavailable(
-                        "the teacher is shutting down",
-                    ))));
-                }
-                Poll::Pending => false,
-            },
-        };
-        if ends {
+        if matches!(next, Poll::Ready(None | Some(Err(_)))) {
             self.answers = None;
         }
         next

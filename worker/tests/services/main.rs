@@ -112,11 +112,51 @@ async fn a_stream_that_breaks_within_an_episode_costs_nothing() {
         Status::not_found("no account yet"),
         Status::ok("closing"),
     ] {
-        let teacher = Arc::new(FakeTeacher::default().failing_at([0, 7, 8, 60], fault.clone()));
+        let teacher = Arc::new(FakeTeacher::default().failing_at([0, 7, 8, 60], &fault));
         let learner = Arc::new(FakeLearner::new(orders()));
         assert_eq!(work_through(&learner, &teacher).await, expected, "{fault:?}");
         assert_eq!(learner.n_calls(Call::Join), 1);
     }
+}
+
+#[tokio::test]
+async fn an_episode_to_be_recorded_gets_a_log() {
+    let logs = tempfile::tempdir().expect("a directory");
+    let (learner, teacher) =
+        (Arc::new(FakeLearner::new(orders())), Arc::new(FakeTeacher::default()));
+    let (learner_server, teacher_server) = (Server::learner(&learner), Server::teacher(&teacher));
+    let log_dir = Some(logs.path().join("mcap"));
+    let config = WorkerConfig { log_dir, ..config(&learner_server, Some(&teacher_server)) };
+    run_with(config, PATIENCE, CancellationToken::new()).await.expect("the run ends");
+    let names: Vec<_> = std::fs::read_dir(logs.path().join("mcap"))
+        .expect("made by the worker")
+        .map(|entry| entry.expect("readable").file_name())
+        .collect();
+    assert_eq!(names, ["eval-000002-001.mcap"]);
+}
+
+#[tokio::test]
+async fn a_teacher_that_never_answers_is_asked_again() {
+    let expected = undisturbed().await;
+    let (teacher, _at_fault) = FakeTeacher::default().hanging_at(3);
+    let (learner, teacher) = (Arc::new(FakeLearner::new(orders())), Arc::new(teacher));
+    let (learner_server, teacher_server) = (Server::learner(&learner), Server::teacher(&teacher));
+    let config = config(&learner_server, Some(&teacher_server));
+    let patience = Patience { answer: Duration::from_millis(40), ..PATIENCE };
+    run_with(config, patience, CancellationToken::new()).await.expect("the run ends");
+    assert_eq!(learner.episodes(), expected);
+}
+
+#[tokio::test]
+async fn advice_on_other_steps_ends_the_worker() {
+    let learner = Arc::new(FakeLearner::new(orders()));
+    let teacher = Arc::new(FakeTeacher::default().forgetful_at(3));
+    let (learner_server, teacher_server) = (Server::learner(&learner), Server::teacher(&teacher));
+    let config = config(&learner_server, Some(&teacher_server));
+    let error =
+        run_with(config, PATIENCE, CancellationToken::new()).await.expect_err("one answer of two");
+    assert_eq!(error.to_string(), "cannot ask the teacher");
+    assert!(learner.episodes().is_empty());
 }
 
 #[tokio::test]

@@ -14,8 +14,7 @@ use tandem_core::{EpisodeKind, Layout, Task};
 use tandem_proto::pb::learner_server::LearnerServer;
 use tandem_proto::pb::teacher_server::TeacherServer;
 use tokio::runtime::Runtime;
-use tokio_stream::wrappers::TcpListenerStream;
-use tonic::transport::server::Router;
+use tonic::transport::server::{Router, TcpIncoming};
 
 use learner::FakeLearner;
 use teacher::FakeTeacher;
@@ -31,7 +30,8 @@ pub(crate) fn terms() -> RunTerms {
     }
 }
 
-/// Two slots of training, of which episode 3 goes without advice, and one of evaluation with later parameters.
+/// Two slots of training, of which episode 3 goes without advice, and one of evaluation with later parameters, of
+/// which episode 1 is to be recorded.
 pub(crate) fn orders() -> Vec<SlotOrder> {
     let slot = |slot, parameter_version, kind, numbers: [u64; 2]| SlotOrder {
         slot,
@@ -47,8 +47,14 @@ pub(crate) fn orders() -> Vec<SlotOrder> {
 }
 
 fn order(number: u64, kind: EpisodeKind) -> EpisodeOrder {
-    let advised = kind == EpisodeKind::Training && number != 3;
-    EpisodeOrder { number, seed: 21, advised, uniform: false, record: false }
+    let is_training = kind == EpisodeKind::Training;
+    EpisodeOrder {
+        number,
+        seed: 21,
+        advised: is_training && number != 3,
+        uniform: false,
+        record: !is_training && number == 1,
+    }
 }
 
 /// A small network whose weights follow from its version.
@@ -98,7 +104,7 @@ impl Server {
         let runtime = runtime.expect("a runtime");
         runtime.spawn(async move {
             let listener = tokio::net::TcpListener::from_std(listener).expect("within a runtime");
-            router.serve_with_incoming(TcpListenerStream::new(listener)).await
+            router.serve_with_incoming(TcpIncoming::from(listener).with_nodelay(Some(true))).await
         });
         Self { runtime: Some(runtime), address }
     }

@@ -30,11 +30,13 @@ enum Fault {
     Hang(mpsc::Sender<()>),
     /// Answered, but not before this was told.
     Tell(mpsc::Sender<()>),
+    /// Answered, but for the last step.
+    Forget,
 }
 
 impl FakeTeacher {
     /// Ends the stream when these questions come, counted from 0 over all streams.
-    pub(crate) fn failing_at(self, questions: [usize; 4], status: Status) -> Self {
+    pub(crate) fn failing_at(self, questions: [usize; 4], status: &Status) -> Self {
         Self::with_faults(questions.map(|nth| (nth, Fault::End(status.clone()))).into())
     }
 
@@ -48,6 +50,11 @@ impl FakeTeacher {
     pub(crate) fn telling_at(self, nth: usize) -> (Self, mpsc::Receiver<()>) {
         let (reached, at_fault) = mpsc::channel(1);
         (Self::with_faults(vec![(nth, Fault::Tell(reached))]), at_fault)
+    }
+
+    /// Leaves the last step out of an answer.
+    pub(crate) fn forgetful_at(self, nth: usize) -> Self {
+        Self::with_faults(vec![(nth, Fault::Forget)])
     }
 
     fn with_faults(faults: Vec<(usize, Fault)>) -> Self {
@@ -108,7 +115,7 @@ impl Inner {
         answers: mpsc::Sender<Result<pb::AdviseResponse, Status>>,
     ) {
         while let Some(Ok(request)) = requests.next().await {
-            let answer = self.answer(request);
+            let mut answer = self.answer(request);
             match self.next_fault() {
                 None => {}
                 Some(Fault::End(status)) if status.code() == Code::Ok => return,
@@ -122,6 +129,9 @@ impl Inner {
                 }
                 Some(Fault::Tell(reached)) => {
                     reached.send(()).await.ok();
+                }
+                Some(Fault::Forget) => {
+                    answer.as_mut().map(|answer| answer.steps.pop()).ok();
                 }
             }
             if answers.send(answer).await.is_err() {

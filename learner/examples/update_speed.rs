@@ -1,0 +1,78 @@
+//! Prints how fast this machine updates the two-arm push student, against its own matrix product:
+//! `cargo run --release -p tandem-learner --example update_speed`.
+//!
+//! Each figure is the best of many short samples, taken in turn, so that other programs on the machine matter little.
+
+#![expect(clippy::print_stdout, reason = "its output is its purpose")]
+
+use std::time::Instant;
+
+use tandem_core::rng::uniform;
+use tandem_core::{Layout, Stream, Task, episode_rng};
+use tandem_learner::ddpg::{Batch, Ddpg, DdpgConfig};
+use tandem_policy::{Matrix, MatrixMut, multiply};
+
+const N_SAMPLES: usize = 40;
+const UPDATES_PER_SAMPLE: u32 = 8;
+const PRODUCTS_PER_SAMPLE: u32 = 200;
+const SIDE: usize = 256;
+
+fn main() -> Result<(), Box<dyn std::error::Error>> {
+    let layout = Layout::new(Task::Push, 2);
+    let config = DdpgConfig::default();
+    let mut batch = Batch::new(layout, 2, config.batch_size);
+    let mut rng = episode_rng(1, 0, Stream::Replay);
+    for x in batch.inputs.iter_mut().chain(&mut batch.next_inputs).chain(&mut batch.actions) {
+        *x = uniform(&mut rng, -1.0, 1.0);
+    }
+    batch.rewards.fill(-1.0);
+    let mut ddpg = Ddpg::new(config, layout, 2, 1);
+
+    let mut updates_per_s = [0.0_f64; 2];
+    let mut products_per_s = 0.0_f64;
+    for _ in 0..N_SAMPLES {
+        products_per_s = products_per_s.max(sample_products());
+        for (n_threads, best) in (1..).zip(&mut updates_per_s) {
+            ddpg.set_threads(n_threads);
+            *best = best.max(sample_updates(&mut ddpg, &batch)?);
+        }
+    }
+
+    let [one, two] = updates_per_s;
+    let product_gflops = products_per_s * 2.0 * (SIDE * SIDE * SIDE) as f64 / 1e9;
+    let update_gflop = ddpg.flops_per_update() as f64 / 1e9;
+    println!(
+        "product {SIDE}^3: {product_gflops:.1} GFLOP/s; an update with Polyak: {update_gflop:.3} GFLOP"
+    );
+    println!(
+        "1 thread:  {one:.1} updates/s, {:.0} % of that rate",
+        100.0 * one * update_gflop / product_gflops
+    );
+    println!("2 threads: {two:.1} updates/s, {:.2} x one thread", two / one);
+    Ok(())
+}
+
+fn sample_updates(ddpg: &mut Ddpg, batch: &Batch) -> Result<f64, Box<dyn std::error::Error>> {
+    let start = now();
+    for _ in 0..UPDATES_PER_SAMPLE {
+        ddpg.update(batch)?;
+        ddpg.polyak();
+    }
+    Ok(f64::from(UPDATES_PER_SAMPLE) / start.elapsed().as_secs_f64())
+}
+
+fn sample_products() -> f64 {
+    let operand = vec![0.5; SIDE * SIDE];
+    let mut product = vec![0.0; SIDE * SIDE];
+    let operand = Matrix::new(&operand, SIDE, SIDE);
+    let start = now();
+    for _ in 0..PRODUCTS_PER_SAMPLE {
+        multiply(&mut MatrixMut::new(&mut product, SIDE, SIDE), operand, operand);
+    }
+    f64::from(PRODUCTS_PER_SAMPLE) / start.elapsed().as_secs_f64()
+}
+
+#[expect(clippy::disallowed_methods, reason = "the clock of a benchmark")]
+fn now() -> Instant {
+    Instant::now()
+}

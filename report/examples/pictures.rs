@@ -1,0 +1,72 @@
+//! Draws a made-up scene and learning curves into the directory named on the command line, to look at.
+
+use std::path::PathBuf;
+
+use tandem_report::{
+    Axis, CurveOptions, Quantity, Series, View, curve_svg, run_report_html, scene_svg,
+};
+use tandem_telemetry::{MetricsLog, MetricsRow};
+
+#[path = "../../telemetry/tests/support/synthetic.rs"]
+#[expect(dead_code, reason = "only the scene is drawn")]
+mod synthetic;
+
+fn main() -> Result<(), Box<dyn std::error::Error>> {
+    let dir =
+        std::env::args_os().nth(1).map(PathBuf::from).ok_or("where shall the pictures go?")?;
+    for (name, progress) in [("start", 0.0), ("middle", 0.5), ("end", 1.0)] {
+        let view = View { caption: Some(format!("made-up episode, {name}")), ..View::default() };
+        std::fs::write(
+            dir.join(format!("scene-{name}.svg")),
+            scene_svg(&synthetic::scene(progress), &view),
+        )?;
+    }
+    let runs = [("none", 0.0), ("mc-q:0.1, half of the episodes", 1.0), ("ea", 0.6)];
+    let series: Vec<Series> = runs
+        .iter()
+        .map(|(name, speed)| Series::of(name, &rows(*speed), Axis::EnvSteps, Quantity::Success))
+        .collect();
+    std::fs::write(
+        dir.join("success.svg"),
+        curve_svg(&series, &CurveOptions::shares("Two arms push", Axis::EnvSteps))?,
+    )?;
+    let mut metrics = MetricsLog::open(&dir.join("metrics.jsonl"))?;
+    rows(1.0).iter().try_for_each(|row| metrics.append(row))?;
+    std::fs::write(dir.join("run.toml"), "task = \"push\"\narms = 2\n")?;
+    run_report_html(&dir)?;
+    Ok(())
+}
+
+/// A learning curve that rises faster the larger `speed` is.
+fn rows(speed: f64) -> Vec<MetricsRow> {
+    let row = |evaluation: u32| {
+        let progress = f64::from(evaluation) / 24.0;
+        let ripple = 0.03 * (f64::from(evaluation) * 2.1).sin();
+        let success = (0.95 / (1.0 + (-(progress * speed - 0.45) * 12.0).exp()) + ripple * speed)
+            .clamp(0.0, 1.0);
+        let interval = tandem_core::Wilson::of((success * 240.0) as usize, 240);
+        MetricsRow {
+            round: u64::from(evaluation) * 5,
+            env_steps: u64::from(evaluation) * 8000,
+            episodes: u64::from(evaluation) * 160,
+            updates: u64::from(evaluation) * 2000,
+            paper_epochs: progress * 2.4,
+            wall_s: progress * 1500.0,
+            success,
+            success_joint: 0.93 * success,
+            success_per_arm: vec![success, success],
+            success_low: interval.low,
+            success_high: interval.high,
+            collision_rate: 0.25 * progress,
+            mean_q: -10.0 + 8.0 * success,
+            advice_spent: u64::from(evaluation) * 700,
+            budget_left: 500_000 - u64::from(evaluation) * 700,
+            moved: (success + 0.3).min(1.0),
+            collision_rate_before_success: 0.1 * progress,
+            training_success: 0.9 * success,
+            n_episodes: 240,
+            ..MetricsRow::default()
+        }
+    };
+    (0..25).map(row).collect()
+}

@@ -1,0 +1,339 @@
+//! Learning curves as SVG.
+
+use plotters::coord::Shift;
+use plotters::prelude::{
+    ChartBuilder, Circle, Color as _, DrawingArea, IntoDrawingArea as _, IntoFont as _, LineSeries,
+    Polygon, RGBColor, Rectangle, SVGBackend, Text, TextStyle, WHITE,
+};
+use tandem_telemetry::MetricsRow;
+
+use crate::error::Error;
+
+/// One colour a series, apart for colour-blind eyes too; a further series starts again.
+const COLORS: [RGBColor; 6] = [
+    RGBColor(0x1f, 0x6f, 0xb8),
+    RGBColor(0xe0, 0x7b, 0x28),
+    RGBColor(0x2f, 0x93, 0x5f),
+    RGBColor(0x8a, 0x5a, 0xb5),
+    RGBColor(0xc4, 0x3d, 0x4b),
+    RGBColor(0x5b, 0x66, 0x73),
+];
+const INK: RGBColor = RGBColor(0x24, 0x29, 0x2f);
+const FAINT_INK: RGBColor = RGBColor(0x6a, 0x73, 0x7d);
+const GRID: RGBColor = RGBColor(0xe6, 0xe9, 0xed);
+const FONT: &str = "-apple-system, 'Segoe UI', Helvetica, Arial, sans-serif";
+
+/// What a curve is drawn against.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Axis {
+    /// Training steps of all episodes.
+    EnvSteps,
+    /// Updates of the networks.
+    Updates,
+    /// Wall time.
+    Minutes,
+    /// Epochs as the paper counts them.
+    PaperEpochs,
+}
+
+impl Axis {
+    /// What stands below the axis.
+    #[must_use]
+    pub const fn label(self) -> &'static str {
+        match self {
+            Self::EnvSteps => "environment steps",
+            Self::Updates => "updates",
+            Self::Minutes => "minutes",
+            Self::PaperEpochs => "paper epochs",
+        }
+    }
+
+    fn of(self, row: &MetricsRow) -> f64 {
+        match self {
+            Self::EnvSteps => row.env_steps as f64,
+            Self::Updates => row.updates as f64,
+            Self::Minutes => row.wall_s / 60.0,
+            Self::PaperEpochs => row.paper_epochs,
+        }
+    }
+}
+
+/// Which of a run's figures a curve shows.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Quantity {
+    /// Evaluation success, with its 95 % interval.
+    Success,
+    /// Success by the joint norm.
+    SuccessJoint,
+    /// Success of the training episodes.
+    TrainingSuccess,
+    /// Share of evaluation episodes in which an object was displaced.
+    Moved,
+    /// Share of evaluation episodes with a contact.
+    CollisionRate,
+    /// Share with a contact before every object had arrived.
+    CollisionRateBeforeSuccess,
+    /// Mean value that the critic gives to the policy's actions.
+    MeanQ,
+    /// Units of advice spent.
+    AdviceSpent,
+}
+
+impl Quantity {
+    fn of(self, row: &MetricsRow) -> f64 {
+        match self {
+            Self::Success => row.success,
+            Self::SuccessJoint => row.success_joint,
+            Self::TrainingSuccess => row.training_success,
+            Self::Moved => row.moved,
+            Self::CollisionRate => row.collision_rate,
+            Self::CollisionRateBeforeSuccess => row.collision_rate_before_success,
+            Self::MeanQ => row.mean_q,
+            Self::AdviceSpent => row.advice_spent as f64,
+        }
+    }
+}
+
+/// A point of a curve.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct CurvePoint {
+    /// Along the axis.
+    pub x: f64,
+    /// The figure.
+    pub y: f64,
+    /// Lower and upper end of its interval, when it has one.
+    pub band: Option<(f64, f64)>,
+}
+
+/// One curve.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Series {
+    /// Its name in the legend.
+    pub name: String,
+    /// Its points, from left to right.
+    pub points: Vec<CurvePoint>,
+}
+
+impl Series {
+    /// The curve of `quantity` against `axis`; rows without the figure are left out.
+    #[must_use]
+    pub fn of(name: &str, rows: &[MetricsRow], axis: Axis, quantity: Quantity) -> Self {
+        let point = |row: &MetricsRow| CurvePoint {
+            x: axis.of(row),
+            y: quantity.of(row),
+            band: (quantity == Quantity::Success).then_some((row.success_low, row.success_high)),
+        };
+        let points =
+            rows.iter().map(point).filter(|point| point.x.is_finite() && point.y.is_finite());
+        Self { name: name.to_owned(), points: points.collect() }
+    }
+}
+
+/// How curves are drawn.
+#[derive(Debug, Clone, PartialEq)]
+pub struct CurveOptions {
+    /// Above the curves.
+    pub title: String,
+    /// Below the horizontal axis.
+    pub x_label: String,
+    /// Whether the figures are shares: the vertical axis is then 0 to 100 %.
+    pub percent: bool,
+    /// Width, pixels.
+    pub width: u32,
+    /// Height, pixels.
+    pub height: u32,
+}
+
+impl CurveOptions {
+    /// Shares against `axis`, at the size of a README's picture.
+    #[must_use]
+    pub fn shares(title: &str, axis: Axis) -> Self {
+        Self {
+            title: title.to_owned(),
+            x_label: axis.label().to_owned(),
+            percent: true,
+            width: 760,
+            height: 400,
+        }
+    }
+
+    /// Other figures against `axis`, at the same size.
+    #[must_use]
+    pub fn figures(title: &str, axis: Axis) -> Self {
+        Self { percent: false, ..Self::shares(title, axis) }
+    }
+}
+
+/// Draws `series` with their bands and a legend.
+///
+/// # Errors
+/// When the plotting library fails, for instance because the picture is too small for its labels.
+pub fn curve_svg(series: &[Series], options: &CurveOptions) -> Result<String, Error> {
+    let mut svg = String::new();
+    draw(series, options, &mut svg).map_err(|error| Error::Draw {
+        title: options.title.clone(),
+        problem: error.to_string(),
+    })?;
+    Ok(svg)
+}
+
+type Area<'a> = DrawingArea<SVGBackend<'a>, Shift>;
+type Drawn = Result<(), Box<dyn std::error::Error>>;
+
+fn draw(series: &[Series], options: &CurveOptions, svg: &mut String) -> Drawn {
+    let root = SVGBackend::with_string(svg, (options.width, options.height)).into_drawing_area();
+    root.fill(&WHITE)?;
+    draw_head(&root, series, options)?;
+    let head_px = if series.len() > 1 { 66 } else { 46 };
+    let (_, plot) = root.split_vertically(head_px);
+    draw_plot(&plot, series, options)?;
+    root.present()?;
+    Ok(())
+}
+
+/// The title and, for several curves, the legend.
+fn draw_head(root: &Area<'_>, series: &[Series], options: &CurveOptions) -> Drawn {
+    let title = (FONT, 17).into_font().style(plotters::style::FontStyle::Bold).color(&INK);
+    root.draw(&Text::new(options.title.clone(), (20, 16), title))?;
+    if series.len() < 2 {
+        return Ok(());
+    }
+    let mut left = 20;
+    for (one, color) in series.iter().zip(COLORS.iter().cycle()) {
+        root.draw(&Rectangle::new([(left, 50), (left + 16, 53)], color.filled()))?;
+        root.draw(&Text::new(one.name.clone(), (left + 22, 44), text_style(13, INK)))?;
+        left += 22 + estimated_width_px(&one.name, 13) + 20;
+    }
+    Ok(())
+}
+
+fn draw_plot(plot: &Area<'_>, series: &[Series], options: &CurveOptions) -> Drawn {
+    let (x_max, y_range) = (x_max(series), y_range(series, options.percent));
+    let mut chart = ChartBuilder::on(plot)
+        .margin_left(8)
+        .margin_right(28)
+        .margin_bottom(8)
+        .margin_top(8)
+        .x_label_area_size(46)
+        .y_label_area_size(52)
+        .build_cartesian_2d(0.0..x_max, y_range.clone())?;
+    let y_label =
+        |y: &f64| if options.percent { format!("{:.0} %", 100.0 * y) } else { short_number(*y) };
+    chart
+        .configure_mesh()
+        .disable_x_mesh()
+        .light_line_style(plotters::style::TRANSPARENT)
+        .bold_line_style(GRID)
+        .axis_style(GRID)
+        .x_desc(options.x_label.as_str())
+        .x_labels(7)
+        .y_labels(6)
+        .x_label_formatter(&|x| short_number(*x))
+        .y_label_formatter(&y_label)
+        .label_style(text_style(12, FAINT_INK))
+        .axis_desc_style(text_style(13, FAINT_INK))
+        .draw()?;
+    for (one, color) in series.iter().zip(COLORS.iter().cycle()) {
+        chart.draw_series(band(one).map(|outline| Polygon::new(outline, color.mix(0.16))))?;
+    }
+    for (one, color) in series.iter().zip(COLORS.iter().cycle()) {
+        let line = one.points.iter().map(|point| (point.x, point.y));
+        chart.draw_series(LineSeries::new(line.clone(), color.stroke_width(2)))?;
+        if let Some(last) = line.last() {
+            chart.draw_series([Circle::new(last, 4, color.filled())])?;
+        }
+    }
+    Ok(())
+}
+
+/// The outline of a curve's intervals, when it has them.
+fn band(series: &Series) -> impl Iterator<Item = Vec<(f64, f64)>> {
+    let side = |end: fn((f64, f64)) -> f64| {
+        series
+            .points
+            .iter()
+            .filter_map(move |point| Some((point.x, end(point.band?))))
+            .collect::<Vec<_>>()
+    };
+    let (lower, upper) = (side(|band| band.0), side(|band| band.1));
+    let outline: Vec<_> = lower.into_iter().chain(upper.into_iter().rev()).collect();
+    (outline.len() > 2).then_some(outline).into_iter()
+}
+
+fn x_max(series: &[Series]) -> f64 {
+    let largest =
+        series.iter().flat_map(|one| &one.points).map(|point| point.x).fold(0.0, f64::max);
+    if largest > 0.0 { largest } else { 1.0 }
+}
+
+fn y_range(series: &[Series], percent: bool) -> std::ops::Range<f64> {
+    if percent {
+        return 0.0..1.0;
+    }
+    let values = || series.iter().flat_map(|one| &one.points).map(|point| point.y);
+    let (low, high) = (values().fold(0.0, f64::min), values().fold(0.0, f64::max));
+    let room = 0.06 * (high - low);
+    match high > low {
+        true => {
+            (if low < 0.0 { low - room } else { low })..(if high > 0.0 {
+                high + room
+            } else {
+                high
+            })
+        }
+        false => 0.0..1.0,
+    }
+}
+
+/// 1500000 as 1.5M, 20000 as 20k.
+fn short_number(value: f64) -> String {
+    let (scaled, unit) = match value.abs() {
+        size if size >= 999_500.0 => (value / 1e6, "M"),
+        size if size >= 1000.0 => (value / 1e3, "k"),
+        _ => (value, ""),
+    };
+    let text = format!("{scaled:.2}");
+    let text = text.trim_end_matches('0').trim_end_matches('.');
+    format!("{}{unit}", if text == "-0" { "0" } else { text })
+}
+
+fn text_style(size_px: u32, color: RGBColor) -> TextStyle<'static> {
+    (FONT, size_px).into_font().color(&color)
+}
+
+/// The width of `text` in a usual sans-serif font: viewers choose the font, so it cannot be known.
+fn estimated_width_px(text: &str, size_px: u32) -> i32 {
+    let n_chars = u32::try_from(text.chars().count()).unwrap_or(u32::MAX);
+    i32::try_from(n_chars.saturating_mul(size_px) / 2).unwrap_or(i32::MAX / 2)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn axis_numbers_are_short() {
+        let texts =
+            [0.0, -0.001, 0.25, 50.0, 1500.0, 20_000.0, 999_900.0, 1.5e6, -10.0].map(short_number);
+        assert_eq!(texts, ["0", "0", "0.25", "50", "1.5k", "20k", "1M", "1.5M", "-10"]);
+    }
+
+    #[test]
+    fn a_row_without_the_figure_is_left_out_of_its_curve() {
+        let row = |mean_q| MetricsRow { mean_q, ..MetricsRow::default() };
+        let series =
+            Series::of("run", &[row(f64::NAN), row(-3.0)], Axis::EnvSteps, Quantity::MeanQ);
+        assert_eq!(series.points, [CurvePoint { x: 0.0, y: -3.0, band: None }]);
+    }
+
+    #[test]
+    fn the_axis_of_other_figures_shows_all_of_them_and_zero() {
+        let series = |values: &[f64]| Series {
+            name: String::new(),
+            points: values.iter().map(|y| CurvePoint { x: 1.0, y: *y, band: None }).collect(),
+        };
+        let range = y_range(&[series(&[-8.0, -2.0])], false);
+        assert!(range.start < -8.0 && range.end == 0.0, "{range:?}");
+        assert_eq!(y_range(&[series(&[])], false), 0.0..1.0);
+    }
+}

@@ -1,0 +1,203 @@
+//! Reports as one HTML file that needs nothing else.
+
+use std::fmt::Write as _;
+use std::path::{Path, PathBuf};
+
+use tandem_telemetry::MetricsRow;
+
+use crate::curve::{Axis, CurveOptions, Quantity, Series, curve_svg};
+use crate::error::Error;
+use crate::run::Run;
+use crate::table::{HEADER, cells, duration, interval, number, share, thousands};
+
+const STYLE: &str = include_str!("report.css");
+
+/// Writes `report.html` into the run directory `run_dir` and returns its path.
+///
+/// # Errors
+/// When the run's metrics cannot be read or the file cannot be written.
+pub fn run_report_html(run_dir: &Path) -> Result<PathBuf, Error> {
+    let run = Run::load(run_dir)?;
+    let path = run_dir.join("report.html");
+    write(&path, &run_page(&run)?)?;
+    Ok(path)
+}
+
+/// Writes a page that sets several runs side by side to `path`.
+///
+/// # Errors
+/// When a curve cannot be drawn or the file cannot be written.
+pub fn comparison_html(runs: &[Run], path: &Path) -> Result<(), Error> {
+    let against = |axis| {
+        let series: Vec<Series> = runs
+            .iter()
+            .map(|run| Series::of(&run.name, &run.rows, axis, Quantity::Success))
+            .collect();
+        curve_svg(&series, &CurveOptions::shares("Success", axis))
+    };
+    let mean_q: Vec<Series> = runs
+        .iter()
+        .map(|run| Series::of(&run.name, &run.rows, Axis::EnvSteps, Quantity::MeanQ))
+        .collect();
+    let curves = [
+        against(Axis::EnvSteps)?,
+        against(Axis::Minutes)?,
+        curve_svg(&mean_q, &CurveOptions::figures("Mean Q", Axis::EnvSteps))?,
+    ];
+    let lines: Vec<Vec<String>> = runs.iter().map(|run| cells(run).to_vec()).collect();
+    let body = format!("{}{}", table(&HEADER, &lines), figures(&curves));
+    write(path, &page("Runs compared", &body))
+}
+
+fn run_page(run: &Run) -> Result<String, Error> {
+    let mut body = match (run.best(), run.last()) {
+        (Some(best), Some(last)) => format!("{}{}", tiles(best, last), figures(&curves(run)?)),
+        _ => "<p>No evaluation yet.</p>".to_owned(),
+    };
+    if !run.rows.is_empty() {
+        let lines: Vec<Vec<String>> = run.rows.iter().map(evaluation_cells).collect();
+        let _ = write!(body, "<h2>Evaluations</h2>{}", table(&EVALUATION_HEADER, &lines));
+    }
+    if let Some(text) = &run.configuration {
+        let _ = write!(body, "<h2>Configuration</h2><pre>{}</pre>", escaped(text));
+    }
+    Ok(page(&run.name, &body))
+}
+
+/// The figures that matter most.
+fn tiles(best: &MetricsRow, last: &MetricsRow) -> String {
+    let per_arm: Vec<String> = best.success_per_arm.iter().map(|success| share(*success)).collect();
+    let tiles = [
+        (
+            "best success",
+            share(best.success),
+            format!("95 % interval {}, {} episodes", interval(best), best.n_episodes),
+        ),
+        ("joint norm", share(best.success_joint), format!("each arm: {}", per_arm.join(" / "))),
+        (
+            "with contact",
+            share(best.collision_rate),
+            format!("before success: {}", share(best.collision_rate_before_success)),
+        ),
+        (
+            "reached after",
+            thousands(best.env_steps),
+            format!("env steps, {}", duration(best.wall_s)),
+        ),
+        (
+            "advice spent",
+            thousands(last.advice_spent),
+            format!("{} left", thousands(last.budget_left)),
+        ),
+        (
+            "whole run",
+            duration(last.wall_s),
+            format!("{} env steps, {} updates", thousands(last.env_steps), thousands(last.updates)),
+        ),
+    ];
+    let tile = |(label, value, note): &(&str, String, String)| {
+        format!(
+            "<div class=tile><span>{label}</span><strong>{}</strong><small>{}</small></div>",
+            escaped(value),
+            escaped(note)
+        )
+    };
+    format!("<div class=tiles>{}</div>", tiles.iter().map(tile).collect::<String>())
+}
+
+/// Success, mean Q, contacts, advice.
+fn curves(run: &Run) -> Result<[String; 4], Error> {
+    const AXIS: Axis = Axis::EnvSteps;
+    let series = |named: &[(&str, Quantity)]| -> Vec<Series> {
+        named.iter().map(|(name, quantity)| Series::of(name, &run.rows, AXIS, *quantity)).collect()
+    };
+    let success = series(&[
+        ("success", Quantity::Success),
+        ("joint norm", Quantity::SuccessJoint),
+        ("training episodes", Quantity::TrainingSuccess),
+        ("object moved", Quantity::Moved),
+    ]);
+    let contacts = series(&[
+        ("any", Quantity::CollisionRate),
+        ("before success", Quantity::CollisionRateBeforeSuccess),
+    ]);
+    Ok([
+        curve_svg(&success, &CurveOptions::shares("Success", AXIS))?,
+        curve_svg(&series(&[("", Quantity::MeanQ)]), &CurveOptions::figures("Mean Q", AXIS))?,
+        curve_svg(&contacts, &CurveOptions::shares("Episodes with contact", AXIS))?,
+        curve_svg(
+            &series(&[("", Quantity::AdviceSpent)]),
+            &CurveOptions::figures("Advice spent", AXIS),
+        )?,
+    ])
+}
+
+const EVALUATION_HEADER: [&str; 12] = [
+    "round",
+    "env steps",
+    "updates",
+    "paper epochs",
+    "time",
+    "success",
+    "95 % interval",
+    "joint",
+    "contact",
+    "moved",
+    "mean Q",
+    "advice spent",
+];
+
+fn evaluation_cells(row: &MetricsRow) -> Vec<String> {
+    vec![
+        row.round.to_string(),
+        thousands(row.env_steps),
+        thousands(row.updates),
+        format!("{:.2}", row.paper_epochs),
+        duration(row.wall_s),
+        share(row.success),
+        interval(row),
+        share(row.success_joint),
+        share(row.collision_rate),
+        share(row.moved),
+        number(row.mean_q),
+        thousands(row.advice_spent),
+    ]
+}
+
+fn table(header: &[&str], lines: &[Vec<String>]) -> String {
+    let row = |tag: &str, cells: &mut dyn Iterator<Item = &str>| {
+        let cells: String = cells.map(|cell| format!("<{tag}>{}</{tag}>", escaped(cell))).collect();
+        format!("<tr>{cells}</tr>")
+    };
+    let body: String =
+        lines.iter().map(|line| row("td", &mut line.iter().map(String::as_str))).collect();
+    format!(
+        "<div class=scroll><table><thead>{}</thead><tbody>{body}</tbody></table></div>",
+        row("th", &mut header.iter().copied())
+    )
+}
+
+fn figures(curves: &[String]) -> String {
+    let figures: String = curves.iter().map(|svg| format!("<figure>{svg}</figure>")).collect();
+    format!("<div class=figures>{figures}</div>")
+}
+
+fn page(title: &str, body: &str) -> String {
+    let title = escaped(title);
+    format!(
+        "<!doctype html>\n<html lang=en><head><meta charset=utf-8><meta name=viewport content=\"width=device-width\">\
+         <title>{title}</title><style>{STYLE}</style></head><body><main><h1>{title}</h1>{body}</main></body></html>\n"
+    )
+}
+
+fn escaped(text: &str) -> String {
+    text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;").replace('"', "&quot;")
+}
+
+fn write(path: &Path, text: &str) -> Result<(), Error> {
+    std::fs::write(path, text).map_err(|source| Error::Io {
+        action: "write",
+        path: path.to_owned(),
+        source,
+    })
+}

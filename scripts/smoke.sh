@@ -1,0 +1,63 @@
+#!/usr/bin/env bash
+# Uses the built program as a user would, and checks its files with programs that are not ours.
+# Needs Python 3 with venv; installs the packages of scripts/requirements.txt into a temporary environment.
+set -euo pipefail
+cd "$(dirname "$0")/.."
+cargo build --release --locked
+tandem=$PWD/target/release/tandem
+work=$(mktemp -d)
+trap 'rm -rf "$work"' EXIT
+
+expect() { # expect CODE WORD COMMAND...: the exit code, and one line that has the word in it
+  local code=$1 word=$2 got=0
+  shift 2
+  "$@" >"$work/out" 2>"$work/err" || got=$?
+  if [ "$got" != "$code" ] || ! grep -q -- "$word" "$work/err"; then
+    echo "expected exit code $code and \"$word\" from: $*; got $got:"
+    cat "$work/err"
+    exit 1
+  fi
+}
+
+echo '- wrong input gets one clear line and the right exit code'
+expect 64 'unexpected argument' "$tandem" train --no-such-flag
+expect 64 'ddpg.discont' "$tandem" train --set ddpg.discont=0.9 --out "$work/none"
+expect 64 'cannot read run file' "$tandem" train --run "$work/missing.toml"
+expect 65 'missing.safetensors' "$tandem" eval --policy "$work/missing.safetensors"
+head -c 1000 policies/teacher-push.safetensors >"$work/torn.safetensors"
+expect 65 'torn.safetensors' "$tandem" eval --policy "$work/torn.safetensors"
+expect 64 'holds a run already' bash -c "mkdir -p '$work/taken' && touch '$work/taken/run.toml' && '$tandem' train --out '$work/taken'"
+
+echo '- a short advised run, start to end'
+"$tandem" train --max-env-steps 4000 --seed 3 --workers 2 --out "$work/run" --json \
+  --set evaluation.episodes=16 --set evaluation.every_env_steps=1600 --set ddpg.n_hidden=64 >"$work/summary.json"
+python3 - "$work/summary.json" <<'PY'
+import json, sys
+summary = json.loads(open(sys.argv[1]).read().splitlines()[-1])
+fields = "task arms episodes success success_low success_high success_joint success_per_arm collision_rate mean_return " \
+         "policy_digest env_steps updates wall_s advice_spent budget_left run_dir policy digest".split()
+missing = [field for field in fields if field not in summary]
+assert not missing, f"summary lacks {missing}"
+assert summary["env_steps"] == 4000 and summary["updates"] == 1000, summary
+assert summary["advice_spent"] + summary["budget_left"] == 500000, summary
+assert 0 < summary["advice_spent"] <= 2000, summary
+PY
+ls "$work/run/run.toml" "$work/run/metrics.jsonl" "$work/run/curve.svg" "$work/run/report.html" "$work/run/policy/best.safetensors" >/dev/null
+
+echo '- the same run with another number of workers ends with the same digest'
+"$tandem" train --max-env-steps 4000 --seed 3 --workers 1 --out "$work/again" --json \
+  --set evaluation.episodes=16 --set evaluation.every_env_steps=1600 --set ddpg.n_hidden=64 >"$work/again.json"
+python3 - "$work/summary.json" "$work/again.json" <<'PY'
+import json, sys
+first, second = (json.loads(open(path).read().splitlines()[-1])["digest"] for path in sys.argv[1:])
+assert first == second, f"{first} != {second}"
+PY
+
+echo '- other programs read what it wrote'
+python3 -m venv "$work/venv"
+"$work/venv/bin/pip" install --quiet --requirement scripts/requirements.txt
+"$work/venv/bin/python" scripts/read_mcap.py "$work"/run/mcap/*.mcap
+cargo run --release --locked --quiet -p tandem-policy --example policy_probe -- policies/teacher-push.safetensors >"$work/probe.json"
+"$work/venv/bin/python" scripts/check_policy.py policies/teacher-push.safetensors "$work/probe.json"
+for log in "$work"/run/mcap/*.mcap; do "$tandem" replay "$log" --verify >/dev/null; done
+echo 'smoke run passed'

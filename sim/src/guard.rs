@@ -1,0 +1,396 @@
+//! Keeps the links of two arms apart by limiting how fast they may approach.
+//!
+//! The links are no rapier bodies: posed by inverse kinematics they would push with unlimited force. Instead each
+//! arm's wanted velocity is limited, for every close pair of capsules, along the pair's normal: the approach may be at
+//! most [`APPROACH_GAIN`] times the gap, and an overlap must be left. The limit acts through the palm's bounded servo.
+//!
+//! A pair that overlaps keeps the side from which it came: where two axes cross, the direction between their nearest
+//! points turns over, and taken as it is it would pull the links through each other.
+
+use rapier3d::math::{Matrix, Vector};
+
+use crate::arm::Arm;
+use crate::hand::{WRIST_ABOVE_M, WRIST_RADIUS_M};
+use crate::physics::Physics;
+
+/// Largest approach speed of an arm per metre of gap, 1/s.
+const APPROACH_GAIN: f32 = 20.0;
+/// Largest speed at which an overlap is left, metres per second.
+const SEPARATION_MPS: f32 = 0.4;
+/// Gap above which a pair limits nothing, metres.
+const LIMIT_WITHIN_M: f32 = 0.08;
+/// Gap at the start of a control step above which a pair cannot come within [`LIMIT_WITHIN_M`] in that step, metres.
+const WATCH_WITHIN_M: f32 = 0.24;
+/// Distance of two axes below which their direction from each other says nothing, metres.
+const CROSSING_M: f32 = 0.002;
+/// Least share of the palm's motion for which a capsule's point counts as moved by the palm.
+const LEAST_LEVERAGE: f32 = 0.05;
+/// Half-planes that one velocity is projected onto, at most, before it is scaled back instead.
+const MAX_PROJECTIONS: usize = 12;
+
+/// Frames of the arm's posture between which the links' capsules lie.
+pub(crate) const LINK_FRAMES: [usize; 4] = [1, 2, 4, 5];
+/// Radii of the links: upper arm, forearm, wrist bend; metres.
+pub(crate) const LINK_RADII_M: [f32; 3] = [0.045, 0.04, 0.035];
+/// Capsules of an arm: its links, its wrist, and one round palm plate and fingers.
+const N_CAPSULES: usize = 5;
+/// Of these, how many are links. Wrists, palms and fingers of two arms collide in rapier.
+const N_LINKS: usize = LINK_RADII_M.len();
+const N_PAIRS: usize = N_CAPSULES * N_CAPSULES - (N_CAPSULES - N_LINKS) * (N_CAPSULES - N_LINKS);
+/// The capsule round palm plate and fingers: its ends, relative to the end effector, and its radius, metres.
+const GRASP_ENDS: [Vector; 2] = [Vector::new(0.0, -0.025, 0.03), Vector::new(0.0, 0.025, 0.03)];
+const GRASP_RADIUS_M: f32 = 0.045;
+
+/// A point of an arm, world frame, metres, and its motion per metre of the palm.
+#[derive(Clone, Copy)]
+struct MovedPoint {
+    at: Vector,
+    motion: Matrix,
+}
+
+#[derive(Clone, Copy)]
+struct MovedCapsule {
+    ends: [MovedPoint; 2],
+    radius_m: f32,
+}
+
+/// An arm's capsules in the posture that the inverse kinematics gave at the start of a control step.
+#[derive(Clone, Copy)]
+struct PosedArm {
+    palm_at: Vector,
+    capsules: [MovedCapsule; N_CAPSULES],
+}
+
+/// One capsule of the first arm against one of the second.
+#[derive(Clone, Copy)]
+struct Pair {
+    capsules: [usize; 2],
+    /// Unit vector towards the first arm's capsule, as of when the pair was last looked at.
+    normal: Option<Vector>,
+    /// Whether the pair can come close in this control step.
+    watched: bool,
+}
+
+/// How a pair stands in one physics step.
+struct Nearness {
+    gap_m: f32,
+    /// Unit vector towards the first arm's capsule.
+    normal: Vector,
+    /// How the nearest point of each arm's capsule moves with its palm.
+    motions: [Matrix; 2],
+}
+
+/// What an arm's velocity must satisfy: `direction · velocity >= least_mps`.
+#[derive(Clone, Copy)]
+struct Limit {
+    direction: Vector,
+    least_mps: f32,
+}
+
+/// An arm's limits in one physics step: the first `n` of `limits`.
+struct Limits {
+    limits: [Limit; N_PAIRS],
+    n: usize,
+}
+
+/// The velocity damper between two arms.
+#[derive(Clone)]
+pub(crate) struct LinkGuard {
+    arms: [PosedArm; 2],
+    pairs: [Pair; N_PAIRS],
+    smallest_gap_m: f32,
+}
+
+impl LinkGuard {
+    /// A guard of `arms` as they stand now.
+    pub(crate) fn new(arms: [&Arm; 2], physics: &Physics) -> Self {
+        let mut guard = Self {
+            arms: arms.map(|arm| PosedArm::of(arm, physics)),
+            pairs: all_pairs(),
+            smallest_gap_m: f32::INFINITY,
+        };
+        guard.pose(arms, physics);
+        guard
+    }
+
+    /// Takes over the arms' postures at the start of a control step.
+    pub(crate) fn pose(&mut self, arms: [&Arm; 2], physics: &Physics) {
+        self.arms = arms.map(|arm| PosedArm::of(arm, physics));
+        self.smallest_gap_m = f32::INFINITY;
+        let palms = self.arms.map(|arm| arm.palm_at);
+        for pair in &mut self.pairs {
+            let gap_m = pair.look(&self.arms, palms).gap_m;
+            pair.watched = gap_m < WATCH_WITHIN_M;
+            self.smallest_gap_m = self.smallest_gap_m.min(gap_m);
+        }
+    }
+
+    /// The smallest gap between the arms' links, or links and hands, since the control step began; negative when they
+    /// overlap. Metres; exact below the distance at which pairs are watched.
+    pub(crate) fn smallest_gap_m(&self) -> f32 {
+        self.smallest_gap_m
+    }
+
+    /// The palms' wanted velocities as far as the links permit, arm by arm; world frame, metres per second.
+    ///
+    /// `palms` is where the palms are now, world frame, metres.
+    pub(crate) fn limit(&mut self, palms: [Vector; 2], wanted: [Vector; 2]) -> [Vector; 2] {
+        let mut limits = [Limits::none(), Limits::none()];
+        for pair in self.pairs.iter_mut().filter(|pair| pair.watched) {
+            let near = pair.look(&self.arms, palms);
+            self.smallest_gap_m = self.smallest_gap_m.min(near.gap_m);
+            if near.gap_m < LIMIT_WITHIN_M {
+                let least_mps = (-APPROACH_GAIN * near.gap_m).min(SEPARATION_MPS);
+                let [first, second] = near.motions;
+                limits[0].add(first.transpose() * near.normal, least_mps);
+                limits[1].add(second.transpose() * -near.normal, least_mps);
+            }
+        }
+        [limits[0].nearest(wanted[0]), limits[1].nearest(wanted[1])]
+    }
+}
+
+impl Pair {
+    fn look(&mut self, arms: &[PosedArm; 2], palms: [Vector; 2]) -> Nearness {
+        let [first, second] =
+            std::array::from_fn(|arm| arms[arm].capsules[self.capsules[arm]].moved_by(palms[arm] - arms[arm].palm_at));
+        let [s, t] = nearest_shares(first.axis(), second.axis());
+        let offset = first.point(s) - second.point(t);
+        let (distance_m, radii_m) = (offset.length(), first.radius_m + second.radius_m);
+        let seen = if distance_m > CROSSING_M { Some(offset / distance_m) } else { None };
+        let (normal, along_m) = match (seen, self.normal) {
+            (Some(seen), Some(known)) if distance_m < radii_m && seen.dot(known) < 0.0 => (-seen, -distance_m),
+            (Some(seen), _) => (seen, distance_m),
+            (None, known) => (known.unwrap_or(Vector::Z), 0.0),
+        };
+        self.normal = Some(normal);
+        Nearness { gap_m: along_m - radii_m, normal, motions: [first.motion(s), second.motion(t)] }
+    }
+}
+
+impl Limits {
+    fn none() -> Self {
+        Self { limits: [Limit { direction: Vector::ZERO, least_mps: 0.0 }; N_PAIRS], n: 0 }
+    }
+
+    fn add(&mut self, direction: Vector, least_mps: f32) {
+        self.limits[self.n] = Limit { direction, least_mps };
+        self.n += 1;
+    }
+
+    fn iter(&self) -> impl Iterator<Item = &Limit> {
+        self.limits[..self.n].iter()
+    }
+
+    /// A velocity near `wanted` within every limit: projected onto the worst one again and again; what is still too
+    /// fast an approach after that is scaled back.
+    ///
+    /// Going by how far limits are exceeded, not by their order, treats both arms alike.
+    fn nearest(&self, wanted: Vector) -> Vector {
+        let mut velocity = wanted;
+        for _ in 0..MAX_PROJECTIONS {
+            let worst = self.iter().max_by(|a, b| a.missing_mps(velocity).total_cmp(&b.missing_mps(velocity)));
+            match worst {
+                Some(limit) if limit.missing_mps(velocity) > 1e-4 => velocity = limit.project(velocity),
+                _ => return velocity,
+            }
+        }
+        let scale = self.iter().map(|limit| limit.scale(velocity)).fold(1.0, f32::min);
+        velocity * scale
+    }
+}
+
+impl Limit {
+    fn missing_mps(&self, velocity: Vector) -> f32 {
+        self.least_mps - self.direction.dot(velocity)
+    }
+
+    fn project(&self, velocity: Vector) -> Vector {
+        let leverage = self.direction.length_squared().max(LEAST_LEVERAGE * LEAST_LEVERAGE);
+        velocity + self.direction * (self.missing_mps(velocity) / leverage)
+    }
+
+    /// The share of `velocity` that keeps within this limit, where slowing down helps.
+    fn scale(&self, velocity: Vector) -> f32 {
+        let speed_mps = self.direction.dot(velocity);
+        if speed_mps < self.least_mps && speed_mps < 0.0 { (self.least_mps.min(0.0) / speed_mps).min(1.0) } else { 1.0 }
+    }
+}
+
+impl PosedArm {
+    fn of(arm: &Arm, physics: &Physics) -> Self {
+        let palm_at = arm.hand.end_effector(physics);
+        let joints = arm.joint_motions(LINK_FRAMES).map(|(at, motion)| MovedPoint { at, motion });
+        let with_palm = |offset: Vector| MovedPoint { at: palm_at + offset, motion: Matrix::IDENTITY };
+        let link = |idx: usize| MovedCapsule { ends: [joints[idx], joints[idx + 1]], radius_m: LINK_RADII_M[idx] };
+        let wrist_ends = WRIST_ABOVE_M.map(|above_m| with_palm(Vector::Z * above_m));
+        let wrist = MovedCapsule { ends: wrist_ends, radius_m: WRIST_RADIUS_M };
+        let grasp_ends = GRASP_ENDS.map(|end| with_palm(arm.frame.turned(end)));
+        let grasp = MovedCapsule { ends: grasp_ends, radius_m: GRASP_RADIUS_M };
+        Self { palm_at, capsules: [link(0), link(1), link(2), wrist, grasp] }
+    }
+}
+
+impl MovedCapsule {
+    /// The capsule after the palm moved by `palm_move`, metres.
+    fn moved_by(&self, palm_move: Vector) -> Self {
+        let ends = self.ends.map(|end| MovedPoint { at: end.at + end.motion * palm_move, ..end });
+        Self { ends, ..*self }
+    }
+
+    fn axis(&self) -> [Vector; 2] {
+        self.ends.map(|end| end.at)
+    }
+
+    fn point(&self, share: f32) -> Vector {
+        let [from, to] = self.axis();
+        from + (to - from) * share
+    }
+
+    fn motion(&self, share: f32) -> Matrix {
+        let [from, to] = self.ends.map(|end| end.motion);
+        from * (1.0 - share) + to * share
+    }
+}
+
+/// Every pair of capsules of which at least one is a link.
+fn all_pairs() -> [Pair; N_PAIRS] {
+    let mut pairs = [Pair { capsules: [0, 0], normal: None, watched: false }; N_PAIRS];
+    let with_link = (0..N_CAPSULES)
+        .flat_map(|first| (0..N_CAPSULES).map(move |second| [first, second]))
+        .filter(|capsules| capsules.iter().any(|capsule| *capsule < N_LINKS));
+    for (pair, capsules) in pairs.iter_mut().zip(with_link) {
+        pair.capsules = capsules;
+    }
+    pairs
+}
+
+/// How far along each of two segments their nearest points lie, as shares of the segments.
+fn nearest_shares(first: [Vector; 2], second: [Vector; 2]) -> [f32; 2] {
+    const TINY: f32 = 1e-9;
+    let (along_first, along_second) = (first[1] - first[0], second[1] - second[0]);
+    let offset = first[0] - second[0];
+    let (a, e) = (along_first.length_squared(), along_second.length_squared());
+    let (b, c, f) = (along_first.dot(along_second), along_first.dot(offset), along_second.dot(offset));
+    let crossing = a * e - b * b;
+    let s = if crossing > TINY { ((b * f - c * e) / crossing).clamp(0.0, 1.0) } else { 0.0 };
+    let t = (b * s + f) / e.max(TINY);
+    if t < 0.0 {
+        [(-c / a.max(TINY)).clamp(0.0, 1.0), 0.0]
+    } else if t > 1.0 {
+        [((b - c) / a.max(TINY)).clamp(0.0, 1.0), 1.0]
+    } else {
+        [s, t]
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use tandem_core::rng::{coin, index, uniform};
+    use tandem_core::scene::{Capsule, Scene};
+    use tandem_core::{Contacts, Layout, Stream, Task, episode_rng};
+
+    use crate::config::{Starts, WorldConfig};
+    use crate::env::Env;
+
+    #[test]
+    fn nearest_points_of_crossing_and_of_parallel_segments() {
+        let check = |first, second, shares: [f32; 2]| assert_eq!(nearest_shares(first, second), shares);
+        let along_x = [Vector::ZERO, Vector::X];
+        check(along_x, [Vector::new(0.25, -1.0, 0.5), Vector::new(0.25, 1.0, 0.5)], [0.25, 0.5]);
+        check(along_x, [Vector::new(2.0, 1.0, 0.0), Vector::new(3.0, 1.0, 0.0)], [1.0, 0.0]);
+        check(along_x, [Vector::new(0.0, 1.0, 0.0), Vector::new(1.0, 1.0, 0.0)], [0.0, 0.0]);
+    }
+
+    #[test]
+    fn a_pair_that_crosses_keeps_its_side() {
+        let capsule = |y_m: f32, along: Vector| {
+            let end = |at| MovedPoint { at, motion: Matrix::IDENTITY };
+            let ends = [-along, along].map(|offset| end(offset + Vector::Y * y_m));
+            MovedCapsule { ends, radius_m: 0.04 }
+        };
+        let arm = |y_m, along| PosedArm { palm_at: Vector::ZERO, capsules: [capsule(y_m, along); N_CAPSULES] };
+        let arms = [arm(0.1, Vector::X), arm(0.0, Vector::Z)];
+        let mut pair = all_pairs()[0];
+        let gaps: Vec<f32> = (0_u8..16)
+            .map(|step| {
+                let near = pair.look(&arms, [Vector::NEG_Y * (0.01 * f32::from(step)), Vector::ZERO]);
+                assert!((near.normal - Vector::Y).length() < 1e-5, "step {step}: {}", near.normal);
+                near.gap_m
+            })
+            .collect();
+        assert!((gaps[0] - 0.02).abs() < 1e-6 && (gaps[15] + 0.13).abs() < 1e-6, "{gaps:?}");
+        assert!(gaps.is_sorted_by(|before, after| before > after), "{gaps:?}");
+    }
+
+    #[test]
+    fn a_limited_velocity_respects_every_limit() {
+        let mut rng = episode_rng(5, 0, Stream::Exploration);
+        let mut vector = |size| Vector::from_array(std::array::from_fn(|_| uniform(&mut rng, -size, size)));
+        for _ in 0..1000 {
+            let mut limits = Limits::none();
+            for least_mps in [0.0, -0.05, -0.2, -0.4] {
+                limits.add(vector(1.0).normalize_or_zero(), least_mps);
+            }
+            let velocity = limits.nearest(vector(1.5));
+            assert!(limits.iter().all(|limit| limit.missing_mps(velocity) < 1e-3), "{velocity}");
+        }
+    }
+
+    /// How an arm that wants to do harm moves: held random actions, or straight for a part of the other arm.
+    fn attack(scene: &Scene, arm: usize, aim: usize) -> [f32; 3] {
+        let other = &scene.arms[1 - arm];
+        let aims = [other.end_effector, other.joint_points[2], other.joint_points[4], other.joint_points[5]];
+        let sign = if arm == 0 { 1.0 } else { -1.0 };
+        let to = |axis: usize| ((aims[aim][axis] - scene.arms[arm].end_effector[axis]) * 20.0).clamp(-1.0, 1.0);
+        [sign * to(0), sign * to(1), to(2)]
+    }
+
+    /// The smallest gap between links as the joints of this very moment give it.
+    fn true_gap_m(scene: &Scene) -> f32 {
+        let axis = |link: &Capsule| [Vector::from_array(link.from), Vector::from_array(link.to)];
+        let gap = |first: &Capsule, second: &Capsule| {
+            let [s, t] = nearest_shares(axis(first), axis(second));
+            let point = |link: &Capsule, share: f32| axis(link)[0].lerp(axis(link)[1], share);
+            (point(first, s) - point(second, t)).length() - first.radius_m - second.radius_m
+        };
+        let [first, second] = [&scene.arms[0].links, &scene.arms[1].links];
+        first.iter().flat_map(|link| second.iter().map(move |other| gap(link, other))).fold(f32::INFINITY, f32::min)
+    }
+
+    #[test]
+    fn links_hardly_overlap_under_attack() {
+        let layout = Layout::new(Task::PickAndPlace, 2);
+        let mut env = Env::new(layout, &WorldConfig::default()).unwrap();
+        let (mut overlapping, mut deepest_m) = (0, 0.0_f32);
+        for episode in 0..200 {
+            let mut rng = episode_rng(9, episode, Stream::Exploration);
+            let starts = Starts { wide_share: 0.5, gripped_share: 0.0 };
+            env.reset(&mut episode_rng(9, episode, Stream::Reset), starts);
+            let mut action = [0.0; 8];
+            let mut aims = [0; 2];
+            let attackers = [coin(&mut rng, 0.7), coin(&mut rng, 0.7)];
+            let mut smallest_m = f32::INFINITY;
+            for step in 0..50 {
+                let scene = env.scene();
+                for arm in 0..2 {
+                    let part = &mut action[arm * 4..arm * 4 + 3];
+                    if step % 10 == 0 {
+                        aims[arm] = index(&mut rng, 4);
+                    }
+                    if attackers[arm] {
+                        part.copy_from_slice(&attack(&scene, arm, aims[arm]));
+                    } else if step % 4 == 0 {
+                        part.fill_with(|| uniform(&mut rng, -1.0, 1.0));
+                    }
+                }
+                let _contacts: Contacts = env.step(&action).unwrap();
+                smallest_m = smallest_m.min(true_gap_m(&env.scene()));
+            }
+            overlapping += u32::from(smallest_m < 0.0);
+            deepest_m = deepest_m.max(-smallest_m);
+        }
+        println!("{overlapping} of 200 attacks overlap, by {deepest_m} m at most");
+    }
+}

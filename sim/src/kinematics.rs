@@ -1,0 +1,257 @@
+//! Kinova's Jaco with six joints and the gripper pointing down: where its joints are, which angles reach a point, and
+//! how the links move when the gripper does.
+//!
+//! All numbers are in the arm's base frame: x away from the base along the own frame's x, z up. `f64` throughout, and
+//! sums in a fixed order, so that the angles have the same bits on every machine.
+
+use std::f64::consts::{FRAC_PI_2, PI};
+
+use rapier3d::glamx::{DMat3, DVec3};
+
+/// Joint angles, radians, base to wrist, by Kinova's convention (joints 2 and 3 are stretched at π).
+pub(crate) type JointAngles = [f64; 6];
+
+/// Angles with the gripper down 0.40 m ahead of the base and 0.15 m above the table, elbow high: the best of 60
+/// solutions from random starts.
+pub(crate) const HOME: JointAngles =
+    [-0.208_556_86, 2.506_949_69, 5.075_284_33, 2.970_589_41, 0.665_106_14, -0.379_560_43];
+
+/// Damping of the least squares, in the mixed unit of metres and radians.
+const DAMPING: f64 = 0.03;
+/// Largest change of an angle per iteration, radians.
+const MAX_ANGLE_STEP_RAD: f64 = 0.3;
+/// Sum of squared errors at which the iteration ends.
+const SOLVED: f64 = 1e-10;
+
+/// One row of the arm's Denavit-Hartenberg table. The twists are multiples of 30 degrees, given by sine and cosine.
+struct Row {
+    sin_twist: f64,
+    cos_twist: f64,
+    length_m: f64,
+    offset_m: f64,
+    /// Joint angle at which the table's angle is 0, and the direction in which it counts.
+    zero_rad: f64,
+    direction: f64,
+}
+
+const SIN_60: f64 = 0.866_025_403_784_438_6;
+/// Half of a wrist bend's part of the link offsets: `sin 30° / sin 60°` of a wrist link of 0.0741 m.
+const BEND_M: f64 = 0.0741 * 0.5 / SIN_60;
+
+/// Jaco with the 60 degree wrist: Kinova's classic parameters of the arm `j2n6s300`.
+const ROWS: [Row; 6] = [
+    Row { sin_twist: 1.0, cos_twist: 0.0, length_m: 0.0, offset_m: 0.2755, zero_rad: 0.0, direction: -1.0 },
+    Row { sin_twist: 0.0, cos_twist: -1.0, length_m: 0.41, offset_m: 0.0, zero_rad: -FRAC_PI_2, direction: 1.0 },
+    Row { sin_twist: 1.0, cos_twist: 0.0, length_m: 0.0, offset_m: -0.0098, zero_rad: FRAC_PI_2, direction: 1.0 },
+    Row { sin_twist: SIN_60, cos_twist: 0.5, length_m: 0.0, offset_m: -(0.2073 + BEND_M), zero_rad: 0.0, direction: 1.0 },
+    Row { sin_twist: SIN_60, cos_twist: 0.5, length_m: 0.0, offset_m: -2.0 * BEND_M, zero_rad: -PI, direction: 1.0 },
+    Row { sin_twist: 0.0, cos_twist: -1.0, length_m: 0.0, offset_m: -(0.16 + BEND_M), zero_rad: FRAC_PI_2, direction: 1.0 },
+];
+
+/// A coordinate system fixed to a link.
+#[derive(Clone, Copy)]
+struct LinkFrame {
+    axes: DMat3,
+    origin: DVec3,
+}
+
+/// The arm in one posture.
+pub(crate) struct Posture {
+    /// Base first, tool last; joint `i` turns about the z axis of frame `i`.
+    frames: [LinkFrame; 7],
+}
+
+impl Posture {
+    pub(crate) fn of(angles: &JointAngles) -> Self {
+        let mut frames = [LinkFrame { axes: DMat3::IDENTITY, origin: DVec3::ZERO }; 7];
+        for (idx, (row, angle)) in ROWS.iter().zip(angles).enumerate() {
+            frames[idx + 1] = frames[idx].next(row, *angle);
+        }
+        Self { frames }
+    }
+
+    /// Where frame `idx` has its origin, metres: 0 the base, 1 to 5 the joints, 6 the tool.
+    pub(crate) fn point(&self, idx: usize) -> DVec3 {
+        self.frames[idx].origin
+    }
+
+    /// The axis of joint `idx` in the direction in which its angle counts.
+    fn axis(&self, idx: usize) -> DVec3 {
+        self.frames[idx].axes.z_axis * ROWS[idx].direction
+    }
+
+    /// Position (metres) and turn (radians) by which the tool misses `target` and pointing down.
+    fn tool_error(&self, target: DVec3) -> [f64; 6] {
+        let tool = &self.frames[6];
+        let position = target - tool.origin;
+        let turn = 0.5
+            * (tool.axes.x_axis.cross(DVec3::Y) + tool.axes.y_axis.cross(DVec3::X) + tool.axes.z_axis.cross(-DVec3::Z));
+        [position.x, position.y, position.z, turn.x, turn.y, turn.z]
+    }
+
+    /// The tool's velocity and turning rate per joint rate: one row a component, one column a joint.
+    fn jacobian(&self) -> [[f64; 6]; 6] {
+        let mut jacobian = [[0.0; 6]; 6];
+        for joint in 0..6 {
+            let axis = self.axis(joint);
+            let swing = axis.cross(self.point(6) - self.point(joint));
+            let column = [swing.x, swing.y, swing.z, axis.x, axis.y, axis.z];
+            for (row, value) in jacobian.iter_mut().zip(column) {
+                row[joint] = value;
+            }
+        }
+        jacobian
+    }
+
+    /// How the origins of `frames` move per metre of the tool, the gripper kept down. Column `c` of each matrix
+    /// belongs to a move along axis `c`.
+    pub(crate) fn motion_of<const N: usize>(&self, frames: [usize; N]) -> [DMat3; N] {
+        let mut moves = [[0.0; 3]; 6];
+        for (axis, row) in moves.iter_mut().take(3).enumerate() {
+            row[axis] = 1.0;
+        }
+        let rates = joint_changes(&self.jacobian(), moves);
+        frames.map(|frame| {
+            let mut motion = [DVec3::ZERO; 3];
+            for (joint, rate) in rates.iter().enumerate().take(frame) {
+                let swing = self.axis(joint).cross(self.point(frame) - self.point(joint));
+                for (column, rate) in motion.iter_mut().zip(rate) {
+                    *column += swing * *rate;
+                }
+            }
+            DMat3::from_cols(motion[0], motion[1], motion[2])
+        })
+    }
+}
+
+impl LinkFrame {
+    fn next(&self, row: &Row, angle: f64) -> Self {
+        let (sin, cos) = libm::sincos(row.direction * angle + row.zero_rad);
+        let (sin_twist, cos_twist) = (row.sin_twist, row.cos_twist);
+        let axes = DMat3::from_cols(
+            DVec3::new(cos, sin, 0.0),
+            DVec3::new(-sin * cos_twist, cos * cos_twist, sin_twist),
+            DVec3::new(sin * sin_twist, -cos * sin_twist, cos_twist),
+        );
+        let step = DVec3::new(row.length_m * cos, row.length_m * sin, row.offset_m);
+        Self { axes: self.axes * axes, origin: self.origin + self.axes * step }
+    }
+}
+
+/// Angles near `start` that bring the tool to `target` (metres) with the gripper down, by damped least squares.
+pub(crate) fn solve(start: JointAngles, target: DVec3, n_iterations: usize) -> JointAngles {
+    let mut angles = start;
+    for _ in 0..n_iterations {
+        let posture = Posture::of(&angles);
+        let error = posture.tool_error(target);
+        if error.iter().map(|e| e * e).sum::<f64>() < SOLVED {
+            break;
+        }
+        let changes = joint_changes(&posture.jacobian(), error.map(|e| [e]));
+        for (angle, [change]) in angles.iter_mut().zip(changes) {
+            *angle += change.clamp(-MAX_ANGLE_STEP_RAD, MAX_ANGLE_STEP_RAD);
+        }
+    }
+    angles
+}
+
+/// Joint changes for each column of `tool_moves`: `Jᵀ (J Jᵀ + damping²)⁻¹ tool_moves`.
+fn joint_changes<const N: usize>(jacobian: &[[f64; 6]; 6], tool_moves: [[f64; N]; 6]) -> [[f64; N]; 6] {
+    let dot = |a: &[f64; 6], b: &[f64; 6]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
+    let mut normal = jacobian.map(|row| jacobian.map(|other| dot(&row, &other)));
+    for (idx, row) in normal.iter_mut().enumerate() {
+        row[idx] += DAMPING * DAMPING;
+    }
+    let weights = solve_positive_definite(normal, tool_moves);
+    std::array::from_fn(|joint| {
+        std::array::from_fn(|column| (0..6).map(|row| jacobian[row][joint] * weights[row][column]).sum())
+    })
+}
+
+/// Solves `matrix · x = sides` for every column by elimination; a positive definite matrix needs no pivots.
+fn solve_positive_definite<const N: usize>(mut matrix: [[f64; 6]; 6], mut sides: [[f64; N]; 6]) -> [[f64; N]; 6] {
+    for pivot in 0..6 {
+        for row in pivot + 1..6 {
+            let factor = matrix[row][pivot] / matrix[pivot][pivot];
+            for column in pivot..6 {
+                matrix[row][column] -= factor * matrix[pivot][column];
+            }
+            for column in 0..N {
+                sides[row][column] -= factor * sides[pivot][column];
+            }
+        }
+    }
+    for row in (0..6).rev() {
+        for column in 0..N {
+            let known: f64 = (row + 1..6).map(|idx| matrix[row][idx] * sides[idx][column]).sum();
+            sides[row][column] = (sides[row][column] - known) / matrix[row][row];
+        }
+    }
+    sides
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use tandem_core::rng::uniform;
+    use tandem_core::{Stream, episode_rng};
+
+    /// Distance by which the tool misses `target`, metres.
+    fn miss_m(angles: &JointAngles, target: DVec3) -> f64 {
+        (Posture::of(angles).point(6) - target).length()
+    }
+
+    #[test]
+    fn stretched_out_the_arm_points_straight_up() {
+        let posture = Posture::of(&[0.0, PI, PI, 0.0, PI, 0.0]);
+        assert!((posture.point(2) - DVec3::new(0.0, 0.0, 0.2755 + 0.41)).length() < 1e-9);
+        assert!((posture.point(4).z - (0.2755 + 0.41 + 0.2073 + BEND_M)).abs() < 1e-9);
+    }
+
+    #[test]
+    fn at_home_the_gripper_points_down_and_the_elbow_is_high() {
+        let target = DVec3::new(0.40, 0.0, 0.15);
+        let error = Posture::of(&HOME).tool_error(target);
+        assert!(error.iter().all(|e| e.abs() < 1e-5), "{error:?}");
+        assert!(Posture::of(&HOME).point(2).z > 0.5);
+    }
+
+    #[test]
+    fn the_jacobian_is_the_derivative_of_the_posture() {
+        let jacobian = Posture::of(&HOME).jacobian();
+        let step = 1e-6;
+        for joint in 0..6 {
+            let mut turned = HOME;
+            turned[joint] += step;
+            let moved = (Posture::of(&turned).point(6) - Posture::of(&HOME).point(6)) / step;
+            for axis in 0..3 {
+                assert!((moved[axis] - jacobian[axis][joint]).abs() < 1e-5, "joint {joint}, axis {axis}");
+            }
+        }
+    }
+
+    #[test]
+    fn the_whole_workspace_is_reached_with_every_joint_high_above_the_table() {
+        let mut rng = episode_rng(3, 0, Stream::Reset);
+        for _ in 0..1000 {
+            let mut between = |low, high| f64::from(uniform(&mut rng, low, high));
+            let target = DVec3::new(0.40 + between(-0.20, 0.20), between(-0.25, 0.25), between(0.022, 0.35));
+            let angles = solve(HOME, target, 100);
+            assert!(miss_m(&angles, target) < 1e-4, "{target} missed by {}", miss_m(&angles, target));
+            let posture = Posture::of(&angles);
+            let lowest_m = (1..6).map(|idx| posture.point(idx).z).fold(f64::INFINITY, f64::min);
+            assert!(lowest_m > 0.2, "a joint at {lowest_m} m for {target}");
+        }
+    }
+
+    #[test]
+    fn joint_points_move_with_the_tool_as_predicted() {
+        let (from, to) = (DVec3::new(0.40, 0.0, 0.15), DVec3::new(0.41, -0.01, 0.16));
+        let (before, after) = (Posture::of(&solve(HOME, from, 100)), Posture::of(&solve(HOME, to, 100)));
+        let motions = before.motion_of([2, 4, 5]);
+        for (motion, frame) in motions.into_iter().zip([2, 4, 5]) {
+            let predicted = before.point(frame) + motion * (to - from);
+            assert!((after.point(frame) - predicted).length() < 2e-3, "frame {frame}");
+        }
+    }
+}

@@ -1,0 +1,162 @@
+//! rapier's sets, bundled so that they can be cloned, with settings for bodies of centimetres.
+
+use rapier3d::dynamics::{
+    CCDSolver, FrictionModel, ImpulseJointSet, IntegrationParameters, IslandManager, MultibodyJointSet, RigidBodySet,
+    SoftBodySet, SpringCoefficients,
+};
+use rapier3d::geometry::{BroadPhaseBvh, ColliderHandle, ColliderSet, ContactPair, Group, InteractionGroups, InteractionTestMode, NarrowPhase};
+use rapier3d::math::Vector;
+use rapier3d::pipeline::PhysicsPipeline;
+use tandem_core::{ArmIndex, Contacts};
+
+use crate::config::WorldConfig;
+
+/// Collision group of the table.
+pub(crate) const TABLE: Group = Group::GROUP_1;
+/// Collision group of the objects.
+pub(crate) const OBJECTS: Group = Group::GROUP_2;
+/// Collision groups of the arms' hands, in arm order.
+const HANDS: [Group; 2] = [Group::GROUP_3, Group::GROUP_4];
+
+/// Collision group of `arm`'s hand.
+pub(crate) fn hand_group(arm: ArmIndex) -> Group {
+    HANDS[arm.0]
+}
+
+/// What a member of `group` collides with: everything else, except that a hand's parts pass through each other.
+pub(crate) fn collides(group: Group) -> InteractionGroups {
+    let everything = TABLE | OBJECTS | HANDS[0] | HANDS[1];
+    let filter = if group == OBJECTS { everything } else { everything & !group };
+    InteractionGroups::new(group, filter, InteractionTestMode::And)
+}
+
+/// A rapier world without joints.
+///
+/// A world that was stepped keeps contact and broad-phase caches, so putting its bodies back is not the same as
+/// starting anew, bit for bit: clone a world that was never stepped instead.
+pub(crate) struct Physics {
+    pub(crate) bodies: RigidBodySet,
+    pub(crate) colliders: ColliderSet,
+    parameters: IntegrationParameters,
+    islands: IslandManager,
+    broad_phase: BroadPhaseBvh,
+    narrow_phase: NarrowPhase,
+    impulse_joints: ImpulseJointSet,
+    multibody_joints: MultibodyJointSet,
+    soft_bodies: SoftBodySet,
+    ccd: CCDSolver,
+    pipeline: PhysicsPipeline,
+}
+
+impl Physics {
+    pub(crate) fn new(config: &WorldConfig) -> Self {
+        Self {
+            bodies: RigidBodySet::new(),
+            colliders: ColliderSet::new(),
+            parameters: integration_parameters(config),
+            islands: IslandManager::new(),
+            broad_phase: BroadPhaseBvh::new(),
+            narrow_phase: NarrowPhase::new(),
+            impulse_joints: ImpulseJointSet::new(),
+            multibody_joints: MultibodyJointSet::new(),
+            soft_bodies: SoftBodySet::new(),
+            ccd: CCDSolver::new(),
+            pipeline: pipeline(),
+        }
+    }
+
+    /// Lets one physics step pass.
+    pub(crate) fn step(&mut self) {
+        self.pipeline.step(
+            Vector::new(0.0, 0.0, -9.81),
+            &self.parameters,
+            &mut self.islands,
+            &mut self.broad_phase,
+            &mut self.narrow_phase,
+            &mut self.bodies,
+            &mut self.colliders,
+            &mut self.impulse_joints,
+            &mut self.multibody_joints,
+            &mut self.soft_bodies,
+            &mut self.ccd,
+            &(),
+            &(),
+        );
+    }
+
+    /// Time of a physics step, seconds.
+    pub(crate) fn substep_s(&self) -> f32 {
+        self.parameters.dt
+    }
+
+    /// Which hands pressed on each other or on the table in the last physics step.
+    pub(crate) fn hand_contacts(&self) -> Contacts {
+        self.narrow_phase
+            .contact_pairs()
+            .map(|pair| {
+                let kind = self.kind_of(pair);
+                if kind.any() && pair.total_impulse_magnitude() > 0.0 { kind } else { Contacts::NONE }
+            })
+            .fold(Contacts::NONE, |all, one| all | one)
+    }
+
+    /// What a contact of this pair would count as.
+    fn kind_of(&self, pair: &ContactPair) -> Contacts {
+        let group = |collider: ColliderHandle| self.colliders[collider].collision_groups().memberships;
+        let both = group(pair.collider1) | group(pair.collider2);
+        if both == HANDS[0] | HANDS[1] {
+            Contacts::ARM_ARM
+        } else if both == TABLE | HANDS[0] || both == TABLE | HANDS[1] {
+            Contacts::ARM_TABLE
+        } else {
+            Contacts::NONE
+        }
+    }
+}
+
+impl Clone for Physics {
+    /// The pipeline is a workspace without state of its own, so the clone gets a fresh one.
+    fn clone(&self) -> Self {
+        Self {
+            bodies: self.bodies.clone(),
+            colliders: self.colliders.clone(),
+            parameters: self.parameters,
+            islands: self.islands.clone(),
+            broad_phase: self.broad_phase.clone(),
+            narrow_phase: self.narrow_phase.clone(),
+            impulse_joints: self.impulse_joints.clone(),
+            multibody_joints: self.multibody_joints.clone(),
+            soft_bodies: self.soft_bodies.clone(),
+            ccd: self.ccd.clone(),
+            pipeline: pipeline(),
+        }
+    }
+}
+
+fn pipeline() -> PhysicsPipeline {
+    let mut pipeline = PhysicsPipeline::new();
+    pipeline.counters.disable();
+    pipeline
+}
+
+/// rapier's defaults are for bodies of metres: they let a cube of centimetres sink in by a third of its size.
+fn integration_parameters(config: &WorldConfig) -> IntegrationParameters {
+    let softness = SpringCoefficients::new(200.0, 5.0);
+    IntegrationParameters {
+        dt: config.substep_s(),
+        num_solver_iterations: config.solver_iterations,
+        num_internal_pgs_iterations: 1,
+        num_internal_stabilization_iterations: 1,
+        normalized_prediction_distance: 0.002,
+        normalized_allowed_linear_error: 0.0005,
+        normalized_max_corrective_velocity: 1.0,
+        contact_softness: softness,
+        static_contact_softness: softness,
+        contact_recycling: false,
+        contact_clustering: true,
+        max_ccd_substeps: 0,
+        friction_model: FrictionModel::Coulomb,
+        friction_in_bias_pass: false,
+        ..IntegrationParameters::default()
+    }
+}

@@ -1,0 +1,67 @@
+//! The world as pictures and logs show it.
+
+use rapier3d::math::{Rotation, Vector};
+use tandem_core::scene::{ArmScene, Capsule, Cuboid, Point, Scene};
+use tandem_core::{ArmIndex, Layout};
+
+use crate::arm::Arm;
+use crate::frame::BASE_IN_OWN;
+use crate::guard::{LINK_FRAMES, LINK_RADII_M};
+use crate::hand::{PAD_HALF_M, PALM_ABOVE_M, PALM_HALF_M, WRIST_ABOVE_M, WRIST_RADIUS_M};
+use crate::kinematics::Posture;
+use crate::world::{TABLE_HALF_M, World};
+
+/// Iterations of the inverse kinematics from the posture at the start of a control step to where the hand is now.
+const ITERATIONS: usize = 20;
+
+/// What `world` looks like `time_s` after the episode's start; `goal` has shape `[n_goal]`, own frames.
+pub(crate) fn scene(world: &World, layout: Layout, goal: &[f32], half_m: f32, time_s: f64) -> Scene {
+    let goal_in_world = |arm: ArmIndex| {
+        let in_own = Vector::from_slice(&goal[layout.goal_of(arm)]);
+        world.arms[arm.0].frame.world_from_own(in_own).to_array()
+    };
+    let object = |arm: ArmIndex| {
+        let body = world.object(arm);
+        cuboid(body.translation(), *body.rotation(), Vector::splat(half_m))
+    };
+    Scene {
+        time_s,
+        arms: world.arms.iter().map(|arm| arm_scene(world, arm)).collect(),
+        objects: layout.arms().map(object).collect(),
+        goals: layout.arms().map(goal_in_world).collect(),
+        table: cuboid(Vector::new(0.0, 0.0, -TABLE_HALF_M.z), Rotation::IDENTITY, TABLE_HALF_M),
+    }
+}
+
+fn arm_scene(world: &World, arm: &Arm) -> ArmScene {
+    let joint_angles_rad = arm.angles_now(&world.physics, ITERATIONS);
+    let posture = Posture::of(&joint_angles_rad);
+    let joint_points: Vec<Point> = (0..7).map(|idx| arm.world_from_base(posture.point(idx)).to_array()).collect();
+    let end_effector = arm.hand.end_effector(&world.physics);
+    let mut links: Vec<Capsule> = LINK_FRAMES
+        .windows(2)
+        .zip(LINK_RADII_M)
+        .map(|(ends, radius_m)| Capsule { from: joint_points[ends[0]], to: joint_points[ends[1]], radius_m })
+        .collect();
+    let [from, to] = WRIST_ABOVE_M.map(|above_m| (end_effector + Vector::Z * above_m).to_array());
+    links.push(Capsule { from, to, radius_m: WRIST_RADIUS_M });
+    let turned = arm.frame.orientation_in_world();
+    let mut hand = vec![cuboid(end_effector + Vector::Z * PALM_ABOVE_M, turned, PALM_HALF_M)];
+    hand.extend(arm.hand.pads(&world.physics).map(|pad| cuboid(pad, turned, PAD_HALF_M)));
+    ArmScene {
+        base: arm.frame.world_from_own(BASE_IN_OWN).to_array(),
+        joint_angles_rad,
+        joint_points,
+        links,
+        hand,
+        end_effector: end_effector.to_array(),
+    }
+}
+
+fn cuboid(centre: Vector, orientation: Rotation, half_extents_m: Vector) -> Cuboid {
+    Cuboid {
+        centre: centre.to_array(),
+        orientation: orientation.to_array(),
+        half_extents_m: half_extents_m.to_array(),
+    }
+}

@@ -1,0 +1,150 @@
+//! The world: table, objects and arms, and what passes in one control step.
+
+use rapier3d::dynamics::{CoefficientCombineRule, RigidBody, RigidBodyBuilder, RigidBodyHandle};
+use rapier3d::geometry::ColliderBuilder;
+use rapier3d::math::{Pose, Vector};
+use tandem_core::{ArmIndex, Contacts, Layout};
+
+use crate::arm::{Arm, Command};
+use crate::config::{SimError, WorldConfig};
+use crate::frame::OwnFrame;
+use crate::guard::LinkGuard;
+use crate::physics::{OBJECTS, Physics, TABLE, collides};
+
+/// Most arms a world can have.
+pub(crate) const MAX_ARMS: usize = 2;
+/// Half extents of the table, metres; its top is at z = 0.
+pub(crate) const TABLE_HALF_M: Vector = Vector::new(0.8, 0.6, 0.05);
+const TABLE_FRICTION: f32 = 0.6;
+
+/// Everything that moves, and what it moves on. One object an arm, in arm order.
+#[derive(Clone)]
+pub(crate) struct World {
+    pub(crate) physics: Physics,
+    pub(crate) arms: Vec<Arm>,
+    objects: Vec<RigidBodyHandle>,
+    /// Between two arms; a single arm needs none.
+    guard: Option<LinkGuard>,
+    substeps: u32,
+}
+
+impl World {
+    /// A world in which nothing has its place yet.
+    pub(crate) fn build(layout: Layout, config: &WorldConfig) -> Self {
+        let friction = config.friction(layout.task);
+        let mut physics = Physics::new(config);
+        add_table(&mut physics);
+        let mut arms = Vec::with_capacity(layout.n_arms);
+        let mut objects = Vec::with_capacity(layout.n_arms);
+        for arm in layout.arms() {
+            let frame = OwnFrame::of(arm, layout.n_arms);
+            arms.push(Arm::build(&mut physics, arm, frame, friction.pads, config));
+            objects.push(add_object(&mut physics, config, friction.object));
+        }
+        Self { physics, arms, objects, guard: None, substeps: config.substeps }
+    }
+
+    /// Puts `arm`'s object, at rest and not turned in the arm's own frame, to `at_in_own`, metres.
+    pub(crate) fn place_object(&mut self, arm: ArmIndex, at_in_own: Vector) {
+        let frame = self.arms[arm.0].frame;
+        let pose = Pose::from_parts(frame.world_from_own(at_in_own), frame.orientation_in_world());
+        let body = &mut self.physics.bodies[self.objects[arm.0]];
+        body.set_position(pose, true);
+        body.set_linvel(Vector::ZERO, true);
+        body.set_angvel(Vector::ZERO, true);
+    }
+
+    /// Puts `arm`, at rest, where its end effector is at `end_effector_in_own` (metres).
+    pub(crate) fn place_arm(&mut self, arm: ArmIndex, end_effector_in_own: Vector, opening_m: f32) {
+        self.arms[arm.0].place(&mut self.physics, end_effector_in_own, opening_m);
+    }
+
+    /// Sets up what watches over the arms, once they are in their places.
+    pub(crate) fn arm_guard(&mut self) {
+        self.guard = match self.arms.as_slice() {
+            [first, second] => Some(LinkGuard::new([first, second], &self.physics)),
+            _ => None,
+        };
+    }
+
+    /// The smallest gap between two arms' links during the last control step, metres; infinite for one arm.
+    pub(crate) fn link_gap_m(&self) -> f32 {
+        self.guard.as_ref().map_or(f32::INFINITY, LinkGuard::smallest_gap_m)
+    }
+
+    /// `arm`'s object.
+    pub(crate) fn object(&self, arm: ArmIndex) -> &RigidBody {
+        &self.physics.bodies[self.objects[arm.0]]
+    }
+
+    /// Lets one control step pass. `commands` has one entry an arm; further ones are not read.
+    pub(crate) fn step(&mut self, commands: &[Command; MAX_ARMS]) -> Result<Contacts, SimError> {
+        for arm in &mut self.arms {
+            arm.track(&self.physics);
+        }
+        if let (Some(guard), [first, second]) = (&mut self.guard, self.arms.as_slice()) {
+            guard.pose([first, second], &self.physics);
+        }
+        let mut contacts = Contacts::NONE;
+        for _ in 0..self.substeps {
+            self.drive(commands);
+            self.physics.step();
+            contacts = contacts | self.physics.hand_contacts();
+        }
+        self.check_finite()?;
+        if self.link_gap_m() < 0.0 {
+            contacts = contacts | Contacts::ARM_ARM;
+        }
+        Ok(contacts)
+    }
+
+    /// Sets the hands' forces for the next physics step.
+    fn drive(&mut self, commands: &[Command; MAX_ARMS]) {
+        let mut velocities = [Vector::ZERO; MAX_ARMS];
+        for ((arm, command), velocity) in self.arms.iter().zip(commands).zip(&mut velocities) {
+            *velocity = arm.velocity_to(&self.physics, command.target);
+        }
+        if let (Some(guard), [first, second]) = (&mut self.guard, self.arms.as_slice()) {
+            let palms = [first, second].map(|arm| arm.hand.end_effector(&self.physics));
+            velocities = guard.limit(palms, velocities);
+        }
+        for ((arm, command), velocity) in self.arms.iter().zip(commands).zip(velocities) {
+            arm.hand.drive(&mut self.physics, velocity, command.gripper);
+        }
+    }
+
+    fn check_finite(&self) -> Result<(), SimError> {
+        for (arm, state) in self.arms.iter().enumerate() {
+            if !state.hand.is_finite(&self.physics) {
+                return Err(SimError::StateNotFinite { part: "hand", arm });
+            }
+            let object = self.object(ArmIndex(arm));
+            let parts = [object.translation(), object.linvel(), object.angvel()];
+            if !parts.iter().all(|part| part.is_finite()) || !object.rotation().is_finite() {
+                return Err(SimError::StateNotFinite { part: "object", arm });
+            }
+        }
+        Ok(())
+    }
+}
+
+fn add_table(physics: &mut Physics) {
+    let table = ColliderBuilder::cuboid(TABLE_HALF_M.x, TABLE_HALF_M.y, TABLE_HALF_M.z)
+        .translation(Vector::new(0.0, 0.0, -TABLE_HALF_M.z))
+        .friction(TABLE_FRICTION)
+        .friction_combine_rule(CoefficientCombineRule::Min)
+        .collision_groups(collides(TABLE));
+    physics.colliders.insert(table);
+}
+
+fn add_object(physics: &mut Physics, config: &WorldConfig, friction: f32) -> RigidBodyHandle {
+    let half_m = config.object_half_size_m;
+    let body = physics.bodies.insert(RigidBodyBuilder::dynamic().can_sleep(false));
+    let cube = ColliderBuilder::cuboid(half_m, half_m, half_m)
+        .mass(config.object_mass_kg)
+        .friction(friction)
+        .friction_combine_rule(CoefficientCombineRule::Max)
+        .collision_groups(collides(OBJECTS));
+    physics.colliders.insert_with_parent(cube, body, &mut physics.bodies);
+    body
+}

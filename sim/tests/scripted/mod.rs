@@ -1,0 +1,202 @@
+//! Controllers by rule, which see what a policy sees: one arm's 28 numbers and its goal, in the arm's own frame.
+
+use tandem_core::layout::EPISODE_STEPS;
+use tandem_core::reward::{REWARD_ACHIEVED, achieved_goal, distance, sparse_reward};
+use tandem_core::{ArmIndex, Layout, Stream, Task, episode_rng};
+use tandem_sim::{Env, Starts, WorldConfig};
+
+/// Metres that an action of 1 asks for.
+const ACTION_M: f32 = 0.05;
+
+/// How one scripted episode went.
+pub(crate) struct Played {
+    /// Every object within the tolerance of its goal at the end.
+    pub(crate) success: bool,
+    /// Largest distance of an object from its goal at the end, metres.
+    pub(crate) miss_m: f32,
+}
+
+/// Plays `n_episodes` with one controller an arm, the controllers blind to each other.
+pub(crate) fn play(layout: Layout, config: &WorldConfig, n_episodes: u64) -> Vec<Played> {
+    let mut env = Env::new(layout, config).unwrap();
+    let mut observation = vec![0.0; layout.n_observation()];
+    let mut action = vec![0.0; layout.n_action()];
+    (0..n_episodes)
+        .map(|episode| {
+            env.reset(&mut episode_rng(11, episode, Stream::Reset), Starts::default());
+            let mut controllers = vec![Controller::new(layout.task); layout.n_arms];
+            for _ in 0..EPISODE_STEPS {
+                env.observe(&mut observation);
+                for (arm, controller) in layout.arms().zip(&mut controllers) {
+                    let (seen, goal) = (&observation[layout.observation_of(arm)], &env.goal()[layout.goal_of(arm)]);
+                    let inputs = controller.act(seen, goal);
+                    let part = &mut action[layout.action_of(arm)];
+                    part.copy_from_slice(&inputs[..part.len()]);
+                }
+                env.step(&action).unwrap();
+            }
+            env.observe(&mut observation);
+            outcome(layout, &observation, env.goal())
+        })
+        .collect()
+}
+
+/// Share of successes.
+pub(crate) fn success_rate(episodes: &[Played]) -> f64 {
+    let n_successes = u32::try_from(episodes.iter().filter(|played| played.success).count()).unwrap();
+    f64::from(n_successes) / f64::from(u32::try_from(episodes.len()).unwrap())
+}
+
+fn outcome(layout: Layout, observation: &[f32], goal: &[f32]) -> Played {
+    let achieved: Vec<f32> = achieved_goal(layout, observation).collect();
+    let of = |arm: ArmIndex| (&achieved[layout.goal_of(arm)], &goal[layout.goal_of(arm)]);
+    Played {
+        success: layout.arms().all(|arm| sparse_reward(of(arm).0, of(arm).1) == REWARD_ACHIEVED),
+        miss_m: layout.arms().map(|arm| distance(of(arm).0, of(arm).1)).fold(0.0, f32::max),
+    }
+}
+
+/// What an arm is busy with.
+#[derive(Clone, Copy)]
+enum Phase {
+    /// Pick: moving above the object. Push: moving behind it.
+    Approach,
+    /// Pick: moving down to it.
+    Descend,
+    /// Pick: closing on it, for so many steps already.
+    Grasp(u32),
+    /// Pick: bringing it to the goal. Push: pushing it there.
+    Bring,
+    /// Push: leaving it, to start again or to rest.
+    Leave,
+}
+
+#[derive(Clone)]
+pub(crate) struct Controller {
+    task: Task,
+    phase: Phase,
+}
+
+/// A point on the table's plane.
+type Flat = [f32; 2];
+
+impl Controller {
+    pub(crate) fn new(task: Task) -> Self {
+        Self { task, phase: Phase::Approach }
+    }
+
+    /// Three displacements and the gripper's input.
+    pub(crate) fn act(&mut self, seen: &[f32], goal: &[f32]) -> [f32; 4] {
+        let hand = [seen[0], seen[1], seen[2]];
+        let object = [seen[3], seen[4], seen[5]];
+        match self.task {
+            Task::PickAndPlace => self.pick_and_place(hand, object, goal),
+            Task::Push => self.push(hand, object, goal),
+        }
+    }
+
+    fn pick_and_place(&mut self, hand: [f32; 3], object: [f32; 3], goal: &[f32]) -> [f32; 4] {
+        let grasp_z = object[2].max(0.0245);
+        let off = length(flat_between(hand, object));
+        match self.phase {
+            Phase::Approach => {
+                if off < 0.008 {
+                    self.phase = Phase::Descend;
+                }
+                let above = if off < 0.03 { 0.04 } else { 0.08 };
+                towards(hand, [object[0], object[1], grasp_z + above], 1.3, 1.0)
+            }
+            Phase::Descend => {
+                if (hand[2] - grasp_z).abs() < 0.006 {
+                    self.phase = Phase::Grasp(0);
+                }
+                towards(hand, [object[0], object[1], grasp_z], 1.3, 1.0)
+            }
+            Phase::Grasp(n_steps) => {
+                self.phase = if n_steps < 4 { Phase::Grasp(n_steps + 1) } else { Phase::Bring };
+                [0.0, 0.0, 0.0, -1.0]
+            }
+            Phase::Bring | Phase::Leave => {
+                if off > 0.05 {
+                    self.phase = Phase::Approach;
+                }
+                let target = std::array::from_fn(|axis| hand[axis] + goal[axis] - object[axis]);
+                towards(hand, target, 1.3, -1.0)
+            }
+        }
+    }
+
+    fn push(&mut self, hand: [f32; 3], object: [f32; 3], goal: &[f32]) -> [f32; 4] {
+        let to_goal = [goal[0] - object[0], goal[1] - object[1]];
+        let distance_m = length(to_goal);
+        let along = to_goal.map(|d| d / distance_m.max(1e-6));
+        let behind = flat_between(object, hand);
+        let advance_m = behind[0] * along[0] + behind[1] * along[1];
+        let lateral = [behind[0] - along[0] * advance_m, behind[1] - along[1] * advance_m];
+        if distance_m < 0.012 {
+            self.phase = Phase::Leave;
+        }
+        match self.phase {
+            Phase::Bring => {
+                if advance_m > -0.012 || length(lateral) > 0.022 {
+                    self.phase = Phase::Leave;
+                }
+                let ahead_m =
+                    (distance_m * 0.5).clamp(0.005, 0.022) * (1.0 - length(lateral) / 0.03).max(0.25);
+                let target = |axis: usize| hand[axis] + along[axis] * ahead_m - lateral[axis] * 0.4;
+                towards(hand, [target(0), target(1), PUSH_Z_M], 1.3, 0.0)
+            }
+            Phase::Leave => self.leave(behind, distance_m),
+            _ => self.get_behind(hand, object, along, behind),
+        }
+    }
+
+    fn leave(&mut self, behind: Flat, distance_m: f32) -> [f32; 4] {
+        let away_m = length(behind);
+        if away_m > 0.065 {
+            if distance_m > 0.02 {
+                self.phase = Phase::Approach;
+            }
+            return [0.0; 4];
+        }
+        [0.5 * behind[0] / away_m.max(1e-6), 0.5 * behind[1] / away_m.max(1e-6), 0.0, 0.0]
+    }
+
+    /// Over the object, never through it, to 7 cm behind it as seen from the goal.
+    fn get_behind(&mut self, hand: [f32; 3], object: [f32; 3], along: Flat, behind: Flat) -> [f32; 4] {
+        let target = [object[0] - along[0] * 0.07, object[1] - along[1] * 0.07];
+        let off = length([target[0] - hand[0], target[1] - hand[1]]);
+        if off < 0.012 && hand[2] < PUSH_Z_M + 0.012 {
+            self.phase = Phase::Bring;
+        }
+        if off < 0.03 {
+            return towards(hand, [target[0], target[1], PUSH_Z_M], 1.3, 0.0);
+        }
+        if hand[2] >= 0.055 {
+            return towards(hand, [target[0], target[1], 0.075], 1.5, 0.0);
+        }
+        let mut rise = towards(hand, [hand[0], hand[1], 0.075], 1.5, 0.0);
+        let away_m = length(behind);
+        if away_m < 0.07 {
+            rise[0] = 0.3 * behind[0] / away_m.max(1e-6);
+            rise[1] = 0.3 * behind[1] / away_m.max(1e-6);
+        }
+        rise
+    }
+}
+
+/// Height of the hand while it pushes, metres.
+const PUSH_Z_M: f32 = 0.024;
+
+fn towards(hand: [f32; 3], target: [f32; 3], gain: f32, gripper: f32) -> [f32; 4] {
+    let input = |axis: usize| ((target[axis] - hand[axis]) / ACTION_M * gain).clamp(-1.0, 1.0);
+    [input(0), input(1), input(2), gripper]
+}
+
+fn flat_between(from: [f32; 3], to: [f32; 3]) -> Flat {
+    [to[0] - from[0], to[1] - from[1]]
+}
+
+fn length(flat: Flat) -> f32 {
+    flat[0].hypot(flat[1])
+}

@@ -1,0 +1,229 @@
+//! `tandem bench`: how fast the parts are on this machine, as rates and as ratios within one run.
+
+use std::time::Duration;
+
+use serde_json::json;
+use tandem_core::layout::EPISODE_STEPS;
+use tandem_core::rng::{Stream, episode_rng, uniform};
+use tandem_core::{Layout, Task};
+use tandem_learner::RunConfig;
+use tandem_learner::config::Recipe;
+use tandem_learner::ddpg::{Batch, Ddpg};
+use tandem_learner::her::{Sampler, Statistics};
+use tandem_learner::replay::{ReplayBuffer, drifting_episode};
+use tandem_learner::trainer::Trainer;
+use tandem_policy::{Matrix, MatrixMut, MlpShape, NormalizerSnapshot, multiply};
+use tandem_sim::{Env, Starts, WorldConfig};
+
+use crate::cli::{BenchArgs, BenchName};
+use crate::clock;
+use crate::exit::{Exit, Failed, OrExit as _};
+
+/// How long one sample of a rate is taken, and how many samples; the best is printed, as the least disturbed.
+const SAMPLE: Duration = Duration::from_millis(600);
+const N_SAMPLES: usize = 5;
+/// Edge of the square matrices whose product is the measure of the machine.
+const SGEMM_EDGE: usize = 256;
+
+/// One measured figure.
+struct Figure {
+    name: String,
+    value: f64,
+    unit: &'static str,
+}
+
+#[expect(clippy::print_stdout, reason = "what the command is for")]
+pub(crate) fn bench(args: &BenchArgs) -> Result<(), Failed> {
+    let all = [BenchName::Sim, BenchName::Inference, BenchName::Update, BenchName::Replay];
+    let chosen: &[BenchName] = if args.what.is_empty() { &all } else { &args.what };
+    for what in chosen {
+        let figures = match what {
+            BenchName::Sim => sim()?,
+            BenchName::Inference => inference()?,
+            BenchName::Update => update(),
+            BenchName::Replay => replay(),
+        };
+        for Figure { name, value, unit } in figures {
+            if args.json {
+                println!("{}", json!({"name": name, "value": value, "unit": unit}));
+            } else {
+                println!("{name:<44} {value:>12.2} {unit}");
+            }
+        }
+    }
+    Ok(())
+}
+
+/// Calls of `work` a second: the best of several samples.
+fn rate(mut work: impl FnMut()) -> f64 {
+    work();
+    let sample = |work: &mut dyn FnMut()| {
+        let start = clock::now();
+        let mut n_calls = 0_u32;
+        while start.elapsed() < SAMPLE {
+            work();
+            n_calls += 1;
+        }
+        f64::from(n_calls) / start.elapsed().as_secs_f64()
+    };
+    (0..N_SAMPLES).map(|_| sample(&mut work)).fold(0.0, f64::max)
+}
+
+/// Environment steps a second on one core, with random actions, resets and observations included.
+fn sim() -> Result<Vec<Figure>, Failed> {
+    let mut figures = Vec::new();
+    for (task, n_arms) in
+        [(Task::Push, 1), (Task::Push, 2), (Task::PickAndPlace, 1), (Task::PickAndPlace, 2)]
+    {
+        let layout = Layout::new(task, n_arms);
+        let mut world =
+            Env::new(layout, &WorldConfig::default()).or_exit(Exit::Bug, String::new)?;
+        let mut rng = episode_rng(1, 0, Stream::Exploration);
+        let (mut observation, mut action) =
+            (vec![0.0; layout.n_observation()], vec![0.0; layout.n_action()]);
+        let mut n_episodes = 0;
+        let mut broken = None;
+        let episodes_per_s = rate(|| {
+            world.reset(&mut episode_rng(1, n_episodes, Stream::Reset), Starts::default());
+            n_episodes += 1;
+            for _ in 0..EPISODE_STEPS {
+                action.iter_mut().for_each(|component| *component = uniform(&mut rng, -1.0, 1.0));
+                broken = world.step(&action).err().or(broken.take());
+                world.observe(&mut observation);
+            }
+        });
+        if let Some(error) = broken {
+            return Err(Failed::new(Exit::Bug, error));
+        }
+        let value = episodes_per_s * EPISODE_STEPS as f64;
+        figures.push(Figure {
+            name: format!("sim/{task}/{n_arms}-arm"),
+            value,
+            unit: "env steps/s",
+        });
+    }
+    Ok(figures)
+}
+
+/// Time of one decision of the two-arm student, for one and for two episodes in lock step.
+fn inference() -> Result<Vec<Figure>, Failed> {
+    let config = RunConfig::defaults(Recipe::Tandem, Task::Push, 2);
+    let trainer = Trainer::new(config).or_exit(Exit::Bug, String::new)?;
+    let policy = trainer.policy(std::collections::BTreeMap::new());
+    let mut actor = policy.actor().or_exit(Exit::Bug, String::new)?;
+    let layout = policy.layout;
+    let mut figures = Vec::new();
+    for n in [1, 2, 8] {
+        let (observations, goals) =
+            (vec![0.1; n * layout.n_observation()], vec![0.1; n * layout.n_goal()]);
+        let mut actions = vec![0.0; n * layout.n_action()];
+        let per_s = rate(|| actor.act(&observations, &goals, &mut actions));
+        figures.push(Figure {
+            name: format!("inference/student-actor/batch-{n}"),
+            value: 1e6 / per_s,
+            unit: "us",
+        });
+    }
+    Ok(figures)
+}
+
+/// Updates a second of the two-arm student, with one thread and with two, beside the machine's matrix product.
+fn update() -> Vec<Figure> {
+    let layout = Layout::new(Task::Push, 2);
+    let config = RunConfig::defaults(Recipe::Tandem, Task::Push, 2).ddpg;
+    let flop = update_flop(
+        layout,
+        config.n_hidden,
+        config.n_hidden_layers,
+        config.batch_size,
+        layout.n_arms,
+    );
+    let batch = random_batch(layout, config.batch_size);
+    let sgemm = sgemm_flop_per_s();
+    let updates_per_s = |n_threads: usize| {
+        let mut ddpg = Ddpg::new(config.clone(), layout, layout.n_arms, 1);
+        ddpg.set_threads(n_threads);
+        rate(|| {
+            drop(ddpg.update(&batch));
+            ddpg.polyak();
+        })
+    };
+    let (one, two) = (updates_per_s(1), updates_per_s(2));
+    let figure = |name: &str, value, unit| Figure { name: name.to_owned(), value, unit };
+    vec![
+        figure("update/sgemm-256", sgemm / 1e9, "GFLOP/s"),
+        figure("update/student/1-thread", one, "updates/s"),
+        figure("update/student/2-threads", two, "updates/s"),
+        figure("update/student/flop", flop / 1e9, "GFLOP"),
+        figure("update/student/1-thread-share-of-sgemm", one * flop / sgemm, "of sgemm-256"),
+        figure("update/student/2-threads-speed-up", two / one, "x 1 thread"),
+    ]
+}
+
+/// Time to draw one batch by hindsight from a buffer of 2,000 episodes.
+fn replay() -> Vec<Figure> {
+    let layout = Layout::new(Task::Push, 2);
+    let config = RunConfig::defaults(Recipe::Tandem, Task::Push, 2);
+    let mut buffer = ReplayBuffer::new(layout, 2000 * EPISODE_STEPS);
+    (0..2000_u16).for_each(|number| {
+        buffer.push(&drifting_episode(layout, u64::from(number), f32::from(number % 7) * 1e-3))
+    });
+    let mut sampler = Sampler::new(&config.replay, layout);
+    let mut batch = Batch::new(layout, layout.n_arms, config.ddpg.batch_size);
+    let (observation, goal) = (
+        NormalizerSnapshot::identity(layout.n_observation()),
+        NormalizerSnapshot::identity(layout.n_goal()),
+    );
+    let statistics = Statistics { observation: &observation, goal: &goal };
+    let mut rng = episode_rng(1, 0, Stream::Replay);
+    let per_s = rate(|| sampler.fill(&buffer, statistics, &mut rng, &mut batch));
+    vec![Figure { name: "replay/batch-256".to_owned(), value: 1e6 / per_s, unit: "us" }]
+}
+
+/// Floating-point operations that one update cannot do without: five forward passes, the critic's two gradients, the
+/// way through the critic to the action columns, the actor's two gradients; a multiplication and an addition count two.
+fn update_flop(
+    layout: Layout,
+    n_hidden: usize,
+    n_layers: usize,
+    batch_size: usize,
+    n_heads: usize,
+) -> f64 {
+    let products = |shape: MlpShape| {
+        let hidden = (shape.n_hidden_layers - 1) * shape.n_hidden * shape.n_hidden;
+        (shape.n_input * shape.n_hidden + hidden + shape.n_hidden * shape.n_output) as f64
+    };
+    let actor = MlpShape::actor(layout, n_hidden, n_layers);
+    let critic = MlpShape::critic(layout, n_hidden, n_layers, n_heads);
+    let (first_actor, first_critic) =
+        ((actor.n_input * n_hidden) as f64, (critic.n_input * n_hidden) as f64);
+    let (a, q) = (products(actor), products(critic));
+    let forward = 2.0 * a + 3.0 * q;
+    let critic_backward = 2.0 * q - first_critic;
+    let through_critic = q - first_critic + (layout.n_action() * n_hidden) as f64;
+    let actor_backward = 2.0 * a - first_actor;
+    2.0 * batch_size as f64 * (forward + critic_backward + through_critic + actor_backward)
+}
+
+fn random_batch(layout: Layout, batch_size: usize) -> Batch {
+    let mut batch = Batch::new(layout, layout.n_arms, batch_size);
+    let mut rng = episode_rng(1, 0, Stream::Replay);
+    for values in [&mut batch.inputs, &mut batch.next_inputs, &mut batch.actions] {
+        values.iter_mut().for_each(|value| *value = uniform(&mut rng, -1.0, 1.0));
+    }
+    batch.rewards.fill(-1.0);
+    batch
+}
+
+fn sgemm_flop_per_s() -> f64 {
+    let n = SGEMM_EDGE;
+    let (lhs, rhs, mut product) = (vec![0.5; n * n], vec![0.25; n * n], vec![0.0; n * n]);
+    let per_s = rate(|| {
+        multiply(
+            &mut MatrixMut::new(&mut product, n, n),
+            Matrix::new(&lhs, n, n),
+            Matrix::new(&rhs, n, n),
+        );
+    });
+    per_s * 2.0 * (n * n * n) as f64
+}

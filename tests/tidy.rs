@@ -1,0 +1,100 @@
+//! The house keeps its order: who may depend on whom, which modules stay pure, what no file may say.
+
+use std::collections::BTreeSet;
+use std::fs;
+use std::path::{Path, PathBuf};
+
+const ALLOWED: [(&str, &[&str]); 9] = [
+    ("core", &[]),
+    ("sim", &["core"]),
+    ("policy", &["core"]),
+    ("proto", &["core"]),
+    ("telemetry", &["core"]),
+    ("learner", &["core", "policy", "proto", "telemetry"]),
+    ("teacher", &["core", "policy", "proto", "telemetry"]),
+    ("worker", &["core", "sim", "policy", "proto", "telemetry"]),
+    ("report", &["core", "telemetry"]),
+];
+
+/// Directories of which every file is pure, and single pure files.
+const PURE: [&str; 14] = [
+    "core/src",
+    "sim/src",
+    "policy/src",
+    "learner/src/board.rs",
+    "learner/src/config.rs",
+    "learner/src/ddpg.rs",
+    "learner/src/her.rs",
+    "learner/src/replay.rs",
+    "learner/src/trainer.rs",
+    "teacher/src/budget.rs",
+    "teacher/src/maps.rs",
+    "teacher/src/procedures.rs",
+    "teacher/src/strategy.rs",
+    "worker/src/rollout.rs",
+];
+
+#[test]
+fn crates_depend_only_downward() {
+    for (name, allowed) in ALLOWED {
+        let ours: BTreeSet<String> = dependencies(name)
+            .iter()
+            .filter_map(|d| d.strip_prefix("tandem-").map(str::to_owned))
+            .collect();
+        let surplus: Vec<_> = ours.iter().filter(|d| !allowed.contains(&d.as_str())).collect();
+        assert!(surplus.is_empty(), "{name} must not depend on {surplus:?}");
+    }
+}
+
+#[test]
+fn pure_modules_name_no_runtime() {
+    for path in PURE.iter().flat_map(|path| rust_files(&root().join(path))) {
+        let text = fs::read_to_string(&path).expect("readable");
+        for word in ["tokio", "tonic", "async fn", "prost", "anyhow", "Instant::now", "SystemTime"]
+        {
+            assert!(!text.contains(word), "{} must not contain `{word}`", path.display());
+        }
+    }
+}
+
+#[test]
+fn files_stay_readable() {
+    let dirs =
+        ALLOWED.iter().map(|(name, _)| root().join(name).join("src")).chain([root().join("src")]);
+    for path in dirs.flat_map(|dir| rust_files(&dir)) {
+        let n_lines = fs::read_to_string(&path).expect("readable").lines().count();
+        assert!(n_lines <= 700, "{} has {n_lines} lines: split it", path.display());
+    }
+}
+
+fn root() -> &'static Path {
+    Path::new(env!("CARGO_MANIFEST_DIR"))
+}
+
+/// The Rust files below a directory, or the file itself.
+fn rust_files(path: &Path) -> Vec<PathBuf> {
+    if path.is_file() {
+        return vec![path.to_owned()];
+    }
+    let entries = fs::read_dir(path).unwrap_or_else(|error| panic!("{}: {error}", path.display()));
+    let below = entries.flatten().map(|entry| entry.path());
+    below
+        .filter(|path| path.is_dir() || path.extension().is_some_and(|e| e == "rs"))
+        .flat_map(|path| rust_files(&path))
+        .collect()
+}
+
+/// Names in the `[dependencies]` table of a crate's manifest.
+fn dependencies(crate_dir: &str) -> BTreeSet<String> {
+    let manifest = root().join(crate_dir).join("Cargo.toml");
+    let text = fs::read_to_string(&manifest)
+        .unwrap_or_else(|error| panic!("{}: {error}", manifest.display()));
+    text.lines()
+        .skip_while(|line| line.trim() != "[dependencies]")
+        .skip(1)
+        .take_while(|line| !line.starts_with('['))
+        .filter_map(|line| line.split(['.', '=', ' ']).next())
+        .filter(|name| !name.is_empty() && !name.starts_with('#'))
+        .map(str::to_owned)
+        .collect()
+}
