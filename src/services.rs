@@ -56,6 +56,7 @@ pub(crate) fn learner(args: LearnerArgs) -> Result<(), Failed> {
             n_threads: usize::from(args.threads),
             clock: clock::since_now(),
             version: VERSION.to_owned(),
+            first_worker: u64::from(std::process::id()) << 20,
         };
         let ended =
             tandem_learner::serve(config, listener, shutdown).await.map_err(learner_failed)?;

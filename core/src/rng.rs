@@ -1,9 +1,9 @@
 //! Where randomness comes from: every draw has an address of run seed, number and stream.
 
-use rand::{Rng, RngExt};
+use rand::{Rng, RngExt as _};
 use rand_chacha::ChaCha8Rng;
-use rand_chacha::rand_core::SeedableRng;
-use rand_distr::{Distribution, StandardNormal};
+use rand_chacha::rand_core::SeedableRng as _;
+use rand_distr::{Distribution as _, StandardNormal};
 
 /// What a generator is for. Streams of one episode are independent; append only, the numbers enter every result.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

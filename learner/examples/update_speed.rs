@@ -12,9 +12,9 @@ use tandem_core::{Layout, Stream, Task, episode_rng};
 use tandem_learner::ddpg::{Batch, Ddpg, DdpgConfig};
 use tandem_policy::{Matrix, MatrixMut, multiply};
 
-const N_SAMPLES: usize = 40;
-const UPDATES_PER_SAMPLE: u32 = 8;
-const PRODUCTS_PER_SAMPLE: u32 = 200;
+const N_SAMPLES: usize = 200;
+const UPDATES_PER_SAMPLE: u32 = 1;
+const PRODUCTS_PER_SAMPLE: u32 = 20;
 const SIDE: usize = 256;
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {

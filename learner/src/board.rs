@@ -74,7 +74,7 @@ impl Board {
         self.next_worker
     }
 
-    /// Numbers slots that workers will number from `first` on, after a restart.
+    /// Numbers workers from `first` on.
     pub const fn start_workers_at(&mut self, first: u64) {
         self.next_worker = first;
     }

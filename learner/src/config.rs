@@ -401,7 +401,9 @@ fn check(
     }
 }
 
-fn is_name(name: &str) -> bool {
+/// Whether `name` can be a run's: 1 to 100 letters, digits, '-', '_' or '.'.
+#[must_use]
+pub fn is_name(name: &str) -> bool {
     (1..=100).contains(&name.len())
         && name.chars().all(|c| c.is_ascii_alphanumeric() || "-_.".contains(c))
 }

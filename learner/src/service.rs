@@ -12,9 +12,10 @@ use tandem_proto::pb::learner_server::{Learner, LearnerServer};
 use tandem_proto::{decode_episode, encode_actor, encode_slot, encode_terms};
 use tokio::net::TcpListener;
 use tokio::sync::{Notify, watch};
-use tokio_stream::wrappers::{TcpListenerStream, WatchStream};
+use tokio_stream::wrappers::WatchStream;
 use tokio_stream::{Stream, StreamExt as _};
 use tokio_util::sync::CancellationToken;
+use tonic::transport::server::TcpIncoming;
 use tonic::{Request, Response, Status};
 
 use crate::board::{Board, SubmitError};
@@ -51,8 +52,11 @@ pub struct LearnerConfig {
     pub n_threads: usize,
     /// Time since the process started.
     pub clock: Clock,
-    /// Digest of the program, kept in what it writes.
+    /// Version of the program, kept in what it writes.
     pub version: String,
+    /// Where workers' numbers start; another one for each start of a learner, so that a worker of the learner before
+    /// is not taken for one of this.
+    pub first_worker: u64,
 }
 
 /// Why a learner gave up.
@@ -155,6 +159,7 @@ pub async fn serve(
     shutdown: CancellationToken,
 ) -> Result<Ended, Error> {
     let shared = Arc::new(Shared::new(config.clock.clone()));
+    shared.lock().board.start_workers_at(config.first_worker);
     let (health, health_service) = tonic_health::server::health_reporter();
     health.set_serving::<LearnerServer<LearnerService>>().await;
     let stop_serving = CancellationToken::new();
@@ -181,14 +186,13 @@ pub async fn serve(
     let learner =
         LearnerServer::new(LearnerService { shared }).max_decoding_message_size(MAX_MESSAGE_BYTES);
     tonic::transport::Server::builder()
-        .tcp_nodelay(true)
         .http2_keepalive_interval(Some(Duration::from_secs(10)))
         .http2_keepalive_timeout(Some(Duration::from_secs(10)))
         .add_service(learner)
         .add_service(health_service)
         .add_service(reflection_v1())
         .add_service(reflection_v1alpha())
-        .serve_with_incoming_shutdown(TcpListenerStream::new(listener), stop_serving.cancelled())
+        .serve_with_incoming_shutdown(TcpIncoming::from(listener).with_nodelay(Some(true)), stop_serving.cancelled())
         .await?;
     match learning {
         Ok(thread) => tokio::task::spawn_blocking(move || thread.join())

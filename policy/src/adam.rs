@@ -47,8 +47,7 @@ impl Adam {
             for i in 0..n {
                 let slope = gradient[i];
                 let first = FIRST_DECAY * first_moments[i] + FIRST_SHARE * slope;
-                let second =
-                    SECOND_DECAY * second_moments[i] + SECOND_SHARE * (slope * slope);
+                let second = SECOND_DECAY * second_moments[i] + SECOND_SHARE * (slope * slope);
                 first_moments[i] = first;
                 second_moments[i] = second;
                 parameters[i] -= step_size * first / (second.sqrt() * second_scale + EPSILON);

@@ -25,11 +25,15 @@ pub fn all_finite(numbers: &[f32]) -> bool {
 
 /// `rows = max(rows + bias, 0)`; `rows` has shape `[n, bias.len()]`.
 pub(crate) fn add_bias_relu(rows: &mut [f32], bias: &[f32]) {
+    #[inline(always)]
+    fn row_kernel(row: &mut [f32], bias: &[f32]) {
+        for (x, bias) in row.iter_mut().zip(bias) {
+            *x = (*x + *bias).max(0.0);
+        }
+    }
     Arch::new().dispatch(|| {
         for row in rows.chunks_exact_mut(bias.len()) {
-            for (x, bias) in row.iter_mut().zip(bias) {
-                *x = (*x + *bias).max(0.0);
-            }
+            row_kernel(row, bias);
         }
     });
 }
@@ -54,17 +58,21 @@ pub(crate) fn mask(delta: &mut [f32], activations: &[f32]) {
 
 /// As [`mask`], and adds up each column of the result: the bias gradient, shape `[n_units]`.
 pub(crate) fn mask_and_sum(delta: &mut [f32], activations: &[f32], sums: &mut [f32]) {
+    #[inline(always)]
+    fn row_kernel(delta: &mut [f32], activations: &[f32], sums: &mut [f32]) {
+        for ((delta, activation), sum) in delta.iter_mut().zip(activations).zip(sums) {
+            let kept = if *activation > 0.0 { *delta } else { 0.0 };
+            *delta = kept;
+            *sum += kept;
+        }
+    }
     sums.fill(0.0);
     let n_units = sums.len();
     Arch::new().dispatch(|| {
         for (delta, activations) in
             delta.chunks_exact_mut(n_units).zip(activations.chunks_exact(n_units))
         {
-            for ((delta, activation), sum) in delta.iter_mut().zip(activations).zip(sums.iter_mut())
-            {
-                *delta = if *activation > 0.0 { *delta } else { 0.0 };
-                *sum += *delta;
-            }
+            row_kernel(delta, activations, sums);
         }
     });
 }

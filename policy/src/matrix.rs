@@ -1,5 +1,7 @@
 //! Matrices inside flat slices, and their product.
 
+use pulp::Arch;
+
 /// A matrix that reads from a slice; any strides.
 #[derive(Debug, Clone, Copy)]
 pub struct Matrix<'a> {
@@ -144,6 +146,58 @@ pub fn multiply(product: &mut MatrixMut<'_>, lhs: Matrix<'_>, rhs: Matrix<'_>) {
     }
 }
 
+/// Writes the transpose of `source`, shape `[n_rows, n_cols]`, to `transposed`, shape `[n_cols, n_rows]`.
+///
+/// # Panics
+/// When a slice is too short.
+pub(crate) fn transpose(source: &[f32], transposed: &mut [f32], n_rows: usize, n_cols: usize) {
+    Arch::new().dispatch(|| transpose_kernel(source, transposed, n_rows, n_cols));
+}
+
+#[inline(always)]
+fn transpose_kernel(source: &[f32], transposed: &mut [f32], n_rows: usize, n_cols: usize) {
+    for row in (0..n_rows).step_by(TILE) {
+        for col in (0..n_cols).step_by(TILE) {
+            if row + TILE <= n_rows && col + TILE <= n_cols {
+                transpose_tile(
+                    &source[row * n_cols + col..],
+                    n_cols,
+                    &mut transposed[col * n_rows + row..],
+                    n_rows,
+                );
+                continue;
+            }
+            for row in row..n_rows.min(row + TILE) {
+                for col in col..n_cols.min(col + TILE) {
+                    transposed[col * n_rows + row] = source[row * n_cols + col];
+                }
+            }
+        }
+    }
+}
+
+/// Side of a square that fits the registers.
+const TILE: usize = 16;
+
+/// Transposes one square; rows of `source` and of `transposed` start a stride apart.
+#[inline(always)]
+fn transpose_tile(
+    source: &[f32],
+    source_stride: usize,
+    transposed: &mut [f32],
+    transposed_stride: usize,
+) {
+    let mut tile = [[0.0; TILE]; TILE];
+    for (row, source) in source.chunks(source_stride).take(TILE).enumerate() {
+        for (column, x) in tile.iter_mut().zip(&source[..TILE]) {
+            column[row] = *x;
+        }
+    }
+    for (transposed, column) in transposed.chunks_mut(transposed_stride).zip(&tile) {
+        transposed[..TILE].copy_from_slice(column);
+    }
+}
+
 fn stride(n: usize) -> isize {
     isize::try_from(n).expect("no slice is longer than isize::MAX")
 }
@@ -163,6 +217,23 @@ mod tests {
             Matrix::new(&rhs, 2, 2).transposed(),
         );
         assert_eq!(product, [21.0, 2100.0, 7.0, 43.0, 4300.0]);
+    }
+
+    #[test]
+    fn a_transpose_has_every_number_in_its_place() {
+        for (n_rows, n_cols) in [(1, 3), (16, 16), (33, 50), (256, 62)] {
+            let source: Vec<f32> = (0..n_rows * n_cols).map(|i| i as f32).collect();
+            let mut transposed = vec![0.0; source.len()];
+            transpose(&source, &mut transposed, n_rows, n_cols);
+            for (i, x) in transposed.iter().enumerate() {
+                let (col, row) = (i / n_rows, i % n_rows);
+                assert_eq!(
+                    *x,
+                    source[row * n_cols + col],
+                    "row {row}, column {col} of {n_rows} x {n_cols}"
+                );
+            }
+        }
     }
 
     #[test]

@@ -7,7 +7,7 @@ use tandem_core::Layout;
 use tandem_core::rng::uniform;
 
 use crate::elementwise::{add_bias, add_bias_relu, column_sums, mask, mask_and_sum};
-use crate::matrix::{Matrix, MatrixMut, multiply};
+use crate::matrix::{Matrix, MatrixMut, multiply, transpose};
 
 /// Sizes of a network: input, equal hidden layers, output.
 ///
@@ -123,6 +123,8 @@ pub struct Workspace {
     hidden: Vec<Vec<f32>>,
     /// Gradients by a layer's output and by its input, each `[max_batch, n_hidden or n_output]`.
     deltas: [Vec<f32>; 2],
+    /// A layer's weight, shape `[in, out]`: a product with it is faster than one with a transposed view.
+    weight: Vec<f32>,
 }
 
 impl Workspace {
@@ -130,9 +132,11 @@ impl Workspace {
     #[must_use]
     pub fn new(shape: &MlpShape, max_batch: usize) -> Self {
         let widest = shape.n_hidden.max(shape.n_output);
+        let largest_weight = (0..shape.n_layers()).map(|layer| shape.weight(layer).len()).max();
         Self {
             hidden: vec![vec![0.0; max_batch * shape.n_hidden]; shape.n_hidden_layers],
             deltas: [vec![0.0; max_batch * widest], vec![0.0; max_batch * widest]],
+            weight: vec![0.0; largest_weight.unwrap_or(0)],
         }
     }
 }
@@ -149,24 +153,32 @@ pub fn forward(
     output: &mut MatrixMut<'_>,
 ) {
     let n_rows = input.n_rows();
+    let Workspace { hidden, weight, .. } = workspace;
     for layer in 0..shape.n_hidden_layers {
-        let (below, above) = workspace.hidden.split_at_mut(layer);
+        let (below, above) = hidden.split_at_mut(layer);
         let layer_input =
             below.last().map_or(input, |rows| Matrix::new(rows, n_rows, shape.n_hidden));
         let rows = &mut above[0][..n_rows * shape.n_hidden];
-        let weight = shape.weight_matrix(parameters, layer);
-        multiply(
-            &mut MatrixMut::new(rows, n_rows, shape.n_hidden),
-            layer_input,
-            weight.transposed(),
-        );
+        let weight = transposed_weight(shape, parameters, layer, weight);
+        multiply(&mut MatrixMut::new(rows, n_rows, shape.n_hidden), layer_input, weight);
         add_bias_relu(rows, &parameters[shape.bias(layer)]);
     }
     let last = shape.n_hidden_layers;
-    let layer_input =
-        workspace.hidden.last().map_or(input, |rows| Matrix::new(rows, n_rows, shape.n_hidden));
-    multiply(output, layer_input, shape.weight_matrix(parameters, last).transposed());
+    let layer_input = hidden.last().map_or(input, |rows| Matrix::new(rows, n_rows, shape.n_hidden));
+    multiply(output, layer_input, transposed_weight(shape, parameters, last, weight));
     add_bias(output, &parameters[shape.bias(last)]);
+}
+
+/// The weight of layer `layer` as a matrix of shape `[in, out]`, written to `memory`.
+fn transposed_weight<'a>(
+    shape: &MlpShape,
+    parameters: &[f32],
+    layer: usize,
+    memory: &'a mut [f32],
+) -> Matrix<'a> {
+    let (n_out, n_in) = (shape.layer_output(layer), shape.layer_input(layer));
+    transpose(&parameters[shape.weight(layer)], memory, n_out, n_in);
+    Matrix::new(memory, n_in, n_out)
 }
 
 /// Computes the loss's gradient by the parameters, shape `[n_parameters]`, from its gradient by the output, shape
@@ -183,7 +195,7 @@ pub fn backward_parameters(
     gradient: &mut [f32],
 ) {
     let n_rows = input.n_rows();
-    let Workspace { hidden, deltas: [delta, next_delta] } = workspace;
+    let Workspace { hidden, deltas: [delta, next_delta], .. } = workspace;
     let (mut delta, mut next_delta) = (delta, next_delta);
     delta[..output_gradient.len()].copy_from_slice(output_gradient);
     for layer in (0..shape.n_layers()).rev() {
@@ -226,7 +238,7 @@ pub fn backward_input(
     input_gradient: &mut [f32],
 ) {
     let n_rows = output_gradient.len() / shape.n_output;
-    let Workspace { hidden, deltas: [delta, next_delta] } = workspace;
+    let Workspace { hidden, deltas: [delta, next_delta], .. } = workspace;
     let (mut delta, mut next_delta) = (delta, next_delta);
     delta[..output_gradient.len()].copy_from_slice(output_gradient);
     for layer in (1..shape.n_layers()).rev() {

@@ -4,7 +4,7 @@
 //! number of rows nor the width of the vector registers enters it, so a row gives the same bits in any batch and on
 //! any machine that rounds a fused multiply-add correctly.
 
-use pulp::Arch;
+use pulp::{Arch, Simd, WithSimd};
 
 use crate::mlp::MlpShape;
 
@@ -68,7 +68,7 @@ impl PackedMlp {
 
     /// Passes the first `n_rows` rows, at most [`MAX_ROWS`], through the network.
     pub(crate) fn run(&mut self, n_rows: usize) {
-        Arch::new().dispatch(|| self.pass(n_rows));
+        Arch::new().dispatch(Pass { network: self, n_rows });
     }
 
     #[inline(always)]
@@ -80,6 +80,21 @@ impl PackedMlp {
             }
             layer.apply(&self.input, &mut self.output, self.row_stride, n_rows);
         }
+    }
+}
+
+/// What [`PackedMlp::run`] has compiled for each instruction set: a closure as long as this would stay a call.
+struct Pass<'a> {
+    network: &'a mut PackedMlp,
+    n_rows: usize,
+}
+
+impl WithSimd for Pass<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, _: S) {
+        self.network.pass(self.n_rows);
     }
 }
 

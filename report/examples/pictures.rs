@@ -30,7 +30,9 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         dir.join("success.svg"),
         curve_svg(&series, &CurveOptions::shares("Two arms push", Axis::EnvSteps))?,
     )?;
-    let mut metrics = MetricsLog::open(&dir.join("metrics.jsonl"))?;
+    let metrics_path = dir.join("metrics.jsonl");
+    std::fs::File::create(&metrics_path)?;
+    let mut metrics = MetricsLog::open(&metrics_path)?;
     rows(1.0).iter().try_for_each(|row| metrics.append(row))?;
     std::fs::write(dir.join("run.toml"), "task = \"push\"\narms = 2\n")?;
     run_report_html(&dir)?;
@@ -44,7 +46,7 @@ fn rows(speed: f64) -> Vec<MetricsRow> {
         let ripple = 0.03 * (f64::from(evaluation) * 2.1).sin();
         let success = (0.95 / (1.0 + (-(progress * speed - 0.45) * 12.0).exp()) + ripple * speed)
             .clamp(0.0, 1.0);
-        let interval = tandem_core::Wilson::of((success * 240.0) as usize, 240);
+        let spread = 1.96 * (success * (1.0 - success) / 240.0).sqrt() + 0.008;
         MetricsRow {
             round: u64::from(evaluation) * 5,
             env_steps: u64::from(evaluation) * 8000,
@@ -55,8 +57,8 @@ fn rows(speed: f64) -> Vec<MetricsRow> {
             success,
             success_joint: 0.93 * success,
             success_per_arm: vec![success, success],
-            success_low: interval.low,
-            success_high: interval.high,
+            success_low: (success - spread).max(0.0),
+            success_high: (success + spread).min(1.0),
             collision_rate: 0.25 * progress,
             mean_q: -10.0 + 8.0 * success,
             advice_spent: u64::from(evaluation) * 700,

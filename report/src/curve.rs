@@ -237,9 +237,9 @@ fn draw_plot(plot: &Area<'_>, series: &[Series], options: &CurveOptions) -> Draw
         chart.draw_series(band(one).map(|outline| Polygon::new(outline, color.mix(0.16))))?;
     }
     for (one, color) in series.iter().zip(COLORS.iter().cycle()) {
-        let line = one.points.iter().map(|point| (point.x, point.y));
+        let mut line = one.points.iter().map(|point| (point.x, point.y));
         chart.draw_series(LineSeries::new(line.clone(), color.stroke_width(2)))?;
-        if let Some(last) = line.last() {
+        if let Some(last) = line.next_back() {
             chart.draw_series([Circle::new(last, 4, color.filled())])?;
         }
     }

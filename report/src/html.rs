@@ -1,6 +1,5 @@
 //! Reports as one HTML file that needs nothing else.
 
-use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
 
 use tandem_telemetry::MetricsRow;
@@ -56,10 +55,10 @@ fn run_page(run: &Run) -> Result<String, Error> {
     };
     if !run.rows.is_empty() {
         let lines: Vec<Vec<String>> = run.rows.iter().map(evaluation_cells).collect();
-        let _ = write!(body, "<h2>Evaluations</h2>{}", table(&EVALUATION_HEADER, &lines));
+        body.push_str(&format!("<h2>Evaluations</h2>{}", table(&EVALUATION_HEADER, &lines)));
     }
     if let Some(text) = &run.configuration {
-        let _ = write!(body, "<h2>Configuration</h2><pre>{}</pre>", escaped(text));
+        body.push_str(&format!("<h2>Configuration</h2><pre>{}</pre>", escaped(text)));
     }
     Ok(page(&run.name, &body))
 }

@@ -1,13 +1,15 @@
 //! A picture of the scene as SVG: table, arms, objects and goals in perspective, far things first.
 
 mod camera;
+mod color;
 mod paint;
 
 use tandem_core::layout::GOAL_TOLERANCE_M;
 use tandem_core::scene::{ArmScene, Capsule, Point, Scene};
 
 use camera::{Camera, Vec3};
-use paint::{Painter, Rgb};
+use color::Rgb;
+use paint::Painter;
 
 /// From where the scene is seen and how large the picture is.
 #[derive(Debug, Clone, PartialEq)]
@@ -46,7 +48,12 @@ const LINK_COLOR: Rgb = Rgb(0xee, 0xf0, 0xf3);
 const HAND_COLOR: Rgb = Rgb(0x4a, 0x52, 0x5c);
 const PEDESTAL_COLOR: Rgb = Rgb(0x59, 0x61, 0x6b);
 /// Height above its base that an arm may need in the picture, metres.
-const ARM_HEIGHT_M: f64 = 0.72;
+const ARM_HEIGHT_M: f64 = 0.75;
+/// How far ahead of its base an arm's workspace ends, and half its width, metres.
+const REACH_M: f64 = 0.62;
+const HALF_WORKSPACE_M: f64 = 0.36;
+/// Room beside a base, metres.
+const STANDING_ROOM_M: f64 = 0.16;
 const PEDESTAL_RADIUS_M: f64 = 0.075;
 const PEDESTAL_HEIGHT_M: f32 = 0.035;
 /// How much wider than its links a joint is drawn.
@@ -78,11 +85,11 @@ fn draw_arm(painter: &mut Painter, arm: &ArmScene, color: Rgb) {
         f64::from(PEDESTAL_HEIGHT_M),
         PEDESTAL_COLOR,
     );
-    for link in &arm.links {
-        painter.shadow_of_capsule(link);
-        painter.capsule(&on_pedestal(link, arm.base), LINK_COLOR);
+    for link in links_from_base(arm) {
+        painter.shadow_of_capsule(&link);
+        painter.capsule(&on_pedestal(&link, arm.base), LINK_COLOR);
     }
-    for pair in arm.links.windows(2) {
+    for pair in links_from_base(arm).windows(2) {
         if let [link, next] = pair {
             painter.joint(link, next, JOINT_WIDENING, color);
         }
@@ -93,20 +100,33 @@ fn draw_arm(painter: &mut Painter, arm: &ArmScene, color: Rgb) {
     }
 }
 
-/// What must be in the picture. It does not move with the arms, so that pictures of one episode match.
+/// The links, and first the post on which they stand when they begin above the base.
+fn links_from_base(arm: &ArmScene) -> Vec<Capsule> {
+    let post = arm.links.first().filter(|link| link.from != arm.base);
+    let post = post.map(|link| Capsule { from: arm.base, to: link.from, radius_m: link.radius_m });
+    post.into_iter().chain(arm.links.iter().copied()).collect()
+}
+
+/// What must be in the picture: where the arms stand, what they reach, and how high they rise. It does not move with
+/// the arms, so that pictures of one episode match.
 fn framed_points(scene: &Scene) -> Vec<Vec3> {
-    let above = |base: Point| {
-        let [x, y, z] = base.map(f64::from);
-        [x, y, z + ARM_HEIGHT_M]
+    let table_z_m = table_height_m(scene);
+    let around = |arm: &ArmScene| {
+        let [x, y, z] = arm.base.map(f64::from);
+        let ahead_m = if x < 0.0 { REACH_M } else { -REACH_M };
+        let beside = |x_m: f64, side_m: f64| [x_m, y + side_m, table_z_m];
+        [
+            [x, y, z + ARM_HEIGHT_M],
+            beside(x, -STANDING_ROOM_M),
+            beside(x, STANDING_ROOM_M),
+            beside(x + ahead_m, -HALF_WORKSPACE_M),
+            beside(x + ahead_m, HALF_WORKSPACE_M),
+        ]
     };
-    let table = &scene.table;
-    let corner = |i: usize| {
-        let sign = |axis: usize| if i >> axis & 1 == 0 { 1.0 } else { -1.0 };
-        std::array::from_fn(|axis| {
-            f64::from(table.centre[axis] + sign(axis) * table.half_extents_m[axis])
-        })
-    };
-    (0..8).map(corner).chain(scene.arms.iter().map(|arm| above(arm.base))).collect()
+    let arms = scene.arms.iter().flat_map(around);
+    arms.chain(scene.goals.iter().map(|goal| goal.map(f64::from)))
+        .chain([[0.0, 0.0, table_z_m]])
+        .collect()
 }
 
 /// `link`, its round end raised when it would stick out below the pedestal.

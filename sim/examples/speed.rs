@@ -1,5 +1,9 @@
 //! Prints how many control steps per second one core simulates, for each environment.
-#![expect(clippy::print_stdout, clippy::disallowed_methods, reason = "a benchmark: its output, and its clock")]
+#![expect(
+    clippy::print_stdout,
+    clippy::disallowed_methods,
+    reason = "a benchmark: its output, and its clock"
+)]
 
 use std::time::Instant;
 
@@ -16,7 +20,9 @@ fn main() -> Result<(), SimError> {
             for n_arms in [1, 2] {
                 let config = WorldConfig { substeps, ..WorldConfig::default() };
                 let steps_per_s = steps_per_s(Layout::new(task, n_arms), &config)?;
-                println!("{task}, {n_arms} arms, {substeps} substeps: {steps_per_s:.0} control steps/s");
+                println!(
+                    "{task}, {n_arms} arms, {substeps} substeps: {steps_per_s:.0} control steps/s"
+                );
             }
         }
     }

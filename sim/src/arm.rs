@@ -38,14 +38,25 @@ pub(crate) struct Arm {
 }
 
 impl Arm {
-    pub(crate) fn build(physics: &mut Physics, arm: ArmIndex, frame: OwnFrame, pads: f32, config: &WorldConfig) -> Self {
+    pub(crate) fn build(
+        physics: &mut Physics,
+        arm: ArmIndex,
+        frame: OwnFrame,
+        pads: f32,
+        config: &WorldConfig,
+    ) -> Self {
         let hand = Hand::build(physics, arm, frame, pads, config.grip_force_n);
         Self { frame, hand, angles: HOME }
     }
 
     /// Puts the arm, at rest, where its end effector is at `end_effector_in_own` and each side of the gripper is open
     /// by `opening_m`. The joint angles follow from the place alone.
-    pub(crate) fn place(&mut self, physics: &mut Physics, end_effector_in_own: Vector, opening_m: f32) {
+    pub(crate) fn place(
+        &mut self,
+        physics: &mut Physics,
+        end_effector_in_own: Vector,
+        opening_m: f32,
+    ) {
         self.hand.place(physics, end_effector_in_own, opening_m);
         self.angles = solve(HOME, self.tool_in_base(physics), REACH_ITERATIONS);
     }
@@ -75,7 +86,10 @@ impl Arm {
     }
 
     /// Where the origins of the posture's `frames` are and how they move per metre of the palm; world frame, metres.
-    pub(crate) fn joint_motions<const N: usize>(&self, frames: [usize; N]) -> [(Vector, Matrix); N] {
+    pub(crate) fn joint_motions<const N: usize>(
+        &self,
+        frames: [usize; N],
+    ) -> [(Vector, Matrix); N] {
         let posture = Posture::of(&self.angles);
         let motions = posture.motion_of(frames);
         std::array::from_fn(|idx| {

@@ -60,7 +60,10 @@ impl WorldConfig {
     /// Names the first value out of range.
     pub fn checked(self) -> Result<Self, SimError> {
         check("substeps", f64::from(self.substeps), 10.0, 80.0)?;
-        #[expect(clippy::cast_precision_loss, reason = "counts above 2^52 are out of range all the same")]
+        #[expect(
+            clippy::cast_precision_loss,
+            reason = "counts above 2^52 are out of range all the same"
+        )]
         check("solver_iterations", self.solver_iterations as f64, 1.0, 16.0)?;
         check("object_half_size_m", self.object_half_size_m.into(), 0.015, 0.045)?;
         check("object_mass_kg", self.object_mass_kg.into(), 0.02, 1.0)?;
@@ -164,8 +167,14 @@ mod tests {
         };
         let default = WorldConfig::default;
         assert_eq!(named(WorldConfig { substeps: 5, ..default() }), "substeps");
-        assert_eq!(named(WorldConfig { object_half_size_m: f32::NAN, ..default() }), "object_half_size_m");
-        assert_eq!(named(WorldConfig { push: Friction { pads: -0.1, object: 0.3 }, ..default() }), "push.pads");
+        assert_eq!(
+            named(WorldConfig { object_half_size_m: f32::NAN, ..default() }),
+            "object_half_size_m"
+        );
+        assert_eq!(
+            named(WorldConfig { push: Friction { pads: -0.1, object: 0.3 }, ..default() }),
+            "push.pads"
+        );
         let edge = WorldConfig { object_half_size_m: 0.045, object_mass_kg: 0.02, ..default() };
         assert_eq!(edge.clone().checked(), Ok(edge));
     }

@@ -152,14 +152,17 @@ impl LinkGuard {
 
 impl Pair {
     fn look(&mut self, arms: &[PosedArm; 2], palms: [Vector; 2]) -> Nearness {
-        let [first, second] =
-            std::array::from_fn(|arm| arms[arm].capsules[self.capsules[arm]].moved_by(palms[arm] - arms[arm].palm_at));
+        let [first, second] = std::array::from_fn(|arm| {
+            arms[arm].capsules[self.capsules[arm]].moved_by(palms[arm] - arms[arm].palm_at)
+        });
         let [s, t] = nearest_shares(first.axis(), second.axis());
         let offset = first.point(s) - second.point(t);
         let (distance_m, radii_m) = (offset.length(), first.radius_m + second.radius_m);
         let seen = if distance_m > CROSSING_M { Some(offset / distance_m) } else { None };
         let (normal, along_m) = match (seen, self.normal) {
-            (Some(seen), Some(known)) if distance_m < radii_m && seen.dot(known) < 0.0 => (-seen, -distance_m),
+            (Some(seen), Some(known)) if distance_m < radii_m && seen.dot(known) < 0.0 => {
+                (-seen, -distance_m)
+            }
             (Some(seen), _) => (seen, distance_m),
             (None, known) => (known.unwrap_or(Vector::Z), 0.0),
         };
@@ -189,9 +192,13 @@ impl Limits {
     fn nearest(&self, wanted: Vector) -> Vector {
         let mut velocity = wanted;
         for _ in 0..MAX_PROJECTIONS {
-            let worst = self.iter().max_by(|a, b| a.missing_mps(velocity).total_cmp(&b.missing_mps(velocity)));
+            let worst = self
+                .iter()
+                .max_by(|a, b| a.missing_mps(velocity).total_cmp(&b.missing_mps(velocity)));
             match worst {
-                Some(limit) if limit.missing_mps(velocity) > 1e-4 => velocity = limit.project(velocity),
+                Some(limit) if limit.missing_mps(velocity) > 1e-4 => {
+                    velocity = limit.project(velocity)
+                }
                 _ => return velocity,
             }
         }
@@ -213,7 +220,11 @@ impl Limit {
     /// The share of `velocity` that keeps within this limit, where slowing down helps.
     fn scale(&self, velocity: Vector) -> f32 {
         let speed_mps = self.direction.dot(velocity);
-        if speed_mps < self.least_mps && speed_mps < 0.0 { (self.least_mps.min(0.0) / speed_mps).min(1.0) } else { 1.0 }
+        if speed_mps < self.least_mps && speed_mps < 0.0 {
+            (self.least_mps.min(0.0) / speed_mps).min(1.0)
+        } else {
+            1.0
+        }
     }
 }
 
@@ -221,8 +232,12 @@ impl PosedArm {
     fn of(arm: &Arm, physics: &Physics) -> Self {
         let palm_at = arm.hand.end_effector(physics);
         let joints = arm.joint_motions(LINK_FRAMES).map(|(at, motion)| MovedPoint { at, motion });
-        let with_palm = |offset: Vector| MovedPoint { at: palm_at + offset, motion: Matrix::IDENTITY };
-        let link = |idx: usize| MovedCapsule { ends: [joints[idx], joints[idx + 1]], radius_m: LINK_RADII_M[idx] };
+        let with_palm =
+            |offset: Vector| MovedPoint { at: palm_at + offset, motion: Matrix::IDENTITY };
+        let link = |idx: usize| MovedCapsule {
+            ends: [joints[idx], joints[idx + 1]],
+            radius_m: LINK_RADII_M[idx],
+        };
         let wrist_ends = WRIST_ABOVE_M.map(|above_m| with_palm(Vector::Z * above_m));
         let wrist = MovedCapsule { ends: wrist_ends, radius_m: WRIST_RADIUS_M };
         let grasp_ends = GRASP_ENDS.map(|end| with_palm(arm.frame.turned(end)));
@@ -271,7 +286,8 @@ fn nearest_shares(first: [Vector; 2], second: [Vector; 2]) -> [f32; 2] {
     let (along_first, along_second) = (first[1] - first[0], second[1] - second[0]);
     let offset = first[0] - second[0];
     let (a, e) = (along_first.length_squared(), along_second.length_squared());
-    let (b, c, f) = (along_first.dot(along_second), along_first.dot(offset), along_second.dot(offset));
+    let (b, c, f) =
+        (along_first.dot(along_second), along_first.dot(offset), along_second.dot(offset));
     let crossing = a * e - b * b;
     let s = if crossing > TINY { ((b * f - c * e) / crossing).clamp(0.0, 1.0) } else { 0.0 };
     let t = (b * s + f) / e.max(TINY);
@@ -296,7 +312,8 @@ mod tests {
 
     #[test]
     fn nearest_points_of_crossing_and_of_parallel_segments() {
-        let check = |first, second, shares: [f32; 2]| assert_eq!(nearest_shares(first, second), shares);
+        let check =
+            |first, second, shares: [f32; 2]| assert_eq!(nearest_shares(first, second), shares);
         let along_x = [Vector::ZERO, Vector::X];
         check(along_x, [Vector::new(0.25, -1.0, 0.5), Vector::new(0.25, 1.0, 0.5)], [0.25, 0.5]);
         check(along_x, [Vector::new(2.0, 1.0, 0.0), Vector::new(3.0, 1.0, 0.0)], [1.0, 0.0]);
@@ -310,12 +327,16 @@ mod tests {
             let ends = [-along, along].map(|offset| end(offset + Vector::Y * y_m));
             MovedCapsule { ends, radius_m: 0.04 }
         };
-        let arm = |y_m, along| PosedArm { palm_at: Vector::ZERO, capsules: [capsule(y_m, along); N_CAPSULES] };
+        let arm = |y_m, along| PosedArm {
+            palm_at: Vector::ZERO,
+            capsules: [capsule(y_m, along); N_CAPSULES],
+        };
         let arms = [arm(0.1, Vector::X), arm(0.0, Vector::Z)];
         let mut pair = all_pairs()[0];
         let gaps: Vec<f32> = (0_u8..16)
             .map(|step| {
-                let near = pair.look(&arms, [Vector::NEG_Y * (0.01 * f32::from(step)), Vector::ZERO]);
+                let near =
+                    pair.look(&arms, [Vector::NEG_Y * (0.01 * f32::from(step)), Vector::ZERO]);
                 assert!((near.normal - Vector::Y).length() < 1e-5, "step {step}: {}", near.normal);
                 near.gap_m
             })
@@ -327,7 +348,8 @@ mod tests {
     #[test]
     fn a_limited_velocity_respects_every_limit() {
         let mut rng = episode_rng(5, 0, Stream::Exploration);
-        let mut vector = |size| Vector::from_array(std::array::from_fn(|_| uniform(&mut rng, -size, size)));
+        let mut vector =
+            |size: f32| Vector::from_array(std::array::from_fn(|_| uniform(&mut rng, -size, size)));
         for _ in 0..1000 {
             let mut limits = Limits::none();
             for least_mps in [0.0, -0.05, -0.2, -0.4] {
@@ -341,9 +363,16 @@ mod tests {
     /// How an arm that wants to do harm moves: held random actions, or straight for a part of the other arm.
     fn attack(scene: &Scene, arm: usize, aim: usize) -> [f32; 3] {
         let other = &scene.arms[1 - arm];
-        let aims = [other.end_effector, other.joint_points[2], other.joint_points[4], other.joint_points[5]];
+        let aims = [
+            other.end_effector,
+            other.joint_points[2],
+            other.joint_points[4],
+            other.joint_points[5],
+        ];
         let sign = if arm == 0 { 1.0 } else { -1.0 };
-        let to = |axis: usize| ((aims[aim][axis] - scene.arms[arm].end_effector[axis]) * 20.0).clamp(-1.0, 1.0);
+        let to = |axis: usize| {
+            ((aims[aim][axis] - scene.arms[arm].end_effector[axis]) * 20.0).clamp(-1.0, 1.0)
+        };
         [sign * to(0), sign * to(1), to(2)]
     }
 
@@ -356,7 +385,10 @@ mod tests {
             (point(first, s) - point(second, t)).length() - first.radius_m - second.radius_m
         };
         let [first, second] = [&scene.arms[0].links, &scene.arms[1].links];
-        first.iter().flat_map(|link| second.iter().map(move |other| gap(link, other))).fold(f32::INFINITY, f32::min)
+        first
+            .iter()
+            .flat_map(|link| second.iter().map(move |other| gap(link, other)))
+            .fold(f32::INFINITY, f32::min)
     }
 
     #[test]
@@ -385,12 +417,21 @@ mod tests {
                         part.fill_with(|| uniform(&mut rng, -1.0, 1.0));
                     }
                 }
-                let _contacts: Contacts = env.step(&action).unwrap();
-                smallest_m = smallest_m.min(true_gap_m(&env.scene()));
+                let contacts = env.step(&action).unwrap();
+                let gap_m = true_gap_m(&env.scene());
+                assert!(
+                    gap_m > -0.003 || contacts.contains(Contacts::ARM_ARM),
+                    "overlap of {gap_m} m not told"
+                );
+                smallest_m = smallest_m.min(gap_m);
             }
             overlapping += u32::from(smallest_m < 0.0);
             deepest_m = deepest_m.max(-smallest_m);
         }
-        println!("{overlapping} of 200 attacks overlap, by {deepest_m} m at most");
+        println!("links overlap in {overlapping} of 200 attacks, by {deepest_m} m at most");
+        assert!(
+            deepest_m < 0.01 && overlapping < 80,
+            "{overlapping} overlaps, up to {deepest_m} m"
+        );
     }
 }

@@ -9,7 +9,7 @@ use rapier3d::math::{Pose, Vector};
 use tandem_core::ArmIndex;
 
 use crate::frame::OwnFrame;
-use crate::physics::{Physics, collides, hand_group};
+use crate::physics::{Part, Physics, collides};
 
 /// How far each side opens, metres.
 pub(crate) const MAX_OPENING_M: f32 = 0.040;
@@ -110,7 +110,10 @@ impl Hand {
         palm.set_linvel(Vector::ZERO, true);
         for finger in &self.fingers {
             let body = &mut physics.bodies[finger.body];
-            body.set_translation(at + finger.shut_offset + Vector::Y * (finger.outward * opening_m), true);
+            body.set_translation(
+                at + finger.shut_offset + Vector::Y * (finger.outward * opening_m),
+                true,
+            );
             body.set_linvel(Vector::ZERO, true);
         }
     }
@@ -144,6 +147,21 @@ impl Hand {
         })
     }
 
+    /// Lets the palm move with `palm` (world frame) and each finger open with its rate, metres per second.
+    #[cfg(test)]
+    pub(crate) fn set_velocities(
+        &self,
+        physics: &mut Physics,
+        palm: Vector,
+        rates_mps: [f32; N_FINGERS],
+    ) {
+        physics.bodies[self.palm].set_linvel(palm, true);
+        for (finger, rate_mps) in self.fingers.iter().zip(rates_mps) {
+            physics.bodies[finger.body]
+                .set_linvel(palm + Vector::Y * (finger.outward * rate_mps), true);
+        }
+    }
+
     /// Sets the forces of the next physics step.
     ///
     /// `velocity` is what the palm shall do (world frame, metres per second), `gripper` the gripper's input in
@@ -152,7 +170,8 @@ impl Hand {
         let substep_s = physics.substep_s();
         let moved_mass_kg = PALM_MASS_KG + FINGERS_MASS_KG;
         let palm_velocity = self.velocity(physics);
-        let palm_force = bounded((velocity - palm_velocity) * (moved_mass_kg / substep_s), PALM_FORCE_N);
+        let palm_force =
+            bounded((velocity - palm_velocity) * (moved_mass_kg / substep_s), PALM_FORCE_N);
         let palm_velocity_next = palm_velocity + palm_force * (substep_s / moved_mass_kg);
 
         let finger_forces = self.finger_forces(physics, palm_velocity_next, gripper);
@@ -167,24 +186,36 @@ impl Hand {
     ///
     /// Without the term that ties the fingers' openings together, force-limited fingers and what they hold would have
     /// nothing to centre them.
-    fn finger_forces(&self, physics: &Physics, palm_velocity: Vector, gripper: f32) -> [Vector; N_FINGERS] {
+    fn finger_forces(
+        &self,
+        physics: &Physics,
+        palm_velocity: Vector,
+        gripper: f32,
+    ) -> [Vector; N_FINGERS] {
         let substep_s = physics.substep_s();
         let states = self.finger_states(physics, palm_velocity);
         let mean = |value: fn(&FingerState) -> f32| -> f32 {
-            self.fingers.iter().zip(&states).map(|(finger, state)| finger.share * value(state)).sum()
+            self.fingers
+                .iter()
+                .zip(&states)
+                .map(|(finger, state)| finger.share * value(state))
+                .sum()
         };
         let opening_m = mean(|state| state.opening_m);
         let rate_mps = mean(|state| state.opening_rate_mps);
         let to_end = OPENING_END_GAIN / substep_s;
-        let rate_wanted_mps =
-            (gripper * OPENING_SPEED_MPS).max(-opening_m * to_end).min((MAX_OPENING_M - opening_m) * to_end);
+        let rate_wanted_mps = (gripper * OPENING_SPEED_MPS)
+            .max(-opening_m * to_end)
+            .min((MAX_OPENING_M - opening_m) * to_end);
         let side_force_n = (0.5 * FINGERS_MASS_KG * (rate_wanted_mps - rate_mps) / substep_s)
             .clamp(-self.grip_force_n, self.grip_force_n);
         std::array::from_fn(|idx| {
             let (finger, state) = (&self.fingers[idx], &states[idx]);
             let gain = finger.mass_kg / substep_s;
             let lateral = (state.offset * -FINGER_HOLD_GAIN - state.velocity) * gain;
-            let evening_n = (gain * (FINGER_HOLD_GAIN * (opening_m - state.opening_m) + rate_mps - state.opening_rate_mps))
+            let evening_n = (gain
+                * (FINGER_HOLD_GAIN * (opening_m - state.opening_m) + rate_mps
+                    - state.opening_rate_mps))
                 .clamp(-FINGER_HOLD_FORCE_N, FINGER_HOLD_FORCE_N);
             let closing_n = finger.outward * (2.0 * finger.share * side_force_n + evening_n);
             let held = bounded(lateral, FINGER_HOLD_FORCE_N);
@@ -215,12 +246,16 @@ fn build_palm(physics: &mut Physics, arm: ArmIndex, frame: OwnFrame) -> RigidBod
             .translation(Vector::new(0.0, 0.0, above_m))
             .mass(mass_kg)
             .friction(0.4)
-            .collision_groups(collides(hand_group(arm)))
+            .collision_groups(collides(Part::Hand, arm))
     };
     let plate = ColliderBuilder::cuboid(PALM_HALF_M.x, PALM_HALF_M.y, PALM_HALF_M.z);
     let [low_m, high_m] = WRIST_ABOVE_M;
     let wrist = ColliderBuilder::capsule_z(0.5 * (high_m - low_m), WRIST_RADIUS_M);
-    physics.colliders.insert_with_parent(part(plate, 0.7 * PALM_MASS_KG, PALM_ABOVE_M), palm, &mut physics.bodies);
+    physics.colliders.insert_with_parent(
+        part(plate, 0.7 * PALM_MASS_KG, PALM_ABOVE_M),
+        palm,
+        &mut physics.bodies,
+    );
     physics.colliders.insert_with_parent(
         part(wrist, 0.3 * PALM_MASS_KG, 0.5 * (low_m + high_m)),
         palm,
@@ -241,7 +276,7 @@ fn build_finger(
         .mass(plan.mass_kg)
         .friction(friction)
         .friction_combine_rule(CoefficientCombineRule::Max)
-        .collision_groups(collides(hand_group(arm)));
+        .collision_groups(collides(Part::Hand, arm));
     physics.colliders.insert_with_parent(pad, body, &mut physics.bodies);
     Finger {
         body,

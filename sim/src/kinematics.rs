@@ -40,12 +40,54 @@ const BEND_M: f64 = 0.0741 * 0.5 / SIN_60;
 
 /// Jaco with the 60 degree wrist: Kinova's classic parameters of the arm `j2n6s300`.
 const ROWS: [Row; 6] = [
-    Row { sin_twist: 1.0, cos_twist: 0.0, length_m: 0.0, offset_m: 0.2755, zero_rad: 0.0, direction: -1.0 },
-    Row { sin_twist: 0.0, cos_twist: -1.0, length_m: 0.41, offset_m: 0.0, zero_rad: -FRAC_PI_2, direction: 1.0 },
-    Row { sin_twist: 1.0, cos_twist: 0.0, length_m: 0.0, offset_m: -0.0098, zero_rad: FRAC_PI_2, direction: 1.0 },
-    Row { sin_twist: SIN_60, cos_twist: 0.5, length_m: 0.0, offset_m: -(0.2073 + BEND_M), zero_rad: 0.0, direction: 1.0 },
-    Row { sin_twist: SIN_60, cos_twist: 0.5, length_m: 0.0, offset_m: -2.0 * BEND_M, zero_rad: -PI, direction: 1.0 },
-    Row { sin_twist: 0.0, cos_twist: -1.0, length_m: 0.0, offset_m: -(0.16 + BEND_M), zero_rad: FRAC_PI_2, direction: 1.0 },
+    Row {
+        sin_twist: 1.0,
+        cos_twist: 0.0,
+        length_m: 0.0,
+        offset_m: 0.2755,
+        zero_rad: 0.0,
+        direction: -1.0,
+    },
+    Row {
+        sin_twist: 0.0,
+        cos_twist: -1.0,
+        length_m: 0.41,
+        offset_m: 0.0,
+        zero_rad: -FRAC_PI_2,
+        direction: 1.0,
+    },
+    Row {
+        sin_twist: 1.0,
+        cos_twist: 0.0,
+        length_m: 0.0,
+        offset_m: -0.0098,
+        zero_rad: FRAC_PI_2,
+        direction: 1.0,
+    },
+    Row {
+        sin_twist: SIN_60,
+        cos_twist: 0.5,
+        length_m: 0.0,
+        offset_m: -(0.2073 + BEND_M),
+        zero_rad: 0.0,
+        direction: 1.0,
+    },
+    Row {
+        sin_twist: SIN_60,
+        cos_twist: 0.5,
+        length_m: 0.0,
+        offset_m: -2.0 * BEND_M,
+        zero_rad: -PI,
+        direction: 1.0,
+    },
+    Row {
+        sin_twist: 0.0,
+        cos_twist: -1.0,
+        length_m: 0.0,
+        offset_m: -(0.16 + BEND_M),
+        zero_rad: FRAC_PI_2,
+        direction: 1.0,
+    },
 ];
 
 /// A coordinate system fixed to a link.
@@ -85,7 +127,9 @@ impl Posture {
         let tool = &self.frames[6];
         let position = target - tool.origin;
         let turn = 0.5
-            * (tool.axes.x_axis.cross(DVec3::Y) + tool.axes.y_axis.cross(DVec3::X) + tool.axes.z_axis.cross(-DVec3::Z));
+            * (tool.axes.x_axis.cross(DVec3::Y)
+                + tool.axes.y_axis.cross(DVec3::X)
+                + tool.axes.z_axis.cross(-DVec3::Z));
         [position.x, position.y, position.z, turn.x, turn.y, turn.z]
     }
 
@@ -156,7 +200,10 @@ pub(crate) fn solve(start: JointAngles, target: DVec3, n_iterations: usize) -> J
 }
 
 /// Joint changes for each column of `tool_moves`: `Jᵀ (J Jᵀ + damping²)⁻¹ tool_moves`.
-fn joint_changes<const N: usize>(jacobian: &[[f64; 6]; 6], tool_moves: [[f64; N]; 6]) -> [[f64; N]; 6] {
+fn joint_changes<const N: usize>(
+    jacobian: &[[f64; 6]; 6],
+    tool_moves: [[f64; N]; 6],
+) -> [[f64; N]; 6] {
     let dot = |a: &[f64; 6], b: &[f64; 6]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
     let mut normal = jacobian.map(|row| jacobian.map(|other| dot(&row, &other)));
     for (idx, row) in normal.iter_mut().enumerate() {
@@ -164,12 +211,17 @@ fn joint_changes<const N: usize>(jacobian: &[[f64; 6]; 6], tool_moves: [[f64; N]
     }
     let weights = solve_positive_definite(normal, tool_moves);
     std::array::from_fn(|joint| {
-        std::array::from_fn(|column| (0..6).map(|row| jacobian[row][joint] * weights[row][column]).sum())
+        std::array::from_fn(|column| {
+            (0..6).map(|row| jacobian[row][joint] * weights[row][column]).sum()
+        })
     })
 }
 
 /// Solves `matrix · x = sides` for every column by elimination; a positive definite matrix needs no pivots.
-fn solve_positive_definite<const N: usize>(mut matrix: [[f64; 6]; 6], mut sides: [[f64; N]; 6]) -> [[f64; N]; 6] {
+fn solve_positive_definite<const N: usize>(
+    mut matrix: [[f64; 6]; 6],
+    mut sides: [[f64; N]; 6],
+) -> [[f64; N]; 6] {
     for pivot in 0..6 {
         for row in pivot + 1..6 {
             let factor = matrix[row][pivot] / matrix[pivot][pivot];
@@ -225,7 +277,10 @@ mod tests {
             turned[joint] += step;
             let moved = (Posture::of(&turned).point(6) - Posture::of(&HOME).point(6)) / step;
             for axis in 0..3 {
-                assert!((moved[axis] - jacobian[axis][joint]).abs() < 1e-5, "joint {joint}, axis {axis}");
+                assert!(
+                    (moved[axis] - jacobian[axis][joint]).abs() < 1e-5,
+                    "joint {joint}, axis {axis}"
+                );
             }
         }
     }
@@ -235,9 +290,14 @@ mod tests {
         let mut rng = episode_rng(3, 0, Stream::Reset);
         for _ in 0..1000 {
             let mut between = |low, high| f64::from(uniform(&mut rng, low, high));
-            let target = DVec3::new(0.40 + between(-0.20, 0.20), between(-0.25, 0.25), between(0.022, 0.35));
+            let target =
+                DVec3::new(0.40 + between(-0.20, 0.20), between(-0.25, 0.25), between(0.022, 0.35));
             let angles = solve(HOME, target, 100);
-            assert!(miss_m(&angles, target) < 1e-4, "{target} missed by {}", miss_m(&angles, target));
+            assert!(
+                miss_m(&angles, target) < 1e-4,
+                "{target} missed by {}",
+                miss_m(&angles, target)
+            );
             let posture = Posture::of(&angles);
             let lowest_m = (1..6).map(|idx| posture.point(idx).z).fold(f64::INFINITY, f64::min);
             assert!(lowest_m > 0.2, "a joint at {lowest_m} m for {target}");
@@ -247,7 +307,8 @@ mod tests {
     #[test]
     fn joint_points_move_with_the_tool_as_predicted() {
         let (from, to) = (DVec3::new(0.40, 0.0, 0.15), DVec3::new(0.41, -0.01, 0.16));
-        let (before, after) = (Posture::of(&solve(HOME, from, 100)), Posture::of(&solve(HOME, to, 100)));
+        let (before, after) =
+            (Posture::of(&solve(HOME, from, 100)), Posture::of(&solve(HOME, to, 100)));
         let motions = before.motion_of([2, 4, 5]);
         for (motion, frame) in motions.into_iter().zip([2, 4, 5]) {
             let predicted = before.point(frame) + motion * (to - from);

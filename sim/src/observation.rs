@@ -21,7 +21,8 @@ use crate::world::World;
 pub(crate) fn observe_arm(world: &World, arm: ArmIndex, observation: &mut [f32]) {
     let (state, object) = (&world.arms[arm.0], world.object(arm));
     let frame = state.frame;
-    let (hand_at, hand_velocity) = (state.hand.end_effector(&world.physics), state.hand.velocity(&world.physics));
+    let (hand_at, hand_velocity) =
+        (state.hand.end_effector(&world.physics), state.hand.velocity(&world.physics));
     let per_step = |velocity| (frame.turned(velocity) * CONTROL_STEP_S).to_array();
     let fingers = state.hand.openings(&world.physics);
 
@@ -35,5 +36,134 @@ pub(crate) fn observe_arm(world: &World, arm: ArmIndex, observation: &mut [f32])
     for (finger, (opening_m, rate_mps)) in fingers.into_iter().enumerate() {
         observation[9 + finger] = opening_m;
         observation[25 + finger] = rate_mps * CONTROL_STEP_S;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use rapier3d::math::{Pose, Rotation, Vector};
+    use tandem_core::layout::OBSERVATION_PER_ARM;
+    use tandem_core::{Layout, Task};
+
+    use crate::config::WorldConfig;
+    use crate::frame::OwnFrame;
+
+    const ARMS: [ArmIndex; 2] = [ArmIndex(0), ArmIndex(1)];
+    const OBJECT: Vector = Vector::new(0.05, -0.08, 0.0225);
+    const HAND: Vector = Vector::new(-0.01, 0.02, 0.12);
+
+    /// What both arms see after `change` was made to the world at arm `arm`, each in its place as given above.
+    fn seen(
+        arm: ArmIndex,
+        change: impl Fn(&mut World, OwnFrame),
+    ) -> [[f32; OBSERVATION_PER_ARM]; 2] {
+        let mut world = World::build(Layout::new(Task::PickAndPlace, 2), &WorldConfig::default());
+        for arm in ARMS {
+            world.place_arm(arm, HAND, 0.03);
+            world.place_object(arm, OBJECT);
+        }
+        let frame = world.arms[arm.0].frame;
+        change(&mut world, frame);
+        ARMS.map(|arm| {
+            let mut observation = [0.0; OBSERVATION_PER_ARM];
+            observe_arm(&world, arm, &mut observation);
+            observation
+        })
+    }
+
+    /// Asserts that `change`, made at either arm, changes just the numbers in `expected`, and only that arm's.
+    fn check(change: impl Fn(&mut World, ArmIndex, OwnFrame), expected: &[(usize, f32)]) {
+        for arm in ARMS {
+            let before = seen(arm, |_, _| ());
+            let after = seen(arm, |world, frame| change(world, arm, frame));
+            assert_eq!(before[1 - arm.0], after[1 - arm.0], "the other arm's numbers changed");
+            for idx in 0..OBSERVATION_PER_ARM {
+                let difference = after[arm.0][idx] - before[arm.0][idx];
+                let wanted = expected.iter().find(|(at, _)| *at == idx).map_or(0.0, |(_, by)| *by);
+                assert!(
+                    (difference - wanted).abs() < 1e-6,
+                    "{arm:?}, number {idx}: {difference}, not {wanted}"
+                );
+            }
+        }
+    }
+
+    #[test]
+    fn at_rest_every_number_says_where_things_are() {
+        for numbers in seen(ArmIndex(0), |_, _| ()) {
+            let mut expected = [0.0; OBSERVATION_PER_ARM];
+            expected[0..3].copy_from_slice(&HAND.to_array());
+            expected[3..6].copy_from_slice(&OBJECT.to_array());
+            expected[6..9].copy_from_slice(&(OBJECT - HAND).to_array());
+            expected[9..12].copy_from_slice(&[0.03; 3]);
+            expected[15] = 1.0;
+            for (idx, (got, wanted)) in numbers.into_iter().zip(expected).enumerate() {
+                assert!((got - wanted).abs() < 1e-6, "number {idx}: {got}, not {wanted}");
+            }
+        }
+    }
+
+    #[test]
+    fn places() {
+        let step = Vector::new(0.01, 0.02, 0.03);
+        check(
+            |world, arm, _| world.place_arm(arm, HAND + step, 0.03),
+            &[(0, 0.01), (1, 0.02), (2, 0.03), (6, -0.01), (7, -0.02), (8, -0.03)],
+        );
+        check(
+            |world, arm, _| world.place_object(arm, OBJECT + step),
+            &[(3, 0.01), (4, 0.02), (5, 0.03), (6, 0.01), (7, 0.02), (8, 0.03)],
+        );
+        check(
+            |world, arm, _| world.place_arm(arm, HAND, 0.01),
+            &[(9, -0.02), (10, -0.02), (11, -0.02)],
+        );
+    }
+
+    #[test]
+    fn orientation_has_a_positive_w() {
+        let turn = Rotation::from_xyzw(0.6, 0.0, 0.0, -0.8);
+        check(
+            |world, arm, frame| {
+                let pose = Pose::from_parts(
+                    frame.world_from_own(OBJECT),
+                    frame.orientation_in_world() * turn,
+                );
+                world.object_mut(arm).set_position(pose, true);
+            },
+            &[(12, -0.6), (15, -0.2)],
+        );
+    }
+
+    #[test]
+    fn velocities_are_per_control_step() {
+        let velocity = Vector::new(0.1, 0.2, 0.3);
+        let per_step = [0.004, 0.008, 0.012];
+        let at =
+            |first: usize, sign: f32| [0, 1, 2].map(|axis| (first + axis, sign * per_step[axis]));
+        check(
+            |world, arm, frame| world.object_mut(arm).set_linvel(frame.turned(velocity), true),
+            &at(16, 1.0),
+        );
+        check(
+            |world, arm, frame| world.object_mut(arm).set_angvel(frame.turned(velocity), true),
+            &at(19, 1.0),
+        );
+        let hand_moves = [at(16, -1.0), at(22, 1.0)].concat();
+        check(
+            |world, arm, frame| {
+                let hand = world.arms[arm.0].hand.clone();
+                hand.set_velocities(&mut world.physics, frame.turned(velocity), [0.0; 3]);
+            },
+            &hand_moves,
+        );
+        check(
+            |world, arm, _| {
+                let hand = world.arms[arm.0].hand.clone();
+                hand.set_velocities(&mut world.physics, Vector::ZERO, [0.1, 0.2, 0.3]);
+            },
+            &at(25, 1.0),
+        );
     }
 }

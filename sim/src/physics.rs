@@ -1,32 +1,46 @@
 //! rapier's sets, bundled so that they can be cloned, with settings for bodies of centimetres.
 
 use rapier3d::dynamics::{
-    CCDSolver, FrictionModel, ImpulseJointSet, IntegrationParameters, IslandManager, MultibodyJointSet, RigidBodySet,
-    SoftBodySet, SpringCoefficients,
+    CCDSolver, FrictionModel, ImpulseJointSet, IntegrationParameters, IslandManager,
+    MultibodyJointSet, RigidBodySet, SoftBodySet, SpringCoefficients,
 };
-use rapier3d::geometry::{BroadPhaseBvh, ColliderHandle, ColliderSet, ContactPair, Group, InteractionGroups, InteractionTestMode, NarrowPhase};
+use rapier3d::geometry::{
+    BroadPhaseBvh, ColliderHandle, ColliderSet, ContactPair, Group, InteractionGroups,
+    InteractionTestMode, NarrowPhase,
+};
 use rapier3d::math::Vector;
 use rapier3d::pipeline::PhysicsPipeline;
 use tandem_core::{ArmIndex, Contacts};
 
 use crate::config::WorldConfig;
 
-/// Collision group of the table.
-pub(crate) const TABLE: Group = Group::GROUP_1;
-/// Collision group of the objects.
-pub(crate) const OBJECTS: Group = Group::GROUP_2;
+/// Collision groups of the tables, one an arm.
+const TABLES: [Group; 2] = [Group::GROUP_1, Group::GROUP_2];
+/// Collision groups of the objects, in arm order.
+const OBJECTS: [Group; 2] = [Group::GROUP_3, Group::GROUP_4];
 /// Collision groups of the arms' hands, in arm order.
-const HANDS: [Group; 2] = [Group::GROUP_3, Group::GROUP_4];
+const HANDS: [Group; 2] = [Group::GROUP_5, Group::GROUP_6];
 
-/// Collision group of `arm`'s hand.
-pub(crate) fn hand_group(arm: ArmIndex) -> Group {
-    HANDS[arm.0]
+/// What a collider belongs to.
+#[derive(Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Part {
+    /// The table, as far as an arm's own object and hand are concerned.
+    Table,
+    /// The arm's object.
+    Object,
+    /// Palm, wrist and fingers.
+    Hand,
 }
 
-/// What a member of `group` collides with: everything else, except that a hand's parts pass through each other.
-pub(crate) fn collides(group: Group) -> InteractionGroups {
-    let everything = TABLE | OBJECTS | HANDS[0] | HANDS[1];
-    let filter = if group == OBJECTS { everything } else { everything & !group };
+/// What `part` of `arm` collides with: everything that is the arm's or the other's, except that a hand's parts pass
+/// through each other and that each arm has a table of its own.
+pub(crate) fn collides(part: Part, arm: ArmIndex) -> InteractionGroups {
+    let movable = OBJECTS[0] | OBJECTS[1] | HANDS[0] | HANDS[1];
+    let (group, filter) = match part {
+        Part::Table => (TABLES[arm.0], OBJECTS[arm.0] | HANDS[arm.0]),
+        Part::Object => (OBJECTS[arm.0], movable | TABLES[arm.0]),
+        Part::Hand => (HANDS[arm.0], (movable & !HANDS[arm.0]) | TABLES[arm.0]),
+    };
     InteractionGroups::new(group, filter, InteractionTestMode::And)
 }
 
@@ -95,18 +109,23 @@ impl Physics {
             .contact_pairs()
             .map(|pair| {
                 let kind = self.kind_of(pair);
-                if kind.any() && pair.total_impulse_magnitude() > 0.0 { kind } else { Contacts::NONE }
+                if kind.any() && pair.total_impulse_magnitude() > 0.0 {
+                    kind
+                } else {
+                    Contacts::NONE
+                }
             })
             .fold(Contacts::NONE, |all, one| all | one)
     }
 
     /// What a contact of this pair would count as.
     fn kind_of(&self, pair: &ContactPair) -> Contacts {
-        let group = |collider: ColliderHandle| self.colliders[collider].collision_groups().memberships;
+        let group =
+            |collider: ColliderHandle| self.colliders[collider].collision_groups().memberships;
         let both = group(pair.collider1) | group(pair.collider2);
         if both == HANDS[0] | HANDS[1] {
             Contacts::ARM_ARM
-        } else if both == TABLE | HANDS[0] || both == TABLE | HANDS[1] {
+        } else if both == TABLES[0] | HANDS[0] || both == TABLES[1] | HANDS[1] {
             Contacts::ARM_TABLE
         } else {
             Contacts::NONE

@@ -15,7 +15,13 @@ use crate::world::{TABLE_HALF_M, World};
 const ITERATIONS: usize = 20;
 
 /// What `world` looks like `time_s` after the episode's start; `goal` has shape `[n_goal]`, own frames.
-pub(crate) fn scene(world: &World, layout: Layout, goal: &[f32], half_m: f32, time_s: f64) -> Scene {
+pub(crate) fn scene(
+    world: &World,
+    layout: Layout,
+    goal: &[f32],
+    half_m: f32,
+    time_s: f64,
+) -> Scene {
     let goal_in_world = |arm: ArmIndex| {
         let in_own = Vector::from_slice(&goal[layout.goal_of(arm)]);
         world.arms[arm.0].frame.world_from_own(in_own).to_array()
@@ -36,12 +42,17 @@ pub(crate) fn scene(world: &World, layout: Layout, goal: &[f32], half_m: f32, ti
 fn arm_scene(world: &World, arm: &Arm) -> ArmScene {
     let joint_angles_rad = arm.angles_now(&world.physics, ITERATIONS);
     let posture = Posture::of(&joint_angles_rad);
-    let joint_points: Vec<Point> = (0..7).map(|idx| arm.world_from_base(posture.point(idx)).to_array()).collect();
+    let joint_points: Vec<Point> =
+        (0..7).map(|idx| arm.world_from_base(posture.point(idx)).to_array()).collect();
     let end_effector = arm.hand.end_effector(&world.physics);
     let mut links: Vec<Capsule> = LINK_FRAMES
         .windows(2)
         .zip(LINK_RADII_M)
-        .map(|(ends, radius_m)| Capsule { from: joint_points[ends[0]], to: joint_points[ends[1]], radius_m })
+        .map(|(ends, radius_m)| Capsule {
+            from: joint_points[ends[0]],
+            to: joint_points[ends[1]],
+            radius_m,
+        })
         .collect();
     let [from, to] = WRIST_ABOVE_M.map(|above_m| (end_effector + Vector::Z * above_m).to_array());
     links.push(Capsule { from, to, radius_m: WRIST_RADIUS_M });

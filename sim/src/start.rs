@@ -54,7 +54,12 @@ enum Kind {
 }
 
 /// Draws how every arm starts: objects, goals and hands apart from each other, nothing achieved yet.
-pub(crate) fn draw(rng: &mut ChaCha8Rng, layout: Layout, object_half_m: f32, starts: Starts) -> Vec<ArmStart> {
+pub(crate) fn draw(
+    rng: &mut ChaCha8Rng,
+    layout: Layout,
+    object_half_m: f32,
+    starts: Starts,
+) -> Vec<ArmStart> {
     let gripped = coin(rng, starts.gripped_share);
     let wide = coin(rng, starts.wide_share);
     let can_hold = layout.task == Task::PickAndPlace && object_half_m < MAX_OPENING_M;
@@ -95,7 +100,11 @@ impl Area {
 
     fn point_on_table(&self, rng: &mut ChaCha8Rng) -> Vector {
         let area_y_m = self.area_y_m();
-        Vector::new(uniform(rng, -AREA_X_M, AREA_X_M), uniform(rng, -area_y_m, area_y_m), self.object_half_m)
+        Vector::new(
+            uniform(rng, -AREA_X_M, AREA_X_M),
+            uniform(rng, -area_y_m, area_y_m),
+            self.object_half_m,
+        )
     }
 
     fn goal(&self, rng: &mut ChaCha8Rng) -> Vector {
@@ -144,12 +153,17 @@ impl Area {
     }
 
     fn is_free(&self, arms: &[ArmStart], kind: Kind) -> bool {
-        let in_world = |arm: usize, point| OwnFrame::of(ArmIndex(arm), self.layout.n_arms).world_from_own(point);
+        let in_world = |arm: usize, point| {
+            OwnFrame::of(ArmIndex(arm), self.layout.n_arms).world_from_own(point)
+        };
         let points = |part: fn(&ArmStart) -> Vector| -> Vec<Vector> {
             arms.iter().enumerate().map(|(arm, start)| in_world(arm, part(start))).collect()
         };
-        let (hands, objects, goals) =
-            (points(|start| start.end_effector), points(|start| start.object), points(|start| start.goal));
+        let (hands, objects, goals) = (
+            points(|start| start.end_effector),
+            points(|start| start.object),
+            points(|start| start.goal),
+        );
         let clear_of = |hand: Vector, object: Vector| match kind {
             Kind::Middle => horizontal(hand - object) >= HAND_CLEARANCE_M,
             Kind::Wide => self.is_beside_or_above(hand, object),
@@ -186,5 +200,8 @@ fn horizontal(offset: Vector) -> f32 {
 
 /// Whether every two of `points` are far enough from each other.
 fn apart(points: &[Vector], far_enough: impl Fn(Vector) -> bool) -> bool {
-    points.iter().enumerate().all(|(idx, point)| points[..idx].iter().all(|other| far_enough(*point - *other)))
+    points
+        .iter()
+        .enumerate()
+        .all(|(idx, point)| points[..idx].iter().all(|other| far_enough(*point - *other)))
 }

@@ -9,7 +9,7 @@ use crate::arm::{Arm, Command};
 use crate::config::{SimError, WorldConfig};
 use crate::frame::OwnFrame;
 use crate::guard::LinkGuard;
-use crate::physics::{OBJECTS, Physics, TABLE, collides};
+use crate::physics::{Part, Physics, collides};
 
 /// Most arms a world can have.
 pub(crate) const MAX_ARMS: usize = 2;
@@ -33,13 +33,13 @@ impl World {
     pub(crate) fn build(layout: Layout, config: &WorldConfig) -> Self {
         let friction = config.friction(layout.task);
         let mut physics = Physics::new(config);
-        add_table(&mut physics);
         let mut arms = Vec::with_capacity(layout.n_arms);
         let mut objects = Vec::with_capacity(layout.n_arms);
         for arm in layout.arms() {
             let frame = OwnFrame::of(arm, layout.n_arms);
+            add_table(&mut physics, arm, frame);
             arms.push(Arm::build(&mut physics, arm, frame, friction.pads, config));
-            objects.push(add_object(&mut physics, config, friction.object));
+            objects.push(add_object(&mut physics, arm, config, friction.object));
         }
         Self { physics, arms, objects, guard: None, substeps: config.substeps }
     }
@@ -75,6 +75,11 @@ impl World {
     /// `arm`'s object.
     pub(crate) fn object(&self, arm: ArmIndex) -> &RigidBody {
         &self.physics.bodies[self.objects[arm.0]]
+    }
+
+    #[cfg(test)]
+    pub(crate) fn object_mut(&mut self, arm: ArmIndex) -> &mut RigidBody {
+        &mut self.physics.bodies[self.objects[arm.0]]
     }
 
     /// Lets one control step pass. `commands` has one entry an arm; further ones are not read.
@@ -128,23 +133,34 @@ impl World {
     }
 }
 
-fn add_table(physics: &mut Physics) {
+/// Adds the table that `arm`'s hand and object stand on: in the same place for every arm, but turned with the arm.
+///
+/// rapier solves a cube's four corners on the table in an order that depends on the table's axes, which pushes a resting
+/// cube by a micrometre. On a table of its own the second arm's cube is pushed to the other side, as the symmetry of the
+/// two arms demands.
+fn add_table(physics: &mut Physics, arm: ArmIndex, frame: OwnFrame) {
+    let top_at_zero = Vector::new(0.0, 0.0, -TABLE_HALF_M.z);
     let table = ColliderBuilder::cuboid(TABLE_HALF_M.x, TABLE_HALF_M.y, TABLE_HALF_M.z)
-        .translation(Vector::new(0.0, 0.0, -TABLE_HALF_M.z))
+        .position(Pose::from_parts(top_at_zero, frame.orientation_in_world()))
         .friction(TABLE_FRICTION)
         .friction_combine_rule(CoefficientCombineRule::Min)
-        .collision_groups(collides(TABLE));
+        .collision_groups(collides(Part::Table, arm));
     physics.colliders.insert(table);
 }
 
-fn add_object(physics: &mut Physics, config: &WorldConfig, friction: f32) -> RigidBodyHandle {
+fn add_object(
+    physics: &mut Physics,
+    arm: ArmIndex,
+    config: &WorldConfig,
+    friction: f32,
+) -> RigidBodyHandle {
     let half_m = config.object_half_size_m;
     let body = physics.bodies.insert(RigidBodyBuilder::dynamic().can_sleep(false));
     let cube = ColliderBuilder::cuboid(half_m, half_m, half_m)
         .mass(config.object_mass_kg)
         .friction(friction)
         .friction_combine_rule(CoefficientCombineRule::Max)
-        .collision_groups(collides(OBJECTS));
+        .collision_groups(collides(Part::Object, arm));
     physics.colliders.insert_with_parent(cube, body, &mut physics.bodies);
     body
 }

@@ -3,7 +3,7 @@
 mod scripted;
 
 use scripted::{play, success_rate};
-use tandem_core::{Layout, Task};
+use tandem_core::{Contacts, Layout, Task};
 use tandem_sim::{Friction, WorldConfig};
 
 #[test]
@@ -13,15 +13,26 @@ fn one_arm_does_either_task_by_rule() {
         let rate = success_rate(&episodes);
         println!("{task}, 1 arm: {rate}, median miss {:.4} m", median_miss_m(&episodes));
         assert!(rate >= 0.97, "{task}: {rate}");
+        assert!(
+            episodes.iter().all(|played| !played.contacts.any()),
+            "{task}: contact of an arm that is alone"
+        );
     }
 }
 
 #[test]
 fn two_arms_blind_to_each_other_mostly_do_either_task() {
     for task in Task::ALL {
-        let rate = success_rate(&play(Layout::new(task, 2), &WorldConfig::default(), 200));
-        println!("{task}, 2 arms: {rate}");
+        let episodes = play(Layout::new(task, 2), &WorldConfig::default(), 200);
+        let n_with =
+            |contact| episodes.iter().filter(|played| played.contacts.contains(contact)).count();
+        let (n_arm_arm, n_arm_table) = (n_with(Contacts::ARM_ARM), n_with(Contacts::ARM_TABLE));
+        let rate = success_rate(&episodes);
+        println!(
+            "{task}, 2 arms: {rate}; arms touch in {n_arm_arm}, the table is touched in {n_arm_table} of 200"
+        );
         assert!(rate >= 0.80, "{task}: {rate}");
+        assert!((1..100).contains(&n_arm_arm), "{task}: arms touch in {n_arm_arm} of 200");
     }
 }
 

@@ -25,11 +25,14 @@ impl Plan {
             (None, Some(out)) if args.resume => Some(out.join("run.toml")),
             (run, _) => run.clone(),
         };
-        let config = run_file::resolve(file.as_deref(), &settings(args)?)?;
+        let mut config = run_file::resolve(file.as_deref(), &settings(args)?)?;
         let out = match &args.out {
             Some(out) => out.clone(),
             None => free_run_directory(&config),
         };
+        if !args.resume {
+            config.name = account_name(&out).unwrap_or(config.name);
+        }
         let teacher =
             if config.advice.asks() { Some(teacher_path(args, &config, &out)?) } else { None };
         let n_workers = args.workers.unwrap_or_else(|| default_workers(&config));
@@ -121,6 +124,12 @@ fn settings(args: &TrainArgs) -> Result<Vec<(String, Value)>, Failed> {
 /// One worker a core, but no more than there are slots.
 fn default_workers(config: &RunConfig) -> usize {
     std::thread::available_parallelism().map_or(1, std::num::NonZero::get).min(config.rounds.slots)
+}
+
+/// The run directory's own name, where it can be the name of an account at a teacher.
+fn account_name(out: &Path) -> Option<String> {
+    let name = out.file_name()?.to_str()?;
+    tandem_learner::config::is_name(name).then(|| name.to_owned())
 }
 
 /// `runs/TASK-ARMS-STRATEGY-seedN`, with a number behind it when that is taken.

@@ -89,11 +89,18 @@ pub(crate) fn joint_states(scene: &Scene, stamp: Timestamp) -> JointStates {
     JointStates { timestamp: Some(stamp), joints: joints.collect() }
 }
 
+/// The links, and the post on which the first of them stands; balls where they meet.
 fn arm_entity(arm: &ArmScene, color: Color, entity: SceneEntity) -> SceneEntity {
+    let post = arm.links.first().map(|link| Capsule {
+        from: arm.base,
+        to: link.from,
+        radius_m: link.radius_m,
+    });
+    let bars: Vec<Capsule> = post.into_iter().chain(arm.links.iter().copied()).collect();
     let ends =
         arm.links.iter().flat_map(|link| [(link.from, link.radius_m), (link.to, link.radius_m)]);
     SceneEntity {
-        cylinders: arm.links.iter().map(|link| cylinder(link, color)).collect(),
+        cylinders: bars.iter().map(|bar| cylinder(bar, color)).collect(),
         spheres: ends.map(|(end, radius_m)| sphere(end, radius_m, color)).collect(),
         cubes: arm.hand.iter().map(|part| cube(part, darker(color))).collect(),
         ..entity

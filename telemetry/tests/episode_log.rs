@@ -113,7 +113,10 @@ fn a_file_cut_anywhere_is_mended_and_more_bytes_never_mean_less() {
                 assert!(log.transitions == synthetic::transitions()[..log.transitions.len()]);
             }
             Err(error) => {
-                assert!(matches!(error, Error::NotAnEpisode { .. }) && n_messages == 0, "{error:?}");
+                assert!(
+                    matches!(error, Error::NotAnEpisode { .. }) && n_messages == 0,
+                    "{error:?}"
+                );
             }
         }
     }

@@ -126,6 +126,16 @@ mod tests {
     }
 
     #[test]
+    fn simulated_worlds_do_not_mind_threads_either() {
+        let evaluate_on = |n_threads| {
+            let n_threads = NonZeroUsize::new(n_threads).expect("1 or more");
+            evaluate(|| FakeActor::Seeker, LAYOUT, &WorldConfig::default(), 3, 5, n_threads)
+                .expect("nothing breaks")
+        };
+        assert_eq!(evaluate_on(1), evaluate_on(2));
+    }
+
+    #[test]
     fn composed_teachers_give_each_arm_its_own_teacher() {
         let (mut observations, mut goals) = (vec![0.0; 2 * 56], vec![0.0; 2 * 6]);
         for (row, value) in [0.1, 0.2, 0.3, 0.4].into_iter().enumerate() {

@@ -5,7 +5,7 @@
 //! ever: no step goes unadvised and no episode is lost because a peer was slow, so a result never depends on timing.
 //!
 //! Start at [`rollout`], the life of an episode. It talks to the world, the policy and the teacher through
-//! [`ports`] and cannot tell a network from a test; [`run`] is the shell of sockets round it.
+//! [`ports`] and cannot tell a network from a test; [`run()`] is the shell of sockets round it.
 #![warn(missing_docs)]
 
 mod error;

@@ -78,7 +78,8 @@ struct Worker {
 /// What a learner that has been joined gives.
 struct Membership {
     worker_id: u64,
-    player: Player,
+    /// Boxed: a world is large to carry through futures.
+    player: Box<Player>,
 }
 
 impl Worker {
@@ -131,7 +132,10 @@ impl Worker {
             return Err(Error::NoTeacher { account: account.clone() });
         }
         tracing::info!(worker_id, task = %terms.layout.task, n_arms = terms.layout.n_arms, "run joined");
-        Ok(Membership { worker_id, player: Player::new(terms, self.config.log_dir.clone())? })
+        Ok(Membership {
+            worker_id,
+            player: Box::new(Player::new(terms, self.config.log_dir.clone())?),
+        })
     }
 
     /// Plays a slot and delivers it. The membership is gone when the learner no longer knows the worker.
@@ -174,9 +178,9 @@ impl Worker {
     /// Plays a slot on a thread, passing its questions on to the teacher.
     async fn play(
         &mut self,
-        mut player: Player,
+        mut player: Box<Player>,
         order: SlotOrder,
-    ) -> Result<(Player, Vec<Episode>), Error> {
+    ) -> Result<(Box<Player>, Vec<Episode>), Error> {
         let slot = order.slot;
         let (account, layout) = (player.terms().account.clone(), player.terms().layout);
         let (questions, mut asked) = Questions::channel();

@@ -1,47 +1,11 @@
 //! Shaded shapes, collected with their depth and written out far ones first.
 
-use std::fmt::Write as _;
-
 use tandem_core::scene::{Capsule, Cuboid};
 
 use super::View;
-use super::camera::{Camera, Projected, Vec3, difference, dot, rotated, scaled, sum};
+use super::camera::{Camera, Projected, Vec3, difference, rotated, scaled, sum};
+use super::color::{LIGHT, Rgb, brightness};
 
-/// A colour, 0 to 255 each.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) struct Rgb(pub(super) u8, pub(super) u8, pub(super) u8);
-
-impl Rgb {
-    /// Black at 0, itself at 1, white at 2.
-    fn lit(self, brightness: f64) -> Self {
-        let channel = |value: u8| {
-            let value = f64::from(value);
-            let lit = if brightness <= 1.0 {
-                value * brightness
-            } else {
-                value + (255.0 - value) * (brightness - 1.0)
-            };
-            to_u8(lit)
-        };
-        Self(channel(self.0), channel(self.1), channel(self.2))
-    }
-
-    fn hex(self) -> String {
-        format!("#{:02x}{:02x}{:02x}", self.0, self.1, self.2)
-    }
-}
-
-#[expect(
-    clippy::cast_possible_truncation,
-    clippy::cast_sign_loss,
-    reason = "clamped to 0..=255 first"
-)]
-fn to_u8(value: f64) -> u8 {
-    value.round().clamp(0.0, 255.0) as u8
-}
-
-/// Where the light comes from: a unit vector, from above, the left and the front.
-const LIGHT: Vec3 = [-0.36, -0.48, 0.80];
 const FONT: &str = "-apple-system, 'Segoe UI', Helvetica, Arial, sans-serif";
 /// Corners of a circle drawn as a polygon.
 const N_CORNERS: u32 = 48;
@@ -73,13 +37,17 @@ impl Painter {
     /// The table, below everything else.
     pub(super) fn table(&mut self, table: &Cuboid, color: Rgb) {
         for (corners, normal) in faces(table) {
+            if normal[2] > 0.5 {
+                let outline = self.outline(&corners);
+                self.definitions
+                    .push_str(&format!(r#"<clipPath id="top"><path d="{outline}"/></clipPath>"#));
+            }
             if self.camera.sees(corners[0], normal) {
                 let outline = self.outline(&corners);
                 let fill = color.lit(brightness(normal)).hex();
-                let _ = write!(
-                    self.ground,
-                    "<path d=\"{outline}\" fill=\"{fill}\" stroke=\"{fill}\" stroke-linejoin=\"round\"/>"
-                );
+                self.ground.push_str(&format!(
+                    r#"<path d="{outline}" fill="{fill}" stroke="{fill}" stroke-linejoin="round"/>"#
+                ));
             }
         }
     }
@@ -92,10 +60,7 @@ impl Painter {
                 let fill = color.lit(brightness(normal)).hex();
                 let edge = color.lit(0.9 * brightness(normal)).hex();
                 let outline = self.outline(&corners);
-                let _ = write!(
-                    drawn,
-                    "<path d=\"{outline}\" fill=\"{fill}\" stroke=\"{edge}\" stroke-width=\"0.8\" stroke-linejoin=\"round\"/>"
-                );
+                drawn.push_str(&format!(r#"<path d="{outline}" fill="{fill}" stroke="{edge}" stroke-width="0.8" stroke-linejoin="round"/>"#));
             }
         }
         let depth_m = self.camera.project(cuboid.centre.map(f64::from)).depth_m;
@@ -118,10 +83,7 @@ impl Painter {
         let (side_x, side_y) = ((b.y - a.y) / length_px, -(b.x - a.x) / length_px);
         let fill = self.gradient_across(&a, [side_x * radius_a, side_y * radius_a], color);
         let mut drawn = String::new();
-        let _ = write!(
-            drawn,
-            "<path d=\"M{:.1} {:.1}L{:.1} {:.1}A{radius_b:.1} {radius_b:.1} 0 0 1 {:.1} {:.1}L{:.1} {:.1}A{radius_a:.1} \
-             {radius_a:.1} 0 0 1 {:.1} {:.1}Z\" fill=\"url(#{fill})\" stroke=\"{}\" stroke-width=\"0.8\"/>",
+        drawn.push_str(&format!(r#"<path d="M{:.1} {:.1}L{:.1} {:.1}A{radius_b:.1} {radius_b:.1} 0 0 1 {:.1} {:.1}L{:.1} {:.1}A{radius_a:.1} {radius_a:.1} 0 0 1 {:.1} {:.1}Z" fill="url(#{fill})" stroke="{}" stroke-width="0.8"/>"#,
             a.x + side_x * radius_a,
             a.y + side_y * radius_a,
             b.x + side_x * radius_b,
@@ -132,8 +94,7 @@ impl Painter {
             a.y - side_y * radius_a,
             a.x + side_x * radius_a,
             a.y + side_y * radius_a,
-            color.lit(0.62).hex(),
-        );
+            color.lit(0.62).hex(),));
         self.shapes.push((self.middle_depth_m(capsule), drawn));
     }
 
@@ -144,7 +105,7 @@ impl Painter {
             .into_iter()
             .fold(f64::INFINITY, f64::min);
         let radius_m = widening * f64::from(link.radius_m.max(next.radius_m));
-        self.ball(next.from.map(f64::from), radius_m, depth_m - 1e-3, color);
+        self.ball(link.to.map(f64::from), radius_m, depth_m - 1e-3, color);
     }
 
     /// A ball with a highlight; `depth_m` says what it is in front of.
@@ -153,7 +114,7 @@ impl Painter {
         let fill = self.gradient_ball(color);
         let radius = radius_m * at.scale;
         let drawn = format!(
-            "<circle cx=\"{:.1}\" cy=\"{:.1}\" r=\"{radius:.1}\" fill=\"url(#{fill})\"/>",
+            r#"<circle cx="{:.1}" cy="{:.1}" r="{radius:.1}" fill="url(#{fill})"/>"#,
             at.x, at.y
         );
         self.shapes.push((depth_m, drawn));
@@ -164,22 +125,15 @@ impl Painter {
         let below = [centre[0], centre[1], self.table_z_m];
         let ring = self.circle_on_table(below, radius_m);
         let hex = color.lit(0.85).hex();
-        let _ = write!(
-            self.ground,
-            "<path d=\"{ring}\" fill=\"{hex}\" fill-opacity=\"0.14\" stroke=\"{hex}\" stroke-width=\"1.6\" stroke-dasharray=\"5 4\"/>"
-        );
+        self.ground.push_str(&format!(r#"<path d="{ring}" fill="{hex}" fill-opacity="0.14" stroke="{hex}" stroke-width="1.6" stroke-dasharray="5 4"/>"#));
         if centre[2] - self.table_z_m > radius_m {
             let (top, foot) = (self.camera.project(centre), self.camera.project(below));
-            let _ = write!(
-                self.ground,
-                "<path d=\"M{:.1} {:.1}L{:.1} {:.1}\" stroke=\"{hex}\" stroke-width=\"1.2\" stroke-dasharray=\"2 4\"/>",
-                foot.x, foot.y, top.x, top.y
-            );
+            self.ground.push_str(&format!(r#"<path d="M{:.1} {:.1}L{:.1} {:.1}" stroke="{hex}" stroke-width="1.2" stroke-dasharray="2 4"/>"#,
+                foot.x, foot.y, top.x, top.y));
         }
         let at = self.camera.project(centre);
         let drawn = format!(
-            "<circle cx=\"{:.1}\" cy=\"{:.1}\" r=\"{:.1}\" fill=\"{}\" fill-opacity=\"0.26\" stroke=\"{hex}\" \
-             stroke-opacity=\"0.75\" stroke-width=\"1.4\"/>",
+            r#"<circle cx="{:.1}" cy="{:.1}" r="{:.1}" fill="{}" fill-opacity="0.26" stroke="{hex}" stroke-opacity="0.75" stroke-width="1.4"/>"#,
             at.x,
             at.y,
             radius_m * at.scale,
@@ -206,14 +160,13 @@ impl Painter {
             high.y
         );
         let (side, lid) = (color.lit(0.75).hex(), color.lit(1.1).hex());
-        let drawn = format!(
-            "<path d=\"{bottom}{wall}\" fill=\"{side}\"/><path d=\"{top}\" fill=\"{lid}\"/>"
-        );
+        let drawn =
+            format!(r#"<path d="{bottom}{wall}" fill="{side}"/><path d="{top}" fill="{lid}"/>"#);
         // Its far rim: the arm stands on it.
         self.shapes.push((low.depth_m + radius_m, drawn));
         let shadow =
             self.circle_on_table([base[0] + 0.02, base[1] + 0.02, self.table_z_m], 1.1 * radius_m);
-        let _ = write!(self.shadows, "<path d=\"{shadow}\"/>");
+        self.shadows.push_str(&format!(r#"<path d="{shadow}"/>"#));
     }
 
     /// What `capsule` keeps the light from.
@@ -221,11 +174,8 @@ impl Painter {
         let [a, b] = [capsule.from, capsule.to]
             .map(|end| self.camera.project(self.shadow_point(end.map(f64::from))));
         let width = 1.7 * f64::from(capsule.radius_m) * 0.5 * (a.scale + b.scale);
-        let _ = write!(
-            self.shadows,
-            "<path d=\"M{:.1} {:.1}L{:.1} {:.1}\" stroke=\"#000\" stroke-width=\"{width:.1}\" stroke-linecap=\"round\"/>",
-            a.x, a.y, b.x, b.y
-        );
+        self.shadows.push_str(&format!(r##"<path d="M{:.1} {:.1}L{:.1} {:.1}" stroke="#000" stroke-width="{width:.1}" stroke-linecap="round"/>"##,
+            a.x, a.y, b.x, b.y));
     }
 
     /// What `cuboid` keeps the light from.
@@ -233,7 +183,7 @@ impl Painter {
         for (corners, _) in faces(cuboid) {
             let corners = corners.map(|corner| self.shadow_point(corner));
             let outline = self.outline(&corners);
-            let _ = write!(self.shadows, "<path d=\"{outline}\"/>");
+            self.shadows.push_str(&format!(r#"<path d="{outline}"/>"#));
         }
     }
 
@@ -249,7 +199,7 @@ impl Painter {
              <stop offset=\"1\" stop-color=\"#dfe5eb\"/></linearGradient><filter id=\"soft\" x=\"-5%\" y=\"-5%\" width=\"110%\" \
              height=\"110%\"><feGaussianBlur stdDeviation=\"4\"/></filter>{}</defs>\
              <rect width=\"100%\" height=\"100%\" fill=\"url(#sky)\"/>{}\
-             <g opacity=\"0.2\" filter=\"url(#soft)\">{}</g>{shapes}{caption}</svg>\n",
+             <g clip-path=\"url(#top)\"><g opacity=\"0.2\" filter=\"url(#soft)\">{}</g></g>{shapes}{caption}</svg>\n",
             self.definitions, self.ground, self.shadows
         )
     }
@@ -270,7 +220,7 @@ impl Painter {
         let mut outline = String::new();
         for (i, corner) in corners.iter().enumerate() {
             let at = self.camera.project(*corner);
-            let _ = write!(outline, "{}{:.1} {:.1}", if i == 0 { 'M' } else { 'L' }, at.x, at.y);
+            outline.push_str(&format!("{}{:.1} {:.1}", if i == 0 { 'M' } else { 'L' }, at.x, at.y));
         }
         outline.push('Z');
         outline
@@ -290,9 +240,7 @@ impl Painter {
         // In the picture the light comes from the upper left.
         let lit_side = if -0.6 * side[0] - 0.8 * side[1] >= 0.0 { 1.0 } else { -1.0 };
         let [dx, dy] = side.map(|x| lit_side * x);
-        let _ = write!(
-            self.definitions,
-            "<linearGradient id=\"{id}\" gradientUnits=\"userSpaceOnUse\" x1=\"{:.1}\" y1=\"{:.1}\" x2=\"{:.1}\" y2=\"{:.1}\">{}</linearGradient>",
+        self.definitions.push_str(&format!(r#"<linearGradient id="{id}" gradientUnits="userSpaceOnUse" x1="{:.1}" y1="{:.1}" x2="{:.1}" y2="{:.1}">{}</linearGradient>"#,
             axis.x + dx,
             axis.y + dy,
             axis.x - dx,
@@ -302,18 +250,16 @@ impl Painter {
                 (0.28, color.lit(1.5)),
                 (0.62, color.lit(0.9)),
                 (1.0, color.lit(0.6))
-            ])
-        );
+            ])));
         id
     }
 
     fn gradient_ball(&mut self, color: Rgb) -> String {
         let id = self.next_id();
-        let _ = write!(
-            self.definitions,
-            "<radialGradient id=\"{id}\" cx=\"0.36\" cy=\"0.3\" r=\"0.75\">{}</radialGradient>",
+        self.definitions.push_str(&format!(
+            r#"<radialGradient id="{id}" cx="0.36" cy="0.3" r="0.75">{}</radialGradient>"#,
             stops(&[(0.0, color.lit(1.45)), (0.45, color), (1.0, color.lit(0.58))])
-        );
+        ));
         id
     }
 
@@ -326,22 +272,15 @@ impl Painter {
 fn stops(stops: &[(f64, Rgb)]) -> String {
     stops
         .iter()
-        .map(|(offset, color)| {
-            format!("<stop offset=\"{offset}\" stop-color=\"{}\"/>", color.hex())
-        })
+        .map(|(offset, color)| format!(r#"<stop offset="{offset}" stop-color="{}"/>"#, color.hex()))
         .collect()
 }
 
 fn caption(text: &str) -> String {
     let text = text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;");
     format!(
-        "<text x=\"22\" y=\"34\" font-family=\"{FONT}\" font-size=\"16\" fill=\"#24292f\">{text}</text>"
+        r##"<text x="22" y="34" font-family="{FONT}" font-size="16" fill="#24292f">{text}</text>"##
     )
-}
-
-/// How bright a face with outward `normal` is, for [`Rgb::lit`].
-fn brightness(normal: Vec3) -> f64 {
-    0.66 + 0.46 * dot(normal, LIGHT).max(0.0)
 }
 
 /// The six faces of a box: corners in order round each, and outward normals.
@@ -366,6 +305,7 @@ fn faces(cuboid: &Cuboid) -> [([Vec3; 4], Vec3); 6] {
 
 #[cfg(test)]
 mod tests {
+    use super::super::camera::dot;
     use super::*;
 
     #[test]
@@ -382,12 +322,5 @@ mod tests {
             let distance_m = dot(outward, outward).sqrt();
             assert!((dot(outward, normal) - distance_m).abs() < 1e-6, "{outward:?} {normal:?}");
         }
-    }
-
-    #[test]
-    fn light_never_leaves_the_range_of_colours() {
-        assert_eq!(Rgb(200, 100, 0).lit(0.5), Rgb(100, 50, 0));
-        assert_eq!(Rgb(200, 100, 0).lit(2.0), Rgb(255, 255, 255));
-        assert_eq!(Rgb(200, 100, 0).lit(9.0), Rgb(255, 255, 255));
     }
 }

@@ -2,7 +2,7 @@
 
 use tandem_core::layout::EPISODE_STEPS;
 use tandem_core::reward::{REWARD_ACHIEVED, achieved_goal, distance, sparse_reward};
-use tandem_core::{ArmIndex, Layout, Stream, Task, episode_rng};
+use tandem_core::{ArmIndex, Contacts, Layout, Stream, Task, episode_rng};
 use tandem_sim::{Env, Starts, WorldConfig};
 
 /// Metres that an action of 1 asks for.
@@ -14,6 +14,8 @@ pub(crate) struct Played {
     pub(crate) success: bool,
     /// Largest distance of an object from its goal at the end, metres.
     pub(crate) miss_m: f32,
+    /// Everything that touched during the episode.
+    pub(crate) contacts: Contacts,
 }
 
 /// Plays `n_episodes` with one controller an arm, the controllers blind to each other.
@@ -25,34 +27,40 @@ pub(crate) fn play(layout: Layout, config: &WorldConfig, n_episodes: u64) -> Vec
         .map(|episode| {
             env.reset(&mut episode_rng(11, episode, Stream::Reset), Starts::default());
             let mut controllers = vec![Controller::new(layout.task); layout.n_arms];
+            let mut contacts = Contacts::NONE;
             for _ in 0..EPISODE_STEPS {
                 env.observe(&mut observation);
                 for (arm, controller) in layout.arms().zip(&mut controllers) {
-                    let (seen, goal) = (&observation[layout.observation_of(arm)], &env.goal()[layout.goal_of(arm)]);
+                    let (seen, goal) = (
+                        &observation[layout.observation_of(arm)],
+                        &env.goal()[layout.goal_of(arm)],
+                    );
                     let inputs = controller.act(seen, goal);
                     let part = &mut action[layout.action_of(arm)];
                     part.copy_from_slice(&inputs[..part.len()]);
                 }
-                env.step(&action).unwrap();
+                contacts = contacts | env.step(&action).unwrap();
             }
             env.observe(&mut observation);
-            outcome(layout, &observation, env.goal())
+            outcome(layout, &observation, env.goal(), contacts)
         })
         .collect()
 }
 
 /// Share of successes.
 pub(crate) fn success_rate(episodes: &[Played]) -> f64 {
-    let n_successes = u32::try_from(episodes.iter().filter(|played| played.success).count()).unwrap();
+    let n_successes =
+        u32::try_from(episodes.iter().filter(|played| played.success).count()).unwrap();
     f64::from(n_successes) / f64::from(u32::try_from(episodes.len()).unwrap())
 }
 
-fn outcome(layout: Layout, observation: &[f32], goal: &[f32]) -> Played {
+fn outcome(layout: Layout, observation: &[f32], goal: &[f32], contacts: Contacts) -> Played {
     let achieved: Vec<f32> = achieved_goal(layout, observation).collect();
     let of = |arm: ArmIndex| (&achieved[layout.goal_of(arm)], &goal[layout.goal_of(arm)]);
     Played {
         success: layout.arms().all(|arm| sparse_reward(of(arm).0, of(arm).1) == REWARD_ACHIEVED),
         miss_m: layout.arms().map(|arm| distance(of(arm).0, of(arm).1)).fold(0.0, f32::max),
+        contacts,
     }
 }
 
@@ -141,8 +149,8 @@ impl Controller {
                 if advance_m > -0.012 || length(lateral) > 0.022 {
                     self.phase = Phase::Leave;
                 }
-                let ahead_m =
-                    (distance_m * 0.5).clamp(0.005, 0.022) * (1.0 - length(lateral) / 0.03).max(0.25);
+                let ahead_m = (distance_m * 0.5).clamp(0.005, 0.022)
+                    * (1.0 - length(lateral) / 0.03).max(0.25);
                 let target = |axis: usize| hand[axis] + along[axis] * ahead_m - lateral[axis] * 0.4;
                 towards(hand, [target(0), target(1), PUSH_Z_M], 1.3, 0.0)
             }
@@ -163,7 +171,13 @@ impl Controller {
     }
 
     /// Over the object, never through it, to 7 cm behind it as seen from the goal.
-    fn get_behind(&mut self, hand: [f32; 3], object: [f32; 3], along: Flat, behind: Flat) -> [f32; 4] {
+    fn get_behind(
+        &mut self,
+        hand: [f32; 3],
+        object: [f32; 3],
+        along: Flat,
+        behind: Flat,
+    ) -> [f32; 4] {
         let target = [object[0] - along[0] * 0.07, object[1] - along[1] * 0.07];
         let off = length([target[0] - hand[0], target[1] - hand[1]]);
         if off < 0.012 && hand[2] < PUSH_Z_M + 0.012 {

@@ -80,7 +80,7 @@ impl Account {
         for episode in episodes {
             if let Some(lease) = self.leases.get_mut(episode).filter(|lease| !lease.settled) {
                 lease.settled = true;
-                self.leased -= u64::from(lease.units);
+                self.leased -= u64::from(lease.units - lease.spent);
             }
         }
     }

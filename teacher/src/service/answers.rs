@@ -15,7 +15,7 @@ use super::status;
 use crate::advisor::{Advice, Advisor};
 use crate::error::Error;
 
-/// Steps of two arms that are answered within some 500 microseconds, on the spot; more are computed on a thread for
+/// Steps answered on the spot, for two arms within some 250 microseconds; more are computed on a thread for
 /// blocking work.
 const MAX_STEPS_ON_THE_SPOT: usize = 8;
 

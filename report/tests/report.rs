@@ -1,0 +1,181 @@
+//! Pictures and pages: well-formed, complete, and not to be broken by names or numbers.
+#![expect(clippy::unwrap_used, reason = "a test that cannot go on may end")]
+
+use std::path::Path;
+
+use tandem_report::{
+    Axis, CurveOptions, CurvePoint, Quantity, Run, Series, View, comparison_html, curve_svg,
+    run_report_html, scene_svg,
+};
+use tandem_telemetry::{MetricsLog, MetricsRow};
+
+#[path = "../../telemetry/tests/support/synthetic.rs"]
+#[expect(dead_code, reason = "only the scene is drawn")]
+mod synthetic;
+
+/// Fails unless every tag is closed by its own, `&` begins an entity, and no number is NaN or infinite.
+fn assert_well_formed(xml: &str) {
+    let mut open = Vec::new();
+    for (position, _) in xml.match_indices('<') {
+        let tag =
+            &xml[position + 1..position + xml[position..].find('>').expect("an unfinished tag")];
+        let name = |tag: &str| tag.split_whitespace().next().unwrap_or_default().to_owned();
+        match tag.strip_prefix('/') {
+            Some(closed) => assert_eq!(open.pop(), Some(name(closed))),
+            None if tag.ends_with('/') || tag.starts_with('!') || tag.starts_with('?') => {}
+            None => open.push(name(tag)),
+        }
+        assert_eq!(tag.matches('"').count() % 2, 0, "{tag}");
+    }
+    assert!(open.is_empty(), "never closed: {open:?}");
+    for (position, _) in xml.match_indices('&') {
+        assert!(
+            ["&amp;", "&lt;", "&gt;", "&quot;", "&apos;", "&#"]
+                .iter()
+                .any(|entity| xml[position..].starts_with(entity))
+        );
+    }
+    assert!(
+        !xml.contains("NaN") && !xml.contains("inf\"") && !xml.contains("inf "),
+        "a number is not finite"
+    );
+}
+
+/// An evaluation in which `n_hits` of 240 episodes succeeded.
+fn row(round: u32, n_hits: u8) -> MetricsRow {
+    let success = f64::from(n_hits) / 240.0;
+    let interval = tandem_core::Wilson::of(usize::from(n_hits), 240);
+    MetricsRow {
+        round: u64::from(round),
+        env_steps: u64::from(round) * 1600,
+        wall_s: 60.0 * f64::from(round),
+        paper_epochs: f64::from(round) / 50.0,
+        success,
+        success_low: interval.low,
+        success_high: interval.high,
+        success_per_arm: vec![success, success],
+        mean_q: -5.0,
+        n_episodes: 240,
+        ..MetricsRow::default()
+    }
+}
+
+fn run_dir(rows: &[MetricsRow]) -> tempfile::TempDir {
+    let dir = tempfile::tempdir().unwrap();
+    let mut log = MetricsLog::open(&dir.path().join("metrics.jsonl")).unwrap();
+    rows.iter().for_each(|row| log.append(row).unwrap());
+    dir
+}
+
+#[test]
+fn several_curves_have_their_bands_and_a_legend() {
+    let rows = [row(0, 0), row(10, 120), row(20, 216)];
+    let series = ["none", "mc-q:0.1 <&>"]
+        .map(|name| Series::of(name, &rows, Axis::EnvSteps, Quantity::Success));
+    let svg = curve_svg(&series, &CurveOptions::shares("Two arms push", Axis::EnvSteps)).unwrap();
+    assert_well_formed(&svg);
+    assert_eq!(svg.matches("<polygon").count(), 2, "a band each");
+    for text in
+        ["Two arms push", "none", "mc-q:0.1 &lt;&amp;&gt;", "environment steps", "100 %", "20k"]
+    {
+        assert!(svg.contains(text), "{text}");
+    }
+}
+
+#[test]
+fn a_single_curve_has_no_legend_and_nothing_at_all_is_drawn_too() {
+    let point = CurvePoint { x: 1.0, y: -2.0, band: None };
+    let check = |points: Vec<CurvePoint>| {
+        let series = [Series { name: "hidden".to_owned(), points }];
+        let svg = curve_svg(&series, &CurveOptions::figures("Mean Q", Axis::Updates)).unwrap();
+        assert_well_formed(&svg);
+        assert!(!svg.contains("hidden") && svg.contains("Mean Q") && svg.contains("updates"));
+    };
+    check(Vec::new());
+    check(vec![point]);
+    check(vec![point, CurvePoint { x: 2.0, ..point }]);
+}
+
+#[test]
+fn curves_can_be_drawn_against_every_axis() {
+    let rows = [row(10, 120)];
+    let x = |axis| Series::of("", &rows, axis, Quantity::Success).points[0].x;
+    assert_eq!(
+        [Axis::EnvSteps, Axis::Updates, Axis::Minutes, Axis::PaperEpochs].map(x),
+        [16_000.0, 0.0, 10.0, 0.2]
+    );
+}
+
+#[test]
+fn a_scene_shows_every_body_from_every_side() {
+    let scene = synthetic::scene(0.5);
+    let n_joints: usize = scene.arms.iter().map(|arm| arm.links.len() - 1).sum();
+    for azimuth_deg in [-150.0, -60.0, 0.0, 60.0, 150.0] {
+        let view =
+            View { azimuth_deg, caption: Some("left & right".to_owned()), ..View::default() };
+        let svg = scene_svg(&scene, &view);
+        assert_well_formed(&svg);
+        assert_eq!(svg.matches("<circle").count(), n_joints + scene.goals.len());
+        assert_eq!(svg.matches("<linearGradient").count(), 1 + 8, "the sky and each link");
+        assert!(svg.contains("left &amp; right"));
+    }
+}
+
+#[test]
+fn what_stands_in_front_is_drawn_last() {
+    // The fill of the first face drawn, with the first object at `y` and the second behind or before it.
+    let first_fill = |y: f32| {
+        let mut scene = synthetic::scene(0.5);
+        (scene.arms, scene.goals) = (Vec::new(), Vec::new());
+        (scene.objects[0].centre, scene.objects[1].centre) = ([0.0, y, 0.02], [0.0, -y, 0.02]);
+        let svg = scene_svg(&scene, &View { azimuth_deg: 0.0, ..View::default() });
+        let shapes = svg.split("</g></g>").last().unwrap();
+        shapes.split("fill=\"").nth(1).unwrap()[..7].to_owned()
+    };
+    let (blue_in_front, orange_in_front) = (first_fill(-0.2), first_fill(0.2));
+    let red = |color: &str| u8::from_str_radix(&color[1..3], 16).unwrap();
+    assert!(red(&blue_in_front) > red(&orange_in_front), "{blue_in_front} {orange_in_front}");
+}
+
+#[test]
+fn a_runs_page_needs_nothing_but_itself() {
+    let dir = run_dir(&[row(0, 0), row(5, 60), row(10, 225)]);
+    std::fs::write(dir.path().join("run.toml"), "name = \"<push>\"\n").unwrap();
+    let path = run_report_html(dir.path()).unwrap();
+    assert_eq!(path, dir.path().join("report.html"));
+    let page = std::fs::read_to_string(path).unwrap();
+    assert_eq!(page.matches("<svg").count(), 4);
+    for text in [
+        "93.8 %",
+        "16,000",
+        "Mean Q",
+        "Advice spent",
+        "Episodes with contact",
+        "name = &quot;&lt;push&gt;&quot;",
+    ] {
+        assert!(page.contains(text), "{text}");
+    }
+    for reference in ["<script", "<link", "src=", "@import", "url(http"] {
+        assert!(!page.contains(reference), "{reference}");
+    }
+}
+
+#[test]
+fn a_run_without_an_evaluation_has_a_page_too() {
+    let dir = run_dir(&[]);
+    let page = std::fs::read_to_string(run_report_html(dir.path()).unwrap()).unwrap();
+    assert!(page.contains("No evaluation yet"));
+    assert!(run_report_html(Path::new("/nowhere")).is_err());
+}
+
+#[test]
+fn runs_are_set_side_by_side() {
+    let (a, b) = (run_dir(&[row(0, 0), row(5, 120)]), run_dir(&[row(0, 0)]));
+    let runs = [a.path(), b.path()].map(|dir| Run::load(dir).unwrap());
+    let path = a.path().join("comparison.html");
+    comparison_html(&runs, &path).unwrap();
+    let page = std::fs::read_to_string(path).unwrap();
+    for run in &runs {
+        assert!(page.matches(&run.name).count() >= 4, "{} in the table and every legend", run.name);
+    }
+}

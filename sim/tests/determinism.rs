@@ -1,0 +1,132 @@
+//! The same draws and actions give the same bits.
+
+use std::thread;
+
+use tandem_core::rng::uniform;
+use tandem_core::{Contacts, Layout, Stream, Task, episode_rng};
+use tandem_sim::{Env, SimError, Starts, WorldConfig};
+
+const STARTS: Starts = Starts { gripped_share: 0.3, wide_share: 0.3 };
+
+/// Every observation's bits, and the contacts, of one episode of held random actions.
+fn trace(env: &mut Env, episode: u64) -> (Vec<u32>, Vec<Contacts>) {
+    let layout = env.layout();
+    env.reset(&mut episode_rng(5, episode, Stream::Reset), STARTS);
+    let mut exploration = episode_rng(5, episode, Stream::Exploration);
+    let mut observation = vec![0.0; layout.n_observation()];
+    let mut action = vec![0.0; layout.n_action()];
+    let (mut bits, mut contacts) = (Vec::new(), Vec::new());
+    for step in 0..50 {
+        if step % 4 == 0 {
+            action.fill_with(|| uniform(&mut exploration, -1.0, 1.0));
+        }
+        contacts.push(env.step(&action).unwrap());
+        env.observe(&mut observation);
+        bits.extend(observation.iter().map(|value| value.to_bits()));
+    }
+    bits.extend(env.goal().iter().map(|value| value.to_bits()));
+    (bits, contacts)
+}
+
+fn new_env(layout: Layout) -> Env {
+    Env::new(layout, &WorldConfig::default()).unwrap()
+}
+
+fn layouts() -> impl Iterator<Item = Layout> {
+    Task::ALL.into_iter().flat_map(|task| [1, 2].map(|n_arms| Layout::new(task, n_arms)))
+}
+
+#[test]
+fn an_episode_is_a_function_of_its_draws_and_actions() {
+    for layout in layouts() {
+        let fresh = trace(&mut new_env(layout), 3);
+        let mut used = new_env(layout);
+        for other in [8, 9, 3, 10] {
+            let traced = trace(&mut used, other);
+            assert_eq!(traced == fresh, other == 3, "{layout:?}, episode {other}");
+        }
+        assert!(trace(&mut used.clone(), 3) == fresh, "{layout:?}: a clone went another way");
+        assert!(trace(&mut used, 3) == fresh, "{layout:?}: what came before entered");
+    }
+}
+
+#[test]
+fn threads_change_nothing() {
+    let layout = Layout::new(Task::PickAndPlace, 2);
+    let prototype = new_env(layout);
+    let alone: Vec<_> = (0..4).map(|episode| trace(&mut prototype.clone(), episode)).collect();
+    let prototype = &prototype;
+    let together: Vec<_> = thread::scope(|scope| {
+        let runs: Vec<_> = (0..4)
+            .map(|episode| scope.spawn(move || trace(&mut prototype.clone(), episode)))
+            .collect();
+        runs.into_iter().map(|run| run.join().unwrap()).collect()
+    });
+    assert!(alone == together);
+}
+
+#[test]
+fn looking_changes_nothing() {
+    for layout in layouts() {
+        let run = |look: bool| {
+            let mut env = new_env(layout);
+            env.reset(&mut episode_rng(1, 1, Stream::Reset), Starts::default());
+            let action = vec![0.7; layout.n_action()];
+            for _ in 0..20 {
+                if look {
+                    assert_eq!(env.scene(), env.scene());
+                }
+                env.step(&action).unwrap();
+            }
+            env.scene()
+        };
+        assert_eq!(run(true), run(false));
+    }
+}
+
+#[test]
+fn a_hundred_thousand_random_steps_stay_finite() {
+    thread::scope(|scope| {
+        for layout in layouts() {
+            scope.spawn(move || {
+                let mut env = new_env(layout);
+                for episode in 100..600 {
+                    let (bits, _) = trace(&mut env, episode);
+                    let in_bounds = bits.iter().all(|bits| f32::from_bits(*bits).abs() < 25.0);
+                    assert!(in_bounds, "{layout:?}, episode {episode}");
+                }
+            });
+        }
+    });
+}
+
+#[test]
+fn bad_actions_are_named_and_change_nothing() {
+    let layout = Layout::new(Task::PickAndPlace, 1);
+    let mut env = new_env(layout);
+    env.reset(&mut episode_rng(1, 1, Stream::Reset), Starts::default());
+    let before = env.scene();
+    assert_eq!(env.step(&[0.0; 3]), Err(SimError::ActionLength { got: 3, expected: 4 }));
+    let error = env.step(&[0.0, f32::INFINITY, 0.0, 0.0]).unwrap_err();
+    assert_eq!(error.to_string(), "action[1] is inf");
+    assert_eq!(env.scene(), before);
+    assert!(matches!(
+        Env::new(Layout::new(Task::Push, 3), &WorldConfig::default()),
+        Err(SimError::Arms(3))
+    ));
+    assert!(matches!(
+        Env::new(Layout::new(Task::Push, 0), &WorldConfig::default()),
+        Err(SimError::Arms(0))
+    ));
+}
+
+#[test]
+fn actions_are_cut_to_one() {
+    let run = |size: f32| {
+        let mut env = new_env(Layout::new(Task::PickAndPlace, 1));
+        env.reset(&mut episode_rng(1, 1, Stream::Reset), Starts::default());
+        env.step(&[size, -size, size, -size]).unwrap();
+        env.scene()
+    };
+    assert_eq!(run(1.0), run(7.0));
+}
