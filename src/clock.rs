@@ -1,7 +1,7 @@
 //! The program's only clock.
 
 use std::sync::Arc;
-use std::time::{Duration, Instant};
+use std::time::{Duration, Instant, SystemTime};
 
 /// The time since this function was called, for those who take time as an argument.
 pub(crate) fn since_now() -> Arc<dyn Fn() -> Duration + Send + Sync> {
@@ -13,4 +13,11 @@ pub(crate) fn since_now() -> Arc<dyn Fn() -> Duration + Send + Sync> {
 #[expect(clippy::disallowed_methods, reason = "the clock")]
 pub(crate) fn now() -> Instant {
     Instant::now()
+}
+
+/// Milliseconds since 1970: another number at every start.
+#[expect(clippy::disallowed_methods, reason = "the clock")]
+pub(crate) fn unix_millis() -> u64 {
+    let since = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default();
+    u64::try_from(since.as_millis()).unwrap_or_default()
 }

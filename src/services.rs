@@ -56,7 +56,7 @@ pub(crate) fn learner(args: LearnerArgs) -> Result<(), Failed> {
             n_threads: usize::from(args.threads),
             clock: clock::since_now(),
             version: VERSION.to_owned(),
-            first_worker: u64::from(std::process::id()) << 20,
+            first_worker: clock::unix_millis() << 12,
         };
         let ended =
             tandem_learner::serve(config, listener, shutdown).await.map_err(learner_failed)?;
@@ -77,7 +77,7 @@ pub(crate) fn worker(args: WorkerArgs) -> Result<(), Failed> {
             name: args.name,
             log_dir: args.log_dir,
         };
-        tandem_worker::run(config, shutdown).await.or_exit(Exit::TryAgain, String::new)
+        tandem_worker::run(config, shutdown).await.map_err(worker_failed)
     })
 }
 
@@ -112,6 +112,16 @@ async fn listen(args: &ListenArgs) -> Result<TcpListener, Failed> {
         bind.await.or_exit(Exit::TryAgain, || format!("cannot listen on {}", args.listen))?;
     println!("listening on {address}");
     Ok(listener)
+}
+
+fn worker_failed(error: tandem_worker::Error) -> Failed {
+    use tandem_worker::Error as E;
+    let exit = match error {
+        E::Address { .. } | E::NoTeacher { .. } => Exit::Usage,
+        E::Rollout { .. } | E::Panicked(_) | E::NoAccount { .. } => Exit::Bug,
+        E::Protocol { .. } | E::Parameters { .. } => Exit::TryAgain,
+    };
+    Failed::new(exit, error)
 }
 
 fn learner_failed(error: LearnerError) -> Failed {

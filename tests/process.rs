@@ -56,7 +56,8 @@ fn signal(signal: &str, pid: u32) {
 
 /// The process numbers of a run's processes whose command line has `role` as its first argument.
 fn pids(parent: u32, role: &str) -> Vec<u32> {
-    let children = fs::read_to_string(format!("/proc/{parent}/task/{parent}/children")).unwrap_or_default();
+    let children =
+        fs::read_to_string(format!("/proc/{parent}/task/{parent}/children")).unwrap_or_default();
     let is_role = |pid: &u32| {
         let line = fs::read_to_string(format!("/proc/{pid}/cmdline")).unwrap_or_default();
         line.split('\0').nth(1) == Some(role)
@@ -66,14 +67,21 @@ fn pids(parent: u32, role: &str) -> Vec<u32> {
 
 /// Waits until the run directory holds a checkpoint: the run is then in full swing.
 fn wait_for_checkpoint(out: &Path) {
-    for _ in 0..1200 {
+    let is_saved = || {
         let saved = fs::read_dir(out.join("checkpoint")).into_iter().flatten().flatten();
-        if saved.map(|entry| entry.path()).any(|path| path.extension().is_some_and(|e| e == "safetensors")) {
-            return;
-        }
+        saved
+            .map(|entry| entry.path())
+            .any(|path| path.extension().is_some_and(|e| e == "safetensors"))
+    };
+    assert!(eventually(is_saved), "no checkpoint within a minute in {}", out.display());
+}
+
+/// Looks every 50 ms for a minute whether something has come true.
+fn eventually(holds: impl Fn() -> bool) -> bool {
+    (0..1200).any(|_| {
         std::thread::sleep(Duration::from_millis(50));
-    }
-    panic!("no checkpoint within a minute in {}", out.display());
+        holds()
+    })
 }
 
 fn directory() -> (TempDir, PathBuf) {
@@ -106,7 +114,8 @@ fn a_disturbed_run_ends_with_the_bits_of_a_calm_one() {
     assert_eq!(interrupted.status.code(), Some(130));
     let told = String::from_utf8_lossy(&interrupted.stderr).into_owned();
     assert!(told.contains("tandem train --resume --out"), "{told}");
-    let resumed = tandem(&["train", "--json", "--resume", "--workers", "2"], &out).output().expect("runs");
+    let resumed =
+        tandem(&["train", "--json", "--resume", "--workers", "2"], &out).output().expect("runs");
     assert_eq!(digest(&resumed), calm, "interrupted and resumed");
 }
 
@@ -118,17 +127,11 @@ fn children_end_with_their_parent_however_it_dies() {
     let learner = pids(run.id(), "learner")[0];
     signal("-KILL", run.id());
     run.wait().expect("is gone");
-    let is_running = || {
+    let is_gone = || {
         let state = fs::read_to_string(format!("/proc/{learner}/stat")).unwrap_or_default();
-        !state.is_empty() && !state.contains(") Z ")
+        state.is_empty() || state.contains(") Z ")
     };
-    for _ in 0..400 {
-        if !is_running() {
-            return;
-        }
-        std::thread::sleep(Duration::from_millis(50));
-    }
-    panic!("the learner outlives its parent");
+    assert!(eventually(is_gone), "the learner outlives its parent");
 }
 
 #[test]
@@ -147,7 +150,15 @@ fn services_say_where_they_listen_and_end_on_sigterm() {
     let address = line.trim().strip_prefix("listening on ").expect("the line").to_owned();
     assert!(std::net::TcpStream::connect(&address).is_ok(), "{address}");
     let taken = Command::new(env!("CARGO_BIN_EXE_tandem"))
-        .args(["learner", "--run", "no-such-run.toml", "--out", "/nonexistent", "--listen", &address])
+        .args([
+            "learner",
+            "--run",
+            "no-such-run.toml",
+            "--out",
+            "/nonexistent",
+            "--listen",
+            &address,
+        ])
         .output()
         .expect("runs");
     assert_eq!(taken.status.code(), Some(64), "a missing run file comes before a taken port");

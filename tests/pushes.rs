@@ -25,16 +25,19 @@ fn episodes(name: &str) -> Vec<Episode> {
     let policy = Policy::load(&path).expect("ships");
     let actor = policy.actor().expect("whole");
     let n_threads = std::thread::available_parallelism().unwrap_or(NonZeroUsize::MIN);
-    evaluate(|| actor.clone(), policy.layout, &WorldConfig::default(), N_EPISODES, SEED, n_threads).expect("finite")
+    evaluate(|| actor.clone(), policy.layout, &WorldConfig::default(), N_EPISODES, SEED, n_threads)
+        .expect("finite")
 }
 
 /// Of the steps in which the object moves: how many, and in how many the hand is above it.
 fn moving_steps(episode: &Episode) -> (usize, usize) {
     let position = |step_idx: usize| &episode.observation(step_idx)[3..6];
-    let moving = (0..EPISODE_STEPS).filter(|step| distance(position(*step), position(step + 1)) > MOVES_M);
+    let moving =
+        (0..EPISODE_STEPS).filter(|step| distance(position(*step), position(step + 1)) > MOVES_M);
     moving.fold((0, 0), |(n_moving, n_above), step| {
         let offset = &episode.observation(step)[6..9];
-        let is_above = offset[0].abs() < HALF_M && offset[1].abs() < HALF_M && -offset[2] > 0.5 * HALF_M;
+        let is_above =
+            offset[0].abs() < HALF_M && offset[1].abs() < HALF_M && -offset[2] > 0.5 * HALF_M;
         (n_moving + 1, n_above + usize::from(is_above))
     })
 }
@@ -42,7 +45,8 @@ fn moving_steps(episode: &Episode) -> (usize, usize) {
 /// Whether the object's own vertical is ever more than 45 degrees off every axis it could rest on.
 fn tips(episode: &Episode) -> bool {
     (0..=EPISODE_STEPS).any(|step| {
-        let [x, y, z, w]: [f32; 4] = episode.observation(step)[12..16].try_into().expect("a quaternion");
+        let [x, y, z, w]: [f32; 4] =
+            episode.observation(step)[12..16].try_into().expect("a quaternion");
         let up = [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)];
         up.iter().all(|component| component.abs() < TIPPED_COSINE)
     })
@@ -53,12 +57,22 @@ fn the_shipped_push_teacher_pushes() {
     let episodes = episodes("teacher-push.safetensors");
     let outcomes: Vec<EpisodeOutcome> = episodes.iter().map(EpisodeOutcome::of).collect();
     let success = EvaluationSummary::of(&outcomes).success;
-    let (n_moving, n_above) = episodes.iter().map(moving_steps).fold((0, 0), |a, b| (a.0 + b.0, a.1 + b.1));
+    let (n_moving, n_above) =
+        episodes.iter().map(moving_steps).fold((0, 0), |a, b| (a.0 + b.0, a.1 + b.1));
     let share_above = n_above as f64 / n_moving as f64;
     let n_tipping = episodes.iter().filter(|episode| tips(episode)).count();
-    println!("success {success:.3}, above the cube in {share_above:.3} of {n_moving} moving steps, tipping in {n_tipping}");
+    println!(
+        "success {success:.3}, above the cube in {share_above:.3} of {n_moving} moving steps, tipping in {n_tipping}"
+    );
     assert!(success >= 0.95, "success {success}");
     assert!(n_moving > 1000, "hardly anything moves");
-    assert!(share_above < 0.25, "the hand is above the cube in {share_above:.2} of the steps in which it moves");
-    assert!(n_tipping * 10 < episodes.len(), "the cube tips in {n_tipping} of {} episodes", episodes.len());
+    assert!(
+        share_above < 0.25,
+        "the hand is above the cube in {share_above:.2} of the steps in which it moves"
+    );
+    assert!(
+        n_tipping * 10 < episodes.len(),
+        "the cube tips in {n_tipping} of {} episodes",
+        episodes.len()
+    );
 }

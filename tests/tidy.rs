@@ -76,7 +76,7 @@ fn rust_files(path: &Path) -> Vec<PathBuf> {
     if path.is_file() {
         return vec![path.to_owned()];
     }
-    let entries = fs::read_dir(path).unwrap_or_else(|error| panic!("{}: {error}", path.display()));
+    let entries = fs::read_dir(path).expect("a directory of sources");
     let below = entries.flatten().map(|entry| entry.path());
     below
         .filter(|path| path.is_dir() || path.extension().is_some_and(|e| e == "rs"))
@@ -87,8 +87,7 @@ fn rust_files(path: &Path) -> Vec<PathBuf> {
 /// Names in the `[dependencies]` table of a crate's manifest.
 fn dependencies(crate_dir: &str) -> BTreeSet<String> {
     let manifest = root().join(crate_dir).join("Cargo.toml");
-    let text = fs::read_to_string(&manifest)
-        .unwrap_or_else(|error| panic!("{}: {error}", manifest.display()));
+    let text = fs::read_to_string(&manifest).expect("a manifest");
     text.lines()
         .skip_while(|line| line.trim() != "[dependencies]")
         .skip(1)

@@ -45,6 +45,17 @@ pub struct Worker {
     pub slot: Option<u64>,
 }
 
+/// A worker that counts as dead.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Silent {
+    /// Its number.
+    pub worker_id: u64,
+    /// Its label.
+    pub name: String,
+    /// How many of its slots are given to others.
+    pub n_slots: usize,
+}
+
 /// Why a worker's episodes are not taken.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum SubmitError {
@@ -162,7 +173,7 @@ impl Board {
     }
 
     /// Puts the slots of silent workers back at the head of the queue; gives the workers that fell silent.
-    pub fn reclaim(&mut self, now: Duration) -> Vec<u64> {
+    pub fn reclaim(&mut self, now: Duration) -> Vec<Silent> {
         let is_silent = |worker: &Worker| now.saturating_sub(worker.heard_at) >= SILENT_AFTER;
         let silent: Vec<u64> = self
             .workers
@@ -170,20 +181,22 @@ impl Board {
             .filter(|(_, worker)| is_silent(worker))
             .map(|(id, _)| *id)
             .collect();
+        let mut fell_silent = Vec::new();
         for id in &silent {
-            self.workers.remove(id);
+            let name = self.workers.remove(id).map(|worker| worker.name).unwrap_or_default();
             let theirs: Vec<u64> = self
                 .out
                 .iter()
                 .filter(|(_, out)| out.worker == *id)
                 .map(|(slot, _)| *slot)
                 .collect();
+            fell_silent.push(Silent { worker_id: *id, name, n_slots: theirs.len() });
             for slot in theirs {
                 self.waiting.extend(self.out.remove(&slot).map(|out| out.order));
             }
         }
         self.waiting.make_contiguous().sort_by_key(|order| order.slot);
-        silent
+        fell_silent
     }
 
     /// Whether every slot of `kind` played with `version` is in.
@@ -276,7 +289,8 @@ mod tests {
         let (mut board, a2, b2) = board_of(1);
         assert_eq!(board.next(a2, at(0)).expect("joined").expect("a slot").slot, slot);
         board.next(b2, at(2)).expect("joined");
-        assert_eq!(board.reclaim(at(16)), [a2]);
+        let silent = Silent { worker_id: a2, name: "a".into(), n_slots: 1 };
+        assert_eq!(board.reclaim(at(16)), [silent]);
         assert_eq!(board.next(a2, at(16)), Err(SubmitError::UnknownWorker(a2)));
         assert_eq!(board.next(b2, at(16)).expect("joined").expect("the slot").slot, slot);
         assert_eq!(a, a2);

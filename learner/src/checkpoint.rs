@@ -56,7 +56,8 @@ pub enum CheckpointError {
     Config(#[from] ConfigError),
 }
 
-/// Writes a checkpoint into `directory` and removes all but the newest `keep`. Gives its path.
+/// Writes a checkpoint into `directory` and removes all but the newest `keep`. Gives its path and
+/// the digest of the state.
 ///
 /// # Errors
 /// When the file system refuses; former checkpoints are then untouched.
@@ -65,7 +66,7 @@ pub fn save(
     trainer: &Trainer,
     resumption: &Resumption,
     keep: usize,
-) -> Result<PathBuf, CheckpointError> {
+) -> Result<(PathBuf, String), CheckpointError> {
     let path = directory.join(format!("{:08}.safetensors", trainer.counters().round));
     let unfinished = path.with_extension("tmp");
     let io = |action: &'static str, path: &Path| {
@@ -82,7 +83,8 @@ pub fn save(
     );
     tensors.push(view("replay.advised_arms", Dtype::U8, &parts.advised_arms));
     tensors.push(view("replay.moved", Dtype::U8, &parts.moved));
-    let metadata = metadata(trainer, resumption).into_iter().collect();
+    let digest = trainer.digest();
+    let metadata = metadata(trainer, resumption, &digest).into_iter().collect();
     let written = safetensors::serialize_to_file(tensors, Some(metadata), &unfinished)
         .map_err(|error| io("write", &path)(std::io::Error::other(error)))
         .and_then(|()| sync(&unfinished).map_err(io("write", &path)))
@@ -95,7 +97,7 @@ pub fn save(
     for old in former.iter().rev().skip(keep) {
         fs::remove_file(old).map_err(io("remove the old", old))?;
     }
-    Ok(path)
+    Ok((path, digest))
 }
 
 /// The checkpoints in `directory`, oldest first.
@@ -174,11 +176,11 @@ impl Reader<'_> {
 
     fn number<T: std::str::FromStr>(&self, key: &str) -> Result<T, String> {
         let text = self.text(key)?;
-        text.parse().map_err(|_| format!("{key:?} is {text:?}, not a number"))
+        text.parse().ok().ok_or_else(|| format!("{key:?} is {text:?}, not a number"))
     }
 
     fn bytes(&self, name: &str, dtype: Dtype) -> Result<&[u8], String> {
-        let tensor = self.tensors.tensor(name).map_err(|_| format!("no tensor {name:?}"))?;
+        let tensor = self.tensors.tensor(name).map_err(|error| error.to_string())?;
         if tensor.dtype() == dtype {
             Ok(tensor.data())
         } else {
@@ -254,12 +256,12 @@ impl Reader<'_> {
     }
 }
 
-fn metadata(trainer: &Trainer, resumption: &Resumption) -> BTreeMap<String, String> {
+fn metadata(trainer: &Trainer, resumption: &Resumption, digest: &str) -> BTreeMap<String, String> {
     let Counters { round, env_steps, episodes, updates, advice_spent } = trainer.counters();
     let (_, next) = trainer.replay.parts();
     let entries = [
         ("format", FORMAT.to_owned()),
-        ("digest", trainer.digest()),
+        ("digest", digest.to_owned()),
         ("round", round.to_string()),
         ("env_steps", env_steps.to_string()),
         ("episodes", episodes.to_string()),

@@ -291,16 +291,16 @@ impl RunConfig {
     /// Names the first setting that cannot be used and what it may be.
     pub fn checked(self) -> Result<Self, ConfigError> {
         let layout = self.layout()?;
-        check("arms", self.arms, (1..=2).contains(&layout.n_arms), "1 or 2")?;
+        check("arms", &self.arms, (1..=2).contains(&layout.n_arms), "1 or 2")?;
         check(
             "name",
-            &self.name,
+            &&self.name,
             is_name(&self.name),
             "1 to 100 letters, digits, '-', '_' or '.'",
         )?;
         check(
             "seed",
-            self.seed,
+            &self.seed,
             self.seed != self.evaluation.seed,
             "another than evaluation.seed",
         )?;
@@ -314,19 +314,19 @@ impl RunConfig {
             ("stop.until_success", self.stop.until_success),
         ];
         for (key, share) in shares {
-            check(key, share, (0.0..=1.0).contains(&share), "a number in [0, 1]")?;
+            check(key, &share, (0.0..=1.0).contains(&share), "a number in [0, 1]")?;
         }
         self.check_rounds()?;
         self.check_exploration()?;
         check(
             "stop.max_minutes",
-            self.stop.max_minutes,
+            &self.stop.max_minutes,
             self.stop.max_minutes >= 0.0,
             "0 (never) or more",
         )?;
         check(
             "advice.budget",
-            self.advice.budget,
+            &self.advice.budget,
             self.advice.budget <= 1_000_000_000_000,
             "at most 10^12",
         )?;
@@ -340,48 +340,53 @@ impl RunConfig {
 
     fn check_rounds(&self) -> Result<(), ConfigError> {
         let (rounds, evaluation) = (&self.rounds, &self.evaluation);
-        check("rounds.slots", rounds.slots, (1..=4096).contains(&rounds.slots), "1 to 4096")?;
-        check("rounds.rollouts", rounds.rollouts, (1..=64).contains(&rounds.rollouts), "1 to 64")?;
-        check("rounds.lag", rounds.lag, rounds.lag <= 1, "0 or 1")?;
+        check("rounds.slots", &rounds.slots, (1..=4096).contains(&rounds.slots), "1 to 4096")?;
+        check("rounds.rollouts", &rounds.rollouts, (1..=64).contains(&rounds.rollouts), "1 to 64")?;
+        check("rounds.lag", &rounds.lag, rounds.lag <= 1, "0 or 1")?;
         let updates = rounds.updates_per_env_step;
         check(
             "rounds.updates_per_env_step",
-            updates,
+            &updates,
             updates > 0.0 && updates <= 100.0,
             "above 0, at most 100",
         )?;
         check(
             "evaluation.episodes",
-            evaluation.episodes,
+            &evaluation.episodes,
             (1..=100_000).contains(&evaluation.episodes),
             "1 to 100,000",
         )?;
         let kept = self.replay.capacity_transitions;
-        check("replay.capacity_transitions", kept, kept >= EPISODE_STEPS, "at least 50")?;
+        check("replay.capacity_transitions", &kept, kept >= EPISODE_STEPS, "at least 50")?;
         check(
             "checkpoint.every_rounds",
-            self.checkpoint.every_rounds,
+            &self.checkpoint.every_rounds,
             self.checkpoint.every_rounds > 0,
             "at least 1",
         )?;
-        check("checkpoint.keep", self.checkpoint.keep, self.checkpoint.keep > 0, "at least 1")
+        check("checkpoint.keep", &self.checkpoint.keep, self.checkpoint.keep > 0, "at least 1")
     }
 
     fn check_exploration(&self) -> Result<(), ConfigError> {
         let ExplorationConfig { noise_std, random_share, random_hold_mean_steps } =
             self.exploration;
-        check("exploration.noise_std", noise_std, (0.0..=10.0).contains(&noise_std), "0 to 10")?;
+        check("exploration.noise_std", &noise_std, (0.0..=10.0).contains(&noise_std), "0 to 10")?;
         check(
             "exploration.random_share",
-            random_share,
+            &random_share,
             (0.0..1.0).contains(&random_share),
             "a number in [0, 1)",
         )?;
         let hold = random_hold_mean_steps;
-        check("exploration.random_hold_mean_steps", hold, (1.0..=50.0).contains(&hold), "1 to 50")?;
+        check(
+            "exploration.random_hold_mean_steps",
+            &&hold,
+            (1.0..=50.0).contains(&hold),
+            "1 to 50",
+        )?;
         check(
             "world.substeps",
-            self.world.substeps,
+            &self.world.substeps,
             matches!(self.world.substeps, 10 | 20),
             "10 or 20",
         )
@@ -390,7 +395,7 @@ impl RunConfig {
 
 fn check(
     key: &'static str,
-    value: impl ToString,
+    value: &(impl ToString + ?Sized),
     fine: bool,
     expected: &'static str,
 ) -> Result<(), ConfigError> {

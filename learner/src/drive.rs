@@ -1,18 +1,26 @@
 //! The thread that learns: opens rounds, waits for their episodes, updates, publishes, judges, saves, stops.
 
-use std::collections::{BTreeMap, VecDeque};
+mod judge;
+mod progress;
+
+use std::collections::VecDeque;
 use std::path::PathBuf;
 use std::time::Duration;
 
+use tandem_core::layout::EPISODE_STEPS;
 use tandem_core::work::{PublishedActor, RunTerms, SlotOrder};
-use tandem_core::{Episode, EpisodeKind, EpisodeOutcome, EvaluationSummary};
+use tandem_core::{Episode, EpisodeKind};
 use tandem_policy::Policy;
 use tandem_proto::pb;
+use tandem_telemetry::events::{
+    CheckpointSaved, ParametersPublished, RoundFinished, RunFinished, WorkerSilent,
+};
 use tandem_telemetry::{MetricsLog, MetricsRow};
 use tokio::runtime::Handle;
 use tokio_util::sync::CancellationToken;
-use tracing::{info, warn};
+use tracing::warn;
 
+use crate::board::Silent;
 use crate::checkpoint::{self, Resumption};
 use crate::service::{Error, LearnerConfig, Shared};
 use crate::teacher::{Ledger, TeacherError};
@@ -24,7 +32,10 @@ const EVALUATION_PATIENCE_ROUNDS: u64 = 4;
 const WAIT_TICK: Duration = Duration::from_millis(200);
 /// Span over which the rates in the progress are taken.
 const RATE_SPAN_S: f64 = 15.0;
-/// Rounds of the paper's epoch (section 4.2; DESIGN: 50 cycles of the reference implementation).
+/// Units of advice that an episode can use: one a step.
+#[expect(clippy::cast_possible_truncation, reason = "an episode has 50 steps")]
+const UNITS_PER_EPISODE: u32 = EPISODE_STEPS as u32;
+/// Rounds of the paper's epoch: 50 cycles of the HER reference implementation (decision 005).
 const ROUNDS_PER_PAPER_EPOCH: f64 = 50.0;
 
 /// How a run ended.
@@ -136,7 +147,7 @@ impl<'a> Drive<'a> {
             success_reached: None,
             judged_round,
         };
-        drive.tell("starting", 0, &RoundFigures::default());
+        drive.tell("starting", &RoundFigures::default());
         shared.lock().terms = Some(terms);
         Ok(drive)
     }
@@ -196,7 +207,17 @@ impl<'a> Drive<'a> {
         while self.rates.len() > 2 && self.rates[0].0 < self.now_s() - RATE_SPAN_S {
             self.rates.pop_front();
         }
-        self.tell("collecting", 0, &figures);
+        self.tell("collecting", &figures);
+        RoundFinished {
+            round: counters.round,
+            env_steps: counters.env_steps,
+            updates: counters.updates,
+            training_success: figures.training_success,
+            training_moved: figures.training_moved,
+            advice_spent: counters.advice_spent,
+        }
+        .emit();
+        ParametersPublished { version: counters.round }.emit();
         Ok(figures)
     }
 
@@ -209,7 +230,7 @@ impl<'a> Drive<'a> {
         if let Some(ledger) = &mut self.ledger {
             let ordered = orders.iter().flat_map(|slot| &slot.episodes);
             let advised = ordered.filter(|order| order.advised).map(|order| order.number).collect();
-            ledger.open_leases(advised, tandem_core::layout::EPISODE_STEPS as u32)?;
+            ledger.open_leases(advised, UNITS_PER_EPISODE)?;
         }
         self.add(orders);
         Ok(())
@@ -238,80 +259,12 @@ impl<'a> Drive<'a> {
             if self.shutdown.is_cancelled() {
                 return None;
             }
-            for worker in state.board.reclaim((self.config.clock)()) {
-                warn!(worker, "worker is silent, its slots are given to others");
+            for silent in state.board.reclaim((self.config.clock)()) {
+                let Silent { worker_id, name, n_slots } = silent;
+                WorkerSilent { worker_id, name: &name, n_slots }.emit();
             }
             state = self.shared.wait(state, WAIT_TICK);
         }
-    }
-
-    /// Starts an evaluation when one is due, and takes in those that are done or overdue.
-    fn judge(&mut self, figures: &RoundFigures) -> Result<(), Error> {
-        let round = self.trainer.counters().round;
-        if round.is_multiple_of(self.config.run.rounds_per_evaluation()) {
-            self.start_evaluation(figures);
-        }
-        while let Some(oldest) = self.pending.front() {
-            let overdue = round >= oldest.row.round + EVALUATION_PATIENCE_ROUNDS;
-            if !overdue {
-                break;
-            }
-            if !self.finish_evaluation()? {
-                break;
-            }
-        }
-        Ok(())
-    }
-
-    fn start_evaluation(&mut self, figures: &RoundFigures) {
-        let version = self.trainer.counters().round;
-        let row = self.row(figures);
-        self.pending.push_back(Pending {
-            version,
-            policy: self.trainer.policy(BTreeMap::new()),
-            row,
-        });
-        self.add(self.trainer.evaluation_orders(version));
-    }
-
-    /// Takes in the oldest pending evaluation. Gives whether it could: false when interrupted.
-    fn finish_evaluation(&mut self) -> Result<bool, Error> {
-        let Some(pending) = self.pending.front() else { return Ok(false) };
-        let Some(episodes) = self.wait_for(EpisodeKind::Evaluation, pending.version) else {
-            return Ok(false);
-        };
-        let Some(Pending { mut policy, mut row, .. }) = self.pending.pop_front() else {
-            return Ok(false);
-        };
-        let outcomes: Vec<EpisodeOutcome> = episodes.iter().map(EpisodeOutcome::of).collect();
-        judge_into(&mut row, &EvaluationSummary::of(&outcomes));
-        row.best = self.best.as_ref().is_none_or(|best| is_better(&row, best));
-        info!(
-            round = row.round,
-            env_steps = row.env_steps,
-            success = row.success,
-            mean_q = row.mean_q,
-            "evaluated"
-        );
-        self.metrics.append(&row).map_err(self.in_run_directory("append to", "metrics.jsonl"))?;
-        self.judged_round = Some(row.round);
-        policy.metadata = self.metadata(&row);
-        if row.best {
-            self.save_policy(&policy, "best")?;
-            self.best = Some(row.clone());
-        }
-        self.save_policy(&policy, "last")?;
-        let until = self.config.run.stop.until_success;
-        if until > 0.0 && row.success >= until {
-            self.success_reached = Some(row.success);
-        }
-        let evaluation = evaluation_message(&row);
-        let best = self.best.as_ref().map(evaluation_message);
-        self.shared.progress.send_modify(|progress| {
-            progress.evaluation = Some(evaluation);
-            progress.best = best;
-        });
-        Ok(true)
     }
 
     fn stop(&self) -> Option<Stop> {
@@ -347,7 +300,7 @@ impl<'a> Drive<'a> {
                     let figures = self.trainer.figures();
                     self.start_evaluation(&figures);
                 }
-                self.tell("evaluating", 0, &self.trainer.figures());
+                self.tell("evaluating", &self.trainer.figures());
                 while !self.pending.is_empty() && self.finish_evaluation()? {}
                 (reason, false)
             }
@@ -356,7 +309,8 @@ impl<'a> Drive<'a> {
             self.save();
         }
         let digest = self.trainer.digest();
-        self.tell("ended", 0, &self.trainer.figures());
+        RunFinished { reason: &reason, round, digest: &digest }.emit();
+        self.tell("ended", &self.trainer.figures());
         self.shared.progress.send_modify(|progress| progress.digest.clone_from(&digest));
         Ok(Ended { reason, interrupted, digest })
     }
@@ -371,132 +325,20 @@ impl<'a> Drive<'a> {
             &resumption,
             self.config.run.checkpoint.keep,
         ) {
-            Ok(path) => info!(?path, round = self.trainer.counters().round, "checkpoint saved"),
+            Ok((path, digest)) => {
+                CheckpointSaved {
+                    round: self.trainer.counters().round,
+                    path: &path,
+                    digest: &digest,
+                }
+                .emit();
+            }
             Err(error) => {
                 let cause =
                     std::error::Error::source(&error).map(ToString::to_string).unwrap_or_default();
                 warn!(%error, cause, "checkpoint not saved, training goes on");
             }
         }
-    }
-
-    fn save_policy(&self, policy: &Policy, name: &str) -> Result<(), Error> {
-        let directory = self.config.out.join("policy");
-        let path = directory.join(format!("{name}.safetensors"));
-        std::fs::create_dir_all(&directory).map_err(self.in_run_directory("create", "policy"))?;
-        policy.save(&path).map_err(|source| Error::RunDirectory {
-            action: "write",
-            path,
-            source: source.into(),
-        })
-    }
-
-    fn in_run_directory<E: std::error::Error + Send + Sync + 'static>(
-        &self,
-        action: &'static str,
-        name: &str,
-    ) -> impl FnOnce(E) -> Error + use<E> {
-        let path = self.config.out.join(name);
-        move |source| Error::RunDirectory { action, path, source: source.into() }
-    }
-
-    fn metadata(&self, row: &MetricsRow) -> BTreeMap<String, String> {
-        let run = &self.config.run;
-        let entries = [
-            ("run", run.name.clone()),
-            ("seed", run.seed.to_string()),
-            (
-                "recipe",
-                if run.recipe == crate::config::Recipe::Tandem { "tandem" } else { "paper" }
-                    .to_owned(),
-            ),
-            ("strategy", run.advice.strategy.clone()),
-            ("advice_share", run.advice.share.to_string()),
-            ("substeps", run.world.substeps.to_string()),
-            ("program", self.config.version.clone()),
-            ("env_steps", row.env_steps.to_string()),
-            ("updates", row.updates.to_string()),
-            ("advice_spent", row.advice_spent.to_string()),
-            ("wall_s", format!("{:.1}", row.wall_s)),
-            ("evaluation_seed", run.evaluation.seed.to_string()),
-            ("evaluation_episodes", row.n_episodes.to_string()),
-            ("evaluation_success", row.success.to_string()),
-        ];
-        entries.into_iter().map(|(key, value)| (key.to_owned(), value)).collect()
-    }
-
-    /// A row of metrics for the present state, without the evaluation's figures.
-    fn row(&self, figures: &RoundFigures) -> MetricsRow {
-        let counters = self.trainer.counters();
-        MetricsRow {
-            round: counters.round,
-            env_steps: counters.env_steps,
-            episodes: counters.episodes,
-            updates: counters.updates,
-            paper_epochs: counters.round as f64 / ROUNDS_PER_PAPER_EPOCH,
-            wall_s: self.now_s(),
-            mean_q: figures.mean_q,
-            critic_loss: figures.critic_loss,
-            actor_loss: figures.actor_loss,
-            advice_spent: counters.advice_spent,
-            budget_left: self.budget_left(),
-            training_success: figures.training_success,
-            training_moved: figures.training_moved,
-            ..MetricsRow::default()
-        }
-    }
-
-    fn budget_left(&self) -> u64 {
-        self.ledger.as_ref().map_or(0, Ledger::left)
-    }
-
-    fn now_s(&self) -> f64 {
-        self.wall_before_s + (self.config.clock)().as_secs_f64()
-    }
-
-    /// Publishes the progress.
-    fn tell(&self, phase: &str, n_updates: u64, figures: &RoundFigures) {
-        let counters = self.trainer.counters();
-        let rate =
-            |count: fn(&(f64, u64, u64)) -> u64| match (self.rates.front(), self.rates.back()) {
-                (Some(first), Some(last)) if last.0 > first.0 => {
-                    (count(last) - count(first)) as f64 / (last.0 - first.0)
-                }
-                _ => 0.0,
-            };
-        let run = &self.config.run;
-        let workers = self.workers();
-        self.shared.progress.send_modify(|progress| {
-            progress.task.clone_from(&run.task);
-            progress.n_arms = run.arms as u32;
-            progress.strategy.clone_from(&run.advice.strategy);
-            progress.round = counters.round;
-            progress.env_steps = counters.env_steps;
-            progress.episodes = counters.episodes;
-            progress.updates = counters.updates + n_updates;
-            progress.wall_s = self.now_s();
-            progress.env_steps_per_s = rate(|(_, env_steps, _)| *env_steps);
-            progress.updates_per_s = rate(|(_, _, updates)| *updates);
-            progress.advice_spent = counters.advice_spent;
-            progress.budget_left = self.budget_left();
-            progress.phase = phase.to_owned();
-            progress.training_success = figures.training_success;
-            progress.workers = workers;
-            if progress.best.is_none() {
-                progress.best = self.best.as_ref().map(evaluation_message);
-            }
-        });
-    }
-
-    fn workers(&self) -> Vec<pb::WorkerProgress> {
-        let state = self.shared.lock();
-        let progress = |(worker_id, worker): (u64, &crate::board::Worker)| pb::WorkerProgress {
-            worker_id,
-            name: worker.name.clone(),
-            episodes: worker.n_episodes,
-            doing: worker.slot.map_or_else(|| "waiting".to_owned(), |slot| format!("slot {slot}")),
-        };
-        state.board.workers().map(progress).collect()
     }
 }
 
@@ -519,7 +361,7 @@ fn open_ledger(
         strategy: advice.strategy.clone(),
     };
     let spent = trainer.counters().advice_spent;
-    Ok(Some(Ledger::open(address, &terms, spent, runtime.clone(), shutdown.clone())?))
+    Ok(Some(Ledger::open(address, &terms, spent, runtime, shutdown)?))
 }
 
 /// Opens the metrics of the run directory; what lies after `round` belongs to a lost future and is cut off.
@@ -534,38 +376,4 @@ fn open_metrics(
     metrics.truncate_after(round).map_err(|error| failed(error.into()))?;
     let rows = MetricsLog::read_all(&path).map_err(|error| failed(error.into()))?;
     Ok((metrics, rows))
-}
-
-fn judge_into(row: &mut MetricsRow, summary: &EvaluationSummary) {
-    row.n_episodes = summary.n_episodes as u64;
-    row.success = summary.success;
-    row.success_low = summary.interval.low;
-    row.success_high = summary.interval.high;
-    row.success_joint = summary.success_joint;
-    row.success_per_arm.clone_from(&summary.success_per_arm);
-    row.collision_rate = summary.collision_rate;
-    row.collision_rate_before_success = summary.collision_rate_before_success;
-    row.moved = summary.moved;
-    row.mean_return = summary.mean_return;
-}
-
-/// Whether an evaluation beats another: more success, or as much with fewer contacts.
-fn is_better(row: &MetricsRow, than: &MetricsRow) -> bool {
-    row.success > than.success
-        || (row.success >= than.success && row.collision_rate < than.collision_rate)
-}
-
-fn evaluation_message(row: &MetricsRow) -> pb::Evaluation {
-    pb::Evaluation {
-        round: row.round,
-        env_steps: row.env_steps,
-        n_episodes: row.n_episodes as u32,
-        success: row.success,
-        success_low: row.success_low,
-        success_high: row.success_high,
-        success_joint: row.success_joint,
-        success_per_arm: row.success_per_arm.clone(),
-        collision_rate: row.collision_rate,
-        mean_q: row.mean_q,
-    }
 }

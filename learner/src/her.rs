@@ -300,12 +300,12 @@ mod tests {
     #[test]
     fn shares_are_as_configured() {
         let count = |reward, holds: fn(&Relabelled) -> bool| {
-            let hits = std::cell::Cell::new(0);
+            let hits = std::cell::Cell::new(0_usize);
             sampled(reward, |sampler, _| hits.set(hits.get() + usize::from(holds(&sampler.drawn))));
-            f64::from(hits.get() as u32) / N_DRAWS as f64
+            hits.get() as f64 / N_DRAWS as f64
         };
         let near = |share: f64, expected: f64| {
-            assert!((share - expected).abs() < 0.03, "{share} is not {expected}")
+            assert!((share - expected).abs() < 0.03, "{share} is not {expected}");
         };
         near(count(RewardKind::PerArm, |drawn| drawn.swapped), 0.5);
         near(count(RewardKind::PerArm, |drawn| drawn.episode_idx == 0), 0.75);

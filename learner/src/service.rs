@@ -10,6 +10,7 @@ use tandem_core::work::{PublishedActor, RunTerms};
 use tandem_proto::pb;
 use tandem_proto::pb::learner_server::{Learner, LearnerServer};
 use tandem_proto::{decode_episode, encode_actor, encode_slot, encode_terms};
+use tandem_telemetry::events::WorkerJoined;
 use tokio::net::TcpListener;
 use tokio::sync::{Notify, watch};
 use tokio_stream::wrappers::WatchStream;
@@ -31,6 +32,8 @@ const WORK_POLL: Duration = Duration::from_secs(2);
 const LINGER: Duration = Duration::from_millis(1500);
 /// Largest message taken in; a slot of 64 two-arm episodes has 1 MB.
 const MAX_MESSAGE_BYTES: usize = 64 << 20;
+/// Longest label of a worker.
+const MAX_NAME_BYTES: usize = 256;
 /// Parameter versions kept for workers that lag behind.
 const KEPT_VERSIONS: usize = 16;
 
@@ -192,7 +195,10 @@ pub async fn serve(
         .add_service(health_service)
         .add_service(reflection_v1())
         .add_service(reflection_v1alpha())
-        .serve_with_incoming_shutdown(TcpIncoming::from(listener).with_nodelay(Some(true)), stop_serving.cancelled())
+        .serve_with_incoming_shutdown(
+            TcpIncoming::from(listener).with_nodelay(Some(true)),
+            stop_serving.cancelled(),
+        )
         .await?;
     match learning {
         Ok(thread) => tokio::task::spawn_blocking(move || thread.join())
@@ -237,11 +243,18 @@ impl Learner for LearnerService {
         request: Request<pb::JoinRequest>,
     ) -> Result<Response<pb::JoinResponse>, Status> {
         let name = request.into_inner().worker;
+        if name.len() > MAX_NAME_BYTES {
+            let message =
+                format!("worker: expected at most {MAX_NAME_BYTES} bytes, got {}", name.len());
+            return Err(Status::invalid_argument(message));
+        }
         let now = (self.shared.clock)();
         let mut state = self.shared.lock();
         let terms =
             state.terms.clone().ok_or_else(|| Status::unavailable("the run is starting"))?;
-        let worker_id = state.board.join(name, now);
+        let worker_id = state.board.join(name.clone(), now);
+        drop(state);
+        WorkerJoined { worker_id, name: &name }.emit();
         Ok(Response::new(pb::JoinResponse { worker_id, terms: Some(encode_terms(&terms)) }))
     }
 

@@ -5,6 +5,7 @@ use std::time::Duration;
 use tandem_core::Episode;
 use tandem_proto::pb;
 use tandem_proto::pb::teacher_client::TeacherClient;
+use tandem_telemetry::events::AdviceAccountOpened;
 use tokio::runtime::Handle;
 use tokio_util::sync::CancellationToken;
 use tonic::Code;
@@ -54,8 +55,8 @@ impl Ledger {
         address: &str,
         terms: &pb::OpenAccountRequest,
         spent: u64,
-        runtime: Handle,
-        shutdown: CancellationToken,
+        runtime: &Handle,
+        shutdown: &CancellationToken,
     ) -> Result<Self, TeacherError> {
         let endpoint = Endpoint::from_shared(address.to_owned())
             .map_err(|source| TeacherError::Address { address: address.to_owned(), source })?
@@ -66,12 +67,12 @@ impl Ledger {
         let mut ledger = Self {
             client,
             runtime: runtime.clone(),
-            shutdown,
+            shutdown: shutdown.clone(),
             account: terms.clone(),
             spent_before: 0,
             left: terms.budget,
         };
-        let account = ledger.open_account(terms.clone())?;
+        let account = ledger.open_account(terms)?;
         if account.spent < spent {
             let remaining = pb::OpenAccountRequest {
                 name: format!("{}.from-{spent}", terms.name),
@@ -80,7 +81,7 @@ impl Ledger {
             };
             ledger.spent_before = spent;
             ledger.account = remaining.clone();
-            ledger.open_account(remaining)?;
+            ledger.open_account(&remaining)?;
         }
         Ok(ledger)
     }
@@ -128,11 +129,16 @@ impl Ledger {
         Ok(())
     }
 
-    fn open_account(&mut self, terms: pb::OpenAccountRequest) -> Result<pb::Account, TeacherError> {
+    fn open_account(
+        &mut self,
+        terms: &pb::OpenAccountRequest,
+    ) -> Result<pb::Account, TeacherError> {
         let account = self.call(async |mut client: TeacherClient<Channel>| {
             client.open_account(terms.clone()).await
         })?;
         self.note(Some(&account));
+        let pb::Account { name, budget, strategy, spent, .. } = &account;
+        AdviceAccountOpened { account: name, budget: *budget, spent: *spent, strategy }.emit();
         Ok(account)
     }
 

@@ -9,7 +9,12 @@ const REFERENCE: &str = include_str!("data/ddpg_reference.json");
 const TOLERANCE: f64 = 1e-6;
 
 fn f64s(value: &Value) -> Vec<f64> {
-    value.as_array().unwrap().iter().map(|number| number.as_f64().unwrap()).collect()
+    value
+        .as_array()
+        .expect("a list")
+        .iter()
+        .map(|number| number.as_f64().expect("a number"))
+        .collect()
 }
 
 #[expect(clippy::cast_possible_truncation, reason = "the reference starts from single precision")]

@@ -5,7 +5,7 @@
 //! touches a file.
 //!
 //! Reading order: [`mlp`] (shape, forward and backward pass over batches), [`adam`], [`normalizer`], [`inference`]
-//! ([`Actor`] and [`Critic`], the same bits on every machine), [`policy`] and [`file`] (the whole of it on disk).
+//! ([`Actor`] and [`Critic`], the same bits on every machine), [`policy`] and [`mod@file`] (the whole of it on disk).
 #![warn(missing_docs)]
 
 pub mod adam;

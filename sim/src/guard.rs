@@ -10,8 +10,11 @@
 use rapier3d::math::{Matrix, Vector};
 
 use crate::arm::Arm;
-use crate::hand::{WRIST_ABOVE_M, WRIST_RADIUS_M};
+use crate::capsule::{N_CAPSULES, N_LINKS, PosedArm, nearest_shares};
 use crate::physics::Physics;
+
+/// Pairs of capsules of two arms of which at least one is a link: wrists, palms and fingers collide in rapier.
+const N_PAIRS: usize = N_CAPSULES * N_CAPSULES - (N_CAPSULES - N_LINKS) * (N_CAPSULES - N_LINKS);
 
 /// Largest approach speed of an arm per metre of gap, 1/s.
 const APPROACH_GAIN: f32 = 20.0;
@@ -23,43 +26,11 @@ const LIMIT_WITHIN_M: f32 = 0.08;
 const WATCH_WITHIN_M: f32 = 0.24;
 /// Distance of two axes below which their direction from each other says nothing, metres.
 const CROSSING_M: f32 = 0.002;
-/// Least share of the palm's motion for which a capsule's point counts as moved by the palm.
-const LEAST_LEVERAGE: f32 = 0.05;
+/// Share of the palm's motion that a capsule's point is taken to follow at least, so that the palm need not race to
+/// move what hardly follows it.
+const LEAST_LEVERAGE: f32 = 0.3;
 /// Half-planes that one velocity is projected onto, at most, before it is scaled back instead.
 const MAX_PROJECTIONS: usize = 12;
-
-/// Frames of the arm's posture between which the links' capsules lie.
-pub(crate) const LINK_FRAMES: [usize; 4] = [1, 2, 4, 5];
-/// Radii of the links: upper arm, forearm, wrist bend; metres.
-pub(crate) const LINK_RADII_M: [f32; 3] = [0.045, 0.04, 0.035];
-/// Capsules of an arm: its links, its wrist, and one round palm plate and fingers.
-const N_CAPSULES: usize = 5;
-/// Of these, how many are links. Wrists, palms and fingers of two arms collide in rapier.
-const N_LINKS: usize = LINK_RADII_M.len();
-const N_PAIRS: usize = N_CAPSULES * N_CAPSULES - (N_CAPSULES - N_LINKS) * (N_CAPSULES - N_LINKS);
-/// The capsule round palm plate and fingers: its ends, relative to the end effector, and its radius, metres.
-const GRASP_ENDS: [Vector; 2] = [Vector::new(0.0, -0.025, 0.03), Vector::new(0.0, 0.025, 0.03)];
-const GRASP_RADIUS_M: f32 = 0.045;
-
-/// A point of an arm, world frame, metres, and its motion per metre of the palm.
-#[derive(Clone, Copy)]
-struct MovedPoint {
-    at: Vector,
-    motion: Matrix,
-}
-
-#[derive(Clone, Copy)]
-struct MovedCapsule {
-    ends: [MovedPoint; 2],
-    radius_m: f32,
-}
-
-/// An arm's capsules in the posture that the inverse kinematics gave at the start of a control step.
-#[derive(Clone, Copy)]
-struct PosedArm {
-    palm_at: Vector,
-    capsules: [MovedCapsule; N_CAPSULES],
-}
 
 /// One capsule of the first arm against one of the second.
 #[derive(Clone, Copy)]
@@ -197,7 +168,7 @@ impl Limits {
                 .max_by(|a, b| a.missing_mps(velocity).total_cmp(&b.missing_mps(velocity)));
             match worst {
                 Some(limit) if limit.missing_mps(velocity) > 1e-4 => {
-                    velocity = limit.project(velocity)
+                    velocity = limit.project(velocity);
                 }
                 _ => return velocity,
             }
@@ -228,46 +199,6 @@ impl Limit {
     }
 }
 
-impl PosedArm {
-    fn of(arm: &Arm, physics: &Physics) -> Self {
-        let palm_at = arm.hand.end_effector(physics);
-        let joints = arm.joint_motions(LINK_FRAMES).map(|(at, motion)| MovedPoint { at, motion });
-        let with_palm =
-            |offset: Vector| MovedPoint { at: palm_at + offset, motion: Matrix::IDENTITY };
-        let link = |idx: usize| MovedCapsule {
-            ends: [joints[idx], joints[idx + 1]],
-            radius_m: LINK_RADII_M[idx],
-        };
-        let wrist_ends = WRIST_ABOVE_M.map(|above_m| with_palm(Vector::Z * above_m));
-        let wrist = MovedCapsule { ends: wrist_ends, radius_m: WRIST_RADIUS_M };
-        let grasp_ends = GRASP_ENDS.map(|end| with_palm(arm.frame.turned(end)));
-        let grasp = MovedCapsule { ends: grasp_ends, radius_m: GRASP_RADIUS_M };
-        Self { palm_at, capsules: [link(0), link(1), link(2), wrist, grasp] }
-    }
-}
-
-impl MovedCapsule {
-    /// The capsule after the palm moved by `palm_move`, metres.
-    fn moved_by(&self, palm_move: Vector) -> Self {
-        let ends = self.ends.map(|end| MovedPoint { at: end.at + end.motion * palm_move, ..end });
-        Self { ends, ..*self }
-    }
-
-    fn axis(&self) -> [Vector; 2] {
-        self.ends.map(|end| end.at)
-    }
-
-    fn point(&self, share: f32) -> Vector {
-        let [from, to] = self.axis();
-        from + (to - from) * share
-    }
-
-    fn motion(&self, share: f32) -> Matrix {
-        let [from, to] = self.ends.map(|end| end.motion);
-        from * (1.0 - share) + to * share
-    }
-}
-
 /// Every pair of capsules of which at least one is a link.
 fn all_pairs() -> [Pair; N_PAIRS] {
     let mut pairs = [Pair { capsules: [0, 0], normal: None, watched: false }; N_PAIRS];
@@ -280,26 +211,6 @@ fn all_pairs() -> [Pair; N_PAIRS] {
     pairs
 }
 
-/// How far along each of two segments their nearest points lie, as shares of the segments.
-fn nearest_shares(first: [Vector; 2], second: [Vector; 2]) -> [f32; 2] {
-    const TINY: f32 = 1e-9;
-    let (along_first, along_second) = (first[1] - first[0], second[1] - second[0]);
-    let offset = first[0] - second[0];
-    let (a, e) = (along_first.length_squared(), along_second.length_squared());
-    let (b, c, f) =
-        (along_first.dot(along_second), along_first.dot(offset), along_second.dot(offset));
-    let crossing = a * e - b * b;
-    let s = if crossing > TINY { ((b * f - c * e) / crossing).clamp(0.0, 1.0) } else { 0.0 };
-    let t = (b * s + f) / e.max(TINY);
-    if t < 0.0 {
-        [(-c / a.max(TINY)).clamp(0.0, 1.0), 0.0]
-    } else if t > 1.0 {
-        [((b - c) / a.max(TINY)).clamp(0.0, 1.0), 1.0]
-    } else {
-        [s, t]
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -307,18 +218,9 @@ mod tests {
     use tandem_core::scene::{Capsule, Scene};
     use tandem_core::{Contacts, Layout, Stream, Task, episode_rng};
 
+    use crate::capsule::{MovedCapsule, MovedPoint};
     use crate::config::{Starts, WorldConfig};
     use crate::env::Env;
-
-    #[test]
-    fn nearest_points_of_crossing_and_of_parallel_segments() {
-        let check =
-            |first, second, shares: [f32; 2]| assert_eq!(nearest_shares(first, second), shares);
-        let along_x = [Vector::ZERO, Vector::X];
-        check(along_x, [Vector::new(0.25, -1.0, 0.5), Vector::new(0.25, 1.0, 0.5)], [0.25, 0.5]);
-        check(along_x, [Vector::new(2.0, 1.0, 0.0), Vector::new(3.0, 1.0, 0.0)], [1.0, 0.0]);
-        check(along_x, [Vector::new(0.0, 1.0, 0.0), Vector::new(1.0, 1.0, 0.0)], [0.0, 0.0]);
-    }
 
     #[test]
     fn a_pair_that_crosses_keeps_its_side() {

@@ -225,21 +225,25 @@ fn solve_positive_definite<const N: usize>(
     for pivot in 0..6 {
         for row in pivot + 1..6 {
             let factor = matrix[row][pivot] / matrix[pivot][pivot];
-            for column in pivot..6 {
-                matrix[row][column] -= factor * matrix[pivot][column];
-            }
-            for column in 0..N {
-                sides[row][column] -= factor * sides[pivot][column];
-            }
+            let (matrix_pivot, sides_pivot) = (matrix[pivot], sides[pivot]);
+            subtract(&mut matrix[row], factor, &matrix_pivot);
+            subtract(&mut sides[row], factor, &sides_pivot);
         }
     }
     for row in (0..6).rev() {
-        for column in 0..N {
-            let known: f64 = (row + 1..6).map(|idx| matrix[row][idx] * sides[idx][column]).sum();
-            sides[row][column] = (sides[row][column] - known) / matrix[row][row];
+        for known in row + 1..6 {
+            let solved = sides[known];
+            subtract(&mut sides[row], matrix[row][known], &solved);
         }
+        sides[row] = sides[row].map(|side| side / matrix[row][row]);
     }
     sides
+}
+
+fn subtract<const N: usize>(row: &mut [f64; N], factor: f64, other: &[f64; N]) {
+    for (value, other) in row.iter_mut().zip(other) {
+        *value -= factor * other;
+    }
 }
 
 #[cfg(test)]

@@ -5,8 +5,9 @@ use tandem_core::scene::{ArmScene, Capsule, Cuboid, Point, Scene};
 use tandem_core::{ArmIndex, Layout};
 
 use crate::arm::Arm;
+use crate::capsule::{LINK_FRAMES, LINK_RADII_M};
 use crate::frame::BASE_IN_OWN;
-use crate::guard::{LINK_FRAMES, LINK_RADII_M};
+
 use crate::hand::{PAD_HALF_M, PALM_ABOVE_M, PALM_HALF_M, WRIST_ABOVE_M, WRIST_RADIUS_M};
 use crate::kinematics::Posture;
 use crate::world::{TABLE_HALF_M, World};

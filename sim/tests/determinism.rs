@@ -20,7 +20,7 @@ fn trace(env: &mut Env, episode: u64) -> (Vec<u32>, Vec<Contacts>) {
         if step % 4 == 0 {
             action.fill_with(|| uniform(&mut exploration, -1.0, 1.0));
         }
-        contacts.push(env.step(&action).unwrap());
+        contacts.push(env.step(&action).expect("a finite step"));
         env.observe(&mut observation);
         bits.extend(observation.iter().map(|value| value.to_bits()));
     }
@@ -29,7 +29,7 @@ fn trace(env: &mut Env, episode: u64) -> (Vec<u32>, Vec<Contacts>) {
 }
 
 fn new_env(layout: Layout) -> Env {
-    Env::new(layout, &WorldConfig::default()).unwrap()
+    Env::new(layout, &WorldConfig::default()).expect("a valid world")
 }
 
 fn layouts() -> impl Iterator<Item = Layout> {
@@ -76,7 +76,7 @@ fn looking_changes_nothing() {
                 if look {
                     assert_eq!(env.scene(), env.scene());
                 }
-                env.step(&action).unwrap();
+                env.step(&action).expect("a finite step");
             }
             env.scene()
         };
@@ -89,11 +89,14 @@ fn a_hundred_thousand_random_steps_stay_finite() {
     thread::scope(|scope| {
         for layout in layouts() {
             scope.spawn(move || {
-                let mut env = new_env(layout);
-                for episode in 100..600 {
-                    let (bits, _) = trace(&mut env, episode);
-                    let in_bounds = bits.iter().all(|bits| f32::from_bits(*bits).abs() < 25.0);
-                    assert!(in_bounds, "{layout:?}, episode {episode}");
+                for substeps in [20, 10] {
+                    let config = WorldConfig { substeps, ..WorldConfig::default() };
+                    let mut env = Env::new(layout, &config).expect("a valid world");
+                    for episode in 100..350 {
+                        let (bits, _) = trace(&mut env, episode);
+                        let in_bounds = bits.iter().all(|bits| f32::from_bits(*bits).abs() < 25.0);
+                        assert!(in_bounds, "{layout:?}, {substeps} substeps, episode {episode}");
+                    }
                 }
             });
         }

@@ -14,7 +14,7 @@ fn layouts() -> impl Iterator<Item = Layout> {
 
 /// Calls `look` with every start of `N_SEEDS`.
 fn each_start(layout: Layout, starts: Starts, mut look: impl FnMut(&mut Env, &[f32])) {
-    let mut env = Env::new(layout, &WorldConfig::default()).unwrap();
+    let mut env = Env::new(layout, &WorldConfig::default()).expect("a valid world");
     let mut observation = vec![0.0; layout.n_observation()];
     for seed in 0..N_SEEDS {
         env.reset(&mut episode_rng(seed, 0, Stream::Reset), starts);
@@ -54,6 +54,17 @@ fn starts_as_evaluated_are_in_reach_apart_and_not_yet_done() {
                 assert_eq!(&seen[12..16], [0.0, 0.0, 0.0, 1.0]);
             }
             let scene = env.scene();
+            for arm in layout.arms() {
+                let in_own = distance(
+                    &observation[layout.achieved_goal_of(arm)],
+                    &env.goal()[layout.goal_of(arm)],
+                );
+                let in_world = distance(&scene.objects[arm.0].centre, &scene.goals[arm.0]);
+                assert!(
+                    (in_own - in_world).abs() < 1e-6,
+                    "goal and object are in different frames"
+                );
+            }
             let apart = |a: [f32; 3], b: [f32; 3]| assert!(distance(&a, &b) >= 0.0699);
             if layout.n_arms == 2 {
                 apart(scene.objects[0].centre, scene.objects[1].centre);
@@ -68,7 +79,7 @@ fn half_of_the_places_to_put_an_object_are_in_the_air() {
     let layout = Layout::new(Task::PickAndPlace, 1);
     let mut n_high = 0;
     each_start(layout, Starts::default(), |env, _| {
-        n_high += u32::from(env.goal()[2] > HALF_M + GOAL_TOLERANCE_M)
+        n_high += u32::from(env.goal()[2] > HALF_M + GOAL_TOLERANCE_M);
     });
     assert!((350..450).contains(&n_high), "{n_high} of 1000, expected half of four fifths");
 }
@@ -121,7 +132,7 @@ fn gripped_starts_keep_holding_while_the_hand_moves() {
     let starts = Starts { gripped_share: 1.0, wide_share: 0.0 };
     for n_arms in [1, 2] {
         let layout = Layout::new(Task::PickAndPlace, n_arms);
-        let mut env = Env::new(layout, &WorldConfig::default()).unwrap();
+        let mut env = Env::new(layout, &WorldConfig::default()).expect("a valid world");
         let mut observation = vec![0.0; layout.n_observation()];
         for seed in 0..60 {
             env.reset(&mut episode_rng(seed, 0, Stream::Reset), starts);
@@ -129,13 +140,13 @@ fn gripped_starts_keep_holding_while_the_hand_moves() {
             let before = observation.clone();
             let mut action = idle(layout, -1.0);
             for _ in 0..5 {
-                env.step(&action).unwrap();
+                env.step(&action).expect("a finite step");
             }
             for arm in layout.arms() {
                 action[layout.action_of(arm)][2] = 0.5;
             }
             for _ in 0..3 {
-                env.step(&action).unwrap();
+                env.step(&action).expect("a finite step");
             }
             env.observe(&mut observation);
             for arm in 0..n_arms {

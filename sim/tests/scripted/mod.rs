@@ -20,7 +20,7 @@ pub(crate) struct Played {
 
 /// Plays `n_episodes` with one controller an arm, the controllers blind to each other.
 pub(crate) fn play(layout: Layout, config: &WorldConfig, n_episodes: u64) -> Vec<Played> {
-    let mut env = Env::new(layout, config).unwrap();
+    let mut env = Env::new(layout, config).expect("a valid world");
     let mut observation = vec![0.0; layout.n_observation()];
     let mut action = vec![0.0; layout.n_action()];
     (0..n_episodes)
@@ -39,7 +39,7 @@ pub(crate) fn play(layout: Layout, config: &WorldConfig, n_episodes: u64) -> Vec
                     let part = &mut action[layout.action_of(arm)];
                     part.copy_from_slice(&inputs[..part.len()]);
                 }
-                contacts = contacts | env.step(&action).unwrap();
+                contacts = contacts | env.step(&action).expect("a finite step");
             }
             env.observe(&mut observation);
             outcome(layout, &observation, env.goal(), contacts)
@@ -49,9 +49,9 @@ pub(crate) fn play(layout: Layout, config: &WorldConfig, n_episodes: u64) -> Vec
 
 /// Share of successes.
 pub(crate) fn success_rate(episodes: &[Played]) -> f64 {
-    let n_successes =
-        u32::try_from(episodes.iter().filter(|played| played.success).count()).unwrap();
-    f64::from(n_successes) / f64::from(u32::try_from(episodes.len()).unwrap())
+    let n_successes = u32::try_from(episodes.iter().filter(|played| played.success).count())
+        .expect("few episodes");
+    f64::from(n_successes) / f64::from(u32::try_from(episodes.len()).expect("few episodes"))
 }
 
 fn outcome(layout: Layout, observation: &[f32], goal: &[f32], contacts: Contacts) -> Played {

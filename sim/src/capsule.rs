@@ -1,0 +1,119 @@
+//! An arm's shape as far as the other arm's links are concerned, and how it follows the palm.
+
+use rapier3d::math::{Matrix, Vector};
+
+use crate::arm::Arm;
+use crate::hand::{WRIST_ABOVE_M, WRIST_RADIUS_M};
+use crate::physics::Physics;
+
+/// Frames of the arm's posture between which the links' capsules lie.
+pub(crate) const LINK_FRAMES: [usize; 4] = [1, 2, 4, 5];
+/// Radii of the links: upper arm, forearm, wrist bend; metres.
+pub(crate) const LINK_RADII_M: [f32; 3] = [0.045, 0.04, 0.035];
+/// Capsules of an arm: its links first, then its wrist, then one round palm plate and fingers.
+pub(crate) const N_CAPSULES: usize = 5;
+/// Of these, how many are links.
+pub(crate) const N_LINKS: usize = LINK_RADII_M.len();
+/// The capsule round palm plate and fingers: its ends, relative to the end effector, and its radius, metres.
+const GRASP_ENDS: [Vector; 2] = [Vector::new(0.0, -0.025, 0.03), Vector::new(0.0, 0.025, 0.03)];
+const GRASP_RADIUS_M: f32 = 0.045;
+
+/// A point of an arm, world frame, metres, and its motion per metre of the palm.
+#[derive(Clone, Copy)]
+pub(crate) struct MovedPoint {
+    pub(crate) at: Vector,
+    pub(crate) motion: Matrix,
+}
+
+/// A bar with round ends, part of an arm.
+#[derive(Clone, Copy)]
+pub(crate) struct MovedCapsule {
+    pub(crate) ends: [MovedPoint; 2],
+    pub(crate) radius_m: f32,
+}
+
+/// An arm's capsules in the posture that the inverse kinematics gave at the start of a control step.
+#[derive(Clone, Copy)]
+pub(crate) struct PosedArm {
+    pub(crate) palm_at: Vector,
+    pub(crate) capsules: [MovedCapsule; N_CAPSULES],
+}
+
+impl PosedArm {
+    /// `arm` as it stands now.
+    pub(crate) fn of(arm: &Arm, physics: &Physics) -> Self {
+        let palm_at = arm.hand.end_effector(physics);
+        let joints = arm.joint_motions(LINK_FRAMES).map(|(at, motion)| MovedPoint { at, motion });
+        let with_palm =
+            |offset: Vector| MovedPoint { at: palm_at + offset, motion: Matrix::IDENTITY };
+        let link = |idx: usize| MovedCapsule {
+            ends: [joints[idx], joints[idx + 1]],
+            radius_m: LINK_RADII_M[idx],
+        };
+        let wrist_ends = WRIST_ABOVE_M.map(|above_m| with_palm(Vector::Z * above_m));
+        let wrist = MovedCapsule { ends: wrist_ends, radius_m: WRIST_RADIUS_M };
+        let grasp_ends = GRASP_ENDS.map(|end| with_palm(arm.frame.turned(end)));
+        let grasp = MovedCapsule { ends: grasp_ends, radius_m: GRASP_RADIUS_M };
+        Self { palm_at, capsules: [link(0), link(1), link(2), wrist, grasp] }
+    }
+}
+
+impl MovedCapsule {
+    /// The capsule after the palm moved by `palm_move`, metres.
+    pub(crate) fn moved_by(&self, palm_move: Vector) -> Self {
+        let ends = self.ends.map(|end| MovedPoint { at: end.at + end.motion * palm_move, ..end });
+        Self { ends, ..*self }
+    }
+
+    /// Where the axis ends, world frame, metres.
+    pub(crate) fn axis(&self) -> [Vector; 2] {
+        self.ends.map(|end| end.at)
+    }
+
+    /// The point at `share` of the axis, world frame, metres.
+    pub(crate) fn point(&self, share: f32) -> Vector {
+        let [from, to] = self.axis();
+        from + (to - from) * share
+    }
+
+    /// How the point at `share` of the axis moves per metre of the palm.
+    pub(crate) fn motion(&self, share: f32) -> Matrix {
+        let [from, to] = self.ends.map(|end| end.motion);
+        from * (1.0 - share) + to * share
+    }
+}
+
+/// How far along each of two segments their nearest points lie, as shares of the segments.
+pub(crate) fn nearest_shares(first: [Vector; 2], second: [Vector; 2]) -> [f32; 2] {
+    const TINY: f32 = 1e-9;
+    let (along_first, along_second) = (first[1] - first[0], second[1] - second[0]);
+    let offset = first[0] - second[0];
+    let (a, e) = (along_first.length_squared(), along_second.length_squared());
+    let (b, c, f) =
+        (along_first.dot(along_second), along_first.dot(offset), along_second.dot(offset));
+    let crossing = a * e - b * b;
+    let s = if crossing > TINY { ((b * f - c * e) / crossing).clamp(0.0, 1.0) } else { 0.0 };
+    let t = (b * s + f) / e.max(TINY);
+    if t < 0.0 {
+        [(-c / a.max(TINY)).clamp(0.0, 1.0), 0.0]
+    } else if t > 1.0 {
+        [((b - c) / a.max(TINY)).clamp(0.0, 1.0), 1.0]
+    } else {
+        [s, t]
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn nearest_points_of_crossing_and_of_parallel_segments() {
+        let check =
+            |first, second, shares: [f32; 2]| assert_eq!(nearest_shares(first, second), shares);
+        let along_x = [Vector::ZERO, Vector::X];
+        check(along_x, [Vector::new(0.25, -1.0, 0.5), Vector::new(0.25, 1.0, 0.5)], [0.25, 0.5]);
+        check(along_x, [Vector::new(2.0, 1.0, 0.0), Vector::new(3.0, 1.0, 0.0)], [1.0, 0.0]);
+        check(along_x, [Vector::new(0.0, 1.0, 0.0), Vector::new(1.0, 1.0, 0.0)], [0.0, 0.0]);
+    }
+}
