@@ -166,7 +166,7 @@ fn replay() -> Vec<Figure> {
     let config = RunConfig::defaults(Recipe::Tandem, Task::Push, 2);
     let mut buffer = ReplayBuffer::new(layout, 2000 * EPISODE_STEPS);
     (0..2000_u16).for_each(|number| {
-        buffer.push(&drifting_episode(layout, u64::from(number), f32::from(number % 7) * 1e-3))
+        buffer.push(&drifting_episode(layout, u64::from(number), f32::from(number % 7) * 1e-3));
     });
     let mut sampler = Sampler::new(&config.replay, layout);
     let mut batch = Batch::new(layout, layout.n_arms, config.ddpg.batch_size);

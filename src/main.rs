@@ -31,12 +31,11 @@ fn main() -> ExitCode {
             return if asked_for { ExitCode::SUCCESS } else { Exit::Usage.into() };
         }
     };
-    let _logging = match services::start_logging(&cli) {
-        Ok(guard) => guard,
-        Err(failed) => return failed.report(),
-    };
+    if let Err(failed) = services::start_logging(&cli) {
+        return failed.report();
+    }
     let done = match cli.command {
-        Command::Train(args) => train::train(*args),
+        Command::Train(args) => train::train(&args),
         Command::Eval(args) => eval::eval(&args),
         Command::Teacher(args) => services::teacher(args),
         Command::Learner(args) => services::learner(args),

@@ -105,7 +105,7 @@ fn merge(base: &mut Table, changes: Table, path: &str) -> anyhow::Result<()> {
             (Some(Value::Table(inner)), Value::Table(changes)) => merge(inner, changes, &name)?,
             (Some(Value::Table(_)), _) => bail!("{name:?} is a section, not a setting"),
             (Some(slot @ Value::Float(_)), Value::Integer(whole)) => {
-                *slot = Value::Float(whole as f64)
+                *slot = Value::Float(whole as f64);
             }
             (Some(slot), change) => {
                 if !slot.same_type(&change) {

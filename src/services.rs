@@ -118,8 +118,8 @@ fn worker_failed(error: tandem_worker::Error) -> Failed {
     use tandem_worker::Error as E;
     let exit = match error {
         E::Address { .. } | E::NoTeacher { .. } => Exit::Usage,
-        E::Rollout { .. } | E::Panicked(_) | E::NoAccount { .. } => Exit::Bug,
-        E::Protocol { .. } | E::Parameters { .. } => Exit::TryAgain,
+        E::Rollout { .. } | E::World(_) | E::Panicked(_) | E::NoAccount { .. } => Exit::Bug,
+        E::Protocol { .. } | E::Parameters { .. } | E::LogDir { .. } => Exit::TryAgain,
     };
     Failed::new(exit, error)
 }

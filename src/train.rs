@@ -24,8 +24,8 @@ const START_DEADLINE: Duration = Duration::from_secs(60);
 /// How long processes may take to save and end.
 const END_DEADLINE: Duration = Duration::from_secs(60);
 
-pub(crate) fn train(args: TrainArgs) -> Result<(), Failed> {
-    let plan = Plan::of(&args)?;
+pub(crate) fn train(args: &TrainArgs) -> Result<(), Failed> {
+    let plan = Plan::of(args)?;
     plan.prepare()?;
     let runtime = services::runtime().or_exit(Exit::TryAgain, String::new)?;
     let last = runtime.block_on(async {

@@ -14,6 +14,8 @@ use tokio::process::{Child, Command};
 
 use super::plan::Plan;
 
+/// How long teacher and workers may take to end once the learner has.
+const GRACE: Duration = Duration::from_secs(5);
 /// Failures of one worker after which the run is given up.
 const MAX_WORKER_FAILURES: u32 = 10;
 
@@ -114,27 +116,19 @@ impl Children {
         Ok(said)
     }
 
-    /// Closes every child's standard input and waits for their end; what then still runs is killed.
+    /// Closes every child's standard input and waits for their end; what then still runs is killed. The learner, which
+    /// saves, has until `deadline`.
     pub(crate) async fn end(&mut self, deadline: Duration) {
-        let mut children: Vec<Child> = self.workers.drain(..).map(|worker| worker.child).collect();
-        children.extend(self.learner.take().map(|(child, _)| child));
-        for child in &mut children {
+        let mut others: Vec<Child> = self.workers.drain(..).map(|worker| worker.child).collect();
+        others.extend(self.teacher.take().map(|(child, _)| child));
+        for child in &mut others {
             drop(child.stdin.take());
         }
-        let all = async {
-            for child in &mut children {
-                drop(child.wait().await);
-            }
-        };
-        if tokio::time::timeout(deadline, all).await.is_err() {
-            for child in &mut children {
-                drop(child.kill().await);
-            }
+        if let Some((learner, _)) = self.learner.take() {
+            end_within(learner, deadline).await;
         }
-        if let Some((mut teacher, _)) = self.teacher.take() {
-            drop(teacher.stdin.take());
-            drop(tokio::time::timeout(Duration::from_secs(5), teacher.wait()).await);
-            drop(teacher.kill().await);
+        for child in others {
+            end_within(child, GRACE).await;
         }
     }
 
@@ -193,6 +187,14 @@ impl Children {
             .stdin(Stdio::piped())
             .stderr(self.log.try_clone()?);
         Ok(command)
+    }
+}
+
+/// Waits for a child whose standard input is closed, and kills it when it takes too long.
+async fn end_within(mut child: Child, deadline: Duration) {
+    drop(child.stdin.take());
+    if tokio::time::timeout(deadline, child.wait()).await.is_err() {
+        drop(child.kill().await);
     }
 }
 
