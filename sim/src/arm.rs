@@ -2,11 +2,11 @@
 
 use rapier3d::glamx::{DMat3, DVec3};
 use rapier3d::math::{Matrix, Vector};
-use tandem_core::ArmIndex;
+use tandem_core::{ArmIndex, Task};
 
 use crate::config::WorldConfig;
 use crate::frame::{BASE_IN_OWN, OwnFrame, WORKSPACE_HIGH, WORKSPACE_LOW};
-use crate::hand::Hand;
+use crate::hand::{Gripper, Hand};
 use crate::kinematics::{HOME, JointAngles, Posture, solve};
 use crate::physics::Physics;
 
@@ -42,10 +42,15 @@ impl Arm {
         physics: &mut Physics,
         arm: ArmIndex,
         frame: OwnFrame,
-        pads: f32,
+        task: Task,
         config: &WorldConfig,
     ) -> Self {
-        let hand = Hand::build(physics, arm, frame, pads, config.grip_force_n);
+        let gripper = match task {
+            Task::Push => Gripper::Locked,
+            Task::PickAndPlace => Gripper::Driven,
+        };
+        let pads = config.friction(task).pads;
+        let hand = Hand::build(physics, arm, frame, gripper, pads, config.grip_force_n);
         Self { frame, hand, angles: HOME }
     }
 

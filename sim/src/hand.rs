@@ -1,7 +1,8 @@
 //! The hand: a palm that flies where its servo pushes it, and three fingers that open and close as one.
 //!
 //! Palm and fingers are rapier bodies that cannot turn. The arm's motors appear as one bounded force on the palm, the
-//! fingers are held in their places by forces whose reaction the palm feels; there are no joints.
+//! fingers are held in their places by forces whose reaction the palm feels; there are no joints. A locked gripper is
+//! one rigid piece with the palm: fingers that could give way would hook over an object's edge and drag it along.
 
 use rapier3d::dynamics::{CoefficientCombineRule, RigidBodyBuilder, RigidBodyHandle};
 use rapier3d::geometry::ColliderBuilder;
@@ -56,17 +57,28 @@ const FINGERS_MASS_KG: f32 = 0.4;
 /// Number of fingers.
 pub(crate) const N_FINGERS: usize = FINGERS.len();
 
+/// What the fingers are to the palm.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Gripper {
+    /// Shut, and one rigid piece with the palm.
+    Locked,
+    /// Bodies of their own that open and close.
+    Driven,
+}
+
 /// The bodies of a hand, all as of one physics step.
 #[derive(Clone)]
 pub(crate) struct Hand {
     frame: OwnFrame,
     palm: RigidBodyHandle,
+    gripper: Gripper,
     fingers: [Finger; N_FINGERS],
     grip_force_n: f32,
 }
 
 #[derive(Clone, Copy)]
 struct Finger {
+    /// The palm's own body when the gripper is locked.
     body: RigidBodyHandle,
     mass_kg: f32,
     /// Share of the mass, and of the common opening's measure.
@@ -94,12 +106,16 @@ impl Hand {
         physics: &mut Physics,
         arm: ArmIndex,
         frame: OwnFrame,
+        gripper: Gripper,
         pad_friction: f32,
         grip_force_n: f32,
     ) -> Self {
         let palm = build_palm(physics, arm, frame);
-        let fingers = FINGERS.map(|plan| build_finger(physics, arm, frame, &plan, pad_friction));
-        Self { frame, palm, fingers, grip_force_n }
+        let fingers = FINGERS.map(|plan| match gripper {
+            Gripper::Locked => attach_finger(physics, arm, frame, palm, &plan, pad_friction),
+            Gripper::Driven => build_finger(physics, arm, frame, &plan, pad_friction),
+        });
+        Self { frame, palm, gripper, fingers, grip_force_n }
     }
 
     /// Puts the hand, at rest, where its end effector is at `end_effector_in_own` and each side is open by `opening_m`.
@@ -108,7 +124,7 @@ impl Hand {
         let palm = &mut physics.bodies[self.palm];
         palm.set_translation(at, true);
         palm.set_linvel(Vector::ZERO, true);
-        for finger in &self.fingers {
+        for finger in self.driven_fingers() {
             let body = &mut physics.bodies[finger.body];
             body.set_translation(
                 at + finger.shut_offset + Vector::Y * (finger.outward * opening_m),
@@ -130,13 +146,19 @@ impl Hand {
 
     /// How far each finger is open (metres) and how fast it opens (metres per second).
     pub(crate) fn openings(&self, physics: &Physics) -> [(f32, f32); N_FINGERS] {
+        if self.gripper == Gripper::Locked {
+            return [(0.0, 0.0); N_FINGERS];
+        }
         let velocity = self.velocity(physics);
         self.finger_states(physics, velocity).map(|state| (state.opening_m, state.opening_rate_mps))
     }
 
     /// The pads' centres, world frame, metres.
     pub(crate) fn pads(&self, physics: &Physics) -> [Vector; N_FINGERS] {
-        self.fingers.map(|finger| physics.bodies[finger.body].translation())
+        self.fingers.map(|finger| match self.gripper {
+            Gripper::Locked => self.end_effector(physics) + finger.shut_offset,
+            Gripper::Driven => physics.bodies[finger.body].translation(),
+        })
     }
 
     /// Whether all positions and velocities are finite.
@@ -156,7 +178,7 @@ impl Hand {
         rates_mps: [f32; N_FINGERS],
     ) {
         physics.bodies[self.palm].set_linvel(palm, true);
-        for (finger, rate_mps) in self.fingers.iter().zip(rates_mps) {
+        for (finger, rate_mps) in self.driven_fingers().iter().zip(rates_mps) {
             physics.bodies[finger.body]
                 .set_linvel(palm + Vector::Y * (finger.outward * rate_mps), true);
         }
@@ -172,6 +194,9 @@ impl Hand {
         let palm_velocity = self.velocity(physics);
         let palm_force =
             bounded((velocity - palm_velocity) * (moved_mass_kg / substep_s), PALM_FORCE_N);
+        if self.gripper == Gripper::Locked {
+            return apply(physics, self.palm, palm_force);
+        }
         let palm_velocity_next = palm_velocity + palm_force * (substep_s / moved_mass_kg);
 
         let finger_forces = self.finger_forces(physics, palm_velocity_next, gripper);
@@ -223,6 +248,14 @@ impl Hand {
         })
     }
 
+    /// The fingers that move by themselves.
+    fn driven_fingers(&self) -> &[Finger] {
+        match self.gripper {
+            Gripper::Locked => &[],
+            Gripper::Driven => &self.fingers,
+        }
+    }
+
     fn finger_states(&self, physics: &Physics, palm_velocity: Vector) -> [FingerState; N_FINGERS] {
         let palm_at = self.end_effector(physics);
         self.fingers.map(|finger| {
@@ -272,17 +305,43 @@ fn build_finger(
     friction: f32,
 ) -> Finger {
     let body = physics.bodies.insert(weightless_body(frame));
-    let pad = ColliderBuilder::cuboid(PAD_HALF_M.x, PAD_HALF_M.y, PAD_HALF_M.z)
+    let pad = pad(arm, plan, friction);
+    physics.colliders.insert_with_parent(pad, body, &mut physics.bodies);
+    finger_on(body, frame, plan)
+}
+
+/// A finger that is part of the palm. The palm's body is turned with the arm, so the pad's place is the arm's own.
+fn attach_finger(
+    physics: &mut Physics,
+    arm: ArmIndex,
+    frame: OwnFrame,
+    palm: RigidBodyHandle,
+    plan: &FingerPlan,
+    friction: f32,
+) -> Finger {
+    let pad = pad(arm, plan, friction).translation(shut_offset_in_own(plan));
+    physics.colliders.insert_with_parent(pad, palm, &mut physics.bodies);
+    finger_on(palm, frame, plan)
+}
+
+fn pad(arm: ArmIndex, plan: &FingerPlan, friction: f32) -> ColliderBuilder {
+    ColliderBuilder::cuboid(PAD_HALF_M.x, PAD_HALF_M.y, PAD_HALF_M.z)
         .mass(plan.mass_kg)
         .friction(friction)
         .friction_combine_rule(CoefficientCombineRule::Max)
-        .collision_groups(collides(Part::Hand, arm));
-    physics.colliders.insert_with_parent(pad, body, &mut physics.bodies);
+        .collision_groups(collides(Part::Hand, arm))
+}
+
+fn shut_offset_in_own(plan: &FingerPlan) -> Vector {
+    Vector::new(plan.x_m, plan.side * PAD_HALF_M.y, 0.0)
+}
+
+fn finger_on(body: RigidBodyHandle, frame: OwnFrame, plan: &FingerPlan) -> Finger {
     Finger {
         body,
         mass_kg: plan.mass_kg,
         share: plan.mass_kg / FINGERS_MASS_KG,
-        shut_offset: frame.turned(Vector::new(plan.x_m, plan.side * PAD_HALF_M.y, 0.0)),
+        shut_offset: frame.turned(shut_offset_in_own(plan)),
         outward: frame.turned(Vector::Y * plan.side).y,
     }
 }

@@ -38,7 +38,7 @@ impl World {
         for arm in layout.arms() {
             let frame = OwnFrame::of(arm, layout.n_arms);
             add_table(&mut physics, arm, frame);
-            arms.push(Arm::build(&mut physics, arm, frame, friction.pads, config));
+            arms.push(Arm::build(&mut physics, arm, frame, layout.task, config));
             objects.push(add_object(&mut physics, arm, config, friction.object));
         }
         Self { physics, arms, objects, guard: None, substeps: config.substeps }
