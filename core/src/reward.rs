@@ -36,16 +36,16 @@ mod tests {
 
     #[test]
     fn the_reward_changes_at_the_tolerance() {
-        assert!(sparse_reward(&[0.0, 0.0, 0.049], &[0.0; 3]) == REWARD_ACHIEVED);
-        assert!(sparse_reward(&[0.0, 0.0, 0.051], &[0.0; 3]) == REWARD_PENDING);
+        assert_eq!(sparse_reward(&[0.0, 0.0, 0.049], &[0.0; 3]), REWARD_ACHIEVED);
+        assert_eq!(sparse_reward(&[0.0, 0.0, 0.051], &[0.0; 3]), REWARD_PENDING);
     }
 
     #[test]
     fn the_joint_norm_is_stricter_than_every_arm_alone() {
         let (achieved, goal) = ([0.04, 0.0, 0.0, 0.0, 0.04, 0.0], [0.0; 6]);
-        assert!(sparse_reward(&achieved[..3], &goal[..3]) == REWARD_ACHIEVED);
-        assert!(sparse_reward(&achieved[3..], &goal[3..]) == REWARD_ACHIEVED);
-        assert!(sparse_reward(&achieved, &goal) == REWARD_PENDING);
+        assert_eq!(sparse_reward(&achieved[..3], &goal[..3]), REWARD_ACHIEVED);
+        assert_eq!(sparse_reward(&achieved[3..], &goal[3..]), REWARD_ACHIEVED);
+        assert_eq!(sparse_reward(&achieved, &goal), REWARD_PENDING);
     }
 
     #[test]

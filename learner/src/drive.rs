@@ -188,6 +188,7 @@ impl<'a> Drive<'a> {
 
     fn learn(&mut self, episodes: &[Episode]) -> Result<RoundFigures, Error> {
         self.trainer.ingest(episodes);
+        self.tell("updating", &self.trainer.figures());
         let counters = self.trainer.counters();
         let mut told_at = self.now_s();
         let (shared, clock, wall_before_s) = (self.shared, &self.config.clock, self.wall_before_s);

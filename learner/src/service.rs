@@ -180,7 +180,7 @@ pub async fn serve(
                 progress.ended = true;
                 progress.end_reason = reason;
             });
-            runtime.block_on(tokio::time::sleep(LINGER));
+            runtime.block_on(async { tokio::time::sleep(LINGER).await });
             // Watchers' streams close at the first message after the one that says so.
             shared.progress.send_modify(|_| ());
             ended

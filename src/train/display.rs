@@ -88,7 +88,8 @@ impl Display {
 
     pub(crate) fn close(&self) {
         if let Some(live) = &self.live {
-            drop(live.all.clear());
+            live.bar.finish_and_clear();
+            live.lines.iter().for_each(ProgressBar::finish_and_clear);
         }
     }
 
