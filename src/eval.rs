@@ -5,7 +5,7 @@ use std::path::Path;
 
 use serde_json::{Value, json};
 use tandem_core::work::{EpisodeOrder, Exploration, RunTerms, WorldTerms};
-use tandem_core::{Episode, EpisodeOutcome, EvaluationSummary, Layout, Task};
+use tandem_core::{Episode, EpisodeOutcome, EvaluationSummary, Layout, Task, Wilson};
 use tandem_policy::Policy;
 use tandem_sim::WorldConfig;
 use tandem_telemetry::EpisodeMetadata;
@@ -107,21 +107,23 @@ impl Measured {
     /// The figures for a person, a line each.
     pub(crate) fn lines(&self) -> Vec<String> {
         let summary = &self.summary;
-        let arms: Vec<String> =
-            summary.success_per_arm.iter().map(|share| format!("{share:.3}")).collect();
-        vec![
-            format!(
-                "success       {:.3}   95 % interval {:.3} to {:.3}, {} episodes",
-                summary.success, summary.interval.low, summary.interval.high, summary.n_episodes
-            ),
-            format!("joint norm    {:.3}", summary.success_joint),
-            format!("each arm      {}", arms.join("  ")),
-            format!(
-                "collisions    {:.3} of episodes, {:.3} before success",
-                summary.collision_rate, summary.collision_rate_before_success
-            ),
-            format!("mean return   {:.1}", summary.mean_return),
-        ]
+        let share = |label: &str, share: f64| {
+            let Wilson { low, high } = summary.interval_of(share);
+            format!("{label:<13} {share:.3}   95 % interval {low:.3} to {high:.3}")
+        };
+        let mut lines = vec![
+            format!("{}, {} episodes", share("success", summary.success), summary.n_episodes),
+            share("joint norm", summary.success_joint),
+        ];
+        let arms = summary.success_per_arm.iter().enumerate();
+        lines.extend(arms.map(|(arm, success)| share(&format!("arm {}", arm + 1), *success)));
+        lines.push(format!(
+            "{}, {:.3} before success",
+            share("collisions", summary.collision_rate),
+            summary.collision_rate_before_success
+        ));
+        lines.push(format!("mean return   {:.1}", summary.mean_return));
+        lines
     }
 }
 

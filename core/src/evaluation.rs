@@ -110,6 +110,17 @@ pub struct EvaluationSummary {
 }
 
 impl EvaluationSummary {
+    /// The 95 % interval of one of this evaluation's shares.
+    #[must_use]
+    #[expect(
+        clippy::cast_possible_truncation,
+        clippy::cast_sign_loss,
+        reason = "a share of few episodes"
+    )]
+    pub fn interval_of(&self, share: f64) -> Wilson {
+        Wilson::of((share * self.n_episodes as f64).round() as usize, self.n_episodes)
+    }
+
     /// Sums up `outcomes` of one layout; all shares are 0 when there are none.
     #[must_use]
     pub fn of(outcomes: &[EpisodeOutcome]) -> Self {

@@ -172,8 +172,7 @@ pub async fn serve(
         std::thread::Builder::new().name("learn".to_owned()).spawn(move || {
             let _stop = stop_serving.drop_guard();
             let ended = drive::run(&config, &shared, &runtime, &shutdown);
-            let reason =
-                ended.as_ref().map_or_else(ToString::to_string, |ended| ended.reason.clone());
+            let reason = ended.as_ref().map_or_else(with_causes, |ended| ended.reason.clone());
             shared.lock().finished = Some(reason.clone());
             shared.work.notify_waiters();
             shared.progress.send_modify(|progress| {
@@ -210,6 +209,20 @@ pub async fn serve(
             source: source.into(),
         }),
     }
+}
+
+/// An error and what caused it, on one line.
+fn with_causes(error: &Error) -> String {
+    let mut line = error.to_string();
+    let mut cause = std::error::Error::source(error);
+    while let Some(inner) = cause {
+        let text = inner.to_string();
+        if !line.contains(&text) {
+            line = format!("{line}: {text}");
+        }
+        cause = inner.source();
+    }
+    line
 }
 
 fn reflection_v1() -> tonic_reflection::server::v1::ServerReflectionServer<

@@ -142,7 +142,12 @@ impl Live {
             .iter()
             .map(|worker| format!("{} {}", worker.name, worker.doing))
             .collect();
-        self.lines[2].set_message(format!("learner {}; {}", progress.phase, workers.join("; ")));
+        let teacher = if progress.strategy == "none" { "" } else { "teacher answering; " };
+        self.lines[2].set_message(format!(
+            "learner {}; {teacher}{}",
+            progress.phase,
+            workers.join("; ")
+        ));
     }
 }
 
