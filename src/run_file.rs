@@ -155,6 +155,19 @@ mod tests {
     }
 
     #[test]
+    fn every_run_file_that_ships_is_valid() {
+        let directory = Path::new(env!("CARGO_MANIFEST_DIR")).join("deploy");
+        let files =
+            std::fs::read_dir(directory).expect("ships").flatten().map(|entry| entry.path());
+        let run_files: Vec<_> =
+            files.filter(|path| path.extension().is_some_and(|e| e == "toml")).collect();
+        assert!(run_files.len() >= 4);
+        for path in run_files {
+            assert!(resolve(Some(&path), &[]).is_ok(), "{}", path.display());
+        }
+    }
+
+    #[test]
     fn a_written_configuration_is_read_back() {
         let config = RunConfig::defaults(Recipe::Paper, Task::PickAndPlace, 2);
         let text = to_toml(&config).expect("writes");

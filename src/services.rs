@@ -4,7 +4,7 @@ use std::future::Future;
 use std::net::SocketAddr;
 
 use anyhow::Context as _;
-use tandem_learner::service::Error as LearnerError;
+use tandem_learner::Error as LearnerError;
 use tandem_telemetry::logging::{LevelFilter, LogConfig};
 use tokio::net::TcpListener;
 use tokio::runtime::{Builder, Runtime};

@@ -22,7 +22,8 @@ use tracing::warn;
 
 use crate::board::Silent;
 use crate::checkpoint::{self, Resumption};
-use crate::service::{Error, LearnerConfig, Shared};
+use crate::error::Error;
+use crate::shared::{LearnerConfig, Shared};
 use crate::teacher::{Ledger, TeacherError};
 use crate::trainer::{RoundFigures, Trainer};
 

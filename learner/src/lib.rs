@@ -12,11 +12,15 @@ pub mod checkpoint;
 pub mod config;
 pub mod ddpg;
 mod drive;
+mod error;
 pub mod her;
 pub mod replay;
 pub mod service;
+mod shared;
 mod teacher;
 pub mod trainer;
 
 pub use config::RunConfig;
-pub use service::{LearnerConfig, serve};
+pub use error::Error;
+pub use service::serve;
+pub use shared::{Clock, LearnerConfig};

@@ -1,30 +1,25 @@
 //! The `Learner` service: a thin shell round the board and the thread that learns.
 
-use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::pin::Pin;
-use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
+use std::sync::Arc;
 use std::time::Duration;
 
-use tandem_core::work::{PublishedActor, RunTerms};
 use tandem_proto::pb;
 use tandem_proto::pb::learner_server::{Learner, LearnerServer};
 use tandem_proto::{decode_episode, encode_actor, encode_slot, encode_terms};
 use tandem_telemetry::events::WorkerJoined;
 use tokio::net::TcpListener;
-use tokio::sync::{Notify, watch};
 use tokio_stream::wrappers::WatchStream;
 use tokio_stream::{Stream, StreamExt as _};
 use tokio_util::sync::CancellationToken;
 use tonic::transport::server::TcpIncoming;
 use tonic::{Request, Response, Status};
 
-use crate::board::{Board, SubmitError};
-use crate::checkpoint::CheckpointError;
-use crate::config::{ConfigError, RunConfig};
-use crate::ddpg::DdpgError;
+use crate::board::SubmitError;
 use crate::drive::{self, Ended};
-use crate::teacher::TeacherError;
+use crate::error::Error;
+use crate::shared::{LearnerConfig, Shared};
 
 /// How long a worker's question for work is held before it is told to wait.
 const WORK_POLL: Duration = Duration::from_secs(2);
@@ -34,123 +29,6 @@ const LINGER: Duration = Duration::from_millis(1500);
 const MAX_MESSAGE_BYTES: usize = 64 << 20;
 /// Longest label of a worker.
 const MAX_NAME_BYTES: usize = 256;
-/// Parameter versions kept for workers that lag behind.
-const KEPT_VERSIONS: usize = 16;
-
-/// The time since some start; passed in so that nothing here reads a clock.
-pub type Clock = Arc<dyn Fn() -> Duration + Send + Sync>;
-
-/// What a learner needs to run.
-#[derive(Clone)]
-pub struct LearnerConfig {
-    /// The run.
-    pub run: RunConfig,
-    /// The teacher's address, `http://host:port`; needed when the run asks for advice.
-    pub teacher: Option<String>,
-    /// The run directory.
-    pub out: PathBuf,
-    /// Whether to go on from the newest checkpoint.
-    pub resume: bool,
-    /// Threads of the update, 1 or 2.
-    pub n_threads: usize,
-    /// Time since the process started.
-    pub clock: Clock,
-    /// Version of the program, kept in what it writes.
-    pub version: String,
-    /// Where workers' numbers start; another one for each start of a learner, so that a worker of the learner before
-    /// is not taken for one of this.
-    pub first_worker: u64,
-}
-
-/// Why a learner gave up.
-#[derive(Debug, thiserror::Error)]
-pub enum Error {
-    /// The run file cannot be used.
-    #[error(transparent)]
-    Config(#[from] ConfigError),
-    /// The state could not be saved or restored.
-    #[error(transparent)]
-    Checkpoint(#[from] CheckpointError),
-    /// Something in the run directory could not be read or written.
-    #[error("cannot {action} {path:?}")]
-    RunDirectory {
-        /// What was attempted.
-        action: &'static str,
-        /// On what.
-        path: PathBuf,
-        /// Why not.
-        source: Box<dyn std::error::Error + Send + Sync>,
-    },
-    /// The teacher declined, or its address is none.
-    #[error(transparent)]
-    Teacher(#[from] TeacherError),
-    /// The run asks for advice and no teacher is named.
-    #[error("strategy {0:?} needs a teacher: give its address")]
-    NoTeacher(String),
-    /// Learning diverged.
-    #[error(transparent)]
-    Diverged(#[from] DdpgError),
-    /// The network refused.
-    #[error("cannot serve")]
-    Serve(#[from] tonic::transport::Error),
-    /// The thread that learns panicked: a bug.
-    #[error("the learning thread panicked")]
-    Panicked,
-}
-
-/// State shared by the service's calls and the thread that learns.
-pub(crate) struct Shared {
-    state: Mutex<State>,
-    /// Signalled whenever episodes come in.
-    pub(crate) arrived: Condvar,
-    /// Signalled whenever there may be work.
-    pub(crate) work: Notify,
-    pub(crate) progress: watch::Sender<pb::Progress>,
-    pub(crate) clock: Clock,
-}
-
-#[derive(Default)]
-pub(crate) struct State {
-    pub(crate) board: Board,
-    pub(crate) terms: Option<RunTerms>,
-    pub(crate) published: BTreeMap<u64, PublishedActor>,
-    pub(crate) finished: Option<String>,
-}
-
-impl Shared {
-    pub(crate) fn new(clock: Clock) -> Self {
-        let (progress, _) = watch::channel(pb::Progress::default());
-        Self {
-            state: Mutex::default(),
-            arrived: Condvar::new(),
-            work: Notify::new(),
-            progress,
-            clock,
-        }
-    }
-
-    pub(crate) fn lock(&self) -> MutexGuard<'_, State> {
-        self.state.lock().unwrap_or_else(PoisonError::into_inner)
-    }
-
-    /// Waits a while for episodes to come in.
-    pub(crate) fn wait<'a>(
-        &self,
-        state: MutexGuard<'a, State>,
-        at_most: Duration,
-    ) -> MutexGuard<'a, State> {
-        self.arrived.wait_timeout(state, at_most).unwrap_or_else(PoisonError::into_inner).0
-    }
-
-    /// Hands out an actor from now on, and forgets the oldest.
-    pub(crate) fn publish(&self, actor: PublishedActor) {
-        let mut state = self.lock();
-        state.published.insert(actor.version, actor);
-        while state.published.len() > KEPT_VERSIONS {
-            state.published.pop_first();
-        }
-    }
-}
 
 /// Serves a run on `listener` until it ends or `shutdown` is cancelled; the state is saved either way.
 ///

@@ -10,7 +10,7 @@ use tandem_telemetry::events::EvaluationFinished;
 use super::progress::evaluation_message;
 use super::{Drive, EVALUATION_PATIENCE_ROUNDS, Pending, ROUNDS_PER_PAPER_EPOCH};
 use crate::config::Recipe;
-use crate::service::Error;
+use crate::error::Error;
 use crate::teacher::Ledger;
 use crate::trainer::RoundFigures;
 

@@ -1,0 +1,95 @@
+//! What the service's calls and the thread that learns share, and what both are told at the start.
+
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
+
+use tandem_core::work::{PublishedActor, RunTerms};
+use tandem_proto::pb;
+use tokio::sync::{Notify, watch};
+
+use crate::board::Board;
+use crate::config::RunConfig;
+
+/// Parameter versions kept for workers that lag behind.
+const KEPT_VERSIONS: usize = 16;
+
+/// The time since some start; passed in so that nothing here reads a clock.
+pub type Clock = Arc<dyn Fn() -> Duration + Send + Sync>;
+
+/// What a learner needs to run.
+#[derive(Clone)]
+pub struct LearnerConfig {
+    /// The run.
+    pub run: RunConfig,
+    /// The teacher's address, `http://host:port`; needed when the run asks for advice.
+    pub teacher: Option<String>,
+    /// The run directory.
+    pub out: PathBuf,
+    /// Whether to go on from the newest checkpoint.
+    pub resume: bool,
+    /// Threads of the update, 1 or 2.
+    pub n_threads: usize,
+    /// Time since the process started.
+    pub clock: Clock,
+    /// Version of the program, kept in what it writes.
+    pub version: String,
+    /// Where workers' numbers start; another one for each start of a learner, so that a worker of the learner before
+    /// is not taken for one of this.
+    pub first_worker: u64,
+}
+
+/// State shared by the service's calls and the thread that learns.
+pub(crate) struct Shared {
+    state: Mutex<State>,
+    /// Signalled whenever episodes come in.
+    pub(crate) arrived: Condvar,
+    /// Signalled whenever there may be work.
+    pub(crate) work: Notify,
+    pub(crate) progress: watch::Sender<pb::Progress>,
+    pub(crate) clock: Clock,
+}
+
+#[derive(Default)]
+pub(crate) struct State {
+    pub(crate) board: Board,
+    pub(crate) terms: Option<RunTerms>,
+    pub(crate) published: BTreeMap<u64, PublishedActor>,
+    pub(crate) finished: Option<String>,
+}
+
+impl Shared {
+    pub(crate) fn new(clock: Clock) -> Self {
+        let (progress, _) = watch::channel(pb::Progress::default());
+        Self {
+            state: Mutex::default(),
+            arrived: Condvar::new(),
+            work: Notify::new(),
+            progress,
+            clock,
+        }
+    }
+
+    pub(crate) fn lock(&self) -> MutexGuard<'_, State> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Waits a while for episodes to come in.
+    pub(crate) fn wait<'a>(
+        &self,
+        state: MutexGuard<'a, State>,
+        at_most: Duration,
+    ) -> MutexGuard<'a, State> {
+        self.arrived.wait_timeout(state, at_most).unwrap_or_else(PoisonError::into_inner).0
+    }
+
+    /// Hands out an actor from now on, and forgets the oldest.
+    pub(crate) fn publish(&self, actor: PublishedActor) {
+        let mut state = self.lock();
+        state.published.insert(actor.version, actor);
+        while state.published.len() > KEPT_VERSIONS {
+            state.published.pop_first();
+        }
+    }
+}
