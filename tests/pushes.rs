@@ -67,7 +67,7 @@ fn the_shipped_push_teacher_pushes() {
     assert!(success >= 0.95, "success {success}");
     assert!(n_moving > 1000, "hardly anything moves");
     assert!(
-        share_above < 0.25,
+        share_above < 0.05,
         "the hand is above the cube in {share_above:.2} of the steps in which it moves"
     );
     assert!(
