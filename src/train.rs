@@ -59,14 +59,24 @@ async fn run(plan: &Plan, interrupted: &CancellationToken) -> Result<pb::Progres
         () = again.cancelled() => (),
     }
     display.close();
-    let last = last.or_exit(Exit::TryAgain, || {
-        format!("the run broke off; see {}", plan.log_path().display())
-    })?;
+    let last = last.or_exit(Exit::TryAgain, || broke_off(plan))?;
     if last.ended && !interrupted.is_cancelled() {
         Ok(last)
     } else {
         Ok(pb::Progress { end_reason: "interrupted".to_owned(), ..last })
     }
+}
+
+/// Says where to look and how to go on.
+fn broke_off(plan: &Plan) -> String {
+    let (log, out) = (plan.log_path(), plan.out.display());
+    let how_to_go_on = if tandem_learner::checkpoint::list(&plan.out.join("checkpoint")).is_empty()
+    {
+        "nothing was saved yet".to_owned()
+    } else {
+        format!("go on with `tandem train --resume --out {out}`")
+    };
+    format!("the run broke off, {how_to_go_on}; see {}", log.display())
 }
 
 /// Follows the learner's progress to its end, and keeps the workers alive.
@@ -94,6 +104,7 @@ async fn watch(
                 }
                 Ok(None) => return failed_or(last),
                 Err(status) => {
+                    tokio::time::sleep(Duration::from_millis(300)).await;
                     children.check(plan)?;
                     return Err(anyhow!("the learner is gone: {}", status.message()));
                 }

@@ -88,11 +88,7 @@ impl Children {
                 && let Some(status) = child.try_wait()?
                 && !(role == "learner" && status.success())
             {
-                bail!(
-                    "the {role} died ({status}); its last words are in {}; go on with `tandem train --resume --out {}`",
-                    plan.log_path().display(),
-                    plan.out.display()
-                );
+                bail!("the {role} died ({status})");
             }
         }
         let mut said = Vec::new();
