@@ -50,6 +50,7 @@ async fn run(plan: &Plan, interrupted: &CancellationToken) -> Result<pb::Progres
         .and_then(|started| started)
         .or_exit(Exit::TryAgain, || format!("cannot start; see {}", plan.log_path().display()))?;
     let last = watch(plan, &mut children, &mut display, interrupted).await;
+    display.close();
     if interrupted.is_cancelled() {
         display.say("interrupted: saving, a second Ctrl-C ends at once");
     }
@@ -58,7 +59,6 @@ async fn run(plan: &Plan, interrupted: &CancellationToken) -> Result<pb::Progres
         () = children.end(END_DEADLINE) => (),
         () = again.cancelled() => (),
     }
-    display.close();
     let last = last.or_exit(Exit::TryAgain, || broke_off(plan))?;
     if last.ended && !interrupted.is_cancelled() {
         Ok(last)

@@ -86,8 +86,9 @@ impl Display {
         }
     }
 
-    pub(crate) fn close(&self) {
-        if let Some(live) = &self.live {
+    /// Takes the live lines away; what is said from now on is plain.
+    pub(crate) fn close(&mut self) {
+        if let Some(live) = self.live.take() {
             live.bar.finish_and_clear();
             live.lines.iter().for_each(ProgressBar::finish_and_clear);
         }
