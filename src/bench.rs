@@ -2,7 +2,8 @@
 
 use std::time::Duration;
 
-use serde_json::json;
+use clap::ValueEnum as _;
+use serde_json::{Value, json};
 use tandem_core::layout::EPISODE_STEPS;
 use tandem_core::rng::{Stream, episode_rng, uniform};
 use tandem_core::{Layout, Task};
@@ -34,14 +35,15 @@ struct Figure {
 
 #[expect(clippy::print_stdout, reason = "what the command is for")]
 pub(crate) fn bench(args: &BenchArgs) -> Result<(), Failed> {
-    let all = [BenchName::Sim, BenchName::Inference, BenchName::Update, BenchName::Replay];
-    let chosen: &[BenchName] = if args.what.is_empty() { &all } else { &args.what };
+    let all = BenchName::value_variants();
+    let chosen: &[BenchName] = if args.what.is_empty() { all } else { &args.what };
     for what in chosen {
         let figures = match what {
             BenchName::Sim => sim()?,
             BenchName::Inference => inference()?,
             BenchName::Update => update(),
             BenchName::Replay => replay(),
+            BenchName::EndToEnd => end_to_end()?,
         };
         for Figure { name, value, unit } in figures {
             if args.json {
@@ -178,6 +180,32 @@ fn replay() -> Vec<Figure> {
     let mut rng = episode_rng(1, 0, Stream::Replay);
     let per_s = rate(|| sampler.fill(&buffer, statistics, &mut rng, &mut batch));
     vec![Figure { name: "replay/batch-256".to_owned(), value: 1e6 / per_s, unit: "us" }]
+}
+
+/// The main job for 30 rounds, evaluations included: its rates and the memory of its processes.
+fn end_to_end() -> Result<Vec<Figure>, Failed> {
+    let directory = std::env::temp_dir().join(format!("tandem-bench-{}", std::process::id()));
+    let program = std::env::current_exe().or_exit(Exit::Bug, String::new)?;
+    let run = std::process::Command::new(program)
+        .args(["train", "--json", "--max-env-steps", "24000", "--max-minutes", "0", "--out"])
+        .arg(&directory)
+        .stderr(std::process::Stdio::null())
+        .output();
+    drop(std::fs::remove_dir_all(&directory));
+    let output = run.or_exit(Exit::TryAgain, || "cannot start a run".to_owned())?;
+    let summary: Value = serde_json::from_slice(&output.stdout).or_exit(Exit::TryAgain, || {
+        "the short run did not end well; try `tandem train`".to_owned()
+    })?;
+    let number = |key: &str| summary[key].as_f64().unwrap_or_default();
+    let figure =
+        |name: &str, value, unit| Figure { name: format!("end-to-end/{name}"), value, unit };
+    Ok(vec![
+        figure("env-steps", number("env_steps") / number("wall_s"), "env steps/s"),
+        figure("updates", number("updates") / number("wall_s"), "updates/s"),
+        figure("learner-memory", number("learner_mib"), "MiB"),
+        figure("teacher-memory", number("teacher_mib"), "MiB"),
+        figure("worker-memory", number("worker_mib"), "MiB"),
+    ])
 }
 
 /// Floating-point operations that one update cannot do without: five forward passes, the critic's two gradients, the

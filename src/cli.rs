@@ -40,7 +40,7 @@ pub(crate) enum Command {
     Learner(LearnerArgs),
     /// Plays episodes for a learner.
     Worker(WorkerArgs),
-    /// Measures simulation, networks, updates and replay on this machine.
+    /// Measures simulation, networks, updates, replay and a short run on this machine.
     Bench(BenchArgs),
     /// Shows what is in a policy file.
     Policy(PolicyArgs),
@@ -235,7 +235,7 @@ pub(crate) struct WorkerArgs {
 #[derive(Debug, Args)]
 #[command(after_help = "\
 Examples:
-  tandem bench                   everything, about a minute
+  tandem bench                   everything, about two minutes
   tandem bench sim update --json")]
 pub(crate) struct BenchArgs {
     /// What to measure [default: all].
@@ -252,6 +252,8 @@ pub(crate) enum BenchName {
     Inference,
     Update,
     Replay,
+    /// A short run of the main job, processes and all.
+    EndToEnd,
 }
 
 #[derive(Debug, Args)]

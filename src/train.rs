@@ -15,7 +15,7 @@ use tokio_util::sync::CancellationToken;
 use crate::cli::TrainArgs;
 use crate::exit::{Exit, Failed, OrExit as _};
 use crate::{services, signals};
-use children::Children;
+use children::{Children, Memory};
 use display::Display;
 use plan::Plan;
 
@@ -28,7 +28,7 @@ pub(crate) fn train(args: &TrainArgs) -> Result<(), Failed> {
     let plan = Plan::of(args)?;
     plan.prepare()?;
     let runtime = services::runtime().or_exit(Exit::TryAgain, String::new)?;
-    let last = runtime.block_on(async {
+    let (last, memory) = runtime.block_on(async {
         let interrupted = signals::shutdown_token(false).or_exit(Exit::TryAgain, String::new)?;
         run(&plan, &interrupted).await
     })?;
@@ -36,11 +36,14 @@ pub(crate) fn train(args: &TrainArgs) -> Result<(), Failed> {
         summary::interrupted(&plan, &last);
         return Err(Failed::new(Exit::Interrupted, anyhow!("interrupted")));
     }
-    summary::print(&plan, &last, args.json)
+    summary::print(&plan, &last, memory, args.json)
 }
 
 /// Starts every process, watches until the run has ended, and ends every process.
-async fn run(plan: &Plan, interrupted: &CancellationToken) -> Result<pb::Progress, Failed> {
+async fn run(
+    plan: &Plan,
+    interrupted: &CancellationToken,
+) -> Result<(pb::Progress, Memory), Failed> {
     let mut display = Display::new(plan);
     let mut children = Children::new(plan).or_exit(Exit::TryAgain, String::new)?;
     let started = tokio::time::timeout(START_DEADLINE, children.start(plan));
@@ -61,10 +64,9 @@ async fn run(plan: &Plan, interrupted: &CancellationToken) -> Result<pb::Progres
     }
     let last = last.or_exit(Exit::TryAgain, || broke_off(plan))?;
     if last.ended && !interrupted.is_cancelled() {
-        Ok(last)
-    } else {
-        Ok(pb::Progress { end_reason: "interrupted".to_owned(), ..last })
+        return Ok((last, children.memory()));
     }
+    Ok((pb::Progress { end_reason: "interrupted".to_owned(), ..last }, children.memory()))
 }
 
 /// Says where to look and how to go on.

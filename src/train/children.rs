@@ -26,6 +26,15 @@ pub(crate) struct Children {
     teacher: Option<(Child, String)>,
     learner: Option<(Child, String)>,
     workers: Vec<Worker>,
+    peak: Memory,
+}
+
+/// Largest resident size of each kind of process, MiB; 0 where there is none or the system does not tell.
+#[derive(Debug, Clone, Copy, Default)]
+pub(crate) struct Memory {
+    pub(crate) learner_mib: u64,
+    pub(crate) teacher_mib: u64,
+    pub(crate) worker_mib: u64,
 }
 
 struct Worker {
@@ -41,7 +50,15 @@ impl Children {
         let log = OpenOptions::new().create(true).append(true).open(&path);
         let log = log.with_context(|| format!("cannot write {}", path.display()))?;
         let program = std::env::current_exe().context("cannot find this program's own file")?;
-        Ok(Self { program, log, log_path: path, teacher: None, learner: None, workers: Vec::new() })
+        Ok(Self {
+            program,
+            log,
+            log_path: path,
+            teacher: None,
+            learner: None,
+            workers: Vec::new(),
+            peak: Memory::default(),
+        })
     }
 
     /// Starts teacher, learner and workers, in this order.
@@ -91,6 +108,7 @@ impl Children {
                 bail!("the {role} died ({status})");
             }
         }
+        self.sample_memory();
         let mut said = Vec::new();
         for idx in 0..self.workers.len() {
             let worker = &mut self.workers[idx];
@@ -110,6 +128,23 @@ impl Children {
             self.workers[idx].child = self.worker(plan, &name)?;
         }
         Ok(said)
+    }
+
+    /// The largest sizes seen so far.
+    pub(crate) const fn memory(&self) -> Memory {
+        self.peak
+    }
+
+    fn sample_memory(&mut self) {
+        let service = |service: &Option<(Child, String)>| {
+            service.as_ref().map_or(0, |(child, _)| peak_resident_mib(child))
+        };
+        let workers = self.workers.iter().map(|worker| peak_resident_mib(&worker.child));
+        self.peak = Memory {
+            learner_mib: self.peak.learner_mib.max(service(&self.learner)),
+            teacher_mib: self.peak.teacher_mib.max(service(&self.teacher)),
+            worker_mib: workers.fold(self.peak.worker_mib, u64::max),
+        };
     }
 
     /// Closes every child's standard input and waits for their end; what then still runs is killed. The learner, which
@@ -192,6 +227,16 @@ async fn end_within(mut child: Child, deadline: Duration) {
     if tokio::time::timeout(deadline, child.wait()).await.is_err() {
         drop(child.kill().await);
     }
+}
+
+/// `VmHWM` of a process, MiB; 0 when it is gone or the system keeps no such account.
+fn peak_resident_mib(child: &Child) -> u64 {
+    let status =
+        child.id().and_then(|pid| std::fs::read_to_string(format!("/proc/{pid}/status")).ok());
+    let status = status.unwrap_or_default();
+    let line = status.lines().find_map(|line| line.strip_prefix("VmHWM:"));
+    let kib = line.and_then(|line| line.split_whitespace().next()?.parse::<u64>().ok());
+    kib.unwrap_or(0) / 1024
 }
 
 /// The last line of the log, which is what a dying process says.

@@ -7,6 +7,7 @@ use tandem_proto::pb;
 use tandem_report::{Axis, CurveOptions, Quantity, Series};
 use tandem_telemetry::{MetricsLog, MetricsRow};
 
+use super::children::Memory;
 use super::display::{clock_text, grouped};
 use super::plan::Plan;
 use crate::eval::{Measured, Subject, measure};
@@ -19,7 +20,12 @@ const REPORT_EPISODES: u64 = 240;
 
 /// Judges the best policy on held-out goals, draws the curve, and prints where everything lies.
 #[expect(clippy::print_stdout, reason = "the result of the command")]
-pub(super) fn print(plan: &Plan, last: &pb::Progress, as_json: bool) -> Result<(), Failed> {
+pub(super) fn print(
+    plan: &Plan,
+    last: &pb::Progress,
+    memory: Memory,
+    as_json: bool,
+) -> Result<(), Failed> {
     let path = plan.best_policy();
     let measured = measure(&Subject::Policy(load_policy(&path)?), REPORT_EPISODES, REPORT_SEED)?;
     let rows =
@@ -27,7 +33,7 @@ pub(super) fn print(plan: &Plan, last: &pb::Progress, as_json: bool) -> Result<(
     let curve = draw_curve(plan, &rows)?;
     let report = tandem_report::run_report_html(&plan.out).or_exit(Exit::TryAgain, String::new)?;
     if as_json {
-        println!("{}", summary_json(plan, last, &measured));
+        println!("{}", summary_json(plan, last, memory, &measured));
         return Ok(());
     }
     println!("done: {}", last.end_reason);
@@ -46,6 +52,10 @@ pub(super) fn print(plan: &Plan, last: &pb::Progress, as_json: bool) -> Result<(
         "advice        {} spent, {} left",
         grouped(last.advice_spent),
         grouped(last.budget_left)
+    );
+    println!(
+        "memory        learner {} MiB, teacher {} MiB, workers at most {} MiB",
+        memory.learner_mib, memory.teacher_mib, memory.worker_mib
     );
     println!("policy        {}", path.display());
     println!("curve         {}", curve.display());
@@ -76,7 +86,7 @@ fn draw_curve(plan: &Plan, rows: &[MetricsRow]) -> Result<PathBuf, Failed> {
     Ok(path)
 }
 
-fn summary_json(plan: &Plan, last: &pb::Progress, measured: &Measured) -> Value {
+fn summary_json(plan: &Plan, last: &pb::Progress, memory: Memory, measured: &Measured) -> Value {
     let mut summary = measured.json();
     let more = json!({
         "env_steps": last.env_steps,
@@ -84,6 +94,9 @@ fn summary_json(plan: &Plan, last: &pb::Progress, measured: &Measured) -> Value 
         "wall_s": last.wall_s,
         "advice_spent": last.advice_spent,
         "budget_left": last.budget_left,
+        "learner_mib": memory.learner_mib,
+        "teacher_mib": memory.teacher_mib,
+        "worker_mib": memory.worker_mib,
         "run_dir": plan.out,
         "policy": plan.best_policy(),
         "digest": last.digest,
