@@ -161,15 +161,41 @@ pub(crate) struct EvalArgs {
     pub(crate) json: bool,
 }
 
+/// The secret that all processes of a run share.
+#[derive(Debug, Args)]
+pub(crate) struct SecretArgs {
+    /// File with the token that callers show and services demand; needed to listen on other than this machine's own
+    /// addresses.
+    #[arg(long, value_name = "FILE", env = "TANDEM_TOKEN_FILE")]
+    pub(crate) token_file: Option<PathBuf>,
+}
+
 /// Where a service listens.
 #[derive(Debug, Args)]
 pub(crate) struct ListenArgs {
     /// Address to listen on; port 0 takes a free one. It is printed as `listening on ADDR`.
     #[arg(long, default_value = "127.0.0.1:0", value_name = "ADDR")]
     pub(crate) listen: SocketAddr,
+    /// Speaks TLS with this certificate chain (PEM).
+    #[arg(long, value_name = "FILE.pem", requires = "tls_key")]
+    pub(crate) tls_cert: Option<PathBuf>,
+    /// The certificate's private key (PEM).
+    #[arg(long, value_name = "FILE.pem", requires = "tls_cert")]
+    pub(crate) tls_key: Option<PathBuf>,
+    /// Lets anybody call who can reach the address, without a token.
+    #[arg(long)]
+    pub(crate) insecure: bool,
     /// Ends when standard input closes, as it does when the parent process dies.
     #[arg(long, hide = true)]
     pub(crate) exit_with_stdin: bool,
+}
+
+/// Whom a client trusts.
+#[derive(Debug, Args)]
+pub(crate) struct DialArgs {
+    /// Calls services by TLS and trusts certificates that this authority (PEM) has signed.
+    #[arg(long, value_name = "FILE.pem")]
+    pub(crate) tls_ca: Option<PathBuf>,
 }
 
 #[derive(Debug, Args)]
@@ -182,6 +208,8 @@ pub(crate) struct TeacherArgs {
     pub(crate) policy: PathBuf,
     #[command(flatten)]
     pub(crate) listen: ListenArgs,
+    #[command(flatten)]
+    pub(crate) secret: SecretArgs,
 }
 
 #[derive(Debug, Args)]
@@ -207,6 +235,10 @@ pub(crate) struct LearnerArgs {
     pub(crate) threads: u8,
     #[command(flatten)]
     pub(crate) listen: ListenArgs,
+    #[command(flatten)]
+    pub(crate) dial: DialArgs,
+    #[command(flatten)]
+    pub(crate) secret: SecretArgs,
 }
 
 #[derive(Debug, Args)]
@@ -227,6 +259,10 @@ pub(crate) struct WorkerArgs {
     /// Where recorded episodes are written.
     #[arg(long, value_name = "DIR")]
     pub(crate) log_dir: Option<PathBuf>,
+    #[command(flatten)]
+    pub(crate) dial: DialArgs,
+    #[command(flatten)]
+    pub(crate) secret: SecretArgs,
     /// Ends when standard input closes, as it does when the parent process dies.
     #[arg(long, hide = true)]
     pub(crate) exit_with_stdin: bool,

@@ -7,6 +7,7 @@ use std::process::ExitCode;
 
 use clap::Parser as _;
 
+mod access;
 mod bench;
 mod cli;
 mod clock;

@@ -12,7 +12,7 @@ use tokio_util::sync::CancellationToken;
 
 use crate::cli::{Cli, Command, LearnerArgs, ListenArgs, TeacherArgs, WorkerArgs};
 use crate::exit::{Exit, Failed, OrExit as _};
-use crate::{clock, run_file, signals};
+use crate::{access, clock, run_file, signals};
 
 /// Version and commit of this program.
 pub(crate) const VERSION: &str = env!("CARGO_PKG_VERSION");
@@ -35,22 +35,29 @@ fn rust_log() -> Option<String> {
 
 pub(crate) fn teacher(args: TeacherArgs) -> Result<(), Failed> {
     crate::files::load_policy(&args.policy)?;
+    let gate = access::gate(&args.listen, &args.secret)?;
     run(async move {
         let shutdown = shutdown(args.listen.exit_with_stdin)?;
         let listener = listen(&args.listen).await?;
         let teacher = tandem_teacher::Config { policy: args.policy };
-        tandem_teacher::serve(teacher, listener, shutdown).await.or_exit(Exit::Data, String::new)
+        tandem_teacher::serve(teacher, listener, &gate, shutdown)
+            .await
+            .or_exit(Exit::Data, String::new)
     })
 }
 
 pub(crate) fn learner(args: LearnerArgs) -> Result<(), Failed> {
     let run_config = run_file::resolve(Some(&args.run), &[])?;
+    let gate = access::gate(&args.listen, &args.secret)?;
+    let dial = access::dial(&args.dial, &args.secret)?;
     run(async move {
         let shutdown = shutdown(args.listen.exit_with_stdin)?;
         let listener = listen(&args.listen).await?;
         let config = tandem_learner::LearnerConfig {
             run: run_config,
-            teacher: args.teacher.map(|address| uri(&address)),
+            gate,
+            dial,
+            teacher: args.teacher,
             out: args.out,
             resume: args.resume,
             n_threads: usize::from(args.threads),
@@ -69,9 +76,11 @@ pub(crate) fn learner(args: LearnerArgs) -> Result<(), Failed> {
 }
 
 pub(crate) fn worker(args: WorkerArgs) -> Result<(), Failed> {
+    let dial = access::dial(&args.dial, &args.secret)?;
     run(async move {
         let shutdown = shutdown(args.exit_with_stdin)?;
         let config = tandem_worker::WorkerConfig {
+            dial,
             learner: args.connect,
             teacher: args.teacher,
             name: args.name,
@@ -131,6 +140,7 @@ fn learner_failed(error: LearnerError) -> Failed {
         }
         LearnerError::Checkpoint(_) => Exit::Data,
         LearnerError::RunDirectory { .. } | LearnerError::Serve(_) => Exit::TryAgain,
+        LearnerError::Gate(_) => Exit::Usage,
         LearnerError::Diverged(_) | LearnerError::Panicked => Exit::Bug,
     };
     Failed::new(exit, error)

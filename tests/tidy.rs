@@ -4,15 +4,16 @@ use std::collections::BTreeSet;
 use std::fs;
 use std::path::{Path, PathBuf};
 
-const ALLOWED: [(&str, &[&str]); 9] = [
+const ALLOWED: [(&str, &[&str]); 10] = [
     ("core", &[]),
     ("sim", &["core"]),
     ("policy", &["core"]),
     ("proto", &["core"]),
     ("telemetry", &["core"]),
-    ("learner", &["core", "policy", "proto", "telemetry"]),
-    ("teacher", &["core", "policy", "proto", "telemetry"]),
-    ("worker", &["core", "sim", "policy", "proto", "telemetry"]),
+    ("net", &["proto"]),
+    ("learner", &["core", "policy", "proto", "telemetry", "net"]),
+    ("teacher", &["core", "policy", "proto", "telemetry", "net"]),
+    ("worker", &["core", "sim", "policy", "proto", "telemetry", "net"]),
     ("report", &["core", "telemetry"]),
 ];
 

@@ -363,7 +363,7 @@ fn open_ledger(
         strategy: advice.strategy.clone(),
     };
     let spent = trainer.counters().advice_spent;
-    Ok(Some(Ledger::open(address, &terms, spent, runtime, shutdown)?))
+    Ok(Some(Ledger::open((&config.dial, address), &terms, spent, runtime, shutdown)?))
 }
 
 /// Opens the metrics of the run directory; what lies after `round` belongs to a lost future and is cut off.

@@ -35,6 +35,9 @@ pub enum Error {
     /// Learning diverged.
     #[error(transparent)]
     Diverged(#[from] DdpgError),
+    /// The service cannot be offered.
+    #[error(transparent)]
+    Gate(#[from] tandem_net::GateError),
     /// The network refused.
     #[error("cannot serve")]
     Serve(#[from] tonic::transport::Error),

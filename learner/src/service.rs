@@ -5,21 +5,20 @@ use std::pin::Pin;
 use std::sync::Arc;
 use std::time::Duration;
 
+use tandem_net::Incoming;
 use tandem_proto::pb;
 use tandem_proto::pb::learner_server::{Learner, LearnerServer};
 use tandem_proto::{decode_episode, encode_actor, encode_slot, encode_terms};
 use tandem_telemetry::events::WorkerJoined;
-use tokio::net::TcpListener;
 use tokio_stream::wrappers::WatchStream;
 use tokio_stream::{Stream, StreamExt as _};
 use tokio_util::sync::CancellationToken;
-use tonic::transport::server::TcpIncoming;
 use tonic::{Request, Response, Status};
 
 use crate::board::SubmitError;
 use crate::drive::{self, Ended};
 use crate::error::Error;
-use crate::shared::{LearnerConfig, Shared};
+use crate::shared::{LearnerConfig, Shared, wait_on};
 
 /// How long a worker's question for work is held before it is told to wait.
 const WORK_POLL: Duration = Duration::from_secs(2);
@@ -30,19 +29,20 @@ const MAX_MESSAGE_BYTES: usize = 64 << 20;
 /// Longest label of a worker.
 const MAX_NAME_BYTES: usize = 256;
 
-/// Serves a run on `listener` until it ends or `shutdown` is cancelled; the state is saved either way.
+/// Serves a run until it ends or `shutdown` is cancelled; the state is saved either way.
 ///
 /// # Errors
 /// When the run cannot start, its state cannot be saved, or learning diverges.
 pub async fn serve(
     config: LearnerConfig,
-    listener: TcpListener,
+    incoming: impl Into<Incoming>,
     shutdown: CancellationToken,
 ) -> Result<Ended, Error> {
     let shared = Arc::new(Shared::new(config.clock.clone()));
     shared.lock().board.start_workers_at(config.first_worker);
-    let (health, health_service) = tonic_health::server::health_reporter();
-    health.set_serving::<LearnerServer<LearnerService>>().await;
+    let learner = LearnerServer::new(LearnerService { shared: shared.clone() })
+        .max_decoding_message_size(MAX_MESSAGE_BYTES);
+    let router = config.gate.router(learner).await?;
     let stop_serving = CancellationToken::new();
     let learning = {
         let (shared, runtime, stop_serving) =
@@ -57,26 +57,13 @@ pub async fn serve(
                 progress.ended = true;
                 progress.end_reason = reason;
             });
-            runtime.block_on(async { tokio::time::sleep(LINGER).await });
+            wait_on(&runtime, async { tokio::time::sleep(LINGER).await });
             // Watchers' streams close at the first message after the one that says so.
             shared.progress.send_modify(|_| ());
             ended
         })
     };
-    let learner =
-        LearnerServer::new(LearnerService { shared }).max_decoding_message_size(MAX_MESSAGE_BYTES);
-    tonic::transport::Server::builder()
-        .http2_keepalive_interval(Some(Duration::from_secs(10)))
-        .http2_keepalive_timeout(Some(Duration::from_secs(10)))
-        .add_service(learner)
-        .add_service(health_service)
-        .add_service(reflection_v1())
-        .add_service(reflection_v1alpha())
-        .serve_with_incoming_shutdown(
-            TcpIncoming::from(listener).with_nodelay(Some(true)),
-            stop_serving.cancelled(),
-        )
-        .await?;
+    router.serve_with_incoming_shutdown(incoming.into(), stop_serving.cancelled()).await?;
     match learning {
         Ok(thread) => tokio::task::spawn_blocking(move || thread.join())
             .await
@@ -101,24 +88,6 @@ fn with_causes(error: &Error) -> String {
         cause = inner.source();
     }
     line
-}
-
-fn reflection_v1() -> tonic_reflection::server::v1::ServerReflectionServer<
-    impl tonic_reflection::server::v1::ServerReflection,
-> {
-    reflection().build_v1().expect("the descriptors are compiled in")
-}
-
-fn reflection_v1alpha() -> tonic_reflection::server::v1alpha::ServerReflectionServer<
-    impl tonic_reflection::server::v1alpha::ServerReflection,
-> {
-    reflection().build_v1alpha().expect("the descriptors are compiled in")
-}
-
-fn reflection() -> tonic_reflection::server::Builder<'static> {
-    tonic_reflection::server::Builder::configure()
-        .register_encoded_file_descriptor_set(tandem_proto::FILE_DESCRIPTOR_SET)
-        .register_encoded_file_descriptor_set(tonic_health::pb::FILE_DESCRIPTOR_SET)
 }
 
 struct LearnerService {

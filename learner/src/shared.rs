@@ -6,7 +6,9 @@ use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use tandem_core::work::{PublishedActor, RunTerms};
+use tandem_net::{Dial, Gate};
 use tandem_proto::pb;
+use tokio::runtime::Handle;
 use tokio::sync::{Notify, watch};
 
 use crate::board::Board;
@@ -23,7 +25,11 @@ pub type Clock = Arc<dyn Fn() -> Duration + Send + Sync>;
 pub struct LearnerConfig {
     /// The run.
     pub run: RunConfig,
-    /// The teacher's address, `http://host:port`; needed when the run asks for advice.
+    /// Who may call.
+    pub gate: Gate,
+    /// How the teacher is called.
+    pub dial: Dial,
+    /// The teacher's address, `HOST:PORT` or a URI; needed when the run asks for advice.
     pub teacher: Option<String>,
     /// The run directory.
     pub out: PathBuf,
@@ -92,4 +98,17 @@ impl Shared {
             state.published.pop_first();
         }
     }
+}
+
+/// Lets `runtime` do `work` and waits for its outcome; `None` when the runtime ends first. Not to be called on one of
+/// the runtime's own threads.
+pub(crate) fn wait_on<T: Send + 'static>(
+    runtime: &Handle,
+    work: impl Future<Output = T> + Send + 'static,
+) -> Option<T> {
+    let (sender, receiver) = std::sync::mpsc::sync_channel(1);
+    runtime.spawn(async move {
+        drop(sender.send(work.await));
+    });
+    receiver.recv().ok()
 }

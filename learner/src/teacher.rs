@@ -3,16 +3,18 @@
 use std::time::Duration;
 
 use tandem_core::Episode;
+use tandem_net::{Dial, DialError, Link};
 use tandem_proto::pb;
 use tandem_proto::pb::teacher_client::TeacherClient;
 use tandem_telemetry::events::AdviceAccountOpened;
 use tokio::runtime::Handle;
 use tokio_util::sync::CancellationToken;
 use tonic::Code;
-use tonic::transport::{Channel, Endpoint};
 use tracing::warn;
 
-/// Deadline of a call, and of a connection.
+use crate::shared::wait_on;
+
+/// Deadline of a call.
 const CALL_DEADLINE: Duration = Duration::from_secs(5);
 /// First pause before an unreachable teacher is tried again; doubled up to [`LONGEST_PAUSE`].
 const FIRST_PAUSE: Duration = Duration::from_millis(100);
@@ -22,13 +24,8 @@ const LONGEST_PAUSE: Duration = Duration::from_secs(2);
 #[derive(Debug, thiserror::Error)]
 pub enum TeacherError {
     /// Not an address.
-    #[error("teacher address {address:?} is not an address")]
-    Address {
-        /// What was given.
-        address: String,
-        /// Why it is none.
-        source: tonic::transport::Error,
-    },
+    #[error("the teacher cannot be called")]
+    Address(#[from] DialError),
     /// The teacher understood and declined; asking again would not help.
     #[error("the teacher refuses: {0}")]
     Refused(String),
@@ -40,7 +37,7 @@ pub enum TeacherError {
 /// An account at a teacher, used from the thread that learns.
 #[derive(Debug)]
 pub(crate) struct Ledger {
-    client: TeacherClient<Channel>,
+    client: TeacherClient<Link>,
     runtime: Handle,
     shutdown: CancellationToken,
     account: pb::OpenAccountRequest,
@@ -52,18 +49,14 @@ pub(crate) struct Ledger {
 impl Ledger {
     /// Opens the account `name`, or goes on with it when it exists. `spent` is what the run has spent so far.
     pub(crate) fn open(
-        address: &str,
+        (dial, address): (&Dial, &str),
         terms: &pb::OpenAccountRequest,
         spent: u64,
         runtime: &Handle,
         shutdown: &CancellationToken,
     ) -> Result<Self, TeacherError> {
-        let endpoint = Endpoint::from_shared(address.to_owned())
-            .map_err(|source| TeacherError::Address { address: address.to_owned(), source })?
-            .connect_timeout(CALL_DEADLINE)
-            .tcp_nodelay(true);
         let _inside = runtime.enter();
-        let client = TeacherClient::new(endpoint.connect_lazy());
+        let client = TeacherClient::new(dial.link(address)?);
         let mut ledger = Self {
             client,
             runtime: runtime.clone(),
@@ -110,8 +103,9 @@ impl Ledger {
             episodes,
             units_per_episode,
         };
-        let response = self.call(async |mut client: TeacherClient<Channel>| {
-            client.open_leases(request.clone()).await
+        let response = self.call(move |mut client| {
+            let request = request.clone();
+            async move { client.open_leases(request).await }
         })?;
         self.note(response.account.as_ref());
         Ok(())
@@ -122,8 +116,9 @@ impl Ledger {
         let numbers: Vec<u64> = episodes.iter().map(|episode| episode.number).collect();
         let request =
             pb::SettleLeasesRequest { account: self.account.name.clone(), episodes: numbers };
-        let account = self.call(async |mut client: TeacherClient<Channel>| {
-            client.settle_leases(request.clone()).await
+        let account = self.call(move |mut client| {
+            let request = request.clone();
+            async move { client.settle_leases(request).await }
         })?;
         self.note(Some(&account));
         Ok(())
@@ -133,8 +128,10 @@ impl Ledger {
         &mut self,
         terms: &pb::OpenAccountRequest,
     ) -> Result<pb::Account, TeacherError> {
-        let account = self.call(async |mut client: TeacherClient<Channel>| {
-            client.open_account(terms.clone()).await
+        let terms = terms.clone();
+        let account = self.call(move |mut client| {
+            let request = terms.clone();
+            async move { client.open_account(request).await }
         })?;
         self.note(Some(&account));
         let pb::Account { name, budget, strategy, spent, .. } = &account;
@@ -149,34 +146,46 @@ impl Ledger {
     }
 
     /// Calls until the teacher answers or the run is stopped. What is asked may be asked again.
-    fn call<T>(
+    fn call<T, F>(
         &self,
-        request: impl AsyncFn(TeacherClient<Channel>) -> Result<tonic::Response<T>, tonic::Status>,
-    ) -> Result<T, TeacherError> {
-        let attempts = async {
-            let mut pause = FIRST_PAUSE;
-            loop {
-                let attempt =
-                    tokio::time::timeout(CALL_DEADLINE, request(self.client.clone())).await;
-                let status = match attempt {
-                    Ok(Ok(response)) => return Ok(response.into_inner()),
-                    Ok(Err(status)) if !is_passing(&status) => {
-                        return Err(TeacherError::Refused(status.message().to_owned()));
-                    }
-                    Ok(Err(status)) => status.message().to_owned(),
-                    Err(_) => "no answer in time".to_owned(),
-                };
-                warn!(error = status, "teacher is unreachable, asking again");
-                tokio::time::sleep(pause).await;
-                pause = (pause * 2).min(LONGEST_PAUSE);
+        request: impl Fn(TeacherClient<Link>) -> F + Send + 'static,
+    ) -> Result<T, TeacherError>
+    where
+        T: Send + 'static,
+        F: Future<Output = Result<tonic::Response<T>, tonic::Status>> + Send,
+    {
+        let (client, shutdown) = (self.client.clone(), self.shutdown.clone());
+        let call = async move {
+            tokio::select! {
+                answer = ask_until_answered(client, request) => answer,
+                () = shutdown.cancelled_owned() => Err(TeacherError::Stopped),
             }
         };
-        self.runtime.block_on(async {
-            tokio::select! {
-                answer = attempts => answer,
-                () = self.shutdown.cancelled() => Err(TeacherError::Stopped),
+        wait_on(&self.runtime, call).unwrap_or(Err(TeacherError::Stopped))
+    }
+}
+
+async fn ask_until_answered<T, F>(
+    client: TeacherClient<Link>,
+    request: impl Fn(TeacherClient<Link>) -> F + Send,
+) -> Result<T, TeacherError>
+where
+    F: Future<Output = Result<tonic::Response<T>, tonic::Status>> + Send,
+{
+    let mut pause = FIRST_PAUSE;
+    loop {
+        let attempt = tokio::time::timeout(CALL_DEADLINE, request(client.clone())).await;
+        let status = match attempt {
+            Ok(Ok(response)) => return Ok(response.into_inner()),
+            Ok(Err(status)) if !is_passing(&status) => {
+                return Err(TeacherError::Refused(status.message().to_owned()));
             }
-        })
+            Ok(Err(status)) => status.message().to_owned(),
+            Err(_) => "no answer in time".to_owned(),
+        };
+        warn!(error = status, "teacher is unreachable, asking again");
+        tokio::time::sleep(pause).await;
+        pause = (pause * 2).min(LONGEST_PAUSE);
     }
 }
 

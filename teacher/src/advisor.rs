@@ -6,8 +6,9 @@ use tandem_core::layout::EPISODE_STEPS;
 use tandem_core::{ArmAdvice, Layout, StepAdvice, StepQuery};
 use tandem_proto::{DecodeError, MAX_ARMS};
 
-use crate::budget::{Account, Balance, Half, Lease, Ledger, Terms, Verdict, Wish};
+use crate::budget::{Balance, Half, Lease, Terms, Verdict, Wish};
 use crate::error::Error;
+use crate::ledger::{Bill, Charge, Ledger, LedgerError, Receipt};
 use crate::maps::Maps;
 use crate::policy::TeacherPolicy;
 use crate::procedures::judge_arm;
@@ -19,7 +20,7 @@ pub struct Advisor {
     digest: String,
     maps: Maps,
     judge: Mutex<Judge>,
-    ledger: Mutex<Ledger>,
+    ledger: Mutex<Box<dyn Ledger>>,
 }
 
 /// The answers to the queries of one request.
@@ -32,11 +33,11 @@ pub struct Advice {
 }
 
 impl Advisor {
-    /// An advisor without accounts.
+    /// An advisor with the accounts of `ledger`.
     ///
     /// # Errors
     /// When the policy is not for one arm.
-    pub fn new(policy: Box<dyn TeacherPolicy>) -> Result<Self, Error> {
+    pub fn new(policy: Box<dyn TeacherPolicy>, ledger: Box<dyn Ledger>) -> Result<Self, Error> {
         let layout = policy.layout();
         if layout.n_arms != 1 {
             return Err(Error::NotOneArm { n_arms: layout.n_arms, n_values: 1 });
@@ -46,7 +47,7 @@ impl Advisor {
             digest: policy.digest().to_owned(),
             maps: Maps::new(Layout::new(layout.task, MAX_ARMS)),
             judge: Mutex::new(Judge::new(policy)),
-            ledger: Mutex::default(),
+            ledger: Mutex::new(ledger),
         })
     }
 
@@ -81,22 +82,22 @@ impl Advisor {
     /// # Errors
     /// When nobody opened it.
     pub fn balance(&self, name: &str) -> Result<Balance, Error> {
-        Ok(self.ledger().account(name)?.balance())
+        Ok(self.ledger().balance(name)?)
     }
 
     /// Sets units of account `name` aside for `episodes`, in their order; see [`Account::open_leases`].
     ///
     /// # Errors
     /// When nobody opened the account.
+    ///
+    /// [`Account::open_leases`]: crate::budget::Account::open_leases
     pub fn open_leases(
         &self,
         name: &str,
         episodes: &[u64],
         units_per_episode: u32,
     ) -> Result<(Vec<Lease>, Balance), Error> {
-        let mut ledger = self.ledger();
-        let account = ledger.account_mut(name)?;
-        Ok((account.open_leases(episodes, units_per_episode), account.balance()))
+        Ok(self.ledger().open_leases(name, episodes, units_per_episode)?)
     }
 
     /// Returns what `episodes` did not spend to account `name`.
@@ -104,10 +105,7 @@ impl Advisor {
     /// # Errors
     /// When nobody opened the account.
     pub fn settle_leases(&self, name: &str, episodes: &[u64]) -> Result<Balance, Error> {
-        let mut ledger = self.ledger();
-        let account = ledger.account_mut(name)?;
-        account.settle(episodes);
-        Ok(account.balance())
+        Ok(self.ledger().settle(name, episodes)?)
     }
 
     /// Answers `queries` on account `name`, in their order, with one forward pass for all of them.
@@ -120,32 +118,33 @@ impl Advisor {
     /// # Panics
     /// When a query's lengths are of no layout of the teacher's task with 1 to [`MAX_ARMS`] arms.
     pub fn advise(&self, name: &str, queries: &[StepQuery]) -> Result<Advice, Error> {
-        self.ledger().account(name)?;
+        let strategy = self.ledger().balance(name)?.terms.strategy;
         let judged = self.judge().judge(&self.maps, queries)?;
-        let mut ledger = self.ledger();
-        let account = ledger.account_mut(name)?;
-        check_steps(account, queries)?;
-        let steps = queries
-            .iter()
-            .zip(judged)
-            .map(|(query, arms)| self.decide(account, query, arms))
-            .collect();
-        Ok(Advice { steps, budget_left: account.left() })
+        let charges = queries.iter().zip(&judged).map(|(query, arms)| Charge {
+            episode: query.episode,
+            step: query.step,
+            wish: Wish {
+                first: picks_any(strategy, Half::First, arms),
+                second: picks_any(strategy, Half::Second, arms),
+            },
+        });
+        let bill = Bill { account: name.to_owned(), charges: charges.collect() };
+        let outcome = self.ledger().charge(&[bill]).pop().unwrap_or_else(|| Ok(Receipt::default()));
+        let receipt = outcome.map_err(|error| named(error, queries))?;
+        let decided = queries.iter().zip(judged).zip(receipt.verdicts);
+        let steps =
+            decided.map(|((query, arms), verdict)| self.decide(strategy, query, arms, verdict));
+        Ok(Advice { steps: steps.collect(), budget_left: receipt.left })
     }
 
-    /// Overrides those of `arms` that the account's strategy picks, when there is a unit to pay for it.
+    /// Overrides those of `arms` that the strategy picks, when there was a unit to pay for it.
     fn decide(
         &self,
-        account: &mut Account,
+        strategy: Strategy,
         query: &StepQuery,
         mut arms: Vec<ArmAdvice>,
+        verdict: Verdict,
     ) -> StepAdvice {
-        let strategy = account.terms().strategy;
-        let wish = Wish {
-            first: picks_any(strategy, Half::First, &arms),
-            second: picks_any(strategy, Half::Second, &arms),
-        };
-        let verdict = account.charge(query.episode, query.step, wish);
         if let Verdict::Charged(half) = verdict {
             for arm in &mut arms {
                 arm.overridden = picks(strategy, half, arm);
@@ -171,7 +170,7 @@ impl Advisor {
         self.judge.lock().expect("nothing panics while it holds the networks")
     }
 
-    fn ledger(&self) -> MutexGuard<'_, Ledger> {
+    fn ledger(&self) -> MutexGuard<'_, Box<dyn Ledger>> {
         self.ledger.lock().expect("nothing panics while it holds the ledger")
     }
 }
@@ -184,23 +183,12 @@ fn picks_any(strategy: Strategy, half: Half, arms: &[ArmAdvice]) -> bool {
     arms.iter().any(|arm| picks(strategy, half, arm))
 }
 
-/// Episodes of a run, which have leases, have [`EPISODE_STEPS`] steps; how long others are is their owner's matter.
-fn check_steps(account: &Account, queries: &[StepQuery]) -> Result<(), DecodeError> {
-    let beyond_end = |query: &StepQuery| {
-        usize::try_from(query.step).map_or(true, |step| step >= EPISODE_STEPS)
-            && account.has_lease(query.episode)
-    };
-    match queries.iter().position(beyond_end) {
-        None => Ok(()),
-        Some(query_idx) => {
-            let expected = format!("0 to {} in an episode that has a lease", EPISODE_STEPS - 1);
-            Err(DecodeError::new(
-                format!("steps[{query_idx}].step"),
-                expected,
-                queries[query_idx].step,
-            ))
-        }
-    }
+/// A refusal that says which of `queries` it is about.
+fn named(error: LedgerError, queries: &[StepQuery]) -> Error {
+    let LedgerError::BeyondEnd { charge_idx } = error else { return error.into() };
+    let expected = format!("0 to {} in an episode that has a lease", EPISODE_STEPS - 1);
+    let step = queries.get(charge_idx).map_or(0, |query| query.step);
+    DecodeError::new(format!("steps[{charge_idx}].step"), expected, step).into()
 }
 
 /// The teacher's networks with the buffers that they work on. A row is one arm of one step.

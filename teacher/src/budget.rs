@@ -8,9 +8,6 @@
 mod account;
 mod verdicts;
 
-use std::collections::BTreeMap;
-use std::collections::btree_map::Entry;
-
 pub use account::Account;
 
 use crate::strategy::Strategy;
@@ -110,90 +107,4 @@ pub enum BudgetError {
     /// More than any account may have.
     #[error("budget: expected 0 to {MAX_BUDGET}, got {0}")]
     BudgetTooLarge(u64),
-}
-
-/// All accounts by name.
-#[derive(Debug, Clone, Default)]
-pub struct Ledger {
-    accounts: BTreeMap<String, Account>,
-}
-
-impl Ledger {
-    /// Opens account `name`, or finds it open on the same terms.
-    ///
-    /// # Errors
-    /// When it is open on other terms, or the budget exceeds [`MAX_BUDGET`].
-    pub fn open(&mut self, name: &str, terms: Terms) -> Result<Balance, BudgetError> {
-        if terms.budget > MAX_BUDGET {
-            return Err(BudgetError::BudgetTooLarge(terms.budget));
-        }
-        match self.accounts.entry(name.to_owned()) {
-            Entry::Vacant(vacant) => Ok(vacant.insert(Account::new(terms)).balance()),
-            Entry::Occupied(account) if account.get().terms() == terms => {
-                Ok(account.get().balance())
-            }
-            Entry::Occupied(account) => Err(BudgetError::OtherTerms {
-                name: name.to_owned(),
-                open: account.get().terms(),
-                asked: terms,
-            }),
-        }
-    }
-
-    /// The account called `name`.
-    ///
-    /// # Errors
-    /// When nobody opened it.
-    pub fn account(&self, name: &str) -> Result<&Account, BudgetError> {
-        self.accounts.get(name).ok_or_else(|| BudgetError::UnknownAccount(name.to_owned()))
-    }
-
-    /// The account called `name`, to charge it.
-    ///
-    /// # Errors
-    /// When nobody opened it.
-    pub fn account_mut(&mut self, name: &str) -> Result<&mut Account, BudgetError> {
-        self.accounts.get_mut(name).ok_or_else(|| BudgetError::UnknownAccount(name.to_owned()))
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    const TERMS: Terms = Terms { budget: 10, strategy: Strategy::EarlyAdvising };
-
-    #[test]
-    fn an_account_is_opened_once() {
-        let mut ledger = Ledger::default();
-        let fresh = Balance { terms: TERMS, spent: 0, leased: 0, left: 10 };
-        assert_eq!(ledger.open("run", TERMS), Ok(fresh));
-        ledger.account_mut("run").unwrap().charge(1, 0, Wish { first: true, second: true });
-        assert_eq!(ledger.open("run", TERMS), Ok(Balance { spent: 1, left: 9, ..fresh }));
-    }
-
-    #[test]
-    fn other_terms_are_refused_with_both_named() {
-        let mut ledger = Ledger::default();
-        ledger.open("run", TERMS).unwrap();
-        let asked = Terms { budget: 11, strategy: Strategy::MistakeQ { threshold: 0.05 } };
-        let message = ledger.open("run", asked).unwrap_err().to_string();
-        let expected = "account \"run\" is open with budget 10 and strategy ea, not with budget 11 and strategy mc-q:0.05";
-        assert_eq!(message, expected);
-    }
-
-    #[test]
-    fn the_largest_budget_is_ten_to_the_twelve() {
-        let mut ledger = Ledger::default();
-        assert!(ledger.open("run", Terms { budget: MAX_BUDGET, ..TERMS }).is_ok());
-        let too_large = Terms { budget: MAX_BUDGET + 1, ..TERMS };
-        assert_eq!(
-            ledger.open("more", too_large),
-            Err(BudgetError::BudgetTooLarge(MAX_BUDGET + 1))
-        );
-        assert_eq!(
-            ledger.account("more").unwrap_err(),
-            BudgetError::UnknownAccount("more".to_owned())
-        );
-    }
 }

@@ -2,7 +2,7 @@
 
 use tandem_proto::DecodeError;
 
-use crate::budget::BudgetError;
+use crate::ledger::LedgerError;
 use crate::strategy::UnknownStrategy;
 
 /// Why a teacher cannot start or cannot answer.
@@ -27,9 +27,9 @@ pub enum Error {
     /// A request names no strategy.
     #[error("strategy: {0}")]
     Strategy(#[from] UnknownStrategy),
-    /// An account cannot be opened or found.
+    /// The ledger declines or is away.
     #[error(transparent)]
-    Budget(#[from] BudgetError),
+    Ledger(#[from] LedgerError),
     /// The teacher's networks gave infinity or NaN.
     #[error(
         "the teacher's networks gave a number that is not finite for step {step} of episode {episode}"
@@ -40,9 +40,9 @@ pub enum Error {
         /// Its step.
         step: u32,
     },
-    /// The descriptors for reflection cannot be read.
-    #[error("cannot describe the service")]
-    Reflection(#[from] tonic_reflection::server::Error),
+    /// The service cannot be offered.
+    #[error(transparent)]
+    Gate(#[from] tandem_net::GateError),
     /// The server stopped unasked.
     #[error("cannot serve")]
     Transport(#[from] tonic::transport::Error),

@@ -8,6 +8,7 @@
 pub mod advisor;
 pub mod budget;
 mod error;
+pub mod ledger;
 pub mod maps;
 pub mod policy;
 pub mod procedures;

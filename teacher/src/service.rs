@@ -7,29 +7,22 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
 
+use tandem_net::{Gate, Incoming};
 use tandem_proto::pb::teacher_server::{Teacher, TeacherServer};
-use tandem_proto::{FILE_DESCRIPTOR_SET, decode_account_name, pb};
-use tokio::net::TcpListener;
+use tandem_proto::{decode_account_name, pb};
 use tokio_util::sync::CancellationToken;
-use tonic::transport::Server;
-use tonic::transport::server::{Router, TcpIncoming};
 use tonic::{Request, Response, Status, Streaming};
 
 use crate::advisor::Advisor;
 use crate::budget::{BudgetError, Terms};
 use crate::error::Error;
+use crate::ledger::{LedgerError, MemoryLedger};
 use crate::policy::OneArmPolicy;
 use answers::{AnswerStream, answer, answer_all};
 use messages::{check_episodes, describe, encode_balance, encode_lease};
 
 /// Bytes that a request may have: some thousands of steps.
 const MAX_REQUEST_BYTES: usize = 4 << 20;
-/// How often a silent connection is probed.
-const KEEPALIVE_INTERVAL: Duration = Duration::from_secs(20);
-/// How long a probe may stay unanswered before the connection is closed.
-const KEEPALIVE_TIMEOUT: Duration = Duration::from_secs(10);
-/// Calls that one connection may have open; further ones wait on the client's side.
-const MAX_STREAMS_PER_CONNECTION: u32 = 1024;
 /// How long calls that are being answered may take to finish once the service shall end.
 const SHUTDOWN_GRACE: Duration = Duration::from_secs(5);
 
@@ -40,31 +33,41 @@ pub struct Config {
     pub policy: PathBuf,
 }
 
-/// Serves the teacher of `config` on `listener` until `shutdown` is cancelled.
+/// Serves the teacher of `config` to those whom `gate` lets in, until `shutdown` is cancelled.
 ///
 /// # Errors
 /// When the policy cannot teach, or the server fails.
 pub async fn serve(
     config: Config,
-    listener: TcpListener,
+    incoming: impl Into<Incoming>,
+    gate: &Gate,
     shutdown: CancellationToken,
 ) -> Result<(), Error> {
     let policy = OneArmPolicy::load(&config.policy)?;
-    serve_advisor(Advisor::new(Box::new(policy))?, listener, shutdown).await
+    serve_advisor(
+        Advisor::new(Box::new(policy), Box::new(MemoryLedger::default()))?,
+        incoming,
+        gate,
+        shutdown,
+    )
+    .await
 }
 
-/// Serves `advisor` on `listener` until `shutdown` is cancelled.
+/// Serves `advisor` to those whom `gate` lets in, until `shutdown` is cancelled.
 ///
 /// # Errors
 /// When the server fails.
 pub async fn serve_advisor(
     advisor: Advisor,
-    listener: TcpListener,
+    incoming: impl Into<Incoming>,
+    gate: &Gate,
     shutdown: CancellationToken,
 ) -> Result<(), Error> {
-    let incoming = TcpIncoming::from(listener).with_nodelay(Some(true));
-    let router = router(Arc::new(advisor), shutdown.clone()).await?;
-    let served = router.serve_with_incoming_shutdown(incoming, shutdown.clone().cancelled_owned());
+    let service = TeacherService { advisor: Arc::new(advisor), shutdown: shutdown.clone() };
+    let teacher = TeacherServer::new(service).max_decoding_message_size(MAX_REQUEST_BYTES);
+    let router = gate.router(teacher).await?;
+    let served =
+        router.serve_with_incoming_shutdown(incoming.into(), shutdown.clone().cancelled_owned());
     tokio::select! {
         outcome = served => Ok(outcome?),
         () = grace_after(&shutdown) => {
@@ -72,27 +75,6 @@ pub async fn serve_advisor(
             Ok(())
         }
     }
-}
-
-/// The teacher with health and both versions of reflection.
-async fn router(advisor: Arc<Advisor>, shutdown: CancellationToken) -> Result<Router, Error> {
-    let teacher = TeacherServer::new(TeacherService { advisor, shutdown })
-        .max_decoding_message_size(MAX_REQUEST_BYTES);
-    let (reporter, health) = tonic_health::server::health_reporter();
-    reporter.set_serving::<TeacherServer<TeacherService>>().await;
-    let reflection = || {
-        tonic_reflection::server::Builder::configure()
-            .register_encoded_file_descriptor_set(FILE_DESCRIPTOR_SET)
-            .register_encoded_file_descriptor_set(tonic_health::pb::FILE_DESCRIPTOR_SET)
-    };
-    Ok(Server::builder()
-        .http2_keepalive_interval(Some(KEEPALIVE_INTERVAL))
-        .http2_keepalive_timeout(Some(KEEPALIVE_TIMEOUT))
-        .max_concurrent_streams(MAX_STREAMS_PER_CONNECTION)
-        .add_service(teacher)
-        .add_service(health)
-        .add_service(reflection().build_v1()?)
-        .add_service(reflection().build_v1alpha()?))
 }
 
 async fn grace_after(shutdown: &CancellationToken) {
@@ -218,15 +200,25 @@ fn settle_leases(
 fn status(error: &Error) -> Status {
     let message = error.to_string();
     match error {
-        Error::Request(_) | Error::Strategy(_) | Error::Budget(BudgetError::BudgetTooLarge(_)) => {
-            Status::invalid_argument(message)
+        Error::Request(_)
+        | Error::Strategy(_)
+        | Error::Ledger(
+            LedgerError::Budget(BudgetError::BudgetTooLarge(_)) | LedgerError::BeyondEnd { .. },
+        ) => Status::invalid_argument(message),
+        Error::Ledger(LedgerError::Budget(BudgetError::UnknownAccount(_))) => {
+            Status::not_found(message)
         }
-        Error::Budget(BudgetError::UnknownAccount(_)) => Status::not_found(message),
-        Error::Budget(BudgetError::OtherTerms { .. }) => Status::already_exists(message),
+        Error::Ledger(LedgerError::Budget(BudgetError::OtherTerms { .. })) => {
+            Status::already_exists(message)
+        }
+        Error::Ledger(LedgerError::Unavailable { .. }) => {
+            tracing::error!(%error, "request failed");
+            Status::unavailable(message)
+        }
         Error::Policy(_)
         | Error::NotOneArm { .. }
         | Error::NotFinite { .. }
-        | Error::Reflection(_)
+        | Error::Gate(_)
         | Error::Transport(_) => {
             tracing::error!(%error, "request failed");
             Status::internal(message)

@@ -10,14 +10,12 @@ use crate::rollout::RolloutError;
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
     /// Not an address.
-    #[error("{role} address {address:?} cannot be used")]
+    #[error("the {role} cannot be called")]
     Address {
         /// Whose address.
         role: &'static str,
-        /// As given.
-        address: String,
         /// What is wrong with it.
-        source: tonic::transport::Error,
+        source: tandem_net::DialError,
     },
     /// The place for logs cannot be made.
     #[error("cannot create the log directory {path:?}")]

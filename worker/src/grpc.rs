@@ -4,20 +4,16 @@ use std::time::Duration;
 
 use tandem_core::work::{PublishedActor, RunTerms, SlotOrder};
 use tandem_core::{Episode, Layout, StepAdvice, StepQuery};
+use tandem_net::Link;
 use tandem_proto::{DecodeError, pb};
 use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
-use tonic::transport::{Channel, Endpoint};
 use tonic::{Code, Status, Streaming};
 
 use crate::retry::Patience;
 
 /// Largest message accepted: a slot's episodes and a large actor fit many times over.
 const MAX_MESSAGE_BYTES: usize = 64 << 20;
-/// How often an idle connection is checked, and how long the check may take.
-const KEEP_ALIVE: Duration = Duration::from_secs(10);
-/// How long a connection attempt may take.
-const CONNECT: Duration = Duration::from_secs(5);
 /// Requests under way on an advice stream. There is one at a time; nobody waits for room.
 const STREAM_CAPACITY: usize = 1;
 
@@ -72,20 +68,6 @@ async fn within<T>(
     tokio::time::timeout(deadline, call).await.unwrap_or_else(|_elapsed| Err(lapsed()))
 }
 
-/// A connection that is made when first used, and made again whenever it is lost.
-pub(crate) fn lazy_channel(address: &str) -> Result<Channel, tonic::transport::Error> {
-    let uri =
-        if address.contains("://") { address.to_owned() } else { format!("http://{address}") };
-    let endpoint = Endpoint::from_shared(uri)?
-        .connect_timeout(CONNECT)
-        .tcp_nodelay(true)
-        .tcp_keepalive(Some(KEEP_ALIVE))
-        .http2_keep_alive_interval(KEEP_ALIVE)
-        .keep_alive_timeout(KEEP_ALIVE)
-        .keep_alive_while_idle(true);
-    Ok(endpoint.connect_lazy())
-}
-
 /// What the learner wants done next.
 #[derive(Debug)]
 pub(crate) enum Work {
@@ -100,13 +82,13 @@ pub(crate) enum Work {
 /// The learner's side of a run.
 #[derive(Debug, Clone)]
 pub(crate) struct Learner {
-    client: pb::learner_client::LearnerClient<Channel>,
+    client: pb::learner_client::LearnerClient<Link>,
     patience: Patience,
 }
 
 impl Learner {
-    pub(crate) fn new(channel: Channel, patience: Patience) -> Self {
-        let client = pb::learner_client::LearnerClient::new(channel)
+    pub(crate) fn new(link: Link, patience: Patience) -> Self {
+        let client = pb::learner_client::LearnerClient::new(link)
             .max_decoding_message_size(MAX_MESSAGE_BYTES)
             .max_encoding_message_size(MAX_MESSAGE_BYTES);
         Self { client, patience }
@@ -175,7 +157,7 @@ fn expect_same(what: &str, expected: u64, got: u64) -> Result<(), CallError> {
 /// The teacher's side of a run, asked over one stream.
 #[derive(Debug)]
 pub(crate) struct Teacher {
-    client: pb::teacher_client::TeacherClient<Channel>,
+    client: pb::teacher_client::TeacherClient<Link>,
     patience: Patience,
     stream: Option<AdviceStream>,
 }
@@ -187,8 +169,8 @@ struct AdviceStream {
 }
 
 impl Teacher {
-    pub(crate) fn new(channel: Channel, patience: Patience) -> Self {
-        let client = pb::teacher_client::TeacherClient::new(channel)
+    pub(crate) fn new(link: Link, patience: Patience) -> Self {
+        let client = pb::teacher_client::TeacherClient::new(link)
             .max_decoding_message_size(MAX_MESSAGE_BYTES)
             .max_encoding_message_size(MAX_MESSAGE_BYTES);
         Self { client, patience, stream: None }

@@ -4,7 +4,7 @@ use tandem_core::work::{PublishedActor, RunTerms};
 use tandem_core::{Episode, Layout, StepAdvice, StepQuery};
 
 use crate::error::Error;
-use crate::grpc::{CallError, Learner, Teacher, Work, lazy_channel};
+use crate::grpc::{CallError, Learner, Teacher, Work};
 use crate::retry::{Attempt, Outage, Patience};
 use crate::run::WorkerConfig;
 
@@ -24,16 +24,12 @@ pub(crate) struct Peers {
 impl Peers {
     /// Peers at the addresses of `config`, which are connected to when first needed.
     pub(crate) fn new(config: &WorkerConfig, patience: Patience) -> Result<Self, Error> {
-        let channel = |role, address: &str| {
-            lazy_channel(address).map_err(|source| Error::Address {
-                role,
-                address: address.to_owned(),
-                source,
-            })
+        let link = |role, address: &str| {
+            config.dial.link(address).map_err(|source| Error::Address { role, source })
         };
-        let learner = Learner::new(channel("learner", &config.learner)?, patience);
+        let learner = Learner::new(link("learner", &config.learner)?, patience);
         let teacher = match &config.teacher {
-            Some(address) => Some(Teacher::new(channel("teacher", address)?, patience)),
+            Some(address) => Some(Teacher::new(link("teacher", address)?, patience)),
             None => None,
         };
         Ok(Self { patience, learner, teacher })

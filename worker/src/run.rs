@@ -4,6 +4,7 @@ use std::path::PathBuf;
 
 use tandem_core::Episode;
 use tandem_core::work::SlotOrder;
+use tandem_net::Dial;
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 
@@ -14,8 +15,10 @@ use crate::player::{Player, Questions};
 use crate::retry::Patience;
 
 /// Where a worker works.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone)]
 pub struct WorkerConfig {
+    /// How learner and teacher are called.
+    pub dial: Dial,
     /// The learner's address, `HOST:PORT` or a URI.
     pub learner: String,
     /// The teacher's address; needed when the run has one.

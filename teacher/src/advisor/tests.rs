@@ -5,9 +5,10 @@ use tandem_core::Task;
 
 use super::*;
 use crate::fake::{FakePolicy, query};
+use crate::ledger::MemoryLedger;
 
 fn advisor(budget: u64, strategy: &str) -> Advisor {
-    let advisor = Advisor::new(Box::new(FakePolicy)).unwrap();
+    let advisor = Advisor::new(Box::new(FakePolicy), Box::new(MemoryLedger::default())).unwrap();
     advisor.open_account("run", Terms { budget, strategy: strategy.parse().unwrap() }).unwrap();
     advisor
 }
@@ -138,7 +139,7 @@ fn a_refused_request_charges_nothing() {
     assert_eq!(refusal, "steps[1].step: expected 0 to 49 in an episode that has a lease, got 50");
     assert_eq!(advisor.balance("run").unwrap(), before);
     assert!(ask(&advisor, &two_arms(50)).charged, "an episode without a lease may be longer");
-    assert!(matches!(advisor.advise("walk", &[]), Err(Error::Budget(_))));
+    assert!(matches!(advisor.advise("walk", &[]), Err(Error::Ledger(LedgerError::Budget(_)))));
 }
 
 /// Values everything at NaN.
@@ -162,7 +163,7 @@ impl TeacherPolicy for Broken {
 
 #[test]
 fn advice_that_is_not_finite_is_not_given() {
-    let advisor = Advisor::new(Box::new(Broken)).unwrap();
+    let advisor = Advisor::new(Box::new(Broken), Box::new(MemoryLedger::default())).unwrap();
     advisor.open_account("run", Terms { budget: 1, strategy: Strategy::EarlyAdvising }).unwrap();
     let refused = advisor.advise("run", &[two_arms(3)]);
     assert!(matches!(refused, Err(Error::NotFinite { episode: 1, step: 3 })));

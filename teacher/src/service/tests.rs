@@ -4,6 +4,7 @@ use std::net::SocketAddr;
 
 use tandem_proto::pb::teacher_client::TeacherClient;
 use tandem_proto::{decode_advice, encode_query};
+use tokio::net::TcpListener;
 use tokio::task::JoinHandle;
 use tokio_stream::wrappers::ReceiverStream;
 use tonic::Code;
@@ -13,6 +14,14 @@ use tonic_health::pb::health_client::HealthClient;
 
 use super::*;
 use crate::fake::{FakePolicy, query};
+
+async fn serve_open(
+    advisor: Advisor,
+    listener: TcpListener,
+    shutdown: CancellationToken,
+) -> Result<(), Error> {
+    serve_advisor(advisor, listener, &Gate::default(), shutdown).await
+}
 
 /// A running service and a client of it.
 struct Fixture {
@@ -27,8 +36,9 @@ impl Fixture {
         let listener = TcpListener::bind(SocketAddr::from(([127, 0, 0, 1], 0))).await.unwrap();
         let address = listener.local_addr().unwrap();
         let shutdown = CancellationToken::new();
-        let advisor = Advisor::new(Box::new(FakePolicy)).unwrap();
-        let served = tokio::spawn(serve_advisor(advisor, listener, shutdown.clone()));
+        let advisor =
+            Advisor::new(Box::new(FakePolicy), Box::new(MemoryLedger::default())).unwrap();
+        let served = tokio::spawn(serve_open(advisor, listener, shutdown.clone()));
         let channel =
             Channel::from_shared(format!("http://{address}")).unwrap().connect().await.unwrap();
         Self { client: TeacherClient::new(channel.clone()), channel, shutdown, served }

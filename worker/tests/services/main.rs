@@ -25,6 +25,7 @@ const PATIENCE: Patience = Patience {
 
 fn config(learner: &Server, teacher: Option<&Server>) -> WorkerConfig {
     WorkerConfig {
+        dial: tandem_net::Dial::default(),
         learner: learner.address(),
         teacher: teacher.map(Server::address),
         name: "test".to_owned(),
