@@ -2,7 +2,8 @@
 
 use std::path::Path;
 
-use tandem_net::{AccessError, Dial, Gate, Token};
+use tandem_net::{AccessError, Dial, Gate, Token, is_exposed};
+use tracing::warn;
 
 use crate::cli::{DialArgs, ListenArgs, SecretArgs};
 use crate::exit::{Exit, Failed, OrExit as _};
@@ -14,28 +15,55 @@ pub(crate) fn gate(listen: &ListenArgs, secret: &SecretArgs) -> Result<Gate, Fai
         gate = gate.with_token(token);
     }
     if let (Some(certificate), Some(key)) = (&listen.tls_cert, &listen.tls_key) {
-        gate = gate.with_certificate(&read(certificate)?, &read(key)?);
+        let what = || format!("cannot serve with --tls-cert {certificate:?} --tls-key {key:?}");
+        gate =
+            gate.with_certificate(&read(certificate)?, &read(key)?).or_exit(Exit::Usage, what)?;
     }
     if !listen.insecure {
         gate.check_address(listen.listen).or_exit(Exit::Usage, String::new)?;
+    }
+    if is_exposed(listen.listen) && secret.token_file.is_some() && gate.is_plain() {
+        let address = listen.listen;
+        warn!(%address, "without --tls-cert the network can read all that is said, the token included");
     }
     Ok(gate)
 }
 
 /// How other services are called.
-pub(crate) fn dial(dial: &DialArgs, secret: &SecretArgs) -> Result<Dial, Failed> {
-    let mut calls = Dial::default();
-    if let Some(token) = token(secret)? {
-        calls = calls.with_token(&token);
-    }
-    if let Some(authority) = &dial.tls_ca {
-        calls = calls.with_authority(&read(authority)?);
-    }
-    Ok(calls)
+pub(crate) fn dial(args: &DialArgs, secret: &SecretArgs) -> Result<Dial, Failed> {
+    let calls = trusting(args)?;
+    Ok(match token(secret)? {
+        Some(token) => calls.with_token(&token),
+        None => calls,
+    })
+}
+
+/// How services are called that want no token.
+pub(crate) fn trusting(args: &DialArgs) -> Result<Dial, Failed> {
+    let Some(authority) = &args.tls_ca else { return Ok(Dial::default()) };
+    let what = || format!("cannot trust --tls-ca {authority:?}");
+    Dial::default().with_authority(&read(authority)?).or_exit(Exit::Usage, what)
 }
 
 fn token(secret: &SecretArgs) -> Result<Option<Token>, Failed> {
-    secret.token_file.as_deref().map(Token::read).transpose().or_exit(Exit::Usage, String::new)
+    let Some(path) = &secret.token_file else { return Ok(None) };
+    let token = Token::read(path).or_exit(Exit::Usage, String::new)?;
+    if is_readable_by_all(path) {
+        warn!(?path, "every user of this machine can read the token: chmod 600 FILE");
+    }
+    Ok(Some(token))
+}
+
+/// Whether the file's mode lets everybody read it.
+#[cfg(unix)]
+fn is_readable_by_all(path: &Path) -> bool {
+    use std::os::unix::fs::PermissionsExt as _;
+    std::fs::metadata(path).is_ok_and(|file| file.permissions().mode() & 0o004 != 0)
+}
+
+#[cfg(not(unix))]
+const fn is_readable_by_all(_: &Path) -> bool {
+    false
 }
 
 fn read(path: &Path) -> Result<Vec<u8>, Failed> {

@@ -15,10 +15,13 @@ use tonic::{Request, Status};
 use tonic_health::ServingStatus;
 use tower::Service;
 
-use crate::access::{AccessError, Token};
+use crate::access::{AccessError, Token, is_exposed};
+use crate::tls::{self, TlsError};
 
 /// How often a silent connection is probed, and how long a probe may stay unanswered before the connection is closed.
 const KEEP_ALIVE: Duration = Duration::from_secs(10);
+/// How long a client may take to agree on TLS.
+const HANDSHAKE: Duration = Duration::from_secs(10);
 /// Calls that one connection may have open; further ones wait on the client's side.
 const MAX_STREAMS_PER_CONNECTION: u32 = 1024;
 
@@ -49,10 +52,19 @@ impl Gate {
     }
 
     /// Speaks TLS only, with this certificate chain and key (PEM).
-    #[must_use]
-    pub fn with_certificate(mut self, certificate: &[u8], key: &[u8]) -> Self {
+    ///
+    /// # Errors
+    /// When one of them cannot be used, or they do not belong together.
+    pub fn with_certificate(mut self, certificate: &[u8], key: &[u8]) -> Result<Self, TlsError> {
+        tls::check_identity(certificate, key)?;
         self.identity = Some(Identity::from_pem(certificate, key));
-        self
+        Ok(self)
+    }
+
+    /// Whether calls cross the network readable to others, the token with them.
+    #[must_use]
+    pub const fn is_plain(&self) -> bool {
+        self.identity.is_none()
     }
 
     /// Refuses an address that other machines can reach while nobody needs a token.
@@ -60,11 +72,10 @@ impl Gate {
     /// # Errors
     /// When `address` is not of the loopback and there is no token.
     pub fn check_address(&self, address: SocketAddr) -> Result<(), AccessError> {
-        if self.token.is_some() || address.ip().to_canonical().is_loopback() {
-            Ok(())
-        } else {
-            Err(AccessError::Unprotected(address))
+        if is_exposed(address) && self.token.is_none() {
+            return Err(AccessError::Unprotected(address));
         }
+        Ok(())
     }
 
     /// What lets calls in.
@@ -99,7 +110,7 @@ impl Gate {
             .http2_keepalive_timeout(Some(KEEP_ALIVE))
             .max_concurrent_streams(MAX_STREAMS_PER_CONNECTION);
         if let Some(identity) = &self.identity {
-            let tls = ServerTlsConfig::new().identity(identity.clone());
+            let tls = ServerTlsConfig::new().identity(identity.clone()).timeout(HANDSHAKE);
             server = server.tls_config(tls).map_err(GateError::Tls)?;
         }
         Ok(server
@@ -121,7 +132,7 @@ impl Interceptor for Guard {
         let Some(token) = &self.token else { return Ok(request) };
         match request.metadata().get("authorization") {
             Some(shown) if token.is_shown_by(shown.as_bytes()) => Ok(request),
-            Some(_) => Err(Status::unauthenticated("the token is not the right one")),
+            Some(_) => Err(Status::unauthenticated("the token is not this service's")),
             None => Err(Status::unauthenticated("a token is needed: authorization: Bearer TOKEN")),
         }
     }

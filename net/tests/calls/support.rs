@@ -1,0 +1,180 @@
+//! A service that counts its calls, and certificates made on the spot.
+
+use std::net::SocketAddr;
+use std::pin::Pin;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+
+use rcgen::{BasicConstraints, CertificateParams, CertifiedIssuer, DnType, IsCa, KeyPair};
+use tandem_net::{Gate, Incoming, Token};
+use tandem_proto::pb;
+use tandem_proto::pb::teacher_server::{Teacher, TeacherServer};
+use tokio::net::TcpListener;
+use tokio::task::JoinHandle;
+use tokio_stream::Stream;
+use tonic::{Request, Response, Status, Streaming};
+
+pub(crate) const SECRET: &str = "the-right-token-0123";
+pub(crate) const OTHER: &str = "another-token-456789";
+
+pub(crate) fn token(text: &str) -> Token {
+    Token::new(text).expect("a token")
+}
+
+/// Counts calls and answers with nothing.
+#[derive(Clone, Default)]
+pub(crate) struct Counter(Arc<AtomicU64>);
+
+impl Counter {
+    pub(crate) fn n_calls(&self) -> u64 {
+        self.0.load(Ordering::SeqCst)
+    }
+
+    fn count<T: Default>(&self) -> Result<Response<T>, Status> {
+        self.0.fetch_add(1, Ordering::SeqCst);
+        Ok(Response::new(T::default()))
+    }
+}
+
+#[tonic::async_trait]
+impl Teacher for Counter {
+    type AdviseStreamStream =
+        Pin<Box<dyn Stream<Item = Result<pb::AdviseResponse, Status>> + Send>>;
+
+    async fn describe(
+        &self,
+        _: Request<pb::DescribeRequest>,
+    ) -> Result<Response<pb::DescribeResponse>, Status> {
+        self.count()
+    }
+
+    async fn open_account(
+        &self,
+        _: Request<pb::OpenAccountRequest>,
+    ) -> Result<Response<pb::Account>, Status> {
+        self.count()
+    }
+
+    async fn get_account(
+        &self,
+        _: Request<pb::GetAccountRequest>,
+    ) -> Result<Response<pb::Account>, Status> {
+        self.count()
+    }
+
+    async fn advise(
+        &self,
+        _: Request<pb::AdviseRequest>,
+    ) -> Result<Response<pb::AdviseResponse>, Status> {
+        self.count()
+    }
+
+    async fn advise_stream(
+        &self,
+        _: Request<Streaming<pb::AdviseRequest>>,
+    ) -> Result<Response<Self::AdviseStreamStream>, Status> {
+        self.count::<()>()?;
+        Ok(Response::new(Box::pin(tokio_stream::once(Ok(pb::AdviseResponse::default())))))
+    }
+
+    async fn open_leases(
+        &self,
+        _: Request<pb::OpenLeasesRequest>,
+    ) -> Result<Response<pb::OpenLeasesResponse>, Status> {
+        self.count()
+    }
+
+    async fn settle_leases(
+        &self,
+        _: Request<pb::SettleLeasesRequest>,
+    ) -> Result<Response<pb::Account>, Status> {
+        self.count()
+    }
+}
+
+/// A counter that is served until it is dropped.
+pub(crate) struct Served {
+    pub(crate) counter: Counter,
+    pub(crate) address: SocketAddr,
+    serving: JoinHandle<()>,
+}
+
+impl Served {
+    pub(crate) async fn start(gate: &Gate) -> Self {
+        Self::start_on(TcpListener::bind("127.0.0.1:0").await.expect("a port"), gate).await
+    }
+
+    pub(crate) async fn start_on(listener: TcpListener, gate: &Gate) -> Self {
+        let address = listener.local_addr().expect("bound");
+        let (counter, serving) = serve(listener, gate).await;
+        Self { counter, address, serving }
+    }
+
+    /// Ends the service with all its connections; gives a new socket on the same address.
+    pub(crate) async fn stop(mut self) -> TcpListener {
+        self.serving.abort();
+        drop((&mut self.serving).await);
+        TcpListener::bind(self.address).await.expect("nobody else has taken the port meanwhile")
+    }
+}
+
+impl Drop for Served {
+    fn drop(&mut self) {
+        self.serving.abort();
+    }
+}
+
+/// Serves a counter to what comes in.
+pub(crate) async fn serve(incoming: impl Into<Incoming>, gate: &Gate) -> (Counter, JoinHandle<()>) {
+    let counter = Counter::default();
+    let router = gate.router(TeacherServer::new(counter.clone())).await.expect("can be offered");
+    let incoming = incoming.into();
+    let serving = tokio::spawn(async move {
+        router.serve_with_incoming(incoming).await.expect("serves");
+    });
+    (counter, serving)
+}
+
+/// Signs certificates.
+pub(crate) struct Authority(CertifiedIssuer<'static, KeyPair>);
+
+/// A certificate and its key (PEM).
+pub(crate) struct Identity {
+    pub(crate) certificate: String,
+    pub(crate) key: String,
+}
+
+impl Authority {
+    pub(crate) fn new(name: &str) -> Self {
+        let mut params = CertificateParams::new([]).expect("no names");
+        params.distinguished_name.push(DnType::CommonName, name);
+        params.is_ca = IsCa::Ca(BasicConstraints::Unconstrained);
+        let key = KeyPair::generate().expect("a key");
+        Self(CertifiedIssuer::self_signed(params, key).expect("a certificate"))
+    }
+
+    pub(crate) fn pem(&self) -> String {
+        self.0.pem()
+    }
+
+    /// A certificate for `name` that is valid for long.
+    pub(crate) fn sign(&self, name: &str) -> Identity {
+        self.sign_until(name, 4000)
+    }
+
+    /// A certificate for `name` that was valid until the first day of `year`.
+    pub(crate) fn sign_until(&self, name: &str, year: i32) -> Identity {
+        let mut params = CertificateParams::new([name.to_owned()]).expect("a name");
+        params.not_after = rcgen::date_time_ymd(year, 1, 1);
+        let key = KeyPair::generate().expect("a key");
+        let certificate = params.signed_by(&key, &self.0).expect("signs");
+        Identity { certificate: certificate.pem(), key: key.serialize_pem() }
+    }
+}
+
+impl Identity {
+    /// `gate`, speaking TLS as this one.
+    pub(crate) fn gate(&self, gate: Gate) -> Gate {
+        gate.with_certificate(self.certificate.as_bytes(), self.key.as_bytes()).expect("fits")
+    }
+}

@@ -1,0 +1,30 @@
+//! `tandem health`: whether a service serves, for people, containers and probes.
+
+use serde_json::json;
+use tandem_net::check_health;
+
+use crate::cli::HealthArgs;
+use crate::exit::{Exit, Failed, OrExit as _};
+use crate::{access, services};
+
+#[expect(clippy::print_stdout, reason = "what the command is for")]
+pub(crate) fn health(args: &HealthArgs) -> Result<(), Failed> {
+    let HealthArgs { address, service, .. } = args;
+    let dial = access::trusting(&args.dial)?;
+    let runtime = services::runtime().or_exit(Exit::TryAgain, String::new)?;
+    let answer = runtime.block_on(async {
+        let link = dial.link(address).or_exit(Exit::Usage, String::new)?;
+        Ok(check_health(link, service, args.timeout_s).await)
+    })?;
+    if args.json {
+        let reason = answer.as_ref().err().map(ToString::to_string);
+        let serving = answer.is_ok();
+        let shown =
+            json!({"address": address, "service": service, "serving": serving, "reason": reason});
+        println!("{shown}");
+    } else if answer.is_ok() {
+        println!("serving");
+    }
+    let says_where = answer.as_ref().is_err_and(|unwell| unwell.to_string().starts_with(address));
+    answer.or_exit(Exit::TryAgain, || if says_where { String::new() } else { address.clone() })
+}

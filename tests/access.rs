@@ -1,0 +1,273 @@
+//! Who may call whom: tokens, certificates and `tandem health`, with the built program.
+
+#[path = "access/program.rs"]
+mod program;
+
+use prost::Message as _;
+use serde_json::{Value, json};
+use tandem_proto::pb;
+use tandem_proto::pb::learner_client::LearnerClient;
+use tandem_proto::pb::teacher_client::TeacherClient;
+use tonic::service::Interceptor;
+use tonic::service::interceptor::InterceptedService;
+use tonic::transport::{Channel, Endpoint};
+use tonic::{Code, Request, Status};
+
+use program::{Place, SECRET, eventually, fails_with, teacher};
+
+const OTHER: &str = "another-token-456789";
+
+/// Shows a token, or none, as any client could.
+#[derive(Clone)]
+struct Shows(Option<&'static str>);
+
+impl Interceptor for Shows {
+    fn call(&mut self, mut request: Request<()>) -> Result<Request<()>, Status> {
+        if let Some(token) = self.0 {
+            let value = format!("Bearer {token}").parse().expect("ASCII");
+            request.metadata_mut().insert("authorization", value);
+        }
+        Ok(request)
+    }
+}
+
+type Caller = InterceptedService<Channel, Shows>;
+
+fn caller(address: &str, token: Option<&'static str>) -> Caller {
+    let endpoint = Endpoint::from_shared(format!("http://{address}")).expect("an address");
+    InterceptedService::new(endpoint.connect_lazy(), Shows(token))
+}
+
+/// The paths of all calls of a service.
+fn calls_of(service: &str) -> Vec<String> {
+    let set = prost_types::FileDescriptorSet::decode(tandem_proto::FILE_DESCRIPTOR_SET);
+    let services = set.expect("descriptors").file.into_iter().flat_map(|file| file.service);
+    services
+        .filter(|found| found.name() == service)
+        .flat_map(|found| found.method)
+        .map(|method| format!("/tandem.v1.{service}/{}", method.name()))
+        .collect()
+}
+
+/// The code of the answer to an empty message; a stream's is the same before it is open.
+async fn code_of(caller: &Caller, path: &str) -> Code {
+    let mut caller = tonic::client::Grpc::new(caller.clone());
+    caller.ready().await.expect("ready");
+    let codec = tonic_prost::ProstCodec::<(), ()>::default();
+    let path = path.parse().expect("a path");
+    let answer =
+        tokio::time::timeout(program::DEADLINE, caller.unary(Request::new(()), path, codec));
+    answer.await.expect("an answer").map_or_else(|status| status.code(), |_| Code::Ok)
+}
+
+#[test]
+fn an_address_that_others_can_reach_needs_a_token() {
+    let place = Place::new();
+    for address in ["0.0.0.0:0", "[::]:0", "[::ffff:0.0.0.0]:0"] {
+        let line = fails_with(64, place.run(&teacher(&["--listen", address])));
+        assert!(line.contains("--token-file"), "{line}");
+    }
+    let mut open = place.serve("insecure", &teacher(&["--listen", "0.0.0.0:0", "--insecure"]));
+    let mut safe =
+        place.serve("safe", &teacher(&["--listen", "0.0.0.0:0", "--token-file", "token"]));
+    for service in [&mut open, &mut safe] {
+        let health = place.run(&["health", &service.local_address()]);
+        assert_eq!(String::from_utf8_lossy(&health.stdout), "serving\n");
+    }
+    assert!(safe.log().contains("without --tls-cert"), "{}", safe.log());
+}
+
+#[test]
+fn secrets_and_certificates_that_cannot_be_used_are_refused_at_start() {
+    let place = Place::new();
+    place.write("empty", " \n");
+    place.write("short", "short\n");
+    place.write("nul", "0123456789\0abcdef\n");
+    place.write("umlaut", "0123456789abcdefü\n");
+    let tls = |certificate, key| teacher(&["--tls-cert", certificate, "--tls-key", key]);
+    let trust = |authority| {
+        ["worker", "--connect", "127.0.0.1:1", "--tls-ca", authority].map(str::to_owned).to_vec()
+    };
+    for (command, expected) in [
+        (teacher(&["--token-file", "empty"]), "it is empty"),
+        (teacher(&["--token-file", "short"]), "5 characters"),
+        (teacher(&["--token-file", "nul"]), "byte 11"),
+        (teacher(&["--token-file", "umlaut"]), "byte 17"),
+        (teacher(&["--token-file", "missing"]), "cannot read \"missing\""),
+        (tls("missing.pem", "tls.key"), "cannot read \"missing.pem\""),
+        (tls("token", "tls.key"), "no certificate"),
+        (tls("tls.pem", "tls.pem"), "no private key"),
+        (tls("tls.pem", "other.key"), "not the certificate's"),
+        (trust("token"), "no certificate"),
+        (trust("tls.key"), "no certificate"),
+        (trust("missing.pem"), "cannot read \"missing.pem\""),
+    ] {
+        let line = fails_with(64, place.run(&command));
+        assert!(line.contains(expected), "{command:?}: {line}");
+    }
+}
+
+#[cfg(unix)]
+#[test]
+fn a_token_that_everybody_can_read_is_used_with_a_warning() {
+    use std::os::unix::fs::PermissionsExt as _;
+    let place = Place::new();
+    for (mode, warned) in [(0o600, false), (0o640, false), (0o644, true)] {
+        let mode = std::fs::Permissions::from_mode(mode);
+        std::fs::set_permissions(place.path().join("token"), mode).expect("our own file");
+        let service = place.serve("teacher", &teacher(&["--token-file", "token"]));
+        assert_eq!(service.log().contains("chmod 600"), warned, "{}", service.log());
+    }
+}
+
+#[test]
+fn health_tells_who_serves_and_why_not() {
+    let place = Place::new();
+    let tls = ["--token-file", "token", "--tls-cert", "tls.pem", "--tls-key", "tls.key"];
+    let service = place.serve("teacher", &teacher(&tls));
+    let address = service.address.clone();
+    let health = |more: &[&str]| place.run(&[&["health", &address], more].concat());
+
+    assert_eq!(String::from_utf8_lossy(&health(&["--tls-ca", "ca.pem"]).stdout), "serving\n");
+    let named = health(&["--tls-ca", "ca.pem", "--service", "tandem.v1.Teacher", "--json"]);
+    let shown: Value = serde_json::from_slice(&named.stdout).expect("JSON");
+    let expected = json!({"address": address, "service": "tandem.v1.Teacher", "serving": true, "reason": null});
+    assert_eq!((named.status.code(), shown), (Some(0), expected));
+
+    let other = ["--tls-ca", "ca.pem", "--service", "tandem.v1.Learner"];
+    let line = fails_with(75, health(&other));
+    assert!(line.contains(&address) && line.contains("tandem.v1.Learner"), "{line}");
+    let line = fails_with(75, health(&[]));
+    assert!(line.contains(&address) && line.contains("--tls-ca"), "{line}");
+    let line = fails_with(75, health(&["--tls-ca", "other.pem"]));
+    assert!(line.contains(&address) && line.contains("--tls-ca"), "{line}");
+
+    drop(service);
+    let gone = health(&["--tls-ca", "ca.pem", "--json"]);
+    let shown: Value = serde_json::from_slice(&gone.stdout).expect("JSON");
+    assert_eq!((gone.status.code(), &shown["serving"]), (Some(75), &json!(false)));
+    assert!(shown["reason"].as_str().is_some_and(|reason| reason.contains("refused")), "{shown}");
+    fails_with(64, place.run(&["health", "nowhere"]));
+}
+
+#[test]
+fn a_service_that_never_answers_is_unwell_after_the_deadline() {
+    let silent = std::net::TcpListener::bind("127.0.0.1:0").expect("a port");
+    let address = silent.local_addr().expect("bound").to_string();
+    let line = fails_with(75, Place::new().run(&["health", &address, "--timeout-s", "0.2"]));
+    assert!(line.contains(&address) && line.contains("200ms"), "{line}");
+}
+
+#[tokio::test]
+async fn without_the_right_token_nothing_is_answered_and_nothing_happens() {
+    let place = Place::new();
+    let teacher = place.serve("teacher", &teacher(&["--token-file", "token"]));
+    let right = ["--teacher", &teacher.address, "--token-file", "token"];
+    let learner = place.serve("learner", &place.learner(&right));
+
+    let (teaches, learns) = (calls_of("Teacher"), calls_of("Learner"));
+    assert!(teaches.len() >= 7 && learns.len() >= 6, "{teaches:?} {learns:?}");
+    for token in [None, Some(OTHER)] {
+        for (service, calls) in [(&teacher, &teaches), (&learner, &learns)] {
+            let intruder = caller(&service.address, token);
+            for path in calls {
+                assert_eq!(code_of(&intruder, path).await, Code::Unauthenticated, "{path}");
+            }
+        }
+        let mut intruder = TeacherClient::new(caller(&teacher.address, token));
+        let opened = intruder.open_account(account("intruder")).await.expect_err("sent away");
+        assert_eq!(opened.code(), Code::Unauthenticated);
+        let mut intruder = LearnerClient::new(caller(&learner.address, token));
+        let joined = intruder.join(worker("intruder")).await.expect_err("sent away");
+        assert_eq!(joined.code(), Code::Unauthenticated);
+    }
+
+    let mut friend = TeacherClient::new(caller(&teacher.address, Some(SECRET)));
+    let named = pb::GetAccountRequest { name: "intruder".to_owned() };
+    let sought = friend.get_account(named).await.expect_err("was not opened");
+    assert_eq!(sought.code(), Code::NotFound);
+    let args = ["worker", "--name", "friend", "--connect", &learner.address];
+    let _friend = place.start("worker", &[&args[..], &right].concat());
+    let mut watcher = LearnerClient::new(caller(&learner.address, Some(SECRET)));
+    let shown = async {
+        let watched = watcher.watch(pb::WatchRequest {}).await;
+        let mut stream = watched.expect("may be watched").into_inner();
+        loop {
+            let progress = stream.message().await.expect("goes on").expect("tells of workers");
+            if !progress.workers.is_empty() {
+                return progress.workers;
+            }
+        }
+    };
+    let workers = tokio::time::timeout(program::DEADLINE, shown).await.expect("is shown");
+    let names: Vec<String> = workers.into_iter().map(|worker| worker.name).collect();
+    assert_eq!(names, ["friend"]);
+    for service in [&teacher, &learner] {
+        assert!(!service.log().contains("intruder"), "{}", service.log());
+    }
+}
+
+fn account(name: &str) -> pb::OpenAccountRequest {
+    pb::OpenAccountRequest { name: name.to_owned(), budget: 10, strategy: "ea".to_owned() }
+}
+
+fn worker(name: &str) -> pb::JoinRequest {
+    pb::JoinRequest { worker: name.to_owned(), version: env!("CARGO_PKG_VERSION").to_owned() }
+}
+
+#[test]
+fn learners_and_workers_with_a_wrong_token_end_and_say_so() {
+    let place = Place::new();
+    place.write("other-token", OTHER);
+    let teacher = place.serve("teacher", &teacher(&["--token-file", "token"]));
+    let right = ["--teacher", &teacher.address, "--token-file", "token"];
+    let learner = place.serve("learner", &place.learner(&right));
+    let worker = ["worker", "--connect", &learner.address, "--teacher", &teacher.address];
+    for token in [&["--token-file", "other-token"][..], &[]] {
+        let line = fails_with(64, place.run(&[&worker[..], token].concat()));
+        assert!(line.contains(&learner.address) && line.contains("--token-file"), "{line}");
+        let args = [&["--teacher", &teacher.address][..], token].concat();
+        let line = fails_with(64, place.run(&place.learner(&args)));
+        assert!(line.contains(&teacher.address) && line.contains("--token-file"), "{line}");
+    }
+}
+
+#[test]
+fn who_speaks_otherwise_says_what_to_do_and_goes_on_asking() {
+    let place = Place::new();
+    let plain = place.serve("plain", &teacher(&[]));
+    let tls = place.serve("tls", &teacher(&["--tls-cert", "tls.pem", "--tls-key", "tls.key"]));
+    let worker = |address: &str| ["worker", "--connect", address].map(str::to_owned).to_vec();
+    let trusting = |mut command: Vec<String>| {
+        command.extend(["--tls-ca".to_owned(), "ca.pem".to_owned()]);
+        command
+    };
+    let learner = |address: &str| place.learner(&["--teacher", address]);
+    for (name, command, told) in [
+        ("plain-worker", worker(&tls.address), "speaks TLS"),
+        ("tls-worker", trusting(worker(&plain.address)), "does not speak TLS"),
+        ("plain-learner", learner(&tls.address), "speaks TLS"),
+        ("tls-learner", trusting(learner(&plain.address)), "does not speak TLS"),
+    ] {
+        let mut running = place.start(name, &command);
+        let told_twice = || running.log().matches(told).count() >= 2;
+        assert!(eventually(told_twice), "{name}: {}", running.log());
+        assert!(running.log().contains("--tls-ca"), "{name}: {}", running.log());
+        assert!(running.is_alive(), "{name}: {}", running.log());
+    }
+}
+
+#[test]
+fn a_run_by_tls_with_a_token_ends_well() {
+    let place = Place::new();
+    let offer = ["--token-file", "token", "--tls-cert", "tls.pem", "--tls-key", "tls.key"];
+    let call = ["--token-file", "token", "--tls-ca", "ca.pem"];
+    let teacher = place.serve("teacher", &teacher(&offer));
+    let more = [&["--teacher", &teacher.address, "--tls-ca", "ca.pem"][..], &offer].concat();
+    let mut learner = place.serve("learner", &place.learner(&more));
+    let worker = ["worker", "--connect", &learner.address, "--teacher", &teacher.address];
+    let played = place.run(&[&worker[..], &call].concat());
+    assert!(played.status.success(), "{}", String::from_utf8_lossy(&played.stderr));
+    assert_eq!(learner.wait(), Some(0), "{}", learner.log());
+    assert!(learner.log().contains("advice account opened"), "{}", learner.log());
+}
