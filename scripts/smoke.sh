@@ -60,4 +60,24 @@ python3 -m venv "$work/venv"
 cargo run --release --locked --quiet -p tandem-policy --example policy_probe -- policies/teacher-push.safetensors >"$work/probe.json"
 "$work/venv/bin/python" scripts/check_policy.py policies/teacher-push.safetensors "$work/probe.json"
 for log in "$work"/run/mcap/*.mcap; do "$tandem" replay "$log" --verify >/dev/null; done
+
+echo '- a client that knows nothing of it talks to a teacher'
+head -c 32 /dev/urandom | base64 >"$work/token"
+"$tandem" teacher --policy policies/teacher-push.safetensors --listen 127.0.0.1:0 --ledger "$work/ledger.sqlite" \
+  --token-file "$work/token" >"$work/listening" 2>"$work/teacher.log" &
+teacher=$!
+trap 'kill "$teacher" 2>/dev/null || true; rm -rf "$work"' EXIT
+for _ in $(seq 600); do grep -q listening "$work/listening" && break; sleep 0.1; done
+address=$(sed -n 's/^listening on //p' "$work/listening")
+ask() { "$work/venv/bin/python" scripts/teacher_client.py "$address" --token-file "$work/token" "$@"; }
+ask --strategy mc-act:0.5 --budget 4 --steps 6 >"$work/asked"
+grep -q '^4 of 6 steps charged, 0 units left' "$work/asked"
+grep -q '^asked again: the same answers, 0 units left, 4 spent in all' "$work/asked"
+expect 64 'expected none, ea' ask --account other --strategy mc-x
+echo 'another-token-of-some-length' >"$work/other-token"
+expect 64 'the token is not' ask --token-file "$work/other-token"
+kill -TERM "$teacher"
+wait "$teacher"
+expect 75 'does not answer' ask
+
 echo 'smoke run passed'

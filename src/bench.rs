@@ -20,6 +20,8 @@ use crate::cli::{BenchArgs, BenchName};
 use crate::clock;
 use crate::exit::{Exit, Failed, OrExit as _};
 
+mod teacher;
+
 /// How long one sample of a rate is taken, and how many samples; the best is printed, as the least disturbed.
 const SAMPLE: Duration = Duration::from_millis(600);
 const N_SAMPLES: usize = 5;
@@ -43,6 +45,7 @@ pub(crate) fn bench(args: &BenchArgs) -> Result<(), Failed> {
             BenchName::Inference => inference()?,
             BenchName::Update => update(),
             BenchName::Replay => replay(),
+            BenchName::Teacher => teacher::teacher()?,
             BenchName::EndToEnd => end_to_end()?,
         };
         for Figure { name, value, unit } in figures {

@@ -2,6 +2,7 @@
 
 use std::net::SocketAddr;
 use std::path::PathBuf;
+use std::time::Duration;
 
 use clap::{Args, Parser, Subcommand, ValueEnum};
 
@@ -34,19 +35,25 @@ pub(crate) enum Command {
     Train(Box<TrainArgs>),
     /// Measures a policy on fixed goals: no noise, no advice.
     Eval(EvalArgs),
+    /// Trains many runs one after another: strategies, tasks, seeds and whatever else a file lists.
+    Sweep(SweepArgs),
+    /// Sets runs side by side: the paper's Table 2, curves, one HTML page.
+    Report(ReportArgs),
     /// Serves a one-arm policy as a teacher.
     Teacher(TeacherArgs),
     /// Serves a run's learner.
     Learner(LearnerArgs),
     /// Plays episodes for a learner.
     Worker(WorkerArgs),
+    /// Asks a service whether it serves.
+    Health(HealthArgs),
     /// Measures simulation, networks, updates, replay and a short run on this machine.
     Bench(BenchArgs),
     /// Shows what is in a policy file.
     Policy(PolicyArgs),
     /// Mends MCAP logs.
     Mcap(McapArgs),
-    /// Plays a recorded episode again in the simulator.
+    /// Plays recorded episodes again in the simulator and compares them bit for bit.
     Replay(ReplayArgs),
     /// Draws the arms at work as an SVG picture.
     Picture(PictureArgs),
@@ -125,6 +132,63 @@ pub(crate) struct TrainArgs {
     /// Prints the summary as one JSON object on the last line of standard output.
     #[arg(long)]
     pub(crate) json: bool,
+    /// Is interrupted when standard input closes, as it does when the parent process dies.
+    #[arg(long, hide = true)]
+    pub(crate) exit_with_stdin: bool,
+}
+
+#[derive(Debug, Args)]
+#[command(after_help = "\
+Examples:
+  tandem sweep deploy/sweep-small.toml --dry-run      what it would run
+  tandem sweep deploy/sweep-small.toml                goes on where it stopped, when it is started again
+  tandem report runs/sweep-small
+
+docs/sweep.md says what the file may hold. Exit code 75 when some runs failed; each is tried once more at the next start.")]
+pub(crate) struct SweepArgs {
+    /// The sweep file: settings of all runs, and lists to combine.
+    #[arg(value_name = "FILE.toml")]
+    pub(crate) file: PathBuf,
+    /// Where the run directories are made [default: runs/ and the file's name].
+    #[arg(long, value_name = "DIR")]
+    pub(crate) out: Option<PathBuf>,
+    /// Runs side by side; they share the cores.
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..=256))]
+    pub(crate) jobs: u16,
+    /// Prints one JSON object on the last line of standard output.
+    #[arg(long)]
+    pub(crate) json: bool,
+    /// Says what would be run, and how far each run is.
+    #[arg(long)]
+    pub(crate) dry_run: bool,
+}
+
+#[derive(Debug, Args)]
+#[command(after_help = "\
+Examples:
+  tandem report runs/sweep-table2
+  tandem report runs/a runs/b --out compared.html --csv compared.csv
+  tandem report docs/results/*.jsonl --composed-teachers policies/teacher-push.safetensors")]
+pub(crate) struct ReportArgs {
+    /// Run directories, directories with runs below, or metrics files by themselves.
+    #[arg(required = true, value_name = "DIR|FILE")]
+    pub(crate) paths: Vec<PathBuf>,
+    /// The page; curves are written beside it as SVG files [default: report.html, in the sweep's directory when
+    /// that is all that is given].
+    #[arg(long, value_name = "FILE.html")]
+    pub(crate) out: Option<PathBuf>,
+    /// Writes one line a run.
+    #[arg(long, value_name = "FILE.csv")]
+    pub(crate) csv: Option<PathBuf>,
+    /// What `tandem eval --json` printed: a row of its own, named after the file; may be repeated.
+    #[arg(long = "eval", value_name = "FILE.json")]
+    pub(crate) evals: Vec<PathBuf>,
+    /// Measures a one-arm policy that drives both arms: the baseline without a student; may be repeated.
+    #[arg(long, value_name = "POLICY")]
+    pub(crate) composed_teachers: Vec<PathBuf>,
+    /// Prints one JSON object on the last line of standard output.
+    #[arg(long)]
+    pub(crate) json: bool,
 }
 
 #[derive(Debug, Args)]
@@ -156,6 +220,9 @@ pub(crate) struct EvalArgs {
     /// Writes the first episode's log there.
     #[arg(long, value_name = "FILE.mcap")]
     pub(crate) record: Option<PathBuf>,
+    /// Writes every episode's log into this directory.
+    #[arg(long, value_name = "DIR")]
+    pub(crate) record_dir: Option<PathBuf>,
     /// Prints one JSON object on the last line of standard output.
     #[arg(long)]
     pub(crate) json: bool,
@@ -201,11 +268,24 @@ pub(crate) struct DialArgs {
 #[derive(Debug, Args)]
 #[command(after_help = "\
 Examples:
-  tandem teacher --policy policies/teacher-push.safetensors --listen 127.0.0.1:7001")]
+  tandem teacher --policy policies/teacher-push.safetensors --listen 127.0.0.1:7001
+  tandem teacher --policy FILE --ledger runs/mine/ledger.sqlite
+  tandem teacher --policy FILE --ledger redis://:PASSWORD@redis:6379/0     several teachers, one budget
+  tandem teacher --policy FILE --ledger memory                             forgotten at the end")]
 pub(crate) struct TeacherArgs {
     /// The one-arm policy that advises.
     #[arg(long, value_name = "FILE")]
     pub(crate) policy: PathBuf,
+    /// Where accounts are kept: an SQLite file that this teacher alone uses, redis://[USER:PASSWORD@]HOST[:PORT][/DB],
+    /// or memory.
+    #[arg(
+        long,
+        value_name = "WHERE",
+        default_value = "ledger.sqlite",
+        env = "TANDEM_LEDGER",
+        hide_env_values = true
+    )]
+    pub(crate) ledger: String,
     #[command(flatten)]
     pub(crate) listen: ListenArgs,
     #[command(flatten)]
@@ -271,6 +351,39 @@ pub(crate) struct WorkerArgs {
 #[derive(Debug, Args)]
 #[command(after_help = "\
 Examples:
+  tandem health 127.0.0.1:7000
+  tandem health learner:7000 --service tandem.v1.Learner --tls-ca ca.pem --timeout-s 1
+  tandem health learner:7000 --json
+
+Prints `serving` and ends with exit code 0; otherwise says why on one line and ends with 75.
+No token is needed: probes have none.")]
+pub(crate) struct HealthArgs {
+    /// The service's address.
+    #[arg(value_name = "ADDR")]
+    pub(crate) address: String,
+    /// One service, tandem.v1.Teacher or tandem.v1.Learner [default: all that is offered there].
+    #[arg(long, default_value = "", hide_default_value = true, value_name = "NAME")]
+    pub(crate) service: String,
+    /// Seconds to wait for the answer.
+    #[arg(long, default_value = "3", value_name = "S", value_parser = seconds)]
+    pub(crate) timeout_s: Duration,
+    #[command(flatten)]
+    pub(crate) dial: DialArgs,
+    /// Prints one JSON object: address, service, serving, reason.
+    #[arg(long)]
+    pub(crate) json: bool,
+}
+
+/// A time span from seconds, more than none.
+fn seconds(text: &str) -> Result<Duration, String> {
+    let span = text.parse().ok().and_then(|seconds| Duration::try_from_secs_f64(seconds).ok());
+    let span = span.filter(|span| !span.is_zero());
+    span.ok_or_else(|| "expected a number of seconds, more than 0".to_owned())
+}
+
+#[derive(Debug, Args)]
+#[command(after_help = "\
+Examples:
   tandem bench                   everything, about two minutes
   tandem bench sim update --json")]
 pub(crate) struct BenchArgs {
@@ -288,6 +401,8 @@ pub(crate) enum BenchName {
     Inference,
     Update,
     Replay,
+    /// The teacher as a service, beside an echo of the same messages.
+    Teacher,
     /// A short run of the main job, processes and all.
     EndToEnd,
 }
@@ -313,12 +428,17 @@ pub(crate) enum PolicyCommand {
 #[derive(Debug, Args)]
 #[command(after_help = "\
 Examples:
-  tandem replay runs/NAME/mcap/eval-000100-000.mcap
-  tandem replay FILE.mcap --verify --json")]
+  tandem replay runs/NAME/mcap/eval-000100-000.mcap     step by step
+  tandem replay runs --verify                           every *.mcap below
+  tandem replay FILE.mcap --verify --json
+
+Every number that the simulator gives is compared bit for bit with the log's; exit code 65 when one differs or a log
+cannot be read.")]
 pub(crate) struct ReplayArgs {
-    /// The recorded episode.
-    pub(crate) file: PathBuf,
-    /// Compares every observation bit for bit; exit code 65 when one differs.
+    /// Recorded episodes, or directories in and below which every *.mcap is one.
+    #[arg(required = true, value_name = "FILE|DIR")]
+    pub(crate) files: Vec<PathBuf>,
+    /// Only compares: without it, one log alone is also shown step by step.
     #[arg(long)]
     pub(crate) verify: bool,
     /// Prints one JSON object on the last line of standard output.

@@ -14,10 +14,13 @@ mod clock;
 mod eval;
 mod exit;
 mod files;
+mod health;
 mod picture;
+mod report;
 mod run_file;
 mod services;
 mod signals;
+mod sweep;
 mod train;
 
 use cli::{Cli, Command};
@@ -38,9 +41,12 @@ fn main() -> ExitCode {
     let done = match cli.command {
         Command::Train(args) => train::train(&args),
         Command::Eval(args) => eval::eval(&args),
+        Command::Sweep(args) => sweep::sweep(&args),
+        Command::Report(args) => report::report(&args),
         Command::Teacher(args) => services::teacher(args),
         Command::Learner(args) => services::learner(args),
         Command::Worker(args) => services::worker(args),
+        Command::Health(args) => health::health(&args),
         Command::Bench(args) => bench::bench(&args),
         Command::Policy(args) => files::policy(&args),
         Command::Mcap(args) => files::mcap(&args),

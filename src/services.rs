@@ -39,10 +39,8 @@ pub(crate) fn teacher(args: TeacherArgs) -> Result<(), Failed> {
     run(async move {
         let shutdown = shutdown(args.listen.exit_with_stdin)?;
         let listener = listen(&args.listen).await?;
-        let teacher = tandem_teacher::Config { policy: args.policy };
-        tandem_teacher::serve(teacher, listener, &gate, shutdown)
-            .await
-            .or_exit(Exit::Data, String::new)
+        let teacher = tandem_teacher::Config { policy: args.policy, ledger: args.ledger };
+        tandem_teacher::serve(teacher, listener, &gate, shutdown).await.map_err(teacher_failed)
     })
 }
 
@@ -90,11 +88,6 @@ pub(crate) fn worker(args: WorkerArgs) -> Result<(), Failed> {
     })
 }
 
-/// `host:port` as the address that gRPC clients take.
-pub(crate) fn uri(address: &str) -> String {
-    if address.contains("://") { address.to_owned() } else { format!("http://{address}") }
-}
-
 /// A runtime for sockets; whatever computes has threads of its own.
 pub(crate) fn runtime() -> anyhow::Result<Runtime> {
     Builder::new_current_thread().enable_all().build().context("cannot start the runtime")
@@ -123,6 +116,21 @@ async fn listen(args: &ListenArgs) -> Result<TcpListener, Failed> {
     Ok(listener)
 }
 
+fn teacher_failed(error: tandem_teacher::Error) -> Failed {
+    use tandem_teacher::Error as E;
+    use tandem_teacher::ledger::OpenError;
+    let exit = match &error {
+        E::OpenLedger(OpenError::NotAPlace(_)) => Exit::Usage,
+        E::OpenLedger(OpenError::InUse(_) | OpenError::Io { .. } | OpenError::Server { .. }) => {
+            Exit::TryAgain
+        }
+        E::Transport(_) | E::Thread(_) => Exit::TryAgain,
+        E::Panicked => Exit::Bug,
+        _ => Exit::Data,
+    };
+    Failed::new(exit, error)
+}
+
 fn worker_failed(error: tandem_worker::Error) -> Failed {
     use tandem_worker::Error as E;
     let exit = match error {
@@ -130,7 +138,18 @@ fn worker_failed(error: tandem_worker::Error) -> Failed {
         E::Rollout { .. } | E::World(_) | E::Panicked(_) | E::NoAccount { .. } => Exit::Bug,
         E::Protocol { .. } | E::Parameters { .. } | E::LogDir { .. } => Exit::TryAgain,
     };
-    Failed::new(exit, error)
+    let error = anyhow::Error::from(error);
+    match wrong_token(&error) {
+        Some(told) => Failed::usage(format!("{error}: {told}")),
+        None => Failed::new(exit, error),
+    }
+}
+
+/// What to do when a peer wants another token, if that is what went wrong.
+fn wrong_token(error: &anyhow::Error) -> Option<&str> {
+    let mut statuses = error.chain().filter_map(|cause| cause.downcast_ref::<tonic::Status>());
+    let status = statuses.find(|status| status.code() == tonic::Code::Unauthenticated);
+    status.map(tonic::Status::message)
 }
 
 fn learner_failed(error: LearnerError) -> Failed {

@@ -9,6 +9,8 @@ mod account;
 mod verdicts;
 
 pub use account::Account;
+pub(crate) use account::{Changes, LeaseRecord};
+pub(crate) use verdicts::{Word, WordIndex};
 
 use crate::strategy::Strategy;
 

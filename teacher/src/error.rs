@@ -1,8 +1,10 @@
 //! What can go wrong in a teacher.
 
+use std::time::Duration;
+
 use tandem_proto::DecodeError;
 
-use crate::ledger::LedgerError;
+use crate::ledger::{LedgerError, OpenError};
 use crate::strategy::UnknownStrategy;
 
 /// Why a teacher cannot start or cannot answer.
@@ -30,6 +32,9 @@ pub enum Error {
     /// The ledger declines or is away.
     #[error(transparent)]
     Ledger(#[from] LedgerError),
+    /// The ledger cannot be opened.
+    #[error(transparent)]
+    OpenLedger(#[from] OpenError),
     /// The teacher's networks gave infinity or NaN.
     #[error(
         "the teacher's networks gave a number that is not finite for step {step} of episode {episode}"
@@ -40,6 +45,15 @@ pub enum Error {
         /// Its step.
         step: u32,
     },
+    /// Nobody answered in time: the ledger is stuck, or too many ask.
+    #[error("no answer within {0:?}: ask again")]
+    Overdue(Duration),
+    /// The thread that owns the networks and the ledger has panicked, and the service ends.
+    #[error("the teacher has a bug and ends: its log says more")]
+    Panicked,
+    /// The thread that owns the networks and the ledger cannot be started.
+    #[error("cannot start a thread")]
+    Thread(#[source] std::io::Error),
     /// The service cannot be offered.
     #[error(transparent)]
     Gate(#[from] tandem_net::GateError),

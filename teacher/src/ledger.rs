@@ -1,12 +1,22 @@
 //! Where accounts are kept: one trait, whatever remembers them.
 //!
 //! What an operation means is said by [`crate::budget`]; a ledger makes it durable and lets several clients at it.
+//! [`open()`] picks one by name: [`MemoryLedger`] forgets, [`SqliteLedger`] keeps accounts in a file that one teacher
+//! owns, [`RedisLedger`] on a server that several teachers share.
 
 mod memory;
+mod redis;
+mod sqlite;
 
-use crate::budget::{Balance, BudgetError, Lease, Terms, Verdict, Wish};
+use std::path::{Path, PathBuf};
+
+use tandem_core::layout::EPISODE_STEPS;
+
+use crate::budget::{Account, Balance, BudgetError, Lease, MAX_BUDGET, Terms, Verdict, Wish};
 
 pub use memory::MemoryLedger;
+pub use redis::RedisLedger;
+pub use sqlite::SqliteLedger;
 
 /// One step that may cost a unit.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -37,20 +47,21 @@ pub struct Receipt {
     pub left: u64,
 }
 
-/// Why a ledger does not do what it is asked. Nothing has then changed.
+/// Why a ledger does not do what it is asked.
 #[derive(Debug, thiserror::Error)]
 pub enum LedgerError {
-    /// The account is unknown, or not as asked for.
+    /// The account is unknown, or not as asked for. Nothing has changed.
     #[error(transparent)]
     Budget(#[from] BudgetError),
-    /// A step lies beyond the end of an episode that has a lease.
+    /// A step lies beyond the end of an episode that has a lease. Nothing has changed.
     #[error("charge {charge_idx} is for a step beyond the end of an episode that has a lease")]
     BeyondEnd {
         /// Which of the bill's charges.
         charge_idx: usize,
     },
-    /// What remembers the accounts cannot be reached or written; asking again may help.
-    #[error("the ledger cannot be used now: {what}")]
+    /// What remembers the accounts cannot be reached or written. Asking again may help and does no harm: if the
+    /// operation was done after all, it is not done twice.
+    #[error("the ledger cannot be used now: {what}{}", because(source.as_deref()))]
     Unavailable {
         /// What failed.
         what: String,
@@ -93,4 +104,137 @@ pub trait Ledger: Send {
 
     /// Charges `bills` in their order, each by itself; see [`crate::budget::Account::charge`]. One outcome per bill.
     fn charge(&mut self, bills: &[Bill]) -> Vec<Result<Receipt, LedgerError>>;
+}
+
+/// Why a ledger cannot be opened.
+#[derive(Debug, thiserror::Error)]
+pub enum OpenError {
+    /// The name means no ledger.
+    #[error(
+        "expected memory, redis://[USER:PASSWORD@]HOST[:PORT][/DB] or a file as the ledger: {0}"
+    )]
+    NotAPlace(String),
+    /// Another process has the file open.
+    #[error(
+        "another teacher uses the ledger {0:?}: end that one, or give this one a ledger of its own"
+    )]
+    InUse(PathBuf),
+    /// The file cannot be read or written.
+    #[error("cannot open the ledger {path:?}")]
+    Io {
+        /// The file.
+        path: PathBuf,
+        /// Why.
+        source: std::io::Error,
+    },
+    /// The file is something else.
+    #[error("{path:?} is no ledger but {found}: move it away or name another file")]
+    NotALedger {
+        /// The file.
+        path: PathBuf,
+        /// What it is.
+        found: &'static str,
+    },
+    /// Another version of this program made the file.
+    #[error(
+        "the ledger {path:?} has version {found}, this program reads version {expected}: use the program that wrote it, or name another file"
+    )]
+    Version {
+        /// The file.
+        path: PathBuf,
+        /// Its version.
+        found: i64,
+        /// The version that can be read.
+        expected: i64,
+    },
+    /// The file was a ledger.
+    #[error(
+        "the ledger {path:?} is damaged ({what}): put a copy in its place, or move it away to begin with no accounts"
+    )]
+    Damaged {
+        /// The file.
+        path: PathBuf,
+        /// How that shows.
+        what: String,
+    },
+    /// The server cannot be reached or does not let us in.
+    #[error("cannot use the ledger {server}")]
+    Server {
+        /// Where it should be, without the password.
+        server: String,
+        /// Why.
+        source: Box<dyn std::error::Error + Send + Sync>,
+    },
+}
+
+/// Opens the ledger called `place`: `memory`, `redis://[USER:PASSWORD@]HOST[:PORT][/DB]`, or else a file, which is
+/// made when there is none.
+///
+/// # Errors
+/// When the name means nothing, when the file is not a ledger of this version or is in use, or when the server cannot
+/// be reached.
+pub fn open(place: &str) -> Result<Box<dyn Ledger>, OpenError> {
+    if place == "memory" {
+        tracing::info!("accounts are kept in memory and forgotten when this process ends");
+        return Ok(Box::new(MemoryLedger::default()));
+    }
+    if place.starts_with("redis://") {
+        return Ok(Box::new(RedisLedger::open(place)?));
+    }
+    if let Some((scheme, _)) = place.split_once("://") {
+        let told = if scheme == "rediss" {
+            "rediss:// is not spoken here, reach a server with TLS through a tunnel".to_owned()
+        } else {
+            format!("there is no ledger of the kind {scheme:?}")
+        };
+        return Err(OpenError::NotAPlace(told));
+    }
+    if place.is_empty() {
+        return Err(OpenError::NotAPlace("the name is empty".to_owned()));
+    }
+    Ok(Box::new(SqliteLedger::open(Path::new(place))?))
+}
+
+/// Refuses a budget that no account may have.
+fn check_budget(terms: Terms) -> Result<(), BudgetError> {
+    if terms.budget > MAX_BUDGET {
+        return Err(BudgetError::BudgetTooLarge(terms.budget));
+    }
+    Ok(())
+}
+
+/// Refuses to open account `name` on other terms than those it is open on.
+fn check_terms(name: &str, open: Terms, asked: Terms) -> Result<(), BudgetError> {
+    if open != asked {
+        return Err(BudgetError::OtherTerms { name: name.to_owned(), open, asked });
+    }
+    Ok(())
+}
+
+fn unknown_account(name: &str) -> LedgerError {
+    BudgetError::UnknownAccount(name.to_owned()).into()
+}
+
+/// Makes all of `charges`, or refuses all of them.
+fn charge_all(account: &mut Account, charges: &[Charge]) -> Result<Receipt, LedgerError> {
+    if let Some(charge_idx) = charges.iter().position(|charge| is_beyond(account, charge)) {
+        return Err(LedgerError::BeyondEnd { charge_idx });
+    }
+    let charge = |charge: &Charge| account.charge(charge.episode, charge.step, charge.wish);
+    let verdicts = charges.iter().map(charge).collect();
+    Ok(Receipt { verdicts, left: account.left() })
+}
+
+/// Episodes of a run, which have leases, have [`EPISODE_STEPS`] steps; how long others are is their owner's matter.
+fn is_beyond(account: &Account, charge: &Charge) -> bool {
+    is_beyond_episode(charge.step) && account.has_lease(charge.episode)
+}
+
+fn is_beyond_episode(step: u32) -> bool {
+    usize::try_from(step).map_or(true, |step| step >= EPISODE_STEPS)
+}
+
+/// What an error's source adds to its message.
+fn because(source: Option<&(dyn std::error::Error + Send + Sync)>) -> String {
+    source.map(|source| format!(": {source}")).unwrap_or_default()
 }

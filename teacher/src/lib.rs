@@ -18,7 +18,7 @@ pub mod strategy;
 #[cfg(test)]
 mod fake;
 
-pub use advisor::{Advice, Advisor};
+pub use advisor::{Advice, Advisor, Profile, Question};
 pub use error::Error;
 pub use policy::TeacherPolicy;
 pub use service::{Config, serve, serve_advisor};

@@ -2,9 +2,9 @@
 
 mod answers;
 mod messages;
+mod thread;
 
 use std::path::PathBuf;
-use std::sync::Arc;
 use std::time::Duration;
 
 use tandem_net::{Gate, Incoming};
@@ -16,13 +16,16 @@ use tonic::{Request, Response, Status, Streaming};
 use crate::advisor::Advisor;
 use crate::budget::{BudgetError, Terms};
 use crate::error::Error;
-use crate::ledger::{LedgerError, MemoryLedger};
+use crate::ledger::{self, LedgerError};
 use crate::policy::OneArmPolicy;
 use answers::{AnswerStream, answer, answer_all};
 use messages::{check_episodes, describe, encode_balance, encode_lease};
+use thread::{AdvisorHandle, AdvisorThread};
 
 /// Bytes that a request may have: some thousands of steps.
 const MAX_REQUEST_BYTES: usize = 4 << 20;
+/// How long a call waits for its answer: less than a learner waits for a call.
+const PATIENCE: Duration = Duration::from_secs(4);
 /// How long calls that are being answered may take to finish once the service shall end.
 const SHUTDOWN_GRACE: Duration = Duration::from_secs(5);
 
@@ -31,12 +34,14 @@ const SHUTDOWN_GRACE: Duration = Duration::from_secs(5);
 pub struct Config {
     /// The file of the policy that teaches.
     pub policy: PathBuf,
+    /// Where its accounts are kept; see [`ledger::open`].
+    pub ledger: String,
 }
 
 /// Serves the teacher of `config` to those whom `gate` lets in, until `shutdown` is cancelled.
 ///
 /// # Errors
-/// When the policy cannot teach, or the server fails.
+/// When the policy cannot teach, the ledger cannot be opened, or the server fails.
 pub async fn serve(
     config: Config,
     incoming: impl Into<Incoming>,
@@ -44,8 +49,9 @@ pub async fn serve(
     shutdown: CancellationToken,
 ) -> Result<(), Error> {
     let policy = OneArmPolicy::load(&config.policy)?;
+    let ledger = ledger::open(&config.ledger)?;
     serve_advisor(
-        Advisor::new(Box::new(policy), Box::new(MemoryLedger::default()))?,
+        Advisor::new(Box::new(policy), ledger)?,
         incoming,
         gate,
         shutdown,
@@ -55,24 +61,32 @@ pub async fn serve(
 
 /// Serves `advisor` to those whom `gate` lets in, until `shutdown` is cancelled.
 ///
+/// The advisor gets a thread of its own. Should that thread panic, calls under way fail and the service ends.
+///
 /// # Errors
-/// When the server fails.
+/// When the server fails, or the advisor has panicked.
 pub async fn serve_advisor(
     advisor: Advisor,
     incoming: impl Into<Incoming>,
     gate: &Gate,
     shutdown: CancellationToken,
 ) -> Result<(), Error> {
-    let service = TeacherService { advisor: Arc::new(advisor), shutdown: shutdown.clone() };
+    let stop = shutdown.child_token();
+    let (thread, advisor) =
+        AdvisorThread::spawn(advisor, PATIENCE, stop.clone()).map_err(Error::Thread)?;
+    let service = TeacherService { advisor, stop: stop.clone() };
     let teacher = TeacherServer::new(service).max_decoding_message_size(MAX_REQUEST_BYTES);
     let router = gate.router(teacher).await?;
     let served =
-        router.serve_with_incoming_shutdown(incoming.into(), shutdown.clone().cancelled_owned());
+        router.serve_with_incoming_shutdown(incoming.into(), stop.clone().cancelled_owned());
     tokio::select! {
-        outcome = served => Ok(outcome?),
-        () = grace_after(&shutdown) => {
+        outcome = served => {
+            outcome?;
+            thread.join(SHUTDOWN_GRACE).await
+        }
+        () = grace_after(&stop) => {
             tracing::warn!("calls still open after the grace period were cut off");
-            Ok(())
+            thread.join(Duration::ZERO).await
         }
     }
 }
@@ -84,8 +98,9 @@ async fn grace_after(shutdown: &CancellationToken) {
 
 /// What the generated server calls.
 struct TeacherService {
-    advisor: Arc<Advisor>,
-    shutdown: CancellationToken,
+    advisor: AdvisorHandle,
+    /// Cancelled when the service shall end, or must.
+    stop: CancellationToken,
 }
 
 #[tonic::async_trait]
@@ -96,7 +111,7 @@ impl Teacher for TeacherService {
         &self,
         _: Request<pb::DescribeRequest>,
     ) -> Result<Response<pb::DescribeResponse>, Status> {
-        Ok(Response::new(describe(&self.advisor)))
+        Ok(Response::new(describe(self.advisor.profile())))
     }
 
     async fn open_account(
@@ -104,7 +119,7 @@ impl Teacher for TeacherService {
         request: Request<pb::OpenAccountRequest>,
     ) -> Result<Response<pb::Account>, Status> {
         let request = request.into_inner();
-        let account = open_account(&self.advisor, request).map_err(|error| status(&error))?;
+        let account = open_account(&self.advisor, request).await.map_err(|error| status(&error))?;
         Ok(Response::new(account))
     }
 
@@ -112,8 +127,8 @@ impl Teacher for TeacherService {
         &self,
         request: Request<pb::GetAccountRequest>,
     ) -> Result<Response<pb::Account>, Status> {
-        let account =
-            get_account(&self.advisor, request.into_inner()).map_err(|error| status(&error))?;
+        let account = get_account(&self.advisor, request.into_inner()).await;
+        let account = account.map_err(|error| status(&error))?;
         Ok(Response::new(account))
     }
 
@@ -121,23 +136,23 @@ impl Teacher for TeacherService {
         &self,
         request: Request<pb::AdviseRequest>,
     ) -> Result<Response<pb::AdviseResponse>, Status> {
-        answer(Arc::clone(&self.advisor), request.into_inner()).await.map(Response::new)
+        answer(&self.advisor, request.into_inner()).await.map(Response::new)
     }
 
     async fn advise_stream(
         &self,
         request: Request<Streaming<pb::AdviseRequest>>,
     ) -> Result<Response<AnswerStream>, Status> {
-        let advisor = Arc::clone(&self.advisor);
-        Ok(Response::new(answer_all(advisor, request.into_inner(), self.shutdown.clone())))
+        let answers = answer_all(self.advisor.clone(), request.into_inner(), self.stop.clone());
+        Ok(Response::new(answers))
     }
 
     async fn open_leases(
         &self,
         request: Request<pb::OpenLeasesRequest>,
     ) -> Result<Response<pb::OpenLeasesResponse>, Status> {
-        let leases =
-            open_leases(&self.advisor, request.into_inner()).map_err(|error| status(&error))?;
+        let leases = open_leases(&self.advisor, request.into_inner()).await;
+        let leases = leases.map_err(|error| status(&error))?;
         Ok(Response::new(leases))
     }
 
@@ -145,34 +160,43 @@ impl Teacher for TeacherService {
         &self,
         request: Request<pb::SettleLeasesRequest>,
     ) -> Result<Response<pb::Account>, Status> {
-        let account =
-            settle_leases(&self.advisor, request.into_inner()).map_err(|error| status(&error))?;
+        let account = settle_leases(&self.advisor, request.into_inner()).await;
+        let account = account.map_err(|error| status(&error))?;
         Ok(Response::new(account))
     }
 }
 
-fn open_account(advisor: &Advisor, request: pb::OpenAccountRequest) -> Result<pb::Account, Error> {
+async fn open_account(
+    advisor: &AdvisorHandle,
+    request: pb::OpenAccountRequest,
+) -> Result<pb::Account, Error> {
     let name = decode_account_name("name", request.name)?;
     let terms = Terms { budget: request.budget, strategy: request.strategy.parse()? };
-    let balance = advisor.open_account(&name, terms)?;
+    let account = name.clone();
+    let balance = advisor.run(move |advisor| advisor.open_account(&account, terms)).await?;
     tracing::info!(account = name, budget = terms.budget, strategy = %terms.strategy, "account opened");
     Ok(encode_balance(name, &balance))
 }
 
-fn get_account(advisor: &Advisor, request: pb::GetAccountRequest) -> Result<pb::Account, Error> {
+async fn get_account(
+    advisor: &AdvisorHandle,
+    request: pb::GetAccountRequest,
+) -> Result<pb::Account, Error> {
     let name = decode_account_name("name", request.name)?;
-    let balance = advisor.balance(&name)?;
+    let account = name.clone();
+    let balance = advisor.run(move |advisor| advisor.balance(&account)).await?;
     Ok(encode_balance(name, &balance))
 }
 
-fn open_leases(
-    advisor: &Advisor,
+async fn open_leases(
+    advisor: &AdvisorHandle,
     request: pb::OpenLeasesRequest,
 ) -> Result<pb::OpenLeasesResponse, Error> {
     let name = decode_account_name("account", request.account)?;
     check_episodes(&request.episodes)?;
-    let (leases, balance) =
-        advisor.open_leases(&name, &request.episodes, request.units_per_episode)?;
+    let (account, units) = (name.clone(), request.units_per_episode);
+    let open = move |advisor: &mut Advisor| advisor.open_leases(&account, &request.episodes, units);
+    let (leases, balance) = advisor.run(open).await?;
     tracing::debug!(account = name, episodes = leases.len(), left = balance.left, "leases opened");
     Ok(pb::OpenLeasesResponse {
         leases: leases.iter().map(encode_lease).collect(),
@@ -180,19 +204,16 @@ fn open_leases(
     })
 }
 
-fn settle_leases(
-    advisor: &Advisor,
+async fn settle_leases(
+    advisor: &AdvisorHandle,
     request: pb::SettleLeasesRequest,
 ) -> Result<pb::Account, Error> {
     let name = decode_account_name("account", request.account)?;
     check_episodes(&request.episodes)?;
-    let balance = advisor.settle_leases(&name, &request.episodes)?;
-    tracing::debug!(
-        account = name,
-        episodes = request.episodes.len(),
-        left = balance.left,
-        "leases settled"
-    );
+    let (account, n_episodes) = (name.clone(), request.episodes.len());
+    let settle = move |advisor: &mut Advisor| advisor.settle_leases(&account, &request.episodes);
+    let balance = advisor.run(settle).await?;
+    tracing::debug!(account = name, episodes = n_episodes, left = balance.left, "leases settled");
     Ok(encode_balance(name, &balance))
 }
 
@@ -211,13 +232,16 @@ fn status(error: &Error) -> Status {
         Error::Ledger(LedgerError::Budget(BudgetError::OtherTerms { .. })) => {
             Status::already_exists(message)
         }
-        Error::Ledger(LedgerError::Unavailable { .. }) => {
+        Error::Ledger(LedgerError::Unavailable { .. }) | Error::Overdue(_) => {
             tracing::error!(%error, "request failed");
             Status::unavailable(message)
         }
         Error::Policy(_)
+        | Error::OpenLedger(_)
         | Error::NotOneArm { .. }
         | Error::NotFinite { .. }
+        | Error::Panicked
+        | Error::Thread(_)
         | Error::Gate(_)
         | Error::Transport(_) => {
             tracing::error!(%error, "request failed");
@@ -226,5 +250,7 @@ fn status(error: &Error) -> Status {
     }
 }
 
+#[cfg(test)]
+mod gated;
 #[cfg(test)]
 mod tests;

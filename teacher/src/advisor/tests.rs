@@ -1,20 +1,25 @@
-use std::collections::BTreeMap;
-use std::thread;
-
-use tandem_core::Task;
-
 use super::*;
 use crate::fake::{FakePolicy, query};
 use crate::ledger::MemoryLedger;
 
 fn advisor(budget: u64, strategy: &str) -> Advisor {
-    let advisor = Advisor::new(Box::new(FakePolicy), Box::new(MemoryLedger::default())).unwrap();
+    let mut advisor =
+        Advisor::new(Box::new(FakePolicy), Box::new(MemoryLedger::default())).unwrap();
     advisor.open_account("run", Terms { budget, strategy: strategy.parse().unwrap() }).unwrap();
     advisor
 }
 
-fn ask(advisor: &Advisor, query: &StepQuery) -> StepAdvice {
-    advisor.advise("run", std::slice::from_ref(query)).unwrap().steps.remove(0)
+fn question(account: &str, queries: &[StepQuery]) -> Question {
+    Question { account: account.to_owned(), queries: queries.to_vec() }
+}
+
+/// The answer to one question.
+fn advise(advisor: &mut Advisor, account: &str, queries: &[StepQuery]) -> Result<Advice, Error> {
+    advisor.advise(&[question(account, queries)]).remove(0)
+}
+
+fn ask(advisor: &mut Advisor, query: &StepQuery) -> StepAdvice {
+    advise(advisor, "run", std::slice::from_ref(query)).unwrap().steps.remove(0)
 }
 
 /// The teacher would act (0.5, 0, 0) and (0, 0.25, 0): importances 0.25 and 0.0625, distances 0.5 and 0.25.
@@ -25,7 +30,7 @@ fn two_arms(step: u32) -> StepQuery {
 #[test]
 fn each_strategy_overrides_the_arms_that_its_procedure_picks() {
     let check = |strategy: &str, overridden_arms: u8, action: [f32; 6]| {
-        let advice = ask(&advisor(10, strategy), &two_arms(0));
+        let advice = ask(&mut advisor(10, strategy), &two_arms(0));
         assert_eq!(advice.overridden_arms(), overridden_arms, "{strategy}");
         assert_eq!(advice.action, action, "{strategy}");
         assert_eq!(advice.charged, overridden_arms != 0, "{strategy}");
@@ -49,7 +54,7 @@ fn each_strategy_overrides_the_arms_that_its_procedure_picks() {
 fn every_strategy_tells_what_the_teacher_thinks() {
     for strategy in ["none", "ea", "eamc", "mc-q", "mc-act", "mc-act-abs"] {
         for budget in [0, 10] {
-            let advice = ask(&advisor(budget, strategy), &two_arms(0));
+            let advice = ask(&mut advisor(budget, strategy), &two_arms(0));
             let thoughts: Vec<_> = advice
                 .arms
                 .iter()
@@ -68,7 +73,7 @@ fn every_strategy_tells_what_the_teacher_thinks() {
 #[test]
 fn without_budget_the_students_action_comes_back_uncharged() {
     for strategy in ["none", "ea", "eamc", "mc-q", "mc-act", "mc-act-abs"] {
-        let advice = ask(&advisor(0, strategy), &two_arms(0));
+        let advice = ask(&mut advisor(0, strategy), &two_arms(0));
         assert_eq!((advice.charged, advice.overridden_arms()), (false, 0), "{strategy}");
         assert_eq!(advice.action, [0.0; 6], "{strategy}");
     }
@@ -76,10 +81,10 @@ fn without_budget_the_students_action_comes_back_uncharged() {
 
 #[test]
 fn eamc_goes_over_to_mistake_correcting_at_half_of_the_budget() {
-    let advisor = advisor(4, "eamc:0.1");
+    let mut advisor = advisor(4, "eamc:0.1");
     let overridden: Vec<(u8, bool)> = (0..7)
         .map(|step| {
-            ask(&advisor, &if step == 3 { query(1, step, 0.0, 0.0) } else { two_arms(step) })
+            ask(&mut advisor, &if step == 3 { query(1, step, 0.0, 0.0) } else { two_arms(step) })
         })
         .map(|advice| (advice.overridden_arms(), advice.charged))
         .collect();
@@ -94,26 +99,26 @@ fn eamc_goes_over_to_mistake_correcting_at_half_of_the_budget() {
 
 #[test]
 fn a_repeated_query_gets_the_same_answer_in_any_phase() {
-    let advisor = advisor(4, "eamc:0.1");
-    let first: Vec<StepAdvice> = (0..6).map(|step| ask(&advisor, &two_arms(step))).collect();
+    let mut advisor = advisor(4, "eamc:0.1");
+    let first: Vec<StepAdvice> = (0..6).map(|step| ask(&mut advisor, &two_arms(step))).collect();
     let spent = advisor.balance("run").unwrap();
-    let again: Vec<StepAdvice> = (0..6).map(|step| ask(&advisor, &two_arms(step))).collect();
+    let again: Vec<StepAdvice> = (0..6).map(|step| ask(&mut advisor, &two_arms(step))).collect();
     assert_eq!(again, first);
     assert_eq!(advisor.balance("run").unwrap(), spent);
 }
 
 #[test]
 fn an_arm_is_advised_from_its_own_numbers_only() {
-    let advisor = advisor(10, "ea");
+    let mut advisor = advisor(10, "ea");
     let mut query = query(1, 0, 0.5, 0.25);
     query.observation[28..31].copy_from_slice(&[0.0625, 0.0, -0.125]);
     query.goal[..3].copy_from_slice(&[0.0, 0.0, 0.75]);
-    assert_eq!(ask(&advisor, &query).action, [0.5, 0.0, 0.75, 0.0625, 0.25, -0.125]);
+    assert_eq!(ask(&mut advisor, &query).action, [0.5, 0.0, 0.75, 0.0625, 0.25, -0.125]);
 }
 
 #[test]
 fn one_request_may_hold_students_of_several_layouts() {
-    let advisor = advisor(10, "ea");
+    let mut advisor = advisor(10, "ea");
     let three_arms = StepQuery {
         episode: 2,
         step: 0,
@@ -121,7 +126,7 @@ fn one_request_may_hold_students_of_several_layouts() {
         goal: vec![0.0; 9],
         proposed_action: vec![0.0; 9],
     };
-    let advice = advisor.advise("run", &[two_arms(0), three_arms, two_arms(1)]).unwrap();
+    let advice = advise(&mut advisor, "run", &[two_arms(0), three_arms, two_arms(1)]).unwrap();
     let actions: Vec<&[f32]> = advice.steps.iter().map(|step| step.action.as_slice()).collect();
     let both = [0.5, 0.0, 0.0, 0.0, 0.25, 0.0];
     assert_eq!(actions, [&both[..], &[0.125; 9], &both]);
@@ -131,68 +136,134 @@ fn one_request_may_hold_students_of_several_layouts() {
 
 #[test]
 fn a_refused_request_charges_nothing() {
-    let advisor = advisor(10, "ea");
+    let mut advisor = advisor(10, "ea");
     advisor.open_leases("run", &[2], 5).unwrap();
     let before = advisor.balance("run").unwrap();
-    let refusal =
-        advisor.advise("run", &[two_arms(0), query(2, 50, 0.5, 0.5)]).unwrap_err().to_string();
+    let beyond = [two_arms(0), query(2, 50, 0.5, 0.5)];
+    let refusal = advise(&mut advisor, "run", &beyond).unwrap_err().to_string();
     assert_eq!(refusal, "steps[1].step: expected 0 to 49 in an episode that has a lease, got 50");
     assert_eq!(advisor.balance("run").unwrap(), before);
-    assert!(ask(&advisor, &two_arms(50)).charged, "an episode without a lease may be longer");
-    assert!(matches!(advisor.advise("walk", &[]), Err(Error::Ledger(LedgerError::Budget(_)))));
+    assert!(ask(&mut advisor, &two_arms(50)).charged, "an episode without a lease may be longer");
+    let unknown = advise(&mut advisor, "walk", &[]);
+    assert!(matches!(unknown, Err(Error::Ledger(LedgerError::Budget(_)))));
 }
 
-/// Values everything at NaN.
+/// Values at NaN whatever lies beyond 0.9 on the first axis.
 struct Broken;
 
 impl TeacherPolicy for Broken {
     fn layout(&self) -> Layout {
-        Layout::new(Task::Push, 1)
+        FakePolicy.layout()
     }
 
     fn digest(&self) -> &str {
         ""
     }
 
-    fn act(&mut self, _: &[f32], _: &[f32], _: &mut [f32]) {}
+    fn act(&mut self, observations: &[f32], goals: &[f32], actions: &mut [f32]) {
+        FakePolicy.act(observations, goals, actions);
+    }
 
-    fn q(&mut self, _: &[f32], _: &[f32], _: &[f32], q: &mut [f32]) {
-        q.fill(f32::NAN);
+    fn q(&mut self, observations: &[f32], goals: &[f32], actions: &[f32], q: &mut [f32]) {
+        FakePolicy.q(observations, goals, actions, q);
+        for (q, observation) in q.iter_mut().zip(observations.chunks_exact(28)) {
+            *q = if observation[0] > 0.9 { f32::NAN } else { *q };
+        }
     }
 }
 
 #[test]
-fn advice_that_is_not_finite_is_not_given() {
-    let advisor = Advisor::new(Box::new(Broken), Box::new(MemoryLedger::default())).unwrap();
-    advisor.open_account("run", Terms { budget: 1, strategy: Strategy::EarlyAdvising }).unwrap();
-    let refused = advisor.advise("run", &[two_arms(3)]);
-    assert!(matches!(refused, Err(Error::NotFinite { episode: 1, step: 3 })));
-    assert_eq!(advisor.balance("run").unwrap().spent, 0);
+fn a_question_that_is_refused_leaves_the_others_of_its_batch_alone() {
+    let mut advisor = Advisor::new(Box::new(Broken), Box::new(MemoryLedger::default())).unwrap();
+    let terms = Terms { budget: 10, strategy: Strategy::EarlyAdvising };
+    advisor.open_account("run", terms).unwrap();
+    advisor.open_leases("run", &[2], 5).unwrap();
+    let answers = advisor.advise(&[
+        question("run", &[two_arms(0), two_arms(1)]),
+        question("walk", &[two_arms(2)]),
+        question("run", &[two_arms(3), query(1, 4, 0.95, 0.0), two_arms(5)]),
+        question("run", &[two_arms(6), query(2, 50, 0.5, 0.5)]),
+        question("run", &[]),
+        question("run", &[two_arms(0), two_arms(7)]),
+    ]);
+    let outcomes: Vec<_> = answers
+        .iter()
+        .map(|answer| match answer {
+            Ok(advice) => Ok((advice.steps.len(), advice.budget_left)),
+            Err(error) => Err(error.to_string()),
+        })
+        .collect();
+    let refused = |message: &str| Err(message.to_owned());
+    let expected = [
+        Ok((2, 3)),
+        refused("unknown account \"walk\": open it first"),
+        refused("the teacher's networks gave a number that is not finite for step 4 of episode 1"),
+        refused("steps[1].step: expected 0 to 49 in an episode that has a lease, got 50"),
+        Ok((0, 2)),
+        Ok((2, 2)),
+    ];
+    assert_eq!(outcomes, expected);
+    assert_eq!(advisor.balance("run").unwrap().spent, 3, "steps 0, 1 and 7");
 }
 
-/// 64 threads, every step asked about by two of them: what the budget pays for is charged once, and no more.
-#[test]
-fn a_budget_is_never_overspent_and_no_step_is_charged_twice() {
-    let advisor = advisor(10_000, "ea");
-    let charged_steps_of = |thread_idx: u64| -> BTreeMap<(u64, u32), bool> {
-        let episode = thread_idx / 2;
-        (0..400)
-            .map(|step| ((episode, step), ask(&advisor, &query(episode, step, 0.5, 0.5)).charged))
-            .collect()
+/// Questions of several accounts and sizes, some of them about the same steps.
+fn many_questions() -> Vec<Question> {
+    let step = |number: u16| {
+        let (x, y) = (f32::from(number % 7) / 10.0, f32::from(number % 5) / 10.0);
+        query(u64::from(number % 3), u32::from(number / 2), x, y)
     };
-    let by_thread: Vec<BTreeMap<(u64, u32), bool>> = thread::scope(|scope| {
-        let threads: Vec<_> =
-            (0..64).map(|thread_idx| scope.spawn(move || charged_steps_of(thread_idx))).collect();
-        threads.into_iter().map(|thread| thread.join().unwrap()).collect()
-    });
-    for pair in by_thread.chunks_exact(2) {
-        assert_eq!(pair[0], pair[1], "the two threads that asked about the same steps");
-    }
-    let n_charged =
-        by_thread.iter().step_by(2).flat_map(BTreeMap::values).filter(|charged| **charged).count();
-    assert_eq!(n_charged, 10_000);
-    assert_eq!(
-        (advisor.balance("run").unwrap().spent, advisor.balance("run").unwrap().left),
-        (10_000, 0)
+    (0..120_u16)
+        .map(|number| {
+            let account = ["run", "walk", "nobody"][usize::from(number % 17 % 3)];
+            let queries: Vec<StepQuery> =
+                (0..number % 4).map(|idx| step(3 * number + 5 * idx)).collect();
+            question(account, &queries)
+        })
+        .filter(|question| !question.queries.is_empty())
+        .collect()
+}
+
+#[test]
+fn questions_answered_together_get_what_they_would_get_one_by_one() {
+    let fresh = || {
+        let mut advisor = advisor(40, "eamc:0.05");
+        let terms = Terms { budget: 30, strategy: Strategy::MistakeAction { alpha: 0.3 } };
+        advisor.open_account("walk", terms).unwrap();
+        advisor.open_leases("run", &[0, 1], 8).unwrap();
+        advisor
+    };
+    let shown = |answers: Vec<Result<Advice, Error>>| -> Vec<Result<Advice, String>> {
+        answers.into_iter().map(|answer| answer.map_err(|error| error.to_string())).collect()
+    };
+    let questions = many_questions();
+    let mut alone = fresh();
+    let one_by_one: Vec<_> = shown(
+        questions.iter().map(|one| alone.advise(std::slice::from_ref(one)).remove(0)).collect(),
     );
+    assert!(one_by_one.iter().flatten().any(|advice| advice.steps.iter().any(|s| s.charged)));
+    assert!(one_by_one.iter().any(Result::is_err));
+    for batch_size in [2, 7, questions.len()] {
+        let mut together = fresh();
+        let answers =
+            questions.chunks(batch_size).flat_map(|batch| together.advise(batch)).collect();
+        assert_eq!(shown(answers), one_by_one, "in batches of {batch_size}");
+        for account in ["run", "walk"] {
+            assert_eq!(together.balance(account).unwrap(), alone.balance(account).unwrap());
+        }
+    }
+}
+
+#[test]
+fn the_ledger_is_asked_for_an_accounts_terms_once() {
+    let mut advisor = advisor(10, "ea");
+    ask(&mut advisor, &two_arms(0));
+    assert_eq!(advisor.strategies.get("run"), Some(&Strategy::EarlyAdvising));
+    for number in 0..MAX_REMEMBERED {
+        advisor.strategies.insert(number.to_string(), Strategy::NoAdvice);
+    }
+    let terms = Terms { budget: 10, strategy: Strategy::NoAdvice };
+    advisor.open_account("walk", terms).unwrap();
+    let advice = advise(&mut advisor, "walk", &[two_arms(0)]).unwrap();
+    assert_eq!((advice.steps[0].charged, advisor.strategies.len()), (false, 1));
+    assert!(ask(&mut advisor, &two_arms(1)).charged, "looked up again");
 }

@@ -1,9 +1,14 @@
 //! One account: what is left of its budget, for whom units are set aside, and which steps were charged.
 
+mod journal;
+
 use std::collections::BTreeMap;
 
-use super::verdicts::Verdicts;
+use super::verdicts::{Verdicts, index};
 use super::{Balance, Half, Lease, Terms, Verdict, Wish};
+use journal::Journal;
+
+pub(crate) use journal::{Changes, LeaseRecord};
 
 /// One budget and everything that was charged to it.
 #[derive(Debug, Clone)]
@@ -14,10 +19,12 @@ pub struct Account {
     leased: u64,
     leases: BTreeMap<u64, LeaseState>,
     verdicts: Verdicts,
+    /// What was changed since somebody began to record it.
+    journal: Option<Box<Journal>>,
 }
 
 /// A lease and what became of it.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
 struct LeaseState {
     units: u32,
     early_units: u32,
@@ -29,7 +36,14 @@ impl Account {
     /// An account of which nothing is spent.
     #[must_use]
     pub fn new(terms: Terms) -> Self {
-        Self { terms, spent: 0, leased: 0, leases: BTreeMap::new(), verdicts: Verdicts::default() }
+        Self {
+            terms,
+            spent: 0,
+            leased: 0,
+            leases: BTreeMap::new(),
+            verdicts: Verdicts::default(),
+            journal: None,
+        }
     }
 
     /// What it was opened for.
@@ -64,6 +78,7 @@ impl Account {
     }
 
     fn open_lease(&mut self, episode: u64, max_units: u32) -> Lease {
+        self.note_lease(episode);
         let (handed_out, left) = (self.handed_out(), self.left());
         let lease = self.leases.entry(episode).or_insert_with(|| {
             let units = at_most(max_units, left);
@@ -78,6 +93,7 @@ impl Account {
     /// Returns the unspent units of `episodes` to the budget. Episodes without an open lease have none.
     pub fn settle(&mut self, episodes: &[u64]) {
         for episode in episodes {
+            self.note_lease(*episode);
             if let Some(lease) = self.leases.get_mut(episode).filter(|lease| !lease.settled) {
                 lease.settled = true;
                 self.leased -= u64::from(lease.units - lease.spent);
@@ -93,6 +109,7 @@ impl Account {
         if let Some(verdict) = self.verdicts.get(episode, step) {
             return verdict;
         }
+        self.note_word(index(episode, step));
         let verdict = match self.next_unit(episode) {
             Some(half) if wish.covers(half) => {
                 self.spend_unit(episode);
@@ -117,6 +134,7 @@ impl Account {
 
     /// `n_b ← n_b − 1`: the one place where a unit is spent. There is one, [`Self::next_unit`] found it.
     fn spend_unit(&mut self, episode: u64) {
+        self.note_lease(episode);
         if let Some(lease) = self.leases.get_mut(&episode) {
             lease.spent += 1;
             self.leased -= 1;

@@ -1,12 +1,11 @@
 //! Accounts that live as long as the process.
 
 use std::collections::BTreeMap;
-use std::collections::btree_map::Entry;
 
-use tandem_core::layout::EPISODE_STEPS;
-
-use super::{Bill, Charge, Ledger, LedgerError, Receipt};
-use crate::budget::{Account, Balance, BudgetError, Lease, MAX_BUDGET, Terms};
+use super::{
+    Bill, Ledger, LedgerError, Receipt, charge_all, check_budget, check_terms, unknown_account,
+};
+use crate::budget::{Account, Balance, Lease, Terms};
 
 /// Accounts in memory: forgotten when the process ends.
 #[derive(Debug, Clone, Default)]
@@ -15,48 +14,17 @@ pub struct MemoryLedger {
 }
 
 impl MemoryLedger {
-    fn account(&self, name: &str) -> Result<&Account, BudgetError> {
-        self.accounts.get(name).ok_or_else(|| BudgetError::UnknownAccount(name.to_owned()))
+    fn account(&mut self, name: &str) -> Result<&mut Account, LedgerError> {
+        self.accounts.get_mut(name).ok_or_else(|| unknown_account(name))
     }
-
-    fn account_mut(&mut self, name: &str) -> Result<&mut Account, BudgetError> {
-        self.accounts.get_mut(name).ok_or_else(|| BudgetError::UnknownAccount(name.to_owned()))
-    }
-
-    fn charge_bill(&mut self, bill: &Bill) -> Result<Receipt, LedgerError> {
-        let account = self.account_mut(&bill.account)?;
-        if let Some(charge_idx) = bill.charges.iter().position(|charge| is_beyond(account, charge))
-        {
-            return Err(LedgerError::BeyondEnd { charge_idx });
-        }
-        let charge = |charge: &Charge| account.charge(charge.episode, charge.step, charge.wish);
-        let verdicts = bill.charges.iter().map(charge).collect();
-        Ok(Receipt { verdicts, left: account.left() })
-    }
-}
-
-/// Episodes of a run, which have leases, have [`EPISODE_STEPS`] steps; how long others are is their owner's matter.
-fn is_beyond(account: &Account, charge: &Charge) -> bool {
-    usize::try_from(charge.step).map_or(true, |step| step >= EPISODE_STEPS)
-        && account.has_lease(charge.episode)
 }
 
 impl Ledger for MemoryLedger {
     fn open(&mut self, name: &str, terms: Terms) -> Result<Balance, LedgerError> {
-        if terms.budget > MAX_BUDGET {
-            return Err(BudgetError::BudgetTooLarge(terms.budget).into());
-        }
-        match self.accounts.entry(name.to_owned()) {
-            Entry::Vacant(vacant) => Ok(vacant.insert(Account::new(terms)).balance()),
-            Entry::Occupied(account) if account.get().terms() == terms => {
-                Ok(account.get().balance())
-            }
-            Entry::Occupied(account) => Err(LedgerError::Budget(BudgetError::OtherTerms {
-                name: name.to_owned(),
-                open: account.get().terms(),
-                asked: terms,
-            })),
-        }
+        check_budget(terms)?;
+        let account = self.accounts.entry(name.to_owned()).or_insert_with(|| Account::new(terms));
+        check_terms(name, account.terms(), terms)?;
+        Ok(account.balance())
     }
 
     fn balance(&mut self, name: &str) -> Result<Balance, LedgerError> {
@@ -69,25 +37,27 @@ impl Ledger for MemoryLedger {
         episodes: &[u64],
         units_per_episode: u32,
     ) -> Result<(Vec<Lease>, Balance), LedgerError> {
-        let account = self.account_mut(name)?;
+        let account = self.account(name)?;
         Ok((account.open_leases(episodes, units_per_episode), account.balance()))
     }
 
     fn settle(&mut self, name: &str, episodes: &[u64]) -> Result<Balance, LedgerError> {
-        let account = self.account_mut(name)?;
+        let account = self.account(name)?;
         account.settle(episodes);
         Ok(account.balance())
     }
 
     fn charge(&mut self, bills: &[Bill]) -> Vec<Result<Receipt, LedgerError>> {
-        bills.iter().map(|bill| self.charge_bill(bill)).collect()
+        let charge = |bill: &Bill| charge_all(self.account(&bill.account)?, &bill.charges);
+        bills.iter().map(charge).collect()
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::budget::Wish;
+    use crate::budget::{MAX_BUDGET, Wish};
+    use crate::ledger::Charge;
     use crate::strategy::Strategy;
 
     const TERMS: Terms = Terms { budget: 10, strategy: Strategy::EarlyAdvising };

@@ -1,10 +1,8 @@
 //! Answers to requests for advice, one by one and as a stream.
 
 use std::pin::Pin;
-use std::sync::Arc;
 use std::task::{Context, Poll};
 
-use tandem_core::StepQuery;
 use tandem_proto::{decode_account_name, encode_advice, pb};
 use tokio_stream::{Stream, StreamExt as _};
 use tokio_util::sync::{CancellationToken, WaitForCancellationFutureOwned};
@@ -12,12 +10,9 @@ use tonic::{Status, Streaming};
 
 use super::messages::decode_queries;
 use super::status;
-use crate::advisor::{Advice, Advisor};
+use super::thread::AdvisorHandle;
+use crate::advisor::{Advice, Question};
 use crate::error::Error;
-
-/// Steps answered on the spot, for two arms within some 250 microseconds; more are computed on a thread for
-/// blocking work.
-const MAX_STEPS_ON_THE_SPOT: usize = 8;
 
 /// Answers in the order of their requests.
 pub(super) type AnswerStream =
@@ -25,44 +20,34 @@ pub(super) type AnswerStream =
 
 /// The answer to one request.
 pub(super) async fn answer(
-    advisor: Arc<Advisor>,
+    advisor: &AdvisorHandle,
     request: pb::AdviseRequest,
 ) -> Result<pb::AdviseResponse, Status> {
-    let (account, queries) = decode(&advisor, request).map_err(|error| status(&error))?;
-    let advice = if queries.len() <= MAX_STEPS_ON_THE_SPOT {
-        advisor.advise(&account, &queries)
-    } else {
-        tokio::task::spawn_blocking(move || advisor.advise(&account, &queries))
-            .await
-            .map_err(|gone| Status::unavailable(gone.to_string()))?
-    };
+    let question = decode(advisor, request).map_err(|error| status(&error))?;
+    let advice = advisor.advise(question).await;
     advice.map(|advice| encode(&advice)).map_err(|error| status(&error))
 }
 
-/// The answers to `requests`, computed one at a time as they are read: flow control bounds what waits on either side.
+/// The answers to `requests`, one at a time as they are read: flow control bounds what waits on either side.
 ///
-/// The stream ends after the first request that cannot be answered, and when `shutdown` is cancelled.
+/// A call ends with its first error: after a request that cannot be answered, and, once `shutdown` is cancelled, after
+/// the answer that is under way.
 pub(super) fn answer_all(
-    advisor: Arc<Advisor>,
+    advisor: AdvisorHandle,
     requests: Streaming<pb::AdviseRequest>,
     shutdown: CancellationToken,
 ) -> AnswerStream {
-    let answers = requests.then(move |request| {
-        let advisor = Arc::clone(&advisor);
-        async move { answer(advisor, request?).await }
-    });
-    Box::pin(UntilCancelled {
-        answers: Some(Box::pin(answers)),
-        cancelled: Box::pin(shutdown.cancelled_owned()),
-    })
+    let requests = UntilCancelled { requests, cancelled: Box::pin(shutdown.cancelled_owned()) };
+    Box::pin(requests.then(move |request| {
+        let advisor = advisor.clone();
+        async move { answer(&advisor, request?).await }
+    }))
 }
 
-fn decode(
-    advisor: &Advisor,
-    request: pb::AdviseRequest,
-) -> Result<(String, Vec<StepQuery>), Error> {
+fn decode(advisor: &AdvisorHandle, request: pb::AdviseRequest) -> Result<Question, Error> {
     let account = decode_account_name("account", request.account)?;
-    Ok((account, decode_queries(request.steps, advisor.layout().task)?))
+    let queries = decode_queries(request.steps, advisor.profile().layout.task)?;
+    Ok(Question { account, queries })
 }
 
 fn encode(advice: &Advice) -> pb::AdviseResponse {
@@ -72,28 +57,19 @@ fn encode(advice: &Advice) -> pb::AdviseResponse {
     }
 }
 
-/// Answers until the service shall end, so that a client that keeps its stream open does not keep the service alive.
+/// Requests until the service shall end, so that a client that keeps its stream open does not keep the service alive.
 struct UntilCancelled {
-    /// `None` once the stream has ended.
-    answers: Option<AnswerStream>,
+    requests: Streaming<pb::AdviseRequest>,
     cancelled: Pin<Box<WaitForCancellationFutureOwned>>,
 }
 
 impl Stream for UntilCancelled {
-    type Item = Result<pb::AdviseResponse, Status>;
+    type Item = Result<pb::AdviseRequest, Status>;
 
     fn poll_next(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<Option<Self::Item>> {
-        if self.answers.is_some() && self.cancelled.as_mut().poll(context).is_ready() {
-            self.answers = None;
+        if self.cancelled.as_mut().poll(context).is_ready() {
             return Poll::Ready(Some(Err(Status::unavailable("the teacher is shutting down"))));
         }
-        let Some(answers) = self.answers.as_mut() else {
-            return Poll::Ready(None);
-        };
-        let next = answers.as_mut().poll_next(context);
-        if matches!(next, Poll::Ready(None | Some(Err(_)))) {
-            self.answers = None;
-        }
-        next
+        Pin::new(&mut self.requests).poll_next(context)
     }
 }

@@ -5,7 +5,7 @@ use std::ops::Range;
 use tandem_core::{StepQuery, Task};
 use tandem_proto::{DecodeError, decode_query, layout_of_query, pb};
 
-use crate::advisor::Advisor;
+use crate::advisor::Profile;
 use crate::budget::{Balance, Lease};
 use crate::maps::ArmMap;
 use crate::strategy::Strategy;
@@ -41,16 +41,16 @@ fn check_count(field: &str, count: usize, max: usize) -> Result<(), DecodeError>
     Err(DecodeError::new(field, format_args!("at most {max}"), count))
 }
 
-pub(super) fn describe(advisor: &Advisor) -> pb::DescribeResponse {
-    let layout = advisor.layout();
+pub(super) fn describe(profile: &Profile) -> pb::DescribeResponse {
+    let layout = profile.layout;
     pb::DescribeResponse {
         task: layout.task.name().to_owned(),
         n_observation_per_arm: index(layout.n_observation()),
         n_goal_per_arm: index(layout.n_goal()),
         n_action_per_arm: index(layout.n_action()),
-        arms: advisor.maps().arms().iter().map(encode_map).collect(),
+        arms: profile.maps.arms().iter().map(encode_map).collect(),
         strategies: Strategy::NAMES.map(str::to_owned).to_vec(),
-        policy_digest: advisor.digest().to_owned(),
+        policy_digest: profile.digest.clone(),
     }
 }
 

@@ -5,6 +5,7 @@ use std::net::SocketAddr;
 use tandem_proto::pb::teacher_client::TeacherClient;
 use tandem_proto::{decode_advice, encode_query};
 use tokio::net::TcpListener;
+use tokio::sync::mpsc;
 use tokio::task::JoinHandle;
 use tokio_stream::wrappers::ReceiverStream;
 use tonic::Code;
@@ -12,6 +13,7 @@ use tonic::transport::Channel;
 use tonic_health::pb::health_check_response::ServingStatus;
 use tonic_health::pb::health_client::HealthClient;
 
+use super::gated::{GatedLedger, Mode, Watch};
 use super::*;
 use crate::fake::{FakePolicy, query};
 
@@ -27,6 +29,7 @@ async fn serve_open(
 struct Fixture {
     client: TeacherClient<Channel>,
     channel: Channel,
+    watch: Watch,
     shutdown: CancellationToken,
     served: JoinHandle<Result<(), Error>>,
 }
@@ -36,12 +39,13 @@ impl Fixture {
         let listener = TcpListener::bind(SocketAddr::from(([127, 0, 0, 1], 0))).await.unwrap();
         let address = listener.local_addr().unwrap();
         let shutdown = CancellationToken::new();
-        let advisor =
-            Advisor::new(Box::new(FakePolicy), Box::new(MemoryLedger::default())).unwrap();
+        let watch = Watch::new();
+        let ledger = Box::new(GatedLedger::new(watch.clone()));
+        let advisor = Advisor::new(Box::new(FakePolicy), ledger).unwrap();
         let served = tokio::spawn(serve_open(advisor, listener, shutdown.clone()));
         let channel =
             Channel::from_shared(format!("http://{address}")).unwrap().connect().await.unwrap();
-        Self { client: TeacherClient::new(channel.clone()), channel, shutdown, served }
+        Self { client: TeacherClient::new(channel.clone()), channel, watch, shutdown, served }
     }
 
     async fn open(&mut self, budget: u64, strategy: &str) -> Result<pb::Account, Status> {
@@ -56,6 +60,13 @@ impl Fixture {
     async fn advise(&mut self, steps: Vec<pb::StepQuery>) -> Result<pb::AdviseResponse, Status> {
         let request = pb::AdviseRequest { account: "run".to_owned(), steps };
         self.client.advise(request).await.map(Response::into_inner)
+    }
+
+    /// A stream on which requests can be sent one after another.
+    async fn stream(&mut self) -> (mpsc::Sender<pb::AdviseRequest>, Streaming<pb::AdviseResponse>) {
+        let (sender, receiver) = mpsc::channel(8);
+        let answers = self.client.advise_stream(ReceiverStream::new(receiver)).await.unwrap();
+        (sender, answers.into_inner())
     }
 
     async fn stop(self) {
@@ -169,9 +180,7 @@ async fn a_request_of_many_steps_is_answered_like_many_requests() {
 async fn a_stream_is_answered_in_order_until_a_request_is_refused() {
     let mut fixture = Fixture::start().await;
     fixture.open(100, "ea").await.unwrap();
-    let (sender, receiver) = tokio::sync::mpsc::channel(8);
-    let mut answers =
-        fixture.client.advise_stream(ReceiverStream::new(receiver)).await.unwrap().into_inner();
+    let (sender, mut answers) = fixture.stream().await;
     let ask = |steps| pb::AdviseRequest { account: "run".to_owned(), steps };
     for first in [0_u32, 1, 2] {
         sender.send(ask((0..=first).map(|i| step(10 * first + i)).collect())).await.unwrap();
@@ -191,9 +200,7 @@ async fn a_stream_is_answered_in_order_until_a_request_is_refused() {
 async fn an_open_stream_does_not_keep_the_service_alive() {
     let mut fixture = Fixture::start().await;
     fixture.open(1, "ea").await.unwrap();
-    let (sender, receiver) = tokio::sync::mpsc::channel::<pb::AdviseRequest>(1);
-    let mut answers =
-        fixture.client.advise_stream(ReceiverStream::new(receiver)).await.unwrap().into_inner();
+    let (sender, mut answers) = fixture.stream().await;
     fixture.shutdown.cancel();
     assert_eq!(refusal(answers.message().await).0, Code::Unavailable);
     fixture.served.await.unwrap().unwrap();
@@ -283,4 +290,95 @@ async fn a_round_leases_spends_and_settles() {
         assert_eq!((settled.spent, settled.leased, settled.left), (2, 0, 58));
     }
     fixture.stop().await;
+}
+
+#[tokio::test]
+async fn a_request_under_way_is_answered_before_the_service_ends() {
+    let ask = || pb::AdviseRequest { account: "run".to_owned(), steps: vec![step(0)] };
+    let held_up = async || {
+        let mut fixture = Fixture::start().await;
+        fixture.open(10, "ea").await.unwrap();
+        // The account's terms are known from here on; to charge is what blocks.
+        assert_eq!(fixture.advise(Vec::new()).await.unwrap().budget_left, 10);
+        fixture.watch.set(Mode::Block);
+        fixture
+    };
+    let let_end = async |fixture: &Fixture| {
+        fixture.watch.visited(1).await;
+        fixture.shutdown.cancel();
+        fixture.watch.set(Mode::Answer);
+    };
+
+    let mut fixture = held_up().await;
+    let (sender, mut answers) = fixture.stream().await;
+    sender.send(ask()).await.unwrap();
+    let_end(&fixture).await;
+    assert_eq!(answers.message().await.unwrap().unwrap().budget_left, 9);
+    assert_eq!(refusal(answers.message().await).0, Code::Unavailable);
+    drop((sender, answers));
+    fixture.stop().await;
+
+    let fixture = held_up().await;
+    let mut client = fixture.client.clone();
+    let asked = tokio::spawn(async move { client.advise(ask()).await });
+    let_end(&fixture).await;
+    assert_eq!(asked.await.unwrap().unwrap().into_inner().budget_left, 9);
+    fixture.stop().await;
+}
+
+/// Code and message of the refusal that each kind of call gets.
+async fn refusals(fixture: &mut Fixture) -> Vec<(Code, String)> {
+    let (sender, mut answers) = fixture.stream().await;
+    let ask = pb::AdviseRequest { account: "run".to_owned(), steps: vec![step(0)] };
+    sender.send(ask.clone()).await.unwrap();
+    let name = || "run".to_owned();
+    let leases = pb::OpenLeasesRequest { account: name(), episodes: vec![1], units_per_episode: 1 };
+    let settle = pb::SettleLeasesRequest { account: name(), episodes: vec![1] };
+    let [mut first, mut second, mut third, mut fourth] = [(); 4].map(|()| fixture.client.clone());
+    let get = pb::GetAccountRequest { name: name() };
+    let (advise, streamed, get, leases, settle) = tokio::join!(
+        first.advise(ask),
+        answers.message(),
+        second.get_account(get),
+        third.open_leases(leases),
+        fourth.settle_leases(settle),
+    );
+    vec![refusal(advise), refusal(streamed), refusal(get), refusal(leases), refusal(settle)]
+}
+
+#[tokio::test]
+async fn a_ledger_that_cannot_be_used_is_unavailable_for_every_call_and_only_so_long() {
+    let mut fixture = Fixture::start().await;
+    fixture.open(10, "ea").await.unwrap();
+    for (mode, message) in [
+        (Mode::Refuse, "the ledger cannot be used now: the disk is full"),
+        (Mode::Block, "no answer within 4s: ask again"),
+    ] {
+        fixture.watch.set(mode);
+        let expected = (Code::Unavailable, message.to_owned());
+        assert_eq!(refusals(&mut fixture).await, vec![expected; 5]);
+        fixture.client.describe(pb::DescribeRequest {}).await.unwrap();
+        fixture.watch.set(Mode::Answer);
+        assert!(fixture.advise(vec![step(0)]).await.unwrap().steps[0].charged);
+    }
+    assert_eq!(fixture.open(10, "ea").await.unwrap().spent, 1);
+    fixture.stop().await;
+}
+
+#[tokio::test]
+async fn a_panic_is_an_internal_error_and_ends_the_service() {
+    let mut fixture = Fixture::start().await;
+    fixture.open(10, "ea").await.unwrap();
+    let (sender, mut answers) = fixture.stream().await;
+    fixture.watch.set(Mode::Panic);
+    let ask = pb::AdviseRequest { account: "run".to_owned(), steps: vec![step(0)] };
+    sender.send(ask).await.unwrap();
+    let (code, message) = refusal(answers.message().await);
+    assert_eq!(
+        (code, message.as_str()),
+        (Code::Internal, "the teacher has a bug and ends: its log says more")
+    );
+    let Fixture { client, channel, served, .. } = fixture;
+    drop((client, channel, sender, answers));
+    assert!(matches!(served.await.unwrap(), Err(Error::Panicked)));
 }

@@ -1,0 +1,85 @@
+//! A teacher that gives everybody the same answer: what the messages themselves cost.
+
+use std::pin::Pin;
+
+use tandem_net::{Gate, Incoming};
+use tandem_proto::pb;
+use tandem_proto::pb::teacher_server::{Teacher, TeacherServer};
+use tokio::net::TcpListener;
+use tokio_stream::{Stream, StreamExt as _};
+use tokio_util::sync::CancellationToken;
+use tonic::{Request, Response, Status, Streaming};
+
+/// Answers every question with `answer`, until `shutdown` is cancelled.
+pub(super) async fn serve(
+    answer: pb::AdviseResponse,
+    listener: TcpListener,
+    shutdown: CancellationToken,
+) -> anyhow::Result<()> {
+    let router = Gate::default().router(TeacherServer::new(Echo { answer })).await?;
+    router
+        .serve_with_incoming_shutdown(Incoming::from(listener), shutdown.cancelled_owned())
+        .await?;
+    Ok(())
+}
+
+struct Echo {
+    answer: pb::AdviseResponse,
+}
+
+#[tonic::async_trait]
+impl Teacher for Echo {
+    type AdviseStreamStream =
+        Pin<Box<dyn Stream<Item = Result<pb::AdviseResponse, Status>> + Send>>;
+
+    async fn advise(
+        &self,
+        _: Request<pb::AdviseRequest>,
+    ) -> Result<Response<pb::AdviseResponse>, Status> {
+        Ok(Response::new(self.answer.clone()))
+    }
+
+    async fn advise_stream(
+        &self,
+        requests: Request<Streaming<pb::AdviseRequest>>,
+    ) -> Result<Response<Self::AdviseStreamStream>, Status> {
+        let answer = self.answer.clone();
+        let answers = requests.into_inner().map(move |request| request.map(|_| answer.clone()));
+        Ok(Response::new(Box::pin(answers)))
+    }
+
+    async fn describe(
+        &self,
+        _: Request<pb::DescribeRequest>,
+    ) -> Result<Response<pb::DescribeResponse>, Status> {
+        Err(Status::unimplemented("an echo only"))
+    }
+
+    async fn open_account(
+        &self,
+        _: Request<pb::OpenAccountRequest>,
+    ) -> Result<Response<pb::Account>, Status> {
+        Err(Status::unimplemented("an echo only"))
+    }
+
+    async fn get_account(
+        &self,
+        _: Request<pb::GetAccountRequest>,
+    ) -> Result<Response<pb::Account>, Status> {
+        Err(Status::unimplemented("an echo only"))
+    }
+
+    async fn open_leases(
+        &self,
+        _: Request<pb::OpenLeasesRequest>,
+    ) -> Result<Response<pb::OpenLeasesResponse>, Status> {
+        Err(Status::unimplemented("an echo only"))
+    }
+
+    async fn settle_leases(
+        &self,
+        _: Request<pb::SettleLeasesRequest>,
+    ) -> Result<Response<pb::Account>, Status> {
+        Err(Status::unimplemented("an echo only"))
+    }
+}

@@ -1,0 +1,3 @@
+-- How an account stands.
+
+return {balance(), {}, {}}

@@ -1,0 +1,66 @@
+-- Makes all charges of a bill, in their order, or refuses it. ARGV holds five texts a charge: the episode, the
+-- verdicts' field, the step's place in it from 1 on, its wish, and 1 when an episode with a lease has no such step.
+--
+-- A wish has two characters, for a unit of the first and of the second half: 1 when the step is worth it. A field holds
+-- a character a step: - not asked about, 0 not charged, 1 and 2 charged a unit of that half.
+--
+-- Numbers: the verdicts. Refused: the place, from 0 on, of a charge beyond its episode's end.
+
+local leases = {}
+for i = 1, #ARGV, 5 do
+  local episode = ARGV[i]
+  if leases[episode] == nil then
+    leases[episode] = load_lease(episode)
+  end
+  if ARGV[i + 4] == '1' and leases[episode] then
+    return {balance(), {}, {(i - 1) / 5}}
+  end
+end
+
+-- The half of the next unit that an episode with this lease, or without one, may spend, when there is one.
+local function next_unit(lease)
+  local handed_out = spent + leased
+  local available, early = handed_out < budget, handed_out < first_half
+  if lease then
+    available = not lease.settled and lease.spent < lease.units
+    early = lease.spent < lease.early_units
+  end
+  return available and (early and 1 or 2) or nil
+end
+
+local words, changed_words, changed_leases, verdicts = {}, {}, {}, {}
+for i = 1, #ARGV, 5 do
+  local episode, field, place, wish = ARGV[i], ARGV[i + 1], tonumber(ARGV[i + 2]), ARGV[i + 3]
+  local word = words[field] or redis.call('HGET', KEYS[3], field) or ''
+  local verdict = string.sub(word, place, place)
+  if verdict == '' or verdict == '-' then
+    local lease = leases[episode]
+    local half = next_unit(lease)
+    verdict = '0'
+    if half and string.sub(wish, half, half) == '1' then
+      verdict = tostring(half)
+      spent = spent + 1
+      if lease then
+        lease.spent = lease.spent + 1
+        leased = leased - 1
+        changed_leases[episode] = lease
+      end
+    end
+    word = word .. string.rep('-', place - 1 - #word)
+    word = string.sub(word, 1, place - 1) .. verdict .. string.sub(word, place + 1)
+    changed_words[field] = word
+  end
+  words[field] = word
+  verdicts[#verdicts + 1] = tonumber(verdict)
+end
+
+for field, word in pairs(changed_words) do
+  redis.call('HSET', KEYS[3], field, word)
+end
+for episode, lease in pairs(changed_leases) do
+  save_lease(episode, lease)
+end
+if next(changed_words) then
+  save_account()
+end
+return {balance(), verdicts, {}}

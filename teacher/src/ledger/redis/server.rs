@@ -1,0 +1,203 @@
+//! The connection to a Redis server: made when it is needed, and again when it broke.
+
+use std::fmt;
+use std::time::Duration;
+
+use redis::{
+    Client, Cmd, Connection, ConnectionAddr, IntoConnectionInfo as _, Pipeline, RedisError,
+    RedisResult,
+};
+
+use crate::ledger::OpenError;
+
+const CONNECT_TIMEOUT: Duration = Duration::from_secs(2);
+const ANSWER_TIMEOUT: Duration = Duration::from_secs(2);
+
+/// The names of all accounts; for people, no operation reads it.
+const ACCOUNTS: &str = "tandem:accounts";
+
+macro_rules! on_account {
+    ($file:literal) => {
+        concat!(include_str!("account.lua"), include_str!($file))
+    };
+}
+
+/// What the server can do with an account.
+#[derive(Debug, Clone, Copy)]
+pub(super) enum Script {
+    Open,
+    Balance,
+    OpenLeases,
+    Settle,
+    Charge,
+}
+
+impl Script {
+    /// In the order of the enum.
+    const CODE: [&str; 5] = [
+        include_str!("open.lua"),
+        on_account!("balance.lua"),
+        on_account!("open_leases.lua"),
+        on_account!("settle.lua"),
+        on_account!("charge.lua"),
+    ];
+}
+
+/// A script with the account that it works on and its arguments.
+pub(super) struct Call {
+    script: Script,
+    account: String,
+    args: Vec<String>,
+}
+
+/// What a script answers.
+pub(super) struct Reply {
+    /// Budget, strategy, spent, leased; empty when there is no such account.
+    pub(super) fields: Vec<Option<String>>,
+    pub(super) numbers: Vec<u64>,
+    /// Places of what is refused.
+    pub(super) refused: Vec<u64>,
+}
+
+/// The same as it is sent.
+type Raw = (Vec<Option<String>>, Vec<u64>, Vec<u64>);
+
+/// What a server is like.
+pub(super) struct Survey {
+    pub(super) n_accounts: u64,
+    /// Whether it writes an append-only file.
+    pub(super) appends: bool,
+    /// Whether it drops keys when it runs out of memory.
+    pub(super) evicts: bool,
+}
+
+/// A server and the connection to it, if there is one.
+pub(super) struct Server {
+    client: Client,
+    name: String,
+    scripts: [redis::Script; Script::CODE.len()],
+    connection: Option<Connection>,
+}
+
+impl Call {
+    pub(super) fn new(script: Script, account: &str) -> Self {
+        Self { script, account: account.to_owned(), args: Vec::new() }
+    }
+
+    pub(super) fn arg(mut self, arg: impl fmt::Display) -> Self {
+        self.args.push(arg.to_string());
+        self
+    }
+
+    pub(super) fn args(mut self, args: &[u64]) -> Self {
+        self.args.extend(args.iter().map(ToString::to_string));
+        self
+    }
+
+    fn command(&self, hash: &str) -> Cmd {
+        let key = |kind| format!("{{tandem:{}}}:{kind}", self.account);
+        let mut command = redis::cmd("EVALSHA");
+        command.arg(hash).arg(3).arg(key("account")).arg(key("leases")).arg(key("verdicts"));
+        command.arg(&self.args);
+        command
+    }
+}
+
+impl Server {
+    /// The server at `url`; nothing is sent to it yet.
+    pub(super) fn at(url: &str) -> Result<Self, OpenError> {
+        // The URL may hold a password: what is wrong is said without it.
+        let refused = |what: &str| OpenError::NotAPlace(format!("the redis:// URL {what}"));
+        let parsed = redis::parse_redis_url(url).ok_or_else(|| refused("cannot be read"))?;
+        if parsed.query().is_some() || parsed.fragment().is_some() {
+            return Err(refused("has a ? or #, which a password must have as %3F or %23"));
+        }
+        let info = parsed.into_connection_info();
+        let info = info.map_err(|error| refused(&format!("cannot be used: {error}")))?;
+        let ConnectionAddr::Tcp(host, port) = info.addr() else {
+            return Err(refused("names no host"));
+        };
+        let host = if host.contains(':') { format!("[{host}]") } else { host.clone() };
+        let name = format!("redis://{host}:{port}/{}", info.redis_settings().db());
+        let settings = info.tcp_settings().clone().set_nodelay(true);
+        let client = Client::open(info.set_tcp_settings(settings));
+        let client = client.map_err(|error| refused(&format!("cannot be used: {error}")))?;
+        let scripts = Script::CODE.map(redis::Script::new);
+        Ok(Self { client, name, scripts, connection: None })
+    }
+
+    /// Its address without the password.
+    pub(super) fn name(&self) -> &str {
+        &self.name
+    }
+
+    /// Looks what the server is like.
+    pub(super) fn survey(&mut self) -> RedisResult<Survey> {
+        let mut ask = redis::pipe();
+        ask.cmd("SCARD").arg(ACCOUNTS);
+        ask.cmd("INFO").arg("persistence").cmd("INFO").arg("memory");
+        let (n_accounts, persistence, memory): (u64, String, String) = self.query(&ask)?;
+        let appends = persistence.lines().any(|line| line == "aof_enabled:1");
+        let policy = memory.lines().find_map(|line| line.strip_prefix("maxmemory_policy:"));
+        let is_bounded = !memory.lines().any(|line| line == "maxmemory:0");
+        let evicts = is_bounded && policy.is_some_and(|policy| policy != "noeviction");
+        Ok(Survey { n_accounts, appends, evicts })
+    }
+
+    /// Sends all calls, then reads all replies. An error is one for all of them; some may have been done.
+    pub(super) fn run(&mut self, calls: &[Call]) -> RedisResult<Vec<Reply>> {
+        let mut pipeline = redis::pipe();
+        for call in calls {
+            let script = &self.scripts[call.script as usize];
+            pipeline.add_command(call.command(script.get_hash()));
+            if matches!(call.script, Script::Open) {
+                pipeline.cmd("SADD").arg(ACCOUNTS).arg(&call.account).ignore();
+            }
+        }
+        let replies: Vec<Raw> = self.query(&pipeline)?;
+        let reply = |(fields, numbers, refused)| Reply { fields, numbers, refused };
+        Ok(replies.into_iter().map(reply).collect())
+    }
+
+    /// Asks on the connection that there is or a new one, and once more when the former one turns out to be broken or
+    /// the server has forgotten the scripts. What took too long is not asked again here.
+    fn query<T: redis::FromRedisValue>(&mut self, pipeline: &Pipeline) -> RedisResult<T> {
+        if let Some(connection) = self.connection.as_mut() {
+            match pipeline.query(connection) {
+                Err(error) if !error.is_timeout() => self.connection = None,
+                outcome => {
+                    self.keep_if_sound(&outcome);
+                    return outcome;
+                }
+            }
+        }
+        let connection = self.connect()?;
+        let connection = self.connection.insert(connection);
+        let outcome = pipeline.query(connection);
+        self.keep_if_sound(&outcome);
+        outcome
+    }
+
+    /// A connection on which something failed is not used again: the next reply might belong to the former question.
+    fn keep_if_sound<T>(&mut self, outcome: &Result<T, RedisError>) {
+        if outcome.is_err() {
+            self.connection = None;
+        }
+    }
+
+    fn connect(&self) -> RedisResult<Connection> {
+        let mut connection = self.client.get_connection_with_timeout(CONNECT_TIMEOUT)?;
+        connection.set_read_timeout(Some(ANSWER_TIMEOUT))?;
+        connection.set_write_timeout(Some(ANSWER_TIMEOUT))?;
+        for script in &self.scripts {
+            script.load(&mut connection)?;
+        }
+        Ok(connection)
+    }
+}
+
+impl fmt::Debug for Server {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Server").field("name", &self.name).finish_non_exhaustive()
+    }
+}

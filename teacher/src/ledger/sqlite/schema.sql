@@ -1,0 +1,46 @@
+-- Budgets of advice, in units; spent says how many were charged.
+CREATE TABLE accounts (
+    id INTEGER PRIMARY KEY,
+    name TEXT NOT NULL UNIQUE,
+    budget INTEGER NOT NULL,
+    strategy TEXT NOT NULL,
+    spent INTEGER NOT NULL
+) STRICT;
+
+-- Units set aside for an episode; charged_before says how many the episode was charged before it had the lease.
+-- An episode's number from 2^63 on stands here less 2^64.
+CREATE TABLE leases (
+    account INTEGER NOT NULL REFERENCES accounts (id),
+    episode INTEGER NOT NULL,
+    units INTEGER NOT NULL,
+    early_units INTEGER NOT NULL,
+    charged_before INTEGER NOT NULL,
+    settled INTEGER NOT NULL,
+    PRIMARY KEY (account, episode)
+) STRICT, WITHOUT ROWID;
+
+-- Which steps were asked about, which of them were charged, and which of those with a unit of the budget's first
+-- half: one bit a step. Bit b of word w is step 64 * w + b.
+CREATE TABLE verdicts (
+    account INTEGER NOT NULL REFERENCES accounts (id),
+    episode INTEGER NOT NULL,
+    word INTEGER NOT NULL,
+    asked INTEGER NOT NULL,
+    charged INTEGER NOT NULL,
+    first_half INTEGER NOT NULL,
+    PRIMARY KEY (account, episode, word)
+) STRICT, WITHOUT ROWID;
+
+-- One row for every unit that was charged.
+CREATE VIEW charges (account, episode, step, half) AS
+WITH RECURSIVE bits (bit) AS (
+    SELECT 0 UNION ALL SELECT bit + 1 FROM bits WHERE bit < 63
+)
+SELECT
+    accounts.name,
+    CASE WHEN episode < 0 THEN printf('%u', episode) ELSE episode END,
+    64 * word + bit,
+    CASE WHEN (first_half >> bit) & 1 THEN 'first' ELSE 'second' END
+FROM verdicts
+JOIN accounts ON accounts.id = verdicts.account
+JOIN bits ON (charged >> bit) & 1;

@@ -1,0 +1,222 @@
+//! The file of a ledger: who may open it, what is refused, what a person sees in it.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use rusqlite::Connection;
+use tandem_teacher::ledger::{self, Ledger as _, OpenError, SqliteLedger};
+use tempfile::TempDir;
+
+use crate::place::{BOTH, bill, charge, terms};
+
+fn directory() -> (TempDir, PathBuf) {
+    let directory = tempfile::tempdir().expect("a directory");
+    let path = directory.path().join("ledger.sqlite");
+    (directory, path)
+}
+
+/// A closed ledger with some hundred episodes.
+fn filled(path: &Path) {
+    let mut ledger = SqliteLedger::open(path).expect("a ledger");
+    ledger.open("run", terms(10_000)).expect("an account");
+    let episodes: Vec<u64> = (0..600).collect();
+    ledger.open_leases("run", &episodes, 10).expect("leases");
+    let charges: Vec<_> = episodes.iter().map(|episode| charge(*episode, 7, BOTH)).collect();
+    ledger.charge(&[bill("run", &charges)]).remove(0).expect("paid");
+}
+
+/// Opening must fail and leave the file as it is. Gives what is said, the path shortened.
+fn refusal(path: &Path) -> String {
+    let before = fs::read(path).ok();
+    let error = SqliteLedger::open(path).expect_err("refused");
+    assert_eq!(fs::read(path).ok(), before, "{error}");
+    let told = error.to_string();
+    assert!(!told.contains('\n'), "{told}");
+    told.replace(&format!("{:?}", path.display().to_string()), "FILE")
+}
+
+#[test]
+fn a_file_has_one_owner_at_a_time() {
+    let (directory, path) = directory();
+    let first = SqliteLedger::open(&path).expect("a ledger");
+    let in_use =
+        "another teacher uses the ledger FILE: end that one, or give this one a ledger of its own";
+    assert_eq!(refusal(&path), in_use);
+    let link = directory.path().join("link.sqlite");
+    std::os::unix::fs::symlink(&path, &link).expect("a link");
+    assert_eq!(refusal(&link), in_use, "by another name");
+    drop(first);
+    SqliteLedger::open(&link).expect("free again");
+}
+
+#[test]
+fn a_file_that_is_no_ledger_is_refused_and_left_alone() {
+    let check = |bytes: &[u8]| {
+        let (_directory, path) = directory();
+        fs::write(&path, bytes).expect("written");
+        assert_eq!(
+            refusal(&path),
+            "FILE is no ledger but something that is not an SQLite database: move it away or name another file"
+        );
+    };
+    check(b"a shopping list\n");
+    check(&[0x53; 10_000]);
+    check(b"SQLite format 3");
+
+    let (_directory, path) = directory();
+    let other = Connection::open(&path).expect("a database");
+    other.execute_batch("CREATE TABLE accounts (id, name)").expect("a table");
+    drop(other);
+    assert_eq!(
+        refusal(&path),
+        "FILE is no ledger but an SQLite database of another program: move it away or name another file"
+    );
+}
+
+#[test]
+fn another_version_is_refused_by_its_number() {
+    let (_directory, path) = directory();
+    filled(&path);
+    let other = Connection::open(&path).expect("a database");
+    other.pragma_update(None, "user_version", 2).expect("another version");
+    drop(other);
+    let told = refusal(&path);
+    assert!(
+        told.starts_with("the ledger FILE has version 2, this program reads version 1: "),
+        "{told}"
+    );
+}
+
+#[test]
+fn a_damaged_file_is_refused() {
+    let damage = |change: &dyn Fn(&mut Vec<u8>)| {
+        let (_directory, path) = directory();
+        filled(&path);
+        let mut bytes = fs::read(&path).expect("bytes");
+        change(&mut bytes);
+        fs::write(&path, bytes).expect("written");
+        let told = refusal(&path);
+        assert!(told.starts_with("the ledger FILE is damaged ("), "{told}");
+        assert!(
+            told.ends_with("): put a copy in its place, or move it away to begin with no accounts"),
+            "{told}"
+        );
+    };
+    damage(&|bytes| bytes.truncate(bytes.len() / 2));
+    damage(&|bytes| bytes.truncate(5_000));
+    damage(&|bytes| {
+        let from = bytes.len() / 2;
+        bytes[from..from + 4096].fill(0xA5);
+    });
+    damage(&|bytes| {
+        let from = bytes.len() - 4096;
+        bytes[from..].fill(0);
+    });
+}
+
+#[test]
+fn tables_that_contradict_one_another_are_damage() {
+    let check = |sql: &str, expected: &str| {
+        let (_directory, path) = directory();
+        filled(&path);
+        let other = Connection::open(&path).expect("a database");
+        other.execute_batch(sql).expect(sql);
+        drop(other);
+        let told = refusal(&path);
+        assert!(told.contains(expected), "{sql}: {told}");
+    };
+    check("UPDATE accounts SET spent = 599", "account \"run\" has spent 599, its verdicts say 600");
+    check("UPDATE accounts SET budget = 599", "more than the budget is handed out");
+    check("UPDATE accounts SET budget = -1", "is damaged");
+    check("UPDATE accounts SET strategy = 'often'", "often");
+    check(
+        "UPDATE verdicts SET asked = 0 WHERE episode = 5",
+        "the verdicts on episode 5 contradict one another",
+    );
+    check("DELETE FROM verdicts WHERE episode = 5", "its verdicts say 599");
+    check(
+        "UPDATE leases SET units = 0, early_units = 0 WHERE episode = 5",
+        "the lease of episode 5 does not fit",
+    );
+    check("UPDATE leases SET units = 1 << 40 WHERE episode = 5", "is damaged");
+    check("PRAGMA foreign_keys = OFF; DELETE FROM accounts", "there is no account 1");
+    check("DROP TABLE leases", "no such table: leases");
+}
+
+#[test]
+fn a_place_where_no_file_can_be_is_refused() {
+    let (directory, path) = directory();
+    let told = refusal(&path.join("below"));
+    assert_eq!(
+        told,
+        "cannot open the ledger FILE.lock"
+            .replace("FILE", &format!("{:?}", path.join("below")))
+            .replace("\".lock", ".lock\"")
+    );
+    let told = refusal(directory.path());
+    assert!(told.starts_with("cannot open the ledger"), "{told}");
+}
+
+#[test]
+fn an_empty_file_becomes_a_ledger() {
+    let (_directory, path) = directory();
+    fs::write(&path, b"").expect("written");
+    SqliteLedger::open(&path).expect("a ledger").open("run", terms(3)).expect("an account");
+    assert_eq!(SqliteLedger::open(&path).expect("a ledger").balance("run").expect("kept").left, 3);
+}
+
+#[test]
+fn a_name_that_is_no_place_is_refused() {
+    let check = |place: &str, expected: &str| {
+        let error = ledger::open(place).err().expect(place);
+        assert!(matches!(error, OpenError::NotAPlace(_)), "{place}: {error}");
+        let told = error.to_string();
+        assert!(told.contains(expected) && !told.contains("hunter2"), "{place}: {told}");
+        assert!(told.starts_with("expected memory, redis://"), "{place}: {told}");
+    };
+    check("", "the name is empty");
+    check("postgres://user:hunter2@host/db", "there is no ledger of the kind \"postgres\"");
+    check("rediss://user:hunter2@host/0", "through a tunnel");
+    check("redis://", "the redis:// URL");
+    check("redis://user:hunter2@host:port/0", "the redis:// URL cannot be read");
+    check("redis://user:hunter2@host/zero", "Invalid database number");
+    check("redis://user:hunter2#@host/0", "the redis:// URL");
+    check("redis://user:hunter2@host/0?protocol=resp3", "which a password must have as %3F or %23");
+}
+
+/// A person with the tool `sqlite3` reads the same.
+#[test]
+fn the_tables_say_what_was_charged() {
+    let (_directory, path) = directory();
+    let mut ledger = SqliteLedger::open(&path).expect("a ledger");
+    ledger.open("run", terms(5)).expect("an account");
+    ledger.open_leases("run", &[3], 2).expect("leases");
+    let charges = [
+        charge(3, 0, BOTH),
+        charge(3, 49, BOTH),
+        charge(3, 20, BOTH),
+        charge(u64::MAX, 63, BOTH),
+        charge(u64::MAX, 129, BOTH),
+    ];
+    ledger.charge(&[bill("run", &charges)]).remove(0).expect("paid");
+    ledger.settle("run", &[3]).expect("settled");
+    // While the ledger is open, too.
+    let reader = Connection::open(&path).expect("a database");
+    let text = |sql: &str| -> Vec<String> {
+        let mut statement = reader.prepare(sql).expect(sql);
+        statement.query_map((), |row| row.get(0)).expect(sql).collect::<Result<_, _>>().expect(sql)
+    };
+    let sql =
+        "SELECT account || ' ' || episode || ' ' || step || ' ' || half FROM charges ORDER BY 1";
+    let expected = [
+        "run 18446744073709551615 129 second",
+        "run 18446744073709551615 63 first",
+        "run 3 0 first",
+        "run 3 49 first",
+    ];
+    assert_eq!(text(sql), expected);
+    let sql = "SELECT name || ' ' || budget || ' ' || strategy || ' ' || spent FROM accounts";
+    assert_eq!(text(sql), ["run 5 eamc:0.1 4"]);
+    let sql = "SELECT episode || ' ' || units || ' ' || early_units || ' ' || settled FROM leases";
+    assert_eq!(text(sql), ["3 2 2 1"]);
+}

@@ -1,0 +1,96 @@
+//! A full disk: what cannot be written is not done, and works again once there is room.
+
+use std::fs;
+use std::path::PathBuf;
+use std::process::{Command, Stdio};
+
+use tandem_teacher::ledger::{Ledger as _, LedgerError, MemoryLedger, SqliteLedger};
+use tempfile::TempDir;
+
+use crate::place::{BOTH, NEITHER, bill, charge, terms};
+
+/// A disk of 1 MiB.
+struct SmallDisk {
+    directory: TempDir,
+}
+
+impl SmallDisk {
+    /// None where this process may not mount one.
+    fn mount() -> Option<Self> {
+        let directory = tempfile::tempdir().expect("a directory");
+        let mounted = Command::new("mount")
+            .args(["-t", "tmpfs", "-o", "size=1m", "none"])
+            .arg(directory.path())
+            .stderr(Stdio::null())
+            .status();
+        mounted.is_ok_and(|status| status.success()).then_some(Self { directory })
+    }
+
+    fn path(&self, name: &str) -> PathBuf {
+        self.directory.path().join(name)
+    }
+}
+
+impl Drop for SmallDisk {
+    fn drop(&mut self) {
+        let unmounted = Command::new("umount").arg("-l").arg(self.directory.path()).status();
+        assert!(unmounted.is_ok_and(|status| status.success()), "unmounted");
+    }
+}
+
+#[test]
+fn a_full_disk_makes_the_ledger_unavailable_until_there_is_room() {
+    let Some(disk) = SmallDisk::mount() else {
+        println!("SKIPPED: this process may not mount a disk");
+        return;
+    };
+    fs::write(disk.path("filler"), vec![0x5A; 600 << 10]).expect("written");
+    let mut ledger = SqliteLedger::open(&disk.path("ledger.sqlite")).expect("a ledger");
+    let mut model = MemoryLedger::default();
+    for ledger in [&mut ledger as &mut dyn tandem_teacher::ledger::Ledger, &mut model] {
+        ledger.open("run", terms(1_000_000)).expect("an account");
+        ledger.open_leases("run", &[0, 1], 20).expect("leases");
+    }
+    let bill_of = |episode: u64| bill("run", &[charge(episode, 1, BOTH), charge(episode, 2, BOTH)]);
+    let mut episode = 0;
+    let refused = loop {
+        match ledger.charge(&[bill_of(episode)]).remove(0) {
+            Ok(receipt) => {
+                let expected = model.charge(&[bill_of(episode)]).remove(0).expect("paid");
+                assert_eq!(receipt, expected);
+            }
+            Err(error) => break error,
+        }
+        episode += 1;
+        assert!(episode < 10_000, "the disk is never full");
+    };
+    assert!(matches!(refused, LedgerError::Unavailable { .. }), "{refused}");
+    assert!(refused.to_string().contains("full"), "{refused}");
+    for attempt in 0..3 {
+        let unpaid = ledger.charge(&[bill_of(episode), bill_of(episode + attempt)]);
+        assert!(unpaid.iter().all(Result::is_err), "{unpaid:?}");
+        assert_eq!(ledger.balance("run").expect("known"), model.balance("run").expect("known"));
+    }
+    // What stands already is still told.
+    let known = ledger.charge(&[bill("run", &[charge(0, 1, NEITHER)])]).remove(0).expect("known");
+    assert_eq!(known.verdicts, [crate::place::FIRST]);
+
+    fs::remove_file(disk.path("filler")).expect("room");
+    for ledger in [&mut ledger as &mut dyn tandem_teacher::ledger::Ledger, &mut model] {
+        ledger.settle("run", &[0]).expect("settled");
+        ledger.open_leases("run", &[2_000_000], 20).expect("leases");
+        // Had the bill that was refused left anything behind, these would not be charged.
+        let receipt = ledger.charge(&[bill_of(episode)]).remove(0).expect("paid");
+        assert_eq!(receipt.verdicts, [crate::place::FIRST; 2]);
+    }
+    let expected = model.balance("run").expect("known");
+    assert_eq!(ledger.balance("run").expect("known"), expected);
+    drop(ledger);
+    let mut again = SqliteLedger::open(&disk.path("ledger.sqlite")).expect("a sound ledger");
+    assert_eq!(again.balance("run").expect("known"), expected);
+    for episode in 0..=episode {
+        let receipt = again.charge(&[bill_of(episode)]).remove(0).expect("known");
+        assert_eq!(receipt, model.charge(&[bill_of(episode)]).remove(0).expect("known"));
+    }
+    assert_eq!(again.balance("run").expect("known"), expected);
+}

@@ -1,0 +1,114 @@
+//! A Redis server of a test's own.
+
+use std::net::TcpListener;
+use std::path::Path;
+use std::process::{Child, Command, Stdio};
+use std::time::Duration;
+
+use tempfile::TempDir;
+
+/// A running server with an append-only file; it ends with the test.
+pub(crate) struct RedisServer {
+    process: Child,
+    port: u16,
+    directory: TempDir,
+    settings: Vec<String>,
+}
+
+impl RedisServer {
+    /// None, with a line that says so, where Redis is not installed; there the test fails if
+    /// `TANDEM_REQUIRE_REDIS` is 1.
+    pub(crate) fn start() -> Option<Self> {
+        Self::start_with(&["--appendonly", "yes"])
+    }
+
+    /// A server with settings of its own.
+    pub(crate) fn start_with(settings: &[&str]) -> Option<Self> {
+        if Command::new("redis-server").arg("--version").stdout(Stdio::null()).status().is_err() {
+            #[expect(clippy::disallowed_methods, reason = "the one switch of the tests")]
+            let required = std::env::var("TANDEM_REQUIRE_REDIS").is_ok_and(|value| value == "1");
+            assert!(!required, "redis-server is not installed, but TANDEM_REQUIRE_REDIS=1");
+            println!("SKIPPED: redis-server is not installed");
+            return None;
+        }
+        let directory = tempfile::tempdir().expect("a directory");
+        let settings = settings.iter().map(|setting| (*setting).to_owned()).collect::<Vec<_>>();
+        // Between looking for a free port and taking it, somebody else may take it.
+        let started = (0..10).find_map(|_| {
+            let port = TcpListener::bind("127.0.0.1:0").and_then(|listener| listener.local_addr());
+            let port = port.expect("a port").port();
+            run(port, directory.path(), &settings).map(|process| (port, process))
+        });
+        let (port, process) = started.expect("redis-server starts");
+        Some(Self { process, port, directory, settings })
+    }
+
+    pub(crate) fn url(&self) -> String {
+        format!("redis://127.0.0.1:{}/0", self.port)
+    }
+
+    pub(crate) const fn port(&self) -> u16 {
+        self.port
+    }
+
+    /// Ends the server at once.
+    pub(crate) fn kill(&mut self) {
+        self.process.kill().expect("killed");
+        self.process.wait().expect("gone");
+    }
+
+    /// Starts it again where it was, with what it wrote.
+    pub(crate) fn restart(&mut self) {
+        let again = || run(self.port, self.directory.path(), &self.settings);
+        self.process = (0..10).find_map(|_| again()).expect("redis-server starts again");
+    }
+
+    /// Stops or continues the server's process.
+    pub(crate) fn signal(&self, signal: &str) {
+        let pid = self.process.id().to_string();
+        assert!(Command::new("kill").args([signal, &pid]).status().expect("kill runs").success());
+    }
+
+    /// A connection of the test's own.
+    pub(crate) fn connection(&self) -> redis::Connection {
+        let client = redis::Client::open(self.url()).expect("a URL");
+        client.get_connection().expect("a connection")
+    }
+}
+
+impl Drop for RedisServer {
+    fn drop(&mut self) {
+        drop(self.process.kill());
+        drop(self.process.wait());
+    }
+}
+
+/// Starts a server and waits until it answers; none when it ends first.
+fn run(port: u16, directory: &Path, settings: &[String]) -> Option<Child> {
+    let mut process = Command::new("redis-server")
+        .args(["--port", &port.to_string(), "--bind", "127.0.0.1", "--save", "", "--dir"])
+        .arg(directory)
+        .args(settings)
+        .stdin(Stdio::null())
+        .stdout(Stdio::null())
+        .stderr(Stdio::null())
+        .spawn()
+        .expect("starts");
+    let client = redis::Client::open(("127.0.0.1", port)).expect("an address");
+    for _ in 0..6000 {
+        let answer = client
+            .get_connection_with_timeout(Duration::from_secs(1))
+            .and_then(|mut connection| redis::cmd("PING").query::<String>(&mut connection));
+        match answer {
+            Ok(_) => return Some(process),
+            // It is there and wants a password.
+            Err(error) if error.code() == Some("NOAUTH") => return Some(process),
+            Err(_) => std::thread::sleep(Duration::from_millis(10)),
+        }
+        if process.try_wait().expect("a child").is_some() {
+            return None;
+        }
+    }
+    drop(process.kill());
+    None
+}

@@ -1,0 +1,231 @@
+//! A Redis server that is shared, dies, hangs, forgets and wants a password.
+
+use std::io::Write;
+use std::sync::{Arc, Mutex};
+use std::thread;
+use std::time::Duration;
+
+use tandem_teacher::ledger::{Ledger as _, LedgerError, RedisLedger};
+
+use crate::place::{BOTH, FIRST, NEITHER, NOTHING, bill, charge, terms};
+use crate::redis_server::RedisServer;
+
+fn is_unavailable<T: std::fmt::Debug>(outcome: Result<T, LedgerError>) -> String {
+    match outcome {
+        Err(error @ LedgerError::Unavailable { .. }) => error.to_string(),
+        other => panic!("expected unavailable, got {other:?}"),
+    }
+}
+
+#[test]
+fn teachers_share_an_account_and_never_overspend_it() {
+    let Some(server) = RedisServer::start() else { return };
+    let budget = 2_000;
+    let play = |number: u64| {
+        let url = server.url();
+        move || {
+            let mut ledger = RedisLedger::open(&url).expect("a ledger");
+            ledger.open("run", terms(budget)).expect("an account");
+            let mut charged = Vec::new();
+            for step in 0..400 {
+                // Episodes of its own, one that all ask about, and a round of leases now and then.
+                let asked = [
+                    charge(number, step, BOTH),
+                    charge(100, step, BOTH),
+                    charge(200 + number, step % 50, BOTH),
+                ];
+                if step == 100 {
+                    ledger.open_leases("run", &[200 + number], 30).expect("leases");
+                }
+                if step == 300 {
+                    ledger.settle("run", &[200 + number]).expect("settled");
+                }
+                let receipt = ledger.charge(&[bill("run", &asked)]).remove(0).expect("paid");
+                let steps = asked.map(|asked| (asked.episode, asked.step));
+                charged.extend(steps.into_iter().zip(receipt.verdicts));
+            }
+            charged
+        }
+    };
+    let threads: Vec<_> = (0..4).map(|number| thread::spawn(play(number))).collect();
+    let mut verdicts = std::collections::BTreeMap::new();
+    for thread in threads {
+        for (step, verdict) in thread.join().expect("played") {
+            assert_eq!(*verdicts.entry(step).or_insert(verdict), verdict, "{step:?}");
+        }
+    }
+    let n_charged = verdicts.values().filter(|verdict| **verdict != NOTHING).count();
+    let mut ledger = RedisLedger::open(&server.url()).expect("a ledger");
+    let balance = ledger.balance("run").expect("an account");
+    assert_eq!((balance.spent, balance.leased, balance.left), (budget, 0, 0));
+    assert_eq!(u64::try_from(n_charged).expect("few"), budget);
+}
+
+#[test]
+fn a_killed_server_is_unavailable_and_comes_back_with_everything() {
+    let Some(mut server) =
+        RedisServer::start_with(&["--appendonly", "yes", "--appendfsync", "always"])
+    else {
+        return;
+    };
+    let mut ledger = RedisLedger::open(&server.url()).expect("a ledger");
+    ledger.open("run", terms(10)).expect("an account");
+    ledger.open_leases("run", &[1], 3).expect("leases");
+    let asked = bill("run", &[charge(1, 0, BOTH), charge(2, 0, NEITHER), charge(2, 1, BOTH)]);
+    let receipt = ledger.charge(std::slice::from_ref(&asked)).remove(0).expect("paid");
+    server.kill();
+    let told = is_unavailable(ledger.balance("run"));
+    assert!(
+        told.starts_with(&format!("the ledger cannot be used now: cannot use {}: ", server.url())),
+        "{told}"
+    );
+    is_unavailable(ledger.open("run", terms(10)));
+    is_unavailable(ledger.open_leases("run", &[1], 3));
+    is_unavailable(ledger.settle("run", &[1]));
+    let outcomes = ledger.charge(&[asked.clone(), asked.clone()]);
+    outcomes.into_iter().for_each(|outcome| drop(is_unavailable(outcome)));
+    server.restart();
+    // The same ledger finds it again.
+    assert_eq!(ledger.charge(std::slice::from_ref(&asked)).remove(0).expect("paid"), receipt);
+    let balance = ledger.settle("run", &[1]).expect("settled");
+    assert_eq!((balance.spent, balance.leased, balance.left), (2, 0, 8));
+}
+
+/// Between two calls nobody notices that the server was started again or forgot the scripts.
+#[test]
+fn a_broken_connection_and_forgotten_scripts_are_mended_unseen() {
+    let Some(mut server) = RedisServer::start() else { return };
+    let mut ledger = RedisLedger::open(&server.url()).expect("a ledger");
+    ledger.open("run", terms(10)).expect("an account");
+    let flush =
+        || redis::cmd("SCRIPT").arg("FLUSH").exec(&mut server.connection()).expect("flushed");
+    flush();
+    let asked = [bill("run", &[charge(1, 0, BOTH)]), bill("run", &[charge(1, 1, BOTH)])];
+    let outcomes = ledger.charge(&asked);
+    assert!(outcomes.iter().all(|outcome| outcome.as_ref().is_ok_and(|r| r.verdicts == [FIRST])));
+    assert_eq!(ledger.balance("run").expect("known").spent, 2);
+    server.kill();
+    server.restart();
+    assert!(ledger.balance("run").is_ok());
+}
+
+#[test]
+fn a_server_that_hangs_is_unavailable_within_seconds() {
+    let Some(server) = RedisServer::start() else { return };
+    let mut ledger = RedisLedger::open(&server.url()).expect("a ledger");
+    ledger.open("run", terms(10)).expect("an account");
+    server.signal("-STOP");
+    is_unavailable(ledger.charge(&[bill("run", &[charge(1, 0, BOTH)])]).remove(0));
+    is_unavailable(ledger.balance("run"));
+    server.signal("-CONT");
+    // Whether the charge was made before the answer was lost is all the same.
+    let again = ledger.charge(&[bill("run", &[charge(1, 0, BOTH)])]).remove(0).expect("paid");
+    assert_eq!((again.verdicts.as_slice(), again.left), ([FIRST].as_slice(), 9));
+}
+
+#[test]
+fn a_password_is_used_and_never_told() {
+    let Some(server) =
+        RedisServer::start_with(&["--appendonly", "yes", "--requirepass", "hunter2"])
+    else {
+        return;
+    };
+    let at = |userinfo: &str| format!("redis://{userinfo}127.0.0.1:{}/3", server.port());
+    let log = Log::default();
+    let refused = log.of(|| RedisLedger::open(&at(":hunter3@")).expect_err("wrong password"));
+    let told = format!("{refused}: {}", std::error::Error::source(&refused).expect("why"));
+    assert!(told.starts_with(&format!("cannot use the ledger {}: ", at(""))), "{told}");
+    assert!(!told.contains("hunter") && !format!("{refused:?}").contains("hunter"), "{refused:?}");
+    assert!(RedisLedger::open(&at("")).is_err(), "no password");
+    let mut ledger = log.of(|| RedisLedger::open(&at(":hunter2@")).expect("let in"));
+    ledger.open("run", terms(10)).expect("an account");
+    assert!(!format!("{ledger:?}").contains("hunter"), "{ledger:?}");
+    let logged = log.text();
+    assert!(logged.contains("ledger opened") && !logged.contains("hunter"), "{logged}");
+}
+
+#[test]
+fn a_server_that_may_forget_is_warned_about() {
+    let careless =
+        ["--appendonly", "no", "--maxmemory", "50mb", "--maxmemory-policy", "allkeys-lru"];
+    let Some(server) = RedisServer::start_with(&careless) else { return };
+    let log = Log::default();
+    let mut ledger = log.of(|| RedisLedger::open(&server.url()).expect("a ledger"));
+    let logged = log.text();
+    assert!(logged.contains("append-only file") && logged.contains("noeviction"), "{logged}");
+    ledger.open("run", terms(10)).expect("an account");
+    ledger.open("walk", terms(10)).expect("an account");
+
+    let Some(careful) = RedisServer::start() else { return };
+    let log = Log::default();
+    drop(log.of(|| RedisLedger::open(&careful.url())));
+    assert!(!log.text().contains("WARN"), "{}", log.text());
+    let log = Log::default();
+    drop(log.of(|| RedisLedger::open(&server.url())));
+    assert!(log.text().contains("accounts=2"), "{}", log.text());
+}
+
+#[test]
+fn the_keys_of_an_account_have_one_hash_tag_and_can_be_read() {
+    let Some(server) = RedisServer::start() else { return };
+    let mut ledger = RedisLedger::open(&server.url()).expect("a ledger");
+    for name in ["run", "}"] {
+        ledger.open(name, terms(10)).expect("an account");
+        ledger.open_leases(name, &[u64::MAX], 3).expect("leases");
+        let charges =
+            [charge(u64::MAX, 2, BOTH), charge(u64::MAX, 4, NEITHER), charge(9, 64, BOTH)];
+        ledger.charge(&[bill(name, &charges)]).remove(0).expect("paid");
+    }
+    let mut connection = server.connection();
+    let mut text = |command: &str, key: &str, field: &str| -> String {
+        redis::cmd(command).arg(key).arg(field).query(&mut connection).expect(key)
+    };
+    for name in ["run", "}"] {
+        let key = |kind: &str| format!("{{tandem:{name}}}:{kind}");
+        assert_eq!(text("HGET", &key("account"), "spent"), "2");
+        assert_eq!(text("HGET", &key("account"), "leased"), "2");
+        assert_eq!(text("HGET", &key("leases"), "18446744073709551615"), "3 3 1 0");
+        assert_eq!(text("HGET", &key("verdicts"), "18446744073709551615:0"), "--1-0");
+        assert_eq!(text("HGET", &key("verdicts"), "9:1"), "1");
+    }
+}
+
+/// Log lines of one thread.
+#[derive(Clone, Default)]
+struct Log(Arc<Mutex<Vec<u8>>>);
+
+impl Log {
+    fn of<T>(&self, call: impl FnOnce() -> T) -> T {
+        let writer = self.clone();
+        let subscriber =
+            tracing_subscriber::fmt().with_ansi(false).with_writer(move || writer.clone()).finish();
+        tracing::subscriber::with_default(subscriber, call)
+    }
+
+    fn text(&self) -> String {
+        String::from_utf8(self.0.lock().expect("whole").clone()).expect("UTF-8")
+    }
+}
+
+impl Write for Log {
+    fn write(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
+        self.0.lock().expect("whole").write(bytes)
+    }
+
+    fn flush(&mut self) -> std::io::Result<()> {
+        Ok(())
+    }
+}
+
+/// A server that accepts and never answers is given up when the connection is made, too.
+#[test]
+fn a_port_where_nobody_answers_is_given_up() {
+    let silent = std::net::TcpListener::bind("127.0.0.1:0").expect("a port");
+    let url = format!("redis://{}", silent.local_addr().expect("an address"));
+    let (send, receive) = std::sync::mpsc::sync_channel(1);
+    let open = move || send.send(RedisLedger::open(&url).map(drop)).expect("heard");
+    let opening = thread::spawn(open);
+    let outcome = receive.recv_timeout(Duration::from_secs(60)).expect("it does not wait for ever");
+    assert!(outcome.is_err());
+    opening.join().expect("ended");
+}
