@@ -6,13 +6,18 @@
 use std::collections::{BTreeMap, VecDeque};
 use std::time::Duration;
 
-use tandem_core::work::SlotOrder;
+use tandem_core::work::{EpisodeOrder, SlotOrder};
 use tandem_core::{Episode, EpisodeKind};
 
-/// A worker that has not been heard of for so long counts as dead.
+/// A worker that has not been heard of for so long counts as dead: its slots go back to the queue.
 pub const SILENT_AFTER: Duration = Duration::from_secs(15);
 /// A slot that is out for so long is given to a second worker that has nothing else to do.
 pub const COVER_AFTER: Duration = Duration::from_secs(3);
+/// A worker that has not been heard of for so long is no longer known. Until then what it delivers counts: it may have
+/// been slow and not dead.
+pub const FORGET_AFTER: Duration = Duration::from_secs(600);
+/// Workers that may be known at a time.
+pub const MAX_WORKERS: usize = 10_000;
 
 /// The slots of the open rounds and the workers that play them.
 #[derive(Debug, Default)]
@@ -41,8 +46,10 @@ pub struct Worker {
     pub heard_at: Duration,
     /// Training and evaluation episodes it has delivered.
     pub n_episodes: u64,
-    /// The slot it plays.
+    /// The slot it was given last, until it delivers it.
     pub slot: Option<u64>,
+    /// Whether it counts as dead.
+    pub silent: bool,
 }
 
 /// A worker that counts as dead.
@@ -56,33 +63,71 @@ pub struct Silent {
     pub n_slots: usize,
 }
 
-/// Why a worker's episodes are not taken.
+/// Why a worker is not taken in.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("{MAX_WORKERS} workers are in the run, as many as there may be")]
+pub struct TooManyWorkers;
+
+/// Why a worker's episodes are not taken. Nothing of them is used.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum SubmitError {
     /// The worker must join first.
     #[error("worker {0} is unknown here: join first")]
     UnknownWorker(u64),
-    /// Not the episodes that the slot consists of.
-    #[error("slot {slot} consists of episodes {expected:?} of version {version}, {got:?} came")]
-    WrongEpisodes {
+    /// Nobody was given such a slot.
+    #[error("slot: expected one of the {n_slots} that were ordered, got {slot}")]
+    UnknownSlot {
+        /// What came.
+        slot: u64,
+        /// Slots ordered so far.
+        n_slots: u64,
+    },
+    /// More or fewer episodes than the slot has.
+    #[error("episodes: expected the {expected} of slot {slot}, got {got}")]
+    WrongCount {
         /// The slot.
         slot: u64,
-        /// The version that should have acted.
-        version: u64,
-        /// The numbers ordered.
-        expected: Vec<u64>,
-        /// The numbers that came.
-        got: Vec<u64>,
+        /// Episodes ordered.
+        expected: usize,
+        /// Episodes that came.
+        got: usize,
+    },
+    /// An episode that was not ordered so.
+    #[error("episode {number}: {field}: expected {expected}, got {got}")]
+    WrongEpisode {
+        /// The episode's number as it came.
+        number: u64,
+        /// What of it was not ordered.
+        field: &'static str,
+        /// What was ordered.
+        expected: String,
+        /// What came.
+        got: String,
     },
 }
 
 impl Board {
     /// Takes in a worker and gives it a number.
-    pub fn join(&mut self, name: String, now: Duration) -> u64 {
+    ///
+    /// # Errors
+    /// When there are [`MAX_WORKERS`], none of them silent.
+    pub fn join(&mut self, name: String, now: Duration) -> Result<u64, TooManyWorkers> {
+        if self.workers.len() >= MAX_WORKERS {
+            self.forget_the_longest_silent(now)?;
+        }
         self.next_worker += 1;
-        self.workers
-            .insert(self.next_worker, Worker { name, heard_at: now, n_episodes: 0, slot: None });
-        self.next_worker
+        let worker = Worker { name, heard_at: now, n_episodes: 0, slot: None, silent: false };
+        self.workers.insert(self.next_worker, worker);
+        Ok(self.next_worker)
+    }
+
+    fn forget_the_longest_silent(&mut self, now: Duration) -> Result<(), TooManyWorkers> {
+        let longest = self.workers.iter().min_by_key(|(_, worker)| worker.heard_at);
+        let (id, _) = longest.filter(|(_, worker)| is_silent(worker, now)).ok_or(TooManyWorkers)?;
+        let id = *id;
+        self.put_back_slots_of(id);
+        self.workers.remove(&id);
+        Ok(())
     }
 
     /// Numbers workers from `first` on.
@@ -99,6 +144,9 @@ impl Board {
 
     /// The next slot for a worker, if there is one; `None` for a worker means it must wait.
     ///
+    /// A worker that asks plays nothing. What it was given before and did not deliver is given to it again, so that
+    /// one that never delivers holds a single slot, and counts as out since it was first given.
+    ///
     /// # Errors
     /// When the worker has not joined.
     pub fn next(
@@ -106,19 +154,28 @@ impl Board {
         worker_id: u64,
         now: Duration,
     ) -> Result<Option<SlotOrder>, SubmitError> {
-        let worker =
-            self.workers.get_mut(&worker_id).ok_or(SubmitError::UnknownWorker(worker_id))?;
-        worker.heard_at = now;
-        worker.slot = None;
-        let order = self.pop().or_else(|| self.to_cover(worker_id, now));
+        let own = self.heard(worker_id, now)?.slot.and_then(|slot| self.out.get(&slot));
+        if let Some(own) = own.filter(|out| out.worker == worker_id) {
+            return Ok(Some(own.order.clone()));
+        }
+        let order = self.pop().or_else(|| self.to_cover(now));
         if let Some(order) = &order {
             self.out
                 .insert(order.slot, Out { order: order.clone(), worker: worker_id, since: now });
-            if let Some(worker) = self.workers.get_mut(&worker_id) {
-                worker.slot = Some(order.slot);
-            }
+        }
+        if let Some(worker) = self.workers.get_mut(&worker_id) {
+            worker.slot = order.as_ref().map(|order| order.slot);
         }
         Ok(order)
+    }
+
+    /// Notes that a worker lives.
+    fn heard(&mut self, worker_id: u64, now: Duration) -> Result<&Worker, SubmitError> {
+        let worker =
+            self.workers.get_mut(&worker_id).ok_or(SubmitError::UnknownWorker(worker_id))?;
+        worker.heard_at = now;
+        worker.silent = false;
+        Ok(worker)
     }
 
     /// The next slot in the queue; training comes before evaluation, so that the learner never waits for its own test.
@@ -127,17 +184,45 @@ impl Board {
         self.waiting.remove(training.unwrap_or(0))
     }
 
-    /// The slot that has been out longest, when that is too long or its worker is gone or asks for more itself.
-    fn to_cover(&self, worker_id: u64, now: Duration) -> Option<SlotOrder> {
-        let oldest = self.out.values().min_by_key(|out| (out.since, out.order.slot))?;
-        let overdue = now.saturating_sub(oldest.since) >= COVER_AFTER || oldest.worker == worker_id;
-        overdue.then(|| oldest.order.clone())
+    fn longest_out(&self) -> Option<&Out> {
+        self.out.values().min_by_key(|out| (out.since, out.order.slot))
+    }
+
+    /// The slot that has been out longest, when that is too long.
+    fn to_cover(&self, now: Duration) -> Option<SlotOrder> {
+        let longest = self.longest_out()?;
+        let overdue = now.saturating_sub(longest.since) >= COVER_AFTER;
+        overdue.then(|| longest.order.clone())
+    }
+
+    /// In what time there is a slot to cover for, unless it is delivered before; `None` when no slot is out.
+    #[must_use]
+    pub fn cover_in(&self, now: Duration) -> Option<Duration> {
+        self.longest_out().map(|out| (out.since + COVER_AFTER).saturating_sub(now))
+    }
+
+    /// What `slot` consists of, for a worker that delivers it; `None` when it is in already.
+    ///
+    /// # Errors
+    /// When the worker is unknown or there never was such a slot.
+    pub fn ordered(
+        &mut self,
+        worker_id: u64,
+        slot: u64,
+        now: Duration,
+    ) -> Result<Option<&SlotOrder>, SubmitError> {
+        self.heard(worker_id, now)?;
+        if slot >= self.next_slot {
+            return Err(SubmitError::UnknownSlot { slot, n_slots: self.next_slot });
+        }
+        let waiting = || self.waiting.iter().find(|order| order.slot == slot);
+        Ok(self.out.get(&slot).map(|out| &out.order).or_else(waiting))
     }
 
     /// Takes a slot's episodes; a slot that is in already changes nothing. Gives whether they are new.
     ///
     /// # Errors
-    /// When the worker is unknown or the episodes are not the slot's.
+    /// When the worker or the slot is unknown or the episodes are not the slot's.
     pub fn submit(
         &mut self,
         worker_id: u64,
@@ -145,58 +230,49 @@ impl Board {
         episodes: Vec<Episode>,
         now: Duration,
     ) -> Result<bool, SubmitError> {
-        let worker =
-            self.workers.get_mut(&worker_id).ok_or(SubmitError::UnknownWorker(worker_id))?;
-        worker.heard_at = now;
-        let Some(out) = self.out.get(&slot) else { return Ok(false) };
-        let order = &out.order;
-        let fits = episodes.len() == order.episodes.len()
-            && episodes.iter().zip(&order.episodes).all(|(episode, ordered)| {
-                episode.number == ordered.number
-                    && episode.kind == order.kind
-                    && episode.parameter_version == order.parameter_version
-            });
-        if !fits {
-            return Err(SubmitError::WrongEpisodes {
-                slot,
-                version: order.parameter_version,
-                expected: order.episodes.iter().map(|ordered| ordered.number).collect(),
-                got: episodes.iter().map(|episode| episode.number).collect(),
-            });
+        let ordered = self.ordered(worker_id, slot, now)?;
+        let is_new = ordered.is_some();
+        if let Some(order) = ordered {
+            check(order, &episodes)?;
         }
-        worker.n_episodes += episodes.len() as u64;
-        worker.slot = None;
-        if let Some(out) = self.out.remove(&slot) {
-            self.finished.push((out.order, episodes));
+        if let Some(worker) = self.workers.get_mut(&worker_id) {
+            worker.slot = worker.slot.filter(|given| *given != slot);
+            worker.n_episodes += if is_new { episodes.len() as u64 } else { 0 };
         }
-        Ok(true)
+        let out = self.out.remove(&slot).map(|out| out.order);
+        let waiting = self.waiting.iter().position(|order| order.slot == slot);
+        let order = out.or_else(|| self.waiting.remove(waiting?));
+        self.finished.extend(order.map(|order| (order, episodes)));
+        Ok(is_new)
     }
 
-    /// Puts the slots of silent workers back at the head of the queue; gives the workers that fell silent.
+    /// Puts the slots of silent workers back into the queue, in their order; gives the workers that fell silent.
     pub fn reclaim(&mut self, now: Duration) -> Vec<Silent> {
-        let is_silent = |worker: &Worker| now.saturating_sub(worker.heard_at) >= SILENT_AFTER;
-        let silent: Vec<u64> = self
-            .workers
-            .iter()
-            .filter(|(_, worker)| is_silent(worker))
-            .map(|(id, _)| *id)
-            .collect();
+        let newly = |worker: &Worker| !worker.silent && is_silent(worker, now);
+        let silent: Vec<u64> =
+            self.workers.iter().filter(|(_, worker)| newly(worker)).map(|(id, _)| *id).collect();
         let mut fell_silent = Vec::new();
-        for id in &silent {
-            let name = self.workers.remove(id).map(|worker| worker.name).unwrap_or_default();
-            let theirs: Vec<u64> = self
-                .out
-                .iter()
-                .filter(|(_, out)| out.worker == *id)
-                .map(|(slot, _)| *slot)
-                .collect();
-            fell_silent.push(Silent { worker_id: *id, name, n_slots: theirs.len() });
-            for slot in theirs {
-                self.waiting.extend(self.out.remove(&slot).map(|out| out.order));
+        for worker_id in silent {
+            let n_slots = self.put_back_slots_of(worker_id);
+            if let Some(worker) = self.workers.get_mut(&worker_id) {
+                worker.silent = true;
+                worker.slot = None;
+                fell_silent.push(Silent { worker_id, name: worker.name.clone(), n_slots });
             }
         }
-        self.waiting.make_contiguous().sort_by_key(|order| order.slot);
+        self.workers.retain(|_, worker| now.saturating_sub(worker.heard_at) < FORGET_AFTER);
         fell_silent
+    }
+
+    fn put_back_slots_of(&mut self, worker_id: u64) -> usize {
+        let theirs = self.out.extract_if(.., |_, out| out.worker == worker_id);
+        let orders: Vec<SlotOrder> = theirs.map(|(_, out)| out.order).collect();
+        let n_slots = orders.len();
+        if n_slots > 0 {
+            self.waiting.extend(orders);
+            self.waiting.make_contiguous().sort_by_key(|order| order.slot);
+        }
+        n_slots
     }
 
     /// Whether every slot of `kind` played with `version` is in.
@@ -216,101 +292,67 @@ impl Board {
         episodes
     }
 
-    /// The workers that are not silent, by number.
+    /// What is known of a worker.
+    #[must_use]
+    pub fn worker(&self, worker_id: u64) -> Option<&Worker> {
+        self.workers.get(&worker_id)
+    }
+
+    /// The workers that are known, by number.
     pub fn workers(&self) -> impl Iterator<Item = (u64, &Worker)> {
         self.workers.iter().map(|(id, worker)| (*id, worker))
     }
 }
 
-#[cfg(test)]
-mod tests {
-    use tandem_core::work::EpisodeOrder;
-    use tandem_core::{Layout, Task};
-
-    use super::*;
-    use crate::replay::drifting_episode;
-
-    const fn at(seconds: u64) -> Duration {
-        Duration::from_secs(seconds)
-    }
-
-    fn order(number: u64) -> SlotOrder {
-        let episode =
-            EpisodeOrder { number, seed: 1, advised: false, uniform: false, record: false };
-        SlotOrder {
-            slot: 0,
-            parameter_version: 0,
-            kind: EpisodeKind::Training,
-            episodes: vec![episode],
-        }
-    }
-
-    fn played(number: u64) -> Vec<Episode> {
-        vec![drifting_episode(Layout::new(Task::Push, 1), number, 0.0)]
-    }
-
-    fn board_of(n_slots: u64) -> (Board, u64, u64) {
-        let mut board = Board::default();
-        (0..n_slots).for_each(|number| board.add(order(number)));
-        let (a, b) = (board.join("a".into(), at(0)), board.join("b".into(), at(0)));
-        (board, a, b)
-    }
-
-    #[test]
-    fn episodes_come_back_in_order_whoever_was_first() {
-        let (mut board, a, b) = board_of(2);
-        let first = board.next(a, at(0)).expect("joined").expect("a slot").slot;
-        let second = board.next(b, at(0)).expect("joined").expect("a slot").slot;
-        assert_eq!(board.submit(b, second, played(1), at(1)), Ok(true));
-        assert!(!board.is_complete(EpisodeKind::Training, 0));
-        assert_eq!(board.submit(a, first, played(0), at(1)), Ok(true));
-        assert!(board.is_complete(EpisodeKind::Training, 0));
-        let numbers: Vec<u64> =
-            board.take(EpisodeKind::Training, 0).iter().map(|e| e.number).collect();
-        assert_eq!(numbers, [0, 1]);
-    }
-
-    #[test]
-    fn a_slot_that_comes_twice_counts_once() {
-        let (mut board, a, b) = board_of(1);
-        let slot = board.next(a, at(0)).expect("joined").expect("a slot").slot;
-        assert_eq!(board.next(b, at(1)), Ok(None), "too early to cover");
-        assert_eq!(board.next(b, at(4)).expect("joined").expect("covers").slot, slot);
-        assert_eq!(board.submit(b, slot, played(0), at(5)), Ok(true));
-        assert_eq!(board.submit(a, slot, played(0), at(6)), Ok(false));
-        assert_eq!(board.take(EpisodeKind::Training, 0).len(), 1);
-    }
-
-    #[test]
-    fn a_silent_workers_slots_go_back_to_the_queue() {
-        let (mut board, a, b) = board_of(1);
-        let slot = board.next(a, at(0)).expect("joined").expect("a slot").slot;
-        assert_eq!(board.next(b, at(14)).map(|order| order.is_some()), Ok(true), "covered before");
-        let (mut board, a2, b2) = board_of(1);
-        assert_eq!(board.next(a2, at(0)).expect("joined").expect("a slot").slot, slot);
-        board.next(b2, at(2)).expect("joined");
-        let silent = Silent { worker_id: a2, name: "a".into(), n_slots: 1 };
-        assert_eq!(board.reclaim(at(16)), [silent]);
-        assert_eq!(board.next(a2, at(16)), Err(SubmitError::UnknownWorker(a2)));
-        assert_eq!(board.next(b2, at(16)).expect("joined").expect("the slot").slot, slot);
-        assert_eq!(a, a2);
-    }
-
-    #[test]
-    fn a_worker_that_asks_again_gets_its_own_lost_slot() {
-        let (mut board, a, _) = board_of(1);
-        let slot = board.next(a, at(0)).expect("joined").expect("a slot").slot;
-        assert_eq!(board.next(a, at(0)).expect("joined").expect("the same").slot, slot);
-    }
-
-    #[test]
-    fn other_episodes_than_ordered_are_refused() {
-        let (mut board, a, _) = board_of(1);
-        let slot = board.next(a, at(0)).expect("joined").expect("a slot").slot;
-        assert!(matches!(
-            board.submit(a, slot, played(5), at(0)),
-            Err(SubmitError::WrongEpisodes { .. })
-        ));
-        assert!(!board.is_complete(EpisodeKind::Training, 0));
-    }
+fn is_silent(worker: &Worker, now: Duration) -> bool {
+    now.saturating_sub(worker.heard_at) >= SILENT_AFTER
 }
+
+/// Refuses a number of episodes that is not the slot's.
+///
+/// # Errors
+/// When it is another.
+pub fn check_count(order: &SlotOrder, got: usize) -> Result<(), SubmitError> {
+    let expected = order.episodes.len();
+    if got == expected {
+        return Ok(());
+    }
+    Err(SubmitError::WrongCount { slot: order.slot, expected, got })
+}
+
+fn check(order: &SlotOrder, episodes: &[Episode]) -> Result<(), SubmitError> {
+    check_count(order, episodes.len())?;
+    episodes
+        .iter()
+        .zip(&order.episodes)
+        .try_for_each(|(episode, ordered)| check_episode(order, ordered, episode))
+}
+
+fn check_episode(
+    order: &SlotOrder,
+    ordered: &EpisodeOrder,
+    episode: &Episode,
+) -> Result<(), SubmitError> {
+    let refuse = |field, expected: String, got: String| {
+        Err(SubmitError::WrongEpisode { number: episode.number, field, expected, got })
+    };
+    let (number, version) = (episode.number, episode.parameter_version);
+    if number != ordered.number {
+        return refuse("number", ordered.number.to_string(), number.to_string());
+    }
+    if episode.kind != order.kind {
+        return refuse("kind", format!("{:?}", order.kind), format!("{:?}", episode.kind));
+    }
+    if version != order.parameter_version {
+        let expected = order.parameter_version.to_string();
+        return refuse("parameter_version", expected, version.to_string());
+    }
+    if !ordered.advised && episode.advice_charged > 0 {
+        let expected = "0, as nobody was to be asked".to_owned();
+        return refuse("advice_charged", expected, episode.advice_charged.to_string());
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests;

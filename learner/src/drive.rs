@@ -1,35 +1,32 @@
-//! The thread that learns: opens rounds, waits for their episodes, updates, publishes, judges, saves, stops.
+//! The thread that learns: opens rounds, waits for their episodes, learns, publishes, judges, saves, stops.
 
 mod judge;
+mod keep;
 mod progress;
+mod start;
 
 use std::collections::VecDeque;
-use std::path::PathBuf;
 use std::time::Duration;
 
 use tandem_core::layout::EPISODE_STEPS;
-use tandem_core::work::{PublishedActor, RunTerms, SlotOrder};
+use tandem_core::work::{PublishedActor, SlotOrder};
 use tandem_core::{Episode, EpisodeKind};
-use tandem_policy::Policy;
-use tandem_proto::pb;
-use tandem_telemetry::events::{
-    CheckpointSaved, ParametersPublished, RoundFinished, RunFinished, WorkerSilent,
-};
-use tandem_telemetry::{MetricsLog, MetricsRow};
+use tandem_telemetry::events::{ParametersPublished, RoundFinished, RunFinished, WorkerSilent};
 use tokio::runtime::Handle;
 use tokio_util::sync::CancellationToken;
-use tracing::warn;
 
 use crate::board::Silent;
-use crate::checkpoint::{self, Resumption};
 use crate::error::Error;
+use crate::records::{Pending, Records};
 use crate::shared::{LearnerConfig, Shared};
 use crate::teacher::{Ledger, TeacherError};
 use crate::trainer::{RoundFigures, Trainer};
+use keep::Keeping;
+use start::{Beginning, RunLock};
 
 /// Rounds after which an evaluation must be in; until then it fills the workers' gaps.
 const EVALUATION_PATIENCE_ROUNDS: u64 = 4;
-/// Pause between two looks at the stop conditions while episodes are awaited.
+/// Pause between two looks at what else may have happened while episodes are awaited.
 const WAIT_TICK: Duration = Duration::from_millis(200);
 /// Span over which the rates in the progress are taken.
 const RATE_SPAN_S: f64 = 15.0;
@@ -57,17 +54,26 @@ pub(crate) fn run(
     runtime: &Handle,
     shutdown: &CancellationToken,
 ) -> Result<Ended, Error> {
-    match Drive::start(config, shared, runtime, shutdown) {
-        Ok(mut drive) => {
-            let reason = drive.rounds()?;
-            drive.finish(reason)
+    let beginning = Beginning::of(config)?;
+    let ledger = match beginning.open_ledger(config, runtime, shutdown) {
+        Err(Error::Teacher(TeacherError::Stopped)) => {
+            let (round, digest) = (beginning.trainer.counters().round, beginning.trainer.digest());
+            let reason = "interrupted".to_owned();
+            RunFinished { reason: &reason, round, digest: &digest }.emit();
+            return Ok(Ended { reason, interrupted: true, digest });
         }
-        Err(Error::Teacher(TeacherError::Stopped)) => Ok(Ended {
-            reason: "stopped before the first round".to_owned(),
-            interrupted: true,
-            digest: String::new(),
-        }),
-        Err(error) => Err(error),
+        ledger => ledger?,
+    };
+    let mut drive = Drive::new(config, shared, shutdown, beginning, ledger);
+    match drive.rounds() {
+        Ok(stop) => drive.finish(stop),
+        Err(error) => {
+            // A state whose numbers are no longer finite is of no use; any other is what a run goes on from.
+            if !matches!(error, Error::Diverged(_)) {
+                drive.save();
+            }
+            Err(error)
+        }
     }
 }
 
@@ -78,13 +84,6 @@ enum Stop {
     Interrupted,
 }
 
-/// An evaluation whose episodes are being played.
-struct Pending {
-    version: u64,
-    policy: Policy,
-    row: MetricsRow,
-}
-
 struct Drive<'a> {
     config: &'a LearnerConfig,
     shared: &'a Shared,
@@ -93,98 +92,64 @@ struct Drive<'a> {
     /// Plays the round that is being awaited.
     acting: PublishedActor,
     ledger: Option<Ledger>,
-    metrics: MetricsLog,
+    records: Records,
     pending: VecDeque<Pending>,
-    best: Option<MetricsRow>,
+    keeping: Keeping,
     wall_before_s: f64,
     rates: VecDeque<(f64, u64, u64)>,
-    success_reached: Option<f64>,
-    /// The round of the latest row of metrics.
-    judged_round: Option<u64>,
+    _lock: RunLock,
 }
 
-impl<'a> Drive<'a> {
-    fn start(
-        config: &'a LearnerConfig,
-        shared: &'a Shared,
-        runtime: &Handle,
-        shutdown: &'a CancellationToken,
-    ) -> Result<Self, Error> {
-        let checkpoints = config.out.join("checkpoint");
-        let (mut trainer, acting, wall_before_s) = if config.resume {
-            let (trainer, Resumption { acting, wall_s }) =
-                checkpoint::load_newest(&checkpoints, &config.run)?;
-            (trainer, acting, wall_s)
-        } else {
-            let trainer = Trainer::new(config.run.clone())?;
-            let acting = trainer.publish();
-            (trainer, acting, 0.0)
-        };
-        trainer.set_threads(config.n_threads);
-        let ledger = open_ledger(config, &trainer, runtime, shutdown)?;
-        let (metrics, rows) = open_metrics(config, trainer.counters().round)?;
-        let judged_round = rows.last().map(|row| row.round);
-        let best = rows.into_iter().rfind(|row| row.best);
-        let terms = RunTerms {
-            layout: trainer.layout,
-            account: ledger.as_ref().map(|ledger| ledger.account().to_owned()),
-            exploration: config.run.exploration(),
-            world: config.run.world_terms(),
-        };
-        shared.publish(acting.clone());
-        shared.publish(trainer.publish());
-        let drive = Self {
-            config,
-            shared,
-            shutdown,
-            trainer,
-            acting,
-            ledger,
-            metrics,
-            pending: VecDeque::new(),
-            best,
-            wall_before_s,
-            rates: VecDeque::new(),
-            success_reached: None,
-            judged_round,
-        };
-        drive.tell("starting", &RoundFigures::default());
-        shared.lock().terms = Some(terms);
-        Ok(drive)
-    }
-
+impl Drive<'_> {
     /// Learns round after round until something stops it.
     fn rounds(&mut self) -> Result<Stop, Error> {
-        self.open_round(self.trainer.counters().round, self.acting.version)?;
+        if let Some(stop) = self.stop() {
+            return Ok(stop);
+        }
+        if !self.open_round(self.trainer.counters().round, self.acting.version)? {
+            return Ok(Stop::Interrupted);
+        }
         loop {
             if let Some(stop) = self.stop() {
                 return Ok(stop);
             }
-            let Some(episodes) = self.wait_for(EpisodeKind::Training, self.acting.version) else {
+            if !self.round()? {
                 return Ok(Stop::Interrupted);
-            };
-            if let Some(ledger) = &mut self.ledger {
-                ledger.settle(&episodes)?;
             }
-            let round = self.trainer.counters().round;
-            let lagged = self.config.run.rounds.lag == 1;
-            if lagged {
-                self.acting = self.trainer.publish();
-                self.open_round(round + 1, round)?;
-            }
-            let figures = self.learn(&episodes)?;
-            let newest = self.trainer.publish();
-            self.shared.publish(newest.clone());
-            if !lagged {
-                self.acting = newest;
-                self.open_round(round + 1, round + 1)?;
-            }
-            self.judge(&figures)?;
-            if self.trainer.counters().round.is_multiple_of(self.config.run.checkpoint.every_rounds)
-            {
-                self.save();
-            }
+            self.keep_up();
         }
+    }
+
+    /// Awaits the open round, learns it and opens the next; false when the run is interrupted. Whenever it gives false
+    /// or an error other than divergence, the state is one that a run can go on from.
+    fn round(&mut self) -> Result<bool, Error> {
+        let Some(episodes) = self.wait_for(EpisodeKind::Training, self.acting.version)? else {
+            return Ok(false);
+        };
+        let spent = self.trainer.counters().advice_spent;
+        if let Some(ledger) = &mut self.ledger
+            && stopped(ledger.settle(&episodes, spent))?
+        {
+            return Ok(false);
+        }
+        let round = self.trainer.counters().round;
+        let lagged = self.config.run.rounds.lag == 1;
+        let spent_by_now = spent + charged(&episodes);
+        if lagged && !self.open_round_knowing(round + 1, round, spent_by_now)? {
+            return Ok(false);
+        }
+        // From here to the end of learning nothing is awaited: a round is learned whole or not at all.
+        let before = self.trainer.publish();
+        let figures = self.learn(&episodes)?;
+        let newest = self.trainer.publish();
+        self.shared.publish(newest.clone());
+        self.acting = if lagged { before } else { newest };
+        self.note_evaluation(&figures);
+        if !lagged && !self.open_round(round + 1, round + 1)? {
+            return Ok(false);
+        }
+        self.order_evaluation();
+        self.take_overdue_evaluations()
     }
 
     fn learn(&mut self, episodes: &[Episode]) -> Result<RoundFigures, Error> {
@@ -223,19 +188,26 @@ impl<'a> Drive<'a> {
         Ok(figures)
     }
 
-    /// Hands out the slots of a round, after its leases are open.
-    fn open_round(&mut self, round: u64, version: u64) -> Result<(), Error> {
+    /// Hands out the slots of a round, after its leases are open; false when the run is interrupted.
+    fn open_round(&mut self, round: u64, version: u64) -> Result<bool, Error> {
+        self.open_round_knowing(round, version, self.trainer.counters().advice_spent)
+    }
+
+    /// [`Self::open_round`] when `spent` units of advice are known to be spent.
+    fn open_round_knowing(&mut self, round: u64, version: u64, spent: u64) -> Result<bool, Error> {
         if self.is_last(round) {
-            return Ok(());
+            return Ok(true);
         }
         let orders = self.trainer.training_orders(round, version);
         if let Some(ledger) = &mut self.ledger {
             let ordered = orders.iter().flat_map(|slot| &slot.episodes);
             let advised = ordered.filter(|order| order.advised).map(|order| order.number).collect();
-            ledger.open_leases(advised, UNITS_PER_EPISODE)?;
+            if stopped(ledger.open_leases(advised, spent))? {
+                return Ok(false);
+            }
         }
         self.add(orders);
-        Ok(())
+        Ok(true)
     }
 
     /// Whether the run is known to end before `round`.
@@ -252,20 +224,26 @@ impl<'a> Drive<'a> {
     }
 
     /// Waits until every episode of `kind` played with `version` is in; `None` when the run is interrupted.
-    fn wait_for(&self, kind: EpisodeKind, version: u64) -> Option<Vec<Episode>> {
-        let mut state = self.shared.lock();
+    fn wait_for(&mut self, kind: EpisodeKind, version: u64) -> Result<Option<Vec<Episode>>, Error> {
+        let spent = self.trainer.counters().advice_spent;
         loop {
+            if let Some(ledger) = &mut self.ledger
+                && stopped(ledger.mend(spent))?
+            {
+                return Ok(None);
+            }
+            let mut state = self.shared.lock();
             if state.board.is_complete(kind, version) {
-                return Some(state.board.take(kind, version));
+                return Ok(Some(state.board.take(kind, version)));
             }
             if self.shutdown.is_cancelled() {
-                return None;
+                return Ok(None);
             }
             for silent in state.board.reclaim((self.config.clock)()) {
                 let Silent { worker_id, name, n_slots } = silent;
                 WorkerSilent { worker_id, name: &name, n_slots }.emit();
             }
-            state = self.shared.wait(state, WAIT_TICK);
+            drop(self.shared.wait(state, WAIT_TICK));
         }
     }
 
@@ -274,7 +252,7 @@ impl<'a> Drive<'a> {
         if self.shutdown.is_cancelled() {
             return Some(Stop::Interrupted);
         }
-        if let Some(success) = self.success_reached {
+        if let Some(success) = self.records.judged().reached(stop.until_success) {
             return Some(Stop::Reached(format!("success rate {success:.3} reached")));
         }
         if self.is_last(self.trainer.counters().round) {
@@ -292,90 +270,41 @@ impl<'a> Drive<'a> {
     /// Judges the final parameters, saves everything and says how it ended.
     fn finish(&mut self, stop: Stop) -> Result<Ended, Error> {
         let round = self.trainer.counters().round;
-        let (reason, interrupted) = match stop {
-            Stop::Interrupted => ("interrupted".to_owned(), true),
+        let reached = match stop {
+            Stop::Interrupted => None,
             Stop::Reached(reason) => {
-                self.save();
-                let judged = self.pending.back().is_some_and(|pending| pending.version == round)
-                    || self.judged_round == Some(round);
-                if !judged && round > 0 {
+                if round > 0 && !self.is_judged(round) {
                     let figures = self.trainer.figures();
-                    self.start_evaluation(&figures);
+                    self.push_evaluation(&figures);
+                    self.order_evaluation();
                 }
+                // What was learned is safe before anything more is waited for.
+                self.save();
                 self.tell("evaluating", &self.trainer.figures());
-                while !self.pending.is_empty() && self.finish_evaluation()? {}
-                (reason, false)
+                while self.finish_evaluation()? {}
+                self.pending.is_empty().then_some(reason)
             }
         };
-        if interrupted {
-            self.save();
-        }
+        let interrupted = reached.is_none();
+        let reason = reached.unwrap_or_else(|| "interrupted".to_owned());
+        self.save();
         let digest = self.trainer.digest();
         RunFinished { reason: &reason, round, digest: &digest }.emit();
         self.tell("ended", &self.trainer.figures());
-        self.shared.progress.send_modify(|progress| progress.digest.clone_from(&digest));
+        self.refuse_unwritten()?;
         Ok(Ended { reason, interrupted, digest })
     }
+}
 
-    /// Saves a checkpoint; when that fails training goes on and the former one stays.
-    fn save(&self) {
-        let resumption = Resumption { acting: self.acting.clone(), wall_s: self.now_s() };
-        let directory = self.config.out.join("checkpoint");
-        match checkpoint::save(
-            &directory,
-            &self.trainer,
-            &resumption,
-            self.config.run.checkpoint.keep,
-        ) {
-            Ok((path, digest)) => {
-                CheckpointSaved {
-                    round: self.trainer.counters().round,
-                    path: &path,
-                    digest: &digest,
-                }
-                .emit();
-            }
-            Err(error) => {
-                let cause =
-                    std::error::Error::source(&error).map(ToString::to_string).unwrap_or_default();
-                warn!(%error, cause, "checkpoint not saved, training goes on");
-            }
-        }
+/// Whether a call to the teacher was given up because the run is to stop.
+fn stopped(outcome: Result<(), TeacherError>) -> Result<bool, TeacherError> {
+    match outcome {
+        Err(TeacherError::Stopped) => Ok(true),
+        outcome => outcome.map(|()| false),
     }
 }
 
-/// Opens the run's account when it asks for advice.
-fn open_ledger(
-    config: &LearnerConfig,
-    trainer: &Trainer,
-    runtime: &Handle,
-    shutdown: &CancellationToken,
-) -> Result<Option<Ledger>, Error> {
-    let advice = &config.run.advice;
-    if !advice.asks() {
-        return Ok(None);
-    }
-    let address =
-        config.teacher.as_deref().ok_or_else(|| Error::NoTeacher(advice.strategy.clone()))?;
-    let terms = pb::OpenAccountRequest {
-        name: config.run.name.clone(),
-        budget: advice.budget,
-        strategy: advice.strategy.clone(),
-    };
-    let spent = trainer.counters().advice_spent;
-    Ok(Some(Ledger::open((&config.dial, address), &terms, spent, runtime, shutdown)?))
-}
-
-/// Opens the metrics of the run directory; what lies after `round` belongs to a lost future and is cut off.
-fn open_metrics(
-    config: &LearnerConfig,
-    round: u64,
-) -> Result<(MetricsLog, Vec<MetricsRow>), Error> {
-    let path: PathBuf = config.out.join("metrics.jsonl");
-    let failed = |source| Error::RunDirectory { action: "open", path: path.clone(), source };
-    std::fs::create_dir_all(&config.out).map_err(|error| failed(error.into()))?;
-    let mut metrics = MetricsLog::open(&path).map_err(|error| failed(error.into()))?;
-    metrics.truncate_after(round).map_err(|error| failed(error.into()))?;
-    let rows = MetricsLog::read_all(&path).map_err(|error| failed(error.into()))?;
-    Ok((metrics, rows))
+/// Units of advice that episodes were charged.
+fn charged(episodes: &[Episode]) -> u64 {
+    episodes.iter().map(|episode| u64::from(episode.advice_charged)).sum()
 }

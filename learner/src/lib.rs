@@ -4,8 +4,8 @@
 //! It does not know how an episode is simulated, how many workers there are or how a teacher decides.
 //!
 //! Reading order: [`config`] (the run file), [`ddpg`] (the update), [`replay`] and [`her`] (what a batch is made of),
-//! [`trainer`] (a round), [`board`] (who plays what), [`checkpoint`], [`service`] (the gRPC shell and the thread
-//! that learns).
+//! [`trainer`] (a round), [`board`] (who plays what), [`records`] (what evaluations bring), [`checkpoint`], [`service`]
+//! (the gRPC shell and the thread that learns).
 
 pub mod board;
 pub mod checkpoint;
@@ -14,6 +14,7 @@ pub mod ddpg;
 mod drive;
 mod error;
 pub mod her;
+pub mod records;
 pub mod replay;
 pub mod service;
 mod shared;
@@ -21,6 +22,7 @@ mod teacher;
 pub mod trainer;
 
 pub use config::RunConfig;
+pub use drive::Ended;
 pub use error::Error;
 pub use service::serve;
 pub use shared::{Clock, LearnerConfig};

@@ -52,8 +52,10 @@ impl ReplayBuffer {
     ) -> Option<Self> {
         let mut buffer = Self::new(layout, capacity_transitions);
         let n = parts.moved.len();
+        // A buffer that is not full grows at its end; a full one goes round.
+        let expected_next = if n < buffer.capacity_episodes { n..n + 1 } else { 0..n };
         let fits = n <= buffer.capacity_episodes
-            && next <= n
+            && expected_next.contains(&next)
             && parts.observations.len() == n * buffer.observation_stride()
             && parts.goals.len() == n * layout.n_goal()
             && parts.actions.len() == n * EPISODE_STEPS * layout.n_action()
@@ -236,5 +238,11 @@ mod tests {
         let mut torn = parts.clone();
         torn.actions.pop();
         assert_eq!(ReplayBuffer::from_parts(LAYOUT, 2 * EPISODE_STEPS, torn, next), None);
+        let of_capacity = |n_episodes, next| {
+            ReplayBuffer::from_parts(LAYOUT, n_episodes * EPISODE_STEPS, parts.clone(), next)
+        };
+        assert_eq!(of_capacity(2, 2), None, "beyond the end of a full one");
+        assert_eq!(of_capacity(3, 1), None, "in the middle of one that grows");
+        assert!(of_capacity(3, 2).is_some());
     }
 }

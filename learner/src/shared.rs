@@ -33,7 +33,7 @@ pub struct LearnerConfig {
     pub teacher: Option<String>,
     /// The run directory.
     pub out: PathBuf,
-    /// Whether to go on from the newest checkpoint.
+    /// Whether to go on from the newest checkpoint, or from the beginning where there is none.
     pub resume: bool,
     /// Threads of the update, 1 or 2.
     pub n_threads: usize,
@@ -61,7 +61,7 @@ pub(crate) struct Shared {
 pub(crate) struct State {
     pub(crate) board: Board,
     pub(crate) terms: Option<RunTerms>,
-    pub(crate) published: BTreeMap<u64, PublishedActor>,
+    pub(crate) published: BTreeMap<u64, Arc<PublishedActor>>,
     pub(crate) finished: Option<String>,
 }
 
@@ -93,7 +93,7 @@ impl Shared {
     /// Hands out an actor from now on, and forgets the oldest.
     pub(crate) fn publish(&self, actor: PublishedActor) {
         let mut state = self.lock();
-        state.published.insert(actor.version, actor);
+        state.published.insert(actor.version, Arc::new(actor));
         while state.published.len() > KEPT_VERSIONS {
             state.published.pop_first();
         }

@@ -1,15 +1,17 @@
 //! The learner's side of the advice budget: an account for the run, leases for its rounds.
 
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use tandem_core::Episode;
 use tandem_net::{Dial, DialError, Link};
 use tandem_proto::pb;
 use tandem_proto::pb::teacher_client::TeacherClient;
-use tandem_telemetry::events::AdviceAccountOpened;
+use tandem_telemetry::events::{AdviceAccountOpened, Reconnected, Reconnecting};
 use tokio::runtime::Handle;
-use tokio_util::sync::CancellationToken;
-use tonic::Code;
+use tokio_util::sync::{CancellationToken, DropGuard};
+use tonic::{Code, Status};
 use tracing::warn;
 
 use crate::shared::wait_on;
@@ -18,7 +20,10 @@ use crate::shared::wait_on;
 const CALL_DEADLINE: Duration = Duration::from_secs(5);
 /// First pause before an unreachable teacher is tried again; doubled up to [`LONGEST_PAUSE`].
 const FIRST_PAUSE: Duration = Duration::from_millis(100);
-const LONGEST_PAUSE: Duration = Duration::from_secs(2);
+const LONGEST_PAUSE: Duration = Duration::from_secs(1);
+/// How often it is looked whether the teacher still knows the account: workers whose account is lost wait until it is
+/// opened again.
+const LOOK_EVERY: Duration = Duration::from_secs(1);
 
 /// What the learner needs of a teacher that does not come from its own configuration.
 #[derive(Debug, thiserror::Error)]
@@ -27,11 +32,31 @@ pub enum TeacherError {
     #[error("the teacher cannot be called")]
     Address(#[from] DialError),
     /// The teacher understood and declined; asking again would not help.
-    #[error("the teacher refuses: {0}")]
-    Refused(String),
+    #[error("the teacher refuses to {what}: {reason}")]
+    Refused {
+        /// What was asked for.
+        what: &'static str,
+        /// What it said.
+        reason: String,
+    },
+    /// The teacher does not know the account.
+    #[error("the teacher does not know the account: {0}")]
+    UnknownAccount(String),
     /// The run was stopped while the teacher could not be reached.
     #[error("stopped while waiting for the teacher")]
     Stopped,
+}
+
+/// Where a run stands when its account is opened.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Run {
+    /// At its beginning.
+    New,
+    /// On its way; it has learned from so many units of advice.
+    Resumed {
+        /// Units.
+        spent: u64,
+    },
 }
 
 /// An account at a teacher, used from the thread that learns.
@@ -40,124 +65,213 @@ pub(crate) struct Ledger {
     client: TeacherClient<Link>,
     runtime: Handle,
     shutdown: CancellationToken,
-    account: pb::OpenAccountRequest,
-    /// Units spent before this account was opened: a teacher that was restarted has forgotten them.
-    spent_before: u64,
-    left: u64,
+    /// What the run file says.
+    terms: pb::OpenAccountRequest,
+    units_per_episode: u32,
+    /// Advised episodes whose leases are open.
+    under_way: Vec<u64>,
+    /// Whether the teacher was seen not to know the account.
+    lost: Arc<AtomicBool>,
+    _watch: DropGuard,
 }
 
 impl Ledger {
-    /// Opens the account `name`, or goes on with it when it exists. `spent` is what the run has spent so far.
+    /// Opens the account that `terms` name, or goes on with it when it exists.
     pub(crate) fn open(
         (dial, address): (&Dial, &str),
         terms: &pb::OpenAccountRequest,
-        spent: u64,
-        runtime: &Handle,
-        shutdown: &CancellationToken,
+        units_per_episode: u32,
+        run: Run,
+        (runtime, shutdown): (&Handle, &CancellationToken),
     ) -> Result<Self, TeacherError> {
-        let _inside = runtime.enter();
+        let inside = runtime.enter();
         let client = TeacherClient::new(dial.link(address)?);
+        drop(inside);
+        let (lost, stop_watching) = (Arc::new(AtomicBool::new(false)), CancellationToken::new());
         let mut ledger = Self {
-            client,
+            client: client.clone(),
             runtime: runtime.clone(),
             shutdown: shutdown.clone(),
-            account: terms.clone(),
-            spent_before: 0,
-            left: terms.budget,
+            terms: terms.clone(),
+            units_per_episode,
+            under_way: Vec::new(),
+            lost: lost.clone(),
+            _watch: stop_watching.clone().drop_guard(),
         };
-        let account = ledger.open_account(terms)?;
-        if account.spent < spent {
-            let remaining = pb::OpenAccountRequest {
-                name: format!("{}.from-{spent}", terms.name),
-                budget: terms.budget.saturating_sub(spent),
-                strategy: terms.strategy.clone(),
-            };
-            ledger.spent_before = spent;
-            ledger.account = remaining.clone();
-            ledger.open_account(&remaining)?;
+        match run {
+            Run::New => ledger.open_account(terms.budget)?,
+            Run::Resumed { spent } => ledger.resume(spent)?,
         }
+        let watch = watch_account(client, ledger.terms.name.clone(), lost);
+        runtime.spawn(async move {
+            tokio::select! {
+                () = watch => (),
+                () = stop_watching.cancelled() => (),
+            }
+        });
         Ok(ledger)
     }
 
     /// The name under which workers ask.
     pub(crate) fn account(&self) -> &str {
-        &self.account.name
+        &self.terms.name
     }
 
-    /// Units spent by the whole run, and units left, as last heard.
-    pub(crate) const fn left(&self) -> u64 {
-        self.left
-    }
-
-    /// Sets units aside for a round's advised episodes, in their order.
+    /// Sets units aside for a round's advised episodes, in their order. `spent` is what the run has learned from.
     pub(crate) fn open_leases(
         &mut self,
         episodes: Vec<u64>,
-        units_per_episode: u32,
+        spent: u64,
     ) -> Result<(), TeacherError> {
         if episodes.is_empty() {
             return Ok(());
         }
-        let request = pb::OpenLeasesRequest {
-            account: self.account.name.clone(),
-            episodes,
-            units_per_episode,
-        };
-        let response = self.call(move |mut client| {
-            let request = request.clone();
-            async move { client.open_leases(request).await }
-        })?;
-        self.note(response.account.as_ref());
+        match self.call_open_leases(&episodes) {
+            Err(TeacherError::UnknownAccount(_)) => {
+                self.find_account(spent)?;
+                self.renew_leases()?;
+                self.call_open_leases(&episodes)?;
+            }
+            outcome => outcome?,
+        }
+        self.under_way.extend(episodes);
         Ok(())
     }
 
-    /// Returns the unspent units of finished episodes.
-    pub(crate) fn settle(&mut self, episodes: &[Episode]) -> Result<(), TeacherError> {
+    /// Returns the unspent units of finished episodes. `spent` is what the run has learned from, them not counted.
+    pub(crate) fn settle(&mut self, episodes: &[Episode], spent: u64) -> Result<(), TeacherError> {
         let numbers: Vec<u64> = episodes.iter().map(|episode| episode.number).collect();
+        self.under_way.retain(|number| !numbers.contains(number));
         let request =
-            pb::SettleLeasesRequest { account: self.account.name.clone(), episodes: numbers };
-        let account = self.call(move |mut client| {
+            pb::SettleLeasesRequest { account: self.terms.name.clone(), episodes: numbers };
+        let settled = self.call("settle leases", move |mut client| {
             let request = request.clone();
             async move { client.settle_leases(request).await }
-        })?;
-        self.note(Some(&account));
+        });
+        match settled {
+            Err(TeacherError::UnknownAccount(_)) => {
+                let charged: u64 =
+                    episodes.iter().map(|episode| u64::from(episode.advice_charged)).sum();
+                self.find_account(spent + charged)?;
+                self.renew_leases()
+            }
+            settled => settled.map(drop),
+        }
+    }
+
+    /// Opens the account again when the teacher has lost it. `spent` is what the run has learned from.
+    pub(crate) fn mend(&mut self, spent: u64) -> Result<(), TeacherError> {
+        if self.lost.swap(false, Ordering::Relaxed) {
+            self.find_account(spent)?;
+            self.renew_leases()?;
+        }
         Ok(())
     }
 
-    fn open_account(
-        &mut self,
-        terms: &pb::OpenAccountRequest,
-    ) -> Result<pb::Account, TeacherError> {
-        let terms = terms.clone();
-        let account = self.call(move |mut client| {
+    /// Finds the account, or opens one under another name when more is left in it than the run may spend: a ledger
+    /// that was put back to an earlier state. Nobody asks under the old name yet.
+    fn resume(&mut self, spent: u64) -> Result<(), TeacherError> {
+        let left = self.terms.budget.saturating_sub(spent);
+        match self.balance()? {
+            Some(found) if units_left(&found) > left => {
+                let name = format!("{}.from-{spent}", self.terms.name);
+                warn!(
+                    account = self.terms.name,
+                    name, left, "spending is forgotten, another account"
+                );
+                self.terms.name = name;
+                self.open_account(left)
+            }
+            _ => self.find_account(spent),
+        }
+    }
+
+    /// Goes on with the account, or opens one of what is left when the teacher knows none.
+    ///
+    /// What episodes under way were charged is not known here, so as much as they may have been is written off: a
+    /// budget is never overspent.
+    fn find_account(&self, spent: u64) -> Result<(), TeacherError> {
+        let written_off = self.under_way.len() as u64 * u64::from(self.units_per_episode);
+        let left = self.terms.budget.saturating_sub(spent);
+        let name = &self.terms.name;
+        match self.balance()? {
+            Some(found) if units_left(&found) <= left => {
+                if found.budget < self.terms.budget {
+                    let (got, asked) = (found.budget, self.terms.budget);
+                    warn!(account = name, budget = got, asked, "going on with a smaller account");
+                }
+                self.open_account(found.budget.min(self.terms.budget))
+            }
+            Some(found) => {
+                let has = units_left(&found);
+                let reason = format!("{name:?} has {has} units left, the run may spend {left}");
+                Err(TeacherError::Refused { what: "go on with the account", reason })
+            }
+            None => {
+                let budget = left.saturating_sub(written_off);
+                warn!(account = name, budget, "the teacher has lost the account, opening it anew");
+                self.open_account(budget)
+            }
+        }
+    }
+
+    /// Opens the leases of episodes under way at a teacher that may have forgotten them; it keeps those that it knows.
+    fn renew_leases(&self) -> Result<(), TeacherError> {
+        if self.under_way.is_empty() { Ok(()) } else { self.call_open_leases(&self.under_way) }
+    }
+
+    fn open_account(&self, budget: u64) -> Result<(), TeacherError> {
+        let terms = pb::OpenAccountRequest { budget, ..self.terms.clone() };
+        let account = self.call("open the account", move |mut client| {
             let request = terms.clone();
             async move { client.open_account(request).await }
         })?;
-        self.note(Some(&account));
         let pb::Account { name, budget, strategy, spent, .. } = &account;
         AdviceAccountOpened { account: name, budget: *budget, spent: *spent, strategy }.emit();
-        Ok(account)
+        Ok(())
     }
 
-    fn note(&mut self, account: Option<&pb::Account>) {
-        if let Some(account) = account {
-            self.left = account.budget - account.spent.min(account.budget);
+    /// How the account stands; `None` when the teacher does not know it.
+    fn balance(&self) -> Result<Option<pb::Account>, TeacherError> {
+        let request = pb::GetAccountRequest { name: self.terms.name.clone() };
+        let account = self.call("look at the account", move |mut client| {
+            let request = request.clone();
+            async move { client.get_account(request).await }
+        });
+        match account {
+            Ok(account) => Ok(Some(account)),
+            Err(TeacherError::UnknownAccount(_)) => Ok(None),
+            Err(error) => Err(error),
         }
+    }
+
+    fn call_open_leases(&self, episodes: &[u64]) -> Result<(), TeacherError> {
+        let request = pb::OpenLeasesRequest {
+            account: self.terms.name.clone(),
+            episodes: episodes.to_vec(),
+            units_per_episode: self.units_per_episode,
+        };
+        let opened = self.call("open leases", move |mut client| {
+            let request = request.clone();
+            async move { client.open_leases(request).await }
+        });
+        opened.map(drop)
     }
 
     /// Calls until the teacher answers or the run is stopped. What is asked may be asked again.
     fn call<T, F>(
         &self,
+        what: &'static str,
         request: impl Fn(TeacherClient<Link>) -> F + Send + 'static,
     ) -> Result<T, TeacherError>
     where
         T: Send + 'static,
-        F: Future<Output = Result<tonic::Response<T>, tonic::Status>> + Send,
+        F: Future<Output = Result<tonic::Response<T>, Status>> + Send,
     {
         let (client, shutdown) = (self.client.clone(), self.shutdown.clone());
         let call = async move {
             tokio::select! {
-                answer = ask_until_answered(client, request) => answer,
+                answer = ask_until_answered(client, what, request) => answer,
                 () = shutdown.cancelled_owned() => Err(TeacherError::Stopped),
             }
         };
@@ -167,37 +281,78 @@ impl Ledger {
 
 async fn ask_until_answered<T, F>(
     client: TeacherClient<Link>,
+    what: &'static str,
     request: impl Fn(TeacherClient<Link>) -> F + Send,
 ) -> Result<T, TeacherError>
 where
-    F: Future<Output = Result<tonic::Response<T>, tonic::Status>> + Send,
+    F: Future<Output = Result<tonic::Response<T>, Status>> + Send,
 {
     let mut pause = FIRST_PAUSE;
-    loop {
-        let attempt = tokio::time::timeout(CALL_DEADLINE, request(client.clone())).await;
-        let status = match attempt {
-            Ok(Ok(response)) => return Ok(response.into_inner()),
-            Ok(Err(status)) if !is_passing(&status) => {
-                return Err(TeacherError::Refused(status.message().to_owned()));
+    for attempt in 1.. {
+        let answer = tokio::time::timeout(CALL_DEADLINE, request(client.clone())).await;
+        let status = match answer {
+            Ok(Ok(response)) => {
+                if attempt > 1 {
+                    Reconnected { peer: "teacher", attempts: attempt - 1 }.emit();
+                }
+                return Ok(response.into_inner());
             }
-            Ok(Err(status)) => status.message().to_owned(),
-            Err(_) => "no answer in time".to_owned(),
+            Ok(Err(status)) => status,
+            Err(_elapsed) => Status::deadline_exceeded("no answer in time"),
         };
-        warn!(error = status, "teacher is unreachable, asking again");
+        let reason = status.message();
+        match fate(status.code()) {
+            Fate::Passing => {}
+            Fate::UnknownAccount => return Err(TeacherError::UnknownAccount(reason.to_owned())),
+            Fate::Final => return Err(TeacherError::Refused { what, reason: reason.to_owned() }),
+        }
+        let wait_millis = u64::try_from(pause.as_millis()).unwrap_or(u64::MAX);
+        Reconnecting { peer: "teacher", attempt, wait_millis, reason }.emit();
         tokio::time::sleep(pause).await;
         pause = (pause * 2).min(LONGEST_PAUSE);
     }
+    Err(TeacherError::Stopped)
 }
 
-/// Whether a call that failed so may go through later.
-fn is_passing(status: &tonic::Status) -> bool {
-    matches!(
-        status.code(),
-        Code::Unavailable
-            | Code::DeadlineExceeded
-            | Code::Cancelled
-            | Code::Unknown
-            | Code::Aborted
-            | Code::ResourceExhausted
-    )
+const fn units_left(account: &pb::Account) -> u64 {
+    account.budget.saturating_sub(account.spent)
+}
+
+/// Sets `lost` whenever the teacher answers that it does not know the account.
+async fn watch_account(mut client: TeacherClient<Link>, name: String, lost: Arc<AtomicBool>) {
+    loop {
+        tokio::time::sleep(LOOK_EVERY).await;
+        let look = client.get_account(pb::GetAccountRequest { name: name.clone() });
+        if let Ok(Err(status)) = tokio::time::timeout(CALL_DEADLINE, look).await
+            && status.code() == Code::NotFound
+        {
+            lost.store(true, Ordering::Relaxed);
+        }
+    }
+}
+
+/// What a failed call means.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Fate {
+    /// It may go through later.
+    Passing,
+    /// The account is to be opened first.
+    UnknownAccount,
+    /// It will not go through.
+    Final,
+}
+
+const fn fate(code: Code) -> Fate {
+    match code {
+        Code::NotFound => Fate::UnknownAccount,
+        Code::InvalidArgument
+        | Code::FailedPrecondition
+        | Code::OutOfRange
+        | Code::AlreadyExists
+        | Code::PermissionDenied
+        | Code::Unauthenticated
+        | Code::Unimplemented
+        | Code::DataLoss => Fate::Final,
+        _ => Fate::Passing,
+    }
 }

@@ -63,7 +63,7 @@ pub struct Trainer {
     pub(crate) goal_normalizer: Normalizer,
     sampler: Sampler,
     batch: Batch,
-    figures: RoundFigures,
+    pub(crate) figures: RoundFigures,
 }
 
 impl Trainer {

@@ -14,6 +14,8 @@ use crate::pb;
 
 pub use episode::{decode_episode, encode_episode};
 
+/// Letters of an unknown name that a refusal repeats: it travels in a header.
+const MAX_SHOWN_CHARS: usize = 40;
 /// Episodes that one slot may step together.
 const MAX_SLOT_EPISODES: usize = 1024;
 /// Units that a hidden layer may have.
@@ -88,7 +90,9 @@ pub fn decode_terms(terms: pb::RunTerms) -> Result<RunTerms, DecodeError> {
 
 fn decode_layout(task: &str, n_arms: u32) -> Result<Layout, DecodeError> {
     let Ok(known_task) = task.parse::<Task>() else {
-        return Err(DecodeError::new("task", "push or pick-and-place", format_args!("{task:?}")));
+        let beginning: String = task.chars().take(MAX_SHOWN_CHARS).collect();
+        let got = format_args!("{beginning:?}").to_string();
+        return Err(DecodeError::new("task", "push or pick-and-place", got));
     };
     let n_known_arms =
         usize::try_from(n_arms).ok().filter(|n_arms| (1..=MAX_ARMS).contains(n_arms));

@@ -95,6 +95,7 @@ pub struct EpisodeMetadata {
 pub(crate) const METADATA_NAME: &str = "tandem.episode";
 const FORMAT: &str = "1";
 const WORLD_PREFIX: &str = "world.";
+const CHECKSUM: &str = "checksum";
 
 impl EpisodeMetadata {
     pub(crate) fn to_map(&self) -> BTreeMap<String, String> {
@@ -111,7 +112,10 @@ impl EpisodeMetadata {
         ];
         let world =
             self.world.iter().map(|(key, value)| (format!("{WORLD_PREFIX}{key}"), value.clone()));
-        ours.into_iter().map(|(key, value)| (key.to_owned(), value)).chain(world).collect()
+        let ours = ours.into_iter().map(|(key, value)| (key.to_owned(), value));
+        let mut map: BTreeMap<String, String> = ours.chain(world).collect();
+        map.insert(CHECKSUM.to_owned(), checksum(&map));
+        map
     }
 
     /// Reads what [`Self::to_map`] wrote; on failure says which entry is missing or wrong.
@@ -121,6 +125,7 @@ impl EpisodeMetadata {
             let value = text(key)?;
             value.parse::<u64>().map_err(|error| format!("metadata {key} {value:?}: {error}"))
         };
+        check_checksum(map)?;
         let format = text("format")?;
         if format != FORMAT {
             return Err(format!("metadata format {format:?}, this program reads {FORMAT:?}"));
@@ -149,6 +154,30 @@ impl EpisodeMetadata {
                 .collect(),
         })
     }
+}
+
+/// Compares the entries with their checksum. A log without one is taken as it is: older programs wrote none.
+fn check_checksum(map: &BTreeMap<String, String>) -> Result<(), String> {
+    let expected = checksum(map);
+    match map.get(CHECKSUM) {
+        Some(got) if *got != expected => Err(format!(
+            "metadata were altered: their {CHECKSUM} is {expected}, the log says {got:?}"
+        )),
+        _ => Ok(()),
+    }
+}
+
+/// CRC-32, hexadecimal, of all entries but its own. MCAP's own checksum of metadata comes at the end of a file, which
+/// a mended one has lost.
+fn checksum(map: &BTreeMap<String, String>) -> String {
+    let mut crc = crc32fast::Hasher::new();
+    for (key, value) in map.iter().filter(|(key, _)| *key != CHECKSUM) {
+        for text in [key, value] {
+            crc.update(text.as_bytes());
+            crc.update(&[0xff]);
+        }
+    }
+    format!("{:08x}", crc.finalize())
 }
 
 /// One bit an arm in `advised_arms`.

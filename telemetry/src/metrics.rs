@@ -96,18 +96,48 @@ impl MetricsLog {
         Ok(log)
     }
 
-    /// Adds a row.
+    /// Opens `path`, or creates it, so that its rows are the first of `rows`: what follows in the file, or is written
+    /// otherwise, is cut off. Gives how many rows are there.
+    ///
+    /// # Errors
+    /// When the file cannot be opened, read or cut.
+    pub fn restore(path: &Path, rows: &[MetricsRow]) -> Result<(Self, usize), Error> {
+        let file = OpenOptions::new()
+            .append(true)
+            .create(true)
+            .open(path)
+            .map_err(Error::io("open", path))?;
+        let log = Self { path: path.to_owned(), file };
+        let bytes = std::fs::read(path).map_err(Error::io("read", path))?;
+        let (mut end, mut n_rows) = (0, 0);
+        for row in rows {
+            let line = line_of(row).map_err(Error::io("compare", path))?;
+            if !bytes[end..].starts_with(&line) {
+                break;
+            }
+            end += line.len();
+            n_rows += 1;
+        }
+        if end < bytes.len() {
+            log.set_len(end)?;
+        }
+        Ok((log, n_rows))
+    }
+
+    /// Adds a row, whole or not at all.
     ///
     /// # Errors
     /// When the file cannot be written.
     pub fn append(&mut self, row: &MetricsRow) -> Result<(), Error> {
-        let write_error = Error::io("append to", &self.path);
-        let mut line = match serde_json::to_vec(row) {
-            Ok(line) => line,
-            Err(source) => return Err(write_error(source.into())),
-        };
-        line.push(b'\n');
-        self.file.write_all(&line).map_err(write_error)
+        let write_error = |source| Error::io("append to", &self.path)(source);
+        let line = line_of(row).map_err(write_error)?;
+        let end = self.file.metadata().map_err(write_error)?.len();
+        let written = self.file.write_all(&line).and_then(|()| self.file.sync_data());
+        written.map_err(|source| {
+            // A disk that is full takes a part of a line and still lets files be cut.
+            drop(self.file.set_len(end));
+            write_error(source)
+        })
     }
 
     /// Every row of the metrics file `path`; a half-written last line is left out, with a warning.
@@ -118,19 +148,16 @@ impl MetricsLog {
         Ok(Rows::read(path)?.rows.into_iter().map(|(_, row)| row).collect())
     }
 
-    /// Drops every row after `round`: a run that goes on from that round's checkpoint writes them anew.
-    ///
-    /// # Errors
-    /// When the file cannot be read or cut.
-    pub fn truncate_after(&mut self, round: u64) -> Result<(), Error> {
-        let kept =
-            Rows::read(&self.path)?.rows.into_iter().take_while(|(_, row)| row.round <= round);
-        self.set_len(kept.last().map_or(0, |(end, _)| end))
-    }
-
     fn set_len(&self, n_bytes: usize) -> Result<(), Error> {
         self.file.set_len(n_bytes as u64).map_err(Error::io("cut", &self.path))
     }
+}
+
+/// A row as it stands in the file.
+fn line_of(row: &MetricsRow) -> std::io::Result<Vec<u8>> {
+    let mut line = serde_json::to_vec(row)?;
+    line.push(b'\n');
+    Ok(line)
 }
 
 /// The rows of a file, each with the offset of the byte after its line.
@@ -240,15 +267,44 @@ mod tests {
     }
 
     #[test]
-    fn a_resumed_run_writes_the_rows_after_its_checkpoint_anew() {
-        let check = |round, expected: &[u64]| {
-            let (_dir, path, mut log) = log_of(&[5, 10, 15]);
-            log.truncate_after(round).unwrap();
-            log.append(&row(99)).unwrap();
+    fn what_differs_from_the_rows_that_are_known_is_cut_off() {
+        let check = |known: &[u64], spoil: fn(&mut Vec<u8>), expected: &[u64]| {
+            let (_dir, path, log) = log_of(&[5, 10, 15]);
+            drop(log);
+            let mut bytes = std::fs::read(&path).unwrap();
+            spoil(&mut bytes);
+            std::fs::write(&path, bytes).unwrap();
+            let known: Vec<MetricsRow> = known.iter().map(|round| row(*round)).collect();
+            let (mut log, n_rows) = MetricsLog::restore(&path, &known).unwrap();
+            assert_eq!(n_rows, expected.len());
             assert_eq!(rounds(&path), expected);
+            log.append(&row(99)).unwrap();
+            assert_eq!(rounds(&path), [expected, &[99]].concat());
         };
-        check(4, &[99]);
-        check(12, &[5, 10, 99]);
-        check(15, &[5, 10, 15, 99]);
+        check(&[5, 10, 15], |_| (), &[5, 10, 15]);
+        check(&[5, 10, 15, 20], |_| (), &[5, 10, 15]);
+        check(&[5, 10], |_| (), &[5, 10]);
+        check(&[], |_| (), &[]);
+        check(&[5, 11, 15], |_| (), &[5]);
+        check(&[5, 10, 15], |bytes| bytes.truncate(bytes.len() - 1), &[5, 10]);
+        check(&[5, 10, 15], |bytes| bytes.extend(b"{\"round\":"), &[5, 10, 15]);
+        check(&[5, 10, 15], |bytes| bytes.fill(0), &[]);
+    }
+
+    #[test]
+    fn a_number_is_the_same_bits_after_being_written_and_read() {
+        // A parser that rounds twice reads the third as its neighbour.
+        for success in [0.1 + 0.2, 1.0 / 3.0, 1.234_567_890_123_456_7e-300, 5e-324] {
+            let (_dir, path, mut log) = log_of(&[]);
+            log.append(&MetricsRow { success, ..row(5) }).unwrap();
+            assert_eq!(
+                MetricsLog::read_all(&path).unwrap()[0].success.to_bits(),
+                success.to_bits()
+            );
+        }
+        let n_exact = (1..2000_u32).map(|n| f64::from(n) / 1999.0).filter(|x| {
+            serde_json::from_str::<f64>(&x.to_string()).unwrap().to_bits() == x.to_bits()
+        });
+        assert_eq!(n_exact.count(), 1999);
     }
 }

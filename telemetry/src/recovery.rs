@@ -36,9 +36,15 @@ pub fn recover(source: &Path, destination: &Path) -> Result<RecoveredCounts, Err
     }
     let temporary = temporary_path(destination);
     let file = File::create(&temporary).map_err(Error::io("create", &temporary))?;
-    let counts = copy_readable(&bytes, file).map_err(Error::write_log(&temporary))?;
-    std::fs::rename(&temporary, destination).map_err(Error::io("rename", &temporary))?;
-    Ok(counts)
+    let copied =
+        copy_readable(&bytes, file).map_err(Error::write_log(&temporary)).and_then(|counts| {
+            std::fs::rename(&temporary, destination).map_err(Error::io("rename", &temporary))?;
+            Ok(counts)
+        });
+    if copied.is_err() {
+        drop(std::fs::remove_file(&temporary));
+    }
+    copied
 }
 
 /// Differs from the recorder's `.part`, which may well be the source.

@@ -144,6 +144,21 @@ fn a_damaged_file_is_refused_and_mending_it_never_panics() {
 }
 
 #[test]
+fn metadata_that_were_altered_do_not_pass_for_an_episodes() {
+    let (dir, bytes) = written();
+    let seed = synthetic::metadata().seed.to_string();
+    let entry = [&4_u32.to_le_bytes(), &b"seed"[..], &[u8::try_from(seed.len()).unwrap(), 0, 0, 0]];
+    let entry = [entry.concat().as_slice(), seed.as_bytes()].concat();
+    let at = bytes.windows(entry.len()).position(|window| window == entry).unwrap();
+    let mut altered = bytes[..bytes.len() - 100].to_vec();
+    altered[at + entry.len() - 1] ^= 1;
+    let (n_messages, log) = mended(dir.path(), &altered).unwrap();
+    let refusal = log.unwrap_err();
+    assert!(matches!(refusal, Error::NotAnEpisode { .. }) && n_messages > 0, "{refusal:?}");
+    assert!(refusal.to_string().contains("checksum"), "{refusal}");
+}
+
+#[test]
 fn what_is_no_log_of_an_episode_is_refused_in_one_sentence() {
     let (dir, bytes) = written();
     let path = dir.path().join("other.mcap");

@@ -8,54 +8,72 @@ use tandem_telemetry::MetricsRow;
 use tandem_telemetry::events::EvaluationFinished;
 
 use super::progress::evaluation_message;
-use super::{Drive, EVALUATION_PATIENCE_ROUNDS, Pending, ROUNDS_PER_PAPER_EPOCH};
+use super::{Drive, EVALUATION_PATIENCE_ROUNDS, ROUNDS_PER_PAPER_EPOCH};
 use crate::config::Recipe;
 use crate::error::Error;
-use crate::teacher::Ledger;
-use crate::trainer::RoundFigures;
+use crate::records::Pending;
+use crate::trainer::{Counters, RoundFigures};
 
 impl Drive<'_> {
-    /// Starts an evaluation when one is due, and takes in those that are done or overdue.
-    pub(super) fn judge(&mut self, figures: &RoundFigures) -> Result<(), Error> {
+    /// Notes an evaluation of the present parameters when one is due. Its episodes are ordered by
+    /// [`Self::order_evaluation`]; a checkpoint in between holds it.
+    pub(super) fn note_evaluation(&mut self, figures: &RoundFigures) {
         let round = self.trainer.counters().round;
         if round.is_multiple_of(self.config.run.rounds_per_evaluation()) {
-            self.start_evaluation(figures);
+            self.push_evaluation(figures);
         }
-        while let Some(oldest) = self.pending.front() {
-            let overdue = round >= oldest.row.round + EVALUATION_PATIENCE_ROUNDS;
-            if !overdue {
-                break;
-            }
-            if !self.finish_evaluation()? {
-                break;
-            }
-        }
-        Ok(())
     }
 
-    pub(super) fn start_evaluation(&mut self, figures: &RoundFigures) {
-        let version = self.trainer.counters().round;
-        let row = self.row(figures);
+    pub(super) fn push_evaluation(&mut self, figures: &RoundFigures) {
         self.pending.push_back(Pending {
-            version,
+            counters: self.trainer.counters(),
+            figures: *figures,
+            wall_s: self.now_s(),
             policy: self.trainer.policy(BTreeMap::new()),
-            row,
         });
-        self.add(self.trainer.evaluation_orders(version));
     }
 
-    /// Takes in the oldest pending evaluation. Gives whether it could: false when interrupted.
+    /// Hands out the episodes of the evaluation that was noted after the latest round, if one was.
+    pub(super) fn order_evaluation(&self) {
+        let round = self.trainer.counters().round;
+        if self.pending.back().is_some_and(|pending| pending.counters.round == round) {
+            self.add(self.trainer.evaluation_orders(round));
+        }
+    }
+
+    /// Whether the parameters after `round` are judged or being judged.
+    pub(super) fn is_judged(&self, round: u64) -> bool {
+        self.pending.back().is_some_and(|pending| pending.counters.round == round)
+            || self.records.judged().rows.last().is_some_and(|row| row.round == round)
+    }
+
+    /// Takes in the evaluations that have had their time, waiting for them if need be; false when interrupted. When an
+    /// evaluation is taken in depends on the round alone: it may end the run.
+    pub(super) fn take_overdue_evaluations(&mut self) -> Result<bool, Error> {
+        let round = self.trainer.counters().round;
+        let is_overdue =
+            |pending: &Pending| round >= pending.counters.round + EVALUATION_PATIENCE_ROUNDS;
+        while self.pending.front().is_some_and(is_overdue) {
+            if !self.finish_evaluation()? {
+                return Ok(false);
+            }
+        }
+        Ok(true)
+    }
+
+    /// Takes in the oldest pending evaluation. Gives whether it could: false when there is none, or when interrupted.
     pub(super) fn finish_evaluation(&mut self) -> Result<bool, Error> {
-        let Some(pending) = self.pending.front() else { return Ok(false) };
-        let Some(episodes) = self.wait_for(EpisodeKind::Evaluation, pending.version) else {
+        let Some(version) = self.pending.front().map(|pending| pending.counters.round) else {
             return Ok(false);
         };
-        let Some(Pending { mut policy, mut row, .. }) = self.pending.pop_front() else {
+        let Some(episodes) = self.wait_for(EpisodeKind::Evaluation, version)? else {
             return Ok(false);
         };
+        let Some(pending) = self.pending.pop_front() else { return Ok(false) };
+        let mut row = self.row(&pending);
         let outcomes: Vec<EpisodeOutcome> = episodes.iter().map(EpisodeOutcome::of).collect();
         judge_into(&mut row, &EvaluationSummary::of(&outcomes));
-        row.best = self.best.as_ref().is_none_or(|best| is_better(&row, best));
+        row.best = self.records.judged().best_row().is_none_or(|best| is_better(&row, best));
         EvaluationFinished {
             round: row.round,
             env_steps: row.env_steps,
@@ -67,45 +85,22 @@ impl Drive<'_> {
             best: row.best,
         }
         .emit();
-        self.metrics.append(&row).map_err(self.in_run_directory("append to", "metrics.jsonl"))?;
-        self.judged_round = Some(row.round);
-        policy.metadata = self.metadata(&row);
-        if row.best {
-            self.save_policy(&policy, "best")?;
-            self.best = Some(row.clone());
-        }
-        self.save_policy(&policy, "last")?;
-        let until = self.config.run.stop.until_success;
-        if until > 0.0 && row.success >= until {
-            self.success_reached = Some(row.success);
-        }
-        let evaluation = evaluation_message(&row);
-        let best = self.best.as_ref().map(evaluation_message);
-        self.shared.progress.send_modify(|progress| {
-            progress.evaluation = Some(evaluation);
-            progress.best = best;
-        });
+        let policy = Policy { metadata: self.metadata(&row), ..pending.policy };
+        self.records.add(row, policy);
+        self.write_records();
+        self.tell_evaluation();
         Ok(true)
     }
 
-    fn save_policy(&self, policy: &Policy, name: &str) -> Result<(), Error> {
-        let directory = self.config.out.join("policy");
-        let path = directory.join(format!("{name}.safetensors"));
-        std::fs::create_dir_all(&directory).map_err(self.in_run_directory("create", "policy"))?;
-        policy.save(&path).map_err(|source| Error::RunDirectory {
-            action: "write",
-            path,
-            source: source.into(),
-        })
-    }
-
-    fn in_run_directory<E: std::error::Error + Send + Sync + 'static>(
-        &self,
-        action: &'static str,
-        name: &str,
-    ) -> impl FnOnce(E) -> Error + use<E> {
-        let path = self.config.out.join(name);
-        move |source| Error::RunDirectory { action, path, source: source.into() }
+    /// Tells of the latest evaluation and the best.
+    pub(super) fn tell_evaluation(&self) {
+        let judged = self.records.judged();
+        let latest = judged.rows.last().map(evaluation_message);
+        let best = judged.best_row().map(evaluation_message);
+        self.shared.progress.send_modify(|progress| {
+            progress.evaluation = latest;
+            progress.best = best;
+        });
     }
 
     fn metadata(&self, row: &MetricsRow) -> BTreeMap<String, String> {
@@ -129,29 +124,31 @@ impl Drive<'_> {
         entries.into_iter().map(|(key, value)| (key.to_owned(), value)).collect()
     }
 
-    /// A row of metrics for the present state, without the evaluation's figures.
-    fn row(&self, figures: &RoundFigures) -> MetricsRow {
-        let counters = self.trainer.counters();
+    /// A row of metrics without the evaluation's figures.
+    fn row(&self, pending: &Pending) -> MetricsRow {
+        let Pending { counters, figures, wall_s, .. } = pending;
         MetricsRow {
             round: counters.round,
             env_steps: counters.env_steps,
             episodes: counters.episodes,
             updates: counters.updates,
             paper_epochs: counters.round as f64 / ROUNDS_PER_PAPER_EPOCH,
-            wall_s: self.now_s(),
+            wall_s: *wall_s,
             mean_q: figures.mean_q,
             critic_loss: figures.critic_loss,
             actor_loss: figures.actor_loss,
             advice_spent: counters.advice_spent,
-            budget_left: self.budget_left(),
+            budget_left: self.budget_left(*counters),
             training_success: figures.training_success,
             training_moved: figures.training_moved,
             ..MetricsRow::default()
         }
     }
 
-    pub(super) fn budget_left(&self) -> u64 {
-        self.ledger.as_ref().map_or(0, Ledger::left)
+    /// What the run may still spend; a teacher's account may know of charges for episodes that are not learned yet.
+    pub(super) fn budget_left(&self, at: Counters) -> u64 {
+        let advice = &self.config.run.advice;
+        if advice.asks() { advice.budget.saturating_sub(at.advice_spent) } else { 0 }
     }
 
     pub(super) fn now_s(&self) -> f64 {

@@ -1,5 +1,7 @@
 //! What the learner tells of the run as it goes.
 
+use std::collections::BTreeSet;
+
 use tandem_proto::pb;
 use tandem_telemetry::MetricsRow;
 
@@ -32,25 +34,42 @@ impl Drive<'_> {
             progress.env_steps_per_s = rate(|(_, env_steps, _)| *env_steps);
             progress.updates_per_s = rate(|(_, _, updates)| *updates);
             progress.advice_spent = counters.advice_spent;
-            progress.budget_left = self.budget_left();
+            progress.budget_left = self.budget_left(counters);
             progress.phase = phase.to_owned();
             progress.training_success = figures.training_success;
             progress.workers = workers;
-            if progress.best.is_none() {
-                progress.best = self.best.as_ref().map(evaluation_message);
-            }
         });
     }
 
+    /// The workers, without those that are silent while another has their name: started again, as a rule.
     fn workers(&self) -> Vec<pb::WorkerProgress> {
         let state = self.shared.lock();
-        let progress = |(worker_id, worker): (u64, &Worker)| pb::WorkerProgress {
-            worker_id,
-            name: worker.name.clone(),
-            episodes: worker.n_episodes,
-            doing: worker.slot.map_or_else(|| "waiting".to_owned(), |slot| format!("slot {slot}")),
-        };
-        state.board.workers().map(progress).collect()
+        let alive: BTreeSet<&str> = state
+            .board
+            .workers()
+            .filter(|(_, worker)| !worker.silent)
+            .map(|(_, worker)| worker.name.as_str())
+            .collect();
+        let shown = state
+            .board
+            .workers()
+            .filter(|(_, worker)| !worker.silent || !alive.contains(worker.name.as_str()));
+        shown
+            .map(|(worker_id, worker)| pb::WorkerProgress {
+                worker_id,
+                name: worker.name.clone(),
+                episodes: worker.n_episodes,
+                doing: doing(worker),
+            })
+            .collect()
+    }
+}
+
+fn doing(worker: &Worker) -> String {
+    match worker.slot {
+        _ if worker.silent => "silent".to_owned(),
+        Some(slot) => format!("slot {slot}"),
+        None => "waiting".to_owned(),
     }
 }
 

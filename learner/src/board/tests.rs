@@ -1,0 +1,207 @@
+//! The board by itself, and beside a model that keeps a plain list of slots.
+
+mod model;
+
+use tandem_core::work::EpisodeOrder;
+use tandem_core::{Layout, Task};
+
+use super::*;
+use crate::replay::drifting_episode;
+
+const fn at(seconds: u64) -> Duration {
+    Duration::from_secs(seconds)
+}
+
+fn order(number: u64, kind: EpisodeKind) -> SlotOrder {
+    let episode = EpisodeOrder { number, seed: 1, advised: false, uniform: false, record: false };
+    SlotOrder { slot: 0, parameter_version: 0, kind, episodes: vec![episode] }
+}
+
+fn played(number: u64) -> Vec<Episode> {
+    vec![drifting_episode(Layout::new(Task::Push, 1), number, 0.0)]
+}
+
+/// A board with `n_slots` training slots of one episode each and two workers.
+fn board_of(n_slots: u64) -> (Board, u64, u64) {
+    let mut board = Board::default();
+    (0..n_slots).for_each(|number| board.add(order(number, EpisodeKind::Training)));
+    let (a, b) = (join(&mut board, at(0)), join(&mut board, at(0)));
+    (board, a, b)
+}
+
+fn join(board: &mut Board, now: Duration) -> u64 {
+    board.join("w".to_owned(), now).expect("there is room")
+}
+
+fn given(board: &mut Board, worker: u64, now: Duration) -> Option<u64> {
+    board.next(worker, now).expect("joined").map(|order| order.slot)
+}
+
+fn taken(board: &mut Board) -> Vec<u64> {
+    board.take(EpisodeKind::Training, 0).iter().map(|episode| episode.number).collect()
+}
+
+#[test]
+fn episodes_come_back_in_order_whoever_was_first() {
+    let (mut board, a, b) = board_of(2);
+    assert_eq!((given(&mut board, a, at(0)), given(&mut board, b, at(0))), (Some(0), Some(1)));
+    assert_eq!(board.submit(b, 1, played(1), at(1)), Ok(true));
+    assert!(!board.is_complete(EpisodeKind::Training, 0));
+    assert_eq!(board.submit(a, 0, played(0), at(1)), Ok(true));
+    assert!(board.is_complete(EpisodeKind::Training, 0));
+    assert_eq!(taken(&mut board), [0, 1]);
+}
+
+#[test]
+fn training_goes_before_evaluation() {
+    let mut board = Board::default();
+    board.add(order(0, EpisodeKind::Evaluation));
+    board.add(order(7, EpisodeKind::Training));
+    let a = join(&mut board, at(0));
+    let first = board.next(a, at(0)).expect("joined").expect("a slot");
+    assert_eq!((first.slot, first.kind), (1, EpisodeKind::Training));
+}
+
+#[test]
+fn a_slot_that_comes_twice_counts_once() {
+    let (mut board, a, b) = board_of(1);
+    assert_eq!(given(&mut board, a, at(0)), Some(0));
+    assert_eq!(given(&mut board, b, at(1)), None, "too early to cover");
+    assert_eq!(given(&mut board, b, at(4)), Some(0), "covers");
+    assert_eq!(board.submit(b, 0, played(0), at(5)), Ok(true));
+    assert_eq!(board.submit(a, 0, played(0), at(6)), Ok(false));
+    assert_eq!(taken(&mut board), [0]);
+    assert_eq!(board.submit(a, 0, played(0), at(7)), Ok(false), "its round is over");
+    assert_eq!(taken(&mut board), [0; 0]);
+}
+
+#[test]
+fn a_dead_workers_slot_is_with_another_after_three_seconds() {
+    let (mut board, a, b) = board_of(1);
+    given(&mut board, a, at(0));
+    assert_eq!(board.cover_in(Duration::from_millis(1200)), Some(Duration::from_millis(1800)));
+    assert_eq!(board.cover_in(at(9)), Some(Duration::ZERO));
+    assert_eq!(given(&mut board, b, Duration::from_millis(2999)), None);
+    assert_eq!(given(&mut board, b, COVER_AFTER), Some(0));
+    assert_eq!(board.cover_in(COVER_AFTER), Some(COVER_AFTER), "the cover has its own time");
+}
+
+#[test]
+fn a_silent_workers_slots_go_back_to_the_queue() {
+    let (mut board, a, b) = board_of(1);
+    given(&mut board, a, at(0));
+    given(&mut board, b, at(2));
+    let silent = Silent { worker_id: a, name: "w".into(), n_slots: 1 };
+    assert_eq!(board.reclaim(at(16)), [silent]);
+    assert_eq!(board.reclaim(at(16)), [], "told once");
+    assert_eq!(given(&mut board, b, at(16)), Some(0));
+}
+
+#[test]
+fn a_worker_that_was_taken_for_dead_still_delivers_and_counts_once() {
+    for someone_else_plays_it in [false, true] {
+        let (mut board, a, b) = board_of(1);
+        given(&mut board, a, at(0));
+        assert_eq!(board.reclaim(at(20)).len(), 2);
+        if someone_else_plays_it {
+            assert_eq!(given(&mut board, b, at(20)), Some(0));
+        }
+        assert_eq!(board.submit(a, 0, played(0), at(21)), Ok(true));
+        assert!(board.is_complete(EpisodeKind::Training, 0));
+        assert_eq!(board.submit(b, 0, played(0), at(22)), Ok(false));
+        assert_eq!(taken(&mut board), [0]);
+        assert_eq!(given(&mut board, a, at(23)), None, "it is in the run again");
+    }
+}
+
+#[test]
+fn a_worker_that_never_delivers_holds_one_slot_and_not_for_long() {
+    let (mut board, bad, good) = board_of(3);
+    for millis in 0..3000 {
+        assert_eq!(given(&mut board, bad, Duration::from_millis(millis)), Some(0));
+    }
+    for slot in [1, 2] {
+        assert_eq!(given(&mut board, good, at(1)), Some(slot));
+        assert_eq!(board.submit(good, slot, played(slot), at(1)), Ok(true));
+    }
+    assert_eq!(given(&mut board, bad, COVER_AFTER), Some(0));
+    assert_eq!(given(&mut board, good, COVER_AFTER), Some(0), "however often the other asks");
+    assert_eq!(board.submit(good, 0, played(0), at(4)), Ok(true));
+    assert_eq!(taken(&mut board), [0, 1, 2]);
+}
+
+#[test]
+fn a_thousand_workers_that_come_and_go_leave_nothing_behind() {
+    let (mut board, _, _) = board_of(1000);
+    for generation in 0..3 {
+        let now = at(generation * 20);
+        let ids: Vec<u64> = (0..1000).map(|_| join(&mut board, now)).collect();
+        for id in &ids {
+            assert!(given(&mut board, *id, now).is_some());
+        }
+        let n_slots: usize =
+            board.reclaim(now + SILENT_AFTER).iter().map(|silent| silent.n_slots).sum();
+        assert_eq!((n_slots, board.waiting.len(), board.out.len()), (1000, 1000, 0));
+    }
+    assert_eq!(board.workers.len(), 3002);
+    board.reclaim(at(40) + FORGET_AFTER);
+    assert_eq!(board.workers.len(), 0);
+    let last = join(&mut board, at(700));
+    for slot in 0..1000 {
+        assert_eq!(given(&mut board, last, at(700)), Some(slot));
+        assert_eq!(board.submit(last, slot, played(slot), at(700)), Ok(true));
+    }
+    assert_eq!(taken(&mut board), (0..1000).collect::<Vec<_>>());
+}
+
+#[test]
+fn there_is_room_for_a_living_worker_as_long_as_others_are_silent() {
+    let mut board = Board::default();
+    board.add(order(0, EpisodeKind::Training));
+    let first = join(&mut board, at(0));
+    given(&mut board, first, at(0));
+    for _ in 1..MAX_WORKERS {
+        join(&mut board, at(1));
+    }
+    assert_eq!(board.join("w".to_owned(), at(2)), Err(TooManyWorkers));
+    let newest = join(&mut board, at(0) + SILENT_AFTER);
+    assert_eq!(board.workers.len(), MAX_WORKERS);
+    assert_eq!(board.next(first, at(16)), Err(SubmitError::UnknownWorker(first)));
+    assert_eq!(given(&mut board, newest, at(16)), Some(0), "the forgotten worker's slot");
+}
+
+#[test]
+fn what_was_not_ordered_is_refused_by_name_and_nothing_of_it_is_used() {
+    let (mut board, a, _) = board_of(1);
+    assert_eq!(given(&mut board, a, at(0)), Some(0));
+    let mut check = |slot, spoil: fn(&mut Vec<Episode>), message: &str| {
+        let mut episodes = played(0);
+        spoil(&mut episodes);
+        let refusal = board.submit(a, slot, episodes, at(0)).expect_err("must be refused");
+        assert_eq!(refusal.to_string(), message);
+        assert!(!board.is_complete(EpisodeKind::Training, 0));
+        assert_eq!(board.take(EpisodeKind::Training, 0), []);
+    };
+    check(1, |_| (), "slot: expected one of the 1 that were ordered, got 1");
+    check(
+        u64::MAX,
+        |_| (),
+        &format!("slot: expected one of the 1 that were ordered, got {}", u64::MAX),
+    );
+    check(0, Vec::clear, "episodes: expected the 1 of slot 0, got 0");
+    check(0, |all| all.extend(played(1)), "episodes: expected the 1 of slot 0, got 2");
+    check(0, |all| all[0].number = 5, "episode 5: number: expected 0, got 5");
+    check(
+        0,
+        |all| all[0].kind = EpisodeKind::Evaluation,
+        "episode 0: kind: expected Training, got Evaluation",
+    );
+    check(0, |all| all[0].parameter_version = 9, "episode 0: parameter_version: expected 0, got 9");
+    check(
+        0,
+        |all| all[0].advice_charged = 3,
+        "episode 0: advice_charged: expected 0, as nobody was to be asked, got 3",
+    );
+    assert_eq!(board.submit(77, 0, played(0), at(0)), Err(SubmitError::UnknownWorker(77)));
+    assert_eq!(board.submit(a, 0, played(0), at(0)), Ok(true), "the worker may try again");
+}

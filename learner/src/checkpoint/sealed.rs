@@ -1,0 +1,138 @@
+//! The checkpoint's file: safetensors, with a seal over every byte.
+//!
+//! The header begins with the seal, the SHA-256 of the whole file with zeros in the seal's place. Whatever bit of the
+//! file is another, in the header, the metadata or a tensor, the seal is not its.
+
+use std::collections::BTreeMap;
+use std::fs::File;
+use std::io::{self, Write as _};
+use std::path::Path;
+
+use safetensors::{Dtype, SafeTensors};
+use serde_json::{Map, Value, json};
+use sha2::{Digest as _, Sha256};
+
+/// Version of the file's layout.
+pub(super) const FORMAT: &str = "2";
+/// How a header begins; the seal follows.
+const BEFORE_SEAL: &str = r#"{"__metadata__":{"seal":""#;
+const SEAL_CHARS: usize = 64;
+/// The header's length is a little-endian `u64`; headers are filled up to a multiple of this.
+const WORD_BYTES: usize = 8;
+/// Where the seal stands in a file.
+const SEAL: std::ops::Range<usize> =
+    WORD_BYTES + BEFORE_SEAL.len()..WORD_BYTES + BEFORE_SEAL.len() + SEAL_CHARS;
+
+/// A named vector.
+pub(super) struct Tensor<'a> {
+    pub(super) name: String,
+    pub(super) dtype: Dtype,
+    /// Little-endian numbers.
+    pub(super) bytes: &'a [u8],
+}
+
+/// What a file holds, once its seal was found whole.
+pub(super) struct Contents<'a> {
+    pub(super) metadata: BTreeMap<String, String>,
+    pub(super) tensors: SafeTensors<'a>,
+}
+
+/// Why a file is no checkpoint.
+#[derive(Debug, PartialEq, Eq)]
+pub(super) enum Refused {
+    /// Cut short or altered.
+    Damaged(String),
+    /// Of another format.
+    Format(String),
+}
+
+/// Writes a file and makes sure that it is on the disk; gives its seal.
+pub(super) fn write(
+    path: &Path,
+    metadata: &[(&str, String)],
+    tensors: &[Tensor<'_>],
+) -> io::Result<String> {
+    let mut start = start(metadata, tensors)?;
+    let mut hash = Sha256::new_with_prefix(&start);
+    tensors.iter().for_each(|tensor| hash.update(tensor.bytes));
+    let seal = hex(hash);
+    start[SEAL].copy_from_slice(seal.as_bytes());
+    let mut file = File::create(path)?;
+    file.write_all(&start)?;
+    for tensor in tensors {
+        file.write_all(tensor.bytes)?;
+    }
+    file.sync_all()?;
+    Ok(seal)
+}
+
+/// Everything before the tensors' bytes, with zeros for a seal.
+fn start(metadata: &[(&str, String)], tensors: &[Tensor<'_>]) -> io::Result<Vec<u8>> {
+    let mut entries = Map::new();
+    entries.insert("seal".to_owned(), Value::String("0".repeat(SEAL_CHARS)));
+    entries.insert("format".to_owned(), Value::String(FORMAT.to_owned()));
+    for (key, value) in metadata {
+        entries.insert((*key).to_owned(), Value::String(value.clone()));
+    }
+    let mut header = Map::new();
+    header.insert("__metadata__".to_owned(), Value::Object(entries));
+    let mut end = 0;
+    for Tensor { name, dtype, bytes } in tensors {
+        let (begin, shape) = (end, bytes.len() * 8 / dtype.bitsize());
+        end += bytes.len();
+        let entry =
+            json!({ "dtype": dtype.to_string(), "shape": [shape], "data_offsets": [begin, end] });
+        header.insert(name.clone(), entry);
+    }
+    let mut header = serde_json::to_vec(&header)?;
+    header.resize(header.len().next_multiple_of(WORD_BYTES), b' ');
+    Ok([(header.len() as u64).to_le_bytes().as_slice(), &header].concat())
+}
+
+/// Reads a file's bytes.
+pub(super) fn open(bytes: &[u8]) -> Result<Contents<'_>, Refused> {
+    if bytes.get(WORD_BYTES..SEAL.start) == Some(BEFORE_SEAL.as_bytes()) {
+        check_seal(bytes)?;
+    }
+    let damaged = |error: safetensors::SafeTensorError| Refused::Damaged(error.to_string());
+    let (_, header) = SafeTensors::read_metadata(bytes).map_err(damaged)?;
+    let metadata: BTreeMap<String, String> =
+        header.metadata().clone().unwrap_or_default().into_iter().collect();
+    match metadata.get("format").map(String::as_str) {
+        Some(FORMAT) if metadata.contains_key("seal") => {}
+        Some(FORMAT) | None => return Err(Refused::Damaged("it bears no seal".to_owned())),
+        Some(format) => return Err(Refused::Format(format.to_owned())),
+    }
+    if bytes.get(WORD_BYTES..SEAL.start) != Some(BEFORE_SEAL.as_bytes()) {
+        return Err(Refused::Damaged("its seal is not where it should be".to_owned()));
+    }
+    Ok(Contents { metadata, tensors: SafeTensors::deserialize(bytes).map_err(damaged)? })
+}
+
+fn check_seal(bytes: &[u8]) -> Result<(), Refused> {
+    let (Some(seal), Some(after)) = (bytes.get(SEAL), bytes.get(SEAL.end..)) else {
+        return Err(Refused::Damaged("it is cut short".to_owned()));
+    };
+    let mut hash = Sha256::new_with_prefix(&bytes[..SEAL.start]);
+    hash.update([b'0'; SEAL_CHARS]);
+    hash.update(after);
+    if hex(hash).as_bytes() == seal {
+        return Ok(());
+    }
+    Err(Refused::Damaged("its contents are not those that it was sealed with".to_owned()))
+}
+
+fn hex(hash: Sha256) -> String {
+    hash.finalize().iter().map(|byte| format!("{byte:02x}")).collect()
+}
+
+/// The bytes of a file whose contents were altered after it was written, with the seal that fits them.
+#[cfg(test)]
+pub(super) fn seal_anew(mut bytes: Vec<u8>) -> Vec<u8> {
+    if bytes.len() >= SEAL.end {
+        bytes[SEAL].fill(b'0');
+        let seal = hex(Sha256::new_with_prefix(&bytes));
+        bytes[SEAL].copy_from_slice(seal.as_bytes());
+    }
+    bytes
+}

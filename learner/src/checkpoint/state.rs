@@ -1,0 +1,351 @@
+//! The learning state as named vectors and numbers, and back.
+
+use safetensors::Dtype;
+use tandem_core::work::PublishedActor;
+use tandem_policy::{Normalizer, NormalizerParts, NormalizerSnapshot, Policy};
+use tandem_telemetry::MetricsRow;
+
+use super::Resumption;
+use super::sealed::{Contents, Tensor};
+use crate::records::{Judged, Pending};
+use crate::replay::{ReplayBuffer, ReplayParts};
+use crate::trainer::{Counters, RoundFigures, Trainer};
+
+/// No count of a run is larger, so that none overflows when it is multiplied with the size of a round.
+const MAX_COUNT: u64 = 1 << 48;
+/// No run has more rounds.
+const MAX_ROUNDS: u64 = 1 << 32;
+/// No more evaluations are under way at a time.
+const MAX_PENDING: usize = 64;
+
+type OwnedTensor = (String, Dtype, Vec<u8>);
+
+/// The numbers and words of a state, in a fixed order.
+pub(super) fn metadata(trainer: &Trainer, resumption: &Resumption) -> Vec<(&'static str, String)> {
+    let Counters { round, env_steps, episodes, updates, advice_spent } = trainer.counters();
+    let (_, next) = trainer.replay.parts();
+    let config = trainer.config();
+    vec![
+        ("digest", trainer.digest()),
+        ("task", config.task.clone()),
+        ("arms", config.arms.to_string()),
+        ("seed", config.seed.to_string()),
+        ("round", round.to_string()),
+        ("env_steps", env_steps.to_string()),
+        ("episodes", episodes.to_string()),
+        ("updates", updates.to_string()),
+        ("advice_spent", advice_spent.to_string()),
+        ("ddpg.n_updates", trainer.ddpg.n_updates().to_string()),
+        ("normalizer.observation.count", trainer.observation_normalizer.parts().count.to_string()),
+        ("normalizer.goal.count", trainer.goal_normalizer.parts().count.to_string()),
+        ("replay.next", next.to_string()),
+        ("acting.version", resumption.acting.version.to_string()),
+        ("pending", resumption.pending.len().to_string()),
+        ("wall_s", resumption.wall_s.to_string()),
+    ]
+}
+
+/// The vectors of a state that are made for the file.
+pub(super) fn small_tensors(trainer: &Trainer, resumption: &Resumption) -> Vec<OwnedTensor> {
+    let (observation, goal) =
+        (trainer.observation_normalizer.parts(), trainer.goal_normalizer.parts());
+    let Resumption { acting, judged, pending, .. } = resumption;
+    let mut tensors = vec![
+        f64s("figures", &figures(&trainer.figures())),
+        f64s("normalizer.observation.sum", &observation.sum),
+        f64s("normalizer.observation.sum_of_squares", &observation.sum_of_squares),
+        f64s("normalizer.goal.sum", &goal.sum),
+        f64s("normalizer.goal.sum_of_squares", &goal.sum_of_squares),
+    ];
+    for (idx, pending) in pending.iter().enumerate() {
+        let numbers = [figures(&pending.figures).as_slice(), &[pending.wall_s]].concat();
+        tensors.push(f64s(&format!("pending.{idx}.figures"), &numbers));
+        let Counters { round, env_steps, episodes, updates, advice_spent } = pending.counters;
+        let counts = [round, env_steps, episodes, updates, advice_spent];
+        let bytes = counts.iter().flat_map(|count| count.to_le_bytes()).collect();
+        tensors.push((format!("pending.{idx}.counters"), Dtype::U64, bytes));
+    }
+    tensors.extend([
+        f32s("acting.actor", &acting.actor),
+        f32s("acting.observation_mean", &acting.observation_mean),
+        f32s("acting.observation_std", &acting.observation_std),
+        f32s("acting.goal_mean", &acting.goal_mean),
+        f32s("acting.goal_std", &acting.goal_std),
+    ]);
+    let kept = [("best", &judged.best), ("last", &judged.last)];
+    for (name, policy) in kept {
+        tensors.extend(policy.iter().flat_map(|policy| policy_tensors(name, policy)));
+    }
+    for (idx, pending) in pending.iter().enumerate() {
+        tensors.extend(policy_tensors(&format!("pending.{idx}"), &pending.policy));
+    }
+    tensors.push(("metrics".to_owned(), Dtype::U8, json_lines(&judged.rows)));
+    tensors
+}
+
+/// The vectors of a state that lie in the trainer as they are written: nearly all of it.
+pub(super) fn large_tensors(trainer: &Trainer) -> Vec<Tensor<'_>> {
+    let (parts, _) = trainer.replay.parts();
+    let floats = trainer.tensors().into_iter().map(|(name, values)| Tensor {
+        name,
+        dtype: Dtype::F32,
+        bytes: bytemuck::cast_slice(values),
+    });
+    let bytes = [("replay.advised_arms", &parts.advised_arms), ("replay.moved", &parts.moved)];
+    let bytes =
+        bytes.map(|(name, bytes)| Tensor { name: name.to_owned(), dtype: Dtype::U8, bytes });
+    floats.chain(bytes).collect()
+}
+
+fn policy_tensors(of: &str, policy: &Policy) -> Vec<OwnedTensor> {
+    let (observation, goal) = (&policy.observation_normalizer, &policy.goal_normalizer);
+    let named = |name: &str| format!("{of}.policy.{name}");
+    vec![
+        f32s(&named("actor"), &policy.actor),
+        f32s(&named("critic"), &policy.critic),
+        f32s(&named("observation_mean"), &observation.mean),
+        f32s(&named("observation_std"), &observation.std),
+        f32s(&named("goal_mean"), &goal.mean),
+        f32s(&named("goal_std"), &goal.std),
+        (named("metadata"), Dtype::U8, json_lines(&[&policy.metadata])),
+    ]
+}
+
+const fn figures(figures: &RoundFigures) -> [f64; 5] {
+    let RoundFigures { critic_loss, actor_loss, mean_q, training_success, training_moved } =
+        *figures;
+    [critic_loss, actor_loss, mean_q, training_success, training_moved]
+}
+
+fn f32s(name: &str, values: &[f32]) -> OwnedTensor {
+    (name.to_owned(), Dtype::F32, bytemuck::cast_slice(values).to_vec())
+}
+
+fn f64s(name: &str, values: &[f64]) -> OwnedTensor {
+    (name.to_owned(), Dtype::F64, bytemuck::cast_slice(values).to_vec())
+}
+
+fn json_lines(values: &[impl serde::Serialize]) -> Vec<u8> {
+    let line = |value| serde_json::to_string(value).expect("rows and names can be written");
+    values.iter().map(|value| line(value) + "\n").collect::<String>().into_bytes()
+}
+
+/// Reads a state from what a file holds. Every refusal says what does not fit.
+pub(super) struct Reader<'a> {
+    pub(super) contents: Contents<'a>,
+}
+
+impl Reader<'_> {
+    /// Puts the learning state into `trainer`, which is new, and gives the rest.
+    pub(super) fn restore(&self, trainer: &mut Trainer) -> Result<Resumption, String> {
+        self.check_run(trainer)?;
+        trainer.counters = Counters {
+            round: self.number("round", MAX_ROUNDS)?,
+            env_steps: self.count("env_steps")?,
+            episodes: self.count("episodes")?,
+            updates: self.count("updates")?,
+            advice_spent: self.count("advice_spent")?,
+        };
+        let [critic_loss, actor_loss, mean_q, training_success, training_moved] =
+            self.numbers("figures")?;
+        trainer.figures =
+            RoundFigures { critic_loss, actor_loss, mean_q, training_success, training_moved };
+        self.restore_networks(trainer)?;
+        trainer.observation_normalizer =
+            self.normalizer("observation", trainer.layout.n_observation())?;
+        trainer.goal_normalizer = self.normalizer("goal", trainer.layout.n_goal())?;
+        self.restore_replay(trainer)?;
+        let judged = Judged {
+            rows: self.rows()?,
+            best: self.kept_policy("best", trainer)?,
+            last: self.kept_policy("last", trainer)?,
+        };
+        let wall_s = self.text("wall_s")?.parse().ok();
+        Ok(Resumption {
+            acting: self.acting(trainer)?,
+            judged,
+            pending: self.pending(trainer)?,
+            wall_s: wall_s.filter(is_time).ok_or("its wall_s is no time")?,
+        })
+    }
+
+    fn check_run(&self, trainer: &Trainer) -> Result<(), String> {
+        let config = trainer.config();
+        let expected = [
+            ("task", config.task.clone()),
+            ("arms", config.arms.to_string()),
+            ("seed", config.seed.to_string()),
+        ];
+        expected.into_iter().try_for_each(|(key, expected)| match self.text(key)? {
+            got if got == expected => Ok(()),
+            got => Err(format!("its {key} is {got:?}, the run's is {expected:?}")),
+        })
+    }
+
+    fn restore_networks(&self, trainer: &mut Trainer) -> Result<(), String> {
+        let names = trainer.ddpg.state().map(|(name, _)| name);
+        let vectors = names.iter().map(|name| Ok((*name, self.f32s(&format!("ddpg.{name}"))?)));
+        let state: Vec<(String, Vec<f32>)> = vectors
+            .map(|vector| vector.map(|(name, values)| (name.to_owned(), values)))
+            .collect::<Result<_, String>>()?;
+        let n_updates = self.count("ddpg.n_updates")?;
+        trainer.ddpg.restore(&state, n_updates).map_err(|error| error.to_string())
+    }
+
+    fn restore_replay(&self, trainer: &mut Trainer) -> Result<(), String> {
+        let parts = ReplayParts {
+            observations: self.f32s("replay.observations")?,
+            goals: self.f32s("replay.goals")?,
+            actions: self.f32s("replay.actions")?,
+            advised_arms: self.bytes("replay.advised_arms", Dtype::U8)?.to_vec(),
+            moved: self.bytes("replay.moved", Dtype::U8)?.to_vec(),
+        };
+        let next = usize::try_from(self.count("replay.next")?).unwrap_or(usize::MAX);
+        let capacity = trainer.config.replay.capacity_transitions;
+        trainer.replay = ReplayBuffer::from_parts(trainer.layout, capacity, parts, next)
+            .ok_or("its replay buffer does not fit the run file")?;
+        Ok(())
+    }
+
+    fn normalizer(&self, of: &str, n: usize) -> Result<Normalizer, String> {
+        let sum = self.f64s(&format!("normalizer.{of}.sum"))?;
+        let sum_of_squares = self.f64s(&format!("normalizer.{of}.sum_of_squares"))?;
+        let count = self.count(&format!("normalizer.{of}.count"))?;
+        if sum.len() != n || sum_of_squares.len() != n {
+            return Err(format!("the {of} normaliser has {} numbers, {n} are needed", sum.len()));
+        }
+        Ok(Normalizer::from_parts(NormalizerParts { count, sum, sum_of_squares }))
+    }
+
+    fn acting(&self, trainer: &Trainer) -> Result<PublishedActor, String> {
+        let acting = PublishedActor {
+            version: self.number("acting.version", trainer.counters.round)?,
+            n_hidden: trainer.config.ddpg.n_hidden,
+            n_hidden_layers: trainer.config.ddpg.n_hidden_layers,
+            actor: self.f32s("acting.actor")?,
+            observation_mean: self.f32s("acting.observation_mean")?,
+            observation_std: self.f32s("acting.observation_std")?,
+            goal_mean: self.f32s("acting.goal_mean")?,
+            goal_std: self.f32s("acting.goal_std")?,
+        };
+        // An actor that workers would refuse is refused here, where it can be named.
+        match tandem_policy::Actor::new(trainer.layout, acting.clone()) {
+            Ok(_) => Ok(acting),
+            Err(error) => Err(format!("its acting parameters cannot be used: {error}")),
+        }
+    }
+
+    fn pending(&self, trainer: &Trainer) -> Result<Vec<Pending>, String> {
+        let n: usize = usize::try_from(self.count("pending")?).unwrap_or(usize::MAX);
+        if n > MAX_PENDING {
+            return Err(format!("it has {n} evaluations under way"));
+        }
+        (0..n).map(|idx| self.one_pending(&format!("pending.{idx}"), trainer)).collect()
+    }
+
+    fn one_pending(&self, name: &str, trainer: &Trainer) -> Result<Pending, String> {
+        let counters = self.bytes(&format!("{name}.counters"), Dtype::U64)?;
+        let counts: Vec<u64> = bytemuck::pod_collect_to_vec(counters);
+        let [round, env_steps, episodes, updates, advice_spent] =
+            exactly(&format!("{name}.counters"), counts)?;
+        if round > trainer.counters.round {
+            return Err(format!("{name} is of round {round}, which is to come"));
+        }
+        let [critic_loss, actor_loss, mean_q, training_success, training_moved, wall_s] =
+            self.numbers(&format!("{name}.figures"))?;
+        let policy = self.kept_policy(name, trainer)?;
+        Ok(Pending {
+            counters: Counters { round, env_steps, episodes, updates, advice_spent },
+            figures: RoundFigures {
+                critic_loss,
+                actor_loss,
+                mean_q,
+                training_success,
+                training_moved,
+            },
+            wall_s,
+            policy: policy.ok_or_else(|| format!("{name} has no policy"))?,
+        })
+    }
+
+    fn rows(&self) -> Result<Vec<MetricsRow>, String> {
+        let bytes = self.bytes("metrics", Dtype::U8)?;
+        let lines = bytes.split(|byte| *byte == b'\n').filter(|line| !line.is_empty());
+        lines
+            .map(|line| serde_json::from_slice(line).map_err(|error| format!("metrics: {error}")))
+            .collect()
+    }
+
+    /// The policy that is kept under `of`, if there is one.
+    fn kept_policy(&self, of: &str, trainer: &Trainer) -> Result<Option<Policy>, String> {
+        let named = |name: &str| format!("{of}.policy.{name}");
+        if self.contents.tensors.tensor(&named("actor")).is_err() {
+            return Ok(None);
+        }
+        let metadata = serde_json::from_slice(self.bytes(&named("metadata"), Dtype::U8)?)
+            .map_err(|error| format!("{of}: {error}"))?;
+        let snapshot = |of: &str| -> Result<NormalizerSnapshot, String> {
+            Ok(NormalizerSnapshot {
+                mean: self.f32s(&named(&format!("{of}_mean")))?,
+                std: self.f32s(&named(&format!("{of}_std")))?,
+            })
+        };
+        let policy = Policy {
+            actor: self.f32s(&named("actor"))?,
+            critic: self.f32s(&named("critic"))?,
+            observation_normalizer: snapshot("observation")?,
+            goal_normalizer: snapshot("goal")?,
+            ..trainer.policy(metadata)
+        };
+        match policy.check() {
+            Ok(()) => Ok(Some(policy)),
+            Err(error) => Err(format!("policy {of:?} cannot be used: {error}")),
+        }
+    }
+
+    fn text(&self, key: &str) -> Result<&str, String> {
+        let text = self.contents.metadata.get(key).map(String::as_str);
+        text.ok_or_else(|| format!("no {key:?} in its metadata"))
+    }
+
+    fn count(&self, key: &str) -> Result<u64, String> {
+        self.number(key, MAX_COUNT)
+    }
+
+    fn number(&self, key: &str, most: u64) -> Result<u64, String> {
+        let text = self.text(key)?;
+        let number = text.parse().ok().filter(|number| *number <= most);
+        number.ok_or_else(|| format!("{key:?} is {text:?}, not 0 to {most}"))
+    }
+
+    fn numbers<const N: usize>(&self, name: &str) -> Result<[f64; N], String> {
+        exactly(name, self.f64s(name)?)
+    }
+
+    fn bytes(&self, name: &str, dtype: Dtype) -> Result<&[u8], String> {
+        let tensor = self.contents.tensors.tensor(name).map_err(|error| error.to_string())?;
+        if tensor.dtype() == dtype {
+            Ok(tensor.data())
+        } else {
+            Err(format!("tensor {name:?} is not {dtype:?}"))
+        }
+    }
+
+    fn f32s(&self, name: &str) -> Result<Vec<f32>, String> {
+        Ok(bytemuck::pod_collect_to_vec(self.bytes(name, Dtype::F32)?))
+    }
+
+    fn f64s(&self, name: &str) -> Result<Vec<f64>, String> {
+        Ok(bytemuck::pod_collect_to_vec(self.bytes(name, Dtype::F64)?))
+    }
+}
+
+fn exactly<T, const N: usize>(name: &str, values: Vec<T>) -> Result<[T; N], String> {
+    values
+        .try_into()
+        .map_err(|values: Vec<T>| format!("{name:?} has {} numbers, not {N}", values.len()))
+}
+
+fn is_time(wall_s: &f64) -> bool {
+    wall_s.is_finite() && *wall_s >= 0.0
+}

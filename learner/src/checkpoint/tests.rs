@@ -1,0 +1,340 @@
+//! Checkpoints that are whole, cut, altered, of others and hostile.
+
+use std::collections::BTreeMap;
+
+use proptest::prelude::{Strategy, any};
+use proptest::test_runner::{Config, TestCaseError, TestRunner};
+use tandem_core::Task;
+use tandem_telemetry::MetricsRow;
+use tempfile::TempDir;
+
+use super::*;
+use crate::config::Recipe;
+use crate::replay::drifting_episode;
+use crate::trainer::RoundFigures;
+
+fn small_config() -> RunConfig {
+    let mut config = RunConfig::defaults(Recipe::Tandem, Task::Push, 1);
+    config.ddpg.n_hidden = 3;
+    config.ddpg.n_hidden_layers = 1;
+    config.ddpg.batch_size = 4;
+    config.rounds.slots = 1;
+    config.rounds.updates_per_env_step = 0.02;
+    config
+}
+
+fn train_round(trainer: &mut Trainer) -> RoundFigures {
+    let round = trainer.counters().round;
+    let episodes: Vec<_> = (round * 2..round * 2 + 2)
+        .map(|number| drifting_episode(trainer.layout, number, 0.002 * number as f32))
+        .collect();
+    trainer.ingest(&episodes);
+    trainer.learn(|_| ()).expect("finite")
+}
+
+/// What a run has beside its trainer in the middle of an evaluation.
+fn resumption(trainer: &Trainer) -> Resumption {
+    let policy =
+        |name: &str| trainer.policy(BTreeMap::from([("name".to_owned(), name.to_owned())]));
+    let row = |round, best| MetricsRow {
+        round,
+        best,
+        success: f64::from(u32::try_from(round).expect("small")) / 3.0,
+        mean_q: f64::NAN,
+        success_per_arm: vec![0.1 + 0.2],
+        ..MetricsRow::default()
+    };
+    Resumption {
+        acting: trainer.publish(),
+        judged: Judged {
+            rows: vec![row(1, true), row(2, false)],
+            best: Some(policy("best")),
+            last: Some(policy("last")),
+        },
+        pending: vec![Pending {
+            counters: trainer.counters(),
+            figures: trainer.figures(),
+            wall_s: 11.25,
+            policy: policy("pending"),
+        }],
+        wall_s: 12.5,
+    }
+}
+
+/// A directory with the checkpoints of `n` rounds.
+fn saved(n: u64) -> (TempDir, Trainer) {
+    let directory = tempfile::tempdir().expect("a directory");
+    let mut trainer = Trainer::new(small_config()).expect("valid");
+    for _ in 0..n {
+        train_round(&mut trainer);
+        save(directory.path(), &trainer, &resumption(&trainer), 2).expect("saves");
+    }
+    (directory, trainer)
+}
+
+fn newest(directory: &TempDir) -> PathBuf {
+    list(directory.path()).pop().expect("there is one")
+}
+
+fn refusal(directory: &TempDir) -> CheckpointError {
+    load_newest(directory.path(), &small_config()).expect_err("must be refused")
+}
+
+fn restored(directory: &TempDir) -> Restored {
+    load_newest(directory.path(), &small_config()).expect("whole").expect("there is one")
+}
+
+#[test]
+fn everything_comes_back_and_leads_to_the_same_bits() {
+    let (directory, mut uninterrupted) = saved(2);
+    let Restored { mut trainer, resumption: loaded, path } = restored(&directory);
+    assert_eq!(path, newest(&directory));
+    assert_eq!(trainer.figures(), uninterrupted.figures());
+    // NaN is not itself: rows are compared as they are written.
+    let take_rows = |resumption: &mut Resumption| {
+        serde_json::to_string(&std::mem::take(&mut resumption.judged.rows)).expect("written")
+    };
+    let (mut got, mut expected) = (loaded, resumption(&uninterrupted));
+    assert_eq!(take_rows(&mut got), take_rows(&mut expected));
+    assert_eq!(got, expected);
+    assert_eq!(trainer.digest(), uninterrupted.digest());
+    train_round(&mut uninterrupted);
+    train_round(&mut trainer);
+    assert_eq!(trainer.digest(), uninterrupted.digest());
+}
+
+#[test]
+fn the_newest_stay_and_the_one_just_written_among_them() {
+    let (directory, mut trainer) = saved(3);
+    let rounds = || -> Vec<String> {
+        let name = |path: &PathBuf| Some(path.file_stem()?.to_str()?.to_owned());
+        list(directory.path()).iter().filter_map(name).collect()
+    };
+    assert_eq!(rounds(), ["00000002", "00000003"]);
+    let mut earlier = Trainer::new(small_config()).expect("valid");
+    train_round(&mut earlier);
+    save(directory.path(), &earlier, &resumption(&earlier), 1).expect("saves");
+    assert_eq!(rounds(), ["00000001"], "even when others have higher numbers");
+    train_round(&mut trainer);
+    save(directory.path(), &trainer, &resumption(&trainer), 1).expect("saves");
+    assert_eq!(rounds(), ["00000004"]);
+}
+
+#[test]
+fn without_a_checkpoint_there_is_nothing_to_restore_and_nothing_wrong() {
+    let directory = tempfile::tempdir().expect("a directory");
+    let load = || load_newest(&directory.path().join("checkpoint"), &small_config());
+    assert!(load().expect("no error").is_none(), "no directory");
+    fs::create_dir(directory.path().join("checkpoint")).expect("creates");
+    assert!(load().expect("no error").is_none(), "an empty one");
+    fs::write(directory.path().join("checkpoint/00000001.tmp"), "half").expect("writes");
+    assert!(load().expect("no error").is_none(), "an unfinished one");
+    fs::remove_dir(directory.path().join("checkpoint")).expect("the unfinished one is removed");
+    fs::write(directory.path().join("checkpoint"), "").expect("writes");
+    assert!(matches!(load(), Err(CheckpointError::Io { .. })), "what cannot be read is not empty");
+}
+
+#[test]
+fn a_writer_killed_at_any_byte_leaves_the_former_checkpoint_in_use() {
+    let (directory, _) = saved(2);
+    let (whole, unfinished) =
+        (fs::read(newest(&directory)).expect("readable"), newest(&directory).with_extension("tmp"));
+    fs::remove_file(newest(&directory)).expect("removes");
+    let former = newest(&directory);
+    for n_bytes in (0..whole.len()).step_by(1009).chain([whole.len()]) {
+        fs::write(&unfinished, &whole[..n_bytes]).expect("writes");
+        assert_eq!(restored(&directory).path, former, "{n_bytes} bytes");
+        assert!(!unfinished.exists());
+    }
+}
+
+#[test]
+fn a_checkpoint_cut_at_any_byte_is_refused_by_name_and_the_former_offered() {
+    let (directory, _) = saved(2);
+    let newest = newest(&directory);
+    let whole = fs::read(&newest).expect("readable");
+    let header = 8 + usize::from(u16::from_le_bytes([whole[0], whole[1]]));
+    let in_header = (0..header).step_by(13);
+    let in_tensors = (header..whole.len()).step_by(509);
+    for n_bytes in in_header.chain(in_tensors).chain([header, whole.len() - 1]) {
+        fs::write(&newest, &whole[..n_bytes]).expect("writes");
+        let refusal = refusal(&directory);
+        assert!(matches!(refusal, CheckpointError::Damaged { .. }), "{n_bytes} bytes: {refusal}");
+        let message = refusal.to_string();
+        assert!(message.contains("00000002.safetensors\" is damaged"), "{message}");
+        assert!(message.contains("00000001.safetensors"), "{message}");
+    }
+    fs::write(&newest, [whole.as_slice(), b"x"].concat()).expect("writes");
+    assert!(matches!(refusal(&directory), CheckpointError::Damaged { .. }), "a byte too many");
+}
+
+#[test]
+fn a_flipped_bit_anywhere_is_found() {
+    let (directory, _) = saved(1);
+    let path = newest(&directory);
+    let mut bytes = fs::read(&path).expect("readable");
+    let header = 8 + usize::from(u16::from_le_bytes([bytes[0], bytes[1]]));
+    let config = small_config();
+    let anywhere = (0..header).chain((header..bytes.len()).step_by(97));
+    for (n, at) in anywhere.enumerate() {
+        bytes[at] ^= 1 << (n % 8);
+        assert!(sealed::open(&bytes).is_err(), "bit {} of byte {at}", n % 8);
+        bytes[at] ^= 1 << (n % 8);
+    }
+    fs::write(&path, &bytes).expect("writes");
+    assert!(load(&path, &config).is_ok(), "whole again");
+}
+
+#[test]
+fn every_tensor_is_under_the_seal() {
+    let (directory, _) = saved(1);
+    let bytes = fs::read(newest(&directory)).expect("readable");
+    let (n_header, header) = safetensors::SafeTensors::read_metadata(&bytes).expect("whole");
+    let tensors: BTreeMap<_, _> = header.tensors().into_iter().collect();
+    for name in
+        ["acting.actor", "pending.0.policy.critic", "pending.0.counters", "metrics", "figures"]
+    {
+        assert!(tensors.contains_key(name), "{name}");
+    }
+    for (name, info) in tensors {
+        let mut flipped = bytes.clone();
+        flipped[8 + n_header + info.data_offsets.0] ^= 0x10;
+        assert!(matches!(sealed::open(&flipped), Err(Refused::Damaged(_))), "{name}");
+    }
+}
+
+#[test]
+fn another_format_is_refused_by_name() {
+    let directory = tempfile::tempdir().expect("a directory");
+    let path = directory.path().join("00000050.safetensors");
+    let write = |header: &str| {
+        let bytes = [&(header.len() as u64).to_le_bytes(), header.as_bytes()].concat();
+        fs::write(&path, bytes).expect("writes");
+        refusal(&directory).to_string()
+    };
+    let message = write(r#"{"__metadata__":{"round":"50","format":"1"}}"#);
+    assert!(message.ends_with(r#"is of format "1", this program reads "2""#), "{message}");
+    let message = write(r#"{"__metadata__":{"round":"50","format":"2"}}"#);
+    assert!(message.contains("it bears no seal"), "{message}");
+    let message = write(r#"{"__metadata__":{"round":"50","format":"2","seal":"0"}}"#);
+    assert!(message.contains("seal is not where it should be"), "{message}");
+    let message = write("{}");
+    assert!(message.contains("is damaged"), "{message}");
+}
+
+#[test]
+fn a_checkpoint_of_another_run_is_refused() {
+    let (directory, _) = saved(1);
+    let check = |change: fn(&mut RunConfig), what: &str| {
+        let mut config = small_config();
+        change(&mut config);
+        let refusal = load_newest(directory.path(), &config).expect_err("must be refused");
+        assert!(matches!(refusal, CheckpointError::OtherRun { .. }), "{refusal}");
+        assert!(refusal.to_string().contains(what), "{refusal}");
+    };
+    check(|config| config.seed = 2, "seed");
+    check(|config| config.arms = 2, "arms");
+    check(|config| config.task = "pick-and-place".to_owned(), "task");
+    check(|config| config.ddpg.n_hidden = 4, "actor.online");
+    check(|config| config.replay.capacity_transitions = 50, "replay buffer");
+}
+
+/// Changes of a file's bytes: each puts a byte somewhere, or cuts.
+fn spoiled(whole: Vec<u8>) -> impl Strategy<Value = Vec<u8>> {
+    let header = 8 + usize::from(u16::from_le_bytes([whole[0], whole[1]]));
+    let change = (any::<bool>(), any::<usize>(), any::<u8>());
+    let changes = proptest::collection::vec(change, 1..6);
+    (changes, any::<u8>(), any::<usize>()).prop_map(move |(changes, cut, at)| {
+        let mut bytes = whole.clone();
+        for (in_header, at, byte) in changes {
+            let end = if in_header { header } else { bytes.len() };
+            bytes[at % end] = byte;
+        }
+        if cut < 20 {
+            bytes.truncate(at % bytes.len());
+        }
+        bytes
+    })
+}
+
+/// Loads what is hostile; to be refused or taken, never to panic.
+fn load_hostile(name: &str, n_cases: u32, hostile: impl Strategy<Value = Vec<u8>>) {
+    let directory = tempfile::tempdir().expect("a directory");
+    let path = directory.path().join("00000001.safetensors");
+    let config = Config { failure_persistence: None, ..Config::with_cases(n_cases) };
+    let outcome = TestRunner::new(config).run(&hostile, |bytes| {
+        fs::write(&path, bytes).map_err(|error| TestCaseError::fail(error.to_string()))?;
+        if let Ok(Restored { mut trainer, resumption, .. }) = load(&path, &small_config()) {
+            // What is taken can be gone on with.
+            train_with_whatever(&mut trainer);
+            drop(save(&directory.path().join("again"), &trainer, &resumption, 1));
+        }
+        Ok(())
+    });
+    if let Err(error) = outcome {
+        panic!("{name}: {error}");
+    }
+}
+
+fn train_with_whatever(trainer: &mut Trainer) {
+    let round = trainer.counters().round;
+    assert!(!trainer.training_orders(round, round).is_empty());
+    let episodes = [drifting_episode(trainer.layout, round * 2, 0.01)];
+    trainer.ingest(&episodes);
+    // Numbers that are not finite make learning diverge, which is an error and not a panic.
+    drop(trainer.learn(|_| ()));
+}
+
+#[test]
+fn no_bytes_make_loading_panic() {
+    load_hostile("random", 200, proptest::collection::vec(any::<u8>(), 0..400));
+    let lengths = any::<u64>().prop_map(|n| [n.to_le_bytes().as_slice(), b"{\"a\":{}}"].concat());
+    load_hostile("header lengths", 100, lengths);
+    let (directory, _) = saved(1);
+    let whole = fs::read(newest(&directory)).expect("readable");
+    load_hostile("altered", 200, spoiled(whole.clone()));
+    load_hostile("altered and sealed", 600, spoiled(whole).prop_map(sealed::seal_anew));
+}
+
+#[test]
+fn no_number_in_the_metadata_makes_loading_panic() {
+    let (directory, _) = saved(1);
+    let whole = fs::read(newest(&directory)).expect("readable");
+    let (n_header, header) = safetensors::SafeTensors::read_metadata(&whole).expect("whole");
+    let text = String::from_utf8(whole[8..8 + n_header].to_vec()).expect("a header");
+    for (key, value) in header.metadata().iter().flatten() {
+        for hostile in
+            ["", "-1", "18446744073709551615", "281474976710656", "1e999", "NaN", "0", "64"]
+        {
+            let (old, new) = (format!("\"{key}\":\"{value}\""), format!("\"{key}\":\"{hostile}\""));
+            let header = text.replace(&old, &new).into_bytes();
+            let length = (header.len() as u64).to_le_bytes();
+            let bytes = [length.as_slice(), &header, &whole[8 + n_header..]].concat();
+            load_hostile_once(&sealed::seal_anew(bytes));
+        }
+    }
+}
+
+fn load_hostile_once(bytes: &[u8]) {
+    let directory = tempfile::tempdir().expect("a directory");
+    let path = directory.path().join("00000001.safetensors");
+    fs::write(&path, bytes).expect("writes");
+    if let Ok(Restored { mut trainer, .. }) = load(&path, &small_config()) {
+        train_with_whatever(&mut trainer);
+    }
+}
+
+#[test]
+fn a_disk_that_refuses_leaves_the_former_checkpoint() {
+    let (directory, mut trainer) = saved(1);
+    train_round(&mut trainer);
+    // A directory where the unfinished file would go: it can be neither written nor renamed.
+    let in_the_way = directory.path().join("00000002.tmp");
+    fs::create_dir(&in_the_way).expect("creates");
+    let refusal = save(directory.path(), &trainer, &resumption(&trainer), 1);
+    assert!(matches!(refusal, Err(CheckpointError::Io { action: "write", .. })));
+    fs::remove_dir(&in_the_way).expect("removes");
+    assert_eq!(restored(&directory).trainer.counters().round, 1);
+    save(directory.path(), &trainer, &resumption(&trainer), 1).expect("there is room again");
+    assert_eq!(restored(&directory).trainer.counters().round, 2);
+}

@@ -1,0 +1,179 @@
+//! How a run begins: anew, or from its newest checkpoint.
+
+use std::fs::{File, OpenOptions, TryLockError};
+use std::path::Path;
+
+use tandem_core::work::{PublishedActor, RunTerms};
+use tandem_proto::pb;
+use tandem_telemetry::events::RunResumed;
+use tokio::runtime::Handle;
+use tokio_util::sync::CancellationToken;
+
+use super::keep::Keeping;
+use super::{Drive, UNITS_PER_EPISODE};
+use crate::checkpoint::{self, CheckpointError, Restored, Resumption};
+use crate::error::Error;
+use crate::records::{Judged, Pending, Records};
+use crate::shared::{LearnerConfig, Shared};
+use crate::teacher::{Ledger, Run};
+use crate::trainer::Trainer;
+
+/// The file whose lock says that a learner is at work in a run directory.
+const LOCK: &str = "learner.lock";
+
+/// What a run begins with.
+pub(super) struct Beginning {
+    pub(super) trainer: Trainer,
+    acting: PublishedActor,
+    judged: Judged,
+    pending: Vec<Pending>,
+    wall_before_s: f64,
+    is_resumed: bool,
+    lock: RunLock,
+}
+
+impl Beginning {
+    /// Reads what there is.
+    pub(super) fn of(config: &LearnerConfig) -> Result<Self, Error> {
+        let lock = RunLock::take(&config.out)?;
+        let checkpoints = config.out.join("checkpoint");
+        let restored = if config.resume {
+            checkpoint::load_newest(&checkpoints, &config.run)?
+        } else {
+            refuse_former_run(&config.out)?;
+            None
+        };
+        let is_resumed = restored.is_some();
+        let (mut trainer, resumption) = match restored {
+            Some(Restored { path, trainer, resumption }) => {
+                RunResumed { round: trainer.counters().round, path: &path }.emit();
+                (trainer, resumption)
+            }
+            None => {
+                if config.resume {
+                    tracing::info!(path = ?checkpoints, "no checkpoint yet, the run begins anew");
+                }
+                let trainer = Trainer::new(config.run.clone())?;
+                let (acting, judged) = (trainer.publish(), Judged::default());
+                (trainer, Resumption { acting, judged, pending: Vec::new(), wall_s: 0.0 })
+            }
+        };
+        trainer.set_threads(config.n_threads);
+        let Resumption { acting, judged, pending, wall_s } = resumption;
+        Ok(Self { trainer, acting, judged, pending, wall_before_s: wall_s, is_resumed, lock })
+    }
+
+    /// Opens the run's account when it asks for advice.
+    pub(super) fn open_ledger(
+        &self,
+        config: &LearnerConfig,
+        runtime: &Handle,
+        shutdown: &CancellationToken,
+    ) -> Result<Option<Ledger>, Error> {
+        let advice = &config.run.advice;
+        if !advice.asks() {
+            return Ok(None);
+        }
+        let address =
+            config.teacher.as_deref().ok_or_else(|| Error::NoTeacher(advice.strategy.clone()))?;
+        let terms = pb::OpenAccountRequest {
+            name: config.run.name.clone(),
+            budget: advice.budget,
+            strategy: advice.strategy.clone(),
+        };
+        let run = if self.is_resumed {
+            Run::Resumed { spent: self.trainer.counters().advice_spent }
+        } else {
+            Run::New
+        };
+        let whom = (&config.dial, address);
+        Ok(Some(Ledger::open(whom, &terms, UNITS_PER_EPISODE, run, (runtime, shutdown))?))
+    }
+}
+
+impl<'a> Drive<'a> {
+    /// Publishes what workers need and orders again the evaluations that were under way.
+    pub(super) fn new(
+        config: &'a LearnerConfig,
+        shared: &'a Shared,
+        shutdown: &'a CancellationToken,
+        beginning: Beginning,
+        ledger: Option<Ledger>,
+    ) -> Self {
+        let Beginning { trainer, acting, judged, pending, wall_before_s, lock, .. } = beginning;
+        let terms = RunTerms {
+            layout: trainer.layout,
+            account: ledger.as_ref().map(|ledger| ledger.account().to_owned()),
+            exploration: config.run.exploration(),
+            world: config.run.world_terms(),
+        };
+        for Pending { counters, policy, .. } in &pending {
+            shared.publish(policy.published(counters.round));
+        }
+        shared.publish(acting.clone());
+        shared.publish(trainer.publish());
+        let mut drive = Self {
+            config,
+            shared,
+            shutdown,
+            trainer,
+            acting,
+            ledger,
+            records: Records::new(&config.out, judged),
+            pending: pending.into(),
+            keeping: Keeping::default(),
+            wall_before_s,
+            rates: std::collections::VecDeque::new(),
+            _lock: lock,
+        };
+        for Pending { counters, .. } in &drive.pending {
+            drive.add(drive.trainer.evaluation_orders(counters.round));
+        }
+        drive.write_records();
+        drive.tell("starting", &drive.trainer.figures());
+        drive.tell_evaluation();
+        drive.shared.lock().terms = Some(terms);
+        drive
+    }
+}
+
+/// A run that begins anew would overwrite what another has left.
+fn refuse_former_run(out: &Path) -> Result<(), CheckpointError> {
+    let has_rows = std::fs::metadata(out.join("metrics.jsonl")).is_ok_and(|file| file.len() > 0);
+    if has_rows || !checkpoint::list(&out.join("checkpoint")).is_empty() {
+        return Err(CheckpointError::RunExists(out.to_owned()));
+    }
+    Ok(())
+}
+
+/// Keeps a second learner out of a run directory for as long as it lives; the system frees it however a process ends.
+#[derive(Debug)]
+pub(super) struct RunLock {
+    _file: Option<File>,
+}
+
+impl RunLock {
+    fn take(out: &Path) -> Result<Self, Error> {
+        let path = out.join(LOCK);
+        let refused = |source: Box<dyn std::error::Error + Send + Sync>| Error::RunDirectory {
+            action: "lock",
+            path: path.clone(),
+            source,
+        };
+        std::fs::create_dir_all(out).map_err(|error| refused(error.into()))?;
+        let made = OpenOptions::new().append(true).create(true).open(&path);
+        made.map_err(|error| refused(error.into()))?;
+        // Held for reading only: an open file that can be written to keeps a disk from being made read-only.
+        let file = File::open(&path).map_err(|error| refused(error.into()))?;
+        match file.try_lock() {
+            Ok(()) => Ok(Self { _file: Some(file) }),
+            Err(TryLockError::WouldBlock) => {
+                Err(refused("another learner is at work in this directory".into()))
+            }
+            Err(TryLockError::Error(error)) => {
+                tracing::warn!(%error, ?path, "files cannot be locked here, two learners would not notice");
+                Ok(Self { _file: None })
+            }
+        }
+    }
+}

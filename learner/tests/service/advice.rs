@@ -1,0 +1,229 @@
+//! Teachers that are away, refuse or forget.
+
+use std::net::SocketAddr;
+use std::path::Path;
+use std::time::Duration;
+
+use tandem_core::Episode;
+use tandem_core::work::SlotOrder;
+use tandem_learner::checkpoint;
+use tandem_learner::{Error, LearnerConfig, RunConfig};
+use tokio::net::TcpListener;
+use tonic::Status;
+
+use crate::run::{Left, Served, Toy, learner_config};
+use crate::teacher::FakeTeacher;
+use crate::toy::{UNITS, config};
+
+/// More than the toy spends.
+const AMPLE: u64 = 10_000;
+
+fn advised(lag: u32, budget: u64) -> RunConfig {
+    let mut config = config(lag);
+    config.advice.strategy = "ea".to_owned();
+    config.advice.share = 0.5;
+    config.advice.budget = budget;
+    config
+}
+
+fn with_teacher(run: RunConfig, out: &Path, resume: bool, address: SocketAddr) -> LearnerConfig {
+    LearnerConfig { teacher: Some(address.to_string()), ..learner_config(run, out, resume) }
+}
+
+/// Charges the advised episodes of a slot, waiting for a teacher that does not know the account.
+async fn charge(teacher: &FakeTeacher, order: &SlotOrder, episodes: &mut [Episode]) {
+    for (ordered, episode) in order.episodes.iter().zip(episodes) {
+        if !ordered.advised {
+            continue;
+        }
+        let charged = loop {
+            let charged = teacher.books().charge("toy", ordered.number, u64::from(UNITS));
+            match charged {
+                Some(charged) => break charged,
+                None => tokio::time::sleep(Duration::from_millis(10)).await,
+            }
+        };
+        episode.advice_charged = u32::try_from(charged).expect("few");
+    }
+}
+
+async fn play_one(toy: &mut Toy, teacher: &FakeTeacher) -> bool {
+    let Some((order, mut episodes)) = toy.take().await else { return false };
+    charge(teacher, &order, &mut episodes).await;
+    toy.deliver(order.slot, &episodes).await.is_ok()
+}
+
+/// An advised run that nothing happens to, and its teacher.
+async fn calm(run: RunConfig) -> (Left, FakeTeacher) {
+    let directory = tempfile::tempdir().expect("a directory");
+    let teacher = FakeTeacher::default();
+    let address = teacher.serve().await;
+    let served = Served::start(with_teacher(run, directory.path(), false, address)).await;
+    let mut toy = served.join("toy").await;
+    while play_one(&mut toy, &teacher).await {}
+    let ended = served.end().await.expect("a run");
+    (Left::behind(&ended, directory.path()), teacher)
+}
+
+/// 9 rounds of 8 episodes, half of them advised.
+const N_ADVISED: u64 = 36;
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_teacher_that_loses_the_account_is_given_what_is_left() {
+    for lag in [0, 1] {
+        for lost_after in [1, 6, 13, 30] {
+            let directory = tempfile::tempdir().expect("a directory");
+            let teacher = FakeTeacher::default();
+            let address = teacher.serve().await;
+            // So much that it runs out on the way.
+            let budget = 180;
+            let run = advised(lag, budget);
+            let served = Served::start(with_teacher(run, directory.path(), false, address)).await;
+            let mut toy = served.join("toy").await;
+            let mut n_delivered = 0;
+            while play_one(&mut toy, &teacher).await {
+                n_delivered += 1;
+                if n_delivered == lost_after {
+                    teacher.books().accounts.clear();
+                }
+            }
+            let ended = served.end().await.expect("the run goes on to its end");
+            assert!(!ended.interrupted);
+            let books = teacher.books();
+            let [(first, _), (second, left)] = books.opened.as_slice() else {
+                panic!("{:?}", books.opened);
+            };
+            assert_eq!((first.as_str(), second.as_str()), ("toy", "toy"), "workers ask as before");
+            assert!(*left < budget && books.charged_ever <= budget, "{}", books.charged_ever);
+            let rows = Left::behind(&ended, directory.path()).rows;
+            let last = rows.last().expect("rows");
+            assert_eq!(last.advice_spent, books.charged_ever, "what was learned from");
+            assert_eq!(last.budget_left, budget - last.advice_spent);
+        }
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_teacher_that_is_away_is_waited_for_and_the_run_can_be_stopped_meanwhile() {
+    for lag in [0, 1] {
+        let (expected, teacher) = calm(advised(lag, AMPLE)).await;
+        assert_eq!(teacher.books().charged_ever, N_ADVISED * u64::from(UNITS));
+        for away_after in [2, 4, 9, 12] {
+            let directory = tempfile::tempdir().expect("a directory");
+            let teacher = FakeTeacher::default();
+            let address = teacher.serve().await;
+            let run = advised(lag, AMPLE);
+            let served =
+                Served::start(with_teacher(run.clone(), directory.path(), false, address)).await;
+            let mut toy = served.join("toy").await;
+            for _ in 0..away_after {
+                assert!(play_one(&mut toy, &teacher).await);
+            }
+            teacher.books().refusal = Some(Status::unavailable("away"));
+            let stops = async {
+                tokio::time::sleep(Duration::from_millis(150)).await;
+                served.shutdown.cancel();
+            };
+            let plays = async { while play_one(&mut toy, &teacher).await {} };
+            tokio::join!(stops, plays);
+            let ended = served.end().await.expect("saved");
+            assert!(ended.interrupted && ended.digest.len() == 64, "{ended:?}");
+            teacher.books().refusal = None;
+            let again = Served::start(with_teacher(run, directory.path(), true, address)).await;
+            let mut toy = again.join("toy").await;
+            while play_one(&mut toy, &teacher).await {}
+            let ended = again.end().await.expect("goes on");
+            let left = Left::behind(&ended, directory.path());
+            assert_eq!(left, expected, "lag {lag}, away after {away_after}");
+        }
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_teacher_that_refuses_ends_the_run_and_what_was_learned_is_saved() {
+    let (expected, _) = calm(advised(1, AMPLE)).await;
+    let other_terms = "account \"toy\" is open with budget 1";
+    for (status, reason) in [
+        (Status::unauthenticated("no"), "wants a token: name its file in --token-file"),
+        (Status::already_exists(other_terms), other_terms),
+    ] {
+        let directory = tempfile::tempdir().expect("a directory");
+        let teacher = FakeTeacher::default();
+        let address = teacher.serve().await;
+        let run = advised(1, AMPLE);
+        let served =
+            Served::start(with_teacher(run.clone(), directory.path(), false, address)).await;
+        let mut toy = served.join("toy").await;
+        for _ in 0..10 {
+            assert!(play_one(&mut toy, &teacher).await);
+        }
+        teacher.books().refusal = Some(status);
+        while play_one(&mut toy, &teacher).await {}
+        let error = served.end().await.expect_err("the run ends");
+        assert!(matches!(error, Error::Teacher(_)), "{error}");
+        let told = error.to_string();
+        assert!(told.starts_with("the teacher refuses to "), "{told}");
+        assert!(told.ends_with(reason), "{told}");
+        assert!(!checkpoint::list(&directory.path().join("checkpoint")).is_empty());
+        teacher.books().refusal = None;
+        let again = Served::start(with_teacher(run, directory.path(), true, address)).await;
+        let mut toy = again.join("toy").await;
+        while play_one(&mut toy, &teacher).await {}
+        let ended = again.end().await.expect("goes on");
+        assert_eq!(Left::behind(&ended, directory.path()), expected);
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_resumed_run_finds_its_account_in_every_state_of_the_ledger() {
+    let half = config(0).stop.max_env_steps / 2;
+    // What becomes of the ledger between two runs, and the accounts that are there afterwards.
+    type Change = fn(&mut FakeTeacher);
+    let kept: Change = |_| ();
+    let lost: Change = |teacher| teacher.books().accounts.clear();
+    let put_back: Change = |teacher| {
+        if let Some(account) = teacher.books().accounts.get_mut("toy") {
+            account.spent = 0;
+        }
+    };
+    // After 5 rounds 20 episodes were charged 7 units.
+    let spent = 20 * u64::from(UNITS);
+    let renamed = format!("toy.from-{spent}");
+    for (change, expected) in [
+        (kept, vec![("toy".to_owned(), AMPLE)]),
+        (lost, vec![("toy".to_owned(), AMPLE), ("toy".to_owned(), AMPLE - spent)]),
+        (put_back, vec![("toy".to_owned(), AMPLE), (renamed, AMPLE - spent)]),
+    ] {
+        let directory = tempfile::tempdir().expect("a directory");
+        let mut teacher = FakeTeacher::default();
+        let address = teacher.serve().await;
+        let mut run = advised(0, AMPLE);
+        run.stop.max_env_steps = half;
+        let served =
+            Served::start(with_teacher(run.clone(), directory.path(), false, address)).await;
+        let mut toy = served.join("toy").await;
+        while play_one(&mut toy, &teacher).await {}
+        served.end().await.expect("the first half");
+        change(&mut teacher);
+        run.stop.max_env_steps = 2 * half;
+        let again = Served::start(with_teacher(run, directory.path(), true, address)).await;
+        again.join("toy").await;
+        again.shutdown.cancel();
+        again.end().await.expect("resumed");
+        assert_eq!(teacher.books().opened, expected);
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_run_that_is_stopped_before_its_teacher_answers_tells_its_digest() {
+    let directory = tempfile::tempdir().expect("a directory");
+    // Nobody answers there: connections are accepted and nothing is said.
+    let silent = TcpListener::bind("127.0.0.1:0").await.expect("a port");
+    let address = silent.local_addr().expect("bound");
+    let run = advised(0, AMPLE);
+    let served = Served::start(with_teacher(run, directory.path(), false, address)).await;
+    tokio::time::sleep(Duration::from_millis(100)).await;
+    served.shutdown.cancel();
+    let ended = served.end().await.expect("stopped");
+    assert!(ended.interrupted && ended.digest.len() == 64, "{ended:?}");
+}

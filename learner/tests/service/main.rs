@@ -1,0 +1,11 @@
+//! The learner as a service, with workers that play a toy: what is disturbed must not show.
+
+mod advice;
+mod disk;
+mod order;
+mod refusals;
+mod resume;
+mod run;
+mod silence;
+mod teacher;
+mod toy;

@@ -1,0 +1,154 @@
+//! A learner that dies at any moment and is resumed leaves what a calm one leaves.
+
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicUsize, Ordering};
+
+use tandem_learner::RunConfig;
+use tandem_learner::checkpoint::{self, CheckpointError};
+use tandem_learner::{Ended, Error};
+use tandem_telemetry::MetricsLog;
+use tempfile::TempDir;
+
+use crate::run::{Left, Served, calm, copy_all, learner_config};
+use crate::toy::config;
+
+async fn resume(run: RunConfig, out: &Path) -> Result<Ended, Error> {
+    Served::start(learner_config(run, out, true)).await.finish(2).await
+}
+
+/// The run directory as it was before and after every delivery of a run.
+async fn moments(run: RunConfig) -> (TempDir, Vec<PathBuf>) {
+    let keep = tempfile::tempdir().expect("a directory");
+    let out = keep.path().join("run");
+    let served = Served::start(learner_config(run, &out, false)).await;
+    let mut toy = served.join("toy").await;
+    let mut copies = Vec::new();
+    let n = AtomicUsize::new(0);
+    let mut copy = || {
+        let copy = keep.path().join(n.fetch_add(1, Ordering::Relaxed).to_string());
+        copy_all(&out, &copy);
+        copies.push(copy);
+    };
+    copy();
+    while let Some((order, episodes)) = toy.take().await {
+        copy();
+        toy.deliver(order.slot, &episodes).await.expect("taken");
+        copy();
+    }
+    served.end().await.expect("a run");
+    copy();
+    (keep, copies)
+}
+
+async fn check_every_moment(run: RunConfig, step: usize) {
+    let expected = calm(run.clone()).await;
+    let (_keep, copies) = moments(run.clone()).await;
+    assert!(copies.len() > 30, "{} moments", copies.len());
+    for (n, out) in copies.iter().enumerate().step_by(step) {
+        let ended = resume(run.clone(), out).await.expect("goes on");
+        assert_eq!(Left::behind(&ended, out), expected, "from moment {n}");
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_learner_killed_at_any_moment_goes_on_to_the_same_bits() {
+    check_every_moment(config(0), 3).await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_learner_a_round_ahead_killed_at_any_moment_goes_on_to_the_same_bits() {
+    check_every_moment(config(1), 3).await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_run_that_ends_with_a_success_rate_ends_with_the_same_one_when_resumed() {
+    let whole = calm(config(1)).await;
+    let successes: Vec<f64> = whole.rows.iter().map(|row| row.success).collect();
+    let highest = successes[..4].iter().copied().fold(0.0, f64::max);
+    assert!(highest > 0.0 && highest > successes[0], "the toy must vary: {successes:?}");
+    let mut run = config(1);
+    run.stop.until_success = highest;
+    run.stop.max_env_steps = 0;
+    let ended = calm(run.clone()).await;
+    assert!(ended.rows.last().is_some_and(|row| row.round < 16), "it ended by success");
+    check_every_moment(run, 4).await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_run_interrupted_again_and_again_goes_on_to_the_same_bits() {
+    for lag in [0, 1] {
+        let expected = calm(config(lag)).await;
+        let directory = tempfile::tempdir().expect("a directory");
+        let mut n_starts = 0;
+        let ended = loop {
+            n_starts += 1;
+            let served =
+                Served::start(learner_config(config(lag), directory.path(), n_starts > 1)).await;
+            let mut toy = served.join("toy").await;
+            for _ in 0..7 {
+                if !toy.play_one().await {
+                    break;
+                }
+            }
+            served.shutdown.cancel();
+            let ended = served.end().await.expect("saved");
+            assert_eq!(ended.digest.len(), 64, "told on interruption, too");
+            if !ended.interrupted {
+                break ended;
+            }
+        };
+        assert!(n_starts > 4, "{n_starts} starts");
+        assert_eq!(Left::behind(&ended, directory.path()), expected, "lag {lag}");
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_finished_run_is_resumed_without_workers_and_ends_as_before() {
+    let directory = tempfile::tempdir().expect("a directory");
+    let served = Served::start(learner_config(config(1), directory.path(), false)).await;
+    let ended = served.finish(2).await.expect("a run");
+    let left = Left::behind(&ended, directory.path());
+    let again = Served::start(learner_config(config(1), directory.path(), true)).await;
+    let ended = again.end().await.expect("nothing is left to do");
+    assert!(!ended.interrupted);
+    assert_eq!(Left::behind(&ended, directory.path()), left);
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_damaged_checkpoint_is_refused_until_it_is_removed() {
+    let directory = tempfile::tempdir().expect("a directory");
+    let (out, run) = (directory.path(), config(0));
+    let expected = calm(run.clone()).await;
+    Served::start(learner_config(run.clone(), out, false)).await.finish(1).await.expect("a run");
+    let newest = checkpoint::list(&out.join("checkpoint")).pop().expect("saved");
+    let mut bytes = std::fs::read(&newest).expect("readable");
+    let middle = bytes.len() / 2;
+    bytes[middle] ^= 1;
+    std::fs::write(&newest, bytes).expect("writes");
+    let refused = resume(run.clone(), out).await.expect_err("must be refused");
+    let Error::Checkpoint(CheckpointError::Damaged { path, what }) = refused else {
+        panic!("{refused}");
+    };
+    assert_eq!(path, newest);
+    assert!(what.contains("remove it to go on from"), "{what}");
+    std::fs::remove_file(&newest).expect("removes");
+    let ended = resume(run, out).await.expect("goes on from the former");
+    assert_eq!(Left::behind(&ended, out), expected);
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_new_run_does_not_overwrite_a_former_one_nor_join_a_running_one() {
+    let directory = tempfile::tempdir().expect("a directory");
+    let out = directory.path();
+    let first = Served::start(learner_config(config(0), out, false)).await;
+    first.join("toy").await;
+    let second = Served::start(learner_config(config(0), out, true)).await;
+    let refused = second.end().await.expect_err("one is at work").to_string();
+    assert!(refused.starts_with("cannot lock"), "{refused}");
+    first.finish(1).await.expect("a run");
+    let rows = MetricsLog::read_all(&out.join("metrics.jsonl")).expect("rows");
+    let anew = Served::start(learner_config(config(0), out, false)).await;
+    let refused = anew.end().await.expect_err("a run is there");
+    assert!(matches!(refused, Error::Checkpoint(CheckpointError::RunExists(_))), "{refused}");
+    assert_eq!(MetricsLog::read_all(&out.join("metrics.jsonl")).expect("rows"), rows);
+}

@@ -1,0 +1,74 @@
+//! Workers that die, and a learner whose own thread does.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
+
+use tandem_learner::{Error, LearnerConfig};
+use tandem_proto::pb;
+use tandem_proto::pb::next_work_response::Work;
+
+use crate::run::{DEADLINE, Left, Served, calm, learner_config, real_clock};
+use crate::toy::config;
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_dead_workers_slot_is_played_by_another_soon() {
+    let expected = calm(config(0)).await;
+    let directory = tempfile::tempdir().expect("a directory");
+    let served = Served::start(learner_config(config(0), directory.path(), false)).await;
+    let (mut dead, mut alive) = (served.join("dead").await, served.join("alive").await);
+    let (lost, _) = dead.take().await.expect("a slot");
+    let lost_at = tokio::time::Instant::now();
+    for _ in 0..3 {
+        assert!(alive.play_one().await, "the other slots");
+    }
+    let (order, episodes) = alive.take().await.expect("the lost slot");
+    let after = lost_at.elapsed();
+    println!("the slot was with another after {after:?}");
+    assert_eq!(order.slot, lost.slot);
+    assert!(after >= Duration::from_secs(3), "not taken from a worker that may be slow: {after:?}");
+    alive.deliver(order.slot, &episodes).await.expect("taken");
+    while alive.play_one().await {}
+    let ended = served.end().await.expect("a run");
+    assert_eq!(Left::behind(&ended, directory.path()), expected);
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_bug_in_the_learning_thread_ends_the_run_and_holds_nobody() {
+    let directory = tempfile::tempdir().expect("a directory");
+    let (broken, clock) = (Arc::new(AtomicBool::new(false)), real_clock());
+    let breaks = broken.clone();
+    let config = LearnerConfig {
+        clock: Arc::new(move || {
+            let is_learning = std::thread::current().name() == Some("learn");
+            assert!(!(is_learning && breaks.load(Ordering::Relaxed)), "a bug, for a test");
+            clock()
+        }),
+        ..learner_config(config(0), directory.path(), false)
+    };
+    let served = Served::start(config).await;
+    let (mut toy, mut idle) = (served.join("toy").await, served.join("idle").await);
+    // A watcher that never reads does not keep the process alive either.
+    let watching = idle.client.clone().watch(pb::WatchRequest {}).await.expect("watched");
+    let held: Vec<_> = [toy.take().await, idle.take().await].into_iter().flatten().collect();
+    assert_eq!(held.len(), 2);
+    broken.store(true, Ordering::Relaxed);
+    let answer = tokio::time::timeout(DEADLINE, async {
+        loop {
+            match idle.ask().await {
+                Ok(Work::Slot(_) | Work::Wait(_)) => {
+                    tokio::time::sleep(Duration::from_millis(5)).await;
+                }
+                told => break told,
+            }
+        }
+    });
+    match answer.await.expect("the worker is told in time") {
+        Ok(Work::Finished(finished)) => assert_eq!(finished.reason, "the learning thread panicked"),
+        Ok(work) => panic!("{work:?}"),
+        Err(_) => {}
+    }
+    let ended = served.end().await;
+    assert!(matches!(ended, Err(Error::Panicked)), "{ended:?}");
+    drop(watching);
+}
