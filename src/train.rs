@@ -3,41 +3,53 @@
 mod children;
 mod display;
 mod plan;
+mod restarts;
 mod summary;
+mod watch;
 
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
-use anyhow::{Context as _, anyhow};
+use anyhow::anyhow;
 use tandem_proto::pb;
-use tandem_proto::pb::learner_client::LearnerClient;
+use tokio::sync::mpsc;
 use tokio_util::sync::CancellationToken;
 
 use crate::cli::TrainArgs;
 use crate::exit::{Exit, Failed, OrExit as _};
-use crate::{services, signals};
-use children::{Children, Memory};
+use crate::{clock, services, signals};
+use children::{Broken, Children, Memory};
 use display::Display;
 use plan::Plan;
+pub(crate) use plan::shipped_teacher;
+use watch::Heard;
 
-/// How long a process may take to say where it listens; loading a checkpoint is the longest part.
+/// How long a process may take to say where it listens.
 const START_DEADLINE: Duration = Duration::from_secs(60);
 /// How long processes may take to save and end.
 const END_DEADLINE: Duration = Duration::from_secs(60);
+/// How often it is looked whether all processes live.
+const LOOK_EVERY: Duration = Duration::from_millis(100);
+/// How often it is looked how large they are.
+const MEASURE_EVERY: Duration = Duration::from_millis(500);
 
 pub(crate) fn train(args: &TrainArgs) -> Result<(), Failed> {
     let plan = Plan::of(args)?;
     plan.prepare()?;
     let runtime = services::runtime().or_exit(Exit::TryAgain, String::new)?;
     let (last, memory) = runtime.block_on(async {
-        let interrupted = signals::shutdown_token(false).or_exit(Exit::TryAgain, String::new)?;
+        let interrupted =
+            signals::shutdown_token(args.exit_with_stdin).or_exit(Exit::TryAgain, String::new)?;
         run(&plan, &interrupted).await
     })?;
-    if last.end_reason == "interrupted" {
-        summary::interrupted(&plan, &last);
-        return Err(Failed::new(Exit::Interrupted, anyhow!("interrupted")));
+    if last.end_reason == INTERRUPTED {
+        summary::interrupted(&plan);
+        return Err(Failed::new(Exit::Interrupted, anyhow!(INTERRUPTED)));
     }
     summary::print(&plan, &last, memory, args.json)
 }
+
+/// Why a run ends that somebody stopped.
+const INTERRUPTED: &str = "interrupted";
 
 /// Starts every process, watches until the run has ended, and ends every process.
 async fn run(
@@ -46,13 +58,14 @@ async fn run(
 ) -> Result<(pb::Progress, Memory), Failed> {
     let mut display = Display::new(plan);
     let mut children = Children::new(plan).or_exit(Exit::TryAgain, String::new)?;
-    let started = tokio::time::timeout(START_DEADLINE, children.start(plan));
-    started
-        .await
-        .context("a process did not say in time where it listens")
-        .and_then(|started| started)
-        .or_exit(Exit::TryAgain, || format!("cannot start; see {}", plan.log_path().display()))?;
-    let last = watch(plan, &mut children, &mut display, interrupted).await;
+    let last = tokio::select! {
+        started = start(plan, &mut children) => started,
+        () = interrupted.cancelled() => Ok(()),
+    };
+    let last = match last {
+        Ok(()) => Watch::new(plan, &mut children, &mut display).follow(interrupted).await,
+        Err(broken) => Err(broken),
+    };
     display.close();
     if interrupted.is_cancelled() {
         display.say("interrupted: saving, a second Ctrl-C ends at once");
@@ -62,69 +75,118 @@ async fn run(
         () = children.end(END_DEADLINE) => (),
         () = again.cancelled() => (),
     }
-    let last = last.or_exit(Exit::TryAgain, || broke_off(plan))?;
+    let last = match last {
+        Ok(last) => last,
+        Err(Broken { exit, error }) => {
+            return Err(Failed::new(exit, error.context(broke_off(plan, exit))));
+        }
+    };
     if last.ended && !interrupted.is_cancelled() {
         return Ok((last, children.memory()));
     }
-    Ok((pb::Progress { end_reason: "interrupted".to_owned(), ..last }, children.memory()))
+    Ok((pb::Progress { end_reason: INTERRUPTED.to_owned(), ..last }, children.memory()))
 }
 
-/// Says where to look and how to go on.
-fn broke_off(plan: &Plan) -> String {
+/// Starts every process in time.
+async fn start(plan: &Plan, children: &mut Children) -> Result<(), Broken> {
+    let started = tokio::time::timeout(START_DEADLINE, children.start(plan)).await;
+    started.unwrap_or_else(|_elapsed| {
+        Err(anyhow!("a process did not say in time where it listens").into())
+    })
+}
+
+/// Says how to go on, where that can help, and where to look.
+fn broke_off(plan: &Plan, exit: Exit) -> String {
     let (log, out) = (plan.log_path(), plan.out.display());
-    let how_to_go_on = if tandem_learner::checkpoint::list(&plan.out.join("checkpoint")).is_empty()
-    {
-        "nothing was saved yet".to_owned()
-    } else {
-        format!("go on with `tandem train --resume --out {out}`")
-    };
-    format!("the run broke off, {how_to_go_on}; see {}", log.display())
+    let log = log.display();
+    match exit {
+        Exit::TryAgain => {
+            format!("the run broke off, go on with `tandem train --resume --out {out}`; see {log}")
+        }
+        _ => format!("the run cannot go on; see {log}"),
+    }
 }
 
-/// Follows the learner's progress to its end, and keeps the workers alive.
-async fn watch(
-    plan: &Plan,
-    children: &mut Children,
-    display: &mut Display,
-    interrupted: &CancellationToken,
-) -> anyhow::Result<pb::Progress> {
-    let mut learner = LearnerClient::connect(services::uri(children.learner_address()))
-        .await
-        .context("cannot reach the learner that was just started")?;
-    let mut stream = learner.watch(pb::WatchRequest {}).await?.into_inner();
-    let mut last = pb::Progress::default();
-    let mut look = tokio::time::interval(Duration::from_millis(500));
-    loop {
-        tokio::select! {
-            message = stream.message() => match message {
-                Ok(Some(progress)) => {
-                    display.show(&progress);
-                    last = progress;
-                    if last.ended {
-                        return failed_or(last);
-                    }
-                }
-                Ok(None) => return failed_or(last),
-                Err(status) => {
-                    tokio::time::sleep(Duration::from_millis(300)).await;
-                    children.check(plan)?;
-                    return Err(anyhow!("the learner is gone: {}", status.message()));
-                }
-            },
-            _ = look.tick() => {
-                for line in children.check(plan)? {
-                    display.say(&line);
-                }
-            }
-            () = interrupted.cancelled() => return Ok(last),
+/// What is known of a run that goes on.
+struct Watch<'a> {
+    plan: &'a Plan,
+    children: &'a mut Children,
+    display: &'a mut Display,
+    last: pb::Progress,
+    /// How many streams of progress had been opened before the latest message's.
+    n_streams: u32,
+    /// Whether the learner was started again and has not been heard of since.
+    awaits_learner: bool,
+    started_at: Instant,
+    /// Seconds that the run had taken before this start; known once the learner has told.
+    wall_before_s: Option<f64>,
+}
+
+impl<'a> Watch<'a> {
+    fn new(plan: &'a Plan, children: &'a mut Children, display: &'a mut Display) -> Self {
+        Self {
+            plan,
+            children,
+            display,
+            last: pb::Progress::default(),
+            n_streams: 0,
+            awaits_learner: false,
+            started_at: clock::now(),
+            wall_before_s: None,
         }
     }
-}
 
-/// The last progress, unless the learner ended because of an error.
-fn failed_or(last: pb::Progress) -> anyhow::Result<pb::Progress> {
-    if last.ended && last.digest.is_empty() && last.end_reason != "interrupted" {
-        return Err(anyhow!("{}", last.end_reason));
+    /// Follows the learner's progress to its end, and keeps the processes alive.
+    async fn follow(mut self, interrupted: &CancellationToken) -> Result<pb::Progress, Broken> {
+        if interrupted.is_cancelled() {
+            return Ok(self.last);
+        }
+        let mut heard: mpsc::Receiver<Heard> = watch::follow(self.children.learner_address())?;
+        let mut look = tokio::time::interval(LOOK_EVERY);
+        let mut measure = tokio::time::interval(MEASURE_EVERY);
+        loop {
+            tokio::select! {
+                Some(heard) = heard.recv() => {
+                    self.hear(heard);
+                    if self.last.ended {
+                        return Ok(self.last);
+                    }
+                }
+                _ = look.tick() => {
+                    if self.look_after_processes()? {
+                        return Ok(self.last);
+                    }
+                }
+                _ = measure.tick() => self.children.sample_memory(),
+                () = interrupted.cancelled() => return Ok(self.last),
+            }
+        }
     }
-    Ok(last)
+
+    /// Takes in a message. A learner that starts, or that tells of an error as it ends, has nothing to add: what
+    /// follows from its end is decided when it has ended.
+    fn hear(&mut self, Heard { n_streams_before, progress }: Heard) {
+        let is_new = n_streams_before != self.n_streams;
+        if progress.task.is_empty() || (progress.ended && progress.digest.is_empty()) {
+            return;
+        }
+        self.n_streams = n_streams_before;
+        if self.awaits_learner && is_new {
+            self.awaits_learner = false;
+            self.display.say(&format!("the learner goes on from round {}", progress.round));
+        }
+        // A learner that was started again has forgotten the time since its last checkpoint and that of its absence.
+        let elapsed_s = self.started_at.elapsed().as_secs_f64();
+        let before_s = *self.wall_before_s.get_or_insert((progress.wall_s - elapsed_s).max(0.0));
+        self.last = pb::Progress { wall_s: before_s + elapsed_s, ..progress };
+        self.display.show(&self.last);
+    }
+
+    /// Starts dead processes again. Gives whether the learner was interrupted.
+    fn look_after_processes(&mut self) -> Result<bool, Broken> {
+        let news = self.children.check(self.plan)?;
+        news.lines.iter().for_each(|line| self.display.say(line));
+        self.awaits_learner |= news.learner_restarted;
+        Ok(news.interrupted)
+    }
 }

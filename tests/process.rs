@@ -3,8 +3,10 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};
+use std::sync::LazyLock;
 use std::time::Duration;
 
+use serde_json::Value;
 use tempfile::TempDir;
 
 /// A small advised run of 20 rounds.
@@ -31,9 +33,47 @@ fn tandem(args: &[&str], out: &Path) -> Command {
 }
 
 fn start(workers: &str, out: &Path) -> Child {
+    start_with(workers, &[], out)
+}
+
+fn start_with(workers: &str, more: &[&str], out: &Path) -> Child {
     let mut args = vec!["train", "--json", "--workers", workers];
     args.extend(SMALL);
+    args.extend(more);
     tandem(&args, out).spawn().expect("starts")
+}
+
+/// Goes on with a run to its end.
+fn resume(out: &Path) -> Output {
+    tandem(&["train", "--json", "--resume", "--workers", "2"], out).output().expect("runs")
+}
+
+/// What an undisturbed run leaves behind.
+static CALM: LazyLock<(String, Vec<Value>)> = LazyLock::new(|| {
+    let (_keep, out) = directory();
+    let digest = digest(&finish(start("2", &out)));
+    (digest, metrics(&out))
+});
+
+/// The rows of a run's metrics, without the wall time.
+fn metrics(out: &Path) -> Vec<Value> {
+    let text = fs::read_to_string(out.join("metrics.jsonl")).expect("metrics");
+    let row = |line| -> Value {
+        let mut row: Value = serde_json::from_str(line).expect("a row");
+        row.as_object_mut().expect("an object").remove("wall_s").expect("a time");
+        row
+    };
+    text.lines().map(row).collect()
+}
+
+fn check_as_calm(ended: &Output, out: &Path) {
+    assert_eq!(digest(ended), CALM.0);
+    assert_eq!(metrics(out), CALM.1);
+}
+
+/// What a run said to the person who watches it.
+fn said(ended: &Output) -> String {
+    String::from_utf8_lossy(&ended.stderr).into_owned()
 }
 
 fn finish(child: Child) -> Output {
@@ -65,15 +105,24 @@ fn pids(parent: u32, role: &str) -> Vec<u32> {
     children.split_whitespace().filter_map(|pid| pid.parse().ok()).filter(is_role).collect()
 }
 
+/// Kills a process of a run and waits until it is there again.
+fn kill_one(run: &Child, role: &str) {
+    let former = pids(run.id(), role);
+    signal("-KILL", former[0]);
+    let is_back = || pids(run.id(), role).iter().any(|pid| !former.contains(pid));
+    assert!(eventually(is_back), "the {role} is not started again");
+}
+
 /// Waits until the run directory holds a checkpoint: the run is then in full swing.
 fn wait_for_checkpoint(out: &Path) {
-    let is_saved = || {
-        let saved = fs::read_dir(out.join("checkpoint")).into_iter().flatten().flatten();
-        saved
-            .map(|entry| entry.path())
-            .any(|path| path.extension().is_some_and(|e| e == "safetensors"))
-    };
+    let is_saved = || !checkpoints(out).is_empty();
     assert!(eventually(is_saved), "no checkpoint within a minute in {}", out.display());
+}
+
+fn checkpoints(out: &Path) -> Vec<PathBuf> {
+    let saved = fs::read_dir(out.join("checkpoint")).into_iter().flatten().flatten();
+    let is_whole = |path: &PathBuf| path.extension().is_some_and(|e| e == "safetensors");
+    saved.map(|entry| entry.path()).filter(is_whole).collect()
 }
 
 /// Looks every 50 ms for a minute whether something has come true.
@@ -91,10 +140,7 @@ fn directory() -> (TempDir, PathBuf) {
 }
 
 #[test]
-fn a_disturbed_run_ends_with_the_bits_of_a_calm_one() {
-    let (_keep, out) = directory();
-    let calm = digest(&finish(start("2", &out)));
-
+fn a_run_with_dead_and_stopped_workers_ends_as_a_calm_one() {
     let (_keep, out) = directory();
     let run = start("3", &out);
     wait_for_checkpoint(&out);
@@ -102,20 +148,122 @@ fn a_disturbed_run_ends_with_the_bits_of_a_calm_one() {
     assert_eq!(workers.len(), 3);
     signal("-KILL", workers[0]);
     signal("-STOP", workers[1]);
-    let disturbed = finish(run);
-    assert_eq!(digest(&disturbed), calm, "one worker killed and one stopped");
+    check_as_calm(&finish(run), &out);
+}
 
+#[test]
+fn an_interrupted_run_goes_on_to_the_same_end() {
     let (_keep, out) = directory();
     let run = start("1", &out);
     wait_for_checkpoint(&out);
     signal("-INT", run.id());
     let interrupted = finish(run);
     assert_eq!(interrupted.status.code(), Some(130));
-    let told = String::from_utf8_lossy(&interrupted.stderr).into_owned();
+    let told = said(&interrupted);
     assert!(told.contains("tandem train --resume --out"), "{told}");
-    let resumed =
-        tandem(&["train", "--json", "--resume", "--workers", "2"], &out).output().expect("runs");
-    assert_eq!(digest(&resumed), calm, "interrupted and resumed");
+    check_as_calm(&resume(&out), &out);
+}
+
+#[test]
+fn whoever_dies_is_started_again_and_the_run_ends_as_a_calm_one() {
+    let (_keep, out) = directory();
+    let run = start("2", &out);
+    wait_for_checkpoint(&out);
+    for role in ["learner", "teacher", "worker"] {
+        kill_one(&run, role);
+    }
+    let ended = finish(run);
+    check_as_calm(&ended, &out);
+    let told = said(&ended);
+    for line in [
+        "the learner was killed by signal 9 and is started again",
+        "the learner goes on from round",
+        "the teacher was killed by signal 9 and is started again",
+        "was killed by signal 9 and is started again",
+    ] {
+        assert!(told.lines().any(|said| said.contains(line)), "{line:?} is not in {told}");
+    }
+    let summary = String::from_utf8_lossy(&ended.stdout);
+    assert!(summary.contains("\"env_steps\":16000,"), "{summary}");
+}
+
+#[test]
+fn a_learner_that_dies_before_its_first_checkpoint_starts_over() {
+    let (_keep, out) = directory();
+    let run = start_with("2", &["--set", "checkpoint.every_rounds=1000"], &out);
+    let is_under_way = || fs::metadata(out.join("metrics.jsonl")).is_ok_and(|file| file.len() > 0);
+    assert!(eventually(is_under_way));
+    kill_one(&run, "learner");
+    let ended = finish(run);
+    check_as_calm(&ended, &out);
+    assert!(said(&ended).contains("the learner goes on from round 0"), "{}", said(&ended));
+}
+
+#[test]
+fn processes_that_stand_still_for_a_while_are_left_alone() {
+    let (_keep, out) = directory();
+    let run = start("2", &out);
+    wait_for_checkpoint(&out);
+    for role in ["learner", "teacher", "worker"] {
+        let pid = pids(run.id(), role)[0];
+        signal("-STOP", pid);
+        std::thread::sleep(Duration::from_millis(700));
+        signal("-CONT", pid);
+    }
+    let ended = finish(run);
+    check_as_calm(&ended, &out);
+    assert!(!said(&ended).contains("started again"), "{}", said(&ended));
+}
+
+#[test]
+fn a_process_that_does_not_get_going_is_given_up() {
+    let (_keep, out) = directory();
+    let run = start("2", &out);
+    wait_for_checkpoint(&out);
+    for _ in 0..4 {
+        kill_one(&run, "teacher");
+    }
+    signal("-KILL", pids(run.id(), "teacher")[0]);
+    let given_up = finish(run);
+    assert_eq!(given_up.status.code(), Some(75));
+    let told = said(&given_up);
+    let last = told.lines().last().expect("a line");
+    assert!(last.contains("the teacher died 5 times in a row"), "{told}");
+    assert!(last.contains("tandem train --resume --out"), "{told}");
+    check_as_calm(&resume(&out), &out);
+}
+
+#[test]
+fn an_interruption_ends_a_run_whose_teacher_is_away() {
+    let (_keep, out) = directory();
+    let run = start("1", &out);
+    wait_for_checkpoint(&out);
+    signal("-STOP", pids(run.id(), "teacher")[0]);
+    std::thread::sleep(Duration::from_millis(500));
+    signal("-INT", run.id());
+    let interrupted = finish(run);
+    assert_eq!(interrupted.status.code(), Some(130), "{}", said(&interrupted));
+    assert!(said(&interrupted).contains("tandem train --resume --out"), "{}", said(&interrupted));
+    check_as_calm(&resume(&out), &out);
+}
+
+#[test]
+fn a_learner_that_cannot_go_on_ends_the_run_with_its_own_words() {
+    let (_keep, out) = directory();
+    let run = start("1", &out);
+    wait_for_checkpoint(&out);
+    let learner = pids(run.id(), "learner")[0];
+    signal("-STOP", learner);
+    for checkpoint in checkpoints(&out) {
+        fs::write(checkpoint, "no checkpoint").expect("writable");
+    }
+    signal("-KILL", learner);
+    let ended = finish(run);
+    let told = said(&ended);
+    assert_eq!(ended.status.code(), Some(65), "{told}");
+    assert_eq!(told.matches("started again").count(), 1, "{told}");
+    let last = told.lines().last().expect("a line");
+    assert!(last.contains("the learner ended with exit code 65: checkpoint"), "{told}");
 }
 
 #[test]
@@ -137,7 +285,7 @@ fn children_end_with_their_parent_however_it_dies() {
 fn services_say_where_they_listen_and_end_on_sigterm() {
     let policy = Path::new(env!("CARGO_MANIFEST_DIR")).join("policies/teacher-push.safetensors");
     let mut teacher = Command::new(env!("CARGO_BIN_EXE_tandem"))
-        .args(["teacher", "--policy"])
+        .args(["teacher", "--ledger", "memory", "--policy"])
         .arg(policy)
         .stdout(Stdio::piped())
         .stderr(Stdio::null())

@@ -3,29 +3,36 @@
 //! Each child watches its standard input and ends, saved, when that closes; so they end with this process however it
 //! dies. Their log lines go to the run's `tandem.log`.
 
+use std::ffi::OsString;
 use std::fs::{File, OpenOptions};
+use std::io::{Read as _, Seek as _, SeekFrom};
+use std::os::unix::process::ExitStatusExt as _;
 use std::path::{Path, PathBuf};
-use std::process::Stdio;
-use std::time::Duration;
+use std::process::{ExitStatus, Stdio};
+use std::time::{Duration, Instant};
 
-use anyhow::{Context as _, anyhow, bail};
+use anyhow::{Context as _, anyhow};
 use tokio::io::{AsyncBufReadExt as _, BufReader};
 use tokio::process::{Child, Command};
+use tokio::task::JoinSet;
 
 use super::plan::Plan;
+use super::restarts::{End, Restarts, Role, Verdict};
+use crate::clock;
+use crate::exit::Exit;
 
 /// How long teacher and workers may take to end once the learner has.
 const GRACE: Duration = Duration::from_secs(5);
-/// Failures of one worker after which the run is given up.
-const MAX_WORKER_FAILURES: u32 = 10;
 
 pub(crate) struct Children {
     program: PathBuf,
     log: File,
     log_path: PathBuf,
-    teacher: Option<(Child, String)>,
-    learner: Option<(Child, String)>,
-    workers: Vec<Worker>,
+    /// Where the services listen; they do so again after a restart.
+    teacher_address: Option<String>,
+    learner_address: String,
+    /// The teacher, if there is one, the learner, the workers.
+    processes: Vec<Process>,
     peak: Memory,
 }
 
@@ -37,11 +44,43 @@ pub(crate) struct Memory {
     pub(crate) worker_mib: u64,
 }
 
-struct Worker {
-    child: Child,
+/// Why a run cannot go on.
+#[derive(Debug)]
+pub(crate) struct Broken {
+    pub(crate) exit: Exit,
+    pub(crate) error: anyhow::Error,
+}
+
+impl From<anyhow::Error> for Broken {
+    fn from(error: anyhow::Error) -> Self {
+        Self { exit: Exit::TryAgain, error }
+    }
+}
+
+/// What there is to tell about the processes.
+#[derive(Debug, Default)]
+pub(crate) struct News {
+    /// One line an event.
+    pub(crate) lines: Vec<String>,
+    /// Whether the learner was started again.
+    pub(crate) learner_restarted: bool,
+    /// Whether somebody asked the learner to end, and it did.
+    pub(crate) interrupted: bool,
+}
+
+struct Process {
+    role: Role,
     name: String,
-    n_failures: u32,
-    finished: bool,
+    state: State,
+    restarts: Restarts,
+    started_at: Instant,
+    /// Where its lines in the log begin.
+    log_from: u64,
+}
+
+enum State {
+    Runs(Child),
+    Waits { until: Instant, end: End },
 }
 
 impl Children {
@@ -54,80 +93,55 @@ impl Children {
             program,
             log,
             log_path: path,
-            teacher: None,
-            learner: None,
-            workers: Vec::new(),
+            teacher_address: None,
+            learner_address: String::new(),
+            processes: Vec::new(),
             peak: Memory::default(),
         })
     }
 
     /// Starts teacher, learner and workers, in this order.
-    pub(crate) async fn start(&mut self, plan: &Plan) -> anyhow::Result<()> {
+    pub(crate) async fn start(&mut self, plan: &Plan) -> Result<(), Broken> {
         if plan.teacher.is_some() {
-            let policy = plan.teacher_copy();
-            let args = [
-                "teacher".into(),
-                "--exit-with-stdin".into(),
-                "--policy".into(),
-                policy.into_os_string(),
-            ];
-            self.teacher = Some(self.service("teacher", &args).await?);
+            let address = self.start_service(Role::Teacher, &teacher_args(plan)).await?;
+            self.teacher_address = Some(address);
         }
-        let mut args: Vec<std::ffi::OsString> = vec!["learner".into(), "--exit-with-stdin".into()];
-        args.extend(["--run".into(), plan.run_file().into_os_string()]);
-        args.extend(["--out".into(), plan.out.clone().into_os_string()]);
-        if let Some((_, address)) = &self.teacher {
-            args.extend(["--teacher".into(), address.into()]);
-        }
-        if plan.resume {
-            args.push("--resume".into());
-        }
-        self.learner = Some(self.service("learner", &args).await?);
+        let args = self.learner_args(plan, plan.resume);
+        self.learner_address = self.start_service(Role::Learner, &args).await?;
         for number in 1..=plan.n_workers {
             let name = format!("worker-{number}");
-            let child = self.worker(plan, &name)?;
-            self.workers.push(Worker { child, name, n_failures: 0, finished: false });
+            let args = self.worker_args(plan, &name);
+            self.processes.push(self.spawn(Role::Worker, name, &args, Stdio::null())?);
         }
         Ok(())
     }
 
     pub(crate) fn learner_address(&self) -> &str {
-        self.learner.as_ref().map_or("", |(_, address)| address)
+        &self.learner_address
     }
 
-    /// Looks after the processes: starts dead workers again and says so.
+    /// Looks after the processes: starts again those that have died.
     ///
     /// # Errors
-    /// When a process that cannot be replaced has died, or a worker dies again and again.
-    pub(crate) fn check(&mut self, plan: &Plan) -> anyhow::Result<Vec<String>> {
-        for (role, service) in [("teacher", &mut self.teacher), ("learner", &mut self.learner)] {
-            if let Some((child, _)) = service
-                && let Some(status) = child.try_wait()?
-                && !(role == "learner" && status.success())
+    /// When one has died that is not to be started again.
+    pub(crate) fn check(&mut self, plan: &Plan) -> Result<News, Broken> {
+        let mut news = News::default();
+        for idx in 0..self.processes.len() {
+            let process = &mut self.processes[idx];
+            if let State::Runs(child) = &mut process.state
+                && let Some(status) = child.try_wait().context("cannot look after a process")?
             {
-                bail!("the {role} died ({status})");
+                process.has_ended(status, &self.log_path, &mut news)?;
+            }
+            if let State::Waits { until, end } = process.state
+                && until <= clock::now()
+            {
+                news.lines.push(format!("{} {end} and is started again", process.name));
+                news.learner_restarted |= process.role == Role::Learner;
+                self.start_again(idx, plan)?;
             }
         }
-        self.sample_memory();
-        let mut said = Vec::new();
-        for idx in 0..self.workers.len() {
-            let worker = &mut self.workers[idx];
-            let Some(status) = worker.child.try_wait()?.filter(|_| !worker.finished) else {
-                continue;
-            };
-            worker.finished = status.success();
-            if worker.finished {
-                continue;
-            }
-            worker.n_failures += 1;
-            let name = worker.name.clone();
-            if worker.n_failures >= MAX_WORKER_FAILURES {
-                bail!("{name} died {MAX_WORKER_FAILURES} times, last with {status}");
-            }
-            said.push(format!("{name} died ({status}) and is started again"));
-            self.workers[idx].child = self.worker(plan, &name)?;
-        }
-        Ok(said)
+        Ok(news)
     }
 
     /// The largest sizes seen so far.
@@ -135,78 +149,130 @@ impl Children {
         self.peak
     }
 
-    fn sample_memory(&mut self) {
-        let service = |service: &Option<(Child, String)>| {
-            service.as_ref().map_or(0, |(child, _)| peak_resident_mib(child))
-        };
-        let workers = self.workers.iter().map(|worker| peak_resident_mib(&worker.child));
-        self.peak = Memory {
-            learner_mib: self.peak.learner_mib.max(service(&self.learner)),
-            teacher_mib: self.peak.teacher_mib.max(service(&self.teacher)),
-            worker_mib: workers.fold(self.peak.worker_mib, u64::max),
-        };
+    /// Looks how large the processes are.
+    pub(crate) fn sample_memory(&mut self) {
+        for process in &self.processes {
+            let State::Runs(child) = &process.state else { continue };
+            let peak = match process.role {
+                Role::Teacher => &mut self.peak.teacher_mib,
+                Role::Learner => &mut self.peak.learner_mib,
+                Role::Worker => &mut self.peak.worker_mib,
+            };
+            *peak = peak_resident_mib(child).max(*peak);
+        }
     }
 
     /// Closes every child's standard input and waits for their end; what then still runs is killed. The learner, which
-    /// saves, has until `deadline`.
+    /// saves, has until `deadline`; the teacher, whom it settles with, ends after it.
     pub(crate) async fn end(&mut self, deadline: Duration) {
-        let mut others: Vec<Child> = self.workers.drain(..).map(|worker| worker.child).collect();
-        others.extend(self.teacher.take().map(|(child, _)| child));
-        for child in &mut others {
-            drop(child.stdin.take());
+        let mut learner = None;
+        let mut teacher = None;
+        let mut workers = JoinSet::new();
+        for process in self.processes.drain(..) {
+            let State::Runs(child) = process.state else { continue };
+            match process.role {
+                Role::Learner => learner = Some(child),
+                Role::Teacher => teacher = Some(child),
+                Role::Worker => drop(workers.spawn(end_within(child, GRACE))),
+            }
         }
-        if let Some((learner, _)) = self.learner.take() {
+        if let Some(learner) = learner {
             end_within(learner, deadline).await;
         }
-        for child in others {
-            end_within(child, GRACE).await;
+        if let Some(teacher) = teacher {
+            end_within(teacher, GRACE).await;
         }
-    }
-
-    fn worker(&self, plan: &Plan, name: &str) -> anyhow::Result<Child> {
-        let mut command = self.command()?;
-        command.args([
-            "worker",
-            "--exit-with-stdin",
-            "--name",
-            name,
-            "--connect",
-            self.learner_address(),
-            "--log-dir",
-        ]);
-        command.arg(plan.out.join("mcap"));
-        if let Some((_, address)) = &self.teacher {
-            command.args(["--teacher", address]);
-        }
-        command.stdout(Stdio::null()).spawn().with_context(|| format!("cannot start {name}"))
+        workers.join_all().await;
     }
 
     /// Starts a service and waits for the line that says where it listens.
-    async fn service(
-        &self,
-        role: &str,
-        args: &[std::ffi::OsString],
-    ) -> anyhow::Result<(Child, String)> {
-        let mut command = self.command()?;
-        let mut child = command
-            .args(args)
-            .stdout(Stdio::piped())
-            .spawn()
-            .with_context(|| format!("cannot start the {role}"))?;
-        let output =
-            child.stdout.take().ok_or_else(|| anyhow!("the {role} has no standard output"))?;
+    async fn start_service(&mut self, role: Role, args: &[OsString]) -> Result<String, Broken> {
+        let name = format!("the {}", role.name());
+        let mut process = self.spawn(role, name, args, Stdio::piped())?;
+        let name = &process.name;
+        let State::Runs(child) = &mut process.state else {
+            return Err(anyhow!("{name} is not running").into());
+        };
+        let output = child.stdout.take().ok_or_else(|| anyhow!("{name} cannot be heard"))?;
         let mut line = String::new();
-        BufReader::new(output).read_line(&mut line).await?;
-        match line.trim().strip_prefix("listening on ") {
-            Some(address) => Ok((child, address.to_owned())),
-            None => {
-                let status = child.wait().await?;
-                bail!(
-                    "the {role} ended ({status}) before it listened: {}",
-                    last_words(&self.log_path)
-                )
-            }
+        let read = BufReader::new(output).read_line(&mut line).await;
+        read.with_context(|| format!("{name} cannot be heard"))?;
+        let Some(address) = line.trim().strip_prefix("listening on ") else {
+            let status = child.wait().await.context("cannot look after a process")?;
+            let told = last_words(&self.log_path, process.log_from);
+            let error = anyhow!("{name} {}: {told}", how_ended(status));
+            return Err(Broken { exit: exit_of(how_ended(status)), error });
+        };
+        let address = address.to_owned();
+        self.processes.push(process);
+        Ok(address)
+    }
+
+    /// Starts a process where its predecessor was: others find it there, and nobody has to be told where it listens.
+    fn start_again(&mut self, idx: usize, plan: &Plan) -> anyhow::Result<()> {
+        let (role, name) = (self.processes[idx].role, self.processes[idx].name.clone());
+        let mut args = match role {
+            Role::Teacher => teacher_args(plan),
+            Role::Learner => self.learner_args(plan, true),
+            Role::Worker => self.worker_args(plan, &name),
+        };
+        let address = match role {
+            Role::Teacher => self.teacher_address.as_deref(),
+            Role::Learner => Some(self.learner_address.as_str()),
+            Role::Worker => None,
+        };
+        if let Some(address) = address {
+            args.extend(["--listen".into(), address.into()]);
         }
+        let former = &mut self.processes[idx].restarts;
+        let restarts = std::mem::replace(former, Restarts::new(role));
+        let process = self.spawn(role, name, &args, Stdio::null())?;
+        self.processes[idx] = Process { restarts, ..process };
+        Ok(())
+    }
+
+    fn learner_args(&self, plan: &Plan, resume: bool) -> Vec<OsString> {
+        let mut args: Vec<OsString> = vec!["learner".into(), "--exit-with-stdin".into()];
+        args.extend(["--run".into(), plan.run_file().into_os_string()]);
+        args.extend(["--out".into(), plan.out.clone().into_os_string()]);
+        if let Some(address) = &self.teacher_address {
+            args.extend(["--teacher".into(), address.into()]);
+        }
+        if resume {
+            args.push("--resume".into());
+        }
+        args
+    }
+
+    fn worker_args(&self, plan: &Plan, name: &str) -> Vec<OsString> {
+        let mut args: Vec<OsString> =
+            vec!["worker".into(), "--exit-with-stdin".into(), "--name".into(), name.into()];
+        args.extend(["--connect".into(), self.learner_address.clone().into()]);
+        args.extend(["--log-dir".into(), plan.out.join("mcap").into_os_string()]);
+        if let Some(address) = &self.teacher_address {
+            args.extend(["--teacher".into(), address.into()]);
+        }
+        args
+    }
+
+    fn spawn(
+        &self,
+        role: Role,
+        name: String,
+        args: &[OsString],
+        stdout: Stdio,
+    ) -> anyhow::Result<Process> {
+        let log_from = self.log.metadata().map_or(0, |metadata| metadata.len());
+        let child = self.command()?.args(args).stdout(stdout).spawn();
+        let child = child.with_context(|| format!("cannot start {name}"))?;
+        Ok(Process {
+            role,
+            name,
+            state: State::Runs(child),
+            restarts: Restarts::new(role),
+            started_at: clock::now(),
+            log_from,
+        })
     }
 
     fn command(&self) -> anyhow::Result<Command> {
@@ -218,6 +284,59 @@ impl Children {
             .stdin(Stdio::piped())
             .stderr(self.log.try_clone()?);
         Ok(command)
+    }
+}
+
+impl Process {
+    /// Notes that the process has ended, and decides what follows.
+    fn has_ended(&mut self, status: ExitStatus, log: &Path, news: &mut News) -> Result<(), Broken> {
+        let end = how_ended(status);
+        let lived = clock::now().saturating_duration_since(self.started_at);
+        let name = &self.name;
+        match self.restarts.ended(end, lived) {
+            Verdict::Again { after } => {
+                self.state = State::Waits { until: clock::now() + after, end };
+                Ok(())
+            }
+            Verdict::Interrupted => {
+                news.interrupted = true;
+                Ok(())
+            }
+            Verdict::Final(exit) => {
+                let error = anyhow!("{name} {end}: {}", last_words(log, self.log_from));
+                Err(Broken { exit, error })
+            }
+            Verdict::GivenUp { n_times } => {
+                let error = anyhow!("{name} died {n_times} times in a row; the last time it {end}");
+                let error = match end {
+                    End::Code(_) => anyhow!("{error}: {}", last_words(log, self.log_from)),
+                    End::Signal(_) => error,
+                };
+                Err(error.into())
+            }
+        }
+    }
+}
+
+fn teacher_args(plan: &Plan) -> Vec<OsString> {
+    let policy = plan.teacher_copy().into_os_string();
+    let ledger = plan.out.join("ledger.sqlite").into_os_string();
+    let mut args: Vec<OsString> = vec!["teacher".into(), "--exit-with-stdin".into()];
+    args.extend(["--policy".into(), policy, "--ledger".into(), ledger]);
+    args
+}
+
+fn how_ended(status: ExitStatus) -> End {
+    status.code().map_or_else(|| End::Signal(status.signal().unwrap_or_default()), End::Code)
+}
+
+/// The exit code that passes on why a process did not start.
+const fn exit_of(end: End) -> Exit {
+    match end {
+        End::Code(64) => Exit::Usage,
+        End::Code(65) => Exit::Data,
+        End::Code(70) => Exit::Bug,
+        _ => Exit::TryAgain,
     }
 }
 
@@ -239,8 +358,14 @@ fn peak_resident_mib(child: &Child) -> u64 {
     kib.unwrap_or(0) / 1024
 }
 
-/// The last line of the log, which is what a dying process says.
-fn last_words(log: &Path) -> String {
-    let text = std::fs::read_to_string(log).unwrap_or_default();
-    text.lines().last().unwrap_or("it said nothing").to_owned()
+/// What a process said as it ended: the last line from `log_from` on that is meant for a person.
+fn last_words(log: &Path, log_from: u64) -> String {
+    let mut bytes = Vec::new();
+    let read = File::open(log).and_then(|mut log| {
+        log.seek(SeekFrom::Start(log_from))?;
+        log.read_to_end(&mut bytes)
+    });
+    let text = if read.is_ok() { String::from_utf8_lossy(&bytes) } else { "".into() };
+    let told = text.lines().rev().find_map(|line| line.strip_prefix("tandem: "));
+    told.unwrap_or("it did not say why").to_owned()
 }

@@ -16,6 +16,7 @@ pub(crate) struct Display {
     until: Until,
     told_at_s: f64,
     told_evaluation: Option<u64>,
+    told_warning: String,
 }
 
 struct Live {
@@ -44,6 +45,7 @@ impl Display {
             until,
             told_at_s: -PLAIN_EVERY_S,
             told_evaluation: None,
+            told_warning: String::new(),
         };
         let config = &plan.config;
         display.say(&format!(
@@ -61,6 +63,10 @@ impl Display {
     pub(crate) fn show(&mut self, progress: &pb::Progress) {
         if progress.task.is_empty() {
             return;
+        }
+        if progress.warning != self.told_warning {
+            self.told_warning.clone_from(&progress.warning);
+            self.say(&warning_line(progress));
         }
         if let Some(evaluation) = &progress.evaluation
             && self.told_evaluation != Some(evaluation.round)
@@ -170,6 +176,14 @@ fn counts_line(progress: &pb::Progress) -> String {
     )
 }
 
+fn warning_line(progress: &pb::Progress) -> String {
+    let clock = clock_text(progress.wall_s);
+    match progress.warning.as_str() {
+        "" => format!("{clock} what was wrong is mended"),
+        warning => format!("{clock} warning: {warning}"),
+    }
+}
+
 fn evaluation_line(progress: &pb::Progress, evaluation: &pb::Evaluation) -> String {
     format!(
         "{} success {:.3} [{:.3}, {:.3}] at {} env steps; joint {:.3}, contacts {:.3}, mean Q {:.2}, advice {} of {}",
@@ -212,6 +226,15 @@ pub(crate) fn grouped(number: u64) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_warning_is_told_and_its_end_too() {
+        let of = |warning: &str| {
+            warning_line(&pb::Progress { warning: warning.to_owned(), ..Default::default() })
+        };
+        assert_eq!(of("the disk is full"), "00:00 warning: the disk is full");
+        assert_eq!(of(""), "00:00 what was wrong is mended");
+    }
 
     #[test]
     fn numbers_and_times_are_written_for_people() {

@@ -52,11 +52,8 @@ impl Plan {
                 "{shown} holds a run already: go on with it by `tandem train --resume --out {shown}`, or choose another --out"
             )));
         }
-        if self.resume && tandem_learner::checkpoint::list(&out.join("checkpoint")).is_empty() {
-            return Err(Failed::usage(format!(
-                "{} has no checkpoint to go on from",
-                out.display()
-            )));
+        if self.resume && !holds_a_run {
+            return Err(Failed::usage(format!("{} holds no run to go on with", out.display())));
         }
         let failed = || format!("cannot write to {}", out.display());
         std::fs::create_dir_all(out.join("policy")).or_exit(Exit::TryAgain, failed)?;
@@ -171,7 +168,7 @@ fn teacher_path(args: &TrainArgs, config: &RunConfig, out: &Path) -> Result<Path
 }
 
 /// The teacher that ships: beside the caller, beside the program, or in the program's source tree.
-fn shipped_teacher(task: &str) -> Result<PathBuf, Failed> {
+pub(crate) fn shipped_teacher(task: &str) -> Result<PathBuf, Failed> {
     let name = format!("policies/teacher-{task}.safetensors");
     let beside_program =
         std::env::current_exe().ok().and_then(|exe| Some(exe.parent()?.join(&name)));

@@ -67,9 +67,16 @@ pub(super) fn print(
 
 /// Says how to go on with an interrupted run.
 #[expect(clippy::print_stderr, reason = "the line that resumes")]
-pub(super) fn interrupted(plan: &Plan, last: &pb::Progress) {
+pub(super) fn interrupted(plan: &Plan) {
     let out = plan.out.display();
-    eprintln!("interrupted after round {}; the state is saved. Go on with:", last.round);
+    let saved = tandem_learner::checkpoint::list(&plan.out.join("checkpoint"));
+    let round = saved.last().and_then(|path| path.file_stem()?.to_str()?.parse::<u64>().ok());
+    match round {
+        Some(round) => {
+            eprintln!("interrupted; the state after round {round} is saved. Go on with:");
+        }
+        None => eprintln!("interrupted before anything was saved. Start over with:"),
+    }
     eprintln!("  tandem train --resume --out {out}");
 }
 

@@ -187,7 +187,7 @@ impl Teacher {
         let request = pb::AdviseRequest { account: account.to_owned(), steps };
         // A stream that failed or was abandoned half-way is not put back: its next answer could be to an older question.
         let stream = self.stream.take();
-        let (stream, answer) = within(self.patience.answer, self.exchange(stream, request)).await?;
+        let (stream, answer) = within(self.patience.advice, self.exchange(stream, request)).await?;
         self.stream = Some(stream);
         expect_same("steps", queries.len() as u64, answer.steps.len() as u64)?;
         let decode = |advice| tandem_proto::decode_advice(advice, layout);

@@ -8,12 +8,14 @@ use std::path::{Path, PathBuf};
 use std::str::FromStr;
 
 use tandem_core::layout::EPISODE_STEPS;
-use tandem_core::reward::sparse_reward;
+use tandem_core::reward::{achieved_goal, sparse_reward};
 use tandem_core::rng::{Stream, episode_rng};
 use tandem_core::work::{EpisodeOrder, RunTerms, WorldTerms};
-use tandem_core::{Episode, EpisodeKind};
+use tandem_core::{Episode, EpisodeKind, Layout};
 use tandem_sim::{Env, SimError};
-use tandem_telemetry::{EpisodeMetadata, EpisodeRecorder, TransitionRecord};
+use tandem_telemetry::{
+    EpisodeLog, EpisodeMetadata, EpisodeRecorder, LoggedTransition, TransitionRecord,
+};
 
 use crate::rollout::{starts, world_config};
 
@@ -39,6 +41,23 @@ pub enum RecordError {
         /// The first step before which the observation is another one; 0 is the start.
         step: usize,
     },
+    /// A log's episode, played again, takes another course than the log tells.
+    #[error("step {step}: {field}[{component}] is {logged} in the log, {played} when played again")]
+    Differs {
+        /// The first step that differs, from 0; the number of steps stands for the end of the episode.
+        step: usize,
+        /// Which of the step's vectors.
+        field: &'static str,
+        /// Index within the vector.
+        component: usize,
+        /// The log's number.
+        logged: f32,
+        /// The number that the simulator gives.
+        played: f32,
+    },
+    /// The log has no step that could be compared.
+    #[error("the log holds no step")]
+    NoSteps,
     /// The log's metadata do not describe a world.
     #[error("metadata entry {key:?} of the world is {got:?}, expected a number")]
     Metadata {
@@ -125,7 +144,9 @@ pub fn record_episode(
     for step_idx in 0..EPISODE_STEPS {
         check_repeats(&world, episode, step_idx)?;
         record_step(&mut recorder, &world, episode, step_idx)?;
-        world.step(episode.action(step_idx))?;
+        if world.step(episode.action(step_idx))? != episode.contacts[step_idx] {
+            return Err(RecordError::Diverged { episode: episode.number, step: step_idx + 1 });
+        }
     }
     check_repeats(&world, episode, EPISODE_STEPS)?;
     recorder.record_outcome(&world.scene(), episode.observation(EPISODE_STEPS))?;
@@ -169,6 +190,65 @@ fn check_repeats(world: &Env, episode: &Episode, step_idx: usize) -> Result<(), 
     } else {
         Err(RecordError::Diverged { episode: episode.number, step: step_idx })
     }
+}
+
+/// Plays a log's actions again and compares, bit for bit, whatever the simulator gives with what the log holds:
+/// observations, goals, contacts and rewards. A log that is cut short is compared as far as it goes.
+///
+/// # Errors
+/// [`RecordError::Differs`] names the first number that is another one; the others say that the log's world cannot be
+/// built or broke.
+pub fn replay_log(log: &EpisodeLog) -> Result<(), RecordError> {
+    if log.transitions.is_empty() {
+        return Err(RecordError::NoSteps);
+    }
+    let layout = log.metadata.layout;
+    let mut world = world_of(&log.metadata)?;
+    let mut observation = vec![0.0; layout.n_observation()];
+    world.observe(&mut observation);
+    for (step_idx, logged) in log.transitions.iter().enumerate() {
+        compare(step_idx, "observation", &logged.observation, &observation)?;
+        compare(step_idx, "goal", &logged.goal, world.goal())?;
+        let contacts = world.step(&logged.action)?;
+        world.observe(&mut observation);
+        let [logged_contacts, contacts] = [logged.contacts, contacts].map(|c| [c.bits().into()]);
+        compare(step_idx, "contacts", &logged_contacts, &contacts)?;
+        compare_rewards(step_idx, logged, layout, &observation)?;
+    }
+    let last_observation = log.last_observation.as_deref();
+    last_observation.map_or(Ok(()), |last_observation| {
+        compare(log.transitions.len(), "observation", last_observation, &observation)
+    })
+}
+
+/// Compares the rewards of a step after which `observation` was made.
+fn compare_rewards(
+    step_idx: usize,
+    logged: &LoggedTransition,
+    layout: Layout,
+    observation: &[f32],
+) -> Result<(), RecordError> {
+    let achieved: Vec<f32> = achieved_goal(layout, observation).collect();
+    compare(step_idx, "reward", &[logged.reward], &[sparse_reward(&achieved, &logged.goal)])?;
+    let arm_reward = |arm| {
+        let part = layout.goal_of(arm);
+        sparse_reward(&achieved[part.clone()], &logged.goal[part])
+    };
+    let played: Vec<f32> = layout.arms().map(arm_reward).collect();
+    compare(step_idx, "rewards_per_arm", &logged.rewards_per_arm, &played)
+}
+
+fn compare(
+    step: usize,
+    field: &'static str,
+    logged: &[f32],
+    played: &[f32],
+) -> Result<(), RecordError> {
+    let pairs = logged.iter().zip(played).enumerate();
+    let mut different = pairs.filter(|(_, (logged, played))| logged.to_bits() != played.to_bits());
+    different.next().map_or(Ok(()), |(component, (logged, played))| {
+        Err(RecordError::Differs { step, field, component, logged: *logged, played: *played })
+    })
 }
 
 #[cfg(test)]

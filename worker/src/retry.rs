@@ -13,10 +13,12 @@ pub struct Patience {
     pub first_pause: Duration,
     /// The pause does not grow beyond this.
     pub longest_pause: Duration,
-    /// For an answer to a call; one that takes longer counts as failed.
+    /// For the learner's answer to a call; one that takes longer counts as failed.
     pub answer: Duration,
     /// For the answer to a request for work, which the learner holds back for some seconds when it has none.
     pub work: Duration,
+    /// For the teacher's advice, which takes milliseconds: an episode stands still meanwhile.
+    pub advice: Duration,
     /// For the slot in hand to be played and delivered once the worker has been told to stop.
     pub drain: Duration,
 }
@@ -25,9 +27,10 @@ impl Default for Patience {
     fn default() -> Self {
         Self {
             first_pause: Duration::from_millis(50),
-            longest_pause: Duration::from_secs(5),
+            longest_pause: Duration::from_secs(1),
             answer: Duration::from_secs(20),
-            work: Duration::from_secs(60),
+            work: Duration::from_secs(20),
+            advice: Duration::from_secs(5),
             drain: Duration::from_secs(5),
         }
     }

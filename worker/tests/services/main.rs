@@ -20,6 +20,7 @@ const PATIENCE: Patience = Patience {
     longest_pause: Duration::from_millis(10),
     answer: Duration::from_secs(20),
     work: Duration::from_secs(20),
+    advice: Duration::from_secs(20),
     drain: Duration::from_millis(20),
 };
 
@@ -143,7 +144,7 @@ async fn a_teacher_that_never_answers_is_asked_again() {
     let (learner, teacher) = (Arc::new(FakeLearner::new(orders())), Arc::new(teacher));
     let (learner_server, teacher_server) = (Server::learner(&learner), Server::teacher(&teacher));
     let config = config(&learner_server, Some(&teacher_server));
-    let patience = Patience { answer: Duration::from_millis(40), ..PATIENCE };
+    let patience = Patience { advice: Duration::from_millis(40), ..PATIENCE };
     run_with(config, patience, CancellationToken::new()).await.expect("the run ends");
     assert_eq!(learner.episodes(), expected);
 }

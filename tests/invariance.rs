@@ -1,0 +1,141 @@
+//! The same run file and seed give the same bits, however many workers play, also where the budget runs out.
+
+use std::fs;
+use std::path::Path;
+use std::process::{Command, Stdio};
+
+use serde_json::Value;
+
+const STRATEGIES: [&str; 4] = ["ea", "eamc:0.1", "mc-q:0.1", "mc-act:0.1"];
+const N_WORKERS: [usize; 4] = [1, 2, 5, 16];
+/// Runs out in the middle of the run, for every strategy.
+const BUDGET: u64 = 1_700;
+/// Twelve rounds of sixteen slots, so that sixteen workers have something to do; the policy is judged after each.
+const SMALL: [&str; 18] = [
+    "--max-env-steps",
+    "9600",
+    "--set",
+    "advice.share=1",
+    "--set",
+    "rounds.slots=16",
+    "--set",
+    "rounds.rollouts=1",
+    "--set",
+    "rounds.updates_per_env_step=0.05",
+    "--set",
+    "ddpg.n_hidden=32",
+    "--set",
+    "evaluation.episodes=2",
+    "--set",
+    "evaluation.every_env_steps=800",
+    "--set",
+    "checkpoint.every_rounds=100",
+];
+
+/// What a run left behind that must not depend on who played it.
+#[derive(Debug, PartialEq)]
+struct Left {
+    digest: String,
+    best_policy: String,
+    /// Without the wall time.
+    metrics: Vec<Value>,
+}
+
+#[test]
+fn one_worker_and_five_give_the_same_bits_with_every_strategy() {
+    for strategy in STRATEGIES {
+        check(strategy, 1, &[1, 5]);
+    }
+}
+
+#[test]
+fn sixteen_workers_give_the_bits_of_two_with_either_lag() {
+    check("eamc:0.1", 0, &[2, 16]);
+    check("eamc:0.1", 1, &[2, 16]);
+}
+
+#[test]
+#[ignore = "takes five minutes"]
+fn any_number_of_workers_gives_the_same_bits_with_every_strategy_and_either_lag() {
+    for strategy in STRATEGIES {
+        check(strategy, 0, &N_WORKERS);
+        check(strategy, 1, &N_WORKERS);
+    }
+}
+
+#[test]
+fn a_policy_is_judged_alike_by_any_number_of_threads() {
+    let judged: Vec<Value> = ["1", "2", "5"].map(judged_by_threads).into();
+    assert_eq!(judged[0], judged[1]);
+    assert_eq!(judged[0], judged[2]);
+}
+
+/// Runs once for each number of workers and compares.
+fn check(strategy: &str, lag: u32, n_workers: &[usize]) {
+    let (first, others) = n_workers.split_first().expect("numbers of workers");
+    let expected = train(strategy, lag, *first);
+    for n_workers in others {
+        let got = train(strategy, lag, *n_workers);
+        assert_eq!(got, expected, "{strategy}, lag {lag}: {n_workers} workers against {first}");
+    }
+}
+
+fn train(strategy: &str, lag: u32, n_workers: usize) -> Left {
+    let directory = tempfile::tempdir().expect("a directory");
+    let out = directory.path().join("run");
+    let mut args = vec!["train".to_owned(), "--json".into(), "--workers".into()];
+    args.extend([n_workers.to_string(), "--strategy".into(), strategy.into()]);
+    args.extend(["--budget".into(), BUDGET.to_string()]);
+    args.extend(["--set".into(), format!("rounds.lag={lag}")]);
+    args.extend(SMALL.map(str::to_owned));
+    let summary = last_line(tandem(&args).arg("--out").arg(&out));
+    assert_eq!(summary["budget_left"], 0, "{strategy}: the budget is to run out");
+    assert_eq!(summary["advice_spent"], BUDGET, "{strategy}");
+    let metrics = metrics(&out);
+    check_runs_out_on_the_way(strategy, &metrics);
+    let text = |key: &str| summary[key].as_str().expect("a text").to_owned();
+    Left { digest: text("digest"), best_policy: text("policy_digest"), metrics }
+}
+
+/// The first half of the budget is gone after some round, and the second some rounds before the end.
+fn check_runs_out_on_the_way(strategy: &str, metrics: &[Value]) {
+    let spent: Vec<u64> =
+        metrics.iter().map(|row| row["advice_spent"].as_u64().expect("a number")).collect();
+    let n_before_half = spent.iter().filter(|spent| **spent < BUDGET / 2).count();
+    let n_after = spent.iter().filter(|spent| **spent == BUDGET).count();
+    assert!(n_before_half >= 1 && n_after >= 2, "{strategy}: {spent:?}");
+}
+
+fn metrics(out: &Path) -> Vec<Value> {
+    let text = fs::read_to_string(out.join("metrics.jsonl")).expect("metrics");
+    let row = |line| -> Value {
+        let mut row: Value = serde_json::from_str(line).expect("a row");
+        row.as_object_mut().expect("an object").remove("wall_s").expect("a time");
+        row
+    };
+    text.lines().map(row).collect()
+}
+
+fn judged_by_threads(n_threads: &str) -> Value {
+    let mut args: Vec<String> = vec!["eval".into(), "--json".into(), "--policy".into()];
+    args.push("policies/student-push.safetensors".into());
+    args.extend(["--episodes".into(), "40".into(), "--seed".into(), "5".into()]);
+    let mut judged = last_line(tandem(&args).env("RAYON_NUM_THREADS", n_threads));
+    judged.as_object_mut().expect("an object").remove("steps_per_s").expect("a speed");
+    judged
+}
+
+fn tandem(args: &[String]) -> Command {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_tandem"));
+    command.args(args).current_dir(env!("CARGO_MANIFEST_DIR")).stdin(Stdio::null());
+    command
+}
+
+/// The JSON object on the last line of standard output.
+fn last_line(command: &mut Command) -> Value {
+    let output = command.output().expect("runs");
+    let errors = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success(), "{:?}: {errors}", output.status);
+    let text = String::from_utf8_lossy(&output.stdout);
+    serde_json::from_str(text.lines().last().expect("a line")).expect("an object")
+}
