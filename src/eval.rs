@@ -3,12 +3,14 @@
 use std::num::NonZeroUsize;
 use std::path::Path;
 
+use rayon::iter::{IntoParallelRefIterator as _, ParallelIterator as _};
 use serde_json::{Value, json};
 use tandem_core::work::{EpisodeOrder, Exploration, RunTerms, WorldTerms};
 use tandem_core::{Episode, EpisodeOutcome, EvaluationSummary, Layout, Task, Wilson};
 use tandem_policy::Policy;
 use tandem_sim::WorldConfig;
 use tandem_telemetry::EpisodeMetadata;
+use tandem_worker::record::{RecordError, log_name, metadata_of, record_episode};
 use tandem_worker::{ComposedTeachers, evaluate};
 
 use crate::cli::{EvalArgs, TaskName};
@@ -61,8 +63,9 @@ impl Subject {
     }
 }
 
-/// An evaluation's figures and how fast it went.
+/// An evaluation's episodes and figures, and how fast it went.
 pub(crate) struct Measured {
+    pub(crate) episodes: Vec<Episode>,
     pub(crate) layout: Layout,
     pub(crate) summary: EvaluationSummary,
     pub(crate) steps_per_s: f64,
@@ -78,6 +81,7 @@ pub(crate) fn measure(subject: &Subject, n_episodes: u64, seed: u64) -> Result<M
     let outcomes: Vec<EpisodeOutcome> = episodes.iter().map(EpisodeOutcome::of).collect();
     let summary = EvaluationSummary::of(&outcomes);
     Ok(Measured {
+        episodes,
         layout: subject.layout(),
         summary,
         steps_per_s,
@@ -131,8 +135,17 @@ impl Measured {
 pub(crate) fn eval(args: &EvalArgs) -> Result<(), Failed> {
     let subject = subject(args)?;
     let measured = measure(&subject, args.episodes, args.seed)?;
-    if let Some(path) = &args.record {
-        record(&subject, args.seed, path)?;
+    let terms = terms(&subject);
+    if let (Some(path), Some(first)) = (&args.record, measured.episodes.first()) {
+        record(&subject, &terms, args.seed, first, path)?;
+    }
+    if let Some(directory) = &args.record_dir {
+        std::fs::create_dir_all(directory)
+            .or_exit(Exit::TryAgain, || format!("cannot create {}", directory.display()))?;
+        measured.episodes.par_iter().try_for_each(|episode| {
+            let path = directory.join(log_name(episode));
+            record(&subject, &terms, args.seed, episode, &path)
+        })?;
     }
     if args.json {
         println!("{}", measured.json());
@@ -141,17 +154,15 @@ pub(crate) fn eval(args: &EvalArgs) -> Result<(), Failed> {
         println!("task          {}, arms {}, seed {}", layout.task, layout.n_arms, args.seed);
         measured.lines().iter().for_each(|line| println!("{line}"));
         println!("speed         {:.0} env steps/s", measured.steps_per_s);
-        if let Some(path) = &args.record {
+        for path in args.record.iter().chain(&args.record_dir) {
             println!("recorded      {}", path.display());
         }
     }
     Ok(())
 }
 
-/// Writes the log of the first fixed goal's episode.
-fn record(subject: &Subject, seed: u64, path: &Path) -> Result<(), Failed> {
-    let episode = subject.play(1, seed)?.remove(0);
-    let order = EpisodeOrder { number: 0, seed, advised: false, uniform: false, record: true };
+/// The terms on which an evaluation plays.
+fn terms(subject: &Subject) -> RunTerms {
     let world = WorldTerms {
         gripped_start_share: 0.0,
         wide_start_share: 0.0,
@@ -159,14 +170,28 @@ fn record(subject: &Subject, seed: u64, path: &Path) -> Result<(), Failed> {
     };
     let exploration =
         Exploration { noise_std: 0.0, random_share: 0.0, random_hold_mean_steps: 1.0 };
-    let terms = RunTerms { layout: subject.layout(), account: None, exploration, world };
+    RunTerms { layout: subject.layout(), account: None, exploration, world }
+}
+
+/// Writes the log of one episode of the goals that `seed` fixes.
+fn record(
+    subject: &Subject,
+    terms: &RunTerms,
+    seed: u64,
+    episode: &Episode,
+    path: &Path,
+) -> Result<(), Failed> {
+    let number = episode.number;
+    let order = EpisodeOrder { number, seed, advised: false, uniform: false, record: true };
     let metadata = EpisodeMetadata {
         policy_digest: subject.policy().digest(),
-        ..tandem_worker::record::metadata_of(order, &episode, &terms)
+        ..metadata_of(order, episode, terms)
     };
-    tandem_worker::record::record_episode(&metadata, &episode, path)
-        .or_exit(Exit::TryAgain, String::new)?;
-    Ok(())
+    match record_episode(&metadata, episode, path) {
+        Ok(_) => Ok(()),
+        Err(error @ RecordError::Log(_)) => Err(Failed::new(Exit::TryAgain, error)),
+        Err(error) => Err(Failed::new(Exit::Bug, error)),
+    }
 }
 
 fn subject(args: &EvalArgs) -> Result<Subject, Failed> {

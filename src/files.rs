@@ -3,8 +3,13 @@
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-use serde_json::json;
+use anyhow::anyhow;
+use indicatif::ProgressBar;
+use rayon::iter::{IntoParallelIterator as _, ParallelIterator as _};
+use serde_json::{Value, json};
 use tandem_policy::Policy;
+use tandem_telemetry::{LoggedTransition, read_episode};
+use tandem_worker::record::{RecordError, replay_log};
 
 use crate::cli::{McapArgs, McapCommand, PolicyArgs, PolicyCommand, ReplayArgs};
 use crate::exit::{Exit, Failed, OrExit as _};
@@ -44,6 +49,7 @@ pub(crate) fn policy(args: &PolicyArgs) -> Result<(), Failed> {
 
 #[expect(clippy::print_stdout, reason = "what the command is for")]
 pub(crate) fn mcap(args: &McapArgs) -> Result<(), Failed> {
+    use tandem_telemetry::Error as E;
     let McapCommand::Recover { file, to } = &args.command;
     let to =
         to.clone().unwrap_or_else(|| PathBuf::from(format!("{}.recovered.mcap", file.display())));
@@ -53,48 +59,152 @@ pub(crate) fn mcap(args: &McapArgs) -> Result<(), Failed> {
             to.display()
         )));
     }
-    let counts = tandem_telemetry::recover(file, &to).or_exit(Exit::Data, String::new)?;
+    let counts = tandem_telemetry::recover(file, &to).map_err(|error| match error {
+        E::WriteLog { .. } | E::Io { action: "create" | "rename", .. } => {
+            Failed::new(Exit::TryAgain, error)
+        }
+        _ => Failed::new(Exit::Data, error),
+    })?;
     println!("recovered {} messages of {} into {}", counts.messages, file.display(), to.display());
     Ok(())
 }
 
-#[expect(clippy::print_stdout, reason = "what the command is for")]
+/// A log that was played again.
+struct Replayed {
+    file: PathBuf,
+    outcome: Result<(), RecordError>,
+    /// Whether the log ends before its episode does.
+    cut_short: bool,
+}
+
 pub(crate) fn replay(args: &ReplayArgs) -> Result<(), Failed> {
-    let log = tandem_telemetry::read_episode(&args.file).or_exit(Exit::Data, String::new)?;
-    let mut world =
-        tandem_worker::record::world_of(&log.metadata).or_exit(Exit::Data, String::new)?;
-    let mut observation = vec![0.0; log.metadata.layout.n_observation()];
-    let mut differs_before = None;
-    for (step_idx, transition) in log.transitions.iter().enumerate() {
-        world.observe(&mut observation);
-        if differs_before.is_none() && observation != transition.observation {
-            differs_before = Some(step_idx);
-        }
-        if !args.json && !args.verify {
-            println!(
-                "step {step_idx:>2}  reward {:>4.1}  action {:?}",
-                transition.reward, transition.action
-            );
-        }
-        world.step(&transition.action).or_exit(Exit::Data, || format!("step {step_idx}"))?;
+    let files = logs_among(&args.files)?;
+    if let ([file], false, false) = (files.as_slice(), args.verify, args.json) {
+        print_steps(file)?;
     }
-    let n_steps = log.transitions.len();
-    if args.json {
+    let bar = ProgressBar::new(files.len() as u64);
+    let replay_one = |file| {
+        let replayed = Replayed::of(file);
+        bar.inc(1);
+        replayed
+    };
+    let replayed: Vec<Replayed> = files.into_par_iter().map(replay_one).collect();
+    bar.finish_and_clear();
+    print_replayed(&replayed, args.json);
+    let bad: Vec<String> = replayed.iter().filter_map(Replayed::problem).collect();
+    match bad.as_slice() {
+        [] => Ok(()),
+        [problem] => Err(Failed::new(Exit::Data, anyhow!("{problem}"))),
+        [first, ..] => Err(Failed::new(
+            Exit::Data,
+            anyhow!("{} logs differ or cannot be read, the first: {first}", bad.len()),
+        )),
+    }
+}
+
+/// The logs that are named, and those in and below the directories that are named, in the order of their names.
+fn logs_among(named: &[PathBuf]) -> Result<Vec<PathBuf>, Failed> {
+    let mut files = Vec::new();
+    for path in named {
+        if !path.is_dir() {
+            files.push(path.clone());
+            continue;
+        }
+        let n_before = files.len();
+        collect_logs(path, &mut files)
+            .or_exit(Exit::Data, || format!("cannot look into {}", path.display()))?;
+        if files.len() == n_before {
+            return Err(Failed::new(Exit::Data, anyhow!("no *.mcap below {}", path.display())));
+        }
+    }
+    Ok(files)
+}
+
+fn collect_logs(directory: &Path, files: &mut Vec<PathBuf>) -> std::io::Result<()> {
+    let mut entries = std::fs::read_dir(directory)?.collect::<Result<Vec<_>, _>>()?;
+    entries.sort_by_key(std::fs::DirEntry::path);
+    for entry in entries {
+        let path = entry.path();
+        if entry.file_type()?.is_dir() {
+            collect_logs(&path, files)?;
+        } else if path.extension().is_some_and(|extension| extension == "mcap") {
+            files.push(path);
+        }
+    }
+    Ok(())
+}
+
+impl Replayed {
+    fn of(file: PathBuf) -> Self {
+        match read_episode(&file) {
+            Ok(log) => {
+                Self { file, outcome: replay_log(&log), cut_short: log.last_observation.is_none() }
+            }
+            Err(error) => Self { file, outcome: Err(error.into()), cut_short: false },
+        }
+    }
+
+    /// What is wrong with which file, in one line.
+    fn problem(&self) -> Option<String> {
+        let error = self.outcome.as_ref().err()?;
+        let file = self.file.display();
+        Some(match error {
+            RecordError::Log(_) => causes(error),
+            _ => format!("{file}: {}", causes(error)),
+        })
+    }
+}
+
+/// An error and what it came from, in one line.
+fn causes(error: &RecordError) -> String {
+    anyhow::Chain::new(error).map(ToString::to_string).collect::<Vec<_>>().join(": ")
+}
+
+#[expect(clippy::print_stdout, reason = "what the command is for")]
+fn print_steps(file: &Path) -> Result<(), Failed> {
+    let log = read_episode(file).or_exit(Exit::Data, String::new)?;
+    println!("episode {} of {}", log.metadata.episode, file.display());
+    for (step_idx, LoggedTransition { reward, action, .. }) in log.transitions.iter().enumerate() {
+        println!("step {step_idx:>2}  reward {reward:>4.1}  action {action:?}");
+    }
+    Ok(())
+}
+
+#[expect(clippy::print_stdout, reason = "what the command is for")]
+fn print_replayed(replayed: &[Replayed], json: bool) {
+    let (n_episodes, n_equal) =
+        (replayed.len(), replayed.iter().filter(|log| log.outcome.is_ok()).count());
+    let cut_short: Vec<&Path> =
+        replayed.iter().filter(|log| log.cut_short).map(|log| log.file.as_path()).collect();
+    let bad = || replayed.iter().filter(|log| log.outcome.is_err());
+    if json {
+        let (differing, unreadable): (Vec<&Replayed>, _) =
+            bad().partition(|log| matches!(log.outcome, Err(RecordError::Differs { .. })));
+        let [differing, unreadable] =
+            [differing, unreadable].map(|logs| logs.into_iter().map(problem_json).collect());
+        let (differing, unreadable): (Value, Value) = (differing, unreadable);
         println!(
             "{}",
-            json!({"file": args.file, "steps": n_steps, "identical": differs_before.is_none()})
+            json!({
+                "episodes": n_episodes, "equal": n_equal, "differing": differing, "unreadable": unreadable,
+                "cut_short": cut_short,
+            })
         );
-    } else {
-        println!("{n_steps} steps of episode {} played again", log.metadata.episode);
+        return;
     }
-    match differs_before {
-        Some(step_idx) if args.verify => {
-            let file = args.file.display();
-            Err(Failed::new(
-                Exit::Data,
-                anyhow::anyhow!("{file}: the observation before step {step_idx} differs"),
-            ))
-        }
-        _ => Ok(()),
+    bad().filter_map(Replayed::problem).for_each(|problem| println!("{problem}"));
+    println!("{n_equal} of {n_episodes} episodes equal bit for bit");
+    if !cut_short.is_empty() {
+        println!("{} of them compared only as far as their logs go", cut_short.len());
+    }
+}
+
+fn problem_json(log: &Replayed) -> Value {
+    match &log.outcome {
+        Err(RecordError::Differs { step, field, component, logged, played }) => json!({
+            "file": log.file, "step": step, "field": field, "component": component, "logged": logged,
+            "played": played,
+        }),
+        _ => json!({ "file": log.file, "problem": log.problem() }),
     }
 }

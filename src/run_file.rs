@@ -5,10 +5,14 @@ use std::path::Path;
 use anyhow::{Context as _, anyhow, bail};
 use tandem_core::Task;
 use tandem_learner::RunConfig;
-use tandem_learner::config::Recipe;
+use tandem_learner::config::{ConfigError, Recipe};
+use tandem_teacher::{Strategy, UnknownStrategy};
 use toml::{Table, Value};
 
 use crate::exit::{Exit, Failed, OrExit as _};
+
+/// Longer texts are cut where a message shows them.
+const MAX_SHOWN_BYTES: usize = 80;
 
 /// Reads a run file and lays `settings` (`key=value`) over it; what both leave out takes the recipe's values.
 pub(crate) fn resolve(
@@ -26,7 +30,10 @@ pub(crate) fn resolve(
 /// Splits `key=value`; the value is TOML where it can be read as such, else text.
 pub(crate) fn parse_setting(setting: &str) -> Result<(String, Value), Failed> {
     let Some((key, text)) = setting.split_once('=') else {
-        return Err(Failed::usage(format!("--set {setting:?} is not of the form KEY=VALUE")));
+        return Err(Failed::usage(format!(
+            "--set {:?} is not of the form KEY=VALUE",
+            shortened(setting)
+        )));
     };
     Ok((key.trim().to_owned(), parse_value(text.trim())))
 }
@@ -36,17 +43,31 @@ pub(crate) fn to_toml(config: &RunConfig) -> anyhow::Result<String> {
     Ok(toml::to_string_pretty(config)?)
 }
 
+/// The whole of `text` as a TOML value; what is more than a value, such as one with a comment behind it, is text.
 fn parse_value(text: &str) -> Value {
-    let document = format!("value = {text}");
-    let parsed = document.parse::<Table>().ok().and_then(|mut table| table.remove("value"));
-    parsed.unwrap_or_else(|| Value::String(text.to_owned()))
+    let as_text = || Value::String(text.to_owned());
+    if text.contains(['#', '\n']) && !text.starts_with(['"', '\'']) {
+        return as_text();
+    }
+    text.parse().unwrap_or_else(|_: toml::de::Error| as_text())
 }
 
 fn read(path: &Path) -> anyhow::Result<Table> {
     let text =
         std::fs::read_to_string(path).with_context(|| format!("cannot read run file {path:?}"))?;
-    let table = text.parse::<Table>();
-    table.map_err(|error| anyhow!("run file {path:?}: {}", error.to_string().replace('\n', " ")))
+    parse(&text).map_err(|problem| anyhow!("run file {path:?}: {problem}"))
+}
+
+/// The tables of a run file, or in one line what is wrong where.
+fn parse(text: &str) -> Result<Table, String> {
+    text.parse().map_err(|error: toml::de::Error| {
+        let start = error.span().map_or(0, |span| span.start);
+        let before = text.get(..start).unwrap_or(text);
+        let line_idx = before.matches('\n').count();
+        let line = text.lines().nth(line_idx).unwrap_or_default();
+        let message = error.message().replace('\n', " ");
+        format!("line {}: {message} in {:?}", line_idx + 1, shortened(line.trim()))
+    })
 }
 
 fn overlay(from_file: Table, settings: &[(String, Value)]) -> anyhow::Result<RunConfig> {
@@ -54,12 +75,48 @@ fn overlay(from_file: Table, settings: &[(String, Value)]) -> anyhow::Result<Run
     for (key, value) in settings {
         set(&mut changes, key, value.clone())?;
     }
-    let mut resolved = Table::try_from(defaults_for(&changes)?)?;
-    merge(&mut resolved, changes, "")?;
-    let config: RunConfig = Value::Table(resolved)
-        .try_into()
-        .map_err(|error: toml::de::Error| anyhow!("{}", error.message()))?;
-    Ok(config.checked()?)
+    let defaults = Table::try_from(defaults_for(&changes)?)?;
+    let mut resolved = defaults.clone();
+    merge(&mut resolved, &changes, "", &names_below(&defaults, ""))?;
+    let config = typed(resolved).map_err(|error| blame(&defaults, &changes, &error))?;
+    let config = config.checked().map_err(in_one_line)?;
+    let strategy = config.advice.strategy.parse::<Strategy>().map_err(|UnknownStrategy(text)| {
+        anyhow!("advice.strategy: {}", UnknownStrategy(shortened(&text)))
+    });
+    strategy?;
+    Ok(config)
+}
+
+/// Says what is out of its range without repeating a long text.
+fn in_one_line(error: ConfigError) -> anyhow::Error {
+    match error {
+        ConfigError::OutOfRange { key, value, expected } => {
+            anyhow!("{key} is {}: expected {expected}", shortened(&value))
+        }
+        ConfigError::Task(unknown) => anyhow!("task: {unknown}"),
+    }
+}
+
+fn typed(table: Table) -> Result<RunConfig, toml::de::Error> {
+    Value::Table(table).try_into()
+}
+
+/// Finds the change that alone keeps the configuration from being one.
+fn blame(defaults: &Table, changes: &Table, error: &toml::de::Error) -> anyhow::Error {
+    for (name, value) in settings_below(changes, "") {
+        let mut alone = defaults.clone();
+        if set(&mut alone, &name, value.clone()).is_ok()
+            && let Err(error) = typed(alone)
+        {
+            let expected = match (&value, error.message().rsplit_once("expected ")) {
+                (Value::Integer(whole), _) if *whole < 0 => "0 or more",
+                (_, Some((_, expected))) => expected,
+                (_, None) => "another value",
+            };
+            return anyhow!("{name} is {}: expected {expected}", shown(&value));
+        }
+    }
+    anyhow!("{}", shortened(error.message()))
 }
 
 /// The recipe's values for the task and arms that the changes choose.
@@ -67,110 +124,136 @@ fn defaults_for(changes: &Table) -> anyhow::Result<RunConfig> {
     let recipe = match changes.get("recipe").and_then(Value::as_str) {
         None | Some("tandem") => Recipe::Tandem,
         Some("paper") => Recipe::Paper,
-        Some(other) => bail!("recipe is {other:?}: expected \"tandem\" or \"paper\""),
+        Some(other) => {
+            bail!("recipe is {:?}: expected \"tandem\" or \"paper\"", shortened(other))
+        }
     };
-    let task: Task = changes.get("task").and_then(Value::as_str).unwrap_or("push").parse()?;
+    let task = changes.get("task").and_then(Value::as_str).unwrap_or("push");
+    let known_task = task.parse::<Task>().map_err(|_unknown| {
+        let names = Task::ALL.map(Task::name).join(" or ");
+        anyhow!("task is {:?}: expected {names}", shortened(task))
+    });
     let arms = changes.get("arms").and_then(Value::as_integer).unwrap_or(2);
     let n_arms = usize::try_from(arms).ok().filter(|n_arms| (1..=2).contains(n_arms));
-    Ok(RunConfig::defaults(
-        recipe,
-        task,
-        n_arms.ok_or_else(|| anyhow!("arms is {arms}: expected 1 or 2"))?,
-    ))
+    let n_arms = n_arms.ok_or_else(|| anyhow!("arms is {arms}: expected 1 or 2"))?;
+    Ok(RunConfig::defaults(recipe, known_task?, n_arms))
 }
 
 /// Sets the value of a dotted key.
 fn set(table: &mut Table, key: &str, value: Value) -> anyhow::Result<()> {
     match key.split_once('.') {
+        None if value.is_table() => {
+            bail!("{:?} is {}: expected one value, not a section", shortened(key), shown(&value))
+        }
         None => {
             table.insert(key.to_owned(), value);
             Ok(())
         }
         Some((section, rest)) => {
             let section = table.entry(section).or_insert_with(|| Value::Table(Table::new()));
-            let inner =
-                section.as_table_mut().ok_or_else(|| anyhow!("{key:?} is not a setting"))?;
+            let inner = section
+                .as_table_mut()
+                .ok_or_else(|| anyhow!("{:?} is not a setting", shortened(key)))?;
             set(inner, rest, value)
         }
     }
 }
 
 /// Lays `changes` over `base`; a key that `base` lacks is unknown. Whole numbers are taken where fractions are meant.
-fn merge(base: &mut Table, changes: Table, path: &str) -> anyhow::Result<()> {
+/// `known` are all settings there are.
+fn merge(base: &mut Table, changes: &Table, path: &str, known: &[String]) -> anyhow::Result<()> {
     for (key, change) in changes {
-        let name = if path.is_empty() { key.clone() } else { format!("{path}.{key}") };
-        let known: Vec<String> = base.keys().cloned().collect();
-        match (base.get_mut(&key), change) {
-            (None, _) => bail!("unknown setting {name:?}: expected one of {}", known.join(", ")),
-            (Some(Value::Table(inner)), Value::Table(changes)) => merge(inner, changes, &name)?,
-            (Some(Value::Table(_)), _) => bail!("{name:?} is a section, not a setting"),
-            (Some(slot @ Value::Float(_)), Value::Integer(whole)) => {
-                *slot = Value::Float(whole as f64);
-            }
-            (Some(slot), change) => {
-                if !slot.same_type(&change) {
-                    bail!("{name} is {change}: expected a {}", slot.type_str());
+        let name = dotted(path, key);
+        let siblings = || base.keys().cloned().collect::<Vec<_>>().join(", ");
+        if !base.contains_key(key) {
+            let hint = match nearest(&name, known) {
+                Some(near) => format!("did you mean {near:?}?"),
+                None => format!("expected one of {}", siblings()),
+            };
+            bail!("unknown setting {:?}: {hint}", shortened(&name));
+        }
+        match (&mut base[key], change) {
+            (Value::Table(inner), Value::Table(changes)) => merge(inner, changes, &name, known)?,
+            (Value::Table(_), _) => bail!("{name:?} is a section, not a setting"),
+            (slot @ Value::Float(_), Value::Integer(whole)) => *slot = Value::Float(*whole as f64),
+            (slot, change) => {
+                if !slot.same_type(change) {
+                    bail!("{name} is {}: expected {}", shown(change), with_article(slot));
                 }
-                *slot = change;
+                *slot = change.clone();
             }
         }
     }
     Ok(())
 }
 
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    fn resolved(settings: &[&str]) -> Result<RunConfig, String> {
-        let settings: Vec<_> =
-            settings.iter().map(|setting| parse_setting(setting).expect("KEY=VALUE")).collect();
-        overlay(Table::new(), &settings).map_err(|error| error.to_string())
-    }
-
-    #[test]
-    fn settings_change_what_they_name_and_nothing_else() {
-        let config = resolved(&["arms=1", "ddpg.discount=0.9", "advice.budget=7"]).expect("valid");
-        let mut expected = RunConfig::defaults(Recipe::Tandem, Task::Push, 1);
-        expected.ddpg.discount = 0.9;
-        expected.advice.budget = 7;
-        assert_eq!(config, expected);
-    }
-
-    #[test]
-    fn what_is_wrong_is_named() {
-        let check = |setting: &str, words: &[&str]| {
-            let message = resolved(&[setting]).expect_err("must be refused");
-            words
-                .iter()
-                .for_each(|word| assert!(message.contains(word), "{message:?} lacks {word:?}"));
-        };
-        check("ddpg.discont=0.9", &["ddpg.discont", "discount"]);
-        check("nonsense=1", &["nonsense", "advice"]);
-        check("ddpg=1", &["ddpg", "section"]);
-        check("advice.budget=many", &["advice.budget", "integer"]);
-        check("recipe=mine", &["mine", "paper"]);
-        check("arms=3", &["arms", "1 or 2"]);
-        check("ddpg.discount=nan", &["ddpg.discount"]);
-    }
-
-    #[test]
-    fn every_run_file_that_ships_is_valid() {
-        let directory = Path::new(env!("CARGO_MANIFEST_DIR")).join("deploy");
-        let files =
-            std::fs::read_dir(directory).expect("ships").flatten().map(|entry| entry.path());
-        let run_files: Vec<_> =
-            files.filter(|path| path.extension().is_some_and(|e| e == "toml")).collect();
-        assert!(run_files.len() >= 4);
-        for path in run_files {
-            assert!(resolve(Some(&path), &[]).is_ok(), "{}", path.display());
-        }
-    }
-
-    #[test]
-    fn a_written_configuration_is_read_back() {
-        let config = RunConfig::defaults(Recipe::Paper, Task::PickAndPlace, 2);
-        let text = to_toml(&config).expect("writes");
-        assert_eq!(overlay(text.parse().expect("TOML"), &[]).expect("valid"), config);
+fn with_article(value: &Value) -> &'static str {
+    match value {
+        Value::String(_) => "a string",
+        Value::Integer(_) => "an integer",
+        Value::Float(_) => "a number",
+        Value::Boolean(_) => "true or false",
+        Value::Datetime(_) | Value::Array(_) | Value::Table(_) => "a value",
     }
 }
+
+fn dotted(path: &str, key: &str) -> String {
+    if path.is_empty() { key.to_owned() } else { format!("{path}.{key}") }
+}
+
+/// Dotted names and values of all settings in and below `table`.
+fn settings_below(table: &Table, path: &str) -> Vec<(String, Value)> {
+    let below = |(key, value): (&String, &Value)| match value {
+        Value::Table(inner) => settings_below(inner, &dotted(path, key)),
+        value => vec![(dotted(path, key), value.clone())],
+    };
+    table.iter().flat_map(below).collect()
+}
+
+fn names_below(table: &Table, path: &str) -> Vec<String> {
+    settings_below(table, path).into_iter().map(|(name, _)| name).collect()
+}
+
+/// The known setting that `name` may have been meant for: its last part stands elsewhere, or a few letters differ.
+fn nearest<'a>(name: &str, known: &'a [String]) -> Option<&'a String> {
+    if name.len() > MAX_SHOWN_BYTES {
+        return None;
+    }
+    let last = |name: &str| name.rsplit('.').next().map(str::to_owned);
+    let elsewhere = known.iter().find(|known| last(known) == last(name));
+    let distances = known.iter().map(|known| (edits(name, known), known));
+    let close = distances.min().filter(|(n_edits, _)| *n_edits <= 2.max(name.len() / 5));
+    elsewhere.or(close.map(|(_, known)| known))
+}
+
+/// Letters to insert, remove or exchange to make `from` into `to` (Levenshtein's distance).
+fn edits(from: &str, to: &str) -> usize {
+    let to: Vec<char> = to.chars().collect();
+    let mut row: Vec<usize> = (0..=to.len()).collect();
+    for (from_idx, from_char) in from.chars().enumerate() {
+        let mut diagonal = std::mem::replace(&mut row[0], from_idx + 1);
+        for (to_idx, to_char) in to.iter().enumerate() {
+            let exchanged = diagonal + usize::from(from_char != *to_char);
+            diagonal = row[to_idx + 1];
+            row[to_idx + 1] = exchanged.min(diagonal + 1).min(row[to_idx] + 1);
+        }
+    }
+    row[to.len()]
+}
+
+/// A value as a message shows it.
+fn shown(value: &Value) -> String {
+    shortened(&value.to_string().replace('\n', " "))
+}
+
+/// The beginning of a text that is too long for a line.
+fn shortened(text: &str) -> String {
+    if text.len() <= MAX_SHOWN_BYTES {
+        return text.to_owned();
+    }
+    let beginning: String = text.chars().take(MAX_SHOWN_BYTES / 2).collect();
+    format!("{beginning}... ({} bytes)", text.len())
+}
+
+#[cfg(test)]
+mod tests;

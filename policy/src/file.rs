@@ -24,6 +24,8 @@ pub const FORMAT: &str = "tandem-policy";
 pub const FORMAT_VERSION: &str = "1";
 
 const MAX_ARMS: usize = 64;
+/// Letters of a file's own words that a refusal repeats; a digest has 64.
+const MAX_SHOWN_CHARS: usize = 80;
 /// The header's length is a little-endian `u64`, and headers are filled up to this many bytes.
 const HEADER_ALIGNMENT: usize = 8;
 
@@ -159,9 +161,11 @@ fn check_reserved(mut policy: Policy) -> Result<Policy, FormatError> {
             (_, Some(got)) if got == expected => {}
             ("digest", None) => {}
             ("digest", Some(written)) => {
-                return Err(FormatError::Digest { got: expected, expected: written });
+                return Err(FormatError::Digest { got: expected, expected: shortened(&written) });
             }
-            (_, Some(got)) => return Err(FormatError::Metadata { key, got, expected }),
+            (_, Some(got)) => {
+                return Err(FormatError::Metadata { key, got: shortened(&got), expected });
+            }
             (_, None) => return Err(FormatError::MissingMetadata { key }),
         }
     }
@@ -184,14 +188,14 @@ fn expect_entry(
     if got == expected {
         return Ok(());
     }
-    Err(FormatError::Metadata { key, got: got.to_owned(), expected: format!("{expected:?}") })
+    Err(FormatError::Metadata { key, got: shortened(got), expected: format!("{expected:?}") })
 }
 
 fn parse_task(metadata: &BTreeMap<String, String>) -> Result<Task, FormatError> {
     let got = entry(metadata, "task")?;
     let expected = || Task::ALL.map(Task::name).join(" or ");
     let refusal =
-        |_unknown| FormatError::Metadata { key: "task", got: got.to_owned(), expected: expected() };
+        |_unknown| FormatError::Metadata { key: "task", got: shortened(got), expected: expected() };
     got.parse().map_err(refusal)
 }
 
@@ -205,7 +209,7 @@ fn parse_size(
         Ok(size) if (1..=most).contains(&size) => Ok(size),
         _ => Err(FormatError::Metadata {
             key,
-            got: got.to_owned(),
+            got: shortened(got),
             expected: format!("1 to {most}"),
         }),
     }
@@ -255,8 +259,16 @@ fn refuse_unknown_tensors(file: &SafeTensors<'_>, policy: &Policy) -> Result<(),
     let mut names = file.names();
     names.sort_unstable();
     match names.into_iter().find(|name| !known.iter().any(|known| known == name)) {
-        Some(name) => Err(FormatError::UnknownTensor { name: name.to_owned() }),
+        Some(name) => Err(FormatError::UnknownTensor { name: shortened(name) }),
         None => Ok(()),
+    }
+}
+
+/// The beginning of a text of the file's that may be of any length.
+fn shortened(text: &str) -> String {
+    match text.char_indices().nth(MAX_SHOWN_CHARS) {
+        Some((end, _)) => format!("{}...", &text[..end]),
+        None => text.to_owned(),
     }
 }
 

@@ -1,0 +1,212 @@
+//! The built program: as a service, and as a command that is given what it cannot use.
+
+use std::fs;
+use std::io::{BufRead as _, BufReader};
+use std::net::{SocketAddr, TcpListener};
+use std::path::Path;
+use std::process::{Child, Command, Stdio};
+use std::time::Duration;
+
+use tempfile::TempDir;
+
+/// A process that is ended with this value.
+pub(crate) struct Running {
+    child: Child,
+    /// Where it leaves what it leaves.
+    _directory: TempDir,
+    /// Where it listens; of a worker nothing that means anything.
+    pub(crate) address: SocketAddr,
+}
+
+impl Running {
+    /// Starts a process that listens nowhere.
+    pub(crate) fn start(args: &[&str]) -> Self {
+        let directory = tempfile::tempdir().expect("a directory");
+        let mut command = command(args, directory.path());
+        let child = command.stdout(Stdio::null()).stderr(Stdio::null()).spawn().expect("starts");
+        Self { child, _directory: directory, address: ([127, 0, 0, 1], 0).into() }
+    }
+
+    /// Starts a service and reads where it listens.
+    pub(crate) fn service(args: &[&str]) -> Self {
+        let directory = tempfile::tempdir().expect("a directory");
+        let mut command = command(args, directory.path());
+        let child = command.stdout(Stdio::piped()).stderr(Stdio::null()).spawn();
+        let mut child = child.expect("starts");
+        let mut line = String::new();
+        let mut output = BufReader::new(child.stdout.take().expect("piped"));
+        output.read_line(&mut line).expect("a line");
+        let address = line.trim().strip_prefix("listening on ").expect("the line").parse();
+        Self { child, _directory: directory, address: address.expect("an address") }
+    }
+
+    /// The most memory it has had, MiB.
+    pub(crate) fn peak_mib(&self) -> u64 {
+        let status = fs::read_to_string(format!("/proc/{}/status", self.child.id()));
+        let status = status.expect("it runs");
+        let line = status.lines().find_map(|line| line.strip_prefix("VmHWM:")).expect("a figure");
+        let kib: u64 = line.split_whitespace().next().expect("a number").parse().expect("kB");
+        kib / 1024
+    }
+
+    /// Whether it ends by itself, and well.
+    pub(crate) fn ends_well(&mut self) -> bool {
+        for _ in 0..1200 {
+            if let Some(status) = self.child.try_wait().expect("there") {
+                return status.success();
+            }
+            std::thread::sleep(Duration::from_millis(50));
+        }
+        false
+    }
+
+    /// Whether it ends well when it is asked to.
+    pub(crate) fn ends_on_sigterm(&mut self) -> bool {
+        let sent = Command::new("kill").args(["-TERM", &self.child.id().to_string()]).status();
+        sent.expect("kill runs").success() && self.ends_well()
+    }
+}
+
+impl Drop for Running {
+    fn drop(&mut self) {
+        drop(self.child.kill());
+        drop(self.child.wait());
+    }
+}
+
+/// The program in `directory`, with no settings from outside.
+fn command(args: &[&str], directory: &Path) -> Command {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_tandem"));
+    command.args(args).stdin(Stdio::null()).current_dir(directory);
+    for variable in ["RUST_LOG", "TANDEM_LEDGER", "TANDEM_TOKEN_FILE"] {
+        command.env_remove(variable);
+    }
+    command
+}
+
+/// The path of a policy that ships.
+pub(crate) fn shipped(name: &str) -> String {
+    format!("{}/policies/{name}.safetensors", env!("CARGO_MANIFEST_DIR"))
+}
+
+/// Files and directories of every wrong kind, by the names that stand for them in command lines.
+fn prepare(directory: &Path) {
+    let whole = fs::read(shipped("teacher-push")).expect("ships");
+    let mut altered = whole.clone();
+    *altered.last_mut().expect("not empty") ^= 1;
+    let files: [(&str, &[u8]); 8] = [
+        ("empty", b""),
+        ("garbage", &[0x8f; 3000]),
+        ("torn", &whole[..1000]),
+        ("altered", &altered),
+        ("utf16.toml", b"\xff\xfes\0e\0e\0d\0"),
+        ("unknown.toml", b"[ddpg]\ndiscont = 0.9\n"),
+        ("twice.toml", b"seed = 1\nseed = 2\n"),
+        ("advised.toml", b"arms = 2\n"),
+    ];
+    for (name, bytes) in files {
+        fs::write(directory.join(name), bytes).expect("written");
+    }
+    fs::create_dir(directory.join("folder")).expect("created");
+}
+
+/// Command lines, the exit codes they end with, and a word of what is said. `@name` stands for a file or a directory
+/// of those prepared, `@empty/x` for a place that cannot be written, `%name` for a policy that ships, `BUSY` for an
+/// address that is taken.
+const CASES: [(&str, i32, &str); 62] = [
+    ("", 64, "Usage"),
+    ("dance", 64, "dance"),
+    ("--log [[ policy show %teacher-push", 64, "[["),
+    ("train --no-such-flag", 64, "--no-such-flag"),
+    ("train --run @missing.toml", 64, "missing.toml"),
+    ("train --run @folder", 64, "folder"),
+    ("train --run @garbage", 64, "garbage"),
+    ("train --run @utf16.toml", 64, "UTF-8"),
+    ("train --run @unknown.toml", 64, "did you mean \"ddpg.discount\"?"),
+    ("train --run @twice.toml", 64, "line 2"),
+    ("train --run @empty/x", 64, "empty/x"),
+    ("train --set ddpg.discont=0.9", 64, "ddpg.discount"),
+    ("train --set ddpg.discount", 64, "KEY=VALUE"),
+    ("train --set ddpg.discount=nan", 64, "[0, 1)"),
+    ("train --max-minutes nan", 64, "stop.max_minutes"),
+    ("train --arms 3", 64, "1 or 2"),
+    ("train --arms two", 64, "two"),
+    ("train --seed -1", 64, "-1"),
+    ("train --task shove", 64, "shove"),
+    ("train --strategy bogus", 64, "bogus"),
+    ("train --workers 0", 64, "--workers"),
+    ("train --resume", 64, "--out"),
+    ("train --resume --out @folder", 64, "folder"),
+    ("train --teacher @missing", 65, "missing"),
+    ("train --teacher @torn", 65, "torn"),
+    ("train --teacher %student-push", 64, "drives 2 arms"),
+    ("train --teacher %teacher-pick-and-place", 64, "pick-and-place"),
+    ("train --out @empty/x", 75, "empty/x"),
+    ("eval", 64, "--policy"),
+    ("eval --policy @missing", 65, "missing"),
+    ("eval --policy @folder", 65, "folder"),
+    ("eval --policy @empty", 65, "empty"),
+    ("eval --policy @garbage", 65, "garbage"),
+    ("eval --policy @altered", 65, "digest"),
+    ("eval --policy %teacher-push --arms 2", 64, "1 arm"),
+    ("eval --policy %teacher-push --episodes 0", 64, "episodes"),
+    ("eval --policy %teacher-push --episodes 1 --record @empty/x.mcap", 75, "x.mcap"),
+    ("eval --policy %teacher-push --episodes 1 --record-dir @empty/x", 75, "empty/x"),
+    ("eval --composed-teachers %student-push", 64, "a teacher drives one"),
+    ("teacher", 64, "--policy"),
+    ("teacher --policy @missing", 65, "missing"),
+    ("teacher --policy @torn", 65, "torn"),
+    ("teacher --policy %teacher-push --listen BUSY", 75, "cannot listen"),
+    ("teacher --policy %teacher-push --listen nowhere", 64, "nowhere"),
+    ("learner --run @missing.toml --out @out", 64, "missing.toml"),
+    ("learner --run @unknown.toml --out @out", 64, "ddpg.discont"),
+    (
+        "learner --run @advised.toml --out @out --teacher 127.0.0.1:1 --listen BUSY",
+        75,
+        "cannot listen",
+    ),
+    ("learner --run @advised.toml --out @out", 64, "teacher"),
+    ("learner --run @advised.toml --out @empty/x --teacher 127.0.0.1:1", 75, "empty/x"),
+    ("worker", 64, "--connect"),
+    ("policy show @missing", 65, "missing"),
+    ("policy show @folder --json", 65, "folder"),
+    ("mcap recover @missing", 65, "missing"),
+    ("mcap recover @folder --to @mended", 65, "folder"),
+    ("mcap recover @garbage --to @mended", 65, "garbage"),
+    ("mcap recover @garbage --to @empty", 64, "exists"),
+    ("replay", 64, "FILE"),
+    ("replay @missing", 65, "missing"),
+    ("replay @folder", 65, "no *.mcap"),
+    ("replay @empty --verify", 65, "empty"),
+    ("picture --policy %teacher-push --out @empty/x.svg", 75, "x.svg"),
+    ("bench dance", 64, "dance"),
+];
+
+#[test]
+fn what_cannot_be_used_is_said_in_one_line() {
+    let directory = tempfile::tempdir().expect("a directory");
+    prepare(directory.path());
+    let busy = TcpListener::bind("127.0.0.1:0").expect("a free address");
+    let busy = busy.local_addr().expect("an address").to_string();
+    for (line, code, word) in CASES {
+        let args: Vec<String> = line
+            .split_whitespace()
+            .map(|arg| match (arg.strip_prefix('@'), arg.strip_prefix('%')) {
+                (Some(name), _) => directory.path().join(name).display().to_string(),
+                (_, Some(name)) => shipped(name),
+                _ => arg.replace("BUSY", &busy),
+            })
+            .collect();
+        let args: Vec<&str> = args.iter().map(String::as_str).collect();
+        let output = command(&args, directory.path()).output().expect("runs");
+        let told = String::from_utf8_lossy(&output.stderr).into_owned();
+        assert_eq!(output.status.code(), Some(code), "{line}: {told}");
+        assert!(told.contains(word), "{line}: {told:?} lacks {word:?}");
+        assert!(!told.contains("panicked") && !told.contains("RUST_BACKTRACE"), "{line}: {told}");
+        let lines =
+            told.lines().filter(|line| line.starts_with("tandem: ") || line.starts_with("error: "));
+        assert!(lines.count() == 1 || told.starts_with("Teaches"), "{line}: {told}");
+        assert!(told.len() < 3000, "{line}: {} bytes", told.len());
+    }
+    assert!(!directory.path().join("mended").exists(), "nothing was made of garbage");
+}

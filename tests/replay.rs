@@ -1,0 +1,396 @@
+//! Recorded episodes of every kind, played again by the program: equal bit for bit, or the first other number named.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
+
+use proptest::prelude::{ProptestConfig, any, prop_assert, proptest};
+use serde_json::{Value, json};
+use tandem_core::layout::EPISODE_STEPS;
+use tandem_core::work::{EpisodeOrder, Exploration, RunTerms, SlotOrder, WorldTerms};
+use tandem_core::{ArmAdvice, Contacts, EpisodeKind, Layout, StepAdvice, StepQuery, Task};
+use tandem_policy::{Actor, Policy};
+use tandem_sim::{Env, WorldConfig};
+use tandem_telemetry::{
+    EpisodeLog, EpisodeMetadata, EpisodeRecorder, TransitionRecord, read_episode, recover,
+};
+use tandem_worker::ports::AdvisorGone;
+use tandem_worker::record::{log_name, metadata_of, record_episode, replay_log, world_of};
+use tandem_worker::rollout::play_slot;
+use tandem_worker::{Advisor, ComposedTeachers};
+
+/// Episodes of one slot.
+const N_TOGETHER: u64 = 5;
+
+/// What an episode is played for and how it starts and explores.
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum Kind {
+    Evaluation,
+    Explored,
+    Uniform,
+    Advised,
+    SpecialStart,
+}
+
+const KINDS: [Kind; 5] =
+    [Kind::Evaluation, Kind::Explored, Kind::Uniform, Kind::Advised, Kind::SpecialStart];
+
+fn teacher(task: Task) -> Actor {
+    let name = format!("policies/teacher-{task}.safetensors");
+    let policy = Policy::load(&Path::new(env!("CARGO_MANIFEST_DIR")).join(name)).expect("ships");
+    policy.actor().expect("usable")
+}
+
+/// Takes over one arm or both on two steps of three.
+struct EagerTeacher(Actor, Layout);
+
+impl EagerTeacher {
+    fn verdict(&mut self, query: &StepQuery) -> StepAdvice {
+        let mut action = query.proposed_action.clone();
+        let mut arms = Vec::new();
+        for arm in self.1.arms() {
+            let mut teacher_action = vec![0.0; self.1.single_arm().n_action()];
+            let observation = &query.observation[self.1.observation_of(arm)];
+            self.0.act(observation, &query.goal[self.1.goal_of(arm)], &mut teacher_action);
+            let overridden = !(query.step as usize + arm.0).is_multiple_of(3);
+            if overridden {
+                action[self.1.action_of(arm)].copy_from_slice(&teacher_action);
+            }
+            arms.push(ArmAdvice {
+                teacher_action,
+                q_teacher: -1.0,
+                q_student: -2.0,
+                importance: 1.0,
+                distance: 0.5,
+                overridden,
+            });
+        }
+        StepAdvice { action, charged: arms.iter().any(|arm| arm.overridden), arms }
+    }
+}
+
+impl Advisor for EagerTeacher {
+    fn advise(&mut self, queries: &[StepQuery]) -> Result<Vec<StepAdvice>, AdvisorGone> {
+        Ok(queries.iter().map(|query| self.verdict(query)).collect())
+    }
+}
+
+fn terms(layout: Layout, kind: Kind, substeps: u32) -> RunTerms {
+    let share = if kind == Kind::SpecialStart { 1.0 } else { 0.3 };
+    RunTerms {
+        layout,
+        account: Some("replay".to_owned()),
+        exploration: Exploration { noise_std: 0.2, random_share: 0.3, random_hold_mean_steps: 4.0 },
+        world: WorldTerms { gripped_start_share: share, wide_start_share: share, substeps },
+    }
+}
+
+fn slot(kind: Kind) -> SlotOrder {
+    let first = N_TOGETHER * KINDS.iter().position(|other| *other == kind).expect("listed") as u64;
+    let order = |number| EpisodeOrder {
+        number,
+        seed: 31,
+        advised: kind == Kind::Advised,
+        uniform: kind == Kind::Uniform,
+        record: true,
+    };
+    let played_for =
+        if kind == Kind::Evaluation { EpisodeKind::Evaluation } else { EpisodeKind::Training };
+    SlotOrder {
+        slot: 0,
+        parameter_version: 3,
+        kind: played_for,
+        episodes: (first..first + N_TOGETHER).map(order).collect(),
+    }
+}
+
+/// Plays a slot of a kind and records it as a worker does; gives the logs.
+fn record(layout: Layout, kind: Kind, substeps: u32, directory: &Path) -> Vec<PathBuf> {
+    let (terms, slot) = (terms(layout, kind, substeps), slot(kind));
+    let world = Env::new(layout, &WorldConfig { substeps, ..WorldConfig::default() });
+    let mut actor = ComposedTeachers(teacher(layout.task));
+    let mut advisor = EagerTeacher(teacher(layout.task), layout);
+    let world = world.expect("in range");
+    let episodes = play_slot(&world, &slot, &terms, &mut actor, &mut advisor).expect("plays");
+    let write = |(order, episode)| {
+        let path = directory.join(log_name(episode));
+        record_episode(&metadata_of(order, episode, &terms), episode, &path).expect("recorded")
+    };
+    slot.episodes.iter().copied().zip(&episodes).map(write).collect()
+}
+
+/// One log of two arms that pick and place.
+fn one_log(directory: &Path) -> PathBuf {
+    record(Layout::new(Task::PickAndPlace, 2), Kind::Advised, 10, directory).remove(0)
+}
+
+fn tandem(args: &[&str], paths: &[&Path]) -> Output {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_tandem"));
+    command.args(args).args(paths).output().expect("runs")
+}
+
+fn stdout(output: &Output) -> String {
+    String::from_utf8_lossy(&output.stdout).into_owned()
+}
+
+/// The one line on standard error.
+fn complaint(output: &Output) -> String {
+    let errors = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert_eq!(errors.lines().count(), 1, "{errors}");
+    assert!(errors.starts_with("tandem: "), "{errors}");
+    errors
+}
+
+fn summary(output: &Output) -> Value {
+    serde_json::from_str(stdout(output).lines().last().expect("a line")).expect("JSON")
+}
+
+#[test]
+fn two_hundred_episodes_of_every_kind_repeat_themselves() {
+    let keep = tempfile::tempdir().expect("a directory");
+    let worlds = Task::ALL.into_iter().flat_map(|task| {
+        [1, 2].into_iter().flat_map(move |n_arms| [(task, n_arms, 10), (task, n_arms, 20)])
+    });
+    let logs: Vec<PathBuf> = std::thread::scope(|scope| {
+        let threads: Vec<_> = worlds
+            .map(|(task, n_arms, substeps)| {
+                let directory = keep.path().join(format!("{task}-{n_arms}-{substeps}"));
+                scope.spawn(move || {
+                    fs::create_dir(&directory).expect("created");
+                    let layout = Layout::new(task, n_arms);
+                    let of_kind = |kind| record(layout, kind, substeps, &directory);
+                    KINDS.into_iter().flat_map(of_kind).collect::<Vec<_>>()
+                })
+            })
+            .collect();
+        threads.into_iter().flat_map(|thread| thread.join().expect("records")).collect()
+    });
+    assert_eq!(logs.len(), 200);
+
+    let read: Vec<EpisodeLog> = logs.iter().map(|log| read_episode(log).expect("whole")).collect();
+    let n_logs_with = |holds: &dyn Fn(&EpisodeLog) -> bool| {
+        read.iter().filter(|log| log.transitions.len() == EPISODE_STEPS && holds(log)).count()
+    };
+    let advised = n_logs_with(&|log| log.transitions.iter().any(|step| step.advised_arms != 0));
+    let touching = n_logs_with(&|log| log.transitions.iter().any(|step| step.contacts.any()));
+    let achieving = n_logs_with(&|log| log.transitions.iter().any(|step| step.reward == 0.0));
+    assert_eq!(advised, 40);
+    assert!(touching >= 8 && achieving >= 40, "{touching} touch, {achieving} achieve");
+
+    let whole = tandem(&["replay", "--verify"], &[keep.path()]);
+    assert_eq!(stdout(&whole), "200 of 200 episodes equal bit for bit\n");
+    assert!(whole.status.success() && whole.stderr.is_empty());
+    let as_json = tandem(&["replay", "--json"], &[keep.path(), &logs[0]]);
+    let expected = json!({
+        "episodes": 201, "equal": 201, "differing": [], "unreadable": [], "cut_short": [],
+    });
+    assert_eq!(summary(&as_json), expected);
+}
+
+/// Writes a log that says what `log` says, with its checksums right.
+fn rewrite(log: &EpisodeLog, metadata: &EpisodeMetadata, path: &Path) {
+    let mut world = world_of(&log.metadata).expect("described");
+    let mut recorder = EpisodeRecorder::create(path, metadata).expect("created");
+    for (step, transition) in (0..).zip(&log.transitions) {
+        let record = TransitionRecord {
+            step,
+            observation: &transition.observation,
+            goal: &transition.goal,
+            action: &transition.action,
+            reward: transition.reward,
+            rewards_per_arm: &transition.rewards_per_arm,
+            advised_arms: transition.advised_arms,
+            contacts: transition.contacts,
+            advice: &transition.advice,
+        };
+        recorder.record_step(&world.scene(), &record).expect("recorded");
+        world.step(&transition.action).expect("steps");
+    }
+    if let Some(last_observation) = &log.last_observation {
+        recorder.record_outcome(&world.scene(), last_observation).expect("recorded");
+    }
+    recorder.finish().expect("finished");
+}
+
+fn flip_last_bit(number: &mut f32) {
+    *number = f32::from_bits(number.to_bits() ^ 1);
+}
+
+type Spoil = fn(&mut EpisodeLog);
+
+/// Numbers that are spoilt, and where that shows: step, vector, component.
+const SPOILT: [(&str, Spoil, (usize, &str, usize)); 7] = [
+    (
+        "seen",
+        |log| flip_last_bit(&mut log.transitions[17].observation[41]),
+        (17, "observation", 41),
+    ),
+    ("goal", |log| flip_last_bit(&mut log.transitions[20].goal[4]), (20, "goal", 4)),
+    ("reward", |log| log.transitions[33].reward = -0.5, (33, "reward", 0)),
+    (
+        "arm",
+        |log| flip_last_bit(&mut log.transitions[8].rewards_per_arm[1]),
+        (8, "rewards_per_arm", 1),
+    ),
+    ("contacts", |log| spoil_contacts(&mut log.transitions[25].contacts), (25, "contacts", 0)),
+    (
+        "last",
+        |log| flip_last_bit(&mut log.last_observation.as_mut().expect("whole")[3]),
+        (50, "observation", 3),
+    ),
+    ("minus", |log| log.transitions[4].goal[0] = -log.transitions[4].goal[0], (4, "goal", 0)),
+];
+
+fn spoil_contacts(contacts: &mut Contacts) {
+    *contacts = Contacts::from_bits(contacts.bits() ^ 1).expect("two bits");
+}
+
+#[test]
+fn a_spoilt_number_is_found_and_named() {
+    let keep = tempfile::tempdir().expect("a directory");
+    let log = read_episode(&one_log(keep.path())).expect("whole");
+    let (good, bad) = (keep.path().join("good"), keep.path().join("bad"));
+    fs::create_dir(&good).expect("created");
+    fs::create_dir(&bad).expect("created");
+    for (name, spoil, _) in SPOILT {
+        let mut spoilt = log.clone();
+        spoil(&mut spoilt);
+        assert_ne!(format!("{spoilt:?}"), format!("{log:?}"), "{name} is spoilt");
+        rewrite(&spoilt, &log.metadata, &bad.join(format!("{name}.mcap")));
+    }
+    rewrite(&log, &log.metadata, &good.join("unspoilt.mcap"));
+
+    let found = tandem(&["replay", "--json"], &[&good, &bad]);
+    assert_eq!(found.status.code(), Some(65));
+    let found = summary(&found);
+    assert_eq!((&found["episodes"], &found["equal"]), (&json!(8), &json!(1)));
+    let differing = found["differing"].as_array().expect("a list");
+    assert_eq!(differing.len(), SPOILT.len());
+    for (name, _, (step, field, component)) in SPOILT {
+        let path = bad.join(format!("{name}.mcap"));
+        let entry = differing.iter().find(|entry| entry["file"] == json!(path)).expect(name);
+        let place = (&entry["step"], &entry["field"], &entry["component"]);
+        assert_eq!(place, (&json!(step), &json!(field), &json!(component)), "{name}");
+        let alone = tandem(&["replay", "--verify"], &[&path]);
+        let line = complaint(&alone);
+        assert_eq!(alone.status.code(), Some(65), "{line}");
+        assert!(
+            line.contains(&format!("{name}.mcap: step {step}: {field}[{component}] is ")),
+            "{line}"
+        );
+    }
+}
+
+#[test]
+fn another_action_or_another_world_shows_in_what_follows() {
+    let keep = tempfile::tempdir().expect("a directory");
+    let log = read_episode(&one_log(keep.path())).expect("whole");
+    assert!(replay_log(&log).is_ok());
+    let check = |spoil: Spoil, words: &str| {
+        let mut spoilt = log.clone();
+        spoil(&mut spoilt);
+        let told = replay_log(&spoilt).expect_err(words).to_string();
+        assert!(told.starts_with(words), "{told:?} does not begin with {words:?}");
+    };
+    check(|log| log.transitions[9].action[2] = 0.77, "step 10: observation[");
+    check(|log| log.transitions[9].action[2] = f32::NAN, "action");
+    check(|log| log.metadata.seed += 1, "step 0: observation[");
+    check(|log| log.metadata.episode += 1, "step 0: observation[");
+    check(
+        |log| drop(log.metadata.world.insert("substeps".into(), "20".into())),
+        "step 1: observation[",
+    );
+    check(|log| drop(log.metadata.world.remove("substeps")), "metadata entry \"substeps\"");
+    check(
+        |log| drop(log.metadata.world.insert("substeps".into(), "-1".into())),
+        "metadata entry \"substeps\"",
+    );
+    check(
+        |log| drop(log.metadata.world.insert("substeps".into(), "9".into())),
+        "world.substeps is 9",
+    );
+}
+
+/// What comes of a damaged log: refused as it is, and mended to the beginning of what it was.
+fn check_damaged(whole: &EpisodeLog, bytes: &[u8], directory: &Path) -> Option<usize> {
+    let (damaged, mended) = (directory.join("damaged.mcap"), directory.join("mended.mcap"));
+    fs::write(&damaged, bytes).expect("written");
+    assert!(read_episode(&damaged).is_err(), "{} bytes are taken for whole", bytes.len());
+    let log = recover(&damaged, &mended).ok().map(|_| read_episode(&mended))?;
+    let Ok(log) = log else { return None };
+    assert_eq!(log.metadata, whole.metadata);
+    assert!(log.transitions == whole.transitions[..log.transitions.len()]);
+    assert!(log.last_observation.is_none() || log.last_observation == whole.last_observation);
+    Some(log.transitions.len())
+}
+
+#[test]
+fn a_log_cut_anywhere_is_mended_to_its_beginning() {
+    let keep = tempfile::tempdir().expect("a directory");
+    let path = one_log(keep.path());
+    let (whole, bytes) = (read_episode(&path).expect("whole"), fs::read(&path).expect("readable"));
+    let mut n_before = None;
+    for n_bytes in (0..bytes.len()).step_by(37) {
+        let n_steps = check_damaged(&whole, &bytes[..n_bytes], keep.path());
+        assert!(
+            n_steps >= n_before,
+            "{n_bytes} bytes give {n_steps:?} steps, fewer gave {n_before:?}"
+        );
+        if n_steps > n_before && n_steps > Some(0) {
+            let log = read_episode(&keep.path().join("mended.mcap")).expect("whole");
+            assert!(replay_log(&log).is_ok(), "{n_bytes} bytes");
+            n_before = n_steps;
+        }
+    }
+    assert_eq!(n_before, Some(EPISODE_STEPS));
+}
+
+#[test]
+fn the_program_refuses_what_is_cut_and_mends_it() {
+    let keep = tempfile::tempdir().expect("a directory");
+    let bytes = fs::read(one_log(keep.path())).expect("readable");
+    let (cut, mended) = (keep.path().join("cut.mcap"), keep.path().join("mended.mcap"));
+    for n_bytes in [0, 7, 8, 100, 3000, bytes.len() / 2, bytes.len() - 1] {
+        fs::write(&cut, &bytes[..n_bytes]).expect("written");
+        let refused = tandem(&["replay", "--verify"], &[&cut]);
+        assert_eq!(refused.status.code(), Some(65), "{n_bytes} bytes");
+        assert!(complaint(&refused).contains("cut.mcap"));
+        let recovered = tandem(&["mcap", "recover"], &[&cut, Path::new("--to"), &mended]);
+        let code = recovered.status.code();
+        assert_eq!(code, Some(if n_bytes < 8 { 65 } else { 0 }), "{n_bytes} bytes");
+        assert_eq!(mended.exists(), n_bytes >= 8);
+        if mended.exists() {
+            let again = tandem(&["replay", "--json"], &[&mended]);
+            let summary = summary(&again);
+            let is_prefix = summary["equal"] == json!(1);
+            assert_eq!(again.status.code(), Some(if is_prefix { 0 } else { 65 }), "{summary}");
+            assert!(is_prefix == (n_bytes > 3000), "{n_bytes} bytes: {summary}");
+            fs::remove_file(&mended).expect("there");
+        }
+    }
+    let left: Vec<_> =
+        fs::read_dir(keep.path()).expect("there").flatten().map(|e| e.path()).collect();
+    assert!(left.iter().all(|path| path.extension().is_some_and(|e| e == "mcap")), "{left:?}");
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig { cases: 4, failure_persistence: None, ..ProptestConfig::default() })]
+
+    #[test]
+    fn a_log_with_other_bytes_is_refused_and_mended(
+        damages in proptest::collection::vec(
+            proptest::collection::vec((any::<usize>(), 1_u8..=255), 1..4), 150,
+        ),
+    ) {
+        let keep = tempfile::tempdir().expect("a directory");
+        let path = one_log(keep.path());
+        let (whole, bytes) = (read_episode(&path).expect("whole"), fs::read(&path).expect("readable"));
+        for damage in damages {
+            let mut damaged = bytes.clone();
+            for (at, change) in &damage {
+                damaged[at % bytes.len()] ^= change;
+            }
+            prop_assert!(damaged == bytes || check_damaged(&whole, &damaged, keep.path()).is_none_or(|n| n <= EPISODE_STEPS));
+        }
+    }
+}
