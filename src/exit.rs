@@ -39,6 +39,11 @@ impl Failed {
         Self::new(Exit::Usage, anyhow::anyhow!("{message}"))
     }
 
+    /// The error without its exit code, for those who tell of it themselves.
+    pub(crate) fn into_error(self) -> anyhow::Error {
+        self.error
+    }
+
     /// Prints the one line and gives the exit code.
     #[expect(clippy::print_stderr, reason = "the one line that says what is wrong")]
     pub(crate) fn report(&self) -> ExitCode {

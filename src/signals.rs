@@ -1,6 +1,5 @@
 //! When a process is asked to end.
 
-use tokio::io::AsyncReadExt as _;
 use tokio::signal::unix::{SignalKind, signal};
 use tokio_util::sync::CancellationToken;
 
@@ -21,11 +20,16 @@ pub(crate) fn shutdown_token(exit_with_stdin: bool) -> std::io::Result<Cancellat
     Ok(token)
 }
 
+/// Waits until standard input closes. A thread of its own reads it: that may take for ever, and a runtime does not end
+/// before its own blocked reads do.
 async fn standard_input_closed(is_watched: bool) {
     if !is_watched {
         std::future::pending::<()>().await;
     }
-    let mut input = tokio::io::stdin();
-    let mut byte = [0];
-    while !matches!(input.read(&mut byte).await, Ok(0) | Err(_)) {}
+    let (closed, is_closed) = tokio::sync::oneshot::channel();
+    std::thread::spawn(move || {
+        drop(std::io::copy(&mut std::io::stdin().lock(), &mut std::io::sink()));
+        closed.send(()).ok();
+    });
+    drop(is_closed.await);
 }

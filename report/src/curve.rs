@@ -8,6 +8,7 @@ use plotters::prelude::{
 use tandem_telemetry::MetricsRow;
 
 use crate::error::Error;
+use crate::table::short_number;
 
 /// One colour a series, apart for colour-blind eyes too; a further series starts again.
 const COLORS: [RGBColor; 6] = [
@@ -21,6 +22,10 @@ const COLORS: [RGBColor; 6] = [
 const INK: RGBColor = RGBColor(0x24, 0x29, 0x2f);
 const FAINT_INK: RGBColor = RGBColor(0x6a, 0x73, 0x7d);
 const GRID: RGBColor = RGBColor(0xe6, 0xe9, 0xed);
+/// Left edge of the legend, pixels.
+const LEGEND_LEFT_PX: i32 = 20;
+/// Height of a line of the legend, pixels.
+const LEGEND_LINE_PX: i32 = 20;
 const FONT: &str = "-apple-system, 'Segoe UI', Helvetica, Arial, sans-serif";
 
 /// What a curve is drawn against.
@@ -48,7 +53,7 @@ impl Axis {
         }
     }
 
-    fn of(self, row: &MetricsRow) -> f64 {
+    pub(crate) fn of(self, row: &MetricsRow) -> f64 {
         match self {
             Self::EnvSteps => row.env_steps as f64,
             Self::Updates => row.updates as f64,
@@ -80,7 +85,7 @@ pub enum Quantity {
 }
 
 impl Quantity {
-    fn of(self, row: &MetricsRow) -> f64 {
+    pub(crate) fn of(self, row: &MetricsRow) -> f64 {
         match self {
             Self::Success => row.success,
             Self::SuccessJoint => row.success_joint,
@@ -183,26 +188,49 @@ type Drawn = Result<(), Box<dyn std::error::Error>>;
 fn draw(series: &[Series], options: &CurveOptions, svg: &mut String) -> Drawn {
     let root = SVGBackend::with_string(svg, (options.width, options.height)).into_drawing_area();
     root.fill(&WHITE)?;
-    draw_head(&root, series, options)?;
-    let head_px = if series.len() > 1 { 66 } else { 46 };
-    let (_, plot) = root.split_vertically(head_px);
+    let legend = legend(series, options.width);
+    draw_head(&root, &legend, options)?;
+    let n_lines = legend.last().map_or(0, |entry| entry.line + 1);
+    let (_, plot) = root.split_vertically(46 + LEGEND_LINE_PX * n_lines);
     draw_plot(&plot, series, options)?;
     root.present()?;
     Ok(())
 }
 
-/// The title and, for several curves, the legend.
-fn draw_head(root: &Area<'_>, series: &[Series], options: &CurveOptions) -> Drawn {
+/// A curve's name in the legend.
+#[derive(Debug, PartialEq)]
+struct LegendEntry<'a> {
+    name: &'a str,
+    /// Left edge, pixels.
+    left: i32,
+    /// Line, from 0.
+    line: i32,
+}
+
+/// Places the names of several curves on as many lines as it takes; a single curve needs none.
+fn legend(series: &[Series], width_px: u32) -> Vec<LegendEntry<'_>> {
+    let width_px = i32::try_from(width_px).unwrap_or(i32::MAX);
+    let (mut left, mut line) = (LEGEND_LEFT_PX, 0);
+    let mut entries = Vec::new();
+    for one in series.iter().filter(|_| series.len() > 1) {
+        let entry_px = 22 + estimated_width_px(&one.name, 13);
+        if left > LEGEND_LEFT_PX && left + entry_px > width_px {
+            (left, line) = (LEGEND_LEFT_PX, line + 1);
+        }
+        entries.push(LegendEntry { name: &one.name, left, line });
+        left += entry_px + 20;
+    }
+    entries
+}
+
+/// The title and the legend.
+fn draw_head(root: &Area<'_>, legend: &[LegendEntry<'_>], options: &CurveOptions) -> Drawn {
     let title = (FONT, 17).into_font().style(plotters::style::FontStyle::Bold).color(&INK);
     root.draw(&Text::new(options.title.clone(), (20, 16), title))?;
-    if series.len() < 2 {
-        return Ok(());
-    }
-    let mut left = 20;
-    for (one, color) in series.iter().zip(COLORS.iter().cycle()) {
-        root.draw(&Rectangle::new([(left, 50), (left + 16, 53)], color.filled()))?;
-        root.draw(&Text::new(one.name.clone(), (left + 22, 44), text_style(13, INK)))?;
-        left += 22 + estimated_width_px(&one.name, 13) + 20;
+    for (LegendEntry { name, left, line }, color) in legend.iter().zip(COLORS.iter().cycle()) {
+        let top = 44 + LEGEND_LINE_PX * line;
+        root.draw(&Rectangle::new([(*left, top + 6), (left + 16, top + 9)], color.filled()))?;
+        root.draw(&Text::new((*name).to_owned(), (left + 22, top), text_style(13, INK)))?;
     }
     Ok(())
 }
@@ -285,18 +313,6 @@ fn y_range(series: &[Series], percent: bool) -> std::ops::Range<f64> {
     }
 }
 
-/// 1500000 as 1.5M, 20000 as 20k.
-fn short_number(value: f64) -> String {
-    let (scaled, unit) = match value.abs() {
-        size if size >= 999_500.0 => (value / 1e6, "M"),
-        size if size >= 1000.0 => (value / 1e3, "k"),
-        _ => (value, ""),
-    };
-    let text = format!("{scaled:.2}");
-    let text = text.trim_end_matches('0').trim_end_matches('.');
-    format!("{}{unit}", if text == "-0" { "0" } else { text })
-}
-
 fn text_style(size_px: u32, color: RGBColor) -> TextStyle<'static> {
     (FONT, size_px).into_font().color(&color)
 }
@@ -312,18 +328,25 @@ mod tests {
     use super::*;
 
     #[test]
-    fn axis_numbers_are_short() {
-        let texts =
-            [0.0, -0.001, 0.25, 50.0, 1500.0, 20_000.0, 999_900.0, 1.5e6, -10.0].map(short_number);
-        assert_eq!(texts, ["0", "0", "0.25", "50", "1.5k", "20k", "1M", "1.5M", "-10"]);
-    }
-
-    #[test]
     fn a_row_without_the_figure_is_left_out_of_its_curve() {
         let row = |mean_q| MetricsRow { mean_q, ..MetricsRow::default() };
         let series =
             Series::of("run", &[row(f64::NAN), row(-3.0)], Axis::EnvSteps, Quantity::MeanQ);
         assert_eq!(series.points, [CurvePoint { x: 0.0, y: -3.0, band: None }]);
+    }
+
+    #[test]
+    fn a_legend_takes_as_many_lines_as_its_names_need() {
+        let named = |name: &str| Series { name: name.to_owned(), points: Vec::new() };
+        let places = |names: &[&str]| {
+            let series: Vec<Series> = names.iter().map(|name| named(name)).collect();
+            legend(&series, 300).iter().map(|entry| (entry.left, entry.line)).collect::<Vec<_>>()
+        };
+        assert_eq!(places(&["alone"]), []);
+        let long = "0123456789";
+        assert_eq!(places(&[long, long, long]), [(20, 0), (127, 0), (20, 1)]);
+        let longest = long.repeat(6);
+        assert_eq!(places(&[&longest, long]), [(20, 0), (20, 1)]);
     }
 
     #[test]

@@ -5,9 +5,6 @@ use std::path::PathBuf;
 /// What can go wrong while reporting.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
-    /// A run's records cannot be read.
-    #[error("cannot read the metrics of a run")]
-    Metrics(#[from] tandem_telemetry::Error),
     /// A file operation failed.
     #[error("cannot {action} {path:?}")]
     Io {
@@ -17,6 +14,20 @@ pub enum Error {
         path: PathBuf,
         /// Why it failed.
         source: std::io::Error,
+    },
+    /// Nothing that a report could show.
+    #[error("{path:?} holds no run: expected a metrics.jsonl in it or below")]
+    NoRun {
+        /// Where one was looked for.
+        path: PathBuf,
+    },
+    /// A file is no result of an evaluation.
+    #[error("{path:?} is no result of `tandem eval --json`: {problem}")]
+    NoEvaluation {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong with it.
+        problem: String,
     },
     /// A curve could not be drawn.
     #[error("cannot draw the curve {title:?}: {problem}")]

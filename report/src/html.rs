@@ -4,10 +4,13 @@ use std::path::{Path, PathBuf};
 
 use tandem_telemetry::MetricsRow;
 
+use crate::comparison::{Comparison, paper_table};
 use crate::curve::{Axis, CurveOptions, Quantity, Series, curve_svg};
 use crate::error::Error;
+use crate::figures::{Figure, figures as comparison_figures};
+use crate::paper;
 use crate::run::Run;
-use crate::table::{HEADER, cells, duration, interval, number, share, thousands};
+use crate::table::{Table, duration, interval, number, share, thousands};
 
 const STYLE: &str = include_str!("report.css");
 
@@ -16,41 +19,68 @@ const STYLE: &str = include_str!("report.css");
 /// # Errors
 /// When the run's metrics cannot be read or the file cannot be written.
 pub fn run_report_html(run_dir: &Path) -> Result<PathBuf, Error> {
-    let run = Run::load(run_dir)?;
+    let run = Run::load(run_dir, &mut Vec::new())?;
     let path = run_dir.join("report.html");
     write(&path, &run_page(&run)?)?;
     Ok(path)
 }
 
-/// Writes a page that sets several runs side by side to `path`.
+/// What a comparison's report consists of.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Written {
+    /// The page.
+    pub page: PathBuf,
+    /// Its curves, each a file beside it.
+    pub figures: Vec<PathBuf>,
+}
+
+/// Writes a page with the tables and curves of `comparison` to `path`, and each curve as a file of its own beside it.
 ///
 /// # Errors
-/// When a curve cannot be drawn or the file cannot be written.
-pub fn comparison_html(runs: &[Run], path: &Path) -> Result<(), Error> {
-    let against = |axis| {
-        let series: Vec<Series> = runs
-            .iter()
-            .map(|run| Series::of(&run.name, &run.rows, axis, Quantity::Success))
-            .collect();
-        curve_svg(&series, &CurveOptions::shares("Success", axis))
-    };
-    let mean_q: Vec<Series> = runs
-        .iter()
-        .map(|run| Series::of(&run.name, &run.rows, Axis::EnvSteps, Quantity::MeanQ))
-        .collect();
-    let curves = [
-        against(Axis::EnvSteps)?,
-        against(Axis::Minutes)?,
-        curve_svg(&mean_q, &CurveOptions::figures("Mean Q", Axis::EnvSteps))?,
-    ];
-    let lines: Vec<Vec<String>> = runs.iter().map(|run| cells(run).to_vec()).collect();
-    let body = format!("{}{}", table(&HEADER, &lines), figures(&curves));
-    write(path, &page("Runs compared", &body))
+/// When a curve cannot be drawn or a file cannot be written.
+pub fn comparison_html(comparison: &Comparison, path: &Path) -> Result<Written, Error> {
+    let figures = comparison_figures(comparison)?;
+    let mut written = Written { page: path.to_owned(), figures: Vec::new() };
+    for figure in &figures {
+        let svg_path = path.with_file_name(&figure.file_name);
+        write(&svg_path, &figure.svg)?;
+        written.figures.push(svg_path);
+    }
+    write(path, &page("Runs compared", &comparison_body(comparison, &figures)))?;
+    Ok(written)
+}
+
+fn comparison_body(comparison: &Comparison, drawn: &[Figure]) -> String {
+    let mut body = String::new();
+    for section in &comparison.sections {
+        let tables = section.tables();
+        body.extend(tables.iter().map(titled_table));
+    }
+    let svgs: Vec<&str> = drawn.iter().map(|figure| figure.svg.as_str()).collect();
+    body.push_str(&figures(&svgs));
+    body.push_str(&titled_table(&paper_table()));
+    body.push_str(&format!("<p>{}</p><p>{}</p>", escaped(paper::SOURCE), escaped(NOTES)));
+    body
+}
+
+/// How the figures of a comparison are meant.
+const NOTES: &str = "IE: epoch of the first evaluation with 10 % of the maximum success. RT: epochs from there to 90 % of it. \
+     MSR: maximum success. ELR: 90 % of MSR over the epochs to reach it. Of several runs: mean (smallest–largest), and how \
+     many have the figure where not all do; intervals are Wilson's 95 % over the episodes of all runs together and know \
+     nothing of the differences between seeds. The best of many evaluations is a choice and flatters; held-out goals do not.";
+
+fn titled_table(shown: &Table) -> String {
+    let header: Vec<&str> = shown.header.iter().map(String::as_str).collect();
+    format!("<h2>{}</h2>{}", escaped(&shown.title), table(&header, &shown.lines))
 }
 
 fn run_page(run: &Run) -> Result<String, Error> {
     let mut body = match (run.best(), run.last()) {
-        (Some(best), Some(last)) => format!("{}{}", tiles(best, last), figures(&curves(run)?)),
+        (Some(best), Some(last)) => format!(
+            "{}{}",
+            tiles(best, last),
+            figures(&curves(run)?.each_ref().map(String::as_str))
+        ),
         _ => "<p>No evaluation yet.</p>".to_owned(),
     };
     if !run.rows.is_empty() {
@@ -176,7 +206,7 @@ fn table(header: &[&str], lines: &[Vec<String>]) -> String {
     )
 }
 
-fn figures(curves: &[String]) -> String {
+fn figures(curves: &[&str]) -> String {
     let figures: String = curves.iter().map(|svg| format!("<figure>{svg}</figure>")).collect();
     format!("<div class=figures>{figures}</div>")
 }

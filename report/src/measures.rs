@@ -1,4 +1,4 @@
-//! The paper's measures of a learning curve (Table 2).
+//! The paper's measures of a learning curve (Table 2), and what it cost to reach a success.
 
 use tandem_telemetry::MetricsRow;
 
@@ -6,6 +6,8 @@ use tandem_telemetry::MetricsRow;
 const INSPIRED_SHARE: f64 = 0.1;
 /// Share of the maximum success at which learning counts as done.
 const RISEN_SHARE: f64 = 0.9;
+/// Shares are whole numbers of episodes; a product of two may miss the very share it stands for by a rounding.
+const ROUNDING: f64 = 1e-9;
 
 /// The paper's measures of a learning curve, in paper epochs. A curve that never leaves zero has only `max_success`.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -26,9 +28,8 @@ impl LearningMeasures {
     pub fn of(rows: &[MetricsRow]) -> Self {
         let max_success = rows.iter().map(|row| row.success).fold(0.0, f64::max);
         let epoch_reaching = |share: f64| {
-            let reached =
-                rows.iter().find(|row| max_success > 0.0 && row.success >= share * max_success);
-            reached.map(|row| row.paper_epochs)
+            let reached = first_reaching(rows, share * max_success);
+            reached.filter(|_| max_success > 0.0).map(|row| row.paper_epochs)
         };
         let (inspired, risen) = (epoch_reaching(INSPIRED_SHARE), epoch_reaching(RISEN_SHARE));
         Self {
@@ -40,6 +41,12 @@ impl LearningMeasures {
                 .map(|epochs| RISEN_SHARE * max_success / epochs),
         }
     }
+}
+
+/// The first evaluation of which the success is `success` or more.
+#[must_use]
+pub fn first_reaching(rows: &[MetricsRow], success: f64) -> Option<&MetricsRow> {
+    rows.iter().find(|row| row.success >= success - ROUNDING)
 }
 
 #[cfg(test)]
@@ -72,5 +79,27 @@ mod tests {
             (None, None, None)
         );
         assert_eq!(LearningMeasures::of(&[]).max_success, 0.0);
+    }
+
+    #[test]
+    fn exactly_ten_and_ninety_per_cent_count_whatever_the_rounding() {
+        for n_tenths in 1..=24 {
+            let share = |n_hits: i32| f64::from(n_hits) / 240.0;
+            let curve = [0.0, share(n_tenths), share(9 * n_tenths), share(10 * n_tenths)];
+            let measures = LearningMeasures::of(&rows(&curve));
+            assert_eq!(measures.inspired_epoch, Some(10.0), "{n_tenths} of 240");
+            assert_eq!(measures.rising_epochs, Some(10.0), "{n_tenths} of 240");
+        }
+    }
+
+    #[test]
+    fn a_threshold_is_reached_by_the_first_evaluation_at_or_above_it() {
+        let rows = rows(&[0.4, 228.0 / 240.0, 0.8, 1.0]);
+        let epoch = |success| first_reaching(&rows, success).map(|row| row.paper_epochs);
+        assert_eq!(
+            [0.0, 0.5, 0.95, 0.951, 1.0].map(epoch),
+            [Some(0.0), Some(10.0), Some(10.0), Some(30.0), Some(30.0)]
+        );
+        assert_eq!(first_reaching(&rows[..1], 0.5), None);
     }
 }

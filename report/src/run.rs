@@ -1,37 +1,63 @@
-//! A run as reports see it: a name and its metrics.
+//! A run as reports see it: its metrics and, where there is a run directory, what it was made of.
 
 use std::io::ErrorKind;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
-use tandem_telemetry::{MetricsLog, MetricsRow};
+use tandem_core::Task;
+use tandem_telemetry::MetricsRow;
+use toml::{Table, Value};
 
 use crate::error::Error;
+use crate::held_out::HeldOut;
+
+/// How deep below a directory runs are looked for.
+const MAX_DEPTH: usize = 6;
 
 /// A run as reports see it.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Default)]
 pub struct Run {
-    /// The name of its directory.
+    /// The name of its directory, or of its metrics file.
     pub name: String,
     /// One row an evaluation, in order.
     pub rows: Vec<MetricsRow>,
     /// Its resolved configuration as it stands in `run.toml`, when there is one.
     pub configuration: Option<String>,
+    /// What its best policy reached on held-out goals, when `summary.json` says so.
+    pub held_out: Option<HeldOut>,
+}
+
+/// What was found of runs, and what could not be used.
+#[derive(Debug, Default)]
+pub struct Found {
+    /// The runs, in the order of the paths given, those of a directory by name.
+    pub runs: Vec<Run>,
+    /// A line for every file that is used in part or not at all.
+    pub warnings: Vec<String>,
 }
 
 impl Run {
-    /// Reads the run directory `dir`.
+    /// Reads the run directory `dir`; what is unreadable in its metrics ends them, with a warning.
     ///
     /// # Errors
-    /// When it has no readable `metrics.jsonl`.
-    pub fn load(dir: &Path) -> Result<Self, Error> {
-        let rows = MetricsLog::read_all(&dir.join("metrics.jsonl"))?;
-        let run_file = dir.join("run.toml");
-        let configuration = match std::fs::read_to_string(&run_file) {
-            Ok(text) => Some(text),
-            Err(error) if error.kind() == ErrorKind::NotFound => None,
-            Err(source) => return Err(Error::Io { action: "read", path: run_file, source }),
+    /// When its `metrics.jsonl` or `run.toml` cannot be read.
+    pub fn load(dir: &Path, warnings: &mut Vec<String>) -> Result<Self, Error> {
+        let rows = read_rows(&dir.join("metrics.jsonl"), warnings)?;
+        let configuration = read_if_there(&dir.join("run.toml"))?;
+        let summary = dir.join("summary.json");
+        let held_out = match summary.exists() {
+            true => HeldOut::load(&summary).map_err(|error| warnings.push(error.to_string())).ok(),
+            false => None,
         };
-        Ok(Self { name: directory_name(dir), rows, configuration })
+        Ok(Self { name: directory_name(dir), rows, configuration, held_out })
+    }
+
+    /// Reads a metrics file that stands by itself.
+    ///
+    /// # Errors
+    /// When it cannot be read.
+    pub fn load_file(path: &Path, warnings: &mut Vec<String>) -> Result<Self, Error> {
+        let name = path.file_stem().unwrap_or(path.as_os_str()).to_string_lossy().into_owned();
+        Ok(Self { name, rows: read_rows(path, warnings)?, ..Self::default() })
     }
 
     /// The evaluation with the highest success; of equals the first.
@@ -45,9 +71,190 @@ impl Run {
     pub fn last(&self) -> Option<&MetricsRow> {
         self.rows.last()
     }
+
+    /// The configuration as a table; empty when there is none.
+    pub(crate) fn settings(&self) -> Table {
+        self.configuration.as_ref().and_then(|text| text.parse().ok()).unwrap_or_default()
+    }
+
+    /// What the arms do, by the configuration or else by the name.
+    #[must_use]
+    pub fn task(&self) -> Option<Task> {
+        match self.settings().get("task").and_then(Value::as_str) {
+            Some(name) => name.parse().ok(),
+            None => Task::ALL.into_iter().find(|task| self.name.contains(task.name())),
+        }
+    }
+
+    /// The seed, by the configuration or else by the name's `-seedN`.
+    #[must_use]
+    pub fn seed(&self) -> Option<u64> {
+        match self.settings().get("seed").and_then(Value::as_integer) {
+            Some(seed) => u64::try_from(seed).ok(),
+            None => self.name.rsplit_once("-seed")?.1.parse().ok(),
+        }
+    }
+
+    /// The name without its `-seedN`.
+    #[must_use]
+    pub fn stem(&self) -> &str {
+        match self.name.rsplit_once("-seed") {
+            Some((stem, seed)) if seed.bytes().all(|byte| byte.is_ascii_digit()) => stem,
+            _ => &self.name,
+        }
+    }
+}
+
+/// Reads every run that `paths` name: run directories, directories with runs below, bare metrics files.
+///
+/// # Errors
+/// When a path cannot be read or has no run. What is wrong with single runs of a directory is a warning.
+pub fn find(paths: &[PathBuf]) -> Result<Found, Error> {
+    let mut found = Found::default();
+    for path in paths {
+        if path.is_file() {
+            found.runs.push(Run::load_file(path, &mut found.warnings)?);
+            continue;
+        }
+        let dirs = run_directories(path, MAX_DEPTH)?;
+        if dirs.is_empty() {
+            return Err(Error::NoRun { path: path.clone() });
+        }
+        for dir in dirs {
+            match Run::load(&dir, &mut found.warnings) {
+                Ok(run) => found.runs.push(run),
+                Err(error) => {
+                    found.warnings.push(format!("{} is left out: {error}", dir.display()));
+                }
+            }
+        }
+    }
+    Ok(found)
+}
+
+/// `dir` itself when it is a run directory, else those below it, sorted.
+fn run_directories(dir: &Path, depth: usize) -> Result<Vec<PathBuf>, Error> {
+    if dir.join("metrics.jsonl").is_file() {
+        return Ok(vec![dir.to_owned()]);
+    }
+    let entries = std::fs::read_dir(dir).map_err(read_error(dir))?;
+    let is_dir =
+        |entry: &std::fs::DirEntry| entry.file_type().is_ok_and(|file_type| file_type.is_dir());
+    let mut below: Vec<PathBuf> =
+        entries.flatten().filter(is_dir).map(|entry| entry.path()).collect();
+    below.sort();
+    let mut dirs = Vec::new();
+    for dir in below.iter().filter(|_| depth > 0) {
+        dirs.extend(run_directories(dir, depth - 1)?);
+    }
+    Ok(dirs)
+}
+
+/// The rows of a metrics file up to the first line that is none, of which a warning tells.
+fn read_rows(path: &Path, warnings: &mut Vec<String>) -> Result<Vec<MetricsRow>, Error> {
+    let bytes = std::fs::read(path).map_err(read_error(path))?;
+    let mut rows = Vec::new();
+    for (line_idx, line) in bytes.split_inclusive(|byte| *byte == b'\n').enumerate() {
+        match serde_json::from_slice(line) {
+            Ok(row) => rows.push(row),
+            Err(error) => {
+                let shown = path.display();
+                warnings.push(format!(
+                    "{shown}, line {}, is no metrics row ({error}): used up to there",
+                    line_idx + 1
+                ));
+                break;
+            }
+        }
+    }
+    Ok(rows)
+}
+
+fn read_if_there(path: &Path) -> Result<Option<String>, Error> {
+    match std::fs::read_to_string(path) {
+        Ok(text) => Ok(Some(text)),
+        Err(error) if error.kind() == ErrorKind::NotFound => Ok(None),
+        Err(error) => Err(read_error(path)(error)),
+    }
+}
+
+fn read_error(path: &Path) -> impl FnOnce(std::io::Error) -> Error {
+    move |source| Error::Io { action: "read", path: path.to_owned(), source }
 }
 
 fn directory_name(dir: &Path) -> String {
     let absolute = dir.canonicalize().unwrap_or_else(|_| dir.to_owned());
     absolute.file_name().unwrap_or(dir.as_os_str()).to_string_lossy().into_owned()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn line(round: u64) -> String {
+        let row = MetricsRow { round, success: 0.5, ..MetricsRow::default() };
+        serde_json::to_string(&row).unwrap() + "\n"
+    }
+
+    fn write(path: &Path, text: &str) {
+        std::fs::create_dir_all(path.parent().unwrap()).unwrap();
+        std::fs::write(path, text).unwrap();
+    }
+
+    #[test]
+    fn runs_are_found_wherever_they_lie_below_a_directory() {
+        let dir = tempfile::tempdir().unwrap();
+        write(&dir.path().join("b/metrics.jsonl"), &line(1));
+        write(&dir.path().join("deep/a/metrics.jsonl"), &line(1));
+        write(&dir.path().join("deep/a/checkpoint/metrics.jsonl"), &line(1));
+        write(&dir.path().join("lone.jsonl"), &line(1));
+        let found = find(&[dir.path().to_owned(), dir.path().join("lone.jsonl")]).unwrap();
+        let names: Vec<&str> = found.runs.iter().map(|run| run.name.as_str()).collect();
+        assert_eq!(names, ["b", "a", "lone"]);
+        assert!(found.warnings.is_empty(), "{:?}", found.warnings);
+    }
+
+    #[test]
+    fn a_metrics_file_counts_up_to_what_is_no_row() {
+        let check = |tail: &str| {
+            let dir = tempfile::tempdir().unwrap();
+            write(&dir.path().join("metrics.jsonl"), &(line(1) + &line(2) + tail));
+            let found = find(&[dir.path().to_owned()]).unwrap();
+            let rounds: Vec<u64> = found.runs[0].rows.iter().map(|row| row.round).collect();
+            assert_eq!(rounds, [1, 2], "{tail:?}");
+            assert_eq!(found.warnings.len(), 1, "{:?}", found.warnings);
+            assert!(found.warnings[0].contains("line 3"), "{:?}", found.warnings);
+        };
+        check(&line(3)[..40]);
+        check(&(line(3)[..40].to_owned() + "\n" + &line(4)));
+        check("nonsense\n");
+        check("\u{0}\n");
+    }
+
+    #[test]
+    fn a_path_without_a_run_is_an_error() {
+        let dir = tempfile::tempdir().unwrap();
+        assert!(matches!(find(&[dir.path().to_owned()]), Err(Error::NoRun { .. })));
+        assert!(matches!(find(&[dir.path().join("missing")]), Err(Error::Io { .. })));
+    }
+
+    #[test]
+    fn task_and_seed_come_from_the_configuration_before_the_name() {
+        let run = |name: &str, configuration: Option<&str>| Run {
+            name: name.to_owned(),
+            configuration: configuration.map(str::to_owned),
+            ..Run::default()
+        };
+        let named = run("teacher-pick-and-place-seed12", None);
+        assert_eq!(
+            (named.task(), named.seed(), named.stem()),
+            (Some(Task::PickAndPlace), Some(12), "teacher-pick-and-place")
+        );
+        let configured = run("mine", Some("task = \"push\"\nseed = 7"));
+        assert_eq!(
+            (configured.task(), configured.seed(), configured.stem()),
+            (Some(Task::Push), Some(7), "mine")
+        );
+        assert_eq!(run("odd-seedling", None).stem(), "odd-seedling");
+    }
 }

@@ -1,74 +1,80 @@
-//! The figures of runs as a table of plain text.
+//! Tables of figures, as plain text and for pages.
 
+use tandem_core::Wilson;
 use tandem_telemetry::MetricsRow;
 
-use crate::measures::LearningMeasures;
-use crate::run::Run;
+use crate::group::Spread;
 
 /// What stands for a number that does not exist.
-const NONE: &str = "–";
+pub(crate) const NONE: &str = "–";
 
-/// One line a run: the best evaluation, the cost of reaching it and the paper's measures.
-#[must_use]
-pub fn summary_table(runs: &[Run]) -> String {
-    let header = HEADER.map(str::to_owned);
-    let lines: Vec<[String; N_COLUMNS]> =
-        std::iter::once(header).chain(runs.iter().map(cells)).collect();
-    let width =
-        |column: usize| lines.iter().map(|line| line[column].chars().count()).max().unwrap_or(0);
-    let widths: [usize; N_COLUMNS] = std::array::from_fn(width);
-    let mut table = String::new();
-    for line in &lines {
-        let padded =
-            line.iter().zip(widths).enumerate().map(|(column, (cell, width))| match column {
-                0 => format!("{cell:<width$}"),
-                _ => format!("{cell:>width$}"),
-            });
-        table.push_str(padded.collect::<Vec<_>>().join("  ").trim_end());
-        table.push('\n');
-    }
-    table
+/// A table: a heading, heads of columns, and lines of as many cells.
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
+pub struct Table {
+    /// What it shows.
+    pub title: String,
+    /// Heads of the columns.
+    pub header: Vec<String>,
+    /// A cell a column each.
+    pub lines: Vec<Vec<String>>,
 }
 
-pub(crate) const N_COLUMNS: usize = 12;
-/// Heads of the columns of [`cells`].
-pub(crate) const HEADER: [&str; N_COLUMNS] = [
-    "run",
-    "success",
-    "95 % interval",
-    "joint",
-    "per arm",
-    "contact",
-    "env steps",
-    "updates",
-    "time",
-    "advice",
-    "IE",
-    "ELR",
-];
+impl Table {
+    /// A table without lines.
+    pub(crate) fn new(title: String, header: &[&str]) -> Self {
+        let header = header.iter().map(|head| (*head).to_owned()).collect();
+        Self { title, header, lines: Vec::new() }
+    }
 
-/// A run's line.
-pub(crate) fn cells(run: &Run) -> [String; N_COLUMNS] {
-    let Some(best) = run.best() else {
-        return std::array::from_fn(
-            |column| if column == 0 { run.name.clone() } else { NONE.to_owned() },
-        );
+    /// The table for a terminal: columns line up, the first to the left, the others to the right.
+    #[must_use]
+    pub fn text(&self) -> String {
+        let lines: Vec<&Vec<String>> = std::iter::once(&self.header).chain(&self.lines).collect();
+        let width = |column: usize| {
+            lines.iter().filter_map(|line| line.get(column)).map(|cell| cell.chars().count()).max()
+        };
+        let widths: Vec<usize> =
+            (0..self.header.len()).map(|column| width(column).unwrap_or(0)).collect();
+        let mut text = format!("{}\n", self.title);
+        for line in lines {
+            let padded =
+                line.iter().zip(&widths).enumerate().map(|(column, (cell, width))| match column {
+                    0 => format!("{cell:<width$}"),
+                    _ => format!("{cell:>width$}"),
+                });
+            text.push_str(padded.collect::<Vec<_>>().join("  ").trim_end());
+            text.push('\n');
+        }
+        text
+    }
+}
+
+/// A figure over a group's runs: its mean and, of several runs, its range and how many have it.
+pub(crate) fn spread(spread: &Spread, written: impl Fn(f64) -> String) -> String {
+    let Spread { n, n_runs, mean, min, max } = *spread;
+    if n == 0 {
+        return NONE.to_owned();
+    }
+    let range = match n {
+        1 => String::new(),
+        _ => format!(" ({}–{})", written(min), written(max)),
     };
-    let measures = LearningMeasures::of(&run.rows);
-    [
-        run.name.clone(),
-        share(best.success),
-        interval(best),
-        share(best.success_joint),
-        best.success_per_arm.iter().map(|success| share(*success)).collect::<Vec<_>>().join(" / "),
-        share(best.collision_rate),
-        thousands(best.env_steps),
-        thousands(best.updates),
-        duration(best.wall_s),
-        thousands(best.advice_spent),
-        measures.inspired_epoch.map_or_else(|| NONE.to_owned(), |epoch| format!("{epoch:.1}")),
-        measures.learning_rate.map_or_else(|| NONE.to_owned(), |rate| format!("{rate:.4}")),
-    ]
+    let how_many = if n < n_runs { format!(", {n} of {n_runs}") } else { String::new() };
+    format!("{}{range}{how_many}", written(mean))
+}
+
+/// The same of a share, with the interval of all episodes together.
+pub(crate) fn share_spread((values, interval): &(Spread, Option<Wilson>)) -> String {
+    let text = spread(values, |share| format!("{share:.3}"));
+    match interval {
+        Some(Wilson { low, high }) => format!("{text} [{low:.3}, {high:.3}]"),
+        None => text,
+    }
+}
+
+/// A figure that may not exist.
+pub(crate) fn optional(value: Option<f64>, written: impl Fn(f64) -> String) -> String {
+    value.map_or_else(|| NONE.to_owned(), written)
 }
 
 /// A share in per cent.
@@ -99,6 +105,18 @@ pub(crate) fn thousands(count: u64) -> String {
     text
 }
 
+/// 1500000 as 1.5M, 20000 as 20k.
+pub(crate) fn short_number(value: f64) -> String {
+    let (scaled, unit) = match value.abs() {
+        size if size >= 999_500.0 => (value / 1e6, "M"),
+        size if size >= 1000.0 => (value / 1e3, "k"),
+        _ => (value, ""),
+    };
+    let text = format!("{scaled:.2}");
+    let text = text.trim_end_matches('0').trim_end_matches('.');
+    format!("{}{unit}", if text == "-0" { "0" } else { text })
+}
+
 /// A span of time in hours, minutes and seconds.
 pub(crate) fn duration(seconds: f64) -> String {
     let whole = std::time::Duration::try_from_secs_f64(seconds).unwrap_or_default().as_secs();
@@ -120,31 +138,31 @@ mod tests {
             [0.4, 59.9, 61.0, 3725.0, f64::NAN].map(duration),
             ["0:00 min", "0:59 min", "1:01 min", "1:02 h", "0:00 min"]
         );
+        assert_eq!(
+            [0.0, -0.001, 0.25, 50.0, 1500.0, 20_000.0, 999_900.0, 1.5e6, -10.0].map(short_number),
+            ["0", "0", "0.25", "50", "1.5k", "20k", "1M", "1.5M", "-10"]
+        );
     }
 
     #[test]
-    fn columns_line_up_and_the_best_row_counts() {
-        let row = |success, env_steps| MetricsRow {
-            success,
-            env_steps,
-            success_per_arm: vec![success; 2],
-            ..MetricsRow::default()
+    fn a_spread_says_how_many_runs_it_is_of() {
+        let written = |values: &[f64], n_runs| {
+            spread(&Spread::of(values, n_runs), |value| format!("{value:.1}"))
         };
-        let run = |name: &str, rows| Run { name: name.to_owned(), rows, configuration: None };
-        let table = summary_table(&[
-            run("a-long-name", vec![row(0.5, 1000), row(0.9375, 2000), row(0.9375, 3000)]),
-            run("empty", Vec::new()),
-        ]);
-        let lines: Vec<&str> = table.lines().collect();
-        assert_eq!(lines.len(), 3);
-        assert!(
-            lines[1].contains("93.8 %")
-                && lines[1].contains("2,000")
-                && !lines[1].contains("3,000"),
-            "{table}"
-        );
-        let end_of =
-            |line: &str, text: &str| line[..line.find(text).unwrap() + text.len()].chars().count();
-        assert_eq!(end_of(lines[0], "success"), end_of(lines[1], "93.8 %"));
+        assert_eq!(written(&[2.0], 1), "2.0");
+        assert_eq!(written(&[1.0, 3.0], 2), "2.0 (1.0–3.0)");
+        assert_eq!(written(&[1.0, 3.0], 3), "2.0 (1.0–3.0), 2 of 3");
+        assert_eq!(written(&[2.0], 3), "2.0, 1 of 3");
+        assert_eq!(written(&[], 3), NONE);
+    }
+
+    #[test]
+    fn columns_line_up() {
+        let mut table = Table::new("heading".to_owned(), &["strategy", "IE"]);
+        table.lines = vec![vec!["a-long-name".to_owned(), "1.0–2.0".to_owned()]];
+        table.lines.push(vec!["b".to_owned(), "3".to_owned()]);
+        let text = table.text();
+        let ends: Vec<usize> = text.lines().skip(1).map(|line| line.chars().count()).collect();
+        assert_eq!(ends, [20, 20, 20], "{text}");
     }
 }

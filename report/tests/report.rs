@@ -4,8 +4,8 @@
 use std::path::Path;
 
 use tandem_report::{
-    Axis, CurveOptions, CurvePoint, Quantity, Run, Series, View, comparison_html, curve_svg,
-    run_report_html, scene_svg,
+    Axis, Comparison, CurveOptions, CurvePoint, Quantity, Series, View, comparison_html, curve_svg,
+    run, run_report_html, scene_svg,
 };
 use tandem_telemetry::{MetricsLog, MetricsRow};
 
@@ -168,14 +168,41 @@ fn a_run_without_an_evaluation_has_a_page_too() {
     assert!(run_report_html(Path::new("/nowhere")).is_err());
 }
 
+/// A run directory below `parent` with its configuration and metrics.
+fn seed_of(parent: &Path, strategy: &str, seed: u64, rows: &[MetricsRow]) {
+    let dir = parent.join(format!("push-{}-seed{seed}", strategy.replace(':', "-")));
+    std::fs::create_dir(&dir).unwrap();
+    let settings =
+        format!("task = \"push\"\narms = 2\nseed = {seed}\n[advice]\nstrategy = \"{strategy}\"\n");
+    std::fs::write(dir.join("run.toml"), settings).unwrap();
+    let mut log = MetricsLog::open(&dir.join("metrics.jsonl")).unwrap();
+    rows.iter().for_each(|row| log.append(row).unwrap());
+}
+
 #[test]
-fn runs_are_set_side_by_side() {
-    let (a, b) = (run_dir(&[row(0, 0), row(5, 120)]), run_dir(&[row(0, 0)]));
-    let runs = [a.path(), b.path()].map(|dir| Run::load(dir).unwrap());
-    let path = a.path().join("comparison.html");
-    comparison_html(&runs, &path).unwrap();
-    let page = std::fs::read_to_string(path).unwrap();
-    for run in &runs {
-        assert!(page.matches(&run.name).count() >= 4, "{} in the table and every legend", run.name);
+fn a_sweeps_page_has_its_tables_its_curves_and_the_papers_values() {
+    let dir = tempfile::tempdir().unwrap();
+    seed_of(dir.path(), "mc-q:0.1", 1, &[row(0, 0), row(5, 120), row(10, 230)]);
+    seed_of(dir.path(), "mc-q:0.1", 2, &[row(0, 0), row(5, 60)]);
+    seed_of(dir.path(), "none", 1, &[row(0, 0), row(5, 0)]);
+    let found = run::find(&[dir.path().to_owned()]).unwrap();
+    let comparison = Comparison::of(found.runs, Vec::new());
+    let written = comparison_html(&comparison, &dir.path().join("report.html")).unwrap();
+    let page = std::fs::read_to_string(&written.page).unwrap();
+    assert_eq!(page.matches("<svg").count(), written.figures.len());
+    assert_eq!(written.figures.len(), 5, "three of success, one of mean Q, one of advice");
+    for text in ["MC-ACTABS005", "0.9625", "push, 2 arms", "0.9583", "1 of 2", "10.1016/j.engappai"]
+    {
+        assert!(page.contains(text), "{text}");
+    }
+    for svg in &written.figures {
+        let svg = std::fs::read_to_string(svg).unwrap();
+        assert_well_formed(&svg);
+        assert!(svg.contains("mc-q:0.1") && svg.contains("none"));
+    }
+    let success = std::fs::read_to_string(&written.figures[0]).unwrap();
+    assert!(success.contains("<polygon"), "a band over the seeds");
+    for reference in ["<script", "<link", "src=", "@import", "url(http"] {
+        assert!(!page.contains(reference), "{reference}");
     }
 }

@@ -64,6 +64,36 @@ fn a_bill() {
     }
 }
 
+/// One bill a call: a single client, which waits for every answer.
+fn measure_alone(name: &str, ledger: &mut dyn Ledger) {
+    ledger.open("alone", terms(1_000_000)).expect("an account");
+    let mut calls_us = Vec::new();
+    for first in (0..4_000).step_by(2) {
+        ledger.open_leases("alone", &[first, first + 1], 5).expect("leases");
+        for step in 0..5 {
+            let bills =
+                [bill("alone", &[charge(first, step, BOTH), charge(first + 1, step, BOTH)])];
+            let start = now();
+            let outcomes = ledger.charge(&bills);
+            calls_us.push(start.elapsed().as_micros());
+            assert!(outcomes.iter().all(Result::is_ok));
+        }
+    }
+    calls_us.sort_unstable();
+    let at = |share: usize| calls_us[calls_us.len() * share / 100];
+    println!("{name}: a call with 1 bill of 2 steps p50 {} p99 {} us", at(50), at(99));
+}
+
+#[test]
+#[ignore = "a measurement"]
+fn a_bill_alone() {
+    measure_alone("memory", Place::memory().ledger());
+    measure_alone("sqlite", Place::sqlite().ledger());
+    if let Some(mut place) = Place::redis() {
+        measure_alone("redis", place.ledger());
+    }
+}
+
 #[test]
 #[ignore = "a measurement"]
 fn a_file_with_100_000_episodes() {

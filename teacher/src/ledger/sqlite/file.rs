@@ -243,12 +243,11 @@ fn refused(path: &Path, error: rusqlite::Error) -> OpenError {
         Some(ErrorCode::NotADatabase) => {
             OpenError::NotALedger { path, found: "something that is not an SQLite database" }
         }
-        Some(ErrorCode::DatabaseCorrupt | ErrorCode::TypeMismatch) => {
+        // The tables are not those of a ledger, or hold what no ledger writes.
+        Some(ErrorCode::DatabaseCorrupt | ErrorCode::TypeMismatch | ErrorCode::Unknown) | None => {
             OpenError::Damaged { path, what: error.to_string() }
         }
         Some(_) => OpenError::Io { path, source: std::io::Error::other(error) },
-        // The tables are not those of a ledger, or hold what no ledger writes.
-        None => OpenError::Damaged { path, what: error.to_string() },
     }
 }
 

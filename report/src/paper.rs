@@ -1,0 +1,201 @@
+//! The paper's own results, to stand beside ours.
+
+use tandem_core::Task;
+
+/// Where the values of [`TABLE_2`] come from.
+pub const SOURCE: &str = "H. Ren, P. Ben-Tzvi: Advising reinforcement learning toward scaling agents in continuous control \
+     environments with sparse rewards. Engineering Applications of Artificial Intelligence, 2020, Table 2; \
+     https://doi.org/10.1016/j.engappai.2020.103515";
+
+/// A row of the paper's Table 2.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct PaperRow {
+    /// As the paper prints it.
+    pub name: &'static str,
+    /// The strategy's name on our command line.
+    pub strategy: &'static str,
+    /// Its threshold; `None` where it has none or the paper does not say which.
+    pub threshold: Option<f64>,
+    /// The push task.
+    pub push: PaperMeasures,
+    /// The pick and place task.
+    pub pick_and_place: PaperMeasures,
+}
+
+/// What the paper gives of a strategy on a task; epochs are the paper's.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct PaperMeasures {
+    /// IE: the epoch reaching 10 % of the maximum success. `None` where the paper prints NaN.
+    pub inspired_epoch: Option<f64>,
+    /// RT: epochs from 10 % to 90 %. `None` where the paper prints NaN.
+    pub rising_epochs: Option<f64>,
+    /// MSR: the maximum success, in [0, 1].
+    pub max_success: f64,
+    /// ELR: 90 % of the maximum over the epochs it took.
+    pub learning_rate: f64,
+}
+
+/// The paper's Table 2, whole.
+pub const TABLE_2: [PaperRow; 12] = [
+    PaperRow {
+        name: "NA",
+        strategy: "none",
+        threshold: None,
+        push: PaperMeasures {
+            inspired_epoch: None,
+            rising_epochs: None,
+            max_success: 0.0,
+            learning_rate: 0.0,
+        },
+        pick_and_place: measures(336.0, 489.0, 0.9219, 0.0010),
+    },
+    row("EA", "ea", None, [252.0, 363.0, 0.9333, 0.0014], [228.0, 96.0, 0.9750, 0.0027]),
+    row("EAMC", "eamc", None, [116.0, 139.0, 0.9417, 0.0033], [135.0, 178.0, 0.9250, 0.0027]),
+    row(
+        "MC-Q001",
+        "mc-q",
+        Some(0.01),
+        [140.0, 105.0, 0.9583, 0.0035],
+        [220.0, 93.0, 0.9250, 0.0027],
+    ),
+    row(
+        "MC-Q005",
+        "mc-q",
+        Some(0.05),
+        [46.0, 195.0, 0.9583, 0.0036],
+        [174.0, 156.0, 0.9417, 0.0026],
+    ),
+    row("MC-Q01", "mc-q", Some(0.1), [63.0, 229.0, 0.9583, 0.0030], [86.0, 209.0, 0.8417, 0.0026]),
+    row(
+        "MC-ACT001",
+        "mc-act",
+        Some(0.01),
+        [214.0, 71.0, 0.9333, 0.0029],
+        [225.0, 82.0, 0.9167, 0.0027],
+    ),
+    row(
+        "MC-ACT005",
+        "mc-act",
+        Some(0.05),
+        [215.0, 96.0, 0.9500, 0.0027],
+        [224.0, 134.0, 0.9167, 0.0023],
+    ),
+    row(
+        "MC-ACT01",
+        "mc-act",
+        Some(0.1),
+        [216.0, 80.0, 0.9500, 0.0029],
+        [226.0, 85.0, 0.9167, 0.0027],
+    ),
+    row(
+        "MC-ACTABS001",
+        "mc-act-abs",
+        Some(0.01),
+        [217.0, 101.0, 0.9625, 0.0027],
+        [225.0, 104.0, 0.9167, 0.0025],
+    ),
+    row(
+        "MC-ACTABS005",
+        "mc-act-abs",
+        Some(0.05),
+        [214.0, 91.0, 0.9500, 0.0028],
+        [229.0, 85.0, 0.9250, 0.0027],
+    ),
+    row(
+        "MC-ACTABS01",
+        "mc-act-abs",
+        Some(0.1),
+        [213.0, 104.0, 0.9500, 0.0027],
+        [222.0, 108.0, 0.9083, 0.0025],
+    ),
+];
+
+impl PaperRow {
+    /// The row of `strategy` as it is written on the command line, such as `mc-q:0.05`, with its index.
+    #[must_use]
+    pub fn of(strategy: &str) -> Option<(usize, &'static Self)> {
+        let (name, threshold) = split(strategy);
+        TABLE_2.iter().enumerate().find(|(_, row)| {
+            row.strategy == name && (row.threshold.is_none() || row.threshold == threshold)
+        })
+    }
+
+    /// What the paper gives for `task`.
+    #[must_use]
+    pub const fn measures(&self, task: Task) -> &PaperMeasures {
+        match task {
+            Task::Push => &self.push,
+            Task::PickAndPlace => &self.pick_and_place,
+        }
+    }
+}
+
+/// A strategy's name and threshold; 0.1 is the threshold of one that is named without.
+pub(crate) fn split(strategy: &str) -> (&str, Option<f64>) {
+    match strategy.split_once(':') {
+        Some((name, threshold)) => (name, threshold.parse().ok()),
+        None => (strategy, (!matches!(strategy, "none" | "ea")).then_some(0.1)),
+    }
+}
+
+/// A row without a hole; the numbers stand in the paper's order: IE, RT, MSR, ELR.
+const fn row(
+    name: &'static str,
+    strategy: &'static str,
+    threshold: Option<f64>,
+    push: [f64; 4],
+    pick_and_place: [f64; 4],
+) -> PaperRow {
+    let ([a, b, c, d], [e, f, g, h]) = (push, pick_and_place);
+    PaperRow {
+        name,
+        strategy,
+        threshold,
+        push: measures(a, b, c, d),
+        pick_and_place: measures(e, f, g, h),
+    }
+}
+
+const fn measures(
+    inspired_epoch: f64,
+    rising_epochs: f64,
+    max_success: f64,
+    learning_rate: f64,
+) -> PaperMeasures {
+    PaperMeasures {
+        inspired_epoch: Some(inspired_epoch),
+        rising_epochs: Some(rising_epochs),
+        max_success,
+        learning_rate,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_strategy_finds_its_row() {
+        let name = |strategy: &str| PaperRow::of(strategy).map(|(_, row)| row.name);
+        assert_eq!(
+            ["none", "ea", "eamc:0.1", "mc-q:0.05", "mc-q", "mc-q:0.10", "mc-act-abs:0.01"]
+                .map(name),
+            ["NA", "EA", "EAMC", "MC-Q005", "MC-Q01", "MC-Q01", "MC-ACTABS001"].map(Some)
+        );
+        assert_eq!(["mc-q:0.2", "other", ""].map(name), [None, None, None]);
+    }
+
+    #[test]
+    fn effective_learning_rates_agree_with_the_other_columns() {
+        let mut deviating = Vec::new();
+        for (row, task) in TABLE_2.iter().flat_map(|row| Task::ALL.map(|task| (row, task))) {
+            let given = row.measures(task);
+            let epochs = given.inspired_epoch.zip(given.rising_epochs).map(|(ie, rt)| ie + rt);
+            let rate = epochs.map_or(0.0, |epochs| 0.9 * given.max_success / epochs);
+            if (rate - given.learning_rate).abs() > 0.000_06 {
+                deviating.push((row.name, task, given.learning_rate, rate));
+            }
+        }
+        assert!(deviating.is_empty(), "{deviating:?}");
+    }
+}

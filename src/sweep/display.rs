@@ -1,0 +1,152 @@
+//! What a person sees of a sweep: a line for every run that ends, and on a terminal how the others are.
+
+use std::fs::File;
+use std::io::{IsTerminal as _, Read as _, Seek as _, SeekFrom};
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use indicatif::{HumanCount, MultiProgress, ProgressBar, ProgressStyle};
+use serde_json::Value;
+
+use super::child::last_line;
+
+/// Enough of a log's end for its last line.
+const TAIL_BYTES: u64 = 4096;
+
+pub(super) struct Display {
+    live: Option<Live>,
+    n_runs: usize,
+    n_ended: usize,
+}
+
+struct Live {
+    all: MultiProgress,
+    bar: ProgressBar,
+    running: Vec<Running>,
+}
+
+struct Running {
+    name: String,
+    log: PathBuf,
+    line: ProgressBar,
+}
+
+impl Display {
+    pub(super) fn new(n_runs: usize, n_finished: usize) -> Self {
+        let live = std::io::stderr().is_terminal().then(|| Live::new(n_runs, n_finished));
+        Self { live, n_runs, n_ended: n_finished }
+    }
+
+    /// A run was started that writes its lines to `log`.
+    pub(super) fn started(&mut self, name: &str, log: PathBuf) {
+        if let Some(live) = &mut self.live {
+            let line = live.all.add(ProgressBar::new_spinner());
+            line.set_style(style("  {msg}"));
+            line.set_message(format!("{name}: starts"));
+            live.running.push(Running { name: name.to_owned(), log, line });
+        }
+    }
+
+    /// A run ended; `how` is what there is to say.
+    pub(super) fn ended(&mut self, name: &str, how: &str) {
+        self.n_ended += 1;
+        self.say(&format!("[{} of {}] {name}: {how}", self.n_ended, self.n_runs));
+        if let Some(live) = &mut self.live {
+            live.bar.set_position(self.n_ended as u64);
+            for running in live.running.extract_if(.., |running| running.name == name) {
+                running.line.finish_and_clear();
+            }
+        }
+    }
+
+    /// Shows the last line of every run under way.
+    pub(super) fn refresh(&self) {
+        for Running { name, log, line } in self.live.iter().flat_map(|live| &live.running) {
+            if let Some(said) = tail(log).as_deref().and_then(last_line) {
+                line.set_message(format!("{name}: {said}"));
+            }
+        }
+    }
+
+    /// Prints one line that stays.
+    #[expect(clippy::print_stderr, reason = "what a person watches")]
+    pub(super) fn say(&self, line: &str) {
+        match &self.live {
+            Some(live) => drop(live.all.println(line)),
+            None => eprintln!("{line}"),
+        }
+    }
+
+    /// Takes the live lines away; what is said from now on is plain.
+    pub(super) fn close(&mut self) {
+        if let Some(live) = self.live.take() {
+            live.bar.finish_and_clear();
+            live.running.iter().for_each(|running| running.line.finish_and_clear());
+        }
+    }
+}
+
+impl Live {
+    fn new(n_runs: usize, n_finished: usize) -> Self {
+        let all = MultiProgress::new();
+        let bar = all.add(ProgressBar::new(n_runs as u64));
+        bar.set_style(style("{spinner} [{bar:32}] {pos} of {len} runs, {elapsed}"));
+        bar.set_position(n_finished as u64);
+        bar.enable_steady_tick(Duration::from_millis(200));
+        Self { all, bar, running: Vec::new() }
+    }
+}
+
+fn style(template: &str) -> ProgressStyle {
+    ProgressStyle::with_template(template)
+        .unwrap_or_else(|_| ProgressStyle::default_bar())
+        .progress_chars("=> ")
+}
+
+/// What a finished run reached, from its summary.
+pub(super) fn reached(summary: &Value) -> String {
+    let number = |key: &str| summary[key].as_f64().unwrap_or(f64::NAN);
+    format!(
+        "success {:.3} [{:.3}, {:.3}] on held-out goals, {} env steps in {:.1} minutes",
+        number("success"),
+        number("success_low"),
+        number("success_high"),
+        HumanCount(summary["env_steps"].as_u64().unwrap_or_default()),
+        number("wall_s") / 60.0
+    )
+}
+
+/// The end of a file.
+fn tail(path: &Path) -> Option<Vec<u8>> {
+    let mut file = File::open(path).ok()?;
+    let n_bytes = file.metadata().ok()?.len();
+    file.seek(SeekFrom::Start(n_bytes.saturating_sub(TAIL_BYTES))).ok()?;
+    let mut bytes = Vec::new();
+    file.read_to_end(&mut bytes).ok()?;
+    Some(bytes)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_summary_is_told_in_one_line() {
+        let summary = serde_json::json!({
+            "success": 0.9625, "success_low": 0.93, "success_high": 0.98, "env_steps": 940_000, "wall_s": 1803.0
+        });
+        assert_eq!(
+            reached(&summary),
+            "success 0.963 [0.930, 0.980] on held-out goals, 940,000 env steps in 30.1 minutes"
+        );
+    }
+
+    #[test]
+    fn the_end_of_a_long_log_is_enough() {
+        let dir = tempfile::tempdir().expect("a directory");
+        let log = dir.path().join("log");
+        std::fs::write(&log, "x".repeat(10_000) + "\nlast\n").expect("writes");
+        let tail = tail(&log).expect("there");
+        assert_eq!((tail.len(), last_line(&tail).as_deref()), (4096, Some("last")));
+    }
+}

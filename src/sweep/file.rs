@@ -1,0 +1,246 @@
+//! The sweep file: settings of all runs, and lists of which every combination is a run.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context as _, anyhow, bail, ensure};
+use serde::Deserialize;
+use tandem_learner::RunConfig;
+use toml::{Table, Value};
+
+use crate::exit::{Exit, Failed, OrExit as _};
+use crate::run_file;
+
+/// More runs than anybody waits for are a slip.
+const MAX_RUNS: usize = 10_000;
+
+/// A sweep file as it is written.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+struct SweepFile {
+    /// Tasks; without any the one of `[run]`.
+    tasks: Vec<String>,
+    /// Values of `advice.strategy`; each is a column of the sweep, as each variant is.
+    strategies: Vec<String>,
+    /// Seeds; without any the one of `[run]`.
+    seeds: Vec<u64>,
+    /// Further settings to combine: a table each, with one setting and its list of values.
+    axis: Vec<Table>,
+    /// Named sets of settings, laid over `[run]`.
+    variant: Vec<Variant>,
+    /// Settings of all runs, as in a run file.
+    run: Table,
+    /// A teacher's policy file for each task; without one the teacher that ships.
+    teachers: BTreeMap<String, PathBuf>,
+}
+
+impl Default for SweepFile {
+    fn default() -> Self {
+        Self {
+            tasks: Vec::new(),
+            strategies: Vec::new(),
+            seeds: Vec::new(),
+            axis: Vec::new(),
+            variant: Vec::new(),
+            run: Table::new(),
+            teachers: BTreeMap::new(),
+        }
+    }
+}
+
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Variant {
+    name: String,
+    #[serde(default)]
+    set: Table,
+}
+
+/// A run of the sweep.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct PlannedRun {
+    /// Name of its directory.
+    pub(super) name: String,
+    /// Everything that decides its result, except the teacher.
+    pub(super) config: RunConfig,
+    /// The teacher's policy file, where the sweep file names one.
+    pub(super) teacher: Option<PathBuf>,
+}
+
+/// Settings under a name that becomes part of the run directory's.
+#[derive(Debug, Clone)]
+struct Choice {
+    name: String,
+    settings: Vec<(String, Value)>,
+}
+
+/// Reads the sweep file `path`: its runs in the order in which they are made, seeds outermost, so that a sweep that is
+/// stopped early has one seed of everything.
+pub(super) fn read(path: &Path) -> Result<Vec<PlannedRun>, Failed> {
+    let told = || format!("sweep file {}", path.display());
+    let text =
+        std::fs::read_to_string(path).context("cannot be read").or_exit(Exit::Usage, told)?;
+    runs(&text).or_exit(Exit::Usage, told)
+}
+
+/// Every combination that `text` lists.
+fn runs(text: &str) -> anyhow::Result<Vec<PlannedRun>> {
+    let file: SweepFile = toml::from_str(text).map_err(|error| in_one_line(text, &error))?;
+    let base = flattened(&file.run);
+    let (tasks, seeds) = (tasks(&file), choices("seed", file.seeds.iter().map(whole)));
+    let (columns, axes) = (columns(&file, &base)?, axes(&file)?);
+    let n_runs = [tasks.len(), seeds.len(), columns.len(), axes.len()].iter().product::<usize>();
+    ensure!(n_runs <= MAX_RUNS, "lists {n_runs} runs: expected at most {MAX_RUNS}");
+    let mut runs = Vec::with_capacity(n_runs);
+    for (seed, task) in pairs(&seeds, &tasks) {
+        for (column, axis) in pairs(&columns, &axes) {
+            let mut settings = base.clone();
+            for choice in [task, column, axis, seed] {
+                settings.extend(choice.settings.iter().cloned());
+            }
+            runs.push(planned(&settings, &column.name, &axis.name, &file.teachers)?);
+        }
+    }
+    refuse_equal_names(&runs)?;
+    Ok(runs)
+}
+
+fn planned(
+    settings: &[(String, Value)],
+    column: &str,
+    axis: &str,
+    teachers: &BTreeMap<String, PathBuf>,
+) -> anyhow::Result<PlannedRun> {
+    let mut settings = settings.to_vec();
+    let limits_time = settings.iter().any(|(key, _)| key == "stop.max_minutes");
+    if !limits_time {
+        // Runs that are to be compared do not end by the clock, unless they are told to.
+        settings.push(("stop.max_minutes".to_owned(), Value::Float(0.0)));
+    }
+    let resolved = run_file::resolve(None, &settings).map_err(Failed::into_error)?;
+    let column =
+        if column.is_empty() { named(&resolved.advice.strategy) } else { column.to_owned() };
+    let name = format!("{}-{column}{axis}-seed{}", resolved.task, resolved.seed);
+    ensure!(
+        tandem_learner::config::is_name(&name),
+        "{name:?} is no name of a run: expected 1 to 100 letters, digits, '-', '_' or '.'"
+    );
+    let stop = &resolved.stop;
+    ensure!(
+        stop.max_env_steps > 0 || stop.max_minutes > 0.0,
+        "{name} may never end: set stop.max_env_steps or stop.max_minutes in [run]"
+    );
+    let teacher = teachers.get(&resolved.task).filter(|_| resolved.advice.asks()).cloned();
+    Ok(PlannedRun { config: RunConfig { name: name.clone(), ..resolved }, name, teacher })
+}
+
+fn refuse_equal_names(runs: &[PlannedRun]) -> anyhow::Result<()> {
+    let mut seen = BTreeSet::new();
+    match runs.iter().find(|run| !seen.insert(&run.name)) {
+        Some(run) => bail!("two runs would be called {}: something is listed twice", run.name),
+        None => Ok(()),
+    }
+}
+
+fn tasks(file: &SweepFile) -> Vec<Choice> {
+    choices("task", file.tasks.iter().cloned().map(Value::String))
+}
+
+/// A choice for each value of `key`; where there is none, one that chooses nothing.
+fn choices(key: &str, values: impl Iterator<Item = Value>) -> Vec<Choice> {
+    let choice =
+        |value: Value| Choice { name: String::new(), settings: vec![(key.to_owned(), value)] };
+    or_nothing(values.map(choice).collect())
+}
+
+fn or_nothing(choices: Vec<Choice>) -> Vec<Choice> {
+    match choices.is_empty() {
+        true => vec![Choice { name: String::new(), settings: Vec::new() }],
+        false => choices,
+    }
+}
+
+/// Strategies, then variants.
+fn columns(file: &SweepFile, base: &[(String, Value)]) -> anyhow::Result<Vec<Choice>> {
+    const STRATEGY: &str = "advice.strategy";
+    if !file.strategies.is_empty()
+        && base.iter().any(|(key, _)| key == STRATEGY)
+        && file.variant.is_empty()
+    {
+        bail!("{STRATEGY} stands in [run] and in `strategies`: expected one of them");
+    }
+    let mut columns: Vec<Choice> = file
+        .strategies
+        .iter()
+        .map(|strategy| Choice {
+            name: named(strategy),
+            settings: vec![(STRATEGY.to_owned(), Value::String(strategy.clone()))],
+        })
+        .collect();
+    for Variant { name, set } in &file.variant {
+        ensure!(!name.is_empty(), "a variant has no name");
+        columns.push(Choice { name: name.clone(), settings: flattened(set) });
+    }
+    Ok(or_nothing(columns))
+}
+
+/// Every combination of the axes' values; each adds `-KEY-VALUE` to the name, the key without its section.
+fn axes(file: &SweepFile) -> anyhow::Result<Vec<Choice>> {
+    let mut combinations = or_nothing(Vec::new());
+    for axis in &file.axis {
+        let [(key, Value::Array(values))] = &flattened(axis)[..] else {
+            let held = axis.to_string().trim().replace('\n', ", ");
+            bail!("[[axis]] holds {held}: expected one setting with a list of values");
+        };
+        ensure!(!values.is_empty(), "the list of axis {key} is empty");
+        let short = key.rsplit('.').next().unwrap_or(key);
+        let with = |(before, value): (&Choice, &Value)| Choice {
+            name: format!("{}-{short}-{}", before.name, named(&plain(value))),
+            settings: [before.settings.clone(), vec![(key.clone(), value.clone())]].concat(),
+        };
+        combinations = pairs(&combinations, values).map(with).collect();
+    }
+    Ok(combinations)
+}
+
+/// A value as it stands in a name: text without its quotes.
+fn plain(value: &Value) -> String {
+    value.as_str().map_or_else(|| value.to_string(), str::to_owned)
+}
+
+/// A text as part of a directory's name: what does not belong there becomes a dash.
+fn named(text: &str) -> String {
+    let letter = |c: char| if c.is_ascii_alphanumeric() || "-_.".contains(c) { c } else { '-' };
+    text.chars().map(letter).collect()
+}
+
+/// Dotted names and values of all settings in and below `table`.
+pub(super) fn flattened(table: &Table) -> Vec<(String, Value)> {
+    let below = |(key, value): (&String, &Value)| match value {
+        Value::Table(inner) => flattened(inner)
+            .into_iter()
+            .map(|(rest, value)| (format!("{key}.{rest}"), value))
+            .collect(),
+        value => vec![(key.clone(), value.clone())],
+    };
+    table.iter().flat_map(below).collect()
+}
+
+/// Every element of `outer` with every one of `inner`, in order.
+fn pairs<'a, A, B>(outer: &'a [A], inner: &'a [B]) -> impl Iterator<Item = (&'a A, &'a B)> {
+    outer.iter().flat_map(move |a| inner.iter().map(move |b| (a, b)))
+}
+
+/// A seed as TOML has it; one that TOML cannot hold stays text and is refused with the other settings.
+fn whole(n: &u64) -> Value {
+    i64::try_from(*n).map_or_else(|_| Value::String(n.to_string()), Value::Integer)
+}
+
+fn in_one_line(text: &str, error: &toml::de::Error) -> anyhow::Error {
+    let start = error.span().map_or(0, |span| span.start);
+    let line_idx = text.get(..start).unwrap_or(text).matches('\n').count();
+    anyhow!("line {}: {}", line_idx + 1, error.message().replace('\n', " "))
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,232 @@
+//! A sweep of real runs, stopped in every way and started again, and the report on it.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Output, Stdio};
+use std::time::{Duration, SystemTime};
+
+use serde_json::Value;
+
+/// Settings of small runs of 10 rounds.
+const SMALL: [(&str, &str); 8] = [
+    ("stop.max_env_steps", "8000"),
+    ("ddpg.n_hidden", "32"),
+    ("rounds.updates_per_env_step", "0.1"),
+    ("evaluation.episodes", "8"),
+    ("evaluation.every_env_steps", "1600"),
+    ("evaluation.recorded_episodes", "0"),
+    ("checkpoint.every_rounds", "2"),
+    ("world.substeps", "10"),
+];
+
+const RUNS: [&str; 4] =
+    ["push-none-seed1", "push-mc-q-0.1-seed1", "push-none-seed2", "push-mc-q-0.1-seed2"];
+
+fn tandem() -> Command {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_tandem"));
+    command.current_dir(env!("CARGO_MANIFEST_DIR"));
+    command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped());
+    command
+}
+
+/// A sweep file with the small runs' settings.
+fn write_sweep(path: &Path, lists: &str, extra: &[(&str, &str)]) {
+    let settings = SMALL.iter().chain(extra).map(|(key, value)| format!("{key} = {value}\n"));
+    fs::write(path, format!("{lists}\n[run]\n{}", settings.collect::<String>())).expect("writes");
+}
+
+fn sweep(file: &Path, out: &Path, more: &[&str]) -> Command {
+    let mut command = tandem();
+    command.arg("sweep").arg(file).arg("--out").arg(out).args(more);
+    command
+}
+
+fn text(bytes: &[u8]) -> String {
+    String::from_utf8_lossy(bytes).into_owned()
+}
+
+/// The object on the last line of standard output.
+fn told(output: &Output) -> Value {
+    assert!(output.status.success(), "{:?}: {}", output.status, text(&output.stderr));
+    let stdout = text(&output.stdout);
+    serde_json::from_str(stdout.lines().last().expect("a line")).expect("JSON")
+}
+
+fn signal(signal: &str, pid: u32) {
+    let sent = Command::new("kill").args([signal, &pid.to_string()]).status().expect("kill runs");
+    assert!(sent.success(), "no process {pid}");
+}
+
+/// Looks every 20 ms for two minutes whether something has come true.
+fn eventually(what: &str, holds: impl Fn() -> bool) {
+    let came_true = (0..6000).any(|_| {
+        let holds = holds();
+        if !holds {
+            std::thread::sleep(Duration::from_millis(20));
+        }
+        holds
+    });
+    assert!(came_true, "{what} never came true");
+}
+
+fn wait_for_checkpoint(run: &Path) {
+    let is_saved = || {
+        let saved = fs::read_dir(run.join("checkpoint")).into_iter().flatten().flatten();
+        saved
+            .map(|entry| entry.path())
+            .any(|path| path.extension().is_some_and(|e| e == "safetensors"))
+    };
+    eventually("a checkpoint", is_saved);
+}
+
+/// The sweep's only child: the run under way.
+fn child_of(sweep: &Child) -> u32 {
+    let pid = sweep.id();
+    let children = fs::read_to_string(format!("/proc/{pid}/task/{pid}/children"));
+    let children = children.expect("the sweep lives");
+    children.split_whitespace().next().expect("a run is under way").parse().expect("a number")
+}
+
+fn is_gone(pid: u32) -> bool {
+    let state = fs::read_to_string(format!("/proc/{pid}/stat")).unwrap_or_default();
+    state.is_empty() || state.contains(") Z ")
+}
+
+/// Names, bytes and times of the finished runs' summaries.
+fn finished(out: &Path) -> Vec<(&'static str, Vec<u8>, SystemTime)> {
+    let summary = |name: &'static str| {
+        let path = out.join(name).join("summary.json");
+        let bytes = fs::read(&path).ok()?;
+        let written_at = fs::metadata(&path).ok()?.modified().ok()?;
+        Some((name, bytes, written_at))
+    };
+    RUNS.into_iter().filter_map(summary).collect()
+}
+
+/// The digest of the run that the sweep calls `name`, made by hand and never disturbed.
+fn calm_digest(name: &str, dir: &Path) -> String {
+    let (strategy, seed) =
+        name.strip_prefix("push-").expect("push").split_once("-seed").expect("a seed");
+    let mut command = tandem();
+    command.args(["train", "--json", "--max-minutes", "0", "--seed", seed]);
+    command.args(["--strategy", &strategy.replacen("mc-q-", "mc-q:", 1)]);
+    for (key, value) in SMALL {
+        command.args(["--set", &format!("{key}={value}")]);
+    }
+    let output = command.arg("--out").arg(dir.join(name)).output().expect("runs");
+    told(&output)["digest"].as_str().expect("a digest").to_owned()
+}
+
+/// Interrupts a sweep in its first run, kills the next in its third, and lets the last go on to its end.
+fn disturbed_sweep(file: &Path, out: &Path) -> Value {
+    let first = sweep(file, out, &[]).spawn().expect("starts");
+    wait_for_checkpoint(&out.join(RUNS[0]));
+    signal("-INT", first.id());
+    let interrupted = first.wait_with_output().expect("ends");
+    assert_eq!(interrupted.status.code(), Some(130), "{}", text(&interrupted.stderr));
+    assert!(text(&interrupted.stderr).contains("tandem sweep "), "the line that goes on");
+
+    let mut second = sweep(file, out, &[]).spawn().expect("starts");
+    wait_for_checkpoint(&out.join(RUNS[2]));
+    let run = child_of(&second);
+    let other = sweep(file, out, &[]).output().expect("runs");
+    assert_eq!(other.status.code(), Some(75), "two sweeps in one directory");
+    let before = finished(out);
+    signal("-KILL", second.id());
+    second.wait().expect("is gone");
+    assert!((2..4).contains(&before.len()), "{before:?}");
+
+    let third = sweep(file, out, &["--json"]).output().expect("runs");
+    assert!(is_gone(run), "a run of the killed sweep was still there when its place was taken");
+    let after = finished(out);
+    assert_eq!(after[..before.len()], before[..], "finished runs are left alone");
+    told(&third)
+}
+
+#[test]
+fn a_sweep_that_is_stopped_in_every_way_ends_with_the_bits_of_calm_runs() {
+    let keep = tempfile::tempdir().expect("a directory");
+    let (file, out) = (keep.path().join("sweep.toml"), keep.path().join("sweep"));
+    write_sweep(&file, "strategies = [\"none\", \"mc-q:0.1\"]\nseeds = [1, 2]", &[]);
+    let result = disturbed_sweep(&file, &out);
+    assert_eq!(result["finished"], 4, "{result}");
+    for (run, name) in result["runs"].as_array().expect("a list").iter().zip(RUNS) {
+        assert_eq!(run["name"], name);
+        assert_eq!(run["summary"]["digest"], calm_digest(name, keep.path()), "{name}");
+    }
+
+    let planned = told(&sweep(&file, &out, &["--dry-run", "--json"]).output().expect("runs"));
+    let states = planned["runs"].as_array().expect("a list").iter().map(|run| run["state"].clone());
+    assert_eq!(states.collect::<Vec<_>>(), ["finished"; 4]);
+
+    write_sweep(
+        &file,
+        "strategies = [\"none\", \"mc-q:0.1\"]\nseeds = [1, 2]",
+        &[("ddpg.discount", "0.9")],
+    );
+    let refused = sweep(&file, &out, &[]).output().expect("runs");
+    assert_eq!(refused.status.code(), Some(64));
+    let why = text(&refused.stderr);
+    assert!(why.contains(RUNS[0]) && why.contains("ddpg.discount is 0.95"), "{why}");
+
+    report_has_every_run(&out, keep.path());
+}
+
+/// The report on the finished sweep: two strategies of two seeds, five evaluations each where nobody disturbed.
+fn report_has_every_run(out: &Path, directory: &Path) {
+    let csv = directory.join("runs.csv");
+    let report = tandem().arg("report").arg(out).arg("--csv").arg(&csv).output().expect("runs");
+    assert!(report.status.success() && report.stderr.is_empty(), "{}", text(&report.stderr));
+    let table = text(&report.stdout);
+    for (strategy, paper) in [("none", "NA"), ("mc-q:0.1", "MC-Q01")] {
+        let line = table.lines().find(|line| line.starts_with(&format!("{strategy} ")));
+        let cells: Vec<&str> = line.expect("a row").split_whitespace().collect();
+        assert_eq!(cells[1], "2", "seeds of {strategy}");
+        assert!(cells.contains(&paper), "{cells:?}");
+    }
+    let lines: Vec<String> =
+        fs::read_to_string(&csv).expect("written").lines().skip(1).map(str::to_owned).collect();
+    assert_eq!(lines.len(), 4);
+    for line in &lines {
+        let cells: Vec<&str> = line.split(',').collect();
+        // An evaluation that was under way when a run was stopped is not repeated.
+        let n_evaluations: u32 = cells[6].parse().expect("a count");
+        let was_disturbed = [RUNS[0], RUNS[2]].contains(&cells[4]);
+        assert!(if was_disturbed { n_evaluations > 0 } else { n_evaluations == 5 }, "{line}");
+        assert!(!cells[24].is_empty(), "held-out success in {line}");
+    }
+    let page = fs::read_to_string(out.join("report.html")).expect("written");
+    assert!(page.contains("<svg") && page.contains("push, 2 arms"));
+    assert!(out.join("push-2-success-paper-epochs-strategies.svg").is_file());
+}
+
+#[test]
+fn a_run_that_fails_is_told_of_and_tried_again_at_the_next_start() {
+    let keep = tempfile::tempdir().expect("a directory");
+    let (file, out) = (keep.path().join("sweep.toml"), keep.path().join("sweep"));
+    let teacher: PathBuf = keep.path().join("teacher.safetensors");
+    let lists = format!("strategies = [\"none\", \"ea\"]\n[teachers]\npush = {teacher:?}");
+    let shorter =
+        SMALL.map(|(key, value)| (key, if key == "stop.max_env_steps" { "1600" } else { value }));
+    let settings: String =
+        shorter.iter().map(|(key, value)| format!("{key} = {value}\n")).collect();
+    fs::write(&file, format!("{lists}\n[run]\n{settings}")).expect("writes");
+
+    let failed = sweep(&file, &out, &["--jobs", "2"]).output().expect("runs");
+    let said = text(&failed.stderr);
+    assert_eq!(failed.status.code(), Some(75), "{said}");
+    assert!(
+        said.contains("push-ea-seed1: failed:") && said.contains("teacher.safetensors"),
+        "{said}"
+    );
+    assert!(said.contains("1 of 2 runs failed"), "{said}");
+    assert!(text(&failed.stdout).contains("1 of 2"), "{}", text(&failed.stdout));
+
+    let shipped = Path::new(env!("CARGO_MANIFEST_DIR")).join("policies/teacher-push.safetensors");
+    fs::copy(shipped, &teacher).expect("copies");
+    let again = sweep(&file, &out, &["--json"]).output().expect("runs");
+    assert!(text(&again.stderr).contains("failed before"), "{}", text(&again.stderr));
+    let result = told(&again);
+    assert_eq!(result["finished"], 2, "{result}");
+    assert!(result["runs"][1]["failure"].is_null(), "{result}");
+}
