@@ -270,8 +270,8 @@ pub(crate) struct DialArgs {
 Examples:
   tandem teacher --policy policies/teacher-push.safetensors --listen 127.0.0.1:7001
   tandem teacher --policy FILE --ledger runs/mine/ledger.sqlite
-  tandem teacher --policy FILE --ledger redis://:PASSWORD@redis:6379/0     several teachers, one budget
-  tandem teacher --policy FILE --ledger memory                             forgotten at the end")]
+  tandem teacher --policy FILE --ledger redis://:PASSWORD@redis:6379   several teachers, one budget
+  tandem teacher --policy FILE --ledger memory                          forgotten at the end")]
 pub(crate) struct TeacherArgs {
     /// The one-arm policy that advises.
     #[arg(long, value_name = "FILE")]

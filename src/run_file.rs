@@ -91,7 +91,8 @@ fn overlay(from_file: Table, settings: &[(String, Value)]) -> anyhow::Result<Run
 fn in_one_line(error: ConfigError) -> anyhow::Error {
     match error {
         ConfigError::OutOfRange { key, value, expected } => {
-            anyhow!("{key} is {}: expected {expected}", shortened(&value))
+            let value = shortened(&value.escape_debug().to_string());
+            anyhow!("{key} is {value}: expected {expected}")
         }
         ConfigError::Task(unknown) => anyhow!("task: {unknown}"),
     }

@@ -38,9 +38,11 @@ pub(crate) fn teacher(args: TeacherArgs) -> Result<(), Failed> {
     let gate = access::gate(&args.listen, &args.secret)?;
     run(async move {
         let shutdown = shutdown(args.listen.exit_with_stdin)?;
+        let config = tandem_teacher::Config { policy: args.policy, ledger: args.ledger };
+        let advisor = tandem_teacher::open(&config).map_err(teacher_failed)?;
         let listener = listen(&args.listen).await?;
-        let teacher = tandem_teacher::Config { policy: args.policy, ledger: args.ledger };
-        tandem_teacher::serve(teacher, listener, &gate, shutdown).await.map_err(teacher_failed)
+        let served = tandem_teacher::serve_advisor(advisor, listener, &gate, shutdown).await;
+        served.map_err(teacher_failed)
     })
 }
 
@@ -136,7 +138,9 @@ fn worker_failed(error: tandem_worker::Error) -> Failed {
     let exit = match error {
         E::Address { .. } | E::NoTeacher { .. } => Exit::Usage,
         E::Rollout { .. } | E::World(_) | E::Panicked(_) | E::NoAccount { .. } => Exit::Bug,
-        E::Protocol { .. } | E::Parameters { .. } | E::LogDir { .. } => Exit::TryAgain,
+        E::Protocol { .. } | E::Parameters { .. } | E::LogDir { .. } | E::Thread(_) => {
+            Exit::TryAgain
+        }
     };
     let error = anyhow::Error::from(error);
     match wrong_token(&error) {

@@ -31,20 +31,24 @@ struct Teacher {
 
 impl Teacher {
     fn start(ledger: &str, listen: &str) -> Self {
-        let policy =
-            Path::new(env!("CARGO_MANIFEST_DIR")).join("policies/teacher-push.safetensors");
-        let mut process = Command::new(env!("CARGO_BIN_EXE_tandem"))
-            .args(["--log", "warn", "teacher", "--listen", listen, "--ledger", ledger, "--policy"])
-            .arg(policy)
-            .stdin(Stdio::null())
-            .stdout(Stdio::piped())
-            .spawn()
-            .expect("starts");
+        let mut process = Self::spawn(ledger, listen);
         let mut line = String::new();
         let output = process.stdout.take().expect("piped");
         BufReader::new(output).read_line(&mut line).expect("a line");
         let address = line.trim().strip_prefix("listening on ").expect("an address").to_owned();
         Self { process, address }
+    }
+
+    fn spawn(ledger: &str, listen: &str) -> Child {
+        let policy =
+            Path::new(env!("CARGO_MANIFEST_DIR")).join("policies/teacher-push.safetensors");
+        Command::new(env!("CARGO_BIN_EXE_tandem"))
+            .args(["--log", "warn", "teacher", "--listen", listen, "--ledger", ledger, "--policy"])
+            .arg(policy)
+            .stdin(Stdio::null())
+            .stdout(Stdio::piped())
+            .spawn()
+            .expect("starts")
     }
 
     /// Ends it as `kill -9` does.
@@ -224,11 +228,15 @@ fn ten_thousand_units_are_charged_once_while_the_teacher_is_killed_fifty_times()
     open_account(&runtime, &address, BUDGET);
     let clients = start_clients(&runtime, std::slice::from_ref(&address), &told);
     for kill in 1..=N_KILLS {
-        // Every tenth one dies as soon as it listens, while it opens the ledger.
-        if !kill.is_multiple_of(10) {
-            told.wait_for(kill * 190);
-        }
+        told.wait_for(kill * 190);
         teacher.kill();
+        if kill.is_multiple_of(10) {
+            // One more, which dies as it begins, before, while or after it opens the ledger.
+            let mut unborn = Teacher::spawn(ledger, &address);
+            std::thread::sleep(Duration::from_millis(u64::try_from(kill).expect("few")));
+            unborn.kill().expect("killed");
+            unborn.wait().expect("gone");
+        }
         teacher = Teacher::start(ledger, &address);
     }
     let n_charged = told.verdicts.lock().expect("whole").n_charged;

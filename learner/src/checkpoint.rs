@@ -115,7 +115,7 @@ pub fn save(
         .map(|(name, dtype, bytes)| Tensor { name: name.clone(), dtype: *dtype, bytes })
         .collect();
     tensors.extend(state::large_tensors(trainer));
-    let written = fs::create_dir_all(directory)
+    let written = make(directory)
         .and_then(|()| sealed::write(&unfinished, &state::metadata(trainer, resumption), &tensors))
         .and_then(|seal| fs::rename(&unfinished, &path).map(|()| seal))
         .and_then(|seal| sync_directory(directory).map(|()| seal));
@@ -129,6 +129,15 @@ pub fn save(
     })?;
     prune(directory, &path, keep);
     Ok(Saved { path, seal })
+}
+
+/// Makes `directory`, and sure that it is on the disk.
+fn make(directory: &Path) -> io::Result<()> {
+    if directory.is_dir() {
+        return Ok(());
+    }
+    fs::create_dir_all(directory)?;
+    directory.parent().filter(|parent| parent.is_dir()).map_or(Ok(()), sync_directory)
 }
 
 /// Makes sure that a rename is on the disk.

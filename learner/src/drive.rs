@@ -54,7 +54,7 @@ pub(crate) fn run(
     runtime: &Handle,
     shutdown: &CancellationToken,
 ) -> Result<Ended, Error> {
-    let beginning = Beginning::of(config)?;
+    let beginning = Beginning::of(config, shutdown)?;
     let ledger = match beginning.open_ledger(config, runtime, shutdown) {
         Err(Error::Teacher(TeacherError::Stopped)) => {
             let (round, digest) = (beginning.trainer.counters().round, beginning.trainer.digest());

@@ -67,6 +67,7 @@ fn what_is_wrong_is_named() {
     check("stop.max_minutes=nan", &["stop.max_minutes", "NaN"]);
     check("seed=1 # one", &["seed", "1 # one", "integer"]);
     check("seed=1\nname=\"other\"", &["seed", "integer"]);
+    check("name=\"two\\nlines\"", &["name", "two\\nlines", "letters"]);
     check(&format!("name={}", "x".repeat(100_000)), &["name", "100000 bytes", "letters"]);
     check(&format!("{}=1", "x".repeat(100_000)), &["unknown setting", "100000 bytes"]);
 }

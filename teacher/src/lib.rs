@@ -21,5 +21,5 @@ mod fake;
 pub use advisor::{Advice, Advisor, Profile, Question};
 pub use error::Error;
 pub use policy::TeacherPolicy;
-pub use service::{Config, serve, serve_advisor};
+pub use service::{Config, open, serve, serve_advisor};
 pub use strategy::{Strategy, UnknownStrategy};

@@ -38,6 +38,15 @@ pub struct Config {
     pub ledger: String,
 }
 
+/// The advisor of `config`, with its policy loaded and its ledger open.
+///
+/// # Errors
+/// When the policy cannot teach, or the ledger cannot be opened.
+pub fn open(config: &Config) -> Result<Advisor, Error> {
+    let policy = OneArmPolicy::load(&config.policy)?;
+    Advisor::new(Box::new(policy), ledger::open(&config.ledger)?)
+}
+
 /// Serves the teacher of `config` to those whom `gate` lets in, until `shutdown` is cancelled.
 ///
 /// # Errors
@@ -48,15 +57,7 @@ pub async fn serve(
     gate: &Gate,
     shutdown: CancellationToken,
 ) -> Result<(), Error> {
-    let policy = OneArmPolicy::load(&config.policy)?;
-    let ledger = ledger::open(&config.ledger)?;
-    serve_advisor(
-        Advisor::new(Box::new(policy), ledger)?,
-        incoming,
-        gate,
-        shutdown,
-    )
-    .await
+    serve_advisor(open(&config)?, incoming, gate, shutdown).await
 }
 
 /// Serves `advisor` to those whom `gate` lets in, until `shutdown` is cancelled.

@@ -90,8 +90,9 @@ impl Place {
         let mut line = String::new();
         let mut output = BufReader::new(running.child.stdout.take().expect("piped"));
         output.read_line(&mut line).expect("a line");
-        let address = line.trim().strip_prefix("listening on ");
-        running.address = address.unwrap_or_else(|| panic!("{name}: {}", running.log())).to_owned();
+        let address = line.trim().strip_prefix("listening on ").map(str::to_owned);
+        assert!(address.is_some(), "{name}: {}", running.log());
+        running.address = address.unwrap_or_default();
         running
     }
 }

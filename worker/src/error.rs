@@ -64,7 +64,10 @@ pub enum Error {
         /// What went wrong.
         source: RolloutError,
     },
+    /// The system gives no thread for a rollout.
+    #[error("cannot start a thread for a rollout")]
+    Thread(#[source] std::io::Error),
     /// A bug: the rollout's thread panicked.
     #[error("the rollout's thread panicked")]
-    Panicked(#[from] tokio::task::JoinError),
+    Panicked(#[from] tokio::sync::oneshot::error::RecvError),
 }

@@ -253,6 +253,7 @@ fn compare(
 
 #[cfg(test)]
 mod tests {
+    use tandem_core::Contacts;
     use tandem_core::work::SlotOrder;
     use tandem_telemetry::read_episode;
 
@@ -301,6 +302,12 @@ mod tests {
         let error = record_episode(&metadata, &episode, &path).expect_err("differs");
         assert!(matches!(error, RecordError::Diverged { episode: 3, step: 7 }), "{error}");
         assert!(!path.exists());
+
+        let (metadata, mut episode) = played(EpisodeKind::Evaluation);
+        episode.contacts[9] =
+            if episode.contacts[9].any() { Contacts::NONE } else { Contacts::ARM_ARM };
+        let error = record_episode(&metadata, &episode, &path).expect_err("differs");
+        assert!(matches!(error, RecordError::Diverged { episode: 3, step: 10 }), "{error}");
     }
 
     #[test]

@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use tandem_core::Episode;
 use tandem_core::work::SlotOrder;
 use tandem_net::Dial;
+use tokio::sync::oneshot;
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 
@@ -178,7 +179,7 @@ impl Worker {
         Ok(true)
     }
 
-    /// Plays a slot on a thread, passing its questions on to the teacher.
+    /// Plays a slot on a thread of its own, passing its questions on to the teacher.
     async fn play(
         &mut self,
         mut player: Box<Player>,
@@ -187,10 +188,17 @@ impl Worker {
         let slot = order.slot;
         let (account, layout) = (player.terms().account.clone(), player.terms().layout);
         let (questions, mut asked) = Questions::channel();
-        let playing = self.rollouts.spawn_blocking(move || {
-            let episodes = player.play(&order, questions);
-            (player, episodes)
-        });
+        let (finished, playing) = oneshot::channel();
+        let counted = self.rollouts.token();
+        let rollout = std::thread::Builder::new().name("rollout".to_owned());
+        rollout
+            .spawn(move || {
+                let _counted = counted;
+                let episodes = player.play(&order, questions);
+                // Nobody waits for the episodes any more when the worker has ended meanwhile.
+                drop(finished.send((player, episodes)));
+            })
+            .map_err(Error::Thread)?;
         // Ends when the player has dropped its end, played to the end or not.
         while let Some(question) = asked.recv().await {
             let account = account.as_deref().ok_or(Error::NoAccount { slot })?;

@@ -2,6 +2,7 @@
 
 use std::fs::{File, OpenOptions, TryLockError};
 use std::path::Path;
+use std::time::Duration;
 
 use tandem_core::work::{PublishedActor, RunTerms};
 use tandem_proto::pb;
@@ -20,6 +21,10 @@ use crate::trainer::Trainer;
 
 /// The file whose lock says that a learner is at work in a run directory.
 const LOCK: &str = "learner.lock";
+/// How long a learner that was there before may take to save and go.
+const LOCK_PATIENCE: Duration = Duration::from_secs(30);
+/// Pause between two looks whether it has gone.
+const LOCK_TICK: Duration = Duration::from_millis(50);
 
 /// What a run begins with.
 pub(super) struct Beginning {
@@ -34,8 +39,8 @@ pub(super) struct Beginning {
 
 impl Beginning {
     /// Reads what there is.
-    pub(super) fn of(config: &LearnerConfig) -> Result<Self, Error> {
-        let lock = RunLock::take(&config.out)?;
+    pub(super) fn of(config: &LearnerConfig, shutdown: &CancellationToken) -> Result<Self, Error> {
+        let lock = RunLock::take(config, shutdown)?;
         let checkpoints = config.out.join("checkpoint");
         let restored = if config.resume {
             checkpoint::load_newest(&checkpoints, &config.run)?
@@ -153,27 +158,33 @@ pub(super) struct RunLock {
 }
 
 impl RunLock {
-    fn take(out: &Path) -> Result<Self, Error> {
-        let path = out.join(LOCK);
+    /// Takes the lock, waiting a while for the learner that has it.
+    fn take(config: &LearnerConfig, shutdown: &CancellationToken) -> Result<Self, Error> {
+        let path = config.out.join(LOCK);
         let refused = |source: Box<dyn std::error::Error + Send + Sync>| Error::RunDirectory {
             action: "lock",
             path: path.clone(),
             source,
         };
-        std::fs::create_dir_all(out).map_err(|error| refused(error.into()))?;
+        std::fs::create_dir_all(&config.out).map_err(|error| refused(error.into()))?;
         let made = OpenOptions::new().append(true).create(true).open(&path);
         made.map_err(|error| refused(error.into()))?;
         // Held for reading only: an open file that can be written to keeps a disk from being made read-only.
         let file = File::open(&path).map_err(|error| refused(error.into()))?;
-        match file.try_lock() {
-            Ok(()) => Ok(Self { _file: Some(file) }),
-            Err(TryLockError::WouldBlock) => {
-                Err(refused("another learner is at work in this directory".into()))
+        let until = (config.clock)() + LOCK_PATIENCE;
+        loop {
+            match file.try_lock() {
+                Ok(()) => return Ok(Self { _file: Some(file) }),
+                Err(TryLockError::WouldBlock) => {}
+                Err(TryLockError::Error(error)) => {
+                    tracing::warn!(%error, ?path, "no locks here, a second learner goes unnoticed");
+                    return Ok(Self { _file: None });
+                }
             }
-            Err(TryLockError::Error(error)) => {
-                tracing::warn!(%error, ?path, "files cannot be locked here, two learners would not notice");
-                Ok(Self { _file: None })
+            if (config.clock)() >= until || shutdown.is_cancelled() {
+                return Err(refused("another learner is at work in this directory".into()));
             }
+            std::thread::sleep(LOCK_TICK);
         }
     }
 }

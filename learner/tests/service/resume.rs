@@ -1,15 +1,16 @@
 //! A learner that dies at any moment and is resumed leaves what a calm one leaves.
 
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 use tandem_learner::RunConfig;
 use tandem_learner::checkpoint::{self, CheckpointError};
-use tandem_learner::{Ended, Error};
+use tandem_learner::{Ended, Error, LearnerConfig};
 use tandem_telemetry::MetricsLog;
 use tempfile::TempDir;
 
-use crate::run::{Left, Served, calm, copy_all, learner_config};
+use crate::run::{Left, Served, calm, copy_all, learner_config, real_clock};
 use crate::toy::config;
 
 async fn resume(run: RunConfig, out: &Path) -> Result<Ended, Error> {
@@ -142,10 +143,19 @@ async fn a_new_run_does_not_overwrite_a_former_one_nor_join_a_running_one() {
     let out = directory.path();
     let first = Served::start(learner_config(config(0), out, false)).await;
     first.join("toy").await;
-    let second = Served::start(learner_config(config(0), out, true)).await;
+    // It waits for half a minute by its clock, which is fast.
+    let clock = real_clock();
+    let second = Served::start(LearnerConfig {
+        clock: Arc::new(move || clock() * 1000),
+        ..learner_config(config(0), out, true)
+    });
+    let second = second.await;
     let refused = second.end().await.expect_err("one is at work").to_string();
     assert!(refused.starts_with("cannot lock"), "{refused}");
-    first.finish(1).await.expect("a run");
+    let third = Served::start(learner_config(config(0), out, true)).await;
+    let ended = first.finish(1).await.expect("a run");
+    let again = third.end().await.expect("the directory is free, and the run is over");
+    assert_eq!(again.digest, ended.digest);
     let rows = MetricsLog::read_all(&out.join("metrics.jsonl")).expect("rows");
     let anew = Served::start(learner_config(config(0), out, false)).await;
     let refused = anew.end().await.expect_err("a run is there");
