@@ -63,10 +63,8 @@ fn load(bytes: &[u8]) -> Result<Policy, FormatError> {
         assert!(error.to_string().contains(&name), "{error} does not name {name}");
         let reason = error.source().expect("a reason").to_string();
         assert!((10..400).contains(&reason.len()), "{} bytes: {reason:.400}", reason.len());
-        match error {
-            Error::Refused { source, .. } => *source,
-            error => panic!("{error}"),
-        }
+        let Error::Refused { source, .. } = error else { unreachable!("it was read") };
+        *source
     })
 }
 
