@@ -276,7 +276,7 @@ pub(crate) struct TeacherArgs {
     /// The one-arm policy that advises.
     #[arg(long, value_name = "FILE")]
     pub(crate) policy: PathBuf,
-    /// Where accounts are kept: an SQLite file that this teacher alone uses, redis://[USER:PASSWORD@]HOST[:PORT][/DB],
+    /// Where accounts are kept: an SQLite file that this teacher alone uses, `redis://[USER:PASSWORD@]HOST[:PORT][/DB]`,
     /// or memory.
     #[arg(
         long,

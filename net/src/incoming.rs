@@ -4,11 +4,16 @@ use std::fmt;
 use std::io;
 use std::pin::Pin;
 use std::task::{Context, Poll};
+use std::time::Duration;
 
 use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
 use tokio::net::TcpListener;
+use tokio::time::Sleep;
 use tokio_stream::{Stream, StreamExt as _};
 use tonic::transport::server::{Connected, TcpIncoming};
+
+/// How long a client may take to say its first word.
+const GREETING: Duration = Duration::from_secs(10);
 
 /// A connection over any network.
 pub struct Connection(Pin<Box<dyn Duplex>>);
@@ -75,6 +80,69 @@ impl AsyncWrite for Connection {
     }
 }
 
+/// A connection that fails when its client says nothing at first.
+struct Greeting<S> {
+    stream: S,
+    /// `None` once the client has spoken.
+    patience: Option<Pin<Box<Sleep>>>,
+}
+
+impl<S> Greeting<S> {
+    fn await_from(stream: S) -> Self {
+        Self { stream, patience: Some(Box::pin(tokio::time::sleep(GREETING))) }
+    }
+}
+
+impl<S: AsyncRead + Unpin> AsyncRead for Greeting<S> {
+    fn poll_read(
+        mut self: Pin<&mut Self>,
+        context: &mut Context<'_>,
+        buffer: &mut ReadBuf<'_>,
+    ) -> Poll<io::Result<()>> {
+        let n_before = buffer.filled().len();
+        let read = Pin::new(&mut self.stream).poll_read(context, buffer);
+        if buffer.filled().len() > n_before {
+            self.patience = None;
+        }
+        let patience = self.patience.as_mut();
+        if patience.is_some_and(|patience| patience.as_mut().poll(context).is_ready()) {
+            let silent = io::Error::new(io::ErrorKind::TimedOut, "the client says nothing");
+            return Poll::Ready(Err(silent));
+        }
+        read
+    }
+}
+
+impl<S: AsyncWrite + Unpin> AsyncWrite for Greeting<S> {
+    fn poll_write(
+        mut self: Pin<&mut Self>,
+        context: &mut Context<'_>,
+        bytes: &[u8],
+    ) -> Poll<io::Result<usize>> {
+        Pin::new(&mut self.stream).poll_write(context, bytes)
+    }
+
+    fn poll_flush(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<io::Result<()>> {
+        Pin::new(&mut self.stream).poll_flush(context)
+    }
+
+    fn poll_shutdown(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<io::Result<()>> {
+        Pin::new(&mut self.stream).poll_shutdown(context)
+    }
+
+    fn poll_write_vectored(
+        mut self: Pin<&mut Self>,
+        context: &mut Context<'_>,
+        slices: &[io::IoSlice<'_>],
+    ) -> Poll<io::Result<usize>> {
+        Pin::new(&mut self.stream).poll_write_vectored(context, slices)
+    }
+
+    fn is_write_vectored(&self) -> bool {
+        self.stream.is_write_vectored()
+    }
+}
+
 /// The connections that reach a service, as they come.
 pub struct Incoming(Pin<Box<dyn Stream<Item = io::Result<Connection>> + Send>>);
 
@@ -88,7 +156,7 @@ impl Incoming {
 impl From<TcpListener> for Incoming {
     fn from(listener: TcpListener) -> Self {
         let accepted = TcpIncoming::from(listener).with_nodelay(Some(true));
-        Self::new(accepted.map(|stream| stream.map(Connection::new)))
+        Self::new(accepted.map(|stream| Ok(Connection::new(Greeting::await_from(stream?)))))
     }
 }
 
@@ -103,5 +171,29 @@ impl Stream for Incoming {
 
     fn poll_next(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<Option<Self::Item>> {
         self.0.as_mut().poll_next(context)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
+
+    use super::*;
+
+    #[tokio::test(start_paused = true)]
+    async fn a_client_that_says_nothing_is_hung_up_on_and_one_that_spoke_is_not() {
+        let (_silent, stream) = tokio::io::duplex(16);
+        let refused = Greeting::await_from(stream).read_u8().await.unwrap_err();
+        assert_eq!(refused.kind(), io::ErrorKind::TimedOut);
+
+        let (mut client, stream) = tokio::io::duplex(16);
+        let mut greeting = Greeting::await_from(stream);
+        client.write_u8(1).await.unwrap();
+        assert_eq!(greeting.read_u8().await.unwrap(), 1);
+        let later = async {
+            tokio::time::sleep(10 * GREETING).await;
+            client.write_u8(2).await.unwrap();
+        };
+        assert_eq!(tokio::join!(greeting.read_u8(), later).0.unwrap(), 2);
     }
 }

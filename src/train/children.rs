@@ -281,6 +281,9 @@ impl Children {
         command
             .process_group(0)
             .kill_on_drop(true)
+            // They listen on this machine's own addresses only, and this process calls them without a token.
+            .env_remove("TANDEM_TOKEN_FILE")
+            .env_remove("TANDEM_LEDGER")
             .stdin(Stdio::piped())
             .stderr(self.log.try_clone()?);
         Ok(command)

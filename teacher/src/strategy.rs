@@ -77,6 +77,9 @@ impl fmt::Display for Strategy {
     }
 }
 
+/// How much of a text that names no strategy is repeated to whoever gave it.
+const MAX_TOLD_CHARS: usize = 80;
+
 /// A text that names no strategy.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("expected {names} (thresholds finite, 0 or more, 0.1 when left out), got {0:?}", names = Strategy::NAMES.join(", "))]
@@ -86,7 +89,7 @@ impl FromStr for Strategy {
     type Err = UnknownStrategy;
 
     fn from_str(text: &str) -> Result<Self, UnknownStrategy> {
-        let unknown = || UnknownStrategy(text.to_owned());
+        let unknown = || UnknownStrategy(text.chars().take(MAX_TOLD_CHARS).collect());
         let (name, threshold_text) = match text.split_once(':') {
             Some((name, threshold)) => (name, Some(threshold)),
             None => (text, None),

@@ -17,6 +17,7 @@ use tandem_policy::Policy;
 use tandem_teacher::budget::Balance;
 use tandem_teacher::policy::OneArmPolicy;
 use tandem_teacher::{Advisor, serve_advisor};
+use tandem_telemetry::{MetricsLog, MetricsRow};
 use tandem_worker::{Patience, WorkerConfig, run_with};
 use tempfile::TempDir;
 use tokio_util::sync::CancellationToken;
@@ -49,6 +50,8 @@ pub(crate) struct Outcome {
     pub(crate) digest: String,
     pub(crate) counters: Counters,
     pub(crate) balance: Balance,
+    /// All evaluations, without the time they took.
+    pub(crate) metrics: Vec<MetricsRow>,
 }
 
 /// What happened on the way.
@@ -243,7 +246,11 @@ impl Stage {
         if let Some(complaint) = complaint {
             return Err(complaint);
         }
-        let checkpoints = self.learner_directory(self.n_learners.get()).join("checkpoint");
+        let directory = self.learner_directory(self.n_learners.get());
+        let mut metrics = MetricsLog::read_all(&directory.join("metrics.jsonl"))
+            .map_err(|error| error.to_string())?;
+        metrics.iter_mut().for_each(|row| row.wall_s = 0.0);
+        let checkpoints = directory.join("checkpoint");
         let loaded =
             checkpoint::load_newest(&checkpoints, &self.run).map_err(|error| error.to_string())?;
         let trainer = loaded.ok_or("no checkpoint is left")?.trainer;
@@ -264,7 +271,7 @@ impl Stage {
                 "{n_charged} steps were charged, {n_arrived} units came with episodes, {spent} are spent"
             ));
         }
-        Ok(Outcome { digest, counters, balance })
+        Ok(Outcome { digest, counters, balance, metrics })
     }
 }
 

@@ -149,7 +149,7 @@ impl<'a> Machines<'a> {
                 is_calm = true;
                 self.calm_down();
             }
-            self.sim.step().map_err(|error| error.to_string())?;
+            threads.during(|| self.sim.step()).map_err(|error| error.to_string())?;
             let micros = u64::try_from(self.sim.elapsed().as_micros()).expect("an hour at most");
             self.house.now.store(micros, Ordering::Relaxed);
             if let Some(ended) = ended() {
@@ -158,7 +158,6 @@ impl<'a> Machines<'a> {
             if now >= NEVER {
                 return Err(format!("no end after {NEVER:?}"));
             }
-            threads.wait_until_idle();
         }
     }
 

@@ -51,7 +51,7 @@ fn run_config((strategy, budget, share, lag): (&str, u64, f64, u32)) -> RunConfi
     run.ddpg.n_hidden = 16;
     run.ddpg.n_hidden_layers = 2;
     run.ddpg.batch_size = 32;
-    run.evaluation.every_env_steps = 1_000_000;
+    run.evaluation.every_env_steps = 2 * run.env_steps_per_round();
     run.evaluation.episodes = 2;
     run.evaluation.recorded_episodes = 0;
     run.stop.max_env_steps = N_ROUNDS * run.env_steps_per_round();
@@ -103,11 +103,13 @@ fn check_run(seed: u64) -> Result<Course, String> {
 }
 
 #[test]
-fn every_budget_runs_out() {
+fn every_calm_run_uses_up_its_budget_and_is_judged_three_times() {
     for (run_idx, (_, budget, ..)) in RUNS.iter().enumerate() {
-        let balance = calm(run_idx).balance;
+        let Outcome { balance, counters, metrics, .. } = calm(run_idx);
         assert_eq!((balance.spent, balance.leased, balance.left), (*budget, 0, 0));
-        assert_eq!(calm(run_idx).counters.round, N_ROUNDS);
+        assert_eq!(counters.round, N_ROUNDS);
+        let rounds: Vec<u64> = metrics.iter().map(|row| row.round).collect();
+        assert_eq!(rounds, [2, 4, 5]);
     }
 }
 

@@ -4,10 +4,9 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::ffi::OsString;
 use std::fs::{self, File};
-use std::os::unix::fs::{FileExt as _, MetadataExt as _};
+use std::os::unix::fs::FileExt as _;
 use std::path::Path;
-use std::sync::atomic::{AtomicU64, Ordering};
-use std::sync::{Mutex, MutexGuard};
+use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 /// The threads of this process, according to Linux.
@@ -17,23 +16,21 @@ const PAUSE: Duration = Duration::from_micros(50);
 /// So many looks later time moves on all the same.
 const MAX_LOOKS: u32 = 2000;
 
-/// What the simulations know of each other's threads.
+/// What the simulations know of each other's threads. Who holds it makes a step; a thread that is new then belongs to
+/// that simulation.
 #[derive(Default)]
 struct Known {
-    /// Those that simulate.
+    /// Threads that simulate.
     simulating: BTreeSet<OsString>,
-    /// Those that belong to one of them. A new thread belongs to who sees it first, which is almost always the one
-    /// whose host has started it.
+    /// Threads that belong to one of them.
     computing: BTreeSet<OsString>,
 }
 
 static KNOWN: Mutex<Known> =
     Mutex::new(Known { simulating: BTreeSet::new(), computing: BTreeSet::new() });
-/// Simulations that have begun.
-static N_BEGUN: AtomicU64 = AtomicU64::new(0);
 
 fn known() -> MutexGuard<'static, Known> {
-    KNOWN.lock().expect("no panics here")
+    KNOWN.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 /// The threads of one simulation.
@@ -44,9 +41,6 @@ pub(crate) struct Threads {
     others: BTreeSet<OsString>,
     /// What Linux tells of those that belong to this simulation.
     ours: BTreeMap<OsString, File>,
-    /// When they were last listed: links to their directory, of which there is one for each of them and two more, and
-    /// simulations that had begun.
-    listed_at: (u64, u64),
 }
 
 impl Threads {
@@ -55,42 +49,28 @@ impl Threads {
         let own = fs::read_link("/proc/thread-self").ok();
         let own = own.as_deref().and_then(Path::file_name).unwrap_or_default().to_owned();
         known().simulating.insert(own.clone());
-        N_BEGUN.fetch_add(1, Ordering::Relaxed);
-        Self { own, others: names().collect(), ours: BTreeMap::new(), listed_at: (0, 0) }
+        Self { own, others: names().collect(), ours: BTreeMap::new() }
     }
 
-    /// Returns when all threads of the simulation wait for something.
-    pub(crate) fn wait_until_idle(&mut self) {
-        for _ in 0..MAX_LOOKS {
-            if !self.is_any_busy() {
-                return;
+    /// Makes a step, and returns when all threads of the simulation wait for something.
+    pub(crate) fn during<T>(&mut self, step: impl FnOnce() -> T) -> T {
+        let mut known = known();
+        let outcome = step();
+        self.list(&mut known);
+        drop(known);
+        let is_any_busy = || self.ours.values().any(is_busy);
+        let mut looks = (0..MAX_LOOKS).map(|look| {
+            if look > 0 {
+                std::thread::sleep(PAUSE);
             }
-            std::thread::sleep(PAUSE);
-        }
+            is_any_busy()
+        });
+        looks.find(|is_any_busy| !is_any_busy);
+        outcome
     }
 
-    fn is_any_busy(&mut self) -> bool {
-        // Without Linux's help each step of the simulation takes some time.
-        let Ok(tasks) = fs::metadata(TASKS) else { return true };
-        let now = (tasks.nlink(), N_BEGUN.load(Ordering::Relaxed));
-        if now != self.listed_at {
-            self.listed_at = now;
-            self.list();
-        }
-        let mut states = self.ours.values().map(state);
-        states.any(|state| match state {
-            Some(state) => matches!(state, b'R' | b'D'),
-            None => {
-                // One has ended, perhaps another begun.
-                self.listed_at = (0, 0);
-                true
-            }
-        })
-    }
-
-    fn list(&mut self) {
+    fn list(&mut self, Known { simulating, computing }: &mut Known) {
         let now: BTreeSet<OsString> = names().collect();
-        let Known { simulating, computing } = &mut *known();
         let is_ours = |task: &OsString| now.contains(task) && !simulating.contains(task);
         self.ours.retain(|task, _| is_ours(task) || !computing.remove(task));
         for task in &now {
@@ -125,10 +105,12 @@ fn names() -> impl Iterator<Item = OsString> {
     fs::read_dir(TASKS).into_iter().flatten().flatten().map(|task| task.file_name())
 }
 
-/// `R` of a thread that runs or could, `D` of one that waits for a disk; nothing of one that has ended.
-fn state(stat: &File) -> Option<u8> {
+/// Whether a thread runs, could run, or waits for a disk.
+fn is_busy(stat: &File) -> bool {
     let mut text = [0; 64];
-    let n_bytes = stat.read_at(&mut text, 0).ok()?;
+    // Of a thread that has ended nothing can be read.
+    let n_bytes = stat.read_at(&mut text, 0).unwrap_or(0);
     // The state follows the name, which stands in brackets.
-    text[..n_bytes].rsplit(|byte| *byte == b')').next()?.get(1).copied()
+    let state = text[..n_bytes].rsplit(|byte| *byte == b')').next().and_then(|rest| rest.get(1));
+    matches!(state, Some(b'R' | b'D'))
 }

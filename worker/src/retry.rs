@@ -88,7 +88,7 @@ impl Outage {
             peer: self.attempt.peer,
             attempt: self.n_failures,
             wait_millis: u64::try_from(pause.as_millis()).unwrap_or(u64::MAX),
-            reason: &format!("cannot {}: {status}", self.attempt.what),
+            reason: &format!("cannot {}: {}", self.attempt.what, status.message()),
         }
         .emit();
         tokio::time::sleep(pause).await;
