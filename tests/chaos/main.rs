@@ -24,6 +24,8 @@ use cluster::{Cluster, NAME, Outcome, ledger_path, run_dir};
 use schedule::{HAND_EVENTS, Schedule, Target};
 
 const N_WORKERS: usize = 4;
+/// On a fast machine faults come faster, so that every kind of fault has its turn.
+const MIN_FAULTS_PER_CALM_RUN: u32 = 16;
 /// A killed process does its part again in this time, most of the time; the machine may have other things to do.
 const RECOVERS_WITHIN: Duration = Duration::from_secs(5);
 /// And in this time always.
@@ -82,7 +84,7 @@ fn compare(scale: &Scale) {
     };
     let (calm_dir, calm) = run(None, Duration::from_secs(1_800));
     let seed = seed();
-    let every = scale.every.min(calm.wall.div_f64(HAND_EVENTS as f64));
+    let every = scale.every.min(calm.wall / MIN_FAULTS_PER_CALM_RUN);
     println!("calm run: {:?}; schedule: seed {seed}, a fault every {every:?}", calm.wall);
     let schedule = Schedule::new(seed, N_WORKERS, every);
     let deadline = Duration::from_secs(300) + 10 * calm.wall;
