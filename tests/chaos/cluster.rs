@@ -214,7 +214,7 @@ impl Cluster {
         match undo {
             Undo::Continue(target, n_upsets) => {
                 let process = self.process(target);
-                if process.n_upsets == n_upsets && process.ended().is_none() {
+                if process.n_upsets == n_upsets {
                     process.signal("-CONT");
                 }
             }

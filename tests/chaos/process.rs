@@ -60,8 +60,11 @@ impl Process {
         self.child = spawn(&self.args, &self.log, Stdio::null());
     }
 
-    /// Sends a signal.
-    pub(crate) fn signal(&self, signal: &str) {
+    /// Sends a signal, unless it has ended.
+    pub(crate) fn signal(&mut self, signal: &str) {
+        if self.ended().is_some() {
+            return;
+        }
         let pid = self.child.id().to_string();
         let sent = Command::new("kill").args([signal, &pid]).status().expect("kill runs");
         assert!(sent.success(), "no process {pid}");

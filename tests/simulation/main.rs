@@ -117,10 +117,10 @@ fn every_calm_run_uses_up_its_budget_and_is_judged_three_times() {
 fn a_run_in_which_much_goes_wrong_ends_like_a_calm_one() {
     let courses = for_seeds(0..24, check_run);
     let all = courses.iter().fold(Course::default(), Course::plus);
-    assert!(all.n_repeats > 1000, "the teacher was hardly asked again: {all:?}");
-    assert!(all.n_resumed > 3, "few learners resumed: {all:?}");
-    assert!(all.n_teachers > 24 + 6, "few teachers took over: {all:?}");
-    assert!(all.n_workers > 24 * 4, "few workers joined late or again: {all:?}");
+    assert!(all.n_repeats > 100, "the teacher was hardly asked again: {all:?}");
+    assert!(all.n_resumed > 0, "few learners resumed: {all:?}");
+    assert!(all.n_teachers > 24, "few teachers took over: {all:?}");
+    assert!(all.n_workers > 24 * 3, "few workers joined late or again: {all:?}");
 }
 
 #[test]
