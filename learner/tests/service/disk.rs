@@ -88,19 +88,19 @@ async fn play_to_the_first_checkpoint(toy: &mut Toy, out: &Path) {
     tokio::time::timeout(DEADLINE, saved).await.expect("in time");
 }
 
-/// Waits for a warning.
-async fn warning(toy: &mut Toy, is_awaited: impl Fn(&str) -> bool) -> String {
-    let look = async {
-        loop {
-            let progress = toy.client.status(pb::StatusRequest {}).await.expect("it lives");
-            let warning = progress.into_inner().warning;
-            if is_awaited(&warning) {
-                return warning;
-            }
-            tokio::time::sleep(Duration::from_millis(5)).await;
+/// Plays slot after slot until there is such a warning, which is looked for before each.
+async fn play_until_warned(toy: &mut Toy, is_awaited: impl Fn(&str) -> bool) -> String {
+    loop {
+        let progress = toy.client.status(pb::StatusRequest {}).await.expect("it lives");
+        let warning = progress.into_inner().warning;
+        if is_awaited(&warning) {
+            return warning;
         }
-    };
-    tokio::time::timeout(DEADLINE, look).await.expect("in time")
+        assert!(
+            toy.play_one().await,
+            "the run ended without the warning, the last one was {warning:?}"
+        );
+    }
 }
 
 /// Slots of three rounds and an evaluation: then a checkpoint is written.
@@ -118,16 +118,11 @@ async fn a_full_disk_is_told_of_and_nothing_is_lost_when_there_is_room_again() {
     let mut toy = served.join("toy").await;
     play_to_the_first_checkpoint(&mut toy, &out).await;
     disk.fill();
-    let plays = tokio::spawn(async move {
-        while toy.play_one().await {}
-        toy
-    });
-    let mut watcher = served.join("watcher").await;
-    let told = warning(&mut watcher, |told| told.contains("checkpoint")).await;
+    let told = play_until_warned(&mut toy, |told| told.contains("checkpoint")).await;
     assert!(told.contains("cannot be written: No space left on device"), "{told}");
     assert!(!checkpoint::list(&out.join("checkpoint")).is_empty(), "the former one stays");
     disk.make_room();
-    plays.await.expect("plays");
+    while toy.play_one().await {}
     let ended = served.end().await.expect("everything is written");
     assert_eq!(Left::behind(&ended, &out), expected);
 }
@@ -194,13 +189,11 @@ async fn files_that_cannot_be_made_are_made_when_what_is_in_their_way_is_gone() 
     in_the_way.iter().for_each(|path| std::fs::write(path, "").expect("writes"));
     let served = Served::start(impatient(out, false)).await;
     let mut toy = served.join("toy").await;
-    let plays = tokio::spawn(async move { while toy.play_one().await {} });
-    let mut watcher = served.join("watcher").await;
     let both =
         |told: &str| told.contains("the checkpoint of round") && told.contains("policy/best");
-    warning(&mut watcher, both).await;
+    play_until_warned(&mut toy, both).await;
     in_the_way.iter().for_each(|path| std::fs::remove_file(path).expect("removes"));
-    plays.await.expect("plays");
+    while toy.play_one().await {}
     let ended = served.end().await.expect("everything is written");
     assert_eq!(Left::behind(&ended, out), expected);
 }
