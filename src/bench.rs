@@ -9,7 +9,7 @@ use tandem_core::rng::{Stream, episode_rng, uniform};
 use tandem_core::{Layout, Task};
 use tandem_learner::RunConfig;
 use tandem_learner::config::Recipe;
-use tandem_learner::ddpg::{Batch, Ddpg};
+use tandem_learner::ddpg::{Batch, Ddpg, Rewards};
 use tandem_learner::her::{Sampler, Statistics};
 use tandem_learner::replay::{ReplayBuffer, drifting_episode};
 use tandem_learner::trainer::Trainer;
@@ -146,7 +146,7 @@ fn update() -> Vec<Figure> {
     let batch = random_batch(layout, config.batch_size);
     let sgemm = sgemm_flop_per_s();
     let updates_per_s = |n_threads: usize| {
-        let mut ddpg = Ddpg::new(config.clone(), layout, layout.n_arms, 1);
+        let mut ddpg = Ddpg::new(config.clone(), layout, Rewards::sparse(layout.n_arms), 1);
         ddpg.set_threads(n_threads);
         rate(|| {
             drop(ddpg.update(&batch));

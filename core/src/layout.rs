@@ -8,8 +8,13 @@ use std::str::FromStr;
 pub const OBSERVATION_PER_ARM: usize = 28;
 /// Numbers of one arm's goal: where its object shall be, metres, in the arm's own frame.
 pub const GOAL_PER_ARM: usize = 3;
+/// Where the end effector's position stands within its arm's part of the observation.
+pub const HAND_POSITION: Range<usize> = 0..3;
 /// Where an object's position stands within its arm's part of the observation.
 pub const OBJECT_POSITION: Range<usize> = 3..6;
+/// Distance between the centres of two arms' workspaces, the origins of their own frames, metres. The second arm is
+/// the first turned by half a turn, so each arm's x points at the other.
+pub const WORKSPACES_APART_M: f32 = 0.24;
 /// Control steps of an episode.
 pub const EPISODE_STEPS: usize = 50;
 /// Distance between object and goal, metres, within which the goal counts as achieved.

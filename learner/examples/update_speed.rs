@@ -10,7 +10,7 @@ use std::time::Instant;
 
 use tandem_core::rng::uniform;
 use tandem_core::{Layout, Stream, Task, episode_rng};
-use tandem_learner::ddpg::{Batch, Ddpg, DdpgConfig};
+use tandem_learner::ddpg::{Batch, Ddpg, DdpgConfig, Rewards};
 use tandem_policy::{Matrix, MatrixMut, multiply};
 
 const N_BLOCKS: usize = 10;
@@ -27,7 +27,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         *x = uniform(&mut rng, -1.0, 1.0);
     }
     batch.rewards.fill(-1.0);
-    let mut ddpg = Ddpg::new(config, layout, 2, 1);
+    let mut ddpg = Ddpg::new(config, layout, Rewards::sparse(2), 1);
 
     let mut updates_per_s = [0.0_f64; 2];
     let mut products_per_s = 0.0_f64;

@@ -33,7 +33,7 @@ pub struct RunConfig {
     pub seed: u64,
     /// The recipe that the defaults came from.
     pub recipe: Recipe,
-    /// Which network acts: `target` (the paper) or `online`.
+    /// Which network acts: `target` (the paper), `averaged` or `online`.
     pub behaviour: Behaviour,
     /// Who is asked for advice, and when.
     pub advice: AdviceConfig,
@@ -61,6 +61,8 @@ pub struct RunConfig {
 pub enum Behaviour {
     /// The Polyak-averaged one (the paper, section 4.1).
     Target,
+    /// A slower average than the target's (`ddpg.averaged_keep`), which no target is computed with.
+    Averaged,
     /// The one that is being updated.
     Online,
 }
@@ -310,6 +312,8 @@ impl RunConfig {
             ("world.wide_start_share", f64::from(self.world.wide_start_share)),
             ("replay.her_future_share", f64::from(self.replay.her_future_share)),
             ("replay.moved_share", f64::from(self.replay.moved_share)),
+            ("replay.advised_share", f64::from(self.replay.advised_share)),
+            ("replay.recombined_share", f64::from(self.replay.recombined_share)),
             ("replay.swap_share", f64::from(self.replay.swap_share)),
             ("stop.until_success", self.stop.until_success),
         ];
@@ -356,6 +360,17 @@ impl RunConfig {
             (1..=100_000).contains(&evaluation.episodes),
             "1 to 100,000",
         )?;
+        let recombined = self.replay.recombined_share;
+        check(
+            "replay.recombined_share",
+            &recombined,
+            recombined == 0.0 || self.replay.reward == RewardKind::PerArm,
+            "0 with one reward for all arms",
+        )?;
+        let cost = self.replay.contact_cost;
+        check("replay.contact_cost", &cost, (0.0..=100.0).contains(&cost), "0 to 100")?;
+        let foresight = self.replay.contact_foresight_steps;
+        check("replay.contact_foresight_steps", &foresight, foresight <= EPISODE_STEPS, "0 to 50")?;
         let kept = self.replay.capacity_transitions;
         check("replay.capacity_transitions", &kept, kept >= EPISODE_STEPS, "at least 50")?;
         check(
@@ -449,8 +464,12 @@ fn replay(recipe: Recipe, n_arms: usize) -> ReplayConfig {
         capacity_transitions: 1_000_000,
         her_future_share: 0.8,
         moved_share: if tandem { 0.5 } else { 0.0 },
+        advised_share: 0.0,
+        recombined_share: 0.0,
         swap_share: if tandem && n_arms == 2 { 0.5 } else { 0.0 },
         reward: if tandem { RewardKind::PerArm } else { RewardKind::Joint },
+        contact_cost: 0.0,
+        contact_foresight_steps: 0,
     }
 }
 

@@ -89,6 +89,8 @@ pub struct Ddpg {
     n_threads: usize,
     n_updates: u64,
     actor: Network,
+    /// A slower average of the actor than its target.
+    averaged_actor: Vec<f32>,
     critic: Network,
     actor_half: ActorHalf,
     critic_half: CriticHalf,
@@ -110,18 +112,28 @@ impl Network {
 }
 
 impl Ddpg {
-    /// Fresh networks for `layout`, drawn from `run_seed`; the critic has `n_heads` values, 1 or one per arm.
+    /// Fresh networks for `layout`, drawn from `run_seed`; the critic has a value for each of the rewards' heads.
     #[must_use]
-    pub fn new(config: DdpgConfig, layout: Layout, n_heads: usize, run_seed: u64) -> Self {
+    pub fn new(config: DdpgConfig, layout: Layout, rewards: Rewards, run_seed: u64) -> Self {
         let (n_hidden, n_hidden_layers) = (config.n_hidden, config.n_hidden_layers);
         let network = |shape, number| {
             Network::new(shape, &mut episode_rng(run_seed, number, Stream::Initialisation))
         };
         let actor = network(MlpShape::actor(layout, n_hidden, n_hidden_layers), 0);
-        let critic = network(MlpShape::critic(layout, n_hidden, n_hidden_layers, n_heads), 1);
+        let critic =
+            network(MlpShape::critic(layout, n_hidden, n_hidden_layers, rewards.n_heads), 1);
         let actor_half = ActorHalf::new(&config, &actor.shape, &critic.shape);
-        let critic_half = CriticHalf::new(&config, &actor.shape, &critic.shape);
-        Self { config, n_threads: 1, n_updates: 0, actor, critic, actor_half, critic_half }
+        let critic_half = CriticHalf::new(&config, rewards.lowest, &actor.shape, &critic.shape);
+        Self {
+            config,
+            n_threads: 1,
+            n_updates: 0,
+            averaged_actor: actor.online.clone(),
+            actor,
+            critic,
+            actor_half,
+            critic_half,
+        }
     }
 
     /// One gradient step of critic and actor on `batch`.
@@ -153,13 +165,21 @@ impl Ddpg {
         }
     }
 
-    /// Moves both target networks toward the online ones, keeping the configured share of the old.
+    /// Moves both target networks, and the averaged actor, toward the online ones, keeping the configured share of
+    /// the old.
     pub fn polyak(&mut self) {
-        let Self { config, n_threads, actor, critic, .. } = self;
+        let Self { config, n_threads, actor, averaged_actor, critic, .. } = self;
         let move_target = |network: &mut Network| {
             polyak_update(&mut network.target, &network.online, config.polyak_keep);
         };
-        join(*n_threads, || move_target(critic), || move_target(actor));
+        join(
+            *n_threads,
+            || move_target(critic),
+            || {
+                move_target(actor);
+                polyak_update(averaged_actor, &actor.online, config.averaged_keep);
+            },
+        );
     }
 
     /// Whether the two halves of an update run one after the other (1) or side by side (2); the bits are the same.
@@ -168,9 +188,28 @@ impl Ddpg {
     }
 }
 
+/// What the critic values.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Rewards {
+    /// Rewards of a step, 1 or one per arm.
+    pub n_heads: usize,
+    /// The lowest that one of them can be; the highest is 0.
+    pub lowest: f32,
+}
+
+impl Rewards {
+    /// Of -1 while a goal is pending, else 0.
+    #[must_use]
+    pub const fn sparse(n_heads: usize) -> Self {
+        Self { n_heads, lowest: -1.0 }
+    }
+}
+
 /// The critic's half of an update.
 #[derive(Debug, Clone)]
 struct CriticHalf {
+    /// The lowest reward of a step.
+    lowest_reward: f32,
     /// Input and executed action, shape `[b, n_input + n_action]`.
     input: Vec<f32>,
     /// Next input and the target actor's action.
@@ -187,9 +226,10 @@ struct CriticHalf {
 }
 
 impl CriticHalf {
-    fn new(config: &DdpgConfig, actor: &MlpShape, critic: &MlpShape) -> Self {
+    fn new(config: &DdpgConfig, lowest_reward: f32, actor: &MlpShape, critic: &MlpShape) -> Self {
         let b = config.batch_size;
         Self {
+            lowest_reward,
             input: vec![0.0; b * critic.n_input],
             next_input: vec![0.0; b * critic.n_input],
             q: vec![0.0; b * critic.n_output],
@@ -247,7 +287,7 @@ impl CriticHalf {
         let mut loss = 0.0;
         let values = self.q.iter().zip(&self.next_q).zip(&batch.rewards);
         for (gradient, ((q, next_q), reward)) in self.q_gradient.iter_mut().zip(values) {
-            let error = q - critic_target(config.discount, *reward, *next_q);
+            let error = q - critic_target(config.discount, self.lowest_reward, *reward, *next_q);
             loss += f64::from(error) * f64::from(error);
             *gradient = 2.0 * error / b as f32;
         }
@@ -264,11 +304,11 @@ impl CriticHalf {
     }
 }
 
-/// `y = r + discount * Q'(s', pi'(s'))`, clipped to what rewards of -1 and 0 can add up to.
+/// `y = r + discount * Q'(s', pi'(s'))`, clipped to what rewards from the lowest to 0 can add up to.
 ///
 /// Episodes end by their time limit only, and the world would have gone on: there is always a next value.
-fn critic_target(discount: f32, reward: f32, next_q: f32) -> f32 {
-    (reward + discount * next_q).clamp(-1.0 / (1.0 - discount), 0.0)
+fn critic_target(discount: f32, lowest_reward: f32, reward: f32, next_q: f32) -> f32 {
+    (reward + discount * next_q).clamp(lowest_reward / (1.0 - discount), 0.0)
 }
 
 /// The actor's half of an update.

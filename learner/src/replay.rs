@@ -1,5 +1,7 @@
 //! The replay buffer: whole episodes, the oldest overwritten first.
 
+use std::ops::Range;
+
 use tandem_core::layout::{ArmIndex, EPISODE_STEPS, Layout};
 use tandem_core::{Contacts, Episode, EpisodeKind};
 
@@ -11,6 +13,7 @@ pub struct ReplayBuffer {
     next: usize,
     parts: ReplayParts,
     moved_episodes: Vec<usize>,
+    advised_episodes: Vec<usize>,
 }
 
 /// The buffer's contents as they are stored.
@@ -24,6 +27,8 @@ pub struct ReplayParts {
     pub actions: Vec<f32>,
     /// Shape `[n_episodes, EPISODE_STEPS]`, bit `a`: arm `a` executed the teacher's action.
     pub advised_arms: Vec<u8>,
+    /// Shape `[n_episodes, EPISODE_STEPS]`, [`Contacts::bits`] of the step.
+    pub contacts: Vec<u8>,
     /// Shape `[n_episodes]`, 1 where an object was displaced.
     pub moved: Vec<u8>,
 }
@@ -39,6 +44,7 @@ impl ReplayBuffer {
             next: 0,
             parts: ReplayParts::default(),
             moved_episodes: Vec::new(),
+            advised_episodes: Vec::new(),
         }
     }
 
@@ -59,13 +65,14 @@ impl ReplayBuffer {
             && parts.observations.len() == n * buffer.observation_stride()
             && parts.goals.len() == n * layout.n_goal()
             && parts.actions.len() == n * EPISODE_STEPS * layout.n_action()
-            && parts.advised_arms.len() == n * EPISODE_STEPS;
+            && parts.advised_arms.len() == n * EPISODE_STEPS
+            && parts.contacts.len() == n * EPISODE_STEPS;
         if !fits {
             return None;
         }
         buffer.parts = parts;
         buffer.next = next;
-        buffer.index_moved();
+        buffer.index_episodes();
         Some(buffer)
     }
 
@@ -93,6 +100,12 @@ impl ReplayBuffer {
         &self.moved_episodes
     }
 
+    /// The stored episodes in which an arm executed an action of the teacher's.
+    #[must_use]
+    pub fn advised_episodes(&self) -> &[usize] {
+        &self.advised_episodes
+    }
+
     /// Stores an episode, in the place of the oldest when the buffer is full.
     ///
     /// # Panics
@@ -100,23 +113,29 @@ impl ReplayBuffer {
     pub fn push(&mut self, episode: &Episode) {
         assert_eq!(episode.layout, self.layout, "an episode of another layout");
         let moved = u8::from(episode.moved());
+        let contacts: Vec<u8> = episode.contacts.iter().map(|contacts| contacts.bits()).collect();
         let parts = &mut self.parts;
         if parts.moved.len() < self.capacity_episodes {
             parts.observations.extend_from_slice(&episode.observations);
             parts.goals.extend_from_slice(&episode.goal);
             parts.actions.extend_from_slice(&episode.actions);
             parts.advised_arms.extend_from_slice(&episode.advised_arms);
+            parts.contacts.extend_from_slice(&contacts);
             parts.moved.push(moved);
             if moved == 1 {
                 self.moved_episodes.push(self.next);
+            }
+            if is_advised(&episode.advised_arms) {
+                self.advised_episodes.push(self.next);
             }
         } else {
             overwrite(&mut parts.observations, self.next, &episode.observations);
             overwrite(&mut parts.goals, self.next, &episode.goal);
             overwrite(&mut parts.actions, self.next, &episode.actions);
             overwrite(&mut parts.advised_arms, self.next, &episode.advised_arms);
+            overwrite(&mut parts.contacts, self.next, &contacts);
             parts.moved[self.next] = moved;
-            self.index_moved();
+            self.index_episodes();
         }
         self.next = (self.next + 1) % self.capacity_episodes;
     }
@@ -156,11 +175,18 @@ impl ReplayBuffer {
         self.parts.advised_arms[episode_idx * EPISODE_STEPS + step_idx]
     }
 
+    /// Whether an arm touched the other or the table on one of the steps of an episode.
+    #[must_use]
+    pub fn has_contact(&self, steps: Range<usize>, episode_idx: usize) -> bool {
+        let start = episode_idx * EPISODE_STEPS;
+        self.parts.contacts[start + steps.start..start + steps.end].iter().any(|bits| *bits != 0)
+    }
+
     const fn observation_stride(&self) -> usize {
         (EPISODE_STEPS + 1) * self.layout.n_observation()
     }
 
-    fn index_moved(&mut self) {
+    fn index_episodes(&mut self) {
         self.moved_episodes.clear();
         let moved = self
             .parts
@@ -170,7 +196,16 @@ impl ReplayBuffer {
             .filter(|(_, moved)| **moved == 1)
             .map(|(episode, _)| episode);
         self.moved_episodes.extend(moved);
+        self.advised_episodes.clear();
+        let steps = self.parts.advised_arms.chunks_exact(EPISODE_STEPS);
+        let advised = steps.enumerate().filter(|(_, steps)| is_advised(steps));
+        self.advised_episodes.extend(advised.map(|(episode, _)| episode));
     }
+}
+
+/// Whether an arm executed an action of the teacher's on one of the steps.
+fn is_advised(advised_arms: &[u8]) -> bool {
+    advised_arms.iter().any(|arms| *arms != 0)
 }
 
 /// Puts `row` in the place of row `row_idx` of a table with rows of that length.

@@ -14,7 +14,7 @@ use tandem_core::work::{EpisodeOrder, PublishedActor, SlotOrder};
 use tandem_policy::{Normalizer, NormalizerSnapshot, Policy};
 
 use crate::config::{Behaviour, ConfigError, PolyakEvery, RunConfig};
-use crate::ddpg::{Batch, Ddpg, DdpgError};
+use crate::ddpg::{Batch, Ddpg, DdpgError, Rewards};
 use crate::her::{Sampler, Statistics};
 use crate::replay::ReplayBuffer;
 
@@ -75,11 +75,12 @@ impl Trainer {
         let config = config.checked()?;
         let layout = config.layout()?;
         let n_heads = config.replay.reward.n_heads(layout);
+        let rewards = Rewards { n_heads, lowest: config.replay.lowest_reward() };
         Ok(Self {
             layout,
             counters: Counters::default(),
             replay: ReplayBuffer::new(layout, config.replay.capacity_transitions),
-            ddpg: Ddpg::new(config.ddpg.clone(), layout, n_heads, config.seed),
+            ddpg: Ddpg::new(config.ddpg.clone(), layout, rewards, config.seed),
             observation_normalizer: Normalizer::new(layout.n_observation()),
             goal_normalizer: Normalizer::new(layout.n_goal()),
             sampler: Sampler::new(&config.replay, layout),
@@ -199,6 +200,7 @@ impl Trainer {
     pub fn publish(&self) -> PublishedActor {
         let actor = match self.config.behaviour {
             Behaviour::Target => self.ddpg.target_actor(),
+            Behaviour::Averaged => self.ddpg.averaged_actor(),
             Behaviour::Online => self.ddpg.actor(),
         };
         let NormalizerSnapshot { mean: observation_mean, std: observation_std } =
@@ -222,6 +224,7 @@ impl Trainer {
     pub fn policy(&self, metadata: BTreeMap<String, String>) -> Policy {
         let (actor, critic) = match self.config.behaviour {
             Behaviour::Target => (self.ddpg.target_actor(), self.ddpg.target_critic()),
+            Behaviour::Averaged => (self.ddpg.averaged_actor(), self.ddpg.target_critic()),
             Behaviour::Online => (self.ddpg.actor(), self.ddpg.critic()),
         };
         Policy {
@@ -255,6 +258,7 @@ impl Trainer {
         }
         let (parts, next) = self.replay.parts();
         hash.update(&parts.advised_arms);
+        hash.update(&parts.contacts);
         hash.update(&parts.moved);
         let Counters { round, env_steps, episodes, updates, advice_spent } = self.counters;
         for count in

@@ -2,7 +2,7 @@
 
 use serde_json::Value;
 use tandem_core::{Layout, Task};
-use tandem_learner::ddpg::{Batch, Ddpg, DdpgConfig};
+use tandem_learner::ddpg::{Batch, Ddpg, DdpgConfig, Rewards};
 
 const REFERENCE: &str = include_str!("data/ddpg_reference.json");
 /// Single precision's share in a loss, a gradient or a step, of numbers of 1 and more.
@@ -47,7 +47,7 @@ fn assert_close(what: &str, got: &[f32], expected: &Value) {
 fn every_update_agrees_with_the_reference() {
     let reference: Value = serde_json::from_str(REFERENCE).unwrap();
     let config: DdpgConfig = serde_json::from_value(reference["config"].clone()).unwrap();
-    let mut ddpg = Ddpg::new(config, Layout::new(Task::Push, 1), 2, 0);
+    let mut ddpg = Ddpg::new(config, Layout::new(Task::Push, 1), Rewards::sparse(2), 0);
     for (n_before, update) in (0..).zip(reference["updates"].as_array().unwrap()) {
         let before = update["before"].as_object().unwrap();
         let before: Vec<_> =

@@ -2,9 +2,10 @@
 
 use rapier3d::math::{Matrix, Rotation, Vector};
 use tandem_core::ArmIndex;
+use tandem_core::layout::WORKSPACES_APART_M;
 
 /// Distance of two arms' workspace centres from the world's origin, metres.
-const CENTRE_X_M: f32 = 0.12;
+const CENTRE_X_M: f32 = WORKSPACES_APART_M / 2.0;
 /// The arm's base in its own frame, metres: behind the workspace's centre, at table height.
 pub(crate) const BASE_IN_OWN: Vector = Vector::new(-0.40, 0.0, 0.0);
 /// Lower corner of where the end effector may be, own frame, metres.

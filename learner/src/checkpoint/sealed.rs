@@ -13,7 +13,7 @@ use serde_json::{Map, Value, json};
 use sha2::{Digest as _, Sha256};
 
 /// Version of the file's layout.
-pub(super) const FORMAT: &str = "2";
+pub(super) const FORMAT: &str = "3";
 /// How a header begins; the seal follows.
 const BEFORE_SEAL: &str = r#"{"__metadata__":{"seal":""#;
 const SEAL_CHARS: usize = 64;

@@ -91,7 +91,11 @@ pub(super) fn large_tensors(trainer: &Trainer) -> Vec<Tensor<'_>> {
         dtype: Dtype::F32,
         bytes: bytemuck::cast_slice(values),
     });
-    let bytes = [("replay.advised_arms", &parts.advised_arms), ("replay.moved", &parts.moved)];
+    let bytes = [
+        ("replay.advised_arms", &parts.advised_arms),
+        ("replay.contacts", &parts.contacts),
+        ("replay.moved", &parts.moved),
+    ];
     let bytes =
         bytes.map(|(name, bytes)| Tensor { name: name.to_owned(), dtype: Dtype::U8, bytes });
     floats.chain(bytes).collect()
@@ -198,6 +202,7 @@ impl Reader<'_> {
             goals: self.f32s("replay.goals")?,
             actions: self.f32s("replay.actions")?,
             advised_arms: self.bytes("replay.advised_arms", Dtype::U8)?.to_vec(),
+            contacts: self.bytes("replay.contacts", Dtype::U8)?.to_vec(),
             moved: self.bytes("replay.moved", Dtype::U8)?.to_vec(),
         };
         let next = usize::try_from(self.count("replay.next")?).unwrap_or(usize::MAX);

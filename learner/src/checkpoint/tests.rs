@@ -213,10 +213,10 @@ fn another_format_is_refused_by_name() {
         refusal(&directory).to_string()
     };
     let message = write(r#"{"__metadata__":{"round":"50","format":"1"}}"#);
-    assert!(message.ends_with(r#"is of format "1", this program reads "2""#), "{message}");
-    let message = write(r#"{"__metadata__":{"round":"50","format":"2"}}"#);
+    assert!(message.ends_with(r#"is of format "1", this program reads "3""#), "{message}");
+    let message = write(r#"{"__metadata__":{"round":"50","format":"3"}}"#);
     assert!(message.contains("it bears no seal"), "{message}");
-    let message = write(r#"{"__metadata__":{"round":"50","format":"2","seal":"0"}}"#);
+    let message = write(r#"{"__metadata__":{"round":"50","format":"3","seal":"0"}}"#);
     assert!(message.contains("seal is not where it should be"), "{message}");
     let message = write("{}");
     assert!(message.contains("is damaged"), "{message}");

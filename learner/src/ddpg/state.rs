@@ -41,6 +41,12 @@ impl Ddpg {
         &self.actor.target
     }
 
+    /// The slow average of the actor, flat.
+    #[must_use]
+    pub fn averaged_actor(&self) -> &[f32] {
+        &self.averaged_actor
+    }
+
     /// The critic that is being updated, flat.
     #[must_use]
     pub fn critic(&self) -> &[f32] {
@@ -62,12 +68,13 @@ impl Ddpg {
     /// Every vector that the next update depends on, by name, in a fixed order. With [`Ddpg::n_updates`] it is the
     /// whole state.
     #[must_use]
-    pub fn state(&self) -> [(&'static str, &[f32]); 8] {
+    pub fn state(&self) -> [(&'static str, &[f32]); 9] {
         let [actor_first, actor_second] = self.actor_half.step.adam.moments();
         let [critic_first, critic_second] = self.critic_half.step.adam.moments();
         [
             ("actor.online", &self.actor.online),
             ("actor.target", &self.actor.target),
+            ("actor.averaged", &self.averaged_actor),
             ("actor.adam.first", actor_first),
             ("actor.adam.second", actor_second),
             ("critic.online", &self.critic.online),
@@ -86,7 +93,7 @@ impl Ddpg {
         stored: &[(String, Vec<f32>)],
         n_updates: u64,
     ) -> Result<(), DdpgError> {
-        let mut vectors: [&[f32]; 8] = [&[]; 8];
+        let mut vectors: [&[f32]; 9] = [&[]; 9];
         for ((name, now), vector) in self.state().into_iter().zip(&mut vectors) {
             let found = stored
                 .iter()
@@ -102,6 +109,7 @@ impl Ddpg {
         let [
             actor,
             target_actor,
+            averaged_actor,
             actor_first,
             actor_second,
             critic,
@@ -111,6 +119,7 @@ impl Ddpg {
         ] = vectors;
         self.actor.online.copy_from_slice(actor);
         self.actor.target.copy_from_slice(target_actor);
+        self.averaged_actor.copy_from_slice(averaged_actor);
         self.actor_half.step.adam.restore(n_updates, [actor_first, actor_second]);
         self.critic.online.copy_from_slice(critic);
         self.critic.target.copy_from_slice(target_critic);

@@ -4,7 +4,7 @@ use tandem_core::rng::{index, uniform};
 use tandem_core::{Layout, Stream, Task, episode_rng};
 use tandem_policy::MlpShape;
 
-use super::{Batch, Ddpg, DdpgConfig, DdpgError};
+use super::{Batch, Ddpg, DdpgConfig, DdpgError, Rewards};
 
 const LAYOUT: Layout = Layout::new(Task::Push, 1);
 
@@ -122,7 +122,7 @@ fn assert_is_gradient(what: &str, gradient: &[f32], at: &[f32], loss: impl Fn(&[
 #[test]
 fn both_gradients_agree_with_finite_differences() {
     let check = |n_heads, change: fn(&mut DdpgConfig)| {
-        let mut ddpg = Ddpg::new(small(change), LAYOUT, n_heads, 4);
+        let mut ddpg = Ddpg::new(small(change), LAYOUT, Rewards::sparse(n_heads), 4);
         let batch = random_batch(n_heads, 5, 0);
         let before = ddpg.clone();
         let losses = ddpg.update(&batch).unwrap();
@@ -145,7 +145,7 @@ fn both_gradients_agree_with_finite_differences() {
 fn one_and_two_threads_give_the_same_bits() {
     let config = small(|config| (config.n_hidden, config.batch_size) = (64, 32));
     let learn = |n_threads| {
-        let mut ddpg = Ddpg::new(config.clone(), LAYOUT, 2, 9);
+        let mut ddpg = Ddpg::new(config.clone(), LAYOUT, Rewards::sparse(2), 9);
         ddpg.set_threads(n_threads);
         let mut losses = Vec::new();
         for number in 0..20 {
@@ -159,7 +159,7 @@ fn one_and_two_threads_give_the_same_bits() {
 
 #[test]
 fn the_critic_learns_what_its_target_says() {
-    let mut ddpg = Ddpg::new(small(|config| config.n_hidden = 32), LAYOUT, 1, 1);
+    let mut ddpg = Ddpg::new(small(|config| config.n_hidden = 32), LAYOUT, Rewards::sparse(1), 1);
     let batch = random_batch(1, 5, 0);
     let first = ddpg.update(&batch).unwrap().critic_loss;
     let last = (0..200).map(|_| ddpg.update(&batch).unwrap().critic_loss).last().unwrap();
@@ -168,7 +168,8 @@ fn the_critic_learns_what_its_target_says() {
 
 #[test]
 fn polyak_averaging_moves_only_the_targets() {
-    let mut ddpg = Ddpg::new(small(|config| config.polyak_keep = 0.5), LAYOUT, 1, 1);
+    let mut ddpg =
+        Ddpg::new(small(|config| config.polyak_keep = 0.5), LAYOUT, Rewards::sparse(1), 1);
     ddpg.update(&random_batch(1, 5, 0)).unwrap();
     let before = ddpg.clone();
     ddpg.polyak();
@@ -185,15 +186,36 @@ fn polyak_averaging_moves_only_the_targets() {
 }
 
 #[test]
+fn the_averaged_actor_follows_more_slowly() {
+    let change = |config: &mut DdpgConfig| config.averaged_keep = 0.75;
+    let mut ddpg = Ddpg::new(small(change), LAYOUT, Rewards::sparse(1), 1);
+    let first = ddpg.actor().to_vec();
+    assert_eq!(ddpg.averaged_actor(), first);
+    ddpg.update(&random_batch(1, 5, 0)).unwrap();
+    ddpg.polyak();
+    for ((averaged, old), online) in ddpg.averaged_actor().iter().zip(&first).zip(ddpg.actor()) {
+        assert!((averaged - (0.75 * old + 0.25 * online)).abs() < 1e-6);
+    }
+}
+
+#[test]
+fn targets_reach_as_low_as_the_lowest_reward_goes_on_for_ever() {
+    assert_eq!(super::critic_target(0.5, -1.0, -1.0, -9.0), -2.0);
+    assert_eq!(super::critic_target(0.5, -3.0, -1.0, -9.0), -5.5);
+    assert_eq!(super::critic_target(0.5, -3.0, -3.0, -9.0), -6.0);
+    assert_eq!(super::critic_target(0.5, -3.0, 0.0, 9.0), 0.0);
+}
+
+#[test]
 fn a_restored_learner_goes_on_alike() {
     let config = small(|_| {});
-    let mut first = Ddpg::new(config.clone(), LAYOUT, 2, 1);
+    let mut first = Ddpg::new(config.clone(), LAYOUT, Rewards::sparse(2), 1);
     for number in 0..3 {
         first.update(&random_batch(2, 5, number)).unwrap();
         first.polyak();
     }
     let stored = first.state().map(|(name, vector)| (name.to_owned(), vector.to_vec()));
-    let mut second = Ddpg::new(config, LAYOUT, 2, 2);
+    let mut second = Ddpg::new(config, LAYOUT, Rewards::sparse(2), 2);
     second.restore(&stored, first.n_updates()).unwrap();
     let batch = random_batch(2, 5, 3);
     assert_eq!(first.update(&batch), second.update(&batch));
@@ -203,12 +225,13 @@ fn a_restored_learner_goes_on_alike() {
 
 #[test]
 fn a_state_that_does_not_fit_is_refused_and_changes_nothing() {
-    let mut ddpg = Ddpg::new(small(|_| {}), LAYOUT, 1, 1);
+    let mut ddpg = Ddpg::new(small(|_| {}), LAYOUT, Rewards::sparse(1), 1);
     let untouched = ddpg.clone();
     let mut stored =
         ddpg.state().map(|(name, vector)| (name.to_owned(), vec![0.5; vector.len()])).to_vec();
-    let expected = stored[7].1.len();
-    stored[7].1.pop();
+    let (_, last) = stored.last_mut().unwrap();
+    let expected = last.len();
+    last.pop();
     let refusal = |got| Err(DdpgError::Restore { name: "critic.adam.second", got, expected });
     assert_eq!(ddpg.restore(&stored, 1), refusal(Some(expected - 1)));
     stored.pop();
@@ -219,7 +242,7 @@ fn a_state_that_does_not_fit_is_refused_and_changes_nothing() {
 #[test]
 fn numbers_that_are_not_finite_stop_the_learner() {
     let check = |spoil: fn(&mut Batch), what| {
-        let mut ddpg = Ddpg::new(small(|_| {}), LAYOUT, 1, 1);
+        let mut ddpg = Ddpg::new(small(|_| {}), LAYOUT, Rewards::sparse(1), 1);
         let mut batch = random_batch(1, 5, 0);
         spoil(&mut batch);
         assert_eq!(ddpg.update(&batch), Err(DdpgError::NotFinite { what, update: 1 }));
