@@ -1,0 +1,157 @@
+//! A motion as it is handed to the arms: samples at even times, and the cubic between them.
+
+use crate::joints::Joints;
+
+/// One arm at one sample.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct ArmSample {
+    /// Joint angles, radians.
+    pub angles: Joints,
+    /// Their rates, radians per second.
+    pub velocities: Joints,
+    /// How far the gripper is open: 0 is shut, 1 open.
+    pub opening: f64,
+}
+
+/// The motion of all arms as samples. Between two samples each joint follows the cubic that has the angles and rates of
+/// both.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Motion {
+    /// Time from one sample to the next, seconds.
+    pub period_s: f64,
+    /// Samples of every arm, the first at time 0; as many for each.
+    pub arms: Vec<Vec<ArmSample>>,
+}
+
+/// A joint's motion between two samples, time counted from the first, seconds.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Cubic {
+    from_rad: f64,
+    /// Rates at the ends and the middle control value between them, radians per second: a quadratic in Bernstein's form.
+    rates: [f64; 3],
+    period_s: f64,
+}
+
+impl Cubic {
+    pub(crate) fn between(from: &ArmSample, to: &ArmSample, joint: usize, period_s: f64) -> Self {
+        let mean = (to.angles[joint] - from.angles[joint]) / period_s;
+        let (first, last) = (from.velocities[joint], to.velocities[joint]);
+        let rates = [first, 3.0 * mean - first - last, last];
+        Self { from_rad: from.angles[joint], rates, period_s }
+    }
+
+    pub(crate) fn angle(&self, time_s: f64) -> f64 {
+        let [a, b, c] = self.rates;
+        let t = time_s / self.period_s;
+        let of_period = t * (a + t * ((b - a) + t * (a - 2.0 * b + c) / 3.0));
+        self.from_rad + of_period * self.period_s
+    }
+
+    pub(crate) fn rate(&self, time_s: f64) -> f64 {
+        let [a, b, c] = self.rates;
+        let t = time_s / self.period_s;
+        a + t * (2.0 * (b - a) + t * (a - 2.0 * b + c))
+    }
+
+    /// A bound of the absolute rate, radians per second.
+    pub(crate) fn rate_bound(&self) -> f64 {
+        self.rates.iter().fold(0.0, |max: f64, rate| max.max(rate.abs()))
+    }
+
+    /// The largest absolute rate, radians per second.
+    pub(crate) fn largest_rate(&self) -> f64 {
+        let [a, b, c] = self.rates;
+        let ends = a.abs().max(c.abs());
+        let top = (a - b) / (a - 2.0 * b + c);
+        if top > 0.0 && top < 1.0 { ends.max(self.rate(top * self.period_s).abs()) } else { ends }
+    }
+
+    /// The largest absolute rate of the rate, radians per second squared.
+    pub(crate) fn largest_acceleration(&self) -> f64 {
+        let [a, b, c] = self.rates;
+        2.0 * (b - a).abs().max((c - b).abs()) / self.period_s
+    }
+
+    /// The smallest acceleration limit with which any motion could go from one sample to the next, radians per second
+    /// squared.
+    ///
+    /// That motion accelerates fully one way and then the other. With A the limit, h the period, a the mean
+    /// acceleration and d the way in excess of that at even acceleration, d = h² (A² − a²) / 4 A.
+    pub(crate) fn least_acceleration(&self) -> f64 {
+        let [first, middle, last] = self.rates;
+        let mean = (last - first) / self.period_s;
+        let excess_m = (middle - 0.5 * (first + last)) / 3.0 * self.period_s;
+        let part = 2.0 * excess_m.abs() / (self.period_s * self.period_s);
+        part + libm::hypot(part, mean)
+    }
+
+    /// The smallest and the largest angle, radians.
+    pub(crate) fn angle_bounds(&self) -> [f64; 2] {
+        let ends = [self.from_rad, self.angle(self.period_s)];
+        let turns = self.turns_at().into_iter().filter(|share| *share > 0.0 && *share < 1.0);
+        let angles = turns.map(|share| self.angle(share * self.period_s)).chain(ends);
+        angles.fold([f64::INFINITY, f64::NEG_INFINITY], |[low, high], angle| {
+            [low.min(angle), high.max(angle)]
+        })
+    }
+
+    /// Shares of the period at which the rate would be 0; what is none of the period or no number does not count.
+    fn turns_at(&self) -> [f64; 2] {
+        let [a, b, c] = self.rates;
+        let (square, half) = (a - 2.0 * b + c, b - a);
+        let root = (half * half - square * a).sqrt();
+        let far = -(half + root.copysign(half));
+        [far / square, a / far]
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn cubic(angles: [f64; 2], rates: [f64; 2], period_s: f64) -> Cubic {
+        let [from, to] = [0, 1].map(|end| ArmSample {
+            angles: Joints::new(&[angles[end]]),
+            velocities: Joints::new(&[rates[end]]),
+            opening: 0.0,
+        });
+        Cubic::between(&from, &to, 0, period_s)
+    }
+
+    #[test]
+    fn the_cubic_has_the_angles_and_rates_of_both_samples() {
+        let cubic = cubic([1.0, 1.3], [0.5, -2.0], 0.1);
+        let close = |a: f64, b: f64| assert!((a - b).abs() < 1e-12, "{a} {b}");
+        close(cubic.angle(0.0), 1.0);
+        close(cubic.angle(0.1), 1.3);
+        close(cubic.rate(0.0), 0.5);
+        close(cubic.rate(0.1), -2.0);
+        let derived = (cubic.angle(0.04 + 1e-6) - cubic.angle(0.04 - 1e-6)) / 2e-6;
+        assert!((derived - cubic.rate(0.04)).abs() < 1e-6);
+        let [low, high] = cubic.angle_bounds();
+        let (mut largest_rate, mut largest_acceleration) = (0.0_f64, 0.0_f64);
+        for step in 0..=1000 {
+            let time_s = 1e-4 * f64::from(step);
+            assert!((low..=high).contains(&cubic.angle(time_s)));
+            largest_rate = largest_rate.max(cubic.rate(time_s).abs());
+            let acceleration = (cubic.rate(time_s + 1e-6) - cubic.rate(time_s - 1e-6)) / 2e-6;
+            largest_acceleration = largest_acceleration.max(acceleration.abs());
+        }
+        assert!((cubic.largest_rate() - largest_rate).abs() < 1e-3);
+        assert!((cubic.largest_acceleration() - largest_acceleration).abs() < 1e-3);
+    }
+
+    #[test]
+    fn the_least_acceleration_is_that_of_full_thrust_one_way_and_then_the_other() {
+        // With 3 rad/s² for 0.7 of a period and then −3 rad/s² for the rest, from 0.2 rad/s.
+        let (period_s, limit, share) = (0.01_f64, 3.0_f64, 0.7_f64);
+        let (first_s, then_s) = (share * period_s, (1.0 - share) * period_s);
+        let middle = 0.2 + limit * first_s;
+        let last = middle - limit * then_s;
+        let way = 0.5 * (0.2 + middle) * first_s + 0.5 * (middle + last) * then_s;
+        let least = cubic([0.0, way], [0.2, last], period_s).least_acceleration();
+        assert!((least - limit).abs() < 1e-9, "{least}");
+        let even = cubic([0.0, 0.2 * 0.01 + 1e-4], [0.2, 0.22], period_s).least_acceleration();
+        assert!((even - 2.0).abs() < 1e-9, "{even}");
+    }
+}

@@ -1,0 +1,179 @@
+//! A planned motion of all arms over time, at any time and as samples.
+
+use tandem_core::ArmIndex;
+
+use crate::cell::Cell;
+use crate::joints::Joints;
+use crate::motion::{ArmSample, Motion};
+use crate::spline::Spline;
+
+/// Samples per second that the arms want.
+pub const DEFAULT_RATE_HZ: f64 = 100.0;
+
+/// Which channels of a path are whose: each arm's joints, then its gripper's opening.
+#[derive(Debug, Clone)]
+pub(crate) struct Channels {
+    /// For each arm its first channel, and last the number of channels.
+    firsts: Vec<usize>,
+}
+
+/// The motion of all arms from rest to rest. Times are seconds since its start.
+#[derive(Debug, Clone)]
+pub struct Trajectory {
+    channels: Channels,
+    path: Spline,
+    /// Rate of the path at each end of spans, spans per second, and the time of it, seconds.
+    rates: Vec<f64>,
+    times_s: Vec<f64>,
+    n_pieces: u32,
+}
+
+/// One arm at one time.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct ArmState {
+    /// Joint angles, radians.
+    pub angles: Joints,
+    /// Their rates, radians per second.
+    pub velocities: Joints,
+    /// The rates' rates, radians per second squared.
+    pub accelerations: Joints,
+    /// How far the gripper is open: 0 is shut, 1 open.
+    pub opening: f64,
+    /// The opening's change, 1/s.
+    pub opening_per_s: f64,
+}
+
+/// A place on the path and how it is passed.
+struct Place {
+    span: usize,
+    share: f64,
+    rate: f64,
+    acceleration: f64,
+}
+
+impl Trajectory {
+    pub(crate) fn new(channels: Channels, path: Spline, rates: Vec<f64>, n_pieces: u32) -> Self {
+        let mut times_s = vec![0.0];
+        let mut now_s = 0.0;
+        for ends in rates.windows(2) {
+            now_s += 2.0 / (ends[0] + ends[1]);
+            times_s.push(now_s);
+        }
+        Self { channels, path, rates, times_s, n_pieces }
+    }
+
+    /// How long it takes, seconds.
+    #[must_use]
+    pub fn duration_s(&self) -> f64 {
+        self.times_s[self.times_s.len() - 1]
+    }
+
+    /// How many way points it was made of.
+    #[must_use]
+    pub fn n_way_points(&self) -> usize {
+        self.path.n_spans() / self.n_pieces as usize + 1
+    }
+
+    /// When the tools are at way point `idx`, counted from 0, or nearest to it where they turn a corner; seconds.
+    ///
+    /// # Panics
+    /// When there is no such way point.
+    #[must_use]
+    pub fn way_point_s(&self, idx: usize) -> f64 {
+        self.times_s[idx * self.n_pieces as usize]
+    }
+
+    /// Every arm at `time_s`; before the start and after the end the arms rest.
+    #[must_use]
+    pub fn at(&self, time_s: f64) -> Vec<ArmState> {
+        let place = self.place(time_s);
+        (0..self.channels.n_arms()).map(|arm| self.state(&place, ArmIndex(arm))).collect()
+    }
+
+    /// The motion as samples, `rate_hz` a second, the last at or just after the end.
+    ///
+    /// # Panics
+    /// When `rate_hz` is not positive and finite.
+    #[must_use]
+    pub fn sampled(&self, rate_hz: f64) -> Motion {
+        assert!(rate_hz > 0.0 && rate_hz.is_finite(), "{rate_hz} samples a second");
+        #[expect(
+            clippy::cast_possible_truncation,
+            clippy::cast_sign_loss,
+            reason = "a finite number of samples that has to fit in memory all the same"
+        )]
+        let n_periods = (self.duration_s() * rate_hz).ceil() as u32;
+        let mut arms = vec![Vec::new(); self.channels.n_arms()];
+        for sample in 0..=n_periods {
+            for (arm, state) in arms.iter_mut().zip(self.at(f64::from(sample) / rate_hz)) {
+                let ArmState { angles, velocities, opening, .. } = state;
+                arm.push(ArmSample { angles, velocities, opening });
+            }
+        }
+        Motion { period_s: 1.0 / rate_hz, arms }
+    }
+
+    fn place(&self, time_s: f64) -> Place {
+        let n_spans = self.path.n_spans();
+        let time_s = time_s.clamp(0.0, self.duration_s());
+        let span = self.times_s.partition_point(|start_s| *start_s <= time_s);
+        let span = span.saturating_sub(1).min(n_spans - 1);
+        let (from, to) = (self.rates[span], self.rates[span + 1]);
+        let acceleration = 0.5 * (to * to - from * from);
+        let since_s = time_s - self.times_s[span];
+        let share = (from + 0.5 * acceleration * since_s) * since_s;
+        let rate = from + acceleration * since_s;
+        Place { span, share: share.clamp(0.0, 1.0), rate: rate.max(0.0), acceleration }
+    }
+
+    fn state(&self, place: &Place, arm: ArmIndex) -> ArmState {
+        let jet = |channel| self.path.at(place.span, place.share, channel);
+        let n_joints = self.channels.n_joints(arm);
+        let of_joints = |number: &dyn Fn(usize) -> f64| {
+            Joints::from_fn(n_joints, |joint| number(self.channels.joint(arm, joint)))
+        };
+        let opening = jet(self.channels.opening(arm));
+        ArmState {
+            angles: of_joints(&|channel| jet(channel).value),
+            velocities: of_joints(&|channel| jet(channel).first * place.rate),
+            accelerations: of_joints(&|channel| {
+                let jet = jet(channel);
+                jet.second * place.rate * place.rate + jet.first * place.acceleration
+            }),
+            opening: opening.value.clamp(0.0, 1.0),
+            opening_per_s: opening.first * place.rate,
+        }
+    }
+}
+
+impl Channels {
+    pub(crate) fn of(cell: &Cell) -> Self {
+        let mut firsts = vec![0];
+        let mut next = 0;
+        for arm in &cell.arms {
+            next += arm.model.n_joints() + 1;
+            firsts.push(next);
+        }
+        Self { firsts }
+    }
+
+    pub(crate) fn n_channels(&self) -> usize {
+        self.firsts[self.firsts.len() - 1]
+    }
+
+    pub(crate) fn joint(&self, arm: ArmIndex, joint: usize) -> usize {
+        self.firsts[arm.0] + joint
+    }
+
+    pub(crate) fn opening(&self, arm: ArmIndex) -> usize {
+        self.firsts[arm.0 + 1] - 1
+    }
+
+    fn n_joints(&self, arm: ArmIndex) -> usize {
+        self.opening(arm) - self.firsts[arm.0]
+    }
+
+    fn n_arms(&self) -> usize {
+        self.firsts.len() - 1
+    }
+}

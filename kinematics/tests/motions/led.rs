@@ -1,0 +1,112 @@
+//! The check on way points that lead an arm where it must not be.
+
+use std::f64::consts::FRAC_PI_2;
+
+use glam::DVec3;
+use rand::RngExt as _;
+use rand_chacha::ChaCha8Rng;
+use tandem_core::{ArmIndex, Stream, episode_rng};
+use tandem_kinematics::{
+    ArmWayPoint, Cell, CheckSettings, Joints, MICO_4, PlanSettings, Posture, Reason, WayPoint,
+    check, plan,
+};
+
+use crate::refusals::{N_BROKEN, PERIOD_S};
+use crate::walks::{Area, walk};
+
+/// Plans good way points of which some were replaced, and checks them with the limit itself for the expected time.
+fn break_way_points(
+    name: &str,
+    change: impl Fn(&Cell, &mut Vec<WayPoint>, &mut ChaCha8Rng),
+    (expected, tolerance): (fn(&Reason) -> bool, f64),
+    margin: impl Fn(&Cell, &[Joints]) -> f64,
+) {
+    let cell = Cell::mico_pair();
+    let start = cell.ready(0.15).unwrap();
+    let mut rng = episode_rng(8, 0, Stream::Exploration);
+    for seed in 0..N_BROKEN as u64 {
+        let mut way_points = walk(&cell, Area::FAR, seed % 50, 3);
+        change(&cell, &mut way_points, &mut rng);
+        let trajectory = plan(&cell, &way_points, &start, &PlanSettings::default());
+        let trajectory = trajectory.unwrap_or_else(|error| panic!("{name} {seed}: {error}"));
+        let motion = trajectory.sampled(1.0 / PERIOD_S);
+        let at: Vec<Joints> = motion.arms.iter().map(|samples| samples[0].angles).collect();
+        let refusal = check(&cell, &motion, &at, &CheckSettings::default()).expect_err(name);
+        assert!(expected(&refusal.reason), "{name} {seed}: {refusal}");
+        // The limit is first passed, and then passed by more than the tolerance, between these samples.
+        let first = |slack: f64| {
+            let passes = |idx: &usize| {
+                let at: Vec<Joints> = motion.arms.iter().map(|s| s[*idx].angles).collect();
+                margin(&cell, &at) < -slack
+            };
+            (0..motion.arms[0].len()).find(passes).unwrap() as f64 * PERIOD_S
+        };
+        let (from_s, to_s) = (first(0.0) - PERIOD_S, first(tolerance) + 1e-9);
+        let in_time = (from_s..=to_s).contains(&refusal.when_s);
+        assert!(in_time, "{name} {seed}: {refusal}, expected from {from_s} to {to_s} s");
+    }
+}
+
+/// Leads `arm` in `n` steps from where it is to a point of its base frame.
+fn lead(cell: &Cell, way_points: &mut Vec<WayPoint>, goals_in_base: &[(usize, DVec3)], n: u32) {
+    let from = way_points[way_points.len() - 1].clone();
+    for step in 1..=n {
+        let mut next: WayPoint = from.clone();
+        for (arm, goal_in_base) in goals_in_base {
+            let goal = cell.arms[*arm].world_from_base(*goal_in_base);
+            let share = f64::from(step) / f64::from(n);
+            let tool_in_world_m = from[*arm].tool_in_world_m.lerp(goal, share);
+            next[*arm] = ArmWayPoint { tool_in_world_m, ..from[*arm] };
+        }
+        way_points.push(next);
+    }
+}
+
+#[test]
+fn grippers_that_tilt_too_far() {
+    let tilt_rad =
+        |at: &[Joints]| at.iter().map(|q| Posture::of(&MICO_4, q).tilt_rad()).fold(0.0, f64::max);
+    break_way_points(
+        "tilt",
+        |cell, way_points, rng| {
+            let side = if rng.random_bool(0.5) { 1.0 } else { -1.0 };
+            let direction = side * rng.random_range(1.0..FRAC_PI_2);
+            let radius_m = rng.random_range(0.40..0.50);
+            let height_m = rng.random_range(0.10..0.16);
+            let goal = DVec3::new(radius_m * direction.cos(), radius_m * direction.sin(), height_m);
+            lead(cell, way_points, &[(rng.random_range(0..2), goal)], 5);
+        },
+        (|reason| matches!(reason, Reason::Tilt(_)), 2e-3),
+        |_, at| 25.0_f64.to_radians() - tilt_rad(at),
+    );
+}
+
+#[test]
+fn tools_that_are_led_into_the_table() {
+    break_way_points(
+        "table",
+        |cell, way_points, rng| {
+            let x_m = rng.random_range(0.24..0.32);
+            let goal =
+                DVec3::new(x_m, rng.random_range(-0.06..0.06), rng.random_range(-0.02..0.044));
+            lead(cell, way_points, &[(rng.random_range(0..2), goal)], 4);
+        },
+        (|reason| matches!(reason, Reason::TableGap(..)), 2e-4),
+        |cell, at| cell.gaps(at).table_m.into_iter().fold(f64::INFINITY, f64::min) - 0.002,
+    );
+}
+
+#[test]
+fn arms_that_are_led_into_each_other() {
+    break_way_points(
+        "arms",
+        |cell, way_points, rng| {
+            let (y_m, z_m) = (rng.random_range(-0.06..0.06), rng.random_range(0.06..0.14));
+            let goal = |y_m: f64| DVec3::new(0.345, y_m, z_m);
+            let off_m = rng.random_range(-0.02..0.02);
+            lead(cell, way_points, &[(0, goal(y_m)), (1, goal(off_m - y_m))], 5);
+        },
+        (|reason| matches!(reason, Reason::ArmsGap(ArmIndex(1), ..)), 2e-4),
+        |cell, at| cell.gaps(at).arms_m - 0.02,
+    );
+}
