@@ -108,10 +108,10 @@ pub(crate) struct TrainArgs {
     /// Stops once an evaluation succeeds so often, 0 to 1.
     #[arg(long, value_name = "P")]
     pub(crate) until_success: Option<f64>,
-    /// Stops after so many environment steps.
+    /// Stops after so many environment steps [default: the recipe's; 0 for never].
     #[arg(long, value_name = "N")]
     pub(crate) max_env_steps: Option<u64>,
-    /// Stops after so many minutes [default: 30; 0 for never].
+    /// Stops after so many minutes instead [0: never].
     #[arg(long, value_name = "N")]
     pub(crate) max_minutes: Option<f64>,
     /// Where the settings' defaults come from [default: tandem].

@@ -78,7 +78,12 @@ fn overlay(from_file: Table, settings: &[(String, Value)]) -> anyhow::Result<Run
     let defaults = Table::try_from(defaults_for(&changes)?)?;
     let mut resolved = defaults.clone();
     merge(&mut resolved, &changes, "", &names_below(&defaults, ""))?;
-    let config = typed(resolved).map_err(|error| blame(&defaults, &changes, &error))?;
+    let mut config = typed(resolved).map_err(|error| blame(&defaults, &changes, &error))?;
+    let is_set = |key| changes.get("stop").is_some_and(|stop| stop.get(key).is_some());
+    if config.stop.max_minutes > 0.0 && is_set("max_minutes") && !is_set("max_env_steps") {
+        // Who gives a time wants that time, not the recipe's number of steps.
+        config.stop.max_env_steps = 0;
+    }
     let config = config.checked().map_err(in_one_line)?;
     let strategy = config.advice.strategy.parse::<Strategy>().map_err(|UnknownStrategy(text)| {
         anyhow!("advice.strategy: {}", UnknownStrategy(shortened(&text)))

@@ -21,7 +21,13 @@ pub fn distance(a: &[f32], b: &[f32]) -> f32 {
 /// one arm's it is that arm's own.
 #[must_use]
 pub fn sparse_reward(achieved: &[f32], desired: &[f32]) -> f32 {
-    if distance(achieved, desired) > GOAL_TOLERANCE_M { REWARD_PENDING } else { REWARD_ACHIEVED }
+    sparse_reward_within(GOAL_TOLERANCE_M, distance(achieved, desired))
+}
+
+/// The sparse reward of an object at a distance from its goal, both in metres, for another tolerance.
+#[must_use]
+pub fn sparse_reward_within(tolerance_m: f32, distance_m: f32) -> f32 {
+    if distance_m > tolerance_m { REWARD_PENDING } else { REWARD_ACHIEVED }
 }
 
 /// The goals that an observation has achieved: every object's position, arm after arm, shape `[n_goal]`.
@@ -38,6 +44,8 @@ mod tests {
     fn the_reward_changes_at_the_tolerance() {
         assert_eq!(sparse_reward(&[0.0, 0.0, 0.049], &[0.0; 3]), REWARD_ACHIEVED);
         assert_eq!(sparse_reward(&[0.0, 0.0, 0.051], &[0.0; 3]), REWARD_PENDING);
+        assert_eq!(sparse_reward_within(0.04, 0.041), REWARD_PENDING);
+        assert_eq!(sparse_reward_within(0.04, 0.039), REWARD_ACHIEVED);
     }
 
     #[test]

@@ -30,6 +30,7 @@ use std::f64::consts::{FRAC_PI_2, PI};
 
 use glam::{DMat3, DVec3};
 use tandem_core::ArmIndex;
+use tandem_core::layout::WORKSPACES_APART_M;
 
 use crate::capsule::PosedLinks;
 use crate::inverse::{ReachError, ToolTarget};
@@ -103,9 +104,9 @@ impl Cell {
     /// Two Micos with four joints that face each other, the centres of their workspaces 0.24 m apart.
     #[must_use]
     pub fn mico_pair() -> Self {
-        const CENTRES_APART_M: f64 = tandem_core::layout::WORKSPACES_APART_M as f64;
+        let centres_apart_m = f64::from(WORKSPACES_APART_M);
         let task_frame = TaskFrame::MICO_4;
-        let x_m = 0.5 * CENTRES_APART_M + task_frame.centre_m;
+        let x_m = 0.5 * centres_apart_m + task_frame.centre_m;
         let arm = |x_m, yaw_rad| PlacedArm {
             model: &MICO_4,
             base_in_world_m: DVec3::new(x_m, 0.0, 0.0),
@@ -183,7 +184,8 @@ impl PlacedArm {
     }
 
     /// The base frame's axes in the world.
-    pub(crate) fn axes(&self) -> DMat3 {
+    #[must_use]
+    pub fn axes(&self) -> DMat3 {
         let (sin, cos) = libm::sincos(self.yaw_rad);
         let x_axis = DVec3::new(cos, sin, 0.0);
         DMat3::from_cols(x_axis, DVec3::new(-sin, cos, 0.0), DVec3::Z)

@@ -203,7 +203,8 @@ impl ArmModel {
     }
 
     /// For each joint, a distance that no point on the lines of the links has from the joint's axis, metres.
-    pub(crate) fn link_levers_m(&self) -> Joints {
+    #[must_use]
+    pub fn link_levers_m(&self) -> Joints {
         let n = self.n_joints();
         let in_last_frame = |anchor: &Anchor| match anchor.frame {
             frame if frame == n => Some(anchor.offset_m),

@@ -23,6 +23,43 @@ pub struct Motion {
     pub arms: Vec<Vec<ArmSample>>,
 }
 
+impl Motion {
+    /// How long it takes, seconds.
+    #[must_use]
+    pub fn duration_s(&self) -> f64 {
+        let n_samples = self.arms.first().map_or(0, Vec::len);
+        n_samples.saturating_sub(1) as f64 * self.period_s
+    }
+
+    /// Every arm at `time_s`; before the start and after the end the arms are where they begin and end.
+    ///
+    /// # Panics
+    /// When an arm has fewer than two samples, or the samples of an arm differ in their joints.
+    #[must_use]
+    pub fn at(&self, time_s: f64) -> Vec<ArmSample> {
+        self.arms.iter().map(|samples| arm_at(samples, self.period_s, time_s)).collect()
+    }
+}
+
+fn arm_at(samples: &[ArmSample], period_s: f64, time_s: f64) -> ArmSample {
+    let n_intervals = samples.len() - 1;
+    let periods = (time_s / period_s).clamp(0.0, n_intervals as f64);
+    #[expect(
+        clippy::cast_possible_truncation,
+        clippy::cast_sign_loss,
+        reason = "between 0 and the number of samples"
+    )]
+    let idx = (periods as usize).min(n_intervals - 1);
+    let (from, to) = (&samples[idx], &samples[idx + 1]);
+    let share = periods - idx as f64;
+    let cubic = |joint| Cubic::between(from, to, joint, period_s);
+    ArmSample {
+        angles: Joints::from_fn(from.angles.len(), |joint| cubic(joint).angle(share * period_s)),
+        velocities: Joints::from_fn(from.angles.len(), |joint| cubic(joint).rate(share * period_s)),
+        opening: from.opening + share * (to.opening - from.opening),
+    }
+}
+
 /// A joint's motion between two samples, time counted from the first, seconds.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Cubic {
@@ -139,6 +176,25 @@ mod tests {
         }
         assert!((cubic.largest_rate() - largest_rate).abs() < 1e-3);
         assert!((cubic.largest_acceleration() - largest_acceleration).abs() < 1e-3);
+    }
+
+    #[test]
+    fn a_motion_passes_its_samples_and_rests_beyond_its_ends() {
+        let sample = |angle, rate, opening| ArmSample {
+            angles: Joints::new(&[angle]),
+            velocities: Joints::new(&[rate]),
+            opening,
+        };
+        let samples = vec![sample(0.0, 0.0, 0.2), sample(0.1, 0.5, 0.4), sample(0.3, 0.0, 0.4)];
+        let motion = Motion { period_s: 0.2, arms: vec![samples.clone()] };
+        assert!((motion.duration_s() - 0.4).abs() < 1e-12);
+        for (time_s, expected) in [(-1.0, 0), (0.0, 0), (0.2, 1), (0.4, 2), (9.0, 2)] {
+            let (got, expected) = (motion.at(time_s)[0], samples[expected]);
+            assert!((got.angles[0] - expected.angles[0]).abs() < 1e-12, "{time_s}");
+            assert!((got.velocities[0] - expected.velocities[0]).abs() < 1e-12, "{time_s}");
+        }
+        let middle = motion.at(0.1)[0];
+        assert!((middle.opening - 0.3).abs() < 1e-12 && middle.angles[0] < 0.05);
     }
 
     #[test]

@@ -59,7 +59,11 @@ impl Posture {
     }
 
     /// Where `anchor` is, metres.
-    pub(crate) fn anchor(&self, anchor: &Anchor) -> DVec3 {
+    ///
+    /// # Panics
+    /// When the arm has no such frame.
+    #[must_use]
+    pub fn anchor(&self, anchor: &Anchor) -> DVec3 {
         let frame = &self.frames[anchor.frame];
         frame.origin_m + frame.axes * anchor.offset_m
     }

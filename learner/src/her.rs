@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 use tandem_core::layout::{
     ArmIndex, EPISODE_STEPS, HAND_POSITION, Layout, OBJECT_POSITION, WORKSPACES_APART_M,
 };
-use tandem_core::reward::sparse_reward;
+use tandem_core::reward::{distance, sparse_reward_within};
 use tandem_core::rng::{coin, index};
 use tandem_policy::NormalizerSnapshot;
 
@@ -53,13 +53,16 @@ pub struct ReplayConfig {
     /// Share of transitions drawn from the steps on which an arm executed the teacher's action, in [0, 1] (paper: 0).
     pub advised_share: f32,
     /// Share of two-arm transitions whose second arm is tried from another step than the first: counterfactual data
-    /// augmentation (Pitis et al. 2020). It is kept where nothing of the two arms is near. In [0, 1], 0 with
-    /// [`RewardKind::Joint`].
+    /// augmentation (Pitis et al. 2020). It is kept where nothing of the two arms is near. In [0, 1]; only with
+    /// [`RewardKind::PerArm`].
     pub recombined_share: f32,
     /// Share of two-arm transitions in which the arms change places, in [0, 1]: the world's exact symmetry.
     pub swap_share: f32,
     /// Which reward the critic learns.
     pub reward: RewardKind,
+    /// Distance of an object from its goal, metres, within which training rewards it, above 0 (paper: 0.05, which
+    /// success is always judged by). A smaller one leaves room for what an object does after it was let go.
+    pub goal_tolerance_m: f32,
     /// What every arm pays for a step on which an arm touches the other or the table, 0 or more; a pending goal
     /// costs 1 (paper: 0).
     pub contact_cost: f32,
@@ -164,7 +167,8 @@ impl Sampler {
     fn draw(&mut self, buffer: &ReplayBuffer, rng: &mut ChaCha8Rng) {
         let first = self.draw_step(buffer, rng);
         self.drawn.steps.fill(first);
-        if coin(rng, self.config.recombined_share) && self.layout.n_arms == 2 {
+        let per_arm = self.config.reward == RewardKind::PerArm && self.layout.n_arms == 2;
+        if coin(rng, self.config.recombined_share) && per_arm {
             let second = self.draw_step(buffer, rng);
             if is_apart(buffer, [first, second]) {
                 self.drawn.steps[1] = second;
@@ -204,7 +208,8 @@ impl Sampler {
             self.take_goal(buffer, arm, moment);
             let drawn = &mut self.drawn;
             let achieved = buffer.achieved(episode_idx, step_idx + 1, arm);
-            drawn.rewards[arm.0] = sparse_reward(achieved, &drawn.goal[self.layout.goal_of(arm)]);
+            let distance_m = distance(achieved, &drawn.goal[self.layout.goal_of(arm)]);
+            drawn.rewards[arm.0] = sparse_reward_within(self.config.goal_tolerance_m, distance_m);
         }
     }
 
@@ -219,7 +224,8 @@ impl Sampler {
             squared_distance +=
                 achieved.iter().zip(goal).map(|(a, g)| (a - g) * (a - g)).sum::<f32>();
         }
-        self.drawn.rewards[0] = sparse_reward(&[squared_distance.sqrt()], &[0.0]);
+        self.drawn.rewards[0] =
+            sparse_reward_within(self.config.goal_tolerance_m, squared_distance.sqrt());
     }
 
     /// The later moment whose achieved goal is taken, strictly after the step; `None` keeps the desired goal.
@@ -308,6 +314,7 @@ fn is_apart(buffer: &ReplayBuffer, steps: [Step; 2]) -> bool {
 
 #[cfg(test)]
 mod tests {
+    use tandem_core::reward::sparse_reward;
     use tandem_core::rng::{Stream, episode_rng};
     use tandem_core::{Contacts, Episode, Task};
 
@@ -326,6 +333,7 @@ mod tests {
             recombined_share: 0.0,
             swap_share: 0.5,
             reward,
+            goal_tolerance_m: 0.05,
             contact_cost: 0.0,
             contact_foresight_steps: 0,
         }

@@ -73,6 +73,18 @@ fn what_is_wrong_is_named() {
 }
 
 #[test]
+fn minutes_that_are_given_take_the_place_of_the_recipes_steps() {
+    let limits = |settings: &[&str]| {
+        let stop = resolved(settings).expect("valid").stop;
+        (stop.max_env_steps, stop.max_minutes)
+    };
+    assert_eq!(limits(&[]), (300_000, 0.0));
+    assert_eq!(limits(&["stop.max_minutes=5"]), (0, 5.0));
+    assert_eq!(limits(&["stop.max_minutes=0"]), (300_000, 0.0));
+    assert_eq!(limits(&["stop.max_minutes=5", "stop.max_env_steps=100"]), (100, 5.0));
+}
+
+#[test]
 fn every_run_file_that_ships_is_valid() {
     let directory = Path::new(env!("CARGO_MANIFEST_DIR")).join("deploy");
     let files = std::fs::read_dir(directory).expect("ships").flatten().map(|entry| entry.path());

@@ -80,7 +80,7 @@ fn what_is_wrong_is_said_in_one_line() {
     check("[[axis]]\nseed = []", &["seed", "empty"]);
     check("[[variant]]\nname = \"a/b\"", &["a/b"]);
     check("strategies = [\"ea\"]\n[run.advice]\nstrategy = \"none\"", &["advice.strategy"]);
-    let unlimited = runs("seeds = [1]").expect_err("must be refused").to_string();
+    let unlimited = runs("[run]\nrecipe = \"paper\"").expect_err("must be refused").to_string();
     assert!(unlimited.contains("max_env_steps"), "{unlimited}");
     let many: Vec<String> = (0..10_001).map(|seed| seed.to_string()).collect();
     check(&format!("seeds = [{}]", many.join(",")), &["10001", "at most"]);
@@ -97,6 +97,13 @@ fn every_sweep_that_ships_is_valid() {
             (name, read(&path).expect("valid").len())
         })
         .collect();
-    let expected = [("sweep-small".to_owned(), 8), ("sweep-table2".to_owned(), 72)];
-    assert_eq!(counts.into_iter().collect::<Vec<_>>(), expected);
+    let expected = [
+        ("sweep-recipe", 30),
+        ("sweep-small", 8),
+        ("sweep-students", 6),
+        ("sweep-table2", 72),
+        ("sweep-teachers", 6),
+    ];
+    let counts: Vec<_> = counts.iter().map(|(name, count)| (name.as_str(), *count)).collect();
+    assert_eq!(counts, expected);
 }
