@@ -168,7 +168,7 @@ pub(crate) struct SweepArgs {
 Examples:
   tandem report runs/sweep-table2
   tandem report runs/a runs/b --out compared.html --csv compared.csv
-  tandem report docs/results/*.jsonl --composed-teachers policies/teacher-push.safetensors")]
+  tandem report docs/results/students --composed-teachers policies/teacher-push.safetensors")]
 pub(crate) struct ReportArgs {
     /// Run directories, directories with runs below, or metrics files by themselves.
     #[arg(required = true, value_name = "DIR|FILE")]
