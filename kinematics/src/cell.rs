@@ -201,7 +201,8 @@ mod tests {
         let cell = Cell::mico_pair();
         let check = |arm, own: [f64; 3], world: [f64; 3]| {
             let got = cell.world_from_own(ArmIndex(arm), DVec3::from(own));
-            assert!((got - DVec3::from(world)).length() < 1e-12, "{got}");
+            // The training world's distances are single precision.
+            assert!((got - DVec3::from(world)).length() < 1e-8, "{got}");
             let placed = &cell.arms[arm];
             let back = cell.task_frame.own_from_base(placed.base_from_world(got));
             assert!((back - DVec3::from(own)).length() < 1e-12, "{back}");
