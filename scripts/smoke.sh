@@ -38,7 +38,7 @@ fields = "task arms episodes success success_low success_high success_joint succ
          "policy_digest env_steps updates wall_s advice_spent budget_left run_dir policy digest".split()
 missing = [field for field in fields if field not in summary]
 assert not missing, f"summary lacks {missing}"
-assert summary["env_steps"] == 4000 and summary["updates"] == 1000, summary
+assert summary["env_steps"] == 4000 and summary["updates"] == 2000, summary
 assert summary["advice_spent"] + summary["budget_left"] == 500000, summary
 assert 0 < summary["advice_spent"] <= 2000, summary
 PY
