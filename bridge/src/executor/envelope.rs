@@ -1,0 +1,416 @@
+//! What no command may do, whoever made it.
+//!
+//! Every command is looked at before it leaves, with the arms where they really are. Numbers, speeds and accelerations are
+//! those of the command itself. Ranges and gaps are those of the **stopping way**: from the angles that were read, through what
+//! the arms were told already and what they would be told now, to where they stand still when they brake
+//! after that. As long as each command has a stopping way within the limits, there is a way to stop within the limits at
+//! every time: the one of the command before.
+//!
+//! The way is a chain of postures with straight lines of the joints between them. On a line that turns the joints by d, no
+//! point of an arm moves farther than the sum of d times lever; a gap in the middle that is larger than the limit
+//! by half of that keeps the limit on the whole line. Otherwise both halves are looked at, down to a tenth of a millimetre.
+
+use std::collections::VecDeque;
+
+use tandem_kinematics::model::Joint;
+use tandem_kinematics::{Cell, Excess, Joints, PlacedArm, Posture};
+
+use crate::driver::{ArmCommand, PairState};
+use crate::executor::settings::Settings;
+use crate::executor::stop::{Breach, StopCause};
+
+/// Slack for rounding.
+const ROUNDING: f64 = 1e-9;
+/// The tool's speed is looked at with the angles of the newest state, which are some periods old; share of its limit.
+const TOOL_SPEED_SLACK: f64 = 0.02;
+/// What a joint's speed may differ from what it was told because of its lag and of noise, radians per second.
+const EXPLAINED_RADPS: f64 = 2.5 * std::f64::consts::PI / 180.0;
+/// What may hide between two looks at the gaps, metres.
+const HIDES_M: f64 = 1e-4;
+/// Postures of the way on which the drives brake.
+const N_BRAKING: u32 = 4;
+
+/// The velocities at which a joint may be told to move next, radians per second, when it was told `before`: it speeds
+/// up no harder than motions do, and slows down no harder than the drives brake.
+pub(crate) fn reachable(
+    joint: &Joint,
+    before: f64,
+    settings: &Settings,
+    period_s: f64,
+) -> [f64; 2] {
+    let faster = joint.speed_radps / settings.check.limits.ramp_s * period_s;
+    let slower = joint.speed_radps / settings.brake_s * period_s;
+    let towards_zero = |speed: f64| {
+        // Braking comes first; what is left of the period is for speeding up the other way.
+        if speed >= slower { slower } else { speed + faster * (1.0 - speed / slower) }
+    };
+    let [down, up] = if before >= 0.0 {
+        [towards_zero(before), faster]
+    } else {
+        [faster, towards_zero(-before)]
+    };
+    [before - down, before + up]
+}
+
+/// The envelope of one cell.
+#[derive(Debug, Clone)]
+pub(crate) struct Envelope {
+    cell: Cell,
+    settings: Settings,
+    period_s: f64,
+    /// For each arm, a distance that no point of it has from a joint's axis, metres.
+    levers_m: Vec<Joints>,
+}
+
+/// What the arms were told, the newest first: one entry a period, each with velocities arm by arm.
+pub(crate) type History = VecDeque<Vec<Joints>>;
+
+impl Envelope {
+    pub(crate) fn new(cell: &Cell, settings: &Settings, period_s: f64) -> Self {
+        let levers = |arm: &PlacedArm| arm.model.link_levers_m();
+        Self {
+            cell: cell.clone(),
+            settings: *settings,
+            period_s,
+            levers_m: cell.arms.iter().map(levers).collect(),
+        }
+    }
+
+    /// Passes `commands` when they keep every limit. `state` is the newest one, `stale_s` how much later than usual it is.
+    pub(crate) fn check(
+        &self,
+        commands: &[ArmCommand],
+        history: &History,
+        state: &PairState,
+        stale_s: f64,
+    ) -> Result<(), Breach> {
+        for (arm, command) in commands.iter().enumerate() {
+            self.check_numbers(arm, command, history.front().map(|told| &told[arm]))?;
+            self.check_tool(arm, command, &state.arms[arm].angles)?;
+        }
+        let ways = self.stopping_ways(commands, history, state, stale_s);
+        for (arm, way) in ways.iter().enumerate() {
+            self.check_ranges(arm, way)?;
+        }
+        let n_postures = ways[0].len();
+        for step in 1..n_postures {
+            let ends = [step - 1, step].map(|idx| ways.iter().map(|way| way[idx]).collect());
+            self.check_gaps(&ends)?;
+        }
+        Ok(())
+    }
+
+    fn check_numbers(
+        &self,
+        arm: usize,
+        command: &ArmCommand,
+        before: Option<&Joints>,
+    ) -> Result<(), Breach> {
+        let joints = self.cell.arms[arm].model.joints;
+        if command.velocities.len() != joints.len()
+            || !command.velocities.is_finite()
+            || !(0.0..=1.0).contains(&command.opening)
+        {
+            return Err(StopCause::CommandNotFinite.of(arm));
+        }
+        for (idx, (joint, velocity)) in joints.iter().zip(command.velocities.iter()).enumerate() {
+            let (got, allowed) = (velocity.abs(), joint.speed_radps);
+            if got > allowed * (1.0 + ROUNDING) {
+                return Err(StopCause::JointSpeed(Excess { got, allowed }).of_joint(arm, idx));
+            }
+            let before = before.map_or(0.0, |before| before[idx]);
+            let [low, high] = reachable(joint, before, &self.settings, self.period_s);
+            if *velocity < low - ROUNDING || *velocity > high + ROUNDING {
+                let end = if *velocity < low { low } else { high };
+                let [got, allowed] = [velocity, &end].map(|to| (to - before).abs() / self.period_s);
+                let cause = StopCause::JointAcceleration(Excess { got, allowed });
+                return Err(cause.of_joint(arm, idx));
+            }
+        }
+        Ok(())
+    }
+
+    fn check_tool(&self, arm: usize, command: &ArmCommand, at: &Joints) -> Result<(), Breach> {
+        let posture = Posture::of(self.cell.arms[arm].model, at);
+        let got = posture.tool_velocity(&command.velocities).length();
+        let allowed = self.settings.check.limits.tool_speed_mps;
+        if got > allowed * (1.0 + TOOL_SPEED_SLACK) {
+            return Err(StopCause::ToolSpeed(Excess { got, allowed }).of(arm));
+        }
+        Ok(())
+    }
+
+    /// For each arm the postures of its stopping way, as many for each.
+    fn stopping_ways(
+        &self,
+        commands: &[ArmCommand],
+        history: &History,
+        state: &PairState,
+        stale_s: f64,
+    ) -> Vec<Vec<Joints>> {
+        #[expect(
+            clippy::cast_possible_truncation,
+            clippy::cast_sign_loss,
+            reason = "a reaction is some periods"
+        )]
+        let n_told =
+            ((self.settings.reaction_s + stale_s.max(0.0)) / self.period_s - 1e-6).ceil() as usize;
+        let way = |(arm, command): (usize, &ArmCommand)| {
+            let (reading, model) = (&state.arms[arm], self.cell.arms[arm].model);
+            let unexplained = unexplained(&reading.velocities, arm, history);
+            let mut at = reading.angles;
+            let mut way = vec![at];
+            let told = history.iter().take(n_told.saturating_sub(1)).rev().map(|told| &told[arm]);
+            for velocities in told.chain([&command.velocities]) {
+                at = Joints::from_fn(at.len(), |joint| {
+                    at[joint] + (velocities[joint] + unexplained[joint]) * self.period_s
+                });
+                way.push(at);
+            }
+            for step in 1..=N_BRAKING {
+                let since_s = self.settings.brake_s * f64::from(step) / f64::from(N_BRAKING);
+                way.push(Joints::from_fn(at.len(), |joint| {
+                    let speed = command.velocities[joint] + unexplained[joint];
+                    let brake = model.joints[joint].speed_radps / self.settings.brake_s;
+                    at[joint] + braking_way(speed, brake, since_s)
+                }));
+            }
+            way
+        };
+        commands.iter().enumerate().map(way).collect()
+    }
+
+    fn check_ranges(&self, arm: usize, way: &[Joints]) -> Result<(), Breach> {
+        for (idx, joint) in self.cell.arms[arm].model.joints.iter().enumerate() {
+            let [low, high] = joint.range_rad;
+            for angles in way {
+                let got = angles[idx];
+                if !(low..=high).contains(&got) {
+                    let allowed = if got > high { high } else { low };
+                    return Err(StopCause::JointRange(Excess { got, allowed }).of_joint(arm, idx));
+                }
+            }
+        }
+        Ok(())
+    }
+
+    /// The gaps on the straight line of the joints between two postures of all arms.
+    fn check_gaps(&self, [from, to]: &[Vec<Joints>; 2]) -> Result<(), Breach> {
+        let moved_m = |arm: usize| -> f64 {
+            let levers = self.levers_m[arm].iter().zip(from[arm].iter().zip(to[arm].iter()));
+            levers.map(|(lever_m, (a, b))| lever_m * (b - a).abs()).sum()
+        };
+        let half_m: Vec<f64> = (0..from.len()).map(|arm| 0.5 * moved_m(arm)).collect();
+        let middle: Vec<Joints> = from
+            .iter()
+            .zip(to)
+            .map(|(a, b)| Joints::from_fn(a.len(), |joint| 0.5 * (a[joint] + b[joint])))
+            .collect();
+        let gaps = self.cell.gaps(&middle);
+        let mut settled = true;
+        for (arm, gap_m) in gaps.table_m.iter().enumerate() {
+            let (got, allowed) = (*gap_m, self.settings.table_gap_m);
+            settled &= got - half_m[arm] >= allowed || half_m[arm] <= HIDES_M;
+            if got < allowed {
+                return Err(StopCause::TableGap(Excess { got, allowed }).of(arm));
+            }
+        }
+        let (got, allowed) = (gaps.arms_m, self.settings.arms_gap_m);
+        let both_m: f64 = half_m.iter().sum();
+        settled &= got - both_m >= allowed || both_m <= HIDES_M;
+        if got < allowed {
+            return Err(StopCause::ArmsGap(Excess { got, allowed }).anywhere());
+        }
+        if settled {
+            return Ok(());
+        }
+        self.check_gaps(&[from.clone(), middle.clone()])?;
+        self.check_gaps(&[middle, to.clone()])
+    }
+}
+
+/// What a joint does that none of its last commands explains, radians per second.
+fn unexplained(measured: &Joints, arm: usize, history: &History) -> Joints {
+    Joints::from_fn(measured.len(), |joint| {
+        let told = || history.iter().map(|told| told[arm][joint]);
+        let low = told().fold(0.0, f64::min) - EXPLAINED_RADPS;
+        let high = told().fold(0.0, f64::max) + EXPLAINED_RADPS;
+        measured[joint] - measured[joint].clamp(low, high)
+    })
+}
+
+/// How far a joint turns in `since_s` when it brakes from `speed`, radians.
+fn braking_way(speed: f64, brake: f64, since_s: f64) -> f64 {
+    let since_s = since_s.min(speed.abs() / brake);
+    (speed.abs() - 0.5 * brake * since_s) * since_s * speed.signum()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::driver::{ArmReading, Faults};
+    use crate::layout::mico_cell;
+    use tandem_kinematics::MICO_4;
+
+    const PERIOD_S: f64 = 0.01;
+    const DEGREE: f64 = std::f64::consts::PI / 180.0;
+
+    /// Both arms where `at` is, at rest.
+    fn state(at: &[Joints]) -> PairState {
+        let zero = Joints::new(&[0.0; 4]);
+        let reading = |angles: &Joints| ArmReading {
+            angles: *angles,
+            velocities: zero,
+            torques_nm: None,
+            opening: 0.0,
+            faults: Faults::default(),
+        };
+        let arms = at.iter().map(reading).collect();
+        PairState { sequence: 1, stamp_s: 0.0, newest_command: None, arms }
+    }
+
+    /// What the envelope says of velocities in degrees per second that the arms were told for a while already.
+    fn check(at: &[Joints], degrees: [[f64; 4]; 2]) -> Result<(), Breach> {
+        let velocities = degrees.map(|arm| Joints::new(&arm.map(|rate| rate * DEGREE)));
+        let history: History = (0..8).map(|_| velocities.to_vec()).collect();
+        check_after(at, velocities, &history)
+    }
+
+    fn check_after(
+        at: &[Joints],
+        velocities: [Joints; 2],
+        history: &History,
+    ) -> Result<(), Breach> {
+        let envelope = Envelope::new(&mico_cell(), &Settings::default(), PERIOD_S);
+        let commands = velocities.map(|velocities| ArmCommand { velocities, opening: 0.5 });
+        envelope.check(&commands, history, &state(at), 0.0)
+    }
+
+    fn ready() -> Vec<Joints> {
+        mico_cell().ready(0.06).unwrap()
+    }
+
+    const REST: [f64; 4] = [0.0; 4];
+
+    #[test]
+    fn what_keeps_all_limits_passes() {
+        assert_eq!(check(&ready(), [REST, REST]), Ok(()));
+        assert_eq!(check(&ready(), [[10.0, 5.0, -5.0, 40.0], REST]), Ok(()));
+    }
+
+    #[test]
+    fn a_joint_stops_before_the_end_of_its_range() {
+        // At 20 degrees/s: 0.2 degrees in each of four periods, and 20² / (2 · 720) while it brakes.
+        let way_deg = 4.0 * 0.2 + 20.0 * 20.0 / (2.0 * 36.0 / 0.05);
+        let [low, high] = MICO_4.joints[2].range_rad;
+        for (end, rate) in [(low, -20.0), (high, 20.0)] {
+            let mut at = ready();
+            let towards = rate * DEGREE / 20.0;
+            at[1][2] = end - (way_deg + 0.01) * towards;
+            let gaps = check(&at, [REST, [0.0, 0.0, rate, 0.0]]);
+            let is_range = |breach: &Breach| matches!(breach.cause, StopCause::JointRange(_));
+            assert!(!gaps.as_ref().is_err_and(is_range), "{gaps:?}");
+            at[1][2] = end - (way_deg - 0.01) * towards;
+            let breach = check(&at, [REST, [0.0, 0.0, rate, 0.0]]).unwrap_err();
+            assert!(is_range(&breach) && breach.joint == Some(2), "{breach:?}");
+        }
+    }
+
+    #[test]
+    fn an_arm_stops_before_the_table() {
+        let cell = mico_cell();
+        let (mut passed, mut refused) = (0, 0);
+        for step in 0..40 {
+            let at = cell.ready(0.001 + 0.0005 * f64::from(step)).unwrap();
+            // Joint 2 leans the arm down, at about 0.1 m/s.
+            match check(&at, [REST, [0.0, -20.0, 0.0, 0.0]]) {
+                Ok(()) => {
+                    passed += 1;
+                    // What passes has room for four periods and the braking: 0.02 m/s would not need it.
+                    assert!(cell.gaps(&at).table_m[1] > 0.004);
+                }
+                Err(breach) => {
+                    assert!(matches!(breach.cause, StopCause::TableGap(_)), "{breach:?}");
+                    assert_eq!(breach.arm.map(|arm| arm.0), Some(1));
+                    refused += 1;
+                }
+            }
+            assert_eq!(check(&at, [REST, REST]), Ok(()));
+        }
+        assert!(passed > 3 && refused > 3, "{passed} {refused}");
+    }
+
+    #[test]
+    fn arms_stop_before_they_touch() {
+        let mut cell = mico_cell();
+        let at = ready();
+        // The second base is moved up until the elbows are nearly as near as they may be.
+        for _ in 0..100 {
+            let gap_m = cell.gaps(&at).arms_m;
+            cell.arms[1].base_in_world_m.x -= gap_m - 0.013;
+        }
+        assert!((cell.gaps(&at).arms_m - 0.013).abs() < 1e-4);
+        let envelope = Envelope::new(&cell, &Settings::default(), PERIOD_S);
+        let check = |rate: f64| {
+            let lean = Joints::new(&[0.0, rate * DEGREE, 0.0, 0.0]);
+            let history: History = (0..8).map(|_| vec![lean; 2]).collect();
+            let commands = [ArmCommand { velocities: lean, opening: 0.0 }; 2];
+            envelope.check(&commands, &history, &state(&at), 0.0)
+        };
+        assert_eq!(check(0.0), Ok(()));
+        let [one, other] = [check(20.0), check(-20.0)];
+        let near = |result: &Result<(), Breach>| {
+            result.as_ref().is_err_and(|breach| matches!(breach.cause, StopCause::ArmsGap(_)))
+        };
+        assert!(near(&one) != near(&other), "towards each other only: {one:?} {other:?}");
+    }
+
+    #[test]
+    fn commands_are_numbers_within_speed_and_acceleration() {
+        let at = ready();
+        let zero = Joints::new(&REST);
+        let still: History = (0..8).map(|_| vec![zero; 2]).collect();
+        let from_rest = |rate: f64| {
+            let velocities = Joints::new(&[0.0, 0.0, 0.0, rate * DEGREE]);
+            check_after(&at, [velocities, zero], &still).map_err(|breach| breach.cause)
+        };
+        // 48 degrees/s in 0.25 s are 1.92 degrees/s a period.
+        assert_eq!(from_rest(1.91), Ok(()));
+        assert!(matches!(from_rest(1.93), Err(StopCause::JointAcceleration(_))));
+        assert!(matches!(from_rest(f64::NAN), Err(StopCause::CommandNotFinite)));
+        let breach = check(&at, [REST, [0.0, 0.0, 0.0, 48.1]]).unwrap_err();
+        assert!(matches!(breach.cause, StopCause::JointSpeed(_)) && breach.joint == Some(3));
+        // Joints 1 to 3 of an outstretched arm at full speed are too fast for the tool.
+        let mut far = at.clone();
+        far[0][1] = 120.0 * DEGREE;
+        far[0][2] = 200.0 * DEGREE;
+        let breach = check(&far, [[36.0, 0.0, 0.0, 0.0], REST]).unwrap_err();
+        assert!(matches!(breach.cause, StopCause::ToolSpeed(_)), "{breach:?}");
+    }
+
+    #[test]
+    fn slowing_down_may_be_harder_than_speeding_up() {
+        let joint = &MICO_4.joints[0];
+        let check = |before: f64, expected: [f64; 2]| {
+            let got = reachable(joint, before * DEGREE, &Settings::default(), PERIOD_S);
+            for (got, expected) in got.iter().zip(expected) {
+                assert!((got / DEGREE - expected).abs() < 1e-9, "{before}: {got} {expected}");
+            }
+        };
+        // 36 degrees/s in 0.25 s and in 0.05 s: 1.44 and 7.2 degrees/s a period.
+        check(0.0, [-1.44, 1.44]);
+        check(20.0, [12.8, 21.44]);
+        check(-20.0, [-21.44, -12.8]);
+        check(3.6, [-0.72, 5.04]);
+    }
+
+    #[test]
+    fn drifts_lengthen_the_stopping_way() {
+        let history: History = (0..8).map(|_| vec![Joints::new(&REST); 2]).collect();
+        let measured = Joints::new(&[2.0 * DEGREE, -10.0 * DEGREE, 0.0, 3.0 * DEGREE]);
+        let drift = unexplained(&measured, 0, &history);
+        for (got, expected) in drift.iter().zip([0.0, -7.5, 0.0, 0.5]) {
+            assert!((got / DEGREE - expected).abs() < 1e-9, "{drift:?}");
+        }
+    }
+}

@@ -1,0 +1,205 @@
+//! Why the arms were stopped.
+
+use std::fmt;
+
+use tandem_core::ArmIndex;
+use tandem_kinematics::Excess;
+
+use crate::driver::DriverError;
+
+/// A stop: when, where and why.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Stop {
+    /// When, seconds by the clock of whoever ticks the executor.
+    pub when_s: f64,
+    /// The arm, where it was one.
+    pub arm: Option<ArmIndex>,
+    /// The joint, counted from 0, where it was one. Messages count from 1, as Kinova does.
+    pub joint: Option<usize>,
+    /// Why.
+    pub cause: StopCause,
+}
+
+/// Why the arms were stopped. An [`Excess`] holds what was and what is allowed, in the unit that stands with it.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+#[non_exhaustive]
+pub enum StopCause {
+    /// Nobody has let the arms go yet.
+    #[error("the arms were not reset since the start")]
+    NotReset,
+    /// Somebody asked for it.
+    #[error("somebody stopped the arms")]
+    Requested,
+    /// The owner of a motion was not heard; seconds.
+    #[error("the owner was silent for {:.3} s, at most {:.3} s", .0.got, .0.allowed)]
+    OwnerSilent(Excess),
+    /// The owner gave the arms up during a motion.
+    #[error("the owner gave the arms up during a motion")]
+    OwnerLeft,
+    /// The executor was not called in time; seconds.
+    #[error("{:.3} s since the last command, at most {:.3} s", .0.got, .0.allowed)]
+    Late(Excess),
+    /// The driver failed.
+    #[error("the driver failed")]
+    Driver(#[source] DriverError),
+    /// No new state has come; seconds.
+    #[error("no new state for {:.3} s, at most {:.3} s", .0.got, .0.allowed)]
+    StateStale(Excess),
+    /// States come later and later; seconds.
+    #[error("the state is {:.3} s older than states were, at most {:.3} s", .0.got, .0.allowed)]
+    StateOld(Excess),
+    /// A state's number is not the one after the one before.
+    #[error("state number {got}, expected {expected}")]
+    SequenceJump {
+        /// The number.
+        got: u64,
+        /// What comes after the one before.
+        expected: u64,
+    },
+    /// A new state has the time of the one before, or an earlier one.
+    #[error("the state's time did not advance: it is {stamp_s:.3} s")]
+    TimeStands {
+        /// The state's time by the arms' clock, seconds.
+        stamp_s: f64,
+    },
+    /// A moving joint reports the same angle over and over; radians.
+    #[error("the angle stands at {:.3} degrees while the joint is told to move", .0.to_degrees())]
+    Frozen(f64),
+    /// The state is of other arms or joints.
+    #[error("a state of {got} arms or joints, expected {expected}")]
+    Shape {
+        /// What the state has.
+        got: usize,
+        /// What there is.
+        expected: usize,
+    },
+    /// A number of a state is infinite or not a number.
+    #[error("a number of the state is not finite")]
+    StateNotFinite,
+    /// An angle changed by more than a joint can; radians.
+    #[error("the angle changed by {:.2} degrees from one state to the next, at most {:.2}",
+        .0.got.to_degrees(), .0.allowed.to_degrees())]
+    AngleJump(Excess),
+    /// The arm complains about a drive.
+    #[error("a drive reports a fault")]
+    DriveFault,
+    /// The emergency stop at the arm is pressed.
+    #[error("the emergency stop is pressed")]
+    EmergencyStop,
+    /// Something touches the arm: reported from outside.
+    #[error("a contact is reported")]
+    ContactReported,
+    /// Something touches the arm: a torque that nothing explains; newton metres.
+    #[error("an unexplained torque of {:.1} N m, at most {:.1}", .0.got, .0.allowed)]
+    Torque(Excess),
+    /// Commands do not take effect; commands.
+    #[error("{:.0} commands without effect, at most {:.0}", .0.got, .0.allowed)]
+    CommandLost(Excess),
+    /// A joint is not where the motion has it; radians.
+    #[error("{:.2} degrees from where the motion has it, at most {:.2}",
+        .0.got.to_degrees(), .0.allowed.to_degrees())]
+    Tracking(Excess),
+    /// The arms did not settle at the motion's end; radians.
+    #[error("{:.2} degrees from the goal after the motion's end, at most {:.2}",
+        .0.got.to_degrees(), .0.allowed.to_degrees())]
+    NotSettled(Excess),
+    /// A joint is measured to be too fast; radians per second.
+    #[error("measured at {:.2} degrees/s, at most {:.2}",
+        .0.got.to_degrees(), .0.allowed.to_degrees())]
+    Overspeed(Excess),
+    /// A number of the command is infinite, not a number, or an opening beyond 0 to 1.
+    #[error("a number of the command is out of its range")]
+    CommandNotFinite,
+    /// The command is too fast for the joint; radians per second.
+    #[error("commanded to {:.2} degrees/s, at most {:.2}",
+        .0.got.to_degrees(), .0.allowed.to_degrees())]
+    JointSpeed(Excess),
+    /// The command accelerates the joint too much; radians per second squared.
+    #[error("commanded to accelerate by {:.1} degrees/s2, at most {:.1}",
+        .0.got.to_degrees(), .0.allowed.to_degrees())]
+    JointAcceleration(Excess),
+    /// The joint could not stop within its range: where it would, and that end; radians.
+    #[error("the joint would stop at {:.2} degrees, its range ends at {:.2}",
+        .0.got.to_degrees(), .0.allowed.to_degrees())]
+    JointRange(Excess),
+    /// The command is too fast for the tool; metres per second.
+    #[error("the tool would move at {:.4} m/s, at most {:.4}", .0.got, .0.allowed)]
+    ToolSpeed(Excess),
+    /// The arm is too near to the table, or would be before it stands still; metres.
+    #[error("{:.1} mm above the table before it can stop, at least {:.1}",
+        .0.got * 1e3, .0.allowed * 1e3)]
+    TableGap(Excess),
+    /// The arms are too near to each other, or would be before they stand still; metres.
+    #[error("{:.1} mm from the other arm before both can stop, at least {:.1}",
+        .0.got * 1e3, .0.allowed * 1e3)]
+    ArmsGap(Excess),
+}
+
+/// A cause with its place, before the time is known.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) struct Breach {
+    pub(crate) arm: Option<ArmIndex>,
+    pub(crate) joint: Option<usize>,
+    pub(crate) cause: StopCause,
+}
+
+impl StopCause {
+    pub(crate) fn anywhere(self) -> Breach {
+        Breach { arm: None, joint: None, cause: self }
+    }
+
+    pub(crate) fn of(self, arm: usize) -> Breach {
+        Breach { arm: Some(ArmIndex(arm)), joint: None, cause: self }
+    }
+
+    pub(crate) fn of_joint(self, arm: usize, joint: usize) -> Breach {
+        Breach { arm: Some(ArmIndex(arm)), joint: Some(joint), cause: self }
+    }
+}
+
+impl Breach {
+    pub(crate) fn at(self, when_s: f64) -> Stop {
+        Stop { when_s, arm: self.arm, joint: self.joint, cause: self.cause }
+    }
+}
+
+impl fmt::Display for Stop {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "at {:.3} s", self.when_s)?;
+        if let Some(arm) = self.arm {
+            write!(f, " arm {}", arm.0)?;
+        }
+        if let Some(joint) = self.joint {
+            write!(f, " joint {}", joint + 1)?;
+        }
+        write!(f, ": {}", self.cause)?;
+        if let StopCause::Driver(source) = &self.cause {
+            write!(f, ": {source}")?;
+        }
+        Ok(())
+    }
+}
+
+impl std::error::Error for Stop {}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_stop_says_when_where_and_why() {
+        let excess = Excess { got: 0.05, allowed: 0.035 };
+        let check = |stop: Stop, expected: &str| assert_eq!(stop.to_string(), expected);
+        check(
+            StopCause::Tracking(excess).of_joint(1, 2).at(1.5),
+            "at 1.500 s arm 1 joint 3: 2.86 degrees from where the motion has it, at most 2.01",
+        );
+        check(StopCause::Requested.anywhere().at(0.25), "at 0.250 s: somebody stopped the arms");
+        check(
+            StopCause::Driver(DriverError::Disconnected { what: "closed".into() })
+                .anywhere()
+                .at(2.0),
+            "at 2.000 s: the driver failed: the arms are not connected: closed",
+        );
+    }
+}

@@ -1,0 +1,20 @@
+//! What moves a pair of arms: an executor that lets nothing but a checked motion through, and what stands behind it.
+//!
+//! From the bottom up: [`driver`] is the contract between the executor and a pair of arms, [`executor`] plays a motion
+//! through a driver and is the envelope round it while it moves, and [`simulated`] is a pair of Kinova Micos with physics of its own, which
+//! stands in where there are no arms. [`layout`] says how the arms stand and what their motions have to keep.
+//!
+//! Nothing here reads a clock or knows a wire: whoever ticks the executor says what time it is, in seconds since a start of
+//! their own.
+#![warn(missing_docs)]
+
+pub mod driver;
+pub mod executor;
+pub mod layout;
+pub mod simulated;
+
+pub use driver::{ArmCommand, ArmReading, Command, Driver, DriverError, Faults, Order, PairState};
+pub use executor::{
+    Executor, LeaseError, Phase, Progress, ResetError, Settings, StartError, Stop, StopCause, Token,
+};
+pub use simulated::{SimulatedConfig, SimulatedPair};

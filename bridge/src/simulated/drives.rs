@@ -1,0 +1,237 @@
+//! The drives: commands arrive late, joints follow with a lag, and brake by themselves when nothing arrives.
+
+use std::collections::VecDeque;
+
+use rand_chacha::ChaCha8Rng;
+use tandem_core::Contacts;
+use tandem_core::rng::index;
+use tandem_kinematics::{ArmModel, Cell, Gaps, Joints};
+
+use crate::driver::{ArmCommand, Command, Order, SILENCE_S};
+use crate::simulated::config::{Disturbance, N_SUBSTEPS, PERIOD_S, SimulatedConfig};
+
+/// Time of a physics step, seconds.
+pub(crate) const SUBSTEP_S: f64 = PERIOD_S / N_SUBSTEPS as f64;
+
+/// The drives of all arms, and where the joints truly are.
+pub(crate) struct Drives {
+    /// Arm by arm.
+    pub(crate) arms: Vec<ArmDrives>,
+    gaps: Gaps,
+    /// What the arms touched in the last physics step.
+    contacts: Contacts,
+    waiting: VecDeque<Waiting>,
+    order: Order,
+    newest: u64,
+    n_periods: u64,
+    n_silent: u32,
+    /// The drives have braked by themselves and wait to be told to stop.
+    tripped: bool,
+    rng: ChaCha8Rng,
+}
+
+/// The drives of one arm.
+#[derive(Debug, Clone)]
+pub(crate) struct ArmDrives {
+    model: &'static ArmModel,
+    /// Radians.
+    pub(crate) angles: Joints,
+    /// Radians per second.
+    pub(crate) velocities: Joints,
+    /// What stops a joint, newton metres; 0 for joints that turn freely.
+    pub(crate) stalled_nm: Joints,
+    /// What the gripper was told.
+    pub(crate) opening: f64,
+}
+
+/// A command on its way.
+struct Waiting {
+    due_period: u64,
+    number: Option<u64>,
+    order: Order,
+}
+
+impl Drives {
+    pub(crate) fn new(cell: &Cell, at: &[Joints], opening: f64, rng: ChaCha8Rng) -> Self {
+        let arm = |(placed, at): (&tandem_kinematics::PlacedArm, &Joints)| {
+            let zero = Joints::from_fn(at.len(), |_| 0.0);
+            let model = placed.model;
+            ArmDrives { model, angles: *at, velocities: zero, stalled_nm: zero, opening }
+        };
+        Self {
+            arms: cell.arms.iter().zip(at).map(arm).collect(),
+            gaps: cell.gaps(at),
+            contacts: Contacts::NONE,
+            waiting: VecDeque::new(),
+            order: Order::Stop,
+            newest: 0,
+            n_periods: 0,
+            n_silent: 0,
+            tripped: false,
+            rng,
+        }
+    }
+
+    /// Number of the newest command that has taken effect.
+    pub(crate) fn newest(&self) -> u64 {
+        self.newest
+    }
+
+    /// How many periods have passed.
+    pub(crate) fn n_periods(&self) -> u64 {
+        self.n_periods
+    }
+
+    /// Whether the drives have braked by themselves.
+    pub(crate) fn tripped(&self) -> bool {
+        self.tripped
+    }
+
+    /// The gaps round the arms now.
+    pub(crate) fn gaps(&self) -> &Gaps {
+        &self.gaps
+    }
+
+    /// What the arms touched in the last physics step.
+    pub(crate) fn contacts(&self) -> Contacts {
+        self.contacts
+    }
+
+    /// Takes a command that will have effect later.
+    pub(crate) fn hand_over(&mut self, command: Command, latency_periods: [u32; 2]) {
+        self.n_silent = 0;
+        self.wait(Some(command.number), command.order, latency_periods);
+    }
+
+    /// Takes the order to stop on the way beside the commands, which is as long.
+    pub(crate) fn stop(&mut self, latency_periods: [u32; 2]) {
+        self.wait(None, Order::Stop, latency_periods);
+    }
+
+    fn wait(&mut self, number: Option<u64>, order: Order, [least, most]: [u32; 2]) {
+        let extra = index(&mut self.rng, (most.max(least) - least) as usize + 1);
+        let due_period = self.n_periods + u64::from(least) + extra as u64;
+        let due_period = self.waiting.back().map_or(0, |last| last.due_period).max(due_period);
+        self.waiting.push_back(Waiting { due_period, number, order });
+    }
+
+    /// Lets the next period begin: commands take effect, and silence is noticed.
+    pub(crate) fn begin_period(&mut self) {
+        while self.waiting.front().is_some_and(|next| next.due_period <= self.n_periods) {
+            let Some(next) = self.waiting.pop_front() else { break };
+            self.newest = next.number.unwrap_or(self.newest);
+            if next.order == Order::Stop {
+                self.tripped = false;
+            }
+            self.order = next.order;
+        }
+        self.tripped |= f64::from(self.n_silent) * PERIOD_S >= SILENCE_S - 0.5 * PERIOD_S;
+        self.n_silent += 1;
+        self.n_periods += 1;
+        if let (Order::Move(commands), false) = (&self.order, self.tripped) {
+            for (arm, command) in self.arms.iter_mut().zip(commands) {
+                arm.opening = command.opening.clamp(0.0, 1.0);
+            }
+        }
+    }
+
+    /// Lets a physics step pass. `torques_nm` are those of what the arms touch.
+    pub(crate) fn step(
+        &mut self,
+        cell: &Cell,
+        config: &SimulatedConfig,
+        disturbance: &Disturbance,
+        torques_nm: &[Joints],
+    ) {
+        let before: Vec<Joints> = self.arms.iter().map(|arm| arm.angles).collect();
+        let commands = match (&self.order, self.tripped) {
+            (Order::Move(commands), false) => Some(commands),
+            _ => None,
+        };
+        for (idx, arm) in self.arms.iter_mut().enumerate() {
+            let drift = disturbance.drift_radps.get(idx);
+            let told = commands.map(|commands| told(&commands[idx], drift));
+            let blocked = disturbance.blocked.filter(|(arm, _)| arm.0 == idx).map(|(_, j)| j);
+            arm.follow(told.as_ref(), config, blocked, &torques_nm[idx]);
+        }
+        self.keep_apart(cell, config, &before);
+    }
+
+    /// Shells do not pass through each other or the table: an arm that would go deeper does not move.
+    fn keep_apart(&mut self, cell: &Cell, config: &SimulatedConfig, before: &[Joints]) {
+        let angles: Vec<Joints> = self.arms.iter().map(|arm| arm.angles).collect();
+        let gaps = cell.gaps(&angles);
+        let deeper = |now: f64, then: f64| now < 0.0 && now < then;
+        let pressed = deeper(gaps.arms_m, self.gaps.arms_m);
+        self.contacts = if gaps.arms_m <= 0.0 { Contacts::ARM_ARM } else { Contacts::NONE };
+        let mut any = false;
+        for (idx, arm) in self.arms.iter_mut().enumerate() {
+            if gaps.table_m[idx] <= 0.0 {
+                self.contacts = self.contacts | Contacts::ARM_TABLE;
+            }
+            if pressed || deeper(gaps.table_m[idx], self.gaps.table_m[idx]) {
+                arm.hold_at(&before[idx], config);
+                any = true;
+            }
+        }
+        let angles: Vec<Joints> = self.arms.iter().map(|arm| arm.angles).collect();
+        self.gaps = if any { cell.gaps(&angles) } else { gaps };
+    }
+}
+
+impl ArmDrives {
+    /// Moves the joints for one physics step: towards the velocities `told`, or braking when there are none.
+    fn follow(
+        &mut self,
+        told: Option<&Joints>,
+        config: &SimulatedConfig,
+        blocked: Option<usize>,
+        torques_nm: &Joints,
+    ) {
+        for (idx, joint) in self.model.joints.iter().enumerate() {
+            let speed = self.velocities[idx];
+            let next = match told {
+                Some(told) => {
+                    let share = SUBSTEP_S / (config.lag_s + SUBSTEP_S);
+                    let most = config.motor_radps2 * SUBSTEP_S;
+                    speed + (share * (told[idx] - speed)).clamp(-most, most)
+                }
+                None => {
+                    let most = joint.speed_radps / config.brake_s * SUBSTEP_S;
+                    speed - speed.clamp(-most, most)
+                }
+            };
+            let stalled =
+                next * torques_nm[idx] < 0.0 && torques_nm[idx].abs() > config.stall_nm[idx];
+            let [low, high] = joint.range_rad;
+            let angle = self.angles[idx] + next * SUBSTEP_S;
+            let at_end = !(low..=high).contains(&angle);
+            if blocked == Some(idx) || stalled || at_end {
+                let pushes = told.map_or(0.0, |told| told[idx]);
+                self.stalled_nm[idx] =
+                    -pushes.signum() * f64::from(pushes != 0.0) * config.stall_nm[idx];
+                self.velocities[idx] = 0.0;
+            } else {
+                self.stalled_nm[idx] = 0.0;
+                self.velocities[idx] = next;
+                self.angles[idx] = angle;
+            }
+        }
+    }
+
+    /// Lets the joints stay at `angles`, where something is in their way.
+    fn hold_at(&mut self, angles: &Joints, config: &SimulatedConfig) {
+        self.angles = *angles;
+        for joint in 0..angles.len() {
+            self.stalled_nm[joint] = -self.velocities[joint].signum() * config.stall_nm[joint];
+            self.velocities[joint] = 0.0;
+        }
+    }
+}
+
+/// The velocities that the servos try to keep.
+fn told(command: &ArmCommand, drift: Option<&Joints>) -> Joints {
+    Joints::from_fn(command.velocities.len(), |joint| {
+        command.velocities[joint] + drift.map_or(0.0, |drift| drift[joint])
+    })
+}

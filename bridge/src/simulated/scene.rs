@@ -1,0 +1,64 @@
+//! The simulated pair as pictures show it.
+
+use glam::DVec3;
+use rapier3d::math::{Pose, Rotation, Vector};
+use tandem_core::scene::{ArmScene, Capsule, Cuboid, Point, Scene};
+use tandem_kinematics::model::Anchor;
+use tandem_kinematics::{Cell, Joints, PlacedArm, Posture};
+
+use crate::simulated::config::Block;
+use crate::simulated::world::{TABLE_HALF_M, World};
+
+/// What the arms at `angles` and the world look like `time_s` after the start; there are no goals.
+pub(crate) fn scene(
+    cell: &Cell,
+    angles: &[Joints],
+    world: &World,
+    blocks: &[Block],
+    time_s: f64,
+) -> Scene {
+    let arm = |idx: usize| arm_scene(&cell.arms[idx], &angles[idx], world.hand_parts(idx));
+    let object = |(idx, block): (usize, &Block)| {
+        cuboid(world.object(idx).position(), Vector::splat(block.half_m))
+    };
+    let under = Pose::from_parts(Vector::new(0.0, 0.0, -TABLE_HALF_M.z), Rotation::IDENTITY);
+    Scene {
+        time_s,
+        arms: (0..angles.len()).map(arm).collect(),
+        objects: blocks.iter().enumerate().map(object).collect(),
+        goals: Vec::new(),
+        table: cuboid(&under, TABLE_HALF_M),
+    }
+}
+
+fn arm_scene(placed: &PlacedArm, angles: &Joints, hand: [(Pose, Vector); 3]) -> ArmScene {
+    let posture = Posture::of(placed.model, angles);
+    let point = |anchor: &Anchor| single(placed.world_from_base(posture.anchor(anchor)));
+    let origin = |frame| point(&Anchor { frame, offset_m: DVec3::ZERO });
+    let links = placed.model.links.iter().map(|link| Capsule {
+        from: point(&link.ends[0]),
+        to: point(&link.ends[1]),
+        radius_m: DVec3::splat(link.radius_m).as_vec3().x,
+    });
+    let n_joints = angles.len();
+    ArmScene {
+        base: single(placed.base_in_world_m),
+        joint_angles_rad: std::array::from_fn(|joint| angles.get(joint).copied().unwrap_or(0.0)),
+        joint_points: (0..=n_joints + 1).map(origin).collect(),
+        links: links.collect(),
+        hand: hand.iter().map(|(pose, half_m)| cuboid(pose, *half_m)).collect(),
+        end_effector: origin(n_joints + 1),
+    }
+}
+
+fn single(point: DVec3) -> Point {
+    point.as_vec3().to_array()
+}
+
+fn cuboid(pose: &Pose, half_m: Vector) -> Cuboid {
+    Cuboid {
+        centre: pose.translation.to_array(),
+        orientation: pose.rotation.to_array(),
+        half_extents_m: half_m.to_array(),
+    }
+}

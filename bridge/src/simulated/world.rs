@@ -1,0 +1,353 @@
+//! Table, objects and hands in rapier: hands are carried by the joints exactly, fingers slide on them and press.
+//!
+//! Hands and forearms are kinematic bodies: they go where the joints bring them, tilted as these tilt them. Each finger is a
+//! body of its own on a sliding joint along the direction in which the fingers close, driven by a spring whose force is
+//! bounded. What objects press on a hand is turned into torques of the joints.
+
+use glam::{DMat3, DVec3};
+use rapier3d::dynamics::{
+    CCDSolver, CoefficientCombineRule, FrictionModel, ImpulseJointHandle, ImpulseJointSet,
+    IntegrationParameters, IslandManager, MotorModel, MultibodyJointSet, PrismaticJointBuilder,
+    RigidBody, RigidBodyBuilder, RigidBodyHandle, RigidBodySet, SoftBodySet, SpringCoefficients,
+};
+use rapier3d::geometry::{
+    BroadPhaseBvh, ColliderBuilder, ColliderHandle, ColliderSet, Group, InteractionGroups,
+    InteractionTestMode, NarrowPhase,
+};
+use rapier3d::math::{Matrix, Pose, Rotation, Vector};
+use rapier3d::pipeline::PhysicsPipeline;
+
+use crate::simulated::config::{Block, GripperConfig, SimulatedConfig};
+
+/// How far each finger's pad opens, metres.
+pub(crate) const MAX_OPENING_M: f32 = 0.062;
+/// Half extents of a pad: along the fingers' closing, across, along the hand; metres.
+pub(crate) const PAD_HALF_M: Vector = Vector::new(0.005, 0.008, 0.015);
+/// The pads' centres ahead of the tool's origin, metres.
+pub(crate) const PAD_AHEAD_M: f32 = 0.021;
+/// Half extents of the hand's shell, in the tool's axes, metres.
+pub(crate) const HAND_HALF_M: Vector = Vector::new(0.035, 0.030, 0.050);
+/// The shell's centre behind the tool's origin: from the last joint to where the fingers begin, metres.
+pub(crate) const HAND_BEHIND_M: f32 = 0.110;
+/// Half extents of the table, metres; its top is at z = 0.
+pub(crate) const TABLE_HALF_M: Vector = Vector::new(0.9, 0.7, 0.05);
+/// Radius of the forearm's shell, metres.
+const FOREARM_RADIUS_M: f32 = 0.035;
+
+/// Time of a physics step, seconds: as the drives'.
+const SUBSTEP_S: f32 = 0.0025;
+/// The spring that holds a finger at its place, newtons per metre and newton seconds per metre.
+const FINGER_STIFFNESS: f32 = 4000.0;
+const FINGER_DAMPING: f32 = 30.0;
+/// Share of the grip that the spring may use to keep both fingers alike.
+const FINGER_RESERVE: f32 = 3.0;
+
+const TABLE: Group = Group::GROUP_1;
+const OBJECTS: Group = Group::GROUP_2;
+const ARMS: [Group; 2] = [Group::GROUP_3, Group::GROUP_4];
+
+/// The bodies.
+pub(crate) struct World {
+    bodies: RigidBodySet,
+    colliders: ColliderSet,
+    joints: ImpulseJointSet,
+    parameters: IntegrationParameters,
+    islands: IslandManager,
+    broad_phase: BroadPhaseBvh,
+    narrow_phase: NarrowPhase,
+    multibody_joints: MultibodyJointSet,
+    soft_bodies: SoftBodySet,
+    ccd: CCDSolver,
+    pipeline: PhysicsPipeline,
+    hands: Vec<Hand>,
+    objects: Vec<RigidBodyHandle>,
+}
+
+/// Where an arm's joints bring what the physics knows of it; world frame, metres.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Carried {
+    pub(crate) tool_m: DVec3,
+    pub(crate) tool_axes: DMat3,
+    /// Ends of the forearm.
+    pub(crate) forearm_m: [DVec3; 2],
+}
+
+struct Hand {
+    body: RigidBodyHandle,
+    forearm: RigidBodyHandle,
+    fingers: [Finger; 2],
+    colliders: Vec<ColliderHandle>,
+    /// What the fingers are told, on its way to what was commanded; metres.
+    opening_m: f32,
+}
+
+struct Finger {
+    body: RigidBodyHandle,
+    joint: ImpulseJointHandle,
+    /// Direction in which it opens, along x of the tool.
+    side: f32,
+}
+
+impl World {
+    pub(crate) fn new(config: &SimulatedConfig, carried: &[Carried], opening: f32) -> Self {
+        let mut pipeline = PhysicsPipeline::new();
+        pipeline.counters.disable();
+        let mut world = Self {
+            bodies: RigidBodySet::new(),
+            colliders: ColliderSet::new(),
+            joints: ImpulseJointSet::new(),
+            parameters: integration_parameters(),
+            islands: IslandManager::new(),
+            broad_phase: BroadPhaseBvh::new(),
+            narrow_phase: NarrowPhase::new(),
+            multibody_joints: MultibodyJointSet::new(),
+            soft_bodies: SoftBodySet::new(),
+            ccd: CCDSolver::new(),
+            pipeline,
+            hands: Vec::new(),
+            objects: Vec::new(),
+        };
+        let table = ColliderBuilder::cuboid(TABLE_HALF_M.x, TABLE_HALF_M.y, TABLE_HALF_M.z)
+            .translation(Vector::new(0.0, 0.0, -TABLE_HALF_M.z))
+            .friction(config.table_friction)
+            .friction_combine_rule(CoefficientCombineRule::Min)
+            .collision_groups(groups(TABLE, OBJECTS | ARMS[0] | ARMS[1]));
+        world.colliders.insert(table);
+        for (arm, carried) in carried.iter().enumerate() {
+            world.add_hand(ARMS[arm % ARMS.len()], carried, &config.gripper, opening);
+        }
+        for block in &config.blocks {
+            world.add_block(block, config.table_friction);
+        }
+        world
+    }
+
+    /// Lets a physics step pass in which the joints bring the arms to `carried` and the grippers shall be open by `openings`.
+    pub(crate) fn step(&mut self, carried: &[Carried], openings: &[f64], gripper: &GripperConfig) {
+        for (arm, carried) in carried.iter().enumerate() {
+            let hand = &self.hands[arm];
+            for (body, pose) in [(hand.body, carried.hand()), (hand.forearm, carried.forearm())] {
+                let body = &mut self.bodies[body];
+                let pose = nearest(&pose, body.position());
+                body.set_next_kinematic_position(pose);
+            }
+            let wanted_m = single(openings[arm]) * MAX_OPENING_M;
+            self.drive_fingers(arm, wanted_m, gripper);
+        }
+        self.pipeline.step(
+            Vector::new(0.0, 0.0, -9.81),
+            &self.parameters,
+            &mut self.islands,
+            &mut self.broad_phase,
+            &mut self.narrow_phase,
+            &mut self.bodies,
+            &mut self.colliders,
+            &mut self.joints,
+            &mut self.multibody_joints,
+            &mut self.soft_bodies,
+            &mut self.ccd,
+            &(),
+            &(),
+        );
+    }
+
+    /// The force with which objects pressed on a hand in the last physics step, world frame, newtons. Friction, and so the
+    /// weight of what is held, is not part of it.
+    pub(crate) fn force_n(&self, arm: usize) -> DVec3 {
+        let mut impulse = Vector::ZERO;
+        for collider in &self.hands[arm].colliders {
+            for pair in self.narrow_phase.contact_pairs_with(*collider) {
+                let towards = if pair.collider1 == *collider { -1.0 } else { 1.0 };
+                impulse += pair.total_impulse() * towards;
+            }
+        }
+        (impulse / SUBSTEP_S).as_dvec3()
+    }
+
+    /// How far a gripper is open: 0 is shut, 1 open.
+    pub(crate) fn opening(&self, arm: usize) -> f64 {
+        let [first, second] = self.openings_m(arm);
+        f64::from(0.5 * (first + second) / MAX_OPENING_M).clamp(0.0, 1.0)
+    }
+
+    pub(crate) fn object(&self, idx: usize) -> &RigidBody {
+        &self.bodies[self.objects[idx]]
+    }
+
+    pub(crate) fn n_objects(&self) -> usize {
+        self.objects.len()
+    }
+
+    /// Poses of a hand's shell and its pads.
+    pub(crate) fn hand_parts(&self, arm: usize) -> [(Pose, Vector); 3] {
+        let hand = &self.hands[arm];
+        let at = self.bodies[hand.body].position();
+        let shell = *at * Pose::from_parts(Vector::Z * -HAND_BEHIND_M, Rotation::IDENTITY);
+        let pad = |finger: &Finger| (*self.bodies[finger.body].position(), PAD_HALF_M);
+        [(shell, HAND_HALF_M), pad(&hand.fingers[0]), pad(&hand.fingers[1])]
+    }
+
+    /// Whether every object is somewhere.
+    pub(crate) fn is_finite(&self) -> bool {
+        self.bodies.iter().all(|(_, body)| body.translation().is_finite())
+    }
+
+    fn openings_m(&self, arm: usize) -> [f32; 2] {
+        let hand = &self.hands[arm];
+        let at = self.bodies[hand.body].position();
+        [0, 1].map(|idx| {
+            let finger = &hand.fingers[idx];
+            let offset = at.inv_mul(self.bodies[finger.body].position()).translation;
+            offset.x * finger.side - PAD_HALF_M.x
+        })
+    }
+
+    /// Sets the fingers' springs. The one that is ahead of the other when both press is held back, so that what is held
+    /// stays in the middle.
+    fn drive_fingers(&mut self, arm: usize, wanted_m: f32, gripper: &GripperConfig) {
+        let openings = self.openings_m(arm);
+        let mean_m = 0.5 * (openings[0] + openings[1]);
+        let step_m = gripper.opening_per_s * MAX_OPENING_M * SUBSTEP_S;
+        let hand = &mut self.hands[arm];
+        hand.opening_m = wanted_m.clamp(hand.opening_m - step_m, hand.opening_m + step_m);
+        let held_m = gripper.grip_n / FINGER_STIFFNESS;
+        let target_m = hand.opening_m.clamp(mean_m - held_m, mean_m + held_m);
+        for finger in &hand.fingers {
+            if let Some(joint) = self.joints.get_mut(finger.joint, true)
+                && let Some(slide) = joint.data.as_prismatic_mut()
+            {
+                slide.set_motor_position(target_m, FINGER_STIFFNESS, FINGER_DAMPING);
+            }
+        }
+    }
+
+    fn add_hand(&mut self, group: Group, carried: &Carried, gripper: &GripperConfig, opening: f32) {
+        let others = (OBJECTS | TABLE | ARMS[0] | ARMS[1]) & !group;
+        let kinematic = |pose| RigidBodyBuilder::kinematic_position_based().pose(pose);
+        let body = self.bodies.insert(kinematic(carried.hand()));
+        let forearm = self.bodies.insert(kinematic(carried.forearm()));
+        let shell = ColliderBuilder::cuboid(HAND_HALF_M.x, HAND_HALF_M.y, HAND_HALF_M.z)
+            .translation(Vector::Z * -HAND_BEHIND_M)
+            .friction(0.3)
+            .collision_groups(groups(group, others));
+        let half_m = single(0.5 * (carried.forearm_m[1] - carried.forearm_m[0]).length());
+        let bar = ColliderBuilder::capsule_z(half_m, FOREARM_RADIUS_M)
+            .friction(0.3)
+            .collision_groups(groups(group, others));
+        let mut colliders = vec![
+            self.colliders.insert_with_parent(shell, body, &mut self.bodies),
+            self.colliders.insert_with_parent(bar, forearm, &mut self.bodies),
+        ];
+        let opening_m = opening * MAX_OPENING_M;
+        let fingers = [1.0, -1.0].map(|side| {
+            let shut = Vector::new(side * PAD_HALF_M.x, 0.0, PAD_AHEAD_M);
+            let offset = shut + Vector::X * (side * opening_m);
+            let pose = carried.hand() * Pose::from_parts(offset, Rotation::IDENTITY);
+            let finger = self
+                .bodies
+                .insert(RigidBodyBuilder::dynamic().pose(pose).gravity_scale(0.0).can_sleep(false));
+            let pad = ColliderBuilder::cuboid(PAD_HALF_M.x, PAD_HALF_M.y, PAD_HALF_M.z)
+                .mass(gripper.finger_kg)
+                .friction(gripper.pad_friction)
+                .friction_combine_rule(CoefficientCombineRule::Max)
+                .collision_groups(groups(group, others));
+            colliders.push(self.colliders.insert_with_parent(pad, finger, &mut self.bodies));
+            let slide = PrismaticJointBuilder::new(Vector::X * side)
+                .local_anchor1(shut)
+                .local_anchor2(Vector::ZERO)
+                .contacts_enabled(false)
+                .limits([0.0, MAX_OPENING_M])
+                .motor_model(MotorModel::ForceBased)
+                .motor_position(opening_m, FINGER_STIFFNESS, FINGER_DAMPING)
+                .motor_max_force(FINGER_RESERVE * gripper.grip_n)
+                .build();
+            Finger { body: finger, joint: self.joints.insert(body, finger, slide, true), side }
+        });
+        self.hands.push(Hand { body, forearm, fingers, colliders, opening_m });
+    }
+
+    fn add_block(&mut self, block: &Block, friction: f32) {
+        let at = Vector::new(block.at_m[0], block.at_m[1], block.half_m);
+        let pose = Pose::from_parts(at, Rotation::from_rotation_z(block.yaw_rad));
+        let body = self.bodies.insert(RigidBodyBuilder::dynamic().pose(pose).can_sleep(false));
+        let cube = ColliderBuilder::cuboid(block.half_m, block.half_m, block.half_m)
+            .mass(block.mass_kg)
+            .friction(friction)
+            .friction_combine_rule(CoefficientCombineRule::Max)
+            .collision_groups(groups(OBJECTS, OBJECTS | TABLE | ARMS[0] | ARMS[1]));
+        self.colliders.insert_with_parent(cube, body, &mut self.bodies);
+        self.objects.push(body);
+    }
+}
+
+impl Carried {
+    fn hand(&self) -> Pose {
+        let [x, y, z] = [self.tool_axes.x_axis, self.tool_axes.y_axis, self.tool_axes.z_axis];
+        let axes = Matrix::from_cols(x.as_vec3(), y.as_vec3(), z.as_vec3());
+        Pose::from_parts(self.tool_m.as_vec3(), Rotation::from_mat3(&axes))
+    }
+
+    fn forearm(&self) -> Pose {
+        let [from, to] = self.forearm_m;
+        let along = (to - from).normalize().as_vec3();
+        let turn = Rotation::from_rotation_arc(Vector::Z, along);
+        Pose::from_parts((0.5 * (from + to)).as_vec3(), turn)
+    }
+}
+
+/// `pose` with that of the two quaternions of its turn that is the nearer to `from`: rapier would take the other one for a
+/// full turn.
+fn nearest(pose: &Pose, from: &Pose) -> Pose {
+    let turn = if pose.rotation.dot(from.rotation) < 0.0 { -pose.rotation } else { pose.rotation };
+    Pose::from_parts(pose.translation, turn)
+}
+
+/// In single precision, as the physics has it.
+fn single(value: f64) -> f32 {
+    DVec3::splat(value).as_vec3().x
+}
+
+fn groups(member: Group, of: Group) -> InteractionGroups {
+    InteractionGroups::new(member, of, InteractionTestMode::And)
+}
+
+/// Not the training world's settings: a longer step, more iterations, other softness.
+fn integration_parameters() -> IntegrationParameters {
+    let softness = SpringCoefficients::new(120.0, 4.0);
+    IntegrationParameters {
+        dt: SUBSTEP_S,
+        num_solver_iterations: 6,
+        normalized_prediction_distance: 0.002,
+        normalized_allowed_linear_error: 0.0005,
+        normalized_max_corrective_velocity: 1.0,
+        contact_softness: softness,
+        static_contact_softness: softness,
+        contact_recycling: false,
+        max_ccd_substeps: 0,
+        friction_model: FrictionModel::Coulomb,
+        ..IntegrationParameters::default()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use tandem_kinematics::MICO_4;
+
+    #[test]
+    fn the_pads_stay_within_what_kinematics_has_for_the_fingers() {
+        let fingers = &MICO_4.links[MICO_4.links.len() - 1];
+        let [from, to] = [0, 1].map(|end| fingers.ends[end].offset_m);
+        for opening in [0.0, 0.25, 0.5, 0.75, 1.0] {
+            for corner in 0..8_u32 {
+                let side = |bit: u32| if corner >> bit & 1 == 1 { 1.0 } else { -1.0 };
+                let centre = Vector::new(PAD_HALF_M.x + opening * MAX_OPENING_M, 0.0, PAD_AHEAD_M);
+                let corner = centre + PAD_HALF_M * Vector::new(side(0), side(1), side(2));
+                let corner = corner.as_dvec3();
+                let on_line = corner.clamp(from.min(to), from.max(to));
+                let distance_m = (corner - on_line).length();
+                assert!(distance_m < fingers.radius_m, "{opening}: {corner} {distance_m}");
+            }
+        }
+    }
+}

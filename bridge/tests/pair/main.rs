@@ -1,0 +1,11 @@
+//! The executor on the simulated pair: tasks, ownership, and everything that can go wrong.
+#![expect(clippy::unwrap_used, clippy::panic, reason = "a test panics where it fails")]
+
+mod faults;
+mod injection;
+mod observer;
+mod ownership;
+mod rig;
+mod simulated;
+mod tasks;
+mod undisturbed;

@@ -1,0 +1,110 @@
+//! Somebody who looks at the true arms, period by period, and knows nothing of the executor.
+
+use tandem_bridge::SimulatedPair;
+use tandem_bridge::layout::mico_cell;
+use tandem_bridge::simulated::PERIOD_S;
+use tandem_core::ArmIndex;
+use tandem_kinematics::{Cell, Joints, Posture};
+
+/// Tool speed, metres per second; gaps, metres: as the executor's settings have them.
+const TOOL_MPS: f64 = 0.20;
+const TABLE_GAP_M: f64 = 0.001;
+const ARMS_GAP_M: f64 = 0.012;
+const RAMP_S: f64 = 0.25;
+/// Time in which the simulated drives brake, seconds.
+const BRAKE_S: f64 = 0.040;
+
+/// What may be exceeded, and why.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Slack {
+    /// What a fault itself adds to a joint's speed, radians per second.
+    pub(crate) drift_radps: f64,
+    /// The executor knows angles with a noise of 0.015 degrees, three times of which are 0.5 mm at a lever of 0.57 m. A
+    /// drift that begins is known and braked some 50 ms later: 12 degrees/s make 3 mm at 0.3 m. The rest of the
+    /// gaps is there for this.
+    pub(crate) gap_m: f64,
+    /// Whether a fault makes joints start or stop at once.
+    pub(crate) sudden: bool,
+}
+
+impl Slack {
+    pub(crate) const NONE: Self = Self { drift_radps: 0.0, gap_m: 0.0005, sudden: false };
+}
+
+pub(crate) struct Observer {
+    cell: Cell,
+    slack: Slack,
+    before: Option<Vec<Joints>>,
+    /// When a joint was last seen to move, seconds of simulated time.
+    pub(crate) moved_s: f64,
+    /// Largest shares of limits.
+    pub(crate) tool_share: f64,
+    pub(crate) least_arms_gap_m: f64,
+    pub(crate) least_table_gap_m: f64,
+}
+
+impl Observer {
+    pub(crate) fn new(slack: Slack) -> Self {
+        Self {
+            cell: mico_cell(),
+            slack,
+            before: None,
+            moved_s: 0.0,
+            tool_share: 0.0,
+            least_arms_gap_m: f64::INFINITY,
+            least_table_gap_m: f64::INFINITY,
+        }
+    }
+
+    /// Sees that no limit is exceeded; `what` is for messages.
+    pub(crate) fn look(&mut self, pair: &SimulatedPair, what: &str) {
+        let [angles, rates]: [Vec<Joints>; 2] = [
+            [0, 1].map(|arm| *pair.angles(ArmIndex(arm))).to_vec(),
+            [0, 1].map(|arm| *pair.velocities(ArmIndex(arm))).to_vec(),
+        ];
+        let time_s = pair.time_s();
+        for arm in 0..2 {
+            self.look_at_joints(arm, &angles[arm], &rates[arm], &format!("{what}, {time_s:.2} s"));
+        }
+        if rates.iter().flat_map(|rates| rates.iter()).any(|rate| *rate != 0.0) {
+            self.moved_s = time_s;
+        }
+        let gaps = self.cell.gaps(&angles);
+        for gap_m in &gaps.table_m {
+            self.least_table_gap_m = self.least_table_gap_m.min(*gap_m);
+            assert!(*gap_m >= TABLE_GAP_M - self.slack.gap_m, "{what}, {time_s:.2} s: {gaps:?}");
+        }
+        self.least_arms_gap_m = self.least_arms_gap_m.min(gaps.arms_m);
+        let allowed_m = ARMS_GAP_M - 2.0 * self.slack.gap_m;
+        assert!(gaps.arms_m >= allowed_m, "{what}, {time_s:.2} s: {gaps:?}");
+        assert!(!pair.contacts().any(), "{what}, {time_s:.2} s: contact");
+        self.before = Some(rates);
+    }
+
+    fn look_at_joints(&mut self, arm: usize, angles: &Joints, rates: &Joints, what: &str) {
+        let placed = &self.cell.arms[arm];
+        for (idx, joint) in placed.model.joints.iter().enumerate() {
+            let [low, high] = joint.range_rad;
+            assert!((low..=high).contains(&angles[idx]), "{what}: joint {idx} at {angles:?}");
+            let allowed = joint.speed_radps * (1.0 + 1e-9) + self.slack.drift_radps;
+            assert!(rates[idx].abs() <= allowed, "{what}: joint {idx} at {rates:?}");
+            if let Some(before) = &self.before {
+                let (rate, before) = (rates[idx], before[arm][idx]);
+                let got = (rate - before).abs() / PERIOD_S;
+                // Two commands may take effect in one period.
+                let hardest = if rate.abs() > before.abs() { 2.0 / RAMP_S } else { 1.0 / BRAKE_S };
+                let allowed = joint.speed_radps * hardest * (1.0 + 1e-6);
+                assert!(
+                    self.slack.sudden || got <= allowed,
+                    "{what}: joint {idx} {before} to {rate}"
+                );
+            }
+        }
+        let posture = Posture::of(placed.model, angles);
+        let tool_mps = posture.tool_velocity(rates).length();
+        let drift_mps = self.slack.drift_radps * 3.0 * 0.6;
+        self.tool_share = self.tool_share.max(tool_mps / TOOL_MPS);
+        // The executor multiplies velocities by where the arm was some periods before.
+        assert!(tool_mps <= 1.04 * TOOL_MPS + drift_mps, "{what}: tool at {tool_mps}");
+    }
+}

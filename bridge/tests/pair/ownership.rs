@@ -1,0 +1,181 @@
+//! Who may do what, and when.
+
+use tandem_bridge::layout::mico_cell;
+use tandem_bridge::{
+    Executor, LeaseError, Phase, ResetError, Settings, SimulatedConfig, StartError, StopCause,
+    Token,
+};
+use tandem_core::ArmIndex;
+use tandem_kinematics::Reason;
+
+use crate::injection::Kind;
+use crate::rig::{OWNER, Rig, TASKS, walk};
+
+const STRANGER: Token = Token(5);
+
+fn config() -> SimulatedConfig {
+    SimulatedConfig::default()
+}
+
+#[test]
+fn nothing_moves_before_somebody_lets_the_arms_go() {
+    let motion = walk(TASKS, 1, 3);
+    let mut rig = Rig::new(&motion, config());
+    let at = rig.angles();
+    let start = |rig: &mut Rig| rig.executor.start(OWNER, motion.clone(), 1.0, rig.now_s);
+    assert_eq!(start(&mut rig), Err(StartError::Lease(LeaseError::Nobody)));
+    rig.executor.acquire(OWNER, rig.now_s).unwrap();
+    assert_eq!(start(&mut rig), Err(StartError::NotIdle(Phase::Stopped)));
+    let reset = rig.executor.reset(OWNER, rig.now_s);
+    assert_eq!(reset, Err(ResetError::States { got: 0 }));
+    for _ in 0..20 {
+        assert_eq!(rig.tick(), Phase::Stopped);
+    }
+    assert_eq!(rig.executor.stopped_by().unwrap().cause, StopCause::NotReset);
+    rig.executor.reset(OWNER, rig.now_s).unwrap();
+    for _ in 0..20 {
+        assert_eq!(rig.tick(), Phase::Idle);
+    }
+    assert_eq!(rig.angles(), at);
+}
+
+#[test]
+fn only_the_owner_starts_and_anyone_stops() {
+    let motion = walk(TASKS, 2, 3);
+    let mut rig = Rig::ready(&motion, config());
+    let held = |result| matches!(result, Err(LeaseError::Held { .. }));
+    assert!(held(rig.executor.acquire(STRANGER, rig.now_s)));
+    assert!(held(rig.executor.release(STRANGER, rig.now_s)));
+    let start = rig.executor.start(STRANGER, motion.clone(), 1.0, rig.now_s);
+    assert!(matches!(start, Err(StartError::Lease(LeaseError::Held { .. }))));
+    rig.executor.start(OWNER, motion.clone(), 1.0, rig.now_s).unwrap();
+    for _ in 0..30 {
+        assert_eq!(rig.tick_owned(), Phase::Moving);
+    }
+    let again = rig.executor.start(OWNER, motion, 1.0, rig.now_s);
+    assert_eq!(again, Err(StartError::NotIdle(Phase::Moving)));
+    rig.executor.stop(rig.now_s);
+    for _ in 0..20 {
+        assert_eq!(rig.tick_owned(), Phase::Stopped);
+    }
+    assert!(rig.executor.at_rest());
+    let reset = rig.executor.reset(STRANGER, rig.now_s);
+    assert!(matches!(reset, Err(ResetError::Lease(_))));
+    rig.executor.reset(OWNER, rig.now_s).unwrap();
+    // From here the motion does not begin where the arms are.
+    let motion = walk(TASKS, 2, 3);
+    let refused = rig.executor.start(OWNER, motion, 1.0, rig.now_s);
+    let refusal = refused.unwrap_err();
+    assert!(
+        matches!(&refusal, StartError::Refused(refusal) if matches!(refusal.reason, Reason::Start(..))),
+        "{refusal}"
+    );
+    assert_eq!(rig.tick(), Phase::Idle);
+}
+
+#[test]
+fn an_owner_who_leaves_stops_the_motion_and_a_lease_ends_by_itself() {
+    let motion = walk(TASKS, 3, 3);
+    let mut rig = Rig::ready(&motion, config());
+    rig.executor.start(OWNER, motion, 1.0, rig.now_s).unwrap();
+    rig.tick_owned();
+    rig.executor.release(OWNER, rig.now_s).unwrap();
+    assert_eq!(rig.executor.stopped_by().unwrap().cause, StopCause::OwnerLeft);
+    rig.executor.acquire(STRANGER, rig.now_s).unwrap();
+    for _ in 0..510 {
+        rig.tick();
+    }
+    rig.executor.acquire(OWNER, rig.now_s).unwrap();
+    assert!(rig.executor.acquire(STRANGER, rig.now_s).is_err());
+}
+
+#[test]
+fn a_motion_waits_for_an_owner_who_is_late_and_goes_on() {
+    let motion = walk(TASKS, 4, 3);
+    let end = [0, 1].map(|arm: usize| motion.arms[arm][motion.arms[arm].len() - 1].angles);
+    let mut rig = Rig::ready(&motion, config());
+    rig.executor.start(OWNER, motion, 1.0, rig.now_s).unwrap();
+    for _ in 0..20 {
+        rig.tick_owned();
+    }
+    let phases: Vec<Phase> = (0..60).map(|_| rig.tick()).collect();
+    assert_eq!(phases[25], Phase::Moving);
+    assert_eq!(phases[50], Phase::Holding);
+    let (at, progress) = (rig.angles(), rig.executor.progress());
+    for _ in 0..20 {
+        assert_eq!(rig.tick(), Phase::Holding);
+    }
+    assert_eq!(rig.executor.progress(), progress, "a motion on hold does not go on");
+    for (at, now) in at.iter().zip(rig.angles()) {
+        assert!(at.largest_difference(&now) < 1e-3, "{at:?} {now:?}");
+    }
+    while rig.tick_owned() != Phase::Idle {
+        assert!(rig.executor.stopped_by().is_none(), "{:?}", rig.executor.stopped_by());
+    }
+    for (end, at) in end.iter().zip(rig.angles()) {
+        assert!(end.largest_difference(&at) < 0.3_f64.to_radians());
+    }
+}
+
+#[test]
+fn a_motion_outlives_a_short_silence_of_the_arms() {
+    let motion = walk(TASKS, 5, 3);
+    let mut rig = Rig::ready(&motion, config());
+    rig.executor.start(OWNER, motion, 1.0, rig.now_s).unwrap();
+    for _ in 0..40 {
+        assert_eq!(rig.tick_owned(), Phase::Moving);
+    }
+    rig.injection.borrow_mut().begin(Kind::StateLost, ArmIndex(0), 0);
+    let phases = [(); 3].map(|()| rig.tick_owned());
+    assert_eq!(phases, [Phase::Moving, Phase::Moving, Phase::Holding]);
+    rig.injection.borrow_mut().end();
+    while rig.tick_owned() != Phase::Idle {
+        assert!(rig.executor.stopped_by().is_none(), "{:?}", rig.executor.stopped_by());
+    }
+}
+
+#[test]
+fn a_motion_at_half_speed_takes_twice_as_long() {
+    let motion = walk(TASKS, 6, 3);
+    let mut rig = Rig::ready(&motion, config());
+    for speed in [0.0, -1.0, 1.01, f64::NAN] {
+        let refused = rig.executor.start(OWNER, motion.clone(), speed, rig.now_s);
+        assert!(matches!(refused, Err(StartError::Speed(_))));
+    }
+    let (from_s, duration_s) = (rig.now_s, motion.duration_s());
+    rig.play(motion, 0.5, |_| {});
+    let took_s = rig.now_s - from_s;
+    assert!((0.0..0.3).contains(&(took_s - 2.0 * duration_s)), "{took_s} {duration_s}");
+}
+
+#[test]
+fn whoever_ticks_too_late_stops_the_arms() {
+    for (pause_s, late) in [(0.044, false), (0.046, true), (0.0, true), (-1.0, true)] {
+        let motion = walk(TASKS, 7, 3);
+        let mut rig = Rig::ready(&motion, config());
+        rig.executor.start(OWNER, motion, 1.0, rig.now_s).unwrap();
+        rig.tick_owned();
+        rig.now_s += pause_s;
+        rig.executor.tick(rig.now_s);
+        let cause = rig.executor.stopped_by().map(|stop| stop.cause.clone());
+        assert_eq!(matches!(cause, Some(StopCause::Late(_))), late, "{pause_s}: {cause:?}");
+    }
+}
+
+#[test]
+fn settings_that_make_no_sense_are_refused() {
+    let check = |settings: Settings, name: &str| {
+        let motion = walk(TASKS, 1, 2);
+        let at = [0, 1].map(|arm: usize| motion.arms[arm][0].angles);
+        let pair = tandem_bridge::SimulatedPair::new(mico_cell(), &at, 0.0, config());
+        let refused = Executor::new(mico_cell(), pair, settings).unwrap_err();
+        assert_eq!(refused.name, name, "{refused}");
+    };
+    let default = Settings::default();
+    check(Settings { tracking_rad: f64::NAN, ..default }, "tracking_rad");
+    check(Settings { torque_nm: 0.0, ..default }, "torque_nm");
+    check(Settings { gain_per_s: 50.0, ..default }, "gain_per_s");
+    check(Settings { arms_gap_m: 0.03, ..default }, "arms_gap_m");
+    check(Settings { brake_s: 1.0, ..default }, "brake_s");
+    check(Settings { lease_s: 0.5, ..default }, "lease_s");
+}
