@@ -449,7 +449,7 @@ const fn rounds(recipe: Recipe) -> RoundsConfig {
     }
 }
 
-/// By how many environment steps the curves of three seeds were flat; the paper's recipe takes a day.
+/// Where a run ends: the paper's recipe by the clock, because it has no end in sight on two cores.
 const fn stop(recipe: Recipe, task: Task, n_arms: usize) -> StopConfig {
     let max_env_steps = match (recipe, task, n_arms) {
         (Recipe::Paper, ..) => 0,
