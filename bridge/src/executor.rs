@@ -319,6 +319,12 @@ impl<D: Driver> Executor<D> {
         }
     }
 
+    /// What stands behind, to look at.
+    #[must_use]
+    pub fn driver(&self) -> &D {
+        &self.driver
+    }
+
     /// The newest state of the arms that was believed.
     #[must_use]
     pub fn state(&self) -> Option<&PairState> {

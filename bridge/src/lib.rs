@@ -12,6 +12,7 @@ pub mod driver;
 pub mod executor;
 pub mod layout;
 pub mod simulated;
+pub mod trial;
 
 pub use driver::{ArmCommand, ArmReading, Command, Driver, DriverError, Faults, Order, PairState};
 pub use executor::{

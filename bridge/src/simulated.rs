@@ -28,6 +28,7 @@ pub use config::{
     Block, CameraConfig, Disturbance, GripperConfig, N_SUBSTEPS, PERIOD_S, SimulatedConfig,
 };
 pub use sensors::ObjectPose;
+pub use world::MAX_OPENING_M;
 
 mod config;
 mod drives;

@@ -15,6 +15,7 @@ pub mod recorder;
 mod records;
 pub mod recovery;
 mod scene;
+pub mod trials;
 
 pub use episode_log::{EpisodeLog, LoggedTransition, read_episode};
 pub use error::Error;
@@ -22,3 +23,4 @@ pub use messages::EpisodeMetadata;
 pub use metrics::{MetricsLog, MetricsRow};
 pub use recorder::{EpisodeRecorder, TransitionRecord};
 pub use recovery::{RecoveredCounts, recover};
+pub use trials::{ToolsAt, TrialRow, TrialsLog, read_trials};

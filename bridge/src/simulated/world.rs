@@ -20,7 +20,7 @@ use rapier3d::pipeline::PhysicsPipeline;
 use crate::simulated::config::{Block, GripperConfig, SimulatedConfig};
 
 /// How far each finger's pad opens, metres.
-pub(crate) const MAX_OPENING_M: f32 = 0.062;
+pub const MAX_OPENING_M: f32 = 0.062;
 /// Half extents of a pad: along the fingers' closing, across, along the hand; metres.
 pub(crate) const PAD_HALF_M: Vector = Vector::new(0.005, 0.008, 0.015);
 /// The pads' centres ahead of the tool's origin, metres.

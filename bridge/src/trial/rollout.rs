@@ -1,0 +1,171 @@
+//! What a policy does in the training world, and the start and goals of a trial.
+
+use glam::DVec3;
+use tandem_core::layout::EPISODE_STEPS;
+use tandem_core::{ArmIndex, Contacts, Layout, Stream, Task, episode_rng};
+use tandem_sim::{Env, SimError, Starts, WorldConfig};
+
+use crate::simulated::Block;
+use crate::trial::mapping::{OPENING_M, TRAINED_HALF_M};
+use crate::trial::{Decide, TrialError};
+
+/// Least room between two blocks, and between a block and the place of another one's goal, metres.
+const ROOM_M: f64 = 0.02;
+/// Starts that are drawn until one has room for the blocks.
+const N_DRAWS: usize = 1000;
+
+/// How a trial begins and where its objects shall go; own frames, metres.
+#[derive(Debug, Clone, PartialEq)]
+pub struct TrialStart {
+    /// End effectors, arm by arm.
+    pub hands: Vec<DVec3>,
+    /// How far each side of the grippers is open, metres.
+    pub opening_m: f64,
+    /// Objects, arm by arm, heights as those of the training world's blocks.
+    pub objects: Vec<DVec3>,
+    /// Goals, in the same way.
+    pub goals: Vec<DVec3>,
+}
+
+/// One step of a rollout, arm by arm.
+#[derive(Debug, Clone, PartialEq)]
+pub struct RolloutStep {
+    /// End effectors after it, own frames, metres.
+    pub hands: Vec<DVec3>,
+    /// The actions, arm after arm, shape `[n_action]`.
+    pub action: Vec<f32>,
+}
+
+/// A policy's episode in the training world.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Rollout {
+    /// The steps, in order.
+    pub steps: Vec<RolloutStep>,
+    /// How far each object is from its goal after the last step, metres.
+    pub goal_distances_m: Vec<f64>,
+    /// What touched what at any time.
+    pub contacts: Contacts,
+}
+
+/// The training world, with blocks of the size of a trial's.
+pub struct Rehearsal {
+    env: Env,
+    layout: Layout,
+    half_m: f64,
+}
+
+impl Rehearsal {
+    /// The world of `layout` with blocks of the size and mass of `block`.
+    ///
+    /// # Errors
+    /// When there is no such world.
+    pub fn new(layout: Layout, block: &Block) -> Result<Self, SimError> {
+        let world = WorldConfig {
+            object_half_size_m: block.half_m,
+            object_mass_kg: block.mass_kg,
+            ..WorldConfig::default()
+        };
+        Ok(Self { env: Env::new(layout, &world)?, layout, half_m: f64::from(block.half_m) })
+    }
+
+    /// Draws how trial `number` of `seed` starts: as the training world's episodes do, with room between the blocks.
+    ///
+    /// # Errors
+    /// When no start has room for the blocks.
+    pub fn start(&mut self, seed: u64, number: u64) -> Result<TrialStart, TrialError> {
+        let mut rng = episode_rng(seed, number, Stream::Reset);
+        for _ in 0..N_DRAWS {
+            self.env.reset(&mut rng, Starts::default());
+            let start = self.started();
+            if self.has_room(&start) {
+                return Ok(start);
+            }
+        }
+        Err(TrialError::NoRoom { half_m: self.half_m })
+    }
+
+    /// Lets the policy act from the start that was drawn last.
+    ///
+    /// # Errors
+    /// When the world breaks.
+    pub fn play(&mut self, policy: &mut dyn Decide) -> Result<Rollout, SimError> {
+        let mut observation = vec![0.0; self.layout.n_observation()];
+        let goal = self.env.goal().to_vec();
+        let mut contacts = Contacts::NONE;
+        let mut steps = Vec::with_capacity(EPISODE_STEPS);
+        for _ in 0..EPISODE_STEPS {
+            self.env.observe(&mut observation);
+            let mut action = vec![0.0; self.layout.n_action()];
+            policy.decide(&observation, &goal, &mut action);
+            contacts = contacts | self.env.step(&action)?;
+            self.env.observe(&mut observation);
+            steps.push(RolloutStep { hands: self.part(&observation, 0), action });
+        }
+        let distance = |(at, goal): (DVec3, DVec3)| (at - goal).length();
+        let objects = self.above_rest(self.part(&observation, 3));
+        let goal_distances_m = objects.into_iter().zip(self.goals()).map(distance).collect();
+        Ok(Rollout { steps, goal_distances_m, contacts })
+    }
+
+    fn started(&self) -> TrialStart {
+        let mut observation = vec![0.0; self.layout.n_observation()];
+        self.env.observe(&mut observation);
+        let opening_m = match self.layout.task {
+            Task::Push => 0.0,
+            Task::PickAndPlace => OPENING_M,
+        };
+        let (hands, objects) = (self.part(&observation, 0), self.part(&observation, 3));
+        let objects = self.above_rest(objects);
+        TrialStart { hands, opening_m, objects, goals: self.goals() }
+    }
+
+    /// Three numbers of each arm's observation from `first` on.
+    fn part(&self, observation: &[f32], first: usize) -> Vec<DVec3> {
+        let of_arm = |arm: ArmIndex| &observation[self.layout.observation_of(arm)][first..];
+        self.layout.arms().map(|arm| point(of_arm(arm))).collect()
+    }
+
+    fn goals(&self) -> Vec<DVec3> {
+        let goal = self.env.goal();
+        let goals = self.layout.arms().map(|arm| point(&goal[self.layout.goal_of(arm)])).collect();
+        self.above_rest(goals)
+    }
+
+    /// Places of objects with heights as those of the training world's own blocks.
+    fn above_rest(&self, places: Vec<DVec3>) -> Vec<DVec3> {
+        let lower = DVec3::Z * (self.half_m - TRAINED_HALF_M);
+        places.into_iter().map(|place| place - lower).collect()
+    }
+
+    /// Whether blocks as they lie, and as they shall lie, leave room between each other however they are turned.
+    fn has_room(&self, start: &TrialStart) -> bool {
+        let scene = self.env.scene();
+        let apart_m = 2.0 * self.half_m * std::f64::consts::SQRT_2 + ROOM_M;
+        let places = [
+            scene.objects.iter().map(|object| object.centre).collect::<Vec<_>>(),
+            scene.goals.clone(),
+        ];
+        let hands: Vec<_> = scene.arms.iter().map(|arm| arm.end_effector).collect();
+        let hand_m = self.half_m * std::f64::consts::SQRT_2 + 0.05;
+        start.hands.len() == 1
+            || places.iter().all(|places| pairs_apart(places, apart_m))
+                && hands.iter().all(|hand| {
+                    places[0].iter().all(|object| horizontal_m(*hand, *object) >= hand_m)
+                })
+    }
+}
+
+fn point(numbers: &[f32]) -> DVec3 {
+    DVec3::new(numbers[0].into(), numbers[1].into(), numbers[2].into())
+}
+
+fn horizontal_m(a: [f32; 3], b: [f32; 3]) -> f64 {
+    f64::from((a[0] - b[0]).hypot(a[1] - b[1]))
+}
+
+fn pairs_apart(places: &[[f32; 3]], apart_m: f64) -> bool {
+    let far = |(idx, place): (usize, &[f32; 3])| {
+        places[..idx].iter().all(|other| horizontal_m(*place, *other) >= apart_m)
+    };
+    places.iter().enumerate().all(far)
+}
