@@ -4,7 +4,8 @@
 //! ([`rollout`]). [`Mode::OpenLoop`] is the paper's way (section 4.3): the policy's whole episode in the training world becomes one
 //! motion, which is planned, checked and executed without a look at the objects. [`Mode::ClosedLoop`] asks the policy
 //! again after every step, with what the cameras and encoders say; each step is planned and checked as a motion of its own, from rest to
-//! rest. The executor's envelope is the same for both. [`judge`] then looks at where the objects are.
+//! rest. [`Mode::Twin`] is an open loop whose motion was made by a closed loop on a copy of the pair: blind too, but made for these
+//! arms. The executor's envelope is the same for all. [`judge`] then looks at where the objects are.
 //!
 //! [`mapping`] says how the policy's world lies on the table.
 
@@ -27,6 +28,7 @@ pub mod judge;
 pub mod mapping;
 pub mod rollout;
 
+mod closed;
 mod run;
 mod shape;
 mod stage;
@@ -48,6 +50,8 @@ impl<F: FnMut(&[f32], &[f32], &mut [f32])> Decide for F {
 pub enum Mode {
     /// One motion, made of an episode in the training world.
     OpenLoop,
+    /// One motion, made of a closed loop on a copy of the pair that differs from it as a model does from the arms.
+    Twin,
     /// A look at the table before every step.
     ClosedLoop,
 }
@@ -58,6 +62,7 @@ impl Mode {
     pub const fn name(self) -> &'static str {
         match self {
             Self::OpenLoop => "open-loop",
+            Self::Twin => "twin",
             Self::ClosedLoop => "closed-loop",
         }
     }
@@ -91,7 +96,9 @@ pub struct TrialReport {
     pub cause: Option<Cause>,
     /// What happened to each object, arm by arm.
     pub objects: Vec<ObjectCourse>,
-    /// How far from their goals the objects were after the episode in the training world, metres; open loop only.
+    /// Where the objects lay, should go and ended in the world, arm by arm.
+    pub places: Vec<Places>,
+    /// How far from their goals the objects were after the rehearsal, metres; not in the closed loop.
     pub rehearsed_m: Option<Vec<f64>>,
     /// How long the arms took, seconds of simulated time.
     pub duration_s: f64,
@@ -107,6 +114,17 @@ pub struct TrialReport {
     pub table_gap_m: f64,
     /// Where the tools were and where the motion had them, some twenty times a second.
     pub path: Vec<PathPoint>,
+}
+
+/// An object's places, world frame, metres.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Places {
+    /// Where it lay at first.
+    pub start: DVec3,
+    /// Where it should go.
+    pub goal: DVec3,
+    /// Where it ended.
+    pub end: DVec3,
 }
 
 /// Where the tools were at one time and where they should have been; world frame, metres.
