@@ -91,7 +91,7 @@ pub struct QuarcDriver {
     stream: TcpStream,
     inbox: Inbox,
     newest: PairState,
-    /// Exchanges in which a vector was not completed.
+    /// Exchanges in which a vector was begun and none completed, since the last state.
     n_short: u32,
     /// Number of the newest command that was sent.
     number: u64,
@@ -232,12 +232,13 @@ impl QuarcDriver {
         let Some(state) = new else { return Ok(false) };
         let sequence = self.newest.sequence + 1;
         self.newest = PairState { sequence, ..state };
+        self.n_short = 0;
         Ok(true)
     }
 
     fn judge_short(&mut self, new: bool) -> Result<(), DriverError> {
         let n_bytes = self.inbox.n_short();
-        self.n_short = if new || n_bytes == 0 { 0 } else { self.n_short + 1 };
+        self.n_short += u32::from(!new && n_bytes > 0);
         if self.n_short > self.config.short_exchanges {
             let what = format!(
                 "a vector of {n_bytes} bytes instead of {STATE_BYTES}: check the width and the data type of the stream block's signal"

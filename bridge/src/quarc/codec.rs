@@ -271,9 +271,9 @@ pub(crate) mod tests {
 
     #[test]
     fn numbers_stand_where_the_tables_say() {
-        let vector = encode_command(&command(), 0.01).unwrap();
+        let vector = encode_command(&command(), 0.5).unwrap();
         let expected =
-            [20_001.0, 41.0, 0.41, 1.0, -1.0, -0.75, -0.5, -0.25, 0.5, 0.5, 0.75, 1.0, 1.25, 0.5];
+            [20_001.0, 41.0, 20.5, 1.0, -1.0, -0.75, -0.5, -0.25, 0.5, 0.5, 0.75, 1.0, 1.25, 0.5];
         assert_eq!(vector, expected);
         let vector = encode_state(&state(3)).unwrap();
         assert_eq!(vector[..8], [20_002.0, 3.0, 0.03, 7.0, 0.0, 1.0, 2.0, 3.0]);

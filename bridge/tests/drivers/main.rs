@@ -2,6 +2,8 @@
 //! behind them.
 #![expect(clippy::unwrap_used, clippy::panic, reason = "a test panics where it fails")]
 
+mod kinova;
+mod kinova_side;
 mod quarc;
 mod quarc_side;
 mod rig;

@@ -10,7 +10,7 @@ use std::time::Duration;
 use tandem_bridge::quarc::codec::{encode_state, to_bytes};
 use tandem_bridge::quarc::{QuarcConfig, QuarcDriver};
 use tandem_bridge::{
-    ArmCommand, Command, Driver, DriverError, Order, PairState, Phase, ResetError, Settings,
+    ArmCommand, Command, Driver as _, DriverError, Order, PairState, Phase, ResetError, Settings,
     StartError, StopCause,
 };
 use tandem_kinematics::{Joints, Motion};

@@ -9,8 +9,8 @@ use std::time::Duration;
 use glam::DVec3;
 use tandem_bridge::layout::{check_settings, mico_cell};
 use tandem_bridge::{
-    Command, Driver, DriverError, Executor, PairState, Phase, Settings, SimulatedConfig,
-    SimulatedPair, StopCause, Token,
+    Command, Driver, DriverError, Executor, PairState, Phase, ResetError, Settings,
+    SimulatedConfig, SimulatedPair, StopCause, Token,
 };
 use tandem_core::ArmIndex;
 use tandem_kinematics::{ArmWayPoint, Joints, Motion, PlanSettings, WayPoint, check, plan};
@@ -51,8 +51,9 @@ impl<D: Listen> Driver for Patient<D> {
     }
 
     fn exchange(&mut self, command: &Command) -> Result<PairState, DriverError> {
-        let mut state = self.inner.exchange(command)?;
+        let state = self.inner.exchange(command);
         (self.pass)();
+        let mut state = state?;
         for _ in 0..600 {
             if !self.waits.get() || self.seen != state.sequence {
                 break;
@@ -88,12 +89,22 @@ impl<D: Driver> Rig<D> {
 
     /// Lets go what is stopped.
     pub(crate) fn reset(&mut self) {
+        let phase = self.try_reset();
+        assert_eq!(phase, Phase::Idle, "{:?}", self.executor.stopped_by());
+    }
+
+    /// Resets, and ticks once.
+    pub(crate) fn try_reset(&mut self) -> Phase {
         for _ in 0..15 {
             assert_eq!(self.tick(), Phase::Stopped);
         }
-        self.executor.reset(OWNER, self.now_s).unwrap();
-        let phase = self.tick();
-        assert_eq!(phase, Phase::Idle, "{:?}", self.executor.stopped_by());
+        // Some arms tell less often than others.
+        for _ in 0..100 {
+            if let Err(ResetError::States { .. }) = self.executor.reset(OWNER, self.now_s) {
+                self.tick();
+            }
+        }
+        self.tick()
     }
 
     /// Starts `motion`.
@@ -145,10 +156,10 @@ pub(crate) fn angles(pair: &SharedPair) -> Vec<Joints> {
     [0, 1].map(|arm| *pair.angles(ArmIndex(arm))).to_vec()
 }
 
-/// Whether nothing moves.
+/// Whether nothing moves. Arms that follow a velocity of zero come to rest little by little.
 pub(crate) fn at_rest(pair: &SharedPair) -> bool {
     let pair = pair.lock().unwrap();
-    let rest = |arm| pair.velocities(ArmIndex(arm)).iter().all(|rate| *rate == 0.0);
+    let rest = |arm| pair.velocities(ArmIndex(arm)).iter().all(|rate| rate.abs() < 1e-4);
     rest(0) && rest(1)
 }
 
