@@ -5,7 +5,7 @@
 //!
 //! | name | type | what |
 //! |---|---|---|
-//! | `in/joint_velocity` | `kinova_msgs/JointVelocity` | published: degrees per second, `joint5` to `joint7` are 0 |
+//! | `in/joint_velocity` | `kinova_msgs/JointVelocity` | published, and heard again: degrees per second, `joint5` to `joint7` are 0 |
 //! | `out/joint_state` | `sensor_msgs/JointState` | heard: radians, radians per second, newton metres; fingers as joints |
 //! | `fingers_action/finger_positions/goal`, `…/result` | `kinova_msgs/SetFingersPositionAction…` | published and heard: turns of the fingers |
 //! | `in/stop`, `in/start` | `kinova_msgs/Stop`, `kinova_msgs/Start` | called; `in/stop` empties the arm's queue as well |
@@ -16,6 +16,11 @@
 //! **Velocities** are published once per exchange and arm, and at no other time. The arms want them at 100 Hz exactly: less often moves them
 //! slower, more often fills a queue of 2000 in the arm, which is played to its end. A velocity that cannot be written at once is an error and not kept.
 //!
+//! **Nothing may pile up** in rosbridge either, because a burst of velocities is played to its end. The driver therefore hears its own
+//! velocities: a command counts as done ([`PairState::newest_command`]) when those of all arms were published in ROS. An
+//! executor stops when commands are too long under way, and cannot be reset while any is. A velocity that is heard and not the driver's own ends
+//! the connection: somebody else is moving the arm.
+//!
 //! **To stop** nothing is published any more, and `in/stop` is called. The arm stops because nothing comes (the dead-man's switch:
 //! a killed process publishes nothing), and the service keeps everybody else from moving it. With the first
 //! [`Order::Move`] after a stop, which an executor gives only after a reset, `in/start` is called, and velocities are
@@ -24,15 +29,18 @@
 //!
 //! **Grippers** move only while their arms stand, see [`FingerSettings`]. A motion should rest for a second where it opens or closes a gripper.
 //!
-//! **States.** A state of the pair is new when both arms have told anew, and has the older one's stamp. The arms do not tell which
-//! command has taken effect, nor faults. Efforts count as torques only where [`KinovaRosConfig::tells_torques`] says
+//! **States.** A state of the pair is new when both arms have told anew, and has the older one's stamp. The arms do not tell faults. Efforts count as torques only where [`KinovaRosConfig::tells_torques`] says
 //! that they are without the arm's own weight.
 //!
 //! A driver is for one connection. Whatever cannot be understood, a service that refuses or does not answer, and a lost connection end it: the
 //! arms are told to stop if they still can be, and every later exchange fails with that first error. Going on takes a new
 //! connection, a new executor and a reset.
 
+use std::collections::VecDeque;
 use std::time::Duration;
+
+use serde_json::Value;
+use tandem_kinematics::Joints;
 
 use crate::driver::{ArmCommand, Command, Driver, DriverError, Order, PairState};
 use crate::executor::Settings;
@@ -50,6 +58,8 @@ mod protocol;
 
 /// Time from one exchange to the next, seconds. The arms take velocities at this rate and no other.
 pub const PERIOD_S: f64 = 0.01;
+/// Velocities that may be under way to ROS at most: a second. An executor stops much earlier.
+const MOST_UNDER_WAY: usize = 100;
 /// Slices of the time in which the first state has to come.
 const N_FIRST_WAITS: u32 = 100;
 
@@ -107,8 +117,8 @@ impl KinovaRosConfig {
     }
 }
 
-/// Settings of the executor to begin with. They allow for states that come at 40 Hz (what a USB connection gives) and for
-/// the 50 ms of `in/start`; reaction and lag are guesses until somebody has measured the arms.
+/// Settings of the executor to begin with. They allow for states that come at 40 Hz (what a USB connection gives), for
+/// the 50 ms of `in/start` and for 60 ms through rosbridge; reaction and lag are guesses until somebody has measured the arms.
 #[must_use]
 pub fn settings() -> Settings {
     Settings {
@@ -116,6 +126,7 @@ pub fn settings() -> Settings {
         lag_s: 0.050,
         state_hold_s: 0.030,
         state_stop_s: 0.150,
+        command_s: 0.060,
         ..Settings::default()
     }
 }
@@ -128,6 +139,8 @@ pub struct KinovaRosDriver {
     arms: Vec<Arm>,
     merge: Merge,
     newest: PairState,
+    /// Number of the last command.
+    number: u64,
     /// Names for calls and goals.
     n_ids: u64,
     /// Why the connection has ended.
@@ -140,6 +153,8 @@ struct Arm {
     node: String,
     control: Control,
     fingers: Fingers,
+    /// Numbers of commands, and their velocities, that were sent and not heard again; oldest first.
+    under_way: VecDeque<(u64, Joints)>,
 }
 
 /// Whether a node lets its arm move.
@@ -164,6 +179,10 @@ enum Service {
 impl Arm {
     fn topic(&self, name: &str) -> String {
         format!("{}/{name}", self.node)
+    }
+
+    fn velocity_topic(&self) -> String {
+        self.topic("in/joint_velocity")
     }
 
     fn goal_topic(&self) -> String {
@@ -193,6 +212,17 @@ impl Arm {
             Service::Start => Control::Started,
         };
         Ok(())
+    }
+
+    /// Notes velocities that were published in ROS. They have to be those that were sent.
+    fn published(&mut self, msg: &Value) -> Result<(), DriverError> {
+        match self.under_way.pop_front() {
+            Some((_, rates)) if protocol::says(msg, &rates) => Ok(()),
+            _ => {
+                let what = format!("somebody else publishes {}", self.velocity_topic());
+                Err(DriverError::Refused { what })
+            }
+        }
     }
 
     /// Lets an exchange pass. A service has to answer in time.
@@ -233,11 +263,13 @@ impl KinovaRosDriver {
             node: arm.node.trim_end_matches('/').to_owned(),
             control: Control::Unknown,
             fingers: Fingers::new(config.fingers),
+            under_way: VecDeque::new(),
         };
         let arms: Vec<Arm> = config.arms.iter().map(arm).collect();
         let merge = Merge::new(arms.len(), config.skew_s);
         let newest = PairState { sequence: 0, stamp_s: 0.0, newest_command: None, arms: vec![] };
-        let mut driver = Self { config, link, arms, merge, newest, n_ids: 0, failure: None };
+        let mut driver =
+            Self { config, link, arms, merge, newest, number: 0, n_ids: 0, failure: None };
         driver.introduce()?;
         let slice = driver.config.connect_timeout / N_FIRST_WAITS;
         for _ in 0..N_FIRST_WAITS {
@@ -262,18 +294,20 @@ impl KinovaRosDriver {
     pub fn listen(&mut self, patience: Duration) -> Result<PairState, DriverError> {
         self.unless_failed(|driver| {
             driver.receive(patience)?;
-            Ok(driver.newest.clone())
+            Ok(driver.state(driver.number))
         })
     }
 
     /// Says what will be published and what shall be heard.
     fn introduce(&mut self) -> Result<(), DriverError> {
         for arm in &self.arms {
-            let velocity = arm.topic("in/joint_velocity");
+            let velocity = arm.velocity_topic();
+            let kind = "kinova_msgs/JointVelocity";
             let state = arm.topic("out/joint_state");
             let goal = "kinova_msgs/SetFingersPositionActionGoal";
             let result = "kinova_msgs/SetFingersPositionActionResult";
-            self.link.say(protocol::advertise(&velocity, "kinova_msgs/JointVelocity"))?;
+            self.link.say(protocol::advertise(&velocity, kind))?;
+            self.link.say(protocol::subscribe_to_all(&velocity, kind))?;
             self.link.say(protocol::advertise(&arm.goal_topic(), goal))?;
             self.link.say(protocol::subscribe(&arm.result_topic(), result))?;
             self.link.say(protocol::subscribe(&state, "sensor_msgs/JointState"))?;
@@ -336,7 +370,7 @@ impl KinovaRosDriver {
     }
 
     /// Hands on what an arm shall do.
-    fn drive(&mut self, arm: usize, command: &ArmCommand) -> Result<(), DriverError> {
+    fn drive(&mut self, arm: usize, number: u64, command: &ArmCommand) -> Result<(), DriverError> {
         if !(0.0..=1.0).contains(&command.opening) {
             let what = format!("opening {}, expected 0 to 1", command.opening);
             return Err(DriverError::Refused { what });
@@ -348,14 +382,19 @@ impl KinovaRosDriver {
             }
             Control::Asked { .. } => Ok(()),
             Control::Stopped => self.ask(arm, Service::Start),
-            Control::Started => self.publish(arm, command),
+            Control::Started => self.publish(arm, number, command),
         }
     }
 
     /// Publishes velocities, or a goal for the fingers.
-    fn publish(&mut self, arm: usize, command: &ArmCommand) -> Result<(), DriverError> {
-        let velocities =
-            protocol::velocities(&self.arms[arm].topic("in/joint_velocity"), &command.velocities)?;
+    fn publish(
+        &mut self,
+        arm: usize,
+        number: u64,
+        command: &ArmCommand,
+    ) -> Result<(), DriverError> {
+        let topic = self.arms[arm].velocity_topic();
+        let velocities = protocol::velocities(&topic, &command.velocities)?;
         let standing_radps = self.config.fingers.standing_radps;
         let stands = command.velocities.iter().all(|rate| rate.abs() <= standing_radps);
         if let Some(opening) = self.arms[arm].fingers.next(command.opening, stands) {
@@ -364,7 +403,23 @@ impl KinovaRosDriver {
             self.link.say(protocol::finger_goal(&self.arms[arm].goal_topic(), &id, turns))?;
             self.arms[arm].fingers.sent(id);
         }
-        if self.arms[arm].fingers.busy() { Ok(()) } else { self.link.say(velocities) }
+        if self.arms[arm].fingers.busy() {
+            return Ok(());
+        }
+        if self.arms[arm].under_way.len() >= MOST_UNDER_WAY {
+            let what =
+                format!("rosbridge holds {MOST_UNDER_WAY} velocities and does not publish them");
+            return Err(DriverError::Disconnected { what });
+        }
+        self.arms[arm].under_way.push_back((number, command.velocities));
+        self.link.say(velocities)
+    }
+
+    /// The newest state, and the newest command of which all is done when `number` was the last one.
+    fn state(&self, number: u64) -> PairState {
+        let oldest = self.arms.iter().filter_map(|arm| arm.under_way.front());
+        let newest = oldest.map(|(under_way, _)| under_way - 1).min().unwrap_or(number);
+        PairState { newest_command: Some(newest), ..self.newest.clone() }
     }
 
     fn next_id(&mut self) -> String {
@@ -379,6 +434,7 @@ impl Driver for KinovaRosDriver {
     }
 
     fn exchange(&mut self, command: &Command) -> Result<PairState, DriverError> {
+        let number = command.number;
         self.unless_failed(|driver| {
             match &command.order {
                 Order::Stop => (0..driver.arms.len()).try_for_each(|arm| driver.halt(arm))?,
@@ -388,14 +444,15 @@ impl Driver for KinovaRosDriver {
                         return Err(DriverError::Shape { got, expected });
                     }
                     for (arm, command) in commands.iter().enumerate() {
-                        driver.drive(arm, command)?;
+                        driver.drive(arm, number, command)?;
                     }
                 }
             }
             driver.receive(Duration::ZERO)?;
             let most = driver.config.answer_exchanges;
             driver.arms.iter_mut().try_for_each(|arm| arm.await_answer(most))?;
-            Ok(driver.newest.clone())
+            driver.number = number;
+            Ok(driver.state(number))
         })
     }
 
@@ -417,6 +474,8 @@ fn take(
                 if topic == arm.topic("out/joint_state") {
                     let told = reading(config, idx).joint_state(&msg);
                     merge.note(idx, told.map_err(|error| of_node(error, &arm.node))?);
+                } else if topic == arm.velocity_topic() {
+                    arm.published(&msg)?;
                 } else if topic == arm.result_topic()
                     && let Some(id) = protocol::ended_goal(&msg)
                 {

@@ -149,7 +149,7 @@ mod tests {
     #[test]
     fn no_goal_goes_out_while_the_arm_moves_or_another_is_under_way() {
         let wanted = |n: u32| if n < 20 { 1.0 } else { 0.2 };
-        assert_eq!(goals(wanted, |n| n < 10 || n > 200, 10), [(201, 0.2)]);
+        assert_eq!(goals(wanted, |n| !(10..=200).contains(&n), 10), [(201, 0.2)]);
         let twice = |n: u32| [1.0, 0.2, 0.6][(n / 30).min(2) as usize];
         assert_eq!(goals(twice, |_| true, 150), [(30, 0.2), (180, 0.6)]);
     }

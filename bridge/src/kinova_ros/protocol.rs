@@ -52,8 +52,20 @@ pub(crate) fn advertise(topic: &str, kind: &str) -> String {
 
 /// Asks for the newest messages of `topic`: a queue of one message forgets the older one.
 pub(crate) fn subscribe(topic: &str, kind: &str) -> String {
-    json!({"op": "subscribe", "topic": topic, "type": kind, "queue_length": 1, "throttle_rate": 0})
-        .to_string()
+    subscribe_with(topic, kind, 1)
+}
+
+/// Asks for every message of `topic`.
+pub(crate) fn subscribe_to_all(topic: &str, kind: &str) -> String {
+    subscribe_with(topic, kind, 0)
+}
+
+fn subscribe_with(topic: &str, kind: &str, queue_length: u32) -> String {
+    json!({
+        "op": "subscribe", "topic": topic, "type": kind,
+        "queue_length": queue_length, "throttle_rate": 0,
+    })
+    .to_string()
 }
 
 /// Calls a service that takes nothing.
@@ -76,6 +88,14 @@ pub(crate) fn velocities(topic: &str, rates: &Joints) -> Result<String, DriverEr
         "joint5": 0.0, "joint6": 0.0, "joint7": 0.0,
     });
     Ok(json!({"op": "publish", "topic": topic, "msg": msg}).to_string())
+}
+
+/// Whether a message of `kinova_msgs/JointVelocity` says these velocities, radians per second. It has single precision.
+pub(crate) fn says(msg: &Value, rates: &Joints) -> bool {
+    rates.iter().enumerate().all(|(joint, rate)| {
+        let told = msg.get(format!("joint{}", joint + 1)).and_then(Value::as_f64);
+        told.is_some_and(|told| (told - rate.to_degrees()).abs() < 1e-3)
+    })
 }
 
 /// Publishes a goal for both fingers, in turns, as `kinova_msgs/SetFingersPositionActionGoal`.
@@ -294,6 +314,10 @@ mod tests {
             assert!((joint(nth) - expected).abs() < 1e-6, "joint {nth}: {sent}");
         }
         assert_eq!(sent["msg"].as_object().unwrap().len(), 7);
+        assert!(says(&sent["msg"], &rates));
+        let other = Joints::from_fn(4, |joint| rates[joint] + if joint == 2 { 0.001 } else { 0.0 });
+        assert!(!says(&sent["msg"], &other));
+        assert!(!says(&json!({"joint1": 0.0}), &Joints::new(&[0.0; 4])));
         let nan = Joints::new(&[0.0, f64::NAN, 0.0, 0.0]);
         assert!(matches!(velocities("/a", &nan), Err(DriverError::Refused { .. })));
         assert!(matches!(

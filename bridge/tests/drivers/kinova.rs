@@ -197,6 +197,7 @@ fn what_is_no_state_ends_the_connection_and_the_arms_rest() {
     ends(Fault::Names, "no joint \"m1n4s200_joint_1\"");
     ends(Fault::Clock, "s apart");
     ends(Fault::Complains, "rosbridge: no such type");
+    ends(Fault::Stranger, "somebody else publishes /left/m1n4s200_driver/in/joint_velocity");
     ends(Fault::Close, "not connected");
 }
 
@@ -211,6 +212,18 @@ fn silent_arms_are_stopped() {
         assert_eq!(test.n_calls("in/stop"), [2, 2]);
         assert!(test.side.ros().nodes.iter().all(|node| node.stopped));
     }
+}
+
+#[test]
+fn velocities_that_are_stuck_stop_the_arms_and_prevent_a_reset() {
+    let mut test = Test::moving();
+    test.side.begin(Fault::Lags);
+    let cause = test.rig.until_stopped();
+    assert!(matches!(cause, StopCause::CommandLost(_)), "{cause}");
+    test.assert_rests();
+    assert_eq!(test.n_calls("in/stop"), [2, 2]);
+    let reset = test.rig.executor.reset(OWNER, test.rig.now_s);
+    assert!(matches!(reset, Err(ResetError::States { .. })), "{reset:?}");
 }
 
 #[test]
@@ -340,7 +353,7 @@ fn commands_do_not_pile_up_before_a_rosbridge_that_does_not_read() {
     });
     // From here on nobody reads.
     let error = (number..10_000_000).find_map(|number| driver.exchange(&moves(number)).err());
-    assert!(error.unwrap().to_string().contains("does not take messages any more"));
+    assert!(error.unwrap().to_string().contains("rosbridge holds 100 velocities"));
 }
 
 #[test]
