@@ -5,7 +5,7 @@
 //!
 //! | name | type | what |
 //! |---|---|---|
-//! | `in/joint_velocity` | `kinova_msgs/JointVelocity` | published, and heard again: degrees per second, `joint5` to `joint7` are 0 |
+//! | `in/joint_velocity` | `kinova_msgs/JointVelocity` | published, and heard again: degrees per second; `joint7`, which the arms lack, carries the command's number in millionths |
 //! | `out/joint_state` | `sensor_msgs/JointState` | heard: radians, radians per second, newton metres; fingers as joints |
 //! | `fingers_action/finger_positions/goal`, `…/result` | `kinova_msgs/SetFingersPositionAction…` | published and heard: turns of the fingers |
 //! | `in/stop`, `in/start` | `kinova_msgs/Stop`, `kinova_msgs/Start` | called; `in/stop` empties the arm's queue as well |
@@ -214,15 +214,15 @@ impl Arm {
         Ok(())
     }
 
-    /// Notes velocities that were published in ROS. They have to be those that were sent.
+    /// Notes velocities that were published in ROS. They have to be some that were sent; those before them were overtaken and dropped.
     fn published(&mut self, msg: &Value) -> Result<(), DriverError> {
-        match self.under_way.pop_front() {
-            Some((_, rates)) if protocol::says(msg, &rates) => Ok(()),
-            _ => {
-                let what = format!("somebody else publishes {}", self.velocity_topic());
-                Err(DriverError::Refused { what })
-            }
-        }
+        let is_it = |(number, rates): &(u64, Joints)| protocol::is_of(msg, *number, rates);
+        let Some(place) = self.under_way.iter().position(is_it) else {
+            let what = format!("somebody else publishes {}", self.velocity_topic());
+            return Err(DriverError::Refused { what });
+        };
+        self.under_way.drain(..=place);
+        Ok(())
     }
 
     /// Lets an exchange pass. A service has to answer in time.
@@ -394,7 +394,7 @@ impl KinovaRosDriver {
         command: &ArmCommand,
     ) -> Result<(), DriverError> {
         let topic = self.arms[arm].velocity_topic();
-        let velocities = protocol::velocities(&topic, &command.velocities)?;
+        let velocities = protocol::velocities(&topic, number, &command.velocities)?;
         let standing_radps = self.config.fingers.standing_radps;
         let stands = command.velocities.iter().all(|rate| rate.abs() <= standing_radps);
         if let Some(opening) = self.arms[arm].fingers.next(command.opening, stands) {

@@ -74,7 +74,9 @@ pub(crate) fn call(id: &str, service: &str) -> String {
 }
 
 /// Publishes velocities (radians per second) as `kinova_msgs/JointVelocity` (degrees per second).
-pub(crate) fn velocities(topic: &str, rates: &Joints) -> Result<String, DriverError> {
+///
+/// Joint 7, which these arms do not have, carries the number of the command: its last three digits, in millionths of a degree per second.
+pub(crate) fn velocities(topic: &str, number: u64, rates: &Joints) -> Result<String, DriverError> {
     let (got, expected) = (rates.len(), N_JOINTS);
     if got != expected {
         return Err(DriverError::Shape { got, expected });
@@ -85,17 +87,24 @@ pub(crate) fn velocities(topic: &str, rates: &Joints) -> Result<String, DriverEr
     let [joint1, joint2, joint3, joint4] = std::array::from_fn(|joint| rates[joint].to_degrees());
     let msg = json!({
         "joint1": joint1, "joint2": joint2, "joint3": joint3, "joint4": joint4,
-        "joint5": 0.0, "joint6": 0.0, "joint7": 0.0,
+        "joint5": 0.0, "joint6": 0.0, "joint7": label(number),
     });
     Ok(json!({"op": "publish", "topic": topic, "msg": msg}).to_string())
 }
 
-/// Whether a message of `kinova_msgs/JointVelocity` says these velocities, radians per second. It has single precision.
-pub(crate) fn says(msg: &Value, rates: &Joints) -> bool {
-    rates.iter().enumerate().all(|(joint, rate)| {
-        let told = msg.get(format!("joint{}", joint + 1)).and_then(Value::as_f64);
-        told.is_some_and(|told| (told - rate.to_degrees()).abs() < 1e-3)
-    })
+/// What joint 7 is told in the command of this number, degrees per second.
+fn label(number: u64) -> f64 {
+    (number % 1000) as f64 * 1e-6
+}
+
+/// Whether a message of `kinova_msgs/JointVelocity` is that of this command. It has single precision.
+pub(crate) fn is_of(msg: &Value, number: u64, rates: &Joints) -> bool {
+    let near = |joint: usize, expected: f64, most: f64| {
+        let told = msg.get(format!("joint{joint}")).and_then(Value::as_f64);
+        told.is_some_and(|told| (told - expected).abs() < most)
+    };
+    let rates = rates.iter().map(|rate| rate.to_degrees());
+    (1..).zip(rates).all(|(joint, rate)| near(joint, rate, 1e-3)) && near(7, label(number), 1e-7)
 }
 
 /// Publishes a goal for both fingers, in turns, as `kinova_msgs/SetFingersPositionActionGoal`.
@@ -305,23 +314,25 @@ mod tests {
     fn velocities_leave_in_degrees_per_second() {
         let rates = Joints::new(&[0.1, -0.2, 0.0, std::f64::consts::PI / 6.0]);
         let sent: Value =
-            serde_json::from_str(&velocities("/a/in/joint_velocity", &rates).unwrap()).unwrap();
+            serde_json::from_str(&velocities("/a/in/joint_velocity", 41_234, &rates).unwrap())
+                .unwrap();
         assert_eq!(sent["op"], "publish");
         assert_eq!(sent["topic"], "/a/in/joint_velocity");
         let joint = |nth: usize| sent["msg"][format!("joint{nth}")].as_f64().unwrap();
-        let expected = [5.729_578, -11.459_156, 0.0, 30.0, 0.0, 0.0, 0.0];
+        let expected = [5.729_578, -11.459_156, 0.0, 30.0, 0.0, 0.0, 0.000_234];
         for (nth, expected) in (1..).zip(expected) {
-            assert!((joint(nth) - expected).abs() < 1e-6, "joint {nth}: {sent}");
+            assert!((joint(nth) - expected).abs() < 5e-7, "joint {nth}: {sent}");
         }
         assert_eq!(sent["msg"].as_object().unwrap().len(), 7);
-        assert!(says(&sent["msg"], &rates));
+        assert!(is_of(&sent["msg"], 41_234, &rates) && is_of(&sent["msg"], 234, &rates));
+        assert!(!is_of(&sent["msg"], 41_235, &rates));
         let other = Joints::from_fn(4, |joint| rates[joint] + if joint == 2 { 0.001 } else { 0.0 });
-        assert!(!says(&sent["msg"], &other));
-        assert!(!says(&json!({"joint1": 0.0}), &Joints::new(&[0.0; 4])));
+        assert!(!is_of(&sent["msg"], 41_234, &other));
+        assert!(!is_of(&json!({"joint1": 0.0}), 0, &Joints::new(&[0.0; 4])));
         let nan = Joints::new(&[0.0, f64::NAN, 0.0, 0.0]);
-        assert!(matches!(velocities("/a", &nan), Err(DriverError::Refused { .. })));
+        assert!(matches!(velocities("/a", 1, &nan), Err(DriverError::Refused { .. })));
         assert!(matches!(
-            velocities("/a", &Joints::new(&[0.0; 6])),
+            velocities("/a", 1, &Joints::new(&[0.0; 6])),
             Err(DriverError::Shape { .. })
         ));
     }

@@ -227,6 +227,17 @@ fn velocities_that_are_stuck_stop_the_arms_and_prevent_a_reset() {
 }
 
 #[test]
+fn velocities_that_are_dropped_do_not_add_up() {
+    let mut test = Test::moving();
+    test.side.begin(Fault::Drops);
+    test.rig.play();
+    for _ in 0..200 {
+        assert_eq!(test.rig.tick(), Phase::Idle, "{:?}", test.rig.executor.stopped_by());
+    }
+    assert_ended(&test.side.ros().pair, &test.motion);
+}
+
+#[test]
 fn stopped_arms_go_on_after_a_reset_and_not_before() {
     let mut test = Test::moving();
     test.rig.executor.stop(test.rig.now_s);

@@ -45,6 +45,8 @@ pub(crate) enum Fault {
     Complains,
     /// rosbridge does not hand on velocities.
     Lags,
+    /// rosbridge drops some velocities, as a queue of length 1 does.
+    Drops,
     /// Somebody else moves the first arm.
     Stranger,
 }
@@ -203,8 +205,11 @@ impl Ros {
             }
             ("publish", "in/joint_velocity") => {
                 let rate = |joint: usize| message["msg"][format!("joint{}", joint + 1)].as_f64();
-                assert!((4..7).all(|joint| rate(joint) == Some(0.0)), "{message}");
+                assert!((4..7).all(|joint| rate(joint).unwrap().abs() <= 0.001), "{message}");
                 node.n_velocities += 1;
+                if self.fault == Some(Fault::Drops) && node.n_velocities.is_multiple_of(10) {
+                    return;
+                }
                 node.n_while_busy += usize::from(node.goal.is_some());
                 node.rates = Some(Joints::from_fn(4, |joint| rate(joint).unwrap().to_radians()));
                 if self.fault != Some(Fault::Lags) && self.subscribed.iter().any(|t| t == topic) {
