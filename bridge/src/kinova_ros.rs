@@ -36,17 +36,13 @@
 //! arms are told to stop if they still can be, and every later exchange fails with that first error. Going on takes a new
 //! connection, a new executor and a reset.
 
-use std::collections::VecDeque;
 use std::time::Duration;
-
-use serde_json::Value;
-use tandem_kinematics::Joints;
 
 use crate::driver::{ArmCommand, Command, Driver, DriverError, Order, PairState};
 use crate::executor::Settings;
-use crate::kinova_ros::fingers::Fingers;
 use crate::kinova_ros::link::Link;
 use crate::kinova_ros::merge::Merge;
+use crate::kinova_ros::node::{Arm, Control, MOST_UNDER_WAY, Service};
 use crate::kinova_ros::protocol::{Heard, Reading};
 
 pub use fingers::FingerSettings;
@@ -54,12 +50,11 @@ pub use fingers::FingerSettings;
 mod fingers;
 mod link;
 mod merge;
+mod node;
 mod protocol;
 
 /// Time from one exchange to the next, seconds. The arms take velocities at this rate and no other.
 pub const PERIOD_S: f64 = 0.01;
-/// Velocities that may be under way to ROS at most: a second. An executor stops much earlier.
-const MOST_UNDER_WAY: usize = 100;
 /// Slices of the time in which the first state has to come.
 const N_FIRST_WAITS: u32 = 100;
 
@@ -147,110 +142,6 @@ pub struct KinovaRosDriver {
     failure: Option<DriverError>,
 }
 
-/// What is known of one arm's node.
-#[derive(Debug)]
-struct Arm {
-    node: String,
-    control: Control,
-    fingers: Fingers,
-    /// Numbers of commands, and their velocities, that were sent and not heard again; oldest first.
-    under_way: VecDeque<(u64, Joints)>,
-}
-
-/// Whether a node lets its arm move.
-#[derive(Debug, Clone, PartialEq, Eq)]
-enum Control {
-    /// Nobody has asked for anything over this connection.
-    Unknown,
-    /// A service was called that has not answered for some exchanges.
-    Asked { id: String, service: Service, n: u32 },
-    /// The arm is stopped.
-    Stopped,
-    /// The arm follows velocities.
-    Started,
-}
-
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Service {
-    Stop,
-    Start,
-}
-
-impl Arm {
-    fn topic(&self, name: &str) -> String {
-        format!("{}/{name}", self.node)
-    }
-
-    fn velocity_topic(&self) -> String {
-        self.topic("in/joint_velocity")
-    }
-
-    fn goal_topic(&self) -> String {
-        self.topic("fingers_action/finger_positions/goal")
-    }
-
-    fn result_topic(&self) -> String {
-        self.topic("fingers_action/finger_positions/result")
-    }
-
-    fn asked_to_stop(&self) -> bool {
-        matches!(self.control, Control::Stopped | Control::Asked { service: Service::Stop, .. })
-    }
-
-    /// Notes the answer of a service.
-    fn answered(&mut self, id: &str, result: bool, values: &str) -> Result<(), DriverError> {
-        let Control::Asked { id: asked, service, .. } = &self.control else { return Ok(()) };
-        if asked != id {
-            return Ok(());
-        }
-        if !result {
-            let what = format!("{}: {values}", self.topic(service.name()));
-            return Err(DriverError::Refused { what });
-        }
-        self.control = match service {
-            Service::Stop => Control::Stopped,
-            Service::Start => Control::Started,
-        };
-        Ok(())
-    }
-
-    /// Notes velocities that were published in ROS. They have to be some that were sent; those before them were overtaken and dropped.
-    fn published(&mut self, msg: &Value) -> Result<(), DriverError> {
-        let is_it = |(number, rates): &(u64, Joints)| protocol::is_of(msg, *number, rates);
-        let Some(place) = self.under_way.iter().position(is_it) else {
-            let what = format!("somebody else publishes {}", self.velocity_topic());
-            return Err(DriverError::Refused { what });
-        };
-        self.under_way.drain(..=place);
-        Ok(())
-    }
-
-    /// Lets an exchange pass. A service has to answer in time.
-    fn await_answer(&mut self, most: u32) -> Result<(), DriverError> {
-        let node = &self.node;
-        if let Control::Asked { service, n, .. } = &mut self.control {
-            *n += 1;
-            if *n > most {
-                let what = format!(
-                    "{node}/{} did not answer for {most} exchanges: does the node run?",
-                    service.name()
-                );
-                return Err(DriverError::Refused { what });
-            }
-        }
-        Ok(())
-    }
-}
-
-impl Service {
-    fn name(self) -> &'static str {
-        match self {
-            Self::Stop => "in/stop",
-            Self::Start => "in/start",
-        }
-    }
-}
-
 impl KinovaRosDriver {
     /// Dials rosbridge and waits for the first state of both arms. Moves and stops nothing.
     ///
@@ -259,12 +150,7 @@ impl KinovaRosDriver {
     pub fn connect(config: KinovaRosConfig) -> Result<Self, DriverError> {
         let address = config.address.trim_start_matches("ws://").trim_end_matches('/');
         let link = Link::connect(address, config.connect_timeout)?;
-        let arm = |arm: &KinovaArm| Arm {
-            node: arm.node.trim_end_matches('/').to_owned(),
-            control: Control::Unknown,
-            fingers: Fingers::new(config.fingers),
-            under_way: VecDeque::new(),
-        };
+        let arm = |arm: &KinovaArm| Arm::new(&arm.node, config.fingers);
         let arms: Vec<Arm> = config.arms.iter().map(arm).collect();
         let merge = Merge::new(arms.len(), config.skew_s);
         let newest = PairState { sequence: 0, stamp_s: 0.0, newest_command: None, arms: vec![] };
