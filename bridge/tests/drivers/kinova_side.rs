@@ -66,7 +66,8 @@ pub(crate) struct Node {
     rates: Option<Joints>,
     opening: f64,
     goal: Option<(String, u32)>,
-    starting: u32,
+    /// The call of `in/start` that is under way, and the periods until it is done.
+    starting: Option<(Value, u32)>,
     /// Messages with velocities.
     pub(crate) n_velocities: usize,
     /// Those that came while the fingers moved.
@@ -164,7 +165,7 @@ impl Ros {
         let state = self.pair.lock().unwrap().exchange(&command).unwrap();
         self.end_goals(&state);
         self.finish_starts();
-        let starting = self.nodes.iter().any(|node| node.starting > 0);
+        let starting = self.nodes.iter().any(|node| node.starting.is_some());
         let due = self.n_passes.is_multiple_of(self.every) && !starting;
         let told = due && self.socket.is_some() && self.tell(&state);
         self.before = Some(state);
@@ -206,6 +207,7 @@ impl Ros {
             ("publish", "in/joint_velocity") => {
                 let rate = |joint: usize| message["msg"][format!("joint{}", joint + 1)].as_f64();
                 assert!((4..7).all(|joint| rate(joint).unwrap().abs() <= 0.001), "{message}");
+                assert!(!node.stopped, "a velocity for a stopped arm");
                 node.n_velocities += 1;
                 if self.fault == Some(Fault::Drops) && node.n_velocities.is_multiple_of(10) {
                     return;
@@ -237,21 +239,34 @@ impl Ros {
             return;
         }
         match name {
-            "in/stop" if !refused => (node.stopped, node.starting, node.goal) = (true, 0, None),
-            "in/start" if !refused => node.starting = START_PERIODS,
+            "in/stop" if !refused => (node.stopped, node.starting, node.goal) = (true, None, None),
+            "in/start" if !refused => {
+                node.starting = Some((id.clone(), START_PERIODS));
+                return;
+            }
             "in/stop" | "in/start" => {}
             _ => panic!("no service {name}"),
         }
-        let values = if refused { json!("Could not stop the control API") } else { json!({}) };
+        self.answer(arm, name, id, !refused);
+    }
+
+    fn answer(&mut self, arm: usize, name: &str, id: &Value, result: bool) {
+        let values = if result { json!({}) } else { json!("Could not stop the control API") };
         let service = format!("{}/{name}", NODES[arm]);
-        self.say(&json!({"op": "service_response", "id": id, "service": service, "values": values, "result": !refused}));
+        self.say(&json!({
+            "op": "service_response", "id": id, "service": service, "values": values,
+            "result": result,
+        }));
     }
 
     fn finish_starts(&mut self) {
-        for node in &mut self.nodes {
-            if node.starting > 0 {
-                node.starting -= 1;
-                node.stopped = node.starting > 0;
+        for arm in 0..NODES.len() {
+            let Some((id, n)) = self.nodes[arm].starting.take() else { continue };
+            if n > 1 {
+                self.nodes[arm].starting = Some((id, n - 1));
+            } else {
+                self.nodes[arm].stopped = false;
+                self.answer(arm, "in/start", &id, true);
             }
         }
     }
