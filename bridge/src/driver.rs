@@ -126,6 +126,12 @@ pub enum DriverError {
         /// What is wrong with it.
         what: String,
     },
+    /// The arms, or the way to them, do not take the command.
+    #[error("the arms do not take this: {what}")]
+    Refused {
+        /// What is wrong, and what to do.
+        what: String,
+    },
     /// The command does not fit the arms.
     #[error("a command for {got} arms or joints, expected {expected}")]
     Shape {

@@ -4,13 +4,20 @@
 //! through a driver and is the envelope round it while it moves, and [`simulated`] is a pair of Kinova Micos with physics of its own, which
 //! stands in where there are no arms. [`layout`] says how the arms stand and what their motions have to keep.
 //!
-//! Nothing here reads a clock or knows a wire: whoever ticks the executor says what time it is, in seconds since a start of
-//! their own.
+//! Real arms are behind features of this crate: `quarc` for arms that a Simulink model drives by way of QUARC, `kinova-ros`
+//! for arms behind Kinova's ROS driver.
+//!
+//! Nothing here reads a clock, and but for the drivers of real arms nothing knows a wire: whoever ticks the executor says what
+//! time it is, in seconds since a start of their own.
 #![warn(missing_docs)]
 
 pub mod driver;
 pub mod executor;
+#[cfg(feature = "kinova-ros")]
+pub mod kinova_ros;
 pub mod layout;
+#[cfg(feature = "quarc")]
+pub mod quarc;
 pub mod simulated;
 pub mod trial;
 

@@ -58,7 +58,7 @@ impl Monitor {
         self.newest.as_ref().map(|seen| &seen.state)
     }
 
-    /// How many states in a row were new and good.
+    /// How many states in a row were good and came in time.
     pub(crate) fn n_good(&self) -> u32 {
         self.n_good
     }
@@ -85,7 +85,10 @@ impl Monitor {
     ) -> Result<(), Breach> {
         let known = self.newest.as_ref().map(|seen| seen.state.sequence);
         if known == Some(state.sequence) {
-            self.n_good = 0;
+            // Arms may tell less often than once a period.
+            if self.stale_s(now_s) > self.settings.state_hold_s {
+                self.n_good = 0;
+            }
             return Ok(());
         }
         let judged = self.judge(now_s, &state, told);

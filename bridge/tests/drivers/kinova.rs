@@ -1,0 +1,397 @@
+//! The driver for kinova-ros.
+
+use std::cell::Cell;
+use std::io::{Read as _, Write as _};
+use std::net::TcpListener;
+use std::rc::Rc;
+use std::thread;
+use std::time::Duration;
+
+use tandem_bridge::kinova_ros::{KinovaRosConfig, KinovaRosDriver, settings};
+use tandem_bridge::{
+    ArmCommand, Command, Driver as _, DriverError, Order, PairState, Phase, ResetError, StartError,
+    StopCause,
+};
+use tandem_kinematics::{Joints, Motion};
+
+use crate::kinova_side::{Fault, Side};
+use crate::rig::{
+    Listen, OWNER, Patient, Rig, SharedPair, angles, assert_ended, at_rest, eventually, failure,
+    pair_at, sweep,
+};
+
+const STEADY: [f64; 4] = [0.8; 4];
+
+impl Listen for KinovaRosDriver {
+    fn listen(&mut self, patience: Duration) -> Result<PairState, DriverError> {
+        Self::listen(self, patience)
+    }
+}
+
+struct Test {
+    side: Side,
+    rig: Rig<Patient<KinovaRosDriver>>,
+    motion: Motion,
+}
+
+fn connected(side: &Side) -> KinovaRosDriver {
+    let driver = KinovaRosDriver::connect(KinovaRosConfig::at(format!("ws://{}", side.address)));
+    let mut driver = driver.unwrap();
+    side.take_over();
+    // What is on its way still belongs to the time before.
+    while driver.listen(Duration::from_millis(20)).unwrap().sequence
+        != driver.listen(Duration::from_millis(20)).unwrap().sequence
+    {}
+    driver
+}
+
+impl Test {
+    fn new(openings: [f64; 4]) -> Self {
+        let motion = sweep(openings);
+        let side = Side::new(&pair_at(&motion));
+        let driver = connected(&side);
+        Self::with(side, driver, motion)
+    }
+
+    fn with(side: Side, driver: KinovaRosDriver, motion: Motion) -> Self {
+        let waits = Rc::new(Cell::new(false));
+        let (passing, due) = (side.clone(), Rc::clone(&waits));
+        let driver = Patient::new(driver, &waits, move || due.set(passing.pass()));
+        Self { rig: Rig::new(driver, settings()), side, motion }
+    }
+
+    /// Arms in the middle of the motion.
+    fn moving() -> Self {
+        let mut test = Self::new(STEADY);
+        test.let_go();
+        test.set_off();
+        test
+    }
+
+    /// Resets and waits until both nodes are started.
+    fn let_go(&mut self) {
+        self.rig.reset();
+        for _ in 0..30 {
+            assert_eq!(self.rig.tick(), Phase::Idle, "{:?}", self.rig.executor.stopped_by());
+        }
+        assert!(self.side.ros().nodes.iter().all(|node| !node.stopped));
+    }
+
+    fn set_off(&mut self) {
+        self.rig.start(&self.motion);
+        for _ in 0..60 {
+            assert_eq!(self.rig.tick(), Phase::Moving, "{:?}", self.rig.executor.stopped_by());
+        }
+        assert!(!at_rest(&self.side.ros().pair));
+    }
+
+    fn n_velocities(&self) -> [usize; 2] {
+        self.side.ros().nodes.each_ref().map(|node| node.n_velocities)
+    }
+
+    fn n_calls(&self, service: &str) -> [usize; 2] {
+        self.side.ros().nodes.each_ref().map(|node| *node.calls.get(service).unwrap_or(&0))
+    }
+
+    /// Nothing is published any more, and the arms rest and stay.
+    fn assert_rests(&mut self) {
+        for _ in 0..30 {
+            self.rig.tick();
+        }
+        let pair = std::sync::Arc::clone(&self.side.ros().pair);
+        assert!(at_rest(&pair));
+        let (rested, n_velocities) = (angles(&pair), self.n_velocities());
+        for _ in 0..30 {
+            assert_eq!(self.rig.tick(), Phase::Stopped);
+        }
+        assert_eq!(self.n_velocities(), n_velocities);
+        assert_stayed(&pair, &rested);
+    }
+}
+
+fn assert_stayed(pair: &SharedPair, rested: &[Joints]) {
+    for (rested, angles) in rested.iter().zip(angles(pair)) {
+        assert!(rested.largest_difference(&angles) < 1e-4);
+    }
+}
+
+#[test]
+fn a_motion_is_played_to_its_end() {
+    let mut test = Test::new(STEADY);
+    test.let_go();
+    let before = test.n_velocities();
+    test.rig.start(&test.motion);
+    let n_ticks = test.rig.play();
+    test.side.pass();
+    assert_ended(&test.side.ros().pair, &test.motion);
+    // One message an exchange and arm, no more and no less.
+    assert_eq!(test.n_velocities(), before.map(|n| n + n_ticks));
+    assert_eq!((test.n_calls("in/stop"), test.n_calls("in/start")), ([1, 1], [1, 1]));
+    assert!(test.side.ros().nodes.iter().all(|node| node.goals.is_empty()));
+    // What the arms' own weight needs is not taken for a contact.
+    assert_eq!(test.rig.executor.state().unwrap().arms[0].torques_nm, None);
+}
+
+#[test]
+fn arms_that_tell_at_50_hz_are_moved_as_well() {
+    let mut test = Test::new(STEADY);
+    test.side.ros().every = 2;
+    test.let_go();
+    test.rig.start(&test.motion);
+    test.rig.play();
+    assert_ended(&test.side.ros().pair, &test.motion);
+}
+
+#[test]
+fn grippers_move_while_the_arms_stand() {
+    let mut test = Test::new([0.8, 0.8, 0.4, 0.4]);
+    test.let_go();
+    test.rig.start(&test.motion);
+    test.rig.play();
+    assert_ended(&test.side.ros().pair, &test.motion);
+    let opening = |test: &Test| test.rig.executor.state().unwrap().arms[1].opening;
+    for _ in 0..300 {
+        assert_eq!(test.rig.tick(), Phase::Idle, "{:?}", test.rig.executor.stopped_by());
+    }
+    assert!((opening(&test) - 0.4).abs() < 0.02, "{}", opening(&test));
+    for node in &test.side.ros().nodes {
+        let last = node.goals.last().unwrap();
+        assert!((last["finger1"].as_f64().unwrap() - 0.6 * 6400.0).abs() < 64.0, "{last}");
+        assert_eq!((&last["finger2"], last["finger3"].as_f64()), (&last["finger1"], Some(0.0)));
+        assert!(node.goals.len() <= 3, "{:?}", node.goals);
+        assert_eq!(node.n_while_busy, 0);
+    }
+}
+
+#[test]
+fn states_that_come_again_or_late_are_not_new() {
+    let mut test = Test::moving();
+    test.side.begin(Fault::Again);
+    test.rig.play();
+    assert_ended(&test.side.ros().pair, &test.motion);
+}
+
+#[test]
+fn what_is_no_state_ends_the_connection_and_the_arms_rest() {
+    let ends = |fault: Fault, expected: &str| {
+        let mut test = Test::moving();
+        test.side.begin(fault);
+        let cause = test.rig.until_stopped();
+        let error = failure(&cause).to_string();
+        assert!(error.contains(expected), "{error}");
+        test.assert_rests();
+        // Whoever tells the arms to stop does so before the socket is shut.
+        if fault != Fault::Close {
+            eventually("the stops arrive", || {
+                test.side.pass();
+                !test.side.ros().connected()
+            });
+            assert_eq!(test.n_calls("in/stop"), [2, 2]);
+        }
+        assert_eq!(test.rig.executor.stopped_by().unwrap().cause, cause);
+        let reset = test.rig.executor.reset(OWNER, test.rig.now_s);
+        assert!(matches!(reset, Err(ResetError::States { .. })), "{reset:?}");
+    };
+    ends(Fault::Null, "/left/m1n4s200_driver: position of m1n4s200_joint_2 is null");
+    ends(Fault::Nan, "not JSON");
+    ends(Fault::Names, "no joint \"m1n4s200_joint_1\"");
+    ends(Fault::Clock, "s apart");
+    ends(Fault::Complains, "rosbridge: no such type");
+    ends(Fault::Stranger, "somebody else publishes /left/m1n4s200_driver/in/joint_velocity");
+    ends(Fault::Close, "not connected");
+}
+
+#[test]
+fn silent_arms_are_stopped() {
+    for n_silent in [1, 2] {
+        let mut test = Test::moving();
+        test.side.begin(Fault::Silent(n_silent));
+        let cause = test.rig.until_stopped();
+        assert!(matches!(cause, StopCause::StateStale(_)), "{cause}");
+        test.assert_rests();
+        assert_eq!(test.n_calls("in/stop"), [2, 2]);
+        assert!(test.side.ros().nodes.iter().all(|node| node.stopped));
+    }
+}
+
+#[test]
+fn velocities_that_are_stuck_stop_the_arms_and_prevent_a_reset() {
+    let mut test = Test::moving();
+    test.side.begin(Fault::Lags);
+    let cause = test.rig.until_stopped();
+    assert!(matches!(cause, StopCause::CommandLost(_)), "{cause}");
+    test.assert_rests();
+    assert_eq!(test.n_calls("in/stop"), [2, 2]);
+    let reset = test.rig.executor.reset(OWNER, test.rig.now_s);
+    assert!(matches!(reset, Err(ResetError::States { .. })), "{reset:?}");
+}
+
+#[test]
+fn velocities_that_are_dropped_do_not_add_up() {
+    let mut test = Test::moving();
+    test.side.begin(Fault::Drops);
+    test.rig.play();
+    for _ in 0..200 {
+        assert_eq!(test.rig.tick(), Phase::Idle, "{:?}", test.rig.executor.stopped_by());
+    }
+    assert_ended(&test.side.ros().pair, &test.motion);
+}
+
+#[test]
+fn stopped_arms_go_on_after_a_reset_and_not_before() {
+    let mut test = Test::moving();
+    test.rig.executor.stop(test.rig.now_s);
+    test.assert_rests();
+    assert_eq!((test.n_calls("in/stop"), test.n_calls("in/start")), ([2, 2], [1, 1]));
+    test.let_go();
+    assert_eq!(test.n_calls("in/start"), [2, 2]);
+}
+
+#[test]
+fn a_service_that_refuses_or_does_not_answer_ends_the_connection() {
+    let ends = |fault: Fault, expected: &str| {
+        let mut test = Test::moving();
+        test.side.begin(fault);
+        test.rig.executor.stop(test.rig.now_s);
+        test.assert_rests();
+        // Only the first stop shows; that the connection has ended shows by the states.
+        eventually("states are missing", || {
+            test.rig.tick();
+            let reset = test.rig.executor.reset(OWNER, test.rig.now_s);
+            matches!(reset, Err(ResetError::States { .. }))
+        });
+        let Test { side, .. } = test;
+        let mut driver = connected(&side);
+        let stop = |number| Command { number, order: Order::Stop };
+        let error = (1..400).find_map(|number| {
+            let error = driver.exchange(&stop(number)).err();
+            thread::sleep(Duration::from_millis(1));
+            side.pass();
+            error
+        });
+        let error = error.unwrap().to_string();
+        assert!(error.contains(expected), "{error}");
+    };
+    ends(Fault::Refuses("stop"), "in/stop: \"Could not stop the control API\"");
+    ends(Fault::NoAnswers, "in/stop did not answer for 100 exchanges");
+
+    let mut test = Test::new(STEADY);
+    test.side.begin(Fault::Refuses("start"));
+    test.rig.try_reset();
+    let error = failure(&test.rig.until_stopped()).to_string();
+    assert!(error.contains("in/start: \"Could not"), "{error}");
+    assert_eq!(test.n_velocities(), [0, 0]);
+}
+
+#[test]
+fn arms_whose_commander_hangs_or_is_killed_stand_still() {
+    let test = Test::moving();
+    let n_velocities = test.n_velocities();
+    for _ in 0..30 {
+        test.side.pass();
+    }
+    assert!(at_rest(&test.side.ros().pair));
+    assert!(test.n_velocities()[0] <= n_velocities[0] + 1);
+}
+
+#[test]
+fn a_dropped_executor_leaves_stopped_arms() {
+    let Test { side, rig, .. } = Test::moving();
+    drop(rig);
+    eventually("the stops arrive", || {
+        side.pass();
+        side.ros().nodes.iter().all(|node| node.stopped)
+    });
+    for _ in 0..30 {
+        side.pass();
+    }
+    assert!(at_rest(&side.ros().pair));
+}
+
+#[test]
+fn nothing_moves_over_a_new_connection_before_a_reset() {
+    let mut test = Test::moving();
+    test.side.begin(Fault::Close);
+    test.rig.until_stopped();
+    test.assert_rests();
+    test.side.ros().fault = None;
+    let Test { side, motion, .. } = test;
+    let pair = std::sync::Arc::clone(&side.ros().pair);
+    let rested = angles(&pair);
+
+    let driver = connected(&side);
+    let mut test = Test::with(side, driver, motion);
+    let n_velocities = test.n_velocities();
+    for _ in 0..30 {
+        assert_eq!(test.rig.tick(), Phase::Stopped);
+        assert!(matches!(test.rig.executor.stopped_by().unwrap().cause, StopCause::NotReset));
+        let started = test.rig.executor.start(OWNER, test.motion.clone(), 1.0, test.rig.now_s);
+        assert_eq!(started, Err(StartError::NotIdle(Phase::Stopped)));
+    }
+    assert_stayed(&pair, &rested);
+    assert_eq!(test.n_velocities(), n_velocities);
+    test.let_go();
+}
+
+#[test]
+fn a_connection_has_to_begin_with_a_stop() {
+    let side = Side::new(&pair_at(&sweep(STEADY)));
+    let mut driver = connected(&side);
+    let arm = ArmCommand { velocities: Joints::from_fn(4, |_| 0.3), opening: 0.5 };
+    let command = Command { number: 1, order: Order::Move(vec![arm; 2]) };
+    let refused = driver.exchange(&command).unwrap_err();
+    assert!(matches!(refused, DriverError::Refused { .. }), "{refused}");
+    assert_eq!(driver.stop().unwrap_err(), refused);
+    eventually("the stops arrive", || {
+        side.pass();
+        side.ros().nodes.iter().all(|node| node.stopped && node.n_velocities == 0)
+    });
+}
+
+#[test]
+fn commands_do_not_pile_up_before_a_rosbridge_that_does_not_read() {
+    let side = Side::new(&pair_at(&sweep(STEADY)));
+    let mut driver = connected(&side);
+    let arm = ArmCommand { velocities: Joints::from_fn(4, |_| 0.0), opening: 0.8 };
+    let moves = |number| Command { number, order: Order::Move(vec![arm; 2]) };
+    driver.exchange(&Command { number: 1, order: Order::Stop }).unwrap();
+    let mut number = 1;
+    eventually("both nodes follow", || {
+        side.pass();
+        number += 1;
+        driver.exchange(&moves(number)).unwrap();
+        side.ros().nodes.iter().all(|node| node.n_velocities > 0)
+    });
+    // From here on nobody reads.
+    let error = (number..10_000_000).find_map(|number| driver.exchange(&moves(number)).err());
+    assert!(error.unwrap().to_string().contains("rosbridge holds 100 velocities"));
+}
+
+#[test]
+fn a_connection_without_states_says_what_to_look_at() {
+    let config = |address: String| KinovaRosConfig {
+        connect_timeout: Duration::from_millis(300),
+        ..KinovaRosConfig::at(address)
+    };
+    let check = |config: KinovaRosConfig, expected: &str| {
+        let error = KinovaRosDriver::connect(config).unwrap_err().to_string();
+        assert!(error.contains(expected), "{error}");
+    };
+    let side = Side::new(&pair_at(&sweep(STEADY)));
+    side.begin(Fault::Silent(1));
+    check(config(side.address.to_string()), "no out/joint_state of both /left/m1n4s200_driver and");
+
+    let closed = TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap();
+    check(config(closed.to_string()), "does rosbridge_websocket run");
+    let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+    let address = listener.local_addr().unwrap().to_string();
+    let server = thread::spawn(move || {
+        let (mut stream, _) = listener.accept().unwrap();
+        let mut asked = [0; 16];
+        stream.read_exact(&mut asked).unwrap();
+        stream.write_all(b"HTTP/1.1 404 Not Found\r\nContent-Length: 0\r\n\r\n").unwrap();
+        stream
+    });
+    check(config(address), "no websocket: ");
+    drop(server.join().unwrap());
+}

@@ -1,0 +1,9 @@
+//! The drivers of real arms against stand-ins that speak what the arms' side speaks, over real sockets, with a simulated pair
+//! behind them.
+#![expect(clippy::unwrap_used, clippy::panic, reason = "a test panics where it fails")]
+
+mod kinova;
+mod kinova_side;
+mod quarc;
+mod quarc_side;
+mod rig;

@@ -1,0 +1,168 @@
+//! A stand-in for the Simulink model: reads commands and sends states as a stream server does, and brakes when it should.
+
+use std::io::{Read as _, Write as _};
+use std::net::{SocketAddr, TcpListener, TcpStream};
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::{Arc, Mutex};
+use std::thread;
+use std::time::Duration;
+
+use tandem_bridge::quarc::codec::{
+    COMMAND_LEN, decode_command, encode_state, from_bytes, to_bytes,
+};
+use tandem_bridge::{Command, Driver as _, Order, PairState};
+
+use crate::rig::SharedPair;
+
+/// What goes wrong with the states that are sent from now on.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) enum Fault {
+    /// Half of a vector, and then nothing.
+    Short,
+    /// A vector that lacks its last number.
+    Narrow,
+    /// This number is this value.
+    Number(usize, f64),
+    /// The sequence jumps.
+    Jump,
+    /// The connection is closed.
+    Close,
+    /// States do not come any more.
+    Mute,
+    /// Bytes come in two packets.
+    Split,
+    /// Two states come at once.
+    Twice,
+}
+
+/// The arms' side.
+pub(crate) struct Side {
+    pub(crate) address: SocketAddr,
+    pub(crate) pair: SharedPair,
+    pub(crate) fault: Arc<Mutex<Option<Fault>>>,
+    /// Connections that have ended and whose arms were left alone for a while.
+    pub(crate) n_ended: Arc<AtomicUsize>,
+    /// The commands of all connections.
+    pub(crate) commands: Arc<Mutex<Vec<Command>>>,
+}
+
+impl Side {
+    /// Listens on a port of its own.
+    pub(crate) fn new(pair: &SharedPair) -> Self {
+        let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+        let side = Self {
+            address: listener.local_addr().unwrap(),
+            pair: Arc::clone(pair),
+            fault: Arc::default(),
+            n_ended: Arc::default(),
+            commands: Arc::default(),
+        };
+        let model = Model {
+            pair: Arc::clone(&side.pair),
+            fault: Arc::clone(&side.fault),
+            commands: Arc::clone(&side.commands),
+            sequence: 1000,
+        };
+        let n_ended = Arc::clone(&side.n_ended);
+        thread::spawn(move || serve(&listener, model, &n_ended));
+        side
+    }
+
+    pub(crate) fn begin(&self, fault: Fault) {
+        *self.fault.lock().unwrap() = Some(fault);
+    }
+
+    pub(crate) fn end(&self) {
+        *self.fault.lock().unwrap() = None;
+    }
+
+    pub(crate) fn n_ended(&self) -> usize {
+        self.n_ended.load(Ordering::SeqCst)
+    }
+}
+
+/// Takes one peer after the other. Samples go on without a peer.
+fn serve(listener: &TcpListener, mut model: Model, n_ended: &AtomicUsize) {
+    for stream in listener.incoming() {
+        model.talk(stream.unwrap());
+        for _ in 0..20 {
+            model.pair.lock().unwrap().pass();
+        }
+        n_ended.fetch_add(1, Ordering::SeqCst);
+    }
+}
+
+struct Model {
+    pair: SharedPair,
+    fault: Arc<Mutex<Option<Fault>>>,
+    commands: Arc<Mutex<Vec<Command>>>,
+    sequence: u64,
+}
+
+impl Model {
+    fn talk(&mut self, mut stream: TcpStream) {
+        stream.set_nodelay(true).unwrap();
+        let (mut number, mut obeys) = (0, false);
+        let state = self.pair.lock().unwrap().pass();
+        if !self.send(&mut stream, state) {
+            return;
+        }
+        let mut bytes = [0; 8 * COMMAND_LEN];
+        while stream.read_exact(&mut bytes).is_ok() {
+            let Ok(command) = decode_command(&from_bytes(&bytes)) else { return };
+            self.commands.lock().unwrap().push(command.clone());
+            obeys |= command.order == Order::Stop;
+            if command.number == number && command.order == Order::Stop {
+                // Beside the commands, between two samples.
+                self.pair.lock().unwrap().stop().unwrap();
+                continue;
+            }
+            number = command.number;
+            let mut pair = self.pair.lock().unwrap();
+            let state = if obeys { pair.exchange(&command).unwrap() } else { pair.pass() };
+            drop(pair);
+            if !self.send(&mut stream, state) {
+                return;
+            }
+        }
+    }
+
+    /// Sends a state, or what has become of it. Says whether to go on.
+    fn send(&mut self, stream: &mut TcpStream, state: PairState) -> bool {
+        let fault = *self.fault.lock().unwrap();
+        let mut vector = encode_state(&self.counted(state)).unwrap();
+        match fault {
+            Some(Fault::Number(idx, value)) => vector[idx] = value,
+            Some(Fault::Jump) => vector[1] += 3.0,
+            _ => {}
+        }
+        let mut bytes = to_bytes(&vector);
+        match fault {
+            Some(Fault::Close) => return false,
+            Some(Fault::Mute) => return true,
+            Some(Fault::Short) => {
+                *self.fault.lock().unwrap() = Some(Fault::Mute);
+                bytes.truncate(100);
+            }
+            Some(Fault::Narrow) => bytes.truncate(bytes.len() - 8),
+            Some(Fault::Split) => {
+                if stream.write_all(&bytes[..100]).is_err() {
+                    return false;
+                }
+                thread::sleep(Duration::from_millis(1));
+                bytes.drain(..100);
+            }
+            Some(Fault::Twice) => {
+                let later = self.pair.lock().unwrap().pass();
+                bytes.extend(to_bytes(&encode_state(&self.counted(later)).unwrap()));
+            }
+            _ => {}
+        }
+        stream.write_all(&bytes).is_ok()
+    }
+
+    fn counted(&mut self, state: PairState) -> PairState {
+        self.sequence += 1;
+        PairState { sequence: self.sequence, ..state }
+    }
+}

@@ -1,0 +1,204 @@
+//! An executor on a driver of real arms, with time that passes in exchanges and not by a clock.
+
+use std::cell::Cell;
+use std::rc::Rc;
+use std::sync::{Arc, Mutex};
+use std::thread;
+use std::time::Duration;
+
+use glam::DVec3;
+use tandem_bridge::layout::{check_settings, mico_cell};
+use tandem_bridge::{
+    Command, Driver, DriverError, Executor, PairState, Phase, ResetError, Settings,
+    SimulatedConfig, SimulatedPair, StopCause, Token,
+};
+use tandem_core::ArmIndex;
+use tandem_kinematics::{ArmWayPoint, Joints, Motion, PlanSettings, WayPoint, check, plan};
+
+pub(crate) const OWNER: Token = Token(5);
+pub(crate) const PERIOD_S: f64 = 0.01;
+
+/// Sequence of the state that a driver has got by connecting.
+const FIRST: u64 = 1;
+
+/// A pair that a stand-in moves and a test looks at.
+pub(crate) type SharedPair = Arc<Mutex<SimulatedPair>>;
+
+/// A driver that can wait for a state.
+pub(crate) trait Listen: Driver {
+    fn listen(&mut self, patience: Duration) -> Result<PairState, DriverError>;
+}
+
+/// Exchanges, lets a period pass on the other side, and waits for the state that comes of it, however slow the machine is.
+pub(crate) struct Patient<D> {
+    pub(crate) inner: D,
+    /// Lets a period pass on the other side, where that does not do so by itself.
+    pass: Box<dyn FnMut()>,
+    /// Whether to wait; a test that lets states fail to come does not.
+    waits: Rc<Cell<bool>>,
+    seen: u64,
+}
+
+impl<D> Patient<D> {
+    pub(crate) fn new(inner: D, waits: &Rc<Cell<bool>>, pass: impl FnMut() + 'static) -> Self {
+        Self { inner, pass: Box::new(pass), waits: Rc::clone(waits), seen: FIRST }
+    }
+}
+
+impl<D: Listen> Driver for Patient<D> {
+    fn period_s(&self) -> f64 {
+        self.inner.period_s()
+    }
+
+    fn exchange(&mut self, command: &Command) -> Result<PairState, DriverError> {
+        let state = self.inner.exchange(command);
+        (self.pass)();
+        let mut state = state?;
+        for _ in 0..600 {
+            if !self.waits.get() || self.seen != state.sequence {
+                break;
+            }
+            state = self.inner.listen(Duration::from_millis(100))?;
+        }
+        self.seen = state.sequence;
+        Ok(state)
+    }
+
+    fn stop(&mut self) -> Result<(), DriverError> {
+        self.inner.stop()
+    }
+}
+
+/// The executor and its clock.
+pub(crate) struct Rig<D: Driver> {
+    pub(crate) executor: Executor<D>,
+    pub(crate) now_s: f64,
+}
+
+impl<D: Driver> Rig<D> {
+    pub(crate) fn new(driver: D, settings: Settings) -> Self {
+        Self { executor: Executor::new(mico_cell(), driver, settings).unwrap(), now_s: 77.0 }
+    }
+
+    /// Lets a period pass in which the owner is heard.
+    pub(crate) fn tick(&mut self) -> Phase {
+        self.now_s += PERIOD_S;
+        self.executor.acquire(OWNER, self.now_s).unwrap();
+        self.executor.tick(self.now_s)
+    }
+
+    /// Lets go what is stopped.
+    pub(crate) fn reset(&mut self) {
+        let phase = self.try_reset();
+        assert_eq!(phase, Phase::Idle, "{:?}", self.executor.stopped_by());
+    }
+
+    /// Resets, and ticks once.
+    pub(crate) fn try_reset(&mut self) -> Phase {
+        for _ in 0..15 {
+            assert_eq!(self.tick(), Phase::Stopped);
+        }
+        // Some arms tell less often than others.
+        for _ in 0..100 {
+            if let Err(ResetError::States { .. }) = self.executor.reset(OWNER, self.now_s) {
+                self.tick();
+            }
+        }
+        self.tick()
+    }
+
+    /// Starts `motion`.
+    pub(crate) fn start(&mut self, motion: &Motion) {
+        self.executor.start(OWNER, motion.clone(), 1.0, self.now_s).unwrap();
+    }
+
+    /// Plays what was started to its end; the number of ticks.
+    pub(crate) fn play(&mut self) -> usize {
+        for n in 1..100_000 {
+            match self.tick() {
+                Phase::Idle => return n,
+                Phase::Stopped => panic!("{}", self.executor.stopped_by().unwrap()),
+                _ => {}
+            }
+        }
+        panic!("no end");
+    }
+
+    /// Ticks until the executor stops, and says why.
+    pub(crate) fn until_stopped(&mut self) -> StopCause {
+        for _ in 0..2000 {
+            if self.tick() == Phase::Stopped {
+                return self.executor.stopped_by().unwrap().cause.clone();
+            }
+        }
+        panic!("not stopped");
+    }
+}
+
+/// What the driver failed by.
+pub(crate) fn failure(cause: &StopCause) -> &DriverError {
+    match cause {
+        StopCause::Driver(error) => error,
+        other => panic!("stopped by {other}"),
+    }
+}
+
+/// Arms at rest where `motion` begins.
+pub(crate) fn pair_at(motion: &Motion) -> SharedPair {
+    let at: Vec<Joints> = motion.arms.iter().map(|samples| samples[0].angles).collect();
+    let opening = motion.arms[0][0].opening;
+    Arc::new(Mutex::new(SimulatedPair::new(mico_cell(), &at, opening, SimulatedConfig::default())))
+}
+
+/// The true joint angles.
+pub(crate) fn angles(pair: &SharedPair) -> Vec<Joints> {
+    let pair = pair.lock().unwrap();
+    [0, 1].map(|arm| *pair.angles(ArmIndex(arm))).to_vec()
+}
+
+/// Whether nothing moves. Arms that follow a velocity of zero come to rest little by little.
+pub(crate) fn at_rest(pair: &SharedPair) -> bool {
+    let pair = pair.lock().unwrap();
+    let rest = |arm| pair.velocities(ArmIndex(arm)).iter().all(|rate| rate.abs() < 1e-4);
+    rest(0) && rest(1)
+}
+
+/// The arms are where `motion` ends.
+pub(crate) fn assert_ended(pair: &SharedPair, motion: &Motion) {
+    for (samples, angles) in motion.arms.iter().zip(angles(pair)) {
+        let off_rad = samples[samples.len() - 1].angles.largest_difference(&angles);
+        assert!(off_rad < 0.3_f64.to_radians(), "{off_rad} rad from the end");
+    }
+}
+
+/// Waits until something is so, on machines of any speed.
+pub(crate) fn eventually(what: &str, mut so: impl FnMut() -> bool) {
+    for _ in 0..12_000 {
+        if so() {
+            return;
+        }
+        thread::sleep(Duration::from_millis(10));
+    }
+    panic!("{what}: not in two minutes");
+}
+
+/// Both arms out and back over the table, with grippers that close on the way where `openings` says so.
+pub(crate) fn sweep(openings: [f64; 4]) -> Motion {
+    let cell = mico_cell();
+    let places = [
+        [DVec3::new(-0.04, -0.05, 0.10), DVec3::new(-0.02, 0.04, 0.12)],
+        [DVec3::new(0.00, 0.00, 0.06), DVec3::new(-0.05, 0.00, 0.08)],
+        [DVec3::new(-0.03, 0.04, 0.08), DVec3::new(-0.04, -0.05, 0.06)],
+        [DVec3::new(-0.05, 0.02, 0.10), DVec3::new(-0.02, -0.02, 0.10)],
+    ];
+    let way_point = |(own, opening): (&[DVec3; 2], f64)| {
+        let tool = |arm: usize| cell.world_from_own(ArmIndex(arm), own[arm]);
+        [0, 1].map(|arm| ArmWayPoint { tool_in_world_m: tool(arm), opening }).to_vec()
+    };
+    let way_points: Vec<WayPoint> = places.iter().zip(openings).map(way_point).collect();
+    let start = cell.ready(0.05).unwrap();
+    let motion = plan(&cell, &way_points, &start, &PlanSettings::default()).unwrap().sampled(100.0);
+    let at: Vec<Joints> = motion.arms.iter().map(|samples| samples[0].angles).collect();
+    check(&cell, &motion, &at, &check_settings()).unwrap();
+    motion
+}
