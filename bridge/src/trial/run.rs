@@ -80,7 +80,7 @@ impl Trials {
             Mode::Twin => Some(self.rehearse_on_twin(&start, &at, number, policy)?),
             Mode::ClosedLoop => None,
         };
-        let pair = self.pair(&start, &at, number, self.config.simulated.clone());
+        let pair = self.pair(&start, &at, number, &self.config.simulated);
         let lain: Vec<ObjectPose> = pair.objects();
         let goals = self.in_world(&start.goals);
         let mut stage = Stage::new(self.mapping.cell().clone(), pair, goals, witness)?;
@@ -163,7 +163,7 @@ impl Trials {
         number: u64,
         policy: &mut dyn Decide,
     ) -> Result<Blind, TrialError> {
-        let pair = self.pair(start, at, number, twin_of(&self.config.simulated));
+        let pair = self.pair(start, at, number, &twin_of(&self.config.simulated));
         let mut nobody = NoWitness;
         let mut stage = Stage::new(self.mapping.cell().clone(), pair, Vec::new(), &mut nobody)?;
         let (course, hands) = self.closed_loop(&mut stage, start, at, policy);
@@ -255,7 +255,7 @@ impl Trials {
         start: &TrialStart,
         at: &[Joints],
         number: u64,
-        simulated: SimulatedConfig,
+        simulated: &SimulatedConfig,
     ) -> SimulatedPair {
         let block = |at: DVec3| {
             let at = at.as_vec3();
@@ -264,7 +264,7 @@ impl Trials {
         let config = SimulatedConfig {
             seed: self.config.seed.wrapping_mul(1_000_003).wrapping_add(number),
             blocks: self.in_world(&start.objects).into_iter().map(block).collect(),
-            ..simulated
+            ..simulated.clone()
         };
         let opening = self.mapping.opening(start.opening_m);
         SimulatedPair::new(self.mapping.cell().clone(), at, opening, config)
