@@ -2,19 +2,22 @@
 //!
 //! From the bottom up: [`driver`] is the contract between the executor and a pair of arms, [`executor`] plays a motion
 //! through a driver and is the envelope round it while it moves, and [`simulated`] is a pair of Kinova Micos with physics of its own, which
-//! stands in where there are no arms. [`layout`] says how the arms stand and what their motions have to keep.
+//! stands in where there are no arms. [`layout`] says how the arms stand and what their motions have to keep. [`service`] offers
+//! it all as `tandem.v1.Bridge`.
 //!
-//! Nothing here reads a clock or knows a wire: whoever ticks the executor says what time it is, in seconds since a start of
-//! their own.
+//! Nothing here reads a clock, and nothing below the service knows a wire: whoever ticks the executor says what time it is,
+//! in seconds since a start of their own.
 #![warn(missing_docs)]
 
 pub mod driver;
 pub mod executor;
 pub mod layout;
+pub mod service;
 pub mod simulated;
 
 pub use driver::{ArmCommand, ArmReading, Command, Driver, DriverError, Faults, Order, PairState};
 pub use executor::{
-    Executor, LeaseError, Phase, Progress, ResetError, Settings, StartError, Stop, StopCause, Token,
+    CheckError, CheckedMotion, Checker, Executor, LeaseError, Phase, Progress, ResetError,
+    Settings, StartError, Stop, StopCause, Token,
 };
 pub use simulated::{SimulatedConfig, SimulatedPair};
