@@ -4,7 +4,9 @@ use std::fs::File;
 use std::io::Read as _;
 use std::sync::Arc;
 
+use anyhow::Context as _;
 use tandem_bridge::service::{Config, Error};
+use tokio::runtime::{Builder, Runtime};
 
 use crate::cli::{BridgeArgs, BridgeCommand, BridgeServeArgs};
 use crate::exit::{Exit, Failed, OrExit as _};
@@ -18,6 +20,8 @@ mod show;
 
 /// Where the system's secrets come from.
 const ENTROPY: &str = "/dev/urandom";
+/// Threads for sockets.
+const SOCKET_THREADS: usize = 2;
 
 pub(crate) fn bridge(args: BridgeArgs) -> Result<(), Failed> {
     match args.command {
@@ -33,7 +37,8 @@ pub(crate) fn bridge(args: BridgeArgs) -> Result<(), Failed> {
 fn serve(args: BridgeServeArgs) -> Result<(), Failed> {
     let gate = access::gate(&args.listen, &args.secret)?;
     let secret = secret().or_exit(Exit::TryAgain, || format!("cannot read {ENTROPY}"))?;
-    services::run(async move {
+    let runtime = runtime().or_exit(Exit::TryAgain, String::new)?;
+    runtime.block_on(async move {
         let shutdown = services::shutdown(args.listen.exit_with_stdin)?;
         let listener = services::listen(&args.listen).await?;
         let time = Arc::new(clock::Ticking::new());
@@ -49,6 +54,12 @@ fn serve(args: BridgeServeArgs) -> Result<(), Failed> {
             tandem_bridge::service::serve(executor, config, listener, &gate, shutdown).await;
         served.map_err(bridge_failed)
     })
+}
+
+/// A runtime whose sockets do not wait for one another: a stop is heard while a long motion is being read.
+fn runtime() -> anyhow::Result<Runtime> {
+    let mut runtime = Builder::new_multi_thread();
+    runtime.worker_threads(SOCKET_THREADS).enable_all().build().context("cannot start the runtime")
 }
 
 /// What nobody can guess.

@@ -96,7 +96,7 @@ pub(crate) fn runtime() -> anyhow::Result<Runtime> {
     Builder::new_current_thread().enable_all().build().context("cannot start the runtime")
 }
 
-pub(crate) fn run(service: impl Future<Output = Result<(), Failed>>) -> Result<(), Failed> {
+fn run(service: impl Future<Output = Result<(), Failed>>) -> Result<(), Failed> {
     runtime().or_exit(Exit::TryAgain, String::new)?.block_on(service)
 }
 

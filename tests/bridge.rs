@@ -189,8 +189,8 @@ fn operators_look_reset_move_and_stop() {
     let lines = bridge.run(&["status"]);
     assert!(lines.stdout.starts_with(b"phase   stopped: at "));
 
-    let health = tandem(&["health", &bridge.address, "--service", "tandem.v1.Bridge"]);
-    let health = { health }.output().expect("runs");
+    let mut health = tandem(&["health", &bridge.address, "--service", "tandem.v1.Bridge"]);
+    let health = health.output().expect("runs");
     assert_eq!(health.stdout, b"serving\n");
     let mut bridge = bridge;
     signal(&bridge.served, "-TERM");
@@ -225,7 +225,8 @@ fn a_motion_that_cannot_be_is_refused_and_moves_nothing() {
     try_out(&one_arm.to_string(), "way_points[0].arms: expected 2 arms, got 1 arms");
     let missing = Path::new("no-such-motion.json").to_string_lossy();
     fails_with(65, &bridge.run(&["move", &missing]), "cannot read \"no-such-motion.json\"");
-    fails_with(64, &bridge.run(&["move", &path, "--connect", "nowhere"]), "is not an address");
+    let mut nowhere = tandem(&["bridge", "move", &path, "--connect", "nowhere"]);
+    fails_with(64, &nowhere.output().expect("runs"), "is not an address");
 }
 
 #[test]

@@ -18,7 +18,11 @@ pub(super) fn phase(phase: pb::BridgePhase) -> &'static str {
 pub(super) fn status_lines(status: &pb::BridgeStatusResponse) -> Vec<String> {
     let why =
         status.stopped.as_ref().map_or_else(String::new, |stop| format!(": {}", stop.sentence));
-    let rests = if status.at_rest { "at rest" } else { "in motion, or nobody knows" };
+    let rests = match (status.at_rest, status.arms.is_empty()) {
+        (true, _) => "at rest",
+        (false, false) => "moving",
+        (false, true) => "nobody knows whether they move",
+    };
     let owner = if status.is_owned {
         format!("somebody, for another {:.1} s unless they renew", status.lease_left_s)
     } else {
@@ -69,9 +73,10 @@ fn arm_line(idx: usize, arm: &pb::ArmState) -> String {
     line
 }
 
-/// Metres, to the millimetre.
+/// Metres, to the millimetre; nothing is -0.000.
 fn place(metres: &[f64]) -> String {
-    let numbers: Vec<String> = metres.iter().map(|metres| format!("{metres:.3}")).collect();
+    let rounded = metres.iter().map(|metres| (metres * 1e3).round() / 1e3 + 0.0);
+    let numbers: Vec<String> = rounded.map(|metres| format!("{metres:.3}")).collect();
     numbers.join(" ")
 }
 

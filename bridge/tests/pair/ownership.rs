@@ -223,3 +223,13 @@ fn a_lease_is_renewed_by_its_owner_only_and_says_how_long_it_holds() {
     assert_eq!(rig.executor.renew(OWNER, rig.now_s), Err(LeaseError::Nobody));
     assert_eq!(rig.executor.lease_left_s(rig.now_s), None);
 }
+
+#[test]
+fn after_a_failure_of_the_driver_a_reset_wants_good_states_anew() {
+    let motion = walk(TASKS, 8, 3);
+    let mut rig = Rig::ready(&motion, config());
+    rig.injection.borrow_mut().begin(Kind::DriverError, ArmIndex(0), 0);
+    assert_eq!(rig.tick(), Phase::Stopped);
+    let reset = rig.executor.reset(OWNER, rig.now_s);
+    assert_eq!(reset, Err(ResetError::States { got: 0 }), "what was seen last is not old yet");
+}
