@@ -2,6 +2,7 @@
 //!
 //! The arms move in real time. On a machine that is busy with other things the program may come too late for them, and then
 //! it stops them, as it should; these tests try again.
+#![expect(clippy::panic, reason = "a test panics where it fails")]
 
 use std::io::{BufRead as _, BufReader};
 use std::path::Path;

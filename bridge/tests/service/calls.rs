@@ -5,7 +5,7 @@ use tandem_kinematics::{ArmWayPoint, PlanSettings, plan};
 use tandem_proto::pb;
 use tonic::Code;
 
-use crate::rig::{READY_M, Rig, UP_M, patient, slow, through};
+use crate::rig::{DEADLINE, READY_M, Rig, UP_M, patient, slow, through};
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn the_arms_are_described() {
@@ -155,6 +155,22 @@ async fn a_check_says_what_is_wrong_and_moves_nothing() {
     );
     assert_eq!(close.name, "arms-gap", "{close:?}");
     assert_eq!(rig.tap.angles(), before);
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_long_motion_is_checked_beside_the_ticks() {
+    let mut rig = Rig::new(patient()).await;
+    rig.eventually(|status| !status.arms.is_empty()).await;
+    // No tick can come: whoever needed one to check would wait for ever.
+    rig.clock.hold();
+    let long = through(&[UP_M, READY_M].repeat(200), 1.0);
+    let checking = rig.client.check(pb::CheckRequest { motion: Some(long) });
+    let checked = tokio::time::timeout(DEADLINE, checking).await.unwrap().unwrap().into_inner();
+    let Some(pb::check_response::Verdict::Accepted(accepted)) = checked.verdict else {
+        panic!("{checked:?}")
+    };
+    assert!(accepted.duration_s > 60.0, "{accepted:?}");
+    rig.clock.free();
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
