@@ -7,7 +7,10 @@ use prost::Message as _;
 
 fn main() -> Result<(), Box<dyn Error>> {
     println!("cargo:rerun-if-changed=proto");
-    let files = protox::compile(["tandem/v1/teacher.proto", "tandem/v1/learner.proto"], ["proto"])?;
+    let files = protox::compile(
+        ["tandem/v1/teacher.proto", "tandem/v1/learner.proto", "tandem/v1/bridge.proto"],
+        ["proto"],
+    )?;
     let out = PathBuf::from(std::env::var_os("OUT_DIR").ok_or("cargo sets OUT_DIR")?);
     std::fs::write(out.join("tandem_descriptor.bin"), files.encode_to_vec())?;
     tonic_prost_build::configure().compile_fds(files)?;

@@ -6,6 +6,12 @@ use std::time::Duration;
 
 use clap::{Args, Parser, Subcommand, ValueEnum};
 
+mod bridge;
+
+pub(crate) use bridge::{
+    BridgeArgs, BridgeCommand, BridgeServeArgs, ConnectArgs, DriverName, MoveArgs, OperatorArgs,
+};
+
 /// Teaches robots with two arms by letting a robot with one arm advise them.
 #[derive(Debug, Parser)]
 #[command(
@@ -45,6 +51,8 @@ pub(crate) enum Command {
     Learner(LearnerArgs),
     /// Plays episodes for a learner.
     Worker(WorkerArgs),
+    /// Serves a pair of arms, real or simulated, and tells them what to do.
+    Bridge(BridgeArgs),
     /// Asks a service whether it serves.
     Health(HealthArgs),
     /// Measures simulation, networks, updates, replay and a short run on this machine.
@@ -361,7 +369,7 @@ pub(crate) struct HealthArgs {
     /// The service's address.
     #[arg(value_name = "ADDR")]
     pub(crate) address: String,
-    /// One service, tandem.v1.Teacher or tandem.v1.Learner [default: all that is offered there].
+    /// One service, tandem.v1.Teacher, tandem.v1.Learner or tandem.v1.Bridge [default: all that is offered there].
     #[arg(long, default_value = "", hide_default_value = true, value_name = "NAME")]
     pub(crate) service: String,
     /// Seconds to wait for the answer.

@@ -3,6 +3,8 @@
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
+use tandem_bridge::service::Time;
+
 /// The time since this function was called, for those who take time as an argument.
 pub(crate) fn since_now() -> Arc<dyn Fn() -> Duration + Send + Sync> {
     let start = now();
@@ -20,4 +22,25 @@ pub(crate) fn now() -> Instant {
 pub(crate) fn unix_millis() -> u64 {
     let since = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default();
     u64::try_from(since.as_millis()).unwrap_or_default()
+}
+
+/// The clock by which arms are moved. It begins with its making.
+pub(crate) struct Ticking(Instant);
+
+impl Ticking {
+    pub(crate) fn new() -> Self {
+        Self(now())
+    }
+}
+
+impl Time for Ticking {
+    fn now_s(&self) -> f64 {
+        self.0.elapsed().as_secs_f64()
+    }
+
+    fn sleep_until(&self, when_s: f64) {
+        if let Ok(left) = Duration::try_from_secs_f64(when_s - self.now_s()) {
+            std::thread::sleep(left);
+        }
+    }
 }

@@ -9,6 +9,7 @@ use clap::Parser as _;
 
 mod access;
 mod bench;
+mod bridge;
 mod cli;
 mod clock;
 mod eval;
@@ -46,6 +47,7 @@ fn main() -> ExitCode {
         Command::Teacher(args) => services::teacher(args),
         Command::Learner(args) => services::learner(args),
         Command::Worker(args) => services::worker(args),
+        Command::Bridge(args) => bridge::bridge(args),
         Command::Health(args) => health::health(&args),
         Command::Bench(args) => bench::bench(&args),
         Command::Policy(args) => files::policy(&args),

@@ -19,8 +19,9 @@ pub(crate) const VERSION: &str = env!("CARGO_PKG_VERSION");
 
 /// Sends log lines to standard error: of services from `info` up, of everything else warnings.
 pub(crate) fn start_logging(cli: &Cli) -> Result<(), Failed> {
-    let level = match cli.command {
+    let level = match &cli.command {
         Command::Teacher(_) | Command::Learner(_) | Command::Worker(_) => LevelFilter::INFO,
+        Command::Bridge(args) if args.command.is_none() => LevelFilter::INFO,
         _ => LevelFilter::WARN,
     };
     let directives = cli.log.clone().or_else(rust_log);
@@ -99,14 +100,14 @@ fn run(service: impl Future<Output = Result<(), Failed>>) -> Result<(), Failed> 
     runtime().or_exit(Exit::TryAgain, String::new)?.block_on(service)
 }
 
-fn shutdown(exit_with_stdin: bool) -> Result<CancellationToken, Failed> {
+pub(crate) fn shutdown(exit_with_stdin: bool) -> Result<CancellationToken, Failed> {
     signals::shutdown_token(exit_with_stdin)
         .or_exit(Exit::TryAgain, || "cannot watch for signals".to_owned())
 }
 
 /// Binds and says where, on one line of standard output.
 #[expect(clippy::print_stdout, reason = "the line that tells others the address")]
-async fn listen(args: &ListenArgs) -> Result<TcpListener, Failed> {
+pub(crate) async fn listen(args: &ListenArgs) -> Result<TcpListener, Failed> {
     let bind = async {
         let listener = TcpListener::bind(args.listen).await?;
         let address: SocketAddr = listener.local_addr()?;

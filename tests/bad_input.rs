@@ -18,6 +18,7 @@ use std::time::Duration;
 use prost::Message as _;
 use tandem_core::rng::{Stream, episode_rng, index};
 use tandem_proto::pb;
+use tandem_proto::pb::bridge_client::BridgeClient;
 use tandem_proto::pb::learner_client::LearnerClient;
 use tandem_proto::pb::teacher_client::TeacherClient;
 use tonic::Code;
@@ -226,6 +227,31 @@ fn a_teacher_that_is_sent_nonsense_serves_on_and_charges_nothing() {
     });
     assert!(teacher.peak_mib() < 256, "{} MiB", teacher.peak_mib());
     assert!(teacher.ends_on_sigterm(), "{N_IDLE} silent connections do not hold it up");
+    drop(idle);
+}
+
+#[test]
+fn a_bridge_that_is_sent_nonsense_moves_nothing_and_serves_on() {
+    let mut bridge = Running::service(&["bridge", "--driver", "sim", "--listen", "127.0.0.1:0"]);
+    let address = bridge.address;
+    let idle = idle_connections(address);
+    runtime().block_on(async {
+        let client = BridgeClient::connect(format!("http://{address}")).await;
+        let mut client = client.expect("connects");
+        attack(address, "tandem.v1.Bridge").await;
+        let status = client.status(pb::BridgeStatusRequest {}).await.expect("served").into_inner();
+        assert_eq!(status.phase(), pb::BridgePhase::Stopped, "nobody has let the arms go");
+        assert!(status.at_rest, "{status:?}");
+        for (arm, x_m) in status.arms.iter().zip([-0.12, 0.12]) {
+            for (at_m, was_m) in arm.tool_in_world_m.iter().zip([x_m, 0.0, 0.095]) {
+                assert!((at_m - was_m).abs() < 0.001, "{arm:?}");
+            }
+        }
+        let stopped = client.stop(pb::StopRequest {}).await;
+        assert!(stopped.is_ok(), "{stopped:?}");
+    });
+    assert!(bridge.peak_mib() < 256, "{} MiB", bridge.peak_mib());
+    assert!(bridge.ends_on_sigterm(), "{N_IDLE} silent connections do not hold it up");
     drop(idle);
 }
 

@@ -43,6 +43,20 @@ pub trait Driver {
     fn stop(&mut self) -> Result<(), DriverError>;
 }
 
+impl<D: Driver + ?Sized> Driver for Box<D> {
+    fn period_s(&self) -> f64 {
+        (**self).period_s()
+    }
+
+    fn exchange(&mut self, command: &Command) -> Result<PairState, DriverError> {
+        (**self).exchange(command)
+    }
+
+    fn stop(&mut self) -> Result<(), DriverError> {
+        (**self).stop()
+    }
+}
+
 /// What the arms shall do in the coming period.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Command {

@@ -16,29 +16,31 @@
 //! **Every way out stops the drives**: when the executor is dropped it tells them, and when its process is killed they
 //! fall silent (see [`driver`](crate::driver)).
 
-use tandem_core::ArmIndex;
-use tandem_kinematics::{Cell, Excess, Joints, Motion, Refusal, check};
+use tandem_kinematics::{Cell, Excess, Joints, Motion};
 
-use crate::driver::{ArmCommand, Command, Driver, Order, PairState};
+use crate::driver::{ArmCommand, Command, Driver, DriverError, Order, PairState};
 use crate::executor::envelope::{Envelope, History};
 use crate::executor::lease::Lease;
 use crate::executor::monitor::{Monitor, Told};
 use crate::executor::playback::{Moment, Playback};
+use crate::executor::refused::GOOD_STATES;
 use crate::executor::stop::Breach;
 
+pub use checked::{CheckError, CheckedMotion, Checker};
 pub use lease::{LeaseError, Token};
+pub use refused::{ResetError, StartError};
 pub use settings::{BadSetting, Settings};
 pub use stop::{Stop, StopCause};
 
+mod checked;
 mod envelope;
 mod lease;
 mod monitor;
 mod playback;
+mod refused;
 mod settings;
 mod stop;
 
-/// Good states in a row that a reset asks for.
-const GOOD_STATES: u32 = 10;
 /// Commands that are remembered beyond a reaction.
 const REMEMBERED_BEYOND: usize = 8;
 
@@ -66,64 +68,12 @@ pub struct Progress {
     pub duration_s: f64,
 }
 
-/// Why a motion was not started.
-#[derive(Debug, Clone, PartialEq, thiserror::Error)]
-#[non_exhaustive]
-pub enum StartError {
-    /// Whoever asks does not own the arms.
-    #[error(transparent)]
-    Lease(#[from] LeaseError),
-    /// The arms are not idle.
-    #[error("the arms are not idle but {0:?}")]
-    NotIdle(Phase),
-    /// The speed is not in (0, 1].
-    #[error("speed {0}, expected more than 0 and at most 1")]
-    Speed(f64),
-    /// No state is known, or it is too old.
-    #[error("nobody knows where the arms are")]
-    NoState,
-    /// The motion breaks a limit.
-    #[error("the motion is refused")]
-    Refused(#[from] Refusal),
-    /// The motion comes too near to the end of a joint's range; radians.
-    #[error("arm {} joint {} comes within {:.2} degrees of the end of its range, at least {:.2}",
-        .arm.0, .joint + 1, .excess.got.to_degrees(), .excess.allowed.to_degrees())]
-    RangeMargin {
-        /// The arm.
-        arm: ArmIndex,
-        /// The joint, counted from 0.
-        joint: usize,
-        /// How near it comes, and what it has to stay away.
-        excess: Excess,
-    },
-}
-
-/// Why stopped arms were not let go.
-#[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
-#[non_exhaustive]
-pub enum ResetError {
-    /// Whoever asks does not own the arms.
-    #[error(transparent)]
-    Lease(#[from] LeaseError),
-    /// The arms are not stopped.
-    #[error("the arms are not stopped but {0:?}")]
-    NotStopped(Phase),
-    /// The arms' states have not been good for long enough.
-    #[error("{got} good states in a row, at least {GOOD_STATES} are needed")]
-    States {
-        /// Good states in a row.
-        got: u32,
-    },
-    /// A joint still moves.
-    #[error("the arms still move")]
-    Moving,
-}
-
 /// Moves a pair of arms; nothing else may talk to their driver.
 #[derive(Debug)]
 pub struct Executor<D: Driver> {
     cell: Cell,
     settings: Settings,
+    checker: Checker,
     driver: D,
     period_s: f64,
     lease: Lease,
@@ -134,6 +84,8 @@ pub struct Executor<D: Driver> {
     history: History,
     before: Vec<ArmCommand>,
     ticked_s: Option<f64>,
+    /// Why the drives could not be told to stop, until they were.
+    untold: Option<DriverError>,
 }
 
 /// What the arms are doing, and what goes with it.
@@ -171,6 +123,8 @@ impl<D: Driver> Executor<D> {
             history: History::new(),
             before,
             ticked_s: None,
+            untold: None,
+            checker: Checker::new(cell.clone(), settings),
             cell,
             settings,
             driver,
@@ -186,6 +140,14 @@ impl<D: Driver> Executor<D> {
         self.lease.acquire(token, now_s, self.settings.lease_s)
     }
 
+    /// Notes that the owner was heard.
+    ///
+    /// # Errors
+    /// When whoever has `token` does not own the arms, or does no longer.
+    pub fn renew(&mut self, token: Token, now_s: f64) -> Result<(), LeaseError> {
+        self.lease.renew(token, now_s, self.settings.lease_s)
+    }
+
     /// Gives the arms up. A motion is stopped.
     ///
     /// # Errors
@@ -199,7 +161,20 @@ impl<D: Driver> Executor<D> {
         Ok(())
     }
 
-    /// Starts `motion` from where the arms are, at `speed` (in (0, 1], a share of the motion's own).
+    /// Time from one tick to the next, seconds.
+    #[must_use]
+    pub fn period_s(&self) -> f64 {
+        self.period_s
+    }
+
+    /// What checks motions for this executor.
+    #[must_use]
+    pub fn checker(&self) -> &Checker {
+        &self.checker
+    }
+
+    /// Checks `motion` and starts it from where the arms are, at `speed` (in (0, 1], a share of the motion's own). The
+    /// check of a long motion takes longer than a period: see [`start_checked`](Self::start_checked).
     ///
     /// # Errors
     /// Says what is wrong with the motion, or why this is not the time. Nothing moves then.
@@ -210,6 +185,39 @@ impl<D: Driver> Executor<D> {
         speed: f64,
         now_s: f64,
     ) -> Result<(), StartError> {
+        let at = self.startable(token, speed, now_s)?;
+        let motion = self.checker.check(motion, &at)?;
+        self.play(motion, speed);
+        Ok(())
+    }
+
+    /// Starts a motion that the [`checker`](Self::checker) has passed, if the arms are still where it begins.
+    ///
+    /// # Errors
+    /// As [`start`](Self::start).
+    pub fn start_checked(
+        &mut self,
+        token: Token,
+        motion: CheckedMotion,
+        speed: f64,
+        now_s: f64,
+    ) -> Result<(), StartError> {
+        let at = self.startable(token, speed, now_s)?;
+        if !motion.passed(&self.checker) {
+            return Err(StartError::OtherChecker);
+        }
+        motion.begins_at(&at)?;
+        self.play(motion, speed);
+        Ok(())
+    }
+
+    /// Where the arms are, joint angles in radians, when a motion may start now.
+    fn startable(
+        &mut self,
+        token: Token,
+        speed: f64,
+        now_s: f64,
+    ) -> Result<Vec<Joints>, StartError> {
         self.lease.renew(token, now_s, self.settings.lease_s)?;
         if self.phase() != Phase::Idle {
             return Err(StartError::NotIdle(self.phase()));
@@ -220,17 +228,25 @@ impl<D: Driver> Executor<D> {
         let stale_s = self.monitor.stale_s(now_s);
         let state = self.monitor.state().filter(|_| stale_s <= self.settings.state_hold_s);
         let state = state.ok_or(StartError::NoState)?;
-        let at: Vec<Joints> = state.arms.iter().map(|arm| arm.angles).collect();
-        check(&self.cell, &motion, &at, &self.settings.check)?;
-        self.check_margins(&motion)?;
-        let playback = Box::new(Playback::new(motion, speed));
+        if !self.monitor.at_rest() {
+            return Err(StartError::Moving);
+        }
+        Ok(state.arms.iter().map(|arm| arm.angles).collect())
+    }
+
+    fn play(&mut self, motion: CheckedMotion, speed: f64) {
+        let playback = Box::new(Playback::new(motion.into_motion(), speed));
         self.state = State::Playing { playback, holding: false };
-        Ok(())
     }
 
     /// Stops the arms. Anyone may at any time.
     pub fn stop(&mut self, now_s: f64) {
         self.halt(StopCause::Requested.anywhere(), now_s);
+    }
+
+    /// Stops the arms because whoever ticks the executor is about to end.
+    pub fn shut_down(&mut self, now_s: f64) {
+        self.halt(StopCause::ShutDown.anywhere(), now_s);
     }
 
     /// Lets stopped arms go: they stay where they are until a motion is started.
@@ -266,13 +282,17 @@ impl<D: Driver> Executor<D> {
         self.remember(&order);
         match self.driver.exchange(&Command { number: self.number, order }) {
             Ok(state) => {
+                self.untold = None;
                 let ago = self.history.len().min(self.lag_periods()) - 1;
                 let told = Told { number: self.number, velocities: &self.history[ago] };
                 if let Err(breach) = self.monitor.take(now_s, state, &told) {
                     self.halt(breach, now_s);
                 }
             }
-            Err(error) => self.halt(StopCause::Driver(error).anywhere(), now_s),
+            Err(error) => {
+                self.monitor.miss();
+                self.halt(StopCause::Driver(error).anywhere(), now_s);
+            }
         }
         self.phase()
     }
@@ -296,6 +316,19 @@ impl<D: Driver> Executor<D> {
             State::Stopped(stop) => Some(stop),
             _ => None,
         }
+    }
+
+    /// Why the drives could not be told to stop, as long as they were not.
+    #[must_use]
+    pub fn untold(&self) -> Option<&DriverError> {
+        self.untold.as_ref()
+    }
+
+    /// How long the present owner's lease holds unless it is renewed, seconds; `None` when nobody owns the arms.
+    #[must_use]
+    pub fn lease_left_s(&self, now_s: f64) -> Option<f64> {
+        let left_s = self.settings.lease_s - self.lease.silent_s(now_s);
+        (left_s > 0.0).then_some(left_s)
     }
 
     /// How far the present motion has come.
@@ -423,25 +456,7 @@ impl<D: Driver> Executor<D> {
             self.state = State::Stopped(breach.at(now_s));
         }
         // When this fails, the next command says it again, and without one the drives brake by themselves.
-        self.driver.stop().ok();
-    }
-
-    /// Whether every sample stays away from the ends of the joints' ranges.
-    fn check_margins(&self, motion: &Motion) -> Result<(), StartError> {
-        let allowed = self.settings.range_margin_rad;
-        for (arm, (samples, placed)) in motion.arms.iter().zip(&self.cell.arms).enumerate() {
-            for sample in samples {
-                for (idx, joint) in placed.model.joints.iter().enumerate() {
-                    let [low, high] = joint.range_rad;
-                    let got = (sample.angles[idx] - low).min(high - sample.angles[idx]);
-                    if got < allowed {
-                        let (arm, excess) = (ArmIndex(arm), Excess { got, allowed });
-                        return Err(StartError::RangeMargin { arm, joint: idx, excess });
-                    }
-                }
-            }
-        }
-        Ok(())
+        self.untold = self.driver.stop().err();
     }
 
     /// A reaction in periods.

@@ -2,13 +2,14 @@
 //!
 //! From the bottom up: [`driver`] is the contract between the executor and a pair of arms, [`executor`] plays a motion
 //! through a driver and is the envelope round it while it moves, and [`simulated`] is a pair of Kinova Micos with physics of its own, which
-//! stands in where there are no arms. [`layout`] says how the arms stand and what their motions have to keep.
+//! stands in where there are no arms. [`layout`] says how the arms stand and what their motions have to keep. [`service`] offers
+//! it all as `tandem.v1.Bridge`.
 //!
 //! Real arms are behind features of this crate: `quarc` for arms that a Simulink model drives by way of QUARC, `kinova-ros`
 //! for arms behind Kinova's ROS driver.
 //!
-//! Nothing here reads a clock, and but for the drivers of real arms nothing knows a wire: whoever ticks the executor says what
-//! time it is, in seconds since a start of their own.
+//! Nothing here reads a clock, and but for the service and the drivers of real arms nothing knows a wire: whoever ticks the
+//! executor says what time it is, in seconds since a start of their own.
 #![warn(missing_docs)]
 
 pub mod driver;
@@ -18,11 +19,13 @@ pub mod kinova_ros;
 pub mod layout;
 #[cfg(feature = "quarc")]
 pub mod quarc;
+pub mod service;
 pub mod simulated;
 pub mod trial;
 
 pub use driver::{ArmCommand, ArmReading, Command, Driver, DriverError, Faults, Order, PairState};
 pub use executor::{
-    Executor, LeaseError, Phase, Progress, ResetError, Settings, StartError, Stop, StopCause, Token,
+    CheckError, CheckedMotion, Checker, Executor, LeaseError, Phase, Progress, ResetError,
+    Settings, StartError, Stop, StopCause, Token,
 };
 pub use simulated::{SimulatedConfig, SimulatedPair};

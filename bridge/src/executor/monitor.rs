@@ -63,6 +63,11 @@ impl Monitor {
         self.n_good
     }
 
+    /// Notes that no state has come because the driver failed: good ones have to come anew.
+    pub(crate) fn miss(&mut self) {
+        self.n_good = 0;
+    }
+
     /// By how much more than a period the newest state is past, seconds; infinite when there is none.
     pub(crate) fn stale_s(&self, now_s: f64) -> f64 {
         self.newest.as_ref().map_or(f64::INFINITY, |seen| now_s - seen.at_s - self.period_s)

@@ -30,6 +30,9 @@ pub enum StopCause {
     /// Somebody asked for it.
     #[error("somebody stopped the arms")]
     Requested,
+    /// The program that moves the arms was told to end.
+    #[error("the program that moves the arms ends")]
+    ShutDown,
     /// The owner of a motion was not heard; seconds.
     #[error("the owner was silent for {:.3} s, at most {:.3} s", .0.got, .0.allowed)]
     OwnerSilent(Excess),

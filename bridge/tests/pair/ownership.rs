@@ -179,3 +179,57 @@ fn settings_that_make_no_sense_are_refused() {
     check(Settings { brake_s: 1.0, ..default }, "brake_s");
     check(Settings { lease_s: 0.5, ..default }, "lease_s");
 }
+
+#[test]
+fn a_checked_motion_starts_where_it_was_checked_for_and_nowhere_else() {
+    let motion = walk(TASKS, 6, 3);
+    let mut rig = Rig::ready(&motion, config());
+    let at: Vec<_> = motion.arms.iter().map(|samples| samples[0].angles).collect();
+    let checked = |rig: &Rig| rig.executor.checker().check(motion.clone(), &at).unwrap();
+    let of_another = checked(&Rig::new(&motion, config()));
+    let refused = rig.executor.start_checked(OWNER, of_another, 1.0, rig.now_s);
+    assert_eq!(refused, Err(StartError::OtherChecker));
+    let refused = rig.executor.start_checked(STRANGER, checked(&rig), 1.0, rig.now_s);
+    assert!(matches!(refused, Err(StartError::Lease(LeaseError::Held { .. }))));
+
+    let again = checked(&rig);
+    let started = rig.executor.start_checked(OWNER, checked(&rig), 1.0, rig.now_s);
+    assert_eq!(started, Ok(()));
+    while rig.tick_owned() != Phase::Idle {
+        assert!(rig.executor.stopped_by().is_none(), "{:?}", rig.executor.stopped_by());
+    }
+    // It was fine where it was checked, and the arms are elsewhere now.
+    let refused = rig.executor.start_checked(OWNER, again, 1.0, rig.now_s);
+    assert!(
+        matches!(&refused, Err(StartError::Refused(refusal)) if matches!(refusal.reason, Reason::Start(..))),
+        "{refused:?}"
+    );
+    assert_eq!(rig.tick(), Phase::Idle);
+}
+
+#[test]
+fn a_lease_is_renewed_by_its_owner_only_and_says_how_long_it_holds() {
+    let motion = walk(TASKS, 7, 3);
+    let mut rig = Rig::new(&motion, config());
+    assert_eq!(rig.executor.renew(OWNER, rig.now_s), Err(LeaseError::Nobody));
+    assert_eq!(rig.executor.lease_left_s(rig.now_s), None);
+    rig.executor.acquire(OWNER, rig.now_s).unwrap();
+    rig.now_s += 3.0;
+    assert!(matches!(rig.executor.renew(STRANGER, rig.now_s), Err(LeaseError::Held { .. })));
+    assert!((rig.executor.lease_left_s(rig.now_s).unwrap() - 2.0).abs() < 1e-9);
+    rig.executor.renew(OWNER, rig.now_s).unwrap();
+    assert!((rig.executor.lease_left_s(rig.now_s).unwrap() - 5.0).abs() < 1e-9);
+    rig.now_s += 5.0;
+    assert_eq!(rig.executor.renew(OWNER, rig.now_s), Err(LeaseError::Nobody));
+    assert_eq!(rig.executor.lease_left_s(rig.now_s), None);
+}
+
+#[test]
+fn after_a_failure_of_the_driver_a_reset_wants_good_states_anew() {
+    let motion = walk(TASKS, 8, 3);
+    let mut rig = Rig::ready(&motion, config());
+    rig.injection.borrow_mut().begin(Kind::DriverError, ArmIndex(0), 0);
+    assert_eq!(rig.tick(), Phase::Stopped);
+    let reset = rig.executor.reset(OWNER, rig.now_s);
+    assert_eq!(reset, Err(ResetError::States { got: 0 }), "what was seen last is not old yet");
+}

@@ -1,0 +1,128 @@
+//! Motions that have passed the check before they reach the executor, which must not wait for it.
+
+use std::sync::Arc;
+
+use tandem_core::ArmIndex;
+use tandem_kinematics::{Cell, Excess, Joints, Motion, Reason, Refusal, check};
+
+use crate::executor::settings::Settings;
+
+/// Checks motions for one executor, on any thread: long motions take far longer than a period.
+#[derive(Debug, Clone)]
+pub struct Checker(Arc<Terms>);
+
+/// What a motion has to keep, and for which arms.
+#[derive(Debug)]
+struct Terms {
+    cell: Cell,
+    settings: Settings,
+}
+
+/// A motion that has passed the check of an executor's own [`Checker`]; there is no other way to have one.
+#[derive(Debug, Clone)]
+pub struct CheckedMotion {
+    motion: Motion,
+    passed: Checker,
+}
+
+/// What is wrong with a motion.
+#[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
+#[non_exhaustive]
+pub enum CheckError {
+    /// It breaks a limit.
+    #[error(transparent)]
+    Refused(#[from] Refusal),
+    /// It comes too near to the end of a joint's range; radians.
+    #[error("at {when_s:.3} s arm {}: joint {} comes within {:.2} degrees of the end of its range, at least {:.2}",
+        .arm.0, .joint + 1, .excess.got.to_degrees(), .excess.allowed.to_degrees())]
+    RangeMargin {
+        /// When, seconds since the start of the motion.
+        when_s: f64,
+        /// The arm.
+        arm: ArmIndex,
+        /// The joint, counted from 0.
+        joint: usize,
+        /// How near it comes, and what it has to stay away.
+        excess: Excess,
+    },
+}
+
+impl Checker {
+    pub(crate) fn new(cell: Cell, settings: Settings) -> Self {
+        Self(Arc::new(Terms { cell, settings }))
+    }
+
+    /// The arms.
+    #[must_use]
+    pub fn cell(&self) -> &Cell {
+        &self.0.cell
+    }
+
+    /// What they may do.
+    #[must_use]
+    pub fn settings(&self) -> &Settings {
+        &self.0.settings
+    }
+
+    /// Passes a motion that keeps every limit from where the arms are: `at`, joint angles in radians, arm by arm.
+    ///
+    /// # Errors
+    /// Names the first limit that is broken.
+    pub fn check(&self, motion: Motion, at: &[Joints]) -> Result<CheckedMotion, CheckError> {
+        check(self.cell(), &motion, at, &self.settings().check)?;
+        self.check_margins(&motion)?;
+        Ok(CheckedMotion { motion, passed: self.clone() })
+    }
+
+    /// Whether every sample stays away from the ends of the joints' ranges.
+    fn check_margins(&self, motion: &Motion) -> Result<(), CheckError> {
+        let allowed = self.settings().range_margin_rad;
+        for (arm, (samples, placed)) in motion.arms.iter().zip(&self.cell().arms).enumerate() {
+            for (sample_idx, sample) in samples.iter().enumerate() {
+                for (joint, limits) in placed.model.joints.iter().enumerate() {
+                    let [low, high] = limits.range_rad;
+                    let got = (sample.angles[joint] - low).min(high - sample.angles[joint]);
+                    if got < allowed {
+                        let when_s = sample_idx as f64 * motion.period_s;
+                        let (arm, excess) = (ArmIndex(arm), Excess { got, allowed });
+                        return Err(CheckError::RangeMargin { when_s, arm, joint, excess });
+                    }
+                }
+            }
+        }
+        Ok(())
+    }
+}
+
+impl CheckedMotion {
+    /// The motion.
+    #[must_use]
+    pub fn motion(&self) -> &Motion {
+        &self.motion
+    }
+
+    pub(crate) fn into_motion(self) -> Motion {
+        self.motion
+    }
+
+    /// Whether it was checked for the executor that `checker` belongs to.
+    pub(crate) fn passed(&self, checker: &Checker) -> bool {
+        Arc::ptr_eq(&self.passed.0, &checker.0)
+    }
+
+    /// Whether it begins where the arms are now: `at`, radians, arm by arm.
+    pub(crate) fn begins_at(&self, at: &[Joints]) -> Result<(), Refusal> {
+        let allowed = self.passed.settings().check.start_rad;
+        for (arm, (samples, at)) in self.motion.arms.iter().zip(at).enumerate() {
+            for (joint, (begins, at)) in samples[0].angles.iter().zip(at.iter()).enumerate() {
+                let got = (begins - at).abs();
+                // NaN is nowhere.
+                if got.is_nan() || got > allowed {
+                    let reason = Reason::Start(joint, Excess { got, allowed });
+                    return Err(Refusal { when_s: 0.0, arm: ArmIndex(arm), reason });
+                }
+            }
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,83 @@
+//! Why the executor does not do what it is asked to.
+
+use tandem_core::ArmIndex;
+use tandem_kinematics::{Excess, Refusal};
+
+use crate::executor::Phase;
+use crate::executor::checked::CheckError;
+use crate::executor::lease::LeaseError;
+
+/// Good states in a row that a reset asks for.
+pub(crate) const GOOD_STATES: u32 = 10;
+
+/// Why a motion was not started.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+#[non_exhaustive]
+pub enum StartError {
+    /// Whoever asks does not own the arms.
+    #[error(transparent)]
+    Lease(#[from] LeaseError),
+    /// The arms are not idle.
+    #[error("the arms are not idle but {0:?}")]
+    NotIdle(Phase),
+    /// The speed is not in (0, 1].
+    #[error("speed {0}, expected more than 0 and at most 1")]
+    Speed(f64),
+    /// No state is known, or it is too old.
+    #[error("nobody knows where the arms are")]
+    NoState,
+    /// The motion breaks a limit.
+    #[error("the motion is refused")]
+    Refused(#[from] Refusal),
+    /// The motion comes too near to the end of a joint's range; radians.
+    #[error("the motion is refused: at {when_s:.3} s arm {}: joint {} comes within {:.2} degrees of the end of its range, at least {:.2}",
+        .arm.0, .joint + 1, .excess.got.to_degrees(), .excess.allowed.to_degrees())]
+    RangeMargin {
+        /// When, seconds since the start of the motion.
+        when_s: f64,
+        /// The arm.
+        arm: ArmIndex,
+        /// The joint, counted from 0.
+        joint: usize,
+        /// How near it comes, and what it has to stay away.
+        excess: Excess,
+    },
+    /// A joint still moves.
+    #[error("the arms still move")]
+    Moving,
+    /// The motion was checked for other arms or settings.
+    #[error("the motion was checked for another executor")]
+    OtherChecker,
+}
+
+impl From<CheckError> for StartError {
+    fn from(error: CheckError) -> Self {
+        match error {
+            CheckError::Refused(refusal) => Self::Refused(refusal),
+            CheckError::RangeMargin { when_s, arm, joint, excess } => {
+                Self::RangeMargin { when_s, arm, joint, excess }
+            }
+        }
+    }
+}
+
+/// Why stopped arms were not let go.
+#[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
+#[non_exhaustive]
+pub enum ResetError {
+    /// Whoever asks does not own the arms.
+    #[error(transparent)]
+    Lease(#[from] LeaseError),
+    /// The arms are not stopped.
+    #[error("the arms are not stopped but {0:?}")]
+    NotStopped(Phase),
+    /// The arms' states have not been good for long enough.
+    #[error("{got} good states in a row, at least {GOOD_STATES} are needed")]
+    States {
+        /// Good states in a row.
+        got: u32,
+    },
+    /// A joint still moves.
+    #[error("the arms still move")]
+    Moving,
+}

@@ -1,0 +1,245 @@
+//! From a request to a motion that has passed the check.
+
+use glam::DVec3;
+use tandem_kinematics::plan::MAX_WAY_POINTS;
+use tandem_kinematics::{
+    ArmSample, ArmWayPoint, Cell, Joints, Motion, PlanError, PlanSettings, Posture, WayPoint, plan,
+};
+use tandem_proto::{DecodeError, pb};
+
+use crate::driver::PairState;
+use crate::executor::{CheckError, CheckedMotion, Checker};
+
+/// Most samples of a joint motion: more than ten minutes at 100 a second have.
+const MAX_SAMPLES: usize = 60_001;
+/// Samples a second of what is planned here.
+const RATE_HZ: f64 = 100.0;
+
+/// What a client wants the arms to do.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct Wanted {
+    pub(super) way: Way,
+    /// Share of the motion's own speed, in (0, 1].
+    pub(super) speed: f64,
+}
+
+#[derive(Debug, Clone, PartialEq)]
+pub(super) enum Way {
+    /// Places of the tools.
+    Tools { way_points: Vec<WayPoint>, step_s: f64, from_here: bool },
+    /// Angles of the joints.
+    Joints(Motion),
+}
+
+/// Why the arms do not do it.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum Refused {
+    /// There is no way through these way points.
+    #[error("{}{}", .0, because(.0))]
+    Plan(PlanError),
+    /// The motion breaks a limit.
+    #[error(transparent)]
+    Check(#[from] CheckError),
+}
+
+/// What stands behind a plan's error.
+fn because(error: &PlanError) -> String {
+    match error {
+        PlanError::Unreachable { source, .. } => format!(": {source}"),
+        _ => String::new(),
+    }
+}
+
+impl Wanted {
+    /// What `request` wants of the arms of `cell`; fields are named from the motion on.
+    pub(super) fn decode(request: pb::MotionRequest, cell: &Cell) -> Result<Self, DecodeError> {
+        use pb::motion_request::Motion as M;
+        let speed = within("speed", request.speed, "more than 0 and at most 1", |speed| {
+            speed > 0.0 && speed <= 1.0
+        })?;
+        let way = match request.motion {
+            Some(M::WayPoints(message)) => {
+                decode_tools(message, cell).map_err(|error| error.within("way_points"))?
+            }
+            Some(M::JointMotion(message)) => {
+                decode_joints(message, cell).map_err(|error| error.within("joint_motion"))?
+            }
+            None => return Err(DecodeError::new("motion", "way_points or joint_motion", "none")),
+        };
+        Ok(Self { way, speed })
+    }
+
+    /// The motion from where the arms are, checked.
+    pub(super) fn prepare(
+        self,
+        state: &PairState,
+        checker: &Checker,
+    ) -> Result<CheckedMotion, Refused> {
+        let at: Vec<Joints> = state.arms.iter().map(|arm| arm.angles).collect();
+        let motion = match self.way {
+            Way::Joints(motion) => motion,
+            Way::Tools { mut way_points, step_s, from_here } => {
+                if from_here {
+                    way_points.insert(0, here(state, checker.cell()));
+                }
+                let limits = checker.settings().check.limits;
+                let settings = PlanSettings { limits, step_s, ..PlanSettings::default() };
+                let planned = plan(checker.cell(), &way_points, &at, &settings);
+                let planned = planned.map_err(|error| Refused::Plan(numbered(error, from_here)))?;
+                // Refused before it is sampled, which takes memory.
+                let longest_s = checker.settings().check.duration_s;
+                let rate_hz = if planned.duration_s() > 2.0 * longest_s { 1.0 } else { RATE_HZ };
+                planned.sampled(rate_hz)
+            }
+        };
+        Ok(checker.check(motion, &at)?)
+    }
+}
+
+/// Where the tools are.
+fn here(state: &PairState, cell: &Cell) -> WayPoint {
+    let arms = state.arms.iter().zip(&cell.arms);
+    let way_point = |(arm, placed): (&crate::ArmReading, &tandem_kinematics::PlacedArm)| {
+        let tool = Posture::of(placed.model, &arm.angles).tool().origin_m;
+        ArmWayPoint {
+            tool_in_world_m: placed.world_from_base(tool),
+            opening: arm.opening.clamp(0.0, 1.0),
+        }
+    };
+    arms.map(way_point).collect()
+}
+
+/// The error with way points counted as the client counts them.
+fn numbered(error: PlanError, from_here: bool) -> PlanError {
+    let client = |way_point: usize| way_point.saturating_sub(usize::from(from_here));
+    match error {
+        PlanError::Step { way_point, arm, step_m } => {
+            PlanError::Step { way_point: client(way_point), arm, step_m }
+        }
+        PlanError::Unreachable { way_point, arm, source } => {
+            PlanError::Unreachable { way_point: client(way_point), arm, source }
+        }
+        PlanError::Jump { way_point, arm, joint, jump_rad } => {
+            PlanError::Jump { way_point: client(way_point), arm, joint, jump_rad }
+        }
+        other => other,
+    }
+}
+
+fn decode_tools(message: pb::WayPoints, cell: &Cell) -> Result<Way, DecodeError> {
+    let (from_here, got) = (message.from_here, message.way_points.len());
+    let (least, most) = if from_here { (1, MAX_WAY_POINTS - 1) } else { (2, MAX_WAY_POINTS) };
+    if !(least..=most).contains(&got) {
+        return Err(DecodeError::new("way_points", format_args!("{least} to {most}"), got));
+    }
+    let step_s =
+        within("step_s", message.step_s, "a number of seconds in [0.001, 10]", |step_s| {
+            (0.001..=10.0).contains(&step_s)
+        })?;
+    let decode_indexed = |(idx, way_point)| {
+        decode_way_point(way_point, cell)
+            .map_err(|error| error.within(format_args!("way_points[{idx}]")))
+    };
+    let way_points = message.way_points.into_iter().enumerate().map(decode_indexed);
+    Ok(Way::Tools { way_points: way_points.collect::<Result<_, _>>()?, step_s, from_here })
+}
+
+fn decode_way_point(message: pb::BridgeWayPoint, cell: &Cell) -> Result<WayPoint, DecodeError> {
+    check_arms(message.arms.len(), cell)?;
+    let decode_indexed = |(idx, arm): (usize, pb::ArmWayPoint)| {
+        decode_arm(&arm).map_err(|error| error.within(format_args!("arms[{idx}]")))
+    };
+    message.arms.into_iter().enumerate().map(decode_indexed).collect()
+}
+
+fn decode_arm(message: &pb::ArmWayPoint) -> Result<ArmWayPoint, DecodeError> {
+    let field = "tool_in_world_m";
+    let numbers = &message.tool_in_world_m;
+    let [x, y, z] = numbers[..] else {
+        return Err(DecodeError::new(
+            field,
+            "3 numbers",
+            format_args!("{} numbers", numbers.len()),
+        ));
+    };
+    check_finite(field, numbers)?;
+    Ok(ArmWayPoint {
+        tool_in_world_m: DVec3::new(x, y, z),
+        opening: decode_opening(message.opening)?,
+    })
+}
+
+fn decode_joints(message: pb::JointMotion, cell: &Cell) -> Result<Way, DecodeError> {
+    let expected = "a number of seconds in [0.001, 0.1]";
+    let period_s = within("period_s", message.period_s, expected, |period_s| {
+        (0.001..=0.1).contains(&period_s)
+    })?;
+    check_arms(message.arms.len(), cell)?;
+    let n_samples = message.arms[0].samples.len();
+    let mut arms = Vec::with_capacity(message.arms.len());
+    for (arm, (message, placed)) in message.arms.into_iter().zip(&cell.arms).enumerate() {
+        let field = format!("arms[{arm}].samples");
+        let got = message.samples.len();
+        if !(2..=MAX_SAMPLES).contains(&got) {
+            return Err(DecodeError::new(field, format_args!("2 to {MAX_SAMPLES}"), got));
+        }
+        if got != n_samples {
+            let expected = format_args!("{n_samples}, as the first arm has").to_string();
+            return Err(DecodeError::new(field, expected, got));
+        }
+        let decode_indexed = |(idx, sample): (usize, pb::JointSample)| {
+            decode_sample(&sample, placed.model.n_joints())
+                .map_err(|error| error.within(format_args!("arms[{arm}].samples[{idx}]")))
+        };
+        let samples = message.samples.into_iter().enumerate().map(decode_indexed);
+        arms.push(samples.collect::<Result<_, _>>()?);
+    }
+    Ok(Way::Joints(Motion { period_s, arms }))
+}
+
+fn decode_sample(message: &pb::JointSample, n_joints: usize) -> Result<ArmSample, DecodeError> {
+    let joints = |field: &str, numbers: &[f64]| {
+        if numbers.len() != n_joints {
+            let got = format_args!("{} numbers", numbers.len()).to_string();
+            return Err(DecodeError::new(field, format_args!("{n_joints} numbers"), got));
+        }
+        check_finite(field, numbers)?;
+        Ok(Joints::new(numbers))
+    };
+    Ok(ArmSample {
+        angles: joints("angles_rad", &message.angles_rad)?,
+        velocities: joints("velocities_radps", &message.velocities_radps)?,
+        opening: decode_opening(message.opening)?,
+    })
+}
+
+fn check_arms(got: usize, cell: &Cell) -> Result<(), DecodeError> {
+    let expected = cell.arms.len();
+    if got == expected {
+        return Ok(());
+    }
+    Err(DecodeError::new("arms", format_args!("{expected} arms"), format_args!("{got} arms")))
+}
+
+fn check_finite(field: &str, numbers: &[f64]) -> Result<(), DecodeError> {
+    match numbers.iter().position(|number| !number.is_finite()) {
+        None => Ok(()),
+        Some(bad) => {
+            Err(DecodeError::new(format!("{field}[{bad}]"), "a finite number", numbers[bad]))
+        }
+    }
+}
+
+fn decode_opening(opening: f64) -> Result<f64, DecodeError> {
+    within("opening", opening, "a number in [0, 1]", |opening| (0.0..=1.0).contains(&opening))
+}
+
+/// `value` when it `fits`, which no NaN does.
+fn within(
+    field: &str,
+    value: f64,
+    expected: &str,
+    fits: impl Fn(f64) -> bool,
+) -> Result<f64, DecodeError> {
+    if fits(value) { Ok(value) } else { Err(DecodeError::new(field, expected, value)) }
+}

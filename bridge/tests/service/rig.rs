@@ -1,0 +1,376 @@
+//! A running service, its clients, its clock, and what stands behind it.
+
+use std::net::SocketAddr;
+use std::sync::{Arc, Condvar, Mutex};
+use std::time::Duration;
+
+use tandem_bridge::layout::mico_cell;
+use tandem_bridge::service::{Config, Error, Time, serve};
+use tandem_bridge::{
+    Command, Driver, DriverError, Executor, Order, PairState, Settings, SimulatedConfig,
+    SimulatedPair,
+};
+use tandem_core::ArmIndex;
+use tandem_kinematics::Joints;
+use tandem_net::Gate;
+use tandem_proto::pb;
+use tandem_proto::pb::bridge_client::BridgeClient;
+use tokio::net::TcpListener;
+use tokio::sync::mpsc;
+use tokio::task::JoinHandle;
+use tokio_stream::wrappers::ReceiverStream;
+use tokio_util::sync::CancellationToken;
+use tonic::transport::Channel;
+use tonic::{Response, Status, Streaming};
+
+/// Longer than anything takes, even on a machine that is busy with other things.
+pub(crate) const DEADLINE: Duration = Duration::from_secs(120);
+/// What a tick takes at least, so that tests leave the processor to one another.
+const TICK: Duration = Duration::from_micros(200);
+
+/// A clock whose time passes when somebody sleeps, up to where the test lets it.
+#[derive(Default)]
+pub(crate) struct Clock(Mutex<Hands>, Condvar);
+
+#[derive(Default)]
+struct Hands {
+    now_s: f64,
+    /// `None` for as far as it goes.
+    until_s: Option<f64>,
+    late_s: f64,
+}
+
+impl Clock {
+    /// Lets time pass as fast as it goes.
+    pub(crate) fn free(&self) {
+        self.0.lock().unwrap().until_s = None;
+        self.1.notify_all();
+    }
+
+    /// Lets no time pass from now on.
+    pub(crate) fn hold(&self) {
+        let mut hands = self.0.lock().unwrap();
+        hands.until_s = Some(hands.now_s);
+    }
+
+    /// Lets `seconds` pass beyond what was allowed before.
+    pub(crate) fn pass(&self, seconds: f64) {
+        let mut hands = self.0.lock().unwrap();
+        let until_s = hands.until_s.unwrap_or(hands.now_s);
+        hands.until_s = Some(until_s.max(hands.now_s) + seconds);
+        self.1.notify_all();
+    }
+
+    /// The next sleep takes longer by this.
+    pub(crate) fn oversleep(&self, seconds: f64) {
+        self.0.lock().unwrap().late_s = seconds;
+    }
+}
+
+impl Time for Clock {
+    fn now_s(&self) -> f64 {
+        self.0.lock().unwrap().now_s
+    }
+
+    fn sleep_until(&self, when_s: f64) {
+        std::thread::sleep(TICK);
+        let hands = self.0.lock().unwrap();
+        let is_held = |hands: &mut Hands| hands.until_s.is_some_and(|until_s| when_s > until_s);
+        let mut hands = self.1.wait_while(hands, is_held).unwrap();
+        hands.now_s = hands.now_s.max(when_s) + std::mem::take(&mut hands.late_s);
+    }
+}
+
+/// What goes wrong with the driver.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Fault {
+    None,
+    /// An exchange fails; stopping works.
+    Exchange,
+    /// Nothing gets through any more.
+    Dead,
+    /// An exchange panics.
+    Panic,
+    /// An exchange does not come back before the fault is over.
+    Hang,
+}
+
+/// A simulated pair that a test can look at and spoil.
+pub(crate) struct Bench {
+    pair: SimulatedPair,
+    fault: Fault,
+    /// How often the drives were told to stop past all exchanges.
+    n_stops: usize,
+    newest: Order,
+}
+
+#[derive(Clone)]
+pub(crate) struct Tap(Arc<(Mutex<Bench>, Condvar)>);
+
+impl Tap {
+    fn new(seed: u64) -> Self {
+        let cell = mico_cell();
+        let at = cell.ready(0.05).unwrap();
+        let config = SimulatedConfig { seed, ..SimulatedConfig::default() };
+        let pair = SimulatedPair::new(cell, &at, 0.5, config);
+        let bench = Bench { pair, fault: Fault::None, n_stops: 0, newest: Order::Stop };
+        Self(Arc::new((Mutex::new(bench), Condvar::new())))
+    }
+
+    pub(crate) fn fail(&self, fault: Fault) {
+        self.0.0.lock().unwrap().fault = fault;
+        self.0.1.notify_all();
+    }
+
+    pub(crate) fn n_stops(&self) -> usize {
+        self.0.0.lock().unwrap().n_stops
+    }
+
+    /// The newest command that has got through.
+    pub(crate) fn newest(&self) -> Order {
+        self.0.0.lock().unwrap().newest.clone()
+    }
+
+    /// The true joint angles.
+    pub(crate) fn angles(&self) -> [Joints; 2] {
+        let bench = self.0.0.lock().unwrap();
+        [0, 1].map(|arm| *bench.pair.angles(ArmIndex(arm)))
+    }
+}
+
+impl Driver for Tap {
+    fn period_s(&self) -> f64 {
+        tandem_bridge::simulated::PERIOD_S
+    }
+
+    fn exchange(&mut self, command: &Command) -> Result<PairState, DriverError> {
+        let bench = self.0.0.lock().unwrap();
+        let mut bench = self.0.1.wait_while(bench, |bench| bench.fault == Fault::Hang).unwrap();
+        match bench.fault {
+            Fault::None | Fault::Hang => {
+                bench.newest = command.order.clone();
+                bench.pair.exchange(command)
+            }
+            Fault::Exchange | Fault::Dead => {
+                Err(DriverError::Disconnected { what: "the test pulled the plug".into() })
+            }
+            Fault::Panic => {
+                drop(bench);
+                panic!("a bug, as the test wants it")
+            }
+        }
+    }
+
+    fn stop(&mut self) -> Result<(), DriverError> {
+        let mut bench = self.0.0.lock().unwrap();
+        if bench.fault == Fault::Dead {
+            return Err(DriverError::Disconnected { what: "the test pulled the plug".into() });
+        }
+        bench.n_stops += 1;
+        bench.pair.stop()
+    }
+}
+
+/// Settings with which no test's client is too slow.
+pub(crate) fn patient() -> Settings {
+    Settings { owner_hold_s: 1e6, owner_stop_s: 1e6, lease_s: 1e6, ..Settings::default() }
+}
+
+/// A running service.
+pub(crate) struct Rig {
+    pub(crate) client: BridgeClient<Channel>,
+    pub(crate) clock: Arc<Clock>,
+    pub(crate) tap: Tap,
+    pub(crate) shutdown: CancellationToken,
+    pub(crate) served: JoinHandle<Result<(), Error>>,
+    address: SocketAddr,
+}
+
+/// A motion under way: signs of life go in, progress comes out.
+pub(crate) struct Playing {
+    pub(crate) signs: mpsc::Sender<pb::ExecuteRequest>,
+    pub(crate) told: Streaming<pb::ExecuteResponse>,
+}
+
+impl Rig {
+    pub(crate) async fn new(settings: Settings) -> Self {
+        Self::bounded(settings, 1.0).await
+    }
+
+    /// A service that plays nothing faster than `speed`.
+    pub(crate) async fn bounded(settings: Settings, speed: f64) -> Self {
+        let listener = TcpListener::bind(SocketAddr::from(([127, 0, 0, 1], 0))).await.unwrap();
+        let address = listener.local_addr().unwrap();
+        let (clock, tap) = (Arc::new(Clock::default()), Tap::new(1));
+        let executor = Executor::new(mico_cell(), Box::new(tap.clone()) as _, settings).unwrap();
+        let shutdown = CancellationToken::new();
+        let config = Config {
+            driver: "sim".to_owned(),
+            version: "0.0.0-test".to_owned(),
+            speed,
+            time: clock.clone(),
+            secret: [7; 32],
+        };
+        let ends = shutdown.clone();
+        let served =
+            tokio::spawn(
+                async move { serve(executor, config, listener, &Gate::default(), ends).await },
+            );
+        let client = connect(address).await;
+        Self { client, clock, tap, shutdown, served, address }
+    }
+
+    /// A client of its own connection.
+    pub(crate) async fn stranger(&self) -> BridgeClient<Channel> {
+        connect(self.address).await
+    }
+
+    pub(crate) async fn acquire(&mut self) -> String {
+        let answer = self.client.acquire(pb::AcquireRequest::default()).await.unwrap();
+        answer.into_inner().token
+    }
+
+    /// Owned and let go.
+    pub(crate) async fn ready(&mut self) -> String {
+        let token = self.acquire().await;
+        self.reset(&token).await.unwrap();
+        token
+    }
+
+    /// Lets the arms go as soon as they are well.
+    pub(crate) async fn reset(&mut self, token: &str) -> Result<(), Status> {
+        let deadline = tokio::time::sleep(DEADLINE);
+        tokio::pin!(deadline);
+        loop {
+            let reset = self.client.reset(pb::ResetRequest { token: token.to_owned() });
+            match reset.await {
+                Err(status) if status.message().contains("good states") => {}
+                Err(status) if status.message().contains("still move") => {}
+                reset => return reset.map(|_| ()),
+            }
+            assert!(!deadline.is_elapsed(), "the arms do not get well");
+        }
+    }
+
+    pub(crate) async fn status(&mut self) -> pb::BridgeStatusResponse {
+        self.client.status(pb::BridgeStatusRequest {}).await.unwrap().into_inner()
+    }
+
+    /// Waits until the status is as wanted.
+    pub(crate) async fn eventually(
+        &mut self,
+        wanted: impl Fn(&pb::BridgeStatusResponse) -> bool,
+    ) -> pb::BridgeStatusResponse {
+        let deadline = tokio::time::sleep(DEADLINE);
+        tokio::pin!(deadline);
+        loop {
+            let status = self.status().await;
+            if wanted(&status) {
+                return status;
+            }
+            assert!(!deadline.is_elapsed(), "{status:?}");
+        }
+    }
+
+    pub(crate) async fn execute(
+        &mut self,
+        token: &str,
+        motion: pb::MotionRequest,
+    ) -> Result<Playing, Status> {
+        let (signs, requests) = mpsc::channel(8);
+        let start = pb::ExecuteStart { token: token.to_owned(), motion: Some(motion) };
+        signs.send(request(pb::execute_request::Request::Start(start))).await.unwrap();
+        let told = self.client.execute(ReceiverStream::new(requests)).await;
+        told.map(Response::into_inner).map(|told| Playing { signs, told })
+    }
+
+    /// A motion that takes minutes, under way.
+    pub(crate) async fn moving(&mut self, token: &str) -> Playing {
+        let mut playing = self.execute(token, slow()).await.unwrap();
+        while playing.next().await.unwrap().progress.unwrap().played_s <= 0.0 {}
+        playing
+    }
+
+    /// The drives have braked, and nothing moves whatever time passes.
+    pub(crate) async fn assert_nothing_moves(&mut self) {
+        let since_s = self.status().await.now_s;
+        self.eventually(|status| status.now_s > since_s + 0.5).await;
+        let before = self.tap.angles();
+        self.eventually(|status| status.now_s > since_s + 2.5).await;
+        let moved = before.iter().zip(self.tap.angles()).map(|(a, b)| a.largest_difference(&b));
+        assert!(moved.fold(0.0, f64::max) < 1e-6, "{before:?} {:?}", self.tap.angles());
+        assert_eq!(self.tap.newest(), Order::Stop);
+    }
+}
+
+impl Playing {
+    /// A sign of life; nobody hears it after the end.
+    pub(crate) async fn alive(&self) {
+        let alive = pb::execute_request::Request::Alive(pb::SignOfLife {});
+        self.signs.send(request(alive)).await.ok();
+    }
+
+    pub(crate) async fn next(&mut self) -> Result<pb::ExecuteResponse, Status> {
+        let next = tokio::time::timeout(DEADLINE, self.told.message()).await.unwrap();
+        next.map(|response| response.expect("an outcome comes before the end"))
+    }
+
+    /// What the stream tells last, and all phases on the way.
+    pub(crate) async fn last(
+        &mut self,
+    ) -> Result<(pb::ExecuteResponse, Vec<pb::BridgePhase>), Status> {
+        let mut phases = Vec::new();
+        loop {
+            let response = self.next().await?;
+            let phase = response.progress.as_ref().unwrap().phase();
+            if phases.last() != Some(&phase) {
+                phases.push(phase);
+            }
+            if response.outcome.is_some() {
+                assert!(self.told.message().await.unwrap().is_none(), "nothing after the outcome");
+                return Ok((response, phases));
+            }
+        }
+    }
+
+    /// Why the motion was stopped.
+    pub(crate) async fn stopped(&mut self) -> pb::BridgeStop {
+        let (last, _) = self.last().await.unwrap();
+        match last.outcome.unwrap().outcome.unwrap() {
+            pb::motion_outcome::Outcome::Stopped(stop) => stop,
+            done @ pb::motion_outcome::Outcome::Done(_) => panic!("{done:?}"),
+        }
+    }
+}
+
+async fn connect(address: SocketAddr) -> BridgeClient<Channel> {
+    let endpoint = Channel::from_shared(format!("http://{address}")).unwrap();
+    BridgeClient::new(endpoint.connect().await.unwrap())
+}
+
+pub(crate) fn request(request: pb::execute_request::Request) -> pb::ExecuteRequest {
+    pb::ExecuteRequest { request: Some(request) }
+}
+
+/// Where the tools are before anything has moved, and up and towards the middle from there: metres.
+pub(crate) const READY_M: [[f64; 3]; 2] = [[-0.12, 0.0, 0.095], [0.12, 0.0, 0.095]];
+pub(crate) const UP_M: [[f64; 3]; 2] = [[-0.10, 0.02, 0.115], [0.10, -0.02, 0.115]];
+
+/// A way of both tools through `places` from where they are.
+pub(crate) fn through(places: &[[[f64; 3]; 2]], speed: f64) -> pb::MotionRequest {
+    let arm = |at_m: &[f64; 3]| pb::ArmWayPoint { tool_in_world_m: at_m.to_vec(), opening: 0.8 };
+    let way_points = pb::WayPoints {
+        way_points: places
+            .iter()
+            .map(|arms| pb::BridgeWayPoint { arms: arms.iter().map(arm).collect() })
+            .collect(),
+        step_s: 0.04,
+        from_here: true,
+    };
+    pb::MotionRequest { motion: Some(pb::motion_request::Motion::WayPoints(way_points)), speed }
+}
+
+/// Up and back, in minutes.
+pub(crate) fn slow() -> pb::MotionRequest {
+    through(&[UP_M, READY_M, UP_M, READY_M], 0.005)
+}

@@ -1,0 +1,272 @@
+//! Every way in which a motion ends before its time: the drives are stopped, and nothing moves before a reset.
+
+use tandem_bridge::service::Error;
+use tandem_bridge::{Order, Settings};
+use tandem_proto::pb;
+use tonic::Code;
+
+use crate::rig::{Fault, Rig, UP_M, patient, request, slow, through};
+
+/// Nothing moves, no motion begins, and after a reset all is well again.
+async fn assert_stopped_until_reset(rig: &mut Rig, name: &str) {
+    let is_stopped = |status: &pb::BridgeStatusResponse| status.phase() == pb::BridgePhase::Stopped;
+    let status = rig.eventually(is_stopped).await;
+    assert_eq!(status.stopped.unwrap().name, name);
+    rig.assert_nothing_moves().await;
+    let token = match rig.client.acquire(pb::AcquireRequest::default()).await {
+        Ok(answer) => answer.into_inner().token,
+        Err(status) => panic!("{status}"),
+    };
+    let refused = rig.execute(&token, slow()).await.err().unwrap();
+    assert_eq!(refused.code(), Code::FailedPrecondition);
+    assert!(refused.message().contains("not idle but Stopped"), "{refused}");
+    rig.assert_nothing_moves().await;
+    rig.reset(&token).await.unwrap();
+    let mut playing = rig.execute(&token, through(&[UP_M], 1.0)).await.unwrap();
+    let (last, _) = playing.last().await.unwrap();
+    assert!(matches!(last.outcome.unwrap().outcome, Some(pb::motion_outcome::Outcome::Done(_))));
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn nothing_moves_before_a_reset() {
+    let mut rig = Rig::new(patient()).await;
+    let status = rig.status().await;
+    assert_eq!(status.stopped.unwrap().name, "not-reset");
+    assert_stopped_until_reset(&mut rig, "not-reset").await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn anyone_stops_the_arms() {
+    let mut rig = Rig::new(patient()).await;
+    let token = rig.ready().await;
+    let mut playing = rig.moving(&token).await;
+    let n_stops = rig.tap.n_stops();
+    let stopped = rig.stranger().await.stop(pb::StopRequest {}).await.unwrap().into_inner();
+    assert!(rig.tap.n_stops() > n_stops, "the drives were told before the answer");
+    assert_eq!(rig.tap.newest(), Order::Stop);
+    assert_eq!(stopped.stopped.unwrap().name, "requested");
+    let why = playing.stopped().await;
+    assert_eq!((why.name.as_str(), why.arm), ("requested", None));
+    rig.client.release(pb::ReleaseRequest { token }).await.unwrap();
+    assert_stopped_until_reset(&mut rig, "requested").await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_stop_queues_behind_nothing() {
+    let mut rig = Rig::new(patient()).await;
+    let token = rig.ready().await;
+    let mut playing = rig.moving(&token).await;
+    rig.clock.hold();
+    // More than the queue takes, and none of it can be done while no time passes.
+    let flood: Vec<_> = (0..200)
+        .map(|_| {
+            let (mut client, token) = (rig.client.clone(), token.clone());
+            tokio::spawn(async move { client.acquire(pb::AcquireRequest { token }).await })
+        })
+        .collect();
+    tokio::time::sleep(std::time::Duration::from_millis(50)).await;
+    let mut other = rig.stranger().await;
+    let stop = tokio::spawn(async move { other.stop(pb::StopRequest {}).await });
+    tokio::time::sleep(std::time::Duration::from_millis(50)).await;
+    let before_s = rig.status().await.now_s;
+    rig.clock.free();
+    let why = playing.stopped().await;
+    assert_eq!(why.name, "requested");
+    // 200 calls take 25 ticks; the stop took one of the first.
+    assert!(why.when_s - before_s < 0.1, "after {} s", why.when_s - before_s);
+    stop.await.unwrap().unwrap();
+    for call in flood {
+        drop(call.await.unwrap());
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_stream_that_breaks_stops_the_arms() {
+    let mut rig = Rig::new(patient()).await;
+    let token = rig.ready().await;
+    let playing = rig.moving(&token).await;
+    drop(playing);
+    assert_stopped_until_reset(&mut rig, "owner-left").await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_client_that_ends_its_signs_of_life_stops_the_arms_and_hears_of_it() {
+    let mut rig = Rig::new(patient()).await;
+    let token = rig.ready().await;
+    let mut playing = rig.moving(&token).await;
+    let (signs, _) = tokio::sync::mpsc::channel(1);
+    playing.signs = signs;
+    assert_eq!(playing.stopped().await.name, "owner-left");
+    assert_stopped_until_reset(&mut rig, "owner-left").await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_second_start_on_one_stream_is_no_sign_of_life() {
+    let mut rig = Rig::new(patient()).await;
+    let token = rig.ready().await;
+    let mut playing = rig.moving(&token).await;
+    let start = pb::ExecuteStart { token, motion: Some(slow()) };
+    playing.signs.send(request(pb::execute_request::Request::Start(start))).await.unwrap();
+    assert_eq!(playing.stopped().await.name, "owner-left");
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn an_owner_who_gives_the_arms_up_stops_them() {
+    let mut rig = Rig::new(patient()).await;
+    let token = rig.ready().await;
+    let mut playing = rig.moving(&token).await;
+    rig.client.release(pb::ReleaseRequest { token }).await.unwrap();
+    assert_eq!(playing.stopped().await.name, "owner-left");
+    assert_stopped_until_reset(&mut rig, "owner-left").await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn the_motion_of_a_silent_owner_pauses_and_is_then_stopped() {
+    // Signs of life are counted by a clock that runs as fast as it goes, so none is sent at all.
+    let settings = Settings { lease_s: 1e6, ..Settings::default() };
+    let mut rig = Rig::new(settings).await;
+    let token = rig.ready().await;
+    let mut playing = rig.execute(&token, slow()).await.unwrap();
+    let (last, phases) = playing.last().await.unwrap();
+    use pb::BridgePhase::{Holding, Moving, Stopped};
+    assert_eq!(phases, [Moving, Holding, Stopped]);
+    let Some(pb::motion_outcome::Outcome::Stopped(why)) = last.outcome.unwrap().outcome else {
+        panic!("a silent owner's motion does not end by itself")
+    };
+    assert_eq!(why.name, "owner-silent");
+    assert!(why.got > Some(1.0) && why.allowed == Some(1.0) && why.unit == "s", "{why:?}");
+    rig.client.release(pb::ReleaseRequest { token }).await.unwrap();
+    rig.assert_nothing_moves().await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn signs_of_life_keep_a_motion_going() {
+    let settings = Settings { lease_s: 1e6, ..Settings::default() };
+    let mut rig = Rig::new(settings).await;
+    let token = rig.ready().await;
+    rig.clock.hold();
+    let (mut client, clock) = (rig.client.clone(), rig.clock.clone());
+    let playing = tokio::spawn(async move {
+        let (signs, requests) = tokio::sync::mpsc::channel(8);
+        let start = pb::ExecuteStart { token, motion: Some(slow()) };
+        signs.send(request(pb::execute_request::Request::Start(start))).await.unwrap();
+        let requests = tokio_stream::wrappers::ReceiverStream::new(requests);
+        let told = client.execute(requests).await.unwrap().into_inner();
+        crate::rig::Playing { signs, told }
+    });
+    while !playing.is_finished() {
+        clock.pass(0.01);
+        tokio::time::sleep(std::time::Duration::from_millis(2)).await;
+    }
+    let mut playing = playing.await.unwrap();
+    // Three seconds of the arms' time; without signs of life one stops them.
+    let since_s = rig.status().await.now_s;
+    let mut now_s = since_s;
+    while now_s < since_s + 3.0 {
+        playing.alive().await;
+        // The lease is whole again when the sign has arrived: time passes in small steps until then.
+        loop {
+            clock.pass(0.01);
+            let status = rig.status().await;
+            assert_eq!(status.stopped, None, "{status:?}");
+            now_s = status.now_s;
+            if status.lease_left_s > 1e6 - 0.15 {
+                break;
+            }
+        }
+        for _ in 0..10 {
+            clock.pass(0.01);
+        }
+    }
+    clock.free();
+    assert_eq!(playing.stopped().await.name, "owner-silent");
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn the_services_end_stops_the_arms_first() {
+    let mut rig = Rig::new(patient()).await;
+    let token = rig.ready().await;
+    let mut playing = rig.moving(&token).await;
+    let n_stops = rig.tap.n_stops();
+    rig.shutdown.cancel();
+    assert_eq!(playing.stopped().await.name, "shut-down");
+    drop((playing, rig.client));
+    rig.served.await.unwrap().unwrap();
+    assert!(rig.tap.n_stops() > n_stops);
+    assert_eq!(rig.tap.newest(), Order::Stop);
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_driver_that_fails_stops_the_arms() {
+    let mut rig = Rig::new(patient()).await;
+    let token = rig.ready().await;
+    let mut playing = rig.moving(&token).await;
+    let n_stops = rig.tap.n_stops();
+    rig.tap.fail(Fault::Exchange);
+    let why = playing.stopped().await;
+    assert_eq!(why.name, "driver");
+    assert!(why.sentence.contains("the test pulled the plug"), "{why:?}");
+    assert!(rig.tap.n_stops() > n_stops);
+    // Nobody resets arms that say nothing.
+    let refused = rig.client.reset(pb::ResetRequest { token: token.clone() }).await.unwrap_err();
+    assert_eq!(refused.code(), Code::FailedPrecondition);
+    rig.tap.fail(Fault::None);
+    rig.client.release(pb::ReleaseRequest { token }).await.unwrap();
+    assert_stopped_until_reset(&mut rig, "driver").await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_stop_that_does_not_get_through_is_told() {
+    let mut rig = Rig::new(patient()).await;
+    let token = rig.ready().await;
+    let mut playing = rig.moving(&token).await;
+    rig.tap.fail(Fault::Dead);
+    assert_eq!(playing.stopped().await.name, "driver");
+    let told = rig.client.stop(pb::StopRequest {}).await.unwrap_err();
+    assert_eq!(told.code(), Code::Unavailable);
+    assert!(told.message().contains("could NOT be told to stop"), "{told}");
+    rig.tap.fail(Fault::None);
+    rig.client.stop(pb::StopRequest {}).await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_driver_that_hangs_is_told_of_and_keeps_nobody_waiting() {
+    let mut rig = Rig::new(patient()).await;
+    let token = rig.ready().await;
+    let mut playing = rig.moving(&token).await;
+    rig.tap.fail(Fault::Hang);
+    let told = rig.client.stop(pb::StopRequest {}).await.unwrap_err();
+    assert_eq!(told.code(), Code::Unavailable);
+    assert!(told.message().contains("has not answered"), "{told}");
+    assert_eq!(rig.status().await.phase(), pb::BridgePhase::Moving, "what was known last");
+    rig.tap.fail(Fault::None);
+    assert_eq!(playing.stopped().await.name, "requested");
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_bug_in_a_driver_stops_the_drives_and_ends_the_service() {
+    let mut rig = Rig::new(patient()).await;
+    let token = rig.ready().await;
+    let mut playing = rig.moving(&token).await;
+    let n_stops = rig.tap.n_stops();
+    rig.tap.fail(Fault::Panic);
+    let told = playing.last().await.unwrap_err();
+    assert_eq!(told.code(), Code::Unavailable, "{told}");
+    drop((playing, rig.client));
+    assert!(matches!(rig.served.await.unwrap(), Err(Error::Panicked)));
+    assert!(rig.tap.n_stops() > n_stops, "the drives were told");
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_thread_that_oversleeps_stops_the_arms() {
+    let mut rig = Rig::new(patient()).await;
+    let token = rig.ready().await;
+    let mut playing = rig.moving(&token).await;
+    // The pair's time stands meanwhile, and its states would be old as well: lateness is found first.
+    rig.clock.oversleep(0.05);
+    let why = playing.stopped().await;
+    assert_eq!(why.name, "late");
+    assert!(why.got > Some(0.045) && why.unit == "s", "{why:?}");
+    rig.client.release(pb::ReleaseRequest { token }).await.unwrap();
+    assert_stopped_until_reset(&mut rig, "late").await;
+}

@@ -1,0 +1,79 @@
+//! `tandem bridge`: serves a pair of arms, and what operators do with one.
+
+use std::fs::File;
+use std::io::Read as _;
+use std::sync::Arc;
+
+use anyhow::Context as _;
+use tandem_bridge::service::{Config, Error};
+use tokio::runtime::{Builder, Runtime};
+
+use crate::cli::{BridgeArgs, BridgeCommand, BridgeServeArgs};
+use crate::exit::{Exit, Failed, OrExit as _};
+use crate::{access, clock, services};
+
+mod arms;
+mod file;
+mod operator;
+mod play;
+mod show;
+
+/// Where the system's secrets come from.
+const ENTROPY: &str = "/dev/urandom";
+/// Threads for sockets.
+const SOCKET_THREADS: usize = 2;
+
+pub(crate) fn bridge(args: BridgeArgs) -> Result<(), Failed> {
+    match args.command {
+        None => serve(args.serve),
+        Some(BridgeCommand::Status(args)) => operator::status(&args),
+        Some(BridgeCommand::Stop(args)) => operator::stop(&args),
+        Some(BridgeCommand::Describe(args)) => operator::describe(&args),
+        Some(BridgeCommand::Reset(args)) => operator::reset(&args),
+        Some(BridgeCommand::Move(args)) => play::play(&args),
+    }
+}
+
+fn serve(args: BridgeServeArgs) -> Result<(), Failed> {
+    let gate = access::gate(&args.listen, &args.secret)?;
+    let secret = secret().or_exit(Exit::TryAgain, || format!("cannot read {ENTROPY}"))?;
+    let runtime = runtime().or_exit(Exit::TryAgain, String::new)?;
+    runtime.block_on(async move {
+        let shutdown = services::shutdown(args.listen.exit_with_stdin)?;
+        let listener = services::listen(&args.listen).await?;
+        let time = Arc::new(clock::Ticking::new());
+        let executor = arms::executor(&args, time.clone())?;
+        let config = Config {
+            driver: arms::name(args.driver).to_owned(),
+            version: services::VERSION.to_owned(),
+            speed: args.speed,
+            time,
+            secret,
+        };
+        let served =
+            tandem_bridge::service::serve(executor, config, listener, &gate, shutdown).await;
+        served.map_err(bridge_failed)
+    })
+}
+
+/// A runtime whose sockets do not wait for one another: a stop is heard while a long motion is being read.
+fn runtime() -> anyhow::Result<Runtime> {
+    let mut runtime = Builder::new_multi_thread();
+    runtime.worker_threads(SOCKET_THREADS).enable_all().build().context("cannot start the runtime")
+}
+
+/// What nobody can guess.
+fn secret() -> std::io::Result<[u8; 32]> {
+    let mut secret = [0; 32];
+    File::open(ENTROPY)?.read_exact(&mut secret)?;
+    Ok(secret)
+}
+
+fn bridge_failed(error: Error) -> Failed {
+    let exit = match &error {
+        Error::Panicked => Exit::Bug,
+        Error::Gate(_) => Exit::Usage,
+        _ => Exit::TryAgain,
+    };
+    Failed::new(exit, error)
+}

@@ -1,0 +1,41 @@
+//! Which arms stand behind a bridge: the one place that makes drivers.
+
+use std::sync::Arc;
+
+use tandem_bridge::layout::mico_cell;
+use tandem_bridge::service::{AnyDriver, Paced, Time};
+use tandem_bridge::{Executor, Settings, SimulatedConfig, SimulatedPair};
+
+use crate::cli::{BridgeServeArgs, DriverName};
+use crate::exit::{Exit, Failed, OrExit as _};
+
+/// How high above its workspace a simulated tool is at first, metres, and how far its gripper is open.
+const READY_M: f64 = 0.05;
+const READY_OPENING: f64 = 0.5;
+
+/// What clients are told of the driver.
+pub(crate) const fn name(driver: DriverName) -> &'static str {
+    match driver {
+        DriverName::Sim => "sim",
+    }
+}
+
+/// The arms that the command line asks for, behind what lets checked motions through only.
+pub(crate) fn executor(
+    args: &BridgeServeArgs,
+    time: Arc<dyn Time>,
+) -> Result<Executor<AnyDriver>, Failed> {
+    let driver = match args.driver {
+        DriverName::Sim => simulated(args.seed, time)?,
+    };
+    Executor::new(mico_cell(), driver, Settings::default()).or_exit(Exit::Bug, String::new)
+}
+
+/// A simulated pair in real time, its tools above their workspaces.
+fn simulated(seed: u64, time: Arc<dyn Time>) -> Result<AnyDriver, Failed> {
+    let cell = mico_cell();
+    let at = cell.ready(READY_M).or_exit(Exit::Bug, String::new)?;
+    let config = SimulatedConfig { seed, ..SimulatedConfig::default() };
+    let pair = SimulatedPair::new(cell, &at, READY_OPENING, config);
+    Ok(Box::new(Paced::new(pair, time)))
+}

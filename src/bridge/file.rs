@@ -1,0 +1,141 @@
+//! A motion as a file: JSON that people write.
+
+use std::path::Path;
+
+use serde::Deserialize;
+use tandem_proto::pb;
+
+use crate::exit::{Exit, Failed, OrExit as _};
+
+/// Time between way points of the training world, seconds.
+const STEP_S: f64 = 0.04;
+
+/// What a file holds; unknown keys are refused.
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct MotionFile {
+    /// Share of the motion's own speed, in (0, 1].
+    speed: f64,
+    /// Places of the tools, one entry an arm in each.
+    way_points: Option<Vec<Vec<FileWayPoint>>>,
+    /// Whether the way begins where the tools are; with way points only. True when left out.
+    from_here: Option<bool>,
+    /// The motion is never faster than one way point in this time, seconds; with way points only. 0.04 when left out.
+    step_s: Option<f64>,
+    /// Angles of the joints, in place of way points.
+    joint_motion: Option<FileJointMotion>,
+}
+
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct FileWayPoint {
+    /// Where the tool shall be in the world: x, y, z, metres.
+    tool_m: [f64; 3],
+    /// How far the gripper shall be open, 0 to 1.
+    opening: f64,
+}
+
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct FileJointMotion {
+    /// Time from one sample to the next, seconds.
+    period_s: f64,
+    /// Samples of every arm.
+    arms: Vec<Vec<FileSample>>,
+}
+
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct FileSample {
+    angles_rad: Vec<f64>,
+    velocities_radps: Vec<f64>,
+    opening: f64,
+}
+
+/// The motion in the file `path`, at `speed` when it is given.
+pub(super) fn read(path: &Path, speed: Option<f64>) -> Result<pb::MotionRequest, Failed> {
+    let cannot_read = || format!("cannot read {path:?}");
+    let text = std::fs::read_to_string(path).or_exit(Exit::Data, cannot_read)?;
+    let not_a_motion = || format!("{path:?} does not hold a motion");
+    let file: MotionFile = serde_json::from_str(&text).or_exit(Exit::Data, not_a_motion)?;
+    let speed = speed.unwrap_or(file.speed);
+    let motion = motion(file).map_err(|what| anyhow::anyhow!(what));
+    let motion = motion.or_exit(Exit::Data, not_a_motion)?;
+    Ok(pb::MotionRequest { motion: Some(motion), speed })
+}
+
+fn motion(file: MotionFile) -> Result<pb::motion_request::Motion, &'static str> {
+    use pb::motion_request::Motion as M;
+    match (file.way_points, file.joint_motion) {
+        (Some(way_points), None) => {
+            let way_points = way_points.into_iter().map(way_point).collect();
+            let step_s = file.step_s.unwrap_or(STEP_S);
+            let from_here = file.from_here.unwrap_or(true);
+            Ok(M::WayPoints(pb::WayPoints { way_points, step_s, from_here }))
+        }
+        (None, Some(_)) if file.from_here.is_some() || file.step_s.is_some() => {
+            Err("from_here and step_s belong to way_points only")
+        }
+        (None, Some(joints)) => {
+            let arms = joints.arms.into_iter().map(samples).collect();
+            Ok(M::JointMotion(pb::JointMotion { period_s: joints.period_s, arms }))
+        }
+        _ => Err("it needs either way_points or joint_motion"),
+    }
+}
+
+fn way_point(arms: Vec<FileWayPoint>) -> pb::BridgeWayPoint {
+    let arm = |arm: FileWayPoint| pb::ArmWayPoint {
+        tool_in_world_m: arm.tool_m.to_vec(),
+        opening: arm.opening,
+    };
+    pb::BridgeWayPoint { arms: arms.into_iter().map(arm).collect() }
+}
+
+fn samples(samples: Vec<FileSample>) -> pb::ArmMotion {
+    let sample = |sample: FileSample| pb::JointSample {
+        angles_rad: sample.angles_rad,
+        velocities_radps: sample.velocities_radps,
+        opening: sample.opening,
+    };
+    pb::ArmMotion { samples: samples.into_iter().map(sample).collect() }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn parsed(text: &str) -> Result<pb::motion_request::Motion, String> {
+        let file = serde_json::from_str(text).map_err(|error| error.to_string())?;
+        motion(file).map_err(str::to_owned)
+    }
+
+    #[test]
+    fn a_file_holds_way_points_or_angles_and_nothing_else() {
+        let places = r#"[[{"tool_m": [0, 0, 0.1], "opening": 1}]]"#;
+        let whole = parsed(&format!(r#"{{"speed": 1, "way_points": {places}}}"#)).unwrap();
+        let pb::motion_request::Motion::WayPoints(way) = whole else { panic!("{whole:?}") };
+        assert!(way.from_here && way.way_points[0].arms[0].tool_in_world_m[2] > 0.09);
+        let joints = r#"{"period_s": 0.01, "arms": []}"#;
+        assert!(parsed(&format!(r#"{{"speed": 1, "joint_motion": {joints}}}"#)).is_ok());
+        for (text, expected) in [
+            (r#"{"speed": 1}"#.to_owned(), "either way_points or joint_motion"),
+            (
+                format!(r#"{{"speed": 1, "way_points": {places}, "joint_motion": {joints}}}"#),
+                "either",
+            ),
+            (format!(r#"{{"way_points": {places}}}"#), "missing field `speed`"),
+            (
+                format!(r#"{{"speed": 1, "way_points": {places}, "sped": 2}}"#),
+                "unknown field `sped`",
+            ),
+            (
+                format!(r#"{{"speed": 1, "joint_motion": {joints}, "from_here": true}}"#),
+                "belong to way_points",
+            ),
+        ] {
+            let refused = parsed(&text).unwrap_err();
+            assert!(refused.contains(expected), "{text}: {refused}");
+        }
+    }
+}

@@ -1,0 +1,230 @@
+//! What a bridge says, for people and as JSON.
+
+use serde_json::{Value, json};
+use tandem_proto::pb;
+
+/// A phase in one word.
+pub(super) fn phase(phase: pb::BridgePhase) -> &'static str {
+    match phase {
+        pb::BridgePhase::Unspecified => "unknown",
+        pb::BridgePhase::Stopped => "stopped",
+        pb::BridgePhase::Idle => "idle",
+        pb::BridgePhase::Moving => "moving",
+        pb::BridgePhase::Holding => "holding",
+        pb::BridgePhase::Settling => "settling",
+    }
+}
+
+pub(super) fn status_lines(status: &pb::BridgeStatusResponse) -> Vec<String> {
+    let why =
+        status.stopped.as_ref().map_or_else(String::new, |stop| format!(": {}", stop.sentence));
+    let rests = match (status.at_rest, status.arms.is_empty()) {
+        (true, _) => "at rest",
+        (false, false) => "moving",
+        (false, true) => "nobody knows whether they move",
+    };
+    let owner = if status.is_owned {
+        format!("somebody, for another {:.1} s unless they renew", status.lease_left_s)
+    } else {
+        "nobody".to_owned()
+    };
+    let mut lines = vec![
+        format!("phase   {}{why}", phase(status.phase())),
+        format!("joints  {rests}"),
+        format!("owner   {owner}"),
+        format!(
+            "clock   {:.2} s, last command {:.0} ms ago",
+            status.now_s,
+            1e3 * status.since_tick_s
+        ),
+    ];
+    lines.extend(status.arms.iter().enumerate().map(|(idx, arm)| arm_line(idx, arm)));
+    if status.arms.is_empty() {
+        lines.push("arms    nobody knows where they are".to_owned());
+    }
+    if let Some(motion) = &status.motion {
+        lines.push(format!(
+            "motion  {:.2} of {:.2} s of its own time, at speed {}",
+            motion.played_s, motion.duration_s, motion.speed
+        ));
+    }
+    lines
+}
+
+fn arm_line(idx: usize, arm: &pb::ArmState) -> String {
+    let degrees: Vec<String> =
+        arm.angles_rad.iter().map(|angle| format!("{:.1}", angle.to_degrees())).collect();
+    let mut line = format!(
+        "arm {idx}   joints {} degrees, tool at {} m, gripper {:.0} % open",
+        degrees.join(" "),
+        place(&arm.tool_in_world_m),
+        100.0 * arm.opening
+    );
+    for (fault, what) in [
+        (arm.drive_fault, "DRIVE FAULT"),
+        (arm.contact, "CONTACT"),
+        (arm.emergency_stop, "EMERGENCY STOP"),
+    ] {
+        if fault {
+            line.push_str(", ");
+            line.push_str(what);
+        }
+    }
+    line
+}
+
+/// Metres, to the millimetre; nothing is -0.000.
+fn place(metres: &[f64]) -> String {
+    let rounded = metres.iter().map(|metres| (metres * 1e3).round() / 1e3 + 0.0);
+    let numbers: Vec<String> = rounded.map(|metres| format!("{metres:.3}")).collect();
+    numbers.join(" ")
+}
+
+pub(super) fn description_lines(told: &pb::DescribeBridgeResponse) -> Vec<String> {
+    let mut lines = vec![format!(
+        "driver  {}, version {}, a command every {:.0} ms",
+        told.driver,
+        told.version,
+        1e3 * told.period_s
+    )];
+    for (idx, arm) in told.arms.iter().enumerate() {
+        lines.push(format!(
+            "arm {idx}   {}, base at {} m, turned by {:.0} degrees",
+            arm.model,
+            place(&arm.base_in_world_m),
+            arm.yaw_rad.to_degrees()
+        ));
+        lines.extend(arm.joints.iter().enumerate().map(|(joint, told)| {
+            format!(
+                "        joint {}: {:.0} to {:.0} degrees, {:.0} degrees/s",
+                joint + 1,
+                told.low_rad.to_degrees(),
+                told.high_rad.to_degrees(),
+                told.speed_radps.to_degrees()
+            )
+        }));
+    }
+    lines.push(format!("table   at a height of {:.3} m", told.table_z_m));
+    if let Some(limits) = &told.limits {
+        lines.extend(limit_lines(limits));
+    }
+    lines
+}
+
+fn limit_lines(limits: &pb::BridgeLimits) -> Vec<String> {
+    vec![
+        format!(
+            "speed   at most {} of a motion's own, tools at most {} m/s",
+            limits.speed, limits.tool_speed_mps
+        ),
+        format!(
+            "tilt    at most {:.0} degrees, reach at most {:.0} % of the arm's",
+            limits.tilt_rad.to_degrees(),
+            100.0 * limits.reach_share
+        ),
+        format!(
+            "gaps    motions keep {:.0} mm to the table and {:.0} mm between arms, the envelope {:.0} and {:.0} mm",
+            1e3 * limits.check_table_gap_m,
+            1e3 * limits.check_arms_gap_m,
+            1e3 * limits.table_gap_m,
+            1e3 * limits.arms_gap_m
+        ),
+        format!(
+            "owner   a motion pauses after {} s of silence and is stopped after {} s",
+            limits.owner_hold_s, limits.owner_stop_s
+        ),
+    ]
+}
+
+pub(super) fn stop_json(stop: &pb::BridgeStop) -> Value {
+    json!({
+        "name": stop.name, "sentence": stop.sentence, "when_s": stop.when_s, "arm": stop.arm,
+        "joint": stop.joint, "got": stop.got, "allowed": stop.allowed, "unit": stop.unit,
+    })
+}
+
+pub(super) fn refusal_json(refusal: &pb::MotionRefusal) -> Value {
+    json!({
+        "name": refusal.name, "sentence": refusal.sentence, "when_s": refusal.when_s,
+        "arm": refusal.arm, "joint": refusal.joint, "way_point": refusal.way_point,
+        "got": refusal.got, "allowed": refusal.allowed, "unit": refusal.unit,
+    })
+}
+
+pub(super) fn accepted_json(accepted: &pb::AcceptedMotion) -> Value {
+    json!({
+        "duration_s": accepted.duration_s, "speed": accepted.speed,
+        "table_gap_m": accepted.table_gap_m, "arms_gap_m": accepted.arms_gap_m,
+    })
+}
+
+fn arm_json(arm: &pb::ArmState) -> Value {
+    json!({
+        "angles_rad": arm.angles_rad, "velocities_radps": arm.velocities_radps,
+        "tool_in_world_m": arm.tool_in_world_m, "opening": arm.opening,
+        "drive_fault": arm.drive_fault, "contact": arm.contact,
+        "emergency_stop": arm.emergency_stop,
+    })
+}
+
+pub(super) fn progress_json(progress: &pb::MotionProgress) -> Value {
+    json!({
+        "phase": phase(progress.phase()), "played_s": progress.played_s,
+        "duration_s": progress.duration_s, "speed": progress.speed,
+        "arms": progress.arms.iter().map(arm_json).collect::<Vec<_>>(),
+    })
+}
+
+pub(super) fn status_json(status: &pb::BridgeStatusResponse) -> Value {
+    let motion = status.motion.as_ref().map(|motion| {
+        json!({
+            "played_s": motion.played_s, "duration_s": motion.duration_s, "speed": motion.speed,
+        })
+    });
+    json!({
+        "phase": phase(status.phase()),
+        "stopped": status.stopped.as_ref().map(stop_json),
+        "is_owned": status.is_owned, "lease_left_s": status.lease_left_s,
+        "at_rest": status.at_rest,
+        "arms": status.arms.iter().map(arm_json).collect::<Vec<_>>(),
+        "motion": motion, "now_s": status.now_s, "since_tick_s": status.since_tick_s,
+    })
+}
+
+pub(super) fn description_json(told: &pb::DescribeBridgeResponse) -> Value {
+    let joint = |joint: &pb::JointDescription| {
+        json!({
+            "low_rad": joint.low_rad, "high_rad": joint.high_rad,
+            "speed_radps": joint.speed_radps, "continuous": joint.continuous,
+        })
+    };
+    let arm = |arm: &pb::ArmDescription| {
+        json!({
+            "model": arm.model, "base_in_world_m": arm.base_in_world_m, "yaw_rad": arm.yaw_rad,
+            "joints": arm.joints.iter().map(joint).collect::<Vec<_>>(),
+        })
+    };
+    let frame = told.task_frame.as_ref().map(
+        |frame| json!({"scale": frame.scale, "centre_m": frame.centre_m, "lift_m": frame.lift_m}),
+    );
+    json!({
+        "driver": told.driver, "version": told.version, "period_s": told.period_s,
+        "arms": told.arms.iter().map(arm).collect::<Vec<_>>(), "table_z_m": told.table_z_m,
+        "task_frame": frame, "limits": told.limits.as_ref().map(limits_json),
+    })
+}
+
+fn limits_json(limits: &pb::BridgeLimits) -> Value {
+    json!({
+        "speed": limits.speed, "tool_speed_mps": limits.tool_speed_mps, "ramp_s": limits.ramp_s,
+        "opening_per_s": limits.opening_per_s, "tilt_rad": limits.tilt_rad,
+        "reach_share": limits.reach_share, "check_table_gap_m": limits.check_table_gap_m,
+        "check_arms_gap_m": limits.check_arms_gap_m, "table_gap_m": limits.table_gap_m,
+        "arms_gap_m": limits.arms_gap_m, "range_margin_rad": limits.range_margin_rad,
+        "start_rad": limits.start_rad, "duration_s": limits.duration_s,
+        "tracking_rad": limits.tracking_rad, "torque_nm": limits.torque_nm,
+        "owner_hold_s": limits.owner_hold_s, "owner_stop_s": limits.owner_stop_s,
+        "lease_s": limits.lease_s, "max_way_points": limits.max_way_points,
+        "max_step_m": limits.max_step_m,
+    })
+}

@@ -1,0 +1,265 @@
+//! `tandem bridge` with the built program: a served pair of simulated arms, and operators who look, reset, move and stop.
+//!
+//! The arms move in real time. On a machine that is busy with other things the program may come too late for them, and then
+//! it stops them, as it should; these tests try again.
+#![expect(clippy::panic, reason = "a test panics where it fails")]
+
+use std::io::{BufRead as _, BufReader};
+use std::path::Path;
+use std::process::{Child, Command, Output, Stdio};
+use std::time::Duration;
+
+use serde_json::{Value, json};
+use tempfile::TempDir;
+
+/// What a busy machine may stop the arms for.
+const BUSY: [&str; 6] =
+    ["late", "owner-silent", "state-old", "state-stale", "command-lost", "drive-fault"];
+/// Longer than anything takes: this many pauses.
+const MANY: usize = 1200;
+const PAUSE: Duration = Duration::from_millis(50);
+
+/// A served pair, ended with the test.
+struct Bridge {
+    served: Child,
+    address: String,
+    directory: TempDir,
+}
+
+fn tandem(args: &[&str]) -> Command {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_tandem"));
+    command.args(args).current_dir(env!("CARGO_MANIFEST_DIR"));
+    command.env_remove("TANDEM_TOKEN_FILE").env_remove("RUST_LOG");
+    command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped());
+    command
+}
+
+impl Bridge {
+    fn serve(more: &[&str]) -> Self {
+        let args = [&["bridge", "--driver", "sim", "--listen", "127.0.0.1:0"][..], more].concat();
+        let directory = tempfile::tempdir().expect("a directory");
+        let mut served = tandem(&args).stderr(Stdio::inherit()).spawn().expect("starts");
+        let mut line = String::new();
+        let mut output = BufReader::new(served.stdout.take().expect("piped"));
+        output.read_line(&mut line).expect("a line");
+        let address = line.trim().strip_prefix("listening on ").expect("an address").to_owned();
+        Self { served, address, directory }
+    }
+
+    fn command(&self, what: &[&str]) -> Command {
+        let args = [&["bridge"], what, &["--connect", &self.address]].concat();
+        tandem(&args)
+    }
+
+    fn run(&self, what: &[&str]) -> Output {
+        self.command(what).output().expect("runs")
+    }
+
+    fn json(&self, what: &[&str]) -> Value {
+        let output = self.run(&[what, &["--json"]].concat());
+        assert_eq!(output.status.code(), Some(0), "{}", said(&output));
+        serde_json::from_slice(&output.stdout).expect("one JSON object")
+    }
+
+    fn status(&self) -> Value {
+        self.json(&["status"])
+    }
+
+    /// Waits until the status is as wanted; gives `None` when a busy machine has stopped the arms.
+    fn eventually(&self, wanted: impl Fn(&Value) -> bool) -> Option<Value> {
+        for _ in 0..MANY {
+            let status = self.status();
+            if wanted(&status) {
+                return Some(status);
+            }
+            if was_busy(&status) {
+                return None;
+            }
+            std::thread::sleep(PAUSE);
+        }
+        panic!("{}", self.status())
+    }
+
+    /// Lets the arms go.
+    fn reset(&self) {
+        for _ in 0..MANY {
+            let output = self.run(&["reset"]);
+            if output.status.success() || said(&output).contains("not stopped but Idle") {
+                return;
+            }
+            assert_eq!(output.status.code(), Some(75), "{}", said(&output));
+            std::thread::sleep(PAUSE);
+        }
+        panic!("{}", self.status())
+    }
+
+    /// Does `work` with arms that are let go, again as long as a busy machine stops them.
+    fn with_arms<T>(&self, work: impl Fn() -> Option<T>) -> T {
+        for _ in 0..20 {
+            self.reset();
+            if let Some(done) = work() {
+                return done;
+            }
+        }
+        panic!("{}", self.status())
+    }
+
+    /// A motion under way, slowly; `None` when a busy machine has stopped it.
+    fn moving(&self) -> Option<Child> {
+        let slowly = ["move", "deploy/first-motion.json", "--speed", "0.05"];
+        let mover = self.command(&slowly).spawn().expect("starts");
+        let is_under_way = |status: &Value| status["motion"]["played_s"].as_f64() > Some(0.0);
+        match self.eventually(is_under_way) {
+            Some(_) => Some(mover),
+            None => {
+                end(mover);
+                None
+            }
+        }
+    }
+}
+
+impl Drop for Bridge {
+    fn drop(&mut self) {
+        drop(self.served.kill());
+        drop(self.served.wait());
+    }
+}
+
+fn was_busy(status: &Value) -> bool {
+    status["stopped"]["name"].as_str().is_some_and(|name| BUSY.contains(&name))
+}
+
+fn said(output: &Output) -> String {
+    String::from_utf8_lossy(&output.stderr).into_owned()
+}
+
+fn end(mut child: Child) {
+    drop(child.kill());
+    drop(child.wait());
+}
+
+fn signal(child: &Child, signal: &str) {
+    let sent = Command::new("kill").args([signal, &child.id().to_string()]).status();
+    assert!(sent.expect("kill runs").success());
+}
+
+fn fails_with(code: i32, output: &Output, expected: &str) {
+    let told = said(output);
+    assert_eq!(output.status.code(), Some(code), "{told}");
+    let line = told.lines().last().unwrap_or_default();
+    assert!(line.starts_with("tandem: ") && line.contains(expected), "{told}");
+}
+
+#[test]
+fn operators_look_reset_move_and_stop() {
+    let bridge = Bridge::serve(&["--speed", "0.8"]);
+    let told = bridge.json(&["describe"]);
+    assert_eq!((&told["driver"], &told["arms"][1]["model"]), (&json!("sim"), &json!("m1n4s200")));
+    assert_eq!(told["limits"]["speed"], json!(0.8));
+    assert_eq!(bridge.status()["stopped"]["name"], json!("not-reset"));
+    let early = bridge.run(&["move", "deploy/first-motion.json"]);
+    if !said(&early).contains("nobody knows where the arms are") {
+        fails_with(75, &early, "tandem bridge reset");
+    }
+
+    bridge.reset();
+    let check = bridge.json(&["move", "deploy/first-motion.json", "--check-only"]);
+    assert!(check["accepted"]["duration_s"].as_f64() > Some(0.5), "{check}");
+    bridge.with_arms(|| {
+        let moved = bridge.run(&["move", "deploy/first-motion.json", "--json"]);
+        if moved.status.code() == Some(75) && was_busy(&bridge.status()) {
+            return None;
+        }
+        assert_eq!(moved.status.code(), Some(0), "{}", said(&moved));
+        let done: Value = serde_json::from_slice(&moved.stdout).expect("one JSON object");
+        assert_eq!((&done["done"], &done["progress"]["speed"]), (&json!(true), &json!(0.8)));
+        let at_m = &done["progress"]["arms"][0]["tool_in_world_m"];
+        for (axis, goal_m) in [-0.12, 0.0, 0.095].into_iter().enumerate() {
+            let got_m = at_m[axis].as_f64().expect("a number");
+            assert!((got_m - goal_m).abs() < 0.003, "{at_m}");
+        }
+        Some(())
+    });
+
+    let stopped = bridge.run(&["stop"]);
+    assert_eq!((stopped.status.code(), stopped.stdout.starts_with(b"stopped\n")), (Some(0), true));
+    let status = bridge.status();
+    assert!(status["stopped"]["name"] == json!("requested") || was_busy(&status), "{status}");
+    fails_with(75, &bridge.run(&["move", "deploy/first-motion.json"]), "tandem bridge reset");
+    let lines = bridge.run(&["status"]);
+    assert!(lines.stdout.starts_with(b"phase   stopped: at "));
+
+    let mut health = tandem(&["health", &bridge.address, "--service", "tandem.v1.Bridge"]);
+    let health = health.output().expect("runs");
+    assert_eq!(health.stdout, b"serving\n");
+    let mut bridge = bridge;
+    signal(&bridge.served, "-TERM");
+    assert_eq!(bridge.served.wait().expect("ends").code(), Some(0));
+    fails_with(75, &bridge.run(&["stop"]), "does not answer");
+}
+
+#[test]
+fn a_motion_that_cannot_be_is_refused_and_moves_nothing() {
+    let bridge = Bridge::serve(&[]);
+    bridge.reset();
+    let file = bridge.directory.path().join("motion.json");
+    let path = file.to_string_lossy();
+    let try_out = |text: &str, expected: &str| {
+        std::fs::write(&file, text).expect("writes");
+        fails_with(65, &bridge.run(&["move", &path, "--check-only"]), expected);
+        fails_with(65, &bridge.run(&["move", &path]), expected);
+    };
+    let at = |left_m: [f64; 3], opening: f64| {
+        let arms = json!([
+            {"tool_m": left_m, "opening": opening},
+            {"tool_m": [0.12, 0.0, 0.095], "opening": 0.5},
+        ]);
+        json!({"speed": 1.0, "way_points": [arms]}).to_string()
+    };
+    try_out("{", "does not hold a motion");
+    try_out(r#"{"speed": 1.0}"#, "either way_points or joint_motion");
+    try_out(&at([-0.12, 0.0, 0.02], 0.5), "mm above the table, at least 4.0");
+    try_out(&at([-0.12, 0.0, 0.1], 1.5), "arms[0].opening: expected a number in [0, 1], got 1.5");
+    try_out(&at([-0.12, 0.9, 0.1], 0.5), "way point 0 of arm 0");
+    let one_arm = json!({"speed": 1.0, "way_points": [[{"tool_m": [0, 0, 0], "opening": 1}]]});
+    try_out(&one_arm.to_string(), "way_points[0].arms: expected 2 arms, got 1 arms");
+    let missing = Path::new("no-such-motion.json").to_string_lossy();
+    fails_with(65, &bridge.run(&["move", &missing]), "cannot read \"no-such-motion.json\"");
+    let mut nowhere = tandem(&["bridge", "move", &path, "--connect", "nowhere"]);
+    fails_with(64, &nowhere.output().expect("runs"), "is not an address");
+}
+
+#[test]
+fn whoever_moves_the_arms_and_goes_stops_them() {
+    let bridge = Bridge::serve(&[]);
+    let interrupted = bridge.with_arms(|| {
+        let mover = bridge.moving()?;
+        signal(&mover, "-INT");
+        let ended = mover.wait_with_output().expect("ends");
+        (ended.status.code() == Some(130) || !was_busy(&bridge.status())).then_some(ended)
+    });
+    assert_eq!(interrupted.status.code(), Some(130), "{}", said(&interrupted));
+    assert!(said(&interrupted).contains("interrupted: the arms are stopped"));
+    assert!(bridge.status()["stopped"].is_object());
+
+    let status = bridge.with_arms(|| {
+        end(bridge.moving()?);
+        bridge.eventually(|status| status["stopped"].is_object() && !was_busy(status))
+    });
+    assert_eq!(status["stopped"]["name"], json!("owner-left"));
+}
+
+#[test]
+fn a_bridge_with_a_token_obeys_nobody_without() {
+    let directory = tempfile::tempdir().expect("a directory");
+    let token = directory.path().join("token");
+    std::fs::write(&token, "the-right-token-0123").expect("writes");
+    let token = token.to_string_lossy();
+    let bridge = Bridge::serve(&["--token-file", &token]);
+    for what in ["status", "stop", "describe", "reset"] {
+        fails_with(64, &bridge.run(&[what]), "wants a token: name its file in --token-file");
+        let known = bridge.run(&[what, "--token-file", &token]);
+        assert_ne!(known.status.code(), Some(64), "{}", said(&known));
+    }
+}
