@@ -43,7 +43,7 @@ pub(crate) enum Command {
     Eval(EvalArgs),
     /// Trains many runs one after another: strategies, tasks, seeds and whatever else a file lists.
     Sweep(SweepArgs),
-    /// Sets runs side by side: the paper's Table 2, curves, one HTML page.
+    /// Sets runs and trials side by side: the paper's Tables 2 and 4, curves, one HTML page.
     Report(ReportArgs),
     /// Serves a one-arm policy as a teacher.
     Teacher(TeacherArgs),
@@ -176,13 +176,14 @@ pub(crate) struct SweepArgs {
 Examples:
   tandem report runs/sweep-table2
   tandem report runs/a runs/b --out compared.html --csv compared.csv
+  tandem report trials/student-push --all-trials
   tandem report docs/results/students --composed-teachers policies/teacher-push.safetensors")]
 pub(crate) struct ReportArgs {
-    /// Run directories, directories with runs below, or metrics files by themselves.
+    /// Run directories, directories with runs or trials below, or metrics and trials files by themselves.
     #[arg(required = true, value_name = "DIR|FILE")]
     pub(crate) paths: Vec<PathBuf>,
-    /// The page; curves are written beside it as SVG files [default: report.html, in the sweep's directory when
-    /// that is all that is given].
+    /// The page; curves and pictures of trials are written beside it as SVG files [default: report.html, in the
+    /// directory of the sweep or the trials when that is all that is given].
     #[arg(long, value_name = "FILE.html")]
     pub(crate) out: Option<PathBuf>,
     /// Writes one line a run.
@@ -194,6 +195,9 @@ pub(crate) struct ReportArgs {
     /// Measures a one-arm policy that drives both arms: the baseline without a student; may be repeated.
     #[arg(long, value_name = "POLICY")]
     pub(crate) composed_teachers: Vec<PathBuf>,
+    /// Draws every trial, not only those that failed.
+    #[arg(long)]
+    pub(crate) all_trials: bool,
     /// Prints one JSON object on the last line of standard output.
     #[arg(long)]
     pub(crate) json: bool,

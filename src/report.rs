@@ -1,9 +1,11 @@
-//! `tandem report`: runs side by side, on the terminal, as a page, as JSON and CSV.
+//! `tandem report`: runs and trials side by side, on the terminal, as a page, as JSON and CSV.
 
 use std::path::{Path, PathBuf};
 
 use serde_json::json;
-use tandem_report::{Baseline, Comparison, HeldOut, comparison_html, records, run};
+use tandem_report::{
+    Baseline, Comparison, HeldOut, Pictured, Trials, Written, records, report_html, run, trials,
+};
 
 use crate::cli::ReportArgs;
 use crate::eval::{Measured, composed, measure};
@@ -14,35 +16,50 @@ use crate::files::load_policy;
 const HELD_OUT_SEED: u64 = 777;
 const HELD_OUT_EPISODES: u64 = 240;
 
-#[expect(clippy::print_stdout, reason = "what the command is for")]
 pub(crate) fn report(args: &ReportArgs) -> Result<(), Failed> {
     let found = run::find(&args.paths).or_exit(Exit::Data, String::new)?;
-    warn(&found.warnings);
+    let trials = Trials::of(found.trials);
+    warn(found.warnings.iter().chain(&trials.warnings));
     let comparison = Comparison::of(found.runs, baselines(args)?);
     let page = args.out.clone().unwrap_or_else(|| default_page(&args.paths));
-    let written = comparison_html(&comparison, &page).or_exit(Exit::TryAgain, String::new)?;
+    let pictured = if args.all_trials { Pictured::All } else { Pictured::Failures };
+    let written =
+        report_html(&comparison, &trials, pictured, &page).or_exit(Exit::TryAgain, String::new)?;
     if let Some(path) = &args.csv {
         std::fs::write(path, records::csv(&comparison))
             .or_exit(Exit::TryAgain, || format!("cannot write {}", path.display()))?;
     }
-    if args.json {
-        let mut value = records::json(&comparison);
-        value["report"] = json!(written.page);
-        value["figures"] = json!(written.figures);
-        println!("{value}");
-        return Ok(());
-    }
-    println!("{}", comparison.text());
-    println!("of several runs: mean (smallest–largest); [95 % interval of all their episodes]");
-    println!("report        {}, {} curves beside it", page.display(), written.figures.len());
-    if let Some(path) = &args.csv {
-        println!("csv           {}", path.display());
-    }
+    print(args, &comparison, &trials, &written);
     Ok(())
 }
 
+#[expect(clippy::print_stdout, reason = "what the command is for")]
+fn print(args: &ReportArgs, comparison: &Comparison, trials: &Trials, written: &Written) {
+    if args.json {
+        let mut value = records::json(comparison);
+        value["trials"] = trials::json(trials);
+        value["report"] = json!(written.page);
+        value["figures"] = json!(written.figures);
+        println!("{value}");
+        return;
+    }
+    if !trials.groups.is_empty() {
+        println!("{}", trials.text());
+        println!("median time: of all trials, failures too; [95 % interval of the share]");
+    }
+    if !comparison.sections.is_empty() {
+        println!("{}", comparison.text());
+        println!("of several runs: mean (smallest–largest); [95 % interval of all their episodes]");
+    }
+    let n_pictures = written.figures.len();
+    println!("report        {}, {n_pictures} pictures beside it", written.page.display());
+    if let Some(path) = &args.csv {
+        println!("csv           {}", path.display());
+    }
+}
+
 #[expect(clippy::print_stderr, reason = "a warning is for people")]
-fn warn(warnings: &[String]) {
+fn warn<'a>(warnings: impl Iterator<Item = &'a String>) {
     for warning in warnings {
         eprintln!("tandem: warning: {warning}");
     }

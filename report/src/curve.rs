@@ -19,14 +19,14 @@ const COLORS: [RGBColor; 6] = [
     RGBColor(0xc4, 0x3d, 0x4b),
     RGBColor(0x5b, 0x66, 0x73),
 ];
-const INK: RGBColor = RGBColor(0x24, 0x29, 0x2f);
-const FAINT_INK: RGBColor = RGBColor(0x6a, 0x73, 0x7d);
-const GRID: RGBColor = RGBColor(0xe6, 0xe9, 0xed);
+pub(crate) const INK: RGBColor = RGBColor(0x24, 0x29, 0x2f);
+pub(crate) const FAINT_INK: RGBColor = RGBColor(0x6a, 0x73, 0x7d);
+pub(crate) const GRID: RGBColor = RGBColor(0xe6, 0xe9, 0xed);
 /// Left edge of the legend, pixels.
 const LEGEND_LEFT_PX: i32 = 20;
 /// Height of a line of the legend, pixels.
-const LEGEND_LINE_PX: i32 = 20;
-const FONT: &str = "-apple-system, 'Segoe UI', Helvetica, Arial, sans-serif";
+pub(crate) const LEGEND_LINE_PX: i32 = 20;
+pub(crate) const FONT: &str = "-apple-system, 'Segoe UI', Helvetica, Arial, sans-serif";
 
 /// What a curve is drawn against.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -209,18 +209,28 @@ struct LegendEntry<'a> {
 
 /// Places the names of several curves on as many lines as it takes; a single curve needs none.
 fn legend(series: &[Series], width_px: u32) -> Vec<LegendEntry<'_>> {
+    let named = || series.iter().filter(|_| series.len() > 1).map(|one| one.name.as_str());
+    let places = legend_places(named(), width_px);
+    named().zip(places).map(|(name, (left, line))| LegendEntry { name, left, line }).collect()
+}
+
+/// Left edges (pixels) and lines, from 0, of a legend's entries, each a sign of 22 pixels and a name.
+pub(crate) fn legend_places<'a>(
+    names: impl Iterator<Item = &'a str>,
+    width_px: u32,
+) -> Vec<(i32, i32)> {
     let width_px = i32::try_from(width_px).unwrap_or(i32::MAX);
     let (mut left, mut line) = (LEGEND_LEFT_PX, 0);
-    let mut entries = Vec::new();
-    for one in series.iter().filter(|_| series.len() > 1) {
-        let entry_px = 22 + estimated_width_px(&one.name, 13);
+    let place = |name| {
+        let entry_px = 22 + estimated_width_px(name, 13);
         if left > LEGEND_LEFT_PX && left + entry_px > width_px {
             (left, line) = (LEGEND_LEFT_PX, line + 1);
         }
-        entries.push(LegendEntry { name: &one.name, left, line });
+        let place = (left, line);
         left += entry_px + 20;
-    }
-    entries
+        place
+    };
+    names.map(place).collect()
 }
 
 /// The title and the legend.
@@ -318,7 +328,7 @@ fn text_style(size_px: u32, color: RGBColor) -> TextStyle<'static> {
 }
 
 /// The width of `text` in a usual sans-serif font: viewers choose the font, so it cannot be known.
-fn estimated_width_px(text: &str, size_px: u32) -> i32 {
+pub(crate) fn estimated_width_px(text: &str, size_px: u32) -> i32 {
     let n_chars = u32::try_from(text.chars().count()).unwrap_or(u32::MAX);
     i32::try_from(n_chars.saturating_mul(size_px) / 2).unwrap_or(i32::MAX / 2)
 }

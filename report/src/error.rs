@@ -16,10 +16,20 @@ pub enum Error {
         source: std::io::Error,
     },
     /// Nothing that a report could show.
-    #[error("{path:?} holds no run: expected a metrics.jsonl in it or below")]
+    #[error(
+        "{path:?} holds no run and no trials: expected a metrics.jsonl or a trials.jsonl in it or below"
+    )]
     NoRun {
         /// Where one was looked for.
         path: PathBuf,
+    },
+    /// A file of trials without a single one.
+    #[error("{path:?} holds no trial: {problem}")]
+    NoTrial {
+        /// The file.
+        path: PathBuf,
+        /// What stands there instead.
+        problem: String,
     },
     /// A file is no result of an evaluation.
     #[error("{path:?} is no result of `tandem eval --json`: {problem}")]

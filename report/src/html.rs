@@ -11,6 +11,7 @@ use crate::figures::{Figure, figures as comparison_figures};
 use crate::paper;
 use crate::run::Run;
 use crate::table::{Table, duration, interval, number, share, thousands};
+use crate::trials::{Pictured, Trials, trials_body};
 
 const STYLE: &str = include_str!("report.css");
 
@@ -25,28 +26,48 @@ pub fn run_report_html(run_dir: &Path) -> Result<PathBuf, Error> {
     Ok(path)
 }
 
-/// What a comparison's report consists of.
+/// What a report consists of.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Written {
     /// The page.
     pub page: PathBuf,
-    /// Its curves, each a file beside it.
+    /// Its pictures, each a file beside it.
     pub figures: Vec<PathBuf>,
 }
 
-/// Writes a page with the tables and curves of `comparison` to `path`, and each curve as a file of its own beside it.
+/// Writes a page with the tables and pictures of `comparison` and `trials` to `path`, and each picture as a file of its
+/// own beside it.
 ///
 /// # Errors
 /// When a curve cannot be drawn or a file cannot be written.
-pub fn comparison_html(comparison: &Comparison, path: &Path) -> Result<Written, Error> {
-    let figures = comparison_figures(comparison)?;
+pub fn report_html(
+    comparison: &Comparison,
+    trials: &Trials,
+    pictured: Pictured,
+    path: &Path,
+) -> Result<Written, Error> {
+    let curves = comparison_figures(comparison)?;
+    let pictures = trials.pictures(pictured);
     let mut written = Written { page: path.to_owned(), figures: Vec::new() };
-    for figure in &figures {
+    for figure in curves.iter().chain(&pictures) {
         let svg_path = path.with_file_name(&figure.file_name);
         write(&svg_path, &figure.svg)?;
         written.figures.push(svg_path);
     }
-    write(path, &page("Runs compared", &comparison_body(comparison, &figures)))?;
+    let (has_runs, has_trials) = (!comparison.sections.is_empty(), !trials.groups.is_empty());
+    let mut body = String::new();
+    if has_trials {
+        body.push_str(&trials_body(trials, &pictures));
+    }
+    if has_runs || !has_trials {
+        body.push_str(&comparison_body(comparison, &curves));
+    }
+    let title = match (has_runs, has_trials) {
+        (true, true) => "Trials and runs compared",
+        (false, true) => "Trials compared",
+        (_, false) => "Runs compared",
+    };
+    write(path, &page(title, &body))?;
     Ok(written)
 }
 
@@ -56,8 +77,7 @@ fn comparison_body(comparison: &Comparison, drawn: &[Figure]) -> String {
         let tables = section.tables();
         body.extend(tables.iter().map(titled_table));
     }
-    let svgs: Vec<&str> = drawn.iter().map(|figure| figure.svg.as_str()).collect();
-    body.push_str(&figures(&svgs));
+    body.push_str(&figures(drawn));
     body.push_str(&titled_table(&paper_table()));
     body.push_str(&format!("<p>{}</p><p>{}</p>", escaped(paper::SOURCE), escaped(NOTES)));
     body
@@ -69,18 +89,16 @@ const NOTES: &str = "IE: epoch of the first evaluation with 10 % of the maximum 
      many have the figure where not all do; intervals are Wilson's 95 % over the episodes of all runs together and know \
      nothing of the differences between seeds. The best of many evaluations is a choice and flatters; held-out goals do not.";
 
-fn titled_table(shown: &Table) -> String {
+pub(crate) fn titled_table(shown: &Table) -> String {
     let header: Vec<&str> = shown.header.iter().map(String::as_str).collect();
     format!("<h2>{}</h2>{}", escaped(&shown.title), table(&header, &shown.lines))
 }
 
 fn run_page(run: &Run) -> Result<String, Error> {
     let mut body = match (run.best(), run.last()) {
-        (Some(best), Some(last)) => format!(
-            "{}{}",
-            tiles(best, last),
-            figures(&curves(run)?.each_ref().map(String::as_str))
-        ),
+        (Some(best), Some(last)) => {
+            format!("{}{}", tiles(best, last), framed(&curves(run)?.each_ref().map(String::as_str)))
+        }
         _ => "<p>No evaluation yet.</p>".to_owned(),
     };
     if !run.rows.is_empty() {
@@ -206,8 +224,14 @@ fn table(header: &[&str], lines: &[Vec<String>]) -> String {
     )
 }
 
-fn figures(curves: &[&str]) -> String {
-    let figures: String = curves.iter().map(|svg| format!("<figure>{svg}</figure>")).collect();
+/// The pictures of `drawn`.
+pub(crate) fn figures(drawn: &[Figure]) -> String {
+    let svgs: Vec<&str> = drawn.iter().map(|figure| figure.svg.as_str()).collect();
+    framed(&svgs)
+}
+
+fn framed(svgs: &[&str]) -> String {
+    let figures: String = svgs.iter().map(|svg| format!("<figure>{svg}</figure>")).collect();
     format!("<div class=figures>{figures}</div>")
 }
 
@@ -219,7 +243,7 @@ fn page(title: &str, body: &str) -> String {
     )
 }
 
-fn escaped(text: &str) -> String {
+pub(crate) fn escaped(text: &str) -> String {
     text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;").replace('"', "&quot;")
 }
 

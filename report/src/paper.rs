@@ -2,9 +2,9 @@
 
 use tandem_core::Task;
 
-/// Where the values of [`TABLE_2`] come from.
+/// Where the values of [`TABLE_2`] and [`TABLE_4`] come from.
 pub const SOURCE: &str = "H. Ren, P. Ben-Tzvi: Advising reinforcement learning toward scaling agents in continuous control \
-     environments with sparse rewards. Engineering Applications of Artificial Intelligence, 2020, Table 2; \
+     environments with sparse rewards. Engineering Applications of Artificial Intelligence, 2020, Tables 2 and 4; \
      https://doi.org/10.1016/j.engappai.2020.103515";
 
 /// A row of the paper's Table 2.
@@ -109,6 +109,37 @@ pub const TABLE_2: [PaperRow; 12] = [
         [222.0, 108.0, 0.9083, 0.0025],
     ),
 ];
+
+/// A row of the paper's Table 4: trials on two real arms.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct PaperTrials {
+    /// What is said of the policies.
+    pub name: &'static str,
+    /// Successes of [`N_PAPER_TRIALS`] in the push task.
+    pub push: usize,
+    /// Successes of [`N_PAPER_TRIALS`] in the pick and place task.
+    pub pick_and_place: usize,
+}
+
+/// How often the paper tried each policy of its Table 4.
+pub const N_PAPER_TRIALS: usize = 50;
+
+/// The paper's Table 4, whole.
+pub const TABLE_4: [PaperTrials; 2] = [
+    PaperTrials { name: "proposed method", push: 40, pick_and_place: 38 },
+    PaperTrials { name: "from scratch", push: 0, pick_and_place: 30 },
+];
+
+impl PaperTrials {
+    /// Successes in `task`.
+    #[must_use]
+    pub const fn n_successes(&self, task: Task) -> usize {
+        match task {
+            Task::Push => self.push,
+            Task::PickAndPlace => self.pick_and_place,
+        }
+    }
+}
 
 impl PaperRow {
     /// The row of `strategy` as it is written on the command line, such as `mc-q:0.05`, with its index.

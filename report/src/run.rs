@@ -3,8 +3,10 @@
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 
+use serde::de::DeserializeOwned;
 use tandem_core::Task;
-use tandem_telemetry::MetricsRow;
+use tandem_telemetry::trials::TRIALS_FILE;
+use tandem_telemetry::{MetricsRow, TrialRow};
 use toml::{Table, Value};
 
 use crate::error::Error;
@@ -26,11 +28,13 @@ pub struct Run {
     pub held_out: Option<HeldOut>,
 }
 
-/// What was found of runs, and what could not be used.
+/// What was found of runs and trials, and what could not be used.
 #[derive(Debug, Default)]
 pub struct Found {
     /// The runs, in the order of the paths given, those of a directory by name.
     pub runs: Vec<Run>,
+    /// The trials of every file of them, in the same order.
+    pub trials: Vec<TrialRow>,
     /// A line for every file that is used in part or not at all.
     pub warnings: Vec<String>,
 }
@@ -105,69 +109,168 @@ impl Run {
     }
 }
 
-/// Reads every run that `paths` name: run directories, directories with runs below, bare metrics files.
+/// Reads every run and every trial that `paths` name: run directories, directories with runs and trials below, bare
+/// metrics and trials files.
 ///
 /// # Errors
-/// When a path cannot be read or has no run. What is wrong with single runs of a directory is a warning.
+/// When a path cannot be read or has neither. What is wrong with single runs and trials of a directory is a warning.
 pub fn find(paths: &[PathBuf]) -> Result<Found, Error> {
     let mut found = Found::default();
     for path in paths {
         if path.is_file() {
-            found.runs.push(Run::load_file(path, &mut found.warnings)?);
-            continue;
-        }
-        let dirs = run_directories(path, MAX_DEPTH)?;
-        if dirs.is_empty() {
-            return Err(Error::NoRun { path: path.clone() });
-        }
-        for dir in dirs {
-            match Run::load(&dir, &mut found.warnings) {
-                Ok(run) => found.runs.push(run),
-                Err(error) => {
-                    found.warnings.push(format!("{} is left out: {error}", dir.display()));
-                }
-            }
+            found.read_file(path)?;
+        } else {
+            found.read_below(path)?;
         }
     }
     Ok(found)
 }
 
-/// `dir` itself when it is a run directory, else those below it, sorted.
-fn run_directories(dir: &Path, depth: usize) -> Result<Vec<PathBuf>, Error> {
-    if dir.join("metrics.jsonl").is_file() {
-        return Ok(vec![dir.to_owned()]);
+impl Found {
+    fn read_file(&mut self, path: &Path) -> Result<(), Error> {
+        if is_trials_file(path)? {
+            self.trials.extend(read_trials(path, &mut self.warnings)?);
+        } else {
+            self.runs.push(Run::load_file(path, &mut self.warnings)?);
+        }
+        Ok(())
     }
-    let entries = std::fs::read_dir(dir).map_err(read_error(dir))?;
-    let is_dir =
-        |entry: &std::fs::DirEntry| entry.file_type().is_ok_and(|file_type| file_type.is_dir());
-    let mut below: Vec<PathBuf> =
-        entries.flatten().filter(is_dir).map(|entry| entry.path()).collect();
-    below.sort();
-    let mut dirs = Vec::new();
-    for dir in below.iter().filter(|_| depth > 0) {
-        dirs.extend(run_directories(dir, depth - 1)?);
+
+    fn read_below(&mut self, path: &Path) -> Result<(), Error> {
+        let mut places = Places::default();
+        places.look_in(path, MAX_DEPTH, Within::Directory)?;
+        if places.runs.is_empty() && places.trials.is_empty() {
+            return Err(Error::NoRun { path: path.to_owned() });
+        }
+        let mut refused = None;
+        let n_before = self.runs.len() + self.trials.len();
+        for dir in &places.runs {
+            match Run::load(dir, &mut self.warnings) {
+                Ok(run) => self.runs.push(run),
+                Err(error) => {
+                    self.warnings.push(format!("{} is left out: {error}", dir.display()));
+                }
+            }
+        }
+        for file in &places.trials {
+            match read_trials(file, &mut self.warnings) {
+                Ok(rows) => self.trials.extend(rows),
+                Err(error) => {
+                    self.warnings.push(format!("left out: {error}"));
+                    refused.get_or_insert(error);
+                }
+            }
+        }
+        let n_found = self.runs.len() + self.trials.len() - n_before;
+        refused.filter(|_| n_found == 0).map_or(Ok(()), Err)
     }
-    Ok(dirs)
+}
+
+/// Where runs and trials lie below a directory.
+#[derive(Debug, Default)]
+struct Places {
+    /// Run directories.
+    runs: Vec<PathBuf>,
+    /// Files.
+    trials: Vec<PathBuf>,
+}
+
+/// What a directory is part of: what lies below a run belongs to it, but for trials.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Within {
+    Directory,
+    Run,
+}
+
+impl Places {
+    /// Notes `dir` itself and what is below it, sorted.
+    fn look_in(&mut self, dir: &Path, depth: usize, within: Within) -> Result<(), Error> {
+        let is_run = within == Within::Directory && dir.join("metrics.jsonl").is_file();
+        if is_run {
+            self.runs.push(dir.to_owned());
+        }
+        let trials = dir.join(TRIALS_FILE);
+        if trials.is_file() {
+            self.trials.push(trials);
+        }
+        let within = if is_run { Within::Run } else { within };
+        let entries = std::fs::read_dir(dir).map_err(read_error(dir))?;
+        let is_dir =
+            |entry: &std::fs::DirEntry| entry.file_type().is_ok_and(|file_type| file_type.is_dir());
+        let mut below: Vec<PathBuf> =
+            entries.flatten().filter(is_dir).map(|entry| entry.path()).collect();
+        below.sort();
+        for dir in below.iter().filter(|_| depth > 0) {
+            match self.look_in(dir, depth - 1, within) {
+                // A run's other directories are its own affair.
+                Err(_) if within == Within::Run => {}
+                other => other?,
+            }
+        }
+        Ok(())
+    }
+}
+
+/// Whether a file by itself is one of trials, by its name or else by its first line.
+fn is_trials_file(path: &Path) -> Result<bool, Error> {
+    if path.file_name().is_some_and(|name| name == TRIALS_FILE) {
+        return Ok(true);
+    }
+    let bytes = std::fs::read(path).map_err(read_error(path))?;
+    let first = bytes.split(|byte| *byte == b'\n').next().unwrap_or_default();
+    Ok(serde_json::from_slice::<TrialRow>(first).is_ok())
+}
+
+/// The trials of a file up to the first line that is none, of which a warning tells; a file without one is refused.
+fn read_trials(path: &Path, warnings: &mut Vec<String>) -> Result<Vec<TrialRow>, Error> {
+    let (rows, broken) = read_lines::<TrialRow>(path)?;
+    if rows.is_empty() {
+        let problem = broken.map_or_else(
+            || "it is empty".to_owned(),
+            |Broken { line, problem }| format!("line {line} is none ({problem})"),
+        );
+        return Err(Error::NoTrial { path: path.to_owned(), problem });
+    }
+    warnings.extend(broken.map(|broken| broken.warning(path, "trial")));
+    Ok(rows)
 }
 
 /// The rows of a metrics file up to the first line that is none, of which a warning tells.
 fn read_rows(path: &Path, warnings: &mut Vec<String>) -> Result<Vec<MetricsRow>, Error> {
+    let (rows, broken) = read_lines(path)?;
+    warnings.extend(broken.map(|broken| broken.warning(path, "metrics row")));
+    Ok(rows)
+}
+
+/// Where a file of lines stops making sense.
+struct Broken {
+    /// The line, from 1.
+    line: usize,
+    problem: String,
+}
+
+impl Broken {
+    fn warning(&self, path: &Path, what: &str) -> String {
+        let Self { line, problem } = self;
+        format!("{}, line {line}, is no {what} ({problem}): used up to there", path.display())
+    }
+}
+
+fn read_lines<T: DeserializeOwned>(path: &Path) -> Result<(Vec<T>, Option<Broken>), Error> {
     let bytes = std::fs::read(path).map_err(read_error(path))?;
     let mut rows = Vec::new();
     for (line_idx, line) in bytes.split_inclusive(|byte| *byte == b'\n').enumerate() {
         match serde_json::from_slice(line) {
             Ok(row) => rows.push(row),
             Err(error) => {
-                let shown = path.display();
-                warnings.push(format!(
-                    "{shown}, line {}, is no metrics row ({error}): used up to there",
-                    line_idx + 1
-                ));
-                break;
+                let text = error.to_string();
+                // The parser counts lines within the line that it was given.
+                let problem = text.split(" at line ").next().unwrap_or(&text).to_owned();
+                return Ok((rows, Some(Broken { line: line_idx + 1, problem })));
             }
         }
     }
-    Ok(rows)
+    Ok((rows, None))
 }
 
 fn read_if_there(path: &Path) -> Result<Option<String>, Error> {
@@ -229,6 +332,76 @@ mod tests {
         check(&(line(3)[..40].to_owned() + "\n" + &line(4)));
         check("nonsense\n");
         check("\u{0}\n");
+    }
+
+    fn trial(trial: u64) -> String {
+        let row = TrialRow {
+            subject: "student".to_owned(),
+            mode: "open-loop".to_owned(),
+            task: "push".to_owned(),
+            trial,
+            seed: 1,
+            success: true,
+            cause: None,
+            detail: None,
+            goal_distances_m: vec![0.01],
+            rehearsed_m: None,
+            duration_s: 2.0,
+            n_steps: 50,
+            n_shortened: 0,
+            arms_gap_m: None,
+            table_gap_m: 0.01,
+            starts: Vec::new(),
+            goals: Vec::new(),
+            ends: Vec::new(),
+            path: Vec::new(),
+            log: None,
+        };
+        serde_json::to_string(&row).unwrap() + "\n"
+    }
+
+    #[test]
+    fn trials_are_found_beside_runs_below_them_and_by_themselves() {
+        let dir = tempfile::tempdir().unwrap();
+        write(&dir.path().join("a/metrics.jsonl"), &line(1));
+        write(&dir.path().join("a/trials/trials.jsonl"), &trial(1));
+        write(&dir.path().join("b/trials.jsonl"), &(trial(2) + &trial(3)));
+        write(&dir.path().join("kept.jsonl"), &trial(4));
+        let found = find(&[dir.path().to_owned(), dir.path().join("kept.jsonl")]).unwrap();
+        let numbers: Vec<u64> = found.trials.iter().map(|row| row.trial).collect();
+        assert_eq!((numbers, found.runs.len()), (vec![1, 2, 3, 4], 1));
+        assert!(found.warnings.is_empty(), "{:?}", found.warnings);
+    }
+
+    #[test]
+    fn a_trials_file_counts_up_to_what_is_no_trial() {
+        let dir = tempfile::tempdir().unwrap();
+        for tail in [&trial(3)[..200], "nonsense\n", &trial(3).replace("\"seed\":1", "\"seed\":-1")]
+        {
+            write(&dir.path().join("trials.jsonl"), &(trial(1) + &trial(2) + tail));
+            let found = find(&[dir.path().to_owned()]).unwrap();
+            assert_eq!(found.trials.len(), 2, "{tail:?}");
+            let [warning] = &found.warnings[..] else { panic!("{:?}", found.warnings) };
+            assert!(warning.contains("trials.jsonl, line 3, is no trial ("), "{warning}");
+            assert!(!warning.contains("line 1"), "{warning}");
+        }
+    }
+
+    #[test]
+    fn a_file_without_a_trial_is_an_error_unless_there_is_something_else() {
+        let dir = tempfile::tempdir().unwrap();
+        let file = dir.path().join("mine/trials.jsonl");
+        for (content, reason) in [("", "it is empty"), ("{}\n", "line 1 is none (missing field")] {
+            write(&file, content);
+            for path in [dir.path().to_owned(), file.clone()] {
+                let error = find(&[path]).unwrap_err();
+                assert!(matches!(error, Error::NoTrial { .. }), "{error:?}");
+                assert!(error.to_string().contains(reason), "{error}");
+            }
+        }
+        write(&dir.path().join("a/metrics.jsonl"), &line(1));
+        let found = find(&[dir.path().to_owned()]).unwrap();
+        assert_eq!((found.runs.len(), found.trials.len(), found.warnings.len()), (1, 0, 1));
     }
 
     #[test]

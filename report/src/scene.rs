@@ -59,6 +59,11 @@ const PEDESTAL_HEIGHT_M: f32 = 0.035;
 /// How much wider than its links a joint is drawn.
 const JOINT_WIDENING: f64 = 1.12;
 
+/// The colour of an arm and of what belongs to it, as SVG writes it; darker below a `brightness` of 1, lighter above.
+pub(crate) fn arm_color(arm: usize, brightness: f64) -> String {
+    ARM_COLORS[arm % ARM_COLORS.len()].lit(brightness).hex()
+}
+
 /// Draws `scene` as seen by `view`.
 #[must_use]
 pub fn scene_svg(scene: &Scene, view: &View) -> String {

@@ -4,42 +4,18 @@
 use std::path::Path;
 
 use tandem_report::{
-    Axis, Comparison, CurveOptions, CurvePoint, Quantity, Series, View, comparison_html, curve_svg,
-    run, run_report_html, scene_svg,
+    Axis, Comparison, CurveOptions, CurvePoint, Pictured, Quantity, Series, Trials, View,
+    curve_svg, report_html, run, run_report_html, scene_svg,
 };
 use tandem_telemetry::{MetricsLog, MetricsRow};
 
 #[path = "../../telemetry/tests/support/synthetic.rs"]
 #[expect(dead_code, reason = "only the scene is drawn")]
 mod synthetic;
+#[path = "support/well_formed.rs"]
+mod well_formed;
 
-/// Fails unless every tag is closed by its own, `&` begins an entity, and no number is NaN or infinite.
-fn assert_well_formed(xml: &str) {
-    let mut open = Vec::new();
-    for (position, _) in xml.match_indices('<') {
-        let tag =
-            &xml[position + 1..position + xml[position..].find('>').expect("an unfinished tag")];
-        let name = |tag: &str| tag.split_whitespace().next().unwrap_or_default().to_owned();
-        match tag.strip_prefix('/') {
-            Some(closed) => assert_eq!(open.pop(), Some(name(closed))),
-            None if tag.ends_with('/') || tag.starts_with('!') || tag.starts_with('?') => {}
-            None => open.push(name(tag)),
-        }
-        assert_eq!(tag.matches('"').count() % 2, 0, "{tag}");
-    }
-    assert!(open.is_empty(), "never closed: {open:?}");
-    for (position, _) in xml.match_indices('&') {
-        assert!(
-            ["&amp;", "&lt;", "&gt;", "&quot;", "&apos;", "&#"]
-                .iter()
-                .any(|entity| xml[position..].starts_with(entity))
-        );
-    }
-    assert!(
-        !xml.contains("NaN") && !xml.contains("inf\"") && !xml.contains("inf "),
-        "a number is not finite"
-    );
-}
+use well_formed::assert_well_formed;
 
 /// An evaluation in which `n_hits` of 240 episodes succeeded.
 fn row(round: u32, n_hits: u8) -> MetricsRow {
@@ -187,7 +163,8 @@ fn a_sweeps_page_has_its_tables_its_curves_and_the_papers_values() {
     seed_of(dir.path(), "none", 1, &[row(0, 0), row(5, 0)]);
     let found = run::find(&[dir.path().to_owned()]).unwrap();
     let comparison = Comparison::of(found.runs, Vec::new());
-    let written = comparison_html(&comparison, &dir.path().join("report.html")).unwrap();
+    let page = dir.path().join("report.html");
+    let written = report_html(&comparison, &Trials::default(), Pictured::Failures, &page).unwrap();
     let page = std::fs::read_to_string(&written.page).unwrap();
     assert_eq!(page.matches("<svg").count(), written.figures.len());
     assert_eq!(written.figures.len(), 5, "three of success, one of mean Q, one of advice");

@@ -113,9 +113,7 @@ impl EpisodeMetadata {
         let world =
             self.world.iter().map(|(key, value)| (format!("{WORLD_PREFIX}{key}"), value.clone()));
         let ours = ours.into_iter().map(|(key, value)| (key.to_owned(), value));
-        let mut map: BTreeMap<String, String> = ours.chain(world).collect();
-        map.insert(CHECKSUM.to_owned(), checksum(&map));
-        map
+        with_checksum(ours.chain(world).collect())
     }
 
     /// Reads what [`Self::to_map`] wrote; on failure says which entry is missing or wrong.
@@ -154,6 +152,12 @@ impl EpisodeMetadata {
                 .collect(),
         })
     }
+}
+
+/// The entries and their checksum.
+pub(crate) fn with_checksum(mut map: BTreeMap<String, String>) -> BTreeMap<String, String> {
+    map.insert(CHECKSUM.to_owned(), checksum(&map));
+    map
 }
 
 /// Compares the entries with their checksum. A log without one is taken as it is: older programs wrote none.

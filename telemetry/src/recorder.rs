@@ -1,20 +1,15 @@
 //! Writes one episode into one MCAP file.
 
-use std::collections::BTreeMap;
-use std::fs::File;
-use std::io::BufWriter;
-use std::marker::PhantomData;
 use std::path::{Path, PathBuf};
 
-use foxglove::Encode;
-use foxglove::messages::{FrameTransforms, JointStates, Log, SceneUpdate, Timestamp, log::Level};
-use mcap::records::{MessageHeader, Metadata};
+use foxglove::messages::{FrameTransforms, JointStates, Log, SceneUpdate, log::Level};
 use tandem_core::layout::GOAL_TOLERANCE_M;
 use tandem_core::reward::{distance, sparse_reward};
 use tandem_core::scene::Scene;
 use tandem_core::{ArmAdvice, Contacts, Layout};
 
 use crate::error::Error;
+use crate::log_file::{Channel, LogFile, check_length, log_line, nanoseconds, timestamp};
 use crate::messages::{EpisodeMetadata, METADATA_NAME, pb};
 use crate::scene::{frame_transforms, joint_states, scene_update};
 
@@ -53,8 +48,6 @@ pub struct TransitionRecord<'a> {
 /// The file is called `NAME.mcap.part` until [`finish`](Self::finish) gives it its name, so a file without that
 /// ending is always whole. Message times are simulated time since the episode's start.
 pub struct EpisodeRecorder {
-    path: PathBuf,
-    part_path: PathBuf,
     layout: Layout,
     file: LogFile,
     channels: Channels,
@@ -69,12 +62,9 @@ impl EpisodeRecorder {
     /// # Errors
     /// When the file cannot be written.
     pub fn create(path: &Path, metadata: &EpisodeMetadata) -> Result<Self, Error> {
-        let part_path = part_path(path);
-        let file = File::create(&part_path).map_err(Error::io("create", &part_path))?;
-        let (file, channels) = start_log(file, metadata).map_err(Error::write_log(&part_path))?;
+        let mut file = LogFile::create(path)?;
+        let channels = Channels::start(&mut file, metadata).map_err(file.write_error())?;
         Ok(Self {
-            path: path.to_owned(),
-            part_path,
             layout: metadata.layout,
             file,
             channels,
@@ -98,7 +88,7 @@ impl EpisodeRecorder {
         self.goal = transition.goal.to_vec();
         self.count(scene, transition);
         let caption = step_caption(&self.stats, transition);
-        self.write_step(scene, &caption, transition).map_err(Error::write_log(&self.part_path))
+        self.write_step(scene, &caption, transition).map_err(self.file.write_error())
     }
 
     /// Logs the world and the observation after the last step, shape `[n_observation]`, and what they amount to.
@@ -112,7 +102,7 @@ impl EpisodeRecorder {
         let outcome = self.outcome(observation);
         let verdict = if outcome.success { "success" } else { "failure" };
         let caption = format!("{verdict}\nreturn {:.0}", self.stats.episode_return);
-        self.write_outcome(scene, &caption, &outcome).map_err(Error::write_log(&self.part_path))
+        self.write_outcome(scene, &caption, &outcome).map_err(self.file.write_error())
     }
 
     /// Adds a line to the episode's log channel, at the time of the latest step.
@@ -120,28 +110,17 @@ impl EpisodeRecorder {
     /// # Errors
     /// When the file cannot be written.
     pub fn log(&mut self, message: &str) -> Result<(), Error> {
-        let entry = Log {
-            timestamp: Some(timestamp(self.time_ns)),
-            level: Level::Info.into(),
-            message: message.to_owned(),
-            name: "tandem".to_owned(),
-            ..Log::default()
-        };
-        self.channels
-            .log
-            .write(&mut self.file, self.time_ns, &entry)
-            .map_err(Error::write_log(&self.part_path))
+        let line = log_line(self.time_ns, Level::Info, message);
+        let (file, now) = (&mut self.file, self.time_ns);
+        self.channels.log.write(file, now, &line).map_err(self.file.write_error())
     }
 
     /// Completes the file, gives it its name and returns that.
     ///
     /// # Errors
     /// When the file cannot be written or renamed.
-    pub fn finish(mut self) -> Result<PathBuf, Error> {
-        self.file.writer.finish().map_err(Error::write_log(&self.part_path))?;
-        std::fs::rename(&self.part_path, &self.path)
-            .map_err(Error::io("rename", &self.part_path))?;
-        Ok(self.path)
+    pub fn finish(self) -> Result<PathBuf, Error> {
+        self.file.finish()
     }
 
     fn check_lengths(&self, transition: &TransitionRecord<'_>) -> Result<(), Error> {
@@ -189,7 +168,7 @@ impl EpisodeRecorder {
         self.channels.transition.write(&mut self.file, self.time_ns, &transition_message(step))?;
         self.channels.stats.write(&mut self.file, self.time_ns, &self.stats)?;
         if (step.step + 1).is_multiple_of(FLUSH_EVERY_STEPS) {
-            self.file.writer.flush()?;
+            self.file.flush()?;
         }
         Ok(())
     }
@@ -202,7 +181,7 @@ impl EpisodeRecorder {
     ) -> mcap::McapResult<()> {
         self.write_world(scene, caption)?;
         self.channels.outcome.write(&mut self.file, self.time_ns, outcome)?;
-        self.file.writer.flush()
+        self.file.flush()
     }
 
     fn write_world(&mut self, scene: &Scene, caption: &str) -> mcap::McapResult<()> {
@@ -212,41 +191,6 @@ impl EpisodeRecorder {
         self.channels.tf.write(file, now, &frame_transforms(scene, stamp))?;
         self.channels.joint_states.write(file, now, &joint_states(scene, stamp))
     }
-}
-
-/// The name of `path` while it is being written.
-pub(crate) fn part_path(path: &Path) -> PathBuf {
-    let mut name = path.as_os_str().to_owned();
-    name.push(".part");
-    PathBuf::from(name)
-}
-
-/// The options of every log: no helper threads, as there are as many writers as episodes in flight.
-pub(crate) fn write_options() -> mcap::WriteOptions {
-    mcap::WriteOptions::new()
-        .compression(Some(mcap::Compression::Zstd))
-        .compression_level(0)
-        .compression_threads(0)
-        .library(concat!("tandem/", env!("CARGO_PKG_VERSION")))
-}
-
-/// Puts metadata and channels at the head of `file` and onto the disk.
-fn start_log(file: File, metadata: &EpisodeMetadata) -> mcap::McapResult<(LogFile, Channels)> {
-    let mut writer = write_options().create(BufWriter::new(file))?;
-    writer.write_metadata(&Metadata {
-        name: METADATA_NAME.to_owned(),
-        metadata: metadata.to_map(),
-    })?;
-    let mut file = LogFile { writer, buffer: Vec::new() };
-    let channels = Channels::open(&mut file)?;
-    file.writer.flush()?;
-    Ok((file, channels))
-}
-
-/// An MCAP writer and the buffer in which messages are encoded.
-struct LogFile {
-    writer: mcap::Writer<BufWriter<File>>,
-    buffer: Vec<u8>,
 }
 
 struct Channels {
@@ -260,8 +204,10 @@ struct Channels {
 }
 
 impl Channels {
-    fn open(file: &mut LogFile) -> mcap::McapResult<Self> {
-        Ok(Self {
+    /// Puts metadata and channels at the head of `file` and onto the disk.
+    fn start(file: &mut LogFile, metadata: &EpisodeMetadata) -> mcap::McapResult<Self> {
+        file.write_metadata(METADATA_NAME, metadata.to_map())?;
+        let channels = Self {
             scene: Channel::open(file, "/scene")?,
             tf: Channel::open(file, "/tf")?,
             joint_states: Channel::open(file, "/joint_states")?,
@@ -269,45 +215,9 @@ impl Channels {
             transition: Channel::open(file, TRANSITION_TOPIC)?,
             stats: Channel::open(file, "/stats")?,
             outcome: Channel::open(file, OUTCOME_TOPIC)?,
-        })
-    }
-}
-
-/// A channel of one log.
-struct Channel<T> {
-    id: u16,
-    n_messages: u32,
-    message: PhantomData<T>,
-}
-
-impl<T: Encode> Channel<T> {
-    fn open(file: &mut LogFile, topic: &str) -> mcap::McapResult<Self> {
-        let schema_id = match T::get_schema() {
-            Some(schema) => file.writer.add_schema(&schema.name, &schema.encoding, &schema.data)?,
-            None => 0,
         };
-        let id = file.writer.add_channel(
-            schema_id,
-            topic,
-            &T::get_message_encoding(),
-            &BTreeMap::new(),
-        )?;
-        Ok(Self { id, n_messages: 0, message: PhantomData })
-    }
-
-    fn write(&mut self, file: &mut LogFile, time_ns: u64, message: &T) -> mcap::McapResult<()> {
-        file.buffer.clear();
-        message
-            .encode(&mut file.buffer)
-            .map_err(|error| std::io::Error::other(error.to_string()))?;
-        let header = MessageHeader {
-            channel_id: self.id,
-            sequence: self.n_messages,
-            log_time: time_ns,
-            publish_time: time_ns,
-        };
-        self.n_messages += 1;
-        file.writer.write_to_known_channel(&header, &file.buffer)
+        file.flush()?;
+        Ok(channels)
     }
 }
 
@@ -345,18 +255,4 @@ fn goal_distances_m(scene: &Scene) -> Vec<f32> {
         .zip(&scene.goals)
         .map(|(object, goal)| distance(&object.centre, goal))
         .collect()
-}
-
-fn check_length(field: &'static str, got: usize, expected: usize) -> Result<(), Error> {
-    if got == expected { Ok(()) } else { Err(Error::Length { field, got, expected }) }
-}
-
-/// Simulated seconds as a log's nanoseconds.
-fn nanoseconds(time_s: f64) -> Result<u64, Error> {
-    let time = std::time::Duration::try_from_secs_f64(time_s).ok();
-    time.and_then(|time| u64::try_from(time.as_nanos()).ok()).ok_or(Error::Time { time_s })
-}
-
-fn timestamp(time_ns: u64) -> Timestamp {
-    Timestamp::saturating_from_epoch_secs_f64(time_ns as f64 * 1e-9)
 }

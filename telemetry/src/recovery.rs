@@ -8,7 +8,7 @@ use mcap::McapError;
 use mcap::records::Record;
 
 use crate::error::Error;
-use crate::recorder::write_options;
+use crate::log_file::write_options;
 use crate::records::Records;
 
 /// What [`recover`] saved.

@@ -8,6 +8,10 @@ use foxglove::messages::{
 use tandem_core::layout::GOAL_TOLERANCE_M;
 use tandem_core::scene::{ArmScene, Capsule, Cuboid, Point, Scene};
 
+pub(crate) use trail::Trails;
+
+mod trail;
+
 /// The frame in which everything is given.
 const WORLD: &str = "world";
 const NO_ROTATION: Quaternion = Quaternion { x: 0.0, y: 0.0, z: 0.0, w: 1.0 };
@@ -79,14 +83,31 @@ pub(crate) fn frame_transforms(scene: &Scene, stamp: Timestamp) -> FrameTransfor
 
 /// Joints `arm{i}/joint{j}`, `j` from 1 as the arm's maker counts, radians.
 pub(crate) fn joint_states(scene: &Scene, stamp: Timestamp) -> JointStates {
-    let joints = scene.arms.iter().enumerate().flat_map(|(i, arm)| {
-        arm.joint_angles_rad.iter().enumerate().map(move |(joint_idx, angle_rad)| JointState {
-            name: format!("arm{i}/joint{}", joint_idx + 1),
-            position: Some(*angle_rad),
-            ..JointState::default()
+    let angles_rad: Vec<&[f64]> =
+        scene.arms.iter().map(|arm| arm.joint_angles_rad.as_slice()).collect();
+    joint_states_of(&angles_rad, &[], stamp)
+}
+
+/// The same of joint angles (radians), arm by arm, and after them `arm{i}/gripper`, 0 shut to 1 open.
+pub(crate) fn joint_states_of<A: AsRef<[f64]>>(
+    angles_rad: &[A],
+    openings: &[f64],
+    stamp: Timestamp,
+) -> JointStates {
+    let state = |name: String, position: f64| JointState {
+        name,
+        position: Some(position),
+        ..JointState::default()
+    };
+    let joints = angles_rad.iter().enumerate().flat_map(|(i, arm)| {
+        let angles = arm.as_ref().iter().enumerate();
+        angles.map(move |(joint_idx, angle_rad)| {
+            state(format!("arm{i}/joint{}", joint_idx + 1), *angle_rad)
         })
     });
-    JointStates { timestamp: Some(stamp), joints: joints.collect() }
+    let grippers = openings.iter().enumerate();
+    let grippers = grippers.map(|(i, opening)| state(format!("arm{i}/gripper"), *opening));
+    JointStates { timestamp: Some(stamp), joints: joints.chain(grippers).collect() }
 }
 
 /// The links, and the post on which the first of them stands; balls where they meet.

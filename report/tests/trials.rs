@@ -1,0 +1,245 @@
+//! Trials: counted, drawn, told of on a page.
+#![expect(clippy::unwrap_used, reason = "a test that cannot go on may end")]
+
+use tandem_report::{Comparison, Pictured, Trials, report_html, trial_svg, trials};
+use tandem_telemetry::{ToolsAt, TrialRow};
+
+#[path = "support/well_formed.rs"]
+mod well_formed;
+
+use well_formed::assert_well_formed;
+
+/// A trial of two arms that push; the ways have a place each centimetre, the planned ones stop at two thirds.
+fn row(trial: u64, cause: Option<&str>) -> TrialRow {
+    let tools = |step: u32, off_m: f64| {
+        let x = 0.01 * f64::from(step);
+        vec![[x - 0.2, 0.1 + off_m, 0.05], [0.2 - x, off_m - 0.1, 0.05]]
+    };
+    let path = (0..30).map(|step| ToolsAt {
+        time_s: 0.04 * f64::from(step),
+        planned: if step < 20 { tools(step, 0.0) } else { Vec::new() },
+        measured: tools(step, 0.004),
+    });
+    TrialRow {
+        subject: "student-push".to_owned(),
+        mode: "closed-loop".to_owned(),
+        task: "push".to_owned(),
+        trial,
+        seed: 777,
+        success: cause.is_none(),
+        cause: cause.map(str::to_owned),
+        detail: cause.map(|cause| format!("{cause} & more: arm 0 < arm 1")),
+        goal_distances_m: vec![0.012, 0.0834],
+        rehearsed_m: None,
+        duration_s: 10.0 + trial as f64,
+        n_steps: 40,
+        n_shortened: 3,
+        arms_gap_m: Some(0.0305),
+        table_gap_m: 0.0061,
+        starts: vec![[-0.05, 0.15, 0.0], [0.05, -0.15, 0.0]],
+        goals: vec![[-0.1, -0.05, 0.0], [0.1, 0.05, 0.0]],
+        ends: vec![[-0.1, -0.06, 0.0], [0.1, 0.1, 0.0]],
+        path: path.collect(),
+        log: Some(format!("trial-{trial}.mcap")),
+    }
+}
+
+/// The numbers of points of every polyline, in order.
+fn points_of_polylines(svg: &str) -> Vec<usize> {
+    let lines = svg.split("<polyline points=\"").skip(1);
+    lines.map(|line| line.split('"').next().unwrap().split_whitespace().count()).collect()
+}
+
+/// Two successes and a failure of each cause, in an order that is nobody's.
+fn of_every_cause() -> Vec<TrialRow> {
+    let causes = trials::CAUSES.iter().rev().map(|cause| Some(*cause));
+    (0..).zip(causes.chain([None, None])).map(|(trial, cause)| row(trial, cause)).collect()
+}
+
+#[test]
+fn the_table_has_successes_intervals_causes_and_the_papers_rows() {
+    let mut rows = of_every_cause();
+    for trial in 0..4 {
+        rows.push(TrialRow { mode: "open-loop".to_owned(), ..row(trial, None) });
+    }
+    let text = Trials::of(rows).text();
+    let expected = "\
+push: trials, as the paper's Table 4
+subject, mode               success  share [95 % interval]  not-reached  object-lost  timed-out  arms-touched  table-touched  refused  stopped  median time
+student-push, closed-loop       2/9      22.2 % [6.3–54.7]            1            1          1             1              1        1        1       14.0 s
+student-push, open-loop         4/4   100.0 % [51.0–100.0]            0            0          0             0              0        0        0       11.5 s
+the paper, proposed method    40/50     80.0 % [67.0–88.8]            –            –          –             –              –        –        –            –
+the paper, from scratch        0/50        0.0 % [0.0–7.1]            –            –          –             –              –        –        –            –
+";
+    assert_eq!(text, expected);
+}
+
+#[test]
+fn pick_and_place_comes_after_push_and_causes_that_nobody_knows_last() {
+    let other_task = |trial, cause| TrialRow {
+        task: "pick-and-place".to_owned(),
+        subject: "a".to_owned(),
+        ..row(trial, cause)
+    };
+    let mut without_cause = row(3, None);
+    without_cause.success = false;
+    let mut contradictory = row(4, Some("stopped"));
+    contradictory.success = true;
+    let rows = vec![
+        other_task(1, None),
+        row(1, Some("lightning")),
+        row(2, Some("not-reached")),
+        without_cause,
+        contradictory,
+    ];
+    let tables = Trials::of(rows).tables();
+    assert_eq!(tables.len(), 2);
+    assert!(tables[0].title.starts_with("push:") && tables[1].title.starts_with("pick-and-place:"));
+    let cell = |head: &str| {
+        let column = tables[0].header.iter().position(|cell| cell == head).unwrap();
+        tables[0].lines[0][column].as_str()
+    };
+    assert_eq!(
+        ["success", "not-reached", "stopped", "other"].map(cell),
+        ["0/4", "1", "1", "2"],
+        "a trial that names a cause is no success"
+    );
+    assert!(!tables[1].header.contains(&"other".to_owned()));
+    let papers: Vec<&str> = tables[1].lines[1..].iter().map(|line| line[1].as_str()).collect();
+    assert_eq!(papers, ["38/50", "30/50"]);
+}
+
+#[test]
+fn one_arm_is_not_set_beside_the_papers_two() {
+    let mut lone = row(1, Some("timed-out"));
+    for places in [&mut lone.starts, &mut lone.goals, &mut lone.ends] {
+        places.truncate(1);
+    }
+    for tools in &mut lone.path {
+        tools.planned.truncate(1);
+        tools.measured.truncate(1);
+    }
+    (lone.arms_gap_m, lone.goal_distances_m, lone.detail) = (None, vec![0.07], None);
+    let trials = Trials::of(vec![lone.clone()]);
+    assert_eq!(trials.tables()[0].lines.len(), 1);
+    let svg = trial_svg(&lone);
+    assert_well_formed(&svg);
+    assert_eq!(points_of_polylines(&svg), [30, 20, 30, 20]);
+    assert!(svg.contains("arm 0<") && !svg.contains("arm 1<"));
+}
+
+#[test]
+fn a_picture_has_both_ways_of_both_arms_in_both_views() {
+    let svg = trial_svg(&row(7, Some("arms-touched")));
+    assert_well_formed(&svg);
+    assert_eq!(points_of_polylines(&svg), [30, 20, 30, 20, 30, 20, 30, 20]);
+    let dashed = svg
+        .split("<polyline")
+        .skip(1)
+        .filter(|line| line.split("/>").next().unwrap().contains("stroke-dasharray"));
+    assert_eq!(dashed.count(), 4, "what was planned");
+    for text in [
+        "push, trial 7: arms-touched",
+        "12 / 83 mm",
+        "arms-touched &amp; more: arm 0 &lt; arm 1",
+        "3 of them shortened",
+        "10 cm",
+        "where it stopped",
+    ] {
+        assert!(svg.contains(text), "{text}");
+    }
+    let success = trial_svg(&row(8, None));
+    assert!(success.contains("trial 8: success") && !success.contains("where it stopped"));
+}
+
+#[test]
+fn a_trial_that_never_moved_is_drawn_and_so_is_one_of_which_nothing_is_known() {
+    let still = TrialRow { path: Vec::new(), ..row(1, Some("refused")) };
+    let unknown = TrialRow {
+        starts: Vec::new(),
+        goals: Vec::new(),
+        ends: Vec::new(),
+        goal_distances_m: Vec::new(),
+        ..still.clone()
+    };
+    for row in [still, unknown] {
+        let svg = trial_svg(&row);
+        assert_well_formed(&svg);
+        assert!(points_of_polylines(&svg).is_empty() && svg.contains("trial 1: refused"));
+    }
+}
+
+#[test]
+fn an_object_that_flew_away_does_not_shrink_the_picture() {
+    let circle = |row: &TrialRow| {
+        let svg = trial_svg(row);
+        assert_well_formed(&svg);
+        let radius =
+            svg.split("r=\"").skip(1).map(|rest| rest.split('"').next().unwrap().to_owned());
+        radius.map(|radius| radius.parse::<f64>().unwrap()).fold(0.0, f64::max)
+    };
+    let near = row(1, Some("object-lost"));
+    let mut far = near.clone();
+    far.ends[1] = [3.0, 0.1, -9.0];
+    assert_eq!(circle(&near), circle(&far));
+}
+
+#[test]
+fn the_page_shows_every_failure_and_lists_every_trial() {
+    let dir = tempfile::tempdir().unwrap();
+    let trials = Trials::of(of_every_cause());
+    let comparison = Comparison::of(Vec::new(), Vec::new());
+    let page = dir.path().join("report.html");
+    let written = report_html(&comparison, &trials, Pictured::Failures, &page).unwrap();
+    assert_eq!(written.figures.len(), trials::CAUSES.len());
+    assert!(written.figures.iter().all(|path| path.exists()));
+    let html = std::fs::read_to_string(&written.page).unwrap();
+    assert_eq!(html.matches("<svg").count(), trials::CAUSES.len());
+    for (trial, cause) in trials::CAUSES.iter().rev().enumerate() {
+        assert!(html.contains(&format!("push, trial {trial}: {cause}")), "{cause}");
+    }
+    for number in 0..9 {
+        assert!(html.contains(&format!("<td>trial-{number}.mcap</td>")), "{number}");
+    }
+    assert!(html.contains("Trials compared") && html.contains("Tables 2 and 4"));
+    assert!(
+        !html.contains("Table 2</h2>"),
+        "without a run the paper's Table 2 is beside the point"
+    );
+    let all = report_html(&comparison, &trials, Pictured::All, &page).unwrap();
+    assert_eq!(all.figures.len(), 9);
+}
+
+#[test]
+fn trials_that_repeat_another_are_told_of_and_keep_their_pictures() {
+    let rows = vec![row(1, Some("stopped")), row(1, Some("stopped")), row(2, None)];
+    let trials = Trials::of(rows);
+    let [warning] = &trials.warnings[..] else { panic!("{:?}", trials.warnings) };
+    assert!(warning.contains("1 of 3 trials repeat"), "{warning}");
+    let names: Vec<String> =
+        trials.pictures(Pictured::Failures).into_iter().map(|figure| figure.file_name).collect();
+    assert_eq!(
+        names,
+        [
+            "trial-push-student-push-closed-loop-seed777-1.svg",
+            "trial-push-student-push-closed-loop-seed777-1-again2.svg"
+        ]
+    );
+    assert!(Trials::of(of_every_cause()).warnings.is_empty());
+}
+
+#[test]
+fn programs_get_every_groups_figures() {
+    let value = trials::json(&Trials::of(of_every_cause()));
+    let group = &value["groups"][0];
+    assert_eq!((&group["trials"], &group["successes"]), (&9.into(), &2.into()));
+    assert_eq!(group["success"], 2.0 / 9.0);
+    assert_eq!(group["success_low"], tandem_core::Wilson::of(2, 9).low);
+    assert_eq!(group["failed_by"]["table-touched"], 1);
+    assert_eq!(group["failed_by"]["other"], 0);
+    assert_eq!(group["median_duration_s"], 14.0);
+    assert_eq!(group["median_success_duration_s"], 17.5);
+    assert_eq!(group["failures"].as_array().unwrap().len(), 7);
+    assert_eq!(group["failures"][6]["log"], "trial-6.mcap");
+    assert_eq!(group["paper"][0]["successes"], 40);
+}
