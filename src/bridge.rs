@@ -17,6 +17,7 @@ mod file;
 mod operator;
 mod play;
 mod show;
+mod trial;
 
 /// Where the system's secrets come from.
 const ENTROPY: &str = "/dev/urandom";
@@ -31,6 +32,7 @@ pub(crate) fn bridge(args: BridgeArgs) -> Result<(), Failed> {
         Some(BridgeCommand::Describe(args)) => operator::describe(&args),
         Some(BridgeCommand::Reset(args)) => operator::reset(&args),
         Some(BridgeCommand::Move(args)) => play::play(&args),
+        Some(BridgeCommand::Trial(args)) => trial::trial(&args),
     }
 }
 

@@ -7,10 +7,12 @@ use std::time::Duration;
 use clap::{Args, Parser, Subcommand, ValueEnum};
 
 mod bridge;
+mod trial;
 
 pub(crate) use bridge::{
     BridgeArgs, BridgeCommand, BridgeServeArgs, ConnectArgs, DriverName, MoveArgs, OperatorArgs,
 };
+pub(crate) use trial::{ModeName, RecordName, TrialArgs};
 
 /// Teaches robots with two arms by letting a robot with one arm advise them.
 #[derive(Debug, Parser)]

@@ -151,6 +151,8 @@ pub struct Look<'a> {
     pub planned: Option<&'a [Joints]>,
     /// What the arms said last.
     pub measured: Option<&'a PairState>,
+    /// Where the tools are by the motion and in truth.
+    pub tools: &'a PathPoint,
 }
 
 /// Somebody who watches a trial.

@@ -17,6 +17,8 @@ const READY_OPENING: f64 = 0.5;
 pub(crate) const fn name(driver: DriverName) -> &'static str {
     match driver {
         DriverName::Sim => "sim",
+        DriverName::Quarc => "quarc",
+        DriverName::KinovaRos => "kinova-ros",
     }
 }
 
@@ -25,10 +27,13 @@ pub(crate) fn executor(
     args: &BridgeServeArgs,
     time: Arc<dyn Time>,
 ) -> Result<Executor<AnyDriver>, Failed> {
-    let driver = match args.driver {
-        DriverName::Sim => simulated(args.seed, time)?,
+    let address = args.arms_at.as_deref().unwrap_or_default();
+    let (driver, settings) = match args.driver {
+        DriverName::Sim => (simulated(args.seed, time)?, Settings::default()),
+        DriverName::Quarc => quarc(address)?,
+        DriverName::KinovaRos => kinova_ros(address)?,
     };
-    Executor::new(mico_cell(), driver, Settings::default()).or_exit(Exit::Bug, String::new)
+    Executor::new(mico_cell(), driver, settings).or_exit(Exit::Bug, String::new)
 }
 
 /// A simulated pair in real time, its tools above their workspaces.
@@ -38,4 +43,37 @@ fn simulated(seed: u64, time: Arc<dyn Time>) -> Result<AnyDriver, Failed> {
     let config = SimulatedConfig { seed, ..SimulatedConfig::default() };
     let pair = SimulatedPair::new(cell, &at, READY_OPENING, config);
     Ok(Box::new(Paced::new(pair, time)))
+}
+
+/// Arms behind a Simulink model.
+#[cfg(feature = "quarc")]
+fn quarc(address: &str) -> Result<(AnyDriver, Settings), Failed> {
+    use tandem_bridge::quarc::{QuarcConfig, QuarcDriver};
+    let driver = QuarcDriver::connect(QuarcConfig::at(address));
+    Ok((Box::new(driver.or_exit(Exit::TryAgain, String::new)?), Settings::default()))
+}
+
+#[cfg(not(feature = "quarc"))]
+fn quarc(_: &str) -> Result<(AnyDriver, Settings), Failed> {
+    Err(not_built("quarc"))
+}
+
+/// Arms behind Kinova's ROS driver.
+#[cfg(feature = "kinova-ros")]
+fn kinova_ros(address: &str) -> Result<(AnyDriver, Settings), Failed> {
+    use tandem_bridge::kinova_ros::{KinovaRosConfig, KinovaRosDriver, settings};
+    let driver = KinovaRosDriver::connect(KinovaRosConfig::at(address));
+    Ok((Box::new(driver.or_exit(Exit::TryAgain, String::new)?), settings()))
+}
+
+#[cfg(not(feature = "kinova-ros"))]
+fn kinova_ros(_: &str) -> Result<(AnyDriver, Settings), Failed> {
+    Err(not_built("kinova-ros"))
+}
+
+#[cfg(not(all(feature = "quarc", feature = "kinova-ros")))]
+fn not_built(feature: &str) -> Failed {
+    Failed::usage(format!(
+        "this program was built without the driver {feature}: build it with --features {feature}"
+    ))
 }

@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use clap::{Args, Subcommand, ValueEnum};
 
-use super::{DialArgs, ListenArgs, SecretArgs};
+use super::{DialArgs, ListenArgs, SecretArgs, TrialArgs};
 
 /// Where a bridge listens, and where operators look for it.
 const ADDRESS: &str = "127.0.0.1:7002";
@@ -21,6 +21,8 @@ Examples:
   tandem bridge reset                                     lets stopped arms go
   tandem bridge move deploy/first-motion.json --check-only
   tandem bridge move deploy/first-motion.json --speed 0.1
+  tandem bridge trial --policy policies/student-push.safetensors
+  tandem bridge --driver quarc --arms-at tcpip://10.0.0.5:18000 --speed 0.1
 
 docs/bridge.md leads from nothing to a first motion."
 )]
@@ -37,6 +39,9 @@ pub(crate) struct BridgeServeArgs {
     /// What moves the arms.
     #[arg(long, value_enum, default_value_t = DriverName::Sim)]
     pub(crate) driver: DriverName,
+    /// Where the arms' side listens: tcpip://HOST:PORT for quarc, ws://HOST:PORT for kinova-ros.
+    #[arg(long, value_name = "ADDR", required_if_eq_any([("driver", "quarc"), ("driver", "kinova-ros")]))]
+    pub(crate) arms_at: Option<String>,
     /// No motion is played faster than this share of its own speed, 0.01 to 1.
     #[arg(long, default_value_t = 1.0, value_parser = share)]
     pub(crate) speed: f64,
@@ -54,6 +59,10 @@ pub(crate) struct BridgeServeArgs {
 pub(crate) enum DriverName {
     /// A simulated pair of Kinova Micos: nothing real moves.
     Sim,
+    /// Arms behind a Simulink model, by way of QUARC [builds with feature quarc].
+    Quarc,
+    /// Arms behind Kinova's ROS driver, by way of rosbridge [builds with feature kinova-ros].
+    KinovaRos,
 }
 
 #[derive(Debug, Subcommand)]
@@ -68,6 +77,8 @@ pub(crate) enum BridgeCommand {
     Reset(OperatorArgs),
     /// Moves the arms as a file says. Ctrl-C stops them.
     Move(MoveArgs),
+    /// Tries policies on a simulated pair and counts how often they succeed; needs no bridge.
+    Trial(TrialArgs),
 }
 
 /// How a bridge is reached.

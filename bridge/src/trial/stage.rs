@@ -142,18 +142,20 @@ impl<'a> Stage<'a> {
         }
         let time_s = self.n_periods as f64 * PERIOD_S;
         let planned = self.executor.reference();
-        let tools = |angles: &[Joints]| tools(&self.cell, angles);
+        let at = |angles: &[Joints]| tools(&self.cell, angles);
         let n_arms = self.cell.arms.len();
         let angles: Vec<Joints> = (0..n_arms).map(|arm| *pair.angles(ArmIndex(arm))).collect();
-        self.path.push(PathPoint {
+        let tools = PathPoint {
             time_s,
-            planned: planned.map(tools).unwrap_or_default(),
-            measured: tools(&angles),
-        });
+            planned: planned.map(at).unwrap_or_default(),
+            measured: at(&angles),
+        };
         let goals = self.goals.iter().map(|goal| goal.as_vec3().to_array()).collect();
         let scene = Scene { goals, time_s, ..pair.scene() };
         let measured = self.executor.state();
-        self.witness.look(&Look { time_s, phase, scene, planned, measured });
+        let look = Look { time_s, phase, scene, planned, measured, tools: &tools };
+        self.witness.look(&look);
+        self.path.push(tools);
     }
 }
 

@@ -1,0 +1,62 @@
+//! `tandem bridge trial` with the built program.
+#![expect(clippy::panic, reason = "a test panics where it fails")]
+
+use std::path::Path;
+use std::process::{Command, Output};
+
+use serde_json::Value;
+
+const STUDENT: &str = "policies/student-push.safetensors";
+const TEACHER: &str = "policies/teacher-push.safetensors";
+
+fn trial(out: &Path, more: &[&str]) -> Output {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_tandem"));
+    command.args(["bridge", "trial", "--out"]).arg(out).args(more);
+    command.current_dir(env!("CARGO_MANIFEST_DIR")).env_remove("RUST_LOG");
+    command.output().expect("runs")
+}
+
+fn rows(out: &Path) -> Vec<Value> {
+    let text = std::fs::read_to_string(out.join("trials.jsonl")).expect("written");
+    text.lines().map(|line| serde_json::from_str(line).expect("an object")).collect()
+}
+
+#[test]
+fn policies_are_tried_judged_and_recorded() {
+    let dir = tempfile::tempdir().expect("a directory");
+    let args = ["--policy", STUDENT, "--composed-teachers", TEACHER, "--trials", "2", "--json"];
+    let output = trial(dir.path(), &[&args[..], &["--record", "all"]].concat());
+    assert_eq!(output.status.code(), Some(0), "{}", String::from_utf8_lossy(&output.stderr));
+    let told: Value = serde_json::from_slice(&output.stdout).expect("one object");
+    assert!(told["trials"].is_object() || told["trials"].is_array(), "{told}");
+    let rows = rows(dir.path());
+    assert_eq!(rows.len(), 2 * 3 * 2, "subjects, modes, trials");
+    for row in &rows {
+        let log = dir.path().join(row["log"].as_str().expect("a log"));
+        assert!(log.metadata().expect("written").len() > 1000, "{}", log.display());
+        let same_start = rows.iter().filter(|other| other["trial"] == row["trial"]);
+        assert!(same_start.clone().all(|other| other["goals"] == row["goals"]));
+    }
+    let looking = |row: &&Value| row["mode"] == "closed-loop" && row["subject"] == "student-push";
+    assert!(rows.iter().filter(looking).all(|row| row["success"] == true), "{rows:?}");
+    assert!(dir.path().join("report.html").exists());
+}
+
+#[test]
+fn what_cannot_be_tried_is_said_in_one_line() {
+    let dir = tempfile::tempdir().expect("a directory");
+    let check = |args: &[&str], code: i32, said: &str| {
+        let output = trial(dir.path(), args);
+        let error = String::from_utf8_lossy(&output.stderr).into_owned();
+        assert_eq!(output.status.code(), Some(code), "{args:?}: {error}");
+        assert!(error.contains(said), "{args:?}: {error}");
+        assert!(code == 64 && said.starts_with("--") || error.lines().count() == 1, "{error}");
+    };
+    check(&["--policy", TEACHER], 64, "drives 1 arm");
+    check(&["--composed-teachers", STUDENT], 64, "a teacher drives one");
+    check(&["--policy", STUDENT, "--task", "pick-and-place"], 64, "is for push");
+    check(&["--policy", STUDENT, "--block-cm", "20"], 64, "expected 3 to 9");
+    check(&["--policy", STUDENT, "--speed", "2"], 64, "at most 1");
+    check(&["--policy", "no-such-file"], 65, "no-such-file");
+    check(&[], 64, "--policy");
+}
