@@ -14,7 +14,7 @@ pub(crate) const NOTES: &str = "A trial succeeds when every object ends within 5
      trials, failures too. The paper's trials were on two real arms with a driver and objects of its own, and it gives no \
      counts by cause.";
 
-const HEADER: [&str; 13] = [
+const HEADER: [&str; 12] = [
     "trial",
     "seed",
     "outcome",
@@ -25,9 +25,8 @@ const HEADER: [&str; 13] = [
     "shortened",
     "gap of arms, mm",
     "gap to table, mm",
-    "looks",
-    "log",
     "detail",
+    "log",
 ];
 
 /// Everything there is to show of `trials`; `drawn` are their pictures.
@@ -65,9 +64,8 @@ fn cells(row: &TrialRow) -> Vec<String> {
         row.n_shortened.to_string(),
         optional(row.arms_gap_m, one_millimetre),
         one_millimetre(row.table_gap_m),
-        row.path.len().to_string(),
-        text(&row.log),
         text(&row.detail),
+        text(&row.log),
     ]
 }
 
