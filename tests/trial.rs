@@ -43,6 +43,11 @@ fn policies_are_tried_judged_and_recorded() {
 }
 
 #[test]
+fn reports_know_every_cause_of_failure() {
+    assert_eq!(tandem_report::trials::CAUSES, tandem_bridge::trial::Cause::NAMES);
+}
+
+#[test]
 fn what_cannot_be_tried_is_said_in_one_line() {
     let dir = tempfile::tempdir().expect("a directory");
     let check = |args: &[&str], code: i32, said: &str| {

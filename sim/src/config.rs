@@ -48,7 +48,7 @@ impl Default for WorldConfig {
             object_mass_kg: 0.1,
             grip_force_n: 15.0,
             push: Friction { pads: 0.3, object: 0.3 },
-            pick_and_place: Friction { pads: 1.0, object: 0.6 },
+            pick_and_place: Friction { pads: 0.45, object: 0.45 },
         }
     }
 }

@@ -3,6 +3,8 @@
 use std::path::Path;
 
 use serde::Deserialize;
+use serde_json::{Value, json};
+use tandem_kinematics::{ArmWayPoint, WayPoint};
 use tandem_proto::pb;
 
 use crate::exit::{Exit, Failed, OrExit as _};
@@ -50,6 +52,20 @@ struct FileSample {
     angles_rad: Vec<f64>,
     velocities_radps: Vec<f64>,
     opening: f64,
+}
+
+/// Writes a motion through `way_points` at `speed` as such a file.
+pub(super) fn write(path: &Path, speed: f64, way_points: &[WayPoint]) -> Result<(), Failed> {
+    let arm = |arm: &ArmWayPoint| {
+        let round = |number: f64| (number * 1e5).round() * 1e-5;
+        let tool_m = arm.tool_in_world_m.to_array().map(round);
+        json!({ "tool_m": tool_m, "opening": round(arm.opening) })
+    };
+    let way_points: Vec<Vec<Value>> =
+        way_points.iter().map(|arms| arms.iter().map(arm).collect()).collect();
+    let text = json!({ "speed": speed, "way_points": way_points }).to_string();
+    std::fs::write(path, text + "\n")
+        .or_exit(Exit::TryAgain, || format!("cannot write {}", path.display()))
 }
 
 /// The motion in the file `path`, at `speed` when it is given.

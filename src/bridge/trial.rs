@@ -18,6 +18,7 @@ use tandem_telemetry::trial_log::{TrialLook, TrialMetadata, TrialOutcome, TrialR
 use tandem_telemetry::trials::TRIALS_FILE;
 use tandem_telemetry::{ToolsAt, TrialRow, TrialsLog};
 
+use crate::bridge::file;
 use crate::cli::{ModeName, RecordName, TrialArgs};
 use crate::eval::task;
 use crate::exit::{Exit, Failed, OrExit as _};
@@ -56,8 +57,10 @@ pub(crate) fn trial(args: &TrialArgs) -> Result<(), Failed> {
     let all_modes = [ModeName::ClosedLoop, ModeName::Twin, ModeName::OpenLoop];
     let modes = if args.modes.is_empty() { &all_modes[..] } else { &args.modes };
     let out = args.out.clone().unwrap_or_else(|| PathBuf::from(format!("runs/trial-{task}")));
-    std::fs::create_dir_all(out.join("mcap"))
-        .or_exit(Exit::TryAgain, || format!("cannot create {}", out.display()))?;
+    for directory in ["mcap", "motions"] {
+        std::fs::create_dir_all(out.join(directory))
+            .or_exit(Exit::TryAgain, || format!("cannot create {}", out.display()))?;
+    }
     let file = out.join(TRIALS_FILE);
     let mut log = TrialsLog::create(&file).or_exit(Exit::TryAgain, String::new)?;
     let mut all = Vec::new();
@@ -157,7 +160,7 @@ impl Series<'_> {
                     let trials = trials.as_mut().map_err(|error| {
                         Failed::new(Exit::Bug, anyhow::anyhow!("no training world: {error}"))
                     })?;
-                    let row = self.one(trials, actor, number, args.record, out)?;
+                    let row = self.one(trials, actor, number, args, out)?;
                     bar.inc(1);
                     Ok(row)
                 },
@@ -172,9 +175,10 @@ impl Series<'_> {
         trials: &mut Trials,
         actor: &mut Actor,
         number: u64,
-        record: RecordName,
+        args: &TrialArgs,
         out: &Path,
     ) -> Result<TrialRow, Failed> {
+        let (record, motions) = (args.record, args.motions);
         let mut attempt = |witness: &mut dyn Witness| {
             let mut decide = |observation: &[f32], goal: &[f32], action: &mut [f32]| {
                 actor.act(observation, goal, action);
@@ -183,6 +187,10 @@ impl Series<'_> {
         };
         let report = attempt(&mut NoWitness)?;
         let mut row = self.row(&report);
+        if motions && !report.way_points.is_empty() {
+            let name = format!("motions/{}-{}-{number:04}.json", row.subject, row.mode);
+            file::write(&out.join(name), self.config.speed, &report.way_points)?;
+        }
         let wanted = match record {
             RecordName::All => true,
             RecordName::Failures => !row.success,

@@ -43,6 +43,9 @@ pub(crate) struct TrialArgs {
     /// Which trials leave an MCAP log.
     #[arg(long, value_enum, default_value_t = RecordName::Failures)]
     pub(crate) record: RecordName,
+    /// Leaves each trial's motion as a file for `tandem bridge move`.
+    #[arg(long)]
+    pub(crate) motions: bool,
     /// Directory for trials.jsonl and the logs [default: runs/trial-TASK].
     #[arg(long, value_name = "DIR")]
     pub(crate) out: Option<PathBuf>,

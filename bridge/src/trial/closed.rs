@@ -53,7 +53,7 @@ const ATTEMPTS: [[Part; 2]; 10] = {
 };
 
 /// What the closed loop remembers.
-pub(super) struct Hands {
+struct Hands {
     /// Joint angles where the arms were told to be, radians.
     at: Vec<Joints>,
     /// Openings that were told, metres on each side.
@@ -64,7 +64,7 @@ pub(super) struct Hands {
     /// Looks in a row at which every object was at its goal.
     n_done: usize,
     /// Where the tools went so far.
-    pub(super) way_points: Vec<WayPoint>,
+    way_points: Vec<WayPoint>,
 }
 
 impl Trials {
@@ -75,13 +75,14 @@ impl Trials {
         start: &TrialStart,
         at: &[Joints],
         policy: &mut dyn Decide,
-    ) -> (Course, Hands) {
+    ) -> Course {
         let mut course = Course {
             ended: Ok(()),
             n_steps: 0,
             n_shortened: 0,
             rehearsed_m: None,
             time_over: false,
+            way_points: Vec::new(),
         };
         let mut hands = Hands {
             at: at.to_vec(),
@@ -102,12 +103,13 @@ impl Trials {
                 Ok(whole) => course.n_shortened += usize::from(!whole),
                 Err(cause) => {
                     course.ended = Err(cause);
-                    return (course, hands);
+                    break;
                 }
             }
         }
-        course.ended = stage.wait(REST_S);
-        (course, hands)
+        course.ended = course.ended.and_then(|()| stage.wait(REST_S));
+        course.way_points = hands.way_points;
+        course
     }
 
     /// One step of the closed loop; tells whether the arms did all of what the policy asked for.
@@ -188,20 +190,23 @@ impl Trials {
                     Part::Back => from[arm] + BACK_M,
                 })
                 .collect();
-            let Ok([corner, last]) = self.ways(&from, &to, &openings_m, hands, blocks) else {
+            let Ok([corner, end, last]) = self.ways(&from, &to, &openings_m, hands, blocks) else {
                 continue;
             };
             if is_still(&first, &corner) && is_still(&first, &last) {
                 hands.openings_m = openings_m;
                 return Ok(attempt == 0);
             }
-            let way_points = [first.clone(), corner, last];
+            let way_points = [first.clone(), corner, end, last];
             let makes_room = parts.iter().any(|part| matches!(part, Part::Back));
             let check = if makes_room { &self.check } else { &self.step_check };
             let Ok(motion) = self.motion(&way_points, &hands.at, check) else { continue };
             let ends: Vec<Joints> =
                 motion.arms.iter().map(|samples| samples[samples.len() - 1].angles).collect();
-            stage.play(motion, self.config.speed)?;
+            match stage.play(motion, self.config.speed) {
+                Err(Cause::Refused(_)) => continue,
+                played => played?,
+            }
             hands.follow(way_points);
             (hands.at, hands.openings_m) = (ends, openings_m);
             return Ok(attempt == 0);
@@ -209,7 +214,8 @@ impl Trials {
         Ok(false)
     }
 
-    /// Where the tools go on their way from end effectors `from` to `to` (own frames, metres): a corner and the end.
+    /// Where the tools go on their way from end effectors `from` to `to` (own frames, metres): a corner, the end, and the
+    /// end once more, where grippers close that are to close. One that closes on its way would drag what it holds along.
     fn ways(
         &self,
         from: &[DVec3],
@@ -217,8 +223,8 @@ impl Trials {
         openings_m: &[f64],
         hands: &Hands,
         blocks: &[SeenBlock],
-    ) -> Result<[WayPoint; 2], ReachError> {
-        let mut ways: [WayPoint; 2] = [Vec::new(), Vec::new()];
+    ) -> Result<[WayPoint; 3], ReachError> {
+        let mut ways: [WayPoint; 3] = Default::default();
         for (arm, placed) in self.mapping.cell().arms.iter().enumerate() {
             let (idx, near) = (ArmIndex(arm), &hands.at[arm]);
             let [before, opening] = [hands.openings_m[arm], openings_m[arm]]
@@ -228,11 +234,16 @@ impl Trials {
             let tilt_rad = |angles| Posture::of(placed.model, angles).tilt_rad();
             let pads = Pads {
                 yaw_rad: placed.yaw_rad + Cell::FINGERS_YAW_RAD,
-                opening_m: before.min(opening) * f64::from(MAX_OPENING_M),
+                opening_m: before * f64::from(MAX_OPENING_M),
                 tilt_rad: tilt_rad(near).max(tilt_rad(&then)),
             };
-            let points = way(from, to, &pads, blocks);
-            let openings = [0.5 * (before + opening), opening];
+            let [corner, end] = way(from, to, &pads, blocks);
+            let openings = if opening < before {
+                [before, before, opening]
+            } else {
+                [0.5 * (before + opening), opening, opening]
+            };
+            let points = [corner, end, end];
             for ((way, point), opening) in ways.iter_mut().zip(points).zip(openings) {
                 let (tool_in_world_m, _) = self.mapping.tool_for_pads(idx, point, near)?;
                 way.push(ArmWayPoint { tool_in_world_m, opening });
@@ -244,7 +255,7 @@ impl Trials {
 
 impl Hands {
     /// Adds a step's way points, of which the first is where the tools were.
-    fn follow(&mut self, step: [WayPoint; 3]) {
+    fn follow(&mut self, step: [WayPoint; 4]) {
         let known = usize::from(!self.way_points.is_empty());
         self.way_points.extend(step.into_iter().skip(known));
     }

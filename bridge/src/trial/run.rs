@@ -44,6 +44,8 @@ pub(super) struct Course {
     pub(super) n_shortened: usize,
     pub(super) rehearsed_m: Option<Vec<f64>>,
     pub(super) time_over: bool,
+    /// Where the tools went, or should have gone.
+    pub(super) way_points: Vec<WayPoint>,
 }
 
 impl Trials {
@@ -86,7 +88,7 @@ impl Trials {
         let mut stage = Stage::new(self.mapping.cell().clone(), pair, goals, witness)?;
         let course = match blind {
             Some(blind) => self.open_loop(&mut stage, &at, blind),
-            None => self.closed_loop(&mut stage, &start, &at, policy).0,
+            None => self.closed_loop(&mut stage, &start, &at, policy),
         };
         Ok(self.report(number, &start, &lain, &stage, course))
     }
@@ -127,6 +129,7 @@ impl Trials {
             arms_gap_m: stage.arms_gap_m,
             table_gap_m: stage.table_gap_m,
             path: stage.path.clone(),
+            way_points: course.way_points,
             objects,
         }
     }
@@ -166,13 +169,13 @@ impl Trials {
         let pair = self.pair(start, at, number, &twin_of(&self.config.simulated));
         let mut nobody = NoWitness;
         let mut stage = Stage::new(self.mapping.cell().clone(), pair, Vec::new(), &mut nobody)?;
-        let (course, hands) = self.closed_loop(&mut stage, start, at, policy);
+        let course = self.closed_loop(&mut stage, start, at, policy);
         let ends = stage.pair().objects();
         let distance = |(arm, goal): (usize, &DVec3)| {
             (self.mapping.object_in_own(ArmIndex(arm), ends[arm].at_m) - *goal).length()
         };
         Ok(Blind {
-            way_points: course.ended.map(|()| hands.way_points),
+            way_points: course.ended.map(|()| course.way_points),
             rehearsed_m: start.goals.iter().enumerate().map(distance).collect(),
             n_steps: course.n_steps,
         })
@@ -180,6 +183,7 @@ impl Trials {
 
     /// One motion that was made before.
     fn open_loop(&self, stage: &mut Stage<'_>, at: &[Joints], blind: Blind) -> Course {
+        let way_points = blind.way_points.as_ref().map(Clone::clone).unwrap_or_default();
         let ended = blind
             .way_points
             .and_then(|way_points| self.motion(&way_points, at, &self.check))
@@ -191,6 +195,7 @@ impl Trials {
             n_shortened: 0,
             rehearsed_m: Some(blind.rehearsed_m),
             time_over: false,
+            way_points,
         }
     }
 

@@ -2,7 +2,7 @@
 //!
 //! In the training world a hand that comes down on a block is held up by it and slides on. An arm would press until the
 //! envelope stops it. So a hand above a block's top goes sideways first; where its pads would then come down on
-//! a block it stays just above.
+//! a block it stays just above. And what a hand holds it lowers to the table and no further.
 
 use glam::{DVec2, DVec3};
 
@@ -13,6 +13,10 @@ const PADS_BELOW_M: f64 = 0.015;
 /// Room that is kept beside a block, and above it, metres.
 const BESIDE_M: f64 = 0.003;
 const ABOVE_M: f64 = 0.004;
+/// A block between shut pads is held when its centre is so near, horizontally, metres.
+const HELD_WITHIN_M: f64 = 0.025;
+/// Height above the table at which a block that is held counts as set down, metres: cameras are not exact.
+const SET_DOWN_M: f64 = 0.002;
 /// Room to be added beside a block for pads that are not upright, metres for a gripper that lies.
 const TILTED_M: f64 = 0.010;
 
@@ -40,6 +44,8 @@ pub(crate) struct Pads {
 
 /// Where the point between the pads shall go on its way from `from` to `to`, world frame, metres: a corner and the end.
 pub(crate) fn way(from: DVec3, to: DVec3, pads: &Pads, blocks: &[SeenBlock]) -> [DVec3; 2] {
+    let room_m = blocks.iter().filter(|block| pads.hold(from, block)).map(SeenBlock::room_m);
+    let to = to.with_z(to.z.max(from.z - room_m.fold(f64::INFINITY, f64::min)));
     let straight = [from.midpoint(to), to];
     let (sin, cos) = libm::sincos(pads.tilt_rad);
     let reach_m = PADS_BELOW_M * cos + PAD_HALF_M.x * sin;
@@ -59,12 +65,25 @@ pub(crate) fn way(from: DVec3, to: DVec3, pads: &Pads, blocks: &[SeenBlock]) -> 
 }
 
 impl SeenBlock {
+    /// How far it may be lowered, metres.
+    fn room_m(&self) -> f64 {
+        (self.at.z - self.half_m - SET_DOWN_M).max(0.0)
+    }
+
     fn top_m(&self) -> f64 {
         self.at.z + self.half_m
     }
 }
 
 impl Pads {
+    /// Whether pads about `centre` hold `block`.
+    fn hold(&self, centre: DVec3, block: &SeenBlock) -> bool {
+        let offset = block.at - centre;
+        self.opening_m <= block.half_m
+            && offset.truncate().length() < HELD_WITHIN_M
+            && offset.z.abs() < block.half_m
+    }
+
     /// Whether pads about `centre` stand over `block` or too near beside it.
     fn overlap(&self, centre: DVec3, block: &SeenBlock) -> bool {
         let room_m = BESIDE_M + TILTED_M * libm::sin(self.tilt_rad);
@@ -130,6 +149,18 @@ mod tests {
         let narrow = Pads { opening_m: 0.033, ..OPEN };
         assert_eq!(way(from, to, &narrow, &[BLOCK])[1], to);
         assert!(way(from, to, &narrow, &[turned])[1].z > 0.07, "a corner is under a pad");
+    }
+
+    #[test]
+    fn what_is_held_is_lowered_to_the_table_and_no_further() {
+        let held = SeenBlock { at: BLOCK.at.with_z(0.06), ..BLOCK };
+        let from = DVec3::new(0.1, 0.005, 0.07);
+        let to = from.with_z(0.03);
+        let shut = Pads { opening_m: 0.02, ..OPEN };
+        let [_, end] = way(from, to, &shut, &[held]);
+        assert!((end.z - (0.07 - (0.06 - 0.028 - SET_DOWN_M))).abs() < 1e-12, "{end}");
+        let [_, end] = way(from, from.with_z(0.04), &OPEN, &[BLOCK]);
+        assert!((end.z - 0.04).abs() < 1e-12, "nothing is held by an open gripper");
     }
 
     #[test]
