@@ -1,5 +1,4 @@
 //! `tandem bridge trial` with the built program.
-#![expect(clippy::panic, reason = "a test panics where it fails")]
 
 use std::path::Path;
 use std::process::{Command, Output};

@@ -183,7 +183,7 @@ impl Trials {
 
     /// One motion that was made before.
     fn open_loop(&self, stage: &mut Stage<'_>, at: &[Joints], blind: Blind) -> Course {
-        let way_points = blind.way_points.as_ref().map(Clone::clone).unwrap_or_default();
+        let way_points = blind.way_points.clone().unwrap_or_default();
         let ended = blind
             .way_points
             .and_then(|way_points| self.motion(&way_points, at, &self.check))
