@@ -24,7 +24,8 @@ fn rows(out: &Path) -> Vec<Value> {
 fn policies_are_tried_judged_and_recorded() {
     let dir = tempfile::tempdir().expect("a directory");
     let args = ["--policy", STUDENT, "--composed-teachers", TEACHER, "--trials", "2", "--json"];
-    let output = trial(dir.path(), &[&args[..], &["--record", "all"]].concat());
+    let more = ["--record", "all", "--seed", "2", "--motions"];
+    let output = trial(dir.path(), &[&args[..], &more].concat());
     assert_eq!(output.status.code(), Some(0), "{}", String::from_utf8_lossy(&output.stderr));
     let told: Value = serde_json::from_slice(&output.stdout).expect("one object");
     assert!(told["trials"].is_object() || told["trials"].is_array(), "{told}");
@@ -39,6 +40,10 @@ fn policies_are_tried_judged_and_recorded() {
     let looking = |row: &&Value| row["mode"] == "closed-loop" && row["subject"] == "student-push";
     assert!(rows.iter().filter(looking).all(|row| row["success"] == true), "{rows:?}");
     assert!(dir.path().join("report.html").exists());
+    let motion = dir.path().join("motions/student-push-twin-0000.json");
+    let motion = std::fs::read_to_string(motion).expect("written");
+    let motion: Value = serde_json::from_str(&motion).expect("an object");
+    assert!(motion["way_points"].as_array().is_some_and(|points| points.len() > 10));
 }
 
 #[test]

@@ -37,7 +37,7 @@ fn run(trials: &mut Trials, number: u64, actor: &mut Actor) -> TrialReport {
 #[test]
 fn a_policy_that_looks_pushes_both_blocks_to_their_goals() {
     let mut actor = shipped("student-push.safetensors");
-    let mut trials = trials(Task::Push, Mode::ClosedLoop, 1);
+    let mut trials = trials(Task::Push, Mode::ClosedLoop, 2);
     for number in 0..6 {
         let report = run(&mut trials, number, &mut actor);
         assert_eq!(report.cause, None, "trial {number}");
@@ -53,11 +53,11 @@ fn a_policy_that_looks_pushes_both_blocks_to_their_goals() {
 #[test]
 fn a_trial_is_the_same_whatever_was_tried_before() {
     let mut actor = shipped("student-push.safetensors");
-    let alone = run(&mut trials(Task::Push, Mode::ClosedLoop, 1), 2, &mut actor);
-    let mut after_others = trials(Task::Push, Mode::ClosedLoop, 1);
+    let alone = run(&mut trials(Task::Push, Mode::ClosedLoop, 2), 2, &mut actor);
+    let mut after_others = trials(Task::Push, Mode::ClosedLoop, 2);
     run(&mut after_others, 0, &mut actor);
     assert_eq!(run(&mut after_others, 2, &mut actor), alone);
-    let open = run(&mut trials(Task::Push, Mode::OpenLoop, 1), 2, &mut actor);
+    let open = run(&mut trials(Task::Push, Mode::OpenLoop, 2), 2, &mut actor);
     let start = |report: &TrialReport| report.objects.iter().map(|o| o.start).collect::<Vec<_>>();
     assert_eq!(start(&open), start(&alone), "both modes have the same starts");
 }

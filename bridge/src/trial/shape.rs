@@ -2,7 +2,8 @@
 //!
 //! In the training world a hand that comes down on a block is held up by it and slides on. An arm would press until the
 //! envelope stops it. So a hand above a block's top goes sideways first; where its pads would then come down on
-//! a block it stays just above. And what a hand holds it lowers to the table and no further.
+//! a block it stays just above. A hand beside a block goes down first and then sideways: pads that come down along a block's
+//! side press it on the table. And what a hand holds it lowers to the table and no further.
 
 use glam::{DVec2, DVec3};
 
@@ -46,12 +47,14 @@ pub(crate) struct Pads {
 pub(crate) fn way(from: DVec3, to: DVec3, pads: &Pads, blocks: &[SeenBlock]) -> [DVec3; 2] {
     let room_m = blocks.iter().filter(|block| pads.hold(from, block)).map(SeenBlock::room_m);
     let to = to.with_z(to.z.max(from.z - room_m.fold(f64::INFINITY, f64::min)));
-    let straight = [from.midpoint(to), to];
     let (sin, cos) = libm::sincos(pads.tilt_rad);
     let reach_m = PADS_BELOW_M * cos + PAD_HALF_M.x * sin;
     let was_above = |block: &&SeenBlock| from.z - reach_m >= block.top_m() - ABOVE_M;
-    if to.z >= from.z || blocks.iter().filter(was_above).count() == 0 {
-        return straight;
+    if to.z >= from.z {
+        return [from.midpoint(to), to];
+    }
+    if blocks.iter().filter(was_above).count() == 0 {
+        return [from.with_z(to.z), to];
     }
     let blocked = |block: &&SeenBlock| pads.overlap(to, block);
     let lowest_m = blocks
@@ -164,9 +167,9 @@ mod tests {
     }
 
     #[test]
-    fn a_hand_beside_a_block_goes_straight() {
+    fn a_hand_beside_a_block_goes_down_before_it_pushes() {
         let (from, to) = (DVec3::new(0.04, 0.0, 0.04), DVec3::new(0.08, 0.0, 0.03));
-        assert_eq!(way(from, to, &OPEN, &[BLOCK]), [from.midpoint(to), to]);
+        assert_eq!(way(from, to, &OPEN, &[BLOCK]), [from.with_z(0.03), to]);
         let up = from.with_z(0.1);
         assert_eq!(way(from, up, &OPEN, &[BLOCK]), [from.midpoint(up), up]);
     }

@@ -14,7 +14,9 @@ use crate::injection::{KINDS, Kind, disturbance};
 use crate::observer::{Observer, Slack};
 use crate::rig::{LOW, MIDDLE, OWNER, Rig, TASKS, tools, walk};
 
-const N_PER_KIND: usize = 30;
+/// Executions with each kind of fault, every day and when there is time.
+const N_PER_KIND: usize = 15;
+const N_PER_KIND_WITH_TIME: usize = 200;
 /// Time from when a fault can be seen until nothing moves, seconds.
 const STOPPED_S: f64 = 0.100;
 /// How long the arms are watched afterwards, periods.
@@ -227,8 +229,18 @@ fn abandon(rig: Rig, plan: &Plan, mut observer: Observer, began_s: f64) -> Endin
 
 #[test]
 fn every_fault_at_any_time_stops_the_arms_within_their_limits() {
+    execute_each_kind(N_PER_KIND);
+}
+
+#[test]
+#[ignore = "takes a minute"]
+fn two_hundred_of_every_fault_at_any_time_stop_the_arms_within_their_limits() {
+    execute_each_kind(N_PER_KIND_WITH_TIME);
+}
+
+fn execute_each_kind(n_per_kind: usize) {
     let (mut n, mut slowest, mut causes) = (0, BTreeMap::new(), BTreeMap::new());
-    for idx in 0..N_PER_KIND * KINDS.len() {
+    for idx in 0..n_per_kind * KINDS.len() {
         let (kind, seed) = (KINDS[idx % KINDS.len()], idx as u64);
         let ending = execute(&Plan::new(kind, seed));
         assert!(
