@@ -42,9 +42,9 @@ fn serve(args: BridgeServeArgs) -> Result<(), Failed> {
     let runtime = runtime().or_exit(Exit::TryAgain, String::new)?;
     runtime.block_on(async move {
         let shutdown = services::shutdown(args.listen.exit_with_stdin)?;
-        let listener = services::listen(&args.listen).await?;
         let time = Arc::new(clock::Ticking::new());
         let executor = arms::executor(&args, time.clone())?;
+        let listener = services::listen(&args.listen).await?;
         let config = Config {
             driver: arms::name(args.driver).to_owned(),
             version: services::VERSION.to_owned(),

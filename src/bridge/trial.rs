@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use indicatif::ProgressBar;
-use rayon::iter::{IntoParallelIterator as _, ParallelIterator as _};
+use rayon::iter::{IntoParallelIterator as _, IntoParallelRefIterator as _, ParallelIterator as _};
 use serde_json::json;
 use tandem_bridge::SimulatedConfig;
 use tandem_bridge::simulated::Block;
@@ -75,10 +75,12 @@ pub(crate) fn trial(args: &TrialArgs) -> Result<(), Failed> {
                 simulated: SimulatedConfig::default(),
                 time_limit_s: TIME_LIMIT_S,
             };
-            let rows = Series { subject, config }.run(args, &out)?;
+            let series = Series { subject, config };
+            let rows = series.run(args, &out)?;
             for row in &rows {
                 log.append(row).or_exit(Exit::TryAgain, String::new)?;
             }
+            series.record(&rows, &out)?;
             all.extend(rows);
         }
     }
@@ -155,11 +157,11 @@ impl Series<'_> {
         let rows: Result<Vec<TrialRow>, Failed> = (0..args.trials)
             .into_par_iter()
             .map_init(
-                || (Trials::new(self.config.clone()), actor.clone()),
+                || (self.trials(), actor.clone()),
                 |(trials, actor), number| {
-                    let trials = trials.as_mut().map_err(|error| {
-                        Failed::new(Exit::Bug, anyhow::anyhow!("no training world: {error}"))
-                    })?;
+                    let trials = trials
+                        .as_mut()
+                        .map_err(|failed| Failed::new(Exit::Bug, anyhow::anyhow!("{failed:?}")))?;
                     let row = self.one(trials, actor, number, args, out)?;
                     bar.inc(1);
                     Ok(row)
@@ -178,35 +180,39 @@ impl Series<'_> {
         args: &TrialArgs,
         out: &Path,
     ) -> Result<TrialRow, Failed> {
-        let (record, motions) = (args.record, args.motions);
-        let mut attempt = |witness: &mut dyn Witness| {
-            let mut decide = |observation: &[f32], goal: &[f32], action: &mut [f32]| {
-                actor.act(observation, goal, action);
-            };
-            trials.run(number, &mut decide, witness).map_err(|error| failed(error, number))
-        };
-        let report = attempt(&mut NoWitness)?;
+        let report = attempt(trials, actor, number, &mut NoWitness)?;
         let mut row = self.row(&report);
-        if motions && !report.way_points.is_empty() {
-            let name = format!("motions/{}-{}-{number:04}.json", row.subject, row.mode);
-            file::write(&out.join(name), self.config.speed, &report.way_points)?;
+        let name = format!("{}-{}-{number:04}", row.subject, row.mode);
+        if args.motions && !report.way_points.is_empty() {
+            let path = out.join(format!("motions/{name}.json"));
+            file::write(&path, self.config.speed, &report.way_points)?;
         }
-        let wanted = match record {
+        let wanted = match args.record {
             RecordName::All => true,
             RecordName::Failures => !row.success,
             RecordName::None => false,
         };
-        if wanted {
-            // Played again, a trial takes the same course.
-            let name = format!("mcap/{}-{}-{number:04}.mcap", row.subject, row.mode);
-            let recorder = TrialRecorder::create(&out.join(&name), &self.metadata(number))
+        row.log = wanted.then(|| format!("mcap/{name}.mcap"));
+        Ok(row)
+    }
+
+    /// Plays every trial that shall have a log once more: it takes the same course.
+    fn record(&self, rows: &[TrialRow], out: &Path) -> Result<(), Failed> {
+        let actor = self.subject.policy.actor().or_exit(Exit::Data, String::new)?;
+        rows.par_iter().filter(|row| row.log.is_some()).try_for_each(|row| {
+            let Some(name) = &row.log else { return Ok(()) };
+            let recorder = TrialRecorder::create(&out.join(name), &self.metadata(row.trial))
                 .or_exit(Exit::TryAgain, String::new)?;
             let mut recording = Recording { recorder, failure: None };
-            attempt(&mut recording)?;
-            recording.finish(&row)?;
-            row.log = Some(name);
-        }
-        Ok(row)
+            let mut trials = self.trials()?;
+            attempt(&mut trials, &mut actor.clone(), row.trial, &mut recording)?;
+            recording.finish(row)
+        })
+    }
+
+    fn trials(&self) -> Result<Trials, Failed> {
+        let trials = Trials::new(self.config.clone());
+        trials.or_exit(Exit::Bug, || "there is no training world".to_owned())
     }
 
     fn metadata(&self, number: u64) -> TrialMetadata {
@@ -249,6 +255,19 @@ impl Series<'_> {
             log: None,
         }
     }
+}
+
+/// Carries out a trial that somebody may watch.
+fn attempt(
+    trials: &mut Trials,
+    actor: &mut Actor,
+    number: u64,
+    witness: &mut dyn Witness,
+) -> Result<TrialReport, Failed> {
+    let mut decide = |observation: &[f32], goal: &[f32], action: &mut [f32]| {
+        actor.act(observation, goal, action);
+    };
+    trials.run(number, &mut decide, witness).map_err(|error| failed(error, number))
 }
 
 /// A trial on its way into a log.

@@ -238,6 +238,7 @@ fn two_hundred_of_every_fault_at_any_time_stop_the_arms_within_their_limits() {
     execute_each_kind(N_PER_KIND_WITH_TIME);
 }
 
+#[expect(clippy::print_stdout, reason = "what was seen, for whoever asks with --nocapture")]
 fn execute_each_kind(n_per_kind: usize) {
     let (mut n, mut slowest, mut causes) = (0, BTreeMap::new(), BTreeMap::new());
     for idx in 0..n_per_kind * KINDS.len() {
