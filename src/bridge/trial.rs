@@ -157,11 +157,9 @@ impl Series<'_> {
         let rows: Result<Vec<TrialRow>, Failed> = (0..args.trials)
             .into_par_iter()
             .map_init(
-                || (self.trials(), actor.clone()),
+                || (self.trials().ok(), actor.clone()),
                 |(trials, actor), number| {
-                    let trials = trials
-                        .as_mut()
-                        .map_err(|failed| Failed::new(Exit::Bug, anyhow::anyhow!("{failed:?}")))?;
+                    let trials = trials.as_mut().ok_or_else(no_world)?;
                     let row = self.one(trials, actor, number, args, out)?;
                     bar.inc(1);
                     Ok(row)
@@ -211,8 +209,7 @@ impl Series<'_> {
     }
 
     fn trials(&self) -> Result<Trials, Failed> {
-        let trials = Trials::new(self.config.clone());
-        trials.or_exit(Exit::Bug, || "there is no training world".to_owned())
+        Trials::new(self.config.clone()).map_err(|_| no_world())
     }
 
     fn metadata(&self, number: u64) -> TrialMetadata {
@@ -255,6 +252,10 @@ impl Series<'_> {
             log: None,
         }
     }
+}
+
+fn no_world() -> Failed {
+    Failed::new(Exit::Bug, anyhow::anyhow!("there is no training world for these blocks"))
 }
 
 /// Carries out a trial that somebody may watch.
