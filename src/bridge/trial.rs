@@ -35,6 +35,8 @@ const TIME_LIMIT_S: f64 = 120.0;
 /// Points of the tools' way that a row keeps at most.
 const PATH_POINTS: usize = 150;
 
+const NO_WORLD: &str = "there is no training world for these blocks";
+
 /// Somebody whose trials these are.
 struct Subject {
     name: String,
@@ -107,7 +109,7 @@ fn subjects(args: &TrialArgs) -> Result<(Task, Vec<Subject>), Failed> {
                 policy.layout.n_arms
             )));
         }
-        subjects.push(Subject { name: stem(path), policy });
+        subjects.push(Subject { name: name_of(path), policy });
     }
     for path in &args.composed_teachers {
         let policy = load_policy(path)?;
@@ -118,7 +120,7 @@ fn subjects(args: &TrialArgs) -> Result<(Task, Vec<Subject>), Failed> {
                 policy.layout.n_arms
             )));
         }
-        subjects.push(Subject { name: format!("composed-{}", stem(path)), policy });
+        subjects.push(Subject { name: format!("composed-{}", name_of(path)), policy });
     }
     let found = |subject: &Subject| subject.policy.layout.task;
     let wanted = args.task.map(task);
@@ -209,7 +211,7 @@ impl Series<'_> {
     }
 
     fn trials(&self) -> Result<Trials, Failed> {
-        Trials::new(self.config.clone()).map_err(|_| no_world())
+        Trials::new(self.config.clone()).or_exit(Exit::Bug, || NO_WORLD.to_owned())
     }
 
     fn metadata(&self, number: u64) -> TrialMetadata {
@@ -255,7 +257,7 @@ impl Series<'_> {
 }
 
 fn no_world() -> Failed {
-    Failed::new(Exit::Bug, anyhow::anyhow!("there is no training world for these blocks"))
+    Failed::new(Exit::Bug, anyhow::anyhow!(NO_WORLD))
 }
 
 /// Carries out a trial that somebody may watch.
@@ -354,6 +356,9 @@ fn show(args: &TrialArgs, rows: Vec<TrialRow>, file: &Path) -> Result<(), Failed
     Ok(())
 }
 
-fn stem(path: &Path) -> String {
-    path.file_stem().unwrap_or(path.as_os_str()).to_string_lossy().into_owned()
+/// The name of a policy's file, or of the run directory in which it lies.
+fn name_of(path: &Path) -> String {
+    let of_run = path.parent().filter(|directory| directory.ends_with("policy"));
+    let named = of_run.and_then(Path::parent).and_then(Path::file_name);
+    named.or(path.file_stem()).unwrap_or(path.as_os_str()).to_string_lossy().into_owned()
 }

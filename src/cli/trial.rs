@@ -15,7 +15,7 @@ Examples:
   tandem report runs/trial-push")]
 #[command(group = clap::ArgGroup::new("who").required(true).multiple(true))]
 pub(crate) struct TrialArgs {
-    /// A policy for both arms, tried under the name of its file; may be repeated.
+    /// A policy for both arms, tried under the name of its file or run directory; may be repeated.
     #[arg(long = "policy", value_name = "FILE", group = "who")]
     pub(crate) policies: Vec<PathBuf>,
     /// A one-arm policy that drives each arm by itself; may be repeated.
