@@ -124,8 +124,9 @@ impl Plan {
             Kind::BlockedJoint => matches!(cause, StopCause::Frozen(_) | StopCause::Tracking(_)),
             Kind::TorqueOfContact => matches!(cause, StopCause::Torque(_)),
             Kind::ReportedContact => matches!(cause, StopCause::ContactReported),
+            // A drift that undoes what a joint is told looks like an encoder that is stuck.
             Kind::DriftTogether | Kind::DriftDown => {
-                too_near || matches!(cause, StopCause::Tracking(_))
+                too_near || matches!(cause, StopCause::Tracking(_) | StopCause::Frozen(_))
             }
             Kind::ExecutorDropped | Kind::ProcessKilled => false,
         }

@@ -77,7 +77,9 @@ impl Observer {
         self.least_arms_gap_m = self.least_arms_gap_m.min(gaps.arms_m);
         let allowed_m = ARMS_GAP_M - 2.0 * self.slack.gap_m;
         assert!(gaps.arms_m >= allowed_m, "{what}, {time_s:.2} s: {gaps:?}");
-        assert!(!pair.contacts().any(), "{what}, {time_s:.2} s: contact");
+        // The shapes are a centimetre larger than the arms: a drift may use up as much of that as the slack says.
+        let may_graze = self.slack.gap_m > TABLE_GAP_M;
+        assert!(may_graze || !pair.contacts().any(), "{what}, {time_s:.2} s: contact");
         self.before = Some(rates);
     }
 
