@@ -122,19 +122,19 @@ impl ObjectCourse {
     }
 }
 
-/// What became of a trial that was carried out to its end or to `time_over`; `None` is success.
-pub(crate) fn judge(
-    task: Task,
-    objects: &[ObjectCourse],
-    touched: Contacts,
-    time_over: bool,
-) -> Option<Cause> {
+/// What arms may not do, however the trial ends.
+pub(crate) fn forbidden(touched: Contacts) -> Option<Cause> {
     if touched.contains(Contacts::ARM_ARM) {
-        return Some(Cause::ArmsTouched);
+        Some(Cause::ArmsTouched)
+    } else if touched.contains(Contacts::ARM_TABLE) {
+        Some(Cause::TableTouched)
+    } else {
+        None
     }
-    if touched.contains(Contacts::ARM_TABLE) {
-        return Some(Cause::TableTouched);
-    }
+}
+
+/// What became of a trial that was carried out to its end or to `time_over`; `None` is success.
+pub(crate) fn judge(task: Task, objects: &[ObjectCourse], time_over: bool) -> Option<Cause> {
     let missed = |object: &&ObjectCourse| object.goal_distance_m() > f64::from(GOAL_TOLERANCE_M);
     let mut missed = objects.iter().filter(missed).peekable();
     missed.peek()?;
@@ -144,5 +144,36 @@ pub(crate) fn judge(
         Some(Cause::TimedOut)
     } else {
         Some(Cause::NotReached)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_touch_counts_before_the_stop_that_it_leads_to() {
+        let both = Contacts::ARM_ARM | Contacts::ARM_TABLE;
+        assert_eq!(forbidden(both), Some(Cause::ArmsTouched));
+        assert_eq!(forbidden(Contacts::ARM_TABLE), Some(Cause::TableTouched));
+        assert_eq!(forbidden(Contacts::NONE), None);
+    }
+
+    #[test]
+    fn an_object_that_fell_is_lost_and_one_that_lies_elsewhere_was_not_brought() {
+        let course = |end: DVec3, highest_m| ObjectCourse {
+            start: DVec3::new(0.0, 0.0, 0.0225),
+            goal: DVec3::new(0.1, 0.0, 0.2),
+            end,
+            highest_m,
+        };
+        let check = |object: ObjectCourse, time_over, expected: Option<Cause>| {
+            assert_eq!(judge(Task::PickAndPlace, &[object], time_over), expected);
+        };
+        check(course(DVec3::new(0.1, 0.03, 0.18), 0.2), false, None);
+        check(course(DVec3::new(0.05, 0.0, 0.0225), 0.15), false, Some(Cause::ObjectLost));
+        check(course(DVec3::new(0.0, 0.0, 0.0225), 0.0225), false, Some(Cause::NotReached));
+        check(course(DVec3::new(0.0, 0.0, 0.0225), 0.0225), true, Some(Cause::TimedOut));
+        check(course(DVec3::new(0.4, 0.0, 0.0225), 0.0225), true, Some(Cause::ObjectLost));
     }
 }

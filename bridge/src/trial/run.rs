@@ -12,7 +12,7 @@ use crate::simulated::{
     Block, CameraConfig, GripperConfig, ObjectPose, SimulatedConfig, SimulatedPair,
 };
 use crate::trial::closed::STEP_GAP_M;
-use crate::trial::judge::{Cause, ObjectCourse, RefusedBy, judge};
+use crate::trial::judge::{Cause, ObjectCourse, RefusedBy, forbidden, judge};
 use crate::trial::mapping::Mapping;
 use crate::trial::rollout::{Rehearsal, TrialStart};
 use crate::trial::stage::Stage;
@@ -115,8 +115,8 @@ impl Trials {
         let places = (0..ends.len())
             .map(|arm| Places { start: lain[arm].at_m, goal: goals[arm], end: ends[arm].at_m })
             .collect();
-        let judged = || judge(self.config.layout.task, &objects, stage.touched, course.time_over);
-        let cause = course.ended.err().or_else(judged);
+        let judged = || judge(self.config.layout.task, &objects, course.time_over);
+        let cause = forbidden(stage.touched).or(course.ended.err()).or_else(judged);
         TrialReport {
             number,
             cause,
