@@ -43,13 +43,14 @@ fn serve(args: BridgeServeArgs) -> Result<(), Failed> {
     runtime.block_on(async move {
         let shutdown = services::shutdown(args.listen.exit_with_stdin)?;
         let time = Arc::new(clock::Ticking::new());
-        let executor = arms::executor(&args, time.clone())?;
+        let (executor, dial) = arms::arms(&args, time.clone())?;
         let listener = services::listen(&args.listen).await?;
         let config = Config {
             driver: arms::name(args.driver).to_owned(),
             version: services::VERSION.to_owned(),
             speed: args.speed,
             time,
+            dial,
             secret,
         };
         let served =

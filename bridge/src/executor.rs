@@ -23,7 +23,6 @@ use crate::executor::envelope::{Envelope, History};
 use crate::executor::lease::Lease;
 use crate::executor::monitor::{Monitor, Told};
 use crate::executor::playback::{Moment, Playback};
-use crate::executor::refused::GOOD_STATES;
 use crate::executor::stop::Breach;
 
 pub use checked::{CheckError, CheckedMotion, Checker};
@@ -31,6 +30,8 @@ pub use lease::{LeaseError, Token};
 pub use refused::{ResetError, StartError};
 pub use settings::{BadSetting, Settings};
 pub use stop::{Stop, StopCause};
+
+pub(crate) use refused::GOOD_STATES;
 
 mod checked;
 mod envelope;
@@ -86,6 +87,8 @@ pub struct Executor<D: Driver> {
     ticked_s: Option<f64>,
     /// Why the drives could not be told to stop, until they were.
     untold: Option<DriverError>,
+    /// Why the last exchange failed, if it did.
+    failed: Option<DriverError>,
 }
 
 /// What the arms are doing, and what goes with it.
@@ -124,6 +127,7 @@ impl<D: Driver> Executor<D> {
             before,
             ticked_s: None,
             untold: None,
+            failed: None,
             checker: Checker::new(cell.clone(), settings),
             cell,
             settings,
@@ -272,6 +276,29 @@ impl<D: Driver> Executor<D> {
         Ok(())
     }
 
+    /// Puts a driver with a new connection to the same arms in the place of one that has failed. The arms stay stopped, its
+    /// first commands are stops, commands are counted from 1, and nothing is believed of what the driver before has told.
+    ///
+    /// # Errors
+    /// When whoever asks does not own the arms, they are not stopped, or the driver has not failed.
+    pub fn replace_driver(
+        &mut self,
+        token: Token,
+        driver: D,
+        now_s: f64,
+    ) -> Result<(), ResetError> {
+        self.lease.renew(token, now_s, self.settings.lease_s)?;
+        if self.phase() != Phase::Stopped || self.failed.is_none() {
+            return Err(ResetError::Connected);
+        }
+        self.driver = driver;
+        self.monitor = Monitor::new(&self.cell, &self.settings, self.period_s);
+        self.history = History::new();
+        self.number = 0;
+        (self.untold, self.failed) = (None, None);
+        Ok(())
+    }
+
     /// Lets one period begin at `now_s`: sends a command and takes a state. To be called once a period.
     pub fn tick(&mut self, now_s: f64) -> Phase {
         let order = self.next_order(now_s).unwrap_or_else(|breach| {
@@ -282,7 +309,7 @@ impl<D: Driver> Executor<D> {
         self.remember(&order);
         match self.driver.exchange(&Command { number: self.number, order }) {
             Ok(state) => {
-                self.untold = None;
+                (self.untold, self.failed) = (None, None);
                 let ago = self.history.len().min(self.lag_periods()) - 1;
                 let told = Told { number: self.number, velocities: &self.history[ago] };
                 if let Err(breach) = self.monitor.take(now_s, state, &told) {
@@ -291,6 +318,7 @@ impl<D: Driver> Executor<D> {
             }
             Err(error) => {
                 self.monitor.miss();
+                self.failed = Some(error.clone());
                 self.halt(StopCause::Driver(error).anywhere(), now_s);
             }
         }
@@ -322,6 +350,18 @@ impl<D: Driver> Executor<D> {
     #[must_use]
     pub fn untold(&self) -> Option<&DriverError> {
         self.untold.as_ref()
+    }
+
+    /// Why the last exchange failed, if it did. A driver that has failed may never work again.
+    #[must_use]
+    pub fn failed(&self) -> Option<&DriverError> {
+        self.failed.as_ref()
+    }
+
+    /// How many states in a row were good.
+    #[must_use]
+    pub fn n_good(&self) -> u32 {
+        self.monitor.n_good()
     }
 
     /// How long the present owner's lease holds unless it is renewed, seconds; `None` when nobody owns the arms.

@@ -34,7 +34,7 @@
 //!
 //! A driver is for one connection. Whatever cannot be understood, a service that refuses or does not answer, and a lost connection end it: the
 //! arms are told to stop if they still can be, and every later exchange fails with that first error. Going on takes a new
-//! connection, a new executor and a reset.
+//! connection and a reset.
 
 use std::time::Duration;
 

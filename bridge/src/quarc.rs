@@ -19,7 +19,7 @@
 //! **Here**, a number that is not finite, an unknown flag, a jump in the sequence, a vector that stays short, a command that cannot be written
 //! at once and a closed connection all end the connection: the driver tells the arms to stop if it still can, shuts the socket and
 //! answers every later exchange with that first error. **A driver is for one connection.** Whoever wants to go on connects anew and
-//! gives the driver to a new executor, which is stopped until somebody resets it. Nothing moves by connecting:
+//! gives the new driver to the executor, which stays stopped until somebody resets it. Nothing moves by connecting:
 //! the driver refuses to hand on a motion before an order to stop was exchanged, and the numbers of commands begin at 1.
 //!
 //! **Who dials** is free. [`QuarcDriver::connect`] dials a Stream Server block; where a Stream Client block dials us,

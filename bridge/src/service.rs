@@ -30,7 +30,7 @@ use tokio_stream::wrappers::ReceiverStream;
 use tokio_util::sync::CancellationToken;
 use tonic::{Request, Response, Status, Streaming};
 
-use crate::executor::{CheckedMotion, Executor, Stop, StopCause, Token};
+use crate::executor::{CheckedMotion, Executor, GOOD_STATES, Stop, StopCause, Token};
 use error::status;
 use messages::{decode_token, token_text};
 use motion::Wanted;
@@ -39,7 +39,7 @@ use thread::{ArmsHandle, ArmsThread, Snapshot};
 pub use error::Error;
 pub use motion::Refused;
 pub use paced::Paced;
-pub use thread::AnyDriver;
+pub use thread::{AnyDriver, Dial};
 pub use time::Time;
 
 /// Bytes that a request may have: joint motions of ten minutes.
@@ -60,6 +60,8 @@ pub struct Config {
     pub speed: f64,
     /// What the arms are ticked by.
     pub time: Arc<dyn Time>,
+    /// Connects again when a reset finds that the driver has failed; `None` for arms that do not lose their connection.
+    pub dial: Option<Dial>,
     /// Makes tokens hard to guess: different at every start, and known to nobody.
     pub secret: [u8; 32],
 }
@@ -132,12 +134,15 @@ struct BridgeService {
     tokens: Mutex<ChaCha20Rng>,
     /// Motions are checked one at a time: the arms' thread needs a processor as well.
     checks: Arc<Semaphore>,
+    /// One connection is made at a time.
+    dials: Semaphore,
 }
 
 impl BridgeService {
     fn new(arms: ArmsHandle, config: Config) -> Self {
         let tokens = Mutex::new(ChaCha20Rng::from_seed(config.secret));
-        Self { arms, config, tokens, checks: Arc::new(Semaphore::new(1)) }
+        let (checks, dials) = (Arc::new(Semaphore::new(1)), Semaphore::new(1));
+        Self { arms, config, tokens, checks, dials }
     }
 
     fn new_token(&self) -> Token {
@@ -165,7 +170,25 @@ impl BridgeService {
 
     async fn reset_arms(&self, shown: &str) -> Result<(), Error> {
         let token = decode_token("token", shown)?;
+        if let Some(dial) = self.config.dial.as_ref().filter(|_| self.arms.newest().failed) {
+            self.connect_again(Arc::clone(dial), token).await?;
+        }
         self.arms.run(move |arms, now_s| arms.executor.reset(token, now_s)).await
+    }
+
+    /// Gives the arms a new connection in the place of one that has failed, and waits for good states. Nothing moves by it.
+    async fn connect_again(&self, dial: Dial, token: Token) -> Result<(), Error> {
+        let _turn = self.dials.acquire().await.map_err(|_closed| Error::Ended)?;
+        self.arms.run(move |arms, now_s| arms.executor.renew(token, now_s)).await?;
+        if !self.arms.newest().failed {
+            return Ok(());
+        }
+        let dialled = tokio::task::spawn_blocking(move || dial()).await;
+        let driver = dialled.map_err(|_panic| Error::Panicked)?.map_err(Error::Dial)?;
+        self.arms.run(move |arms, now_s| arms.replace_driver(token, driver, now_s)).await?;
+        tracing::info!("the arms have a new connection");
+        self.arms.until(|newest| newest.failed || newest.n_good >= GOOD_STATES).await;
+        Ok(())
     }
 
     /// What `request` wants, as field `field` of its message.

@@ -3,8 +3,8 @@
 use std::sync::Arc;
 
 use tandem_bridge::layout::mico_cell;
-use tandem_bridge::service::{AnyDriver, Paced, Time};
-use tandem_bridge::{Executor, Settings, SimulatedConfig, SimulatedPair};
+use tandem_bridge::service::{AnyDriver, Dial, Paced, Time};
+use tandem_bridge::{DriverError, Executor, Settings, SimulatedConfig, SimulatedPair};
 
 use crate::cli::{BridgeServeArgs, DriverName};
 use crate::exit::{Exit, Failed, OrExit as _};
@@ -22,17 +22,30 @@ pub(crate) const fn name(driver: DriverName) -> &'static str {
     }
 }
 
-/// The arms that the command line asks for, behind what lets checked motions through only.
-pub(crate) fn executor(
+/// Connects to real arms at an address.
+type Connect = fn(&str) -> Result<AnyDriver, DriverError>;
+
+/// The arms that the command line asks for, behind what lets checked motions through only, and how to connect to them again.
+/// Simulated arms do not lose their connection.
+pub(crate) fn arms(
     args: &BridgeServeArgs,
     time: Arc<dyn Time>,
-) -> Result<Executor<AnyDriver>, Failed> {
-    let address = args.arms_at.as_deref().unwrap_or_default();
-    let (driver, settings) = match args.driver {
-        DriverName::Sim => (simulated(args.seed, time)?, Settings::default()),
-        DriverName::Quarc => quarc(address)?,
-        DriverName::KinovaRos => kinova_ros(address)?,
+) -> Result<(Executor<AnyDriver>, Option<Dial>), Failed> {
+    let (connect, settings) = match args.driver {
+        DriverName::Sim => {
+            let driver = simulated(args.seed, time)?;
+            return Ok((executor(driver, Settings::default())?, None));
+        }
+        DriverName::Quarc => quarc()?,
+        DriverName::KinovaRos => kinova_ros()?,
     };
+    let address = args.arms_at.clone().unwrap_or_default();
+    let dial: Dial = Arc::new(move || connect(&address));
+    let driver = dial().or_exit(Exit::TryAgain, String::new)?;
+    Ok((executor(driver, settings)?, Some(dial)))
+}
+
+fn executor(driver: AnyDriver, settings: Settings) -> Result<Executor<AnyDriver>, Failed> {
     Executor::new(mico_cell(), driver, settings).or_exit(Exit::Bug, String::new)
 }
 
@@ -47,27 +60,31 @@ fn simulated(seed: u64, time: Arc<dyn Time>) -> Result<AnyDriver, Failed> {
 
 /// Arms behind a Simulink model.
 #[cfg(feature = "quarc")]
-fn quarc(address: &str) -> Result<(AnyDriver, Settings), Failed> {
+fn quarc() -> Result<(Connect, Settings), Failed> {
     use tandem_bridge::quarc::{QuarcConfig, QuarcDriver};
-    let driver = QuarcDriver::connect(QuarcConfig::at(address));
-    Ok((Box::new(driver.or_exit(Exit::TryAgain, String::new)?), Settings::default()))
+    fn connect(address: &str) -> Result<AnyDriver, DriverError> {
+        Ok(Box::new(QuarcDriver::connect(QuarcConfig::at(address))?))
+    }
+    Ok((connect, Settings::default()))
 }
 
 #[cfg(not(feature = "quarc"))]
-fn quarc(_: &str) -> Result<(AnyDriver, Settings), Failed> {
+fn quarc() -> Result<(Connect, Settings), Failed> {
     Err(not_built("quarc"))
 }
 
 /// Arms behind Kinova's ROS driver.
 #[cfg(feature = "kinova-ros")]
-fn kinova_ros(address: &str) -> Result<(AnyDriver, Settings), Failed> {
+fn kinova_ros() -> Result<(Connect, Settings), Failed> {
     use tandem_bridge::kinova_ros::{KinovaRosConfig, KinovaRosDriver, settings};
-    let driver = KinovaRosDriver::connect(KinovaRosConfig::at(address));
-    Ok((Box::new(driver.or_exit(Exit::TryAgain, String::new)?), settings()))
+    fn connect(address: &str) -> Result<AnyDriver, DriverError> {
+        Ok(Box::new(KinovaRosDriver::connect(KinovaRosConfig::at(address))?))
+    }
+    Ok((connect, settings()))
 }
 
 #[cfg(not(feature = "kinova-ros"))]
-fn kinova_ros(_: &str) -> Result<(AnyDriver, Settings), Failed> {
+fn kinova_ros() -> Result<(Connect, Settings), Failed> {
     Err(not_built("kinova-ros"))
 }
 

@@ -9,7 +9,7 @@ use tandem_proto::pb;
 use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
 use tokio_util::sync::CancellationToken;
-use tonic::Streaming;
+use tonic::{Code, Status, Streaming};
 
 use super::operator::{Client, acquire, answer, failed, release, with_client};
 use super::{file, show};
@@ -98,6 +98,18 @@ fn stopped(stop: &pb::BridgeStop) -> Failed {
     Failed::new(Exit::TryAgain, what)
 }
 
+/// What a person is told when the stream of a motion ends with an error. One that the bridge has not sent is the connection's.
+fn broken(status: &Status) -> Failed {
+    if status.code() != Code::Unknown {
+        return failed(status);
+    }
+    let what = anyhow::anyhow!(
+        "the connection to the bridge broke: {} (the arms are stopped by that; look at them)",
+        status.message()
+    );
+    Failed::new(Exit::TryAgain, what)
+}
+
 /// Plays the motion; gives where it has led.
 async fn execute(
     client: &mut Client,
@@ -137,7 +149,7 @@ async fn watch(
             }
         };
         let next = next.or_exit(Exit::TryAgain, || "the bridge says nothing more".to_owned())?;
-        let Some(next) = next.map_err(|status| failed(&status))? else {
+        let Some(next) = next.map_err(|status| broken(&status))? else {
             let what = anyhow::anyhow!("the bridge has not said how the motion ended");
             return Err(Failed::new(Exit::TryAgain, what));
         };

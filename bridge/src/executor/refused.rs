@@ -80,4 +80,7 @@ pub enum ResetError {
     /// A joint still moves.
     #[error("the arms still move")]
     Moving,
+    /// The connection works, and needs no new one.
+    #[error("the arms are connected: reset them")]
+    Connected,
 }

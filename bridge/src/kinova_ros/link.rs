@@ -126,5 +126,5 @@ fn blocked() -> DriverError {
 }
 
 fn lost(error: &Error) -> DriverError {
-    DriverError::Disconnected { what: format!("rosbridge: {error}") }
+    DriverError::Disconnected { what: format!("the connection to rosbridge broke: {error}") }
 }

@@ -22,6 +22,9 @@ pub enum Error {
     /// The arms were not let go.
     #[error(transparent)]
     Reset(#[from] ResetError),
+    /// No new connection could be made in the place of one that has failed.
+    #[error("{0}")]
+    Dial(#[source] DriverError),
     /// The motion was not started.
     #[error(transparent)]
     Start(#[from] StartError),
@@ -87,7 +90,7 @@ pub(super) fn status(error: &Error) -> Status {
         Error::Left => Status::cancelled(message),
         Error::Broken(status) => Status::new(status.code(), message),
         Error::Busy => Status::resource_exhausted(message),
-        Error::Ended => Status::unavailable(message),
+        Error::Ended | Error::Dial(_) => Status::unavailable(message),
         Error::Overdue(_) | Error::Untold(_) => {
             tracing::error!(%error, "request failed");
             Status::unavailable(message)

@@ -16,7 +16,8 @@ use tokio_util::sync::{CancellationToken, DropGuard};
 
 use crate::driver::{Driver, DriverError, PairState};
 use crate::executor::{
-    CheckedMotion, Checker, Executor, LeaseError, Phase, Progress, StartError, Stop,
+    CheckedMotion, Checker, Executor, LeaseError, Phase, Progress, ResetError, StartError, Stop,
+    Token,
 };
 use crate::service::error::Error;
 use crate::service::execution::{Execution, Outcome};
@@ -24,6 +25,9 @@ use crate::service::time::{Time, next_time};
 
 /// Any driver.
 pub type AnyDriver = Box<dyn Driver + Send>;
+
+/// Makes a driver with a new connection to the same arms.
+pub type Dial = Arc<dyn Fn() -> Result<AnyDriver, DriverError> + Send + Sync>;
 
 /// Jobs that wait for the thread; further ones wait with their callers.
 const CAPACITY: usize = 64;
@@ -43,6 +47,10 @@ pub(super) struct Snapshot {
     pub(super) now_s: f64,
     pub(super) phase: Phase,
     pub(super) stopped: Option<Stop>,
+    /// Whether the last exchange with the arms failed.
+    pub(super) failed: bool,
+    /// How many states in a row were good.
+    pub(super) n_good: u32,
     /// Why the drives could not be told to stop.
     pub(super) untold: Option<DriverError>,
     pub(super) lease_left_s: Option<f64>,
@@ -209,6 +217,18 @@ impl Arms {
         Ok(())
     }
 
+    /// Gives the executor a new driver in the place of one that has failed, and tells so at once.
+    pub(super) fn replace_driver(
+        &mut self,
+        token: Token,
+        driver: AnyDriver,
+        now_s: f64,
+    ) -> Result<(), ResetError> {
+        self.executor.replace_driver(token, driver, now_s)?;
+        self.publish(now_s);
+        Ok(())
+    }
+
     /// Notes how a motion has ended, once it has.
     fn conclude(&mut self) {
         let outcome = match self.executor.phase() {
@@ -255,6 +275,12 @@ impl ArmsHandle {
         }
     }
 
+    /// Waits until the thread tells what is `wanted`, no longer than for a call.
+    pub(super) async fn until(&self, wanted: impl FnMut(&Arc<Snapshot>) -> bool) {
+        let mut snapshots = self.snapshots.clone();
+        tokio::time::timeout(PATIENCE, snapshots.wait_for(wanted)).await.ok();
+    }
+
     /// What `work` gives, done in its turn before a tick. Whoever drops the future before that leaves it undone.
     pub(super) async fn run<T: Send + 'static, E: Into<Error> + Send + 'static>(
         &self,
@@ -285,6 +311,8 @@ fn snapshot(
         now_s,
         phase: executor.phase(),
         stopped: executor.stopped_by().cloned(),
+        failed: executor.failed().is_some(),
+        n_good: executor.n_good(),
         untold: executor.untold().cloned(),
         lease_left_s: executor.lease_left_s(now_s),
         at_rest: executor.at_rest(),

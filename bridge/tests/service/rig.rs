@@ -5,7 +5,7 @@ use std::sync::{Arc, Condvar, Mutex};
 use std::time::Duration;
 
 use tandem_bridge::layout::mico_cell;
-use tandem_bridge::service::{Config, Error, Time, serve};
+use tandem_bridge::service::{AnyDriver, Config, Dial, Error, Time, serve};
 use tandem_bridge::{
     Command, Driver, DriverError, Executor, Order, PairState, Settings, SimulatedConfig,
     SimulatedPair,
@@ -93,6 +93,8 @@ pub(crate) enum Fault {
     Panic,
     /// An exchange does not come back before the fault is over.
     Hang,
+    /// The present connection never works again; new ones do.
+    Lost,
 }
 
 /// A simulated pair that a test can look at and spoil.
@@ -102,10 +104,15 @@ pub(crate) struct Bench {
     /// How often the drives were told to stop past all exchanges.
     n_stops: usize,
     newest: Order,
+    /// The connection that works, counted from 0.
+    connection: usize,
+    /// What the present connection was told first.
+    first: Option<Command>,
 }
 
+/// The bench, and which connection to it this is.
 #[derive(Clone)]
-pub(crate) struct Tap(Arc<(Mutex<Bench>, Condvar)>);
+pub(crate) struct Tap(Arc<(Mutex<Bench>, Condvar)>, usize);
 
 impl Tap {
     fn new(seed: u64) -> Self {
@@ -113,13 +120,31 @@ impl Tap {
         let at = cell.ready(0.05).unwrap();
         let config = SimulatedConfig { seed, ..SimulatedConfig::default() };
         let pair = SimulatedPair::new(cell, &at, 0.5, config);
-        let bench = Bench { pair, fault: Fault::None, n_stops: 0, newest: Order::Stop };
-        Self(Arc::new((Mutex::new(bench), Condvar::new())))
+        let (fault, newest) = (Fault::None, Order::Stop);
+        let bench = Bench { pair, fault, n_stops: 0, newest, connection: 0, first: None };
+        Self(Arc::new((Mutex::new(bench), Condvar::new())), 0)
     }
 
     pub(crate) fn fail(&self, fault: Fault) {
         self.0.0.lock().unwrap().fault = fault;
         self.0.1.notify_all();
+    }
+
+    /// A new connection, when the one before is lost.
+    fn dial(&self) -> Result<Self, DriverError> {
+        let mut bench = self.0.0.lock().unwrap();
+        if bench.fault != Fault::Lost {
+            return Err(DriverError::Disconnected { what: "nobody answers".into() });
+        }
+        (bench.fault, bench.first) = (Fault::None, None);
+        bench.connection += 1;
+        Ok(Self(Arc::clone(&self.0), bench.connection))
+    }
+
+    /// How many connections were made anew, and what the present one was told first.
+    pub(crate) fn dialled(&self) -> (usize, Option<Command>) {
+        let bench = self.0.0.lock().unwrap();
+        (bench.connection, bench.first.clone())
     }
 
     pub(crate) fn n_stops(&self) -> usize {
@@ -146,12 +171,16 @@ impl Driver for Tap {
     fn exchange(&mut self, command: &Command) -> Result<PairState, DriverError> {
         let bench = self.0.0.lock().unwrap();
         let mut bench = self.0.1.wait_while(bench, |bench| bench.fault == Fault::Hang).unwrap();
+        if self.1 != bench.connection {
+            return Err(DriverError::Disconnected { what: "this connection is lost".into() });
+        }
         match bench.fault {
             Fault::None | Fault::Hang => {
+                bench.first.get_or_insert_with(|| command.clone());
                 bench.newest = command.order.clone();
                 bench.pair.exchange(command)
             }
-            Fault::Exchange | Fault::Dead => {
+            Fault::Exchange | Fault::Dead | Fault::Lost => {
                 Err(DriverError::Disconnected { what: "the test pulled the plug".into() })
             }
             Fault::Panic => {
@@ -197,8 +226,21 @@ impl Rig {
         Self::bounded(settings, 1.0).await
     }
 
+    /// A service that can connect to its arms again.
+    pub(crate) async fn dialling(settings: Settings) -> Self {
+        Self::start(settings, 1.0, |tap| {
+            let tap = tap.clone();
+            Some(Arc::new(move || tap.dial().map(|tap| Box::new(tap) as AnyDriver)))
+        })
+        .await
+    }
+
     /// A service that plays nothing faster than `speed`.
     pub(crate) async fn bounded(settings: Settings, speed: f64) -> Self {
+        Self::start(settings, speed, |_| None).await
+    }
+
+    async fn start(settings: Settings, speed: f64, dial: fn(&Tap) -> Option<Dial>) -> Self {
         let listener = TcpListener::bind(SocketAddr::from(([127, 0, 0, 1], 0))).await.unwrap();
         let address = listener.local_addr().unwrap();
         let (clock, tap) = (Arc::new(Clock::default()), Tap::new(1));
@@ -209,6 +251,7 @@ impl Rig {
             version: "0.0.0-test".to_owned(),
             speed,
             time: clock.clone(),
+            dial: dial(&tap),
             secret: [7; 32],
         };
         let ends = shutdown.clone();

@@ -1,7 +1,7 @@
 //! Every way in which a motion ends before its time: the drives are stopped, and nothing moves before a reset.
 
 use tandem_bridge::service::Error;
-use tandem_bridge::{Order, Settings};
+use tandem_bridge::{Command, Order, Settings};
 use tandem_proto::pb;
 use tonic::Code;
 
@@ -213,6 +213,39 @@ async fn a_driver_that_fails_stops_the_arms() {
     rig.tap.fail(Fault::None);
     rig.client.release(pb::ReleaseRequest { token }).await.unwrap();
     assert_stopped_until_reset(&mut rig, "driver").await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_reset_connects_again_and_nothing_moves_by_it() {
+    let mut rig = Rig::dialling(patient()).await;
+    let token = rig.ready().await;
+    let mut playing = rig.moving(&token).await;
+    rig.tap.fail(Fault::Dead);
+    assert_eq!(playing.stopped().await.name, "driver");
+    // Nobody is there to connect to.
+    let refused = rig.client.reset(pb::ResetRequest { token: token.clone() }).await.unwrap_err();
+    assert_eq!(refused.code(), Code::Unavailable);
+    assert!(refused.message().contains("not connected: nobody answers"), "{refused}");
+
+    rig.tap.fail(Fault::Lost);
+    let since_s = rig.status().await.now_s;
+    rig.eventually(|status| status.now_s > since_s + 1.0).await;
+    assert_eq!(rig.tap.dialled().0, 0, "nobody connects unasked");
+    // Who does not own the arms connects nothing either.
+    let unknown = pb::ResetRequest { token: "0".repeat(32) };
+    assert!(rig.client.reset(unknown).await.is_err());
+    assert_eq!(rig.tap.dialled().0, 0);
+
+    let before = rig.tap.angles();
+    rig.reset(&token).await.unwrap();
+    let first = Command { number: 1, order: Order::Stop };
+    assert_eq!(rig.tap.dialled(), (1, Some(first)));
+    let since_s = rig.status().await.now_s;
+    let status = rig.eventually(|status| status.now_s > since_s + 1.0).await;
+    assert_eq!(status.phase(), pb::BridgePhase::Idle);
+    let moved = before.iter().zip(rig.tap.angles()).map(|(a, b)| a.largest_difference(&b));
+    assert!(moved.fold(0.0, f64::max) < 1e-3, "{before:?} {:?}", rig.tap.angles());
+    rig.moving(&token).await;
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
