@@ -1,7 +1,8 @@
 //! A Redis server that is shared, dies, hangs, forgets and wants a password.
 
+use std::cell::RefCell;
 use std::io::Write;
-use std::sync::{Arc, Mutex};
+use std::sync::{Arc, Mutex, Once};
 use std::thread;
 use std::time::Duration;
 
@@ -194,12 +195,24 @@ fn the_keys_of_an_account_have_one_hash_tag_and_can_be_read() {
 #[derive(Clone, Default)]
 struct Log(Arc<Mutex<Vec<u8>>>);
 
+thread_local! {
+    /// Where this thread's log lines go.
+    static LISTENING: RefCell<Option<Log>> = const { RefCell::new(None) };
+}
+
 impl Log {
+    /// One subscriber for all threads: with one for each, an event that another thread meets first, where nobody listens,
+    /// may be taken for one that nobody wants, here too.
     fn of<T>(&self, call: impl FnOnce() -> T) -> T {
-        let writer = self.clone();
-        let subscriber =
-            tracing_subscriber::fmt().with_ansi(false).with_writer(move || writer.clone()).finish();
-        tracing::subscriber::with_default(subscriber, call)
+        static SUBSCRIBED: Once = Once::new();
+        SUBSCRIBED.call_once(|| {
+            let writer = || LISTENING.with_borrow(|log| log.clone().unwrap_or_default());
+            tracing_subscriber::fmt().with_ansi(false).with_writer(writer).init();
+        });
+        LISTENING.replace(Some(self.clone()));
+        let outcome = call();
+        LISTENING.replace(None);
+        outcome
     }
 
     fn text(&self) -> String {
