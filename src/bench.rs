@@ -20,6 +20,7 @@ use crate::cli::{BenchArgs, BenchName};
 use crate::clock;
 use crate::exit::{Exit, Failed, OrExit as _};
 
+mod scale;
 mod teacher;
 
 /// How long one sample of a rate is taken, and how many samples; the best is printed, as the least disturbed.
@@ -37,8 +38,9 @@ struct Figure {
 
 #[expect(clippy::print_stdout, reason = "what the command is for")]
 pub(crate) fn bench(args: &BenchArgs) -> Result<(), Failed> {
-    let all = BenchName::value_variants();
-    let chosen: &[BenchName] = if args.what.is_empty() { all } else { &args.what };
+    let mut all = BenchName::value_variants().to_vec();
+    all.retain(|what| *what != BenchName::Scale);
+    let chosen = if args.what.is_empty() { &all } else { &args.what };
     for what in chosen {
         let figures = match what {
             BenchName::Sim => sim()?,
@@ -47,6 +49,11 @@ pub(crate) fn bench(args: &BenchArgs) -> Result<(), Failed> {
             BenchName::Replay => replay(),
             BenchName::Teacher => teacher::teacher()?,
             BenchName::EndToEnd => end_to_end()?,
+            BenchName::Scale if args.json => scale::scale(&args.scale)?.figures(),
+            BenchName::Scale => {
+                print!("{}", scale::scale(&args.scale)?);
+                continue;
+            }
         };
         for Figure { name, value, unit } in figures {
             if args.json {

@@ -7,18 +7,22 @@ use std::time::Duration;
 use clap::{Args, Parser, Subcommand, ValueEnum};
 
 mod bridge;
+mod relay;
+mod scale;
 mod trial;
 
 pub(crate) use bridge::{
     BridgeArgs, BridgeCommand, BridgeServeArgs, ConnectArgs, DriverName, MoveArgs, OperatorArgs,
 };
+pub(crate) use relay::RelayArgs;
+pub(crate) use scale::ScaleArgs;
 pub(crate) use trial::{ModeName, RecordName, TrialArgs};
 
 /// Teaches robots with two arms by letting a robot with one arm advise them.
 #[derive(Debug, Parser)]
 #[command(
     name = "tandem",
-    version,
+    version = crate::services::VERSION,
     propagate_version = true,
     after_help = "\
 Examples:
@@ -27,7 +31,7 @@ Examples:
   tandem eval --policy runs/NAME/policy/best.safetensors
   tandem COMMAND --help                         more examples
 
-Exit codes: 0 done, 64 bad usage or configuration, 65 bad input data, 70 a bug, 75 try again, 130 interrupted."
+Exit codes: 0 done, 64 bad usage or configuration, 65 bad input data, 70 a bug, 75 try again, 130 interrupted, 141 nobody reads."
 )]
 pub(crate) struct Cli {
     /// Log filter, such as info or tandem_learner=debug; overrides RUST_LOG.
@@ -53,10 +57,14 @@ pub(crate) enum Command {
     Learner(LearnerArgs),
     /// Plays episodes for a learner.
     Worker(WorkerArgs),
+    /// Hands out a learner's parameters near its workers, for runs with very many.
+    Relay(RelayArgs),
     /// Serves a pair of arms, real or simulated, and tells them what to do.
     Bridge(BridgeArgs),
     /// Asks a service whether it serves.
     Health(HealthArgs),
+    /// Asks a learner how far its run is.
+    Status(StatusArgs),
     /// Measures simulation, networks, updates, replay and a short run on this machine.
     Bench(BenchArgs),
     /// Shows what is in a policy file.
@@ -99,7 +107,8 @@ pub(crate) struct TrainArgs {
     /// Arms of the learning policy, 1 or 2 [default: 2].
     #[arg(long)]
     pub(crate) arms: Option<usize>,
-    /// When the teacher takes over: none, ea, eamc:T, mc-q:T, mc-act:A or mc-act-abs:A
+    /// When the teacher takes over: none, ea, eamc:T, mc-q:T, mc-act:A or mc-act-abs:A; init:teacher starts from
+    /// copies of the teacher and asks for nothing
     /// [default: mc-q:0.1 with two arms, none with one].
     #[arg(long, value_name = "NAME[:THRESHOLD]")]
     pub(crate) strategy: Option<String>,
@@ -310,7 +319,8 @@ pub(crate) struct TeacherArgs {
 #[command(after_help = "\
 Examples:
   tandem learner --run runs/mine/run.toml --listen 0.0.0.0:7000 --teacher 127.0.0.1:7001 --out runs/mine
-  tandem learner --run runs/mine/run.toml --out runs/mine --resume --teacher 127.0.0.1:7001")]
+  tandem learner --run runs/mine/run.toml --out runs/mine --resume --teacher 127.0.0.1:7001
+  tandem learner --run run.toml --out runs/mine --start-or-resume --teacher teacher:7001   under a supervisor")]
 pub(crate) struct LearnerArgs {
     /// Run file; settings that it leaves out take the recipe's values.
     #[arg(long, value_name = "FILE.toml")]
@@ -318,15 +328,30 @@ pub(crate) struct LearnerArgs {
     /// The teacher's address, when the run asks for advice.
     #[arg(long, value_name = "ADDR")]
     pub(crate) teacher: Option<String>,
+    /// The one-arm policy that a run of strategy init:teacher starts from.
+    #[arg(long, value_name = "FILE")]
+    pub(crate) start_from: Option<PathBuf>,
     /// Run directory.
     #[arg(long, value_name = "DIR")]
     pub(crate) out: PathBuf,
     /// Goes on from the newest checkpoint.
     #[arg(long)]
     pub(crate) resume: bool,
+    /// Starts the run, or goes on with it where the run directory holds one: for supervisors, which start a process
+    /// that has ended by the same command again. Keeps the resolved settings in the run directory's run.toml. A run
+    /// that has ended ends again at once, with exit code 0.
+    #[arg(long, conflicts_with = "resume")]
+    pub(crate) start_or_resume: bool,
     /// Threads of the update, 1 or 2; the result is the same.
     #[arg(long, default_value_t = 2, value_parser = clap::value_parser!(u8).range(1..=2))]
     pub(crate) threads: u8,
+    /// Shows the run's figures at http://ADDR/metrics, as Prometheus reads them. Whoever reaches the address can read
+    /// them, without a token: keep it inside a cluster.
+    #[arg(long, value_name = "ADDR")]
+    pub(crate) metrics_listen: Option<SocketAddr>,
+    /// Goes on serving once the run is complete, until it is asked to end.
+    #[arg(long)]
+    pub(crate) stay: bool,
     #[command(flatten)]
     pub(crate) listen: ListenArgs,
     #[command(flatten)]
@@ -388,6 +413,30 @@ pub(crate) struct HealthArgs {
     pub(crate) json: bool,
 }
 
+#[derive(Debug, Args)]
+#[command(after_help = "\
+Examples:
+  tandem status 127.0.0.1:7000
+  tandem status learner:7000 --token-file token --watch
+  tandem status learner:7000 --token-file token --json
+
+Exit codes: 0 told (with --watch: until the run had ended), 64 a wrong token, 75 the learner is away or went away.")]
+pub(crate) struct StatusArgs {
+    /// The learner's address.
+    #[arg(value_name = "ADDR")]
+    pub(crate) address: String,
+    /// Goes on telling until the run has ended: a line for each evaluation, and every half minute.
+    #[arg(long)]
+    pub(crate) watch: bool,
+    /// Prints one JSON object, with --watch one for each message.
+    #[arg(long)]
+    pub(crate) json: bool,
+    #[command(flatten)]
+    pub(crate) dial: DialArgs,
+    #[command(flatten)]
+    pub(crate) secret: SecretArgs,
+}
+
 /// A time span from seconds, more than none.
 fn seconds(text: &str) -> Result<Duration, String> {
     let span = text.parse().ok().and_then(|seconds| Duration::try_from_secs_f64(seconds).ok());
@@ -398,15 +447,19 @@ fn seconds(text: &str) -> Result<Duration, String> {
 #[derive(Debug, Args)]
 #[command(after_help = "\
 Examples:
-  tandem bench                   everything, about two minutes
-  tandem bench sim update --json")]
+  tandem bench                   everything but scale, about two minutes
+  tandem bench sim update --json
+  tandem bench scale             how many workers one learner holds, about two minutes
+  tandem bench scale --workers 0 --idle 1000 --join-leave 100")]
 pub(crate) struct BenchArgs {
-    /// What to measure [default: all].
+    /// What to measure [default: all but scale].
     #[arg(value_enum)]
     pub(crate) what: Vec<BenchName>,
     /// Prints one JSON object a line: name, value, unit.
     #[arg(long)]
     pub(crate) json: bool,
+    #[command(flatten)]
+    pub(crate) scale: ScaleArgs,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
@@ -419,6 +472,8 @@ pub(crate) enum BenchName {
     Teacher,
     /// A short run of the main job, processes and all.
     EndToEnd,
+    /// One learner and more and more workers, real ones and ones that only wait.
+    Scale,
 }
 
 #[derive(Debug, Args)]

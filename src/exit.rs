@@ -15,6 +15,25 @@ pub(crate) enum Exit {
     TryAgain = 75,
     /// Interrupted; the state is saved.
     Interrupted = 130,
+    /// Nobody reads what is printed any more, as behind `| head`; what a shell tells of a process that SIGPIPE ended.
+    Unread = 141,
+}
+
+/// Ends the program without a word once its standard output has no reader, where `println!` would panic.
+pub(crate) fn end_when_nobody_reads() {
+    let tell = std::panic::take_hook();
+    std::panic::set_hook(Box::new(move |panic| {
+        let told = panic.payload_as_str().unwrap_or_default();
+        if told.starts_with("failed printing to stdout") && told.contains("Broken pipe") {
+            leave(Exit::Unread);
+        }
+        tell(panic);
+    }));
+}
+
+#[expect(clippy::exit, reason = "whoever prints cannot go on, and nobody is there to be told why")]
+fn leave(exit: Exit) -> ! {
+    std::process::exit(exit as i32)
 }
 
 impl From<Exit> for ExitCode {

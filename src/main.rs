@@ -12,6 +12,7 @@ mod bench;
 mod bridge;
 mod cli;
 mod clock;
+mod descriptors;
 mod eval;
 mod exit;
 mod files;
@@ -21,6 +22,7 @@ mod report;
 mod run_file;
 mod services;
 mod signals;
+mod status;
 mod sweep;
 mod train;
 
@@ -28,6 +30,7 @@ use cli::{Cli, Command};
 use exit::Exit;
 
 fn main() -> ExitCode {
+    exit::end_when_nobody_reads();
     let cli = match Cli::try_parse() {
         Ok(cli) => cli,
         Err(error) => {
@@ -47,8 +50,10 @@ fn main() -> ExitCode {
         Command::Teacher(args) => services::teacher(args),
         Command::Learner(args) => services::learner(args),
         Command::Worker(args) => services::worker(args),
+        Command::Relay(args) => services::relay(args),
         Command::Bridge(args) => bridge::bridge(args),
         Command::Health(args) => health::health(&args),
+        Command::Status(args) => status::status(&args),
         Command::Bench(args) => bench::bench(&args),
         Command::Policy(args) => files::policy(&args),
         Command::Mcap(args) => files::mcap(&args),

@@ -5,7 +5,7 @@ use std::path::Path;
 use anyhow::{Context as _, anyhow, bail};
 use tandem_core::Task;
 use tandem_learner::RunConfig;
-use tandem_learner::config::{ConfigError, Recipe};
+use tandem_learner::config::{ConfigError, INIT_TEACHER, Recipe};
 use tandem_teacher::{Strategy, UnknownStrategy};
 use toml::{Table, Value};
 
@@ -36,6 +36,16 @@ pub(crate) fn parse_setting(setting: &str) -> Result<(String, Value), Failed> {
         )));
     };
     Ok((key.trim().to_owned(), parse_value(text.trim())))
+}
+
+/// Writes the configuration with every setting, whole or not at all.
+pub(crate) fn save(config: &RunConfig, path: &Path) -> Result<(), Failed> {
+    let text = to_toml(config).or_exit(Exit::Bug, String::new)?;
+    let header = format!("# tandem {}\n", crate::services::VERSION);
+    let unfinished = path.with_extension("tmp");
+    let written = std::fs::write(&unfinished, header + &text);
+    let written = written.and_then(|()| std::fs::rename(&unfinished, path));
+    written.or_exit(Exit::TryAgain, || format!("cannot write {}", path.display()))
 }
 
 /// The configuration as a TOML document with every setting.
@@ -85,10 +95,12 @@ fn overlay(from_file: Table, settings: &[(String, Value)]) -> anyhow::Result<Run
         config.stop.max_env_steps = 0;
     }
     let config = config.checked().map_err(in_one_line)?;
-    let strategy = config.advice.strategy.parse::<Strategy>().map_err(|UnknownStrategy(text)| {
-        anyhow!("advice.strategy: {}", UnknownStrategy(shortened(&text)))
-    });
-    strategy?;
+    if !config.advice.starts_from_teacher() {
+        let strategy = config.advice.strategy.parse::<Strategy>();
+        strategy.map_err(|UnknownStrategy(text)| {
+            anyhow!("advice.strategy: {} (or {INIT_TEACHER})", UnknownStrategy(shortened(&text)))
+        })?;
+    }
     Ok(config)
 }
 
@@ -142,7 +154,13 @@ fn defaults_for(changes: &Table) -> anyhow::Result<RunConfig> {
     let arms = changes.get("arms").and_then(Value::as_integer).unwrap_or(2);
     let n_arms = usize::try_from(arms).ok().filter(|n_arms| (1..=2).contains(n_arms));
     let n_arms = n_arms.ok_or_else(|| anyhow!("arms is {arms}: expected 1 or 2"))?;
-    Ok(RunConfig::defaults(recipe, known_task?, n_arms))
+    let task = known_task?;
+    let defaults = RunConfig::defaults(recipe, task, n_arms);
+    let strategy = changes.get("advice").and_then(|advice| advice.get("strategy"));
+    match strategy.and_then(Value::as_str) {
+        Some(INIT_TEACHER) => Ok(defaults.sized_for_copies(task)),
+        _ => Ok(defaults),
+    }
 }
 
 /// Sets the value of a dotted key.

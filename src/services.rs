@@ -2,25 +2,28 @@
 
 use std::future::Future;
 use std::net::SocketAddr;
+use std::path::Path;
 
 use anyhow::Context as _;
-use tandem_learner::Error as LearnerError;
+use tandem_learner::{AfterTheEnd, Beside, Error as LearnerError, RunConfig};
 use tandem_telemetry::logging::{LevelFilter, LogConfig};
 use tokio::net::TcpListener;
 use tokio::runtime::{Builder, Runtime};
 use tokio_util::sync::CancellationToken;
 
-use crate::cli::{Cli, Command, LearnerArgs, ListenArgs, TeacherArgs, WorkerArgs};
+use crate::cli::{Cli, Command, LearnerArgs, ListenArgs, RelayArgs, TeacherArgs, WorkerArgs};
 use crate::exit::{Exit, Failed, OrExit as _};
-use crate::{access, clock, run_file, signals};
+use crate::{access, clock, descriptors, run_file, signals};
 
 /// Version and commit of this program.
-pub(crate) const VERSION: &str = env!("CARGO_PKG_VERSION");
+pub(crate) const VERSION: &str = env!("TANDEM_VERSION");
 
 /// Sends log lines to standard error: of services from `info` up, of everything else warnings.
 pub(crate) fn start_logging(cli: &Cli) -> Result<(), Failed> {
     let level = match &cli.command {
-        Command::Teacher(_) | Command::Learner(_) | Command::Worker(_) => LevelFilter::INFO,
+        Command::Teacher(_) | Command::Learner(_) | Command::Worker(_) | Command::Relay(_) => {
+            LevelFilter::INFO
+        }
         Command::Bridge(args) if args.command.is_none() => LevelFilter::INFO,
         _ => LevelFilter::WARN,
     };
@@ -49,31 +52,62 @@ pub(crate) fn teacher(args: TeacherArgs) -> Result<(), Failed> {
 
 pub(crate) fn learner(args: LearnerArgs) -> Result<(), Failed> {
     let run_config = run_file::resolve(Some(&args.run), &[])?;
+    let start_from = args.start_from.as_deref().map(crate::files::load_policy).transpose()?;
     let gate = access::gate(&args.listen, &args.secret)?;
     let dial = access::dial(&args.dial, &args.secret)?;
+    if args.start_or_resume {
+        keep_run_file(&run_config, &args.out)?;
+    }
     run(async move {
         let shutdown = shutdown(args.listen.exit_with_stdin)?;
+        let beside = beside(&args).await?;
         let listener = listen(&args.listen).await?;
         let config = tandem_learner::LearnerConfig {
             run: run_config,
             gate,
             dial,
             teacher: args.teacher,
+            start_from,
             out: args.out,
-            resume: args.resume,
+            resume: args.resume || args.start_or_resume,
             n_threads: usize::from(args.threads),
             clock: clock::since_now(),
             version: VERSION.to_owned(),
             first_worker: clock::unix_millis() << 12,
         };
-        let ended =
-            tandem_learner::serve(config, listener, shutdown).await.map_err(learner_failed)?;
+        let served = tandem_learner::serve_beside(config, listener, shutdown, beside).await;
+        let ended = served.map_err(learner_failed)?;
         if ended.interrupted {
             Err(Failed::new(Exit::Interrupted, anyhow::anyhow!(ended.reason)))
         } else {
             Ok(())
         }
     })
+}
+
+/// Makes the run directory with the run's settings in it: what reports read, and what `tandem train --resume` goes on
+/// with elsewhere.
+fn keep_run_file(run: &RunConfig, out: &Path) -> Result<(), Failed> {
+    let failed = || format!("cannot write to {}", out.display());
+    std::fs::create_dir_all(out).or_exit(Exit::TryAgain, failed)?;
+    run_file::save(run, &out.join("run.toml"))
+}
+
+/// What the command line asks for beside the service.
+async fn beside(args: &LearnerArgs) -> Result<Beside, Failed> {
+    let metrics = match args.metrics_listen {
+        Some(address) => {
+            let bound = TcpListener::bind(address).await;
+            let cannot = || format!("cannot listen on {address} for --metrics-listen");
+            Some(bound.or_exit(Exit::TryAgain, cannot)?)
+        }
+        None => None,
+    };
+    if let Some(Ok(address)) = metrics.as_ref().map(TcpListener::local_addr) {
+        tracing::info!(%address, "figures for Prometheus, without a token");
+    }
+    let after_the_end = if args.stay { AfterTheEnd::Stay } else { AfterTheEnd::default() };
+    Ok(Beside { metrics, after_the_end })
 }
 
 pub(crate) fn worker(args: WorkerArgs) -> Result<(), Failed> {
@@ -91,12 +125,25 @@ pub(crate) fn worker(args: WorkerArgs) -> Result<(), Failed> {
     })
 }
 
+pub(crate) fn relay(args: RelayArgs) -> Result<(), Failed> {
+    let gate = access::gate(&args.listen, &args.secret)?;
+    let dial = access::dial(&args.dial, &args.secret)?;
+    run(async move {
+        let shutdown = shutdown(args.listen.exit_with_stdin)?;
+        let listener = listen(&args.listen).await?;
+        let relayed =
+            tandem_learner::relay::serve(&args.connect, &dial, &gate, listener, shutdown).await;
+        relayed.map_err(learner_failed)
+    })
+}
+
 /// A runtime for sockets; whatever computes has threads of its own.
 pub(crate) fn runtime() -> anyhow::Result<Runtime> {
     Builder::new_current_thread().enable_all().build().context("cannot start the runtime")
 }
 
 fn run(service: impl Future<Output = Result<(), Failed>>) -> Result<(), Failed> {
+    descriptors::raise();
     runtime().or_exit(Exit::TryAgain, String::new)?.block_on(service)
 }
 
@@ -159,12 +206,13 @@ fn wrong_token(error: &anyhow::Error) -> Option<&str> {
 
 fn learner_failed(error: LearnerError) -> Failed {
     let exit = match error {
-        LearnerError::Config(_) | LearnerError::NoTeacher(_) | LearnerError::Teacher(_) => {
-            Exit::Usage
-        }
+        LearnerError::Config(_)
+        | LearnerError::NoTeacher(_)
+        | LearnerError::Teacher(_)
+        | LearnerError::StartFrom(_) => Exit::Usage,
         LearnerError::Checkpoint(_) => Exit::Data,
         LearnerError::RunDirectory { .. } | LearnerError::Serve(_) => Exit::TryAgain,
-        LearnerError::Gate(_) => Exit::Usage,
+        LearnerError::Gate(_) | LearnerError::Address(_) => Exit::Usage,
         LearnerError::Diverged(_) | LearnerError::Panicked => Exit::Bug,
     };
     Failed::new(exit, error)

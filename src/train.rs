@@ -19,6 +19,7 @@ use crate::exit::{Exit, Failed, OrExit as _};
 use crate::{clock, services, signals};
 use children::{Broken, Children, Memory};
 use display::Display;
+pub(crate) use display::{counts_line, evaluation_line, grouped};
 use plan::Plan;
 pub(crate) use plan::shipped_teacher;
 use watch::Heard;

@@ -164,11 +164,13 @@ async fn without_the_right_token_nothing_is_answered_and_nothing_happens() {
     let teacher = place.serve("teacher", &teacher(&["--token-file", "token"]));
     let right = ["--teacher", &teacher.address, "--token-file", "token"];
     let learner = place.serve("learner", &place.learner(&right));
+    let relay = ["relay", "--connect", &learner.address, "--token-file", "token"];
+    let relay = place.serve("relay", &relay);
 
     let (teaches, learns) = (calls_of("Teacher"), calls_of("Learner"));
     assert!(teaches.len() >= 7 && learns.len() >= 6, "{teaches:?} {learns:?}");
     for token in [None, Some(OTHER)] {
-        for (service, calls) in [(&teacher, &teaches), (&learner, &learns)] {
+        for (service, calls) in [(&teacher, &teaches), (&learner, &learns), (&relay, &learns)] {
             let intruder = caller(&service.address, token);
             for path in calls {
                 assert_eq!(code_of(&intruder, path).await, Code::Unauthenticated, "{path}");
@@ -255,6 +257,24 @@ fn who_speaks_otherwise_says_what_to_do_and_goes_on_asking() {
         assert!(running.log().contains("--tls-ca"), "{name}: {}", running.log());
         assert!(running.is_alive(), "{name}: {}", running.log());
     }
+}
+
+#[test]
+fn a_run_through_a_relay_by_tls_with_a_token_ends_well() {
+    let place = Place::new();
+    let offer = ["--token-file", "token", "--tls-cert", "tls.pem", "--tls-key", "tls.key"];
+    let call = ["--token-file", "token", "--tls-ca", "ca.pem"];
+    let teacher = place.serve("teacher", &teacher(&offer));
+    let more = [&["--teacher", &teacher.address, "--tls-ca", "ca.pem"][..], &offer].concat();
+    let mut learner = place.serve("learner", &place.learner(&more));
+    let relay = ["relay", "--connect", &learner.address, "--tls-ca", "ca.pem"];
+    let relay = place.serve("relay", &[&relay[..], &offer].concat());
+    let health = place.run(&["health", &relay.address, "--tls-ca", "ca.pem"]);
+    assert_eq!(String::from_utf8_lossy(&health.stdout), "serving\n");
+    let worker = ["worker", "--connect", &relay.address, "--teacher", &teacher.address];
+    let played = place.run(&[&worker[..], &call].concat());
+    assert!(played.status.success(), "{}", String::from_utf8_lossy(&played.stderr));
+    assert_eq!(learner.wait(), Some(0), "{}", learner.log());
 }
 
 #[test]

@@ -13,6 +13,7 @@ use std::fs;
 use std::io::Write as _;
 use std::net::{SocketAddr, TcpStream};
 use std::path::Path;
+use std::process::Command;
 use std::time::Duration;
 
 use prost::Message as _;
@@ -367,4 +368,15 @@ async fn foreign_episodes(address: SocketAddr) {
             taken => assert_eq!(taken, Answer::Closed, "episodes of slot {slot} by nobody"),
         }
     }
+}
+
+#[test]
+fn output_that_nobody_reads_ends_a_command_without_a_word() {
+    let (reader, writer) = std::io::pipe().expect("a pipe");
+    drop(reader);
+    let policy = concat!(env!("CARGO_MANIFEST_DIR"), "/policies/teacher-push.safetensors");
+    let mut command = Command::new(env!("CARGO_BIN_EXE_tandem"));
+    let ended = command.args(["policy", "show", policy]).stdout(writer).output().expect("runs");
+    assert_eq!(String::from_utf8_lossy(&ended.stderr), "");
+    assert_eq!(ended.status.code(), Some(141));
 }

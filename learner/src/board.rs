@@ -3,7 +3,7 @@
 //! Pure: time comes in as an argument. Nothing here decides a result; a slot that two workers play gives the same
 //! episodes twice and counts once.
 
-use std::collections::{BTreeMap, VecDeque};
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::time::Duration;
 
 use tandem_core::work::{EpisodeOrder, SlotOrder};
@@ -11,7 +11,8 @@ use tandem_core::{Episode, EpisodeKind};
 
 /// A worker that has not been heard of for so long counts as dead: its slots go back to the queue.
 pub const SILENT_AFTER: Duration = Duration::from_secs(15);
-/// A slot that is out for so long is given to a second worker that has nothing else to do.
+/// A slot that is out for so long, and for twice as long as slots took of late, is given to a second worker that has
+/// nothing else to do.
 pub const COVER_AFTER: Duration = Duration::from_secs(3);
 /// A worker that has not been heard of for so long is no longer known. Until then what it delivers counts: it may have
 /// been slow and not dead.
@@ -26,6 +27,10 @@ pub struct Board {
     next_worker: u64,
     waiting: VecDeque<SlotOrder>,
     out: BTreeMap<u64, Out>,
+    /// Since when each slot is out, the longest first: every worker that waits asks for it.
+    out_since: BTreeSet<(Duration, u64)>,
+    /// How long slots took of late: an average that moves an eighth of the way with each.
+    took: Option<Duration>,
     finished: Vec<(SlotOrder, Vec<Episode>)>,
     workers: BTreeMap<u64, Worker>,
 }
@@ -160,8 +165,7 @@ impl Board {
         }
         let order = self.pop().or_else(|| self.to_cover(now));
         if let Some(order) = &order {
-            self.out
-                .insert(order.slot, Out { order: order.clone(), worker: worker_id, since: now });
+            self.hand_out(order.clone(), worker_id, now);
         }
         if let Some(worker) = self.workers.get_mut(&worker_id) {
             worker.slot = order.as_ref().map(|order| order.slot);
@@ -184,21 +188,47 @@ impl Board {
         self.waiting.remove(training.unwrap_or(0))
     }
 
+    fn hand_out(&mut self, order: SlotOrder, worker: u64, now: Duration) {
+        let slot = order.slot;
+        if let Some(former) = self.out.insert(slot, Out { order, worker, since: now }) {
+            self.out_since.remove(&(former.since, slot));
+        }
+        self.out_since.insert((now, slot));
+    }
+
+    fn note_how_long(&mut self, slot: u64, now: Duration) {
+        if let Some(out) = self.out.get(&slot) {
+            let took = now.saturating_sub(out.since);
+            self.took = Some(self.took.map_or(took, |before| (7 * before + took) / 8));
+        }
+    }
+
+    fn take_back(&mut self, slot: u64) -> Option<SlotOrder> {
+        let out = self.out.remove(&slot)?;
+        self.out_since.remove(&(out.since, slot));
+        Some(out.order)
+    }
+
     fn longest_out(&self) -> Option<&Out> {
-        self.out.values().min_by_key(|out| (out.since, out.order.slot))
+        self.out_since.first().and_then(|(_, slot)| self.out.get(slot))
     }
 
     /// The slot that has been out longest, when that is too long.
     fn to_cover(&self, now: Duration) -> Option<SlotOrder> {
         let longest = self.longest_out()?;
-        let overdue = now.saturating_sub(longest.since) >= COVER_AFTER;
+        let overdue = now.saturating_sub(longest.since) >= self.cover_after();
         overdue.then(|| longest.order.clone())
     }
 
     /// In what time there is a slot to cover for, unless it is delivered before; `None` when no slot is out.
     #[must_use]
     pub fn cover_in(&self, now: Duration) -> Option<Duration> {
-        self.longest_out().map(|out| (out.since + COVER_AFTER).saturating_sub(now))
+        self.longest_out().map(|out| (out.since + self.cover_after()).saturating_sub(now))
+    }
+
+    /// A worker that covers for one that is only as slow as all others would be missed in the next round.
+    fn cover_after(&self) -> Duration {
+        (2 * self.took.unwrap_or_default()).clamp(COVER_AFTER, SILENT_AFTER)
     }
 
     /// What `slot` consists of, for a worker that delivers it; `None` when it is in already.
@@ -239,7 +269,8 @@ impl Board {
             worker.slot = worker.slot.filter(|given| *given != slot);
             worker.n_episodes += if is_new { episodes.len() as u64 } else { 0 };
         }
-        let out = self.out.remove(&slot).map(|out| out.order);
+        self.note_how_long(slot, now);
+        let out = self.take_back(slot);
         let waiting = self.waiting.iter().position(|order| order.slot == slot);
         let order = out.or_else(|| self.waiting.remove(waiting?));
         self.finished.extend(order.map(|order| (order, episodes)));
@@ -264,9 +295,18 @@ impl Board {
         fell_silent
     }
 
+    /// Puts the slot of a worker whose connection has ended back into the queue, in its place, and gives whether it had
+    /// one. The worker stays known: it may call again, and what it delivers counts.
+    pub fn hung_up(&mut self, worker_id: u64) -> bool {
+        self.workers.get_mut(&worker_id).is_some_and(|worker| worker.slot.take().is_some())
+            && self.put_back_slots_of(worker_id) > 0
+    }
+
     fn put_back_slots_of(&mut self, worker_id: u64) -> usize {
-        let theirs = self.out.extract_if(.., |_, out| out.worker == worker_id);
-        let orders: Vec<SlotOrder> = theirs.map(|(_, out)| out.order).collect();
+        let theirs = self.out.iter().filter(|(_, out)| out.worker == worker_id);
+        let slots: Vec<u64> = theirs.map(|(slot, _)| *slot).collect();
+        let orders: Vec<SlotOrder> =
+            slots.into_iter().filter_map(|slot| self.take_back(slot)).collect();
         let n_slots = orders.len();
         if n_slots > 0 {
             self.waiting.extend(orders);
@@ -296,6 +336,30 @@ impl Board {
     #[must_use]
     pub fn worker(&self, worker_id: u64) -> Option<&Worker> {
         self.workers.get(&worker_id)
+    }
+
+    /// Whether a worker counts as dead; one that is not known does.
+    #[must_use]
+    pub fn is_silent(&self, worker_id: u64, now: Duration) -> bool {
+        self.worker(worker_id).is_none_or(|worker| is_silent(worker, now))
+    }
+
+    /// Slots that wait for a worker.
+    #[must_use]
+    pub fn n_waiting(&self) -> usize {
+        self.waiting.len()
+    }
+
+    /// Slots that a worker has and has not delivered.
+    #[must_use]
+    pub fn n_out(&self) -> usize {
+        self.out.len()
+    }
+
+    /// Workers that do not count as dead.
+    #[must_use]
+    pub fn n_alive(&self, now: Duration) -> usize {
+        self.workers.values().filter(|worker| !is_silent(worker, now)).count()
     }
 
     /// The workers that are known, by number.

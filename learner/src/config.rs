@@ -67,11 +67,14 @@ pub enum Behaviour {
     Online,
 }
 
+/// The strategy without advice whose student starts as a copy of the teacher for each arm.
+pub const INIT_TEACHER: &str = "init:teacher";
+
 /// `[advice]`
 #[derive(Debug, Clone, PartialEq, Deserialize, Serialize)]
 #[serde(deny_unknown_fields)]
 pub struct AdviceConfig {
-    /// `none`, `ea`, `eamc:T`, `mc-q:T`, `mc-act:A` or `mc-act-abs:A` (section 3.2 of the paper).
+    /// `none`, `ea`, `eamc:T`, `mc-q:T`, `mc-act:A` or `mc-act-abs:A` (section 3.2 of the paper), or [`INIT_TEACHER`].
     pub strategy: String,
     /// Units of advice for the whole run (paper: 500,000).
     pub budget: u64,
@@ -83,7 +86,19 @@ impl AdviceConfig {
     /// Whether anybody is asked at all.
     #[must_use]
     pub fn asks(&self) -> bool {
-        self.strategy != "none" && self.share > 0.0
+        self.strategy != "none" && !self.starts_from_teacher() && self.share > 0.0
+    }
+
+    /// Whether the run starts from copies of the teacher instead of asking it.
+    #[must_use]
+    pub fn starts_from_teacher(&self) -> bool {
+        self.strategy == INIT_TEACHER
+    }
+
+    /// Whether the run has a use for a teacher's policy at all.
+    #[must_use]
+    pub fn needs_teacher(&self) -> bool {
+        self.asks() || self.starts_from_teacher()
     }
 }
 
@@ -232,6 +247,16 @@ impl RunConfig {
             stop: stop(recipe, task, n_arms),
             checkpoint: CheckpointConfig { every_rounds: 50, keep: 2 },
         }
+    }
+
+    /// The settings with which a run that starts from a teacher of the recipe's size can do so: the teacher's depth, and
+    /// its width for each arm.
+    #[must_use]
+    pub fn sized_for_copies(mut self, task: Task) -> Self {
+        let teacher = Self::defaults(self.recipe, task, 1).ddpg;
+        self.ddpg.n_hidden = teacher.n_hidden * self.arms;
+        self.ddpg.n_hidden_layers = teacher.n_hidden_layers;
+        self
     }
 
     /// The layout of the learning policy.

@@ -142,7 +142,7 @@ impl Drive<'_> {
         let before = self.trainer.publish();
         let figures = self.learn(&episodes)?;
         let newest = self.trainer.publish();
-        self.shared.publish(newest.clone());
+        self.shared.publish(&newest);
         self.acting = if lagged { before } else { newest };
         self.note_evaluation(&figures);
         if !lagged && !self.open_round(round + 1, round + 1)? {
@@ -226,6 +226,7 @@ impl Drive<'_> {
     /// Waits until every episode of `kind` played with `version` is in; `None` when the run is interrupted.
     fn wait_for(&mut self, kind: EpisodeKind, version: u64) -> Result<Option<Vec<Episode>>, Error> {
         let spent = self.trainer.counters().advice_spent;
+        let mut looked_at = None;
         loop {
             if let Some(ledger) = &mut self.ledger
                 && stopped(ledger.mend(spent))?
@@ -239,9 +240,13 @@ impl Drive<'_> {
             if self.shutdown.is_cancelled() {
                 return Ok(None);
             }
-            for silent in state.board.reclaim((self.config.clock)()) {
-                let Silent { worker_id, name, n_slots } = silent;
-                WorkerSilent { worker_id, name: &name, n_slots }.emit();
+            let now = (self.config.clock)();
+            // Not with every slot that comes in: all workers are looked at.
+            if looked_at.is_none_or(|before| now.saturating_sub(before) >= WAIT_TICK) {
+                looked_at = Some(now);
+                for Silent { worker_id, name, n_slots } in state.board.reclaim(now) {
+                    WorkerSilent { worker_id, name: &name, n_slots }.emit();
+                }
             }
             drop(self.shared.wait(state, WAIT_TICK));
         }

@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use crate::checkpoint::CheckpointError;
-use crate::config::ConfigError;
+use crate::config::{ConfigError, INIT_TEACHER};
 use crate::ddpg::DdpgError;
 use crate::teacher::TeacherError;
 
@@ -32,12 +32,18 @@ pub enum Error {
     /// The run asks for advice and no teacher is named.
     #[error("strategy {0:?} needs a teacher: give its address")]
     NoTeacher(String),
+    /// The run cannot start from the teacher that was given, or none was.
+    #[error("strategy {INIT_TEACHER:?} {0}")]
+    StartFrom(String),
     /// Learning diverged.
     #[error(transparent)]
     Diverged(#[from] DdpgError),
     /// The service cannot be offered.
     #[error(transparent)]
     Gate(#[from] tandem_net::GateError),
+    /// A relay cannot call its learner.
+    #[error(transparent)]
+    Address(#[from] tandem_net::DialError),
     /// The network refused.
     #[error("cannot serve")]
     Serve(#[from] tonic::transport::Error),

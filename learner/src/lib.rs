@@ -5,7 +5,7 @@
 //!
 //! Reading order: [`config`] (the run file), [`ddpg`] (the update), [`replay`] and [`her`] (what a batch is made of),
 //! [`trainer`] (a round), [`board`] (who plays what), [`records`] (what evaluations bring), [`checkpoint`], [`service`]
-//! (the gRPC shell and the thread that learns).
+//! (the gRPC shell and the thread that learns), [`relay`] (what stands between a learner and many workers).
 
 pub mod board;
 pub mod checkpoint;
@@ -14,7 +14,9 @@ pub mod ddpg;
 mod drive;
 mod error;
 pub mod her;
+mod metrics;
 pub mod records;
+pub mod relay;
 pub mod replay;
 pub mod service;
 mod shared;
@@ -24,5 +26,5 @@ pub mod trainer;
 pub use config::RunConfig;
 pub use drive::Ended;
 pub use error::Error;
-pub use service::serve;
+pub use service::{AfterTheEnd, Beside, serve, serve_beside};
 pub use shared::{Clock, LearnerConfig};

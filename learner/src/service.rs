@@ -9,11 +9,12 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use tandem_core::Episode;
-use tandem_net::Incoming;
+use tandem_net::{Hangup, Incoming, Page, Prepared};
 use tandem_proto::pb;
 use tandem_proto::pb::learner_server::{Learner, LearnerServer};
-use tandem_proto::{decode_episode, encode_actor, encode_slot, encode_terms};
+use tandem_proto::{decode_episode, encode_slot, encode_terms};
 use tandem_telemetry::events::WorkerJoined;
+use tokio::net::TcpListener;
 use tokio::runtime::Handle;
 use tokio_stream::wrappers::WatchStream;
 use tokio_stream::{Stream, StreamExt as _};
@@ -23,17 +24,45 @@ use tonic::{Request, Response, Status};
 use crate::board::check_count;
 use crate::drive::{self, Ended};
 use crate::error::Error;
+use crate::metrics;
 use crate::shared::{LearnerConfig, Shared, wait_on};
-use refusals::{check_name, check_version, malformed, refusal};
+pub(crate) use refusals::check_version;
+use refusals::{check_name, malformed, refusal};
 
 /// How long a worker's question for work is held before it is told to wait.
 const WORK_POLL: Duration = Duration::from_secs(2);
 /// How long the service stays after the run's end, so that all can hear of it.
 const LINGER: Duration = Duration::from_millis(1500);
+/// Pause between two looks whether all workers have heard of it.
+const LINGER_TICK: Duration = Duration::from_millis(50);
 /// How long calls that are open may take to finish once the service shall end.
-const SHUTDOWN_GRACE: Duration = Duration::from_secs(5);
+pub(crate) const SHUTDOWN_GRACE: Duration = Duration::from_secs(5);
 /// Largest message taken in; a slot of 64 two-arm episodes has 1 MB.
-const MAX_MESSAGE_BYTES: usize = 64 << 20;
+pub(crate) const MAX_MESSAGE_BYTES: usize = 64 << 20;
+
+/// What goes with the service.
+#[derive(Debug, Default)]
+pub struct Beside {
+    /// Where the run's figures stand at `/metrics`, for anybody who can reach it: no token is asked for.
+    pub metrics: Option<TcpListener>,
+    /// How long the service stays once the run is complete.
+    pub after_the_end: AfterTheEnd,
+}
+
+/// How long a service stays once its run is complete. It stays for a moment only after one that was interrupted or failed.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum AfterTheEnd {
+    /// For a while, so that all can hear of it.
+    Linger(Duration),
+    /// Until it is told to end.
+    Stay,
+}
+
+impl Default for AfterTheEnd {
+    fn default() -> Self {
+        Self::Linger(LINGER)
+    }
+}
 
 /// Serves a run until it ends or `shutdown` is cancelled; the state is saved either way.
 ///
@@ -44,7 +73,7 @@ pub async fn serve(
     incoming: impl Into<Incoming>,
     shutdown: CancellationToken,
 ) -> Result<Ended, Error> {
-    serve_and_linger(config, incoming, shutdown, LINGER).await
+    serve_beside(config, incoming, shutdown, Beside::default()).await
 }
 
 /// [`serve`], staying for `linger` after the run's end.
@@ -57,19 +86,39 @@ pub async fn serve_and_linger(
     shutdown: CancellationToken,
     linger: Duration,
 ) -> Result<Ended, Error> {
+    let beside = Beside { after_the_end: AfterTheEnd::Linger(linger), metrics: None };
+    serve_beside(config, incoming, shutdown, beside).await
+}
+
+/// [`serve`], with what `beside` asks for.
+///
+/// # Errors
+/// When the run cannot start, its state cannot be saved, or learning diverges.
+pub async fn serve_beside(
+    config: LearnerConfig,
+    incoming: impl Into<Incoming>,
+    shutdown: CancellationToken,
+    beside: Beside,
+) -> Result<Ended, Error> {
     let shared = Arc::new(Shared::new(config.clock.clone()));
     shared.lock().board.start_workers_at(config.first_worker);
-    let learner = LearnerServer::new(LearnerService { shared: shared.clone() })
-        .max_decoding_message_size(MAX_MESSAGE_BYTES);
+    let learner =
+        LearnerServer::new(LearnerService { shared: shared.clone(), start: config.first_worker })
+            .max_decoding_message_size(MAX_MESSAGE_BYTES);
     let router = config.gate.router(learner).await?;
     let stop_serving = CancellationToken::new();
+    let showing = show_figures(beside.metrics, shared.clone());
     let learning = {
         let (runtime, stop) = (Handle::current(), stop_serving.clone());
         let shutdown = shutdown.clone();
         let learn = move || {
             let _stop = stop.drop_guard();
             let ended = learn(&config, &shared, &runtime, &shutdown);
-            wait_on(&runtime, async move { tokio::time::sleep(linger).await });
+            wait_on(&runtime, linger(beside.after_the_end));
+            if is_complete(&ended) {
+                wait_on(&runtime, until_workers_know(shared.clone(), shutdown.clone()));
+                wait_on(&runtime, stay(beside.after_the_end, shutdown));
+            }
             // Watchers' streams close at the first message after the one that says so.
             shared.progress.send_modify(|_| ());
             ended
@@ -87,6 +136,7 @@ pub async fn serve_and_linger(
     let served = tokio::select! {
         served = serving => served,
         () = grace_after(&stop_serving) => Ok(()),
+        () = showing => Ok(()),
     };
     // A server that fails takes the run with it: nobody can reach it any more.
     shutdown.cancel();
@@ -95,6 +145,44 @@ pub async fn serve_and_linger(
         joined.map_or(Err(Error::Panicked), |joined| joined.unwrap_or(Err(Error::Panicked)));
     served?;
     ended
+}
+
+fn is_complete(ended: &Result<Ended, Error>) -> bool {
+    ended.as_ref().is_ok_and(|ended| !ended.interrupted)
+}
+
+/// Waits until every worker that was playing when the run ended has asked for work and been told, or counts as dead:
+/// who is not told waits for the learner for ever.
+async fn until_workers_know(shared: Arc<Shared>, shutdown: CancellationToken) {
+    while shared.lock().is_awaited((shared.clock)()) {
+        tokio::select! {
+            () = tokio::time::sleep(LINGER_TICK) => (),
+            () = shutdown.cancelled() => return,
+        }
+    }
+}
+
+/// Shows the run's figures for as long as it is polled.
+async fn show_figures(listener: Option<TcpListener>, shared: Arc<Shared>) {
+    let Some(listener) = listener else { return std::future::pending().await };
+    let write = Arc::new(move || metrics::page(&shared));
+    let page = Page { path: metrics::PATH, content_type: metrics::CONTENT_TYPE, write };
+    page.serve(listener).await;
+}
+
+/// Waits until those who ask now and then have heard of the run's end.
+async fn linger(after_the_end: AfterTheEnd) {
+    match after_the_end {
+        AfterTheEnd::Linger(linger) => tokio::time::sleep(linger).await,
+        AfterTheEnd::Stay => tokio::time::sleep(LINGER).await,
+    }
+}
+
+/// Waits for `shutdown` where a service is to stay until then.
+async fn stay(after_the_end: AfterTheEnd, shutdown: CancellationToken) {
+    if after_the_end == AfterTheEnd::Stay {
+        shutdown.cancelled().await;
+    }
 }
 
 /// A watcher that reads nothing keeps its call open for ever.
@@ -113,7 +201,8 @@ fn learn(
     let run = AssertUnwindSafe(|| drive::run(config, shared, runtime, shutdown));
     let ended = std::panic::catch_unwind(run).unwrap_or(Err(Error::Panicked));
     let reason = ended.as_ref().map_or_else(with_causes, |ended| ended.reason.clone());
-    shared.lock().finished = Some(reason.clone());
+    let interrupted = !is_complete(&ended);
+    shared.lock().finish(pb::Finished { reason: reason.clone(), interrupted });
     shared.work.notify_waiters();
     shared.progress.send_modify(|progress| {
         progress.ended = true;
@@ -138,8 +227,20 @@ fn with_causes(error: &Error) -> String {
     line
 }
 
+/// Waits until a worker's connection has ended, and hands its slot to the next that asks: a round need not wait until
+/// the worker counts as slow. A worker that was only cut off delivers all the same.
+async fn give_to_others(shared: Arc<Shared>, worker_id: u64, hangup: Hangup) {
+    hangup.wait().await;
+    if shared.lock().board.hung_up(worker_id) {
+        tracing::info!(worker_id, "connection has ended, its slot goes to another worker");
+        shared.work.notify_waiters();
+    }
+}
+
 struct LearnerService {
     shared: Arc<Shared>,
+    /// Which start of a learner this is.
+    start: u64,
 }
 
 #[tonic::async_trait]
@@ -150,9 +251,10 @@ impl Learner for LearnerService {
         &self,
         request: Request<pb::JoinRequest>,
     ) -> Result<Response<pb::JoinResponse>, Status> {
+        let hangup = Hangup::of(request.extensions());
         let pb::JoinRequest { worker: name, version } = request.into_inner();
         check_name(&name)?;
-        check_version(&name, &version)?;
+        check_version(&name, &version, "learner")?;
         let now = (self.shared.clock)();
         let mut state = self.shared.lock();
         let terms =
@@ -163,7 +265,11 @@ impl Learner for LearnerService {
             .map_err(|error| Status::resource_exhausted(error.to_string()))?;
         drop(state);
         WorkerJoined { worker_id, name: &name }.emit();
-        Ok(Response::new(pb::JoinResponse { worker_id, terms: Some(encode_terms(&terms)) }))
+        if let Some(hangup) = hangup {
+            tokio::spawn(give_to_others(self.shared.clone(), worker_id, hangup));
+        }
+        let terms = Some(encode_terms(&terms));
+        Ok(Response::new(pb::JoinResponse { worker_id, terms, learner: self.start }))
     }
 
     async fn next_work(
@@ -192,10 +298,9 @@ impl Learner for LearnerService {
         request: Request<pb::GetParametersRequest>,
     ) -> Result<Response<pb::Parameters>, Status> {
         let version = request.into_inner().version;
-        let actor = self.shared.lock().published.get(&version).cloned();
-        let actor = actor
-            .ok_or_else(|| Status::not_found(format!("parameter version {version} is not kept")))?;
-        Ok(Response::new(encode_actor(&actor)))
+        let prepared = self.shared.lock().published.get(&version).cloned();
+        let gone = || Status::not_found(format!("parameter version {version} is not kept"));
+        prepared.map(Prepared::answer).ok_or_else(gone)
     }
 
     async fn submit_episodes(
@@ -235,12 +340,13 @@ impl LearnerService {
     fn work_for(&self, worker_id: u64) -> Result<(Option<Work>, Duration), Status> {
         let now = (self.shared.clock)();
         let mut state = self.shared.lock();
-        if let Some(reason) = &state.finished {
-            let finished = pb::Finished { reason: reason.clone() };
+        if let Some(finished) = state.finished.clone() {
+            state.untold.remove(&worker_id);
             return Ok((Some(Work::Finished(finished)), WORK_POLL));
         }
         let order = state.board.next(worker_id, now).map_err(|error| refusal(&error, None))?;
         let look_again_in = state.board.cover_in(now).unwrap_or(WORK_POLL);
+        drop(state);
         Ok((order.map(|order| Work::Slot(encode_slot(&order))), look_again_in))
     }
 

@@ -1,21 +1,22 @@
 //! What the service's calls and the thread that learns share, and what both are told at the start.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use tandem_core::work::{PublishedActor, RunTerms};
-use tandem_net::{Dial, Gate};
-use tandem_proto::pb;
+use tandem_net::{Dial, Gate, Prepared};
+use tandem_policy::Policy;
+use tandem_proto::{encode_actor, pb};
 use tokio::runtime::Handle;
 use tokio::sync::{Notify, watch};
 
-use crate::board::Board;
+use crate::board::{Board, Worker};
 use crate::config::RunConfig;
 
 /// Parameter versions kept for workers that lag behind.
-const KEPT_VERSIONS: usize = 16;
+pub(crate) const KEPT_VERSIONS: usize = 16;
 
 /// The time since some start; passed in so that nothing here reads a clock.
 pub type Clock = Arc<dyn Fn() -> Duration + Send + Sync>;
@@ -31,6 +32,8 @@ pub struct LearnerConfig {
     pub dial: Dial,
     /// The teacher's address, `HOST:PORT` or a URI; needed when the run asks for advice.
     pub teacher: Option<String>,
+    /// The one-arm policy whose copies a run of strategy `init:teacher` starts from.
+    pub start_from: Option<Policy>,
     /// The run directory.
     pub out: PathBuf,
     /// Whether to go on from the newest checkpoint, or from the beginning where there is none.
@@ -61,8 +64,28 @@ pub(crate) struct Shared {
 pub(crate) struct State {
     pub(crate) board: Board,
     pub(crate) terms: Option<RunTerms>,
-    pub(crate) published: BTreeMap<u64, Arc<PublishedActor>>,
-    pub(crate) finished: Option<String>,
+    pub(crate) published: BTreeMap<u64, Prepared>,
+    /// What workers are told once nothing more is to be done.
+    pub(crate) finished: Option<pb::Finished>,
+    /// Workers that were playing when the run ended and have not been told yet.
+    pub(crate) untold: BTreeSet<u64>,
+    /// Episodes in the replay buffer.
+    pub(crate) n_replay_episodes: usize,
+}
+
+impl State {
+    /// Notes how the run ended, and who is to be told.
+    pub(crate) fn finish(&mut self, finished: pb::Finished) {
+        let is_playing = |worker: &Worker| worker.slot.is_some() && !worker.silent;
+        let playing = self.board.workers().filter(|(_, worker)| is_playing(worker));
+        self.untold = playing.map(|(worker_id, _)| worker_id).collect();
+        self.finished = Some(finished);
+    }
+
+    /// Whether a worker that counts as alive does not know yet that the run has ended.
+    pub(crate) fn is_awaited(&self, now: Duration) -> bool {
+        self.untold.iter().any(|worker_id| !self.board.is_silent(*worker_id, now))
+    }
 }
 
 impl Shared {
@@ -91,9 +114,10 @@ impl Shared {
     }
 
     /// Hands out an actor from now on, and forgets the oldest.
-    pub(crate) fn publish(&self, actor: PublishedActor) {
+    pub(crate) fn publish(&self, actor: &PublishedActor) {
+        let prepared = Prepared::of(&encode_actor(actor));
         let mut state = self.lock();
-        state.published.insert(actor.version, Arc::new(actor));
+        state.published.insert(actor.version, prepared);
         while state.published.len() > KEPT_VERSIONS {
             state.published.pop_first();
         }

@@ -21,6 +21,9 @@ use crate::replay::ReplayBuffer;
 /// Episodes of an evaluation slot.
 const EVALUATION_SLOT_EPISODES: usize = 8;
 
+/// As how many rows a teacher's normalisation counts in a run that starts from it: some 2,000 episodes.
+const TEACHERS_ROWS: u64 = 100_000;
+
 /// How far a run has come.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Counters {
@@ -88,6 +91,37 @@ impl Trainer {
             figures: RoundFigures::default(),
             config,
         })
+    }
+
+    /// Starts from a copy of `teacher` for each arm: networks and how their inputs are normalised. Meant for a run that
+    /// has not begun.
+    ///
+    /// # Errors
+    /// Says what does not fit: the teacher's task, its arms or its sizes, or a critic of one head for several arms.
+    pub fn start_from(&mut self, teacher: &Policy) -> Result<(), String> {
+        if teacher.layout != self.layout.single_arm() || teacher.n_heads != 1 {
+            let (task, n_arms) = (self.layout.task, teacher.layout.n_arms);
+            return Err(format!(
+                "needs a teacher for {task} with one arm and one value, got {n_arms} arm(s) for {} with {} value(s)",
+                teacher.layout.task, teacher.n_heads
+            ));
+        }
+        let copies = teacher.copies(self.layout.n_arms);
+        let sizes = |policy: &Policy| (policy.n_hidden, policy.n_hidden_layers, policy.n_heads);
+        let ddpg = &self.config.ddpg;
+        let n_heads = self.config.replay.reward.n_heads(self.layout);
+        if sizes(&copies) != (ddpg.n_hidden, ddpg.n_hidden_layers, n_heads) {
+            return Err(format!(
+                "needs ddpg.n_hidden = {}, ddpg.n_hidden_layers = {} and replay.reward = \"per-arm\" to hold this teacher's \
+                 copies",
+                copies.n_hidden, copies.n_hidden_layers
+            ));
+        }
+        self.ddpg.start_from(&copies);
+        self.observation_normalizer =
+            Normalizer::from_snapshot(&copies.observation_normalizer, TEACHERS_ROWS);
+        self.goal_normalizer = Normalizer::from_snapshot(&copies.goal_normalizer, TEACHERS_ROWS);
+        Ok(())
     }
 
     /// The configuration of the run.

@@ -25,6 +25,10 @@ const KEEP_ALIVE: Duration = Duration::from_secs(10);
 /// How long a connection attempt may take, and then the agreement on TLS.
 const CONNECT: Duration = Duration::from_secs(5);
 
+/// Largest piece in which a service may send its answer: an actor's parameters (0.86 MB) are written to a connection in
+/// one go, not in 53.
+const FRAME_BYTES: u32 = 1 << 20;
+
 type Connecting = Pin<Box<dyn Future<Output = io::Result<Connection>> + Send>>;
 type Connector = Arc<dyn Fn(Uri) -> Connecting + Send + Sync>;
 
@@ -99,7 +103,8 @@ impl Dial {
         let mut endpoint = Endpoint::from(uri)
             .http2_keep_alive_interval(KEEP_ALIVE)
             .keep_alive_timeout(KEEP_ALIVE)
-            .keep_alive_while_idle(true);
+            .keep_alive_while_idle(true)
+            .max_frame_size(FRAME_BYTES);
         if by_tls {
             let authority = self.authority.clone();
             let authority = authority.ok_or_else(|| DialError::NoAuthority(address.to_owned()))?;

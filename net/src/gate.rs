@@ -16,6 +16,7 @@ use tonic_health::ServingStatus;
 use tower::Service;
 
 use crate::access::{AccessError, Token, is_exposed};
+use crate::prepared::Sending;
 use crate::tls::{self, TlsError};
 
 /// How often a silent connection is probed, and how long a probe may stay unanswered before the connection is closed.
@@ -114,7 +115,7 @@ impl Gate {
             server = server.tls_config(tls).map_err(GateError::Tls)?;
         }
         Ok(server
-            .add_service(InterceptedService::new(service, self.guard()))
+            .add_service(InterceptedService::new(Sending(service), self.guard()))
             .add_service(health)
             .add_service(InterceptedService::new(reflection().build_v1()?, self.guard()))
             .add_service(InterceptedService::new(reflection().build_v1alpha()?, self.guard())))

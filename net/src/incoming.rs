@@ -8,15 +8,21 @@ use std::time::Duration;
 
 use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
 use tokio::net::TcpListener;
+use tokio::sync::watch;
 use tokio::time::Sleep;
 use tokio_stream::{Stream, StreamExt as _};
+use tonic::Extensions;
 use tonic::transport::server::{Connected, TcpIncoming};
 
 /// How long a client may take to say its first word.
 const GREETING: Duration = Duration::from_secs(10);
 
 /// A connection over any network.
-pub struct Connection(Pin<Box<dyn Duplex>>);
+pub struct Connection {
+    stream: Pin<Box<dyn Duplex>>,
+    /// Dropped with the connection.
+    open: watch::Sender<()>,
+}
 
 trait Duplex: AsyncRead + AsyncWrite + Send {}
 impl<T: AsyncRead + AsyncWrite + Send> Duplex for T {}
@@ -24,7 +30,7 @@ impl<T: AsyncRead + AsyncWrite + Send> Duplex for T {}
 impl Connection {
     /// A connection over `stream`.
     pub fn new(stream: impl AsyncRead + AsyncWrite + Send + 'static) -> Self {
-        Self(Box::pin(stream))
+        Self { stream: Box::pin(stream), open: watch::Sender::new(()) }
     }
 }
 
@@ -35,9 +41,28 @@ impl fmt::Debug for Connection {
 }
 
 impl Connected for Connection {
-    type ConnectInfo = ();
+    type ConnectInfo = Hangup;
 
-    fn connect_info(&self) {}
+    fn connect_info(&self) -> Hangup {
+        Hangup(self.open.subscribe())
+    }
+}
+
+/// Tells when a connection has ended.
+#[derive(Debug, Clone)]
+pub struct Hangup(watch::Receiver<()>);
+
+impl Hangup {
+    /// Of the connection over which a request with these extensions came; `None` when it came otherwise.
+    #[must_use]
+    pub fn of(extensions: &Extensions) -> Option<Self> {
+        extensions.get::<Self>().cloned()
+    }
+
+    /// Waits until the connection has ended, from whichever side.
+    pub async fn wait(mut self) {
+        while self.0.changed().await.is_ok() {}
+    }
 }
 
 impl AsyncRead for Connection {
@@ -46,7 +71,7 @@ impl AsyncRead for Connection {
         context: &mut Context<'_>,
         buffer: &mut ReadBuf<'_>,
     ) -> Poll<io::Result<()>> {
-        self.0.as_mut().poll_read(context, buffer)
+        self.stream.as_mut().poll_read(context, buffer)
     }
 }
 
@@ -56,15 +81,15 @@ impl AsyncWrite for Connection {
         context: &mut Context<'_>,
         bytes: &[u8],
     ) -> Poll<io::Result<usize>> {
-        self.0.as_mut().poll_write(context, bytes)
+        self.stream.as_mut().poll_write(context, bytes)
     }
 
     fn poll_flush(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<io::Result<()>> {
-        self.0.as_mut().poll_flush(context)
+        self.stream.as_mut().poll_flush(context)
     }
 
     fn poll_shutdown(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<io::Result<()>> {
-        self.0.as_mut().poll_shutdown(context)
+        self.stream.as_mut().poll_shutdown(context)
     }
 
     fn poll_write_vectored(
@@ -72,11 +97,11 @@ impl AsyncWrite for Connection {
         context: &mut Context<'_>,
         slices: &[io::IoSlice<'_>],
     ) -> Poll<io::Result<usize>> {
-        self.0.as_mut().poll_write_vectored(context, slices)
+        self.stream.as_mut().poll_write_vectored(context, slices)
     }
 
     fn is_write_vectored(&self) -> bool {
-        self.0.is_write_vectored()
+        self.stream.is_write_vectored()
     }
 }
 

@@ -1,8 +1,8 @@
 //! How processes reach one another: who may call a service, how a service is offered, how it is called.
 //!
 //! [`Gate`] is a service's side: its token, its certificate, and what it offers beside its calls (health, reflection,
-//! keep-alive). [`Dial`] is a client's side; its [`Link`]s say what to do when a call does not get through. [`Incoming`] and [`Dial::through`] let both run over any network, a
-//! simulated one included. What is said over a connection is not known here.
+//! keep-alive); an answer that goes to many is [`Prepared`] for it once. [`Dial`] is a client's side; its [`Link`]s say what to do when a call does not get through. [`Incoming`] and [`Dial::through`] let both run over any network, a
+//! simulated one included. [`Page`] is what a service shows to programs that speak plain HTTP. What is said over a connection is not known here.
 
 mod access;
 mod dial;
@@ -11,12 +11,16 @@ mod health;
 mod heard;
 mod incoming;
 mod link;
+mod page;
+mod prepared;
 mod tls;
 
 pub use access::{AccessError, Token, TokenRefused, is_exposed};
 pub use dial::{Dial, DialError};
 pub use gate::{Gate, GateError, Guard};
 pub use health::{Unwell, check_health};
-pub use incoming::{Connection, Incoming};
+pub use incoming::{Connection, Hangup, Incoming};
 pub use link::Link;
+pub use page::Page;
+pub use prepared::Prepared;
 pub use tls::TlsError;

@@ -9,6 +9,7 @@
 #![warn(missing_docs)]
 
 pub mod adam;
+mod copies;
 mod elementwise;
 mod error;
 pub mod file;

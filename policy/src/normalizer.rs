@@ -76,6 +76,18 @@ impl Normalizer {
         normalizer
     }
 
+    /// Goes on as if `count` rows with `snapshot`'s means and standard deviations had been seen.
+    #[must_use]
+    pub fn from_snapshot(snapshot: &NormalizerSnapshot, count: u64) -> Self {
+        let rows = count as f64;
+        let columns = || snapshot.mean.iter().zip(&snapshot.std);
+        let sum = columns().map(|(mean, _)| f64::from(*mean) * rows).collect();
+        let square = |x: f32| f64::from(x) * f64::from(x);
+        let sum_of_squares =
+            columns().map(|(mean, std)| (square(*mean) + square(*std)) * rows).collect();
+        Self::from_parts(NormalizerParts { count, sum, sum_of_squares })
+    }
+
     /// What was seen.
     #[must_use]
     pub const fn parts(&self) -> &NormalizerParts {
@@ -187,5 +199,23 @@ mod tests {
         let mut normalizer = Normalizer::new(3);
         normalizer.update(&rows());
         assert_eq!(Normalizer::from_parts(normalizer.parts().clone()), normalizer);
+    }
+
+    #[test]
+    fn a_snapshot_goes_on_as_the_rows_that_it_came_from_would() {
+        let snapshot = NormalizerSnapshot { mean: vec![0.3, -2.0], std: vec![0.5, 1.5] };
+        let mut normalizer = Normalizer::from_snapshot(&snapshot, 1000);
+        for (got, expected) in [
+            (&normalizer.snapshot().mean, &snapshot.mean),
+            (&normalizer.snapshot().std, &snapshot.std),
+        ] {
+            for (got, expected) in got.iter().zip(expected) {
+                assert!((got - expected).abs() < 1e-5, "{got} against {expected}");
+            }
+        }
+        normalizer.update(&[0.3, 4.0].repeat(1000));
+        let after = normalizer.snapshot();
+        assert!((after.mean[1] - 1.0).abs() < 1e-4, "half of the rows each: {after:?}");
+        assert!((after.std[0] - 0.5 / 2.0_f32.sqrt()).abs() < 1e-4, "{after:?}");
     }
 }

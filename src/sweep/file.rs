@@ -130,7 +130,7 @@ fn planned(
         stop.max_env_steps > 0 || stop.max_minutes > 0.0,
         "{name} may never end: set stop.max_env_steps or stop.max_minutes in [run]"
     );
-    let teacher = teachers.get(&resolved.task).filter(|_| resolved.advice.asks()).cloned();
+    let teacher = teachers.get(&resolved.task).filter(|_| resolved.advice.needs_teacher()).cloned();
     Ok(PlannedRun { config: RunConfig { name: name.clone(), ..resolved }, name, teacher })
 }
 

@@ -102,7 +102,7 @@ impl Children {
 
     /// Starts teacher, learner and workers, in this order.
     pub(crate) async fn start(&mut self, plan: &Plan) -> Result<(), Broken> {
-        if plan.teacher.is_some() {
+        if plan.config.advice.asks() {
             let address = self.start_service(Role::Teacher, &teacher_args(plan)).await?;
             self.teacher_address = Some(address);
         }
@@ -237,6 +237,9 @@ impl Children {
         args.extend(["--out".into(), plan.out.clone().into_os_string()]);
         if let Some(address) = &self.teacher_address {
             args.extend(["--teacher".into(), address.into()]);
+        }
+        if plan.config.advice.starts_from_teacher() {
+            args.extend(["--start-from".into(), plan.teacher_copy().into_os_string()]);
         }
         if resume {
             args.push("--resume".into());

@@ -164,7 +164,8 @@ fn style(template: &str) -> ProgressStyle {
         .progress_chars("=> ")
 }
 
-fn counts_line(progress: &pb::Progress) -> String {
+/// How far a run is.
+pub(crate) fn counts_line(progress: &pb::Progress) -> String {
     format!(
         "{} round {}, {} env steps ({:.0}/s), {} updates ({:.0}/s)",
         clock_text(progress.wall_s),
@@ -184,7 +185,8 @@ fn warning_line(progress: &pb::Progress) -> String {
     }
 }
 
-fn evaluation_line(progress: &pb::Progress, evaluation: &pb::Evaluation) -> String {
+/// What an evaluation has brought.
+pub(crate) fn evaluation_line(progress: &pb::Progress, evaluation: &pb::Evaluation) -> String {
     format!(
         "{} success {:.3} [{:.3}, {:.3}] at {} env steps; joint {:.3}, contacts {:.3}, mean Q {:.2}, advice {} of {}",
         clock_text(progress.wall_s),

@@ -33,8 +33,10 @@ impl Plan {
         if !args.resume {
             config.name = account_name(&out).unwrap_or(config.name);
         }
-        let teacher =
-            if config.advice.asks() { Some(teacher_path(args, &config, &out)?) } else { None };
+        let teacher = match config.advice.needs_teacher() {
+            true => Some(teacher_path(args, &config, &out)?),
+            false => None,
+        };
         let n_workers = args.workers.unwrap_or_else(|| default_workers(&config));
         if !(1..=1024).contains(&n_workers) {
             return Err(Failed::usage(format!("--workers {n_workers}: expected 1 to 1024")));
@@ -57,9 +59,7 @@ impl Plan {
         }
         let failed = || format!("cannot write to {}", out.display());
         std::fs::create_dir_all(out.join("policy")).or_exit(Exit::TryAgain, failed)?;
-        let text = run_file::to_toml(&self.config).or_exit(Exit::Bug, String::new)?;
-        let header = format!("# tandem {}\n", crate::services::VERSION);
-        std::fs::write(self.run_file(), header + &text).or_exit(Exit::TryAgain, failed)?;
+        run_file::save(&self.config, &self.run_file())?;
         if let Some(teacher) = &self.teacher
             && *teacher != self.teacher_copy()
         {
@@ -159,11 +159,6 @@ fn teacher_path(args: &TrainArgs, config: &RunConfig, out: &Path) -> Result<Path
             policy.layout.task, config.task
         )));
     }
-    config
-        .advice
-        .strategy
-        .parse::<tandem_teacher::Strategy>()
-        .or_exit(Exit::Usage, || format!("strategy {:?}", config.advice.strategy))?;
     Ok(path)
 }
 

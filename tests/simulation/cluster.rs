@@ -191,6 +191,7 @@ impl Stage {
             gate: Gate::default(),
             dial: dial(),
             teacher: Some(address(TEACHER)),
+            start_from: None,
             out,
             resume,
             n_threads: 1,

@@ -77,6 +77,8 @@ pub(crate) enum Work {
     Wait,
     /// The run has ended, for this reason.
     Finished(String),
+    /// The learner ends before the run does, for this reason.
+    Interrupted(String),
 }
 
 /// The learner's side of a run.
@@ -112,7 +114,10 @@ impl Learner {
         Ok(match answer.work.ok_or_else(|| missing("work"))? {
             Message::Slot(slot) => Work::Slot(tandem_proto::decode_slot(slot)?),
             Message::Wait(pb::Wait {}) => Work::Wait,
-            Message::Finished(pb::Finished { reason }) => Work::Finished(reason),
+            Message::Finished(pb::Finished { reason, interrupted: false }) => {
+                Work::Finished(reason)
+            }
+            Message::Finished(pb::Finished { reason, .. }) => Work::Interrupted(reason),
         })
     }
 

@@ -33,7 +33,8 @@ pub struct WorkerConfig {
 /// Plays slots for a learner until the run has ended or `shutdown` is cancelled; a slot in hand is then delivered
 /// first, if that takes a few seconds at most.
 ///
-/// A learner or teacher that cannot be reached is waited for, for ever. Rollouts run on a thread of their own; a
+/// A learner or teacher that cannot be reached is waited for, for ever, and so is a learner that was stopped before the
+/// run's end. Rollouts run on a thread of their own; a
 /// current-thread runtime with time and IO enabled is enough.
 ///
 /// # Errors
@@ -116,6 +117,11 @@ impl Worker {
                 Some(Work::Finished(reason)) => {
                     tracing::info!(reason, "run ended");
                     return Ok(None);
+                }
+                Some(Work::Interrupted(reason)) => {
+                    tracing::warn!(reason, "learner stopped before the run's end, waiting for it");
+                    tokio::time::sleep(self.patience.longest_pause).await;
+                    None
                 }
                 Some(Work::Wait) => Some(member),
                 None => {

@@ -53,6 +53,21 @@ fn episodes_come_back_in_order_whoever_was_first() {
 }
 
 #[test]
+fn the_slot_of_a_worker_that_hung_up_goes_to_the_next_at_once() {
+    let (mut board, a, b) = board_of(3);
+    assert_eq!((given(&mut board, a, at(0)), given(&mut board, b, at(0))), (Some(0), Some(1)));
+    assert!(board.hung_up(a));
+    assert!(!board.hung_up(a), "it has no other");
+    assert_eq!(board.submit(b, 1, played(1), at(1)), Ok(true));
+    assert_eq!(given(&mut board, b, at(1)), Some(0), "before slot 2, which was never given");
+    // It was only cut off, calls again and delivers: it is the first, and counts.
+    assert_eq!(board.submit(a, 0, played(0), at(2)), Ok(true));
+    assert_eq!(board.submit(b, 0, played(0), at(2)), Ok(false));
+    assert!(!board.hung_up(b), "what it had is in");
+    assert!(!board.hung_up(99), "a stranger");
+}
+
+#[test]
 fn training_goes_before_evaluation() {
     let mut board = Board::default();
     board.add(order(0, EpisodeKind::Evaluation));
@@ -84,6 +99,16 @@ fn a_dead_workers_slot_is_with_another_after_three_seconds() {
     assert_eq!(given(&mut board, b, Duration::from_millis(2999)), None);
     assert_eq!(given(&mut board, b, COVER_AFTER), Some(0));
     assert_eq!(board.cover_in(COVER_AFTER), Some(COVER_AFTER), "the cover has its own time");
+}
+
+#[test]
+fn slots_that_all_take_long_are_not_covered_before_twice_that_time() {
+    let (mut board, a, b) = board_of(2);
+    assert_eq!((given(&mut board, a, at(0)), given(&mut board, b, at(0))), (Some(0), Some(1)));
+    assert_eq!(board.submit(a, 0, played(0), at(5)), Ok(true));
+    assert_eq!(board.cover_in(at(5)), Some(at(5)));
+    assert_eq!(given(&mut board, a, at(9)), None, "the other is as slow as this one");
+    assert_eq!(given(&mut board, a, at(10)), Some(1), "the other is slower");
 }
 
 #[test]

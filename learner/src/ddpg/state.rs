@@ -1,6 +1,6 @@
 //! What a checkpoint keeps, and what a policy is made of.
 
-use tandem_policy::MlpShape;
+use tandem_policy::{MlpShape, Policy};
 
 use super::{Ddpg, DdpgConfig, DdpgError};
 
@@ -63,6 +63,18 @@ impl Ddpg {
     #[must_use]
     pub fn gradients(&self) -> [&[f32]; 2] {
         [&self.actor_half.step.gradient, &self.critic_half.step.gradient]
+    }
+
+    /// Starts all networks, online, target and averaged, from a policy's. Meant for a learner that has made no update.
+    ///
+    /// # Panics
+    /// When the policy's networks have other sizes.
+    pub fn start_from(&mut self, policy: &Policy) {
+        self.actor.online.copy_from_slice(&policy.actor);
+        self.actor.target.copy_from_slice(&policy.actor);
+        self.averaged_actor.copy_from_slice(&policy.actor);
+        self.critic.online.copy_from_slice(&policy.critic);
+        self.critic.target.copy_from_slice(&policy.critic);
     }
 
     /// Every vector that the next update depends on, by name, in a fixed order. With [`Ddpg::n_updates`] it is the

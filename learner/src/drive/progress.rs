@@ -21,6 +21,7 @@ impl Drive<'_> {
                 _ => 0.0,
             };
         let run = &self.config.run;
+        self.shared.lock().n_replay_episodes = self.trainer.replay.n_episodes();
         let workers = self.workers();
         self.shared.progress.send_modify(|progress| {
             progress.task.clone_from(&run.task);

@@ -58,7 +58,16 @@ impl Beginning {
                 if config.resume {
                     tracing::info!(path = ?checkpoints, "no checkpoint yet, the run begins anew");
                 }
-                let trainer = Trainer::new(config.run.clone())?;
+                let mut trainer = Trainer::new(config.run.clone())?;
+                if config.run.advice.starts_from_teacher() {
+                    let none = || {
+                        Error::StartFrom(
+                            "needs the teacher's policy file: give it by --start-from".to_owned(),
+                        )
+                    };
+                    let teacher = config.start_from.as_ref().ok_or_else(none)?;
+                    trainer.start_from(teacher).map_err(Error::StartFrom)?;
+                }
                 let (acting, judged) = (trainer.publish(), Judged::default());
                 (trainer, Resumption { acting, judged, pending: Vec::new(), wall_s: 0.0 })
             }
@@ -113,10 +122,10 @@ impl<'a> Drive<'a> {
             world: config.run.world_terms(),
         };
         for Pending { counters, policy, .. } in &pending {
-            shared.publish(policy.published(counters.round));
+            shared.publish(&policy.published(counters.round));
         }
-        shared.publish(acting.clone());
-        shared.publish(trainer.publish());
+        shared.publish(&acting);
+        shared.publish(&trainer.publish());
         let mut drive = Self {
             config,
             shared,

@@ -39,14 +39,14 @@ fn is_control(c: char) -> bool {
         || matches!(c, '\u{200e}' | '\u{200f}' | '\u{2028}'..='\u{202e}' | '\u{2066}'..='\u{2069}')
 }
 
-/// Refuses workers of another version.
-pub(super) fn check_version(name: &str, version: &str) -> Result<(), Status> {
+/// Refuses workers of another version than this learner or relay.
+pub(crate) fn check_version(name: &str, version: &str, this: &str) -> Result<(), Status> {
     if version == VERSION {
         return Ok(());
     }
     let shown: String = version.chars().take(MAX_SHOWN_CHARS).collect();
     Err(Status::failed_precondition(format!(
-        "worker {name:?} is of version {shown:?}, this learner of version {VERSION:?}: both must be the same"
+        "worker {name:?} is of version {shown:?}, this {this} of version {VERSION:?}: both must be the same"
     )))
 }
 

@@ -2,8 +2,10 @@
 
 mod advice;
 mod disk;
+mod metrics;
 mod order;
 mod refusals;
+mod relay;
 mod resume;
 mod run;
 mod silence;

@@ -39,6 +39,7 @@ pub(crate) fn learner_config(run: RunConfig, out: &Path, resume: bool) -> Learne
         gate: Gate::default(),
         dial: Dial::default(),
         teacher: None,
+        start_from: None,
         out: out.to_owned(),
         resume,
         n_threads: 1,

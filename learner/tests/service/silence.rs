@@ -35,6 +35,40 @@ async fn a_dead_workers_slot_is_played_by_another_soon() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_worker_that_plays_beyond_the_runs_end_is_told_of_it() {
+    let directory = tempfile::tempdir().expect("a directory");
+    let served = Served::start(learner_config(config(0), directory.path(), false)).await;
+    let (mut slow, mut fast) = (served.join("slow").await, served.join("fast").await);
+    let (order, episodes) = slow.take().await.expect("a slot");
+    while fast.play_one().await {}
+    // Far longer than the learner stays for those who have nothing to do.
+    tokio::time::sleep(Duration::from_millis(500)).await;
+    slow.deliver(order.slot, &episodes).await.expect("the learner is still there");
+    match slow.ask().await {
+        Ok(Work::Finished(finished)) => assert!(!finished.interrupted, "{}", finished.reason),
+        other => panic!("{other:?}"),
+    }
+    assert!(!served.end().await.expect("a run").interrupted);
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn the_slot_of_a_worker_that_hangs_up_is_played_by_another_at_once() {
+    let expected = calm(config(0)).await;
+    let directory = tempfile::tempdir().expect("a directory");
+    // Time stands still: nobody is ever slow or silent here.
+    let clock = Arc::new(|| Duration::ZERO);
+    let config = LearnerConfig { clock, ..learner_config(config(0), directory.path(), false) };
+    let served = Served::start(config).await;
+    let (mut gone, mut alive) = (served.join("gone").await, served.join("alive").await);
+    gone.take().await.expect("a slot");
+    drop(gone);
+    let played = async { while alive.play_one().await {} };
+    tokio::time::timeout(DEADLINE, played).await.expect("every slot is to be had");
+    let ended = served.end().await.expect("a run");
+    assert_eq!(Left::behind(&ended, directory.path()), expected);
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_bug_in_the_learning_thread_ends_the_run_and_holds_nobody() {
     let directory = tempfile::tempdir().expect("a directory");
     let (broken, clock) = (Arc::new(AtomicBool::new(false)), real_clock());

@@ -98,7 +98,7 @@ fn every_sweep_that_ships_is_valid() {
         })
         .collect();
     let expected = [
-        ("sweep-recipe", 30),
+        ("sweep-recipe", 26),
         ("sweep-small", 8),
         ("sweep-students", 6),
         ("sweep-table2", 72),

@@ -88,6 +88,8 @@ async fn a_learner_that_fails_now_and_then_gets_the_same_episodes() {
     assert_eq!(learner.n_calls(Call::Join), 2);
     let learner = check(Call::Submit, 1, Fault::WorkersForgotten).await;
     assert_eq!(learner.n_calls(Call::Join), 2);
+    let learner = check(Call::NextWork, 1, Fault::Stopped).await;
+    assert_eq!(learner.n_calls(Call::Join), 2);
 }
 
 #[tokio::test]

@@ -72,6 +72,8 @@ struct Model {
     joined: Vec<u64>,
     n_episodes: u64,
     now: Duration,
+    /// How long slots took of late.
+    took: Option<Duration>,
 }
 
 impl Model {
@@ -91,7 +93,8 @@ impl Model {
             Place::Out { since, .. } => Some((since, slot.order.slot)),
             _ => None,
         });
-        let overdue = out.min().filter(|(since, _)| now - *since >= COVER_AFTER);
+        let cover_after = (2 * self.took.unwrap_or_default()).clamp(COVER_AFTER, SILENT_AFTER);
+        let overdue = out.min().filter(|(since, _)| now - *since >= cover_after);
         let chosen = queued.map(|slot| slot.order.slot).or(overdue.map(|(_, slot)| slot));
         member.given = chosen;
         if let Some(slot) = chosen.and_then(|slot| self.slots.get_mut(&slot)) {
@@ -105,7 +108,13 @@ impl Model {
         (member.heard_at, member.silent) = (self.now, false);
         member.given = member.given.filter(|given| *given != slot);
         let open = self.slots.get_mut(&slot).filter(|slot| slot.place.is_open());
-        Ok(open.map(|slot| slot.place = Place::In).is_some())
+        let Some(slot) = open else { return Ok(false) };
+        if let Place::Out { since, .. } = slot.place {
+            let took = self.now - since;
+            self.took = Some(self.took.map_or(took, |before| (7 * before + took) / 8));
+        }
+        slot.place = Place::In;
+        Ok(true)
     }
 
     fn reclaim(&mut self) -> Vec<(u64, usize)> {

@@ -29,6 +29,8 @@ pub(crate) enum Fault {
     AnswerLost,
     /// The learner has lost all memory of its workers and of the slots they play.
     WorkersForgotten,
+    /// The learner is stopped before the run's end, and another goes on with the run.
+    Stopped,
     /// Never answered.
     Hang(mpsc::Sender<()>),
 }
@@ -43,6 +45,7 @@ struct State {
     out: BTreeMap<u64, SlotOrder>,
     workers: BTreeSet<u64>,
     n_joined: u64,
+    is_stopping: bool,
     n_calls: BTreeMap<Call, usize>,
     episodes: BTreeMap<(bool, u64), Episode>,
 }
@@ -67,6 +70,7 @@ impl FakeLearner {
             out: BTreeMap::new(),
             workers: BTreeSet::new(),
             n_joined: 0,
+            is_stopping: false,
             n_calls: BTreeMap::new(),
             episodes: BTreeMap::new(),
         };
@@ -118,6 +122,11 @@ impl FakeLearner {
                 self.forget_workers();
                 Ok(false)
             }
+            Some(Fault::Stopped) => {
+                self.forget_workers();
+                self.state().is_stopping = true;
+                Ok(false)
+            }
             Some(Fault::Hang(reached)) => {
                 reached.send(()).await.expect("the test waits for it");
                 std::future::pending().await
@@ -140,6 +149,7 @@ impl pb::learner_server::Learner for FakeLearner {
         Ok(Response::new(pb::JoinResponse {
             worker_id,
             terms: Some(tandem_proto::encode_terms(&terms())),
+            learner: 1,
         }))
     }
 
@@ -150,13 +160,22 @@ impl pb::learner_server::Learner for FakeLearner {
         use pb::next_work_response::Work;
         self.arrive(Call::NextWork).await?;
         let mut state = self.state();
+        if std::mem::take(&mut state.is_stopping) {
+            let finished = pb::Finished { reason: "interrupted".to_owned(), interrupted: true };
+            return Ok(Response::new(pb::NextWorkResponse {
+                work: Some(Work::Finished(finished)),
+            }));
+        }
         state.check_known(request.into_inner().worker_id)?;
         let work = match state.waiting.pop_front().or_else(|| state.out.values().next().cloned()) {
             Some(order) => {
                 state.out.insert(order.slot, order.clone());
                 Work::Slot(tandem_proto::encode_slot(&order))
             }
-            None => Work::Finished(pb::Finished { reason: "all slots are in".to_owned() }),
+            None => {
+                let reason = "all slots are in".to_owned();
+                Work::Finished(pb::Finished { reason, interrupted: false })
+            }
         };
         Ok(Response::new(pb::NextWorkResponse { work: Some(work) }))
     }

@@ -1,0 +1,116 @@
+//! The run's figures over HTTP, beside what the service itself says.
+
+use std::collections::BTreeMap;
+use std::net::SocketAddr;
+use std::time::Duration;
+
+use tandem_learner::{AfterTheEnd, Beside, serve_beside};
+use tandem_proto::pb;
+use tandem_proto::pb::learner_client::LearnerClient;
+use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
+use tokio::net::{TcpListener, TcpStream};
+use tokio_util::sync::CancellationToken;
+
+use crate::run::{DEADLINE, Toy, learner_config};
+use crate::toy;
+
+/// What stands at `/metrics`: values by name and labels.
+async fn scrape(address: SocketAddr) -> BTreeMap<String, f64> {
+    let mut caller = TcpStream::connect(address).await.expect("it listens");
+    let question = b"GET /metrics HTTP/1.1\r\nhost: learner\r\n\r\n";
+    caller.write_all(question).await.expect("sent");
+    let mut answer = String::new();
+    caller.read_to_string(&mut answer).await.expect("answered");
+    let (head, page) = answer.split_once("\r\n\r\n").expect("a page");
+    assert!(head.starts_with("HTTP/1.1 200 OK\r\n"), "{head}");
+    assert!(head.contains("content-type: application/openmetrics-text"), "{head}");
+    assert!(page.ends_with("\n# EOF\n"), "{page}");
+    values(page)
+}
+
+fn values(page: &str) -> BTreeMap<String, f64> {
+    let samples = page.lines().filter(|line| !line.starts_with('#'));
+    let sample = |line: &str| {
+        let (name, value) = line.rsplit_once(' ').expect("a name and a value");
+        (name.to_owned(), value.parse().expect("a number"))
+    };
+    samples.map(sample).collect()
+}
+
+/// Looks again and again until `name` is `expected`.
+async fn comes_true(address: SocketAddr, name: &str, expected: f64) -> BTreeMap<String, f64> {
+    let looking = async {
+        loop {
+            let figures = scrape(address).await;
+            if figures.get(name) == Some(&expected) {
+                return figures;
+            }
+            tokio::time::sleep(Duration::from_millis(5)).await;
+        }
+    };
+    tokio::time::timeout(DEADLINE, looking).await.expect("it comes true in time")
+}
+
+#[tokio::test]
+async fn figures_say_who_waits_and_how_far_the_run_is_and_stay_after_its_end() {
+    let directory = tempfile::tempdir().expect("a directory");
+    let shutdown = CancellationToken::new();
+    let listener = TcpListener::bind("127.0.0.1:0").await.expect("a port");
+    let address = listener.local_addr().expect("bound");
+    let metrics = TcpListener::bind("127.0.0.1:0").await.expect("a port");
+    let metrics_at = metrics.local_addr().expect("bound");
+    let beside = Beside { metrics: Some(metrics), after_the_end: AfterTheEnd::Stay };
+    // Without lag no round is opened before the last is learned, so that the counts are what they are.
+    let config = learner_config(toy::config(0), directory.path(), false);
+    let serving = tokio::spawn(serve_beside(config, listener, shutdown.clone(), beside));
+
+    let figures = comes_true(metrics_at, "tandem_assignments_waiting", 4.0).await;
+    assert_eq!(figures["tandem_workers"], 0.0);
+    assert_eq!(figures["tandem_assignments_playing"], 0.0);
+    assert_eq!(figures["tandem_rounds_total"], 0.0);
+    assert_eq!(figures["tandem_run_info{task=\"push\",arms=\"1\",strategy=\"none\"}"], 1.0);
+    assert!(!figures.contains_key("tandem_evaluation_success_ratio"), "nothing was judged yet");
+
+    let client =
+        || async { LearnerClient::connect(format!("http://{address}")).await.expect("it listens") };
+    let mut toy = Toy::join(client().await, "toy").await.expect("it lives");
+    let (order, episodes) = toy.take().await.expect("a slot");
+    let figures = scrape(metrics_at).await;
+    assert_eq!(figures["tandem_workers"], 1.0);
+    assert_eq!(figures["tandem_assignments_waiting"], 3.0);
+    assert_eq!(figures["tandem_assignments_playing"], 1.0);
+    toy.deliver(order.slot, &episodes).await.expect("taken");
+    let figures = scrape(metrics_at).await;
+    assert_eq!(figures["tandem_assignments_playing"], 0.0);
+
+    while toy.play_one().await {}
+    let figures = comes_true(metrics_at, "tandem_ended", 1.0).await;
+    let mut client = client().await;
+    let status = client.status(pb::StatusRequest {}).await.expect("it stays").into_inner();
+    assert!(status.ended);
+    for (name, expected) in [
+        ("tandem_rounds_total", status.round as f64),
+        ("tandem_env_steps_total", status.env_steps as f64),
+        ("tandem_episodes_total", status.episodes as f64),
+        ("tandem_updates_total", status.updates as f64),
+        ("tandem_advice_spent_total", status.advice_spent as f64),
+        ("tandem_advice_left", status.budget_left as f64),
+        ("tandem_wall_seconds", status.wall_s),
+        ("tandem_training_success_ratio", status.training_success),
+        ("tandem_evaluation_success_ratio", status.evaluation.expect("judged").success),
+        ("tandem_best_evaluation_success_ratio", status.best.expect("judged").success),
+        ("tandem_assignments_waiting", 0.0),
+        ("tandem_needs_attention", 0.0),
+        // 72 episodes were played, the buffer holds 2,000 transitions.
+        ("tandem_replay_episodes", 40.0),
+    ] {
+        assert_eq!(figures[name], expected, "{name}");
+    }
+    assert!(figures["tandem_rounds_total"] > 8.0 && figures["tandem_updates_total"] > 0.0);
+
+    assert!(!serving.is_finished(), "it stays until it is told to end");
+    shutdown.cancel();
+    let ended = tokio::time::timeout(DEADLINE, serving).await.expect("it ends in time");
+    assert!(!ended.expect("no panic").expect("a whole run").interrupted);
+    assert!(TcpStream::connect(metrics_at).await.is_err(), "figures end with the service");
+}

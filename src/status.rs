@@ -1,0 +1,165 @@
+//! `tandem status`: how far a run is, from wherever its learner can be reached.
+
+use std::time::Duration;
+
+use anyhow::anyhow;
+use serde_json::{Value, json};
+use tandem_net::Link;
+use tandem_proto::pb;
+use tandem_proto::pb::learner_client::LearnerClient;
+use tonic::{Code, Response, Status};
+
+use crate::cli::StatusArgs;
+use crate::exit::{Exit, Failed, OrExit as _};
+use crate::train::{counts_line, evaluation_line, grouped};
+use crate::{access, services};
+
+/// How long the learner may take to answer.
+const DEADLINE: Duration = Duration::from_secs(10);
+/// Seconds of run time between two lines without news.
+const LINE_EVERY_S: f64 = 30.0;
+
+pub(crate) fn status(args: &StatusArgs) -> Result<(), Failed> {
+    let dial = access::dial(&args.dial, &args.secret)?;
+    let runtime = services::runtime().or_exit(Exit::TryAgain, String::new)?;
+    runtime.block_on(async {
+        let link = dial.link(&args.address).or_exit(Exit::Usage, String::new)?;
+        let mut learner = LearnerClient::new(link);
+        if args.watch { watch(&mut learner, args).await } else { show(&mut learner, args).await }
+    })
+}
+
+/// What the learner says now.
+#[expect(clippy::print_stdout, reason = "what the command is for")]
+async fn show(learner: &mut LearnerClient<Link>, args: &StatusArgs) -> Result<(), Failed> {
+    let progress = answer(learner.status(pb::StatusRequest {})).await?;
+    if args.json {
+        println!("{}", progress_json(&progress));
+    } else {
+        lines(&progress).iter().for_each(|line| println!("{line}"));
+    }
+    Ok(())
+}
+
+/// A line for each evaluation and every half minute, or each message as JSON, until the run has ended.
+#[expect(clippy::print_stdout, reason = "what the command is for")]
+async fn watch(learner: &mut LearnerClient<Link>, args: &StatusArgs) -> Result<(), Failed> {
+    let mut stream = answer(learner.watch(pb::WatchRequest {})).await?;
+    let (mut told_round, mut told_at_s) = (None, f64::NEG_INFINITY);
+    while let Some(progress) = stream.message().await.map_err(|status| failed(&status))? {
+        if args.json {
+            println!("{}", progress_json(&progress));
+        } else if let Some(evaluation) = progress.evaluation.as_ref()
+            && told_round != Some(evaluation.round)
+        {
+            (told_round, told_at_s) = (Some(evaluation.round), progress.wall_s);
+            println!("{}", evaluation_line(&progress, evaluation));
+        } else if progress.wall_s - told_at_s >= LINE_EVERY_S {
+            told_at_s = progress.wall_s;
+            println!("{}", counts_line(&progress));
+        }
+        if progress.ended {
+            if !args.json {
+                println!("ended: {}", progress.end_reason);
+            }
+            return Ok(());
+        }
+    }
+    Err(Failed::new(Exit::TryAgain, anyhow!("the learner has gone before the run's end")))
+}
+
+/// The answer to a call, in time.
+async fn answer<T>(call: impl Future<Output = Result<Response<T>, Status>>) -> Result<T, Failed> {
+    match tokio::time::timeout(DEADLINE, call).await {
+        Ok(answer) => answer.map(Response::into_inner).map_err(|status| failed(&status)),
+        Err(_elapsed) => {
+            let what = anyhow!("the learner has not answered within {DEADLINE:?}");
+            Err(Failed::new(Exit::TryAgain, what))
+        }
+    }
+}
+
+fn failed(status: &Status) -> Failed {
+    let exit = match status.code() {
+        Code::Unauthenticated | Code::Unimplemented => Exit::Usage,
+        _ => Exit::TryAgain,
+    };
+    Failed::new(exit, anyhow!("{}", status.message()))
+}
+
+fn lines(progress: &pb::Progress) -> Vec<String> {
+    if progress.task.is_empty() {
+        return vec!["starting".to_owned()];
+    }
+    let phase = if progress.ended { &progress.end_reason } else { &progress.phase };
+    let mut lines = vec![format!("{}: {phase}", counts_line(progress))];
+    lines.extend(progress.evaluation.as_ref().map(|latest| evaluation_line(progress, latest)));
+    let best = |best: &pb::Evaluation| {
+        format!("best success {:.3} at {} env steps", best.success, grouped(best.env_steps))
+    };
+    lines.extend(progress.best.as_ref().map(best));
+    let (spent, left) = (grouped(progress.advice_spent), grouped(progress.budget_left));
+    lines.push(format!("advice spent {spent}, left {left}"));
+    let silent = progress.workers.iter().filter(|worker| worker.doing == "silent").count();
+    lines.push(format!("workers {}, silent {silent}", progress.workers.len() - silent));
+    if !progress.warning.is_empty() {
+        lines.push(format!("warning: {}", progress.warning));
+    }
+    lines
+}
+
+fn progress_json(progress: &pb::Progress) -> Value {
+    let worker = |worker: &pb::WorkerProgress| {
+        json!({
+            "worker_id": worker.worker_id, "name": worker.name, "episodes": worker.episodes,
+            "doing": worker.doing,
+        })
+    };
+    json!({
+        "task": progress.task, "arms": progress.n_arms, "strategy": progress.strategy,
+        "phase": progress.phase, "round": progress.round, "env_steps": progress.env_steps,
+        "episodes": progress.episodes, "updates": progress.updates, "wall_s": progress.wall_s,
+        "env_steps_per_s": progress.env_steps_per_s, "updates_per_s": progress.updates_per_s,
+        "advice_spent": progress.advice_spent, "budget_left": progress.budget_left,
+        "training_success": progress.training_success,
+        "evaluation": progress.evaluation.as_ref().map(evaluation_json),
+        "best": progress.best.as_ref().map(evaluation_json),
+        "workers": progress.workers.iter().map(worker).collect::<Vec<_>>(),
+        "ended": progress.ended, "end_reason": progress.end_reason, "digest": progress.digest,
+        "warning": progress.warning,
+    })
+}
+
+fn evaluation_json(evaluation: &pb::Evaluation) -> Value {
+    json!({
+        "round": evaluation.round, "env_steps": evaluation.env_steps,
+        "episodes": evaluation.n_episodes, "success": evaluation.success,
+        "success_low": evaluation.success_low, "success_high": evaluation.success_high,
+        "success_joint": evaluation.success_joint, "success_per_arm": evaluation.success_per_arm,
+        "collision_rate": evaluation.collision_rate, "mean_q": evaluation.mean_q,
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_person_sees_workers_that_are_silent_and_a_warning() {
+        let worker =
+            |doing: &str| pb::WorkerProgress { doing: doing.to_owned(), ..Default::default() };
+        let progress = pb::Progress {
+            task: "push".to_owned(),
+            phase: "collecting".to_owned(),
+            workers: vec![worker("slot 3"), worker("silent"), worker("waiting")],
+            warning: "the disk is full".to_owned(),
+            ..Default::default()
+        };
+        let lines = lines(&progress);
+        assert!(lines.contains(&"workers 2, silent 1".to_owned()), "{lines:?}");
+        assert_eq!(lines.last().expect("lines"), "warning: the disk is full");
+        assert!(lines[0].ends_with(": collecting"), "{lines:?}");
+        let ended = pb::Progress { ended: true, end_reason: "done".to_owned(), ..progress };
+        assert!(super::lines(&ended)[0].ends_with(": done"));
+    }
+}

@@ -1,0 +1,207 @@
+//! Services under a supervisor that knows one thing: to start the same command again.
+
+use std::fs::{self, File};
+use std::io::{BufRead as _, BufReader};
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, ExitStatus, Output, Stdio};
+use std::time::Duration;
+
+use serde_json::Value;
+use tempfile::TempDir;
+
+/// A small run without advice: 40 rounds of 8 episodes.
+const RUN: &str = r#"
+    name = "supervised"
+    task = "push"
+    arms = 2
+    advice = { strategy = "none" }
+    rounds = { slots = 4, rollouts = 2, updates_per_env_step = 0.1 }
+    ddpg = { n_hidden = 32 }
+    evaluation = { every_env_steps = 3200, episodes = 8, recorded_episodes = 0 }
+    checkpoint = { every_rounds = 2 }
+    stop = { max_env_steps = 16000 }
+"#;
+
+/// A run with a learner and two workers, each a process that is killed at the latest with the test.
+struct Supervised {
+    directory: TempDir,
+    address: String,
+    learner: Child,
+    workers: Vec<Child>,
+}
+
+impl Supervised {
+    fn start() -> Self {
+        let directory = tempfile::tempdir().expect("a directory");
+        fs::write(directory.path().join("run.toml"), RUN).expect("writable");
+        let (learner, address) = learner(directory.path(), "127.0.0.1:0").expect("a port");
+        let worker = |number| {
+            let mut command = tandem(&["worker", "--connect", &address]);
+            log_to(&mut command, &directory.path().join(format!("worker-{number}.log")));
+            command.spawn().expect("starts")
+        };
+        let workers = (0..2).map(worker).collect();
+        Self { address, learner, workers, directory }
+    }
+
+    fn out(&self) -> PathBuf {
+        self.directory.path().join("run")
+    }
+
+    /// Does what a supervisor does: starts the same command again, at the same address.
+    fn start_learner_again(&mut self) {
+        let started = (0..100).find_map(|_| {
+            std::thread::sleep(Duration::from_millis(100));
+            learner(self.directory.path(), &self.address)
+        });
+        self.learner = started.expect("its port is free again").0;
+    }
+
+    /// Waits for a checkpoint that was not there before.
+    fn wait_for_checkpoint(&self) {
+        let newest = || {
+            let saved = fs::read_dir(self.out().join("checkpoint")).into_iter().flatten().flatten();
+            saved.map(|entry| entry.file_name()).max()
+        };
+        let before = newest();
+        assert!(eventually(|| newest() > before), "no new checkpoint, {}", self.told());
+    }
+
+    fn status(&self) -> Output {
+        tandem(&["status", &self.address, "--json"]).output().expect("runs")
+    }
+
+    /// Waits for the end of the run: of the learner and of the workers, which nobody asks to end.
+    fn end(&mut self) {
+        let ended = end_of(&mut self.learner);
+        assert!(ended.is_some_and(|ended| ended.success()), "{ended:?}: {}", self.told());
+        for idx in 0..self.workers.len() {
+            let ended = end_of(&mut self.workers[idx]);
+            let is_done = ended.is_some_and(|ended| ended.success());
+            assert!(is_done, "worker {idx}: {ended:?}: {}", self.told());
+        }
+    }
+
+    /// The rows of the run's metrics, without the wall time.
+    fn metrics(&self) -> Vec<Value> {
+        let text = fs::read_to_string(self.out().join("metrics.jsonl")).expect("metrics");
+        let row = |line| {
+            let mut row: Value = serde_json::from_str(line).expect("a row");
+            row.as_object_mut().expect("an object").remove("wall_s").expect("a time");
+            row
+        };
+        text.lines().map(row).collect()
+    }
+
+    /// What the processes said.
+    fn told(&self) -> String {
+        let logs = ["learner.log", "worker-0.log", "worker-1.log"];
+        let read = |name| fs::read_to_string(self.directory.path().join(name)).unwrap_or_default();
+        logs.map(|name| format!("{name}:\n{}", read(name))).join("\n")
+    }
+}
+
+impl Drop for Supervised {
+    fn drop(&mut self) {
+        for process in self.workers.iter_mut().chain([&mut self.learner]) {
+            drop((process.kill(), process.wait()));
+        }
+    }
+}
+
+fn tandem(args: &[&str]) -> Command {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_tandem"));
+    command.args(args).stdin(Stdio::null());
+    command
+}
+
+fn log_to(command: &mut Command, path: &Path) {
+    let log = File::options().create(true).append(true).open(path).expect("a place for logs");
+    command.stderr(log).stdout(Stdio::null());
+}
+
+/// Starts the learner of `directory` and gives its address; `None` when it cannot listen there.
+fn learner(directory: &Path, listen: &str) -> Option<(Child, String)> {
+    let mut command = tandem(&["learner", "--start-or-resume", "--listen", listen, "--run"]);
+    command.arg(directory.join("run.toml")).arg("--out").arg(directory.join("run"));
+    log_to(&mut command, &directory.join("learner.log"));
+    let mut process = command.stdout(Stdio::piped()).spawn().expect("starts");
+    let mut line = String::new();
+    let output = process.stdout.take().expect("piped");
+    BufReader::new(output).read_line(&mut line).expect("readable");
+    match line.trim().strip_prefix("listening on ") {
+        Some(address) => Some((process, address.to_owned())),
+        None => {
+            assert_eq!(process.wait().expect("ends").code(), Some(75), "it says {line:?}");
+            None
+        }
+    }
+}
+
+fn signal(signal: &str, process: &Child) {
+    let pid = process.id().to_string();
+    assert!(Command::new("kill").args([signal, &pid]).status().expect("kill runs").success());
+}
+
+/// Waits two minutes for a process to end.
+fn end_of(process: &mut Child) -> Option<ExitStatus> {
+    (0..2400).find_map(|_| {
+        std::thread::sleep(Duration::from_millis(50));
+        process.try_wait().expect("a process")
+    })
+}
+
+/// Looks every 50 ms for two minutes whether something has come true.
+fn eventually(holds: impl Fn() -> bool) -> bool {
+    (0..2400).any(|_| {
+        std::thread::sleep(Duration::from_millis(50));
+        holds()
+    })
+}
+
+#[test]
+fn the_same_command_starts_a_run_and_goes_on_with_it_however_it_ended() {
+    let mut calm = Supervised::start();
+    calm.end();
+    let mut run = Supervised::start();
+    run.wait_for_checkpoint();
+
+    let told = run.status();
+    let progress: Value = serde_json::from_slice(&told.stdout).expect("JSON");
+    assert_eq!(progress["workers"].as_array().map(Vec::len), Some(2), "{progress}");
+    assert_eq!((&progress["task"], &progress["ended"]), (&"push".into(), &false.into()));
+
+    signal("-TERM", &run.learner);
+    let interrupted = end_of(&mut run.learner).expect("it ends");
+    assert_eq!(interrupted.code(), Some(130), "{}", run.told());
+    let away = run.status();
+    assert_eq!(away.status.code(), Some(75), "{}", String::from_utf8_lossy(&away.stderr));
+    for worker in &mut run.workers {
+        assert!(
+            worker.try_wait().expect("a process").is_none(),
+            "a worker must wait for a learner that was stopped"
+        );
+    }
+
+    run.start_learner_again();
+    run.wait_for_checkpoint();
+    signal("-KILL", &run.learner);
+    end_of(&mut run.learner).expect("it ends");
+    run.start_learner_again();
+    run.end();
+    assert_eq!(run.metrics(), calm.metrics());
+
+    // A run that has ended ends again, and is not learned once more.
+    run.start_learner_again();
+    assert_eq!(end_of(&mut run.learner).expect("it ends").code(), Some(0), "{}", run.told());
+    assert_eq!(run.metrics(), calm.metrics());
+    let kept = fs::read_to_string(run.out().join("run.toml")).expect("the settings are kept");
+    assert!(kept.contains("name = \"supervised\"") && kept.contains("[replay]"), "{kept}");
+}
+
+#[test]
+fn a_run_that_is_there_is_not_started_anew_by_mistake() {
+    let both = tandem(&["learner", "--run", "r", "--out", "o", "--resume", "--start-or-resume"]);
+    let refused = { both }.output().expect("runs");
+    assert_eq!(refused.status.code(), Some(64), "{}", String::from_utf8_lossy(&refused.stderr));
+}
