@@ -88,6 +88,25 @@ fn files_stay_readable() {
     }
 }
 
+#[test]
+fn the_image_is_of_this_version_and_toolchain() {
+    let read = |name: &str| fs::read_to_string(root().join(name)).expect("readable");
+    let toolchain = read("rust-toolchain.toml");
+    let channel = toolchain.lines().find_map(|line| line.strip_prefix("channel = "));
+    let channel = channel.expect("a channel").trim_matches('"');
+    let dockerfile = read("deploy/Dockerfile");
+    assert!(dockerfile.contains(&format!("FROM rust:{channel}-slim-")), "not Rust {channel}");
+    let image = format!("image: tandem:{}\n", env!("CARGO_PKG_VERSION"));
+    assert!(read("compose.yaml").contains(&image), "compose.yaml lacks {image:?}");
+    // The image is built from what is listed here, and from nothing else.
+    let context = read(".dockerignore");
+    for name in
+        ALLOWED.map(|(name, _)| name).iter().chain(&["src", "build.rs", "policies", "Cargo.lock"])
+    {
+        assert!(context.lines().any(|line| line == format!("!{name}")), "no {name} in the context");
+    }
+}
+
 fn root() -> &'static Path {
     Path::new(env!("CARGO_MANIFEST_DIR"))
 }

@@ -1,0 +1,156 @@
+//! The Kubernetes manifests' own commands, arguments, settings and probes, run as processes of this machine.
+//!
+//! Pods get addresses of the loopback, services lead to them, volumes are directories. What no cluster is needed for is
+//! proven so: that commands are spelt right, that they fit together, and that what is killed goes on.
+#![cfg(target_os = "linux")]
+#![expect(clippy::panic, reason = "a test panics where it fails")]
+
+#[path = "kubernetes/cluster.rs"]
+mod cluster;
+#[path = "kubernetes/manifests.rs"]
+mod manifests;
+
+use std::collections::BTreeMap;
+use std::process::{Command, Stdio};
+
+use tandem_proto::pb;
+use tandem_proto::pb::teacher_client::TeacherClient;
+use tokio::runtime::Builder;
+use toml::{Table, Value};
+use tonic::Request;
+
+use cluster::{Cluster, SECRETS};
+use manifests::Manifests;
+
+const ENV_STEPS: i64 = 4_000;
+
+/// The run file of the manifests, made small: rounds of 4 slots, small networks, few updates.
+fn small(run: &str) -> String {
+    let mut run: Table = run.parse().expect("a run file");
+    let mut change = |section: &str, key: &str, value: Value| {
+        let section = run.entry(section).or_insert_with(|| Value::Table(Table::new()));
+        section.as_table_mut().expect("a section").insert(key.to_owned(), value);
+    };
+    change("rounds", "slots", Value::Integer(4));
+    change("rounds", "updates_per_env_step", Value::Float(0.05));
+    change("rounds", "warmup_env_steps", Value::Integer(400));
+    change("ddpg", "n_hidden", Value::Integer(16));
+    change("world", "substeps", Value::Integer(10));
+    change("evaluation", "episodes", Value::Integer(4));
+    change("evaluation", "every_env_steps", Value::Integer(2_000));
+    change("checkpoint", "every_rounds", Value::Integer(1));
+    change("stop", "max_env_steps", Value::Integer(ENV_STEPS));
+    toml::to_string(&run).expect("TOML")
+}
+
+/// Whether Redis is installed; where it must be, the test fails if it is not.
+fn has_redis() -> bool {
+    let is_installed = |program: &str| {
+        Command::new(program).arg("--version").stdout(Stdio::null()).status().is_ok()
+    };
+    let installed = is_installed("redis-server") && is_installed("redis-cli");
+    #[expect(clippy::disallowed_methods, reason = "the one switch of the tests")]
+    let required = std::env::var("TANDEM_REQUIRE_REDIS").is_ok_and(|value| value == "1");
+    assert!(installed || !required, "Redis is not installed, but TANDEM_REQUIRE_REDIS=1");
+    installed
+}
+
+/// What the teachers' ledger says of an account: spent and left.
+fn account(cluster: &Cluster, teacher: &str, name: &str) -> (u64, u64) {
+    let address = format!("http://{}", cluster.address(teacher, "grpc"));
+    let mut request = Request::new(pb::GetAccountRequest { name: name.to_owned() });
+    let token = format!("Bearer {}", SECRETS[0].2).parse().expect("ASCII");
+    request.metadata_mut().insert("authorization", token);
+    let runtime = Builder::new_current_thread().enable_all().build().expect("a runtime");
+    let account = runtime.block_on(async {
+        let mut teacher = TeacherClient::connect(address).await.expect("it listens");
+        teacher.get_account(request).await.expect("an account").into_inner()
+    });
+    assert_eq!(account.leased, 0);
+    (account.spent, account.left)
+}
+
+#[test]
+fn what_the_manifests_start_trains_to_the_end_while_its_pods_are_taken_away() {
+    if !has_redis() {
+        println!("SKIPPED: redis-server is not installed");
+        return;
+    }
+    let manifests = Manifests::read();
+    let run = small(&manifests.run);
+    let workloads = manifests.workloads.clone();
+    let mut cluster = Cluster::new(manifests, run);
+    let mut names = Vec::new();
+    for (name, workload) in &workloads {
+        // Workers are as many as an overlay says; all others as the base does.
+        let replicas = if name == "worker" { 2 } else { workload.replicas };
+        names.extend(cluster.add(name, replicas));
+    }
+    assert_eq!(
+        names,
+        ["bridge-0", "learner-0", "redis-0", "teacher-0", "teacher-1", "worker-0", "worker-1"]
+    );
+    // All at once, as they are applied: who comes too early tries again.
+    for name in &names {
+        cluster.start(name);
+    }
+    cluster.wait_until_ready();
+
+    let rounds = |figures: &BTreeMap<String, f64>| {
+        figures.get("tandem_rounds_total").copied().unwrap_or_default()
+    };
+    let before = cluster.wait_for_figures("learner-0", |figures| rounds(figures) >= 2.0);
+    assert_eq!(before["tandem_ended"], 0.0, "the run ended before anything was done to it");
+    assert_eq!(cluster.terminate("learner-0"), Some(130), "{}", cluster.log("learner-0"));
+    for taken in ["redis-0", "teacher-1", "worker-1"] {
+        cluster.kill(taken);
+        cluster.start(taken);
+    }
+    cluster.start("learner-0");
+    cluster.wait_until_ready();
+    assert!(cluster.log("learner-0").contains("run resumed"), "{}", cluster.log("learner-0"));
+
+    let figures =
+        cluster.wait_for_figures("learner-0", |figures| figures.get("tandem_ended") == Some(&1.0));
+    assert!(rounds(&figures) > rounds(&before));
+    assert_eq!(figures["tandem_env_steps_total"], ENV_STEPS as f64);
+    let (spent, left) = account(&cluster, "teacher-0", "push");
+    assert!(spent > 0);
+    assert_eq!(figures["tandem_advice_spent_total"], spent as f64);
+    assert_eq!(figures["tandem_advice_left"], left as f64);
+
+    for worker in ["worker-0", "worker-1"] {
+        assert_eq!(cluster.wait_for_the_end(worker), Some(0), "{}", cluster.log(worker));
+    }
+    // Results can still be asked for.
+    assert!(cluster.is_well(cluster.pod("learner-0")), "{}", cluster.log("learner-0"));
+    for asked in ["learner-0", "teacher-0", "teacher-1", "bridge-0", "redis-0"] {
+        assert_eq!(cluster.terminate(asked), Some(0), "{asked}: {}", cluster.log(asked));
+    }
+    for name in &names {
+        assert!(cluster.litter(name).is_empty(), "{name} wrote {:?}", cluster.litter(name));
+        let shown = SECRETS.iter().find(|(_, _, value)| cluster.log(name).contains(value));
+        assert!(shown.is_none(), "{name} tells a secret: {}", cluster.log(name));
+    }
+}
+
+#[test]
+fn a_misspelt_argument_of_a_manifest_would_be_noticed() {
+    let manifests = Manifests::read();
+    let run = small(&manifests.run);
+    let mut cluster = Cluster::new(manifests, run);
+    for name in ["redis", "teacher", "learner", "bridge", "worker"] {
+        cluster.add(name, 1);
+    }
+    for name in ["teacher-0", "learner-0", "bridge-0", "worker-0"] {
+        let args = cluster.container(name).args.clone();
+        let named = args.iter().enumerate();
+        for (idx, flag) in named.filter(|(idx, arg)| *idx == 0 || arg.starts_with("--")) {
+            let misspelt = format!("{flag}x");
+            let output = cluster.run_changed(name, idx, &misspelt);
+            let told = String::from_utf8_lossy(&output.stderr);
+            assert_eq!(output.status.code(), Some(64), "{misspelt}: {told}");
+            assert!(told.contains(&misspelt), "{misspelt}: {told}");
+        }
+    }
+}
