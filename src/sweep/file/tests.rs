@@ -99,6 +99,9 @@ fn every_sweep_that_ships_is_valid() {
         .collect();
     let expected = [
         ("sweep-recipe", 26),
+        ("sweep-recipe-long", 12),
+        ("sweep-recipe-starts", 4),
+        ("sweep-recipe-teachers", 10),
         ("sweep-small", 8),
         ("sweep-students", 6),
         ("sweep-table2", 72),
