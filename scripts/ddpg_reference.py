@@ -4,8 +4,8 @@
     python3 scripts/ddpg_reference.py > learner/tests/data/ddpg_reference.json
 
 Written from the formulas, not from the program: forward and backward passes as matrix algebra, per-arm heads, behaviour cloning,
-action penalty, Adam, Polyak averaging, the actor's slower average. Each update starts from parameters rounded to float32, so that a test can compare
-update by update, without rounding errors that add up.
+action penalty, Adam, Polyak averaging. Each update starts from parameters rounded to float32, so that a test can compare update by
+update, without rounding errors that add up.
 """
 
 import json
@@ -14,7 +14,7 @@ import numpy as np
 
 N_INPUT, N_ACTION, N_HEADS = 31, 3, 2  # one arm, push; two heads whatever the layout
 N_HIDDEN, N_HIDDEN_LAYERS, BATCH = 5, 2, 6
-DISCOUNT, ACTION_PENALTY, CLONING_WEIGHT, POLYAK_KEEP, AVERAGED_KEEP = 0.9, 0.7, 1.5, 0.8, 0.95
+DISCOUNT, ACTION_PENALTY, CLONING_WEIGHT, POLYAK_KEEP = 0.9, 0.7, 1.5, 0.8
 RATES = {"actor": 0.002, "critic": 0.003}
 KINK_MARGIN = 1e-4
 
@@ -101,7 +101,6 @@ def step(state, gradient, t):
         target = POLYAK_KEEP * state[f"{name}.target"] + (1 - POLYAK_KEEP) * online
         new |= {f"{name}.online": online, f"{name}.target": target}
         new |= {f"{name}.adam.first": first, f"{name}.adam.second": second}
-    new["actor.averaged"] = AVERAGED_KEEP * state["actor.averaged"] + (1 - AVERAGED_KEEP) * new["actor.online"]
     return new
 
 
@@ -113,7 +112,6 @@ def main(seed):
         n = sum(n_out * (n_in + 1) for n_out, n_in in layers)
         state |= {f"{name}.online": decimals(n, 0.5), f"{name}.target": decimals(n, 0.5)}
         state |= {f"{name}.adam.first": np.zeros(n), f"{name}.adam.second": np.zeros(n)}
-    state["actor.averaged"] = state["actor.target"][::-1].copy()
     state["critic.target"][-N_HEADS:] = [-11.0, 0.2]  # so that targets are clipped at both ends
 
     clamped = {"low": False, "high": False}
@@ -129,7 +127,7 @@ def main(seed):
         state = {key: to_f32(value) for key, value in after.items()}
     assert all(clamped.values()), clamped
     config = {"discount": DISCOUNT, "action_penalty": ACTION_PENALTY, "cloning_weight": CLONING_WEIGHT}
-    config |= {"polyak_keep": POLYAK_KEEP, "averaged_keep": AVERAGED_KEEP, "batch_size": BATCH, "n_hidden": N_HIDDEN, "n_hidden_layers": N_HIDDEN_LAYERS}
+    config |= {"polyak_keep": POLYAK_KEEP, "batch_size": BATCH, "n_hidden": N_HIDDEN, "n_hidden_layers": N_HIDDEN_LAYERS}
     config |= {f"{name}_learning_rate": rate for name, rate in RATES.items()}
     flat = lambda x: [float(f"{v:.9g}") for v in x.ravel()] if isinstance(x, np.ndarray) else float(x)
     nested = lambda x: {k: nested(v) for k, v in x.items()} if isinstance(x, dict) else flat(x)

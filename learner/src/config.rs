@@ -33,7 +33,7 @@ pub struct RunConfig {
     pub seed: u64,
     /// The recipe that the defaults came from.
     pub recipe: Recipe,
-    /// Which network acts: `target` (the paper), `averaged` or `online`.
+    /// Which network acts: `target` (the paper) or `online`.
     pub behaviour: Behaviour,
     /// Who is asked for advice, and when.
     pub advice: AdviceConfig,
@@ -61,8 +61,6 @@ pub struct RunConfig {
 pub enum Behaviour {
     /// The Polyak-averaged one (the paper, section 4.1).
     Target,
-    /// A slower average than the target's (`ddpg.averaged_keep`), which no target is computed with.
-    Averaged,
     /// The one that is being updated.
     Online,
 }
@@ -223,7 +221,7 @@ impl RunConfig {
             arms: n_arms,
             seed: 1,
             recipe,
-            behaviour: if tandem { Behaviour::Averaged } else { Behaviour::Target },
+            behaviour: Behaviour::Target,
             advice: AdviceConfig {
                 strategy: if n_arms == 1 { "none" } else { "mc-q:0.1" }.to_owned(),
                 budget: 500_000,
@@ -244,7 +242,7 @@ impl RunConfig {
                 seed: 240_240,
                 recorded_episodes: 2,
             },
-            stop: stop(recipe, task, n_arms),
+            stop: stop(recipe),
             checkpoint: CheckpointConfig { every_rounds: 50, keep: 2 },
         }
     }
@@ -475,11 +473,10 @@ const fn rounds(recipe: Recipe) -> RoundsConfig {
 }
 
 /// Where a run ends: the paper's recipe by the clock, because it has no end in sight on two cores.
-const fn stop(recipe: Recipe, task: Task, n_arms: usize) -> StopConfig {
-    let max_env_steps = match (recipe, task, n_arms) {
-        (Recipe::Paper, ..) => 0,
-        (Recipe::Tandem, Task::Push, 1) => 200_000,
-        (Recipe::Tandem, ..) => 300_000,
+const fn stop(recipe: Recipe) -> StopConfig {
+    let max_env_steps = match recipe {
+        Recipe::Paper => 0,
+        Recipe::Tandem => 200_000,
     };
     let max_minutes = if max_env_steps == 0 { 30.0 } else { 0.0 };
     StopConfig { until_success: 0.0, max_env_steps, max_minutes }
@@ -489,7 +486,7 @@ fn world(recipe: Recipe, task: Task) -> WorldSettings {
     let helped = recipe == Recipe::Tandem && task == Task::PickAndPlace;
     WorldSettings {
         gripped_start_share: if helped { 0.2 } else { 0.0 },
-        wide_start_share: if helped { 0.5 } else { 0.0 },
+        wide_start_share: 0.0,
         substeps: 20,
     }
 }

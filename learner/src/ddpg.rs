@@ -89,8 +89,6 @@ pub struct Ddpg {
     n_threads: usize,
     n_updates: u64,
     actor: Network,
-    /// A slower average of the actor than its target.
-    averaged_actor: Vec<f32>,
     critic: Network,
     actor_half: ActorHalf,
     critic_half: CriticHalf,
@@ -124,16 +122,7 @@ impl Ddpg {
             network(MlpShape::critic(layout, n_hidden, n_hidden_layers, rewards.n_heads), 1);
         let actor_half = ActorHalf::new(&config, &actor.shape, &critic.shape);
         let critic_half = CriticHalf::new(&config, rewards.lowest, &actor.shape, &critic.shape);
-        Self {
-            config,
-            n_threads: 1,
-            n_updates: 0,
-            averaged_actor: actor.online.clone(),
-            actor,
-            critic,
-            actor_half,
-            critic_half,
-        }
+        Self { config, n_threads: 1, n_updates: 0, actor, critic, actor_half, critic_half }
     }
 
     /// One gradient step of critic and actor on `batch`.
@@ -165,21 +154,13 @@ impl Ddpg {
         }
     }
 
-    /// Moves both target networks, and the averaged actor, toward the online ones, keeping the configured share of
-    /// the old.
+    /// Moves both target networks toward the online ones, keeping the configured share of the old.
     pub fn polyak(&mut self) {
-        let Self { config, n_threads, actor, averaged_actor, critic, .. } = self;
+        let Self { config, n_threads, actor, critic, .. } = self;
         let move_target = |network: &mut Network| {
             polyak_update(&mut network.target, &network.online, config.polyak_keep);
         };
-        join(
-            *n_threads,
-            || move_target(critic),
-            || {
-                move_target(actor);
-                polyak_update(averaged_actor, &actor.online, config.averaged_keep);
-            },
-        );
+        join(*n_threads, || move_target(critic), || move_target(actor));
     }
 
     /// Whether the two halves of an update run one after the other (1) or side by side (2); the bits are the same.

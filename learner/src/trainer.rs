@@ -234,7 +234,6 @@ impl Trainer {
     pub fn publish(&self) -> PublishedActor {
         let actor = match self.config.behaviour {
             Behaviour::Target => self.ddpg.target_actor(),
-            Behaviour::Averaged => self.ddpg.averaged_actor(),
             Behaviour::Online => self.ddpg.actor(),
         };
         let NormalizerSnapshot { mean: observation_mean, std: observation_std } =
@@ -258,7 +257,6 @@ impl Trainer {
     pub fn policy(&self, metadata: BTreeMap<String, String>) -> Policy {
         let (actor, critic) = match self.config.behaviour {
             Behaviour::Target => (self.ddpg.target_actor(), self.ddpg.target_critic()),
-            Behaviour::Averaged => (self.ddpg.averaged_actor(), self.ddpg.target_critic()),
             Behaviour::Online => (self.ddpg.actor(), self.ddpg.critic()),
         };
         Policy {

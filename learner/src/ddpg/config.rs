@@ -14,8 +14,6 @@ pub struct DdpgConfig {
     pub cloning_weight: f32,
     /// Share of the old target network kept by each Polyak step, in [0, 1] (HER reference implementation: 0.95).
     pub polyak_keep: f32,
-    /// Share of the averaged actor kept by each Polyak step, in [0, 1]; it acts when `behaviour` is `averaged`.
-    pub averaged_keep: f32,
     /// Adam's step size for the actor, above 0 (HER reference implementation: 0.001).
     pub actor_learning_rate: f32,
     /// Adam's step size for the critic, above 0 (HER reference implementation: 0.001).
@@ -35,7 +33,6 @@ impl Default for DdpgConfig {
             action_penalty: 0.1,
             cloning_weight: 2.0,
             polyak_keep: 0.95,
-            averaged_keep: 0.999,
             actor_learning_rate: 1e-3,
             critic_learning_rate: 1e-3,
             batch_size: 256,
@@ -66,12 +63,6 @@ impl DdpgConfig {
                 "ddpg.polyak_keep",
                 self.polyak_keep,
                 (0.0..=1.0).contains(&self.polyak_keep),
-                "a number in [0, 1]",
-            ),
-            (
-                "ddpg.averaged_keep",
-                self.averaged_keep,
-                (0.0..=1.0).contains(&self.averaged_keep),
                 "a number in [0, 1]",
             ),
             (

@@ -41,12 +41,6 @@ impl Ddpg {
         &self.actor.target
     }
 
-    /// The slow average of the actor, flat.
-    #[must_use]
-    pub fn averaged_actor(&self) -> &[f32] {
-        &self.averaged_actor
-    }
-
     /// The critic that is being updated, flat.
     #[must_use]
     pub fn critic(&self) -> &[f32] {
@@ -65,14 +59,13 @@ impl Ddpg {
         [&self.actor_half.step.gradient, &self.critic_half.step.gradient]
     }
 
-    /// Starts all networks, online, target and averaged, from a policy's. Meant for a learner that has made no update.
+    /// Starts all networks, online and target, from a policy's. Meant for a learner that has made no update.
     ///
     /// # Panics
     /// When the policy's networks have other sizes.
     pub fn start_from(&mut self, policy: &Policy) {
         self.actor.online.copy_from_slice(&policy.actor);
         self.actor.target.copy_from_slice(&policy.actor);
-        self.averaged_actor.copy_from_slice(&policy.actor);
         self.critic.online.copy_from_slice(&policy.critic);
         self.critic.target.copy_from_slice(&policy.critic);
     }
@@ -80,13 +73,12 @@ impl Ddpg {
     /// Every vector that the next update depends on, by name, in a fixed order. With [`Ddpg::n_updates`] it is the
     /// whole state.
     #[must_use]
-    pub fn state(&self) -> [(&'static str, &[f32]); 9] {
+    pub fn state(&self) -> [(&'static str, &[f32]); 8] {
         let [actor_first, actor_second] = self.actor_half.step.adam.moments();
         let [critic_first, critic_second] = self.critic_half.step.adam.moments();
         [
             ("actor.online", &self.actor.online),
             ("actor.target", &self.actor.target),
-            ("actor.averaged", &self.averaged_actor),
             ("actor.adam.first", actor_first),
             ("actor.adam.second", actor_second),
             ("critic.online", &self.critic.online),
@@ -105,7 +97,7 @@ impl Ddpg {
         stored: &[(String, Vec<f32>)],
         n_updates: u64,
     ) -> Result<(), DdpgError> {
-        let mut vectors: [&[f32]; 9] = [&[]; 9];
+        let mut vectors: [&[f32]; 8] = [&[]; 8];
         for ((name, now), vector) in self.state().into_iter().zip(&mut vectors) {
             let found = stored
                 .iter()
@@ -121,7 +113,6 @@ impl Ddpg {
         let [
             actor,
             target_actor,
-            averaged_actor,
             actor_first,
             actor_second,
             critic,
@@ -131,7 +122,6 @@ impl Ddpg {
         ] = vectors;
         self.actor.online.copy_from_slice(actor);
         self.actor.target.copy_from_slice(target_actor);
-        self.averaged_actor.copy_from_slice(averaged_actor);
         self.actor_half.step.adam.restore(n_updates, [actor_first, actor_second]);
         self.critic.online.copy_from_slice(critic);
         self.critic.target.copy_from_slice(target_critic);

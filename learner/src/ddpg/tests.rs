@@ -186,19 +186,6 @@ fn polyak_averaging_moves_only_the_targets() {
 }
 
 #[test]
-fn the_averaged_actor_follows_more_slowly() {
-    let change = |config: &mut DdpgConfig| config.averaged_keep = 0.75;
-    let mut ddpg = Ddpg::new(small(change), LAYOUT, Rewards::sparse(1), 1);
-    let first = ddpg.actor().to_vec();
-    assert_eq!(ddpg.averaged_actor(), first);
-    ddpg.update(&random_batch(1, 5, 0)).unwrap();
-    ddpg.polyak();
-    for ((averaged, old), online) in ddpg.averaged_actor().iter().zip(&first).zip(ddpg.actor()) {
-        assert!((averaged - (0.75 * old + 0.25 * online)).abs() < 1e-6);
-    }
-}
-
-#[test]
 fn targets_reach_as_low_as_the_lowest_reward_goes_on_for_ever() {
     assert_eq!(super::critic_target(0.5, -1.0, -1.0, -9.0), -2.0);
     assert_eq!(super::critic_target(0.5, -3.0, -1.0, -9.0), -5.5);

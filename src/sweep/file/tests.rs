@@ -98,10 +98,10 @@ fn every_sweep_that_ships_is_valid() {
         })
         .collect();
     let expected = [
-        ("sweep-recipe", 26),
-        ("sweep-recipe-long", 12),
-        ("sweep-recipe-starts", 4),
-        ("sweep-recipe-teachers", 10),
+        ("sweep-recipe", 24),
+        ("sweep-recipe-long", 10),
+        ("sweep-recipe-starts", 6),
+        ("sweep-recipe-teachers", 12),
         ("sweep-small", 8),
         ("sweep-students", 6),
         ("sweep-table2", 72),
