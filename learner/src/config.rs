@@ -242,7 +242,7 @@ impl RunConfig {
                 seed: 240_240,
                 recorded_episodes: 2,
             },
-            stop: stop(recipe),
+            stop: stop(recipe, task, n_arms),
             checkpoint: CheckpointConfig { every_rounds: 50, keep: 2 },
         }
     }
@@ -473,10 +473,11 @@ const fn rounds(recipe: Recipe) -> RoundsConfig {
 }
 
 /// Where a run ends: the paper's recipe by the clock, because it has no end in sight on two cores.
-const fn stop(recipe: Recipe) -> StopConfig {
-    let max_env_steps = match recipe {
-        Recipe::Paper => 0,
-        Recipe::Tandem => 200_000,
+const fn stop(recipe: Recipe, task: Task, n_arms: usize) -> StopConfig {
+    let max_env_steps = match (recipe, task, n_arms) {
+        (Recipe::Paper, ..) => 0,
+        (Recipe::Tandem, Task::Push, 2) => 300_000,
+        (Recipe::Tandem, ..) => 200_000,
     };
     let max_minutes = if max_env_steps == 0 { 30.0 } else { 0.0 };
     StopConfig { until_success: 0.0, max_env_steps, max_minutes }

@@ -78,9 +78,9 @@ fn minutes_that_are_given_take_the_place_of_the_recipes_steps() {
         let stop = resolved(settings).expect("valid").stop;
         (stop.max_env_steps, stop.max_minutes)
     };
-    assert_eq!(limits(&[]), (200_000, 0.0));
+    assert_eq!(limits(&[]), (300_000, 0.0));
     assert_eq!(limits(&["stop.max_minutes=5"]), (0, 5.0));
-    assert_eq!(limits(&["stop.max_minutes=0"]), (200_000, 0.0));
+    assert_eq!(limits(&["stop.max_minutes=0"]), (300_000, 0.0));
     assert_eq!(limits(&["stop.max_minutes=5", "stop.max_env_steps=100"]), (100, 5.0));
 }
 
