@@ -289,6 +289,15 @@ impl RunConfig {
             .max(1)
     }
 
+    /// Whether round `round`, from 0, lies in the last `ddpg.cooldown_share` of the run's environment steps. A run
+    /// whose end is not given in environment steps never cools down.
+    #[must_use]
+    pub fn is_cooldown(&self, round: u64) -> bool {
+        let max = self.stop.max_env_steps;
+        let first = (1.0 - f64::from(self.ddpg.cooldown_share)) * max as f64;
+        max > 0 && (round * self.env_steps_per_round()) as f64 >= first
+    }
+
     /// Rounds between two evaluations, at least one.
     #[must_use]
     pub fn rounds_per_evaluation(&self) -> u64 {
@@ -476,8 +485,8 @@ const fn rounds(recipe: Recipe) -> RoundsConfig {
 const fn stop(recipe: Recipe, task: Task, n_arms: usize) -> StopConfig {
     let max_env_steps = match (recipe, task, n_arms) {
         (Recipe::Paper, ..) => 0,
-        (Recipe::Tandem, Task::Push, 2) => 300_000,
-        (Recipe::Tandem, ..) => 200_000,
+        (Recipe::Tandem, Task::Push, 1) => 200_000,
+        (Recipe::Tandem, ..) => 300_000,
     };
     let max_minutes = if max_env_steps == 0 { 30.0 } else { 0.0 };
     StopConfig { until_success: 0.0, max_env_steps, max_minutes }
@@ -516,6 +525,7 @@ fn ddpg(recipe: Recipe, n_arms: usize) -> DdpgConfig {
         discount: if tandem { 0.95 } else { 0.98 },
         action_penalty: if tandem { 0.1 } else { 1.0 },
         cloning_weight: if tandem && n_arms > 1 { 2.0 } else { 0.0 },
+        cooldown_share: if tandem { 0.2 } else { 0.0 },
         ..DdpgConfig::default()
     }
 }
@@ -540,6 +550,18 @@ mod tests {
     fn the_papers_round_has_forty_updates() {
         let paper = RunConfig::defaults(Recipe::Paper, Task::Push, 2);
         assert_eq!((paper.episodes_per_round(), paper.updates_per_round()), (32, 40));
+    }
+
+    #[test]
+    fn a_run_cools_down_over_its_last_fifth_if_it_has_an_end() {
+        let mut config = RunConfig::defaults(Recipe::Tandem, Task::Push, 2);
+        config.stop.max_env_steps = 10_000;
+        let first = (0..100).find(|round| config.is_cooldown(*round));
+        assert_eq!((config.env_steps_per_round(), first), (800, Some(10)), "8,000 of 10,000");
+        config.ddpg.cooldown_share = 0.0;
+        assert!((0..=12).all(|round| !config.is_cooldown(round)), "no share of it");
+        config.stop.max_env_steps = 0;
+        assert!((0..100).all(|round| !config.is_cooldown(round)), "without an end");
     }
 
     #[test]

@@ -163,6 +163,14 @@ impl Ddpg {
         join(*n_threads, || move_target(critic), || move_target(actor));
     }
 
+    /// Whether the next updates are made at the cooldown's learning rate.
+    pub fn set_cooldown(&mut self, is_cooldown: bool) {
+        let Self { config, actor_half, critic_half, .. } = self;
+        let rate = |usual| if is_cooldown { config.cooldown_learning_rate } else { usual };
+        actor_half.step.adam.set_learning_rate(rate(config.actor_learning_rate));
+        critic_half.step.adam.set_learning_rate(rate(config.critic_learning_rate));
+    }
+
     /// Whether the two halves of an update run one after the other (1) or side by side (2); the bits are the same.
     pub const fn set_threads(&mut self, n_threads: usize) {
         self.n_threads = n_threads;

@@ -205,6 +205,7 @@ impl Trainer {
             observation: self.observation_normalizer.snapshot(),
             goal: self.goal_normalizer.snapshot(),
         };
+        self.ddpg.set_cooldown(self.config.is_cooldown(self.counters.round));
         let n_updates = self.config.updates_per_round();
         let mut sums = RoundFigures::default();
         for update in 1..=n_updates {

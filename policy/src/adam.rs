@@ -55,6 +55,11 @@ impl Adam {
         });
     }
 
+    /// Goes on with another learning rate; the moments stay.
+    pub const fn set_learning_rate(&mut self, learning_rate: f32) {
+        self.learning_rate = learning_rate;
+    }
+
     /// How many steps were taken.
     #[must_use]
     pub const fn n_steps(&self) -> u64 {

@@ -18,6 +18,11 @@ pub struct DdpgConfig {
     pub actor_learning_rate: f32,
     /// Adam's step size for the critic, above 0 (HER reference implementation: 0.001).
     pub critic_learning_rate: f32,
+    /// The last share of a run's `stop.max_env_steps`, in [0, 1], over which both networks learn at
+    /// `cooldown_learning_rate` (paper: 0).
+    pub cooldown_share: f32,
+    /// Adam's step size for both networks over that share, above 0.
+    pub cooldown_learning_rate: f32,
     /// Transitions per update (paper, section 4.1: 256).
     pub batch_size: usize,
     /// Units of each hidden layer of both networks (paper, section 4.1: 256).
@@ -35,6 +40,8 @@ impl Default for DdpgConfig {
             polyak_keep: 0.95,
             actor_learning_rate: 1e-3,
             critic_learning_rate: 1e-3,
+            cooldown_share: 0.2,
+            cooldown_learning_rate: 2e-4,
             batch_size: 256,
             n_hidden: 256,
             n_hidden_layers: 4,
@@ -49,6 +56,7 @@ impl DdpgConfig {
     /// Names the first setting that cannot be used, its value and what it may be.
     pub fn check(&self) -> Result<(), (&'static str, String, &'static str)> {
         let weight = |weight: f32| weight >= 0.0 && weight.is_finite();
+        let share = |share: f32| (0.0..=1.0).contains(&share);
         let rate = |rate: f32| rate > 0.0 && rate <= 1.0;
         let numbers = [
             (
@@ -59,11 +67,18 @@ impl DdpgConfig {
             ),
             ("ddpg.action_penalty", self.action_penalty, weight(self.action_penalty), "0 or more"),
             ("ddpg.cloning_weight", self.cloning_weight, weight(self.cloning_weight), "0 or more"),
+            ("ddpg.polyak_keep", self.polyak_keep, share(self.polyak_keep), "a number in [0, 1]"),
             (
-                "ddpg.polyak_keep",
-                self.polyak_keep,
-                (0.0..=1.0).contains(&self.polyak_keep),
+                "ddpg.cooldown_share",
+                self.cooldown_share,
+                share(self.cooldown_share),
                 "a number in [0, 1]",
+            ),
+            (
+                "ddpg.cooldown_learning_rate",
+                self.cooldown_learning_rate,
+                rate(self.cooldown_learning_rate),
+                "above 0, at most 1",
             ),
             (
                 "ddpg.actor_learning_rate",

@@ -211,6 +211,24 @@ fn a_restored_learner_goes_on_alike() {
 }
 
 #[test]
+fn a_cooldown_changes_the_learning_rate_and_nothing_else() {
+    let batch = random_batch(2, 5, 0);
+    let cooled = |usual: f32, is_cooldown| {
+        let config = small(|config| {
+            config.actor_learning_rate = usual;
+            config.critic_learning_rate = usual;
+            config.cooldown_learning_rate = 1e-4;
+        });
+        let mut ddpg = Ddpg::new(config, LAYOUT, Rewards::sparse(2), 1);
+        ddpg.set_cooldown(is_cooldown);
+        ddpg.update(&batch).unwrap();
+        ddpg.state().map(|(_, vector)| vector.to_vec())
+    };
+    assert_eq!(cooled(1e-3, true), cooled(1e-4, false));
+    assert_ne!(cooled(1e-3, false), cooled(1e-4, false));
+}
+
+#[test]
 fn a_state_that_does_not_fit_is_refused_and_changes_nothing() {
     let mut ddpg = Ddpg::new(small(|_| {}), LAYOUT, Rewards::sparse(1), 1);
     let untouched = ddpg.clone();
@@ -249,6 +267,8 @@ fn settings_out_of_range_are_named() {
     check(|config| config.cloning_weight = -1.0, "ddpg.cloning_weight");
     check(|config| config.action_penalty = f32::INFINITY, "ddpg.action_penalty");
     check(|config| config.actor_learning_rate = 0.0, "ddpg.actor_learning_rate");
+    check(|config| config.cooldown_share = 1.5, "ddpg.cooldown_share");
+    check(|config| config.cooldown_learning_rate = f32::NAN, "ddpg.cooldown_learning_rate");
     check(|config| config.batch_size = 0, "ddpg.batch_size");
     check(|config| config.n_hidden_layers = 0, "ddpg.n_hidden_layers");
 }
