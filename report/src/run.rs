@@ -64,10 +64,12 @@ impl Run {
         Ok(Self { name, rows: read_rows(path, warnings)?, ..Self::default() })
     }
 
-    /// The evaluation with the highest success; of equals the first.
+    /// The evaluation of the policy that the run kept as its best; where none says so, the one with the highest success,
+    /// of equals the first.
     #[must_use]
     pub fn best(&self) -> Option<&MetricsRow> {
-        self.rows.iter().rev().max_by(|a, b| a.success.total_cmp(&b.success))
+        let highest = || self.rows.iter().rev().max_by(|a, b| a.success.total_cmp(&b.success));
+        self.rows.iter().rfind(|row| row.best).or_else(highest)
     }
 
     /// The last evaluation.

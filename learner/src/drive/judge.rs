@@ -73,7 +73,9 @@ impl Drive<'_> {
         let mut row = self.row(&pending);
         let outcomes: Vec<EpisodeOutcome> = episodes.iter().map(EpisodeOutcome::of).collect();
         judge_into(&mut row, &EvaluationSummary::of(&outcomes));
-        row.best = self.records.judged().best_row().is_none_or(|best| is_better(&row, best));
+        let is_cooled = row.round > 0 && self.config.run.is_cooldown(row.round - 1);
+        let best = self.records.judged().best_row();
+        row.best = best.is_none_or(|best| is_better(&row, best, is_cooled));
         EvaluationFinished {
             round: row.round,
             env_steps: row.env_steps,
@@ -169,8 +171,35 @@ fn judge_into(row: &mut MetricsRow, summary: &EvaluationSummary) {
     row.mean_return = summary.mean_return;
 }
 
-/// Whether an evaluation beats another: more success, or as much with fewer contacts.
-fn is_better(row: &MetricsRow, than: &MetricsRow) -> bool {
+/// Whether an evaluation beats an earlier one: more success, or as much with fewer contacts. In the cooldown the policy
+/// gets better by less than 240 goals can tell, so there the later wins unless their intervals lie apart.
+fn is_better(row: &MetricsRow, than: &MetricsRow, is_cooled: bool) -> bool {
+    if is_cooled && row.success_high >= than.success_low {
+        return true;
+    }
     row.success > than.success
         || (row.success >= than.success && row.collision_rate < than.collision_rate)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_later_of_two_alike_is_kept_in_the_cooldown_and_only_there() {
+        let row = |success, [success_low, success_high]: [f64; 2], collision_rate| MetricsRow {
+            success,
+            success_low,
+            success_high,
+            collision_rate,
+            ..MetricsRow::default()
+        };
+        let lucky = row(1.0, [0.984, 1.0], 0.02);
+        let alike = row(0.983, [0.958, 0.994], 0.02);
+        let worse = row(0.9, [0.856, 0.932], 0.0);
+        assert!(is_better(&alike, &lucky, true));
+        assert!(!is_better(&alike, &lucky, false));
+        assert!(!is_better(&worse, &lucky, true));
+        assert!(is_better(&row(1.0, [0.984, 1.0], 0.01), &lucky, false), "fewer contacts");
+    }
 }
