@@ -99,6 +99,7 @@ fn every_sweep_that_ships_is_valid() {
         .collect();
     let expected = [
         ("sweep-recipe", 24),
+        ("sweep-recipe-cooldown", 2),
         ("sweep-recipe-long", 10),
         ("sweep-recipe-starts", 6),
         ("sweep-recipe-teachers", 12),
