@@ -30,7 +30,7 @@ use seeds::{complaints, for_seeds, seeds_asked_for};
 
 /// Strategy, budget, share of advised episodes and lag of the runs that are simulated. All budgets run out.
 const RUNS: [(&str, u64, f64, u32); 3] =
-    [("ea", 700, 1.0, 0), ("eamc:0.1", 500, 1.0, 1), ("mc-q:0.1", 180, 0.5, 1)];
+    [("ea", 700, 1.0, 0), ("eamc:0.1", 500, 1.0, 1), ("mc-q:0.1", 150, 0.5, 1)];
 /// Rounds of a run.
 const N_ROUNDS: u64 = 5;
 /// Simulated time within which most of what goes wrong begins: about as long as a calm run takes on a fast network.
