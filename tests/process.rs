@@ -10,7 +10,7 @@ use serde_json::Value;
 use tempfile::TempDir;
 
 /// A small advised run of 16 rounds whose budget runs out on the way.
-const SMALL: [&str; 14] = [
+const SMALL: [&str; 16] = [
     "--max-env-steps",
     "12800",
     "--set",
@@ -25,6 +25,8 @@ const SMALL: [&str; 14] = [
     "checkpoint.every_rounds=3",
     "--set",
     "advice.budget=1500",
+    "--set",
+    "world.substeps=10",
 ];
 
 fn tandem(args: &[&str], out: &Path) -> Command {
