@@ -6,6 +6,7 @@ use std::path::Path;
 
 use anyhow::Context as _;
 use tandem_learner::{AfterTheEnd, Beside, Error as LearnerError, RunConfig};
+use tandem_net::{Capacity, Incoming};
 use tandem_telemetry::logging::{LevelFilter, LogConfig};
 use tokio::net::TcpListener;
 use tokio::runtime::{Builder, Runtime};
@@ -152,9 +153,10 @@ pub(crate) fn shutdown(exit_with_stdin: bool) -> Result<CancellationToken, Faile
         .or_exit(Exit::TryAgain, || "cannot watch for signals".to_owned())
 }
 
-/// Binds and says where, on one line of standard output.
+/// Binds and says where, on one line of standard output. As many connections are kept as the process may have open files.
 #[expect(clippy::print_stdout, reason = "the line that tells others the address")]
-pub(crate) async fn listen(args: &ListenArgs) -> Result<TcpListener, Failed> {
+pub(crate) async fn listen(args: &ListenArgs) -> Result<Incoming, Failed> {
+    let capacity = Capacity::for_open_files(descriptors::raise());
     let bind = async {
         let listener = TcpListener::bind(args.listen).await?;
         let address: SocketAddr = listener.local_addr()?;
@@ -163,7 +165,7 @@ pub(crate) async fn listen(args: &ListenArgs) -> Result<TcpListener, Failed> {
     let (listener, address) =
         bind.await.or_exit(Exit::TryAgain, || format!("cannot listen on {}", args.listen))?;
     println!("listening on {address}");
-    Ok(listener)
+    Ok(Incoming::from(listener).with_capacity(capacity))
 }
 
 fn teacher_failed(error: tandem_teacher::Error) -> Failed {
