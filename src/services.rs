@@ -193,16 +193,18 @@ fn worker_failed(error: tandem_worker::Error) -> Failed {
         }
     };
     let error = anyhow::Error::from(error);
-    match wrong_token(&error) {
+    match misdirected(&error) {
         Some(told) => Failed::usage(format!("{error}: {told}")),
         None => Failed::new(exit, error),
     }
 }
 
-/// What to do when a peer wants another token, if that is what went wrong.
-fn wrong_token(error: &anyhow::Error) -> Option<&str> {
+/// What to do when a peer wants another token or is another service, if that is what went wrong.
+fn misdirected(error: &anyhow::Error) -> Option<&str> {
+    use tonic::Code;
     let mut statuses = error.chain().filter_map(|cause| cause.downcast_ref::<tonic::Status>());
-    let status = statuses.find(|status| status.code() == tonic::Code::Unauthenticated);
+    let is_final = |code| matches!(code, Code::Unauthenticated | Code::Unimplemented);
+    let status = statuses.find(|status| is_final(status.code()));
     status.map(tonic::Status::message)
 }
 

@@ -8,6 +8,7 @@ mod access;
 mod admission;
 mod connection;
 mod dial;
+mod elsewhere;
 mod gate;
 mod health;
 mod heard;
