@@ -13,6 +13,15 @@ fn main() -> Result<(), Box<dyn Error>> {
     )?;
     let out = PathBuf::from(std::env::var_os("OUT_DIR").ok_or("cargo sets OUT_DIR")?);
     std::fs::write(out.join("tandem_descriptor.bin"), files.encode_to_vec())?;
-    tonic_prost_build::configure().compile_fds(files)?;
+    tonic_prost_build::configure().build_server(false).compile_fds(files.clone())?;
+    // Servers refuse requests that they cannot decode otherwise than clients do answers, so their codec is another one.
+    let servers = out.join("servers");
+    std::fs::create_dir_all(&servers)?;
+    tonic_prost_build::configure()
+        .build_client(false)
+        .codec_path("crate::codec::RequestCodec")
+        .extern_path(".tandem.v1", "crate::pb")
+        .out_dir(servers)
+        .compile_fds(files)?;
     Ok(())
 }

@@ -6,6 +6,7 @@ use std::path::Path;
 
 use anyhow::Context as _;
 use tandem_learner::{AfterTheEnd, Beside, Error as LearnerError, RunConfig};
+use tandem_net::{Capacity, Incoming};
 use tandem_telemetry::logging::{LevelFilter, LogConfig};
 use tokio::net::TcpListener;
 use tokio::runtime::{Builder, Runtime};
@@ -152,9 +153,10 @@ pub(crate) fn shutdown(exit_with_stdin: bool) -> Result<CancellationToken, Faile
         .or_exit(Exit::TryAgain, || "cannot watch for signals".to_owned())
 }
 
-/// Binds and says where, on one line of standard output.
+/// Binds and says where, on one line of standard output. As many connections are kept as the process may have open files.
 #[expect(clippy::print_stdout, reason = "the line that tells others the address")]
-pub(crate) async fn listen(args: &ListenArgs) -> Result<TcpListener, Failed> {
+pub(crate) async fn listen(args: &ListenArgs) -> Result<Incoming, Failed> {
+    let capacity = Capacity::for_open_files(descriptors::raise());
     let bind = async {
         let listener = TcpListener::bind(args.listen).await?;
         let address: SocketAddr = listener.local_addr()?;
@@ -163,7 +165,7 @@ pub(crate) async fn listen(args: &ListenArgs) -> Result<TcpListener, Failed> {
     let (listener, address) =
         bind.await.or_exit(Exit::TryAgain, || format!("cannot listen on {}", args.listen))?;
     println!("listening on {address}");
-    Ok(listener)
+    Ok(Incoming::from(listener).with_capacity(capacity))
 }
 
 fn teacher_failed(error: tandem_teacher::Error) -> Failed {
@@ -191,16 +193,18 @@ fn worker_failed(error: tandem_worker::Error) -> Failed {
         }
     };
     let error = anyhow::Error::from(error);
-    match wrong_token(&error) {
+    match misdirected(&error) {
         Some(told) => Failed::usage(format!("{error}: {told}")),
         None => Failed::new(exit, error),
     }
 }
 
-/// What to do when a peer wants another token, if that is what went wrong.
-fn wrong_token(error: &anyhow::Error) -> Option<&str> {
+/// What to do when a peer wants another token or is another service, if that is what went wrong.
+fn misdirected(error: &anyhow::Error) -> Option<&str> {
+    use tonic::Code;
     let mut statuses = error.chain().filter_map(|cause| cause.downcast_ref::<tonic::Status>());
-    let status = statuses.find(|status| status.code() == tonic::Code::Unauthenticated);
+    let is_final = |code| matches!(code, Code::Unauthenticated | Code::Unimplemented);
+    let status = statuses.find(|status| is_final(status.code()));
     status.map(tonic::Status::message)
 }
 

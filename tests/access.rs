@@ -235,6 +235,29 @@ fn learners_and_workers_with_a_wrong_token_end_and_say_so() {
 }
 
 #[test]
+fn a_command_that_is_given_the_address_of_another_service_ends_and_says_which_one_it_is() {
+    let place = Place::new();
+    let teacher = place.serve("teacher", &teacher(&[]));
+    let learner = place.serve("learner", &place.learner(&["--teacher", &teacher.address]));
+    let (teacher, learner) = (teacher.address.as_str(), learner.address.as_str());
+    let command = |args: &[&str]| args.iter().copied().map(str::to_owned).collect::<Vec<_>>();
+    let is_teacher = format!("the service at {teacher} is a teacher, not a ");
+    let is_learner = format!("the service at {learner} is a learner, not a ");
+    for (command, expected) in [
+        (command(&["worker", "--connect", teacher, "--teacher", learner]), &is_teacher),
+        (command(&["worker", "--connect", learner, "--teacher", learner]), &is_learner),
+        (place.learner(&["--teacher", learner]), &is_learner),
+        (command(&["status", teacher]), &is_teacher),
+        (command(&["status", teacher, "--watch"]), &is_teacher),
+        (command(&["bridge", "stop", "--connect", teacher]), &is_teacher),
+        (command(&["bridge", "reset", "--connect", learner]), &is_learner),
+    ] {
+        let line = fails_with(64, place.run(&command));
+        assert!(line.contains(expected), "{command:?}: {line}");
+    }
+}
+
+#[test]
 fn who_speaks_otherwise_says_what_to_do_and_goes_on_asking() {
     let place = Place::new();
     let plain = place.serve("plain", &teacher(&[]));

@@ -44,6 +44,9 @@ async fn soon<T>(what: &str, work: impl Future<Output = T>) -> T {
     ended.expect("checked")
 }
 
+/// Bodies that are whole frames and no message of any type.
+const UNDECODABLE: [&str; 2] = ["a tag that cannot be", "a number without end"];
+
 /// Bodies of a request, and whether an answer without an error would be right.
 fn hostile_bodies() -> Vec<(String, Vec<u8>, bool)> {
     let mut bodies = vec![
@@ -81,6 +84,12 @@ async fn attack(address: SocketAddr, service: &str) {
                 || matches!(answer, Answer::Status(code, _) if code != Code::Ok);
             assert!(refused || may_be_fine, "{what}: {answer:?}");
             assert!(!matches!(&answer, Answer::Status(Code::Unknown, _)), "{what}: {answer:?}");
+            if UNDECODABLE.contains(&name.as_str()) {
+                let Answer::Status(Code::InvalidArgument, told) = &answer else {
+                    panic!("{what} is the client's mistake: {answer:?}")
+                };
+                assert!(told.contains("the request is malformed: "), "{what}: {told}");
+            }
         }
         soon("a call that never ends", wire::endless(address, &rpc.path)).await;
     }

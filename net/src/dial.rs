@@ -15,8 +15,8 @@ use tonic::transport::{Certificate, ClientTlsConfig, Endpoint};
 use tower::ServiceExt as _;
 
 use crate::access::Token;
+use crate::connection::Connection;
 use crate::heard::{Heard, Listening};
-use crate::incoming::Connection;
 use crate::link::{Link, Peer};
 use crate::tls::{self, TlsError};
 

@@ -9,13 +9,15 @@ use tonic::body::Body;
 use tonic::server::NamedService;
 use tonic::service::Interceptor;
 use tonic::service::interceptor::InterceptedService;
-use tonic::transport::server::Router;
+use tonic::transport::server::Router as TonicRouter;
 use tonic::transport::{Identity, Server, ServerTlsConfig};
 use tonic::{Request, Status};
 use tonic_health::ServingStatus;
 use tower::Service;
+use tower::layer::util::{Identity as NoLayer, Stack};
 
 use crate::access::{AccessError, Token, is_exposed};
+use crate::connection::{Caller, Noting};
 use crate::prepared::Sending;
 use crate::tls::{self, TlsError};
 
@@ -36,6 +38,9 @@ pub enum GateError {
     #[error("the certificate or its key cannot be used")]
     Tls(#[source] tonic::transport::Error),
 }
+
+/// A service with what is offered beside it, ready to be served to what is [`Incoming`](crate::Incoming).
+pub type Router = TonicRouter<Stack<Noting, NoLayer>>;
 
 /// Who may call a service, and how.
 #[derive(Clone, Default)]
@@ -115,6 +120,7 @@ impl Gate {
             server = server.tls_config(tls).map_err(GateError::Tls)?;
         }
         Ok(server
+            .layer(Noting)
             .add_service(InterceptedService::new(Sending(service), self.guard()))
             .add_service(health)
             .add_service(InterceptedService::new(reflection().build_v1()?, self.guard()))
@@ -130,11 +136,19 @@ pub struct Guard {
 
 impl Interceptor for Guard {
     fn call(&mut self, request: Request<()>) -> Result<Request<()>, Status> {
-        let Some(token) = &self.token else { return Ok(request) };
-        match request.metadata().get("authorization") {
-            Some(shown) if token.is_shown_by(shown.as_bytes()) => Ok(request),
-            Some(_) => Err(Status::unauthenticated("the token is not this service's")),
-            None => Err(Status::unauthenticated("a token is needed: authorization: Bearer TOKEN")),
+        if let Some(token) = &self.token {
+            match request.metadata().get("authorization") {
+                Some(shown) if token.is_shown_by(shown.as_bytes()) => {}
+                Some(_) => return Err(Status::unauthenticated("the token is not this service's")),
+                None => {
+                    let message = "a token is needed: authorization: Bearer TOKEN";
+                    return Err(Status::unauthenticated(message));
+                }
+            }
         }
+        if let Some(caller) = request.extensions().get::<Caller>() {
+            caller.authenticated();
+        }
+        Ok(request)
     }
 }

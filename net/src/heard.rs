@@ -8,7 +8,7 @@ use std::task::{Context, Poll, ready};
 
 use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
 
-use crate::incoming::Connection;
+use crate::connection::Connection;
 
 /// First bytes of TLS records that a service may begin with: an alert, a handshake.
 const TLS_RECORDS: [u16; 2] = [0x15, 0x16];

@@ -1,187 +1,94 @@
 //! The connections that reach a service.
 
 use std::fmt;
+use std::future::Future as _;
 use std::io;
 use std::pin::Pin;
-use std::task::{Context, Poll};
+use std::sync::Arc;
+use std::task::{Context, Poll, ready};
 use std::time::Duration;
 
-use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
 use tokio::net::TcpListener;
-use tokio::sync::watch;
-use tokio::time::Sleep;
-use tokio_stream::{Stream, StreamExt as _};
-use tonic::Extensions;
-use tonic::transport::server::{Connected, TcpIncoming};
+use tokio::time::{Instant, Sleep};
+use tokio_stream::Stream;
 
-/// How long a client may take to say its first word.
-const GREETING: Duration = Duration::from_secs(10);
+use crate::admission::{Admission, Capacity};
+use crate::connection::Connection;
+use crate::throttle::Throttle;
 
-/// A connection over any network.
-pub struct Connection {
-    stream: Pin<Box<dyn Duplex>>,
-    /// Dropped with the connection.
-    open: watch::Sender<()>,
+/// The pause after the system has refused to hand over a connection; doubled up to [`LONGEST_PAUSE`].
+const FIRST_PAUSE: Duration = Duration::from_millis(5);
+const LONGEST_PAUSE: Duration = Duration::from_secs(1);
+/// The time between two log lines about such refusals.
+const LOG_EVERY: Duration = Duration::from_secs(60);
+
+/// The connections that reach a service, as they come and as far as there is room.
+///
+/// A connection that makes no request within 10 s is closed. [`Capacity`] says how many are kept.
+pub struct Incoming {
+    accepted: Pin<Box<dyn Stream<Item = io::Result<Connection>> + Send>>,
+    admission: Arc<Admission>,
+    pause: Option<Pin<Box<Sleep>>>,
+    next_pause: Duration,
+    log: Throttle,
 }
-
-trait Duplex: AsyncRead + AsyncWrite + Send {}
-impl<T: AsyncRead + AsyncWrite + Send> Duplex for T {}
-
-impl Connection {
-    /// A connection over `stream`.
-    pub fn new(stream: impl AsyncRead + AsyncWrite + Send + 'static) -> Self {
-        Self { stream: Box::pin(stream), open: watch::Sender::new(()) }
-    }
-}
-
-impl fmt::Debug for Connection {
-    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
-        formatter.write_str("Connection(..)")
-    }
-}
-
-impl Connected for Connection {
-    type ConnectInfo = Hangup;
-
-    fn connect_info(&self) -> Hangup {
-        Hangup(self.open.subscribe())
-    }
-}
-
-/// Tells when a connection has ended.
-#[derive(Debug, Clone)]
-pub struct Hangup(watch::Receiver<()>);
-
-impl Hangup {
-    /// Of the connection over which a request with these extensions came; `None` when it came otherwise.
-    #[must_use]
-    pub fn of(extensions: &Extensions) -> Option<Self> {
-        extensions.get::<Self>().cloned()
-    }
-
-    /// Waits until the connection has ended, from whichever side.
-    pub async fn wait(mut self) {
-        while self.0.changed().await.is_ok() {}
-    }
-}
-
-impl AsyncRead for Connection {
-    fn poll_read(
-        mut self: Pin<&mut Self>,
-        context: &mut Context<'_>,
-        buffer: &mut ReadBuf<'_>,
-    ) -> Poll<io::Result<()>> {
-        self.stream.as_mut().poll_read(context, buffer)
-    }
-}
-
-impl AsyncWrite for Connection {
-    fn poll_write(
-        mut self: Pin<&mut Self>,
-        context: &mut Context<'_>,
-        bytes: &[u8],
-    ) -> Poll<io::Result<usize>> {
-        self.stream.as_mut().poll_write(context, bytes)
-    }
-
-    fn poll_flush(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<io::Result<()>> {
-        self.stream.as_mut().poll_flush(context)
-    }
-
-    fn poll_shutdown(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<io::Result<()>> {
-        self.stream.as_mut().poll_shutdown(context)
-    }
-
-    fn poll_write_vectored(
-        mut self: Pin<&mut Self>,
-        context: &mut Context<'_>,
-        slices: &[io::IoSlice<'_>],
-    ) -> Poll<io::Result<usize>> {
-        self.stream.as_mut().poll_write_vectored(context, slices)
-    }
-
-    fn is_write_vectored(&self) -> bool {
-        self.stream.is_write_vectored()
-    }
-}
-
-/// A connection that fails when its client says nothing at first.
-struct Greeting<S> {
-    stream: S,
-    /// `None` once the client has spoken.
-    patience: Option<Pin<Box<Sleep>>>,
-}
-
-impl<S> Greeting<S> {
-    fn await_from(stream: S) -> Self {
-        Self { stream, patience: Some(Box::pin(tokio::time::sleep(GREETING))) }
-    }
-}
-
-impl<S: AsyncRead + Unpin> AsyncRead for Greeting<S> {
-    fn poll_read(
-        mut self: Pin<&mut Self>,
-        context: &mut Context<'_>,
-        buffer: &mut ReadBuf<'_>,
-    ) -> Poll<io::Result<()>> {
-        let n_before = buffer.filled().len();
-        let read = Pin::new(&mut self.stream).poll_read(context, buffer);
-        if buffer.filled().len() > n_before {
-            self.patience = None;
-        }
-        let patience = self.patience.as_mut();
-        if patience.is_some_and(|patience| patience.as_mut().poll(context).is_ready()) {
-            let silent = io::Error::new(io::ErrorKind::TimedOut, "the client says nothing");
-            return Poll::Ready(Err(silent));
-        }
-        read
-    }
-}
-
-impl<S: AsyncWrite + Unpin> AsyncWrite for Greeting<S> {
-    fn poll_write(
-        mut self: Pin<&mut Self>,
-        context: &mut Context<'_>,
-        bytes: &[u8],
-    ) -> Poll<io::Result<usize>> {
-        Pin::new(&mut self.stream).poll_write(context, bytes)
-    }
-
-    fn poll_flush(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<io::Result<()>> {
-        Pin::new(&mut self.stream).poll_flush(context)
-    }
-
-    fn poll_shutdown(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<io::Result<()>> {
-        Pin::new(&mut self.stream).poll_shutdown(context)
-    }
-
-    fn poll_write_vectored(
-        mut self: Pin<&mut Self>,
-        context: &mut Context<'_>,
-        slices: &[io::IoSlice<'_>],
-    ) -> Poll<io::Result<usize>> {
-        Pin::new(&mut self.stream).poll_write_vectored(context, slices)
-    }
-
-    fn is_write_vectored(&self) -> bool {
-        self.stream.is_write_vectored()
-    }
-}
-
-/// The connections that reach a service, as they come.
-pub struct Incoming(Pin<Box<dyn Stream<Item = io::Result<Connection>> + Send>>);
 
 impl Incoming {
     /// Connections over any network.
     pub fn new(connections: impl Stream<Item = io::Result<Connection>> + Send + 'static) -> Self {
-        Self(Box::pin(connections))
+        Self {
+            accepted: Box::pin(connections),
+            admission: Admission::new(Capacity::default()),
+            pause: None,
+            next_pause: FIRST_PAUSE,
+            log: Throttle::default(),
+        }
     }
+
+    /// Keeps as many connections as `capacity` allows. To be called before any has come.
+    #[must_use]
+    pub fn with_capacity(mut self, capacity: Capacity) -> Self {
+        self.admission = Admission::new(capacity);
+        self
+    }
+
+    /// Waits a while before the next try: whatever the system lacks, asking at once again finds it lacking.
+    fn back_off(&mut self, error: &io::Error) {
+        self.admission.make_room();
+        if self.log.pass(Instant::now(), LOG_EVERY).is_some() {
+            let n_open = self.admission.n_open();
+            tracing::warn!(%error, n_open, "cannot accept connections, trying again");
+        }
+        self.pause = Some(Box::pin(tokio::time::sleep(self.next_pause)));
+        self.next_pause = (2 * self.next_pause).min(LONGEST_PAUSE);
+    }
+}
+
+/// Whether an error is one connection's, which ended before it was accepted.
+fn is_of_one_connection(error: &io::Error) -> bool {
+    use io::ErrorKind as E;
+    matches!(error.kind(), E::ConnectionAborted | E::ConnectionReset | E::Interrupted)
 }
 
 impl From<TcpListener> for Incoming {
     fn from(listener: TcpListener) -> Self {
-        let accepted = TcpIncoming::from(listener).with_nodelay(Some(true));
-        Self::new(accepted.map(|stream| Ok(Connection::new(Greeting::await_from(stream?)))))
+        Self::new(Accepting(listener))
+    }
+}
+
+/// The connections that reach a socket.
+struct Accepting(TcpListener);
+
+impl Stream for Accepting {
+    type Item = io::Result<Connection>;
+
+    fn poll_next(self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<Option<Self::Item>> {
+        let accepted = ready!(self.0.poll_accept(context));
+        Poll::Ready(Some(accepted.map(|(stream, peer)| {
+            // Without it the connection is slower; one that has closed already fails when it is read.
+            stream.set_nodelay(true).ok();
+            Connection::new(stream).with_peer(peer.ip())
+        })))
     }
 }
 
@@ -195,30 +102,27 @@ impl Stream for Incoming {
     type Item = io::Result<Connection>;
 
     fn poll_next(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<Option<Self::Item>> {
-        self.0.as_mut().poll_next(context)
+        loop {
+            ready!(self.admission.poll_room(context));
+            if let Some(pause) = &mut self.pause {
+                ready!(pause.as_mut().poll(context));
+                self.pause = None;
+            }
+            match ready!(self.accepted.as_mut().poll_next(context)) {
+                Some(Ok(connection)) => {
+                    self.next_pause = FIRST_PAUSE;
+                    return Poll::Ready(Some(Ok(connection.admitted_to(&self.admission))));
+                }
+                Some(Err(error)) if is_of_one_connection(&error) => {
+                    context.waker().wake_by_ref();
+                    return Poll::Pending;
+                }
+                Some(Err(error)) => self.back_off(&error),
+                None => return Poll::Ready(None),
+            }
+        }
     }
 }
 
 #[cfg(test)]
-mod tests {
-    use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
-
-    use super::*;
-
-    #[tokio::test(start_paused = true)]
-    async fn a_client_that_says_nothing_is_hung_up_on_and_one_that_spoke_is_not() {
-        let (_silent, stream) = tokio::io::duplex(16);
-        let refused = Greeting::await_from(stream).read_u8().await.unwrap_err();
-        assert_eq!(refused.kind(), io::ErrorKind::TimedOut);
-
-        let (mut client, stream) = tokio::io::duplex(16);
-        let mut greeting = Greeting::await_from(stream);
-        client.write_u8(1).await.unwrap();
-        assert_eq!(greeting.read_u8().await.unwrap(), 1);
-        let later = async {
-            tokio::time::sleep(10 * GREETING).await;
-            client.write_u8(2).await.unwrap();
-        };
-        assert_eq!(tokio::join!(greeting.read_u8(), later).0.unwrap(), 2);
-    }
-}
+mod tests;

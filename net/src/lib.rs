@@ -5,7 +5,10 @@
 //! simulated one included. [`Page`] is what a service shows to programs that speak plain HTTP. What is said over a connection is not known here.
 
 mod access;
+mod admission;
+mod connection;
 mod dial;
+mod elsewhere;
 mod gate;
 mod health;
 mod heard;
@@ -13,13 +16,16 @@ mod incoming;
 mod link;
 mod page;
 mod prepared;
+mod throttle;
 mod tls;
 
 pub use access::{AccessError, Token, TokenRefused, is_exposed};
+pub use admission::Capacity;
+pub use connection::{Caller, Connection, Hangup, Noting, NotingRequests};
 pub use dial::{Dial, DialError};
-pub use gate::{Gate, GateError, Guard};
+pub use gate::{Gate, GateError, Guard, Router};
 pub use health::{Unwell, check_health};
-pub use incoming::{Connection, Hangup, Incoming};
+pub use incoming::Incoming;
 pub use link::Link;
 pub use page::Page;
 pub use prepared::Prepared;

@@ -13,12 +13,14 @@ use tonic::transport::Channel;
 use tonic::{Code, Status};
 use tower::Service;
 
+use crate::elsewhere::{explain, is_unknown_call};
 use crate::heard::Heard;
 
 /// A connection that is made when first used, and made again whenever it is lost; it shows the token, if there is one.
 ///
 /// A call that does not reach the service, or that the service's guard sends back, fails with a status whose message
-/// names the address and what to do about it: `UNAVAILABLE`, which may pass, or `UNAUTHENTICATED`, which does not.
+/// names the address and what to do about it: `UNAVAILABLE`, which may pass, or `UNAUTHENTICATED`, which does not. So
+/// does a call that the service does not know, `UNIMPLEMENTED`: it says which service the address is.
 #[derive(Debug, Clone)]
 pub struct Link {
     channel: Channel,
@@ -59,9 +61,13 @@ impl Service<http::Request<Body>> for Link {
         if let Some(authorization) = &self.peer.authorization {
             request.headers_mut().insert(AUTHORIZATION, authorization.clone());
         }
+        let (path, probe) = (request.uri().path().to_owned(), self.channel.clone());
         let (calling, peer) = (self.channel.call(request), Arc::clone(&self.peer));
         Box::pin(async move {
             match calling.await {
+                Ok(response) if is_unknown_call(&response) => {
+                    Err(explain(&peer.address, &path, probe).await)
+                }
                 Ok(response) => peer.let_in(response),
                 Err(error) => Err(peer.unreachable(error)),
             }

@@ -7,21 +7,24 @@ use std::time::Duration;
 use http::header::{ALLOW, CONTENT_TYPE};
 use http::{HeaderValue, Method, Request, Response, StatusCode};
 use http_body_util::Full;
-use hyper::body::{Bytes, Incoming};
+use hyper::body::{Bytes, Incoming as Body};
 use hyper::server::conn::http1;
 use hyper::service::service_fn;
 use hyper_util::rt::TokioIo;
-use tokio::net::{TcpListener, TcpStream};
 use tokio::task::JoinSet;
+use tokio_stream::StreamExt as _;
+use tonic::transport::server::Connected as _;
+
+use crate::admission::Capacity;
+use crate::connection::Connection;
+use crate::incoming::Incoming;
 
 /// How long a caller may take to ask and to take the answer.
 const PATIENCE: Duration = Duration::from_secs(10);
-/// Callers that are answered at a time; further ones wait to be taken in.
+/// Callers that are answered at a time; the next one takes the place of one that has asked nothing for longest.
 const MAX_CALLERS: usize = 16;
 /// Bytes of a question that are read.
 const MAX_QUESTION_BYTES: usize = 16 << 10;
-/// Pause after the system refused to hand over a caller, as when there are too many open files.
-const PAUSE: Duration = Duration::from_millis(100);
 
 /// What stands at one path. Nobody needs a token to read it.
 #[derive(Clone)]
@@ -35,18 +38,21 @@ pub struct Page {
 }
 
 impl Page {
-    /// Answers those who come to `listener`, until it is dropped.
-    pub async fn serve(self, listener: TcpListener) {
+    /// Answers those who come, until nobody can come any more.
+    pub async fn serve(self, incoming: impl Into<Incoming>) {
+        let mut incoming = incoming.into().with_capacity(Capacity::of(MAX_CALLERS));
         let mut callers = JoinSet::new();
         loop {
             tokio::select! {
-                accepted = listener.accept(), if callers.len() < MAX_CALLERS => match accepted {
-                    Ok((caller, _)) => drop(callers.spawn(answer(self.clone(), caller))),
-                    Err(_refused) => tokio::time::sleep(PAUSE).await,
+                accepted = incoming.next() => match accepted {
+                    Some(Ok(caller)) => drop(callers.spawn(answer(self.clone(), caller))),
+                    Some(Err(_refused)) => {}
+                    None => break,
                 },
-                Some(_) = callers.join_next() => (),
+                Some(_) = callers.join_next() => {}
             }
         }
+        callers.join_all().await;
     }
 
     fn answer<B>(&self, request: &Request<B>) -> Response<Full<Bytes>> {
@@ -69,15 +75,17 @@ impl Page {
 }
 
 /// Answers one question and closes the connection.
-async fn answer(page: Page, caller: TcpStream) {
-    let service = service_fn(|request: Request<Incoming>| {
+async fn answer(page: Page, connection: Connection) {
+    let caller = connection.connect_info();
+    let service = service_fn(|request: Request<Body>| {
+        caller.requested();
         let answer = page.answer(&request);
         async move { Ok::<_, Infallible>(answer) }
     });
     let answered = http1::Builder::new()
         .keep_alive(false)
         .max_buf_size(MAX_QUESTION_BYTES)
-        .serve_connection(TokioIo::new(caller), service);
+        .serve_connection(TokioIo::new(connection), service);
     // Whoever goes away, is too slow or speaks otherwise gets nothing, and misses nothing that matters.
     drop(tokio::time::timeout(PATIENCE, answered).await);
 }
@@ -91,6 +99,7 @@ fn told(status: StatusCode, text: String) -> Response<Full<Bytes>> {
 #[cfg(test)]
 mod tests {
     use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
+    use tokio::net::{TcpListener, TcpStream};
 
     use super::*;
 
@@ -106,7 +115,7 @@ mod tests {
         let address = listener.local_addr().expect("bound");
         let serving = tokio::spawn(page.serve(listener));
         let mut silent = Vec::new();
-        for _ in 0..MAX_CALLERS - 1 {
+        for _ in 0..2 * MAX_CALLERS {
             silent.push(TcpStream::connect(address).await.expect("taken in"));
         }
         let mut answers = Vec::new();

@@ -48,7 +48,7 @@ pub(super) async fn answer<T>(
 /// What a person is told of a call that failed.
 pub(super) fn failed(status: &Status) -> Failed {
     let exit = match status.code() {
-        Code::Unauthenticated => Exit::Usage,
+        Code::Unauthenticated | Code::Unimplemented => Exit::Usage,
         Code::InvalidArgument | Code::OutOfRange => Exit::Data,
         Code::Internal => Exit::Bug,
         _ => Exit::TryAgain,

@@ -7,6 +7,8 @@ use std::time::Duration;
 use support::{Authority, Identity, OTHER, SECRET, Served, token};
 use tandem_net::{Connection, Dial, Gate, Incoming, Link, Unwell, check_health};
 use tandem_proto::pb;
+use tandem_proto::pb::bridge_client::BridgeClient;
+use tandem_proto::pb::learner_client::LearnerClient;
 use tandem_proto::pb::teacher_client::TeacherClient;
 use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
@@ -146,7 +148,7 @@ async fn nothing_of_a_call_is_read_before_its_token_is_right() {
         let outcome = caller.unary(request, path, Garbled::default()).await;
         outcome.expect_err("cannot be read").code()
     };
-    assert_eq!(open_garbled(SECRET).await, Code::Internal);
+    assert_eq!(open_garbled(SECRET).await, Code::InvalidArgument);
     assert_eq!(open_garbled(OTHER).await, Code::Unauthenticated);
     assert_eq!(served.counter.n_calls(), 0);
 }
@@ -237,6 +239,30 @@ async fn nobody_there_is_told_with_the_address() {
         describe(&Dial::default().link(&address).expect("an address")).await.expect_err("nobody");
     assert_eq!(status.code(), Code::Unavailable, "{status}");
     assert!(status.message().starts_with(&format!("{address} does not answer: ")), "{status}");
+}
+
+#[tokio::test]
+async fn a_call_to_another_kind_of_service_is_told_which_one_it_is() {
+    let served = Served::start(&Gate::default().with_token(token(SECRET))).await;
+    let address = served.address.to_string();
+    let link = Dial::default().with_token(&token(SECRET)).link(&address).expect("an address");
+    let join = LearnerClient::new(link.clone()).join(pb::JoinRequest::default()).await;
+    let execute = BridgeClient::new(link.clone()).execute(tokio_stream::empty()).await;
+    let mut caller = tonic::client::Grpc::new(link);
+    caller.ready().await.expect("ready");
+    let path = http::uri::PathAndQuery::from_static("/tandem.v1.Teacher/Guess");
+    let codec = tonic_prost::ProstCodec::<(), ()>::default();
+    let unknown = caller.unary(tonic::Request::new(()), path, codec).await;
+    for (outcome, expected) in [
+        (join.map(drop), "is a teacher, not a learner: check the address"),
+        (execute.map(drop), "is a teacher, not a bridge: check the address"),
+        (unknown.map(drop), "does not know /tandem.v1.Teacher/Guess: it is of another version"),
+    ] {
+        let status = outcome.expect_err(expected);
+        assert_eq!(status.code(), Code::Unimplemented, "{status}");
+        let message = status.message();
+        assert!(message.contains(&address) && message.ends_with(expected), "{message}");
+    }
 }
 
 #[tokio::test]

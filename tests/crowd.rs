@@ -1,0 +1,237 @@
+//! Strangers that hold as many connections to a service as it may have open files: operators and probes still get in.
+
+#![cfg(target_os = "linux")]
+
+use std::fs::{self, File};
+use std::io::{BufRead as _, BufReader, Write as _};
+use std::net::{SocketAddr, TcpStream};
+use std::path::PathBuf;
+use std::process::{Child, Command, Output, Stdio};
+use std::time::{Duration, Instant};
+
+use tempfile::TempDir;
+use tokio::runtime::Runtime;
+use tonic::transport::{Channel, Endpoint};
+use tonic::{Request, Streaming};
+
+/// The files that a service may have open.
+const MAX_FILES: usize = 256;
+/// The connections of a crowd.
+const N_STRANGERS: usize = 300;
+/// Longer than anything takes, even on a machine that is busy with other things.
+const DEADLINE: Duration = Duration::from_secs(60);
+const PAUSE: Duration = Duration::from_millis(20);
+const SECRET: &str = "the-right-token-0123";
+const PREFACE: &[u8] = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n";
+/// The settings of an HTTP/2 client that wants nothing special.
+const SETTINGS: [u8; 9] = [0, 0, 0, 4, 0, 0, 0, 0, 0];
+
+/// A service that may have [`MAX_FILES`] open files.
+struct Service {
+    child: Child,
+    address: SocketAddr,
+    directory: TempDir,
+}
+
+impl Service {
+    /// Starts `tandem ARGS` and waits until it says where it listens. `token` is a file beside it.
+    fn start(args: &[&str]) -> Self {
+        let directory = tempfile::tempdir().expect("a directory");
+        fs::write(directory.path().join("token"), SECRET).expect("writes");
+        let log = File::create(directory.path().join("log")).expect("a log");
+        let script = format!("ulimit -n {MAX_FILES}; exec \"$0\" \"$@\"");
+        let mut command = Command::new("sh");
+        command.args(["-c", &script, env!("CARGO_BIN_EXE_tandem")]).args(args);
+        command.args(["--listen", "127.0.0.1:0"]).current_dir(directory.path());
+        command.env_remove("TANDEM_TOKEN_FILE").env_remove("RUST_LOG");
+        let streams = command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(log);
+        let mut child = streams.spawn().expect("starts");
+        let mut line = String::new();
+        let mut output = BufReader::new(child.stdout.take().expect("piped"));
+        output.read_line(&mut line).expect("a line");
+        let address = line.trim().strip_prefix("listening on ").expect("an address");
+        Self { address: address.parse().expect("an address"), child, directory }
+    }
+
+    fn log(&self) -> String {
+        fs::read_to_string(self.directory.path().join("log")).expect("readable")
+    }
+
+    fn n_files(&self) -> usize {
+        let files = PathBuf::from(format!("/proc/{}/fd", self.child.id()));
+        fs::read_dir(files).expect("it lives").count()
+    }
+
+    /// The processor time that it has used, in clock ticks.
+    fn cpu_ticks(&self) -> u64 {
+        let stat = fs::read_to_string(format!("/proc/{}/stat", self.child.id()));
+        let stat = stat.expect("it lives");
+        let (_, fields) = stat.rsplit_once(") ").expect("a name in brackets");
+        let ticks = fields.split(' ').skip(11).take(2);
+        ticks.map(|ticks| ticks.parse::<u64>().expect("a number")).sum()
+    }
+
+    /// The share of a core that it uses.
+    fn cpu_share(&self) -> f64 {
+        let (before, since) = (self.cpu_ticks(), Instant::now());
+        std::thread::sleep(Duration::from_millis(500));
+        let used = (self.cpu_ticks() - before) as f64;
+        used / rustix::param::clock_ticks_per_second() as f64 / since.elapsed().as_secs_f64()
+    }
+
+    /// Waits until it has taken in as many strangers as it has room for.
+    fn wait_until_full(&self) {
+        let since = Instant::now();
+        while self.n_files() < 3 * MAX_FILES / 4 {
+            assert!(since.elapsed() < DEADLINE, "{} files: {}", self.n_files(), self.log());
+            std::thread::sleep(PAUSE);
+        }
+    }
+
+    fn run(&self, args: &[&str]) -> Output {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_tandem"));
+        command.args(args).current_dir(self.directory.path()).stdin(Stdio::null());
+        command.env_remove("TANDEM_TOKEN_FILE").env_remove("RUST_LOG");
+        command.output().expect("runs")
+    }
+
+    /// Runs a command that must succeed.
+    fn succeed(&self, args: &[&str]) {
+        let Output { status, stderr, .. } = self.run(args);
+        let told = String::from_utf8_lossy(&stderr);
+        assert!(status.success(), "{args:?}: {status}: {told}, log: {}", self.log());
+    }
+}
+
+impl Drop for Service {
+    fn drop(&mut self) {
+        drop(self.child.kill());
+        drop(self.child.wait());
+    }
+}
+
+/// Connections that are never closed by those who opened them.
+#[derive(Default)]
+struct Strangers {
+    sockets: Vec<TcpStream>,
+    channels: Vec<Channel>,
+    watches: Vec<Streaming<()>>,
+}
+
+/// What strangers do with a connection.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Habit {
+    OneByte,
+    PrefaceOnly,
+    WatchHealth,
+    AskForStatus,
+}
+
+impl Habit {
+    fn crowd(self, runtime: &Runtime, address: SocketAddr) -> Strangers {
+        let mut strangers = Strangers::default();
+        match self {
+            Self::OneByte => strangers.say(address, b"P"),
+            Self::PrefaceOnly => strangers.say(address, &[PREFACE, &SETTINGS].concat()),
+            Self::WatchHealth => runtime.block_on(strangers.watch(address)),
+            Self::AskForStatus => runtime.block_on(strangers.ask(address)),
+        }
+        strangers
+    }
+}
+
+impl Strangers {
+    fn say(&mut self, address: SocketAddr, words: &[u8]) {
+        for _ in 0..N_STRANGERS {
+            let mut socket = TcpStream::connect(address).expect("connects");
+            socket.write_all(words).expect("sent");
+            self.sockets.push(socket);
+        }
+    }
+
+    /// Watches health, which needs no token. Those who come late may be sent away.
+    async fn watch(&mut self, address: SocketAddr) {
+        let path = "/grpc.health.v1.Health/Watch".parse::<http::uri::PathAndQuery>();
+        let path = path.expect("a path");
+        for _ in 0..N_STRANGERS {
+            let Some((channel, mut caller)) = dial(address).await else { continue };
+            let codec = tonic_prost::ProstCodec::<(), ()>::default();
+            let watch = caller.server_streaming(Request::new(()), path.clone(), codec);
+            if let Ok(Ok(watch)) = tokio::time::timeout(DEADLINE, watch).await {
+                self.watches.push(watch.into_inner());
+            }
+            self.channels.push(channel);
+        }
+    }
+
+    /// Makes a call that is authenticated where no token is needed.
+    async fn ask(&mut self, address: SocketAddr) {
+        let path = "/tandem.v1.Bridge/Status".parse::<http::uri::PathAndQuery>();
+        let path = path.expect("a path");
+        for _ in 0..N_STRANGERS {
+            let Some((channel, mut caller)) = dial(address).await else { continue };
+            let codec = tonic_prost::ProstCodec::<(), ()>::default();
+            let call = caller.unary(Request::new(()), path.clone(), codec);
+            drop(tokio::time::timeout(DEADLINE, call).await);
+            self.channels.push(channel);
+        }
+    }
+}
+
+async fn dial(address: SocketAddr) -> Option<(Channel, tonic::client::Grpc<Channel>)> {
+    let endpoint = Endpoint::from_shared(format!("http://{address}")).expect("an address");
+    let channel = endpoint.connect().await.ok()?;
+    let mut caller = tonic::client::Grpc::new(channel.clone());
+    caller.ready().await.ok()?;
+    Some((channel, caller))
+}
+
+/// Fills a service with strangers of each habit in turn; meanwhile `check` must get through.
+fn crowd(service: &Service, habits: &[Habit], check: impl Fn(&Service)) {
+    let mut runtime = tokio::runtime::Builder::new_multi_thread();
+    let runtime = runtime.worker_threads(1).enable_all().build().expect("a runtime");
+    for habit in habits {
+        let strangers = habit.crowd(&runtime, service.address);
+        service.wait_until_full();
+        check(service);
+        let share = service.cpu_share();
+        assert!(share < 0.7, "{habit:?}: {share:.2} cores");
+        assert!(service.n_files() < MAX_FILES, "{habit:?}: {} files", service.n_files());
+        drop(strangers);
+    }
+    let log = service.log();
+    assert_eq!(log.matches("too many connections").count(), 1, "{log}");
+    assert!(!log.contains("cannot accept"), "{log}");
+}
+
+#[test]
+fn the_arms_can_be_stopped_while_idle_strangers_hold_all_connections_of_a_bridge() {
+    let bridge = Service::start(&["bridge", "--driver", "sim"]);
+    let address = bridge.address.to_string();
+    let habits = [Habit::OneByte, Habit::PrefaceOnly, Habit::WatchHealth, Habit::AskForStatus];
+    crowd(&bridge, &habits, |bridge| {
+        bridge.succeed(&["bridge", "stop", "--connect", &address]);
+        bridge.succeed(&["health", &address]);
+    });
+}
+
+#[test]
+fn the_arms_can_be_stopped_with_the_token_while_strangers_without_it_watch_health() {
+    let bridge = Service::start(&["bridge", "--driver", "sim", "--token-file", "token"]);
+    let address = bridge.address.to_string();
+    let habits = [Habit::WatchHealth, Habit::AskForStatus, Habit::OneByte];
+    crowd(&bridge, &habits, |bridge| {
+        bridge.succeed(&["bridge", "stop", "--connect", &address, "--token-file", "token"]);
+        bridge.succeed(&["health", &address]);
+    });
+}
+
+#[test]
+fn a_teacher_is_well_while_idle_strangers_hold_all_its_connections() {
+    let policy = concat!(env!("CARGO_MANIFEST_DIR"), "/policies/teacher-push.safetensors");
+    let teacher = Service::start(&["teacher", "--ledger", "memory", "--policy", policy]);
+    let address = teacher.address.to_string();
+    crowd(&teacher, &[Habit::OneByte, Habit::WatchHealth], |teacher| {
+        teacher.succeed(&["health", &address]);
+    });
+}
