@@ -83,7 +83,7 @@ pub struct Episode {
     pub advised_arms: Vec<u8>,
     /// Per step, what touched what, shape `[EPISODE_STEPS]`.
     pub contacts: Vec<Contacts>,
-    /// Units of the advice budget that the episode was charged.
+    /// Units of the advice budget that the episode's advised steps cost: one for each step with an advised arm.
     pub advice_charged: u32,
 }
 

@@ -5,6 +5,7 @@
 #![warn(missing_docs)]
 
 pub mod advice;
+pub mod bounds;
 pub mod episode;
 pub mod evaluation;
 pub mod layout;

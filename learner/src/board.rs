@@ -3,11 +3,16 @@
 //! Pure: time comes in as an argument. Nothing here decides a result; a slot that two workers play gives the same
 //! episodes twice and counts once.
 
+mod check;
+
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::time::Duration;
 
-use tandem_core::work::{EpisodeOrder, SlotOrder};
+use tandem_core::work::SlotOrder;
 use tandem_core::{Episode, EpisodeKind};
+
+pub use check::{SubmitError, check_count};
+use check::{check, check_allowances};
 
 /// A worker that has not been heard of for so long counts as dead: its slots go back to the queue.
 pub const SILENT_AFTER: Duration = Duration::from_secs(15);
@@ -19,6 +24,10 @@ pub const COVER_AFTER: Duration = Duration::from_secs(3);
 pub const FORGET_AFTER: Duration = Duration::from_secs(600);
 /// Workers that may be known at a time.
 pub const MAX_WORKERS: usize = 10_000;
+/// Workers that have delivered nothing yet and may be known of one connection: as many as can ask over it at a time.
+pub const MAX_UNPROVEN_PER_CONNECTION: usize = 1024;
+/// A worker that has joined and has not asked for work for so long makes room for another when there is none.
+pub const ASK_WITHIN: Duration = Duration::from_secs(1);
 
 /// The slots of the open rounds and the workers that play them.
 #[derive(Debug, Default)]
@@ -33,6 +42,12 @@ pub struct Board {
     took: Option<Duration>,
     finished: Vec<(SlotOrder, Vec<Episode>)>,
     workers: BTreeMap<u64, Worker>,
+    /// The workers that joined over each connection that is open.
+    connections: BTreeMap<u64, Connection>,
+    /// Workers that have joined and have not asked for work yet.
+    unasked: BTreeSet<u64>,
+    /// Units of advice that open episodes can claim; those that are missing can claim a unit a step.
+    allowances: BTreeMap<u64, u32>,
 }
 
 #[derive(Debug)]
@@ -40,6 +55,15 @@ struct Out {
     order: SlotOrder,
     worker: u64,
     since: Duration,
+}
+
+/// What is known of an open connection.
+#[derive(Debug, Default)]
+struct Connection {
+    /// The workers that joined over it.
+    workers: BTreeSet<u64>,
+    /// How many of them have delivered nothing yet.
+    n_unproven: usize,
 }
 
 /// What is known of a worker.
@@ -55,6 +79,8 @@ pub struct Worker {
     pub slot: Option<u64>,
     /// Whether it counts as dead.
     pub silent: bool,
+    /// The connection over which it joined, while that is open.
+    pub connection: Option<u64>,
 }
 
 /// A worker that counts as dead.
@@ -69,70 +95,127 @@ pub struct Silent {
 }
 
 /// Why a worker is not taken in.
-#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error("{MAX_WORKERS} workers are in the run, as many as there may be")]
-pub struct TooManyWorkers;
-
-/// Why a worker's episodes are not taken. Nothing of them is used.
-#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-pub enum SubmitError {
-    /// The worker must join first.
-    #[error("worker {0} is unknown here: join first")]
-    UnknownWorker(u64),
-    /// Nobody was given such a slot.
-    #[error("slot: expected one of the {n_slots} that were ordered, got {slot}")]
-    UnknownSlot {
-        /// What came.
-        slot: u64,
-        /// Slots ordered so far.
-        n_slots: u64,
-    },
-    /// More or fewer episodes than the slot has.
-    #[error("episodes: expected the {expected} of slot {slot}, got {got}")]
-    WrongCount {
-        /// The slot.
-        slot: u64,
-        /// Episodes ordered.
-        expected: usize,
-        /// Episodes that came.
-        got: usize,
-    },
-    /// An episode that was not ordered so.
-    #[error("episode {number}: {field}: expected {expected}, got {got}")]
-    WrongEpisode {
-        /// The episode's number as it came.
-        number: u64,
-        /// What of it was not ordered.
-        field: &'static str,
-        /// What was ordered.
-        expected: String,
-        /// What came.
-        got: String,
-    },
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+pub enum JoinError {
+    /// The run has [`MAX_WORKERS`], and none of them can make room.
+    #[error("{MAX_WORKERS} workers are in the run, as many as there may be")]
+    RunFull,
+    /// The connection has [`MAX_UNPROVEN_PER_CONNECTION`] that play and have delivered nothing.
+    #[error(
+        "{MAX_UNPROVEN_PER_CONNECTION} workers of this connection have delivered nothing, as many as there may be"
+    )]
+    ConnectionFull,
 }
 
 impl Board {
-    /// Takes in a worker and gives it a number.
+    /// Takes in a worker that calls over `connection` and gives it a number.
+    ///
+    /// Workers that have joined and done nothing else make room for others: first those of the same connection, when it
+    /// has too many, then those that do not ask for work, then those of the connection that has most of them.
     ///
     /// # Errors
-    /// When there are [`MAX_WORKERS`], none of them silent.
-    pub fn join(&mut self, name: String, now: Duration) -> Result<u64, TooManyWorkers> {
+    /// When there are too many workers and none of them can make room.
+    pub fn join(
+        &mut self,
+        name: String,
+        connection: Option<u64>,
+        now: Duration,
+    ) -> Result<u64, JoinError> {
+        let n_unproven = connection.map_or(0, |connection| self.n_unproven(connection));
+        if n_unproven >= MAX_UNPROVEN_PER_CONNECTION {
+            let oldest = connection.and_then(|connection| self.oldest_idle(connection));
+            self.forget(oldest.ok_or(JoinError::ConnectionFull)?);
+        }
         if self.workers.len() >= MAX_WORKERS {
-            self.forget_the_longest_silent(now)?;
+            let leaves = self.who_makes_room(n_unproven, now).ok_or(JoinError::RunFull)?;
+            self.forget(leaves);
         }
         self.next_worker += 1;
-        let worker = Worker { name, heard_at: now, n_episodes: 0, slot: None, silent: false };
+        let worker =
+            Worker { name, heard_at: now, n_episodes: 0, slot: None, silent: false, connection };
         self.workers.insert(self.next_worker, worker);
+        self.unasked.insert(self.next_worker);
+        if let Some(connection) = connection {
+            let connection = self.connections.entry(connection).or_default();
+            connection.workers.insert(self.next_worker);
+            connection.n_unproven += 1;
+        }
         Ok(self.next_worker)
     }
 
-    fn forget_the_longest_silent(&mut self, now: Duration) -> Result<(), TooManyWorkers> {
-        let longest = self.workers.iter().min_by_key(|(_, worker)| worker.heard_at);
-        let (id, _) = longest.filter(|(_, worker)| is_silent(worker, now)).ok_or(TooManyWorkers)?;
-        let id = *id;
-        self.put_back_slots_of(id);
-        self.workers.remove(&id);
-        Ok(())
+    /// Whom a full board forgets for a worker whose connection has `n_unproven` others that have delivered nothing.
+    fn who_makes_room(&self, n_unproven: usize, now: Duration) -> Option<u64> {
+        let does_not_ask = |id: &&u64| {
+            self.worker(**id)
+                .is_some_and(|worker| now.saturating_sub(worker.heard_at) >= ASK_WITHIN)
+        };
+        let longest_silent = || {
+            let longest = self.workers.iter().min_by_key(|(_, worker)| worker.heard_at);
+            longest.filter(|(_, worker)| is_silent(worker, now)).map(|(id, _)| *id)
+        };
+        let crowded = || {
+            let counted = self.connections.iter().map(|(number, it)| (it.n_unproven, *number));
+            counted.max().filter(|(n, _)| *n > n_unproven + 1).map(|(_, connection)| connection)
+        };
+        self.unasked
+            .first()
+            .filter(does_not_ask)
+            .copied()
+            .or_else(longest_silent)
+            .or_else(|| self.oldest_idle(crowded()?))
+    }
+
+    fn n_unproven(&self, connection: u64) -> usize {
+        self.connections.get(&connection).map_or(0, |connection| connection.n_unproven)
+    }
+
+    /// The oldest worker of a connection that has delivered nothing and plays nothing.
+    fn oldest_idle(&self, connection: u64) -> Option<u64> {
+        let is_idle = |worker: &Worker| worker.n_episodes == 0 && worker.slot.is_none();
+        let theirs = &self.connections.get(&connection)?.workers;
+        theirs.iter().find(|id| self.worker(**id).is_some_and(is_idle)).copied()
+    }
+
+    /// Forgets a worker; its slot goes back to the queue.
+    fn forget(&mut self, worker_id: u64) {
+        if !self.unasked.remove(&worker_id) {
+            self.put_back_slots_of(worker_id);
+        }
+        let Some(Worker { connection: Some(number), n_episodes, .. }) =
+            self.workers.remove(&worker_id)
+        else {
+            return;
+        };
+        if let Some(connection) = self.connections.get_mut(&number) {
+            connection.workers.remove(&worker_id);
+            connection.n_unproven -= usize::from(n_episodes == 0);
+            if connection.workers.is_empty() {
+                self.connections.remove(&number);
+            }
+        }
+    }
+
+    /// Notes what a worker has delivered.
+    fn note_delivery(&mut self, worker_id: u64, slot: u64, n_new: usize) {
+        self.unasked.remove(&worker_id);
+        let Some(worker) = self.workers.get_mut(&worker_id) else { return };
+        worker.slot = worker.slot.filter(|given| *given != slot);
+        let was_unproven = worker.n_episodes == 0;
+        worker.n_episodes += n_new as u64;
+        let connection = worker.connection.filter(|_| was_unproven && n_new > 0);
+        if let Some(connection) = connection.and_then(|it| self.connections.get_mut(&it)) {
+            connection.n_unproven -= 1;
+        }
+    }
+
+    /// Bounds the units of advice that episodes can claim.
+    pub fn allow(&mut self, allowances: impl IntoIterator<Item = (u64, u32)>) {
+        self.allowances.extend(allowances);
+    }
+
+    /// Lets open episodes claim a unit for each of their steps.
+    pub fn lift_allowances(&mut self) {
+        self.allowances.clear();
     }
 
     /// Numbers workers from `first` on.
@@ -159,6 +242,7 @@ impl Board {
         worker_id: u64,
         now: Duration,
     ) -> Result<Option<SlotOrder>, SubmitError> {
+        self.unasked.remove(&worker_id);
         let own = self.heard(worker_id, now)?.slot.and_then(|slot| self.out.get(&slot));
         if let Some(own) = own.filter(|out| out.worker == worker_id) {
             return Ok(Some(own.order.clone()));
@@ -263,12 +347,11 @@ impl Board {
         let ordered = self.ordered(worker_id, slot, now)?;
         let is_new = ordered.is_some();
         if let Some(order) = ordered {
-            check(order, &episodes)?;
+            let order = order.clone();
+            check(&order, &episodes)?;
+            check_allowances(&self.allowances, &order, &episodes)?;
         }
-        if let Some(worker) = self.workers.get_mut(&worker_id) {
-            worker.slot = worker.slot.filter(|given| *given != slot);
-            worker.n_episodes += if is_new { episodes.len() as u64 } else { 0 };
-        }
+        self.note_delivery(worker_id, slot, if is_new { episodes.len() } else { 0 });
         self.note_how_long(slot, now);
         let out = self.take_back(slot);
         let waiting = self.waiting.iter().position(|order| order.slot == slot);
@@ -277,8 +360,12 @@ impl Board {
         Ok(is_new)
     }
 
-    /// Puts the slots of silent workers back into the queue, in their order; gives the workers that fell silent.
+    /// Puts the slots of silent workers back into the queue, in their order; gives the workers that fell silent. Those
+    /// that never asked for work are forgotten.
     pub fn reclaim(&mut self, now: Duration) -> Vec<Silent> {
+        let never_came = |id: &&u64| self.is_silent(**id, now);
+        let never_came: Vec<u64> = self.unasked.iter().filter(never_came).copied().collect();
+        never_came.into_iter().for_each(|id| self.forget(id));
         let newly = |worker: &Worker| !worker.silent && is_silent(worker, now);
         let silent: Vec<u64> =
             self.workers.iter().filter(|(_, worker)| newly(worker)).map(|(id, _)| *id).collect();
@@ -291,8 +378,29 @@ impl Board {
                 fell_silent.push(Silent { worker_id, name: worker.name.clone(), n_slots });
             }
         }
-        self.workers.retain(|_, worker| now.saturating_sub(worker.heard_at) < FORGET_AFTER);
+        let is_gone = |worker: &Worker| now.saturating_sub(worker.heard_at) >= FORGET_AFTER;
+        let gone: Vec<u64> =
+            self.workers.iter().filter(|(_, worker)| is_gone(worker)).map(|(id, _)| *id).collect();
+        gone.into_iter().for_each(|id| self.forget(id));
         fell_silent
+    }
+
+    /// Ends what depends on a connection that has ended; gives the workers whose slots go back to the queue. A worker
+    /// that never asked for work is forgotten.
+    pub fn connection_ended(&mut self, connection: u64) -> Vec<u64> {
+        let theirs = self.connections.remove(&connection).unwrap_or_default();
+        let mut gave_back = Vec::new();
+        for worker_id in theirs.workers {
+            if let Some(worker) = self.workers.get_mut(&worker_id) {
+                worker.connection = None;
+            }
+            if self.unasked.contains(&worker_id) {
+                self.forget(worker_id);
+            } else if self.hung_up(worker_id) {
+                gave_back.push(worker_id);
+            }
+        }
+        gave_back
     }
 
     /// Puts the slot of a worker whose connection has ended back into the queue, in its place, and gives whether it had
@@ -324,11 +432,15 @@ impl Board {
 
     /// Takes out the finished episodes of `kind` played with `version`, in episode order.
     pub fn take(&mut self, kind: EpisodeKind, version: u64) -> Vec<Episode> {
-        let taken = self
-            .finished
-            .extract_if(.., |(order, _)| order.kind == kind && order.parameter_version == version);
+        let is_taken = |order: &SlotOrder| order.kind == kind && order.parameter_version == version;
+        let taken = self.finished.extract_if(.., |(order, _)| is_taken(order));
         let mut episodes: Vec<Episode> = taken.flat_map(|(_, episodes)| episodes).collect();
         episodes.sort_by_key(|episode| episode.number);
+        if kind == EpisodeKind::Training {
+            for episode in &episodes {
+                self.allowances.remove(&episode.number);
+            }
+        }
         episodes
     }
 
@@ -370,52 +482,6 @@ impl Board {
 
 fn is_silent(worker: &Worker, now: Duration) -> bool {
     now.saturating_sub(worker.heard_at) >= SILENT_AFTER
-}
-
-/// Refuses a number of episodes that is not the slot's.
-///
-/// # Errors
-/// When it is another.
-pub fn check_count(order: &SlotOrder, got: usize) -> Result<(), SubmitError> {
-    let expected = order.episodes.len();
-    if got == expected {
-        return Ok(());
-    }
-    Err(SubmitError::WrongCount { slot: order.slot, expected, got })
-}
-
-fn check(order: &SlotOrder, episodes: &[Episode]) -> Result<(), SubmitError> {
-    check_count(order, episodes.len())?;
-    episodes
-        .iter()
-        .zip(&order.episodes)
-        .try_for_each(|(episode, ordered)| check_episode(order, ordered, episode))
-}
-
-fn check_episode(
-    order: &SlotOrder,
-    ordered: &EpisodeOrder,
-    episode: &Episode,
-) -> Result<(), SubmitError> {
-    let refuse = |field, expected: String, got: String| {
-        Err(SubmitError::WrongEpisode { number: episode.number, field, expected, got })
-    };
-    let (number, version) = (episode.number, episode.parameter_version);
-    if number != ordered.number {
-        return refuse("number", ordered.number.to_string(), number.to_string());
-    }
-    if episode.kind != order.kind {
-        return refuse("kind", format!("{:?}", order.kind), format!("{:?}", episode.kind));
-    }
-    if version != order.parameter_version {
-        let expected = order.parameter_version.to_string();
-        return refuse("parameter_version", expected, version.to_string());
-    }
-    if !ordered.advised && episode.advice_charged > 0 {
-        let expected = "0, as nobody was to be asked".to_owned();
-        return refuse("advice_charged", expected, episode.advice_charged.to_string());
-    }
-    Ok(())
 }
 
 #[cfg(test)]

@@ -19,15 +19,17 @@ use crate::board::Silent;
 use crate::error::Error;
 use crate::records::{Pending, Records};
 use crate::shared::{LearnerConfig, Shared};
-use crate::teacher::{Ledger, TeacherError};
+use crate::teacher::{Ledger, Mismatch, TeacherError};
 use crate::trainer::{RoundFigures, Trainer};
-use keep::Keeping;
+use keep::{Keeping, Notice};
 use start::{Beginning, RunLock};
 
 /// Rounds after which an evaluation must be in; until then it fills the workers' gaps.
 const EVALUATION_PATIENCE_ROUNDS: u64 = 4;
 /// Pause between two looks at what else may have happened while episodes are awaited.
 const WAIT_TICK: Duration = Duration::from_millis(200);
+/// Workers that are named in the log when they fall silent at the same time.
+const MAX_SILENT_LINES: usize = 100;
 /// Span over which the rates in the progress are taken.
 const RATE_SPAN_S: f64 = 15.0;
 /// Units of advice that an episode can use: one a step.
@@ -126,21 +128,15 @@ impl Drive<'_> {
         let Some(episodes) = self.wait_for(EpisodeKind::Training, self.acting.version)? else {
             return Ok(false);
         };
-        let spent = self.trainer.counters().advice_spent;
-        if let Some(ledger) = &mut self.ledger
-            && stopped(ledger.settle(&episodes, spent))?
-        {
-            return Ok(false);
-        }
+        let Some(spent_by_now) = self.settle(&episodes)? else { return Ok(false) };
         let round = self.trainer.counters().round;
         let lagged = self.config.run.rounds.lag == 1;
-        let spent_by_now = spent + charged(&episodes);
         if lagged && !self.open_round_knowing(round + 1, round, spent_by_now)? {
             return Ok(false);
         }
         // From here to the end of learning nothing is awaited: a round is learned whole or not at all.
         let before = self.trainer.publish();
-        let figures = self.learn(&episodes)?;
+        let figures = self.learn(&episodes, spent_by_now)?;
         let newest = self.trainer.publish();
         self.shared.publish(&newest);
         self.acting = if lagged { before } else { newest };
@@ -152,8 +148,33 @@ impl Drive<'_> {
         self.take_overdue_evaluations()
     }
 
-    fn learn(&mut self, episodes: &[Episode]) -> Result<RoundFigures, Error> {
+    /// Settles the leases of a round's episodes and gives the units of advice spent by then; `None` when the run is
+    /// interrupted. The teacher's account decides what an episode has cost, not the worker that played it.
+    fn settle(&mut self, episodes: &[Episode]) -> Result<Option<u64>, Error> {
+        let spent = self.trainer.counters().advice_spent;
+        let Some(ledger) = &mut self.ledger else { return Ok(Some(spent)) };
+        let Some(settled) = unless_stopped(ledger.settle(episodes, spent))? else {
+            return Ok(None);
+        };
+        if let Some(Mismatch { claimed, charged }) = settled.mismatch {
+            let (round, account) = (self.trainer.counters().round, ledger.account().to_owned());
+            self.notice(
+                Notice::Advice,
+                format!(
+                    "the episodes of round {round} claim {claimed} units of advice, the teacher's account {account:?} \
+                     was charged {charged}: the account counts"
+                ),
+            );
+        }
+        Ok(Some(spent + settled.units))
+    }
+
+    fn learn(&mut self, episodes: &[Episode], advice_spent: u64) -> Result<RoundFigures, Error> {
         self.trainer.ingest(episodes);
+        self.trainer.correct_advice_spent(advice_spent);
+        if let Some(absurd) = self.trainer.absurd_statistic() {
+            self.notice(Notice::Statistics, absurd);
+        }
         self.tell("updating", &self.trainer.figures());
         let counters = self.trainer.counters();
         let mut told_at = self.now_s();
@@ -202,9 +223,13 @@ impl Drive<'_> {
         if let Some(ledger) = &mut self.ledger {
             let ordered = orders.iter().flat_map(|slot| &slot.episodes);
             let advised = ordered.filter(|order| order.advised).map(|order| order.number).collect();
-            if stopped(ledger.open_leases(advised, spent))? {
+            let Some(allowances) = unless_stopped(ledger.open_leases(advised, spent))? else {
                 return Ok(false);
-            }
+            };
+            self.shared
+                .lock()
+                .board
+                .allow(allowances.iter().map(|each| (each.episode, each.units)));
         }
         self.add(orders);
         Ok(true)
@@ -228,10 +253,12 @@ impl Drive<'_> {
         let spent = self.trainer.counters().advice_spent;
         let mut looked_at = None;
         loop {
-            if let Some(ledger) = &mut self.ledger
-                && stopped(ledger.mend(spent))?
-            {
-                return Ok(None);
+            if let Some(ledger) = self.ledger.as_mut().filter(|ledger| ledger.is_lost()) {
+                // In an account that is opened anew an episode may be charged beyond its first lease.
+                self.shared.lock().board.lift_allowances();
+                if unless_stopped(ledger.mend(spent))?.is_none() {
+                    return Ok(None);
+                }
             }
             let mut state = self.shared.lock();
             if state.board.is_complete(kind, version) {
@@ -244,9 +271,7 @@ impl Drive<'_> {
             // Not with every slot that comes in: all workers are looked at.
             if looked_at.is_none_or(|before| now.saturating_sub(before) >= WAIT_TICK) {
                 looked_at = Some(now);
-                for Silent { worker_id, name, n_slots } in state.board.reclaim(now) {
-                    WorkerSilent { worker_id, name: &name, n_slots }.emit();
-                }
+                report_silent(&state.board.reclaim(now));
             }
             drop(self.shared.wait(state, WAIT_TICK));
         }
@@ -301,15 +326,22 @@ impl Drive<'_> {
     }
 }
 
-/// Whether a call to the teacher was given up because the run is to stop.
-fn stopped(outcome: Result<(), TeacherError>) -> Result<bool, TeacherError> {
-    match outcome {
-        Err(TeacherError::Stopped) => Ok(true),
-        outcome => outcome.map(|()| false),
+/// Logs the workers that fell silent, the first of them by name: there can be thousands.
+fn report_silent(fell_silent: &[Silent]) {
+    let n_logged = fell_silent.len().min(MAX_SILENT_LINES);
+    let (logged, rest) = fell_silent.split_at(n_logged);
+    for Silent { worker_id, name, n_slots } in logged {
+        WorkerSilent { worker_id: *worker_id, name, n_slots: *n_slots }.emit();
+    }
+    if !rest.is_empty() {
+        tracing::warn!(n = rest.len(), "more workers silent");
     }
 }
 
-/// Units of advice that episodes were charged.
-fn charged(episodes: &[Episode]) -> u64 {
-    episodes.iter().map(|episode| u64::from(episode.advice_charged)).sum()
+/// What the teacher answered; `None` when the call was given up because the run is to stop.
+fn unless_stopped<T>(outcome: Result<T, TeacherError>) -> Result<Option<T>, TeacherError> {
+    match outcome {
+        Err(TeacherError::Stopped) => Ok(None),
+        outcome => outcome.map(Some),
+    }
 }

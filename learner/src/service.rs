@@ -1,5 +1,6 @@
 //! The `Learner` service: a thin shell round the board and the thread that learns.
 
+mod connections;
 mod refusals;
 
 use std::panic::AssertUnwindSafe;
@@ -26,6 +27,7 @@ use crate::drive::{self, Ended};
 use crate::error::Error;
 use crate::metrics;
 use crate::shared::{LearnerConfig, Shared, wait_on};
+pub(crate) use connections::{Connections, LogQuota};
 pub(crate) use refusals::check_version;
 use refusals::{check_name, malformed, refusal};
 
@@ -227,12 +229,18 @@ fn with_causes(error: &Error) -> String {
     line
 }
 
-/// Waits until a worker's connection has ended, and hands its slot to the next that asks: a round need not wait until
-/// the worker counts as slow. A worker that was only cut off delivers all the same.
-async fn give_to_others(shared: Arc<Shared>, worker_id: u64, hangup: Hangup) {
+/// Waits until a connection has ended and hands the slots of its workers to the next that ask: a round need not wait
+/// until they count as slow. A worker that was only cut off delivers all the same.
+async fn give_to_others(shared: Arc<Shared>, connection: u64, hangup: Hangup) {
     hangup.wait().await;
-    if shared.lock().board.hung_up(worker_id) {
+    let mut state = shared.lock();
+    state.connections.ended(connection);
+    let gave_back = state.board.connection_ended(connection);
+    drop(state);
+    for worker_id in &gave_back {
         tracing::info!(worker_id, "connection has ended, its slot goes to another worker");
+    }
+    if !gave_back.is_empty() {
         shared.work.notify_waiters();
     }
 }
@@ -259,14 +267,21 @@ impl Learner for LearnerService {
         let mut state = self.shared.lock();
         let terms =
             state.terms.clone().ok_or_else(|| Status::unavailable("the run is starting"))?;
+        let connection = hangup.as_ref().map(|hangup| state.connections.number_of(hangup));
+        if let (Some(hangup), Some((number, true))) = (hangup, connection) {
+            tokio::spawn(give_to_others(self.shared.clone(), number, hangup));
+        }
         let worker_id = state
             .board
-            .join(name.clone(), now)
+            .join(name.clone(), connection.map(|(number, _)| number), now)
             .map_err(|error| Status::resource_exhausted(error.to_string()))?;
+        let lines = state.join_lines.count(now);
         drop(state);
-        WorkerJoined { worker_id, name: &name }.emit();
-        if let Some(hangup) = hangup {
-            tokio::spawn(give_to_others(self.shared.clone(), worker_id, hangup));
+        if let Some(n) = lines.left_out {
+            tracing::info!(n, "more workers joined");
+        }
+        if lines.this {
+            WorkerJoined { worker_id, name: &name }.emit();
         }
         let terms = Some(encode_terms(&terms));
         Ok(Response::new(pb::JoinResponse { worker_id, terms, learner: self.start }))

@@ -14,6 +14,7 @@ use tokio::sync::{Notify, watch};
 
 use crate::board::{Board, Worker};
 use crate::config::RunConfig;
+use crate::service::{Connections, LogQuota};
 
 /// Parameter versions kept for workers that lag behind.
 pub(crate) const KEPT_VERSIONS: usize = 16;
@@ -69,6 +70,10 @@ pub(crate) struct State {
     pub(crate) finished: Option<pb::Finished>,
     /// Workers that were playing when the run ended and have not been told yet.
     pub(crate) untold: BTreeSet<u64>,
+    /// The connections over which workers have joined.
+    pub(crate) connections: Connections,
+    /// Log lines about workers that join.
+    pub(crate) join_lines: LogQuota,
     /// Episodes in the replay buffer.
     pub(crate) n_replay_episodes: usize,
 }

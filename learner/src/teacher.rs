@@ -1,4 +1,7 @@
-//! The learner's side of the advice budget: an account for the run, leases for its rounds.
+//! The learner's side of the advice budget: an account for the run, leases for its rounds, and the comparison of what
+//! episodes claim with what the account was charged.
+
+mod audit;
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -15,6 +18,7 @@ use tonic::{Code, Status};
 use tracing::warn;
 
 use crate::shared::wait_on;
+use audit::{Audit, Cost, Statement};
 
 /// Deadline of a call.
 const CALL_DEADLINE: Duration = Duration::from_secs(5);
@@ -59,6 +63,33 @@ pub(crate) enum Run {
     },
 }
 
+/// Units set aside for an episode: the most that it can claim.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct Allowance {
+    /// The episode's number.
+    pub(crate) episode: u64,
+    /// Units.
+    pub(crate) units: u32,
+}
+
+/// What the settled episodes of a round cost.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct Settled {
+    /// Units that count as spent by the run.
+    pub(crate) units: u64,
+    /// What the episodes claim and what the account was charged for them, when the claim cannot be true.
+    pub(crate) mismatch: Option<Mismatch>,
+}
+
+/// A claim that the teacher's account contradicts.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct Mismatch {
+    /// Units that the episodes claim.
+    pub(crate) claimed: u64,
+    /// Units that the account was charged.
+    pub(crate) charged: u64,
+}
+
 /// An account at a teacher, used from the thread that learns.
 #[derive(Debug)]
 pub(crate) struct Ledger {
@@ -70,6 +101,9 @@ pub(crate) struct Ledger {
     units_per_episode: u32,
     /// Advised episodes whose leases are open.
     under_way: Vec<u64>,
+    /// The budget that an account of this name has unless it was lost and opened anew.
+    full_budget: u64,
+    audit: Audit,
     /// Whether the teacher was seen not to know the account.
     lost: Arc<AtomicBool>,
     _watch: DropGuard,
@@ -95,11 +129,13 @@ impl Ledger {
             terms: terms.clone(),
             units_per_episode,
             under_way: Vec::new(),
+            full_budget: terms.budget,
+            audit: Audit::new(Statement { spent: 0, leased: 0 }, 0, true),
             lost: lost.clone(),
             _watch: stop_watching.clone().drop_guard(),
         };
         match run {
-            Run::New => ledger.open_account(terms.budget)?,
+            Run::New => ledger.open_account(terms.budget, 0)?,
             Run::Resumed { spent } => ledger.resume(spent)?,
         }
         let watch = watch_account(client, ledger.terms.name.clone(), lost);
@@ -117,29 +153,47 @@ impl Ledger {
         &self.terms.name
     }
 
-    /// Sets units aside for a round's advised episodes, in their order. `spent` is what the run has learned from.
+    /// Sets units aside for a round's advised episodes, in their order, and gives them. `spent` is what the run has
+    /// learned from.
     pub(crate) fn open_leases(
         &mut self,
         episodes: Vec<u64>,
         spent: u64,
-    ) -> Result<(), TeacherError> {
+    ) -> Result<Vec<Allowance>, TeacherError> {
         if episodes.is_empty() {
-            return Ok(());
+            return Ok(Vec::new());
         }
-        match self.call_open_leases(&episodes) {
+        let opened = match self.call_open_leases(&episodes) {
             Err(TeacherError::UnknownAccount(_)) => {
                 self.find_account(spent)?;
                 self.renew_leases()?;
-                self.call_open_leases(&episodes)?;
+                self.call_open_leases(&episodes)?
             }
-            outcome => outcome?,
-        }
+            opened => opened?,
+        };
         self.under_way.extend(episodes);
-        Ok(())
+        if let Some(account) = &opened.account {
+            let units = opened.leases.iter().map(|lease| u64::from(lease.units)).sum();
+            self.audit.leases_opened(units, statement(account));
+        }
+        Ok(self.allowances(&opened.leases))
     }
 
-    /// Returns the unspent units of finished episodes. `spent` is what the run has learned from, them not counted.
-    pub(crate) fn settle(&mut self, episodes: &[Episode], spent: u64) -> Result<(), TeacherError> {
+    /// What the episodes of `leases` can claim. In an account that was opened anew workers may have been charged before
+    /// the lease was there, so leases bound nothing.
+    fn allowances(&self, leases: &[pb::Lease]) -> Vec<Allowance> {
+        let allowance =
+            |lease: &pb::Lease| Allowance { episode: lease.episode, units: lease.units };
+        if self.audit.is_whole() { leases.iter().map(allowance).collect() } else { Vec::new() }
+    }
+
+    /// Returns the unspent units of finished episodes to the budget and gives what they cost. `spent` is what the run
+    /// has learned from, them not counted. No other episode may be under way.
+    pub(crate) fn settle(
+        &mut self,
+        episodes: &[Episode],
+        spent: u64,
+    ) -> Result<Settled, TeacherError> {
         let numbers: Vec<u64> = episodes.iter().map(|episode| episode.number).collect();
         self.under_way.retain(|number| !numbers.contains(number));
         let request =
@@ -148,15 +202,24 @@ impl Ledger {
             let request = request.clone();
             async move { client.settle_leases(request).await }
         });
+        let claimed = episodes.iter().map(|episode| u64::from(episode.advice_charged)).sum();
         match settled {
             Err(TeacherError::UnknownAccount(_)) => {
-                let charged: u64 =
-                    episodes.iter().map(|episode| u64::from(episode.advice_charged)).sum();
-                self.find_account(spent + charged)?;
-                self.renew_leases()
+                self.find_account(spent + claimed)?;
+                self.renew_leases()?;
+                Ok(Settled { units: claimed, mismatch: None })
             }
-            settled => settled.map(drop),
+            settled => {
+                let Cost { units, instead } = self.audit.settled(claimed, statement(&settled?));
+                let mismatch = instead.map(|charged| Mismatch { claimed, charged });
+                Ok(Settled { units, mismatch })
+            }
         }
+    }
+
+    /// Whether the teacher was seen not to know the account.
+    pub(crate) fn is_lost(&self) -> bool {
+        self.lost.load(Ordering::Relaxed)
     }
 
     /// Opens the account again when the teacher has lost it. `spent` is what the run has learned from.
@@ -180,7 +243,8 @@ impl Ledger {
                     name, left, "spending is forgotten, another account"
                 );
                 self.terms.name = name;
-                self.open_account(left)
+                self.full_budget = left;
+                self.open_account(left, spent)
             }
             _ => self.find_account(spent),
         }
@@ -190,17 +254,17 @@ impl Ledger {
     ///
     /// What episodes under way were charged is not known here, so as much as they may have been is written off: a
     /// budget is never overspent.
-    fn find_account(&self, spent: u64) -> Result<(), TeacherError> {
+    fn find_account(&mut self, spent: u64) -> Result<(), TeacherError> {
         let written_off = self.under_way.len() as u64 * u64::from(self.units_per_episode);
         let left = self.terms.budget.saturating_sub(spent);
-        let name = &self.terms.name;
+        let name = self.terms.name.clone();
         match self.balance()? {
             Some(found) if units_left(&found) <= left => {
                 if found.budget < self.terms.budget {
                     let (got, asked) = (found.budget, self.terms.budget);
                     warn!(account = name, budget = got, asked, "going on with a smaller account");
                 }
-                self.open_account(found.budget.min(self.terms.budget))
+                self.open_account(found.budget.min(self.terms.budget), spent)
             }
             Some(found) => {
                 let has = units_left(&found);
@@ -210,17 +274,22 @@ impl Ledger {
             None => {
                 let budget = left.saturating_sub(written_off);
                 warn!(account = name, budget, "the teacher has lost the account, opening it anew");
-                self.open_account(budget)
+                self.open_account(budget, spent)
             }
         }
     }
 
     /// Opens the leases of episodes under way at a teacher that may have forgotten them; it keeps those that it knows.
     fn renew_leases(&self) -> Result<(), TeacherError> {
-        if self.under_way.is_empty() { Ok(()) } else { self.call_open_leases(&self.under_way) }
+        if self.under_way.is_empty() {
+            return Ok(());
+        }
+        self.call_open_leases(&self.under_way).map(drop)
     }
 
-    fn open_account(&self, budget: u64) -> Result<(), TeacherError> {
+    /// Opens the account with `budget`, or finds it open, and begins to compare with it; the run has learned from
+    /// `learned` units.
+    fn open_account(&mut self, budget: u64, learned: u64) -> Result<(), TeacherError> {
         let terms = pb::OpenAccountRequest { budget, ..self.terms.clone() };
         let account = self.call("open the account", move |mut client| {
             let request = terms.clone();
@@ -228,6 +297,9 @@ impl Ledger {
         })?;
         let pb::Account { name, budget, strategy, spent, .. } = &account;
         AdviceAccountOpened { account: name, budget: *budget, spent: *spent, strategy }.emit();
+        let may_spend = self.terms.budget.saturating_sub(learned);
+        let ahead = may_spend.saturating_sub(units_left(&account));
+        self.audit = Audit::new(statement(&account), ahead, *budget == self.full_budget);
         Ok(())
     }
 
@@ -245,17 +317,16 @@ impl Ledger {
         }
     }
 
-    fn call_open_leases(&self, episodes: &[u64]) -> Result<(), TeacherError> {
+    fn call_open_leases(&self, episodes: &[u64]) -> Result<pb::OpenLeasesResponse, TeacherError> {
         let request = pb::OpenLeasesRequest {
             account: self.terms.name.clone(),
             episodes: episodes.to_vec(),
             units_per_episode: self.units_per_episode,
         };
-        let opened = self.call("open leases", move |mut client| {
+        self.call("open leases", move |mut client| {
             let request = request.clone();
             async move { client.open_leases(request).await }
-        });
-        opened.map(drop)
+        })
     }
 
     /// Calls until the teacher answers or the run is stopped. What is asked may be asked again.
@@ -316,6 +387,10 @@ where
 
 const fn units_left(account: &pb::Account) -> u64 {
     account.budget.saturating_sub(account.spent)
+}
+
+const fn statement(account: &pb::Account) -> Statement {
+    Statement { spent: account.spent, leased: account.leased }
 }
 
 /// Sets `lost` whenever the teacher answers that it does not know the account.

@@ -8,7 +8,7 @@ use rand_chacha::ChaCha8Rng;
 use sha2::{Digest as _, Sha256};
 use tandem_core::Episode;
 use tandem_core::episode::EpisodeKind;
-use tandem_core::layout::{EPISODE_STEPS, Layout};
+use tandem_core::layout::{EPISODE_STEPS, Layout, OBJECT_POSITION};
 use tandem_core::rng::{Stream, coin, episode_rng, index};
 use tandem_core::work::{EpisodeOrder, PublishedActor, SlotOrder};
 use tandem_policy::{Normalizer, NormalizerSnapshot, Policy};
@@ -195,6 +195,22 @@ impl Trainer {
             share(episodes.iter().filter(|episode| episode.moved()).count());
     }
 
+    /// Sets the units of advice spent, where the teacher's account contradicts the episodes' claims.
+    pub const fn correct_advice_spent(&mut self, units: u64) {
+        self.counters.advice_spent = units;
+    }
+
+    /// Names the first statistic of the normalisers that is not finite or beyond everything that a world shows. Inputs
+    /// normalised with it are all alike, and the policy learns nothing.
+    #[must_use]
+    pub fn absurd_statistic(&self) -> Option<String> {
+        let largest_of_object = self.layout.largest_observation(OBJECT_POSITION.start);
+        let largest_goal = self.layout.largest_goal().max(largest_of_object);
+        let observation = self.observation_normalizer.snapshot();
+        first_absurd("observations", observation, |idx| self.layout.largest_observation(idx))
+            .or_else(|| first_absurd("goals", self.goal_normalizer.snapshot(), |_| largest_goal))
+    }
+
     /// Makes a round's updates. `on_update` hears how many are done.
     ///
     /// # Errors
@@ -352,6 +368,23 @@ impl Trainer {
     }
 }
 
+fn first_absurd(
+    what: &str,
+    snapshot: &NormalizerSnapshot,
+    largest: impl Fn(usize) -> f32,
+) -> Option<String> {
+    // A mean or a standard deviation of bounded numbers exceeds their bound by rounding only.
+    let is_sane = |value: f32, idx| value.abs() <= 1.001 * largest(idx);
+    let numbers = snapshot.mean.iter().zip(&snapshot.std).enumerate();
+    let (idx, (mean, std)) = numbers
+        .into_iter()
+        .find(|(idx, (mean, std))| !(is_sane(**mean, *idx) && is_sane(**std, *idx)))?;
+    Some(format!(
+        "number {idx} of the {what} has mean {mean:e} and standard deviation {std:e} over the run, which no world shows: \
+         the policy cannot learn from it"
+    ))
+}
+
 /// Whether episode `number` is one of the advised ones: a share of any run of episodes, evenly spread.
 #[expect(
     clippy::cast_possible_truncation,
@@ -383,4 +416,31 @@ fn slots(
 fn swapped(vector: &[f32]) -> Vec<f32> {
     let (first, second) = vector.split_at(vector.len() / 2);
     [second, first].concat()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::Recipe;
+
+    #[test]
+    fn a_statistic_that_one_absurd_number_has_ruined_is_named() {
+        let mut config = RunConfig::defaults(Recipe::Tandem, tandem_core::Task::Push, 2);
+        config.ddpg.n_hidden = 4;
+        let mut trainer = Trainer::new(config).expect("valid");
+        assert_eq!(trainer.absurd_statistic(), None);
+        let mut row = vec![0.0; trainer.layout.n_observation()];
+        trainer.observation_normalizer.update(&row);
+        row[31] = 25.0;
+        trainer.observation_normalizer.update(&row);
+        assert_eq!(trainer.absurd_statistic(), None, "an object may fall");
+        row[31] = 1e29;
+        trainer.observation_normalizer.update(&row);
+        let named = trainer.absurd_statistic().expect("ruined");
+        assert!(named.starts_with("number 31 of the observations has mean 3.3"), "{named}");
+        trainer.observation_normalizer = Normalizer::new(row.len());
+        trainer.goal_normalizer.update(&[f32::NAN; 6]);
+        let named = trainer.absurd_statistic().expect("not finite");
+        assert!(named.starts_with("number 0 of the goals has mean NaN"), "{named}");
+    }
 }

@@ -103,6 +103,12 @@ impl Hangup {
         extensions.get::<Caller>().map(|caller| caller.hangup.clone())
     }
 
+    /// Whether both are of the same connection.
+    #[must_use]
+    pub fn is_same(&self, other: &Self) -> bool {
+        self.0.same_channel(&other.0)
+    }
+
     /// Waits until the connection has ended, from whichever side.
     pub async fn wait(mut self) {
         while self.0.changed().await.is_ok() {}

@@ -1,10 +1,11 @@
 //! `teacher.proto`: what is asked of a teacher and what it answers.
 
+use tandem_core::bounds::LARGEST_MAGNITUDE;
 use tandem_core::layout::OBSERVATION_PER_ARM;
 use tandem_core::{ArmAdvice, Layout, StepAdvice, StepQuery, Task};
 
 use crate::error::DecodeError;
-use crate::numbers::{actions, finite, one_finite, one_within};
+use crate::numbers::{actions, bounded, one_finite, one_within};
 use crate::pb;
 
 /// Arms that a layout on the wire may have: an episode keeps one bit an arm.
@@ -58,13 +59,16 @@ pub fn encode_query(query: &StepQuery) -> pb::StepQuery {
 /// Any step is taken: how long an episode may be is the matter of whoever keeps its account.
 ///
 /// # Errors
-/// When a vector has the wrong length, a number is not finite, or the proposed action leaves [−1, 1].
+/// When a vector has the wrong length, a number is not finite or beyond [`LARGEST_MAGNITUDE`], or the proposed action
+/// leaves [−1, 1].
 pub fn decode_query(query: pb::StepQuery, layout: Layout) -> Result<StepQuery, DecodeError> {
+    // Students of other trainers ask as well, so the bound is that of any world.
+    let largest = |_| LARGEST_MAGNITUDE;
     Ok(StepQuery {
         episode: query.episode,
         step: query.step,
-        observation: finite("observation", query.observation, layout.n_observation())?,
-        goal: finite("goal", query.goal, layout.n_goal())?,
+        observation: bounded("observation", query.observation, layout.n_observation(), largest)?,
+        goal: bounded("goal", query.goal, layout.n_goal(), largest)?,
         proposed_action: actions("proposed_action", query.proposed_action, layout.n_action())?,
     })
 }
@@ -188,6 +192,11 @@ mod tests {
             |q| q.observation[17] = f32::NAN,
             "observation[17]: expected a finite number, got NaN",
         );
+        check(
+            |q| q.observation[3] = -1e4,
+            "observation[3]: expected a number in [-1000, 1000], got -1e4",
+        );
+        check(|q| q.goal[1] = 1001.0, "goal[1]: expected a number in [-1000, 1000], got 1.001e3");
         check(|q| q.goal[0] = f32::INFINITY, "goal[0]: expected a finite number, got inf");
         check(
             |q| q.proposed_action[7] = -1.25,

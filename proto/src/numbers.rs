@@ -25,6 +25,16 @@ pub(crate) fn finite_from_bytes(
     finite(field, from_bytes(field, bytes, n)?, n)
 }
 
+/// The `n` numbers that `bytes` hold, each finite and of at most the magnitude that `largest` gives for its index.
+pub(crate) fn bounded_from_bytes(
+    field: &str,
+    bytes: &[u8],
+    n: usize,
+    largest: impl Fn(usize) -> f32,
+) -> Result<Vec<f32>, DecodeError> {
+    bounded(field, from_bytes(field, bytes, n)?, n, largest)
+}
+
 /// The `n` action components that `bytes` hold.
 pub(crate) fn actions_from_bytes(
     field: &str,
@@ -49,6 +59,25 @@ fn from_bytes(field: &str, bytes: &[u8], n: usize) -> Result<Vec<f32>, DecodeErr
 /// `values` when they are `n` finite numbers.
 pub(crate) fn finite(field: &str, values: Vec<f32>, n: usize) -> Result<Vec<f32>, DecodeError> {
     checked(field, values, n, "a finite number", f32::is_finite)
+}
+
+/// `values` when they are `n` finite numbers, each of at most the magnitude that `largest` gives for its index.
+pub(crate) fn bounded(
+    field: &str,
+    values: Vec<f32>,
+    n: usize,
+    largest: impl Fn(usize) -> f32,
+) -> Result<Vec<f32>, DecodeError> {
+    let values = finite(field, values, n)?;
+    let beyond = values.iter().enumerate().find(|(idx, value)| value.abs() > largest(*idx));
+    match beyond {
+        None => Ok(values),
+        Some((bad, value)) => {
+            let bound = largest(bad);
+            let expected = format_args!("a number in [-{bound}, {bound}]").to_string();
+            Err(DecodeError::new(format!("{field}[{bad}]"), expected, format_args!("{value:e}")))
+        }
+    }
 }
 
 /// `values` when they are `n` finite numbers above 0.
@@ -137,9 +166,28 @@ mod tests {
         check(finite_from_bytes("x", &[0; 12], 2), "x: expected 2 numbers, got 3 numbers");
         check(finite("x", vec![0.0, f32::NAN], 2), "x[1]: expected a finite number, got NaN");
         check(finite("x", vec![f32::NEG_INFINITY], 1), "x[0]: expected a finite number, got -inf");
+        let growing = |idx: usize| if idx == 0 { 0.5 } else { 2.5 };
+        check(
+            bounded("x", vec![0.0, 3e38], 2, growing),
+            "x[1]: expected a number in [-2.5, 2.5], got 3e38",
+        );
+        check(
+            bounded("x", vec![-0.75, 0.0], 2, growing),
+            "x[0]: expected a number in [-0.5, 0.5], got -7.5e-1",
+        );
+        check(
+            bounded("x", vec![f32::NAN, 9.0], 2, growing),
+            "x[0]: expected a finite number, got NaN",
+        );
         check(positive("x", vec![1.0, 0.0], 2), "x[1]: expected a finite number above 0, got 0");
         check(actions("x", vec![1.00001], 1), "x[0]: expected a number in [-1, 1], got 1.00001");
         check(actions("x", vec![f32::NAN], 1), "x[0]: expected a number in [-1, 1], got NaN");
+    }
+
+    #[test]
+    fn a_number_at_its_bound_and_a_denormal_are_taken() {
+        let values = vec![2.5, -2.5, 1e-45, -0.0];
+        assert_eq!(bounded("x", values.clone(), 4, |_| 2.5), Ok(values));
     }
 
     #[test]

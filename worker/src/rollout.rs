@@ -45,6 +45,14 @@ pub enum RolloutError {
         /// How many were expected.
         expected: usize,
     },
+    /// The teacher put its action in the place of the student's without charging for it.
+    #[error("the teacher overrides arms of episode {episode} on step {step} and charges nothing")]
+    UnpaidAdvice {
+        /// The episode's number.
+        episode: u64,
+        /// The step, from 0.
+        step: usize,
+    },
 }
 
 /// Plays the episodes of `order` in lock step, so that one question to the teacher is about all of them, and returns
@@ -183,11 +191,16 @@ impl<W: World> Rollout<W> {
         check_count(number, step_idx, "arms", advice.arms.len(), layout.n_arms)?;
         self.action.copy_from_slice(&advice.action);
         self.advised_arms = advice.overridden_arms();
+        if self.advised_arms != 0 && !advice.charged {
+            return Err(RolloutError::UnpaidAdvice { episode: number, step: step_idx });
+        }
         if self.advised_arms != 0 {
             let step = u32::try_from(step_idx).expect("an episode's steps are few");
             StepAdvised { episode: number, step, overridden_arms: self.advised_arms }.emit();
         }
-        self.episode.advice_charged += u32::from(advice.charged);
+        // A step can have cost a unit when a former worker asked, whose student acted otherwise; now no arm is overridden.
+        // The teacher's account knows of the unit, the episode is not advised on this step.
+        self.episode.advice_charged += u32::from(self.advised_arms != 0);
         Ok(())
     }
 
@@ -351,6 +364,46 @@ mod tests {
             |input| play(&order, FakeActor::Constant(input), &mut NoAdvisor).remove(0).actions;
         assert_eq!(actions(0.1), actions(0.9));
         assert!(actions(0.1).iter().any(|component| component.abs() > 0.9));
+    }
+
+    /// Answers with the student's own actions, and with what it is told to about arms and charges.
+    struct Says {
+        overridden: bool,
+        charged: bool,
+    }
+
+    impl Advisor for Says {
+        fn advise(&mut self, queries: &[StepQuery]) -> Result<Vec<StepAdvice>, AdvisorGone> {
+            let mut teacher = FakeTeacher::new(|_, _, _| self.overridden);
+            let answers = teacher.advise(queries)?.into_iter();
+            Ok(answers.map(|advice| StepAdvice { charged: self.charged, ..advice }).collect())
+        }
+    }
+
+    #[test]
+    fn a_step_that_was_charged_before_and_is_not_overridden_now_is_not_claimed() {
+        let mut remembers = Says { overridden: false, charged: true };
+        let episode = play(&slot(&[3], true), FakeActor::Seeker, &mut remembers).remove(0);
+        assert_eq!(
+            (episode.advised_arms.as_slice(), episode.advice_charged),
+            ([0; 50].as_slice(), 0)
+        );
+    }
+
+    #[test]
+    fn a_teacher_that_overrides_for_nothing_is_an_error() {
+        let mut generous = Says { overridden: true, charged: false };
+        let played = play_slot(
+            &FakeWorld::new(),
+            &slot(&[3], true),
+            &terms(),
+            &mut FakeActor::Seeker,
+            &mut generous,
+        );
+        assert_eq!(
+            played.expect_err("nobody paid").to_string(),
+            "the teacher overrides arms of episode 3 on step 0 and charges nothing"
+        );
     }
 
     #[test]

@@ -30,7 +30,7 @@ fn board_of(n_slots: u64) -> (Board, u64, u64) {
 }
 
 fn join(board: &mut Board, now: Duration) -> u64 {
-    board.join("w".to_owned(), now).expect("there is room")
+    board.join("w".to_owned(), None, now).expect("there is room")
 }
 
 fn given(board: &mut Board, worker: u64, now: Duration) -> Option<u64> {
@@ -127,6 +127,7 @@ fn a_worker_that_was_taken_for_dead_still_delivers_and_counts_once() {
     for someone_else_plays_it in [false, true] {
         let (mut board, a, b) = board_of(1);
         given(&mut board, a, at(0));
+        given(&mut board, b, at(0));
         assert_eq!(board.reclaim(at(20)).len(), 2);
         if someone_else_plays_it {
             assert_eq!(given(&mut board, b, at(20)), Some(0));
@@ -168,7 +169,7 @@ fn a_thousand_workers_that_come_and_go_leave_nothing_behind() {
             board.reclaim(now + SILENT_AFTER).iter().map(|silent| silent.n_slots).sum();
         assert_eq!((n_slots, board.waiting.len(), board.out.len()), (1000, 1000, 0));
     }
-    assert_eq!(board.workers.len(), 3002);
+    assert_eq!(board.workers.len(), 3000, "without the two that never asked");
     board.reclaim(at(40) + FORGET_AFTER);
     assert_eq!(board.workers.len(), 0);
     let last = join(&mut board, at(700));
@@ -186,13 +187,157 @@ fn there_is_room_for_a_living_worker_as_long_as_others_are_silent() {
     let first = join(&mut board, at(0));
     given(&mut board, first, at(0));
     for _ in 1..MAX_WORKERS {
-        join(&mut board, at(1));
+        let worker = join(&mut board, at(1));
+        given(&mut board, worker, at(1));
     }
-    assert_eq!(board.join("w".to_owned(), at(2)), Err(TooManyWorkers));
+    assert_eq!(board.join("w".to_owned(), None, at(2)), Err(JoinError::RunFull));
     let newest = join(&mut board, at(0) + SILENT_AFTER);
     assert_eq!(board.workers.len(), MAX_WORKERS);
     assert_eq!(board.next(first, at(16)), Err(SubmitError::UnknownWorker(first)));
     assert_eq!(given(&mut board, newest, at(16)), Some(0), "the forgotten worker's slot");
+}
+
+#[test]
+fn workers_that_join_and_never_ask_make_room_within_a_second_and_are_soon_forgotten() {
+    let mut board = Board::default();
+    for _ in 0..MAX_WORKERS {
+        join(&mut board, at(0));
+    }
+    let soon = ASK_WITHIN / 2;
+    assert_eq!(board.join("w".to_owned(), None, soon), Err(JoinError::RunFull));
+    let honest = join(&mut board, ASK_WITHIN);
+    assert_eq!(board.next(honest, at(2)), Ok(None));
+    for _ in 1..MAX_WORKERS {
+        join(&mut board, at(2));
+    }
+    assert_eq!(board.workers.len(), MAX_WORKERS);
+    assert_eq!(board.next(honest, at(3)), Ok(None), "whoever asks stays");
+    assert_eq!(board.reclaim(at(20)).len(), 1, "of the others nothing is said");
+    assert_eq!(board.workers.len(), 1);
+}
+
+#[test]
+fn one_connection_cannot_take_the_places_of_others() {
+    let mut board = Board::default();
+    let mut join_over = |connection, now| {
+        let worker = board.join("w".to_owned(), Some(connection), now).expect("there is room");
+        board.next(worker, now).expect("joined");
+        worker
+    };
+    let first = join_over(1, at(0));
+    let honest = join_over(2, at(0));
+    let mut last = first;
+    for _ in 0..20_000 {
+        last = join_over(1, at(0));
+    }
+    assert_eq!(board.workers.len(), MAX_UNPROVEN_PER_CONNECTION + 1);
+    assert_eq!(board.next(first, at(0)), Err(SubmitError::UnknownWorker(first)));
+    assert_eq!(board.next(last, at(0)), Ok(None));
+    assert_eq!(board.next(honest, at(0)), Ok(None));
+}
+
+#[test]
+fn workers_that_play_do_not_make_room_for_others_of_their_connection() {
+    let mut board = Board::default();
+    (0..2000).for_each(|number| board.add(order(number, EpisodeKind::Training)));
+    let mut first = 0;
+    for slot in 0..MAX_UNPROVEN_PER_CONNECTION as u64 {
+        let worker = board.join("w".to_owned(), Some(1), at(0)).expect("there is room");
+        assert_eq!(given(&mut board, worker, at(0)), Some(slot));
+        first = if slot == 0 { worker } else { first };
+    }
+    assert_eq!(board.join("w".to_owned(), Some(1), at(0)), Err(JoinError::ConnectionFull));
+    assert!(board.join("w".to_owned(), Some(2), at(0)).is_ok());
+    assert_eq!(board.submit(first, 0, played(0), at(1)), Ok(true));
+    assert!(board.join("w".to_owned(), Some(1), at(1)).is_ok(), "one has delivered");
+}
+
+#[test]
+fn a_full_board_takes_a_place_from_the_connection_that_has_most() {
+    let mut board = Board::default();
+    for n in 0..MAX_WORKERS {
+        let connection = if n < 9_990 { n as u64 / 1000 } else { 100 + n as u64 };
+        let worker = board.join("w".to_owned(), Some(connection), at(0)).expect("there is room");
+        board.next(worker, at(0)).expect("joined");
+    }
+    for newcomer in 0..500 {
+        let joined = board.join("w".to_owned(), Some(50_000 + newcomer), at(1));
+        assert!(joined.is_ok(), "newcomer {newcomer}: {joined:?}");
+    }
+    let mut alone = Board::default();
+    for n in 0..MAX_WORKERS {
+        let worker = alone.join("w".to_owned(), Some(n as u64), at(0)).expect("there is room");
+        alone.next(worker, at(0)).expect("joined");
+    }
+    let refused = alone.join("w".to_owned(), Some(50_000), at(1));
+    assert_eq!(refused, Err(JoinError::RunFull), "nobody has more than this one would have");
+}
+
+#[test]
+fn joins_end_with_their_connection() {
+    let mut board = Board::default();
+    board.add(order(0, EpisodeKind::Training));
+    let joined: Vec<u64> =
+        (0..3).map(|_| board.join("w".to_owned(), Some(7), at(0)).expect("room")).collect();
+    let other = board.join("w".to_owned(), Some(8), at(0)).expect("room");
+    assert_eq!(given(&mut board, joined[0], at(0)), Some(0));
+    assert_eq!(given(&mut board, joined[1], at(0)), None);
+    assert_eq!(board.connection_ended(7), [joined[0]], "it had a slot");
+    assert_eq!(board.next(joined[2], at(0)), Err(SubmitError::UnknownWorker(joined[2])));
+    assert_eq!(given(&mut board, other, at(0)), Some(0));
+    // Those that were only cut off call again over another connection.
+    assert_eq!(given(&mut board, joined[1], at(0)), None);
+    assert_eq!(board.submit(joined[0], 0, played(0), at(1)), Ok(true));
+    assert_eq!(board.connection_ended(7), [0; 0], "that is known");
+    assert_eq!(board.connection_ended(99), [0; 0], "a strange one");
+}
+
+/// An advised training slot of one episode, and an episode that claims `charged` units with these arms advised.
+fn advised(charged: u32, advised_arms: &[u8]) -> (SlotOrder, Vec<Episode>) {
+    let mut ordered = order(0, EpisodeKind::Training);
+    ordered.episodes[0].advised = true;
+    let mut episodes = played(0);
+    episodes[0].advice_charged = charged;
+    episodes[0].advised_arms[..advised_arms.len()].copy_from_slice(advised_arms);
+    (ordered, episodes)
+}
+
+#[test]
+fn claims_of_advice_that_cannot_be_true_are_refused_by_name() {
+    let check = |charged, arms: &[u8], told: &str| {
+        let (ordered, episodes) = advised(charged, arms);
+        let mut board = Board::default();
+        board.add(ordered);
+        board.allow([(0, 3)]);
+        let worker = join(&mut board, at(0));
+        given(&mut board, worker, at(0));
+        let told_now = board.submit(worker, 0, episodes.clone(), at(0)).map_err(|e| e.to_string());
+        match told {
+            "" => assert_eq!(told_now, Ok(true), "{charged} for {arms:?}"),
+            told => assert_eq!(told_now, Err(format!("episode 0: advice_charged: {told}"))),
+        }
+    };
+    check(0, &[], "");
+    check(3, &[1, 0, 1, 0, 1], "");
+    check(50, &[], "expected 0, the steps with an advised arm, got 50");
+    check(0, &[1, 1], "expected 2, the steps with an advised arm, got 0");
+    check(2, &[1], "expected 1, the steps with an advised arm, got 2");
+    check(4, &[1; 4], "expected at most 3, the units set aside for it, got 4");
+}
+
+#[test]
+fn a_lease_bounds_the_claim_until_it_is_lifted_or_its_episode_is_in() {
+    let (ordered, episodes) = advised(4, &[1; 4]);
+    let mut board = Board::default();
+    board.add(ordered);
+    board.allow([(0, 3)]);
+    let worker = join(&mut board, at(0));
+    assert!(board.submit(worker, 0, episodes.clone(), at(0)).is_err());
+    board.lift_allowances();
+    assert_eq!(board.submit(worker, 0, episodes, at(0)), Ok(true));
+    board.allow([(0, 3)]);
+    assert_eq!(taken(&mut board), [0]);
+    assert!(board.allowances.is_empty(), "nothing is kept of what is in");
 }
 
 #[test]
@@ -226,6 +371,11 @@ fn what_was_not_ordered_is_refused_by_name_and_nothing_of_it_is_used() {
         0,
         |all| all[0].advice_charged = 3,
         "episode 0: advice_charged: expected 0, as nobody was to be asked, got 3",
+    );
+    check(
+        0,
+        |all| all[0].advised_arms[7] = 1,
+        "episode 0: advised_arms: expected no advised arm, as nobody was to be asked, got 0b00000001 on step 7",
     );
     assert_eq!(board.submit(77, 0, played(0), at(0)), Err(SubmitError::UnknownWorker(77)));
     assert_eq!(board.submit(a, 0, played(0), at(0)), Ok(true), "the worker may try again");

@@ -3,6 +3,8 @@
 //! Training goes on. What could not be written is kept here and tried again, a person is told, and a run does not end
 //! well before everything is written.
 
+use std::collections::BTreeMap;
+
 use tandem_telemetry::events::CheckpointSaved;
 
 use super::Drive;
@@ -21,7 +23,16 @@ struct Stand {
     n_pending: usize,
 }
 
-/// What the disk has and has not.
+/// What else may need a person's attention; each kind is reported once.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub(super) enum Notice {
+    /// Workers claim other charges than the teacher's account has.
+    Advice,
+    /// A statistic that normalises inputs is out of all proportion.
+    Statistics,
+}
+
+/// What the disk has and has not, and what else is wrong.
 #[derive(Debug, Default)]
 pub(super) struct Keeping {
     /// What the newest checkpoint holds.
@@ -30,6 +41,7 @@ pub(super) struct Keeping {
     records_missing: Vec<Unwritten>,
     tried_at_s: f64,
     told: String,
+    notices: BTreeMap<Notice, String>,
 }
 
 impl Keeping {
@@ -42,12 +54,36 @@ impl Keeping {
         missing.join("; ")
     }
 
+    /// Everything that is wrong, for a person; empty when nothing is.
+    fn warning(&self) -> String {
+        let trouble = Some(self.trouble()).filter(|trouble| !trouble.is_empty());
+        let parts: Vec<String> =
+            trouble.into_iter().chain(self.notices.values().cloned()).collect();
+        parts.join("; ")
+    }
+
     fn missing(&self) -> impl Iterator<Item = &Unwritten> {
         self.checkpoint_missing.iter().chain(&self.records_missing)
     }
 }
 
 impl Drive<'_> {
+    /// Reports what needs a person's attention, the first time for each kind of it.
+    pub(super) fn notice(&mut self, kind: Notice, text: String) {
+        if self.keeping.notices.contains_key(&kind) {
+            tracing::debug!(?kind, text, "needs attention again");
+            return;
+        }
+        tracing::warn!(?kind, text, "needs attention");
+        self.keeping.notices.insert(kind, text);
+        self.publish_warning();
+    }
+
+    fn publish_warning(&self) {
+        let warning = self.keeping.warning();
+        self.shared.progress.send_modify(|progress| progress.warning = warning);
+    }
+
     /// Saves a checkpoint when one is due, and tries again what the disk refused before.
     pub(super) fn keep_up(&mut self) {
         let round = self.trainer.counters().round;
@@ -110,8 +146,8 @@ impl Drive<'_> {
         } else {
             tracing::warn!(trouble, "disk refuses, training goes on and it is tried again");
         }
-        self.shared.progress.send_modify(|progress| progress.warning.clone_from(&trouble));
         self.keeping.told = trouble;
+        self.publish_warning();
     }
 
     /// Refuses to end well while something is not written.

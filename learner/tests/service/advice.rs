@@ -13,12 +13,12 @@ use tonic::Status;
 
 use crate::run::{Left, Served, Toy, learner_config};
 use crate::teacher::FakeTeacher;
-use crate::toy::{UNITS, config};
+use crate::toy::{UNITS, claim, config};
 
 /// More than the toy spends.
 const AMPLE: u64 = 10_000;
 
-fn advised(lag: u32, budget: u64) -> RunConfig {
+pub(crate) fn advised(lag: u32, budget: u64) -> RunConfig {
     let mut config = config(lag);
     config.advice.strategy = "ea".to_owned();
     config.advice.share = 0.5;
@@ -26,12 +26,17 @@ fn advised(lag: u32, budget: u64) -> RunConfig {
     config
 }
 
-fn with_teacher(run: RunConfig, out: &Path, resume: bool, address: SocketAddr) -> LearnerConfig {
+pub(crate) fn with_teacher(
+    run: RunConfig,
+    out: &Path,
+    resume: bool,
+    address: SocketAddr,
+) -> LearnerConfig {
     LearnerConfig { teacher: Some(address.to_string()), ..learner_config(run, out, resume) }
 }
 
 /// Charges the advised episodes of a slot, waiting for a teacher that does not know the account.
-async fn charge(teacher: &FakeTeacher, order: &SlotOrder, episodes: &mut [Episode]) {
+pub(crate) async fn charge(teacher: &FakeTeacher, order: &SlotOrder, episodes: &mut [Episode]) {
     for (ordered, episode) in order.episodes.iter().zip(episodes) {
         if !ordered.advised {
             continue;
@@ -43,7 +48,7 @@ async fn charge(teacher: &FakeTeacher, order: &SlotOrder, episodes: &mut [Episod
                 None => tokio::time::sleep(Duration::from_millis(10)).await,
             }
         };
-        episode.advice_charged = u32::try_from(charged).expect("few");
+        claim(episode, u32::try_from(charged).expect("few"));
     }
 }
 

@@ -2,6 +2,7 @@
 
 mod advice;
 mod disk;
+mod lies;
 mod metrics;
 mod order;
 mod refusals;

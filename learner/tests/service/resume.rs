@@ -2,7 +2,6 @@
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use std::sync::atomic::{AtomicUsize, Ordering};
 
 use tandem_learner::RunConfig;
 use tandem_learner::checkpoint::{self, CheckpointError};
@@ -23,22 +22,38 @@ async fn moments(run: RunConfig) -> (TempDir, Vec<PathBuf>) {
     let out = keep.path().join("run");
     let served = Served::start(learner_config(run, &out, false)).await;
     let mut toy = served.join("toy").await;
-    let mut copies = Vec::new();
-    let n = AtomicUsize::new(0);
-    let mut copy = || {
-        let copy = keep.path().join(n.fetch_add(1, Ordering::Relaxed).to_string());
-        copy_all(&out, &copy);
-        copies.push(copy);
-    };
-    copy();
+    let mut moments = copies_of(&out, keep.path());
+    moments.copy();
     while let Some((order, episodes)) = toy.take().await {
-        copy();
+        moments.copy();
         toy.deliver(order.slot, &episodes).await.expect("taken");
-        copy();
+        moments.copy();
     }
     served.end().await.expect("a run");
-    copy();
+    moments.copy();
+    let copies = moments.copies;
     (keep, copies)
+}
+
+/// Copies of a run directory at several moments.
+pub(crate) struct Moments {
+    out: PathBuf,
+    keep: PathBuf,
+    pub(crate) copies: Vec<PathBuf>,
+}
+
+/// Copies of the run directory `out`, made in `keep`.
+pub(crate) fn copies_of(out: &Path, keep: &Path) -> Moments {
+    Moments { out: out.to_owned(), keep: keep.to_owned(), copies: Vec::new() }
+}
+
+impl Moments {
+    /// Copies the directory as it is now.
+    pub(crate) fn copy(&mut self) {
+        let copy = self.keep.join(self.copies.len().to_string());
+        copy_all(&self.out, &copy);
+        self.copies.push(copy);
+    }
 }
 
 async fn check_every_moment(run: RunConfig, step: usize) {

@@ -148,12 +148,15 @@ impl Teacher for FakeTeacher {
             request.into_inner();
         let mut books = self.books();
         let account = books.account(&name)?;
+        let mut leases = Vec::new();
         for episode in episodes {
             let units = account.left().min(u64::from(units_per_episode));
-            account.leases.entry(episode).or_insert((units, false));
+            let (units, _) = *account.leases.entry(episode).or_insert((units, false));
+            let units = u32::try_from(units).expect("few");
+            leases.push(pb::Lease { episode, units, early_units: 0 });
         }
         let answer = Some(message(&name, account));
-        Ok(Response::new(pb::OpenLeasesResponse { leases: Vec::new(), account: answer }))
+        Ok(Response::new(pb::OpenLeasesResponse { leases, account: answer }))
     }
 
     async fn settle_leases(

@@ -9,7 +9,7 @@ use tandem_learner::config::Recipe;
 use tandem_policy::Actor;
 
 pub(crate) const LAYOUT: Layout = Layout::new(Task::Push, 1);
-/// Units that every advised episode is charged.
+/// Units that every advised episode is charged: its first steps are advised.
 pub(crate) const UNITS: u32 = 7;
 /// How far an action of 1 moves the object, metres.
 const ACTION_M: f32 = 0.02;
@@ -64,7 +64,7 @@ fn play_episode(actor: &mut Actor, slot: &SlotOrder, order: EpisodeOrder) -> Epi
         slot.kind == EpisodeKind::Evaluation && order.number < 3 * slot.parameter_version % 10;
     let end = if is_put_there { [goal[0], goal[1], goal[2]] } else { object };
     observations.extend(observe(end));
-    Episode {
+    let mut episode = Episode {
         number: order.number,
         kind: slot.kind,
         parameter_version: slot.parameter_version,
@@ -72,9 +72,21 @@ fn play_episode(actor: &mut Actor, slot: &SlotOrder, order: EpisodeOrder) -> Epi
         observations,
         goal,
         actions,
-        advised_arms: vec![u8::from(order.advised); EPISODE_STEPS],
+        advised_arms: vec![0; EPISODE_STEPS],
         contacts: vec![Contacts::NONE; EPISODE_STEPS],
-        advice_charged: if order.advised { UNITS } else { 0 },
+        advice_charged: 0,
+    };
+    if order.advised {
+        claim(&mut episode, UNITS);
+    }
+    episode
+}
+
+/// Makes an episode claim that its first `units` steps were advised.
+pub(crate) fn claim(episode: &mut Episode, units: u32) {
+    episode.advice_charged = units;
+    for (step, arms) in (0..).zip(&mut episode.advised_arms) {
+        *arms = u8::from(step < units);
     }
 }
 

@@ -5,7 +5,7 @@ use tandem_core::{Contacts, Episode, Layout};
 
 use super::{decode_kind, encode_kind};
 use crate::error::DecodeError;
-use crate::numbers::{actions_from_bytes, count_within, finite_from_bytes, to_bytes};
+use crate::numbers::{actions_from_bytes, bounded_from_bytes, count_within, to_bytes};
 use crate::pb;
 
 /// An episode as a message.
@@ -27,8 +27,9 @@ pub fn encode_episode(episode: &Episode) -> pb::Episode {
 /// An episode of a run with `layout`.
 ///
 /// # Errors
-/// When the kind is unknown, a length is not the layout's, a number is not finite, an action leaves [−1, 1], a bit
-/// stands for no arm or no contact, or more units were charged than the episode has steps.
+/// When the kind is unknown, a length is not the layout's, a number is not finite or larger than any world of the layout
+/// has it ([`tandem_core::bounds`]), an action leaves [−1, 1], a bit stands for no arm or no contact, or more units were
+/// charged than the episode has steps.
 pub fn decode_episode(episode: pb::Episode, layout: Layout) -> Result<Episode, DecodeError> {
     let n_observations = (EPISODE_STEPS + 1) * layout.n_observation();
     let max_charged = u32::try_from(EPISODE_STEPS).expect("an episode has few steps");
@@ -37,8 +38,15 @@ pub fn decode_episode(episode: pb::Episode, layout: Layout) -> Result<Episode, D
         kind: decode_kind(episode.kind)?,
         parameter_version: episode.parameter_version,
         layout,
-        observations: finite_from_bytes("observations", &episode.observations, n_observations)?,
-        goal: finite_from_bytes("goal", &episode.goal, layout.n_goal())?,
+        observations: bounded_from_bytes(
+            "observations",
+            &episode.observations,
+            n_observations,
+            |idx| layout.largest_observation(idx % layout.n_observation()),
+        )?,
+        goal: bounded_from_bytes("goal", &episode.goal, layout.n_goal(), |_| {
+            layout.largest_goal()
+        })?,
         actions: actions_from_bytes(
             "actions",
             &episode.actions,
@@ -149,6 +157,14 @@ mod tests {
         check(
             |e| e.contacts[49] = 4,
             "contacts[49]: expected bits 0 (arm and arm) and 1 (arm and table), got 0b00000100",
+        );
+        check(
+            |e| e.observations[400..404].copy_from_slice(&1e29_f32.to_le_bytes()),
+            "observations[100]: expected a number in [-2, 2], got 1e29",
+        );
+        check(
+            |e| e.goal[8..12].copy_from_slice(&(-3.5_f32).to_le_bytes()),
+            "goal[2]: expected a number in [-2, 2], got -3.5e0",
         );
         check(|e| e.advice_charged = 51, "advice_charged: expected 0 to 50, got 51");
     }

@@ -61,6 +61,7 @@ struct Slot {
 struct Member {
     heard_at: Duration,
     silent: bool,
+    has_asked: bool,
     given: Option<u64>,
 }
 
@@ -80,7 +81,7 @@ impl Model {
     fn next(&mut self, worker: u64) -> Result<Option<u64>, SubmitError> {
         let now = self.now;
         let member = self.members.get_mut(&worker).ok_or(SubmitError::UnknownWorker(worker))?;
-        (member.heard_at, member.silent) = (now, false);
+        (member.heard_at, member.silent, member.has_asked) = (now, false, true);
         let is_own = |slot: &u64| self.slots[slot].place.is_with(worker);
         if let Some(own) = member.given.filter(is_own) {
             return Ok(Some(own));
@@ -105,7 +106,7 @@ impl Model {
 
     fn submit(&mut self, worker: u64, slot: u64) -> Result<bool, SubmitError> {
         let member = self.members.get_mut(&worker).ok_or(SubmitError::UnknownWorker(worker))?;
-        (member.heard_at, member.silent) = (self.now, false);
+        (member.heard_at, member.silent, member.has_asked) = (self.now, false, true);
         member.given = member.given.filter(|given| *given != slot);
         let open = self.slots.get_mut(&slot).filter(|slot| slot.place.is_open());
         let Some(slot) = open else { return Ok(false) };
@@ -119,6 +120,9 @@ impl Model {
 
     fn reclaim(&mut self) -> Vec<(u64, usize)> {
         let mut fell_silent = Vec::new();
+        let now = self.now;
+        let is_silent = |member: &Member| now - member.heard_at >= SILENT_AFTER;
+        self.members.retain(|_, member| member.has_asked || !is_silent(member));
         for (id, member) in &mut self.members {
             if member.silent || self.now - member.heard_at < SILENT_AFTER {
                 continue;
@@ -162,7 +166,8 @@ impl Both {
 
     fn join(&mut self) -> u64 {
         let id = join(&mut self.board, self.model.now);
-        let member = Member { heard_at: self.model.now, silent: false, given: None };
+        let heard_at = self.model.now;
+        let member = Member { heard_at, silent: false, has_asked: false, given: None };
         self.model.members.insert(id, member);
         self.model.joined.push(id);
         id

@@ -1,0 +1,143 @@
+//! What is taken of a worker: the episodes that were ordered, with claims of advice that can be true.
+
+use std::collections::BTreeMap;
+
+use tandem_core::work::{EpisodeOrder, SlotOrder};
+use tandem_core::{Episode, EpisodeKind};
+
+/// Why a worker's episodes are not taken. Nothing of them is used.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum SubmitError {
+    /// The worker must join first.
+    #[error("worker {0} is unknown here: join first")]
+    UnknownWorker(u64),
+    /// Nobody was given such a slot.
+    #[error("slot: expected one of the {n_slots} that were ordered, got {slot}")]
+    UnknownSlot {
+        /// What came.
+        slot: u64,
+        /// Slots ordered so far.
+        n_slots: u64,
+    },
+    /// More or fewer episodes than the slot has.
+    #[error("episodes: expected the {expected} of slot {slot}, got {got}")]
+    WrongCount {
+        /// The slot.
+        slot: u64,
+        /// Episodes ordered.
+        expected: usize,
+        /// Episodes that came.
+        got: usize,
+    },
+    /// An episode that was not ordered so.
+    #[error("episode {number}: {field}: expected {expected}, got {got}")]
+    WrongEpisode {
+        /// The episode's number as it came.
+        number: u64,
+        /// What of it was not ordered.
+        field: &'static str,
+        /// What was ordered.
+        expected: String,
+        /// What came.
+        got: String,
+    },
+}
+
+/// Refuses a number of episodes that is not the slot's.
+///
+/// # Errors
+/// When it is another.
+pub fn check_count(order: &SlotOrder, got: usize) -> Result<(), SubmitError> {
+    let expected = order.episodes.len();
+    if got == expected {
+        return Ok(());
+    }
+    Err(SubmitError::WrongCount { slot: order.slot, expected, got })
+}
+
+pub(super) fn check(order: &SlotOrder, episodes: &[Episode]) -> Result<(), SubmitError> {
+    check_count(order, episodes.len())?;
+    episodes
+        .iter()
+        .zip(&order.episodes)
+        .try_for_each(|(episode, ordered)| check_episode(order, ordered, episode))
+}
+
+fn check_episode(
+    order: &SlotOrder,
+    ordered: &EpisodeOrder,
+    episode: &Episode,
+) -> Result<(), SubmitError> {
+    let refuse = |field, expected: String, got: String| {
+        Err(SubmitError::WrongEpisode { number: episode.number, field, expected, got })
+    };
+    let (number, version) = (episode.number, episode.parameter_version);
+    if number != ordered.number {
+        return refuse("number", ordered.number.to_string(), number.to_string());
+    }
+    if episode.kind != order.kind {
+        return refuse("kind", format!("{:?}", order.kind), format!("{:?}", episode.kind));
+    }
+    if version != order.parameter_version {
+        let expected = order.parameter_version.to_string();
+        return refuse("parameter_version", expected, version.to_string());
+    }
+    check_advice(order, ordered, episode)
+}
+
+/// Refuses claims of advice that contradict each other or the order. A unit pays for one step however many arms are
+/// overridden on it, and a step on which no arm is overridden costs nothing.
+fn check_advice(
+    order: &SlotOrder,
+    ordered: &EpisodeOrder,
+    episode: &Episode,
+) -> Result<(), SubmitError> {
+    let refuse = |field, expected, got| {
+        Err(SubmitError::WrongEpisode { number: episode.number, field, expected, got })
+    };
+    let claimed = episode.advice_charged;
+    if ordered.advised && order.kind == EpisodeKind::Training {
+        let n_advised = episode.advised_arms.iter().filter(|arms| **arms != 0).count();
+        if usize::try_from(claimed) == Ok(n_advised) {
+            return Ok(());
+        }
+        let expected = format!("{n_advised}, the steps with an advised arm");
+        return refuse("advice_charged", expected, claimed.to_string());
+    }
+    if claimed > 0 {
+        let expected = "0, as nobody was to be asked".to_owned();
+        return refuse("advice_charged", expected, claimed.to_string());
+    }
+    match episode.advised_arms.iter().position(|arms| *arms != 0) {
+        None => Ok(()),
+        Some(step_idx) => {
+            let expected = "no advised arm, as nobody was to be asked".to_owned();
+            let got = format!("{:#010b} on step {step_idx}", episode.advised_arms[step_idx]);
+            refuse("advised_arms", expected, got)
+        }
+    }
+}
+
+/// Refuses an episode that claims more units of advice than `allowances` has for it.
+pub(super) fn check_allowances(
+    allowances: &BTreeMap<u64, u32>,
+    order: &SlotOrder,
+    episodes: &[Episode],
+) -> Result<(), SubmitError> {
+    // Evaluation episodes have numbers of their own and claim nothing.
+    if order.kind != EpisodeKind::Training {
+        return Ok(());
+    }
+    for episode in episodes {
+        let (number, claimed) = (episode.number, episode.advice_charged);
+        if let Some(units) = allowances.get(&number).filter(|units| claimed > **units) {
+            return Err(SubmitError::WrongEpisode {
+                number,
+                field: "advice_charged",
+                expected: format!("at most {units}, the units set aside for it"),
+                got: claimed.to_string(),
+            });
+        }
+    }
+    Ok(())
+}

@@ -1,0 +1,302 @@
+//! Workers that claim what is not so, and workers that keep others out.
+
+use std::net::SocketAddr;
+use std::path::Path;
+
+use tandem_core::work::SlotOrder;
+use tandem_core::{Episode, EpisodeKind};
+use tandem_learner::{Ended, LearnerConfig};
+use tandem_proto::pb::learner_client::LearnerClient;
+use tandem_proto::{encode_episode, pb};
+use tokio::task::JoinHandle;
+use tonic::transport::Channel;
+use tonic::{Code, Status};
+
+use crate::advice::{advised, charge, with_teacher};
+use crate::resume::copies_of;
+use crate::run::{DEADLINE, Left, Served, Toy, VERSION, calm, learner_config};
+use crate::teacher::FakeTeacher;
+use crate::toy::{UNITS, claim, config};
+
+/// More than the toy spends.
+const BUDGET: u64 = 2000;
+
+/// Follows a run to its end and gives every warning that there was.
+fn follow(mut client: LearnerClient<Channel>) -> JoinHandle<Vec<String>> {
+    tokio::spawn(async move {
+        let mut warnings: Vec<String> = Vec::new();
+        let watched = client.watch(pb::WatchRequest {}).await.expect("a stream");
+        let mut stream = watched.into_inner();
+        while let Ok(Some(progress)) = stream.message().await {
+            if !progress.warning.is_empty() && warnings.last() != Some(&progress.warning) {
+                warnings.push(progress.warning);
+            }
+        }
+        warnings
+    })
+}
+
+/// What a worker claims of an advised episode, whatever the teacher was asked before.
+type Lie = fn(&mut Episode);
+
+/// Plays a slot, telling lies about its advised episodes; `asks` says whether the teacher is asked at all.
+async fn lie_once(toy: &mut Toy, teacher: &FakeTeacher, asks: bool, lie: Lie) -> bool {
+    let Some((order, mut episodes)) = toy.take().await else { return false };
+    if asks {
+        charge(teacher, &order, &mut episodes).await;
+    }
+    for (ordered, episode) in order.episodes.iter().zip(&mut episodes) {
+        if ordered.advised && order.kind == EpisodeKind::Training {
+            lie(episode);
+        }
+    }
+    toy.deliver(order.slot, &episodes).await.is_ok()
+}
+
+/// A run whose only worker lies: how it ended and every warning.
+async fn run_of_a_liar(
+    config: LearnerConfig,
+    teacher: &FakeTeacher,
+    asks: bool,
+    lie: Lie,
+) -> (Ended, Vec<String>) {
+    let served = Served::start(config).await;
+    let mut toy = served.join("liar").await;
+    let warnings = follow(served.client().await);
+    while lie_once(&mut toy, teacher, asks, lie).await {}
+    let ended = served.end().await.expect("a run");
+    (ended, warnings.await.expect("followed"))
+}
+
+fn spent(out: &Path, ended: &Ended) -> (u64, u64) {
+    let rows = Left::behind(ended, out).rows;
+    rows.last().map(|row| (row.advice_spent, row.budget_left)).expect("rows")
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_claim_that_the_teachers_account_contradicts_is_reported_and_the_account_counts() {
+    // 9 rounds of 4 advised episodes.
+    let charged_in_all = 36 * u64::from(UNITS);
+    let all_advised: Lie = |episode| claim(episode, 50);
+    let none_advised: Lie = |episode| claim(episode, 0);
+    let one_less: Lie = |episode| claim(episode, UNITS - 1);
+    for (asks, lie, charged, claimed_in_round) in [
+        (false, all_advised, 0, 200),
+        (true, none_advised, charged_in_all, 0),
+        (true, one_less, charged_in_all, 4 * u64::from(UNITS - 1)),
+    ] {
+        for lag in [0, 1] {
+            let directory = tempfile::tempdir().expect("a directory");
+            let (out, teacher) = (directory.path(), FakeTeacher::default());
+            let address = teacher.serve().await;
+            let config = with_teacher(advised(lag, BUDGET), out, false, address);
+            let (ended, warnings) = run_of_a_liar(config, &teacher, asks, lie).await;
+            let charged_in_round = charged / 9;
+            let expected = format!(
+                "the episodes of round 0 claim {claimed_in_round} units of advice, the teacher's account \"toy\" was \
+                 charged {charged_in_round}: the account counts"
+            );
+            assert_eq!(warnings, [expected]);
+            assert_eq!(spent(out, &ended), (charged, BUDGET - charged));
+        }
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_run_resumed_after_false_claims_goes_on_with_its_account() {
+    let directory = tempfile::tempdir().expect("a directory");
+    let (out, teacher) = (directory.path(), FakeTeacher::default());
+    let address = teacher.serve().await;
+    let whole = advised(0, BUDGET);
+    let mut half = whole.clone();
+    half.stop.max_env_steps /= 2;
+    let config = with_teacher(half, out, false, address);
+    run_of_a_liar(config, &teacher, false, |episode| claim(episode, 50)).await;
+    let served = Served::start(with_teacher(whole, out, true, address)).await;
+    let mut toy = served.join("honest").await;
+    let warnings = follow(served.client().await);
+    while lie_once(&mut toy, &teacher, true, |_| ()).await {}
+    let ended = served.end().await.expect("a run");
+    assert_eq!(warnings.await.expect("followed"), [""; 0]);
+    let charged = 16 * u64::from(UNITS);
+    assert_eq!(teacher.books().opened, [("toy".to_owned(), BUDGET)]);
+    assert_eq!(spent(out, &ended), (charged, BUDGET - charged));
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn claims_that_contradict_themselves_are_refused_and_the_right_ones_taken() {
+    let teacher = FakeTeacher::default();
+    let directory = tempfile::tempdir().expect("a directory");
+    // Enough for the first episode of a round and a part of the second.
+    let run = advised(0, 60);
+    let address = teacher.serve().await;
+    let served = Served::start(with_teacher(run, directory.path(), false, address)).await;
+    let mut toys = [served.join("a").await, served.join("b").await];
+    let mut slots: Vec<(SlotOrder, Vec<Episode>)> = Vec::new();
+    for toy in &mut toys {
+        slots.push(toy.take().await.expect("a slot"));
+    }
+    slots.sort_by_key(|(order, _)| order.slot);
+    let mut refused = async |slot: usize, spoil: fn(&mut Episode), told: &str| {
+        let (order, mut episodes) = slots[slot].clone();
+        let at = order.episodes.iter().position(|ordered| ordered.advised).expect("one is");
+        spoil(&mut episodes[at]);
+        let status = toys[0].deliver(order.slot, &episodes).await.expect_err("must be refused");
+        assert_eq!(status.code(), Code::InvalidArgument);
+        let number = episodes[at].number;
+        let told = format!("episode {number}: advice_charged: {told}");
+        assert!(status.message().ends_with(&told), "{}", status.message());
+    };
+    let claims_without_arms: fn(&mut Episode) = |episode| {
+        claim(episode, 0);
+        episode.advice_charged = 50;
+    };
+    refused(0, claims_without_arms, "expected 0, the steps with an advised arm, got 50").await;
+    let hides_arms: fn(&mut Episode) = |episode| {
+        claim(episode, 7);
+        episode.advice_charged = 0;
+    };
+    refused(0, hides_arms, "expected 7, the steps with an advised arm, got 0").await;
+    let beyond = "expected at most 10, the units set aside for it, got 11";
+    refused(1, |episode| claim(episode, 11), beyond).await;
+    served.shutdown.cancel();
+    served.end().await.expect("interrupted");
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn arms_advised_where_nobody_was_asked_and_absurd_numbers_are_refused() {
+    let expected = calm(config(0)).await;
+    let directory = tempfile::tempdir().expect("a directory");
+    let served = Served::start(learner_config(config(0), directory.path(), false)).await;
+    let mut toy = served.join("liar").await;
+    let put = |bytes: &mut [u8], at: usize, value: f32| {
+        bytes[4 * at..4 * at + 4].copy_from_slice(&value.to_le_bytes());
+    };
+    type Spoil<'a> = &'a dyn Fn(&mut pb::Episode);
+    let arm: Spoil<'_> = &|episode| episode.advised_arms[3] = 1;
+    let far: Spoil<'_> = &|episode| put(&mut episode.observations, 28 + 3, 1e29);
+    let goal: Spoil<'_> = &|episode| put(&mut episode.goal, 2, -3e38);
+    let turned: Spoil<'_> = &|episode| put(&mut episode.observations, 12, 1.5);
+    let all = [
+        (
+            arm,
+            "advised_arms: expected no advised arm, as nobody was to be asked, got 0b00000001 on step 3",
+        ),
+        (far, "observations[31]: expected a number in [-25, 25], got 1e29"),
+        (goal, "goal[2]: expected a number in [-2, 2], got -3e38"),
+        (turned, "observations[12]: expected a number in [-1.01, 1.01], got 1.5e0"),
+    ];
+    // Training slots and, after the second round, evaluations.
+    let mut kinds = Vec::new();
+    while let Some((order, episodes)) = toy.take().await {
+        kinds.push(order.kind);
+        for (spoil, told) in &all {
+            let mut messages: Vec<pb::Episode> = episodes.iter().map(encode_episode).collect();
+            spoil(&mut messages[0]);
+            let request = pb::SubmitEpisodesRequest {
+                worker_id: toy.id,
+                slot: order.slot,
+                episodes: messages,
+            };
+            let refused = toy.client.submit_episodes(request).await.expect_err("must be refused");
+            assert_eq!(refused.code(), Code::InvalidArgument);
+            let told = format!("episode {}: {told}", episodes[0].number);
+            assert!(refused.message().ends_with(&told), "{}", refused.message());
+        }
+        toy.deliver(order.slot, &episodes).await.expect("the right ones are taken");
+    }
+    assert!(kinds.contains(&EpisodeKind::Training) && kinds.contains(&EpisodeKind::Evaluation));
+    let ended = served.end().await.expect("a run");
+    assert_eq!(Left::behind(&ended, directory.path()), expected, "nothing of it was used");
+}
+
+async fn join_by(client: &mut LearnerClient<Channel>) -> Result<u64, Status> {
+    let request = pb::JoinRequest { worker: "flood".to_owned(), version: VERSION.to_owned() };
+    Ok(client.join(request).await?.into_inner().worker_id)
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn ten_thousand_joins_keep_nobody_out() {
+    let expected = calm(config(0)).await;
+    let directory = tempfile::tempdir().expect("a directory");
+    let served = Served::start(learner_config(config(0), directory.path(), false)).await;
+    // Waits until the run has begun.
+    served.join("early").await;
+    let mut flood = served.client().await;
+    for _ in 0..10_000 {
+        join_by(&mut flood).await.expect("taken in");
+    }
+    let mut honest = served.join("honest").await;
+    while honest.play_one().await {
+        join_by(&mut flood).await.ok();
+    }
+    let ended = served.end().await.expect("a run");
+    assert_eq!(Left::behind(&ended, directory.path()), expected);
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn joins_end_with_their_connection() {
+    let directory = tempfile::tempdir().expect("a directory");
+    let served = Served::start(learner_config(config(0), directory.path(), false)).await;
+    let mut honest = served.join("honest").await;
+    let mut flood = served.client().await;
+    let joined = join_by(&mut flood).await.expect("taken in");
+    drop(flood);
+    // The number is unknown as soon as the connection is seen to have ended.
+    let forgotten = async {
+        loop {
+            let request =
+                pb::SubmitEpisodesRequest { worker_id: joined, slot: 0, episodes: vec![] };
+            let status = honest.client.submit_episodes(request).await.expect_err("no slot is out");
+            if status.code() == Code::NotFound {
+                return;
+            }
+            tokio::time::sleep(std::time::Duration::from_millis(5)).await;
+        }
+    };
+    tokio::time::timeout(DEADLINE, forgotten).await.expect("in time");
+    served.shutdown.cancel();
+    served.end().await.expect("interrupted");
+}
+
+/// Resumes a run from `out` with an honest worker: what it leaves, and every warning.
+async fn resume(
+    lag: u32,
+    budget: u64,
+    out: &Path,
+    teacher: &FakeTeacher,
+    address: SocketAddr,
+) -> (Left, Vec<String>) {
+    let served = Served::start(with_teacher(advised(lag, budget), out, true, address)).await;
+    let mut toy = served.join("honest").await;
+    let warnings = follow(served.client().await);
+    while lie_once(&mut toy, teacher, true, |_| ()).await {}
+    let ended = served.end().await.expect("a run");
+    (Left::behind(&ended, out), warnings.await.expect("followed"))
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn an_honest_run_raises_no_alarm_wherever_it_is_resumed() {
+    // With a budget that runs out, and with one that does not.
+    for (lag, budget) in [(0, 150), (1, 150), (0, BUDGET), (1, BUDGET)] {
+        let keep = tempfile::tempdir().expect("a directory");
+        let (out, teacher) = (keep.path().join("run"), FakeTeacher::default());
+        let address = teacher.serve().await;
+        let served = Served::start(with_teacher(advised(lag, budget), &out, false, address)).await;
+        let mut toy = served.join("honest").await;
+        let warnings = follow(served.client().await);
+        let mut moments = copies_of(&out, keep.path());
+        while lie_once(&mut toy, &teacher, true, |_| ()).await {
+            moments.copy();
+        }
+        let ended = served.end().await.expect("a run");
+        let expected = Left::behind(&ended, &out);
+        assert_eq!(warnings.await.expect("followed"), [""; 0]);
+        // The teacher has been charged for the whole run, whatever the copy knows of it.
+        for (n, copy) in moments.copies.iter().enumerate().step_by(6) {
+            let (left, warnings) = resume(lag, budget, copy, &teacher, address).await;
+            assert_eq!(warnings, [""; 0], "lag {lag}, budget {budget}, moment {n}");
+            assert_eq!(left, expected, "lag {lag}, budget {budget}, moment {n}");
+        }
+    }
+}
