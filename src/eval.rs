@@ -17,6 +17,7 @@ use crate::cli::{EvalArgs, TaskName};
 use crate::clock;
 use crate::exit::{Exit, Failed, OrExit as _};
 use crate::files::load_policy;
+use crate::output;
 
 /// Who acts in an evaluation.
 #[derive(Debug, Clone)]
@@ -131,7 +132,6 @@ impl Measured {
     }
 }
 
-#[expect(clippy::print_stdout, reason = "what the command is for")]
 pub(crate) fn eval(args: &EvalArgs) -> Result<(), Failed> {
     let subject = subject(args)?;
     let measured = measure(&subject, args.episodes, args.seed)?;
@@ -148,14 +148,17 @@ pub(crate) fn eval(args: &EvalArgs) -> Result<(), Failed> {
         })?;
     }
     if args.json {
-        println!("{}", measured.json());
+        output::print(measured.json())?;
     } else {
         let layout = measured.layout;
-        println!("task          {}, arms {}, seed {}", layout.task, layout.n_arms, args.seed);
-        measured.lines().iter().for_each(|line| println!("{line}"));
-        println!("speed         {:.0} env steps/s", measured.steps_per_s);
+        output::print(format_args!(
+            "task          {}, arms {}, seed {}",
+            layout.task, layout.n_arms, args.seed
+        ))?;
+        measured.lines().iter().try_for_each(output::print)?;
+        output::print(format_args!("speed         {:.0} env steps/s", measured.steps_per_s))?;
         for path in args.record.iter().chain(&args.record_dir) {
-            println!("recorded      {}", path.display());
+            output::print(format_args!("recorded      {}", path.display()))?;
         }
     }
     Ok(())

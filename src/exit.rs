@@ -2,6 +2,8 @@
 
 use std::process::ExitCode;
 
+use crate::output;
+
 /// How the program ends when it is not done (sysexits.h).
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Exit {
@@ -11,29 +13,14 @@ pub(crate) enum Exit {
     Data = 65,
     /// A bug.
     Bug = 70,
+    /// The result cannot be written to standard output.
+    Output = 74,
     /// A peer cannot be reached, a disk is full: try again.
     TryAgain = 75,
     /// Interrupted; the state is saved.
     Interrupted = 130,
-    /// Nobody reads what is printed any more, as behind `| head`; what a shell tells of a process that SIGPIPE ended.
+    /// Standard output has no reader any more, as behind `| head`. The code that a shell gives a process ended by SIGPIPE.
     Unread = 141,
-}
-
-/// Ends the program without a word once its standard output has no reader, where `println!` would panic.
-pub(crate) fn end_when_nobody_reads() {
-    let tell = std::panic::take_hook();
-    std::panic::set_hook(Box::new(move |panic| {
-        let told = panic.payload_as_str().unwrap_or_default();
-        if told.starts_with("failed printing to stdout") && told.contains("Broken pipe") {
-            leave(Exit::Unread);
-        }
-        tell(panic);
-    }));
-}
-
-#[expect(clippy::exit, reason = "whoever prints cannot go on, and nobody is there to be told why")]
-fn leave(exit: Exit) -> ! {
-    std::process::exit(exit as i32)
 }
 
 impl From<Exit> for ExitCode {
@@ -58,17 +45,21 @@ impl Failed {
         Self::new(Exit::Usage, anyhow::anyhow!("{message}"))
     }
 
+    /// The same failure, with `what` said before it.
+    pub(crate) fn context(self, what: String) -> Self {
+        Self { error: self.error.context(what), ..self }
+    }
+
     /// The error without its exit code, for those who tell of it themselves.
     pub(crate) fn into_error(self) -> anyhow::Error {
         self.error
     }
 
     /// Prints the one line and gives the exit code.
-    #[expect(clippy::print_stderr, reason = "the one line that says what is wrong")]
     pub(crate) fn report(&self) -> ExitCode {
-        if self.exit != Exit::Interrupted {
+        if !matches!(self.exit, Exit::Interrupted | Exit::Unread) {
             let causes: Vec<String> = self.error.chain().map(ToString::to_string).collect();
-            eprintln!("tandem: {}", one_line(&causes));
+            output::message(format_args!("tandem: {}", one_line(&causes)));
         }
         self.exit.into()
     }

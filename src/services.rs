@@ -13,7 +13,7 @@ use tokio_util::sync::CancellationToken;
 
 use crate::cli::{Cli, Command, LearnerArgs, ListenArgs, RelayArgs, TeacherArgs, WorkerArgs};
 use crate::exit::{Exit, Failed, OrExit as _};
-use crate::{access, clock, descriptors, run_file, signals};
+use crate::{access, clock, descriptors, output, run_file, signals};
 
 /// Version and commit of this program.
 pub(crate) const VERSION: &str = env!("TANDEM_VERSION");
@@ -152,8 +152,8 @@ pub(crate) fn shutdown(exit_with_stdin: bool) -> Result<CancellationToken, Faile
         .or_exit(Exit::TryAgain, || "cannot watch for signals".to_owned())
 }
 
-/// Binds and says where, on one line of standard output.
-#[expect(clippy::print_stdout, reason = "the line that tells others the address")]
+/// Binds and prints the address, on one line of standard output. A service whose line cannot be written serves all the
+/// same.
 pub(crate) async fn listen(args: &ListenArgs) -> Result<TcpListener, Failed> {
     let bind = async {
         let listener = TcpListener::bind(args.listen).await?;
@@ -162,7 +162,10 @@ pub(crate) async fn listen(args: &ListenArgs) -> Result<TcpListener, Failed> {
     };
     let (listener, address) =
         bind.await.or_exit(Exit::TryAgain, || format!("cannot listen on {}", args.listen))?;
-    println!("listening on {address}");
+    if let Err(failed) = output::print(format_args!("listening on {address}")) {
+        let error = failed.into_error();
+        tracing::warn!(%address, "the address is not on standard output: {error:#}");
+    }
     Ok(listener)
 }
 

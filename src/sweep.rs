@@ -20,7 +20,7 @@ use tokio_util::sync::CancellationToken;
 
 use crate::cli::SweepArgs;
 use crate::exit::{Exit, Failed, OrExit as _};
-use crate::{services, signals};
+use crate::{output, services, signals};
 use child::{Ended, Start};
 use display::Display;
 use standing::{Standing, State};
@@ -45,8 +45,7 @@ pub(crate) fn sweep(args: &SweepArgs) -> Result<(), Failed> {
     }
     refuse(&refused, &out)?;
     if args.dry_run {
-        print_plan(&standings, &out, args.json);
-        return Ok(());
+        return print_plan(&standings, &out, args.json);
     }
     let runtime = services::runtime().or_exit(Exit::TryAgain, String::new)?;
     let is_whole = runtime.block_on(async {
@@ -58,7 +57,8 @@ pub(crate) fn sweep(args: &SweepArgs) -> Result<(), Failed> {
         tell_how_to_go_on(args, &out);
         return Err(Failed::new(Exit::Interrupted, anyhow!("interrupted")));
     }
-    print_result(&standings, &out, args.json);
+    print_result(&standings, &out, args.json)
+        .map_err(|failed| failed.context(format!("the runs have ended, see {}", out.display())))?;
     failures(&standings)
 }
 
@@ -212,8 +212,7 @@ impl<'a> Sweep<'a> {
     }
 }
 
-#[expect(clippy::print_stdout, reason = "what the command is for")]
-fn print_plan(standings: &[Standing], out: &Path, as_json: bool) {
+fn print_plan(standings: &[Standing], out: &Path, as_json: bool) -> Result<(), Failed> {
     if as_json {
         let runs: Vec<Value> = standings
             .iter()
@@ -221,19 +220,17 @@ fn print_plan(standings: &[Standing], out: &Path, as_json: bool) {
                 json!({"name": standing.run.name, "state": standing.todo(), "failure": standing.failure})
             })
             .collect();
-        println!("{}", json!({"out": out, "runs": runs}));
-        return;
+        return output::print(json!({"out": out, "runs": runs}));
     }
     for standing in standings {
         let failure = standing.failure.as_ref();
         let failure = failure.map_or_else(String::new, |why| format!(", failed before: {why}"));
-        println!("{:<10}{}{failure}", standing.todo(), standing.run.name);
+        output::print(format_args!("{:<10}{}{failure}", standing.todo(), standing.run.name))?;
     }
-    println!("{} runs in {}", standings.len(), out.display());
+    output::print(format_args!("{} runs in {}", standings.len(), out.display()))
 }
 
-#[expect(clippy::print_stdout, reason = "the result of the command")]
-fn print_result(standings: &[Standing], out: &Path, as_json: bool) {
+fn print_result(standings: &[Standing], out: &Path, as_json: bool) -> Result<(), Failed> {
     let n_finished = standings.iter().filter(|one| matches!(one.state, State::Finished(_))).count();
     if as_json {
         let runs: Vec<Value> = standings
@@ -246,11 +243,14 @@ fn print_result(standings: &[Standing], out: &Path, as_json: bool) {
                 json!({"name": standing.run.name, "summary": summary, "failure": standing.failure})
             })
             .collect();
-        println!("{}", json!({"out": out, "finished": n_finished, "runs": runs}));
-        return;
+        return output::print(json!({"out": out, "finished": n_finished, "runs": runs}));
     }
-    println!("finished      {n_finished} of {} runs in {}", standings.len(), out.display());
-    println!("compare them  tandem report {}", out.display());
+    output::print(format_args!(
+        "finished      {n_finished} of {} runs in {}",
+        standings.len(),
+        out.display()
+    ))?;
+    output::print(format_args!("compare them  tandem report {}", out.display()))
 }
 
 /// An error that names the runs that failed, when some did.
@@ -272,9 +272,12 @@ fn failures(standings: &[Standing]) -> Result<(), Failed> {
     Err(Failed::new(Exit::TryAgain, error))
 }
 
-#[expect(clippy::print_stderr, reason = "the line that resumes")]
 fn tell_how_to_go_on(args: &SweepArgs, out: &Path) {
     let jobs = if args.jobs > 1 { format!(" --jobs {}", args.jobs) } else { String::new() };
-    eprintln!("interrupted; the state is saved. Go on with:");
-    eprintln!("  tandem sweep {} --out {}{jobs}", args.file.display(), out.display());
+    output::message("interrupted; the state is saved. Go on with:");
+    output::message(format_args!(
+        "  tandem sweep {} --out {}{jobs}",
+        args.file.display(),
+        out.display()
+    ));
 }

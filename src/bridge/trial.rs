@@ -23,6 +23,7 @@ use crate::cli::{ModeName, RecordName, TrialArgs};
 use crate::eval::task;
 use crate::exit::{Exit, Failed, OrExit as _};
 use crate::files::load_policy;
+use crate::output;
 
 /// Density of the blocks, kilograms per cubic metre: a block of 5.6 cm has 0.12 kg.
 const DENSITY_KGPM3: f32 = 683.3;
@@ -336,7 +337,6 @@ fn failed(error: TrialError, number: u64) -> Failed {
     Failed::new(exit, anyhow::Error::new(error).context(format!("trial {number}")))
 }
 
-#[expect(clippy::print_stdout, reason = "what the command is for")]
 fn show(args: &TrialArgs, rows: Vec<TrialRow>, file: &Path) -> Result<(), Failed> {
     let trials = tandem_report::Trials::of(rows);
     let page = file.with_file_name("report.html");
@@ -347,12 +347,16 @@ fn show(args: &TrialArgs, rows: Vec<TrialRow>, file: &Path) -> Result<(), Failed
         let mut value = json!({ "trials": tandem_report::trials::json(&trials) });
         value["file"] = json!(file);
         value["report"] = json!(written.page);
-        println!("{value}");
+        output::print(value)?;
         return Ok(());
     }
-    println!("{}", trials.text());
-    println!("trials        {}", file.display());
-    println!("report        {}, {} pictures beside it", page.display(), written.figures.len());
+    output::print(trials.text())?;
+    output::print(format_args!("trials        {}", file.display()))?;
+    output::print(format_args!(
+        "report        {}, {} pictures beside it",
+        page.display(),
+        written.figures.len()
+    ))?;
     Ok(())
 }
 

@@ -16,6 +16,7 @@ pub mod recorder;
 mod records;
 pub mod recovery;
 mod scene;
+pub mod standard_error;
 pub mod trial_log;
 pub mod trials;
 
