@@ -141,7 +141,7 @@ pub(crate) fn eval(args: &EvalArgs) -> Result<(), Failed> {
     }
     if let Some(directory) = &args.record_dir {
         std::fs::create_dir_all(directory)
-            .or_exit(Exit::TryAgain, || format!("cannot create {}", directory.display()))?;
+            .or_cannot_write(|| format!("cannot create {}", directory.display()))?;
         measured.episodes.par_iter().try_for_each(|episode| {
             let path = directory.join(log_name(episode));
             record(&subject, &terms, args.seed, episode, &path)
@@ -184,6 +184,10 @@ fn record(
     episode: &Episode,
     path: &Path,
 ) -> Result<(), Failed> {
+    // The whole log takes the place of what has its name: that must not be a device or a pipe.
+    if std::fs::metadata(path).is_ok_and(|there| !there.is_file() && !there.is_dir()) {
+        return Err(Failed::usage(format!("cannot write {path:?}: it is not a regular file")));
+    }
     let number = episode.number;
     let order = EpisodeOrder { number, seed, advised: false, uniform: false, record: true };
     let metadata = EpisodeMetadata {
@@ -192,7 +196,7 @@ fn record(
     };
     match record_episode(&metadata, episode, path) {
         Ok(_) => Ok(()),
-        Err(error @ RecordError::Log(_)) => Err(Failed::new(Exit::TryAgain, error)),
+        Err(error @ RecordError::Log(_)) => Err(error).or_cannot_write(String::new),
         Err(error) => Err(Failed::new(Exit::Bug, error)),
     }
 }

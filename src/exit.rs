@@ -2,6 +2,8 @@
 
 use std::process::ExitCode;
 
+use rustix::io::Errno;
+
 use crate::output;
 
 /// How the program ends when it is not done (sysexits.h).
@@ -23,6 +25,23 @@ pub(crate) enum Exit {
     Unread = 141,
 }
 
+impl Exit {
+    /// The exit code of a write that failed. A place that can never be written is a mistake of the command line; for
+    /// everything else, such as a full disk, another attempt may help.
+    fn of_write(error: &anyhow::Error) -> Self {
+        use std::io::ErrorKind as Kind;
+        let is_final = |error: &std::io::Error| {
+            let kind = error.kind();
+            matches!(kind, Kind::NotFound | Kind::AlreadyExists | Kind::NotADirectory)
+                || matches!(kind, Kind::IsADirectory | Kind::InvalidFilename)
+                || matches!(kind, Kind::PermissionDenied | Kind::InvalidInput)
+                || Errno::from_io_error(error) == Some(Errno::LOOP)
+        };
+        let mut causes = error.chain().filter_map(|cause| cause.downcast_ref::<std::io::Error>());
+        if causes.any(is_final) { Self::Usage } else { Self::TryAgain }
+    }
+}
+
 impl From<Exit> for ExitCode {
     fn from(exit: Exit) -> Self {
         Self::from(exit as u8)
@@ -39,6 +58,12 @@ pub(crate) struct Failed {
 impl Failed {
     pub(crate) fn new(exit: Exit, error: impl Into<anyhow::Error>) -> Self {
         Self { exit, error: error.into() }
+    }
+
+    /// A write that failed.
+    pub(crate) fn of_write(error: impl Into<anyhow::Error>) -> Self {
+        let error = error.into();
+        Self { exit: Exit::of_write(&error), error }
     }
 
     pub(crate) fn usage(message: impl std::fmt::Display) -> Self {
@@ -83,21 +108,52 @@ fn one_line(causes: &[String]) -> String {
 pub(crate) trait OrExit<T> {
     /// Ends with `exit`, saying `what` was attempted.
     fn or_exit(self, exit: Exit, what: impl FnOnce() -> String) -> Result<T, Failed>;
+
+    /// Ends with the exit code that the error of a write means, saying `what` was attempted.
+    fn or_cannot_write(self, what: impl FnOnce() -> String) -> Result<T, Failed>;
 }
 
 impl<T, E: Into<anyhow::Error>> OrExit<T> for Result<T, E> {
     fn or_exit(self, exit: Exit, what: impl FnOnce() -> String) -> Result<T, Failed> {
+        self.map_err(|error| failed(exit, error.into(), what()))
+    }
+
+    fn or_cannot_write(self, what: impl FnOnce() -> String) -> Result<T, Failed> {
         self.map_err(|error| {
-            let what = what();
-            let error = error.into();
-            Failed { exit, error: if what.is_empty() { error } else { error.context(what) } }
+            let Failed { exit, error } = Failed::of_write(error);
+            failed(exit, error, what())
         })
     }
+}
+
+fn failed(exit: Exit, error: anyhow::Error, what: String) -> Failed {
+    Failed { exit, error: if what.is_empty() { error } else { error.context(what) } }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_place_that_can_never_be_written_is_not_tried_again() {
+        let check = |errno: Errno, expected| {
+            let error = anyhow::Error::new(std::io::Error::from(errno)).context("cannot write x");
+            assert_eq!(Exit::of_write(&error), expected, "{errno:?}");
+        };
+        let never = [
+            Errno::NOENT,
+            Errno::EXIST,
+            Errno::NOTDIR,
+            Errno::ISDIR,
+            Errno::ACCESS,
+            Errno::PERM,
+            Errno::LOOP,
+            Errno::NAMETOOLONG,
+        ];
+        never.into_iter().for_each(|errno| check(errno, Exit::Usage));
+        let later = [Errno::NOSPC, Errno::DQUOT, Errno::FBIG, Errno::IO, Errno::ROFS, Errno::MFILE];
+        later.into_iter().for_each(|errno| check(errno, Exit::TryAgain));
+    }
 
     #[test]
     fn a_cause_that_repeats_the_line_is_left_out() {

@@ -63,12 +63,13 @@ pub(crate) fn mcap(args: &McapArgs) -> Result<(), Failed> {
             to.display()
         )));
     }
-    let counts = tandem_telemetry::recover(file, &to).map_err(|error| match error {
-        E::WriteLog { .. } | E::Io { action: "create" | "rename", .. } => {
-            Failed::new(Exit::TryAgain, error)
+    let recovered = tandem_telemetry::recover(file, &to);
+    let counts = match recovered {
+        Err(E::WriteLog { .. } | E::Io { action: "create" | "rename", .. }) => {
+            recovered.or_cannot_write(String::new)
         }
-        _ => Failed::new(Exit::Data, error),
-    })?;
+        _ => recovered.or_exit(Exit::Data, String::new),
+    }?;
     output::print(format_args!(
         "recovered {} messages of {} into {}",
         counts.messages,

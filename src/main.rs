@@ -17,6 +17,7 @@ mod eval;
 mod exit;
 mod files;
 mod health;
+mod input;
 mod output;
 mod picture;
 mod report;

@@ -25,7 +25,7 @@ pub(crate) fn picture(args: &PictureArgs) -> Result<(), Failed> {
     }
     let svg = tandem_report::scene_svg(&world.scene(), &View::default());
     std::fs::write(&args.out, svg)
-        .or_exit(Exit::TryAgain, || format!("cannot write {}", args.out.display()))?;
+        .or_cannot_write(|| format!("cannot write {}", args.out.display()))?;
     output::print(args.out.display())?;
     Ok(())
 }

@@ -25,10 +25,10 @@ pub(crate) fn report(args: &ReportArgs) -> Result<(), Failed> {
     let page = args.out.clone().unwrap_or_else(|| default_page(&args.paths));
     let pictured = if args.all_trials { Pictured::All } else { Pictured::Failures };
     let written =
-        report_html(&comparison, &trials, pictured, &page).or_exit(Exit::TryAgain, String::new)?;
+        report_html(&comparison, &trials, pictured, &page).or_cannot_write(String::new)?;
     if let Some(path) = &args.csv {
         std::fs::write(path, records::csv(&comparison))
-            .or_exit(Exit::TryAgain, || format!("cannot write {}", path.display()))?;
+            .or_cannot_write(|| format!("cannot write {}", path.display()))?;
     }
     print(args, &comparison, &trials, &written)
 }

@@ -89,7 +89,7 @@ pub(crate) fn learner(args: LearnerArgs) -> Result<(), Failed> {
 /// with elsewhere.
 fn keep_run_file(run: &RunConfig, out: &Path) -> Result<(), Failed> {
     let failed = || format!("cannot write to {}", out.display());
-    std::fs::create_dir_all(out).or_exit(Exit::TryAgain, failed)?;
+    std::fs::create_dir_all(out).or_cannot_write(failed)?;
     run_file::save(run, &out.join("run.toml"))
 }
 
@@ -196,18 +196,29 @@ fn worker_failed(error: tandem_worker::Error) -> Failed {
     let error = anyhow::Error::from(error);
     match wrong_token(&error) {
         Some(told) => Failed::usage(format!("{error}: {told}")),
+        None if refused_with(&error, tonic::Code::Unimplemented).is_some() => {
+            let what = "another service answers there: are --connect and --teacher exchanged?";
+            Failed::usage(format!("{error}: {what}"))
+        }
         None => Failed::new(exit, error),
     }
 }
 
 /// What to do when a peer wants another token, if that is what went wrong.
 fn wrong_token(error: &anyhow::Error) -> Option<&str> {
+    refused_with(error, tonic::Code::Unauthenticated).map(tonic::Status::message)
+}
+
+/// The peer's answer, where one with this code is what went wrong.
+fn refused_with(error: &anyhow::Error, code: tonic::Code) -> Option<&tonic::Status> {
     let mut statuses = error.chain().filter_map(|cause| cause.downcast_ref::<tonic::Status>());
-    let status = statuses.find(|status| status.code() == tonic::Code::Unauthenticated);
-    status.map(tonic::Status::message)
+    statuses.find(|status| status.code() == code)
 }
 
 fn learner_failed(error: LearnerError) -> Failed {
+    if let error @ LearnerError::RunDirectory { .. } = error {
+        return Failed::of_write(error);
+    }
     let exit = match error {
         LearnerError::Config(_)
         | LearnerError::NoTeacher(_)

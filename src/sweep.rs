@@ -33,8 +33,7 @@ const MAX_NAMED: usize = 3;
 pub(crate) fn sweep(args: &SweepArgs) -> Result<(), Failed> {
     let out = args.out.clone().unwrap_or_else(|| default_out(&args.file));
     let planned = file::read(&args.file)?;
-    let lock =
-        if args.dry_run { None } else { Some(lock(&out).or_exit(Exit::TryAgain, String::new)?) };
+    let lock = if args.dry_run { None } else { Some(lock(&out).or_cannot_write(String::new)?) };
     let mut standings = Vec::new();
     let mut refused = Vec::new();
     for run in planned {
@@ -179,8 +178,8 @@ impl<'a> Sweep<'a> {
         running: &mut JoinSet<(usize, Ended)>,
         interrupted: &CancellationToken,
     ) -> Result<(), Failed> {
-        let start = Start::of(&self.standings[idx], self.workers_per_run())
-            .or_exit(Exit::TryAgain, String::new)?;
+        let start =
+            Start::of(&self.standings[idx], self.workers_per_run()).or_cannot_write(String::new)?;
         self.display.started(&start.name, start.log_path());
         let stop = interrupted.clone();
         running.spawn(async move { (idx, start.play(stop).await) });

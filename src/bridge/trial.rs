@@ -62,10 +62,10 @@ pub(crate) fn trial(args: &TrialArgs) -> Result<(), Failed> {
     let out = args.out.clone().unwrap_or_else(|| PathBuf::from(format!("runs/trial-{task}")));
     for directory in ["mcap", "motions"] {
         std::fs::create_dir_all(out.join(directory))
-            .or_exit(Exit::TryAgain, || format!("cannot create {}", out.display()))?;
+            .or_cannot_write(|| format!("cannot create {}", out.display()))?;
     }
     let file = out.join(TRIALS_FILE);
-    let mut log = TrialsLog::create(&file).or_exit(Exit::TryAgain, String::new)?;
+    let mut log = TrialsLog::create(&file).or_cannot_write(String::new)?;
     let mut all = Vec::new();
     for subject in &subjects {
         for mode in modes {
@@ -203,7 +203,7 @@ impl Series<'_> {
         rows.par_iter().filter(|row| row.log.is_some()).try_for_each(|row| {
             let Some(name) = &row.log else { return Ok(()) };
             let recorder = TrialRecorder::create(&out.join(name), &self.metadata(row.trial))
-                .or_exit(Exit::TryAgain, String::new)?;
+                .or_cannot_write(String::new)?;
             let mut recording = Recording { recorder, failure: None };
             let mut trials = self.trials()?;
             attempt(&mut trials, &mut actor.clone(), row.trial, &mut recording)?;
@@ -341,8 +341,8 @@ fn show(args: &TrialArgs, rows: Vec<TrialRow>, file: &Path) -> Result<(), Failed
     let trials = tandem_report::Trials::of(rows);
     let page = file.with_file_name("report.html");
     let nothing = Comparison::of(Vec::new(), Vec::new());
-    let written = report_html(&nothing, &trials, Pictured::Failures, &page)
-        .or_exit(Exit::TryAgain, String::new)?;
+    let written =
+        report_html(&nothing, &trials, Pictured::Failures, &page).or_cannot_write(String::new)?;
     if args.json {
         let mut value = json!({ "trials": tandem_report::trials::json(&trials) });
         value["file"] = json!(file);

@@ -32,7 +32,7 @@ pub(super) fn print(
         MetricsLog::read_all(&plan.out.join("metrics.jsonl")).or_exit(Exit::Data, String::new)?;
     let drawn = Drawn {
         curve: draw_curve(plan, &rows)?,
-        report: tandem_report::run_report_html(&plan.out).or_exit(Exit::TryAgain, String::new)?,
+        report: tandem_report::run_report_html(&plan.out).or_cannot_write(String::new)?,
     };
     let summary = match as_json {
         true => summary_json(plan, last, memory, &measured).to_string(),
@@ -112,8 +112,7 @@ fn draw_curve(plan: &Plan, rows: &[MetricsRow]) -> Result<PathBuf, Failed> {
     let options = CurveOptions::shares("Success of the policy alone", Axis::EnvSteps);
     let svg = tandem_report::curve_svg(&[series], &options).or_exit(Exit::Bug, String::new)?;
     let path = plan.out.join("curve.svg");
-    std::fs::write(&path, svg)
-        .or_exit(Exit::TryAgain, || format!("cannot write {}", path.display()))?;
+    std::fs::write(&path, svg).or_cannot_write(|| format!("cannot write {}", path.display()))?;
     Ok(path)
 }
 
