@@ -10,8 +10,6 @@ use tempfile::TempDir;
 
 const TANDEM: &str = env!("CARGO_BIN_EXE_tandem");
 const POLICY: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/policies/teacher-push.safetensors");
-/// More than a pipe holds unless it is asked to.
-const PIPE_BYTES: usize = 64 << 10;
 
 /// A short run of one arm without a teacher.
 const SHORT_RUN: &str = r#"
@@ -115,7 +113,9 @@ fn a_run_without_room_for_its_messages_and_logs_ends_as_any_other() {
 fn a_run_does_not_wait_for_a_reader_of_its_messages() {
     let directory = directory();
     let (reader, mut writer) = std::io::pipe().expect("a pipe");
-    writer.write_all(&[b'x'; PIPE_BYTES]).expect("fits");
+    rustix::io::ioctl_fionbio(&writer, true).expect("a pipe");
+    while writer.write(&[b'x'; 512]).is_ok() {}
+    rustix::io::ioctl_fionbio(&writer, false).expect("a pipe");
     let ended = train(directory.path(), "stuck").stderr(writer).stdout(Stdio::piped()).output();
     digest(&ended.expect("runs"));
     drop(reader);

@@ -417,6 +417,23 @@ mod tests {
     }
 
     #[test]
+    fn a_metrics_file_without_a_row_is_an_error_by_itself_and_a_young_run_in_its_directory() {
+        let dir = tempfile::tempdir().unwrap();
+        let file = dir.path().join("metrics.jsonl");
+        for content in ["", "\u{1b}[31mred\n"] {
+            write(&file, content);
+            assert!(matches!(find(&[file.clone()]), Err(Error::NoRow { .. })), "{content:?}");
+            assert!(find(&[dir.path().to_owned()]).unwrap().runs[0].rows.is_empty());
+        }
+    }
+
+    #[test]
+    fn a_result_that_may_have_no_end_is_not_read() {
+        let error = HeldOut::load(Path::new("/dev/zero")).unwrap_err();
+        assert!(matches!(error, Error::Io { .. }), "{error:?}");
+    }
+
+    #[test]
     fn a_path_without_a_run_is_an_error() {
         let dir = tempfile::tempdir().unwrap();
         assert!(matches!(find(&[dir.path().to_owned()]), Err(Error::NoRun { .. })));
