@@ -7,6 +7,7 @@ use tracing::warn;
 
 use crate::cli::{DialArgs, ListenArgs, SecretArgs};
 use crate::exit::{Exit, Failed, OrExit as _};
+use crate::input;
 
 /// Who may call the service; refuses an address that others can reach and nothing protects.
 pub(crate) fn gate(listen: &ListenArgs, secret: &SecretArgs) -> Result<Gate, Failed> {
@@ -47,7 +48,10 @@ pub(crate) fn trusting(args: &DialArgs) -> Result<Dial, Failed> {
 
 fn token(secret: &SecretArgs) -> Result<Option<Token>, Failed> {
     let Some(path) = &secret.token_file else { return Ok(None) };
-    let token = Token::read(path).or_exit(Exit::Usage, String::new)?;
+    let (name, cannot_read) = (path.clone(), || format!("cannot read {path:?}"));
+    let read =
+        input::in_time(path, move || Token::read(&name)).or_exit(Exit::Usage, cannot_read)?;
+    let token = read.or_exit(Exit::Usage, String::new)?;
     if is_readable_by_all(path) {
         warn!(?path, "every user of this machine can read the token: chmod 600 FILE");
     }
@@ -67,7 +71,7 @@ const fn is_readable_by_all(_: &Path) -> bool {
 }
 
 fn read(path: &Path) -> Result<Vec<u8>, Failed> {
-    std::fs::read(path)
+    input::bytes(path)
         .map_err(|source| AccessError::Read { path: path.to_owned(), source })
         .or_exit(Exit::Usage, String::new)
 }

@@ -17,8 +17,8 @@ use tandem_policy::{Matrix, MatrixMut, MlpShape, NormalizerSnapshot, multiply};
 use tandem_sim::{Env, Starts, WorldConfig};
 
 use crate::cli::{BenchArgs, BenchName};
-use crate::clock;
 use crate::exit::{Exit, Failed, OrExit as _};
+use crate::{clock, output};
 
 mod scale;
 mod teacher;
@@ -36,7 +36,6 @@ struct Figure {
     unit: &'static str,
 }
 
-#[expect(clippy::print_stdout, reason = "what the command is for")]
 pub(crate) fn bench(args: &BenchArgs) -> Result<(), Failed> {
     let mut all = BenchName::value_variants().to_vec();
     all.retain(|what| *what != BenchName::Scale);
@@ -51,15 +50,16 @@ pub(crate) fn bench(args: &BenchArgs) -> Result<(), Failed> {
             BenchName::EndToEnd => end_to_end()?,
             BenchName::Scale if args.json => scale::scale(&args.scale)?.figures(),
             BenchName::Scale => {
-                print!("{}", scale::scale(&args.scale)?);
+                let table = scale::scale(&args.scale)?.to_string();
+                output::print(table.trim_end())?;
                 continue;
             }
         };
         for Figure { name, value, unit } in figures {
             if args.json {
-                println!("{}", json!({"name": name, "value": value, "unit": unit}));
+                output::print(json!({"name": name, "value": value, "unit": unit}))?;
             } else {
-                println!("{name:<44} {value:>12.2} {unit}");
+                output::print(format_args!("{name:<44} {value:>12.2} {unit}"))?;
             }
         }
     }

@@ -31,7 +31,8 @@ Examples:
   tandem eval --policy runs/NAME/policy/best.safetensors
   tandem COMMAND --help                         more examples
 
-Exit codes: 0 done, 64 bad usage or configuration, 65 bad input data, 70 a bug, 75 try again, 130 interrupted, 141 nobody reads."
+Exit codes: 0 done, 64 bad usage or configuration, 65 bad input data, 70 a bug, 74 the result cannot be
+written to standard output, 75 try again, 130 interrupted, 141 standard output has no reader."
 )]
 pub(crate) struct Cli {
     /// Log filter, such as info or tandem_learner=debug; overrides RUST_LOG.
@@ -143,7 +144,7 @@ pub(crate) struct TrainArgs {
     #[arg(long = "set", value_name = "KEY=VALUE")]
     pub(crate) settings: Vec<String>,
     /// Run directory [default: runs/TASK-ARMS-STRATEGY-seedN].
-    #[arg(long, value_name = "DIR")]
+    #[arg(long, value_name = "DIR", value_parser = utf8_path())]
     pub(crate) out: Option<PathBuf>,
     /// Goes on with the run in --out from its newest checkpoint.
     #[arg(long, requires = "out")]
@@ -169,7 +170,7 @@ pub(crate) struct SweepArgs {
     #[arg(value_name = "FILE.toml")]
     pub(crate) file: PathBuf,
     /// Where the run directories are made [default: runs/ and the file's name].
-    #[arg(long, value_name = "DIR")]
+    #[arg(long, value_name = "DIR", value_parser = utf8_path())]
     pub(crate) out: Option<PathBuf>,
     /// Runs side by side; they share the cores.
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..=256))]
@@ -435,6 +436,13 @@ pub(crate) struct StatusArgs {
     pub(crate) dial: DialArgs,
     #[command(flatten)]
     pub(crate) secret: SecretArgs,
+}
+
+/// A path that may be part of an address, as a ledger's is.
+fn utf8_path() -> impl clap::builder::TypedValueParser<Value = PathBuf> {
+    use clap::builder::{OsStringValueParser, TypedValueParser as _};
+    OsStringValueParser::new()
+        .try_map(|path| path.into_string().map(PathBuf::from).map_err(|_| "expected UTF-8"))
 }
 
 /// A time span from seconds, more than none.

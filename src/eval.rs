@@ -17,6 +17,7 @@ use crate::cli::{EvalArgs, TaskName};
 use crate::clock;
 use crate::exit::{Exit, Failed, OrExit as _};
 use crate::files::load_policy;
+use crate::output;
 
 /// Who acts in an evaluation.
 #[derive(Debug, Clone)]
@@ -131,7 +132,6 @@ impl Measured {
     }
 }
 
-#[expect(clippy::print_stdout, reason = "what the command is for")]
 pub(crate) fn eval(args: &EvalArgs) -> Result<(), Failed> {
     let subject = subject(args)?;
     let measured = measure(&subject, args.episodes, args.seed)?;
@@ -141,21 +141,24 @@ pub(crate) fn eval(args: &EvalArgs) -> Result<(), Failed> {
     }
     if let Some(directory) = &args.record_dir {
         std::fs::create_dir_all(directory)
-            .or_exit(Exit::TryAgain, || format!("cannot create {}", directory.display()))?;
+            .or_cannot_write(|| format!("cannot create {}", directory.display()))?;
         measured.episodes.par_iter().try_for_each(|episode| {
             let path = directory.join(log_name(episode));
             record(&subject, &terms, args.seed, episode, &path)
         })?;
     }
     if args.json {
-        println!("{}", measured.json());
+        output::print(measured.json())?;
     } else {
         let layout = measured.layout;
-        println!("task          {}, arms {}, seed {}", layout.task, layout.n_arms, args.seed);
-        measured.lines().iter().for_each(|line| println!("{line}"));
-        println!("speed         {:.0} env steps/s", measured.steps_per_s);
+        output::print(format_args!(
+            "task          {}, arms {}, seed {}",
+            layout.task, layout.n_arms, args.seed
+        ))?;
+        measured.lines().iter().try_for_each(output::print)?;
+        output::print(format_args!("speed         {:.0} env steps/s", measured.steps_per_s))?;
         for path in args.record.iter().chain(&args.record_dir) {
-            println!("recorded      {}", path.display());
+            output::print(format_args!("recorded      {}", path.display()))?;
         }
     }
     Ok(())
@@ -181,6 +184,10 @@ fn record(
     episode: &Episode,
     path: &Path,
 ) -> Result<(), Failed> {
+    // The whole log takes the place of what has its name: that must not be a device or a pipe.
+    if std::fs::metadata(path).is_ok_and(|there| !there.is_file() && !there.is_dir()) {
+        return Err(Failed::usage(format!("cannot write {path:?}: it is not a regular file")));
+    }
     let number = episode.number;
     let order = EpisodeOrder { number, seed, advised: false, uniform: false, record: true };
     let metadata = EpisodeMetadata {
@@ -189,7 +196,7 @@ fn record(
     };
     match record_episode(&metadata, episode, path) {
         Ok(_) => Ok(()),
-        Err(error @ RecordError::Log(_)) => Err(Failed::new(Exit::TryAgain, error)),
+        Err(error @ RecordError::Log(_)) => Err(error).or_cannot_write(String::new),
         Err(error) => Err(Failed::new(Exit::Bug, error)),
     }
 }

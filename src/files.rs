@@ -13,13 +13,13 @@ use tandem_worker::record::{RecordError, replay_log};
 
 use crate::cli::{McapArgs, McapCommand, PolicyArgs, PolicyCommand, ReplayArgs};
 use crate::exit::{Exit, Failed, OrExit as _};
+use crate::output;
 
 /// Loads a policy file, or says in one line why it cannot be used.
 pub(crate) fn load_policy(path: &Path) -> Result<Policy, Failed> {
     Policy::load(path).or_exit(Exit::Data, String::new)
 }
 
-#[expect(clippy::print_stdout, reason = "what the command is for")]
 pub(crate) fn policy(args: &PolicyArgs) -> Result<(), Failed> {
     let PolicyCommand::Show { file, json } = &args.command;
     let policy = load_policy(file)?;
@@ -30,24 +30,28 @@ pub(crate) fn policy(args: &PolicyArgs) -> Result<(), Failed> {
             "n_hidden_layers": policy.n_hidden_layers, "critic_heads": policy.n_heads, "digest": policy.digest(),
             "metadata": metadata,
         });
-        println!("{shown}");
+        output::print(shown)?;
         return Ok(());
     }
-    println!("task          {}", policy.layout.task);
-    println!("arms          {}", policy.layout.n_arms);
-    println!(
+    output::print(format_args!("task          {}", policy.layout.task))?;
+    output::print(format_args!("arms          {}", policy.layout.n_arms))?;
+    output::print(format_args!(
         "networks      {} hidden layers of {}, critic heads {}",
         policy.n_hidden_layers, policy.n_hidden, policy.n_heads
-    );
-    println!("parameters    actor {}, critic {}", policy.actor.len(), policy.critic.len());
-    println!("digest        {}", policy.digest());
+    ))?;
+    output::print(format_args!(
+        "parameters    actor {}, critic {}",
+        policy.actor.len(),
+        policy.critic.len()
+    ))?;
+    output::print(format_args!("digest        {}", policy.digest()))?;
     for (key, value) in metadata {
-        println!("{key:<22} {value}");
+        let [key, value] = [key, value].map(|text| output::escaped(text).replace('\n', "\\n"));
+        output::print(format_args!("{key:<22} {value}"))?;
     }
     Ok(())
 }
 
-#[expect(clippy::print_stdout, reason = "what the command is for")]
 pub(crate) fn mcap(args: &McapArgs) -> Result<(), Failed> {
     use tandem_telemetry::Error as E;
     let McapCommand::Recover { file, to } = &args.command;
@@ -59,13 +63,19 @@ pub(crate) fn mcap(args: &McapArgs) -> Result<(), Failed> {
             to.display()
         )));
     }
-    let counts = tandem_telemetry::recover(file, &to).map_err(|error| match error {
-        E::WriteLog { .. } | E::Io { action: "create" | "rename", .. } => {
-            Failed::new(Exit::TryAgain, error)
+    let recovered = tandem_telemetry::recover(file, &to);
+    let counts = match recovered {
+        Err(E::WriteLog { .. } | E::Io { action: "create" | "rename", .. }) => {
+            recovered.or_cannot_write(String::new)
         }
-        _ => Failed::new(Exit::Data, error),
-    })?;
-    println!("recovered {} messages of {} into {}", counts.messages, file.display(), to.display());
+        _ => recovered.or_exit(Exit::Data, String::new),
+    }?;
+    output::print(format_args!(
+        "recovered {} messages of {} into {}",
+        counts.messages,
+        file.display(),
+        to.display()
+    ))?;
     Ok(())
 }
 
@@ -90,7 +100,7 @@ pub(crate) fn replay(args: &ReplayArgs) -> Result<(), Failed> {
     };
     let replayed: Vec<Replayed> = files.into_par_iter().map(replay_one).collect();
     bar.finish_and_clear();
-    print_replayed(&replayed, args.json);
+    print_replayed(&replayed, args.json)?;
     let bad: Vec<String> = replayed.iter().filter_map(Replayed::problem).collect();
     match bad.as_slice() {
         [] => Ok(()),
@@ -160,18 +170,16 @@ fn causes(error: &RecordError) -> String {
     anyhow::Chain::new(error).map(ToString::to_string).collect::<Vec<_>>().join(": ")
 }
 
-#[expect(clippy::print_stdout, reason = "what the command is for")]
 fn print_steps(file: &Path) -> Result<(), Failed> {
     let log = read_episode(file).or_exit(Exit::Data, String::new)?;
-    println!("episode {} of {}", log.metadata.episode, file.display());
+    output::print(format_args!("episode {} of {}", log.metadata.episode, file.display()))?;
     for (step_idx, LoggedTransition { reward, action, .. }) in log.transitions.iter().enumerate() {
-        println!("step {step_idx:>2}  reward {reward:>4.1}  action {action:?}");
+        output::print(format_args!("step {step_idx:>2}  reward {reward:>4.1}  action {action:?}"))?;
     }
     Ok(())
 }
 
-#[expect(clippy::print_stdout, reason = "what the command is for")]
-fn print_replayed(replayed: &[Replayed], json: bool) {
+fn print_replayed(replayed: &[Replayed], json: bool) -> Result<(), Failed> {
     let (n_episodes, n_equal) =
         (replayed.len(), replayed.iter().filter(|log| log.outcome.is_ok()).count());
     let cut_short: Vec<&Path> =
@@ -183,20 +191,21 @@ fn print_replayed(replayed: &[Replayed], json: bool) {
         let [differing, unreadable] =
             [differing, unreadable].map(|logs| logs.into_iter().map(problem_json).collect());
         let (differing, unreadable): (Value, Value) = (differing, unreadable);
-        println!(
-            "{}",
-            json!({
-                "episodes": n_episodes, "equal": n_equal, "differing": differing, "unreadable": unreadable,
-                "cut_short": cut_short,
-            })
-        );
-        return;
+        output::print(json!({
+            "episodes": n_episodes, "equal": n_equal, "differing": differing, "unreadable": unreadable,
+            "cut_short": cut_short,
+        }))?;
+        return Ok(());
     }
-    bad().filter_map(Replayed::problem).for_each(|problem| println!("{problem}"));
-    println!("{n_equal} of {n_episodes} episodes equal bit for bit");
+    bad().filter_map(Replayed::problem).try_for_each(output::print)?;
+    output::print(format_args!("{n_equal} of {n_episodes} episodes equal bit for bit"))?;
     if !cut_short.is_empty() {
-        println!("{} of them compared only as far as their logs go", cut_short.len());
+        output::print(format_args!(
+            "{} of them compared only as far as their logs go",
+            cut_short.len()
+        ))?;
     }
+    Ok(())
 }
 
 fn problem_json(log: &Replayed) -> Value {

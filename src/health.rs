@@ -5,9 +5,8 @@ use tandem_net::check_health;
 
 use crate::cli::HealthArgs;
 use crate::exit::{Exit, Failed, OrExit as _};
-use crate::{access, services};
+use crate::{access, output, services};
 
-#[expect(clippy::print_stdout, reason = "what the command is for")]
 pub(crate) fn health(args: &HealthArgs) -> Result<(), Failed> {
     let HealthArgs { address, service, .. } = args;
     let dial = access::trusting(&args.dial)?;
@@ -21,9 +20,9 @@ pub(crate) fn health(args: &HealthArgs) -> Result<(), Failed> {
         let serving = answer.is_ok();
         let shown =
             json!({"address": address, "service": service, "serving": serving, "reason": reason});
-        println!("{shown}");
+        output::print(shown)?;
     } else if answer.is_ok() {
-        println!("serving");
+        output::print("serving")?;
     }
     let says_where = answer.as_ref().is_err_and(|unwell| unwell.to_string().starts_with(address));
     answer.or_exit(Exit::TryAgain, || if says_where { String::new() } else { address.clone() })

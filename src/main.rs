@@ -17,6 +17,8 @@ mod eval;
 mod exit;
 mod files;
 mod health;
+mod input;
+mod output;
 mod picture;
 mod report;
 mod run_file;
@@ -27,22 +29,28 @@ mod sweep;
 mod train;
 
 use cli::{Cli, Command};
-use exit::Exit;
+use exit::{Exit, Failed};
 
 fn main() -> ExitCode {
-    exit::end_when_nobody_reads();
+    signals::survive_a_limit_of_file_sizes();
+    let code = run();
+    output::finish();
+    code
+}
+
+fn run() -> ExitCode {
     let cli = match Cli::try_parse() {
         Ok(cli) => cli,
-        Err(error) => {
-            let asked_for = !error.use_stderr();
+        Err(error) if error.use_stderr() => {
             drop(error.print());
-            return if asked_for { ExitCode::SUCCESS } else { Exit::Usage.into() };
+            return Exit::Usage.into();
         }
+        Err(help) => return ended(output::print_help(&help)),
     };
     if let Err(failed) = services::start_logging(&cli) {
         return failed.report();
     }
-    let done = match cli.command {
+    ended(match cli.command {
         Command::Train(args) => train::train(&args),
         Command::Eval(args) => eval::eval(&args),
         Command::Sweep(args) => sweep::sweep(&args),
@@ -59,7 +67,10 @@ fn main() -> ExitCode {
         Command::Mcap(args) => files::mcap(&args),
         Command::Replay(args) => files::replay(&args),
         Command::Picture(args) => picture::picture(&args),
-    };
+    })
+}
+
+fn ended(done: Result<(), Failed>) -> ExitCode {
     match done {
         Ok(()) => ExitCode::SUCCESS,
         Err(failed) => failed.report(),

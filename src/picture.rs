@@ -8,8 +8,8 @@ use crate::cli::PictureArgs;
 use crate::eval::{Subject, composed};
 use crate::exit::{Exit, Failed, OrExit as _};
 use crate::files::load_policy;
+use crate::output;
 
-#[expect(clippy::print_stdout, reason = "what the command is for")]
 pub(crate) fn picture(args: &PictureArgs) -> Result<(), Failed> {
     let subject = match (&args.policy, &args.composed_teachers) {
         (Some(path), _) => Subject::Policy(load_policy(path)?),
@@ -25,7 +25,7 @@ pub(crate) fn picture(args: &PictureArgs) -> Result<(), Failed> {
     }
     let svg = tandem_report::scene_svg(&world.scene(), &View::default());
     std::fs::write(&args.out, svg)
-        .or_exit(Exit::TryAgain, || format!("cannot write {}", args.out.display()))?;
-    println!("{}", args.out.display());
+        .or_cannot_write(|| format!("cannot write {}", args.out.display()))?;
+    output::print(args.out.display())?;
     Ok(())
 }

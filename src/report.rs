@@ -11,6 +11,7 @@ use crate::cli::ReportArgs;
 use crate::eval::{Measured, composed, measure};
 use crate::exit::{Exit, Failed, OrExit as _};
 use crate::files::load_policy;
+use crate::output;
 
 /// Held-out goals on which composed teachers are measured: those of `tandem eval` and of a run's end.
 const HELD_OUT_SEED: u64 = 777;
@@ -24,44 +25,51 @@ pub(crate) fn report(args: &ReportArgs) -> Result<(), Failed> {
     let page = args.out.clone().unwrap_or_else(|| default_page(&args.paths));
     let pictured = if args.all_trials { Pictured::All } else { Pictured::Failures };
     let written =
-        report_html(&comparison, &trials, pictured, &page).or_exit(Exit::TryAgain, String::new)?;
+        report_html(&comparison, &trials, pictured, &page).or_cannot_write(String::new)?;
     if let Some(path) = &args.csv {
         std::fs::write(path, records::csv(&comparison))
-            .or_exit(Exit::TryAgain, || format!("cannot write {}", path.display()))?;
+            .or_cannot_write(|| format!("cannot write {}", path.display()))?;
     }
-    print(args, &comparison, &trials, &written);
-    Ok(())
+    print(args, &comparison, &trials, &written)
 }
 
-#[expect(clippy::print_stdout, reason = "what the command is for")]
-fn print(args: &ReportArgs, comparison: &Comparison, trials: &Trials, written: &Written) {
+fn print(
+    args: &ReportArgs,
+    comparison: &Comparison,
+    trials: &Trials,
+    written: &Written,
+) -> Result<(), Failed> {
     if args.json {
         let mut value = records::json(comparison);
         value["trials"] = trials::json(trials);
         value["report"] = json!(written.page);
         value["figures"] = json!(written.figures);
-        println!("{value}");
-        return;
+        return output::print(value);
     }
     if !trials.groups.is_empty() {
-        println!("{}", trials.text());
-        println!("median time: of all trials, failures too; [95 % interval of the share]");
+        output::print(trials.text())?;
+        output::print("median time: of all trials, failures too; [95 % interval of the share]")?;
     }
     if !comparison.sections.is_empty() {
-        println!("{}", comparison.text());
-        println!("of several runs: mean (smallest–largest); [95 % interval of all their episodes]");
+        output::print(comparison.text())?;
+        output::print(
+            "of several runs: mean (smallest–largest); [95 % interval of all their episodes]",
+        )?;
     }
     let n_pictures = written.figures.len();
-    println!("report        {}, {n_pictures} pictures beside it", written.page.display());
+    output::print(format_args!(
+        "report        {}, {n_pictures} pictures beside it",
+        written.page.display()
+    ))?;
     if let Some(path) = &args.csv {
-        println!("csv           {}", path.display());
+        output::print(format_args!("csv           {}", path.display()))?;
     }
+    Ok(())
 }
 
-#[expect(clippy::print_stderr, reason = "a warning is for people")]
 fn warn<'a>(warnings: impl Iterator<Item = &'a String>) {
     for warning in warnings {
-        eprintln!("tandem: warning: {warning}");
+        output::message(format_args!("tandem: warning: {warning}"));
     }
 }
 

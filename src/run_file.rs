@@ -10,6 +10,7 @@ use tandem_teacher::{Strategy, UnknownStrategy};
 use toml::{Table, Value};
 
 use crate::exit::{Exit, Failed, OrExit as _};
+use crate::input;
 
 /// Longer texts are cut where a message shows them.
 const MAX_SHOWN_BYTES: usize = 80;
@@ -45,7 +46,7 @@ pub(crate) fn save(config: &RunConfig, path: &Path) -> Result<(), Failed> {
     let unfinished = path.with_extension("tmp");
     let written = std::fs::write(&unfinished, header + &text);
     let written = written.and_then(|()| std::fs::rename(&unfinished, path));
-    written.or_exit(Exit::TryAgain, || format!("cannot write {}", path.display()))
+    written.or_cannot_write(|| format!("cannot write {}", path.display()))
 }
 
 /// The configuration as a TOML document with every setting.
@@ -63,8 +64,7 @@ fn parse_value(text: &str) -> Value {
 }
 
 fn read(path: &Path) -> anyhow::Result<Table> {
-    let text =
-        std::fs::read_to_string(path).with_context(|| format!("cannot read run file {path:?}"))?;
+    let text = input::text(path).with_context(|| format!("cannot read run file {path:?}"))?;
     parse(&text).map_err(|problem| anyhow!("run file {path:?}: {problem}"))
 }
 

@@ -14,7 +14,7 @@ use tokio_util::sync::CancellationToken;
 
 use crate::cli::{Cli, Command, LearnerArgs, ListenArgs, RelayArgs, TeacherArgs, WorkerArgs};
 use crate::exit::{Exit, Failed, OrExit as _};
-use crate::{access, clock, descriptors, run_file, signals};
+use crate::{access, clock, descriptors, output, run_file, signals};
 
 /// Version and commit of this program.
 pub(crate) const VERSION: &str = env!("TANDEM_VERSION");
@@ -90,7 +90,7 @@ pub(crate) fn learner(args: LearnerArgs) -> Result<(), Failed> {
 /// with elsewhere.
 fn keep_run_file(run: &RunConfig, out: &Path) -> Result<(), Failed> {
     let failed = || format!("cannot write to {}", out.display());
-    std::fs::create_dir_all(out).or_exit(Exit::TryAgain, failed)?;
+    std::fs::create_dir_all(out).or_cannot_write(failed)?;
     run_file::save(run, &out.join("run.toml"))
 }
 
@@ -153,8 +153,8 @@ pub(crate) fn shutdown(exit_with_stdin: bool) -> Result<CancellationToken, Faile
         .or_exit(Exit::TryAgain, || "cannot watch for signals".to_owned())
 }
 
-/// Binds and says where, on one line of standard output. As many connections are kept as the process may have open files.
-#[expect(clippy::print_stdout, reason = "the line that tells others the address")]
+/// Binds and prints the address, on one line of standard output. A service whose line cannot be written serves all the
+/// same. It keeps as many connections as the process may have open files.
 pub(crate) async fn listen(args: &ListenArgs) -> Result<Incoming, Failed> {
     let capacity = Capacity::for_open_files(descriptors::raise());
     let bind = async {
@@ -164,7 +164,10 @@ pub(crate) async fn listen(args: &ListenArgs) -> Result<Incoming, Failed> {
     };
     let (listener, address) =
         bind.await.or_exit(Exit::TryAgain, || format!("cannot listen on {}", args.listen))?;
-    println!("listening on {address}");
+    if let Err(failed) = output::print(format_args!("listening on {address}")) {
+        let error = failed.into_error();
+        tracing::warn!(%address, "the address is not on standard output: {error:#}");
+    }
     Ok(Incoming::from(listener).with_capacity(capacity))
 }
 
@@ -209,6 +212,9 @@ fn misdirected(error: &anyhow::Error) -> Option<&str> {
 }
 
 fn learner_failed(error: LearnerError) -> Failed {
+    if let error @ LearnerError::RunDirectory { .. } = error {
+        return Failed::of_write(error);
+    }
     let exit = match error {
         LearnerError::Config(_)
         | LearnerError::NoTeacher(_)

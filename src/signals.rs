@@ -20,6 +20,17 @@ pub(crate) fn shutdown_token(exit_with_stdin: bool) -> std::io::Result<Cancellat
     Ok(token)
 }
 
+/// Makes a write beyond the limit of file sizes (`ulimit -f`) an error like that of a full disk. Without this the system
+/// ends the process.
+pub(crate) fn survive_a_limit_of_file_sizes() {
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build();
+    // Where it cannot be done, the system's own rule holds.
+    if let Ok(runtime) = runtime {
+        let _within = runtime.enter();
+        drop(signal(SignalKind::from_raw(rustix::process::Signal::XFSZ.as_raw())));
+    }
+}
+
 /// Waits until standard input closes. A thread of its own reads it: that may take for ever, and a runtime does not end
 /// before its own blocked reads do.
 async fn standard_input_closed(is_watched: bool) {

@@ -12,7 +12,7 @@ use tonic::{Code, Response, Status};
 use crate::cli::StatusArgs;
 use crate::exit::{Exit, Failed, OrExit as _};
 use crate::train::{counts_line, evaluation_line, grouped};
-use crate::{access, services};
+use crate::{access, output, services};
 
 /// How long the learner may take to answer.
 const DEADLINE: Duration = Duration::from_secs(10);
@@ -30,37 +30,35 @@ pub(crate) fn status(args: &StatusArgs) -> Result<(), Failed> {
 }
 
 /// What the learner says now.
-#[expect(clippy::print_stdout, reason = "what the command is for")]
 async fn show(learner: &mut LearnerClient<Link>, args: &StatusArgs) -> Result<(), Failed> {
     let progress = answer(learner.status(pb::StatusRequest {})).await?;
     if args.json {
-        println!("{}", progress_json(&progress));
+        output::print(progress_json(&progress))?;
     } else {
-        lines(&progress).iter().for_each(|line| println!("{line}"));
+        lines(&progress).iter().try_for_each(output::print)?;
     }
     Ok(())
 }
 
 /// A line for each evaluation and every half minute, or each message as JSON, until the run has ended.
-#[expect(clippy::print_stdout, reason = "what the command is for")]
 async fn watch(learner: &mut LearnerClient<Link>, args: &StatusArgs) -> Result<(), Failed> {
     let mut stream = answer(learner.watch(pb::WatchRequest {})).await?;
     let (mut told_round, mut told_at_s) = (None, f64::NEG_INFINITY);
     while let Some(progress) = stream.message().await.map_err(|status| failed(&status))? {
         if args.json {
-            println!("{}", progress_json(&progress));
+            output::print(progress_json(&progress))?;
         } else if let Some(evaluation) = progress.evaluation.as_ref()
             && told_round != Some(evaluation.round)
         {
             (told_round, told_at_s) = (Some(evaluation.round), progress.wall_s);
-            println!("{}", evaluation_line(&progress, evaluation));
+            output::print(evaluation_line(&progress, evaluation))?;
         } else if progress.wall_s - told_at_s >= LINE_EVERY_S {
             told_at_s = progress.wall_s;
-            println!("{}", counts_line(&progress));
+            output::print(counts_line(&progress))?;
         }
         if progress.ended {
             if !args.json {
-                println!("ended: {}", progress.end_reason);
+                output::print(format_args!("ended: {}", progress.end_reason))?;
             }
             return Ok(());
         }

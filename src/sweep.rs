@@ -20,7 +20,7 @@ use tokio_util::sync::CancellationToken;
 
 use crate::cli::SweepArgs;
 use crate::exit::{Exit, Failed, OrExit as _};
-use crate::{services, signals};
+use crate::{output, services, signals};
 use child::{Ended, Start};
 use display::Display;
 use standing::{Standing, State};
@@ -33,8 +33,7 @@ const MAX_NAMED: usize = 3;
 pub(crate) fn sweep(args: &SweepArgs) -> Result<(), Failed> {
     let out = args.out.clone().unwrap_or_else(|| default_out(&args.file));
     let planned = file::read(&args.file)?;
-    let lock =
-        if args.dry_run { None } else { Some(lock(&out).or_exit(Exit::TryAgain, String::new)?) };
+    let lock = if args.dry_run { None } else { Some(lock(&out).or_cannot_write(String::new)?) };
     let mut standings = Vec::new();
     let mut refused = Vec::new();
     for run in planned {
@@ -45,8 +44,7 @@ pub(crate) fn sweep(args: &SweepArgs) -> Result<(), Failed> {
     }
     refuse(&refused, &out)?;
     if args.dry_run {
-        print_plan(&standings, &out, args.json);
-        return Ok(());
+        return print_plan(&standings, &out, args.json);
     }
     let runtime = services::runtime().or_exit(Exit::TryAgain, String::new)?;
     let is_whole = runtime.block_on(async {
@@ -58,7 +56,8 @@ pub(crate) fn sweep(args: &SweepArgs) -> Result<(), Failed> {
         tell_how_to_go_on(args, &out);
         return Err(Failed::new(Exit::Interrupted, anyhow!("interrupted")));
     }
-    print_result(&standings, &out, args.json);
+    print_result(&standings, &out, args.json)
+        .map_err(|failed| failed.context(format!("the runs have ended, see {}", out.display())))?;
     failures(&standings)
 }
 
@@ -179,8 +178,8 @@ impl<'a> Sweep<'a> {
         running: &mut JoinSet<(usize, Ended)>,
         interrupted: &CancellationToken,
     ) -> Result<(), Failed> {
-        let start = Start::of(&self.standings[idx], self.workers_per_run())
-            .or_exit(Exit::TryAgain, String::new)?;
+        let start =
+            Start::of(&self.standings[idx], self.workers_per_run()).or_cannot_write(String::new)?;
         self.display.started(&start.name, start.log_path());
         let stop = interrupted.clone();
         running.spawn(async move { (idx, start.play(stop).await) });
@@ -212,8 +211,7 @@ impl<'a> Sweep<'a> {
     }
 }
 
-#[expect(clippy::print_stdout, reason = "what the command is for")]
-fn print_plan(standings: &[Standing], out: &Path, as_json: bool) {
+fn print_plan(standings: &[Standing], out: &Path, as_json: bool) -> Result<(), Failed> {
     if as_json {
         let runs: Vec<Value> = standings
             .iter()
@@ -221,19 +219,17 @@ fn print_plan(standings: &[Standing], out: &Path, as_json: bool) {
                 json!({"name": standing.run.name, "state": standing.todo(), "failure": standing.failure})
             })
             .collect();
-        println!("{}", json!({"out": out, "runs": runs}));
-        return;
+        return output::print(json!({"out": out, "runs": runs}));
     }
     for standing in standings {
         let failure = standing.failure.as_ref();
         let failure = failure.map_or_else(String::new, |why| format!(", failed before: {why}"));
-        println!("{:<10}{}{failure}", standing.todo(), standing.run.name);
+        output::print(format_args!("{:<10}{}{failure}", standing.todo(), standing.run.name))?;
     }
-    println!("{} runs in {}", standings.len(), out.display());
+    output::print(format_args!("{} runs in {}", standings.len(), out.display()))
 }
 
-#[expect(clippy::print_stdout, reason = "the result of the command")]
-fn print_result(standings: &[Standing], out: &Path, as_json: bool) {
+fn print_result(standings: &[Standing], out: &Path, as_json: bool) -> Result<(), Failed> {
     let n_finished = standings.iter().filter(|one| matches!(one.state, State::Finished(_))).count();
     if as_json {
         let runs: Vec<Value> = standings
@@ -246,11 +242,14 @@ fn print_result(standings: &[Standing], out: &Path, as_json: bool) {
                 json!({"name": standing.run.name, "summary": summary, "failure": standing.failure})
             })
             .collect();
-        println!("{}", json!({"out": out, "finished": n_finished, "runs": runs}));
-        return;
+        return output::print(json!({"out": out, "finished": n_finished, "runs": runs}));
     }
-    println!("finished      {n_finished} of {} runs in {}", standings.len(), out.display());
-    println!("compare them  tandem report {}", out.display());
+    output::print(format_args!(
+        "finished      {n_finished} of {} runs in {}",
+        standings.len(),
+        out.display()
+    ))?;
+    output::print(format_args!("compare them  tandem report {}", out.display()))
 }
 
 /// An error that names the runs that failed, when some did.
@@ -272,9 +271,12 @@ fn failures(standings: &[Standing]) -> Result<(), Failed> {
     Err(Failed::new(Exit::TryAgain, error))
 }
 
-#[expect(clippy::print_stderr, reason = "the line that resumes")]
 fn tell_how_to_go_on(args: &SweepArgs, out: &Path) {
     let jobs = if args.jobs > 1 { format!(" --jobs {}", args.jobs) } else { String::new() };
-    eprintln!("interrupted; the state is saved. Go on with:");
-    eprintln!("  tandem sweep {} --out {}{jobs}", args.file.display(), out.display());
+    output::message("interrupted; the state is saved. Go on with:");
+    output::message(format_args!(
+        "  tandem sweep {} --out {}{jobs}",
+        args.file.display(),
+        out.display()
+    ));
 }

@@ -58,7 +58,7 @@ async fn run(
     interrupted: &CancellationToken,
 ) -> Result<(pb::Progress, Memory), Failed> {
     let mut display = Display::new(plan);
-    let mut children = Children::new(plan).or_exit(Exit::TryAgain, String::new)?;
+    let mut children = Children::new(plan).or_cannot_write(String::new)?;
     let last = tokio::select! {
         started = start(plan, &mut children) => started,
         () = interrupted.cancelled() => Ok(()),

@@ -78,6 +78,21 @@ fn pure_modules_name_no_runtime() {
     }
 }
 
+/// `println!` and `eprintln!` panic where nothing can be written.
+#[test]
+fn one_module_prints() {
+    let dirs =
+        ALLOWED.iter().map(|(name, _)| root().join(name).join("src")).chain([root().join("src")]);
+    let printer = root().join("src/output.rs");
+    for path in dirs.flat_map(|dir| rust_files(&dir)).filter(|path| *path != printer) {
+        let text = fs::read_to_string(&path).expect("readable");
+        let program = text.split("#[cfg(test)]").next().unwrap_or_default();
+        for word in ["print!(", "println!(", "stdout()", "stderr().lock()"] {
+            assert!(!program.contains(word), "{} must not contain `{word}`", path.display());
+        }
+    }
+}
+
 #[test]
 fn files_stay_readable() {
     let dirs =

@@ -24,6 +24,8 @@ pub const FORMAT: &str = "tandem-policy";
 pub const FORMAT_VERSION: &str = "1";
 
 const MAX_ARMS: usize = 64;
+/// The largest networks that a run file can ask for take half of it.
+const MAX_BYTES: u64 = 4 << 30;
 /// Letters of a file's own words that a refusal repeats; a digest has 64.
 const MAX_SHOWN_CHARS: usize = 80;
 /// The header's length is a little-endian `u64`, and headers are filled up to this many bytes.
@@ -47,7 +49,7 @@ impl Policy {
     /// not fit the task, the arms and the networks' sizes.
     pub fn load(path: &Path) -> Result<Self, Error> {
         let bytes =
-            fs::read(path).map_err(|source| Error::Read { path: path.to_owned(), source })?;
+            read_regular(path).map_err(|source| Error::Read { path: path.to_owned(), source })?;
         decode(&bytes)
             .map_err(|source| Error::Refused { path: path.to_owned(), source: Box::new(source) })
     }
@@ -270,6 +272,18 @@ fn shortened(text: &str) -> String {
         Some((end, _)) => format!("{}...", &text[..end]),
         None => text.to_owned(),
     }
+}
+
+/// Reads a regular file: a pipe or a device may never end, and opening a pipe waits for its writer.
+fn read_regular(path: &Path) -> io::Result<Vec<u8>> {
+    let file = fs::metadata(path)?;
+    if !file.is_file() && !file.is_dir() {
+        return Err(io::Error::new(io::ErrorKind::InvalidInput, "it is not a regular file"));
+    }
+    if file.len() > MAX_BYTES {
+        return Err(io::Error::new(io::ErrorKind::FileTooLarge, "it has more than 4 GiB"));
+    }
+    fs::read(path)
 }
 
 /// Writes beside `path` and renames, so that `path` is always a whole file, old or new.

@@ -31,6 +31,12 @@ pub enum Error {
         /// What stands there instead.
         problem: String,
     },
+    /// A metrics file without a single row.
+    #[error("{path:?} holds no metrics: its first line is no metrics row")]
+    NoRow {
+        /// The file.
+        path: PathBuf,
+    },
     /// A file is no result of an evaluation.
     #[error("{path:?} is no result of `tandem eval --json`: {problem}")]
     NoEvaluation {

@@ -6,6 +6,7 @@ use serde_json::Value;
 use tandem_core::Task;
 
 use crate::error::Error;
+use crate::run::read_text;
 
 /// An evaluation on held-out goals.
 #[derive(Debug, Clone, PartialEq)]
@@ -32,7 +33,7 @@ impl HeldOut {
     /// # Errors
     /// When the file cannot be read or its last line is no such object; names the field.
     pub fn load(path: &Path) -> Result<Self, Error> {
-        let text = std::fs::read_to_string(path).map_err(|source| Error::Io {
+        let text = read_text(path).map_err(|source| Error::Io {
             action: "read",
             path: path.to_owned(),
             source,

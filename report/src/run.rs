@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use serde::de::DeserializeOwned;
 use tandem_core::Task;
 use tandem_telemetry::trials::TRIALS_FILE;
-use tandem_telemetry::{MetricsRow, TrialRow};
+use tandem_telemetry::{MetricsRow, TrialRow, read_regular};
 use toml::{Table, Value};
 
 use crate::error::Error;
@@ -58,10 +58,14 @@ impl Run {
     /// Reads a metrics file that stands by itself.
     ///
     /// # Errors
-    /// When it cannot be read.
+    /// When it cannot be read or its first line is no metrics row.
     pub fn load_file(path: &Path, warnings: &mut Vec<String>) -> Result<Self, Error> {
         let name = path.file_stem().unwrap_or(path.as_os_str()).to_string_lossy().into_owned();
-        Ok(Self { name, rows: read_rows(path, warnings)?, ..Self::default() })
+        let rows = read_rows(path, warnings)?;
+        if rows.is_empty() {
+            return Err(Error::NoRow { path: path.to_owned() });
+        }
+        Ok(Self { name, rows, ..Self::default() })
     }
 
     /// The evaluation of the policy that the run kept as its best; where none says so, the one with the highest success,
@@ -218,7 +222,7 @@ fn is_trials_file(path: &Path) -> Result<bool, Error> {
     if path.file_name().is_some_and(|name| name == TRIALS_FILE) {
         return Ok(true);
     }
-    let bytes = std::fs::read(path).map_err(read_error(path))?;
+    let bytes = read_regular(path).map_err(read_error(path))?;
     let first = bytes.split(|byte| *byte == b'\n').next().unwrap_or_default();
     Ok(serde_json::from_slice::<TrialRow>(first).is_ok())
 }
@@ -259,7 +263,7 @@ impl Broken {
 }
 
 fn read_lines<T: DeserializeOwned>(path: &Path) -> Result<(Vec<T>, Option<Broken>), Error> {
-    let bytes = std::fs::read(path).map_err(read_error(path))?;
+    let bytes = read_regular(path).map_err(read_error(path))?;
     let mut rows = Vec::new();
     for (line_idx, line) in bytes.split_inclusive(|byte| *byte == b'\n').enumerate() {
         match serde_json::from_slice(line) {
@@ -276,11 +280,17 @@ fn read_lines<T: DeserializeOwned>(path: &Path) -> Result<(Vec<T>, Option<Broken
 }
 
 fn read_if_there(path: &Path) -> Result<Option<String>, Error> {
-    match std::fs::read_to_string(path) {
+    match read_text(path) {
         Ok(text) => Ok(Some(text)),
         Err(error) if error.kind() == ErrorKind::NotFound => Ok(None),
         Err(error) => Err(read_error(path)(error)),
     }
+}
+
+/// Reads a text from a regular file.
+pub(crate) fn read_text(path: &Path) -> std::io::Result<String> {
+    let not_utf8 = |_| std::io::Error::new(ErrorKind::InvalidData, "it is not UTF-8");
+    String::from_utf8(read_regular(path)?).map_err(not_utf8)
 }
 
 fn read_error(path: &Path) -> impl FnOnce(std::io::Error) -> Error {
@@ -404,6 +414,23 @@ mod tests {
         write(&dir.path().join("a/metrics.jsonl"), &line(1));
         let found = find(&[dir.path().to_owned()]).unwrap();
         assert_eq!((found.runs.len(), found.trials.len(), found.warnings.len()), (1, 0, 1));
+    }
+
+    #[test]
+    fn a_metrics_file_without_a_row_is_an_error_by_itself_and_a_young_run_in_its_directory() {
+        let dir = tempfile::tempdir().unwrap();
+        let file = dir.path().join("metrics.jsonl");
+        for content in ["", "\u{1b}[31mred\n"] {
+            write(&file, content);
+            assert!(matches!(find(&[file.clone()]), Err(Error::NoRow { .. })), "{content:?}");
+            assert!(find(&[dir.path().to_owned()]).unwrap().runs[0].rows.is_empty());
+        }
+    }
+
+    #[test]
+    fn a_result_that_may_have_no_end_is_not_read() {
+        let error = HeldOut::load(Path::new("/dev/zero")).unwrap_err();
+        assert!(matches!(error, Error::Io { .. }), "{error:?}");
     }
 
     #[test]

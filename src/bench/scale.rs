@@ -17,7 +17,7 @@ use tandem_learner::Clock;
 use super::Figure;
 use crate::cli::ScaleArgs;
 use crate::exit::{Exit, Failed, OrExit as _};
-use crate::{clock, descriptors, services};
+use crate::{clock, descriptors, output, services};
 use children::{Place, Service};
 use idle::Crowd;
 use row::{Reading, Rounds, Row, Scale};
@@ -164,7 +164,6 @@ impl IdleStage<'_> {
     }
 }
 
-#[expect(clippy::print_stderr, reason = "what is under way, for those who wait")]
 fn say(what: &str) {
-    eprintln!("scale: {what}");
+    output::message(format_args!("scale: {what}"));
 }

@@ -8,6 +8,7 @@ use tandem_kinematics::{ArmWayPoint, WayPoint};
 use tandem_proto::pb;
 
 use crate::exit::{Exit, Failed, OrExit as _};
+use crate::input;
 
 /// Time between way points of the training world, seconds.
 const STEP_S: f64 = 0.04;
@@ -64,14 +65,13 @@ pub(super) fn write(path: &Path, speed: f64, way_points: &[WayPoint]) -> Result<
     let way_points: Vec<Vec<Value>> =
         way_points.iter().map(|arms| arms.iter().map(arm).collect()).collect();
     let text = json!({ "speed": speed, "way_points": way_points }).to_string();
-    std::fs::write(path, text + "\n")
-        .or_exit(Exit::TryAgain, || format!("cannot write {}", path.display()))
+    std::fs::write(path, text + "\n").or_cannot_write(|| format!("cannot write {}", path.display()))
 }
 
 /// The motion in the file `path`, at `speed` when it is given.
 pub(super) fn read(path: &Path, speed: Option<f64>) -> Result<pb::MotionRequest, Failed> {
     let cannot_read = || format!("cannot read {path:?}");
-    let text = std::fs::read_to_string(path).or_exit(Exit::Data, cannot_read)?;
+    let text = input::text(path).or_exit(Exit::Data, cannot_read)?;
     let not_a_motion = || format!("{path:?} does not hold a motion");
     let file: MotionFile = serde_json::from_str(&text).or_exit(Exit::Data, not_a_motion)?;
     let speed = speed.unwrap_or(file.speed);

@@ -11,7 +11,7 @@ use tonic::{Code, Response, Status};
 use super::show;
 use crate::cli::{ConnectArgs, OperatorArgs};
 use crate::exit::{Exit, Failed, OrExit as _};
-use crate::{access, services};
+use crate::{access, output, services};
 
 /// How long a call may take.
 const DEADLINE: Duration = Duration::from_secs(10);
@@ -66,49 +66,45 @@ pub(super) async fn release(client: &mut Client, token: String) {
     answer(client.release(pb::ReleaseRequest { token })).await.ok();
 }
 
-#[expect(clippy::print_stdout, reason = "what the command is for")]
 pub(super) fn status(args: &OperatorArgs) -> Result<(), Failed> {
     with_client(&args.connect, async |mut client: Client| {
         let status = answer(client.status(pb::BridgeStatusRequest {})).await?;
         if args.json {
-            println!("{}", show::status_json(&status));
+            output::print(show::status_json(&status))?;
         } else {
-            show::status_lines(&status).iter().for_each(|line| println!("{line}"));
+            show::status_lines(&status).iter().try_for_each(output::print)?;
         }
         Ok(())
     })
 }
 
-#[expect(clippy::print_stdout, reason = "what the command is for")]
 pub(super) fn describe(args: &OperatorArgs) -> Result<(), Failed> {
     with_client(&args.connect, async |mut client: Client| {
         let told = answer(client.describe(pb::DescribeBridgeRequest {})).await?;
         if args.json {
-            println!("{}", show::description_json(&told));
+            output::print(show::description_json(&told))?;
         } else {
-            show::description_lines(&told).iter().for_each(|line| println!("{line}"));
+            show::description_lines(&told).iter().try_for_each(output::print)?;
         }
         Ok(())
     })
 }
 
-#[expect(clippy::print_stdout, reason = "what the command is for")]
 pub(super) fn stop(args: &OperatorArgs) -> Result<(), Failed> {
     with_client(&args.connect, async |mut client: Client| {
         let stopped = answer(client.stop(pb::StopRequest {})).await?.stopped;
         if args.json {
-            println!("{}", json!({"stopped": stopped.as_ref().map(show::stop_json)}));
+            output::print(json!({"stopped": stopped.as_ref().map(show::stop_json)}))?;
         } else {
-            println!("stopped");
+            output::print("stopped")?;
             if let Some(stop) = stopped.filter(|stop| stop.name != "requested") {
-                println!("they were stopped before: {}", stop.sentence);
+                output::print(format_args!("they were stopped before: {}", stop.sentence))?;
             }
         }
         Ok(())
     })
 }
 
-#[expect(clippy::print_stdout, reason = "what the command is for")]
 pub(super) fn reset(args: &OperatorArgs) -> Result<(), Failed> {
     with_client(&args.connect, async |mut client: Client| {
         let token = acquire(&mut client).await?;
@@ -116,9 +112,9 @@ pub(super) fn reset(args: &OperatorArgs) -> Result<(), Failed> {
         release(&mut client, token).await;
         reset?;
         if args.json {
-            println!("{}", json!({"reset": true}));
+            output::print(json!({"reset": true}))?;
         } else {
-            println!("reset: the arms stay where they are until a motion begins");
+            output::print("reset: the arms stay where they are until a motion begins")?;
         }
         Ok(())
     })

@@ -15,7 +15,7 @@ use super::operator::{Client, acquire, answer, failed, release, with_client};
 use super::{file, show};
 use crate::cli::MoveArgs;
 use crate::exit::{Exit, Failed, OrExit as _};
-use crate::signals;
+use crate::{output, signals};
 
 /// Time from one sign of life to the next: the bridge wants one every 100 ms.
 const SIGN: Duration = Duration::from_millis(40);
@@ -24,16 +24,15 @@ const SILENCE: Duration = Duration::from_secs(5);
 /// Seconds of a motion's own time between two plain lines.
 const PLAIN_EVERY_S: f64 = 1.0;
 
-#[expect(clippy::print_stdout, reason = "what the command is for")]
 pub(super) fn play(args: &MoveArgs) -> Result<(), Failed> {
     let motion = file::read(&args.file, args.speed)?;
     with_client(&args.connect, async |mut client: Client| {
         let accepted = check(&mut client, &motion, args.json).await?;
         if args.check_only {
             if args.json {
-                println!("{}", json!({"accepted": show::accepted_json(&accepted)}));
+                output::print(json!({"accepted": show::accepted_json(&accepted)}))?;
             } else {
-                println!("accepted: {}", accepted_line(&accepted));
+                output::print(format_args!("accepted: {}", accepted_line(&accepted)))?;
             }
             return Ok(());
         }
@@ -49,16 +48,15 @@ pub(super) fn play(args: &MoveArgs) -> Result<(), Failed> {
         watched.close();
         let last = done?;
         if args.json {
-            println!("{}", json!({"done": true, "progress": show::progress_json(&last)}));
+            output::print(json!({"done": true, "progress": show::progress_json(&last)}))?;
         } else {
-            println!("done");
+            output::print("done")?;
         }
         Ok(())
     })
 }
 
 /// The motion as the bridge accepts it.
-#[expect(clippy::print_stdout, reason = "the JSON object of a refusal")]
 async fn check(
     client: &mut Client,
     motion: &pb::MotionRequest,
@@ -70,7 +68,7 @@ async fn check(
         Some(Verdict::Accepted(accepted)) => Ok(accepted),
         Some(Verdict::Refused(refused)) => {
             if as_json {
-                println!("{}", json!({"refused": show::refusal_json(&refused)}));
+                output::print(json!({"refused": show::refusal_json(&refused)}))?;
             }
             let what = anyhow::anyhow!("the motion is refused: {}", refused.sentence);
             Err(Failed::new(Exit::Data, what))
@@ -163,14 +161,13 @@ async fn watch(
 }
 
 /// Stops the arms and says whether that was heard.
-#[expect(clippy::print_stderr, reason = "what a person has to know before leaving")]
 async fn interrupt(client: &mut Client) -> Failed {
     match answer(client.stop(pb::StopRequest {})).await {
-        Ok(_) => eprintln!("tandem: interrupted: the arms are stopped"),
-        Err(failed) => eprintln!(
+        Ok(_) => output::message("tandem: interrupted: the arms are stopped"),
+        Err(failed) => output::message(format_args!(
             "tandem: interrupted, and the arms could NOT be stopped, use the emergency stop: {:#}",
             failed.into_error()
-        ),
+        )),
     }
     Failed::new(Exit::Interrupted, anyhow::anyhow!("interrupted"))
 }
@@ -208,11 +205,10 @@ impl Watched {
         Self { bar, told_s: f64::NEG_INFINITY, phase: pb::BridgePhase::Unspecified }
     }
 
-    #[expect(clippy::print_stderr, reason = "what a person watches")]
     fn say(&self, line: &str) {
         match &self.bar {
-            Some(bar) => bar.println(line),
-            None => eprintln!("{line}"),
+            Some(bar) => bar.println(output::escaped(line)),
+            None => output::message(line),
         }
     }
 

@@ -23,6 +23,7 @@ use crate::cli::{ModeName, RecordName, TrialArgs};
 use crate::eval::task;
 use crate::exit::{Exit, Failed, OrExit as _};
 use crate::files::load_policy;
+use crate::output;
 
 /// Density of the blocks, kilograms per cubic metre: a block of 5.6 cm has 0.12 kg.
 const DENSITY_KGPM3: f32 = 683.3;
@@ -61,10 +62,10 @@ pub(crate) fn trial(args: &TrialArgs) -> Result<(), Failed> {
     let out = args.out.clone().unwrap_or_else(|| PathBuf::from(format!("runs/trial-{task}")));
     for directory in ["mcap", "motions"] {
         std::fs::create_dir_all(out.join(directory))
-            .or_exit(Exit::TryAgain, || format!("cannot create {}", out.display()))?;
+            .or_cannot_write(|| format!("cannot create {}", out.display()))?;
     }
     let file = out.join(TRIALS_FILE);
-    let mut log = TrialsLog::create(&file).or_exit(Exit::TryAgain, String::new)?;
+    let mut log = TrialsLog::create(&file).or_cannot_write(String::new)?;
     let mut all = Vec::new();
     for subject in &subjects {
         for mode in modes {
@@ -202,7 +203,7 @@ impl Series<'_> {
         rows.par_iter().filter(|row| row.log.is_some()).try_for_each(|row| {
             let Some(name) = &row.log else { return Ok(()) };
             let recorder = TrialRecorder::create(&out.join(name), &self.metadata(row.trial))
-                .or_exit(Exit::TryAgain, String::new)?;
+                .or_cannot_write(String::new)?;
             let mut recording = Recording { recorder, failure: None };
             let mut trials = self.trials()?;
             attempt(&mut trials, &mut actor.clone(), row.trial, &mut recording)?;
@@ -336,23 +337,26 @@ fn failed(error: TrialError, number: u64) -> Failed {
     Failed::new(exit, anyhow::Error::new(error).context(format!("trial {number}")))
 }
 
-#[expect(clippy::print_stdout, reason = "what the command is for")]
 fn show(args: &TrialArgs, rows: Vec<TrialRow>, file: &Path) -> Result<(), Failed> {
     let trials = tandem_report::Trials::of(rows);
     let page = file.with_file_name("report.html");
     let nothing = Comparison::of(Vec::new(), Vec::new());
-    let written = report_html(&nothing, &trials, Pictured::Failures, &page)
-        .or_exit(Exit::TryAgain, String::new)?;
+    let written =
+        report_html(&nothing, &trials, Pictured::Failures, &page).or_cannot_write(String::new)?;
     if args.json {
         let mut value = json!({ "trials": tandem_report::trials::json(&trials) });
         value["file"] = json!(file);
         value["report"] = json!(written.page);
-        println!("{value}");
+        output::print(value)?;
         return Ok(());
     }
-    println!("{}", trials.text());
-    println!("trials        {}", file.display());
-    println!("report        {}, {} pictures beside it", page.display(), written.figures.len());
+    output::print(trials.text())?;
+    output::print(format_args!("trials        {}", file.display()))?;
+    output::print(format_args!(
+        "report        {}, {} pictures beside it",
+        page.display(),
+        written.figures.len()
+    ))?;
     Ok(())
 }
 

@@ -9,6 +9,7 @@ use indicatif::{HumanCount, MultiProgress, ProgressBar, ProgressStyle};
 use serde_json::Value;
 
 use super::child::last_line;
+use crate::output;
 
 /// Enough of a log's end for its last line.
 const TAIL_BYTES: u64 = 4096;
@@ -63,17 +64,16 @@ impl Display {
     pub(super) fn refresh(&self) {
         for Running { name, log, line } in self.live.iter().flat_map(|live| &live.running) {
             if let Some(said) = tail(log).as_deref().and_then(last_line) {
-                line.set_message(format!("{name}: {said}"));
+                line.set_message(output::escaped(&format!("{name}: {said}")));
             }
         }
     }
 
     /// Prints one line that stays.
-    #[expect(clippy::print_stderr, reason = "what a person watches")]
     pub(super) fn say(&self, line: &str) {
         match &self.live {
-            Some(live) => drop(live.all.println(line)),
-            None => eprintln!("{line}"),
+            Some(live) => drop(live.all.println(output::escaped(line))),
+            None => output::message(line),
         }
     }
 

@@ -9,43 +9,29 @@ use tandem_learner::RunConfig;
 use toml::{Table, Value};
 
 use crate::exit::{Exit, Failed, OrExit as _};
-use crate::run_file;
+use crate::{input, run_file};
 
 /// More runs than anybody waits for are a slip.
 const MAX_RUNS: usize = 10_000;
 
-/// A sweep file as it is written.
-#[derive(Debug, Clone, PartialEq, Deserialize)]
+/// A sweep file as it is written. A list that is there has entries.
+#[derive(Debug, Clone, PartialEq, Default, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 struct SweepFile {
     /// Tasks; without any the one of `[run]`.
-    tasks: Vec<String>,
+    tasks: Option<Vec<String>>,
     /// Values of `advice.strategy`; each is a column of the sweep, as each variant is.
-    strategies: Vec<String>,
+    strategies: Option<Vec<String>>,
     /// Seeds; without any the one of `[run]`.
-    seeds: Vec<u64>,
+    seeds: Option<Vec<u64>>,
     /// Further settings to combine: a table each, with one setting and its list of values.
-    axis: Vec<Table>,
+    axis: Option<Vec<Table>>,
     /// Named sets of settings, laid over `[run]`.
-    variant: Vec<Variant>,
+    variant: Option<Vec<Variant>>,
     /// Settings of all runs, as in a run file.
     run: Table,
     /// A teacher's policy file for each task; without one the teacher that ships.
     teachers: BTreeMap<String, PathBuf>,
-}
-
-impl Default for SweepFile {
-    fn default() -> Self {
-        Self {
-            tasks: Vec::new(),
-            strategies: Vec::new(),
-            seeds: Vec::new(),
-            axis: Vec::new(),
-            variant: Vec::new(),
-            run: Table::new(),
-            teachers: BTreeMap::new(),
-        }
-    }
 }
 
 #[derive(Debug, Clone, PartialEq, Deserialize)]
@@ -77,17 +63,17 @@ struct Choice {
 /// Reads the sweep file `path`: its runs in the order in which they are made, seeds outermost, so that a sweep that is
 /// stopped early has one seed of everything.
 pub(super) fn read(path: &Path) -> Result<Vec<PlannedRun>, Failed> {
-    let told = || format!("sweep file {}", path.display());
-    let text =
-        std::fs::read_to_string(path).context("cannot be read").or_exit(Exit::Usage, told)?;
+    let told = || format!("sweep file {path:?}");
+    let text = input::text(path).context("cannot be read").or_exit(Exit::Usage, told)?;
     runs(&text).or_exit(Exit::Usage, told)
 }
 
 /// Every combination that `text` lists.
 fn runs(text: &str) -> anyhow::Result<Vec<PlannedRun>> {
     let file: SweepFile = toml::from_str(text).map_err(|error| in_one_line(text, &error))?;
+    refuse_nothing(&file)?;
     let base = flattened(&file.run);
-    let (tasks, seeds) = (tasks(&file), choices("seed", file.seeds.iter().map(whole)));
+    let (tasks, seeds) = (tasks(&file), choices("seed", listed(&file.seeds).iter().map(whole)));
     let (columns, axes) = (columns(&file, &base)?, axes(&file)?);
     let n_runs = [tasks.len(), seeds.len(), columns.len(), axes.len()].iter().product::<usize>();
     ensure!(n_runs <= MAX_RUNS, "lists {n_runs} runs: expected at most {MAX_RUNS}");
@@ -103,6 +89,27 @@ fn runs(text: &str) -> anyhow::Result<Vec<PlannedRun>> {
     }
     refuse_equal_names(&runs)?;
     Ok(runs)
+}
+
+/// Refuses a file that says nothing and lists without entries: what they stand for would be one run.
+fn refuse_nothing(file: &SweepFile) -> anyhow::Result<()> {
+    ensure!(
+        *file != SweepFile::default(),
+        "is empty: expected lists to combine, such as seeds = [1, 2]"
+    );
+    let lengths = [
+        ("tasks", file.tasks.as_ref().map(Vec::len)),
+        ("strategies", file.strategies.as_ref().map(Vec::len)),
+        ("seeds", file.seeds.as_ref().map(Vec::len)),
+        ("axis", file.axis.as_ref().map(Vec::len)),
+        ("variant", file.variant.as_ref().map(Vec::len)),
+    ];
+    match lengths.iter().find(|(_, length)| *length == Some(0)) {
+        Some((key, _)) => {
+            bail!("{key} is an empty list: expected at least one entry, or no {key} at all")
+        }
+        None => Ok(()),
+    }
 }
 
 fn planned(
@@ -142,8 +149,13 @@ fn refuse_equal_names(runs: &[PlannedRun]) -> anyhow::Result<()> {
     }
 }
 
+/// The entries of a list that may be left out.
+fn listed<T>(list: &Option<Vec<T>>) -> &[T] {
+    list.as_deref().unwrap_or_default()
+}
+
 fn tasks(file: &SweepFile) -> Vec<Choice> {
-    choices("task", file.tasks.iter().cloned().map(Value::String))
+    choices("task", listed(&file.tasks).iter().cloned().map(Value::String))
 }
 
 /// A choice for each value of `key`; where there is none, one that chooses nothing.
@@ -163,21 +175,20 @@ fn or_nothing(choices: Vec<Choice>) -> Vec<Choice> {
 /// Strategies, then variants.
 fn columns(file: &SweepFile, base: &[(String, Value)]) -> anyhow::Result<Vec<Choice>> {
     const STRATEGY: &str = "advice.strategy";
-    if !file.strategies.is_empty()
+    if file.strategies.is_some()
         && base.iter().any(|(key, _)| key == STRATEGY)
-        && file.variant.is_empty()
+        && file.variant.is_none()
     {
         bail!("{STRATEGY} stands in [run] and in `strategies`: expected one of them");
     }
-    let mut columns: Vec<Choice> = file
-        .strategies
+    let mut columns: Vec<Choice> = listed(&file.strategies)
         .iter()
         .map(|strategy| Choice {
             name: named(strategy),
             settings: vec![(STRATEGY.to_owned(), Value::String(strategy.clone()))],
         })
         .collect();
-    for Variant { name, set } in &file.variant {
+    for Variant { name, set } in listed(&file.variant) {
         ensure!(!name.is_empty(), "a variant has no name");
         columns.push(Choice { name: name.clone(), settings: flattened(set) });
     }
@@ -187,7 +198,7 @@ fn columns(file: &SweepFile, base: &[(String, Value)]) -> anyhow::Result<Vec<Cho
 /// Every combination of the axes' values; each adds `-KEY-VALUE` to the name, the key without its section.
 fn axes(file: &SweepFile) -> anyhow::Result<Vec<Choice>> {
     let mut combinations = or_nothing(Vec::new());
-    for axis in &file.axis {
+    for axis in listed(&file.axis) {
         let [(key, Value::Array(values))] = &flattened(axis)[..] else {
             let held = axis.to_string().trim().replace('\n', ", ");
             bail!("[[axis]] holds {held}: expected one setting with a list of values");

@@ -7,6 +7,7 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context as _, anyhow};
 use serde_json::Value as Json;
 use tandem_learner::{RunConfig, checkpoint};
+use tandem_telemetry::read_regular;
 use toml::{Table, Value};
 
 use super::file::{PlannedRun, flattened};
@@ -132,9 +133,9 @@ fn written(value: &Value) -> String {
 /// Whether the run's copy of its teacher is the teacher that the sweep file names.
 fn same_teacher(run: &PlannedRun, dir: &Path) -> bool {
     let Some(teacher) = &run.teacher else { return true };
-    let copy = std::fs::read(dir.join("policy/teacher.safetensors"));
+    let copy = read_regular(&dir.join("policy/teacher.safetensors"));
     // A file that is missing is reported by the run itself.
-    let named = std::fs::read(teacher);
+    let named = read_regular(teacher);
     copy.ok().zip(named.ok()).is_none_or(|(copy, named)| copy == named)
 }
 

@@ -7,6 +7,7 @@ use indicatif::{MultiProgress, ProgressBar, ProgressStyle};
 use tandem_proto::pb;
 
 use super::plan::Plan;
+use crate::output;
 
 /// Seconds of run time between two plain lines without news.
 const PLAIN_EVERY_S: f64 = 30.0;
@@ -84,11 +85,10 @@ impl Display {
     }
 
     /// Prints one line that stays.
-    #[expect(clippy::print_stderr, reason = "what a person watches")]
     pub(crate) fn say(&self, line: &str) {
         match &self.live {
-            Some(live) => drop(live.all.println(line)),
-            None => eprintln!("{line}"),
+            Some(live) => drop(live.all.println(output::escaped(line))),
+            None => output::message(line),
         }
     }
 

@@ -6,7 +6,7 @@ use tandem_learner::RunConfig;
 use toml::Value;
 
 use crate::cli::{RecipeName, TrainArgs};
-use crate::exit::{Exit, Failed, OrExit as _};
+use crate::exit::{Failed, OrExit as _};
 use crate::{eval, files, run_file};
 
 /// A run that can be started.
@@ -58,12 +58,12 @@ impl Plan {
             return Err(Failed::usage(format!("{} holds no run to go on with", out.display())));
         }
         let failed = || format!("cannot write to {}", out.display());
-        std::fs::create_dir_all(out.join("policy")).or_exit(Exit::TryAgain, failed)?;
+        std::fs::create_dir_all(out.join("policy")).or_cannot_write(failed)?;
         run_file::save(&self.config, &self.run_file())?;
         if let Some(teacher) = &self.teacher
             && *teacher != self.teacher_copy()
         {
-            std::fs::copy(teacher, self.teacher_copy()).or_exit(Exit::TryAgain, failed)?;
+            std::fs::copy(teacher, self.teacher_copy()).or_cannot_write(failed)?;
         }
         Ok(())
     }

@@ -13,13 +13,13 @@ use super::plan::Plan;
 use crate::eval::{Measured, Subject, measure};
 use crate::exit::{Exit, Failed, OrExit as _};
 use crate::files::load_policy;
+use crate::output;
 
 /// Held-out goals on which the best policy is judged at the end; no run chooses by them.
 const REPORT_SEED: u64 = 777;
 const REPORT_EPISODES: u64 = 240;
 
 /// Judges the best policy on held-out goals, draws the curve, and prints where everything lies.
-#[expect(clippy::print_stdout, reason = "the result of the command")]
 pub(super) fn print(
     plan: &Plan,
     last: &pb::Progress,
@@ -30,54 +30,78 @@ pub(super) fn print(
     let measured = measure(&Subject::Policy(load_policy(&path)?), REPORT_EPISODES, REPORT_SEED)?;
     let rows =
         MetricsLog::read_all(&plan.out.join("metrics.jsonl")).or_exit(Exit::Data, String::new)?;
-    let curve = draw_curve(plan, &rows)?;
-    let report = tandem_report::run_report_html(&plan.out).or_exit(Exit::TryAgain, String::new)?;
-    if as_json {
-        println!("{}", summary_json(plan, last, memory, &measured));
-        return Ok(());
-    }
-    println!("done: {}", last.end_reason);
-    println!(
-        "best policy on {REPORT_EPISODES} held-out goals (seed {REPORT_SEED}), alone: no noise, no advice"
-    );
-    measured.lines().iter().for_each(|line| println!("  {line}"));
-    println!(
-        "training      {} env steps, {} updates, {} rounds in {}",
-        grouped(last.env_steps),
-        grouped(last.updates),
-        last.round,
-        clock_text(last.wall_s)
-    );
-    println!(
-        "advice        {} spent, {} left",
-        grouped(last.advice_spent),
-        grouped(last.budget_left)
-    );
-    println!(
-        "memory        learner {} MiB, teacher {} MiB, workers at most {} MiB",
-        memory.learner_mib, memory.teacher_mib, memory.worker_mib
-    );
-    println!("policy        {}", path.display());
-    println!("curve         {}", curve.display());
-    println!("report        {}", report.display());
-    println!("logs          {}, {}", plan.out.join("mcap").display(), plan.log_path().display());
-    println!("digest        {}", last.digest);
-    Ok(())
+    let drawn = Drawn {
+        curve: draw_curve(plan, &rows)?,
+        report: tandem_report::run_report_html(&plan.out).or_cannot_write(String::new)?,
+    };
+    let summary = match as_json {
+        true => summary_json(plan, last, memory, &measured).to_string(),
+        false => summary_lines(plan, last, memory, &measured, &drawn).join("\n"),
+    };
+    let saved = || format!("the run is complete and saved in {}", plan.out.display());
+    output::print(summary).map_err(|failed| failed.context(saved()))
+}
+
+/// The pictures of a run that has ended.
+struct Drawn {
+    curve: PathBuf,
+    report: PathBuf,
+}
+
+fn summary_lines(
+    plan: &Plan,
+    last: &pb::Progress,
+    memory: Memory,
+    measured: &Measured,
+    drawn: &Drawn,
+) -> Vec<String> {
+    let mut lines = vec![
+        format!("done: {}", last.end_reason),
+        format!(
+            "best policy on {REPORT_EPISODES} held-out goals (seed {REPORT_SEED}), alone: no noise, no advice"
+        ),
+    ];
+    lines.extend(measured.lines().iter().map(|line| format!("  {line}")));
+    lines.extend([
+        format!(
+            "training      {} env steps, {} updates, {} rounds in {}",
+            grouped(last.env_steps),
+            grouped(last.updates),
+            last.round,
+            clock_text(last.wall_s)
+        ),
+        format!(
+            "advice        {} spent, {} left",
+            grouped(last.advice_spent),
+            grouped(last.budget_left)
+        ),
+        format!(
+            "memory        learner {} MiB, teacher {} MiB, workers at most {} MiB",
+            memory.learner_mib, memory.teacher_mib, memory.worker_mib
+        ),
+        format!("policy        {}", plan.best_policy().display()),
+        format!("curve         {}", drawn.curve.display()),
+        format!("report        {}", drawn.report.display()),
+        format!("logs          {}, {}", plan.out.join("mcap").display(), plan.log_path().display()),
+        format!("digest        {}", last.digest),
+    ]);
+    lines
 }
 
 /// Says how to go on with an interrupted run.
-#[expect(clippy::print_stderr, reason = "the line that resumes")]
 pub(super) fn interrupted(plan: &Plan) {
     let out = plan.out.display();
     let saved = tandem_learner::checkpoint::list(&plan.out.join("checkpoint"));
     let round = saved.last().and_then(|path| path.file_stem()?.to_str()?.parse::<u64>().ok());
     match round {
         Some(round) => {
-            eprintln!("interrupted; the state after round {round} is saved. Go on with:");
+            output::message(format_args!(
+                "interrupted; the state after round {round} is saved. Go on with:"
+            ));
         }
-        None => eprintln!("interrupted before anything was saved. Start over with:"),
+        None => output::message("interrupted before anything was saved. Start over with:"),
     }
-    eprintln!("  tandem train --resume --out {out}");
+    output::message(format_args!("  tandem train --resume --out {out}"));
 }
 
 /// Draws success against environment steps into the run directory.
@@ -88,8 +112,7 @@ fn draw_curve(plan: &Plan, rows: &[MetricsRow]) -> Result<PathBuf, Failed> {
     let options = CurveOptions::shares("Success of the policy alone", Axis::EnvSteps);
     let svg = tandem_report::curve_svg(&[series], &options).or_exit(Exit::Bug, String::new)?;
     let path = plan.out.join("curve.svg");
-    std::fs::write(&path, svg)
-        .or_exit(Exit::TryAgain, || format!("cannot write {}", path.display()))?;
+    std::fs::write(&path, svg).or_cannot_write(|| format!("cannot write {}", path.display()))?;
     Ok(path)
 }
 

@@ -12,6 +12,7 @@ use tracing_subscriber::layer::{Layer as _, SubscriberExt as _};
 use tracing_subscriber::util::SubscriberInitExt as _;
 
 use crate::error::Error;
+use crate::standard_error::Events;
 
 /// Where log lines go and which ones.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
@@ -24,7 +25,7 @@ pub struct LogConfig {
     pub directives: Option<String>,
 }
 
-/// Sends the log lines of this process where `config` says.
+/// Sends the log lines of this process where `config` says. Lines that cannot be written are dropped.
 ///
 /// # Errors
 /// When the file cannot be opened, the directives are malformed or logging is already set up.
@@ -32,7 +33,7 @@ pub fn init(config: &LogConfig) -> Result<(), Error> {
     let console = match config.console {
         Some(level) => {
             let layer = fmt::layer()
-                .with_writer(std::io::stderr)
+                .with_writer(Events::default)
                 .with_ansi(std::io::stderr().is_terminal());
             Some(layer.with_filter(filter(level, config)?))
         }

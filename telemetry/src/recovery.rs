@@ -10,6 +10,7 @@ use mcap::records::Record;
 use crate::error::Error;
 use crate::log_file::write_options;
 use crate::records::Records;
+use crate::whole_file::read_regular;
 
 /// What [`recover`] saved.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
@@ -30,7 +31,7 @@ pub struct RecoveredCounts {
 /// # Errors
 /// When `source` cannot be read or does not begin like an MCAP file, or `destination` cannot be written.
 pub fn recover(source: &Path, destination: &Path) -> Result<RecoveredCounts, Error> {
-    let bytes = std::fs::read(source).map_err(Error::io("read", source))?;
+    let bytes = read_regular(source).map_err(Error::io("read", source))?;
     if !bytes.starts_with(mcap::MAGIC) {
         return Err(Error::ReadLog { path: source.to_owned(), source: McapError::BadMagic });
     }

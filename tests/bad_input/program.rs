@@ -108,12 +108,14 @@ fn prepare(directory: &Path) {
         fs::write(directory.join(name), bytes).expect("written");
     }
     fs::create_dir(directory.join("folder")).expect("created");
+    let made = Command::new("mkfifo").arg(directory.join("pipe")).status();
+    assert!(made.expect("mkfifo runs").success());
 }
 
 /// Command lines, the exit codes they end with, and a word of what is said. `@name` stands for a file or a directory
 /// of those prepared, `@empty/x` for a place that cannot be written, `%name` for a policy that ships, `BUSY` for an
 /// address that is taken.
-const CASES: [(&str, i32, &str); 62] = [
+const CASES: [(&str, i32, &str); 74] = [
     ("", 64, "Usage"),
     ("dance", 64, "dance"),
     ("--log [[ policy show %teacher-push", 64, "[["),
@@ -141,7 +143,7 @@ const CASES: [(&str, i32, &str); 62] = [
     ("train --teacher @torn", 65, "torn"),
     ("train --teacher %student-push", 64, "drives 2 arms"),
     ("train --teacher %teacher-pick-and-place", 64, "pick-and-place"),
-    ("train --out @empty/x", 75, "empty/x"),
+    ("train --out @empty/x", 64, "empty/x"),
     ("eval", 64, "--policy"),
     ("eval --policy @missing", 65, "missing"),
     ("eval --policy @folder", 65, "folder"),
@@ -150,8 +152,8 @@ const CASES: [(&str, i32, &str); 62] = [
     ("eval --policy @altered", 65, "digest"),
     ("eval --policy %teacher-push --arms 2", 64, "1 arm"),
     ("eval --policy %teacher-push --episodes 0", 64, "episodes"),
-    ("eval --policy %teacher-push --episodes 1 --record @empty/x.mcap", 75, "x.mcap"),
-    ("eval --policy %teacher-push --episodes 1 --record-dir @empty/x", 75, "empty/x"),
+    ("eval --policy %teacher-push --episodes 1 --record @empty/x.mcap", 64, "x.mcap"),
+    ("eval --policy %teacher-push --episodes 1 --record-dir @empty/x", 64, "empty/x"),
     ("eval --composed-teachers %student-push", 64, "a teacher drives one"),
     ("teacher", 64, "--policy"),
     ("teacher --policy @missing", 65, "missing"),
@@ -166,7 +168,7 @@ const CASES: [(&str, i32, &str); 62] = [
         "cannot listen",
     ),
     ("learner --run @advised.toml --out @out", 64, "teacher"),
-    ("learner --run @advised.toml --out @empty/x --teacher 127.0.0.1:1", 75, "empty/x"),
+    ("learner --run @advised.toml --out @empty/x --teacher 127.0.0.1:1", 64, "empty/x"),
     ("worker", 64, "--connect"),
     ("policy show @missing", 65, "missing"),
     ("policy show @folder --json", 65, "folder"),
@@ -178,8 +180,20 @@ const CASES: [(&str, i32, &str); 62] = [
     ("replay @missing", 65, "missing"),
     ("replay @folder", 65, "no *.mcap"),
     ("replay @empty --verify", 65, "empty"),
-    ("picture --policy %teacher-push --out @empty/x.svg", 75, "x.svg"),
+    ("picture --policy %teacher-push --out @empty/x.svg", 64, "x.svg"),
     ("bench dance", 64, "dance"),
+    ("train --teacher /dev/zero", 65, "\"/dev/zero\": it is not a regular file"),
+    ("train --run /dev/zero", 64, "it has more than 16 MiB"),
+    ("eval --policy @pipe", 65, "it is not a regular file"),
+    ("eval --policy %teacher-push --episodes 1 --record @pipe", 64, "it is not a regular file"),
+    ("replay @pipe", 65, "it is not a regular file"),
+    ("mcap recover @pipe --to @mended", 65, "it is not a regular file"),
+    ("report @empty", 65, "no metrics row"),
+    ("report @garbage", 65, "no metrics row"),
+    ("bridge move /dev/zero", 65, "it has more than 16 MiB"),
+    ("health 127.0.0.1:1 --tls-ca /dev/zero", 64, "it has more than 16 MiB"),
+    ("sweep @empty --dry-run", 64, "is empty"),
+    ("sweep /dev/null --dry-run", 64, "is empty"),
 ];
 
 #[test]
@@ -209,4 +223,39 @@ fn what_cannot_be_used_is_said_in_one_line() {
         assert!(told.len() < 3000, "{line}: {} bytes", told.len());
     }
     assert!(!directory.path().join("mended").exists(), "nothing was made of garbage");
+}
+
+#[test]
+fn a_pipe_that_nobody_writes_to_is_not_waited_for_without_end() {
+    let directory = tempfile::tempdir().expect("a directory");
+    prepare(directory.path());
+    let pipe = directory.path().join("pipe").display().to_string();
+    let policy = shipped("teacher-push");
+    let lines: [&[&str]; 3] = [
+        &["train", "--run", &pipe],
+        &["sweep", &pipe],
+        &["teacher", "--policy", &policy, "--ledger", "memory", "--token-file", &pipe],
+    ];
+    let start = |args: &&[&str]| {
+        let mut command = command(args, directory.path());
+        command.stdout(Stdio::null()).stderr(Stdio::piped()).spawn().expect("starts")
+    };
+    for child in lines.iter().map(start).collect::<Vec<_>>() {
+        let ended = child.wait_with_output().expect("ends");
+        let told = String::from_utf8_lossy(&ended.stderr).into_owned();
+        assert_eq!(ended.status.code(), Some(64), "{told}");
+        assert!(told.contains("pipe\"") && told.contains("no end of it came"), "{told}");
+    }
+}
+
+#[test]
+fn a_text_may_come_from_a_pipe() {
+    let directory = tempfile::tempdir().expect("a directory");
+    let script = r#"exec "$0" sweep <(printf 'seeds = [1, 2]\n[run]\nstop.max_env_steps = 800\n') --dry-run"#;
+    let mut shell = Command::new("bash");
+    shell.args(["-c", script, env!("CARGO_BIN_EXE_tandem")]).current_dir(directory.path());
+    let output = shell.output().expect("runs");
+    let told = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert!(output.status.success(), "{told}");
+    assert!(String::from_utf8_lossy(&output.stdout).contains("2 runs"), "{told}");
 }

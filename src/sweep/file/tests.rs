@@ -78,12 +78,23 @@ fn what_is_wrong_is_said_in_one_line() {
     check("[[axis]]\n\"ddpg.polyak_keep\" = 0.9", &["axis", "list"]);
     check("[[axis]]\n\"ddpg.polyak\" = [0.9]", &["ddpg.polyak"]);
     check("[[axis]]\nseed = []", &["seed", "empty"]);
+    for key in ["tasks", "strategies", "seeds", "axis", "variant"] {
+        check(&format!("{key} = []"), &[key, "is an empty list"]);
+    }
     check("[[variant]]\nname = \"a/b\"", &["a/b"]);
     check("strategies = [\"ea\"]\n[run.advice]\nstrategy = \"none\"", &["advice.strategy"]);
     let unlimited = runs("[run]\nrecipe = \"paper\"").expect_err("must be refused").to_string();
     assert!(unlimited.contains("max_env_steps"), "{unlimited}");
     let many: Vec<String> = (0..10_001).map(|seed| seed.to_string()).collect();
     check(&format!("seeds = [{}]", many.join(",")), &["10001", "at most"]);
+}
+
+#[test]
+fn a_file_that_says_nothing_is_refused() {
+    for text in ["", "\n\n", "# nothing yet\n"] {
+        let error = runs(text).expect_err("must be refused").to_string();
+        assert!(error.starts_with("is empty: expected"), "{text:?}: {error}");
+    }
 }
 
 #[test]
