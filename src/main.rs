@@ -19,6 +19,7 @@ mod files;
 mod health;
 mod picture;
 mod report;
+mod run_directory;
 mod run_file;
 mod services;
 mod signals;
