@@ -1,5 +1,6 @@
 //! The command line.
 
+use std::ffi::OsString;
 use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::time::Duration;
@@ -100,7 +101,8 @@ Examples:
   tandem train --strategy ea --budget 50000 --seed 2 --max-minutes 20
   tandem train --set ddpg.discount=0.98 --set rounds.slots=16
   tandem train --run my-run.toml --out runs/mine
-  tandem train --resume --out runs/mine               goes on where it stopped")]
+  tandem train --resume --out runs/mine               goes on where it stopped
+  tandem train --resume --out runs/mine --max-env-steps 600000    goes on for longer")]
 pub(crate) struct TrainArgs {
     /// What the arms do [default: push].
     #[arg(long, value_enum)]
@@ -146,7 +148,9 @@ pub(crate) struct TrainArgs {
     /// Run directory [default: runs/TASK-ARMS-STRATEGY-seedN].
     #[arg(long, value_name = "DIR", value_parser = utf8_path())]
     pub(crate) out: Option<PathBuf>,
-    /// Goes on with the run in --out from its newest checkpoint.
+    /// Goes on with the run in --out from its newest checkpoint. Its settings and its teacher stay those that it began
+    /// with; only when it stops (--max-env-steps, --max-minutes, --until-success), checkpoint.*,
+    /// evaluation.recorded_episodes and --workers may change. A refused --resume changes nothing.
     #[arg(long, requires = "out")]
     pub(crate) resume: bool,
     /// Prints the summary as one JSON object on the last line of standard output.
@@ -309,7 +313,7 @@ pub(crate) struct TeacherArgs {
         env = "TANDEM_LEDGER",
         hide_env_values = true
     )]
-    pub(crate) ledger: String,
+    pub(crate) ledger: OsString,
     #[command(flatten)]
     pub(crate) listen: ListenArgs,
     #[command(flatten)]
@@ -335,9 +339,16 @@ pub(crate) struct LearnerArgs {
     /// Run directory.
     #[arg(long, value_name = "DIR")]
     pub(crate) out: PathBuf,
-    /// Goes on from the newest checkpoint.
+    /// Goes on from the newest checkpoint. Of the settings only stop.*, checkpoint.* and evaluation.recorded_episodes
+    /// may differ from those that the run began with.
     #[arg(long)]
     pub(crate) resume: bool,
+    /// Keeps the resolved settings in the run directory's run.toml.
+    #[arg(long, hide = true)]
+    pub(crate) keep_run_file: bool,
+    /// The parent process holds the lock of the run directory.
+    #[arg(long, hide = true)]
+    pub(crate) out_is_locked: bool,
     /// Starts the run, or goes on with it where the run directory holds one: for supervisors, which start a process
     /// that has ended by the same command again. Keeps the resolved settings in the run directory's run.toml. A run
     /// that has ended ends again at once, with exit code 0.

@@ -21,6 +21,7 @@ mod input;
 mod output;
 mod picture;
 mod report;
+mod run_directory;
 mod run_file;
 mod services;
 mod signals;

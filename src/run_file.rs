@@ -39,12 +39,16 @@ pub(crate) fn parse_setting(setting: &str) -> Result<(String, Value), Failed> {
     Ok((key.trim().to_owned(), parse_value(text.trim())))
 }
 
+/// The text of a run file with every setting.
+pub(crate) fn to_text(config: &RunConfig) -> Result<String, Failed> {
+    let text = to_toml(config).or_exit(Exit::Bug, String::new)?;
+    Ok(format!("# tandem {}\n{text}", crate::services::VERSION))
+}
+
 /// Writes the configuration with every setting, whole or not at all.
 pub(crate) fn save(config: &RunConfig, path: &Path) -> Result<(), Failed> {
-    let text = to_toml(config).or_exit(Exit::Bug, String::new)?;
-    let header = format!("# tandem {}\n", crate::services::VERSION);
     let unfinished = path.with_extension("tmp");
-    let written = std::fs::write(&unfinished, header + &text);
+    let written = std::fs::write(&unfinished, to_text(config)?);
     let written = written.and_then(|()| std::fs::rename(&unfinished, path));
     written.or_cannot_write(|| format!("cannot write {}", path.display()))
 }

@@ -1,12 +1,17 @@
 //! The services as subcommands: bind, say where, serve until asked to end.
 
+use std::ffi::OsString;
 use std::future::Future;
 use std::net::SocketAddr;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use anyhow::Context as _;
-use tandem_learner::{AfterTheEnd, Beside, Error as LearnerError, RunConfig};
+use tandem_learner::checkpoint::CheckpointError;
+use tandem_learner::{AfterTheEnd, Beside, Error as LearnerError};
 use tandem_net::{Capacity, Incoming};
+use tandem_teacher::Advisor;
+use tandem_teacher::ledger::SqliteLedger;
+use tandem_teacher::policy::OneArmPolicy;
 use tandem_telemetry::logging::{LevelFilter, LogConfig};
 use tokio::net::TcpListener;
 use tokio::runtime::{Builder, Runtime};
@@ -14,7 +19,7 @@ use tokio_util::sync::CancellationToken;
 
 use crate::cli::{Cli, Command, LearnerArgs, ListenArgs, RelayArgs, TeacherArgs, WorkerArgs};
 use crate::exit::{Exit, Failed, OrExit as _};
-use crate::{access, clock, descriptors, output, run_file, signals};
+use crate::{access, clock, descriptors, output, run_directory, run_file, signals};
 
 /// Version and commit of this program.
 pub(crate) const VERSION: &str = env!("TANDEM_VERSION");
@@ -43,12 +48,22 @@ pub(crate) fn teacher(args: TeacherArgs) -> Result<(), Failed> {
     let gate = access::gate(&args.listen, &args.secret)?;
     run(async move {
         let shutdown = shutdown(args.listen.exit_with_stdin)?;
-        let config = tandem_teacher::Config { policy: args.policy, ledger: args.ledger };
-        let advisor = tandem_teacher::open(&config).map_err(teacher_failed)?;
+        let advisor = advisor(args.policy, args.ledger).map_err(teacher_failed)?;
         let listener = listen(&args.listen).await?;
         let served = tandem_teacher::serve_advisor(advisor, listener, &gate, shutdown).await;
         served.map_err(teacher_failed)
     })
+}
+
+/// The teacher's policy with its ledger; a ledger whose name is not UTF-8 can only be a file.
+fn advisor(policy: PathBuf, ledger: OsString) -> Result<Advisor, tandem_teacher::Error> {
+    match ledger.into_string() {
+        Ok(ledger) => tandem_teacher::open(&tandem_teacher::Config { policy, ledger }),
+        Err(file) => {
+            let policy = OneArmPolicy::load(&policy)?;
+            Advisor::new(Box::new(policy), Box::new(SqliteLedger::open(Path::new(&file))?))
+        }
+    }
 }
 
 pub(crate) fn learner(args: LearnerArgs) -> Result<(), Failed> {
@@ -56,9 +71,9 @@ pub(crate) fn learner(args: LearnerArgs) -> Result<(), Failed> {
     let start_from = args.start_from.as_deref().map(crate::files::load_policy).transpose()?;
     let gate = access::gate(&args.listen, &args.secret)?;
     let dial = access::dial(&args.dial, &args.secret)?;
-    if args.start_or_resume {
-        keep_run_file(&run_config, &args.out)?;
-    }
+    run_directory::check_place(&args.out)?;
+    let keeps_run_file = args.start_or_resume || args.keep_run_file;
+    let run_file = keeps_run_file.then(|| run_file::to_text(&run_config)).transpose()?;
     run(async move {
         let shutdown = shutdown(args.listen.exit_with_stdin)?;
         let beside = beside(&args).await?;
@@ -71,6 +86,8 @@ pub(crate) fn learner(args: LearnerArgs) -> Result<(), Failed> {
             start_from,
             out: args.out,
             resume: args.resume || args.start_or_resume,
+            out_is_locked: args.out_is_locked,
+            run_file,
             n_threads: usize::from(args.threads),
             clock: clock::since_now(),
             version: VERSION.to_owned(),
@@ -84,14 +101,6 @@ pub(crate) fn learner(args: LearnerArgs) -> Result<(), Failed> {
             Ok(())
         }
     })
-}
-
-/// Makes the run directory with the run's settings in it: what reports read, and what `tandem train --resume` goes on
-/// with elsewhere.
-fn keep_run_file(run: &RunConfig, out: &Path) -> Result<(), Failed> {
-    let failed = || format!("cannot write to {}", out.display());
-    std::fs::create_dir_all(out).or_cannot_write(failed)?;
-    run_file::save(run, &out.join("run.toml"))
 }
 
 /// What the command line asks for beside the service.
@@ -171,7 +180,7 @@ pub(crate) async fn listen(args: &ListenArgs) -> Result<Incoming, Failed> {
     Ok(Incoming::from(listener).with_capacity(capacity))
 }
 
-fn teacher_failed(error: tandem_teacher::Error) -> Failed {
+pub(crate) fn teacher_failed(error: tandem_teacher::Error) -> Failed {
     use tandem_teacher::Error as E;
     use tandem_teacher::ledger::OpenError;
     let exit = match &error {
@@ -219,7 +228,8 @@ fn learner_failed(error: LearnerError) -> Failed {
         LearnerError::Config(_)
         | LearnerError::NoTeacher(_)
         | LearnerError::Teacher(_)
-        | LearnerError::StartFrom(_) => Exit::Usage,
+        | LearnerError::StartFrom(_)
+        | LearnerError::Checkpoint(CheckpointError::OtherSettings { .. }) => Exit::Usage,
         LearnerError::Checkpoint(_) => Exit::Data,
         LearnerError::RunDirectory { .. } | LearnerError::Serve(_) => Exit::TryAgain,
         LearnerError::Gate(_) | LearnerError::Address(_) => Exit::Usage,

@@ -1,7 +1,9 @@
 //! `tandem train`: one command that starts learner, teacher and workers as processes, watches them and reports.
 
 mod children;
+mod claim;
 mod display;
+mod in_use;
 mod plan;
 mod restarts;
 mod summary;
@@ -18,8 +20,10 @@ use crate::cli::TrainArgs;
 use crate::exit::{Exit, Failed, OrExit as _};
 use crate::{clock, services, signals};
 use children::{Broken, Children, Memory};
+use claim::Claim;
 use display::Display;
 pub(crate) use display::{counts_line, evaluation_line, grouped};
+use in_use::InUse;
 use plan::Plan;
 pub(crate) use plan::shipped_teacher;
 use watch::Heard;
@@ -35,13 +39,18 @@ const MEASURE_EVERY: Duration = Duration::from_millis(500);
 
 pub(crate) fn train(args: &TrainArgs) -> Result<(), Failed> {
     let plan = Plan::of(args)?;
+    let claim = Claim::take(&plan)?;
+    let quiet = claim.wait_for_former(&plan)?;
     plan.prepare()?;
+    let in_use = InUse::write(&plan)?;
+    drop(quiet);
     let runtime = services::runtime().or_exit(Exit::TryAgain, String::new)?;
     let (last, memory) = runtime.block_on(async {
         let interrupted =
             signals::shutdown_token(args.exit_with_stdin).or_exit(Exit::TryAgain, String::new)?;
-        run(&plan, &interrupted).await
+        run((&plan, &claim), &interrupted).await
     })?;
+    drop(in_use);
     if last.end_reason == INTERRUPTED {
         summary::interrupted(&plan);
         return Err(Failed::new(Exit::Interrupted, anyhow!(INTERRUPTED)));
@@ -54,17 +63,17 @@ const INTERRUPTED: &str = "interrupted";
 
 /// Starts every process, watches until the run has ended, and ends every process.
 async fn run(
-    plan: &Plan,
+    (plan, claim): (&Plan, &Claim),
     interrupted: &CancellationToken,
 ) -> Result<(pb::Progress, Memory), Failed> {
     let mut display = Display::new(plan);
     let mut children = Children::new(plan).or_cannot_write(String::new)?;
     let last = tokio::select! {
-        started = start(plan, &mut children) => started,
+        started = start(plan, &mut children, &display) => started,
         () = interrupted.cancelled() => Ok(()),
     };
     let last = match last {
-        Ok(()) => Watch::new(plan, &mut children, &mut display).follow(interrupted).await,
+        Ok(()) => Watch::new((plan, claim), &mut children, &mut display).follow(interrupted).await,
         Err(broken) => Err(broken),
     };
     display.close();
@@ -89,8 +98,8 @@ async fn run(
 }
 
 /// Starts every process in time.
-async fn start(plan: &Plan, children: &mut Children) -> Result<(), Broken> {
-    let started = tokio::time::timeout(START_DEADLINE, children.start(plan)).await;
+async fn start(plan: &Plan, children: &mut Children, display: &Display) -> Result<(), Broken> {
+    let started = tokio::time::timeout(START_DEADLINE, children.start(plan, display)).await;
     started.unwrap_or_else(|_elapsed| {
         Err(anyhow!("a process did not say in time where it listens").into())
     })
@@ -111,6 +120,7 @@ fn broke_off(plan: &Plan, exit: Exit) -> String {
 /// What is known of a run that goes on.
 struct Watch<'a> {
     plan: &'a Plan,
+    claim: &'a Claim,
     children: &'a mut Children,
     display: &'a mut Display,
     last: pb::Progress,
@@ -124,9 +134,14 @@ struct Watch<'a> {
 }
 
 impl<'a> Watch<'a> {
-    fn new(plan: &'a Plan, children: &'a mut Children, display: &'a mut Display) -> Self {
+    fn new(
+        (plan, claim): (&'a Plan, &'a Claim),
+        children: &'a mut Children,
+        display: &'a mut Display,
+    ) -> Self {
         Self {
             plan,
+            claim,
             children,
             display,
             last: pb::Progress::default(),
@@ -172,6 +187,11 @@ impl<'a> Watch<'a> {
             return;
         }
         self.n_streams = n_streams_before;
+        if self.last.task.is_empty()
+            && let Err(failed) = self.plan.keep_teacher()
+        {
+            self.display.say(&format!("{:#}", failed.into_error()));
+        }
         if self.awaits_learner && is_new {
             self.awaits_learner = false;
             self.display.say(&format!("the learner goes on from round {}", progress.round));
@@ -185,7 +205,7 @@ impl<'a> Watch<'a> {
 
     /// Starts dead processes again. Gives whether the learner was interrupted.
     fn look_after_processes(&mut self) -> Result<bool, Broken> {
-        let news = self.children.check(self.plan)?;
+        let news = self.children.check(self.plan, self.claim)?;
         news.lines.iter().for_each(|line| self.display.say(line));
         self.awaits_learner |= news.learner_restarted;
         Ok(news.interrupted)

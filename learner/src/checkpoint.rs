@@ -15,6 +15,7 @@ use tandem_core::work::PublishedActor;
 
 use crate::config::{ConfigError, RunConfig};
 use crate::records::{Judged, Pending};
+use crate::settings::{self, ADVICE, Changed};
 use crate::trainer::Trainer;
 use sealed::{FORMAT, Refused, Tensor};
 
@@ -67,6 +68,14 @@ pub enum CheckpointError {
         path: PathBuf,
         /// What does not fit.
         what: String,
+    },
+    /// A whole checkpoint of a run that began with another value of a setting which it must keep.
+    #[error("{setting}'s checkpoint {path:?}: {ADVICE}")]
+    OtherSettings {
+        /// The file.
+        path: PathBuf,
+        /// What differs.
+        setting: Changed,
     },
     /// A run that is to start anew in a directory that holds one.
     #[error("{0:?} holds a run already: resume it, or choose another directory")]
@@ -132,7 +141,7 @@ pub fn save(
 }
 
 /// Makes `directory`, and sure that it is on the disk.
-fn make(directory: &Path) -> io::Result<()> {
+pub(crate) fn make(directory: &Path) -> io::Result<()> {
     if directory.is_dir() {
         return Ok(());
     }
@@ -226,10 +235,33 @@ pub fn load(path: &Path, config: &RunConfig) -> Result<Restored, CheckpointError
         Err(Refused::Damaged(what)) => return Err(CheckpointError::Damaged { path, what }),
         Err(Refused::Format(got)) => return Err(CheckpointError::Format { path, got }),
     };
+    let began_with = contents.metadata.get(sealed::SETTINGS);
+    if let Some(setting) = began_with.and_then(|text| changed(config, text)) {
+        return Err(CheckpointError::OtherSettings { path, setting });
+    }
     let mut trainer = Trainer::new(config.clone())?;
     match (state::Reader { contents }).restore(&mut trainer) {
         Ok(resumption) => Ok(Restored { path, trainer, resumption }),
         Err(what) => Err(CheckpointError::OtherRun { path, what }),
+    }
+}
+
+/// The setting in which `config` differs from `began_with`; a text that cannot be read tells of none.
+fn changed(config: &RunConfig, began_with: &str) -> Option<Changed> {
+    settings::first_change(config, began_with).ok().flatten()
+}
+
+/// Refuses settings with which the run whose checkpoints are in `directory` cannot go on, as far as the newest one's
+/// header tells; gives whether it does. Whether that checkpoint is sound is for [`load_newest`] to say.
+///
+/// # Errors
+/// When a setting differs that a run must keep.
+pub fn check_settings(directory: &Path, config: &RunConfig) -> Result<bool, CheckpointError> {
+    let told = list(directory).pop().and_then(|path| Some((sealed::settings_of(&path)?, path)));
+    let Some((began_with, path)) = told else { return Ok(false) };
+    match changed(config, &began_with) {
+        Some(setting) => Err(CheckpointError::OtherSettings { path, setting }),
+        None => Ok(true),
     }
 }
 

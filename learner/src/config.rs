@@ -111,7 +111,7 @@ pub struct RoundsConfig {
     /// 0: a round is played with the parameters of the round before (paper). 1: it is played while the round before
     /// is being learned.
     pub lag: u32,
-    /// Updates for each environment step of a round.
+    /// Updates for each environment step of a round, 1e-9 to 100; a round has at least one.
     pub updates_per_env_step: f64,
     /// Polyak averaging after every update (`update`) or once a round (`round`, paper).
     pub polyak_every: PolyakEvery,
@@ -357,7 +357,7 @@ impl RunConfig {
         check(
             "stop.max_minutes",
             &self.stop.max_minutes,
-            self.stop.max_minutes >= 0.0,
+            self.stop.max_minutes >= 0.0 && self.stop.max_minutes.is_finite(),
             "0 (never) or more",
         )?;
         check(
@@ -383,8 +383,8 @@ impl RunConfig {
         check(
             "rounds.updates_per_env_step",
             &updates,
-            updates > 0.0 && updates <= 100.0,
-            "above 0, at most 100",
+            (1e-9..=100.0).contains(&updates),
+            "1e-9 to 100",
         )?;
         check(
             "evaluation.episodes",
@@ -396,8 +396,8 @@ impl RunConfig {
         check(
             "replay.goal_tolerance_m",
             &tolerance_m,
-            tolerance_m > 0.0 && tolerance_m <= 1.0,
-            "above 0, at most 1",
+            (1e-4..=1.0).contains(&tolerance_m),
+            "0.0001 to 1",
         )?;
         let cost = self.replay.contact_cost;
         check("replay.contact_cost", &cost, (0.0..=100.0).contains(&cost), "0 to 100")?;
@@ -576,6 +576,10 @@ mod tests {
         check(|config| config.task = "shove".to_owned(), "shove");
         check(|config| config.advice.share = f64::NAN, "advice.share");
         check(|config| config.rounds.updates_per_env_step = 0.0, "rounds.updates_per_env_step");
+        check(|config| config.rounds.updates_per_env_step = 1e-300, "updates_per_env_step");
+        check(|config| config.replay.goal_tolerance_m = 1e-30, "replay.goal_tolerance_m");
+        check(|config| config.stop.max_minutes = f64::INFINITY, "stop.max_minutes");
+        check(|config| config.ddpg.actor_learning_rate = 1e-40, "ddpg.actor_learning_rate");
         check(|config| config.exploration.random_share = 1.0, "exploration.random_share");
         check(|config| config.name = "a/b".to_owned(), "name");
         check(|config| config.ddpg.discount = 1.0, "ddpg.discount");

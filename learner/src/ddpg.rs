@@ -71,12 +71,12 @@ pub enum DdpgError {
         update: u64,
     },
     /// A stored state lacks a vector, or has one of another length.
-    #[error("stored {name:?} has {got:?} numbers, expected {expected}")]
+    #[error("stored {name:?} has {got} numbers, expected {expected}")]
     Restore {
         /// The vector.
         name: &'static str,
-        /// Its length, if there is one.
-        got: Option<usize>,
+        /// Its length, 0 where there is none.
+        got: usize,
         /// The length that the networks have.
         expected: usize,
     },

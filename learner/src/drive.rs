@@ -22,7 +22,7 @@ use crate::shared::{LearnerConfig, Shared};
 use crate::teacher::{Ledger, Mismatch, TeacherError};
 use crate::trainer::{RoundFigures, Trainer};
 use keep::{Keeping, Notice};
-use start::{Beginning, RunLock};
+use start::{Beginning, RunLock, keep_run_file};
 
 /// Rounds after which an evaluation must be in; until then it fills the workers' gaps.
 const EVALUATION_PATIENCE_ROUNDS: u64 = 4;
@@ -66,6 +66,7 @@ pub(crate) fn run(
         }
         ledger => ledger?,
     };
+    keep_run_file(config)?;
     let mut drive = Drive::new(config, shared, shutdown, beginning, ledger);
     match drive.rounds() {
         Ok(stop) => drive.finish(stop),
@@ -99,7 +100,7 @@ struct Drive<'a> {
     keeping: Keeping,
     wall_before_s: f64,
     rates: VecDeque<(f64, u64, u64)>,
-    _lock: RunLock,
+    lock: RunLock,
 }
 
 impl Drive<'_> {

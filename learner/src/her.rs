@@ -60,7 +60,7 @@ pub struct ReplayConfig {
     pub swap_share: f32,
     /// Which reward the critic learns.
     pub reward: RewardKind,
-    /// Distance of an object from its goal, metres, within which training rewards it, above 0 (paper: 0.05, which
+    /// Distance of an object from its goal, metres, within which training rewards it, 0.0001 to 1 (paper: 0.05, which
     /// success is always judged by). A smaller one leaves room for what an object does after it was let go.
     pub goal_tolerance_m: f32,
     /// What every arm pays for a step on which an arm touches the other or the table, 0 or more; a pending goal

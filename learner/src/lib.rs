@@ -4,8 +4,9 @@
 //! It does not know how an episode is simulated, how many workers there are or how a teacher decides.
 //!
 //! Reading order: [`config`] (the run file), [`ddpg`] (the update), [`replay`] and [`her`] (what a batch is made of),
-//! [`trainer`] (a round), [`board`] (who plays what), [`records`] (what evaluations bring), [`checkpoint`], [`service`]
-//! (the gRPC shell and the thread that learns), [`relay`] (what stands between a learner and many workers).
+//! [`trainer`] (a round), [`board`] (who plays what), [`records`] (what evaluations bring), [`checkpoint`], [`settings`] (what a
+//! run keeps when it goes on), [`lock`] (who works in a directory), [`service`] (the gRPC shell and the thread that
+//! learns), [`relay`] (what stands between a learner and many workers).
 
 pub mod board;
 pub mod checkpoint;
@@ -14,11 +15,13 @@ pub mod ddpg;
 mod drive;
 mod error;
 pub mod her;
+pub mod lock;
 mod metrics;
 pub mod records;
 pub mod relay;
 pub mod replay;
 pub mod service;
+pub mod settings;
 mod shared;
 mod teacher;
 pub mod trainer;

@@ -39,6 +39,11 @@ pub struct LearnerConfig {
     pub out: PathBuf,
     /// Whether to go on from the newest checkpoint, or from the beginning where there is none.
     pub resume: bool,
+    /// Whether somebody else, such as the parent process, holds the lock of the run directory for this learner.
+    pub out_is_locked: bool,
+    /// What `run.toml` in the run directory holds from the moment on in which it is certain that the run goes on with
+    /// these settings; `None` leaves the file alone.
+    pub run_file: Option<String>,
     /// Threads of the update, 1 or 2.
     pub n_threads: usize,
     /// Time since the process started.

@@ -16,6 +16,9 @@ use tokio::io::{AsyncBufReadExt as _, BufReader};
 use tokio::process::{Child, Command};
 use tokio::task::JoinSet;
 
+use super::claim::Claim;
+use super::display::Display;
+use super::in_use;
 use super::plan::Plan;
 use super::restarts::{End, Restarts, Role, Verdict};
 use crate::clock;
@@ -101,13 +104,14 @@ impl Children {
     }
 
     /// Starts teacher, learner and workers, in this order.
-    pub(crate) async fn start(&mut self, plan: &Plan) -> Result<(), Broken> {
+    pub(crate) async fn start(&mut self, plan: &Plan, display: &Display) -> Result<(), Broken> {
         if plan.config.advice.asks() {
-            let address = self.start_service(Role::Teacher, &teacher_args(plan)).await?;
+            let address = self.start_service(Role::Teacher, &teacher_args(plan), display).await?;
             self.teacher_address = Some(address);
         }
-        let args = self.learner_args(plan, plan.resume);
-        self.learner_address = self.start_service(Role::Learner, &args).await?;
+        let mut args = self.learner_args(plan, plan.resume);
+        args.push("--keep-run-file".into());
+        self.learner_address = self.start_service(Role::Learner, &args, display).await?;
         for number in 1..=plan.n_workers {
             let name = format!("worker-{number}");
             let args = self.worker_args(plan, &name);
@@ -124,7 +128,7 @@ impl Children {
     ///
     /// # Errors
     /// When one has died that is not to be started again.
-    pub(crate) fn check(&mut self, plan: &Plan) -> Result<News, Broken> {
+    pub(crate) fn check(&mut self, plan: &Plan, claim: &Claim) -> Result<News, Broken> {
         let mut news = News::default();
         for idx in 0..self.processes.len() {
             let process = &mut self.processes[idx];
@@ -136,6 +140,9 @@ impl Children {
             if let State::Waits { until, end } = process.state
                 && until <= clock::now()
             {
+                if !claim.is_in_place() {
+                    return Err(displaced(plan, &process.name, end));
+                }
                 news.lines.push(format!("{} {end} and is started again", process.name));
                 news.learner_restarted |= process.role == Role::Learner;
                 self.start_again(idx, plan)?;
@@ -185,27 +192,65 @@ impl Children {
         workers.join_all().await;
     }
 
-    /// Starts a service and waits for the line that says where it listens.
-    async fn start_service(&mut self, role: Role, args: &[OsString]) -> Result<String, Broken> {
+    /// Starts a service and gives where it listens. One that is killed before it says so is started again.
+    async fn start_service(
+        &mut self,
+        role: Role,
+        args: &[OsString],
+        display: &Display,
+    ) -> Result<String, Broken> {
+        let mut restarts = Restarts::new(role);
+        loop {
+            let started = self.try_start_service(role, args).await?;
+            let (process, end) = match started {
+                Ok((process, address)) => {
+                    self.processes.push(Process { restarts, ..process });
+                    return Ok(address);
+                }
+                Err(ended) => ended,
+            };
+            let Process { name, started_at, log_from, .. } = process;
+            let lived = clock::now().saturating_duration_since(started_at);
+            match (end, restarts.ended(end, lived)) {
+                (End::Signal(_), Verdict::Again { after }) => {
+                    display.say(&format!("{name} {end} and is started again"));
+                    tokio::time::sleep(after).await;
+                }
+                (End::Signal(_), Verdict::GivenUp { n_times }) => {
+                    return Err(given_up(&name, n_times, end, &self.log_path, log_from).into());
+                }
+                _ => {
+                    let told = last_words(&self.log_path, log_from);
+                    let error = anyhow!("{name} {end}: {told}");
+                    return Err(Broken { exit: exit_of(end), error });
+                }
+            }
+        }
+    }
+
+    /// Starts a service and waits for the line that says where it listens, or for its end.
+    async fn try_start_service(
+        &self,
+        role: Role,
+        args: &[OsString],
+    ) -> anyhow::Result<Result<(Process, String), (Process, End)>> {
         let name = format!("the {}", role.name());
         let mut process = self.spawn(role, name, args, Stdio::piped())?;
         let name = &process.name;
         let State::Runs(child) = &mut process.state else {
-            return Err(anyhow!("{name} is not running").into());
+            return Err(anyhow!("{name} is not running"));
         };
         let output = child.stdout.take().ok_or_else(|| anyhow!("{name} cannot be heard"))?;
         let mut line = String::new();
         let read = BufReader::new(output).read_line(&mut line).await;
         read.with_context(|| format!("{name} cannot be heard"))?;
-        let Some(address) = line.trim().strip_prefix("listening on ") else {
-            let status = child.wait().await.context("cannot look after a process")?;
-            let told = last_words(&self.log_path, process.log_from);
-            let error = anyhow!("{name} {}: {told}", how_ended(status));
-            return Err(Broken { exit: exit_of(how_ended(status)), error });
-        };
-        let address = address.to_owned();
-        self.processes.push(process);
-        Ok(address)
+        match line.trim().strip_prefix("listening on ") {
+            Some(address) => Ok(Ok((process, address.to_owned()))),
+            None => {
+                let status = child.wait().await.context("cannot look after a process")?;
+                Ok(Err((process, how_ended(status))))
+            }
+        }
     }
 
     /// Starts a process where its predecessor was: others find it there, and nobody has to be told where it listens.
@@ -232,14 +277,15 @@ impl Children {
     }
 
     fn learner_args(&self, plan: &Plan, resume: bool) -> Vec<OsString> {
-        let mut args: Vec<OsString> = vec!["learner".into(), "--exit-with-stdin".into()];
-        args.extend(["--run".into(), plan.run_file().into_os_string()]);
+        let mut args: Vec<OsString> =
+            vec!["learner".into(), "--exit-with-stdin".into(), "--out-is-locked".into()];
+        args.extend(["--run".into(), in_use::settings(&plan.out).into_os_string()]);
         args.extend(["--out".into(), plan.out.clone().into_os_string()]);
         if let Some(address) = &self.teacher_address {
             args.extend(["--teacher".into(), address.into()]);
         }
         if plan.config.advice.starts_from_teacher() {
-            args.extend(["--start-from".into(), plan.teacher_copy().into_os_string()]);
+            args.extend(["--start-from".into(), in_use::teacher(&plan.out).into_os_string()]);
         }
         if resume {
             args.push("--resume".into());
@@ -313,20 +359,31 @@ impl Process {
                 Err(Broken { exit, error })
             }
             Verdict::GivenUp { n_times } => {
-                let error = anyhow!("{name} died {n_times} times in a row; the last time it {end}");
-                let error = match end {
-                    End::Code(_) => anyhow!("{error}: {}", last_words(log, self.log_from)),
-                    End::Signal(_) => error,
-                };
-                Err(error.into())
+                Err(given_up(name, n_times, end, log, self.log_from).into())
             }
         }
     }
 }
 
+/// Why a process is not started once more.
+fn given_up(name: &str, n_times: u32, end: End, log: &Path, log_from: u64) -> anyhow::Error {
+    let error = anyhow!("{name} died {n_times} times in a row; the last time it {end}");
+    match end {
+        End::Code(_) => anyhow!("{error}: {}", last_words(log, log_from)),
+        End::Signal(_) => error,
+    }
+}
+
+/// Why a process cannot be started again: what it would read and write is not this run.
+fn displaced(plan: &Plan, name: &str, end: End) -> Broken {
+    let out = plan.out.display();
+    let error = anyhow!("{name} {end}, and {out} was moved, removed or replaced");
+    Broken { exit: Exit::Usage, error }
+}
+
 fn teacher_args(plan: &Plan) -> Vec<OsString> {
-    let policy = plan.teacher_copy().into_os_string();
-    let ledger = plan.out.join("ledger.sqlite").into_os_string();
+    let policy = in_use::teacher(&plan.out).into_os_string();
+    let ledger = plan.ledger().into_os_string();
     let mut args: Vec<OsString> = vec!["teacher".into(), "--exit-with-stdin".into()];
     args.extend(["--policy".into(), policy, "--ledger".into(), ledger]);
     args

@@ -2,70 +2,128 @@
 
 use std::path::{Path, PathBuf};
 
-use tandem_learner::RunConfig;
+use tandem_learner::{RunConfig, checkpoint, settings};
+use tandem_policy::Policy;
 use toml::Value;
 
 use crate::cli::{RecipeName, TrainArgs};
-use crate::exit::{Failed, OrExit as _};
-use crate::{eval, files, run_file};
+use crate::exit::{Exit, Failed, OrExit as _};
+use crate::{eval, files, run_directory, run_file};
 
 /// A run that can be started.
 pub(crate) struct Plan {
     pub(crate) config: RunConfig,
     pub(crate) out: PathBuf,
-    pub(crate) teacher: Option<PathBuf>,
+    pub(crate) teacher: Option<TeacherFile>,
     pub(crate) n_workers: usize,
     pub(crate) resume: bool,
+}
+
+/// A policy that teaches, as it was when it was read.
+pub(crate) struct TeacherFile {
+    path: PathBuf,
+    pub(crate) policy: Policy,
 }
 
 impl Plan {
     /// Decides everything, and refuses what cannot be started.
     pub(crate) fn of(args: &TrainArgs) -> Result<Self, Failed> {
-        let file = match (&args.run, &args.out) {
-            (None, Some(out)) if args.resume => Some(out.join("run.toml")),
-            (run, _) => run.clone(),
-        };
-        let mut config = run_file::resolve(file.as_deref(), &settings(args)?)?;
+        let config = config(args)?;
         let out = match &args.out {
             Some(out) => out.clone(),
             None => free_run_directory(&config),
         };
-        if !args.resume {
-            config.name = account_name(&out).unwrap_or(config.name);
-        }
+        let config = match args.resume {
+            true => config,
+            false => RunConfig { name: account_name(&out).unwrap_or(config.name), ..config },
+        };
         let teacher = match config.advice.needs_teacher() {
-            true => Some(teacher_path(args, &config, &out)?),
+            true => Some(teacher_file(args, &config, &out)?),
             false => None,
         };
         let n_workers = args.workers.unwrap_or_else(|| default_workers(&config));
         if !(1..=1024).contains(&n_workers) {
             return Err(Failed::usage(format!("--workers {n_workers}: expected 1 to 1024")));
         }
-        Ok(Self { config, out, teacher, n_workers, resume: args.resume })
+        let plan = Self { config, out, teacher, n_workers, resume: args.resume };
+        plan.check_directory()?;
+        Ok(plan)
     }
 
-    /// Creates the run directory with what the run is made of.
-    pub(crate) fn prepare(&self) -> Result<(), Failed> {
-        let out = &self.out;
-        let holds_a_run = out.join("run.toml").exists();
-        if holds_a_run && !self.resume {
-            let shown = out.display();
-            return Err(Failed::usage(format!(
+    /// Refuses a run directory that holds a run where none is expected, or none where one is.
+    fn check_directory(&self) -> Result<(), Failed> {
+        let shown = self.out.display();
+        match (self.run_file().exists(), self.resume) {
+            (true, false) => Err(Failed::usage(format!(
                 "{shown} holds a run already: go on with it by `tandem train --resume --out {shown}`, or choose another --out"
-            )));
+            ))),
+            (false, true) => Err(Failed::usage(format!("{shown} holds no run to go on with"))),
+            _ => Ok(()),
         }
-        if self.resume && !holds_a_run {
-            return Err(Failed::usage(format!("{} holds no run to go on with", out.display())));
+    }
+
+    /// Checks the plan against what the run directory holds, and writes what a new run is made of. The directory of a
+    /// run that goes on stays as it is: its learner writes changed settings down once the run does go on.
+    pub(crate) fn prepare(&self) -> Result<(), Failed> {
+        self.check_directory()?;
+        if self.resume {
+            self.check_settings()?;
+            return self.check_teacher();
         }
-        let failed = || format!("cannot write to {}", out.display());
-        std::fs::create_dir_all(out.join("policy")).or_cannot_write(failed)?;
+        let failed = || format!("cannot write to {}", self.out.display());
+        std::fs::create_dir_all(self.out.join("policy")).or_cannot_write(failed)?;
         run_file::save(&self.config, &self.run_file())?;
-        if let Some(teacher) = &self.teacher
-            && *teacher != self.teacher_copy()
-        {
-            std::fs::copy(teacher, self.teacher_copy()).or_cannot_write(failed)?;
+        self.keep_teacher()
+    }
+
+    /// Refuses settings with which the run did not begin, by its newest checkpoint or else by its run file.
+    fn check_settings(&self) -> Result<(), Failed> {
+        let is_told = checkpoint::check_settings(&self.checkpoints(), &self.config);
+        if is_told.or_exit(Exit::Usage, String::new)? {
+            return Ok(());
         }
-        Ok(())
+        let Ok(began_with) = run_file::resolve(Some(&self.run_file()), &[]) else { return Ok(()) };
+        let began_with = settings::to_json(&began_with);
+        match settings::first_change(&self.config, &began_with).or_exit(Exit::Bug, String::new)? {
+            Some(changed) => {
+                let path = self.run_file();
+                Err(Failed::usage(format!("{changed}'s {}: {}", path.display(), settings::ADVICE)))
+            }
+            None => Ok(()),
+        }
+    }
+
+    /// Refuses another teacher than the run's own.
+    fn check_teacher(&self) -> Result<(), Failed> {
+        let copy = self.teacher_copy();
+        let Some(teacher) = self.teacher.as_ref().filter(|teacher| teacher.path != copy) else {
+            return Ok(());
+        };
+        // A copy that is missing or damaged gives way.
+        match Policy::load(&copy) {
+            Ok(own) if own.digest() != teacher.policy.digest() => Err(Failed::usage(format!(
+                "--teacher {}: the run's own teacher, {}, is another policy: leave --teacher out, or start a new run",
+                teacher.path.display(),
+                copy.display()
+            ))),
+            _ => Ok(()),
+        }
+    }
+
+    /// Keeps the teacher's file with the run where it is not there yet, or not whole.
+    pub(crate) fn keep_teacher(&self) -> Result<(), Failed> {
+        let copy = self.teacher_copy();
+        let Some(teacher) = self.teacher.as_ref().filter(|teacher| teacher.path != copy) else {
+            return Ok(());
+        };
+        if self.resume && Policy::load(&copy).is_ok() {
+            return Ok(());
+        }
+        let unfinished = copy.with_extension("tmp");
+        let written = std::fs::create_dir_all(self.out.join("policy"))
+            .and_then(|()| std::fs::copy(&teacher.path, &unfinished))
+            .and_then(|_n_bytes| std::fs::rename(&unfinished, &copy));
+        written.or_cannot_write(|| format!("cannot write {}", copy.display()))
     }
 
     pub(crate) fn run_file(&self) -> PathBuf {
@@ -80,6 +138,16 @@ impl Plan {
         self.out.join("policy/best.safetensors")
     }
 
+    /// The directory of its checkpoints.
+    pub(crate) fn checkpoints(&self) -> PathBuf {
+        self.out.join("checkpoint")
+    }
+
+    /// The ledger of its teacher.
+    pub(crate) fn ledger(&self) -> PathBuf {
+        self.out.join("ledger.sqlite")
+    }
+
     /// The teacher's policy, kept with the run.
     pub(crate) fn teacher_copy(&self) -> PathBuf {
         teacher_copy(&self.out)
@@ -90,8 +158,30 @@ fn teacher_copy(out: &Path) -> PathBuf {
     out.join("policy/teacher.safetensors")
 }
 
+/// The settings of the run, by its own run file where it goes on.
+fn config(args: &TrainArgs) -> Result<RunConfig, Failed> {
+    let own_file = args.out.as_ref().filter(|_| args.resume).map(|out| out.join("run.toml"));
+    if let Some((file, out)) = own_file.as_ref().zip(args.out.as_ref())
+        && !file.exists()
+    {
+        run_directory::check_place(out)?;
+        return Err(Failed::usage(format!("{} holds no run to go on with", out.display())));
+    }
+    let settings = settings_of(args)?;
+    let config = run_file::resolve(args.run.as_deref().or(own_file.as_deref()), &settings)?;
+    let is_named = settings.iter().any(|(key, _)| key == "name");
+    // A run keeps its name, which its run directory gave it, also where another run file is given again.
+    match own_file.filter(|_| args.run.is_some() && !is_named) {
+        Some(own_file) => match run_file::resolve(Some(&own_file), &[]) {
+            Ok(RunConfig { name, .. }) => Ok(RunConfig { name, ..config }),
+            Err(_) => Ok(config),
+        },
+        None => Ok(config),
+    }
+}
+
 /// What the command line says, as settings of the run file; flags come after `--set`.
-fn settings(args: &TrainArgs) -> Result<Vec<(String, Value)>, Failed> {
+fn settings_of(args: &TrainArgs) -> Result<Vec<(String, Value)>, Failed> {
     let mut settings = args
         .settings
         .iter()
@@ -139,7 +229,7 @@ fn free_run_directory(config: &RunConfig) -> PathBuf {
 }
 
 /// The teacher's file, checked: it must be a one-arm policy for the task.
-fn teacher_path(args: &TrainArgs, config: &RunConfig, out: &Path) -> Result<PathBuf, Failed> {
+fn teacher_file(args: &TrainArgs, config: &RunConfig, out: &Path) -> Result<TeacherFile, Failed> {
     let path = match &args.teacher {
         Some(path) => path.clone(),
         None if args.resume && teacher_copy(out).exists() => teacher_copy(out),
@@ -159,7 +249,7 @@ fn teacher_path(args: &TrainArgs, config: &RunConfig, out: &Path) -> Result<Path
             policy.layout.task, config.task
         )));
     }
-    Ok(path)
+    Ok(TeacherFile { path, policy })
 }
 
 /// The teacher that ships: beside the caller, beside the program, or in the program's source tree.

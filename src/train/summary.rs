@@ -91,7 +91,7 @@ fn summary_lines(
 /// Says how to go on with an interrupted run.
 pub(super) fn interrupted(plan: &Plan) {
     let out = plan.out.display();
-    let saved = tandem_learner::checkpoint::list(&plan.out.join("checkpoint"));
+    let saved = tandem_learner::checkpoint::list(&plan.checkpoints());
     let round = saved.last().and_then(|path| path.file_stem()?.to_str()?.parse::<u64>().ok());
     match round {
         Some(round) => {
@@ -127,8 +127,8 @@ fn summary_json(plan: &Plan, last: &pb::Progress, memory: Memory, measured: &Mea
         "learner_mib": memory.learner_mib,
         "teacher_mib": memory.teacher_mib,
         "worker_mib": memory.worker_mib,
-        "run_dir": plan.out,
-        "policy": plan.best_policy(),
+        "run_dir": plan.out.to_string_lossy(),
+        "policy": plan.best_policy().to_string_lossy(),
         "digest": last.digest,
     });
     if let (Some(summary), Value::Object(more)) = (summary.as_object_mut(), more) {

@@ -115,7 +115,7 @@ fn prepare(directory: &Path) {
 /// Command lines, the exit codes they end with, and a word of what is said. `@name` stands for a file or a directory
 /// of those prepared, `@empty/x` for a place that cannot be written, `%name` for a policy that ships, `BUSY` for an
 /// address that is taken.
-const CASES: [(&str, i32, &str); 74] = [
+const CASES: [(&str, i32, &str); 76] = [
     ("", 64, "Usage"),
     ("dance", 64, "dance"),
     ("--log [[ policy show %teacher-push", 64, "[["),
@@ -143,7 +143,9 @@ const CASES: [(&str, i32, &str); 74] = [
     ("train --teacher @torn", 65, "torn"),
     ("train --teacher %student-push", 64, "drives 2 arms"),
     ("train --teacher %teacher-pick-and-place", 64, "pick-and-place"),
-    ("train --out @empty/x", 64, "empty/x"),
+    ("train --out @empty/x", 64, "empty is a file"),
+    ("train --out @empty", 64, "it is a file"),
+    ("train --resume --out @empty", 64, "it is a file"),
     ("eval", 64, "--policy"),
     ("eval --policy @missing", 65, "missing"),
     ("eval --policy @folder", 65, "folder"),
@@ -168,7 +170,7 @@ const CASES: [(&str, i32, &str); 74] = [
         "cannot listen",
     ),
     ("learner --run @advised.toml --out @out", 64, "teacher"),
-    ("learner --run @advised.toml --out @empty/x --teacher 127.0.0.1:1", 64, "empty/x"),
+    ("learner --run @advised.toml --out @empty/x --teacher 127.0.0.1:1", 64, "empty is a file"),
     ("worker", 64, "--connect"),
     ("policy show @missing", 65, "missing"),
     ("policy show @folder --json", 65, "folder"),

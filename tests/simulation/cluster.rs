@@ -194,6 +194,8 @@ impl Stage {
             start_from: None,
             out,
             resume,
+            out_is_locked: false,
+            run_file: None,
             n_threads: 1,
             clock: Arc::new(move || {
                 let _life = &life;

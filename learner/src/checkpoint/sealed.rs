@@ -5,7 +5,7 @@
 
 use std::collections::BTreeMap;
 use std::fs::File;
-use std::io::{self, Write as _};
+use std::io::{self, Read as _, Write as _};
 use std::path::Path;
 
 use safetensors::{Dtype, SafeTensors};
@@ -22,6 +22,11 @@ const WORD_BYTES: usize = 8;
 /// Where the seal stands in a file.
 const SEAL: std::ops::Range<usize> =
     WORD_BYTES + BEFORE_SEAL.len()..WORD_BYTES + BEFORE_SEAL.len() + SEAL_CHARS;
+
+/// Where the metadata has the settings that the run began with. Checkpoints of older programs lack them.
+pub(super) const SETTINGS: &str = "settings";
+/// No header is longer.
+const MAX_HEADER_BYTES: u64 = 100 << 20;
 
 /// A named vector.
 pub(super) struct Tensor<'a> {
@@ -107,6 +112,18 @@ pub(super) fn open(bytes: &[u8]) -> Result<Contents<'_>, Refused> {
         return Err(Refused::Damaged("its seal is not where it should be".to_owned()));
     }
     Ok(Contents { metadata, tensors: SafeTensors::deserialize(bytes).map_err(damaged)? })
+}
+
+/// The settings in a file's header, of which nothing else is read or checked.
+pub(super) fn settings_of(path: &Path) -> Option<String> {
+    let mut file = File::open(path).ok()?;
+    let mut n_bytes = [0; WORD_BYTES];
+    file.read_exact(&mut n_bytes).ok()?;
+    let n_bytes = Some(u64::from_le_bytes(n_bytes)).filter(|n| *n <= MAX_HEADER_BYTES)?;
+    let mut header = Vec::new();
+    file.take(n_bytes).read_to_end(&mut header).ok()?;
+    let header: Value = serde_json::from_slice(&header).ok()?;
+    Some(header.pointer("/__metadata__")?.get(SETTINGS)?.as_str()?.to_owned())
 }
 
 fn check_seal(bytes: &[u8]) -> Result<(), Refused> {

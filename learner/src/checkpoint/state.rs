@@ -6,9 +6,10 @@ use tandem_policy::{Normalizer, NormalizerParts, NormalizerSnapshot, Policy};
 use tandem_telemetry::MetricsRow;
 
 use super::Resumption;
-use super::sealed::{Contents, Tensor};
+use super::sealed::{Contents, SETTINGS, Tensor};
 use crate::records::{Judged, Pending};
 use crate::replay::{ReplayBuffer, ReplayParts};
+use crate::settings;
 use crate::trainer::{Counters, RoundFigures, Trainer};
 
 /// No count of a run is larger, so that none overflows when it is multiplied with the size of a round.
@@ -42,6 +43,7 @@ pub(super) fn metadata(trainer: &Trainer, resumption: &Resumption) -> Vec<(&'sta
         ("acting.version", resumption.acting.version.to_string()),
         ("pending", resumption.pending.len().to_string()),
         ("wall_s", resumption.wall_s.to_string()),
+        (SETTINGS, settings::to_json(config)),
     ]
 }
 
@@ -193,7 +195,8 @@ impl Reader<'_> {
             .map(|vector| vector.map(|(name, values)| (name.to_owned(), values)))
             .collect::<Result<_, String>>()?;
         let n_updates = self.count("ddpg.n_updates")?;
-        trainer.ddpg.restore(&state, n_updates).map_err(|error| error.to_string())
+        let told = "the run file gives ddpg.n_hidden or ddpg.n_hidden_layers another value than the run began with";
+        trainer.ddpg.restore(&state, n_updates).map_err(|error| format!("{error}; {told}"))
     }
 
     fn restore_replay(&self, trainer: &mut Trainer) -> Result<(), String> {
@@ -208,7 +211,7 @@ impl Reader<'_> {
         let next = usize::try_from(self.count("replay.next")?).unwrap_or(usize::MAX);
         let capacity = trainer.config.replay.capacity_transitions;
         trainer.replay = ReplayBuffer::from_parts(trainer.layout, capacity, parts, next)
-            .ok_or("its replay buffer does not fit the run file")?;
+            .ok_or("its replay buffer does not fit replay.capacity_transitions in the run file")?;
         Ok(())
     }
 

@@ -231,12 +231,54 @@ fn a_checkpoint_of_another_run_is_refused() {
         let refusal = load_newest(directory.path(), &config).expect_err("must be refused");
         assert!(matches!(refusal, CheckpointError::OtherRun { .. }), "{refusal}");
         assert!(refusal.to_string().contains(what), "{refusal}");
+        assert!(!refusal.to_string().contains("Some("), "{refusal}");
     };
+    without_settings(&newest(&directory));
+    assert!(!check_settings(directory.path(), &small_config()).expect("nothing told"));
     check(|config| config.seed = 2, "seed");
     check(|config| config.arms = 2, "arms");
     check(|config| config.task = "pick-and-place".to_owned(), "task");
     check(|config| config.ddpg.n_hidden = 4, "actor.online");
-    check(|config| config.replay.capacity_transitions = 50, "replay buffer");
+    check(|config| config.ddpg.n_hidden = 4, "ddpg.n_hidden");
+    check(|config| config.replay.capacity_transitions = 50, "replay.capacity_transitions");
+    assert_eq!(restored(&directory).trainer.config(), &small_config());
+}
+
+/// Makes of a checkpoint one of a program that did not keep the settings in it.
+fn without_settings(path: &Path) {
+    let mut bytes = fs::read(path).expect("readable");
+    let key = b"\"settings\"";
+    let at = bytes.windows(key.len()).position(|window| window == key).expect("they are kept");
+    bytes[at + 1] = b'x';
+    fs::write(path, sealed::seal_anew(bytes)).expect("writes");
+}
+
+#[test]
+fn a_run_keeps_the_settings_that_decide_what_it_learns() {
+    let (directory, _) = saved(1);
+    let check = |change: fn(&mut RunConfig), told: &str| {
+        let mut config = small_config();
+        change(&mut config);
+        let whole = load_newest(directory.path(), &config).expect_err("must be refused");
+        let by_header = check_settings(directory.path(), &config).expect_err("must be refused");
+        for refusal in [whole, by_header] {
+            assert!(matches!(refusal, CheckpointError::OtherSettings { .. }), "{refusal}");
+            assert!(refusal.to_string().starts_with(told), "{refusal}");
+        }
+    };
+    check(|c| c.ddpg.n_hidden = 4, "ddpg.n_hidden is 4 here and 3 in the run's checkpoint \"");
+    check(|c| c.seed = 2, "seed is 2 here and 1 in the run's checkpoint \"");
+    check(|c| c.arms = 2, "arms is 2 here and 1 in");
+    check(
+        |c| c.task = "pick-and-place".to_owned(),
+        "task is \"pick-and-place\" here and \"push\" in",
+    );
+    check(|c| c.ddpg.discount = 0.5, "ddpg.discount is 0.5 here and 0.95 in");
+    let mut longer = small_config();
+    longer.stop.max_env_steps += 1;
+    longer.checkpoint.keep += 1;
+    assert!(check_settings(directory.path(), &longer).expect("fits"));
+    assert!(load_newest(directory.path(), &longer).expect("fits").is_some());
 }
 
 /// Changes of a file's bytes: each puts a byte somewhere, or cuts.

@@ -14,14 +14,14 @@ pub struct DdpgConfig {
     pub cloning_weight: f32,
     /// Share of the old target network kept by each Polyak step, in [0, 1] (HER reference implementation: 0.95).
     pub polyak_keep: f32,
-    /// Adam's step size for the actor, above 0 (HER reference implementation: 0.001).
+    /// Adam's step size for the actor, 1e-8 to 1 (HER reference implementation: 0.001).
     pub actor_learning_rate: f32,
-    /// Adam's step size for the critic, above 0 (HER reference implementation: 0.001).
+    /// Adam's step size for the critic, 1e-8 to 1 (HER reference implementation: 0.001).
     pub critic_learning_rate: f32,
     /// The last share of a run's `stop.max_env_steps`, in [0, 1], over which both networks learn at
     /// `cooldown_learning_rate` (paper: 0).
     pub cooldown_share: f32,
-    /// Adam's step size for both networks over that share, above 0.
+    /// Adam's step size for both networks over that share, 1e-8 to 1.
     pub cooldown_learning_rate: f32,
     /// Transitions per update (paper, section 4.1: 256).
     pub batch_size: usize,
@@ -57,7 +57,7 @@ impl DdpgConfig {
     pub fn check(&self) -> Result<(), (&'static str, String, &'static str)> {
         let weight = |weight: f32| weight >= 0.0 && weight.is_finite();
         let share = |share: f32| (0.0..=1.0).contains(&share);
-        let rate = |rate: f32| rate > 0.0 && rate <= 1.0;
+        let rate = |rate: f32| (1e-8..=1.0).contains(&rate);
         let numbers = [
             (
                 "ddpg.discount",
@@ -78,19 +78,19 @@ impl DdpgConfig {
                 "ddpg.cooldown_learning_rate",
                 self.cooldown_learning_rate,
                 rate(self.cooldown_learning_rate),
-                "above 0, at most 1",
+                "1e-8 to 1",
             ),
             (
                 "ddpg.actor_learning_rate",
                 self.actor_learning_rate,
                 rate(self.actor_learning_rate),
-                "above 0, at most 1",
+                "1e-8 to 1",
             ),
             (
                 "ddpg.critic_learning_rate",
                 self.critic_learning_rate,
                 rate(self.critic_learning_rate),
-                "above 0, at most 1",
+                "1e-8 to 1",
             ),
         ];
         for (key, value, fine, expected) in numbers {

@@ -103,8 +103,8 @@ impl Ddpg {
                 .iter()
                 .find(|(stored_name, _)| stored_name == name)
                 .map(|(_, found)| found.as_slice());
-            let (got, expected) = (found.map(<[f32]>::len), now.len());
-            *vector = found.filter(|_| got == Some(expected)).ok_or(DdpgError::Restore {
+            let (got, expected) = (found.map_or(0, <[f32]>::len), now.len());
+            *vector = found.filter(|_| got == expected).ok_or(DdpgError::Restore {
                 name,
                 got,
                 expected,

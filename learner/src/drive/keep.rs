@@ -15,6 +15,9 @@ use crate::records::{Unwritten, innermost};
 /// Pause before a disk that refused is tried again.
 const TRY_AGAIN_S: f64 = 10.0;
 
+/// Why nothing is written to a path that no longer leads to the run directory: another run may be there.
+const DISPLACED: &str = "the run directory was moved, removed or replaced";
+
 /// What of a run changes between two checkpoints.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 struct Stand {
@@ -111,6 +114,12 @@ impl Drive<'_> {
     }
 
     fn save_checkpoint(&mut self, stand: Stand) {
+        let what = format!("the checkpoint of round {}", stand.round);
+        if !self.lock.is_in_place() {
+            let cause = DISPLACED.to_owned();
+            self.keeping.checkpoint_missing = Some(Unwritten { what, cause });
+            return;
+        }
         let resumption = Resumption {
             acting: self.acting.clone(),
             judged: self.records.judged().clone(),
@@ -126,7 +135,6 @@ impl Drive<'_> {
                 self.keeping.checkpoint_missing = None;
             }
             Err(error) => {
-                let what = format!("the checkpoint of round {}", stand.round);
                 let cause = innermost(&error);
                 self.keeping.checkpoint_missing = Some(Unwritten { what, cause });
             }
@@ -135,7 +143,12 @@ impl Drive<'_> {
 
     /// Writes the records that are due, and tells when something is wrong or no longer is.
     pub(super) fn write_records(&mut self) {
-        self.keeping.records_missing = self.records.write();
+        if self.lock.is_in_place() {
+            self.keeping.records_missing = self.records.write();
+        } else if self.records.is_due() {
+            let (what, cause) = ("metrics.jsonl and policies".to_owned(), DISPLACED.to_owned());
+            self.keeping.records_missing = vec![Unwritten { what, cause }];
+        }
         self.keeping.tried_at_s = self.now_s();
         let trouble = self.keeping.trouble();
         if trouble == self.keeping.told {

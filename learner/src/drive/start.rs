@@ -1,7 +1,6 @@
 //! How a run begins: anew, or from its newest checkpoint.
 
-use std::fs::{File, OpenOptions, TryLockError};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use tandem_core::work::{PublishedActor, RunTerms};
@@ -14,13 +13,12 @@ use super::keep::Keeping;
 use super::{Drive, UNITS_PER_EPISODE};
 use crate::checkpoint::{self, CheckpointError, Restored, Resumption};
 use crate::error::Error;
+use crate::lock::DirectoryLock;
 use crate::records::{Judged, Pending, Records};
 use crate::shared::{LearnerConfig, Shared};
 use crate::teacher::{Ledger, Run};
 use crate::trainer::Trainer;
 
-/// The file whose lock says that a learner is at work in a run directory.
-const LOCK: &str = "learner.lock";
 /// How long a learner that was there before may take to save and go.
 const LOCK_PATIENCE: Duration = Duration::from_secs(30);
 /// Pause between two looks whether it has gone.
@@ -138,7 +136,7 @@ impl<'a> Drive<'a> {
             keeping: Keeping::default(),
             wall_before_s,
             rates: std::collections::VecDeque::new(),
-            _lock: lock,
+            lock,
         };
         for Pending { counters, .. } in &drive.pending {
             drive.add(drive.trainer.evaluation_orders(counters.round));
@@ -160,40 +158,65 @@ fn refuse_former_run(out: &Path) -> Result<(), CheckpointError> {
     Ok(())
 }
 
-/// Keeps a second learner out of a run directory for as long as it lives; the system frees it however a process ends.
+/// Writes down the settings with which the run goes on.
+pub(super) fn keep_run_file(config: &LearnerConfig) -> Result<(), Error> {
+    let Some(text) = &config.run_file else { return Ok(()) };
+    let path = config.out.join("run.toml");
+    if std::fs::read(&path).is_ok_and(|there| there == text.as_bytes()) {
+        return Ok(());
+    }
+    let unfinished = path.with_extension("tmp");
+    let written = std::fs::write(&unfinished, text);
+    written
+        .and_then(|()| std::fs::rename(&unfinished, &path))
+        .map_err(|error| Error::RunDirectory { action: "write", path, source: error.into() })
+}
+
+/// Keeps a second learner out of a run directory.
+///
+/// Two directories are locked: the run directory by whoever is in charge of the run, which is this learner or the
+/// `tandem train` that started it, and the directory of checkpoints by the learner. So a learner that still saves is
+/// noticed when its `tandem train` is dead.
 #[derive(Debug)]
 pub(super) struct RunLock {
-    _file: Option<File>,
+    out: Option<DirectoryLock>,
+    checkpoints: DirectoryLock,
 }
 
 impl RunLock {
     /// Takes the lock, waiting a while for the learner that has it.
     fn take(config: &LearnerConfig, shutdown: &CancellationToken) -> Result<Self, Error> {
-        let path = config.out.join(LOCK);
-        let refused = |source: Box<dyn std::error::Error + Send + Sync>| Error::RunDirectory {
-            action: "lock",
-            path: path.clone(),
-            source,
-        };
-        std::fs::create_dir_all(&config.out).map_err(|error| refused(error.into()))?;
-        let made = OpenOptions::new().append(true).create(true).open(&path);
-        made.map_err(|error| refused(error.into()))?;
-        // Held for reading only: an open file that can be written to keeps a disk from being made read-only.
-        let file = File::open(&path).map_err(|error| refused(error.into()))?;
         let until = (config.clock)() + LOCK_PATIENCE;
-        loop {
-            match file.try_lock() {
-                Ok(()) => return Ok(Self { _file: Some(file) }),
-                Err(TryLockError::WouldBlock) => {}
-                Err(TryLockError::Error(error)) => {
-                    tracing::warn!(%error, ?path, "no locks here, a second learner goes unnoticed");
-                    return Ok(Self { _file: None });
-                }
-            }
-            if (config.clock)() >= until || shutdown.is_cancelled() {
+        let is_over = || (config.clock)() >= until || shutdown.is_cancelled();
+        let checkpoints = config.out.join("checkpoint");
+        let out = match config.out_is_locked {
+            true => None,
+            false => Some(lock(&config.out, &is_over)?),
+        };
+        Ok(Self { out, checkpoints: lock(&checkpoints, &is_over)? })
+    }
+
+    /// Whether the paths still lead to the directories that are locked.
+    pub(super) fn is_in_place(&self) -> bool {
+        self.checkpoints.is_in_place() && self.out.as_ref().is_none_or(DirectoryLock::is_in_place)
+    }
+}
+
+/// Locks `directory`, which is made when there is none, and tries again until `is_over`.
+fn lock(directory: &Path, is_over: &impl Fn() -> bool) -> Result<DirectoryLock, Error> {
+    let refused = |source: Box<dyn std::error::Error + Send + Sync>| {
+        let path: PathBuf = directory.to_owned();
+        Error::RunDirectory { action: "lock", path, source }
+    };
+    checkpoint::make(directory).map_err(|error| refused(error.into()))?;
+    loop {
+        match DirectoryLock::try_take(directory) {
+            Ok(Some(lock)) => return Ok(lock),
+            Ok(None) if is_over() => {
                 return Err(refused("another learner is at work in this directory".into()));
             }
-            std::thread::sleep(LOCK_TICK);
+            Ok(None) => std::thread::sleep(LOCK_TICK),
+            Err(error) => return Err(refused(error.into())),
         }
     }
 }

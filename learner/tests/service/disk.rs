@@ -197,3 +197,22 @@ async fn files_that_cannot_be_made_are_made_when_what_is_in_their_way_is_gone() 
     let ended = served.end().await.expect("everything is written");
     assert_eq!(Left::behind(&ended, out), expected);
 }
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_learner_writes_nothing_to_a_directory_that_has_taken_its_place() {
+    let expected = calm(config(0)).await;
+    let keep = tempfile::tempdir().expect("a directory");
+    let (out, moved) = (keep.path().join("run"), keep.path().join("moved"));
+    let served = Served::start(impatient(&out, false)).await;
+    let mut toy = served.join("toy").await;
+    play_to_the_first_checkpoint(&mut toy, &out).await;
+    std::fs::rename(&out, &moved).expect("moves");
+    std::fs::create_dir(&out).expect("creates");
+    let told = play_until_warned(&mut toy, |told| told.contains("checkpoint")).await;
+    assert!(told.contains("the run directory was moved, removed or replaced"), "{told}");
+    std::fs::remove_dir(&out).expect("nothing was written there");
+    std::fs::rename(&moved, &out).expect("moves back");
+    while toy.play_one().await {}
+    let ended = served.end().await.expect("everything is written");
+    assert_eq!(Left::behind(&ended, &out), expected);
+}

@@ -42,6 +42,8 @@ pub(crate) fn learner_config(run: RunConfig, out: &Path, resume: bool) -> Learne
         start_from: None,
         out: out.to_owned(),
         resume,
+        out_is_locked: false,
+        run_file: None,
         n_threads: 1,
         clock: real_clock(),
         version: VERSION.to_owned(),

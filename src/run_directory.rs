@@ -1,0 +1,29 @@
+//! The place of a run directory.
+
+use std::path::Path;
+
+use crate::exit::{Exit, Failed, OrExit as _};
+
+/// Refuses a place where no directory can be: a file, or something below one.
+pub(crate) fn check_place(out: &Path) -> Result<(), Failed> {
+    let is_in_the_way = |path: &&Path| path.exists() && !path.is_dir();
+    match out.ancestors().find(is_in_the_way) {
+        Some(file) if file == out => Err(Failed::usage(format!(
+            "--out {}: it is a file, expected a directory for the run",
+            out.display()
+        ))),
+        Some(file) => Err(Failed::usage(format!(
+            "--out {}: {} is a file, expected a directory",
+            out.display(),
+            file.display()
+        ))),
+        None => Ok(()),
+    }
+}
+
+/// Makes the directory `out` where there is none.
+pub(crate) fn make(out: &Path) -> Result<(), Failed> {
+    check_place(out)?;
+    std::fs::create_dir_all(out)
+        .or_exit(Exit::TryAgain, || format!("cannot make {}", out.display()))
+}

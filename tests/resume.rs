@@ -1,0 +1,287 @@
+//! Resumed runs: what a resume may change, whom it waits for, and what a refused one leaves alone.
+
+use std::ffi::OsStr;
+use std::fs;
+use std::io::{BufRead as _, BufReader};
+use std::os::unix::ffi::OsStrExt as _;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Output, Stdio};
+use std::sync::LazyLock;
+use std::time::Duration;
+
+use tandem_policy::Policy;
+use tempfile::TempDir;
+
+/// A small advised run of 12 rounds.
+const SMALL: [&str; 14] = [
+    "--max-env-steps",
+    "9600",
+    "--set",
+    "rounds.updates_per_env_step=0.15",
+    "--set",
+    "ddpg.n_hidden=32",
+    "--set",
+    "evaluation.episodes=8",
+    "--set",
+    "evaluation.every_env_steps=4000",
+    "--set",
+    "checkpoint.every_rounds=2",
+    "--set",
+    "advice.budget=1500",
+];
+
+/// A whole run that nobody disturbed: its directory and its digest.
+static CALM: LazyLock<(TempDir, String)> = LazyLock::new(|| {
+    let keep = tempfile::tempdir().expect("a directory");
+    let ended = start(&keep.path().join("run")).wait_with_output().expect("ends");
+    (keep, digest(&ended))
+});
+
+fn tandem(args: &[&str], out: &Path) -> Command {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_tandem"));
+    command.args(args).arg("--out").arg(out).current_dir(env!("CARGO_MANIFEST_DIR"));
+    command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped());
+    command
+}
+
+fn start(out: &Path) -> Child {
+    let args = [&["train", "--json", "--workers", "2"], &SMALL[..]].concat();
+    tandem(&args, out).spawn().expect("starts")
+}
+
+fn resume(out: &Path, more: &[&str]) -> Output {
+    let args = [&["train", "--json", "--resume", "--workers", "2"], more].concat();
+    tandem(&args, out).output().expect("runs")
+}
+
+fn said(ended: &Output) -> String {
+    String::from_utf8_lossy(&ended.stderr).into_owned()
+}
+
+fn digest(ended: &Output) -> String {
+    assert!(ended.status.success(), "{:?}: {}", ended.status, said(ended));
+    let text = String::from_utf8_lossy(&ended.stdout);
+    let after = text.lines().last().and_then(|line| line.split("\"digest\":\"").nth(1));
+    after.and_then(|after| after.split('"').next()).expect("a digest").to_owned()
+}
+
+/// Checks that a resume is refused with `code`, in one line that says `what`.
+fn check_refused(refused: &Output, code: i32, what: &str) {
+    let told = said(refused);
+    assert_eq!(refused.status.code(), Some(code), "{told}");
+    assert!(told.contains(what), "{told:?} lacks {what:?}");
+    assert_eq!(told.lines().count(), 1, "{told}");
+    assert!(!told.contains("go on with") && !told.contains("Some("), "{told}");
+}
+
+/// What a refused resume must leave as it is.
+fn kept(out: &Path) -> [Vec<u8>; 2] {
+    ["run.toml", "policy/teacher.safetensors"].map(|name| fs::read(out.join(name)).expect(name))
+}
+
+/// Another teacher for the same task, in `directory`.
+fn other_teacher(directory: &Path) -> String {
+    let shipped = Path::new(env!("CARGO_MANIFEST_DIR")).join("policies/teacher-push.safetensors");
+    let mut policy = Policy::load(&shipped).expect("ships");
+    policy.actor[0] += 0.5;
+    let path = directory.join("other.safetensors");
+    policy.save(&path).expect("writable");
+    path.to_str().expect("UTF-8").to_owned()
+}
+
+fn signal(signal: &str, pid: u32) {
+    let sent = Command::new("kill").args([signal, &pid.to_string()]).status().expect("kill runs");
+    assert!(sent.success(), "no process {pid}");
+}
+
+/// The process numbers of a run's processes whose command line has `role` as its first argument.
+fn pids(run: &Child, role: &str) -> Vec<u32> {
+    let pid = run.id();
+    let children = fs::read_to_string(format!("/proc/{pid}/task/{pid}/children"));
+    let is_role = |pid: &u32| {
+        let line = fs::read_to_string(format!("/proc/{pid}/cmdline")).unwrap_or_default();
+        line.split('\0').nth(1) == Some(role)
+    };
+    let children = children.unwrap_or_default();
+    children.split_whitespace().filter_map(|pid| pid.parse().ok()).filter(is_role).collect()
+}
+
+/// Kills a process of a run and waits until it is there again.
+fn kill_one(run: &Child, role: &str) {
+    let former = pids(run, role);
+    signal("-KILL", former[0]);
+    let is_back = || pids(run, role).iter().any(|pid| !former.contains(pid));
+    assert!(eventually(is_back), "the {role} is not started again");
+}
+
+/// Waits until the run is in full swing.
+fn wait_for_checkpoint(out: &Path) {
+    let is_saved = || {
+        let saved = fs::read_dir(out.join("checkpoint")).into_iter().flatten().flatten();
+        saved.map(|entry| entry.path()).any(|path| path.extension() == Some("safetensors".as_ref()))
+    };
+    assert!(eventually(is_saved), "no checkpoint in {}", out.display());
+}
+
+/// Looks every 20 ms for two minutes whether something has come true.
+fn eventually(holds: impl Fn() -> bool) -> bool {
+    (0..6000).any(|_| {
+        std::thread::sleep(Duration::from_millis(20));
+        holds()
+    })
+}
+
+fn directory() -> (TempDir, PathBuf) {
+    let keep = tempfile::tempdir().expect("a directory");
+    let out = keep.path().join("run");
+    (keep, out)
+}
+
+/// A copy of the calm run.
+fn finished() -> (TempDir, PathBuf) {
+    let (keep, out) = directory();
+    let copied = Command::new("cp").arg("-a").arg(CALM.0.path().join("run")).arg(&out).status();
+    assert!(copied.expect("cp runs").success());
+    (keep, out)
+}
+
+#[test]
+fn a_refused_resume_does_not_reach_the_run_that_is_under_way() {
+    let (keep, out) = directory();
+    let run = start(&out);
+    wait_for_checkpoint(&out);
+    let (before, other) = (kept(&out), other_teacher(keep.path()));
+    for name in fs::read_dir(&out).expect("a run").flatten().map(|entry| entry.file_name()) {
+        if name.as_bytes().ends_with(b".lock") {
+            fs::remove_file(out.join(name)).expect("removes");
+        }
+    }
+    for more in [&[][..], &["--set", "ddpg.discount=0.5"], &["--teacher", &other]] {
+        check_refused(&resume(&out, more), 75, "another process is at work in");
+        assert_eq!(kept(&out), before, "{more:?}");
+    }
+    kill_one(&run, "learner");
+    assert_eq!(kept(&out), before);
+    // Nor does what somebody writes there.
+    let text = String::from_utf8_lossy(&before[0]).replace("discount = 0.95", "discount = 0.5");
+    assert_ne!(text.as_bytes(), before[0]);
+    fs::write(out.join("run.toml"), text).expect("writable");
+    fs::copy(&other, out.join("policy/teacher.safetensors")).expect("writable");
+    kill_one(&run, "teacher");
+    kill_one(&run, "learner");
+    assert_eq!(digest(&run.wait_with_output().expect("ends")), CALM.1);
+    assert!(!out.join("in-use").exists(), "it ends with the run");
+}
+
+#[test]
+fn a_resume_with_other_settings_is_refused_by_name_and_changes_nothing() {
+    let (keep, out) = finished();
+    let (before, other) = (kept(&out), other_teacher(keep.path()));
+    let refusals = [
+        ("ddpg.n_hidden=64", "tandem: ddpg.n_hidden is 64 here and 32 in the run's checkpoint \""),
+        ("ddpg.discount=0.5", "tandem: ddpg.discount is 0.5 here and 0.95 in the run's checkpoint"),
+        ("seed=77", "tandem: seed is 77 here and 1 in"),
+        ("advice.budget=99", "tandem: advice.budget is 99 here and 1500 in"),
+    ];
+    for (setting, what) in refusals {
+        check_refused(&resume(&out, &["--set", setting]), 64, what);
+    }
+    check_refused(&resume(&out, &["--teacher", &other]), 64, "another policy");
+    assert_eq!(kept(&out), before);
+
+    let changed = keep.path().join("changed.toml");
+    let text = String::from_utf8_lossy(&before[0]).replace("n_hidden = 32", "n_hidden = 64");
+    fs::write(&changed, text).expect("writable");
+    let args = ["learner", "--start-or-resume", "--teacher", "127.0.0.1:1", "--run"];
+    let refused = tandem(&[&args[..], &[changed.to_str().expect("UTF-8")]].concat(), &out).output();
+    let refused = refused.expect("runs");
+    assert_eq!(refused.status.code(), Some(64), "{}", said(&refused));
+    assert!(said(&refused).contains("ddpg.n_hidden is 64 here and 32 in"), "{}", said(&refused));
+    assert_eq!(kept(&out), before);
+
+    assert_eq!(digest(&resume(&out, &[])), CALM.1, "it can still be resumed");
+}
+
+#[test]
+fn a_run_that_has_ended_goes_on_for_longer() {
+    let (_keep, out) = finished();
+    let longer = resume(&out, &["--max-env-steps", "11200"]);
+    assert_ne!(digest(&longer), CALM.1);
+    let summary = String::from_utf8_lossy(&longer.stdout);
+    assert!(summary.contains("\"env_steps\":11200,"), "{summary}");
+    let settings = fs::read_to_string(out.join("run.toml")).expect("readable");
+    assert!(settings.contains("max_env_steps = 11200"), "{settings}");
+    assert_eq!(digest(&resume(&out, &[])), digest(&longer), "it stays so");
+}
+
+#[test]
+fn a_run_without_a_checkpoint_keeps_the_settings_of_its_run_file() {
+    let (_keep, out) = finished();
+    fs::remove_dir_all(out.join("checkpoint")).expect("removes");
+    let refused = resume(&out, &["--set", "ddpg.n_hidden=64"]);
+    check_refused(&refused, 64, "tandem: ddpg.n_hidden is 64 here and 32 in the run's ");
+    assert!(said(&refused).contains("run.toml"), "{}", said(&refused));
+}
+
+#[test]
+fn a_run_killed_and_resumed_at_once_goes_on_to_the_same_end() {
+    let (_keep, out) = directory();
+    let mut run = start(&out);
+    wait_for_checkpoint(&out);
+    signal("-KILL", run.id());
+    assert_eq!(digest(&resume(&out, &[])), CALM.1);
+    run.wait().expect("is gone");
+}
+
+#[test]
+fn a_resume_waits_for_the_teacher_that_an_earlier_start_left_behind() {
+    let (_keep, out) = finished();
+    let mut teacher = Command::new(env!("CARGO_BIN_EXE_tandem"))
+        .arg("teacher")
+        .args(["--policy".as_ref(), out.join("policy/teacher.safetensors").as_os_str()])
+        .args(["--ledger".as_ref(), out.join("ledger.sqlite").as_os_str()])
+        .stdin(Stdio::null())
+        .stdout(Stdio::piped())
+        .stderr(Stdio::null())
+        .spawn()
+        .expect("starts");
+    let mut line = String::new();
+    let output = teacher.stdout.take().expect("piped");
+    BufReader::new(output).read_line(&mut line).expect("readable");
+    let mut resumed = tandem(&["train", "--json", "--resume"], &out).spawn().expect("starts");
+    let mut told = BufReader::new(resumed.stderr.take().expect("piped"));
+    let mut line = String::new();
+    told.read_line(&mut line).expect("readable");
+    assert!(line.contains("teacher of an earlier start still uses"), "{line}");
+    signal("-TERM", teacher.id());
+    teacher.wait().expect("ends");
+    let rest = std::thread::spawn(move || told.lines().map_while(Result::ok).collect::<Vec<_>>());
+    assert_eq!(digest(&resumed.wait_with_output().expect("ends")), CALM.1);
+    drop(rest.join());
+}
+
+#[test]
+fn a_teacher_that_is_killed_as_it_starts_is_started_again() {
+    let (_keep, out) = directory();
+    let run = start(&out);
+    assert!((0..20_000).any(|_| {
+        std::thread::sleep(Duration::from_millis(1));
+        pids(&run, "teacher").first().is_some_and(|pid| {
+            signal("-KILL", *pid);
+            true
+        })
+    }));
+    let ended = run.wait_with_output().expect("ends");
+    assert_eq!(digest(&ended), CALM.1);
+    let line = "the teacher was killed by signal 9 and is started again";
+    assert!(said(&ended).contains(line), "{}", said(&ended));
+}
+
+#[test]
+fn a_run_directory_may_have_a_name_that_is_not_text() {
+    let keep = tempfile::tempdir().expect("a directory");
+    let out = keep.path().join(OsStr::from_bytes(b"run \xff"));
+    assert_eq!(digest(&start(&out).wait_with_output().expect("ends")), CALM.1);
+    assert_eq!(digest(&resume(&out, &[])), CALM.1);
+    assert!(out.join("report.html").exists());
+}
