@@ -10,6 +10,7 @@ use tandem_proto::pb;
 use tandem_proto::pb::bridge_client::BridgeClient;
 use tandem_proto::pb::learner_client::LearnerClient;
 use tandem_proto::pb::teacher_client::TeacherClient;
+use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
 use tonic::{Code, Status};
@@ -286,6 +287,34 @@ async fn tokens_and_tls_work_over_any_network() {
     let status = describe(&wrong).await.expect_err("sent away");
     assert_eq!(status.code(), Code::Unauthenticated, "{status}");
     assert_eq!(counter.n_calls(), 1);
+    serving.abort();
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_connection_without_a_request_is_closed_and_one_that_made_a_request_is_kept() {
+    let (connections, accepted) = mpsc::channel(4);
+    let incoming = Incoming::new(ReceiverStream::new(accepted));
+    let (_, serving) = support::serve(incoming, &Gate::default().with_token(token(SECRET))).await;
+    let connect = async || {
+        let (near, far) = tokio::io::duplex(1 << 16);
+        connections.send(Ok(Connection::new(far))).await.expect("the service is there");
+        near
+    };
+    let mut silent = connect().await;
+    silent.write_all(b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n\0\0\0\x04\0\0\0\0\0").await.expect("sent");
+    let started = tokio::time::Instant::now();
+    silent.read_to_end(&mut Vec::new()).await.expect("closed");
+    assert_eq!(started.elapsed().as_secs(), 10);
+
+    let only = std::sync::Mutex::new(Some(connect().await));
+    let dial = Dial::default().through(move |_| {
+        let stream = only.lock().expect("nobody panics").take();
+        async move { stream.map(Connection::new).ok_or(std::io::ErrorKind::NotConnected.into()) }
+    });
+    let link = dial.link("127.0.0.1:1").expect("an address");
+    check_health(link.clone(), "", LONG).await.expect("serves");
+    tokio::time::sleep(Duration::from_secs(600)).await;
+    check_health(link, "", LONG).await.expect("over the same connection");
     serving.abort();
 }
 
