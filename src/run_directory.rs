@@ -1,8 +1,11 @@
 //! The place of a run directory.
 
+use std::io::ErrorKind;
 use std::path::Path;
 
-use crate::exit::{Exit, Failed, OrExit as _};
+use anyhow::anyhow;
+
+use crate::exit::{Exit, Failed};
 
 /// Refuses a place where no directory can be: a file, or something below one.
 pub(crate) fn check_place(out: &Path) -> Result<(), Failed> {
@@ -24,6 +27,11 @@ pub(crate) fn check_place(out: &Path) -> Result<(), Failed> {
 /// Makes the directory `out` where there is none.
 pub(crate) fn make(out: &Path) -> Result<(), Failed> {
     check_place(out)?;
-    std::fs::create_dir_all(out)
-        .or_exit(Exit::TryAgain, || format!("cannot make {}", out.display()))
+    std::fs::create_dir_all(out).map_err(|error| {
+        let exit = match error.kind() {
+            ErrorKind::InvalidFilename | ErrorKind::InvalidInput => Exit::Usage,
+            _ => Exit::TryAgain,
+        };
+        Failed::new(exit, anyhow!(error).context(format!("cannot make {}", out.display())))
+    })
 }

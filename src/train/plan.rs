@@ -87,7 +87,7 @@ impl Plan {
         match settings::first_change(&self.config, &began_with).or_exit(Exit::Bug, String::new)? {
             Some(changed) => {
                 let path = self.run_file();
-                Err(Failed::usage(format!("{changed}'s {}: {}", path.display(), settings::ADVICE)))
+                Err(Failed::usage(format!("{changed}'s run file {path:?}: {}", settings::ADVICE)))
             }
             None => Ok(()),
         }

@@ -180,7 +180,8 @@ pub(super) fn keep_run_file(config: &LearnerConfig) -> Result<(), Error> {
 #[derive(Debug)]
 pub(super) struct RunLock {
     out: Option<DirectoryLock>,
-    checkpoints: DirectoryLock,
+    /// `None` where something is in its way: a checkpoint is then as missing as on a full disk.
+    checkpoints: Option<DirectoryLock>,
 }
 
 impl RunLock {
@@ -188,17 +189,21 @@ impl RunLock {
     fn take(config: &LearnerConfig, shutdown: &CancellationToken) -> Result<Self, Error> {
         let until = (config.clock)() + LOCK_PATIENCE;
         let is_over = || (config.clock)() >= until || shutdown.is_cancelled();
-        let checkpoints = config.out.join("checkpoint");
         let out = match config.out_is_locked {
             true => None,
             false => Some(lock(&config.out, &is_over)?),
         };
-        Ok(Self { out, checkpoints: lock(&checkpoints, &is_over)? })
+        let checkpoints = config.out.join("checkpoint");
+        let checkpoints = match checkpoints.exists() && !checkpoints.is_dir() {
+            true => None,
+            false => Some(lock(&checkpoints, &is_over)?),
+        };
+        Ok(Self { out, checkpoints })
     }
 
     /// Whether the paths still lead to the directories that are locked.
     pub(super) fn is_in_place(&self) -> bool {
-        self.checkpoints.is_in_place() && self.out.as_ref().is_none_or(DirectoryLock::is_in_place)
+        self.out.iter().chain(&self.checkpoints).all(DirectoryLock::is_in_place)
     }
 }
 
