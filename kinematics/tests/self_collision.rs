@@ -11,9 +11,9 @@ use tandem_kinematics::{
     PlacedArm, Reason, Refusal, TaskFrame, check,
 };
 
-const N_POSTURES: u32 = 100_000;
-const N_MOTIONS: u32 = 200;
-const N_MOTIONS_6: u32 = 50;
+/// Postures and motions of the Mico with four joints, and of the arms with six.
+const N_POSTURES: [u32; 2] = [100_000, 20_000];
+const N_MOTIONS: [u32; 2] = [200, 50];
 const PERIOD_S: f64 = 0.01;
 const MARGIN_M: f64 = 0.005;
 /// What the check states to hide between its looks, and what the distances below leave to rounding.
@@ -155,7 +155,8 @@ fn no_posture_in_which_an_arm_is_too_near_to_itself_is_accepted_and_no_other_is_
         let (cell, settings) = alone(arm.model);
         let mut rng = episode_rng(11, 0, Stream::Reset);
         let (mut n_refused, mut least_m) = (0, f64::INFINITY);
-        for _ in 0..N_POSTURES {
+        let n_postures = N_POSTURES[usize::from(arm.table.len() > 4)];
+        for _ in 0..n_postures {
             let angles = random_angles(arm.model, &mut rng);
             let opening = rng.random_range(0.0..1.0);
             let velocities = Joints::from_fn(angles.len(), |_| 0.0);
@@ -173,12 +174,12 @@ fn no_posture_in_which_an_arm_is_too_near_to_itself_is_accepted_and_no_other_is_
             }
         }
         println!(
-            "{}: {n_refused} of {N_POSTURES} refused, the others at {:.2} mm or more",
+            "{}: {n_refused} of {n_postures} refused, the others at {:.2} mm or more",
             arm.model.name,
             1e3 * least_m
         );
         assert!(least_m >= MARGIN_M - TOLERANCE_M - ROUNDING_M, "accepted at {least_m} m");
-        assert!(n_refused > N_POSTURES / 50 && n_refused < N_POSTURES / 5);
+        assert!(n_refused > n_postures / 50 && n_refused < n_postures / 5);
     }
 }
 
@@ -240,7 +241,7 @@ fn no_motion_that_leads_an_arm_into_itself_between_its_samples_is_accepted() {
         let (cell, settings) = alone(arm.model);
         let mut rng = episode_rng(12, 0, Stream::Exploration);
         let (mut n_refused, mut least_m) = (0, f64::INFINITY);
-        let n_motions = if arm.table.len() == 4 { N_MOTIONS } else { N_MOTIONS_6 };
+        let n_motions = N_MOTIONS[usize::from(arm.table.len() > 4)];
         for number in 0..n_motions {
             let motion = random_motion(arm.model, &mut rng);
             let at = motion.arms[0][0].angles;
