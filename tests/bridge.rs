@@ -159,7 +159,7 @@ fn operators_look_reset_move_and_stop() {
     assert_eq!(told["limits"]["speed"], json!(0.8));
     assert_eq!(bridge.status()["stopped"]["name"], json!("not-reset"));
     let early = bridge.run(&["move", "deploy/first-motion.json"]);
-    if !said(&early).contains("nobody knows where the arms are") {
+    if !said(&early).contains("the position of the arms is not known") {
         fails_with(75, &early, "tandem bridge reset");
     }
 

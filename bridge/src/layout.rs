@@ -15,9 +15,10 @@ pub fn mico_cell() -> Cell {
     Cell { task_frame: TaskFrame { scale: 1.0, ..TaskFrame::MICO_4 }, ..half }
 }
 
-/// What a motion has to keep before it may start: tilt up to 45 degrees, 4 mm above the table, 20 mm between arms.
+/// What a motion has to keep before it may start: tilt up to 45 degrees, 4 mm above the table, 20 mm between arms, 5 mm
+/// between parts of one arm.
 ///
-/// The gaps are larger than those that the envelope keeps while the arms move (1 mm and 12 mm), so that a motion
+/// The gaps are larger than those that the envelope keeps while the arms move (1, 12 and 2 mm), so that a motion
 /// along the limit is not stopped for what its stopping way would have been.
 #[must_use]
 pub fn check_settings() -> CheckSettings {

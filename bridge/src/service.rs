@@ -209,6 +209,8 @@ impl BridgeService {
         wanted: Wanted,
         look: impl FnOnce(CheckedMotion) -> T + Send + 'static,
     ) -> Result<T, Error> {
+        // After a state that was not believed there is none until the next one has come.
+        self.arms.until(|newest| newest.state.is_some()).await;
         let turn = tokio::time::timeout(CHECK_QUEUE, Arc::clone(&self.checks).acquire_owned());
         let turn = turn.await.map_err(|_elapsed| Error::Busy)?.map_err(|_closed| Error::Ended)?;
         let newest = self.arms.newest();

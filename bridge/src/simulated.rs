@@ -3,8 +3,8 @@
 //! It stands for the real world in trials, so it is unlike the training world on purpose: joints instead of a hand that flies,
 //! a gripper that tilts as the joints tilt it, two fingers, commands that arrive late, speeds that follow with a lag,
 //! encoders with noise, cameras that see late. The arms' shapes are those of `tandem-kinematics`, whose capsules include
-//! about a centimetre of margin: two arms touch, and an arm touches the table, when these do. Objects are touched by thinner
-//! shells.
+//! about a centimetre of margin: two arms touch, and an arm touches the table or itself, when these do. Objects are touched by
+//! thinner shells. An arm that touches itself reports a contact.
 //!
 //! **The gripper** has two pads that slide straight along the closing direction, from 0 to 62 mm each, and reach 36 mm beyond
 //! the tool's origin: in every opening they stay within the capsule that kinematics has for the fingers. Kinova's
@@ -19,7 +19,7 @@ use tandem_core::{ArmIndex, Contacts, Stream, episode_rng};
 use tandem_kinematics::model::Anchor;
 use tandem_kinematics::{Cell, Gaps, Joints, Posture};
 
-use crate::driver::{Command, Driver, DriverError, Order, PairState};
+use crate::driver::{Command, Driver, DriverError, Faults, Order, PairState};
 use crate::simulated::drives::Drives;
 use crate::simulated::sensors::Cameras;
 use crate::simulated::world::{Carried, World};
@@ -58,6 +58,8 @@ pub struct SimulatedPair {
     /// What the arms touched in the last period, as torques of the joints, newton metres.
     torques_nm: Vec<Joints>,
     contacts: Contacts,
+    /// For each arm whether two of its own parts touched in the last period.
+    self_contacts: Vec<bool>,
     rng: ChaCha8Rng,
 }
 
@@ -89,6 +91,7 @@ impl SimulatedPair {
             cameras: Cameras::new(config.camera, objects, rng(Source::Cameras)),
             torques_nm: at.iter().map(|at| Joints::from_fn(at.len(), |_| 0.0)).collect(),
             contacts: Contacts::NONE,
+            self_contacts: vec![false; at.len()],
             rng: rng(Source::Joints),
             disturbance: Disturbance::default(),
             world,
@@ -144,6 +147,15 @@ impl SimulatedPair {
         self.contacts
     }
 
+    /// Whether two parts of `arm` itself touched in the last period.
+    ///
+    /// # Panics
+    /// When there is no such arm.
+    #[must_use]
+    pub fn touches_itself(&self, arm: ArmIndex) -> bool {
+        self.self_contacts[arm.0]
+    }
+
     /// Where the objects truly are.
     #[must_use]
     pub fn objects(&self) -> Vec<ObjectPose> {
@@ -166,10 +178,13 @@ impl SimulatedPair {
     fn let_pass(&mut self) {
         self.drives.begin_period();
         self.contacts = Contacts::NONE;
-        let mut forces_n = vec![DVec3::ZERO; self.cell.arms.len()];
+        self.self_contacts.fill(false);
+        let n_arms = self.cell.arms.len();
+        let mut forces_n = vec![DVec3::ZERO; n_arms];
         for _ in 0..N_SUBSTEPS {
             let torques = self.torques_nm.clone();
-            self.drives.step(&self.cell, &self.config, &self.disturbance, &torques);
+            let opened: Vec<f64> = (0..n_arms).map(|arm| self.world.opening(arm)).collect();
+            self.drives.step(&self.cell, &self.config, &self.disturbance, &opened, &torques);
             let angles: Vec<Joints> = self.drives.arms.iter().map(|arm| arm.angles).collect();
             let carried: Vec<Carried> = carried(&self.cell, &angles).collect();
             let openings: Vec<f64> = self.drives.arms.iter().map(|arm| arm.opening).collect();
@@ -178,6 +193,9 @@ impl SimulatedPair {
                 *force_n += self.world.force_n(arm) / f64::from(N_SUBSTEPS);
             }
             self.contacts = self.contacts | self.drives.contacts();
+            for (any, now) in self.self_contacts.iter_mut().zip(self.drives.self_contacts()) {
+                *any |= *now;
+            }
         }
         for (arm, force_n) in forces_n.into_iter().enumerate() {
             self.torques_nm[arm] = self.torques(arm, force_n);
@@ -202,7 +220,9 @@ impl SimulatedPair {
         let mut arms = Vec::with_capacity(self.cell.arms.len());
         for (idx, arm) in self.drives.arms.iter().enumerate() {
             let (opening, torques) = (self.world.opening(idx), &self.torques_nm[idx]);
-            arms.push(sensors::read(arm, opening, torques, tripped, &self.config, &mut self.rng));
+            let contact = self.self_contacts[idx];
+            let faults = Faults { drive: tripped, contact, emergency_stop: false };
+            arms.push(sensors::read(arm, opening, torques, faults, &self.config, &mut self.rng));
         }
         PairState {
             sequence: self.drives.n_periods(),

@@ -3,7 +3,9 @@
 use glam::DVec3;
 
 use crate::cell::PlacedArm;
+use crate::model::ArmModel;
 use crate::posture::Posture;
+use crate::self_collision::SelfPair;
 
 /// Most links of an arm.
 pub(crate) const MAX_LINKS: usize = 8;
@@ -23,18 +25,25 @@ pub(crate) struct PosedLinks {
 }
 
 impl PosedLinks {
+    /// The links in the world, the gripper wide open.
     pub(crate) fn of(arm: &PlacedArm, posture: &Posture) -> Self {
         let axes = arm.axes();
+        Self::placed(arm.model, posture, |in_base| arm.base_in_world_m + axes * in_base)
+    }
+
+    /// The links in the arm's base frame, the gripper wide open.
+    pub(crate) fn in_base(model: &ArmModel, posture: &Posture) -> Self {
+        Self::placed(model, posture, |in_base| in_base)
+    }
+
+    fn placed(model: &ArmModel, posture: &Posture, place: impl Fn(DVec3) -> DVec3) -> Self {
         let nowhere = Capsule { ends: [DVec3::ZERO; 2], radius_m: 0.0 };
         let mut capsules = [nowhere; MAX_LINKS];
-        for (capsule, link) in capsules.iter_mut().zip(arm.model.links) {
-            let in_world = |anchor| arm.base_in_world_m + axes * posture.anchor(anchor);
-            *capsule = Capsule {
-                ends: [in_world(&link.ends[0]), in_world(&link.ends[1])],
-                radius_m: link.radius_m,
-            };
+        for (capsule, link) in capsules.iter_mut().zip(model.links) {
+            let ends = [0, 1].map(|end: usize| place(posture.anchor(&link.ends[end])));
+            *capsule = Capsule { ends, radius_m: link.radius_m };
         }
-        Self { capsules, n: arm.model.links.len() }
+        Self { capsules, n: model.links.len() }
     }
 
     fn iter(&self) -> impl Iterator<Item = (usize, &Capsule)> {
@@ -68,9 +77,44 @@ impl PosedLinks {
         }
         least
     }
+
+    /// The smallest gap between two parts of this arm that can meet, metres (negative when they overlap), and these parts.
+    /// The arm is `model`, its gripper open by `opening` (0 to 1).
+    pub(crate) fn self_gap_m(&self, model: &ArmModel, opening: f64) -> (f64, [usize; 2]) {
+        let mut least = (f64::INFINITY, [0, 0]);
+        for pair in model.self_pairs {
+            let gap_m = self.pair_gap_m(model, pair, opening, least.0);
+            if gap_m < least.0 {
+                least = (gap_m, pair.links);
+            }
+        }
+        least
+    }
+
+    /// The gap between the parts of `pair`, metres; some larger number than `least_m` when that is quickly seen.
+    pub(crate) fn pair_gap_m(
+        &self,
+        model: &ArmModel,
+        pair: &SelfPair,
+        opening: f64,
+        least_m: f64,
+    ) -> f64 {
+        let [first, second] = pair.links.map(|link| {
+            let shut_share = model.links[link].shut_share;
+            self.capsules[link].shortened(shut_share + opening * (1.0 - shut_share))
+        });
+        first.gap_m(&second, least_m - pair.allowance_m) + pair.allowance_m
+    }
 }
 
 impl Capsule {
+    /// What is left of it about its middle.
+    fn shortened(&self, share: f64) -> Self {
+        let middle = 0.5 * (self.ends[0] + self.ends[1]);
+        let ends = self.ends.map(|end| middle + share * (end - middle));
+        Self { ends, radius_m: self.radius_m }
+    }
+
     /// The gap to another capsule, metres; some larger number than `least_m` when that is quickly seen.
     fn gap_m(&self, other: &Self, least_m: f64) -> f64 {
         let half = |capsule: &Self| 0.5 * (capsule.ends[1] - capsule.ends[0]);

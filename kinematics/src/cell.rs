@@ -67,6 +67,8 @@ pub struct Gaps {
     pub table_m: Vec<f64>,
     /// The smallest gap between parts of two arms; infinite when there is one arm only.
     pub arms_m: f64,
+    /// For each arm the smallest gap between two of its own parts that can meet.
+    pub self_m: Vec<f64>,
 }
 
 /// How an arm's own frame of the training world lies in the arm's base frame.
@@ -138,13 +140,25 @@ impl Cell {
         self.indexed().map(ready).collect()
     }
 
-    /// The gaps round the arms at joint angles `at`, radians, arm by arm.
+    /// The gaps of the arms at joint angles `at`, radians, arm by arm, with grippers that may be wide open.
     ///
     /// # Panics
     /// When `at` is of other arms.
     #[must_use]
     pub fn gaps(&self, at: &[Joints]) -> Gaps {
-        assert_eq!(at.len(), self.arms.len(), "angles of other arms");
+        self.gaps_with(at, &vec![1.0; at.len()])
+    }
+
+    /// The gaps of the arms at joint angles `at`, radians, arm by arm, with grippers open by `openings` (0 to 1).
+    ///
+    /// Openings count between parts of one arm only: for all else a gripper takes the room that it has when open.
+    ///
+    /// # Panics
+    /// When `at` or `openings` are of other arms.
+    #[must_use]
+    pub fn gaps_with(&self, at: &[Joints], openings: &[f64]) -> Gaps {
+        let n_arms = self.arms.len();
+        assert!(at.len() == n_arms && openings.len() == n_arms, "angles of other arms");
         let pose =
             |(arm, q): (&PlacedArm, &Joints)| PosedLinks::of(arm, &Posture::of(arm.model, q));
         let posed: Vec<PosedLinks> = self.arms.iter().zip(at).map(pose).collect();
@@ -154,6 +168,9 @@ impl Cell {
         Gaps {
             table_m: posed.iter().map(|links| links.table_gap_m(self.table_z_m).0).collect(),
             arms_m: posed.iter().enumerate().map(between).fold(f64::INFINITY, f64::min),
+            self_m: (0..n_arms)
+                .map(|arm| posed[arm].self_gap_m(self.arms[arm].model, openings[arm]).0)
+                .collect(),
         }
     }
 

@@ -12,7 +12,10 @@
 //!
 //! What is wrong as a whole (numbers of arms and samples, length, start) comes first, then the earliest interval that
 //! breaks a limit; within one interval (10 ms) numbers and grippers, then joints, then the arms' shape, each
-//! arm by arm. Each arm's collisions with itself are left to its own firmware.
+//! arm by arm.
+//!
+//! Gaps between parts of one arm are those with the gripper open as the motion has it, the wider of an interval's ends. There
+//! is no limit of the jerk: an acceleration may change from one sample to the next.
 
 use tandem_core::ArmIndex;
 
@@ -22,6 +25,7 @@ use crate::limits::Limits;
 use crate::model::{ArmModel, Joint};
 use crate::motion::{ArmSample, Cubic, Motion};
 use crate::refusal::{Excess, Reason, Refusal};
+use crate::self_collision::SELF_GAP_M;
 use crate::sweep::Sweep;
 
 /// Slack for rounding: limits hold to one part in a billion.
@@ -42,6 +46,8 @@ pub struct CheckSettings {
     pub table_gap_m: f64,
     /// Smallest gap between the parts of two arms, metres.
     pub arms_gap_m: f64,
+    /// Smallest gap between parts of one arm that can meet ([`SelfPair`](crate::self_collision::SelfPair)), metres.
+    pub self_gap_m: f64,
     /// Largest difference between a joint's first angle and where it is, radians.
     pub start_rad: f64,
     /// Longest motion, seconds.
@@ -49,8 +55,8 @@ pub struct CheckSettings {
 }
 
 impl Default for CheckSettings {
-    /// Tilt up to 25 degrees, reach up to 97 per cent, 2 mm above the table, 20 mm between arms, a start within 1 degree,
-    /// at most 10 minutes.
+    /// Tilt up to 25 degrees, reach up to 97 per cent, 2 mm above the table, 20 mm between arms, 5 mm between parts of one
+    /// arm, a start within 1 degree, at most 10 minutes.
     fn default() -> Self {
         Self {
             limits: Limits::default(),
@@ -58,6 +64,7 @@ impl Default for CheckSettings {
             reach_share: 0.97,
             table_gap_m: 0.002,
             arms_gap_m: 0.020,
+            self_gap_m: SELF_GAP_M,
             start_rad: 1.0_f64.to_radians(),
             duration_s: 600.0,
         }
@@ -92,7 +99,7 @@ pub fn check(
             };
             let cubics = pair.checked(placed.model, &settings.limits);
             let cubics = cubics.map_err(|(reason, since_s)| reason.of(arm, when_s + since_s))?;
-            sweep.follow(arm, cubics);
+            sweep.follow(arm, cubics, pair.from.opening.max(pair.to.opening));
         }
         sweep.check(when_s, motion.period_s)?;
     }
@@ -167,6 +174,7 @@ fn check_settings(settings: &CheckSettings) -> Result<(), Refusal> {
         ("reach_share", settings.reach_share),
         ("table_gap_m", settings.table_gap_m),
         ("arms_gap_m", settings.arms_gap_m),
+        ("self_gap_m", settings.self_gap_m),
         ("start_rad", settings.start_rad),
         ("duration_s", settings.duration_s),
     ];

@@ -24,12 +24,15 @@ use crate::iterative;
 use crate::joints::Joints;
 use crate::model::{ArmModel, TOOL_ORIGIN_M};
 use crate::posture::Posture;
+use crate::self_collision::SELF_GAP_M;
 
 /// Postures of an arm with four joints are singular with a smaller gain, metres per radian. It has this where it is bent
 /// by 8 degrees, 1.5 mm short of its reach.
 pub const LEAST_GAIN_M: f64 = 0.02;
 /// The same with six joints, where turning counts too, weighed with 0.1 m per radian.
 pub const LEAST_GAIN_6_M: f64 = 0.002;
+/// A solution that differs by no more than this in any joint is where the arm moves on to, radians.
+pub(crate) const MOVES_ON_RAD: f64 = 0.35;
 
 /// Where the tool shall be, and how the fingers shall stand. The gripper shall point straight down.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -109,7 +112,8 @@ pub enum ReachError {
 
 impl ArmModel {
     /// The solution for `target` whose angles are nearest to `near`, radians. Joints that turn round and round are
-    /// taken by the shorter way.
+    /// taken by the shorter way. Solutions in which the arm is too near to itself come last, unless `near` is so near
+    /// that the arm just moves on.
     ///
     /// # Errors
     /// Says why the target cannot be reached.
@@ -123,10 +127,11 @@ impl ArmModel {
         if self.n_joints() == 4 {
             let solutions = self.solutions(target, near)?;
             let distance = |solution: &Solution| squared_distance(&solution.angles, near);
-            let nearest = solutions
-                .into_iter()
-                .min_by(|a, b| distance(a).total_cmp(&distance(b)))
-                .expect("an empty list is an error");
+            let before = |a: &Solution, b: &Solution| {
+                let last = [a, b].map(|solution| !self.takes(&solution.angles, near));
+                last[0].cmp(&last[1]).then(distance(a).total_cmp(&distance(b)))
+            };
+            let nearest = solutions.into_iter().min_by(before).expect("an empty list is an error");
             return Ok(nearest);
         }
         self.nearest_pose(target.at_m, &pointing_down(target.yaw_rad), near)
@@ -183,24 +188,36 @@ impl ArmModel {
         let from = |start: &Joints| {
             iterative::solve(self, at_m, axes, start).and_then(|angles| self.accept(angles, near))
         };
-        let first = match from(near) {
-            Ok(solution) => return Ok(solution),
-            Err(error) => error,
-        };
+        let mut touching = None;
+        let mut worst = None;
+        match from(near) {
+            Ok(found) if self.takes(&found.angles, near) => return Ok(found),
+            Ok(found) => touching = Some(found),
+            Err(error) => worst = Some(error),
+        }
         let mut best: Option<Solution> = None;
-        let mut worst = first;
         for start in iterative::starts(self) {
             match from(&start) {
                 Ok(found) => {
-                    let nearer = best.is_none_or(|best| {
-                        squared_distance(&found.angles, near) < squared_distance(&best.angles, near)
+                    let place =
+                        if self.takes(&found.angles, near) { &mut best } else { &mut touching };
+                    let nearer = place.is_none_or(|known| {
+                        squared_distance(&found.angles, near)
+                            < squared_distance(&known.angles, near)
                     });
-                    best = if nearer { Some(found) } else { best };
+                    *place = if nearer { Some(found) } else { *place };
                 }
-                Err(error) => worst = nearer_miss(Some(worst), error),
+                Err(error) => worst = Some(nearer_miss(worst, error)),
             }
         }
-        best.ok_or(worst)
+        best.or(touching).ok_or_else(|| worst.expect("every start has failed"))
+    }
+
+    /// Whether a solution need not come last: the arm keeps clear of itself, or moves on from `near`. Where an arm that
+    /// moves on meets itself is for the check to say; another solution would be a jump.
+    fn takes(&self, angles: &Joints, near: &Joints) -> bool {
+        angles.largest_difference(near) <= MOVES_ON_RAD
+            || self.self_gap_m(angles, 1.0) >= SELF_GAP_M
     }
 
     /// `angles` by full turns as near to `near` as the ranges permit, when they are within them and not singular.

@@ -20,6 +20,7 @@ pub mod motion;
 pub mod plan;
 pub mod posture;
 pub mod refusal;
+pub mod self_collision;
 pub mod trajectory;
 
 mod capsule;

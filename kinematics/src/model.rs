@@ -12,6 +12,7 @@ use std::f64::consts::{PI, TAU};
 use glam::{DMat3, DVec3};
 
 use crate::joints::Joints;
+use crate::self_collision::{SELF_PAIRS_4, SELF_PAIRS_6, SelfPair};
 
 /// A joint: its frame in the frame of the joint before it, and what it can do.
 #[derive(Debug)]
@@ -46,6 +47,8 @@ pub struct Link {
     pub ends: [Anchor; 2],
     /// Radius, metres.
     pub radius_m: f64,
+    /// Share of the line that is left, about its middle, when the gripper is shut; 1 for parts that keep their length.
+    pub shut_share: f64,
 }
 
 /// An arm: its joints from base to wrist, its tool and its shape.
@@ -57,6 +60,8 @@ pub struct ArmModel {
     pub joints: &'static [Joint],
     /// The arm's parts, base first. Only the base may touch the table.
     pub links: &'static [Link],
+    /// Parts of the arm that can meet other parts of it.
+    pub self_pairs: &'static [SelfPair],
     /// Joint angles with the gripper down ahead of the base (along its x axis) and the elbow above it, radians: where
     /// to look for solutions from when the arm is not there yet.
     pub elbow_up_rad: &'static [f64],
@@ -67,6 +72,7 @@ pub static MICO_4: ArmModel = ArmModel {
     name: "m1n4s200",
     joints: &MICO_JOINTS_4,
     links: &MICO_LINKS_4,
+    self_pairs: &SELF_PAIRS_4,
     elbow_up_rad: &ELBOW_UP_4,
 };
 
@@ -75,6 +81,7 @@ pub static MICO_6: ArmModel = ArmModel {
     name: "m1n6s200",
     joints: &MICO_JOINTS_6,
     links: &SIX_JOINT_LINKS,
+    self_pairs: &SELF_PAIRS_6,
     elbow_up_rad: &ELBOW_UP_6,
 };
 
@@ -83,6 +90,7 @@ pub static JACO_6: ArmModel = ArmModel {
     name: "j2n6s300",
     joints: &JACO_JOINTS,
     links: &SIX_JOINT_LINKS,
+    self_pairs: &SELF_PAIRS_6,
     elbow_up_rad: &ELBOW_UP_6,
 };
 
@@ -137,6 +145,9 @@ const HAND_RADIUS_M: f64 = 0.045;
 const FINGERS_RADIUS_M: f64 = 0.035;
 const FINGERS_ASIDE_M: f64 = 0.0525;
 const FINGERS_AHEAD_M: f64 = 0.0085;
+/// A shut gripper reaches 52.5 mm to each side: the hinges are 31 mm from the middle, the fingers about 10 mm thick, and a
+/// centimetre is added. In between the width grows evenly with the opening, and the hinged fingers are never wider.
+const FINGERS_SHUT_SHARE: f64 = 1.0 / 3.0;
 /// How far the hand's shell reaches from the last joint towards the fingers.
 const HAND_LENGTH_M: f64 = 0.10;
 
@@ -231,7 +242,7 @@ const fn anchor(frame: usize, offset_m: DVec3) -> Anchor {
 }
 
 const fn link(name: &'static str, from: Anchor, to: Anchor, radius_m: f64) -> Link {
-    Link { name, ends: [from, to], radius_m }
+    Link { name, ends: [from, to], radius_m, shut_share: 1.0 }
 }
 
 const fn hand(frame: usize) -> Link {
@@ -240,12 +251,10 @@ const fn hand(frame: usize) -> Link {
 }
 
 const fn fingers(frame: usize) -> Link {
-    link(
-        "gripper",
-        anchor(frame, DVec3::new(-FINGERS_ASIDE_M, 0.0, FINGERS_AHEAD_M)),
-        anchor(frame, DVec3::new(FINGERS_ASIDE_M, 0.0, FINGERS_AHEAD_M)),
-        FINGERS_RADIUS_M,
-    )
+    let from = anchor(frame, DVec3::new(-FINGERS_ASIDE_M, 0.0, FINGERS_AHEAD_M));
+    let to = anchor(frame, DVec3::new(FINGERS_ASIDE_M, 0.0, FINGERS_AHEAD_M));
+    let open = link("gripper", from, to, FINGERS_RADIUS_M);
+    Link { shut_share: FINGERS_SHUT_SHARE, ..open }
 }
 
 #[cfg(test)]

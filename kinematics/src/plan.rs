@@ -33,7 +33,7 @@ const LEAST_PIECES: f64 = 8.0;
 const SPEED_PIECES: u32 = 8;
 /// Largest change of a joint from one control point to the next, radians. More is another solution of the
 /// inverse kinematics, or a place close to a singular posture.
-const MAX_JUMP_RAD: f64 = 0.35;
+const MAX_JUMP_RAD: f64 = crate::inverse::MOVES_ON_RAD;
 /// Largest distance of consecutive way points, metres.
 pub const MAX_STEP_M: f64 = 0.25;
 /// Most way points of a plan.

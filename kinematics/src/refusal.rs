@@ -102,6 +102,10 @@ pub enum Reason {
     #[error("the {} is {:.1} mm from the {} of arm {}, at least {:.1}",
         .1[0], .2.got * 1e3, .1[1], .0.0, .2.allowed * 1e3)]
     ArmsGap(ArmIndex, [&'static str; 2], Excess),
+    /// Two parts of one arm, named, are too near to each other; metres.
+    #[error("the {} is {:.1} mm from the arm's own {}, at least {:.1}",
+        .0[1], .1.got * 1e3, .0[0], .1.allowed * 1e3)]
+    SelfGap([&'static str; 2], Excess),
 }
 
 impl Reason {

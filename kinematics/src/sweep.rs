@@ -30,6 +30,8 @@ pub(crate) struct Sweep<'a> {
 /// One arm in the present interval.
 struct Swept {
     cubics: Vec<Cubic>,
+    /// How far the gripper is open at most, 0 to 1.
+    opening: f64,
     tool_levers_m: Joints,
     link_levers_m: Joints,
     change: Change,
@@ -58,6 +60,7 @@ impl<'a> Sweep<'a> {
     pub(crate) fn new(cell: &'a Cell, settings: &'a CheckSettings) -> Self {
         let swept = |arm: &PlacedArm| Swept {
             cubics: Vec::new(),
+            opening: 1.0,
             tool_levers_m: arm.model.tool_levers_m(),
             link_levers_m: arm.model.link_levers_m(),
             change: Change::default(),
@@ -65,10 +68,10 @@ impl<'a> Sweep<'a> {
         Self { cell, settings, arms: cell.arms.iter().map(swept).collect() }
     }
 
-    /// Takes over the joints' motion of `arm` in the interval to be checked.
-    pub(crate) fn follow(&mut self, arm: ArmIndex, cubics: Vec<Cubic>) {
+    /// Takes over the joints' motion of `arm` in the interval to be checked, and how far its gripper is open at most.
+    pub(crate) fn follow(&mut self, arm: ArmIndex, cubics: Vec<Cubic>, opening: f64) {
         let swept = &mut self.arms[arm.0];
-        swept.cubics = cubics;
+        (swept.cubics, swept.opening) = (cubics, opening);
         swept.change = swept.changes();
     }
 
@@ -101,6 +104,7 @@ impl<'a> Sweep<'a> {
             self.look_at_tool(&mut look, arm, &posture, &rates);
             let links = PosedLinks::of(placed, &posture);
             self.look_at_table(&mut look, arm, &links);
+            self.look_at_itself(&mut look, arm, &links);
             for (other, other_links) in posed.iter().enumerate() {
                 self.look_between(&mut look, [ArmIndex(other), arm], [other_links, &links]);
             }
@@ -134,6 +138,17 @@ impl<'a> Sweep<'a> {
         let name = self.cell.arms[arm.0].model.links[link].name;
         look.at_least(arm, gap_m, self.settings.table_gap_m, hides, |excess| {
             Reason::TableGap(name, excess)
+        });
+    }
+
+    /// The arm's own parts. Joint 1 turns all of them together, so that what changes their distances is what changes heights.
+    fn look_at_itself(&self, look: &mut Look, arm: ArmIndex, links: &PosedLinks) {
+        let (model, swept) = (self.cell.arms[arm.0].model, &self.arms[arm.0]);
+        let (gap_m, nearest) = links.self_gap_m(model, swept.opening);
+        let hides = (swept.change.height, LENGTH_TOLERANCE_M);
+        let names = nearest.map(|link| model.links[link].name);
+        look.at_least(arm, gap_m, self.settings.self_gap_m, hides, |excess| {
+            Reason::SelfGap(names, excess)
         });
     }
 

@@ -78,14 +78,19 @@ async fn check(
 }
 
 fn accepted_line(accepted: &pb::AcceptedMotion) -> String {
-    let table_m = accepted.table_gap_m.iter().copied().fold(f64::INFINITY, f64::min);
-    format!(
-        "{:.1} s at speed {}, at least {:.0} mm above the table and {:.0} mm between the arms",
+    let least_mm = |gaps_m: &[f64]| 1e3 * gaps_m.iter().copied().fold(f64::INFINITY, f64::min);
+    let mut line = format!(
+        "{:.1} s at speed {}, at least {:.0} mm above the table, {:.0} mm between the arms",
         accepted.duration_s / accepted.speed,
         accepted.speed,
-        1e3 * table_m,
+        least_mm(&accepted.table_gap_m),
         1e3 * accepted.arms_gap_m
-    )
+    );
+    // A bridge of an earlier version does not report the gaps within an arm.
+    if !accepted.self_gap_m.is_empty() {
+        line.push_str(&format!(", {:.0} mm within an arm", least_mm(&accepted.self_gap_m)));
+    }
+    line
 }
 
 fn stopped(stop: &pb::BridgeStop) -> Failed {

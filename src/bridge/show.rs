@@ -40,7 +40,7 @@ pub(super) fn status_lines(status: &pb::BridgeStatusResponse) -> Vec<String> {
     ];
     lines.extend(status.arms.iter().enumerate().map(|(idx, arm)| arm_line(idx, arm)));
     if status.arms.is_empty() {
-        lines.push("arms    nobody knows where they are".to_owned());
+        lines.push("arms    their position is not known".to_owned());
     }
     if let Some(motion) = &status.motion {
         lines.push(format!(
@@ -123,11 +123,13 @@ fn limit_lines(limits: &pb::BridgeLimits) -> Vec<String> {
             100.0 * limits.reach_share
         ),
         format!(
-            "gaps    motions keep {:.0} mm to the table and {:.0} mm between arms, the envelope {:.0} and {:.0} mm",
+            "gaps    motions keep {:.0} mm to the table, {:.0} mm between arms and {:.0} mm within an arm, the envelope {:.0}, {:.0} and {:.0} mm",
             1e3 * limits.check_table_gap_m,
             1e3 * limits.check_arms_gap_m,
+            1e3 * limits.check_self_gap_m,
             1e3 * limits.table_gap_m,
-            1e3 * limits.arms_gap_m
+            1e3 * limits.arms_gap_m,
+            1e3 * limits.self_gap_m
         ),
         format!(
             "owner   a motion pauses after {} s of silence and is stopped after {} s",
@@ -155,6 +157,7 @@ pub(super) fn accepted_json(accepted: &pb::AcceptedMotion) -> Value {
     json!({
         "duration_s": accepted.duration_s, "speed": accepted.speed,
         "table_gap_m": accepted.table_gap_m, "arms_gap_m": accepted.arms_gap_m,
+        "self_gap_m": accepted.self_gap_m,
     })
 }
 
@@ -226,5 +229,6 @@ fn limits_json(limits: &pb::BridgeLimits) -> Value {
         "owner_hold_s": limits.owner_hold_s, "owner_stop_s": limits.owner_stop_s,
         "lease_s": limits.lease_s, "max_way_points": limits.max_way_points,
         "max_step_m": limits.max_step_m,
+        "check_self_gap_m": limits.check_self_gap_m, "self_gap_m": limits.self_gap_m,
     })
 }

@@ -9,6 +9,9 @@
 //! The way is a chain of postures with straight lines of the joints between them. On a line that turns the joints by d, no
 //! point of an arm moves farther than the sum of d times lever; a gap in the middle that is larger than the limit
 //! by half of that keeps the limit on the whole line. Otherwise both halves are looked at, down to a tenth of a millimetre.
+//!
+//! For gaps between parts of one arm a gripper is as wide as it was measured, or as it is told to be when that is wider: on
+//! its way between the two it is no wider.
 
 use std::collections::VecDeque;
 
@@ -92,10 +95,15 @@ impl Envelope {
         for (arm, way) in ways.iter().enumerate() {
             self.check_ranges(arm, way)?;
         }
+        let openings: Vec<f64> = commands
+            .iter()
+            .zip(&state.arms)
+            .map(|(command, arm)| command.opening.max(arm.opening).clamp(0.0, 1.0))
+            .collect();
         let n_postures = ways[0].len();
         for step in 1..n_postures {
             let ends = [step - 1, step].map(|idx| ways.iter().map(|way| way[idx]).collect());
-            self.check_gaps(&ends)?;
+            self.check_gaps(&ends, &openings)?;
         }
         Ok(())
     }
@@ -195,7 +203,7 @@ impl Envelope {
     }
 
     /// The gaps on the straight line of the joints between two postures of all arms.
-    fn check_gaps(&self, [from, to]: &[Vec<Joints>; 2]) -> Result<(), Breach> {
+    fn check_gaps(&self, [from, to]: &[Vec<Joints>; 2], openings: &[f64]) -> Result<(), Breach> {
         let moved_m = |arm: usize| -> f64 {
             let levers = self.levers_m[arm].iter().zip(from[arm].iter().zip(to[arm].iter()));
             levers.map(|(lever_m, (a, b))| lever_m * (b - a).abs()).sum()
@@ -206,14 +214,17 @@ impl Envelope {
             .zip(to)
             .map(|(a, b)| Joints::from_fn(a.len(), |joint| 0.5 * (a[joint] + b[joint])))
             .collect();
-        let gaps = self.cell.gaps(&middle);
+        let gaps = self.cell.gaps_with(&middle, openings);
         let mut settled = true;
-        for (arm, gap_m) in gaps.table_m.iter().enumerate() {
-            let (got, allowed) = (*gap_m, self.settings.table_gap_m);
-            settled &= got - half_m[arm] >= allowed || half_m[arm] <= HIDES_M;
-            if got < allowed {
-                return Err(StopCause::TableGap(Excess { got, allowed }).of(arm));
-            }
+        for (arm, half_m) in half_m.iter().enumerate() {
+            let mut keeps = |got: f64, allowed: f64| {
+                settled &= got - half_m >= allowed || *half_m <= HIDES_M;
+                if got < allowed { Err(Excess { got, allowed }) } else { Ok(()) }
+            };
+            keeps(gaps.table_m[arm], self.settings.table_gap_m)
+                .map_err(|excess| StopCause::TableGap(excess).of(arm))?;
+            keeps(gaps.self_m[arm], self.settings.self_gap_m)
+                .map_err(|excess| StopCause::SelfGap(excess).of(arm))?;
         }
         let (got, allowed) = (gaps.arms_m, self.settings.arms_gap_m);
         let both_m: f64 = half_m.iter().sum();
@@ -224,8 +235,8 @@ impl Envelope {
         if settled {
             return Ok(());
         }
-        self.check_gaps(&[from.clone(), middle.clone()])?;
-        self.check_gaps(&[middle, to.clone()])
+        self.check_gaps(&[from.clone(), middle.clone()], openings)?;
+        self.check_gaps(&[middle, to.clone()], openings)
     }
 }
 
@@ -363,6 +374,53 @@ mod tests {
             result.as_ref().is_err_and(|breach| matches!(breach.cause, StopCause::ArmsGap(_)))
         };
         assert!(near(&one) != near(&other), "towards each other only: {one:?} {other:?}");
+    }
+
+    /// The posture on the way of arm 0 from the ready one into its own base in which the gap there is `gap_m`, with the
+    /// gripper half open, and the arm's velocities on this way, in degrees per second.
+    fn near_own_base(gap_m: f64) -> (Vec<Joints>, [f64; 4]) {
+        let (cell, at) = (mico_cell(), ready());
+        let way_deg = [0.0, -11.3, 27.0, 90.3];
+        let on_way = |share: f64| {
+            let mut on_way = at.clone();
+            on_way[0] = Joints::from_fn(4, |joint| at[0][joint] + share * way_deg[joint] * DEGREE);
+            on_way
+        };
+        let [mut near, mut far] = [1.0, 0.0];
+        for _ in 0..40 {
+            let middle = 0.5 * (near + far);
+            let is_near = cell.gaps_with(&on_way(middle), &[0.5; 2]).self_m[0] < gap_m;
+            *(if is_near { &mut near } else { &mut far }) = middle;
+        }
+        (on_way(far), way_deg.map(|way| 0.4 * way))
+    }
+
+    #[test]
+    fn an_arm_stops_before_it_touches_itself() {
+        let (at, towards) = near_own_base(0.003);
+        assert_eq!(check(&at, [REST, REST]), Ok(()));
+        assert_eq!(check(&at, [towards.map(|rate| -rate), REST]), Ok(()));
+        let breach = check(&at, [towards, REST]).unwrap_err();
+        assert!(matches!(breach.cause, StopCause::SelfGap(_)), "{breach:?}");
+        assert_eq!(breach.arm.map(|arm| arm.0), Some(0));
+        // With room for four periods and the braking it may go on.
+        let (at, towards) = near_own_base(0.008);
+        assert_eq!(check(&at, [towards, REST]), Ok(()));
+    }
+
+    #[test]
+    fn a_gripper_is_as_wide_as_it_is_and_not_as_it_was_told() {
+        let (at, _) = near_own_base(0.003);
+        let envelope = Envelope::new(&mico_cell(), &Settings::default(), PERIOD_S);
+        let command = ArmCommand { velocities: Joints::new(&REST), opening: 0.5 };
+        let check = |opening: f64| {
+            let mut state = state(&at);
+            state.arms[0].opening = opening;
+            envelope.check(&[command; 2], &History::new(), &state, 0.0)
+        };
+        assert_eq!(check(0.4), Ok(()));
+        let breach = check(0.9).unwrap_err();
+        assert!(matches!(breach.cause, StopCause::SelfGap(_)), "{breach:?}");
     }
 
     #[test]

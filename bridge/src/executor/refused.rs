@@ -24,7 +24,7 @@ pub enum StartError {
     #[error("speed {0}, expected more than 0 and at most 1")]
     Speed(f64),
     /// No state is known, or it is too old.
-    #[error("nobody knows where the arms are")]
+    #[error("the position of the arms is not known")]
     NoState,
     /// The motion breaks a limit.
     #[error("the motion is refused")]

@@ -13,6 +13,8 @@ pub struct Settings {
     pub table_gap_m: f64,
     /// Smallest gap between the parts of two arms, until both could stand still; metres.
     pub arms_gap_m: f64,
+    /// Smallest gap between parts of one arm that can meet, until it could stand still; metres.
+    pub self_gap_m: f64,
     /// A motion has to stay this far from the ends of the joints' ranges, radians. The envelope itself goes to the ends.
     pub range_margin_rad: f64,
     /// Longest time from what a state says to the moment at which a command given upon it takes effect, seconds.
@@ -67,6 +69,7 @@ impl Default for Settings {
             check: check_settings(),
             table_gap_m: 0.001,
             arms_gap_m: 0.012,
+            self_gap_m: 0.002,
             range_margin_rad: 1.0_f64.to_radians(),
             reaction_s: 0.040,
             brake_s: 0.050,
@@ -110,6 +113,7 @@ impl Settings {
             ("period_s", period_s),
             ("table_gap_m", self.table_gap_m),
             ("arms_gap_m", self.arms_gap_m),
+            ("self_gap_m", self.self_gap_m),
             ("range_margin_rad", self.range_margin_rad),
             ("reaction_s", self.reaction_s),
             ("brake_s", self.brake_s),
@@ -158,6 +162,7 @@ impl Settings {
             ("pause_s", self.pause_s, self.pause_s >= 2.0 * self.brake_s),
             ("arms_gap_m", self.arms_gap_m, self.arms_gap_m < self.check.arms_gap_m),
             ("table_gap_m", self.table_gap_m, self.table_gap_m < self.check.table_gap_m),
+            ("self_gap_m", self.self_gap_m, self.self_gap_m < self.check.self_gap_m),
             ("state_stop_s", self.state_stop_s, self.state_hold_s <= self.state_stop_s),
             ("owner_stop_s", self.owner_stop_s, self.owner_hold_s <= self.owner_stop_s),
             ("lease_s", self.lease_s, self.owner_stop_s <= self.lease_s),

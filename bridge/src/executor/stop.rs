@@ -136,6 +136,10 @@ pub enum StopCause {
     #[error("{:.1} mm from the other arm before both can stop, at least {:.1}",
         .0.got * 1e3, .0.allowed * 1e3)]
     ArmsGap(Excess),
+    /// Parts of one arm are too near to each other, or would be before it stands still; metres.
+    #[error("{:.1} mm between parts of the arm itself before it can stop, at least {:.1}",
+        .0.got * 1e3, .0.allowed * 1e3)]
+    SelfGap(Excess),
 }
 
 /// A cause with its place, before the time is known.

@@ -31,8 +31,8 @@ pub enum Error {
     /// The motion is refused.
     #[error("the motion is refused: {0}")]
     Refused(#[from] Refused),
-    /// Nobody knows where the arms are, so no motion can be judged.
-    #[error("nobody knows where the arms are: see the status")]
+    /// The position of the arms is not known, so no motion can be checked.
+    #[error("the position of the arms is not known: see the status")]
     NoState,
     /// The drives could not be told to stop.
     #[error("the drives could NOT be told to stop, use the emergency stop: {0}")]

@@ -2,7 +2,7 @@
 
 use glam::DVec3;
 use tandem_kinematics::plan::{MAX_STEP_M, MAX_WAY_POINTS};
-use tandem_kinematics::{Cell, Joints, Motion, PlacedArm, Posture};
+use tandem_kinematics::{Cell, Gaps, Joints, Motion, PlacedArm, Posture};
 use tandem_proto::{DecodeError, pb};
 
 use crate::driver::ArmReading;
@@ -78,6 +78,8 @@ pub(super) fn limits(checker: &Checker, speed: f64) -> pb::BridgeLimits {
         lease_s: settings.lease_s,
         max_way_points: index(MAX_WAY_POINTS),
         max_step_m: MAX_STEP_M,
+        check_self_gap_m: check.self_gap_m,
+        self_gap_m: settings.self_gap_m,
     }
 }
 
@@ -86,18 +88,26 @@ pub(super) fn accepted(checked: &CheckedMotion, cell: &Cell, speed: f64) -> pb::
     let motion = checked.motion();
     let mut table_gap_m = vec![f64::INFINITY; cell.arms.len()];
     let mut arms_gap_m = f64::INFINITY;
+    let mut self_gap_m = table_gap_m.clone();
     for sample in 0..motion.arms[0].len() {
-        let gaps = cell.gaps(&angles_at(motion, sample));
+        let gaps = gaps_at(motion, sample, cell);
         arms_gap_m = arms_gap_m.min(gaps.arms_m);
         for (least, gap) in table_gap_m.iter_mut().zip(gaps.table_m) {
             *least = least.min(gap);
         }
+        for (least, gap) in self_gap_m.iter_mut().zip(gaps.self_m) {
+            *least = least.min(gap);
+        }
     }
-    pb::AcceptedMotion { duration_s: motion.duration_s(), speed, table_gap_m, arms_gap_m }
+    let duration_s = motion.duration_s();
+    pb::AcceptedMotion { duration_s, speed, table_gap_m, arms_gap_m, self_gap_m }
 }
 
-fn angles_at(motion: &Motion, sample: usize) -> Vec<Joints> {
-    motion.arms.iter().map(|samples| samples[sample].angles).collect()
+fn gaps_at(motion: &Motion, sample: usize, cell: &Cell) -> Gaps {
+    let samples = motion.arms.iter().map(|samples| &samples[sample]);
+    let (angles, openings): (Vec<Joints>, Vec<f64>) =
+        samples.map(|sample| (sample.angles, sample.opening)).unzip();
+    cell.gaps_with(&angles, &openings)
 }
 
 /// A refused motion.
@@ -161,7 +171,7 @@ pub(super) fn phase(phase: Phase) -> pb::BridgePhase {
     }
 }
 
-/// The arms as they were last seen; empty when nobody knows where they are.
+/// The arms as they were last seen; empty when their position is not known.
 pub(super) fn arms(snapshot: &Snapshot, cell: &Cell) -> Vec<pb::ArmState> {
     let Some(state) = &snapshot.state else { return Vec::new() };
     let reference = |arm: usize| snapshot.reference.as_ref().map(|all| all[arm]);

@@ -47,6 +47,7 @@ pub(super) fn of_cause(cause: &StopCause) -> (&'static str, Option<Numbers>) {
         C::ToolSpeed(e) => ("tool-speed", numbers(e, "m/s")),
         C::TableGap(e) => ("table-gap", numbers(e, "m")),
         C::ArmsGap(e) => ("arms-gap", numbers(e, "m")),
+        C::SelfGap(e) => ("self-gap", numbers(e, "m")),
     }
 }
 
@@ -94,6 +95,7 @@ fn of_reason(reason: &Reason) -> Word {
         R::Tilt(e) => word("tilt", None, numbers(e, "rad")),
         R::TableGap(_, e) => word("table-gap", None, numbers(e, "m")),
         R::ArmsGap(_, _, e) => word("arms-gap", None, numbers(e, "m")),
+        R::SelfGap(_, e) => word("self-gap", None, numbers(e, "m")),
         _ => word("limit", None, None),
     }
 }

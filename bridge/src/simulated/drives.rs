@@ -20,6 +20,8 @@ pub(crate) struct Drives {
     gaps: Gaps,
     /// What the arms touched in the last physics step.
     contacts: Contacts,
+    /// For each arm whether two of its own parts touched in the last physics step.
+    self_contacts: Vec<bool>,
     waiting: VecDeque<Waiting>,
     order: Order,
     newest: u64,
@@ -60,8 +62,9 @@ impl Drives {
         };
         Self {
             arms: cell.arms.iter().zip(at).map(arm).collect(),
-            gaps: cell.gaps(at),
+            gaps: cell.gaps_with(at, &vec![opening; at.len()]),
             contacts: Contacts::NONE,
+            self_contacts: vec![false; at.len()],
             waiting: VecDeque::new(),
             order: Order::Stop,
             newest: 0,
@@ -95,6 +98,11 @@ impl Drives {
     /// What the arms touched in the last physics step.
     pub(crate) fn contacts(&self) -> Contacts {
         self.contacts
+    }
+
+    /// For each arm whether two of its own parts touched in the last physics step.
+    pub(crate) fn self_contacts(&self) -> &[bool] {
+        &self.self_contacts
     }
 
     /// Takes a command that will have effect later.
@@ -135,12 +143,13 @@ impl Drives {
         }
     }
 
-    /// Lets a physics step pass. `torques_nm` are those of what the arms touch.
+    /// Lets a physics step pass. `openings` are how far the grippers are open, `torques_nm` those of what the arms touch.
     pub(crate) fn step(
         &mut self,
         cell: &Cell,
         config: &SimulatedConfig,
         disturbance: &Disturbance,
+        openings: &[f64],
         torques_nm: &[Joints],
     ) {
         let before: Vec<Joints> = self.arms.iter().map(|arm| arm.angles).collect();
@@ -154,13 +163,20 @@ impl Drives {
             let blocked = disturbance.blocked.filter(|(arm, _)| arm.0 == idx).map(|(_, j)| j);
             arm.follow(told.as_ref(), config, blocked, &torques_nm[idx]);
         }
-        self.keep_apart(cell, config, &before);
+        self.keep_apart(cell, config, openings, &before);
     }
 
-    /// Shells do not pass through each other or the table: an arm that would go deeper does not move.
-    fn keep_apart(&mut self, cell: &Cell, config: &SimulatedConfig, before: &[Joints]) {
+    /// Shells do not pass through each other, the table or the arm's own parts: an arm that would go deeper does not move.
+    fn keep_apart(
+        &mut self,
+        cell: &Cell,
+        config: &SimulatedConfig,
+        openings: &[f64],
+        before: &[Joints],
+    ) {
         let angles: Vec<Joints> = self.arms.iter().map(|arm| arm.angles).collect();
-        let gaps = cell.gaps(&angles);
+        let gaps = cell.gaps_with(&angles, openings);
+        self.self_contacts = gaps.self_m.iter().map(|gap_m| *gap_m <= 0.0).collect();
         let deeper = |now: f64, then: f64| now < 0.0 && now < then;
         let pressed = deeper(gaps.arms_m, self.gaps.arms_m);
         self.contacts = if gaps.arms_m <= 0.0 { Contacts::ARM_ARM } else { Contacts::NONE };
@@ -169,13 +185,15 @@ impl Drives {
             if gaps.table_m[idx] <= 0.0 {
                 self.contacts = self.contacts | Contacts::ARM_TABLE;
             }
-            if pressed || deeper(gaps.table_m[idx], self.gaps.table_m[idx]) {
+            let by_itself = deeper(gaps.table_m[idx], self.gaps.table_m[idx])
+                || deeper(gaps.self_m[idx], self.gaps.self_m[idx]);
+            if pressed || by_itself {
                 arm.hold_at(&before[idx], config);
                 any = true;
             }
         }
         let angles: Vec<Joints> = self.arms.iter().map(|arm| arm.angles).collect();
-        self.gaps = if any { cell.gaps(&angles) } else { gaps };
+        self.gaps = if any { cell.gaps_with(&angles, openings) } else { gaps };
     }
 }
 

@@ -27,7 +27,7 @@ pub(crate) fn read(
     arm: &ArmDrives,
     opening: f64,
     torques_nm: &Joints,
-    drive_fault: bool,
+    faults: Faults,
     config: &SimulatedConfig,
     rng: &mut ChaCha8Rng,
 ) -> ArmReading {
@@ -47,7 +47,7 @@ pub(crate) fn read(
         velocities,
         torques_nm: config.tells_torques.then_some(torques),
         opening,
-        faults: Faults { drive: drive_fault, ..Faults::default() },
+        faults,
     }
 }
 

@@ -338,7 +338,10 @@ mod tests {
     fn the_pads_stay_within_what_kinematics_has_for_the_fingers() {
         let fingers = &MICO_4.links[MICO_4.links.len() - 1];
         let [from, to] = [0, 1].map(|end| fingers.ends[end].offset_m);
-        for opening in [0.0, 0.25, 0.5, 0.75, 1.0] {
+        let middle = 0.5 * (from + to);
+        for opening in [0.0_f32, 0.25, 0.5, 0.75, 1.0] {
+            let share = fingers.shut_share + f64::from(opening) * (1.0 - fingers.shut_share);
+            let [from, to] = [from, to].map(|end| middle + share * (end - middle));
             for corner in 0..8_u32 {
                 let side = |bit: u32| if corner >> bit & 1 == 1 { 1.0 } else { -1.0 };
                 let centre = Vector::new(PAD_HALF_M.x + opening * MAX_OPENING_M, 0.0, PAD_AHEAD_M);

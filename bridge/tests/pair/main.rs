@@ -3,6 +3,7 @@
 
 mod faults;
 mod injection;
+mod itself;
 mod observer;
 mod ownership;
 mod rig;

@@ -10,6 +10,7 @@ use tandem_kinematics::{Cell, Joints, Posture};
 const TOOL_MPS: f64 = 0.20;
 const TABLE_GAP_M: f64 = 0.001;
 const ARMS_GAP_M: f64 = 0.012;
+const SELF_GAP_M: f64 = 0.002;
 const RAMP_S: f64 = 0.25;
 /// Time in which the simulated drives brake, seconds.
 const BRAKE_S: f64 = 0.040;
@@ -74,12 +75,17 @@ impl Observer {
             self.least_table_gap_m = self.least_table_gap_m.min(*gap_m);
             assert!(*gap_m >= TABLE_GAP_M - self.slack.gap_m, "{what}, {time_s:.2} s: {gaps:?}");
         }
+        for gap_m in &pair.gaps().self_m {
+            assert!(*gap_m >= SELF_GAP_M - self.slack.gap_m, "{what}, {time_s:.2} s: {gaps:?}");
+        }
         self.least_arms_gap_m = self.least_arms_gap_m.min(gaps.arms_m);
         let allowed_m = ARMS_GAP_M - 2.0 * self.slack.gap_m;
         assert!(gaps.arms_m >= allowed_m, "{what}, {time_s:.2} s: {gaps:?}");
         // The shapes are a centimetre larger than the arms: a drift may use up as much of that as the slack says.
         let may_graze = self.slack.gap_m > TABLE_GAP_M;
         assert!(may_graze || !pair.contacts().any(), "{what}, {time_s:.2} s: contact");
+        let touches_itself = (0..2).any(|arm| pair.touches_itself(ArmIndex(arm)));
+        assert!(!touches_itself, "{what}, {time_s:.2} s: an arm touches itself");
         self.before = Some(rates);
     }
 

@@ -176,6 +176,7 @@ fn settings_that_make_no_sense_are_refused() {
     check(Settings { torque_nm: 0.0, ..default }, "torque_nm");
     check(Settings { gain_per_s: 50.0, ..default }, "gain_per_s");
     check(Settings { arms_gap_m: 0.03, ..default }, "arms_gap_m");
+    check(Settings { self_gap_m: 0.006, ..default }, "self_gap_m");
     check(Settings { brake_s: 1.0, ..default }, "brake_s");
     check(Settings { lease_s: 0.5, ..default }, "lease_s");
 }

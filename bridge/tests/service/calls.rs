@@ -1,11 +1,11 @@
 //! What clients can do with the arms.
 
 use tandem_bridge::layout::mico_cell;
-use tandem_kinematics::{ArmWayPoint, PlanSettings, plan};
+use tandem_kinematics::{ArmSample, ArmWayPoint, Joints, Motion, PlanSettings, plan};
 use tandem_proto::pb;
 use tonic::Code;
 
-use crate::rig::{DEADLINE, READY_M, Rig, UP_M, patient, slow, through};
+use crate::rig::{DEADLINE, Fault, READY_M, Rig, UP_M, joint_request, patient, slow, through};
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn the_arms_are_described() {
@@ -68,23 +68,7 @@ async fn a_motion_of_joints_is_played() {
     let start = cell.ready(0.05).unwrap();
     let way = [at(READY_M), at(UP_M)];
     let motion = plan(&cell, &way, &start, &PlanSettings::default()).unwrap().sampled(100.0);
-    let samples = |arm: &Vec<tandem_kinematics::ArmSample>| {
-        let sample = |sample: &tandem_kinematics::ArmSample| pb::JointSample {
-            angles_rad: sample.angles.to_vec(),
-            velocities_radps: sample.velocities.to_vec(),
-            opening: sample.opening,
-        };
-        pb::ArmMotion { samples: arm.iter().map(sample).collect() }
-    };
-    let joints = pb::JointMotion {
-        period_s: motion.period_s,
-        arms: motion.arms.iter().map(samples).collect(),
-    };
-    let request = pb::MotionRequest {
-        motion: Some(pb::motion_request::Motion::JointMotion(joints)),
-        speed: 1.0,
-    };
-    rig.execute(&token, request).await.unwrap().last().await.unwrap();
+    rig.execute(&token, joint_request(&motion)).await.unwrap().last().await.unwrap();
     for (arm, angles) in rig.tap.angles().iter().enumerate() {
         let end = motion.arms[arm][motion.arms[arm].len() - 1].angles;
         assert!(end.largest_difference(angles) < 0.3_f64.to_radians(), "{angles:?}");
@@ -111,10 +95,6 @@ async fn a_check_says_what_is_wrong_and_moves_nothing() {
     use pb::check_response::Verdict;
     let mut rig = Rig::new(patient()).await;
     let check = |motion| pb::CheckRequest { motion: Some(motion) };
-    let unknown = rig.client.check(check(through(&[UP_M], 1.0))).await;
-    if let Err(status) = unknown {
-        assert_eq!(status.code(), Code::FailedPrecondition, "{status}");
-    }
     // The arms need not be let go to be asked about.
     rig.eventually(|status| !status.arms.is_empty()).await;
     let before = rig.tap.angles();
@@ -126,6 +106,8 @@ async fn a_check_says_what_is_wrong_and_moves_nothing() {
             assert!(accepted.duration_s > 0.2, "{accepted:?}");
             assert!(accepted.arms_gap_m > 0.02 && accepted.table_gap_m.len() == 2);
             assert!(accepted.table_gap_m.iter().all(|gap_m| (0.004..0.1).contains(gap_m)));
+            assert!(accepted.self_gap_m.iter().all(|gap_m| (0.005..0.2).contains(gap_m)));
+            assert_eq!(accepted.self_gap_m.len(), 2);
         }
         refused @ Verdict::Refused(_) => panic!("{refused:?}"),
     }
@@ -155,6 +137,57 @@ async fn a_check_says_what_is_wrong_and_moves_nothing() {
     );
     assert_eq!(close.name, "arms-gap", "{close:?}");
     assert_eq!(rig.tap.angles(), before);
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_check_waits_for_the_next_state_when_the_newest_was_not_believed() {
+    let mut rig = Rig::new(patient()).await;
+    rig.eventually(|status| !status.arms.is_empty()).await;
+    rig.tap.fail(Fault::Untrue);
+    rig.eventually(|status| status.arms.is_empty()).await;
+    let request = pb::CheckRequest { motion: Some(through(&[UP_M], 1.0)) };
+    let unknown = rig.client.check(request.clone()).await.unwrap_err();
+    assert_eq!(unknown.code(), Code::FailedPrecondition, "{unknown}");
+    assert!(unknown.message().contains("position of the arms is not known"), "{unknown}");
+
+    let mut other = rig.stranger().await;
+    let checking = tokio::spawn(async move { other.check(request).await });
+    tokio::time::sleep(std::time::Duration::from_millis(50)).await;
+    rig.tap.fail(Fault::None);
+    let verdict = checking.await.unwrap().unwrap().into_inner().verdict.unwrap();
+    assert!(matches!(verdict, pb::check_response::Verdict::Accepted(_)), "{verdict:?}");
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_motion_into_the_arms_own_base_is_refused_by_name() {
+    let mut rig = Rig::new(patient()).await;
+    let token = rig.ready().await;
+    let ready = mico_cell().ready(0.05).unwrap();
+    // The tool goes back to 0.11 m from the base, and the fingers turn towards it.
+    let way_deg = [0.0, -11.3, 27.0, 90.3];
+    let sample = |arm: usize, idx: u32| {
+        let (u, moves) = (f64::from(idx) / 600.0, if arm == 0 { 1.0 } else { 0.0 });
+        let s = u * u * u * (10.0 + u * (6.0 * u - 15.0)) * moves;
+        let rate = 30.0 * u * u * (1.0 - u) * (1.0 - u) / 6.0 * moves;
+        let way = way_deg.map(f64::to_radians);
+        let velocities = Joints::from_fn(4, |joint| rate * way[joint]);
+        let angles = Joints::from_fn(4, |joint| ready[arm][joint] + s * way[joint]);
+        ArmSample { angles, velocities, opening: 1.0 }
+    };
+    let samples = |arm| (0..=600).map(|idx| sample(arm, idx)).collect();
+    let motion = joint_request(&Motion { period_s: 0.01, arms: vec![samples(0), samples(1)] });
+    let request = pb::CheckRequest { motion: Some(motion.clone()) };
+    let verdict = rig.client.check(request).await.unwrap().into_inner().verdict.unwrap();
+    let pb::check_response::Verdict::Refused(refused) = verdict else { panic!("{verdict:?}") };
+    assert_eq!((refused.name.as_str(), refused.arm), ("self-gap", Some(0)), "{refused:?}");
+    assert!(refused.got < refused.allowed && refused.unit == "m", "{refused:?}");
+    assert!(refused.sentence.contains("from the arm's own base"), "{refused:?}");
+    let before = rig.tap.angles();
+    let refused = rig.execute(&token, motion).await.err().unwrap();
+    assert_eq!(refused.code(), Code::FailedPrecondition);
+    assert!(refused.message().contains("from the arm's own base"), "{refused}");
+    let moved = before.iter().zip(rig.tap.angles()).map(|(a, b)| a.largest_difference(&b));
+    assert!(moved.fold(0.0, f64::max) < 1e-3);
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

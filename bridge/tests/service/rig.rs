@@ -11,7 +11,7 @@ use tandem_bridge::{
     SimulatedPair,
 };
 use tandem_core::ArmIndex;
-use tandem_kinematics::Joints;
+use tandem_kinematics::{ArmSample, Joints, Motion};
 use tandem_net::Gate;
 use tandem_proto::pb;
 use tandem_proto::pb::bridge_client::BridgeClient;
@@ -95,6 +95,8 @@ pub(crate) enum Fault {
     Hang,
     /// The present connection never works again; new ones do.
     Lost,
+    /// States come, but no number of them is one.
+    Untrue,
 }
 
 /// A simulated pair that a test can look at and spoil.
@@ -179,6 +181,11 @@ impl Driver for Tap {
                 bench.first.get_or_insert_with(|| command.clone());
                 bench.newest = command.order.clone();
                 bench.pair.exchange(command)
+            }
+            Fault::Untrue => {
+                let mut state = bench.pair.exchange(command)?;
+                state.arms[0].angles[0] = f64::NAN;
+                Ok(state)
             }
             Fault::Exchange | Fault::Dead | Fault::Lost => {
                 Err(DriverError::Disconnected { what: "the test pulled the plug".into() })
@@ -416,4 +423,18 @@ pub(crate) fn through(places: &[[[f64; 3]; 2]], speed: f64) -> pb::MotionRequest
 /// Up and back, in minutes.
 pub(crate) fn slow() -> pb::MotionRequest {
     through(&[UP_M, READY_M, UP_M, READY_M], 0.005)
+}
+
+/// A motion of joints at its own speed.
+pub(crate) fn joint_request(motion: &Motion) -> pb::MotionRequest {
+    let sample = |sample: &ArmSample| pb::JointSample {
+        angles_rad: sample.angles.to_vec(),
+        velocities_radps: sample.velocities.to_vec(),
+        opening: sample.opening,
+    };
+    let samples =
+        |arm: &Vec<ArmSample>| pb::ArmMotion { samples: arm.iter().map(sample).collect() };
+    let arms = motion.arms.iter().map(samples).collect();
+    let joints = pb::JointMotion { period_s: motion.period_s, arms };
+    pb::MotionRequest { motion: Some(pb::motion_request::Motion::JointMotion(joints)), speed: 1.0 }
 }

@@ -17,6 +17,7 @@ use crate::walks::{Area, walk};
 /// Plans good way points of which some were replaced, and checks them with the limit itself for the expected time.
 fn break_way_points(
     name: &str,
+    settings: &CheckSettings,
     change: impl Fn(&Cell, &mut Vec<WayPoint>, &mut ChaCha8Rng),
     (expected, tolerance): (fn(&Reason) -> bool, f64),
     margin: impl Fn(&Cell, &[Joints]) -> f64,
@@ -31,7 +32,7 @@ fn break_way_points(
         let trajectory = trajectory.unwrap_or_else(|error| panic!("{name} {seed}: {error}"));
         let motion = trajectory.sampled(1.0 / PERIOD_S);
         let at: Vec<Joints> = motion.arms.iter().map(|samples| samples[0].angles).collect();
-        let refusal = check(&cell, &motion, &at, &CheckSettings::default()).expect_err(name);
+        let refusal = check(&cell, &motion, &at, settings).expect_err(name);
         assert!(expected(&refusal.reason), "{name} {seed}: {refusal}");
         // The limit is first passed, and then passed by more than the tolerance, between these samples.
         let first = |slack: f64| {
@@ -68,6 +69,7 @@ fn grippers_that_tilt_too_far() {
         |at: &[Joints]| at.iter().map(|q| Posture::of(&MICO_4, q).tilt_rad()).fold(0.0, f64::max);
     break_way_points(
         "tilt",
+        &CheckSettings::default(),
         |cell, way_points, rng| {
             let side = if rng.random_bool(0.5) { 1.0 } else { -1.0 };
             let direction = side * rng.random_range(1.0..FRAC_PI_2);
@@ -85,6 +87,7 @@ fn grippers_that_tilt_too_far() {
 fn tools_that_are_led_into_the_table() {
     break_way_points(
         "table",
+        &CheckSettings::default(),
         |cell, way_points, rng| {
             let x_m = rng.random_range(0.24..0.32);
             let goal =
@@ -100,6 +103,7 @@ fn tools_that_are_led_into_the_table() {
 fn arms_that_are_led_into_each_other() {
     break_way_points(
         "arms",
+        &CheckSettings::default(),
         |cell, way_points, rng| {
             let (y_m, z_m) = (rng.random_range(-0.06..0.06), rng.random_range(0.06..0.14));
             let goal = |y_m: f64| DVec3::new(0.345, y_m, z_m);
@@ -108,5 +112,22 @@ fn arms_that_are_led_into_each_other() {
         },
         (|reason| matches!(reason, Reason::ArmsGap(ArmIndex(1), ..)), 2e-4),
         |cell, at| cell.gaps(at).arms_m - 0.02,
+    );
+}
+
+#[test]
+fn tools_that_are_led_through_the_arms_own_base() {
+    // Grippers tilt near the base: without room for that they would be refused before they come there.
+    let settings = CheckSettings { tilt_rad: 1.5, ..CheckSettings::default() };
+    break_way_points(
+        "own base",
+        &settings,
+        |cell, way_points, rng| {
+            let (x_m, y_m) = (rng.random_range(0.05..0.08), rng.random_range(-0.02..0.02));
+            let goal = DVec3::new(x_m, y_m, rng.random_range(0.07..0.09));
+            lead(cell, way_points, &[(rng.random_range(0..2), goal)], 5);
+        },
+        (|reason| matches!(reason, Reason::SelfGap(["base", _], _)), 2e-4),
+        |cell, at| cell.gaps(at).self_m.into_iter().fold(f64::INFINITY, f64::min) - 0.005,
     );
 }

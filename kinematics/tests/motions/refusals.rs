@@ -352,11 +352,12 @@ fn motions_of_other_arms_or_of_no_sensible_length() {
     });
     break_all("settings", |case, rng| {
         let bad = [-1.0, f64::NAN, f64::INFINITY][rng.random_range(0..3)];
-        match rng.random_range(0..5) {
+        match rng.random_range(0..6) {
             0 => case.settings.tilt_rad = bad,
             1 => case.settings.arms_gap_m = bad,
             2 => case.settings.table_gap_m = bad,
             3 => case.settings.limits.tool_speed_mps = bad,
+            4 => case.settings.self_gap_m = bad,
             _ => case.settings.start_rad = bad,
         }
         Expected::at_start(0, |reason| matches!(reason, Reason::Setting(..)))
