@@ -453,7 +453,7 @@ pub(crate) struct StatusArgs {
 fn utf8_path() -> impl clap::builder::TypedValueParser<Value = PathBuf> {
     use clap::builder::{OsStringValueParser, TypedValueParser as _};
     OsStringValueParser::new()
-        .try_map(|path| path.into_string().map(PathBuf::from).map_err(|_| "expected UTF-8"))
+        .try_map(|path| path.into_string().map(PathBuf::from).map_err(|_raw| "expected UTF-8"))
 }
 
 /// A time span from seconds, more than none.
