@@ -6,6 +6,7 @@ use std::path::Path;
 
 use anyhow::Context as _;
 use tandem_learner::{AfterTheEnd, Beside, Error as LearnerError, RunConfig};
+use tandem_net::Pacing;
 use tandem_telemetry::logging::{LevelFilter, LogConfig};
 use tokio::net::TcpListener;
 use tokio::runtime::{Builder, Runtime};
@@ -45,7 +46,9 @@ pub(crate) fn teacher(args: TeacherArgs) -> Result<(), Failed> {
         let config = tandem_teacher::Config { policy: args.policy, ledger: args.ledger };
         let advisor = tandem_teacher::open(&config).map_err(teacher_failed)?;
         let listener = listen(&args.listen).await?;
-        let served = tandem_teacher::serve_advisor(advisor, listener, &gate, shutdown).await;
+        let served =
+            tandem_teacher::serve_advisor(advisor, listener, &gate, shutdown, Pacing::Concurrent)
+                .await;
         served.map_err(teacher_failed)
     })
 }
@@ -74,6 +77,7 @@ pub(crate) fn learner(args: LearnerArgs) -> Result<(), Failed> {
             clock: clock::since_now(),
             version: VERSION.to_owned(),
             first_worker: clock::unix_millis() << 12,
+            pacing: Pacing::Concurrent,
         };
         let served = tandem_learner::serve_beside(config, listener, shutdown, beside).await;
         let ended = served.map_err(learner_failed)?;
@@ -120,6 +124,7 @@ pub(crate) fn worker(args: WorkerArgs) -> Result<(), Failed> {
             teacher: args.teacher,
             name: args.name,
             log_dir: args.log_dir,
+            pacing: Pacing::Concurrent,
         };
         tandem_worker::run(config, shutdown).await.map_err(worker_failed)
     })

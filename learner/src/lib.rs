@@ -18,6 +18,7 @@ mod metrics;
 pub mod records;
 pub mod relay;
 pub mod replay;
+mod runtime;
 pub mod service;
 mod shared;
 mod teacher;
