@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 use anyhow::Context as _;
 use tandem_learner::checkpoint::CheckpointError;
 use tandem_learner::{AfterTheEnd, Beside, Error as LearnerError};
-use tandem_net::{Capacity, Incoming};
+use tandem_net::{Capacity, Incoming, Pacing};
 use tandem_teacher::Advisor;
 use tandem_teacher::ledger::SqliteLedger;
 use tandem_teacher::policy::OneArmPolicy;
@@ -50,7 +50,9 @@ pub(crate) fn teacher(args: TeacherArgs) -> Result<(), Failed> {
         let shutdown = shutdown(args.listen.exit_with_stdin)?;
         let advisor = advisor(args.policy, args.ledger).map_err(teacher_failed)?;
         let listener = listen(&args.listen).await?;
-        let served = tandem_teacher::serve_advisor(advisor, listener, &gate, shutdown).await;
+        let served =
+            tandem_teacher::serve_advisor(advisor, listener, &gate, shutdown, Pacing::Concurrent)
+                .await;
         served.map_err(teacher_failed)
     })
 }
@@ -92,6 +94,7 @@ pub(crate) fn learner(args: LearnerArgs) -> Result<(), Failed> {
             clock: clock::since_now(),
             version: VERSION.to_owned(),
             first_worker: clock::unix_millis() << 12,
+            pacing: Pacing::Concurrent,
         };
         let served = tandem_learner::serve_beside(config, listener, shutdown, beside).await;
         let ended = served.map_err(learner_failed)?;
@@ -130,6 +133,7 @@ pub(crate) fn worker(args: WorkerArgs) -> Result<(), Failed> {
             teacher: args.teacher,
             name: args.name,
             log_dir: args.log_dir,
+            pacing: Pacing::Concurrent,
         };
         tandem_worker::run(config, shutdown).await.map_err(worker_failed)
     })

@@ -12,12 +12,12 @@ use tandem_core::layout::EPISODE_STEPS;
 use tandem_core::work::{PublishedActor, SlotOrder};
 use tandem_core::{Episode, EpisodeKind};
 use tandem_telemetry::events::{ParametersPublished, RoundFinished, RunFinished, WorkerSilent};
-use tokio::runtime::Handle;
 use tokio_util::sync::CancellationToken;
 
 use crate::board::Silent;
 use crate::error::Error;
 use crate::records::{Pending, Records};
+use crate::runtime::Runtime;
 use crate::shared::{LearnerConfig, Shared};
 use crate::teacher::{Ledger, Mismatch, TeacherError};
 use crate::trainer::{RoundFigures, Trainer};
@@ -53,7 +53,7 @@ pub struct Ended {
 pub(crate) fn run(
     config: &LearnerConfig,
     shared: &Shared,
-    runtime: &Handle,
+    runtime: &Runtime,
     shutdown: &CancellationToken,
 ) -> Result<Ended, Error> {
     let beginning = Beginning::of(config, shutdown)?;
@@ -67,7 +67,7 @@ pub(crate) fn run(
         ledger => ledger?,
     };
     keep_run_file(config)?;
-    let mut drive = Drive::new(config, shared, shutdown, beginning, ledger);
+    let mut drive = Drive::new(config, shared, (runtime, shutdown), beginning, ledger);
     match drive.rounds() {
         Ok(stop) => drive.finish(stop),
         Err(error) => {
@@ -90,6 +90,7 @@ enum Stop {
 struct Drive<'a> {
     config: &'a LearnerConfig,
     shared: &'a Shared,
+    runtime: &'a Runtime,
     shutdown: &'a CancellationToken,
     trainer: Trainer,
     /// Plays the round that is being awaited.
@@ -274,7 +275,12 @@ impl Drive<'_> {
                 looked_at = Some(now);
                 report_silent(&state.board.reclaim(now));
             }
-            drop(self.shared.wait(state, WAIT_TICK));
+            drop(state);
+            let arrived = self.shared.arrived.clone();
+            let news = async move { tokio::time::timeout(WAIT_TICK, arrived.notified()).await };
+            if self.runtime.wait_on(news).is_none() {
+                return Ok(None);
+            }
         }
     }
 

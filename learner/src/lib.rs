@@ -20,6 +20,7 @@ mod metrics;
 pub mod records;
 pub mod relay;
 pub mod replay;
+mod runtime;
 pub mod service;
 pub mod settings;
 mod shared;

@@ -16,7 +16,6 @@ use tandem_proto::pb::learner_server::{Learner, LearnerServer};
 use tandem_proto::{decode_episode, encode_slot, encode_terms};
 use tandem_telemetry::events::WorkerJoined;
 use tokio::net::TcpListener;
-use tokio::runtime::Handle;
 use tokio_stream::wrappers::WatchStream;
 use tokio_stream::{Stream, StreamExt as _};
 use tokio_util::sync::CancellationToken;
@@ -26,7 +25,8 @@ use crate::board::check_count;
 use crate::drive::{self, Ended};
 use crate::error::Error;
 use crate::metrics;
-use crate::shared::{LearnerConfig, Shared, wait_on};
+use crate::runtime::{Runtime, on_a_thread};
+use crate::shared::{LearnerConfig, Shared};
 pub(crate) use connections::{Connections, LogQuota};
 pub(crate) use refusals::check_version;
 use refusals::{check_name, malformed, refusal};
@@ -111,42 +111,40 @@ pub async fn serve_beside(
     let stop_serving = CancellationToken::new();
     let showing = show_figures(beside.metrics, shared.clone());
     let learning = {
-        let (runtime, stop) = (Handle::current(), stop_serving.clone());
+        let (pacing, stop) = (config.pacing, stop_serving.clone());
         let shutdown = shutdown.clone();
-        let learn = move || {
+        on_a_thread("learn", pacing, move |runtime| {
             let _stop = stop.drop_guard();
             let ended = learn(&config, &shared, &runtime, &shutdown);
-            wait_on(&runtime, linger(beside.after_the_end));
+            runtime.wait_on(linger(beside.after_the_end));
             if is_complete(&ended) {
-                wait_on(&runtime, until_workers_know(shared.clone(), shutdown.clone()));
-                wait_on(&runtime, stay(beside.after_the_end, shutdown));
+                runtime.wait_on(until_workers_know(shared.clone(), shutdown.clone()));
+                runtime.wait_on(stay(beside.after_the_end, shutdown));
             }
             // Watchers' streams close at the first message after the one that says so.
             shared.progress.send_modify(|_| ());
             ended
+        })
+    };
+    let serving = async {
+        let stopping = stop_serving.clone().cancelled_owned();
+        let served = tokio::select! {
+            served = router.serve_with_incoming_shutdown(incoming.into(), stopping) => served,
+            () = grace_after(&stop_serving) => Ok(()),
+            () = showing => Ok(()),
         };
-        std::thread::Builder::new().name("learn".to_owned()).spawn(learn).map_err(|source| {
-            Error::RunDirectory {
-                action: "start a thread for",
-                path: PathBuf::from("learning"),
-                source: source.into(),
-            }
-        })?
+        // A server that fails takes the run with it: nobody can reach it any more.
+        shutdown.cancel();
+        served
     };
-    let serving = router
-        .serve_with_incoming_shutdown(incoming.into(), stop_serving.clone().cancelled_owned());
-    let served = tokio::select! {
-        served = serving => served,
-        () = grace_after(&stop_serving) => Ok(()),
-        () = showing => Ok(()),
-    };
-    // A server that fails takes the run with it: nobody can reach it any more.
-    shutdown.cancel();
-    let joined = tokio::task::spawn_blocking(move || learning.join()).await;
-    let ended =
-        joined.map_or(Err(Error::Panicked), |joined| joined.unwrap_or(Err(Error::Panicked)));
+    let (joined, served) = tokio::join!(learning, serving);
+    let ended = joined.map_err(|source| Error::RunDirectory {
+        action: "start a thread for",
+        path: PathBuf::from("learning"),
+        source: source.into(),
+    })?;
     served?;
-    ended
+    ended.unwrap_or(Err(Error::Panicked))
 }
 
 fn is_complete(ended: &Result<Ended, Error>) -> bool {
@@ -197,7 +195,7 @@ async fn grace_after(stop_serving: &CancellationToken) {
 fn learn(
     config: &LearnerConfig,
     shared: &Shared,
-    runtime: &Handle,
+    runtime: &Runtime,
     shutdown: &CancellationToken,
 ) -> Result<Ended, Error> {
     let run = AssertUnwindSafe(|| drive::run(config, shared, runtime, shutdown));
@@ -387,7 +385,7 @@ impl LearnerService {
         };
         let episodes: Vec<Episode> = episodes.into_iter().map(decode).collect::<Result<_, _>>()?;
         self.shared.lock().board.submit(worker_id, slot, episodes, now).map_err(refused)?;
-        self.shared.arrived.notify_all();
+        self.shared.arrived.notify_one();
         Ok(())
     }
 }

@@ -2,14 +2,13 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
-use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use tandem_core::work::{PublishedActor, RunTerms};
-use tandem_net::{Dial, Gate, Prepared};
+use tandem_net::{Dial, Gate, Pacing, Prepared};
 use tandem_policy::Policy;
 use tandem_proto::{encode_actor, pb};
-use tokio::runtime::Handle;
 use tokio::sync::{Notify, watch};
 
 use crate::board::{Board, Worker};
@@ -53,13 +52,15 @@ pub struct LearnerConfig {
     /// Where workers' numbers start; another one for each start of a learner, so that a worker of the learner before
     /// is not taken for one of this.
     pub first_worker: u64,
+    /// How the service and the thread that learns take turns.
+    pub pacing: Pacing,
 }
 
 /// State shared by the service's calls and the thread that learns.
 pub(crate) struct Shared {
     state: Mutex<State>,
     /// Signalled whenever episodes come in.
-    pub(crate) arrived: Condvar,
+    pub(crate) arrived: Arc<Notify>,
     /// Signalled whenever there may be work.
     pub(crate) work: Notify,
     pub(crate) progress: watch::Sender<pb::Progress>,
@@ -103,7 +104,7 @@ impl Shared {
         let (progress, _) = watch::channel(pb::Progress::default());
         Self {
             state: Mutex::default(),
-            arrived: Condvar::new(),
+            arrived: Arc::default(),
             work: Notify::new(),
             progress,
             clock,
@@ -112,15 +113,6 @@ impl Shared {
 
     pub(crate) fn lock(&self) -> MutexGuard<'_, State> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
-    }
-
-    /// Waits a while for episodes to come in.
-    pub(crate) fn wait<'a>(
-        &self,
-        state: MutexGuard<'a, State>,
-        at_most: Duration,
-    ) -> MutexGuard<'a, State> {
-        self.arrived.wait_timeout(state, at_most).unwrap_or_else(PoisonError::into_inner).0
     }
 
     /// Hands out an actor from now on, and forgets the oldest.
@@ -132,17 +124,4 @@ impl Shared {
             state.published.pop_first();
         }
     }
-}
-
-/// Lets `runtime` do `work` and waits for its outcome; `None` when the runtime ends first. Not to be called on one of
-/// the runtime's own threads.
-pub(crate) fn wait_on<T: Send + 'static>(
-    runtime: &Handle,
-    work: impl Future<Output = T> + Send + 'static,
-) -> Option<T> {
-    let (sender, receiver) = std::sync::mpsc::sync_channel(1);
-    runtime.spawn(async move {
-        drop(sender.send(work.await));
-    });
-    receiver.recv().ok()
 }

@@ -12,12 +12,11 @@ use tandem_net::{Dial, DialError, Link};
 use tandem_proto::pb;
 use tandem_proto::pb::teacher_client::TeacherClient;
 use tandem_telemetry::events::{AdviceAccountOpened, Reconnected, Reconnecting};
-use tokio::runtime::Handle;
 use tokio_util::sync::{CancellationToken, DropGuard};
 use tonic::{Code, Status};
 use tracing::warn;
 
-use crate::shared::wait_on;
+use crate::runtime::Runtime;
 use audit::{Audit, Cost, Statement};
 
 /// Deadline of a call.
@@ -94,7 +93,7 @@ pub(crate) struct Mismatch {
 #[derive(Debug)]
 pub(crate) struct Ledger {
     client: TeacherClient<Link>,
-    runtime: Handle,
+    runtime: Runtime,
     shutdown: CancellationToken,
     /// What the run file says.
     terms: pb::OpenAccountRequest,
@@ -116,7 +115,7 @@ impl Ledger {
         terms: &pb::OpenAccountRequest,
         units_per_episode: u32,
         run: Run,
-        (runtime, shutdown): (&Handle, &CancellationToken),
+        (runtime, shutdown): (&Runtime, &CancellationToken),
     ) -> Result<Self, TeacherError> {
         let inside = runtime.enter();
         let client = TeacherClient::new(dial.link(address)?);
@@ -346,7 +345,7 @@ impl Ledger {
                 () = shutdown.cancelled_owned() => Err(TeacherError::Stopped),
             }
         };
-        wait_on(&self.runtime, call).unwrap_or(Err(TeacherError::Stopped))
+        self.runtime.wait_on(call).unwrap_or(Err(TeacherError::Stopped))
     }
 }
 

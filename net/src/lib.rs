@@ -2,7 +2,7 @@
 //!
 //! [`Gate`] is a service's side: its token, its certificate, and what it offers beside its calls (health, reflection,
 //! keep-alive); an answer that goes to many is [`Prepared`] for it once. [`Dial`] is a client's side; its [`Link`]s say what to do when a call does not get through. [`Incoming`] and [`Dial::through`] let both run over any network, a
-//! simulated one included. [`Page`] is what a service shows to programs that speak plain HTTP. What is said over a connection is not known here.
+//! simulated one included; [`Pacing`] is how services and their threads take turns on it. [`Page`] is what a service shows to programs that speak plain HTTP. What is said over a connection is not known here.
 
 mod access;
 mod admission;
@@ -14,6 +14,7 @@ mod health;
 mod heard;
 mod incoming;
 mod link;
+mod pacing;
 mod page;
 mod prepared;
 mod throttle;
@@ -27,6 +28,7 @@ pub use gate::{Gate, GateError, Guard, Router};
 pub use health::{Unwell, check_health};
 pub use incoming::Incoming;
 pub use link::Link;
+pub use pacing::Pacing;
 pub use page::Page;
 pub use prepared::Prepared;
 pub use tls::TlsError;

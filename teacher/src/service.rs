@@ -7,7 +7,7 @@ mod thread;
 use std::path::PathBuf;
 use std::time::Duration;
 
-use tandem_net::{Gate, Incoming};
+use tandem_net::{Gate, Incoming, Pacing};
 use tandem_proto::pb::teacher_server::{Teacher, TeacherServer};
 use tandem_proto::{decode_account_name, pb};
 use tokio_util::sync::CancellationToken;
@@ -57,12 +57,13 @@ pub async fn serve(
     gate: &Gate,
     shutdown: CancellationToken,
 ) -> Result<(), Error> {
-    serve_advisor(open(&config)?, incoming, gate, shutdown).await
+    serve_advisor(open(&config)?, incoming, gate, shutdown, Pacing::Concurrent).await
 }
 
 /// Serves `advisor` to those whom `gate` lets in, until `shutdown` is cancelled.
 ///
-/// The advisor gets a thread of its own. Should that thread panic, calls under way fail and the service ends.
+/// The advisor gets a thread of its own, or under [`Pacing::Lockstep`] a task. Should that panic, calls under way fail
+/// and the service ends.
 ///
 /// # Errors
 /// When the server fails, or the advisor has panicked.
@@ -71,10 +72,11 @@ pub async fn serve_advisor(
     incoming: impl Into<Incoming>,
     gate: &Gate,
     shutdown: CancellationToken,
+    pacing: Pacing,
 ) -> Result<(), Error> {
     let stop = shutdown.child_token();
     let (thread, advisor) =
-        AdvisorThread::spawn(advisor, PATIENCE, stop.clone()).map_err(Error::Thread)?;
+        AdvisorThread::spawn(advisor, PATIENCE, stop.clone(), pacing).map_err(Error::Thread)?;
     let service = TeacherService { advisor, stop: stop.clone() };
     let teacher = TeacherServer::new(service).max_decoding_message_size(MAX_REQUEST_BYTES);
     let router = gate.router(teacher).await?;

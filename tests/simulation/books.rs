@@ -7,7 +7,7 @@ use std::sync::{Arc, Mutex, MutexGuard};
 use tandem_teacher::budget::{Account, Balance, BudgetError, Lease, Terms, Verdict};
 use tandem_teacher::ledger::{Bill, Charge, Ledger, LedgerError, Receipt, SqliteLedger};
 
-type Open = dyn Fn(&Path) -> Box<dyn Ledger>;
+type Open = dyn Fn() -> Box<dyn Ledger>;
 
 /// Opens the ledger of each teacher that starts.
 pub(crate) struct Ledgers(Box<Open>);
@@ -16,19 +16,17 @@ impl Ledgers {
     /// All teachers use `ledger`, which survives them.
     pub(crate) fn kept(ledger: impl Ledger + 'static) -> Self {
         let kept = Kept(Arc::new(Mutex::new(ledger)));
-        Self(Box::new(move |_| Box::new(kept.clone())))
+        Self(Box::new(move || Box::new(kept.clone())))
     }
 
     /// Each teacher opens the ledger's file.
     pub(crate) fn in_file() -> Self {
-        Self(Box::new(|directory| {
-            Box::new(SqliteLedger::open(&directory.join("ledger.db")).expect("a ledger"))
-        }))
+        Self(Box::new(|| Box::new(SqliteLedger::open(Path::new("ledger.db")).expect("a ledger"))))
     }
 
-    /// The ledger for a teacher with the files in `directory`.
-    pub(crate) fn open(&self, directory: &Path) -> Box<dyn Ledger> {
-        (self.0)(directory)
+    /// The ledger for a teacher.
+    pub(crate) fn open(&self) -> Box<dyn Ledger> {
+        (self.0)()
     }
 }
 
@@ -185,13 +183,11 @@ pub(crate) type SharedBook = Arc<Mutex<Book>>;
 pub(crate) struct Watched {
     ledger: Box<dyn Ledger>,
     book: SharedBook,
-    /// Shows that the teacher that holds the ledger has not ended yet.
-    _life: Arc<()>,
 }
 
 impl Watched {
-    pub(crate) fn new(ledger: Box<dyn Ledger>, book: SharedBook, life: Arc<()>) -> Self {
-        Self { ledger, book, _life: life }
+    pub(crate) fn new(ledger: Box<dyn Ledger>, book: SharedBook) -> Self {
+        Self { ledger, book }
     }
 
     /// Notes how account `name` stands after an operation.

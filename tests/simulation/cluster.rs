@@ -10,16 +10,14 @@ use std::rc::Rc;
 use std::sync::{Arc, Mutex, OnceLock};
 use std::time::Duration;
 
-use tandem_learner::trainer::Counters;
+use serde::{Deserialize, Serialize};
 use tandem_learner::{LearnerConfig, RunConfig, checkpoint};
-use tandem_net::Gate;
+use tandem_net::{Gate, Pacing};
 use tandem_policy::Policy;
-use tandem_teacher::budget::Balance;
 use tandem_teacher::policy::OneArmPolicy;
 use tandem_teacher::{Advisor, serve_advisor};
-use tandem_telemetry::{MetricsLog, MetricsRow};
+use tandem_telemetry::MetricsLog;
 use tandem_worker::{Patience, WorkerConfig, run_with};
-use tempfile::TempDir;
 use tokio_util::sync::CancellationToken;
 
 use crate::books::{Ledgers, SharedBook, Watched};
@@ -45,17 +43,20 @@ pub(crate) struct Scenario {
 }
 
 /// How a run ended.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(crate) struct Outcome {
     pub(crate) digest: String,
-    pub(crate) counters: Counters,
-    pub(crate) balance: Balance,
-    /// All evaluations, without the time they took.
-    pub(crate) metrics: Vec<MetricsRow>,
+    pub(crate) n_rounds: u64,
+    /// Units of advice spent, set aside and left.
+    pub(crate) units: [u64; 3],
+    /// Rounds after which the policy was judged.
+    pub(crate) judged: Vec<u64>,
+    /// Counters, balance and evaluations in every detail, without the time they took.
+    pub(crate) details: String,
 }
 
 /// What happened on the way.
-#[derive(Debug, Clone, Copy, Default)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 pub(crate) struct Course {
     /// Simulated time that it took.
     pub(crate) took: Duration,
@@ -112,9 +113,7 @@ pub(crate) fn simulate_with<'a>(
     let mut machines = Machines::new(schedule, &house, links(scenario.workers), before_crash);
     let for_teacher = Rc::clone(&stage);
     machines.add(TEACHER, move || {
-        let ledger = scenario.ledgers.open(for_teacher.disk.path());
-        let ledger =
-            Watched::new(ledger, for_teacher.book.clone(), for_teacher.house.life_of(TEACHER));
+        let ledger = Watched::new(scenario.ledgers.open(), for_teacher.book.clone());
         Rc::clone(&for_teacher).teacher(ledger)
     });
     let for_learner = Rc::clone(&stage);
@@ -132,11 +131,10 @@ pub(crate) fn simulate_with<'a>(
     Ok((outcome, Course { n_repeats, ..course }))
 }
 
-/// What outlives the processes on the hosts: disks, and what was seen.
+/// What outlives the processes on the hosts: the learner's directories, and what was seen.
 struct Stage {
     run: RunConfig,
     house: Rc<House>,
-    disk: TempDir,
     book: SharedBook,
     /// Learners that have started. Each has a directory of its own.
     n_learners: Cell<u64>,
@@ -150,7 +148,6 @@ impl Stage {
         Self {
             run,
             house: Rc::clone(house),
-            disk: TempDir::new().expect("a directory"),
             book: Arc::new(Mutex::default()),
             n_learners: Cell::new(0),
             course: Cell::default(),
@@ -159,29 +156,29 @@ impl Stage {
     }
 
     /// The run directory of the learner that started as number `number`, from 1.
-    fn learner_directory(&self, number: u64) -> PathBuf {
-        self.disk.path().join(format!("learner-{number}"))
+    fn learner_directory(number: u64) -> PathBuf {
+        PathBuf::from(format!("learner-{number}"))
     }
 
     /// Hands what is on the learner's disk at this moment to the learner that will start next.
     fn keep_learner_disk(&self) {
         let (from, to) = (
-            self.learner_directory(self.n_learners.get()),
-            self.learner_directory(self.n_learners.get() + 1),
+            Self::learner_directory(self.n_learners.get()),
+            Self::learner_directory(self.n_learners.get() + 1),
         );
         fs::create_dir_all(to.join("checkpoint")).expect("a directory");
         for path in checkpoint::list(&from.join("checkpoint")) {
             let name = path.file_name().expect("a file").to_owned();
-            // The learner's thread removes old checkpoints meanwhile.
-            drop(fs::copy(&path, to.join("checkpoint").join(name)));
+            fs::copy(&path, to.join("checkpoint").join(name)).expect("a copy");
         }
+        // There is none before the first evaluation.
         drop(fs::copy(from.join("metrics.jsonl"), to.join("metrics.jsonl")));
     }
 
     async fn learner(self: Rc<Self>) -> turmoil::Result {
         let number = self.n_learners.get() + 1;
         self.n_learners.set(number);
-        let out = self.learner_directory(number);
+        let out = Self::learner_directory(number);
         let resume = !checkpoint::list(&out.join("checkpoint")).is_empty();
         self.course
             .update(|course| Course { n_resumed: course.n_resumed + u64::from(resume), ..course });
@@ -203,6 +200,7 @@ impl Stage {
             }),
             version: "simulated".to_owned(),
             first_worker: number * WORKER_NUMBERS,
+            pacing: Pacing::Lockstep,
         };
         // A crash drops this future and cancels the token: what is left of the learner's thread then ends.
         let shutdown = CancellationToken::new();
@@ -221,7 +219,9 @@ impl Stage {
         let policy = OneArmPolicy::new(teacher_policy())?;
         let advisor = Advisor::new(Box::new(policy), Box::new(ledger))?;
         let (gate, for_ever) = (Gate::default(), CancellationToken::new());
-        if let Err(error) = serve_advisor(advisor, listen().await?, &gate, for_ever).await {
+        let served =
+            serve_advisor(advisor, listen().await?, &gate, for_ever, Pacing::Lockstep).await;
+        if let Err(error) = served {
             self.house.complain(with_causes(TEACHER, &error));
         }
         Ok(())
@@ -235,6 +235,7 @@ impl Stage {
             teacher: Some(address(TEACHER)),
             name: host.to_owned(),
             log_dir: None,
+            pacing: Pacing::Lockstep,
         };
         if let Err(error) = run_with(config, Patience::default(), self.house.leave_of(host)).await {
             self.house.complain(with_causes(host, &error));
@@ -249,7 +250,7 @@ impl Stage {
         if let Some(complaint) = complaint {
             return Err(complaint);
         }
-        let directory = self.learner_directory(self.n_learners.get());
+        let directory = Self::learner_directory(self.n_learners.get());
         let mut metrics = MetricsLog::read_all(&directory.join("metrics.jsonl"))
             .map_err(|error| error.to_string())?;
         metrics.iter_mut().for_each(|row| row.wall_s = 0.0);
@@ -264,8 +265,7 @@ impl Stage {
         if book.accounts() != [account] {
             return Err(format!("a run has one account, not {:?}", book.accounts()));
         }
-        let balance =
-            ledgers.open(self.disk.path()).balance(account).map_err(|error| error.to_string())?;
+        let balance = ledgers.open().balance(account).map_err(|error| error.to_string())?;
         let counters = trainer.counters();
         let (n_charged, n_arrived) = (book.n_charged(account), counters.advice_spent);
         if [n_charged, n_arrived] != [balance.spent; 2] {
@@ -274,7 +274,13 @@ impl Stage {
                 "{n_charged} steps were charged, {n_arrived} units came with episodes, {spent} are spent"
             ));
         }
-        Ok(Outcome { digest, counters, balance, metrics })
+        Ok(Outcome {
+            digest,
+            n_rounds: counters.round,
+            units: [balance.spent, balance.leased, balance.left],
+            judged: metrics.iter().map(|row| row.round).collect(),
+            details: format!("{counters:?} {balance:?} {metrics:?}"),
+        })
     }
 }
 

@@ -7,11 +7,10 @@ use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use tandem_core::{Layout, StepQuery, Task};
-use tandem_net::{Gate, Link};
+use tandem_net::{Gate, Link, Pacing};
 use tandem_proto::pb::teacher_client::TeacherClient;
 use tandem_proto::{encode_query, pb};
 use tandem_teacher::{Advisor, TeacherPolicy, serve_advisor};
-use tempfile::TempDir;
 use tokio_util::sync::CancellationToken;
 use tonic::{Response, Status};
 
@@ -63,9 +62,8 @@ pub(crate) fn simulate_crowd(seed: u64, ledgers: &Ledgers) -> Result<u64, String
     let mut machines = Machines::new(&schedule, &stage.house, links, |_| {});
     let for_teacher = Rc::clone(&stage);
     machines.add(TEACHER, move || {
-        let ledger = ledgers.open(for_teacher.disk.path());
-        let life = for_teacher.house.life_of(TEACHER);
-        Rc::clone(&for_teacher).teacher(Watched::new(ledger, for_teacher.book.clone(), life))
+        let ledger = Watched::new(ledgers.open(), for_teacher.book.clone());
+        Rc::clone(&for_teacher).teacher(ledger)
     });
     for (client_idx, client) in CLIENTS.iter().enumerate() {
         let for_client = Rc::clone(&stage);
@@ -80,7 +78,6 @@ pub(crate) fn simulate_crowd(seed: u64, ledgers: &Ledgers) -> Result<u64, String
 /// What outlives the processes on the hosts.
 struct Stage {
     house: Rc<House>,
-    disk: TempDir,
     book: SharedBook,
     /// What clients were told of steps, by episode and step.
     charged: RefCell<BTreeMap<(u64, u32), bool>>,
@@ -91,7 +88,6 @@ impl Default for Stage {
     fn default() -> Self {
         Self {
             house: Rc::default(),
-            disk: TempDir::new().expect("a directory"),
             book: Arc::new(Mutex::default()),
             charged: RefCell::default(),
             have_asked: RefCell::default(),
@@ -103,7 +99,9 @@ impl Stage {
     async fn teacher(self: Rc<Self>, ledger: Watched) -> turmoil::Result {
         let advisor = Advisor::new(Box::new(Still), Box::new(ledger))?;
         let (gate, for_ever) = (Gate::default(), CancellationToken::new());
-        if let Err(error) = serve_advisor(advisor, listen().await?, &gate, for_ever).await {
+        let served =
+            serve_advisor(advisor, listen().await?, &gate, for_ever, Pacing::Lockstep).await;
+        if let Err(error) = served {
             self.house.complain(with_causes(TEACHER, &error));
         }
         Ok(())
@@ -158,8 +156,7 @@ impl Stage {
         if let Some(complaint) = complaint {
             return Err(complaint);
         }
-        let balance =
-            ledgers.open(self.disk.path()).balance(ACCOUNT).map_err(|error| error.to_string())?;
+        let balance = ledgers.open().balance(ACCOUNT).map_err(|error| error.to_string())?;
         let charged = self.charged.borrow();
         let n_heard = charged.values().filter(|charged| **charged).count() as u64;
         let counts = [n_heard, book.n_charged(ACCOUNT), balance.spent];

@@ -1,8 +1,8 @@
 //! The machines of a simulation: run them through a schedule.
 //!
-//! A host's tasks run on the simulation's thread; what its processes compute on threads of their own takes real time.
-//! A crash ends a host's tasks at once. Its threads end as soon as they want something of the host, or are told to
-//! stop, and can reach nothing meanwhile. The host starts again when they have ended.
+//! A host's tasks run on the simulation's thread, which waits for what they let other threads compute. A crash ends a
+//! host's tasks at once. Its threads end as soon as they want something of the host, or are told to stop, and can reach
+//! nothing meanwhile; time moves on when they have ended.
 
 use std::cell::RefCell;
 use std::collections::BTreeMap;
@@ -15,7 +15,7 @@ use tokio_util::sync::CancellationToken;
 use turmoil::Sim;
 
 use crate::schedule::{Event, Host, Schedule};
-use crate::threads::Threads;
+use crate::trace;
 
 /// How much simulated time passes at a time.
 const TICK: Duration = Duration::from_millis(5);
@@ -137,7 +137,6 @@ impl<'a> Machines<'a> {
 
     /// Runs until `ended` gives something.
     pub(crate) fn run_until<T>(&mut self, ended: impl Fn() -> Option<T>) -> Result<T, String> {
-        let mut threads = Threads::of_simulation();
         let mut events = self.schedule.events.iter().copied().peekable();
         let mut is_calm = false;
         loop {
@@ -149,9 +148,10 @@ impl<'a> Machines<'a> {
                 is_calm = true;
                 self.calm_down();
             }
-            threads.during(|| self.sim.step()).map_err(|error| error.to_string())?;
+            self.sim.step().map_err(|error| error.to_string())?;
             let micros = u64::try_from(self.sim.elapsed().as_micros()).expect("an hour at most");
             self.house.now.store(micros, Ordering::Relaxed);
+            trace::set_now(self.sim.elapsed());
             if let Some(ended) = ended() {
                 return Ok(ended);
             }
@@ -162,11 +162,12 @@ impl<'a> Machines<'a> {
     }
 
     fn apply(&mut self, event: Event) {
+        tracing::info!(?event, "schedule");
         match event {
             Event::Crash(host) => self.crash(host),
             Event::Start(host) => {
                 self.down.retain(|down| *down != host);
-                self.start(host);
+                self.sim.bounce(host);
             }
             Event::Leave(host) => {
                 if let Some(leave) = self.house.leave.borrow().get(host) {
@@ -184,13 +185,11 @@ impl<'a> Machines<'a> {
         if self.sim.is_host_running(host) {
             (self.before_crash)(host);
         }
-        self.sim.crash(host);
+        trace::without(|| {
+            self.sim.crash(host);
+            self.house.wait_until_gone(host);
+        });
         self.down.push(host);
-    }
-
-    fn start(&mut self, host: Host) {
-        self.house.wait_until_gone(host);
-        self.sim.bounce(host);
     }
 
     /// From here on every host is up and every message gets through.
@@ -200,7 +199,7 @@ impl<'a> Machines<'a> {
             self.repair(a, b);
         }
         for host in std::mem::take(&mut self.down) {
-            self.start(host);
+            self.sim.bounce(host);
         }
     }
 
@@ -212,8 +211,10 @@ impl<'a> Machines<'a> {
     /// Ends everything and waits for the threads.
     pub(crate) fn end(self) {
         let Self { sim, house, hosts, .. } = self;
-        drop(sim);
-        hosts.iter().for_each(|host| house.wait_until_gone(host));
+        trace::without(|| {
+            drop(sim);
+            hosts.iter().for_each(|host| house.wait_until_gone(host));
+        });
     }
 }
 

@@ -1,18 +1,26 @@
 //! Whole runs on a simulated network where everything goes wrong that can: messages late, lost and held back, hosts
 //! cut off, crashed and started again. What comes out is what a calm run gives.
 //!
-//! A seed draws what goes wrong. The same seed does not take the same course twice, because threads take part; what is
-//! checked holds for every course. `TANDEM_SIM_SEEDS=17 cargo test --release --test simulation -- --ignored` looks at
-//! seed 17 alone, `17..40` at several.
+//! A seed draws what goes wrong, and the same seed always takes the same course:
+//! `TANDEM_SIM_SEEDS=17 cargo test --release --test simulation -- --ignored many_runs` looks at seed 17 alone, `17..40`
+//! at several. Each simulation has a process of its own. What that process does can be written down, one line for each
+//! message, log line and trouble, or be followed in a debugger:
+//! ```text
+//! TANDEM_SIMULATION=run:17 TANDEM_SIM_TRACE=/tmp/trace cargo test --release --test simulation -- \
+//!     --ignored --exact one_simulation --nocapture
+//! ```
+//! Complaints begin with the simulation that they are about, such as `run:17`.
 
 mod books;
 mod cluster;
 mod crowd;
 mod machines;
 mod network;
+mod process;
+mod repeats;
 mod schedule;
 mod seeds;
-mod threads;
+mod trace;
 
 use std::sync::OnceLock;
 use std::time::Duration;
@@ -25,6 +33,7 @@ use tandem_teacher::ledger::MemoryLedger;
 use books::{ForgetfulLedger, Ledgers};
 use cluster::{Course, Outcome, SERVICES, Scenario, WORKERS, links, simulate, simulate_with};
 use crowd::simulate_crowd;
+use process::{Kind, Report, Simulation};
 use schedule::Schedule;
 use seeds::{complaints, for_seeds, seeds_asked_for};
 
@@ -60,36 +69,6 @@ fn run_config((strategy, budget, share, lag): (&str, u64, f64, u32)) -> RunConfi
     run
 }
 
-/// How a calm run with one worker ends.
-fn calm(run_idx: usize) -> &'static Outcome {
-    static CALM: [OnceLock<Outcome>; RUNS.len()] = [const { OnceLock::new() }; RUNS.len()];
-    CALM[run_idx].get_or_init(|| {
-        let scenario = Scenario {
-            run: run_config(RUNS[run_idx]),
-            workers: &WORKERS[..1],
-            ledgers: Ledgers::kept(MemoryLedger::default()),
-        };
-        simulate(&scenario, &Schedule::calm(0)).expect("nothing goes wrong").0
-    })
-}
-
-/// Simulates a run that `seed` picks, with what `seed` lets go wrong, and compares its end with a calm one's.
-fn check(seed: u64, ledgers: Ledgers) -> Result<Course, String> {
-    let run_idx = usize::try_from(seed).expect("a small seed") % RUNS.len();
-    let workers = &WORKERS[..2 + usize::try_from(seed / 3 % 4).expect("below 4")];
-    let schedule = Schedule::draw(seed, &links(workers), &SERVICES, workers, SPAN);
-    let scenario = Scenario { run: run_config(RUNS[run_idx]), workers, ledgers };
-    let told = |what: String| {
-        format!("{what}\n{} workers, {:?}, {schedule}", workers.len(), RUNS[run_idx])
-    };
-    let (outcome, course) = simulate(&scenario, &schedule).map_err(told)?;
-    let expected = calm(run_idx);
-    if outcome == *expected {
-        return Ok(course);
-    }
-    Err(told(format!("expected the end of a calm run, {expected:?}, got {outcome:?}")))
-}
-
 /// A ledger that does what it must, every fourth one in a file.
 fn proper_ledgers(seed: u64) -> Ledgers {
     match seed % 4 {
@@ -98,18 +77,110 @@ fn proper_ledgers(seed: u64) -> Ledgers {
     }
 }
 
+fn forgetful_ledgers() -> Ledgers {
+    Ledgers::kept(ForgetfulLedger::default())
+}
+
+/// Runs a simulation in this process.
+fn simulate_here(Simulation(kind, number): Simulation) -> Result<Report, String> {
+    let (outcome, course) = match kind {
+        Kind::Calm => simulate_calm(run_idx_of(number), &WORKERS[..1], false)?,
+        Kind::Silent => simulate_calm(run_idx_of(number), &WORKERS[..2], true)?,
+        Kind::Run => simulate_trouble(number, proper_ledgers(number))?,
+        Kind::ForgetfulRun => simulate_trouble(number, forgetful_ledgers())?,
+        Kind::Crowd | Kind::ForgetfulCrowd => {
+            let is_forgetful = kind == Kind::ForgetfulCrowd;
+            let ledgers = if is_forgetful { forgetful_ledgers() } else { proper_ledgers(number) };
+            let n_repeats = simulate_crowd(number, &ledgers)?;
+            return Ok(Report { outcome: None, course: Course { n_repeats, ..Course::default() } });
+        }
+    };
+    Ok(Report { outcome: Some(outcome), course })
+}
+
+/// The run that `number` picks.
+fn run_idx_of(number: u64) -> usize {
+    usize::try_from(number).expect("a small number") % RUNS.len()
+}
+
+/// Simulates a run without trouble, if need be with somebody who is connected and says nothing.
+fn simulate_calm(
+    run_idx: usize,
+    workers: &'static [schedule::Host],
+    with_silent: bool,
+) -> Result<(Outcome, Course), String> {
+    let ledgers = Ledgers::kept(MemoryLedger::default());
+    let scenario = Scenario { run: run_config(RUNS[run_idx]), workers, ledgers };
+    let schedule = Schedule::calm(u64::from(with_silent));
+    simulate_with(&scenario, &schedule, |machines| {
+        if with_silent {
+            machines.add("silent", network::say_nothing_to_learner);
+        }
+    })
+}
+
+/// Simulates the run that `seed` picks, with what `seed` lets go wrong.
+fn simulate_trouble(seed: u64, ledgers: Ledgers) -> Result<(Outcome, Course), String> {
+    let (scenario, schedule) = trouble(seed, ledgers);
+    simulate(&scenario, &schedule).map_err(|what| format!("{what}\n{}", described(seed)))
+}
+
+fn trouble(seed: u64, ledgers: Ledgers) -> (Scenario, Schedule) {
+    let workers = &WORKERS[..2 + usize::try_from(seed / 3 % 4).expect("below 4")];
+    let schedule = Schedule::draw(seed, &links(workers), &SERVICES, workers, SPAN);
+    (Scenario { run: run_config(RUNS[run_idx_of(seed)]), workers, ledgers }, schedule)
+}
+
+/// What `seed` lets go wrong with which run.
+fn described(seed: u64) -> String {
+    let (Scenario { workers, .. }, schedule) = trouble(seed, proper_ledgers(1));
+    format!("{} workers, {:?}, {schedule}", workers.len(), RUNS[run_idx_of(seed)])
+}
+
+/// How a calm run with one worker ends.
+fn calm(run_idx: usize) -> &'static Outcome {
+    static CALM: [OnceLock<Outcome>; RUNS.len()] = [const { OnceLock::new() }; RUNS.len()];
+    CALM[run_idx].get_or_init(|| {
+        let report = process::run(Simulation(Kind::Calm, run_idx as u64), None);
+        report.expect("nothing goes wrong").outcome.expect("a run ends somehow")
+    })
+}
+
+/// Simulates a run in trouble and compares its end with a calm one's.
+fn check(kind: Kind, seed: u64) -> Result<Course, String> {
+    let simulation = Simulation(kind, seed);
+    let Report { outcome, course } = process::run(simulation, None)?;
+    let (outcome, expected) = (outcome.expect("a run ends somehow"), calm(run_idx_of(seed)));
+    if outcome == *expected {
+        return Ok(course);
+    }
+    let told = described(seed);
+    Err(format!(
+        "{simulation}: expected the end of a calm run, {expected:?}, got {outcome:?}\n{told}"
+    ))
+}
+
 fn check_run(seed: u64) -> Result<Course, String> {
-    check(seed, proper_ledgers(seed))
+    check(Kind::Run, seed)
+}
+
+fn check_crowd(seed: u64) -> Result<u64, String> {
+    Ok(process::run(Simulation(Kind::Crowd, seed), None)?.course.n_repeats)
+}
+
+#[test]
+#[ignore = "the others start it, each time in a process of its own"]
+fn one_simulation() {
+    process::run_the_one_asked_for(simulate_here);
 }
 
 #[test]
 fn every_calm_run_uses_up_its_budget_and_is_judged_three_times() {
     for (run_idx, (_, budget, ..)) in RUNS.iter().enumerate() {
-        let Outcome { balance, counters, metrics, .. } = calm(run_idx);
-        assert_eq!((balance.spent, balance.leased, balance.left), (*budget, 0, 0));
-        assert_eq!(counters.round, N_ROUNDS);
-        let rounds: Vec<u64> = metrics.iter().map(|row| row.round).collect();
-        assert_eq!(rounds, [2, 4, 5]);
+        let Outcome { units, n_rounds, judged, .. } = calm(run_idx);
+        assert_eq!(*units, [*budget, 0, 0]);
+        assert_eq!(*n_rounds, N_ROUNDS);
+        assert_eq!(*judged, [2, 4, 5]);
     }
 }
 
@@ -125,12 +196,8 @@ fn a_run_in_which_much_goes_wrong_ends_like_a_calm_one() {
 
 #[test]
 fn a_ledger_that_forgets_its_verdicts_is_found_out() {
-    let found = complaints(0..6, |seed| check(seed, Ledgers::kept(ForgetfulLedger::default())));
+    let found = complaints(0..6, |seed| check(Kind::ForgetfulRun, seed));
     assert!(!found.is_empty(), "six seeds found nothing");
-}
-
-fn check_crowd(seed: u64) -> Result<u64, String> {
-    simulate_crowd(seed, &proper_ledgers(seed))
 }
 
 #[test]
@@ -141,24 +208,29 @@ fn a_crowd_spends_the_budget_once_and_no_more() {
 
 #[test]
 fn a_crowd_finds_out_a_ledger_that_forgets_its_verdicts() {
-    let forgetful = |seed| simulate_crowd(seed, &Ledgers::kept(ForgetfulLedger::default()));
+    let forgetful = |seed| process::run(Simulation(Kind::ForgetfulCrowd, seed), None);
     assert!(!complaints(0..3, forgetful).is_empty(), "three seeds found nothing");
 }
 
 #[test]
 fn a_run_ends_although_somebody_is_connected_who_says_nothing() {
-    let scenario = Scenario {
-        run: run_config(RUNS[0]),
-        workers: &WORKERS[..2],
-        ledgers: Ledgers::kept(MemoryLedger::default()),
-    };
-    let schedule = Schedule::calm(1);
-    let (outcome, course) = simulate_with(&scenario, &schedule, |machines| {
-        machines.add("silent", network::say_nothing_to_learner);
-    })
-    .expect("ends");
-    assert_eq!(&outcome, calm(0));
+    let Report { outcome, course } = process::run(Simulation(Kind::Silent, 0), None).expect("ends");
+    assert_eq!(outcome.as_ref(), Some(calm(0)));
     assert!(course.took < Duration::from_secs(60), "{course:?}");
+}
+
+#[test]
+fn the_same_seed_takes_the_same_course() {
+    repeats::check(&[Simulation(Kind::Run, 8), Simulation(Kind::Crowd, 4)], 3);
+}
+
+#[test]
+#[ignore = "takes minutes"]
+fn many_seeds_take_the_same_course_ten_times_on_a_busy_machine() {
+    let runs = seeds_asked_for(12).map(|seed| Simulation(Kind::Run, seed));
+    let crowds = seeds_asked_for(12).map(|seed| Simulation(Kind::Crowd, seed));
+    let simulations: Vec<_> = runs.chain(crowds).collect();
+    repeats::on_a_busy_machine(|| repeats::check(&simulations, 10));
 }
 
 #[test]

@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use tandem_core::Episode;
 use tandem_core::work::SlotOrder;
-use tandem_net::Dial;
+use tandem_net::{Dial, Pacing};
 use tokio::sync::oneshot;
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
@@ -28,6 +28,8 @@ pub struct WorkerConfig {
     pub name: String,
     /// Where logs of recorded episodes go, made if need be; without it none are written.
     pub log_dir: Option<PathBuf>,
+    /// How sockets and rollouts take turns.
+    pub pacing: Pacing,
 }
 
 /// Plays slots for a learner until the run has ended or `shutdown` is cancelled; a slot in hand is then delivered
@@ -57,7 +59,7 @@ pub async fn run_with(
             .map_err(|source| Error::LogDir { path: path.clone(), source })?;
     }
     let rollouts = TaskTracker::new();
-    let peers = Peers::new(&config, patience)?;
+    let (peers, pacing) = (Peers::new(&config, patience)?, config.pacing);
     let mut worker = Worker { config, patience, peers, rollouts: rollouts.clone() };
     let drained = async {
         shutdown.cancelled().await;
@@ -68,7 +70,7 @@ pub async fn run_with(
         () = drained => Ok(()),
     };
     rollouts.close();
-    rollouts.wait().await;
+    pacing.next(rollouts.wait()).await;
     outcome
 }
 
@@ -206,14 +208,14 @@ impl Worker {
             })
             .map_err(Error::Thread)?;
         // Ends when the player has dropped its end, played to the end or not.
-        while let Some(question) = asked.recv().await {
+        while let Some(question) = self.config.pacing.next(asked.recv()).await {
             let account = account.as_deref().ok_or(Error::NoAccount { slot })?;
             let advice = self.peers.advise(account, layout, &question.queries).await?;
             if question.answer.send(advice).is_err() {
                 break;
             }
         }
-        let (player, episodes) = playing.await?;
+        let (player, episodes) = self.config.pacing.next(playing).await?;
         Ok((player, episodes.map_err(|source| Error::Rollout { slot, source })?))
     }
 }

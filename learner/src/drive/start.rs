@@ -6,7 +6,6 @@ use std::time::Duration;
 use tandem_core::work::{PublishedActor, RunTerms};
 use tandem_proto::pb;
 use tandem_telemetry::events::RunResumed;
-use tokio::runtime::Handle;
 use tokio_util::sync::CancellationToken;
 
 use super::keep::Keeping;
@@ -15,6 +14,7 @@ use crate::checkpoint::{self, CheckpointError, Restored, Resumption};
 use crate::error::Error;
 use crate::lock::DirectoryLock;
 use crate::records::{Judged, Pending, Records};
+use crate::runtime::Runtime;
 use crate::shared::{LearnerConfig, Shared};
 use crate::teacher::{Ledger, Run};
 use crate::trainer::Trainer;
@@ -79,7 +79,7 @@ impl Beginning {
     pub(super) fn open_ledger(
         &self,
         config: &LearnerConfig,
-        runtime: &Handle,
+        runtime: &Runtime,
         shutdown: &CancellationToken,
     ) -> Result<Option<Ledger>, Error> {
         let advice = &config.run.advice;
@@ -108,7 +108,7 @@ impl<'a> Drive<'a> {
     pub(super) fn new(
         config: &'a LearnerConfig,
         shared: &'a Shared,
-        shutdown: &'a CancellationToken,
+        (runtime, shutdown): (&'a Runtime, &'a CancellationToken),
         beginning: Beginning,
         ledger: Option<Ledger>,
     ) -> Self {
@@ -127,6 +127,7 @@ impl<'a> Drive<'a> {
         let mut drive = Self {
             config,
             shared,
+            runtime,
             shutdown,
             trainer,
             acting,

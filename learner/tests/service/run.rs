@@ -10,7 +10,7 @@ use tandem_core::Episode;
 use tandem_core::work::SlotOrder;
 use tandem_learner::service::serve_and_linger;
 use tandem_learner::{Clock, Ended, Error, LearnerConfig, RunConfig};
-use tandem_net::{Dial, Gate};
+use tandem_net::{Dial, Gate, Pacing};
 use tandem_policy::{Actor, Policy};
 use tandem_proto::pb::learner_client::LearnerClient;
 use tandem_proto::pb::next_work_response::Work;
@@ -48,6 +48,7 @@ pub(crate) fn learner_config(run: RunConfig, out: &Path, resume: bool) -> Learne
         clock: real_clock(),
         version: VERSION.to_owned(),
         first_worker: 4096,
+        pacing: Pacing::Concurrent,
     }
 }
 

@@ -1,10 +1,11 @@
-//! The thread that owns the networks and the ledger, and how calls reach it.
+//! The thread that owns the networks and the ledger, and how calls reach it. Under [`Pacing::Lockstep`] it is a task.
 
 use std::io;
 use std::sync::Arc;
 use std::thread::JoinHandle;
 use std::time::Duration;
 
+use tandem_net::Pacing;
 use tokio::sync::{mpsc, oneshot};
 use tokio_util::sync::{CancellationToken, DropGuard};
 
@@ -28,8 +29,14 @@ enum Job {
 
 /// A running thread.
 pub(super) struct AdvisorThread {
-    thread: JoinHandle<()>,
+    place: Place,
     ended: oneshot::Receiver<()>,
+}
+
+/// Where the advisor's jobs are done.
+enum Place {
+    Thread(JoinHandle<()>),
+    Task(tokio::task::JoinHandle<()>),
 }
 
 /// Reaches the thread. It ends once nobody holds one of these any more.
@@ -53,16 +60,25 @@ impl AdvisorThread {
         advisor: Advisor,
         patience: Duration,
         stop: CancellationToken,
+        pacing: Pacing,
     ) -> io::Result<(Self, AdvisorHandle)> {
         let (jobs, waiting) = mpsc::channel(CAPACITY);
         let (ending, ended) = oneshot::channel();
         let profile = Arc::new(advisor.profile().clone());
         let ending = Ending { _stop: stop.drop_guard(), _ended: ending };
-        let thread = std::thread::Builder::new().name("advisor".to_owned()).spawn(move || {
-            let _ending = ending;
-            work(advisor, waiting);
-        })?;
-        Ok((Self { thread, ended }, AdvisorHandle { profile, jobs, patience }))
+        let place = match pacing {
+            Pacing::Concurrent => Place::Thread(
+                std::thread::Builder::new().name("advisor".to_owned()).spawn(move || {
+                    let _ending = ending;
+                    work(advisor, waiting);
+                })?,
+            ),
+            Pacing::Lockstep => Place::Task(tokio::spawn(async move {
+                let _ending = ending;
+                work_as_a_task(advisor, waiting).await;
+            })),
+        };
+        Ok((Self { place, ended }, AdvisorHandle { profile, jobs, patience }))
     }
 
     /// Waits for the thread's end, no longer than `grace`; a thread that is still asked or stuck is left to itself.
@@ -71,7 +87,10 @@ impl AdvisorThread {
     /// When it has panicked.
     pub(super) async fn join(self, grace: Duration) -> Result<(), Error> {
         match tokio::time::timeout(grace, self.ended).await {
-            Ok(_ended) => self.thread.join().map_err(|_panic| Error::Panicked),
+            Ok(_ended) => match self.place {
+                Place::Thread(thread) => thread.join().map_err(|_panic| Error::Panicked),
+                Place::Task(task) => task.await.map_err(|_panic| Error::Panicked),
+            },
             Err(_elapsed) => {
                 tracing::warn!("the ledger is still in use after the grace period");
                 Ok(())
@@ -121,12 +140,16 @@ impl AdvisorHandle {
 fn work(mut advisor: Advisor, mut jobs: mpsc::Receiver<Job>) {
     let mut batch = Batch::default();
     while let Some(job) = jobs.blocking_recv() {
-        batch.take(job, &mut advisor);
-        while batch.n_steps < MAX_BATCH_STEPS
-            && let Ok(job) = jobs.try_recv()
-        {
-            batch.take(job, &mut advisor);
-        }
+        batch.take_all(job, &mut jobs, &mut advisor);
+        batch.answer(&mut advisor);
+    }
+}
+
+/// [`work`] on the runtime of the calls: questions that arrive at one simulated moment are answered together.
+async fn work_as_a_task(mut advisor: Advisor, mut jobs: mpsc::Receiver<Job>) {
+    let mut batch = Batch::default();
+    while let Some(job) = jobs.recv().await {
+        batch.take_all(job, &mut jobs, &mut advisor);
         batch.answer(&mut advisor);
     }
 }
@@ -140,6 +163,16 @@ struct Batch {
 }
 
 impl Batch {
+    /// Takes `job` and those that wait behind it, as many as are answered together.
+    fn take_all(&mut self, job: Job, jobs: &mut mpsc::Receiver<Job>, advisor: &mut Advisor) {
+        self.take(job, advisor);
+        while self.n_steps < MAX_BATCH_STEPS
+            && let Ok(job) = jobs.try_recv()
+        {
+            self.take(job, advisor);
+        }
+    }
+
     /// Adds a question, unless nobody waits for its answer any more. Anything else is done after the questions that
     /// came before it.
     fn take(&mut self, job: Job, advisor: &mut Advisor) {

@@ -7,6 +7,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use tandem_core::{Episode, EpisodeKind};
+use tandem_net::Pacing;
 use tandem_worker::{Error, Patience, WorkerConfig, run_with};
 use tokio_util::sync::CancellationToken;
 use tonic::Status;
@@ -31,6 +32,7 @@ fn config(learner: &Server, teacher: Option<&Server>) -> WorkerConfig {
         teacher: teacher.map(Server::address),
         name: "test".to_owned(),
         log_dir: None,
+        pacing: Pacing::Concurrent,
     }
 }
 

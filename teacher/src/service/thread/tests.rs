@@ -26,7 +26,8 @@ impl Fixture {
         let (watch, stop) = (Watch::new(), CancellationToken::new());
         let ledger = Box::new(GatedLedger::new(watch.clone()));
         let advisor = Advisor::new(Box::new(FakePolicy), ledger).unwrap();
-        let (thread, handle) = AdvisorThread::spawn(advisor, LONG, stop.clone()).unwrap();
+        let (thread, handle) =
+            AdvisorThread::spawn(advisor, LONG, stop.clone(), Pacing::Concurrent).unwrap();
         let terms = Terms { budget, strategy: "ea".parse().unwrap() };
         handle.run(move |advisor| advisor.open_account("run", terms)).await.unwrap();
         Self { thread, handle, watch, stop }

@@ -1,0 +1,89 @@
+//! Whether a simulation takes the same course each time.
+
+use std::fs::{self, File};
+use std::hash::{DefaultHasher, Hasher as _};
+use std::io::{BufRead as _, BufReader};
+use std::path::Path;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use tempfile::TempDir;
+
+use crate::process::{self, Simulation};
+
+/// Threads that keep a machine busy.
+const N_BUSY: usize = 4;
+
+/// Runs each of `simulations` `n_times`, two at a time.
+///
+/// # Panics
+/// When one of them takes another course; says with which line of the trace it begins.
+pub(crate) fn check(simulations: &[Simulation], n_times: usize) {
+    let disk = TempDir::new().expect("a directory");
+    for simulation in simulations {
+        let first = disk.path().join("first");
+        let report = process::run(*simulation, Some(&first));
+        let hash = hash_of(&first);
+        let repeat = |number: usize| {
+            let path = disk.path().join(format!("again-{number}"));
+            let again = process::run(*simulation, Some(&path));
+            if hash_of(&path) != hash || again != report {
+                let difference = first_difference(&first, &path);
+                panic!("{simulation} took another course:\n{difference}\n{report:?}\n{again:?}");
+            }
+            fs::remove_file(path).expect("a trace");
+        };
+        for numbers in (1..n_times).collect::<Vec<_>>().chunks(2) {
+            std::thread::scope(|scope| {
+                numbers.iter().for_each(|number| drop(scope.spawn(|| repeat(*number))));
+            });
+        }
+        let n_lines = lines(&first).count();
+        assert!(n_lines > 1000, "{simulation}: a trace of {n_lines} lines");
+        println!("{simulation}: {n_times} times {hash:016x}, {n_lines} lines");
+    }
+}
+
+/// Does `work` while more threads than there are processors compute.
+pub(crate) fn on_a_busy_machine(work: impl FnOnce()) {
+    struct Stop<'a>(&'a AtomicBool);
+    impl Drop for Stop<'_> {
+        fn drop(&mut self) {
+            self.0.store(true, Ordering::Relaxed);
+        }
+    }
+    let is_done = AtomicBool::new(false);
+    std::thread::scope(|scope| {
+        let _stop = Stop(&is_done);
+        for _ in 0..N_BUSY {
+            scope.spawn(|| {
+                while !is_done.load(Ordering::Relaxed) {
+                    std::hint::spin_loop();
+                }
+            });
+        }
+        work();
+    });
+}
+
+fn hash_of(path: &Path) -> u64 {
+    let mut hasher = DefaultHasher::new();
+    hasher.write(&fs::read(path).expect("a trace"));
+    hasher.finish()
+}
+
+fn lines(path: &Path) -> impl Iterator<Item = String> {
+    BufReader::new(File::open(path).expect("a trace")).lines().map(|line| line.expect("text"))
+}
+
+/// The first line in which two traces differ.
+fn first_difference(one: &Path, other: &Path) -> String {
+    let (mut one, mut other) = (lines(one), lines(other));
+    for number in 1.. {
+        match (one.next(), other.next()) {
+            (None, None) => break,
+            (one, other) if one == other => {}
+            (one, other) => return format!("line {number}:\n  {one:?}\n  {other:?}"),
+        }
+    }
+    "no line of the trace differs".to_owned()
+}
