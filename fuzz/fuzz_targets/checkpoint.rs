@@ -15,7 +15,10 @@ fuzz_target!(|file: &[u8]| {
     if sealed != file {
         write(&path, file);
         let refused = with_bounded_memory(|| checkpoint::load(&path, &config));
-        assert!(matches!(refused, Err(CheckpointError::Damaged { .. })), "a wrong seal was accepted");
+        assert!(
+            matches!(refused, Err(CheckpointError::Damaged { .. })),
+            "a wrong seal was accepted"
+        );
     }
     write(&path, &sealed);
     let Ok(restored) = with_bounded_memory(|| checkpoint::load(&path, &config)) else { return };

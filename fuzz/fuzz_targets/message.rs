@@ -23,7 +23,8 @@ fn read(message: u8, layout: Layout, bytes: &[u8]) {
     match message % 10 {
         0 => check(bytes, |query: pb::StepQuery| {
             let _layout = tandem_proto::layout_of_query(&query, layout.task);
-            tandem_proto::decode_query(query, layout).map(|query| tandem_proto::encode_query(&query))
+            tandem_proto::decode_query(query, layout)
+                .map(|query| tandem_proto::encode_query(&query))
         }),
         1 => check(bytes, |advice: pb::StepAdvice| {
             tandem_proto::decode_advice(advice, layout).map(|it| tandem_proto::encode_advice(&it))
@@ -35,7 +36,8 @@ fn read(message: u8, layout: Layout, bytes: &[u8]) {
             tandem_proto::decode_slot(slot).map(|slot| tandem_proto::encode_slot(&slot))
         }),
         4 => check(bytes, |parameters: pb::Parameters| {
-            tandem_proto::decode_actor(&parameters, layout).map(|it| tandem_proto::encode_actor(&it))
+            tandem_proto::decode_actor(&parameters, layout)
+                .map(|it| tandem_proto::encode_actor(&it))
         }),
         5 => check(bytes, |episode: pb::Episode| {
             tandem_proto::decode_episode(episode, layout)

@@ -142,7 +142,8 @@ fn write_messages(to: &Path) -> Result<(), AnyError> {
         budget: 500_000,
         strategy: "mc-q:0.1".to_owned(),
     };
-    let progress = pb::Progress { workers: vec![pb::WorkerProgress::default()], ..Default::default() };
+    let progress =
+        pb::Progress { workers: vec![pb::WorkerProgress::default()], ..Default::default() };
     let query = tandem_proto::encode_query(&query());
     let asked = pb::AdviseRequest { account: "run-7".to_owned(), steps: vec![query.clone()] };
     let actor: PublishedActor = sample::trainer(0).publish();
@@ -187,7 +188,11 @@ fn advice() -> StepAdvice {
 }
 
 fn execute_request() -> pb::ExecuteRequest {
-    let sample = pb::JointSample { angles_rad: vec![0.5; 6], velocities_radps: vec![0.0; 6], ..Default::default() };
+    let sample = pb::JointSample {
+        angles_rad: vec![0.5; 6],
+        velocities_radps: vec![0.0; 6],
+        ..Default::default()
+    };
     let arm = pb::ArmMotion { samples: vec![sample] };
     let motion = pb::JointMotion { arms: vec![arm], ..Default::default() };
     let motion = pb::motion_request::Motion::JointMotion(motion);
