@@ -1,5 +1,12 @@
 //! Matrices inside flat slices, and their product.
 
+#[cfg(miri)]
+mod interpreted;
+
+#[cfg(not(miri))]
+use gemm::gemm;
+#[cfg(miri)]
+use interpreted::gemm;
 use pulp::Arch;
 
 /// A matrix that reads from a slice; any strides.
@@ -122,7 +129,7 @@ pub fn multiply(product: &mut MatrixMut<'_>, lhs: Matrix<'_>, rhs: Matrix<'_>) {
     // SAFETY: the constructors checked that the last element of each matrix lies within its slice, the shapes match,
     // and `product` is borrowed mutably, with rows that do not overlap.
     unsafe {
-        gemm::gemm(
+        gemm(
             product.n_rows,
             product.n_cols,
             lhs.n_cols,

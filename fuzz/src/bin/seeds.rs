@@ -1,0 +1,202 @@
+//! Writes the seed inputs of every fuzz target below the directory given on the command line.
+
+use std::collections::BTreeMap;
+use std::fs;
+use std::path::{Path, PathBuf};
+
+// Not called: the instrumentation of the build needs its symbols.
+use libfuzzer_sys as _;
+use mcap::records::{MessageHeader, Record};
+use prost::Message as _;
+use tandem_core::work::{
+    EpisodeOrder, Exploration, PublishedActor, RunTerms, SlotOrder, WorldTerms,
+};
+use tandem_core::{ArmAdvice, EpisodeKind, Layout, StepAdvice, StepQuery, Task};
+use tandem_fuzz::sample;
+use tandem_learner::checkpoint::{self, Resumption};
+use tandem_learner::records::{Judged, Pending};
+use tandem_learner::trainer::Trainer;
+use tandem_proto::pb;
+use tandem_telemetry::MetricsRow;
+
+type AnyError = Box<dyn std::error::Error>;
+
+const LAYOUT: Layout = Layout::new(Task::Push, 1);
+
+fn main() -> Result<(), AnyError> {
+    let seeds = std::env::args_os().nth(1).map(PathBuf::from).ok_or("expected a directory")?;
+    let scratch = tempfile::tempdir()?;
+    for target in ["checkpoint", "policy", "log", "message"] {
+        fs::create_dir_all(seeds.join(target))?;
+    }
+    write_checkpoints(&seeds.join("checkpoint"), scratch.path())?;
+    write_policies(&seeds.join("policy"))?;
+    write_logs(&seeds.join("log"), scratch.path())?;
+    write_messages(&seeds.join("message"))
+}
+
+fn write_checkpoints(to: &Path, scratch: &Path) -> Result<(), AnyError> {
+    for (name, trainer) in [("new", sample::trainer(0)), ("trained", sample::trainer(1))] {
+        let saved = checkpoint::save(scratch, &trainer, &resumption(&trainer), 1)?;
+        fs::rename(saved.path, to.join(name))?;
+    }
+    Ok(())
+}
+
+/// What a run has beside its trainer while an evaluation is under way.
+fn resumption(trainer: &Trainer) -> Resumption {
+    let policy = trainer.policy(BTreeMap::from([("name".to_owned(), "sample".to_owned())]));
+    let row = MetricsRow { round: 1, success_per_arm: vec![0.5], ..MetricsRow::default() };
+    let pending = Pending {
+        counters: trainer.counters(),
+        figures: trainer.figures(),
+        wall_s: 1.5,
+        policy: policy.clone(),
+    };
+    Resumption {
+        acting: trainer.publish(),
+        judged: Judged { rows: vec![row], best: Some(policy.clone()), last: Some(policy) },
+        pending: vec![pending],
+        wall_s: 2.5,
+    }
+}
+
+fn write_policies(to: &Path) -> Result<(), AnyError> {
+    let policy = sample::trainer(0).policy(BTreeMap::new());
+    let path = to.join("with-digest");
+    policy.save(&path)?;
+    // Without a digest, changed numbers are accepted: the fuzzer gets past the checksum.
+    let file = fs::read(&path)?;
+    let entry = format!(r#","digest":"{}""#, policy.digest());
+    fs::write(to.join("without-digest"), without_header_text(&file, &entry)?)?;
+    Ok(())
+}
+
+/// The safetensors `file` without the first `text` in its header.
+fn without_header_text(file: &[u8], text: &str) -> Result<Vec<u8>, AnyError> {
+    let (length, rest) = file.split_first_chunk::<8>().ok_or("expected a header length")?;
+    let (header, tensors) = rest.split_at(usize::try_from(u64::from_le_bytes(*length))?);
+    let shorter = String::from_utf8(header.to_vec())?.replacen(text, "", 1);
+    if shorter.len() == header.len() {
+        return Err(format!("expected {text:?} in the header").into());
+    }
+    let length = (shorter.len() as u64).to_le_bytes();
+    Ok([length.as_slice(), shorter.as_bytes(), tensors].concat())
+}
+
+fn write_logs(to: &Path, scratch: &Path) -> Result<(), AnyError> {
+    let recorded = sample::record_episode(&scratch.join("episode.mcap"))?;
+    let recorded = fs::read(recorded)?;
+    let short = |compression| small_log(&recorded, compression);
+    fs::write(to.join("uncompressed"), short(None)?)?;
+    fs::write(to.join("zstd"), short(Some(mcap::Compression::Zstd))?)?;
+    fs::write(to.join("lz4"), short(Some(mcap::Compression::Lz4))?)?;
+    let whole = short(None)?;
+    fs::write(to.join("cut-short"), &whole[..whole.len() / 2])?;
+    Ok(())
+}
+
+/// A log with the transitions, outcome and metadata of `log` only, without schemas and with no metadata checksum.
+fn small_log(log: &[u8], compression: Option<mcap::Compression>) -> Result<Vec<u8>, AnyError> {
+    let options = mcap::WriteOptions::new().compression(compression).compression_threads(0);
+    let mut writer = options.create(std::io::Cursor::new(Vec::new()))?;
+    let mut channels = BTreeMap::new();
+    for record in mcap::read::ChunkFlattener::new(log)? {
+        match record? {
+            Record::Metadata(mut metadata) => {
+                metadata.metadata.remove("checksum");
+                writer.write_metadata(&metadata)?;
+            }
+            Record::Channel(channel)
+                if matches!(channel.topic.as_str(), "/transition" | "/outcome") =>
+            {
+                let id = writer.add_channel(0, &channel.topic, "protobuf", &BTreeMap::new())?;
+                channels.insert(channel.id, id);
+            }
+            Record::Message { header, data } => {
+                if let Some(channel_id) = channels.get(&header.channel_id) {
+                    let header = MessageHeader { channel_id: *channel_id, ..header };
+                    writer.write_to_known_channel(&header, &data)?;
+                }
+            }
+            Record::DataEnd(_) => break,
+            _ => {}
+        }
+    }
+    writer.finish()?;
+    Ok(writer.into_inner().into_inner())
+}
+
+fn write_messages(to: &Path) -> Result<(), AnyError> {
+    let terms = RunTerms {
+        layout: LAYOUT,
+        account: Some("run-7".to_owned()),
+        exploration: Exploration { noise_std: 0.2, random_share: 0.3, random_hold_mean_steps: 4.0 },
+        world: WorldTerms { gripped_start_share: 0.0, wide_start_share: 1.0, substeps: 20 },
+    };
+    let order = EpisodeOrder { number: 64, seed: 42, advised: true, uniform: false, record: true };
+    let kind = EpisodeKind::Evaluation;
+    let slot = SlotOrder { slot: 3, parameter_version: 9, kind, episodes: vec![order] };
+    let account = pb::OpenAccountRequest {
+        name: "run-7".to_owned(),
+        budget: 500_000,
+        strategy: "mc-q:0.1".to_owned(),
+    };
+    let progress =
+        pb::Progress { workers: vec![pb::WorkerProgress::default()], ..Default::default() };
+    let query = tandem_proto::encode_query(&query());
+    let asked = pb::AdviseRequest { account: "run-7".to_owned(), steps: vec![query.clone()] };
+    let actor: PublishedActor = sample::trainer(0).publish();
+    let seeds = [
+        ("query", query.encode_to_vec()),
+        ("advice", tandem_proto::encode_advice(&advice()).encode_to_vec()),
+        ("terms", tandem_proto::encode_terms(&terms).encode_to_vec()),
+        ("slot", tandem_proto::encode_slot(&slot).encode_to_vec()),
+        ("parameters", tandem_proto::encode_actor(&actor).encode_to_vec()),
+        ("episode", tandem_proto::encode_episode(&sample::episode(7)).encode_to_vec()),
+        ("account", account.encode_to_vec()),
+        ("progress", progress.encode_to_vec()),
+        ("execute", execute_request().encode_to_vec()),
+        ("advise", asked.encode_to_vec()),
+    ];
+    for (message, (name, bytes)) in (0_u8..).zip(seeds) {
+        fs::write(to.join(name), [&[message, 0], bytes.as_slice()].concat())?;
+    }
+    Ok(())
+}
+
+fn query() -> StepQuery {
+    StepQuery {
+        episode: 300,
+        step: 7,
+        observation: vec![0.25; LAYOUT.n_observation()],
+        goal: vec![0.5; LAYOUT.n_goal()],
+        proposed_action: vec![-1.0; LAYOUT.n_action()],
+    }
+}
+
+fn advice() -> StepAdvice {
+    let arm = ArmAdvice {
+        teacher_action: vec![0.5; LAYOUT.n_action()],
+        q_teacher: -1.5,
+        q_student: -2.0,
+        importance: 0.5,
+        distance: 0.75,
+        overridden: true,
+    };
+    StepAdvice { action: vec![0.5; LAYOUT.n_action()], charged: true, arms: vec![arm] }
+}
+
+fn execute_request() -> pb::ExecuteRequest {
+    let sample = pb::JointSample {
+        angles_rad: vec![0.5; 6],
+        velocities_radps: vec![0.0; 6],
+        ..Default::default()
+    };
+    let arm = pb::ArmMotion { samples: vec![sample] };
+    let motion = pb::JointMotion { arms: vec![arm], ..Default::default() };
+    let motion = pb::motion_request::Motion::JointMotion(motion);
+    let motion = pb::MotionRequest { motion: Some(motion), ..Default::default() };
+    let start = pb::ExecuteStart { motion: Some(motion), ..Default::default() };
+    pb::ExecuteRequest { request: Some(pb::execute_request::Request::Start(start)) }
+}

@@ -1,0 +1,129 @@
+//! Files and messages that earlier versions wrote are still read. `tests/corpus/README.md` lists them.
+
+mod messages;
+mod run;
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use serde_json::Value;
+use tandem_core::{Layout, Task};
+use tandem_policy::Policy;
+use tandem_report::Run;
+use tandem_teacher::budget::Wish;
+use tandem_teacher::ledger::{Bill, Charge, Ledger as _, SqliteLedger};
+use tandem_telemetry::{read_episode, read_trials, recover};
+use tempfile::TempDir;
+
+/// The directories of the corpus, one a version.
+fn versions() -> Vec<PathBuf> {
+    let corpus = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/corpus");
+    let entries = fs::read_dir(corpus).expect("the corpus is there");
+    let mut versions: Vec<PathBuf> = entries.map(|entry| entry.expect("readable").path()).collect();
+    versions.retain(|path| path.is_dir());
+    versions.sort();
+    assert!(versions.iter().any(|version| version.ends_with("v0.1")), "no corpus of version 0.1");
+    versions
+}
+
+fn json(path: &Path) -> Value {
+    serde_json::from_slice(&fs::read(path).expect("readable")).expect("JSON")
+}
+
+/// A copy of the corpus's `file`, for what is opened to be written.
+fn copy(file: &Path) -> (TempDir, PathBuf) {
+    let directory = tempfile::tempdir().expect("a directory");
+    let path = directory.path().join(file.file_name().expect("a file"));
+    fs::copy(file, &path).expect("copied");
+    (directory, path)
+}
+
+#[test]
+fn policies_are_read() {
+    for version in versions() {
+        for (task, n_arms) in Task::ALL.into_iter().flat_map(|task| [(task, 1), (task, 2)]) {
+            let path = version.join(format!("policies/{task}-{n_arms}.safetensors"));
+            let policy = Policy::load(&path).expect("a policy");
+            assert_eq!(policy.layout, Layout::new(task, n_arms), "{path:?}");
+            assert_eq!((policy.n_hidden, policy.n_hidden_layers), (8, 1), "{path:?}");
+            let mut action = vec![f32::NAN; policy.layout.n_action()];
+            let observation = vec![0.1; policy.layout.n_observation()];
+            let mut actor = policy.actor().expect("usable");
+            actor.act(&observation, &vec![0.2; policy.layout.n_goal()], &mut action);
+            assert!(action.iter().all(|x| x.abs() <= 1.0), "{path:?} acts {action:?}");
+        }
+    }
+}
+
+#[test]
+fn a_ledger_keeps_its_accounts_leases_and_verdicts() {
+    for version in versions() {
+        let (_directory, path) = copy(&version.join("ledger.sqlite"));
+        let mut ledger = SqliteLedger::open(&path).expect("a ledger");
+        let mut balance = |name: &str| {
+            let balance = ledger.balance(name).expect("an account");
+            (balance.terms.strategy.to_string(), balance.spent, balance.leased, balance.left)
+        };
+        assert_eq!(balance("unleased"), ("mc-q:0.1".to_owned(), 10, 0, 0));
+        assert_eq!(balance("leased"), ("eamc:0.25".to_owned(), 25, 45, 930));
+        // A step that was charged is not charged again; the next one is charged to the open lease.
+        let wish = Wish { first: true, second: true };
+        let charge = |step| Charge { episode: 1, step, wish };
+        let bill = Bill { account: "leased".to_owned(), charges: vec![charge(4), charge(5)] };
+        ledger.charge(&[bill]).remove(0).expect("charged");
+        let balance = ledger.balance("leased").expect("an account");
+        assert_eq!((balance.spent, balance.leased, balance.left), (26, 44, 930));
+    }
+}
+
+#[test]
+fn an_episode_log_is_read() {
+    for version in versions() {
+        let log = read_episode(&version.join("episode.mcap")).expect("an episode");
+        let layout = Layout::new(Task::Push, 2);
+        assert_eq!((log.metadata.layout, log.metadata.parameter_version), (layout, 6));
+        assert_eq!(log.metadata.world.get("substeps").map(String::as_str), Some("10"));
+        assert_eq!(log.transitions.len(), 50);
+        assert!(log.transitions.iter().all(|step| step.observation.len() == 56));
+        assert_eq!(log.last_observation.map(|observation| observation.len()), Some(56));
+    }
+}
+
+#[test]
+fn a_log_that_was_cut_short_is_recovered() {
+    for version in versions() {
+        let directory = tempfile::tempdir().expect("a directory");
+        let recovered = directory.path().join("recovered.mcap");
+        let counts = recover(&version.join("cut-short.mcap"), &recovered).expect("recovered");
+        assert!(counts.ended_by.is_some() && counts.messages > 0, "{counts:?}");
+        let log = read_episode(&recovered).expect("an episode");
+        let whole = read_episode(&version.join("episode.mcap")).expect("an episode");
+        assert_eq!(log.metadata, whole.metadata);
+        assert_eq!(log.transitions, whole.transitions[..log.transitions.len()]);
+    }
+}
+
+#[test]
+fn trials_are_read() {
+    for version in versions() {
+        let rows = read_trials(&version.join("trials.jsonl")).expect("trials");
+        let [row] = rows.as_slice() else { panic!("expected one trial, got {}", rows.len()) };
+        assert_eq!((row.mode.as_str(), row.trial, row.success), ("closed-loop", 0, true));
+        let directory = tempfile::tempdir().expect("a directory");
+        let copy = recover(&version.join("trial.mcap"), &directory.path().join("copy.mcap"));
+        let copy = copy.expect("readable");
+        assert_eq!((copy.ended_by.as_deref(), copy.metadata_records), (None, 2));
+    }
+}
+
+#[test]
+fn a_run_directory_can_be_reported_on() {
+    for version in versions() {
+        let mut warnings = Vec::new();
+        let run = Run::load(&version.join("run"), &mut warnings).expect("a run");
+        assert!(warnings.is_empty(), "{warnings:?}");
+        let env_steps: Vec<u64> = run.rows.iter().map(|row| row.env_steps).collect();
+        assert_eq!(env_steps, [200, 400, 600]);
+        assert!(run.configuration.is_some_and(|toml| toml.contains("strategy = \"ea\"")));
+    }
+}
