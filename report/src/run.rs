@@ -422,7 +422,10 @@ mod tests {
         let file = dir.path().join("metrics.jsonl");
         for content in ["", "\u{1b}[31mred\n"] {
             write(&file, content);
-            assert!(matches!(find(&[file.clone()]), Err(Error::NoRow { .. })), "{content:?}");
+            assert!(
+                matches!(find(std::slice::from_ref(&file)), Err(Error::NoRow { .. })),
+                "{content:?}"
+            );
             assert!(find(&[dir.path().to_owned()]).unwrap().runs[0].rows.is_empty());
         }
     }
