@@ -71,7 +71,7 @@ fn an_arm_that_drifts_towards_itself_is_stopped_before_it_touches() {
         let mut rig = Rig::ready(&near, SimulatedConfig::default());
         rig.executor.start(OWNER, near, 1.0, rig.now_s).unwrap();
         let least_m = RefCell::new(f64::INFINITY);
-        let mut tick = |rig: &mut Rig| {
+        let tick = |rig: &mut Rig| {
             let phase = rig.tick_owned();
             let pair = rig.pair.borrow();
             assert!(!pair.touches_itself(ArmIndex(0)), "joint {joint}");
