@@ -84,7 +84,7 @@ impl LedgerFile {
     pub(super) fn open(path: &Path) -> Result<(Self, Vec<StoredAccount>), OpenError> {
         let mut hold = Hold::take(path)?;
         let flags = OpenFlags::SQLITE_OPEN_READ_WRITE | OpenFlags::SQLITE_OPEN_NO_MUTEX;
-        let refused = |error| refused(path, error);
+        let refused = |error| refused(path, &error);
         let mut connection =
             Connection::open_with_flags(hold.resolved(), flags).map_err(refused)?;
         let version = prepare(&mut connection, path)?;
@@ -212,7 +212,7 @@ impl LedgerFile {
 
 /// Checks that the file is a sound ledger, or makes it one when it is empty, and gives its version.
 fn prepare(connection: &mut Connection, path: &Path) -> Result<i64, OpenError> {
-    let refused = |error| refused(path, error);
+    let refused = |error| refused(path, &error);
     connection.busy_timeout(BUSY_TIMEOUT).map_err(refused)?;
     let header = |name| connection.pragma_query_value(None, name, |row| row.get::<_, i64>(0));
     let application_id = header("application_id").map_err(refused)?;
@@ -257,7 +257,7 @@ fn check(connection: &Connection, path: &Path) -> Result<(), OpenError> {
     match verdict {
         Ok(verdict) if verdict == "ok" => Ok(()),
         Ok(what) => Err(OpenError::Damaged { path: path.to_owned(), what: printable(&what) }),
-        Err(error) => Err(refused(path, error)),
+        Err(error) => Err(refused(path, &error)),
     }
 }
 
@@ -286,7 +286,7 @@ fn load(
     version: i64,
     path: &Path,
 ) -> Result<Vec<StoredAccount>, OpenError> {
-    let refused = |error| refused(path, error);
+    let refused = |error| refused(path, &error);
     let damaged = |what: String| OpenError::Damaged { path: path.to_owned(), what };
     let mut leases = by_account(read_leases(connection).map_err(refused)?);
     let mut words = by_account(read_words(connection).map_err(refused)?);
@@ -337,7 +337,7 @@ fn by_account<T>(rows: Vec<(i64, T)>) -> BTreeMap<i64, Vec<T>> {
 }
 
 /// What an error of SQLite's means for somebody who opens a ledger.
-fn refused(path: &Path, error: rusqlite::Error) -> OpenError {
+fn refused(path: &Path, error: &rusqlite::Error) -> OpenError {
     use ErrorCode as E;
     let (path, what) = (path.to_owned(), printable(&error.to_string()));
     match error.sqlite_error_code() {

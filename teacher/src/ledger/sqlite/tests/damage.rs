@@ -24,7 +24,10 @@ fn small_ledger(path: &Path) -> Vec<u8> {
     ledger.settle("run", &[0, 1, 2, 3]).unwrap();
     drop(ledger);
     let connection = Connection::open(path).unwrap();
-    let sql = format!("PRAGMA journal_mode = DELETE; PRAGMA page_size = {PAGE_BYTES}; VACUUM;");
+    let sql = format!(
+        "PRAGMA journal_mode = DELETE; PRAGMA page_size = {PAGE_BYTES}; VACUUM;
+        PRAGMA journal_mode = WAL;"
+    );
     connection.execute_batch(&sql).unwrap();
     drop(connection);
     fs::read(path).unwrap()
@@ -62,12 +65,23 @@ fn start(path: &Path, bytes: &[u8], expected: &str) -> Outcome {
 
 #[test]
 fn a_flipped_bit_is_refused_or_changes_nothing() {
+    check_flips(7);
+}
+
+#[test]
+#[ignore = "takes minutes"]
+fn every_flipped_bit_is_refused_or_changes_nothing() {
+    check_flips(1);
+}
+
+/// Flips one bit in `stride`, one after the other.
+fn check_flips(stride: usize) {
     let directory = tempfile::tempdir().unwrap();
     let path = directory.path().join("ledger.sqlite");
     let mut bytes = small_ledger(&path);
     let expected = accounts(&SqliteLedger::open(&path).unwrap());
     let (mut n_believed, mut n_refused, mut wrong) = (0, 0, Vec::new());
-    for place in 0..bytes.len() * 8 {
+    for place in (0..bytes.len() * 8).step_by(stride) {
         let (byte, bit) = (place / 8, place % 8);
         bytes[byte] ^= 1 << bit;
         match start(&path, &bytes, &expected) {
@@ -81,5 +95,6 @@ fn a_flipped_bit_is_refused_or_changes_nothing() {
         bytes[byte] ^= 1 << bit;
     }
     assert!(wrong.is_empty(), "{} flips: {:#?}", wrong.len(), &wrong[..wrong.len().min(20)]);
-    assert!(n_refused > 10_000, "{n_refused} of {} refused", n_refused + n_believed);
+    println!("{n_believed} flips believed, {n_refused} refused");
+    assert!(n_refused > n_believed / 10, "{n_believed} flips believed, {n_refused} refused");
 }
