@@ -1,4 +1,5 @@
-//! The program's budget under fire: teachers that are killed while many clients ask.
+//! The program's budget under fire: teachers that are killed while many clients ask, ledgers that are taken away, and
+//! second teachers on the same ledger.
 
 use std::collections::BTreeMap;
 use std::io::{BufRead as _, BufReader, Read as _, Write as _};
@@ -58,6 +59,24 @@ impl Teacher {
         self.process.kill().expect("killed");
         self.process.wait().expect("gone");
     }
+}
+
+/// The exit code and the one line of a teacher that does not start on `ledger`.
+fn refusal(ledger: &Path) -> (Option<i32>, String) {
+    let policy = Path::new(env!("CARGO_MANIFEST_DIR")).join("policies/teacher-push.safetensors");
+    let output = Command::new(env!("CARGO_BIN_EXE_tandem"))
+        .args(["--log", "warn", "teacher", "--listen", "127.0.0.1:0", "--exit-with-stdin"])
+        .arg("--ledger")
+        .arg(ledger)
+        .arg("--policy")
+        .arg(policy)
+        .stdin(Stdio::null())
+        .output()
+        .expect("ran");
+    let told = String::from_utf8(output.stderr).expect("UTF-8");
+    assert_eq!(told.matches('\n').count(), 1, "{told:?}");
+    assert!(!told.trim_end().contains(char::is_control), "{told:?}");
+    (output.status.code(), told)
 }
 
 impl Drop for Teacher {
@@ -263,6 +282,111 @@ fn ten_thousand_units_are_charged_once_while_the_teacher_is_killed_fifty_times()
     teacher.kill();
     let teacher = Teacher::start(ledger, &address);
     check_sums(&runtime, JoinSet::new(), &teacher.address, &told, BUDGET);
+}
+
+/// Asks once about `steps` of episode 1; gives which were charged.
+fn ask_once(
+    runtime: &Runtime,
+    address: &str,
+    steps: std::ops::Range<u32>,
+) -> Result<Vec<bool>, tonic::Status> {
+    let steps = steps.map(|step| query(1, step)).collect();
+    let request = pb::AdviseRequest { account: ACCOUNT.to_owned(), steps };
+    let address = format!("http://{address}");
+    let answer = runtime.block_on(async {
+        TeacherClient::connect(address).await.expect("connected").advise(request).await
+    })?;
+    Ok(answer.into_inner().steps.iter().map(|step| step.charged).collect())
+}
+
+#[test]
+fn a_second_teacher_on_one_file_is_refused_whatever_is_deleted_or_linked() {
+    let directory = tempfile::tempdir().expect("a directory");
+    let beside = |name: &str| directory.path().join(name);
+    let ledger = beside("ledger.sqlite");
+    let ledger = ledger.to_str().expect("UTF-8");
+    let mut teacher = Teacher::start(ledger, "127.0.0.1:0");
+    let runtime = runtime();
+    open_account(&runtime, &teacher.address, 10);
+    assert_eq!(ask_once(&runtime, &teacher.address, 0..6).expect("charged"), [true; 6]);
+
+    let (link, twin) = (beside("link.sqlite"), beside("twin.sqlite"));
+    std::os::unix::fs::symlink(ledger, &link).expect("a link");
+    std::fs::hard_link(ledger, &twin).expect("a link");
+    let is_in_use = |path: &Path| {
+        let (code, told) = refusal(path);
+        assert!(told.contains("another teacher uses the ledger"), "{told}");
+        assert_eq!(code, Some(75), "{told}");
+    };
+    for deleted in ["ledger.sqlite.lock", "ledger.sqlite-shm", "ledger.sqlite-wal"] {
+        drop(std::fs::remove_file(beside(deleted)));
+        for path in [Path::new(ledger), &link, &twin] {
+            is_in_use(path);
+        }
+    }
+
+    // The log is gone: what it had is rescued, and nothing is charged that might be lost.
+    let refused = ask_once(&runtime, &teacher.address, 6..8).expect_err("refused");
+    assert_eq!(refused.code(), Code::Unavailable, "{refused}");
+    assert!(refused.message().contains("-wal file was deleted"), "{refused}");
+    assert_eq!(ask_once(&runtime, &teacher.address, 0..6).expect("known"), [true; 6]);
+    teacher.kill();
+    for path in [Path::new(ledger), &twin] {
+        let (code, told) = refusal(path);
+        assert!(told.contains("the file has 2 names (hard links)"), "{told}");
+        assert_eq!(code, Some(64), "{told}");
+    }
+    std::fs::remove_file(twin).expect("removed");
+    let teacher = Teacher::start(link.to_str().expect("UTF-8"), "127.0.0.1:0");
+    let charged = ask_once(&runtime, &teacher.address, 0..20).expect("charged");
+    assert_eq!(charged, [[true; 10], [false; 10]].concat());
+}
+
+#[test]
+fn a_teacher_charges_nothing_to_a_ledger_that_was_deleted() {
+    let directory = tempfile::tempdir().expect("a directory");
+    let ledger = directory.path().join("ledger.sqlite");
+    let teacher = Teacher::start(ledger.to_str().expect("UTF-8"), "127.0.0.1:0");
+    let runtime = runtime();
+    open_account(&runtime, &teacher.address, 10);
+    assert_eq!(ask_once(&runtime, &teacher.address, 0..6).expect("charged"), [true; 6]);
+    for suffix in ["", "-wal", "-shm"] {
+        let name = format!("ledger.sqlite{suffix}");
+        std::fs::remove_file(directory.path().join(name)).expect("removed");
+    }
+    let second = Teacher::start(ledger.to_str().expect("UTF-8"), "127.0.0.1:0");
+    open_account(&runtime, &second.address, 10);
+    for _ in 0..2 {
+        let refused = ask_once(&runtime, &teacher.address, 6..8).expect_err("refused");
+        assert_eq!(refused.code(), Code::Unavailable, "{refused}");
+        let told = "the file was deleted, moved or replaced while in use";
+        assert!(refused.message().contains(told), "{refused}");
+    }
+    let charged = ask_once(&runtime, &second.address, 0..20).expect("charged");
+    assert_eq!(charged, [[true; 10], [false; 10]].concat());
+}
+
+#[test]
+fn a_ledger_that_cannot_be_opened_is_refused_with_a_code_that_says_whether_to_try_again() {
+    let directory = tempfile::tempdir().expect("a directory");
+    let check = |path: &Path, expected_code: i32, expected: &str| {
+        let (code, told) = refusal(path);
+        assert!(told.contains(expected), "{told}");
+        assert_eq!(code, Some(expected_code), "{told}");
+    };
+    check(directory.path(), 64, "it is a directory");
+    check(Path::new("/dev/null"), 64, "it is not a regular file");
+    check(&directory.path().join("none/ledger.sqlite"), 64, "there is no directory");
+    let text = directory.path().join("text");
+    std::fs::write(&text, "a shopping list").expect("written");
+    check(&text, 65, "is no ledger");
+    let damaged = directory.path().join("damaged.sqlite");
+    drop(Teacher::start(damaged.to_str().expect("UTF-8"), "127.0.0.1:0"));
+    let sql = "INSERT INTO accounts VALUES (1, char(27) || '[31m' || char(10), 10, 'ea', 0, 0)";
+    let other = rusqlite::Connection::open(&damaged).expect("a database");
+    other.execute_batch(sql).expect(sql);
+    drop(other);
+    check(&damaged, 65, "its rows do not match its checksum");
 }
 
 #[test]

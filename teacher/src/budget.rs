@@ -9,7 +9,7 @@ mod account;
 mod verdicts;
 
 pub use account::Account;
-pub(crate) use account::{Changes, LeaseRecord};
+pub(crate) use account::{Changes, Checksum, LeaseRecord};
 pub(crate) use verdicts::{Word, WordIndex};
 
 use crate::strategy::Strategy;

@@ -114,11 +114,19 @@ pub enum OpenError {
         "expected memory, redis://[USER:PASSWORD@]HOST[:PORT][/DB] or a file as the ledger: {0}"
     )]
     NotAPlace(String),
-    /// Another process has the file open.
+    /// Another ledger has the file open, in another process or in this one. It may be free a moment later.
     #[error(
         "another teacher uses the ledger {0:?}: end that one, or give this one a ledger of its own"
     )]
     InUse(PathBuf),
+    /// No ledger can be kept under this name.
+    #[error("cannot keep a ledger at {path:?}: {what}")]
+    BadPath {
+        /// The name.
+        path: PathBuf,
+        /// What is wrong with it.
+        what: String,
+    },
     /// The file cannot be read or written.
     #[error("cannot open the ledger {path:?}")]
     Io {
@@ -137,15 +145,15 @@ pub enum OpenError {
     },
     /// Another version of this program made the file.
     #[error(
-        "the ledger {path:?} has version {found}, this program reads version {expected}: use the program that wrote it, or name another file"
+        "the ledger {path:?} has version {found}, this program reads versions 1 to {newest}: use the program that wrote it, or name another file"
     )]
     Version {
         /// The file.
         path: PathBuf,
         /// Its version.
         found: i64,
-        /// The version that can be read.
-        expected: i64,
+        /// The newest version that can be read.
+        newest: i64,
     },
     /// The file was a ledger.
     #[error(
@@ -236,5 +244,20 @@ fn is_beyond_episode(step: u32) -> bool {
 
 /// What an error's source adds to its message.
 fn because(source: Option<&(dyn std::error::Error + Send + Sync)>) -> String {
-    source.map(|source| format!(": {source}")).unwrap_or_default()
+    source.map(|source| format!(": {}", printable(&source.to_string()))).unwrap_or_default()
+}
+
+/// Characters of a foreign text that are shown.
+const MAX_SHOWN_CHARS: usize = 300;
+
+/// The beginning of a text that comes from a file or a server, on one line and without control characters.
+fn printable(text: &str) -> String {
+    let mut shown = String::new();
+    for character in text.chars().take(MAX_SHOWN_CHARS) {
+        match character {
+            '"' | '\'' | '\\' => shown.push(character),
+            _ => shown.extend(character.escape_debug()),
+        }
+    }
+    shown
 }

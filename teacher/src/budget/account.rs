@@ -1,5 +1,6 @@
 //! One account: what is left of its budget, for whom units are set aside, and which steps were charged.
 
+mod checksum;
 mod journal;
 
 use std::collections::BTreeMap;
@@ -8,6 +9,7 @@ use super::verdicts::{Verdicts, index};
 use super::{Balance, Half, Lease, Terms, Verdict, Wish};
 use journal::Journal;
 
+pub(crate) use checksum::Checksum;
 pub(crate) use journal::{Changes, LeaseRecord};
 
 /// One budget and everything that was charged to it.

@@ -13,7 +13,7 @@ mod server;
 
 use super::{
     Bill, Charge, Ledger, LedgerError, OpenError, Receipt, check_budget, check_terms,
-    is_beyond_episode, unknown_account,
+    is_beyond_episode, printable, unknown_account,
 };
 use crate::budget::{Balance, Half, Lease, Terms, Verdict};
 use crate::strategy::UnknownStrategy;
@@ -37,7 +37,7 @@ impl RedisLedger {
         let mut server = Server::at(url)?;
         let refused = |server: &Server, source: redis::RedisError| OpenError::Server {
             server: server.name().to_owned(),
-            source: Box::new(source),
+            source: printable(&source.to_string()).into(),
         };
         let survey = server.survey().map_err(|error| refused(&server, error))?;
         tracing::info!(ledger = server.name(), accounts = survey.n_accounts, "ledger opened");

@@ -12,10 +12,16 @@
 //! - Episodes without a lease: what was forgotten is charged anew when it is asked about again, and may then get
 //!   another verdict; if it is not asked about again, so much more than the budget is spent.
 //!
-//! Everything can be looked at with the `sqlite3` tool while the teacher runs, but not changed: this process would not
-//! see it.
+//! The file can be read with the `sqlite3` tool while the teacher runs. It must not be changed, at any time: each
+//! account has a checksum over its rows, and a ledger with another one is refused as damaged.
+//!
+//! One process at a time has the file, by whichever path. The lock is on the file itself: other files, such as the
+//! `.lock` file that earlier versions left beside it, have no part in it. A file with several names (hard links) is
+//! refused. After every transaction the path must still lead to the file, else nothing more is charged.
 
 mod file;
+mod hold;
+mod rows;
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
@@ -24,8 +30,8 @@ use super::{
     Bill, Ledger, LedgerError, OpenError, Receipt, charge_all, check_budget, check_terms,
     unknown_account,
 };
-use crate::budget::{Account, Balance, Lease, Terms};
-use file::{Durability, LedgerFile};
+use crate::budget::{Account, Balance, Checksum, Lease, Terms};
+use file::{AccountChanges, Durability, LedgerFile, StoredAccount, WriteError};
 
 /// Accounts in an SQLite file.
 #[derive(Debug)]
@@ -34,10 +40,11 @@ pub struct SqliteLedger {
     accounts: BTreeMap<String, Kept>,
 }
 
-/// An account and its number in the file.
+/// An account, and its number and checksum in the file.
 #[derive(Debug)]
 struct Kept {
     id: i64,
+    checksum: Checksum,
     account: Account,
 }
 
@@ -47,10 +54,12 @@ impl SqliteLedger {
     /// # Errors
     /// When another process has it open, when it cannot be read or written, or is not a sound ledger of this version.
     pub fn open(path: &Path) -> Result<Self, OpenError> {
-        let mut file = LedgerFile::open(path)?;
-        let accounts = file.load()?;
-        tracing::info!(ledger = %path.display(), accounts = accounts.len(), "ledger opened");
-        let accounts = accounts.into_iter().map(|(name, id, account)| (name, Kept { id, account }));
+        let (file, accounts) = LedgerFile::open(path)?;
+        tracing::info!(ledger = ?path, accounts = accounts.len(), "ledger opened");
+        let accounts = accounts.into_iter().map(|stored| {
+            let StoredAccount { id, name, checksum, account } = stored;
+            (name, Kept { id, checksum, account })
+        });
         Ok(Self { file, accounts: accounts.collect() })
     }
 
@@ -60,21 +69,18 @@ impl SqliteLedger {
     }
 
     /// Writes what changed in the accounts called `names`; when that fails, nothing has changed.
-    fn commit(
-        &mut self,
-        names: &BTreeSet<&str>,
-        durability: Durability,
-    ) -> Result<(), rusqlite::Error> {
+    fn commit(&mut self, names: &BTreeSet<&str>, durability: Durability) -> Result<(), WriteError> {
         let accounts = &self.accounts;
-        let changed = names.iter().filter_map(|name| accounts.get(*name));
-        let changes = changed.map(|kept| (kept.id, kept.account.recorded()));
-        let changes: Vec<_> = changes.filter(|(_, changes)| !changes.is_empty()).collect();
+        let changed = names.iter().filter_map(|name| accounts.get(*name)).map(Kept::changes);
+        let changed: Vec<_> = changed.filter(|changed| !changed.changes.is_empty()).collect();
         let written =
-            if changes.is_empty() { Ok(()) } else { self.file.write(&changes, durability) };
+            if changed.is_empty() { Ok(()) } else { self.file.write(&changed, durability) };
+        let checksums: BTreeMap<i64, Checksum> =
+            changed.iter().map(|changed| (changed.id, changed.checksum)).collect();
         for name in names {
             if let Some(kept) = self.accounts.get_mut(*name) {
                 match written {
-                    Ok(()) => kept.account.keep(),
+                    Ok(()) => kept.keep(checksums.get(&kept.id)),
                     Err(_) => kept.account.undo(),
                 }
             }
@@ -103,6 +109,21 @@ impl SqliteLedger {
     }
 }
 
+impl Kept {
+    /// What has changed since the last transaction.
+    fn changes(&self) -> AccountChanges {
+        let changes = self.account.recorded();
+        let checksum = self.checksum + changes.checksum;
+        AccountChanges { id: self.id, changes, checksum }
+    }
+
+    /// Notes that the changes are written, and with which checksum.
+    fn keep(&mut self, written: Option<&Checksum>) {
+        self.account.keep();
+        self.checksum = written.copied().unwrap_or(self.checksum);
+    }
+}
+
 impl Ledger for SqliteLedger {
     fn open(&mut self, name: &str, terms: Terms) -> Result<Balance, LedgerError> {
         check_budget(terms)?;
@@ -110,10 +131,12 @@ impl Ledger for SqliteLedger {
             check_terms(name, kept.account.terms(), terms)?;
             return Ok(kept.account.balance());
         }
-        let id = self.file.add_account(name, terms).map_err(|error| self.unavailable(error))?;
+        let checksum = Checksum::of_terms(name, terms);
+        let added = self.file.add_account(name, terms, checksum);
+        let id = added.map_err(|error| self.unavailable(error))?;
         let account = Account::new(terms);
         let balance = account.balance();
-        self.accounts.insert(name.to_owned(), Kept { id, account });
+        self.accounts.insert(name.to_owned(), Kept { id, checksum, account });
         Ok(balance)
     }
 

@@ -36,20 +36,6 @@ fn refusal(path: &Path) -> String {
 }
 
 #[test]
-fn a_file_has_one_owner_at_a_time() {
-    let (directory, path) = directory();
-    let first = SqliteLedger::open(&path).expect("a ledger");
-    let in_use =
-        "another teacher uses the ledger FILE: end that one, or give this one a ledger of its own";
-    assert_eq!(refusal(&path), in_use);
-    let link = directory.path().join("link.sqlite");
-    std::os::unix::fs::symlink(&path, &link).expect("a link");
-    assert_eq!(refusal(&link), in_use, "by another name");
-    drop(first);
-    SqliteLedger::open(&link).expect("free again");
-}
-
-#[test]
 fn a_file_that_is_no_ledger_is_refused_and_left_alone() {
     let check = |bytes: &[u8]| {
         let (_directory, path) = directory();
@@ -78,11 +64,11 @@ fn another_version_is_refused_by_its_number() {
     let (_directory, path) = directory();
     filled(&path);
     let other = Connection::open(&path).expect("a database");
-    other.pragma_update(None, "user_version", 2).expect("another version");
+    other.pragma_update(None, "user_version", 3).expect("another version");
     drop(other);
     let told = refusal(&path);
     assert!(
-        told.starts_with("the ledger FILE has version 2, this program reads version 1: "),
+        told.starts_with("the ledger FILE has version 3, this program reads versions 1 to 2: "),
         "{told}"
     );
 }
@@ -144,17 +130,75 @@ fn tables_that_contradict_one_another_are_damage() {
 }
 
 #[test]
+fn a_checksum_covers_what_the_tables_cannot_contradict() {
+    let check = |sql: &str| {
+        let (_directory, path) = directory();
+        filled(&path);
+        let other = Connection::open(&path).expect("a database");
+        other.execute_batch(sql).expect(sql);
+        drop(other);
+        let told = refusal(&path);
+        let expected = "account \"run\": its rows do not match its checksum";
+        assert!(told.contains(expected), "{sql}: {told}");
+    };
+    check("UPDATE accounts SET budget = 10001");
+    check("UPDATE accounts SET strategy = 'ea'");
+    check("UPDATE accounts SET checksum = checksum + 1");
+    check("UPDATE verdicts SET asked = asked | 256 WHERE episode = 5");
+    check("UPDATE verdicts SET first_half = 0 WHERE episode = 5");
+    check("UPDATE verdicts SET word = 1 WHERE episode = 5");
+    check("INSERT INTO verdicts VALUES (1, 601, 0, 1, 0, 0)");
+    check("UPDATE leases SET settled = 1 WHERE episode = 5");
+    check("UPDATE leases SET early_units = 9 WHERE episode = 5");
+    check("DELETE FROM leases WHERE episode = 5");
+    check(
+        "PRAGMA foreign_keys = OFF; UPDATE verdicts SET episode = 700 WHERE episode = 5;
+        UPDATE leases SET episode = 700 WHERE episode = 5",
+    );
+}
+
+/// Bytes of a damaged file must not reach a terminal as they are, nor break the one line.
+#[test]
+fn a_refusal_has_no_control_characters_of_the_file() {
+    let check = |sql: &str, expected: &str| {
+        let (_directory, path) = directory();
+        filled(&path);
+        let other = Connection::open(&path).expect("a database");
+        other.execute_batch(sql).expect(sql);
+        drop(other);
+        let told = refusal(&path);
+        assert!(told.contains(expected) && !told.contains(char::is_control), "{sql}: {told:?}");
+    };
+    check(
+        "UPDATE accounts SET name = 'a' || char(27) || '[31m' || char(10, 13, 133, 8238), spent = 1",
+        "account \"a\\u{1b}[31m\\n\\r\\u{85}\\u{202e}\" has spent 1",
+    );
+    check("UPDATE accounts SET strategy = char(27, 10)", "\\u{1b}\\n");
+    check(
+        "PRAGMA writable_schema = ON; UPDATE sqlite_schema SET sql = 'CREATE ' || char(27, 10)",
+        "malformed database schema",
+    );
+}
+
+#[test]
 fn a_place_where_no_file_can_be_is_refused() {
     let (directory, path) = directory();
-    let told = refusal(&path.join("below"));
-    assert_eq!(
-        told,
-        "cannot open the ledger FILE.lock"
-            .replace("FILE", &format!("{:?}", path.join("below")))
-            .replace("\".lock", ".lock\"")
-    );
-    let told = refusal(directory.path());
-    assert!(told.starts_with("cannot open the ledger"), "{told}");
+    let check = |path: &Path, expected: &str| {
+        let error = SqliteLedger::open(path).expect_err("refused");
+        assert!(matches!(error, OpenError::BadPath { .. }), "{error}");
+        assert_eq!(error.to_string(), format!("cannot keep a ledger at {path:?}: {expected}"));
+    };
+    check(directory.path(), "it is a directory");
+    check(Path::new("/dev/null"), "it is not a regular file");
+    check(&path.join("below"), &format!("there is no directory {path:?}"));
+    fs::write(&path, b"").expect("written");
+    check(&path.join("below"), &format!("there is no directory {path:?}"));
+    let twin = directory.path().join("twin.sqlite");
+    fs::hard_link(&path, &twin).expect("a link");
+    check(&twin, "the file has 2 names (hard links), keep only one of them");
+    let long = directory.path().join("a".repeat(300));
+    check(&long, "File name too long (os error 36)");
+    assert_eq!(fs::read(&path).expect("bytes"), b"");
 }
 
 #[test]

@@ -11,6 +11,8 @@ mod full;
 #[cfg(test)]
 mod model;
 #[cfg(test)]
+mod owner;
+#[cfg(test)]
 mod place;
 #[cfg(test)]
 mod redis_server;
@@ -20,6 +22,8 @@ mod semantics;
 mod servers;
 #[cfg(test)]
 mod speed;
+#[cfg(test)]
+mod upgrade;
 
 /// Every test of `semantics` and `model` on every ledger.
 macro_rules! on_every_ledger {

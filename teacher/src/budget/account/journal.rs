@@ -4,6 +4,7 @@
 use std::collections::BTreeMap;
 
 use super::super::verdicts::{Verdicts, Word, WordIndex};
+use super::checksum::Checksum;
 use super::{Account, LeaseState, Terms};
 
 /// How an account was before the first change: only what has been touched.
@@ -18,12 +19,14 @@ pub(super) struct Journal {
 /// What is to be written down of an account that has changed.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub(crate) struct Changes {
-    /// Units charged, all in all; none when that is as it was.
-    pub(crate) spent: Option<u64>,
+    /// Units charged, all in all.
+    pub(crate) spent: u64,
     /// Leases opened or settled.
     pub(crate) leases: Vec<LeaseRecord>,
     /// Words of verdicts that are new or have more bits.
     pub(crate) words: Vec<(WordIndex, Word)>,
+    /// The difference that they make to the account's checksum.
+    pub(crate) checksum: Checksum,
 }
 
 /// A lease as it is written down. What is spent of it follows from the verdicts.
@@ -58,7 +61,7 @@ pub(crate) enum Unsound {
 impl Changes {
     /// Whether there is nothing to write.
     pub(crate) const fn is_empty(&self) -> bool {
-        self.spent.is_none() && self.leases.is_empty() && self.words.is_empty()
+        self.leases.is_empty() && self.words.is_empty()
     }
 }
 
@@ -109,18 +112,29 @@ impl Account {
     /// What has changed since [`Self::record`].
     pub(crate) fn recorded(&self) -> Changes {
         let Some(journal) = &self.journal else { return Changes::default() };
-        let leases = journal.leases.iter().filter_map(|(episode, before)| {
-            let lease = self.leases.get(episode)?;
-            let is_known = before.is_some_and(|before| before.settled == lease.settled);
-            (!is_known).then(|| lease.record(*episode, &self.verdicts))
-        });
-        let words =
-            journal.words.keys().filter_map(|index| Some((*index, self.verdicts.word(*index)?)));
-        Changes {
-            spent: (self.spent != journal.spent).then_some(self.spent),
-            leases: leases.collect(),
-            words: words.collect(),
+        let mut changes = Changes { spent: self.spent, ..Changes::default() };
+        for (episode, before) in &journal.leases {
+            let Some(lease) = self.leases.get(episode) else { continue };
+            let lease = lease.record(*episode, &self.verdicts);
+            match before {
+                Some(before) if before.settled == lease.settled => continue,
+                Some(before) => {
+                    let before = LeaseRecord { settled: before.settled, ..lease };
+                    changes.checksum = changes.checksum - Checksum::of_lease(&before);
+                }
+                None => {}
+            }
+            changes.checksum = changes.checksum + Checksum::of_lease(&lease);
+            changes.leases.push(lease);
         }
+        for (index, before) in &journal.words {
+            let Some(word) = self.verdicts.word(*index) else { continue };
+            let before = before.map(|before| Checksum::of_word(*index, before));
+            changes.checksum =
+                changes.checksum - before.unwrap_or_default() + Checksum::of_word(*index, word);
+            changes.words.push((*index, word));
+        }
+        changes
     }
 
     /// Ends the record: the changes stand.
@@ -200,19 +214,31 @@ mod tests {
         leases: BTreeMap<u64, LeaseRecord>,
         words: BTreeMap<WordIndex, Word>,
         spent: u64,
+        checksum: Checksum,
     }
 
     impl Written {
         fn write(&mut self, changes: Changes) {
+            if !changes.is_empty() {
+                self.spent = changes.spent;
+            }
+            self.checksum = self.checksum + changes.checksum;
             self.leases.extend(changes.leases.iter().map(|lease| (lease.episode, *lease)));
             self.words.extend(changes.words);
-            self.spent = changes.spent.unwrap_or(self.spent);
         }
 
         fn restore(&self) -> Account {
             let leases: Vec<LeaseRecord> = self.leases.values().copied().collect();
             let words = self.words.iter().map(|(index, word)| (*index, *word));
             Account::restore(TERMS, &leases, words).expect("sound")
+        }
+
+        /// The checksum, computed anew from every record.
+        fn sum(&self) -> Checksum {
+            let leases = self.leases.values().map(Checksum::of_lease);
+            leases
+                .chain(self.words.iter().map(|(index, word)| Checksum::of_word(*index, *word)))
+                .sum()
         }
     }
 
@@ -260,6 +286,7 @@ mod tests {
                 }
                 assert_eq!(parts(&written.restore()), parts(&account), "seed {seed}");
                 assert_eq!(written.spent, account.spent(), "seed {seed}");
+                assert_eq!(written.checksum, written.sum(), "seed {seed}");
             }
         }
     }

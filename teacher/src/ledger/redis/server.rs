@@ -8,7 +8,7 @@ use redis::{
     RedisResult,
 };
 
-use crate::ledger::OpenError;
+use crate::ledger::{OpenError, printable};
 
 const CONNECT_TIMEOUT: Duration = Duration::from_secs(2);
 const ANSWER_TIMEOUT: Duration = Duration::from_secs(2);
@@ -113,7 +113,9 @@ impl Server {
             return Err(refused("has a ? or #, which a password must have as %3F or %23"));
         }
         let info = parsed.into_connection_info();
-        let info = info.map_err(|error| refused(&format!("cannot be used: {error}")))?;
+        let info = info.map_err(|error| {
+            refused(&format!("cannot be used: {}", printable(&error.to_string())))
+        })?;
         let ConnectionAddr::Tcp(host, port) = info.addr() else {
             return Err(refused("names no host"));
         };
@@ -121,7 +123,9 @@ impl Server {
         let name = format!("redis://{host}:{port}/{}", info.redis_settings().db());
         let settings = info.tcp_settings().clone().set_nodelay(true);
         let client = Client::open(info.set_tcp_settings(settings));
-        let client = client.map_err(|error| refused(&format!("cannot be used: {error}")))?;
+        let client = client.map_err(|error| {
+            refused(&format!("cannot be used: {}", printable(&error.to_string())))
+        })?;
         let scripts = Script::CODE.map(redis::Script::new);
         Ok(Self { client, name, scripts, connection: None })
     }

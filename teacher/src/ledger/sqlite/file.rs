@@ -1,22 +1,29 @@
 //! The file itself: who owns it, what stands in it, how it is written.
 
 use std::collections::BTreeMap;
-use std::fs::{File, TryLockError};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use rusqlite::{Connection, ErrorCode, OpenFlags, Row, TransactionBehavior, params};
+use rusqlite::{Connection, ErrorCode, OpenFlags, TransactionBehavior};
 
-use crate::budget::{Account, Changes, LeaseRecord, Terms, Word, WordIndex};
-use crate::ledger::OpenError;
+use super::hold::{Displaced, Hold};
+use super::rows::{
+    AccountRow, insert_account, read_accounts, read_leases, read_words, write_changes,
+    write_checksum,
+};
+use crate::budget::{Account, Changes, Checksum, LeaseRecord, Terms, Word, WordIndex};
+use crate::ledger::{OpenError, printable};
 
 /// Transactions that a loss of power may undo before one is waited for.
 pub(super) const MAX_UNSYNCED: u32 = 256;
 
 /// What stands in the file's header: "tndm" in ASCII.
 const APPLICATION_ID: i64 = 0x746E_646D;
-const VERSION: i64 = 1;
+const VERSION: i64 = 2;
+/// The version without checksums.
+const VERSION_1: i64 = 1;
 const SCHEMA: &str = include_str!("schema.sql");
+const UPGRADE_FROM_1: &str = "ALTER TABLE accounts ADD COLUMN checksum INTEGER NOT NULL DEFAULT 0";
 /// How long somebody else, who ought only to look, may hold the file.
 const BUSY_TIMEOUT: Duration = Duration::from_secs(2);
 
@@ -29,6 +36,34 @@ pub(super) enum Durability {
     PowerCut,
 }
 
+/// Why a transaction is not made.
+#[derive(Debug, thiserror::Error)]
+pub(super) enum WriteError {
+    /// SQLite cannot write it.
+    #[error(transparent)]
+    Sqlite(#[from] rusqlite::Error),
+    /// It would be lost. Nothing is written to this file any more.
+    #[error(transparent)]
+    Displaced(#[from] Displaced),
+}
+
+/// An account as the file has it.
+#[derive(Debug)]
+pub(super) struct StoredAccount {
+    pub(super) id: i64,
+    pub(super) name: String,
+    pub(super) checksum: Checksum,
+    pub(super) account: Account,
+}
+
+/// What changed in one account.
+pub(super) struct AccountChanges {
+    pub(super) id: i64,
+    pub(super) changes: Changes,
+    /// Of the account once it has changed.
+    pub(super) checksum: Checksum,
+}
+
 /// An open ledger.
 #[derive(Debug)]
 pub(super) struct LedgerFile {
@@ -38,28 +73,33 @@ pub(super) struct LedgerFile {
     durability: Durability,
     /// Transactions since the last one that survives a loss of power.
     n_unsynced: u32,
-    /// Held as long as the ledger is open; the system frees it when the process ends.
-    _lock: File,
+    /// Set for good when the file is found to be no longer in its place.
+    displaced: Option<Displaced>,
+    /// Dropped after the connection: closing the file would release SQLite's locks.
+    hold: Hold,
 }
 
 impl LedgerFile {
-    pub(super) fn open(path: &Path) -> Result<Self, OpenError> {
-        let failed = |source| OpenError::Io { path: path.to_owned(), source };
-        // A name such as ":memory:" is a file too, and a link leads to the lock beside the file itself.
-        let file = std::path::absolute(path).map_err(failed)?;
-        let file = std::fs::canonicalize(&file).unwrap_or(file);
-        if file.is_dir() {
-            return Err(failed(std::io::ErrorKind::IsADirectory.into()));
-        }
-        let lock = lock(&file, path)?;
-        let flags = OpenFlags::SQLITE_OPEN_READ_WRITE
-            | OpenFlags::SQLITE_OPEN_CREATE
-            | OpenFlags::SQLITE_OPEN_NO_MUTEX;
+    /// Opens the ledger at `path`, which is made when there is none, with every account in it.
+    pub(super) fn open(path: &Path) -> Result<(Self, Vec<StoredAccount>), OpenError> {
+        let mut hold = Hold::take(path)?;
+        let flags = OpenFlags::SQLITE_OPEN_READ_WRITE | OpenFlags::SQLITE_OPEN_NO_MUTEX;
+        let refused = |error| refused(path, &error);
         let mut connection =
-            Connection::open_with_flags(&file, flags).map_err(|error| refused(path, error))?;
-        prepare(&mut connection, path)?;
+            Connection::open_with_flags(hold.resolved(), flags).map_err(refused)?;
+        let version = prepare(&mut connection, path)?;
+        let accounts = load(&connection, version, path)?;
+        if version == VERSION_1 {
+            upgrade(&mut connection, &accounts).map_err(refused)?;
+            tracing::info!(ledger = ?path, "ledger upgraded from version 1 to version {VERSION}");
+        }
+        hold.note_log();
+        if hold.check_in_place().is_err() {
+            return Err(OpenError::InUse(path.to_owned()));
+        }
         let (path, durability) = (path.to_owned(), Durability::PowerCut);
-        Ok(Self { connection, path, durability, n_unsynced: 0, _lock: lock })
+        let file = Self { connection, path, durability, n_unsynced: 0, displaced: None, hold };
+        Ok((file, accounts))
     }
 
     /// As it was named when it was opened.
@@ -67,49 +107,28 @@ impl LedgerFile {
         &self.path
     }
 
-    /// Every account with its name and number.
-    pub(super) fn load(&mut self) -> Result<Vec<(String, i64, Account)>, OpenError> {
-        let refused = |error| refused(&self.path, error);
-        let damaged = |what: String| OpenError::Damaged { path: self.path.clone(), what };
-        let mut leases = by_account(read_leases(&self.connection).map_err(refused)?);
-        let mut words = by_account(read_words(&self.connection).map_err(refused)?);
-        let mut accounts = Vec::new();
-        for (id, name, terms, spent) in read_accounts(&self.connection).map_err(refused)? {
-            let leases = leases.remove(&id).unwrap_or_default();
-            let words = words.remove(&id).unwrap_or_default();
-            let account = Account::restore(terms, &leases, words)
-                .map_err(|unsound| damaged(format!("account {name:?}: {unsound}")))?;
-            if account.spent() != spent {
-                let counted = account.spent();
-                let what =
-                    format!("account {name:?} has spent {spent}, its verdicts say {counted}");
-                return Err(damaged(what));
-            }
-            accounts.push((name, id, account));
-        }
-        match leases.keys().chain(words.keys()).next() {
-            Some(id) => Err(damaged(format!("there is no account {id}"))),
-            None => Ok(accounts),
-        }
-    }
-
     /// Adds an account of which nothing is spent, and gives it a number.
-    pub(super) fn add_account(&mut self, name: &str, terms: Terms) -> rusqlite::Result<i64> {
+    pub(super) fn add_account(
+        &mut self,
+        name: &str,
+        terms: Terms,
+        checksum: Checksum,
+    ) -> Result<i64, WriteError> {
         self.transaction(Durability::PowerCut, |connection| {
-            let sql = "INSERT INTO accounts (name, budget, strategy, spent) VALUES (?, ?, ?, 0)";
-            let params = params![name, terms.budget, terms.strategy.to_string()];
-            connection.prepare_cached(sql)?.insert(params)
+            insert_account(connection, name, terms, checksum)
         })
     }
 
-    /// Writes down what changed in accounts, by their numbers: all of it or nothing.
+    /// Writes down what changed in accounts: all of it or nothing.
     pub(super) fn write(
         &mut self,
-        changes: &[(i64, Changes)],
+        changed: &[AccountChanges],
         durability: Durability,
-    ) -> rusqlite::Result<()> {
+    ) -> Result<(), WriteError> {
         self.transaction(durability, |connection| {
-            changes.iter().try_for_each(|(id, changes)| write(connection, *id, changes))
+            changed.iter().try_for_each(|AccountChanges { id, changes, checksum }| {
+                write_changes(connection, *id, changes, *checksum)
+            })
         })
     }
 
@@ -122,7 +141,7 @@ impl LedgerFile {
     /// Lets the file have no more than `n_pages` pages, or those that it has.
     #[cfg(test)]
     pub(super) fn limit_pages(&self, n_pages: u32) {
-        let check = |_: &Row<'_>| Ok(());
+        let check = |_: &rusqlite::Row<'_>| Ok(());
         self.connection
             .pragma_update_and_check(None, "max_page_count", n_pages, check)
             .expect("a limit");
@@ -132,7 +151,10 @@ impl LedgerFile {
         &mut self,
         durability: Durability,
         write: impl FnOnce(&Connection) -> rusqlite::Result<T>,
-    ) -> rusqlite::Result<T> {
+    ) -> Result<T, WriteError> {
+        if let Some(displaced) = self.displaced {
+            return Err(displaced.into());
+        }
         let durability =
             if self.n_unsynced >= MAX_UNSYNCED { Durability::PowerCut } else { durability };
         self.set_durability(durability)?;
@@ -145,7 +167,31 @@ impl LedgerFile {
             Durability::Kill => self.n_unsynced + 1,
             Durability::PowerCut => 0,
         };
+        // Only now is it certain that the transaction is in a file that will be found again.
+        self.hold.check_in_place().map_err(|displaced| self.give_up(displaced))?;
         Ok(answer)
+    }
+
+    /// Writes nothing from now on: it would be lost, or would not fit what is in the file when it is put back.
+    fn give_up(&mut self, displaced: Displaced) -> Displaced {
+        tracing::error!(ledger = ?self.path, "nothing more is charged: {displaced}");
+        self.displaced = Some(displaced);
+        if displaced == Displaced::Log {
+            self.rescue_log();
+        }
+        displaced
+    }
+
+    /// Copies what only the lost log has into the database.
+    fn rescue_log(&self) {
+        let mut is_blocked = true;
+        let copied = self.connection.pragma(None, "wal_checkpoint", "TRUNCATE", |row| {
+            is_blocked = row.get(0)?;
+            Ok(())
+        });
+        if copied.is_err() || is_blocked {
+            tracing::error!(ledger = ?self.path, "the last charges are lost if this process is killed");
+        }
     }
 
     fn set_durability(&mut self, durability: Durability) -> rusqlite::Result<()> {
@@ -164,23 +210,9 @@ impl LedgerFile {
     }
 }
 
-/// Takes the lock beside `file`, which was named `path`.
-fn lock(file: &Path, path: &Path) -> Result<File, OpenError> {
-    let mut name = file.as_os_str().to_owned();
-    name.push(".lock");
-    let name = PathBuf::from(name);
-    let lock = File::options().create(true).truncate(false).write(true).open(&name);
-    let lock = lock.map_err(|source| OpenError::Io { path: name.clone(), source })?;
-    match lock.try_lock() {
-        Ok(()) => Ok(lock),
-        Err(TryLockError::WouldBlock) => Err(OpenError::InUse(path.to_owned())),
-        Err(TryLockError::Error(source)) => Err(OpenError::Io { path: name, source }),
-    }
-}
-
-/// Checks that the file is a sound ledger of this version, or makes it one when it is empty.
-fn prepare(connection: &mut Connection, path: &Path) -> Result<(), OpenError> {
-    let refused = |error| refused(path, error);
+/// Checks that the file is a sound ledger, or makes it one when it is empty, and gives its version.
+fn prepare(connection: &mut Connection, path: &Path) -> Result<i64, OpenError> {
+    let refused = |error| refused(path, &error);
     connection.busy_timeout(BUSY_TIMEOUT).map_err(refused)?;
     let header = |name| connection.pragma_query_value(None, name, |row| row.get::<_, i64>(0));
     let application_id = header("application_id").map_err(refused)?;
@@ -190,18 +222,19 @@ fn prepare(connection: &mut Connection, path: &Path) -> Result<(), OpenError> {
     let path_buf = || path.to_owned();
     match (application_id, version, n_tables) {
         (0, 0, 0) => {}
-        (APPLICATION_ID, VERSION, _) => check(connection, path)?,
+        (APPLICATION_ID, VERSION_1 | VERSION, _) => check(connection, path)?,
         (APPLICATION_ID, found, _) => {
-            return Err(OpenError::Version { path: path_buf(), found, expected: VERSION });
+            return Err(OpenError::Version { path: path_buf(), found, newest: VERSION });
         }
         _ => {
             let found = "an SQLite database of another program";
             return Err(OpenError::NotALedger { path: path_buf(), found });
         }
     }
+    // The file itself is open for writing by now.
     if connection.is_readonly("main").map_err(refused)? {
-        let source = std::io::ErrorKind::PermissionDenied.into();
-        return Err(OpenError::Io { path: path_buf(), source });
+        let what = "its header says that it cannot be written".to_owned();
+        return Err(OpenError::Damaged { path: path_buf(), what });
     }
     let mode = connection
         .pragma_update_and_check(None, "journal_mode", "WAL", |row| row.get::<_, String>(0));
@@ -212,19 +245,19 @@ fn prepare(connection: &mut Connection, path: &Path) -> Result<(), OpenError> {
     connection.pragma_update(None, "synchronous", "FULL").map_err(refused)?;
     if n_tables == 0 {
         create(connection).map_err(refused)?;
+        return Ok(VERSION);
     }
-    Ok(())
+    Ok(version)
 }
 
-/// Lets SQLite look whether every page is where it belongs.
+/// Lets SQLite check whether every page is where it belongs and every account is in the index of names.
 fn check(connection: &Connection, path: &Path) -> Result<(), OpenError> {
-    let verdict = connection.pragma_query_value(None, "quick_check", |row| row.get::<_, String>(0));
+    let verdict =
+        connection.pragma_query_value(None, "integrity_check", |row| row.get::<_, String>(0));
     match verdict {
         Ok(verdict) if verdict == "ok" => Ok(()),
-        Ok(what) => {
-            Err(OpenError::Damaged { path: path.to_owned(), what: what.replace('\n', " ") })
-        }
-        Err(error) => Err(refused(path, error)),
+        Ok(what) => Err(OpenError::Damaged { path: path.to_owned(), what: printable(&what) }),
+        Err(error) => Err(refused(path, &error)),
     }
 }
 
@@ -236,62 +269,63 @@ fn create(connection: &mut Connection) -> rusqlite::Result<()> {
     transaction.commit()
 }
 
-/// What an error of SQLite's means for somebody who opens a ledger.
-fn refused(path: &Path, error: rusqlite::Error) -> OpenError {
-    let path = path.to_owned();
-    match error.sqlite_error_code() {
-        Some(ErrorCode::NotADatabase) => {
-            OpenError::NotALedger { path, found: "something that is not an SQLite database" }
+/// Gives a ledger of version 1 the checksums that it lacks, in one transaction.
+fn upgrade(connection: &mut Connection, accounts: &[StoredAccount]) -> rusqlite::Result<()> {
+    let transaction = connection.transaction_with_behavior(TransactionBehavior::Immediate)?;
+    transaction.execute_batch(UPGRADE_FROM_1)?;
+    for account in accounts {
+        write_checksum(&transaction, account.id, account.checksum)?;
+    }
+    transaction.pragma_update(None, "user_version", VERSION)?;
+    transaction.commit()
+}
+
+/// Every account, checked against its checksum where the version of the file has them.
+fn load(
+    connection: &Connection,
+    version: i64,
+    path: &Path,
+) -> Result<Vec<StoredAccount>, OpenError> {
+    let refused = |error| refused(path, &error);
+    let damaged = |what: String| OpenError::Damaged { path: path.to_owned(), what };
+    let mut leases = by_account(read_leases(connection).map_err(refused)?);
+    let mut words = by_account(read_words(connection).map_err(refused)?);
+    let has_checksums = version != VERSION_1;
+    let mut accounts = Vec::new();
+    for row in read_accounts(connection, has_checksums).map_err(refused)? {
+        let leases = leases.remove(&row.id).unwrap_or_default();
+        let words = words.remove(&row.id).unwrap_or_default();
+        let stored = row.checksum;
+        let account = restore(row, &leases, &words).map_err(damaged)?;
+        if has_checksums && stored != Some(account.checksum) {
+            let what = "its rows do not match its checksum";
+            return Err(damaged(format!("account {:?}: {what}", account.name)));
         }
-        // The tables are not those of a ledger, or hold what no ledger writes.
-        Some(ErrorCode::DatabaseCorrupt | ErrorCode::TypeMismatch | ErrorCode::Unknown) | None => {
-            OpenError::Damaged { path, what: error.to_string() }
-        }
-        Some(_) => OpenError::Io { path, source: std::io::Error::other(error) },
+        accounts.push(account);
+    }
+    match leases.keys().chain(words.keys()).next() {
+        Some(id) => Err(damaged(format!("there is no account {id}"))),
+        None => Ok(accounts),
     }
 }
 
-fn read_accounts(connection: &Connection) -> rusqlite::Result<Vec<(i64, String, Terms, u64)>> {
-    let sql = "SELECT id, name, budget, strategy, spent FROM accounts";
-    let read = |row: &Row<'_>| {
-        let strategy = row.get_ref(3)?.as_str()?.parse();
-        let strategy = strategy.map_err(|error| unreadable(3, error))?;
-        let terms = Terms { budget: row.get(2)?, strategy };
-        Ok((row.get(0)?, row.get(1)?, terms, row.get(4)?))
-    };
-    connection.prepare(sql)?.query_map((), read)?.collect()
-}
-
-fn read_leases(connection: &Connection) -> rusqlite::Result<Vec<(i64, LeaseRecord)>> {
-    let sql = "SELECT account, episode, units, early_units, charged_before, settled FROM leases";
-    let read = |row: &Row<'_>| {
-        let lease = LeaseRecord {
-            episode: row.get::<_, i64>(1)?.cast_unsigned(),
-            units: row.get(2)?,
-            early_units: row.get(3)?,
-            charged_before: row.get(4)?,
-            settled: row.get(5)?,
-        };
-        Ok((row.get(0)?, lease))
-    };
-    connection.prepare(sql)?.query_map((), read)?.collect()
-}
-
-fn read_words(connection: &Connection) -> rusqlite::Result<Vec<(i64, (WordIndex, Word))>> {
-    let sql = "SELECT account, episode, word, asked, charged, first_half FROM verdicts";
-    let read = |row: &Row<'_>| {
-        let bits = |idx| row.get::<_, i64>(idx).map(i64::cast_unsigned);
-        let word = Word { asked: bits(3)?, charged: bits(4)?, first_half: bits(5)? };
-        Ok((row.get(0)?, ((bits(1)?, row.get(2)?), word)))
-    };
-    connection.prepare(sql)?.query_map((), read)?.collect()
-}
-
-fn unreadable(
-    column: usize,
-    error: impl std::error::Error + Send + Sync + 'static,
-) -> rusqlite::Error {
-    rusqlite::Error::FromSqlConversionFailure(column, rusqlite::types::Type::Text, Box::new(error))
+/// The account of these rows, or what is wrong with them.
+fn restore(
+    row: AccountRow,
+    leases: &[LeaseRecord],
+    words: &[(WordIndex, Word)],
+) -> Result<StoredAccount, String> {
+    let AccountRow { id, name, terms, spent, .. } = row;
+    let account = Account::restore(terms, leases, words.iter().copied())
+        .map_err(|unsound| format!("account {name:?}: {unsound}"))?;
+    if account.spent() != spent {
+        let counted = account.spent();
+        return Err(format!("account {name:?} has spent {spent}, its verdicts say {counted}"));
+    }
+    let leases = leases.iter().map(Checksum::of_lease);
+    let words = words.iter().map(|(index, word)| Checksum::of_word(*index, *word));
+    let checksum = Checksum::of_terms(&name, terms) + leases.chain(words).sum();
+    Ok(StoredAccount { id, name, checksum, account })
 }
 
 fn by_account<T>(rows: Vec<(i64, T)>) -> BTreeMap<i64, Vec<T>> {
@@ -302,30 +336,29 @@ fn by_account<T>(rows: Vec<(i64, T)>) -> BTreeMap<i64, Vec<T>> {
     by_account
 }
 
-fn write(connection: &Connection, id: i64, changes: &Changes) -> rusqlite::Result<()> {
-    if let Some(spent) = changes.spent {
-        let sql = "UPDATE accounts SET spent = ?2 WHERE id = ?1";
-        connection.prepare_cached(sql)?.execute(params![id, spent])?;
-    }
-    if !changes.leases.is_empty() {
-        let sql = "INSERT INTO leases VALUES (?, ?, ?, ?, ?, ?)
-            ON CONFLICT DO UPDATE SET settled = excluded.settled";
-        let mut statement = connection.prepare_cached(sql)?;
-        for lease in &changes.leases {
-            let LeaseRecord { units, early_units, charged_before, settled, .. } = *lease;
-            let episode = lease.episode.cast_signed();
-            statement.execute(params![id, episode, units, early_units, charged_before, settled])?;
+/// What an error of SQLite's means for somebody who opens a ledger.
+fn refused(path: &Path, error: &rusqlite::Error) -> OpenError {
+    use ErrorCode as E;
+    let (path, what) = (path.to_owned(), printable(&error.to_string()));
+    match error.sqlite_error_code() {
+        Some(E::NotADatabase) => {
+            OpenError::NotALedger { path, found: "something that is not an SQLite database" }
         }
+        Some(
+            E::PermissionDenied
+            | E::OperationAborted
+            | E::DatabaseBusy
+            | E::DatabaseLocked
+            | E::OutOfMemory
+            | E::ReadOnly
+            | E::OperationInterrupted
+            | E::SystemIoFailure
+            | E::DiskFull
+            | E::CannotOpen
+            | E::FileLockingProtocolFailed
+            | E::NoLargeFileSupport,
+        ) => OpenError::Io { path, source: std::io::Error::other(what) },
+        // The tables are not those of a ledger, or hold what no ledger writes.
+        _ => OpenError::Damaged { path, what },
     }
-    if !changes.words.is_empty() {
-        let sql = "INSERT INTO verdicts VALUES (?, ?, ?, ?, ?, ?) ON CONFLICT DO UPDATE SET
-            asked = excluded.asked, charged = excluded.charged, first_half = excluded.first_half";
-        let mut statement = connection.prepare_cached(sql)?;
-        for ((episode, word_idx), word) in &changes.words {
-            let [episode, asked, charged, first_half] =
-                [*episode, word.asked, word.charged, word.first_half].map(u64::cast_signed);
-            statement.execute(params![id, episode, word_idx, asked, charged, first_half])?;
-        }
-    }
-    Ok(())
 }

@@ -1,10 +1,12 @@
--- Budgets of advice, in units; spent says how many were charged.
+-- Budgets of advice, in units; spent says how many were charged. The checksum is over the account's name and terms and
+-- its rows in the other tables.
 CREATE TABLE accounts (
     id INTEGER PRIMARY KEY,
     name TEXT NOT NULL UNIQUE,
     budget INTEGER NOT NULL,
     strategy TEXT NOT NULL,
-    spent INTEGER NOT NULL
+    spent INTEGER NOT NULL,
+    checksum INTEGER NOT NULL
 ) STRICT;
 
 -- Units set aside for an episode; charged_before says how many the episode was charged before it had the lease.

@@ -1,3 +1,5 @@
+mod damage;
+
 use super::*;
 use crate::budget::{Half, Verdict, Wish};
 use crate::ledger::Charge;

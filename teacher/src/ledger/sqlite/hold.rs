@@ -1,0 +1,192 @@
+//! Exclusive ownership of a ledger's file, and the check that the file is still in its place.
+
+use std::collections::BTreeSet;
+use std::fs::{File, Metadata};
+use std::io::{self, ErrorKind};
+use std::os::unix::fs::{MetadataExt as _, OpenOptionsExt as _};
+use std::path::{Path, PathBuf};
+use std::sync::{Mutex, PoisonError};
+
+use nix::errno::Errno;
+use nix::fcntl::{FcntlArg, fcntl};
+use nix::libc;
+
+use crate::ledger::OpenError;
+
+/// The byte that the owner of a file locks. It lies beyond the data of any database and beyond the bytes that SQLite
+/// locks, so that the locks do not conflict where the system keeps them together, as NFS does.
+const LOCKED_BYTE: i64 = 1 << 62;
+
+/// The ledgers that this process holds.
+///
+/// SQLite's own locks are POSIX locks: the system releases them as soon as the process closes any descriptor of the
+/// file. A second attempt to open a ledger in one process is therefore refused before it opens the file.
+static HELD: Mutex<BTreeSet<FileId>> = Mutex::new(BTreeSet::new());
+
+/// A file, whatever its names.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+struct FileId {
+    device: u64,
+    inode: u64,
+}
+
+/// Exclusive ownership of a ledger's file, from any process and by any name, until this is dropped or the process
+/// ends. The lock is on the file itself, so deleting other files does not release it.
+#[derive(Debug)]
+pub(super) struct Hold {
+    id: FileId,
+    /// As it was given, made absolute.
+    path: PathBuf,
+    /// Without symbolic links: where SQLite puts its own files beside the database.
+    resolved: PathBuf,
+    /// SQLite's write-ahead log, once it exists.
+    log: Option<FileId>,
+    /// Has the lock.
+    _file: File,
+}
+
+/// Why nothing more is written to a ledger.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+pub(super) enum Displaced {
+    /// The path leads to no file or to another one.
+    #[error(
+        "the file was deleted, moved or replaced while in use: put it back and restart the teacher"
+    )]
+    Database,
+    /// The same is true of the write-ahead log, while the database is in its place.
+    #[error("its -wal file was deleted, moved or replaced while in use: restart the teacher")]
+    Log,
+}
+
+impl Hold {
+    /// Takes the file at `path`, which is made when there is none.
+    pub(super) fn take(path: &Path) -> Result<Self, OpenError> {
+        let failed = |source| open_failed(path, source);
+        // A name such as ":memory:" is a file too.
+        let absolute = std::path::absolute(path).map_err(failed)?;
+        let mut held = HELD.lock().unwrap_or_else(PoisonError::into_inner);
+        match std::fs::metadata(&absolute) {
+            Ok(metadata) => check_free(&metadata, &held, path)?,
+            Err(error) if error.kind() == ErrorKind::NotFound => {}
+            Err(error) => return Err(failed(error)),
+        }
+        let file = File::options()
+            .read(true)
+            .write(true)
+            .create(true)
+            .truncate(false)
+            .mode(0o644)
+            .open(&absolute)
+            .map_err(failed)?;
+        lock(&file, path)?;
+        let metadata = file.metadata().map_err(failed)?;
+        check_free(&metadata, &held, path)?;
+        check_names(&metadata, path)?;
+        let resolved = std::fs::canonicalize(&absolute).map_err(failed)?;
+        let id = FileId::of(&metadata);
+        held.insert(id);
+        Ok(Self { id, path: absolute, resolved, log: None, _file: file })
+    }
+
+    /// The path to give to SQLite.
+    pub(super) fn resolved(&self) -> &Path {
+        &self.resolved
+    }
+
+    /// Notes the write-ahead log, which SQLite has made by now.
+    pub(super) fn note_log(&mut self) {
+        self.log = FileId::at(&self.log_path());
+    }
+
+    /// Checks that the path still leads to the file, and SQLite's name for the log to the log.
+    pub(super) fn check_in_place(&self) -> Result<(), Displaced> {
+        if FileId::at(&self.path) != Some(self.id) {
+            return Err(Displaced::Database);
+        }
+        if FileId::at(&self.log_path()) != self.log {
+            return Err(Displaced::Log);
+        }
+        Ok(())
+    }
+
+    fn log_path(&self) -> PathBuf {
+        let mut name = self.resolved.as_os_str().to_owned();
+        name.push("-wal");
+        name.into()
+    }
+}
+
+impl Drop for Hold {
+    fn drop(&mut self) {
+        HELD.lock().unwrap_or_else(PoisonError::into_inner).remove(&self.id);
+    }
+}
+
+impl FileId {
+    fn of(metadata: &Metadata) -> Self {
+        Self { device: metadata.dev(), inode: metadata.ino() }
+    }
+
+    /// The file that `path` leads to, if any.
+    fn at(path: &Path) -> Option<Self> {
+        std::fs::metadata(path).ok().as_ref().map(Self::of)
+    }
+}
+
+/// Refuses what is no regular file, and a file that this process holds already.
+fn check_free(metadata: &Metadata, held: &BTreeSet<FileId>, path: &Path) -> Result<(), OpenError> {
+    let bad_path = |what: &str| OpenError::BadPath { path: path.into(), what: what.to_owned() };
+    if metadata.is_dir() {
+        return Err(bad_path("it is a directory"));
+    }
+    if !metadata.is_file() {
+        return Err(bad_path("it is not a regular file"));
+    }
+    if held.contains(&FileId::of(metadata)) {
+        return Err(OpenError::InUse(path.to_owned()));
+    }
+    Ok(())
+}
+
+/// Refuses a file with several names: SQLite's log lies beside one of them and is not found by another.
+fn check_names(metadata: &Metadata, path: &Path) -> Result<(), OpenError> {
+    if metadata.nlink() <= 1 {
+        return Ok(());
+    }
+    let what =
+        format!("the file has {} names (hard links), keep only one of them", metadata.nlink());
+    Err(OpenError::BadPath { path: path.to_owned(), what })
+}
+
+/// Locks one byte with a lock that belongs to `file`, not to the process.
+fn lock(file: &File, path: &Path) -> Result<(), OpenError> {
+    let lock = libc::flock {
+        l_type: i16::try_from(libc::F_WRLCK).expect("a small number"),
+        l_whence: i16::try_from(libc::SEEK_SET).expect("a small number"),
+        l_start: LOCKED_BYTE,
+        l_len: 1,
+        l_pid: 0,
+    };
+    match fcntl(file, FcntlArg::F_OFD_SETLK(&lock)) {
+        Ok(_) => Ok(()),
+        Err(Errno::EAGAIN | Errno::EACCES) => Err(OpenError::InUse(path.to_owned())),
+        Err(errno) => Err(OpenError::Io { path: path.to_owned(), source: errno.into() }),
+    }
+}
+
+/// What an error of the system's means for somebody who opens the ledger `path`.
+fn open_failed(path: &Path, source: io::Error) -> OpenError {
+    let path = path.to_owned();
+    let what = match source.kind() {
+        ErrorKind::NotFound | ErrorKind::NotADirectory => {
+            match path.parent().filter(|parent| !parent.is_dir() && !parent.as_os_str().is_empty())
+            {
+                Some(directory) => format!("there is no directory {directory:?}"),
+                None => source.to_string(),
+            }
+        }
+        ErrorKind::InvalidFilename | ErrorKind::InvalidInput => source.to_string(),
+        _ => return OpenError::Io { path, source },
+    };
+    OpenError::BadPath { path, what }
+}
