@@ -85,10 +85,8 @@ async fn attack(address: SocketAddr, service: &str) {
             assert!(refused || may_be_fine, "{what}: {answer:?}");
             assert!(!matches!(&answer, Answer::Status(Code::Unknown, _)), "{what}: {answer:?}");
             if UNDECODABLE.contains(&name.as_str()) {
-                let Answer::Status(Code::InvalidArgument, told) = &answer else {
-                    panic!("{what} is the client's mistake: {answer:?}")
-                };
-                assert!(told.contains("the request is malformed: "), "{what}: {told}");
+                let is_told = matches!(&answer, Answer::Status(Code::InvalidArgument, told) if told.contains("malformed"));
+                assert!(is_told, "{what} is the client's mistake: {answer:?}");
             }
         }
         soon("a call that never ends", wire::endless(address, &rpc.path)).await;
