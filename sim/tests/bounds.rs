@@ -89,7 +89,7 @@ fn note(largest: &mut Largest, observation: &[f32], goal: &[f32]) {
 
 fn play(layout: Layout, substeps: u32) -> Largest {
     let config = WorldConfig { substeps, ..WorldConfig::default() };
-    let mut env = Env::new(layout, &config).unwrap();
+    let mut env = Env::new(layout, &config).expect("a valid world");
     let mut largest = Largest { observation: [0.0; OBSERVATION_PER_ARM], goal: 0.0 };
     let mut observation = vec![0.0; layout.n_observation()];
     let mut action = vec![0.0; layout.n_action()];
@@ -107,7 +107,7 @@ fn play(layout: Layout, substeps: u32) -> Largest {
                 let part = &mut action[layout.action_of(arm)];
                 part.copy_from_slice(&inputs[..part.len()]);
             }
-            env.step(&action).unwrap();
+            env.step(&action).expect("a finite step");
         }
     }
     largest
