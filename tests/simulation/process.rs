@@ -8,8 +8,8 @@ use std::process::Command;
 use std::str::FromStr;
 
 use mad_turmoil::time::SimClocksGuard;
-use rand_09::SeedableRng as _;
-use rand_09::rngs::StdRng;
+use rand::SeedableRng as _;
+use rand::rngs::StdRng;
 use serde::{Deserialize, Serialize};
 use tempfile::TempDir;
 
