@@ -146,7 +146,7 @@ pub(crate) struct TrainArgs {
     #[arg(long = "set", value_name = "KEY=VALUE")]
     pub(crate) settings: Vec<String>,
     /// Run directory [default: runs/TASK-ARMS-STRATEGY-seedN].
-    #[arg(long, value_name = "DIR", value_parser = utf8_path())]
+    #[arg(long, value_name = "DIR")]
     pub(crate) out: Option<PathBuf>,
     /// Goes on with the run in --out from its newest checkpoint. Its settings and its teacher stay those that it began
     /// with; only when it stops (--max-env-steps, --max-minutes, --until-success), checkpoint.*,

@@ -24,6 +24,7 @@ use crate::books::{Ledgers, SharedBook, Watched};
 use crate::machines::{House, Machines, with_causes};
 use crate::network::{address, dial, listen};
 use crate::schedule::{Host, Schedule};
+use crate::system;
 
 /// Hosts of the services.
 pub(crate) const SERVICES: [Host; 2] = [TEACHER, LEARNER];
@@ -182,7 +183,7 @@ impl Stage {
         let resume = !checkpoint::list(&out.join("checkpoint")).is_empty();
         self.course
             .update(|course| Course { n_resumed: course.n_resumed + u64::from(resume), ..course });
-        let (life, clock) = (self.house.life_of(LEARNER), self.house.clock());
+        let life = self.house.life_of(LEARNER);
         let config = LearnerConfig {
             run: self.run.clone(),
             gate: Gate::default(),
@@ -196,7 +197,7 @@ impl Stage {
             n_threads: 1,
             clock: Arc::new(move || {
                 let _life = &life;
-                clock()
+                system::now()
             }),
             version: "simulated".to_owned(),
             first_worker: number * WORKER_NUMBERS,

@@ -7,7 +7,6 @@
 use std::cell::RefCell;
 use std::collections::BTreeMap;
 use std::rc::Rc;
-use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Weak};
 use std::time::Duration;
 
@@ -15,7 +14,7 @@ use tokio_util::sync::CancellationToken;
 use turmoil::Sim;
 
 use crate::schedule::{Event, Host, Schedule};
-use crate::trace;
+use crate::{system, trace};
 
 /// How much simulated time passes at a time.
 const TICK: Duration = Duration::from_millis(5);
@@ -27,8 +26,6 @@ const LAST_BREATH_MILLIS: u32 = 60_000;
 /// What the processes on the hosts and the one who runs the machines share.
 #[derive(Default)]
 pub(crate) struct House {
-    /// Simulated time, microseconds.
-    now: Arc<AtomicU64>,
     /// What started last on a host, as long as anything of it is left.
     lives: RefCell<BTreeMap<Host, Weak<()>>>,
     /// Tell processes to leave.
@@ -38,12 +35,6 @@ pub(crate) struct House {
 }
 
 impl House {
-    /// Simulated time.
-    pub(crate) fn clock(&self) -> impl Fn() -> Duration + Send + Sync + use<> {
-        let now = Arc::clone(&self.now);
-        move || Duration::from_micros(now.load(Ordering::Relaxed))
-    }
-
     /// Shows that what starts on `host` lives, until every clone is dropped.
     pub(crate) fn life_of(&self, host: Host) -> Arc<()> {
         let life = Arc::new(());
@@ -149,9 +140,7 @@ impl<'a> Machines<'a> {
                 self.calm_down();
             }
             self.sim.step().map_err(|error| error.to_string())?;
-            let micros = u64::try_from(self.sim.elapsed().as_micros()).expect("an hour at most");
-            self.house.now.store(micros, Ordering::Relaxed);
-            trace::set_now(self.sim.elapsed());
+            system::set_now(self.sim.elapsed());
             if let Some(ended) = ended() {
                 return Ok(ended);
             }

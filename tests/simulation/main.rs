@@ -20,6 +20,7 @@ mod process;
 mod repeats;
 mod schedule;
 mod seeds;
+mod system;
 mod trace;
 
 use std::sync::OnceLock;
@@ -171,7 +172,9 @@ fn check_crowd(seed: u64) -> Result<u64, String> {
 #[test]
 #[ignore = "the others start it, each time in a process of its own"]
 fn one_simulation() {
-    process::run_the_one_asked_for(simulate_here);
+    if let Some(report) = process::run_the_one_asked_for(simulate_here) {
+        println!("{report}");
+    }
 }
 
 #[test]
@@ -221,7 +224,8 @@ fn a_run_ends_although_somebody_is_connected_who_says_nothing() {
 
 #[test]
 fn the_same_seed_takes_the_same_course() {
-    repeats::check(&[Simulation(Kind::Run, 8), Simulation(Kind::Crowd, 4)], 3);
+    let compared = repeats::compare(&[Simulation(Kind::Run, 8), Simulation(Kind::Crowd, 4)], 3);
+    println!("{}", compared.unwrap_or_else(|difference| panic!("{difference}")));
 }
 
 #[test]
@@ -230,7 +234,8 @@ fn many_seeds_take_the_same_course_ten_times_on_a_busy_machine() {
     let runs = seeds_asked_for(12).map(|seed| Simulation(Kind::Run, seed));
     let crowds = seeds_asked_for(12).map(|seed| Simulation(Kind::Crowd, seed));
     let simulations: Vec<_> = runs.chain(crowds).collect();
-    repeats::on_a_busy_machine(|| repeats::check(&simulations, 10));
+    let compared = repeats::on_a_busy_machine(|| repeats::compare(&simulations, 10));
+    println!("{}", compared.unwrap_or_else(|difference| panic!("{difference}")));
 }
 
 #[test]

@@ -7,14 +7,11 @@ use std::path::Path;
 use std::process::Command;
 use std::str::FromStr;
 
-use mad_turmoil::time::SimClocksGuard;
-use rand::SeedableRng as _;
-use rand::rngs::StdRng;
 use serde::{Deserialize, Serialize};
 use tempfile::TempDir;
 
 use crate::cluster::{Course, Outcome};
-use crate::trace;
+use crate::{system, trace};
 
 /// Names the simulation that a process is to run.
 const SIMULATION: &str = "TANDEM_SIMULATION";
@@ -106,11 +103,14 @@ pub(crate) fn run(simulation: Simulation, trace: Option<&Path>) -> Result<Report
     }
 }
 
-/// Runs the simulation that this process was started for, by `simulate`; does nothing when it was not started for one.
-pub(crate) fn run_the_one_asked_for(simulate: fn(Simulation) -> Result<Report, String>) {
+/// Runs the simulation that this process was started for, by `simulate`, and gives the report that is to be printed;
+/// `None` when it was not started for one.
+pub(crate) fn run_the_one_asked_for(
+    simulate: fn(Simulation) -> Result<Report, String>,
+) -> Option<String> {
     #[expect(clippy::disallowed_methods, reason = "who starts the process says what for")]
     let (asked, traced) = (std::env::var(SIMULATION), std::env::var(TRACE));
-    let Ok(asked) = asked else { return };
+    let asked = asked.ok()?;
     let simulation: Simulation = asked.parse().expect(SIMULATION);
     if let Ok(path) = traced {
         trace::write_to(Path::new(&path));
@@ -118,12 +118,12 @@ pub(crate) fn run_the_one_asked_for(simulate: fn(Simulation) -> Result<Report, S
     // Everything is written here, by names that are always the same.
     let disk = TempDir::new().expect("a directory");
     std::env::set_current_dir(disk.path()).expect("a directory");
-    mad_turmoil::rand::set_rng(StdRng::seed_from_u64(simulation.1));
-    let clocks = SimClocksGuard::init();
     // A thread asks for random numbers when it first uses a hash map; this one may have.
-    let thread = std::thread::spawn(move || simulate(simulation));
+    let thread = std::thread::spawn(move || {
+        system::simulate(simulation.1);
+        simulate(simulation)
+    });
     let report = thread.join().unwrap_or_else(|_panic| Err("a panic, see above".to_owned()));
-    drop(clocks);
     let report = serde_json::to_string(&report).expect("is written as JSON");
-    println!("\n{REPORT}{report}");
+    Some(format!("\n{REPORT}{report}"))
 }

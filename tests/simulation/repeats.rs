@@ -13,38 +13,46 @@ use crate::process::{self, Simulation};
 /// Threads that keep a machine busy.
 const N_BUSY: usize = 4;
 
-/// Runs each of `simulations` `n_times`, two at a time.
-///
-/// # Panics
-/// When one of them takes another course; says with which line of the trace it begins.
-pub(crate) fn check(simulations: &[Simulation], n_times: usize) {
+/// Runs each of `simulations` `n_times`, two at a time; gives a line about each, or with which line of the trace another
+/// course begins.
+pub(crate) fn compare(simulations: &[Simulation], n_times: usize) -> Result<String, String> {
+    let lines: Result<Vec<String>, String> =
+        simulations.iter().map(|simulation| compare_one(*simulation, n_times)).collect();
+    Ok(lines?.join("\n"))
+}
+
+fn compare_one(simulation: Simulation, n_times: usize) -> Result<String, String> {
     let disk = TempDir::new().expect("a directory");
-    for simulation in simulations {
-        let first = disk.path().join("first");
-        let report = process::run(*simulation, Some(&first));
-        let hash = hash_of(&first);
-        let repeat = |number: usize| {
-            let path = disk.path().join(format!("again-{number}"));
-            let again = process::run(*simulation, Some(&path));
-            if hash_of(&path) != hash || again != report {
-                let difference = first_difference(&first, &path);
-                panic!("{simulation} took another course:\n{difference}\n{report:?}\n{again:?}");
-            }
+    let first = disk.path().join("first");
+    let report = process::run(simulation, Some(&first));
+    let hash = hash_of(&first);
+    let repeat = &|number: usize| {
+        let path = disk.path().join(format!("again-{number}"));
+        let again = process::run(simulation, Some(&path));
+        if hash_of(&path) == hash && again == report {
             fs::remove_file(path).expect("a trace");
-        };
-        for numbers in (1..n_times).collect::<Vec<_>>().chunks(2) {
-            std::thread::scope(|scope| {
-                numbers.iter().for_each(|number| drop(scope.spawn(|| repeat(*number))));
-            });
+            return Ok(());
         }
-        let n_lines = lines(&first).count();
-        assert!(n_lines > 1000, "{simulation}: a trace of {n_lines} lines");
-        println!("{simulation}: {n_times} times {hash:016x}, {n_lines} lines");
+        let difference = first_difference(&first, &path);
+        Err(format!("{simulation} took another course:\n{difference}\n{report:?}\n{again:?}"))
+    };
+    for numbers in (1..n_times).collect::<Vec<_>>().chunks(2) {
+        std::thread::scope(|scope| {
+            let start = |number: &usize| {
+                let number = *number;
+                scope.spawn(move || repeat(number))
+            };
+            let repeats: Vec<_> = numbers.iter().map(start).collect();
+            repeats.into_iter().try_for_each(|repeat| repeat.join().expect("nobody panics"))
+        })?;
     }
+    let n_lines = lines(&first).count();
+    assert!(n_lines > 1000, "{simulation}: a trace of {n_lines} lines");
+    Ok(format!("{simulation}: {n_times} times {hash:016x}, {n_lines} lines"))
 }
 
 /// Does `work` while more threads than there are processors compute.
-pub(crate) fn on_a_busy_machine(work: impl FnOnce()) {
+pub(crate) fn on_a_busy_machine<T>(work: impl FnOnce() -> T) -> T {
     struct Stop<'a>(&'a AtomicBool);
     impl Drop for Stop<'_> {
         fn drop(&mut self) {
@@ -61,8 +69,8 @@ pub(crate) fn on_a_busy_machine(work: impl FnOnce()) {
                 }
             });
         }
-        work();
-    });
+        work()
+    })
 }
 
 fn hash_of(path: &Path) -> u64 {

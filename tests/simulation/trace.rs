@@ -5,26 +5,20 @@ use std::fs::File;
 use std::hash::{DefaultHasher, Hasher as _};
 use std::io::{BufWriter, Write as _};
 use std::path::Path;
-use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Mutex, MutexGuard, PoisonError};
-use std::time::Duration;
 
 use tracing::field::{Field, Visit};
 use tracing::span::{Attributes, Id, Record};
 use tracing::{Event, Level, Metadata, Subscriber};
 
+use crate::system;
+
 /// Characters of a field that are written down; the rest is told apart by its hash.
 const MAX_FIELD_CHARS: usize = 240;
 
-/// Simulated time, microseconds.
-static NOW: AtomicU64 = AtomicU64::new(0);
 /// Whether what happens is not written down.
 static IS_PAUSED: AtomicBool = AtomicBool::new(false);
-
-/// Sets the simulated time of what happens from now on.
-pub(crate) fn set_now(now: Duration) {
-    NOW.store(u64::try_from(now.as_micros()).expect("an hour at most"), Ordering::Relaxed);
-}
 
 /// Leaves out what happens during `work`: what a crashed host's threads still do, nobody sees.
 pub(crate) fn without<T>(work: impl FnOnce() -> T) -> T {
@@ -92,7 +86,7 @@ impl Subscriber for TraceWriter {
         let mut line = Line::default();
         event.record(&mut line);
         let mut state = self.lock();
-        let now = Duration::from_micros(NOW.load(Ordering::Relaxed)).as_secs_f64();
+        let now = system::now().as_secs_f64();
         let node = state.node.and_then(|node_idx| state.nodes.get(node_idx)).cloned();
         let (node, target) = (node.unwrap_or_default(), event.metadata().target());
         writeln!(state.file, "{now:9.3}{node} {target}{}", line.0).expect("room for the trace");
