@@ -27,7 +27,7 @@ pub(crate) fn print(line: impl Display) -> Result<(), Failed> {
 /// Prints what the command line asked for: `--help` or `--version`.
 ///
 /// # Errors
-/// As for [`print`].
+/// As for [`print()`].
 pub(crate) fn print_help(help: &clap::Error) -> Result<(), Failed> {
     checked(help.print().and_then(|()| io::stdout().flush()))
 }

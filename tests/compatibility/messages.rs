@@ -44,7 +44,6 @@ fn generated_types_keep_every_field() {
 }
 
 /// Decodes and encodes `bytes` as the generated type called `name`.
-#[expect(clippy::too_many_lines, reason = "a line for each message")]
 fn read_and_write(name: &str, bytes: &[u8]) -> Vec<u8> {
     macro_rules! one_of {
         ($($message:ident),* $(,)?) => {
