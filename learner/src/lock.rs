@@ -63,6 +63,15 @@ impl DirectoryLock {
     }
 }
 
+impl Drop for DirectoryLock {
+    /// Releases the lock. Closing the directory is not enough while a process that was just forked has a copy of it.
+    fn drop(&mut self) {
+        if let Err(error) = self.directory.unlock() {
+            tracing::debug!(%error, path = ?self.path, "the lock on the directory is not released");
+        }
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use std::fs;
@@ -78,8 +87,10 @@ mod tests {
         let keep = tempfile::tempdir().expect("a directory");
         let held = DirectoryLock::try_take(keep.path()).expect("a directory").expect("free");
         assert!(!is_free(keep.path()));
+        let copy = held.directory.try_clone().expect("a copy, as a forked process has it");
         drop(held);
         assert!(is_free(keep.path()));
+        drop(copy);
     }
 
     #[test]

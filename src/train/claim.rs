@@ -8,7 +8,7 @@ use tandem_teacher::ledger::{OpenError, SqliteLedger};
 
 use super::plan::Plan;
 use crate::exit::{Exit, Failed, OrExit as _};
-use crate::{clock, run_directory, services};
+use crate::{clock, output, run_directory, services};
 
 /// How long a process that was killed a moment ago may take to be gone.
 const GONE_PATIENCE: Duration = Duration::from_secs(1);
@@ -83,10 +83,9 @@ fn open_ledger(path: &Path) -> Result<Option<SqliteLedger>, Failed> {
 }
 
 /// Tries until it is done; says what is waited for, and gives up when that takes too long.
-#[expect(clippy::print_stderr, reason = "what a person waits for")]
 fn awaited<T>(who: &str, take: impl FnMut() -> Result<Option<T>, Failed>) -> Result<T, Failed> {
     let patience_s = FORMER_PATIENCE.as_secs();
-    let say = || eprintln!("{who}: waiting up to {patience_s} s for its end");
+    let say = || output::message(format_args!("{who}: waiting up to {patience_s} s for its end"));
     let taken = tried_for(FORMER_PATIENCE, say, take)?;
     taken.ok_or_else(|| try_again(format!("{who} after {patience_s} s: end it, then try again")))
 }

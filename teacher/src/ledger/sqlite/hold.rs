@@ -42,7 +42,7 @@ pub(super) struct Hold {
     /// SQLite's write-ahead log, once it exists.
     log: Option<FileId>,
     /// Has the lock.
-    _file: File,
+    file: File,
 }
 
 /// Why nothing more is written to a ledger.
@@ -85,7 +85,7 @@ impl Hold {
         let resolved = std::fs::canonicalize(&absolute).map_err(failed)?;
         let id = FileId::of(&metadata);
         held.insert(id);
-        Ok(Self { id, path: absolute, resolved, log: None, _file: file })
+        Ok(Self { id, path: absolute, resolved, log: None, file })
     }
 
     /// The path to give to SQLite.
@@ -117,7 +117,11 @@ impl Hold {
 }
 
 impl Drop for Hold {
+    /// Releases the lock. Closing the file is not enough while a process that was just forked has a copy of it.
     fn drop(&mut self) {
+        if let Err(error) = fcntl(&self.file, FcntlArg::F_OFD_SETLK(&byte_lock(libc::F_UNLCK))) {
+            tracing::warn!(%error, path = ?self.path, "the lock on the ledger is not released");
+        }
         HELD.lock().unwrap_or_else(PoisonError::into_inner).remove(&self.id);
     }
 }
@@ -160,17 +164,21 @@ fn check_names(metadata: &Metadata, path: &Path) -> Result<(), OpenError> {
 
 /// Locks one byte with a lock that belongs to `file`, not to the process.
 fn lock(file: &File, path: &Path) -> Result<(), OpenError> {
-    let lock = libc::flock {
-        l_type: i16::try_from(libc::F_WRLCK).expect("a small number"),
+    match fcntl(file, FcntlArg::F_OFD_SETLK(&byte_lock(libc::F_WRLCK))) {
+        Ok(_) => Ok(()),
+        Err(Errno::EAGAIN | Errno::EACCES) => Err(OpenError::InUse(path.to_owned())),
+        Err(errno) => Err(OpenError::Io { path: path.to_owned(), source: errno.into() }),
+    }
+}
+
+/// Describes a lock of `kind` on the locked byte.
+fn byte_lock(kind: i32) -> libc::flock {
+    libc::flock {
+        l_type: i16::try_from(kind).expect("a small number"),
         l_whence: i16::try_from(libc::SEEK_SET).expect("a small number"),
         l_start: LOCKED_BYTE,
         l_len: 1,
         l_pid: 0,
-    };
-    match fcntl(file, FcntlArg::F_OFD_SETLK(&lock)) {
-        Ok(_) => Ok(()),
-        Err(Errno::EAGAIN | Errno::EACCES) => Err(OpenError::InUse(path.to_owned())),
-        Err(errno) => Err(OpenError::Io { path: path.to_owned(), source: errno.into() }),
     }
 }
 
@@ -189,4 +197,21 @@ fn open_failed(path: &Path, source: io::Error) -> OpenError {
         _ => return OpenError::Io { path, source },
     };
     OpenError::BadPath { path, what }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_ledger_is_free_at_once_although_a_forked_process_has_a_copy_of_its_file() {
+        let directory = tempfile::tempdir().expect("a directory");
+        let path = directory.path().join("ledger.sqlite");
+        let hold = Hold::take(&path).expect("free");
+        let copy = hold.file.try_clone().expect("a copy");
+        assert!(matches!(Hold::take(&path), Err(OpenError::InUse(_))));
+        drop(hold);
+        assert!(Hold::take(&path).is_ok(), "free again");
+        drop(copy);
+    }
 }
