@@ -150,6 +150,9 @@ fn a_refused_resume_does_not_reach_the_run_that_is_under_way() {
     let (keep, out) = directory();
     let run = start(&out);
     wait_for_checkpoint(&out);
+    // So that the run does not end before all has been tried.
+    let workers = pids(&run, "worker");
+    workers.iter().for_each(|pid| signal("-STOP", *pid));
     let (before, other) = (kept(&out), other_teacher(keep.path()));
     for name in fs::read_dir(&out).expect("a run").flatten().map(|entry| entry.file_name()) {
         if name.as_bytes().ends_with(b".lock") {
@@ -169,6 +172,7 @@ fn a_refused_resume_does_not_reach_the_run_that_is_under_way() {
     fs::copy(&other, out.join("policy/teacher.safetensors")).expect("writable");
     kill_one(&run, "teacher");
     kill_one(&run, "learner");
+    workers.iter().for_each(|pid| signal("-CONT", *pid));
     assert_eq!(digest(&run.wait_with_output().expect("ends")), CALM.1);
     assert!(!out.join("in-use").exists(), "it ends with the run");
 }
