@@ -22,7 +22,7 @@ use std::time::Duration;
 
 use rand_chacha::ChaCha20Rng;
 use rand_chacha::rand_core::{Rng as _, SeedableRng as _};
-use tandem_net::{Gate, Incoming};
+use tandem_net::{Gate, Incoming, SHUTDOWN_GRACE};
 use tandem_proto::pb::bridge_server::{Bridge, BridgeServer};
 use tandem_proto::{DecodeError, pb};
 use tokio::sync::{Semaphore, watch};
@@ -46,8 +46,6 @@ pub use time::Time;
 const MAX_REQUEST_BYTES: usize = 16 << 20;
 /// How long a motion waits until it is its turn to be checked.
 const CHECK_QUEUE: Duration = Duration::from_secs(4);
-/// How long calls under way, and the driver, may take to finish once the service shall end.
-const SHUTDOWN_GRACE: Duration = Duration::from_secs(5);
 
 /// What a bridge service needs to know beside its arms.
 #[derive(Clone)]
@@ -91,20 +89,10 @@ pub async fn serve(
     let service = BridgeService::new(arms, config);
     let bridge = BridgeServer::new(service).max_decoding_message_size(MAX_REQUEST_BYTES);
     let router = gate.router(bridge).await?;
-    let served =
-        router.serve_with_incoming_shutdown(incoming.into(), ends.clone().cancelled_owned());
-    let served = tokio::select! {
-        outcome = served => outcome,
-        () = grace_after(&ends) => Ok(()),
-    };
+    let served = tandem_net::serve(router, incoming, ends.clone()).await;
     ends.cancel();
     thread.join(SHUTDOWN_GRACE).await?;
     Ok(served?)
-}
-
-async fn grace_after(ends: &CancellationToken) {
-    ends.cancelled().await;
-    tokio::time::sleep(SHUTDOWN_GRACE).await;
 }
 
 /// Logs why the arms were stopped. The thread that ticks does not: it must not wait for a log.

@@ -17,7 +17,7 @@ use tokio_util::sync::CancellationToken;
 use tonic::{Request, Response, Status, Streaming};
 
 use crate::error::Error;
-use crate::service::{MAX_MESSAGE_BYTES, SHUTDOWN_GRACE, check_version};
+use crate::service::{MAX_MESSAGE_BYTES, check_version};
 use crate::shared::KEPT_VERSIONS;
 
 /// How long the learner may take to answer; a question for work is held there for some seconds.
@@ -41,16 +41,7 @@ pub async fn serve(
     let relay = Relay { client, cache: Mutex::default() };
     let server = LearnerServer::new(relay).max_decoding_message_size(MAX_MESSAGE_BYTES);
     let router = gate.router(server).await?;
-    let serving =
-        router.serve_with_incoming_shutdown(incoming.into(), shutdown.clone().cancelled_owned());
-    let grace = async {
-        shutdown.cancelled().await;
-        tokio::time::sleep(SHUTDOWN_GRACE).await;
-    };
-    tokio::select! {
-        served = serving => Ok(served?),
-        () = grace => Ok(()),
-    }
+    Ok(tandem_net::serve(router, incoming, shutdown).await?)
 }
 
 struct Relay {

@@ -37,8 +37,6 @@ const WORK_POLL: Duration = Duration::from_secs(2);
 const LINGER: Duration = Duration::from_millis(1500);
 /// Pause between two looks whether all workers have heard of it.
 const LINGER_TICK: Duration = Duration::from_millis(50);
-/// How long calls that are open may take to finish once the service shall end.
-pub(crate) const SHUTDOWN_GRACE: Duration = Duration::from_secs(5);
 /// Largest message taken in; a slot of 64 two-arm episodes has 1 MB.
 pub(crate) const MAX_MESSAGE_BYTES: usize = 64 << 20;
 
@@ -127,10 +125,8 @@ pub async fn serve_beside(
         })
     };
     let serving = async {
-        let stopping = stop_serving.clone().cancelled_owned();
         let served = tokio::select! {
-            served = router.serve_with_incoming_shutdown(incoming.into(), stopping) => served,
-            () = grace_after(&stop_serving) => Ok(()),
+            served = tandem_net::serve(router, incoming, stop_serving) => served,
             () = showing => Ok(()),
         };
         // A server that fails takes the run with it: nobody can reach it any more.
@@ -183,12 +179,6 @@ async fn stay(after_the_end: AfterTheEnd, shutdown: CancellationToken) {
     if after_the_end == AfterTheEnd::Stay {
         shutdown.cancelled().await;
     }
-}
-
-/// A watcher that reads nothing keeps its call open for ever.
-async fn grace_after(stop_serving: &CancellationToken) {
-    stop_serving.cancelled().await;
-    tokio::time::sleep(SHUTDOWN_GRACE).await;
 }
 
 /// Runs the run and tells workers and watchers how it ended, even when that is by a bug.

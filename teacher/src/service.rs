@@ -7,7 +7,7 @@ mod thread;
 use std::path::PathBuf;
 use std::time::Duration;
 
-use tandem_net::{Gate, Incoming, Pacing};
+use tandem_net::{Gate, Incoming, Pacing, SHUTDOWN_GRACE};
 use tandem_proto::pb::teacher_server::{Teacher, TeacherServer};
 use tandem_proto::{decode_account_name, pb};
 use tokio_util::sync::CancellationToken;
@@ -26,8 +26,6 @@ use thread::{AdvisorHandle, AdvisorThread};
 const MAX_REQUEST_BYTES: usize = 4 << 20;
 /// How long a call waits for its answer: less than a learner waits for a call.
 const PATIENCE: Duration = Duration::from_secs(4);
-/// How long calls that are being answered may take to finish once the service shall end.
-const SHUTDOWN_GRACE: Duration = Duration::from_secs(5);
 
 /// What a teacher service needs to know.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -80,23 +78,8 @@ pub async fn serve_advisor(
     let service = TeacherService { advisor, stop: stop.clone() };
     let teacher = TeacherServer::new(service).max_decoding_message_size(MAX_REQUEST_BYTES);
     let router = gate.router(teacher).await?;
-    let served =
-        router.serve_with_incoming_shutdown(incoming.into(), stop.clone().cancelled_owned());
-    tokio::select! {
-        outcome = served => {
-            outcome?;
-            thread.join(SHUTDOWN_GRACE).await
-        }
-        () = grace_after(&stop) => {
-            tracing::warn!("calls still open after the grace period were cut off");
-            thread.join(Duration::ZERO).await
-        }
-    }
-}
-
-async fn grace_after(shutdown: &CancellationToken) {
-    shutdown.cancelled().await;
-    tokio::time::sleep(SHUTDOWN_GRACE).await;
+    tandem_net::serve(router, incoming, stop).await?;
+    thread.join(SHUTDOWN_GRACE).await
 }
 
 /// What the generated server calls.

@@ -143,7 +143,7 @@ impl Fake {
         let (listener, address) = bound().await;
         let router =
             Gate::default().router(LearnerServer::new(self.clone())).await.expect("serves");
-        tokio::spawn(router.serve_with_incoming(tandem_net::Incoming::from(listener)));
+        tokio::spawn(tandem_net::serve(router, listener, CancellationToken::new()));
         address
     }
 

@@ -4,10 +4,11 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::net::SocketAddr;
 use std::sync::{Arc, Mutex, MutexGuard};
 
+use tandem_net::Gate;
 use tandem_proto::pb;
 use tandem_proto::pb::teacher_server::{Teacher, TeacherServer};
 use tokio::net::TcpListener;
-use tokio_stream::wrappers::TcpListenerStream;
+use tokio_util::sync::CancellationToken;
 use tonic::{Request, Response, Status, Streaming};
 
 #[derive(Default, Clone)]
@@ -79,10 +80,9 @@ impl FakeTeacher {
     pub(crate) async fn serve(&self) -> SocketAddr {
         let listener = TcpListener::bind("127.0.0.1:0").await.expect("a port");
         let address = listener.local_addr().expect("bound");
-        let server = tonic::transport::Server::builder()
-            .add_service(TeacherServer::new(self.clone()))
-            .serve_with_incoming(TcpListenerStream::new(listener));
-        tokio::spawn(server);
+        let router = Gate::default().router(TeacherServer::new(self.clone())).await;
+        let router = router.expect("can be offered");
+        tokio::spawn(tandem_net::serve(router, listener, CancellationToken::new()));
         address
     }
 

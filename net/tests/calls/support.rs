@@ -12,6 +12,7 @@ use tandem_proto::pb::teacher_server::{Teacher, TeacherServer};
 use tokio::net::TcpListener;
 use tokio::task::JoinHandle;
 use tokio_stream::Stream;
+use tokio_util::sync::CancellationToken;
 use tonic::{Request, Response, Status, Streaming};
 
 pub(crate) const SECRET: &str = "the-right-token-0123";
@@ -130,7 +131,7 @@ pub(crate) async fn serve(incoming: impl Into<Incoming>, gate: &Gate) -> (Counte
     let router = gate.router(TeacherServer::new(counter.clone())).await.expect("can be offered");
     let incoming = incoming.into();
     let serving = tokio::spawn(async move {
-        router.serve_with_incoming(incoming).await.expect("serves");
+        tandem_net::serve(router, incoming, CancellationToken::new()).await.expect("serves");
     });
     (counter, serving)
 }

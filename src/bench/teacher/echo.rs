@@ -2,7 +2,7 @@
 
 use std::pin::Pin;
 
-use tandem_net::{Gate, Incoming};
+use tandem_net::Gate;
 use tandem_proto::pb;
 use tandem_proto::pb::teacher_server::{Teacher, TeacherServer};
 use tokio::net::TcpListener;
@@ -17,10 +17,7 @@ pub(super) async fn serve(
     shutdown: CancellationToken,
 ) -> anyhow::Result<()> {
     let router = Gate::default().router(TeacherServer::new(Echo { answer })).await?;
-    router
-        .serve_with_incoming_shutdown(Incoming::from(listener), shutdown.cancelled_owned())
-        .await?;
-    Ok(())
+    Ok(tandem_net::serve(router, listener, shutdown).await?)
 }
 
 struct Echo {

@@ -11,10 +11,11 @@ use tandem_core::work::{
     EpisodeOrder, Exploration, PublishedActor, RunTerms, SlotOrder, WorldTerms,
 };
 use tandem_core::{EpisodeKind, Layout, Task};
+use tandem_net::{Gate, GateError, Router};
 use tandem_proto::pb::learner_server::LearnerServer;
 use tandem_proto::pb::teacher_server::TeacherServer;
 use tokio::runtime::Runtime;
-use tonic::transport::server::{Router, TcpIncoming};
+use tokio_util::sync::CancellationToken;
 
 use learner::FakeLearner;
 use teacher::FakeTeacher;
@@ -87,16 +88,19 @@ impl Server {
 
     pub(crate) fn learner_on(listener: TcpListener, learner: &Arc<FakeLearner>) -> Self {
         let service = LearnerServer::from_arc(Arc::clone(learner));
-        Self::serve(listener, tonic::transport::Server::builder().add_service(service))
+        Self::serve(listener, async { Gate::default().router(service).await })
     }
 
     pub(crate) fn teacher(teacher: &Arc<FakeTeacher>) -> Self {
-        let service = TeacherServer::from_arc(Arc::clone(teacher));
         let listener = TcpListener::bind("127.0.0.1:0").expect("loopback");
-        Self::serve(listener, tonic::transport::Server::builder().add_service(service))
+        let service = TeacherServer::from_arc(Arc::clone(teacher));
+        Self::serve(listener, async { Gate::default().router(service).await })
     }
 
-    fn serve(listener: TcpListener, router: Router) -> Self {
+    fn serve(
+        listener: TcpListener,
+        router: impl Future<Output = Result<Router, GateError>> + Send + 'static,
+    ) -> Self {
         let address = listener.local_addr().expect("bound");
         listener.set_nonblocking(true).expect("a socket can be made so");
         let runtime =
@@ -104,7 +108,8 @@ impl Server {
         let runtime = runtime.expect("a runtime");
         runtime.spawn(async move {
             let listener = tokio::net::TcpListener::from_std(listener).expect("within a runtime");
-            router.serve_with_incoming(TcpIncoming::from(listener).with_nodelay(Some(true))).await
+            let router = router.await.expect("can be offered");
+            tandem_net::serve(router, listener, CancellationToken::new()).await
         });
         Self { runtime: Some(runtime), address }
     }
