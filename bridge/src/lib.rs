@@ -5,8 +5,8 @@
 //! stands in where there are no arms. [`layout`] says how the arms stand and what their motions have to keep. [`service`] offers
 //! it all as `tandem.v1.Bridge`.
 //!
-//! Real arms are behind features of this crate: `quarc` for arms that a Simulink model drives by way of QUARC, `kinova-ros`
-//! for arms behind Kinova's ROS driver.
+//! Drivers of real arms are [`quarc`], for arms that a Simulink model drives by way of QUARC, and [`kinova_ros`], for arms
+//! behind Kinova's ROS driver.
 //!
 //! Nothing here reads a clock, and but for the service and the drivers of real arms nothing knows a wire: whoever ticks the
 //! executor says what time it is, in seconds since a start of their own.
@@ -14,10 +14,8 @@
 
 pub mod driver;
 pub mod executor;
-#[cfg(feature = "kinova-ros")]
 pub mod kinova_ros;
 pub mod layout;
-#[cfg(feature = "quarc")]
 pub mod quarc;
 pub mod service;
 pub mod simulated;

@@ -59,7 +59,6 @@ fn simulated(seed: u64, time: Arc<dyn Time>) -> Result<AnyDriver, Failed> {
 }
 
 /// Arms behind a Simulink model.
-#[cfg(feature = "quarc")]
 fn quarc() -> Result<(Connect, Settings), Failed> {
     use tandem_bridge::quarc::{QuarcConfig, QuarcDriver};
     fn connect(address: &str) -> Result<AnyDriver, DriverError> {
@@ -68,29 +67,11 @@ fn quarc() -> Result<(Connect, Settings), Failed> {
     Ok((connect, Settings::default()))
 }
 
-#[cfg(not(feature = "quarc"))]
-fn quarc() -> Result<(Connect, Settings), Failed> {
-    Err(not_built("quarc"))
-}
-
 /// Arms behind Kinova's ROS driver.
-#[cfg(feature = "kinova-ros")]
 fn kinova_ros() -> Result<(Connect, Settings), Failed> {
     use tandem_bridge::kinova_ros::{KinovaRosConfig, KinovaRosDriver, settings};
     fn connect(address: &str) -> Result<AnyDriver, DriverError> {
         Ok(Box::new(KinovaRosDriver::connect(KinovaRosConfig::at(address))?))
     }
     Ok((connect, settings()))
-}
-
-#[cfg(not(feature = "kinova-ros"))]
-fn kinova_ros() -> Result<(Connect, Settings), Failed> {
-    Err(not_built("kinova-ros"))
-}
-
-#[cfg(not(all(feature = "quarc", feature = "kinova-ros")))]
-fn not_built(feature: &str) -> Failed {
-    Failed::usage(format!(
-        "this program was built without the driver {feature}: build it with --features {feature}"
-    ))
 }

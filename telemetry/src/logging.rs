@@ -5,8 +5,8 @@ use std::io::IsTerminal as _;
 use std::path::PathBuf;
 use std::sync::Mutex;
 
-use tracing_subscriber::filter::EnvFilter;
 pub use tracing_subscriber::filter::LevelFilter;
+use tracing_subscriber::filter::Targets;
 use tracing_subscriber::fmt;
 use tracing_subscriber::layer::{Layer as _, SubscriberExt as _};
 use tracing_subscriber::util::SubscriberInitExt as _;
@@ -21,7 +21,7 @@ pub struct LogConfig {
     pub console: Option<LevelFilter>,
     /// A file that gets everything from `info` up; lines are added to what it has.
     pub file: Option<PathBuf>,
-    /// Directives that take the place of the levels above, in the syntax of `RUST_LOG`.
+    /// Directives that take the place of the levels above: `LEVEL` or `TARGET=LEVEL`, separated by commas.
     pub directives: Option<String>,
 }
 
@@ -56,9 +56,7 @@ pub fn init(config: &LogConfig) -> Result<(), Error> {
 }
 
 /// Our own crates from `level` up, others' warnings.
-fn filter(level: LevelFilter, config: &LogConfig) -> Result<EnvFilter, Error> {
+fn filter(level: LevelFilter, config: &LogConfig) -> Result<Targets, Error> {
     let directives = config.directives.clone().unwrap_or_else(|| format!("warn,tandem={level}"));
-    EnvFilter::builder()
-        .parse(&directives)
-        .map_err(|source| Error::LogFilter { filter: directives, source })
+    directives.parse().map_err(|source| Error::LogFilter { filter: directives, source })
 }
