@@ -18,6 +18,7 @@ use tandem_proto::pb::teacher_client::TeacherClient;
 use tokio::runtime::Builder;
 use toml::{Table, Value};
 use tonic::Request;
+use tonic::transport::Endpoint;
 
 use cluster::{Cluster, SECRETS};
 use manifests::Manifests;
@@ -63,7 +64,8 @@ fn account(cluster: &Cluster, teacher: &str, name: &str) -> (u64, u64) {
     request.metadata_mut().insert("authorization", token);
     let runtime = Builder::new_current_thread().enable_all().build().expect("a runtime");
     let account = runtime.block_on(async {
-        let mut teacher = TeacherClient::connect(address).await.expect("it listens");
+        let mut teacher =
+            TeacherClient::new(Endpoint::from_shared(address).expect("an address").connect_lazy());
         teacher.get_account(request).await.expect("an account").into_inner()
     });
     assert_eq!(account.leased, 0);

@@ -152,12 +152,8 @@ struct Client {
 
 impl Client {
     fn of(addresses: &[String], number: u64) -> Self {
-        let connect = |address: &String| {
-            let endpoint = Endpoint::from_shared(format!("http://{address}")).expect("an address");
-            TeacherClient::new(endpoint.timeout(DEADLINE).connect_lazy())
-        };
         let asked = usize::try_from(number).expect("few") % addresses.len();
-        Self { teachers: addresses.iter().map(connect).collect(), asked }
+        Self { teachers: addresses.iter().map(|address| client_of(address)).collect(), asked }
     }
 
     async fn advise(&mut self, request: &pb::AdviseRequest) -> pb::AdviseResponse {
@@ -213,13 +209,16 @@ fn runtime() -> Runtime {
     Builder::new_multi_thread().worker_threads(2).enable_all().build().expect("a runtime")
 }
 
+/// Connects at the first call. To connect here would compile the client again, for this file.
+fn client_of(address: &str) -> TeacherClient<Channel> {
+    let endpoint = Endpoint::from_shared(format!("http://{address}")).expect("an address");
+    TeacherClient::new(endpoint.timeout(DEADLINE).connect_lazy())
+}
+
 fn open_account(runtime: &Runtime, address: &str, budget: u64) {
-    let address = format!("http://{address}");
     let request =
         pb::OpenAccountRequest { name: ACCOUNT.to_owned(), budget, strategy: "ea".to_owned() };
-    let opened = runtime.block_on(async {
-        TeacherClient::connect(address).await.expect("connected").open_account(request).await
-    });
+    let opened = runtime.block_on(async { client_of(address).open_account(request).await });
     assert_eq!(opened.expect("opened").into_inner().left, budget);
 }
 
@@ -237,11 +236,8 @@ fn start_clients(runtime: &Runtime, addresses: &[String], told: &Arc<Told>) -> J
 fn check_sums(runtime: &Runtime, clients: JoinSet<()>, address: &str, told: &Told, budget: u64) {
     let done = async { tokio::time::timeout(DEADLINE, clients.join_all()).await };
     runtime.block_on(done).expect("all clients are done");
-    let address = format!("http://{address}");
     let request = pb::GetAccountRequest { name: ACCOUNT.to_owned() };
-    let account = runtime.block_on(async {
-        TeacherClient::connect(address).await.expect("connected").get_account(request).await
-    });
+    let account = runtime.block_on(async { client_of(address).get_account(request).await });
     let account = account.expect("an account").into_inner();
     let told = told.verdicts.lock().expect("whole");
     assert_eq!(account.spent, budget);
@@ -292,10 +288,7 @@ fn ask_once(
 ) -> Result<Vec<bool>, tonic::Status> {
     let steps = steps.map(|step| query(1, step)).collect();
     let request = pb::AdviseRequest { account: ACCOUNT.to_owned(), steps };
-    let address = format!("http://{address}");
-    let answer = runtime.block_on(async {
-        TeacherClient::connect(address).await.expect("connected").advise(request).await
-    })?;
+    let answer = runtime.block_on(async { client_of(address).advise(request).await })?;
     Ok(answer.into_inner().steps.iter().map(|step| step.charged).collect())
 }
 

@@ -266,13 +266,13 @@ impl Rig {
             tokio::spawn(
                 async move { serve(executor, config, listener, &Gate::default(), ends).await },
             );
-        let client = connect(address).await;
+        let client = connect(address);
         Self { client, clock, tap, shutdown, served, address }
     }
 
     /// A client of its own connection.
     pub(crate) async fn stranger(&self) -> BridgeClient<Channel> {
-        connect(self.address).await
+        connect(self.address)
     }
 
     pub(crate) async fn acquire(&mut self) -> String {
@@ -393,9 +393,9 @@ impl Playing {
     }
 }
 
-async fn connect(address: SocketAddr) -> BridgeClient<Channel> {
+fn connect(address: SocketAddr) -> BridgeClient<Channel> {
     let endpoint = Channel::from_shared(format!("http://{address}")).unwrap();
-    BridgeClient::new(endpoint.connect().await.unwrap())
+    BridgeClient::new(endpoint.connect_lazy())
 }
 
 pub(crate) fn request(request: pb::execute_request::Request) -> pb::ExecuteRequest {

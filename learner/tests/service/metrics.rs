@@ -6,12 +6,11 @@ use std::time::Duration;
 
 use tandem_learner::{AfterTheEnd, Beside, serve_beside};
 use tandem_proto::pb;
-use tandem_proto::pb::learner_client::LearnerClient;
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tokio::net::{TcpListener, TcpStream};
 use tokio_util::sync::CancellationToken;
 
-use crate::run::{DEADLINE, Toy, learner_config};
+use crate::run::{DEADLINE, Toy, client_of, learner_config};
 use crate::toy;
 
 /// What stands at `/metrics`: values by name and labels.
@@ -71,8 +70,7 @@ async fn figures_say_who_waits_and_how_far_the_run_is_and_stay_after_its_end() {
     assert_eq!(figures["tandem_run_info{task=\"push\",arms=\"1\",strategy=\"none\"}"], 1.0);
     assert!(!figures.contains_key("tandem_evaluation_success_ratio"), "nothing was judged yet");
 
-    let client =
-        || async { LearnerClient::connect(format!("http://{address}")).await.expect("it listens") };
+    let client = || async { client_of(address) };
     let mut toy = Toy::join(client().await, "toy").await.expect("it lives");
     let (order, episodes) = toy.take().await.expect("a slot");
     let figures = scrape(metrics_at).await;

@@ -16,7 +16,7 @@ use tokio_util::sync::CancellationToken;
 use tonic::transport::Channel;
 use tonic::{Code, Request, Response, Status};
 
-use crate::run::{DEADLINE, Left, Served, Toy, VERSION, calm, learner_config};
+use crate::run::{DEADLINE, Left, Served, Toy, VERSION, calm, client_of, learner_config};
 use crate::toy::config;
 
 async fn bound() -> (TcpListener, SocketAddr) {
@@ -39,7 +39,7 @@ async fn relay(learner: SocketAddr) -> (SocketAddr, tokio_util::sync::DropGuard)
 }
 
 async fn client(address: SocketAddr) -> LearnerClient<Channel> {
-    LearnerClient::connect(format!("http://{address}")).await.expect("it listens")
+    client_of(address)
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

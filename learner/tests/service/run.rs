@@ -20,7 +20,7 @@ use tokio::net::TcpListener;
 use tokio::task::JoinHandle;
 use tokio_util::sync::CancellationToken;
 use tonic::Status;
-use tonic::transport::Channel;
+use tonic::transport::{Channel, Endpoint};
 
 use crate::toy::{LAYOUT, play};
 
@@ -59,6 +59,12 @@ pub(crate) struct Served {
     ended: JoinHandle<Result<Ended, Error>>,
 }
 
+/// Connects at the first call. To connect here would compile the client again, for this file.
+pub(crate) fn client_of(address: SocketAddr) -> LearnerClient<Channel> {
+    let endpoint = Endpoint::from_shared(format!("http://{address}")).expect("an address");
+    LearnerClient::new(endpoint.connect_lazy())
+}
+
 impl Served {
     pub(crate) async fn start(config: LearnerConfig) -> Self {
         let listener = TcpListener::bind("127.0.0.1:0").await.expect("a port");
@@ -70,7 +76,7 @@ impl Served {
     }
 
     pub(crate) async fn client(&self) -> LearnerClient<Channel> {
-        LearnerClient::connect(format!("http://{}", self.address)).await.expect("it listens")
+        client_of(self.address)
     }
 
     pub(crate) async fn join(&self, name: &str) -> Toy {

@@ -43,8 +43,7 @@ impl Fixture {
         let ledger = Box::new(GatedLedger::new(watch.clone()));
         let advisor = Advisor::new(Box::new(FakePolicy), ledger).unwrap();
         let served = tokio::spawn(serve_open(advisor, listener, shutdown.clone()));
-        let channel =
-            Channel::from_shared(format!("http://{address}")).unwrap().connect().await.unwrap();
+        let channel = Channel::from_shared(format!("http://{address}")).unwrap().connect_lazy();
         Self { client: TeacherClient::new(channel.clone()), channel, watch, shutdown, served }
     }
 
