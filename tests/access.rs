@@ -74,6 +74,7 @@ fn an_address_that_others_can_reach_needs_a_token() {
         let health = place.run(&["health", &service.local_address()]);
         assert_eq!(String::from_utf8_lossy(&health.stdout), "serving\n");
     }
+    assert_eq!(safe.end(), Some(0), "{}", safe.log());
     assert!(safe.log().contains("without --tls-cert"), "{}", safe.log());
 }
 
@@ -115,7 +116,8 @@ fn a_token_that_everybody_can_read_is_used_with_a_warning() {
     for (mode, warned) in [(0o600, false), (0o640, false), (0o644, true)] {
         let mode = std::fs::Permissions::from_mode(mode);
         std::fs::set_permissions(place.path().join("token"), mode).expect("our own file");
-        let service = place.serve("teacher", &teacher(&["--token-file", "token"]));
+        let mut service = place.serve("teacher", &teacher(&["--token-file", "token"]));
+        assert_eq!(service.end(), Some(0), "{}", service.log());
         assert_eq!(service.log().contains("chmod 600"), warned, "{}", service.log());
     }
 }
@@ -161,9 +163,9 @@ fn a_service_that_never_answers_is_unwell_after_the_deadline() {
 #[tokio::test]
 async fn without_the_right_token_nothing_is_answered_and_nothing_happens() {
     let place = Place::new();
-    let teacher = place.serve("teacher", &teacher(&["--token-file", "token"]));
+    let mut teacher = place.serve("teacher", &teacher(&["--token-file", "token"]));
     let right = ["--teacher", &teacher.address, "--token-file", "token"];
-    let learner = place.serve("learner", &place.learner(&right));
+    let mut learner = place.serve("learner", &place.learner(&right));
     let relay = ["relay", "--connect", &learner.address, "--token-file", "token"];
     let relay = place.serve("relay", &relay);
 
@@ -204,7 +206,8 @@ async fn without_the_right_token_nothing_is_answered_and_nothing_happens() {
     let workers = tokio::time::timeout(program::DEADLINE, shown).await.expect("is shown");
     let names: Vec<String> = workers.into_iter().map(|worker| worker.name).collect();
     assert_eq!(names, ["friend"]);
-    for service in [&teacher, &learner] {
+    for service in [&mut teacher, &mut learner] {
+        service.end();
         assert!(!service.log().contains("intruder"), "{}", service.log());
     }
 }

@@ -68,12 +68,14 @@ pub enum Error {
         source: serde_json::Error,
     },
     /// The log filter cannot be understood.
-    #[error("log filter {filter:?} is malformed")]
+    #[error(
+        "log filter {filter:?} is malformed: expected LEVEL or TARGET=LEVEL, separated by commas"
+    )]
     LogFilter {
         /// The filter.
         filter: String,
-        /// What is wrong with it.
-        source: tracing_subscriber::filter::ParseError,
+        /// What is wrong with it, where it has the form of directives.
+        source: Option<tracing_subscriber::filter::ParseError>,
     },
     /// Logging was set up twice in one process.
     #[error("logging is already set up")]

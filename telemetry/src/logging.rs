@@ -58,5 +58,33 @@ pub fn init(config: &LogConfig) -> Result<(), Error> {
 /// Our own crates from `level` up, others' warnings.
 fn filter(level: LevelFilter, config: &LogConfig) -> Result<Targets, Error> {
     let directives = config.directives.clone().unwrap_or_else(|| format!("warn,tandem={level}"));
-    directives.parse().map_err(|source| Error::LogFilter { filter: directives, source })
+    match directives.parse::<Targets>() {
+        Ok(filter) if filter.iter().all(|(target, _)| is_target(target)) => Ok(filter),
+        parsed => Err(Error::LogFilter { filter: directives, source: parsed.err() }),
+    }
+}
+
+/// Whether `name` can be the path of a module.
+fn is_target(name: &str) -> bool {
+    name.chars().all(|character| character.is_ascii_alphanumeric() || "_-:".contains(character))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_filter_is_a_list_of_levels_and_modules() {
+        let check = |directives: &str, is_good: bool| {
+            let config =
+                LogConfig { directives: Some(directives.to_owned()), ..LogConfig::default() };
+            assert_eq!(filter(LevelFilter::INFO, &config).is_ok(), is_good, "{directives:?}");
+        };
+        for good in ["info", "off", "tandem_learner=debug", "warn,tandem_net::link=trace,h2=info"] {
+            check(good, true);
+        }
+        for bad in ["[[", "tandem=loud", "tandem[run]=info", "a=b=c", "in fo"] {
+            check(bad, false);
+        }
+    }
 }

@@ -128,6 +128,13 @@ impl Running {
         self.child.try_wait().expect("ours").is_none()
     }
 
+    /// Asks the process to end and waits until it has: its log is then complete. Returns the exit code.
+    pub(crate) fn end(&mut self) -> Option<i32> {
+        let asked = Command::new("kill").arg(self.child.id().to_string()).status();
+        assert!(asked.expect("kill runs").success(), "{}", self.log());
+        self.wait()
+    }
+
     /// Waits for the end; gives the exit code.
     pub(crate) fn wait(&mut self) -> Option<i32> {
         self.child.wait().expect("ours").code()
