@@ -1,0 +1,80 @@
+//! A disk that tears writes, returns errors and loses power, and what becomes of runs and teachers on it.
+
+mod device;
+mod run;
+
+use std::collections::BTreeMap;
+use std::sync::atomic::{AtomicUsize, Ordering};
+
+use device::{Fault, Mode};
+use run::{CALM, check};
+
+/// Which files are hit, and at which share of the calls on them, in percent.
+fn faults(mode: Mode, hits: &[(&str, usize)]) -> Vec<Fault> {
+    let fault = |(pattern, percent): &(&str, usize)| {
+        let n_calls = CALM.1.iter().filter(|call| call.contains(pattern)).count();
+        assert!(n_calls > 0, "no call matches {pattern:?}");
+        Fault::new(mode, (n_calls * percent).div_ceil(100).max(1), pattern)
+    };
+    hits.iter().map(fault).collect()
+}
+
+#[test]
+fn a_run_survives_a_write_that_fails_once() {
+    let hits = [("fsync run/checkpoint/", 50), ("ledger.sqlite-wal", 60)];
+    faults(Mode::Once, &hits).iter().for_each(check);
+}
+
+/// Calls of every kind in every mode. `TANDEM_DISK_SWEEP` is the modes and how many calls of each kind are hit; 0 stands
+/// for all of them, which takes a day:
+///
+/// ```text
+/// TANDEM_DISK_SWEEP=once,dead,kill,cut:0 cargo test --release --test disk -- --ignored --nocapture
+/// ```
+#[test]
+#[ignore = "takes minutes to hours"]
+fn every_call_of_a_run_may_fail() {
+    #[expect(clippy::disallowed_methods, reason = "the one switch of this test")]
+    let part = std::env::var("TANDEM_DISK_SWEEP").unwrap_or("once,dead,kill,cut:1".to_owned());
+    let (modes, n_hits) = part.split_once(':').expect("MODES:COUNT");
+    let n_hits = n_hits.parse().expect("a number");
+    let faults = modes.split(',').flat_map(|mode| sweep(mode_of(mode), n_hits));
+    let faults: Vec<Fault> = faults.collect();
+    let next = AtomicUsize::new(0);
+    let failed = AtomicUsize::new(0);
+    let work = || {
+        while let Some(fault) = faults.get(next.fetch_add(1, Ordering::Relaxed)) {
+            match std::panic::catch_unwind(|| check(fault)) {
+                Ok(()) => println!("survived: {fault}"),
+                Err(_) => {
+                    println!("FAILED: {fault}");
+                    failed.fetch_add(1, Ordering::Relaxed);
+                }
+            }
+        }
+    };
+    std::thread::scope(|scope| (0..3).for_each(|_| drop(scope.spawn(work))));
+    assert_eq!(failed.into_inner(), 0, "of {} faults", faults.len());
+}
+
+fn mode_of(name: &str) -> Mode {
+    match name {
+        "once" => Mode::Once,
+        "dead" => Mode::Dead,
+        "kill" => Mode::Kill,
+        "cut" => Mode::Cut,
+        other => panic!("no mode is called {other:?}"),
+    }
+}
+
+/// Faults at `n_hits` calls of every kind, at equal distances, or at all of them.
+fn sweep(mode: Mode, n_hits: usize) -> Vec<Fault> {
+    let mut kinds: BTreeMap<&str, usize> = BTreeMap::new();
+    CALM.1.iter().for_each(|call| *kinds.entry(call).or_default() += 1);
+    let hits = |(kind, n_calls): (&&str, &usize)| {
+        let n_hits = if n_hits == 0 { *n_calls } else { n_hits.min(*n_calls) };
+        let at = |hit: usize| (hit * 2 + 1) * n_calls / (n_hits * 2) + 1;
+        (0..n_hits).map(|hit| Fault::new(mode, at(hit), kind)).collect::<Vec<_>>()
+    };
+    kinds.iter().flat_map(hits).collect()
+}
