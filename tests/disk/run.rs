@@ -199,7 +199,8 @@ fn signal(signal: &str, pid: u32) {
 
 /// Whether a line names what cannot be written, and why.
 pub(crate) fn names_the_fault(said: &str) -> bool {
-    let causes = ["Input/output error", "disk I/O error", "No space left", "disk is full"];
+    let of_sqlite = ["disk I/O error", "disk is full", "unable to open database file"];
+    let causes = [&["Input/output error", "No space left"][..], &of_sqlite].concat();
     let whats = ["checkpoint", "ledger", "metrics.jsonl", "policy", "run.toml", "/run", "in-use"];
     let names = |line: &str, words: &[&str]| words.iter().any(|word| line.contains(word));
     said.lines().any(|line| names(line, &causes) && names(line, &whats))
