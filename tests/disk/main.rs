@@ -2,11 +2,12 @@
 
 mod device;
 mod run;
+mod teacher;
 
 use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
-use device::{Fault, Mode};
+use device::{ENOSPC, Fault, Mode};
 use run::{CALM, check};
 
 /// Which files are hit, and at which share of the calls on them, in percent.
@@ -20,9 +21,38 @@ fn faults(mode: Mode, hits: &[(&str, usize)]) -> Vec<Fault> {
 }
 
 #[test]
-fn a_run_survives_a_write_that_fails_once() {
-    let hits = [("fsync run/checkpoint/", 50), ("ledger.sqlite-wal", 60)];
+fn a_run_survives_calls_that_fail_once() {
+    let hits = [
+        ("fsync run/checkpoint/#.tmp", 50),
+        ("pwrite run/ledger.sqlite-wal", 60),
+        ("write run/metrics.jsonl", 50),
+    ];
     faults(Mode::Once, &hits).iter().for_each(check);
+}
+
+#[test]
+fn a_run_on_a_disk_that_died_says_so_and_is_resumed_on_another() {
+    let hits = [("write run/checkpoint/#.tmp", 50), ("pwrite run/ledger.sqlite-wal", 30)];
+    faults(Mode::Dead, &hits).iter().for_each(check);
+    let full = faults(Mode::Dead, &[("write run/policy/last", 50)]).remove(0);
+    check(&Fault { errno: ENOSPC, ..full });
+}
+
+#[test]
+fn a_run_survives_processes_that_are_killed_as_they_write() {
+    let hits = [("write run/checkpoint/#.tmp", 70), ("pwrite run/ledger.sqlite-wal", 40)];
+    faults(Mode::Kill, &hits).iter().for_each(check);
+}
+
+#[test]
+fn a_run_is_resumed_after_a_power_cut() {
+    let hits = [
+        ("rename run/run.toml", 100),
+        ("mkdir run/in-use", 100),
+        ("pwrite run/ledger.sqlite-wal", 50),
+        ("rename run/checkpoint/", 60),
+    ];
+    faults(Mode::Cut, &hits).iter().for_each(check);
 }
 
 /// Calls of every kind in every mode. `TANDEM_DISK_SWEEP` is the modes and how many calls of each kind are hit; 0 stands

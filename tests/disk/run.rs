@@ -192,7 +192,7 @@ impl<'a> Run<'a> {
     }
 }
 
-fn signal(signal: &str, pid: u32) {
+pub(crate) fn signal(signal: &str, pid: u32) {
     let sent = Command::new("kill").args([signal, &pid.to_string()]).stderr(Stdio::null()).status();
     sent.expect("kill runs");
 }

@@ -86,9 +86,11 @@ struct Disk {
 #[derive(Clone, Copy, PartialEq, Eq)]
 enum Fate {
     Passes,
-    /// Fails with the error number; half of a write is written.
+    /// Fails with the error number; half of a write is written first.
+    Tears(c_int),
+    /// Fails with the error number and does nothing.
     Fails(c_int),
-    /// Ends the process; half of a write is written.
+    /// Ends the process; half of a write is written first.
     Kills,
 }
 
@@ -150,7 +152,7 @@ impl Disk {
             Some(fault) if n_matching == fault.at => {
                 self.counters.is_hit.store(1, Ordering::SeqCst);
                 match fault.mode {
-                    Mode::Once | Mode::Dead => Fate::Fails(fault.errno),
+                    Mode::Once | Mode::Dead => Fate::Tears(fault.errno),
                     Mode::Kill | Mode::Cut => Fate::Kills,
                 }
             }
@@ -266,7 +268,7 @@ macro_rules! changes {
                     let next = next!($name as extern "C" fn($($type),*) -> c_int);
                     next($($argument),*)
                 }
-                Fate::Fails(errno) => failed(errno),
+                Fate::Tears(errno) | Fate::Fails(errno) => failed(errno),
                 Fate::Kills => die(),
             }
         }
@@ -307,7 +309,7 @@ macro_rules! opens {
                     let next = next!($name as extern "C" fn($($type,)* c_int, c_uint) -> c_int);
                     next($($argument,)* $flags, mode)
                 }
-                Fate::Fails(errno) => failed(errno),
+                Fate::Tears(errno) | Fate::Fails(errno) => failed(errno),
                 Fate::Kills => die(),
             }
         }
@@ -333,7 +335,7 @@ macro_rules! syncs {
                     }
                     done
                 }
-                Fate::Fails(errno) => failed(errno),
+                Fate::Tears(errno) | Fate::Fails(errno) => failed(errno),
                 Fate::Kills => die(),
             }
         }
@@ -345,17 +347,13 @@ syncs! { fsync fdatasync }
 /// Lets `write` write half of `n` bytes where the fault says so.
 fn tear(name: &str, fd: c_int, n: usize, mut write: impl FnMut(usize) -> isize) -> isize {
     let fate = fate(name, || path_of(fd));
+    if matches!(fate, Fate::Tears(_) | Fate::Kills) && n / 2 > 0 {
+        write(n / 2);
+    }
     match fate {
         Fate::Passes => write(n),
-        Fate::Fails(_) | Fate::Kills => {
-            if n / 2 > 0 {
-                write(n / 2);
-            }
-            match fate {
-                Fate::Fails(errno) => failed(errno) as isize,
-                _ => die(),
-            }
-        }
+        Fate::Tears(errno) | Fate::Fails(errno) => failed(errno) as isize,
+        Fate::Kills => die(),
     }
 }
 
