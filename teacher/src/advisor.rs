@@ -26,8 +26,6 @@ pub struct Advisor {
     ledger: Box<dyn Ledger>,
     /// By account. An account's terms never change.
     strategies: BTreeMap<String, Strategy>,
-    /// Why the ledger could not be written the last time; empty when it could.
-    warning: String,
 }
 
 /// What a teacher tells of itself.
@@ -74,8 +72,7 @@ impl Advisor {
             digest: policy.digest().to_owned(),
             maps: Maps::new(Layout::new(layout.task, MAX_ARMS)),
         };
-        let (judge, strategies, warning) = (Judge::new(policy), BTreeMap::new(), String::new());
-        Ok(Self { profile, judge, ledger, strategies, warning })
+        Ok(Self { profile, judge: Judge::new(policy), ledger, strategies: BTreeMap::new() })
     }
 
     /// What the teacher tells of itself.
@@ -89,15 +86,7 @@ impl Advisor {
     /// # Errors
     /// When it is open on other terms, the budget is too large, or the ledger cannot be used.
     pub fn open_account(&mut self, name: &str, terms: Terms) -> Result<Balance, Error> {
-        let opened = self.ledger.open(name, terms);
-        self.note(&opened);
-        Ok(opened?)
-    }
-
-    /// Why the ledger cannot be written; empty when the last attempt succeeded.
-    #[must_use]
-    pub fn warning(&self) -> &str {
-        &self.warning
+        Ok(self.ledger.open(name, terms)?)
     }
 
     /// How account `name` stands.
@@ -106,6 +95,12 @@ impl Advisor {
     /// When nobody opened it, or the ledger cannot be used.
     pub fn balance(&mut self, name: &str) -> Result<Balance, Error> {
         Ok(self.ledger.balance(name)?)
+    }
+
+    /// Why the ledger cannot be written, if the last attempt failed.
+    #[must_use]
+    pub fn warning(&self) -> Option<&str> {
+        self.ledger.warning()
     }
 
     /// Sets units of account `name` aside for `episodes`, in their order; see [`Account::open_leases`].
@@ -120,9 +115,7 @@ impl Advisor {
         episodes: &[u64],
         units_per_episode: u32,
     ) -> Result<(Vec<Lease>, Balance), Error> {
-        let opened = self.ledger.open_leases(name, episodes, units_per_episode);
-        self.note(&opened);
-        Ok(opened?)
+        Ok(self.ledger.open_leases(name, episodes, units_per_episode)?)
     }
 
     /// Returns what `episodes` did not spend to account `name`.
@@ -130,9 +123,7 @@ impl Advisor {
     /// # Errors
     /// When nobody opened the account, or the ledger cannot be used.
     pub fn settle_leases(&mut self, name: &str, episodes: &[u64]) -> Result<Balance, Error> {
-        let settled = self.ledger.settle(name, episodes);
-        self.note(&settled);
-        Ok(settled?)
+        Ok(self.ledger.settle(name, episodes)?)
     }
 
     /// Answers `questions`, in their order, with one forward pass and one visit to the ledger for all of them.
@@ -201,28 +192,8 @@ impl Advisor {
         }
         let receipts = self.ledger.charge(bills);
         assert_eq!(receipts.len(), bills.len(), "a ledger answers every bill");
-        let is_unwritten = |receipt: &&Result<_, _>| receipt.as_ref().is_err_and(is_unavailable);
-        self.note(receipts.iter().find(is_unwritten).unwrap_or(&receipts[0]));
         receipts
     }
-
-    /// Remembers whether the ledger could be written.
-    fn note<T>(&mut self, written: &Result<T, LedgerError>) {
-        let warning = match written {
-            Err(error) if is_unavailable(error) => error.to_string(),
-            _ => String::new(),
-        };
-        match (self.warning.is_empty(), warning.is_empty()) {
-            (true, false) => tracing::error!("no advice is given: {warning}"),
-            (false, true) => tracing::info!("the ledger can be written again"),
-            _ => {}
-        }
-        self.warning = warning;
-    }
-}
-
-const fn is_unavailable(error: &LedgerError) -> bool {
-    matches!(error, LedgerError::Unavailable { .. })
 }
 
 /// A question, and what the teacher thinks of it.

@@ -187,8 +187,9 @@ async fn get_account(
 ) -> Result<pb::Account, Error> {
     let name = decode_account_name("name", request.name)?;
     let account = name.clone();
-    let look =
-        move |advisor: &mut Advisor| Ok((advisor.balance(&account)?, advisor.warning().to_owned()));
+    let look = move |advisor: &mut Advisor| {
+        Ok((advisor.balance(&account)?, advisor.warning().unwrap_or_default().to_owned()))
+    };
     let (balance, warning) = advisor.run(look).await?;
     Ok(pb::Account { warning, ..encode_balance(name, &balance) })
 }

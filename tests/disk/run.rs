@@ -10,6 +10,7 @@ use std::time::Duration;
 use rusqlite::{Connection, OpenFlags};
 use serde_json::Value;
 use tandem_policy::Policy;
+use tandem_telemetry::read_episode;
 
 use crate::device::{Device, Fault, Mode};
 
@@ -83,6 +84,16 @@ impl Left {
             account: account(&out.join("ledger.sqlite")),
             policies: policies.map(|name| Policy::load(&out.join(name)).expect(name).digest()),
         }
+    }
+}
+
+/// Checks that every episode's log that has its name is whole.
+fn check_logs(device: &Device) {
+    let logs = fs::read_dir(device.root().join("run/mcap")).into_iter().flatten().flatten();
+    for path in
+        logs.map(|entry| entry.path()).filter(|path| path.extension() == Some("mcap".as_ref()))
+    {
+        read_episode(&path).expect("whole");
     }
 }
 
@@ -218,6 +229,7 @@ pub(crate) fn check(fault: &Fault) {
     let hit = device.calls().into_iter().find(|call| call.starts_with('!'));
     let what = format!("{fault}, {hit:?}: {:?}: {}", ended.status, ended.said);
     check_end(&ended, fault, &what);
+    check_logs(&device);
     let ended = match ended.status.code() {
         Some(0) => ended,
         _ => Run::start(&device, None, device.root().join("run/run.toml").exists()).end(),
