@@ -48,7 +48,7 @@ mod tests {
     fn a_source_that_has_nothing_to_say_does_not_withdraw_the_warning_of_another() {
         let (progress, shown) = watch::channel(pb::Progress::default());
         let warnings = Warnings::new(progress);
-        let mut check = |source, warning, expected| {
+        let check = |source, warning, expected| {
             warnings.set(source, warning);
             assert_eq!(shown.borrow().warning, expected);
         };

@@ -41,6 +41,18 @@ pub(crate) enum Mode {
     Cut,
 }
 
+impl Mode {
+    /// As the shim calls it.
+    pub(crate) const fn name(self) -> &'static str {
+        match self {
+            Self::Once => "once",
+            Self::Dead => "dead",
+            Self::Kill => "kill",
+            Self::Cut => "cut",
+        }
+    }
+}
+
 /// A fault of the disk.
 #[derive(Debug, Clone)]
 pub(crate) struct Fault {
@@ -97,7 +109,7 @@ impl Device {
             .env("FAULTY_DISK_ROOT", self.root())
             .env("FAULTY_DISK_STATE", self.beside("state"));
         if let Some(Fault { mode, errno, at, pattern }) = fault {
-            let mode = format!("{mode:?}").to_lowercase();
+            let mode = mode.name();
             command.env("FAULTY_DISK_FAULT", format!("{mode} {errno} {at} {pattern}"));
         }
     }

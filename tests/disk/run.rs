@@ -151,33 +151,39 @@ impl<'a> Run<'a> {
         Ended { status, said: self.said(), digest }
     }
 
-    /// Waits for the end.
-    pub(crate) fn end(mut self) -> Ended {
+    /// Waits for the end, and calls `look` now and then.
+    fn end_watched(mut self, mut look: impl FnMut(&Self)) -> Ended {
         for _ in 0..PATIENCE {
             if let Some(status) = self.process.try_wait().expect("a child") {
                 return self.ended(status);
             }
+            look(&self);
             std::thread::sleep(Duration::from_millis(20));
         }
         drop(self.process.kill());
-        panic!("the run hangs: {}", self.said());
+        let status = self.process.wait().expect("a child");
+        assert!(
+            status.success(),
+            "the run neither ends nor says what it waits for: {}",
+            self.said()
+        );
+        self.ended(status)
+    }
+
+    /// Waits for the end.
+    pub(crate) fn end(self) -> Ended {
+        self.end_watched(|_| ())
     }
 
     /// Waits for the end. A run that waits for its disk to recover is interrupted once it has said so.
-    fn end_or_interrupt(mut self) -> Ended {
+    fn end_or_interrupt(self) -> Ended {
         let mut n_waited = 0;
-        for _ in 0..PATIENCE {
-            if let Some(status) = self.process.try_wait().expect("a child") {
-                return self.ended(status);
-            }
-            n_waited += usize::from(self.device.is_hit() && names_the_fault(&self.said()));
+        self.end_watched(|run| {
+            n_waited += usize::from(run.device.is_hit() && names_the_fault(&run.said()));
             if n_waited == WAITS {
-                signal("-INT", self.process.id());
+                signal("-INT", run.process.id());
             }
-            std::thread::sleep(Duration::from_millis(20));
-        }
-        drop(self.process.kill());
-        panic!("the run neither ends nor says what it waits for: {}", self.said());
+        })
     }
 
     /// Waits until the power is cut, and ends every process.
@@ -245,17 +251,17 @@ fn check_end(ended: &Ended, fault: &Fault, what: &str) {
     assert!(!ended.said.contains("panicked"), "{what}");
     match ended.status.code() {
         Some(0) => {}
-        Some(75) => {
-            let last = ended.said.lines().last().unwrap_or_default();
-            let is_killed = fault.mode == Mode::Kill && last.contains("killed by signal 9");
-            assert!(last.starts_with("tandem: "), "{what}");
-            assert!(names_the_fault(last) || is_killed, "{what}");
-        }
         Some(130) => assert_eq!(fault.mode, Mode::Dead, "{what}"),
         None => {
             assert_eq!(ended.status.signal(), Some(9), "{what}");
             assert!(matches!(fault.mode, Mode::Kill | Mode::Cut), "{what}");
         }
-        Some(_) => panic!("{what}"),
+        code => {
+            assert_eq!(code, Some(75), "{what}");
+            let last = ended.said.lines().last().unwrap_or_default();
+            let is_killed = fault.mode == Mode::Kill && last.contains("killed by signal 9");
+            assert!(last.starts_with("tandem: "), "{what}");
+            assert!(names_the_fault(last) || is_killed, "{what}");
+        }
     }
 }
