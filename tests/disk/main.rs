@@ -48,7 +48,6 @@ fn a_run_survives_processes_that_are_killed_as_they_write() {
 fn a_run_is_resumed_after_a_power_cut() {
     let hits = [
         ("rename run/run.toml", 100),
-        ("mkdir run/in-use", 100),
         ("pwrite run/ledger.sqlite-wal", 50),
         ("rename run/checkpoint/", 60),
     ];
