@@ -4,8 +4,8 @@ use std::path::Path;
 
 use anyhow::{Context as _, anyhow, bail};
 use tandem_core::Task;
-use tandem_learner::RunConfig;
 use tandem_learner::config::{ConfigError, INIT_TEACHER, Recipe};
+use tandem_learner::{RunConfig, atomic};
 use tandem_teacher::{Strategy, UnknownStrategy};
 use toml::{Table, Value};
 
@@ -47,9 +47,7 @@ pub(crate) fn to_text(config: &RunConfig) -> Result<String, Failed> {
 
 /// Writes the configuration with every setting, whole or not at all.
 pub(crate) fn save(config: &RunConfig, path: &Path) -> Result<(), Failed> {
-    let unfinished = path.with_extension("tmp");
-    let written = std::fs::write(&unfinished, to_text(config)?);
-    let written = written.and_then(|()| std::fs::rename(&unfinished, path));
+    let written = atomic::write(path, to_text(config)?.as_bytes());
     written.or_cannot_write(|| format!("cannot write {}", path.display()))
 }
 

@@ -225,7 +225,9 @@ fn misdirected(error: &anyhow::Error) -> Option<&str> {
 }
 
 fn learner_failed(error: LearnerError) -> Failed {
-    if let error @ LearnerError::RunDirectory { .. } = error {
+    if let error @ (LearnerError::RunDirectory { .. }
+    | LearnerError::Checkpoint(CheckpointError::Io { .. })) = error
+    {
         return Failed::of_write(error);
     }
     let exit = match error {

@@ -13,6 +13,7 @@ use std::path::{Path, PathBuf};
 
 use tandem_core::work::PublishedActor;
 
+use crate::atomic::sync_directory;
 use crate::config::{ConfigError, RunConfig};
 use crate::records::{Judged, Pending};
 use crate::settings::{self, ADVICE, Changed};
@@ -147,11 +148,6 @@ pub(crate) fn make(directory: &Path) -> io::Result<()> {
     }
     fs::create_dir_all(directory)?;
     directory.parent().filter(|parent| parent.is_dir()).map_or(Ok(()), sync_directory)
-}
-
-/// Makes sure that a rename is on the disk.
-fn sync_directory(directory: &Path) -> io::Result<()> {
-    fs::File::open(directory)?.sync_all()
 }
 
 /// Removes all but the newest `keep` checkpoints, `newest` being the first of them.

@@ -57,7 +57,7 @@ pub(crate) fn run(
     shutdown: &CancellationToken,
 ) -> Result<Ended, Error> {
     let beginning = Beginning::of(config, shutdown)?;
-    let ledger = match beginning.open_ledger(config, runtime, shutdown) {
+    let ledger = match beginning.open_ledger(config, &shared.warnings, (runtime, shutdown)) {
         Err(Error::Teacher(TeacherError::Stopped)) => {
             let (round, digest) = (beginning.trainer.counters().round, beginning.trainer.digest());
             let reason = "interrupted".to_owned();

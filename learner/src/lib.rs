@@ -5,9 +5,10 @@
 //!
 //! Reading order: [`config`] (the run file), [`ddpg`] (the update), [`replay`] and [`her`] (what a batch is made of),
 //! [`trainer`] (a round), [`board`] (who plays what), [`records`] (what evaluations bring), [`checkpoint`], [`settings`] (what a
-//! run keeps when it goes on), [`lock`] (who works in a directory), [`service`] (the gRPC shell and the thread that
+//! run keeps when it goes on), [`lock`] (who works in a directory), [`atomic`] (files that are replaced as a whole), [`service`] (the gRPC shell and the thread that
 //! learns), [`relay`] (what stands between a learner and many workers).
 
+pub mod atomic;
 pub mod board;
 pub mod checkpoint;
 pub mod config;
@@ -26,6 +27,7 @@ pub mod settings;
 mod shared;
 mod teacher;
 pub mod trainer;
+mod warnings;
 
 pub use config::RunConfig;
 pub use drive::Ended;

@@ -14,6 +14,7 @@ use tokio::sync::{Notify, watch};
 use crate::board::{Board, Worker};
 use crate::config::RunConfig;
 use crate::service::{Connections, LogQuota};
+use crate::warnings::Warnings;
 
 /// Parameter versions kept for workers that lag behind.
 pub(crate) const KEPT_VERSIONS: usize = 16;
@@ -64,6 +65,7 @@ pub(crate) struct Shared {
     /// Signalled whenever there may be work.
     pub(crate) work: Notify,
     pub(crate) progress: watch::Sender<pb::Progress>,
+    pub(crate) warnings: Warnings,
     pub(crate) clock: Clock,
 }
 
@@ -106,6 +108,7 @@ impl Shared {
             state: Mutex::default(),
             arrived: Arc::default(),
             work: Notify::new(),
+            warnings: Warnings::new(progress.clone()),
             progress,
             clock,
         }

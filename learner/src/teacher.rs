@@ -17,6 +17,7 @@ use tonic::{Code, Status};
 use tracing::warn;
 
 use crate::runtime::Runtime;
+use crate::warnings::{Source, Warnings};
 use audit::{Audit, Cost, Statement};
 
 /// Deadline of a call.
@@ -114,7 +115,7 @@ impl Ledger {
         (dial, address): (&Dial, &str),
         terms: &pb::OpenAccountRequest,
         units_per_episode: u32,
-        run: Run,
+        (run, warnings): (Run, &Warnings),
         (runtime, shutdown): (&Runtime, &CancellationToken),
     ) -> Result<Self, TeacherError> {
         let inside = runtime.enter();
@@ -137,7 +138,7 @@ impl Ledger {
             Run::New => ledger.open_account(terms.budget, 0)?,
             Run::Resumed { spent } => ledger.resume(spent)?,
         }
-        let watch = watch_account(client, ledger.terms.name.clone(), lost);
+        let watch = watch_account(client, ledger.terms.name.clone(), lost, warnings.clone());
         runtime.spawn(async move {
             tokio::select! {
                 () = watch => (),
@@ -392,15 +393,22 @@ const fn statement(account: &pb::Account) -> Statement {
     Statement { spent: account.spent, leased: account.leased }
 }
 
-/// Sets `lost` whenever the teacher answers that it does not know the account.
-async fn watch_account(mut client: TeacherClient<Link>, name: String, lost: Arc<AtomicBool>) {
+/// Sets `lost` whenever the teacher answers that it does not know the account, and passes on its warning.
+async fn watch_account(
+    mut client: TeacherClient<Link>,
+    name: String,
+    lost: Arc<AtomicBool>,
+    warnings: Warnings,
+) {
     loop {
         tokio::time::sleep(LOOK_EVERY).await;
         let look = client.get_account(pb::GetAccountRequest { name: name.clone() });
-        if let Ok(Err(status)) = tokio::time::timeout(CALL_DEADLINE, look).await
-            && status.code() == Code::NotFound
-        {
-            lost.store(true, Ordering::Relaxed);
+        match tokio::time::timeout(CALL_DEADLINE, look).await {
+            Ok(Ok(account)) => warnings.set(Source::Teacher, &account.into_inner().warning),
+            Ok(Err(status)) if status.code() == Code::NotFound => {
+                lost.store(true, Ordering::Relaxed);
+            }
+            _ => {}
         }
     }
 }

@@ -5,7 +5,7 @@
 
 use std::ffi::OsString;
 use std::fs::{File, OpenOptions};
-use std::io::{Read as _, Seek as _, SeekFrom};
+use std::io::{Read as _, Seek as _, SeekFrom, Write as _};
 use std::os::unix::process::ExitStatusExt as _;
 use std::path::{Path, PathBuf};
 use std::process::{ExitStatus, Stdio};
@@ -430,5 +430,16 @@ fn last_words(log: &Path, log_from: u64) -> String {
     });
     let text = if read.is_ok() { String::from_utf8_lossy(&bytes) } else { "".into() };
     let told = text.lines().rev().find_map(|line| line.strip_prefix("tandem: "));
-    told.unwrap_or("it did not say why").to_owned()
+    match told.map_or_else(|| note_silence(log).map(|()| "it did not say why"), Ok) {
+        Ok(told) => told.to_owned(),
+        Err(error) => {
+            format!("it could not say why: {} cannot be written: {error}", log.display())
+        }
+    }
+}
+
+/// Writes to the log that a process ended without a word, which shows whether it could have written one.
+fn note_silence(log: &Path) -> std::io::Result<()> {
+    let mut log = OpenOptions::new().append(true).open(log)?;
+    log.write_all(b"a process ended without saying why\n")
 }

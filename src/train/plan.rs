@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use tandem_learner::{RunConfig, checkpoint, settings};
+use tandem_learner::{RunConfig, atomic, checkpoint, settings};
 use tandem_policy::Policy;
 use toml::Value;
 
@@ -72,8 +72,9 @@ impl Plan {
         }
         let failed = || format!("cannot write to {}", self.out.display());
         std::fs::create_dir_all(self.out.join("policy")).or_cannot_write(failed)?;
-        run_file::save(&self.config, &self.run_file())?;
-        self.keep_teacher()
+        // The run file comes last: a directory without it holds no run, and one with it can be resumed.
+        self.keep_teacher()?;
+        run_file::save(&self.config, &self.run_file())
     }
 
     /// Refuses settings with which the run did not begin, by its newest checkpoint or else by its run file.
@@ -116,13 +117,12 @@ impl Plan {
         let Some(teacher) = self.teacher.as_ref().filter(|teacher| teacher.path != copy) else {
             return Ok(());
         };
-        if self.resume && Policy::load(&copy).is_ok() {
+        if Policy::load(&copy).is_ok_and(|own| own.digest() == teacher.policy.digest()) {
             return Ok(());
         }
-        let unfinished = copy.with_extension("tmp");
         let written = std::fs::create_dir_all(self.out.join("policy"))
-            .and_then(|()| std::fs::copy(&teacher.path, &unfinished))
-            .and_then(|_n_bytes| std::fs::rename(&unfinished, &copy));
+            .and_then(|()| std::fs::read(&teacher.path))
+            .and_then(|bytes| atomic::write(&copy, &bytes));
         written.or_cannot_write(|| format!("cannot write {}", copy.display()))
     }
 

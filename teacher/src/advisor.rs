@@ -97,6 +97,12 @@ impl Advisor {
         Ok(self.ledger.balance(name)?)
     }
 
+    /// Why the ledger cannot be written, if the last attempt failed.
+    #[must_use]
+    pub fn warning(&self) -> Option<&str> {
+        self.ledger.warning()
+    }
+
     /// Sets units of account `name` aside for `episodes`, in their order; see [`Account::open_leases`].
     ///
     /// # Errors

@@ -104,6 +104,12 @@ pub trait Ledger: Send {
 
     /// Charges `bills` in their order, each by itself; see [`crate::budget::Account::charge`]. One outcome per bill.
     fn charge(&mut self, bills: &[Bill]) -> Vec<Result<Receipt, LedgerError>>;
+
+    /// Why nothing can be charged, if the last attempt to write failed. For ledgers that answer [`Self::balance`] all the
+    /// same.
+    fn warning(&self) -> Option<&str> {
+        None
+    }
 }
 
 /// Why a ledger cannot be opened.

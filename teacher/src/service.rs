@@ -170,8 +170,11 @@ async fn get_account(
 ) -> Result<pb::Account, Error> {
     let name = decode_account_name("name", request.name)?;
     let account = name.clone();
-    let balance = advisor.run(move |advisor| advisor.balance(&account)).await?;
-    Ok(encode_balance(name, &balance))
+    let look = move |advisor: &mut Advisor| {
+        Ok((advisor.balance(&account)?, advisor.warning().unwrap_or_default().to_owned()))
+    };
+    let (balance, warning) = advisor.run(look).await?;
+    Ok(pb::Account { warning, ..encode_balance(name, &balance) })
 }
 
 async fn open_leases(

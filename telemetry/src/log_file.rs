@@ -14,7 +14,8 @@ use crate::error::Error;
 
 /// An MCAP writer, where its file is, and the buffer in which messages are encoded.
 ///
-/// The file is called `NAME.part` until [`finish`](Self::finish), so a file without that ending is always whole.
+/// The file is called `NAME.part` until [`finish`](Self::finish), which syncs it first, so a file without that ending is
+/// always whole, also after a power cut.
 pub(crate) struct LogFile {
     path: PathBuf,
     part_path: PathBuf,
@@ -53,6 +54,8 @@ impl LogFile {
     /// Completes the file, gives it its name and returns that.
     pub(crate) fn finish(mut self) -> Result<PathBuf, Error> {
         self.writer.finish().map_err(Error::write_log(&self.part_path))?;
+        let synced = self.writer.into_inner().get_ref().sync_all();
+        synced.map_err(Error::io("sync", &self.part_path))?;
         std::fs::rename(&self.part_path, &self.path)
             .map_err(Error::io("rename", &self.part_path))?;
         Ok(self.path)

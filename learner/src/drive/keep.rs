@@ -11,6 +11,7 @@ use super::Drive;
 use crate::checkpoint::{self, Resumption, Saved};
 use crate::error::Error;
 use crate::records::{Unwritten, innermost};
+use crate::warnings::Source;
 
 /// Pause before a disk that refused is tried again.
 const TRY_AGAIN_S: f64 = 10.0;
@@ -83,8 +84,7 @@ impl Drive<'_> {
     }
 
     fn publish_warning(&self) {
-        let warning = self.keeping.warning();
-        self.shared.progress.send_modify(|progress| progress.warning = warning);
+        self.shared.warnings.set(Source::Learner, &self.keeping.warning());
     }
 
     /// Saves a checkpoint when one is due, and tries again what the disk refused before.

@@ -10,6 +10,7 @@ use tokio_util::sync::CancellationToken;
 
 use super::keep::Keeping;
 use super::{Drive, UNITS_PER_EPISODE};
+use crate::atomic;
 use crate::checkpoint::{self, CheckpointError, Restored, Resumption};
 use crate::error::Error;
 use crate::lock::DirectoryLock;
@@ -18,6 +19,7 @@ use crate::runtime::Runtime;
 use crate::shared::{LearnerConfig, Shared};
 use crate::teacher::{Ledger, Run};
 use crate::trainer::Trainer;
+use crate::warnings::Warnings;
 
 /// How long a learner that was there before may take to save and go.
 const LOCK_PATIENCE: Duration = Duration::from_secs(30);
@@ -79,8 +81,8 @@ impl Beginning {
     pub(super) fn open_ledger(
         &self,
         config: &LearnerConfig,
-        runtime: &Runtime,
-        shutdown: &CancellationToken,
+        warnings: &Warnings,
+        (runtime, shutdown): (&Runtime, &CancellationToken),
     ) -> Result<Option<Ledger>, Error> {
         let advice = &config.run.advice;
         if !advice.asks() {
@@ -99,7 +101,13 @@ impl Beginning {
             Run::New
         };
         let whom = (&config.dial, address);
-        Ok(Some(Ledger::open(whom, &terms, UNITS_PER_EPISODE, run, (runtime, shutdown))?))
+        Ok(Some(Ledger::open(
+            whom,
+            &terms,
+            UNITS_PER_EPISODE,
+            (run, warnings),
+            (runtime, shutdown),
+        )?))
     }
 }
 
@@ -166,11 +174,11 @@ pub(super) fn keep_run_file(config: &LearnerConfig) -> Result<(), Error> {
     if std::fs::read(&path).is_ok_and(|there| there == text.as_bytes()) {
         return Ok(());
     }
-    let unfinished = path.with_extension("tmp");
-    let written = std::fs::write(&unfinished, text);
-    written
-        .and_then(|()| std::fs::rename(&unfinished, &path))
-        .map_err(|error| Error::RunDirectory { action: "write", path, source: error.into() })
+    atomic::write(&path, text.as_bytes()).map_err(|error| Error::RunDirectory {
+        action: "write",
+        path,
+        source: error.into(),
+    })
 }
 
 /// Keeps a second learner out of a run directory.

@@ -100,6 +100,7 @@ fn message(name: &str, account: &Account) -> pb::Account {
         spent: account.spent,
         leased: account.budget - account.spent - left,
         left,
+        warning: String::new(),
     }
 }
 

@@ -38,6 +38,8 @@ use file::{AccountChanges, Durability, LedgerFile, StoredAccount, WriteError};
 pub struct SqliteLedger {
     file: LedgerFile,
     accounts: BTreeMap<String, Kept>,
+    /// Why the last transaction failed, if it did.
+    warning: Option<String>,
 }
 
 /// An account, and its number and checksum in the file.
@@ -60,7 +62,7 @@ impl SqliteLedger {
             let StoredAccount { id, name, checksum, account } = stored;
             (name, Kept { id, checksum, account })
         });
-        Ok(Self { file, accounts: accounts.collect() })
+        Ok(Self { file, accounts: accounts.collect(), warning: None })
     }
 
     fn account(&mut self, name: &str) -> Result<&mut Account, LedgerError> {
@@ -77,6 +79,9 @@ impl SqliteLedger {
             if changed.is_empty() { Ok(()) } else { self.file.write(&changed, durability) };
         let checksums: BTreeMap<i64, Checksum> =
             changed.iter().map(|changed| (changed.id, changed.checksum)).collect();
+        if !changed.is_empty() {
+            self.note(&written);
+        }
         for name in names {
             if let Some(kept) = self.accounts.get_mut(*name) {
                 match written {
@@ -101,6 +106,18 @@ impl SqliteLedger {
             Ok(()) => Ok(answer),
             Err(error) => Err(self.unavailable(error)),
         }
+    }
+
+    /// Remembers whether the file could be written, and logs when that changes.
+    fn note<T>(&mut self, written: &Result<T, WriteError>) {
+        let path = self.file.path();
+        let warning = written.as_ref().err().map(|error| format!("cannot write {path:?}: {error}"));
+        match (&self.warning, &warning) {
+            (None, Some(warning)) => tracing::error!("nothing can be charged: {warning}"),
+            (Some(_), None) => tracing::info!(ledger = ?path, "the ledger can be written again"),
+            _ => {}
+        }
+        self.warning = warning;
     }
 
     fn unavailable(&self, error: impl std::error::Error + Send + Sync + 'static) -> LedgerError {
@@ -133,6 +150,7 @@ impl Ledger for SqliteLedger {
         }
         let checksum = Checksum::of_terms(name, terms);
         let added = self.file.add_account(name, terms, checksum);
+        self.note(&added);
         let id = added.map_err(|error| self.unavailable(error))?;
         let account = Account::new(terms);
         let balance = account.balance();
@@ -176,6 +194,10 @@ impl Ledger for SqliteLedger {
             outcome.and_then(|_| Err(self.unavailable(std::sync::Arc::clone(&error))))
         };
         outcomes.into_iter().map(failed).collect()
+    }
+
+    fn warning(&self) -> Option<&str> {
+        self.warning.as_deref()
     }
 }
 

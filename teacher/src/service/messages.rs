@@ -77,6 +77,7 @@ pub(super) fn encode_balance(name: String, balance: &Balance) -> pb::Account {
         spent: balance.spent,
         leased: balance.leased,
         left: balance.left,
+        warning: String::new(),
     }
 }
 

@@ -132,6 +132,7 @@ async fn an_account_is_opened_once() {
         spent: 0,
         leased: 0,
         left: 10,
+        warning: String::new(),
     };
     assert_eq!(fixture.open(10, "mc-q").await.unwrap(), fresh);
     fixture.advise(vec![step(0)]).await.unwrap();

@@ -46,8 +46,12 @@ fn what_cannot_be_written_is_not_done() {
     let told = outcomes[1].as_ref().unwrap_err().to_string();
     assert_eq!(told, "unknown account \"nun\": open it first");
     assert_eq!(accounts(&ledger), before);
+    ledger.charge(&[bill("run", 1, 0..3)]).remove(0).expect("it is known");
+    let warning = ledger.warning().expect("known charges are not written");
+    assert!(warning.contains("ledger.sqlite") && warning.contains("disk is full"), "{warning}");
     ledger.file.limit_pages(1_000_000);
     let outcomes = ledger.charge(&bills);
+    assert_eq!(ledger.warning(), None);
     let first = Verdict::Charged(Half::First);
     assert_eq!(outcomes[0].as_ref().unwrap().verdicts, [first; 3]);
     assert!(outcomes[2..].iter().all(Result::is_ok));
