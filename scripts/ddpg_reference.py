@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Computes two DDPG updates of tiny networks in double precision, with numpy alone, for the update's tests.
 
-    python3 scripts/ddpg_reference.py > learner/tests/data/ddpg_reference.json
+    python3 scripts/ddpg_reference.py > rl/tests/data/ddpg_reference.json
 
 Written from the formulas, not from the program: forward and backward passes as matrix algebra, per-arm heads, behaviour cloning,
 action penalty, Adam, Polyak averaging. Each update starts from parameters rounded to float32, so that a test can compare update by

@@ -4,8 +4,9 @@ use std::path::Path;
 
 use anyhow::{Context as _, anyhow, bail};
 use tandem_core::Task;
-use tandem_learner::config::{ConfigError, INIT_TEACHER, Recipe};
-use tandem_learner::{RunConfig, atomic};
+use tandem_learner::atomic;
+use tandem_rl::RunConfig;
+use tandem_rl::config::{ConfigError, INIT_TEACHER, Recipe};
 use tandem_teacher::{Strategy, UnknownStrategy};
 use toml::{Table, Value};
 

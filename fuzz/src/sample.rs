@@ -6,9 +6,9 @@ use std::path::{Path, PathBuf};
 use tandem_core::layout::EPISODE_STEPS;
 use tandem_core::scene::{ArmScene, Cuboid, Scene};
 use tandem_core::{ArmAdvice, Contacts, Episode, EpisodeKind, Layout, Task};
-use tandem_learner::RunConfig;
-use tandem_learner::config::Recipe;
-use tandem_learner::trainer::Trainer;
+use tandem_rl::RunConfig;
+use tandem_rl::config::Recipe;
+use tandem_rl::trainer::Trainer;
 use tandem_telemetry::{EpisodeMetadata, EpisodeRecorder, Error, TransitionRecord};
 
 /// One arm that pushes, networks of two units, a replay buffer of four episodes.

@@ -10,12 +10,12 @@ use std::time::Instant;
 
 use tandem_core::layout::EPISODE_STEPS;
 use tandem_core::{Layout, Task};
-use tandem_learner::RunConfig;
 use tandem_learner::checkpoint::{self, Resumption};
-use tandem_learner::config::Recipe;
 use tandem_learner::records::Judged;
-use tandem_learner::replay::drifting_episode;
-use tandem_learner::trainer::Trainer;
+use tandem_rl::RunConfig;
+use tandem_rl::config::Recipe;
+use tandem_rl::replay::drifting_episode;
+use tandem_rl::trainer::Trainer;
 
 const N_TRANSITIONS: usize = 300_000;
 const N_TIMES: usize = 3;

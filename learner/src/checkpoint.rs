@@ -14,11 +14,11 @@ use std::path::{Path, PathBuf};
 use tandem_core::work::PublishedActor;
 
 use crate::atomic::sync_directory;
-use crate::config::{ConfigError, RunConfig};
 use crate::records::{Judged, Pending};
 use crate::settings::{self, ADVICE, Changed};
-use crate::trainer::Trainer;
 use sealed::{FORMAT, Refused, Tensor};
+use tandem_rl::config::{ConfigError, RunConfig};
+use tandem_rl::trainer::Trainer;
 
 /// What a checkpoint holds beside the trainer.
 #[derive(Debug, Clone, PartialEq)]

@@ -20,9 +20,9 @@ use crate::records::{Pending, Records};
 use crate::runtime::Runtime;
 use crate::shared::{LearnerConfig, Shared};
 use crate::teacher::{Ledger, Mismatch, TeacherError};
-use crate::trainer::{RoundFigures, Trainer};
 use keep::{Keeping, Notice};
 use start::{Beginning, RunLock, keep_run_file};
+use tandem_rl::trainer::{RoundFigures, Trainer};
 
 /// Rounds after which an evaluation must be in; until then it fills the workers' gaps.
 const EVALUATION_PATIENCE_ROUNDS: u64 = 4;

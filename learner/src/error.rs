@@ -3,9 +3,9 @@
 use std::path::PathBuf;
 
 use crate::checkpoint::CheckpointError;
-use crate::config::{ConfigError, INIT_TEACHER};
-use crate::ddpg::DdpgError;
 use crate::teacher::TeacherError;
+use tandem_rl::config::{ConfigError, INIT_TEACHER};
+use tandem_rl::ddpg::DdpgError;
 
 /// Why a learner gave up.
 #[derive(Debug, thiserror::Error)]

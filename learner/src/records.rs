@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 use tandem_policy::Policy;
 use tandem_telemetry::{MetricsLog, MetricsRow};
 
-use crate::trainer::{Counters, RoundFigures};
+use tandem_rl::trainer::{Counters, RoundFigures};
 
 /// What the evaluations have brought so far. It grows by a row each.
 #[derive(Debug, Clone, PartialEq, Default)]
@@ -161,8 +161,8 @@ mod tests {
     use tandem_core::Task;
 
     use super::*;
-    use crate::config::{Recipe, RunConfig};
-    use crate::trainer::Trainer;
+    use tandem_rl::config::{Recipe, RunConfig};
+    use tandem_rl::trainer::Trainer;
 
     fn row(round: u64, best: bool) -> MetricsRow {
         MetricsRow { round, best, success: round as f64 / 10.0, ..MetricsRow::default() }

@@ -4,7 +4,7 @@ use std::fmt;
 
 use serde_json::Value;
 
-use crate::config::RunConfig;
+use tandem_rl::config::RunConfig;
 
 /// What a run may go on with another value of: when it ends, what is saved and what is logged. Everything else decides
 /// what it learns.
@@ -74,7 +74,7 @@ mod tests {
     use tandem_core::Task;
 
     use super::*;
-    use crate::config::Recipe;
+    use tandem_rl::config::Recipe;
 
     fn config() -> RunConfig {
         RunConfig::defaults(Recipe::Tandem, Task::Push, 2)

@@ -12,9 +12,9 @@ use tandem_proto::{encode_actor, pb};
 use tokio::sync::{Notify, watch};
 
 use crate::board::{Board, Worker};
-use crate::config::RunConfig;
 use crate::service::{Connections, LogQuota};
 use crate::warnings::Warnings;
+use tandem_rl::config::RunConfig;
 
 /// Parameter versions kept for workers that lag behind.
 pub(crate) const KEPT_VERSIONS: usize = 16;

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context as _, anyhow, bail, ensure};
 use serde::Deserialize;
-use tandem_learner::RunConfig;
+use tandem_rl::RunConfig;
 use toml::{Table, Value};
 
 use crate::exit::{Exit, Failed, OrExit as _};
@@ -129,7 +129,7 @@ fn planned(
         if column.is_empty() { named(&resolved.advice.strategy) } else { column.to_owned() };
     let name = format!("{}-{column}{axis}-seed{}", resolved.task, resolved.seed);
     ensure!(
-        tandem_learner::config::is_name(&name),
+        tandem_rl::config::is_name(&name),
         "{name:?} is no name of a run: expected 1 to 100 letters, digits, '-', '_' or '.'"
     );
     let stop = &resolved.stop;

@@ -6,7 +6,8 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context as _, anyhow};
 use serde_json::Value as Json;
-use tandem_learner::{RunConfig, checkpoint};
+use tandem_learner::checkpoint;
+use tandem_rl::RunConfig;
 use tandem_telemetry::read_regular;
 use toml::{Table, Value};
 
@@ -159,7 +160,7 @@ fn summary(dir: &Path) -> anyhow::Result<Option<Json>> {
 mod tests {
     use serde_json::json;
     use tandem_core::Task;
-    use tandem_learner::config::Recipe;
+    use tandem_rl::config::Recipe;
 
     use super::*;
 

@@ -2,8 +2,9 @@
 
 use std::path::{Path, PathBuf};
 
-use tandem_learner::{RunConfig, atomic, checkpoint, settings};
+use tandem_learner::{atomic, checkpoint, settings};
 use tandem_policy::Policy;
+use tandem_rl::RunConfig;
 use toml::Value;
 
 use crate::cli::{RecipeName, TrainArgs};
@@ -216,7 +217,7 @@ fn default_workers(config: &RunConfig) -> usize {
 /// The run directory's own name, where it can be the name of an account at a teacher.
 fn account_name(out: &Path) -> Option<String> {
     let name = out.file_name()?.to_str()?;
-    tandem_learner::config::is_name(name).then(|| name.to_owned())
+    tandem_rl::config::is_name(name).then(|| name.to_owned())
 }
 
 /// `runs/TASK-ARMS-STRATEGY-seedN`, with a number behind it when that is taken.

@@ -6,10 +6,10 @@ use std::process::Command;
 
 use serde_json::Value;
 use tandem_core::Task;
-use tandem_learner::RunConfig;
 use tandem_learner::checkpoint::load_newest;
-use tandem_learner::config::Recipe;
-use tandem_learner::trainer::Counters;
+use tandem_rl::RunConfig;
+use tandem_rl::config::Recipe;
+use tandem_rl::trainer::Counters;
 use toml::Table;
 
 /// The run file's settings over the recipe's, so that settings of later versions have a value.

@@ -11,9 +11,10 @@ use std::sync::{Arc, Mutex, OnceLock};
 use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
-use tandem_learner::{LearnerConfig, RunConfig, checkpoint};
+use tandem_learner::{LearnerConfig, checkpoint};
 use tandem_net::{Gate, Pacing};
 use tandem_policy::Policy;
+use tandem_rl::RunConfig;
 use tandem_teacher::policy::OneArmPolicy;
 use tandem_teacher::{Advisor, serve_advisor};
 use tandem_telemetry::MetricsLog;

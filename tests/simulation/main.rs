@@ -27,8 +27,8 @@ use std::sync::OnceLock;
 use std::time::Duration;
 
 use tandem_core::Task;
-use tandem_learner::RunConfig;
-use tandem_learner::config::Recipe;
+use tandem_rl::RunConfig;
+use tandem_rl::config::Recipe;
 use tandem_teacher::ledger::MemoryLedger;
 
 use books::{ForgetfulLedger, Ledgers};

@@ -15,8 +15,8 @@ use tandem_core::{ArmAdvice, EpisodeKind, Layout, StepAdvice, StepQuery, Task};
 use tandem_fuzz::sample;
 use tandem_learner::checkpoint::{self, Resumption};
 use tandem_learner::records::{Judged, Pending};
-use tandem_learner::trainer::Trainer;
 use tandem_proto::pb;
+use tandem_rl::trainer::Trainer;
 use tandem_telemetry::MetricsRow;
 
 type AnyError = Box<dyn std::error::Error>;

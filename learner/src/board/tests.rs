@@ -6,7 +6,7 @@ use tandem_core::work::EpisodeOrder;
 use tandem_core::{Layout, Task};
 
 use super::*;
-use crate::replay::drifting_episode;
+use tandem_rl::replay::drifting_episode;
 
 const fn at(seconds: u64) -> Duration {
     Duration::from_secs(seconds)

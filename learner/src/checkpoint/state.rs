@@ -8,9 +8,9 @@ use tandem_telemetry::MetricsRow;
 use super::Resumption;
 use super::sealed::{Contents, SETTINGS, Tensor};
 use crate::records::{Judged, Pending};
-use crate::replay::{ReplayBuffer, ReplayParts};
 use crate::settings;
-use crate::trainer::{Counters, RoundFigures, Trainer};
+use tandem_rl::replay::{ReplayBuffer, ReplayParts};
+use tandem_rl::trainer::{Counters, RoundFigures, Trainer};
 
 /// No count of a run is larger, so that none overflows when it is multiplied with the size of a round.
 const MAX_COUNT: u64 = 1 << 48;

@@ -9,9 +9,9 @@ use tandem_telemetry::MetricsRow;
 use tempfile::TempDir;
 
 use super::*;
-use crate::config::Recipe;
-use crate::replay::drifting_episode;
-use crate::trainer::RoundFigures;
+use tandem_rl::config::Recipe;
+use tandem_rl::replay::drifting_episode;
+use tandem_rl::trainer::RoundFigures;
 
 fn small_config() -> RunConfig {
     let mut config = RunConfig::defaults(Recipe::Tandem, Task::Push, 1);

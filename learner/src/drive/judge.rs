@@ -9,10 +9,10 @@ use tandem_telemetry::events::EvaluationFinished;
 
 use super::progress::evaluation_message;
 use super::{Drive, EVALUATION_PATIENCE_ROUNDS, ROUNDS_PER_PAPER_EPOCH};
-use crate::config::Recipe;
 use crate::error::Error;
 use crate::records::Pending;
-use crate::trainer::{Counters, RoundFigures};
+use tandem_rl::config::Recipe;
+use tandem_rl::trainer::{Counters, RoundFigures};
 
 impl Drive<'_> {
     /// Notes an evaluation of the present parameters when one is due. Its episodes are ordered by

@@ -7,7 +7,7 @@ use tandem_telemetry::MetricsRow;
 
 use super::Drive;
 use crate::board::Worker;
-use crate::trainer::RoundFigures;
+use tandem_rl::trainer::RoundFigures;
 
 impl Drive<'_> {
     /// Publishes the progress.

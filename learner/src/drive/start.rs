@@ -18,8 +18,8 @@ use crate::records::{Judged, Pending, Records};
 use crate::runtime::Runtime;
 use crate::shared::{LearnerConfig, Shared};
 use crate::teacher::{Ledger, Run};
-use crate::trainer::Trainer;
 use crate::warnings::Warnings;
+use tandem_rl::trainer::Trainer;
 
 /// How long a learner that was there before may take to save and go.
 const LOCK_PATIENCE: Duration = Duration::from_secs(30);

@@ -7,7 +7,8 @@ use std::time::Duration;
 use tandem_core::Episode;
 use tandem_core::work::SlotOrder;
 use tandem_learner::checkpoint;
-use tandem_learner::{Error, LearnerConfig, RunConfig};
+use tandem_learner::{Error, LearnerConfig};
+use tandem_rl::RunConfig;
 use tokio::net::TcpListener;
 use tonic::Status;
 

@@ -3,9 +3,9 @@
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use tandem_learner::RunConfig;
 use tandem_learner::checkpoint::{self, CheckpointError};
 use tandem_learner::{Ended, Error, LearnerConfig};
+use tandem_rl::RunConfig;
 use tandem_telemetry::MetricsLog;
 use tempfile::TempDir;
 

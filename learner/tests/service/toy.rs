@@ -4,9 +4,9 @@ use tandem_core::layout::{EPISODE_STEPS, Layout, OBJECT_POSITION};
 use tandem_core::rng::{Stream, episode_rng, standard_normal, uniform};
 use tandem_core::work::{EpisodeOrder, SlotOrder};
 use tandem_core::{Contacts, Episode, EpisodeKind, Task};
-use tandem_learner::RunConfig;
-use tandem_learner::config::Recipe;
 use tandem_policy::Actor;
+use tandem_rl::RunConfig;
+use tandem_rl::config::Recipe;
 
 pub(crate) const LAYOUT: Layout = Layout::new(Task::Push, 1);
 /// Units that every advised episode is charged: its first steps are advised.

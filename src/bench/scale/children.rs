@@ -8,8 +8,8 @@ use std::time::Duration;
 
 use anyhow::{Context as _, anyhow};
 use tandem_core::Task;
-use tandem_learner::RunConfig;
-use tandem_learner::config::Recipe;
+use tandem_rl::RunConfig;
+use tandem_rl::config::Recipe;
 use tokio::io::{AsyncBufReadExt as _, BufReader};
 use tokio::process::{Child, Command};
 

@@ -6,10 +6,10 @@ use tandem_core::layout::{EPISODE_STEPS, Layout, OBJECT_POSITION};
 use tandem_core::rng::{Stream, episode_rng, standard_normal, uniform};
 use tandem_core::work::EpisodeOrder;
 use tandem_core::{Contacts, Episode, EpisodeKind, Task};
-use tandem_learner::RunConfig;
-use tandem_learner::config::Recipe;
-use tandem_learner::trainer::Trainer;
 use tandem_policy::Actor;
+use tandem_rl::RunConfig;
+use tandem_rl::config::Recipe;
+use tandem_rl::trainer::Trainer;
 
 const LAYOUT: Layout = Layout::new(Task::Push, 1);
 /// How far an action of 1 moves the object, metres.

@@ -2,7 +2,7 @@
 
 use serde_json::Value;
 use tandem_core::{Layout, Task};
-use tandem_learner::ddpg::{Batch, Ddpg, DdpgConfig, Rewards};
+use tandem_rl::ddpg::{Batch, Ddpg, DdpgConfig, Rewards};
 
 const REFERENCE: &str = include_str!("data/ddpg_reference.json");
 /// Single precision's share in a loss, a gradient or a step, of numbers of 1 and more.

@@ -1,5 +1,5 @@
 //! Prints how fast this machine updates the two-arm push student, against its own matrix product:
-//! `cargo run --release -p tandem-learner --example update_speed`.
+//! `cargo run --release -p tandem-rl --example update_speed`.
 //!
 //! Each figure is the best of many short samples, taken in alternating blocks, so that other programs on the machine
 //! matter little and each block finds the caches as it left them.
@@ -10,8 +10,8 @@ use std::time::Instant;
 
 use tandem_core::rng::uniform;
 use tandem_core::{Layout, Stream, Task, episode_rng};
-use tandem_learner::ddpg::{Batch, Ddpg, DdpgConfig, Rewards};
 use tandem_policy::{Matrix, MatrixMut, multiply};
+use tandem_rl::ddpg::{Batch, Ddpg, DdpgConfig, Rewards};
 
 const N_BLOCKS: usize = 10;
 const SAMPLES_PER_BLOCK: usize = 20;

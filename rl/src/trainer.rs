@@ -54,19 +54,27 @@ pub struct RoundFigures {
     pub training_moved: f64,
 }
 
-/// Everything that learning changes.
+/// Everything that learning changes. Fields are public so that a checkpoint can save and restore them.
 #[derive(Debug)]
 pub struct Trainer {
-    pub(crate) config: RunConfig,
-    pub(crate) layout: Layout,
-    pub(crate) counters: Counters,
-    pub(crate) replay: ReplayBuffer,
-    pub(crate) ddpg: Ddpg,
-    pub(crate) observation_normalizer: Normalizer,
-    pub(crate) goal_normalizer: Normalizer,
+    /// The run's settings, checked.
+    pub config: RunConfig,
+    /// Arms and task, from the settings.
+    pub layout: Layout,
+    /// Rounds, environment steps, episodes, updates and units of advice so far.
+    pub counters: Counters,
+    /// The replay buffer.
+    pub replay: ReplayBuffer,
+    /// Networks, target networks and optimizer states.
+    pub ddpg: Ddpg,
+    /// Running mean and deviation of observations.
+    pub observation_normalizer: Normalizer,
+    /// Running mean and deviation of goals.
+    pub goal_normalizer: Normalizer,
     sampler: Sampler,
     batch: Batch,
-    pub(crate) figures: RoundFigures,
+    /// Statistics of the last round.
+    pub figures: RoundFigures,
 }
 
 impl Trainer {
@@ -319,7 +327,8 @@ impl Trainer {
     }
 
     /// Every large float vector of the state, by name, in a fixed order.
-    pub(crate) fn tensors(&self) -> Vec<(String, &[f32])> {
+    #[must_use]
+    pub fn tensors(&self) -> Vec<(String, &[f32])> {
         let (parts, _) = self.replay.parts();
         let replay = [
             ("replay.observations", parts.observations.as_slice()),
