@@ -286,7 +286,9 @@ fn workers_that_are_forgotten_leave_their_places_on_the_connection_to_others() {
     let mut board = Board::default();
     let mut join_one = |now| board.join("w".to_owned(), Some(1), now).expect("there is room");
     let kept = join_one(at(0));
-    (1..MAX_UNPROVEN_PER_CONNECTION).for_each(|_| drop(join_one(at(0))));
+    for _ in 1..MAX_UNPROVEN_PER_CONNECTION {
+        join_one(at(0));
+    }
     assert_eq!(board.next(kept, at(14)), Ok(None));
     board.reclaim(at(15));
     assert_eq!(board.workers.len(), 1, "the others never asked");
