@@ -218,7 +218,7 @@ impl Board {
         self.allowances.clear();
     }
 
-    /// Numbers workers from `first` on.
+    /// Gives workers the numbers after `first`.
     pub const fn start_workers_at(&mut self, first: u64) {
         self.next_worker = first;
     }

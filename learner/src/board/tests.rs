@@ -193,6 +193,7 @@ fn there_is_room_for_a_living_worker_as_long_as_others_are_silent() {
     assert_eq!(board.join("w".to_owned(), None, at(2)), Err(JoinError::RunFull));
     let newest = join(&mut board, at(0) + SILENT_AFTER);
     assert_eq!(board.workers.len(), MAX_WORKERS);
+    assert_eq!((board.n_waiting(), board.n_out()), (1, 0), "its slot is free at once");
     assert_eq!(board.next(first, at(16)), Err(SubmitError::UnknownWorker(first)));
     assert_eq!(given(&mut board, newest, at(16)), Some(0), "the forgotten worker's slot");
 }
@@ -236,20 +237,108 @@ fn one_connection_cannot_take_the_places_of_others() {
     assert_eq!(board.next(honest, at(0)), Ok(None));
 }
 
-#[test]
-fn workers_that_play_do_not_make_room_for_others_of_their_connection() {
+/// Connection 1 with as many workers as may play over it without having delivered; the first has slot 0, and so on.
+fn crowded_connection() -> (Board, Vec<u64>) {
     let mut board = Board::default();
     (0..2000).for_each(|number| board.add(order(number, EpisodeKind::Training)));
-    let mut first = 0;
-    for slot in 0..MAX_UNPROVEN_PER_CONNECTION as u64 {
+    let workers = (0..MAX_UNPROVEN_PER_CONNECTION as u64).map(|slot| {
         let worker = board.join("w".to_owned(), Some(1), at(0)).expect("there is room");
         assert_eq!(given(&mut board, worker, at(0)), Some(slot));
-        first = if slot == 0 { worker } else { first };
-    }
+        worker
+    });
+    let workers = workers.collect();
+    (board, workers)
+}
+
+#[test]
+fn workers_that_play_do_not_make_room_for_others_of_their_connection() {
+    let (mut board, workers) = crowded_connection();
     assert_eq!(board.join("w".to_owned(), Some(1), at(0)), Err(JoinError::ConnectionFull));
     assert!(board.join("w".to_owned(), Some(2), at(0)).is_ok());
-    assert_eq!(board.submit(first, 0, played(0), at(1)), Ok(true));
+    assert_eq!(board.submit(workers[0], 0, played(0), at(1)), Ok(true));
     assert!(board.join("w".to_owned(), Some(1), at(1)).is_ok(), "one has delivered");
+}
+
+#[test]
+fn a_worker_makes_one_place_on_its_connection_however_often_it_delivers() {
+    let (mut board, workers) = crowded_connection();
+    for _ in 0..2 {
+        let slot = given(&mut board, workers[0], at(1)).expect("a slot");
+        assert_eq!(board.submit(workers[0], slot, played(slot), at(1)), Ok(true));
+    }
+    let newcomer = board.join("w".to_owned(), Some(1), at(1)).expect("one has delivered");
+    assert!(given(&mut board, newcomer, at(1)).is_some());
+    assert_eq!(board.join("w".to_owned(), Some(1), at(1)), Err(JoinError::ConnectionFull));
+}
+
+#[test]
+fn a_worker_that_delivered_only_what_was_in_already_has_delivered_nothing() {
+    let (mut board, workers) = crowded_connection();
+    let other = join(&mut board, at(1));
+    assert_eq!(board.submit(other, 0, played(0), at(1)), Ok(true));
+    assert_eq!(board.submit(workers[0], 0, played(0), at(1)), Ok(false));
+    assert!(board.join("w".to_owned(), Some(1), at(1)).is_ok());
+    assert_eq!(board.next(workers[0], at(1)), Err(SubmitError::UnknownWorker(workers[0])));
+}
+
+#[test]
+fn workers_that_are_forgotten_leave_their_places_on_the_connection_to_others() {
+    let mut board = Board::default();
+    let mut join_one = |now| board.join("w".to_owned(), Some(1), now).expect("there is room");
+    let kept = join_one(at(0));
+    for _ in 1..MAX_UNPROVEN_PER_CONNECTION {
+        join_one(at(0));
+    }
+    assert_eq!(board.next(kept, at(14)), Ok(None));
+    board.reclaim(at(15));
+    assert_eq!(board.workers.len(), 1, "the others never asked");
+    for _ in 1..MAX_UNPROVEN_PER_CONNECTION {
+        board.join("w".to_owned(), Some(1), at(16)).expect("there is room");
+    }
+    assert_eq!(board.next(kept, at(16)), Ok(None), "it did not have to make room");
+}
+
+#[test]
+fn a_workers_episodes_are_counted_when_they_are_new() {
+    let (mut board, a, b) = board_of(3);
+    let n_episodes = |board: &Board, id| board.worker(id).expect("known").n_episodes;
+    for slot in 0..3 {
+        assert_eq!(given(&mut board, a, at(0)), Some(slot));
+        assert_eq!(n_episodes(&board, a), slot);
+        assert_eq!(board.submit(a, slot, played(slot), at(0)), Ok(true));
+        assert_eq!(board.submit(b, slot, played(slot), at(0)), Ok(false));
+    }
+    assert_eq!((n_episodes(&board, a), n_episodes(&board, b)), (3, 0));
+}
+
+#[test]
+fn a_silent_worker_is_known_and_does_not_count_as_alive() {
+    let (mut board, a, b) = board_of(0);
+    assert_eq!(board.n_alive(at(14)), 2);
+    assert_eq!(board.next(b, at(14)), Ok(None));
+    assert_eq!(board.n_alive(at(15)), 1);
+    assert_eq!(board.n_alive(at(29)), 0);
+    let heard: Vec<_> = board.workers().map(|(id, worker)| (id, worker.heard_at)).collect();
+    assert_eq!(heard, [(a, at(0)), (b, at(14))]);
+}
+
+#[test]
+fn a_worker_that_hangs_up_gives_back_no_slot_that_another_plays() {
+    let (mut board, a, b) = board_of(1);
+    given(&mut board, a, at(0));
+    assert_eq!(given(&mut board, b, COVER_AFTER), Some(0), "covers");
+    assert!(!board.hung_up(a), "the slot is with the other");
+    assert_eq!((board.n_waiting(), board.n_out()), (0, 1));
+}
+
+#[test]
+fn a_worker_of_an_earlier_start_is_unknown_to_a_later_one() {
+    let earlier = join(&mut Board::default(), at(0));
+    let mut board = Board::default();
+    board.start_workers_at(4096);
+    let later = join(&mut board, at(0));
+    assert_eq!(board.next(earlier, at(0)), Err(SubmitError::UnknownWorker(earlier)));
+    assert!(later > 4096, "{later}");
 }
 
 #[test]

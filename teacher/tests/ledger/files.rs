@@ -196,9 +196,27 @@ fn a_place_where_no_file_can_be_is_refused() {
     let twin = directory.path().join("twin.sqlite");
     fs::hard_link(&path, &twin).expect("a link");
     check(&twin, "the file has 2 names (hard links), keep only one of them");
+    let dangling = directory.path().join("dangling.sqlite");
+    std::os::unix::fs::symlink(directory.path().join("missing/ledger"), &dangling).expect("a link");
+    check(&dangling, "No such file or directory (os error 2)");
     let long = directory.path().join("a".repeat(300));
     check(&long, "File name too long (os error 36)");
     assert_eq!(fs::read(&path).expect("bytes"), b"");
+}
+
+#[test]
+fn a_ledger_that_cannot_be_opened_now_is_not_called_damaged() {
+    let (_directory, path) = directory();
+    filled(&path);
+    let log = path.with_file_name("ledger.sqlite-wal");
+    fs::create_dir(&log).expect("something in the place of the log");
+    let error = SqliteLedger::open(&path).expect_err("refused");
+    assert!(matches!(error, OpenError::Io { .. }), "{error}");
+    fs::remove_dir(&log).expect("removed");
+    assert_eq!(
+        SqliteLedger::open(&path).expect("a ledger").balance("run").expect("kept").spent,
+        600
+    );
 }
 
 #[test]

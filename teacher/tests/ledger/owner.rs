@@ -9,6 +9,7 @@ use tandem_teacher::ledger::{Ledger as _, LedgerError, OpenError, SqliteLedger};
 use tempfile::TempDir;
 
 use crate::place::{BOTH, FIRST, bill, charge, terms};
+use crate::servers::Log;
 
 /// An open ledger with one unit of ten spent, by step 0 of episode 1.
 fn opened() -> (TempDir, PathBuf, SqliteLedger) {
@@ -133,6 +134,24 @@ fn what_was_answered_survives_the_deletion_of_the_log() {
     charge_step(&mut again, 0).expect("known");
     charge_step(&mut again, 1).expect("paid");
     assert_eq!(again.balance("run").expect("an account").spent, 2);
+}
+
+#[test]
+fn a_log_that_a_reader_keeps_from_being_copied_is_reported() {
+    for is_read in [false, true] {
+        let (_directory, path, mut ledger) = opened();
+        let reader = Connection::open(&path).expect("a database");
+        if is_read {
+            let sql = "BEGIN; SELECT spent FROM accounts";
+            reader.execute_batch(sql).expect(sql);
+        }
+        fs::remove_file(beside(&path, "-wal")).expect("removed");
+        let log = Log::default();
+        log.of(|| charge_step(&mut ledger, 1)).expect_err("refused");
+        let logged = log.text();
+        assert!(logged.contains("nothing more is charged"), "{logged}");
+        assert_eq!(logged.contains("the last charges are lost if"), is_read, "{logged}");
+    }
 }
 
 #[test]

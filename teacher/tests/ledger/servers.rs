@@ -115,13 +115,27 @@ fn a_server_that_hangs_is_unavailable_within_seconds() {
     let Some(server) = RedisServer::start() else { return };
     let mut ledger = RedisLedger::open(&server.url()).expect("a ledger");
     ledger.open("run", terms(10)).expect("an account");
+    let asked = [bill("run", &[charge(1, 0, BOTH)]), bill("run", &[charge(1, 1, BOTH)])];
+    let mut connection = server.connection();
+    let before = n_connections(&mut connection);
     server.signal("-STOP");
-    is_unavailable(ledger.charge(&[bill("run", &[charge(1, 0, BOTH)])]).remove(0));
+    ledger.charge(&asked).into_iter().for_each(|outcome| drop(is_unavailable(outcome)));
+    server.signal("-CONT");
+    assert_eq!(n_connections(&mut connection), before, "what took too long is not asked again");
+    server.signal("-STOP");
     is_unavailable(ledger.balance("run"));
     server.signal("-CONT");
-    // Whether the charge was made before the answer was lost is all the same.
-    let again = ledger.charge(&[bill("run", &[charge(1, 0, BOTH)])]).remove(0).expect("paid");
-    assert_eq!((again.verdicts.as_slice(), again.left), ([FIRST].as_slice(), 9));
+    // Whether the charges were made before the answers were lost is all the same, and no late answer is taken for
+    // that to another question.
+    let again = ledger.charge(&asked).pop().expect("an outcome").expect("paid");
+    assert_eq!((again.verdicts.as_slice(), again.left), ([FIRST].as_slice(), 8));
+}
+
+/// Connections that the server has accepted since it started.
+fn n_connections(connection: &mut redis::Connection) -> u64 {
+    let stats: String = redis::cmd("INFO").arg("stats").query(connection).expect("an answer");
+    let count = stats.lines().find_map(|line| line.strip_prefix("total_connections_received:"));
+    count.and_then(|count| count.trim().parse().ok()).expect("a count")
 }
 
 #[test]
@@ -140,6 +154,7 @@ fn a_password_is_used_and_never_told() {
     assert!(RedisLedger::open(&at("")).is_err(), "no password");
     let mut ledger = log.of(|| RedisLedger::open(&at(":hunter2@")).expect("let in"));
     ledger.open("run", terms(10)).expect("an account");
+    assert!(format!("{ledger:?}").contains(&at("")), "the address is told: {ledger:?}");
     assert!(!format!("{ledger:?}").contains("hunter"), "{ledger:?}");
     let logged = log.text();
     assert!(logged.contains("ledger opened") && !logged.contains("hunter"), "{logged}");
@@ -157,10 +172,18 @@ fn a_server_that_may_forget_is_warned_about() {
     ledger.open("run", terms(10)).expect("an account");
     ledger.open("walk", terms(10)).expect("an account");
 
-    let Some(careful) = RedisServer::start() else { return };
-    let log = Log::default();
-    drop(log.of(|| RedisLedger::open(&careful.url())));
-    assert!(!log.text().contains("WARN"), "{}", log.text());
+    // Keys are dropped only when there is a limit and a policy other than to refuse.
+    let careful: [&[&str]; 3] = [
+        &["--appendonly", "yes"],
+        &["--appendonly", "yes", "--maxmemory-policy", "allkeys-lru"],
+        &["--appendonly", "yes", "--maxmemory", "50mb", "--maxmemory-policy", "noeviction"],
+    ];
+    for settings in careful {
+        let Some(careful) = RedisServer::start_with(settings) else { return };
+        let log = Log::default();
+        drop(log.of(|| RedisLedger::open(&careful.url())));
+        assert!(!log.text().contains("WARN"), "{settings:?}: {}", log.text());
+    }
     let log = Log::default();
     drop(log.of(|| RedisLedger::open(&server.url())));
     assert!(log.text().contains("accounts=2"), "{}", log.text());
@@ -193,7 +216,7 @@ fn the_keys_of_an_account_have_one_hash_tag_and_can_be_read() {
 
 /// Log lines of one thread.
 #[derive(Clone, Default)]
-struct Log(Arc<Mutex<Vec<u8>>>);
+pub(crate) struct Log(Arc<Mutex<Vec<u8>>>);
 
 thread_local! {
     /// Where this thread's log lines go.
@@ -203,7 +226,7 @@ thread_local! {
 impl Log {
     /// One subscriber for all threads: with one for each, an event that another thread meets first, where nobody listens,
     /// may be taken for one that nobody wants, here too.
-    fn of<T>(&self, call: impl FnOnce() -> T) -> T {
+    pub(crate) fn of<T>(&self, call: impl FnOnce() -> T) -> T {
         static SUBSCRIBED: Once = Once::new();
         SUBSCRIBED.call_once(|| {
             let writer = || LISTENING.with_borrow(|log| log.clone().unwrap_or_default());
@@ -215,7 +238,7 @@ impl Log {
         outcome
     }
 
-    fn text(&self) -> String {
+    pub(crate) fn text(&self) -> String {
         String::from_utf8(self.0.lock().expect("whole").clone()).expect("UTF-8")
     }
 }

@@ -87,6 +87,15 @@ fn a_ledger_of_version_1_is_upgraded_and_keeps_its_books() {
 }
 
 #[test]
+fn an_upgraded_ledger_opens_again_although_nothing_was_charged_to_it() {
+    let (_directory, path) = copy();
+    let balance = |path: &Path| SqliteLedger::open(path).expect("a ledger").balance(LEASED);
+    let upgraded = balance(&path).expect("an account");
+    assert_eq!(version(&path), 2);
+    assert_eq!(balance(&path).expect("an account"), upgraded);
+}
+
+#[test]
 fn a_damaged_ledger_of_version_1_is_refused_and_not_upgraded() {
     let (_directory, path) = copy();
     let other = Connection::open(&path).expect("a database");

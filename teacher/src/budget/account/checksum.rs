@@ -99,8 +99,18 @@ mod tests {
         assert_eq!(Checksum::of_terms("run", terms), Checksum(0xCB7107CD35B588B7));
         assert_eq!(Checksum::of_lease(&LEASE), Checksum(0x827388E34CDD0534));
         assert_eq!(Checksum::of_word((7, 1), WORD), Checksum(0x991E109C4DF90316));
-        let checksum = Checksum(u64::MAX);
-        assert_eq!(Checksum::from_bits(checksum.to_bits()), checksum);
+        for (checksum, bits) in [(0, 0), (1, 1), (1 << 63, i64::MIN), (u64::MAX - 1, -2)] {
+            assert_eq!(Checksum(checksum).to_bits(), bits);
+            assert_eq!(Checksum::from_bits(bits), Checksum(checksum));
+        }
+    }
+
+    #[test]
+    fn a_part_is_added_and_taken_away_modulo_two_to_the_64() {
+        let (sum, part) = (Checksum(1), Checksum(3));
+        assert_eq!(Checksum(u64::MAX - 1) + part, sum);
+        assert_eq!(sum - part, Checksum(u64::MAX - 1));
+        assert_eq!([part, sum, part].into_iter().sum::<Checksum>(), Checksum(7));
     }
 
     #[test]

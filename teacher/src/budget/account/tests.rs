@@ -85,6 +85,8 @@ fn a_settled_lease_flows_back_once_and_pays_no_more() {
     for _ in 0..2 {
         account.settle(&[1, 1, 77]);
         assert_eq!(state(&account), (1, 0, 99));
+        assert!(account.has_lease(1), "units were set aside for it");
+        assert!(!account.has_lease(77), "a settlement sets none aside");
     }
     assert_eq!(account.charge(1, 1, ALWAYS), Verdict::Uncharged);
     assert_eq!(account.charge(1, 0, ALWAYS), Verdict::Charged(Half::First));

@@ -138,6 +138,13 @@ impl LedgerFile {
         self.n_unsynced
     }
 
+    /// SQLite's setting `synchronous`: 1 waits for the disk at checkpoints only, 2 at every transaction.
+    #[cfg(test)]
+    pub(super) fn synchronous(&self) -> u32 {
+        let read = |row: &rusqlite::Row<'_>| row.get(0);
+        self.connection.pragma_query_value(None, "synchronous", read).expect("a setting")
+    }
+
     /// Lets the file have no more than `n_pages` pages, or those that it has.
     #[cfg(test)]
     pub(super) fn limit_pages(&self, n_pages: u32) {

@@ -214,4 +214,15 @@ mod tests {
         assert!(Hold::take(&path).is_ok(), "free again");
         drop(copy);
     }
+
+    /// Programs of all versions must lock the same byte, or two of them would own one ledger.
+    #[test]
+    fn a_ledger_is_in_use_while_another_program_locks_the_agreed_byte() {
+        let directory = tempfile::tempdir().expect("a directory");
+        let path = directory.path().join("ledger.sqlite");
+        let other = File::create(&path).expect("a file");
+        let agreed = libc::flock { l_start: 0x4000_0000_0000_0000, ..byte_lock(libc::F_WRLCK) };
+        fcntl(&other, FcntlArg::F_OFD_SETLK(&agreed)).expect("locked");
+        assert!(matches!(Hold::take(&path), Err(OpenError::InUse(_))));
+    }
 }

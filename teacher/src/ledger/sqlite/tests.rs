@@ -82,6 +82,19 @@ fn a_lease_makes_the_charges_before_it_survive_a_loss_of_power() {
 }
 
 #[test]
+fn a_charge_does_not_wait_for_the_disk_and_a_lease_does() {
+    let (_directory, mut ledger) = ledger();
+    for step in 0..2 {
+        ledger.charge(&[bill("run", 1, step..step + 1)]).remove(0).unwrap();
+        assert_eq!(ledger.file.synchronous(), 1, "checkpoints only");
+    }
+    ledger.open_leases("run", &[2], 3).unwrap();
+    assert_eq!(ledger.file.synchronous(), 2, "every transaction");
+    ledger.charge(&[bill("run", 2, 0..1)]).remove(0).unwrap();
+    assert_eq!(ledger.file.synchronous(), 1);
+}
+
+#[test]
 fn no_more_than_so_many_charges_can_be_lost_to_a_loss_of_power() {
     let (_directory, mut ledger) = ledger();
     let mut most = 0;
