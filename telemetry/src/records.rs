@@ -4,8 +4,9 @@ use mcap::McapError;
 use mcap::records::{Record, op};
 use mcap::sans_io::linear_reader::{LinearReadEvent, LinearReader, LinearReaderOptions};
 
-/// No record or chunk may claim to be larger: a damaged length must not fill the memory.
-const MAX_RECORD_BYTES: usize = 256 << 20;
+/// The largest record or chunk, also uncompressed: the reader allocates what a length declares. Our logs have chunks of
+/// less than 1 MiB.
+const MAX_RECORD_BYTES: usize = 16 << 20;
 
 /// The schemas, channels, messages, metadata and the end of the data of a file, in order, those inside chunks too. A
 /// chunk's records come only after its checksum was found right. After an error there is nothing more.
@@ -123,6 +124,20 @@ mod tests {
     fn an_attachment_too_short_for_its_checksum_is_skipped() {
         // Two times, two empty texts and a length of 0, without the checksum.
         assert!(read(op::ATTACHMENT, &[0; 32]).iter().all(Result::is_ok));
+    }
+
+    #[test]
+    fn a_chunk_that_declares_too_large_a_size_is_refused_before_memory_is_reserved() {
+        let chunk = |uncompressed_size: u64| {
+            let (times, checksum) = ([0; 16], [1; 4]);
+            let (compression, n_compressed) = (b"\x04\0\0\0zstd", [0; 8]);
+            [&times[..], &uncompressed_size.to_le_bytes(), &checksum, compression, &n_compressed]
+                .concat()
+        };
+        let records = read(op::CHUNK, &chunk(MAX_RECORD_BYTES as u64 + 1));
+        assert!(matches!(records.as_slice(), [Err(McapError::ChunkTooLarge(_))]), "{records:?}");
+        let records = read(op::CHUNK, &chunk(MAX_RECORD_BYTES as u64));
+        assert!(!matches!(records.as_slice(), [Err(McapError::ChunkTooLarge(_))]), "{records:?}");
     }
 
     #[test]
