@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
+use mcap::McapError;
 use mcap::read::ChannelAccumulator;
 use mcap::records::Record;
 use tandem_core::{ArmAdvice, Contacts, Layout};
@@ -83,10 +84,10 @@ fn read_raw(bytes: &[u8]) -> mcap::McapResult<RawLog> {
                 channels.add_channel(channel)?;
             }
             Record::Message { header, data } => {
-                let channel = channels.get(header.channel_id);
-                match channel.as_ref().map(|channel| channel.topic.as_str()) {
-                    Some(TRANSITION_TOPIC) => raw.transitions.push(data.into_owned()),
-                    Some(OUTCOME_TOPIC) => raw.outcomes.push(data.into_owned()),
+                let unknown = McapError::UnknownChannel(header.sequence, header.channel_id);
+                match channels.get(header.channel_id).ok_or(unknown)?.topic.as_str() {
+                    TRANSITION_TOPIC => raw.transitions.push(data.into_owned()),
+                    OUTCOME_TOPIC => raw.outcomes.push(data.into_owned()),
                     _ => {}
                 }
             }
@@ -143,5 +144,28 @@ fn of_length(field: &str, numbers: Vec<f32>, expected: usize) -> Result<Vec<f32>
     match numbers.len() {
         got if got == expected => Ok(numbers),
         got => Err(format!("{field} has {got} numbers, the layout has {expected}")),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use mcap::records::op;
+
+    use super::*;
+
+    #[test]
+    fn a_message_on_an_unknown_channel_is_refused() {
+        let record = |opcode: u8, body: &[u8]| {
+            [&[opcode], (body.len() as u64).to_le_bytes().as_slice(), body].concat()
+        };
+        let file = |message: &[u8]| {
+            let (header, end) = (record(op::HEADER, &[0; 8]), record(op::DATA_END, &[0; 4]));
+            let footer = record(op::FOOTER, &[0; 20]);
+            [mcap::MAGIC, &header, message, &end, &footer, mcap::MAGIC].concat()
+        };
+        assert!(read_raw(&file(&[])).is_ok(), "an empty log is whole");
+        let message = record(op::MESSAGE, &[[2].as_slice(), &[0; 21]].concat());
+        let refused = read_raw(&file(&message)).err();
+        assert!(matches!(refused, Some(McapError::UnknownChannel(0, 2))), "{refused:?}");
     }
 }
