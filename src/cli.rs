@@ -19,7 +19,7 @@ pub(crate) use relay::RelayArgs;
 pub(crate) use scale::ScaleArgs;
 pub(crate) use trial::{ModeName, RecordName, TrialArgs};
 
-/// Teaches robots with two arms by letting a robot with one arm advise them.
+/// Trains policies for two robot arms with advice from a one-arm policy.
 #[derive(Debug, Parser)]
 #[command(
     name = "tandem",
@@ -27,13 +27,13 @@ pub(crate) use trial::{ModeName, RecordName, TrialArgs};
     propagate_version = true,
     after_help = "\
 Examples:
-  tandem train                                  the main job: two arms learn to push, advised
-  tandem train --arms 1 --task push             a one-arm teacher from scratch
+  tandem train                                  trains two arms to push, with advice
+  tandem train --arms 1 --task push             trains a one-arm teacher from scratch
   tandem eval --policy runs/NAME/policy/best.safetensors
   tandem COMMAND --help                         more examples
 
-Exit codes: 0 done, 64 bad usage or configuration, 65 bad input data, 70 a bug, 74 the result cannot be
-written to standard output, 75 try again, 130 interrupted, 141 standard output has no reader."
+Exit codes: 0 success, 64 wrong usage or configuration, 65 invalid input data, 70 bug, 74 the result cannot be written
+to standard output, 75 temporary failure (try again), 130 interrupted, 141 standard output was closed by its reader."
 )]
 pub(crate) struct Cli {
     /// Log filter, such as info or tandem_learner=debug; overrides RUST_LOG.
@@ -45,37 +45,37 @@ pub(crate) struct Cli {
 
 #[derive(Debug, Subcommand)]
 pub(crate) enum Command {
-    /// Trains a policy: starts learner, teacher and workers on this machine.
+    /// Trains a policy: starts a learner, a teacher and workers on this machine.
     Train(Box<TrainArgs>),
-    /// Measures a policy on fixed goals: no noise, no advice.
+    /// Evaluates a policy on fixed goals, without noise or advice.
     Eval(EvalArgs),
-    /// Trains many runs one after another: strategies, tasks, seeds and whatever else a file lists.
+    /// Trains a list of runs: every combination of the strategies, tasks, seeds and settings in a file.
     Sweep(SweepArgs),
-    /// Sets runs and trials side by side: the paper's Tables 2 and 4, curves, one HTML page.
+    /// Compares runs and trials: the paper's Tables 2 and 4, curves, and an HTML page.
     Report(ReportArgs),
     /// Serves a one-arm policy as a teacher.
     Teacher(TeacherArgs),
-    /// Serves a run's learner.
+    /// Serves the learner of a run.
     Learner(LearnerArgs),
     /// Plays episodes for a learner.
     Worker(WorkerArgs),
-    /// Hands out a learner's parameters near its workers, for runs with very many.
+    /// Distributes a learner's parameters to nearby workers, for runs with very many workers.
     Relay(RelayArgs),
-    /// Serves a pair of arms, real or simulated, and tells them what to do.
+    /// Serves a pair of arms, real or simulated, and operates it.
     Bridge(BridgeArgs),
-    /// Asks a service whether it serves.
+    /// Checks the health of a service.
     Health(HealthArgs),
-    /// Asks a learner how far its run is.
+    /// Shows the progress of a learner's run.
     Status(StatusArgs),
-    /// Measures simulation, networks, updates, replay and a short run on this machine.
+    /// Benchmarks the simulator, networks, updates, replay buffer and a short run on this machine.
     Bench(BenchArgs),
-    /// Shows what is in a policy file.
+    /// Inspects policy files.
     Policy(PolicyArgs),
-    /// Mends MCAP logs.
+    /// Repairs MCAP logs.
     Mcap(McapArgs),
-    /// Plays recorded episodes again in the simulator and compares them bit for bit.
+    /// Simulates recorded episodes again and compares them bit for bit.
     Replay(ReplayArgs),
-    /// Draws the arms at work as an SVG picture.
+    /// Renders a step of an episode as an SVG picture.
     Picture(PictureArgs),
 }
 
@@ -87,7 +87,7 @@ pub(crate) enum TaskName {
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub(crate) enum RecipeName {
-    /// What learns fastest on two cores.
+    /// Tandem's recipe, which needs few environment steps and minutes on two cores.
     Tandem,
     /// The paper's DDPG + HER with the reference implementation's values.
     Paper,
@@ -101,62 +101,62 @@ Examples:
   tandem train --strategy ea --budget 50000 --seed 2 --max-minutes 20
   tandem train --set ddpg.discount=0.98 --set rounds.slots=16
   tandem train --run my-run.toml --out runs/mine
-  tandem train --resume --out runs/mine               goes on where it stopped
-  tandem train --resume --out runs/mine --max-env-steps 600000    goes on for longer")]
+  tandem train --resume --out runs/mine               resumes the run
+  tandem train --resume --out runs/mine --max-env-steps 600000    resumes it for longer")]
 pub(crate) struct TrainArgs {
-    /// What the arms do [default: push].
+    /// Task [default: push].
     #[arg(long, value_enum)]
     pub(crate) task: Option<TaskName>,
-    /// Arms of the learning policy, 1 or 2 [default: 2].
+    /// Number of arms of the trained policy, 1 or 2 [default: 2].
     #[arg(long)]
     pub(crate) arms: Option<usize>,
-    /// When the teacher takes over: none, ea, eamc:T, mc-q:T, mc-act:A or mc-act-abs:A; init:teacher starts from
-    /// copies of the teacher and asks for nothing
+    /// Advising strategy: none, ea, eamc:T, mc-q:T, mc-act:A or mc-act-abs:A. With init:teacher the student starts as
+    /// copies of the teacher and gets no advice
     /// [default: mc-q:0.1 with two arms, none with one].
     #[arg(long, value_name = "NAME[:THRESHOLD]")]
     pub(crate) strategy: Option<String>,
-    /// The teacher's policy file [default: the one that ships for the task].
+    /// Policy file of the teacher [default: the shipped teacher of the task].
     #[arg(long, value_name = "FILE")]
     pub(crate) teacher: Option<PathBuf>,
-    /// Pieces of advice for the whole run [default: 500000].
+    /// Advice budget of the run, in environment steps with advice [default: 500000].
     #[arg(long, value_name = "N")]
     pub(crate) budget: Option<u64>,
-    /// Worker processes [default: one a core, at most one a slot].
+    /// Number of worker processes [default: one per core, at most one per slot].
     #[arg(long, value_name = "N")]
     pub(crate) workers: Option<usize>,
-    /// Seed of every random draw [default: 1].
+    /// Seed of all random numbers [default: 1].
     #[arg(long, value_name = "N")]
     pub(crate) seed: Option<u64>,
-    /// Stops once an evaluation succeeds so often, 0 to 1.
+    /// Stops when an evaluation reaches this success rate, 0 to 1.
     #[arg(long, value_name = "P")]
     pub(crate) until_success: Option<f64>,
-    /// Stops after so many environment steps [default: the recipe's; 0 for never].
+    /// Stops after this many environment steps; 0 for no limit [default: the recipe's].
     #[arg(long, value_name = "N")]
     pub(crate) max_env_steps: Option<u64>,
-    /// Stops after so many minutes instead [0: never].
+    /// Stops after this many minutes instead; 0 for no limit.
     #[arg(long, value_name = "N")]
     pub(crate) max_minutes: Option<f64>,
-    /// Where the settings' defaults come from [default: tandem].
+    /// Recipe that gives the defaults of all settings [default: tandem].
     #[arg(long, value_enum)]
     pub(crate) recipe: Option<RecipeName>,
-    /// Run file with any of the settings; unknown keys are refused.
+    /// Run file (TOML) with any of the settings; unknown keys are rejected.
     #[arg(long, value_name = "FILE.toml")]
     pub(crate) run: Option<PathBuf>,
-    /// One setting, such as ddpg.discount=0.98; may be repeated.
+    /// Overrides one setting, for example ddpg.discount=0.98; can be repeated.
     #[arg(long = "set", value_name = "KEY=VALUE")]
     pub(crate) settings: Vec<String>,
     /// Run directory [default: runs/TASK-ARMS-STRATEGY-seedN].
     #[arg(long, value_name = "DIR")]
     pub(crate) out: Option<PathBuf>,
-    /// Goes on with the run in --out from its newest checkpoint. Its settings and its teacher stay those that it began
-    /// with; only when it stops (--max-env-steps, --max-minutes, --until-success), checkpoint.*,
-    /// evaluation.recorded_episodes and --workers may change. A refused --resume changes nothing.
+    /// Resumes the run in --out from its newest checkpoint. The settings and the teacher remain those of the run; only
+    /// its end (--max-env-steps, --max-minutes, --until-success), checkpoint.*, evaluation.recorded_episodes and
+    /// --workers can change. A rejected --resume changes nothing.
     #[arg(long, requires = "out")]
     pub(crate) resume: bool,
     /// Prints the summary as one JSON object on the last line of standard output.
     #[arg(long)]
     pub(crate) json: bool,
-    /// Is interrupted when standard input closes, as it does when the parent process dies.
+    /// Interrupts the run when standard input closes, which happens when the parent process dies.
     #[arg(long, hide = true)]
     pub(crate) exit_with_stdin: bool,
 }
@@ -164,25 +164,25 @@ pub(crate) struct TrainArgs {
 #[derive(Debug, Args)]
 #[command(after_help = "\
 Examples:
-  tandem sweep deploy/sweep-small.toml --dry-run      what it would run
-  tandem sweep deploy/sweep-small.toml                goes on where it stopped, when it is started again
+  tandem sweep deploy/sweep-small.toml --dry-run      lists the runs
+  tandem sweep deploy/sweep-small.toml                starts them, or resumes them
   tandem report runs/sweep-small
 
-docs/sweep.md says what the file may hold. Exit code 75 when some runs failed; each is tried once more at the next start.")]
+docs/sweep.md describes the file. The exit code is 75 if runs failed; the next start tries each of them once more.")]
 pub(crate) struct SweepArgs {
-    /// The sweep file: settings of all runs, and lists to combine.
+    /// Sweep file (TOML): settings of all runs, and lists of values to combine.
     #[arg(value_name = "FILE.toml")]
     pub(crate) file: PathBuf,
-    /// Where the run directories are made [default: runs/ and the file's name].
+    /// Parent of the run directories [default: runs/NAME, after the file].
     #[arg(long, value_name = "DIR", value_parser = utf8_path())]
     pub(crate) out: Option<PathBuf>,
-    /// Runs side by side; they share the cores.
+    /// Number of concurrent runs; they share the cores.
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..=256))]
     pub(crate) jobs: u16,
     /// Prints one JSON object on the last line of standard output.
     #[arg(long)]
     pub(crate) json: bool,
-    /// Says what would be run, and how far each run is.
+    /// Lists the runs and the progress of each, and starts none.
     #[arg(long)]
     pub(crate) dry_run: bool,
 }
@@ -195,23 +195,23 @@ Examples:
   tandem report trials/student-push --all-trials
   tandem report docs/results/students --composed-teachers policies/teacher-push.safetensors")]
 pub(crate) struct ReportArgs {
-    /// Run directories, directories with runs or trials below, or metrics and trials files by themselves.
+    /// Run directories, directories that contain runs or trials, or single metrics and trials files.
     #[arg(required = true, value_name = "DIR|FILE")]
     pub(crate) paths: Vec<PathBuf>,
-    /// The page; curves and pictures of trials are written beside it as SVG files [default: report.html, in the
-    /// directory of the sweep or the trials when that is all that is given].
+    /// HTML page; curves and pictures of trials are written next to it as SVG files [default: report.html, in the
+    /// directory of the sweep or trials if that is the only one].
     #[arg(long, value_name = "FILE.html")]
     pub(crate) out: Option<PathBuf>,
-    /// Writes one line a run.
+    /// Also writes a CSV file with one line per run.
     #[arg(long, value_name = "FILE.csv")]
     pub(crate) csv: Option<PathBuf>,
-    /// What `tandem eval --json` printed: a row of its own, named after the file; may be repeated.
+    /// Output of `tandem eval --json`, shown as a row with the file's name; can be repeated.
     #[arg(long = "eval", value_name = "FILE.json")]
     pub(crate) evals: Vec<PathBuf>,
-    /// Measures a one-arm policy that drives both arms: the baseline without a student; may be repeated.
+    /// Evaluates a one-arm policy on both arms, the baseline without a student; can be repeated.
     #[arg(long, value_name = "POLICY")]
     pub(crate) composed_teachers: Vec<PathBuf>,
-    /// Draws every trial, not only those that failed.
+    /// Draws all trials, not only failed ones.
     #[arg(long)]
     pub(crate) all_trials: bool,
     /// Prints one JSON object on the last line of standard output.
@@ -227,28 +227,28 @@ Examples:
   tandem eval --composed-teachers policies/teacher-push.safetensors
   tandem eval --policy FILE --episodes 1 --record episode.mcap")]
 pub(crate) struct EvalArgs {
-    /// The policy to measure.
+    /// Policy to evaluate.
     #[arg(long, value_name = "FILE", group = "who")]
     pub(crate) policy: Option<PathBuf>,
-    /// A one-arm policy that drives every arm by itself: the baseline without a student.
+    /// One-arm policy that controls each arm separately: the baseline without a student.
     #[arg(long, value_name = "FILE", group = "who")]
     pub(crate) composed_teachers: Option<PathBuf>,
-    /// Must be the policy's task, when given.
+    /// Fails unless the policy is for this task.
     #[arg(long, value_enum)]
     pub(crate) task: Option<TaskName>,
-    /// Arms [default: the policy's; 2 for composed teachers].
+    /// Number of arms [default: the policy's; 2 for composed teachers].
     #[arg(long)]
     pub(crate) arms: Option<usize>,
-    /// Fixed goals to try.
+    /// Number of episodes, one per goal.
     #[arg(long, default_value_t = 240, value_parser = clap::value_parser!(u64).range(1..=1_000_000))]
     pub(crate) episodes: u64,
-    /// Which goals; none that a run chooses its best policy by.
+    /// Seed of the goals. Runs choose their best policy by goals of another seed.
     #[arg(long, default_value_t = 777)]
     pub(crate) seed: u64,
-    /// Writes the first episode's log there.
+    /// Records the first episode to this MCAP file.
     #[arg(long, value_name = "FILE.mcap")]
     pub(crate) record: Option<PathBuf>,
-    /// Writes every episode's log into this directory.
+    /// Records all episodes to MCAP files in this directory.
     #[arg(long, value_name = "DIR")]
     pub(crate) record_dir: Option<PathBuf>,
     /// Prints one JSON object on the last line of standard output.
@@ -256,39 +256,38 @@ pub(crate) struct EvalArgs {
     pub(crate) json: bool,
 }
 
-/// The secret that all processes of a run share.
+/// Access token.
 #[derive(Debug, Args)]
 pub(crate) struct SecretArgs {
-    /// File with the token that callers show and services demand; needed to listen on other than this machine's own
-    /// addresses.
+    /// File with the access token of the run's services; required to listen on non-loopback addresses.
     #[arg(long, value_name = "FILE", env = "TANDEM_TOKEN_FILE")]
     pub(crate) token_file: Option<PathBuf>,
 }
 
-/// Where a service listens.
+/// Options of a service.
 #[derive(Debug, Args)]
 pub(crate) struct ListenArgs {
-    /// Address to listen on; port 0 takes a free one. It is printed as `listening on ADDR`.
+    /// Address to listen on; port 0 selects a free port. The address is printed as `listening on ADDR`.
     #[arg(long, default_value = "127.0.0.1:0", value_name = "ADDR")]
     pub(crate) listen: SocketAddr,
-    /// Speaks TLS with this certificate chain (PEM).
+    /// Enables TLS with this certificate chain (PEM).
     #[arg(long, value_name = "FILE.pem", requires = "tls_key")]
     pub(crate) tls_cert: Option<PathBuf>,
-    /// The certificate's private key (PEM).
+    /// Private key of the certificate (PEM).
     #[arg(long, value_name = "FILE.pem", requires = "tls_cert")]
     pub(crate) tls_key: Option<PathBuf>,
-    /// Lets anybody call who can reach the address, without a token.
+    /// Allows calls without a token from anyone who can reach the address.
     #[arg(long)]
     pub(crate) insecure: bool,
-    /// Ends when standard input closes, as it does when the parent process dies.
+    /// Exits when standard input closes, which happens when the parent process dies.
     #[arg(long, hide = true)]
     pub(crate) exit_with_stdin: bool,
 }
 
-/// Whom a client trusts.
+/// TLS options of a client.
 #[derive(Debug, Args)]
 pub(crate) struct DialArgs {
-    /// Calls services by TLS and trusts certificates that this authority (PEM) has signed.
+    /// Connects by TLS and trusts certificates signed by this authority (PEM).
     #[arg(long, value_name = "FILE.pem")]
     pub(crate) tls_ca: Option<PathBuf>,
 }
@@ -299,13 +298,13 @@ Examples:
   tandem teacher --policy policies/teacher-push.safetensors --listen 127.0.0.1:7001
   tandem teacher --policy FILE --ledger runs/mine/ledger.sqlite
   tandem teacher --policy FILE --ledger redis://:PASSWORD@redis:6379   several teachers, one budget
-  tandem teacher --policy FILE --ledger memory                          forgotten at the end")]
+  tandem teacher --policy FILE --ledger memory                          lost at exit")]
 pub(crate) struct TeacherArgs {
-    /// The one-arm policy that advises.
+    /// Policy file of the one-arm teacher.
     #[arg(long, value_name = "FILE")]
     pub(crate) policy: PathBuf,
-    /// Where accounts are kept: an SQLite file that this teacher alone uses, `redis://[USER:PASSWORD@]HOST[:PORT][/DB]`,
-    /// or memory.
+    /// Storage of the accounts: an SQLite file that no other teacher uses, `redis://[USER:PASSWORD@]HOST[:PORT][/DB]`,
+    /// or `memory`.
     #[arg(
         long,
         value_name = "WHERE",
@@ -327,41 +326,39 @@ Examples:
   tandem learner --run runs/mine/run.toml --out runs/mine --resume --teacher 127.0.0.1:7001
   tandem learner --run run.toml --out runs/mine --start-or-resume --teacher teacher:7001   under a supervisor")]
 pub(crate) struct LearnerArgs {
-    /// Run file; settings that it leaves out take the recipe's values.
+    /// Run file (TOML); settings that it omits take the recipe's values.
     #[arg(long, value_name = "FILE.toml")]
     pub(crate) run: PathBuf,
-    /// The teacher's address, when the run asks for advice.
+    /// Address of the teacher, if the run uses advice.
     #[arg(long, value_name = "ADDR")]
     pub(crate) teacher: Option<String>,
-    /// The one-arm policy that a run of strategy init:teacher starts from.
+    /// One-arm policy from which a run of strategy init:teacher starts.
     #[arg(long, value_name = "FILE")]
     pub(crate) start_from: Option<PathBuf>,
     /// Run directory.
     #[arg(long, value_name = "DIR")]
     pub(crate) out: PathBuf,
-    /// Goes on from the newest checkpoint. Of the settings only stop.*, checkpoint.* and evaluation.recorded_episodes
-    /// may differ from those that the run began with.
+    /// Resumes from the newest checkpoint. Only the settings stop.*, checkpoint.* and evaluation.recorded_episodes can
+    /// differ from those of the run.
     #[arg(long)]
     pub(crate) resume: bool,
-    /// Keeps the resolved settings in the run directory's run.toml.
+    /// Writes the resolved settings to run.toml in the run directory.
     #[arg(long, hide = true)]
     pub(crate) keep_run_file: bool,
-    /// The parent process holds the lock of the run directory.
+    /// The parent process holds the lock on the run directory.
     #[arg(long, hide = true)]
     pub(crate) out_is_locked: bool,
-    /// Starts the run, or goes on with it where the run directory holds one: for supervisors, which start a process
-    /// that has ended by the same command again. Keeps the resolved settings in the run directory's run.toml. A run
-    /// that has ended ends again at once, with exit code 0.
+    /// Starts the run, or resumes the one in the run directory: for supervisors that repeat the same command. Writes
+    /// the resolved settings to run.toml in the run directory. If the run is complete, exits at once with code 0.
     #[arg(long, conflicts_with = "resume")]
     pub(crate) start_or_resume: bool,
-    /// Threads of the update, 1 or 2; the result is the same.
+    /// Number of threads of the update, 1 or 2. It does not affect the result.
     #[arg(long, default_value_t = 2, value_parser = clap::value_parser!(u8).range(1..=2))]
     pub(crate) threads: u8,
-    /// Shows the run's figures at http://ADDR/metrics, as Prometheus reads them. Whoever reaches the address can read
-    /// them, without a token: keep it inside a cluster.
+    /// Serves Prometheus metrics at http://ADDR/metrics. No token is required: do not expose the address.
     #[arg(long, value_name = "ADDR")]
     pub(crate) metrics_listen: Option<SocketAddr>,
-    /// Goes on serving once the run is complete, until it is asked to end.
+    /// Keeps serving after the run is complete, until the process is asked to exit.
     #[arg(long)]
     pub(crate) stay: bool,
     #[command(flatten)]
@@ -378,23 +375,23 @@ Examples:
   tandem worker --connect 127.0.0.1:7000 --teacher 127.0.0.1:7001
   tandem worker --connect learner:7000 --teacher teacher:7001 --name bench-3")]
 pub(crate) struct WorkerArgs {
-    /// The learner's address.
+    /// Address of the learner or relay.
     #[arg(long, value_name = "ADDR")]
     pub(crate) connect: String,
-    /// The teacher's address, when the run asks for advice.
+    /// Address of the teacher, if the run uses advice.
     #[arg(long, value_name = "ADDR")]
     pub(crate) teacher: Option<String>,
-    /// A label for logs.
+    /// Name of the worker in logs and displays.
     #[arg(long, default_value = "worker")]
     pub(crate) name: String,
-    /// Where recorded episodes are written.
+    /// Directory for recorded episodes.
     #[arg(long, value_name = "DIR")]
     pub(crate) log_dir: Option<PathBuf>,
     #[command(flatten)]
     pub(crate) dial: DialArgs,
     #[command(flatten)]
     pub(crate) secret: SecretArgs,
-    /// Ends when standard input closes, as it does when the parent process dies.
+    /// Exits when standard input closes, which happens when the parent process dies.
     #[arg(long, hide = true)]
     pub(crate) exit_with_stdin: bool,
 }
@@ -406,16 +403,15 @@ Examples:
   tandem health learner:7000 --service tandem.v1.Learner --tls-ca ca.pem --timeout-s 1
   tandem health learner:7000 --json
 
-Prints `serving` and ends with exit code 0; otherwise says why on one line and ends with 75.
-No token is needed: probes have none.")]
+Prints `serving` and exits with code 0, or prints the reason and exits with code 75. No token is required.")]
 pub(crate) struct HealthArgs {
-    /// The service's address.
+    /// Address of the service.
     #[arg(value_name = "ADDR")]
     pub(crate) address: String,
-    /// One service, tandem.v1.Teacher, tandem.v1.Learner or tandem.v1.Bridge [default: all that is offered there].
+    /// Name of one service: tandem.v1.Teacher, tandem.v1.Learner or tandem.v1.Bridge [default: the whole server].
     #[arg(long, default_value = "", hide_default_value = true, value_name = "NAME")]
     pub(crate) service: String,
-    /// Seconds to wait for the answer.
+    /// Timeout in seconds.
     #[arg(long, default_value = "3", value_name = "S", value_parser = seconds)]
     pub(crate) timeout_s: Duration,
     #[command(flatten)]
@@ -432,15 +428,15 @@ Examples:
   tandem status learner:7000 --token-file token --watch
   tandem status learner:7000 --token-file token --json
 
-Exit codes: 0 told (with --watch: until the run had ended), 64 a wrong token, 75 the learner is away or went away.")]
+Exit codes: 0 success (with --watch, the run has ended), 64 wrong token, 75 the learner cannot be reached.")]
 pub(crate) struct StatusArgs {
-    /// The learner's address.
+    /// Address of the learner or relay.
     #[arg(value_name = "ADDR")]
     pub(crate) address: String,
-    /// Goes on telling until the run has ended: a line for each evaluation, and every half minute.
+    /// Follows the run until it ends: a line for each evaluation, and one every half minute.
     #[arg(long)]
     pub(crate) watch: bool,
-    /// Prints one JSON object, with --watch one for each message.
+    /// Prints one JSON object; with --watch, one per message.
     #[arg(long)]
     pub(crate) json: bool,
     #[command(flatten)]
@@ -466,15 +462,15 @@ fn seconds(text: &str) -> Result<Duration, String> {
 #[derive(Debug, Args)]
 #[command(after_help = "\
 Examples:
-  tandem bench                   everything but scale, about two minutes
+  tandem bench                   all but scale, about two minutes
   tandem bench sim update --json
-  tandem bench scale             how many workers one learner holds, about two minutes
+  tandem bench scale             number of workers that one learner serves, about two minutes
   tandem bench scale --workers 0 --idle 1000 --join-leave 100")]
 pub(crate) struct BenchArgs {
-    /// What to measure [default: all but scale].
+    /// Benchmarks to run [default: all but scale].
     #[arg(value_enum)]
     pub(crate) what: Vec<BenchName>,
-    /// Prints one JSON object a line: name, value, unit.
+    /// Prints one JSON object per line: name, value, unit.
     #[arg(long)]
     pub(crate) json: bool,
     #[command(flatten)]
@@ -487,11 +483,11 @@ pub(crate) enum BenchName {
     Inference,
     Update,
     Replay,
-    /// The teacher as a service, beside an echo of the same messages.
+    /// The teacher service, compared with an echo service of the same messages.
     Teacher,
-    /// A short run of the main job, processes and all.
+    /// A short training run with all its processes.
     EndToEnd,
-    /// One learner and more and more workers, real ones and ones that only wait.
+    /// One learner with increasing numbers of workers, real and idle ones.
     Scale,
 }
 
@@ -503,7 +499,7 @@ pub(crate) struct PolicyArgs {
 
 #[derive(Debug, Subcommand)]
 pub(crate) enum PolicyCommand {
-    /// Shows sizes, how it was trained and its digest.
+    /// Shows sizes, training settings and the digest.
     Show {
         /// The policy file.
         file: PathBuf,
@@ -517,16 +513,16 @@ pub(crate) enum PolicyCommand {
 #[command(after_help = "\
 Examples:
   tandem replay runs/NAME/mcap/eval-000100-000.mcap     step by step
-  tandem replay runs --verify                           every *.mcap below
+  tandem replay runs --verify                           all *.mcap files below
   tandem replay FILE.mcap --verify --json
 
-Every number that the simulator gives is compared bit for bit with the log's; exit code 65 when one differs or a log
+All numbers from the simulator are compared bit for bit with the log. The exit code is 65 if one differs or a log
 cannot be read.")]
 pub(crate) struct ReplayArgs {
-    /// Recorded episodes, or directories in and below which every *.mcap is one.
+    /// Recorded episodes, or directories to search for *.mcap files.
     #[arg(required = true, value_name = "FILE|DIR")]
     pub(crate) files: Vec<PathBuf>,
-    /// Only compares: without it, one log alone is also shown step by step.
+    /// Compares only. By default a single log is also printed step by step.
     #[arg(long)]
     pub(crate) verify: bool,
     /// Prints one JSON object on the last line of standard output.
@@ -542,11 +538,11 @@ pub(crate) struct McapArgs {
 
 #[derive(Debug, Subcommand)]
 pub(crate) enum McapCommand {
-    /// Makes a whole file of what a killed writer left.
+    /// Recovers the log of a writer that was killed.
     Recover {
-        /// What was left.
+        /// Incomplete log.
         file: PathBuf,
-        /// The whole file [default: FILE with `.recovered.mcap` appended].
+        /// Recovered log [default: FILE with `.recovered.mcap` appended].
         #[arg(long, value_name = "FILE")]
         to: Option<PathBuf>,
     },
@@ -558,19 +554,19 @@ Examples:
   tandem picture --policy policies/student-push.safetensors --out arms.svg
   tandem picture --composed-teachers policies/teacher-push.safetensors --step 20 --out arms.svg")]
 pub(crate) struct PictureArgs {
-    /// The policy at work.
+    /// Policy that controls the arms.
     #[arg(long, value_name = "FILE", required_unless_present = "composed_teachers")]
     pub(crate) policy: Option<PathBuf>,
-    /// A one-arm policy that drives both arms.
+    /// One-arm policy that controls both arms.
     #[arg(long, value_name = "FILE", conflicts_with = "policy")]
     pub(crate) composed_teachers: Option<PathBuf>,
-    /// Which episode's start and goal.
+    /// Number of the episode, which determines start and goal.
     #[arg(long, default_value_t = 777)]
     pub(crate) seed: u64,
-    /// The control step that is drawn, 0 to 50.
+    /// Control step to draw, 0 to 50.
     #[arg(long, default_value_t = 12, value_parser = clap::value_parser!(u32).range(0..=50))]
     pub(crate) step: u32,
-    /// The picture.
+    /// Output file.
     #[arg(long, value_name = "FILE.svg")]
     pub(crate) out: PathBuf,
 }

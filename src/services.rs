@@ -38,7 +38,7 @@ pub(crate) fn start_logging(cli: &Cli) -> Result<(), Failed> {
     tandem_telemetry::logging::init(&config).or_exit(Exit::Usage, String::new)
 }
 
-#[expect(clippy::disallowed_methods, reason = "RUST_LOG is the one variable that is read")]
+#[expect(clippy::disallowed_methods, reason = "RUST_LOG is read here, before anything is logged")]
 fn rust_log() -> Option<String> {
     std::env::var("RUST_LOG").ok().filter(|filter| !filter.is_empty())
 }

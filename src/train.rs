@@ -111,9 +111,11 @@ fn broke_off(plan: &Plan, exit: Exit) -> String {
     let log = log.display();
     match exit {
         Exit::TryAgain => {
-            format!("the run broke off, go on with `tandem train --resume --out {out}`; see {log}")
+            format!(
+                "the run was interrupted, resume it with `tandem train --resume --out {out}`; see {log}"
+            )
         }
-        _ => format!("the run cannot go on; see {log}"),
+        _ => format!("the run cannot continue; see {log}"),
     }
 }
 
@@ -194,7 +196,7 @@ impl<'a> Watch<'a> {
         }
         if self.awaits_learner && is_new {
             self.awaits_learner = false;
-            self.display.say(&format!("the learner goes on from round {}", progress.round));
+            self.display.say(&format!("the learner continues from round {}", progress.round));
         }
         // A learner that was started again has forgotten the time since its last checkpoint and that of its absence.
         let elapsed_s = self.started_at.elapsed().as_secs_f64();

@@ -172,7 +172,7 @@ fn whoever_dies_is_started_again_and_the_run_ends_as_a_calm_one() {
     let told = said(&ended);
     for line in [
         "the learner was killed by signal 9 and is started again",
-        "the learner goes on from round",
+        "the learner continues from round",
         "the teacher was killed by signal 9 and is started again",
         "was killed by signal 9 and is started again",
     ] {
@@ -191,7 +191,7 @@ fn a_learner_that_dies_before_its_first_checkpoint_starts_over() {
     kill_one(&run, "learner");
     let ended = finish(run);
     check_as_calm(&ended, &out);
-    assert!(said(&ended).contains("the learner goes on from round 0"), "{}", said(&ended));
+    assert!(said(&ended).contains("the learner continues from round 0"), "{}", said(&ended));
 }
 
 #[test]

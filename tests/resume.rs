@@ -71,7 +71,7 @@ fn check_refused(refused: &Output, code: i32, what: &str) {
     assert_eq!(refused.status.code(), Some(code), "{told}");
     assert!(told.contains(what), "{told:?} lacks {what:?}");
     assert_eq!(told.lines().count(), 1, "{told}");
-    assert!(!told.contains("go on with") && !told.contains("Some("), "{told}");
+    assert!(!told.contains("resume it with") && !told.contains("Some("), "{told}");
 }
 
 /// What a refused resume must leave as it is.

@@ -208,7 +208,7 @@ pub fn load_newest(
     let Some(newest) = paths.pop() else { return Ok(None) };
     load(&newest, config).map(Some).map_err(|error| match (error, paths.pop()) {
         (CheckpointError::Damaged { path, what }, Some(former)) => {
-            let what = format!("{what}; remove it to go on from {former:?}");
+            let what = format!("{what}; remove it to continue from {former:?}");
             CheckpointError::Damaged { path, what }
         }
         (error, _) => error,

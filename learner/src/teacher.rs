@@ -269,7 +269,7 @@ impl Ledger {
             Some(found) => {
                 let has = units_left(&found);
                 let reason = format!("{name:?} has {has} units left, the run may spend {left}");
-                Err(TeacherError::Refused { what: "go on with the account", reason })
+                Err(TeacherError::Refused { what: "continue the account", reason })
             }
             None => {
                 let budget = left.saturating_sub(written_off);

@@ -21,12 +21,12 @@ pub(super) fn status_lines(status: &pb::BridgeStatusResponse) -> Vec<String> {
     let rests = match (status.at_rest, status.arms.is_empty()) {
         (true, _) => "at rest",
         (false, false) => "moving",
-        (false, true) => "nobody knows whether they move",
+        (false, true) => "their motion is unknown",
     };
     let owner = if status.is_owned {
-        format!("somebody, for another {:.1} s unless they renew", status.lease_left_s)
+        format!("a client, for another {:.1} s unless it renews its lease", status.lease_left_s)
     } else {
-        "nobody".to_owned()
+        "none".to_owned()
     };
     let mut lines = vec![
         format!("phase   {}{why}", phase(status.phase())),

@@ -6,7 +6,7 @@ use clap::{Args, Subcommand, ValueEnum};
 
 use super::{DialArgs, ListenArgs, SecretArgs, TrialArgs};
 
-/// Where a bridge listens, and where operators look for it.
+/// Default address of a bridge.
 const ADDRESS: &str = "127.0.0.1:7002";
 
 #[derive(Debug, Args)]
@@ -16,15 +16,15 @@ const ADDRESS: &str = "127.0.0.1:7002";
 Examples:
   tandem bridge --driver sim                              serves a simulated pair of arms
   tandem bridge --driver sim --speed 0.1                  the same, no motion faster than a tenth
-  tandem bridge status                                    what the arms do, and why they are stopped
-  tandem bridge stop                                      stops them; anyone may, at any time
-  tandem bridge reset                                     lets stopped arms go
+  tandem bridge status                                    state of the arms, and why they are stopped
+  tandem bridge stop                                      stops them, at any time
+  tandem bridge reset                                     enables stopped arms
   tandem bridge move deploy/first-motion.json --check-only
   tandem bridge move deploy/first-motion.json --speed 0.1
   tandem bridge trial --policy policies/student-push.safetensors
   tandem bridge --driver quarc --arms-at tcpip://10.0.0.5:18000 --speed 0.1
 
-docs/bridge.md leads from nothing to a first motion."
+docs/bridge.md is a tutorial up to the first motion."
 )]
 pub(crate) struct BridgeArgs {
     #[command(subcommand)]
@@ -36,13 +36,13 @@ pub(crate) struct BridgeArgs {
 #[derive(Debug, Args)]
 #[command(mut_arg("listen", |arg| arg.default_value(ADDRESS)))]
 pub(crate) struct BridgeServeArgs {
-    /// What moves the arms.
+    /// Driver of the arms.
     #[arg(long, value_enum, default_value_t = DriverName::Sim)]
     pub(crate) driver: DriverName,
-    /// Where the arms' side listens: tcpip://HOST:PORT for quarc, ws://HOST:PORT for kinova-ros.
+    /// Address of the real arms: tcpip://HOST:PORT for quarc, ws://HOST:PORT for kinova-ros.
     #[arg(long, value_name = "ADDR", required_if_eq_any([("driver", "quarc"), ("driver", "kinova-ros")]))]
     pub(crate) arms_at: Option<String>,
-    /// No motion is played faster than this share of its own speed, 0.01 to 1.
+    /// Speed limit for all motions, as a fraction of each motion's own speed, 0.01 to 1.
     #[arg(long, default_value_t = 1.0, value_parser = share)]
     pub(crate) speed: f64,
     /// Seed of the simulated pair's noise and latencies.
@@ -54,37 +54,37 @@ pub(crate) struct BridgeServeArgs {
     pub(crate) secret: SecretArgs,
 }
 
-/// What moves the arms.
+/// Driver of the arms.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub(crate) enum DriverName {
-    /// A simulated pair of Kinova Micos: nothing real moves.
+    /// A simulated pair of Kinova Micos.
     Sim,
-    /// Arms behind a Simulink model, by way of QUARC [builds with feature quarc].
+    /// Real arms behind a Simulink model (QUARC).
     Quarc,
-    /// Arms behind Kinova's ROS driver, by way of rosbridge [builds with feature kinova-ros].
+    /// Real arms behind Kinova's ROS driver (rosbridge).
     KinovaRos,
 }
 
 #[derive(Debug, Subcommand)]
 pub(crate) enum BridgeCommand {
-    /// Shows what the arms do, and why they are stopped.
+    /// Shows the state of the arms, and why they are stopped.
     Status(OperatorArgs),
-    /// Stops the arms. Exit code 0 says that the drives were told.
+    /// Stops the arms. Exit code 0 means that the drives received the command.
     Stop(OperatorArgs),
-    /// Shows what arms these are and what they may do.
+    /// Shows the model, layout and limits of the arms.
     Describe(OperatorArgs),
-    /// Lets stopped arms go: they stay where they are until a motion begins. Look at them first.
+    /// Enables stopped arms: they hold their position until a motion begins. Inspect them first.
     Reset(OperatorArgs),
-    /// Moves the arms as a file says. Ctrl-C stops them.
+    /// Executes the motion in a file. Ctrl-C stops the arms.
     Move(MoveArgs),
-    /// Tries policies on a simulated pair and counts how often they succeed; needs no bridge.
+    /// Runs trials of policies on a simulated pair and reports success rates; needs no bridge.
     Trial(TrialArgs),
 }
 
-/// How a bridge is reached.
+/// Options of a client of a bridge.
 #[derive(Debug, Args)]
 pub(crate) struct ConnectArgs {
-    /// The bridge's address.
+    /// Address of the bridge.
     #[arg(long, value_name = "ADDR", default_value = ADDRESS)]
     pub(crate) connect: String,
     #[command(flatten)]
@@ -104,16 +104,16 @@ pub(crate) struct OperatorArgs {
 
 #[derive(Debug, Args)]
 #[command(after_help = "\
-Exit codes: 0 the arms are where the motion leads (or it was accepted, with --check-only), 65 the file or the motion is
-refused and nothing has moved, 75 the arms were stopped or are not ready, 130 Ctrl-C.")]
+Exit codes: 0 the motion is complete (with --check-only, it would be accepted), 65 the file or the motion is rejected
+and nothing has moved, 75 the arms were stopped or are not ready, 130 interrupted with Ctrl-C.")]
 pub(crate) struct MoveArgs {
-    /// The motion; docs/bridge.md says what the file holds.
+    /// Motion file, described in docs/bridge.md.
     #[arg(value_name = "FILE.json")]
     pub(crate) file: PathBuf,
-    /// Only asks whether the motion would be accepted from where the arms are; nothing moves.
+    /// Checks the motion from the present posture, and moves nothing.
     #[arg(long)]
     pub(crate) check_only: bool,
-    /// Share of the motion's own speed, 0.01 to 1 [default: the file's].
+    /// Fraction of the motion's own speed, 0.01 to 1 [default: the file's].
     #[arg(long, value_parser = share)]
     pub(crate) speed: Option<f64>,
     #[command(flatten)]
@@ -123,7 +123,7 @@ pub(crate) struct MoveArgs {
     pub(crate) json: bool,
 }
 
-/// A share from 0.01 to 1.
+/// Parses a fraction from 0.01 to 1.
 fn share(text: &str) -> Result<f64, String> {
     let share = text.parse().ok().filter(|share| (0.01..=1.0).contains(share));
     share.ok_or_else(|| "expected a number from 0.01 to 1".to_owned())

@@ -10,9 +10,9 @@ Examples:
   tandem relay --connect learner:7000 --listen 0.0.0.0:7000 --token-file token
   tandem worker --connect relay:7000 --teacher teacher:7001 --token-file token
 
-Workers call it as they would the learner. docs/scale.md says from how many workers on that helps.")]
+Workers connect to a relay as they would to the learner. docs/scale.md shows when relays help.")]
 pub(crate) struct RelayArgs {
-    /// The learner's address.
+    /// Address of the learner.
     #[arg(long, value_name = "ADDR")]
     pub(crate) connect: String,
     #[command(flatten)]

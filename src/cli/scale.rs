@@ -7,7 +7,7 @@ use clap::Args;
 #[derive(Debug, Clone, Args)]
 #[command(next_help_heading = "Options of scale")]
 pub(crate) struct ScaleArgs {
-    /// Numbers of real worker processes to try; 0 tries none.
+    /// Numbers of real worker processes; 0 for none.
     #[arg(
         long,
         value_name = "N,...",
@@ -16,25 +16,25 @@ pub(crate) struct ScaleArgs {
         value_parser = clap::value_parser!(u16).range(0..=1024)
     )]
     pub(crate) workers: Vec<u16>,
-    /// Workers that wait instead of simulating, all in this process; 0 tries none.
+    /// Number of idle workers, which wait instead of simulating, all in this process; 0 for none.
     #[arg(long, value_name = "N", default_value_t = 1000, value_parser = clap::value_parser!(u16).range(0..=4096))]
     pub(crate) idle: u16,
-    /// Rounds measured of each setting.
+    /// Number of rounds to measure for each setting.
     #[arg(long, value_name = "N", default_value_t = 4, value_parser = clap::value_parser!(u16).range(1..=1000))]
     pub(crate) rounds: u16,
-    /// Idle workers that leave at once while as many join [default: a tenth of --idle].
+    /// Number of idle workers that leave at once while as many join [default: a tenth of --idle].
     #[arg(long, value_name = "N")]
     pub(crate) join_leave: Option<u16>,
-    /// Seconds that an idle worker takes for a slot, as one does that makes 20 control steps a second.
+    /// Seconds that an idle worker takes for a slot; the default corresponds to 20 control steps per second.
     #[arg(long, value_name = "S", default_value_t = 2.5, value_parser = seconds_a_slot)]
     pub(crate) slot_s: f64,
-    /// Updates for each environment step; without any the learner makes one a round, the least it can.
+    /// Updates per environment step; with 0 the learner makes one per round.
     #[arg(long, value_name = "R", default_value_t = 0.0)]
     pub(crate) updates_per_env_step: f64,
-    /// Relays between the learner and the idle workers.
+    /// Number of relays between the learner and the idle workers.
     #[arg(long, value_name = "N", default_value_t = 0, value_parser = clap::value_parser!(u16).range(0..=64))]
     pub(crate) relays: u16,
-    /// Another build of this program whose learner, relays and workers are measured [default: this one].
+    /// Other build of this program to measure [default: this one].
     #[arg(long, value_name = "FILE")]
     pub(crate) program: Option<PathBuf>,
 }

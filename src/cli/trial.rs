@@ -15,35 +15,35 @@ Examples:
   tandem report runs/trial-push")]
 #[command(group = clap::ArgGroup::new("who").required(true).multiple(true))]
 pub(crate) struct TrialArgs {
-    /// A policy for both arms, tried under the name of its file or run directory; may be repeated.
+    /// Policy for both arms, reported under the name of its file or run directory; can be repeated.
     #[arg(long = "policy", value_name = "FILE", group = "who")]
     pub(crate) policies: Vec<PathBuf>,
-    /// A one-arm policy that drives each arm by itself; may be repeated.
+    /// One-arm policy that controls each arm separately; can be repeated.
     #[arg(long, value_name = "FILE", group = "who")]
     pub(crate) composed_teachers: Vec<PathBuf>,
-    /// Must be the policies' task, when given.
+    /// Fails unless the policies are for this task.
     #[arg(long, value_enum)]
     pub(crate) task: Option<TaskName>,
-    /// Trials of each policy.
+    /// Number of trials per policy.
     #[arg(long, default_value_t = 50, value_parser = clap::value_parser!(u64).range(1..=100_000))]
     pub(crate) trials: u64,
-    /// Whether the policy sees the table before each step, or a rehearsed motion is carried out blind; may be repeated
-    /// [default: all].
+    /// Closed loop (the policy observes the table before each step) or open loop (a precomputed motion is executed);
+    /// can be repeated [default: all].
     #[arg(long = "mode", value_enum, value_name = "MODE")]
     pub(crate) modes: Vec<ModeName>,
-    /// Decides starts, goals and the arms' noise: the same for every policy and mode.
+    /// Seed of starts, goals and the arms' noise, the same for all policies and modes.
     #[arg(long, default_value_t = 1)]
     pub(crate) seed: u64,
-    /// Share of the fastest speed, more than 0 and at most 1.
+    /// Fraction of the highest speed, above 0 and at most 1.
     #[arg(long, default_value_t = 1.0)]
     pub(crate) speed: f64,
-    /// Edge of the blocks, in cm; the training world's have 4.5, the paper's arms pushed 9.
+    /// Edge of the blocks in cm; 4.5 in training, 9 in the paper's trials.
     #[arg(long, default_value_t = 5.6)]
     pub(crate) block_cm: f32,
-    /// Which trials leave an MCAP log.
+    /// Trials to record to MCAP files.
     #[arg(long, value_enum, default_value_t = RecordName::Failures)]
     pub(crate) record: RecordName,
-    /// Leaves each trial's motion as a file for `tandem bridge move`.
+    /// Writes the motion of each trial to a file for `tandem bridge move`.
     #[arg(long)]
     pub(crate) motions: bool,
     /// Directory for trials.jsonl and the logs [default: runs/trial-TASK].
@@ -56,20 +56,20 @@ pub(crate) struct TrialArgs {
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub(crate) enum ModeName {
-    /// A look at the table before every step.
+    /// Closed loop: the policy observes the table before each step.
     ClosedLoop,
-    /// Blind, rehearsed in the training world: the paper's way.
+    /// Open loop, precomputed in the training simulator, as in the paper.
     OpenLoop,
-    /// Blind, rehearsed on a copy of the pair.
+    /// Open loop, precomputed on a copy of the simulated pair.
     Twin,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub(crate) enum RecordName {
-    /// Every trial.
+    /// All trials.
     All,
-    /// Those that fail.
+    /// Failed trials.
     Failures,
-    /// No trial.
+    /// None.
     None,
 }

@@ -179,7 +179,7 @@ fn columns(file: &SweepFile, base: &[(String, Value)]) -> anyhow::Result<Vec<Cho
         && base.iter().any(|(key, _)| key == STRATEGY)
         && file.variant.is_none()
     {
-        bail!("{STRATEGY} stands in [run] and in `strategies`: expected one of them");
+        bail!("{STRATEGY} is set in [run] and in `strategies`: expected one of them");
     }
     let mut columns: Vec<Choice> = listed(&file.strategies)
         .iter()

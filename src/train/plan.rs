@@ -56,9 +56,9 @@ impl Plan {
         let shown = self.out.display();
         match (self.run_file().exists(), self.resume) {
             (true, false) => Err(Failed::usage(format!(
-                "{shown} holds a run already: go on with it by `tandem train --resume --out {shown}`, or choose another --out"
+                "{shown} holds a run already: resume it with `tandem train --resume --out {shown}`, or choose another --out"
             ))),
-            (false, true) => Err(Failed::usage(format!("{shown} holds no run to go on with"))),
+            (false, true) => Err(Failed::usage(format!("{shown} holds no run to resume"))),
             _ => Ok(()),
         }
     }
@@ -166,7 +166,7 @@ fn config(args: &TrainArgs) -> Result<RunConfig, Failed> {
         && !file.exists()
     {
         run_directory::check_place(out)?;
-        return Err(Failed::usage(format!("{} holds no run to go on with", out.display())));
+        return Err(Failed::usage(format!("{} holds no run to resume", out.display())));
     }
     let settings = settings_of(args)?;
     let config = run_file::resolve(args.run.as_deref().or(own_file.as_deref()), &settings)?;

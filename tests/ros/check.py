@@ -99,7 +99,7 @@ def a_stop_is_heard(rig):
     check(stopped.returncode == 0, stopped.stderr)
     rests(rig, at_s)
     check(all(record.lines("stop", at_s) for record in rig.records), "in/stop is called")
-    ends(mover, "somebody stopped the arms")
+    ends(mover, "a client stopped the arms")
 
 
 def a_killed_bridge_leaves_arms_at_rest(rig):
@@ -144,7 +144,7 @@ def a_killed_node_stops_the_other_arm(rig):
 def a_stranger_stops_the_arms(rig):
     mover = rig.with_arms(rig.moving)
     rig.start("stranger", [sys.executable, HERE / "stranger.py"])
-    ends(mover, "somebody else publishes /left/m1n4s200_driver/in/joint_velocity")
+    ends(mover, "another node publishes /left/m1n4s200_driver/in/joint_velocity")
     at_s = rig.kill("stranger")
     rests(rig, at_s)
 

@@ -16,7 +16,7 @@ impl std::fmt::Debug for Token {
 pub enum LeaseError {
     /// Somebody else owns the arms.
     #[error(
-        "the arms are owned by somebody else for another {expires_in_s:.1} s unless they renew"
+        "the arms are owned by another client for another {expires_in_s:.1} s unless it renews its lease"
     )]
     Held {
         /// When the lease ends if its owner stays silent, seconds from now.

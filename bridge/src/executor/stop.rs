@@ -28,7 +28,7 @@ pub enum StopCause {
     #[error("the arms were not reset since the start")]
     NotReset,
     /// Somebody asked for it.
-    #[error("somebody stopped the arms")]
+    #[error("a client stopped the arms")]
     Requested,
     /// The program that moves the arms was told to end.
     #[error("the program that moves the arms ends")]
@@ -201,7 +201,7 @@ mod tests {
             StopCause::Tracking(excess).of_joint(1, 2).at(1.5),
             "at 1.500 s arm 1 joint 3: 2.86 degrees from where the motion has it, at most 2.01",
         );
-        check(StopCause::Requested.anywhere().at(0.25), "at 0.250 s: somebody stopped the arms");
+        check(StopCause::Requested.anywhere().at(0.25), "at 0.250 s: a client stopped the arms");
         check(
             StopCause::Driver(DriverError::Disconnected { what: "closed".into() })
                 .anywhere()

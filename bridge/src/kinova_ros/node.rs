@@ -99,7 +99,7 @@ impl Arm {
     pub(crate) fn published(&mut self, msg: &Value) -> Result<(), DriverError> {
         let is_it = |(number, rates): &(u64, Joints)| protocol::is_of(msg, *number, rates);
         let Some(place) = self.under_way.iter().position(is_it) else {
-            let what = format!("somebody else publishes {}", self.velocity_topic());
+            let what = format!("another node publishes {}", self.velocity_topic());
             return Err(DriverError::Refused { what });
         };
         self.under_way.drain(..=place);

@@ -35,7 +35,7 @@ pub enum Error {
     #[error("the position of the arms is not known: see the status")]
     NoState,
     /// The drives could not be told to stop.
-    #[error("the drives could NOT be told to stop, use the emergency stop: {0}")]
+    #[error("the drives could NOT be commanded to stop, use the emergency stop: {0}")]
     Untold(#[source] DriverError),
     /// The thread that moves the arms has not answered.
     #[error("the thread that moves the arms has not answered within {0:?}: see the status")]

@@ -197,7 +197,7 @@ fn what_is_no_state_ends_the_connection_and_the_arms_rest() {
     ends(Fault::Names, "no joint \"m1n4s200_joint_1\"");
     ends(Fault::Clock, "s apart");
     ends(Fault::Complains, "rosbridge: no such type");
-    ends(Fault::Stranger, "somebody else publishes /left/m1n4s200_driver/in/joint_velocity");
+    ends(Fault::Stranger, "another node publishes /left/m1n4s200_driver/in/joint_velocity");
     ends(Fault::Close, "not connected");
 }
 

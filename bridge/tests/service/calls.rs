@@ -242,7 +242,7 @@ async fn the_arms_have_one_owner_at_a_time() {
     rig.client.acquire(pb::AcquireRequest { token: token.clone() }).await.unwrap();
     let denied = other.acquire(pb::AcquireRequest::default()).await.unwrap_err();
     assert_eq!(denied.code(), Code::PermissionDenied);
-    assert!(denied.message().contains("owned by somebody else"), "{denied}");
+    assert!(denied.message().contains("owned by another client"), "{denied}");
     let forged = "0123456789abcdef0123456789abcdef".to_owned();
     let denied = other.reset(pb::ResetRequest { token: forged.clone() }).await.unwrap_err();
     assert_eq!(denied.code(), Code::PermissionDenied);

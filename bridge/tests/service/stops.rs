@@ -257,7 +257,7 @@ async fn a_stop_that_does_not_get_through_is_told() {
     assert_eq!(playing.stopped().await.name, "driver");
     let told = rig.client.stop(pb::StopRequest {}).await.unwrap_err();
     assert_eq!(told.code(), Code::Unavailable);
-    assert!(told.message().contains("could NOT be told to stop"), "{told}");
+    assert!(told.message().contains("could NOT be commanded to stop"), "{told}");
     rig.tap.fail(Fault::None);
     rig.client.stop(pb::StopRequest {}).await.unwrap();
 }

@@ -157,7 +157,10 @@ impl Drive<'_> {
         if trouble.is_empty() {
             tracing::info!("everything that could not be written is written");
         } else {
-            tracing::warn!(trouble, "disk refuses, training goes on and it is tried again");
+            tracing::warn!(
+                trouble,
+                "cannot write to disk, training continues and the write is repeated"
+            );
         }
         self.keeping.told = trouble;
         self.publish_warning();

@@ -146,7 +146,7 @@ async fn a_damaged_checkpoint_is_refused_until_it_is_removed() {
         panic!("{refused}");
     };
     assert_eq!(path, newest);
-    assert!(what.contains("remove it to go on from"), "{what}");
+    assert!(what.contains("remove it to continue from"), "{what}");
     std::fs::remove_file(&newest).expect("removes");
     let ended = resume(run, out).await.expect("goes on from the former");
     assert_eq!(Left::behind(&ended, out), expected);
