@@ -32,8 +32,9 @@ Examples:
   tandem eval --policy runs/NAME/policy/best.safetensors
   tandem COMMAND --help                         more examples
 
-Exit codes: 0 success, 64 wrong usage or configuration, 65 invalid input data, 70 bug, 74 the result cannot be written
-to standard output, 75 temporary failure (try again), 130 interrupted, 141 standard output was closed by its reader."
+Exit codes: 0 success, 64 wrong usage or configuration, 65 invalid input data, 70 bug, 74 the
+result cannot be written to standard output, 75 temporary failure (try again), 130 interrupted,
+141 standard output was closed by its reader."
 )]
 pub(crate) struct Cli {
     /// Log filter, such as info or tandem_learner=debug; overrides RUST_LOG.
@@ -168,7 +169,8 @@ Examples:
   tandem sweep deploy/sweep-small.toml                starts them, or resumes them
   tandem report runs/sweep-small
 
-docs/sweep.md describes the file. The exit code is 75 if runs failed; the next start tries each of them once more.")]
+docs/sweep.md describes the file. The exit code is 75 if runs failed; the next start tries each of
+them once more.")]
 pub(crate) struct SweepArgs {
     /// Sweep file (TOML): settings of all runs, and lists of values to combine.
     #[arg(value_name = "FILE.toml")]
@@ -428,7 +430,8 @@ Examples:
   tandem status learner:7000 --token-file token --watch
   tandem status learner:7000 --token-file token --json
 
-Exit codes: 0 success (with --watch, the run has ended), 64 wrong token, 75 the learner cannot be reached.")]
+Exit codes: 0 success (with --watch, the run has ended), 64 wrong token, 75 the learner cannot be
+reached.")]
 pub(crate) struct StatusArgs {
     /// Address of the learner or relay.
     #[arg(value_name = "ADDR")]
@@ -516,8 +519,8 @@ Examples:
   tandem replay runs --verify                           all *.mcap files below
   tandem replay FILE.mcap --verify --json
 
-All numbers from the simulator are compared bit for bit with the log. The exit code is 65 if one differs or a log
-cannot be read.")]
+All numbers from the simulator are compared bit for bit with the log. The exit code is 65 if one
+differs or a log cannot be read.")]
 pub(crate) struct ReplayArgs {
     /// Recorded episodes, or directories to search for *.mcap files.
     #[arg(required = true, value_name = "FILE|DIR")]

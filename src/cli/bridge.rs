@@ -104,8 +104,9 @@ pub(crate) struct OperatorArgs {
 
 #[derive(Debug, Args)]
 #[command(after_help = "\
-Exit codes: 0 the motion is complete (with --check-only, it would be accepted), 65 the file or the motion is rejected
-and nothing has moved, 75 the arms were stopped or are not ready, 130 interrupted with Ctrl-C.")]
+Exit codes: 0 the motion is complete (with --check-only, it would be accepted), 65 the file or the
+motion is rejected and nothing has moved, 75 the arms were stopped or are not ready, 130 interrupted
+with Ctrl-C.")]
 pub(crate) struct MoveArgs {
     /// Motion file, described in docs/bridge.md.
     #[arg(value_name = "FILE.json")]

@@ -221,7 +221,7 @@ fn what_cannot_be_used_is_said_in_one_line() {
         assert!(!told.contains("panicked") && !told.contains("RUST_BACKTRACE"), "{line}: {told}");
         let lines =
             told.lines().filter(|line| line.starts_with("tandem: ") || line.starts_with("error: "));
-        assert!(lines.count() == 1 || told.starts_with("Teaches"), "{line}: {told}");
+        assert!(lines.count() == 1 || told.starts_with("Trains policies"), "{line}: {told}");
         assert!(told.len() < 3000, "{line}: {} bytes", told.len());
     }
     assert!(!directory.path().join("mended").exists(), "nothing was made of garbage");
