@@ -25,7 +25,7 @@ use schedule::{HAND_EVENTS, Schedule, Target};
 
 const N_WORKERS: usize = 4;
 /// On a fast machine faults come faster, so that every kind of fault has its turn.
-const MIN_FAULTS_PER_CALM_RUN: u32 = 14;
+const MIN_FAULTS_PER_CALM_RUN: u32 = 20;
 
 /// How large a run, and how often something befalls it.
 struct Scale {
