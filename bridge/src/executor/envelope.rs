@@ -10,8 +10,8 @@
 //! point of an arm moves farther than the sum of d times lever; a gap in the middle that is larger than the limit
 //! by half of that keeps the limit on the whole line. Otherwise both halves are looked at, down to a tenth of a millimetre.
 //!
-//! For gaps between parts of one arm a gripper is as wide as it was measured, or as it is told to be when that is wider: on
-//! its way between the two it is no wider.
+//! For gaps between parts of one arm, the width of a gripper is the larger of its measured and its commanded opening. It
+//! is never wider on its way between the two.
 
 use std::collections::VecDeque;
 
