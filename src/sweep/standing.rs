@@ -1,12 +1,10 @@
 //! How far a run of the sweep is, as its directory tells.
 
-use std::fs::File;
-use std::io::Write as _;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context as _, anyhow};
 use serde_json::Value as Json;
-use tandem_learner::checkpoint;
+use tandem_learner::{atomic, checkpoint};
 use tandem_rl::RunConfig;
 use tandem_telemetry::read_regular;
 use toml::{Table, Value};
@@ -60,15 +58,9 @@ impl Standing {
 
     /// Keeps what a run reached: from now on it is finished. The file is whole or not there.
     pub(super) fn finish(&mut self, summary: Json) -> anyhow::Result<()> {
-        let (path, partial) =
-            (self.dir.join("summary.json"), self.dir.join("summary.json.partial"));
-        let write = || {
-            let mut file = File::create(&partial)?;
-            writeln!(file, "{summary}")?;
-            file.sync_all()?;
-            std::fs::rename(&partial, &path)
-        };
-        write().with_context(|| format!("cannot write {}", path.display()))?;
+        let path = self.dir.join("summary.json");
+        let written = atomic::write(&path, format!("{summary}\n").as_bytes());
+        written.with_context(|| format!("cannot write {}", path.display()))?;
         drop(std::fs::remove_file(failure_path(&self.dir)));
         (self.state, self.failure) = (State::Finished(summary), None);
         Ok(())
