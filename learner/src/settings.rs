@@ -8,7 +8,8 @@ use tandem_rl::config::RunConfig;
 
 /// What a run may go on with another value of: when it ends, what is saved and what is logged. Everything else decides
 /// what it learns.
-const FREE: [&str; 3] = ["stop.", "checkpoint.", "evaluation.recorded_episodes"];
+const FREE: [&str; 4] =
+    ["stop.", "checkpoint.", "evaluation.recorded_episodes", "evaluation.test_episodes"];
 
 /// A setting with which a run cannot go on.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -29,8 +30,8 @@ impl fmt::Display for Changed {
 }
 
 /// What to do about a setting that differs.
-pub const ADVICE: &str = "only stop.*, checkpoint.* and evaluation.recorded_episodes may change when a run goes on: \
-                          take the value that it began with, or start a new run";
+pub const ADVICE: &str = "only stop.*, checkpoint.*, evaluation.recorded_episodes and evaluation.test_episodes may \
+                          change when a run is resumed: keep the original value, or start a new run";
 
 /// The settings as one JSON object, numbers as a person writes them.
 #[must_use]
@@ -108,6 +109,7 @@ mod tests {
         changed.checkpoint.every_rounds = 7;
         changed.checkpoint.keep = 9;
         changed.evaluation.recorded_episodes = 0;
+        changed.evaluation.test_episodes = 1;
         assert_eq!(first_change(&changed, &to_json(&config())).expect("JSON"), None);
     }
 

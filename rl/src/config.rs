@@ -165,6 +165,8 @@ pub struct EvaluationConfig {
     pub seed: u64,
     /// How many of an evaluation's episodes are logged.
     pub recorded_episodes: u64,
+    /// Test goals on which the best policy is measured once the run has ended.
+    pub test_episodes: u64,
 }
 
 /// `[stop]`: a run ends at the first of these; 0 means never.
@@ -241,6 +243,7 @@ impl RunConfig {
                 episodes: 240,
                 seed: 240_240,
                 recorded_episodes: 2,
+                test_episodes: 240,
             },
             stop: stop(recipe, task, n_arms),
             checkpoint: CheckpointConfig { every_rounds: 50, keep: 2 },
@@ -390,6 +393,12 @@ impl RunConfig {
             "evaluation.episodes",
             &evaluation.episodes,
             (1..=100_000).contains(&evaluation.episodes),
+            "1 to 100,000",
+        )?;
+        check(
+            "evaluation.test_episodes",
+            &evaluation.test_episodes,
+            (1..=100_000).contains(&evaluation.test_episodes),
             "1 to 100,000",
         )?;
         let tolerance_m = self.replay.goal_tolerance_m;
