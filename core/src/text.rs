@@ -25,11 +25,11 @@ pub fn error_chain(error: &(dyn Error + 'static)) -> String {
     line
 }
 
-/// Returns `text`, or its first `max_chars` characters followed by `...`.
+/// Returns `text`, or its first `max_chars` characters followed by its length.
 #[must_use]
 pub fn shortened(text: &str, max_chars: usize) -> String {
     match text.char_indices().nth(max_chars) {
-        Some((end, _)) => format!("{}...", &text[..end]),
+        Some((end, _)) => format!("{}... ({} bytes)", &text[..end], text.len()),
         None => text.to_owned(),
     }
 }
@@ -71,7 +71,7 @@ mod tests {
 
     #[test]
     fn long_texts_are_cut_between_characters() {
-        for (text, expected) in [("", ""), ("äöü", "äöü"), ("äöüß", "äöü..."), ("abcdef", "abc...")]
+        for (text, expected) in [("", ""), ("äöü", "äöü"), ("äöüß", "äöü... (8 bytes)"), ("abcd", "abc... (4 bytes)")]
         {
             assert_eq!(shortened(text, 3), expected);
         }
