@@ -12,6 +12,7 @@ pub mod layout;
 pub mod reward;
 pub mod rng;
 pub mod scene;
+pub mod text;
 pub mod work;
 
 pub use advice::{ArmAdvice, StepAdvice, StepQuery};
