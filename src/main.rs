@@ -18,7 +18,6 @@ mod files;
 mod health;
 mod input;
 mod output;
-mod picture;
 mod report;
 mod run_directory;
 mod run_file;
@@ -66,7 +65,6 @@ fn run() -> ExitCode {
         Command::Policy(args) => files::policy(&args),
         Command::Mcap(args) => files::mcap(&args),
         Command::Replay(args) => files::replay(&args),
-        Command::Picture(args) => picture::picture(&args),
     })
 }
 
