@@ -18,6 +18,7 @@ mod files;
 mod health;
 mod input;
 mod output;
+mod picture;
 mod report;
 mod run_directory;
 mod run_file;
@@ -65,6 +66,7 @@ fn run() -> ExitCode {
         Command::Policy(args) => files::policy(&args),
         Command::Mcap(args) => files::mcap(&args),
         Command::Replay(args) => files::replay(&args),
+        Command::Picture(args) => picture::picture(&args),
     })
 }
 

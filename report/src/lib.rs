@@ -1,4 +1,4 @@
-//! Makes figures for people out of run directories and records of trials: tables, curves, HTML pages.
+//! Makes figures for people out of run directories and records of trials: tables, curves, pictures of the scene, HTML pages.
 //!
 //! Reads what `tandem-telemetry` wrote and knows nothing of how runs are made.
 
@@ -13,6 +13,7 @@ pub mod measures;
 pub mod paper;
 pub mod records;
 pub mod run;
+pub mod scene;
 pub mod table;
 pub mod trials;
 
@@ -25,5 +26,6 @@ pub use held_out::HeldOut;
 pub use html::{Written, report_html, run_report_html};
 pub use measures::LearningMeasures;
 pub use run::{Found, Run};
+pub use scene::{View, scene_svg};
 pub use table::Table;
 pub use trials::{Pictured, TrialGroup, Trials, trial_svg};
