@@ -71,7 +71,8 @@ mod tests {
 
     #[test]
     fn long_texts_are_cut_between_characters() {
-        for (text, expected) in [("", ""), ("äöü", "äöü"), ("äöüß", "äöü... (8 bytes)"), ("abcd", "abc... (4 bytes)")]
+        for (text, expected) in
+            [("", ""), ("äöü", "äöü"), ("äöüß", "äöü... (8 bytes)"), ("abcd", "abc... (4 bytes)")]
         {
             assert_eq!(shortened(text, 3), expected);
         }
