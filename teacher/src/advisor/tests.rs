@@ -5,12 +5,14 @@ use crate::ledger::MemoryLedger;
 fn advisor(budget: u64, strategy: &str) -> Advisor {
     let mut advisor =
         Advisor::new(Box::new(FakePolicy), Box::new(MemoryLedger::default())).unwrap();
-    advisor.open_account("run", Terms { budget, strategy: strategy.parse().unwrap() }).unwrap();
+    advisor
+        .open_account("run", AccountTerms { budget, strategy: strategy.parse().unwrap() })
+        .unwrap();
     advisor
 }
 
-fn question(account: &str, queries: &[StepQuery]) -> Question {
-    Question { account: account.to_owned(), queries: queries.to_vec() }
+fn question(account: &str, queries: &[StepQuery]) -> AdviceRequest {
+    AdviceRequest { account: account.to_owned(), queries: queries.to_vec() }
 }
 
 /// The answer to one question.
@@ -175,7 +177,7 @@ impl TeacherPolicy for Broken {
 #[test]
 fn a_question_that_is_refused_leaves_the_others_of_its_batch_alone() {
     let mut advisor = Advisor::new(Box::new(Broken), Box::new(MemoryLedger::default())).unwrap();
-    let terms = Terms { budget: 10, strategy: Strategy::EarlyAdvising };
+    let terms = AccountTerms { budget: 10, strategy: Strategy::EarlyAdvising };
     advisor.open_account("run", terms).unwrap();
     advisor.open_leases("run", &[2], 5).unwrap();
     let answers = advisor.advise(&[
@@ -197,7 +199,9 @@ fn a_question_that_is_refused_leaves_the_others_of_its_batch_alone() {
     let expected = [
         Ok((2, 3)),
         refused("unknown account \"walk\": open it first"),
-        refused("the teacher's networks gave a number that is not finite for step 4 of episode 1"),
+        refused(
+            "the teacher's networks returned a number that is not finite for step 4 of episode 1",
+        ),
         refused("steps[1].step: expected 0 to 49 in an episode that has a lease, got 50"),
         Ok((0, 2)),
         Ok((2, 2)),
@@ -207,7 +211,7 @@ fn a_question_that_is_refused_leaves_the_others_of_its_batch_alone() {
 }
 
 /// Questions of several accounts and sizes, some of them about the same steps.
-fn many_questions() -> Vec<Question> {
+fn many_questions() -> Vec<AdviceRequest> {
     let step = |number: u16| {
         let (x, y) = (f32::from(number % 7) / 10.0, f32::from(number % 5) / 10.0);
         query(u64::from(number % 3), u32::from(number / 2), x, y)
@@ -227,7 +231,7 @@ fn many_questions() -> Vec<Question> {
 fn questions_answered_together_get_what_they_would_get_one_by_one() {
     let fresh = || {
         let mut advisor = advisor(40, "eamc:0.05");
-        let terms = Terms { budget: 30, strategy: Strategy::MistakeAction { alpha: 0.3 } };
+        let terms = AccountTerms { budget: 30, strategy: Strategy::MistakeAction { alpha: 0.3 } };
         advisor.open_account("walk", terms).unwrap();
         advisor.open_leases("run", &[0, 1], 8).unwrap();
         advisor
@@ -258,10 +262,10 @@ fn the_ledger_is_asked_for_an_accounts_terms_once() {
     let mut advisor = advisor(10, "ea");
     ask(&mut advisor, &two_arms(0));
     assert_eq!(advisor.strategies.get("run"), Some(&Strategy::EarlyAdvising));
-    for number in 0..MAX_REMEMBERED {
+    for number in 0..MAX_CACHED_STRATEGIES {
         advisor.strategies.insert(number.to_string(), Strategy::NoAdvice);
     }
-    let terms = Terms { budget: 10, strategy: Strategy::NoAdvice };
+    let terms = AccountTerms { budget: 10, strategy: Strategy::NoAdvice };
     advisor.open_account("walk", terms).unwrap();
     let advice = advise(&mut advisor, "walk", &[two_arms(0)]).unwrap();
     assert_eq!((advice.steps[0].charged, advisor.strategies.len()), (false, 1));

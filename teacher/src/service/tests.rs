@@ -13,7 +13,7 @@ use tonic::transport::Channel;
 use tonic_health::pb::health_check_response::ServingStatus;
 use tonic_health::pb::health_client::HealthClient;
 
-use super::gated::{GatedLedger, Mode, Watch};
+use super::gated_ledger::{GateControl, GatedLedger, Mode};
 use super::*;
 use crate::fake::{FakePolicy, query};
 
@@ -29,7 +29,7 @@ async fn serve_open(
 struct Fixture {
     client: TeacherClient<Channel>,
     channel: Channel,
-    watch: Watch,
+    gate: GateControl,
     shutdown: CancellationToken,
     served: JoinHandle<Result<(), Error>>,
 }
@@ -39,12 +39,12 @@ impl Fixture {
         let listener = TcpListener::bind(SocketAddr::from(([127, 0, 0, 1], 0))).await.unwrap();
         let address = listener.local_addr().unwrap();
         let shutdown = CancellationToken::new();
-        let watch = Watch::new();
-        let ledger = Box::new(GatedLedger::new(watch.clone()));
+        let gate = GateControl::new();
+        let ledger = Box::new(GatedLedger::new(gate.clone()));
         let advisor = Advisor::new(Box::new(FakePolicy), ledger).unwrap();
         let served = tokio::spawn(serve_open(advisor, listener, shutdown.clone()));
         let channel = Channel::from_shared(format!("http://{address}")).unwrap().connect_lazy();
-        Self { client: TeacherClient::new(channel.clone()), channel, watch, shutdown, served }
+        Self { client: TeacherClient::new(channel.clone()), channel, gate, shutdown, served }
     }
 
     async fn open(&mut self, budget: u64, strategy: &str) -> Result<pb::Account, Status> {
@@ -300,13 +300,13 @@ async fn a_request_under_way_is_answered_before_the_service_ends() {
         fixture.open(10, "ea").await.unwrap();
         // The account's terms are known from here on; to charge is what blocks.
         assert_eq!(fixture.advise(Vec::new()).await.unwrap().budget_left, 10);
-        fixture.watch.set(Mode::Block);
+        fixture.gate.set(Mode::Block);
         fixture
     };
     let let_end = async |fixture: &Fixture| {
-        fixture.watch.visited(1).await;
+        fixture.gate.charge_called(1).await;
         fixture.shutdown.cancel();
-        fixture.watch.set(Mode::Answer);
+        fixture.gate.set(Mode::Answer);
     };
 
     let mut fixture = held_up().await;
@@ -354,11 +354,11 @@ async fn a_ledger_that_cannot_be_used_is_unavailable_for_every_call_and_only_so_
         (Mode::Refuse, "the ledger cannot be used now: the disk is full"),
         (Mode::Block, "no answer within 4s: ask again"),
     ] {
-        fixture.watch.set(mode);
+        fixture.gate.set(mode);
         let expected = (Code::Unavailable, message.to_owned());
         assert_eq!(refusals(&mut fixture).await, vec![expected; 5]);
         fixture.client.describe(pb::DescribeRequest {}).await.unwrap();
-        fixture.watch.set(Mode::Answer);
+        fixture.gate.set(Mode::Answer);
         assert!(fixture.advise(vec![step(0)]).await.unwrap().steps[0].charged);
     }
     assert_eq!(fixture.open(10, "ea").await.unwrap().spent, 1);
@@ -370,13 +370,13 @@ async fn a_panic_is_an_internal_error_and_ends_the_service() {
     let mut fixture = Fixture::start().await;
     fixture.open(10, "ea").await.unwrap();
     let (sender, mut answers) = fixture.stream().await;
-    fixture.watch.set(Mode::Panic);
+    fixture.gate.set(Mode::Panic);
     let ask = pb::AdviseRequest { account: "run".to_owned(), steps: vec![step(0)] };
     sender.send(ask).await.unwrap();
     let (code, message) = refusal(answers.message().await);
     assert_eq!(
         (code, message.as_str()),
-        (Code::Internal, "the teacher has a bug and ends: its log says more")
+        (Code::Internal, "the teacher has a bug and ends: see its log")
     );
     let Fixture { client, channel, served, .. } = fixture;
     drop((client, channel, sender, answers));

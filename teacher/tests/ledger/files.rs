@@ -7,7 +7,7 @@ use rusqlite::Connection;
 use tandem_teacher::ledger::{self, Ledger as _, OpenError, SqliteLedger};
 use tempfile::TempDir;
 
-use crate::place::{BOTH, bill, charge, terms};
+use crate::fixture::{BOTH, charge, request, terms};
 
 fn directory() -> (TempDir, PathBuf) {
     let directory = tempfile::tempdir().expect("a directory");
@@ -22,7 +22,7 @@ fn filled(path: &Path) {
     let episodes: Vec<u64> = (0..600).collect();
     ledger.open_leases("run", &episodes, 10).expect("leases");
     let charges: Vec<_> = episodes.iter().map(|episode| charge(*episode, 7, BOTH)).collect();
-    ledger.charge(&[bill("run", &charges)]).remove(0).expect("paid");
+    ledger.charge(&[request("run", &charges)]).remove(0).expect("paid");
 }
 
 /// Opening must fail and leave the file as it is. Gives what is said, the path shortened.
@@ -231,7 +231,7 @@ fn an_empty_file_becomes_a_ledger() {
 fn a_name_that_is_no_place_is_refused() {
     let check = |place: &str, expected: &str| {
         let error = ledger::open(place).err().expect(place);
-        assert!(matches!(error, OpenError::NotAPlace(_)), "{place}: {error}");
+        assert!(matches!(error, OpenError::InvalidLocation(_)), "{place}: {error}");
         let told = error.to_string();
         assert!(told.contains(expected) && !told.contains("hunter2"), "{place}: {told}");
         assert!(told.starts_with("expected memory, redis://"), "{place}: {told}");
@@ -243,7 +243,10 @@ fn a_name_that_is_no_place_is_refused() {
     check("redis://user:hunter2@host:port/0", "the redis:// URL cannot be read");
     check("redis://user:hunter2@host/zero", "Invalid database number");
     check("redis://user:hunter2#@host/0", "the redis:// URL");
-    check("redis://user:hunter2@host/0?protocol=resp3", "which a password must have as %3F or %23");
+    check(
+        "redis://user:hunter2@host/0?protocol=resp3",
+        "which must be written as %3F or %23 in a password",
+    );
 }
 
 /// A person with the tool `sqlite3` reads the same.
@@ -260,7 +263,7 @@ fn the_tables_say_what_was_charged() {
         charge(u64::MAX, 63, BOTH),
         charge(u64::MAX, 129, BOTH),
     ];
-    ledger.charge(&[bill("run", &charges)]).remove(0).expect("paid");
+    ledger.charge(&[request("run", &charges)]).remove(0).expect("paid");
     ledger.settle("run", &[3]).expect("settled");
     // While the ledger is open, too.
     let reader = Connection::open(&path).expect("a database");

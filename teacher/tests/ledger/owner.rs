@@ -8,7 +8,7 @@ use rusqlite::Connection;
 use tandem_teacher::ledger::{Ledger as _, LedgerError, OpenError, SqliteLedger};
 use tempfile::TempDir;
 
-use crate::place::{BOTH, FIRST, bill, charge, terms};
+use crate::fixture::{BOTH, FIRST, charge, request, terms};
 use crate::servers::Log;
 
 /// An open ledger with one unit of ten spent, by step 0 of episode 1.
@@ -22,8 +22,8 @@ fn opened() -> (TempDir, PathBuf, SqliteLedger) {
 }
 
 fn charge_step(ledger: &mut SqliteLedger, step: u32) -> Result<(), LedgerError> {
-    let receipt = ledger.charge(&[bill("run", &[charge(1, step, BOTH)])]).remove(0)?;
-    assert_eq!(receipt.verdicts, [FIRST]);
+    let result = ledger.charge(&[request("run", &[charge(1, step, BOTH)])]).remove(0)?;
+    assert_eq!(result.verdicts, [FIRST]);
     Ok(())
 }
 

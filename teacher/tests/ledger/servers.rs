@@ -8,7 +8,7 @@ use std::time::Duration;
 
 use tandem_teacher::ledger::{Ledger as _, LedgerError, RedisLedger};
 
-use crate::place::{BOTH, FIRST, NEITHER, NOTHING, bill, charge, terms};
+use crate::fixture::{BOTH, FIRST, NEITHER, NOTHING, charge, request, terms};
 use crate::redis_server::RedisServer;
 
 fn is_unavailable<T: std::fmt::Debug>(outcome: Result<T, LedgerError>) -> String {
@@ -41,9 +41,9 @@ fn teachers_share_an_account_and_never_overspend_it() {
                 if step == 300 {
                     ledger.settle("run", &[200 + number]).expect("settled");
                 }
-                let receipt = ledger.charge(&[bill("run", &asked)]).remove(0).expect("paid");
+                let result = ledger.charge(&[request("run", &asked)]).remove(0).expect("paid");
                 let steps = asked.map(|asked| (asked.episode, asked.step));
-                charged.extend(steps.into_iter().zip(receipt.verdicts));
+                charged.extend(steps.into_iter().zip(result.verdicts));
             }
             charged
         }
@@ -72,8 +72,8 @@ fn a_killed_server_is_unavailable_and_comes_back_with_everything() {
     let mut ledger = RedisLedger::open(&server.url()).expect("a ledger");
     ledger.open("run", terms(10)).expect("an account");
     ledger.open_leases("run", &[1], 3).expect("leases");
-    let asked = bill("run", &[charge(1, 0, BOTH), charge(2, 0, NEITHER), charge(2, 1, BOTH)]);
-    let receipt = ledger.charge(std::slice::from_ref(&asked)).remove(0).expect("paid");
+    let asked = request("run", &[charge(1, 0, BOTH), charge(2, 0, NEITHER), charge(2, 1, BOTH)]);
+    let result = ledger.charge(std::slice::from_ref(&asked)).remove(0).expect("paid");
     server.kill();
     let told = is_unavailable(ledger.balance("run"));
     assert!(
@@ -87,7 +87,7 @@ fn a_killed_server_is_unavailable_and_comes_back_with_everything() {
     outcomes.into_iter().for_each(|outcome| drop(is_unavailable(outcome)));
     server.restart();
     // The same ledger finds it again.
-    assert_eq!(ledger.charge(std::slice::from_ref(&asked)).remove(0).expect("paid"), receipt);
+    assert_eq!(ledger.charge(std::slice::from_ref(&asked)).remove(0).expect("paid"), result);
     let balance = ledger.settle("run", &[1]).expect("settled");
     assert_eq!((balance.spent, balance.leased, balance.left), (2, 0, 8));
 }
@@ -101,7 +101,7 @@ fn a_broken_connection_and_forgotten_scripts_are_mended_unseen() {
     let flush =
         || redis::cmd("SCRIPT").arg("FLUSH").exec(&mut server.connection()).expect("flushed");
     flush();
-    let asked = [bill("run", &[charge(1, 0, BOTH)]), bill("run", &[charge(1, 1, BOTH)])];
+    let asked = [request("run", &[charge(1, 0, BOTH)]), request("run", &[charge(1, 1, BOTH)])];
     let outcomes = ledger.charge(&asked);
     assert!(outcomes.iter().all(|outcome| outcome.as_ref().is_ok_and(|r| r.verdicts == [FIRST])));
     assert_eq!(ledger.balance("run").expect("known").spent, 2);
@@ -115,7 +115,7 @@ fn a_server_that_hangs_is_unavailable_within_seconds() {
     let Some(server) = RedisServer::start() else { return };
     let mut ledger = RedisLedger::open(&server.url()).expect("a ledger");
     ledger.open("run", terms(10)).expect("an account");
-    let asked = [bill("run", &[charge(1, 0, BOTH)]), bill("run", &[charge(1, 1, BOTH)])];
+    let asked = [request("run", &[charge(1, 0, BOTH)]), request("run", &[charge(1, 1, BOTH)])];
     let mut connection = server.connection();
     let before = n_connections(&mut connection);
     server.signal("-STOP");
@@ -198,7 +198,7 @@ fn the_keys_of_an_account_have_one_hash_tag_and_can_be_read() {
         ledger.open_leases(name, &[u64::MAX], 3).expect("leases");
         let charges =
             [charge(u64::MAX, 2, BOTH), charge(u64::MAX, 4, NEITHER), charge(9, 64, BOTH)];
-        ledger.charge(&[bill(name, &charges)]).remove(0).expect("paid");
+        ledger.charge(&[request(name, &charges)]).remove(0).expect("paid");
     }
     let mut connection = server.connection();
     let mut text = |command: &str, key: &str, field: &str| -> String {

@@ -5,11 +5,11 @@ use std::path::{Path, PathBuf};
 
 use rusqlite::Connection;
 use tandem_teacher::Strategy;
-use tandem_teacher::budget::{Balance, Lease, Terms, Verdict};
+use tandem_teacher::budget::{AccountTerms, Balance, Lease};
 use tandem_teacher::ledger::{Ledger, MemoryLedger, OpenError, SqliteLedger};
 use tempfile::TempDir;
 
-use crate::place::{BOTH, NEITHER, bill, charge, terms};
+use crate::fixture::{BOTH, NEITHER, Verdict, charge, request, terms};
 
 const LEASED: &str = "leased";
 const FREE: &str = "free \"quoted\"\n\u{1b}[31m";
@@ -18,15 +18,15 @@ const FREE: &str = "free \"quoted\"\n\u{1b}[31m";
 /// lease, numbers beyond 2^63, steps beyond the first word, and a name with quotes and control characters.
 fn play(ledger: &mut dyn Ledger) {
     ledger.open(LEASED, terms(100)).expect("an account");
-    let free = Terms { budget: 12, strategy: Strategy::MistakeQ { threshold: 0.05 } };
+    let free = AccountTerms { budget: 12, strategy: Strategy::MistakeQ { threshold: 0.05 } };
     ledger.open(FREE, free).expect("an account");
     ledger.open_leases(LEASED, &[0, 1, 2, u64::MAX], 15).expect("leases");
     for step in 0..20 {
-        let wish = if step % 3 == 0 { NEITHER } else { BOTH };
+        let wanted = if step % 3 == 0 { NEITHER } else { BOTH };
         let charges =
-            [charge(0, step, BOTH), charge(1, step, wish), charge(u64::MAX, 49 - step, wish)];
-        let free = [charge(7, 5 * step, wish), charge(1 << 63, step, BOTH)];
-        let outcomes = ledger.charge(&[bill(LEASED, &charges), bill(FREE, &free)]);
+            [charge(0, step, BOTH), charge(1, step, wanted), charge(u64::MAX, 49 - step, wanted)];
+        let free = [charge(7, 5 * step, wanted), charge(1 << 63, step, BOTH)];
+        let outcomes = ledger.charge(&[request(LEASED, &charges), request(FREE, &free)]);
         assert!(outcomes.iter().all(Result::is_ok));
     }
     ledger.settle(LEASED, &[0, u64::MAX]).expect("settled");
@@ -35,7 +35,7 @@ fn play(ledger: &mut dyn Ledger) {
 /// Makes what only the write-ahead log beside the file has.
 fn play_on(ledger: &mut dyn Ledger) {
     ledger.open_leases(LEASED, &[3], 15).expect("leases");
-    ledger.charge(&[bill(LEASED, &[charge(3, 1, BOTH)])]).remove(0).expect("paid");
+    ledger.charge(&[request(LEASED, &[charge(3, 1, BOTH)])]).remove(0).expect("paid");
 }
 
 /// The answers to questions about everything that [`play`] touched, and about steps that are new.
@@ -44,9 +44,10 @@ fn ask(ledger: &mut dyn Ledger) -> (Vec<Verdict>, Vec<Lease>, [Balance; 2]) {
         let steps = episodes.iter().flat_map(|episode| (0..50).map(|step| (*episode, step)));
         steps.map(|(episode, step)| charge(episode, step, BOTH)).collect::<Vec<_>>()
     };
-    let bills = [bill(LEASED, &steps(&[0, 1, 2, 3, u64::MAX])), bill(FREE, &steps(&[7, 1 << 63]))];
-    let receipts = ledger.charge(&bills).into_iter().map(|outcome| outcome.expect("paid"));
-    let verdicts = receipts.flat_map(|receipt| receipt.verdicts).collect();
+    let requests =
+        [request(LEASED, &steps(&[0, 1, 2, 3, u64::MAX])), request(FREE, &steps(&[7, 1 << 63]))];
+    let results = ledger.charge(&requests).into_iter().map(|outcome| outcome.expect("paid"));
+    let verdicts = results.flat_map(|result| result.verdicts).collect();
     let leases = ledger.open_leases(LEASED, &[0, 1, 2, 3, 4, u64::MAX], 15).expect("leases").0;
     let balances = [LEASED, FREE].map(|name| ledger.balance(name).expect("an account"));
     (verdicts, leases, balances)

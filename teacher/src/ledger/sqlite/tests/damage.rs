@@ -14,12 +14,12 @@ const PAGE_BYTES: usize = 512;
 fn small_ledger(path: &Path) -> Vec<u8> {
     let mut ledger = SqliteLedger::open(path).unwrap();
     for (name, budget) in [("run", 100), ("walk", 1_000_000), ("rest", 7)] {
-        ledger.open(name, Terms { budget, ..TERMS }).unwrap();
+        ledger.open(name, AccountTerms { budget, ..TERMS }).unwrap();
     }
     let episodes: Vec<u64> = (0..24).collect();
     ledger.open_leases("run", &episodes, 3).unwrap();
     for episode in episodes {
-        ledger.charge(&[bill("run", episode, 0..5), bill("walk", episode, 60..70)]);
+        ledger.charge(&[request("run", episode, 0..5), request("walk", episode, 60..70)]);
     }
     ledger.settle("run", &[0, 1, 2, 3]).unwrap();
     drop(ledger);
