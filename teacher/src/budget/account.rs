@@ -7,9 +7,6 @@ use super::verdict_bits::{VerdictBits, VerdictIndex, charged_units};
 use super::{AccountTerms, Balance, BudgetHalf, Charge, Lease};
 
 /// A budget with its leases and the verdicts on all steps that were asked about.
-///
-/// Operations run in a [`Transaction`], which leaves the account unchanged until its [`Changes`] are applied. The
-/// methods of the account apply them at once; a ledger that writes to a file writes them first.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Account {
     terms: AccountTerms,
@@ -103,17 +100,23 @@ impl Account {
         Balance { terms, spent, leased, left: terms.budget - spent - leased }
     }
 
-    /// Opens leases; see [`Transaction::open_leases`].
+    /// Reserves `units_per_episode`, or the units that are left, for each of `episodes` in turn.
+    ///
+    /// An episode that has a lease, open or settled, keeps it.
     pub fn open_leases(&mut self, episodes: &[u64], units_per_episode: u32) -> Vec<Lease> {
         self.update(|transaction| transaction.open_leases(episodes, units_per_episode))
     }
 
-    /// Settles leases; see [`Transaction::settle`].
+    /// Returns the unspent units of `episodes` to the budget. Episodes without an open lease have none.
     pub fn settle(&mut self, episodes: &[u64]) {
         self.update(|transaction| transaction.settle(episodes));
     }
 
-    /// Charges one step; see [`Transaction::charge`].
+    /// Decides whether a step costs a unit, and returns the half of the budget that the unit belongs to.
+    ///
+    /// A step costs a unit if the episode has one to spend and the step is worth it. An episode with a lease spends the
+    /// units of its lease and, once settled, none; an episode without a lease spends units that are left. A repeated
+    /// request gets the same verdict, whatever it wants now, and charges nothing.
     pub fn charge(&mut self, charge: Charge) -> Option<BudgetHalf> {
         self.update(|transaction| transaction.charge(charge))
     }

@@ -7,7 +7,7 @@ use super::verdict_bits::{VerdictBits, VerdictIndex, charged_units, verdict_inde
 use super::{BudgetHalf, Charge, Lease};
 
 /// A series of operations on an account. Each operation sees the changes of those before it; the account itself stays as
-/// it is until [`Account::apply`].
+/// it is until [`Account::apply`]. A ledger in a file writes the changes before it applies them.
 #[derive(Debug)]
 pub(crate) struct Transaction<'a> {
     account: &'a Account,
@@ -61,9 +61,7 @@ impl<'a> Transaction<'a> {
         self.lease(episode).is_some()
     }
 
-    /// Reserves `units_per_episode`, or the units that are left, for each of `episodes` in turn.
-    ///
-    /// An episode that has a lease, open or settled, keeps it.
+    /// Opens leases; see [`Account::open_leases`].
     pub(crate) fn open_leases(&mut self, episodes: &[u64], units_per_episode: u32) -> Vec<Lease> {
         episodes.iter().map(|episode| self.open_lease(*episode, units_per_episode)).collect()
     }
@@ -81,7 +79,7 @@ impl<'a> Transaction<'a> {
         Lease { episode, units: record.units, early_units: record.early_units }
     }
 
-    /// Returns the unspent units of `episodes` to the budget. Episodes without an open lease have none.
+    /// Settles leases; see [`Account::settle`].
     pub(crate) fn settle(&mut self, episodes: &[u64]) {
         for episode in episodes {
             if let Some(lease) = self.lease(*episode).filter(|lease| !lease.settled) {
@@ -91,11 +89,7 @@ impl<'a> Transaction<'a> {
         }
     }
 
-    /// Decides whether a step costs a unit, and returns the half of the budget that the unit belongs to.
-    ///
-    /// A step costs a unit if the episode has one to spend and the step is worth it. An episode with a lease spends the
-    /// units of its lease and, once settled, none; an episode without a lease spends units that are left. A repeated
-    /// request gets the same verdict, whatever it wants now, and charges nothing.
+    /// Charges one step; see [`Account::charge`].
     pub(crate) fn charge(&mut self, charge: Charge) -> Option<BudgetHalf> {
         let Charge { episode, step, .. } = charge;
         let index = verdict_index(episode, step);

@@ -25,7 +25,7 @@ async fn serve_open(
     serve_advisor(advisor, listener, &Gate::default(), shutdown, Pacing::Concurrent).await
 }
 
-/// A running service and a client of it.
+/// A running service and its client.
 struct Fixture {
     client: TeacherClient<Channel>,
     channel: Channel,
@@ -61,7 +61,7 @@ impl Fixture {
         self.client.advise(request).await.map(Response::into_inner)
     }
 
-    /// A stream on which requests can be sent one after another.
+    /// Opens a stream, and returns a sender of requests and the answers.
     async fn stream(&mut self) -> (mpsc::Sender<pb::AdviseRequest>, Streaming<pb::AdviseResponse>) {
         let (sender, receiver) = mpsc::channel(8);
         let answers = self.client.advise_stream(ReceiverStream::new(receiver)).await.unwrap();
@@ -79,14 +79,14 @@ fn step(step: u32) -> pb::StepQuery {
     encode_query(&query(1, step, 0.5, 0.25))
 }
 
-/// A refusal's code and message.
+/// Returns the code and message of a refusal.
 fn refusal<T: std::fmt::Debug>(outcome: Result<T, Status>) -> (Code, String) {
     let status = outcome.unwrap_err();
     (status.code(), status.message().to_owned())
 }
 
 #[tokio::test]
-async fn it_describes_itself() {
+async fn describe_returns_layout_maps_strategies_and_digest() {
     let mut fixture = Fixture::start().await;
     let description = fixture.client.describe(pb::DescribeRequest {}).await.unwrap().into_inner();
     assert_eq!(description.task, "push");
@@ -110,7 +110,7 @@ async fn it_describes_itself() {
 }
 
 #[tokio::test]
-async fn it_reports_its_health() {
+async fn the_service_reports_its_health() {
     let fixture = Fixture::start().await;
     let mut health = HealthClient::new(fixture.channel.clone());
     for service in ["", "tandem.v1.Teacher"] {
@@ -208,7 +208,7 @@ async fn an_open_stream_does_not_keep_the_service_alive() {
 }
 
 #[tokio::test]
-async fn bad_requests_are_refused_by_name() {
+async fn invalid_requests_are_refused_by_field() {
     let mut fixture = Fixture::start().await;
     fixture.open(10, "ea").await.unwrap();
     let check = |outcome: Result<pb::AdviseResponse, Status>, expected: &str| {
@@ -253,7 +253,7 @@ async fn bad_requests_are_refused_by_name() {
 #[tokio::test]
 async fn an_unknown_account_is_not_found() {
     let mut fixture = Fixture::start().await;
-    let name = || "nobody".to_owned();
+    let name = || "unknown".to_owned();
     let got = fixture.client.get_account(pb::GetAccountRequest { name: name() }).await;
     assert_eq!(refusal(got).0, Code::NotFound);
     assert_eq!(refusal(fixture.advise(vec![step(0)]).await).0, Code::NotFound);
@@ -293,12 +293,12 @@ async fn a_round_leases_spends_and_settles() {
 }
 
 #[tokio::test]
-async fn a_request_under_way_is_answered_before_the_service_ends() {
+async fn a_pending_request_is_answered_before_the_service_ends() {
     let ask = || pb::AdviseRequest { account: "run".to_owned(), steps: vec![step(0)] };
     let held_up = async || {
         let mut fixture = Fixture::start().await;
         fixture.open(10, "ea").await.unwrap();
-        // The account's terms are known from here on; to charge is what blocks.
+        // The strategy is cached now, so only the charge blocks.
         assert_eq!(fixture.advise(Vec::new()).await.unwrap().budget_left, 10);
         fixture.gate.set(Mode::Block);
         fixture
@@ -326,7 +326,7 @@ async fn a_request_under_way_is_answered_before_the_service_ends() {
     fixture.stop().await;
 }
 
-/// Code and message of the refusal that each kind of call gets.
+/// Returns the code and message with which each kind of call is refused.
 async fn refusals(fixture: &mut Fixture) -> Vec<(Code, String)> {
     let (sender, mut answers) = fixture.stream().await;
     let ask = pb::AdviseRequest { account: "run".to_owned(), steps: vec![step(0)] };
@@ -347,7 +347,7 @@ async fn refusals(fixture: &mut Fixture) -> Vec<(Code, String)> {
 }
 
 #[tokio::test]
-async fn a_ledger_that_cannot_be_used_is_unavailable_for_every_call_and_only_so_long() {
+async fn every_call_is_unavailable_while_the_ledger_is() {
     let mut fixture = Fixture::start().await;
     fixture.open(10, "ea").await.unwrap();
     for (mode, message) in [

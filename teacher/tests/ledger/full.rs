@@ -1,4 +1,4 @@
-//! A full disk: what cannot be written is not done, and works again once there is room.
+//! A full disk: the ledger refuses what it cannot write, and works again once there is room.
 
 use std::fs;
 use std::path::PathBuf;
@@ -15,7 +15,7 @@ struct SmallDisk {
 }
 
 impl SmallDisk {
-    /// None where this process may not mount one.
+    /// Returns `None` if the process may not mount a disk.
     fn mount() -> Option<Self> {
         let directory = tempfile::tempdir().expect("a directory");
         let mounted = Command::new("mount")
@@ -72,7 +72,7 @@ fn a_full_disk_makes_the_ledger_unavailable_until_there_is_room() {
         assert!(unpaid.iter().all(Result::is_err), "{unpaid:?}");
         assert_eq!(ledger.balance("run").expect("known"), model.balance("run").expect("known"));
     }
-    // What stands already is still told.
+    // Verdicts from before are still returned.
     let known =
         ledger.charge(&[request("run", &[charge(0, 1, NEITHER)])]).remove(0).expect("known");
     assert_eq!(known.verdicts, [crate::fixture::FIRST]);
@@ -81,7 +81,7 @@ fn a_full_disk_makes_the_ledger_unavailable_until_there_is_room() {
     for ledger in [&mut ledger as &mut dyn tandem_teacher::ledger::Ledger, &mut model] {
         ledger.settle("run", &[0]).expect("settled");
         ledger.open_leases("run", &[2_000_000], 20).expect("leases");
-        // Had the bill that was refused left anything behind, these would not be charged.
+        // If the refused request had left a verdict, these steps would not be charged.
         let result = ledger.charge(&[request_for(episode)]).remove(0).expect("paid");
         assert_eq!(result.verdicts, [crate::fixture::FIRST; 2]);
     }

@@ -13,8 +13,8 @@ pub(crate) fn an_account_is_opened_once_and_keeps_its_terms(mut fixture: TestLed
     fixture.charge("run", &[charge(1, 0, BOTH)]);
     for _ in 0..2 {
         assert_eq!(fixture.open("run", 10), Balance { spent: 1, left: 9, ..fresh });
-        let asked = AccountTerms { budget: 11, strategy: Strategy::MistakeQ { threshold: 0.05 } };
-        let refused = fixture.ledger().open("run", asked).unwrap_err().to_string();
+        let other = AccountTerms { budget: 11, strategy: Strategy::MistakeQ { threshold: 0.05 } };
+        let refused = fixture.ledger().open("run", other).unwrap_err().to_string();
         assert_eq!(
             refused,
             "account \"run\" is open with budget 10 and strategy eamc:0.1, not with budget 11 and strategy mc-q:0.05"
@@ -78,7 +78,7 @@ pub(crate) fn an_episode_without_a_lease_has_no_end(mut fixture: TestLedger) {
 pub(crate) fn a_repeated_operation_changes_nothing(mut fixture: TestLedger) {
     fixture.open("run", 10);
     let leases = fixture.leases("run", &[3, 4], 3);
-    let asked = [
+    let charges = [
         charge(3, 0, BOTH),
         charge(3, 1, NEITHER),
         charge(4, 0, BOTH),
@@ -86,11 +86,11 @@ pub(crate) fn a_repeated_operation_changes_nothing(mut fixture: TestLedger) {
         charge(9, 64, NEITHER),
         charge(3, 0, BOTH),
     ];
-    let verdicts = fixture.charge("run", &asked);
+    let verdicts = fixture.charge("run", &charges);
     assert_eq!(verdicts, [FIRST, NOTHING, FIRST, SECOND, NOTHING, FIRST]);
     let settled = fixture.settle("run", &[4]);
     assert_eq!(settled, (3, 2, 5));
-    let other_halves = asked.map(|asked| inverted(&asked));
+    let other_halves = charges.map(|charge| inverted(&charge));
     for _ in 0..2 {
         assert_eq!(fixture.leases("run", &[4, 3], 8), [leases[1], leases[0]]);
         assert_eq!(fixture.charge("run", &other_halves), verdicts);
@@ -109,8 +109,8 @@ pub(crate) fn leases_take_what_is_left_in_the_order_of_the_episodes(mut fixture:
     assert_eq!(fixture.state("run"), (0, 120, 0));
     fixture.close();
     assert_eq!(fixture.leases("run", &[7, 3, 5, 9], 1), expected);
-    let asked = [charge(9, 0, BOTH), charge(1, 0, BOTH), charge(5, 0, BOTH)];
-    assert_eq!(fixture.charge("run", &asked), [NOTHING, NOTHING, SECOND]);
+    let charges = [charge(9, 0, BOTH), charge(1, 0, BOTH), charge(5, 0, BOTH)];
+    assert_eq!(fixture.charge("run", &charges), [NOTHING, NOTHING, SECOND]);
     assert_eq!(fixture.state("run"), (1, 119, 0));
 }
 
@@ -135,10 +135,10 @@ pub(crate) fn the_first_half_is_handed_out_first(mut fixture: TestLedger) {
     fixture.open("run", 5);
     let steps =
         |steps: std::ops::Range<u32>, wanted| steps.map(move |step| charge(1, step, wanted));
-    let asked: Vec<_> = steps(0..2, BOTH).chain(steps(2..3, only_second)).collect();
-    assert_eq!(fixture.charge("run", &asked), [FIRST, FIRST, NOTHING]);
-    let asked: Vec<_> = steps(3..5, only_first).chain(steps(5..8, BOTH)).collect();
-    assert_eq!(fixture.charge("run", &asked), [FIRST, NOTHING, SECOND, SECOND, NOTHING]);
+    let charges: Vec<_> = steps(0..2, BOTH).chain(steps(2..3, only_second)).collect();
+    assert_eq!(fixture.charge("run", &charges), [FIRST, FIRST, NOTHING]);
+    let charges: Vec<_> = steps(3..5, only_first).chain(steps(5..8, BOTH)).collect();
+    assert_eq!(fixture.charge("run", &charges), [FIRST, NOTHING, SECOND, SECOND, NOTHING]);
     assert_eq!(fixture.state("run"), (5, 0, 0));
 }
 
@@ -148,7 +148,7 @@ pub(crate) fn a_lease_says_how_many_of_its_units_are_early(mut fixture: TestLedg
     fixture.charge("run", &[charge(100, 0, BOTH)]);
     assert_eq!(fixture.leases("run", &[1, 2], 3), [lease(1, 3, 3), lease(2, 3, 1)]);
     fixture.close();
-    // The second episode is served first; that changes nothing.
+    // Serving the second episode first changes nothing.
     let second: Vec<_> = (0..3).map(|step| charge(2, step, only_first)).collect();
     assert_eq!(fixture.charge("run", &second), [FIRST, NOTHING, NOTHING]);
     let first: Vec<_> = (0..4).map(|step| charge(1, step, BOTH)).collect();
@@ -188,7 +188,7 @@ pub(crate) fn the_largest_numbers_are_kept_to_the_last_digit(mut fixture: TestLe
     assert!(leases.iter().all(|lease| (lease.units, lease.early_units) == (u32::MAX, u32::MAX)));
     let leased = 6 * u64::from(u32::MAX);
     assert_eq!(fixture.state("run"), (0, leased, MAX_BUDGET - leased));
-    // An odd number of steps of every other episode: were two numbers one, a verdict would be repeated.
+    // Alternating verdicts: if two of the numbers collided, a verdict would be repeated.
     for (idx, episode) in episodes.into_iter().enumerate() {
         let wanted = if idx % 2 == 0 { BOTH } else { NEITHER };
         let expected = if idx % 2 == 0 { FIRST } else { NOTHING };
@@ -243,7 +243,7 @@ pub(crate) fn requests_of_one_call_are_charged_in_their_order(mut fixture: TestL
     assert_eq!(verdicts[0], [FIRST, FIRST]);
     assert_eq!(verdicts[1], [FIRST, FIRST]);
     assert_eq!(verdicts[2], [SECOND, NOTHING]);
-    assert_eq!(verdicts[3], [FIRST, FIRST], "asked again");
+    assert_eq!(verdicts[3], [FIRST, FIRST], "repeated");
     assert_eq!(verdicts[4], [NOTHING, NOTHING]);
     let left: Vec<u64> = outcomes.iter().map(|result| result.left).collect();
     assert_eq!(left, [1, 98, 0, 0, 0]);

@@ -14,7 +14,7 @@ use crate::fixture::{BOTH, NEITHER, Verdict, charge, request, terms};
 const LEASED: &str = "leased";
 const FREE: &str = "free \"quoted\"\n\u{1b}[31m";
 
-/// Makes the books of `tests/data/ledger-v1.sqlite`: leases that are open, settled and exhausted, episodes without a
+/// Repeats the operations that created `tests/data/ledger-v1.sqlite`: leases that are open, settled and exhausted, episodes without a
 /// lease, numbers beyond 2^63, steps beyond the first word, and a name with quotes and control characters.
 fn play(ledger: &mut dyn Ledger) {
     ledger.open(LEASED, terms(100)).expect("an account");
@@ -32,14 +32,14 @@ fn play(ledger: &mut dyn Ledger) {
     ledger.settle(LEASED, &[0, u64::MAX]).expect("settled");
 }
 
-/// Makes what only the write-ahead log beside the file has.
+/// Repeats the operations that only its write-ahead log contains.
 fn play_on(ledger: &mut dyn Ledger) {
     ledger.open_leases(LEASED, &[3], 15).expect("leases");
     ledger.charge(&[request(LEASED, &[charge(3, 1, BOTH)])]).remove(0).expect("paid");
 }
 
-/// The answers to questions about everything that [`play`] touched, and about steps that are new.
-fn ask(ledger: &mut dyn Ledger) -> (Vec<Verdict>, Vec<Lease>, [Balance; 2]) {
+/// Returns the answers to requests for all steps and leases of [`play`], and for new ones.
+fn answers_of(ledger: &mut dyn Ledger) -> (Vec<Verdict>, Vec<Lease>, [Balance; 2]) {
     let steps = |episodes: &[u64]| {
         let steps = episodes.iter().flat_map(|episode| (0..50).map(|step| (*episode, step)));
         steps.map(|(episode, step)| charge(episode, step, BOTH)).collect::<Vec<_>>()
@@ -53,7 +53,7 @@ fn ask(ledger: &mut dyn Ledger) -> (Vec<Verdict>, Vec<Lease>, [Balance; 2]) {
     (verdicts, leases, balances)
 }
 
-/// A copy of the ledger as a killed teacher of version 1 left it, log included.
+/// Copies the ledger and the log that a killed teacher of version 1 left.
 fn copy() -> (TempDir, PathBuf) {
     let data = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data");
     let directory = tempfile::tempdir().expect("a directory");
@@ -70,7 +70,7 @@ fn version(path: &Path) -> i64 {
 }
 
 #[test]
-fn a_ledger_of_version_1_is_upgraded_and_keeps_its_books() {
+fn a_ledger_of_version_1_is_upgraded_and_keeps_its_accounts() {
     let (_directory, path) = copy();
     let mut model = MemoryLedger::default();
     play(&mut model);
@@ -79,12 +79,12 @@ fn a_ledger_of_version_1_is_upgraded_and_keeps_its_books() {
     let expected = [LEASED, FREE].map(|name| model.balance(name).expect("an account"));
     let balances = [LEASED, FREE].map(|name| ledger.balance(name).expect("an account"));
     assert_eq!(balances, expected);
-    let answers = ask(&mut ledger);
-    assert_eq!(answers, ask(&mut model));
+    let answers = answers_of(&mut ledger);
+    assert_eq!(answers, answers_of(&mut model));
     drop(ledger);
     assert_eq!(version(&path), 2);
     let mut again = SqliteLedger::open(&path).expect("a ledger");
-    assert_eq!(ask(&mut again), answers);
+    assert_eq!(answers_of(&mut again), answers);
 }
 
 #[test]

@@ -137,10 +137,10 @@ impl Server {
 
     /// Asks the server for its properties.
     pub(super) fn properties(&mut self) -> RedisResult<ServerProperties> {
-        let mut ask = redis::pipe();
-        ask.cmd("SCARD").arg(ACCOUNTS);
-        ask.cmd("INFO").arg("persistence").cmd("INFO").arg("memory");
-        let (n_accounts, persistence, memory): (u64, String, String) = self.query(&ask)?;
+        let mut pipeline = redis::pipe();
+        pipeline.cmd("SCARD").arg(ACCOUNTS);
+        pipeline.cmd("INFO").arg("persistence").cmd("INFO").arg("memory");
+        let (n_accounts, persistence, memory): (u64, String, String) = self.query(&pipeline)?;
         let has_append_only_file = persistence.lines().any(|line| line == "aof_enabled:1");
         let policy = memory.lines().find_map(|line| line.strip_prefix("maxmemory_policy:"));
         let is_bounded = !memory.lines().any(|line| line == "maxmemory:0");

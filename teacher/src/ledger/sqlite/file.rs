@@ -133,6 +133,8 @@ impl LedgerFile {
         let durability =
             if self.n_unsynced >= MAX_UNSYNCED { Durability::PowerCut } else { durability };
         self.set_durability(durability)?;
+        // Another process may have opened a file that replaced this one, and shares its log files.
+        self.check_in_place()?;
         let transaction =
             self.connection.transaction_with_behavior(TransactionBehavior::Immediate)?;
         let answer = write(&transaction)?;
@@ -142,8 +144,12 @@ impl LedgerFile {
             Durability::PowerCut => 0,
         };
         // The transaction counts only if the next process that opens the path finds it.
-        self.lock.check_in_place().map_err(|displaced| self.give_up(displaced))?;
+        self.check_in_place()?;
         Ok(answer)
+    }
+
+    fn check_in_place(&mut self) -> Result<(), Displaced> {
+        self.lock.check_in_place().map_err(|displaced| self.give_up(displaced))
     }
 
     /// Refuses all further transactions: they would be lost, or would contradict the file once it is put back.

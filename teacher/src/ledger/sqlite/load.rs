@@ -20,7 +20,7 @@ const VERSION: i64 = 2;
 const VERSION_1: i64 = 1;
 const SCHEMA: &str = include_str!("schema.sql");
 const UPGRADE_FROM_1: &str = "ALTER TABLE accounts ADD COLUMN checksum INTEGER NOT NULL DEFAULT 0";
-/// How long a transaction waits for another program that has locked the file.
+/// The time that a transaction waits for another program that has locked the file.
 const BUSY_TIMEOUT: Duration = Duration::from_secs(2);
 
 /// Checks that the file is an undamaged database of a ledger, creates the tables if it is empty, and returns its
