@@ -133,8 +133,8 @@ impl Advisor {
     /// does not affect the others.
     ///
     /// # Errors
-    /// Per request: when its account is not open, a step lies beyond the end of an episode that has a lease, the networks
-    /// return a number that is not finite, or the ledger cannot be used.
+    /// Per request: when its account is not open, a step lies beyond the end of an episode that has a lease, the
+    /// networks return a number that is not finite, or the ledger cannot be used.
     ///
     /// # Panics
     /// When a query's lengths match no layout of the teacher's task with 1 to [`MAX_ARMS`] arms, or the ledger does not

@@ -4,8 +4,8 @@ use tandem_core::{ArmIndex, Layout, StepQuery, Task};
 
 use crate::policy::TeacherPolicy;
 
-/// A policy whose action is the first three numbers of the observation plus the goal. The value of an action is minus its
-/// squared distance from that.
+/// A policy whose action is the first three numbers of the observation plus the goal. The value of an action is minus
+/// its squared distance from that.
 pub(crate) struct FakePolicy;
 
 const LAYOUT: Layout = Layout::new(Task::Push, 1);

@@ -175,12 +175,12 @@ pub enum OpenError {
     },
 }
 
-/// Opens the ledger at `location`: `memory`, `redis://[USER:PASSWORD@]HOST[:PORT][/DB]`, or the path of a file, which is
-/// created if it does not exist.
+/// Opens the ledger at `location`: `memory`, `redis://[USER:PASSWORD@]HOST[:PORT][/DB]`, or the path of a file, which
+/// is created if it does not exist.
 ///
 /// # Errors
-/// When the location is invalid, when the file is not a ledger of a known version or is in use, or when the server cannot
-/// be reached.
+/// When the location is invalid, when the file is not a ledger of a known version or is in use, or when the server
+/// cannot be reached.
 pub fn open(location: &str) -> Result<Box<dyn Ledger>, OpenError> {
     if location == "memory" {
         tracing::info!("accounts are kept in memory and lost when this process ends");

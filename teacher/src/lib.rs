@@ -1,8 +1,9 @@
-//! The teacher: a policy for one arm that advises students with several arms, under a budget (section 3.2 of the paper).
+//! The teacher: a policy for one arm that advises students with several arms, under a budget (section 3.2 of the
+//! paper).
 //!
-//! A student sends the state of a step and the action that it is about to execute. For each arm the teacher computes its
-//! own action and the value of both. A [`Strategy`] decides on which arms the teacher's action replaces the student's,
-//! and each step with such an arm costs one unit of the student's account.
+//! A student sends the state of a step and the action that it is about to execute. For each arm the teacher computes
+//! its own action and the value of both. A [`Strategy`] decides on which arms the teacher's action replaces the
+//! student's, and each step with such an arm costs one unit of the student's account.
 //!
 //! - [`maps`] relates a student's vectors to those of each arm.
 //! - [`strategy`] and [`procedures`] decide when an arm is overridden.

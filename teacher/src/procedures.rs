@@ -1,8 +1,8 @@
-//! Procedures 1 to 3 of section 3.2 of the paper, which decide whether the teacher's action replaces the student's on one
-//! arm.
+//! Procedures 1 to 3 of section 3.2 of the paper, which decide whether the teacher's action replaces the student's on
+//! one arm.
 //!
-//! [`crate::advisor`] has the loop over the arms and `a = f^a(a_1, …, a_n)`; [`crate::budget`] has the test `n_b > 0` and
-//! the decrement. The procedures judge the action that the student is about to execute, exploration included.
+//! [`crate::advisor`] has the loop over the arms and `a = f^a(a_1, …, a_n)`; [`crate::budget`] has the test `n_b > 0`
+//! and the decrement. The procedures judge the action that the student is about to execute, exploration included.
 
 use tandem_core::ArmAdvice;
 use tandem_core::reward::distance;

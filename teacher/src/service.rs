@@ -60,8 +60,8 @@ pub async fn serve(
 
 /// Serves `advisor`, with the access control of `gate`, until `shutdown` is cancelled.
 ///
-/// The advisor runs on its own thread, or under [`Pacing::Lockstep`] as a task. If it panics, pending calls fail and the
-/// service ends.
+/// The advisor runs on its own thread, or under [`Pacing::Lockstep`] as a task. If it panics, pending calls fail and
+/// the service ends.
 ///
 /// # Errors
 /// When the server fails, or the advisor has panicked.

@@ -37,8 +37,8 @@ pub enum Strategy {
     },
 }
 
-/// The half of the budget that a unit belongs to. A unit belongs to the first half if more than half of the budget is left
-/// before it is assigned.
+/// The half of the budget that a unit belongs to. A unit belongs to the first half if more than half of the budget is
+/// left before it is assigned.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum BudgetHalf {
     /// The units that are assigned first.

@@ -24,8 +24,8 @@ fn ask(advisor: &mut Advisor, query: &StepQuery) -> StepAdvice {
     advise(advisor, "run", std::slice::from_ref(query)).unwrap().steps.remove(0)
 }
 
-/// Returns a query for which the teacher's actions are (0.5, 0, 0) and (0, 0.25, 0), with importances 0.25 and 0.0625 and
-/// distances 0.5 and 0.25.
+/// Returns a query for which the teacher's actions are (0.5, 0, 0) and (0, 0.25, 0), with importances 0.25 and 0.0625
+/// and distances 0.5 and 0.25.
 fn two_arms(step: u32) -> StepQuery {
     query(1, step, 0.5, 0.25)
 }

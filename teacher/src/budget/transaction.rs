@@ -6,8 +6,8 @@ use super::account::{Account, LeaseRecord};
 use super::verdict_bits::{VerdictBits, VerdictIndex, charged_units, verdict_index};
 use super::{BudgetHalf, Charge, Lease};
 
-/// A series of operations on an account. Each operation sees the changes of those before it; the account itself stays as
-/// it is until [`Account::apply`]. A ledger in a file writes the changes before it applies them.
+/// A series of operations on an account. Each operation sees the changes of those before it; the account itself stays
+/// as it is until [`Account::apply`]. A ledger in a file writes the changes before it applies them.
 #[derive(Debug)]
 pub(crate) struct Transaction<'a> {
     account: &'a Account,

@@ -1,13 +1,13 @@
 //! A ledger on a Redis server, which several teachers can share.
 //!
-//! The process keeps no accounts: each operation is a script that the server runs atomically, and all keys of an account
-//! have one hash tag. [`crate::budget::Account`] defines the scripts in `redis/`; the tests compare them with it. A
-//! script may be run again if its reply was lost.
+//! The process keeps no accounts: each operation is a script that the server runs atomically, and all keys of an
+//! account have one hash tag. [`crate::budget::Account`] defines the scripts in `redis/`; the tests compare them with
+//! it. A script may be run again if its reply was lost.
 //!
 //! Durability depends on the server. With an append-only file a killed server loses next to nothing; a power cut or a
 //! failover to a replica may lose the last second (`appendfsync everysec`). The consequences are those that
-//! [`super::SqliteLedger`] documents for lost charges. Without an append-only file everything since the last snapshot is
-//! lost, and the ledger logs a warning.
+//! [`super::SqliteLedger`] documents for lost charges. Without an append-only file everything since the last snapshot
+//! is lost, and the ledger logs a warning.
 
 mod server;
 

@@ -1,24 +1,8 @@
-//! A ledger in an SQLite file that one process owns.
+//! The ledger in an SQLite file.
 //!
 //! The accounts are in memory. An operation collects its [`Changes`], which are written to the file in one transaction,
 //! for all requests of a call together, and applied to the accounts once the file has them. If the file cannot be
 //! written, the changes are dropped, in the file and in memory.
-//!
-//! The end of the process at any moment (`kill -9`) loses no operation that has returned. A power cut loses no account,
-//! lease or settlement that was returned, and no charge that was returned before one of those. It may lose charges of
-//! the last [`file::MAX_UNSYNCED`] transactions after them:
-//!
-//! - In episodes with a lease, a repeated request restores the lost charges with the same verdicts, because a lease does
-//!   not depend on what other episodes spend.
-//! - In episodes without a lease, a repeated request charges the step anew and may get another verdict. If it is not
-//!   repeated, the lost units are spent in addition to the budget.
-//!
-//! The `sqlite3` tool can read the file while the teacher runs. No other program may change it: each account has a
-//! checksum over its rows, and a ledger whose checksum does not match is refused as damaged.
-//!
-//! One process at a time can open the file, by any path. The lock is on the file itself; other files, such as the `.lock`
-//! file that earlier versions left beside it, are not used. A file with several names (hard links) is refused. After each
-//! transaction the path must still lead to the file; otherwise the ledger refuses all further charges.
 
 mod checksum;
 mod file;
@@ -38,7 +22,23 @@ use crate::budget::{Account, AccountTerms, Balance, Changes, Lease, Transaction}
 use checksum::Checksum;
 use file::{Durability, LedgerFile, WriteError};
 
-/// A ledger in an SQLite file.
+/// A ledger in an SQLite file that one process owns.
+///
+/// The end of the process at any moment (`kill -9`) loses no operation that has returned. A power cut loses no account,
+/// lease or settlement that was returned, and no charge that was returned before one of those. It may lose charges of
+/// the last 256 transactions after them:
+///
+/// - In episodes with a lease, a repeated request restores the lost charges with the same verdicts, because a lease
+///   does not depend on what other episodes spend.
+/// - In episodes without a lease, a repeated request charges the step anew and may get another verdict. If it is not
+///   repeated, the lost units are spent in addition to the budget.
+///
+/// The `sqlite3` tool can read the file while the teacher runs. No other program may change it: each account has a
+/// checksum over its rows, and a ledger whose checksum does not match is refused as damaged.
+///
+/// One process at a time can open the file, by any path. The lock is on the file itself; other files, such as the
+/// `.lock` file that earlier versions left beside it, are not used. A file with several names (hard links) is refused.
+/// Before and after each transaction the path must lead to the file; otherwise the ledger refuses all further charges.
 #[derive(Debug)]
 pub struct SqliteLedger {
     file: LedgerFile,

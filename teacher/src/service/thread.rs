@@ -105,7 +105,8 @@ impl AdvisorHandle {
         &self.info
     }
 
-    /// Answers a request for advice. If the future is dropped before the thread has taken the request, nothing is charged.
+    /// Answers a request for advice. If the future is dropped before the thread has taken the request, nothing is
+    /// charged.
     pub(super) async fn advise(&self, request: AdviceRequest) -> Answer<Advice> {
         let (reply, answer) = oneshot::channel();
         self.send(Job::Advise(request, reply), answer).await

@@ -1,4 +1,5 @@
-//! Random operations on a ledger and on a ledger in memory: equal answers, with the ledger closed and reopened in between.
+//! Random operations on a ledger and on a ledger in memory: equal answers, with the ledger closed and reopened in
+//! between.
 
 use proptest::collection::vec;
 use proptest::prelude::{Just, Strategy as _, any, prop_oneof};

@@ -16,8 +16,8 @@ pub(crate) struct RedisServer {
 }
 
 impl RedisServer {
-    /// Starts a server. Returns `None` and prints a line if Redis is not installed; if `TANDEM_REQUIRE_REDIS` is 1, the test
-    /// fails instead.
+    /// Starts a server. Returns `None` and prints a line if Redis is not installed; if `TANDEM_REQUIRE_REDIS` is 1, the
+    /// test fails instead.
     pub(crate) fn start() -> Option<Self> {
         Self::start_with(&["--appendonly", "yes"])
     }

@@ -14,8 +14,9 @@ use crate::fixture::{BOTH, NEITHER, Verdict, charge, request, terms};
 const LEASED: &str = "leased";
 const FREE: &str = "free \"quoted\"\n\u{1b}[31m";
 
-/// Repeats the operations that created `tests/data/ledger-v1.sqlite`: leases that are open, settled and exhausted, episodes without a
-/// lease, numbers beyond 2^63, steps beyond the first word, and a name with quotes and control characters.
+/// Repeats the operations that created `tests/data/ledger-v1.sqlite`: leases that are open, settled and exhausted,
+/// episodes without a lease, numbers beyond 2^63, steps beyond the first word, and a name with quotes and control
+/// characters.
 fn play(ledger: &mut dyn Ledger) {
     ledger.open(LEASED, terms(100)).expect("an account");
     let free = AccountTerms { budget: 12, strategy: Strategy::MistakeQ { threshold: 0.05 } };

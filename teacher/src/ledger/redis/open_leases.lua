@@ -1,5 +1,5 @@
--- Reserves units for episodes, in their order. ARGV: units per episode, then episodes. Numbers: units and early units of
--- each lease.
+-- Reserves units for episodes, in their order. ARGV: units per episode, then episodes. Numbers: units and early units
+-- of each lease.
 
 local leases = {}
 for i = 2, #ARGV do

@@ -163,8 +163,8 @@ impl Server {
         Ok(replies.into_iter().map(reply).collect())
     }
 
-    /// Runs a pipeline. If the open connection fails, or the server has lost the scripts, the pipeline is run once more on
-    /// a new connection. A pipeline that timed out is not repeated.
+    /// Runs a pipeline. If the open connection fails, or the server has lost the scripts, the pipeline is run once more
+    /// on a new connection. A pipeline that timed out is not repeated.
     fn query<T: redis::FromRedisValue>(&mut self, pipeline: &Pipeline) -> RedisResult<T> {
         if let Some(connection) = self.connection.as_mut() {
             match pipeline.query(connection) {
