@@ -30,7 +30,7 @@ use std::f64::consts::{FRAC_PI_2, PI};
 
 use glam::{DMat3, DVec3};
 use tandem_core::ArmIndex;
-use tandem_core::layout::WORKSPACES_APART_M;
+use tandem_core::layout::WORKSPACE_DISTANCE_M;
 
 use crate::capsule::PosedLinks;
 use crate::inverse::{ReachError, ToolTarget};
@@ -106,7 +106,7 @@ impl Cell {
     /// Two Micos with four joints that face each other, the centres of their workspaces 0.24 m apart.
     #[must_use]
     pub fn mico_pair() -> Self {
-        let centres_apart_m = f64::from(WORKSPACES_APART_M);
+        let centres_apart_m = f64::from(WORKSPACE_DISTANCE_M);
         let task_frame = TaskFrame::MICO_4;
         let x_m = 0.5 * centres_apart_m + task_frame.centre_m;
         let arm = |x_m, yaw_rad| PlacedArm {

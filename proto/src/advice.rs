@@ -1,6 +1,6 @@
 //! `teacher.proto`: what is asked of a teacher and what it answers.
 
-use tandem_core::bounds::LARGEST_MAGNITUDE;
+use tandem_core::bounds::MAX_MAGNITUDE;
 use tandem_core::layout::OBSERVATION_PER_ARM;
 use tandem_core::{ArmAdvice, Layout, StepAdvice, StepQuery, Task};
 
@@ -59,11 +59,11 @@ pub fn encode_query(query: &StepQuery) -> pb::StepQuery {
 /// Any step is taken: how long an episode may be is the matter of whoever keeps its account.
 ///
 /// # Errors
-/// When a vector has the wrong length, a number is not finite or beyond [`LARGEST_MAGNITUDE`], or the proposed action
+/// When a vector has the wrong length, a number is not finite or beyond [`MAX_MAGNITUDE`], or the proposed action
 /// leaves [−1, 1].
 pub fn decode_query(query: pb::StepQuery, layout: Layout) -> Result<StepQuery, DecodeError> {
     // Students of other trainers ask as well, so the bound is that of any world.
-    let largest = |_| LARGEST_MAGNITUDE;
+    let largest = |_| MAX_MAGNITUDE;
     Ok(StepQuery {
         episode: query.episode,
         step: query.step,

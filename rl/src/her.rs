@@ -6,10 +6,10 @@
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 use tandem_core::layout::{
-    ArmIndex, EPISODE_STEPS, HAND_POSITION, Layout, OBJECT_POSITION, WORKSPACES_APART_M,
+    ArmIndex, EPISODE_STEPS, HAND_POSITION, Layout, OBJECT_POSITION, WORKSPACE_DISTANCE_M,
 };
 use tandem_core::reward::{distance, sparse_reward_within};
-use tandem_core::rng::{coin, index};
+use tandem_core::rng::{bernoulli, index};
 use tandem_policy::NormalizerSnapshot;
 
 use crate::ddpg::Batch;
@@ -168,13 +168,13 @@ impl Sampler {
         let first = self.draw_step(buffer, rng);
         self.drawn.steps.fill(first);
         let per_arm = self.config.reward == RewardKind::PerArm && self.layout.n_arms == 2;
-        if coin(rng, self.config.recombined_share) && per_arm {
+        if bernoulli(rng, self.config.recombined_share) && per_arm {
             let second = self.draw_step(buffer, rng);
             if is_apart(buffer, [first, second]) {
                 self.drawn.steps[1] = second;
             }
         }
-        self.drawn.swapped = coin(rng, self.config.swap_share) && self.layout.n_arms == 2;
+        self.drawn.swapped = bernoulli(rng, self.config.swap_share) && self.layout.n_arms == 2;
         match self.config.reward {
             RewardKind::Joint => self.relabel_jointly(buffer, rng),
             RewardKind::PerArm => self.relabel_arms(buffer, rng),
@@ -183,7 +183,7 @@ impl Sampler {
 
     fn draw_step(&self, buffer: &ReplayBuffer, rng: &mut ChaCha8Rng) -> Step {
         let (moved, advised) = (buffer.moved_episodes(), buffer.advised_episodes());
-        if coin(rng, self.config.advised_share) && !advised.is_empty() {
+        if bernoulli(rng, self.config.advised_share) && !advised.is_empty() {
             let episode_idx = advised[index(rng, advised.len())];
             let is_advised = |step_idx: &usize| buffer.advised_arms(episode_idx, *step_idx) != 0;
             let n_advised = (0..EPISODE_STEPS).filter(is_advised).count();
@@ -192,7 +192,7 @@ impl Sampler {
             let step_idx = step_idx.expect("an advised episode has an advised step");
             return Step { episode_idx, step_idx };
         }
-        let from_moved = coin(rng, self.config.moved_share) && !moved.is_empty();
+        let from_moved = bernoulli(rng, self.config.moved_share) && !moved.is_empty();
         let episode_idx = if from_moved {
             moved[index(rng, moved.len())]
         } else {
@@ -230,7 +230,7 @@ impl Sampler {
 
     /// The later moment whose achieved goal is taken, strictly after the step; `None` keeps the desired goal.
     fn hindsight_moment(&self, step_idx: usize, rng: &mut ChaCha8Rng) -> Option<usize> {
-        let hindsight = coin(rng, self.config.her_future_share);
+        let hindsight = bernoulli(rng, self.config.her_future_share);
         let moment = step_idx + 1 + index(rng, EPISODE_STEPS - step_idx);
         hindsight.then_some(moment)
     }
@@ -308,7 +308,7 @@ fn is_apart(buffer: &ReplayBuffer, steps: [Step; 2]) -> bool {
     };
     [0, 1].into_iter().all(|later| {
         let reached_m = reach_m(ArmIndex(0), later) + reach_m(ArmIndex(1), later);
-        WORKSPACES_APART_M - reached_m >= RECOMBINED_APART_M
+        WORKSPACE_DISTANCE_M - reached_m >= RECOMBINED_APART_M
     })
 }
 

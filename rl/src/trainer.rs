@@ -9,7 +9,7 @@ use sha2::{Digest as _, Sha256};
 use tandem_core::Episode;
 use tandem_core::episode::EpisodeKind;
 use tandem_core::layout::{EPISODE_STEPS, Layout, OBJECT_POSITION};
-use tandem_core::rng::{Stream, coin, episode_rng, index};
+use tandem_core::rng::{Stream, bernoulli, episode_rng, index};
 use tandem_core::work::{EpisodeOrder, PublishedActor, SlotOrder};
 use tandem_policy::{Normalizer, NormalizerSnapshot, Policy};
 
@@ -212,11 +212,11 @@ impl Trainer {
     /// normalised with it are all alike, and the policy learns nothing.
     #[must_use]
     pub fn absurd_statistic(&self) -> Option<String> {
-        let largest_of_object = self.layout.largest_observation(OBJECT_POSITION.start);
-        let largest_goal = self.layout.largest_goal().max(largest_of_object);
+        let largest_of_object = self.layout.observation_bound(OBJECT_POSITION.start);
+        let goal_bound = self.layout.goal_bound().max(largest_of_object);
         let observation = self.observation_normalizer.snapshot();
-        first_absurd("observations", observation, |idx| self.layout.largest_observation(idx))
-            .or_else(|| first_absurd("goals", self.goal_normalizer.snapshot(), |_| largest_goal))
+        first_absurd("observations", observation, |idx| self.layout.observation_bound(idx))
+            .or_else(|| first_absurd("goals", self.goal_normalizer.snapshot(), |_| goal_bound))
     }
 
     /// Makes a round's updates. `on_update` hears how many are done.
@@ -367,7 +367,7 @@ impl Trainer {
     ) -> Vec<f32> {
         let mut goal = episode.goal.clone();
         for arm in self.layout.arms() {
-            let hindsight = coin(rng, self.config.replay.her_future_share);
+            let hindsight = bernoulli(rng, self.config.replay.her_future_share);
             let moment = step_idx + 1 + index(rng, EPISODE_STEPS - step_idx);
             if hindsight {
                 goal[self.layout.goal_of(arm)].copy_from_slice(episode.achieved(moment, arm));

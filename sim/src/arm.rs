@@ -5,9 +5,9 @@ use rapier3d::math::{Matrix, Vector};
 use tandem_core::{ArmIndex, Task};
 
 use crate::config::WorldConfig;
-use crate::frame::{BASE_IN_OWN, OwnFrame, WORKSPACE_HIGH, WORKSPACE_LOW};
+use crate::frame::{ArmFrame, BASE_IN_ARM, WORKSPACE_HIGH, WORKSPACE_LOW};
 use crate::hand::{Gripper, Hand};
-use crate::kinematics::{HOME, JointAngles, Posture, solve};
+use crate::kinematics::{ForwardKinematics, HOME, JointAngles, solve_inverse};
 use crate::physics::Physics;
 
 /// Displacement that an action of 1 asks for, metres.
@@ -31,7 +31,7 @@ pub(crate) struct Command {
 /// One arm and its hand.
 #[derive(Clone)]
 pub(crate) struct Arm {
-    pub(crate) frame: OwnFrame,
+    pub(crate) frame: ArmFrame,
     pub(crate) hand: Hand,
     /// As of the start of the latest control step.
     angles: JointAngles,
@@ -41,7 +41,7 @@ impl Arm {
     pub(crate) fn build(
         physics: &mut Physics,
         arm: ArmIndex,
-        frame: OwnFrame,
+        frame: ArmFrame,
         task: Task,
         config: &WorldConfig,
     ) -> Self {
@@ -54,16 +54,16 @@ impl Arm {
         Self { frame, hand, angles: HOME }
     }
 
-    /// Puts the arm, at rest, where its end effector is at `end_effector_in_own` and each side of the gripper is open
+    /// Puts the arm, at rest, where its end effector is at `end_effector_in_arm` and each side of the gripper is open
     /// by `opening_m`. The joint angles follow from the place alone.
     pub(crate) fn place(
         &mut self,
         physics: &mut Physics,
-        end_effector_in_own: Vector,
+        end_effector_in_arm: Vector,
         opening_m: f32,
     ) {
-        self.hand.place(physics, end_effector_in_own, opening_m);
-        self.angles = solve(HOME, self.tool_in_base(physics), REACH_ITERATIONS);
+        self.hand.place(physics, end_effector_in_arm, opening_m);
+        self.angles = solve_inverse(HOME, self.tool_in_base(physics), REACH_ITERATIONS);
     }
 
     /// Lets the joints follow the hand.
@@ -73,16 +73,16 @@ impl Arm {
 
     /// The joint angles that go with where the hand is now, radians.
     pub(crate) fn angles_now(&self, physics: &Physics, n_iterations: usize) -> JointAngles {
-        solve(self.angles, self.tool_in_base(physics), n_iterations)
+        solve_inverse(self.angles, self.tool_in_base(physics), n_iterations)
     }
 
     /// The displacement `action` (own frame, in [−1, 1]) from where the hand is now, kept inside the workspace.
     ///
     /// Counting from the hand and not from the last target, nothing winds up while the hand is blocked.
     pub(crate) fn target(&self, physics: &Physics, action: Vector) -> Vector {
-        let at_in_own = self.frame.own_from_world(self.hand.end_effector(physics));
-        let target_in_own = (at_in_own + action * ACTION_M).clamp(WORKSPACE_LOW, WORKSPACE_HIGH);
-        self.frame.world_from_own(target_in_own)
+        let at_in_arm = self.frame.arm_from_world(self.hand.end_effector(physics));
+        let target_in_arm = (at_in_arm + action * ACTION_M).clamp(WORKSPACE_LOW, WORKSPACE_HIGH);
+        self.frame.world_from_arm(target_in_arm)
     }
 
     /// The palm's velocity on its way to `target`, world frame, metres per second.
@@ -91,25 +91,25 @@ impl Arm {
     }
 
     /// Where the origins of the posture's `frames` are and how they move per metre of the palm; world frame, metres.
-    pub(crate) fn joint_motions<const N: usize>(
+    pub(crate) fn point_jacobians<const N: usize>(
         &self,
         frames: [usize; N],
     ) -> [(Vector, Matrix); N] {
-        let posture = Posture::of(&self.angles);
-        let motions = posture.motion_of(frames);
+        let posture = ForwardKinematics::new(&self.angles);
+        let motions = posture.point_jacobians(frames);
         std::array::from_fn(|idx| {
             let at = self.world_from_base(posture.point(frames[idx]));
-            (at, self.frame.map_in_world(single_precision(motions[idx])))
+            (at, self.frame.jacobian_in_world(single_precision(motions[idx])))
         })
     }
 
     /// A point of the arm's base frame in the world, metres.
     pub(crate) fn world_from_base(&self, in_base: DVec3) -> Vector {
-        self.frame.world_from_own(in_base.as_vec3() + BASE_IN_OWN)
+        self.frame.world_from_arm(in_base.as_vec3() + BASE_IN_ARM)
     }
 
     fn tool_in_base(&self, physics: &Physics) -> DVec3 {
-        (self.frame.own_from_world(self.hand.end_effector(physics)) - BASE_IN_OWN).as_dvec3()
+        (self.frame.arm_from_world(self.hand.end_effector(physics)) - BASE_IN_ARM).as_dvec3()
     }
 }
 

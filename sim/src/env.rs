@@ -123,7 +123,7 @@ impl Env {
             self.world.place_object(arm, start.object);
             self.goal[self.layout.goal_of(arm)].copy_from_slice(&start.goal.to_array());
         }
-        self.world.arm_guard();
+        self.world.reset_link_avoidance();
     }
 
     fn commands(&self, action: &[f32]) -> Result<[Command; MAX_ARMS], SimError> {
@@ -224,7 +224,7 @@ mod tests {
             world.place_arm(arm, hand, MAX_OPENING_M);
             world.place_object(arm, Vector::new(-0.1, 0.2, 0.0225));
         }
-        world.arm_guard();
+        world.reset_link_avoidance();
         let stay = world.arms.iter().map(|arm| arm.hand.end_effector(&world.physics));
         let commands: Vec<Command> = stay.map(|target| Command { target, gripper: 1.0 }).collect();
         world.step(&[commands[0], commands[1]]).unwrap()

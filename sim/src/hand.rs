@@ -9,7 +9,7 @@ use rapier3d::geometry::ColliderBuilder;
 use rapier3d::math::{Pose, Vector};
 use tandem_core::ArmIndex;
 
-use crate::frame::OwnFrame;
+use crate::frame::ArmFrame;
 use crate::physics::{Part, Physics, collides};
 
 /// How far each side opens, metres.
@@ -38,7 +38,7 @@ const FINGER_HOLD_FORCE_N: f32 = 200.0;
 const FINGER_HOLD_GAIN: f32 = 250.0;
 
 /// Where a finger sits and what it carries.
-struct FingerPlan {
+struct FingerGeometry {
     /// Side of the hand on which it closes, own frame: 1 or −1 along y.
     side: f32,
     x_m: f32,
@@ -46,10 +46,10 @@ struct FingerPlan {
 }
 
 /// Two fingers against one. The masses balance, so that closing does not push the hand aside.
-const FINGERS: [FingerPlan; 3] = [
-    FingerPlan { side: 1.0, x_m: 0.016, mass_kg: 0.1 },
-    FingerPlan { side: 1.0, x_m: -0.016, mass_kg: 0.1 },
-    FingerPlan { side: -1.0, x_m: 0.0, mass_kg: 0.2 },
+const FINGERS: [FingerGeometry; 3] = [
+    FingerGeometry { side: 1.0, x_m: 0.016, mass_kg: 0.1 },
+    FingerGeometry { side: 1.0, x_m: -0.016, mass_kg: 0.1 },
+    FingerGeometry { side: -1.0, x_m: 0.0, mass_kg: 0.2 },
 ];
 /// Mass of all fingers, kilograms.
 const FINGERS_MASS_KG: f32 = 0.4;
@@ -69,7 +69,7 @@ pub(crate) enum Gripper {
 /// The bodies of a hand, all as of one physics step.
 #[derive(Clone)]
 pub(crate) struct Hand {
-    frame: OwnFrame,
+    frame: ArmFrame,
     palm: RigidBodyHandle,
     gripper: Gripper,
     fingers: [Finger; N_FINGERS],
@@ -82,7 +82,7 @@ struct Finger {
     body: RigidBodyHandle,
     mass_kg: f32,
     /// Share of the mass, and of the common opening's measure.
-    share: f32,
+    mass_fraction: f32,
     /// Where the finger is when shut, relative to the palm, world frame, metres.
     shut_offset: Vector,
     /// The direction of opening along the world's y: 1 or −1.
@@ -105,22 +105,22 @@ impl Hand {
     pub(crate) fn build(
         physics: &mut Physics,
         arm: ArmIndex,
-        frame: OwnFrame,
+        frame: ArmFrame,
         gripper: Gripper,
         pad_friction: f32,
         grip_force_n: f32,
     ) -> Self {
         let palm = build_palm(physics, arm, frame);
-        let fingers = FINGERS.map(|plan| match gripper {
-            Gripper::Locked => attach_finger(physics, arm, frame, palm, &plan, pad_friction),
-            Gripper::Driven => build_finger(physics, arm, frame, &plan, pad_friction),
+        let fingers = FINGERS.map(|geometry| match gripper {
+            Gripper::Locked => attach_finger(physics, arm, frame, palm, &geometry, pad_friction),
+            Gripper::Driven => build_finger(physics, arm, frame, &geometry, pad_friction),
         });
         Self { frame, palm, gripper, fingers, grip_force_n }
     }
 
-    /// Puts the hand, at rest, where its end effector is at `end_effector_in_own` and each side is open by `opening_m`.
-    pub(crate) fn place(&self, physics: &mut Physics, end_effector_in_own: Vector, opening_m: f32) {
-        let at = self.frame.world_from_own(end_effector_in_own);
+    /// Puts the hand, at rest, where its end effector is at `end_effector_in_arm` and each side is open by `opening_m`.
+    pub(crate) fn place(&self, physics: &mut Physics, end_effector_in_arm: Vector, opening_m: f32) {
+        let at = self.frame.world_from_arm(end_effector_in_arm);
         let palm = &mut physics.bodies[self.palm];
         palm.set_translation(at, true);
         palm.set_linvel(Vector::ZERO, true);
@@ -223,7 +223,7 @@ impl Hand {
             self.fingers
                 .iter()
                 .zip(&states)
-                .map(|(finger, state)| finger.share * value(state))
+                .map(|(finger, state)| finger.mass_fraction * value(state))
                 .sum()
         };
         let opening_m = mean(|state| state.opening_m);
@@ -238,11 +238,12 @@ impl Hand {
             let (finger, state) = (&self.fingers[idx], &states[idx]);
             let gain = finger.mass_kg / substep_s;
             let lateral = (state.offset * -FINGER_HOLD_GAIN - state.velocity) * gain;
-            let evening_n = (gain
+            let balancing_n = (gain
                 * (FINGER_HOLD_GAIN * (opening_m - state.opening_m) + rate_mps
                     - state.opening_rate_mps))
                 .clamp(-FINGER_HOLD_FORCE_N, FINGER_HOLD_FORCE_N);
-            let closing_n = finger.outward * (2.0 * finger.share * side_force_n + evening_n);
+            let closing_n =
+                finger.outward * (2.0 * finger.mass_fraction * side_force_n + balancing_n);
             let held = bounded(lateral, FINGER_HOLD_FORCE_N);
             Vector::new(held.x, closing_n, held.z)
         })
@@ -257,10 +258,10 @@ impl Hand {
     }
 
     fn finger_states(&self, physics: &Physics, palm_velocity: Vector) -> [FingerState; N_FINGERS] {
-        let palm_at = self.end_effector(physics);
+        let palm_position = self.end_effector(physics);
         self.fingers.map(|finger| {
             let body = &physics.bodies[finger.body];
-            let offset = body.translation() - palm_at - finger.shut_offset;
+            let offset = body.translation() - palm_position - finger.shut_offset;
             let velocity = body.linvel() - palm_velocity;
             FingerState {
                 opening_m: offset.y * finger.outward,
@@ -272,7 +273,7 @@ impl Hand {
     }
 }
 
-fn build_palm(physics: &mut Physics, arm: ArmIndex, frame: OwnFrame) -> RigidBodyHandle {
+fn build_palm(physics: &mut Physics, arm: ArmIndex, frame: ArmFrame) -> RigidBodyHandle {
     let palm = physics.bodies.insert(weightless_body(frame));
     let part = |shape: ColliderBuilder, mass_kg: f32, above_m: f32| {
         shape
@@ -300,53 +301,53 @@ fn build_palm(physics: &mut Physics, arm: ArmIndex, frame: OwnFrame) -> RigidBod
 fn build_finger(
     physics: &mut Physics,
     arm: ArmIndex,
-    frame: OwnFrame,
-    plan: &FingerPlan,
+    frame: ArmFrame,
+    geometry: &FingerGeometry,
     friction: f32,
 ) -> Finger {
     let body = physics.bodies.insert(weightless_body(frame));
-    let pad = pad(arm, plan, friction);
+    let pad = pad(arm, geometry, friction);
     physics.colliders.insert_with_parent(pad, body, &mut physics.bodies);
-    finger_on(body, frame, plan)
+    finger(body, frame, geometry)
 }
 
 /// A finger that is part of the palm. The palm's body is turned with the arm, so the pad's place is the arm's own.
 fn attach_finger(
     physics: &mut Physics,
     arm: ArmIndex,
-    frame: OwnFrame,
+    frame: ArmFrame,
     palm: RigidBodyHandle,
-    plan: &FingerPlan,
+    geometry: &FingerGeometry,
     friction: f32,
 ) -> Finger {
-    let pad = pad(arm, plan, friction).translation(shut_offset_in_own(plan));
+    let pad = pad(arm, geometry, friction).translation(shut_offset_in_arm(geometry));
     physics.colliders.insert_with_parent(pad, palm, &mut physics.bodies);
-    finger_on(palm, frame, plan)
+    finger(palm, frame, geometry)
 }
 
-fn pad(arm: ArmIndex, plan: &FingerPlan, friction: f32) -> ColliderBuilder {
+fn pad(arm: ArmIndex, geometry: &FingerGeometry, friction: f32) -> ColliderBuilder {
     ColliderBuilder::cuboid(PAD_HALF_M.x, PAD_HALF_M.y, PAD_HALF_M.z)
-        .mass(plan.mass_kg)
+        .mass(geometry.mass_kg)
         .friction(friction)
         .friction_combine_rule(CoefficientCombineRule::Max)
         .collision_groups(collides(Part::Hand, arm))
 }
 
-fn shut_offset_in_own(plan: &FingerPlan) -> Vector {
-    Vector::new(plan.x_m, plan.side * PAD_HALF_M.y, 0.0)
+fn shut_offset_in_arm(geometry: &FingerGeometry) -> Vector {
+    Vector::new(geometry.x_m, geometry.side * PAD_HALF_M.y, 0.0)
 }
 
-fn finger_on(body: RigidBodyHandle, frame: OwnFrame, plan: &FingerPlan) -> Finger {
+fn finger(body: RigidBodyHandle, frame: ArmFrame, geometry: &FingerGeometry) -> Finger {
     Finger {
         body,
-        mass_kg: plan.mass_kg,
-        share: plan.mass_kg / FINGERS_MASS_KG,
-        shut_offset: frame.turned(shut_offset_in_own(plan)),
-        outward: frame.turned(Vector::Y * plan.side).y,
+        mass_kg: geometry.mass_kg,
+        mass_fraction: geometry.mass_kg / FINGERS_MASS_KG,
+        shut_offset: frame.rotate(shut_offset_in_arm(geometry)),
+        outward: frame.rotate(Vector::Y * geometry.side).y,
     }
 }
 
-fn weightless_body(frame: OwnFrame) -> RigidBodyBuilder {
+fn weightless_body(frame: ArmFrame) -> RigidBodyBuilder {
     RigidBodyBuilder::dynamic()
         .pose(Pose::from_parts(Vector::ZERO, frame.orientation_in_world()))
         .lock_rotations()

@@ -21,10 +21,10 @@ const DAMPING: f64 = 0.03;
 /// Largest change of an angle per iteration, radians.
 const MAX_ANGLE_STEP_RAD: f64 = 0.3;
 /// Sum of squared errors at which the iteration ends.
-const SOLVED: f64 = 1e-10;
+const SQUARED_ERROR_TOLERANCE: f64 = 1e-10;
 
 /// One row of the arm's Denavit-Hartenberg table. The twists are multiples of 30 degrees, given by sine and cosine.
-struct Row {
+struct DhRow {
     sin_twist: f64,
     cos_twist: f64,
     length_m: f64,
@@ -39,8 +39,8 @@ const SIN_60: f64 = 0.866_025_403_784_438_6;
 const BEND_M: f64 = 0.0741 * 0.5 / SIN_60;
 
 /// Jaco with the 60 degree wrist: Kinova's classic parameters of the arm `j2n6s300`.
-const ROWS: [Row; 6] = [
-    Row {
+const DH_TABLE: [DhRow; 6] = [
+    DhRow {
         sin_twist: 1.0,
         cos_twist: 0.0,
         length_m: 0.0,
@@ -48,7 +48,7 @@ const ROWS: [Row; 6] = [
         zero_rad: 0.0,
         direction: -1.0,
     },
-    Row {
+    DhRow {
         sin_twist: 0.0,
         cos_twist: -1.0,
         length_m: 0.41,
@@ -56,7 +56,7 @@ const ROWS: [Row; 6] = [
         zero_rad: -FRAC_PI_2,
         direction: 1.0,
     },
-    Row {
+    DhRow {
         sin_twist: 1.0,
         cos_twist: 0.0,
         length_m: 0.0,
@@ -64,7 +64,7 @@ const ROWS: [Row; 6] = [
         zero_rad: FRAC_PI_2,
         direction: 1.0,
     },
-    Row {
+    DhRow {
         sin_twist: SIN_60,
         cos_twist: 0.5,
         length_m: 0.0,
@@ -72,7 +72,7 @@ const ROWS: [Row; 6] = [
         zero_rad: 0.0,
         direction: 1.0,
     },
-    Row {
+    DhRow {
         sin_twist: SIN_60,
         cos_twist: 0.5,
         length_m: 0.0,
@@ -80,7 +80,7 @@ const ROWS: [Row; 6] = [
         zero_rad: -PI,
         direction: 1.0,
     },
-    Row {
+    DhRow {
         sin_twist: 0.0,
         cos_twist: -1.0,
         length_m: 0.0,
@@ -98,15 +98,15 @@ struct LinkFrame {
 }
 
 /// The arm in one posture.
-pub(crate) struct Posture {
+pub(crate) struct ForwardKinematics {
     /// Base first, tool last; joint `i` turns about the z axis of frame `i`.
     frames: [LinkFrame; 7],
 }
 
-impl Posture {
-    pub(crate) fn of(angles: &JointAngles) -> Self {
+impl ForwardKinematics {
+    pub(crate) fn new(angles: &JointAngles) -> Self {
         let mut frames = [LinkFrame { axes: DMat3::IDENTITY, origin: DVec3::ZERO }; 7];
-        for (idx, (row, angle)) in ROWS.iter().zip(angles).enumerate() {
+        for (idx, (row, angle)) in DH_TABLE.iter().zip(angles).enumerate() {
             frames[idx + 1] = frames[idx].next(row, *angle);
         }
         Self { frames }
@@ -119,7 +119,7 @@ impl Posture {
 
     /// The axis of joint `idx` in the direction in which its angle counts.
     fn axis(&self, idx: usize) -> DVec3 {
-        self.frames[idx].axes.z_axis * ROWS[idx].direction
+        self.frames[idx].axes.z_axis * DH_TABLE[idx].direction
     }
 
     /// Position (metres) and turn (radians) by which the tool misses `target` and pointing down.
@@ -149,7 +149,7 @@ impl Posture {
 
     /// How the origins of `frames` move per metre of the tool, the gripper kept down. Column `c` of each matrix
     /// belongs to a move along axis `c`.
-    pub(crate) fn motion_of<const N: usize>(&self, frames: [usize; N]) -> [DMat3; N] {
+    pub(crate) fn point_jacobians<const N: usize>(&self, frames: [usize; N]) -> [DMat3; N] {
         let mut moves = [[0.0; 3]; 6];
         for (axis, row) in moves.iter_mut().take(3).enumerate() {
             row[axis] = 1.0;
@@ -169,7 +169,7 @@ impl Posture {
 }
 
 impl LinkFrame {
-    fn next(&self, row: &Row, angle: f64) -> Self {
+    fn next(&self, row: &DhRow, angle: f64) -> Self {
         let (sin, cos) = libm::sincos(row.direction * angle + row.zero_rad);
         let (sin_twist, cos_twist) = (row.sin_twist, row.cos_twist);
         let axes = DMat3::from_cols(
@@ -183,12 +183,12 @@ impl LinkFrame {
 }
 
 /// Angles near `start` that bring the tool to `target` (metres) with the gripper down, by damped least squares.
-pub(crate) fn solve(start: JointAngles, target: DVec3, n_iterations: usize) -> JointAngles {
+pub(crate) fn solve_inverse(start: JointAngles, target: DVec3, n_iterations: usize) -> JointAngles {
     let mut angles = start;
     for _ in 0..n_iterations {
-        let posture = Posture::of(&angles);
+        let posture = ForwardKinematics::new(&angles);
         let error = posture.tool_error(target);
-        if error.iter().map(|e| e * e).sum::<f64>() < SOLVED {
+        if error.iter().map(|e| e * e).sum::<f64>() < SQUARED_ERROR_TOLERANCE {
             break;
         }
         let changes = joint_changes(&posture.jacobian(), error.map(|e| [e]));
@@ -253,13 +253,13 @@ mod tests {
     use tandem_core::{Stream, episode_rng};
 
     /// Distance by which the tool misses `target`, metres.
-    fn miss_m(angles: &JointAngles, target: DVec3) -> f64 {
-        (Posture::of(angles).point(6) - target).length()
+    fn error_m(angles: &JointAngles, target: DVec3) -> f64 {
+        (ForwardKinematics::new(angles).point(6) - target).length()
     }
 
     #[test]
     fn stretched_out_the_arm_points_straight_up() {
-        let posture = Posture::of(&[0.0, PI, PI, 0.0, PI, 0.0]);
+        let posture = ForwardKinematics::new(&[0.0, PI, PI, 0.0, PI, 0.0]);
         assert!((posture.point(2) - DVec3::new(0.0, 0.0, 0.2755 + 0.41)).length() < 1e-9);
         assert!((posture.point(4).z - (0.2755 + 0.41 + 0.2073 + BEND_M)).abs() < 1e-9);
     }
@@ -267,19 +267,21 @@ mod tests {
     #[test]
     fn at_home_the_gripper_points_down_and_the_elbow_is_high() {
         let target = DVec3::new(0.40, 0.0, 0.15);
-        let error = Posture::of(&HOME).tool_error(target);
+        let error = ForwardKinematics::new(&HOME).tool_error(target);
         assert!(error.iter().all(|e| e.abs() < 1e-5), "{error:?}");
-        assert!(Posture::of(&HOME).point(2).z > 0.5);
+        assert!(ForwardKinematics::new(&HOME).point(2).z > 0.5);
     }
 
     #[test]
     fn the_jacobian_is_the_derivative_of_the_posture() {
-        let jacobian = Posture::of(&HOME).jacobian();
+        let jacobian = ForwardKinematics::new(&HOME).jacobian();
         let step = 1e-6;
         for joint in 0..6 {
             let mut turned = HOME;
             turned[joint] += step;
-            let moved = (Posture::of(&turned).point(6) - Posture::of(&HOME).point(6)) / step;
+            let moved = (ForwardKinematics::new(&turned).point(6)
+                - ForwardKinematics::new(&HOME).point(6))
+                / step;
             for axis in 0..3 {
                 assert!(
                     (moved[axis] - jacobian[axis][joint]).abs() < 1e-5,
@@ -296,13 +298,13 @@ mod tests {
             let mut between = |low, high| f64::from(uniform(&mut rng, low, high));
             let target =
                 DVec3::new(0.40 + between(-0.20, 0.20), between(-0.25, 0.25), between(0.022, 0.35));
-            let angles = solve(HOME, target, 100);
+            let angles = solve_inverse(HOME, target, 100);
             assert!(
-                miss_m(&angles, target) < 1e-4,
+                error_m(&angles, target) < 1e-4,
                 "{target} missed by {}",
-                miss_m(&angles, target)
+                error_m(&angles, target)
             );
-            let posture = Posture::of(&angles);
+            let posture = ForwardKinematics::new(&angles);
             let lowest_m = (1..6).map(|idx| posture.point(idx).z).fold(f64::INFINITY, f64::min);
             assert!(lowest_m > 0.2, "a joint at {lowest_m} m for {target}");
         }
@@ -311,9 +313,11 @@ mod tests {
     #[test]
     fn joint_points_move_with_the_tool_as_predicted() {
         let (from, to) = (DVec3::new(0.40, 0.0, 0.15), DVec3::new(0.41, -0.01, 0.16));
-        let (before, after) =
-            (Posture::of(&solve(HOME, from, 100)), Posture::of(&solve(HOME, to, 100)));
-        let motions = before.motion_of([2, 4, 5]);
+        let (before, after) = (
+            ForwardKinematics::new(&solve_inverse(HOME, from, 100)),
+            ForwardKinematics::new(&solve_inverse(HOME, to, 100)),
+        );
+        let motions = before.point_jacobians([2, 4, 5]);
         for (motion, frame) in motions.into_iter().zip([2, 4, 5]) {
             let predicted = before.point(frame) + motion * (to - from);
             assert!((after.point(frame) - predicted).length() < 2e-3, "frame {frame}");

@@ -21,15 +21,16 @@ use crate::world::World;
 pub(crate) fn observe_arm(world: &World, arm: ArmIndex, observation: &mut [f32]) {
     let (state, object) = (&world.arms[arm.0], world.object(arm));
     let frame = state.frame;
-    let (hand_at, hand_velocity) =
+    let (hand_position, hand_velocity) =
         (state.hand.end_effector(&world.physics), state.hand.velocity(&world.physics));
-    let per_step = |velocity| (frame.turned(velocity) * CONTROL_STEP_S).to_array();
+    let per_step = |velocity| (frame.rotate(velocity) * CONTROL_STEP_S).to_array();
     let fingers = state.hand.openings(&world.physics);
 
-    observation[0..3].copy_from_slice(&frame.own_from_world(hand_at).to_array());
-    observation[3..6].copy_from_slice(&frame.own_from_world(object.translation()).to_array());
-    observation[6..9].copy_from_slice(&frame.turned(object.translation() - hand_at).to_array());
-    observation[12..16].copy_from_slice(&frame.orientation_in_own(*object.rotation()));
+    observation[0..3].copy_from_slice(&frame.arm_from_world(hand_position).to_array());
+    observation[3..6].copy_from_slice(&frame.arm_from_world(object.translation()).to_array());
+    observation[6..9]
+        .copy_from_slice(&frame.rotate(object.translation() - hand_position).to_array());
+    observation[12..16].copy_from_slice(&frame.orientation_in_arm(*object.rotation()));
     observation[16..19].copy_from_slice(&per_step(object.linvel() - hand_velocity));
     observation[19..22].copy_from_slice(&per_step(object.angvel()));
     observation[22..25].copy_from_slice(&per_step(hand_velocity));
@@ -47,7 +48,7 @@ mod tests {
     use tandem_core::{Layout, Task};
 
     use crate::config::WorldConfig;
-    use crate::frame::OwnFrame;
+    use crate::frame::ArmFrame;
 
     const ARMS: [ArmIndex; 2] = [ArmIndex(0), ArmIndex(1)];
     const OBJECT: Vector = Vector::new(0.05, -0.08, 0.0225);
@@ -56,7 +57,7 @@ mod tests {
     /// What both arms see after `change` was made to the world at arm `arm`, each in its place as given above.
     fn seen(
         arm: ArmIndex,
-        change: impl Fn(&mut World, OwnFrame),
+        change: impl Fn(&mut World, ArmFrame),
     ) -> [[f32; OBSERVATION_PER_ARM]; 2] {
         let mut world = World::build(Layout::new(Task::PickAndPlace, 2), &WorldConfig::default());
         for arm in ARMS {
@@ -73,7 +74,7 @@ mod tests {
     }
 
     /// Asserts that `change`, made at either arm, changes just the numbers in `expected`, and only that arm's.
-    fn check(change: impl Fn(&mut World, ArmIndex, OwnFrame), expected: &[(usize, f32)]) {
+    fn check(change: impl Fn(&mut World, ArmIndex, ArmFrame), expected: &[(usize, f32)]) {
         for arm in ARMS {
             let before = seen(arm, |_, _| ());
             let after = seen(arm, |world, frame| change(world, arm, frame));
@@ -127,7 +128,7 @@ mod tests {
         check(
             |world, arm, frame| {
                 let pose = Pose::from_parts(
-                    frame.world_from_own(OBJECT),
+                    frame.world_from_arm(OBJECT),
                     frame.orientation_in_world() * turn,
                 );
                 world.object_mut(arm).set_position(pose, true);
@@ -143,18 +144,18 @@ mod tests {
         let at =
             |first: usize, sign: f32| [0, 1, 2].map(|axis| (first + axis, sign * per_step[axis]));
         check(
-            |world, arm, frame| world.object_mut(arm).set_linvel(frame.turned(velocity), true),
+            |world, arm, frame| world.object_mut(arm).set_linvel(frame.rotate(velocity), true),
             &at(16, 1.0),
         );
         check(
-            |world, arm, frame| world.object_mut(arm).set_angvel(frame.turned(velocity), true),
+            |world, arm, frame| world.object_mut(arm).set_angvel(frame.rotate(velocity), true),
             &at(19, 1.0),
         );
         let hand_moves = [at(16, -1.0), at(22, 1.0)].concat();
         check(
             |world, arm, frame| {
                 let hand = world.arms[arm.0].hand.clone();
-                hand.set_velocities(&mut world.physics, frame.turned(velocity), [0.0; 3]);
+                hand.set_velocities(&mut world.physics, frame.rotate(velocity), [0.0; 3]);
             },
             &hand_moves,
         );

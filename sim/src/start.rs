@@ -2,11 +2,11 @@
 
 use rand_chacha::ChaCha8Rng;
 use rapier3d::math::Vector;
-use tandem_core::rng::{coin, uniform};
+use tandem_core::rng::{bernoulli, uniform};
 use tandem_core::{ArmIndex, Layout, Task};
 
 use crate::config::Starts;
-use crate::frame::{OwnFrame, WORKSPACE_HIGH, WORKSPACE_LOW};
+use crate::frame::{ArmFrame, WORKSPACE_HIGH, WORKSPACE_LOW};
 use crate::hand::{MAX_OPENING_M, PAD_HALF_M, PALM_HALF_M};
 
 /// Half the area of objects and goals along x, own frame, metres.
@@ -60,8 +60,8 @@ pub(crate) fn draw(
     object_half_m: f32,
     starts: Starts,
 ) -> Vec<ArmStart> {
-    let gripped = coin(rng, starts.gripped_share);
-    let wide = coin(rng, starts.wide_share);
+    let gripped = bernoulli(rng, starts.gripped_share);
+    let wide = bernoulli(rng, starts.wide_share);
     let can_hold = layout.task == Task::PickAndPlace && object_half_m < MAX_OPENING_M;
     let kind = match (gripped && can_hold, wide) {
         (true, _) => Kind::Gripped,
@@ -109,7 +109,7 @@ impl Area {
 
     fn goal(&self, rng: &mut ChaCha8Rng) -> Vector {
         let on_table = self.point_on_table(rng);
-        if self.layout.task == Task::PickAndPlace && coin(rng, AIR_SHARE) {
+        if self.layout.task == Task::PickAndPlace && bernoulli(rng, AIR_SHARE) {
             on_table + Vector::Z * uniform(rng, 0.0, AIR_M)
         } else {
             on_table
@@ -154,7 +154,7 @@ impl Area {
 
     fn is_free(&self, arms: &[ArmStart], kind: Kind) -> bool {
         let in_world = |arm: usize, point| {
-            OwnFrame::of(ArmIndex(arm), self.layout.n_arms).world_from_own(point)
+            ArmFrame::new(ArmIndex(arm), self.layout.n_arms).world_from_arm(point)
         };
         let points = |part: fn(&ArmStart) -> Vector| -> Vec<Vector> {
             arms.iter().enumerate().map(|(arm, start)| in_world(arm, part(start))).collect()

@@ -7,8 +7,8 @@ use tandem_core::{ArmIndex, Contacts, Layout};
 
 use crate::arm::{Arm, Command};
 use crate::config::{SimError, WorldConfig};
-use crate::frame::OwnFrame;
-use crate::guard::LinkGuard;
+use crate::frame::ArmFrame;
+use crate::link_avoidance::VelocityDamper;
 use crate::physics::{Part, Physics, collides};
 
 /// Most arms a world can have.
@@ -24,7 +24,7 @@ pub(crate) struct World {
     pub(crate) arms: Vec<Arm>,
     objects: Vec<RigidBodyHandle>,
     /// Between two arms; a single arm needs none.
-    guard: Option<LinkGuard>,
+    damper: Option<VelocityDamper>,
     substeps: u32,
 }
 
@@ -36,40 +36,40 @@ impl World {
         let mut arms = Vec::with_capacity(layout.n_arms);
         let mut objects = Vec::with_capacity(layout.n_arms);
         for arm in layout.arms() {
-            let frame = OwnFrame::of(arm, layout.n_arms);
+            let frame = ArmFrame::new(arm, layout.n_arms);
             add_table(&mut physics, arm, frame);
             arms.push(Arm::build(&mut physics, arm, frame, layout.task, config));
             objects.push(add_object(&mut physics, arm, config, friction.object));
         }
-        Self { physics, arms, objects, guard: None, substeps: config.substeps }
+        Self { physics, arms, objects, damper: None, substeps: config.substeps }
     }
 
-    /// Puts `arm`'s object, at rest and not turned in the arm's own frame, to `at_in_own`, metres.
-    pub(crate) fn place_object(&mut self, arm: ArmIndex, at_in_own: Vector) {
+    /// Puts `arm`'s object, at rest and not turned in the arm's own frame, to `at_in_arm`, metres.
+    pub(crate) fn place_object(&mut self, arm: ArmIndex, at_in_arm: Vector) {
         let frame = self.arms[arm.0].frame;
-        let pose = Pose::from_parts(frame.world_from_own(at_in_own), frame.orientation_in_world());
+        let pose = Pose::from_parts(frame.world_from_arm(at_in_arm), frame.orientation_in_world());
         let body = &mut self.physics.bodies[self.objects[arm.0]];
         body.set_position(pose, true);
         body.set_linvel(Vector::ZERO, true);
         body.set_angvel(Vector::ZERO, true);
     }
 
-    /// Puts `arm`, at rest, where its end effector is at `end_effector_in_own` (metres).
-    pub(crate) fn place_arm(&mut self, arm: ArmIndex, end_effector_in_own: Vector, opening_m: f32) {
-        self.arms[arm.0].place(&mut self.physics, end_effector_in_own, opening_m);
+    /// Puts `arm`, at rest, where its end effector is at `end_effector_in_arm` (metres).
+    pub(crate) fn place_arm(&mut self, arm: ArmIndex, end_effector_in_arm: Vector, opening_m: f32) {
+        self.arms[arm.0].place(&mut self.physics, end_effector_in_arm, opening_m);
     }
 
     /// Sets up what watches over the arms, once they are in their places.
-    pub(crate) fn arm_guard(&mut self) {
-        self.guard = match self.arms.as_slice() {
-            [first, second] => Some(LinkGuard::new([first, second], &self.physics)),
+    pub(crate) fn reset_link_avoidance(&mut self) {
+        self.damper = match self.arms.as_slice() {
+            [first, second] => Some(VelocityDamper::new([first, second], &self.physics)),
             _ => None,
         };
     }
 
     /// The smallest gap between two arms' links during the last control step, metres; infinite for one arm.
     pub(crate) fn link_gap_m(&self) -> f32 {
-        self.guard.as_ref().map_or(f32::INFINITY, LinkGuard::smallest_gap_m)
+        self.damper.as_ref().map_or(f32::INFINITY, VelocityDamper::min_gap_m)
     }
 
     /// `arm`'s object.
@@ -87,8 +87,8 @@ impl World {
         for arm in &mut self.arms {
             arm.track(&self.physics);
         }
-        if let (Some(guard), [first, second]) = (&mut self.guard, self.arms.as_slice()) {
-            guard.pose([first, second], &self.physics);
+        if let (Some(damper), [first, second]) = (&mut self.damper, self.arms.as_slice()) {
+            damper.update_posture([first, second], &self.physics);
         }
         let mut contacts = Contacts::NONE;
         for _ in 0..self.substeps {
@@ -109,9 +109,9 @@ impl World {
         for ((arm, command), velocity) in self.arms.iter().zip(commands).zip(&mut velocities) {
             *velocity = arm.velocity_to(&self.physics, command.target);
         }
-        if let (Some(guard), [first, second]) = (&mut self.guard, self.arms.as_slice()) {
+        if let (Some(damper), [first, second]) = (&mut self.damper, self.arms.as_slice()) {
             let palms = [first, second].map(|arm| arm.hand.end_effector(&self.physics));
-            velocities = guard.limit(palms, velocities);
+            velocities = damper.limit(palms, velocities);
         }
         for ((arm, command), velocity) in self.arms.iter().zip(commands).zip(velocities) {
             arm.hand.drive(&mut self.physics, velocity, command.gripper);
@@ -138,7 +138,7 @@ impl World {
 /// rapier solves a cube's four corners on the table in an order that depends on the table's axes, which pushes a resting
 /// cube by a micrometre. On a table of its own the second arm's cube is pushed to the other side, as the symmetry of the
 /// two arms demands.
-fn add_table(physics: &mut Physics, arm: ArmIndex, frame: OwnFrame) {
+fn add_table(physics: &mut Physics, arm: ArmIndex, frame: ArmFrame) {
     let top_at_zero = Vector::new(0.0, 0.0, -TABLE_HALF_M.z);
     let table = ColliderBuilder::cuboid(TABLE_HALF_M.x, TABLE_HALF_M.y, TABLE_HALF_M.z)
         .position(Pose::from_parts(top_at_zero, frame.orientation_in_world()))

@@ -4,7 +4,7 @@ use std::ops::Range;
 
 use rand_chacha::ChaCha8Rng;
 use tandem_core::layout::{EPISODE_STEPS, OBSERVATION_PER_ARM};
-use tandem_core::rng::{coin, index, uniform};
+use tandem_core::rng::{bernoulli, index, uniform};
 use tandem_core::{Layout, Stream, Task, episode_rng};
 use tandem_sim::{Env, Starts, WorldConfig};
 
@@ -47,7 +47,7 @@ impl Rowdy {
 
     /// The next action, from what the arm sees.
     fn act(&mut self, rng: &mut ChaCha8Rng, step_idx: usize, seen: &[f32]) -> [f32; 4] {
-        if coin(rng, 0.2) {
+        if bernoulli(rng, 0.2) {
             self.push = corner(rng);
         }
         let to_object =
@@ -122,11 +122,11 @@ fn whatever_the_arms_do_no_number_comes_near_its_bound() {
             for (idx, most) in largest.observation.into_iter().enumerate() {
                 // A unit quaternion has no room to spare: its numbers are 1 at most, but for rounding.
                 let margin = if ORIENTATION.contains(&idx) { 1.0 } else { MARGIN };
-                let bound = layout.largest_observation(idx);
+                let bound = layout.observation_bound(idx);
                 println!("{task}, {n_arms} arm(s), number {idx}: {most} of {bound}");
                 assert!(margin * most <= bound, "number {idx}: {most}, bound {bound}");
             }
-            assert!(MARGIN * largest.goal <= layout.largest_goal(), "goal: {}", largest.goal);
+            assert!(MARGIN * largest.goal <= layout.goal_bound(), "goal: {}", largest.goal);
         }
     }
 }

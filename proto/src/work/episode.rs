@@ -42,11 +42,9 @@ pub fn decode_episode(episode: pb::Episode, layout: Layout) -> Result<Episode, D
             "observations",
             &episode.observations,
             n_observations,
-            |idx| layout.largest_observation(idx % layout.n_observation()),
+            |idx| layout.observation_bound(idx % layout.n_observation()),
         )?,
-        goal: bounded_from_bytes("goal", &episode.goal, layout.n_goal(), |_| {
-            layout.largest_goal()
-        })?,
+        goal: bounded_from_bytes("goal", &episode.goal, layout.n_goal(), |_| layout.goal_bound())?,
         actions: actions_from_bytes(
             "actions",
             &episode.actions,

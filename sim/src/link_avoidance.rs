@@ -10,7 +10,7 @@
 use rapier3d::math::{Matrix, Vector};
 
 use crate::arm::Arm;
-use crate::capsule::{N_CAPSULES, N_LINKS, PosedArm, nearest_shares};
+use crate::capsule::{ArmCapsules, N_CAPSULES, N_LINKS, closest_fractions};
 use crate::physics::Physics;
 
 /// Pairs of capsules of two arms of which at least one is a link: wrists, palms and fingers collide in rapier.
@@ -21,14 +21,14 @@ const APPROACH_GAIN: f32 = 20.0;
 /// Largest speed at which an overlap is left, metres per second.
 const SEPARATION_MPS: f32 = 0.4;
 /// Gap above which a pair limits nothing, metres.
-const LIMIT_WITHIN_M: f32 = 0.08;
-/// Gap at the start of a control step above which a pair cannot come within [`LIMIT_WITHIN_M`] in that step, metres.
-const WATCH_WITHIN_M: f32 = 0.24;
+const INFLUENCE_DISTANCE_M: f32 = 0.08;
+/// Gap at the start of a control step above which a pair cannot come within [`INFLUENCE_DISTANCE_M`] in that step, metres.
+const ACTIVATION_DISTANCE_M: f32 = 0.24;
 /// Distance of two axes below which their direction from each other says nothing, metres.
 const CROSSING_M: f32 = 0.002;
 /// Share of the palm's motion that a capsule's point is taken to follow at least, so that the palm need not race to
 /// move what hardly follows it.
-const LEAST_LEVERAGE: f32 = 0.3;
+const MIN_LEVERAGE: f32 = 0.3;
 /// Half-planes that one velocity is projected onto, at most, before it is scaled back instead.
 const MAX_PROJECTIONS: usize = 12;
 
@@ -39,23 +39,23 @@ struct Pair {
     /// Unit vector towards the first arm's capsule, as of when the pair was last looked at.
     normal: Option<Vector>,
     /// Whether the pair can come close in this control step.
-    watched: bool,
+    active: bool,
 }
 
 /// How a pair stands in one physics step.
-struct Nearness {
+struct Proximity {
     gap_m: f32,
     /// Unit vector towards the first arm's capsule.
     normal: Vector,
     /// How the nearest point of each arm's capsule moves with its palm.
-    motions: [Matrix; 2],
+    jacobians: [Matrix; 2],
 }
 
-/// What an arm's velocity must satisfy: `direction · velocity >= least_mps`.
+/// What an arm's velocity must satisfy: `direction · velocity >= min_mps`.
 #[derive(Clone, Copy)]
 struct Limit {
     direction: Vector,
-    least_mps: f32,
+    min_mps: f32,
 }
 
 /// An arm's limits in one physics step: the first `n` of `limits`.
@@ -66,40 +66,40 @@ struct Limits {
 
 /// The velocity damper between two arms.
 #[derive(Clone)]
-pub(crate) struct LinkGuard {
-    arms: [PosedArm; 2],
+pub(crate) struct VelocityDamper {
+    arms: [ArmCapsules; 2],
     pairs: [Pair; N_PAIRS],
-    smallest_gap_m: f32,
+    min_gap_m: f32,
 }
 
-impl LinkGuard {
+impl VelocityDamper {
     /// A guard of `arms` as they stand now.
     pub(crate) fn new(arms: [&Arm; 2], physics: &Physics) -> Self {
-        let mut guard = Self {
-            arms: arms.map(|arm| PosedArm::of(arm, physics)),
+        let mut damper = Self {
+            arms: arms.map(|arm| ArmCapsules::of(arm, physics)),
             pairs: all_pairs(),
-            smallest_gap_m: f32::INFINITY,
+            min_gap_m: f32::INFINITY,
         };
-        guard.pose(arms, physics);
-        guard
+        damper.update_posture(arms, physics);
+        damper
     }
 
     /// Takes over the arms' postures at the start of a control step.
-    pub(crate) fn pose(&mut self, arms: [&Arm; 2], physics: &Physics) {
-        self.arms = arms.map(|arm| PosedArm::of(arm, physics));
-        self.smallest_gap_m = f32::INFINITY;
-        let palms = self.arms.map(|arm| arm.palm_at);
+    pub(crate) fn update_posture(&mut self, arms: [&Arm; 2], physics: &Physics) {
+        self.arms = arms.map(|arm| ArmCapsules::of(arm, physics));
+        self.min_gap_m = f32::INFINITY;
+        let palms = self.arms.map(|arm| arm.palm_position);
         for pair in &mut self.pairs {
-            let gap_m = pair.look(&self.arms, palms).gap_m;
-            pair.watched = gap_m < WATCH_WITHIN_M;
-            self.smallest_gap_m = self.smallest_gap_m.min(gap_m);
+            let gap_m = pair.update(&self.arms, palms).gap_m;
+            pair.active = gap_m < ACTIVATION_DISTANCE_M;
+            self.min_gap_m = self.min_gap_m.min(gap_m);
         }
     }
 
     /// The smallest gap between the arms' links, or links and hands, since the control step began; negative when they
-    /// overlap. Metres; exact below the distance at which pairs are watched.
-    pub(crate) fn smallest_gap_m(&self) -> f32 {
-        self.smallest_gap_m
+    /// overlap. Metres; exact below the distance at which pairs are active.
+    pub(crate) fn min_gap_m(&self) -> f32 {
+        self.min_gap_m
     }
 
     /// The palms' wanted velocities as far as the links permit, arm by arm; world frame, metres per second.
@@ -107,26 +107,26 @@ impl LinkGuard {
     /// `palms` is where the palms are now, world frame, metres.
     pub(crate) fn limit(&mut self, palms: [Vector; 2], wanted: [Vector; 2]) -> [Vector; 2] {
         let mut limits = [Limits::none(), Limits::none()];
-        for pair in self.pairs.iter_mut().filter(|pair| pair.watched) {
-            let near = pair.look(&self.arms, palms);
-            self.smallest_gap_m = self.smallest_gap_m.min(near.gap_m);
-            if near.gap_m < LIMIT_WITHIN_M {
-                let least_mps = (-APPROACH_GAIN * near.gap_m).min(SEPARATION_MPS);
-                let [first, second] = near.motions;
-                limits[0].add(first.transpose() * near.normal, least_mps);
-                limits[1].add(second.transpose() * -near.normal, least_mps);
+        for pair in self.pairs.iter_mut().filter(|pair| pair.active) {
+            let near = pair.update(&self.arms, palms);
+            self.min_gap_m = self.min_gap_m.min(near.gap_m);
+            if near.gap_m < INFLUENCE_DISTANCE_M {
+                let min_mps = (-APPROACH_GAIN * near.gap_m).min(SEPARATION_MPS);
+                let [first, second] = near.jacobians;
+                limits[0].add(first.transpose() * near.normal, min_mps);
+                limits[1].add(second.transpose() * -near.normal, min_mps);
             }
         }
-        [limits[0].nearest(wanted[0]), limits[1].nearest(wanted[1])]
+        [limits[0].project(wanted[0]), limits[1].project(wanted[1])]
     }
 }
 
 impl Pair {
-    fn look(&mut self, arms: &[PosedArm; 2], palms: [Vector; 2]) -> Nearness {
+    fn update(&mut self, arms: &[ArmCapsules; 2], palms: [Vector; 2]) -> Proximity {
         let [first, second] = std::array::from_fn(|arm| {
-            arms[arm].capsules[self.capsules[arm]].moved_by(palms[arm] - arms[arm].palm_at)
+            arms[arm].capsules[self.capsules[arm]].moved_by(palms[arm] - arms[arm].palm_position)
         });
-        let [s, t] = nearest_shares(first.axis(), second.axis());
+        let [s, t] = closest_fractions(first.axis(), second.axis());
         let offset = first.point(s) - second.point(t);
         let (distance_m, radii_m) = (offset.length(), first.radius_m + second.radius_m);
         let seen = if distance_m > CROSSING_M { Some(offset / distance_m) } else { None };
@@ -138,17 +138,21 @@ impl Pair {
             (None, known) => (known.unwrap_or(Vector::Z), 0.0),
         };
         self.normal = Some(normal);
-        Nearness { gap_m: along_m - radii_m, normal, motions: [first.motion(s), second.motion(t)] }
+        Proximity {
+            gap_m: along_m - radii_m,
+            normal,
+            jacobians: [first.jacobian(s), second.jacobian(t)],
+        }
     }
 }
 
 impl Limits {
     fn none() -> Self {
-        Self { limits: [Limit { direction: Vector::ZERO, least_mps: 0.0 }; N_PAIRS], n: 0 }
+        Self { limits: [Limit { direction: Vector::ZERO, min_mps: 0.0 }; N_PAIRS], n: 0 }
     }
 
-    fn add(&mut self, direction: Vector, least_mps: f32) {
-        self.limits[self.n] = Limit { direction, least_mps };
+    fn add(&mut self, direction: Vector, min_mps: f32) {
+        self.limits[self.n] = Limit { direction, min_mps };
         self.n += 1;
     }
 
@@ -160,14 +164,14 @@ impl Limits {
     /// fast an approach after that is scaled back.
     ///
     /// Going by how far limits are exceeded, not by their order, treats both arms alike.
-    fn nearest(&self, wanted: Vector) -> Vector {
+    fn project(&self, wanted: Vector) -> Vector {
         let mut velocity = wanted;
         for _ in 0..MAX_PROJECTIONS {
             let worst = self
                 .iter()
-                .max_by(|a, b| a.missing_mps(velocity).total_cmp(&b.missing_mps(velocity)));
+                .max_by(|a, b| a.violation_mps(velocity).total_cmp(&b.violation_mps(velocity)));
             match worst {
-                Some(limit) if limit.missing_mps(velocity) > 1e-4 => {
+                Some(limit) if limit.violation_mps(velocity) > 1e-4 => {
                     velocity = limit.project(velocity);
                 }
                 _ => return velocity,
@@ -179,20 +183,20 @@ impl Limits {
 }
 
 impl Limit {
-    fn missing_mps(&self, velocity: Vector) -> f32 {
-        self.least_mps - self.direction.dot(velocity)
+    fn violation_mps(&self, velocity: Vector) -> f32 {
+        self.min_mps - self.direction.dot(velocity)
     }
 
     fn project(&self, velocity: Vector) -> Vector {
-        let leverage = self.direction.length_squared().max(LEAST_LEVERAGE * LEAST_LEVERAGE);
-        velocity + self.direction * (self.missing_mps(velocity) / leverage)
+        let leverage = self.direction.length_squared().max(MIN_LEVERAGE * MIN_LEVERAGE);
+        velocity + self.direction * (self.violation_mps(velocity) / leverage)
     }
 
     /// The share of `velocity` that keeps within this limit, where slowing down helps.
     fn scale(&self, velocity: Vector) -> f32 {
         let speed_mps = self.direction.dot(velocity);
-        if speed_mps < self.least_mps && speed_mps < 0.0 {
-            (self.least_mps.min(0.0) / speed_mps).min(1.0)
+        if speed_mps < self.min_mps && speed_mps < 0.0 {
+            (self.min_mps.min(0.0) / speed_mps).min(1.0)
         } else {
             1.0
         }
@@ -201,7 +205,7 @@ impl Limit {
 
 /// Every pair of capsules of which at least one is a link.
 fn all_pairs() -> [Pair; N_PAIRS] {
-    let mut pairs = [Pair { capsules: [0, 0], normal: None, watched: false }; N_PAIRS];
+    let mut pairs = [Pair { capsules: [0, 0], normal: None, active: false }; N_PAIRS];
     let with_link = (0..N_CAPSULES)
         .flat_map(|first| (0..N_CAPSULES).map(move |second| [first, second]))
         .filter(|capsules| capsules.iter().any(|capsule| *capsule < N_LINKS));
@@ -214,23 +218,23 @@ fn all_pairs() -> [Pair; N_PAIRS] {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use tandem_core::rng::{coin, index, uniform};
+    use tandem_core::rng::{bernoulli, index, uniform};
     use tandem_core::scene::{Capsule, Scene};
     use tandem_core::{Contacts, Layout, Stream, Task, episode_rng};
 
-    use crate::capsule::{MovedCapsule, MovedPoint};
+    use crate::capsule::{ArmCapsule, ArmPoint};
     use crate::config::{Starts, WorldConfig};
     use crate::env::Env;
 
     #[test]
     fn a_pair_that_crosses_keeps_its_side() {
         let capsule = |y_m: f32, along: Vector| {
-            let end = |at| MovedPoint { at, motion: Matrix::IDENTITY };
+            let end = |position| ArmPoint { position, jacobian: Matrix::IDENTITY };
             let ends = [-along, along].map(|offset| end(offset + Vector::Y * y_m));
-            MovedCapsule { ends, radius_m: 0.04 }
+            ArmCapsule { ends, radius_m: 0.04 }
         };
-        let arm = |y_m, along| PosedArm {
-            palm_at: Vector::ZERO,
+        let arm = |y_m, along| ArmCapsules {
+            palm_position: Vector::ZERO,
             capsules: [capsule(y_m, along); N_CAPSULES],
         };
         let arms = [arm(0.1, Vector::X), arm(0.0, Vector::Z)];
@@ -238,7 +242,7 @@ mod tests {
         let gaps: Vec<f32> = (0_u8..16)
             .map(|step| {
                 let near =
-                    pair.look(&arms, [Vector::NEG_Y * (0.01 * f32::from(step)), Vector::ZERO]);
+                    pair.update(&arms, [Vector::NEG_Y * (0.01 * f32::from(step)), Vector::ZERO]);
                 assert!((near.normal - Vector::Y).length() < 1e-5, "step {step}: {}", near.normal);
                 near.gap_m
             })
@@ -254,11 +258,11 @@ mod tests {
             |size: f32| Vector::from_array(std::array::from_fn(|_| uniform(&mut rng, -size, size)));
         for _ in 0..1000 {
             let mut limits = Limits::none();
-            for least_mps in [0.0, -0.05, -0.2, -0.4] {
-                limits.add(vector(1.0).normalize_or_zero(), least_mps);
+            for min_mps in [0.0, -0.05, -0.2, -0.4] {
+                limits.add(vector(1.0).normalize_or_zero(), min_mps);
             }
-            let velocity = limits.nearest(vector(1.5));
-            assert!(limits.iter().all(|limit| limit.missing_mps(velocity) < 1e-3), "{velocity}");
+            let velocity = limits.project(vector(1.5));
+            assert!(limits.iter().all(|limit| limit.violation_mps(velocity) < 1e-3), "{velocity}");
         }
     }
 
@@ -282,7 +286,7 @@ mod tests {
     fn true_gap_m(scene: &Scene) -> f32 {
         let axis = |link: &Capsule| [Vector::from_array(link.from), Vector::from_array(link.to)];
         let gap = |first: &Capsule, second: &Capsule| {
-            let [s, t] = nearest_shares(axis(first), axis(second));
+            let [s, t] = closest_fractions(axis(first), axis(second));
             let point = |link: &Capsule, share: f32| axis(link)[0].lerp(axis(link)[1], share);
             (point(first, s) - point(second, t)).length() - first.radius_m - second.radius_m
         };
@@ -304,7 +308,7 @@ mod tests {
             env.reset(&mut episode_rng(9, episode, Stream::Reset), starts);
             let mut action = [0.0; 8];
             let mut aims = [0; 2];
-            let attackers = [coin(&mut rng, 0.7), coin(&mut rng, 0.7)];
+            let attackers = [bernoulli(&mut rng, 0.7), bernoulli(&mut rng, 0.7)];
             let mut smallest_m = f32::INFINITY;
             for step in 0..50 {
                 let scene = env.scene();
