@@ -29,3 +29,8 @@ fn main() -> Result<(), SimError> {
     }
     Ok(())
 }
+
+#[test]
+fn random_actions_run() {
+    main().unwrap();
+}

@@ -2,38 +2,36 @@
 //! `cargo run --release --example run_policy`.
 #![expect(clippy::print_stdout, reason = "an example that prints its results")]
 
-use std::error::Error;
-
 use tandem_core::layout::EPISODE_STEPS;
 use tandem_core::reward::is_success;
 use tandem_core::{Stream, episode_rng};
 use tandem_policy::Policy;
 use tandem_sim::{Env, Starts, WorldConfig};
 
-const POLICY: &str =
-    concat!(env!("CARGO_MANIFEST_DIR"), "/policies/student-pick-and-place.safetensors");
-
-fn main() -> Result<(), Box<dyn Error>> {
-    println!("success rate over 20 episodes: {:.2}", success_rate(20)?);
-    Ok(())
-}
-
-fn success_rate(n_episodes: u32) -> Result<f64, Box<dyn Error>> {
-    let policy = Policy::load(POLICY.as_ref())?;
-    let (layout, mut actor) = (policy.layout, policy.actor()?);
-    let mut env = Env::new(layout, &WorldConfig::default())?;
-    let (mut observation, mut action) =
-        (vec![0.0; layout.n_observation()], vec![0.0; layout.n_action()]);
+fn main() -> Result<(), Box<dyn std::error::Error>> {
+    let directory = concat!(env!("CARGO_MANIFEST_DIR"), "/policies");
+    let policy = Policy::load(format!("{directory}/student-pick-and-place.safetensors").as_ref())?;
+    let mut actor = policy.actor()?;
+    let mut env = Env::new(policy.layout, &WorldConfig::default())?;
+    let mut observation = vec![0.0; policy.layout.n_observation()];
+    let mut action = vec![0.0; policy.layout.n_action()];
     let mut n_successes = 0;
-    for episode in 0..n_episodes {
-        env.reset(&mut episode_rng(1, episode.into(), Stream::Reset), Starts::default());
+    for episode in 0..20 {
+        env.reset(&mut episode_rng(1, episode, Stream::Reset), Starts::default());
         for _ in 0..EPISODE_STEPS {
             env.observe(&mut observation);
             actor.act(&observation, env.goal(), &mut action);
             env.step(&action)?;
         }
         env.observe(&mut observation);
-        n_successes += u32::from(is_success(layout, &observation, env.goal()));
+        n_successes += u32::from(is_success(policy.layout, &observation, env.goal()));
     }
-    Ok(f64::from(n_successes) / f64::from(n_episodes))
+    println!("success rate {:.2} over 20 episodes", f64::from(n_successes) / 20.0);
+    assert!(n_successes >= 18, "the shipped policy succeeds in 99 % of episodes");
+    Ok(())
+}
+
+#[test]
+fn a_shipped_policy_succeeds() {
+    main().unwrap();
 }

@@ -1,26 +1,25 @@
-//! Each arm's own frame and its place in the world.
+//! The frame of each arm and its pose in the world.
 
 use rapier3d::math::{Matrix, Rotation, Vector};
 use tandem_core::ArmIndex;
 use tandem_core::layout::WORKSPACE_DISTANCE_M;
 
-/// Distance of two arms' workspace centres from the world's origin, metres.
+/// Distance of each workspace centre from the world's origin if there are two arms, metres.
 const CENTRE_X_M: f32 = WORKSPACE_DISTANCE_M / 2.0;
-/// The arm's base in its own frame, metres: behind the workspace's centre, at table height.
+/// Position of the arm's base, arm frame, metres: behind the centre of the workspace, at the height of the table.
 pub(crate) const BASE_IN_ARM: Vector = Vector::new(-0.40, 0.0, 0.0);
-/// Lower corner of where the end effector may be, own frame, metres.
+/// Lower corner of the end effector's workspace, arm frame, metres.
 pub(crate) const WORKSPACE_LOW: Vector = Vector::new(-0.20, -0.25, 0.022);
-/// Upper corner of where the end effector may be, own frame, metres.
+/// Upper corner of the end effector's workspace, arm frame, metres.
 pub(crate) const WORKSPACE_HIGH: Vector = Vector::new(0.20, 0.25, 0.35);
 
-/// An arm's own frame: origin in the centre of its workspace on the table, x away from its base, z up.
+/// The frame of an arm: origin on the table in the centre of the arm's workspace, x away from its base, z up.
 ///
-/// The second of two arms is the first turned by half a turn about z, so numbers in own frames do not tell the arms
-/// apart.
+/// The second of two arms is the first one rotated by 180° about z, so coordinates in arm frames do not distinguish them.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct ArmFrame {
     centre_x_m: f32,
-    /// 1, or −1 when turned by half a turn.
+    /// 1, or −1 if rotated by 180°.
     sign: f32,
 }
 
@@ -41,23 +40,23 @@ impl ArmFrame {
         self.rotate(point_in_world - Vector::new(self.centre_x_m, 0.0, 0.0))
     }
 
-    /// A direction of this frame in the world's, and the other way round: half a turn is its own inverse.
+    /// Rotates a direction from this frame to the world frame, or back: a rotation by 180° is its own inverse.
     pub(crate) fn rotate(self, direction: Vector) -> Vector {
         Vector::new(self.sign * direction.x, self.sign * direction.y, direction.z)
     }
 
-    /// A linear map between directions of this frame as one between directions of the world.
+    /// Expresses a linear map between directions of this frame in the world frame.
     pub(crate) fn jacobian_in_world(self, jacobian_in_arm: Matrix) -> Matrix {
         let turn = Matrix::from_diagonal(Vector::new(self.sign, self.sign, 1.0));
         turn * jacobian_in_arm * turn
     }
 
-    /// The orientation in the world of what is not turned in this frame.
+    /// Returns the orientation of this frame in the world.
     pub(crate) fn orientation_in_world(self) -> Rotation {
         if self.sign > 0.0 { Rotation::IDENTITY } else { Rotation::from_xyzw(0.0, 0.0, 1.0, 0.0) }
     }
 
-    /// A body's orientation in this frame, quaternion (x, y, z, w) with w >= 0.
+    /// Expresses a body's orientation in this frame, as a quaternion (x, y, z, w) with w >= 0.
     pub(crate) fn orientation_in_arm(self, in_world: Rotation) -> [f32; 4] {
         let Rotation { x, y, z, w } = in_world;
         let in_arm = if self.sign > 0.0 { [x, y, z, w] } else { [-y, x, w, -z] };
@@ -83,7 +82,7 @@ mod tests {
     }
 
     #[test]
-    fn an_orientation_reads_the_same_in_both_frames_when_turned_with_the_arm() {
+    fn orientations_that_rotate_with_the_arm_are_equal_in_both_arm_frames() {
         let tilted = Rotation::from_xyzw(0.1, 0.2, -0.3, 0.927_361_8);
         for arm in [ArmIndex(0), ArmIndex(1)] {
             let frame = ArmFrame::new(arm, 2);

@@ -1,11 +1,12 @@
-//! Keeps the links of two arms apart by limiting how fast they may approach.
+//! A velocity damper that keeps the links of two arms apart (Faverjon & Tournassoud 1987).
 //!
-//! The links are no rapier bodies: posed by inverse kinematics they would push with unlimited force. Instead each
-//! arm's wanted velocity is limited, for every close pair of capsules, along the pair's normal: the approach may be at
-//! most [`APPROACH_GAIN`] times the gap, and an overlap must be left. The limit acts through the palm's bounded servo.
+//! The links are not rapier bodies: as bodies posed by inverse kinematics they would push with unlimited force. Instead,
+//! the desired velocity of each arm is limited along the normal of every close pair of capsules. The approach speed may
+//! be at most [`APPROACH_GAIN`] times the gap, and capsules that overlap must separate. The limit acts through the palm's
+//! bounded servo.
 //!
-//! A pair that overlaps keeps the side from which it came: where two axes cross, the direction between their nearest
-//! points turns over, and taken as it is it would pull the links through each other.
+//! Overlapping capsules keep the normal from before the overlap. When their axes cross, the direction between their
+//! closest points reverses; with the reversed normal the damper would pull the links through each other.
 
 use rapier3d::math::{Matrix, Vector};
 
@@ -13,52 +14,53 @@ use crate::arm::Arm;
 use crate::capsule::{ArmCapsules, N_CAPSULES, N_LINKS, closest_fractions};
 use crate::physics::Physics;
 
-/// Pairs of capsules of two arms of which at least one is a link: wrists, palms and fingers collide in rapier.
+/// Number of pairs of capsules with at least one link. Wrists, palms and fingers collide with each other in rapier.
 const N_PAIRS: usize = N_CAPSULES * N_CAPSULES - (N_CAPSULES - N_LINKS) * (N_CAPSULES - N_LINKS);
 
 /// Largest approach speed of an arm per metre of gap, 1/s.
 const APPROACH_GAIN: f32 = 20.0;
-/// Largest speed at which an overlap is left, metres per second.
+/// Largest speed of separation that an overlap demands, metres per second.
 const SEPARATION_MPS: f32 = 0.4;
-/// Gap above which a pair limits nothing, metres.
+/// Gap above which a pair imposes no limit, metres.
 const INFLUENCE_DISTANCE_M: f32 = 0.08;
-/// Gap at the start of a control step above which a pair cannot come within [`INFLUENCE_DISTANCE_M`] in that step, metres.
+/// Gap at the start of a control step above which a pair cannot come within [`INFLUENCE_DISTANCE_M`] during the step,
+/// metres.
 const ACTIVATION_DISTANCE_M: f32 = 0.24;
-/// Distance of two axes below which their direction from each other says nothing, metres.
+/// Distance between two axes below which the direction between them is undefined, metres.
 const CROSSING_M: f32 = 0.002;
-/// Share of the palm's motion that a capsule's point is taken to follow at least, so that the palm need not race to
-/// move what hardly follows it.
-const MIN_LEVERAGE: f32 = 0.3;
-/// Half-planes that one velocity is projected onto, at most, before it is scaled back instead.
+/// Lower bound on the norm of a limit's direction, as a fraction of the palm's motion. Without it, the palm would have to
+/// move very fast to displace a point that hardly follows it.
+const MIN_DIRECTION_NORM: f32 = 0.3;
+/// Largest number of projections of a velocity before it is scaled down instead.
 const MAX_PROJECTIONS: usize = 12;
 
-/// One capsule of the first arm against one of the second.
+/// A capsule of the first arm and one of the second.
 #[derive(Clone, Copy)]
 struct Pair {
     capsules: [usize; 2],
-    /// Unit vector towards the first arm's capsule, as of when the pair was last looked at.
+    /// Unit vector towards the first arm's capsule at the last update.
     normal: Option<Vector>,
-    /// Whether the pair can come close in this control step.
+    /// Whether the pair can come within the influence distance during this control step.
     active: bool,
 }
 
-/// How a pair stands in one physics step.
+/// The gap of a pair in one physics step and its derivatives.
 struct Proximity {
     gap_m: f32,
     /// Unit vector towards the first arm's capsule.
     normal: Vector,
-    /// How the nearest point of each arm's capsule moves with its palm.
+    /// For each arm, the Jacobian of the capsule's closest point with respect to the palm's position.
     jacobians: [Matrix; 2],
 }
 
-/// What an arm's velocity must satisfy: `direction · velocity >= min_mps`.
+/// A constraint on the velocity of a palm: `direction · velocity >= min_mps`.
 #[derive(Clone, Copy)]
 struct Limit {
     direction: Vector,
     min_mps: f32,
 }
 
-/// An arm's limits in one physics step: the first `n` of `limits`.
+/// The constraints on one arm in one physics step: the first `n` of `limits`.
 struct Limits {
     limits: [Limit; N_PAIRS],
     n: usize,
@@ -73,7 +75,7 @@ pub(crate) struct VelocityDamper {
 }
 
 impl VelocityDamper {
-    /// A guard of `arms` as they stand now.
+    /// Creates a damper for `arms` at their current positions.
     pub(crate) fn new(arms: [&Arm; 2], physics: &Physics) -> Self {
         let mut damper = Self {
             arms: arms.map(|arm| ArmCapsules::of(arm, physics)),
@@ -84,7 +86,7 @@ impl VelocityDamper {
         damper
     }
 
-    /// Takes over the arms' postures at the start of a control step.
+    /// Updates the capsules to the joint angles at the start of a control step.
     pub(crate) fn update_posture(&mut self, arms: [&Arm; 2], physics: &Physics) {
         self.arms = arms.map(|arm| ArmCapsules::of(arm, physics));
         self.min_gap_m = f32::INFINITY;
@@ -96,28 +98,28 @@ impl VelocityDamper {
         }
     }
 
-    /// The smallest gap between the arms' links, or links and hands, since the control step began; negative when they
-    /// overlap. Metres; exact below the distance at which pairs are active.
+    /// Returns the smallest gap between links, or links and hands, since the start of the control step, metres. It is
+    /// negative if they overlap, and exact only below [`ACTIVATION_DISTANCE_M`].
     pub(crate) fn min_gap_m(&self) -> f32 {
         self.min_gap_m
     }
 
-    /// The palms' wanted velocities as far as the links permit, arm by arm; world frame, metres per second.
+    /// Limits the desired velocities of the palms, in arm order; world frame, metres per second.
     ///
-    /// `palms` is where the palms are now, world frame, metres.
-    pub(crate) fn limit(&mut self, palms: [Vector; 2], wanted: [Vector; 2]) -> [Vector; 2] {
+    /// `palms` are the current positions of the palms, world frame, metres.
+    pub(crate) fn limit(&mut self, palms: [Vector; 2], desired: [Vector; 2]) -> [Vector; 2] {
         let mut limits = [Limits::none(), Limits::none()];
         for pair in self.pairs.iter_mut().filter(|pair| pair.active) {
-            let near = pair.update(&self.arms, palms);
-            self.min_gap_m = self.min_gap_m.min(near.gap_m);
-            if near.gap_m < INFLUENCE_DISTANCE_M {
-                let min_mps = (-APPROACH_GAIN * near.gap_m).min(SEPARATION_MPS);
-                let [first, second] = near.jacobians;
-                limits[0].add(first.transpose() * near.normal, min_mps);
-                limits[1].add(second.transpose() * -near.normal, min_mps);
+            let proximity = pair.update(&self.arms, palms);
+            self.min_gap_m = self.min_gap_m.min(proximity.gap_m);
+            if proximity.gap_m < INFLUENCE_DISTANCE_M {
+                let min_mps = (-APPROACH_GAIN * proximity.gap_m).min(SEPARATION_MPS);
+                let [first, second] = proximity.jacobians;
+                limits[0].add(first.transpose() * proximity.normal, min_mps);
+                limits[1].add(second.transpose() * -proximity.normal, min_mps);
             }
         }
-        [limits[0].project(wanted[0]), limits[1].project(wanted[1])]
+        [limits[0].project(desired[0]), limits[1].project(desired[1])]
     }
 }
 
@@ -129,17 +131,19 @@ impl Pair {
         let [s, t] = closest_fractions(first.axis(), second.axis());
         let offset = first.point(s) - second.point(t);
         let (distance_m, radii_m) = (offset.length(), first.radius_m + second.radius_m);
-        let seen = if distance_m > CROSSING_M { Some(offset / distance_m) } else { None };
-        let (normal, along_m) = match (seen, self.normal) {
-            (Some(seen), Some(known)) if distance_m < radii_m && seen.dot(known) < 0.0 => {
-                (-seen, -distance_m)
+        let measured = if distance_m > CROSSING_M { Some(offset / distance_m) } else { None };
+        let (normal, signed_distance_m) = match (measured, self.normal) {
+            (Some(measured), Some(previous))
+                if distance_m < radii_m && measured.dot(previous) < 0.0 =>
+            {
+                (-measured, -distance_m)
             }
-            (Some(seen), _) => (seen, distance_m),
-            (None, known) => (known.unwrap_or(Vector::Z), 0.0),
+            (Some(measured), _) => (measured, distance_m),
+            (None, previous) => (previous.unwrap_or(Vector::Z), 0.0),
         };
         self.normal = Some(normal);
         Proximity {
-            gap_m: along_m - radii_m,
+            gap_m: signed_distance_m - radii_m,
             normal,
             jacobians: [first.jacobian(s), second.jacobian(t)],
         }
@@ -160,12 +164,13 @@ impl Limits {
         self.limits[..self.n].iter()
     }
 
-    /// A velocity near `wanted` within every limit: projected onto the worst one again and again; what is still too
-    /// fast an approach after that is scaled back.
+    /// Returns a velocity near `desired` that satisfies every limit. It is projected repeatedly onto the limit with the
+    /// largest violation; if violations remain, it is scaled down.
     ///
-    /// Going by how far limits are exceeded, not by their order, treats both arms alike.
-    fn project(&self, wanted: Vector) -> Vector {
-        let mut velocity = wanted;
+    /// The order of projections depends on the violations and not on the order of the limits, so both arms are treated
+    /// alike.
+    fn project(&self, desired: Vector) -> Vector {
+        let mut velocity = desired;
         for _ in 0..MAX_PROJECTIONS {
             let worst = self
                 .iter()
@@ -188,11 +193,12 @@ impl Limit {
     }
 
     fn project(&self, velocity: Vector) -> Vector {
-        let leverage = self.direction.length_squared().max(MIN_LEVERAGE * MIN_LEVERAGE);
-        velocity + self.direction * (self.violation_mps(velocity) / leverage)
+        let squared_norm =
+            self.direction.length_squared().max(MIN_DIRECTION_NORM * MIN_DIRECTION_NORM);
+        velocity + self.direction * (self.violation_mps(velocity) / squared_norm)
     }
 
-    /// The share of `velocity` that keeps within this limit, where slowing down helps.
+    /// Returns the factor by which to scale `velocity` down to satisfy this limit, 1 if that does not help.
     fn scale(&self, velocity: Vector) -> f32 {
         let speed_mps = self.direction.dot(velocity);
         if speed_mps < self.min_mps && speed_mps < 0.0 {
@@ -203,7 +209,7 @@ impl Limit {
     }
 }
 
-/// Every pair of capsules of which at least one is a link.
+/// Returns all pairs of capsules with at least one link.
 fn all_pairs() -> [Pair; N_PAIRS] {
     let mut pairs = [Pair { capsules: [0, 0], normal: None, active: false }; N_PAIRS];
     let with_link = (0..N_CAPSULES)
@@ -227,7 +233,7 @@ mod tests {
     use crate::env::Env;
 
     #[test]
-    fn a_pair_that_crosses_keeps_its_side() {
+    fn capsules_that_cross_keep_their_normal() {
         let capsule = |y_m: f32, along: Vector| {
             let end = |position| ArmPoint { position, jacobian: Matrix::IDENTITY };
             let ends = [-along, along].map(|offset| end(offset + Vector::Y * y_m));
@@ -241,10 +247,14 @@ mod tests {
         let mut pair = all_pairs()[0];
         let gaps: Vec<f32> = (0_u8..16)
             .map(|step| {
-                let near =
+                let proximity =
                     pair.update(&arms, [Vector::NEG_Y * (0.01 * f32::from(step)), Vector::ZERO]);
-                assert!((near.normal - Vector::Y).length() < 1e-5, "step {step}: {}", near.normal);
-                near.gap_m
+                assert!(
+                    (proximity.normal - Vector::Y).length() < 1e-5,
+                    "step {step}: {}",
+                    proximity.normal
+                );
+                proximity.gap_m
             })
             .collect();
         assert!((gaps[0] - 0.02).abs() < 1e-6 && (gaps[15] + 0.13).abs() < 1e-6, "{gaps:?}");
@@ -252,7 +262,7 @@ mod tests {
     }
 
     #[test]
-    fn a_limited_velocity_respects_every_limit() {
+    fn a_limited_velocity_satisfies_every_limit() {
         let mut rng = episode_rng(5, 0, Stream::Exploration);
         let mut vector =
             |size: f32| Vector::from_array(std::array::from_fn(|_| uniform(&mut rng, -size, size)));
@@ -266,7 +276,7 @@ mod tests {
         }
     }
 
-    /// How an arm that wants to do harm moves: held random actions, or straight for a part of the other arm.
+    /// The action of an arm that moves straight at a part of the other arm.
     fn attack(scene: &Scene, arm: usize, aim: usize) -> [f32; 3] {
         let other = &scene.arms[1 - arm];
         let aims = [
@@ -282,12 +292,12 @@ mod tests {
         [sign * to(0), sign * to(1), to(2)]
     }
 
-    /// The smallest gap between links as the joints of this very moment give it.
+    /// The smallest gap between links at the current joint angles.
     fn true_gap_m(scene: &Scene) -> f32 {
         let axis = |link: &Capsule| [Vector::from_array(link.from), Vector::from_array(link.to)];
         let gap = |first: &Capsule, second: &Capsule| {
             let [s, t] = closest_fractions(axis(first), axis(second));
-            let point = |link: &Capsule, share: f32| axis(link)[0].lerp(axis(link)[1], share);
+            let point = |link: &Capsule, fraction: f32| axis(link)[0].lerp(axis(link)[1], fraction);
             (point(first, s) - point(second, t)).length() - first.radius_m - second.radius_m
         };
         let [first, second] = [&scene.arms[0].links, &scene.arms[1].links];
@@ -327,7 +337,7 @@ mod tests {
                 let gap_m = true_gap_m(&env.scene());
                 assert!(
                     gap_m > -0.003 || contacts.contains(Contacts::ARM_ARM),
-                    "overlap of {gap_m} m not told"
+                    "overlap of {gap_m} m not reported"
                 );
                 smallest_m = smallest_m.min(gap_m);
             }
