@@ -114,7 +114,7 @@ impl Trainer {
                 teacher.layout.task, teacher.n_heads
             ));
         }
-        let copies = teacher.copies(self.layout.n_arms);
+        let copies = teacher.replicated(self.layout.n_arms);
         let sizes = |policy: &Policy| (policy.n_hidden, policy.n_hidden_layers, policy.n_heads);
         let ddpg = &self.config.ddpg;
         let n_heads = self.config.replay.reward.n_heads(self.layout);
@@ -306,7 +306,7 @@ impl Trainer {
             hash.update(bytemuck::cast_slice::<f32, u8>(values));
         }
         for normalizer in [&self.observation_normalizer, &self.goal_normalizer] {
-            let seen = normalizer.parts();
+            let seen = normalizer.state();
             hash.update(seen.count.to_le_bytes());
             seen.sum
                 .iter()
