@@ -43,8 +43,8 @@ impl Task {
         }
     }
 
-    /// Returns the length of one arm's part of an action: a displacement of the end effector (3) and, in pick and place,
-    /// the gripper's input (1).
+    /// Returns the length of one arm's part of an action: a displacement of the end effector (3) and, in pick and
+    /// place, the gripper's input (1).
     #[must_use]
     pub const fn action_per_arm(self) -> usize {
         match self {
@@ -82,8 +82,8 @@ pub struct ArmIndex(pub usize);
 
 /// A task and the number of arms, which together determine the length of every vector.
 ///
-/// The vector of several arms is the concatenation of the vectors of each arm, in arm order (`d_1 || d_2` in the paper).
-/// Each arm's numbers are in the arm's own frame, so a one-arm policy can use an arm's part unchanged.
+/// The vector of several arms is the concatenation of the vectors of each arm, in arm order (`d_1 || d_2` in the
+/// paper). Each arm's numbers are in the arm's own frame, so a one-arm policy can use an arm's part unchanged.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct Layout {
     /// The task.

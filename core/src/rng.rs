@@ -25,8 +25,8 @@ pub enum Stream {
 
 /// Returns the generator for `stream` of episode (or round, or network) `number` in the run with seed `run_seed`.
 ///
-/// The seed does not depend on the worker that plays an episode or on the order in which episodes finish, so any episode
-/// can be replayed in isolation.
+/// The seed does not depend on the worker that plays an episode or on the order in which episodes finish, so any
+/// episode can be replayed in isolation.
 #[must_use]
 pub fn episode_rng(run_seed: u64, number: u64, stream: Stream) -> ChaCha8Rng {
     let mut seed = [0; 32];

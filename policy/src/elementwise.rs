@@ -55,7 +55,8 @@ pub(crate) fn mask(delta: &mut [f32], activations: &[f32]) {
     });
 }
 
-/// Like [`mask`], and also writes the sums of the result's columns, the gradient of the bias, to `sums`, shape `[n_units]`.
+/// Like [`mask`], and also writes the sums of the result's columns, the gradient of the bias, to `sums`, shape
+/// `[n_units]`.
 pub(crate) fn mask_and_sum(delta: &mut [f32], activations: &[f32], sums: &mut [f32]) {
     #[inline(always)]
     fn row_kernel(delta: &mut [f32], activations: &[f32], sums: &mut [f32]) {

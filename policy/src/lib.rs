@@ -1,7 +1,7 @@
 //! Policies: actor and critic networks, their gradients, the Adam optimiser, input normalisation and the policy file.
 //!
-//! The crate knows no environment, replay buffer or wire format, and draws random numbers only from generators that it is
-//! given. Only [`Policy::load`] and [`Policy::save`] access files.
+//! The crate knows no environment, replay buffer or wire format, and draws random numbers only from generators that it
+//! is given. Only [`Policy::load`] and [`Policy::save`] access files.
 //!
 //! # Running a policy
 //!
@@ -25,8 +25,8 @@
 //! # Ok::<(), tandem_policy::Error>(())
 //! ```
 //!
-//! Both take batches, row-major and batch first: observations of shape `[n, n_observation]` give actions of shape
-//! `[n, n_action]`. The bits of a row do not depend on the batch it is in, nor on the machine, provided that it has fused
+//! Both take batches, row-major and batch first: observations of shape `[n, n_observation]` give actions of shape `[n,
+//! n_action]`. The bits of a row do not depend on the batch it is in, nor on the machine, provided that it has fused
 //! multiply-add.
 //!
 //! # Networks and gradients
@@ -58,8 +58,8 @@
 //!
 //! # Normalisation
 //!
-//! A [`Normalizer`] keeps running statistics; its [`NormalizerSnapshot`] is the mean and standard deviation of one moment,
-//! which a policy stores.
+//! A [`Normalizer`] keeps running statistics; its [`NormalizerSnapshot`] is the mean and standard deviation of one
+//! moment, which a policy stores.
 //!
 //! ```
 //! use tandem_policy::Normalizer;

@@ -112,8 +112,8 @@ fn fits(len: usize, n_rows: usize, n_cols: usize, row_stride: usize) -> bool {
 
 /// Computes `product = lhs · rhs` on the calling thread.
 ///
-/// The kernel is chosen at run time for the processor. On one machine, the result depends on the operands only; a machine
-/// with another instruction set may sum in another order.
+/// The kernel is chosen at run time for the processor. On one machine, the result depends on the operands only; a
+/// machine with another instruction set may sum in another order.
 ///
 /// # Panics
 /// If the shapes do not match.

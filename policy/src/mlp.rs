@@ -32,7 +32,8 @@ impl MlpShape {
         Self { n_input, n_hidden, n_hidden_layers, n_output: layout.n_action() }
     }
 
-    /// Returns the shape of a critic, which maps normalised observation and goal, then the action, to one value per head.
+    /// Returns the shape of a critic, which maps normalised observation and goal, then the action, to one value per
+    /// head.
     #[must_use]
     pub const fn critic(
         layout: Layout,

@@ -54,8 +54,8 @@ impl Arm {
         Self { frame, hand, angles: HOME }
     }
 
-    /// Places the arm, at rest, with its end effector at `end_effector_in_arm` (metres) and each side of the gripper open
-    /// by `opening_m`. The joint angles depend on this position only.
+    /// Places the arm, at rest, with its end effector at `end_effector_in_arm` (metres) and each side of the gripper
+    /// open by `opening_m`. The joint angles depend on this position only.
     pub(crate) fn place(
         &mut self,
         physics: &mut Physics,
@@ -76,7 +76,8 @@ impl Arm {
         solve_inverse(self.angles, self.tool_in_base(physics), n_iterations)
     }
 
-    /// Returns the target that `action` (arm frame, in [−1, 1]) commands, clamped to the workspace; world frame, metres.
+    /// Returns the target that `action` (arm frame, in [−1, 1]) commands, clamped to the workspace; world frame,
+    /// metres.
     ///
     /// The displacement is relative to the hand, not to the previous target, so a blocked hand causes no wind-up.
     pub(crate) fn target(&self, physics: &Physics, action: Vector) -> Vector {
@@ -90,8 +91,8 @@ impl Arm {
         (target - self.hand.end_effector(physics)) * APPROACH_GAIN
     }
 
-    /// Returns the origin of each of the link frames `frames` (world frame, metres) and its Jacobian with respect to the
-    /// palm's position.
+    /// Returns the origin of each of the link frames `frames` (world frame, metres) and its Jacobian with respect to
+    /// the palm's position.
     pub(crate) fn point_jacobians<const N: usize>(
         &self,
         frames: [usize; N],

@@ -12,7 +12,8 @@ pub(crate) const CONTROL_STEPS_PER_S: f64 = 25.0;
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct WorldConfig {
-    /// Physics steps per control step of 0.04 s, in [10, 80]. 20 corresponds to the paper's 0.002 s; 10 is twice as fast.
+    /// Physics steps per control step of 0.04 s, in [10, 80]. 20 corresponds to the paper's 0.002 s; 10 is twice as
+    /// fast.
     pub substeps: u32,
     /// Iterations of the contact solver per physics step, in [1, 16].
     pub solver_iterations: usize,
@@ -22,7 +23,8 @@ pub struct WorldConfig {
     pub object_mass_kg: f32,
     /// Largest force of each side of the gripper, newtons, in [0.1, 60].
     pub grip_force_n: f32,
-    /// Friction in the push task. It is lower than the table's, so a hand pushes objects and cannot drag them from above.
+    /// Friction in the push task. It is lower than the table's, so a hand pushes objects and cannot drag them from
+    /// above.
     pub push: Friction,
     /// Friction in the pick-and-place task.
     pub pick_and_place: Friction,

@@ -64,7 +64,8 @@ impl Env {
 
     /// Starts an episode with random positions of hands and objects and with random goals.
     ///
-    /// All bodies are at rest. An object touches nothing but the table or, in a grasped start, the fingers that hold it.
+    /// All bodies are at rest. An object touches nothing but the table or, in a grasped start, the fingers that hold
+    /// it.
     pub fn reset(&mut self, rng: &mut ChaCha8Rng, starts: Starts) {
         self.world = self.prototype.clone();
         self.n_steps = 0;
@@ -77,7 +78,8 @@ impl Env {
         }
     }
 
-    /// Writes the current observation, shape `[n_observation]`: 28 numbers per arm, in arm order, each in the arm's frame.
+    /// Writes the current observation, shape `[n_observation]`: 28 numbers per arm, in arm order, each in the arm's
+    /// frame.
     ///
     /// | numbers | quantity | unit |
     /// |---|---|---|
@@ -113,14 +115,15 @@ impl Env {
     /// the end effector along x, y and z in units of 5 cm and, in pick and place, the gripper's input: positive values
     /// open the gripper, −1 closes it and holds.
     ///
-    /// Two arms are in contact if palms, wrists or fingers press on each other in any physics step, or if the gap between
-    /// a link and a part of the other arm falls below zero. An arm is in contact with the table if palm, wrist or fingers
-    /// press on it; the links stay 0.2 m above it, as the gripper points down. The workspace ends 2 mm above the table,
-    /// so an arm touches the table only if it is pushed down.
+    /// Two arms are in contact if palms, wrists or fingers press on each other in any physics step, or if the gap
+    /// between a link and a part of the other arm falls below zero. An arm is in contact with the table if palm, wrist
+    /// or fingers press on it; the links stay 0.2 m above it, as the gripper points down. The workspace ends 2 mm above
+    /// the table, so an arm touches the table only if it is pushed down.
     ///
     /// # Errors
     /// Returns an error if `action` has the wrong length or contains a number that is not finite; the state is then
-    /// unchanged. Also returns an error if the physics produces such a number; reset the environment before the next step.
+    /// unchanged. Also returns an error if the physics produces such a number; reset the environment before the next
+    /// step.
     pub fn step(&mut self, action: &[f32]) -> Result<Contacts, SimError> {
         let commands = self.commands(action)?;
         self.n_steps += 1;

@@ -15,7 +15,8 @@ pub(crate) const WORKSPACE_HIGH: Vector = Vector::new(0.20, 0.25, 0.35);
 
 /// The frame of an arm: origin on the table in the centre of the arm's workspace, x away from its base, z up.
 ///
-/// The second of two arms is the first one rotated by 180° about z, so coordinates in arm frames do not distinguish them.
+/// The second of two arms is the first one rotated by 180° about z, so coordinates in arm frames do not distinguish
+/// them.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct ArmFrame {
     centre_x_m: f32,

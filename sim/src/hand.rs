@@ -1,8 +1,8 @@
 //! The hand: a palm that a servo moves, and three fingers that open and close together.
 //!
-//! Palm and fingers are rapier bodies with locked rotations. One bounded force on the palm models the arm's motors. Forces
-//! hold the fingers in their places, and the palm receives the reaction; there are no joints. A locked gripper forms one
-//! rigid body with the palm, because compliant fingers would hook over an object's edge and drag it along.
+//! Palm and fingers are rapier bodies with locked rotations. One bounded force on the palm models the arm's motors.
+//! Forces hold the fingers in their places, and the palm receives the reaction; there are no joints. A locked gripper
+//! forms one rigid body with the palm, because compliant fingers would hook over an object's edge and drag it along.
 
 use rapier3d::dynamics::{CoefficientCombineRule, RigidBodyBuilder, RigidBodyHandle};
 use rapier3d::geometry::ColliderBuilder;
@@ -118,7 +118,8 @@ impl Hand {
         Self { frame, palm, gripper, fingers, grip_force_n }
     }
 
-    /// Places the hand, at rest, with its end effector at `end_effector_in_arm` (metres) and each side open by `opening_m`.
+    /// Places the hand, at rest, with its end effector at `end_effector_in_arm` (metres) and each side open by
+    /// `opening_m`.
     pub(crate) fn place(&self, physics: &mut Physics, end_effector_in_arm: Vector, opening_m: f32) {
         let at = self.frame.world_from_arm(end_effector_in_arm);
         let palm = &mut physics.bodies[self.palm];
@@ -186,8 +187,8 @@ impl Hand {
 
     /// Sets the forces for the next physics step.
     ///
-    /// `velocity` is the desired velocity of the palm (world frame, metres per second), `gripper` the input of the gripper
-    /// in [−1, 1]: positive values open it, −1 closes it and holds.
+    /// `velocity` is the desired velocity of the palm (world frame, metres per second), `gripper` the input of the
+    /// gripper in [−1, 1]: positive values open it, −1 closes it and holds.
     pub(crate) fn drive(&self, physics: &mut Physics, velocity: Vector, gripper: f32) {
         let substep_s = physics.substep_s();
         let total_mass_kg = PALM_MASS_KG + FINGERS_MASS_KG;
@@ -311,7 +312,8 @@ fn build_finger(
     finger(body, frame, geometry)
 }
 
-/// Attaches a finger to the palm's body. That body is rotated with the arm, so the pad's position is in the arm's frame.
+/// Attaches a finger to the palm's body. That body is rotated with the arm, so the pad's position is in the arm's
+/// frame.
 fn attach_finger(
     physics: &mut Physics,
     arm: ArmIndex,

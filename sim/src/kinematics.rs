@@ -1,7 +1,7 @@
 //! Forward and inverse kinematics of Kinova's Jaco with six joints, with the gripper pointing down.
 //!
-//! All quantities are in the arm's base frame, whose axes are parallel to those of the arm frame. The module computes in
-//! `f64` and sums in a fixed order, so joint angles have the same bits on every machine.
+//! All quantities are in the arm's base frame, whose axes are parallel to those of the arm frame. The module computes
+//! in `f64` and sums in a fixed order, so joint angles have the same bits on every machine.
 
 use std::f64::consts::{FRAC_PI_2, PI};
 
@@ -10,8 +10,8 @@ use rapier3d::glamx::{DMat3, DVec3};
 /// Joint angles, radians, from base to wrist, by Kinova's convention (joints 2 and 3 are straight at π).
 pub(crate) type JointAngles = [f64; 6];
 
-/// Home posture: gripper pointing down, 0.40 m ahead of the base and 0.15 m above the table, elbow high. It is the best of
-/// 60 solutions from random initial angles.
+/// Home posture: gripper pointing down, 0.40 m ahead of the base and 0.15 m above the table, elbow high. It is the best
+/// of 60 solutions from random initial angles.
 pub(crate) const HOME: JointAngles =
     [-0.208_556_86, 2.506_949_69, 5.075_284_33, 2.970_589_41, 0.665_106_14, -0.379_560_43];
 
@@ -121,8 +121,8 @@ impl ForwardKinematics {
         self.frames[idx].axes.z_axis * DH_TABLE[idx].direction
     }
 
-    /// Returns the error of the tool's position (metres) with respect to `target` and of its orientation (rotation vector,
-    /// radians) with respect to pointing down.
+    /// Returns the error of the tool's position (metres) with respect to `target` and of its orientation (rotation
+    /// vector, radians) with respect to pointing down.
     fn tool_error(&self, target: DVec3) -> [f64; 6] {
         let tool = &self.frames[6];
         let position = target - tool.origin;

@@ -1,8 +1,9 @@
 //! The simulated environments: push and pick and place, with one arm or two.
 //!
-//! An [`Env`] starts episodes, writes observations and executes actions. All four environments share one implementation;
-//! a [`Layout`](tandem_core::Layout) selects the task and the number of arms. The crate knows nothing of policies, advice
-//! or rewards: `tandem_policy` chooses actions, and [`tandem_core::reward`] computes rewards from observations.
+//! An [`Env`] starts episodes, writes observations and executes actions. All four environments share one
+//! implementation; a [`Layout`](tandem_core::Layout) selects the task and the number of arms. The crate knows nothing
+//! of policies, advice or rewards: `tandem_policy` chooses actions, and [`tandem_core::reward`] computes rewards from
+//! observations.
 //!
 //! # An episode
 //!
@@ -64,8 +65,8 @@
 //!
 //! # Configuration
 //!
-//! [`WorldConfig`] sets the resolution of the physics, the objects and their friction. [`Starts`] sets how often training
-//! episodes begin in other states than evaluation episodes. Values out of range are errors:
+//! [`WorldConfig`] sets the resolution of the physics, the objects and their friction. [`Starts`] sets how often
+//! training episodes begin in other states than evaluation episodes. Values out of range are errors:
 //!
 //! ```
 //! # use tandem_core::{Layout, Task};

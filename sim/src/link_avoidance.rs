@@ -1,9 +1,9 @@
 //! A velocity damper that keeps the links of two arms apart (Faverjon & Tournassoud 1987).
 //!
-//! The links are not rapier bodies: as bodies posed by inverse kinematics they would push with unlimited force. Instead,
-//! the desired velocity of each arm is limited along the normal of every close pair of capsules. The approach speed may
-//! be at most [`APPROACH_GAIN`] times the gap, and capsules that overlap must separate. The limit acts through the palm's
-//! bounded servo.
+//! The links are not rapier bodies: as bodies posed by inverse kinematics they would push with unlimited force.
+//! Instead, the desired velocity of each arm is limited along the normal of every close pair of capsules. The approach
+//! speed may be at most [`APPROACH_GAIN`] times the gap, and capsules that overlap must separate. The limit acts
+//! through the palm's bounded servo.
 //!
 //! Overlapping capsules keep the normal from before the overlap. When their axes cross, the direction between their
 //! closest points reverses; with the reversed normal the damper would pull the links through each other.
@@ -28,8 +28,8 @@ const INFLUENCE_DISTANCE_M: f32 = 0.08;
 const ACTIVATION_DISTANCE_M: f32 = 0.24;
 /// Distance between two axes below which the direction between them is undefined, metres.
 const CROSSING_M: f32 = 0.002;
-/// Lower bound on the norm of a limit's direction, as a fraction of the palm's motion. Without it, the palm would have to
-/// move very fast to displace a point that hardly follows it.
+/// Lower bound on the norm of a limit's direction, as a fraction of the palm's motion. Without it, the palm would have
+/// to move very fast to displace a point that hardly follows it.
 const MIN_DIRECTION_NORM: f32 = 0.3;
 /// Largest number of projections of a velocity before it is scaled down instead.
 const MAX_PROJECTIONS: usize = 12;

@@ -158,8 +158,8 @@ fn pipeline() -> PhysicsPipeline {
     pipeline
 }
 
-/// Returns parameters for bodies of centimetres. With rapier's defaults, which are for bodies of metres, a cube sinks into
-/// the table by a third of its size.
+/// Returns parameters for bodies of centimetres. With rapier's defaults, which are for bodies of metres, a cube sinks
+/// into the table by a third of its size.
 fn integration_parameters(config: &WorldConfig) -> IntegrationParameters {
     let softness = SpringCoefficients::new(200.0, 5.0);
     IntegrationParameters {

@@ -11,7 +11,8 @@ use crate::hand::{PAD_HALF_M, PALM_ABOVE_M, PALM_HALF_M, WRIST_ABOVE_M, WRIST_RA
 use crate::kinematics::ForwardKinematics;
 use crate::world::{TABLE_HALF_M, World};
 
-/// Iterations of the inverse kinematics from the joint angles at the start of a control step to the current hand position.
+/// Iterations of the inverse kinematics from the joint angles at the start of a control step to the current hand
+/// position.
 const ITERATIONS: usize = 20;
 
 /// Returns a snapshot of `world`, `time_s` after the start of the episode. `goal` has shape `[n_goal]`, arm frames; the

@@ -67,7 +67,8 @@ impl World {
         };
     }
 
-    /// Returns the smallest gap between the links of two arms during the last control step, metres; infinite for one arm.
+    /// Returns the smallest gap between the links of two arms during the last control step, metres; infinite for one
+    /// arm.
     pub(crate) fn link_gap_m(&self) -> f32 {
         self.damper.as_ref().map_or(f32::INFINITY, VelocityDamper::min_gap_m)
     }
@@ -133,7 +134,8 @@ impl World {
     }
 }
 
-/// Adds the table that `arm`'s hand and object collide with. Each arm has one, at the same place but rotated with the arm.
+/// Adds the table that `arm`'s hand and object collide with. Each arm has one, at the same place but rotated with the
+/// arm.
 ///
 /// rapier solves the contacts of a cube's four corners in an order that depends on the table's axes, which displaces a
 /// resting cube by a micrometre. With a table per arm, the cubes of the two arms are displaced in opposite directions,
