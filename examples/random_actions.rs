@@ -5,8 +5,8 @@
 use tandem_core::layout::EPISODE_STEPS;
 use tandem_core::reward::{achieved_goal, is_success, sparse_reward};
 use tandem_core::rng::uniform;
-use tandem_core::{Layout, Stream, Task, episode_rng};
-use tandem_sim::{Env, SimError, Starts, WorldConfig};
+use tandem_core::{Layout, Stream, Task, WorldSettings, episode_rng};
+use tandem_sim::{Env, SimError, WorldConfig};
 
 fn main() -> Result<(), SimError> {
     let layout = Layout::new(Task::Push, 2);
@@ -14,7 +14,7 @@ fn main() -> Result<(), SimError> {
     let mut observation = vec![0.0; layout.n_observation()];
     let mut action = vec![0.0; layout.n_action()];
     for episode in 0..10 {
-        env.reset(&mut episode_rng(1, episode, Stream::Reset), Starts::default());
+        env.reset(&mut episode_rng(1, episode, Stream::Reset), WorldSettings::default());
         let mut rng = episode_rng(1, episode, Stream::Exploration);
         let mut episode_return = 0.0;
         for _ in 0..EPISODE_STEPS {

@@ -4,9 +4,9 @@
 
 use tandem_core::layout::EPISODE_STEPS;
 use tandem_core::reward::is_success;
-use tandem_core::{Stream, episode_rng};
+use tandem_core::{Stream, WorldSettings, episode_rng};
 use tandem_policy::Policy;
-use tandem_sim::{Env, Starts, WorldConfig};
+use tandem_sim::{Env, WorldConfig};
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {
     let directory = concat!(env!("CARGO_MANIFEST_DIR"), "/policies");
@@ -17,7 +17,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let mut action = vec![0.0; policy.layout.n_action()];
     let mut n_successes = 0;
     for episode in 0..20 {
-        env.reset(&mut episode_rng(1, episode, Stream::Reset), Starts::default());
+        env.reset(&mut episode_rng(1, episode, Stream::Reset), WorldSettings::default());
         for _ in 0..EPISODE_STEPS {
             env.observe(&mut observation);
             actor.act(&observation, env.goal(), &mut action);

@@ -87,9 +87,9 @@
 //!
 //! # Modules in reading order
 //!
-//! [`layout`], [`reward`], [`rng`], [`episode`], [`evaluation`]; then [`work`] (what a learner assigns to workers),
-//! [`advice`] (queries to a teacher and its answers), [`bounds`] (plausible ranges of observations) and [`scene`]
-//! (snapshots for pictures and logs).
+//! [`layout`], [`reward`], [`rng`], [`episode`], [`evaluation`]; then [`settings`] and [`work`] (what a learner assigns
+//! to workers), [`advice`] (queries to a teacher and its answers), [`bounds`] (plausible ranges of observations),
+//! [`scene`] (snapshots for pictures and logs) and [`text`] (texts in messages).
 #![warn(missing_docs)]
 
 pub mod advice;
@@ -100,6 +100,8 @@ pub mod layout;
 pub mod reward;
 pub mod rng;
 pub mod scene;
+pub mod settings;
+pub mod text;
 pub mod work;
 
 pub use advice::{ArmAdvice, StepAdvice, StepQuery};
@@ -107,3 +109,4 @@ pub use episode::{Contacts, Episode, EpisodeKind};
 pub use evaluation::{EpisodeOutcome, EvaluationSummary, Wilson};
 pub use layout::{ArmIndex, Layout, Task};
 pub use rng::{Stream, episode_rng};
+pub use settings::{Exploration, WorldSettings};

@@ -2,6 +2,7 @@
 
 use crate::episode::EpisodeKind;
 use crate::layout::Layout;
+use crate::settings::{Exploration, WorldSettings};
 
 /// Settings that apply to every episode of a run.
 #[derive(Debug, Clone, PartialEq)]
@@ -13,29 +14,7 @@ pub struct RunTerms {
     /// Exploration in training episodes.
     pub exploration: Exploration,
     /// Initial states and physics.
-    pub world: WorldTerms,
-}
-
-/// Exploration in training episodes.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Exploration {
-    /// Standard deviation of the Gaussian noise added to every component of an action.
-    pub noise_std: f32,
-    /// Fraction of an arm's steps that take a random action, in [0, 1].
-    pub random_share: f32,
-    /// Mean number of consecutive steps for which a random action is kept; 1 draws a new one each step.
-    pub random_hold_mean_steps: f32,
-}
-
-/// How training episodes start and how finely all are simulated.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct WorldTerms {
-    /// Share of training episodes that start with the objects grasped (pick and place).
-    pub gripped_start_share: f32,
-    /// Share of training episodes that start with the hand anywhere above the table.
-    pub wide_start_share: f32,
-    /// Physics steps per control step of 0.04 s.
-    pub substeps: u32,
+    pub world: WorldSettings,
 }
 
 /// An episode to play.

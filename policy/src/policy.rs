@@ -1,10 +1,10 @@
 //! A policy: actor and critic, the normalisation of their inputs, and metadata.
 
 use std::collections::BTreeMap;
-use std::fmt::Write as _;
 
 use sha2::{Digest as _, Sha256};
 use tandem_core::Layout;
+use tandem_core::text::hex;
 use tandem_core::work::PublishedActor;
 
 use crate::error::Error;
@@ -148,10 +148,7 @@ impl Policy {
             hasher.update(tensor.name.as_bytes());
             hasher.update(little_endian(tensor.data));
         }
-        hasher.finalize().iter().fold(String::new(), |mut text, byte| {
-            write!(text, "{byte:02x}").expect("a string takes any text");
-            text
-        })
+        hex(&hasher.finalize())
     }
 }
 

@@ -1,7 +1,7 @@
 //! Configuration of the world, initial states of episodes, and errors.
 
 use serde::{Deserialize, Serialize};
-use tandem_core::Task;
+use tandem_core::{Task, WorldSettings};
 
 /// Duration of a control step in simulated time, seconds.
 pub const CONTROL_STEP_S: f32 = 0.04;
@@ -55,6 +55,12 @@ impl Default for WorldConfig {
     }
 }
 
+impl From<WorldSettings> for WorldConfig {
+    fn from(settings: WorldSettings) -> Self {
+        Self { substeps: settings.substeps, ..Self::default() }
+    }
+}
+
 impl WorldConfig {
     /// Returns the configuration if every value is in its range. NaN is in no range.
     ///
@@ -103,15 +109,6 @@ fn check(key: &'static str, value: f64, low: f64, high: f64) -> Result<(), SimEr
     }
 }
 
-/// How often training episodes start otherwise than evaluated ones. Shares of episodes, in [0, 1].
-#[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub struct Starts {
-    /// Share that starts with every object held by its arm, anywhere in reach. Pick and place only.
-    pub gripped_share: f32,
-    /// Share that starts with the hands anywhere in the lower workspace.
-    pub wide_share: f32,
-}
-
 /// An error of creating or stepping a world.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 #[non_exhaustive]
@@ -150,9 +147,9 @@ pub enum SimError {
     /// The physics step gave a NaN or infinite position or velocity.
     #[error("the {part} of arm {arm} has no finite position and velocity")]
     StateNotFinite {
-        /// Which body.
+        /// Name of the body.
         part: &'static str,
-        /// The arm it belongs to.
+        /// Index of its arm.
         arm: usize,
     },
 }

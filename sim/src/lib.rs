@@ -12,8 +12,8 @@
 //! ```
 //! use tandem_core::layout::EPISODE_STEPS;
 //! use tandem_core::reward::{achieved_goal, sparse_reward};
-//! use tandem_core::{Layout, Stream, Task, episode_rng, rng};
-//! use tandem_sim::{Env, Starts, WorldConfig};
+//! use tandem_core::{Layout, Stream, Task, WorldSettings, episode_rng, rng};
+//! use tandem_sim::{Env, WorldConfig};
 //!
 //! let layout = Layout::new(Task::Push, 2);
 //! let mut env = Env::new(layout, &WorldConfig::default())?;
@@ -21,7 +21,7 @@
 //! let mut action = vec![0.0; layout.n_action()];
 //!
 //! // The initial state depends on the seed (1), the episode (0) and the stream only.
-//! env.reset(&mut episode_rng(1, 0, Stream::Reset), Starts::default());
+//! env.reset(&mut episode_rng(1, 0, Stream::Reset), WorldSettings::default());
 //! let mut exploration = episode_rng(1, 0, Stream::Exploration);
 //! let mut episode_return = 0.0;
 //! for _ in 0..EPISODE_STEPS {
@@ -48,10 +48,10 @@
 //! An action of 1 along x moves the end effector away from the arm's base, for either arm:
 //!
 //! ```
-//! # use tandem_core::{Layout, Stream, Task, episode_rng};
-//! # use tandem_sim::{Env, Starts, WorldConfig};
+//! # use tandem_core::{Layout, Stream, Task, WorldSettings, episode_rng};
+//! # use tandem_sim::{Env, WorldConfig};
 //! let mut env = Env::new(Layout::new(Task::Push, 1), &WorldConfig::default())?;
-//! env.reset(&mut episode_rng(1, 0, Stream::Reset), Starts::default());
+//! env.reset(&mut episode_rng(1, 0, Stream::Reset), WorldSettings::default());
 //! let (mut before, mut after) = ([0.0; 28], [0.0; 28]);
 //! env.observe(&mut before);
 //! env.step(&[1.0, 0.0, 0.0])?;
@@ -65,8 +65,9 @@
 //!
 //! # Configuration
 //!
-//! [`WorldConfig`] sets the resolution of the physics, the objects and their friction. [`Starts`] sets how often
-//! training episodes begin in other states than evaluation episodes. Values out of range are errors:
+//! [`WorldConfig`] sets the resolution of the physics, the objects and their friction.
+//! [`WorldSettings`](tandem_core::WorldSettings), a section of the run file, sets how often training episodes start
+//! with grasped objects. Values out of range are errors:
 //!
 //! ```
 //! # use tandem_core::{Layout, Task};
@@ -104,5 +105,5 @@ mod scene;
 mod start;
 mod world;
 
-pub use config::{CONTROL_STEP_S, Friction, SimError, Starts, WorldConfig};
+pub use config::{CONTROL_STEP_S, Friction, SimError, WorldConfig};
 pub use env::Env;

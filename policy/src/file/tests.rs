@@ -1,6 +1,7 @@
 //! Round trips of policy files, and files that are refused.
 
 use std::error::Error as _;
+use std::fs;
 
 use super::*;
 
