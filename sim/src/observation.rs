@@ -5,8 +5,7 @@ use tandem_core::ArmIndex;
 use crate::config::CONTROL_STEP_S;
 use crate::world::World;
 
-/// Writes `arm`'s part of the observation, shape `[28]`, in the order that [`Env::observe`](crate::Env::observe)
-/// documents.
+/// Writes `arm`'s part of the observation, shape `[28]`, in the order that `Env::observe` documents.
 pub(crate) fn observe_arm(world: &World, arm: ArmIndex, observation: &mut [f32]) {
     let (state, object) = (&world.arms[arm.0], world.object(arm));
     let frame = state.frame;
