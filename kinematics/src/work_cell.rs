@@ -7,7 +7,7 @@ use std::f64::consts::{FRAC_PI_2, PI};
 
 use nalgebra::{Isometry3, Point3, Translation3, UnitQuaternion, Vector3};
 use tandem_core::ArmIndex;
-use tandem_core::layout::WORKSPACES_APART_M;
+use tandem_core::layout::WORKSPACE_DISTANCE_M;
 
 use crate::capsule::LinkCapsules;
 use crate::forward::ForwardKinematics;
@@ -56,7 +56,7 @@ impl WorkCell {
     /// Returns two Micos with four joints that face each other, the centres of their workspaces 0.24 m apart.
     #[must_use]
     pub fn mico_pair() -> Self {
-        let centres_apart_m = f64::from(WORKSPACES_APART_M);
+        let centres_apart_m = f64::from(WORKSPACE_DISTANCE_M);
         let task_frame = TaskFrame::MICO_4;
         let x_m = 0.5 * centres_apart_m + task_frame.centre_m;
         let arm = |x_m, yaw_rad| PlacedArm {
