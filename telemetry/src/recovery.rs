@@ -61,7 +61,7 @@ fn copy_readable(bytes: &[u8], file: File) -> mcap::McapResult<RecoveredCounts> 
         counts: RecoveredCounts::default(),
     };
     copy.counts.ended_by = Some(McapError::UnexpectedEof.to_string());
-    for record in Records::of_rest(bytes) {
+    for record in Records::of_partial(bytes) {
         let refused = match record {
             Ok(Record::DataEnd(_)) => {
                 copy.counts.ended_by = None;
