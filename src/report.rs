@@ -60,7 +60,7 @@ fn print(
     }
     let n_plots = files.plots.len();
     output::print(format_args!(
-        "report        {}; {n_plots} plots in the same directory",
+        "report        {}; plots in the same directory: {n_plots}",
         files.page.display()
     ))?;
     if let Some(path) = &args.csv {

@@ -66,8 +66,8 @@ pub struct SeedGroup {
 
 /// Groups runs that differ only in their seed.
 ///
-/// Runs with a configuration are compared by it, others by their name without the seed. Groups are sorted by task setup,
-/// then by their row in the paper's Table 2, then by label.
+/// Runs with a configuration are compared by it, others by their name without the seed. Groups are sorted by task
+/// setup, then by their row in the paper's Table 2, then by label.
 #[must_use]
 pub fn group_by_settings(runs: Vec<Run>) -> Vec<SeedGroup> {
     let mut keyed: Vec<(String, SeedGroup)> = Vec::new();

@@ -124,8 +124,8 @@ fn draw(
 
 /// Returns a group's curve.
 ///
-/// The band of a single run is its 95 % interval. Several runs are drawn as their mean, with a band from the smallest to
-/// the largest value. Rows are matched by environment steps; a point covers the runs that have a row there.
+/// The band of a single run is its 95 % interval. Several runs are drawn as their mean, with a band from the smallest
+/// to the largest value. Rows are matched by environment steps; a point covers the runs that have a row there.
 fn series(group: &SeedGroup, axis: Axis, quantity: Quantity) -> Series {
     if let [run] = group.runs.as_slice() {
         return Series::of(&group.label, &run.rows, axis, quantity);

@@ -1,9 +1,9 @@
 //! Telemetry of Tandem's services: typed events, metrics of runs, MCAP logs of episodes and trials, and results of
 //! trials.
 //!
-//! Foxglove opens the logs; `tandem replay` simulates recorded episodes again. The crate defines the layout of its files,
-//! and does not depend on what writes or reads them. It reads no clock: the times of an episode are simulated, and those
-//! of a run are arguments.
+//! Foxglove opens the logs; `tandem replay` simulates recorded episodes again. The crate defines the layout of its
+//! files, and does not depend on what writes or reads them. It reads no clock: the times of an episode are simulated,
+//! and those of a run are arguments.
 #![warn(missing_docs)]
 
 pub mod episode_log;

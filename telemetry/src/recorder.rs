@@ -45,8 +45,8 @@ pub struct TransitionRecord<'a> {
 
 /// Writes one episode to one MCAP file.
 ///
-/// The file is named `NAME.mcap.part` until [`finish`](Self::finish) renames it, so a file without that suffix is always
-/// complete. Message times are simulated time since the start of the episode.
+/// The file is named `NAME.mcap.part` until [`finish`](Self::finish) renames it, so a file without that suffix is
+/// always complete. Message times are simulated time since the start of the episode.
 pub struct EpisodeRecorder {
     layout: Layout,
     file: LogFile,

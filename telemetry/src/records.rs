@@ -4,8 +4,8 @@ use mcap::McapError;
 use mcap::records::{Record, op};
 use mcap::sans_io::linear_reader::{LinearReadEvent, LinearReader, LinearReaderOptions};
 
-/// Maximum size of a record or an uncompressed chunk. The reader allocates as much as a length field declares. Chunks of
-/// Tandem's logs have less than 1 MiB.
+/// Maximum size of a record or an uncompressed chunk. The reader allocates as much as a length field declares. Chunks
+/// of Tandem's logs have less than 1 MiB.
 const MAX_RECORD_BYTES: usize = 16 << 20;
 
 /// An iterator over the schemas, channels, messages, metadata and the end of the data of a file, in order and including

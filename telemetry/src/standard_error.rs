@@ -1,8 +1,8 @@
 //! Lines for standard error, written by a separate thread.
 //!
-//! Standard error may be a file on a full disk, or a pipe whose reader has stopped. Neither ends the process or blocks a
-//! thread that logs. Lines that cannot be written are dropped and counted; once writing works again, a line with the count
-//! replaces them.
+//! Standard error may be a file on a full disk, or a pipe whose reader has stopped. Neither ends the process or blocks
+//! a thread that logs. Lines that cannot be written are dropped and counted; once writing works again, a line with the
+//! count replaces them.
 
 use std::io::{self, ErrorKind, Write};
 use std::sync::{Arc, Condvar, LazyLock, Mutex, MutexGuard, PoisonError};

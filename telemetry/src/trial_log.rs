@@ -109,8 +109,8 @@ impl From<LogLevel> for Level {
 
 /// Writes one trial to one MCAP file.
 ///
-/// The file is named `NAME.mcap.part` until [`finish`](Self::finish) renames it, so a file without that suffix is always
-/// complete. Message times count from the start of the trial.
+/// The file is named `NAME.mcap.part` until [`finish`](Self::finish) renames it, so a file without that suffix is
+/// always complete. Message times count from the start of the trial.
 pub struct TrialRecorder {
     file: LogFile,
     channels: Channels,

@@ -47,8 +47,8 @@ impl Trails {
         }
     }
 
-    /// Returns the lines `planned{i}`, thin and pale, and `measured{i}`, thick, and a sphere at the planned position of each
-    /// tool.
+    /// Returns the lines `planned{i}`, thin and pale, and `measured{i}`, thick, and a sphere at the planned position of
+    /// each tool.
     pub(crate) fn entities(&self, planned: &[[f64; 3]], stamp: Timestamp) -> Vec<SceneEntity> {
         let lines = [(&self.planned, PLANNED), (&self.measured, MEASURED)];
         let mut entities: Vec<SceneEntity> = lines

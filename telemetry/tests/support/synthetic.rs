@@ -125,7 +125,8 @@ fn advice(step: u32, overridden: bool) -> ArmAdvice {
     }
 }
 
-/// Returns an arm with its hand at `hand`, pointing down. Shoulder and elbow are in the vertical plane of base and hand.
+/// Returns an arm with its hand at `hand`, pointing down. Shoulder and elbow are in the vertical plane of base and
+/// hand.
 fn arm(base: Point, hand: Point) -> ArmScene {
     let (upper_m, lower_m) = (0.41_f32, 0.38_f32);
     let shoulder = [base[0], base[1], base[2] + 0.27];

@@ -71,7 +71,8 @@ impl Marker {
         self.stroke_of(&arm_color(arm, 100), &arm_color(arm, 55))
     }
 
-    /// Planned paths are drawn over measured ones: darker, thinner and dashed, so that both are visible where they coincide.
+    /// Planned paths are drawn over measured ones: darker, thinner and dashed, so that both are visible where they
+    /// coincide.
     fn stroke_of(self, color: &str, dark: &str) -> String {
         match self {
             Self::Planned => {
