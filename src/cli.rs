@@ -76,6 +76,8 @@ pub(crate) enum Command {
     Mcap(McapArgs),
     /// Simulates recorded episodes again and compares them bit for bit.
     Replay(ReplayArgs),
+    /// Renders a step of an episode as an SVG picture.
+    Picture(PictureArgs),
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
@@ -148,8 +150,8 @@ pub(crate) struct TrainArgs {
     #[arg(long, value_name = "DIR")]
     pub(crate) out: Option<PathBuf>,
     /// Resumes the run in --out from its newest checkpoint. The settings and the teacher remain those of the run; only
-    /// its end (--max-env-steps, --max-minutes, --until-success), checkpoint.*, evaluation.recorded_episodes and
-    /// --workers can change. A rejected --resume changes nothing.
+    /// its end (--max-env-steps, --max-minutes, --until-success), checkpoint.*, evaluation.recorded_episodes,
+    /// evaluation.test_episodes and --workers can change. A rejected --resume changes nothing.
     #[arg(long, requires = "out")]
     pub(crate) resume: bool,
     /// Prints the summary as one JSON object on the last line of standard output.
@@ -338,8 +340,8 @@ pub(crate) struct LearnerArgs {
     /// Run directory.
     #[arg(long, value_name = "DIR")]
     pub(crate) out: PathBuf,
-    /// Resumes from the newest checkpoint. Only the settings stop.*, checkpoint.* and evaluation.recorded_episodes can
-    /// differ from those of the run.
+    /// Resumes from the newest checkpoint. Only the settings stop.*, checkpoint.*, evaluation.recorded_episodes and
+    /// evaluation.test_episodes can differ from those of the run.
     #[arg(long)]
     pub(crate) resume: bool,
     /// Writes the resolved settings to run.toml in the run directory.
@@ -547,4 +549,27 @@ pub(crate) enum McapCommand {
         #[arg(long, value_name = "FILE")]
         to: Option<PathBuf>,
     },
+}
+
+#[derive(Debug, Args)]
+#[command(after_help = "\
+Examples:
+  tandem picture --policy policies/student-push.safetensors --out arms.svg
+  tandem picture --composed-teachers policies/teacher-push.safetensors --step 20 --out arms.svg")]
+pub(crate) struct PictureArgs {
+    /// Policy that controls the arms.
+    #[arg(long, value_name = "FILE", required_unless_present = "composed_teachers")]
+    pub(crate) policy: Option<PathBuf>,
+    /// One-arm policy that controls both arms.
+    #[arg(long, value_name = "FILE", conflicts_with = "policy")]
+    pub(crate) composed_teachers: Option<PathBuf>,
+    /// Number of the episode, which determines start and goal.
+    #[arg(long, default_value_t = 777)]
+    pub(crate) seed: u64,
+    /// Control step to draw, 0 to 50.
+    #[arg(long, default_value_t = 12, value_parser = clap::value_parser!(u32).range(0..=50))]
+    pub(crate) step: u32,
+    /// Output file.
+    #[arg(long, value_name = "FILE.svg")]
+    pub(crate) out: PathBuf,
 }

@@ -12,13 +12,13 @@ mod bench;
 mod bridge;
 mod cli;
 mod clock;
-mod descriptors;
 mod eval;
 mod exit;
 mod files;
 mod health;
 mod input;
 mod output;
+mod picture;
 mod report;
 mod run_directory;
 mod run_file;
@@ -66,6 +66,7 @@ fn run() -> ExitCode {
         Command::Policy(args) => files::policy(&args),
         Command::Mcap(args) => files::mcap(&args),
         Command::Replay(args) => files::replay(&args),
+        Command::Picture(args) => picture::picture(&args),
     })
 }
 

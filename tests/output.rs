@@ -18,7 +18,7 @@ arms = 1
 advice.strategy = "none"
 rounds.slots = 2
 ddpg = { n_hidden = 16, n_hidden_layers = 1, batch_size = 32 }
-evaluation = { every_env_steps = 800, episodes = 4 }
+evaluation = { every_env_steps = 800, episodes = 4, test_episodes = 4 }
 stop.max_env_steps = 1600
 "#;
 
@@ -61,7 +61,7 @@ fn digest(output: &Output) -> String {
 fn a_result_that_cannot_be_written_is_told_in_one_line() {
     let directory = directory();
     let path = |name: &str| directory.path().join(name).to_str().expect("UTF-8").to_owned();
-    let (episode, mended) = (path("one.mcap"), path("mended.mcap"));
+    let (episode, mended, picture) = (path("one.mcap"), path("mended.mcap"), path("arms.svg"));
     let recorded =
         tandem(&["eval", "--policy", POLICY, "--episodes", "1", "--record", &episode]).output();
     assert!(recorded.expect("runs").status.success());
@@ -76,6 +76,7 @@ fn a_result_that_cannot_be_written_is_told_in_one_line() {
         &["replay", &episode],
         &["replay", &episode, "--verify", "--json"],
         &["mcap", "recover", &episode, "--to", &mended],
+        &["picture", "--policy", POLICY, "--out", &picture],
         &["sweep", "deploy/sweep-small.toml", "--dry-run"],
     ] {
         let ended = tandem(args).stdout(full()).output().expect("runs");

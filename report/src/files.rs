@@ -4,7 +4,7 @@ use std::io::ErrorKind;
 use std::path::Path;
 
 use serde::de::DeserializeOwned;
-use tandem_telemetry::read_regular;
+use tandem_system::regular_file;
 
 use crate::error::Error;
 
@@ -50,7 +50,7 @@ pub(crate) fn read_rows<T: DeserializeOwned>(
 
 /// Reads a regular file.
 pub(crate) fn read_bytes(path: &Path) -> Result<Vec<u8>, Error> {
-    read_regular(path).map_err(read_error(path))
+    regular_file::read(path).map_err(read_error(path))
 }
 
 /// Reads a text file, or returns `None` if it does not exist.
@@ -65,7 +65,7 @@ pub(crate) fn read_if_present(path: &Path) -> Result<Option<String>, Error> {
 /// Reads a text from a regular file.
 pub(crate) fn read_text(path: &Path) -> std::io::Result<String> {
     let not_utf8 = |_| std::io::Error::new(ErrorKind::InvalidData, "it is not UTF-8");
-    String::from_utf8(read_regular(path)?).map_err(not_utf8)
+    String::from_utf8(regular_file::read(path)?).map_err(not_utf8)
 }
 
 /// Writes `text` to `path`.

@@ -98,9 +98,10 @@ fn settings_key(run: &Run) -> String {
     for free in FREE_SETTINGS {
         settings.remove(free);
     }
-    // The number of recorded episodes does not affect results.
+    // These do not affect training. The intervals show the number of test episodes.
     if let Some(evaluation) = settings.get_mut("evaluation").and_then(Value::as_table_mut) {
         evaluation.remove("recorded_episodes");
+        evaluation.remove("test_episodes");
     }
     settings.to_string()
 }

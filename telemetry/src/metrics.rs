@@ -5,9 +5,9 @@ use std::io::Write as _;
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Deserializer, Serialize};
+use tandem_system::regular_file;
 
 use crate::error::Error;
-use crate::whole_file::read_regular;
 
 /// Metrics after one evaluation.
 ///
@@ -112,7 +112,7 @@ impl MetricsLog {
             .open(path)
             .map_err(Error::io("open", path))?;
         let log = Self { path: path.to_owned(), file };
-        let bytes = read_regular(path).map_err(Error::io("read", path))?;
+        let bytes = regular_file::read(path).map_err(Error::io("read", path))?;
         let (mut end, mut n_rows) = (0, 0);
         for row in rows {
             let line = encode_line(row).map_err(Error::io("compare", path))?;
@@ -171,7 +171,7 @@ struct Rows {
 
 impl Rows {
     fn read(path: &Path) -> Result<Self, Error> {
-        let bytes = read_regular(path).map_err(Error::io("read", path))?;
+        let bytes = regular_file::read(path).map_err(Error::io("read", path))?;
         let mut rows = Vec::new();
         let mut end = 0;
         for (line_idx, line) in bytes.split_inclusive(|byte| *byte == b'\n').enumerate() {

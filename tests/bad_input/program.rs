@@ -115,7 +115,7 @@ fn prepare(directory: &Path) {
 /// Command lines, the exit codes they end with, and a word of what is said. `@name` stands for a file or a directory
 /// of those prepared, `@empty/x` for a place that cannot be written, `%name` for a policy that ships, `BUSY` for an
 /// address that is taken.
-const CASES: [(&str, i32, &str); 75] = [
+const CASES: [(&str, i32, &str); 76] = [
     ("", 64, "Usage"),
     ("dance", 64, "dance"),
     ("--log [[ policy show %teacher-push", 64, "[["),
@@ -182,6 +182,7 @@ const CASES: [(&str, i32, &str); 75] = [
     ("replay @missing", 65, "missing"),
     ("replay @folder", 65, "no *.mcap"),
     ("replay @empty --verify", 65, "empty"),
+    ("picture --policy %teacher-push --out @empty/x.svg", 64, "x.svg"),
     ("bench dance", 64, "dance"),
     ("train --teacher /dev/zero", 65, "\"/dev/zero\": it is not a regular file"),
     ("train --run /dev/zero", 64, "it has more than 16 MiB"),

@@ -3,10 +3,8 @@
 use plotters::prelude::RGBColor;
 
 use crate::curve::INK;
+use crate::scene::arm_color;
 
-/// Colours of the arms and of their objects; further arms reuse them.
-const ARM_COLORS: [RGBColor; 3] =
-    [RGBColor(0x2f, 0x78, 0xbd), RGBColor(0xe0, 0x80, 0x33), RGBColor(0x3c, 0x9a, 0x66)];
 /// Dash pattern of planned paths.
 const DASHES: &str = "5 3";
 
@@ -49,14 +47,14 @@ impl Marker {
 
     /// Draws the marker of an arm at (`x`, `y`), pixels.
     pub(super) fn svg(self, arm: usize, x: f64, y: f64) -> String {
-        self.shape(&arm_color(arm, 100), &arm_color(arm, 55), x, y)
+        self.shape(&arm_color(arm, 1.0), &arm_color(arm, 0.55), x, y)
     }
 
     /// Draws the marker of the legend at (`x`, `y`), pixels.
     pub(super) fn legend_svg(self, x: f64, y: f64) -> String {
         let ink = hex(INK);
         match self {
-            Self::Arm(arm) => self.shape(&arm_color(arm, 100), &ink, x, y),
+            Self::Arm(arm) => self.shape(&arm_color(arm, 1.0), &ink, x, y),
             Self::Planned | Self::Measured => {
                 let (from, to) = (x - 8.5, x + 6.5);
                 let stroke = self.stroke_of(&ink, &ink);
@@ -68,7 +66,7 @@ impl Marker {
 
     /// Returns the stroke attributes of an arm's path.
     pub(super) fn stroke(self, arm: usize) -> String {
-        self.stroke_of(&arm_color(arm, 100), &arm_color(arm, 55))
+        self.stroke_of(&arm_color(arm, 1.0), &arm_color(arm, 0.55))
     }
 
     /// Planned paths are drawn over measured ones: darker, thinner and dashed, so that both are visible where they
@@ -115,16 +113,6 @@ impl Marker {
             Self::Planned | Self::Measured => String::new(),
         }
     }
-}
-
-/// Returns the colour of an arm for SVG, at `percent` of its brightness.
-pub(super) fn arm_color(arm: usize, percent: u16) -> String {
-    let RGBColor(red, green, blue) = ARM_COLORS[arm % ARM_COLORS.len()];
-    let [red, green, blue] = [red, green, blue].map(|channel| {
-        let scaled = (u16::from(channel) * percent + 50) / 100;
-        u8::try_from(scaled).unwrap_or(u8::MAX)
-    });
-    hex(RGBColor(red, green, blue))
 }
 
 /// Formats a colour for SVG.

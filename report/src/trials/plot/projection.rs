@@ -3,8 +3,9 @@
 use tandem_core::layout::GOAL_TOLERANCE_M;
 use tandem_telemetry::TrialRow;
 
-use super::marker::{Marker, arm_color, hex};
+use super::marker::{Marker, hex};
 use crate::curve::{FAINT_INK, GRID, INK};
+use crate::scene::arm_color;
 
 pub(super) const WIDTH_PX: f64 = 760.0;
 pub(super) const MARGIN_PX: f64 = 20.0;
@@ -173,7 +174,7 @@ impl Projection {
     pub(super) fn goal(&self, goal: [f64; 3], arm: usize) -> String {
         let (x, y) = self.point_px(goal);
         let radius = f64::from(GOAL_TOLERANCE_M) * self.scale;
-        let color = arm_color(arm, 100);
+        let color = arm_color(arm, 1.0);
         let cross = [
             line([x - 4.0, y], [x + 4.0, y], &color, 1.0),
             line([x, y - 4.0], [x, y + 4.0], &color, 1.0),
@@ -191,7 +192,7 @@ impl Projection {
         let Some((to_x, to_y)) = end.map(|end| self.point_px(end)) else { return start_marker };
         format!(
             r#"<line x1="{x:.1}" y1="{y:.1}" x2="{to_x:.1}" y2="{to_y:.1}" stroke="{}" stroke-width="1.2" stroke-dasharray="1 3"/>{start_marker}{}"#,
-            arm_color(arm, 80),
+            arm_color(arm, 0.8),
             Marker::ObjectEnd.svg(arm, to_x, to_y)
         )
     }
