@@ -1,15 +1,15 @@
-//! The connections over which workers join, by number, and how many of the joins are logged.
+//! The connections over which workers join, and a limit on log lines about joins.
 
 use std::collections::BTreeMap;
 use std::time::Duration;
 
 use tandem_net::Hangup;
 
-/// Log lines of one kind in a span of [`QUOTA_SPAN`].
+/// Log lines of one kind per [`QUOTA_SPAN`].
 const QUOTA: u64 = 100;
 const QUOTA_SPAN: Duration = Duration::from_secs(10);
 
-/// The open connections over which workers have joined. A relay's workers share one.
+/// The open connections over which workers have joined, by number. The workers of a relay share one.
 #[derive(Debug, Default)]
 pub(crate) struct Connections {
     n_ever: u64,
@@ -17,8 +17,8 @@ pub(crate) struct Connections {
 }
 
 impl Connections {
-    /// The number of a connection, and whether it is new here.
-    pub(crate) fn number_of(&mut self, hangup: &Hangup) -> (u64, bool) {
+    /// Returns the number of a connection, and true if the connection is new.
+    pub(crate) fn register(&mut self, hangup: &Hangup) -> (u64, bool) {
         if let Some((number, _)) = self.open.iter().rfind(|(_, known)| known.is_same(hangup)) {
             return (*number, false);
         }
@@ -27,39 +27,39 @@ impl Connections {
         (self.n_ever, true)
     }
 
-    /// Forgets a connection that has ended.
-    pub(crate) fn ended(&mut self, number: u64) {
+    /// Removes a closed connection.
+    pub(crate) fn remove(&mut self, number: u64) {
         self.open.remove(&number);
     }
 }
 
-/// Bounds how many log lines are written about what anybody can make happen.
+/// Limits the log lines about an event that any client can cause.
 #[derive(Debug, Default)]
 pub(crate) struct LogQuota {
     since: Option<Duration>,
     n: u64,
 }
 
-/// What to log about an occurrence.
+/// How to log one occurrence of an event.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) struct Lines {
-    /// Whether to log it.
-    pub(crate) this: bool,
-    /// How many before it were not logged, when that is to be told.
-    pub(crate) left_out: Option<u64>,
+pub(crate) struct LogDecision {
+    /// True if this occurrence is logged.
+    pub(crate) log: bool,
+    /// The number of earlier occurrences that were not logged, if it is to be logged now.
+    pub(crate) n_skipped: Option<u64>,
 }
 
 impl LogQuota {
     /// Counts an occurrence.
-    pub(crate) fn count(&mut self, now: Duration) -> Lines {
+    pub(crate) fn count(&mut self, now: Duration) -> LogDecision {
         let is_over = self.since.is_none_or(|since| now.saturating_sub(since) >= QUOTA_SPAN);
-        let mut left_out = None;
+        let mut n_skipped = None;
         if is_over {
-            left_out = self.n.checked_sub(QUOTA).filter(|n| *n > 0);
+            n_skipped = self.n.checked_sub(QUOTA).filter(|n| *n > 0);
             (self.since, self.n) = (Some(now), 0);
         }
         self.n += 1;
-        Lines { this: self.n <= QUOTA, left_out }
+        LogDecision { log: self.n <= QUOTA, n_skipped }
     }
 }
 
@@ -70,12 +70,12 @@ mod tests {
     #[test]
     fn ten_thousand_occurrences_are_a_hundred_lines_and_a_count() {
         let mut quota = LogQuota::default();
-        let lines: Vec<Lines> =
+        let lines: Vec<LogDecision> =
             (0..10_000).map(|n| quota.count(Duration::from_micros(n))).collect();
-        assert_eq!(lines.iter().filter(|lines| lines.this).count(), 100);
-        assert!(lines.iter().all(|lines| lines.left_out.is_none()));
+        assert_eq!(lines.iter().filter(|line| line.log).count(), 100);
+        assert!(lines.iter().all(|line| line.n_skipped.is_none()));
         let later = quota.count(QUOTA_SPAN);
-        assert_eq!(later, Lines { this: true, left_out: Some(9_900) });
-        assert_eq!(quota.count(2 * QUOTA_SPAN), Lines { this: true, left_out: None });
+        assert_eq!(later, LogDecision { log: true, n_skipped: Some(9_900) });
+        assert_eq!(quota.count(2 * QUOTA_SPAN), LogDecision { log: true, n_skipped: None });
     }
 }

@@ -5,7 +5,7 @@ use std::path::Path;
 
 use tandem_core::work::SlotOrder;
 use tandem_core::{Episode, EpisodeKind};
-use tandem_learner::{Ended, LearnerConfig};
+use tandem_learner::{LearnerConfig, RunOutcome};
 use tandem_proto::pb::learner_client::LearnerClient;
 use tandem_proto::{encode_episode, pb};
 use tokio::task::JoinHandle;
@@ -59,7 +59,7 @@ async fn run_of_a_liar(
     teacher: &FakeTeacher,
     asks: bool,
     lie: Lie,
-) -> (Ended, Vec<String>) {
+) -> (RunOutcome, Vec<String>) {
     let served = Served::start(config).await;
     let mut toy = served.join("liar").await;
     let warnings = follow(served.client().await);
@@ -68,7 +68,7 @@ async fn run_of_a_liar(
     (ended, warnings.await.expect("followed"))
 }
 
-fn spent(out: &Path, ended: &Ended) -> (u64, u64) {
+fn spent(out: &Path, ended: &RunOutcome) -> (u64, u64) {
     let rows = Left::behind(ended, out).rows;
     rows.last().map(|row| (row.advice_spent, row.budget_left)).expect("rows")
 }
@@ -157,7 +157,7 @@ async fn claims_that_contradict_themselves_are_refused_and_the_right_ones_taken(
         episode.advice_charged = 0;
     };
     refused(0, hides_arms, "expected 7, the steps with an advised arm, got 0").await;
-    let beyond = "expected at most 10, the units set aside for it, got 11";
+    let beyond = "expected at most 10, the units reserved for it, got 11";
     refused(1, |episode| claim(episode, 11), beyond).await;
     served.shutdown.cancel();
     served.end().await.expect("interrupted");
@@ -180,7 +180,7 @@ async fn arms_advised_where_nobody_was_asked_and_absurd_numbers_are_refused() {
     let all = [
         (
             arm,
-            "advised_arms: expected no advised arm, as nobody was to be asked, got 0b00000001 on step 3",
+            "advised_arms: expected no advised arm, as no advice was ordered, got 0b00000001 on step 3",
         ),
         (far, "observations[31]: expected a number in [-25, 25], got 1e29"),
         (goal, "goal[2]: expected a number in [-2, 2], got -3e38"),

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::net::SocketAddr;
 use std::time::Duration;
 
-use tandem_learner::{AfterTheEnd, Beside, serve_beside};
+use tandem_learner::{LingerPolicy, ServeOptions, serve_with};
 use tandem_proto::pb;
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tokio::net::{TcpListener, TcpStream};
@@ -58,10 +58,10 @@ async fn figures_say_who_waits_and_how_far_the_run_is_and_stay_after_its_end() {
     let address = listener.local_addr().expect("bound");
     let metrics = TcpListener::bind("127.0.0.1:0").await.expect("a port");
     let metrics_at = metrics.local_addr().expect("bound");
-    let beside = Beside { metrics: Some(metrics), after_the_end: AfterTheEnd::Stay };
+    let beside = ServeOptions { metrics: Some(metrics), linger: LingerPolicy::UntilShutdown };
     // Without lag no round is opened before the last is learned, so that the counts are what they are.
     let config = learner_config(toy::config(0), directory.path(), false);
-    let serving = tokio::spawn(serve_beside(config, listener, shutdown.clone(), beside));
+    let serving = tokio::spawn(serve_with(config, listener, shutdown.clone(), beside));
 
     let figures = comes_true(metrics_at, "tandem_assignments_waiting", 4.0).await;
     assert_eq!(figures["tandem_workers"], 0.0);

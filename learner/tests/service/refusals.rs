@@ -50,7 +50,7 @@ const WRONG: [(Spoil, &str); 17] = [
     (|m| m.episodes[1].parameter_version = 5, "episode 1: parameter_version: expected 0, got 5"),
     (
         |m| m.episodes[1].advice_charged = 1,
-        "episode 1: advice_charged: expected 0, as nobody was to be asked, got 1",
+        "episode 1: advice_charged: expected 0, as no advice was ordered, got 1",
     ),
     (|m| m.episodes.extend(m.episodes.clone()), "episodes: expected the 2 of slot 0, got 4"),
     (|m| m.episodes.clear(), "episodes: expected the 2 of slot 0, got 0"),

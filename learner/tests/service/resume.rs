@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use tandem_learner::checkpoint::{self, CheckpointError};
-use tandem_learner::{Ended, Error, LearnerConfig};
+use tandem_learner::{Error, LearnerConfig, RunOutcome};
 use tandem_rl::RunConfig;
 use tandem_telemetry::MetricsLog;
 use tempfile::TempDir;
@@ -12,7 +12,7 @@ use tempfile::TempDir;
 use crate::run::{Left, Served, calm, copy_all, learner_config, real_clock};
 use crate::toy::config;
 
-async fn resume(run: RunConfig, out: &Path) -> Result<Ended, Error> {
+async fn resume(run: RunConfig, out: &Path) -> Result<RunOutcome, Error> {
     Served::start(learner_config(run, out, true)).await.finish(2).await
 }
 
