@@ -92,7 +92,7 @@ fn train(n_rounds: u64) -> Trainer {
 }
 
 #[test]
-fn from_sparse_rewards_alone_the_goal_is_reached() {
+fn the_goal_is_reached_from_sparse_rewards_alone() {
     let before = success(&train(0));
     let trained = train(25);
     let after = success(&trained);

@@ -21,7 +21,7 @@ fn played(number: u64) -> Vec<Episode> {
 }
 
 /// A queue with `n_slots` training slots of one episode each and two workers.
-fn board_of(n_slots: u64) -> (WorkQueue, u64, u64) {
+fn queue_of(n_slots: u64) -> (WorkQueue, u64, u64) {
     let mut queue = WorkQueue::default();
     (0..n_slots).for_each(|number| queue.push(order(number, EpisodeKind::Training)));
     let (a, b) = (join(&mut queue, at(0)), join(&mut queue, at(0)));
@@ -32,7 +32,7 @@ fn join(queue: &mut WorkQueue, now: Duration) -> u64 {
     queue.join("w".to_owned(), None, now).expect("there is room")
 }
 
-fn given(queue: &mut WorkQueue, worker: u64, now: Duration) -> Option<u64> {
+fn next_slot(queue: &mut WorkQueue, worker: u64, now: Duration) -> Option<u64> {
     queue.next(worker, now).expect("joined").map(|order| order.slot)
 }
 
@@ -41,9 +41,12 @@ fn taken(queue: &mut WorkQueue) -> Vec<u64> {
 }
 
 #[test]
-fn episodes_come_back_in_order_whoever_was_first() {
-    let (mut queue, a, b) = board_of(2);
-    assert_eq!((given(&mut queue, a, at(0)), given(&mut queue, b, at(0))), (Some(0), Some(1)));
+fn episodes_are_taken_in_order_regardless_of_arrival() {
+    let (mut queue, a, b) = queue_of(2);
+    assert_eq!(
+        (next_slot(&mut queue, a, at(0)), next_slot(&mut queue, b, at(0))),
+        (Some(0), Some(1))
+    );
     assert_eq!(queue.submit(b, 1, played(1), at(1)), Ok(true));
     assert!(!queue.is_complete(EpisodeKind::Training, 0));
     assert_eq!(queue.submit(a, 0, played(0), at(1)), Ok(true));
@@ -52,13 +55,16 @@ fn episodes_come_back_in_order_whoever_was_first() {
 }
 
 #[test]
-fn the_slot_of_a_worker_that_hung_up_goes_to_the_next_at_once() {
-    let (mut queue, a, b) = board_of(3);
-    assert_eq!((given(&mut queue, a, at(0)), given(&mut queue, b, at(0))), (Some(0), Some(1)));
+fn a_disconnected_workers_slot_goes_to_the_next_worker_at_once() {
+    let (mut queue, a, b) = queue_of(3);
+    assert_eq!(
+        (next_slot(&mut queue, a, at(0)), next_slot(&mut queue, b, at(0))),
+        (Some(0), Some(1))
+    );
     assert!(queue.release_slot(a));
     assert!(!queue.release_slot(a), "it has no other");
     assert_eq!(queue.submit(b, 1, played(1), at(1)), Ok(true));
-    assert_eq!(given(&mut queue, b, at(1)), Some(0), "before slot 2, which was never given");
+    assert_eq!(next_slot(&mut queue, b, at(1)), Some(0), "before slot 2, which was never given");
     // It was only cut off, calls again and delivers: it is the first, and counts.
     assert_eq!(queue.submit(a, 0, played(0), at(2)), Ok(true));
     assert_eq!(queue.submit(b, 0, played(0), at(2)), Ok(false));
@@ -67,7 +73,7 @@ fn the_slot_of_a_worker_that_hung_up_goes_to_the_next_at_once() {
 }
 
 #[test]
-fn training_goes_before_evaluation() {
+fn training_comes_before_evaluation() {
     let mut queue = WorkQueue::default();
     queue.push(order(0, EpisodeKind::Evaluation));
     queue.push(order(7, EpisodeKind::Training));
@@ -77,11 +83,11 @@ fn training_goes_before_evaluation() {
 }
 
 #[test]
-fn a_slot_that_comes_twice_counts_once() {
-    let (mut queue, a, b) = board_of(1);
-    assert_eq!(given(&mut queue, a, at(0)), Some(0));
-    assert_eq!(given(&mut queue, b, at(1)), None, "too early to cover");
-    assert_eq!(given(&mut queue, b, at(4)), Some(0), "covers");
+fn a_slot_delivered_twice_counts_once() {
+    let (mut queue, a, b) = queue_of(1);
+    assert_eq!(next_slot(&mut queue, a, at(0)), Some(0));
+    assert_eq!(next_slot(&mut queue, b, at(1)), None, "too early to cover");
+    assert_eq!(next_slot(&mut queue, b, at(4)), Some(0), "covers");
     assert_eq!(queue.submit(b, 0, played(0), at(5)), Ok(true));
     assert_eq!(queue.submit(a, 0, played(0), at(6)), Ok(false));
     assert_eq!(taken(&mut queue), [0]);
@@ -90,79 +96,82 @@ fn a_slot_that_comes_twice_counts_once() {
 }
 
 #[test]
-fn a_dead_workers_slot_is_with_another_after_three_seconds() {
-    let (mut queue, a, b) = board_of(1);
-    given(&mut queue, a, at(0));
+fn a_dead_workers_slot_is_reassigned_after_three_seconds() {
+    let (mut queue, a, b) = queue_of(1);
+    next_slot(&mut queue, a, at(0));
     assert_eq!(queue.next_cover_in(Duration::from_millis(1200)), Some(Duration::from_millis(1800)));
     assert_eq!(queue.next_cover_in(at(9)), Some(Duration::ZERO));
-    assert_eq!(given(&mut queue, b, Duration::from_millis(2999)), None);
-    assert_eq!(given(&mut queue, b, COVER_AFTER), Some(0));
+    assert_eq!(next_slot(&mut queue, b, Duration::from_millis(2999)), None);
+    assert_eq!(next_slot(&mut queue, b, COVER_AFTER), Some(0));
     assert_eq!(queue.next_cover_in(COVER_AFTER), Some(COVER_AFTER), "the cover has its own time");
 }
 
 #[test]
-fn slots_that_all_take_long_are_not_covered_before_twice_that_time() {
-    let (mut queue, a, b) = board_of(2);
-    assert_eq!((given(&mut queue, a, at(0)), given(&mut queue, b, at(0))), (Some(0), Some(1)));
+fn slow_slots_are_reassigned_after_twice_their_mean_time() {
+    let (mut queue, a, b) = queue_of(2);
+    assert_eq!(
+        (next_slot(&mut queue, a, at(0)), next_slot(&mut queue, b, at(0))),
+        (Some(0), Some(1))
+    );
     assert_eq!(queue.submit(a, 0, played(0), at(5)), Ok(true));
     assert_eq!(queue.next_cover_in(at(5)), Some(at(5)));
-    assert_eq!(given(&mut queue, a, at(9)), None, "the other is as slow as this one");
-    assert_eq!(given(&mut queue, a, at(10)), Some(1), "the other is slower");
+    assert_eq!(next_slot(&mut queue, a, at(9)), None, "the other is as slow as this one");
+    assert_eq!(next_slot(&mut queue, a, at(10)), Some(1), "the other is slower");
 }
 
 #[test]
-fn a_silent_workers_slots_go_back_to_the_queue() {
-    let (mut queue, a, b) = board_of(1);
-    given(&mut queue, a, at(0));
-    given(&mut queue, b, at(2));
+fn a_silent_workers_slots_return_to_the_queue() {
+    let (mut queue, a, b) = queue_of(1);
+    next_slot(&mut queue, a, at(0));
+    next_slot(&mut queue, b, at(2));
     let silent = SilentWorker { worker_id: a, name: "w".into(), n_slots: 1 };
     assert_eq!(queue.reclaim(at(16)), [silent]);
     assert_eq!(queue.reclaim(at(16)), [], "told once");
-    assert_eq!(given(&mut queue, b, at(16)), Some(0));
+    assert_eq!(next_slot(&mut queue, b, at(16)), Some(0));
 }
 
 #[test]
-fn a_worker_that_was_taken_for_dead_still_delivers_and_counts_once() {
+fn a_worker_mistaken_for_dead_still_delivers_and_counts_once() {
     for someone_else_plays_it in [false, true] {
-        let (mut queue, a, b) = board_of(1);
-        given(&mut queue, a, at(0));
-        given(&mut queue, b, at(0));
+        let (mut queue, a, b) = queue_of(1);
+        next_slot(&mut queue, a, at(0));
+        next_slot(&mut queue, b, at(0));
         assert_eq!(queue.reclaim(at(20)).len(), 2);
         if someone_else_plays_it {
-            assert_eq!(given(&mut queue, b, at(20)), Some(0));
+            assert_eq!(next_slot(&mut queue, b, at(20)), Some(0));
         }
         assert_eq!(queue.submit(a, 0, played(0), at(21)), Ok(true));
         assert!(queue.is_complete(EpisodeKind::Training, 0));
         assert_eq!(queue.submit(b, 0, played(0), at(22)), Ok(false));
         assert_eq!(taken(&mut queue), [0]);
-        assert_eq!(given(&mut queue, a, at(23)), None, "it is in the run again");
+        assert_eq!(next_slot(&mut queue, a, at(23)), None, "it is in the run again");
     }
 }
 
 #[test]
-fn a_worker_that_never_delivers_holds_one_slot_and_not_for_long() {
-    let (mut queue, bad, good) = board_of(3);
+fn a_worker_that_never_delivers_holds_one_slot_for_a_short_time() {
+    let (mut queue, bad, good) = queue_of(3);
     for millis in 0..3000 {
-        assert_eq!(given(&mut queue, bad, Duration::from_millis(millis)), Some(0));
+        assert_eq!(next_slot(&mut queue, bad, Duration::from_millis(millis)), Some(0));
     }
     for slot in [1, 2] {
-        assert_eq!(given(&mut queue, good, at(1)), Some(slot));
+        assert_eq!(next_slot(&mut queue, good, at(1)), Some(slot));
         assert_eq!(queue.submit(good, slot, played(slot), at(1)), Ok(true));
     }
-    assert_eq!(given(&mut queue, bad, COVER_AFTER), Some(0));
-    assert_eq!(given(&mut queue, good, COVER_AFTER), Some(0), "however often the other asks");
+    assert_eq!(next_slot(&mut queue, bad, COVER_AFTER), Some(0));
+    assert_eq!(next_slot(&mut queue, good, COVER_AFTER), Some(0), "however often the other asks");
     assert_eq!(queue.submit(good, 0, played(0), at(4)), Ok(true));
     assert_eq!(taken(&mut queue), [0, 1, 2]);
 }
 
 #[test]
-fn a_thousand_workers_that_come_and_go_leave_nothing_behind() {
-    let (mut queue, _, _) = board_of(1000);
+fn a_thousand_short_lived_workers_leave_no_state_behind() {
+    let (mut queue, _, _) = queue_of(1000);
     for generation in 0..3 {
         let now = at(generation * 20);
         let ids: Vec<u64> = (0..1000).map(|_| join(&mut queue, now)).collect();
         for id in &ids {
-            assert!(given(&mut queue, *id, now).is_some());
+            assert!(next_slot(&mut queue, *id, now).is_some());
         }
         let n_slots: usize =
             queue.reclaim(now + SILENT_AFTER).iter().map(|silent| silent.n_slots).sum();
@@ -173,32 +182,32 @@ fn a_thousand_workers_that_come_and_go_leave_nothing_behind() {
     assert_eq!(queue.workers.len(), 0);
     let last = join(&mut queue, at(700));
     for slot in 0..1000 {
-        assert_eq!(given(&mut queue, last, at(700)), Some(slot));
+        assert_eq!(next_slot(&mut queue, last, at(700)), Some(slot));
         assert_eq!(queue.submit(last, slot, played(slot), at(700)), Ok(true));
     }
     assert_eq!(taken(&mut queue), (0..1000).collect::<Vec<_>>());
 }
 
 #[test]
-fn there_is_room_for_a_living_worker_as_long_as_others_are_silent() {
+fn a_live_worker_replaces_a_silent_one_in_a_full_run() {
     let mut queue = WorkQueue::default();
     queue.push(order(0, EpisodeKind::Training));
     let first = join(&mut queue, at(0));
-    given(&mut queue, first, at(0));
+    next_slot(&mut queue, first, at(0));
     for _ in 1..MAX_WORKERS {
         let worker = join(&mut queue, at(1));
-        given(&mut queue, worker, at(1));
+        next_slot(&mut queue, worker, at(1));
     }
     assert_eq!(queue.join("w".to_owned(), None, at(2)), Err(JoinError::RunFull));
     let newest = join(&mut queue, at(0) + SILENT_AFTER);
     assert_eq!(queue.workers.len(), MAX_WORKERS);
     assert_eq!((queue.n_waiting(), queue.n_assigned()), (1, 0), "its slot is free at once");
     assert_eq!(queue.next(first, at(16)), Err(SubmitError::UnknownWorker(first)));
-    assert_eq!(given(&mut queue, newest, at(16)), Some(0), "the forgotten worker's slot");
+    assert_eq!(next_slot(&mut queue, newest, at(16)), Some(0), "the forgotten worker's slot");
 }
 
 #[test]
-fn workers_that_join_and_never_ask_make_room_within_a_second_and_are_soon_forgotten() {
+fn workers_that_never_ask_for_work_are_replaced_after_a_second() {
     let mut queue = WorkQueue::default();
     for _ in 0..MAX_WORKERS {
         join(&mut queue, at(0));
@@ -217,7 +226,7 @@ fn workers_that_join_and_never_ask_make_room_within_a_second_and_are_soon_forgot
 }
 
 #[test]
-fn one_connection_cannot_take_the_places_of_others() {
+fn one_connection_cannot_crowd_out_others() {
     let mut queue = WorkQueue::default();
     let mut join_over = |connection, now| {
         let worker = queue.join("w".to_owned(), Some(connection), now).expect("there is room");
@@ -242,7 +251,7 @@ fn crowded_connection() -> (WorkQueue, Vec<u64>) {
     (0..2000).for_each(|number| queue.push(order(number, EpisodeKind::Training)));
     let workers = (0..MAX_UNPROVEN_PER_CONNECTION as u64).map(|slot| {
         let worker = queue.join("w".to_owned(), Some(1), at(0)).expect("there is room");
-        assert_eq!(given(&mut queue, worker, at(0)), Some(slot));
+        assert_eq!(next_slot(&mut queue, worker, at(0)), Some(slot));
         worker
     });
     let workers = workers.collect();
@@ -250,7 +259,7 @@ fn crowded_connection() -> (WorkQueue, Vec<u64>) {
 }
 
 #[test]
-fn workers_that_play_do_not_make_room_for_others_of_their_connection() {
+fn playing_workers_are_not_removed_for_others_of_their_connection() {
     let (mut queue, workers) = crowded_connection();
     assert_eq!(queue.join("w".to_owned(), Some(1), at(0)), Err(JoinError::ConnectionFull));
     assert!(queue.join("w".to_owned(), Some(2), at(0)).is_ok());
@@ -259,19 +268,19 @@ fn workers_that_play_do_not_make_room_for_others_of_their_connection() {
 }
 
 #[test]
-fn a_worker_makes_one_place_on_its_connection_however_often_it_delivers() {
+fn a_worker_frees_one_place_on_its_connection_regardless_of_deliveries() {
     let (mut queue, workers) = crowded_connection();
     for _ in 0..2 {
-        let slot = given(&mut queue, workers[0], at(1)).expect("a slot");
+        let slot = next_slot(&mut queue, workers[0], at(1)).expect("a slot");
         assert_eq!(queue.submit(workers[0], slot, played(slot), at(1)), Ok(true));
     }
     let newcomer = queue.join("w".to_owned(), Some(1), at(1)).expect("one has delivered");
-    assert!(given(&mut queue, newcomer, at(1)).is_some());
+    assert!(next_slot(&mut queue, newcomer, at(1)).is_some());
     assert_eq!(queue.join("w".to_owned(), Some(1), at(1)), Err(JoinError::ConnectionFull));
 }
 
 #[test]
-fn a_worker_that_delivered_only_what_was_in_already_has_delivered_nothing() {
+fn a_worker_that_only_repeated_deliveries_counts_as_unproven() {
     let (mut queue, workers) = crowded_connection();
     let other = join(&mut queue, at(1));
     assert_eq!(queue.submit(other, 0, played(0), at(1)), Ok(true));
@@ -281,7 +290,7 @@ fn a_worker_that_delivered_only_what_was_in_already_has_delivered_nothing() {
 }
 
 #[test]
-fn workers_that_are_forgotten_leave_their_places_on_the_connection_to_others() {
+fn removed_workers_free_their_places_on_the_connection() {
     let mut queue = WorkQueue::default();
     let mut join_one = |now| queue.join("w".to_owned(), Some(1), now).expect("there is room");
     let kept = join_one(at(0));
@@ -298,11 +307,11 @@ fn workers_that_are_forgotten_leave_their_places_on_the_connection_to_others() {
 }
 
 #[test]
-fn a_workers_episodes_are_counted_when_they_are_new() {
-    let (mut queue, a, b) = board_of(3);
+fn only_new_episodes_count_for_a_worker() {
+    let (mut queue, a, b) = queue_of(3);
     let n_episodes = |queue: &WorkQueue, id| queue.worker(id).expect("known").n_episodes;
     for slot in 0..3 {
-        assert_eq!(given(&mut queue, a, at(0)), Some(slot));
+        assert_eq!(next_slot(&mut queue, a, at(0)), Some(slot));
         assert_eq!(n_episodes(&queue, a), slot);
         assert_eq!(queue.submit(a, slot, played(slot), at(0)), Ok(true));
         assert_eq!(queue.submit(b, slot, played(slot), at(0)), Ok(false));
@@ -311,8 +320,8 @@ fn a_workers_episodes_are_counted_when_they_are_new() {
 }
 
 #[test]
-fn a_silent_worker_is_known_and_does_not_count_as_alive() {
-    let (mut queue, a, b) = board_of(0);
+fn a_silent_worker_is_listed_and_does_not_count_as_alive() {
+    let (mut queue, a, b) = queue_of(0);
     assert_eq!(queue.n_alive(at(14)), 2);
     assert_eq!(queue.next(b, at(14)), Ok(None));
     assert_eq!(queue.n_alive(at(15)), 1);
@@ -322,16 +331,16 @@ fn a_silent_worker_is_known_and_does_not_count_as_alive() {
 }
 
 #[test]
-fn a_worker_that_hangs_up_gives_back_no_slot_that_another_plays() {
-    let (mut queue, a, b) = board_of(1);
-    given(&mut queue, a, at(0));
-    assert_eq!(given(&mut queue, b, COVER_AFTER), Some(0), "covers");
+fn a_disconnected_worker_does_not_return_a_reassigned_slot() {
+    let (mut queue, a, b) = queue_of(1);
+    next_slot(&mut queue, a, at(0));
+    assert_eq!(next_slot(&mut queue, b, COVER_AFTER), Some(0), "covers");
     assert!(!queue.release_slot(a), "the slot is with the other");
     assert_eq!((queue.n_waiting(), queue.n_assigned()), (0, 1));
 }
 
 #[test]
-fn a_worker_of_an_earlier_start_is_unknown_to_a_later_one() {
+fn a_worker_of_an_earlier_start_is_unknown() {
     let earlier = join(&mut WorkQueue::default(), at(0));
     let mut queue = WorkQueue::default();
     queue.start_workers_at(4096);
@@ -341,7 +350,7 @@ fn a_worker_of_an_earlier_start_is_unknown_to_a_later_one() {
 }
 
 #[test]
-fn a_full_board_takes_a_place_from_the_connection_that_has_most() {
+fn a_full_queue_removes_a_worker_of_the_largest_connection() {
     let mut queue = WorkQueue::default();
     for n in 0..MAX_WORKERS {
         let connection = if n < 9_990 { n as u64 / 1000 } else { 100 + n as u64 };
@@ -368,13 +377,13 @@ fn joins_end_with_their_connection() {
     let joined: Vec<u64> =
         (0..3).map(|_| queue.join("w".to_owned(), Some(7), at(0)).expect("room")).collect();
     let other = queue.join("w".to_owned(), Some(8), at(0)).expect("room");
-    assert_eq!(given(&mut queue, joined[0], at(0)), Some(0));
-    assert_eq!(given(&mut queue, joined[1], at(0)), None);
+    assert_eq!(next_slot(&mut queue, joined[0], at(0)), Some(0));
+    assert_eq!(next_slot(&mut queue, joined[1], at(0)), None);
     assert_eq!(queue.remove_connection(7), [joined[0]], "it had a slot");
     assert_eq!(queue.next(joined[2], at(0)), Err(SubmitError::UnknownWorker(joined[2])));
-    assert_eq!(given(&mut queue, other, at(0)), Some(0));
+    assert_eq!(next_slot(&mut queue, other, at(0)), Some(0));
     // Those that were only cut off call again over another connection.
-    assert_eq!(given(&mut queue, joined[1], at(0)), None);
+    assert_eq!(next_slot(&mut queue, joined[1], at(0)), None);
     assert_eq!(queue.submit(joined[0], 0, played(0), at(1)), Ok(true));
     assert_eq!(queue.remove_connection(7), [0; 0], "that is known");
     assert_eq!(queue.remove_connection(99), [0; 0], "a strange one");
@@ -391,14 +400,14 @@ fn advised(charged: u32, advised_arms: &[u8]) -> (SlotOrder, Vec<Episode>) {
 }
 
 #[test]
-fn claims_of_advice_that_cannot_be_true_are_refused_by_name() {
+fn impossible_claims_of_advice_are_refused_by_name() {
     let check = |charged, arms: &[u8], told: &str| {
         let (ordered, episodes) = advised(charged, arms);
         let mut queue = WorkQueue::default();
         queue.push(ordered);
         queue.limit_claims([(0, 3)]);
         let worker = join(&mut queue, at(0));
-        given(&mut queue, worker, at(0));
+        next_slot(&mut queue, worker, at(0));
         let told_now = queue.submit(worker, 0, episodes.clone(), at(0)).map_err(|e| e.to_string());
         match told {
             "" => assert_eq!(told_now, Ok(true), "{charged} for {arms:?}"),
@@ -414,7 +423,7 @@ fn claims_of_advice_that_cannot_be_true_are_refused_by_name() {
 }
 
 #[test]
-fn a_lease_bounds_the_claim_until_it_is_lifted_or_its_episode_is_in() {
+fn a_lease_limits_the_claim_of_its_episode_until_delivery() {
     let (ordered, episodes) = advised(4, &[1; 4]);
     let mut queue = WorkQueue::default();
     queue.push(ordered);
@@ -429,9 +438,9 @@ fn a_lease_bounds_the_claim_until_it_is_lifted_or_its_episode_is_in() {
 }
 
 #[test]
-fn what_was_not_ordered_is_refused_by_name_and_nothing_of_it_is_used() {
-    let (mut queue, a, _) = board_of(1);
-    assert_eq!(given(&mut queue, a, at(0)), Some(0));
+fn episodes_that_do_not_match_the_order_are_refused_by_name() {
+    let (mut queue, a, _) = queue_of(1);
+    assert_eq!(next_slot(&mut queue, a, at(0)), Some(0));
     let mut check = |slot, spoil: fn(&mut Vec<Episode>), message: &str| {
         let mut episodes = played(0);
         spoil(&mut episodes);

@@ -107,7 +107,7 @@ async fn play_until_warned(toy: &mut Toy, is_awaited: impl Fn(&str) -> bool) -> 
 const TO_THE_FIRST_CHECKPOINT: usize = 14;
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_full_disk_is_told_of_and_nothing_is_lost_when_there_is_room_again() {
+async fn a_full_disk_is_reported_and_nothing_is_lost_once_there_is_room() {
     let Some(disk) = SmallDisk::mount() else {
         println!("{SKIPPED}");
         return;
@@ -153,7 +153,7 @@ async fn a_disk_that_stays_full_ends_the_run_with_an_error_and_it_can_be_resumed
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_disk_that_becomes_read_only_is_told_of_and_written_to_when_it_is_well_again() {
+async fn a_read_only_disk_is_reported_and_written_once_it_recovers() {
     let Some(disk) = SmallDisk::mount() else {
         println!("{SKIPPED}");
         return;
@@ -181,7 +181,7 @@ async fn a_disk_that_becomes_read_only_is_told_of_and_written_to_when_it_is_well
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn files_that_cannot_be_made_are_made_when_what_is_in_their_way_is_gone() {
+async fn blocked_files_are_written_once_the_obstacle_is_gone() {
     let expected = calm(config(0)).await;
     let directory = tempfile::tempdir().expect("a directory");
     let out = directory.path();
@@ -199,7 +199,7 @@ async fn files_that_cannot_be_made_are_made_when_what_is_in_their_way_is_gone() 
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_learner_writes_nothing_to_a_directory_that_has_taken_its_place() {
+async fn a_learner_writes_nothing_to_a_replaced_run_directory() {
     let expected = calm(config(0)).await;
     let keep = tempfile::tempdir().expect("a directory");
     let (out, moved) = (keep.path().join("run"), keep.path().join("moved"));

@@ -103,7 +103,7 @@ async fn a_claim_that_the_teachers_account_contradicts_is_reported_and_the_accou
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_run_resumed_after_false_claims_goes_on_with_its_account() {
+async fn a_run_resumed_after_false_claims_continues_with_its_account() {
     let directory = tempfile::tempdir().expect("a directory");
     let (out, teacher) = (directory.path(), FakeTeacher::default());
     let address = teacher.serve().await;
@@ -124,7 +124,7 @@ async fn a_run_resumed_after_false_claims_goes_on_with_its_account() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn claims_that_contradict_themselves_are_refused_and_the_right_ones_taken() {
+async fn contradictory_claims_are_refused_and_true_ones_accepted() {
     let teacher = FakeTeacher::default();
     let directory = tempfile::tempdir().expect("a directory");
     // Enough for the first episode of a round and a part of the second.
@@ -164,7 +164,7 @@ async fn claims_that_contradict_themselves_are_refused_and_the_right_ones_taken(
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn arms_advised_where_nobody_was_asked_and_absurd_numbers_are_refused() {
+async fn advice_without_an_order_and_absurd_numbers_are_refused() {
     let expected = calm(config(0)).await;
     let directory = tempfile::tempdir().expect("a directory");
     let served = Served::start(learner_config(config(0), directory.path(), false)).await;
@@ -216,7 +216,7 @@ async fn join_by(client: &mut LearnerClient<Channel>) -> Result<u64, Status> {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn ten_thousand_joins_keep_nobody_out() {
+async fn ten_thousand_joins_do_not_keep_other_workers_out() {
     let expected = calm(config(0)).await;
     let directory = tempfile::tempdir().expect("a directory");
     let served = Served::start(learner_config(config(0), directory.path(), false)).await;
@@ -276,7 +276,7 @@ async fn resume(
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn an_honest_run_raises_no_alarm_wherever_it_is_resumed() {
+async fn an_honest_run_raises_no_warning_wherever_it_is_resumed() {
     // With a budget that runs out, and with one that does not.
     for (lag, budget) in [(0, 150), (1, 150), (0, BUDGET), (1, BUDGET)] {
         let keep = tempfile::tempdir().expect("a directory");

@@ -51,7 +51,7 @@ async fn comes_true(address: SocketAddr, name: &str, expected: f64) -> BTreeMap<
 }
 
 #[tokio::test]
-async fn figures_say_who_waits_and_how_far_the_run_is_and_stay_after_its_end() {
+async fn metrics_follow_the_run_and_stay_after_its_end() {
     let directory = tempfile::tempdir().expect("a directory");
     let shutdown = CancellationToken::new();
     let listener = TcpListener::bind("127.0.0.1:0").await.expect("a port");

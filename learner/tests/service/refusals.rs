@@ -104,7 +104,7 @@ async fn a_wrong_message_is_refused_by_name_and_changes_nothing() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn workers_that_cannot_take_part_are_told_why() {
+async fn workers_that_cannot_join_get_the_reason() {
     let directory = tempfile::tempdir().expect("a directory");
     let served = Served::start(learner_config(config(0), directory.path(), false)).await;
     let mut toy = served.join("").await;

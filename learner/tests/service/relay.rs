@@ -161,7 +161,7 @@ async fn parameters(
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_version_is_fetched_once_however_many_ask() {
+async fn a_version_is_fetched_once_for_all_workers() {
     let fake = Fake::default();
     fake.n_versions.store(5, Ordering::SeqCst);
     let (address, _relay) = relay(fake.serve().await).await;
@@ -180,7 +180,7 @@ async fn a_version_is_fetched_once_however_many_ask() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn what_a_learner_does_not_have_is_asked_for_again() {
+async fn a_failed_fetch_is_repeated() {
     let fake = Fake::default();
     let (address, _relay) = relay(fake.serve().await).await;
     let client = client(address).await;
@@ -191,7 +191,7 @@ async fn what_a_learner_does_not_have_is_asked_for_again() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn nothing_of_a_former_learner_is_handed_out() {
+async fn parameters_of_a_former_learner_are_dropped() {
     let fake = Fake::default();
     fake.n_versions.store(1, Ordering::SeqCst);
     let (address, _relay) = relay(fake.serve().await).await;
@@ -207,7 +207,7 @@ async fn nothing_of_a_former_learner_is_handed_out() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn refusals_are_passed_on_and_another_version_is_refused() {
+async fn refusals_are_forwarded_and_another_version_is_refused() {
     let fake = Fake::default();
     let (address, _relay) = relay(fake.serve().await).await;
     let mut client = client(address).await;
@@ -224,7 +224,7 @@ async fn refusals_are_passed_on_and_another_version_is_refused() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_learner_that_is_away_is_said_to_be() {
+async fn an_absent_learner_is_reported() {
     let (listener, nobody) = bound().await;
     drop(listener);
     let (address, _relay) = relay(nobody).await;

@@ -67,12 +67,12 @@ async fn check_every_moment(run: RunConfig, step: usize) {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_learner_killed_at_any_moment_goes_on_to_the_same_bits() {
+async fn a_learner_killed_at_any_moment_ends_with_the_same_bits() {
     check_every_moment(config(0), 3).await;
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_learner_a_round_ahead_killed_at_any_moment_goes_on_to_the_same_bits() {
+async fn a_learner_with_lag_killed_at_any_moment_ends_with_the_same_bits() {
     check_every_moment(config(1), 3).await;
 }
 
@@ -91,7 +91,7 @@ async fn a_run_that_ends_with_a_success_rate_ends_with_the_same_one_when_resumed
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_run_interrupted_again_and_again_goes_on_to_the_same_bits() {
+async fn a_run_interrupted_repeatedly_ends_with_the_same_bits() {
     for lag in [0, 1] {
         let expected = calm(config(lag)).await;
         let directory = tempfile::tempdir().expect("a directory");

@@ -260,7 +260,7 @@ impl Both {
 }
 
 #[test]
-fn whatever_happens_every_episode_comes_once_and_in_order() {
+fn every_episode_is_taken_once_and_in_order() {
     let mut runner =
         TestRunner::new(Config { failure_persistence: None, ..Config::with_cases(300) });
     let lives = proptest::collection::vec(happening(), 0..150);
