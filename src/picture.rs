@@ -1,6 +1,7 @@
 //! `tandem picture`: the arms at work, as an SVG picture.
 
-use tandem_core::{Stream, WorldSettings, episode_rng};
+use tandem_core::WorldSettings;
+use tandem_core::rng::{Stream, episode_rng};
 use tandem_report::View;
 use tandem_sim::{Env, WorldConfig};
 

@@ -13,6 +13,7 @@ pub mod reward;
 pub mod rng;
 pub mod scene;
 pub mod settings;
+pub mod text;
 pub mod work;
 
 pub use advice::{ArmAdvice, StepAdvice, StepQuery};

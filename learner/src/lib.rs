@@ -4,17 +4,14 @@
 //! are or how a teacher decides.
 //!
 //! Reading order: [`work_queue`] (the assignment of slots to workers), [`evaluation_store`] (results of evaluations),
-//! [`checkpoint`], [`settings`] (settings that a resumed run keeps), [`lock`] (the lock on a run directory), [`atomic`]
-//! (files that are replaced as a whole), [`service`] (the gRPC service, next to the learning thread), [`relay`] (a proxy
-//! between a learner and many workers).
+//! [`checkpoint`], [`settings`] (settings that a resumed run keeps), [`service`] (the gRPC service, next to the learning
+//! thread), [`relay`] (a proxy between a learner and many workers).
 #![warn(missing_docs)]
 
 mod advice_account;
-pub mod atomic;
 pub mod checkpoint;
 mod error;
 pub mod evaluation_store;
-pub mod lock;
 mod metrics;
 mod progress;
 pub mod relay;

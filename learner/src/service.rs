@@ -11,6 +11,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use tandem_core::Episode;
+use tandem_core::text::error_chain;
 use tandem_net::{Hangup, Incoming, Page, Prepared};
 use tandem_proto::pb;
 use tandem_proto::pb::learner_server::{Learner, LearnerServer};
@@ -182,7 +183,9 @@ fn learn(
     let run = AssertUnwindSafe(|| training_loop::run(context));
     let outcome = std::panic::catch_unwind(run).unwrap_or(Err(Error::Panicked));
     let end = RunEnd {
-        reason: outcome.as_ref().map_or_else(with_causes, |outcome| outcome.reason.clone()),
+        reason: outcome
+            .as_ref()
+            .map_or_else(|error| error_chain(error), |outcome| outcome.reason.clone()),
         interrupted: !is_complete(&outcome),
         digest: outcome.as_ref().ok().map(|outcome| outcome.digest.clone()),
     };
@@ -190,20 +193,6 @@ fn learn(
     shared.work.notify_waiters();
     shared.progress.send_modify(|progress| progress.end = Some(end));
     outcome
-}
-
-/// Returns an error and its causes on one line.
-fn with_causes(error: &Error) -> String {
-    let mut line = error.to_string();
-    let mut cause = std::error::Error::source(error);
-    while let Some(inner) = cause {
-        let text = inner.to_string();
-        if !line.contains(&text) {
-            line = format!("{line}: {text}");
-        }
-        cause = inner.source();
-    }
-    line
 }
 
 /// Waits for the end of a connection and returns the slots of its workers to the queue, so that a round does not wait

@@ -5,8 +5,10 @@ use std::fmt;
 use serde_json::Value;
 use tandem_rl::config::{RunConfig, former_keys};
 
-/// Settings that may change when a run resumes: its limits, and what is saved and logged. All others affect learning.
-const FREE: [&str; 3] = ["stop.", "checkpoint.", "evaluation.recorded_episodes"];
+/// Settings that may change when a run resumes: its limits, and what is saved, logged and tested. All others affect
+/// learning.
+const FREE: [&str; 4] =
+    ["stop.", "checkpoint.", "evaluation.recorded_episodes", "evaluation.test_episodes"];
 
 /// A setting that differs from the one that the run started with.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -27,8 +29,8 @@ impl fmt::Display for Changed {
 }
 
 /// Advice about a setting that differs.
-pub const ADVICE: &str = "only stop.*, checkpoint.* and evaluation.recorded_episodes may change when a run is resumed: \
-                          use the value that it started with, or start a new run";
+pub const ADVICE: &str = "only stop.*, checkpoint.*, evaluation.recorded_episodes and evaluation.test_episodes may \
+                          change when a run is resumed: keep the original value, or start a new run";
 
 /// Returns the settings as one JSON object, with the shortest form of each number.
 #[must_use]
@@ -122,6 +124,7 @@ mod tests {
         changed.checkpoint.every_rounds = 7;
         changed.checkpoint.keep = 9;
         changed.evaluation.recorded_episodes = 0;
+        changed.evaluation.test_episodes = 1;
         assert_eq!(first_change(&changed, &to_json(&config())).expect("JSON"), None);
     }
 

@@ -135,12 +135,14 @@ pub enum PolyakEvery {
 pub struct EvaluationConfig {
     /// Environment steps between two evaluations.
     pub every_env_steps: u64,
-    /// Fixed goals per evaluation, 1 to 10,000 (paper: 240).
+    /// Fixed goals per evaluation, 1 to 100,000 (paper: 240).
     pub episodes: u64,
     /// Seed of the goals with which a run selects its best policy. Reports use another one.
     pub seed: u64,
     /// Number of episodes of an evaluation that are logged.
     pub recorded_episodes: u64,
+    /// Test goals on which the best policy is measured once the run has ended, 1 to 100,000.
+    pub test_episodes: u64,
 }
 
 /// Section `[stop]`: a run ends at the first of these limits; 0 means no limit.

@@ -10,6 +10,7 @@ use tandem_core::Episode;
 use tandem_core::episode::EpisodeKind;
 use tandem_core::layout::{EPISODE_STEPS, Layout, OBJECT_POSITION};
 use tandem_core::rng::{Stream, coin, episode_rng, index};
+use tandem_core::text::hex;
 use tandem_core::work::{EpisodeOrder, PublishedActor, SlotOrder};
 use tandem_policy::{Normalizer, NormalizerSnapshot, Policy};
 
@@ -324,7 +325,7 @@ impl Trainer {
         {
             hash.update(count.to_le_bytes());
         }
-        hash.finalize().iter().map(|byte| format!("{byte:02x}")).collect()
+        hex(&hash.finalize())
     }
 
     /// Returns the large float vectors of the state by name, in a fixed order.

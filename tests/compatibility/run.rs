@@ -83,7 +83,8 @@ fn a_run_resumes_and_ends_with_the_same_counts() {
         let run: PathBuf = directory.path().join("run");
         copy_directory(&version.join("run"), &run);
         let output = Command::new(env!("CARGO_BIN_EXE_tandem"))
-            .args(["train", "--resume", "--json", "--workers", "1", "--out"])
+            .args(["train", "--resume", "--json", "--workers", "1"])
+            .args(["--set", "evaluation.test_episodes=8", "--out"])
             .arg(&run)
             .output()
             .expect("runs");

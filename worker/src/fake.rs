@@ -115,9 +115,10 @@ impl<F: Fn(u64, u32, usize) -> bool> FakeTeacher<F> {
 }
 
 impl<F: Fn(u64, u32, usize) -> bool> Advisor for FakeTeacher<F> {
-    fn advise(&mut self, queries: &[StepQuery]) -> Result<Vec<StepAdvice>, AdvisorGone> {
-        self.questions.push(queries.to_vec());
-        Ok(queries.iter().map(|query| self.verdict(query)).collect())
+    fn advise(&mut self, queries: Vec<StepQuery>) -> Result<Vec<StepAdvice>, AdvisorGone> {
+        let answers = queries.iter().map(|query| self.verdict(query)).collect();
+        self.questions.push(queries);
+        Ok(answers)
     }
 }
 

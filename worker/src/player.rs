@@ -111,11 +111,9 @@ impl Questions {
 }
 
 impl Advisor for Questions {
-    fn advise(&mut self, queries: &[StepQuery]) -> Result<Vec<StepAdvice>, AdvisorGone> {
+    fn advise(&mut self, queries: Vec<StepQuery>) -> Result<Vec<StepAdvice>, AdvisorGone> {
         let (answer, answered) = oneshot::channel();
-        self.0
-            .blocking_send(Question { queries: queries.to_vec(), answer })
-            .map_err(|_unsent| AdvisorGone)?;
+        self.0.blocking_send(Question { queries, answer }).map_err(|_unsent| AdvisorGone)?;
         answered.blocking_recv().map_err(|_closed| AdvisorGone)
     }
 }

@@ -23,7 +23,7 @@ pub trait Advisor {
     ///
     /// # Errors
     /// When no answer will come any more, because the worker is stopping.
-    fn advise(&mut self, queries: &[StepQuery]) -> Result<Vec<StepAdvice>, AdvisorGone>;
+    fn advise(&mut self, queries: Vec<StepQuery>) -> Result<Vec<StepAdvice>, AdvisorGone>;
 }
 
 /// No answer will come any more.
@@ -36,7 +36,7 @@ pub struct AdvisorGone;
 pub struct NoAdvisor;
 
 impl Advisor for NoAdvisor {
-    fn advise(&mut self, _queries: &[StepQuery]) -> Result<Vec<StepAdvice>, AdvisorGone> {
+    fn advise(&mut self, _queries: Vec<StepQuery>) -> Result<Vec<StepAdvice>, AdvisorGone> {
         Err(AdvisorGone)
     }
 }

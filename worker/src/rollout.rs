@@ -97,8 +97,8 @@ fn take_advice<W: World>(
     };
     let first_number = first.episode.number;
     let queries: Vec<StepQuery> = advised.iter().map(|rollout| rollout.query(step_idx)).collect();
-    let answers = advisor.advise(&queries)?;
-    check_count(first_number, step_idx, "steps", answers.len(), queries.len())?;
+    let answers = advisor.advise(queries)?;
+    check_count(first_number, step_idx, "steps", answers.len(), advised.len())?;
     for (rollout, advice) in advised.iter_mut().zip(&answers) {
         rollout.follow(advice, step_idx)?;
     }
@@ -358,7 +358,7 @@ mod tests {
     }
 
     impl Advisor for Says {
-        fn advise(&mut self, queries: &[StepQuery]) -> Result<Vec<StepAdvice>, AdvisorGone> {
+        fn advise(&mut self, queries: Vec<StepQuery>) -> Result<Vec<StepAdvice>, AdvisorGone> {
             let mut teacher = FakeTeacher::new(|_, _, _| self.overridden);
             let answers = teacher.advise(queries)?.into_iter();
             Ok(answers.map(|advice| StepAdvice { charged: self.charged, ..advice }).collect())
@@ -395,7 +395,7 @@ mod tests {
     fn advice_about_other_steps_is_an_error() {
         struct Mute;
         impl Advisor for Mute {
-            fn advise(&mut self, _queries: &[StepQuery]) -> Result<Vec<StepAdvice>, AdvisorGone> {
+            fn advise(&mut self, _queries: Vec<StepQuery>) -> Result<Vec<StepAdvice>, AdvisorGone> {
                 Ok(Vec::new())
             }
         }

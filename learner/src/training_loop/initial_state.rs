@@ -5,6 +5,7 @@ use std::path::Path;
 use tandem_core::work::{PublishedActor, RunTerms};
 use tandem_proto::pb;
 use tandem_rl::trainer::Trainer;
+use tandem_system::atomic_file;
 use tandem_telemetry::events::RunResumed;
 
 use super::evaluations::Evaluations;
@@ -13,7 +14,6 @@ use super::progress_publisher::ProgressPublisher;
 use super::run_lock::RunLock;
 use super::{Context, LearnerLoop, UNITS_PER_EPISODE};
 use crate::advice_account::{AccountOptions, AdviceAccount, RunStart};
-use crate::atomic;
 use crate::checkpoint::{self, CheckpointError, Restored, Resumption};
 use crate::error::Error;
 use crate::evaluation_store::{EvaluationHistory, PendingEvaluation};
@@ -170,7 +170,7 @@ pub(super) fn write_run_file(config: &LearnerConfig) -> Result<(), Error> {
     if std::fs::read(&path).is_ok_and(|there| there == text.as_bytes()) {
         return Ok(());
     }
-    atomic::write(&path, text.as_bytes()).map_err(|error| Error::RunDirectory {
+    atomic_file::replace(&path, text.as_bytes()).map_err(|error| Error::RunDirectory {
         action: "write",
         path,
         source: error.into(),

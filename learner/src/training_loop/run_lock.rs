@@ -3,11 +3,10 @@
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
+use tandem_system::{DirectoryLock, atomic_file};
 use tokio_util::sync::CancellationToken;
 
-use crate::checkpoint;
 use crate::error::Error;
-use crate::lock::DirectoryLock;
 use crate::shared::LearnerConfig;
 
 /// Time that the previous learner may take to save and exit.
@@ -62,7 +61,7 @@ fn lock(directory: &Path, is_over: &impl Fn() -> bool) -> Result<DirectoryLock, 
         let path: PathBuf = directory.to_owned();
         Error::RunDirectory { action: "lock", path, source }
     };
-    checkpoint::make(directory).map_err(|error| refused(error.into()))?;
+    atomic_file::create_directory(directory).map_err(|error| refused(error.into()))?;
     loop {
         match DirectoryLock::try_take(directory) {
             Ok(Some(lock)) => return Ok(lock),

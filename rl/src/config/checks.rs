@@ -31,6 +31,9 @@ impl RunConfig {
         let episodes = self.evaluation.episodes;
         let is_count = (1..=100_000).contains(&episodes);
         check("evaluation.episodes", episodes, is_count, "1 to 100,000")?;
+        let test_episodes = self.evaluation.test_episodes;
+        let is_count = (1..=100_000).contains(&test_episodes);
+        check("evaluation.test_episodes", test_episodes, is_count, "1 to 100,000")?;
         let every_rounds = self.checkpoint.every_rounds;
         check("checkpoint.every_rounds", every_rounds, every_rounds > 0, "at least 1")?;
         check("checkpoint.keep", self.checkpoint.keep, self.checkpoint.keep > 0, "at least 1")

@@ -54,6 +54,7 @@ impl RunConfig {
                 episodes: 240,
                 seed: 240_240,
                 recorded_episodes: 2,
+                test_episodes: 240,
             },
             stop: stop(recipe, task, n_arms),
             checkpoint: CheckpointConfig { every_rounds: 50, keep: 2 },
