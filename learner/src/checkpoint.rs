@@ -12,13 +12,13 @@ use std::io;
 use std::path::{Path, PathBuf};
 
 use tandem_core::work::PublishedActor;
+use tandem_rl::config::{ConfigError, RunConfig};
+use tandem_rl::trainer::Trainer;
 use tandem_system::atomic_file::{self, TEMPORARY_EXTENSION};
 
 use crate::evaluation_store::{EvaluationHistory, PendingEvaluation};
 use crate::settings::{self, ADVICE, Changed};
 use sealed::{FORMAT, Refused, Tensor};
-use tandem_rl::config::{ConfigError, RunConfig};
-use tandem_rl::trainer::Trainer;
 
 /// The contents of a checkpoint besides the trainer.
 #[derive(Debug, Clone, PartialEq)]

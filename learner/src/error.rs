@@ -1,11 +1,11 @@
 //! Errors of a learner.
 
 use std::path::PathBuf;
+use tandem_rl::config::{ConfigError, INIT_TEACHER};
+use tandem_rl::ddpg::DdpgError;
 
 use crate::advice_account::TeacherError;
 use crate::checkpoint::CheckpointError;
-use tandem_rl::config::{ConfigError, INIT_TEACHER};
-use tandem_rl::ddpg::DdpgError;
 
 /// An error that ends a learner.
 #[derive(Debug, thiserror::Error)]

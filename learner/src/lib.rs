@@ -10,6 +10,7 @@
 
 mod advice_account;
 pub mod checkpoint;
+mod connections;
 mod error;
 pub mod evaluation_store;
 mod metrics;

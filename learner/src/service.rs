@@ -1,6 +1,5 @@
 //! The `Learner` service: gRPC calls on the work queue, next to the learning thread.
 
-mod connections;
 mod messages;
 mod refusals;
 
@@ -30,7 +29,6 @@ use crate::runtime::{Runtime, on_a_thread};
 use crate::shared::{LearnerConfig, Shared};
 use crate::training_loop::{self, Context, RunOutcome};
 use crate::work_queue::check_count;
-pub(crate) use connections::{Connections, LogQuota};
 use messages::{encode_finished, encode_progress};
 pub(crate) use refusals::check_version;
 use refusals::{check_name, malformed, refusal};

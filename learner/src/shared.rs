@@ -9,13 +9,13 @@ use tandem_core::work::{PublishedActor, RunTerms};
 use tandem_net::{Dial, Gate, Pacing, Prepared};
 use tandem_policy::Policy;
 use tandem_proto::encode_actor;
+use tandem_rl::config::RunConfig;
 use tokio::sync::{Notify, watch};
 
+use crate::connections::{Connections, LogQuota};
 use crate::progress::{Progress, RunEnd};
-use crate::service::{Connections, LogQuota};
 use crate::warnings::Warnings;
 use crate::work_queue::{WorkQueue, Worker};
-use tandem_rl::config::RunConfig;
 
 /// Parameter versions that are kept for workers that lag behind.
 pub(crate) const KEPT_VERSIONS: usize = 16;

@@ -5,12 +5,12 @@ use std::collections::BTreeMap;
 use proptest::prelude::{Strategy, any};
 use proptest::test_runner::{Config, TestCaseError, TestRunner};
 use tandem_core::{ArmIndex, Episode, Layout, Task};
+use tandem_rl::config::Recipe;
+use tandem_rl::trainer::RoundStats;
 use tandem_telemetry::MetricsRow;
 use tempfile::TempDir;
 
 use super::*;
-use tandem_rl::config::Recipe;
-use tandem_rl::trainer::RoundStats;
 
 /// Returns an episode in which the object of arm 0 moves by `drift_m` per step along x.
 fn drifting_episode(layout: Layout, number: u64, drift_m: f32) -> Episode {

@@ -1,4 +1,4 @@
-//! Workers that claim what is not so, and workers that keep others out.
+//! Workers that claim advice falsely, and workers that crowd out others.
 
 use std::net::SocketAddr;
 use std::path::Path;
@@ -21,7 +21,7 @@ use crate::toy::{UNITS, claim, config};
 /// More than the toy spends.
 const BUDGET: u64 = 2000;
 
-/// Follows a run to its end and gives every warning that there was.
+/// Follows a run to its end and returns its warnings.
 fn follow(mut client: LearnerClient<Channel>) -> JoinHandle<Vec<String>> {
     tokio::spawn(async move {
         let mut warnings: Vec<String> = Vec::new();
@@ -36,34 +36,39 @@ fn follow(mut client: LearnerClient<Channel>) -> JoinHandle<Vec<String>> {
     })
 }
 
-/// What a worker claims of an advised episode, whatever the teacher was asked before.
-type Lie = fn(&mut Episode);
+/// Changes what a worker claims about an advised episode, regardless of the charges.
+type FalseClaim = fn(&mut Episode);
 
-/// Plays a slot, telling lies about its advised episodes; `asks` says whether the teacher is asked at all.
-async fn lie_once(toy: &mut Toy, teacher: &FakeTeacher, asks: bool, lie: Lie) -> bool {
+/// Plays a slot with false claims about its advised episodes; charges the teacher if it `asks`.
+async fn claim_once(
+    toy: &mut Toy,
+    teacher: &FakeTeacher,
+    asks: bool,
+    false_claim: FalseClaim,
+) -> bool {
     let Some((order, mut episodes)) = toy.take().await else { return false };
     if asks {
         charge(teacher, &order, &mut episodes).await;
     }
     for (ordered, episode) in order.episodes.iter().zip(&mut episodes) {
         if ordered.advised && order.kind == EpisodeKind::Training {
-            lie(episode);
+            false_claim(episode);
         }
     }
     toy.deliver(order.slot, &episodes).await.is_ok()
 }
 
-/// A run whose only worker lies: how it ended and every warning.
-async fn run_of_a_liar(
+/// Runs a run whose only worker claims falsely; returns its outcome and its warnings.
+async fn run_with_false_claims(
     config: LearnerConfig,
     teacher: &FakeTeacher,
     asks: bool,
-    lie: Lie,
+    false_claim: FalseClaim,
 ) -> (RunOutcome, Vec<String>) {
     let served = Served::start(config).await;
-    let mut toy = served.join("liar").await;
+    let mut toy = served.join("claimant").await;
     let warnings = follow(served.client().await);
-    while lie_once(&mut toy, teacher, asks, lie).await {}
+    while claim_once(&mut toy, teacher, asks, false_claim).await {}
     let ended = served.end().await.expect("a run");
     (ended, warnings.await.expect("followed"))
 }
@@ -77,10 +82,10 @@ fn spent(out: &Path, ended: &RunOutcome) -> (u64, u64) {
 async fn a_claim_that_the_teachers_account_contradicts_is_reported_and_the_account_counts() {
     // 9 rounds of 4 advised episodes.
     let charged_in_all = 36 * u64::from(UNITS);
-    let all_advised: Lie = |episode| claim(episode, 50);
-    let none_advised: Lie = |episode| claim(episode, 0);
-    let one_less: Lie = |episode| claim(episode, UNITS - 1);
-    for (asks, lie, charged, claimed_in_round) in [
+    let all_advised: FalseClaim = |episode| claim(episode, 50);
+    let none_advised: FalseClaim = |episode| claim(episode, 0);
+    let one_less: FalseClaim = |episode| claim(episode, UNITS - 1);
+    for (asks, false_claim, charged, claimed_in_round) in [
         (false, all_advised, 0, 200),
         (true, none_advised, charged_in_all, 0),
         (true, one_less, charged_in_all, 4 * u64::from(UNITS - 1)),
@@ -90,7 +95,8 @@ async fn a_claim_that_the_teachers_account_contradicts_is_reported_and_the_accou
             let (out, teacher) = (directory.path(), FakeTeacher::default());
             let address = teacher.serve().await;
             let config = with_teacher(advised(lag, BUDGET), out, false, address);
-            let (ended, warnings) = run_of_a_liar(config, &teacher, asks, lie).await;
+            let (ended, warnings) =
+                run_with_false_claims(config, &teacher, asks, false_claim).await;
             let charged_in_round = charged / 9;
             let expected = format!(
                 "the episodes of round 0 claim {claimed_in_round} units of advice, the teacher's account \"toy\" was \
@@ -111,11 +117,11 @@ async fn a_run_resumed_after_false_claims_continues_with_its_account() {
     let mut half = whole.clone();
     half.stop.max_env_steps /= 2;
     let config = with_teacher(half, out, false, address);
-    run_of_a_liar(config, &teacher, false, |episode| claim(episode, 50)).await;
+    run_with_false_claims(config, &teacher, false, |episode| claim(episode, 50)).await;
     let served = Served::start(with_teacher(whole, out, true, address)).await;
     let mut toy = served.join("honest").await;
     let warnings = follow(served.client().await);
-    while lie_once(&mut toy, &teacher, true, |_| ()).await {}
+    while claim_once(&mut toy, &teacher, true, |_| ()).await {}
     let ended = served.end().await.expect("a run");
     assert_eq!(warnings.await.expect("followed"), [""; 0]);
     let charged = 16 * u64::from(UNITS);
@@ -168,7 +174,7 @@ async fn advice_without_an_order_and_absurd_numbers_are_refused() {
     let expected = calm(config(0)).await;
     let directory = tempfile::tempdir().expect("a directory");
     let served = Served::start(learner_config(config(0), directory.path(), false)).await;
-    let mut toy = served.join("liar").await;
+    let mut toy = served.join("claimant").await;
     let put = |bytes: &mut [u8], at: usize, value: f32| {
         bytes[4 * at..4 * at + 4].copy_from_slice(&value.to_le_bytes());
     };
@@ -270,7 +276,7 @@ async fn resume(
     let served = Served::start(with_teacher(advised(lag, budget), out, true, address)).await;
     let mut toy = served.join("honest").await;
     let warnings = follow(served.client().await);
-    while lie_once(&mut toy, teacher, true, |_| ()).await {}
+    while claim_once(&mut toy, teacher, true, |_| ()).await {}
     let ended = served.end().await.expect("a run");
     (Left::behind(&ended, out), warnings.await.expect("followed"))
 }
@@ -286,7 +292,7 @@ async fn an_honest_run_raises_no_warning_wherever_it_is_resumed() {
         let mut toy = served.join("honest").await;
         let warnings = follow(served.client().await);
         let mut moments = copies_of(&out, keep.path());
-        while lie_once(&mut toy, &teacher, true, |_| ()).await {
+        while claim_once(&mut toy, &teacher, true, |_| ()).await {
             moments.copy();
         }
         let ended = served.end().await.expect("a run");
