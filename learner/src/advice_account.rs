@@ -1,5 +1,5 @@
-//! The run's account at the teacher: leases for its rounds, and the comparison of the units that episodes claim with the
-//! charges of the account.
+//! The run's account at the teacher: leases for its rounds, and the comparison of the units that episodes claim with
+//! the charges of the account.
 
 mod audit;
 
@@ -171,8 +171,8 @@ impl AdviceAccount {
         &self.terms.name
     }
 
-    /// Reserves units for a round's advised episodes, in their order, and returns the reserved units. `spent` counts the
-    /// units of the episodes learned so far.
+    /// Reserves units for a round's advised episodes, in their order, and returns the reserved units. `spent` counts
+    /// the units of the episodes learned so far.
     pub(crate) fn open_leases(
         &mut self,
         episodes: Vec<u64>,
@@ -205,8 +205,8 @@ impl AdviceAccount {
         if self.audit.is_whole() { leases.iter().map(allowance).collect() } else { Vec::new() }
     }
 
-    /// Returns the unspent units of finished episodes to the budget, and the cost of the episodes to the caller. `spent`
-    /// counts the units of the episodes learned so far, without these. No other lease may be open.
+    /// Returns the unspent units of finished episodes to the budget, and the cost of the episodes to the caller.
+    /// `spent` counts the units of the episodes learned so far, without these. No other lease may be open.
     pub(crate) fn settle(
         &mut self,
         episodes: &[Episode],

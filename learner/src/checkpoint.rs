@@ -106,8 +106,8 @@ pub struct Restored {
     pub resumption: Resumption,
 }
 
-/// Writes a checkpoint to `directory` and removes old ones, so that `keep` remain, including this one. A file that cannot
-/// be removed stays, with a warning.
+/// Writes a checkpoint to `directory` and removes old ones, so that `keep` remain, including this one. A file that
+/// cannot be removed stays, with a warning.
 ///
 /// # Errors
 /// When the file cannot be written; former checkpoints are unchanged then.
@@ -175,8 +175,8 @@ fn files(directory: &Path, extension: &str) -> io::Result<Vec<PathBuf>> {
 /// unfinished files of a killed process.
 ///
 /// # Errors
-/// When the directory cannot be read, or the newest checkpoint is damaged or does not fit the run. The message names the
-/// file and, if the file is damaged, the previous one.
+/// When the directory cannot be read, or the newest checkpoint is damaged or does not fit the run. The message names
+/// the file and, if the file is damaged, the previous one.
 pub fn load_newest(
     directory: &Path,
     config: &RunConfig,

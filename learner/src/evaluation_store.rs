@@ -1,7 +1,7 @@
 //! The results of evaluations: rows of metrics, and the best and the latest policy.
 //!
-//! A checkpoint contains all of them; the files in the run directory are copies for users. A copy that cannot be written
-//! stays due until the write succeeds.
+//! A checkpoint contains all of them; the files in the run directory are copies for users. A copy that cannot be
+//! written stays due until the write succeeds.
 
 use std::path::{Path, PathBuf};
 

@@ -1,11 +1,11 @@
 //! The learner: the training loop over rounds, checkpoints, evaluations, and the `Learner` service.
 //!
-//! The learning algorithm is in `tandem-rl`. The crate does not know how an episode is simulated, how many workers there
-//! are or how a teacher decides.
+//! The learning algorithm is in `tandem-rl`. The crate does not know how an episode is simulated, how many workers
+//! there are or how a teacher decides.
 //!
 //! Reading order: [`work_queue`] (the assignment of slots to workers), [`evaluation_store`] (results of evaluations),
-//! [`checkpoint`], [`settings`] (settings that a resumed run keeps), [`service`] (the gRPC service, next to the learning
-//! thread), [`relay`] (a proxy between a learner and many workers).
+//! [`checkpoint`], [`settings`] (settings that a resumed run keeps), [`service`] (the gRPC service, next to the
+//! learning thread), [`relay`] (a proxy between a learner and many workers).
 #![warn(missing_docs)]
 
 mod advice_account;

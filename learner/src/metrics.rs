@@ -1,7 +1,7 @@
 //! The run's metrics for Prometheus (OpenMetrics text).
 //!
-//! They are meant for dashboards and autoscalers. Reading them requires no token, so they contain no secret and no worker's
-//! own label.
+//! They are meant for dashboards and autoscalers. Reading them requires no token, so they contain no secret and no
+//! worker's own label.
 
 use std::time::Duration;
 

@@ -136,8 +136,8 @@ fn is_complete(outcome: &Result<RunOutcome, Error>) -> bool {
     outcome.as_ref().is_ok_and(|outcome| !outcome.interrupted)
 }
 
-/// Waits until every worker that was playing at the end of the run has asked for work and received the end, or counts as
-/// dead. A worker that does not know of the end would wait for the learner forever.
+/// Waits until every worker that was playing at the end of the run has asked for work and received the end, or counts
+/// as dead. A worker that does not know of the end would wait for the learner forever.
 async fn until_workers_know(shared: Arc<Shared>, shutdown: CancellationToken) {
     while shared.lock().awaits_workers((shared.clock)()) {
         tokio::select! {

@@ -39,8 +39,8 @@ pub fn to_json(config: &RunConfig) -> String {
 }
 
 /// Returns the first setting that affects learning and has another value in `config` than in `began_with`, a text
-/// written by [`to_json`]. A setting that only one of the two has is skipped: programs of two versions may know different
-/// settings. `began_with` may use former keys.
+/// written by [`to_json`]. A setting that only one of the two has is skipped: programs of two versions may know
+/// different settings. `began_with` may use former keys.
 ///
 /// # Errors
 /// When `began_with` is not such a text.

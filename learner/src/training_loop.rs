@@ -1,7 +1,7 @@
 //! The learning thread: opens rounds, waits for their episodes, learns, publishes, evaluates, saves.
 //!
-//! [`LearnerLoop`] owns the trainer and three parts with state of their own: the evaluations, the persistence of the run
-//! directory, and the publisher of the progress.
+//! [`LearnerLoop`] owns the trainer and three parts with state of their own: the evaluations, the persistence of the
+//! run directory, and the publisher of the progress.
 
 mod evaluations;
 mod initial_state;

@@ -1,5 +1,5 @@
-//! The queue of slots: assigns slots to workers, accepts each slot's episodes once, and reassigns the slots of silent and
-//! slow workers.
+//! The queue of slots: assigns slots to workers, accepts each slot's episodes once, and reassigns the slots of silent
+//! and slow workers.
 //!
 //! Pure: time is an argument. Assignments never affect a result: a slot that two workers play gives the same episodes
 //! twice and counts once.
@@ -365,8 +365,9 @@ impl WorkQueue {
         Ok(is_new)
     }
 
-    /// Returns the slots of silent workers to their places in the queue, and the workers that fell silent to the caller.
-    /// Removes silent workers that never asked for work, and workers that have been silent for [`FORGET_AFTER`].
+    /// Returns the slots of silent workers to their places in the queue, and the workers that fell silent to the
+    /// caller. Removes silent workers that never asked for work, and workers that have been silent for
+    /// [`FORGET_AFTER`].
     pub fn reclaim(&mut self, now: Duration) -> Vec<SilentWorker> {
         let never_came = |id: &&u64| self.is_silent(**id, now);
         let never_came: Vec<u64> = self.newcomers.iter().filter(never_came).copied().collect();
@@ -408,8 +409,8 @@ impl WorkQueue {
         requeued
     }
 
-    /// Returns the slot of a disconnected worker to its place in the queue; returns true if it had one. The worker stays:
-    /// it may call again, and the episodes that it delivers count.
+    /// Returns the slot of a disconnected worker to its place in the queue; returns true if it had one. The worker
+    /// stays: it may call again, and the episodes that it delivers count.
     pub fn release_slot(&mut self, worker_id: u64) -> bool {
         self.workers.get_mut(&worker_id).is_some_and(|worker| worker.slot.take().is_some())
             && self.requeue_slots_of(worker_id) > 0

@@ -174,8 +174,8 @@ impl Ddpg {
         critic_half.optimizer.adam.set_learning_rate(rate(config.critic_learning_rate));
     }
 
-    /// Sets whether the two halves of an update run one after the other (1) or in parallel (2). The results are the same,
-    /// bit for bit.
+    /// Sets whether the two halves of an update run one after the other (1) or in parallel (2). The results are the
+    /// same, bit for bit.
     pub const fn set_threads(&mut self, n_threads: usize) {
         self.n_threads = n_threads;
     }
@@ -387,8 +387,8 @@ impl ActorHalf {
         (action_loss - sum_q / b as f64, sum_q / self.q.len() as f64)
     }
 
-    /// Adds the terms of the loss that depend on the action directly, propagates the gradient back through the tanh, and
-    /// returns these terms: the mean squared action, and the squared error to the teacher's action where that was
+    /// Adds the terms of the loss that depend on the action directly, propagates the gradient back through the tanh,
+    /// and returns these terms: the mean squared action, and the squared error to the teacher's action where that was
     /// executed.
     fn add_action_terms(&mut self, config: &DdpgConfig, batch: &Batch, n_input: usize) -> f64 {
         let n_action = self.action_gradient.len() / config.batch_size;

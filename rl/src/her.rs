@@ -167,8 +167,8 @@ impl Sampler {
             sparse_reward_within(self.config.goal_tolerance_m, squared_distance.sqrt());
     }
 
-    /// Samples the later step whose achieved goal replaces the desired one (strategy "future"); `None` keeps the desired
-    /// goal.
+    /// Samples the later step whose achieved goal replaces the desired one (strategy "future"); `None` keeps the
+    /// desired goal.
     fn hindsight_step(&self, step_idx: usize, rng: &mut ChaCha8Rng) -> Option<usize> {
         let hindsight = coin(rng, self.config.her_ratio);
         let later_step = step_idx + 1 + index(rng, EPISODE_STEPS - step_idx);

@@ -131,8 +131,8 @@ impl ReplayBuffer {
         self.next = (self.next + 1) % self.capacity_episodes;
     }
 
-    /// Returns the observation before step `step_idx` of a stored episode, shape `[n_observation]`; `EPISODE_STEPS` gives
-    /// the last one.
+    /// Returns the observation before step `step_idx` of a stored episode, shape `[n_observation]`; `EPISODE_STEPS`
+    /// gives the last one.
     #[must_use]
     pub fn observation(&self, episode_idx: usize, step_idx: usize) -> &[f32] {
         let n = self.layout.n_observation();
@@ -200,7 +200,8 @@ fn overwrite<T: Copy>(table: &mut [T], row_idx: usize, row: &[T]) {
 pub(crate) mod fixtures {
     use super::*;
 
-    /// Returns an episode in which the object of arm 0 moves by `drift_m` per step along x, and everything else is zero.
+    /// Returns an episode in which the object of arm 0 moves by `drift_m` per step along x, and everything else is
+    /// zero.
     pub(crate) fn drifting_episode(layout: Layout, number: u64, drift_m: f32) -> Episode {
         let mut episode = Episode::zeros(layout, number);
         let x = layout.achieved_goal_of(ArmIndex(0)).start;

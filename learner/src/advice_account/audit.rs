@@ -55,8 +55,8 @@ impl Audit {
 
     /// Records a round's leases of `units` in total.
     ///
-    /// If all of them are new, no earlier learner has ordered this round. Then no earlier charge is for a future episode,
-    /// so charges without an episode never get one.
+    /// If all of them are new, no earlier learner has ordered this round. Then no earlier charge is for a future
+    /// episode, so charges without an episode never get one.
     pub(super) const fn leases_opened(&mut self, units: u64, now: Statement) {
         let handed_out_before = self.latest.spent + self.latest.leased;
         let are_new = units > 0 && now.spent + now.leased == handed_out_before + units;

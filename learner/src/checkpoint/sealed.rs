@@ -1,7 +1,7 @@
 //! The file of a checkpoint: safetensors, with a checksum over every byte (the seal).
 //!
-//! The header begins with the seal, the SHA-256 of the whole file with zeros in place of the seal. Any flipped bit, in the
-//! header, the metadata or a tensor, invalidates it.
+//! The header begins with the seal, the SHA-256 of the whole file with zeros in place of the seal. Any flipped bit, in
+//! the header, the metadata or a tensor, invalidates it.
 
 use std::collections::BTreeMap;
 use std::fs::File;

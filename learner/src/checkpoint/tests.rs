@@ -246,7 +246,7 @@ fn a_checkpoint_of_another_run_is_refused() {
         assert!(!refusal.to_string().contains("Some("), "{refusal}");
     };
     without_settings(&newest(&directory));
-    assert!(!check_settings(directory.path(), &small_config()).expect("nothing told"));
+    assert!(!check_settings(directory.path(), &small_config()).expect("no settings"));
     check(|config| config.seed = 2, "seed");
     check(|config| config.arms = 2, "arms");
     check(|config| config.task = "pick-and-place".to_owned(), "task");
@@ -268,14 +268,14 @@ fn without_settings(path: &Path) {
 #[test]
 fn settings_that_affect_learning_must_stay() {
     let (directory, _) = saved(1);
-    let check = |change: fn(&mut RunConfig), told: &str| {
+    let check = |change: fn(&mut RunConfig), message: &str| {
         let mut config = small_config();
         change(&mut config);
         let whole = load_newest(directory.path(), &config).expect_err("must be refused");
         let by_header = check_settings(directory.path(), &config).expect_err("must be refused");
         for refusal in [whole, by_header] {
             assert!(matches!(refusal, CheckpointError::OtherSettings { .. }), "{refusal}");
-            assert!(refusal.to_string().starts_with(told), "{refusal}");
+            assert!(refusal.to_string().starts_with(message), "{refusal}");
         }
     };
     check(|c| c.ddpg.n_hidden = 4, "ddpg.n_hidden is 4 here and 3 in the run's checkpoint \"");

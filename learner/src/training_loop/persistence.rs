@@ -91,8 +91,8 @@ impl<'a> Persistence<'a> {
         }
     }
 
-    /// Saves a checkpoint unless the newest one contains this state, and writes the records. A failure leaves the former
-    /// checkpoint in place.
+    /// Saves a checkpoint unless the newest one contains this state, and writes the records. A failure leaves the
+    /// former checkpoint in place.
     pub(super) fn save(&mut self, state: &mut LoopState<'_, '_>) {
         let key = state.key();
         if self.saved != Some(key) {

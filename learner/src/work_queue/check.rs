@@ -85,8 +85,8 @@ fn check_episode(
     check_advice(order, ordered, episode)
 }
 
-/// Checks that the claims of advice agree with each other and with the order. A unit pays for one step regardless of the
-/// number of overridden arms, and a step without an overridden arm costs nothing.
+/// Checks that the claims of advice agree with each other and with the order. A unit pays for one step regardless of
+/// the number of overridden arms, and a step without an overridden arm costs nothing.
 fn check_advice(
     order: &SlotOrder,
     ordered: &EpisodeOrder,

@@ -126,7 +126,7 @@ fn a_silent_workers_slots_return_to_the_queue() {
     next_slot(&mut queue, b, at(2));
     let silent = SilentWorker { worker_id: a, name: "w".into(), n_slots: 1 };
     assert_eq!(queue.reclaim(at(16)), [silent]);
-    assert_eq!(queue.reclaim(at(16)), [], "told once");
+    assert_eq!(queue.reclaim(at(16)), [], "reported once");
     assert_eq!(next_slot(&mut queue, b, at(16)), Some(0));
 }
 
@@ -220,7 +220,7 @@ fn workers_that_never_ask_for_work_are_replaced_after_a_second() {
         join(&mut queue, at(2));
     }
     assert_eq!(queue.workers.len(), MAX_WORKERS);
-    assert_eq!(queue.next(honest, at(3)), Ok(None), "whoever asks stays");
+    assert_eq!(queue.next(honest, at(3)), Ok(None), "a worker that asks stays");
     assert_eq!(queue.reclaim(at(20)).len(), 1, "of the others nothing is said");
     assert_eq!(queue.workers.len(), 1);
 }
@@ -326,8 +326,8 @@ fn a_silent_worker_is_listed_and_does_not_count_as_alive() {
     assert_eq!(queue.next(b, at(14)), Ok(None));
     assert_eq!(queue.n_alive(at(15)), 1);
     assert_eq!(queue.n_alive(at(29)), 0);
-    let heard: Vec<_> = queue.workers().map(|(id, worker)| (id, worker.last_seen)).collect();
-    assert_eq!(heard, [(a, at(0)), (b, at(14))]);
+    let last_seen: Vec<_> = queue.workers().map(|(id, worker)| (id, worker.last_seen)).collect();
+    assert_eq!(last_seen, [(a, at(0)), (b, at(14))]);
 }
 
 #[test]
@@ -367,7 +367,7 @@ fn a_full_queue_removes_a_worker_of_the_largest_connection() {
         alone.next(worker, at(0)).expect("joined");
     }
     let refused = alone.join("w".to_owned(), Some(50_000), at(1));
-    assert_eq!(refused, Err(JoinError::RunFull), "nobody has more than this one would have");
+    assert_eq!(refused, Err(JoinError::RunFull), "no connection has more than this one would have");
 }
 
 #[test]
@@ -401,17 +401,17 @@ fn advised(charged: u32, advised_arms: &[u8]) -> (SlotOrder, Vec<Episode>) {
 
 #[test]
 fn impossible_claims_of_advice_are_refused_by_name() {
-    let check = |charged, arms: &[u8], told: &str| {
+    let check = |charged, arms: &[u8], expected: &str| {
         let (ordered, episodes) = advised(charged, arms);
         let mut queue = WorkQueue::default();
         queue.push(ordered);
         queue.limit_claims([(0, 3)]);
         let worker = join(&mut queue, at(0));
         next_slot(&mut queue, worker, at(0));
-        let told_now = queue.submit(worker, 0, episodes.clone(), at(0)).map_err(|e| e.to_string());
-        match told {
-            "" => assert_eq!(told_now, Ok(true), "{charged} for {arms:?}"),
-            told => assert_eq!(told_now, Err(format!("episode 0: advice_charged: {told}"))),
+        let outcome = queue.submit(worker, 0, episodes.clone(), at(0)).map_err(|e| e.to_string());
+        match expected {
+            "" => assert_eq!(outcome, Ok(true), "{charged} for {arms:?}"),
+            expected => assert_eq!(outcome, Err(format!("episode 0: advice_charged: {expected}"))),
         }
     };
     check(0, &[], "");

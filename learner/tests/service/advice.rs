@@ -93,7 +93,7 @@ async fn a_lost_account_is_reopened_with_the_remaining_budget() {
                     teacher.books().accounts.clear();
                 }
             }
-            let ended = served.end().await.expect("the run goes on to its end");
+            let ended = served.end().await.expect("the run ends");
             assert!(!ended.interrupted);
             let books = teacher.books();
             let [(first, _), (second, left)] = books.opened.as_slice() else {
@@ -138,7 +138,7 @@ async fn a_run_waits_for_its_teacher_and_can_be_stopped_meanwhile() {
             let again = Served::start(with_teacher(run, directory.path(), true, address)).await;
             let mut toy = again.join("toy").await;
             while play_one(&mut toy, &teacher).await {}
-            let ended = again.end().await.expect("goes on");
+            let ended = again.end().await.expect("continues");
             let left = Left::behind(&ended, directory.path());
             assert_eq!(left, expected, "lag {lag}, away after {away_after}");
         }
@@ -167,15 +167,15 @@ async fn a_refusal_of_the_teacher_ends_the_run_after_saving() {
         while play_one(&mut toy, &teacher).await {}
         let error = served.end().await.expect_err("the run ends");
         assert!(matches!(error, Error::Teacher(_)), "{error}");
-        let told = error.to_string();
-        assert!(told.starts_with("the teacher refuses to "), "{told}");
-        assert!(told.ends_with(reason), "{told}");
+        let message = error.to_string();
+        assert!(message.starts_with("the teacher refuses to "), "{message}");
+        assert!(message.ends_with(reason), "{message}");
         assert!(!checkpoint::list(&directory.path().join("checkpoint")).is_empty());
         teacher.books().refusal = None;
         let again = Served::start(with_teacher(run, directory.path(), true, address)).await;
         let mut toy = again.join("toy").await;
         while play_one(&mut toy, &teacher).await {}
-        let ended = again.end().await.expect("goes on");
+        let ended = again.end().await.expect("continues");
         assert_eq!(Left::behind(&ended, directory.path()), expected);
     }
 }

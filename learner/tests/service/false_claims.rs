@@ -143,15 +143,15 @@ async fn contradictory_claims_are_refused_and_true_ones_accepted() {
         slots.push(toy.take().await.expect("a slot"));
     }
     slots.sort_by_key(|(order, _)| order.slot);
-    let mut refused = async |slot: usize, spoil: fn(&mut Episode), told: &str| {
+    let mut refused = async |slot: usize, spoil: fn(&mut Episode), refusal: &str| {
         let (order, mut episodes) = slots[slot].clone();
         let at = order.episodes.iter().position(|ordered| ordered.advised).expect("one is");
         spoil(&mut episodes[at]);
         let status = toys[0].deliver(order.slot, &episodes).await.expect_err("must be refused");
         assert_eq!(status.code(), Code::InvalidArgument);
         let number = episodes[at].number;
-        let told = format!("episode {number}: advice_charged: {told}");
-        assert!(status.message().ends_with(&told), "{}", status.message());
+        let refusal = format!("episode {number}: advice_charged: {refusal}");
+        assert!(status.message().ends_with(&refusal), "{}", status.message());
     };
     let claims_without_arms: fn(&mut Episode) = |episode| {
         claim(episode, 0);
@@ -196,7 +196,7 @@ async fn advice_without_an_order_and_absurd_numbers_are_refused() {
     let mut kinds = Vec::new();
     while let Some((order, episodes)) = toy.take().await {
         kinds.push(order.kind);
-        for (spoil, told) in &all {
+        for (spoil, refusal) in &all {
             let mut messages: Vec<pb::Episode> = episodes.iter().map(encode_episode).collect();
             spoil(&mut messages[0]);
             let request = pb::SubmitEpisodesRequest {
@@ -206,8 +206,8 @@ async fn advice_without_an_order_and_absurd_numbers_are_refused() {
             };
             let refused = toy.client.submit_episodes(request).await.expect_err("must be refused");
             assert_eq!(refused.code(), Code::InvalidArgument);
-            let told = format!("episode {}: {told}", episodes[0].number);
-            assert!(refused.message().ends_with(&told), "{}", refused.message());
+            let refusal = format!("episode {}: {refusal}", episodes[0].number);
+            assert!(refused.message().ends_with(&refusal), "{}", refused.message());
         }
         toy.deliver(order.slot, &episodes).await.expect("the right ones are taken");
     }

@@ -13,7 +13,7 @@ use tokio_util::sync::CancellationToken;
 use crate::run::{DEADLINE, Toy, client_of, learner_config};
 use crate::toy;
 
-/// What stands at `/metrics`: values by name and labels.
+/// Returns the values at `/metrics` by name and labels.
 async fn scrape(address: SocketAddr) -> BTreeMap<String, f64> {
     let mut caller = TcpStream::connect(address).await.expect("it listens");
     let question = b"GET /metrics HTTP/1.1\r\nhost: learner\r\n\r\n";
@@ -106,7 +106,7 @@ async fn metrics_follow_the_run_and_stay_after_its_end() {
     }
     assert!(figures["tandem_rounds_total"] > 8.0 && figures["tandem_updates_total"] > 0.0);
 
-    assert!(!serving.is_finished(), "it stays until it is told to end");
+    assert!(!serving.is_finished(), "it stays until shutdown");
     shutdown.cancel();
     let ended = tokio::time::timeout(DEADLINE, serving).await.expect("it ends in time");
     assert!(!ended.expect("no panic").expect("a whole run").interrupted);

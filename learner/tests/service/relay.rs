@@ -54,8 +54,8 @@ async fn a_run_whose_workers_call_relays_is_the_same() {
         tokio::spawn(async move { while toy.play_one().await {} });
     }
     let mut progress = client(first).await;
-    let told = progress.status(pb::StatusRequest {}).await.expect("is passed on").into_inner();
-    assert_eq!(told.task, "push");
+    let status = progress.status(pb::StatusRequest {}).await.expect("is forwarded").into_inner();
+    assert_eq!(status.task, "push");
     let mut watched = progress.watch(pb::WatchRequest {}).await.expect("a stream").into_inner();
     let ended = served.end().await.expect("a run");
     assert_eq!(Left::behind(&ended, directory.path()), expected);
@@ -225,10 +225,10 @@ async fn refusals_are_forwarded_and_another_version_is_refused() {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn an_absent_learner_is_reported() {
-    let (listener, nobody) = bound().await;
+    let (listener, absent) = bound().await;
     drop(listener);
-    let (address, _relay) = relay(nobody).await;
-    let status = parameters(&client(address).await, 0).await.expect_err("nobody is there");
+    let (address, _relay) = relay(absent).await;
+    let status = parameters(&client(address).await, 0).await.expect_err("no learner listens");
     assert_eq!(status.code(), Code::Unavailable);
-    assert!(status.message().contains(&nobody.to_string()), "{}", status.message());
+    assert!(status.message().contains(&absent.to_string()), "{}", status.message());
 }

@@ -61,7 +61,7 @@ async fn check_every_moment(run: RunConfig, step: usize) {
     let (_keep, copies) = moments(run.clone()).await;
     assert!(copies.len() > 30, "{} moments", copies.len());
     for (n, out) in copies.iter().enumerate().step_by(step) {
-        let ended = resume(run.clone(), out).await.expect("goes on");
+        let ended = resume(run.clone(), out).await.expect("continues");
         assert_eq!(Left::behind(&ended, out), expected, "from moment {n}");
     }
 }
@@ -108,7 +108,7 @@ async fn a_run_interrupted_repeatedly_ends_with_the_same_bits() {
             }
             served.shutdown.cancel();
             let ended = served.end().await.expect("saved");
-            assert_eq!(ended.digest.len(), 64, "told on interruption, too");
+            assert_eq!(ended.digest.len(), 64, "reported after an interruption too");
             if !ended.interrupted {
                 break ended;
             }
@@ -148,7 +148,7 @@ async fn a_damaged_checkpoint_is_refused_until_it_is_removed() {
     assert_eq!(path, newest);
     assert!(what.contains("remove it to continue from"), "{what}");
     std::fs::remove_file(&newest).expect("removes");
-    let ended = resume(run, out).await.expect("goes on from the former");
+    let ended = resume(run, out).await.expect("continues from the former one");
     assert_eq!(Left::behind(&ended, out), expected);
 }
 

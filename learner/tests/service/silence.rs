@@ -55,7 +55,7 @@ async fn a_worker_that_plays_beyond_the_end_receives_it() {
 async fn a_disconnected_workers_slot_is_played_by_another_at_once() {
     let expected = calm(config(0)).await;
     let directory = tempfile::tempdir().expect("a directory");
-    // Time stands still: nobody is ever slow or silent here.
+    // The clock does not advance, so no worker is slow or silent.
     let clock = Arc::new(|| Duration::ZERO);
     let config = LearnerConfig { clock, ..learner_config(config(0), directory.path(), false) };
     let served = Served::start(config).await;
