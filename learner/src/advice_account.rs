@@ -51,7 +51,7 @@ pub enum TeacherError {
     Stopped,
 }
 
-/// How a run starts when its account is opened.
+/// The start of a run, for the opening of its account.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum RunStart {
     /// Without a checkpoint.
@@ -90,7 +90,7 @@ pub(crate) struct Mismatch {
     pub(crate) charged: u64,
 }
 
-/// How to open an account.
+/// Options for [`AdviceAccount::open`].
 pub(crate) struct AccountOptions<'a> {
     /// Token and TLS of the calls.
     pub(crate) dial: &'a Dial,
@@ -100,7 +100,7 @@ pub(crate) struct AccountOptions<'a> {
     pub(crate) terms: pb::OpenAccountRequest,
     /// Units that an episode can use.
     pub(crate) units_per_episode: u32,
-    /// Whether the run is new.
+    /// The start of the run.
     pub(crate) start: RunStart,
 }
 

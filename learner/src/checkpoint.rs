@@ -33,7 +33,7 @@ pub struct Resumption {
     pub wall_s: f64,
 }
 
-/// Why a checkpoint could not be written or read.
+/// An error about a checkpoint.
 #[derive(Debug, thiserror::Error)]
 pub enum CheckpointError {
     /// The file system returned an error.

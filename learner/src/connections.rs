@@ -40,7 +40,7 @@ pub(crate) struct LogQuota {
     n: u64,
 }
 
-/// How to log one occurrence of an event.
+/// The decision about logging one occurrence of an event.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct LogDecision {
     /// True if this occurrence is logged.

@@ -68,7 +68,7 @@ pub(crate) struct WorkerProgress {
     pub(crate) activity: Activity,
 }
 
-/// What a worker does.
+/// The activity of a worker.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Activity {
     /// Plays the slot of this number.

@@ -47,11 +47,11 @@ pub(crate) const MAX_MESSAGE_BYTES: usize = 64 << 20;
 pub struct ServeOptions {
     /// Serves metrics at `/metrics`, without a token.
     pub metrics: Option<TcpListener>,
-    /// How long the service stays after a complete run.
+    /// The stay of the service after a complete run.
     pub linger: LingerPolicy,
 }
 
-/// How long the service stays after a complete run. After a run that was interrupted or failed it stays for at most
+/// The stay of the service after a complete run. After a run that was interrupted or failed it stays for at most
 /// 1.5 s.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum LingerPolicy {

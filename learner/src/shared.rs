@@ -54,7 +54,7 @@ pub struct LearnerConfig {
     /// First number of a worker. It differs for each start of a learner, so that a worker of the previous learner is
     /// not mistaken for one of this.
     pub first_worker: u64,
-    /// How the service and the learning thread take turns.
+    /// Scheduling of the service and the learning thread.
     pub pacing: Pacing,
 }
 

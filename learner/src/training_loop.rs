@@ -84,7 +84,7 @@ pub(crate) fn run(context: Context<'_>) -> Result<RunOutcome, Error> {
     }
 }
 
-/// Why the loop ends.
+/// The reason for which the loop ends.
 #[derive(Debug, Clone, PartialEq, Eq)]
 enum StopReason {
     Reached(String),
@@ -304,7 +304,7 @@ impl LearnerLoop<'_> {
                     self.schedule_evaluation(&self.trainer.stats());
                     self.order_evaluation();
                 }
-                // What was learned is saved before anything else is awaited.
+                // The learning state is saved before anything else is awaited.
                 self.save();
                 self.publish_progress(Phase::Evaluating);
                 while self.complete_evaluation()? {}

@@ -95,15 +95,15 @@ pub struct SilentWorker {
     pub n_slots: usize,
 }
 
-/// Why a worker cannot join.
+/// A refusal of a join.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub enum JoinError {
     /// The run has [`MAX_WORKERS`], and none of them can be removed.
-    #[error("{MAX_WORKERS} workers are in the run, as many as there may be")]
+    #[error("the run has {MAX_WORKERS} workers, the most that it can have")]
     RunFull,
     /// The connection has [`MAX_UNPROVEN_PER_CONNECTION`] workers that are playing and have delivered nothing.
     #[error(
-        "{MAX_UNPROVEN_PER_CONNECTION} workers of this connection have delivered nothing, as many as there may be"
+        "{MAX_UNPROVEN_PER_CONNECTION} workers of this connection have delivered nothing, the most that it can have"
     )]
     ConnectionFull,
 }

@@ -59,7 +59,7 @@ pub struct UpdateLosses {
     pub mean_q: f64,
 }
 
-/// Why learning cannot continue.
+/// An error that ends learning.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum DdpgError {
     /// An update gave an infinite number or NaN; the parameters are useless from then on.

@@ -2,7 +2,7 @@
 //! cloning of advised actions.
 //!
 //! The crate is pure: it reads no clock and no file, uses no network protocol, and does not know how an episode is
-//! simulated or by whom it was played. A [`trainer::Trainer`] takes whole episodes and makes the updates of a round.
+//! simulated or played. A [`trainer::Trainer`] takes whole episodes and makes the updates of a round.
 //!
 //! Reading order: [`config`] (the run file), [`ddpg`] (the update, in the order of the paper), [`replay`] and [`her`]
 //! (the replay buffer and how batches are sampled from it), [`trainer`] (a round).

@@ -12,7 +12,7 @@ use tandem_rl::config::Recipe;
 use tandem_rl::trainer::Trainer;
 
 const LAYOUT: Layout = Layout::new(Task::Push, 1);
-/// How far an action of 1 moves the object, metres.
+/// Displacement of the object by an action of 1, metres.
 const ACTION_M: f32 = 0.02;
 /// Starts and goals lie within this of the origin on each axis, metres.
 const REACH_M: f32 = 0.15;

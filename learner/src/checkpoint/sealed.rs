@@ -43,7 +43,7 @@ pub(super) struct Contents<'a> {
     pub(super) tensors: SafeTensors<'a>,
 }
 
-/// Why a file cannot be read as a checkpoint.
+/// A file that cannot be read as a checkpoint.
 #[derive(Debug, PartialEq, Eq)]
 pub(super) enum Refused {
     /// Cut short or altered.

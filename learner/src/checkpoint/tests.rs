@@ -43,7 +43,7 @@ fn train_round(trainer: &mut Trainer) -> RoundStats {
     trainer.learn(|_| ()).expect("finite")
 }
 
-/// What a run has beside its trainer in the middle of an evaluation.
+/// Returns the state of a run besides its trainer, with a pending evaluation.
 fn resumption(trainer: &Trainer) -> Resumption {
     let policy =
         |name: &str| trainer.policy(BTreeMap::from([("name".to_owned(), name.to_owned())]));
@@ -319,7 +319,7 @@ fn load_hostile(name: &str, n_cases: u32, hostile: impl Strategy<Value = Vec<u8>
     let outcome = TestRunner::new(config).run(&hostile, |bytes| {
         fs::write(&path, bytes).map_err(|error| TestCaseError::fail(error.to_string()))?;
         if let Ok(Restored { mut trainer, resumption, .. }) = load(&path, &small_config()) {
-            // What is taken can be gone on with.
+            // A state that loads can be trained.
             train_with_whatever(&mut trainer);
             drop(save(&directory.path().join("again"), &trainer, &resumption, 1));
         }

@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use tandem_core::work::{EpisodeOrder, SlotOrder};
 use tandem_core::{Episode, EpisodeKind};
 
-/// Why a worker's episodes are refused. None of them is used.
+/// A refusal of a worker's call or episodes. None of the episodes is used.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum SubmitError {
     /// The worker must join first.

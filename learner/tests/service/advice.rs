@@ -183,7 +183,7 @@ async fn a_refusal_of_the_teacher_ends_the_run_after_saving() {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_resumed_run_finds_its_account_in_every_state_of_the_ledger() {
     let half = config(0).stop.max_env_steps / 2;
-    // What becomes of the ledger between two runs, and the accounts that are there afterwards.
+    // Changes of the ledger between two runs, and the accounts after them.
     type Change = fn(&mut FakeTeacher);
     let kept: Change = |_| ();
     let lost: Change = |teacher| teacher.books().accounts.clear();

@@ -1,4 +1,4 @@
-//! What workers may not send, and that nothing of it is used.
+//! Refused messages of workers, none of which has an effect.
 
 use tandem_core::Episode;
 use tandem_proto::{encode_episode, pb};

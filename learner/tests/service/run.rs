@@ -189,7 +189,7 @@ pub(crate) async fn deliver_as(
     client.submit_episodes(request).await.map(drop)
 }
 
-/// What a run leaves that does not depend on wall time.
+/// The results of a run that do not depend on wall time.
 #[derive(Debug, PartialEq)]
 pub(crate) struct Left {
     pub(crate) digest: String,

@@ -73,7 +73,7 @@ struct Model {
     joined: Vec<u64>,
     n_episodes: u64,
     now: Duration,
-    /// How long slots took of late.
+    /// Moving average of the time that a slot takes.
     took: Option<Duration>,
 }
 
