@@ -229,7 +229,7 @@ fn another_format_is_refused_by_name() {
     let message = write(r#"{"__metadata__":{"round":"50","format":"3"}}"#);
     assert!(message.contains("it has no seal"), "{message}");
     let message = write(r#"{"__metadata__":{"round":"50","format":"3","seal":"0"}}"#);
-    assert!(message.contains("seal is not where it should be"), "{message}");
+    assert!(message.contains("its seal is misplaced"), "{message}");
     let message = write("{}");
     assert!(message.contains("is damaged"), "{message}");
 }
