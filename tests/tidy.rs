@@ -45,7 +45,7 @@ const PURE: [&str; 28] = [
     "bridge/src/simulated",
     "bridge/src/trial.rs",
     "bridge/src/trial",
-    "learner/src/board.rs",
+    "learner/src/work_queue.rs",
     "teacher/src/budget.rs",
     "teacher/src/maps.rs",
     "teacher/src/procedures.rs",

@@ -5,6 +5,8 @@
 //! the simulator takes it as it is. Another world setting needs a field here, its conversion in `proto` and its effect
 //! in `sim`.
 
+use std::fmt::Display;
+
 use serde::{Deserialize, Serialize};
 
 use crate::episode::EpisodeKind;
@@ -131,7 +133,7 @@ impl OutOfRange {
     pub fn unless(
         is_usable: bool,
         key: &'static str,
-        value: impl ToString,
+        value: impl Display + Copy,
         expected: &'static str,
     ) -> Result<(), Self> {
         match is_usable {
