@@ -1,10 +1,10 @@
 //! A whole policy: both networks, how their inputs are normalised, and how it came to be.
 
 use std::collections::BTreeMap;
-use std::fmt::Write as _;
 
 use sha2::{Digest as _, Sha256};
 use tandem_core::Layout;
+use tandem_core::text::hex;
 use tandem_core::work::PublishedActor;
 
 use crate::elementwise::all_finite;
@@ -151,10 +151,7 @@ impl Policy {
             hasher.update(tensor.name.as_bytes());
             hasher.update(little_endian(tensor.data));
         }
-        hasher.finalize().iter().fold(String::new(), |mut text, byte| {
-            write!(text, "{byte:02x}").expect("a string takes any text");
-            text
-        })
+        hex(&hasher.finalize())
     }
 }
 

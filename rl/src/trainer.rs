@@ -10,6 +10,7 @@ use tandem_core::Episode;
 use tandem_core::episode::EpisodeKind;
 use tandem_core::layout::{EPISODE_STEPS, Layout, OBJECT_POSITION};
 use tandem_core::rng::{Stream, coin, episode_rng, index};
+use tandem_core::text::hex;
 use tandem_core::work::{EpisodeOrder, PublishedActor, SlotOrder};
 use tandem_policy::{Normalizer, NormalizerSnapshot, Policy};
 
@@ -323,7 +324,7 @@ impl Trainer {
         {
             hash.update(count.to_le_bytes());
         }
-        hash.finalize().iter().map(|byte| format!("{byte:02x}")).collect()
+        hex(&hash.finalize())
     }
 
     /// Every large float vector of the state, by name, in a fixed order.
@@ -343,7 +344,7 @@ impl Trainer {
     /// Feeds the normalisers with an episode's observations and with goals relabelled as in a batch.
     fn feed_normalizers(&mut self, episode: &Episode) {
         let mut rng = episode_rng(self.config.seed, episode.number, Stream::Normaliser);
-        let both_orders = self.config.replay.swap_share > 0.0 && self.layout.n_arms == 2;
+        let both_orders = self.config.replay.arm_swap_prob > 0.0 && self.layout.n_arms == 2;
         let (mut observations, mut goals) = (Vec::new(), Vec::new());
         for step_idx in 0..EPISODE_STEPS {
             let goal = self.relabelled_goal(episode, step_idx, &mut rng);
@@ -367,7 +368,7 @@ impl Trainer {
     ) -> Vec<f32> {
         let mut goal = episode.goal.clone();
         for arm in self.layout.arms() {
-            let hindsight = coin(rng, self.config.replay.her_future_share);
+            let hindsight = coin(rng, self.config.replay.her_ratio);
             let moment = step_idx + 1 + index(rng, EPISODE_STEPS - step_idx);
             if hindsight {
                 goal[self.layout.goal_of(arm)].copy_from_slice(episode.achieved(moment, arm));

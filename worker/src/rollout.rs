@@ -2,9 +2,9 @@
 
 use tandem_core::layout::EPISODE_STEPS;
 use tandem_core::rng::{Stream, episode_rng};
-use tandem_core::work::{EpisodeOrder, RunTerms, SlotOrder, WorldTerms};
+use tandem_core::work::{EpisodeOrder, RunTerms, SlotOrder};
 use tandem_core::{Episode, EpisodeKind, StepAdvice, StepQuery};
-use tandem_sim::{SimError, Starts, WorldConfig};
+use tandem_sim::SimError;
 use tandem_telemetry::events::StepAdvised;
 
 use crate::explore::Explorer;
@@ -137,7 +137,7 @@ struct Rollout<W> {
 impl<W: World> Rollout<W> {
     fn start(mut world: W, order: EpisodeOrder, slot: &SlotOrder, terms: &RunTerms) -> Self {
         let layout = terms.layout;
-        world.reset(order, starts(slot.kind, terms.world));
+        world.reset(order, terms.world.for_kind(slot.kind));
         let mut observation = vec![0.0; layout.n_observation()];
         world.observe(&mut observation);
         let mut observations = Vec::with_capacity((EPISODE_STEPS + 1) * layout.n_observation());
@@ -216,21 +216,6 @@ impl<W: World> Rollout<W> {
         self.episode.advised_arms.push(self.advised_arms);
         self.episode.contacts.push(contacts);
         Ok(())
-    }
-}
-
-/// The world that the terms ask for.
-pub(crate) fn world_config(terms: WorldTerms) -> WorldConfig {
-    WorldConfig { substeps: terms.substeps, ..WorldConfig::default() }
-}
-
-/// Evaluation episodes start as the task says, training episodes by the terms.
-pub(crate) fn starts(kind: EpisodeKind, terms: WorldTerms) -> Starts {
-    match kind {
-        EpisodeKind::Training => {
-            Starts { gripped_share: terms.gripped_start_share, wide_share: terms.wide_start_share }
-        }
-        EpisodeKind::Evaluation => Starts { gripped_share: 0.0, wide_share: 0.0 },
     }
 }
 

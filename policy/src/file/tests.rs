@@ -1,6 +1,7 @@
 //! What a policy file brings back, and what is refused.
 
 use std::error::Error as _;
+use std::fs;
 
 use super::*;
 
