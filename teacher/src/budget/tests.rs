@@ -1,7 +1,7 @@
 use std::collections::BTreeMap;
 
 use tandem_core::layout::EPISODE_STEPS;
-use tandem_core::rng::{Stream, coin, episode_rng, index};
+use tandem_core::rng::{Stream, bernoulli, episode_rng, index};
 
 use super::*;
 use crate::strategy::Strategy;
@@ -265,7 +265,7 @@ fn an_account_agrees_with_a_naive_model() {
                     let unleased = kind == 2 || n_opened == 0;
                     let episode = if unleased { 100 + any_leased % 5 } else { any_leased };
                     let step = u32::try_from(index(&mut rng, EPISODE_STEPS)).unwrap();
-                    let wanted = [coin(&mut rng, 0.9), coin(&mut rng, 0.6)];
+                    let wanted = [bernoulli(&mut rng, 0.9), bernoulli(&mut rng, 0.6)];
                     assert_eq!(
                         account.charge(charge(episode, step, wanted)),
                         model.charge(episode, step, wanted)
