@@ -11,7 +11,7 @@ const ALLOWED: [(&str, &[&str]); 13] = [
     ("policy", &["core"]),
     ("proto", &["core"]),
     ("telemetry", &["core"]),
-    ("net", &["proto"]),
+    ("net", &[]),
     ("rl", &["core", "policy"]),
     ("learner", &["core", "policy", "rl", "proto", "telemetry", "net"]),
     ("teacher", &["core", "policy", "proto", "telemetry", "net"]),

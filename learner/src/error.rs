@@ -40,10 +40,10 @@ pub enum Error {
     Diverged(#[from] DdpgError),
     /// The service cannot be offered.
     #[error(transparent)]
-    Gate(#[from] tandem_net::GateError),
+    Gate(#[from] tandem_net::ServerConfigError),
     /// A relay cannot call its learner.
     #[error(transparent)]
-    Address(#[from] tandem_net::DialError),
+    Address(#[from] tandem_net::ClientConfigError),
     /// The network refused.
     #[error("cannot serve")]
     Serve(#[from] tonic::transport::Error),

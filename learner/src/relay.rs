@@ -8,7 +8,9 @@ use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
-use tandem_net::{Dial, Gate, Incoming, Link, Prepared};
+use tandem_net::{
+    AuthChannel, ClientConfig, EncodedResponse, Incoming, MAX_MESSAGE_BYTES, ServerConfig, within,
+};
 use tandem_proto::pb;
 use tandem_proto::pb::learner_client::LearnerClient;
 use tandem_proto::pb::learner_server::{Learner, LearnerServer};
@@ -17,7 +19,7 @@ use tokio_util::sync::CancellationToken;
 use tonic::{Request, Response, Status, Streaming};
 
 use crate::error::Error;
-use crate::service::{MAX_MESSAGE_BYTES, check_version};
+use crate::service::check_version;
 use crate::shared::KEPT_VERSIONS;
 
 /// How long the learner may take to answer; a question for work is held there for some seconds.
@@ -29,23 +31,23 @@ const ANSWER: Duration = Duration::from_secs(20);
 /// When `learner` is no address, or the relay can no longer be reached.
 pub async fn serve(
     learner: &str,
-    dial: &Dial,
-    gate: &Gate,
+    dial: &ClientConfig,
+    gate: &ServerConfig,
     incoming: impl Into<Incoming>,
     shutdown: CancellationToken,
 ) -> Result<(), Error> {
-    let link = dial.link(learner).map_err(Error::Address)?;
+    let link = dial.channel(learner).map_err(Error::Address)?;
     let client = LearnerClient::new(link)
         .max_decoding_message_size(MAX_MESSAGE_BYTES)
         .max_encoding_message_size(MAX_MESSAGE_BYTES);
     let relay = Relay { client, cache: Mutex::default() };
     let server = LearnerServer::new(relay).max_decoding_message_size(MAX_MESSAGE_BYTES);
-    let router = gate.router(server).await?;
+    let router = gate.router(server, tandem_proto::FILE_DESCRIPTOR_SET).await?;
     Ok(tandem_net::serve(router, incoming, shutdown).await?)
 }
 
 struct Relay {
-    client: LearnerClient<Link>,
+    client: LearnerClient<AuthChannel>,
     cache: Mutex<Cache>,
 }
 
@@ -54,7 +56,7 @@ struct Relay {
 struct Cache {
     /// Which start that is; another learner's version 3 is another one.
     learner: u64,
-    versions: BTreeMap<u64, Arc<OnceCell<Prepared>>>,
+    versions: BTreeMap<u64, Arc<OnceCell<EncodedResponse>>>,
 }
 
 impl Cache {
@@ -66,7 +68,7 @@ impl Cache {
     }
 
     /// The place of a version: all that want it wait there for the one that fetches it.
-    fn place_of(&mut self, version: u64) -> Arc<OnceCell<Prepared>> {
+    fn place_of(&mut self, version: u64) -> Arc<OnceCell<EncodedResponse>> {
         let place = self.versions.entry(version).or_default().clone();
         while self.versions.len() > KEPT_VERSIONS {
             self.versions.pop_first();
@@ -87,11 +89,11 @@ impl Relay {
         self.cache.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    async fn fetch(&self, version: u64) -> Result<Prepared, Status> {
+    async fn fetch(&self, version: u64) -> Result<EncodedResponse, Status> {
         let mut client = self.client.clone();
         let request = pb::GetParametersRequest { version };
-        let parameters = within(client.get_parameters(request)).await?;
-        Ok(Prepared::of(parameters.get_ref()))
+        let parameters = answer(client.get_parameters(request)).await?;
+        Ok(EncodedResponse::encode(parameters.get_ref()))
     }
 }
 
@@ -106,7 +108,7 @@ impl Learner for Relay {
         let request = request.into_inner();
         // Of what another version says, this one would pass on only what it knows itself.
         check_version(&request.worker, &request.version, "relay")?;
-        let answer = within(self.client.clone().join(request)).await?;
+        let answer = answer(self.client.clone().join(request)).await?;
         self.cache().belongs_to(answer.get_ref().learner);
         Ok(answer)
     }
@@ -115,7 +117,7 @@ impl Learner for Relay {
         &self,
         request: Request<pb::NextWorkRequest>,
     ) -> Result<Response<pb::NextWorkResponse>, Status> {
-        within(self.client.clone().next_work(request.into_inner())).await
+        answer(self.client.clone().next_work(request.into_inner())).await
     }
 
     async fn get_parameters(
@@ -125,7 +127,7 @@ impl Learner for Relay {
         let version = request.into_inner().version;
         let place = self.cache().place_of(version);
         match place.get_or_try_init(|| self.fetch(version)).await {
-            Ok(prepared) => Ok(prepared.clone().answer()),
+            Ok(prepared) => Ok(prepared.clone().into_response()),
             Err(status) => {
                 self.cache().free(version);
                 Err(status)
@@ -137,31 +139,28 @@ impl Learner for Relay {
         &self,
         request: Request<pb::SubmitEpisodesRequest>,
     ) -> Result<Response<pb::SubmitEpisodesResponse>, Status> {
-        within(self.client.clone().submit_episodes(request.into_inner())).await
+        answer(self.client.clone().submit_episodes(request.into_inner())).await
     }
 
     async fn status(
         &self,
         request: Request<pb::StatusRequest>,
     ) -> Result<Response<pb::Progress>, Status> {
-        within(self.client.clone().status(request.into_inner())).await
+        answer(self.client.clone().status(request.into_inner())).await
     }
 
     async fn watch(
         &self,
         request: Request<pb::WatchRequest>,
     ) -> Result<Response<Self::WatchStream>, Status> {
-        within(self.client.clone().watch(request.into_inner())).await
+        answer(self.client.clone().watch(request.into_inner())).await
     }
 }
 
 /// Waits for the learner no longer than a worker would.
-async fn within<T>(
+async fn answer<T>(
     call: impl Future<Output = Result<Response<T>, Status>>,
 ) -> Result<Response<T>, Status> {
-    let lapsed =
-        |_elapsed| Status::unavailable(format!("no answer of the learner within {ANSWER:?}"));
-    let answer = tokio::time::timeout(ANSWER, call).await.map_err(lapsed)??;
     // The learner's own headers, such as its date, are not this answer's.
-    Ok(Response::new(answer.into_inner()))
+    Ok(Response::new(within(ANSWER, call).await?.into_inner()))
 }

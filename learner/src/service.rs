@@ -10,7 +10,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use tandem_core::Episode;
-use tandem_net::{Hangup, Incoming, Page, Prepared};
+use tandem_net::{ConnectionClosed, EncodedResponse, Incoming, MAX_MESSAGE_BYTES, TextEndpoint};
 use tandem_proto::pb;
 use tandem_proto::pb::learner_server::{Learner, LearnerServer};
 use tandem_proto::{decode_episode, encode_slot, encode_terms};
@@ -37,8 +37,6 @@ const WORK_POLL: Duration = Duration::from_secs(2);
 const LINGER: Duration = Duration::from_millis(1500);
 /// Pause between two looks whether all workers have heard of it.
 const LINGER_TICK: Duration = Duration::from_millis(50);
-/// Largest message taken in; a slot of 64 two-arm episodes has 1 MB.
-pub(crate) const MAX_MESSAGE_BYTES: usize = 64 << 20;
 
 /// What goes with the service.
 #[derive(Debug, Default)]
@@ -105,7 +103,7 @@ pub async fn serve_beside(
     let learner =
         LearnerServer::new(LearnerService { shared: shared.clone(), start: config.first_worker })
             .max_decoding_message_size(MAX_MESSAGE_BYTES);
-    let router = config.gate.router(learner).await?;
+    let router = config.gate.router(learner, tandem_proto::FILE_DESCRIPTOR_SET).await?;
     let stop_serving = CancellationToken::new();
     let showing = show_figures(beside.metrics, shared.clone());
     let learning = {
@@ -162,7 +160,7 @@ async fn until_workers_know(shared: Arc<Shared>, shutdown: CancellationToken) {
 async fn show_figures(listener: Option<TcpListener>, shared: Arc<Shared>) {
     let Some(listener) = listener else { return std::future::pending().await };
     let write = Arc::new(move || metrics::page(&shared));
-    let page = Page { path: metrics::PATH, content_type: metrics::CONTENT_TYPE, write };
+    let page = TextEndpoint { path: metrics::PATH, content_type: metrics::CONTENT_TYPE, write };
     page.serve(listener).await;
 }
 
@@ -219,7 +217,7 @@ fn with_causes(error: &Error) -> String {
 
 /// Waits until a connection has ended and hands the slots of its workers to the next that ask: a round need not wait
 /// until they count as slow. A worker that was only cut off delivers all the same.
-async fn give_to_others(shared: Arc<Shared>, connection: u64, hangup: Hangup) {
+async fn give_to_others(shared: Arc<Shared>, connection: u64, hangup: ConnectionClosed) {
     hangup.wait().await;
     let mut state = shared.lock();
     state.connections.ended(connection);
@@ -247,7 +245,7 @@ impl Learner for LearnerService {
         &self,
         request: Request<pb::JoinRequest>,
     ) -> Result<Response<pb::JoinResponse>, Status> {
-        let hangup = Hangup::of(request.extensions());
+        let hangup = ConnectionClosed::from_extensions(request.extensions());
         let pb::JoinRequest { worker: name, version } = request.into_inner();
         check_name(&name)?;
         check_version(&name, &version, "learner")?;
@@ -303,7 +301,7 @@ impl Learner for LearnerService {
         let version = request.into_inner().version;
         let prepared = self.shared.lock().published.get(&version).cloned();
         let gone = || Status::not_found(format!("parameter version {version} is not kept"));
-        prepared.map(Prepared::answer).ok_or_else(gone)
+        prepared.map(EncodedResponse::into_response).ok_or_else(gone)
     }
 
     async fn submit_episodes(

@@ -6,7 +6,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use tandem_core::work::{PublishedActor, RunTerms};
-use tandem_net::{Dial, Gate, Pacing, Prepared};
+use tandem_net::{ClientConfig, EncodedResponse, Pacing, ServerConfig};
 use tandem_policy::Policy;
 use tandem_proto::{encode_actor, pb};
 use tokio::sync::{Notify, watch};
@@ -28,9 +28,9 @@ pub struct LearnerConfig {
     /// The run.
     pub run: RunConfig,
     /// Who may call.
-    pub gate: Gate,
+    pub gate: ServerConfig,
     /// How the teacher is called.
-    pub dial: Dial,
+    pub dial: ClientConfig,
     /// The teacher's address, `HOST:PORT` or a URI; needed when the run asks for advice.
     pub teacher: Option<String>,
     /// The one-arm policy whose copies a run of strategy `init:teacher` starts from.
@@ -73,7 +73,7 @@ pub(crate) struct Shared {
 pub(crate) struct State {
     pub(crate) board: Board,
     pub(crate) terms: Option<RunTerms>,
-    pub(crate) published: BTreeMap<u64, Prepared>,
+    pub(crate) published: BTreeMap<u64, EncodedResponse>,
     /// What workers are told once nothing more is to be done.
     pub(crate) finished: Option<pb::Finished>,
     /// Workers that were playing when the run ended and have not been told yet.
@@ -120,7 +120,7 @@ impl Shared {
 
     /// Hands out an actor from now on, and forgets the oldest.
     pub(crate) fn publish(&self, actor: &PublishedActor) {
-        let prepared = Prepared::of(&encode_actor(actor));
+        let prepared = EncodedResponse::encode(&encode_actor(actor));
         let mut state = self.lock();
         state.published.insert(actor.version, prepared);
         while state.published.len() > KEPT_VERSIONS {

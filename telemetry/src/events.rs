@@ -272,48 +272,6 @@ impl BudgetExhausted<'_> {
     }
 }
 
-/// A peer cannot be reached; it is tried again after a while.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Reconnecting<'a> {
-    /// The peer: "learner" or "teacher".
-    pub peer: &'a str,
-    /// How many attempts failed in a row.
-    pub attempt: u32,
-    /// The wait before the next.
-    pub wait_millis: u64,
-    /// Why the latest failed.
-    pub reason: &'a str,
-}
-
-impl Reconnecting<'_> {
-    /// Logs the event.
-    pub fn emit(&self) {
-        tracing::warn!(
-            peer = self.peer,
-            attempt = self.attempt,
-            wait_millis = self.wait_millis,
-            reason = self.reason,
-            "reconnecting"
-        );
-    }
-}
-
-/// A peer answers again.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Reconnected<'a> {
-    /// The peer: "learner" or "teacher".
-    pub peer: &'a str,
-    /// How many attempts had failed.
-    pub attempts: u32,
-}
-
-impl Reconnected<'_> {
-    /// Logs the event.
-    pub fn emit(&self) {
-        tracing::info!(peer = self.peer, attempts = self.attempts, "reconnected");
-    }
-}
-
 /// A run ended.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct RunFinished<'a> {

@@ -98,7 +98,7 @@ fn evaluation_terms(layout: Layout) -> RunTerms {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::fake::{FakeActor, FakeWorld, LAYOUT};
+    use crate::fakes::{FakeActor, FakeWorld, LAYOUT};
 
     fn evaluate_fake(n_episodes: u64, seed: u64, n_threads: usize) -> Vec<Episode> {
         let n_threads = NonZeroUsize::new(n_threads).expect("1 or more");

@@ -258,7 +258,7 @@ mod tests {
     use tandem_telemetry::read_episode;
 
     use super::*;
-    use crate::fake::{FakeActor, slot, terms};
+    use crate::fakes::{FakeActor, slot, terms};
     use crate::ports::NoAdvisor;
     use crate::rollout::play_slot;
 

@@ -246,7 +246,7 @@ fn explorer(order: EpisodeOrder, kind: EpisodeKind, terms: &RunTerms) -> Option<
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::fake::{FakeActor, FakeTeacher, FakeWorld, LAYOUT, TEACHER_ACTION, slot, terms};
+    use crate::fakes::{FakeActor, FakeTeacher, FakeWorld, LAYOUT, TEACHER_ACTION, slot, terms};
     use crate::ports::NoAdvisor;
 
     fn play(order: &SlotOrder, actor: FakeActor, advisor: &mut impl Advisor) -> Vec<Episode> {

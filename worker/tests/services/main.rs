@@ -7,8 +7,8 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use tandem_core::{Episode, EpisodeKind};
-use tandem_net::Pacing;
-use tandem_worker::{Error, Patience, WorkerConfig, run_with};
+use tandem_net::{Backoff, ClientConfig, Pacing};
+use tandem_worker::{Error, Timeouts, WorkerConfig, run_with};
 use tokio_util::sync::CancellationToken;
 use tonic::Status;
 
@@ -16,10 +16,12 @@ use support::learner::{Call, FakeLearner, Fault};
 use support::teacher::FakeTeacher;
 use support::{Server, orders, terms};
 
-const PATIENCE: Patience = Patience {
-    first_pause: Duration::from_millis(1),
-    longest_pause: Duration::from_millis(10),
-    answer: Duration::from_secs(20),
+const TIMEOUTS: Timeouts = Timeouts {
+    backoff: Backoff {
+        first_pause: Duration::from_millis(1),
+        max_pause: Duration::from_millis(10),
+    },
+    call: Duration::from_secs(20),
     work: Duration::from_secs(20),
     advice: Duration::from_secs(20),
     drain: Duration::from_millis(20),
@@ -27,7 +29,7 @@ const PATIENCE: Patience = Patience {
 
 fn config(learner: &Server, teacher: Option<&Server>) -> WorkerConfig {
     WorkerConfig {
-        dial: tandem_net::Dial::default(),
+        client: ClientConfig::default(),
         learner: learner.address(),
         teacher: teacher.map(Server::address),
         name: "test".to_owned(),
@@ -43,7 +45,7 @@ async fn work_through(
 ) -> BTreeMap<(bool, u64), Episode> {
     let (learner_server, teacher_server) = (Server::learner(learner), Server::teacher(teacher));
     let config = config(&learner_server, Some(&teacher_server));
-    run_with(config, PATIENCE, CancellationToken::new()).await.expect("the run ends");
+    run_with(config, TIMEOUTS, CancellationToken::new()).await.expect("the run ends");
     learner.episodes()
 }
 
@@ -101,7 +103,7 @@ async fn a_learner_that_dies_and_comes_back_gets_the_same_episodes() {
     let (learner, teacher) = (Arc::new(learner), Arc::new(FakeTeacher::default()));
     let (first_life, teacher_server) = (Server::learner(&learner), Server::teacher(&teacher));
     let config = config(&first_life, Some(&teacher_server));
-    let worker = tokio::spawn(run_with(config, PATIENCE, CancellationToken::new()));
+    let worker = tokio::spawn(run_with(config, TIMEOUTS, CancellationToken::new()));
     at_fault.recv().await.expect("the learner gets there");
     let listener = first_life.kill();
     learner.forget_workers();
@@ -133,7 +135,7 @@ async fn an_episode_to_be_recorded_gets_a_log() {
     let (learner_server, teacher_server) = (Server::learner(&learner), Server::teacher(&teacher));
     let log_dir = Some(logs.path().join("mcap"));
     let config = WorkerConfig { log_dir, ..config(&learner_server, Some(&teacher_server)) };
-    run_with(config, PATIENCE, CancellationToken::new()).await.expect("the run ends");
+    run_with(config, TIMEOUTS, CancellationToken::new()).await.expect("the run ends");
     let names: Vec<_> = std::fs::read_dir(logs.path().join("mcap"))
         .expect("made by the worker")
         .map(|entry| entry.expect("readable").file_name())
@@ -148,8 +150,8 @@ async fn a_teacher_that_never_answers_is_asked_again() {
     let (learner, teacher) = (Arc::new(FakeLearner::new(orders())), Arc::new(teacher));
     let (learner_server, teacher_server) = (Server::learner(&learner), Server::teacher(&teacher));
     let config = config(&learner_server, Some(&teacher_server));
-    let patience = Patience { advice: Duration::from_millis(40), ..PATIENCE };
-    run_with(config, patience, CancellationToken::new()).await.expect("the run ends");
+    let timeouts = Timeouts { advice: Duration::from_millis(40), ..TIMEOUTS };
+    run_with(config, timeouts, CancellationToken::new()).await.expect("the run ends");
     assert_eq!(learner.episodes(), expected);
 }
 
@@ -160,7 +162,7 @@ async fn advice_on_other_steps_ends_the_worker() {
     let (learner_server, teacher_server) = (Server::learner(&learner), Server::teacher(&teacher));
     let config = config(&learner_server, Some(&teacher_server));
     let error =
-        run_with(config, PATIENCE, CancellationToken::new()).await.expect_err("one answer of two");
+        run_with(config, TIMEOUTS, CancellationToken::new()).await.expect_err("one answer of two");
     assert_eq!(error.to_string(), "cannot ask the teacher");
     assert!(learner.episodes().is_empty());
 }
@@ -173,7 +175,7 @@ async fn refusals_end_the_worker_with_one_clear_error() {
         Fault::Answer(Status::failed_precondition("this run needs version 9")),
     ));
     let server = Server::learner(&learner);
-    let error = run_with(config(&server, None), PATIENCE, CancellationToken::new())
+    let error = run_with(config(&server, None), TIMEOUTS, CancellationToken::new())
         .await
         .expect_err("refused");
     assert!(matches!(error, Error::Protocol { .. }), "{error:?}");
@@ -184,7 +186,7 @@ async fn refusals_end_the_worker_with_one_clear_error() {
 #[tokio::test]
 async fn an_advised_run_needs_a_teacher() {
     let server = Server::learner(&Arc::new(FakeLearner::new(orders())));
-    let error = run_with(config(&server, None), PATIENCE, CancellationToken::new())
+    let error = run_with(config(&server, None), TIMEOUTS, CancellationToken::new())
         .await
         .expect_err("no teacher");
     assert!(
@@ -199,7 +201,7 @@ async fn a_worker_that_waits_for_its_teacher_can_be_stopped() {
     let (learner_server, teacher_server) = (Server::learner(&learner), Server::teacher(&teacher));
     let shutdown = CancellationToken::new();
     let config = config(&learner_server, Some(&teacher_server));
-    let worker = tokio::spawn(run_with(config, PATIENCE, shutdown.clone()));
+    let worker = tokio::spawn(run_with(config, TIMEOUTS, shutdown.clone()));
     at_fault.recv().await.expect("the teacher gets there");
     shutdown.cancel();
     worker.await.expect("no panic").expect("stops without an error");
@@ -214,8 +216,8 @@ async fn a_worker_that_is_told_to_stop_delivers_what_it_plays() {
     let (learner_server, teacher_server) = (Server::learner(&learner), Server::teacher(&teacher));
     let shutdown = CancellationToken::new();
     let config = config(&learner_server, Some(&teacher_server));
-    let patience = Patience { drain: Duration::from_secs(20), ..PATIENCE };
-    let worker = tokio::spawn(run_with(config, patience, shutdown.clone()));
+    let timeouts = Timeouts { drain: Duration::from_secs(20), ..TIMEOUTS };
+    let worker = tokio::spawn(run_with(config, timeouts, shutdown.clone()));
     at_fault.recv().await.expect("the teacher gets there");
     shutdown.cancel();
     worker.await.expect("no panic").expect("stops without an error");

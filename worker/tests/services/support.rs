@@ -11,7 +11,7 @@ use tandem_core::work::{
     EpisodeOrder, Exploration, PublishedActor, RunTerms, SlotOrder, WorldTerms,
 };
 use tandem_core::{EpisodeKind, Layout, Task};
-use tandem_net::{Gate, GateError, Router};
+use tandem_net::{Router, ServerConfig, ServerConfigError};
 use tandem_proto::pb::learner_server::LearnerServer;
 use tandem_proto::pb::teacher_server::TeacherServer;
 use tokio::runtime::Runtime;
@@ -88,18 +88,22 @@ impl Server {
 
     pub(crate) fn learner_on(listener: TcpListener, learner: &Arc<FakeLearner>) -> Self {
         let service = LearnerServer::from_arc(Arc::clone(learner));
-        Self::serve(listener, async { Gate::default().router(service).await })
+        Self::serve(listener, async {
+            ServerConfig::default().router(service, tandem_proto::FILE_DESCRIPTOR_SET).await
+        })
     }
 
     pub(crate) fn teacher(teacher: &Arc<FakeTeacher>) -> Self {
         let listener = TcpListener::bind("127.0.0.1:0").expect("loopback");
         let service = TeacherServer::from_arc(Arc::clone(teacher));
-        Self::serve(listener, async { Gate::default().router(service).await })
+        Self::serve(listener, async {
+            ServerConfig::default().router(service, tandem_proto::FILE_DESCRIPTOR_SET).await
+        })
     }
 
     fn serve(
         listener: TcpListener,
-        router: impl Future<Output = Result<Router, GateError>> + Send + 'static,
+        router: impl Future<Output = Result<Router, ServerConfigError>> + Send + 'static,
     ) -> Self {
         let address = listener.local_addr().expect("bound");
         listener.set_nonblocking(true).expect("a socket can be made so");
