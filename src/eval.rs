@@ -9,7 +9,6 @@ use tandem_core::work::{EpisodeOrder, Exploration, RunTerms, WorldTerms};
 use tandem_core::{Episode, EpisodeOutcome, EvaluationSummary, Layout, Task, Wilson};
 use tandem_policy::Policy;
 use tandem_sim::WorldConfig;
-use tandem_telemetry::EpisodeMetadata;
 use tandem_worker::record::{RecordError, log_name, metadata_of, record_episode};
 use tandem_worker::{ComposedTeachers, evaluate};
 
@@ -173,7 +172,7 @@ fn terms(subject: &Subject) -> RunTerms {
     };
     let exploration =
         Exploration { noise_std: 0.0, random_share: 0.0, random_hold_mean_steps: 1.0 };
-    RunTerms { layout: subject.layout(), account: None, exploration, world }
+    RunTerms { run: String::new(), layout: subject.layout(), account: None, exploration, world }
 }
 
 /// Writes the log of one episode of the goals that `seed` fixes.
@@ -190,10 +189,7 @@ fn record(
     }
     let number = episode.number;
     let order = EpisodeOrder { number, seed, advised: false, uniform: false, record: true };
-    let metadata = EpisodeMetadata {
-        policy_digest: subject.policy().digest(),
-        ..metadata_of(order, episode, terms)
-    };
+    let metadata = metadata_of(order, episode, terms, subject.policy().digest());
     match record_episode(&metadata, episode, path) {
         Ok(_) => Ok(()),
         Err(error @ RecordError::Log(_)) => Err(error).or_cannot_write(String::new),

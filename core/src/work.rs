@@ -6,6 +6,8 @@ use crate::layout::Layout;
 /// What holds for every episode of a run.
 #[derive(Debug, Clone, PartialEq)]
 pub struct RunTerms {
+    /// The run's name; empty outside a run.
+    pub run: String,
     /// Task and arms.
     pub layout: Layout,
     /// The teacher's account; `None` when nobody is to be asked.

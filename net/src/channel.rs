@@ -32,7 +32,7 @@ pub struct AuthChannel {
 pub(crate) struct Target {
     /// The address as the caller gave it.
     pub(crate) address: String,
-    /// Whether the channel uses TLS.
+    /// Set if the channel uses TLS.
     pub(crate) uses_tls: bool,
     /// The header with the token.
     pub(crate) authorization: Option<HeaderValue>,

@@ -27,4 +27,4 @@ pub use inference::{Actor, Critic};
 pub use matrix::{Matrix, MatrixMut, multiply};
 pub use mlp::{MlpShape, Workspace, backward_input, backward_parameters, forward};
 pub use normalizer::{Normalizer, NormalizerParts, NormalizerSnapshot};
-pub use policy::Policy;
+pub use policy::{Policy, actor_digest};

@@ -126,17 +126,11 @@ impl Policy {
     pub fn tensors(&self) -> Vec<Tensor<'_>> {
         let mut tensors = network_tensors("actor", &self.actor_shape(), &self.actor);
         tensors.extend(network_tensors("critic.0", &self.critic_shape(), &self.critic));
-        let normalizers =
-            [("observation", &self.observation_normalizer), ("goal", &self.goal_normalizer)];
-        for (name, normalizer) in normalizers {
-            for (part, data) in [("mean", &normalizer.mean), ("std", &normalizer.std)] {
-                tensors.push(Tensor {
-                    name: format!("normalizer.{name}.{part}"),
-                    shape: vec![data.len()],
-                    data,
-                });
-            }
-        }
+        let (observation, goal) = (&self.observation_normalizer, &self.goal_normalizer);
+        tensors.extend(normalizer_tensors([
+            [&observation.mean, &observation.std],
+            [&goal.mean, &goal.std],
+        ]));
         tensors
     }
 
@@ -146,16 +140,46 @@ impl Policy {
     /// When [`Policy::check`] would fail.
     #[must_use]
     pub fn digest(&self) -> String {
-        let mut hasher = Sha256::new();
-        for tensor in self.tensors() {
-            hasher.update(tensor.name.as_bytes());
-            hasher.update(little_endian(tensor.data));
-        }
-        hasher.finalize().iter().fold(String::new(), |mut text, byte| {
-            write!(text, "{byte:02x}").expect("a string takes any text");
-            text
-        })
+        digest_of(&self.tensors())
     }
+}
+
+/// Returns the digest of a published actor: [`Policy::digest`] over the tensors of the actor and the normalisers alone.
+///
+/// # Panics
+/// When [`Actor::new`] would fail.
+#[must_use]
+pub fn actor_digest(layout: Layout, published: &PublishedActor) -> String {
+    let shape = MlpShape::actor(layout, published.n_hidden, published.n_hidden_layers);
+    let mut tensors = network_tensors("actor", &shape, &published.actor);
+    tensors.extend(normalizer_tensors([
+        [&published.observation_mean, &published.observation_std],
+        [&published.goal_mean, &published.goal_std],
+    ]));
+    digest_of(&tensors)
+}
+
+fn digest_of(tensors: &[Tensor<'_>]) -> String {
+    let mut hasher = Sha256::new();
+    for tensor in tensors {
+        hasher.update(tensor.name.as_bytes());
+        hasher.update(little_endian(tensor.data));
+    }
+    hasher.finalize().iter().fold(String::new(), |mut text, byte| {
+        write!(text, "{byte:02x}").expect("a string takes any text");
+        text
+    })
+}
+
+/// Returns the tensors of the normalisers, given mean and standard deviation of observations, then of goals.
+fn normalizer_tensors(normalizers: [[&[f32]; 2]; 2]) -> impl Iterator<Item = Tensor<'_>> {
+    ["observation", "goal"].into_iter().zip(normalizers).flat_map(|(name, parts)| {
+        ["mean", "std"].into_iter().zip(parts).map(move |(part, data)| Tensor {
+            name: format!("normalizer.{name}.{part}"),
+            shape: vec![data.len()],
+            data,
+        })
+    })
 }
 
 /// The tensors that a network's flat parameters consist of, in their order.

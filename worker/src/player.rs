@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use tandem_core::work::{EpisodeOrder, PublishedActor, RunTerms, SlotOrder};
 use tandem_core::{Contacts, Episode, StepAdvice, StepQuery};
-use tandem_policy::Actor;
+use tandem_policy::{Actor, actor_digest};
 use tandem_sim::{Env, SimError};
 use tandem_telemetry::events::{EpisodeFinished, EpisodeRecorded};
 use tokio::sync::{mpsc, oneshot};
@@ -18,13 +18,15 @@ pub(crate) struct Player {
     terms: RunTerms,
     world: Env,
     actor: Option<Actor>,
+    /// The digest of the actor's parameters; empty without a directory for logs.
+    actor_digest: String,
     log_dir: Option<PathBuf>,
 }
 
 impl Player {
     pub(crate) fn new(terms: RunTerms, log_dir: Option<PathBuf>) -> Result<Self, SimError> {
         let world = Env::new(terms.layout, &world_config(terms.world))?;
-        Ok(Self { terms, world, actor: None, log_dir })
+        Ok(Self { terms, world, actor: None, actor_digest: String::new(), log_dir })
     }
 
     pub(crate) const fn terms(&self) -> &RunTerms {
@@ -38,7 +40,11 @@ impl Player {
 
     /// Loads the actor for the following slots.
     pub(crate) fn load(&mut self, published: PublishedActor) -> Result<(), tandem_policy::Error> {
-        self.actor = Some(Actor::new(self.terms.layout, published)?);
+        let layout = self.terms.layout;
+        let for_digest = self.log_dir.is_some().then(|| published.clone());
+        self.actor = Some(Actor::new(layout, published)?);
+        self.actor_digest =
+            for_digest.map_or_else(String::new, |published| actor_digest(layout, &published));
         Ok(())
     }
 
@@ -65,7 +71,8 @@ impl Player {
     /// Writes an episode's log. Failures are only logged: the episode itself is delivered.
     fn record(&self, order: EpisodeOrder, episode: &Episode, log_dir: &Path) {
         let path = log_dir.join(log_name(episode));
-        match record_episode(&metadata_of(order, episode, &self.terms), episode, &path) {
+        let metadata = metadata_of(order, episode, &self.terms, self.actor_digest.clone());
+        match record_episode(&metadata, episode, &path) {
             Ok(path) => EpisodeRecorded { episode: episode.number, path: &path }.emit(),
             Err(error) => {
                 let error: &dyn std::error::Error = &error;

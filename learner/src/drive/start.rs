@@ -122,6 +122,7 @@ impl<'a> Drive<'a> {
     ) -> Self {
         let Beginning { trainer, acting, judged, pending, wall_before_s, lock, .. } = beginning;
         let terms = RunTerms {
+            run: config.run.name.clone(),
             layout: trainer.layout,
             account: ledger.as_ref().map(|ledger| ledger.account().to_owned()),
             exploration: config.run.exploration(),

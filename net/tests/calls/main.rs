@@ -243,7 +243,7 @@ async fn a_failed_connection_is_reported_with_the_address() {
     drop(served.stop().await);
     let status = describe(&ClientConfig::default().channel(&address).expect("an address"))
         .await
-        .expect_err("nobody");
+        .expect_err("no server");
     assert_eq!(status.code(), Code::Unavailable, "{status}");
     assert!(status.message().starts_with(&format!("{address} does not answer: ")), "{status}");
 }
@@ -346,6 +346,6 @@ async fn a_health_check_distinguishes_the_ways_of_not_serving() {
     assert!(matches!(error, HealthError::Timeout(_)), "{error}");
     drop(silent);
     let channel = ClientConfig::default().channel(&address).expect("an address");
-    let error = check_health(channel, "", LONG).await.expect_err("nobody there");
+    let error = check_health(channel, "", LONG).await.expect_err("no server");
     assert!(matches!(error, HealthError::Unreachable(_)), "{error}");
 }

@@ -1,4 +1,4 @@
-//! A worker against a learner and a teacher on the loopback interface that fail in every way they can.
+//! A worker with a learner and a teacher on the loopback interface that fail in various ways.
 
 mod support;
 
@@ -8,13 +8,15 @@ use std::time::Duration;
 
 use tandem_core::{Episode, EpisodeKind};
 use tandem_net::{Backoff, ClientConfig, Pacing};
+use tandem_policy::actor_digest;
+use tandem_telemetry::read_episode;
 use tandem_worker::{Error, Timeouts, WorkerConfig, run_with};
 use tokio_util::sync::CancellationToken;
 use tonic::Status;
 
 use support::learner::{Call, FakeLearner, Fault};
 use support::teacher::FakeTeacher;
-use support::{Server, orders, terms};
+use support::{LAYOUT, Server, actor, orders, terms};
 
 const TIMEOUTS: Timeouts = Timeouts {
     backoff: Backoff {
@@ -38,8 +40,8 @@ fn config(learner: &Server, teacher: Option<&Server>) -> WorkerConfig {
     }
 }
 
-/// Works for `learner` until its slots are all in; gives the episodes that it took, by kind and number.
-async fn work_through(
+/// Runs a worker until all slots of `learner` are delivered; returns the delivered episodes by kind and number.
+async fn play_run(
     learner: &Arc<FakeLearner>,
     teacher: &Arc<FakeTeacher>,
 ) -> BTreeMap<(bool, u64), Episode> {
@@ -49,15 +51,15 @@ async fn work_through(
     learner.episodes()
 }
 
-async fn undisturbed() -> BTreeMap<(bool, u64), Episode> {
-    work_through(&Arc::new(FakeLearner::new(orders())), &Arc::new(FakeTeacher::default())).await
+async fn episodes_without_faults() -> BTreeMap<(bool, u64), Episode> {
+    play_run(&Arc::new(FakeLearner::new(orders())), &Arc::new(FakeTeacher::default())).await
 }
 
 #[tokio::test]
 async fn every_slot_is_played_and_delivered() {
     let teacher = Arc::new(FakeTeacher::default());
     let learner = Arc::new(FakeLearner::new(orders()));
-    let episodes = work_through(&learner, &teacher).await;
+    let episodes = play_run(&learner, &teacher).await;
     let played: Vec<(bool, u64)> = episodes.keys().copied().collect();
     assert_eq!(played, [(false, 0), (false, 1), (false, 2), (false, 3), (true, 0), (true, 1)]);
     for ((is_evaluation, number), episode) in &episodes {
@@ -72,11 +74,11 @@ async fn every_slot_is_played_and_delivered() {
 }
 
 #[tokio::test]
-async fn a_learner_that_fails_now_and_then_gets_the_same_episodes() {
-    let expected = undisturbed().await;
+async fn a_learner_with_failing_calls_gets_the_same_episodes() {
+    let expected = episodes_without_faults().await;
     let check = async |call, nth, fault| {
         let learner = Arc::new(FakeLearner::new(orders()).with_fault(call, nth, fault));
-        let episodes = work_through(&learner, &Arc::new(FakeTeacher::default())).await;
+        let episodes = play_run(&learner, &Arc::new(FakeTeacher::default())).await;
         assert_eq!(episodes, expected, "{call:?} {nth}");
         learner
     };
@@ -97,8 +99,8 @@ async fn a_learner_that_fails_now_and_then_gets_the_same_episodes() {
 }
 
 #[tokio::test]
-async fn a_learner_that_dies_and_comes_back_gets_the_same_episodes() {
-    let expected = undisturbed().await;
+async fn a_restarted_learner_gets_the_same_episodes() {
+    let expected = episodes_without_faults().await;
     let (learner, mut at_fault) = FakeLearner::new(orders()).hanging_at(Call::Submit, 1);
     let (learner, teacher) = (Arc::new(learner), Arc::new(FakeTeacher::default()));
     let (first_life, teacher_server) = (Server::learner(&learner), Server::teacher(&teacher));
@@ -113,8 +115,8 @@ async fn a_learner_that_dies_and_comes_back_gets_the_same_episodes() {
 }
 
 #[tokio::test]
-async fn a_stream_that_breaks_within_an_episode_costs_nothing() {
-    let expected = undisturbed().await;
+async fn a_stream_that_breaks_within_an_episode_changes_nothing() {
+    let expected = episodes_without_faults().await;
     for fault in [
         Status::unavailable("restarting"),
         Status::not_found("no account yet"),
@@ -122,13 +124,13 @@ async fn a_stream_that_breaks_within_an_episode_costs_nothing() {
     ] {
         let teacher = Arc::new(FakeTeacher::default().failing_at([0, 7, 8, 60], &fault));
         let learner = Arc::new(FakeLearner::new(orders()));
-        assert_eq!(work_through(&learner, &teacher).await, expected, "{fault:?}");
+        assert_eq!(play_run(&learner, &teacher).await, expected, "{fault:?}");
         assert_eq!(learner.n_calls(Call::Join), 1);
     }
 }
 
 #[tokio::test]
-async fn an_episode_to_be_recorded_gets_a_log() {
+async fn a_recorded_episode_gets_a_log_with_its_run_and_policy() {
     let logs = tempfile::tempdir().expect("a directory");
     let (learner, teacher) =
         (Arc::new(FakeLearner::new(orders())), Arc::new(FakeTeacher::default()));
@@ -141,11 +143,16 @@ async fn an_episode_to_be_recorded_gets_a_log() {
         .map(|entry| entry.expect("readable").file_name())
         .collect();
     assert_eq!(names, ["eval-000002-001.mcap"]);
+    let log = read_episode(&logs.path().join("mcap").join("eval-000002-001.mcap"));
+    let metadata = log.expect("a whole log").metadata;
+    assert_eq!(metadata.run, "run-7", "the run's name, not the account's");
+    assert_eq!(metadata.policy_digest, actor_digest(LAYOUT, &actor(2)));
+    assert_ne!(metadata.policy_digest, actor_digest(LAYOUT, &actor(1)));
 }
 
 #[tokio::test]
-async fn a_teacher_that_never_answers_is_asked_again() {
-    let expected = undisturbed().await;
+async fn a_request_without_an_answer_is_repeated() {
+    let expected = episodes_without_faults().await;
     let (teacher, _at_fault) = FakeTeacher::default().hanging_at(3);
     let (learner, teacher) = (Arc::new(FakeLearner::new(orders())), Arc::new(teacher));
     let (learner_server, teacher_server) = (Server::learner(&learner), Server::teacher(&teacher));
@@ -209,9 +216,9 @@ async fn a_worker_that_waits_for_its_teacher_can_be_stopped() {
 }
 
 #[tokio::test]
-async fn a_worker_that_is_told_to_stop_delivers_what_it_plays() {
+async fn a_worker_that_is_stopped_delivers_its_slot() {
     let learner = Arc::new(FakeLearner::new(orders()));
-    let (teacher, mut at_fault) = FakeTeacher::default().telling_at(3);
+    let (teacher, mut at_fault) = FakeTeacher::default().signalling_at(3);
     let teacher = Arc::new(teacher);
     let (learner_server, teacher_server) = (Server::learner(&learner), Server::teacher(&teacher));
     let shutdown = CancellationToken::new();
