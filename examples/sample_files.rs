@@ -1,6 +1,6 @@
-//! Writes samples of what no short run leaves: a ledger with open leases, and encoded messages of every type.
+//! Writes sample files that no short run produces: a ledger with open leases, and encoded messages of every type.
 //!
-//! `scripts/make-corpus` calls it with the directory to write to.
+//! `scripts/make-corpus` runs it with the output directory as argument.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -15,7 +15,7 @@ use tandem_teacher::ledger::{Bill, Charge, Ledger as _, SqliteLedger};
 
 type AnyError = Box<dyn std::error::Error>;
 
-/// No message has more alternatives in a `oneof`.
+/// Largest number of alternatives in a `oneof`.
 const N_VARIANTS: usize = 4;
 
 fn main() -> Result<(), AnyError> {
@@ -24,10 +24,10 @@ fn main() -> Result<(), AnyError> {
     write_messages(&directory.join("messages.json"))
 }
 
-/// Two accounts: one without leases and one with a settled lease, an open one and charges under both.
+/// Writes two accounts: one without leases, and one with a settled lease, an open lease and charges under both.
 fn write_ledger(path: &Path) -> Result<(), AnyError> {
     if path.exists() {
-        return Err(format!("{path:?} exists already").into());
+        return Err(format!("{path:?} already exists").into());
     }
     let mut ledger = SqliteLedger::open(path)?;
     ledger.open("unleased", Terms { budget: 10, strategy: "mc-q:0.1".parse()? })?;
@@ -53,7 +53,7 @@ fn write_ledger(path: &Path) -> Result<(), AnyError> {
     Ok(())
 }
 
-/// Every message type of the package with every field set: once for each alternative of its `oneof`s.
+/// Writes every message type of the package with every field set, once for each alternative of its `oneof`s.
 fn write_messages(path: &Path) -> Result<(), AnyError> {
     let pool = DescriptorPool::decode(tandem_proto::FILE_DESCRIPTOR_SET)?;
     let mut samples = Vec::new();
@@ -75,7 +75,8 @@ fn write_messages(path: &Path) -> Result<(), AnyError> {
     Ok(())
 }
 
-/// A message with every field set, of each `oneof` the alternative `variant`. `n` counts values: all of them differ.
+/// Creates a message with every field set, and alternative `variant` of each `oneof`. `n` counts values, so that all
+/// differ.
 fn filled(message: &MessageDescriptor, variant: usize, n: &mut u32) -> DynamicMessage {
     let mut filled = DynamicMessage::new(message.clone());
     for field in message.fields().filter(|field| is_chosen(field, variant)) {

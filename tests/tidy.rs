@@ -4,19 +4,20 @@ use std::collections::BTreeSet;
 use std::fs;
 use std::path::{Path, PathBuf};
 
-const ALLOWED: [(&str, &[&str]); 13] = [
+const ALLOWED: [(&str, &[&str]); 14] = [
     ("core", &[]),
+    ("system", &[]),
     ("kinematics", &["core"]),
     ("sim", &["core"]),
-    ("policy", &["core"]),
+    ("policy", &["core", "system"]),
     ("proto", &["core"]),
-    ("telemetry", &["core"]),
-    ("net", &[]),
+    ("telemetry", &["core", "system"]),
+    ("net", &["core"]),
     ("rl", &["core", "policy"]),
-    ("learner", &["core", "policy", "rl", "proto", "telemetry", "net"]),
+    ("learner", &["core", "system", "policy", "rl", "proto", "telemetry", "net"]),
     ("teacher", &["core", "policy", "proto", "telemetry", "net"]),
     ("worker", &["core", "sim", "policy", "proto", "telemetry", "net"]),
-    ("report", &["core", "telemetry"]),
+    ("report", &["core", "system", "telemetry"]),
     ("bridge", &["core", "kinematics", "policy", "sim", "telemetry", "proto", "net"]),
 ];
 

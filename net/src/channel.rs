@@ -1,13 +1,13 @@
 //! A channel to a service that sends the token and reports failures in one line.
 
 use std::error::Error;
-use std::fmt;
 use std::future::Future;
 use std::pin::Pin;
 use std::sync::Arc;
 use std::task::{Context, Poll};
 
 use http::header::{AUTHORIZATION, HeaderValue};
+use tandem_core::text::{causes, error_chain};
 use tonic::body::Body;
 use tonic::transport::Channel;
 use tonic::{Code, Status};
@@ -91,7 +91,7 @@ impl Target {
 
     /// Returns the status of a call that did not reach the service.
     fn unavailable(&self, error: tonic::transport::Error) -> Status {
-        let (address, causes) = (&self.address, Causes(&error).to_string());
+        let (address, chain) = (&self.address, error_chain(&error));
         let message = match (self.uses_tls, self.first_byte.is_tls()) {
             (true, Some(false)) => format!(
                 "{address} does not speak TLS: leave --tls-ca out, or start it with --tls-cert and --tls-key"
@@ -100,9 +100,9 @@ impl Target {
                 format!("{address} speaks TLS: name its authority's certificate in --tls-ca")
             }
             (true, _) if is_certificate_rejected(&error) => {
-                format!("{address} is not trusted, see --tls-ca: {causes}")
+                format!("{address} is not trusted, see --tls-ca: {chain}")
             }
-            _ => format!("{address} does not answer: {causes}"),
+            _ => format!("{address} does not answer: {chain}"),
         };
         match Status::from_error(Box::new(error)).code() {
             code @ (Code::Cancelled | Code::DeadlineExceeded) => Status::new(code, message),
@@ -113,7 +113,7 @@ impl Target {
 
 /// Returns whether the client rejected the service's certificate.
 fn is_certificate_rejected(error: &(dyn Error + 'static)) -> bool {
-    chain(error).any(|cause| {
+    causes(error).any(|cause| {
         // `io::Error::source` skips the wrapped error and returns that error's source.
         let wrapped = cause.downcast_ref::<std::io::Error>().and_then(|error| error.get_ref());
         let tls = match wrapped {
@@ -122,28 +122,4 @@ fn is_certificate_rejected(error: &(dyn Error + 'static)) -> bool {
         };
         matches!(tls, Some(rustls::Error::InvalidCertificate(_)))
     })
-}
-
-/// Returns an error and its causes, outermost first.
-fn chain<'a>(
-    error: &'a (dyn Error + 'static),
-) -> impl Iterator<Item = &'a (dyn Error + 'static)> + use<'a> {
-    std::iter::successors(Some(error), |&error| error.source())
-}
-
-/// Formats an error and its causes on one line, without repeating text that a cause has in common with its effect.
-struct Causes<'a>(&'a (dyn Error + 'static));
-
-impl fmt::Display for Causes<'_> {
-    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let mut line = String::new();
-        for cause in chain(self.0) {
-            let text = cause.to_string().replace('\n', " ");
-            if !line.contains(&text) {
-                let separator = if line.is_empty() { "" } else { ": " };
-                line = format!("{line}{separator}{text}");
-            }
-        }
-        formatter.write_str(&line)
-    }
 }

@@ -5,8 +5,9 @@ use std::path::{Path, PathBuf};
 
 use serde::de::DeserializeOwned;
 use tandem_core::Task;
+use tandem_system::regular_file;
 use tandem_telemetry::trials::TRIALS_FILE;
-use tandem_telemetry::{MetricsRow, TrialRow, read_regular};
+use tandem_telemetry::{MetricsRow, TrialRow};
 use toml::{Table, Value};
 
 use crate::error::Error;
@@ -222,7 +223,7 @@ fn is_trials_file(path: &Path) -> Result<bool, Error> {
     if path.file_name().is_some_and(|name| name == TRIALS_FILE) {
         return Ok(true);
     }
-    let bytes = read_regular(path).map_err(read_error(path))?;
+    let bytes = regular_file::read(path).map_err(read_error(path))?;
     let first = bytes.split(|byte| *byte == b'\n').next().unwrap_or_default();
     Ok(serde_json::from_slice::<TrialRow>(first).is_ok())
 }
@@ -263,7 +264,7 @@ impl Broken {
 }
 
 fn read_lines<T: DeserializeOwned>(path: &Path) -> Result<(Vec<T>, Option<Broken>), Error> {
-    let bytes = read_regular(path).map_err(read_error(path))?;
+    let bytes = regular_file::read(path).map_err(read_error(path))?;
     let mut rows = Vec::new();
     for (line_idx, line) in bytes.split_inclusive(|byte| *byte == b'\n').enumerate() {
         match serde_json::from_slice(line) {
@@ -290,7 +291,7 @@ fn read_if_there(path: &Path) -> Result<Option<String>, Error> {
 /// Reads a text from a regular file.
 pub(crate) fn read_text(path: &Path) -> std::io::Result<String> {
     let not_utf8 = |_| std::io::Error::new(ErrorKind::InvalidData, "it is not UTF-8");
-    String::from_utf8(read_regular(path)?).map_err(not_utf8)
+    String::from_utf8(regular_file::read(path)?).map_err(not_utf8)
 }
 
 fn read_error(path: &Path) -> impl FnOnce(std::io::Error) -> Error {

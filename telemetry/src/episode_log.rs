@@ -7,12 +7,12 @@ use mcap::McapError;
 use mcap::read::ChannelAccumulator;
 use mcap::records::Record;
 use tandem_core::{ArmAdvice, Contacts, Layout};
+use tandem_system::regular_file;
 
 use crate::error::Error;
 use crate::messages::{EpisodeMetadata, METADATA_NAME, decode, pb};
 use crate::recorder::{OUTCOME_TOPIC, TRANSITION_TOPIC};
 use crate::records::Records;
-use crate::whole_file::read_regular;
 
 /// A recorded episode.
 #[derive(Debug, Clone, PartialEq)]
@@ -51,7 +51,7 @@ pub struct LoggedTransition {
 /// # Errors
 /// When the file cannot be read, is not whole, or is no log of an episode.
 pub fn read_episode(path: &Path) -> Result<EpisodeLog, Error> {
-    let bytes = read_regular(path).map_err(Error::io("read", path))?;
+    let bytes = regular_file::read(path).map_err(Error::io("read", path))?;
     let not_an_episode = |problem| Error::NotAnEpisode { path: path.to_owned(), problem };
     let raw = read_raw(&bytes).map_err(Error::read_log(path))?;
     checked(raw).map_err(not_an_episode)

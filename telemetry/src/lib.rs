@@ -19,7 +19,6 @@ mod scene;
 pub mod standard_error;
 pub mod trial_log;
 pub mod trials;
-mod whole_file;
 
 pub use episode_log::{EpisodeLog, LoggedTransition, read_episode};
 pub use error::Error;
@@ -29,4 +28,3 @@ pub use recorder::{EpisodeRecorder, TransitionRecord};
 pub use recovery::{RecoveredCounts, recover};
 pub use trial_log::{LogLevel, TrialLook, TrialMetadata, TrialOutcome, TrialRecorder};
 pub use trials::{ToolsAt, TrialRow, TrialsLog, read_trials};
-pub use whole_file::read_regular;

@@ -9,6 +9,7 @@ use std::path::{Path, PathBuf};
 use foxglove::Encode;
 use foxglove::messages::{Log, Timestamp, log::Level};
 use mcap::records::{MessageHeader, Metadata};
+use tandem_system::atomic_file;
 
 use crate::error::Error;
 
@@ -54,10 +55,9 @@ impl LogFile {
     /// Completes the file, gives it its name and returns that.
     pub(crate) fn finish(mut self) -> Result<PathBuf, Error> {
         self.writer.finish().map_err(Error::write_log(&self.part_path))?;
-        let synced = self.writer.into_inner().get_ref().sync_all();
-        synced.map_err(Error::io("sync", &self.part_path))?;
-        std::fs::rename(&self.part_path, &self.path)
-            .map_err(Error::io("rename", &self.part_path))?;
+        let file = self.writer.into_inner();
+        atomic_file::publish(file.get_ref(), &self.part_path, &self.path)
+            .map_err(Error::io("complete", &self.part_path))?;
         Ok(self.path)
     }
 }

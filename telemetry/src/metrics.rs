@@ -5,9 +5,9 @@ use std::io::Write as _;
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Deserializer, Serialize};
+use tandem_system::regular_file;
 
 use crate::error::Error;
-use crate::whole_file::read_regular;
 
 /// What is known after one evaluation. Shares are in [0, 1]; a number that does not exist (no update yet, no training
 /// episode) is NaN here and `null` in the file.
@@ -109,7 +109,7 @@ impl MetricsLog {
             .open(path)
             .map_err(Error::io("open", path))?;
         let log = Self { path: path.to_owned(), file };
-        let bytes = read_regular(path).map_err(Error::io("read", path))?;
+        let bytes = regular_file::read(path).map_err(Error::io("read", path))?;
         let (mut end, mut n_rows) = (0, 0);
         for row in rows {
             let line = line_of(row).map_err(Error::io("compare", path))?;
@@ -168,7 +168,7 @@ struct Rows {
 
 impl Rows {
     fn read(path: &Path) -> Result<Self, Error> {
-        let bytes = read_regular(path).map_err(Error::io("read", path))?;
+        let bytes = regular_file::read(path).map_err(Error::io("read", path))?;
         let mut rows = Vec::new();
         let mut end = 0;
         for (line_idx, line) in bytes.split_inclusive(|byte| *byte == b'\n').enumerate() {

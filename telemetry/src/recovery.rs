@@ -2,15 +2,15 @@
 
 use std::fs::File;
 use std::io::BufWriter;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use mcap::McapError;
 use mcap::records::Record;
+use tandem_system::{atomic_file, regular_file};
 
 use crate::error::Error;
 use crate::log_file::write_options;
 use crate::records::Records;
-use crate::whole_file::read_regular;
 
 /// What [`recover`] saved.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
@@ -31,31 +31,15 @@ pub struct RecoveredCounts {
 /// # Errors
 /// When `source` cannot be read or does not begin like an MCAP file, or `destination` cannot be written.
 pub fn recover(source: &Path, destination: &Path) -> Result<RecoveredCounts, Error> {
-    let bytes = read_regular(source).map_err(Error::io("read", source))?;
+    let bytes = regular_file::read(source).map_err(Error::io("read", source))?;
     if !bytes.starts_with(mcap::MAGIC) {
         return Err(Error::ReadLog { path: source.to_owned(), source: McapError::BadMagic });
     }
-    let temporary = temporary_path(destination);
-    let file = File::create(&temporary).map_err(Error::io("create", &temporary))?;
-    let copied =
-        copy_readable(&bytes, file).map_err(Error::write_log(&temporary)).and_then(|counts| {
-            std::fs::rename(&temporary, destination).map_err(Error::io("rename", &temporary))?;
-            Ok(counts)
-        });
-    if copied.is_err() {
-        drop(std::fs::remove_file(&temporary));
-    }
-    copied
+    atomic_file::replace_with(destination, |file| copy_readable(&bytes, file))
+        .map_err(Error::write_log(destination))
 }
 
-/// Differs from the recorder's `.part`, which may well be the source.
-fn temporary_path(destination: &Path) -> PathBuf {
-    let mut name = destination.as_os_str().to_owned();
-    name.push(".recovering");
-    PathBuf::from(name)
-}
-
-fn copy_readable(bytes: &[u8], file: File) -> mcap::McapResult<RecoveredCounts> {
+fn copy_readable(bytes: &[u8], file: &File) -> mcap::McapResult<RecoveredCounts> {
     let mut copy = Copy {
         writer: write_options().create(BufWriter::new(file))?,
         counts: RecoveredCounts::default(),
@@ -80,12 +64,12 @@ fn copy_readable(bytes: &[u8], file: File) -> mcap::McapResult<RecoveredCounts> 
 }
 
 /// The file that is being made whole.
-struct Copy {
-    writer: mcap::Writer<BufWriter<File>>,
+struct Copy<'a> {
+    writer: mcap::Writer<BufWriter<&'a File>>,
     counts: RecoveredCounts,
 }
 
-impl Copy {
+impl Copy<'_> {
     /// Writes a record, or says why it cannot stand after those before it.
     fn write(&mut self, record: &Record<'_>) -> mcap::McapResult<Option<McapError>> {
         match self.try_write(record) {

@@ -61,7 +61,7 @@ impl Learner {
         let call = |mut client: Client, request| async move { client.join(request).await };
         let response = self.call(JOIN, self.timeouts.call, request, call).await;
         let response = response.map_err(|status| Error::protocol(JOIN, status))?;
-        let terms = required("terms", response.terms).and_then(tandem_proto::decode_terms);
+        let terms = required("terms", response.terms).and_then(tandem_proto::decode_run_terms);
         Ok((response.worker_id, terms.map_err(|error| Error::protocol(JOIN, error))?))
     }
 

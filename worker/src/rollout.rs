@@ -2,9 +2,9 @@
 
 use tandem_core::layout::EPISODE_STEPS;
 use tandem_core::rng::{Stream, episode_rng};
-use tandem_core::work::{EpisodeOrder, RunTerms, SlotOrder, WorldTerms};
+use tandem_core::work::{EpisodeOrder, RunTerms, SlotOrder};
 use tandem_core::{Episode, EpisodeKind, StepAdvice, StepQuery};
-use tandem_sim::{SimError, Starts, WorldConfig};
+use tandem_sim::SimError;
 use tandem_telemetry::events::StepAdvised;
 
 use crate::explore::Explorer;
@@ -97,8 +97,8 @@ fn take_advice<E: Environment>(
     };
     let first_number = first.episode.number;
     let queries: Vec<StepQuery> = advised.iter().map(|rollout| rollout.query(step_idx)).collect();
-    let answers = advisor.advise(&queries)?;
-    check_count(first_number, step_idx, "steps", answers.len(), queries.len())?;
+    let answers = advisor.advise(queries)?;
+    check_count(first_number, step_idx, "steps", answers.len(), advised.len())?;
     for (rollout, advice) in advised.iter_mut().zip(&answers) {
         rollout.apply_advice(advice, step_idx)?;
     }
@@ -137,7 +137,7 @@ struct Rollout<E> {
 impl<E: Environment> Rollout<E> {
     fn start(mut env: E, order: EpisodeOrder, slot: &SlotOrder, terms: &RunTerms) -> Self {
         let layout = terms.layout;
-        env.reset(order, starts(slot.kind, terms.world));
+        env.reset(order, terms.world.for_kind(slot.kind));
         let mut observation = vec![0.0; layout.n_observation()];
         env.observe(&mut observation);
         let mut observations = Vec::with_capacity((EPISODE_STEPS + 1) * layout.n_observation());
@@ -216,21 +216,6 @@ impl<E: Environment> Rollout<E> {
         self.episode.advised_arms.push(self.advised_arms);
         self.episode.contacts.push(contacts);
         Ok(())
-    }
-}
-
-/// Returns the configuration of the simulated world for these terms.
-pub(crate) fn world_config(terms: WorldTerms) -> WorldConfig {
-    WorldConfig { substeps: terms.substeps, ..WorldConfig::default() }
-}
-
-/// Returns the start states of episodes: those of the task for evaluations, and by the terms for training.
-pub(crate) fn starts(kind: EpisodeKind, terms: WorldTerms) -> Starts {
-    match kind {
-        EpisodeKind::Training => {
-            Starts { gripped_share: terms.gripped_start_share, wide_share: terms.wide_start_share }
-        }
-        EpisodeKind::Evaluation => Starts { gripped_share: 0.0, wide_share: 0.0 },
     }
 }
 
@@ -375,7 +360,7 @@ mod tests {
     }
 
     impl Advisor for FixedFlags {
-        fn advise(&mut self, queries: &[StepQuery]) -> Result<Vec<StepAdvice>, AdvisorGone> {
+        fn advise(&mut self, queries: Vec<StepQuery>) -> Result<Vec<StepAdvice>, AdvisorGone> {
             let mut teacher = FakeTeacher::new(|_, _, _| self.overridden);
             let answers = teacher.advise(queries)?.into_iter();
             Ok(answers.map(|advice| StepAdvice { charged: self.charged, ..advice }).collect())
@@ -412,7 +397,7 @@ mod tests {
     fn advice_about_other_steps_is_an_error() {
         struct Silent;
         impl Advisor for Silent {
-            fn advise(&mut self, _queries: &[StepQuery]) -> Result<Vec<StepAdvice>, AdvisorGone> {
+            fn advise(&mut self, _queries: Vec<StepQuery>) -> Result<Vec<StepAdvice>, AdvisorGone> {
                 Ok(Vec::new())
             }
         }

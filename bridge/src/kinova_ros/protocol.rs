@@ -3,6 +3,7 @@
 //! The words are those of version 2 of rosbridge's protocol, ROS 1's message types, and kinova-ros (state of February 2023).
 
 use serde_json::{Value, json};
+use tandem_core::text::shortened;
 use tandem_kinematics::Joints;
 
 use crate::driver::{ArmReading, DriverError, Faults};
@@ -11,6 +12,8 @@ use crate::driver::{ArmReading, DriverError, Faults};
 pub(crate) const N_JOINTS: usize = 4;
 /// Fingers of a gripper.
 const N_FINGERS: usize = 2;
+/// Characters of a message that an error repeats.
+const MAX_SHOWN_CHARS: usize = 200;
 /// kinova-ros tells a finger's turn as an angle of its joint: degrees for each unit of turn.
 const FINGER_DEGREES_PER_TURN: f64 = 80.0 / 6800.0;
 
@@ -29,8 +32,9 @@ pub(crate) enum Heard {
 
 /// Reads what rosbridge says.
 pub(crate) fn hear(text: &str) -> Result<Heard, DriverError> {
-    let message: Value = serde_json::from_str(text)
-        .map_err(|error| malformed(format!("not JSON: {error}: {}", shortened(text))))?;
+    let message: Value = serde_json::from_str(text).map_err(|error| {
+        malformed(format!("not JSON: {error}: {}", shortened(text, MAX_SHOWN_CHARS)))
+    })?;
     let word = |key: &str| message.get(key).and_then(Value::as_str).unwrap_or_default().to_owned();
     let value = |key: &str| message.get(key).cloned().unwrap_or(Value::Null);
     Ok(match word("op").as_str() {
@@ -40,7 +44,9 @@ pub(crate) fn hear(text: &str) -> Result<Heard, DriverError> {
             result: value("result").as_bool().unwrap_or(false),
             values: value("values"),
         },
-        "status" if word("level") == "error" => Heard::Complaint(shortened(&word("msg"))),
+        "status" if word("level") == "error" => {
+            Heard::Complaint(shortened(&word("msg"), MAX_SHOWN_CHARS))
+        }
         _ => Heard::Other,
     })
 }
@@ -198,7 +204,7 @@ impl Reading<'_> {
             *place = match (found.next(), found.next()) {
                 (Some(place), None) => place,
                 (None, _) => {
-                    let known = shortened(&names.join(" "));
+                    let known = shortened(&names.join(" "), MAX_SHOWN_CHARS);
                     return Err(malformed(format!("no joint {name:?} among {known:?}")));
                 }
                 (Some(_), Some(_)) => return Err(malformed(format!("joint {name:?} twice"))),
@@ -229,11 +235,6 @@ fn stamp_s(msg: &Value) -> Result<f64, DriverError> {
 fn list<'a>(msg: &'a Value, key: &str) -> Result<&'a Vec<Value>, DriverError> {
     let value = msg.get(key).and_then(Value::as_array);
     value.ok_or_else(|| malformed(format!("a joint state without a list {key:?}")))
-}
-
-/// The beginning of what is too long for a message.
-fn shortened(text: &str) -> String {
-    text.chars().take(200).collect()
 }
 
 fn malformed(what: String) -> DriverError {

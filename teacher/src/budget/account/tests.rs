@@ -1,5 +1,5 @@
 use tandem_core::layout::EPISODE_STEPS;
-use tandem_core::rng::{Stream, coin, episode_rng, index};
+use tandem_core::rng::{Stream, bernoulli, episode_rng, index};
 
 use super::*;
 use crate::strategy::Strategy;
@@ -253,7 +253,8 @@ fn an_account_does_what_the_written_down_model_does() {
                     let unleased = kind == 2 || n_opened == 0;
                     let episode = if unleased { 100 + any_leased % 5 } else { any_leased };
                     let step = u32::try_from(index(&mut rng, EPISODE_STEPS)).unwrap();
-                    let wish = Wish { first: coin(&mut rng, 0.9), second: coin(&mut rng, 0.6) };
+                    let wish =
+                        Wish { first: bernoulli(&mut rng, 0.9), second: bernoulli(&mut rng, 0.6) };
                     assert_eq!(
                         account.charge(episode, step, wish),
                         model.charge(episode, step, wish)

@@ -1,17 +1,17 @@
 //! Locks on directories.
 //!
-//! What is locked is the directory itself and not a file beside the data: there is nothing that could be taken for
-//! rubbish and removed. The system frees a lock however its process ends.
+//! The lock is on the directory itself, so there is no lock file that a cleanup could remove. The system releases a lock
+//! however its process ends.
 
 use std::fs::{File, TryLockError};
 use std::io::{self, ErrorKind};
 use std::os::unix::fs::MetadataExt as _;
 use std::path::{Path, PathBuf};
 
-/// How often a directory that is replaced at the very moment is opened again.
-const MAX_TRIES: usize = 10;
+/// Attempts to open a directory that is being replaced at the same time.
+const MAX_ATTEMPTS: usize = 10;
 
-/// Keeps others who ask for it out of a directory until it is dropped.
+/// An exclusive advisory lock on a directory. Dropping it releases the lock.
 #[derive(Debug)]
 pub struct DirectoryLock {
     path: PathBuf,
@@ -19,13 +19,13 @@ pub struct DirectoryLock {
 }
 
 impl DirectoryLock {
-    /// Locks the directory `path`; `None` while somebody else holds its lock. Where the file system has no locks it
-    /// says so in one warning and counts as locked.
+    /// Locks the directory `path`, or returns `None` if it is already locked. On a file system without locks, this logs
+    /// a warning and returns a lock that excludes no other process.
     ///
     /// # Errors
     /// When `path` cannot be opened or is not a directory.
     pub fn try_take(path: &Path) -> io::Result<Option<Self>> {
-        for _ in 0..MAX_TRIES {
+        for _ in 0..MAX_ATTEMPTS {
             let directory = File::open(path)?;
             if !directory.metadata()?.is_dir() {
                 return Err(ErrorKind::NotADirectory.into());
@@ -36,25 +36,25 @@ impl DirectoryLock {
                 Err(TryLockError::Error(error)) => tracing::warn!(
                     %error,
                     ?path,
-                    "this file system has no locks: see to it that no second process works in the directory"
+                    "this file system has no locks: make sure that no second process uses the directory"
                 ),
             }
             let lock = Self { path: path.to_owned(), directory };
-            // Between the opening and the locking another directory may have taken its place.
+            // Another directory may have taken its place between opening and locking.
             if lock.is_in_place() {
                 return Ok(Some(lock));
             }
         }
-        Err(io::Error::new(ErrorKind::NotFound, "it is replaced again and again"))
+        Err(io::Error::new(ErrorKind::NotFound, "it is being replaced repeatedly"))
     }
 
-    /// Whether the path still leads to the locked directory, which may have been moved, removed or replaced. Yes while
-    /// that cannot be told.
+    /// Returns whether the path still leads to the locked directory, which may have been moved, removed or replaced.
+    /// Returns `true` while that cannot be determined.
     #[must_use]
     pub fn is_in_place(&self) -> bool {
         let identity = |metadata: std::fs::Metadata| (metadata.dev(), metadata.ino());
         match (std::fs::metadata(&self.path), self.directory.metadata()) {
-            (Ok(there), Ok(held)) => identity(there) == identity(held),
+            (Ok(current), Ok(locked)) => identity(current) == identity(locked),
             (Err(error), _) => {
                 !matches!(error.kind(), ErrorKind::NotFound | ErrorKind::NotADirectory)
             }
@@ -67,7 +67,7 @@ impl Drop for DirectoryLock {
     /// Releases the lock. Closing the directory is not enough while a process that was just forked has a copy of it.
     fn drop(&mut self) {
         if let Err(error) = self.directory.unlock() {
-            tracing::debug!(%error, path = ?self.path, "the lock on the directory is not released");
+            tracing::debug!(%error, path = ?self.path, "the lock on the directory cannot be released");
         }
     }
 }
@@ -83,7 +83,7 @@ mod tests {
     }
 
     #[test]
-    fn one_at_a_time_holds_a_directory() {
+    fn a_directory_has_one_lock_at_a_time() {
         let keep = tempfile::tempdir().expect("a directory");
         let held = DirectoryLock::try_take(keep.path()).expect("a directory").expect("free");
         assert!(!is_free(keep.path()));
@@ -94,7 +94,7 @@ mod tests {
     }
 
     #[test]
-    fn no_file_in_the_directory_is_the_lock() {
+    fn a_lock_creates_no_file() {
         let keep = tempfile::tempdir().expect("a directory");
         let held = DirectoryLock::try_take(keep.path()).expect("a directory").expect("free");
         assert_eq!(fs::read_dir(keep.path()).expect("readable").count(), 0);
@@ -102,7 +102,7 @@ mod tests {
     }
 
     #[test]
-    fn a_directory_that_was_replaced_is_noticed() {
+    fn a_replaced_directory_is_detected() {
         let keep = tempfile::tempdir().expect("a directory");
         let path = keep.path().join("run");
         fs::create_dir(&path).expect("creates");
@@ -110,7 +110,7 @@ mod tests {
         fs::rename(&path, keep.path().join("moved")).expect("moves");
         assert!(!held.is_in_place(), "moved");
         fs::create_dir(&path).expect("creates");
-        assert!(!held.is_in_place(), "another is in its place");
+        assert!(!held.is_in_place(), "another directory is in its place");
         assert!(is_free(&path) && !is_free(&keep.path().join("moved")));
         fs::remove_dir(&path).expect("removes");
         fs::write(&path, "").expect("writes");
