@@ -73,7 +73,7 @@ impl EagerTeacher {
 }
 
 impl Advisor for EagerTeacher {
-    fn advise(&mut self, queries: &[StepQuery]) -> Result<Vec<StepAdvice>, AdvisorGone> {
+    fn advise(&mut self, queries: Vec<StepQuery>) -> Result<Vec<StepAdvice>, AdvisorGone> {
         Ok(queries.iter().map(|query| self.verdict(query)).collect())
     }
 }
