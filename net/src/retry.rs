@@ -78,8 +78,8 @@ pub struct Operation {
 
 /// The retries of one operation.
 ///
-/// The first failure of an outage is logged as a warning, a later one only if its message differs from the previous
-/// one. The end of the outage is logged once.
+/// The first failure of an outage is logged as a warning. A later one is a warning only if its message differs from the
+/// previous one, and otherwise has level debug. The end of the outage is logged once.
 #[derive(Debug)]
 pub struct Retrier {
     backoff: Backoff,
@@ -112,10 +112,13 @@ impl Retrier {
     async fn back_off(&mut self, status: &Status) {
         self.n_failures = self.n_failures.saturating_add(1);
         let (peer, message) = (self.operation.peer, status.message());
-        if self.n_failures == 1 || self.logged != message {
-            let reason = format!("cannot {}: {message}", self.operation.purpose);
-            tracing::warn!(peer, reason, attempt = self.n_failures, "call failed, retrying");
+        let (reason, attempt) =
+            (format!("cannot {}: {message}", self.operation.purpose), self.n_failures);
+        if attempt == 1 || self.logged != message {
+            tracing::warn!(peer, reason, attempt, "call failed, retrying");
             message.clone_into(&mut self.logged);
+        } else {
+            tracing::debug!(peer, reason, attempt, "call failed again");
         }
         tokio::time::sleep(self.backoff.pause_after(self.n_failures)).await;
     }
