@@ -10,8 +10,8 @@ use prost_reflect::{
     DescriptorPool, DynamicMessage, FieldDescriptor, Kind, MessageDescriptor, Value,
 };
 use serde_json::json;
-use tandem_teacher::budget::{Terms, Wish};
-use tandem_teacher::ledger::{Bill, Charge, Ledger as _, SqliteLedger};
+use tandem_teacher::budget::{AccountTerms, Charge};
+use tandem_teacher::ledger::{ChargeRequest, Ledger as _, SqliteLedger};
 
 type AnyError = Box<dyn std::error::Error>;
 
@@ -30,15 +30,21 @@ fn write_ledger(path: &Path) -> Result<(), AnyError> {
         return Err(format!("{path:?} already exists").into());
     }
     let mut ledger = SqliteLedger::open(path)?;
-    ledger.open("unleased", Terms { budget: 10, strategy: "mc-q:0.1".parse()? })?;
-    ledger.open("leased", Terms { budget: 1000, strategy: "eamc:0.25".parse()? })?;
+    ledger.open("unleased", AccountTerms { budget: 10, strategy: "mc-q:0.1".parse()? })?;
+    ledger.open("leased", AccountTerms { budget: 1000, strategy: "eamc:0.25".parse()? })?;
     ledger.open_leases("leased", &[0, 1], 50)?;
-    let charges = |account: &str, episode, steps: std::ops::Range<u32>, wish| Bill {
+    let charges = |account: &str, episode, steps: std::ops::Range<u32>, wanted| ChargeRequest {
         account: account.to_owned(),
-        charges: steps.map(|step| Charge { episode, step, wish }).collect(),
+        charges: steps
+            .map(|step| Charge {
+                episode,
+                step,
+                wanted_in_first_half: wanted,
+                wanted_in_second_half: wanted,
+            })
+            .collect(),
     };
-    let always = Wish { first: true, second: true };
-    let never = Wish { first: false, second: false };
+    let (always, never) = (true, false);
     for bill in [
         charges("unleased", 3, 0..12, always),
         charges("leased", 0, 0..20, always),

@@ -189,7 +189,7 @@ pub(crate) fn teacher_failed(error: tandem_teacher::Error) -> Failed {
     use tandem_teacher::Error as E;
     use tandem_teacher::ledger::OpenError;
     let exit = match &error {
-        E::OpenLedger(OpenError::NotAPlace(_) | OpenError::BadPath { .. }) => Exit::Usage,
+        E::OpenLedger(OpenError::InvalidLocation(_) | OpenError::BadPath { .. }) => Exit::Usage,
         E::OpenLedger(OpenError::InUse(_) | OpenError::Io { .. } | OpenError::Server { .. }) => {
             Exit::TryAgain
         }

@@ -15,10 +15,10 @@ use crate::exit::{Exit, Failed, OrExit as _};
 use crate::files::load_policy;
 use crate::output;
 
-/// Held-out goals on which the best policy is judged at the end; no run chooses by them.
+/// Test goals for the final evaluation of the best policy; no run selects its policy by them.
 const REPORT_SEED: u64 = 777;
 
-/// Judges the best policy on held-out goals, draws the curve, and prints where everything lies.
+/// Evaluates the best policy on test goals, draws the curve, and prints where everything lies.
 pub(super) fn print(
     plan: &Plan,
     last: &pb::Progress,
@@ -58,7 +58,7 @@ fn summary_lines(
     let mut lines = vec![
         format!("done: {}", last.end_reason),
         format!(
-            "best policy on {} held-out goals (seed {REPORT_SEED}), alone: no noise, no advice",
+            "best policy on {} test goals (seed {REPORT_SEED}), alone: no noise, no advice",
             plan.config.evaluation.test_episodes
         ),
     ];
