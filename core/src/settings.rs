@@ -127,7 +127,8 @@ impl OutOfRange {
     /// Returns an error about the setting `key` unless `is_usable`.
     ///
     /// # Errors
-    /// When the value cannot be used.
+    /// Returns an error unless `is_usable`.
+    #[expect(clippy::needless_pass_by_value, reason = "nearly all values are numbers")]
     pub fn unless(
         is_usable: bool,
         key: &'static str,
