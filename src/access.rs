@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use tandem_net::{AccessError, Dial, Gate, Token, is_exposed};
+use tandem_net::{AccessError, ClientConfig, ServerConfig, Token, is_exposed};
 use tracing::warn;
 
 use crate::cli::{DialArgs, ListenArgs, SecretArgs};
@@ -10,8 +10,8 @@ use crate::exit::{Exit, Failed, OrExit as _};
 use crate::input;
 
 /// Who may call the service; refuses an address that others can reach and nothing protects.
-pub(crate) fn gate(listen: &ListenArgs, secret: &SecretArgs) -> Result<Gate, Failed> {
-    let mut gate = Gate::default();
+pub(crate) fn gate(listen: &ListenArgs, secret: &SecretArgs) -> Result<ServerConfig, Failed> {
+    let mut gate = ServerConfig::default();
     if let Some(token) = token(secret)? {
         gate = gate.with_token(token);
     }
@@ -31,7 +31,7 @@ pub(crate) fn gate(listen: &ListenArgs, secret: &SecretArgs) -> Result<Gate, Fai
 }
 
 /// How other services are called.
-pub(crate) fn dial(args: &DialArgs, secret: &SecretArgs) -> Result<Dial, Failed> {
+pub(crate) fn dial(args: &DialArgs, secret: &SecretArgs) -> Result<ClientConfig, Failed> {
     let calls = trusting(args)?;
     Ok(match token(secret)? {
         Some(token) => calls.with_token(&token),
@@ -40,10 +40,10 @@ pub(crate) fn dial(args: &DialArgs, secret: &SecretArgs) -> Result<Dial, Failed>
 }
 
 /// How services are called that want no token.
-pub(crate) fn trusting(args: &DialArgs) -> Result<Dial, Failed> {
-    let Some(authority) = &args.tls_ca else { return Ok(Dial::default()) };
+pub(crate) fn trusting(args: &DialArgs) -> Result<ClientConfig, Failed> {
+    let Some(authority) = &args.tls_ca else { return Ok(ClientConfig::default()) };
     let what = || format!("cannot trust --tls-ca {authority:?}");
-    Dial::default().with_authority(&read(authority)?).or_exit(Exit::Usage, what)
+    ClientConfig::default().with_authority(&read(authority)?).or_exit(Exit::Usage, what)
 }
 
 fn token(secret: &SecretArgs) -> Result<Option<Token>, Failed> {

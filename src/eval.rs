@@ -11,7 +11,6 @@ use tandem_core::{
 };
 use tandem_policy::Policy;
 use tandem_sim::WorldConfig;
-use tandem_telemetry::EpisodeMetadata;
 use tandem_worker::record::{RecordError, log_name, metadata_of, record_episode};
 use tandem_worker::{ComposedTeachers, evaluate};
 
@@ -169,6 +168,7 @@ pub(crate) fn eval(args: &EvalArgs) -> Result<(), Failed> {
 /// The terms on which an evaluation plays.
 fn terms(subject: &Subject) -> RunTerms {
     RunTerms {
+        run: String::new(),
         layout: subject.layout(),
         account: None,
         exploration: Exploration::NONE,
@@ -190,10 +190,7 @@ fn record(
     }
     let number = episode.number;
     let order = EpisodeOrder { number, seed, advised: false, uniform: false, record: true };
-    let metadata = EpisodeMetadata {
-        policy_digest: subject.policy().digest(),
-        ..metadata_of(order, episode, terms)
-    };
+    let metadata = metadata_of(order, episode, terms, subject.policy().digest());
     match record_episode(&metadata, episode, path) {
         Ok(_) => Ok(()),
         Err(error @ RecordError::Log(_)) => Err(error).or_cannot_write(String::new),

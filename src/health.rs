@@ -12,7 +12,7 @@ pub(crate) fn health(args: &HealthArgs) -> Result<(), Failed> {
     let dial = access::trusting(&args.dial)?;
     let runtime = services::runtime().or_exit(Exit::TryAgain, String::new)?;
     let answer = runtime.block_on(async {
-        let link = dial.link(address).or_exit(Exit::Usage, String::new)?;
+        let link = dial.channel(address).or_exit(Exit::Usage, String::new)?;
         Ok(check_health(link, service, args.timeout_s).await)
     })?;
     if args.json {

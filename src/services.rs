@@ -129,7 +129,7 @@ pub(crate) fn worker(args: WorkerArgs) -> Result<(), Failed> {
     run(async move {
         let shutdown = shutdown(args.exit_with_stdin)?;
         let config = tandem_worker::WorkerConfig {
-            dial,
+            client: dial,
             learner: args.connect,
             teacher: args.teacher,
             name: args.name,

@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use anyhow::anyhow;
 use serde_json::{Value, json};
-use tandem_net::Link;
+use tandem_net::AuthChannel;
 use tandem_proto::pb;
 use tandem_proto::pb::learner_client::LearnerClient;
 use tonic::{Code, Response, Status};
@@ -23,14 +23,14 @@ pub(crate) fn status(args: &StatusArgs) -> Result<(), Failed> {
     let dial = access::dial(&args.dial, &args.secret)?;
     let runtime = services::runtime().or_exit(Exit::TryAgain, String::new)?;
     runtime.block_on(async {
-        let link = dial.link(&args.address).or_exit(Exit::Usage, String::new)?;
+        let link = dial.channel(&args.address).or_exit(Exit::Usage, String::new)?;
         let mut learner = LearnerClient::new(link);
         if args.watch { watch(&mut learner, args).await } else { show(&mut learner, args).await }
     })
 }
 
 /// What the learner says now.
-async fn show(learner: &mut LearnerClient<Link>, args: &StatusArgs) -> Result<(), Failed> {
+async fn show(learner: &mut LearnerClient<AuthChannel>, args: &StatusArgs) -> Result<(), Failed> {
     let progress = answer(learner.status(pb::StatusRequest {})).await?;
     if args.json {
         output::print(progress_json(&progress))?;
@@ -41,7 +41,7 @@ async fn show(learner: &mut LearnerClient<Link>, args: &StatusArgs) -> Result<()
 }
 
 /// A line for each evaluation and every half minute, or each message as JSON, until the run has ended.
-async fn watch(learner: &mut LearnerClient<Link>, args: &StatusArgs) -> Result<(), Failed> {
+async fn watch(learner: &mut LearnerClient<AuthChannel>, args: &StatusArgs) -> Result<(), Failed> {
     let mut stream = answer(learner.watch(pb::WatchRequest {})).await?;
     let (mut told_round, mut told_at_s) = (None, f64::NEG_INFINITY);
     while let Some(progress) = stream.message().await.map_err(|status| failed(&status))? {

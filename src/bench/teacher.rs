@@ -9,7 +9,7 @@ use std::time::Duration;
 use anyhow::Context as _;
 use tandem_core::rng::{Stream, episode_rng, uniform};
 use tandem_core::{Layout, StepQuery, Task};
-use tandem_net::{Dial, Gate, Link};
+use tandem_net::{AuthChannel, ClientConfig, ServerConfig};
 use tandem_proto::pb::teacher_client::TeacherClient;
 use tandem_proto::{encode_query, pb};
 use tokio::net::TcpListener;
@@ -49,7 +49,7 @@ pub(super) fn teacher() -> Result<Vec<Figure>, Failed> {
 
 async fn measure(config: tandem_teacher::Config) -> anyhow::Result<Vec<Figure>> {
     let teacher = Server::start(async move |listener, shutdown| {
-        tandem_teacher::serve(config, listener, &Gate::default(), shutdown)
+        tandem_teacher::serve(config, listener, &ServerConfig::default(), shutdown)
             .await
             .map_err(Into::into)
     })?;
@@ -164,17 +164,17 @@ struct Best {
 
 /// A client, or several, of one service.
 struct Bench {
-    client: TeacherClient<Link>,
+    client: TeacherClient<AuthChannel>,
     asker: Asker,
-    streams: Vec<(TeacherClient<Link>, Asker)>,
+    streams: Vec<(TeacherClient<AuthChannel>, Asker)>,
     best: Best,
 }
 
 impl Bench {
     /// Clients of the service at `address`, which connect when they ask. To be called inside a runtime.
     fn new(address: SocketAddr) -> anyhow::Result<Self> {
-        let dial = Dial::default();
-        let connect = || dial.link(&address.to_string()).map(TeacherClient::new);
+        let dial = ClientConfig::default();
+        let connect = || dial.channel(&address.to_string()).map(TeacherClient::new);
         let streams = (1..=N_STREAMS).map(|idx| Ok((connect()?, Asker::new(idx))));
         Ok(Self {
             client: connect()?,
@@ -225,7 +225,7 @@ impl Bench {
 
     /// Times of requests on one stream, one after another.
     async fn stream(
-        client: TeacherClient<Link>,
+        client: TeacherClient<AuthChannel>,
         asker: &mut Asker,
     ) -> anyhow::Result<Vec<Duration>> {
         let mut conversation = Conversation::open(client).await?;
@@ -266,7 +266,7 @@ struct Conversation {
 }
 
 impl Conversation {
-    async fn open(mut client: TeacherClient<Link>) -> anyhow::Result<Self> {
+    async fn open(mut client: TeacherClient<AuthChannel>) -> anyhow::Result<Self> {
         let (questions, receiver) = tokio::sync::mpsc::channel(1);
         let answers = client.advise_stream(ReceiverStream::new(receiver)).await?.into_inner();
         Ok(Self { questions, answers })

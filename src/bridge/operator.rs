@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 use serde_json::json;
-use tandem_net::Link;
+use tandem_net::AuthChannel;
 use tandem_proto::pb;
 use tandem_proto::pb::bridge_client::BridgeClient;
 use tonic::{Code, Response, Status};
@@ -16,7 +16,7 @@ use crate::{access, output, services};
 /// How long a call may take.
 const DEADLINE: Duration = Duration::from_secs(10);
 
-pub(super) type Client = BridgeClient<Link>;
+pub(super) type Client = BridgeClient<AuthChannel>;
 
 /// Runs `work` with a client of the bridge that `args` name.
 pub(super) fn with_client<F: Future<Output = Result<(), Failed>>>(
@@ -26,7 +26,7 @@ pub(super) fn with_client<F: Future<Output = Result<(), Failed>>>(
     let dial = access::dial(&args.dial, &args.secret)?;
     let runtime = services::runtime().or_exit(Exit::TryAgain, String::new)?;
     runtime.block_on(async {
-        let link = dial.link(&args.connect).or_exit(Exit::Usage, String::new)?;
+        let link = dial.channel(&args.connect).or_exit(Exit::Usage, String::new)?;
         work(BridgeClient::new(link)).await
     })
 }

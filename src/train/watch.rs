@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 use anyhow::Context as _;
-use tandem_net::{Dial, Link};
+use tandem_net::{AuthChannel, ClientConfig, within};
 use tandem_proto::pb;
 use tandem_proto::pb::learner_client::LearnerClient;
 use tokio::sync::mpsc;
@@ -25,7 +25,7 @@ pub(super) struct Heard {
 
 /// Follows the learner at `address` until the receiver is dropped; a learner that is away is called again and again.
 pub(super) fn follow(address: &str) -> anyhow::Result<mpsc::Receiver<Heard>> {
-    let link = Dial::default().link(address).context("cannot follow the learner")?;
+    let link = ClientConfig::default().channel(address).context("cannot follow the learner")?;
     let (sender, receiver) = mpsc::channel(CAPACITY);
     tokio::spawn(async move {
         tokio::select! {
@@ -36,7 +36,7 @@ pub(super) fn follow(address: &str) -> anyhow::Result<mpsc::Receiver<Heard>> {
     Ok(receiver)
 }
 
-async fn follow_for_ever(mut learner: LearnerClient<Link>, sender: &mpsc::Sender<Heard>) {
+async fn follow_for_ever(mut learner: LearnerClient<AuthChannel>, sender: &mpsc::Sender<Heard>) {
     for n_streams_before in 0.. {
         // What ended a stream is of no interest: whether the learner lives is for others to see.
         if let Ok(mut stream) = open(&mut learner).await {
@@ -50,7 +50,7 @@ async fn follow_for_ever(mut learner: LearnerClient<Link>, sender: &mpsc::Sender
     }
 }
 
-async fn open(learner: &mut LearnerClient<Link>) -> Result<Streaming<pb::Progress>, Status> {
-    let opened = tokio::time::timeout(OPEN_DEADLINE, learner.watch(pb::WatchRequest {})).await;
-    opened.map_err(|_elapsed| Status::deadline_exceeded("no answer"))?.map(|it| it.into_inner())
+async fn open(learner: &mut LearnerClient<AuthChannel>) -> Result<Streaming<pb::Progress>, Status> {
+    let opened = within(OPEN_DEADLINE, learner.watch(pb::WatchRequest {})).await?;
+    Ok(opened.into_inner())
 }

@@ -12,7 +12,7 @@ use tandem_bridge::{
 };
 use tandem_core::ArmIndex;
 use tandem_kinematics::{ArmSample, Joints, Motion};
-use tandem_net::Gate;
+use tandem_net::ServerConfig;
 use tandem_proto::pb;
 use tandem_proto::pb::bridge_client::BridgeClient;
 use tokio::net::TcpListener;
@@ -262,10 +262,9 @@ impl Rig {
             secret: [7; 32],
         };
         let ends = shutdown.clone();
-        let served =
-            tokio::spawn(
-                async move { serve(executor, config, listener, &Gate::default(), ends).await },
-            );
+        let served = tokio::spawn(async move {
+            serve(executor, config, listener, &ServerConfig::default(), ends).await
+        });
         let client = connect(address);
         Self { client, clock, tap, shutdown, served, address }
     }

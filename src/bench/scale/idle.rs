@@ -10,13 +10,13 @@ use std::time::Duration;
 use anyhow::Context as _;
 use tandem_core::{Episode, Layout, Task};
 use tandem_learner::Clock;
-use tandem_net::{Dial, Link};
+use tandem_net::{AuthChannel, ClientConfig, MAX_MESSAGE_BYTES, Retryability, within};
 use tandem_proto::pb::learner_client::LearnerClient;
 use tandem_proto::pb::next_work_response::Work;
 use tandem_proto::{encode_episode, pb};
 use tokio::sync::watch;
 use tokio::task::JoinHandle;
-use tonic::{Code, Status};
+use tonic::Status;
 
 pub(super) use book::Book;
 
@@ -26,8 +26,6 @@ const VERSION: &str = env!("CARGO_PKG_VERSION");
 const ANSWER: Duration = Duration::from_secs(20);
 /// Pause before a call that failed is made again.
 const PAUSE: Duration = Duration::from_millis(100);
-/// As much as a real worker takes in.
-const MAX_MESSAGE_BYTES: usize = 64 << 20;
 
 /// Many idle workers.
 pub(super) struct Crowd {
@@ -39,7 +37,7 @@ pub(super) struct Crowd {
 struct Common {
     /// A worker calls one of these, in turn.
     addresses: Vec<String>,
-    dial: Dial,
+    dial: ClientConfig,
     slot_time: Duration,
     episodes_per_round: u64,
     clock: Clock,
@@ -73,7 +71,7 @@ impl Crowd {
         let episode = encode_episode(&Episode::zeros(Layout::new(Task::Push, 2), 0));
         let common = Common {
             addresses,
-            dial: Dial::default(),
+            dial: ClientConfig::default(),
             slot_time,
             episodes_per_round: episodes_per_round as u64,
             clock,
@@ -90,7 +88,7 @@ impl Crowd {
     pub(super) fn join(&mut self, n: usize) -> anyhow::Result<()> {
         for _ in 0..n {
             let address = &self.common.addresses[self.n_spawned % self.common.addresses.len()];
-            let link = self.common.dial.link(address).context("cannot call the learner")?;
+            let link = self.common.dial.channel(address).context("cannot call the learner")?;
             let state = Arc::<MemberState>::default();
             let worker = Worker {
                 name: format!("idle-{}", self.n_spawned),
@@ -174,7 +172,7 @@ struct Worker {
     name: String,
     common: Arc<Common>,
     state: Arc<MemberState>,
-    client: LearnerClient<Link>,
+    client: LearnerClient<AuthChannel>,
     /// Of the parameters that it has.
     version: Option<u64>,
 }
@@ -197,9 +195,9 @@ impl Worker {
                     if *self.common.n_joined.borrow() > 0 {
                         self.common.book().fail(&status);
                     }
-                    match status.code() {
-                        Code::NotFound => worker_id = None,
-                        Code::FailedPrecondition if worker_id.is_none() => {
+                    match Retryability::of(status.code()) {
+                        Retryability::NotFound => worker_id = None,
+                        Retryability::Final if worker_id.is_none() => {
                             let reason = status.message().to_owned();
                             self.common.refused.send_replace(Some(reason));
                             return;
@@ -218,13 +216,14 @@ impl Worker {
 
     async fn join(&mut self) -> Result<u64, Status> {
         let request = pb::JoinRequest { worker: self.name.clone(), version: VERSION.to_owned() };
-        Ok(within(self.client.join(request)).await?.worker_id)
+        Ok(within(ANSWER, self.client.join(request)).await?.into_inner().worker_id)
     }
 
     /// Asks for a slot and plays it, if there is one.
     async fn work(&mut self, worker_id: u64) -> Result<(), Status> {
         let asked = self.common.now();
-        let answer = within(self.client.next_work(pb::NextWorkRequest { worker_id })).await?;
+        let asking = self.client.next_work(pb::NextWorkRequest { worker_id });
+        let answer = within(ANSWER, asking).await?.into_inner();
         let answered = self.common.now();
         let slot = match answer.work {
             Some(Work::Slot(slot)) => slot,
@@ -253,7 +252,7 @@ impl Worker {
             return Ok(());
         }
         let asked = self.common.now();
-        within(self.client.get_parameters(pb::GetParametersRequest { version })).await?;
+        within(ANSWER, self.client.get_parameters(pb::GetParametersRequest { version })).await?;
         self.version = Some(version);
         self.common.book().fetched(round, self.common.now().saturating_sub(asked));
         Ok(())
@@ -269,16 +268,8 @@ impl Worker {
         let episodes = slot.episodes.iter().map(episode).collect();
         let request = pb::SubmitEpisodesRequest { worker_id, slot: slot.slot, episodes };
         let sent = self.common.now();
-        within(self.client.submit_episodes(request)).await?;
+        within(ANSWER, self.client.submit_episodes(request)).await?;
         self.common.book().deliver(round, (sent, self.common.now()));
         Ok(())
     }
-}
-
-async fn within<T>(
-    call: impl Future<Output = Result<tonic::Response<T>, Status>>,
-) -> Result<T, Status> {
-    let lapsed = |_elapsed| Status::deadline_exceeded("no answer in time");
-    let answer = tokio::time::timeout(ANSWER, call).await.map_err(lapsed)??;
-    Ok(answer.into_inner())
 }

@@ -5,7 +5,7 @@ use std::time::Duration;
 use anyhow::Context as _;
 use tandem_core::layout::EPISODE_STEPS;
 use tandem_learner::Clock;
-use tandem_net::Dial;
+use tandem_net::ClientConfig;
 use tandem_proto::pb;
 use tandem_proto::pb::learner_client::LearnerClient;
 use tonic::Streaming;
@@ -65,7 +65,7 @@ struct Marks<'a> {
 
 impl<'a> Marks<'a> {
     async fn of(learner: &str, clock: &'a Clock) -> anyhow::Result<Self> {
-        let mut client = LearnerClient::new(Dial::default().link(learner)?);
+        let mut client = LearnerClient::new(ClientConfig::default().channel(learner)?);
         let progress = client.watch(pb::WatchRequest {}).await?.into_inner();
         Ok(Self { progress, round: None, clock })
     }

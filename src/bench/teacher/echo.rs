@@ -2,7 +2,7 @@
 
 use std::pin::Pin;
 
-use tandem_net::Gate;
+use tandem_net::ServerConfig;
 use tandem_proto::pb;
 use tandem_proto::pb::teacher_server::{Teacher, TeacherServer};
 use tokio::net::TcpListener;
@@ -16,7 +16,9 @@ pub(super) async fn serve(
     listener: TcpListener,
     shutdown: CancellationToken,
 ) -> anyhow::Result<()> {
-    let router = Gate::default().router(TeacherServer::new(Echo { answer })).await?;
+    let router = ServerConfig::default()
+        .router(TeacherServer::new(Echo { answer }), tandem_proto::FILE_DESCRIPTOR_SET)
+        .await?;
     Ok(tandem_net::serve(router, listener, shutdown).await?)
 }
 

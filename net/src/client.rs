@@ -1,4 +1,4 @@
-//! Connections to services.
+//! The configuration of a client, and the channels it opens.
 
 use std::fmt;
 use std::future::Future;
@@ -15,55 +15,57 @@ use tonic::transport::{Certificate, ClientTlsConfig, Endpoint};
 use tower::ServiceExt as _;
 
 use crate::access::Token;
+use crate::channel::{AuthChannel, Target};
 use crate::connection::Connection;
-use crate::heard::{Heard, Listening};
-use crate::link::{Link, Peer};
 use crate::tls::{self, TlsError};
+use crate::tls_probe::{FirstByte, SniffedStream};
 
-/// How often an idle connection is checked, and how long the check may take.
+/// The interval of keep-alive probes, and the time after which an unanswered probe closes the connection.
 const KEEP_ALIVE: Duration = Duration::from_secs(10);
-/// How long a connection attempt may take, and then the agreement on TLS.
+/// The deadline of a connection attempt, and of the TLS handshake after it.
 const CONNECT: Duration = Duration::from_secs(5);
 
-/// Largest piece in which a service may send its answer: an actor's parameters (0.86 MB) are written to a connection in
-/// one go, not in 53.
+/// The largest HTTP/2 frame that a service may send, in bytes: the parameters of an actor (0.86 MB) fit into one frame
+/// and are written at once.
 const FRAME_BYTES: u32 = 1 << 20;
 
 type Connecting = Pin<Box<dyn Future<Output = io::Result<Connection>> + Send>>;
 type Connector = Arc<dyn Fn(Uri) -> Connecting + Send + Sync>;
 
-/// Why an address cannot be called.
+/// An error that prevents an address from being called.
 #[derive(Debug, thiserror::Error)]
-pub enum DialError {
-    /// Not an address.
+pub enum ClientConfigError {
+    /// The text is not an address.
     #[error("{0:?} is not an address: expected HOST:PORT, http://HOST:PORT or https://HOST:PORT")]
-    Address(String),
-    /// TLS is asked for, and nobody is trusted.
-    #[error("{0} is to be called by TLS: name its authority's certificate in --tls-ca")]
+    InvalidAddress(String),
+    /// The address requires TLS, and no authority is trusted.
+    #[error("{0} requires TLS: name its authority's certificate in --tls-ca")]
     NoAuthority(String),
-    /// TLS cannot be spoken with this address.
+    /// TLS cannot be used with this address.
     #[error("{address} cannot be called by TLS")]
     Tls {
-        /// What was given.
+        /// The address as given.
         address: String,
-        /// Why not.
+        /// The cause.
         source: tonic::transport::Error,
     },
 }
 
-/// How services are called: over which network, with which token, trusting whom.
+/// The configuration with which services are called: the token, the trusted authority and the network.
+///
+/// The default sends no token, trusts no authority and connects through the system's sockets.
 #[derive(Clone, Default)]
-pub struct Dial {
+pub struct ClientConfig {
     authorization: Option<HeaderValue>,
     authority: Option<Certificate>,
     connector: Option<Connector>,
 }
 
-impl Dial {
-    /// Shows `token` with every call.
+impl ClientConfig {
+    /// Sends `token` with every call.
     ///
     /// # Panics
-    /// Never: a token fits into a header.
+    /// Never: every token is a valid header value.
     #[must_use]
     pub fn with_token(mut self, token: &Token) -> Self {
         let mut value = HeaderValue::try_from(token.header()).expect("a token is printable ASCII");
@@ -72,19 +74,19 @@ impl Dial {
         self
     }
 
-    /// Speaks TLS with services whose certificates one of `authority` (PEM) has signed.
+    /// Uses TLS, and trusts services whose certificate is signed by one of the certificates in `authority` (PEM).
     ///
     /// # Errors
-    /// When there is no certificate, or one that cannot be used.
+    /// When `authority` has no certificate, or one that cannot be used.
     pub fn with_authority(mut self, authority: &[u8]) -> Result<Self, TlsError> {
         tls::check_authority(authority)?;
         self.authority = Some(Certificate::from_pem(authority));
         Ok(self)
     }
 
-    /// Connects through `connector` and not through the system's sockets.
+    /// Connects through `connector` instead of the system's sockets.
     #[must_use]
-    pub fn through<F>(mut self, connector: impl Fn(Uri) -> F + Send + Sync + 'static) -> Self
+    pub fn with_connector<F>(mut self, connector: impl Fn(Uri) -> F + Send + Sync + 'static) -> Self
     where
         F: Future<Output = io::Result<Connection>> + Send + 'static,
     {
@@ -92,48 +94,58 @@ impl Dial {
         self
     }
 
-    /// A connection to `address`: `HOST:PORT`, or a URI whose scheme says whether TLS is spoken. Call it inside a
-    /// runtime.
+    /// Returns a channel to `address`, `HOST:PORT` or a URI whose scheme determines whether TLS is used.
+    ///
+    /// The channel connects on its first call. It must be created within a tokio runtime.
     ///
     /// # Errors
-    /// When the address is none, or is to be called by TLS and nobody is trusted.
-    pub fn link(&self, address: &str) -> Result<Link, DialError> {
+    /// When `address` is malformed, or requires TLS while no authority is trusted.
+    pub fn channel(&self, address: &str) -> Result<AuthChannel, ClientConfigError> {
         let uri = self.uri(address)?;
-        let by_tls = uri.scheme_str() == Some("https");
-        let mut endpoint = Endpoint::from(uri)
-            .http2_keep_alive_interval(KEEP_ALIVE)
-            .keep_alive_timeout(KEEP_ALIVE)
-            .keep_alive_while_idle(true)
-            .max_frame_size(FRAME_BYTES);
-        if by_tls {
-            let authority = self.authority.clone();
-            let authority = authority.ok_or_else(|| DialError::NoAuthority(address.to_owned()))?;
-            let tls = ClientTlsConfig::new().ca_certificate(authority).timeout(CONNECT);
-            endpoint = endpoint
-                .tls_config(tls)
-                .map_err(|source| DialError::Tls { address: address.to_owned(), source })?;
-        }
-        let heard = Heard::nothing();
-        let (connector, to) = (self.connector.clone().unwrap_or_else(sockets), heard.clone());
+        let uses_tls = uri.scheme_str() == Some("https");
+        let endpoint = self.endpoint(uri, address)?;
+        let first_byte = FirstByte::default();
+        let connector = self.connector.clone().unwrap_or_else(sockets);
+        let seen = first_byte.clone();
         let connect = tower::service_fn(move |uri| {
-            let (connecting, heard) = (connector(uri), to.clone());
+            let (connecting, first_byte) = (connector(uri), seen.clone());
             async move {
-                heard.forget();
+                first_byte.clear();
                 let connection = tokio::time::timeout(CONNECT, connecting)
                     .await
                     .map_err(|_elapsed| io::Error::from(io::ErrorKind::TimedOut))??;
-                Ok::<_, io::Error>(TokioIo::new(Listening::new(connection, heard)))
+                Ok::<_, io::Error>(TokioIo::new(SniffedStream::new(connection, first_byte)))
             }
         });
         let channel = endpoint.connect_with_connector_lazy(connect);
         let authorization = self.authorization.clone();
-        Ok(Link::new(channel, Peer { address: address.to_owned(), by_tls, authorization, heard }))
+        let address = address.to_owned();
+        Ok(AuthChannel::new(channel, Target { address, uses_tls, authorization, first_byte }))
     }
 
-    /// `address` with a scheme, a host and a port.
-    fn uri(&self, address: &str) -> Result<Uri, DialError> {
+    fn endpoint(&self, uri: Uri, address: &str) -> Result<Endpoint, ClientConfigError> {
+        let uses_tls = uri.scheme_str() == Some("https");
+        let endpoint = Endpoint::from(uri)
+            .http2_keep_alive_interval(KEEP_ALIVE)
+            .keep_alive_timeout(KEEP_ALIVE)
+            .keep_alive_while_idle(true)
+            .max_frame_size(FRAME_BYTES);
+        if !uses_tls {
+            return Ok(endpoint);
+        }
+        let authority = self.authority.clone();
+        let authority =
+            authority.ok_or_else(|| ClientConfigError::NoAuthority(address.to_owned()))?;
+        let tls = ClientTlsConfig::new().ca_certificate(authority).timeout(CONNECT);
+        endpoint
+            .tls_config(tls)
+            .map_err(|source| ClientConfigError::Tls { address: address.to_owned(), source })
+    }
+
+    /// Parses `address` into a URI with a scheme, a host and a port.
+    fn uri(&self, address: &str) -> Result<Uri, ClientConfigError> {
         let scheme = if self.authority.is_some() { "https" } else { "http" };
-        let whole = match address.contains("://") {
+        let with_scheme = match address.contains("://") {
             true => address.to_owned(),
             false => format!("{scheme}://{address}"),
         };
@@ -143,12 +155,12 @@ impl Dial {
                 && uri.port_u16().is_some_and(|port| port != 0)
                 && uri.path() == "/"
         };
-        let uri = whole.parse().ok().filter(is_complete);
-        uri.ok_or_else(|| DialError::Address(address.to_owned()))
+        let uri = with_scheme.parse().ok().filter(is_complete);
+        uri.ok_or_else(|| ClientConfigError::InvalidAddress(address.to_owned()))
     }
 }
 
-/// Connects through the system's sockets.
+/// Returns a connector that uses the system's sockets.
 fn sockets() -> Connector {
     let mut sockets = HttpConnector::new();
     sockets.enforce_http(false);
@@ -164,10 +176,10 @@ fn sockets() -> Connector {
     })
 }
 
-impl fmt::Debug for Dial {
+impl fmt::Debug for ClientConfig {
     fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
         formatter
-            .debug_struct("Dial")
+            .debug_struct("ClientConfig")
             .field("token", &self.authorization.is_some())
             .field("tls", &self.authority.is_some())
             .finish_non_exhaustive()
@@ -180,8 +192,8 @@ mod tests {
 
     #[test]
     fn an_address_has_a_host_and_a_port() {
-        let dial = Dial::default();
-        let uri = |address: &str| dial.uri(address).map(|uri| uri.to_string()).ok();
+        let config = ClientConfig::default();
+        let uri = |address: &str| config.uri(address).map(|uri| uri.to_string()).ok();
         for (address, expected) in [
             ("127.0.0.1:7000", "http://127.0.0.1:7000/"),
             ("[::1]:7000", "http://[::1]:7000/"),
@@ -210,9 +222,10 @@ mod tests {
     }
 
     #[test]
-    fn tls_needs_somebody_to_trust() {
-        let refused = Dial::default().link("https://learner:7000").expect_err("nobody is trusted");
-        assert!(matches!(refused, DialError::NoAuthority(_)), "{refused}");
+    fn tls_requires_a_trusted_authority() {
+        let refused =
+            ClientConfig::default().channel("https://learner:7000").expect_err("no authority");
+        assert!(matches!(refused, ClientConfigError::NoAuthority(_)), "{refused}");
         assert!(refused.to_string().contains("--tls-ca"), "{refused}");
     }
 }

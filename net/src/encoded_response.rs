@@ -1,4 +1,4 @@
-//! Answers that are encoded once and sent to many.
+//! Responses that are encoded once and sent to many clients.
 
 use std::future::Future;
 use std::pin::Pin;
@@ -13,31 +13,32 @@ use tonic::body::Body;
 use tonic::server::NamedService;
 use tower::Service;
 
-/// Bytes before a message: whether it is compressed, and its length.
+/// The length of the gRPC frame header, in bytes: the compression flag and the message's length.
 const PREFIX_BYTES: usize = 5;
 
-/// An answer as it crosses the wire. A copy shares its bytes: however many it is being sent to, it is in memory once.
+/// An encoded response. Clones share its bytes, so it is in memory once, no matter how many clients receive it.
 #[derive(Debug, Clone)]
-pub struct Prepared(Bytes);
+pub struct EncodedResponse(Bytes);
 
-impl Prepared {
+impl EncodedResponse {
     /// Encodes `message`.
     ///
     /// # Panics
-    /// When it has 4 GiB or more.
+    /// When the encoded message has 4 GiB or more.
     #[must_use]
-    pub fn of(message: &impl Message) -> Self {
+    pub fn encode(message: &impl Message) -> Self {
         let n_bytes = message.encoded_len();
         let mut frame = BytesMut::with_capacity(PREFIX_BYTES + n_bytes);
         frame.put_u8(0);
         frame.put_u32(u32::try_from(n_bytes).expect("messages are shorter than 4 GiB"));
-        message.encode(&mut frame).expect("a buffer grows");
+        message.encode(&mut frame).expect("the buffer grows as needed");
         Self(frame.freeze())
     }
 
-    /// The answer to a call of a service behind a [`Gate`](crate::Gate), which sends it in place of an empty one.
+    /// Returns the response to a call: an empty message, which the service's [`Router`](crate::Router) replaces by the
+    /// encoded one.
     #[must_use]
-    pub fn answer<M: Default>(self) -> Response<M> {
+    pub fn into_response<M: Default>(self) -> Response<M> {
         let mut response = Response::new(M::default());
         response.extensions_mut().insert(self);
         response
@@ -50,15 +51,15 @@ impl Prepared {
     }
 }
 
-/// A service whose answers may be [`Prepared`].
+/// A service whose responses may be an [`EncodedResponse`].
 #[derive(Debug, Clone)]
-pub(crate) struct Sending<S>(pub(crate) S);
+pub(crate) struct EncodedService<S>(pub(crate) S);
 
-impl<S: NamedService> NamedService for Sending<S> {
+impl<S: NamedService> NamedService for EncodedService<S> {
     const NAME: &'static str = S::NAME;
 }
 
-impl<S> Service<http::Request<Body>> for Sending<S>
+impl<S> Service<http::Request<Body>> for EncodedService<S>
 where
     S: Service<http::Request<Body>, Response = http::Response<Body>>,
     S::Future: Send + 'static,
@@ -72,11 +73,11 @@ where
     }
 
     fn call(&mut self, request: http::Request<Body>) -> Self::Future {
-        let answering = self.0.call(request);
+        let call = self.0.call(request);
         Box::pin(async move {
-            let mut response = answering.await?;
-            if let Some(prepared) = response.extensions_mut().remove::<Prepared>() {
-                *response.body_mut() = prepared.into_body();
+            let mut response = call.await?;
+            if let Some(encoded) = response.extensions_mut().remove::<EncodedResponse>() {
+                *response.body_mut() = encoded.into_body();
             }
             Ok(response)
         })
@@ -85,14 +86,14 @@ where
 
 #[cfg(test)]
 mod tests {
-    use tandem_proto::pb;
+    use tonic_health::pb::HealthCheckRequest;
 
     use super::*;
 
     #[tokio::test]
-    async fn an_answer_has_its_length_its_bytes_and_says_that_all_is_well() {
-        let message = pb::GetParametersRequest { version: 300 };
-        let body = Prepared::of(&message).into_body().collect().await.unwrap();
+    async fn a_body_is_one_frame_with_an_ok_status() {
+        let message = HealthCheckRequest { service: "a".to_owned() };
+        let body = EncodedResponse::encode(&message).into_body().collect().await.unwrap();
         assert_eq!(body.trailers().unwrap()["grpc-status"], "0");
         let bytes = body.to_bytes();
         assert_eq!(bytes[..5], [0, 0, 0, 0, 3]);
@@ -100,8 +101,9 @@ mod tests {
     }
 
     #[test]
-    fn copies_share_their_bytes() {
-        let prepared = Prepared::of(&pb::Parameters { actor: vec![7; 1000], ..Default::default() });
-        assert_eq!(prepared.clone().0.as_ptr(), prepared.0.as_ptr());
+    fn clones_share_their_bytes() {
+        let message = HealthCheckRequest { service: "a".repeat(1000) };
+        let encoded = EncodedResponse::encode(&message);
+        assert_eq!(encoded.clone().0.as_ptr(), encoded.0.as_ptr());
     }
 }

@@ -1,4 +1,4 @@
-//! A world, a policy and teachers for tests, all of which can be followed by hand.
+//! An environment, actors and a teacher for tests, simple enough to follow by hand.
 
 use tandem_core::layout::{Layout, OBSERVATION_PER_ARM, Task};
 use tandem_core::rng::{Stream, episode_rng, uniform};
@@ -8,24 +8,24 @@ use tandem_core::{
 };
 use tandem_sim::SimError;
 
-use crate::ports::{Act, Advisor, AdvisorGone, World};
+use crate::ports::{Act, Advisor, AdvisorGone, Environment};
 
 pub(crate) const LAYOUT: Layout = Layout::new(Task::Push, 2);
 
-/// Hands that go where the action says; hands that meet touch.
+/// Hands that move by the action. Hands at the same place touch.
 #[derive(Debug, Clone)]
-pub(crate) struct FakeWorld {
+pub(crate) struct FakeEnvironment {
     positions: Vec<f32>,
     goal: Vec<f32>,
 }
 
-impl FakeWorld {
+impl FakeEnvironment {
     pub(crate) fn new() -> Self {
         Self { positions: vec![9.0; LAYOUT.n_action()], goal: vec![9.0; LAYOUT.n_goal()] }
     }
 }
 
-impl World for FakeWorld {
+impl Environment for FakeEnvironment {
     fn reset(&mut self, order: EpisodeOrder, settings: WorldSettings) {
         let mut rng = episode_rng(order.seed, order.number, Stream::Reset);
         let width = 0.5 + settings.grasped_start_prob;
@@ -53,7 +53,7 @@ impl World for FakeWorld {
     }
 }
 
-/// Goes for the goal, or does the same thing always.
+/// An actor that moves towards the goal, or always takes the same action.
 #[derive(Debug, Clone, Copy)]
 pub(crate) enum FakeActor {
     Seeker,
@@ -77,18 +77,18 @@ impl Act for FakeActor {
     }
 }
 
-/// Overrides the arms that `overrides` names, by episode, step and arm; notes every question.
+/// A teacher that overrides the arms for which `overrides` returns true, given episode, step and arm. Records requests.
 pub(crate) struct FakeTeacher<F> {
     pub(crate) overrides: F,
-    pub(crate) questions: Vec<Vec<StepQuery>>,
+    pub(crate) requests: Vec<Vec<StepQuery>>,
 }
 
-/// What the teacher always does; no proposal equals it.
+/// The teacher's action, which no proposal equals.
 pub(crate) const TEACHER_ACTION: [f32; 3] = [0.75, -0.75, 0.25];
 
 impl<F: Fn(u64, u32, usize) -> bool> FakeTeacher<F> {
     pub(crate) const fn new(overrides: F) -> Self {
-        Self { overrides, questions: Vec::new() }
+        Self { overrides, requests: Vec::new() }
     }
 
     fn verdict(&self, query: &StepQuery) -> StepAdvice {
@@ -116,15 +116,16 @@ impl<F: Fn(u64, u32, usize) -> bool> FakeTeacher<F> {
 
 impl<F: Fn(u64, u32, usize) -> bool> Advisor for FakeTeacher<F> {
     fn advise(&mut self, queries: Vec<StepQuery>) -> Result<Vec<StepAdvice>, AdvisorGone> {
-        let answers = queries.iter().map(|query| self.verdict(query)).collect();
-        self.questions.push(queries);
-        Ok(answers)
+        let advice = queries.iter().map(|query| self.verdict(query)).collect();
+        self.requests.push(queries);
+        Ok(advice)
     }
 }
 
-/// Terms with exploration of every kind.
+/// Returns terms with every kind of exploration.
 pub(crate) fn terms() -> RunTerms {
     RunTerms {
+        run: "run-7".to_owned(),
         layout: LAYOUT,
         account: Some("run".to_owned()),
         exploration: Exploration {
@@ -136,7 +137,7 @@ pub(crate) fn terms() -> RunTerms {
     }
 }
 
-/// A slot of training episodes of these numbers.
+/// Returns a slot of training episodes with these numbers.
 pub(crate) fn slot(numbers: &[u64], advised: bool) -> SlotOrder {
     let order = |number: &u64| EpisodeOrder {
         number: *number,
