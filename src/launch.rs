@@ -1,7 +1,8 @@
 //! Child processes: starting them, reading the address of a service, and ending them.
 //!
-//! A child watches its standard input and exits, saved, when that closes, so the children exit with this process, however
-//! it ends. Each child has its own process group: Ctrl-C reaches this process only, which then ends its children in order.
+//! A child watches its standard input and exits, saved, when that closes, so the children exit with this process,
+//! however it ends. Each child has its own process group: Ctrl-C reaches this process only, which then ends its
+//! children in order.
 
 mod log;
 

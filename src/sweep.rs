@@ -1,7 +1,7 @@
 //! `tandem sweep`: trains a list of runs, each in a `tandem train` process, one after another or concurrently.
 //!
-//! The state of a sweep is in the directories of its runs, so a sweep can be stopped and restarted at any point. Finished
-//! runs are skipped, and unfinished runs are resumed from their checkpoints.
+//! The state of a sweep is in the directories of its runs, so a sweep can be stopped and restarted at any point.
+//! Finished runs are skipped, and unfinished runs are resumed from their checkpoints.
 
 mod display;
 mod run_process;
