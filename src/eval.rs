@@ -3,9 +3,8 @@
 use std::path::Path;
 
 use rayon::iter::{IntoParallelRefIterator as _, ParallelIterator as _};
-use tandem_core::work::{EpisodeOrder, Exploration, RunTerms, WorldTerms};
-use tandem_core::{Episode, Task};
-use tandem_sim::WorldConfig;
+use tandem_core::work::{EpisodeOrder, RunTerms};
+use tandem_core::{Episode, Exploration, Task, WorldSettings};
 use tandem_telemetry::EpisodeMetadata;
 use tandem_worker::record::{RecordError, log_name, metadata_of, record_episode};
 
@@ -48,14 +47,12 @@ pub(crate) fn eval(args: &EvalArgs) -> Result<(), Failed> {
 
 /// Returns the terms of an evaluation, for the metadata of its logs.
 fn terms(subject: &EvaluatedPolicy) -> RunTerms {
-    let world = WorldTerms {
-        gripped_start_share: 0.0,
-        wide_start_share: 0.0,
-        substeps: WorldConfig::default().substeps,
-    };
-    let exploration =
-        Exploration { noise_std: 0.0, random_share: 0.0, random_hold_mean_steps: 1.0 };
-    RunTerms { layout: subject.layout(), account: None, exploration, world }
+    RunTerms {
+        layout: subject.layout(),
+        account: None,
+        exploration: Exploration::NONE,
+        world: WorldSettings::default(),
+    }
 }
 
 /// Writes the log of one episode of an evaluation with `seed`.

@@ -4,14 +4,18 @@ use std::path::Path;
 
 use anyhow::{Context as _, anyhow, bail};
 use tandem_core::Task;
+use tandem_core::settings::OutOfRange;
 use tandem_rl::RunConfig;
-use tandem_rl::config::{ConfigError, INIT_TEACHER, Recipe};
+use tandem_rl::config::{ConfigError, INIT_TEACHER, Recipe, former_keys};
 use tandem_system::atomic_file;
 use tandem_teacher::{Strategy, UnknownStrategy};
 use toml::{Table, Value};
 
 use crate::exit::{Exit, Failed, OrExit as _};
 use crate::input;
+use former::{current_keys, is_removed};
+
+mod former;
 
 /// Longer texts are cut where a message shows them.
 const MAX_SHOWN_CHARS: usize = 80;
@@ -84,9 +88,11 @@ fn parse(text: &str) -> Result<Table, String> {
 }
 
 fn overlay(from_file: Table, settings: &[(String, Value)]) -> anyhow::Result<RunConfig> {
-    let mut changes = from_file;
+    let mut changes = current_keys(from_file)?;
     for (key, value) in settings {
-        set(&mut changes, key, value.clone())?;
+        if !is_removed(key, value)? {
+            set(&mut changes, former_keys::current(key), value.clone())?;
+        }
     }
     let defaults = Table::try_from(defaults_for(&changes)?)?;
     let mut resolved = defaults.clone();
@@ -110,7 +116,7 @@ fn overlay(from_file: Table, settings: &[(String, Value)]) -> anyhow::Result<Run
 /// Says what is out of its range without repeating a long text.
 fn in_one_line(error: ConfigError) -> anyhow::Error {
     match error {
-        ConfigError::OutOfRange { key, value, expected } => {
+        ConfigError::OutOfRange(OutOfRange { key, value, expected }) => {
             let value = shortened(&value.escape_debug().to_string());
             anyhow!("{key} is {value}: expected {expected}")
         }

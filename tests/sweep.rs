@@ -8,11 +8,12 @@ use std::time::{Duration, SystemTime};
 use serde_json::Value;
 
 /// Settings of small runs of 10 rounds.
-const SMALL: [(&str, &str); 8] = [
+const SMALL: [(&str, &str); 9] = [
     ("stop.max_env_steps", "8000"),
     ("ddpg.n_hidden", "32"),
     ("rounds.updates_per_env_step", "0.1"),
     ("evaluation.episodes", "8"),
+    ("evaluation.test_episodes", "8"),
     ("evaluation.every_env_steps", "1600"),
     ("evaluation.recorded_episodes", "0"),
     ("checkpoint.every_rounds", "2"),

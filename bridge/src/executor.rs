@@ -16,7 +16,7 @@
 //! **Every way out stops the drives**: when the executor is dropped it tells them, and when its process is killed they
 //! fall silent (see [`driver`](crate::driver)).
 
-use tandem_kinematics::{Cell, Excess, Joints, Motion};
+use tandem_kinematics::{Excess, Joints, Motion, WorkCell};
 
 use crate::driver::{ArmCommand, Command, Driver, DriverError, Order, PairState};
 use crate::executor::envelope::{Envelope, History};
@@ -72,7 +72,7 @@ pub struct Progress {
 /// Moves a pair of arms; nothing else may talk to their driver.
 #[derive(Debug)]
 pub struct Executor<D: Driver> {
-    cell: Cell,
+    cell: WorkCell,
     settings: Settings,
     checker: Checker,
     driver: D,
@@ -110,7 +110,7 @@ impl<D: Driver> Executor<D> {
     ///
     /// # Errors
     /// Names a setting that makes no sense.
-    pub fn new(cell: Cell, driver: D, settings: Settings) -> Result<Self, BadSetting> {
+    pub fn new(cell: WorkCell, driver: D, settings: Settings) -> Result<Self, BadSetting> {
         let period_s = driver.period_s();
         let settings = settings.checked(&cell, period_s)?;
         let still =

@@ -6,13 +6,13 @@
 //! 95 per cent up to the highest goal, of which 98 per cent are reached (example `area` of `tandem-kinematics`). Motions may
 //! therefore tilt the gripper by up to 45 degrees.
 
-use tandem_kinematics::{Cell, CheckSettings, TaskFrame};
+use tandem_kinematics::{CheckSettings, TaskFrame, WorkCell};
 
 /// Two Micos with four joints that face each other, for objects of their true size.
 #[must_use]
-pub fn mico_cell() -> Cell {
-    let half = Cell::mico_pair();
-    Cell { task_frame: TaskFrame { scale: 1.0, ..TaskFrame::MICO_4 }, ..half }
+pub fn mico_cell() -> WorkCell {
+    let half = WorkCell::mico_pair();
+    WorkCell { task_frame: TaskFrame { scale: 1.0, ..TaskFrame::MICO_4 }, ..half }
 }
 
 /// What a motion has to keep before it may start: tilt up to 45 degrees, 4 mm above the table, 20 mm between arms, 5 mm

@@ -17,7 +17,7 @@ use rand_chacha::ChaCha8Rng;
 use tandem_core::scene::Scene;
 use tandem_core::{ArmIndex, Contacts, Stream, episode_rng};
 use tandem_kinematics::model::Anchor;
-use tandem_kinematics::{Cell, Gaps, Joints, Posture};
+use tandem_kinematics::{ForwardKinematics, Gaps, Joints, WorkCell};
 
 use crate::driver::{Command, Driver, DriverError, Faults, Order, PairState};
 use crate::simulated::drives::Drives;
@@ -49,7 +49,7 @@ enum Source {
 
 /// Two simulated Micos with four joints, their table and what lies on it.
 pub struct SimulatedPair {
-    cell: Cell,
+    cell: WorkCell,
     config: SimulatedConfig,
     disturbance: Disturbance,
     drives: Drives,
@@ -75,7 +75,7 @@ impl SimulatedPair {
     /// # Panics
     /// When the cell's arms do not have four joints each, there are more than two, or `at` is of others.
     #[must_use]
-    pub fn new(cell: Cell, at: &[Joints], opening: f64, config: SimulatedConfig) -> Self {
+    pub fn new(cell: WorkCell, at: &[Joints], opening: f64, config: SimulatedConfig) -> Self {
         assert!(
             (1..=2).contains(&cell.arms.len()) && cell.arms.len() == at.len(),
             "one or two arms"
@@ -207,7 +207,7 @@ impl SimulatedPair {
     /// A force on the tool (world frame, newtons) and whoever leans on the arm, as torques of the joints.
     fn torques(&self, arm: usize, force_n: DVec3) -> Joints {
         let placed = &self.cell.arms[arm];
-        let posture = Posture::of(placed.model, &self.drives.arms[arm].angles);
+        let posture = ForwardKinematics::new(placed.model, &self.drives.arms[arm].angles);
         let in_base = placed.axes().transpose() * force_n;
         let leaning = self.disturbance.torque_nm.get(arm);
         Joints::from_fn(placed.model.n_joints(), |joint| {
@@ -267,9 +267,9 @@ impl Driver for SimulatedPair {
 }
 
 /// Where joint angles bring what the physics knows of the arms.
-fn carried(cell: &Cell, angles: &[Joints]) -> impl Iterator<Item = Carried> {
+fn carried(cell: &WorkCell, angles: &[Joints]) -> impl Iterator<Item = Carried> {
     cell.arms.iter().zip(angles).map(|(placed, angles)| {
-        let posture = Posture::of(placed.model, angles);
+        let posture = ForwardKinematics::new(placed.model, angles);
         let tool = posture.tool();
         Carried {
             tool_m: placed.world_from_base(tool.origin_m),

@@ -12,7 +12,7 @@
 use glam::DVec3;
 use tandem_core::scene::Scene;
 use tandem_core::{Contacts, Layout};
-use tandem_kinematics::{Joints, WayPoint};
+use tandem_kinematics::{Joints, Waypoint};
 use tandem_sim::SimError;
 
 use crate::driver::PairState;
@@ -113,7 +113,7 @@ pub struct TrialReport {
     /// The smallest gap between an arm and the table, metres.
     pub table_gap_m: f64,
     /// Where the tools went, or should have gone, from way point to way point; empty when nothing could be planned.
-    pub way_points: Vec<WayPoint>,
+    pub way_points: Vec<Waypoint>,
     /// Where the tools were and where the motion had them, some twenty times a second.
     pub path: Vec<PathPoint>,
 }

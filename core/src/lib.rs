@@ -12,6 +12,7 @@ pub mod layout;
 pub mod reward;
 pub mod rng;
 pub mod scene;
+pub mod settings;
 pub mod text;
 pub mod work;
 
@@ -20,3 +21,4 @@ pub use episode::{Contacts, Episode, EpisodeKind};
 pub use evaluation::{EpisodeOutcome, EvaluationSummary, Wilson};
 pub use layout::{ArmIndex, Layout, Task};
 pub use rng::{Stream, episode_rng};
+pub use settings::{Exploration, WorldSettings};

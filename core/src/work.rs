@@ -2,6 +2,7 @@
 
 use crate::episode::EpisodeKind;
 use crate::layout::Layout;
+use crate::settings::{Exploration, WorldSettings};
 
 /// What holds for every episode of a run.
 #[derive(Debug, Clone, PartialEq)]
@@ -13,29 +14,7 @@ pub struct RunTerms {
     /// How training episodes explore.
     pub exploration: Exploration,
     /// How episodes start and how finely they are simulated.
-    pub world: WorldTerms,
-}
-
-/// How training episodes explore.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Exploration {
-    /// Standard deviation of the Gaussian added to every action component.
-    pub noise_std: f32,
-    /// Share of an arm's steps that take random actions.
-    pub random_share: f32,
-    /// How many steps a random action is kept, on average; 1 draws a new one each step.
-    pub random_hold_mean_steps: f32,
-}
-
-/// How training episodes start and how finely all are simulated.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct WorldTerms {
-    /// Share of training episodes that start with the objects grasped (pick and place).
-    pub gripped_start_share: f32,
-    /// Share of training episodes that start with the hand anywhere above the table.
-    pub wide_start_share: f32,
-    /// Physics steps per control step of 0.04 s.
-    pub substeps: u32,
+    pub world: WorldSettings,
 }
 
 /// One episode to play.

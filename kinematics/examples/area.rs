@@ -4,7 +4,7 @@
 use glam::DVec3;
 use tandem_core::rng::uniform;
 use tandem_core::{Stream, episode_rng};
-use tandem_kinematics::{Cell, Joints, MICO_4, TaskFrame, ToolTarget};
+use tandem_kinematics::{Joints, MICO_4, TaskFrame, ToolTarget, WorkCell};
 
 const N_POINTS: u32 = 20_000;
 const TILTS_DEG: [f64; 6] = [10.0, 15.0, 20.0, 25.0, 30.0, 40.0];
@@ -38,7 +38,8 @@ fn print_row(frame: TaskFrame, heights_m: [f32; 2]) {
         let mut between = |low, high| f64::from(uniform(&mut rng, low, high));
         let (x, y) = (between(-AREA_M, AREA_M), between(-AREA_M, AREA_M));
         let own = DVec3::new(x, y, between(heights_m[0], heights_m[1]));
-        let target = ToolTarget { at_m: frame.base_from_own(own), yaw_rad: Cell::FINGERS_YAW_RAD };
+        let target =
+            ToolTarget { at_m: frame.base_from_own(own), yaw_rad: WorkCell::FINGERS_YAW_RAD };
         if let Ok(solution) = MICO_4.nearest(&target, &near) {
             reached += 1;
             for (count, tilt) in within.iter_mut().zip(TILTS_DEG) {

@@ -2,10 +2,10 @@
 
 use glam::DVec3;
 
-use crate::cell::PlacedArm;
+use crate::forward::ForwardKinematics;
 use crate::model::ArmModel;
-use crate::posture::Posture;
 use crate::self_collision::SelfPair;
+use crate::work_cell::PlacedArm;
 
 /// Most links of an arm.
 pub(crate) const MAX_LINKS: usize = 8;
@@ -26,17 +26,21 @@ pub(crate) struct PosedLinks {
 
 impl PosedLinks {
     /// The links in the world, the gripper wide open.
-    pub(crate) fn of(arm: &PlacedArm, posture: &Posture) -> Self {
+    pub(crate) fn of(arm: &PlacedArm, posture: &ForwardKinematics) -> Self {
         let axes = arm.axes();
         Self::placed(arm.model, posture, |in_base| arm.base_in_world_m + axes * in_base)
     }
 
     /// The links in the arm's base frame, the gripper wide open.
-    pub(crate) fn in_base(model: &ArmModel, posture: &Posture) -> Self {
+    pub(crate) fn in_base(model: &ArmModel, posture: &ForwardKinematics) -> Self {
         Self::placed(model, posture, |in_base| in_base)
     }
 
-    fn placed(model: &ArmModel, posture: &Posture, place: impl Fn(DVec3) -> DVec3) -> Self {
+    fn placed(
+        model: &ArmModel,
+        posture: &ForwardKinematics,
+        place: impl Fn(DVec3) -> DVec3,
+    ) -> Self {
         let nowhere = Capsule { ends: [DVec3::ZERO; 2], radius_m: 0.0 };
         let mut capsules = [nowhere; MAX_LINKS];
         for (capsule, link) in capsules.iter_mut().zip(model.links) {

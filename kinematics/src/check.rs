@@ -19,14 +19,17 @@
 
 use tandem_core::ArmIndex;
 
-use crate::cell::Cell;
 use crate::joints::Joints;
 use crate::limits::Limits;
 use crate::model::{ArmModel, Joint};
 use crate::motion::{ArmSample, Cubic, Motion};
 use crate::refusal::{Excess, Reason, Refusal};
 use crate::self_collision::SELF_GAP_M;
-use crate::sweep::Sweep;
+use crate::work_cell::WorkCell;
+
+mod continuous;
+
+use continuous::Sweep;
 
 /// Slack for rounding: limits hold to one part in a billion.
 const ROUNDING: f64 = 1e-9;
@@ -76,7 +79,7 @@ impl Default for CheckSettings {
 /// # Errors
 /// Names the first limit that is broken, and when.
 pub fn check(
-    cell: &Cell,
+    cell: &WorkCell,
     motion: &Motion,
     at: &[Joints],
     settings: &CheckSettings,
@@ -99,7 +102,7 @@ pub fn check(
             };
             let cubics = pair.checked(placed.model, &settings.limits);
             let cubics = cubics.map_err(|(reason, since_s)| reason.of(arm, when_s + since_s))?;
-            sweep.follow(arm, cubics, pair.from.opening.max(pair.to.opening));
+            sweep.follow(arm, cubics, pair.from.gripper_opening.max(pair.to.gripper_opening));
         }
         sweep.check(when_s, motion.period_s)?;
     }
@@ -124,16 +127,17 @@ impl Pair<'_> {
             if !(sample.angles.is_finite() && sample.velocities.is_finite()) {
                 return Err((Reason::NotFinite, since_s));
             }
-            if !sample.opening.is_finite() {
+            if !sample.gripper_opening.is_finite() {
                 return Err((Reason::NotFinite, since_s));
             }
-            if !(0.0..=1.0).contains(&sample.opening) {
-                return Err((Reason::Opening(sample.opening), since_s));
+            if !(0.0..=1.0).contains(&sample.gripper_opening) {
+                return Err((Reason::GripperOpening(sample.gripper_opening), since_s));
             }
         }
-        let opening_per_s = (self.to.opening - self.from.opening).abs() / self.period_s;
-        if let Some(excess) = excess(opening_per_s, limits.opening_per_s) {
-            return Err((Reason::OpeningSpeed(excess), 0.0));
+        let gripper_opening_per_s =
+            (self.to.gripper_opening - self.from.gripper_opening).abs() / self.period_s;
+        if let Some(excess) = excess(gripper_opening_per_s, limits.gripper_opening_per_s) {
+            return Err((Reason::GripperSpeed(excess), 0.0));
         }
         let joints = model.joints.iter().enumerate();
         joints.map(|(idx, joint)| self.checked_joint(idx, joint, limits)).collect()
@@ -187,7 +191,7 @@ fn check_settings(settings: &CheckSettings) -> Result<(), Refusal> {
 
 /// Arms, samples and joints are as many as the cell has, and the motion is neither empty nor too long.
 fn check_shape(
-    cell: &Cell,
+    cell: &WorkCell,
     motion: &Motion,
     at: &[Joints],
     settings: &CheckSettings,

@@ -19,16 +19,16 @@ use std::f64::consts::{PI, TAU};
 
 use glam::{DMat3, DVec3};
 
-use crate::gain::least_gain_m;
+use crate::forward::ForwardKinematics;
 use crate::iterative;
 use crate::joints::Joints;
+use crate::manipulability::manipulability_m;
 use crate::model::{ArmModel, TOOL_ORIGIN_M};
-use crate::posture::Posture;
 use crate::self_collision::SELF_GAP_M;
 
 /// Postures of an arm with four joints are singular with a smaller gain, metres per radian. It has this where it is bent
 /// by 8 degrees, 1.5 mm short of its reach.
-pub const LEAST_GAIN_M: f64 = 0.02;
+pub const MIN_MANIPULABILITY_M: f64 = 0.02;
 /// The same with six joints, where turning counts too, weighed with 0.1 m per radian.
 pub const LEAST_GAIN_6_M: f64 = 0.002;
 /// A solution that differs by no more than this in any joint is where the arm moves on to, radians.
@@ -51,7 +51,7 @@ pub struct Solution {
     /// Angle between the way the gripper points and straight down, radians. About 0 with six joints.
     pub tilt_rad: f64,
     /// The smallest displacement of the tool per radian of the joints, metres: small near a singular posture.
-    pub gain_m: f64,
+    pub manipulability_m: f64,
 }
 
 /// Why no joint angles can be given for a target.
@@ -92,11 +92,11 @@ pub enum ReachError {
     },
     /// The only solutions are singular postures.
     #[error(
-        "the posture is singular: {gain_m:.4} m per radian, at least {LEAST_GAIN_M} m is needed"
+        "the posture is singular: {manipulability_m:.4} m per radian, at least {MIN_MANIPULABILITY_M} m is needed"
     )]
     Singular {
         /// The smallest displacement of the tool per radian, metres.
-        gain_m: f64,
+        manipulability_m: f64,
         /// What it has to be at least, metres.
         least_m: f64,
     },
@@ -236,18 +236,18 @@ impl ArmModel {
                 return Err(ReachError::JointRange { joint, angle_rad: *angle, range_rad });
             }
         }
-        let posture = Posture::of(self, &angles);
-        let gain_m = least_gain_m(&posture, angles.len());
-        let least_m = if angles.len() < 6 { LEAST_GAIN_M } else { LEAST_GAIN_6_M };
-        if gain_m < least_m {
-            return Err(ReachError::Singular { gain_m, least_m });
+        let posture = ForwardKinematics::new(self, &angles);
+        let manipulability_m = manipulability_m(&posture, angles.len());
+        let least_m = if angles.len() < 6 { MIN_MANIPULABILITY_M } else { LEAST_GAIN_6_M };
+        if manipulability_m < least_m {
+            return Err(ReachError::Singular { manipulability_m, least_m });
         }
-        Ok(Solution { angles, tilt_rad: posture.tilt_rad(), gain_m })
+        Ok(Solution { angles, tilt_rad: posture.tilt_rad(), manipulability_m })
     }
 
     /// Joints 1 to 3 with a joint 4 that turns the fingers as near to `yaw_rad` as it can.
     fn facing(&self, [q1, q2, q3]: [f64; 3], yaw_rad: f64) -> Joints {
-        let posture = Posture::of(self, &Joints::new(&[q1, q2, q3, 0.0]));
+        let posture = ForwardKinematics::new(self, &Joints::new(&[q1, q2, q3, 0.0]));
         let (sin, cos) = libm::sincos(yaw_rad);
         let wanted = DVec3::new(cos, sin, 0.0);
         let axes = posture.joint_axes(3);
@@ -336,7 +336,7 @@ fn nearer_miss(known: Option<ReachError>, new: ReachError) -> ReachError {
         ReachError::JointRange { angle_rad, range_rad: [low, high], .. } => {
             (1, (low - angle_rad).max(angle_rad - high))
         }
-        ReachError::Singular { gain_m, .. } => (0, -gain_m),
+        ReachError::Singular { manipulability_m, .. } => (0, -manipulability_m),
         ReachError::Unsolved { miss_m, turn_rad } => (2, miss_m + turn_rad),
         _ => (3, 0.0),
     };

@@ -2,10 +2,10 @@
 
 use glam::{DMat3, DVec3};
 
+use crate::forward::ForwardKinematics;
 use crate::inverse::ReachError;
 use crate::joints::{Joints, MAX_JOINTS};
 use crate::model::ArmModel;
-use crate::posture::Posture;
 
 /// Iterations from one start.
 const ITERATIONS: usize = 60;
@@ -33,7 +33,7 @@ pub(crate) fn solve(
     let mut angles = *start;
     let mut error = [0.0; 6];
     for _ in 0..ITERATIONS {
-        let posture = Posture::of(model, &angles);
+        let posture = ForwardKinematics::new(model, &angles);
         error = tool_error(&posture, at_m, axes);
         let squared = dot(&error, &error);
         if squared < SOLVED {
@@ -75,7 +75,7 @@ pub(crate) fn starts(model: &ArmModel) -> impl Iterator<Item = Joints> {
 }
 
 /// Place (metres) and turn (radians) by which the tool misses.
-fn tool_error(posture: &Posture, at_m: DVec3, axes: &DMat3) -> Vector6 {
+fn tool_error(posture: &ForwardKinematics, at_m: DVec3, axes: &DMat3) -> Vector6 {
     let tool = posture.tool();
     let miss = at_m - tool.origin_m;
     let sines = 0.5
@@ -99,7 +99,7 @@ fn tool_error(posture: &Posture, at_m: DVec3, axes: &DMat3) -> Vector6 {
 }
 
 /// Joint changes for `error`: `Jᵀ (J Jᵀ + damping)⁻¹ error`.
-fn step(posture: &Posture, error: &Vector6, damping: f64) -> Vector6 {
+fn step(posture: &ForwardKinematics, error: &Vector6, damping: f64) -> Vector6 {
     let columns: [Vector6; 6] = std::array::from_fn(|joint| {
         let (along, axis) = posture.tool_motion(joint);
         [along.x, along.y, along.z, axis.x, axis.y, axis.z]

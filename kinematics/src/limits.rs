@@ -15,12 +15,12 @@ pub struct Limits {
     pub ramp_s: f64,
     /// Largest change of a gripper's opening per second, 1/s; 1 is from shut to open. The default of 0.8 is a choice: the
     /// description of the arms does not say how fast the fingers are.
-    pub opening_per_s: f64,
+    pub gripper_opening_per_s: f64,
 }
 
 impl Default for Limits {
     fn default() -> Self {
-        Self { tool_speed_mps: 0.20, ramp_s: 0.25, opening_per_s: 0.8 }
+        Self { tool_speed_mps: 0.20, ramp_s: 0.25, gripper_opening_per_s: 0.8 }
     }
 }
 
@@ -30,7 +30,7 @@ impl Limits {
         let settings = [
             ("tool_speed_mps", self.tool_speed_mps),
             ("ramp_s", self.ramp_s),
-            ("opening_per_s", self.opening_per_s),
+            ("gripper_opening_per_s", self.gripper_opening_per_s),
         ];
         settings.into_iter().find(|(_, value)| !(value.is_finite() && *value > 0.0))
     }

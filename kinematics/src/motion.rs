@@ -10,7 +10,7 @@ pub struct ArmSample {
     /// Their rates, radians per second.
     pub velocities: Joints,
     /// How far the gripper is open: 0 is shut, 1 open.
-    pub opening: f64,
+    pub gripper_opening: f64,
 }
 
 /// The motion of all arms as samples. Between two samples each joint follows the cubic that has the angles and rates of
@@ -56,7 +56,7 @@ fn arm_at(samples: &[ArmSample], period_s: f64, time_s: f64) -> ArmSample {
     ArmSample {
         angles: Joints::from_fn(from.angles.len(), |joint| cubic(joint).angle(share * period_s)),
         velocities: Joints::from_fn(from.angles.len(), |joint| cubic(joint).rate(share * period_s)),
-        opening: from.opening + share * (to.opening - from.opening),
+        gripper_opening: from.gripper_opening + share * (to.gripper_opening - from.gripper_opening),
     }
 }
 
@@ -150,7 +150,7 @@ mod tests {
         let [from, to] = [0, 1].map(|end| ArmSample {
             angles: Joints::new(&[angles[end]]),
             velocities: Joints::new(&[rates[end]]),
-            opening: 0.0,
+            gripper_opening: 0.0,
         });
         Cubic::between(&from, &to, 0, period_s)
     }
@@ -183,7 +183,7 @@ mod tests {
         let sample = |angle, rate, opening| ArmSample {
             angles: Joints::new(&[angle]),
             velocities: Joints::new(&[rate]),
-            opening,
+            gripper_opening: opening,
         };
         let samples = vec![sample(0.0, 0.0, 0.2), sample(0.1, 0.5, 0.4), sample(0.3, 0.0, 0.4)];
         let motion = Motion { period_s: 0.2, arms: vec![samples.clone()] };
@@ -194,7 +194,7 @@ mod tests {
             assert!((got.velocities[0] - expected.velocities[0]).abs() < 1e-12, "{time_s}");
         }
         let middle = motion.at(0.1)[0];
-        assert!((middle.opening - 0.3).abs() < 1e-12 && middle.angles[0] < 0.05);
+        assert!((middle.gripper_opening - 0.3).abs() < 1e-12 && middle.angles[0] < 0.05);
     }
 
     #[test]

@@ -1,12 +1,12 @@
-//! Way points become a trajectory that the arms can follow.
+//! Waypoints become a trajectory that the arms can follow.
 //!
-//! 1. Way points are joined by straight lines of the tool, cut into equal pieces of at most
+//! 1. Waypoints are joined by straight lines of the tool, cut into equal pieces of at most
 //!    [`PlanSettings::piece_m`]; inverse kinematics, each time near the angles before, gives joint angles for every cut.
 //! 2. These angles and the openings are the control points of one cubic B-spline for all arms together. The tool leaves the
 //!    line at corners only, by at most a third of a piece where it turns straight back, less where it turns less: 2 mm
 //!    with pieces of 6 mm.
 //! 3. The path is followed as fast as the limits allow, from rest to rest, with one time scaling for all arms and
-//!    grippers: what was simultaneous stays so. It is never followed faster than the way points say. `speed` then
+//!    grippers: what was simultaneous stays so. It is never followed faster than the waypoints say. `speed` then
 //!    slows all of it down.
 //!
 //! The limits hold between samples too: speeds and accelerations of the joints by bounds of the spline's
@@ -16,47 +16,47 @@
 use glam::DVec3;
 use tandem_core::ArmIndex;
 
-use crate::cell::{Cell, PlacedArm};
+use crate::forward::ForwardKinematics;
 use crate::inverse::ReachError;
 use crate::joints::Joints;
 use crate::limits::Limits;
-use crate::posture::Posture;
 use crate::retime::{SpanBounds, fastest_rates};
 use crate::spline::Spline;
 use crate::trajectory::{Channels, Trajectory};
+use crate::work_cell::{PlacedArm, WorkCell};
 
 /// Share of every limit that a plan uses.
 const USED_SHARE: f64 = 0.98;
-/// Least pieces of a line between way points: a gripper that closes while the hand waits needs some too.
+/// Least pieces of a line between waypoints: a gripper that closes while the hand waits needs some too.
 const LEAST_PIECES: f64 = 8.0;
 /// Pieces of a span at whose ends the tool's speed is looked at.
 const SPEED_PIECES: u32 = 8;
 /// Largest change of a joint from one control point to the next, radians. More is another solution of the
 /// inverse kinematics, or a place close to a singular posture.
 const MAX_JUMP_RAD: f64 = crate::inverse::MOVES_ON_RAD;
-/// Largest distance of consecutive way points, metres.
+/// Largest distance of consecutive waypoints, metres.
 pub const MAX_STEP_M: f64 = 0.25;
-/// Most way points of a plan.
-pub const MAX_WAY_POINTS: usize = 1000;
+/// Most waypoints of a plan.
+pub const MAX_WAYPOINTS: usize = 1000;
 
-/// Where one arm shall be at a way point.
+/// Where one arm shall be at a waypoint.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct ArmWayPoint {
+pub struct ArmWaypoint {
     /// The tool's origin in the world, metres.
     pub tool_in_world_m: DVec3,
     /// How far the gripper is open: 0 is shut, 1 open.
-    pub opening: f64,
+    pub gripper_opening: f64,
 }
 
 /// Where every arm shall be at one time, in the order of the cell's arms.
-pub type WayPoint = Vec<ArmWayPoint>;
+pub type Waypoint = Vec<ArmWaypoint>;
 
-/// How way points become a trajectory.
+/// How waypoints become a trajectory.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PlanSettings {
     /// What the arms may do.
     pub limits: Limits,
-    /// Time from one way point to the next as they were made, seconds: 0.04 in the training world.
+    /// Time from one waypoint to the next as they were made, seconds: 0.04 in the training world.
     pub step_s: f64,
     /// Share of the fastest possible speed, in (0, 1].
     pub speed: f64,
@@ -70,7 +70,7 @@ impl Default for PlanSettings {
     }
 }
 
-/// Why way points cannot become a trajectory.
+/// Why waypoints cannot become a trajectory.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 #[non_exhaustive]
 pub enum PlanError {
@@ -82,57 +82,57 @@ pub enum PlanError {
         /// Its value.
         value: f64,
     },
-    /// Too few or too many way points.
-    #[error("{got} way points, expected 2 to {MAX_WAY_POINTS}")]
-    WayPoints {
+    /// Too few or too many waypoints.
+    #[error("{got} waypoints, expected 2 to {MAX_WAYPOINTS}")]
+    WaypointCount {
         /// How many there are.
         got: usize,
     },
-    /// A way point, or the start, is not of as many arms and joints as the cell has.
-    #[error("way point {way_point} is of {got} arms, the cell has {expected}")]
+    /// A waypoint, or the start, is not of as many arms and joints as the cell has.
+    #[error("waypoint {waypoint} is of {got} arms, the cell has {expected}")]
     Arms {
-        /// The way point, counted from 0.
-        way_point: usize,
+        /// The waypoint, counted from 0.
+        waypoint: usize,
         /// Its arms, or the start's.
         got: usize,
         /// The cell's.
         expected: usize,
     },
     /// An opening is not in [0, 1], or not a number.
-    #[error("way point {way_point} of arm {}: opening {opening}, expected 0 to 1", arm.0)]
-    Opening {
-        /// The way point, counted from 0.
-        way_point: usize,
+    #[error("waypoint {waypoint} of arm {}: gripper opening {gripper_opening}, expected 0 to 1", arm.0)]
+    GripperOpening {
+        /// The waypoint, counted from 0.
+        waypoint: usize,
         /// The arm.
         arm: ArmIndex,
         /// The opening.
-        opening: f64,
+        gripper_opening: f64,
     },
-    /// Two way points are farther apart than [`MAX_STEP_M`], or one is not finite.
-    #[error("way point {way_point} of arm {} is {step_m:.3} m from the one before, at most {MAX_STEP_M} m", arm.0)]
+    /// Two waypoints are farther apart than [`MAX_STEP_M`], or one is not finite.
+    #[error("waypoint {waypoint} of arm {} is {step_m:.3} m from the one before, at most {MAX_STEP_M} m", arm.0)]
     Step {
-        /// The later way point, counted from 0.
-        way_point: usize,
+        /// The later waypoint, counted from 0.
+        waypoint: usize,
         /// The arm.
         arm: ArmIndex,
         /// The distance, metres.
         step_m: f64,
     },
-    /// The arm cannot be there, or on the way there from the way point before.
-    #[error("arm {} cannot reach way point {way_point} or the way there", arm.0)]
+    /// The arm cannot be there, or on the way there from the waypoint before.
+    #[error("arm {} cannot reach waypoint {waypoint} or the way there", arm.0)]
     Unreachable {
-        /// The way point, counted from 0.
-        way_point: usize,
+        /// The waypoint, counted from 0.
+        waypoint: usize,
         /// The arm.
         arm: ArmIndex,
         /// Why not.
         source: ReachError,
     },
     /// The way passes a singular posture: a joint would have to jump.
-    #[error("on the way to way point {way_point} joint {} of arm {} jumps by {jump_rad:.2} rad", .joint + 1, arm.0)]
+    #[error("on the way to waypoint {waypoint} joint {} of arm {} jumps by {jump_rad:.2} rad", .joint + 1, arm.0)]
     Jump {
-        /// The way point, counted from 0.
-        way_point: usize,
+        /// The waypoint, counted from 0.
+        waypoint: usize,
         /// The arm.
         arm: ArmIndex,
         /// The joint, counted from 0.
@@ -142,19 +142,19 @@ pub enum PlanError {
     },
 }
 
-/// The trajectory of `cell`'s arms through `way_points`, the arms' angles near `start` (radians) at the first.
+/// The trajectory of `cell`'s arms through `waypoints`, the arms' angles near `start` (radians) at the first.
 ///
 /// # Errors
-/// Says which way point cannot be reached, or what else is wrong.
+/// Says which waypoint cannot be reached, or what else is wrong.
 pub fn plan(
-    cell: &Cell,
-    way_points: &[WayPoint],
+    cell: &WorkCell,
+    waypoints: &[Waypoint],
     start: &[Joints],
     settings: &PlanSettings,
 ) -> Result<Trajectory, PlanError> {
-    let n_pieces = checked_pieces(cell, way_points, start, settings)?;
+    let n_pieces = checked_pieces(cell, waypoints, start, settings)?;
     let channels = Channels::of(cell);
-    let points = control_points(cell, way_points, start, n_pieces)?;
+    let points = control_points(cell, waypoints, start, n_pieces)?;
     let path = Spline::following(channels.n_channels(), &points);
     let fastest = f64::from(n_pieces) / settings.step_s;
     let spans: Vec<SpanBounds> = (0..path.n_spans())
@@ -165,36 +165,36 @@ pub fn plan(
     Ok(Trajectory::new(channels, path, rates, n_pieces))
 }
 
-/// How many pieces each line between way points is cut into, when all that is given makes sense.
+/// How many pieces each line between waypoints is cut into, when all that is given makes sense.
 fn checked_pieces(
-    cell: &Cell,
-    way_points: &[WayPoint],
+    cell: &WorkCell,
+    waypoints: &[Waypoint],
     start: &[Joints],
     settings: &PlanSettings,
 ) -> Result<u32, PlanError> {
     check_settings(settings)?;
-    if !(2..=MAX_WAY_POINTS).contains(&way_points.len()) {
-        return Err(PlanError::WayPoints { got: way_points.len() });
+    if !(2..=MAX_WAYPOINTS).contains(&waypoints.len()) {
+        return Err(PlanError::WaypointCount { got: waypoints.len() });
     }
     let expected = cell.arms.len();
     let fits = start.iter().zip(&cell.arms).all(|(q, arm)| q.len() == arm.model.n_joints());
     if start.len() != expected || !fits {
-        return Err(PlanError::Arms { way_point: 0, got: start.len(), expected });
+        return Err(PlanError::Arms { waypoint: 0, got: start.len(), expected });
     }
     let mut longest_m: f64 = 0.0;
-    for (way_point, at) in way_points.iter().enumerate() {
+    for (waypoint, at) in waypoints.iter().enumerate() {
         if at.len() != expected {
-            return Err(PlanError::Arms { way_point, got: at.len(), expected });
+            return Err(PlanError::Arms { waypoint, got: at.len(), expected });
         }
-        let before = &way_points[way_point.saturating_sub(1)];
+        let before = &waypoints[waypoint.saturating_sub(1)];
         for (arm, (at, before)) in at.iter().zip(before).enumerate() {
-            let (arm, opening) = (ArmIndex(arm), at.opening);
-            if !(0.0..=1.0).contains(&opening) {
-                return Err(PlanError::Opening { way_point, arm, opening });
+            let (arm, gripper_opening) = (ArmIndex(arm), at.gripper_opening);
+            if !(0.0..=1.0).contains(&gripper_opening) {
+                return Err(PlanError::GripperOpening { waypoint, arm, gripper_opening });
             }
             let step_m = (at.tool_in_world_m - before.tool_in_world_m).length();
             if step_m.is_nan() || step_m > MAX_STEP_M {
-                return Err(PlanError::Step { way_point, arm, step_m });
+                return Err(PlanError::Step { waypoint, arm, step_m });
             }
             longest_m = longest_m.max(step_m);
         }
@@ -225,18 +225,18 @@ fn check_settings(settings: &PlanSettings) -> Result<(), PlanError> {
     Ok(())
 }
 
-/// All channels at every cut of the lines between way points, shape `[n_points, n_channels]`.
+/// All channels at every cut of the lines between waypoints, shape `[n_points, n_channels]`.
 fn control_points(
-    cell: &Cell,
-    way_points: &[WayPoint],
+    cell: &WorkCell,
+    waypoints: &[Waypoint],
     start: &[Joints],
     n_pieces: u32,
 ) -> Result<Vec<f64>, PlanError> {
     let mut near = start.to_vec();
     let mut points = Vec::new();
-    for (way_point, to) in way_points.iter().enumerate() {
-        let from = &way_points[way_point.saturating_sub(1)];
-        let first = if way_point == 0 { n_pieces } else { 1 };
+    for (waypoint, to) in waypoints.iter().enumerate() {
+        let from = &waypoints[waypoint.saturating_sub(1)];
+        let first = if waypoint == 0 { n_pieces } else { 1 };
         for piece in first..=n_pieces {
             let share = f64::from(piece) / f64::from(n_pieces);
             for (arm, placed) in cell.indexed() {
@@ -245,13 +245,15 @@ fn control_points(
                 let solution = placed
                     .model
                     .nearest(&placed.target(tool_m), &near[arm.0])
-                    .map_err(|source| PlanError::Unreachable { way_point, arm, source })?;
-                if way_point > 0 {
-                    check_jump(way_point, arm, &near[arm.0], &solution.angles)?;
+                    .map_err(|source| PlanError::Unreachable { waypoint, arm, source })?;
+                if waypoint > 0 {
+                    check_jump(waypoint, arm, &near[arm.0], &solution.angles)?;
                 }
                 near[arm.0] = solution.angles;
                 points.extend_from_slice(&solution.angles);
-                points.push(from.opening + share * (to.opening - from.opening));
+                points.push(
+                    from.gripper_opening + share * (to.gripper_opening - from.gripper_opening),
+                );
             }
         }
     }
@@ -259,7 +261,7 @@ fn control_points(
 }
 
 fn check_jump(
-    way_point: usize,
+    waypoint: usize,
     arm: ArmIndex,
     before: &Joints,
     after: &Joints,
@@ -267,7 +269,7 @@ fn check_jump(
     for (joint, (before, after)) in before.iter().zip(after.iter()).enumerate() {
         let jump_rad = after - before;
         if jump_rad.abs() > MAX_JUMP_RAD {
-            return Err(PlanError::Jump { way_point, arm, joint, jump_rad });
+            return Err(PlanError::Jump { waypoint, arm, joint, jump_rad });
         }
     }
     Ok(())
@@ -275,7 +277,7 @@ fn check_jump(
 
 /// What limits the path's rate in one span.
 fn span_bounds(
-    cell: &Cell,
+    cell: &WorkCell,
     channels: &Channels,
     path: &Spline,
     span: usize,
@@ -292,7 +294,7 @@ fn span_bounds(
             *per_span = path.bounds(span, channels.joint(arm, joint));
             rate_within(placed.model.joints[joint].speed_radps, per_span[0]);
         }
-        rate_within(limits.opening_per_s, path.bounds(span, channels.opening(arm))[0]);
+        rate_within(limits.gripper_opening_per_s, path.bounds(span, channels.gripper(arm))[0]);
         let per_span = &per_span[..placed.model.n_joints()];
         let tool_m = tool_per_span(placed, path, span, channels.joint(arm, 0), per_span);
         rate_within(limits.tool_speed_mps, tool_m);
@@ -332,7 +334,7 @@ fn tool_per_span(
             });
             let angles = Joints::from_fn(n_joints, |joint| jets[joint].value);
             let rates = Joints::from_fn(n_joints, |joint| jets[joint].first);
-            Posture::of(placed.model, &angles).tool_velocity(&rates).length()
+            ForwardKinematics::new(placed.model, &angles).tool_velocity(&rates).length()
         })
         .fold(0.0, f64::max);
     largest_seen_m + change_m * 0.5 / f64::from(SPEED_PIECES)

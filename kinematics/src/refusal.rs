@@ -81,10 +81,10 @@ pub enum Reason {
     JointAcceleration(usize, Excess),
     /// The gripper is commanded beyond shut (0) or open (1).
     #[error("the gripper is open by {0}, expected 0 to 1")]
-    Opening(f64),
+    GripperOpening(f64),
     /// The gripper is commanded faster than it is; 1/s.
     #[error("the opening changes by {:.3}/s, at most {:.3}/s", .0.got, .0.allowed)]
-    OpeningSpeed(Excess),
+    GripperSpeed(Excess),
     /// The tool is too fast; metres per second.
     #[error("the tool moves at {:.4} m/s, at most {:.4}", .0.got, .0.allowed)]
     ToolSpeed(Excess),

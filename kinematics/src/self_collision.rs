@@ -16,9 +16,9 @@
 //! 28.5 mm less than those of the capsules. No other pair has an allowance: overlaps of capsules are refused.
 
 use crate::capsule::PosedLinks;
+use crate::forward::ForwardKinematics;
 use crate::joints::Joints;
 use crate::model::ArmModel;
-use crate::posture::Posture;
 
 /// The default for the smallest gap between parts of one arm that a motion keeps, metres.
 pub const SELF_GAP_M: f64 = 0.005;
@@ -67,7 +67,7 @@ impl ArmModel {
     /// When `angles` are of an arm with another number of joints.
     #[must_use]
     pub fn self_gap_m(&self, angles: &Joints, opening: f64) -> f64 {
-        PosedLinks::in_base(self, &Posture::of(self, angles)).self_gap_m(self, opening).0
+        PosedLinks::in_base(self, &ForwardKinematics::new(self, angles)).self_gap_m(self, opening).0
     }
     /// The same for one of [`self_pairs`](Self::self_pairs).
     ///
@@ -75,7 +75,7 @@ impl ArmModel {
     /// When there is no such pair, or `angles` are of an arm with another number of joints.
     #[must_use]
     pub fn pair_gap_m(&self, pair: usize, angles: &Joints, opening: f64) -> f64 {
-        let links = PosedLinks::in_base(self, &Posture::of(self, angles));
+        let links = PosedLinks::in_base(self, &ForwardKinematics::new(self, angles));
         links.pair_gap_m(self, &self.self_pairs[pair], opening, f64::INFINITY)
     }
 }

@@ -2,10 +2,10 @@
 
 use tandem_core::ArmIndex;
 
-use crate::cell::Cell;
 use crate::joints::Joints;
 use crate::motion::{ArmSample, Motion};
 use crate::spline::Spline;
+use crate::work_cell::WorkCell;
 
 /// Samples per second that the arms want.
 pub const DEFAULT_RATE_HZ: f64 = 100.0;
@@ -38,9 +38,9 @@ pub struct ArmState {
     /// The rates' rates, radians per second squared.
     pub accelerations: Joints,
     /// How far the gripper is open: 0 is shut, 1 open.
-    pub opening: f64,
+    pub gripper_opening: f64,
     /// The opening's change, 1/s.
-    pub opening_per_s: f64,
+    pub gripper_opening_per_s: f64,
 }
 
 /// A place on the path and how it is passed.
@@ -68,18 +68,18 @@ impl Trajectory {
         self.times_s[self.times_s.len() - 1]
     }
 
-    /// How many way points it was made of.
+    /// How many waypoints it was made of.
     #[must_use]
-    pub fn n_way_points(&self) -> usize {
+    pub fn n_waypoints(&self) -> usize {
         self.path.n_spans() / self.n_pieces as usize + 1
     }
 
-    /// When the tools are at way point `idx`, counted from 0, or nearest to it where they turn a corner; seconds.
+    /// When the tools are at waypoint `idx`, counted from 0, or nearest to it where they turn a corner; seconds.
     ///
     /// # Panics
-    /// When there is no such way point.
+    /// When there is no such waypoint.
     #[must_use]
-    pub fn way_point_s(&self, idx: usize) -> f64 {
+    pub fn waypoint_s(&self, idx: usize) -> f64 {
         self.times_s[idx * self.n_pieces as usize]
     }
 
@@ -106,8 +106,8 @@ impl Trajectory {
         let mut arms = vec![Vec::new(); self.channels.n_arms()];
         for sample in 0..=n_periods {
             for (arm, state) in arms.iter_mut().zip(self.at(f64::from(sample) / rate_hz)) {
-                let ArmState { angles, velocities, opening, .. } = state;
-                arm.push(ArmSample { angles, velocities, opening });
+                let ArmState { angles, velocities, gripper_opening, .. } = state;
+                arm.push(ArmSample { angles, velocities, gripper_opening });
             }
         }
         Motion { period_s: 1.0 / rate_hz, arms }
@@ -132,7 +132,7 @@ impl Trajectory {
         let of_joints = |number: &dyn Fn(usize) -> f64| {
             Joints::from_fn(n_joints, |joint| number(self.channels.joint(arm, joint)))
         };
-        let opening = jet(self.channels.opening(arm));
+        let opening = jet(self.channels.gripper(arm));
         ArmState {
             angles: of_joints(&|channel| jet(channel).value),
             velocities: of_joints(&|channel| jet(channel).first * place.rate),
@@ -140,14 +140,14 @@ impl Trajectory {
                 let jet = jet(channel);
                 jet.second * place.rate * place.rate + jet.first * place.acceleration
             }),
-            opening: opening.value.clamp(0.0, 1.0),
-            opening_per_s: opening.first * place.rate,
+            gripper_opening: opening.value.clamp(0.0, 1.0),
+            gripper_opening_per_s: opening.first * place.rate,
         }
     }
 }
 
 impl Channels {
-    pub(crate) fn of(cell: &Cell) -> Self {
+    pub(crate) fn of(cell: &WorkCell) -> Self {
         let mut firsts = vec![0];
         let mut next = 0;
         for arm in &cell.arms {
@@ -165,12 +165,12 @@ impl Channels {
         self.firsts[arm.0] + joint
     }
 
-    pub(crate) fn opening(&self, arm: ArmIndex) -> usize {
+    pub(crate) fn gripper(&self, arm: ArmIndex) -> usize {
         self.firsts[arm.0 + 1] - 1
     }
 
     fn n_joints(&self, arm: ArmIndex) -> usize {
-        self.opening(arm) - self.firsts[arm.0]
+        self.gripper(arm) - self.firsts[arm.0]
     }
 
     fn n_arms(&self) -> usize {

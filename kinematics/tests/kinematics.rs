@@ -6,9 +6,9 @@ use glam::DVec3;
 use rand::RngExt as _;
 use rand_chacha::ChaCha8Rng;
 use tandem_core::{Stream, episode_rng};
-use tandem_kinematics::inverse::LEAST_GAIN_M;
+use tandem_kinematics::inverse::MIN_MANIPULABILITY_M;
 use tandem_kinematics::{
-    ArmModel, JACO_6, Joints, MICO_4, MICO_6, Posture, ReachError, ToolTarget,
+    ArmModel, ForwardKinematics, JACO_6, Joints, MICO_4, MICO_6, ReachError, ToolTarget,
 };
 
 const N_POSES: u32 = 100_000;
@@ -28,7 +28,7 @@ fn four_joints_are_found_again_from_where_they_bring_the_tool() {
     let mut branches = [0; 5];
     for _ in 0..N_POSES {
         let angles = random_angles(&MICO_4, &mut rng);
-        let posture = Posture::of(&MICO_4, &angles);
+        let posture = ForwardKinematics::new(&MICO_4, &angles);
         let tool = posture.tool();
         // The level direction that is across the tool's y axis is the one whose nearest turn is this one.
         let across = tool.axes.y_axis.cross(DVec3::Z);
@@ -36,8 +36,8 @@ fn four_joints_are_found_again_from_where_they_bring_the_tool() {
         let target = ToolTarget { at_m: tool.origin_m, yaw_rad: level.y.atan2(level.x) };
         let nearest = match MICO_4.nearest(&target, &angles) {
             Ok(nearest) => nearest,
-            Err(ReachError::Singular { gain_m, .. }) => {
-                assert!(gain_m < LEAST_GAIN_M);
+            Err(ReachError::Singular { manipulability_m, .. }) => {
+                assert!(manipulability_m < MIN_MANIPULABILITY_M);
                 singular += 1;
                 continue;
             }
@@ -48,7 +48,9 @@ fn four_joints_are_found_again_from_where_they_bring_the_tool() {
             let level_m = across.length();
             let own = MICO_4.solutions(&target, &angles).unwrap();
             let listed = own.iter().any(|s| s.angles.largest_difference(&angles) < 1e-6);
-            assert!(!listed && (level_m < 1e-6 || nearest.gain_m >= LEAST_GAIN_M));
+            assert!(
+                !listed && (level_m < 1e-6 || nearest.manipulability_m >= MIN_MANIPULABILITY_M)
+            );
             singular += 1;
         } else {
             worst_rad = worst_rad.max(nearest.angles.largest_difference(&angles));
@@ -57,7 +59,7 @@ fn four_joints_are_found_again_from_where_they_bring_the_tool() {
         let solutions = MICO_4.solutions(&target, &angles).unwrap();
         branches[solutions.len()] += 1;
         for solution in solutions {
-            let there = Posture::of(&MICO_4, &solution.angles);
+            let there = ForwardKinematics::new(&MICO_4, &solution.angles);
             worst_m = worst_m.max((there.tool().origin_m - target.at_m).length());
             assert!((there.tilt_rad() - solution.tilt_rad).abs() < 1e-12);
         }
@@ -79,7 +81,7 @@ fn six_joints_find_the_way_back_from_nearby() {
         let (mut failed, mut same) = (0, 0);
         for _ in 0..N_POSES {
             let angles = random_angles(model, &mut rng);
-            let posture = Posture::of(model, &angles);
+            let posture = ForwardKinematics::new(model, &angles);
             let tool = posture.tool();
             let near = Joints::from_fn(6, |joint| angles[joint] + rng.random_range(-0.1..0.1));
             let found = model.nearest_pose(tool.origin_m, &tool.axes, &near);
@@ -87,7 +89,7 @@ fn six_joints_find_the_way_back_from_nearby() {
                 failed += 1;
                 continue;
             };
-            let there = Posture::of(model, &found.angles);
+            let there = ForwardKinematics::new(model, &found.angles);
             assert!((there.tool().origin_m - tool.origin_m).length() < 1e-8);
             assert!(there.tool().axes.abs_diff_eq(tool.axes, 1e-8));
             for (angle, joint) in found.angles.iter().zip(model.joints) {
@@ -118,7 +120,7 @@ fn six_joints_point_down_where_the_training_worlds_arm_works() {
             Err(error) => panic!("{at_m}: {error}"),
         };
         assert!(solution.tilt_rad < 1e-8);
-        let tool = *Posture::of(&JACO_6, &solution.angles).tool();
+        let tool = *ForwardKinematics::new(&JACO_6, &solution.angles).tool();
         assert!((tool.origin_m - at_m).length() < 1e-9);
         assert!((tool.axes.x_axis - DVec3::Y).length() < 1e-8);
     }
@@ -130,7 +132,7 @@ fn six_joints_point_down_where_the_training_worlds_arm_works() {
 fn the_simulated_arms_home_posture_is_the_same_by_this_table() {
     let home =
         [-0.208_556_86, 2.506_949_69, 5.075_284_33, 2.970_589_41, 0.665_106_14, -0.379_560_43];
-    let posture = Posture::of(&JACO_6, &Joints::new(&home));
+    let posture = ForwardKinematics::new(&JACO_6, &Joints::new(&home));
     let off_m = (posture.tool().origin_m - DVec3::new(0.40, 0.0, 0.15)).length();
     assert!(off_m < 1e-3 && posture.tilt_rad() < 2e-3, "{off_m} m, {} rad", posture.tilt_rad());
 }

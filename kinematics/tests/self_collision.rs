@@ -7,8 +7,8 @@ use rand::RngExt as _;
 use rand_chacha::ChaCha8Rng;
 use tandem_core::{ArmIndex, Stream, episode_rng};
 use tandem_kinematics::{
-    ArmModel, ArmSample, Cell, CheckSettings, JACO_6, Joints, Limits, MICO_4, MICO_6, Motion,
-    PlacedArm, Reason, Refusal, TaskFrame, check,
+    ArmModel, ArmSample, CheckSettings, JACO_6, Joints, Limits, MICO_4, MICO_6, Motion, PlacedArm,
+    Reason, Refusal, TaskFrame, WorkCell, check,
 };
 
 /// Postures and motions of the Mico with four joints, and of the arms with six.
@@ -123,9 +123,9 @@ fn bar_gap_m(first: &Bar, second: &Bar) -> f64 {
 }
 
 /// One arm with nothing round it, and a check that looks at nothing but speeds and the arm itself.
-fn alone(model: &'static ArmModel) -> (Cell, CheckSettings) {
+fn alone(model: &'static ArmModel) -> (WorkCell, CheckSettings) {
     let arm = PlacedArm { model, base_in_world_m: DVec3::new(0.3, -0.2, 0.0), yaw_rad: 0.7 };
-    let cell = Cell { arms: vec![arm], table_z_m: -2.0, task_frame: TaskFrame::MICO_4 };
+    let cell = WorkCell { arms: vec![arm], table_z_m: -2.0, task_frame: TaskFrame::MICO_4 };
     let settings = CheckSettings {
         limits: Limits { tool_speed_mps: 10.0, ..Limits::default() },
         tilt_rad: PI,
@@ -160,7 +160,7 @@ fn no_posture_in_which_an_arm_is_too_near_to_itself_is_accepted_and_no_other_is_
             let angles = random_angles(arm.model, &mut rng);
             let opening = rng.random_range(0.0..1.0);
             let velocities = Joints::from_fn(angles.len(), |_| 0.0);
-            let rest = ArmSample { angles, velocities, opening };
+            let rest = ArmSample { angles, velocities, gripper_opening: opening };
             let motion = Motion { period_s: PERIOD_S, arms: vec![vec![rest; 2]] };
             let gap_m = arm.gap_m(&angles, opening);
             let same_m = arm.model.self_gap_m(&angles, opening);
@@ -197,7 +197,7 @@ fn random_motion(model: &ArmModel, rng: &mut ChaCha8Rng) -> Motion {
         let (way, speed) = ((to[joint] - from[joint]).abs(), model.joints[joint].speed_radps);
         (1.9 * way / speed).max((6.5 * way * ramp_s / speed).sqrt())
     };
-    let opens_s = 1.9 * (openings[1] - openings[0]).abs() / Limits::default().opening_per_s;
+    let opens_s = 1.9 * (openings[1] - openings[0]).abs() / Limits::default().gripper_opening_per_s;
     let duration_s = (0..from.len()).map(least_s).fold(opens_s.max(0.1), f64::max);
     let n = (duration_s / PERIOD_S).ceil();
     let mut samples = Vec::new();
@@ -209,7 +209,7 @@ fn random_motion(model: &ArmModel, rng: &mut ChaCha8Rng) -> Motion {
         let angles = Joints::from_fn(from.len(), |j| from[j] + s * (to[j] - from[j]));
         let velocities = Joints::from_fn(from.len(), |j| rate * (to[j] - from[j]));
         let opening = openings[0] + s * (openings[1] - openings[0]);
-        samples.push(ArmSample { angles, velocities, opening });
+        samples.push(ArmSample { angles, velocities, gripper_opening: opening });
         idx += 1.0;
     }
     Motion { period_s: PERIOD_S, arms: vec![samples] }
@@ -228,7 +228,8 @@ fn gaps(arm: &Own, motion: &Motion) -> Vec<(f64, f64)> {
                     + u * u * (3.0 - 2.0 * u) * b
                     + PERIOD_S * u * (1.0 - u) * ((1.0 - u) * da - u * db)
             });
-            let opening = ends[0].opening + u * (ends[1].opening - ends[0].opening);
+            let opening =
+                ends[0].gripper_opening + u * (ends[1].gripper_opening - ends[0].gripper_opening);
             gaps.push(((idx as f64 + u) * PERIOD_S, arm.gap_m(&angles, opening)));
         }
     }
@@ -291,7 +292,7 @@ fn solutions_in_which_the_arm_meets_itself_come_last() {
     let (mut n_avoided, mut n_followed) = (0, 0);
     for _ in 0..100_000 {
         let angles = random_angles(&MICO_4, &mut rng);
-        let at_m = tandem_kinematics::Posture::of(&MICO_4, &angles).tool().origin_m;
+        let at_m = tandem_kinematics::ForwardKinematics::new(&MICO_4, &angles).tool().origin_m;
         let target = tandem_kinematics::ToolTarget { at_m, yaw_rad: 0.0 };
         let near = random_angles(&MICO_4, &mut rng);
         let Ok(all) = MICO_4.solutions(&target, &near) else { continue };

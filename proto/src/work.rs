@@ -2,10 +2,8 @@
 
 mod episode;
 
-use tandem_core::work::{
-    EpisodeOrder, Exploration, PublishedActor, RunTerms, SlotOrder, WorldTerms,
-};
-use tandem_core::{EpisodeKind, Layout, Task};
+use tandem_core::work::{EpisodeOrder, PublishedActor, RunTerms, SlotOrder};
+use tandem_core::{EpisodeKind, Exploration, Layout, Task, WorldSettings};
 
 use crate::advice::{MAX_ARMS, decode_account_name};
 use crate::error::DecodeError;
@@ -60,12 +58,12 @@ pub fn encode_terms(terms: &RunTerms) -> pb::RunTerms {
         account: terms.account.clone().unwrap_or_default(),
         exploration: Some(pb::Exploration {
             noise_std: terms.exploration.noise_std,
-            random_share: terms.exploration.random_share,
-            random_hold_mean_steps: terms.exploration.random_hold_mean_steps,
+            random_share: terms.exploration.random_action_prob,
+            random_hold_mean_steps: terms.exploration.sticky_random_mean_steps,
         }),
         world: Some(pb::WorldTerms {
-            gripped_start_share: terms.world.gripped_start_share,
-            wide_start_share: terms.world.wide_start_share,
+            gripped_start_share: terms.world.grasped_start_prob,
+            wide_start_share: 0.0,
             substeps: terms.world.substeps,
         }),
     }
@@ -104,19 +102,26 @@ fn decode_exploration(exploration: pb::Exploration) -> Result<Exploration, Decod
     let hold = exploration.random_hold_mean_steps;
     Ok(Exploration {
         noise_std: one_within("noise_std", exploration.noise_std, &(0.0..=f32::INFINITY))?,
-        random_share: one_within("random_share", exploration.random_share, &(0.0..=1.0))?,
-        random_hold_mean_steps: one_within("random_hold_mean_steps", hold, &(1.0..=f32::INFINITY))?,
+        random_action_prob: one_within("random_share", exploration.random_share, &(0.0..=1.0))?,
+        sticky_random_mean_steps: one_within(
+            "random_hold_mean_steps",
+            hold,
+            &(1.0..=f32::INFINITY),
+        )?,
     })
 }
 
-fn decode_world(world: pb::WorldTerms) -> Result<WorldTerms, DecodeError> {
-    Ok(WorldTerms {
-        gripped_start_share: one_within(
+fn decode_world(world: pb::WorldTerms) -> Result<WorldSettings, DecodeError> {
+    if world.wide_start_share != 0.0 {
+        let expected = "0, there are no such starts any more";
+        return Err(DecodeError::new("wide_start_share", expected, world.wide_start_share));
+    }
+    Ok(WorldSettings {
+        grasped_start_prob: one_within(
             "gripped_start_share",
             world.gripped_start_share,
             &(0.0..=1.0),
         )?,
-        wide_start_share: one_within("wide_start_share", world.wide_start_share, &(0.0..=1.0))?,
         substeps: count_within("substeps", world.substeps, &(1..=MAX_SUBSTEPS))?,
     })
 }
@@ -250,10 +255,10 @@ mod tests {
             account: Some("run-7".to_owned()),
             exploration: Exploration {
                 noise_std: 0.2,
-                random_share: 0.3,
-                random_hold_mean_steps: 4.0,
+                random_action_prob: 0.3,
+                sticky_random_mean_steps: 4.0,
             },
-            world: WorldTerms { gripped_start_share: 0.0, wide_start_share: 1.0, substeps: 20 },
+            world: WorldSettings { grasped_start_prob: 1.0, substeps: 20 },
         }
     }
 
@@ -321,8 +326,12 @@ mod tests {
             "world.substeps: expected 1 to 10000, got 0",
         );
         check(
-            |t| t.world.as_mut().unwrap().wide_start_share = f32::NAN,
-            "world.wide_start_share: expected a number in [0, 1], got NaN",
+            |t| t.world.as_mut().unwrap().gripped_start_share = f32::NAN,
+            "world.gripped_start_share: expected a number in [0, 1], got NaN",
+        );
+        check(
+            |t| t.world.as_mut().unwrap().wide_start_share = 0.5,
+            "world.wide_start_share: expected 0, there are no such starts any more, got 0.5",
         );
         let mut spoilt = encode_terms(&terms());
         spoilt.exploration = Some(pb::Exploration {

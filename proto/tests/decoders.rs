@@ -134,7 +134,8 @@ fn terms() -> impl Strategy<Value = pb::RunTerms> {
             random_share,
             random_hold_mean_steps,
         });
-    let world = (one_number(), one_number(), any_count(10_000)).prop_map(
+    let removed = prop_oneof![4 => Just(0.0), 1 => one_number()];
+    let world = (one_number(), removed, any_count(10_000)).prop_map(
         |(gripped_start_share, wide_start_share, substeps)| pb::WorldTerms {
             gripped_start_share,
             wide_start_share,

@@ -95,9 +95,10 @@ fn key(run: &Run) -> String {
     for free in FREE_SETTINGS {
         settings.remove(free);
     }
-    // How many evaluated episodes leave a log changes nothing that a report shows.
+    // These do not affect training; the intervals show how many episodes were tested.
     if let Some(evaluation) = settings.get_mut("evaluation").and_then(Value::as_table_mut) {
         evaluation.remove("recorded_episodes");
+        evaluation.remove("test_episodes");
     }
     settings.to_string()
 }

@@ -344,7 +344,7 @@ impl Trainer {
     /// Feeds the normalisers with an episode's observations and with goals relabelled as in a batch.
     fn feed_normalizers(&mut self, episode: &Episode) {
         let mut rng = episode_rng(self.config.seed, episode.number, Stream::Normaliser);
-        let both_orders = self.config.replay.swap_share > 0.0 && self.layout.n_arms == 2;
+        let both_orders = self.config.replay.arm_swap_prob > 0.0 && self.layout.n_arms == 2;
         let (mut observations, mut goals) = (Vec::new(), Vec::new());
         for step_idx in 0..EPISODE_STEPS {
             let goal = self.relabelled_goal(episode, step_idx, &mut rng);
@@ -368,7 +368,7 @@ impl Trainer {
     ) -> Vec<f32> {
         let mut goal = episode.goal.clone();
         for arm in self.layout.arms() {
-            let hindsight = coin(rng, self.config.replay.her_future_share);
+            let hindsight = coin(rng, self.config.replay.her_ratio);
             let moment = step_idx + 1 + index(rng, EPISODE_STEPS - step_idx);
             if hindsight {
                 goal[self.layout.goal_of(arm)].copy_from_slice(episode.achieved(moment, arm));

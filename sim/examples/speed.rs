@@ -9,8 +9,8 @@ use std::time::Instant;
 
 use tandem_core::layout::EPISODE_STEPS;
 use tandem_core::rng::uniform;
-use tandem_core::{Layout, Stream, Task, episode_rng};
-use tandem_sim::{Env, SimError, Starts, WorldConfig};
+use tandem_core::{Layout, Stream, Task, WorldSettings, episode_rng};
+use tandem_sim::{Env, SimError, WorldConfig};
 
 const EPISODES: u64 = 40;
 
@@ -36,7 +36,7 @@ fn steps_per_s(layout: Layout, config: &WorldConfig) -> Result<f64, SimError> {
     let mut observation = vec![0.0; layout.n_observation()];
     let start = Instant::now();
     for episode in 0..EPISODES {
-        env.reset(&mut episode_rng(1, episode, Stream::Reset), Starts::default());
+        env.reset(&mut episode_rng(1, episode, Stream::Reset), WorldSettings::default());
         let mut exploration = episode_rng(1, episode, Stream::Exploration);
         for step in 0..EPISODE_STEPS {
             if step % 4 == 0 {

@@ -1,7 +1,7 @@
 //! What a world is made of, how its episodes start, and what can go wrong with it.
 
 use serde::{Deserialize, Serialize};
-use tandem_core::Task;
+use tandem_core::{Task, WorldSettings};
 
 /// Simulated time of a control step, seconds.
 pub const CONTROL_STEP_S: f32 = 0.04;
@@ -53,6 +53,12 @@ impl Default for WorldConfig {
     }
 }
 
+impl From<WorldSettings> for WorldConfig {
+    fn from(settings: WorldSettings) -> Self {
+        Self { substeps: settings.substeps, ..Self::default() }
+    }
+}
+
 impl WorldConfig {
     /// The configuration, when every value is in its range; NaN is in none.
     ///
@@ -99,15 +105,6 @@ fn check(key: &'static str, value: f64, low: f64, high: f64) -> Result<(), SimEr
     } else {
         Err(SimError::OutOfRange { key, value, low, high })
     }
-}
-
-/// How often training episodes start otherwise than evaluated ones. Shares of episodes, in [0, 1].
-#[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub struct Starts {
-    /// Share that starts with every object held by its arm, anywhere in reach. Pick and place only.
-    pub gripped_share: f32,
-    /// Share that starts with the hands anywhere in the lower workspace.
-    pub wide_share: f32,
 }
 
 /// Why a world cannot be built or stepped.

@@ -3,10 +3,10 @@
 use rand_chacha::ChaCha8Rng;
 use rapier3d::math::Vector;
 use tandem_core::scene::Scene;
-use tandem_core::{ArmIndex, Contacts, Layout, Task};
+use tandem_core::{ArmIndex, Contacts, Layout, Task, WorldSettings};
 
 use crate::arm::Command;
-use crate::config::{CONTROL_STEPS_PER_S, SimError, Starts, WorldConfig};
+use crate::config::{CONTROL_STEPS_PER_S, SimError, WorldConfig};
 use crate::observation::observe_arm;
 use crate::scene::scene;
 use crate::start::{ArmStart, draw};
@@ -62,11 +62,11 @@ impl Env {
 
     /// Starts an episode: everything at rest in random places and with random goals, nothing touching anything but
     /// the table or the fingers that hold it.
-    pub fn reset(&mut self, rng: &mut ChaCha8Rng, starts: Starts) {
+    pub fn reset(&mut self, rng: &mut ChaCha8Rng, settings: WorldSettings) {
         self.world = self.prototype.clone();
         self.n_steps = 0;
         loop {
-            let arms = draw(rng, self.layout, self.object_half_m, starts);
+            let arms = draw(rng, self.layout, self.object_half_m, settings);
             self.place(&arms);
             if self.world.link_gap_m() >= START_LINK_GAP_M {
                 return;
@@ -257,8 +257,10 @@ mod tests {
             let (mut by_swapping, mut by_nudging) = (Vec::new(), Vec::new());
             for episode in 0..240 {
                 let mut rng = episode_rng(2, episode, Stream::Reset);
-                let starts = Starts { gripped_share: 0.3, wide_share: 0.3 };
-                let [first, second] = draw(&mut rng, layout, env.object_half_m, starts)[..] else {
+                let settings =
+                    WorldSettings { grasped_start_prob: 0.3, ..WorldSettings::default() };
+                let [first, second] = draw(&mut rng, layout, env.object_half_m, settings)[..]
+                else {
                     panic!()
                 };
                 let mut noise =

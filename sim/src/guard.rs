@@ -216,10 +216,10 @@ mod tests {
     use super::*;
     use tandem_core::rng::{coin, index, uniform};
     use tandem_core::scene::{Capsule, Scene};
-    use tandem_core::{Contacts, Layout, Stream, Task, episode_rng};
+    use tandem_core::{Contacts, Layout, Stream, Task, WorldSettings, episode_rng};
 
     use crate::capsule::{MovedCapsule, MovedPoint};
-    use crate::config::{Starts, WorldConfig};
+    use crate::config::WorldConfig;
     use crate::env::Env;
 
     #[test]
@@ -300,8 +300,7 @@ mod tests {
         let (mut overlapping, mut deepest_m) = (0, 0.0_f32);
         for episode in 0..200 {
             let mut rng = episode_rng(9, episode, Stream::Exploration);
-            let starts = Starts { wide_share: 0.5, gripped_share: 0.0 };
-            env.reset(&mut episode_rng(9, episode, Stream::Reset), starts);
+            env.reset(&mut episode_rng(9, episode, Stream::Reset), WorldSettings::default());
             let mut action = [0.0; 8];
             let mut aims = [0; 2];
             let attackers = [coin(&mut rng, 0.7), coin(&mut rng, 0.7)];

@@ -26,5 +26,5 @@ mod scene;
 mod start;
 mod world;
 
-pub use config::{CONTROL_STEP_S, Friction, SimError, Starts, WorldConfig};
+pub use config::{CONTROL_STEP_S, Friction, SimError, WorldConfig};
 pub use env::Env;

@@ -3,11 +3,10 @@
 use rand_chacha::ChaCha8Rng;
 use rapier3d::math::Vector;
 use tandem_core::rng::{coin, uniform};
-use tandem_core::{ArmIndex, Layout, Task};
+use tandem_core::{ArmIndex, Layout, Task, WorldSettings};
 
-use crate::config::Starts;
-use crate::frame::{OwnFrame, WORKSPACE_HIGH, WORKSPACE_LOW};
-use crate::hand::{MAX_OPENING_M, PAD_HALF_M, PALM_HALF_M};
+use crate::frame::{OwnFrame, WORKSPACE_LOW};
+use crate::hand::MAX_OPENING_M;
 
 /// Half the area of objects and goals along x, own frame, metres.
 const AREA_X_M: f32 = 0.12;
@@ -24,10 +23,6 @@ const HANDS_APART_M: f32 = 0.17;
 /// Share of pick-and-place goals that are above the table, and up to how far, metres.
 const AIR_SHARE: f32 = 0.5;
 const AIR_M: f32 = 0.25;
-/// Room to spare between a widely placed hand and an object, metres.
-const MARGIN_M: f32 = 0.006;
-/// Highest end effector of a wide start, metres.
-const WIDE_HIGH_M: f32 = 0.20;
 /// Highest end effector of a gripped start, metres.
 const GRIPPED_HIGH_M: f32 = 0.30;
 /// How far a gripped object may be off the pads' centre along x and z, metres.
@@ -47,8 +42,6 @@ pub(crate) struct ArmStart {
 enum Kind {
     /// Above the middle of the workspace: as evaluated.
     Middle,
-    /// Anywhere in the lower workspace.
-    Wide,
     /// With the object held.
     Gripped,
 }
@@ -58,16 +51,13 @@ pub(crate) fn draw(
     rng: &mut ChaCha8Rng,
     layout: Layout,
     object_half_m: f32,
-    starts: Starts,
+    settings: WorldSettings,
 ) -> Vec<ArmStart> {
-    let gripped = coin(rng, starts.gripped_share);
-    let wide = coin(rng, starts.wide_share);
+    let grasped = coin(rng, settings.grasped_start_prob);
+    // An episode's later draws keep their place in the random stream: this one belonged to a removed kind of start.
+    let _: bool = coin(rng, 0.0);
     let can_hold = layout.task == Task::PickAndPlace && object_half_m < MAX_OPENING_M;
-    let kind = match (gripped && can_hold, wide) {
-        (true, _) => Kind::Gripped,
-        (false, true) => Kind::Wide,
-        (false, false) => Kind::Middle,
-    };
+    let kind = if grasped && can_hold { Kind::Gripped } else { Kind::Middle };
     let area = Area { layout, object_half_m };
     loop {
         let arms: Vec<ArmStart> = layout.arms().map(|_| area.arm_start(rng, kind)).collect();
@@ -89,7 +79,6 @@ impl Area {
         let goal = self.goal(rng);
         let (end_effector, opening_m, object) = match kind {
             Kind::Middle => (self.hand_in_the_middle(rng), self.free_opening_m(), on_table),
-            Kind::Wide => (wide_hand(rng), self.free_opening_m(), on_table),
             Kind::Gripped => {
                 let hand = self.holding_hand(rng);
                 (hand, self.object_half_m, self.held_object(rng, hand))
@@ -166,7 +155,6 @@ impl Area {
         );
         let clear_of = |hand: Vector, object: Vector| match kind {
             Kind::Middle => horizontal(hand - object) >= HAND_CLEARANCE_M,
-            Kind::Wide => self.is_beside_or_above(hand, object),
             Kind::Gripped => true,
         };
         arms.iter().all(|start| (start.object - start.goal).length() >= GOAL_DISTANCE_M)
@@ -175,23 +163,6 @@ impl Area {
             && apart(&hands, |offset| horizontal(offset) >= HANDS_APART_M)
             && hands.iter().all(|hand| objects.iter().all(|object| clear_of(*hand, *object)))
     }
-
-    /// Whether a hand, anywhere, does not touch an object that lies on the table.
-    fn is_beside_or_above(&self, hand: Vector, object: Vector) -> bool {
-        let room_m = self.object_half_m + MARGIN_M;
-        let offset = (hand - object).abs();
-        offset.x > PALM_HALF_M.x + room_m
-            || offset.y > PALM_HALF_M.y + room_m
-            || hand.z - PAD_HALF_M.z > object.z + room_m
-    }
-}
-
-fn wide_hand(rng: &mut ChaCha8Rng) -> Vector {
-    Vector::new(
-        uniform(rng, WORKSPACE_LOW.x, WORKSPACE_HIGH.x),
-        uniform(rng, WORKSPACE_LOW.y, WORKSPACE_HIGH.y),
-        uniform(rng, WORKSPACE_LOW.z, WIDE_HIGH_M),
-    )
 }
 
 fn horizontal(offset: Vector) -> f32 {

@@ -5,8 +5,8 @@ use std::ops::Range;
 use rand_chacha::ChaCha8Rng;
 use tandem_core::layout::{EPISODE_STEPS, OBSERVATION_PER_ARM};
 use tandem_core::rng::{coin, index, uniform};
-use tandem_core::{Layout, Stream, Task, episode_rng};
-use tandem_sim::{Env, Starts, WorldConfig};
+use tandem_core::{Layout, Stream, Task, WorldSettings, episode_rng};
+use tandem_sim::{Env, WorldConfig};
 
 /// Episodes of each layout.
 const N_EPISODES: u64 = 100;
@@ -95,8 +95,8 @@ fn play(layout: Layout, substeps: u32) -> Largest {
     let mut action = vec![0.0; layout.n_action()];
     for episode in 0..N_EPISODES {
         let mut rng = episode_rng(5, episode, Stream::Exploration);
-        let starts = Starts { gripped_share: 0.5, wide_share: 0.5 };
-        env.reset(&mut episode_rng(5, episode, Stream::Reset), starts);
+        let settings = WorldSettings { grasped_start_prob: 0.5, substeps };
+        env.reset(&mut episode_rng(5, episode, Stream::Reset), settings);
         let mut arms: Vec<Rowdy> = layout.arms().map(|_| Rowdy::new(&mut rng)).collect();
         for step_idx in 0..=EPISODE_STEPS {
             env.observe(&mut observation);

@@ -3,15 +3,15 @@
 use std::thread;
 
 use tandem_core::rng::uniform;
-use tandem_core::{Contacts, Layout, Stream, Task, episode_rng};
-use tandem_sim::{Env, SimError, Starts, WorldConfig};
+use tandem_core::{Contacts, Layout, Stream, Task, WorldSettings, episode_rng};
+use tandem_sim::{Env, SimError, WorldConfig};
 
-const STARTS: Starts = Starts { gripped_share: 0.3, wide_share: 0.3 };
+const SETTINGS: WorldSettings = WorldSettings { grasped_start_prob: 0.3, substeps: 20 };
 
 /// Every observation's bits, and the contacts, of one episode of held random actions.
 fn trace(env: &mut Env, episode: u64) -> (Vec<u32>, Vec<Contacts>) {
     let layout = env.layout();
-    env.reset(&mut episode_rng(5, episode, Stream::Reset), STARTS);
+    env.reset(&mut episode_rng(5, episode, Stream::Reset), SETTINGS);
     let mut exploration = episode_rng(5, episode, Stream::Exploration);
     let mut observation = vec![0.0; layout.n_observation()];
     let mut action = vec![0.0; layout.n_action()];
@@ -70,7 +70,7 @@ fn looking_changes_nothing() {
     for layout in layouts() {
         let run = |look: bool| {
             let mut env = new_env(layout);
-            env.reset(&mut episode_rng(1, 1, Stream::Reset), Starts::default());
+            env.reset(&mut episode_rng(1, 1, Stream::Reset), WorldSettings::default());
             let action = vec![0.7; layout.n_action()];
             for _ in 0..20 {
                 if look {
@@ -107,7 +107,7 @@ fn a_hundred_thousand_random_steps_stay_finite() {
 fn bad_actions_are_named_and_change_nothing() {
     let layout = Layout::new(Task::PickAndPlace, 1);
     let mut env = new_env(layout);
-    env.reset(&mut episode_rng(1, 1, Stream::Reset), Starts::default());
+    env.reset(&mut episode_rng(1, 1, Stream::Reset), WorldSettings::default());
     let before = env.scene();
     assert_eq!(env.step(&[0.0; 3]), Err(SimError::ActionLength { got: 3, expected: 4 }));
     let error = env.step(&[0.0, f32::INFINITY, 0.0, 0.0]).unwrap_err();
@@ -127,7 +127,7 @@ fn bad_actions_are_named_and_change_nothing() {
 fn actions_are_cut_to_one() {
     let run = |size: f32| {
         let mut env = new_env(Layout::new(Task::PickAndPlace, 1));
-        env.reset(&mut episode_rng(1, 1, Stream::Reset), Starts::default());
+        env.reset(&mut episode_rng(1, 1, Stream::Reset), WorldSettings::default());
         env.step(&[size, -size, size, -size]).unwrap();
         env.scene()
     };

@@ -70,8 +70,8 @@ pub(crate) struct TrainArgs {
     #[arg(long, value_name = "DIR")]
     pub(crate) out: Option<PathBuf>,
     /// Resumes the run in --out from its newest checkpoint. The settings and the teacher remain those of the run; only
-    /// its end (--max-env-steps, --max-minutes, --until-success), checkpoint.*, evaluation.recorded_episodes and
-    /// --workers can change. A rejected --resume changes nothing.
+    /// its end (--max-env-steps, --max-minutes, --until-success), checkpoint.*, evaluation.recorded_episodes,
+    /// evaluation.test_episodes and --workers can change. A rejected --resume changes nothing.
     #[arg(long, requires = "out")]
     pub(crate) resume: bool,
     /// Prints the summary as one JSON object on the last line of standard output.

@@ -14,9 +14,8 @@ use crate::exit::{Exit, Failed, OrExit as _};
 use crate::progress_text::{clock_text, grouped};
 use crate::{output, policy_file};
 
-/// Seed and number of the test goals. No run selects its best policy by them.
+/// Seed of the test goals. No run selects its best policy by them.
 const REPORT_SEED: u64 = 777;
-const REPORT_EPISODES: u64 = 240;
 
 /// Evaluates the best policy on the test goals, draws the curve and prints the summary.
 pub(super) fn print(
@@ -25,9 +24,10 @@ pub(super) fn print(
     memory: PeakMemory,
     as_json: bool,
 ) -> Result<(), Failed> {
+    let n_test_episodes = plan.config.evaluation.test_episodes;
     let path = plan.best_policy();
     let result =
-        measure(&EvaluatedPolicy::Policy(policy_file::load(&path)?), REPORT_EPISODES, REPORT_SEED)?;
+        measure(&EvaluatedPolicy::Policy(policy_file::load(&path)?), n_test_episodes, REPORT_SEED)?;
     let rows =
         MetricsLog::read_all(&plan.out.join("metrics.jsonl")).or_exit(Exit::Data, String::new)?;
     let pictures = Pictures {
@@ -58,7 +58,8 @@ fn summary_lines(
     let mut lines = vec![
         format!("done: {}", last.end_reason),
         format!(
-            "best policy on {REPORT_EPISODES} held-out goals (seed {REPORT_SEED}), alone: no noise, no advice"
+            "best policy on {} held-out goals (seed {REPORT_SEED}), alone: no noise, no advice",
+            plan.config.evaluation.test_episodes
         ),
     ];
     lines.extend(result.lines().iter().map(|line| format!("  {line}")));

@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use tandem_core::ArmIndex;
-use tandem_kinematics::{Cell, Excess, Joints, Motion, Reason, Refusal, check};
+use tandem_kinematics::{Excess, Joints, Motion, Reason, Refusal, WorkCell, check};
 
 use crate::executor::settings::Settings;
 
@@ -14,7 +14,7 @@ pub struct Checker(Arc<Terms>);
 /// What a motion has to keep, and for which arms.
 #[derive(Debug)]
 struct Terms {
-    cell: Cell,
+    cell: WorkCell,
     settings: Settings,
 }
 
@@ -48,13 +48,13 @@ pub enum CheckError {
 }
 
 impl Checker {
-    pub(crate) fn new(cell: Cell, settings: Settings) -> Self {
+    pub(crate) fn new(cell: WorkCell, settings: Settings) -> Self {
         Self(Arc::new(Terms { cell, settings }))
     }
 
     /// The arms.
     #[must_use]
-    pub fn cell(&self) -> &Cell {
+    pub fn cell(&self) -> &WorkCell {
         &self.0.cell
     }
 

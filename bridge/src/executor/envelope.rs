@@ -16,7 +16,7 @@
 use std::collections::VecDeque;
 
 use tandem_kinematics::model::Joint;
-use tandem_kinematics::{Cell, Excess, Joints, PlacedArm, Posture};
+use tandem_kinematics::{Excess, ForwardKinematics, Joints, PlacedArm, WorkCell};
 
 use crate::driver::{ArmCommand, PairState};
 use crate::executor::settings::Settings;
@@ -58,7 +58,7 @@ pub(crate) fn reachable(
 /// The envelope of one cell.
 #[derive(Debug, Clone)]
 pub(crate) struct Envelope {
-    cell: Cell,
+    cell: WorkCell,
     settings: Settings,
     period_s: f64,
     /// For each arm, a distance that no point of it has from a joint's axis, metres.
@@ -69,7 +69,7 @@ pub(crate) struct Envelope {
 pub(crate) type History = VecDeque<Vec<Joints>>;
 
 impl Envelope {
-    pub(crate) fn new(cell: &Cell, settings: &Settings, period_s: f64) -> Self {
+    pub(crate) fn new(cell: &WorkCell, settings: &Settings, period_s: f64) -> Self {
         let levers = |arm: &PlacedArm| arm.model.link_levers_m();
         Self {
             cell: cell.clone(),
@@ -139,7 +139,7 @@ impl Envelope {
     }
 
     fn check_tool(&self, arm: usize, command: &ArmCommand, at: &Joints) -> Result<(), Breach> {
-        let posture = Posture::of(self.cell.arms[arm].model, at);
+        let posture = ForwardKinematics::new(self.cell.arms[arm].model, at);
         let got = posture.tool_velocity(&command.velocities).length();
         let allowed = self.settings.check.limits.tool_speed_mps;
         if got > allowed * (1.0 + TOOL_SPEED_SLACK) {

@@ -2,7 +2,7 @@
 
 use std::collections::VecDeque;
 
-use tandem_kinematics::{Cell, Excess, Joints, Motion};
+use tandem_kinematics::{Excess, Joints, Motion, WorkCell};
 
 use crate::driver::{ArmCommand, PairState};
 use crate::executor::envelope::reachable;
@@ -27,7 +27,7 @@ pub(crate) struct Playback {
 
 /// What surrounds one tick.
 pub(crate) struct Moment<'a> {
-    pub(crate) cell: &'a Cell,
+    pub(crate) cell: &'a WorkCell,
     pub(crate) settings: &'a Settings,
     pub(crate) period_s: f64,
     /// The newest state; `None` when it is too old to be steered by.
@@ -73,7 +73,7 @@ impl Playback {
             Some(state) => Some(self.errors(moment, state)?),
             None => None,
         };
-        let opening_step = moment.settings.check.limits.opening_per_s * moment.period_s;
+        let opening_step = moment.settings.check.limits.gripper_opening_per_s * moment.period_s;
         let from = self.past[0].clone();
         self.go_on(moment, paused);
         let to = self.motion.at(self.played_s);
@@ -84,7 +84,8 @@ impl Playback {
                 ahead + moment.settings.gain_per_s * error
             });
             let before = moment.before[arm].opening;
-            let opening = to[arm].opening.clamp(before - opening_step, before + opening_step);
+            let opening =
+                to[arm].gripper_opening.clamp(before - opening_step, before + opening_step);
             ArmCommand { velocities: within_limits(moment, arm, &ahead), opening }
         };
         let commands = (0..from.len()).map(command).collect();
@@ -173,7 +174,7 @@ fn within_limits(moment: &Moment<'_>, arm: usize, wanted: &Joints) -> Joints {
         wanted[joint].clamp(-fastest, fastest).clamp(low, high)
     });
     let Some(state) = moment.state else { return velocities };
-    let posture = tandem_kinematics::Posture::of(placed.model, &state.arms[arm].angles);
+    let posture = tandem_kinematics::ForwardKinematics::new(placed.model, &state.arms[arm].angles);
     let tool_mps = posture.tool_velocity(&velocities).length();
     if tool_mps > limits.tool_speed_mps {
         let share = limits.tool_speed_mps / tool_mps;

@@ -1,9 +1,10 @@
 //! From a request to a motion that has passed the check.
 
 use glam::DVec3;
-use tandem_kinematics::plan::MAX_WAY_POINTS;
+use tandem_kinematics::plan::MAX_WAYPOINTS;
 use tandem_kinematics::{
-    ArmSample, ArmWayPoint, Cell, Joints, Motion, PlanError, PlanSettings, Posture, WayPoint, plan,
+    ArmSample, ArmWaypoint, ForwardKinematics, Joints, Motion, PlanError, PlanSettings, Waypoint,
+    WorkCell, plan,
 };
 use tandem_proto::{DecodeError, pb};
 
@@ -26,7 +27,7 @@ pub(super) struct Wanted {
 #[derive(Debug, Clone, PartialEq)]
 pub(super) enum Way {
     /// Places of the tools.
-    Tools { way_points: Vec<WayPoint>, step_s: f64, from_here: bool },
+    Tools { way_points: Vec<Waypoint>, step_s: f64, from_here: bool },
     /// Angles of the joints.
     Joints(Motion),
 }
@@ -52,7 +53,7 @@ fn because(error: &PlanError) -> String {
 
 impl Wanted {
     /// What `request` wants of the arms of `cell`; fields are named from the motion on.
-    pub(super) fn decode(request: pb::MotionRequest, cell: &Cell) -> Result<Self, DecodeError> {
+    pub(super) fn decode(request: pb::MotionRequest, cell: &WorkCell) -> Result<Self, DecodeError> {
         use pb::motion_request::Motion as M;
         let speed = within("speed", request.speed, "more than 0 and at most 1", |speed| {
             speed > 0.0 && speed <= 1.0
@@ -97,13 +98,13 @@ impl Wanted {
 }
 
 /// Where the tools are.
-fn here(state: &PairState, cell: &Cell) -> WayPoint {
+fn here(state: &PairState, cell: &WorkCell) -> Waypoint {
     let arms = state.arms.iter().zip(&cell.arms);
     let way_point = |(arm, placed): (&crate::ArmReading, &tandem_kinematics::PlacedArm)| {
-        let tool = Posture::of(placed.model, &arm.angles).tool().origin_m;
-        ArmWayPoint {
+        let tool = ForwardKinematics::new(placed.model, &arm.angles).tool().origin_m;
+        ArmWaypoint {
             tool_in_world_m: placed.world_from_base(tool),
-            opening: arm.opening.clamp(0.0, 1.0),
+            gripper_opening: arm.opening.clamp(0.0, 1.0),
         }
     };
     arms.map(way_point).collect()
@@ -111,24 +112,24 @@ fn here(state: &PairState, cell: &Cell) -> WayPoint {
 
 /// The error with way points counted as the client counts them.
 fn numbered(error: PlanError, from_here: bool) -> PlanError {
-    let client = |way_point: usize| way_point.saturating_sub(usize::from(from_here));
+    let client = |waypoint: usize| waypoint.saturating_sub(usize::from(from_here));
     match error {
-        PlanError::Step { way_point, arm, step_m } => {
-            PlanError::Step { way_point: client(way_point), arm, step_m }
+        PlanError::Step { waypoint, arm, step_m } => {
+            PlanError::Step { waypoint: client(waypoint), arm, step_m }
         }
-        PlanError::Unreachable { way_point, arm, source } => {
-            PlanError::Unreachable { way_point: client(way_point), arm, source }
+        PlanError::Unreachable { waypoint, arm, source } => {
+            PlanError::Unreachable { waypoint: client(waypoint), arm, source }
         }
-        PlanError::Jump { way_point, arm, joint, jump_rad } => {
-            PlanError::Jump { way_point: client(way_point), arm, joint, jump_rad }
+        PlanError::Jump { waypoint, arm, joint, jump_rad } => {
+            PlanError::Jump { waypoint: client(waypoint), arm, joint, jump_rad }
         }
         other => other,
     }
 }
 
-fn decode_tools(message: pb::WayPoints, cell: &Cell) -> Result<Way, DecodeError> {
+fn decode_tools(message: pb::WayPoints, cell: &WorkCell) -> Result<Way, DecodeError> {
     let (from_here, got) = (message.from_here, message.way_points.len());
-    let (least, most) = if from_here { (1, MAX_WAY_POINTS - 1) } else { (2, MAX_WAY_POINTS) };
+    let (least, most) = if from_here { (1, MAX_WAYPOINTS - 1) } else { (2, MAX_WAYPOINTS) };
     if !(least..=most).contains(&got) {
         return Err(DecodeError::new("way_points", format_args!("{least} to {most}"), got));
     }
@@ -144,7 +145,7 @@ fn decode_tools(message: pb::WayPoints, cell: &Cell) -> Result<Way, DecodeError>
     Ok(Way::Tools { way_points: way_points.collect::<Result<_, _>>()?, step_s, from_here })
 }
 
-fn decode_way_point(message: pb::BridgeWayPoint, cell: &Cell) -> Result<WayPoint, DecodeError> {
+fn decode_way_point(message: pb::BridgeWayPoint, cell: &WorkCell) -> Result<Waypoint, DecodeError> {
     check_arms(message.arms.len(), cell)?;
     let decode_indexed = |(idx, arm): (usize, pb::ArmWayPoint)| {
         decode_arm(&arm).map_err(|error| error.within(format_args!("arms[{idx}]")))
@@ -152,7 +153,7 @@ fn decode_way_point(message: pb::BridgeWayPoint, cell: &Cell) -> Result<WayPoint
     message.arms.into_iter().enumerate().map(decode_indexed).collect()
 }
 
-fn decode_arm(message: &pb::ArmWayPoint) -> Result<ArmWayPoint, DecodeError> {
+fn decode_arm(message: &pb::ArmWayPoint) -> Result<ArmWaypoint, DecodeError> {
     let field = "tool_in_world_m";
     let numbers = &message.tool_in_world_m;
     let [x, y, z] = numbers[..] else {
@@ -163,13 +164,13 @@ fn decode_arm(message: &pb::ArmWayPoint) -> Result<ArmWayPoint, DecodeError> {
         ));
     };
     check_finite(field, numbers)?;
-    Ok(ArmWayPoint {
+    Ok(ArmWaypoint {
         tool_in_world_m: DVec3::new(x, y, z),
-        opening: decode_opening(message.opening)?,
+        gripper_opening: decode_opening(message.opening)?,
     })
 }
 
-fn decode_joints(message: pb::JointMotion, cell: &Cell) -> Result<Way, DecodeError> {
+fn decode_joints(message: pb::JointMotion, cell: &WorkCell) -> Result<Way, DecodeError> {
     let expected = "a number of seconds in [0.001, 0.1]";
     let period_s = within("period_s", message.period_s, expected, |period_s| {
         (0.001..=0.1).contains(&period_s)
@@ -209,11 +210,11 @@ fn decode_sample(message: &pb::JointSample, n_joints: usize) -> Result<ArmSample
     Ok(ArmSample {
         angles: joints("angles_rad", &message.angles_rad)?,
         velocities: joints("velocities_radps", &message.velocities_radps)?,
-        opening: decode_opening(message.opening)?,
+        gripper_opening: decode_opening(message.opening)?,
     })
 }
 
-fn check_arms(got: usize, cell: &Cell) -> Result<(), DecodeError> {
+fn check_arms(got: usize, cell: &WorkCell) -> Result<(), DecodeError> {
     let expected = cell.arms.len();
     if got == expected {
         return Ok(());

@@ -88,8 +88,8 @@ fn of_reason(reason: &Reason) -> Word {
         R::JointAcceleration(joint, e) => {
             word("joint-acceleration", Some(*joint), numbers(e, "rad/s2"))
         }
-        R::Opening(opening) => word("opening", None, number(*opening, "")),
-        R::OpeningSpeed(e) => word("opening-speed", None, numbers(e, "1/s")),
+        R::GripperOpening(opening) => word("opening", None, number(*opening, "")),
+        R::GripperSpeed(e) => word("opening-speed", None, numbers(e, "1/s")),
         R::ToolSpeed(e) => word("tool-speed", None, numbers(e, "m/s")),
         R::Reach(e) => word("reach", None, numbers(e, "m")),
         R::Tilt(e) => word("tilt", None, numbers(e, "rad")),
@@ -105,21 +105,21 @@ pub(super) fn of_plan(error: &PlanError) -> (Word, Option<usize>, Option<usize>)
     use PlanError as P;
     match error {
         P::Setting { .. } => (word("setting", None, None), None, None),
-        P::WayPoints { .. } => (word("way-points", None, None), None, None),
-        P::Arms { way_point, .. } => (word("arms", None, None), Some(*way_point), None),
-        P::Opening { way_point, arm, opening } => {
-            (word("opening", None, number(*opening, "")), Some(*way_point), Some(arm.0))
+        P::WaypointCount { .. } => (word("way-points", None, None), None, None),
+        P::Arms { waypoint, .. } => (word("arms", None, None), Some(*waypoint), None),
+        P::GripperOpening { waypoint, arm, gripper_opening: opening } => {
+            (word("opening", None, number(*opening, "")), Some(*waypoint), Some(arm.0))
         }
-        P::Step { way_point, arm, step_m } => {
+        P::Step { waypoint, arm, step_m } => {
             let excess = Excess { got: *step_m, allowed: tandem_kinematics::plan::MAX_STEP_M };
-            (word("step", None, numbers(&excess, "m")), Some(*way_point), Some(arm.0))
+            (word("step", None, numbers(&excess, "m")), Some(*waypoint), Some(arm.0))
         }
-        P::Unreachable { way_point, arm, .. } => {
-            (word("unreachable", None, None), Some(*way_point), Some(arm.0))
+        P::Unreachable { waypoint, arm, .. } => {
+            (word("unreachable", None, None), Some(*waypoint), Some(arm.0))
         }
-        P::Jump { way_point, arm, joint, jump_rad } => {
+        P::Jump { waypoint, arm, joint, jump_rad } => {
             let word = word("jump", Some(*joint), number(*jump_rad, "rad"));
-            (word, Some(*way_point), Some(arm.0))
+            (word, Some(*waypoint), Some(arm.0))
         }
         _ => (word("plan", None, None), None, None),
     }

@@ -5,7 +5,7 @@ use std::collections::VecDeque;
 use rand_chacha::ChaCha8Rng;
 use tandem_core::Contacts;
 use tandem_core::rng::index;
-use tandem_kinematics::{ArmModel, Cell, Gaps, Joints};
+use tandem_kinematics::{ArmModel, Gaps, Joints, WorkCell};
 
 use crate::driver::{ArmCommand, Command, Order, SILENCE_S};
 use crate::simulated::config::{Disturbance, N_SUBSTEPS, PERIOD_S, SimulatedConfig};
@@ -54,7 +54,7 @@ struct Waiting {
 }
 
 impl Drives {
-    pub(crate) fn new(cell: &Cell, at: &[Joints], opening: f64, rng: ChaCha8Rng) -> Self {
+    pub(crate) fn new(cell: &WorkCell, at: &[Joints], opening: f64, rng: ChaCha8Rng) -> Self {
         let arm = |(placed, at): (&tandem_kinematics::PlacedArm, &Joints)| {
             let zero = Joints::from_fn(at.len(), |_| 0.0);
             let model = placed.model;
@@ -146,7 +146,7 @@ impl Drives {
     /// Lets a physics step pass. `openings` are how far the grippers are open, `torques_nm` those of what the arms touch.
     pub(crate) fn step(
         &mut self,
-        cell: &Cell,
+        cell: &WorkCell,
         config: &SimulatedConfig,
         disturbance: &Disturbance,
         openings: &[f64],
@@ -169,7 +169,7 @@ impl Drives {
     /// Shells do not pass through each other, the table or the arm's own parts: an arm that would go deeper does not move.
     fn keep_apart(
         &mut self,
-        cell: &Cell,
+        cell: &WorkCell,
         config: &SimulatedConfig,
         openings: &[f64],
         before: &[Joints],

@@ -4,14 +4,14 @@ use glam::DVec3;
 use rapier3d::math::{Pose, Rotation, Vector};
 use tandem_core::scene::{ArmScene, Capsule, Cuboid, Point, Scene};
 use tandem_kinematics::model::Anchor;
-use tandem_kinematics::{Cell, Joints, PlacedArm, Posture};
+use tandem_kinematics::{ForwardKinematics, Joints, PlacedArm, WorkCell};
 
 use crate::simulated::config::Block;
 use crate::simulated::world::{TABLE_HALF_M, World};
 
 /// What the arms at `angles` and the world look like `time_s` after the start; there are no goals.
 pub(crate) fn scene(
-    cell: &Cell,
+    cell: &WorkCell,
     angles: &[Joints],
     world: &World,
     blocks: &[Block],
@@ -32,7 +32,7 @@ pub(crate) fn scene(
 }
 
 fn arm_scene(placed: &PlacedArm, angles: &Joints, hand: [(Pose, Vector); 3]) -> ArmScene {
-    let posture = Posture::of(placed.model, angles);
+    let posture = ForwardKinematics::new(placed.model, angles);
     let point = |anchor: &Anchor| single(placed.world_from_base(posture.anchor(anchor)));
     let origin = |frame| point(&Anchor { frame, offset_m: DVec3::ZERO });
     let links = placed.model.links.iter().map(|link| Capsule {

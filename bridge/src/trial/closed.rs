@@ -3,7 +3,7 @@
 use glam::{DVec3, EulerRot};
 use tandem_core::ArmIndex;
 use tandem_core::layout::{EPISODE_STEPS, GOAL_TOLERANCE_M};
-use tandem_kinematics::{ArmWayPoint, Cell, Joints, Posture, ReachError, WayPoint};
+use tandem_kinematics::{ArmWaypoint, ForwardKinematics, Joints, ReachError, Waypoint, WorkCell};
 
 use crate::simulated::{MAX_OPENING_M, ObjectPose};
 use crate::trial::Decide;
@@ -64,7 +64,7 @@ struct Hands {
     /// Looks in a row at which every object was at its goal.
     n_done: usize,
     /// Where the tools went so far.
-    way_points: Vec<WayPoint>,
+    way_points: Vec<Waypoint>,
 }
 
 impl Trials {
@@ -177,10 +177,10 @@ impl Trials {
             openings_m.iter().map(|opening_m| self.mapping.opening(*opening_m)).collect()
         };
         let here = tools(cell, &hands.at);
-        let first: WayPoint = here
+        let first: Waypoint = here
             .iter()
             .zip(openings(&hands.openings_m))
-            .map(|(tool, opening)| ArmWayPoint { tool_in_world_m: *tool, opening })
+            .map(|(tool, opening)| ArmWaypoint { tool_in_world_m: *tool, gripper_opening: opening })
             .collect();
         let openings_m: Vec<f64> = wanted.iter().map(|(_, opening_m)| *opening_m).collect();
         for (attempt, parts) in ATTEMPTS.iter().enumerate() {
@@ -223,17 +223,17 @@ impl Trials {
         openings_m: &[f64],
         hands: &Hands,
         blocks: &[SeenBlock],
-    ) -> Result<[WayPoint; 3], ReachError> {
-        let mut ways: [WayPoint; 3] = Default::default();
+    ) -> Result<[Waypoint; 3], ReachError> {
+        let mut ways: [Waypoint; 3] = Default::default();
         for (arm, placed) in self.mapping.cell().arms.iter().enumerate() {
             let (idx, near) = (ArmIndex(arm), &hands.at[arm]);
             let [before, opening] = [hands.openings_m[arm], openings_m[arm]]
                 .map(|opening_m| self.mapping.opening(opening_m));
             let [from, to] = [from, to].map(|own| self.mapping.pads_in_world(idx, own[arm]));
             let (_, then) = self.mapping.tool_for_pads(idx, to, near)?;
-            let tilt_rad = |angles| Posture::of(placed.model, angles).tilt_rad();
+            let tilt_rad = |angles| ForwardKinematics::new(placed.model, angles).tilt_rad();
             let pads = Pads {
-                yaw_rad: placed.yaw_rad + Cell::FINGERS_YAW_RAD,
+                yaw_rad: placed.yaw_rad + WorkCell::FINGERS_YAW_RAD,
                 opening_m: before * f64::from(MAX_OPENING_M),
                 tilt_rad: tilt_rad(near).max(tilt_rad(&then)),
             };
@@ -246,7 +246,7 @@ impl Trials {
             let points = [corner, end, end];
             for ((way, point), opening) in ways.iter_mut().zip(points).zip(openings) {
                 let (tool_in_world_m, _) = self.mapping.tool_for_pads(idx, point, near)?;
-                way.push(ArmWayPoint { tool_in_world_m, opening });
+                way.push(ArmWaypoint { tool_in_world_m, gripper_opening: opening });
             }
         }
         Ok(ways)
@@ -255,7 +255,7 @@ impl Trials {
 
 impl Hands {
     /// Adds a step's way points, of which the first is where the tools were.
-    fn follow(&mut self, step: [WayPoint; 4]) {
+    fn follow(&mut self, step: [Waypoint; 4]) {
         let known = usize::from(!self.way_points.is_empty());
         self.way_points.extend(step.into_iter().skip(known));
     }
@@ -267,9 +267,9 @@ impl Hands {
     }
 }
 
-fn is_still(from: &WayPoint, to: &WayPoint) -> bool {
+fn is_still(from: &Waypoint, to: &Waypoint) -> bool {
     from.iter().zip(to).all(|(from, to)| {
         (from.tool_in_world_m - to.tool_in_world_m).length() < STILL_M
-            && (from.opening - to.opening).abs() < STILL_OPENING
+            && (from.gripper_opening - to.gripper_opening).abs() < STILL_OPENING
     })
 }

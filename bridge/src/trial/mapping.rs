@@ -17,7 +17,7 @@
 
 use glam::{DQuat, DVec3};
 use tandem_core::{ArmIndex, Layout, Task};
-use tandem_kinematics::{Cell, Joints, PlacedArm, ReachError, TaskFrame};
+use tandem_kinematics::{Joints, PlacedArm, ReachError, TaskFrame, WorkCell};
 
 use crate::simulated::{Block, MAX_OPENING_M, ObjectPose};
 
@@ -53,9 +53,9 @@ const TILT_ROUNDS: usize = 4;
 /// How a policy's world lies in a cell.
 #[derive(Debug, Clone)]
 pub struct Mapping {
-    cell: Cell,
+    cell: WorkCell,
     /// Each arm alone, for its gap to the table.
-    alone: Vec<Cell>,
+    alone: Vec<WorkCell>,
     layout: Layout,
     block_half_m: f64,
 }
@@ -78,17 +78,17 @@ pub struct ArmMoment {
 impl Mapping {
     /// The mapping of `layout`'s world with blocks like `block` into `cell`.
     #[must_use]
-    pub fn new(cell: Cell, layout: Layout, block: &Block) -> Self {
+    pub fn new(cell: WorkCell, layout: Layout, block: &Block) -> Self {
         let task_frame = TaskFrame { scale: 1.0, lift_m: 0.0, ..cell.task_frame };
-        let cell = Cell { task_frame, ..cell };
-        let alone = |arm: &PlacedArm| Cell { arms: vec![*arm], ..cell.clone() };
+        let cell = WorkCell { task_frame, ..cell };
+        let alone = |arm: &PlacedArm| WorkCell { arms: vec![*arm], ..cell.clone() };
         let alone = cell.arms.iter().map(alone).collect();
         Self { cell, alone, layout, block_half_m: f64::from(block.half_m) }
     }
 
     /// The cell, with the table as the origin of heights.
     #[must_use]
-    pub fn cell(&self) -> &Cell {
+    pub fn cell(&self) -> &WorkCell {
         &self.cell
     }
 
@@ -150,7 +150,7 @@ impl Mapping {
     #[must_use]
     pub fn hand_in_own(&self, arm: ArmIndex, angles: &Joints) -> DVec3 {
         let placed = &self.cell.arms[arm.0];
-        let posture = tandem_kinematics::Posture::of(placed.model, angles);
+        let posture = tandem_kinematics::ForwardKinematics::new(placed.model, angles);
         let tool = placed.world_from_base(posture.tool().origin_m);
         let pads = tool + pointing(placed, angles) * PADS_AHEAD_M;
         self.own(arm, pads) - DVec3::Z * HAND_LIFT_M
@@ -278,5 +278,6 @@ pub fn observe_arm(now: &ArmMoment, before: &ArmMoment, observation: &mut [f32])
 
 /// The way a gripper points, world frame.
 fn pointing(placed: &PlacedArm, angles: &Joints) -> DVec3 {
-    placed.axes() * tandem_kinematics::Posture::of(placed.model, angles).tool().axes.z_axis
+    placed.axes()
+        * tandem_kinematics::ForwardKinematics::new(placed.model, angles).tool().axes.z_axis
 }

@@ -3,7 +3,7 @@
 use glam::DVec3;
 use tandem_core::ArmIndex;
 use tandem_kinematics::{
-    ArmWayPoint, CheckSettings, Joints, Motion, PlanSettings, WayPoint, check, plan,
+    ArmWaypoint, CheckSettings, Joints, Motion, PlanSettings, Waypoint, check, plan,
 };
 use tandem_sim::SimError;
 
@@ -45,7 +45,7 @@ pub(super) struct Course {
     pub(super) rehearsed_m: Option<Vec<f64>>,
     pub(super) time_over: bool,
     /// Where the tools went, or should have gone.
-    pub(super) way_points: Vec<WayPoint>,
+    pub(super) way_points: Vec<Waypoint>,
 }
 
 impl Trials {
@@ -202,7 +202,7 @@ impl Trials {
     /// The motion through `way_points` from joint angles `at`, when it passes the check with `settings`.
     pub(super) fn motion(
         &self,
-        way_points: &[WayPoint],
+        way_points: &[Waypoint],
         at: &[Joints],
         settings: &CheckSettings,
     ) -> Result<Motion, Cause> {
@@ -222,17 +222,20 @@ impl Trials {
         hands: &[DVec3],
         openings_m: &[f64],
         near: &[Joints],
-    ) -> Result<WayPoint, Cause> {
+    ) -> Result<Waypoint, Cause> {
         let arm_way_point = |arm: usize| {
             let (tool_in_world_m, _) =
                 self.mapping.tool_in_world(ArmIndex(arm), hands[arm], &near[arm])?;
-            Ok(ArmWayPoint { tool_in_world_m, opening: self.mapping.opening(openings_m[arm]) })
+            Ok(ArmWaypoint {
+                tool_in_world_m,
+                gripper_opening: self.mapping.opening(openings_m[arm]),
+            })
         };
         let arms = (0..hands.len()).map(|arm| {
             arm_way_point(arm).map_err(|source| {
                 let arm = ArmIndex(arm);
                 Cause::Refused(RefusedBy::Plan(tandem_kinematics::PlanError::Unreachable {
-                    way_point: 0,
+                    waypoint: 0,
                     arm,
                     source,
                 }))
@@ -278,7 +281,7 @@ impl Trials {
 
 /// A motion for arms that do not look.
 struct Blind {
-    way_points: Result<Vec<WayPoint>, Cause>,
+    way_points: Result<Vec<Waypoint>, Cause>,
     /// How far the objects ended from their goals in the rehearsal, metres.
     rehearsed_m: Vec<f64>,
     n_steps: usize,

@@ -3,7 +3,7 @@
 use glam::DVec3;
 use tandem_core::scene::Scene;
 use tandem_core::{ArmIndex, Contacts};
-use tandem_kinematics::{Cell, Joints, Motion, Posture};
+use tandem_kinematics::{ForwardKinematics, Joints, Motion, WorkCell};
 
 use crate::executor::{Executor, Phase, Settings, Token};
 use crate::simulated::{ObjectPose, PERIOD_S, SimulatedPair};
@@ -20,7 +20,7 @@ const LOOK_EVERY: u64 = 4;
 /// What moves, and what is noted about it.
 pub(crate) struct Stage<'a> {
     executor: Executor<SimulatedPair>,
-    cell: Cell,
+    cell: WorkCell,
     witness: &'a mut dyn Witness,
     goals: Vec<DVec3>,
     n_periods: u64,
@@ -35,7 +35,7 @@ pub(crate) struct Stage<'a> {
 impl<'a> Stage<'a> {
     /// Lets the arms of `pair` go; `goals` (world, metres) are for pictures only.
     pub(crate) fn new(
-        cell: Cell,
+        cell: WorkCell,
         pair: SimulatedPair,
         goals: Vec<DVec3>,
         witness: &'a mut dyn Witness,
@@ -160,10 +160,10 @@ impl<'a> Stage<'a> {
 }
 
 /// Where the tools are, world frame, metres.
-pub(crate) fn tools(cell: &Cell, angles: &[Joints]) -> Vec<DVec3> {
+pub(crate) fn tools(cell: &WorkCell, angles: &[Joints]) -> Vec<DVec3> {
     let arms = cell.arms.iter().zip(angles);
     arms.map(|(placed, angles)| {
-        placed.world_from_base(Posture::of(placed.model, angles).tool().origin_m)
+        placed.world_from_base(ForwardKinematics::new(placed.model, angles).tool().origin_m)
     })
     .collect()
 }

@@ -8,7 +8,7 @@ use tandem_bridge::simulated::PERIOD_S;
 use tandem_bridge::{Phase, SimulatedConfig, StartError, StopCause};
 use tandem_core::rng::{index, uniform};
 use tandem_core::{ArmIndex, Stream, episode_rng};
-use tandem_kinematics::{Joints, Motion, Posture};
+use tandem_kinematics::{ForwardKinematics, Joints, Motion};
 
 use crate::injection::{KINDS, Kind, disturbance};
 use crate::observer::{Observer, Slack};
@@ -98,7 +98,7 @@ impl Plan {
         };
         let drift = |arm: usize| {
             let placed = &cell.arms[arm];
-            let posture = Posture::of(placed.model, &angles[arm]);
+            let posture = ForwardKinematics::new(placed.model, &angles[arm]);
             let in_base = placed.axes().transpose() * along(arm);
             let gain = Joints::from_fn(4, |joint| posture.tool_motion(joint).0.dot(in_base));
             let most = gain.iter().fold(1e-9, |most: f64, gain| most.max(gain.abs()));

@@ -4,7 +4,7 @@ use tandem_bridge::SimulatedPair;
 use tandem_bridge::layout::mico_cell;
 use tandem_bridge::simulated::PERIOD_S;
 use tandem_core::ArmIndex;
-use tandem_kinematics::{Cell, Joints, Posture};
+use tandem_kinematics::{ForwardKinematics, Joints, WorkCell};
 
 /// Tool speed, metres per second; gaps, metres: as the executor's settings have them.
 const TOOL_MPS: f64 = 0.20;
@@ -33,7 +33,7 @@ impl Slack {
 }
 
 pub(crate) struct Observer {
-    cell: Cell,
+    cell: WorkCell,
     slack: Slack,
     before: Option<Vec<Joints>>,
     /// When a joint was last seen to move, seconds of simulated time.
@@ -108,7 +108,7 @@ impl Observer {
                 );
             }
         }
-        let posture = Posture::of(placed.model, angles);
+        let posture = ForwardKinematics::new(placed.model, angles);
         let tool_mps = posture.tool_velocity(rates).length();
         let drift_mps = self.slack.drift_radps * 3.0 * 0.6;
         self.tool_share = self.tool_share.max(tool_mps / TOOL_MPS);

@@ -1,4 +1,4 @@
-//! The check on way points that lead an arm where it must not be.
+//! The check on waypoints that lead an arm where it must not be.
 
 use std::f64::consts::FRAC_PI_2;
 
@@ -7,28 +7,28 @@ use rand::RngExt as _;
 use rand_chacha::ChaCha8Rng;
 use tandem_core::{ArmIndex, Stream, episode_rng};
 use tandem_kinematics::{
-    ArmWayPoint, Cell, CheckSettings, Joints, MICO_4, PlanSettings, Posture, Reason, WayPoint,
-    check, plan,
+    ArmWaypoint, CheckSettings, ForwardKinematics, Joints, MICO_4, PlanSettings, Reason, Waypoint,
+    WorkCell, check, plan,
 };
 
 use crate::refusals::{N_BROKEN, PERIOD_S};
 use crate::walks::{Area, walk};
 
-/// Plans good way points of which some were replaced, and checks them with the limit itself for the expected time.
-fn break_way_points(
+/// Plans good waypoints of which some were replaced, and checks them with the limit itself for the expected time.
+fn break_waypoints(
     name: &str,
     settings: &CheckSettings,
-    change: impl Fn(&Cell, &mut Vec<WayPoint>, &mut ChaCha8Rng),
+    change: impl Fn(&WorkCell, &mut Vec<Waypoint>, &mut ChaCha8Rng),
     (expected, tolerance): (fn(&Reason) -> bool, f64),
-    margin: impl Fn(&Cell, &[Joints]) -> f64,
+    margin: impl Fn(&WorkCell, &[Joints]) -> f64,
 ) {
-    let cell = Cell::mico_pair();
+    let cell = WorkCell::mico_pair();
     let start = cell.ready(0.15).unwrap();
     let mut rng = episode_rng(8, 0, Stream::Exploration);
     for seed in 0..N_BROKEN as u64 {
-        let mut way_points = walk(&cell, Area::FAR, seed % 50, 3);
-        change(&cell, &mut way_points, &mut rng);
-        let trajectory = plan(&cell, &way_points, &start, &PlanSettings::default());
+        let mut waypoints = walk(&cell, Area::FAR, seed % 50, 3);
+        change(&cell, &mut waypoints, &mut rng);
+        let trajectory = plan(&cell, &waypoints, &start, &PlanSettings::default());
         let trajectory = trajectory.unwrap_or_else(|error| panic!("{name} {seed}: {error}"));
         let motion = trajectory.sampled(1.0 / PERIOD_S);
         let at: Vec<Joints> = motion.arms.iter().map(|samples| samples[0].angles).collect();
@@ -49,34 +49,35 @@ fn break_way_points(
 }
 
 /// Leads `arm` in `n` steps from where it is to a point of its base frame.
-fn lead(cell: &Cell, way_points: &mut Vec<WayPoint>, goals_in_base: &[(usize, DVec3)], n: u32) {
-    let from = way_points[way_points.len() - 1].clone();
+fn lead(cell: &WorkCell, waypoints: &mut Vec<Waypoint>, goals_in_base: &[(usize, DVec3)], n: u32) {
+    let from = waypoints[waypoints.len() - 1].clone();
     for step in 1..=n {
-        let mut next: WayPoint = from.clone();
+        let mut next: Waypoint = from.clone();
         for (arm, goal_in_base) in goals_in_base {
             let goal = cell.arms[*arm].world_from_base(*goal_in_base);
             let share = f64::from(step) / f64::from(n);
             let tool_in_world_m = from[*arm].tool_in_world_m.lerp(goal, share);
-            next[*arm] = ArmWayPoint { tool_in_world_m, ..from[*arm] };
+            next[*arm] = ArmWaypoint { tool_in_world_m, ..from[*arm] };
         }
-        way_points.push(next);
+        waypoints.push(next);
     }
 }
 
 #[test]
 fn grippers_that_tilt_too_far() {
-    let tilt_rad =
-        |at: &[Joints]| at.iter().map(|q| Posture::of(&MICO_4, q).tilt_rad()).fold(0.0, f64::max);
-    break_way_points(
+    let tilt_rad = |at: &[Joints]| {
+        at.iter().map(|q| ForwardKinematics::new(&MICO_4, q).tilt_rad()).fold(0.0, f64::max)
+    };
+    break_waypoints(
         "tilt",
         &CheckSettings::default(),
-        |cell, way_points, rng| {
+        |cell, waypoints, rng| {
             let side = if rng.random_bool(0.5) { 1.0 } else { -1.0 };
             let direction = side * rng.random_range(1.0..FRAC_PI_2);
             let radius_m = rng.random_range(0.40..0.50);
             let height_m = rng.random_range(0.10..0.16);
             let goal = DVec3::new(radius_m * direction.cos(), radius_m * direction.sin(), height_m);
-            lead(cell, way_points, &[(rng.random_range(0..2), goal)], 5);
+            lead(cell, waypoints, &[(rng.random_range(0..2), goal)], 5);
         },
         (|reason| matches!(reason, Reason::Tilt(_)), 2e-3),
         |_, at| 25.0_f64.to_radians() - tilt_rad(at),
@@ -85,14 +86,14 @@ fn grippers_that_tilt_too_far() {
 
 #[test]
 fn tools_that_are_led_into_the_table() {
-    break_way_points(
+    break_waypoints(
         "table",
         &CheckSettings::default(),
-        |cell, way_points, rng| {
+        |cell, waypoints, rng| {
             let x_m = rng.random_range(0.24..0.32);
             let goal =
                 DVec3::new(x_m, rng.random_range(-0.06..0.06), rng.random_range(-0.02..0.044));
-            lead(cell, way_points, &[(rng.random_range(0..2), goal)], 4);
+            lead(cell, waypoints, &[(rng.random_range(0..2), goal)], 4);
         },
         (|reason| matches!(reason, Reason::TableGap(..)), 2e-4),
         |cell, at| cell.gaps(at).table_m.into_iter().fold(f64::INFINITY, f64::min) - 0.002,
@@ -101,14 +102,14 @@ fn tools_that_are_led_into_the_table() {
 
 #[test]
 fn arms_that_are_led_into_each_other() {
-    break_way_points(
+    break_waypoints(
         "arms",
         &CheckSettings::default(),
-        |cell, way_points, rng| {
+        |cell, waypoints, rng| {
             let (y_m, z_m) = (rng.random_range(-0.06..0.06), rng.random_range(0.06..0.14));
             let goal = |y_m: f64| DVec3::new(0.345, y_m, z_m);
             let off_m = rng.random_range(-0.02..0.02);
-            lead(cell, way_points, &[(0, goal(y_m)), (1, goal(off_m - y_m))], 5);
+            lead(cell, waypoints, &[(0, goal(y_m)), (1, goal(off_m - y_m))], 5);
         },
         (|reason| matches!(reason, Reason::ArmsGap(ArmIndex(1), ..)), 2e-4),
         |cell, at| cell.gaps(at).arms_m - 0.02,
@@ -119,13 +120,13 @@ fn arms_that_are_led_into_each_other() {
 fn tools_that_are_led_through_the_arms_own_base() {
     // Grippers tilt near the base: without room for that they would be refused before they come there.
     let settings = CheckSettings { tilt_rad: 1.5, ..CheckSettings::default() };
-    break_way_points(
+    break_waypoints(
         "own base",
         &settings,
-        |cell, way_points, rng| {
+        |cell, waypoints, rng| {
             let (x_m, y_m) = (rng.random_range(0.05..0.08), rng.random_range(-0.02..0.02));
             let goal = DVec3::new(x_m, y_m, rng.random_range(0.07..0.09));
-            lead(cell, way_points, &[(rng.random_range(0..2), goal)], 5);
+            lead(cell, waypoints, &[(rng.random_range(0..2), goal)], 5);
         },
         (|reason| matches!(reason, Reason::SelfGap(["base", _], _)), 2e-4),
         |cell, at| cell.gaps(at).self_m.into_iter().fold(f64::INFINITY, f64::min) - 0.005,

@@ -1,4 +1,4 @@
-//! Way points of two arms become motions within all limits, and what breaks one is refused.
+//! Waypoints of two arms become motions within all limits, and what breaks one is refused.
 #![expect(clippy::unwrap_used, clippy::panic, reason = "a test panics where it fails")]
 
 mod led;

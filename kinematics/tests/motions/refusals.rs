@@ -7,7 +7,8 @@ use rand::RngExt as _;
 use rand_chacha::ChaCha8Rng;
 use tandem_core::{ArmIndex, Stream, episode_rng};
 use tandem_kinematics::{
-    ArmSample, Cell, CheckSettings, Joints, MICO_4, Motion, Posture, Reason, Refusal, check,
+    ArmSample, CheckSettings, ForwardKinematics, Joints, MICO_4, Motion, Reason, Refusal, WorkCell,
+    check,
 };
 
 use crate::walks::{Area, sampled, walk};
@@ -19,7 +20,7 @@ pub(crate) const PERIOD_S: f64 = 0.01;
 
 #[test]
 fn a_thousand_good_walks_are_passed() {
-    let cell = Cell::mico_pair();
+    let cell = WorkCell::mico_pair();
     let (mut seconds, mut longest_s) = (0.0, 0.0_f64);
     for seed in 0..N_GOOD {
         let (motion, at) = sampled(&cell, &walk(&cell, Area::TASKS, seed, 50));
@@ -46,7 +47,7 @@ impl Case {
         self.motion.arms[0].len()
     }
 
-    fn check(&self, cell: &Cell) -> Result<(), Refusal> {
+    fn check(&self, cell: &WorkCell) -> Result<(), Refusal> {
         check(cell, &self.motion, &self.at, &self.settings)
     }
 
@@ -59,7 +60,7 @@ impl Case {
 }
 
 /// Good motions far from each other, so that one thing can be broken without breaking another.
-fn pool(cell: &Cell) -> Vec<Case> {
+fn pool(cell: &WorkCell) -> Vec<Case> {
     (0..20)
         .map(|seed| {
             let (motion, at) = sampled(cell, &walk(cell, Area::FAR, seed, 6));
@@ -91,7 +92,7 @@ impl Expected {
 
 /// Breaks motions of the pool; `how` says what to expect, or that this motion does not suit.
 fn break_all(name: &str, how: impl Fn(&mut Case, &mut ChaCha8Rng) -> Option<Expected>) {
-    let cell = Cell::mico_pair();
+    let cell = WorkCell::mico_pair();
     let pool = pool(&cell);
     let mut rng = episode_rng(7, 0, Stream::Exploration);
     let (mut broken, mut tried) = (0, 0);
@@ -120,7 +121,7 @@ fn numbers_that_are_none() {
         match rng.random_range(0..9) {
             joint @ 0..4 => sample.angles[joint] = none,
             joint @ 4..8 => sample.velocities[joint - 4] = none,
-            _ => sample.opening = none,
+            _ => sample.gripper_opening = none,
         }
         Expected::around(arm, idx, |reason| *reason == Reason::NotFinite)
     });
@@ -132,14 +133,14 @@ fn openings_out_of_range_or_too_fast() {
         let beyond = rng.random_range(1e-6..0.5);
         let opening = if rng.random_bool(0.5) { 1.0 + beyond } else { -beyond };
         let (arm, idx, sample) = case.sample(rng);
-        sample.opening = opening;
-        Expected::around(arm, idx, |reason| matches!(reason, Reason::Opening(_)))
+        sample.gripper_opening = opening;
+        Expected::around(arm, idx, |reason| matches!(reason, Reason::GripperOpening(_)))
     });
     break_all("opening speed", |case, rng| {
         let by = rng.random_range(0.1..0.5);
         let (arm, idx, sample) = case.sample(rng);
-        sample.opening += if sample.opening < 0.5 { by } else { -by };
-        Expected::around(arm, idx, |reason| matches!(reason, Reason::OpeningSpeed(_)))
+        sample.gripper_opening += if sample.gripper_opening < 0.5 { by } else { -by };
+        Expected::around(arm, idx, |reason| matches!(reason, Reason::GripperSpeed(_)))
     });
 }
 
@@ -251,7 +252,7 @@ fn joints_that_are_too_fast_or_accelerate_too_much() {
         // The same within both limits is passed; then the speed limit is taken down below it.
         let arm = rng.random_range(0..2);
         swing(case, arm, 3, 0.99 * speed / acceleration, 0.99 * acceleration);
-        assert_eq!(case.check(&Cell::mico_pair()), Ok(()));
+        assert_eq!(case.check(&WorkCell::mico_pair()), Ok(()));
         case.settings.limits.ramp_s *= 1.05;
         Expected::around(ArmIndex(arm), 11, |r| matches!(r, Reason::JointAcceleration(3, _)))
     });
@@ -259,7 +260,7 @@ fn joints_that_are_too_fast_or_accelerate_too_much() {
 
 #[test]
 fn tools_that_are_too_fast() {
-    let cell = Cell::mico_pair();
+    let cell = WorkCell::mico_pair();
     break_all("tool speed", |case, rng| {
         // An arm stretched out sideways swings away from the other one; its joint is not too fast.
         let arm = rng.random_range(0..2);
@@ -367,7 +368,8 @@ fn motions_of_other_arms_or_of_no_sensible_length() {
 #[test]
 fn tools_that_reach_too_far() {
     let shoulder_m = MICO_4.shoulder_m();
-    let distance_m = |q: &Joints| (Posture::of(&MICO_4, q).tool().origin_m - shoulder_m).length();
+    let distance_m =
+        |q: &Joints| (ForwardKinematics::new(&MICO_4, q).tool().origin_m - shoulder_m).length();
     break_all("reach", |case, rng| {
         // The limit is put between the least and the largest distance that the motion has.
         let arms = &case.motion.arms;
@@ -395,15 +397,15 @@ fn tools_that_reach_too_far() {
 
 #[test]
 fn a_refusal_says_where_when_and_how_much() {
-    let cell = Cell::mico_pair();
+    let cell = WorkCell::mico_pair();
     let (mut motion, at) = sampled(&cell, &walk(&cell, Area::FAR, 1, 6));
-    motion.arms[1][40].opening = 1.5;
+    motion.arms[1][40].gripper_opening = 1.5;
     let refusal = check(&cell, &motion, &at, &CheckSettings::default()).unwrap_err();
     assert_eq!(
         refusal.to_string(),
         "at 0.400 s arm 1: the gripper is open by 1.5, expected 0 to 1"
     );
-    motion.arms[1][40].opening = 0.5;
+    motion.arms[1][40].gripper_opening = 0.5;
     let elsewhere: Vec<Joints> =
         at.iter().map(|q| Joints::from_fn(4, |joint| q[joint] + 0.1)).collect();
     let refusal = check(&cell, &motion, &elsewhere, &CheckSettings::default()).unwrap_err();

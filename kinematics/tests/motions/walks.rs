@@ -6,7 +6,7 @@ use rand_chacha::ChaCha8Rng;
 use tandem_core::{ArmIndex, Stream, episode_rng};
 use tandem_kinematics::trajectory::DEFAULT_RATE_HZ;
 use tandem_kinematics::{
-    ArmWayPoint, Cell, Joints, Motion, PlanSettings, Trajectory, WayPoint, plan,
+    ArmWaypoint, Joints, Motion, PlanSettings, Trajectory, Waypoint, WorkCell, plan,
 };
 
 /// Longest step of a walk, metres: that of an action.
@@ -37,8 +37,8 @@ impl Area {
     }
 }
 
-/// `n` way points of both arms: steps of up to 5 cm within the area, openings that jump now and then.
-pub(crate) fn walk(cell: &Cell, area: Area, seed: u64, n: usize) -> Vec<WayPoint> {
+/// `n` waypoints of both arms: steps of up to 5 cm within the area, openings that jump now and then.
+pub(crate) fn walk(cell: &WorkCell, area: Area, seed: u64, n: usize) -> Vec<Waypoint> {
     let mut rng = episode_rng(seed, 0, Stream::Exploration);
     let mut own: Vec<DVec3> = cell.arms.iter().map(|_| area.point(&mut rng)).collect();
     let mut opening = 1.0;
@@ -55,24 +55,28 @@ pub(crate) fn walk(cell: &Cell, area: Area, seed: u64, n: usize) -> Vec<WayPoint
             if step % 7 == 6 {
                 opening = rng.random_range(0.0..=1.0);
             }
-            let way_point = |(arm, own): (usize, &DVec3)| ArmWayPoint {
+            let waypoint = |(arm, own): (usize, &DVec3)| ArmWaypoint {
                 tool_in_world_m: cell.world_from_own(ArmIndex(arm), *own),
-                opening,
+                gripper_opening: opening,
             };
-            own.iter().enumerate().map(way_point).collect()
+            own.iter().enumerate().map(waypoint).collect()
         })
         .collect()
 }
 
 /// The walk's trajectory from postures with the elbow up.
-pub(crate) fn planned(cell: &Cell, way_points: &[WayPoint], settings: &PlanSettings) -> Trajectory {
+pub(crate) fn planned(
+    cell: &WorkCell,
+    waypoints: &[Waypoint],
+    settings: &PlanSettings,
+) -> Trajectory {
     let start = cell.ready(0.15).unwrap();
-    plan(cell, way_points, &start, settings).unwrap()
+    plan(cell, waypoints, &start, settings).unwrap()
 }
 
 /// The walk as samples, and where the arms have to be before.
-pub(crate) fn sampled(cell: &Cell, way_points: &[WayPoint]) -> (Motion, Vec<Joints>) {
-    let motion = planned(cell, way_points, &PlanSettings::default()).sampled(DEFAULT_RATE_HZ);
+pub(crate) fn sampled(cell: &WorkCell, waypoints: &[Waypoint]) -> (Motion, Vec<Joints>) {
+    let motion = planned(cell, waypoints, &PlanSettings::default()).sampled(DEFAULT_RATE_HZ);
     let at = motion.arms.iter().map(|samples| samples[0].angles).collect();
     (motion, at)
 }

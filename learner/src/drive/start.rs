@@ -123,8 +123,8 @@ impl<'a> Drive<'a> {
         let terms = RunTerms {
             layout: trainer.layout,
             account: ledger.as_ref().map(|ledger| ledger.account().to_owned()),
-            exploration: config.run.exploration(),
-            world: config.run.world_terms(),
+            exploration: config.run.exploration,
+            world: config.run.world,
         };
         for Pending { counters, policy, .. } in &pending {
             shared.publish(&policy.published(counters.round));

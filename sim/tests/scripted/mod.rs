@@ -2,8 +2,8 @@
 
 use tandem_core::layout::EPISODE_STEPS;
 use tandem_core::reward::{REWARD_ACHIEVED, achieved_goal, distance, sparse_reward};
-use tandem_core::{ArmIndex, Contacts, Layout, Stream, Task, episode_rng};
-use tandem_sim::{Env, Starts, WorldConfig};
+use tandem_core::{ArmIndex, Contacts, Layout, Stream, Task, WorldSettings, episode_rng};
+use tandem_sim::{Env, WorldConfig};
 
 /// Metres that an action of 1 asks for.
 const ACTION_M: f32 = 0.05;
@@ -25,7 +25,7 @@ pub(crate) fn play(layout: Layout, config: &WorldConfig, n_episodes: u64) -> Vec
     let mut action = vec![0.0; layout.n_action()];
     (0..n_episodes)
         .map(|episode| {
-            env.reset(&mut episode_rng(11, episode, Stream::Reset), Starts::default());
+            env.reset(&mut episode_rng(11, episode, Stream::Reset), WorldSettings::default());
             let mut controllers = vec![Controller::new(layout.task); layout.n_arms];
             let mut contacts = Contacts::NONE;
             for _ in 0..EPISODE_STEPS {

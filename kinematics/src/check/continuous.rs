@@ -8,12 +8,12 @@
 use tandem_core::ArmIndex;
 
 use crate::capsule::PosedLinks;
-use crate::cell::{Cell, PlacedArm};
 use crate::check::CheckSettings;
+use crate::forward::ForwardKinematics;
 use crate::joints::Joints;
 use crate::motion::Cubic;
-use crate::posture::Posture;
 use crate::refusal::{Excess, Reason, Refusal};
+use crate::work_cell::{PlacedArm, WorkCell};
 
 /// What may hide between the looks: of lengths (metres), of the tilt (radians), of the tool's speed (m/s).
 const LENGTH_TOLERANCE_M: f64 = 1e-4;
@@ -22,7 +22,7 @@ const SPEED_TOLERANCE_MPS: f64 = 2e-3;
 
 /// The arms' motion in one interval after the other.
 pub(crate) struct Sweep<'a> {
-    cell: &'a Cell,
+    cell: &'a WorkCell,
     settings: &'a CheckSettings,
     arms: Vec<Swept>,
 }
@@ -31,7 +31,7 @@ pub(crate) struct Sweep<'a> {
 struct Swept {
     cubics: Vec<Cubic>,
     /// How far the gripper is open at most, 0 to 1.
-    opening: f64,
+    gripper_opening: f64,
     tool_levers_m: Joints,
     link_levers_m: Joints,
     change: Change,
@@ -57,10 +57,10 @@ struct Look {
 }
 
 impl<'a> Sweep<'a> {
-    pub(crate) fn new(cell: &'a Cell, settings: &'a CheckSettings) -> Self {
+    pub(crate) fn new(cell: &'a WorkCell, settings: &'a CheckSettings) -> Self {
         let swept = |arm: &PlacedArm| Swept {
             cubics: Vec::new(),
-            opening: 1.0,
+            gripper_opening: 1.0,
             tool_levers_m: arm.model.tool_levers_m(),
             link_levers_m: arm.model.link_levers_m(),
             change: Change::default(),
@@ -69,9 +69,9 @@ impl<'a> Sweep<'a> {
     }
 
     /// Takes over the joints' motion of `arm` in the interval to be checked, and how far its gripper is open at most.
-    pub(crate) fn follow(&mut self, arm: ArmIndex, cubics: Vec<Cubic>, opening: f64) {
+    pub(crate) fn follow(&mut self, arm: ArmIndex, cubics: Vec<Cubic>, gripper_opening: f64) {
         let swept = &mut self.arms[arm.0];
-        (swept.cubics, swept.opening) = (cubics, opening);
+        (swept.cubics, swept.gripper_opening) = (cubics, gripper_opening);
         swept.change = swept.changes();
     }
 
@@ -99,7 +99,8 @@ impl<'a> Sweep<'a> {
         let mut posed: Vec<PosedLinks> = Vec::with_capacity(self.arms.len());
         for (arm, placed) in self.cell.indexed() {
             let swept = &self.arms[arm.0];
-            let posture = Posture::of(placed.model, &swept.joints(|cubic| cubic.angle(at_s)));
+            let posture =
+                ForwardKinematics::new(placed.model, &swept.joints(|cubic| cubic.angle(at_s)));
             let rates = swept.joints(|cubic| cubic.rate(at_s));
             self.look_at_tool(&mut look, arm, &posture, &rates);
             let links = PosedLinks::of(placed, &posture);
@@ -113,7 +114,13 @@ impl<'a> Sweep<'a> {
         look
     }
 
-    fn look_at_tool(&self, look: &mut Look, arm: ArmIndex, posture: &Posture, rates: &Joints) {
+    fn look_at_tool(
+        &self,
+        look: &mut Look,
+        arm: ArmIndex,
+        posture: &ForwardKinematics,
+        rates: &Joints,
+    ) {
         let (settings, model) = (self.settings, self.cell.arms[arm.0].model);
         let change = &self.arms[arm.0].change;
         let speed_mps = posture.tool_velocity(rates).length();
@@ -144,7 +151,7 @@ impl<'a> Sweep<'a> {
     /// The arm's own parts. Joint 1 turns all of them together, so that what changes their distances is what changes heights.
     fn look_at_itself(&self, look: &mut Look, arm: ArmIndex, links: &PosedLinks) {
         let (model, swept) = (self.cell.arms[arm.0].model, &self.arms[arm.0]);
-        let (gap_m, nearest) = links.self_gap_m(model, swept.opening);
+        let (gap_m, nearest) = links.self_gap_m(model, swept.gripper_opening);
         let hides = (swept.change.height, LENGTH_TOLERANCE_M);
         let names = nearest.map(|link| model.links[link].name);
         look.at_least(arm, gap_m, self.settings.self_gap_m, hides, |excess| {

@@ -16,19 +16,19 @@ pub struct Frame {
 
 /// An arm in one posture; all in the arm's base frame.
 #[derive(Debug, Clone)]
-pub struct Posture {
+pub struct ForwardKinematics {
     /// Base first, then the joints, then the tool.
     frames: [Frame; MAX_JOINTS + 2],
     n_joints: usize,
 }
 
-impl Posture {
+impl ForwardKinematics {
     /// The posture of `model` with its joints at `angles`, radians.
     ///
     /// # Panics
     /// When `angles` are of an arm with another number of joints.
     #[must_use]
-    pub fn of(model: &ArmModel, angles: &Joints) -> Self {
+    pub fn new(model: &ArmModel, angles: &Joints) -> Self {
         assert_eq!(angles.len(), model.n_joints(), "angles of another arm");
         let base = Frame { origin_m: DVec3::ZERO, axes: DMat3::IDENTITY };
         let mut frames = [base; MAX_JOINTS + 2];
@@ -108,7 +108,7 @@ mod tests {
                 1 | 2 => PI,
                 _ => 0.0,
             });
-            let got_m = Posture::of(model, &angles).tool().origin_m;
+            let got_m = ForwardKinematics::new(model, &angles).tool().origin_m;
             assert!((got_m - DVec3::from(tool_m)).length() < 6e-4, "{}: {got_m}", model.name);
         };
         check(&MICO_4, [0.0, -0.007, 0.8486]);
@@ -121,11 +121,11 @@ mod tests {
         let step = 1e-6;
         for model in [&MICO_4, &MICO_6, &JACO_6] {
             let angles = Joints::new(&[0.3, 2.5, 4.0, -1.0, 0.7, 2.0][..model.n_joints()]);
-            let posture = Posture::of(model, &angles);
+            let posture = ForwardKinematics::new(model, &angles);
             for joint in 0..model.n_joints() {
                 let mut turned = angles;
                 turned[joint] += step;
-                let after = Posture::of(model, &turned);
+                let after = ForwardKinematics::new(model, &turned);
                 let (along, axis) = posture.tool_motion(joint);
                 let moved = (after.tool().origin_m - posture.tool().origin_m) / step;
                 assert!((moved - along).length() < 1e-5, "{}, joint {joint}", model.name);

@@ -33,10 +33,10 @@ use tandem_core::ArmIndex;
 use tandem_core::layout::WORKSPACES_APART_M;
 
 use crate::capsule::PosedLinks;
+use crate::forward::ForwardKinematics;
 use crate::inverse::{ReachError, ToolTarget};
 use crate::joints::Joints;
 use crate::model::{ArmModel, MICO_4};
-use crate::posture::Posture;
 
 /// An arm and where it stands.
 #[derive(Debug, Clone, Copy)]
@@ -51,7 +51,7 @@ pub struct PlacedArm {
 
 /// The arms that work together, and their table.
 #[derive(Debug, Clone)]
-pub struct Cell {
+pub struct WorkCell {
     /// The arms, in the order of the layout.
     pub arms: Vec<PlacedArm>,
     /// Height of the table's top in the world, metres.
@@ -99,7 +99,7 @@ impl TaskFrame {
     }
 }
 
-impl Cell {
+impl WorkCell {
     /// Direction in which the fingers close, base frame, radians: along the own frame's y.
     pub const FINGERS_YAW_RAD: f64 = FRAC_PI_2;
 
@@ -159,8 +159,9 @@ impl Cell {
     pub fn gaps_with(&self, at: &[Joints], openings: &[f64]) -> Gaps {
         let n_arms = self.arms.len();
         assert!(at.len() == n_arms && openings.len() == n_arms, "angles of other arms");
-        let pose =
-            |(arm, q): (&PlacedArm, &Joints)| PosedLinks::of(arm, &Posture::of(arm.model, q));
+        let pose = |(arm, q): (&PlacedArm, &Joints)| {
+            PosedLinks::of(arm, &ForwardKinematics::new(arm.model, q))
+        };
         let posed: Vec<PosedLinks> = self.arms.iter().zip(at).map(pose).collect();
         let between = |(idx, links): (usize, &PosedLinks)| {
             posed[..idx].iter().map(|other| links.gap_m(other).0).fold(f64::INFINITY, f64::min)
@@ -197,7 +198,7 @@ impl PlacedArm {
     #[must_use]
     pub fn target(&self, tool_in_world: DVec3) -> ToolTarget {
         let at_m = self.base_from_world(tool_in_world);
-        ToolTarget { at_m, yaw_rad: Cell::FINGERS_YAW_RAD }
+        ToolTarget { at_m, yaw_rad: WorkCell::FINGERS_YAW_RAD }
     }
 
     /// The base frame's axes in the world.
@@ -215,7 +216,7 @@ mod tests {
 
     #[test]
     fn the_arms_face_each_other() {
-        let cell = Cell::mico_pair();
+        let cell = WorkCell::mico_pair();
         let check = |arm, own: [f64; 3], world: [f64; 3]| {
             let got = cell.world_from_own(ArmIndex(arm), DVec3::from(own));
             // The training world's distances are single precision.

@@ -1,7 +1,7 @@
 //! Singular postures: how much the tool moves at least when the joints do.
 
+use crate::forward::ForwardKinematics;
 use crate::joints::MAX_JOINTS;
-use crate::posture::Posture;
 
 /// Length that weighs turning against moving where both count, metres: about that of a hand.
 const TURN_WEIGHT_M: f64 = 0.1;
@@ -13,7 +13,7 @@ const SWEEPS: usize = 8;
 ///
 /// With four joints only the place counts (joint 4 does nothing for it), with six also the turn, weighed with 0.1 m per
 /// radian. 0 in a singular posture.
-pub(crate) fn least_gain_m(posture: &Posture, n_joints: usize) -> f64 {
+pub(crate) fn manipulability_m(posture: &ForwardKinematics, n_joints: usize) -> f64 {
     let mut columns = [[0.0; 6]; MAX_JOINTS];
     for (joint, column) in columns.iter_mut().enumerate().take(n_joints) {
         let (along, axis) = posture.tool_motion(joint);
