@@ -95,25 +95,25 @@ impl ChildProcess {
     }
 
     /// Closes the pipe to standard input when the returned value is dropped, which asks the process to exit.
-    pub(crate) fn take_stdin(&mut self) -> Option<ChildStdin> {
+    pub(crate) fn take_input(&mut self) -> Option<ChildStdin> {
         self.child.stdin.take()
     }
 
     /// Returns the pipe from standard output, which the caller must have requested at the start.
-    pub(crate) fn take_stdout(&mut self) -> anyhow::Result<ChildStdout> {
+    pub(crate) fn take_output(&mut self) -> anyhow::Result<ChildStdout> {
         self.child.stdout.take().ok_or_else(|| anyhow!("no pipe from standard output"))
     }
 
     /// Reads the address of a service from the line `listening on ADDR`; `None` if the process does not print it.
     pub(crate) async fn service_address(&mut self) -> anyhow::Result<Option<String>> {
         let mut line = String::new();
-        BufReader::new(self.take_stdout()?).read_line(&mut line).await?;
+        BufReader::new(self.take_output()?).read_line(&mut line).await?;
         Ok(line.trim().strip_prefix("listening on ").map(str::to_owned))
     }
 
     /// Asks the process to exit and waits for it; kills it after `deadline`.
     pub(crate) async fn end(mut self, deadline: Duration) {
-        drop(self.take_stdin());
+        drop(self.take_input());
         if tokio::time::timeout(deadline, self.child.wait()).await.is_err() {
             drop(self.child.kill().await);
         }

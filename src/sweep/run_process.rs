@@ -86,8 +86,8 @@ impl RunProcess {
         let mut child =
             launcher.spawn(&self.args, Stdio::piped()).context("cannot start tandem train")?;
         let log_offset = child.log_offset();
-        let stdin = child.take_stdin();
-        let mut stdout = child.take_stdout()?;
+        let stdin = child.take_input();
+        let mut stdout = child.take_output()?;
         let mut output = Vec::new();
         let status = {
             let read = async { tokio::join!(child.wait(), stdout.read_to_end(&mut output)).0 };
