@@ -194,7 +194,7 @@ fn report_has_every_run(out: &Path, directory: &Path) {
         let n_evaluations: u32 = cells[6].parse().expect("a count");
         let was_disturbed = [RUNS[0], RUNS[2]].contains(&cells[4]);
         assert!(if was_disturbed { n_evaluations > 0 } else { n_evaluations == 5 }, "{line}");
-        assert!(!cells[24].is_empty(), "held-out success in {line}");
+        assert!(!cells[24].is_empty(), "test success in {line}");
     }
     let page = fs::read_to_string(out.join("report.html")).expect("written");
     assert!(page.contains("<svg") && page.contains("push, 2 arms"));

@@ -12,7 +12,7 @@
 //!
 //! Time passes only in exchanges, [`PERIOD_S`] each. The same seed and commands give the same bits.
 
-use glam::DVec3;
+use glam::{DMat3, DVec3};
 use rand_chacha::ChaCha8Rng;
 use tandem_core::scene::Scene;
 use tandem_core::{ArmIndex, Contacts, Stream, episode_rng};
@@ -208,10 +208,11 @@ impl SimulatedPair {
     fn torques(&self, arm: usize, force_n: DVec3) -> Joints {
         let placed = &self.cell.arms[arm];
         let posture = ForwardKinematics::new(placed.model, &self.drives.arms[arm].angles);
-        let in_base = placed.axes().transpose() * force_n;
+        let in_base = placed.world_from_base().inverse_transform_vector(&force_n.into());
+        let jacobian = posture.position_jacobian();
         let leaning = self.disturbance.torque_nm.get(arm);
         Joints::from_fn(placed.model.n_joints(), |joint| {
-            posture.tool_motion(joint).0.dot(in_base) + leaning.map_or(0.0, |nm| nm[joint])
+            jacobian.column(joint).dot(&in_base) + leaning.map_or(0.0, |nm| nm[joint])
         })
     }
 
@@ -270,13 +271,13 @@ impl Driver for SimulatedPair {
 fn carried(cell: &WorkCell, angles: &[Joints]) -> impl Iterator<Item = Carried> {
     cell.arms.iter().zip(angles).map(|(placed, angles)| {
         let posture = ForwardKinematics::new(placed.model, angles);
-        let tool = posture.tool();
+        let world_from_base = placed.world_from_base();
+        let world_from_tool = world_from_base * posture.tool();
         Carried {
-            tool_m: placed.world_from_base(tool.origin_m),
-            tool_axes: placed.axes() * tool.axes,
+            tool_m: world_from_tool.translation.vector.into(),
+            tool_axes: DMat3::from_quat(world_from_tool.rotation.into()),
             forearm_m: FOREARM_FRAMES.map(|frame| {
-                let anchor = Anchor { frame, offset_m: DVec3::ZERO };
-                placed.world_from_base(posture.anchor(&anchor))
+                (world_from_base * posture.anchor_m(&Anchor::origin_of(frame))).into()
             }),
         }
     })

@@ -1,5 +1,5 @@
-//! Settings of a run that its workers need as well: how training episodes explore and start, and how finely the world is
-//! simulated.
+//! Settings of a run that its workers need as well: how training episodes explore and start, and how finely the world
+//! is simulated.
 //!
 //! Each struct is declared once: the run file contains it as a section, the learner sends it with the run's terms, and
 //! the simulator takes it as it is. Another world setting needs a field here, its conversion in `proto` and its effect

@@ -1,138 +1,127 @@
-//! An arm in one posture: where its frames are, and how the tool moves when the joints turn.
+//! Forward kinematics: the frames of an arm at given joint angles, and the velocity of its tool.
 
-use glam::{DMat3, DVec3};
+use nalgebra::{Isometry3, Point3, SMatrix, UnitQuaternion, Vector3};
 
 use crate::joints::{Joints, MAX_JOINTS};
-use crate::model::{Anchor, ArmModel, TOOL_AXES, TOOL_ORIGIN_M};
+use crate::model::{Anchor, ArmModel};
 
-/// A coordinate system in the arm's base frame.
-#[derive(Debug, Clone, Copy)]
-pub struct Frame {
-    /// Origin, metres.
-    pub origin_m: DVec3,
-    /// Axes as columns.
-    pub axes: DMat3,
-}
+/// The Jacobian of the tool's position: column `j` is its velocity per rate of joint `j`, metres per radian. Columns
+/// beyond the arm's joints are 0.
+pub type PositionJacobian = SMatrix<f64, 3, MAX_JOINTS>;
 
-/// An arm in one posture; all in the arm's base frame.
+/// The frames of an arm at given joint angles, in the arm's base frame.
 #[derive(Debug, Clone)]
 pub struct ForwardKinematics {
-    /// Base first, then the joints, then the tool.
-    frames: [Frame; MAX_JOINTS + 2],
+    /// Base, joints, tool.
+    frames: [Isometry3<f64>; MAX_JOINTS + 2],
     n_joints: usize,
 }
 
 impl ForwardKinematics {
-    /// The posture of `model` with its joints at `angles`, radians.
+    /// Computes the frames of `model` at joint angles `angles`, radians.
     ///
     /// # Panics
-    /// When `angles` are of an arm with another number of joints.
+    /// If `angles` has another number of joints than `model`.
     #[must_use]
     pub fn new(model: &ArmModel, angles: &Joints) -> Self {
         assert_eq!(angles.len(), model.n_joints(), "angles of another arm");
-        let base = Frame { origin_m: DVec3::ZERO, axes: DMat3::IDENTITY };
-        let mut frames = [base; MAX_JOINTS + 2];
-        for (idx, (joint, angle)) in model.joints.iter().zip(angles.iter()).enumerate() {
-            let (sin, cos) = libm::sincos(*angle);
-            let at_zero = frames[idx].then(joint.origin_m, joint.axes);
-            let DMat3 { x_axis, y_axis, z_axis } = at_zero.axes;
-            let axes =
-                DMat3::from_cols(x_axis * cos + y_axis * sin, y_axis * cos - x_axis * sin, z_axis);
-            frames[idx + 1] = Frame { axes, ..at_zero };
-        }
         let n_joints = angles.len();
-        frames[n_joints + 1] = frames[n_joints].then(TOOL_ORIGIN_M, TOOL_AXES);
+        let mut frames = [Isometry3::identity(); MAX_JOINTS + 2];
+        for (idx, (joint, angle)) in model.joints.iter().zip(angles.iter()).enumerate() {
+            let rotation = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), *angle);
+            frames[idx + 1] = frames[idx] * joint.previous_from_joint * rotation;
+        }
+        frames[n_joints + 1] = frames[n_joints] * model.last_from_tool;
         Self { frames, n_joints }
     }
 
-    /// The tool: x is the direction in which the fingers close, z the way the gripper points.
+    /// Returns the pose of the tool, metres. The fingers close along its x axis, and the gripper points along its z axis.
     #[must_use]
-    pub fn tool(&self) -> &Frame {
+    pub fn tool(&self) -> &Isometry3<f64> {
         &self.frames[self.n_joints + 1]
     }
 
-    /// The angle between the way the gripper points and straight down, radians in [0, π].
+    /// Returns the position of the tool's origin, metres.
+    #[must_use]
+    pub fn tool_m(&self) -> Point3<f64> {
+        self.tool().translation.vector.into()
+    }
+
+    /// Returns the direction in which the gripper points, a unit vector.
+    #[must_use]
+    pub fn pointing(&self) -> Vector3<f64> {
+        self.tool().rotation * Vector3::z()
+    }
+
+    /// Returns the angle between the gripper's direction and straight down, radians in [0, π].
     #[must_use]
     pub fn tilt_rad(&self) -> f64 {
-        let pointing = self.tool().axes.z_axis;
+        let pointing = self.pointing();
         libm::atan2(libm::hypot(pointing.x, pointing.y), -pointing.z)
     }
 
-    /// Where `anchor` is, metres.
+    /// Returns the position of `anchor`, metres.
     ///
     /// # Panics
-    /// When the arm has no such frame.
+    /// If the anchor's frame is out of range.
     #[must_use]
-    pub fn anchor(&self, anchor: &Anchor) -> DVec3 {
-        let frame = &self.frames[anchor.frame];
-        frame.origin_m + frame.axes * anchor.offset_m
+    pub fn anchor_m(&self, anchor: &Anchor) -> Point3<f64> {
+        self.frames[anchor.frame] * anchor.offset_m
     }
 
-    /// The axes of joint `joint`'s frame, its own turn included.
-    pub(crate) fn joint_axes(&self, joint: usize) -> &DMat3 {
-        &self.frames[joint + 1].axes
+    /// Returns the orientation of the frame of `joint` (counted from 0), including the joint's own rotation.
+    pub(crate) fn joint_rotation(&self, joint: usize) -> &UnitQuaternion<f64> {
+        &self.frames[joint + 1].rotation
     }
 
-    /// How the tool moves per radian of joint `joint`: its origin (metres) and its turn (radians).
+    /// Returns the Jacobian of the tool's position, metres per radian.
     #[must_use]
-    pub fn tool_motion(&self, joint: usize) -> (DVec3, DVec3) {
-        let frame = &self.frames[joint + 1];
-        let axis = frame.axes.z_axis;
-        (axis.cross(self.tool().origin_m - frame.origin_m), axis)
+    pub fn position_jacobian(&self) -> PositionJacobian {
+        let tool_m = self.tool().translation.vector;
+        let mut jacobian = PositionJacobian::zeros();
+        for (joint, frame) in self.frames[1..=self.n_joints].iter().enumerate() {
+            let axis = frame.rotation * Vector3::z();
+            jacobian.set_column(joint, &axis.cross(&(tool_m - frame.translation.vector)));
+        }
+        jacobian
     }
 
-    /// The velocity of the tool's origin at joint rates `rates`, metres per second when they are radians per second.
+    /// Returns the velocity of the tool's origin at joint velocities `velocities` (radians per second), metres per second.
     #[must_use]
-    pub fn tool_velocity(&self, rates: &Joints) -> DVec3 {
-        let moves = rates.iter().enumerate().map(|(joint, rate)| self.tool_motion(joint).0 * *rate);
-        moves.fold(DVec3::ZERO, |sum, part| sum + part)
-    }
-}
-
-impl Frame {
-    fn then(&self, origin_m: DVec3, axes: DMat3) -> Self {
-        Self { origin_m: self.origin_m + self.axes * origin_m, axes: self.axes * axes }
+    pub fn tool_velocity(&self, velocities: &Joints) -> Vector3<f64> {
+        let jacobian = self.position_jacobian();
+        let terms =
+            velocities.iter().enumerate().map(|(joint, rate)| jacobian.column(joint) * *rate);
+        terms.fold(Vector3::zeros(), |sum, term| sum + term)
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::model::{JACO_6, MICO_4, MICO_6};
+    use crate::model::MICO_4;
     use std::f64::consts::PI;
 
     #[test]
-    fn stretched_out_the_arms_stand_upright() {
-        let check = |model: &ArmModel, tool_m: [f64; 3]| {
-            let angles = Joints::from_fn(model.n_joints(), |joint| match joint {
-                1 | 2 => PI,
-                _ => 0.0,
-            });
-            let got_m = ForwardKinematics::new(model, &angles).tool().origin_m;
-            assert!((got_m - DVec3::from(tool_m)).length() < 6e-4, "{}: {got_m}", model.name);
-        };
-        check(&MICO_4, [0.0, -0.007, 0.8486]);
-        check(&MICO_6, [0.0, 0.067, 0.977]);
-        check(&JACO_6, [0.0, 0.064, 1.181]);
+    fn the_stretched_arm_is_upright() {
+        let angles = Joints::new(&[0.0, PI, PI, 0.0]);
+        let tool_m = ForwardKinematics::new(&MICO_4, &angles).tool_m();
+        assert!((tool_m - Point3::new(0.0, -0.007, 0.8486)).norm() < 6e-4, "{tool_m}");
     }
 
     #[test]
-    fn the_tools_motion_is_the_derivative_of_its_place() {
+    fn the_jacobian_is_the_derivative_of_the_tools_position() {
         let step = 1e-6;
-        for model in [&MICO_4, &MICO_6, &JACO_6] {
-            let angles = Joints::new(&[0.3, 2.5, 4.0, -1.0, 0.7, 2.0][..model.n_joints()]);
-            let posture = ForwardKinematics::new(model, &angles);
-            for joint in 0..model.n_joints() {
-                let mut turned = angles;
-                turned[joint] += step;
-                let after = ForwardKinematics::new(model, &turned);
-                let (along, axis) = posture.tool_motion(joint);
-                let moved = (after.tool().origin_m - posture.tool().origin_m) / step;
-                assert!((moved - along).length() < 1e-5, "{}, joint {joint}", model.name);
-                let swung = (after.tool().axes.x_axis - posture.tool().axes.x_axis) / step;
-                let expected = axis.cross(posture.tool().axes.x_axis);
-                assert!((swung - expected).length() < 1e-5, "{}, joint {joint}", model.name);
+        let angles = Joints::new(&[0.3, 2.5, 4.0, -1.0]);
+        let forward = ForwardKinematics::new(&MICO_4, &angles);
+        let jacobian = forward.position_jacobian();
+        for joint in 0..MAX_JOINTS {
+            let mut turned = angles;
+            if let Some(angle) = turned.get_mut(joint) {
+                *angle += step;
             }
+            let moved = ForwardKinematics::new(&MICO_4, &turned).tool_m() - forward.tool_m();
+            assert!((moved / step - jacobian.column(joint)).norm() < 1e-5, "joint {joint}");
         }
     }
 }

@@ -14,7 +14,7 @@ use tandem_core::text::error_chain;
 use tandem_net::{Hangup, Incoming, Page, Prepared};
 use tandem_proto::pb;
 use tandem_proto::pb::learner_server::{Learner, LearnerServer};
-use tandem_proto::{decode_episode, encode_slot, encode_terms};
+use tandem_proto::{decode_episode, encode_run_terms, encode_slot};
 use tandem_telemetry::events::WorkerJoined;
 use tokio::net::TcpListener;
 use tokio_stream::wrappers::WatchStream;
@@ -259,7 +259,7 @@ impl Learner for LearnerService {
         if lines.this {
             WorkerJoined { worker_id, name: &name }.emit();
         }
-        let terms = Some(encode_terms(&terms));
+        let terms = Some(encode_run_terms(&terms));
         Ok(Response::new(pb::JoinResponse { worker_id, terms, learner: self.start }))
     }
 

@@ -1,4 +1,4 @@
-//! The policy file: one safetensors file. `docs/policy-format.md` says what stands in it and how to compute with it.
+//! The policy file, a safetensors file. `docs/policy-format.md` specifies the format.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -18,33 +18,33 @@ use crate::policy::{MAX_HEADS, MAX_HIDDEN, MAX_HIDDEN_LAYERS, Policy, little_end
 #[cfg(test)]
 mod tests;
 
-/// What metadata `format` says.
+/// Value of the metadata entry `format`.
 pub const FORMAT: &str = "tandem-policy";
-/// What metadata `format_version` says; another version is refused.
+/// Value of the metadata entry `format_version`. Files of other versions are refused.
 pub const FORMAT_VERSION: &str = "1";
 
 const MAX_ARMS: usize = 64;
-/// Letters of a file's own words that a refusal repeats; a digest has 64.
+/// Largest number of characters of a file's entry in an error message. A digest has 64.
 const MAX_SHOWN_CHARS: usize = 80;
-/// The header's length is a little-endian `u64`, and headers are filled up to this many bytes.
+/// Headers are padded to a multiple of this number of bytes. A header's length precedes it as a little-endian `u64`.
 const HEADER_ALIGNMENT: usize = 8;
 
 impl Policy {
-    /// Writes the policy to `path`, whole or not at all.
+    /// Writes the policy to `path` atomically.
     ///
     /// # Errors
-    /// When a number cannot be used (see [`Policy::check`]) or the file cannot be written.
+    /// Returns an error if the policy is invalid (see [`Policy::check`]) or the file cannot be written.
     pub fn save(&self, path: &Path) -> Result<(), Error> {
         self.check()?;
         atomic_file::replace(path, &encode(self))
             .map_err(|source| Error::Write { path: path.to_owned(), source })
     }
 
-    /// Reads the policy that `path` holds.
+    /// Reads a policy from `path`.
     ///
     /// # Errors
-    /// When there is no such file, it was cut short or altered, has another format or version, or any tensor does
-    /// not fit the task, the arms and the networks' sizes.
+    /// Returns an error if the file cannot be read, was truncated or altered, has another format or version, or if a
+    /// tensor does not match the task, the number of arms and the networks' sizes.
     pub fn load(path: &Path) -> Result<Self, Error> {
         let bytes = regular_file::read(path)
             .map_err(|source| Error::Read { path: path.to_owned(), source })?;
@@ -53,7 +53,7 @@ impl Policy {
     }
 }
 
-/// The bytes of a policy file; equal policies give equal bytes.
+/// Encodes a policy file. Equal policies give equal bytes.
 fn encode(policy: &Policy) -> Vec<u8> {
     let mut header = Map::new();
     header.insert("__metadata__".to_owned(), json!(metadata(policy)));
@@ -73,14 +73,14 @@ fn encode(policy: &Policy) -> Vec<u8> {
     bytes
 }
 
-/// The policy's own metadata and the format's entries.
+/// Returns the policy's own metadata and the entries that the format defines.
 fn metadata(policy: &Policy) -> BTreeMap<String, String> {
     let mut metadata = policy.metadata.clone();
     metadata.extend(reserved(policy).map(|(key, value)| (key.to_owned(), value)));
     metadata
 }
 
-/// The format's entries in the order in which a reader checks them.
+/// Returns the entries that the format defines, in the order in which a reader checks them.
 fn reserved(policy: &Policy) -> [(&'static str, String); 15] {
     let layout = policy.layout;
     [
@@ -118,7 +118,7 @@ fn decode(bytes: &[u8]) -> Result<Policy, FormatError> {
     check_reserved(policy)
 }
 
-/// Reads sizes and tensors; the sizes are believed only as far as the tensors bear them out.
+/// Reads sizes and tensors. Every tensor must have the shape that follows from the sizes.
 fn read_policy(
     file: &SafeTensors<'_>,
     metadata: BTreeMap<String, String>,
@@ -153,8 +153,8 @@ fn read_policy(
     })
 }
 
-/// Compares the format's entries with what this version writes for the same tensors, then drops them from the
-/// policy's own. A file without a digest is taken as it is: other programs may write one.
+/// Compares the entries that the format defines with those that this version writes for the same tensors, and removes
+/// them from the policy's metadata. The digest may be missing, as in files of other programs.
 fn check_reserved(mut policy: Policy) -> Result<Policy, FormatError> {
     for (key, expected) in reserved(&policy) {
         match (key, policy.metadata.remove(key)) {
@@ -229,7 +229,7 @@ fn parse_size(
     }
 }
 
-/// A network's parameters: its tensors one after another.
+/// Reads a network's parameters, the concatenation of its tensors.
 fn read_network(
     file: &SafeTensors<'_>,
     prefix: &str,

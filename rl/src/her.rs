@@ -5,10 +5,10 @@
 
 use rand_chacha::ChaCha8Rng;
 use tandem_core::layout::{
-    ArmIndex, EPISODE_STEPS, HAND_POSITION, Layout, OBJECT_POSITION, WORKSPACES_APART_M,
+    ArmIndex, EPISODE_STEPS, HAND_POSITION, Layout, OBJECT_POSITION, WORKSPACE_DISTANCE_M,
 };
 use tandem_core::reward::{distance, sparse_reward_within};
-use tandem_core::rng::{coin, index};
+use tandem_core::rng::{bernoulli, index};
 use tandem_policy::NormalizerSnapshot;
 
 use crate::ddpg::Batch;
@@ -114,13 +114,13 @@ impl Sampler {
         let first = self.draw_step(buffer, rng);
         self.drawn.steps.fill(first);
         let per_arm = self.config.reward == RewardKind::PerArm && self.layout.n_arms == 2;
-        if coin(rng, self.config.coda_fraction) && per_arm {
+        if bernoulli(rng, self.config.coda_fraction) && per_arm {
             let second = self.draw_step(buffer, rng);
             if is_apart(buffer, [first, second]) {
                 self.drawn.steps[1] = second;
             }
         }
-        self.drawn.swapped = coin(rng, self.config.arm_swap_prob) && self.layout.n_arms == 2;
+        self.drawn.swapped = bernoulli(rng, self.config.arm_swap_prob) && self.layout.n_arms == 2;
         match self.config.reward {
             RewardKind::Joint => self.relabel_jointly(buffer, rng),
             RewardKind::PerArm => self.relabel_arms(buffer, rng),
@@ -129,9 +129,10 @@ impl Sampler {
 
     fn draw_step(&self, buffer: &ReplayBuffer, rng: &mut ChaCha8Rng) -> Step {
         // The draws of a run keep their place in the random stream: this one belonged to a removed setting.
-        let _: bool = coin(rng, 0.0);
+        let _: bool = bernoulli(rng, 0.0);
         let displaced = buffer.displaced_episodes();
-        let from_displaced = coin(rng, self.config.displaced_fraction) && !displaced.is_empty();
+        let from_displaced =
+            bernoulli(rng, self.config.displaced_fraction) && !displaced.is_empty();
         let episode_idx = if from_displaced {
             displaced[index(rng, displaced.len())]
         } else {
@@ -169,7 +170,7 @@ impl Sampler {
 
     /// The later moment whose achieved goal is taken, strictly after the step; `None` keeps the desired goal.
     fn hindsight_moment(&self, step_idx: usize, rng: &mut ChaCha8Rng) -> Option<usize> {
-        let hindsight = coin(rng, self.config.her_ratio);
+        let hindsight = bernoulli(rng, self.config.her_ratio);
         let moment = step_idx + 1 + index(rng, EPISODE_STEPS - step_idx);
         hindsight.then_some(moment)
     }
@@ -247,6 +248,6 @@ fn is_apart(buffer: &ReplayBuffer, steps: [Step; 2]) -> bool {
     };
     [0, 1].into_iter().all(|later| {
         let reached_m = reach_m(ArmIndex(0), later) + reach_m(ArmIndex(1), later);
-        WORKSPACES_APART_M - reached_m >= RECOMBINED_APART_M
+        WORKSPACE_DISTANCE_M - reached_m >= RECOMBINED_APART_M
     })
 }

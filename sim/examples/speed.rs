@@ -1,8 +1,8 @@
-//! Prints how many control steps per second one core simulates, for each environment.
+//! Prints the number of control steps per second that one core simulates, for each environment.
 #![expect(
     clippy::print_stdout,
     clippy::disallowed_methods,
-    reason = "a benchmark: its output, and its clock"
+    reason = "a benchmark prints its results and reads the clock"
 )]
 
 use std::time::Instant;
@@ -29,7 +29,7 @@ fn main() -> Result<(), SimError> {
     Ok(())
 }
 
-/// Episodes of held random actions, resets included.
+/// Measures episodes with random actions that are held for four steps, including resets.
 fn steps_per_s(layout: Layout, config: &WorldConfig) -> Result<f64, SimError> {
     let mut env = Env::new(layout, config)?;
     let mut action = vec![0.0; layout.n_action()];

@@ -1,4 +1,4 @@
-//! How episodes start: in reach, touching nothing, apart from each other, with something left to do.
+//! Initial states: in reach, without contacts, apart from each other, and with goals not yet achieved.
 
 use tandem_core::layout::{GOAL_TOLERANCE_M, Layout, OBSERVATION_PER_ARM, Task};
 use tandem_core::reward::{REWARD_PENDING, distance, sparse_reward};
@@ -14,7 +14,7 @@ fn layouts() -> impl Iterator<Item = Layout> {
     Task::ALL.into_iter().flat_map(|task| [1, 2].map(|n_arms| Layout::new(task, n_arms)))
 }
 
-/// Calls `look` with every start of `N_SEEDS`.
+/// Calls `look` with the initial state of each of `N_SEEDS` seeds.
 fn each_start(layout: Layout, settings: WorldSettings, mut look: impl FnMut(&mut Env, &[f32])) {
     let mut env = Env::new(layout, &WorldConfig::default()).expect("a valid world");
     let mut observation = vec![0.0; layout.n_observation()];
@@ -31,7 +31,7 @@ fn idle(layout: Layout, gripper: f32) -> Vec<f32> {
 }
 
 #[test]
-fn starts_as_evaluated_are_in_reach_apart_and_not_yet_done() {
+fn evaluation_starts_are_in_reach_apart_and_not_yet_successful() {
     for layout in layouts() {
         let area_y_m = if layout.n_arms == 1 { 0.15 } else { 0.12 };
         each_start(layout, WorldSettings::default(), |env, observation| {
@@ -64,7 +64,7 @@ fn starts_as_evaluated_are_in_reach_apart_and_not_yet_done() {
                 let in_world = distance(&scene.objects[arm.0].centre, &scene.goals[arm.0]);
                 assert!(
                     (in_own - in_world).abs() < 1e-6,
-                    "goal and object are in different frames"
+                    "goal and object are given in different frames"
                 );
             }
             let apart = |a: [f32; 3], b: [f32; 3]| assert!(distance(&a, &b) >= 0.0699);
@@ -77,7 +77,7 @@ fn starts_as_evaluated_are_in_reach_apart_and_not_yet_done() {
 }
 
 #[test]
-fn half_of_the_places_to_put_an_object_are_in_the_air() {
+fn half_of_the_goals_are_in_the_air() {
     let layout = Layout::new(Task::PickAndPlace, 1);
     let mut n_high = 0;
     each_start(layout, WorldSettings::default(), |env, _| {
@@ -87,7 +87,7 @@ fn half_of_the_places_to_put_an_object_are_in_the_air() {
 }
 
 #[test]
-fn nothing_touches_at_the_start() {
+fn no_start_has_a_contact() {
     for layout in layouts() {
         let gripper = 1.0;
         each_start(layout, WorldSettings::default(), |env, before| {
@@ -97,7 +97,10 @@ fn nothing_touches_at_the_start() {
             for arm in layout.arms() {
                 let object = layout.achieved_goal_of(arm);
                 let moved_m = distance(&before[object.clone()], &after[object]);
-                assert!(moved_m < 2e-4, "{layout:?}: the object moved by {moved_m} m by itself");
+                assert!(
+                    moved_m < 2e-4,
+                    "{layout:?}: the object moved by {moved_m} m without contact"
+                );
             }
         });
     }
@@ -136,7 +139,7 @@ fn grasped_starts_keep_holding_while_the_hand_moves() {
 }
 
 #[test]
-fn pushers_never_start_with_something_in_the_gripper() {
+fn push_episodes_never_start_with_a_grasped_object() {
     let layout = Layout::new(Task::Push, 1);
     each_start(layout, GRASPED, |_, observation| {
         assert!(observation[9..12].iter().all(|opening_m| opening_m.abs() < 1e-7));

@@ -59,7 +59,7 @@ struct FileSample {
 pub(super) fn write(path: &Path, speed: f64, way_points: &[Waypoint]) -> Result<(), Failed> {
     let arm = |arm: &ArmWaypoint| {
         let round = |number: f64| (number * 1e5).round() * 1e-5;
-        let tool_m = arm.tool_in_world_m.to_array().map(round);
+        let tool_m = <[f64; 3]>::from(arm.tool_in_world_m).map(round);
         json!({ "tool_m": tool_m, "opening": round(arm.gripper_opening) })
     };
     let way_points: Vec<Vec<Value>> =

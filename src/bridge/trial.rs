@@ -13,10 +13,10 @@ use tandem_bridge::trial::{
 use tandem_core::{Layout, Task};
 use tandem_kinematics::Joints;
 use tandem_policy::{Actor, Policy};
-use tandem_report::{Comparison, Pictured, report_html};
-use tandem_telemetry::trial_log::{TrialLook, TrialMetadata, TrialOutcome, TrialRecorder};
+use tandem_report::{Comparison, PlottedTrials, report_html};
+use tandem_telemetry::trial_log::{TrialMetadata, TrialOutcome, TrialRecorder, TrialSnapshot};
 use tandem_telemetry::trials::TRIALS_FILE;
-use tandem_telemetry::{ToolsAt, TrialRow, TrialsLog};
+use tandem_telemetry::{ToolPathPoint, TrialRow, TrialsLog};
 
 use crate::bridge::file;
 use crate::cli::{ModeName, RecordName, TrialArgs};
@@ -181,7 +181,7 @@ impl Series<'_> {
     ) -> Result<TrialRow, Failed> {
         let report = attempt(trials, actor, number, &mut NoWitness)?;
         let mut row = self.row(&report);
-        let name = format!("{}-{}-{number:04}", row.subject, row.mode);
+        let name = format!("{}-{}-{number:04}", row.policy, row.mode);
         if args.motions && !report.way_points.is_empty() {
             let path = out.join(format!("motions/{name}.json"));
             file::write(&path, self.config.speed, &report.way_points)?;
@@ -215,7 +215,7 @@ impl Series<'_> {
 
     fn metadata(&self, number: u64) -> TrialMetadata {
         TrialMetadata {
-            subject: self.subject.name.clone(),
+            policy: self.subject.name.clone(),
             layout: self.config.layout,
             mode: self.config.mode.name().to_owned(),
             trial: number,
@@ -231,7 +231,7 @@ impl Series<'_> {
         let distances = report.objects.iter().map(|object| object.goal_distance_m());
         let every = report.path.len().div_ceil(PATH_POINTS).max(1);
         TrialRow {
-            subject: self.subject.name.clone(),
+            policy: self.subject.name.clone(),
             mode: self.config.mode.name().to_owned(),
             task: self.config.layout.task.name().to_owned(),
             trial: report.number,
@@ -292,7 +292,7 @@ impl Witness for Recording {
         let openings: Vec<f64> = arms.iter().map(|arm| arm.opening).collect();
         let [planned_tools, measured_tools] =
             [&look.tools.planned, &look.tools.measured].map(|tools| places(tools));
-        let written = self.recorder.look(&TrialLook {
+        let written = self.recorder.record(&TrialSnapshot {
             time_s: look.time_s,
             scene: &look.scene,
             planned_joints: planned.as_deref(),
@@ -319,8 +319,8 @@ fn places(tools: &[glam::DVec3]) -> Vec<[f64; 3]> {
     tools.iter().map(|tool| tool.to_array()).collect()
 }
 
-fn tools_at(point: &tandem_bridge::trial::PathPoint) -> ToolsAt {
-    ToolsAt {
+fn tools_at(point: &tandem_bridge::trial::PathPoint) -> ToolPathPoint {
+    ToolPathPoint {
         time_s: point.time_s,
         planned: places(&point.planned),
         measured: places(&point.measured),
@@ -339,8 +339,8 @@ fn show(args: &TrialArgs, rows: Vec<TrialRow>, file: &Path) -> Result<(), Failed
     let trials = tandem_report::Trials::of(rows);
     let page = file.with_file_name("report.html");
     let nothing = Comparison::of(Vec::new(), Vec::new());
-    let written =
-        report_html(&nothing, &trials, Pictured::Failures, &page).or_cannot_write(String::new)?;
+    let written = report_html(&nothing, &trials, PlottedTrials::Failed, &page)
+        .or_cannot_write(String::new)?;
     if args.json {
         let mut value = json!({ "trials": tandem_report::trials::json(&trials) });
         value["file"] = json!(file);
@@ -351,9 +351,9 @@ fn show(args: &TrialArgs, rows: Vec<TrialRow>, file: &Path) -> Result<(), Failed
     output::print(trials.text())?;
     output::print(format_args!("trials        {}", file.display()))?;
     output::print(format_args!(
-        "report        {}, {} pictures beside it",
+        "report        {}; plots in the same directory: {}",
         page.display(),
-        written.figures.len()
+        written.plots.len()
     ))?;
     Ok(())
 }

@@ -29,7 +29,7 @@ pub(crate) struct EvalArgs {
     /// Number of episodes, one per goal.
     #[arg(long, default_value_t = 240, value_parser = clap::value_parser!(u64).range(1..=1_000_000))]
     pub(crate) episodes: u64,
-    /// Seed of the goals. Runs choose their best policy by goals of another seed.
+    /// Seed of the test goals. Runs select their best policy on validation goals of another seed.
     #[arg(long, default_value_t = 777)]
     pub(crate) seed: u64,
     /// Records the first episode to this MCAP file.
@@ -54,7 +54,7 @@ pub(crate) struct ReportArgs {
     /// Run directories, directories that contain runs or trials, or single metrics and trials files.
     #[arg(required = true, value_name = "DIR|FILE")]
     pub(crate) paths: Vec<PathBuf>,
-    /// HTML page; curves and pictures of trials are written next to it as SVG files [default: report.html, in the
+    /// HTML page; curves and plots of trials are written next to it as SVG files [default: report.html, in the
     /// directory of the sweep or trials if that is the only one].
     #[arg(long, value_name = "FILE.html")]
     pub(crate) out: Option<PathBuf>,

@@ -42,7 +42,7 @@ fn advisor(policy: PathBuf, ledger: OsString) -> Result<Advisor, Error> {
 pub(crate) fn teacher_failed(error: Error) -> Failed {
     use Error as E;
     let exit = match &error {
-        E::OpenLedger(OpenError::NotAPlace(_) | OpenError::BadPath { .. }) => Exit::Usage,
+        E::OpenLedger(OpenError::InvalidLocation(_) | OpenError::BadPath { .. }) => Exit::Usage,
         E::OpenLedger(OpenError::InUse(_) | OpenError::Io { .. } | OpenError::Server { .. }) => {
             Exit::TryAgain
         }

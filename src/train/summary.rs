@@ -58,7 +58,7 @@ fn summary_lines(
     let mut lines = vec![
         format!("done: {}", last.end_reason),
         format!(
-            "best policy on {} held-out goals (seed {REPORT_SEED}), alone: no noise, no advice",
+            "best policy on {} test goals (seed {REPORT_SEED}), alone: no noise, no advice",
             plan.config.evaluation.test_episodes
         ),
     ];

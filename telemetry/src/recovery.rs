@@ -1,4 +1,4 @@
-//! Makes a whole file of what a killed writer left.
+//! Recovery of the incomplete MCAP file of a killed writer.
 
 use std::fs::File;
 use std::io::BufWriter;
@@ -12,24 +12,24 @@ use crate::error::Error;
 use crate::log_file::write_options;
 use crate::records::Records;
 
-/// What [`recover`] saved.
+/// Contents of a recovered file.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct RecoveredCounts {
-    /// Messages of all channels.
+    /// Number of messages of all channels.
     pub messages: u64,
-    /// Metadata records.
+    /// Number of metadata records.
     pub metadata_records: u64,
-    /// Where the source ended, in the reader's words; `None` when it was whole.
+    /// Error at which reading of the source ended; `None` if it was complete.
     pub ended_by: Option<String>,
 }
 
-/// Copies everything that is readable of `source`, up to the first damage, into the whole file `destination`.
+/// Copies all readable records of `source`, up to the first damage, to the complete file `destination`.
 ///
-/// Works for any MCAP file. `source` is left as it is; `destination` appears when it is complete, so a failure leaves
-/// nothing half done.
+/// This works for any MCAP file. `source` is not modified. `destination` is created only when it is complete, so an
+/// error leaves no incomplete file.
 ///
 /// # Errors
-/// When `source` cannot be read or does not begin like an MCAP file, or `destination` cannot be written.
+/// If `source` cannot be read or does not start like an MCAP file, or if `destination` cannot be written.
 pub fn recover(source: &Path, destination: &Path) -> Result<RecoveredCounts, Error> {
     let bytes = regular_file::read(source).map_err(Error::io("read", source))?;
     if !bytes.starts_with(mcap::MAGIC) {
@@ -45,8 +45,8 @@ fn copy_readable(bytes: &[u8], file: &File) -> mcap::McapResult<RecoveredCounts>
         counts: RecoveredCounts::default(),
     };
     copy.counts.ended_by = Some(McapError::UnexpectedEof.to_string());
-    for record in Records::of_rest(bytes) {
-        let refused = match record {
+    for record in Records::of_partial(bytes) {
+        let damage = match record {
             Ok(Record::DataEnd(_)) => {
                 copy.counts.ended_by = None;
                 break;
@@ -54,7 +54,7 @@ fn copy_readable(bytes: &[u8], file: &File) -> mcap::McapResult<RecoveredCounts>
             Ok(record) => copy.write(&record)?,
             Err(damage) => Some(damage),
         };
-        if let Some(damage) = refused {
+        if let Some(damage) = damage {
             copy.counts.ended_by = Some(damage.to_string());
             break;
         }
@@ -70,7 +70,7 @@ struct Copy<'a> {
 }
 
 impl Copy<'_> {
-    /// Writes a record, or says why it cannot stand after those before it.
+    /// Writes a record, or returns why it contradicts the previous ones.
     fn write(&mut self, record: &Record<'_>) -> mcap::McapResult<Option<McapError>> {
         match self.try_write(record) {
             Ok(()) => Ok(None),

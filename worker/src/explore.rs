@@ -6,7 +6,7 @@
 use rand_chacha::ChaCha8Rng;
 use tandem_core::Exploration;
 use tandem_core::layout::Layout;
-use tandem_core::rng::{coin, standard_normal, uniform};
+use tandem_core::rng::{bernoulli, standard_normal, uniform};
 
 /// The exploration of one episode.
 ///
@@ -76,7 +76,7 @@ impl Explorer {
 impl HeldAction {
     /// Goes on by one step: an action whose time is over may be followed by a new one.
     fn advance(&mut self, rng: &mut ChaCha8Rng, start_probability: f32, hold_mean_steps: f32) {
-        let starts = coin(rng, start_probability);
+        let starts = bernoulli(rng, start_probability);
         let n_steps = hold_steps(uniform(rng, 0.0, 1.0), hold_mean_steps);
         let free = self.n_steps_left <= 1;
         self.n_steps_left = match (free, starts) {

@@ -150,7 +150,7 @@ fn record_step(
         observation: episode.observation(step_idx),
         goal: &episode.goal,
         action: episode.action(step_idx),
-        reward: episode.joint_reward_after(step_idx),
+        reward: episode.joint_reward(step_idx),
         rewards_per_arm: &rewards_per_arm,
         advised_arms: episode.advised_arms[step_idx],
         contacts: episode.contacts[step_idx],

@@ -140,7 +140,7 @@ impl Envelope {
 
     fn check_tool(&self, arm: usize, command: &ArmCommand, at: &Joints) -> Result<(), Breach> {
         let posture = ForwardKinematics::new(self.cell.arms[arm].model, at);
-        let got = posture.tool_velocity(&command.velocities).length();
+        let got = posture.tool_velocity(&command.velocities).norm();
         let allowed = self.settings.check.limits.tool_speed_mps;
         if got > allowed * (1.0 + TOOL_SPEED_SLACK) {
             return Err(StopCause::ToolSpeed(Excess { got, allowed }).of(arm));

@@ -175,7 +175,7 @@ fn within_limits(moment: &Moment<'_>, arm: usize, wanted: &Joints) -> Joints {
     });
     let Some(state) = moment.state else { return velocities };
     let posture = tandem_kinematics::ForwardKinematics::new(placed.model, &state.arms[arm].angles);
-    let tool_mps = posture.tool_velocity(&velocities).length();
+    let tool_mps = posture.tool_velocity(&velocities).norm();
     if tool_mps > limits.tool_speed_mps {
         let share = limits.tool_speed_mps / tool_mps;
         for (velocity, [low, high]) in velocities.iter_mut().zip(&ranges) {

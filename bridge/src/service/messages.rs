@@ -1,6 +1,5 @@
 //! The bridge's own words as messages.
 
-use glam::DVec3;
 use tandem_kinematics::plan::{MAX_STEP_M, MAX_WAYPOINTS};
 use tandem_kinematics::{ForwardKinematics, Gaps, Joints, Motion, PlacedArm, WorkCell};
 use tandem_proto::{DecodeError, pb};
@@ -42,7 +41,7 @@ pub(super) fn describe_arm(placed: &PlacedArm) -> pb::ArmDescription {
     };
     pb::ArmDescription {
         model: placed.model.name.to_owned(),
-        base_in_world_m: numbers_of(placed.base_in_world_m),
+        base_in_world_m: numbers_of(placed.base_in_world_m.into()),
         yaw_rad: placed.yaw_rad,
         joints: placed.model.joints.iter().map(joint).collect(),
     }
@@ -181,9 +180,8 @@ pub(super) fn arms(snapshot: &Snapshot, cell: &WorkCell) -> Vec<pb::ArmState> {
 
 fn arm_state(reading: &ArmReading, placed: &PlacedArm, reference: Option<Joints>) -> pb::ArmState {
     let tool = |angles: &Joints| {
-        numbers_of(
-            placed.world_from_base(ForwardKinematics::new(placed.model, angles).tool().origin_m),
-        )
+        let tool_in_base_m = ForwardKinematics::new(placed.model, angles).tool_m();
+        numbers_of((placed.world_from_base() * tool_in_base_m).into())
     };
     pb::ArmState {
         angles_rad: reading.angles.to_vec(),
@@ -202,8 +200,8 @@ fn unit(numbers: Option<Numbers>) -> String {
     numbers.map_or_else(String::new, |numbers| numbers.unit.to_owned())
 }
 
-fn numbers_of(point: DVec3) -> Vec<f64> {
-    point.to_array().to_vec()
+fn numbers_of(point: [f64; 3]) -> Vec<f64> {
+    point.to_vec()
 }
 
 fn index(index: usize) -> u32 {

@@ -1,6 +1,5 @@
 //! From a request to a motion that has passed the check.
 
-use glam::DVec3;
 use tandem_kinematics::plan::MAX_WAYPOINTS;
 use tandem_kinematics::{
     ArmSample, ArmWaypoint, ForwardKinematics, Joints, Motion, PlanError, PlanSettings, Waypoint,
@@ -101,9 +100,9 @@ impl Wanted {
 fn here(state: &PairState, cell: &WorkCell) -> Waypoint {
     let arms = state.arms.iter().zip(&cell.arms);
     let way_point = |(arm, placed): (&crate::ArmReading, &tandem_kinematics::PlacedArm)| {
-        let tool = ForwardKinematics::new(placed.model, &arm.angles).tool().origin_m;
+        let tool = ForwardKinematics::new(placed.model, &arm.angles).tool_m();
         ArmWaypoint {
-            tool_in_world_m: placed.world_from_base(tool),
+            tool_in_world_m: placed.world_from_base() * tool,
             gripper_opening: arm.opening.clamp(0.0, 1.0),
         }
     };
@@ -165,7 +164,7 @@ fn decode_arm(message: &pb::ArmWayPoint) -> Result<ArmWaypoint, DecodeError> {
     };
     check_finite(field, numbers)?;
     Ok(ArmWaypoint {
-        tool_in_world_m: DVec3::new(x, y, z),
+        tool_in_world_m: [x, y, z].into(),
         gripper_opening: decode_opening(message.opening)?,
     })
 }

@@ -33,8 +33,9 @@ pub(crate) fn scene(
 
 fn arm_scene(placed: &PlacedArm, angles: &Joints, hand: [(Pose, Vector); 3]) -> ArmScene {
     let posture = ForwardKinematics::new(placed.model, angles);
-    let point = |anchor: &Anchor| single(placed.world_from_base(posture.anchor(anchor)));
-    let origin = |frame| point(&Anchor { frame, offset_m: DVec3::ZERO });
+    let point =
+        |anchor: &Anchor| single((placed.world_from_base() * posture.anchor_m(anchor)).into());
+    let origin = |frame| point(&Anchor::origin_of(frame));
     let links = placed.model.links.iter().map(|link| Capsule {
         from: point(&link.ends[0]),
         to: point(&link.ends[1]),
@@ -42,7 +43,7 @@ fn arm_scene(placed: &PlacedArm, angles: &Joints, hand: [(Pose, Vector); 3]) -> 
     });
     let n_joints = angles.len();
     ArmScene {
-        base: single(placed.base_in_world_m),
+        base: single(placed.base_in_world_m.into()),
         joint_angles_rad: std::array::from_fn(|joint| angles.get(joint).copied().unwrap_or(0.0)),
         joint_points: (0..=n_joints + 1).map(origin).collect(),
         links: links.collect(),

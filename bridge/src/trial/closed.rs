@@ -180,7 +180,10 @@ impl Trials {
         let first: Waypoint = here
             .iter()
             .zip(openings(&hands.openings_m))
-            .map(|(tool, opening)| ArmWaypoint { tool_in_world_m: *tool, gripper_opening: opening })
+            .map(|(tool, opening)| ArmWaypoint {
+                tool_in_world_m: (*tool).into(),
+                gripper_opening: opening,
+            })
             .collect();
         let openings_m: Vec<f64> = wanted.iter().map(|(_, opening_m)| *opening_m).collect();
         for (attempt, parts) in ATTEMPTS.iter().enumerate() {
@@ -246,7 +249,10 @@ impl Trials {
             let points = [corner, end, end];
             for ((way, point), opening) in ways.iter_mut().zip(points).zip(openings) {
                 let (tool_in_world_m, _) = self.mapping.tool_for_pads(idx, point, near)?;
-                way.push(ArmWaypoint { tool_in_world_m, gripper_opening: opening });
+                way.push(ArmWaypoint {
+                    tool_in_world_m: tool_in_world_m.into(),
+                    gripper_opening: opening,
+                });
             }
         }
         Ok(ways)
@@ -269,7 +275,7 @@ impl Hands {
 
 fn is_still(from: &Waypoint, to: &Waypoint) -> bool {
     from.iter().zip(to).all(|(from, to)| {
-        (from.tool_in_world_m - to.tool_in_world_m).length() < STILL_M
+        (from.tool_in_world_m - to.tool_in_world_m).norm() < STILL_M
             && (from.gripper_opening - to.gripper_opening).abs() < STILL_OPENING
     })
 }

@@ -95,7 +95,8 @@ impl Mapping {
     /// Where an object or goal at `own` (own frame of `arm`, metres) is in the world.
     #[must_use]
     pub fn object_in_world(&self, arm: ArmIndex, own: DVec3) -> DVec3 {
-        self.cell.world_from_own(arm, own + DVec3::Z * (self.block_half_m - TRAINED_HALF_M))
+        let own = own + DVec3::Z * (self.block_half_m - TRAINED_HALF_M);
+        self.cell.world_from_own(arm, &own.into()).into()
     }
 
     /// Where the policy has an object that is at `in_world`, metres.
@@ -121,7 +122,7 @@ impl Mapping {
     /// Where the point between the pads is in the world for an end effector at `own` (own frame of `arm`), metres.
     #[must_use]
     pub fn pads_in_world(&self, arm: ArmIndex, own: DVec3) -> DVec3 {
-        self.cell.world_from_own(arm, own + DVec3::Z * HAND_LIFT_M)
+        self.cell.world_from_own(arm, &(own + DVec3::Z * HAND_LIFT_M).into()).into()
     }
 
     /// As [`tool_in_world`](Self::tool_in_world), for a point between the pads in the world, metres.
@@ -138,7 +139,7 @@ impl Mapping {
         let mut tool = pads + DVec3::Z * PADS_AHEAD_M;
         let mut angles = *near;
         for _ in 0..TILT_ROUNDS {
-            angles = placed.model.nearest(&placed.target(tool), near)?.angles;
+            angles = placed.model.inverse_kinematics(&placed.target(&tool.into()), near)?.angles;
             let gap_m = self.alone[arm.0].gaps(&[angles]).table_m[0];
             pads.z += (TABLE_GAP_M - gap_m).max(0.0);
             tool = pads - pointing(placed, &angles) * PADS_AHEAD_M;
@@ -151,7 +152,7 @@ impl Mapping {
     pub fn hand_in_own(&self, arm: ArmIndex, angles: &Joints) -> DVec3 {
         let placed = &self.cell.arms[arm.0];
         let posture = tandem_kinematics::ForwardKinematics::new(placed.model, angles);
-        let tool = placed.world_from_base(posture.tool().origin_m);
+        let tool = DVec3::from(placed.world_from_base() * posture.tool_m());
         let pads = tool + pointing(placed, angles) * PADS_AHEAD_M;
         self.own(arm, pads) - DVec3::Z * HAND_LIFT_M
     }
@@ -235,8 +236,9 @@ impl Mapping {
     }
 
     fn own(&self, arm: ArmIndex, in_world: DVec3) -> DVec3 {
-        let in_base = self.cell.arms[arm.0].base_from_world(in_world);
-        self.cell.task_frame.own_from_base(in_base)
+        let in_base =
+            self.cell.arms[arm.0].world_from_base().inverse_transform_point(&in_world.into());
+        self.cell.task_frame.own_from_base(&in_base).into()
     }
 }
 
@@ -278,6 +280,6 @@ pub fn observe_arm(now: &ArmMoment, before: &ArmMoment, observation: &mut [f32])
 
 /// The way a gripper points, world frame.
 fn pointing(placed: &PlacedArm, angles: &Joints) -> DVec3 {
-    placed.axes()
-        * tandem_kinematics::ForwardKinematics::new(placed.model, angles).tool().axes.z_axis
+    let posture = tandem_kinematics::ForwardKinematics::new(placed.model, angles);
+    (placed.world_from_base() * posture.pointing()).into()
 }

@@ -227,7 +227,7 @@ impl Trials {
             let (tool_in_world_m, _) =
                 self.mapping.tool_in_world(ArmIndex(arm), hands[arm], &near[arm])?;
             Ok(ArmWaypoint {
-                tool_in_world_m,
+                tool_in_world_m: tool_in_world_m.into(),
                 gripper_opening: self.mapping.opening(openings_m[arm]),
             })
         };

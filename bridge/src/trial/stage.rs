@@ -163,7 +163,7 @@ impl<'a> Stage<'a> {
 pub(crate) fn tools(cell: &WorkCell, angles: &[Joints]) -> Vec<DVec3> {
     let arms = cell.arms.iter().zip(angles);
     arms.map(|(placed, angles)| {
-        placed.world_from_base(ForwardKinematics::new(placed.model, angles).tool().origin_m)
+        (placed.world_from_base() * ForwardKinematics::new(placed.model, angles).tool_m()).into()
     })
     .collect()
 }

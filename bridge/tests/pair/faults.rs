@@ -99,8 +99,9 @@ impl Plan {
         let drift = |arm: usize| {
             let placed = &cell.arms[arm];
             let posture = ForwardKinematics::new(placed.model, &angles[arm]);
-            let in_base = placed.axes().transpose() * along(arm);
-            let gain = Joints::from_fn(4, |joint| posture.tool_motion(joint).0.dot(in_base));
+            let in_base = placed.world_from_base().inverse_transform_vector(&along(arm).into());
+            let jacobian = posture.position_jacobian();
+            let gain = Joints::from_fn(4, |joint| jacobian.column(joint).dot(&in_base));
             let most = gain.iter().fold(1e-9, |most: f64, gain| most.max(gain.abs()));
             Joints::from_fn(4, |joint| DRIFT_RADPS * gain[joint] / most)
         };

@@ -109,7 +109,7 @@ impl Observer {
             }
         }
         let posture = ForwardKinematics::new(placed.model, angles);
-        let tool_mps = posture.tool_velocity(rates).length();
+        let tool_mps = posture.tool_velocity(rates).norm();
         let drift_mps = self.slack.drift_radps * 3.0 * 0.6;
         self.tool_share = self.tool_share.max(tool_mps / TOOL_MPS);
         // The executor multiplies velocities by where the arm was some periods before.

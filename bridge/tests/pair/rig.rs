@@ -89,7 +89,7 @@ impl Rig {
 pub(crate) fn tools(cell: &WorkCell, angles: &[Joints]) -> Vec<DVec3> {
     let tool = |(arm, angles): (usize, &Joints)| {
         let placed = &cell.arms[arm];
-        placed.world_from_base(ForwardKinematics::new(placed.model, angles).tool().origin_m)
+        (placed.world_from_base() * ForwardKinematics::new(placed.model, angles).tool_m()).into()
     };
     angles.iter().enumerate().map(tool).collect()
 }
@@ -100,7 +100,8 @@ pub(crate) fn planned(points: &[([DVec3; 2], f64)]) -> Motion {
     let way_points: Vec<Waypoint> = points
         .iter()
         .map(|(points, opening)| {
-            let in_world = |arm: usize| cell.arms[arm].world_from_base(points[arm]);
+            let in_world =
+                |arm: usize| cell.arms[arm].world_from_base().transform_point(&points[arm].into());
             let way_point =
                 |arm| ArmWaypoint { tool_in_world_m: in_world(arm), gripper_opening: *opening };
             vec![way_point(0), way_point(1)]
@@ -138,7 +139,8 @@ pub(crate) fn walk([low, high]: Area, seed: u64, n: usize) -> Motion {
                 *own = (*own + step).clamp(low, high);
             }
             let opening = f64::from(uniform(&mut rng, 0.0, 1.0));
-            let tool = |arm: usize| cell.world_from_own(tandem_core::ArmIndex(arm), own[arm]);
+            let tool =
+                |arm: usize| cell.world_from_own(tandem_core::ArmIndex(arm), &own[arm].into());
             let way_point =
                 |arm| ArmWaypoint { tool_in_world_m: tool(arm), gripper_opening: opening };
             way_points.push(vec![way_point(0), way_point(1)]);

@@ -223,7 +223,7 @@ async fn a_refused_motion_is_not_played() {
     }
     let refused = rig.execute(&token, elsewhere).await.err().unwrap();
     assert_eq!(refused.code(), Code::FailedPrecondition);
-    assert!(refused.message().contains("from where the motion begins"), "{refused}");
+    assert!(refused.message().contains("from the start of the motion"), "{refused}");
     assert_eq!(rig.status().await.phase(), pb::BridgePhase::Idle);
     let moved = before.iter().zip(rig.tap.angles()).map(|(a, b)| a.largest_difference(&b));
     assert!(moved.fold(0.0, f64::max) < 1e-3);

@@ -1,12 +1,12 @@
-//! A ledger that does what a test wants.
+//! A ledger whose behaviour a test controls.
 
 use std::sync::{Arc, Condvar, Mutex};
 use std::time::Duration;
 
-use crate::budget::{Balance, Lease, Terms};
-use crate::ledger::{Bill, Ledger, LedgerError, MemoryLedger, Receipt};
+use crate::budget::{AccountTerms, Balance, Lease};
+use crate::ledger::{ChargeRequest, ChargeResult, Ledger, LedgerError, MemoryLedger};
 
-/// What a [`GatedLedger`] does when it is used.
+/// The behaviour of a [`GatedLedger`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Mode {
     Answer,
@@ -16,18 +16,18 @@ pub(super) enum Mode {
     Panic,
 }
 
-/// Tells a [`GatedLedger`] what to do, and what it was asked to charge.
+/// Sets the mode of a [`GatedLedger`], and records its calls to charge.
 #[derive(Clone)]
-pub(super) struct Watch(Arc<(Mutex<State>, Condvar)>);
+pub(super) struct GateControl(Arc<(Mutex<State>, Condvar)>);
 
 struct State {
     mode: Mode,
-    visits: Vec<Vec<usize>>,
+    charge_calls: Vec<Vec<usize>>,
 }
 
-impl Watch {
+impl GateControl {
     pub(super) fn new() -> Self {
-        let state = State { mode: Mode::Answer, visits: Vec::new() };
+        let state = State { mode: Mode::Answer, charge_calls: Vec::new() };
         Self(Arc::new((Mutex::new(state), Condvar::new())))
     }
 
@@ -36,17 +36,17 @@ impl Watch {
         self.0.1.notify_all();
     }
 
-    /// By visit, how many charges each bill has.
-    pub(super) fn visits(&self) -> Vec<Vec<usize>> {
-        self.0.0.lock().unwrap().visits.clone()
+    /// Returns, for each call, the number of charges of each request.
+    pub(super) fn charge_calls(&self) -> Vec<Vec<usize>> {
+        self.0.0.lock().unwrap().charge_calls.clone()
     }
 
-    /// Waits until the ledger was asked to charge `n` times.
-    pub(super) async fn visited(&self, n: usize) {
-        eventually(|| self.visits().len() >= n).await;
+    /// Waits until the ledger was called to charge `n` times.
+    pub(super) async fn charge_called(&self, n: usize) {
+        eventually(|| self.charge_calls().len() >= n).await;
     }
 
-    fn pass(&self) -> Result<(), LedgerError> {
+    fn enter(&self) -> Result<(), LedgerError> {
         let state = self.0.0.lock().unwrap();
         let state = self.0.1.wait_while(state, |state| state.mode == Mode::Block).unwrap();
         let mode = state.mode;
@@ -56,7 +56,7 @@ impl Watch {
             Mode::Refuse => {
                 Err(LedgerError::Unavailable { what: "the disk is full".to_owned(), source: None })
             }
-            Mode::Panic => panic!("a bug, as the test wants it"),
+            Mode::Panic => panic!("a bug, as the test requested"),
         }
     }
 }
@@ -71,26 +71,26 @@ pub(super) async fn eventually(holds: impl Fn() -> bool) {
     tokio::time::timeout(Duration::from_secs(60), waited).await.expect("it comes true");
 }
 
-/// Accounts in memory behind a gate.
+/// A ledger in memory that obeys a [`GateControl`].
 pub(super) struct GatedLedger {
     ledger: MemoryLedger,
-    watch: Watch,
+    gate: GateControl,
 }
 
 impl GatedLedger {
-    pub(super) fn new(watch: Watch) -> Self {
-        Self { ledger: MemoryLedger::default(), watch }
+    pub(super) fn new(gate: GateControl) -> Self {
+        Self { ledger: MemoryLedger::default(), gate }
     }
 }
 
 impl Ledger for GatedLedger {
-    fn open(&mut self, name: &str, terms: Terms) -> Result<Balance, LedgerError> {
-        self.watch.pass()?;
+    fn open(&mut self, name: &str, terms: AccountTerms) -> Result<Balance, LedgerError> {
+        self.gate.enter()?;
         self.ledger.open(name, terms)
     }
 
     fn balance(&mut self, name: &str) -> Result<Balance, LedgerError> {
-        self.watch.pass()?;
+        self.gate.enter()?;
         self.ledger.balance(name)
     }
 
@@ -100,21 +100,21 @@ impl Ledger for GatedLedger {
         episodes: &[u64],
         units_per_episode: u32,
     ) -> Result<(Vec<Lease>, Balance), LedgerError> {
-        self.watch.pass()?;
+        self.gate.enter()?;
         self.ledger.open_leases(name, episodes, units_per_episode)
     }
 
     fn settle(&mut self, name: &str, episodes: &[u64]) -> Result<Balance, LedgerError> {
-        self.watch.pass()?;
+        self.gate.enter()?;
         self.ledger.settle(name, episodes)
     }
 
-    fn charge(&mut self, bills: &[Bill]) -> Vec<Result<Receipt, LedgerError>> {
-        let sizes = bills.iter().map(|bill| bill.charges.len()).collect();
-        self.watch.0.0.lock().unwrap().visits.push(sizes);
-        match self.watch.pass() {
-            Ok(()) => self.ledger.charge(bills),
-            Err(_) => bills.iter().map(|_| Err(self.watch.pass().unwrap_err())).collect(),
+    fn charge(&mut self, requests: &[ChargeRequest]) -> Vec<Result<ChargeResult, LedgerError>> {
+        let sizes = requests.iter().map(|request| request.charges.len()).collect();
+        self.gate.0.0.lock().unwrap().charge_calls.push(sizes);
+        match self.gate.enter() {
+            Ok(()) => self.ledger.charge(requests),
+            Err(_) => requests.iter().map(|_| Err(self.gate.enter().unwrap_err())).collect(),
         }
     }
 }

@@ -1,4 +1,4 @@
-//! The curves of the paper's Figures 4 to 8 for runs of our own, with bands over seeds.
+//! Plots of a comparison: the curves of the paper's Figures 4 to 8 for Tandem's runs, with bands over seeds.
 
 use std::collections::BTreeMap;
 
@@ -8,38 +8,38 @@ use tandem_telemetry::MetricsRow;
 use crate::comparison::{Comparison, Section};
 use crate::curve::{Axis, CurveOptions, CurvePoint, Quantity, Series, curve_svg};
 use crate::error::Error;
-use crate::group::Group;
-use crate::paper::split;
+use crate::group::SeedGroup;
+use crate::paper::split_strategy;
 
-/// Curves of one picture; more are spread over several.
+/// Maximum number of curves in a plot of other runs, or of learning from scratch.
 const MAX_CURVES: usize = 6;
-/// The threshold that stands for a strategy where strategies are compared (the paper's Figures 5a to 8a).
+/// Threshold that represents a strategy where strategies are compared (the paper's Figures 5a to 8a).
 const USUAL_THRESHOLD: f64 = 0.1;
 
-/// A picture of curves.
+/// A plot and the name of its file.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Figure {
-    /// Name of its file, without a directory.
+pub struct Plot {
+    /// File name, without a directory.
     pub file_name: String,
-    /// What it shows.
+    /// Title.
     pub title: String,
-    /// The picture.
+    /// The plot as SVG.
     pub svg: String,
 }
 
-/// Which groups share a picture.
+/// Groups that share a plot.
 #[derive(Debug, Clone)]
 struct Panel<'a> {
-    /// Part of the file's name.
+    /// Part of the file name.
     slug: String,
     /// Part of the title.
     title: String,
-    /// `a` to `d` where the paper has this panel.
+    /// Letter of this panel in the paper's figures, `a` to `d`, if the paper has it.
     letter: Option<char>,
-    groups: Vec<&'a Group>,
+    groups: Vec<&'a SeedGroup>,
 }
 
-/// What is drawn of every panel, and the paper's figure for push and for pick and place.
+/// Plots of each panel: name, quantity, axis, and the number of the paper's figure for push and for pick and place.
 const VIEWS: [(&str, Quantity, Axis, Option<[u32; 2]>); 5] = [
     ("success", Quantity::Success, Axis::PaperEpochs, Some([5, 7])),
     ("success", Quantity::Success, Axis::EnvSteps, None),
@@ -48,86 +48,85 @@ const VIEWS: [(&str, Quantity, Axis, Option<[u32; 2]>); 5] = [
     ("advice spent", Quantity::AdviceSpent, Axis::EnvSteps, None),
 ];
 
-/// Draws every figure of a comparison.
+/// Draws all plots of a comparison.
 ///
 /// # Errors
-/// When the plotting library fails.
-pub fn figures(comparison: &Comparison) -> Result<Vec<Figure>, Error> {
-    let mut figures = from_scratch(comparison)?;
+/// If the plotting library fails.
+pub fn comparison_plots(comparison: &Comparison) -> Result<Vec<Plot>, Error> {
+    let mut plots = from_scratch(comparison)?;
     for section in &comparison.sections {
-        figures.extend(section_figures(section)?);
+        plots.extend(section_plots(section)?);
     }
-    Ok(figures)
+    Ok(plots)
 }
 
-/// The figures of one section.
-///
-/// # Errors
-/// When the plotting library fails.
-fn section_figures(section: &Section) -> Result<Vec<Figure>, Error> {
-    let mut figures = Vec::new();
+/// Draws the plots of one section.
+fn section_plots(section: &Section) -> Result<Vec<Plot>, Error> {
+    let mut plots = Vec::new();
     for panel in panels(&section.groups) {
-        for (what, quantity, axis, paper) in VIEWS {
-            let reference = paper.zip(panel.letter).zip(section.subject.task);
-            let reference = reference.filter(|_| section.subject.n_arms != Some(1));
+        for (name, quantity, axis, paper) in VIEWS {
+            let reference = paper.zip(panel.letter).zip(section.setup.task);
+            let reference = reference.filter(|_| section.setup.n_arms != Some(1));
             let reference =
                 reference.map_or_else(String::new, |(([push, other], letter), task)| {
                     let number = if task == Task::Push { push } else { other };
                     format!(" (the paper's Figure {number}{letter})")
                 });
-            let title = format!("{}: {what}, {}{reference}", section.subject.title(), panel.title);
-            let slug = format!("{}-{what}-{}-{}", section.subject.slug(), axis.label(), panel.slug);
-            figures.push(draw(&panel.groups, &title, &slug, quantity, axis)?);
+            let title = format!("{}: {name}, {}{reference}", section.setup.title(), panel.title);
+            let slug = format!("{}-{name}-{}-{}", section.setup.slug(), axis.label(), panel.slug);
+            plots.push(draw(&panel.groups, &title, &slug, quantity, axis)?);
         }
     }
-    Ok(figures)
+    Ok(plots)
 }
 
-/// Learning without a teacher with one and with two arms: the paper's Figure 4.
-fn from_scratch(comparison: &Comparison) -> Result<Vec<Figure>, Error> {
-    let mut figures = Vec::new();
+/// Draws learning without advice, with one arm and with two (the paper's Figure 4).
+fn from_scratch(comparison: &Comparison) -> Result<Vec<Plot>, Error> {
+    let mut plots = Vec::new();
     for (task, letter) in Task::ALL.into_iter().zip(['a', 'b']) {
-        let of_task = comparison.sections.iter().filter(|one| one.subject.task == Some(task));
-        let groups: Vec<Group> = of_task
+        let of_task = comparison.sections.iter().filter(|one| one.setup.task == Some(task));
+        let groups: Vec<SeedGroup> = of_task
             .flat_map(|section| &section.groups)
             .filter(|group| group.is_from_scratch())
-            .map(|group| Group {
-                label: format!("{}, {}", group.label, group.subject.title()),
+            .map(|group| SeedGroup {
+                label: format!("{}, {}", group.label, group.setup.title()),
                 ..group.clone()
             })
             .collect();
-        let n_one_arm = groups.iter().filter(|group| group.subject.n_arms == Some(1)).count();
+        let n_one_arm = groups.iter().filter(|group| group.setup.n_arms == Some(1)).count();
         if n_one_arm == 0 {
             continue;
         }
-        let shown: Vec<&Group> = groups.iter().take(MAX_CURVES).collect();
+        let shown: Vec<&SeedGroup> = groups.iter().take(MAX_CURVES).collect();
         let title = format!("{task}: success from scratch (the paper's Figure 4{letter})");
         let slug = format!("{task}-from-scratch");
-        figures.push(draw(&shown, &title, &slug, Quantity::Success, Axis::PaperEpochs)?);
+        plots.push(draw(&shown, &title, &slug, Quantity::Success, Axis::PaperEpochs)?);
     }
-    Ok(figures)
+    Ok(plots)
 }
 
 fn draw(
-    groups: &[&Group],
+    groups: &[&SeedGroup],
     title: &str,
     slug: &str,
     quantity: Quantity,
     axis: Axis,
-) -> Result<Figure, Error> {
+) -> Result<Plot, Error> {
     let series: Vec<Series> = groups.iter().map(|group| series(group, axis, quantity)).collect();
     let options = match quantity {
         Quantity::Success => CurveOptions::shares(title, axis),
-        _ => CurveOptions::figures(title, axis),
+        _ => CurveOptions::values(title, axis),
     };
     let svg = curve_svg(&series, &options)?;
     let file_name = format!("{}.svg", slug.to_lowercase().replace(' ', "-"));
-    Ok(Figure { file_name, title: title.to_owned(), svg })
+    Ok(Plot { file_name, title: title.to_owned(), svg })
 }
 
-/// A group's curve. A single run has its own intervals; several are drawn as their mean with a band from the smallest
-/// to the largest. Runs meet at equal environment steps; where a run has no evaluation the others stand alone.
-fn series(group: &Group, axis: Axis, quantity: Quantity) -> Series {
+/// Returns a group's curve.
+///
+/// The band of a single run is its 95 % interval. Several runs are drawn as their mean, with a band from the smallest
+/// to the largest value. Rows are matched by environment steps; a point covers the runs that have a row there.
+fn series(group: &SeedGroup, axis: Axis, quantity: Quantity) -> Series {
     if let [run] = group.runs.as_slice() {
         return Series::of(&group.label, &run.rows, axis, quantity);
     }
@@ -155,12 +154,12 @@ fn series(group: &Group, axis: Axis, quantity: Quantity) -> Series {
     Series { name: group.label.clone(), points: rows_at.into_values().filter_map(point).collect() }
 }
 
-/// The pictures that show every group: strategies, thresholds of each strategy, and whatever else there is.
-fn panels(groups: &[Group]) -> Vec<Panel<'_>> {
-    let plain: Vec<&Group> = groups.iter().filter(|group| group.is_plain_strategy()).collect();
+/// Distributes all groups over panels: strategies, thresholds of each strategy, and other runs.
+fn panels(groups: &[SeedGroup]) -> Vec<Panel<'_>> {
+    let plain: Vec<&SeedGroup> = groups.iter().filter(|group| group.is_plain_strategy()).collect();
     let mut panels = Vec::new();
-    let strategies: Vec<&Group> =
-        plain.iter().filter(|group| stands_for_strategy(group, &plain)).copied().collect();
+    let strategies: Vec<&SeedGroup> =
+        plain.iter().filter(|group| represents_strategy(group, &plain)).copied().collect();
     if !strategies.is_empty() {
         panels.push(Panel {
             slug: "strategies".to_owned(),
@@ -170,8 +169,8 @@ fn panels(groups: &[Group]) -> Vec<Panel<'_>> {
         });
     }
     for (family, letter) in [("mc-q", 'b'), ("mc-act", 'c'), ("mc-act-abs", 'd')] {
-        let members: Vec<&Group> =
-            plain.iter().filter(|group| name(group) == family).copied().collect();
+        let members: Vec<&SeedGroup> =
+            plain.iter().filter(|group| strategy_name(group) == family).copied().collect();
         if members.len() > 1 {
             panels.push(Panel {
                 slug: family.to_owned(),
@@ -181,10 +180,10 @@ fn panels(groups: &[Group]) -> Vec<Panel<'_>> {
             });
         }
     }
-    let is_shown = |group: &&Group| {
+    let is_shown = |group: &&SeedGroup| {
         panels.iter().any(|panel| panel.groups.iter().any(|shown| std::ptr::eq(*shown, *group)))
     };
-    let others: Vec<&Group> = groups.iter().filter(|group| !is_shown(group)).collect();
+    let others: Vec<&SeedGroup> = groups.iter().filter(|group| !is_shown(group)).collect();
     let further = others.chunks(MAX_CURVES - 2).enumerate().map(|(idx, others)| Panel {
         slug: format!("others-{}", idx + 1),
         title: "other runs".to_owned(),
@@ -195,24 +194,28 @@ fn panels(groups: &[Group]) -> Vec<Panel<'_>> {
     panels
 }
 
-/// Groups after the plain strategies that they are variants of.
-fn with_their_strategies<'a>(others: &[&'a Group], plain: &[&'a Group]) -> Vec<&'a Group> {
-    let is_origin = |group: &&&Group| {
+/// Returns `others`, preceded by the plain strategies of which they are variants.
+fn with_their_strategies<'a>(
+    others: &[&'a SeedGroup],
+    plain: &[&'a SeedGroup],
+) -> Vec<&'a SeedGroup> {
+    let is_origin = |group: &&&SeedGroup| {
         others.iter().any(|other| {
-            (&other.strategy, other.subject) == (&group.strategy, group.subject)
+            (&other.strategy, other.setup) == (&group.strategy, group.setup)
                 && !std::ptr::eq(**group, *other)
         })
     };
     plain.iter().filter(is_origin).chain(others).copied().collect()
 }
 
-/// Whether a group stands for its strategy among others: it has the usual threshold, or the largest where none has.
-fn stands_for_strategy(group: &Group, all: &[&Group]) -> bool {
-    let threshold = |group: &Group| split(group.strategy.as_deref().unwrap_or_default()).1;
+/// Returns whether a group represents its strategy: it has the usual threshold, or the largest if no group has that.
+fn represents_strategy(group: &SeedGroup, all: &[&SeedGroup]) -> bool {
+    let threshold =
+        |group: &SeedGroup| split_strategy(group.strategy.as_deref().unwrap_or_default()).1;
     let Some(own) = threshold(group) else { return true };
     let family: Vec<f64> = all
         .iter()
-        .filter(|other| name(other) == name(group))
+        .filter(|other| strategy_name(other) == strategy_name(group))
         .filter_map(|other| threshold(other))
         .collect();
     let has_usual = family.contains(&USUAL_THRESHOLD);
@@ -220,14 +223,14 @@ fn stands_for_strategy(group: &Group, all: &[&Group]) -> bool {
     own == chosen
 }
 
-fn name(group: &Group) -> &str {
-    split(group.strategy.as_deref().unwrap_or_default()).0
+fn strategy_name(group: &SeedGroup) -> &str {
+    split_strategy(group.strategy.as_deref().unwrap_or_default()).0
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::group::groups;
+    use crate::group::group_by_settings;
     use crate::run::Run;
 
     fn run(strategy: &str, seed: u64, name: &str, curve: &[(u64, f64, f64)]) -> Run {
@@ -244,7 +247,7 @@ mod tests {
             configuration: Some(format!(
                 "task = \"push\"\narms = 2\nseed = {seed}\ncopy = \"{name}\"\n[advice]\nstrategy = \"{strategy}\""
             )),
-            held_out: None,
+            test: None,
         }
     }
 
@@ -254,7 +257,7 @@ mod tests {
 
     #[test]
     fn seeds_become_a_mean_with_a_band() {
-        let groups = groups(vec![
+        let groups = group_by_settings(vec![
             run("ea", 1, "ea", &[(1000, 60.0, 0.2), (2000, 120.0, 0.6)]),
             run("ea", 2, "ea", &[(1000, 120.0, 0.4), (2000, 240.0, 0.8), (3000, 360.0, 0.9)]),
         ]);
@@ -267,7 +270,7 @@ mod tests {
     }
 
     #[test]
-    fn panels_are_the_papers_and_leave_nobody_out() {
+    fn panels_are_those_of_the_paper_and_show_every_group() {
         let strategies = [
             "none",
             "ea",
@@ -281,8 +284,8 @@ mod tests {
         ];
         let mut runs: Vec<Run> = strategies.map(plain).into();
         runs.push(run("mc-q:0.1", 1, "no-cloning", &[(1000, 60.0, 0.5)]));
-        let groups = groups(runs);
-        let seen: Vec<(String, Option<char>, Vec<&str>)> = panels(&groups)
+        let groups = group_by_settings(runs);
+        let actual: Vec<(String, Option<char>, Vec<&str>)> = panels(&groups)
             .into_iter()
             .map(|panel| {
                 let labels = panel.groups.iter().map(|group| group.label.as_str()).collect();
@@ -299,25 +302,28 @@ mod tests {
             ("mc-act", Some('c'), vec!["mc-act:0.01", "mc-act:0.05"]),
             ("others-1", None, vec!["mc-q:0.1", "no-cloning"]),
         ];
-        assert_eq!(seen, expected.map(|(slug, letter, labels)| (slug.to_owned(), letter, labels)));
+        assert_eq!(
+            actual,
+            expected.map(|(slug, letter, labels)| (slug.to_owned(), letter, labels))
+        );
     }
 
     #[test]
-    fn figures_have_names_of_their_own_and_say_which_of_the_papers_they_are() {
+    fn plots_have_unique_names_and_refer_to_the_papers_figures() {
         let runs = vec![plain("none"), plain("mc-q:0.05"), plain("mc-q:0.1")];
-        let figures = figures(&Comparison::of(runs, Vec::new())).unwrap();
-        let mut names: Vec<&str> = figures.iter().map(|figure| figure.file_name.as_str()).collect();
+        let plots = comparison_plots(&Comparison::of(runs, Vec::new())).unwrap();
+        let mut names: Vec<&str> = plots.iter().map(|plot| plot.file_name.as_str()).collect();
         assert_eq!(names.len(), 10);
         assert_eq!(names[0], "push-2-success-paper-epochs-strategies.svg");
-        assert!(figures[0].title.ends_with("(the paper's Figure 5a)"), "{}", figures[0].title);
-        assert!(figures[8].title.ends_with("(the paper's Figure 6b)"), "{}", figures[8].title);
+        assert!(plots[0].title.ends_with("(the paper's Figure 5a)"), "{}", plots[0].title);
+        assert!(plots[8].title.ends_with("(the paper's Figure 6b)"), "{}", plots[8].title);
         names.sort_unstable();
         names.dedup();
         assert_eq!(names.len(), 10);
     }
 
     #[test]
-    fn one_arm_and_two_from_scratch_share_a_figure() {
+    fn one_and_two_arms_from_scratch_share_a_plot() {
         let mut one_arm = plain("none");
         one_arm.configuration =
             one_arm.configuration.map(|text| text.replace("arms = 2", "arms = 1"));

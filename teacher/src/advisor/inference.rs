@@ -1,14 +1,14 @@
-//! What the teacher's networks say of many steps at once.
+//! Batched inference with the teacher's networks.
 
 use tandem_core::{ArmAdvice, StepQuery};
 
 use crate::error::Error;
 use crate::maps::Maps;
 use crate::policy::TeacherPolicy;
-use crate::procedures::judge_arm;
+use crate::procedures::score_arm;
 
-/// The teacher's networks with the buffers that they work on. A row is one arm of one step.
-pub(super) struct Judge {
+/// The teacher's networks with the buffers of a batch. A row is one arm of one step.
+pub(super) struct TeacherInference {
     policy: Box<dyn TeacherPolicy>,
     /// Every state twice, for the two actions: shape `[2 n, n_observation]`.
     observations: Vec<f32>,
@@ -22,14 +22,7 @@ pub(super) struct Judge {
     q: Vec<f32>,
 }
 
-/// What a [`Judge`] found, row after row.
-pub(super) struct Opinions<'a> {
-    judge: &'a Judge,
-    n_action: usize,
-    next_row: usize,
-}
-
-impl Judge {
+impl TeacherInference {
     pub(super) const fn new(policy: Box<dyn TeacherPolicy>) -> Self {
         Self {
             policy,
@@ -41,19 +34,32 @@ impl Judge {
         }
     }
 
-    /// Looks at every arm of every one of `queries`.
-    pub(super) fn judge<'a>(
+    /// Scores each arm of each of `queries`, with nothing overridden. Returns one result for each query.
+    ///
+    /// # Errors
+    /// Per query: when the networks return a number that is not finite, which no procedure can compare.
+    pub(super) fn score<'a>(
         &mut self,
         maps: &Maps,
-        queries: impl Iterator<Item = &'a StepQuery>,
-    ) -> Opinions<'_> {
-        let n_rows = self.gather(maps, queries);
-        let n_action = self.policy.layout().n_action();
-        self.run(n_rows, n_action);
-        Opinions { judge: self, n_action, next_row: 0 }
+        queries: impl Iterator<Item = &'a StepQuery> + Clone,
+    ) -> Vec<Result<Vec<ArmAdvice>, Error>> {
+        let n_rows = self.gather(maps, queries.clone());
+        self.run(n_rows);
+        let mut next_row = 0;
+        let score = |query: &StepQuery| {
+            let rows = next_row..next_row + maps.of_student(query.proposed_action.len()).len();
+            next_row = rows.end;
+            let arms: Vec<ArmAdvice> = rows.map(|row| self.score_row(row)).collect();
+            if arms.iter().all(is_finite) {
+                Ok(arms)
+            } else {
+                Err(Error::NotFinite { episode: query.episode, step: query.step })
+            }
+        };
+        queries.map(score).collect()
     }
 
-    /// Lays the states and the students' actions out in rows; gives their number.
+    /// Copies the states and the students' actions into rows, and returns their number.
     fn gather<'a>(&mut self, maps: &Maps, queries: impl Iterator<Item = &'a StepQuery>) -> usize {
         self.observations.clear();
         self.goals.clear();
@@ -71,10 +77,10 @@ impl Judge {
         n_rows
     }
 
-    /// One pass of the actor over all states, one of the critic over all states with both actions.
-    fn run(&mut self, n_rows: usize, n_action: usize) {
+    /// Runs the actor once on all states, and the critic once on all states with both actions.
+    fn run(&mut self, n_rows: usize) {
         self.actions.clear();
-        self.actions.resize(n_rows * n_action, 0.0);
+        self.actions.resize(self.student_actions.len(), 0.0);
         self.policy.act(&self.observations, &self.goals, &mut self.actions);
         self.actions.extend_from_slice(&self.student_actions);
         self.observations.extend_from_within(..);
@@ -83,29 +89,14 @@ impl Judge {
         self.q.resize(2 * n_rows, 0.0);
         self.policy.q(&self.observations, &self.goals, &self.actions, &mut self.q);
     }
-}
 
-impl Opinions<'_> {
-    /// What the teacher thinks of every arm of the next query, which is `query`.
-    ///
-    /// # Errors
-    /// When one of its numbers is not finite: no procedure can compare it.
-    pub(super) fn next(&mut self, maps: &Maps, query: &StepQuery) -> Result<Vec<ArmAdvice>, Error> {
-        let first = self.next_row;
-        self.next_row += maps.of_student(query.proposed_action.len()).len();
-        let arms: Vec<ArmAdvice> = (first..self.next_row).map(|row| self.arm(row)).collect();
-        if arms.iter().all(is_finite) {
-            Ok(arms)
-        } else {
-            Err(Error::NotFinite { episode: query.episode, step: query.step })
-        }
-    }
-
-    fn arm(&self, row: usize) -> ArmAdvice {
-        let (of_teacher, of_student) = self.judge.actions.split_at(self.judge.actions.len() / 2);
-        let (q_teacher, q_student) = self.judge.q.split_at(self.judge.q.len() / 2);
-        let action = row * self.n_action..(row + 1) * self.n_action;
-        judge_arm(&of_teacher[action.clone()], &of_student[action], q_teacher[row], q_student[row])
+    fn score_row(&self, row: usize) -> ArmAdvice {
+        let n_action = self.policy.layout().n_action();
+        let (teacher_actions, student_actions) = self.actions.split_at(self.actions.len() / 2);
+        let (q_teacher, q_student) = self.q.split_at(self.q.len() / 2);
+        let action = row * n_action..(row + 1) * n_action;
+        let (teacher, student) = (&teacher_actions[action.clone()], &student_actions[action]);
+        score_arm(teacher, student, q_teacher[row], q_student[row])
     }
 }
 

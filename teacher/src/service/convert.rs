@@ -1,21 +1,21 @@
-//! The teacher's own words as messages.
+//! Conversions between the teacher's types and messages.
 
 use std::ops::Range;
 
 use tandem_core::{StepQuery, Task};
 use tandem_proto::{DecodeError, decode_query, layout_of_query, pb};
 
-use crate::advisor::Profile;
+use crate::advisor::TeacherInfo;
 use crate::budget::{Balance, Lease};
 use crate::maps::ArmMap;
 use crate::strategy::Strategy;
 
-/// Steps that one request may ask about.
+/// The largest number of steps in a request.
 const MAX_STEPS: usize = 1024;
-/// Episodes that one request may name.
+/// The largest number of episodes in a request.
 const MAX_EPISODES: usize = 65_536;
 
-/// The queries of a request by students of `task`.
+/// Decodes the queries of students of `task`.
 pub(super) fn decode_queries(
     steps: Vec<pb::StepQuery>,
     task: Task,
@@ -29,7 +29,7 @@ pub(super) fn decode_queries(
     steps.into_iter().enumerate().map(decode_indexed).collect()
 }
 
-/// Refuses to look at more episodes than a round has.
+/// Refuses a request with more episodes than a round can have.
 pub(super) fn check_episodes(episodes: &[u64]) -> Result<(), DecodeError> {
     check_count("episodes", episodes.len(), MAX_EPISODES)
 }
@@ -41,16 +41,16 @@ fn check_count(field: &str, count: usize, max: usize) -> Result<(), DecodeError>
     Err(DecodeError::new(field, format_args!("at most {max}"), count))
 }
 
-pub(super) fn describe(profile: &Profile) -> pb::DescribeResponse {
-    let layout = profile.layout;
+pub(super) fn describe(info: &TeacherInfo) -> pb::DescribeResponse {
+    let layout = info.layout;
     pb::DescribeResponse {
         task: layout.task.name().to_owned(),
         n_observation_per_arm: index(layout.n_observation()),
         n_goal_per_arm: index(layout.n_goal()),
         n_action_per_arm: index(layout.n_action()),
-        arms: profile.maps.arms().iter().map(encode_map).collect(),
+        arms: info.maps.arms().iter().map(encode_map).collect(),
         strategies: Strategy::NAMES.map(str::to_owned).to_vec(),
-        policy_digest: profile.digest.clone(),
+        policy_digest: info.digest.clone(),
     }
 }
 
@@ -66,7 +66,7 @@ fn encode_map(map: &ArmMap) -> pb::ArmMap {
 }
 
 fn index(index: usize) -> u32 {
-    u32::try_from(index).expect("vectors have some hundred numbers")
+    u32::try_from(index).expect("vectors have a few hundred numbers")
 }
 
 pub(super) fn encode_balance(name: String, balance: &Balance) -> pb::Account {

@@ -1,4 +1,4 @@
-//! A policy for several arms made of copies of one for a single arm.
+//! A policy for several arms that consists of copies of a one-arm policy.
 
 use std::collections::BTreeMap;
 
@@ -10,14 +10,20 @@ use crate::normalizer::NormalizerSnapshot;
 use crate::policy::Policy;
 
 impl Policy {
-    /// A policy for `n_arms` arms in which each arm acts, and is valued, as this policy would do it alone: networks
-    /// `n_arms` times as wide, made of blocks that no weight connects, and a critic head for each arm.
+    /// Creates a policy for `n_arms` arms in which each arm acts, and is valued, as by this one-arm policy.
+    ///
+    /// The networks are `n_arms` times as wide and block-diagonal, and the critic has one head per arm. The metadata is
+    /// empty.
     ///
     /// # Panics
-    /// When this policy is for several arms, its critic has several heads, or [`Policy::check`] would fail.
+    /// If this policy has several arms or critic heads, or if a vector has the wrong length; see [`Policy::check`].
     #[must_use]
-    pub fn copies(&self, n_arms: usize) -> Self {
-        assert_eq!((self.layout.n_arms, self.n_heads), (1, 1), "only one arm can be copied");
+    pub fn replicated(&self, n_arms: usize) -> Self {
+        assert_eq!(
+            (self.layout.n_arms, self.n_heads),
+            (1, 1),
+            "only a one-arm policy can be copied"
+        );
         let layout = Layout::new(self.layout.task, n_arms);
         let (n_hidden, n_heads) = (self.n_hidden * n_arms, n_arms);
         let actor_shape = MlpShape::actor(layout, n_hidden, self.n_hidden_layers);
@@ -49,14 +55,14 @@ impl Policy {
     }
 }
 
-/// Where `arm`'s numbers stand among observation and goal.
+/// Returns the indices of `arm`'s numbers in the concatenation of observation and goal.
 fn state_columns(layout: Layout, arm: ArmIndex) -> Vec<usize> {
     let goals = layout.goal_of(arm).map(|i| layout.n_observation() + i);
     layout.observation_of(arm).chain(goals).collect()
 }
 
-/// Writes a whole network into another as the block of `arm`: its inputs stand in the columns, its outputs in the rows
-/// that `(inputs, outputs)` name.
+/// Writes a network into another one as the block of `arm`. `inputs` are the columns of its inputs in the first layer,
+/// `outputs` the rows of its outputs in the last one.
 fn write_block(
     (source_shape, source): (&MlpShape, &[f32]),
     (shape, parameters): (&MlpShape, &mut [f32]),
@@ -123,28 +129,28 @@ mod tests {
     }
 
     #[test]
-    fn each_arm_acts_and_is_valued_as_the_one_arm_would() {
+    fn each_arm_acts_and_is_valued_as_by_the_one_arm_policy() {
         let one = one_arm();
-        let both = one.copies(2);
+        let both = one.replicated(2);
         both.check().unwrap();
         let mut rng = episode_rng(6, 0, Stream::Initialisation);
         let mut draw = |n: usize| (0..n).map(|_| uniform(&mut rng, -1.0, 1.0)).collect::<Vec<_>>();
         let layout = both.layout;
         let (observation, goal) = (draw(layout.n_observation()), draw(layout.n_goal()));
-        let given = draw(layout.n_action());
+        let actions_taken = draw(layout.n_action());
 
         let (mut acting, mut valuing) = (both.actor().unwrap(), both.critic().unwrap());
         let mut actions = vec![0.0; layout.n_action()];
         acting.act(&observation, &goal, &mut actions);
         let mut values = vec![0.0; 2];
-        valuing.q(&observation, &goal, &given, &mut values);
+        valuing.q(&observation, &goal, &actions_taken, &mut values);
         for arm in layout.arms() {
             let (observation, goal) =
                 (&observation[layout.observation_of(arm)], &goal[layout.goal_of(arm)]);
             let mut action = vec![0.0; LAYOUT.n_action()];
             one.actor().unwrap().act(observation, goal, &mut action);
             let mut value = vec![0.0];
-            let alone = &given[layout.action_of(arm)];
+            let alone = &actions_taken[layout.action_of(arm)];
             one.critic().unwrap().q(observation, goal, alone, &mut value);
             for (got, expected) in actions[layout.action_of(arm)].iter().zip(&action) {
                 assert!((got - expected).abs() < 1e-5, "arm {arm:?}: {got} against {expected}");

@@ -1,4 +1,4 @@
-//! Exclusive ownership of a ledger's file, and the check that the file is still in its place.
+//! Exclusive ownership of a ledger's file, and the check that the path still leads to it.
 
 use std::collections::BTreeSet;
 use std::fs::{File, Metadata};
@@ -14,53 +14,53 @@ use nix::libc;
 use crate::ledger::OpenError;
 
 /// The byte that the owner of a file locks. It lies beyond the data of any database and beyond the bytes that SQLite
-/// locks, so that the locks do not conflict where the system keeps them together, as NFS does.
+/// locks, so that the locks do not conflict on systems such as NFS that do not distinguish their kinds.
 const LOCKED_BYTE: i64 = 1 << 62;
 
-/// The ledgers that this process holds.
+/// The ledger files that this process has open.
 ///
 /// SQLite's own locks are POSIX locks: the system releases them as soon as the process closes any descriptor of the
 /// file. A second attempt to open a ledger in one process is therefore refused before it opens the file.
 static HELD: Mutex<BTreeSet<FileId>> = Mutex::new(BTreeSet::new());
 
-/// A file, whatever its names.
+/// The identity of a file, independent of its names.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 struct FileId {
     device: u64,
     inode: u64,
 }
 
-/// Exclusive ownership of a ledger's file, from any process and by any name, until this is dropped or the process
-/// ends. The lock is on the file itself, so deleting other files does not release it.
+/// Exclusive ownership of a ledger's file, under all its names and against all processes, until the value is dropped or
+/// the process ends. The lock is on the file itself, so deleting other files does not release it.
 #[derive(Debug)]
-pub(super) struct Hold {
+pub(super) struct FileLock {
     id: FileId,
-    /// As it was given, made absolute.
+    /// The given path, made absolute.
     path: PathBuf,
-    /// Without symbolic links: where SQLite puts its own files beside the database.
+    /// The path without symbolic links. SQLite creates its own files beside it.
     resolved: PathBuf,
     /// SQLite's write-ahead log, once it exists.
     log: Option<FileId>,
-    /// Has the lock.
+    /// The open file that has the lock.
     file: File,
 }
 
-/// Why nothing more is written to a ledger.
+/// The reason why no further transaction is written to a file.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub(super) enum Displaced {
-    /// The path leads to no file or to another one.
+    /// The path no longer leads to the file.
     #[error(
         "the file was deleted, moved or replaced while in use: put it back and restart the teacher"
     )]
     Database,
-    /// The same is true of the write-ahead log, while the database is in its place.
+    /// The path of the write-ahead log no longer leads to the log.
     #[error("its -wal file was deleted, moved or replaced while in use: restart the teacher")]
     Log,
 }
 
-impl Hold {
-    /// Takes the file at `path`, which is made when there is none.
-    pub(super) fn take(path: &Path) -> Result<Self, OpenError> {
+impl FileLock {
+    /// Locks the file at `path`, which is created if it does not exist.
+    pub(super) fn acquire(path: &Path) -> Result<Self, OpenError> {
         let failed = |source| open_failed(path, source);
         // A name such as ":memory:" is a file too.
         let absolute = std::path::absolute(path).map_err(failed)?;
@@ -88,17 +88,17 @@ impl Hold {
         Ok(Self { id, path: absolute, resolved, log: None, file })
     }
 
-    /// The path to give to SQLite.
-    pub(super) fn resolved(&self) -> &Path {
+    /// Returns the path for SQLite.
+    pub(super) fn resolved_path(&self) -> &Path {
         &self.resolved
     }
 
-    /// Notes the write-ahead log, which SQLite has made by now.
-    pub(super) fn note_log(&mut self) {
+    /// Remembers the identity of the write-ahead log, which SQLite has created by now.
+    pub(super) fn remember_log(&mut self) {
         self.log = FileId::at(&self.log_path());
     }
 
-    /// Checks that the path still leads to the file, and SQLite's name for the log to the log.
+    /// Checks that the paths of the file and of its write-ahead log still lead to them.
     pub(super) fn check_in_place(&self) -> Result<(), Displaced> {
         if FileId::at(&self.path) != Some(self.id) {
             return Err(Displaced::Database);
@@ -116,8 +116,8 @@ impl Hold {
     }
 }
 
-impl Drop for Hold {
-    /// Releases the lock. Closing the file is not enough while a process that was just forked has a copy of it.
+impl Drop for FileLock {
+    /// Releases the lock explicitly: closing the file does not release it while a forked process has a copy of it.
     fn drop(&mut self) {
         if let Err(error) = fcntl(&self.file, FcntlArg::F_OFD_SETLK(&byte_lock(libc::F_UNLCK))) {
             tracing::warn!(%error, path = ?self.path, "the lock on the ledger is not released");
@@ -131,13 +131,13 @@ impl FileId {
         Self { device: metadata.dev(), inode: metadata.ino() }
     }
 
-    /// The file that `path` leads to, if any.
+    /// Returns the file that `path` leads to, if any.
     fn at(path: &Path) -> Option<Self> {
         std::fs::metadata(path).ok().as_ref().map(Self::of)
     }
 }
 
-/// Refuses what is no regular file, and a file that this process holds already.
+/// Refuses anything but a regular file, and a file that this process has open already.
 fn check_free(metadata: &Metadata, held: &BTreeSet<FileId>, path: &Path) -> Result<(), OpenError> {
     let bad_path = |what: &str| OpenError::BadPath { path: path.into(), what: what.to_owned() };
     if metadata.is_dir() {
@@ -152,7 +152,7 @@ fn check_free(metadata: &Metadata, held: &BTreeSet<FileId>, path: &Path) -> Resu
     Ok(())
 }
 
-/// Refuses a file with several names: SQLite's log lies beside one of them and is not found by another.
+/// Refuses a file with several names: SQLite's log lies beside one of them and is not found under another.
 fn check_names(metadata: &Metadata, path: &Path) -> Result<(), OpenError> {
     if metadata.nlink() <= 1 {
         return Ok(());
@@ -162,7 +162,7 @@ fn check_names(metadata: &Metadata, path: &Path) -> Result<(), OpenError> {
     Err(OpenError::BadPath { path: path.to_owned(), what })
 }
 
-/// Locks one byte with a lock that belongs to `file`, not to the process.
+/// Locks one byte with a lock that belongs to `file` instead of the process.
 fn lock(file: &File, path: &Path) -> Result<(), OpenError> {
     match fcntl(file, FcntlArg::F_OFD_SETLK(&byte_lock(libc::F_WRLCK))) {
         Ok(_) => Ok(()),
@@ -182,7 +182,7 @@ fn byte_lock(kind: i32) -> libc::flock {
     }
 }
 
-/// What an error of the system's means for somebody who opens the ledger `path`.
+/// Maps an error of the system to the reason why the ledger at `path` cannot be opened.
 fn open_failed(path: &Path, source: io::Error) -> OpenError {
     let path = path.to_owned();
     let what = match source.kind() {
@@ -207,11 +207,11 @@ mod tests {
     fn a_ledger_is_free_at_once_although_a_forked_process_has_a_copy_of_its_file() {
         let directory = tempfile::tempdir().expect("a directory");
         let path = directory.path().join("ledger.sqlite");
-        let hold = Hold::take(&path).expect("free");
-        let copy = hold.file.try_clone().expect("a copy");
-        assert!(matches!(Hold::take(&path), Err(OpenError::InUse(_))));
-        drop(hold);
-        assert!(Hold::take(&path).is_ok(), "free again");
+        let lock = FileLock::acquire(&path).expect("free");
+        let copy = lock.file.try_clone().expect("a copy");
+        assert!(matches!(FileLock::acquire(&path), Err(OpenError::InUse(_))));
+        drop(lock);
+        assert!(FileLock::acquire(&path).is_ok(), "free again");
         drop(copy);
     }
 
@@ -223,6 +223,6 @@ mod tests {
         let other = File::create(&path).expect("a file");
         let agreed = libc::flock { l_start: 0x4000_0000_0000_0000, ..byte_lock(libc::F_WRLCK) };
         fcntl(&other, FcntlArg::F_OFD_SETLK(&agreed)).expect("locked");
-        assert!(matches!(Hold::take(&path), Err(OpenError::InUse(_))));
+        assert!(matches!(FileLock::acquire(&path), Err(OpenError::InUse(_))));
     }
 }

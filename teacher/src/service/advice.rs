@@ -1,4 +1,4 @@
-//! Answers to requests for advice, one by one and as a stream.
+//! The calls `Advise` and `AdviseStream`.
 
 use std::pin::Pin;
 use std::task::{Context, Poll};
@@ -8,46 +8,46 @@ use tokio_stream::{Stream, StreamExt as _};
 use tokio_util::sync::{CancellationToken, WaitForCancellationFutureOwned};
 use tonic::{Status, Streaming};
 
-use super::messages::decode_queries;
+use super::convert::decode_queries;
 use super::status;
 use super::thread::AdvisorHandle;
-use crate::advisor::{Advice, Question};
+use crate::advisor::{Advice, AdviceRequest};
 use crate::error::Error;
 
-/// Answers in the order of their requests.
-pub(super) type AnswerStream =
+/// The responses of a stream, in the order of their requests.
+pub(super) type AdviceStream =
     Pin<Box<dyn Stream<Item = Result<pb::AdviseResponse, Status>> + Send>>;
 
-/// The answer to one request.
-pub(super) async fn answer(
+/// Answers one request.
+pub(super) async fn advise(
     advisor: &AdvisorHandle,
     request: pb::AdviseRequest,
 ) -> Result<pb::AdviseResponse, Status> {
-    let question = decode(advisor, request).map_err(|error| status(&error))?;
-    let advice = advisor.advise(question).await;
+    let request = decode(advisor, request).map_err(|error| status(&error))?;
+    let advice = advisor.advise(request).await;
     advice.map(|advice| encode(&advice)).map_err(|error| status(&error))
 }
 
-/// The answers to `requests`, one at a time as they are read: flow control bounds what waits on either side.
+/// Answers `requests` one at a time, as they are read. Flow control bounds the number of pending messages.
 ///
-/// A call ends with its first error: after a request that cannot be answered, and, once `shutdown` is cancelled, after
-/// the answer that is under way.
-pub(super) fn answer_all(
+/// The stream ends with its first error: after a refused request, or, once `shutdown` is cancelled, after the pending
+/// answer.
+pub(super) fn advise_stream(
     advisor: AdvisorHandle,
     requests: Streaming<pb::AdviseRequest>,
     shutdown: CancellationToken,
-) -> AnswerStream {
+) -> AdviceStream {
     let requests = UntilCancelled { requests, cancelled: Box::pin(shutdown.cancelled_owned()) };
     Box::pin(requests.then(move |request| {
         let advisor = advisor.clone();
-        async move { answer(&advisor, request?).await }
+        async move { advise(&advisor, request?).await }
     }))
 }
 
-fn decode(advisor: &AdvisorHandle, request: pb::AdviseRequest) -> Result<Question, Error> {
+fn decode(advisor: &AdvisorHandle, request: pb::AdviseRequest) -> Result<AdviceRequest, Error> {
     let account = decode_account_name("account", request.account)?;
-    let queries = decode_queries(request.steps, advisor.profile().layout.task)?;
-    Ok(Question { account, queries })
+    let queries = decode_queries(request.steps, advisor.info().layout.task)?;
+    Ok(AdviceRequest { account, queries })
 }
 
 fn encode(advice: &Advice) -> pb::AdviseResponse {
@@ -57,7 +57,7 @@ fn encode(advice: &Advice) -> pb::AdviseResponse {
     }
 }
 
-/// Requests until the service shall end, so that a client that keeps its stream open does not keep the service alive.
+/// Requests until shutdown, so that a client with an open stream does not keep the service alive.
 struct UntilCancelled {
     requests: Streaming<pb::AdviseRequest>,
     cancelled: Pin<Box<WaitForCancellationFutureOwned>>,

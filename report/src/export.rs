@@ -1,21 +1,23 @@
-//! A comparison for programs: JSON and CSV.
+//! Export of a comparison as JSON and CSV.
 
 use serde_json::{Value, json};
 use tandem_core::Wilson;
 use tandem_telemetry::MetricsRow;
 
 use crate::comparison::{Comparison, Section};
-use crate::group::{Group, MILESTONES, Spread};
+use crate::group::{MILESTONES, SeedGroup, Spread};
 use crate::measures::{LearningMeasures, first_reaching};
 use crate::run::Run;
 
-/// Heads of the columns of [`csv`]. Steps are environment steps, epochs the paper's; shares are in [0, 1].
+/// Header of [`csv`]. Steps are environment steps, epochs are the paper's, shares are in [0, 1].
+///
+/// The columns `held_out_*` are the evaluation on test goals.
 pub const CSV_HEADER: &str = "task,arms,group,strategy,run,seed,evaluations,env_steps,wall_s,inspired_epoch,rise_epochs,max_success,\
      effective_learning_rate,env_steps_to_50,env_steps_to_90,env_steps_to_95,minutes_to_50,minutes_to_90,minutes_to_95,\
      advice_spent,last_success,last_low,last_high,collision_rate,held_out_success,held_out_low,held_out_high,\
      held_out_collision_rate";
 
-/// One line a run; a figure that does not exist is empty.
+/// Returns a comparison as CSV with one line per run. Values that do not exist are empty.
 #[must_use]
 pub fn csv(comparison: &Comparison) -> String {
     let mut text = format!("{CSV_HEADER}\n");
@@ -32,32 +34,32 @@ pub fn csv(comparison: &Comparison) -> String {
     text
 }
 
-fn run_cells(group: &Group, run: &Run) -> Vec<String> {
-    let written = |value: Option<f64>| {
+fn run_cells(group: &SeedGroup, run: &Run) -> Vec<String> {
+    let number = |value: Option<f64>| {
         value.filter(|v| v.is_finite()).map(|v| v.to_string()).unwrap_or_default()
     };
     let count = |value: Option<u64>| value.map(|v| v.to_string()).unwrap_or_default();
     let measures = Some(LearningMeasures::of(&run.rows)).filter(|_| !run.rows.is_empty());
     let last = run.last();
-    let held_out = run.held_out.as_ref();
+    let test = run.test.as_ref();
     let mut cells = vec![
-        group.subject.task.map_or_else(String::new, |task| task.name().to_owned()),
-        count(group.subject.n_arms),
+        group.setup.task.map_or_else(String::new, |task| task.name().to_owned()),
+        count(group.setup.n_arms),
         group.label.clone(),
         group.strategy.clone().unwrap_or_default(),
         run.name.clone(),
         count(run.seed()),
         run.rows.len().to_string(),
         count(last.map(|row| row.env_steps)),
-        written(last.map(|row| row.wall_s)),
-        written(measures.and_then(|measures| measures.inspired_epoch)),
-        written(measures.and_then(|measures| measures.rising_epochs)),
-        written(measures.map(|measures| measures.max_success)),
-        written(measures.and_then(|measures| measures.learning_rate)),
+        number(last.map(|row| row.wall_s)),
+        number(measures.and_then(|measures| measures.inspired_epoch)),
+        number(measures.and_then(|measures| measures.rising_epochs)),
+        number(measures.map(|measures| measures.max_success)),
+        number(measures.and_then(|measures| measures.learning_rate)),
     ];
     let reached = MILESTONES.map(|success| first_reaching(&run.rows, success));
     cells.extend(reached.map(|row| count(row.map(|row| row.env_steps))));
-    cells.extend(reached.map(|row| written(row.map(|row| row.wall_s / 60.0))));
+    cells.extend(reached.map(|row| number(row.map(|row| row.wall_s / 60.0))));
     cells.push(count(last.map(|row| row.advice_spent)));
     let of_last: [fn(&MetricsRow) -> f64; 4] = [
         |row| row.success,
@@ -65,17 +67,17 @@ fn run_cells(group: &Group, run: &Run) -> Vec<String> {
         |row| row.success_high,
         |row| row.collision_rate,
     ];
-    cells.extend(of_last.map(|figure| written(last.map(figure))));
+    cells.extend(of_last.map(|value| number(last.map(value))));
     cells.extend([
-        written(held_out.map(|measured| measured.success)),
-        written(held_out.map(|measured| measured.interval.0)),
-        written(held_out.map(|measured| measured.interval.1)),
-        written(held_out.map(|measured| measured.collision_rate)),
+        number(test.map(|test| test.success)),
+        number(test.map(|test| test.interval.0)),
+        number(test.map(|test| test.interval.1)),
+        number(test.map(|test| test.collision_rate)),
     ]);
     cells
 }
 
-/// A cell as CSV wants it.
+/// Quotes a cell if CSV requires it.
 fn quoted(cell: &str) -> String {
     match cell.contains([',', '"', '\n']) {
         true => format!("\"{}\"", cell.replace('"', "\"\"")),
@@ -83,7 +85,9 @@ fn quoted(cell: &str) -> String {
     }
 }
 
-/// A comparison as one JSON object: `sections`, each with `groups` and `baselines`.
+/// Returns a comparison as one JSON object: `sections`, each with `groups` and `baselines`.
+///
+/// The key `held_out_success` is the success on test goals.
 #[must_use]
 pub fn json(comparison: &Comparison) -> Value {
     json!({ "sections": comparison.sections.iter().map(section_json).collect::<Vec<_>>() })
@@ -91,23 +95,23 @@ pub fn json(comparison: &Comparison) -> Value {
 
 fn section_json(section: &Section) -> Value {
     let baselines = section.baselines.iter().map(|baseline| {
-        let measured = &baseline.held_out;
+        let test = &baseline.test;
         json!({
-            "label": baseline.label, "episodes": measured.n_episodes, "success": measured.success,
-            "success_low": measured.interval.0, "success_high": measured.interval.1,
-            "success_joint": measured.success_joint, "collision_rate": measured.collision_rate,
+            "label": baseline.label, "episodes": test.n_episodes, "success": test.success,
+            "success_low": test.interval.0, "success_high": test.interval.1,
+            "success_joint": test.success_joint, "collision_rate": test.collision_rate,
         })
     });
     json!({
-        "task": section.subject.task.map(tandem_core::Task::name),
-        "arms": section.subject.n_arms,
+        "task": section.setup.task.map(tandem_core::Task::name),
+        "arms": section.setup.n_arms,
         "groups": section.groups.iter().map(group_json).collect::<Vec<_>>(),
         "baselines": baselines.collect::<Vec<_>>(),
     })
 }
 
-fn group_json(group: &Group) -> Value {
-    let paper = group.paper().zip(group.subject.task).map(|(row, task)| {
+fn group_json(group: &SeedGroup) -> Value {
+    let paper = group.paper().zip(group.setup.task).map(|(row, task)| {
         let measures = row.measures(task);
         json!({
             "row": row.name, "inspired_epoch": measures.inspired_epoch, "rise_epochs": measures.rising_epochs,
@@ -136,7 +140,7 @@ fn group_json(group: &Group) -> Value {
         "last_success": share_json(group, |run| run.last().map(|row| (row.success, row.n_episodes))),
         "best_success": share_json(group, |run| run.best().map(|row| (row.success, row.n_episodes))),
         "held_out_success": share_json(group, |run| {
-            run.held_out.as_ref().map(|measured| (measured.success, measured.n_episodes))
+            run.test.as_ref().map(|test| (test.success, test.n_episodes))
         }),
         "collision_rate": share_json(group, |run| {
             run.last().map(|row| (row.collision_rate, row.n_episodes))
@@ -144,7 +148,7 @@ fn group_json(group: &Group) -> Value {
     })
 }
 
-/// `null` where no run has the figure.
+/// Returns a spread as JSON; `null` if no run has the value.
 fn spread_json(spread: &Spread) -> Value {
     match spread.n {
         0 => Value::Null,
@@ -152,7 +156,7 @@ fn spread_json(spread: &Spread) -> Value {
     }
 }
 
-fn share_json(group: &Group, pick: impl Fn(&Run) -> Option<(f64, u64)>) -> Value {
+fn share_json(group: &SeedGroup, pick: impl Fn(&Run) -> Option<(f64, u64)>) -> Value {
     let (spread, interval) = group.share(pick);
     let mut value = spread_json(&spread);
     if let (Some(object), Some(Wilson { low, high })) = (value.as_object_mut(), interval) {
@@ -181,7 +185,7 @@ mod tests {
             configuration: Some(
                 "task = \"push\"\narms = 2\nseed = 3\n[advice]\nstrategy = \"ea\"".to_owned(),
             ),
-            held_out: None,
+            test: None,
         };
         Comparison::of(
             vec![run, Run { name: "push-empty-seed1".to_owned(), ..Run::default() }],
@@ -190,7 +194,7 @@ mod tests {
     }
 
     #[test]
-    fn every_csv_line_has_a_cell_for_every_column() {
+    fn every_csv_line_has_a_cell_in_every_column() {
         let text = csv(&comparison());
         let lines: Vec<&str> = text.lines().collect();
         let n_columns = lines[0].split(',').count();
@@ -203,7 +207,7 @@ mod tests {
     }
 
     #[test]
-    fn json_has_null_for_what_no_run_reached() {
+    fn a_milestone_that_no_run_reached_is_null_in_json() {
         let value = json(&comparison());
         let group = &value["sections"][0]["groups"][0];
         assert_eq!(group["milestones"][0]["env_steps"]["mean"], 2000.0);

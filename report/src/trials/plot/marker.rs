@@ -1,75 +1,76 @@
-//! The signs of a picture, in it and in its legend.
+//! Markers of a trial's plot and of its legend.
 
 use plotters::prelude::RGBColor;
 
 use crate::curve::INK;
 use crate::scene::arm_color;
 
-/// Dashes of what was planned.
+/// Dash pattern of planned paths.
 const DASHES: &str = "5 3";
 
-/// A sign and what it means.
+/// A marker or line style.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Glyph {
-    /// The colour of an arm.
+pub(super) enum Marker {
+    /// Colour of an arm.
     Arm(usize),
-    /// The way that a motion had for a tool.
+    /// Planned path of a tool.
     Planned,
-    /// The way that a tool took.
+    /// Measured path of a tool.
     Measured,
-    /// Where a tool was when a trial failed.
+    /// Position of a tool when the trial failed.
     Stopped,
-    /// Where a tool was when a trial succeeded.
+    /// Position of a tool at the end of a successful trial.
     End,
-    /// Where an object lay at first.
+    /// Initial position of an object.
     ObjectStart,
-    /// Where an object ended.
+    /// Final position of an object.
     ObjectEnd,
-    /// A goal, and what is near enough to it.
+    /// A goal and its tolerance.
     Goal,
 }
 
-impl Glyph {
-    /// Its name in the legend.
+impl Marker {
+    /// Returns the name in the legend.
     pub(super) fn name(self) -> String {
         match self {
             Self::Arm(arm) => return format!("arm {arm}"),
             Self::Planned => "tool, planned",
             Self::Measured => "tool, measured",
-            Self::Stopped => "tool, where it stopped",
+            Self::Stopped => "tool, when the trial failed",
             Self::End => "tool, at the end",
-            Self::ObjectStart => "object, at first",
+            Self::ObjectStart => "object, at the start",
             Self::ObjectEnd => "object, at the end",
-            Self::Goal => "goal, 5 cm round it",
+            Self::Goal => "goal, 5 cm around it",
         }
         .to_owned()
     }
 
-    /// The sign in an arm's colour round (`x`, `y`), pixels.
-    pub(super) fn of_arm(self, arm: usize, x: f64, y: f64) -> String {
-        self.drawn(&arm_color(arm, 1.0), &arm_color(arm, 0.55), x, y)
+    /// Draws the marker of an arm at (`x`, `y`), pixels.
+    pub(super) fn svg(self, arm: usize, x: f64, y: f64) -> String {
+        self.shape(&arm_color(arm, 1.0), &arm_color(arm, 0.55), x, y)
     }
 
-    /// The sign as the legend has it.
-    pub(super) fn at(self, x: f64, y: f64) -> String {
+    /// Draws the marker of the legend at (`x`, `y`), pixels.
+    pub(super) fn legend_svg(self, x: f64, y: f64) -> String {
         let ink = hex(INK);
         match self {
-            Self::Arm(arm) => self.drawn(&arm_color(arm, 1.0), &ink, x, y),
+            Self::Arm(arm) => self.shape(&arm_color(arm, 1.0), &ink, x, y),
             Self::Planned | Self::Measured => {
                 let (from, to) = (x - 8.5, x + 6.5);
                 let stroke = self.stroke_of(&ink, &ink);
                 format!(r#"<line x1="{from:.1}" y1="{y:.1}" x2="{to:.1}" y2="{y:.1}" {stroke}/>"#)
             }
-            _ => self.drawn(&ink, &ink, x, y),
+            _ => self.shape(&ink, &ink, x, y),
         }
     }
 
-    /// The attributes of an arm's line.
+    /// Returns the stroke attributes of an arm's path.
     pub(super) fn stroke(self, arm: usize) -> String {
         self.stroke_of(&arm_color(arm, 1.0), &arm_color(arm, 0.55))
     }
 
-    /// What was planned is drawn upon what was measured: darker, thinner and with gaps, both are seen where they are one.
+    /// Planned paths are drawn over measured ones: darker, thinner and dashed, so that both are visible where they
+    /// coincide.
     fn stroke_of(self, color: &str, dark: &str) -> String {
         match self {
             Self::Planned => {
@@ -79,15 +80,15 @@ impl Glyph {
         }
     }
 
-    fn drawn(self, color: &str, dark: &str, x: f64, y: f64) -> String {
-        let square = |half_px: f64, look: &str| {
+    fn shape(self, color: &str, dark: &str, x: f64, y: f64) -> String {
+        let square = |half_px: f64, style: &str| {
             let (left, top, edge) = (x - half_px, y - half_px, 2.0 * half_px);
             format!(
-                r#"<rect x="{left:.1}" y="{top:.1}" width="{edge:.1}" height="{edge:.1}" {look}/>"#
+                r#"<rect x="{left:.1}" y="{top:.1}" width="{edge:.1}" height="{edge:.1}" {style}/>"#
             )
         };
-        let circle = |radius_px: f64, look: &str| {
-            format!(r#"<circle cx="{x:.1}" cy="{y:.1}" r="{radius_px:.1}" {look}/>"#)
+        let circle = |radius_px: f64, style: &str| {
+            format!(r#"<circle cx="{x:.1}" cy="{y:.1}" r="{radius_px:.1}" {style}/>"#)
         };
         match self {
             Self::Arm(_) => square(6.0, &format!(r#"fill="{color}""#)),
@@ -114,6 +115,7 @@ impl Glyph {
     }
 }
 
+/// Formats a colour for SVG.
 pub(super) fn hex(RGBColor(red, green, blue): RGBColor) -> String {
     format!("#{red:02x}{green:02x}{blue:02x}")
 }
