@@ -1,4 +1,4 @@
-//! Tokens and certificates, from the files that the command line names.
+//! Tokens and certificates from the files that the command line names.
 
 use std::path::Path;
 
@@ -9,7 +9,7 @@ use crate::cli::{DialArgs, ListenArgs, SecretArgs};
 use crate::exit::{Exit, Failed, OrExit as _};
 use crate::input;
 
-/// Who may call the service; refuses an address that others can reach and nothing protects.
+/// Returns the access rules of a service; rejects an unprotected address that other machines can reach.
 pub(crate) fn gate(listen: &ListenArgs, secret: &SecretArgs) -> Result<ServerConfig, Failed> {
     let mut gate = ServerConfig::default();
     if let Some(token) = token(secret)? {
@@ -25,22 +25,22 @@ pub(crate) fn gate(listen: &ListenArgs, secret: &SecretArgs) -> Result<ServerCon
     }
     if is_exposed(listen.listen) && secret.token_file.is_some() && gate.is_plain() {
         let address = listen.listen;
-        warn!(%address, "without --tls-cert the network can read all that is said, the token included");
+        warn!(%address, "without --tls-cert, others on the network can read all messages and the token");
     }
     Ok(gate)
 }
 
-/// How other services are called.
+/// Returns how to call other services.
 pub(crate) fn dial(args: &DialArgs, secret: &SecretArgs) -> Result<ClientConfig, Failed> {
-    let calls = trusting(args)?;
+    let calls = dial_without_token(args)?;
     Ok(match token(secret)? {
         Some(token) => calls.with_token(&token),
         None => calls,
     })
 }
 
-/// How services are called that want no token.
-pub(crate) fn trusting(args: &DialArgs) -> Result<ClientConfig, Failed> {
+/// Returns how to call services that require no token.
+pub(crate) fn dial_without_token(args: &DialArgs) -> Result<ClientConfig, Failed> {
     let Some(authority) = &args.tls_ca else { return Ok(ClientConfig::default()) };
     let what = || format!("cannot trust --tls-ca {authority:?}");
     ClientConfig::default().with_authority(&read(authority)?).or_exit(Exit::Usage, what)
@@ -58,7 +58,7 @@ fn token(secret: &SecretArgs) -> Result<Option<Token>, Failed> {
     Ok(Some(token))
 }
 
-/// Whether the file's mode lets everybody read it.
+/// Returns whether the mode of the file lets all users read it.
 #[cfg(unix)]
 fn is_readable_by_all(path: &Path) -> bool {
     use std::os::unix::fs::PermissionsExt as _;

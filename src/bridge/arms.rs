@@ -1,4 +1,4 @@
-//! Which arms stand behind a bridge: the one place that makes drivers.
+//! The arms of a bridge. Only this module creates drivers.
 
 use std::sync::Arc;
 
@@ -9,11 +9,12 @@ use tandem_bridge::{DriverError, Executor, Settings, SimulatedConfig, SimulatedP
 use crate::cli::{BridgeServeArgs, DriverName};
 use crate::exit::{Exit, Failed, OrExit as _};
 
-/// How high above its workspace a simulated tool is at first, metres, and how far its gripper is open.
+/// Initial height of a simulated tool above its workspace, metres.
 const READY_M: f64 = 0.05;
+/// Initial opening of a simulated gripper, 0 to 1.
 const READY_OPENING: f64 = 0.5;
 
-/// What clients are told of the driver.
+/// Returns the name of the driver that clients see.
 pub(crate) const fn name(driver: DriverName) -> &'static str {
     match driver {
         DriverName::Sim => "sim",
@@ -25,8 +26,7 @@ pub(crate) const fn name(driver: DriverName) -> &'static str {
 /// Connects to real arms at an address.
 type Connect = fn(&str) -> Result<AnyDriver, DriverError>;
 
-/// The arms that the command line asks for, behind what lets checked motions through only, and how to connect to them again.
-/// Simulated arms do not lose their connection.
+/// Creates the executor of the arms and, for real arms, a function that reconnects to them.
 pub(crate) fn arms(
     args: &BridgeServeArgs,
     time: Arc<dyn Time>,
@@ -49,7 +49,7 @@ fn executor(driver: AnyDriver, settings: Settings) -> Result<Executor<AnyDriver>
     Executor::new(mico_cell(), driver, settings).or_exit(Exit::Bug, String::new)
 }
 
-/// A simulated pair in real time, its tools above their workspaces.
+/// Creates a simulated pair in real time, with its tools above their workspaces.
 fn simulated(seed: u64, time: Arc<dyn Time>) -> Result<AnyDriver, Failed> {
     let cell = mico_cell();
     let at = cell.ready(READY_M).or_exit(Exit::Bug, String::new)?;
@@ -58,7 +58,7 @@ fn simulated(seed: u64, time: Arc<dyn Time>) -> Result<AnyDriver, Failed> {
     Ok(Box::new(Paced::new(pair, time)))
 }
 
-/// Arms behind a Simulink model.
+/// Returns how to connect to arms behind a Simulink model.
 fn quarc() -> Result<(Connect, Settings), Failed> {
     use tandem_bridge::quarc::{QuarcConfig, QuarcDriver};
     fn connect(address: &str) -> Result<AnyDriver, DriverError> {
@@ -67,7 +67,7 @@ fn quarc() -> Result<(Connect, Settings), Failed> {
     Ok((connect, Settings::default()))
 }
 
-/// Arms behind Kinova's ROS driver.
+/// Returns how to connect to arms behind Kinova's ROS driver.
 fn kinova_ros() -> Result<(Connect, Settings), Failed> {
     use tandem_bridge::kinova_ros::{KinovaRosConfig, KinovaRosDriver, settings};
     fn connect(address: &str) -> Result<AnyDriver, DriverError> {

@@ -1,8 +1,40 @@
-//! `tandem bench scale`: how many workers one learner holds.
+//! The command line of `tandem bench`.
 
 use std::path::PathBuf;
 
-use clap::Args;
+use clap::{Args, ValueEnum};
+
+#[derive(Debug, Args)]
+#[command(after_help = "\
+Examples:
+  tandem bench                   all but scale, about two minutes
+  tandem bench sim update --json
+  tandem bench scale             number of workers that one learner serves, about two minutes
+  tandem bench scale --workers 0 --idle 1000 --join-leave 100")]
+pub(crate) struct BenchArgs {
+    /// Benchmarks to run [default: all but scale].
+    #[arg(value_enum)]
+    pub(crate) what: Vec<BenchName>,
+    /// Prints one JSON object per line: name, value, unit.
+    #[arg(long)]
+    pub(crate) json: bool,
+    #[command(flatten)]
+    pub(crate) scale: ScaleArgs,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub(crate) enum BenchName {
+    Sim,
+    Inference,
+    Update,
+    Replay,
+    /// The teacher service, compared with an echo service of the same messages.
+    Teacher,
+    /// A short training run with all its processes.
+    EndToEnd,
+    /// One learner with increasing numbers of workers, real and idle ones.
+    Scale,
+}
 
 #[derive(Debug, Clone, Args)]
 #[command(next_help_heading = "Options of scale")]
@@ -39,7 +71,7 @@ pub(crate) struct ScaleArgs {
     pub(crate) program: Option<PathBuf>,
 }
 
-/// A time from 10 milliseconds to 10 minutes.
+/// Parses a number of seconds from 0.01 to 600.
 fn seconds_a_slot(text: &str) -> Result<f64, String> {
     let seconds = text.parse::<f64>().ok().filter(|seconds| (0.01..=600.0).contains(seconds));
     seconds.ok_or_else(|| "expected seconds, 0.01 to 600".to_owned())

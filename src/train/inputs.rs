@@ -1,7 +1,6 @@
-//! What a run's processes read: the settings and the teacher of this start.
+//! Files that the processes of a run read: copies of the settings and of the teacher.
 //!
-//! A process that is started again reads what its predecessor read, whatever has become of `run.toml` and of the
-//! teacher's file meanwhile.
+//! A restarted process reads the same copies, even if `run.toml` or the teacher's file has changed since.
 
 use std::path::{Path, PathBuf};
 
@@ -9,29 +8,29 @@ use super::plan::Plan;
 use crate::exit::{Exit, Failed, OrExit as _};
 use crate::run_file;
 
-/// Files in the run directory that belong to one start; removed with this value.
+/// The copies of one start, in the subdirectory `in-use`. Dropping this value removes them.
 #[derive(Debug)]
-pub(super) struct InUse {
+pub(super) struct RunInputs {
     directory: PathBuf,
 }
 
-impl InUse {
-    /// Writes the files; the caller holds the run directory's lock.
+impl RunInputs {
+    /// Writes the copies. The caller holds the lock on the run directory.
     pub(super) fn write(plan: &Plan) -> Result<Self, Failed> {
-        let in_use = Self { directory: directory(&plan.out) };
+        let inputs = Self { directory: directory(&plan.out) };
         let failed = || format!("cannot write to {}", plan.out.display());
-        std::fs::create_dir_all(&in_use.directory).or_exit(Exit::TryAgain, failed)?;
+        std::fs::create_dir_all(&inputs.directory).or_exit(Exit::TryAgain, failed)?;
         let text = run_file::to_text(&plan.config)?;
         std::fs::write(settings(&plan.out), text).or_exit(Exit::TryAgain, failed)?;
         if let Some(teacher) = &plan.teacher {
             let saved = teacher.policy.save(&self::teacher(&plan.out));
             saved.or_exit(Exit::TryAgain, failed)?;
         }
-        Ok(in_use)
+        Ok(inputs)
     }
 }
 
-impl Drop for InUse {
+impl Drop for RunInputs {
     fn drop(&mut self) {
         drop(std::fs::remove_dir_all(&self.directory));
     }
@@ -41,12 +40,12 @@ fn directory(out: &Path) -> PathBuf {
     out.join("in-use")
 }
 
-/// The run file of this start.
+/// Returns the path of the settings.
 pub(super) fn settings(out: &Path) -> PathBuf {
     directory(out).join("settings.toml")
 }
 
-/// The teacher's policy of this start.
+/// Returns the path of the teacher's policy.
 pub(super) fn teacher(out: &Path) -> PathBuf {
     directory(out).join("teacher.safetensors")
 }

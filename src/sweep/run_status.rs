@@ -1,4 +1,4 @@
-//! How far a run of the sweep is, as its directory tells.
+//! The status of a run of the sweep, as found in its directory.
 
 use std::path::{Path, PathBuf};
 
@@ -9,36 +9,36 @@ use tandem_rl::RunConfig;
 use tandem_system::{atomic_file, regular_file};
 use toml::{Table, Value};
 
-use super::file::{PlannedRun, flattened};
+use super::sweep_file::{PlannedRun, flattened};
 use crate::run_file;
 
-/// A run and how far it is.
+/// A run and its status.
 #[derive(Debug)]
-pub(super) struct Standing {
+pub(super) struct RunStatus {
     pub(super) run: PlannedRun,
     /// The run directory.
     pub(super) dir: PathBuf,
     pub(super) state: State,
-    /// Why it failed when it was last tried.
+    /// Why the latest attempt failed.
     pub(super) failure: Option<String>,
 }
 
-/// How far a run is.
+/// The progress of a run.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) enum State {
-    /// Nothing was learned yet.
+    /// The run has learned nothing yet.
     New,
-    /// Begun: it goes on from its newest checkpoint.
-    Begun,
-    /// Over; what it reached, as `tandem train --json` told.
+    /// The run can be resumed from its newest checkpoint.
+    Started,
+    /// The run is complete, with this summary of `tandem train --json`.
     Finished(Json),
 }
 
-impl Standing {
-    /// Looks into the run's directory below `out`.
+impl RunStatus {
+    /// Reads the status from the run's directory in `out`.
     ///
     /// # Errors
-    /// When the directory holds what was learned with other settings, or cannot be read; names what differs.
+    /// When the directory contains a run with other settings, which the error names, or cannot be read.
     pub(super) fn of(run: PlannedRun, out: &Path) -> anyhow::Result<Self> {
         let dir = out.join(&run.name);
         let state = state(&run, &dir)?;
@@ -47,16 +47,16 @@ impl Standing {
         Ok(Self { run, dir, state, failure })
     }
 
-    /// What is to be done, in a word or two.
-    pub(super) const fn todo(&self) -> &'static str {
+    /// Returns the name of the state.
+    pub(super) const fn state_name(&self) -> &'static str {
         match self.state {
             State::New => "new",
-            State::Begun => "begun",
+            State::Started => "begun",
             State::Finished(_) => "finished",
         }
     }
 
-    /// Keeps what a run reached: from now on it is finished. The file is whole or not there.
+    /// Stores the summary of a run, which is finished from now on.
     pub(super) fn finish(&mut self, summary: Json) -> anyhow::Result<()> {
         let path = self.dir.join("summary.json");
         let written = atomic_file::replace(&path, format!("{summary}\n").as_bytes());
@@ -66,7 +66,7 @@ impl Standing {
         Ok(())
     }
 
-    /// Keeps why a run failed, for the next start to tell.
+    /// Stores the reason of a failure, which the next start reports.
     pub(super) fn fail(&mut self, why: String) -> anyhow::Result<()> {
         let path = failure_path(&self.dir);
         std::fs::write(&path, &why).with_context(|| format!("cannot write {}", path.display()))?;
@@ -99,22 +99,23 @@ fn state(run: &PlannedRun, dir: &Path) -> anyhow::Result<State> {
         };
         return Err(anyhow!("{} was made with other settings: {differences}", run.name));
     }
-    Ok(summary.map_or(State::Begun, State::Finished))
+    Ok(summary.map_or(State::Started, State::Finished))
 }
 
-/// Where two configurations differ.
-fn differences(there: &RunConfig, here: &RunConfig) -> anyhow::Result<Vec<String>> {
-    let (there, here) = (flattened(&Table::try_from(there)?), flattened(&Table::try_from(here)?));
-    let differing = there.iter().zip(&here).filter(|(there, here)| there != here);
-    let told = differing.map(|((key, was), (_, is))| {
-        format!("{key} is {} there, {} now", written(was), written(is))
+/// Lists the settings in which the configuration of an existing run differs from the sweep file.
+fn differences(existing: &RunConfig, planned: &RunConfig) -> anyhow::Result<Vec<String>> {
+    let [existing, planned] = [existing, planned].map(Table::try_from);
+    let (existing, planned) = (flattened(&existing?), flattened(&planned?));
+    let differing = existing.iter().zip(&planned).filter(|(existing, planned)| existing != planned);
+    let texts = differing.map(|((key, existing), (_, planned))| {
+        format!("{key} is {} there, {} now", shortest(existing), shortest(planned))
     });
-    Ok(told.collect())
+    Ok(texts.collect())
 }
 
-/// A value as a person wrote it: single-precision settings without the digits that only double precision has.
-#[expect(clippy::cast_possible_truncation, reason = "compared with what it was")]
-fn written(value: &Value) -> String {
+/// Formats a value without the digits that a single-precision setting has in double precision only.
+#[expect(clippy::cast_possible_truncation, reason = "compared with the original")]
+fn shortest(value: &Value) -> String {
     match value {
         Value::Float(double) if f64::from(*double as f32) == *double => {
             (*double as f32).to_string()
@@ -123,11 +124,11 @@ fn written(value: &Value) -> String {
     }
 }
 
-/// Whether the run's copy of its teacher is the teacher that the sweep file names.
+/// Returns whether the run's copy of its teacher equals the file that the sweep file names.
 fn same_teacher(run: &PlannedRun, dir: &Path) -> bool {
     let Some(teacher) = &run.teacher else { return true };
     let copy = regular_file::read(&dir.join("policy/teacher.safetensors"));
-    // A file that is missing is reported by the run itself.
+    // The run itself reports a missing file.
     let named = regular_file::read(teacher);
     copy.ok().zip(named.ok()).is_none_or(|(copy, named)| copy == named)
 }
@@ -170,22 +171,22 @@ mod tests {
         std::fs::write(dir.join("run.toml"), text).expect("writes");
     }
 
-    fn standing(out: &Path, discount: f32) -> Result<Standing, String> {
-        Standing::of(planned(discount), out).map_err(|error| error.to_string())
+    fn status(out: &Path, discount: f32) -> Result<RunStatus, String> {
+        RunStatus::of(planned(discount), out).map_err(|error| error.to_string())
     }
 
     #[test]
     fn a_run_is_new_then_begun_then_finished() {
         let out = tempfile::tempdir().expect("a directory");
         let out = out.path();
-        assert_eq!(standing(out, 0.95).expect("fits").state, State::New);
+        assert_eq!(status(out, 0.95).expect("fits").state, State::New);
         made_with(out, 0.95);
-        let mut begun = standing(out, 0.95).expect("fits");
-        assert_eq!(begun.state, State::Begun);
+        let mut begun = status(out, 0.95).expect("fits");
+        assert_eq!(begun.state, State::Started);
         begun.fail("the disk is full".to_owned()).expect("writes");
-        assert_eq!(standing(out, 0.95).expect("fits").failure.as_deref(), Some("the disk is full"));
+        assert_eq!(status(out, 0.95).expect("fits").failure.as_deref(), Some("the disk is full"));
         begun.finish(json!({"digest": "d"})).expect("writes");
-        let finished = standing(out, 0.95).expect("fits");
+        let finished = status(out, 0.95).expect("fits");
         assert_eq!(finished.state, State::Finished(json!({"digest": "d"})));
         assert_eq!(finished.failure, None);
     }
@@ -194,13 +195,13 @@ mod tests {
     fn what_was_learned_with_other_settings_is_refused_by_name() {
         let out = tempfile::tempdir().expect("a directory");
         made_with(out.path(), 0.9);
-        assert_eq!(standing(out.path(), 0.95).expect("nothing was learned").state, State::New);
+        assert_eq!(status(out.path(), 0.95).expect("nothing was learned").state, State::New);
         std::fs::write(out.path().join("push-ea-seed1/metrics.jsonl"), "{}\n").expect("writes");
-        let message = standing(out.path(), 0.95).expect_err("other settings");
+        let message = status(out.path(), 0.95).expect_err("other settings");
         for word in ["push-ea-seed1", "ddpg.discount is 0.9", "0.95"] {
             assert!(message.contains(word), "{message:?} lacks {word:?}");
         }
-        assert_eq!(standing(out.path(), 0.9).expect("fits").state, State::Begun);
+        assert_eq!(status(out.path(), 0.9).expect("fits").state, State::Started);
     }
 
     #[test]
@@ -216,9 +217,9 @@ mod tests {
         }
         let with = |teacher: &str| {
             let run = PlannedRun { teacher: Some(dir.join(teacher)), ..planned(0.95) };
-            Standing::of(run, out.path()).map_err(|error| error.to_string())
+            RunStatus::of(run, out.path()).map_err(|error| error.to_string())
         };
         assert!(with("mine").expect_err("another teacher").contains("teacher"));
-        assert_eq!(with("policy/teacher.safetensors").expect("the same").state, State::Begun);
+        assert_eq!(with("policy/teacher.safetensors").expect("the same").state, State::Started);
     }
 }

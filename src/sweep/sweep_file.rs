@@ -1,4 +1,4 @@
-//! The sweep file: settings of all runs, and lists of which every combination is a run.
+//! The sweep file: settings of all runs, and lists whose combinations are the runs.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
@@ -11,26 +11,26 @@ use toml::{Table, Value};
 use crate::exit::{Exit, Failed, OrExit as _};
 use crate::{input, run_file};
 
-/// More runs than anybody waits for are a slip.
+/// A larger number of runs is treated as a mistake.
 const MAX_RUNS: usize = 10_000;
 
-/// A sweep file as it is written. A list that is there has entries.
+/// The contents of a sweep file. Lists must not be empty.
 #[derive(Debug, Clone, PartialEq, Default, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 struct SweepFile {
-    /// Tasks; without any the one of `[run]`.
+    /// Tasks; without a list, the task of `[run]`.
     tasks: Option<Vec<String>>,
-    /// Values of `advice.strategy`; each is a column of the sweep, as each variant is.
+    /// Values of `advice.strategy`; each is a column of the sweep, like each variant.
     strategies: Option<Vec<String>>,
-    /// Seeds; without any the one of `[run]`.
+    /// Seeds; without a list, the seed of `[run]`.
     seeds: Option<Vec<u64>>,
-    /// Further settings to combine: a table each, with one setting and its list of values.
+    /// Further settings to combine; each table has one setting with its list of values.
     axis: Option<Vec<Table>>,
-    /// Named sets of settings, laid over `[run]`.
+    /// Named sets of settings that override `[run]`.
     variant: Option<Vec<Variant>>,
     /// Settings of all runs, as in a run file.
     run: Table,
-    /// A teacher's policy file for each task; without one the teacher that ships.
+    /// Teacher policy files by task; the default is the shipped teacher.
     teachers: BTreeMap<String, PathBuf>,
 }
 
@@ -47,33 +47,34 @@ struct Variant {
 pub(super) struct PlannedRun {
     /// Name of its directory.
     pub(super) name: String,
-    /// Everything that decides its result, except the teacher.
+    /// The resolved settings, which with the teacher determine the result.
     pub(super) config: RunConfig,
-    /// The teacher's policy file, where the sweep file names one.
+    /// The teacher policy file, if the sweep file names one.
     pub(super) teacher: Option<PathBuf>,
 }
 
-/// Settings under a name that becomes part of the run directory's.
+/// Settings with a name that becomes part of the name of the run directory.
 #[derive(Debug, Clone)]
 struct Choice {
     name: String,
     settings: Vec<(String, Value)>,
 }
 
-/// Reads the sweep file `path`: its runs in the order in which they are made, seeds outermost, so that a sweep that is
-/// stopped early has one seed of everything.
+/// Reads the sweep file `path` and returns its runs in order. Seeds are the outermost loop, so a sweep that is stopped
+/// early has one seed of every combination.
 pub(super) fn read(path: &Path) -> Result<Vec<PlannedRun>, Failed> {
-    let told = || format!("sweep file {path:?}");
-    let text = input::text(path).context("cannot be read").or_exit(Exit::Usage, told)?;
-    runs(&text).or_exit(Exit::Usage, told)
+    let context = || format!("sweep file {path:?}");
+    let text = input::text(path).context("cannot be read").or_exit(Exit::Usage, context)?;
+    runs(&text).or_exit(Exit::Usage, context)
 }
 
-/// Every combination that `text` lists.
+/// Returns all combinations that `text` lists.
 fn runs(text: &str) -> anyhow::Result<Vec<PlannedRun>> {
-    let file: SweepFile = toml::from_str(text).map_err(|error| in_one_line(text, &error))?;
-    refuse_nothing(&file)?;
+    let file: SweepFile = toml::from_str(text).map_err(|error| parse_error(text, &error))?;
+    reject_empty(&file)?;
     let base = flattened(&file.run);
-    let (tasks, seeds) = (tasks(&file), choices("seed", listed(&file.seeds).iter().map(whole)));
+    let (tasks, seeds) =
+        (tasks(&file), choices("seed", listed(&file.seeds).iter().map(seed_value)));
     let (columns, axes) = (columns(&file, &base)?, axes(&file)?);
     let n_runs = [tasks.len(), seeds.len(), columns.len(), axes.len()].iter().product::<usize>();
     ensure!(n_runs <= MAX_RUNS, "lists {n_runs} runs: expected at most {MAX_RUNS}");
@@ -87,12 +88,12 @@ fn runs(text: &str) -> anyhow::Result<Vec<PlannedRun>> {
             runs.push(planned(&settings, &column.name, &axis.name, &file.teachers)?);
         }
     }
-    refuse_equal_names(&runs)?;
+    reject_equal_names(&runs)?;
     Ok(runs)
 }
 
-/// Refuses a file that says nothing and lists without entries: what they stand for would be one run.
-fn refuse_nothing(file: &SweepFile) -> anyhow::Result<()> {
+/// Rejects an empty file and empty lists, which would otherwise mean a single run.
+fn reject_empty(file: &SweepFile) -> anyhow::Result<()> {
     ensure!(
         *file != SweepFile::default(),
         "is empty: expected lists to combine, such as seeds = [1, 2]"
@@ -121,12 +122,12 @@ fn planned(
     let mut settings = settings.to_vec();
     let limits_time = settings.iter().any(|(key, _)| key == "stop.max_minutes");
     if !limits_time {
-        // Runs that are to be compared do not end by the clock, unless they are told to.
+        // Runs that are compared have no time limit unless the sweep file sets one.
         settings.push(("stop.max_minutes".to_owned(), Value::Float(0.0)));
     }
     let resolved = run_file::resolve(None, &settings).map_err(Failed::into_error)?;
     let column =
-        if column.is_empty() { named(&resolved.advice.strategy) } else { column.to_owned() };
+        if column.is_empty() { sanitized(&resolved.advice.strategy) } else { column.to_owned() };
     let name = format!("{}-{column}{axis}-seed{}", resolved.task, resolved.seed);
     ensure!(
         tandem_rl::config::is_name(&name),
@@ -141,7 +142,7 @@ fn planned(
     Ok(PlannedRun { config: RunConfig { name: name.clone(), ..resolved }, name, teacher })
 }
 
-fn refuse_equal_names(runs: &[PlannedRun]) -> anyhow::Result<()> {
+fn reject_equal_names(runs: &[PlannedRun]) -> anyhow::Result<()> {
     let mut seen = BTreeSet::new();
     match runs.iter().find(|run| !seen.insert(&run.name)) {
         Some(run) => bail!("two runs would be called {}: something is listed twice", run.name),
@@ -149,7 +150,7 @@ fn refuse_equal_names(runs: &[PlannedRun]) -> anyhow::Result<()> {
     }
 }
 
-/// The entries of a list that may be left out.
+/// Returns the entries of an optional list.
 fn listed<T>(list: &Option<Vec<T>>) -> &[T] {
     list.as_deref().unwrap_or_default()
 }
@@ -158,21 +159,21 @@ fn tasks(file: &SweepFile) -> Vec<Choice> {
     choices("task", listed(&file.tasks).iter().cloned().map(Value::String))
 }
 
-/// A choice for each value of `key`; where there is none, one that chooses nothing.
+/// Returns a choice for each value of `key`, or one without settings if there are no values.
 fn choices(key: &str, values: impl Iterator<Item = Value>) -> Vec<Choice> {
     let choice =
         |value: Value| Choice { name: String::new(), settings: vec![(key.to_owned(), value)] };
-    or_nothing(values.map(choice).collect())
+    or_default_choice(values.map(choice).collect())
 }
 
-fn or_nothing(choices: Vec<Choice>) -> Vec<Choice> {
+fn or_default_choice(choices: Vec<Choice>) -> Vec<Choice> {
     match choices.is_empty() {
         true => vec![Choice { name: String::new(), settings: Vec::new() }],
         false => choices,
     }
 }
 
-/// Strategies, then variants.
+/// Returns the strategies, then the variants.
 fn columns(file: &SweepFile, base: &[(String, Value)]) -> anyhow::Result<Vec<Choice>> {
     const STRATEGY: &str = "advice.strategy";
     if file.strategies.is_some()
@@ -184,7 +185,7 @@ fn columns(file: &SweepFile, base: &[(String, Value)]) -> anyhow::Result<Vec<Cho
     let mut columns: Vec<Choice> = listed(&file.strategies)
         .iter()
         .map(|strategy| Choice {
-            name: named(strategy),
+            name: sanitized(strategy),
             settings: vec![(STRATEGY.to_owned(), Value::String(strategy.clone()))],
         })
         .collect();
@@ -192,12 +193,13 @@ fn columns(file: &SweepFile, base: &[(String, Value)]) -> anyhow::Result<Vec<Cho
         ensure!(!name.is_empty(), "a variant has no name");
         columns.push(Choice { name: name.clone(), settings: flattened(set) });
     }
-    Ok(or_nothing(columns))
+    Ok(or_default_choice(columns))
 }
 
-/// Every combination of the axes' values; each adds `-KEY-VALUE` to the name, the key without its section.
+/// Returns all combinations of the values of the axes. Each value adds `-KEY-VALUE` to the name, without the section of
+/// the key.
 fn axes(file: &SweepFile) -> anyhow::Result<Vec<Choice>> {
-    let mut combinations = or_nothing(Vec::new());
+    let mut combinations = or_default_choice(Vec::new());
     for axis in listed(&file.axis) {
         let [(key, Value::Array(values))] = &flattened(axis)[..] else {
             let held = axis.to_string().trim().replace('\n', ", ");
@@ -206,7 +208,7 @@ fn axes(file: &SweepFile) -> anyhow::Result<Vec<Choice>> {
         ensure!(!values.is_empty(), "the list of axis {key} is empty");
         let short = key.rsplit('.').next().unwrap_or(key);
         let with = |(before, value): (&Choice, &Value)| Choice {
-            name: format!("{}-{short}-{}", before.name, named(&plain(value))),
+            name: format!("{}-{short}-{}", before.name, sanitized(&unquoted(value))),
             settings: [before.settings.clone(), vec![(key.clone(), value.clone())]].concat(),
         };
         combinations = pairs(&combinations, values).map(with).collect();
@@ -214,18 +216,18 @@ fn axes(file: &SweepFile) -> anyhow::Result<Vec<Choice>> {
     Ok(combinations)
 }
 
-/// A value as it stands in a name: text without its quotes.
-fn plain(value: &Value) -> String {
+/// Formats a value for a name: text has no quotes.
+fn unquoted(value: &Value) -> String {
     value.as_str().map_or_else(|| value.to_string(), str::to_owned)
 }
 
-/// A text as part of a directory's name: what does not belong there becomes a dash.
-fn named(text: &str) -> String {
+/// Replaces characters that do not belong in the name of a directory by dashes.
+fn sanitized(text: &str) -> String {
     let letter = |c: char| if c.is_ascii_alphanumeric() || "-_.".contains(c) { c } else { '-' };
     text.chars().map(letter).collect()
 }
 
-/// Dotted names and values of all settings in and below `table`.
+/// Returns the dotted names and the values of all settings in `table`.
 pub(super) fn flattened(table: &Table) -> Vec<(String, Value)> {
     let below = |(key, value): (&String, &Value)| match value {
         Value::Table(inner) => flattened(inner)
@@ -237,17 +239,18 @@ pub(super) fn flattened(table: &Table) -> Vec<(String, Value)> {
     table.iter().flat_map(below).collect()
 }
 
-/// Every element of `outer` with every one of `inner`, in order.
+/// Returns all pairs of an element of `outer` and one of `inner`, in order.
 fn pairs<'a, A, B>(outer: &'a [A], inner: &'a [B]) -> impl Iterator<Item = (&'a A, &'a B)> {
     outer.iter().flat_map(move |a| inner.iter().map(move |b| (a, b)))
 }
 
-/// A seed as TOML has it; one that TOML cannot hold stays text and is refused with the other settings.
-fn whole(n: &u64) -> Value {
+/// Converts a seed to TOML. A seed too large for TOML becomes text, which the check of the settings rejects.
+fn seed_value(n: &u64) -> Value {
     i64::try_from(*n).map_or_else(|_| Value::String(n.to_string()), Value::Integer)
 }
 
-fn in_one_line(text: &str, error: &toml::de::Error) -> anyhow::Error {
+/// Converts an error of the TOML parser to one line with the line number.
+fn parse_error(text: &str, error: &toml::de::Error) -> anyhow::Error {
     let start = error.span().map_or(0, |span| span.start);
     let line_idx = text.get(..start).unwrap_or(text).matches('\n').count();
     anyhow!("line {}: {}", line_idx + 1, error.message().replace('\n', " "))

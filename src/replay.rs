@@ -1,6 +1,5 @@
-//! Commands about files: policies and logs.
+//! `tandem replay`: simulates recorded episodes again and compares them with their logs.
 
-use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use anyhow::anyhow;
@@ -8,86 +7,23 @@ use indicatif::ProgressBar;
 use rayon::iter::{IntoParallelIterator as _, ParallelIterator as _};
 use serde_json::{Value, json};
 use tandem_core::text::error_chain;
-use tandem_policy::Policy;
 use tandem_telemetry::{LoggedTransition, read_episode};
 use tandem_worker::record::{RecordError, replay_log};
 
-use crate::cli::{McapArgs, McapCommand, PolicyArgs, PolicyCommand, ReplayArgs};
+use crate::cli::ReplayArgs;
 use crate::exit::{Exit, Failed, OrExit as _};
 use crate::output;
 
-/// Loads a policy file, or says in one line why it cannot be used.
-pub(crate) fn load_policy(path: &Path) -> Result<Policy, Failed> {
-    Policy::load(path).or_exit(Exit::Data, String::new)
-}
-
-pub(crate) fn policy(args: &PolicyArgs) -> Result<(), Failed> {
-    let PolicyCommand::Show { file, json } = &args.command;
-    let policy = load_policy(file)?;
-    let metadata: BTreeMap<_, _> = policy.metadata.iter().collect();
-    if *json {
-        let shown = json!({
-            "task": policy.layout.task.name(), "arms": policy.layout.n_arms, "n_hidden": policy.n_hidden,
-            "n_hidden_layers": policy.n_hidden_layers, "critic_heads": policy.n_heads, "digest": policy.digest(),
-            "metadata": metadata,
-        });
-        output::print(shown)?;
-        return Ok(());
-    }
-    output::print(format_args!("task          {}", policy.layout.task))?;
-    output::print(format_args!("arms          {}", policy.layout.n_arms))?;
-    output::print(format_args!(
-        "networks      {} hidden layers of {}, critic heads {}",
-        policy.n_hidden_layers, policy.n_hidden, policy.n_heads
-    ))?;
-    output::print(format_args!(
-        "parameters    actor {}, critic {}",
-        policy.actor.len(),
-        policy.critic.len()
-    ))?;
-    output::print(format_args!("digest        {}", policy.digest()))?;
-    for (key, value) in metadata {
-        let [key, value] = [key, value].map(|text| output::escaped(text).replace('\n', "\\n"));
-        output::print(format_args!("{key:<22} {value}"))?;
-    }
-    Ok(())
-}
-
-pub(crate) fn mcap(args: &McapArgs) -> Result<(), Failed> {
-    use tandem_telemetry::Error as E;
-    let McapCommand::Recover { file, to } = &args.command;
-    let to =
-        to.clone().unwrap_or_else(|| PathBuf::from(format!("{}.recovered.mcap", file.display())));
-    if to.exists() {
-        return Err(Failed::usage(format!(
-            "{} exists: choose another file with --to",
-            to.display()
-        )));
-    }
-    let recovered = tandem_telemetry::recover(file, &to);
-    let counts = match recovered {
-        Err(E::WriteLog { .. }) => recovered.or_cannot_write(String::new),
-        _ => recovered.or_exit(Exit::Data, String::new),
-    }?;
-    output::print(format_args!(
-        "recovered {} messages of {} into {}",
-        counts.messages,
-        file.display(),
-        to.display()
-    ))?;
-    Ok(())
-}
-
-/// A log that was played again.
+/// A log that was simulated again.
 struct Replayed {
     file: PathBuf,
     outcome: Result<(), RecordError>,
-    /// Whether the log ends before its episode does.
+    /// The log ends before its episode does.
     cut_short: bool,
 }
 
 pub(crate) fn replay(args: &ReplayArgs) -> Result<(), Failed> {
-    let files = logs_among(&args.files)?;
+    let files = find_logs(&args.files)?;
     if let ([file], false, false) = (files.as_slice(), args.verify, args.json) {
         print_steps(file)?;
     }
@@ -99,7 +35,7 @@ pub(crate) fn replay(args: &ReplayArgs) -> Result<(), Failed> {
     };
     let replayed: Vec<Replayed> = files.into_par_iter().map(replay_one).collect();
     bar.finish_and_clear();
-    print_replayed(&replayed, args.json)?;
+    print_result(&replayed, args.json)?;
     let bad: Vec<String> = replayed.iter().filter_map(Replayed::problem).collect();
     match bad.as_slice() {
         [] => Ok(()),
@@ -111,8 +47,8 @@ pub(crate) fn replay(args: &ReplayArgs) -> Result<(), Failed> {
     }
 }
 
-/// The logs that are named, and those in and below the directories that are named, in the order of their names.
-fn logs_among(named: &[PathBuf]) -> Result<Vec<PathBuf>, Failed> {
+/// Returns the named files, and the logs in and below the named directories in the order of their names.
+fn find_logs(named: &[PathBuf]) -> Result<Vec<PathBuf>, Failed> {
     let mut files = Vec::new();
     for path in named {
         if !path.is_dir() {
@@ -121,7 +57,7 @@ fn logs_among(named: &[PathBuf]) -> Result<Vec<PathBuf>, Failed> {
         }
         let n_before = files.len();
         collect_logs(path, &mut files)
-            .or_exit(Exit::Data, || format!("cannot look into {}", path.display()))?;
+            .or_exit(Exit::Data, || format!("cannot read the directory {}", path.display()))?;
         if files.len() == n_before {
             return Err(Failed::new(Exit::Data, anyhow!("no *.mcap below {}", path.display())));
         }
@@ -153,7 +89,7 @@ impl Replayed {
         }
     }
 
-    /// What is wrong with which file, in one line.
+    /// Describes the problem on one line; `None` if the episode is equal.
     fn problem(&self) -> Option<String> {
         let error = self.outcome.as_ref().err()?;
         let file = self.file.display();
@@ -173,7 +109,7 @@ fn print_steps(file: &Path) -> Result<(), Failed> {
     Ok(())
 }
 
-fn print_replayed(replayed: &[Replayed], json: bool) -> Result<(), Failed> {
+fn print_result(replayed: &[Replayed], json: bool) -> Result<(), Failed> {
     let (n_episodes, n_equal) =
         (replayed.len(), replayed.iter().filter(|log| log.outcome.is_ok()).count());
     let cut_short: Vec<&Path> =

@@ -7,7 +7,7 @@ fn names(text: &str) -> Vec<String> {
 }
 
 #[test]
-fn every_combination_is_a_run_and_seeds_come_round_last() {
+fn every_combination_is_a_run_and_seeds_are_the_outermost_loop() {
     let text = "tasks = [\"push\", \"pick-and-place\"]\nstrategies = [\"none\", \"mc-q:0.1\"]\nseeds = [3, 4]\n";
     let seen = names(&format!("{text}{LIMIT}"));
     let expected = [
@@ -24,7 +24,7 @@ fn every_combination_is_a_run_and_seeds_come_round_last() {
 }
 
 #[test]
-fn variants_stand_beside_strategies_and_axes_multiply_both() {
+fn variants_are_added_to_strategies_and_axes_multiply_both() {
     let text = "strategies = [\"ea\"]\n[[variant]]\nname = \"no-cloning\"\nset = { advice.strategy = \"mc-q:0.05\", advice.share = 1 }\n\
                 [[axis]]\n\"ddpg.polyak_keep\" = [0.95, 0.99]\n[[axis]]\nrounds.lag = [0, 1]\n";
     let planned = runs(&format!("{text}{LIMIT}")).expect("valid");
@@ -44,14 +44,14 @@ fn variants_stand_beside_strategies_and_axes_multiply_both() {
 }
 
 #[test]
-fn runs_do_not_end_by_the_clock_unless_they_are_told_to() {
+fn runs_have_no_time_limit_unless_one_is_set() {
     let minutes = |text: &str| runs(text).expect("valid")[0].config.stop.max_minutes;
     assert_eq!(minutes(LIMIT), 0.0);
     assert_eq!(minutes("[run]\nstop.max_minutes = 2"), 2.0);
 }
 
 #[test]
-fn a_teacher_is_named_where_somebody_asks_it() {
+fn a_teacher_is_named_if_the_run_needs_one() {
     let text = "strategies = [\"none\", \"ea\"]\n[teachers]\npush = \"mine.safetensors\"\n";
     let teachers: Vec<_> = runs(&format!("{text}{LIMIT}"))
         .expect("valid")
@@ -62,7 +62,7 @@ fn a_teacher_is_named_where_somebody_asks_it() {
 }
 
 #[test]
-fn what_is_wrong_is_said_in_one_line() {
+fn errors_fit_on_one_line() {
     let check = |text: &str, words: &[&str]| {
         let error = runs(&format!("{text}\n{LIMIT}")).expect_err("must be refused");
         let message = format!("{error:#}");
@@ -90,7 +90,7 @@ fn what_is_wrong_is_said_in_one_line() {
 }
 
 #[test]
-fn a_file_that_says_nothing_is_refused() {
+fn an_empty_file_is_rejected() {
     for text in ["", "\n\n", "# nothing yet\n"] {
         let error = runs(text).expect_err("must be refused").to_string();
         assert!(error.starts_with("is empty: expected"), "{text:?}: {error}");
@@ -98,7 +98,7 @@ fn a_file_that_says_nothing_is_refused() {
 }
 
 #[test]
-fn every_sweep_that_ships_is_valid() {
+fn every_shipped_sweep_file_is_valid() {
     let directory = Path::new(env!("CARGO_MANIFEST_DIR")).join("deploy");
     let files = std::fs::read_dir(directory).expect("ships").flatten().map(|entry| entry.path());
     let counts: BTreeMap<String, usize> = files

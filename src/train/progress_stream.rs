@@ -1,4 +1,4 @@
-//! The learner's progress, followed over its restarts.
+//! The learner's progress, followed across its restarts.
 
 use std::time::Duration;
 
@@ -9,39 +9,42 @@ use tandem_proto::pb::learner_client::LearnerClient;
 use tokio::sync::mpsc;
 use tonic::{Status, Streaming};
 
-/// How long the learner may take to answer that it can be watched.
+/// Timeout of opening a stream of progress.
 const OPEN_DEADLINE: Duration = Duration::from_secs(5);
-/// Pause before a learner that is away is called again.
+/// Pause before an unreachable learner is called again.
 const PAUSE: Duration = Duration::from_millis(200);
-/// Messages that are not looked at yet. When it is full the learner skips some: only the latest counts.
+/// Capacity of the queue of messages. While it is full, the learner skips messages: only the latest one matters.
 const CAPACITY: usize = 1;
 
-/// One message about the run.
-pub(super) struct Heard {
-    /// How many streams were opened before this message's: another number may be another process.
-    pub(super) n_streams_before: u32,
+/// A message about the run.
+pub(super) struct ProgressUpdate {
+    /// Number of the stream that delivered the message. A new stream may come from a new process.
+    pub(super) stream: u32,
     pub(super) progress: pb::Progress,
 }
 
-/// Follows the learner at `address` until the receiver is dropped; a learner that is away is called again and again.
-pub(super) fn follow(address: &str) -> anyhow::Result<mpsc::Receiver<Heard>> {
+/// Follows the learner at `address` until the receiver is dropped, and reconnects while the learner is unreachable.
+pub(super) fn follow(address: &str) -> anyhow::Result<mpsc::Receiver<ProgressUpdate>> {
     let link = ClientConfig::default().channel(address).context("cannot follow the learner")?;
     let (sender, receiver) = mpsc::channel(CAPACITY);
     tokio::spawn(async move {
         tokio::select! {
-            () = follow_for_ever(LearnerClient::new(link), &sender) => (),
+            () = follow_streams(LearnerClient::new(link), &sender) => (),
             () = sender.closed() => (),
         }
     });
     Ok(receiver)
 }
 
-async fn follow_for_ever(mut learner: LearnerClient<AuthChannel>, sender: &mpsc::Sender<Heard>) {
-    for n_streams_before in 0.. {
-        // What ended a stream is of no interest: whether the learner lives is for others to see.
+async fn follow_streams(
+    mut learner: LearnerClient<AuthChannel>,
+    sender: &mpsc::Sender<ProgressUpdate>,
+) {
+    for stream_idx in 0.. {
+        // The reason for the end of a stream does not matter: `RunProcesses` checks whether the learner runs.
         if let Ok(mut stream) = open(&mut learner).await {
             while let Ok(Some(progress)) = stream.message().await {
-                if sender.send(Heard { n_streams_before, progress }).await.is_err() {
+                if sender.send(ProgressUpdate { stream: stream_idx, progress }).await.is_err() {
                     return;
                 }
             }
