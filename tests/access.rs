@@ -61,7 +61,7 @@ async fn code_of(caller: &Caller, path: &str) -> Code {
 }
 
 #[test]
-fn an_address_that_others_can_reach_needs_a_token() {
+fn a_non_loopback_address_requires_a_token() {
     let place = Place::new();
     for address in ["0.0.0.0:0", "[::]:0", "[::ffff:0.0.0.0]:0"] {
         let line = fails_with(64, place.run(&teacher(&["--listen", address])));
@@ -110,7 +110,7 @@ fn secrets_and_certificates_that_cannot_be_used_are_refused_at_start() {
 
 #[cfg(unix)]
 #[test]
-fn a_token_that_everybody_can_read_is_used_with_a_warning() {
+fn a_world_readable_token_file_is_used_with_a_warning() {
     use std::os::unix::fs::PermissionsExt as _;
     let place = Place::new();
     for (mode, warned) in [(0o600, false), (0o640, false), (0o644, true)] {
@@ -123,7 +123,7 @@ fn a_token_that_everybody_can_read_is_used_with_a_warning() {
 }
 
 #[test]
-fn health_tells_who_serves_and_why_not() {
+fn health_reports_the_service_and_the_cause_of_a_failure() {
     let place = Place::new();
     let tls = ["--token-file", "token", "--tls-cert", "tls.pem", "--tls-key", "tls.key"];
     let service = place.serve("teacher", &teacher(&tls));
@@ -153,7 +153,7 @@ fn health_tells_who_serves_and_why_not() {
 }
 
 #[test]
-fn a_service_that_never_answers_is_unwell_after_the_deadline() {
+fn a_service_that_never_answers_is_unhealthy_after_the_timeout() {
     let silent = std::net::TcpListener::bind("127.0.0.1:0").expect("a port");
     let address = silent.local_addr().expect("bound").to_string();
     let line = fails_with(75, Place::new().run(&["health", &address, "--timeout-s", "0.2"]));
@@ -161,7 +161,7 @@ fn a_service_that_never_answers_is_unwell_after_the_deadline() {
 }
 
 #[tokio::test]
-async fn without_the_right_token_nothing_is_answered_and_nothing_happens() {
+async fn calls_without_the_right_token_are_rejected_without_effect() {
     let place = Place::new();
     let mut teacher = place.serve("teacher", &teacher(&["--token-file", "token"]));
     let right = ["--teacher", &teacher.address, "--token-file", "token"];
@@ -221,7 +221,7 @@ fn worker(name: &str) -> pb::JoinRequest {
 }
 
 #[test]
-fn learners_and_workers_with_a_wrong_token_end_and_say_so() {
+fn learners_and_workers_with_a_wrong_token_exit_with_an_error() {
     let place = Place::new();
     place.write("other-token", OTHER);
     let teacher = place.serve("teacher", &teacher(&["--token-file", "token"]));
@@ -238,7 +238,7 @@ fn learners_and_workers_with_a_wrong_token_end_and_say_so() {
 }
 
 #[test]
-fn a_command_that_is_given_the_address_of_another_service_ends_and_says_which_one_it_is() {
+fn a_command_that_dials_the_wrong_service_ends_and_names_it() {
     let place = Place::new();
     let teacher = place.serve("teacher", &teacher(&[]));
     let learner = place.serve("learner", &place.learner(&["--teacher", &teacher.address]));
@@ -261,7 +261,7 @@ fn a_command_that_is_given_the_address_of_another_service_ends_and_says_which_on
 }
 
 #[test]
-fn who_speaks_otherwise_says_what_to_do_and_goes_on_asking() {
+fn a_tls_mismatch_is_explained_and_retried() {
     let place = Place::new();
     let plain = place.serve("plain", &teacher(&[]));
     let tls = place.serve("tls", &teacher(&["--tls-cert", "tls.pem", "--tls-key", "tls.key"]));
@@ -290,7 +290,7 @@ fn who_speaks_otherwise_says_what_to_do_and_goes_on_asking() {
 }
 
 #[test]
-fn a_run_through_a_relay_by_tls_with_a_token_ends_well() {
+fn a_run_through_a_relay_over_tls_with_a_token_succeeds() {
     let place = Place::new();
     let offer = ["--token-file", "token", "--tls-cert", "tls.pem", "--tls-key", "tls.key"];
     let call = ["--token-file", "token", "--tls-ca", "ca.pem"];
@@ -308,7 +308,7 @@ fn a_run_through_a_relay_by_tls_with_a_token_ends_well() {
 }
 
 #[test]
-fn a_run_by_tls_with_a_token_ends_well() {
+fn a_run_over_tls_with_a_token_succeeds() {
     let place = Place::new();
     let offer = ["--token-file", "token", "--tls-cert", "tls.pem", "--tls-key", "tls.key"];
     let call = ["--token-file", "token", "--tls-ca", "ca.pem"];

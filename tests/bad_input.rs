@@ -196,7 +196,7 @@ async fn altered_questions(address: SocketAddr) -> BTreeSet<(u64, u32)> {
 }
 
 #[test]
-fn a_teacher_that_is_sent_nonsense_serves_on_and_charges_nothing() {
+fn a_teacher_serves_and_charges_nothing_after_malformed_input() {
     let teacher_policy = shipped("teacher-push");
     let mut teacher = Running::service(&["teacher", "--policy", &teacher_policy]);
     let address = teacher.address;
@@ -239,7 +239,7 @@ fn a_teacher_that_is_sent_nonsense_serves_on_and_charges_nothing() {
 }
 
 #[test]
-fn a_bridge_that_is_sent_nonsense_moves_nothing_and_serves_on() {
+fn a_bridge_keeps_the_arms_at_rest_and_serves_after_malformed_input() {
     let mut bridge = Running::service(&["bridge", "--driver", "sim", "--listen", "127.0.0.1:0"]);
     let address = bridge.address;
     let idle = idle_connections(address);
@@ -311,7 +311,7 @@ fn play(address: SocketAddr) -> Running {
 }
 
 #[test]
-fn a_learner_that_is_sent_nonsense_learns_what_it_would_have_learned() {
+fn malformed_input_does_not_change_what_a_learner_learns() {
     let runtime = runtime();
     let calm = tempfile::tempdir().expect("a directory");
     let mut undisturbed = learner(calm.path());
@@ -378,7 +378,7 @@ async fn foreign_episodes(address: SocketAddr) {
 }
 
 #[test]
-fn output_that_nobody_reads_ends_a_command_without_a_word() {
+fn a_closed_output_pipe_ends_a_command_silently() {
     let (reader, writer) = std::io::pipe().expect("a pipe");
     drop(reader);
     let policy = concat!(env!("CARGO_MANIFEST_DIR"), "/policies/teacher-push.safetensors");

@@ -206,7 +206,7 @@ fn crowd(service: &Service, habits: &[Habit], check: impl Fn(&Service)) {
 }
 
 #[test]
-fn the_arms_can_be_stopped_while_idle_strangers_hold_all_connections_of_a_bridge() {
+fn the_arms_can_be_stopped_while_idle_clients_hold_all_connections_of_a_bridge() {
     let bridge = Service::start(&["bridge", "--driver", "sim"]);
     let address = bridge.address.to_string();
     let habits = [Habit::OneByte, Habit::PrefaceOnly, Habit::WatchHealth, Habit::AskForStatus];
@@ -217,7 +217,7 @@ fn the_arms_can_be_stopped_while_idle_strangers_hold_all_connections_of_a_bridge
 }
 
 #[test]
-fn the_arms_can_be_stopped_with_the_token_while_strangers_without_it_watch_health() {
+fn the_arms_can_be_stopped_with_the_token_while_unauthenticated_clients_watch_health() {
     let bridge = Service::start(&["bridge", "--driver", "sim", "--token-file", "token"]);
     let address = bridge.address.to_string();
     let habits = [Habit::WatchHealth, Habit::AskForStatus, Habit::OneByte];
@@ -228,7 +228,7 @@ fn the_arms_can_be_stopped_with_the_token_while_strangers_without_it_watch_healt
 }
 
 #[test]
-fn a_teacher_is_well_while_idle_strangers_hold_all_its_connections() {
+fn a_teacher_is_healthy_while_idle_clients_hold_all_its_connections() {
     let policy = concat!(env!("CARGO_MANIFEST_DIR"), "/policies/teacher-push.safetensors");
     let teacher = Service::start(&["teacher", "--ledger", "memory", "--policy", policy]);
     let address = teacher.address.to_string();

@@ -30,7 +30,7 @@ fn rows(out: &Path) -> Vec<Value> {
 }
 
 #[test]
-fn a_student_that_starts_as_its_teachers_copies_succeeds_at_once_and_costs_no_advice() {
+fn a_student_initialized_from_its_teacher_succeeds_without_advice() {
     let keep = tempfile::tempdir().expect("a directory");
     let out = keep.path().join("run");
     let ended = train(&[], &out);
@@ -45,7 +45,7 @@ fn a_student_that_starts_as_its_teachers_copies_succeeds_at_once_and_costs_no_ad
 }
 
 #[test]
-fn sizes_that_cannot_hold_the_copies_are_refused_with_those_that_can() {
+fn network_sizes_that_cannot_hold_the_teacher_are_refused_with_a_suggestion() {
     let keep = tempfile::tempdir().expect("a directory");
     let ended = train(&["--set", "ddpg.n_hidden=256"], &keep.path().join("run"));
     let told = String::from_utf8_lossy(&ended.stderr).into_owned();

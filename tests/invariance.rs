@@ -72,7 +72,7 @@ fn any_number_of_workers_gives_the_same_bits_with_every_strategy_and_either_lag(
 }
 
 #[test]
-fn a_policy_is_judged_alike_by_any_number_of_threads() {
+fn an_evaluation_does_not_depend_on_the_number_of_threads() {
     let judged: Vec<Value> = ["1", "2", "5"].map(judged_by_threads).into();
     assert_eq!(judged[0], judged[1]);
     assert_eq!(judged[0], judged[2]);

@@ -73,7 +73,7 @@ fn account(cluster: &Cluster, teacher: &str, name: &str) -> (u64, u64) {
 }
 
 #[test]
-fn what_the_manifests_start_trains_to_the_end_while_its_pods_are_taken_away() {
+fn the_manifests_train_to_the_end_while_pods_are_deleted() {
     if !has_redis() {
         println!("SKIPPED: redis-server is not installed");
         return;
@@ -137,7 +137,7 @@ fn what_the_manifests_start_trains_to_the_end_while_its_pods_are_taken_away() {
 }
 
 #[test]
-fn a_misspelt_argument_of_a_manifest_would_be_noticed() {
+fn a_misspelt_argument_in_a_manifest_is_detected() {
     let manifests = Manifests::read();
     let run = small(&manifests.run);
     let mut cluster = Cluster::new(manifests, run);

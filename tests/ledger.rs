@@ -293,7 +293,7 @@ fn ask_once(
 }
 
 #[test]
-fn a_second_teacher_on_one_file_is_refused_whatever_is_deleted_or_linked() {
+fn a_second_teacher_on_the_same_ledger_file_is_refused() {
     let directory = tempfile::tempdir().expect("a directory");
     let beside = |name: &str| directory.path().join(name);
     let ledger = beside("ledger.sqlite");
@@ -336,7 +336,7 @@ fn a_second_teacher_on_one_file_is_refused_whatever_is_deleted_or_linked() {
 }
 
 #[test]
-fn a_teacher_charges_nothing_to_a_ledger_that_was_deleted() {
+fn a_teacher_charges_nothing_to_a_deleted_ledger() {
     let directory = tempfile::tempdir().expect("a directory");
     let ledger = directory.path().join("ledger.sqlite");
     let teacher = Teacher::start(ledger.to_str().expect("UTF-8"), "127.0.0.1:0");
@@ -360,7 +360,7 @@ fn a_teacher_charges_nothing_to_a_ledger_that_was_deleted() {
 }
 
 #[test]
-fn a_ledger_that_cannot_be_opened_is_refused_with_a_code_that_says_whether_to_try_again() {
+fn a_ledger_that_cannot_be_opened_is_refused_with_the_right_exit_code() {
     let directory = tempfile::tempdir().expect("a directory");
     let check = |path: &Path, expected_code: i32, expected: &str| {
         let (code, told) = refusal(path);

@@ -58,7 +58,7 @@ fn digest(output: &Output) -> String {
 }
 
 #[test]
-fn a_result_that_cannot_be_written_is_told_in_one_line() {
+fn a_result_that_cannot_be_written_is_reported_in_one_line() {
     let directory = directory();
     let path = |name: &str| directory.path().join(name).to_str().expect("UTF-8").to_owned();
     let (episode, mended, picture) = (path("one.mcap"), path("mended.mcap"), path("arms.svg"));
@@ -91,7 +91,7 @@ fn a_result_that_cannot_be_written_is_told_in_one_line() {
 }
 
 #[test]
-fn a_wrong_command_line_keeps_its_exit_code_where_nothing_can_be_written() {
+fn an_error_keeps_its_exit_code_when_its_message_cannot_be_written() {
     for (args, code) in [(&["dance"][..], 64), (&["policy", "show", "missing"], 65)] {
         let ended = tandem(args).stdout(full()).stderr(full()).status().expect("runs");
         assert_eq!(ended.code(), Some(code), "{args:?}");
@@ -99,7 +99,7 @@ fn a_wrong_command_line_keeps_its_exit_code_where_nothing_can_be_written() {
 }
 
 #[test]
-fn a_run_without_room_for_its_messages_and_logs_ends_as_any_other() {
+fn a_run_does_not_depend_on_room_for_its_messages_and_logs() {
     let directory = directory();
     let expected = digest(&train(directory.path(), "calm").output().expect("runs"));
     let out = directory.path().join("mute");
@@ -122,7 +122,7 @@ fn a_run_does_not_wait_for_a_reader_of_its_messages() {
 }
 
 #[test]
-fn a_run_whose_summary_cannot_be_written_is_saved_and_says_where() {
+fn a_run_whose_summary_cannot_be_written_is_saved_and_reports_its_directory() {
     let directory = directory();
     let ended = train(directory.path(), "run").stdout(full()).output().expect("runs");
     let told = told(&ended);
@@ -145,7 +145,7 @@ fn address(lines: impl Iterator<Item = std::io::Result<String>>) -> String {
 }
 
 #[test]
-fn a_service_that_cannot_say_where_it_listens_serves_all_the_same() {
+fn a_service_that_cannot_print_its_address_still_serves() {
     let mut command = tandem(&["teacher", "--ledger", "memory", "--policy", POLICY]);
     let mut teacher = command.stdout(full()).stderr(Stdio::piped()).spawn().expect("starts");
     let messages = BufReader::new(teacher.stderr.take().expect("piped"));
@@ -157,7 +157,7 @@ fn a_service_that_cannot_say_where_it_listens_serves_all_the_same() {
 }
 
 #[test]
-fn a_service_without_room_for_its_log_serves_all_the_same() {
+fn a_service_that_cannot_write_its_log_still_serves() {
     let mut command = tandem(&["teacher", "--ledger", "memory", "--policy", POLICY]);
     let mut teacher = command.stdout(Stdio::piped()).stderr(full()).spawn().expect("starts");
     let output = BufReader::new(teacher.stdout.take().expect("piped"));
@@ -178,14 +178,14 @@ fn shell(script: &str) -> Output {
 }
 
 #[test]
-fn a_limit_of_file_sizes_is_a_full_disk_and_no_signal() {
+fn a_file_size_limit_is_reported_like_a_full_disk() {
     let ended = shell(r#"ulimit -f 0; exec "$0" policy show "$1" > shown"#);
     assert_eq!(ended.status.code(), Some(74), "{:?}: {}", ended.status, told(&ended));
     assert!(told(&ended).contains("File too large"), "{}", told(&ended));
 }
 
 #[test]
-fn a_closed_output_is_one_that_nobody_wants() {
+fn a_command_succeeds_with_closed_standard_streams() {
     let ended = shell(r#"exec "$0" policy show "$1" >&- 2>&-"#);
     assert_eq!(ended.status.code(), Some(0), "{}", told(&ended));
 }

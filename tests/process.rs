@@ -146,7 +146,7 @@ fn directory() -> (TempDir, PathBuf) {
 }
 
 #[test]
-fn an_interrupted_run_goes_on_to_the_same_end() {
+fn an_interrupted_run_resumes_to_the_same_result() {
     let (_keep, out) = directory();
     let run = start("1", &out);
     wait_for_checkpoint(&out);
@@ -159,7 +159,7 @@ fn an_interrupted_run_goes_on_to_the_same_end() {
 }
 
 #[test]
-fn whoever_dies_is_started_again_and_the_run_ends_as_a_calm_one() {
+fn killed_processes_are_restarted_and_the_run_ends_like_an_undisturbed_one() {
     let (_keep, out) = directory();
     let run = start("3", &out);
     wait_for_checkpoint(&out);
@@ -197,7 +197,7 @@ fn a_learner_that_dies_before_its_first_checkpoint_starts_over() {
 }
 
 #[test]
-fn processes_that_stand_still_for_a_while_are_left_alone() {
+fn briefly_stopped_processes_are_not_restarted() {
     let (_keep, out) = directory();
     let run = start("2", &out);
     wait_for_checkpoint(&out);
@@ -213,7 +213,7 @@ fn processes_that_stand_still_for_a_while_are_left_alone() {
 }
 
 #[test]
-fn a_process_that_does_not_get_going_is_given_up() {
+fn a_run_gives_up_on_a_process_that_keeps_dying() {
     let (_keep, out) = directory();
     let run = start("2", &out);
     wait_for_checkpoint(&out);
@@ -231,7 +231,7 @@ fn a_process_that_does_not_get_going_is_given_up() {
 }
 
 #[test]
-fn an_interruption_ends_a_run_whose_teacher_is_away() {
+fn a_run_whose_teacher_does_not_respond_can_be_interrupted() {
     let (_keep, out) = directory();
     let run = start("1", &out);
     wait_for_checkpoint(&out);
@@ -245,7 +245,7 @@ fn an_interruption_ends_a_run_whose_teacher_is_away() {
 }
 
 #[test]
-fn a_learner_that_cannot_go_on_ends_the_run_with_its_own_words() {
+fn a_learner_that_cannot_continue_ends_the_run_with_its_error_message() {
     let (_keep, out) = directory();
     let run = start("1", &out);
     wait_for_checkpoint(&out);
@@ -264,7 +264,7 @@ fn a_learner_that_cannot_go_on_ends_the_run_with_its_own_words() {
 }
 
 #[test]
-fn children_end_with_their_parent_however_it_dies() {
+fn children_end_when_their_parent_is_killed() {
     let (_keep, out) = directory();
     let mut run = start("1", &out);
     wait_for_checkpoint(&out);
@@ -279,7 +279,7 @@ fn children_end_with_their_parent_however_it_dies() {
 }
 
 #[test]
-fn services_say_where_they_listen_and_end_on_sigterm() {
+fn services_print_their_address_and_end_on_sigterm() {
     let policy = Path::new(env!("CARGO_MANIFEST_DIR")).join("policies/teacher-push.safetensors");
     let mut teacher = Command::new(env!("CARGO_BIN_EXE_tandem"))
         .args(["teacher", "--ledger", "memory", "--policy"])

@@ -155,7 +155,7 @@ fn summary(output: &Output) -> Value {
 }
 
 #[test]
-fn two_hundred_episodes_of_every_kind_repeat_themselves() {
+fn two_hundred_episodes_of_every_kind_replay_bit_for_bit() {
     let keep = tempfile::tempdir().expect("a directory");
     let worlds = Task::ALL.into_iter().flat_map(|task| {
         [1, 2].into_iter().flat_map(move |n_arms| [(task, n_arms, 10), (task, n_arms, 20)])
@@ -255,7 +255,7 @@ fn spoil_contacts(contacts: &mut Contacts) {
 }
 
 #[test]
-fn a_spoilt_number_is_found_and_named() {
+fn an_altered_number_is_found_and_named() {
     let keep = tempfile::tempdir().expect("a directory");
     let log = read_episode(&one_log(keep.path())).expect("whole");
     let (good, bad) = (keep.path().join("good"), keep.path().join("bad"));
@@ -291,7 +291,7 @@ fn a_spoilt_number_is_found_and_named() {
 }
 
 #[test]
-fn another_action_or_another_world_shows_in_what_follows() {
+fn a_changed_action_or_world_changes_the_replay() {
     let keep = tempfile::tempdir().expect("a directory");
     let log = read_episode(&one_log(keep.path())).expect("whole");
     assert!(replay_log(&log).is_ok());
@@ -334,7 +334,7 @@ fn check_damaged(whole: &EpisodeLog, bytes: &[u8], directory: &Path) -> Option<u
 }
 
 #[test]
-fn a_log_cut_anywhere_is_mended_to_its_beginning() {
+fn a_log_truncated_anywhere_is_recovered_up_to_the_cut() {
     let keep = tempfile::tempdir().expect("a directory");
     let path = one_log(keep.path());
     let (whole, bytes) = (read_episode(&path).expect("whole"), fs::read(&path).expect("readable"));
@@ -355,7 +355,7 @@ fn a_log_cut_anywhere_is_mended_to_its_beginning() {
 }
 
 #[test]
-fn the_program_refuses_what_is_cut_and_mends_it() {
+fn the_program_refuses_and_recovers_truncated_logs() {
     let keep = tempfile::tempdir().expect("a directory");
     let bytes = fs::read(one_log(keep.path())).expect("readable");
     let (cut, mended) = (keep.path().join("cut.mcap"), keep.path().join("mended.mcap"));
@@ -386,7 +386,7 @@ proptest! {
     #![proptest_config(ProptestConfig { cases: 4, failure_persistence: None, ..ProptestConfig::default() })]
 
     #[test]
-    fn a_log_with_other_bytes_is_refused_and_mended(
+    fn a_log_with_altered_bytes_is_refused_and_recovered(
         damages in proptest::collection::vec(
             proptest::collection::vec((any::<usize>(), 1_u8..=255), 1..4), 150,
         ),

@@ -148,7 +148,7 @@ fn finished() -> (TempDir, PathBuf) {
 }
 
 #[test]
-fn a_refused_resume_does_not_reach_the_run_that_is_under_way() {
+fn a_refused_resume_leaves_the_active_run_alone() {
     let (keep, out) = directory();
     let run = start(&out);
     wait_for_checkpoint(&out);
@@ -180,7 +180,7 @@ fn a_refused_resume_does_not_reach_the_run_that_is_under_way() {
 }
 
 #[test]
-fn a_resume_with_other_settings_is_refused_by_name_and_changes_nothing() {
+fn a_resume_with_other_settings_is_refused_and_names_them() {
     let (keep, out) = finished();
     let (before, other) = (kept(&out), other_teacher(keep.path()));
     let refusals = [
@@ -209,7 +209,7 @@ fn a_resume_with_other_settings_is_refused_by_name_and_changes_nothing() {
 }
 
 #[test]
-fn a_run_that_has_ended_goes_on_for_longer() {
+fn a_finished_run_can_be_extended() {
     let (_keep, out) = finished();
     let longer = resume(&out, &["--max-env-steps", "11200"]);
     assert_ne!(digest(&longer), CALM.1);
@@ -230,7 +230,7 @@ fn a_run_without_a_checkpoint_keeps_the_settings_of_its_run_file() {
 }
 
 #[test]
-fn a_run_killed_and_resumed_at_once_goes_on_to_the_same_end() {
+fn a_run_killed_and_resumed_at_once_reaches_the_same_result() {
     let (_keep, out) = directory();
     let mut run = start(&out);
     wait_for_checkpoint(&out);
@@ -240,7 +240,7 @@ fn a_run_killed_and_resumed_at_once_goes_on_to_the_same_end() {
 }
 
 #[test]
-fn a_resume_waits_for_the_teacher_that_an_earlier_start_left_behind() {
+fn a_resume_waits_for_the_teacher_of_an_earlier_start() {
     let (_keep, out) = finished();
     let mut teacher = Command::new(env!("CARGO_BIN_EXE_tandem"))
         .arg("teacher")
@@ -267,7 +267,7 @@ fn a_resume_waits_for_the_teacher_that_an_earlier_start_left_behind() {
 }
 
 #[test]
-fn a_teacher_that_is_killed_as_it_starts_is_started_again() {
+fn a_teacher_killed_during_startup_is_restarted() {
     let (_keep, out) = directory();
     let run = start(&out);
     assert!((0..20_000).any(|_| {
@@ -284,7 +284,7 @@ fn a_teacher_that_is_killed_as_it_starts_is_started_again() {
 }
 
 #[test]
-fn a_run_directory_may_have_a_name_that_is_not_text() {
+fn a_run_directory_name_need_not_be_utf8() {
     let keep = tempfile::tempdir().expect("a directory");
     let out = keep.path().join(OsStr::from_bytes(b"run \xff"));
     assert_eq!(digest(&start(&out).wait_with_output().expect("ends")), CALM.1);

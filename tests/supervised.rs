@@ -160,7 +160,7 @@ fn eventually(holds: impl Fn() -> bool) -> bool {
 }
 
 #[test]
-fn the_same_command_starts_a_run_and_goes_on_with_it_however_it_ended() {
+fn the_same_command_starts_and_resumes_a_run() {
     let mut calm = Supervised::start();
     calm.end();
     let mut run = Supervised::start();
@@ -200,7 +200,7 @@ fn the_same_command_starts_a_run_and_goes_on_with_it_however_it_ended() {
 }
 
 #[test]
-fn a_run_that_is_there_is_not_started_anew_by_mistake() {
+fn an_existing_run_is_not_overwritten() {
     let both = tandem(&["learner", "--run", "r", "--out", "o", "--resume", "--start-or-resume"]);
     let refused = { both }.output().expect("runs");
     assert_eq!(refused.status.code(), Some(64), "{}", String::from_utf8_lossy(&refused.stderr));

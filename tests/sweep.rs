@@ -145,7 +145,7 @@ fn disturbed_sweep(file: &Path, out: &Path) -> Value {
 }
 
 #[test]
-fn a_sweep_that_is_stopped_in_every_way_ends_with_the_bits_of_calm_runs() {
+fn an_interrupted_sweep_ends_with_the_bits_of_undisturbed_runs() {
     let keep = tempfile::tempdir().expect("a directory");
     let (file, out) = (keep.path().join("sweep.toml"), keep.path().join("sweep"));
     write_sweep(&file, "strategies = [\"none\", \"mc-q:0.1\"]\nseeds = [1, 2]", &[]);
@@ -202,7 +202,7 @@ fn report_has_every_run(out: &Path, directory: &Path) {
 }
 
 #[test]
-fn a_run_that_fails_is_told_of_and_tried_again_at_the_next_start() {
+fn a_failed_run_is_reported_and_retried_at_the_next_start() {
     let keep = tempfile::tempdir().expect("a directory");
     let (file, out) = (keep.path().join("sweep.toml"), keep.path().join("sweep"));
     let teacher: PathBuf = keep.path().join("teacher.safetensors");

@@ -199,7 +199,7 @@ const CASES: [(&str, i32, &str); 76] = [
 ];
 
 #[test]
-fn what_cannot_be_used_is_said_in_one_line() {
+fn unusable_inputs_are_reported_in_one_line() {
     let directory = tempfile::tempdir().expect("a directory");
     prepare(directory.path());
     let busy = TcpListener::bind("127.0.0.1:0").expect("a free address");
@@ -228,7 +228,7 @@ fn what_cannot_be_used_is_said_in_one_line() {
 }
 
 #[test]
-fn a_pipe_that_nobody_writes_to_is_not_waited_for_without_end() {
+fn reading_a_pipe_without_a_writer_times_out() {
     let directory = tempfile::tempdir().expect("a directory");
     prepare(directory.path());
     let pipe = directory.path().join("pipe").display().to_string();
@@ -251,7 +251,7 @@ fn a_pipe_that_nobody_writes_to_is_not_waited_for_without_end() {
 }
 
 #[test]
-fn a_text_may_come_from_a_pipe() {
+fn a_text_file_can_be_a_pipe() {
     let directory = tempfile::tempdir().expect("a directory");
     let script = r#"exec "$0" sweep <(printf 'seeds = [1, 2]\n[run]\nstop.max_env_steps = 800\n') --dry-run"#;
     let mut shell = Command::new("bash");

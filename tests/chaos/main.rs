@@ -36,13 +36,13 @@ struct Scale {
 }
 
 #[test]
-fn a_run_under_faults_ends_with_the_bits_of_a_calm_one() {
+fn a_run_under_faults_ends_with_the_bits_of_an_undisturbed_run() {
     compare(&Scale { max_env_steps: 48_000, budget: 12_000, every: Duration::from_millis(1_750) });
 }
 
 #[test]
 #[ignore = "takes a quarter of an hour"]
-fn a_long_run_under_faults_ends_with_the_bits_of_a_calm_one() {
+fn a_long_run_under_faults_ends_with_the_bits_of_an_undisturbed_run() {
     compare(&Scale { max_env_steps: 560_000, budget: 80_000, every: Duration::from_secs(5) });
 }
 

@@ -211,7 +211,7 @@ mod tests {
     }
 
     #[test]
-    fn a_seed_is_a_schedule() {
+    fn a_seed_determines_the_schedule() {
         assert_eq!(events(7, 200), events(7, 200));
         assert_ne!(events(7, 20), events(8, 20));
     }

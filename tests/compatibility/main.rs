@@ -95,7 +95,7 @@ fn an_episode_log_is_read() {
 }
 
 #[test]
-fn a_log_that_was_cut_short_is_recovered() {
+fn a_truncated_log_is_recovered() {
     for version in versions() {
         let directory = tempfile::tempdir().expect("a directory");
         let recovered = directory.path().join("recovered.mcap");
@@ -122,7 +122,7 @@ fn trials_are_read() {
 }
 
 #[test]
-fn a_run_directory_can_be_reported_on() {
+fn a_report_is_written_from_a_run_directory() {
     for version in versions() {
         let mut warnings = Vec::new();
         let run = Run::load(&version.join("run"), &mut warnings).expect("a run");

@@ -31,7 +31,7 @@ fn a_run_survives_calls_that_fail_once() {
 }
 
 #[test]
-fn a_run_on_a_disk_that_died_says_so_and_is_resumed_on_another() {
+fn a_run_reports_a_dead_disk_and_resumes_on_another() {
     let hits =
         [("write run/checkpoint/#.safetensors.tmp", 50), ("pwrite run/ledger.sqlite-wal", 30)];
     faults(Mode::Dead, &hits).iter().for_each(check);
@@ -40,7 +40,7 @@ fn a_run_on_a_disk_that_died_says_so_and_is_resumed_on_another() {
 }
 
 #[test]
-fn a_run_survives_processes_that_are_killed_as_they_write() {
+fn a_run_survives_processes_killed_during_a_write() {
     let hits =
         [("write run/checkpoint/#.safetensors.tmp", 70), ("pwrite run/ledger.sqlite-wal", 40)];
     faults(Mode::Kill, &hits).iter().for_each(check);

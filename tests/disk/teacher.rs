@@ -248,14 +248,14 @@ fn faults(mode: Mode, errno: i32, n_hits: usize) -> Vec<Fault> {
 }
 
 #[test]
-fn a_teacher_answers_what_it_has_charged_whatever_its_disk_does() {
+fn a_teachers_answers_match_its_charges_under_disk_faults() {
     for mode in [Mode::Once, Mode::Dead, Mode::Kill, Mode::Cut] {
         faults(mode, EIO, 12).iter().for_each(check);
     }
 }
 
 #[test]
-fn a_teacher_answers_what_it_has_charged_when_its_disk_is_full() {
+fn a_teachers_answers_match_its_charges_on_a_full_disk() {
     for mode in [Mode::Once, Mode::Dead] {
         faults(mode, ENOSPC, 4).iter().for_each(check);
     }

@@ -178,7 +178,7 @@ fn one_simulation() {
 }
 
 #[test]
-fn every_calm_run_uses_up_its_budget_and_is_judged_three_times() {
+fn every_undisturbed_run_spends_its_budget_and_is_evaluated_three_times() {
     for (run_idx, (_, budget, ..)) in RUNS.iter().enumerate() {
         let Outcome { units, n_rounds, judged, .. } = calm(run_idx);
         assert_eq!(*units, [*budget, 0, 0]);
@@ -188,7 +188,7 @@ fn every_calm_run_uses_up_its_budget_and_is_judged_three_times() {
 }
 
 #[test]
-fn a_run_in_which_much_goes_wrong_ends_like_a_calm_one() {
+fn a_run_with_many_faults_ends_like_an_undisturbed_one() {
     let courses = for_seeds(0..24, check_run);
     let all = courses.iter().fold(Course::default(), Course::plus);
     assert!(all.n_repeats > 100, "the teacher was hardly asked again: {all:?}");
@@ -198,39 +198,39 @@ fn a_run_in_which_much_goes_wrong_ends_like_a_calm_one() {
 }
 
 #[test]
-fn a_ledger_that_forgets_its_verdicts_is_found_out() {
+fn a_ledger_that_forgets_verdicts_is_detected() {
     let found = complaints(0..6, |seed| check(Kind::ForgetfulRun, seed));
     assert!(!found.is_empty(), "six seeds found nothing");
 }
 
 #[test]
-fn a_crowd_spends_the_budget_once_and_no_more() {
+fn a_crowd_spends_the_budget_exactly_once() {
     let n_repeats: u64 = for_seeds(0..60, check_crowd).into_iter().sum();
     assert!(n_repeats > 0);
 }
 
 #[test]
-fn a_crowd_finds_out_a_ledger_that_forgets_its_verdicts() {
+fn a_crowd_detects_a_ledger_that_forgets_verdicts() {
     let forgetful = |seed| process::run(Simulation(Kind::ForgetfulCrowd, seed), None);
     assert!(!complaints(0..3, forgetful).is_empty(), "three seeds found nothing");
 }
 
 #[test]
-fn a_run_ends_although_somebody_is_connected_who_says_nothing() {
+fn a_run_ends_despite_a_silent_open_connection() {
     let Report { outcome, course } = process::run(Simulation(Kind::Silent, 0), None).expect("ends");
     assert_eq!(outcome.as_ref(), Some(calm(0)));
     assert!(course.took < Duration::from_secs(60), "{course:?}");
 }
 
 #[test]
-fn the_same_seed_takes_the_same_course() {
+fn the_same_seed_gives_the_same_trace() {
     let compared = repeats::compare(&[Simulation(Kind::Run, 8), Simulation(Kind::Crowd, 4)], 3);
     println!("{}", compared.unwrap_or_else(|difference| panic!("{difference}")));
 }
 
 #[test]
 #[ignore = "takes minutes"]
-fn many_seeds_take_the_same_course_ten_times_on_a_busy_machine() {
+fn many_seeds_repeat_their_traces_ten_times_on_a_busy_machine() {
     let runs = seeds_asked_for(12).map(|seed| Simulation(Kind::Run, seed));
     let crowds = seeds_asked_for(12).map(|seed| Simulation(Kind::Crowd, seed));
     let simulations: Vec<_> = runs.chain(crowds).collect();
@@ -240,7 +240,7 @@ fn many_seeds_take_the_same_course_ten_times_on_a_busy_machine() {
 
 #[test]
 #[ignore = "takes minutes"]
-fn many_runs_in_which_much_goes_wrong_end_like_calm_ones() {
+fn many_runs_with_many_faults_end_like_undisturbed_ones() {
     let courses = for_seeds(seeds_asked_for(500), check_run);
     let all = courses.iter().fold(Course::default(), Course::plus);
     println!("{} runs, together {all:?}", courses.len());
@@ -248,7 +248,7 @@ fn many_runs_in_which_much_goes_wrong_end_like_calm_ones() {
 
 #[test]
 #[ignore = "takes minutes"]
-fn many_crowds_spend_the_budget_once_and_no_more() {
+fn many_crowds_spend_the_budget_exactly_once() {
     let repeats = for_seeds(seeds_asked_for(500), check_crowd);
     println!("{} crowds, {} repeats", repeats.len(), repeats.iter().sum::<u64>());
 }
