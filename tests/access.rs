@@ -1,4 +1,4 @@
-//! Who may call whom: tokens, certificates and `tandem health`, with the built program.
+//! Access control of the built program: tokens, certificates and `tandem health`.
 
 #[path = "access/program.rs"]
 mod program;
@@ -13,15 +13,15 @@ use tonic::service::interceptor::InterceptedService;
 use tonic::transport::{Channel, Endpoint};
 use tonic::{Code, Request, Status};
 
-use program::{Place, SECRET, eventually, fails_with, teacher};
+use program::{SECRET, Workspace, eventually, fails_with, teacher};
 
 const OTHER: &str = "another-token-456789";
 
-/// Shows a token, or none, as any client could.
+/// BearerToken a token, or none, as any client could.
 #[derive(Clone)]
-struct Shows(Option<&'static str>);
+struct BearerToken(Option<&'static str>);
 
-impl Interceptor for Shows {
+impl Interceptor for BearerToken {
     fn call(&mut self, mut request: Request<()>) -> Result<Request<()>, Status> {
         if let Some(token) = self.0 {
             let value = format!("Bearer {token}").parse().expect("ASCII");
@@ -31,15 +31,15 @@ impl Interceptor for Shows {
     }
 }
 
-type Caller = InterceptedService<Channel, Shows>;
+type Caller = InterceptedService<Channel, BearerToken>;
 
 fn caller(address: &str, token: Option<&'static str>) -> Caller {
     let endpoint = Endpoint::from_shared(format!("http://{address}")).expect("an address");
-    InterceptedService::new(endpoint.connect_lazy(), Shows(token))
+    InterceptedService::new(endpoint.connect_lazy(), BearerToken(token))
 }
 
-/// The paths of all calls of a service.
-fn calls_of(service: &str) -> Vec<String> {
+/// Returns the paths of all methods of a service.
+fn methods_of(service: &str) -> Vec<String> {
     let set = prost_types::FileDescriptorSet::decode(tandem_proto::FILE_DESCRIPTOR_SET);
     let services = set.expect("descriptors").file.into_iter().flat_map(|file| file.service);
     services
@@ -49,7 +49,7 @@ fn calls_of(service: &str) -> Vec<String> {
         .collect()
 }
 
-/// The code of the answer to an empty message; a stream's is the same before it is open.
+/// Calls a method with an empty message and returns the status code. Streaming methods fail with the same code.
 async fn code_of(caller: &Caller, path: &str) -> Code {
     let mut caller = tonic::client::Grpc::new(caller.clone());
     caller.ready().await.expect("ready");
@@ -62,16 +62,16 @@ async fn code_of(caller: &Caller, path: &str) -> Code {
 
 #[test]
 fn a_non_loopback_address_requires_a_token() {
-    let place = Place::new();
+    let workspace = Workspace::new();
     for address in ["0.0.0.0:0", "[::]:0", "[::ffff:0.0.0.0]:0"] {
-        let line = fails_with(64, place.run(&teacher(&["--listen", address])));
+        let line = fails_with(64, workspace.run(&teacher(&["--listen", address])));
         assert!(line.contains("--token-file"), "{line}");
     }
-    let mut open = place.serve("insecure", &teacher(&["--listen", "0.0.0.0:0", "--insecure"]));
+    let mut open = workspace.serve("insecure", &teacher(&["--listen", "0.0.0.0:0", "--insecure"]));
     let mut safe =
-        place.serve("safe", &teacher(&["--listen", "0.0.0.0:0", "--token-file", "token"]));
+        workspace.serve("safe", &teacher(&["--listen", "0.0.0.0:0", "--token-file", "token"]));
     for service in [&mut open, &mut safe] {
-        let health = place.run(&["health", &service.local_address()]);
+        let health = workspace.run(&["health", &service.local_address()]);
         assert_eq!(String::from_utf8_lossy(&health.stdout), "serving\n");
     }
     assert_eq!(safe.end(), Some(0), "{}", safe.log());
@@ -80,11 +80,11 @@ fn a_non_loopback_address_requires_a_token() {
 
 #[test]
 fn secrets_and_certificates_that_cannot_be_used_are_refused_at_start() {
-    let place = Place::new();
-    place.write("empty", " \n");
-    place.write("short", "short\n");
-    place.write("nul", "0123456789\0abcdef\n");
-    place.write("umlaut", "0123456789abcdefü\n");
+    let workspace = Workspace::new();
+    workspace.write("empty", " \n");
+    workspace.write("short", "short\n");
+    workspace.write("nul", "0123456789\0abcdef\n");
+    workspace.write("umlaut", "0123456789abcdefü\n");
     let tls = |certificate, key| teacher(&["--tls-cert", certificate, "--tls-key", key]);
     let trust = |authority| {
         ["worker", "--connect", "127.0.0.1:1", "--tls-ca", authority].map(str::to_owned).to_vec()
@@ -103,7 +103,7 @@ fn secrets_and_certificates_that_cannot_be_used_are_refused_at_start() {
         (trust("tls.key"), "no certificate"),
         (trust("missing.pem"), "cannot read \"missing.pem\""),
     ] {
-        let line = fails_with(64, place.run(&command));
+        let line = fails_with(64, workspace.run(&command));
         assert!(line.contains(expected), "{command:?}: {line}");
     }
 }
@@ -112,11 +112,11 @@ fn secrets_and_certificates_that_cannot_be_used_are_refused_at_start() {
 #[test]
 fn a_world_readable_token_file_is_used_with_a_warning() {
     use std::os::unix::fs::PermissionsExt as _;
-    let place = Place::new();
+    let workspace = Workspace::new();
     for (mode, warned) in [(0o600, false), (0o640, false), (0o644, true)] {
         let mode = std::fs::Permissions::from_mode(mode);
-        std::fs::set_permissions(place.path().join("token"), mode).expect("our own file");
-        let mut service = place.serve("teacher", &teacher(&["--token-file", "token"]));
+        std::fs::set_permissions(workspace.path().join("token"), mode).expect("our own file");
+        let mut service = workspace.serve("teacher", &teacher(&["--token-file", "token"]));
         assert_eq!(service.end(), Some(0), "{}", service.log());
         assert_eq!(service.log().contains("chmod 600"), warned, "{}", service.log());
     }
@@ -124,11 +124,11 @@ fn a_world_readable_token_file_is_used_with_a_warning() {
 
 #[test]
 fn health_reports_the_service_and_the_cause_of_a_failure() {
-    let place = Place::new();
+    let workspace = Workspace::new();
     let tls = ["--token-file", "token", "--tls-cert", "tls.pem", "--tls-key", "tls.key"];
-    let service = place.serve("teacher", &teacher(&tls));
+    let service = workspace.serve("teacher", &teacher(&tls));
     let address = service.address.clone();
-    let health = |more: &[&str]| place.run(&[&["health", &address], more].concat());
+    let health = |more: &[&str]| workspace.run(&[&["health", &address], more].concat());
 
     assert_eq!(String::from_utf8_lossy(&health(&["--tls-ca", "ca.pem"]).stdout), "serving\n");
     let named = health(&["--tls-ca", "ca.pem", "--service", "tandem.v1.Teacher", "--json"]);
@@ -149,63 +149,68 @@ fn health_reports_the_service_and_the_cause_of_a_failure() {
     let shown: Value = serde_json::from_slice(&gone.stdout).expect("JSON");
     assert_eq!((gone.status.code(), &shown["serving"]), (Some(75), &json!(false)));
     assert!(shown["reason"].as_str().is_some_and(|reason| reason.contains("refused")), "{shown}");
-    fails_with(64, place.run(&["health", "nowhere"]));
+    fails_with(64, workspace.run(&["health", "nowhere"]));
 }
 
 #[test]
 fn a_service_that_never_answers_is_unhealthy_after_the_timeout() {
     let silent = std::net::TcpListener::bind("127.0.0.1:0").expect("a port");
     let address = silent.local_addr().expect("bound").to_string();
-    let line = fails_with(75, Place::new().run(&["health", &address, "--timeout-s", "0.2"]));
+    let line = fails_with(75, Workspace::new().run(&["health", &address, "--timeout-s", "0.2"]));
     assert!(line.contains(&address) && line.contains("200ms"), "{line}");
 }
 
 #[tokio::test]
 async fn calls_without_the_right_token_are_rejected_without_effect() {
-    let place = Place::new();
-    let mut teacher = place.serve("teacher", &teacher(&["--token-file", "token"]));
+    let workspace = Workspace::new();
+    let mut teacher = workspace.serve("teacher", &teacher(&["--token-file", "token"]));
     let right = ["--teacher", &teacher.address, "--token-file", "token"];
-    let mut learner = place.serve("learner", &place.learner(&right));
+    let mut learner = workspace.serve("learner", &workspace.learner(&right));
     let relay = ["relay", "--connect", &learner.address, "--token-file", "token"];
-    let relay = place.serve("relay", &relay);
+    let relay = workspace.serve("relay", &relay);
 
-    let (teaches, learns) = (calls_of("Teacher"), calls_of("Learner"));
-    assert!(teaches.len() >= 7 && learns.len() >= 6, "{teaches:?} {learns:?}");
+    let (teacher_calls, learner_calls) = (methods_of("Teacher"), methods_of("Learner"));
+    assert!(
+        teacher_calls.len() >= 7 && learner_calls.len() >= 6,
+        "{teacher_calls:?} {learner_calls:?}"
+    );
     for token in [None, Some(OTHER)] {
-        for (service, calls) in [(&teacher, &teaches), (&learner, &learns), (&relay, &learns)] {
+        for (service, calls) in
+            [(&teacher, &teacher_calls), (&learner, &learner_calls), (&relay, &learner_calls)]
+        {
             let intruder = caller(&service.address, token);
             for path in calls {
                 assert_eq!(code_of(&intruder, path).await, Code::Unauthenticated, "{path}");
             }
         }
         let mut intruder = TeacherClient::new(caller(&teacher.address, token));
-        let opened = intruder.open_account(account("intruder")).await.expect_err("sent away");
+        let opened = intruder.open_account(account("intruder")).await.expect_err("rejected");
         assert_eq!(opened.code(), Code::Unauthenticated);
         let mut intruder = LearnerClient::new(caller(&learner.address, token));
-        let joined = intruder.join(worker("intruder")).await.expect_err("sent away");
+        let joined = intruder.join(worker("intruder")).await.expect_err("rejected");
         assert_eq!(joined.code(), Code::Unauthenticated);
     }
 
-    let mut friend = TeacherClient::new(caller(&teacher.address, Some(SECRET)));
+    let mut allowed = TeacherClient::new(caller(&teacher.address, Some(SECRET)));
     let named = pb::GetAccountRequest { name: "intruder".to_owned() };
-    let sought = friend.get_account(named).await.expect_err("was not opened");
+    let sought = allowed.get_account(named).await.expect_err("the account was not opened");
     assert_eq!(sought.code(), Code::NotFound);
-    let args = ["worker", "--name", "friend", "--connect", &learner.address];
-    let _friend = place.start("worker", &[&args[..], &right].concat());
+    let args = ["worker", "--name", "allowed", "--connect", &learner.address];
+    let _worker = workspace.start("worker", &[&args[..], &right].concat());
     let mut watcher = LearnerClient::new(caller(&learner.address, Some(SECRET)));
     let shown = async {
         let watched = watcher.watch(pb::WatchRequest {}).await;
-        let mut stream = watched.expect("may be watched").into_inner();
+        let mut stream = watched.expect("the watch is permitted").into_inner();
         loop {
-            let progress = stream.message().await.expect("goes on").expect("tells of workers");
+            let progress = stream.message().await.expect("the stream continues").expect("progress");
             if !progress.workers.is_empty() {
                 return progress.workers;
             }
         }
     };
-    let workers = tokio::time::timeout(program::DEADLINE, shown).await.expect("is shown");
+    let workers = tokio::time::timeout(program::DEADLINE, shown).await.expect("a worker is listed");
     let names: Vec<String> = workers.into_iter().map(|worker| worker.name).collect();
-    assert_eq!(names, ["friend"]);
+    assert_eq!(names, ["allowed"]);
     for service in [&mut teacher, &mut learner] {
         service.end();
         assert!(!service.log().contains("intruder"), "{}", service.log());
@@ -222,26 +227,26 @@ fn worker(name: &str) -> pb::JoinRequest {
 
 #[test]
 fn learners_and_workers_with_a_wrong_token_exit_with_an_error() {
-    let place = Place::new();
-    place.write("other-token", OTHER);
-    let teacher = place.serve("teacher", &teacher(&["--token-file", "token"]));
+    let workspace = Workspace::new();
+    workspace.write("other-token", OTHER);
+    let teacher = workspace.serve("teacher", &teacher(&["--token-file", "token"]));
     let right = ["--teacher", &teacher.address, "--token-file", "token"];
-    let learner = place.serve("learner", &place.learner(&right));
+    let learner = workspace.serve("learner", &workspace.learner(&right));
     let worker = ["worker", "--connect", &learner.address, "--teacher", &teacher.address];
     for token in [&["--token-file", "other-token"][..], &[]] {
-        let line = fails_with(64, place.run(&[&worker[..], token].concat()));
+        let line = fails_with(64, workspace.run(&[&worker[..], token].concat()));
         assert!(line.contains(&learner.address) && line.contains("--token-file"), "{line}");
         let args = [&["--teacher", &teacher.address][..], token].concat();
-        let line = fails_with(64, place.run(&place.learner(&args)));
+        let line = fails_with(64, workspace.run(&workspace.learner(&args)));
         assert!(line.contains(&teacher.address) && line.contains("--token-file"), "{line}");
     }
 }
 
 #[test]
 fn a_command_that_dials_the_wrong_service_ends_and_names_it() {
-    let place = Place::new();
-    let teacher = place.serve("teacher", &teacher(&[]));
-    let learner = place.serve("learner", &place.learner(&["--teacher", &teacher.address]));
+    let workspace = Workspace::new();
+    let teacher = workspace.serve("teacher", &teacher(&[]));
+    let learner = workspace.serve("learner", &workspace.learner(&["--teacher", &teacher.address]));
     let (teacher, learner) = (teacher.address.as_str(), learner.address.as_str());
     let command = |args: &[&str]| args.iter().copied().map(str::to_owned).collect::<Vec<_>>();
     let is_teacher = format!("the service at {teacher} is a teacher, not a ");
@@ -249,38 +254,38 @@ fn a_command_that_dials_the_wrong_service_ends_and_names_it() {
     for (command, expected) in [
         (command(&["worker", "--connect", teacher, "--teacher", learner]), &is_teacher),
         (command(&["worker", "--connect", learner, "--teacher", learner]), &is_learner),
-        (place.learner(&["--teacher", learner]), &is_learner),
+        (workspace.learner(&["--teacher", learner]), &is_learner),
         (command(&["status", teacher]), &is_teacher),
         (command(&["status", teacher, "--watch"]), &is_teacher),
         (command(&["bridge", "stop", "--connect", teacher]), &is_teacher),
         (command(&["bridge", "reset", "--connect", learner]), &is_learner),
     ] {
-        let line = fails_with(64, place.run(&command));
+        let line = fails_with(64, workspace.run(&command));
         assert!(line.contains(expected), "{command:?}: {line}");
     }
 }
 
 #[test]
 fn a_tls_mismatch_is_explained_and_retried() {
-    let place = Place::new();
-    let plain = place.serve("plain", &teacher(&[]));
-    let tls = place.serve("tls", &teacher(&["--tls-cert", "tls.pem", "--tls-key", "tls.key"]));
+    let workspace = Workspace::new();
+    let plain = workspace.serve("plain", &teacher(&[]));
+    let tls = workspace.serve("tls", &teacher(&["--tls-cert", "tls.pem", "--tls-key", "tls.key"]));
     let worker = |address: &str| ["worker", "--connect", address].map(str::to_owned).to_vec();
     let trusting = |mut command: Vec<String>| {
         command.extend(["--tls-ca".to_owned(), "ca.pem".to_owned()]);
         command
     };
-    let learner = |address: &str| place.learner(&["--teacher", address]);
-    for (name, command, told) in [
+    let learner = |address: &str| workspace.learner(&["--teacher", address]);
+    for (name, command, message) in [
         ("plain-worker", worker(&tls.address), "speaks TLS"),
         ("tls-worker", trusting(worker(&plain.address)), "does not speak TLS"),
         ("plain-learner", learner(&tls.address), "speaks TLS"),
         ("tls-learner", trusting(learner(&plain.address)), "does not speak TLS"),
     ] {
         let debug = ["--log".to_owned(), "tandem_net::retry=debug".to_owned()];
-        let mut running = place.start(name, &[command, debug.to_vec()].concat());
-        let told_twice = || running.log().matches(told).count() >= 2;
-        assert!(eventually(told_twice), "{name}: {}", running.log());
+        let mut running = workspace.start(name, &[command, debug.to_vec()].concat());
+        let logged_twice = || running.log().matches(message).count() >= 2;
+        assert!(eventually(logged_twice), "{name}: {}", running.log());
         let warnings =
             |log: &str| log.lines().filter(|line| line.contains("call failed, ")).count();
         assert_eq!(warnings(&running.log()), 1, "{name}: {}", running.log());
@@ -291,33 +296,33 @@ fn a_tls_mismatch_is_explained_and_retried() {
 
 #[test]
 fn a_run_through_a_relay_over_tls_with_a_token_succeeds() {
-    let place = Place::new();
+    let workspace = Workspace::new();
     let offer = ["--token-file", "token", "--tls-cert", "tls.pem", "--tls-key", "tls.key"];
     let call = ["--token-file", "token", "--tls-ca", "ca.pem"];
-    let teacher = place.serve("teacher", &teacher(&offer));
+    let teacher = workspace.serve("teacher", &teacher(&offer));
     let more = [&["--teacher", &teacher.address, "--tls-ca", "ca.pem"][..], &offer].concat();
-    let mut learner = place.serve("learner", &place.learner(&more));
+    let mut learner = workspace.serve("learner", &workspace.learner(&more));
     let relay = ["relay", "--connect", &learner.address, "--tls-ca", "ca.pem"];
-    let relay = place.serve("relay", &[&relay[..], &offer].concat());
-    let health = place.run(&["health", &relay.address, "--tls-ca", "ca.pem"]);
+    let relay = workspace.serve("relay", &[&relay[..], &offer].concat());
+    let health = workspace.run(&["health", &relay.address, "--tls-ca", "ca.pem"]);
     assert_eq!(String::from_utf8_lossy(&health.stdout), "serving\n");
     let worker = ["worker", "--connect", &relay.address, "--teacher", &teacher.address];
-    let played = place.run(&[&worker[..], &call].concat());
-    assert!(played.status.success(), "{}", String::from_utf8_lossy(&played.stderr));
+    let worked = workspace.run(&[&worker[..], &call].concat());
+    assert!(worked.status.success(), "{}", String::from_utf8_lossy(&worked.stderr));
     assert_eq!(learner.wait(), Some(0), "{}", learner.log());
 }
 
 #[test]
 fn a_run_over_tls_with_a_token_succeeds() {
-    let place = Place::new();
+    let workspace = Workspace::new();
     let offer = ["--token-file", "token", "--tls-cert", "tls.pem", "--tls-key", "tls.key"];
     let call = ["--token-file", "token", "--tls-ca", "ca.pem"];
-    let teacher = place.serve("teacher", &teacher(&offer));
+    let teacher = workspace.serve("teacher", &teacher(&offer));
     let more = [&["--teacher", &teacher.address, "--tls-ca", "ca.pem"][..], &offer].concat();
-    let mut learner = place.serve("learner", &place.learner(&more));
+    let mut learner = workspace.serve("learner", &workspace.learner(&more));
     let worker = ["worker", "--connect", &learner.address, "--teacher", &teacher.address];
-    let played = place.run(&[&worker[..], &call].concat());
-    assert!(played.status.success(), "{}", String::from_utf8_lossy(&played.stderr));
+    let worked = workspace.run(&[&worker[..], &call].concat());
+    assert!(worked.status.success(), "{}", String::from_utf8_lossy(&worked.stderr));
     assert_eq!(learner.wait(), Some(0), "{}", learner.log());
     assert!(learner.log().contains("advice account opened"), "{}", learner.log());
 }

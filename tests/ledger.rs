@@ -1,4 +1,4 @@
-//! The program's budget under fire: teachers that are killed while many clients ask, ledgers that are taken away, and
+//! The advice budget under faults: teachers that are killed while many clients ask, ledger files that are deleted, and
 //! second teachers on the same ledger.
 
 use std::collections::BTreeMap;
@@ -20,12 +20,12 @@ use tonic::transport::{Channel, Endpoint};
 
 const N_CLIENTS: u64 = 64;
 const ACCOUNT: &str = "shared";
-/// Steps of a client's own in a request; one of somebody else's comes with them.
+/// Steps of the client's own episode in a request. Each request also repeats one step of another client.
 const OWN_STEPS: u32 = 4;
-/// Far longer than anything here takes on a busy machine.
+/// Far longer than any operation here takes on a busy machine.
 const DEADLINE: Duration = Duration::from_secs(120);
 
-/// A teacher with a process of its own; killed at the latest with the test.
+/// A teacher process that is killed on drop.
 struct Teacher {
     process: Child,
     address: String,
@@ -53,15 +53,15 @@ impl Teacher {
             .expect("starts")
     }
 
-    /// Ends it as `kill -9` does.
+    /// Kills the process with SIGKILL.
     fn kill(&mut self) {
-        assert!(self.process.try_wait().expect("a child").is_none(), "it still ran");
+        assert!(self.process.try_wait().expect("a child").is_none(), "the teacher ended early");
         self.process.kill().expect("killed");
         self.process.wait().expect("gone");
     }
 }
 
-/// The exit code and the one line of a teacher that does not start on `ledger`.
+/// Returns the exit code and the single error line of a teacher that refuses to start on `ledger`.
 fn refusal(ledger: &Path) -> (Option<i32>, String) {
     let policy = Path::new(env!("CARGO_MANIFEST_DIR")).join("policies/teacher-push.safetensors");
     let output = Command::new(env!("CARGO_BIN_EXE_tandem"))
@@ -73,10 +73,10 @@ fn refusal(ledger: &Path) -> (Option<i32>, String) {
         .stdin(Stdio::null())
         .output()
         .expect("ran");
-    let told = String::from_utf8(output.stderr).expect("UTF-8");
-    assert_eq!(told.matches('\n').count(), 1, "{told:?}");
-    assert!(!told.trim_end().contains(char::is_control), "{told:?}");
-    (output.status.code(), told)
+    let stderr = String::from_utf8(output.stderr).expect("UTF-8");
+    assert_eq!(stderr.matches('\n').count(), 1, "{stderr:?}");
+    assert!(!stderr.trim_end().contains(char::is_control), "{stderr:?}");
+    (output.status.code(), stderr)
 }
 
 impl Drop for Teacher {
@@ -86,46 +86,46 @@ impl Drop for Teacher {
     }
 }
 
-/// What all clients together were told.
+/// The answers that all clients received.
 #[derive(Default)]
-struct Told {
+struct Answers {
     verdicts: Mutex<Verdicts>,
-    news: Condvar,
-    /// Charges after which clients ask nothing new for now, so that none outruns whoever kills; 0 for no such limit.
+    changed: Condvar,
+    /// Number of charges after which clients pause, so that they do not outrun the kills. 0 means no limit.
     hold_at: AtomicUsize,
 }
 
 #[derive(Default)]
 struct Verdicts {
-    /// Whether a step was charged, by episode and step.
+    /// True for charged steps, by episode and step.
     by_step: BTreeMap<(u64, u32), bool>,
     n_charged: usize,
 }
 
-impl Told {
-    /// Notes the answer to a request, which must repeat what was said of its steps before.
-    fn hear(&self, request: &pb::AdviseRequest, answer: &pb::AdviseResponse) {
+impl Answers {
+    /// Records the answer to a request, which must agree with every earlier answer about the same steps.
+    fn record(&self, request: &pb::AdviseRequest, answer: &pb::AdviseResponse) {
         assert_eq!(answer.steps.len(), request.steps.len());
-        let mut told = self.verdicts.lock().expect("whole");
+        let mut verdicts = self.verdicts.lock().expect("whole");
         for (query, advice) in request.steps.iter().zip(&answer.steps) {
             let key = (query.episode, query.step);
-            let known = told.by_step.insert(key, advice.charged);
+            let known = verdicts.by_step.insert(key, advice.charged);
             assert!(known.is_none_or(|known| known == advice.charged), "{key:?} was {known:?}");
-            told.n_charged += usize::from(known.is_none() && advice.charged);
+            verdicts.n_charged += usize::from(known.is_none() && advice.charged);
         }
-        self.news.notify_all();
+        self.changed.notify_all();
     }
 
-    /// Some step that somebody was answered about, or will be.
-    fn anybodys_step(&self, number: u64) -> (u64, u32) {
-        let told = self.verdicts.lock().expect("whole");
+    /// Returns a pseudorandom step that has been answered, or the very first step.
+    fn known_step(&self, number: u64) -> (u64, u32) {
+        let verdicts = self.verdicts.lock().expect("whole");
         let mixed = number.wrapping_mul(0x9E37_79B9_7F4A_7C15) >> 40;
         let from = (mixed % N_CLIENTS, u32::try_from(mixed / N_CLIENTS % 150).expect("few"));
-        told.by_step.range(from..).next().map_or((0, 0), |(step, _)| *step)
+        verdicts.by_step.range(from..).next().map_or((0, 0), |(step, _)| *step)
     }
 
-    /// Waits while the clients are to hold.
-    async fn may_go_on(&self) {
+    /// Waits until the number of charges is below the limit.
+    async fn wait_until_released(&self) {
         let is_held = || {
             let hold_at = self.hold_at.load(Ordering::Relaxed);
             hold_at > 0 && self.verdicts.lock().expect("whole").n_charged >= hold_at
@@ -136,29 +136,30 @@ impl Told {
     }
 
     fn wait_for(&self, n_charged: usize) {
-        let told = self.verdicts.lock().expect("whole");
-        let waited =
-            self.news.wait_timeout_while(told, DEADLINE, |told| told.n_charged < n_charged);
-        let (told, _) = waited.expect("whole");
-        assert!(told.n_charged >= n_charged, "only {} charges until now", told.n_charged);
+        let verdicts = self.verdicts.lock().expect("whole");
+        let waited = self
+            .changed
+            .wait_timeout_while(verdicts, DEADLINE, |verdicts| verdicts.n_charged < n_charged);
+        let (verdicts, _) = waited.expect("whole");
+        assert!(verdicts.n_charged >= n_charged, "only {} charges so far", verdicts.n_charged);
     }
 }
 
-/// A client with a connection to each of some teachers, of which it asks one and, when that is away, the next.
+/// A client that asks one of several teachers and fails over to the next when that one is unavailable.
 struct Client {
     teachers: Vec<TeacherClient<Channel>>,
-    asked: usize,
+    current: usize,
 }
 
 impl Client {
     fn of(addresses: &[String], number: u64) -> Self {
-        let asked = usize::try_from(number).expect("few") % addresses.len();
-        Self { teachers: addresses.iter().map(|address| client_of(address)).collect(), asked }
+        let current = usize::try_from(number).expect("few") % addresses.len();
+        Self { teachers: addresses.iter().map(|address| client_of(address)).collect(), current }
     }
 
     async fn advise(&mut self, request: &pb::AdviseRequest) -> pb::AdviseResponse {
         loop {
-            match self.teachers[self.asked].advise(request.clone()).await {
+            match self.teachers[self.current].advise(request.clone()).await {
                 Ok(answer) => return answer.into_inner(),
                 Err(status) => {
                     let is_refusal = matches!(
@@ -169,7 +170,7 @@ impl Client {
                             | Code::OutOfRange
                     );
                     assert!(!is_refusal, "{status}");
-                    self.asked = (self.asked + 1) % self.teachers.len();
+                    self.current = (self.current + 1) % self.teachers.len();
                     tokio::time::sleep(Duration::from_millis(5)).await;
                 }
             }
@@ -183,17 +184,17 @@ fn query(episode: u64, step: u32) -> pb::StepQuery {
     pb::StepQuery { episode, step, observation, goal, proposed_action }
 }
 
-/// Asks about steps of its own episode until the budget is spent, then about all of them again.
-async fn play(mut client: Client, number: u64, told: Arc<Told>) {
+/// Asks about new steps of the client's own episode until the budget is spent, then repeats every request.
+async fn play(mut client: Client, number: u64, answers: Arc<Answers>) {
     let mut requests = Vec::new();
     for first in (0..).step_by(usize::try_from(OWN_STEPS).expect("few")) {
-        told.may_go_on().await;
-        let others = told.anybodys_step(number + u64::from(first));
+        answers.wait_until_released().await;
+        let others = answers.known_step(number + u64::from(first));
         let own = (first..first + OWN_STEPS).map(|step| query(number, step));
         let steps = own.chain([query(others.0, others.1)]).collect();
         let request = pb::AdviseRequest { account: ACCOUNT.to_owned(), steps };
         let answer = client.advise(&request).await;
-        told.hear(&request, &answer);
+        answers.record(&request, &answer);
         requests.push(request);
         if answer.budget_left == 0 {
             break;
@@ -201,7 +202,7 @@ async fn play(mut client: Client, number: u64, told: Arc<Told>) {
     }
     for request in &requests {
         let answer = client.advise(request).await;
-        told.hear(request, &answer);
+        answers.record(request, &answer);
     }
 }
 
@@ -209,7 +210,7 @@ fn runtime() -> Runtime {
     Builder::new_multi_thread().worker_threads(2).enable_all().build().expect("a runtime")
 }
 
-/// Connects at the first call. To connect here would compile the client again, for this file.
+/// Returns a client that connects on its first call. Connecting here would compile the client again for this file.
 fn client_of(address: &str) -> TeacherClient<Channel> {
     let endpoint = Endpoint::from_shared(format!("http://{address}")).expect("an address");
     TeacherClient::new(endpoint.timeout(DEADLINE).connect_lazy())
@@ -222,27 +223,38 @@ fn open_account(runtime: &Runtime, address: &str, budget: u64) {
     assert_eq!(opened.expect("opened").into_inner().left, budget);
 }
 
-fn start_clients(runtime: &Runtime, addresses: &[String], told: &Arc<Told>) -> JoinSet<()> {
+fn start_clients(runtime: &Runtime, addresses: &[String], answers: &Arc<Answers>) -> JoinSet<()> {
     let mut clients = JoinSet::new();
     for number in 0..N_CLIENTS {
-        let (addresses, told) = (addresses.to_vec(), Arc::clone(told));
-        let play = async move { play(Client::of(&addresses, number), number, told).await };
+        let (addresses, answers) = (addresses.to_vec(), Arc::clone(answers));
+        let play = async move { play(Client::of(&addresses, number), number, answers).await };
         clients.spawn_on(play, runtime.handle());
     }
     clients
 }
 
-/// Waits for the clients and compares the sums: what they were told was charged, and what the account says.
-fn check_sums(runtime: &Runtime, clients: JoinSet<()>, address: &str, told: &Told, budget: u64) {
+/// Waits for the clients, then compares the charges that they counted with the account.
+fn check_sums(
+    runtime: &Runtime,
+    clients: JoinSet<()>,
+    address: &str,
+    answers: &Answers,
+    budget: u64,
+) {
     let done = async { tokio::time::timeout(DEADLINE, clients.join_all()).await };
     runtime.block_on(done).expect("all clients are done");
     let request = pb::GetAccountRequest { name: ACCOUNT.to_owned() };
     let account = runtime.block_on(async { client_of(address).get_account(request).await });
     let account = account.expect("an account").into_inner();
-    let told = told.verdicts.lock().expect("whole");
+    let answers = answers.verdicts.lock().expect("whole");
     assert_eq!(account.spent, budget);
     assert_eq!((account.leased, account.left), (0, 0));
-    assert_eq!(u64::try_from(told.n_charged).expect("few"), budget, "of {}", told.by_step.len());
+    assert_eq!(
+        u64::try_from(answers.n_charged).expect("few"),
+        budget,
+        "of {}",
+        answers.by_step.len()
+    );
 }
 
 #[test]
@@ -254,33 +266,33 @@ fn ten_thousand_units_are_charged_once_while_the_teacher_is_killed_fifty_times()
     let ledger = ledger.to_str().expect("UTF-8");
     let mut teacher = Teacher::start(ledger, "127.0.0.1:0");
     let address = teacher.address.clone();
-    let (runtime, told) = (runtime(), Arc::new(Told::default()));
+    let (runtime, answers) = (runtime(), Arc::new(Answers::default()));
     open_account(&runtime, &address, BUDGET);
-    told.hold_at.store(250, Ordering::Relaxed);
-    let clients = start_clients(&runtime, std::slice::from_ref(&address), &told);
+    answers.hold_at.store(250, Ordering::Relaxed);
+    let clients = start_clients(&runtime, std::slice::from_ref(&address), &answers);
     for kill in 1..=N_KILLS {
-        told.hold_at.store(kill * 190 + 60, Ordering::Relaxed);
-        told.wait_for(kill * 190);
+        answers.hold_at.store(kill * 190 + 60, Ordering::Relaxed);
+        answers.wait_for(kill * 190);
         teacher.kill();
         if kill.is_multiple_of(10) {
-            // One more, which dies as it begins, before, while or after it opens the ledger.
-            let mut unborn = Teacher::spawn(ledger, &address);
+            // Another teacher, killed before, while or after it opens the ledger.
+            let mut short_lived = Teacher::spawn(ledger, &address);
             std::thread::sleep(Duration::from_millis(u64::try_from(kill).expect("few")));
-            unborn.kill().expect("killed");
-            unborn.wait().expect("gone");
+            short_lived.kill().expect("killed");
+            short_lived.wait().expect("gone");
         }
         teacher = Teacher::start(ledger, &address);
     }
-    let n_charged = told.verdicts.lock().expect("whole").n_charged;
+    let n_charged = answers.verdicts.lock().expect("whole").n_charged;
     assert!(n_charged < 10_000, "the budget was spent before the last kill");
-    told.hold_at.store(0, Ordering::Relaxed);
-    check_sums(&runtime, clients, &address, &told, BUDGET);
+    answers.hold_at.store(0, Ordering::Relaxed);
+    check_sums(&runtime, clients, &address, &answers, BUDGET);
     teacher.kill();
     let teacher = Teacher::start(ledger, &address);
-    check_sums(&runtime, JoinSet::new(), &teacher.address, &told, BUDGET);
+    check_sums(&runtime, JoinSet::new(), &teacher.address, &answers, BUDGET);
 }
 
-/// Asks once about `steps` of episode 1; gives which were charged.
+/// Asks once about `steps` of episode 1 and returns which ones were charged.
 fn ask_once(
     runtime: &Runtime,
     address: &str,
@@ -295,39 +307,39 @@ fn ask_once(
 #[test]
 fn a_second_teacher_on_the_same_ledger_file_is_refused() {
     let directory = tempfile::tempdir().expect("a directory");
-    let beside = |name: &str| directory.path().join(name);
-    let ledger = beside("ledger.sqlite");
+    let sibling = |name: &str| directory.path().join(name);
+    let ledger = sibling("ledger.sqlite");
     let ledger = ledger.to_str().expect("UTF-8");
     let mut teacher = Teacher::start(ledger, "127.0.0.1:0");
     let runtime = runtime();
     open_account(&runtime, &teacher.address, 10);
     assert_eq!(ask_once(&runtime, &teacher.address, 0..6).expect("charged"), [true; 6]);
 
-    let (link, twin) = (beside("link.sqlite"), beside("twin.sqlite"));
+    let (link, twin) = (sibling("link.sqlite"), sibling("twin.sqlite"));
     std::os::unix::fs::symlink(ledger, &link).expect("a link");
     std::fs::hard_link(ledger, &twin).expect("a link");
-    let is_in_use = |path: &Path| {
-        let (code, told) = refusal(path);
-        assert!(told.contains("another teacher uses the ledger"), "{told}");
-        assert_eq!(code, Some(75), "{told}");
+    let check_in_use = |path: &Path| {
+        let (code, stderr) = refusal(path);
+        assert!(stderr.contains("another teacher uses the ledger"), "{stderr}");
+        assert_eq!(code, Some(75), "{stderr}");
     };
     for deleted in ["ledger.sqlite.lock", "ledger.sqlite-shm", "ledger.sqlite-wal"] {
-        drop(std::fs::remove_file(beside(deleted)));
+        drop(std::fs::remove_file(sibling(deleted)));
         for path in [Path::new(ledger), &link, &twin] {
-            is_in_use(path);
+            check_in_use(path);
         }
     }
 
-    // The log is gone: what it had is rescued, and nothing is charged that might be lost.
+    // The write-ahead log was deleted: the teacher keeps its contents and charges nothing that could be lost.
     let refused = ask_once(&runtime, &teacher.address, 6..8).expect_err("refused");
     assert_eq!(refused.code(), Code::Unavailable, "{refused}");
     assert!(refused.message().contains("-wal file was deleted"), "{refused}");
     assert_eq!(ask_once(&runtime, &teacher.address, 0..6).expect("known"), [true; 6]);
     teacher.kill();
     for path in [Path::new(ledger), &twin] {
-        let (code, told) = refusal(path);
-        assert!(told.contains("the file has 2 names (hard links)"), "{told}");
-        assert_eq!(code, Some(64), "{told}");
+        let (code, stderr) = refusal(path);
+        assert!(stderr.contains("the file has 2 names (hard links)"), "{stderr}");
+        assert_eq!(code, Some(64), "{stderr}");
     }
     std::fs::remove_file(twin).expect("removed");
     let teacher = Teacher::start(link.to_str().expect("UTF-8"), "127.0.0.1:0");
@@ -352,8 +364,8 @@ fn a_teacher_charges_nothing_to_a_deleted_ledger() {
     for _ in 0..2 {
         let refused = ask_once(&runtime, &teacher.address, 6..8).expect_err("refused");
         assert_eq!(refused.code(), Code::Unavailable, "{refused}");
-        let told = "the file was deleted, moved or replaced while in use";
-        assert!(refused.message().contains(told), "{refused}");
+        let cause = "the file was deleted, moved or replaced while in use";
+        assert!(refused.message().contains(cause), "{refused}");
     }
     let charged = ask_once(&runtime, &second.address, 0..20).expect("charged");
     assert_eq!(charged, [[true; 10], [false; 10]].concat());
@@ -363,9 +375,9 @@ fn a_teacher_charges_nothing_to_a_deleted_ledger() {
 fn a_ledger_that_cannot_be_opened_is_refused_with_the_right_exit_code() {
     let directory = tempfile::tempdir().expect("a directory");
     let check = |path: &Path, expected_code: i32, expected: &str| {
-        let (code, told) = refusal(path);
-        assert!(told.contains(expected), "{told}");
-        assert_eq!(code, Some(expected_code), "{told}");
+        let (code, stderr) = refusal(path);
+        assert!(stderr.contains(expected), "{stderr}");
+        assert_eq!(code, Some(expected_code), "{stderr}");
     };
     check(directory.path(), 64, "it is a directory");
     check(Path::new("/dev/null"), 64, "it is not a regular file");
@@ -392,16 +404,16 @@ fn two_teachers_share_a_budget_on_one_redis_and_one_of_them_is_killed() {
     let ledger = format!("redis://127.0.0.1:{}/0", redis.port);
     let mut teachers = [(); 2].map(|()| Teacher::start(&ledger, "127.0.0.1:0"));
     let addresses = [teachers[0].address.clone(), teachers[1].address.clone()];
-    let (runtime, told) = (runtime(), Arc::new(Told::default()));
+    let (runtime, answers) = (runtime(), Arc::new(Answers::default()));
     open_account(&runtime, &addresses[0], BUDGET);
     open_account(&runtime, &addresses[1], BUDGET);
-    let clients = start_clients(&runtime, &addresses, &told);
-    told.wait_for(1_000);
+    let clients = start_clients(&runtime, &addresses, &answers);
+    answers.wait_for(1_000);
     teachers[0].kill();
-    check_sums(&runtime, clients, &addresses[1], &told, BUDGET);
+    check_sums(&runtime, clients, &addresses[1], &answers, BUDGET);
 }
 
-/// A Redis server of the test's own.
+/// A Redis server owned by the test.
 struct Redis {
     process: Child,
     port: u16,
@@ -409,7 +421,7 @@ struct Redis {
 }
 
 impl Redis {
-    /// None where Redis is not installed; there the test fails if `TANDEM_REQUIRE_REDIS` is 1.
+    /// Starts a server. Returns `None` if Redis is not installed, or panics if `TANDEM_REQUIRE_REDIS` is 1.
     fn start() -> Option<Self> {
         if Command::new("redis-server").arg("--version").stdout(Stdio::null()).status().is_err() {
             #[expect(clippy::disallowed_methods, reason = "the one switch of the tests")]
@@ -417,7 +429,7 @@ impl Redis {
             assert!(!required, "redis-server is not installed, but TANDEM_REQUIRE_REDIS=1");
             return None;
         }
-        // Between looking for a free port and taking it, somebody else may take it.
+        // Another process may take the free port before the server binds it.
         let started = (0..10).find_map(|_| Self::start_once());
         Some(started.expect("redis-server starts"))
     }
@@ -436,7 +448,7 @@ impl Redis {
             .expect("starts");
         let mut server = Self { process, port, _directory: directory };
         for _ in 0..6000 {
-            if server.answers().is_ok_and(|answers| answers) {
+            if server.responds().is_ok_and(|responds| responds) {
                 return Some(server);
             }
             if server.process.try_wait().expect("a child").is_some() {
@@ -447,7 +459,7 @@ impl Redis {
         None
     }
 
-    fn answers(&self) -> std::io::Result<bool> {
+    fn responds(&self) -> std::io::Result<bool> {
         let mut stream = TcpStream::connect(("127.0.0.1", self.port))?;
         stream.set_read_timeout(Some(Duration::from_secs(1)))?;
         stream.write_all(b"PING\r\n")?;

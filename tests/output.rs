@@ -1,4 +1,4 @@
-//! Standard output and standard error that cannot be written: a full disk, a limit of file sizes, a reader that has
+//! Standard output and standard error that cannot be written: a full_device disk, a limit of file sizes, a reader that has
 //! stopped reading.
 
 use std::fs::{self, File};
@@ -11,7 +11,7 @@ use tempfile::TempDir;
 const TANDEM: &str = env!("CARGO_BIN_EXE_tandem");
 const POLICY: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/policies/teacher-push.safetensors");
 
-/// A short run of one arm without a teacher.
+/// A short run with one arm and no teacher.
 const SHORT_RUN: &str = r#"
 task = "push"
 arms = 1
@@ -29,20 +29,20 @@ fn tandem(args: &[&str]) -> Command {
     command
 }
 
-/// A file on a disk without room.
-fn full() -> File {
-    File::options().write(true).open("/dev/full").expect("a device")
+/// Opens a file on a full disk.
+fn full_device() -> File {
+    File::options().write(true).open("/dev/full_device").expect("a device")
 }
 
 fn directory() -> TempDir {
     tempfile::tempdir().expect("a directory")
 }
 
-fn told(output: &Output) -> String {
+fn stderr(output: &Output) -> String {
     String::from_utf8_lossy(&output.stderr).into_owned()
 }
 
-/// Writes the run file and gives the command line that trains it into `name`.
+/// Writes the run file and returns the command that trains it into the directory `name`.
 fn train(directory: &Path, name: &str) -> Command {
     let run = directory.join("short.toml");
     fs::write(&run, SHORT_RUN).expect("writes");
@@ -52,7 +52,7 @@ fn train(directory: &Path, name: &str) -> Command {
 }
 
 fn digest(output: &Output) -> String {
-    assert!(output.status.success(), "{:?}: {}", output.status, told(output));
+    assert!(output.status.success(), "{:?}: {}", output.status, stderr(output));
     let summary: serde_json::Value = serde_json::from_slice(&output.stdout).expect("a summary");
     summary["digest"].as_str().expect("a digest").to_owned()
 }
@@ -61,7 +61,8 @@ fn digest(output: &Output) -> String {
 fn a_result_that_cannot_be_written_is_reported_in_one_line() {
     let directory = directory();
     let path = |name: &str| directory.path().join(name).to_str().expect("UTF-8").to_owned();
-    let (episode, mended, picture) = (path("one.mcap"), path("mended.mcap"), path("arms.svg"));
+    let (episode, recovered, picture) =
+        (path("one.mcap"), path("recovered.mcap"), path("arms.svg"));
     let recorded =
         tandem(&["eval", "--policy", POLICY, "--episodes", "1", "--record", &episode]).output();
     assert!(recorded.expect("runs").status.success());
@@ -75,17 +76,18 @@ fn a_result_that_cannot_be_written_is_reported_in_one_line() {
         &["eval", "--policy", POLICY, "--episodes", "1", "--json"],
         &["replay", &episode],
         &["replay", &episode, "--verify", "--json"],
-        &["mcap", "recover", &episode, "--to", &mended],
+        &["mcap", "recover", &episode, "--to", &recovered],
         &["picture", "--policy", POLICY, "--out", &picture],
         &["sweep", "deploy/sweep-small.toml", "--dry-run"],
     ] {
-        let ended = tandem(args).stdout(full()).output().expect("runs");
-        assert_eq!(ended.status.code(), Some(74), "{args:?}: {}", told(&ended));
+        let ended = tandem(args).stdout(full_device()).output().expect("runs");
+        assert_eq!(ended.status.code(), Some(74), "{args:?}: {}", stderr(&ended));
         let expected =
             "tandem: cannot write to standard output: No space left on device (os error 28)\n";
-        assert_eq!(told(&ended), expected, "{args:?}");
-        fs::remove_file(&mended).ok();
-        let ended = tandem(args).stdout(full()).stderr(full()).status().expect("runs");
+        assert_eq!(stderr(&ended), expected, "{args:?}");
+        fs::remove_file(&recovered).ok();
+        let ended =
+            tandem(args).stdout(full_device()).stderr(full_device()).status().expect("runs");
         assert_eq!(ended.code(), Some(74), "{args:?}");
     }
 }
@@ -93,7 +95,8 @@ fn a_result_that_cannot_be_written_is_reported_in_one_line() {
 #[test]
 fn an_error_keeps_its_exit_code_when_its_message_cannot_be_written() {
     for (args, code) in [(&["dance"][..], 64), (&["policy", "show", "missing"], 65)] {
-        let ended = tandem(args).stdout(full()).stderr(full()).status().expect("runs");
+        let ended =
+            tandem(args).stdout(full_device()).stderr(full_device()).status().expect("runs");
         assert_eq!(ended.code(), Some(code), "{args:?}");
     }
 }
@@ -101,11 +104,12 @@ fn an_error_keeps_its_exit_code_when_its_message_cannot_be_written() {
 #[test]
 fn a_run_does_not_depend_on_room_for_its_messages_and_logs() {
     let directory = directory();
-    let expected = digest(&train(directory.path(), "calm").output().expect("runs"));
+    let expected = digest(&train(directory.path(), "undisturbed").output().expect("runs"));
     let out = directory.path().join("mute");
     fs::create_dir(&out).expect("a directory");
-    std::os::unix::fs::symlink("/dev/full", out.join("tandem.log")).expect("a link");
-    let ended = train(directory.path(), "mute").stderr(full()).stdout(Stdio::piped()).output();
+    std::os::unix::fs::symlink("/dev/full_device", out.join("tandem.log")).expect("a link");
+    let ended =
+        train(directory.path(), "mute").stderr(full_device()).stdout(Stdio::piped()).output();
     assert_eq!(digest(&ended.expect("runs")), expected);
 }
 
@@ -124,19 +128,19 @@ fn a_run_does_not_wait_for_a_reader_of_its_messages() {
 #[test]
 fn a_run_whose_summary_cannot_be_written_is_saved_and_reports_its_directory() {
     let directory = directory();
-    let ended = train(directory.path(), "run").stdout(full()).output().expect("runs");
-    let told = told(&ended);
-    assert_eq!(ended.status.code(), Some(74), "{told}");
+    let ended = train(directory.path(), "run").stdout(full_device()).output().expect("runs");
+    let message = stderr(&ended);
+    assert_eq!(ended.status.code(), Some(74), "{message}");
     let out = directory.path().join("run");
-    let last = told.lines().last().expect("a line");
-    let where_it_is = format!("tandem: the run is complete and saved in {}", out.display());
-    assert!(last.starts_with(&where_it_is), "{told}");
-    assert!(last.contains("cannot write to standard output"), "{told}");
-    assert!(!told.contains("panicked"), "{told}");
+    let last = message.lines().last().expect("a line");
+    let expected = format!("tandem: the run is complete and saved in {}", out.display());
+    assert!(last.starts_with(&expected), "{message}");
+    assert!(last.contains("cannot write to standard output"), "{message}");
+    assert!(!message.contains("panicked"), "{message}");
     assert!(out.join("policy/best.safetensors").exists() && out.join("report.html").exists());
 }
 
-/// The address in the first line that has one.
+/// Returns the address in the first line that contains one.
 fn address(lines: impl Iterator<Item = std::io::Result<String>>) -> String {
     let mut lines = lines.map(|line| line.expect("text"));
     let line = lines.find(|line| line.contains("127.0.0.1:")).expect("an address");
@@ -147,29 +151,29 @@ fn address(lines: impl Iterator<Item = std::io::Result<String>>) -> String {
 #[test]
 fn a_service_that_cannot_print_its_address_still_serves() {
     let mut command = tandem(&["teacher", "--ledger", "memory", "--policy", POLICY]);
-    let mut teacher = command.stdout(full()).stderr(Stdio::piped()).spawn().expect("starts");
+    let mut teacher = command.stdout(full_device()).stderr(Stdio::piped()).spawn().expect("starts");
     let messages = BufReader::new(teacher.stderr.take().expect("piped"));
     let address = address(messages.lines());
     let health = tandem(&["health", &address]).output().expect("runs");
     teacher.kill().expect("runs");
     teacher.wait().expect("ends");
-    assert!(health.status.success(), "{}", told(&health));
+    assert!(health.status.success(), "{}", stderr(&health));
 }
 
 #[test]
 fn a_service_that_cannot_write_its_log_still_serves() {
     let mut command = tandem(&["teacher", "--ledger", "memory", "--policy", POLICY]);
-    let mut teacher = command.stdout(Stdio::piped()).stderr(full()).spawn().expect("starts");
+    let mut teacher = command.stdout(Stdio::piped()).stderr(full_device()).spawn().expect("starts");
     let output = BufReader::new(teacher.stdout.take().expect("piped"));
     let address = address(output.lines());
     let health = tandem(&["health", &address]).output().expect("runs");
     let sent = Command::new("kill").args(["-TERM", &teacher.id().to_string()]).status();
     assert!(sent.expect("kill runs").success());
     assert!(teacher.wait().expect("ends").success());
-    assert!(health.status.success(), "{}", told(&health));
+    assert!(health.status.success(), "{}", stderr(&health));
 }
 
-/// Runs a shell script that has the program as `$0` and a policy as `$1`.
+/// Runs a shell script with the program as `$0` and a policy as `$1`.
 fn shell(script: &str) -> Output {
     let directory = directory();
     let mut command = Command::new("bash");
@@ -180,12 +184,12 @@ fn shell(script: &str) -> Output {
 #[test]
 fn a_file_size_limit_is_reported_like_a_full_disk() {
     let ended = shell(r#"ulimit -f 0; exec "$0" policy show "$1" > shown"#);
-    assert_eq!(ended.status.code(), Some(74), "{:?}: {}", ended.status, told(&ended));
-    assert!(told(&ended).contains("File too large"), "{}", told(&ended));
+    assert_eq!(ended.status.code(), Some(74), "{:?}: {}", ended.status, stderr(&ended));
+    assert!(stderr(&ended).contains("File too large"), "{}", stderr(&ended));
 }
 
 #[test]
 fn a_command_succeeds_with_closed_standard_streams() {
     let ended = shell(r#"exec "$0" policy show "$1" >&- 2>&-"#);
-    assert_eq!(ended.status.code(), Some(0), "{}", told(&ended));
+    assert_eq!(ended.status.code(), Some(0), "{}", stderr(&ended));
 }

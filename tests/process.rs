@@ -1,4 +1,4 @@
-//! Real processes: a whole run from the command line, disturbed.
+//! Whole runs from the command line, with signals sent to their processes.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -49,19 +49,19 @@ fn start_with(workers: &str, more: &[&str], out: &Path) -> Child {
     tandem(&args, out).spawn().expect("starts")
 }
 
-/// Goes on with a run to its end.
+/// Resumes a run and waits for its end.
 fn resume(out: &Path) -> Output {
     tandem(&["train", "--json", "--resume", "--workers", "2"], out).output().expect("runs")
 }
 
-/// What an undisturbed run leaves behind.
-static CALM: LazyLock<(String, Vec<Value>)> = LazyLock::new(|| {
-    let (_keep, out) = directory();
+/// The digest and metrics of an undisturbed run.
+static UNDISTURBED: LazyLock<(String, Vec<Value>)> = LazyLock::new(|| {
+    let (_keep, out) = run_directory();
     let digest = digest(&finish(start("2", &out)));
     (digest, metrics(&out))
 });
 
-/// The rows of a run's metrics, without the wall time.
+/// Reads the rows of a run's metrics, without the wall time.
 fn metrics(out: &Path) -> Vec<Value> {
     let text = fs::read_to_string(out.join("metrics.jsonl")).expect("metrics");
     let row = |line| -> Value {
@@ -72,13 +72,13 @@ fn metrics(out: &Path) -> Vec<Value> {
     text.lines().map(row).collect()
 }
 
-fn check_as_calm(ended: &Output, out: &Path) {
-    assert_eq!(digest(ended), CALM.0);
-    assert_eq!(metrics(out), CALM.1);
+fn check_undisturbed_result(ended: &Output, out: &Path) {
+    assert_eq!(digest(ended), UNDISTURBED.0);
+    assert_eq!(metrics(out), UNDISTURBED.1);
 }
 
-/// What a run said to the person who watches it.
-fn said(ended: &Output) -> String {
+/// Returns the standard error of a run.
+fn stderr(ended: &Output) -> String {
     String::from_utf8_lossy(&ended.stderr).into_owned()
 }
 
@@ -100,7 +100,7 @@ fn signal(signal: &str, pid: u32) {
     assert!(sent.success(), "no process {pid}");
 }
 
-/// The process numbers of a run's processes whose command line has `role` as its first argument.
+/// Returns the process ids of a run's children whose first argument is `role`.
 fn pids(parent: u32, role: &str) -> Vec<u32> {
     let children =
         fs::read_to_string(format!("/proc/{parent}/task/{parent}/children")).unwrap_or_default();
@@ -111,15 +111,15 @@ fn pids(parent: u32, role: &str) -> Vec<u32> {
     children.split_whitespace().filter_map(|pid| pid.parse().ok()).filter(is_role).collect()
 }
 
-/// Kills a process of a run and waits until it is there again.
+/// Kills a process of a run and waits until it is restarted.
 fn kill_one(run: &Child, role: &str) {
     let former = pids(run.id(), role);
     signal("-KILL", former[0]);
     let is_back = || pids(run.id(), role).iter().any(|pid| !former.contains(pid));
-    assert!(eventually(is_back), "the {role} is not restarted");
+    assert!(eventually(is_back), "the {role} was not restarted");
 }
 
-/// Waits until the run directory holds a checkpoint: the run is then in full swing.
+/// Waits until the run run_directory holds a checkpoint: the run is then in full swing.
 fn wait_for_checkpoint(out: &Path) {
     let is_saved = || !checkpoints(out).is_empty();
     assert!(eventually(is_saved), "no checkpoint within a minute in {}", out.display());
@@ -131,7 +131,7 @@ fn checkpoints(out: &Path) -> Vec<PathBuf> {
     saved.map(|entry| entry.path()).filter(is_whole).collect()
 }
 
-/// Looks every 50 ms for a minute whether something has come true.
+/// Polls `holds` every 50 ms for up to a minute.
 fn eventually(holds: impl Fn() -> bool) -> bool {
     (0..1200).any(|_| {
         std::thread::sleep(Duration::from_millis(50));
@@ -139,28 +139,28 @@ fn eventually(holds: impl Fn() -> bool) -> bool {
     })
 }
 
-fn directory() -> (TempDir, PathBuf) {
-    let keep = tempfile::tempdir().expect("a directory");
+fn run_directory() -> (TempDir, PathBuf) {
+    let keep = tempfile::tempdir().expect("a run_directory");
     let out = keep.path().join("run");
     (keep, out)
 }
 
 #[test]
 fn an_interrupted_run_resumes_to_the_same_result() {
-    let (_keep, out) = directory();
+    let (_keep, out) = run_directory();
     let run = start("1", &out);
     wait_for_checkpoint(&out);
     signal("-INT", run.id());
     let interrupted = finish(run);
     assert_eq!(interrupted.status.code(), Some(130));
-    let told = said(&interrupted);
-    assert!(told.contains("tandem train --resume --out"), "{told}");
-    check_as_calm(&resume(&out), &out);
+    let message = stderr(&interrupted);
+    assert!(message.contains("tandem train --resume --out"), "{message}");
+    check_undisturbed_result(&resume(&out), &out);
 }
 
 #[test]
 fn killed_processes_are_restarted_and_the_run_ends_like_an_undisturbed_one() {
-    let (_keep, out) = directory();
+    let (_keep, out) = run_directory();
     let run = start("3", &out);
     wait_for_checkpoint(&out);
     let workers = pids(run.id(), "worker");
@@ -170,15 +170,18 @@ fn killed_processes_are_restarted_and_the_run_ends_like_an_undisturbed_one() {
         kill_one(&run, role);
     }
     let ended = finish(run);
-    check_as_calm(&ended, &out);
-    let told = said(&ended);
+    check_undisturbed_result(&ended, &out);
+    let messages = stderr(&ended);
     for line in [
         "the learner was killed by signal 9 and is restarted",
         "the learner continues from round",
         "the teacher was killed by signal 9 and is restarted",
         "was killed by signal 9 and is restarted",
     ] {
-        assert!(told.lines().any(|said| said.contains(line)), "{line:?} is not in {told}");
+        assert!(
+            messages.lines().any(|message| message.contains(line)),
+            "{line:?} is not in {messages}"
+        );
     }
     let summary = String::from_utf8_lossy(&ended.stdout);
     assert!(summary.contains("\"env_steps\":12800,"), "{summary}");
@@ -186,19 +189,19 @@ fn killed_processes_are_restarted_and_the_run_ends_like_an_undisturbed_one() {
 
 #[test]
 fn a_learner_that_dies_before_its_first_checkpoint_starts_over() {
-    let (_keep, out) = directory();
+    let (_keep, out) = run_directory();
     let run = start_with("2", &["--set", "checkpoint.every_rounds=1000"], &out);
     let is_under_way = || fs::metadata(out.join("metrics.jsonl")).is_ok_and(|file| file.len() > 0);
     assert!(eventually(is_under_way));
     kill_one(&run, "learner");
     let ended = finish(run);
-    check_as_calm(&ended, &out);
-    assert!(said(&ended).contains("the learner continues from round 0"), "{}", said(&ended));
+    check_undisturbed_result(&ended, &out);
+    assert!(stderr(&ended).contains("the learner continues from round 0"), "{}", stderr(&ended));
 }
 
 #[test]
 fn briefly_stopped_processes_are_not_restarted() {
-    let (_keep, out) = directory();
+    let (_keep, out) = run_directory();
     let run = start("2", &out);
     wait_for_checkpoint(&out);
     for role in ["learner", "teacher", "worker"] {
@@ -208,13 +211,13 @@ fn briefly_stopped_processes_are_not_restarted() {
         signal("-CONT", pid);
     }
     let ended = finish(run);
-    check_as_calm(&ended, &out);
-    assert!(!said(&ended).contains("restarted"), "{}", said(&ended));
+    check_undisturbed_result(&ended, &out);
+    assert!(!stderr(&ended).contains("restarted"), "{}", stderr(&ended));
 }
 
 #[test]
 fn a_run_gives_up_on_a_process_that_keeps_dying() {
-    let (_keep, out) = directory();
+    let (_keep, out) = run_directory();
     let run = start("2", &out);
     wait_for_checkpoint(&out);
     for _ in 0..4 {
@@ -223,30 +226,34 @@ fn a_run_gives_up_on_a_process_that_keeps_dying() {
     signal("-KILL", pids(run.id(), "teacher")[0]);
     let given_up = finish(run);
     assert_eq!(given_up.status.code(), Some(75));
-    let told = said(&given_up);
-    let last = told.lines().last().expect("a line");
-    assert!(last.contains("the teacher died 5 times in a row"), "{told}");
-    assert!(last.contains("tandem train --resume --out"), "{told}");
-    check_as_calm(&resume(&out), &out);
+    let messages = stderr(&given_up);
+    let last = messages.lines().last().expect("a line");
+    assert!(last.contains("the teacher died 5 times in a row"), "{messages}");
+    assert!(last.contains("tandem train --resume --out"), "{messages}");
+    check_undisturbed_result(&resume(&out), &out);
 }
 
 #[test]
 fn a_run_whose_teacher_does_not_respond_can_be_interrupted() {
-    let (_keep, out) = directory();
+    let (_keep, out) = run_directory();
     let run = start("1", &out);
     wait_for_checkpoint(&out);
     signal("-STOP", pids(run.id(), "teacher")[0]);
     std::thread::sleep(Duration::from_millis(500));
     signal("-INT", run.id());
     let interrupted = finish(run);
-    assert_eq!(interrupted.status.code(), Some(130), "{}", said(&interrupted));
-    assert!(said(&interrupted).contains("tandem train --resume --out"), "{}", said(&interrupted));
-    check_as_calm(&resume(&out), &out);
+    assert_eq!(interrupted.status.code(), Some(130), "{}", stderr(&interrupted));
+    assert!(
+        stderr(&interrupted).contains("tandem train --resume --out"),
+        "{}",
+        stderr(&interrupted)
+    );
+    check_undisturbed_result(&resume(&out), &out);
 }
 
 #[test]
 fn a_learner_that_cannot_continue_ends_the_run_with_its_error_message() {
-    let (_keep, out) = directory();
+    let (_keep, out) = run_directory();
     let run = start("1", &out);
     wait_for_checkpoint(&out);
     let learner = pids(run.id(), "learner")[0];
@@ -256,26 +263,26 @@ fn a_learner_that_cannot_continue_ends_the_run_with_its_error_message() {
     }
     signal("-KILL", learner);
     let ended = finish(run);
-    let told = said(&ended);
-    assert_eq!(ended.status.code(), Some(65), "{told}");
-    assert_eq!(told.matches("restarted").count(), 1, "{told}");
-    let last = told.lines().last().expect("a line");
-    assert!(last.contains("the learner ended with exit code 65: checkpoint"), "{told}");
+    let messages = stderr(&ended);
+    assert_eq!(ended.status.code(), Some(65), "{messages}");
+    assert_eq!(messages.matches("restarted").count(), 1, "{messages}");
+    let last = messages.lines().last().expect("a line");
+    assert!(last.contains("the learner ended with exit code 65: checkpoint"), "{messages}");
 }
 
 #[test]
 fn children_end_when_their_parent_is_killed() {
-    let (_keep, out) = directory();
+    let (_keep, out) = run_directory();
     let mut run = start("1", &out);
     wait_for_checkpoint(&out);
     let learner = pids(run.id(), "learner")[0];
     signal("-KILL", run.id());
-    run.wait().expect("is gone");
+    run.wait().expect("the run has ended");
     let is_gone = || {
         let state = fs::read_to_string(format!("/proc/{learner}/stat")).unwrap_or_default();
         state.is_empty() || state.contains(") Z ")
     };
-    assert!(eventually(is_gone), "the learner outlives its parent");
+    assert!(eventually(is_gone), "the learner outlived its parent");
 }
 
 #[test]
@@ -305,7 +312,11 @@ fn services_print_their_address_and_end_on_sigterm() {
         ])
         .output()
         .expect("runs");
-    assert_eq!(taken.status.code(), Some(64), "a missing run file comes before a taken port");
+    assert_eq!(
+        taken.status.code(),
+        Some(64),
+        "a missing run file is reported before a port in use"
+    );
     signal("-TERM", teacher.id());
     assert!(teacher.wait().expect("ends").success());
 }

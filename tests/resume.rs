@@ -1,4 +1,4 @@
-//! Resumed runs: what a resume may change, whom it waits for, and what a refused one leaves alone.
+//! Resumed runs: settings that a resume may change, processes that it waits for, and refused resumes.
 
 use std::ffi::OsStr;
 use std::fs;
@@ -32,8 +32,8 @@ const SMALL: [&str; 16] = [
     "advice.budget=1500",
 ];
 
-/// A whole run that nobody disturbed: its directory and its digest.
-static CALM: LazyLock<(TempDir, String)> = LazyLock::new(|| {
+/// The directory and digest of a complete undisturbed run.
+static UNDISTURBED: LazyLock<(TempDir, String)> = LazyLock::new(|| {
     let keep = tempfile::tempdir().expect("a directory");
     let ended = start(&keep.path().join("run")).wait_with_output().expect("ends");
     (keep, digest(&ended))
@@ -56,32 +56,32 @@ fn resume(out: &Path, more: &[&str]) -> Output {
     tandem(&args, out).output().expect("runs")
 }
 
-fn said(ended: &Output) -> String {
+fn stderr(ended: &Output) -> String {
     String::from_utf8_lossy(&ended.stderr).into_owned()
 }
 
 fn digest(ended: &Output) -> String {
-    assert!(ended.status.success(), "{:?}: {}", ended.status, said(ended));
+    assert!(ended.status.success(), "{:?}: {}", ended.status, stderr(ended));
     let text = String::from_utf8_lossy(&ended.stdout);
     let after = text.lines().last().and_then(|line| line.split("\"digest\":\"").nth(1));
     after.and_then(|after| after.split('"').next()).expect("a digest").to_owned()
 }
 
-/// Checks that a resume is refused with `code`, in one line that says `what`.
+/// Checks that a resume is refused with `code`, in one line that contains `what`.
 fn check_refused(refused: &Output, code: i32, what: &str) {
-    let told = said(refused);
-    assert_eq!(refused.status.code(), Some(code), "{told}");
-    assert!(told.contains(what), "{told:?} lacks {what:?}");
-    assert_eq!(told.lines().count(), 1, "{told}");
-    assert!(!told.contains("resume it with") && !told.contains("Some("), "{told}");
+    let message = stderr(refused);
+    assert_eq!(refused.status.code(), Some(code), "{message}");
+    assert!(message.contains(what), "{message:?} lacks {what:?}");
+    assert_eq!(message.lines().count(), 1, "{message}");
+    assert!(!message.contains("resume it with") && !message.contains("Some("), "{message}");
 }
 
-/// What a refused resume must leave as it is.
-fn kept(out: &Path) -> [Vec<u8>; 2] {
+/// Reads the files that a refused resume must not change.
+fn saved_files(out: &Path) -> [Vec<u8>; 2] {
     ["run.toml", "policy/teacher.safetensors"].map(|name| fs::read(out.join(name)).expect(name))
 }
 
-/// Another teacher for the same task, in `directory`.
+/// Writes another teacher for the same task to `directory`.
 fn other_teacher(directory: &Path) -> String {
     let shipped = Path::new(env!("CARGO_MANIFEST_DIR")).join("policies/teacher-push.safetensors");
     let mut policy = Policy::load(&shipped).expect("ships");
@@ -96,7 +96,7 @@ fn signal(signal: &str, pid: u32) {
     assert!(sent.success(), "no process {pid}");
 }
 
-/// The process numbers of a run's processes whose command line has `role` as its first argument.
+/// Returns the process ids of a run's children whose first argument is `role`.
 fn pids(run: &Child, role: &str) -> Vec<u32> {
     let pid = run.id();
     let children = fs::read_to_string(format!("/proc/{pid}/task/{pid}/children"));
@@ -108,15 +108,15 @@ fn pids(run: &Child, role: &str) -> Vec<u32> {
     children.split_whitespace().filter_map(|pid| pid.parse().ok()).filter(is_role).collect()
 }
 
-/// Kills a process of a run and waits until it is there again.
+/// Kills a process of a run and waits until it is restarted.
 fn kill_one(run: &Child, role: &str) {
     let former = pids(run, role);
     signal("-KILL", former[0]);
     let is_back = || pids(run, role).iter().any(|pid| !former.contains(pid));
-    assert!(eventually(is_back), "the {role} is not restarted");
+    assert!(eventually(is_back), "the {role} was not restarted");
 }
 
-/// Waits until the run is in full swing.
+/// Waits until the run has written a checkpoint.
 fn wait_for_checkpoint(out: &Path) {
     let is_saved = || {
         let saved = fs::read_dir(out.join("checkpoint")).into_iter().flatten().flatten();
@@ -125,7 +125,7 @@ fn wait_for_checkpoint(out: &Path) {
     assert!(eventually(is_saved), "no checkpoint in {}", out.display());
 }
 
-/// Looks every 20 ms for two minutes whether something has come true.
+/// Polls `holds` every 20 ms for up to two minutes.
 fn eventually(holds: impl Fn() -> bool) -> bool {
     (0..6000).any(|_| {
         std::thread::sleep(Duration::from_millis(20));
@@ -139,10 +139,11 @@ fn directory() -> (TempDir, PathBuf) {
     (keep, out)
 }
 
-/// A copy of the calm run.
+/// Copies the undisturbed run.
 fn finished() -> (TempDir, PathBuf) {
     let (keep, out) = directory();
-    let copied = Command::new("cp").arg("-a").arg(CALM.0.path().join("run")).arg(&out).status();
+    let copied =
+        Command::new("cp").arg("-a").arg(UNDISTURBED.0.path().join("run")).arg(&out).status();
     assert!(copied.expect("cp runs").success());
     (keep, out)
 }
@@ -152,10 +153,10 @@ fn a_refused_resume_leaves_the_active_run_alone() {
     let (keep, out) = directory();
     let run = start(&out);
     wait_for_checkpoint(&out);
-    // So that the run does not end before all has been tried.
+    // The run must not end before every resume has been tried.
     let workers = pids(&run, "worker");
     workers.iter().for_each(|pid| signal("-STOP", *pid));
-    let (before, other) = (kept(&out), other_teacher(keep.path()));
+    let (before, other) = (saved_files(&out), other_teacher(keep.path()));
     for name in fs::read_dir(&out).expect("a run").flatten().map(|entry| entry.file_name()) {
         if name.as_bytes().ends_with(b".lock") {
             fs::remove_file(out.join(name)).expect("removes");
@@ -163,11 +164,11 @@ fn a_refused_resume_leaves_the_active_run_alone() {
     }
     for more in [&[][..], &["--set", "ddpg.discount=0.5"], &["--teacher", &other]] {
         check_refused(&resume(&out, more), 75, "another process uses");
-        assert_eq!(kept(&out), before, "{more:?}");
+        assert_eq!(saved_files(&out), before, "{more:?}");
     }
     kill_one(&run, "learner");
-    assert_eq!(kept(&out), before);
-    // Nor does what somebody writes there.
+    assert_eq!(saved_files(&out), before);
+    // Edits of the run file have no effect either.
     let text = String::from_utf8_lossy(&before[0]).replace("discount = 0.95", "discount = 0.5");
     assert_ne!(text.as_bytes(), before[0]);
     fs::write(out.join("run.toml"), text).expect("writable");
@@ -175,14 +176,14 @@ fn a_refused_resume_leaves_the_active_run_alone() {
     kill_one(&run, "teacher");
     kill_one(&run, "learner");
     workers.iter().for_each(|pid| signal("-CONT", *pid));
-    assert_eq!(digest(&run.wait_with_output().expect("ends")), CALM.1);
-    assert!(!out.join("in-use").exists(), "it ends with the run");
+    assert_eq!(digest(&run.wait_with_output().expect("ends")), UNDISTURBED.1);
+    assert!(!out.join("in-use").exists(), "the marker is removed at the end of the run");
 }
 
 #[test]
 fn a_resume_with_other_settings_is_refused_and_names_them() {
     let (keep, out) = finished();
-    let (before, other) = (kept(&out), other_teacher(keep.path()));
+    let (before, other) = (saved_files(&out), other_teacher(keep.path()));
     let refusals = [
         ("ddpg.n_hidden=64", "tandem: ddpg.n_hidden is 64 here and 32 in the run's checkpoint \""),
         ("ddpg.discount=0.5", "tandem: ddpg.discount is 0.5 here and 0.95 in the run's checkpoint"),
@@ -193,7 +194,7 @@ fn a_resume_with_other_settings_is_refused_and_names_them() {
         check_refused(&resume(&out, &["--set", setting]), 64, what);
     }
     check_refused(&resume(&out, &["--teacher", &other]), 64, "another policy");
-    assert_eq!(kept(&out), before);
+    assert_eq!(saved_files(&out), before);
 
     let changed = keep.path().join("changed.toml");
     let text = String::from_utf8_lossy(&before[0]).replace("n_hidden = 32", "n_hidden = 64");
@@ -201,23 +202,27 @@ fn a_resume_with_other_settings_is_refused_and_names_them() {
     let args = ["learner", "--start-or-resume", "--teacher", "127.0.0.1:1", "--run"];
     let refused = tandem(&[&args[..], &[changed.to_str().expect("UTF-8")]].concat(), &out).output();
     let refused = refused.expect("runs");
-    assert_eq!(refused.status.code(), Some(64), "{}", said(&refused));
-    assert!(said(&refused).contains("ddpg.n_hidden is 64 here and 32 in"), "{}", said(&refused));
-    assert_eq!(kept(&out), before);
+    assert_eq!(refused.status.code(), Some(64), "{}", stderr(&refused));
+    assert!(
+        stderr(&refused).contains("ddpg.n_hidden is 64 here and 32 in"),
+        "{}",
+        stderr(&refused)
+    );
+    assert_eq!(saved_files(&out), before);
 
-    assert_eq!(digest(&resume(&out, &[])), CALM.1, "it can still be resumed");
+    assert_eq!(digest(&resume(&out, &[])), UNDISTURBED.1, "the run can still be resumed");
 }
 
 #[test]
 fn a_finished_run_can_be_extended() {
     let (_keep, out) = finished();
     let longer = resume(&out, &["--max-env-steps", "11200"]);
-    assert_ne!(digest(&longer), CALM.1);
+    assert_ne!(digest(&longer), UNDISTURBED.1);
     let summary = String::from_utf8_lossy(&longer.stdout);
     assert!(summary.contains("\"env_steps\":11200,"), "{summary}");
     let settings = fs::read_to_string(out.join("run.toml")).expect("readable");
     assert!(settings.contains("max_env_steps = 11200"), "{settings}");
-    assert_eq!(digest(&resume(&out, &[])), digest(&longer), "it stays so");
+    assert_eq!(digest(&resume(&out, &[])), digest(&longer), "the extension is kept");
 }
 
 #[test]
@@ -226,7 +231,7 @@ fn a_run_without_a_checkpoint_keeps_the_settings_of_its_run_file() {
     fs::remove_dir_all(out.join("checkpoint")).expect("removes");
     let refused = resume(&out, &["--set", "ddpg.n_hidden=64"]);
     check_refused(&refused, 64, "tandem: ddpg.n_hidden is 64 here and 32 in the run's ");
-    assert!(said(&refused).contains("run.toml"), "{}", said(&refused));
+    assert!(stderr(&refused).contains("run.toml"), "{}", stderr(&refused));
 }
 
 #[test]
@@ -235,7 +240,7 @@ fn a_run_killed_and_resumed_at_once_reaches_the_same_result() {
     let mut run = start(&out);
     wait_for_checkpoint(&out);
     signal("-KILL", run.id());
-    assert_eq!(digest(&resume(&out, &[])), CALM.1);
+    assert_eq!(digest(&resume(&out, &[])), UNDISTURBED.1);
     run.wait().expect("is gone");
 }
 
@@ -255,14 +260,15 @@ fn a_resume_waits_for_the_teacher_of_an_earlier_start() {
     let output = teacher.stdout.take().expect("piped");
     BufReader::new(output).read_line(&mut line).expect("readable");
     let mut resumed = tandem(&["train", "--json", "--resume"], &out).spawn().expect("starts");
-    let mut told = BufReader::new(resumed.stderr.take().expect("piped"));
+    let mut messages = BufReader::new(resumed.stderr.take().expect("piped"));
     let mut line = String::new();
-    told.read_line(&mut line).expect("readable");
+    messages.read_line(&mut line).expect("readable");
     assert!(line.contains("teacher of an earlier start still uses"), "{line}");
     signal("-TERM", teacher.id());
     teacher.wait().expect("ends");
-    let rest = std::thread::spawn(move || told.lines().map_while(Result::ok).collect::<Vec<_>>());
-    assert_eq!(digest(&resumed.wait_with_output().expect("ends")), CALM.1);
+    let rest =
+        std::thread::spawn(move || messages.lines().map_while(Result::ok).collect::<Vec<_>>());
+    assert_eq!(digest(&resumed.wait_with_output().expect("ends")), UNDISTURBED.1);
     drop(rest.join());
 }
 
@@ -278,16 +284,16 @@ fn a_teacher_killed_during_startup_is_restarted() {
         })
     }));
     let ended = run.wait_with_output().expect("ends");
-    assert_eq!(digest(&ended), CALM.1);
+    assert_eq!(digest(&ended), UNDISTURBED.1);
     let line = "the teacher was killed by signal 9 and is restarted";
-    assert!(said(&ended).contains(line), "{}", said(&ended));
+    assert!(stderr(&ended).contains(line), "{}", stderr(&ended));
 }
 
 #[test]
 fn a_run_directory_name_need_not_be_utf8() {
     let keep = tempfile::tempdir().expect("a directory");
     let out = keep.path().join(OsStr::from_bytes(b"run \xff"));
-    assert_eq!(digest(&start(&out).wait_with_output().expect("ends")), CALM.1);
-    assert_eq!(digest(&resume(&out, &[])), CALM.1);
+    assert_eq!(digest(&start(&out).wait_with_output().expect("ends")), UNDISTURBED.1);
+    assert_eq!(digest(&resume(&out, &[])), UNDISTURBED.1);
     assert!(out.join("report.html").exists());
 }

@@ -1,4 +1,4 @@
-//! Services under a supervisor that knows one thing: to start the same command again.
+//! Services under a supervisor that restarts the same command.
 
 use std::fs::{self, File};
 use std::io::{BufRead as _, BufReader};
@@ -22,7 +22,7 @@ const RUN: &str = r#"
     stop = { max_env_steps = 16000 }
 "#;
 
-/// A run with a learner and two workers, each a process that is killed at the latest with the test.
+/// A run with a learner and two worker processes, which are killed on drop.
 struct Supervised {
     directory: TempDir,
     address: String,
@@ -48,7 +48,7 @@ impl Supervised {
         self.directory.path().join("run")
     }
 
-    /// Does what a supervisor does: starts the same command again, at the same address.
+    /// Restarts the learner as a supervisor does, with the same command and address.
     fn start_learner_again(&mut self) {
         let started = (0..100).find_map(|_| {
             std::thread::sleep(Duration::from_millis(100));
@@ -57,32 +57,32 @@ impl Supervised {
         self.learner = started.expect("its port is free again").0;
     }
 
-    /// Waits for a checkpoint that was not there before.
+    /// Waits for a new checkpoint.
     fn wait_for_checkpoint(&self) {
         let newest = || {
             let saved = fs::read_dir(self.out().join("checkpoint")).into_iter().flatten().flatten();
             saved.map(|entry| entry.file_name()).max()
         };
         let before = newest();
-        assert!(eventually(|| newest() > before), "no new checkpoint, {}", self.told());
+        assert!(eventually(|| newest() > before), "no new checkpoint, {}", self.logs());
     }
 
     fn status(&self) -> Output {
         tandem(&["status", &self.address, "--json"]).output().expect("runs")
     }
 
-    /// Waits for the end of the run: of the learner and of the workers, which nobody asks to end.
+    /// Waits until the learner and the workers end by themselves.
     fn end(&mut self) {
         let ended = end_of(&mut self.learner);
-        assert!(ended.is_some_and(|ended| ended.success()), "{ended:?}: {}", self.told());
+        assert!(ended.is_some_and(|ended| ended.success()), "{ended:?}: {}", self.logs());
         for idx in 0..self.workers.len() {
             let ended = end_of(&mut self.workers[idx]);
             let is_done = ended.is_some_and(|ended| ended.success());
-            assert!(is_done, "worker {idx}: {ended:?}: {}", self.told());
+            assert!(is_done, "worker {idx}: {ended:?}: {}", self.logs());
         }
     }
 
-    /// The rows of the run's metrics, without the wall time.
+    /// Reads the rows of the run's metrics, without the wall time.
     fn metrics(&self) -> Vec<Value> {
         let text = fs::read_to_string(self.out().join("metrics.jsonl")).expect("metrics");
         let row = |line| {
@@ -93,8 +93,8 @@ impl Supervised {
         text.lines().map(row).collect()
     }
 
-    /// What the processes said.
-    fn told(&self) -> String {
+    /// Returns the logs of all processes.
+    fn logs(&self) -> String {
         let logs = ["learner.log", "worker-0.log", "worker-1.log"];
         let read = |name| fs::read_to_string(self.directory.path().join(name)).unwrap_or_default();
         logs.map(|name| format!("{name}:\n{}", read(name))).join("\n")
@@ -116,11 +116,11 @@ fn tandem(args: &[&str]) -> Command {
 }
 
 fn log_to(command: &mut Command, path: &Path) {
-    let log = File::options().create(true).append(true).open(path).expect("a place for logs");
+    let log = File::options().create(true).append(true).open(path).expect("a log file");
     command.stderr(log).stdout(Stdio::null());
 }
 
-/// Starts the learner of `directory` and gives its address; `None` when it cannot listen there.
+/// Starts the learner of `directory` and returns its address, or `None` if it cannot listen on `listen`.
 fn learner(directory: &Path, listen: &str) -> Option<(Child, String)> {
     let mut command = tandem(&["learner", "--start-or-resume", "--listen", listen, "--run"]);
     command.arg(directory.join("run.toml")).arg("--out").arg(directory.join("run"));
@@ -132,7 +132,7 @@ fn learner(directory: &Path, listen: &str) -> Option<(Child, String)> {
     match line.trim().strip_prefix("listening on ") {
         Some(address) => Some((process, address.to_owned())),
         None => {
-            assert_eq!(process.wait().expect("ends").code(), Some(75), "it says {line:?}");
+            assert_eq!(process.wait().expect("ends").code(), Some(75), "printed {line:?}");
             None
         }
     }
@@ -143,7 +143,7 @@ fn signal(signal: &str, process: &Child) {
     assert!(Command::new("kill").args([signal, &pid]).status().expect("kill runs").success());
 }
 
-/// Waits two minutes for a process to end.
+/// Waits up to two minutes for a process to end.
 fn end_of(process: &mut Child) -> Option<ExitStatus> {
     (0..2400).find_map(|_| {
         std::thread::sleep(Duration::from_millis(50));
@@ -151,7 +151,7 @@ fn end_of(process: &mut Child) -> Option<ExitStatus> {
     })
 }
 
-/// Looks every 50 ms for two minutes whether something has come true.
+/// Polls `holds` every 50 ms for up to two minutes.
 fn eventually(holds: impl Fn() -> bool) -> bool {
     (0..2400).any(|_| {
         std::thread::sleep(Duration::from_millis(50));
@@ -161,19 +161,19 @@ fn eventually(holds: impl Fn() -> bool) -> bool {
 
 #[test]
 fn the_same_command_starts_and_resumes_a_run() {
-    let mut calm = Supervised::start();
-    calm.end();
+    let mut undisturbed = Supervised::start();
+    undisturbed.end();
     let mut run = Supervised::start();
     run.wait_for_checkpoint();
 
-    let told = run.status();
-    let progress: Value = serde_json::from_slice(&told.stdout).expect("JSON");
+    let status = run.status();
+    let progress: Value = serde_json::from_slice(&status.stdout).expect("JSON");
     assert_eq!(progress["workers"].as_array().map(Vec::len), Some(2), "{progress}");
     assert_eq!((&progress["task"], &progress["ended"]), (&"push".into(), &false.into()));
 
     signal("-TERM", &run.learner);
     let interrupted = end_of(&mut run.learner).expect("it ends");
-    assert_eq!(interrupted.code(), Some(130), "{}", run.told());
+    assert_eq!(interrupted.code(), Some(130), "{}", run.logs());
     let away = run.status();
     assert_eq!(away.status.code(), Some(75), "{}", String::from_utf8_lossy(&away.stderr));
     for worker in &mut run.workers {
@@ -189,12 +189,12 @@ fn the_same_command_starts_and_resumes_a_run() {
     end_of(&mut run.learner).expect("it ends");
     run.start_learner_again();
     run.end();
-    assert_eq!(run.metrics(), calm.metrics());
+    assert_eq!(run.metrics(), undisturbed.metrics());
 
-    // A run that has ended ends again, and is not learned once more.
+    // A finished run ends again at once without further training.
     run.start_learner_again();
-    assert_eq!(end_of(&mut run.learner).expect("it ends").code(), Some(0), "{}", run.told());
-    assert_eq!(run.metrics(), calm.metrics());
+    assert_eq!(end_of(&mut run.learner).expect("it ends").code(), Some(0), "{}", run.logs());
+    assert_eq!(run.metrics(), undisturbed.metrics());
     let kept = fs::read_to_string(run.out().join("run.toml")).expect("the settings are kept");
     assert!(kept.contains("name = \"supervised\"") && kept.contains("[replay]"), "{kept}");
 }

@@ -1,4 +1,4 @@
-//! A sweep of real runs, stopped in every way and started again, and the report on it.
+//! A sweep of real runs that is interrupted, killed and restarted, and the report on it.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -7,7 +7,7 @@ use std::time::{Duration, SystemTime};
 
 use serde_json::Value;
 
-/// Settings of small runs of 10 rounds.
+/// Settings of small runs with 10 rounds.
 const SMALL: [(&str, &str); 9] = [
     ("stop.max_env_steps", "8000"),
     ("ddpg.n_hidden", "32"),
@@ -46,8 +46,8 @@ fn text(bytes: &[u8]) -> String {
     String::from_utf8_lossy(bytes).into_owned()
 }
 
-/// The object on the last line of standard output.
-fn told(output: &Output) -> Value {
+/// Returns the JSON object on the last line of standard output.
+fn last_object(output: &Output) -> Value {
     assert!(output.status.success(), "{:?}: {}", output.status, text(&output.stderr));
     let stdout = text(&output.stdout);
     serde_json::from_str(stdout.lines().last().expect("a line")).expect("JSON")
@@ -58,16 +58,16 @@ fn signal(signal: &str, pid: u32) {
     assert!(sent.success(), "no process {pid}");
 }
 
-/// Looks every 20 ms for two minutes whether something has come true.
+/// Polls `holds` every 20 ms for up to two minutes.
 fn eventually(what: &str, holds: impl Fn() -> bool) {
-    let came_true = (0..6000).any(|_| {
+    let held = (0..6000).any(|_| {
         let holds = holds();
         if !holds {
             std::thread::sleep(Duration::from_millis(20));
         }
         holds
     });
-    assert!(came_true, "{what} never came true");
+    assert!(held, "{what}: not within two minutes");
 }
 
 fn wait_for_checkpoint(run: &Path) {
@@ -80,7 +80,7 @@ fn wait_for_checkpoint(run: &Path) {
     eventually("a checkpoint", is_saved);
 }
 
-/// The sweep's only child: the run under way.
+/// Returns the process id of the sweep's only child, the active run.
 fn child_of(sweep: &Child) -> u32 {
     let pid = sweep.id();
     let children = fs::read_to_string(format!("/proc/{pid}/task/{pid}/children"));
@@ -93,7 +93,7 @@ fn is_gone(pid: u32) -> bool {
     state.is_empty() || state.contains(") Z ")
 }
 
-/// Names, bytes and times of the finished runs' summaries.
+/// Returns names, content and modification times of the finished runs' summaries.
 fn finished(out: &Path) -> Vec<(&'static str, Vec<u8>, SystemTime)> {
     let summary = |name: &'static str| {
         let path = out.join(name).join("summary.json");
@@ -104,8 +104,8 @@ fn finished(out: &Path) -> Vec<(&'static str, Vec<u8>, SystemTime)> {
     RUNS.into_iter().filter_map(summary).collect()
 }
 
-/// The digest of the run that the sweep calls `name`, made by hand and never disturbed.
-fn calm_digest(name: &str, dir: &Path) -> String {
+/// Trains the run that the sweep calls `name` without interruptions and returns its digest.
+fn undisturbed_digest(name: &str, dir: &Path) -> String {
     let (strategy, seed) =
         name.strip_prefix("push-").expect("push").split_once("-seed").expect("a seed");
     let mut command = tandem();
@@ -115,17 +115,20 @@ fn calm_digest(name: &str, dir: &Path) -> String {
         command.args(["--set", &format!("{key}={value}")]);
     }
     let output = command.arg("--out").arg(dir.join(name)).output().expect("runs");
-    told(&output)["digest"].as_str().expect("a digest").to_owned()
+    last_object(&output)["digest"].as_str().expect("a digest").to_owned()
 }
 
-/// Interrupts a sweep in its first run, kills the next in its third, and lets the last go on to its end.
+/// Interrupts a sweep in its first run, kills its restart in the third run and lets the next restart finish.
 fn disturbed_sweep(file: &Path, out: &Path) -> Value {
     let first = sweep(file, out, &[]).spawn().expect("starts");
     wait_for_checkpoint(&out.join(RUNS[0]));
     signal("-INT", first.id());
     let interrupted = first.wait_with_output().expect("ends");
     assert_eq!(interrupted.status.code(), Some(130), "{}", text(&interrupted.stderr));
-    assert!(text(&interrupted.stderr).contains("tandem sweep "), "the line that goes on");
+    assert!(
+        text(&interrupted.stderr).contains("tandem sweep "),
+        "the command that resumes the sweep"
+    );
 
     let mut second = sweep(file, out, &[]).spawn().expect("starts");
     wait_for_checkpoint(&out.join(RUNS[2]));
@@ -134,14 +137,14 @@ fn disturbed_sweep(file: &Path, out: &Path) -> Value {
     assert_eq!(other.status.code(), Some(75), "two sweeps in one directory");
     let before = finished(out);
     signal("-KILL", second.id());
-    second.wait().expect("is gone");
+    second.wait().expect("the sweep has ended");
     assert!((2..4).contains(&before.len()), "{before:?}");
 
     let third = sweep(file, out, &["--json"]).output().expect("runs");
-    assert!(is_gone(run), "a run of the killed sweep was still there when its place was taken");
+    assert!(is_gone(run), "a run of the killed sweep outlived the restart");
     let after = finished(out);
     assert_eq!(after[..before.len()], before[..], "finished runs are left alone");
-    told(&third)
+    last_object(&third)
 }
 
 #[test]
@@ -153,10 +156,11 @@ fn an_interrupted_sweep_ends_with_the_bits_of_undisturbed_runs() {
     assert_eq!(result["finished"], 4, "{result}");
     for (run, name) in result["runs"].as_array().expect("a list").iter().zip(RUNS) {
         assert_eq!(run["name"], name);
-        assert_eq!(run["summary"]["digest"], calm_digest(name, keep.path()), "{name}");
+        assert_eq!(run["summary"]["digest"], undisturbed_digest(name, keep.path()), "{name}");
     }
 
-    let planned = told(&sweep(&file, &out, &["--dry-run", "--json"]).output().expect("runs"));
+    let planned =
+        last_object(&sweep(&file, &out, &["--dry-run", "--json"]).output().expect("runs"));
     let states = planned["runs"].as_array().expect("a list").iter().map(|run| run["state"].clone());
     assert_eq!(states.collect::<Vec<_>>(), ["finished"; 4]);
 
@@ -173,7 +177,7 @@ fn an_interrupted_sweep_ends_with_the_bits_of_undisturbed_runs() {
     report_has_every_run(&out, keep.path());
 }
 
-/// The report on the finished sweep: two strategies of two seeds, five evaluations each where nobody disturbed.
+/// Checks the report on the finished sweep: two strategies with two seeds, five evaluations per undisturbed run.
 fn report_has_every_run(out: &Path, directory: &Path) {
     let csv = directory.join("runs.csv");
     let report = tandem().arg("report").arg(out).arg("--csv").arg(&csv).output().expect("runs");
@@ -190,7 +194,7 @@ fn report_has_every_run(out: &Path, directory: &Path) {
     assert_eq!(lines.len(), 4);
     for line in &lines {
         let cells: Vec<&str> = line.split(',').collect();
-        // An evaluation that was under way when a run was stopped is not repeated.
+        // An evaluation that was in progress when the run was stopped is not repeated.
         let n_evaluations: u32 = cells[6].parse().expect("a count");
         let was_disturbed = [RUNS[0], RUNS[2]].contains(&cells[4]);
         assert!(if was_disturbed { n_evaluations > 0 } else { n_evaluations == 5 }, "{line}");
@@ -214,20 +218,20 @@ fn a_failed_run_is_reported_and_retried_at_the_next_start() {
     fs::write(&file, format!("{lists}\n[run]\n{settings}")).expect("writes");
 
     let failed = sweep(&file, &out, &["--jobs", "2"]).output().expect("runs");
-    let said = text(&failed.stderr);
-    assert_eq!(failed.status.code(), Some(75), "{said}");
+    let message = text(&failed.stderr);
+    assert_eq!(failed.status.code(), Some(75), "{message}");
     assert!(
-        said.contains("push-ea-seed1: failed:") && said.contains("teacher.safetensors"),
-        "{said}"
+        message.contains("push-ea-seed1: failed:") && message.contains("teacher.safetensors"),
+        "{message}"
     );
-    assert!(said.contains("1 of 2 runs failed"), "{said}");
+    assert!(message.contains("1 of 2 runs failed"), "{message}");
     assert!(text(&failed.stdout).contains("1 of 2"), "{}", text(&failed.stdout));
 
     let shipped = Path::new(env!("CARGO_MANIFEST_DIR")).join("policies/teacher-push.safetensors");
     fs::copy(shipped, &teacher).expect("copies");
     let again = sweep(&file, &out, &["--json"]).output().expect("runs");
     assert!(text(&again.stderr).contains("failed before"), "{}", text(&again.stderr));
-    let result = told(&again);
+    let result = last_object(&again);
     assert_eq!(result["finished"], 2, "{result}");
     assert!(result["runs"][1]["failure"].is_null(), "{result}");
 }

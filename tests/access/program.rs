@@ -1,4 +1,4 @@
-//! The built program in a directory with secrets, certificates and a small run.
+//! The built program in a workspace with secrets, certificates and a small run.
 
 use std::fs::{self, File};
 use std::io::{BufRead as _, BufReader};
@@ -9,13 +9,13 @@ use std::time::Duration;
 use rcgen::{BasicConstraints, CertificateParams, CertifiedIssuer, DnType, IsCa, KeyPair};
 use tempfile::TempDir;
 
-/// What the file `token` holds.
+/// Content of the file `token`.
 pub(crate) const SECRET: &str = "the-right-token-0123";
-/// Longer than anything takes, even on a machine that is busy with other things.
+/// Limit of every wait, sufficient for busy machines.
 pub(crate) const DEADLINE: Duration = Duration::from_secs(120);
 const PAUSE: Duration = Duration::from_millis(50);
 
-/// Two rounds with small networks.
+/// A run file with two rounds and small networks.
 const RUN: &str = "
 arms = 2
 advice.strategy = \"mc-q:0.1\"
@@ -28,24 +28,24 @@ stop.max_env_steps = 1600
 
 /// A directory with `token`, `ca.pem`, `tls.pem` with `tls.key`, another authority's `other.pem`, `other.key` and
 /// `run.toml`.
-pub(crate) struct Place(TempDir);
+pub(crate) struct Workspace(TempDir);
 
-impl Place {
+impl Workspace {
     pub(crate) fn new() -> Self {
-        let place = Self(tempfile::tempdir().expect("a directory"));
+        let workspace = Self(tempfile::tempdir().expect("a directory"));
         let (ours, theirs) = (authority("ours"), authority("theirs"));
         let mut params = CertificateParams::new(["127.0.0.1".to_owned()]).expect("a name");
         params.distinguished_name.push(DnType::CommonName, "tandem");
         let key = KeyPair::generate().expect("a key");
         let certificate = params.signed_by(&key, &ours).expect("signs");
-        place.write("token", SECRET);
-        place.write("ca.pem", &ours.pem());
-        place.write("tls.pem", &certificate.pem());
-        place.write("tls.key", &key.serialize_pem());
-        place.write("other.pem", &theirs.pem());
-        place.write("other.key", &theirs.key().serialize_pem());
-        place.write("run.toml", RUN);
-        place
+        workspace.write("token", SECRET);
+        workspace.write("ca.pem", &ours.pem());
+        workspace.write("tls.pem", &certificate.pem());
+        workspace.write("tls.key", &key.serialize_pem());
+        workspace.write("other.pem", &theirs.pem());
+        workspace.write("other.key", &theirs.key().serialize_pem());
+        workspace.write("run.toml", RUN);
+        workspace
     }
 
     pub(crate) fn path(&self) -> &Path {
@@ -56,7 +56,7 @@ impl Place {
         fs::write(self.path().join(name), text).expect("writes");
     }
 
-    /// The command line of a learner with a run directory of its own.
+    /// Returns the command line of a learner with a new run directory.
     pub(crate) fn learner(&self, more: &[&str]) -> Vec<String> {
         let out = tempfile::tempdir_in(self.path()).expect("a directory").keep();
         let out = out.to_string_lossy();
@@ -71,12 +71,12 @@ impl Place {
         command
     }
 
-    /// Runs a command to its end.
+    /// Runs a command and waits for its end.
     pub(crate) fn run(&self, args: &[impl AsRef<str>]) -> Output {
         self.command(args).output().expect("runs")
     }
 
-    /// Starts a command; `name` is for its log.
+    /// Starts a command whose log is named `name`.
     pub(crate) fn start(&self, name: &str, args: &[impl AsRef<str>]) -> Running {
         let log = self.path().join(format!("{name}.log"));
         let file = File::create(&log).expect("a log");
@@ -84,7 +84,7 @@ impl Place {
         Running { child, address: String::new(), log }
     }
 
-    /// Starts a service and waits until it says where it listens.
+    /// Starts a service and waits until it prints its address.
     pub(crate) fn serve(&self, name: &str, args: &[impl AsRef<str>]) -> Running {
         let mut running = self.start(name, args);
         let mut line = String::new();
@@ -97,7 +97,7 @@ impl Place {
     }
 }
 
-/// The command line of a teacher.
+/// Returns the command line of a teacher.
 pub(crate) fn teacher(more: &[&str]) -> Vec<String> {
     let policy = Path::new(env!("CARGO_MANIFEST_DIR")).join("policies/teacher-push.safetensors");
     let policy = policy.to_string_lossy();
@@ -105,21 +105,21 @@ pub(crate) fn teacher(more: &[&str]) -> Vec<String> {
     args.into_iter().map(str::to_owned).collect()
 }
 
-/// A process that is killed when the test is through with it.
+/// A process that is killed on drop.
 pub(crate) struct Running {
     child: Child,
-    /// Where a service listens.
+    /// The address of a service.
     pub(crate) address: String,
     log: PathBuf,
 }
 
 impl Running {
-    /// The address by which this machine reaches it.
+    /// Returns the address at which this machine reaches the service.
     pub(crate) fn local_address(&self) -> String {
         self.address.replace("0.0.0.0", "127.0.0.1")
     }
 
-    /// What it has said on standard error.
+    /// Returns the standard error so far.
     pub(crate) fn log(&self) -> String {
         fs::read_to_string(&self.log).expect("readable")
     }
@@ -128,14 +128,14 @@ impl Running {
         self.child.try_wait().expect("ours").is_none()
     }
 
-    /// Asks the process to end and waits until it has: its log is then complete. Returns the exit code.
+    /// Sends SIGTERM, waits for the end and returns the exit code. The log is then complete.
     pub(crate) fn end(&mut self) -> Option<i32> {
         let asked = Command::new("kill").arg(self.child.id().to_string()).status();
         assert!(asked.expect("kill runs").success(), "{}", self.log());
         self.wait()
     }
 
-    /// Waits for the end; gives the exit code.
+    /// Waits for the end and returns the exit code.
     pub(crate) fn wait(&mut self) -> Option<i32> {
         self.child.wait().expect("ours").code()
     }
@@ -156,17 +156,17 @@ fn authority(name: &str) -> CertifiedIssuer<'static, KeyPair> {
     CertifiedIssuer::self_signed(params, key).expect("a certificate")
 }
 
-/// The line in which a command that ended with `code` said what is wrong, after its log lines.
+/// Checks that a command ended with `code` and returns its error line, which follows its log lines.
 pub(crate) fn fails_with(code: i32, output: Output) -> String {
-    let told = String::from_utf8(output.stderr).expect("UTF-8");
-    assert_eq!(output.status.code(), Some(code), "{told}");
-    let lines: Vec<&str> = told.lines().filter(|line| line.starts_with("tandem: ")).collect();
-    assert_eq!(lines.len(), 1, "{told}");
-    assert_eq!(told.lines().last(), lines.first().copied(), "{told}");
+    let stderr = String::from_utf8(output.stderr).expect("UTF-8");
+    assert_eq!(output.status.code(), Some(code), "{stderr}");
+    let lines: Vec<&str> = stderr.lines().filter(|line| line.starts_with("tandem: ")).collect();
+    assert_eq!(lines.len(), 1, "{stderr}");
+    assert_eq!(stderr.lines().last(), lines.first().copied(), "{stderr}");
     lines[0].to_owned()
 }
 
-/// Looks again and again for as long as anything may take whether something has come true.
+/// Polls `holds` until it is true or [`DEADLINE`] has passed.
 pub(crate) fn eventually(holds: impl Fn() -> bool) -> bool {
     (0..DEADLINE.as_millis() / PAUSE.as_millis()).any(|_| {
         let held = holds();

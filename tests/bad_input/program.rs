@@ -1,4 +1,4 @@
-//! The built program: as a service, and as a command that is given what it cannot use.
+//! The built program, as a service and as a command with unusable input.
 
 use std::fs;
 use std::io::{BufRead as _, BufReader};
@@ -9,17 +9,17 @@ use std::time::Duration;
 
 use tempfile::TempDir;
 
-/// A process that is ended with this value.
+/// A process that is killed on drop.
 pub(crate) struct Running {
     child: Child,
-    /// Where it leaves what it leaves.
+    /// The process's working directory.
     _directory: TempDir,
-    /// Where it listens; of a worker nothing that means anything.
+    /// The address of a service. Unused for workers.
     pub(crate) address: SocketAddr,
 }
 
 impl Running {
-    /// Starts a process that listens nowhere.
+    /// Starts a process that does not listen.
     pub(crate) fn start(args: &[&str]) -> Self {
         let directory = tempfile::tempdir().expect("a directory");
         let mut command = command(args, directory.path());
@@ -27,7 +27,7 @@ impl Running {
         Self { child, _directory: directory, address: ([127, 0, 0, 1], 0).into() }
     }
 
-    /// Starts a service and reads where it listens.
+    /// Starts a service and reads its address.
     pub(crate) fn service(args: &[&str]) -> Self {
         let directory = tempfile::tempdir().expect("a directory");
         let mut command = command(args, directory.path());
@@ -40,16 +40,16 @@ impl Running {
         Self { child, _directory: directory, address: address.expect("an address") }
     }
 
-    /// The most memory it has had, MiB.
+    /// Returns the peak resident memory, MiB.
     pub(crate) fn peak_mib(&self) -> u64 {
         let status = fs::read_to_string(format!("/proc/{}/status", self.child.id()));
-        let status = status.expect("it runs");
+        let status = status.expect("the process runs");
         let line = status.lines().find_map(|line| line.strip_prefix("VmHWM:")).expect("a figure");
         let kib: u64 = line.split_whitespace().next().expect("a number").parse().expect("kB");
         kib / 1024
     }
 
-    /// Whether it ends by itself, and well.
+    /// Waits for the process and returns true if it succeeded in time.
     pub(crate) fn ends_well(&mut self) -> bool {
         for _ in 0..1200 {
             if let Some(status) = self.child.try_wait().expect("there") {
@@ -60,7 +60,7 @@ impl Running {
         false
     }
 
-    /// Whether it ends well when it is asked to.
+    /// Sends SIGTERM and returns true if the process then succeeds in time.
     pub(crate) fn ends_on_sigterm(&mut self) -> bool {
         let sent = Command::new("kill").args(["-TERM", &self.child.id().to_string()]).status();
         sent.expect("kill runs").success() && self.ends_well()
@@ -74,7 +74,7 @@ impl Drop for Running {
     }
 }
 
-/// The program in `directory`, with no settings from outside.
+/// Returns the command that runs the program in `directory` without outside settings.
 fn command(args: &[&str], directory: &Path) -> Command {
     let mut command = Command::new(env!("CARGO_BIN_EXE_tandem"));
     command.args(args).stdin(Stdio::null()).current_dir(directory);
@@ -84,12 +84,12 @@ fn command(args: &[&str], directory: &Path) -> Command {
     command
 }
 
-/// The path of a policy that ships.
+/// Returns the path of a shipped policy.
 pub(crate) fn shipped(name: &str) -> String {
     format!("{}/policies/{name}.safetensors", env!("CARGO_MANIFEST_DIR"))
 }
 
-/// Files and directories of every wrong kind, by the names that stand for them in command lines.
+/// Creates unusable files and directories under the names that [`CASES`] refers to.
 fn prepare(directory: &Path) {
     let whole = fs::read(shipped("teacher-push")).expect("ships");
     let mut altered = whole.clone();
@@ -112,7 +112,7 @@ fn prepare(directory: &Path) {
     assert!(made.expect("mkfifo runs").success());
 }
 
-/// Command lines, the exit codes they end with, and a word of what is said. `@name` stands for a file or a directory
+/// Command lines, the exit codes they end with, and a expected of what is said. `@name` stands for a file or a directory
 /// of those prepared, `@empty/x` for a place that cannot be written, `%name` for a policy that ships, `BUSY` for an
 /// address that is taken.
 const CASES: [(&str, i32, &str); 76] = [
@@ -204,7 +204,7 @@ fn unusable_inputs_are_reported_in_one_line() {
     prepare(directory.path());
     let busy = TcpListener::bind("127.0.0.1:0").expect("a free address");
     let busy = busy.local_addr().expect("an address").to_string();
-    for (line, code, word) in CASES {
+    for (line, code, expected) in CASES {
         let args: Vec<String> = line
             .split_whitespace()
             .map(|arg| match (arg.strip_prefix('@'), arg.strip_prefix('%')) {
@@ -215,16 +215,20 @@ fn unusable_inputs_are_reported_in_one_line() {
             .collect();
         let args: Vec<&str> = args.iter().map(String::as_str).collect();
         let output = command(&args, directory.path()).output().expect("runs");
-        let told = String::from_utf8_lossy(&output.stderr).into_owned();
-        assert_eq!(output.status.code(), Some(code), "{line}: {told}");
-        assert!(told.contains(word), "{line}: {told:?} lacks {word:?}");
-        assert!(!told.contains("panicked") && !told.contains("RUST_BACKTRACE"), "{line}: {told}");
-        let lines =
-            told.lines().filter(|line| line.starts_with("tandem: ") || line.starts_with("error: "));
-        assert!(lines.count() == 1 || told.starts_with("Trains policies"), "{line}: {told}");
-        assert!(told.len() < 3000, "{line}: {} bytes", told.len());
+        let stderr = String::from_utf8_lossy(&output.stderr).into_owned();
+        assert_eq!(output.status.code(), Some(code), "{line}: {stderr}");
+        assert!(stderr.contains(expected), "{line}: {stderr:?} lacks {expected:?}");
+        assert!(
+            !stderr.contains("panicked") && !stderr.contains("RUST_BACKTRACE"),
+            "{line}: {stderr}"
+        );
+        let lines = stderr
+            .lines()
+            .filter(|line| line.starts_with("tandem: ") || line.starts_with("error: "));
+        assert!(lines.count() == 1 || stderr.starts_with("Trains policies"), "{line}: {stderr}");
+        assert!(stderr.len() < 3000, "{line}: {} bytes", stderr.len());
     }
-    assert!(!directory.path().join("mended").exists(), "nothing was made of garbage");
+    assert!(!directory.path().join("mended").exists(), "garbage was recovered");
 }
 
 #[test]
@@ -244,9 +248,9 @@ fn reading_a_pipe_without_a_writer_times_out() {
     };
     for child in lines.iter().map(start).collect::<Vec<_>>() {
         let ended = child.wait_with_output().expect("ends");
-        let told = String::from_utf8_lossy(&ended.stderr).into_owned();
-        assert_eq!(ended.status.code(), Some(64), "{told}");
-        assert!(told.contains("pipe\"") && told.contains("no end of it came"), "{told}");
+        let stderr = String::from_utf8_lossy(&ended.stderr).into_owned();
+        assert_eq!(ended.status.code(), Some(64), "{stderr}");
+        assert!(stderr.contains("pipe\"") && stderr.contains("no end of it came"), "{stderr}");
     }
 }
 
@@ -257,7 +261,7 @@ fn a_text_file_can_be_a_pipe() {
     let mut shell = Command::new("bash");
     shell.args(["-c", script, env!("CARGO_BIN_EXE_tandem")]).current_dir(directory.path());
     let output = shell.output().expect("runs");
-    let told = String::from_utf8_lossy(&output.stderr).into_owned();
-    assert!(output.status.success(), "{told}");
-    assert!(String::from_utf8_lossy(&output.stdout).contains("2 runs"), "{told}");
+    let stderr = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert!(output.status.success(), "{stderr}");
+    assert!(String::from_utf8_lossy(&output.stdout).contains("2 runs"), "{stderr}");
 }

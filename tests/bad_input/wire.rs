@@ -1,4 +1,4 @@
-//! HTTP/2 by hand: whatever bytes one likes in the place of a request.
+//! A raw HTTP/2 client that sends arbitrary bytes as a request.
 
 use std::io::{Read as _, Write as _};
 use std::net::{SocketAddr, TcpStream};
@@ -12,27 +12,27 @@ use prost::bytes::Bytes;
 use prost_types::FileDescriptorSet;
 use tonic::Code;
 
-/// A call that a service offers.
+/// A method of a service.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct Rpc {
-    /// `tandem.v1.Teacher`, say.
+    /// For example `tandem.v1.Teacher`.
     pub(crate) service: String,
-    /// `/tandem.v1.Teacher/Advise`, say.
+    /// For example `/tandem.v1.Teacher/Advise`.
     pub(crate) path: String,
 }
 
-/// What comes back.
+/// The outcome of a call.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) enum Answer {
-    /// An end without a message: the status and what it says.
+    /// A status code and message without a response message.
     Status(Code, String),
-    /// A message, the first one where there are more.
+    /// The first response message.
     Message(Vec<u8>),
     /// The call or its connection was closed.
     Closed,
 }
 
-/// Every call of every service, from the descriptors.
+/// Returns every method of every service, from the descriptors.
 pub(crate) fn rpcs() -> Vec<Rpc> {
     let files = FileDescriptorSet::decode(tandem_proto::FILE_DESCRIPTOR_SET).expect("descriptors");
     let mut calls = Vec::new();
@@ -46,7 +46,7 @@ pub(crate) fn rpcs() -> Vec<Rpc> {
     calls
 }
 
-/// A message as gRPC frames it.
+/// Returns a message with its gRPC frame header.
 pub(crate) fn frame(flag: u8, message: &[u8]) -> Vec<u8> {
     let length = u32::try_from(message.len()).expect("a small message");
     [&[flag][..], &length.to_be_bytes(), message].concat()
@@ -55,7 +55,7 @@ pub(crate) fn frame(flag: u8, message: &[u8]) -> Vec<u8> {
 async fn connect(address: SocketAddr) -> Option<SendRequest<Bytes>> {
     let socket = tokio::net::TcpStream::connect(address).await.ok()?;
     let (client, connection) = h2::client::handshake(socket).await.ok()?;
-    // The connection ends with the client; whatever it ends with shows in the call.
+    // The connection ends with the client. Its errors surface in the call.
     drop(tokio::spawn(async move { connection.await.is_ok() }));
     client.ready().await.ok()
 }
@@ -73,13 +73,13 @@ fn open(
     client.send_request(request, false).ok()
 }
 
-/// Sends `body` and the end of it as a call of `path`.
+/// Calls `path` with `body` as the complete request stream.
 pub(crate) async fn call(address: SocketAddr, path: &str, body: &[u8]) -> Answer {
     let Some(mut client) = connect(address).await else { return Answer::Closed };
     let Some((response, mut body_stream)) = open(&mut client, address, path) else {
         return Answer::Closed;
     };
-    // A service may refuse before the end of what it is sent, so a failure to send is none of the call.
+    // A service may refuse before it has read everything, so a failure to send is not a failure of the call.
     drop(body_stream.send_data(Bytes::copy_from_slice(body), true));
     match response.await {
         Err(_) => Answer::Closed,
@@ -90,11 +90,12 @@ pub(crate) async fn call(address: SocketAddr, path: &str, body: &[u8]) -> Answer
     }
 }
 
-/// The status that headers or trailers carry.
+/// Returns the gRPC status in headers or trailers.
 fn status_of(headers: &HeaderMap) -> Option<Answer> {
     let code = headers.get("grpc-status")?.to_str().ok()?.parse().ok()?;
-    let told = headers.get("grpc-message").map(|told| String::from_utf8_lossy(told.as_bytes()));
-    Some(Answer::Status(Code::from_i32(code), told.unwrap_or_default().into_owned()))
+    let message =
+        headers.get("grpc-message").map(|message| String::from_utf8_lossy(message.as_bytes()));
+    Some(Answer::Status(Code::from_i32(code), message.unwrap_or_default().into_owned()))
 }
 
 async fn first_message(mut body: RecvStream) -> Answer {
@@ -120,9 +121,9 @@ async fn first_message(mut body: RecvStream) -> Answer {
     trailers.and_then(|trailers| status_of(&trailers)).unwrap_or(Answer::Closed)
 }
 
-/// Sends messages without end, as fast as they are taken in, until the service has enough or 2 MiB are sent; then
-/// goes away without a word.
-pub(crate) async fn endless(address: SocketAddr, path: &str) {
+/// Sends messages as fast as the service accepts them, until it refuses or 2 MiB are sent, then disconnects without
+/// ending the stream.
+pub(crate) async fn send_endlessly(address: SocketAddr, path: &str) {
     let Some(mut client) = connect(address).await else { return };
     let Some((_response, mut body)) = open(&mut client, address, path) else { return };
     let chunk = Bytes::from(frame(0, &[]).repeat(3000));
@@ -130,7 +131,7 @@ pub(crate) async fn endless(address: SocketAddr, path: &str) {
         body.reserve_capacity(chunk.len());
         let mut granted =
             std::pin::pin!(std::future::poll_fn(|context| body.poll_capacity(context)));
-        // A service that takes nothing more in holds the client back: that is an end too.
+        // A service that stops reading blocks the client, which counts as a refusal.
         let granted = tokio::time::timeout(Duration::from_millis(200), &mut granted).await;
         if !matches!(granted, Ok(Some(Ok(_)))) || body.send_data(chunk.clone(), false).is_err() {
             return;
@@ -138,7 +139,7 @@ pub(crate) async fn endless(address: SocketAddr, path: &str) {
     }
 }
 
-/// Opens so many calls on one connection and drops each at once.
+/// Opens `n_calls` calls on one connection and resets each immediately.
 pub(crate) async fn reset_storm(address: SocketAddr, path: &str, n_calls: usize) {
     let Some(mut client) = connect(address).await else { return };
     for _ in 0..n_calls {
@@ -150,8 +151,8 @@ pub(crate) async fn reset_storm(address: SocketAddr, path: &str, n_calls: usize)
     }
 }
 
-/// What is no HTTP/2, or only begins as such.
-pub(crate) fn no_http2() -> Vec<Vec<u8>> {
+/// Returns byte sequences that are not HTTP/2, or only start like it.
+pub(crate) fn not_http2() -> Vec<Vec<u8>> {
     let preface = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n".to_vec();
     let settings = [0, 0, 0, 4, 0, 0, 0, 0, 0];
     let begun = [preface.as_slice(), &settings].concat();
@@ -163,21 +164,21 @@ pub(crate) fn no_http2() -> Vec<Vec<u8>> {
         vec![0xff; 4096],
         vec![0; 4096],
         [preface.as_slice(), &[0xff; 64]].concat(),
-        // A frame of 16 MB, headers that cannot be unpacked, data for a call that was never opened.
+        // A frame of 16 MB, undecodable headers, data for a stream that was never opened.
         with(&[0xff, 0xff, 0xff, 0, 0, 0, 0, 0, 1]),
         with(&[0, 0, 4, 1, 5, 0, 0, 0, 1, 0xff, 0xff, 0xff, 0xff]),
         with(&[0, 0, 1, 0, 1, 0, 0, 0, 5, 9]),
-        // A window of nothing, settings out of their range.
+        // A zero window update, settings out of range.
         with(&[0, 0, 4, 8, 0, 0, 0, 0, 0, 0, 0, 0, 0]),
         with(&[0, 0, 6, 4, 0, 0, 0, 0, 0, 0, 4, 0xff, 0xff, 0xff, 0xff]),
     ]
 }
 
-/// Whether the other side closes the connection on which it was sent `bytes`.
+/// Sends `bytes` and returns true if the peer closes the connection.
 pub(crate) fn is_closed_after(address: SocketAddr, bytes: &[u8]) -> bool {
     let mut stream = TcpStream::connect(address).expect("connects");
     stream.set_read_timeout(Some(super::DEADLINE)).expect("a time");
-    // It may be closed while it is written to.
+    // The peer may close the connection during the write.
     drop(stream.write_all(bytes));
     let mut answer = [0; 1024];
     loop {

@@ -1,4 +1,4 @@
-//! A disk that fails on demand: a directory, and an object that is preloaded into the programs that write there.
+//! A disk that fails on demand: a directory, and a shared object preloaded into the programs that write there.
 
 use std::fmt;
 use std::fs;
@@ -28,21 +28,21 @@ static SHIM: LazyLock<(TempDir, PathBuf)> = LazyLock::new(|| {
     (keep, path)
 });
 
-/// What the call that is hit does, and later ones.
+/// The effect of a fault on the affected call and on later calls.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Mode {
-    /// A write writes its first half; the call fails. Later calls succeed.
+    /// A write writes its first half and fails. Later calls succeed.
     Once,
-    /// The same, and later calls fail.
+    /// As [`Self::Once`], and all later calls fail.
     Dead,
-    /// A write writes its first half; the process that called is killed.
+    /// A write writes its first half and the calling process is killed.
     Kill,
-    /// The same, and so is every process that makes a later call. What was not synced is lost.
+    /// As [`Self::Kill`], and every process that makes a later call is killed. Unsynced data is lost.
     Cut,
 }
 
 impl Mode {
-    /// As the shim calls it.
+    /// Returns the name that the shim uses.
     pub(crate) const fn name(self) -> &'static str {
         match self {
             Self::Once => "once",
@@ -53,14 +53,14 @@ impl Mode {
     }
 }
 
-/// A fault of the disk.
+/// A disk fault.
 #[derive(Debug, Clone)]
 pub(crate) struct Fault {
     pub(crate) mode: Mode,
     pub(crate) errno: i32,
-    /// Which call is hit, from 1, of those whose line contains `pattern`.
+    /// One-based index of the affected call among those whose line contains `pattern`.
     pub(crate) at: usize,
-    /// A part of `NAME PATH`: the called function and the path below the disk's directory.
+    /// A substring of `NAME PATH`: the called function and the path below the disk's directory.
     pub(crate) pattern: String,
 }
 
@@ -77,7 +77,7 @@ impl fmt::Display for Fault {
     }
 }
 
-/// A disk.
+/// A disk that can fail.
 #[derive(Debug)]
 pub(crate) struct Device {
     keep: TempDir,
@@ -92,45 +92,46 @@ impl Device {
         Self { keep }
     }
 
-    /// The directory whose files fail.
+    /// Returns the directory whose files fail.
     pub(crate) fn root(&self) -> PathBuf {
         self.keep.path().join("disk")
     }
 
-    /// A path beside the directory, for files that do not fail.
-    pub(crate) fn beside(&self, name: &str) -> PathBuf {
+    /// Returns a path outside the directory, for files that do not fail.
+    pub(crate) fn sibling(&self, name: &str) -> PathBuf {
         self.keep.path().join(name)
     }
 
-    /// Lets the program that `command` starts, and all that it starts, use the disk.
+    /// Attaches the disk to the program that `command` starts and to its child processes.
     pub(crate) fn attach(&self, command: &mut Command, fault: Option<&Fault>) {
         command
             .env("LD_PRELOAD", &SHIM.1)
             .env("FAULTY_DISK_ROOT", self.root())
-            .env("FAULTY_DISK_STATE", self.beside("state"));
+            .env("FAULTY_DISK_STATE", self.sibling("state"));
         if let Some(Fault { mode, errno, at, pattern }) = fault {
             let mode = mode.name();
             command.env("FAULTY_DISK_FAULT", format!("{mode} {errno} {at} {pattern}"));
         }
     }
 
-    /// Whether the fault has been hit.
-    pub(crate) fn is_hit(&self) -> bool {
-        fs::read(self.beside("state/counters")).expect("readable")[8] == 1
+    /// Returns true once the fault has been triggered.
+    pub(crate) fn is_triggered(&self) -> bool {
+        fs::read(self.sibling("state/counters")).expect("readable")[8] == 1
     }
 
-    /// The calls until now; `! ` stands before those that failed.
+    /// Returns the calls so far. Failed calls start with `! `.
     pub(crate) fn calls(&self) -> Vec<String> {
-        let text = fs::read_to_string(self.beside("state/calls")).unwrap_or_default();
+        let text = fs::read_to_string(self.sibling("state/calls")).unwrap_or_default();
         text.lines().map(str::to_owned).collect()
     }
 
-    /// Takes from every file what was not synced before the power was cut. Names stay as they are, as on a file system
-    /// with a journal of its metadata.
+    /// Discards the data that was not synced before the power cut. File names remain, as on a file system with a metadata
+    /// journal.
     pub(crate) fn lose_unsynced(&self) {
         for path in files_below(&self.root()) {
             let inode = fs::metadata(&path).expect("a file").ino();
-            let synced = fs::read(self.beside("state").join(inode.to_string())).unwrap_or_default();
+            let synced =
+                fs::read(self.sibling("state").join(inode.to_string())).unwrap_or_default();
             fs::write(&path, synced).expect("writes");
         }
     }

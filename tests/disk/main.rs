@@ -1,4 +1,4 @@
-//! A disk that tears writes, returns errors and loses power, and what becomes of runs and teachers on it.
+//! Runs and teachers on a disk that tears writes, returns errors and loses power.
 
 mod device;
 mod run;
@@ -8,12 +8,12 @@ use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 use device::{ENOSPC, Fault, Mode};
-use run::{CALM, check};
+use run::{UNDISTURBED, check};
 
-/// Which files are hit, and at which share of the calls on them, in percent.
+/// Returns a fault for each pattern of `hits`, at the given percentage of the calls that match it.
 fn faults(mode: Mode, hits: &[(&str, usize)]) -> Vec<Fault> {
     let fault = |(pattern, percent): &(&str, usize)| {
-        let n_calls = CALM.1.iter().filter(|call| call.contains(pattern)).count();
+        let n_calls = UNDISTURBED.1.iter().filter(|call| call.contains(pattern)).count();
         assert!(n_calls > 0, "no call matches {pattern:?}");
         Fault::new(mode, (n_calls * percent).div_ceil(100).max(1), pattern)
     };
@@ -56,8 +56,8 @@ fn a_run_is_resumed_after_a_power_cut() {
     faults(Mode::Cut, &hits).iter().for_each(check);
 }
 
-/// Calls of every kind in every mode. `TANDEM_DISK_SWEEP` is the modes and how many calls of each kind are hit; 0 stands
-/// for all of them, which takes a day:
+/// Faults at calls of every kind in every mode. `TANDEM_DISK_SWEEP` lists the modes and the number of calls of each kind.
+/// 0 means every call, which takes a day:
 ///
 /// ```text
 /// TANDEM_DISK_SWEEP=once,dead,kill,cut:0 cargo test --release --test disk -- --ignored --nocapture
@@ -65,7 +65,7 @@ fn a_run_is_resumed_after_a_power_cut() {
 #[test]
 #[ignore = "takes minutes to hours"]
 fn every_call_of_a_run_may_fail() {
-    #[expect(clippy::disallowed_methods, reason = "the one switch of this test")]
+    #[expect(clippy::disallowed_methods, reason = "configures this test")]
     let part = std::env::var("TANDEM_DISK_SWEEP").unwrap_or("once,dead,kill,cut:1".to_owned());
     let (modes, n_hits) = part.split_once(':').expect("MODES:COUNT");
     let n_hits = n_hits.parse().expect("a number");
@@ -90,10 +90,10 @@ fn every_call_of_a_run_may_fail() {
     assert_eq!(failed.into_inner(), 0, "of {} faults", faults.len());
 }
 
-/// Faults at `n_hits` calls of every kind, at equal distances, or at all of them.
+/// Returns faults at `n_hits` evenly spaced calls of every kind, or at every call if `n_hits` is 0.
 fn sweep(mode: Mode, n_hits: usize) -> Vec<Fault> {
     let mut kinds: BTreeMap<&str, usize> = BTreeMap::new();
-    CALM.1.iter().for_each(|call| *kinds.entry(call).or_default() += 1);
+    UNDISTURBED.1.iter().for_each(|call| *kinds.entry(call).or_default() += 1);
     let hits = |(kind, n_calls): (&&str, &usize)| {
         let n_hits = if n_hits == 0 { *n_calls } else { n_hits.min(*n_calls) };
         let at = |hit: usize| (hit * 2 + 1) * n_calls / (n_hits * 2) + 1;

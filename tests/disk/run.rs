@@ -1,4 +1,4 @@
-//! Runs on the disk: started, disturbed, resumed, compared with an undisturbed one.
+//! Runs on the failing disk: started, disturbed, resumed and compared with an undisturbed run.
 
 use std::fs::{self, File};
 use std::os::unix::process::ExitStatusExt as _;
@@ -47,20 +47,20 @@ const SMALL: [&str; 28] = [
 ];
 
 /// Ticks of 20 ms after which a run counts as hanging.
-const PATIENCE: usize = 6000;
+const HANG_LIMIT: usize = 6000;
 /// Ticks of 20 ms after which a run that waits for its disk is interrupted.
-const WAITS: usize = 50;
+const DISK_WAIT_LIMIT: usize = 50;
 
-/// What an undisturbed run leaves behind, and its calls.
-pub(crate) static CALM: LazyLock<(Left, Vec<String>)> = LazyLock::new(|| {
+/// The result of an undisturbed run, and its disk calls.
+pub(crate) static UNDISTURBED: LazyLock<(RunResult, Vec<String>)> = LazyLock::new(|| {
     let device = Device::new();
     let ended = Run::start(&device, None, false).end();
-    (Left::behind(&device, &ended), device.calls())
+    (RunResult::read(&device, &ended), device.calls())
 });
 
-/// What a run leaves behind: everything that must not depend on how often it was disturbed.
+/// The part of a run's output that must not depend on faults.
 #[derive(Debug, PartialEq)]
-pub(crate) struct Left {
+pub(crate) struct RunResult {
     digest: String,
     metrics: Vec<Value>,
     /// Units spent, and every verdict.
@@ -69,9 +69,9 @@ pub(crate) struct Left {
     policies: [String; 2],
 }
 
-impl Left {
-    fn behind(device: &Device, ended: &Ended) -> Self {
-        assert_eq!(ended.status.code(), Some(0), "{}", ended.said);
+impl RunResult {
+    fn read(device: &Device, ended: &Ended) -> Self {
+        assert_eq!(ended.status.code(), Some(0), "{}", ended.stderr);
         let out = device.root().join("run");
         let row = |line| -> Value {
             let mut row: Value = serde_json::from_str(line).expect("a row");
@@ -89,7 +89,7 @@ impl Left {
     }
 }
 
-/// Checks that every episode's log that has its name is whole.
+/// Checks that every episode log with its final name is complete.
 fn check_logs(device: &Device) {
     let logs = fs::read_dir(device.root().join("run/mcap")).into_iter().flatten().flatten();
     for path in
@@ -99,7 +99,7 @@ fn check_logs(device: &Device) {
     }
 }
 
-/// Units spent and verdicts in a ledger that nobody has open.
+/// Reads the units spent and the verdicts from a ledger that is not in use.
 pub(crate) fn account(ledger: &Path) -> Vec<String> {
     let connection = Connection::open_with_flags(ledger, OpenFlags::SQLITE_OPEN_READ_ONLY);
     let connection = connection.expect("a ledger");
@@ -111,15 +111,15 @@ pub(crate) fn account(ledger: &Path) -> Vec<String> {
     rows.collect::<Result<_, _>>().expect("rows")
 }
 
-/// How a run ended.
+/// The exit status and output of a finished run.
 pub(crate) struct Ended {
     pub(crate) status: ExitStatus,
-    /// What it wrote to standard error.
-    pub(crate) said: String,
+    /// The content of standard error.
+    pub(crate) stderr: String,
     digest: Option<String>,
 }
 
-/// A `tandem train`.
+/// A `tandem train` process.
 pub(crate) struct Run<'a> {
     device: &'a Device,
     process: Child,
@@ -127,7 +127,7 @@ pub(crate) struct Run<'a> {
 
 impl<'a> Run<'a> {
     pub(crate) fn start(device: &'a Device, fault: Option<&Fault>, resume: bool) -> Self {
-        let (output, said) = (device.beside("output"), device.beside("said"));
+        let (output, stderr) = (device.sibling("output"), device.sibling("stderr"));
         let mut command = Command::new(env!("CARGO_BIN_EXE_tandem"));
         command.args(["train", "--json"]);
         match resume {
@@ -137,25 +137,25 @@ impl<'a> Run<'a> {
         command.arg("--out").arg(device.root().join("run"));
         command.current_dir(env!("CARGO_MANIFEST_DIR")).stdin(Stdio::null());
         command.stdout(File::create(output).expect("creates"));
-        command.stderr(File::create(said).expect("creates"));
+        command.stderr(File::create(stderr).expect("creates"));
         device.attach(&mut command, fault);
         Self { device, process: command.spawn().expect("starts") }
     }
 
-    fn said(&self) -> String {
-        fs::read_to_string(self.device.beside("said")).expect("readable")
+    fn stderr(&self) -> String {
+        fs::read_to_string(self.device.sibling("stderr")).expect("readable")
     }
 
     fn ended(&self, status: ExitStatus) -> Ended {
-        let output = fs::read_to_string(self.device.beside("output")).expect("readable");
+        let output = fs::read_to_string(self.device.sibling("output")).expect("readable");
         let after = output.lines().last().and_then(|line| line.split("\"digest\":\"").nth(1));
         let digest = after.and_then(|after| after.split('"').next()).map(str::to_owned);
-        Ended { status, said: self.said(), digest }
+        Ended { status, stderr: self.stderr(), digest }
     }
 
-    /// Waits for the end, and calls `look` now and then.
+    /// Waits for the end and calls `look` periodically.
     fn end_watched(mut self, mut look: impl FnMut(&Self)) -> Ended {
-        for _ in 0..PATIENCE {
+        for _ in 0..HANG_LIMIT {
             if let Some(status) = self.process.try_wait().expect("a child") {
                 return self.ended(status);
             }
@@ -167,7 +167,7 @@ impl<'a> Run<'a> {
         assert!(
             status.success(),
             "the run neither ends nor says what it waits for: {}",
-            self.said()
+            self.stderr()
         );
         self.ended(status)
     }
@@ -177,21 +177,21 @@ impl<'a> Run<'a> {
         self.end_watched(|_| ())
     }
 
-    /// Waits for the end. A run that waits for its disk to recover is interrupted once it has said so.
+    /// Waits for the end. Interrupts a run that reports that it is waiting for its disk.
     fn end_or_interrupt(self) -> Ended {
         let mut n_waited = 0;
         self.end_watched(|run| {
-            n_waited += usize::from(run.device.is_hit() && names_the_fault(&run.said()));
-            if n_waited == WAITS {
+            n_waited += usize::from(run.device.is_triggered() && names_the_fault(&run.stderr()));
+            if n_waited == DISK_WAIT_LIMIT {
                 signal("-INT", run.process.id());
             }
         })
     }
 
-    /// Waits until the power is cut, and ends every process.
+    /// Waits for the power cut, then kills every process.
     fn end_by_power_cut(mut self) -> Ended {
-        for _ in 0..PATIENCE {
-            if self.device.is_hit() || self.process.try_wait().expect("a child").is_some() {
+        for _ in 0..HANG_LIMIT {
+            if self.device.is_triggered() || self.process.try_wait().expect("a child").is_some() {
                 break;
             }
             std::thread::sleep(Duration::from_millis(5));
@@ -216,16 +216,16 @@ pub(crate) fn signal(signal: &str, pid: u32) {
     sent.expect("kill runs");
 }
 
-/// Whether a line names what cannot be written, and why.
-pub(crate) fn names_the_fault(said: &str) -> bool {
+/// Returns true if a line names the file that cannot be written and the cause.
+pub(crate) fn names_the_fault(stderr: &str) -> bool {
     let of_sqlite = ["disk I/O error", "disk is full", "unable to open database file"];
     let causes = [&["Input/output error", "No space left"][..], &of_sqlite].concat();
-    let whats = ["checkpoint", "ledger", "metrics.jsonl", "policy", "run.toml", "/run", "in-use"];
+    let files = ["checkpoint", "ledger", "metrics.jsonl", "policy", "run.toml", "/run", "in-use"];
     let names = |line: &str, words: &[&str]| words.iter().any(|word| line.contains(word));
-    said.lines().any(|line| names(line, &causes) && names(line, &whats))
+    stderr.lines().any(|line| names(line, &causes) && names(line, &files))
 }
 
-/// Runs on a disk with a fault, then goes on where it is whole.
+/// Runs on a disk with a fault, then resumes on a healthy disk.
 pub(crate) fn check(fault: &Fault) {
     let device = Device::new();
     let run = Run::start(&device, Some(fault), false);
@@ -235,22 +235,22 @@ pub(crate) fn check(fault: &Fault) {
         Mode::Cut => run.end_by_power_cut(),
     };
     let hit = device.calls().into_iter().find(|call| call.starts_with('!'));
-    let what = format!("{fault}, {hit:?}: {:?}: {}", ended.status, ended.said);
+    let what = format!("{fault}, {hit:?}: {:?}: {}", ended.status, ended.stderr);
     check_end(&ended, fault, &what);
     check_logs(&device);
     let ended = match ended.status.code() {
         Some(0) => ended,
         _ => Run::start(&device, None, device.root().join("run/run.toml").exists()).end(),
     };
-    assert_eq!(ended.status.code(), Some(0), "resumed after {what}: {}", ended.said);
-    let left = Left::behind(&device, &ended);
-    assert_eq!(left.digest, CALM.0.digest, "after {what}");
-    assert_eq!(left, CALM.0, "after {what}");
+    assert_eq!(ended.status.code(), Some(0), "resumed after {what}: {}", ended.stderr);
+    let result = RunResult::read(&device, &ended);
+    assert_eq!(result.digest, UNDISTURBED.0.digest, "after {what}");
+    assert_eq!(result, UNDISTURBED.0, "after {what}");
 }
 
-/// Checks that a run ended as the fault allows, with one line that says why.
+/// Checks that a run ended in a way that the fault allows, with one line that gives the reason.
 fn check_end(ended: &Ended, fault: &Fault, what: &str) {
-    assert!(!ended.said.contains("panicked"), "{what}");
+    assert!(!ended.stderr.contains("panicked"), "{what}");
     match ended.status.code() {
         Some(0) => {}
         Some(130) => assert_eq!(fault.mode, Mode::Dead, "{what}"),
@@ -260,7 +260,7 @@ fn check_end(ended: &Ended, fault: &Fault, what: &str) {
         }
         code => {
             assert_eq!(code, Some(75), "{what}");
-            let last = ended.said.lines().last().unwrap_or_default();
+            let last = ended.stderr.lines().last().unwrap_or_default();
             let is_killed = fault.mode == Mode::Kill && last.contains("killed by signal 9");
             assert!(last.starts_with("tandem: "), "{what}");
             assert!(names_the_fault(last) || is_killed, "{what}");

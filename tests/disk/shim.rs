@@ -1,4 +1,4 @@
-//! A shared object that is preloaded into a program and makes the files below one directory fail on demand.
+//! A preloaded shared object that makes the files below one directory fail on demand.
 //!
 //! `device.rs` compiles it with `rustc` and describes the fault in the environment:
 //!
@@ -9,9 +9,9 @@
 //!   `PATTERN`. Unset: calls are only counted. A line is the name of the function without a `64` at its end, and the path
 //!   below the directory with `#` for every number.
 //!
-//! A write that is hit writes the first half of its bytes. Any other call that is hit does nothing.
+//! An affected write writes the first half of its bytes. Any other affected call does nothing.
 //!
-//! This is not a module of the test: it is compiled by itself and uses nothing but the standard library.
+//! This file is not a module of the test: it is compiled separately and uses only the standard library.
 
 use std::ffi::{CStr, OsStr, c_char, c_int, c_uint, c_void};
 use std::fs::{File, OpenOptions};
@@ -45,16 +45,16 @@ unsafe extern "C" {
     fn kill(pid: c_int, signal: c_int) -> c_int;
 }
 
-/// What follows when the fault is hit.
+/// The effect of the fault.
 #[derive(Clone, Copy, PartialEq, Eq)]
 enum Mode {
-    /// The call fails, later ones succeed.
+    /// The call fails. Later calls succeed.
     Once,
-    /// The call fails and so do all later ones.
+    /// The call and all later calls fail.
     Dead,
     /// The process that makes the call is killed.
     Kill,
-    /// The process that makes the call is killed, and so is each that makes a later one.
+    /// The process that makes the call is killed, as is every process that makes a later call.
     Cut,
 }
 
@@ -68,9 +68,9 @@ struct Fault {
 /// Shared by all processes.
 #[repr(C)]
 struct Counters {
-    /// Calls that the fault's pattern matches; all calls when there is no fault.
+    /// Number of calls that match the fault's pattern, or of all calls if there is no fault.
     n_matching: AtomicU64,
-    /// 1 once the fault was hit.
+    /// 1 once the fault has been triggered.
     is_hit: AtomicU64,
 }
 
@@ -82,15 +82,15 @@ struct Disk {
     fault: Option<Fault>,
 }
 
-/// What becomes of one call.
+/// The outcome of one call.
 #[derive(Clone, Copy, PartialEq, Eq)]
 enum Fate {
     Passes,
-    /// Fails with the error number; half of a write is written first.
+    /// Fails with the error number. A write first writes half of its bytes.
     Tears(c_int),
     /// Fails with the error number and does nothing.
     Fails(c_int),
-    /// Ends the process; half of a write is written first.
+    /// Kills the process. A write first writes half of its bytes.
     Kills,
 }
 
@@ -134,7 +134,7 @@ fn fault(text: &str) -> Fault {
 }
 
 impl Disk {
-    /// Decides about the call `name` on `path`, below the root or not.
+    /// Decides the fate of the call `name` on `path`, which may lie outside the root.
     fn fate(&self, name: &str, path: &Path) -> Fate {
         let Ok(below) = path.strip_prefix(&self.root) else { return Fate::Passes };
         let line = without_numbers(&format!("{} {}", name.trim_end_matches("64"), below.display()));
@@ -167,9 +167,9 @@ impl Disk {
         self.fault.as_ref().is_some_and(|fault| fault.mode == Mode::Cut)
     }
 
-    /// Keeps what a file holds: it survives a power cut.
+    /// Saves a copy of a file's content, which survives a power cut.
     fn keep_synced(&self, fd: c_int) {
-        if !self.loses_unsynced() || !path_of(fd).is_some_and(|path| path.starts_with(&self.root)) {
+        if !self.loses_unsynced() || !path_of_fd(fd).is_some_and(|path| path.starts_with(&self.root)) {
             return;
         }
         let file = format!("/proc/self/fd/{fd}");
@@ -182,7 +182,7 @@ impl Disk {
         }
     }
 
-    /// Forgets what a file held that is about to lose its name: its inode may be used again.
+    /// Discards the saved copy of a file that is about to be unlinked, because its inode may be reused.
     fn forget(&self, path: &Path) {
         if self.loses_unsynced()
             && path.starts_with(&self.root)
@@ -193,7 +193,7 @@ impl Disk {
     }
 }
 
-/// The text with `#` for each number in it: rounds and process numbers differ between runs.
+/// Replaces each number in the text by `#`, because rounds and process ids differ between runs.
 fn without_numbers(text: &str) -> String {
     let mut short = String::new();
     for character in text.chars() {
@@ -206,24 +206,24 @@ fn without_numbers(text: &str) -> String {
     short
 }
 
-/// The path of an open file.
-fn path_of(fd: c_int) -> Option<PathBuf> {
+/// Returns the path of an open file.
+fn path_of_fd(fd: c_int) -> Option<PathBuf> {
     std::fs::read_link(format!("/proc/self/fd/{fd}")).ok()
 }
 
-/// The path that a call names, relative to `directory` or absolute.
+/// Returns the path argument of a call, resolved against `directory` if relative.
 fn path_at(directory: c_int, path: *const c_char) -> Option<PathBuf> {
     // SAFETY: the caller of the intercepted function passes a C string.
     let path = Path::new(OsStr::from_bytes(unsafe { CStr::from_ptr(path) }.to_bytes()));
     let base = match directory {
         _ if path.is_absolute() => PathBuf::new(),
         AT_FDCWD => std::env::current_dir().ok()?,
-        directory => path_of(directory)?,
+        directory => path_of_fd(directory)?,
     };
     Some(base.join(path))
 }
 
-/// The fate of the call `name` on `path`. A process that is killed here ends before the call takes effect.
+/// Returns the fate of the call `name` on `path`. A process killed here ends before the call takes effect.
 fn fate(name: &str, path: impl FnOnce() -> Option<PathBuf>) -> Fate {
     let Some(disk) = DISK.get() else { return Fate::Passes };
     path().map_or(Fate::Passes, |path| disk.fate(name, &path))
@@ -238,12 +238,12 @@ fn failed(errno: c_int) -> c_int {
 fn die() -> ! {
     let pid = c_int::try_from(std::process::id()).expect("a process number");
     loop {
-        // SAFETY: it only ends this process.
+        // SAFETY: the call only ends this process.
         unsafe { kill(pid, SIGKILL) };
     }
 }
 
-/// The function of this name that the program would call without this object.
+/// Returns the next definition of this function, which the program would call without this object.
 macro_rules! next {
     ($name:ident as $signature:ty) => {{
         static NEXT: AtomicPtr<c_void> = AtomicPtr::new(null_mut());
@@ -258,7 +258,7 @@ macro_rules! next {
     }};
 }
 
-/// Functions that change a directory or a file's length: hit by the fault, they do nothing.
+/// Functions that change a directory or a file's length. They do nothing when the fault affects them.
 macro_rules! changes {
     ($($name:ident($($argument:ident: $type:ty),*) on $path:expr;)*) => {$(
         #[unsafe(no_mangle)]
@@ -276,24 +276,24 @@ macro_rules! changes {
 }
 
 changes! {
-    ftruncate(fd: c_int, n_bytes: i64) on path_of(fd);
-    ftruncate64(fd: c_int, n_bytes: i64) on path_of(fd);
-    rename(from: *const c_char, to: *const c_char) on about_to_go(path_at(AT_FDCWD, to));
-    unlink(path: *const c_char) on about_to_go(path_at(AT_FDCWD, path));
-    unlinkat(directory: c_int, path: *const c_char, flags: c_int) on about_to_go(path_at(directory, path));
+    ftruncate(fd: c_int, n_bytes: i64) on path_of_fd(fd);
+    ftruncate64(fd: c_int, n_bytes: i64) on path_of_fd(fd);
+    rename(from: *const c_char, to: *const c_char) on forget_replaced(path_at(AT_FDCWD, to));
+    unlink(path: *const c_char) on forget_replaced(path_at(AT_FDCWD, path));
+    unlinkat(directory: c_int, path: *const c_char, flags: c_int) on forget_replaced(path_at(directory, path));
     mkdir(path: *const c_char, mode: c_uint) on path_at(AT_FDCWD, path);
     rmdir(path: *const c_char) on path_at(AT_FDCWD, path);
 }
 
-/// The path of a file that is replaced or removed.
-fn about_to_go(path: Option<PathBuf>) -> Option<PathBuf> {
+/// Discards the saved copy of a file that is about to be replaced or removed, and returns its path.
+fn forget_replaced(path: Option<PathBuf>) -> Option<PathBuf> {
     if let Some((disk, path)) = DISK.get().zip(path.as_ref()) {
         disk.forget(path);
     }
     path
 }
 
-/// Functions that open a file. They are calls to the disk where they create or cut one.
+/// Functions that open a file. They count as disk calls if they create or truncate it.
 macro_rules! opens {
     ($($name:ident($($argument:ident: $type:ty),*; $flags:ident) at $directory:expr, $path:expr;)*) => {$(
         #[unsafe(no_mangle)]
@@ -322,12 +322,12 @@ opens! {
     openat64(directory: c_int, path: *const c_char; flags) at directory, path;
 }
 
-/// Functions that bring a file onto the disk.
+/// Functions that sync a file.
 macro_rules! syncs {
     ($($name:ident)*) => {$(
         #[unsafe(no_mangle)]
         extern "C" fn $name(fd: c_int) -> c_int {
-            match fate(stringify!($name), || path_of(fd)) {
+            match fate(stringify!($name), || path_of_fd(fd)) {
                 Fate::Passes => {
                     let done = next!($name as extern "C" fn(c_int) -> c_int)(fd);
                     if let Some(disk) = DISK.get() {
@@ -344,9 +344,9 @@ macro_rules! syncs {
 
 syncs! { fsync fdatasync }
 
-/// Lets `write` write half of `n` bytes where the fault says so.
+/// Calls `write` with `n` bytes, or with half of them if the fault affects this call.
 fn tear(name: &str, fd: c_int, n: usize, mut write: impl FnMut(usize) -> isize) -> isize {
-    let fate = fate(name, || path_of(fd));
+    let fate = fate(name, || path_of_fd(fd));
     if matches!(fate, Fate::Tears(_) | Fate::Kills) && n / 2 > 0 {
         write(n / 2);
     }
@@ -375,38 +375,38 @@ extern "C" fn pwrite64(fd: c_int, bytes: *const c_void, n: usize, offset: i64) -
     tear("pwrite64", fd, n, |n| next(fd, bytes, n, offset))
 }
 
-/// One piece of a `writev`.
+/// One buffer of a `writev` (`struct iovec`).
 #[repr(C)]
 #[derive(Clone, Copy)]
-struct Piece {
+struct IoVec {
     bytes: *const c_void,
     n: usize,
 }
 
 #[unsafe(no_mangle)]
-extern "C" fn writev(fd: c_int, pieces: *const Piece, n_pieces: c_int) -> isize {
-    let next = next!(writev as extern "C" fn(c_int, *const Piece, c_int) -> isize);
-    let n_pieces = usize::try_from(n_pieces).unwrap_or(0);
-    // SAFETY: the caller passes so many pieces.
-    let pieces = unsafe { std::slice::from_raw_parts(pieces, n_pieces) };
-    let n_all = pieces.iter().map(|piece| piece.n).sum();
+extern "C" fn writev(fd: c_int, buffers: *const IoVec, n_buffers: c_int) -> isize {
+    let next = next!(writev as extern "C" fn(c_int, *const IoVec, c_int) -> isize);
+    let n_buffers = usize::try_from(n_buffers).unwrap_or(0);
+    // SAFETY: the caller passes this many buffers.
+    let buffers = unsafe { std::slice::from_raw_parts(buffers, n_buffers) };
+    let n_all = buffers.iter().map(|buffer| buffer.n).sum();
     tear("writev", fd, n_all, |n| {
         let mut left = n;
-        let mut cut = pieces.to_vec();
-        for piece in &mut cut {
-            piece.n = piece.n.min(left);
-            left -= piece.n;
+        let mut cut = buffers.to_vec();
+        for buffer in &mut cut {
+            buffer.n = buffer.n.min(left);
+            left -= buffer.n;
         }
         next(fd, cut.as_ptr(), cut.len() as c_int)
     })
 }
 
-/// Copies within the kernel: callers fall back to `write`.
+/// In-kernel copies. They fail with `ENOSYS`, so that callers fall back to `write`.
 macro_rules! copies {
     ($($name:ident($($argument:ident: $type:ty),*) to $fd:ident;)*) => {$(
         #[unsafe(no_mangle)]
         extern "C" fn $name($($argument: $type),*) -> isize {
-            let is_below = |disk: &Disk| path_of($fd).is_some_and(|path| path.starts_with(&disk.root));
+            let is_below = |disk: &Disk| path_of_fd($fd).is_some_and(|path| path.starts_with(&disk.root));
             if DISK.get().is_some_and(is_below) {
                 return failed(ENOSYS) as isize;
             }

@@ -1,4 +1,4 @@
-//! Teachers whose ledger is on the disk: what they answered is what they have charged.
+//! Teachers whose ledger is on the failing disk: their answers always match their charges.
 
 use std::fs::{self, File};
 use std::io::{BufRead as _, BufReader};
@@ -22,33 +22,33 @@ const BUDGET: u64 = 30;
 const EPISODES: [u64; 4] = [1, 2, 3, 4];
 const STEPS: u32 = 10;
 const UNITS_PER_EPISODE: u32 = 10;
-/// Far longer than anything here takes on a busy machine.
+/// Far longer than any operation here takes on a busy machine.
 const DEADLINE: Duration = Duration::from_secs(60);
-/// How often a refused request is made again.
+/// Maximum number of attempts per request.
 const TRIES: usize = 3;
 
-/// An undisturbed teacher: what it answered, its account at the end, and the number of its calls to the disk.
-static CALM: LazyLock<(Vec<bool>, Vec<String>, usize)> = LazyLock::new(|| {
+/// The answers, final account and number of disk calls of an undisturbed teacher.
+static UNDISTURBED: LazyLock<(Vec<bool>, Vec<String>, usize)> = LazyLock::new(|| {
     let device = Device::new();
     let mut teacher = Teacher::start(&device, None).expect("starts");
-    let Told { charged, .. } = teacher.ask_everything();
+    let Answers { charged, .. } = teacher.ask_everything();
     teacher.kill();
     let n_calls = device.calls().len();
     (charged, account(&device.root().join("ledger.sqlite")), n_calls)
 });
 
-/// A teacher with a process of its own; killed at the latest with the test.
+/// A teacher process that is killed on drop.
 struct Teacher {
     process: Child,
-    /// Has the client's connection; gone once the teacher is asked to end.
+    /// Runs the client's connection. `None` once the teacher is asked to end.
     runtime: Option<Runtime>,
     client: TeacherClient<Channel>,
 }
 
-/// What a teacher answered before it could not any more.
+/// A teacher's answers up to its first refusal.
 #[derive(Default)]
-struct Told {
-    /// Whether a step was charged, in the order of the questions.
+struct Answers {
+    /// True for each charged step, in the order of the requests.
     charged: Vec<bool>,
     /// Units charged by then.
     n_spent: usize,
@@ -58,7 +58,7 @@ struct Told {
 }
 
 impl Teacher {
-    /// `None` when it ends before it listens.
+    /// Starts a teacher. Returns `None` if it ends before it listens.
     fn start(device: &Device, fault: Option<&Fault>) -> Option<Self> {
         let policy =
             Path::new(env!("CARGO_MANIFEST_DIR")).join("policies/teacher-push.safetensors");
@@ -66,7 +66,7 @@ impl Teacher {
         command.args(["--log", "warn", "teacher", "--listen", "127.0.0.1:0", "--ledger"]);
         command.arg(device.root().join("ledger.sqlite")).arg("--policy").arg(policy);
         command.stdin(Stdio::null()).stdout(Stdio::piped());
-        command.stderr(File::create(device.beside("said")).expect("creates"));
+        command.stderr(File::create(device.sibling("stderr")).expect("creates"));
         device.attach(&mut command, fault);
         let mut process = command.spawn().expect("starts");
         let mut line = String::new();
@@ -74,7 +74,7 @@ impl Teacher {
         BufReader::new(output).read_line(&mut line).expect("readable");
         let Some(address) = line.trim().strip_prefix("listening on ") else {
             let code = process.wait().expect("a child").code();
-            check_refusal(code, fault, &said(device));
+            check_refusal(code, fault, &stderr(device));
             return None;
         };
         let endpoint = Endpoint::from_shared(format!("http://{address}")).expect("an address");
@@ -86,16 +86,16 @@ impl Teacher {
         Some(Self { process, runtime: Some(runtime), client })
     }
 
-    /// Opens the account and its leases, asks about every step and settles; goes no further than it is answered.
-    fn ask_everything(&mut self) -> Told {
-        let mut told = Told::default();
-        if let Err(refusal) = self.try_everything(&mut told) {
-            told.refusal = Some(refusal);
+    /// Opens the account and its leases, asks about every step and settles. Stops at the first refusal.
+    fn ask_everything(&mut self) -> Answers {
+        let mut answers = Answers::default();
+        if let Err(refusal) = self.try_everything(&mut answers) {
+            answers.refusal = Some(refusal);
         }
-        told
+        answers
     }
 
-    fn try_everything(&mut self, told: &mut Told) -> Result<(), Status> {
+    fn try_everything(&mut self, answers: &mut Answers) -> Result<(), Status> {
         let (name, strategy) = (ACCOUNT.to_owned(), "ea".to_owned());
         let open = pb::OpenAccountRequest { name: name.clone(), budget: BUDGET, strategy };
         self.call(async |mut client| client.open_account(open.clone()).await)?;
@@ -110,18 +110,18 @@ impl Teacher {
                 let ask = pb::AdviseRequest { account: account.clone(), steps };
                 let answer = self.call(async |mut client| client.advise(ask.clone()).await)?;
                 let is_charged = answer.steps[0].charged;
-                told.charged.push(is_charged);
-                told.n_spent += usize::from(is_charged);
+                answers.charged.push(is_charged);
+                answers.n_spent += usize::from(is_charged);
             }
             let settle =
                 pb::SettleLeasesRequest { account: account.clone(), episodes: vec![episode] };
             self.call(async |mut client| client.settle_leases(settle.clone()).await)?;
-            told.n_durable = told.n_spent;
+            answers.n_durable = answers.n_spent;
         }
         Ok(())
     }
 
-    /// Calls until there is an answer, a few times.
+    /// Repeats a call until it succeeds, up to [`TRIES`] times.
     fn call<T>(
         &self,
         ask: impl AsyncFn(TeacherClient<Channel>) -> Result<Response<T>, Status>,
@@ -138,17 +138,17 @@ impl Teacher {
     }
 
     fn block_on<T>(&self, call: impl Future<Output = T>) -> T {
-        self.runtime.as_ref().expect("it was not asked to end").block_on(call)
+        self.runtime.as_ref().expect("the teacher was not asked to end").block_on(call)
     }
 
-    /// Asks it to end, and waits until it has.
+    /// Sends SIGTERM and waits for the end.
     fn end(&mut self) {
         drop(self.runtime.take());
         signal("-TERM", self.process.id());
         self.process.wait().expect("a child");
     }
 
-    /// Ends it as `kill -9` does.
+    /// Kills the process with SIGKILL.
     fn kill(&mut self) {
         drop(self.process.kill());
         self.process.wait().expect("a child");
@@ -161,8 +161,8 @@ impl Drop for Teacher {
     }
 }
 
-fn said(device: &Device) -> String {
-    fs::read_to_string(device.beside("said")).expect("readable")
+fn stderr(device: &Device) -> String {
+    fs::read_to_string(device.sibling("stderr")).expect("readable")
 }
 
 fn query(episode: u64, step: u32) -> pb::StepQuery {
@@ -171,60 +171,63 @@ fn query(episode: u64, step: u32) -> pb::StepQuery {
     pb::StepQuery { episode, step, observation, goal, proposed_action }
 }
 
-/// Checks the end of a teacher that did not start.
-fn check_refusal(code: Option<i32>, fault: Option<&Fault>, said: &str) {
+/// Checks how a teacher that did not start ended.
+fn check_refusal(code: Option<i32>, fault: Option<&Fault>, stderr: &str) {
     let is_killed = fault.is_some_and(|fault| matches!(fault.mode, Mode::Kill | Mode::Cut));
     if is_killed {
-        assert_eq!(code, None, "{said}");
+        assert_eq!(code, None, "{stderr}");
         return;
     }
-    assert_eq!(code, Some(75), "{fault:?}: {said}");
-    assert_eq!(said.lines().count(), 1, "{said}");
-    assert!(said.contains("cannot open the ledger") && said.contains("ledger.sqlite"), "{said}");
+    assert_eq!(code, Some(75), "{fault:?}: {stderr}");
+    assert_eq!(stderr.lines().count(), 1, "{stderr}");
+    assert!(
+        stderr.contains("cannot open the ledger") && stderr.contains("ledger.sqlite"),
+        "{stderr}"
+    );
 }
 
-/// Asks a teacher on a disk with a fault, restarts it on the whole disk and asks everything again.
+/// Asks a teacher on a disk with a fault, restarts it on a healthy disk and repeats every request.
 fn check(fault: &Fault) {
     let device = Device::new();
-    let mut told = Told::default();
+    let mut answers = Answers::default();
     if let Some(mut teacher) = Teacher::start(&device, Some(fault)) {
-        told = teacher.ask_everything();
+        answers = teacher.ask_everything();
         teacher.end();
     }
-    let what = format!("{fault}: {:?}: {}", told.refusal, said(&device));
-    assert_eq!(told.charged, CALM.0[..told.charged.len()], "{what}");
-    check_words(fault, &told, &said(&device), &what);
-    let n_kept = if fault.mode == Mode::Cut { told.n_durable } else { told.n_spent };
+    let what = format!("{fault}: {:?}: {}", answers.refusal, stderr(&device));
+    assert_eq!(answers.charged, UNDISTURBED.0[..answers.charged.len()], "{what}");
+    check_error_messages(fault, &answers, &stderr(&device), &what);
+    let n_kept = if fault.mode == Mode::Cut { answers.n_durable } else { answers.n_spent };
     if fault.mode == Mode::Cut {
         device.lose_unsynced();
     }
-    let mut teacher = Teacher::start(&device, None).expect("starts on a whole disk");
+    let mut teacher = Teacher::start(&device, None).expect("starts on a healthy disk");
     let n_spent = spent(&teacher);
-    // One more than was answered: the charge was written, the answer was not sent.
-    assert!((n_kept..=told.n_spent + 1).contains(&n_spent), "{n_spent} of {n_kept}: {what}");
-    assert_eq!(teacher.ask_everything().charged, CALM.0, "{what}");
+    // One charge more than answers is allowed: the charge was written but its answer was not sent.
+    assert!((n_kept..=answers.n_spent + 1).contains(&n_spent), "{n_spent} of {n_kept}: {what}");
+    assert_eq!(teacher.ask_everything().charged, UNDISTURBED.0, "{what}");
     teacher.kill();
-    assert_eq!(account(&device.root().join("ledger.sqlite")), CALM.1, "{what}");
+    assert_eq!(account(&device.root().join("ledger.sqlite")), UNDISTURBED.1, "{what}");
 }
 
-/// Checks that a teacher that does not answer says why: to its caller, and once in its log.
-fn check_words(fault: &Fault, told: &Told, said: &str, what: &str) {
-    assert!(!said.contains("panicked"), "{what}");
+/// Checks that a teacher that refuses a request gives the reason to its caller and logs it once.
+fn check_error_messages(fault: &Fault, answers: &Answers, stderr: &str, what: &str) {
+    assert!(!stderr.contains("panicked"), "{what}");
     let is_killed = matches!(fault.mode, Mode::Kill | Mode::Cut);
-    let Some(refusal) = told.refusal.as_ref().filter(|_| !is_killed) else { return };
-    assert_eq!(fault.mode, Mode::Dead, "it is asked again: {what}");
+    let Some(refusal) = answers.refusal.as_ref().filter(|_| !is_killed) else { return };
+    assert_eq!(fault.mode, Mode::Dead, "the request is retried: {what}");
     let names = |text: &str| {
         let causes = ["disk I/O error", "database or disk is full"];
         text.contains("ledger.sqlite") && causes.iter().any(|cause| text.contains(cause))
     };
     assert_eq!(refusal.code(), Code::Unavailable, "{what}");
     assert!(names(refusal.message()), "{what}");
-    let lines = said.lines().filter(|line| line.contains("nothing can be charged"));
+    let lines = stderr.lines().filter(|line| line.contains("nothing can be charged"));
     let lines: Vec<&str> = lines.collect();
     assert!(lines.len() == 1 && names(lines[0]), "{what}");
 }
 
-/// Units spent by the account; none when it is not open.
+/// Returns the units spent by the account, or 0 if it is not open.
 fn spent(teacher: &Teacher) -> usize {
     let request = pb::GetAccountRequest { name: ACCOUNT.to_owned() };
     let found = async {
@@ -240,9 +243,9 @@ fn spent(teacher: &Teacher) -> usize {
     }
 }
 
-/// Faults at `n_hits` calls, at equal distances.
+/// Returns faults at `n_hits` evenly spaced calls.
 fn faults(mode: Mode, errno: i32, n_hits: usize) -> Vec<Fault> {
-    let n_calls = CALM.2;
+    let n_calls = UNDISTURBED.2;
     let at = |hit: usize| hit * n_calls / n_hits + 1;
     (0..n_hits).map(|hit| Fault { errno, ..Fault::new(mode, at(hit), "ledger") }).collect()
 }
@@ -261,7 +264,7 @@ fn a_teachers_answers_match_its_charges_on_a_full_disk() {
     }
 }
 
-/// Every call of a teacher to its disk, in every mode:
+/// Faults at every disk call of a teacher, in every mode:
 ///
 /// ```text
 /// cargo test --release --test disk -- --ignored every_call_of_a_teacher_may_fail
@@ -277,7 +280,7 @@ fn every_call_of_a_teacher_may_fail() {
         (Mode::Once, ENOSPC),
         (Mode::Dead, ENOSPC),
     ] {
-        faults(mode, errno, CALM.2).iter().for_each(check);
-        println!("survived: {} calls, {mode:?}, error {errno}", CALM.2);
+        faults(mode, errno, UNDISTURBED.2).iter().for_each(check);
+        println!("survived: {} calls, {mode:?}, error {errno}", UNDISTURBED.2);
     }
 }
