@@ -17,7 +17,7 @@ use program::{SECRET, Workspace, eventually, fails_with, teacher};
 
 const OTHER: &str = "another-token-456789";
 
-/// BearerToken a token, or none, as any client could.
+/// Attaches a bearer token, if any, to each request.
 #[derive(Clone)]
 struct BearerToken(Option<&'static str>);
 

@@ -120,7 +120,7 @@ async fn teacher_client(address: SocketAddr) -> TeacherClient<Channel> {
     TeacherClient::connect(format!("http://{address}")).await.expect("connects")
 }
 
-/// A request_for about one step of a two-arm push.
+/// Returns a request for advice on one step of a two-arm push.
 fn request_for(episode: u64, step: u32) -> pb::AdviseRequest {
     let steps = vec![pb::StepQuery {
         episode,
@@ -176,7 +176,7 @@ async fn altered_requests(address: SocketAddr) -> BTreeSet<(u64, u32)> {
         }
         let body = frame(0, &bytes);
         let answer = wire::call(address, "/tandem.v1.Teacher/Advise", &body);
-        match within_deadline("an altered request_for", answer).await {
+        match within_deadline("an altered request", answer).await {
             Answer::Message(answer) => {
                 let request = pb::AdviseRequest::decode(bytes.as_slice()).expect("it was answered");
                 let answer = pb::AdviseResponse::decode(answer.as_slice()).expect("an answer");
@@ -187,7 +187,7 @@ async fn altered_requests(address: SocketAddr) -> BTreeSet<(u64, u32)> {
             }
             Answer::Status(code, message) => {
                 assert!(!matches!(code, Code::Ok | Code::Unknown), "{code:?}: {message}");
-                assert!(message.len() < 2000, "{} bytes message", message.len());
+                assert!(message.len() < 2000, "a message of {} bytes", message.len());
             }
             Answer::Closed => {}
         }
@@ -228,7 +228,7 @@ fn a_teacher_serves_and_charges_nothing_after_malformed_input() {
         let charged = altered_requests(address).await;
         assert!((5..150).contains(&charged.len()), "{} of 150 were answered", charged.len());
         let advice = late.advise(request_for(1, 0)).await.expect("served").into_inner();
-        assert!(advice.steps[0].charged, "a good request_for is answered as before");
+        assert!(advice.steps[0].charged, "a valid request is still answered");
         let account = late.get_account(name).await.expect("served").into_inner();
         assert_eq!(account.spent, charged.len() as u64 + 1, "only answered steps are charged");
         assert_eq!(account.spent + account.leased + account.left, account.budget);
@@ -295,7 +295,7 @@ fn learner(directory: &Path) -> Running {
     Running::service(&["learner", "--run", &path(&run), "--out", &path(&out)])
 }
 
-/// Lets a worker start_worker until the run has ended; gives its digest.
+/// Follows the run to its end and returns its digest.
 async fn follow_to_the_end(client: &mut LearnerClient<Channel>) -> String {
     let mut watched = client.watch(pb::WatchRequest {}).await.expect("watched").into_inner();
     loop {

@@ -1,4 +1,4 @@
-//! Strangers that hold as many connections to a service as it may have open files: operators and probes still get in.
+//! Clients that hold as many connections to a service as it may have open files: operators and probes still get in.
 
 #![cfg(target_os = "linux")]
 
@@ -15,16 +15,16 @@ use tokio::time::Instant;
 use tonic::transport::{Channel, Endpoint};
 use tonic::{Request, Streaming};
 
-/// The files that a service may have open.
+/// Limit of open files of a service.
 const MAX_FILES: usize = 256;
-/// The connections of a crowd.
-const N_STRANGERS: usize = 300;
-/// Longer than anything takes, even on a machine that is busy with other things.
+/// Number of connections of a crowd.
+const N_CLIENTS: usize = 300;
+/// Limit of every wait, sufficient for busy machines.
 const DEADLINE: Duration = Duration::from_secs(60);
 const PAUSE: Duration = Duration::from_millis(20);
 const SECRET: &str = "the-right-token-0123";
 const PREFACE: &[u8] = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n";
-/// The settings of an HTTP/2 client that wants nothing special.
+/// An empty HTTP/2 settings frame.
 const SETTINGS: [u8; 9] = [0, 0, 0, 4, 0, 0, 0, 0, 0];
 
 /// A service that may have [`MAX_FILES`] open files.
@@ -35,7 +35,7 @@ struct Service {
 }
 
 impl Service {
-    /// Starts `tandem ARGS` and waits until it says where it listens. `token` is a file beside it.
+    /// Starts `tandem ARGS` next to a file `token` and waits until it prints its address.
     fn start(args: &[&str]) -> Self {
         let directory = tempfile::tempdir().expect("a directory");
         fs::write(directory.path().join("token"), SECRET).expect("writes");
@@ -63,7 +63,7 @@ impl Service {
         fs::read_dir(files).expect("it lives").count()
     }
 
-    /// The processor time that it has used, in clock ticks.
+    /// Returns the processor time used so far, in clock ticks.
     fn cpu_ticks(&self) -> u64 {
         let stat = fs::read_to_string(format!("/proc/{}/stat", self.child.id()));
         let stat = stat.expect("it lives");
@@ -72,7 +72,7 @@ impl Service {
         ticks.map(|ticks| ticks.parse::<u64>().expect("a number")).sum()
     }
 
-    /// The share of a core that it uses.
+    /// Measures the share of a core that the service uses.
     fn cpu_share(&self) -> f64 {
         let (before, since) = (self.cpu_ticks(), Instant::now());
         std::thread::sleep(Duration::from_millis(500));
@@ -80,7 +80,7 @@ impl Service {
         used / rustix::param::clock_ticks_per_second() as f64 / since.elapsed().as_secs_f64()
     }
 
-    /// Waits until it has taken in as many strangers as it has room for.
+    /// Waits until the service has accepted as many clients as it can.
     fn wait_until_full(&self) {
         let since = Instant::now();
         while self.n_files() < 3 * MAX_FILES / 4 {
@@ -96,11 +96,11 @@ impl Service {
         command.output().expect("runs")
     }
 
-    /// Runs a command that must succeed.
+    /// Runs a command, which must succeed.
     fn succeed(&self, args: &[&str]) {
         let Output { status, stderr, .. } = self.run(args);
-        let told = String::from_utf8_lossy(&stderr);
-        assert!(status.success(), "{args:?}: {status}: {told}, log: {}", self.log());
+        let stderr = String::from_utf8_lossy(&stderr);
+        assert!(status.success(), "{args:?}: {status}: {stderr}, log: {}", self.log());
     }
 }
 
@@ -111,50 +111,50 @@ impl Drop for Service {
     }
 }
 
-/// Connections that are never closed by those who opened them.
+/// Clients that never close their connections.
 #[derive(Default)]
-struct Strangers {
+struct IdleClients {
     sockets: Vec<TcpStream>,
     channels: Vec<Channel>,
     watches: Vec<Streaming<()>>,
 }
 
-/// What strangers do with a connection.
+/// The behavior of a client on its connection.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Habit {
+enum Behavior {
     OneByte,
     PrefaceOnly,
     WatchHealth,
-    AskForStatus,
+    RequestStatus,
 }
 
-impl Habit {
-    fn crowd(self, runtime: &Runtime, address: SocketAddr) -> Strangers {
-        let mut strangers = Strangers::default();
+impl Behavior {
+    fn crowd(self, runtime: &Runtime, address: SocketAddr) -> IdleClients {
+        let mut clients = IdleClients::default();
         match self {
-            Self::OneByte => strangers.say(address, b"P"),
-            Self::PrefaceOnly => strangers.say(address, &[PREFACE, &SETTINGS].concat()),
-            Self::WatchHealth => runtime.block_on(strangers.watch(address)),
-            Self::AskForStatus => runtime.block_on(strangers.ask(address)),
+            Self::OneByte => clients.send(address, b"P"),
+            Self::PrefaceOnly => clients.send(address, &[PREFACE, &SETTINGS].concat()),
+            Self::WatchHealth => runtime.block_on(clients.watch(address)),
+            Self::RequestStatus => runtime.block_on(clients.request_status(address)),
         }
-        strangers
+        clients
     }
 }
 
-impl Strangers {
-    fn say(&mut self, address: SocketAddr, words: &[u8]) {
-        for _ in 0..N_STRANGERS {
+impl IdleClients {
+    fn send(&mut self, address: SocketAddr, bytes: &[u8]) {
+        for _ in 0..N_CLIENTS {
             let mut socket = TcpStream::connect(address).expect("connects");
-            socket.write_all(words).expect("sent");
+            socket.write_all(bytes).expect("sent");
             self.sockets.push(socket);
         }
     }
 
-    /// Watches health, which needs no token. Those who come late may be sent away.
+    /// Watches health, which needs no token. Late clients may be rejected.
     async fn watch(&mut self, address: SocketAddr) {
         let path = "/grpc.health.v1.Health/Watch".parse::<http::uri::PathAndQuery>();
         let path = path.expect("a path");
-        for _ in 0..N_STRANGERS {
+        for _ in 0..N_CLIENTS {
             let Some((channel, mut caller)) = dial(address).await else { continue };
             let codec = tonic_prost::ProstCodec::<(), ()>::default();
             let watch = caller.server_streaming(Request::new(()), path.clone(), codec);
@@ -165,11 +165,11 @@ impl Strangers {
         }
     }
 
-    /// Makes a call that is authenticated where no token is needed.
-    async fn ask(&mut self, address: SocketAddr) {
+    /// Requests the status, which is authenticated if the service has no token.
+    async fn request_status(&mut self, address: SocketAddr) {
         let path = "/tandem.v1.Bridge/Status".parse::<http::uri::PathAndQuery>();
         let path = path.expect("a path");
-        for _ in 0..N_STRANGERS {
+        for _ in 0..N_CLIENTS {
             let Some((channel, mut caller)) = dial(address).await else { continue };
             let codec = tonic_prost::ProstCodec::<(), ()>::default();
             let call = caller.unary(Request::new(()), path.clone(), codec);
@@ -187,18 +187,18 @@ async fn dial(address: SocketAddr) -> Option<(Channel, tonic::client::Grpc<Chann
     Some((channel, caller))
 }
 
-/// Fills a service with strangers of each habit in turn; meanwhile `check` must get through.
-fn crowd(service: &Service, habits: &[Habit], check: impl Fn(&Service)) {
+/// Fills a service with clients of each behavior in turn. Meanwhile `check` must succeed.
+fn crowd(service: &Service, behaviors: &[Behavior], check: impl Fn(&Service)) {
     let mut runtime = tokio::runtime::Builder::new_multi_thread();
     let runtime = runtime.worker_threads(1).enable_all().build().expect("a runtime");
-    for habit in habits {
-        let strangers = habit.crowd(&runtime, service.address);
+    for behavior in behaviors {
+        let clients = behavior.crowd(&runtime, service.address);
         service.wait_until_full();
         check(service);
         let share = service.cpu_share();
-        assert!(share < 0.7, "{habit:?}: {share:.2} cores");
-        assert!(service.n_files() < MAX_FILES, "{habit:?}: {} files", service.n_files());
-        drop(strangers);
+        assert!(share < 0.7, "{behavior:?}: {share:.2} cores");
+        assert!(service.n_files() < MAX_FILES, "{behavior:?}: {} files", service.n_files());
+        drop(clients);
     }
     let log = service.log();
     assert_eq!(log.matches("too many connections").count(), 1, "{log}");
@@ -209,8 +209,9 @@ fn crowd(service: &Service, habits: &[Habit], check: impl Fn(&Service)) {
 fn the_arms_can_be_stopped_while_idle_clients_hold_all_connections_of_a_bridge() {
     let bridge = Service::start(&["bridge", "--driver", "sim"]);
     let address = bridge.address.to_string();
-    let habits = [Habit::OneByte, Habit::PrefaceOnly, Habit::WatchHealth, Habit::AskForStatus];
-    crowd(&bridge, &habits, |bridge| {
+    let behaviors =
+        [Behavior::OneByte, Behavior::PrefaceOnly, Behavior::WatchHealth, Behavior::RequestStatus];
+    crowd(&bridge, &behaviors, |bridge| {
         bridge.succeed(&["bridge", "stop", "--connect", &address]);
         bridge.succeed(&["health", &address]);
     });
@@ -220,8 +221,8 @@ fn the_arms_can_be_stopped_while_idle_clients_hold_all_connections_of_a_bridge()
 fn the_arms_can_be_stopped_with_the_token_while_unauthenticated_clients_watch_health() {
     let bridge = Service::start(&["bridge", "--driver", "sim", "--token-file", "token"]);
     let address = bridge.address.to_string();
-    let habits = [Habit::WatchHealth, Habit::AskForStatus, Habit::OneByte];
-    crowd(&bridge, &habits, |bridge| {
+    let behaviors = [Behavior::WatchHealth, Behavior::RequestStatus, Behavior::OneByte];
+    crowd(&bridge, &behaviors, |bridge| {
         bridge.succeed(&["bridge", "stop", "--connect", &address, "--token-file", "token"]);
         bridge.succeed(&["health", &address]);
     });
@@ -232,7 +233,7 @@ fn a_teacher_is_healthy_while_idle_clients_hold_all_its_connections() {
     let policy = concat!(env!("CARGO_MANIFEST_DIR"), "/policies/teacher-push.safetensors");
     let teacher = Service::start(&["teacher", "--ledger", "memory", "--policy", policy]);
     let address = teacher.address.to_string();
-    crowd(&teacher, &[Habit::OneByte, Habit::WatchHealth], |teacher| {
+    crowd(&teacher, &[Behavior::OneByte, Behavior::WatchHealth], |teacher| {
         teacher.succeed(&["health", &address]);
     });
 }

@@ -1,11 +1,11 @@
-//! Strategy `init:teacher`: the student starts as two copies of the teacher and is given no advice.
+//! Strategy `init:teacher`: the student starts as two copies of the teacher and gets no advice.
 
 use std::path::Path;
 use std::process::{Command, Output};
 
 use serde_json::Value;
 
-/// A run too short to learn anything: what it can do it was given.
+/// Trains a run that is too short to learn anything.
 fn train(more: &[&str], out: &Path) -> Output {
     let mut command = Command::new(env!("CARGO_BIN_EXE_tandem"));
     command.args(["train", "--strategy", "init:teacher", "--json", "--workers", "2"]);
@@ -48,7 +48,7 @@ fn a_student_initialized_from_its_teacher_succeeds_without_advice() {
 fn network_sizes_that_cannot_hold_the_teacher_are_refused_with_a_suggestion() {
     let keep = tempfile::tempdir().expect("a directory");
     let ended = train(&["--set", "ddpg.n_hidden=256"], &keep.path().join("run"));
-    let told = String::from_utf8_lossy(&ended.stderr).into_owned();
-    assert_eq!(ended.status.code(), Some(64), "{told}");
-    assert!(told.contains("ddpg.n_hidden = 512"), "{told}");
+    let stderr = String::from_utf8_lossy(&ended.stderr).into_owned();
+    assert_eq!(ended.status.code(), Some(64), "{stderr}");
+    assert!(stderr.contains("ddpg.n_hidden = 512"), "{stderr}");
 }

@@ -1,4 +1,4 @@
-//! The same run file and seed give the same bits, however many workers play, also where the budget runs out.
+//! The same run file and seed give the same bits for any number of workers, even when the budget runs out.
 
 use std::fs;
 use std::path::Path;
@@ -11,7 +11,7 @@ const STRATEGIES: [(&str, u64); 4] =
     [("ea", 1_600), EAMC, ("mc-q:0.1", 600), ("mc-act:0.1", 1_600)];
 const EAMC: (&str, u64) = ("eamc:0.1", 900);
 const N_WORKERS: [usize; 4] = [1, 2, 5, 16];
-/// Ten rounds of sixteen slots, so that sixteen workers have something to do; the policy is judged after each.
+/// Ten rounds of sixteen slots, so that sixteen workers have something to do; the policy is evaluations after each.
 const SMALL: [&str; 20] = [
     "--max-env-steps",
     "8000",
@@ -35,12 +35,12 @@ const SMALL: [&str; 20] = [
     "checkpoint.every_rounds=100",
 ];
 
-/// What a run left behind that must not depend on who played it.
+/// The results of a run that must not depend on the number of workers.
 #[derive(Debug, PartialEq)]
-struct Left {
+struct RunResult {
     digest: String,
     best_policy: String,
-    /// Without the wall time.
+    /// Rows without the wall time.
     metrics: Vec<Value>,
 }
 
@@ -73,12 +73,12 @@ fn any_number_of_workers_gives_the_same_bits_with_every_strategy_and_either_lag(
 
 #[test]
 fn an_evaluation_does_not_depend_on_the_number_of_threads() {
-    let judged: Vec<Value> = ["1", "2", "5"].map(judged_by_threads).into();
-    assert_eq!(judged[0], judged[1]);
-    assert_eq!(judged[0], judged[2]);
+    let evaluations: Vec<Value> = ["1", "2", "5"].map(evaluate_with_threads).into();
+    assert_eq!(evaluations[0], evaluations[1]);
+    assert_eq!(evaluations[0], evaluations[2]);
 }
 
-/// Runs once for each number of workers and compares.
+/// Trains once for each number of workers and compares the results.
 fn check(advice: (&str, u64), lag: u32, n_workers: &[usize]) {
     let (first, others) = n_workers.split_first().expect("numbers of workers");
     let expected = train(advice, lag, *first);
@@ -88,7 +88,7 @@ fn check(advice: (&str, u64), lag: u32, n_workers: &[usize]) {
     }
 }
 
-fn train((strategy, budget): (&str, u64), lag: u32, n_workers: usize) -> Left {
+fn train((strategy, budget): (&str, u64), lag: u32, n_workers: usize) -> RunResult {
     let directory = tempfile::tempdir().expect("a directory");
     let out = directory.path().join("run");
     let mut args = vec!["train".to_owned(), "--json".into(), "--workers".into()];
@@ -97,15 +97,15 @@ fn train((strategy, budget): (&str, u64), lag: u32, n_workers: usize) -> Left {
     args.extend(["--set".into(), format!("rounds.lag={lag}")]);
     args.extend(SMALL.map(str::to_owned));
     let summary = last_line(tandem(&args).arg("--out").arg(&out));
-    assert_eq!(summary["budget_left"], 0, "{strategy}: the budget is to run out");
+    assert_eq!(summary["budget_left"], 0, "{strategy}: the budget did not run out");
     assert_eq!(summary["advice_spent"], budget, "{strategy}");
     let metrics = metrics(&out);
     check_runs_out_on_the_way(budget, &metrics);
     let text = |key: &str| summary[key].as_str().expect("a text").to_owned();
-    Left { digest: text("digest"), best_policy: text("policy_digest"), metrics }
+    RunResult { digest: text("digest"), best_policy: text("policy_digest"), metrics }
 }
 
-/// The first half of the budget is gone after some round, and the second some rounds before the end.
+/// Checks that the first half of the budget lasts for at least one evaluation and that all is spent before the end.
 fn check_runs_out_on_the_way(budget: u64, metrics: &[Value]) {
     let spent: Vec<u64> =
         metrics.iter().map(|row| row["advice_spent"].as_u64().expect("a number")).collect();
@@ -124,13 +124,13 @@ fn metrics(out: &Path) -> Vec<Value> {
     text.lines().map(row).collect()
 }
 
-fn judged_by_threads(n_threads: &str) -> Value {
+fn evaluate_with_threads(n_threads: &str) -> Value {
     let mut args: Vec<String> = vec!["eval".into(), "--json".into(), "--policy".into()];
     args.push("policies/student-push.safetensors".into());
     args.extend(["--episodes".into(), "40".into(), "--seed".into(), "5".into()]);
-    let mut judged = last_line(tandem(&args).env("RAYON_NUM_THREADS", n_threads));
-    judged.as_object_mut().expect("an object").remove("steps_per_s").expect("a speed");
-    judged
+    let mut evaluation = last_line(tandem(&args).env("RAYON_NUM_THREADS", n_threads));
+    evaluation.as_object_mut().expect("an object").remove("steps_per_s").expect("a speed");
+    evaluation
 }
 
 fn tandem(args: &[String]) -> Command {
@@ -139,7 +139,7 @@ fn tandem(args: &[String]) -> Command {
     command
 }
 
-/// The JSON object on the last line of standard output.
+/// Runs a command and returns the JSON object on the last line of its output.
 fn last_line(command: &mut Command) -> Value {
     let output = command.output().expect("runs");
     let errors = String::from_utf8_lossy(&output.stderr);

@@ -1,7 +1,7 @@
-//! The Kubernetes manifests' own commands, arguments, settings and probes, run as processes of this machine.
+//! Runs the commands, arguments, settings and probes of the Kubernetes manifests as local processes.
 //!
-//! Pods get addresses of the loopback, services lead to them, volumes are directories. What no cluster is needed for is
-//! proven so: that commands are spelt right, that they fit together, and that what is killed goes on.
+//! Pods get loopback addresses, services resolve to them and volumes are directories. The tests check everything that
+//! needs no cluster: commands are spelt correctly, fit together and recover when they are killed.
 #![cfg(target_os = "linux")]
 #![expect(clippy::panic, reason = "a test panics where it fails")]
 
@@ -25,7 +25,7 @@ use manifests::Manifests;
 
 const ENV_STEPS: i64 = 4_000;
 
-/// The run file of the manifests, made small: rounds of 4 slots, small networks, few updates.
+/// Shrinks the run file of the manifests: rounds of 4 slots, small networks, few updates.
 fn small(run: &str) -> String {
     let mut run: Table = run.parse().expect("a run file");
     let mut change = |section: &str, key: &str, value: Value| {
@@ -44,7 +44,10 @@ fn small(run: &str) -> String {
     toml::to_string(&run).expect("TOML")
 }
 
-/// Whether Redis is installed; where it must be, the test fails if it is not.
+/// Returns true if Redis is installed.
+///
+/// # Panics
+/// If it is not installed and `TANDEM_REQUIRE_REDIS` is 1.
 fn has_redis() -> bool {
     let is_installed = |program: &str| {
         Command::new(program).arg("--version").stdout(Stdio::null()).status().is_ok()
@@ -56,7 +59,7 @@ fn has_redis() -> bool {
     installed
 }
 
-/// What the teachers' ledger says of an account: spent and left.
+/// Returns the units spent and left of an account in the teachers' ledger.
 fn account(cluster: &Cluster, teacher: &str, name: &str) -> (u64, u64) {
     let address = format!("http://{}", cluster.address(teacher, "grpc"));
     let mut request = Request::new(pb::GetAccountRequest { name: name.to_owned() });
@@ -84,7 +87,7 @@ fn the_manifests_train_to_the_end_while_pods_are_deleted() {
     let mut cluster = Cluster::new(manifests, run);
     let mut names = Vec::new();
     for (name, workload) in &workloads {
-        // Workers are as many as an overlay says; all others as the base does.
+        // The base sets all replicas except those of the workers, which come from an overlay.
         let replicas = if name == "worker" { 2 } else { workload.replicas };
         names.extend(cluster.add(name, replicas));
     }
@@ -92,7 +95,7 @@ fn the_manifests_train_to_the_end_while_pods_are_deleted() {
         names,
         ["bridge-0", "learner-0", "redis-0", "teacher-0", "teacher-1", "worker-0", "worker-1"]
     );
-    // All at once, as they are applied: who comes too early tries again.
+    // All pods start at once, as `kubectl apply` starts them. A pod that starts too early retries.
     for name in &names {
         cluster.start(name);
     }
@@ -102,7 +105,7 @@ fn the_manifests_train_to_the_end_while_pods_are_deleted() {
         figures.get("tandem_rounds_total").copied().unwrap_or_default()
     };
     let before = cluster.wait_for_figures("learner-0", |figures| rounds(figures) >= 2.0);
-    assert_eq!(before["tandem_ended"], 0.0, "the run ended before anything was done to it");
+    assert_eq!(before["tandem_ended"], 0.0, "the run ended before the first disturbance");
     assert_eq!(cluster.terminate("learner-0"), Some(130), "{}", cluster.log("learner-0"));
     for taken in ["redis-0", "teacher-1", "worker-1"] {
         cluster.kill(taken);
@@ -122,17 +125,21 @@ fn the_manifests_train_to_the_end_while_pods_are_deleted() {
     assert_eq!(figures["tandem_advice_left"], left as f64);
 
     for worker in ["worker-0", "worker-1"] {
-        assert_eq!(cluster.wait_for_the_end(worker), Some(0), "{}", cluster.log(worker));
+        assert_eq!(cluster.wait_for_exit(worker), Some(0), "{}", cluster.log(worker));
     }
-    // Results can still be asked for.
-    assert!(cluster.is_well(cluster.pod("learner-0")), "{}", cluster.log("learner-0"));
+    // The results remain available.
+    assert!(cluster.is_healthy(cluster.pod("learner-0")), "{}", cluster.log("learner-0"));
     for asked in ["learner-0", "teacher-0", "teacher-1", "bridge-0", "redis-0"] {
         assert_eq!(cluster.terminate(asked), Some(0), "{asked}: {}", cluster.log(asked));
     }
     for name in &names {
-        assert!(cluster.litter(name).is_empty(), "{name} wrote {:?}", cluster.litter(name));
+        assert!(
+            cluster.stray_files(name).is_empty(),
+            "{name} wrote {:?}",
+            cluster.stray_files(name)
+        );
         let shown = SECRETS.iter().find(|(_, _, value)| cluster.log(name).contains(value));
-        assert!(shown.is_none(), "{name} tells a secret: {}", cluster.log(name));
+        assert!(shown.is_none(), "{name} logs a secret: {}", cluster.log(name));
     }
 }
 
@@ -150,9 +157,9 @@ fn a_misspelt_argument_in_a_manifest_is_detected() {
         for (idx, flag) in named.filter(|(idx, arg)| *idx == 0 || arg.starts_with("--")) {
             let misspelt = format!("{flag}x");
             let output = cluster.run_changed(name, idx, &misspelt);
-            let told = String::from_utf8_lossy(&output.stderr);
-            assert_eq!(output.status.code(), Some(64), "{misspelt}: {told}");
-            assert!(told.contains(&misspelt), "{misspelt}: {told}");
+            let stderr = String::from_utf8_lossy(&output.stderr);
+            assert_eq!(output.status.code(), Some(64), "{misspelt}: {stderr}");
+            assert!(stderr.contains(&misspelt), "{misspelt}: {stderr}");
         }
     }
 }

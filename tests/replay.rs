@@ -1,4 +1,4 @@
-//! Recorded episodes of every kind, played again by the program: equal bit for bit, or the first other number named.
+//! Replays of recorded episodes of every kind: bit for bit equal, or the first difference is named.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -22,10 +22,10 @@ use tandem_worker::record::{log_name, metadata_of, record_episode, replay_log, w
 use tandem_worker::rollout::play_slot;
 use tandem_worker::{Advisor, ComposedTeachers};
 
-/// Episodes of one slot.
+/// Number of episodes per slot.
 const N_TOGETHER: u64 = 5;
 
-/// What an episode is played for and how it starts and explores.
+/// The purpose, start and exploration of an episode.
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum Kind {
     Evaluation,
@@ -44,7 +44,7 @@ fn teacher(task: Task) -> Actor {
     policy.actor().expect("usable")
 }
 
-/// Takes over one arm or both on two steps of three.
+/// A teacher that takes over one or both arms on two of three steps.
 struct EagerTeacher(Actor, Layout);
 
 impl EagerTeacher {
@@ -112,7 +112,7 @@ fn slot(kind: Kind) -> SlotOrder {
     }
 }
 
-/// Plays a slot of a kind and records it as a worker does; gives the logs.
+/// Plays a slot of a kind, records it as a worker does and returns the log paths.
 fn record(layout: Layout, kind: Kind, substeps: u32, directory: &Path) -> Vec<PathBuf> {
     let (terms, slot) = (terms(layout, kind, substeps), slot(kind));
     let world = Env::new(layout, &WorldConfig { substeps, ..WorldConfig::default() });
@@ -128,7 +128,7 @@ fn record(layout: Layout, kind: Kind, substeps: u32, directory: &Path) -> Vec<Pa
     slot.episodes.iter().copied().zip(&episodes).map(write).collect()
 }
 
-/// One log of two arms that pick and place.
+/// Records one two-arm pick-and-place episode.
 fn one_log(directory: &Path) -> PathBuf {
     record(Layout::new(Task::PickAndPlace, 2), Kind::Advised, 10, directory).remove(0)
 }
@@ -142,8 +142,8 @@ fn stdout(output: &Output) -> String {
     String::from_utf8_lossy(&output.stdout).into_owned()
 }
 
-/// The one line on standard error.
-fn complaint(output: &Output) -> String {
+/// Returns the only line on standard error.
+fn error_line(output: &Output) -> String {
     let errors = String::from_utf8_lossy(&output.stderr).into_owned();
     assert_eq!(errors.lines().count(), 1, "{errors}");
     assert!(errors.starts_with("tandem: "), "{errors}");
@@ -196,7 +196,7 @@ fn two_hundred_episodes_of_every_kind_replay_bit_for_bit() {
     assert_eq!(summary(&as_json), expected);
 }
 
-/// Writes a log that says what `log` says, with its checksums right.
+/// Writes the content of `log` to a new file with valid checksums.
 fn rewrite(log: &EpisodeLog, metadata: &EpisodeMetadata, path: &Path) {
     let mut world = world_of(&log.metadata).expect("described");
     let mut recorder = EpisodeRecorder::create(path, metadata).expect("created");
@@ -225,10 +225,10 @@ fn flip_last_bit(number: &mut f32) {
     *number = f32::from_bits(number.to_bits() ^ 1);
 }
 
-type Spoil = fn(&mut EpisodeLog);
+type Alteration = fn(&mut EpisodeLog);
 
-/// Numbers that are spoilt, and where that shows: step, vector, component.
-const SPOILT: [(&str, Spoil, (usize, &str, usize)); 7] = [
+/// Alterations, each with the step, vector and component where replay finds it.
+const ALTERATIONS: [(&str, Alteration, (usize, &str, usize)); 7] = [
     (
         "seen",
         |log| flip_last_bit(&mut log.transitions[17].observation[41]),
@@ -241,7 +241,7 @@ const SPOILT: [(&str, Spoil, (usize, &str, usize)); 7] = [
         |log| flip_last_bit(&mut log.transitions[8].rewards_per_arm[1]),
         (8, "rewards_per_arm", 1),
     ),
-    ("contacts", |log| spoil_contacts(&mut log.transitions[25].contacts), (25, "contacts", 0)),
+    ("contacts", |log| alter_contacts(&mut log.transitions[25].contacts), (25, "contacts", 0)),
     (
         "last",
         |log| flip_last_bit(&mut log.last_observation.as_mut().expect("whole")[3]),
@@ -250,7 +250,7 @@ const SPOILT: [(&str, Spoil, (usize, &str, usize)); 7] = [
     ("minus", |log| log.transitions[4].goal[0] = -log.transitions[4].goal[0], (4, "goal", 0)),
 ];
 
-fn spoil_contacts(contacts: &mut Contacts) {
+fn alter_contacts(contacts: &mut Contacts) {
     *contacts = Contacts::from_bits(contacts.bits() ^ 1).expect("two bits");
 }
 
@@ -261,27 +261,27 @@ fn an_altered_number_is_found_and_named() {
     let (good, bad) = (keep.path().join("good"), keep.path().join("bad"));
     fs::create_dir(&good).expect("created");
     fs::create_dir(&bad).expect("created");
-    for (name, spoil, _) in SPOILT {
-        let mut spoilt = log.clone();
-        spoil(&mut spoilt);
-        assert_ne!(format!("{spoilt:?}"), format!("{log:?}"), "{name} is spoilt");
-        rewrite(&spoilt, &log.metadata, &bad.join(format!("{name}.mcap")));
+    for (name, alter, _) in ALTERATIONS {
+        let mut altered = log.clone();
+        alter(&mut altered);
+        assert_ne!(format!("{altered:?}"), format!("{log:?}"), "{name} is altered");
+        rewrite(&altered, &log.metadata, &bad.join(format!("{name}.mcap")));
     }
-    rewrite(&log, &log.metadata, &good.join("unspoilt.mcap"));
+    rewrite(&log, &log.metadata, &good.join("unaltered.mcap"));
 
     let found = tandem(&["replay", "--json"], &[&good, &bad]);
     assert_eq!(found.status.code(), Some(65));
     let found = summary(&found);
     assert_eq!((&found["episodes"], &found["equal"]), (&json!(8), &json!(1)));
     let differing = found["differing"].as_array().expect("a list");
-    assert_eq!(differing.len(), SPOILT.len());
-    for (name, _, (step, field, component)) in SPOILT {
+    assert_eq!(differing.len(), ALTERATIONS.len());
+    for (name, _, (step, field, component)) in ALTERATIONS {
         let path = bad.join(format!("{name}.mcap"));
         let entry = differing.iter().find(|entry| entry["file"] == json!(path)).expect(name);
-        let place = (&entry["step"], &entry["field"], &entry["component"]);
-        assert_eq!(place, (&json!(step), &json!(field), &json!(component)), "{name}");
+        let location = (&entry["step"], &entry["field"], &entry["component"]);
+        assert_eq!(location, (&json!(step), &json!(field), &json!(component)), "{name}");
         let alone = tandem(&["replay", "--verify"], &[&path]);
-        let line = complaint(&alone);
+        let line = error_line(&alone);
         assert_eq!(alone.status.code(), Some(65), "{line}");
         assert!(
             line.contains(&format!("{name}.mcap: step {step}: {field}[{component}] is ")),
@@ -295,11 +295,11 @@ fn a_changed_action_or_world_changes_the_replay() {
     let keep = tempfile::tempdir().expect("a directory");
     let log = read_episode(&one_log(keep.path())).expect("whole");
     assert!(replay_log(&log).is_ok());
-    let check = |spoil: Spoil, words: &str| {
-        let mut spoilt = log.clone();
-        spoil(&mut spoilt);
-        let told = replay_log(&spoilt).expect_err(words).to_string();
-        assert!(told.starts_with(words), "{told:?} does not begin with {words:?}");
+    let check = |alter: Alteration, expected: &str| {
+        let mut altered = log.clone();
+        alter(&mut altered);
+        let message = replay_log(&altered).expect_err(expected).to_string();
+        assert!(message.starts_with(expected), "{message:?} does not start with {expected:?}");
     };
     check(|log| log.transitions[9].action[2] = 0.77, "step 10: observation[");
     check(|log| log.transitions[9].action[2] = f32::NAN, "action");
@@ -320,11 +320,11 @@ fn a_changed_action_or_world_changes_the_replay() {
     );
 }
 
-/// What comes of a damaged log: refused as it is, and mended to the beginning of what it was.
+/// Checks that a damaged log is refused and that its recovery is a prefix of the original. Returns the recovered length.
 fn check_damaged(whole: &EpisodeLog, bytes: &[u8], directory: &Path) -> Option<usize> {
     let (damaged, mended) = (directory.join("damaged.mcap"), directory.join("mended.mcap"));
     fs::write(&damaged, bytes).expect("written");
-    assert!(read_episode(&damaged).is_err(), "{} bytes are taken for whole", bytes.len());
+    assert!(read_episode(&damaged).is_err(), "{} bytes are accepted as complete", bytes.len());
     let log = recover(&damaged, &mended).ok().map(|_| read_episode(&mended))?;
     let Ok(log) = log else { return None };
     assert_eq!(log.metadata, whole.metadata);
@@ -363,7 +363,7 @@ fn the_program_refuses_and_recovers_truncated_logs() {
         fs::write(&cut, &bytes[..n_bytes]).expect("written");
         let refused = tandem(&["replay", "--verify"], &[&cut]);
         assert_eq!(refused.status.code(), Some(65), "{n_bytes} bytes");
-        assert!(complaint(&refused).contains("cut.mcap"));
+        assert!(error_line(&refused).contains("cut.mcap"));
         let recovered = tandem(&["mcap", "recover"], &[&cut, Path::new("--to"), &mended]);
         let code = recovered.status.code();
         assert_eq!(code, Some(if n_bytes < 8 { 65 } else { 0 }), "{n_bytes} bytes");

@@ -5,7 +5,7 @@ use std::process::{Command, Stdio};
 
 use serde_json::Value;
 
-/// Runs the bench; gives value and unit of its figures by name.
+/// Runs the benchmark and returns value and unit of its figures by name.
 fn scale(args: &[&str]) -> BTreeMap<String, (f64, String)> {
     let mut command = Command::new(env!("CARGO_BIN_EXE_tandem"));
     command.args(["bench", "scale", "--json"]).args(args).stdin(Stdio::null());
@@ -42,11 +42,11 @@ fn real_and_idle_workers_are_measured() {
             assert!(value(&name) > 0.0, "{name}: {}", value(&name));
         }
     }
-    // 8 workers with 2 episodes of 50 steps each cannot deliver a round sooner than they wait for it.
+    // 8 workers that each simulate 2 episodes of 50 steps cannot deliver a round faster than their delay.
     assert!(value("scale/idle-8/median-round") >= 0.2);
     assert!(value("scale/idle-8/env-steps") <= 8.0 * 100.0 / 0.2 * 1.01);
-    // Each of them fetches 0.86 MB and delivers 2 episodes of some 13 kB; there is little else. What is under way when
-    // the measured rounds begin and end may be counted with them or not.
+    // Each of them fetches 0.86 MB and delivers 2 episodes of some 13 kB; there is little other traffic.
+    // Transfers in progress at the start and end of the measured rounds may or may not be counted.
     let per_slot = value("scale/idle-8/rounds") * 8.0;
     let (sent_mb, received_mb) = (0.86 * per_slot, 0.0256 * per_slot);
     assert!((0.4..1.7).contains(&(value("scale/idle-8/sent") / sent_mb)), "{figures:?}");

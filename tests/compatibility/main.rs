@@ -1,4 +1,4 @@
-//! Files and messages that earlier versions wrote are still read. `tests/corpus/README.md` lists them.
+//! Reads files and messages that earlier versions wrote. `tests/corpus/README.md` lists them.
 
 mod messages;
 mod run;
@@ -15,10 +15,10 @@ use tandem_teacher::ledger::{ChargeRequest, Ledger as _, SqliteLedger};
 use tandem_telemetry::{read_episode, read_trials, recover};
 use tempfile::TempDir;
 
-/// The directories of the corpus, one a version.
+/// Returns the directories of the corpus, one per version.
 fn versions() -> Vec<PathBuf> {
     let corpus = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/corpus");
-    let entries = fs::read_dir(corpus).expect("the corpus is there");
+    let entries = fs::read_dir(corpus).expect("the corpus exists");
     let mut versions: Vec<PathBuf> = entries.map(|entry| entry.expect("readable").path()).collect();
     versions.retain(|path| path.is_dir());
     versions.sort();
@@ -30,7 +30,7 @@ fn json(path: &Path) -> Value {
     serde_json::from_slice(&fs::read(path).expect("readable")).expect("JSON")
 }
 
-/// A copy of the corpus's `file`, for what is opened to be written.
+/// Copies a corpus file that will be opened for writing.
 fn copy(file: &Path) -> (TempDir, PathBuf) {
     let directory = tempfile::tempdir().expect("a directory");
     let path = directory.path().join(file.file_name().expect("a file"));
@@ -66,7 +66,7 @@ fn a_ledger_keeps_its_accounts_leases_and_verdicts() {
         };
         assert_eq!(balance("unleased"), ("mc-q:0.1".to_owned(), 10, 0, 0));
         assert_eq!(balance("leased"), ("eamc:0.25".to_owned(), 25, 45, 930));
-        // A step that was charged is not charged again; the next one is charged to the open lease.
+        // A charged step is not charged again. The next step is charged to the open lease.
         let charge = |step| Charge {
             episode: 1,
             step,

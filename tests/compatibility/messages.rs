@@ -1,5 +1,5 @@
-//! Encoded messages: the descriptors still give every field its name, type and value, and the generated types keep all
-//! of them.
+//! Encoded messages: the descriptors still give every field its name, type and value, and the generated types preserve
+//! all fields.
 
 use std::path::Path;
 

@@ -1,4 +1,4 @@
-//! A run that an earlier version left in the middle.
+//! An unfinished run of an earlier version.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -12,8 +12,8 @@ use tandem_rl::config::{Recipe, former_keys};
 use tandem_rl::trainer::Counters;
 use toml::Table;
 
-/// The run file's settings over the recipe's, so that settings of later versions have a value. The program does the same
-/// with former keys, see `a_run_resumes_and_ends_with_the_same_counts`.
+/// Merges the run file's settings over the recipe's, so that settings of later versions have a value. The program treats
+/// former keys in the same way, see `a_run_resumes_and_ends_with_the_same_counts`.
 fn configuration(run: &Path) -> RunConfig {
     let mut text = fs::read_to_string(run.join("run.toml")).expect("readable");
     let name = |key: &'static str| key.split_once('.').expect("a section").1;
@@ -34,7 +34,7 @@ fn configuration(run: &Path) -> RunConfig {
     resolved.try_into().expect("a configuration")
 }
 
-/// The digest of the learning state that the checkpoint's header names.
+/// Returns the digest of the learning state in the checkpoint's header.
 fn digest_in(checkpoint: &Path) -> String {
     let bytes = fs::read(checkpoint).expect("readable");
     let text = String::from_utf8_lossy(&bytes);
@@ -60,7 +60,7 @@ fn a_checkpoint_brings_back_the_state_that_was_saved() {
     for version in super::versions() {
         let run = version.join("run");
         let restored = load_newest(&run.join("checkpoint"), &configuration(&run));
-        let restored = restored.expect("readable").expect("there is one");
+        let restored = restored.expect("readable").expect("a checkpoint");
         let expected = Counters {
             round: 4,
             env_steps: 400,
@@ -75,7 +75,7 @@ fn a_checkpoint_brings_back_the_state_that_was_saved() {
     }
 }
 
-/// The learned numbers depend on the processor's matrix kernels; the counts do not.
+/// Compares counts only, because the learned numbers depend on the processor's matrix kernels.
 #[test]
 fn a_run_resumes_and_ends_with_the_same_counts() {
     for version in super::versions() {

@@ -1,4 +1,4 @@
-//! One machine that runs pods as processes: addresses of the loopback for pods, directories for volumes.
+//! Runs pods as local processes, with loopback addresses for pods and directories for volumes.
 
 use std::collections::BTreeMap;
 use std::fs::{self, File, Permissions};
@@ -14,14 +14,14 @@ use tempfile::TempDir;
 
 use crate::manifests::{Container, Manifests, Probe, Source, ValueFrom, Workload};
 
-/// Longer than anything takes, even on a machine that is busy with other things.
+/// Limit of every wait, sufficient for busy machines.
 const DEADLINE: Duration = Duration::from_secs(180);
 const PAUSE: Duration = Duration::from_millis(50);
-/// Every port is so much higher than the manifests say, so that what this machine offers by itself is not in the way.
+/// Offset of every port from the manifests' port, to avoid collisions with other services of this machine.
 const PORT_SHIFT: u16 = 20_000;
-/// How the program ends when it is worth trying again, as when a peer is not there yet.
+/// Exit code of temporary failures, such as a peer that has not started.
 const TRY_AGAIN: i32 = 75;
-/// The secret that `docs/cluster.md` tells people to make.
+/// The secrets that `docs/cluster.md` describes.
 pub(crate) const SECRETS: [(&str, &str, &str); 2] = [
     ("tandem-secrets", "token", "the-right-token-0123"),
     ("tandem-secrets", "redis-password", "a-password-of-letters"),
@@ -31,7 +31,7 @@ pub(crate) const SECRETS: [(&str, &str, &str); 2] = [
 pub(crate) struct Cluster {
     manifests: Manifests,
     run: String,
-    place: TempDir,
+    workspace: TempDir,
     pods: Vec<Pod>,
 }
 
@@ -43,13 +43,13 @@ pub(crate) struct Pod {
 }
 
 impl Cluster {
-    /// An empty cluster whose learner reads `run` as its run file.
+    /// Creates an empty cluster whose learner uses the run file `run`.
     pub(crate) fn new(manifests: Manifests, run: String) -> Self {
-        let place = tempfile::tempdir().expect("a directory");
-        Self { manifests, run, place, pods: Vec::new() }
+        let workspace = tempfile::tempdir().expect("a directory");
+        Self { manifests, run, workspace, pods: Vec::new() }
     }
 
-    /// Adds `replicas` pods of a workload, which are not started yet; gives their names.
+    /// Adds `replicas` pods of a workload without starting them and returns their names.
     pub(crate) fn add(&mut self, workload: &str, replicas: u64) -> Vec<String> {
         let names: Vec<String> = (0..replicas).map(|idx| format!("{workload}-{idx}")).collect();
         for name in &names {
@@ -74,23 +74,23 @@ impl Cluster {
         self.pods[idx].process = Some(command.spawn().expect("starts"));
     }
 
-    /// Waits until every probe of every pod holds. A pod that ended because a peer was not there is started again.
+    /// Waits until every probe of every pod succeeds. Restarts pods that ended because a peer was unavailable.
     pub(crate) fn wait_until_ready(&mut self) {
         let names: Vec<String> = self.pods.iter().map(|pod| pod.name.clone()).collect();
         for name in names {
             let ready = (0..DEADLINE.as_millis() / PAUSE.as_millis()).any(|_| {
                 std::thread::sleep(PAUSE);
-                self.tend(&name);
-                self.is_well(self.pod(&name))
+                self.restart_if_needed(&name);
+                self.is_healthy(self.pod(&name))
             });
-            assert!(ready, "{name} does not get ready: {}", self.log(&name));
+            assert!(ready, "{name} did not become ready: {}", self.log(&name));
         }
     }
 
-    /// Starts a pod again that ended because a peer was not there; one that is through with the run stays so.
-    fn tend(&mut self, name: &str) {
+    /// Restarts a pod that ended because a peer was unavailable. A pod that completed stays ended.
+    fn restart_if_needed(&mut self, name: &str) {
         let idx = self.index(name);
-        let process = self.pods[idx].process.as_mut().expect("it was started");
+        let process = self.pods[idx].process.as_mut().expect("the pod was started");
         match process.try_wait().expect("ours").map(|status| status.code()) {
             None | Some(Some(0)) => {}
             Some(Some(TRY_AGAIN)) => self.start(name),
@@ -98,53 +98,53 @@ impl Cluster {
         }
     }
 
-    pub(crate) fn is_well(&self, pod: &Pod) -> bool {
+    pub(crate) fn is_healthy(&self, pod: &Pod) -> bool {
         let container = &self.workload(pod).container;
         container.probes().all(|probe| self.holds(pod, probe))
     }
 
     fn holds(&self, pod: &Pod, probe: &Probe) -> bool {
         if let Some(grpc) = &probe.grpc {
-            let address = self.inside(pod, grpc.port).to_string();
+            let address = self.pod_address(pod, grpc.port).to_string();
             let mut ask = tandem();
             ask.args(["health", &address, "--service", &grpc.service]);
             return ask.output().expect("runs").status.success();
         }
         if let Some(socket) = &probe.tcp_socket {
-            let address = self.inside(pod, socket.port);
+            let address = self.pod_address(pod, socket.port);
             return TcpStream::connect_timeout(&address, Duration::from_secs(5)).is_ok();
         }
         let exec = &probe.exec.as_ref().expect("a way to probe").command;
-        // Inside a pod this asks the loopback, at the port that the manifests say.
+        // Inside a pod the command probes the loopback address at the manifests' port.
         let [port] = &self.workload(pod).container.ports[..] else { panic!("one port") };
-        let address = self.inside(pod, port.container_port);
+        let address = self.pod_address(pod, port.container_port);
         let mut ask = Command::new(&exec[0]);
         ask.args(["-h", &address.ip().to_string(), "-p", &address.port().to_string()]);
         ask.args(&exec[1..]).envs(self.environment(pod));
         ask.output().expect("runs").status.success()
     }
 
-    /// Asks a pod to end as Kubernetes does; gives its exit code.
+    /// Sends SIGTERM to a pod, as Kubernetes does, and returns its exit code.
     pub(crate) fn terminate(&mut self, name: &str) -> Option<i32> {
         self.signal(name, "-TERM");
-        self.wait_for_the_end(name)
+        self.wait_for_exit(name)
     }
 
-    /// Ends a pod as a lost node does.
+    /// Kills a pod with SIGKILL, as the loss of a node does.
     pub(crate) fn kill(&mut self, name: &str) {
         self.signal(name, "-KILL");
-        assert_eq!(self.wait_for_the_end(name), None, "{name} ended by itself");
+        assert_eq!(self.wait_for_exit(name), None, "{name} ended by itself");
     }
 
     fn signal(&self, name: &str, signal: &str) {
-        let pid = self.pod(name).process.as_ref().expect("it was started").id().to_string();
+        let pid = self.pod(name).process.as_ref().expect("the pod was started").id().to_string();
         let sent = Command::new("kill").args([signal, &pid]).status().expect("kill runs");
-        assert!(sent.success(), "{name} is gone: {}", self.log(name));
+        assert!(sent.success(), "{name} has ended: {}", self.log(name));
     }
 
-    pub(crate) fn wait_for_the_end(&mut self, name: &str) -> Option<i32> {
+    pub(crate) fn wait_for_exit(&mut self, name: &str) -> Option<i32> {
         let idx = self.index(name);
-        let mut process = self.pods[idx].process.take().expect("it was started");
+        let mut process = self.pods[idx].process.take().expect("the pod was started");
         for _ in 0..DEADLINE.as_millis() / PAUSE.as_millis() {
             if let Some(status) = process.try_wait().expect("ours") {
                 return status.code();
@@ -156,18 +156,18 @@ impl Cluster {
         panic!("{name} does not end: {}", self.log(name));
     }
 
-    /// What stands at `/metrics` of a pod's port of that name: values by name; nothing when it cannot be asked.
+    /// Reads `/metrics` from a pod's port `metrics` and returns values by name. Empty if the pod is unreachable.
     pub(crate) fn figures(&self, name: &str) -> BTreeMap<String, f64> {
         let pod = self.pod(name);
         let ports = &self.workload(pod).container.ports;
         let port = ports.iter().find(|port| port.name == "metrics").expect("a port for figures");
-        let page = get(self.inside(pod, port.container_port)).unwrap_or_default();
+        let page = get(self.pod_address(pod, port.container_port)).unwrap_or_default();
         let samples = page.lines().filter(|line| !line.starts_with('#'));
         let samples = samples.filter_map(|line| line.rsplit_once(' '));
         samples.filter_map(|(name, value)| Some((name.to_owned(), value.parse().ok()?))).collect()
     }
 
-    /// Looks at the learner's figures until they are as expected.
+    /// Polls a pod's metrics until they are as expected.
     pub(crate) fn wait_for_figures(
         &self,
         learner: &str,
@@ -183,26 +183,26 @@ impl Cluster {
         panic!("{:?}: {}", self.figures(learner), self.log(learner));
     }
 
-    /// Where others reach a pod's port.
+    /// Returns the address of a pod's port.
     pub(crate) fn address(&self, name: &str, port: &str) -> SocketAddr {
         let pod = self.pod(name);
         let ports = &self.workload(pod).container.ports;
         let port = ports.iter().find(|declared| declared.name == port).expect("a port");
-        self.inside(pod, port.container_port)
+        self.pod_address(pod, port.container_port)
     }
 
-    /// What a pod's processes have said.
+    /// Returns the log of a pod.
     pub(crate) fn log(&self, name: &str) -> String {
         fs::read_to_string(self.log_of(self.pod(name))).unwrap_or_default()
     }
 
-    /// Files that a pod has left outside its volumes.
-    pub(crate) fn litter(&self, name: &str) -> Vec<PathBuf> {
+    /// Returns the files that a pod has left outside its volumes.
+    pub(crate) fn stray_files(&self, name: &str) -> Vec<PathBuf> {
         let left = fs::read_dir(self.root_of(self.pod(name))).expect("a directory");
         left.flatten().map(|entry| entry.path()).collect()
     }
 
-    /// Runs a pod's command to its end, with one of its arguments changed.
+    /// Runs a pod's command with one argument replaced and waits for its end.
     pub(crate) fn run_changed(&self, name: &str, idx: usize, argument: &str) -> Output {
         let pod = self.pod(name);
         let mut changed = self.workload(pod).clone();
@@ -226,8 +226,8 @@ impl Cluster {
         &self.manifests.workloads[&pod.workload]
     }
 
-    /// The address of a pod's own port, which it must have declared.
-    fn inside(&self, pod: &Pod, port: u16) -> SocketAddr {
+    /// Returns the address of a pod's own port, which the pod must declare.
+    fn pod_address(&self, pod: &Pod, port: u16) -> SocketAddr {
         assert!(self.workload(pod).container.has_port(port), "{} declares no {port}", pod.name);
         SocketAddr::from((pod.address, port + PORT_SHIFT))
     }
@@ -244,7 +244,7 @@ impl Cluster {
         };
         let environment = self.environment(pod);
         let arguments = container.command[1..].iter().chain(&container.args);
-        command.args(arguments.map(|text| self.localised(pod, &expanded(text, &environment))));
+        command.args(arguments.map(|text| self.localized(pod, &expanded(text, &environment))));
         command.envs(&environment).current_dir(self.root_of(pod)).stdin(Stdio::null());
         command
     }
@@ -253,7 +253,7 @@ impl Cluster {
         let mut environment = BTreeMap::new();
         for variable in &self.workload(pod).container.env {
             let value = match (&variable.value, &variable.value_from) {
-                (Some(value), None) => self.localised(pod, &expanded(value, &environment)),
+                (Some(value), None) => self.localized(pod, &expanded(value, &environment)),
                 (None, Some(ValueFrom::SecretKeyRef { name, key })) => secret(name, key),
                 (None, Some(ValueFrom::FieldRef { field_path })) => {
                     assert_eq!(field_path, "metadata.name");
@@ -266,8 +266,8 @@ impl Cluster {
         environment
     }
 
-    /// A text of a manifest with this machine's addresses, ports and directories in place of a cluster's.
-    fn localised(&self, pod: &Pod, text: &str) -> String {
+    /// A text of a manifest with this machine's addresses, ports and directories in workspace of a cluster's.
+    fn localized(&self, pod: &Pod, text: &str) -> String {
         let container = &self.workload(pod).container;
         if text.starts_with('/') {
             return self.path(pod, text).to_string_lossy().into_owned();
@@ -283,13 +283,16 @@ impl Cluster {
         let authority = authority.rsplit('@').next().unwrap_or_default();
         let Some((host, port)) = authority.split_once(':') else { return text.to_owned() };
         let Ok(port) = port.parse() else { return text.to_owned() };
-        let there =
-            if host == "0.0.0.0" { self.inside(pod, port) } else { self.called(pod, host, port) };
+        let there = if host == "0.0.0.0" {
+            self.pod_address(pod, port)
+        } else {
+            self.service_address(pod, host, port)
+        };
         text.replace(authority, &there.to_string())
     }
 
-    /// Where a service leads a pod.
-    fn called(&self, pod: &Pod, host: &str, port: u16) -> SocketAddr {
+    /// Resolves a service from a pod.
+    fn service_address(&self, pod: &Pod, host: &str, port: u16) -> SocketAddr {
         let service = self.manifests.services.get(host);
         let service = service.unwrap_or_else(|| panic!("{} calls {host:?}, no service", pod.name));
         let port = service.ports.get(&port);
@@ -297,10 +300,10 @@ impl Cluster {
         let behind: Vec<&Pod> =
             self.pods.iter().filter(|other| other.workload == service.workload).collect();
         let chosen = usize::from(pod.address.octets()[3]) % behind.len();
-        self.inside(behind[chosen], *port)
+        self.pod_address(behind[chosen], *port)
     }
 
-    /// What stands for a path inside a pod: below a volume, or in the image.
+    /// What stands for a path pod_address a pod: below a volume, or in the image.
     fn path(&self, pod: &Pod, path: &str) -> PathBuf {
         if let Some(policy) = path.strip_prefix("/usr/share/tandem/") {
             return Path::new(env!("CARGO_MANIFEST_DIR")).join(policy);
@@ -314,9 +317,9 @@ impl Cluster {
         self.volume(pod, &mount.name).join(rest)
     }
 
-    /// The directory of a pod's volume, filled with what belongs there.
+    /// Creates the directory of a pod's volume with its content.
     fn volume(&self, pod: &Pod, name: &str) -> PathBuf {
-        let directory = self.place.path().join("volumes").join(&pod.name).join(name);
+        let directory = self.workspace.path().join("volumes").join(&pod.name).join(name);
         fs::create_dir_all(&directory).expect("a directory");
         match &self.workload(pod).volumes[name] {
             Source::Claim => {}
@@ -335,13 +338,13 @@ impl Cluster {
         directory
     }
 
-    /// Where a pod's processes start, in place of a root that cannot be written to.
+    /// Where a pod's processes start, in workspace of a root that cannot be written to.
     fn root_of(&self, pod: &Pod) -> PathBuf {
-        self.place.path().join("roots").join(&pod.name)
+        self.workspace.path().join("roots").join(&pod.name)
     }
 
     fn log_of(&self, pod: &Pod) -> PathBuf {
-        self.place.path().join(format!("{}.log", pod.name))
+        self.workspace.path().join(format!("{}.log", pod.name))
     }
 }
 
@@ -362,7 +365,7 @@ fn tandem() -> Command {
     command
 }
 
-/// An address of the loopback that no other pod of any running test has.
+/// Returns a loopback address that no other pod of any running test uses.
 fn new_address() -> Ipv4Addr {
     static NEXT: AtomicU8 = AtomicU8::new(1);
     let [_, _, high, low] = std::process::id().to_be_bytes();
@@ -374,7 +377,7 @@ fn secret(name: &str, key: &str) -> String {
     found.unwrap_or_else(|| panic!("there is no {key:?} in a secret {name:?}")).2.to_owned()
 }
 
-/// `text` with the variables `$(NAME)` that are known by now.
+/// Expands the variables `$(NAME)` of `environment` in `text`.
 fn expanded(text: &str, environment: &BTreeMap<String, String>) -> String {
     let known = environment.iter();
     known.fold(text.to_owned(), |text, (name, value)| text.replace(&format!("$({name})"), value))

@@ -1,4 +1,4 @@
-//! What the manifests say that a machine needs to know to run their containers.
+//! The parts of the Kubernetes manifests that are needed to run their containers.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -8,7 +8,7 @@ use serde::Deserialize;
 use serde::de::DeserializeOwned;
 use serde_json::Value;
 
-/// A container, as its pod describes it.
+/// A container of a pod.
 #[derive(Debug, Clone, Deserialize)]
 #[serde(rename_all = "camelCase")]
 pub(crate) struct Container {
@@ -95,14 +95,14 @@ pub(crate) struct TcpSocket {
     pub(crate) port: u16,
 }
 
-/// What is mounted under a volume's name.
+/// The source of a volume.
 #[derive(Debug, Clone)]
 pub(crate) enum Source {
-    /// Files of a secret, by name: the secret and its key.
+    /// Files of a secret: secret name and key by file name.
     Secret(BTreeMap<String, (String, String)>),
-    /// The files of a map.
+    /// The files of a config map.
     ConfigMap(String),
-    /// A directory of the pod's own that outlives its processes.
+    /// A persistent directory of the pod.
     Claim,
 }
 
@@ -115,14 +115,14 @@ pub(crate) struct Workload {
     labels: Value,
 }
 
-/// Where a service leads: the workload, and its port by the service's own.
+/// A service: its workload and the container port of each service port.
 #[derive(Debug, Clone)]
 pub(crate) struct Service {
     pub(crate) workload: String,
     pub(crate) ports: BTreeMap<u16, u16>,
 }
 
-/// The manifests of the base; overlays change none of their commands.
+/// The base manifests. Overlays do not change commands.
 #[derive(Debug, Clone)]
 pub(crate) struct Manifests {
     pub(crate) workloads: BTreeMap<String, Workload>,
@@ -155,7 +155,7 @@ impl Manifests {
 
 fn workload(object: &Value) -> Workload {
     let containers: Vec<Container> = at(object, "/spec/template/spec/containers");
-    let [container] = <[Container; 1]>::try_from(containers).expect("one container a pod");
+    let [container] = <[Container; 1]>::try_from(containers).expect("one container per pod");
     let spec = object.pointer("/spec").expect("a specification");
     let listed = |list: &str| {
         let list = spec.pointer(list).and_then(Value::as_array).cloned();
@@ -189,8 +189,8 @@ fn service(object: &Value, workloads: &BTreeMap<String, Workload>) -> Service {
         selector.iter().all(|(label, value)| workload.labels[label].as_str() == Some(value))
     };
     let mut meant = workloads.iter().filter(|(_, workload)| is_meant(workload));
-    let (name, workload) = meant.next().expect("a service leads somewhere");
-    assert!(meant.next().is_none(), "a service leads to one workload");
+    let (name, workload) = meant.next().expect("a service selects a workload");
+    assert!(meant.next().is_none(), "a service selects one workload");
     let ports: Vec<Value> = at(object, "/spec/ports");
     let ports = ports.iter().map(|port| {
         let target: String = at(port, "/targetPort");
