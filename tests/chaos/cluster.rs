@@ -1,4 +1,4 @@
-//! A whole run as separate processes, every connection through a proxy, with a schedule of faults.
+//! A whole run in separate processes, with all connections through proxies and a schedule of faults.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -15,13 +15,13 @@ use tonic::transport::{Channel, Endpoint};
 use crate::process::Process;
 use crate::proxy::Proxy;
 use crate::recovery::{Recoveries, Recovery};
-use crate::schedule::{Event, Fault, Line, Schedule, Target};
+use crate::schedule::{Event, Fault, Link, Schedule, Target};
 
 /// Name of the run and of its account.
 pub(crate) const NAME: &str = "chaos";
-/// How often it is looked what there is to do.
+/// Polling interval.
 const TICK: Duration = Duration::from_millis(20);
-/// The port of a process that was killed may be taken for a moment.
+/// Maximum number of restarts that fail because the port is briefly in use.
 const MAX_FALSE_STARTS: u32 = 20;
 
 /// The processes of a run and the proxies between them.
@@ -32,25 +32,25 @@ pub(crate) struct Cluster {
     learner: Process,
     learner_at: SocketAddr,
     workers: Vec<Process>,
-    lines: BTreeMap<Line, Proxy>,
+    links: BTreeMap<Link, Proxy>,
     progress: watch::Receiver<pb::Progress>,
     started: Instant,
-    /// What is to be undone, and when.
+    /// Ends of active faults, with their times.
     undo: Vec<(Duration, Undo)>,
-    /// How often each line was disturbed.
-    n_disturbances: BTreeMap<Line, u32>,
+    /// Number of disturbances of each link.
+    n_disturbances: BTreeMap<Link, u32>,
     recoveries: Recoveries,
     n_false_starts: u32,
 }
 
-/// The end of a fault, unless another one has come since.
+/// The end of a fault. It is ignored if a newer fault has the same target.
 #[derive(Debug, Clone, Copy)]
 enum Undo {
     Continue(Target, u32),
-    Calm(Line, u32),
+    EndDisturbance(Link, u32),
 }
 
-/// How a run ended.
+/// The results of a run.
 #[derive(Debug)]
 pub(crate) struct Outcome {
     pub(crate) progress: pb::Progress,
@@ -60,12 +60,12 @@ pub(crate) struct Outcome {
     pub(crate) recoveries: Vec<Recovery>,
 }
 
-/// Where the ledger of a run in `dir` is kept.
+/// Returns the ledger path of a run in `dir`.
 pub(crate) fn ledger_path(dir: &Path) -> PathBuf {
     dir.join("ledger.sqlite")
 }
 
-/// The run directory of a run in `dir`.
+/// Returns the run directory of a run in `dir`.
 pub(crate) fn run_dir(dir: &Path) -> PathBuf {
     dir.join("run")
 }
@@ -82,12 +82,12 @@ impl Cluster {
         let args = ["teacher".into(), "--policy".into(), path(policy), "--ledger".into()];
         let args = args.into_iter().chain([path(ledger_path(dir))]).collect();
         let (teacher, teacher_at) = Process::serve(args, &log("teacher"));
-        let mut lines = BTreeMap::new();
+        let mut links = BTreeMap::new();
         let proxy = Proxy::start(teacher_at).await;
         let args = ["learner".into(), "--run".into(), path(file), "--out".into()];
         let teacher_arg = ["--teacher".into(), proxy.address().to_string().into()];
         let args = args.into_iter().chain([path(run_dir(dir))]).chain(teacher_arg).collect();
-        lines.insert(Line::LearnerToTeacher, proxy);
+        links.insert(Link::LearnerToTeacher, proxy);
         let (mut learner, learner_at) = Process::serve(args, &log("learner"));
         learner.add_args(["--resume".to_owned()]);
         let mut workers = Vec::new();
@@ -104,8 +104,8 @@ impl Cluster {
                 to_teacher.address().to_string().into(),
             ];
             workers.push(Process::start(args.into(), &log(&format!("worker-{idx}"))));
-            lines.insert(Line::WorkerToLearner(idx), to_learner);
-            lines.insert(Line::WorkerToTeacher(idx), to_teacher);
+            links.insert(Link::WorkerToLearner(idx), to_learner);
+            links.insert(Link::WorkerToTeacher(idx), to_teacher);
         }
         Self {
             dir: dir.to_owned(),
@@ -114,8 +114,8 @@ impl Cluster {
             learner,
             learner_at,
             workers,
-            n_disturbances: lines.keys().map(|line| (*line, 0)).collect(),
-            lines,
+            n_disturbances: links.keys().map(|link| (*link, 0)).collect(),
+            links,
             progress: follow(learner_at),
             started: now(),
             undo: Vec::new(),
@@ -124,7 +124,7 @@ impl Cluster {
         }
     }
 
-    /// Lets the run go on to its end while `schedule` befalls it; fails after `deadline`.
+    /// Waits for the end of the run while `schedule` injects faults. Panics after `deadline`.
     pub(crate) async fn run(mut self, schedule: Option<Schedule>, deadline: Duration) -> Outcome {
         let mut schedule = schedule.into_iter().flatten().peekable();
         let mut events = Vec::new();
@@ -134,7 +134,7 @@ impl Cluster {
             self.undo_until(elapsed);
             if let Some(event) = schedule.next_if(|event| event.at <= elapsed) {
                 events.push(event);
-                self.befall(event.fault);
+                self.apply(event.fault);
             }
             tokio::time::sleep(TICK).await;
         }
@@ -146,14 +146,14 @@ impl Cluster {
         Outcome { progress, account, wall, events, recoveries: self.recoveries.take() }
     }
 
-    /// Whether the learner is done and has told so. Processes that end without having been killed are a failure.
+    /// Whether the learner is done and has is_reported so. Processes that end without having been killed are a failure.
     fn has_ended(&mut self) -> bool {
-        let told = self.progress.borrow().ended && !self.progress.borrow().digest.is_empty();
+        let is_reported = self.progress.borrow().ended && !self.progress.borrow().digest.is_empty();
         match self.learner.ended() {
             None => (),
-            Some(status) if status.success() && told => return true,
-            // Nobody heard its last message: it says the same again.
-            Some(status) if status.success() => self.learner.start_again(),
+            Some(status) if status.success() && is_reported => return true,
+            // Its last message was lost: a restart reports the same result.
+            Some(status) if status.success() => self.learner.restart(),
             Some(status) => self.restart_if_port_was_taken(Target::Learner, status.code()),
         }
         if let Some(status) = self.teacher.ended() {
@@ -167,43 +167,43 @@ impl Cluster {
     }
 
     fn restart_if_port_was_taken(&mut self, target: Target, code: Option<i32>) {
-        let is_taken = self.process(target).last_words().contains("cannot listen");
+        let is_taken = self.process(target).log_tail().contains("cannot listen");
         self.n_false_starts += 1;
         assert!(
             code == Some(75) && is_taken && self.n_false_starts < MAX_FALSE_STARTS,
             "{target:?} ended with {code:?}: {self:?}"
         );
-        self.process(target).start_again();
+        self.process(target).restart();
     }
 
-    fn befall(&mut self, fault: Fault) {
+    fn apply(&mut self, fault: Fault) {
         let quiet = self.undo.is_empty();
         let until = self.started.elapsed() + fault.lasts();
         self.recoveries.disturbed_by(fault);
         match fault {
             Fault::Kill(target) => {
                 self.process(target).kill();
-                self.start_again(target);
+                self.restart(target);
                 self.measure(target, quiet);
             }
             Fault::Stop(target, _) => {
                 let process = self.process(target);
-                process.n_upsets += 1;
+                process.n_interruptions += 1;
                 process.signal("-STOP");
-                let undo = Undo::Continue(target, process.n_upsets);
+                let undo = Undo::Continue(target, process.n_interruptions);
                 self.undo.push((until, undo));
             }
-            Fault::Cut(line) => self.lines[&line].cut(),
-            Fault::Disturb(line, how, _) => {
-                self.lines[&line].disturb(Some(how));
-                let n_disturbances = self.n_disturbances.entry(line).or_default();
+            Fault::Cut(link) => self.links[&link].cut(),
+            Fault::Disturb(link, how, _) => {
+                self.links[&link].disturb(Some(how));
+                let n_disturbances = self.n_disturbances.entry(link).or_default();
                 *n_disturbances += 1;
-                self.undo.push((until, Undo::Calm(line, *n_disturbances)));
+                self.undo.push((until, Undo::EndDisturbance(link, *n_disturbances)));
             }
         }
     }
 
-    /// Ends the faults that last no longer than to `elapsed`.
+    /// Ends the faults that are over at `elapsed`.
     fn undo_until(&mut self, elapsed: Duration) {
         let is_over = |(at, _): &mut (Duration, Undo)| *at <= elapsed;
         let over: Vec<_> = self.undo.extract_if(.., is_over).collect();
@@ -212,37 +212,36 @@ impl Cluster {
 
     fn undo(&mut self, undo: Undo) {
         match undo {
-            Undo::Continue(target, n_upsets) => {
+            Undo::Continue(target, n_interruptions) => {
                 let process = self.process(target);
-                if process.n_upsets == n_upsets {
+                if process.n_interruptions == n_interruptions {
                     process.signal("-CONT");
                 }
             }
-            Undo::Calm(line, n_disturbances) => {
-                if self.n_disturbances[&line] == n_disturbances {
-                    self.lines[&line].disturb(None);
+            Undo::EndDisturbance(link, n_disturbances) => {
+                if self.n_disturbances[&link] == n_disturbances {
+                    self.links[&link].disturb(None);
                 }
             }
         }
     }
 
-    fn start_again(&mut self, target: Target) {
+    fn restart(&mut self, target: Target) {
         let process = self.process(target);
         if let Target::Worker(idx) = target {
-            let name = worker_name(idx, process.n_upsets + 1);
+            let name = worker_name(idx, process.n_interruptions + 1);
             process.set_arg("--name", &name);
         }
-        process.start_again();
+        process.restart();
     }
 
-    /// Measures how long a process takes to do its part again. Of a worker that can be said only when nothing else is
-    /// the matter.
+    /// Measures the recovery time of a process. Workers are measured only if no other fault is active.
     fn measure(&mut self, target: Target, quiet: bool) {
         match target {
             Target::Teacher => self.recoveries.teacher(teacher(self.teacher_at)),
             Target::Learner => self.recoveries.learner(learner(self.learner_at)),
             Target::Worker(idx) if quiet => {
-                let name = worker_name(idx, self.workers[idx].n_upsets);
+                let name = worker_name(idx, self.workers[idx].n_interruptions);
                 self.recoveries.worker(idx, name, learner(self.learner_at));
             }
             Target::Worker(_) => (),
@@ -275,26 +274,26 @@ impl std::fmt::Debug for Cluster {
         let progress = self.progress.borrow();
         let (round, phase) = (progress.round, &progress.phase);
         writeln!(formatter, "run in {:?}, round {round}, {phase}", self.dir)?;
-        writeln!(formatter, "to be undone: {:?}", self.undo)?;
+        writeln!(formatter, "active faults: {:?}", self.undo)?;
         let workers = self.workers.iter().enumerate();
         let workers = workers.map(|(idx, worker)| (format!("worker {idx}"), worker));
         let services = [("teacher", &self.teacher), ("learner", &self.learner)];
         let services = services.map(|(name, process)| (name.to_owned(), process));
         for (name, process) in services.into_iter().chain(workers) {
-            writeln!(formatter, "{name} said last:\n{}", process.last_words())?;
+            writeln!(formatter, "log of {name}:\n{}", process.log_tail())?;
         }
         Ok(())
     }
 }
 
-/// The label of a worker that was started again so often.
+/// Returns the name of a worker after `n_restarts` restarts.
 fn worker_name(idx: usize, n_restarts: u32) -> String {
     format!("worker-{idx}.{n_restarts}")
 }
 
 fn channel(address: SocketAddr) -> Channel {
     let endpoint = Endpoint::from_shared(format!("http://{address}")).expect("an address");
-    // A process that is stopped takes connections and answers nobody.
+    // A stopped process accepts connections but does not answer.
     endpoint.timeout(Duration::from_secs(2)).connect_lazy()
 }
 
@@ -306,7 +305,7 @@ fn learner(address: SocketAddr) -> LearnerClient<Channel> {
     LearnerClient::new(channel(address))
 }
 
-/// The learner's latest progress, followed over its restarts. A learner that starts has nothing to tell.
+/// Follows the learner's progress across its restarts. A starting learner reports nothing.
 fn follow(address: SocketAddr) -> watch::Receiver<pb::Progress> {
     let (sender, receiver) = watch::channel(pb::Progress::default());
     tokio::spawn(async move {

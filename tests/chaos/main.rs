@@ -1,7 +1,7 @@
-//! A run whose processes are killed and stopped and whose connections are disturbed ends as a calm one: the same bits,
-//! the same account, the same metrics.
+//! Runs with killed and stopped processes and disturbed connections end like an undisturbed run: with the same bits,
+//! account and metrics.
 //!
-//! `TANDEM_CHAOS_SEED` chooses another schedule; a failure prints it.
+//! `TANDEM_CHAOS_SEED` selects the schedule. The seed is printed.
 
 #![expect(
     clippy::panic,
@@ -21,17 +21,17 @@ use std::time::Duration;
 use serde_json::Value;
 
 use cluster::{Cluster, NAME, Outcome, ledger_path, run_dir};
-use schedule::{HAND_EVENTS, Schedule, Target};
+use schedule::{BATCH_EVENTS, Schedule, Target};
 
 const N_WORKERS: usize = 4;
-/// On a fast machine faults come faster, so that every kind of fault has its turn.
-const MIN_FAULTS_PER_CALM_RUN: u32 = 20;
+/// Minimum number of faults. Faults come faster on a fast machine, so that every kind of fault occurs.
+const MIN_FAULTS_PER_RUN: u32 = 20;
 
-/// How large a run, and how often something befalls it.
+/// The size of a run and the rate of faults.
 struct Scale {
     max_env_steps: u64,
     budget: u64,
-    /// Longest time from fault to fault.
+    /// Maximum time between faults.
     every: Duration,
 }
 
@@ -66,7 +66,7 @@ fn run_file(scale: &Scale) -> String {
     )
 }
 
-/// A calm run and one under faults.
+/// Compares an undisturbed run with one under faults.
 fn compare(scale: &Scale) {
     let runtime =
         tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build();
@@ -79,38 +79,44 @@ fn compare(scale: &Scale) {
         });
         (dir, outcome)
     };
-    let (calm_dir, calm) = run(None, Duration::from_secs(1_800));
+    let (undisturbed_dir, undisturbed) = run(None, Duration::from_secs(1_800));
     let seed = seed();
-    let every = scale.every.min(calm.wall / MIN_FAULTS_PER_CALM_RUN);
-    println!("calm run: {:?}; schedule: seed {seed}, a fault every {every:?}", calm.wall);
+    let every = scale.every.min(undisturbed.wall / MIN_FAULTS_PER_RUN);
+    println!(
+        "undisturbed run: {:?}; schedule: seed {seed}, a fault every {every:?}",
+        undisturbed.wall
+    );
     let schedule = Schedule::new(seed, N_WORKERS, every);
-    let deadline = Duration::from_secs(300) + 10 * calm.wall;
+    let deadline = Duration::from_secs(300) + 10 * undisturbed.wall;
     let (dir, disturbed) = run(Some(schedule), deadline);
     report(&disturbed);
-    check_equal((calm_dir.path(), &calm), (dir.path(), &disturbed));
-    // On a fast machine the run ends before a whole hand of faults has come.
+    check_equal((undisturbed_dir.path(), &undisturbed), (dir.path(), &disturbed));
+    // On a fast machine the run ends before a whole batch of faults.
     let n_faults = disturbed.events.len();
-    assert!(n_faults >= HAND_EVENTS / 2, "the run was too short for its faults: {n_faults}");
+    assert!(n_faults >= BATCH_EVENTS / 2, "the run was too short for its faults: {n_faults}");
     check_recoveries(&disturbed);
 }
 
-fn check_equal((calm_dir, calm): (&Path, &Outcome), (dir, disturbed): (&Path, &Outcome)) {
-    let (expected, got) = (&calm.progress, &disturbed.progress);
+fn check_equal(
+    (undisturbed_dir, undisturbed): (&Path, &Outcome),
+    (dir, disturbed): (&Path, &Outcome),
+) {
+    let (expected, got) = (&undisturbed.progress, &disturbed.progress);
     let events = &disturbed.events;
-    assert_eq!(got.digest, expected.digest, "other bits after {events:#?}");
+    assert_eq!(got.digest, expected.digest, "different digest after {events:#?}");
     let counted = |progress: &tandem_proto::pb::Progress| {
         (progress.round, progress.env_steps, progress.episodes, progress.updates)
     };
-    assert_eq!(counted(got), counted(expected), "counted otherwise after {events:#?}");
-    assert_eq!(disturbed.account, calm.account, "another account after {events:#?}");
-    assert_eq!(calm.account.left, 0, "the budget is to run out");
+    assert_eq!(counted(got), counted(expected), "different counters after {events:#?}");
+    assert_eq!(disturbed.account, undisturbed.account, "different account after {events:#?}");
+    assert_eq!(undisturbed.account.left, 0, "the budget did not run out");
     let charged = charges(dir);
     assert_eq!(charged.len() as u64, disturbed.account.spent);
-    assert!(charged == charges(calm_dir), "other charges after {events:#?}");
-    assert_eq!(metrics(dir), metrics(calm_dir), "other metrics after {events:#?}");
+    assert!(charged == charges(undisturbed_dir), "different charges after {events:#?}");
+    assert_eq!(metrics(dir), metrics(undisturbed_dir), "different metrics after {events:#?}");
 }
 
-/// Every step that was charged, with the half of the budget that paid for it.
+/// Reads every charged step with the half of the budget that paid for it.
 fn charges(dir: &Path) -> Vec<(String, u32, String)> {
     let ledger = rusqlite::Connection::open(ledger_path(dir)).expect("a ledger");
     let query = "SELECT CAST(episode AS TEXT), step, CAST(half AS TEXT) FROM charges ORDER BY 1, 2";
@@ -121,7 +127,7 @@ fn charges(dir: &Path) -> Vec<(String, u32, String)> {
     charges
 }
 
-/// The rows of the metrics, without the wall time.
+/// Reads the rows of the metrics, without the wall time.
 fn metrics(dir: &Path) -> Vec<Value> {
     let text = std::fs::read_to_string(run_dir(dir).join("metrics.jsonl")).expect("metrics");
     let row = |line| -> Value {
@@ -139,8 +145,8 @@ fn report(disturbed: &Outcome) {
     }
 }
 
-/// Every kind of process recovered from a kill at least once. How long it took is printed, not tested: it depends on the
-/// machine.
+/// Checks that every kind of process recovered from a kill at least once. The durations are only printed, because they
+/// depend on the machine.
 fn check_recoveries(disturbed: &Outcome) {
     let kinds: [fn(&Target) -> bool; 3] = [
         |who| *who == Target::Teacher,
@@ -149,7 +155,7 @@ fn check_recoveries(disturbed: &Outcome) {
     ];
     for is_kind in kinds {
         let recovered = disturbed.recoveries.iter().any(|recovery| is_kind(&recovery.who));
-        assert!(recovered, "nothing recovered of one kind: {:?}", disturbed.recoveries);
+        assert!(recovered, "one kind of process never recovered: {:?}", disturbed.recoveries);
     }
 }
 

@@ -1,4 +1,4 @@
-//! The run's processes: started, killed, stopped, started again where they were.
+//! The processes of a run: started, killed, stopped and restarted at the same address.
 
 use std::ffi::OsString;
 use std::fs::{File, OpenOptions};
@@ -7,24 +7,24 @@ use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus, Stdio};
 
-/// A process that can be started again; it is killed when dropped.
+/// A restartable process that is killed on drop.
 #[derive(Debug)]
 pub(crate) struct Process {
     args: Vec<OsString>,
     log: PathBuf,
     child: Child,
-    /// How often it was started again, or stopped.
-    pub(crate) n_upsets: u32,
+    /// Number of restarts and stops.
+    pub(crate) n_interruptions: u32,
 }
 
 impl Process {
-    /// Starts a process that nobody calls.
+    /// Starts a process that is not a service.
     pub(crate) fn start(args: Vec<OsString>, log: &Path) -> Self {
         let child = spawn(&args, log, Stdio::null());
-        Self { args, log: log.to_owned(), child, n_upsets: 0 }
+        Self { args, log: log.to_owned(), child, n_interruptions: 0 }
     }
 
-    /// Starts a service and waits for the line that says where it listens. It will listen there again.
+    /// Starts a service and waits for its address, which it keeps across restarts.
     pub(crate) fn serve(args: Vec<OsString>, log: &Path) -> (Self, SocketAddr) {
         let mut child = spawn(&args, log, Stdio::piped());
         let output = child.stdout.take().expect("piped");
@@ -32,35 +32,35 @@ impl Process {
         BufReader::new(output).read_line(&mut line).expect("readable");
         let address = line.trim().strip_prefix("listening on ").map(str::parse);
         let Some(Ok(address)) = address else { panic!("no address in {line:?}") };
-        let mut process = Self { args, log: log.to_owned(), child, n_upsets: 0 };
+        let mut process = Self { args, log: log.to_owned(), child, n_interruptions: 0 };
         process.add_args(["--listen".to_owned(), format!("{address}")]);
         (process, address)
     }
 
-    /// Appends to the arguments with which it is started again.
+    /// Appends arguments for the next start.
     pub(crate) fn add_args(&mut self, args: impl IntoIterator<Item = String>) {
         self.args.extend(args.into_iter().map(OsString::from));
     }
 
     /// Replaces the value of an argument for the next start.
     pub(crate) fn set_arg(&mut self, name: &str, value: &str) {
-        let place = self.args.iter().position(|arg| arg == name).expect("an argument");
-        self.args[place + 1] = value.into();
+        let position = self.args.iter().position(|arg| arg == name).expect("an argument");
+        self.args[position + 1] = value.into();
     }
 
-    /// Kills it at once.
+    /// Kills the process.
     pub(crate) fn kill(&mut self) {
         self.child.kill().expect("a process");
         self.child.wait().expect("ends");
     }
 
-    /// Starts it again after it has ended.
-    pub(crate) fn start_again(&mut self) {
-        self.n_upsets += 1;
+    /// Restarts the process after its end.
+    pub(crate) fn restart(&mut self) {
+        self.n_interruptions += 1;
         self.child = spawn(&self.args, &self.log, Stdio::null());
     }
 
-    /// Sends a signal, unless it has ended.
+    /// Sends a signal, unless the process has ended.
     pub(crate) fn signal(&mut self, signal: &str) {
         if self.ended().is_some() {
             return;
@@ -70,19 +70,19 @@ impl Process {
         assert!(sent.success(), "no process {pid}");
     }
 
-    /// How it ended, if it has.
+    /// Returns the exit status if the process has ended.
     pub(crate) fn ended(&mut self) -> Option<ExitStatus> {
         self.child.try_wait().expect("a process")
     }
 
-    /// Asks it to end and waits for that.
+    /// Sends SIGTERM and waits for the end.
     pub(crate) fn end(&mut self) -> ExitStatus {
         self.signal("-TERM");
         self.child.wait().expect("ends")
     }
 
-    /// The last lines of its log.
-    pub(crate) fn last_words(&self) -> String {
+    /// Returns the last lines of the log.
+    pub(crate) fn log_tail(&self) -> String {
         let bytes = std::fs::read(&self.log).unwrap_or_default();
         let text = String::from_utf8_lossy(&bytes);
         let lines: Vec<&str> = text.lines().rev().take(8).collect();
@@ -97,9 +97,8 @@ impl Drop for Process {
 }
 
 fn spawn(args: &[OsString], log: &Path, stdout: Stdio) -> Child {
-    let log: File =
-        OpenOptions::new().create(true).append(true).open(log).expect("a place for logs");
-    // It ends with this process even when that is killed: its standard input then closes.
+    let log: File = OpenOptions::new().create(true).append(true).open(log).expect("a log file");
+    // The closed standard input ends the child even if this process is killed.
     Command::new(env!("CARGO_BIN_EXE_tandem"))
         .args(args)
         .arg("--exit-with-stdin")

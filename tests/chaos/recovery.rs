@@ -1,4 +1,4 @@
-//! How long a process that was killed takes to do its part again.
+//! Recovery times of killed processes.
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex};
@@ -19,11 +19,11 @@ const ASK_EVERY: Duration = Duration::from_millis(20);
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct Recovery {
     pub(crate) who: Target,
-    /// From the successor's start to its first answer, or a worker's first delivery.
+    /// Time from the restart to the first answer, or to a worker's first delivery.
     pub(crate) took: Duration,
 }
 
-/// The recoveries of a run, and those under way.
+/// The completed and active measurements of a run.
 #[derive(Debug, Default)]
 pub(crate) struct Recoveries {
     done: Arc<Mutex<Vec<Recovery>>>,
@@ -31,7 +31,7 @@ pub(crate) struct Recoveries {
 }
 
 impl Recoveries {
-    /// Forgets the measurements that a fault spoils: its target's, and those of all workers.
+    /// Discards the measurements that a fault invalidates: those of its target and of all workers.
     pub(crate) fn disturbed_by(&mut self, fault: Fault) {
         self.under_way.retain(|who, measurement| {
             let is_target = matches!(fault, Fault::Kill(hit) | Fault::Stop(hit, _) if hit == *who);
@@ -71,10 +71,10 @@ impl Recoveries {
         });
     }
 
-    /// What was measured.
+    /// Returns the measurements.
     pub(crate) fn take(self) -> Vec<Recovery> {
         self.under_way.into_values().for_each(|measurement| measurement.abort());
-        std::mem::take(&mut *self.done.lock().expect("nobody panics with it"))
+        std::mem::take(&mut *self.done.lock().expect("not poisoned"))
     }
 
     fn measure<F>(&mut self, who: Target, is_back: impl Fn() -> F + Send + 'static)
@@ -87,7 +87,7 @@ impl Recoveries {
                 tokio::time::sleep(ASK_EVERY).await;
             }
             let recovery = Recovery { who, took: started.elapsed() };
-            done.lock().expect("nobody panics with it").push(recovery);
+            done.lock().expect("not poisoned").push(recovery);
         });
         self.under_way.insert(who, measurement.abort_handle());
     }

@@ -1,4 +1,4 @@
-//! What befalls a run, and when: a pure function of a seed.
+//! The faults of a run and their times, as a pure function of a seed.
 
 use std::collections::VecDeque;
 use std::time::Duration;
@@ -13,39 +13,39 @@ pub(crate) enum Target {
 
 /// Connections that go through one proxy.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-pub(crate) enum Line {
+pub(crate) enum Link {
     WorkerToLearner(usize),
     WorkerToTeacher(usize),
     LearnerToTeacher,
 }
 
-/// How a line is disturbed for a while.
+/// A temporary disturbance of a link.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub(crate) enum Disturbance {
-    /// Nothing is forwarded, connections stay open; what was sent arrives afterwards.
+    /// Nothing is forwarded and connections stay open. Bytes sent meanwhile arrive afterwards.
     Blackhole,
     /// Requests arrive, answers do not.
     OneWay,
-    /// The far end is gone and the near end is not told; afterwards connections are closed.
+    /// The far end closes without notice to the near end. Connections are closed afterwards.
     HalfOpen,
-    /// Connections are closed and new ones refused.
+    /// Connections are closed and new ones are refused.
     Refuse,
 }
 
-/// What befalls the run.
+/// A fault of the run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Fault {
-    /// Killed, and started again at once.
+    /// Kills and immediately restarts a process.
     Kill(Target),
-    /// Stopped for so long, then continued.
+    /// Stops a process for a duration, then continues it.
     Stop(Target, Duration),
-    /// All connections of a line are closed; new ones are taken.
-    Cut(Line),
-    Disturb(Line, Disturbance, Duration),
+    /// Closes all connections of a link. New ones are accepted.
+    Cut(Link),
+    Disturb(Link, Disturbance, Duration),
 }
 
 impl Fault {
-    /// How long it lasts.
+    /// Returns the duration of the fault.
     pub(crate) fn lasts(self) -> Duration {
         match self {
             Self::Kill(_) | Self::Cut(_) => Duration::ZERO,
@@ -61,38 +61,38 @@ pub(crate) struct Event {
     pub(crate) fault: Fault,
 }
 
-/// Faults of which every hand has each once, in an order drawn anew.
-const HAND: [Kind; 12] = [
-    Kind::Kill(Who::Teacher),
-    Kind::Kill(Who::Learner),
-    Kind::Kill(Who::Worker),
-    Kind::Kill(Who::Worker),
-    Kind::Stop(Who::Teacher),
-    Kind::Stop(Who::Learner),
-    Kind::Stop(Who::Worker),
+/// The faults of a batch. Each batch contains each entry once, in a new random order.
+const BATCH: [Kind; 12] = [
+    Kind::Kill(Role::Teacher),
+    Kind::Kill(Role::Learner),
+    Kind::Kill(Role::Worker),
+    Kind::Kill(Role::Worker),
+    Kind::Stop(Role::Teacher),
+    Kind::Stop(Role::Learner),
+    Kind::Stop(Role::Worker),
     Kind::Cut,
     Kind::Disturb(Disturbance::Blackhole),
     Kind::Disturb(Disturbance::OneWay),
     Kind::Disturb(Disturbance::HalfOpen),
     Kind::Disturb(Disturbance::Refuse),
 ];
-/// Events of a hand: after so many, every kind of fault has come.
-pub(crate) const HAND_EVENTS: usize = HAND.len();
-/// A killed worker's successor has the run for itself for so long, so that its recovery can be measured.
+/// Number of events in a batch, after which every kind of fault has occurred.
+pub(crate) const BATCH_EVENTS: usize = BATCH.len();
+/// Pause of all faults after a worker is killed, so that its recovery can be measured.
 const QUIET_AFTER_WORKER_KILL: Duration = Duration::from_millis(4_000);
 /// Shortest and longest duration of a fault.
 const LASTS_MILLIS: (u64, u64) = (500, 6_000);
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Kind {
-    Kill(Who),
-    Stop(Who),
+    Kill(Role),
+    Stop(Role),
     Cut,
     Disturb(Disturbance),
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Who {
+enum Role {
     Teacher,
     Learner,
     Worker,
@@ -104,20 +104,21 @@ pub(crate) struct Schedule {
     random: Random,
     n_workers: usize,
     every: Duration,
-    hand: VecDeque<Kind>,
+    batch: VecDeque<Kind>,
     next_at: Duration,
-    /// When every fault so far is over.
+    /// Time at which every fault so far is over.
     over_at: Duration,
 }
 
 impl Schedule {
-    /// A fault every `every` on a run of `n_workers`; a worker's death is moved to where nothing else is the matter.
+    /// Creates a schedule with a fault every `every` for a run with `n_workers`. Kills of workers are delayed until no other
+    /// fault is active.
     pub(crate) fn new(seed: u64, n_workers: usize, every: Duration) -> Self {
         Self {
             random: Random(seed),
             n_workers,
             every,
-            hand: VecDeque::new(),
+            batch: VecDeque::new(),
             next_at: every,
             over_at: Duration::ZERO,
         }
@@ -125,26 +126,26 @@ impl Schedule {
 
     fn fault(&mut self, kind: Kind) -> Fault {
         match kind {
-            Kind::Kill(who) => Fault::Kill(self.target(who)),
-            Kind::Stop(who) => Fault::Stop(self.target(who), self.lasts()),
-            Kind::Cut => Fault::Cut(self.line()),
-            Kind::Disturb(how) => Fault::Disturb(self.line(), how, self.lasts()),
+            Kind::Kill(role) => Fault::Kill(self.target(role)),
+            Kind::Stop(role) => Fault::Stop(self.target(role), self.lasts()),
+            Kind::Cut => Fault::Cut(self.link()),
+            Kind::Disturb(how) => Fault::Disturb(self.link(), how, self.lasts()),
         }
     }
 
-    fn target(&mut self, who: Who) -> Target {
-        match who {
-            Who::Teacher => Target::Teacher,
-            Who::Learner => Target::Learner,
-            Who::Worker => Target::Worker(self.random.below(self.n_workers)),
+    fn target(&mut self, role: Role) -> Target {
+        match role {
+            Role::Teacher => Target::Teacher,
+            Role::Learner => Target::Learner,
+            Role::Worker => Target::Worker(self.random.below(self.n_workers)),
         }
     }
 
-    fn line(&mut self) -> Line {
+    fn link(&mut self) -> Link {
         match self.random.below(3) {
-            0 => Line::WorkerToLearner(self.random.below(self.n_workers)),
-            1 => Line::WorkerToTeacher(self.random.below(self.n_workers)),
-            _ => Line::LearnerToTeacher,
+            0 => Link::WorkerToLearner(self.random.below(self.n_workers)),
+            1 => Link::WorkerToTeacher(self.random.below(self.n_workers)),
+            _ => Link::LearnerToTeacher,
         }
     }
 
@@ -158,12 +159,12 @@ impl Iterator for Schedule {
     type Item = Event;
 
     fn next(&mut self) -> Option<Event> {
-        if self.hand.is_empty() {
-            let mut hand = HAND;
-            self.random.shuffle(&mut hand);
-            self.hand.extend(hand);
+        if self.batch.is_empty() {
+            let mut batch = BATCH;
+            self.random.shuffle(&mut batch);
+            self.batch.extend(batch);
         }
-        let fault = self.hand.pop_front().map(|kind| self.fault(kind))?;
+        let fault = self.batch.pop_front().map(|kind| self.fault(kind))?;
         let kills_worker = matches!(fault, Fault::Kill(Target::Worker(_)));
         let at = if kills_worker { self.next_at.max(self.over_at) } else { self.next_at };
         self.over_at = self.over_at.max(at + fault.lasts());
@@ -180,10 +181,10 @@ struct Random(u64);
 impl Random {
     fn next(&mut self) -> u64 {
         self.0 = self.0.wrapping_add(0x9E37_79B9_7F4A_7C15);
-        let mut word = self.0;
-        word = (word ^ (word >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
-        word = (word ^ (word >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
-        word ^ (word >> 31)
+        let mut bits = self.0;
+        bits = (bits ^ (bits >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
+        bits = (bits ^ (bits >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
+        bits ^ (bits >> 31)
     }
 
     #[expect(clippy::cast_possible_truncation, reason = "smaller than the bound")]
@@ -217,9 +218,9 @@ mod tests {
     }
 
     #[test]
-    fn every_hand_has_every_kind_of_fault() {
-        for hand in events(1, 20 * HAND_EVENTS).chunks(HAND_EVENTS) {
-            let names: BTreeSet<String> = hand
+    fn every_batch_contains_every_kind_of_fault() {
+        for batch in events(1, 20 * BATCH_EVENTS).chunks(BATCH_EVENTS) {
+            let names: BTreeSet<String> = batch
                 .iter()
                 .map(|event| match event.fault {
                     Fault::Kill(target) | Fault::Stop(target, _) => {
@@ -232,25 +233,29 @@ mod tests {
                     Fault::Disturb(_, how, _) => format!("{how:?}"),
                 })
                 .collect();
-            assert_eq!(names.len(), HAND_EVENTS - 1, "two of a hand kill a worker: {names:?}");
+            assert_eq!(
+                names.len(),
+                BATCH_EVENTS - 1,
+                "two faults of a batch kill a worker: {names:?}"
+            );
         }
     }
 
     #[test]
-    fn every_worker_and_line_gets_its_share() {
+    fn every_worker_and_link_is_disturbed() {
         let mut targets = BTreeSet::new();
-        let mut lines = BTreeSet::new();
+        let mut links = BTreeSet::new();
         for event in events(3, 600) {
             match event.fault {
                 Fault::Kill(target) | Fault::Stop(target, _) => drop(targets.insert(target)),
-                Fault::Cut(line) | Fault::Disturb(line, ..) => drop(lines.insert(line)),
+                Fault::Cut(link) | Fault::Disturb(link, ..) => drop(links.insert(link)),
             }
         }
-        assert_eq!((targets.len(), lines.len()), (6, 9));
+        assert_eq!((targets.len(), links.len()), (6, 9));
     }
 
     #[test]
-    fn faults_come_at_their_pace_and_leave_a_killed_workers_successor_alone() {
+    fn faults_keep_their_interval_and_spare_the_successor_of_a_killed_worker() {
         let events = events(11, 500);
         let mut over_at = Duration::ZERO;
         for (event, next) in events.iter().zip(&events[1..]) {

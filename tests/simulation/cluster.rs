@@ -1,7 +1,7 @@
-//! A whole run on a simulated network: a teacher, a learner and workers, each on a host of its own.
+//! A whole run on a simulated network: a teacher, a learner and workers, each on its own host.
 //!
-//! All three are the real ones. What a crashed learner's thread still writes goes to a directory that nobody reads any
-//! more: the next learner gets what was on the disk at the moment of the crash.
+//! All three run the production code. The next learner starts from the files on disk at the moment of a crash. Later
+//! writes of the crashed learner's thread go to an abandoned directory.
 
 use std::cell::{Cell, RefCell};
 use std::fs;
@@ -21,8 +21,8 @@ use tandem_telemetry::MetricsLog;
 use tandem_worker::{WorkerConfig, run};
 use tokio_util::sync::CancellationToken;
 
-use crate::books::{Ledgers, SharedBook, Watched};
-use crate::machines::{House, Machines, with_causes};
+use crate::ledgers::{Ledgers, ObservedLedger, SharedRecord};
+use crate::machines::{Machines, ProcessTracker, with_causes};
 use crate::network::{address, dial, listen};
 use crate::schedule::{Host, Schedule};
 use crate::system;
@@ -34,45 +34,45 @@ pub(crate) const LEARNER: Host = "learner";
 /// Hosts of the workers.
 pub(crate) const WORKERS: [Host; 5] = ["worker-1", "worker-2", "worker-3", "worker-4", "worker-5"];
 
-/// Numbers of workers that each learner has for itself.
+/// Number of worker ids reserved for each learner.
 const WORKER_NUMBERS: u64 = 1000;
 
-/// A run and who takes part in it.
+/// A run and its participants.
 pub(crate) struct Scenario {
     pub(crate) run: RunConfig,
     pub(crate) workers: &'static [Host],
     pub(crate) ledgers: Ledgers,
 }
 
-/// How a run ended.
+/// The result of a run.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(crate) struct Outcome {
     pub(crate) digest: String,
     pub(crate) n_rounds: u64,
     /// Units of advice spent, set aside and left.
     pub(crate) units: [u64; 3],
-    /// Rounds after which the policy was judged.
-    pub(crate) judged: Vec<u64>,
-    /// Counters, balance and evaluations in every detail, without the time they took.
+    /// Rounds after which the policy was evaluated.
+    pub(crate) evaluated: Vec<u64>,
+    /// Counters, balance and evaluations in full, without wall times.
     pub(crate) details: String,
 }
 
-/// What happened on the way.
+/// Statistics of a simulated run.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
-pub(crate) struct Course {
-    /// Simulated time that it took.
+pub(crate) struct Statistics {
+    /// Simulated duration.
     pub(crate) took: Duration,
-    /// Steps that the teacher was asked about again.
+    /// Number of repeated requests for a step.
     pub(crate) n_repeats: u64,
-    /// Learners that went on from a checkpoint.
+    /// Number of learners that resumed from a checkpoint.
     pub(crate) n_resumed: u64,
-    /// Teachers that started.
+    /// Number of teacher starts.
     pub(crate) n_teachers: u64,
-    /// Workers that started.
+    /// Number of worker starts.
     pub(crate) n_workers: u64,
 }
 
-impl Course {
+impl Statistics {
     pub(crate) fn plus(self, other: &Self) -> Self {
         Self {
             took: self.took + other.took,
@@ -84,85 +84,85 @@ impl Course {
     }
 }
 
-/// The pairs of hosts that talk to each other.
+/// Returns the pairs of hosts that communicate.
 pub(crate) fn links(workers: &[Host]) -> Vec<(Host, Host)> {
     let of_workers = workers.iter().flat_map(|worker| SERVICES.map(|service| (*worker, service)));
     of_workers.chain([(LEARNER, TEACHER)]).collect()
 }
 
-/// Lets `scenario` go through `schedule`; gives how it ended, or what went wrong that must not.
+/// Simulates `scenario` under `schedule`. Returns its outcome, or the first violation.
 pub(crate) fn simulate(
     scenario: &Scenario,
     schedule: &Schedule,
-) -> Result<(Outcome, Course), String> {
+) -> Result<(Outcome, Statistics), String> {
     simulate_with(scenario, schedule, |_| {})
 }
 
-/// [`simulate`] with further hosts, which `invite` adds.
+/// [`simulate`] with further hosts, added by `add_hosts`.
 pub(crate) fn simulate_with<'a>(
     scenario: &'a Scenario,
     schedule: &'a Schedule,
-    invite: impl FnOnce(&mut Machines<'a>),
-) -> Result<(Outcome, Course), String> {
-    let house = Rc::default();
-    let stage = Rc::new(Stage::new(scenario.run.clone(), &house));
-    let disk = Rc::clone(&stage);
+    add_hosts: impl FnOnce(&mut Machines<'a>),
+) -> Result<(Outcome, Statistics), String> {
+    let tracker = Rc::default();
+    let state = Rc::new(PersistentState::new(scenario.run.clone(), &tracker));
+    let disk = Rc::clone(&state);
     let before_crash = move |host| {
         if host == LEARNER {
             disk.keep_learner_disk();
         }
     };
-    let mut machines = Machines::new(schedule, &house, links(scenario.workers), before_crash);
-    let for_teacher = Rc::clone(&stage);
+    let mut machines = Machines::new(schedule, &tracker, links(scenario.workers), before_crash);
+    let for_teacher = Rc::clone(&state);
     machines.add(TEACHER, move || {
-        let ledger = Watched::new(scenario.ledgers.open(), for_teacher.book.clone());
+        let ledger = ObservedLedger::new(scenario.ledgers.open(), for_teacher.record.clone());
         Rc::clone(&for_teacher).teacher(ledger)
     });
-    let for_learner = Rc::clone(&stage);
+    let for_learner = Rc::clone(&state);
     machines.add(LEARNER, move || Rc::clone(&for_learner).learner());
     for worker in scenario.workers {
-        let for_worker = Rc::clone(&stage);
+        let for_worker = Rc::clone(&state);
         machines.add(worker, move || Rc::clone(&for_worker).worker(worker));
     }
-    invite(&mut machines);
-    let ended = machines.run_until(|| stage.ended.borrow_mut().take());
-    let course = Course { took: machines.elapsed(), ..stage.course.get() };
+    add_hosts(&mut machines);
+    let ended = machines.run_until(|| state.ended.borrow_mut().take());
+    let statistics = Statistics { took: machines.elapsed(), ..state.statistics.get() };
     machines.end();
-    let outcome = stage.outcome(&scenario.ledgers, ended??)?;
-    let n_repeats = stage.book.lock().expect("nobody panics").n_repeats;
-    Ok((outcome, Course { n_repeats, ..course }))
+    let outcome = state.outcome(&scenario.ledgers, ended??)?;
+    let n_repeats = state.record.lock().expect("not poisoned").n_repeats;
+    Ok((outcome, Statistics { n_repeats, ..statistics }))
 }
 
-/// What outlives the processes on the hosts: the learner's directories, and what was seen.
-struct Stage {
+/// State that outlives the processes: the learner's directories and the observations.
+struct PersistentState {
     run: RunConfig,
-    house: Rc<House>,
-    book: SharedBook,
-    /// Learners that have started. Each has a directory of its own.
+    tracker: Rc<ProcessTracker>,
+    record: SharedRecord,
+    /// Number of learner starts. Each learner has its own directory.
     n_learners: Cell<u64>,
-    course: Cell<Course>,
-    /// What the learner says at the end: the digest.
+    statistics: Cell<Statistics>,
+    /// The digest that the learner returned, or its error.
     ended: RefCell<Option<Result<String, String>>>,
 }
 
-impl Stage {
-    fn new(run: RunConfig, house: &Rc<House>) -> Self {
+impl PersistentState {
+    fn new(run: RunConfig, tracker: &Rc<ProcessTracker>) -> Self {
         Self {
             run,
-            house: Rc::clone(house),
-            book: Arc::new(Mutex::default()),
+            tracker: Rc::clone(tracker),
+            record: Arc::new(Mutex::default()),
             n_learners: Cell::new(0),
-            course: Cell::default(),
+            statistics: Cell::default(),
             ended: RefCell::default(),
         }
     }
 
-    /// The run directory of the learner that started as number `number`, from 1.
+    /// Returns the run directory of the `number`th learner, counted from 1.
     fn learner_directory(number: u64) -> PathBuf {
         PathBuf::from(format!("learner-{number}"))
     }
 
-    /// Hands what is on the learner's disk at this moment to the learner that will start next.
+    /// Copies the learner's current files to the directory of the next learner.
     fn keep_learner_disk(&self) {
         let (from, to) = (
             Self::learner_directory(self.n_learners.get()),
@@ -173,7 +173,7 @@ impl Stage {
             let name = path.file_name().expect("a file").to_owned();
             fs::copy(&path, to.join("checkpoint").join(name)).expect("a copy");
         }
-        // There is none before the first evaluation.
+        // The file does not exist before the first evaluation.
         drop(fs::copy(from.join("metrics.jsonl"), to.join("metrics.jsonl")));
     }
 
@@ -182,9 +182,11 @@ impl Stage {
         self.n_learners.set(number);
         let out = Self::learner_directory(number);
         let resume = !checkpoint::list(&out.join("checkpoint")).is_empty();
-        self.course
-            .update(|course| Course { n_resumed: course.n_resumed + u64::from(resume), ..course });
-        let life = self.house.life_of(LEARNER);
+        self.statistics.update(|statistics| Statistics {
+            n_resumed: statistics.n_resumed + u64::from(resume),
+            ..statistics
+        });
+        let lifetime = self.tracker.lifetime_token(LEARNER);
         let config = LearnerConfig {
             run: self.run.clone(),
             gate: ServerConfig::default(),
@@ -197,14 +199,14 @@ impl Stage {
             run_file: None,
             n_threads: 1,
             clock: Arc::new(move || {
-                let _life = &life;
+                let _lifetime = &lifetime;
                 system::now()
             }),
             version: "simulated".to_owned(),
             first_worker: number * WORKER_NUMBERS,
             pacing: Pacing::Lockstep,
         };
-        // A crash drops this future and cancels the token: what is left of the learner's thread then ends.
+        // A crash drops this future and cancels the token, which ends the learner's thread.
         let shutdown = CancellationToken::new();
         let _crash = shutdown.clone().drop_guard();
         let ended = match tandem_learner::serve(config, listen().await?, shutdown).await {
@@ -216,21 +218,25 @@ impl Stage {
         Ok(())
     }
 
-    async fn teacher(self: Rc<Self>, ledger: Watched) -> turmoil::Result {
-        self.course.update(|course| Course { n_teachers: course.n_teachers + 1, ..course });
+    async fn teacher(self: Rc<Self>, ledger: ObservedLedger) -> turmoil::Result {
+        self.statistics.update(|statistics| Statistics {
+            n_teachers: statistics.n_teachers + 1,
+            ..statistics
+        });
         let policy = OneArmPolicy::new(teacher_policy())?;
         let advisor = Advisor::new(Box::new(policy), Box::new(ledger))?;
-        let (gate, for_ever) = (ServerConfig::default(), CancellationToken::new());
+        let (gate, shutdown) = (ServerConfig::default(), CancellationToken::new());
         let served =
-            serve_advisor(advisor, listen().await?, &gate, for_ever, Pacing::Lockstep).await;
+            serve_advisor(advisor, listen().await?, &gate, shutdown, Pacing::Lockstep).await;
         if let Err(error) = served {
-            self.house.complain(with_causes(TEACHER, &error));
+            self.tracker.report_violation(with_causes(TEACHER, &error));
         }
         Ok(())
     }
 
     async fn worker(self: Rc<Self>, host: Host) -> turmoil::Result {
-        self.course.update(|course| Course { n_workers: course.n_workers + 1, ..course });
+        self.statistics
+            .update(|statistics| Statistics { n_workers: statistics.n_workers + 1, ..statistics });
         let config = WorkerConfig {
             client: dial(),
             learner: address(LEARNER),
@@ -239,18 +245,19 @@ impl Stage {
             log_dir: None,
             pacing: Pacing::Lockstep,
         };
-        if let Err(error) = run(config, self.house.leave_of(host)).await {
-            self.house.complain(with_causes(host, &error));
+        if let Err(error) = run(config, self.tracker.shutdown_token(host)).await {
+            self.tracker.report_violation(with_causes(host, &error));
         }
         Ok(())
     }
 
-    /// How the run that gave `digest` ended, according to everything that is left of it.
+    /// Returns the outcome of the run that ended with `digest`, from its files, ledger and record.
     fn outcome(&self, ledgers: &Ledgers, digest: String) -> Result<Outcome, String> {
-        let book = self.book.lock().expect("nobody panics");
-        let complaint = self.house.complaint().or_else(|| book.complaints.first().cloned());
-        if let Some(complaint) = complaint {
-            return Err(complaint);
+        let record = self.record.lock().expect("not poisoned");
+        let violation =
+            self.tracker.first_violation().or_else(|| record.violations.first().cloned());
+        if let Some(violation) = violation {
+            return Err(violation);
         }
         let directory = Self::learner_directory(self.n_learners.get());
         let mut metrics = MetricsLog::read_all(&directory.join("metrics.jsonl"))
@@ -259,17 +266,17 @@ impl Stage {
         let checkpoints = directory.join("checkpoint");
         let loaded =
             checkpoint::load_newest(&checkpoints, &self.run).map_err(|error| error.to_string())?;
-        let trainer = loaded.ok_or("no checkpoint is left")?.trainer;
+        let trainer = loaded.ok_or("no checkpoint")?.trainer;
         if trainer.digest() != digest {
-            return Err("the last checkpoint is not what the run ended with".to_owned());
+            return Err("the last checkpoint differs from the result of the run".to_owned());
         }
         let account = self.run.name.as_str();
-        if book.accounts() != [account] {
-            return Err(format!("a run has one account, not {:?}", book.accounts()));
+        if record.accounts() != [account] {
+            return Err(format!("a run has one account, not {:?}", record.accounts()));
         }
         let balance = ledgers.open().balance(account).map_err(|error| error.to_string())?;
         let counters = trainer.counters();
-        let (n_charged, n_arrived) = (book.n_charged(account), counters.advice_spent);
+        let (n_charged, n_arrived) = (record.n_charged(account), counters.advice_spent);
         if [n_charged, n_arrived] != [balance.spent; 2] {
             let spent = balance.spent;
             return Err(format!(
@@ -280,13 +287,13 @@ impl Stage {
             digest,
             n_rounds: counters.round,
             units: [balance.spent, balance.leased, balance.left],
-            judged: metrics.iter().map(|row| row.round).collect(),
+            evaluated: metrics.iter().map(|row| row.round).collect(),
             details: format!("{counters:?} {balance:?} {metrics:?}"),
         })
     }
 }
 
-/// The policy that teaches.
+/// Returns the teacher's policy.
 fn teacher_policy() -> &'static Policy {
     static POLICY: OnceLock<Policy> = OnceLock::new();
     POLICY.get_or_init(|| {

@@ -1,4 +1,4 @@
-//! A teacher alone on a simulated network, asked by many at once who have no leases and share one account.
+//! A teacher on a simulated network with many concurrent clients that share one account and have no leases.
 
 use std::cell::RefCell;
 use std::collections::{BTreeMap, BTreeSet};
@@ -14,13 +14,13 @@ use tandem_teacher::{Advisor, TeacherPolicy, serve_advisor};
 use tokio_util::sync::CancellationToken;
 use tonic::{Response, Status};
 
-use crate::books::{Ledgers, SharedBook, Watched};
-use crate::machines::{House, Machines, with_causes};
+use crate::ledgers::{Ledgers, ObservedLedger, SharedRecord};
+use crate::machines::{Machines, ProcessTracker, with_causes};
 use crate::network::{address, dial, listen};
 use crate::schedule::{Host, Schedule};
 
 const TEACHER: Host = "teacher";
-/// Hosts of those who ask.
+/// Hosts of the clients.
 const CLIENTS: [Host; 16] = [
     "client-1",
     "client-2",
@@ -44,65 +44,64 @@ const N_EPISODES: u64 = 12;
 /// Steps of each, in requests of [`STEPS_PER_REQUEST`].
 const N_STEPS: u32 = 60;
 const STEPS_PER_REQUEST: u32 = 6;
-/// Less than they ask for.
+/// Less than the clients request.
 pub(crate) const BUDGET: u64 = 500;
 const ACCOUNT: &str = "crowd";
-/// Simulated time within which most of what goes wrong begins.
+/// Simulated time within which most faults start.
 const SPAN: Duration = Duration::from_secs(1);
-/// For an answer; who waits longer asks again.
+/// Timeout of a request, after which the client retries.
 const ANSWER: Duration = Duration::from_secs(2);
 const PAUSE: Duration = Duration::from_millis(50);
 
-/// Lets the crowd ask while much goes wrong; gives how many times a step was asked about again, or what went wrong
-/// that must not.
+/// Simulates the crowd under faults. Returns the number of repeated requests for a step, or the first violation.
 pub(crate) fn simulate_crowd(seed: u64, ledgers: &Ledgers) -> Result<u64, String> {
     let links: Vec<(Host, Host)> = CLIENTS.iter().map(|client| (*client, TEACHER)).collect();
     let schedule = Schedule::draw(seed, &links, &[TEACHER], &CLIENTS, SPAN);
-    let stage = Rc::new(Stage::default());
-    let mut machines = Machines::new(&schedule, &stage.house, links, |_| {});
-    let for_teacher = Rc::clone(&stage);
+    let state = Rc::new(CrowdState::default());
+    let mut machines = Machines::new(&schedule, &state.tracker, links, |_| {});
+    let for_teacher = Rc::clone(&state);
     machines.add(TEACHER, move || {
-        let ledger = Watched::new(ledgers.open(), for_teacher.book.clone());
+        let ledger = ObservedLedger::new(ledgers.open(), for_teacher.record.clone());
         Rc::clone(&for_teacher).teacher(ledger)
     });
     for (client_idx, client) in CLIENTS.iter().enumerate() {
-        let for_client = Rc::clone(&stage);
+        let for_client = Rc::clone(&state);
         machines.add(client, move || Rc::clone(&for_client).client(client_idx));
     }
-    let ended = machines.run_until(|| stage.have_all_asked().then_some(()));
+    let ended = machines.run_until(|| state.have_all_finished().then_some(()));
     machines.end();
-    let told = |what| format!("{what}\n{schedule}");
-    ended.and_then(|()| stage.check(ledgers)).map_err(told)
+    let describe = |what| format!("{what}\n{schedule}");
+    ended.and_then(|()| state.check(ledgers)).map_err(describe)
 }
 
-/// What outlives the processes on the hosts.
-struct Stage {
-    house: Rc<House>,
-    book: SharedBook,
-    /// What clients were told of steps, by episode and step.
+/// State that outlives the processes.
+struct CrowdState {
+    tracker: Rc<ProcessTracker>,
+    record: SharedRecord,
+    /// The clients' answers by episode and step: true if charged.
     charged: RefCell<BTreeMap<(u64, u32), bool>>,
-    have_asked: RefCell<BTreeSet<usize>>,
+    finished: RefCell<BTreeSet<usize>>,
 }
 
-impl Default for Stage {
+impl Default for CrowdState {
     fn default() -> Self {
         Self {
-            house: Rc::default(),
-            book: Arc::new(Mutex::default()),
+            tracker: Rc::default(),
+            record: Arc::new(Mutex::default()),
             charged: RefCell::default(),
-            have_asked: RefCell::default(),
+            finished: RefCell::default(),
         }
     }
 }
 
-impl Stage {
-    async fn teacher(self: Rc<Self>, ledger: Watched) -> turmoil::Result {
-        let advisor = Advisor::new(Box::new(Still), Box::new(ledger))?;
-        let (gate, for_ever) = (ServerConfig::default(), CancellationToken::new());
+impl CrowdState {
+    async fn teacher(self: Rc<Self>, ledger: ObservedLedger) -> turmoil::Result {
+        let advisor = Advisor::new(Box::new(StillTeacher), Box::new(ledger))?;
+        let (gate, shutdown) = (ServerConfig::default(), CancellationToken::new());
         let served =
-            serve_advisor(advisor, listen().await?, &gate, for_ever, Pacing::Lockstep).await;
+            serve_advisor(advisor, listen().await?, &gate, shutdown, Pacing::Lockstep).await;
         if let Err(error) = served {
-            self.house.complain(with_causes(TEACHER, &error));
+            self.tracker.report_violation(with_causes(TEACHER, &error));
         }
         Ok(())
     }
@@ -129,49 +128,50 @@ impl Stage {
             })
             .await;
             for (step, advice) in (first..).zip(answer.steps) {
-                self.hear(episode, step, advice.charged);
+                self.record_answer(episode, step, advice.charged);
             }
         }
-        self.have_asked.borrow_mut().insert(client_idx);
+        self.finished.borrow_mut().insert(client_idx);
         Ok(())
     }
 
-    fn hear(&self, episode: u64, step: u32, charged: bool) {
+    fn record_answer(&self, episode: u64, step: u32, charged: bool) {
         let before = self.charged.borrow_mut().insert((episode, step), charged);
         if before.is_some_and(|before| before != charged) {
-            self.house.complain(format!(
-                "one heard of step {step} of episode {episode} charged: {charged}, another the opposite"
+            self.tracker.report_violation(format!(
+                "the answers about step {step} of episode {episode} differ: charged {charged} and the opposite"
             ));
         }
     }
 
-    fn have_all_asked(&self) -> bool {
-        self.have_asked.borrow().len() == CLIENTS.len()
+    fn have_all_finished(&self) -> bool {
+        self.finished.borrow().len() == CLIENTS.len()
     }
 
-    /// Each unit is one step's, and none is left over.
+    /// Checks that each unit pays for exactly one step and that none is left.
     fn check(&self, ledgers: &Ledgers) -> Result<u64, String> {
-        let book = self.book.lock().expect("nobody panics");
-        let complaint = self.house.complaint().or_else(|| book.complaints.first().cloned());
-        if let Some(complaint) = complaint {
-            return Err(complaint);
+        let record = self.record.lock().expect("not poisoned");
+        let violation =
+            self.tracker.first_violation().or_else(|| record.violations.first().cloned());
+        if let Some(violation) = violation {
+            return Err(violation);
         }
         let balance = ledgers.open().balance(ACCOUNT).map_err(|error| error.to_string())?;
         let charged = self.charged.borrow();
-        let n_heard = charged.values().filter(|charged| **charged).count() as u64;
-        let counts = [n_heard, book.n_charged(ACCOUNT), balance.spent];
+        let n_reported = charged.values().filter(|charged| **charged).count() as u64;
+        let counts = [n_reported, record.n_charged(ACCOUNT), balance.spent];
         let n_steps = u64::from(N_STEPS) * N_EPISODES;
         if charged.len() as u64 != n_steps || counts != [BUDGET; 3] || balance.left != 0 {
             let n_answered = charged.len();
             return Err(format!(
-                "of {n_answered} steps answered {counts:?} are charged: heard, written down, spent; {balance:?}"
+                "of {n_answered} answered steps, {counts:?} were charged (clients, record, account); {balance:?}"
             ));
         }
-        Ok(book.n_repeats)
+        Ok(record.n_repeats)
     }
 }
 
-/// Asks until there is an answer.
+/// Repeats a call until it succeeds.
 async fn ask<T, F>(
     client: &TeacherClient<AuthChannel>,
     call: impl Fn(TeacherClient<AuthChannel>) -> F,
@@ -201,9 +201,9 @@ fn query(episode: u64, step: u32) -> pb::StepQuery {
 }
 
 /// A teacher that keeps its arm still.
-struct Still;
+struct StillTeacher;
 
-impl TeacherPolicy for Still {
+impl TeacherPolicy for StillTeacher {
     fn layout(&self) -> Layout {
         STILL
     }

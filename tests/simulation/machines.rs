@@ -1,8 +1,8 @@
-//! The machines of a simulation: run them through a schedule.
+//! The hosts of a simulation and the execution of its schedule.
 //!
-//! A host's tasks run on the simulation's thread, which waits for what they let other threads compute. A crash ends a
-//! host's tasks at once. Its threads end as soon as they want something of the host, or are told to stop, and can reach
-//! nothing meanwhile; time moves on when they have ended.
+//! A host's tasks run on the simulation's thread, which waits for computations on other threads. A crash ends the tasks
+//! immediately. Threads of the crashed host end when they next use the host or are cancelled. Until then they cannot
+//! reach anything, and simulated time does not advance.
 
 use std::cell::RefCell;
 use std::collections::BTreeMap;
@@ -16,86 +16,86 @@ use turmoil::Sim;
 use crate::schedule::{Event, Host, Schedule};
 use crate::{system, trace};
 
-/// How much simulated time passes at a time.
+/// Simulated time per step.
 const TICK: Duration = Duration::from_millis(5);
-/// What takes so much simulated time never ends.
-const NEVER: Duration = Duration::from_secs(3600);
-/// What is left of a crashed host ends within so many milliseconds of real time.
-const LAST_BREATH_MILLIS: u32 = 60_000;
+/// Simulated time after which a run counts as hanging.
+const TIME_LIMIT: Duration = Duration::from_secs(3600);
+/// Real time within which the threads of a crashed host must end, in milliseconds.
+const CRASH_TIMEOUT_MILLIS: u32 = 60_000;
 
-/// What the processes on the hosts and the one who runs the machines share.
+/// State shared between the processes on the hosts and the simulation.
 #[derive(Default)]
-pub(crate) struct House {
-    /// What started last on a host, as long as anything of it is left.
-    lives: RefCell<BTreeMap<Host, Weak<()>>>,
-    /// Tell processes to leave.
-    leave: RefCell<BTreeMap<Host, CancellationToken>>,
-    /// What must not have happened.
-    complaints: RefCell<Vec<String>>,
+pub(crate) struct ProcessTracker {
+    /// Lifetime of the latest process of each host, until its last thread has ended.
+    lifetimes: RefCell<BTreeMap<Host, Weak<()>>>,
+    /// Tokens that ask processes to leave.
+    shutdowns: RefCell<BTreeMap<Host, CancellationToken>>,
+    /// Violations so far.
+    violations: RefCell<Vec<String>>,
 }
 
-impl House {
-    /// Shows that what starts on `host` lives, until every clone is dropped.
-    pub(crate) fn life_of(&self, host: Host) -> Arc<()> {
-        let life = Arc::new(());
-        self.lives.borrow_mut().insert(host, Arc::downgrade(&life));
-        life
+impl ProcessTracker {
+    /// Returns a token that marks the new process on `host` as alive until every clone is dropped.
+    pub(crate) fn lifetime_token(&self, host: Host) -> Arc<()> {
+        let lifetime = Arc::new(());
+        self.lifetimes.borrow_mut().insert(host, Arc::downgrade(&lifetime));
+        lifetime
     }
 
-    /// Cancelled when what starts on `host` is to leave.
-    pub(crate) fn leave_of(&self, host: Host) -> CancellationToken {
-        let leave = CancellationToken::new();
-        self.leave.borrow_mut().insert(host, leave.clone());
-        leave
+    /// Returns the token that is cancelled when the new process on `host` is asked to leave.
+    pub(crate) fn shutdown_token(&self, host: Host) -> CancellationToken {
+        let shutdown = CancellationToken::new();
+        self.shutdowns.borrow_mut().insert(host, shutdown.clone());
+        shutdown
     }
 
-    /// Notes that a process gave up.
-    pub(crate) fn complain(&self, complaint: String) {
-        self.complaints.borrow_mut().push(complaint);
+    /// Records a violation, such as a process that gave up.
+    pub(crate) fn report_violation(&self, violation: String) {
+        self.violations.borrow_mut().push(violation);
     }
 
-    /// What was complained of first.
-    pub(crate) fn complaint(&self) -> Option<String> {
-        self.complaints.borrow().first().cloned()
+    /// Returns the first violation.
+    pub(crate) fn first_violation(&self) -> Option<String> {
+        self.violations.borrow().first().cloned()
     }
 
-    /// Waits, in real time, until nothing is left of what started last on `host`.
+    /// Waits, in real time, until the latest process on `host` has ended completely.
     fn wait_until_gone(&self, host: Host) {
-        let lives = self.lives.borrow();
-        let Some(life) = lives.get(host) else { return };
-        let mut looks = (0..LAST_BREATH_MILLIS).map(|millis| {
+        let lifetimes = self.lifetimes.borrow();
+        let Some(lifetime) = lifetimes.get(host) else { return };
+        let mut polls = (0..CRASH_TIMEOUT_MILLIS).map(|millis| {
             std::thread::sleep(Duration::from_millis(u64::from(millis.min(1))));
-            life.strong_count() == 0
+            lifetime.strong_count() == 0
         });
-        assert!(looks.any(|is_gone| is_gone), "something of {host}, which crashed, goes on and on");
+        assert!(polls.any(|is_gone| is_gone), "a thread of the crashed {host} did not end");
     }
 }
 
-/// Hosts, the network between them, and what goes wrong.
+/// The hosts, the network between them and the schedule of faults.
 pub(crate) struct Machines<'a> {
     sim: Sim<'a>,
     schedule: &'a Schedule,
-    house: Rc<House>,
+    tracker: Rc<ProcessTracker>,
     links: Vec<(Host, Host)>,
     hosts: Vec<Host>,
-    /// Called before a host that runs crashes.
+    /// Called before a running host crashes.
     before_crash: Box<dyn Fn(Host) + 'a>,
-    /// Hosts that crashed and are not to start yet.
+    /// Crashed hosts that have not been restarted.
     down: Vec<Host>,
 }
 
 impl<'a> Machines<'a> {
-    /// Machines without hosts, of which those will talk to each other that `links` names.
+    /// Creates a simulation without hosts. `links` names the pairs of hosts that will communicate.
     pub(crate) fn new(
         schedule: &'a Schedule,
-        house: &Rc<House>,
+        tracker: &Rc<ProcessTracker>,
         links: Vec<(Host, Host)>,
         before_crash: impl Fn(Host) + 'a,
     ) -> Self {
         let sim = turmoil::Builder::new()
             .rng_seed(schedule.seed)
             .tick_duration(TICK)
-            .simulation_duration(NEVER)
+            .simulation_duration(TIME_LIMIT)
             .max_message_latency(schedule.max_latency)
             .fail_rate(schedule.loss)
             .tcp_capacity(1024)
@@ -104,7 +104,7 @@ impl<'a> Machines<'a> {
         Self {
             sim,
             schedule,
-            house: Rc::clone(house),
+            tracker: Rc::clone(tracker),
             links,
             hosts: Vec::new(),
             before_crash: Box::new(before_crash),
@@ -121,31 +121,31 @@ impl<'a> Machines<'a> {
         self.hosts.push(host);
     }
 
-    /// Simulated time that has passed.
+    /// Returns the elapsed simulated time.
     pub(crate) fn elapsed(&self) -> Duration {
         self.sim.elapsed()
     }
 
-    /// Runs until `ended` gives something.
+    /// Runs until `ended` returns a value.
     pub(crate) fn run_until<T>(&mut self, ended: impl Fn() -> Option<T>) -> Result<T, String> {
         let mut events = self.schedule.events.iter().copied().peekable();
-        let mut is_calm = false;
+        let mut is_quiet = false;
         loop {
             let now = self.sim.elapsed();
             while let Some((_, event)) = events.next_if(|(at, _)| *at <= now) {
                 self.apply(event);
             }
-            if !is_calm && now >= self.schedule.calm_from {
-                is_calm = true;
-                self.calm_down();
+            if !is_quiet && now >= self.schedule.quiet_from {
+                is_quiet = true;
+                self.end_faults();
             }
             self.sim.step().map_err(|error| error.to_string())?;
             system::set_now(self.sim.elapsed());
             if let Some(ended) = ended() {
                 return Ok(ended);
             }
-            if now >= NEVER {
-                return Err(format!("no end after {NEVER:?}"));
+            if now >= TIME_LIMIT {
+                return Err(format!("no end after {TIME_LIMIT:?}"));
             }
         }
     }
@@ -159,8 +159,8 @@ impl<'a> Machines<'a> {
                 self.sim.bounce(host);
             }
             Event::Leave(host) => {
-                if let Some(leave) = self.house.leave.borrow().get(host) {
-                    leave.cancel();
+                if let Some(shutdown) = self.tracker.shutdowns.borrow().get(host) {
+                    shutdown.cancel();
                 }
             }
             Event::Partition(a, b) => self.sim.partition(a, b),
@@ -176,13 +176,13 @@ impl<'a> Machines<'a> {
         }
         trace::without(|| {
             self.sim.crash(host);
-            self.house.wait_until_gone(host);
+            self.tracker.wait_until_gone(host);
         });
         self.down.push(host);
     }
 
-    /// From here on every host is up and every message gets through.
-    fn calm_down(&mut self) {
+    /// Ends all faults: starts every host and lets every message through.
+    fn end_faults(&mut self) {
         self.sim.set_fail_rate(0.0);
         for (a, b) in &self.links {
             self.repair(a, b);
@@ -192,22 +192,22 @@ impl<'a> Machines<'a> {
         }
     }
 
-    /// Also delivers what was held.
+    /// Restores a link and delivers the messages that were held.
     fn repair(&self, a: Host, b: Host) {
         self.sim.release(a, b);
     }
 
-    /// Ends everything and waits for the threads.
+    /// Ends the simulation and waits for its threads.
     pub(crate) fn end(self) {
-        let Self { sim, house, hosts, .. } = self;
+        let Self { sim, tracker, hosts, .. } = self;
         trace::without(|| {
             drop(sim);
-            hosts.iter().for_each(|host| house.wait_until_gone(host));
+            hosts.iter().for_each(|host| tracker.wait_until_gone(host));
         });
     }
 }
 
-/// What went wrong with whom, and why, on one line.
+/// Formats an error with its causes on one line.
 pub(crate) fn with_causes(who: &str, error: &dyn std::error::Error) -> String {
     let causes = std::iter::successors(Some(error), |error| error.source());
     let causes: Vec<String> = causes.map(ToString::to_string).collect();

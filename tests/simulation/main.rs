@@ -1,19 +1,19 @@
-//! Whole runs on a simulated network where everything goes wrong that can: messages late, lost and held back, hosts
-//! cut off, crashed and started again. What comes out is what a calm run gives.
+//! Whole runs on a simulated network with delayed, lost and held messages, partitions, crashes and restarts. The result
+//! is always that of an undisturbed run.
 //!
-//! A seed draws what goes wrong, and the same seed always takes the same course:
-//! `TANDEM_SIM_SEEDS=17 cargo test --release --test simulation -- --ignored many_runs` looks at seed 17 alone, `17..40`
-//! at several. Each simulation has a process of its own. What that process does can be written down, one line for each
-//! message, log line and trouble, or be followed in a debugger:
+//! A seed determines all faults, and the same seed always gives the same trace:
+//! `TANDEM_SIM_SEEDS=17 cargo test --release --test simulation -- --ignored many_runs` runs seed 17 only, `17..40`
+//! a range. Each simulation runs in its own process, which can write a trace with one line for each message, log line
+//! and fault, or be followed in a debugger:
 //! ```text
 //! TANDEM_SIMULATION=run:17 TANDEM_SIM_TRACE=/tmp/trace cargo test --release --test simulation -- \
 //!     --ignored --exact one_simulation --nocapture
 //! ```
-//! Complaints begin with the simulation that they are about, such as `run:17`.
+//! Failure messages begin with the simulation, such as `run:17`.
 
-mod books;
 mod cluster;
 mod crowd;
+mod ledgers;
 mod machines;
 mod network;
 mod process;
@@ -31,19 +31,19 @@ use tandem_rl::RunConfig;
 use tandem_rl::config::Recipe;
 use tandem_teacher::ledger::MemoryLedger;
 
-use books::{ForgetfulLedger, Ledgers};
-use cluster::{Course, Outcome, SERVICES, Scenario, WORKERS, links, simulate, simulate_with};
+use cluster::{Outcome, SERVICES, Scenario, Statistics, WORKERS, links, simulate, simulate_with};
 use crowd::simulate_crowd;
+use ledgers::{ForgetfulLedger, Ledgers};
 use process::{Kind, Report, Simulation};
 use schedule::Schedule;
-use seeds::{complaints, for_seeds, seeds_asked_for};
+use seeds::{failures, for_seeds, seeds_from_env};
 
-/// Strategy, budget, share of advised episodes and lag of the runs that are simulated. All budgets run out.
+/// Strategy, budget, share of advised episodes and lag of the simulated runs. All budgets run out.
 const RUNS: [(&str, u64, f64, u32); 3] =
     [("ea", 700, 1.0, 0), ("eamc:0.1", 500, 1.0, 1), ("mc-q:0.1", 150, 0.5, 1)];
 /// Rounds of a run.
 const N_ROUNDS: u64 = 5;
-/// Simulated time within which most of what goes wrong begins: about as long as a calm run takes on a fast network.
+/// Simulated time within which most faults start: about the duration of an undisturbed run on a fast network.
 const SPAN: Duration = Duration::from_secs(4);
 
 fn run_config((strategy, budget, share, lag): (&str, u64, f64, u32)) -> RunConfig {
@@ -70,109 +70,112 @@ fn run_config((strategy, budget, share, lag): (&str, u64, f64, u32)) -> RunConfi
     run
 }
 
-/// A ledger that does what it must, every fourth one in a file.
-fn proper_ledgers(seed: u64) -> Ledgers {
+/// Returns correct ledgers. Every fourth seed keeps them in a file.
+fn correct_ledgers(seed: u64) -> Ledgers {
     match seed % 4 {
         0 => Ledgers::in_file(),
-        _ => Ledgers::kept(MemoryLedger::default()),
+        _ => Ledgers::shared(MemoryLedger::default()),
     }
 }
 
 fn forgetful_ledgers() -> Ledgers {
-    Ledgers::kept(ForgetfulLedger::default())
+    Ledgers::shared(ForgetfulLedger::default())
 }
 
 /// Runs a simulation in this process.
 fn simulate_here(Simulation(kind, number): Simulation) -> Result<Report, String> {
-    let (outcome, course) = match kind {
-        Kind::Calm => simulate_calm(run_idx_of(number), &WORKERS[..1], false)?,
-        Kind::Silent => simulate_calm(run_idx_of(number), &WORKERS[..2], true)?,
-        Kind::Run => simulate_trouble(number, proper_ledgers(number))?,
-        Kind::ForgetfulRun => simulate_trouble(number, forgetful_ledgers())?,
+    let (outcome, statistics) = match kind {
+        Kind::Undisturbed => simulate_undisturbed(run_idx_of(number), &WORKERS[..1], false)?,
+        Kind::Silent => simulate_undisturbed(run_idx_of(number), &WORKERS[..2], true)?,
+        Kind::Run => simulate_faults(number, correct_ledgers(number))?,
+        Kind::ForgetfulRun => simulate_faults(number, forgetful_ledgers())?,
         Kind::Crowd | Kind::ForgetfulCrowd => {
             let is_forgetful = kind == Kind::ForgetfulCrowd;
-            let ledgers = if is_forgetful { forgetful_ledgers() } else { proper_ledgers(number) };
+            let ledgers = if is_forgetful { forgetful_ledgers() } else { correct_ledgers(number) };
             let n_repeats = simulate_crowd(number, &ledgers)?;
-            return Ok(Report { outcome: None, course: Course { n_repeats, ..Course::default() } });
+            return Ok(Report {
+                outcome: None,
+                statistics: Statistics { n_repeats, ..Statistics::default() },
+            });
         }
     };
-    Ok(Report { outcome: Some(outcome), course })
+    Ok(Report { outcome: Some(outcome), statistics })
 }
 
-/// The run that `number` picks.
+/// Returns the index of the run that `number` selects.
 fn run_idx_of(number: u64) -> usize {
     usize::try_from(number).expect("a small number") % RUNS.len()
 }
 
-/// Simulates a run without trouble, if need be with somebody who is connected and says nothing.
-fn simulate_calm(
+/// Simulates a run without faults, optionally with an idle client.
+fn simulate_undisturbed(
     run_idx: usize,
     workers: &'static [schedule::Host],
-    with_silent: bool,
-) -> Result<(Outcome, Course), String> {
-    let ledgers = Ledgers::kept(MemoryLedger::default());
+    with_idle_client: bool,
+) -> Result<(Outcome, Statistics), String> {
+    let ledgers = Ledgers::shared(MemoryLedger::default());
     let scenario = Scenario { run: run_config(RUNS[run_idx]), workers, ledgers };
-    let schedule = Schedule::calm(u64::from(with_silent));
+    let schedule = Schedule::undisturbed(u64::from(with_idle_client));
     simulate_with(&scenario, &schedule, |machines| {
-        if with_silent {
-            machines.add("silent", network::say_nothing_to_learner);
+        if with_idle_client {
+            machines.add("silent", network::idle_client);
         }
     })
 }
 
-/// Simulates the run that `seed` picks, with what `seed` lets go wrong.
-fn simulate_trouble(seed: u64, ledgers: Ledgers) -> Result<(Outcome, Course), String> {
-    let (scenario, schedule) = trouble(seed, ledgers);
-    simulate(&scenario, &schedule).map_err(|what| format!("{what}\n{}", described(seed)))
+/// Simulates the run that `seed` selects, with the faults that `seed` draws.
+fn simulate_faults(seed: u64, ledgers: Ledgers) -> Result<(Outcome, Statistics), String> {
+    let (scenario, schedule) = faulty_scenario(seed, ledgers);
+    simulate(&scenario, &schedule).map_err(|what| format!("{what}\n{}", describe(seed)))
 }
 
-fn trouble(seed: u64, ledgers: Ledgers) -> (Scenario, Schedule) {
+fn faulty_scenario(seed: u64, ledgers: Ledgers) -> (Scenario, Schedule) {
     let workers = &WORKERS[..2 + usize::try_from(seed / 3 % 4).expect("below 4")];
     let schedule = Schedule::draw(seed, &links(workers), &SERVICES, workers, SPAN);
     (Scenario { run: run_config(RUNS[run_idx_of(seed)]), workers, ledgers }, schedule)
 }
 
-/// What `seed` lets go wrong with which run.
-fn described(seed: u64) -> String {
-    let (Scenario { workers, .. }, schedule) = trouble(seed, proper_ledgers(1));
+/// Describes the run and the faults of `seed`.
+fn describe(seed: u64) -> String {
+    let (Scenario { workers, .. }, schedule) = faulty_scenario(seed, correct_ledgers(1));
     format!("{} workers, {:?}, {schedule}", workers.len(), RUNS[run_idx_of(seed)])
 }
 
-/// How a calm run with one worker ends.
-fn calm(run_idx: usize) -> &'static Outcome {
-    static CALM: [OnceLock<Outcome>; RUNS.len()] = [const { OnceLock::new() }; RUNS.len()];
-    CALM[run_idx].get_or_init(|| {
-        let report = process::run(Simulation(Kind::Calm, run_idx as u64), None);
-        report.expect("nothing goes wrong").outcome.expect("a run ends somehow")
+/// Returns the outcome of an undisturbed run with one worker.
+fn undisturbed(run_idx: usize) -> &'static Outcome {
+    static UNDISTURBED: [OnceLock<Outcome>; RUNS.len()] = [const { OnceLock::new() }; RUNS.len()];
+    UNDISTURBED[run_idx].get_or_init(|| {
+        let report = process::run(Simulation(Kind::Undisturbed, run_idx as u64), None);
+        report.expect("no fault").outcome.expect("an outcome")
     })
 }
 
-/// Simulates a run in trouble and compares its end with a calm one's.
-fn check(kind: Kind, seed: u64) -> Result<Course, String> {
+/// Simulates a run under faults and compares its outcome with the undisturbed run.
+fn check(kind: Kind, seed: u64) -> Result<Statistics, String> {
     let simulation = Simulation(kind, seed);
-    let Report { outcome, course } = process::run(simulation, None)?;
-    let (outcome, expected) = (outcome.expect("a run ends somehow"), calm(run_idx_of(seed)));
+    let Report { outcome, statistics } = process::run(simulation, None)?;
+    let (outcome, expected) = (outcome.expect("an outcome"), undisturbed(run_idx_of(seed)));
     if outcome == *expected {
-        return Ok(course);
+        return Ok(statistics);
     }
-    let told = described(seed);
+    let description = describe(seed);
     Err(format!(
-        "{simulation}: expected the end of a calm run, {expected:?}, got {outcome:?}\n{told}"
+        "{simulation}: expected the outcome of an undisturbed run, {expected:?}, got {outcome:?}\n{description}"
     ))
 }
 
-fn check_run(seed: u64) -> Result<Course, String> {
+fn check_run(seed: u64) -> Result<Statistics, String> {
     check(Kind::Run, seed)
 }
 
 fn check_crowd(seed: u64) -> Result<u64, String> {
-    Ok(process::run(Simulation(Kind::Crowd, seed), None)?.course.n_repeats)
+    Ok(process::run(Simulation(Kind::Crowd, seed), None)?.statistics.n_repeats)
 }
 
 #[test]
-#[ignore = "the others start it, each time in a process of its own"]
+#[ignore = "started by the other tests in a separate process"]
 fn one_simulation() {
-    if let Some(report) = process::run_the_one_asked_for(simulate_here) {
+    if let Some(report) = process::run_requested(simulate_here) {
         println!("{report}");
     }
 }
@@ -180,27 +183,27 @@ fn one_simulation() {
 #[test]
 fn every_undisturbed_run_spends_its_budget_and_is_evaluated_three_times() {
     for (run_idx, (_, budget, ..)) in RUNS.iter().enumerate() {
-        let Outcome { units, n_rounds, judged, .. } = calm(run_idx);
+        let Outcome { units, n_rounds, evaluated, .. } = undisturbed(run_idx);
         assert_eq!(*units, [*budget, 0, 0]);
         assert_eq!(*n_rounds, N_ROUNDS);
-        assert_eq!(*judged, [2, 4, 5]);
+        assert_eq!(*evaluated, [2, 4, 5]);
     }
 }
 
 #[test]
 fn a_run_with_many_faults_ends_like_an_undisturbed_one() {
-    let courses = for_seeds(0..24, check_run);
-    let all = courses.iter().fold(Course::default(), Course::plus);
-    assert!(all.n_repeats > 100, "the teacher was hardly asked again: {all:?}");
+    let runs = for_seeds(0..24, check_run);
+    let all = runs.iter().fold(Statistics::default(), Statistics::plus);
+    assert!(all.n_repeats > 100, "few repeated requests: {all:?}");
     assert!(all.n_resumed > 0, "few learners resumed: {all:?}");
-    assert!(all.n_teachers > 24, "few teachers took over: {all:?}");
-    assert!(all.n_workers > 24 * 3, "few workers joined late or again: {all:?}");
+    assert!(all.n_teachers > 24, "few teacher restarts: {all:?}");
+    assert!(all.n_workers > 24 * 3, "few late or repeated joins: {all:?}");
 }
 
 #[test]
 fn a_ledger_that_forgets_verdicts_is_detected() {
-    let found = complaints(0..6, |seed| check(Kind::ForgetfulRun, seed));
-    assert!(!found.is_empty(), "six seeds found nothing");
+    let found = failures(0..6, |seed| check(Kind::ForgetfulRun, seed));
+    assert!(!found.is_empty(), "not detected by six seeds");
 }
 
 #[test]
@@ -212,14 +215,15 @@ fn a_crowd_spends_the_budget_exactly_once() {
 #[test]
 fn a_crowd_detects_a_ledger_that_forgets_verdicts() {
     let forgetful = |seed| process::run(Simulation(Kind::ForgetfulCrowd, seed), None);
-    assert!(!complaints(0..3, forgetful).is_empty(), "three seeds found nothing");
+    assert!(!failures(0..3, forgetful).is_empty(), "not detected by three seeds");
 }
 
 #[test]
 fn a_run_ends_despite_a_silent_open_connection() {
-    let Report { outcome, course } = process::run(Simulation(Kind::Silent, 0), None).expect("ends");
-    assert_eq!(outcome.as_ref(), Some(calm(0)));
-    assert!(course.took < Duration::from_secs(60), "{course:?}");
+    let Report { outcome, statistics } =
+        process::run(Simulation(Kind::Silent, 0), None).expect("ends");
+    assert_eq!(outcome.as_ref(), Some(undisturbed(0)));
+    assert!(statistics.took < Duration::from_secs(60), "{statistics:?}");
 }
 
 #[test]
@@ -231,8 +235,8 @@ fn the_same_seed_gives_the_same_trace() {
 #[test]
 #[ignore = "takes minutes"]
 fn many_seeds_repeat_their_traces_ten_times_on_a_busy_machine() {
-    let runs = seeds_asked_for(12).map(|seed| Simulation(Kind::Run, seed));
-    let crowds = seeds_asked_for(12).map(|seed| Simulation(Kind::Crowd, seed));
+    let runs = seeds_from_env(12).map(|seed| Simulation(Kind::Run, seed));
+    let crowds = seeds_from_env(12).map(|seed| Simulation(Kind::Crowd, seed));
     let simulations: Vec<_> = runs.chain(crowds).collect();
     let compared = repeats::on_a_busy_machine(|| repeats::compare(&simulations, 10));
     println!("{}", compared.unwrap_or_else(|difference| panic!("{difference}")));
@@ -241,14 +245,14 @@ fn many_seeds_repeat_their_traces_ten_times_on_a_busy_machine() {
 #[test]
 #[ignore = "takes minutes"]
 fn many_runs_with_many_faults_end_like_undisturbed_ones() {
-    let courses = for_seeds(seeds_asked_for(500), check_run);
-    let all = courses.iter().fold(Course::default(), Course::plus);
-    println!("{} runs, together {all:?}", courses.len());
+    let runs = for_seeds(seeds_from_env(500), check_run);
+    let all = runs.iter().fold(Statistics::default(), Statistics::plus);
+    println!("{} runs, in total {all:?}", runs.len());
 }
 
 #[test]
 #[ignore = "takes minutes"]
 fn many_crowds_spend_the_budget_exactly_once() {
-    let repeats = for_seeds(seeds_asked_for(500), check_crowd);
+    let repeats = for_seeds(seeds_from_env(500), check_crowd);
     println!("{} crowds, {} repeats", repeats.len(), repeats.iter().sum::<u64>());
 }

@@ -1,4 +1,4 @@
-//! The simulated network: how services listen on it and how they are called over it.
+//! Listeners and clients on the simulated network.
 
 use std::net::Ipv4Addr;
 use std::time::Duration;
@@ -10,15 +10,15 @@ use turmoil::net::{TcpListener, TcpStream};
 
 use crate::cluster::LEARNER;
 
-/// Where every service listens on its host.
+/// Port of every service.
 const PORT: u16 = 7000;
 
-/// The address of the service on `host`.
+/// Returns the address of the service on `host`.
 pub(crate) fn address(host: &str) -> String {
     format!("{host}:{PORT}")
 }
 
-/// Calls services over the simulated network.
+/// Returns a client configuration that connects over the simulated network.
 pub(crate) fn dial() -> ClientConfig {
     ClientConfig::default().with_connector(|uri| async move {
         let host = uri.host().expect("an address has a host").to_owned();
@@ -27,7 +27,7 @@ pub(crate) fn dial() -> ClientConfig {
     })
 }
 
-/// The connections that reach the host on which it is called.
+/// Accepts connections on the calling host.
 pub(crate) async fn listen() -> std::io::Result<Incoming> {
     let listener = TcpListener::bind((Ipv4Addr::UNSPECIFIED, PORT)).await?;
     let (sender, accepted) = mpsc::channel(1);
@@ -42,8 +42,8 @@ pub(crate) async fn listen() -> std::io::Result<Incoming> {
     Ok(Incoming::new(ReceiverStream::new(accepted)))
 }
 
-/// Connects to the learner as soon as it listens, and leaves it at that.
-pub(crate) async fn say_nothing_to_learner() -> turmoil::Result {
+/// Connects to the learner as soon as it listens and never sends anything.
+pub(crate) async fn idle_client() -> turmoil::Result {
     let _connection = loop {
         match TcpStream::connect((LEARNER, PORT)).await {
             Ok(connection) => break connection,

@@ -1,6 +1,6 @@
-//! Each simulation has a process of its own, in which nothing depends on chance: random numbers come from the
-//! simulation's seed and clocks show simulated time. What a process has only once, like the count of runtimes from which
-//! tokio derives its random numbers, is then the same whenever a simulation is repeated.
+//! Runs each simulation in its own deterministic process: random numbers come from the simulation's seed and clocks show
+//! simulated time. Per-process state, such as the runtime counter from which tokio derives its random numbers, is then
+//! the same in every repetition.
 
 use std::fmt;
 use std::path::Path;
@@ -10,37 +10,37 @@ use std::str::FromStr;
 use serde::{Deserialize, Serialize};
 use tempfile::TempDir;
 
-use crate::cluster::{Course, Outcome};
+use crate::cluster::{Outcome, Statistics};
 use crate::{system, trace};
 
-/// Names the simulation that a process is to run.
+/// Environment variable that names the simulation to run.
 const SIMULATION: &str = "TANDEM_SIMULATION";
-/// Names the file for its trace.
+/// Environment variable that names the trace file.
 const TRACE: &str = "TANDEM_SIM_TRACE";
-/// The test that runs it.
+/// The test that runs a simulation.
 const TEST: &str = "one_simulation";
-/// Stands before the report in what a process prints.
+/// Prefix of the report in a process's output.
 const REPORT: &str = "report of the simulation: ";
 
-/// What can be simulated.
+/// The kind of a simulation.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Kind {
-    /// A run without trouble; the number picks the run.
-    Calm,
-    /// A run without trouble and with somebody who is connected and says nothing.
+    /// A run without faults. The number selects the run.
+    Undisturbed,
+    /// A run without faults and with an idle client.
     Silent,
-    /// A run in trouble; the number is the seed.
+    /// A run under faults. The number is the seed.
     Run,
     /// [`Self::Run`] with a ledger that forgets its verdicts.
     ForgetfulRun,
-    /// A teacher that many ask, in trouble; the number is the seed.
+    /// A teacher with many clients, under faults. The number is the seed.
     Crowd,
     /// [`Self::Crowd`] with a ledger that forgets its verdicts.
     ForgetfulCrowd,
 }
 
 const NAMES: [(Kind, &str); 6] = [
-    (Kind::Calm, "calm"),
+    (Kind::Undisturbed, "undisturbed"),
     (Kind::Silent, "silent"),
     (Kind::Run, "run"),
     (Kind::ForgetfulRun, "forgetful-run"),
@@ -72,16 +72,16 @@ impl FromStr for Simulation {
     }
 }
 
-/// What came out of a simulation.
+/// The result of a simulation.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(crate) struct Report {
-    /// How the run ended, when one was simulated.
+    /// The outcome of the run. `None` for crowds.
     pub(crate) outcome: Option<Outcome>,
-    pub(crate) course: Course,
+    pub(crate) statistics: Statistics,
 }
 
-/// Runs `simulation` in a process of its own, and writes its trace to `trace` if need be; gives what came out, or what
-/// went wrong that must not.
+/// Runs `simulation` in a separate process, which optionally writes its trace to `trace`. Returns the report, or the
+/// first violation.
 pub(crate) fn run(simulation: Simulation, trace: Option<&Path>) -> Result<Report, String> {
     let program = std::env::current_exe().expect("a test has a file");
     let mut command = Command::new(program);
@@ -97,33 +97,31 @@ pub(crate) fn run(simulation: Simulation, trace: Option<&Path>) -> Result<Report
     match report.map(serde_json::from_str::<Result<Report, String>>) {
         Some(Ok(report)) => report.map_err(|what| format!("{simulation}: {what}")),
         _ => {
-            let complaints = String::from_utf8_lossy(&output.stderr);
-            Err(format!("{simulation}: {}, no report\n{printed}{complaints}", output.status))
+            let errors = String::from_utf8_lossy(&output.stderr);
+            Err(format!("{simulation}: {}, no report\n{printed}{errors}", output.status))
         }
     }
 }
 
-/// Runs the simulation that this process was started for, by `simulate`, and gives the report that is to be printed;
-/// `None` when it was not started for one.
-pub(crate) fn run_the_one_asked_for(
-    simulate: fn(Simulation) -> Result<Report, String>,
-) -> Option<String> {
-    #[expect(clippy::disallowed_methods, reason = "who starts the process says what for")]
-    let (asked, traced) = (std::env::var(SIMULATION), std::env::var(TRACE));
-    let asked = asked.ok()?;
-    let simulation: Simulation = asked.parse().expect(SIMULATION);
-    if let Ok(path) = traced {
+/// Runs the simulation that the environment requests, with `simulate`, and returns the report to print. Returns `None`
+/// if none is requested.
+pub(crate) fn run_requested(simulate: fn(Simulation) -> Result<Report, String>) -> Option<String> {
+    #[expect(clippy::disallowed_methods, reason = "the parent process names the simulation")]
+    let (requested, trace_path) = (std::env::var(SIMULATION), std::env::var(TRACE));
+    let requested = requested.ok()?;
+    let simulation: Simulation = requested.parse().expect(SIMULATION);
+    if let Ok(path) = trace_path {
         trace::write_to(Path::new(&path));
     }
-    // Everything is written here, by names that are always the same.
+    // Files have relative names, which are the same in every repetition.
     let disk = TempDir::new().expect("a directory");
     std::env::set_current_dir(disk.path()).expect("a directory");
-    // A thread asks for random numbers when it first uses a hash map; this one may have.
+    // A thread draws random numbers for its first hash map. This thread may have done so already.
     let thread = std::thread::spawn(move || {
         system::simulate(simulation.1);
         simulate(simulation)
     });
     let report = thread.join().unwrap_or_else(|_panic| Err("a panic, see above".to_owned()));
-    let report = serde_json::to_string(&report).expect("is written as JSON");
+    let report = serde_json::to_string(&report).expect("serializable");
     Some(format!("\n{REPORT}{report}"))
 }

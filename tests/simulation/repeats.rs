@@ -1,4 +1,4 @@
-//! Whether a simulation takes the same course each time.
+//! Repeats simulations and compares their traces.
 
 use std::fs::{self, File};
 use std::hash::{DefaultHasher, Hasher as _};
@@ -10,11 +10,10 @@ use tempfile::TempDir;
 
 use crate::process::{self, Simulation};
 
-/// Threads that keep a machine busy.
+/// Number of threads that keep the machine busy.
 const N_BUSY: usize = 4;
 
-/// Runs each of `simulations` `n_times`, two at a time; gives a line about each, or with which line of the trace another
-/// course begins.
+/// Runs each simulation `n_times`, two at a time. Returns a line for each, or the first difference between traces.
 pub(crate) fn compare(simulations: &[Simulation], n_times: usize) -> Result<String, String> {
     let lines: Result<Vec<String>, String> =
         simulations.iter().map(|simulation| compare_one(*simulation, n_times)).collect();
@@ -34,7 +33,7 @@ fn compare_one(simulation: Simulation, n_times: usize) -> Result<String, String>
             return Ok(());
         }
         let difference = first_difference(&first, &path);
-        Err(format!("{simulation} took another course:\n{difference}\n{report:?}\n{again:?}"))
+        Err(format!("{simulation} gave a different trace:\n{difference}\n{report:?}\n{again:?}"))
     };
     for numbers in (1..n_times).collect::<Vec<_>>().chunks(2) {
         std::thread::scope(|scope| {
@@ -43,7 +42,7 @@ fn compare_one(simulation: Simulation, n_times: usize) -> Result<String, String>
                 scope.spawn(move || repeat(number))
             };
             let repeats: Vec<_> = numbers.iter().map(start).collect();
-            repeats.into_iter().try_for_each(|repeat| repeat.join().expect("nobody panics"))
+            repeats.into_iter().try_for_each(|repeat| repeat.join().expect("no panic"))
         })?;
     }
     let n_lines = lines(&first).count();
@@ -51,7 +50,7 @@ fn compare_one(simulation: Simulation, n_times: usize) -> Result<String, String>
     Ok(format!("{simulation}: {n_times} times {hash:016x}, {n_lines} lines"))
 }
 
-/// Does `work` while more threads than there are processors compute.
+/// Runs `work` while other threads keep all processors busy.
 pub(crate) fn on_a_busy_machine<T>(work: impl FnOnce() -> T) -> T {
     struct Stop<'a>(&'a AtomicBool);
     impl Drop for Stop<'_> {
@@ -83,7 +82,7 @@ fn lines(path: &Path) -> impl Iterator<Item = String> {
     BufReader::new(File::open(path).expect("a trace")).lines().map(|line| line.expect("text"))
 }
 
-/// The first line in which two traces differ.
+/// Returns the first line in which two traces differ.
 fn first_difference(one: &Path, other: &Path) -> String {
     let (mut one, mut other) = (lines(one), lines(other));
     for number in 1.. {

@@ -1,47 +1,47 @@
-//! Many seeds, some at a time.
+//! Runs checks for many seeds, several at a time.
 
 use std::ops::Range;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicU64, Ordering};
 
-/// Simulations at a time.
-const N_AT_A_TIME: usize = 2;
+/// Number of concurrent simulations.
+const N_PARALLEL: usize = 2;
 
-/// The seeds that the environment names, `FROM..TO` or one, else the first `n`.
-pub(crate) fn seeds_asked_for(n: u64) -> Range<u64> {
-    #[expect(clippy::disallowed_methods, reason = "a person picks the seeds of a long test")]
-    let Ok(asked) = std::env::var("TANDEM_SIM_SEEDS") else { return 0..n };
+/// Returns the seeds in `TANDEM_SIM_SEEDS`, `FROM..TO` or a single one, or else the first `n`.
+pub(crate) fn seeds_from_env(n: u64) -> Range<u64> {
+    #[expect(clippy::disallowed_methods, reason = "the user selects the seeds of a long test")]
+    let Ok(requested) = std::env::var("TANDEM_SIM_SEEDS") else { return 0..n };
     let number = |text: &str| text.trim().parse::<u64>().expect("TANDEM_SIM_SEEDS: FROM..TO or N");
-    match asked.split_once("..") {
+    match requested.split_once("..") {
         Some((from, to)) => number(from)..number(to),
-        None => number(&asked)..number(&asked) + 1,
+        None => number(&requested)..number(&requested) + 1,
     }
 }
 
-/// What `check` gives for each of `seeds`, in no particular order.
+/// Returns the results of `check` for all `seeds`, in no particular order.
 ///
 /// # Panics
-/// When something is wrong with one of them; says with which and what.
+/// If the check of any seed fails. The message lists the failures.
 pub(crate) fn for_seeds<T: Send>(
     seeds: Range<u64>,
     check: impl Fn(u64) -> Result<T, String> + Sync,
 ) -> Vec<T> {
     let mut outcomes = outcomes(seeds, check);
-    let complaints: Vec<String> =
+    let failures: Vec<String> =
         outcomes.extract_if(.., |outcome| outcome.is_err()).filter_map(Result::err).collect();
     assert!(
-        complaints.is_empty(),
+        failures.is_empty(),
         "{} seeds of {}:\n{}",
-        complaints.len(),
-        complaints.len() + outcomes.len(),
-        complaints.join("\n")
+        failures.len(),
+        failures.len() + outcomes.len(),
+        failures.join("\n")
     );
     outcomes.into_iter().flatten().collect()
 }
 
-/// What is wrong with those of `seeds` with which something is wrong.
-pub(crate) fn complaints<T: Send>(
+/// Returns the failures of `check` among `seeds`.
+pub(crate) fn failures<T: Send>(
     seeds: Range<u64>,
     check: impl Fn(u64) -> Result<T, String> + Sync,
 ) -> Vec<String> {
@@ -65,6 +65,6 @@ fn outcomes<T: Send>(
             outcomes.lock().expect("no panics here").push(outcome);
         }
     };
-    std::thread::scope(|scope| (0..N_AT_A_TIME).for_each(|_| drop(scope.spawn(work))));
+    std::thread::scope(|scope| (0..N_PARALLEL).for_each(|_| drop(scope.spawn(work))));
     outcomes.into_inner().expect("no panics here")
 }

@@ -1,4 +1,4 @@
-//! What happens in a simulation, in order: each message with its fate, what services log, what goes wrong on purpose.
+//! The trace of a simulation: each message with its fate, the services' log lines and the injected faults, in order.
 
 use std::fmt::{self, Write as _};
 use std::fs::File;
@@ -14,13 +14,13 @@ use tracing::{Event, Level, Metadata, Subscriber};
 
 use crate::system;
 
-/// Characters of a field that are written down; the rest is told apart by its hash.
+/// Number of characters of a field that are written. Longer fields are distinguished by a hash.
 const MAX_FIELD_CHARS: usize = 240;
 
-/// Whether what happens is not written down.
+/// True while tracing is suspended.
 static IS_PAUSED: AtomicBool = AtomicBool::new(false);
 
-/// Leaves out what happens during `work`: what a crashed host's threads still do, nobody sees.
+/// Suspends the trace during `work`, for threads of crashed hosts that are still running.
 pub(crate) fn without<T>(work: impl FnOnce() -> T) -> T {
     IS_PAUSED.store(true, Ordering::SeqCst);
     let outcome = work();
@@ -28,7 +28,7 @@ pub(crate) fn without<T>(work: impl FnOnce() -> T) -> T {
     outcome
 }
 
-/// Writes the trace of this process to `path` from now on.
+/// Starts to write the trace of this process to `path`.
 pub(crate) fn write_to(path: &Path) {
     let file = BufWriter::new(File::create(path).expect("a file for the trace"));
     let writer = TraceWriter(Mutex::new(State { file, nodes: Vec::new(), node: None }));
@@ -39,9 +39,9 @@ struct TraceWriter(Mutex<State>);
 
 struct State {
     file: BufWriter<File>,
-    /// Hosts by the number of their span, from 1.
+    /// Hosts by span number, from 1.
     nodes: Vec<String>,
-    /// The host that runs.
+    /// The running host.
     node: Option<usize>,
 }
 
@@ -52,7 +52,7 @@ impl TraceWriter {
 }
 
 impl Subscriber for TraceWriter {
-    /// Of other libraries only what becomes of messages; of ours everything.
+    /// Enables everything in our crates, and only the fate of messages in other libraries.
     fn enabled(&self, metadata: &Metadata<'_>) -> bool {
         if metadata.is_span() {
             return metadata.name() == "node";
@@ -104,24 +104,23 @@ impl Subscriber for TraceWriter {
     }
 }
 
-/// Fields, each with its name.
+/// The fields of an event with their names.
 #[derive(Default)]
 struct Line(String);
 
 impl Visit for Line {
     fn record_debug(&mut self, field: &Field, value: &dyn fmt::Debug) {
         let mut text = Shortened::default();
-        write!(text, "{value:?}").expect("nothing refuses");
+        write!(text, "{value:?}").expect("infallible");
         let Shortened { kept, n_chars, hasher } = text;
-        write!(self.0, " {field}={kept}").expect("nothing refuses");
+        write!(self.0, " {field}={kept}").expect("infallible");
         if n_chars > kept.len() {
-            write!(self.0, "… {n_chars} characters, {:016x}", hasher.finish())
-                .expect("nothing refuses");
+            write!(self.0, "… {n_chars} characters, {:016x}", hasher.finish()).expect("infallible");
         }
     }
 }
 
-/// The beginning of a text and the hash of all of it.
+/// The beginning of a text and a hash of the whole text.
 #[derive(Default)]
 struct Shortened {
     kept: String,
@@ -132,7 +131,7 @@ struct Shortened {
 impl fmt::Write for Shortened {
     fn write_str(&mut self, text: &str) -> fmt::Result {
         if self.kept.len() < MAX_FIELD_CHARS {
-            // A line stays a line.
+            // Line breaks become spaces.
             self.kept.extend(text.chars().map(|c| if c == '\n' { ' ' } else { c }));
         }
         self.n_chars += text.len();

@@ -1,4 +1,4 @@
-//! Ledgers that are watched while a simulation runs, and one that does not do what a ledger must.
+//! Ledgers of simulated teachers: observed ones, and a faulty one that forgets its verdicts.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -11,43 +11,43 @@ use tandem_teacher::ledger::{ChargeRequest, ChargeResult, Ledger, LedgerError, S
 
 type Open = dyn Fn() -> Box<dyn Ledger>;
 
-/// Opens the ledger of each teacher that starts.
+/// Opens a ledger for each teacher that starts.
 pub(crate) struct Ledgers(Box<Open>);
 
 impl Ledgers {
-    /// All teachers use `ledger`, which survives them.
-    pub(crate) fn kept(ledger: impl Ledger + 'static) -> Self {
-        let kept = Kept(Arc::new(Mutex::new(ledger)));
-        Self(Box::new(move || Box::new(kept.clone())))
+    /// Creates ledgers that share `ledger`, which outlives the teachers.
+    pub(crate) fn shared(ledger: impl Ledger + 'static) -> Self {
+        let shared = SharedLedger(Arc::new(Mutex::new(ledger)));
+        Self(Box::new(move || Box::new(shared.clone())))
     }
 
-    /// Each teacher opens the ledger's file.
+    /// Creates ledgers that open the same file.
     pub(crate) fn in_file() -> Self {
         Self(Box::new(|| Box::new(SqliteLedger::open(Path::new("ledger.db")).expect("a ledger"))))
     }
 
-    /// The ledger for a teacher.
+    /// Opens the ledger of a teacher.
     pub(crate) fn open(&self) -> Box<dyn Ledger> {
         (self.0)()
     }
 }
 
-/// A ledger that survives its teacher.
-struct Kept<L>(Arc<Mutex<L>>);
+/// A ledger that outlives its teacher.
+struct SharedLedger<L>(Arc<Mutex<L>>);
 
-impl<L> Clone for Kept<L> {
+impl<L> Clone for SharedLedger<L> {
     fn clone(&self) -> Self {
         Self(Arc::clone(&self.0))
     }
 }
 
-impl<L> Kept<L> {
+impl<L> SharedLedger<L> {
     fn lock(&self) -> MutexGuard<'_, L> {
         self.0.lock().expect("no ledger panics")
     }
 }
 
-impl<L: Ledger> Ledger for Kept<L> {
+impl<L: Ledger> Ledger for SharedLedger<L> {
     fn open(&mut self, name: &str, terms: AccountTerms) -> Result<Balance, LedgerError> {
         self.lock().open(name, terms)
     }
@@ -69,16 +69,16 @@ impl<L: Ledger> Ledger for Kept<L> {
         self.lock().settle(name, episodes)
     }
 
-    fn charge(&mut self, bills: &[ChargeRequest]) -> Vec<Result<ChargeResult, LedgerError>> {
-        self.lock().charge(bills)
+    fn charge(&mut self, requests: &[ChargeRequest]) -> Vec<Result<ChargeResult, LedgerError>> {
+        self.lock().charge(requests)
     }
 }
 
-/// Charges a step whenever it is asked about, as if it had never been asked about before.
+/// A faulty ledger that charges a step for every request, as if it were new.
 #[derive(Default)]
 pub(crate) struct ForgetfulLedger {
     accounts: BTreeMap<String, Account>,
-    /// Never used before by any episode.
+    /// Next step number that no episode has used.
     next_step: u32,
 }
 
@@ -88,12 +88,12 @@ impl ForgetfulLedger {
         Ok(self.accounts.get_mut(name).ok_or_else(unknown)?)
     }
 
-    fn charge_bill(&mut self, bill: &ChargeRequest) -> Result<ChargeResult, LedgerError> {
+    fn charge_request(&mut self, request: &ChargeRequest) -> Result<ChargeResult, LedgerError> {
         let first_step = self.next_step;
-        self.next_step += u32::try_from(bill.charges.len()).expect("a bill is short");
-        let account = self.account(&bill.account)?;
+        self.next_step += u32::try_from(request.charges.len()).expect("few charges");
+        let account = self.account(&request.account)?;
         let charge = |(step, charge): (u32, &Charge)| account.charge(Charge { step, ..*charge });
-        let verdicts = (first_step..).zip(&bill.charges).map(charge).collect();
+        let verdicts = (first_step..).zip(&request.charges).map(charge).collect();
         Ok(ChargeResult { verdicts, left: account.left() })
     }
 }
@@ -123,29 +123,29 @@ impl Ledger for ForgetfulLedger {
         Ok(account.balance())
     }
 
-    fn charge(&mut self, bills: &[ChargeRequest]) -> Vec<Result<ChargeResult, LedgerError>> {
-        bills.iter().map(|bill| self.charge_bill(bill)).collect()
+    fn charge(&mut self, requests: &[ChargeRequest]) -> Vec<Result<ChargeResult, LedgerError>> {
+        requests.iter().map(|request| self.charge_request(request)).collect()
     }
 }
 
-/// What a ledger was seen to do in a simulation.
+/// The observed answers of a ledger in a simulation.
 #[derive(Debug, Clone, Default)]
-pub(crate) struct Book {
+pub(crate) struct LedgerRecord {
     verdicts: BTreeMap<(String, u64, u32), Option<BudgetHalf>>,
     spent: BTreeMap<String, u64>,
-    /// Steps asked about again.
+    /// Number of repeated requests for a step.
     pub(crate) n_repeats: u64,
-    /// What a ledger must not do.
-    pub(crate) complaints: Vec<String>,
+    /// Violated invariants.
+    pub(crate) violations: Vec<String>,
 }
 
-impl Book {
-    /// Accounts seen.
+impl LedgerRecord {
+    /// Returns the observed accounts.
     pub(crate) fn accounts(&self) -> Vec<&str> {
         self.spent.keys().map(String::as_str).collect()
     }
 
-    /// Steps of `account` that were charged.
+    /// Counts the charged steps of `account`.
     pub(crate) fn n_charged(&self, account: &str) -> u64 {
         let is_charged = |((name, ..), verdict): &(&(String, u64, u32), &Option<BudgetHalf>)| {
             name == account && verdict.is_some()
@@ -156,11 +156,11 @@ impl Book {
     fn note_balance(&mut self, name: &str, balance: &Balance) {
         let Balance { terms, spent, leased, left } = *balance;
         if spent.checked_add(leased).and_then(|out| out.checked_add(left)) != Some(terms.budget) {
-            self.complaints.push(format!("the balance of {name} does not add up: {balance:?}"));
+            self.violations.push(format!("the balance of {name} does not add up: {balance:?}"));
         }
         let before = self.spent.insert(name.to_owned(), spent).unwrap_or(0);
         if spent < before {
-            self.complaints.push(format!("{name} had spent {before}, now {spent}"));
+            self.violations.push(format!("{name} had spent {before}, now {spent}"));
         }
     }
 
@@ -170,43 +170,43 @@ impl Book {
         self.n_repeats += 1;
         if before != verdict {
             let Charge { episode, step, .. } = charge;
-            self.complaints.push(format!(
+            self.violations.push(format!(
                 "step {step} of episode {episode} was {before:?}, asked again it is {verdict:?}"
             ));
         }
     }
 }
 
-/// Who looks at the book from outside.
-pub(crate) type SharedBook = Arc<Mutex<Book>>;
+/// A record shared with the simulation.
+pub(crate) type SharedRecord = Arc<Mutex<LedgerRecord>>;
 
-/// A ledger of whose answers a book is kept.
-pub(crate) struct Watched {
+/// A ledger whose answers are recorded.
+pub(crate) struct ObservedLedger {
     ledger: Box<dyn Ledger>,
-    book: SharedBook,
+    record: SharedRecord,
 }
 
-impl Watched {
-    pub(crate) fn new(ledger: Box<dyn Ledger>, book: SharedBook) -> Self {
-        Self { ledger, book }
+impl ObservedLedger {
+    pub(crate) fn new(ledger: Box<dyn Ledger>, record: SharedRecord) -> Self {
+        Self { ledger, record }
     }
 
-    /// Notes how account `name` stands after an operation.
-    fn noted(&self, name: &str, balance: Balance) -> Balance {
-        self.book.lock().expect("nobody panics").note_balance(name, &balance);
+    /// Records the balance of account `name` after an operation.
+    fn observed(&self, name: &str, balance: Balance) -> Balance {
+        self.record.lock().expect("not poisoned").note_balance(name, &balance);
         balance
     }
 }
 
-impl Ledger for Watched {
+impl Ledger for ObservedLedger {
     fn open(&mut self, name: &str, terms: AccountTerms) -> Result<Balance, LedgerError> {
         let balance = self.ledger.open(name, terms)?;
-        Ok(self.noted(name, balance))
+        Ok(self.observed(name, balance))
     }
 
     fn balance(&mut self, name: &str) -> Result<Balance, LedgerError> {
         let balance = self.ledger.balance(name)?;
-        Ok(self.noted(name, balance))
+        Ok(self.observed(name, balance))
     }
 
     fn open_leases(
@@ -216,27 +216,27 @@ impl Ledger for Watched {
         units_per_episode: u32,
     ) -> Result<(Vec<Lease>, Balance), LedgerError> {
         let (leases, balance) = self.ledger.open_leases(name, episodes, units_per_episode)?;
-        Ok((leases, self.noted(name, balance)))
+        Ok((leases, self.observed(name, balance)))
     }
 
     fn settle(&mut self, name: &str, episodes: &[u64]) -> Result<Balance, LedgerError> {
         let balance = self.ledger.settle(name, episodes)?;
-        Ok(self.noted(name, balance))
+        Ok(self.observed(name, balance))
     }
 
-    fn charge(&mut self, bills: &[ChargeRequest]) -> Vec<Result<ChargeResult, LedgerError>> {
-        let receipts = self.ledger.charge(bills);
-        for (bill, receipt) in bills.iter().zip(&receipts) {
-            let Ok(receipt) = receipt else { continue };
-            let mut book = self.book.lock().expect("nobody panics");
-            for (charge, verdict) in bill.charges.iter().zip(&receipt.verdicts) {
-                book.note_verdict(&bill.account, charge, *verdict);
+    fn charge(&mut self, requests: &[ChargeRequest]) -> Vec<Result<ChargeResult, LedgerError>> {
+        let results = self.ledger.charge(requests);
+        for (request, result) in requests.iter().zip(&results) {
+            let Ok(result) = result else { continue };
+            let mut record = self.record.lock().expect("not poisoned");
+            for (charge, verdict) in request.charges.iter().zip(&result.verdicts) {
+                record.note_verdict(&request.account, charge, *verdict);
             }
-            drop(book);
-            if let Ok(balance) = self.ledger.balance(&bill.account) {
-                self.noted(&bill.account, balance);
+            drop(record);
+            if let Ok(balance) = self.ledger.balance(&request.account) {
+                self.observed(&request.account, balance);
             }
         }
-        receipts
+        results
     }
 }
