@@ -1,10 +1,10 @@
-"""A stand-in for the driver node of one arm of kinova-ros: arm_node.py RECORD, with ROS_NAMESPACE set.
+"""Simulates the kinova-ros driver node of one arm: arm_node.py RECORD, with ROS_NAMESPACE set.
 
-Topics, services and the fingers' action are those of kinova-ros that our driver uses. The arm itself is a queue of velocities, as Kinova's
-is: every 10 ms one of them moves the joints for 10 ms, and an arm whose queue is empty stands. So an arm that is told to move at 100 Hz
-follows, one that is told nothing stands, and what piles up on the way is played to its end. Nothing is noisy.
+It provides the topics, services and finger action of kinova-ros that the driver uses. As in Kinova's arms, velocities are queued: every
+10 ms, one of them moves the joints for 10 ms, and an arm with an empty queue rests. Queued velocities are always played to the end. There
+is no noise.
 
-RECORD gets one JSON list a line: what happened, when (seconds of the machine's monotonic clock), and numbers.
+RECORD receives one JSON list per line: an event, its time (seconds of the monotonic clock) and numbers.
 """
 
 import collections
@@ -22,16 +22,16 @@ from sensor_msgs.msg import JointState
 
 PERIOD_S = 0.01
 N_JOINTS = 4
-# Where the simulated pair begins as well: the tools stand above their workspaces.
+# The start of the simulated pair: the tools are above their workspaces.
 START_DEG = [-1.5, 110.7, 291.0, 178.5]
-# Turns of the fingers: half open, and how fast they move.
+# Finger motor turns: half open, and their speed.
 START_TURNS = 3200.0
 TURNS_PER_S = 5000.0
-# kinova-ros tells turns as degrees of the fingers' joints.
+# kinova-ros publishes turns as degrees of the finger joints.
 DEGREES_PER_TURN = 80.0 / 6800.0
-# What the arm's own queue holds.
-MOST_POINTS = 2000
-# Time that in/start takes, in which kinova-ros tells no states.
+# Capacity of the arm's queue.
+MAX_POINTS = 2000
+# Duration of in/start, during which kinova-ros publishes no states.
 START_S = 0.05
 NAMES = [f"m1n4s200_joint_{n}" for n in (1, 2, 3, 4)] + [
     f"m1n4s200_joint_finger_{name}" for name in ("1", "2", "tip_1", "tip_2")
@@ -42,7 +42,7 @@ class Arm:
     def __init__(self, record):
         self.record = open(record, "a", buffering=1)
         self.lock = threading.Lock()
-        self.points = collections.deque(maxlen=MOST_POINTS)
+        self.points = collections.deque(maxlen=MAX_POINTS)
         self.angles_deg = list(START_DEG)
         self.rates_degps = [0.0] * N_JOINTS
         self.turns = START_TURNS
@@ -57,13 +57,13 @@ class Arm:
         )
         self.fingers.start()
 
-    def note(self, what, *numbers):
+    def log(self, what, *numbers):
         self.record.write(json.dumps([what, time.monotonic(), *numbers]) + "\n")
 
-    def take_velocity(self, told):
+    def take_velocity(self, command):
         with self.lock:
-            rates = [told.joint1, told.joint2, told.joint3, told.joint4]
-            self.note("velocity", rates)
+            rates = [command.joint1, command.joint2, command.joint3, command.joint4]
+            self.log("velocity", rates)
             if not self.stopped:
                 self.points.append(rates)
 
@@ -71,47 +71,47 @@ class Arm:
         with self.lock:
             self.stopped, self.goal_turns = True, None
             self.points.clear()
-            self.note("stop")
+            self.log("stop")
         return StopResponse("arm stopped")
 
     def start(self, _request):
         with self.lock:
             time.sleep(START_S)
             self.stopped = False
-            self.note("start")
+            self.log("start")
         return StartResponse("arm started")
 
     def move_fingers(self, goal):
-        """Holds the arm until the fingers are where they shall be: a goal is a point in the same queue."""
+        """Holds the arm until the fingers reach their goal, because a goal is a point in the same queue."""
         with self.lock:
-            self.note("goal", goal.fingers.finger1, goal.fingers.finger2, goal.fingers.finger3)
+            self.log("goal", goal.fingers.finger1, goal.fingers.finger2, goal.fingers.finger3)
             self.goal_turns = None if self.stopped else goal.fingers.finger1
         while self.goal_turns is not None and not rospy.is_shutdown():
             time.sleep(PERIOD_S)
         fingers = FingerPosition(self.turns, self.turns, 0.0)
         self.fingers.set_succeeded(SetFingersPositionResult(fingers))
 
-    def pass_period(self):
+    def step(self):
         with self.lock:
             self.rates_degps = [0.0] * N_JOINTS
             if self.goal_turns is not None:
-                most = TURNS_PER_S * PERIOD_S
-                self.turns += min(max(self.goal_turns - self.turns, -most), most)
+                limit = TURNS_PER_S * PERIOD_S
+                self.turns += min(max(self.goal_turns - self.turns, -limit), limit)
                 if self.turns == self.goal_turns:
                     self.goal_turns = None
             elif self.points:
                 self.rates_degps = self.points.popleft()
             self.angles_deg = [at + PERIOD_S * rate for at, rate in zip(self.angles_deg, self.rates_degps)]
-            self.note("state", self.angles_deg, self.rates_degps, self.turns, len(self.points))
-            self.tell()
+            self.log("state", self.angles_deg, self.rates_degps, self.turns, len(self.points))
+            self.publish_state()
 
-    def tell(self):
+    def publish_state(self):
         state = JointState(name=NAMES)
         state.header.stamp = rospy.Time.now()
         finger = math.radians(self.turns * DEGREES_PER_TURN)
         state.position = [math.radians(angle) for angle in self.angles_deg] + [finger, finger, 0.0, 0.0]
         state.velocity = [math.radians(rate) for rate in self.rates_degps] + [0.0] * 4
-        # An arm that is held against its weight, as kinova-ros tells it by default.
+        # Torques that hold the arm against gravity, as kinova-ros publishes them by default.
         state.effort = [0.0, 9.0, 4.0, 0.0] + [0.0] * 4
         self.states.publish(state)
 
@@ -123,7 +123,7 @@ def main():
     while True:
         due_s = max(due_s + PERIOD_S, time.monotonic() - 5 * PERIOD_S)
         time.sleep(max(0.0, due_s - time.monotonic()))
-        arm.pass_period()
+        arm.step()
 
 
 if __name__ == "__main__":

@@ -1,10 +1,9 @@
-"""A relay that speaks the part of rosbridge's protocol (version 2) that our driver uses, as a ROS node: relay.py PORT, 0 for any.
+"""A ROS node that implements the part of the rosbridge protocol (version 2) that the driver uses: relay.py PORT, 0 for any port.
 
-It is for tests where rosbridge itself cannot be had: no distribution but ROS' own packages it. What matters to a driver is as in
-rosbridge_suite for ROS 1: operations of a client are done one after the other, calls of services each in a thread of its own;
-a publisher is made when it is advertised and stays; what it publishes in its first second is given again to whoever subscribes
-in that second; a subscription with a queue forgets its oldest message when the queue is full, one without a queue forgets nothing; what
-goes wrong is told as a status. Types of services are known for kinova_msgs only.
+Tests use it because only ROS' own distribution packages rosbridge. The behavior that matters to a driver is that of rosbridge_suite for
+ROS 1: operations of a client run in sequence, and each service call in its own thread. A publisher is created when it is advertised and
+kept. Messages of its first second are repeated to new subscribers in that second. A full subscription queue drops its oldest message, and
+without a queue nothing is dropped. Errors are returned as a status. Only services of kinova_msgs are known.
 """
 
 import asyncio
@@ -23,35 +22,35 @@ import websockets
 from kinova_msgs.srv import Start, Stop
 
 SERVICES = {"in/stop": Stop, "in/start": Start}
-FIRST_S = 1.0
+EARLY_S = 1.0
 publishers = {}
 
 
 class Publisher(rospy.SubscribeListener):
-    """A publisher, and what it published in its first second."""
+    """A publisher with the messages of its first second."""
 
     def __init__(self, topic, kind, queue_size):
         super().__init__()
-        self.type, self.first, self.made_s = kind, [], time.monotonic()
+        self.type, self.early, self.created_s = kind, [], time.monotonic()
         self.topic = rospy.Publisher(topic, kind, subscriber_listener=self, queue_size=queue_size)
 
     def is_new(self):
-        return time.monotonic() < self.made_s + FIRST_S
+        return time.monotonic() < self.created_s + EARLY_S
 
     def peer_subscribe(self, _topic, _publish, publish_to_peer):
-        for message in list(self.first) if self.is_new() else []:
+        for message in list(self.early) if self.is_new() else []:
             publish_to_peer(message)
 
     def publish(self, fields):
         message = self.type()
         genpy.message.fill_message_args(message, [fields])
         if self.is_new():
-            self.first.append(message)
+            self.early.append(message)
         self.topic.publish(message)
 
 
 class Client:
-    """A connection."""
+    """The connection of a client."""
 
     def __init__(self, socket):
         self.socket = socket
@@ -70,7 +69,7 @@ class Client:
         except websockets.ConnectionClosed:
             pass
         finally:
-            # What has not been done by now is not done any more.
+            # Pending operations are discarded.
             self.incoming.queue.clear()
             self.incoming.put(None)
             for subscriber in self.subscribed:
@@ -79,7 +78,7 @@ class Client:
                 task.cancel()
 
     def sender(self, queue_length):
-        """Something that sends what it is given, from any thread, by a queue of its own."""
+        """Returns a function that queues messages for sending, from any thread."""
         waiting, due = collections.deque(maxlen=queue_length or None), asyncio.Event()
 
         async def send():
@@ -89,51 +88,51 @@ class Client:
                 while waiting:
                     await self.socket.send(json.dumps(waiting.popleft(), allow_nan=False))
 
-        def give(message):
+        def enqueue(message):
             waiting.append(message)
             self.loop.call_soon_threadsafe(due.set)
 
         self.outgoing.append(asyncio.run_coroutine_threadsafe(send(), self.loop))
-        return give
+        return enqueue
 
     def work(self):
         operations = {
             "advertise": self.advertise, "subscribe": self.subscribe, "publish": self.publish,
-            "call_service": lambda asked: threading.Thread(target=self.call, args=[asked], daemon=True).start(),
+            "call_service": lambda request: threading.Thread(target=self.call, args=[request], daemon=True).start(),
         }
         while (text := self.incoming.get()) is not None:
             try:
-                asked = json.loads(text)
-                operations[asked["op"]](asked)
-            except Exception as error:  # whatever it is, the client is told
+                request = json.loads(text)
+                operations[request["op"]](request)
+            except Exception as error:  # every error is returned to the client
                 self.answers({"op": "status", "level": "error", "msg": f"{type(error).__name__}: {error}"})
 
-    def advertise(self, asked):
-        topic, kind = asked["topic"], message_class(asked["type"])
+    def advertise(self, request):
+        topic, kind = request["topic"], message_class(request["type"])
         if topic not in publishers:
-            publishers[topic] = Publisher(topic, kind, asked.get("queue_size", 100))
+            publishers[topic] = Publisher(topic, kind, request.get("queue_size", 100))
         if publishers[topic].type is not kind:
             raise TypeError(f"{topic} is of type {publishers[topic].type._type}")
 
-    def subscribe(self, asked):
-        topic, give = asked["topic"], self.sender(asked.get("queue_length", 0))
-        pause_s, told_s = asked.get("throttle_rate", 0) / 1000, -math.inf
+    def subscribe(self, request):
+        topic, enqueue = request["topic"], self.sender(request.get("queue_length", 0))
+        pause_s, last_sent_s = request.get("throttle_rate", 0) / 1000, -math.inf
 
-        def tell(message):
-            nonlocal told_s
-            if time.monotonic() >= told_s + pause_s:
-                told_s = time.monotonic()
-                give({"op": "publish", "topic": topic, "msg": plain(message)})
+        def forward(message):
+            nonlocal last_sent_s
+            if time.monotonic() >= last_sent_s + pause_s:
+                last_sent_s = time.monotonic()
+                enqueue({"op": "publish", "topic": topic, "msg": plain(message)})
 
-        self.subscribed.append(rospy.Subscriber(topic, message_class(asked["type"]), tell))
+        self.subscribed.append(rospy.Subscriber(topic, message_class(request["type"]), forward))
 
-    def publish(self, asked):
-        publishers[asked["topic"]].publish(asked["msg"])
+    def publish(self, request):
+        publishers[request["topic"]].publish(request["msg"])
 
-    def call(self, asked):
-        service, answer = asked["service"], {"op": "service_response", "service": asked["service"]}
-        if "id" in asked:
-            answer["id"] = asked["id"]
+    def call(self, request):
+        service, answer = request["service"], {"op": "service_response", "service": request["service"]}
+        if "id" in request:
+            answer["id"] = request["id"]
         try:
             kind = next(kind for name, kind in SERVICES.items() if service.endswith(name))
             values = plain(rospy.ServiceProxy(service, kind)())
@@ -150,7 +149,7 @@ def message_class(name):
 
 
 def plain(value):
-    """A message of ROS as JSON has it. Numbers that are none are null."""
+    """Converts a ROS message to JSON values. Numbers that are not finite become null."""
     if isinstance(value, genpy.TVal):
         return {"secs": value.secs, "nsecs": value.nsecs}
     if isinstance(value, genpy.Message):

@@ -1,4 +1,4 @@
-"""What a test over a ROS master runs: the master, two nodes of arms, the relay, and the built program."""
+"""The processes of a test over a ROS master: the master, two arm nodes, the relay and the built program."""
 
 import json
 import os
@@ -14,32 +14,32 @@ import messages
 HERE = pathlib.Path(__file__).parent
 ROOT = HERE.parent.parent
 SIDES = ["left", "right"]
-# Longer than anything takes, seconds.
-PATIENCE_S = 60.0
+# Limit of every wait, seconds.
+TIMEOUT_S = 60.0
 
 
 class Busy(Exception):
-    """The bridge has stopped the arms because this machine is busy with other things, as it should."""
+    """The bridge has correctly stopped the arms because this machine is too busy."""
 
 
-# What a busy machine may stop the arms for. Commands that come late leave gaps in which these arms stand.
+# Stop causes that a busy machine may trigger. Late commands leave gaps in which the arms rest.
 BUSY = {
     "late", "owner-silent", "state-old", "state-stale", "command-lost", "tracking", "frozen", "not-settled",
 }
 
 
-def until(what, so):
-    """Waits until something is so, and gives it."""
-    end_s = time.monotonic() + PATIENCE_S
+def until(what, condition):
+    """Waits until `condition` returns a true value, and returns it."""
+    end_s = time.monotonic() + TIMEOUT_S
     while time.monotonic() < end_s:
-        if found := so():
+        if found := condition():
             return found
         time.sleep(0.02)
-    raise AssertionError(f"{what}: not in {PATIENCE_S:.0f} s")
+    raise AssertionError(f"{what}: not in {TIMEOUT_S:.0f} s")
 
 
-def be_in_time():
-    """Runs before what other programs want to do, where that is allowed: 100 Hz is the arms' own rate."""
+def raise_priority():
+    """Requests real-time scheduling where it is permitted, because the arms run at 100 Hz."""
     try:
         os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(5))
     except OSError:
@@ -47,15 +47,15 @@ def be_in_time():
 
 
 class Record:
-    """What a node has written down."""
+    """The record of a node."""
 
     def __init__(self, path):
         self.path = path
 
     def lines(self, what, since_s=0.0):
         with open(self.path) as file:
-            told = [json.loads(line) for line in file if line.endswith("\n")]
-        return [line for line in told if line[0] == what and line[1] >= since_s]
+            entries = [json.loads(line) for line in file if line.endswith("\n")]
+        return [line for line in entries if line[0] == what and line[1] >= since_s]
 
     def last_state(self):
         return until("a state", lambda: self.lines("state")[-1:])[0]
@@ -84,18 +84,18 @@ class Rig:
         self.environment.pop("ROS_HOSTNAME", None)
         self.environment.pop("TANDEM_TOKEN_FILE", None)
 
-    def start(self, name, command, says=None):
-        """Starts a program; waits for a line that begins with what it `says`, and gives the rest."""
+    def start(self, name, command, prefix=None):
+        """Starts a program. If `prefix` is given, waits for a line that starts with it and returns the rest."""
         log = open(self.work / f"{name}.log", "a")
-        output = subprocess.PIPE if says else log
+        output = subprocess.PIPE if prefix else log
         running = subprocess.Popen(
             command, cwd=ROOT, env=self.environment, stdin=subprocess.DEVNULL, stdout=output, stderr=log, text=True,
-            preexec_fn=be_in_time,
+            preexec_fn=raise_priority,
         )
         self.running[name] = running
-        line = running.stdout.readline() if says else ""
-        assert line.startswith(says or ""), f"{name} did not start:\n{(self.work / f'{name}.log').read_text()}"
-        return line.removeprefix(says or "").strip()
+        line = running.stdout.readline() if prefix else ""
+        assert line.startswith(prefix or ""), f"{name} did not start:\n{(self.work / f'{name}.log').read_text()}"
+        return line.removeprefix(prefix or "").strip()
 
     def start_master(self):
         self.start("master", ["/usr/bin/rosmaster", "--core", "-p", str(self.master_port)])
@@ -107,13 +107,13 @@ class Rig:
         until("the master listens", answers)
 
     def start_node(self, arm):
-        began_s = time.monotonic()
+        start_s = time.monotonic()
         record = self.records[arm]
         self.start(SIDES[arm], ["env", f"ROS_NAMESPACE=/{SIDES[arm]}", sys.executable, HERE / "arm_node.py", record.path])
-        until("the node tells where its arm is", lambda: record.lines("state", began_s))
+        until("the node publishes states", lambda: record.lines("state", start_s))
 
     def start_relay(self):
-        """Starts the relay, again where it was before."""
+        """Starts the relay. A restart uses the same port."""
         command = [sys.executable, HERE / "relay.py", self.relay_port]
         self.relay_port = self.start("relay", command, "listening on ")
         self.arms_at = f"ws://127.0.0.1:{self.relay_port}"
@@ -126,16 +126,16 @@ class Rig:
         self.running[name].send_signal(sent)
 
     def kill(self, name):
-        """Kills a program without warning; when."""
+        """Kills a program and returns the time."""
         at_s = time.monotonic()
         self.signal(name, signal.SIGKILL)
         self.running.pop(name).wait()
         return at_s
 
     def logs(self):
-        """The ends of what the programs said."""
-        told = [(name, self.work / f"{name}.log") for name in ("bridge", "relay", *SIDES)]
-        return "\n".join(f"{name}:\n{path.read_text()[-2000:]}" for name, path in told if path.exists())
+        """Returns the ends of the programs' logs."""
+        logs = [(name, self.work / f"{name}.log") for name in ("bridge", "relay", *SIDES)]
+        return "\n".join(f"{name}:\n{path.read_text()[-2000:]}" for name, path in logs if path.exists())
 
     def end(self):
         for running in self.running.values():
@@ -155,26 +155,26 @@ class Rig:
         )
 
     def status(self):
-        told = self.tandem("status", "--json")
-        assert told.returncode == 0, told.stderr
-        return json.loads(told.stdout)
+        result = self.tandem("status", "--json")
+        assert result.returncode == 0, result.stderr
+        return json.loads(result.stdout)
 
     def reset(self):
-        """Lets the arms go, as soon as they are well, and waits until both nodes are started."""
+        """Resets the arms as soon as they are ready and waits until both nodes are started."""
 
         def done():
-            told = self.tandem("reset")
-            assert told.returncode in (0, 75), told.stderr
-            return told.returncode == 0 or "not stopped but Idle" in told.stderr
+            result = self.tandem("reset")
+            assert result.returncode in (0, 75), result.stderr
+            return result.returncode == 0 or "not stopped but Idle" in result.stderr
 
         until("reset", done)
         until("both nodes are started", lambda: all(self.starts()) or self.status()["stopped"])
 
     def starts(self):
-        """Whether the arms were started and not stopped since, arm by arm."""
+        """Yields for each arm whether its latest event is a start."""
         for record in self.records:
-            told = record.lines("start") + record.lines("stop")
-            yield max(told, key=lambda line: line[1])[0] == "start" if told else False
+            events = record.lines("start") + record.lines("stop")
+            yield max(events, key=lambda line: line[1])[0] == "start" if events else False
 
     def unless_busy(self, stopped):
         if stopped and stopped["name"] in BUSY:
@@ -182,42 +182,42 @@ class Rig:
         assert not stopped, stopped["sentence"]
 
     def with_arms(self, work):
-        """Does `work` with arms that are let go, again as long as a busy machine stops them."""
+        """Resets the arms and runs `work`. Repeats if a busy machine stops them."""
         for _ in range(8):
             self.reset()
             try:
                 return work()
             except Busy as busy:
-                print(f"    again, this machine was busy: {busy}", flush=True)
+                print(f"    retrying, this machine was busy: {busy}", flush=True)
         raise AssertionError("this machine is too busy")
 
     def moving(self, speed=0.1):
-        """A motion that has been under way for a second."""
-        began_s = time.monotonic()
+        """Starts a motion and returns once the arms have moved for a second."""
+        start_s = time.monotonic()
         mover = self.spawn("move", "deploy/first-motion.json", "--speed", speed)
 
-        def under_way():
+        def are_moving():
             if mover.poll() is not None:
                 self.unless_busy(self.status()["stopped"])
                 raise AssertionError(mover.stderr.read())
             return all(
-                sum(any(rates) for _, _, _, rates, _, _ in record.lines("state", began_s)) > 100
+                sum(any(rates) for _, _, _, rates, _, _ in record.lines("state", start_s)) > 100
                 for record in self.records
             )
 
-        until("the arms move", under_way)
+        until("the arms move", are_moving)
         return mover
 
     def rest(self, since_s, arms=(0, 1)):
-        """Waits until the arms have stood for a second. For how long they moved since then, seconds, and how far, degrees."""
+        """Waits until the arms have rested for a second. Returns how long (seconds) and how far (degrees) they moved after `since_s`."""
         records = [self.records[arm] for arm in arms]
 
-        def stands():
+        def are_at_rest():
             last = [record.lines("state", time.monotonic() - 1.0) for record in records]
             enough = all(len(states) > 20 for states in last)
             return enough and not any(any(state[3]) for states in last for state in states)
 
-        until("the arms stand", stands)
+        until("the arms rest", are_at_rest)
         moved_s, moved_deg = 0.0, 0.0
         for record in records:
             states = record.lines("state", since_s)

@@ -1,9 +1,9 @@
-"""Somebody else who moves an arm: publishes its velocities until killed."""
+"""A second publisher of an arm's velocities, which runs until it is killed."""
 
 import rospy
 from kinova_msgs.msg import JointVelocity
 
-rospy.init_node("stranger", disable_signals=True)
+rospy.init_node("second_publisher", disable_signals=True)
 velocities = rospy.Publisher("/left/m1n4s200_driver/in/joint_velocity", JointVelocity, queue_size=1)
 while True:
     velocities.publish(JointVelocity(joint1=4.0))
