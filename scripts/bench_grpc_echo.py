@@ -1,8 +1,8 @@
 #!/usr/bin/env python3
-"""Times grpcio's own echo with messages as long as a teacher's: what a service in Python pays before it has thought.
+"""Times a grpcio echo with messages of a teacher's size: the overhead of a service in Python.
 
 Usage: python scripts/bench_grpc_echo.py [--rounds 3]     run it after `tandem bench teacher`, on the same machine
-Needs: pip install grpcio. Client and server are processes of their own; the messages are bytes that nobody decodes.
+Needs: pip install grpcio. Client and server are separate processes. The messages are bytes that are not decoded.
 Prints one JSON object a line (name, value, unit), the best of the rounds, for grpcio's server with threads and with
 asyncio. A request asks about two steps of two arms.
 """
@@ -57,7 +57,7 @@ async def serve_with_asyncio():
 
 
 def timed(ask):
-    """p50 and p99 of `ask`, in microseconds."""
+    """Returns p50 and p99 of `ask`, in microseconds."""
     times, end = [], time.perf_counter() + SECONDS
     while (start := time.perf_counter()) < end:
         ask()
@@ -84,7 +84,7 @@ def one_client(address):
 
 
 async def many_streams(address):
-    """Steps a second over streams that have one request under way each."""
+    """Returns steps per second over streams with one request in flight each."""
 
     async def one():
         async with grpc.aio.insecure_channel(address, options=[("grpc.use_local_subchannel_pool", 1)]) as channel:

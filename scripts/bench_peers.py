@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Times peers beside Tandem, in turn, on one core: gymnasium-robotics' Fetch environments and PyTorch's DDPG update.
+"""Times other projects and Tandem in turn on one core: gymnasium-robotics' Fetch environments and PyTorch's DDPG update.
 
 Usage: python scripts/bench_peers.py [--tandem target/release/tandem] [--rounds 3]
 Needs: pip install mujoco==3.10.0 gymnasium-robotics==1.4.2 (newer mujoco breaks that package), and torch for the update.
@@ -21,7 +21,7 @@ BATCH, HIDDEN, LAYERS, OBSERVATION, GOAL, ACTION, HEADS = 256, 256, 4, 56, 6, 6,
 
 
 def per_second(work, seconds=SECONDS):
-    """Calls of `work` a second, after one that is not counted."""
+    """Returns calls of `work` per second, after a warm-up call."""
     work()
     start, calls = time.perf_counter(), 0
     while time.perf_counter() - start < seconds:
@@ -31,7 +31,7 @@ def per_second(work, seconds=SECONDS):
 
 
 def fetch(name):
-    """Environment steps a second of a Fetch environment with random actions, resets included."""
+    """Returns environment steps per second of a Fetch environment with random actions, resets included."""
     import gymnasium
     import gymnasium_robotics
 
@@ -48,7 +48,7 @@ def fetch(name):
 
 
 def torch_update():
-    """DDPG updates a second in PyTorch, one thread, fused Adam: the student's networks, the same arithmetic."""
+    """Returns DDPG updates per second in PyTorch with one thread and fused Adam, on the student's networks."""
     import copy
 
     import torch
@@ -90,7 +90,7 @@ def torch_update():
 
 
 def tandem(program):
-    """Tandem's own figures, by name."""
+    """Returns Tandem's figures by name."""
     output = subprocess.run([program, "bench", "sim", "update", "--json"], check=True, capture_output=True, text=True)
     return {row["name"]: row["value"] for row in map(json.loads, output.stdout.splitlines())}
 

@@ -16,20 +16,20 @@ import yaml
 
 ROOT = Path(__file__).resolve().parent.parent
 WORKLOADS = ("Deployment", "StatefulSet")
-# What docs/cluster.md tells people to make.
+# The secrets that docs/cluster.md describes.
 SECRETS = {"tandem-secrets": {"token", "redis-password"}}
-# gRPC probes are there for good since 1.27.
+# gRPC probes are stable since 1.27.
 VERSIONS = ("1.27.0", "1.37.0")
 
 
-# --- Kustomizations, as far as ours go. Where kubectl or kustomize is at hand, its answer must be the same.
+# Kustomizations, limited to the features used here. If kubectl or kustomize is installed, its output must be the same.
 
 def documents(path):
     return [document for document in yaml.safe_load_all(path.read_text()) if document]
 
 
 def build(folder):
-    """The objects of a kustomization; a key that is not known here is an error."""
+    """Returns the objects of a kustomization. Unknown keys are errors."""
     file = folder / "kustomization.yaml"
     kustomization = documents(file)[0]
     known = {"apiVersion", "kind", "namespace", "resources", "configMapGenerator", "generatorOptions", "images", "replicas", "patches"}
@@ -87,7 +87,7 @@ def by_key(objects):
     return keyed
 
 
-# --- What the objects say of one another.
+# References between objects.
 
 def containers(found):
     return found["spec"]["template"]["spec"]["containers"] if found["kind"] in WORKLOADS else []
@@ -102,7 +102,7 @@ def port_numbers(workload):
 
 
 def addresses(container):
-    """Services that a container calls, and the ports by which it does."""
+    """Returns the services that a container calls, with their ports."""
     texts = container.get("args", []) + [env.get("value", "") for env in container.get("env", [])]
     found = [re.fullmatch(r"(?:[a-z]+://(?:.*@)?)?([a-z][a-z-]*):(\d+)(?:/.*)?", text) for text in texts]
     return [(match[1], int(match[2])) for match in found if match]
@@ -218,7 +218,7 @@ class Checked:
         self.expect(len(behind) == 1, f"service {name} leads to {len(behind)} workloads")
         offered = {p["name"]: p["containerPort"] for w in behind for c in containers(w) for p in c.get("ports", [])}
         for port in spec["ports"]:
-            self.expect(port["targetPort"] in offered, f"service {name}: nobody offers {port['targetPort']}")
+            self.expect(port["targetPort"] in offered, f"service {name}: no container offers {port['targetPort']}")
             # The name of a headless service leads to pods, whose ports are their own.
             same = offered.get(port["targetPort"]) == port["port"]
             self.expect(same or spec.get("clusterIP") != "None", f"service {name}: {port['port']} is not the pod's port")
@@ -229,7 +229,7 @@ class Checked:
         self.expect(of, f"policy {name} selects no one")
         for rule in spec.get("ingress", []):
             for port in rule["ports"]:
-                self.expect(any(port["port"] in port_numbers(w) for w in of), f"policy {name}: nobody listens on {port['port']}")
+                self.expect(any(port["port"] in port_numbers(w) for w in of), f"policy {name}: no container listens on {port['port']}")
 
     def check_autoscaler(self, scaler):
         target = scaler["spec"]["scaleTargetRef"]
@@ -243,11 +243,11 @@ class Checked:
         name = metric["metric"]["name"]
         self.expect(name in [rule["name"]["as"] for rule in rules], f"the adapter has no rule for {name}")
         self.expect(name in [rule["seriesQuery"].split("{")[0] for rule in rules], f"the adapter does not look for {name}")
-        told = f'"{name.removeprefix("tandem_")}"' in (ROOT / "learner/src/metrics.rs").read_text()
-        self.expect(told, f"the learner tells nothing called {name}")
+        is_exported = f'"{name.removeprefix("tandem_")}"' in (ROOT / "learner/src/metrics.rs").read_text()
+        self.expect(is_exported, f"the learner exports no metric {name}")
 
 
-# --- The whole of it.
+# The complete check.
 
 def commands(objects):
     fields = ("command", "args", "env", "ports", "startupProbe", "readinessProbe", "livenessProbe", "volumeMounts")
@@ -255,7 +255,7 @@ def commands(objects):
 
 
 def check_files(folder):
-    """That every file is part of something, and that the texts beside the manifests say the same as they do."""
+    """Checks that every file is used and that the documentation agrees with the manifests."""
     used = {folder / "prometheus-adapter.yaml"}
     for file in folder.rglob("kustomization.yaml"):
         kustomization = documents(file)[0]
@@ -304,7 +304,7 @@ def check_schemas(folder):
         print(f"{overlay.name}: {len(objects)} objects fit the schemas of Kubernetes {' and '.join(VERSIONS)}, {how}")
 
 
-# What somebody may get wrong, and no schema notices.
+# Mistakes that no schema detects.
 MISTAKES = [
     ("base/learner.yaml", "teacher:7001", "teachers:7001"),
     ("base/learner.yaml", "teacher:7001", "teacher:7002"),

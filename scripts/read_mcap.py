@@ -32,7 +32,7 @@ CHANNELS = {
 
 
 class Wrong(Exception):
-    """What is off, in one line."""
+    """An error that is reported in one line."""
 
 
 def expect(condition, problem):

@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Uses the built program as a user would, and checks its files with programs that are not ours.
+# Uses the built program as a user would and checks its files with independent programs.
 # Needs Python 3 with venv; installs the packages of scripts/requirements.txt into a temporary environment.
 set -euo pipefail
 cd "$(dirname "$0")/.."

@@ -15,7 +15,7 @@ import os
 import random
 import sys
 
-os.environ.setdefault("GRPC_VERBOSITY", "NONE")  # What goes wrong is said in one line, below.
+os.environ.setdefault("GRPC_VERBOSITY", "NONE")  # Errors are reported in one line, below.
 
 import grpc
 from google.protobuf import descriptor_pool, message_factory
@@ -31,11 +31,11 @@ class Details(
     collections.namedtuple("Details", "method timeout metadata credentials wait_for_ready compression"),
     grpc.ClientCallDetails,
 ):
-    """What a call is made with."""
+    """The details of a call."""
 
 
 class EveryCall(grpc.UnaryUnaryClientInterceptor, grpc.StreamStreamClientInterceptor):
-    """Shows the token, if there is one, and sets a deadline, with every call: reflection's included."""
+    """Attaches the token, if any, and a deadline to every call, including reflection."""
 
     def __init__(self, token):
         self.metadata = [("authorization", f"Bearer {token}")] if token else []
@@ -48,7 +48,7 @@ class EveryCall(grpc.UnaryUnaryClientInterceptor, grpc.StreamStreamClientInterce
 
 
 class Teacher:
-    """The service's calls as methods: `teacher.Describe()`, `teacher.Advise(account="mine", steps=[...])`."""
+    """The service's methods: `teacher.Describe()`, `teacher.Advise(account="mine", steps=[...])`."""
 
     def __init__(self, channel):
         database = ProtoReflectionDescriptorDatabase(channel)
@@ -72,7 +72,7 @@ class Teacher:
 
 
 def connect(arguments):
-    """A channel to the teacher, in the clear or by TLS, that shows the token."""
+    """Opens a channel to the teacher, with or without TLS, that attaches the token."""
     if arguments.tls_ca:
         with open(arguments.tls_ca, "rb") as file:
             channel = grpc.secure_channel(arguments.address, grpc.ssl_channel_credentials(file.read()))
@@ -86,7 +86,7 @@ def connect(arguments):
 
 
 def random_steps(about, episode, n_steps):
-    """Steps 0, 1, ... of an episode: no world, only numbers such as a teacher takes."""
+    """Returns steps 0, 1, ... of an episode with made-up numbers of valid shape."""
     draw = random.Random(episode)
 
     def numbers(per_arm, reach):
@@ -105,7 +105,7 @@ def random_steps(about, episode, n_steps):
 
 
 def reason(strategy, arm):
-    """What the strategy compares for one arm: the left side must be larger for the arm to be overridden."""
+    """Returns the strategy's comparison for one arm. The arm is overridden if the left side is larger."""
     name, _, threshold = strategy.partition(":")
     if name == "mc-q":
         return f"importance {arm.importance:+.4f}, threshold {threshold}"

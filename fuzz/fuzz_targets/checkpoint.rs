@@ -1,6 +1,6 @@
 //! Checkpoints: a file is refused or holds a state that survives being saved.
 //!
-//! The input is sealed anew before it is loaded, so that the checksum hides nothing behind it.
+//! The seal is recomputed before the input is loaded, so that the checksum does not reject mutated files.
 #![no_main]
 
 use std::fs;

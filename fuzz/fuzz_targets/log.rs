@@ -1,4 +1,4 @@
-//! Episode logs (MCAP): reading refuses or accepts a log; recovery makes a whole file of any beginning of one.
+//! Episode logs (MCAP): reading refuses or accepts a log; recovery turns any prefix of a log into a complete file.
 #![no_main]
 
 use libfuzzer_sys::{fuzz_mutator, fuzz_target, fuzzer_mutate};
@@ -21,7 +21,7 @@ fuzz_target!(|file: &[u8]| {
             let recovered = recovered.expect("a whole log can be copied");
             assert_eq!(recovered.ended_by, None, "a whole log was called damaged");
             let copy = read_episode(&recovered_path).expect("the copy of a log is a log");
-            // NaN differs from itself: logs are compared as they are printed.
+            // Logs are compared in printed form, because NaN differs from itself.
             assert_eq!(format!("{copy:?}"), format!("{log:?}"));
         }
         (Err(_), Ok(_)) => {

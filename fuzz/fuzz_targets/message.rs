@@ -9,7 +9,7 @@ use tandem_core::{Layout, Task};
 use tandem_fuzz::with_bounded_memory;
 use tandem_proto::{DecodeError, MAX_ARMS, pb};
 
-/// Longest text of a refusal: it travels in an HTTP/2 header.
+/// Maximum length of an error message, which is sent in an HTTP/2 header.
 const MAX_REFUSAL_BYTES: usize = 400;
 
 fuzz_target!(|input: &[u8]| {
@@ -48,7 +48,7 @@ fn read(message: u8, layout: Layout, bytes: &[u8]) {
             let name = tandem_proto::decode_account_name("name", request.name)?;
             Ok(pb::OpenAccountRequest { name, ..request })
         }),
-        // Services fill these in themselves; here only their wire format is read.
+        // Services create these messages themselves. Only their wire format is decoded here.
         7 => check(bytes, Ok::<pb::Progress, DecodeError>),
         8 => check(bytes, Ok::<pb::ExecuteRequest, DecodeError>),
         _ => check(bytes, Ok::<pb::AdviseRequest, DecodeError>),

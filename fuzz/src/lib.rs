@@ -1,7 +1,7 @@
-//! What the fuzz targets share: a bound on memory, a file to decode, and mutations that keep a file's framing valid.
+//! Shared parts of the fuzz targets: a memory bound, a scratch file, and mutations that keep a file's framing valid.
 //!
 //! Decoders check lengths and checksums first. Random changes rarely get past those, so [`safetensors_file`] and
-//! [`mcap_file`] mutate a part of a file and then make its lengths and checksums fit again.
+//! [`mcap_file`] mutate a part of a file and then recompute its lengths and checksums.
 
 pub mod mcap_file;
 pub mod safetensors_file;
@@ -27,13 +27,13 @@ pub type Mutate = fn(data: &mut [u8], size: usize, max_size: usize) -> usize;
 /// Runs `decode`, which aborts the process when it takes more than 64 MiB.
 pub fn with_bounded_memory<T>(decode: impl FnOnce() -> T) -> T {
     let limit = ALLOCATOR.allocated() + MAX_BYTES;
-    ALLOCATOR.set_limit(limit).expect("the limit is above what is allocated");
+    ALLOCATOR.set_limit(limit).expect("the limit exceeds the allocated memory");
     let decoded = decode();
     ALLOCATOR.set_limit(usize::MAX).expect("no limit is too low");
     decoded
 }
 
-/// The path of this process's scratch file called `name`.
+/// Returns the path of this process's scratch file `name`.
 pub fn scratch_file(name: &str) -> PathBuf {
     static DIRECTORY: OnceLock<TempDir> = OnceLock::new();
     let directory = DIRECTORY.get_or_init(|| tempfile::tempdir().expect("a temporary directory"));

@@ -16,7 +16,7 @@ const DATA_END: u8 = 0x0f;
 const BEFORE_CHUNK_CRC: usize = 24;
 const CRC_BYTES: usize = 4;
 
-/// Mutates the body of one record, inside an uncompressed chunk too, and makes the lengths around it fit. `seed`
+/// Mutates the body of one record, inside an uncompressed chunk too, and updates the enclosing lengths. `seed`
 /// chooses the record.
 pub fn mutate_file(file: &[u8], max_size: usize, seed: u32, mutate: Mutate) -> Vec<u8> {
     let seed = seed as usize;
@@ -48,7 +48,7 @@ pub fn mutate_file(file: &[u8], max_size: usize, seed: u32, mutate: Mutate) -> V
     mutated
 }
 
-/// The file with zeros for every checksum of a chunk, the data and the summary.
+/// Returns the file with every checksum of a chunk, the data and the summary set to zero.
 pub fn without_checksums(file: &[u8]) -> Vec<u8> {
     let mut cleared = file.to_vec();
     for record in records(file, MAGIC_BYTES) {
@@ -66,7 +66,7 @@ pub fn without_checksums(file: &[u8]) -> Vec<u8> {
     cleared
 }
 
-/// Where the whole records of `file[..]` lie that begin at `start`.
+/// Returns the ranges of the complete records of `file` from `start` on.
 fn records(file: &[u8], mut start: usize) -> Vec<Range<usize>> {
     let mut records = Vec::new();
     while let Some(length) = read_u64(file, start + 1) {
@@ -80,7 +80,7 @@ fn records(file: &[u8], mut start: usize) -> Vec<Range<usize>> {
     records
 }
 
-/// The records inside an uncompressed chunk.
+/// Returns the records inside an uncompressed chunk.
 fn inner_records(file: &[u8], record: &Range<usize>) -> Vec<Range<usize>> {
     let (_, records_size) = chunk_size_fields(record);
     let compression = record.start + HEAD_BYTES + BEFORE_CHUNK_CRC + CRC_BYTES;
@@ -91,7 +91,7 @@ fn inner_records(file: &[u8], record: &Range<usize>) -> Vec<Range<usize>> {
     records(&file[..record.end], records_size + 8)
 }
 
-/// Where a chunk says how many bytes its records have: uncompressed, and as they are, without compression.
+/// Positions of a chunk's two size fields: uncompressed and stored. Both are equal without compression.
 fn chunk_size_fields(record: &Range<usize>) -> (usize, usize) {
     let body = record.start + HEAD_BYTES;
     (body + 16, body + BEFORE_CHUNK_CRC + CRC_BYTES + size_of::<u32>())

@@ -5,11 +5,11 @@ use sha2::{Digest as _, Sha256};
 use crate::{Mutate, mutate_part};
 
 const WORD_BYTES: usize = 8;
-/// How the header of a checkpoint begins; the seal follows.
+/// The start of a checkpoint's header, before the seal.
 const BEFORE_SEAL: &[u8] = br#"{"__metadata__":{"seal":""#;
 const SEAL_CHARS: usize = 64;
 
-/// Mutates the header or the tensors and makes the header's length fit. `seed` chooses the part.
+/// Mutates the header or the tensors and updates the header's length. `seed` chooses the part.
 pub fn mutate_file(file: &[u8], max_size: usize, seed: u32, mutate: Mutate) -> Vec<u8> {
     let Some(header_end) = header_end(file) else {
         return mutate_part(file, 0..file.len(), max_size, mutate);
@@ -25,14 +25,14 @@ pub fn mutate_file(file: &[u8], max_size: usize, seed: u32, mutate: Mutate) -> V
     mutated
 }
 
-/// Where the header ends, when the file is long enough to hold it.
+/// Returns the end of the header, or `None` if the file is too short.
 fn header_end(file: &[u8]) -> Option<usize> {
     let length = u64::from_le_bytes(*file.first_chunk::<WORD_BYTES>()?);
     let end = WORD_BYTES.checked_add(usize::try_from(length).ok()?)?;
     (end <= file.len()).then_some(end)
 }
 
-/// The checkpoint `file` with the SHA-256 seal that fits its contents, when it has room for one.
+/// Returns the checkpoint `file` with a valid SHA-256 seal, if it has room for one.
 pub fn seal_anew(file: &[u8]) -> Vec<u8> {
     let mut sealed = file.to_vec();
     let start = WORD_BYTES + BEFORE_SEAL.len();

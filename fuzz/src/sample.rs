@@ -1,4 +1,4 @@
-//! A run that is as small as a run can be, and what it leaves in files.
+//! A minimal run and its files.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -11,7 +11,7 @@ use tandem_rl::config::Recipe;
 use tandem_rl::trainer::Trainer;
 use tandem_telemetry::{EpisodeMetadata, EpisodeRecorder, Error, TransitionRecord};
 
-/// One arm that pushes, networks of two units, a replay buffer of four episodes.
+/// Returns a run with one pushing arm, networks of two units and a replay buffer of four episodes.
 pub fn run_config() -> RunConfig {
     let mut config = RunConfig::defaults(Recipe::Tandem, Task::Push, 1);
     config.ddpg.n_hidden = 2;
@@ -24,7 +24,7 @@ pub fn run_config() -> RunConfig {
     config
 }
 
-/// A trainer of [`run_config`] that has learned `n_rounds` rounds of made-up episodes.
+/// Returns a trainer of [`run_config`] that has learned `n_rounds` rounds of made-up episodes.
 pub fn trainer(n_rounds: u64) -> Trainer {
     let mut trainer = Trainer::new(run_config()).expect("the configuration is valid");
     for number in 0..n_rounds {
@@ -34,7 +34,7 @@ pub fn trainer(n_rounds: u64) -> Trainer {
     trainer
 }
 
-/// A made-up episode of [`run_config`]'s task.
+/// Returns a made-up episode of [`run_config`]'s task.
 pub fn episode(number: u64) -> Episode {
     let layout = Layout::new(Task::Push, 1);
     Episode {
@@ -54,7 +54,7 @@ pub fn episode(number: u64) -> Episode {
 /// Records the first two steps of a made-up episode in the log `path`.
 ///
 /// # Errors
-/// When the log cannot be written.
+/// If the log cannot be written.
 pub fn record_episode(path: &Path) -> Result<PathBuf, Error> {
     let episode = episode(7);
     let layout = episode.layout;

@@ -43,7 +43,7 @@ fn write_checkpoints(to: &Path, scratch: &Path) -> Result<(), AnyError> {
     Ok(())
 }
 
-/// What a run has beside its trainer while an evaluation is under way.
+/// Returns the state that a run keeps besides its trainer during an evaluation.
 fn resumption(trainer: &Trainer) -> Resumption {
     let policy = trainer.policy(BTreeMap::from([("name".to_owned(), "sample".to_owned())]));
     let row = MetricsRow { round: 1, success_per_arm: vec![0.5], ..MetricsRow::default() };
@@ -69,14 +69,14 @@ fn write_policies(to: &Path) -> Result<(), AnyError> {
     let policy = sample::trainer(0).policy(BTreeMap::new());
     let path = to.join("with-digest");
     policy.save(&path)?;
-    // Without a digest, changed numbers are accepted: the fuzzer gets past the checksum.
+    // Changed numbers are accepted without a digest, so that the fuzzer gets past the checksum.
     let file = fs::read(&path)?;
     let entry = format!(r#","digest":"{}""#, policy.digest());
     fs::write(to.join("without-digest"), without_header_text(&file, &entry)?)?;
     Ok(())
 }
 
-/// The safetensors `file` without the first `text` in its header.
+/// Returns the safetensors `file` without the first `text` in its header.
 fn without_header_text(file: &[u8], text: &str) -> Result<Vec<u8>, AnyError> {
     let (length, rest) = file.split_first_chunk::<8>().ok_or("expected a header length")?;
     let (header, tensors) = rest.split_at(usize::try_from(u64::from_le_bytes(*length))?);
@@ -100,7 +100,7 @@ fn write_logs(to: &Path, scratch: &Path) -> Result<(), AnyError> {
     Ok(())
 }
 
-/// A log with the transitions, outcome and metadata of `log` only, without schemas and with no metadata checksum.
+/// Returns a log with the transitions, outcome and metadata of `log` only, without schemas and with no metadata checksum.
 fn small_log(log: &[u8], compression: Option<mcap::Compression>) -> Result<Vec<u8>, AnyError> {
     let options = mcap::WriteOptions::new().compression(compression).compression_threads(0);
     let mut writer = options.create(std::io::Cursor::new(Vec::new()))?;
