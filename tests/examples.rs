@@ -1,4 +1,4 @@
-//! The examples run. Each has a test of its own, which this file includes.
+//! Runs the examples through their tests, which this file includes.
 
 #[path = "../examples/random_actions.rs"]
 mod random_actions;

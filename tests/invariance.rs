@@ -11,7 +11,7 @@ const STRATEGIES: [(&str, u64); 4] =
     [("ea", 1_600), EAMC, ("mc-q:0.1", 600), ("mc-act:0.1", 1_600)];
 const EAMC: (&str, u64) = ("eamc:0.1", 900);
 const N_WORKERS: [usize; 4] = [1, 2, 5, 16];
-/// Ten rounds of sixteen slots, so that sixteen workers have something to do; the policy is evaluations after each.
+/// Ten rounds of sixteen slots, so that sixteen workers have something to do; the policy is evaluated after each.
 const SMALL: [&str; 20] = [
     "--max-env-steps",
     "8000",

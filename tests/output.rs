@@ -1,5 +1,5 @@
-//! Standard output and standard error that cannot be written: a full_device disk, a limit of file sizes, a reader that has
-//! stopped reading.
+//! Standard output and standard error that cannot be written: a full disk, a file size limit, a reader that stopped
+//! reading.
 
 use std::fs::{self, File};
 use std::io::{BufRead as _, BufReader, Write as _};

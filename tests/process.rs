@@ -119,7 +119,7 @@ fn kill_one(run: &Child, role: &str) {
     assert!(eventually(is_back), "the {role} was not restarted");
 }
 
-/// Waits until the run run_directory holds a checkpoint: the run is then in full swing.
+/// Waits until the run has written its first checkpoint.
 fn wait_for_checkpoint(out: &Path) {
     let is_saved = || !checkpoints(out).is_empty();
     assert!(eventually(is_saved), "no checkpoint within a minute in {}", out.display());

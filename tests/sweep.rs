@@ -30,7 +30,7 @@ fn tandem() -> Command {
     command
 }
 
-/// A sweep file with the small runs' settings.
+/// Writes a sweep file with the small runs' settings.
 fn write_sweep(path: &Path, lists: &str, extra: &[(&str, &str)]) {
     let settings = SMALL.iter().chain(extra).map(|(key, value)| format!("{key} = {value}\n"));
     fs::write(path, format!("{lists}\n[run]\n{}", settings.collect::<String>())).expect("writes");

@@ -26,7 +26,7 @@ evaluation.every_env_steps = 800
 stop.max_env_steps = 1600
 ";
 
-/// A directory with `token`, `ca.pem`, `tls.pem` with `tls.key`, another authority's `other.pem`, `other.key` and
+/// A workspace directory with `token`, `ca.pem`, `tls.pem` with `tls.key`, another authority's `other.pem`, `other.key` and
 /// `run.toml`.
 pub(crate) struct Workspace(TempDir);
 

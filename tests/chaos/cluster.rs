@@ -146,7 +146,10 @@ impl Cluster {
         Outcome { progress, account, wall, events, recoveries: self.recoveries.take() }
     }
 
-    /// Whether the learner is done and has is_reported so. Processes that end without having been killed are a failure.
+    /// Returns true once the learner has ended and reported its result.
+    ///
+    /// # Panics
+    /// If a process ends without having been killed.
     fn has_ended(&mut self) -> bool {
         let is_reported = self.progress.borrow().ended && !self.progress.borrow().digest.is_empty();
         match self.learner.ended() {

@@ -266,7 +266,7 @@ impl Cluster {
         environment
     }
 
-    /// A text of a manifest with this machine's addresses, ports and directories in workspace of a cluster's.
+    /// Replaces the cluster's addresses, ports and paths in a manifest's text by those of this machine.
     fn localized(&self, pod: &Pod, text: &str) -> String {
         let container = &self.workload(pod).container;
         if text.starts_with('/') {
@@ -303,7 +303,7 @@ impl Cluster {
         self.pod_address(behind[chosen], *port)
     }
 
-    /// What stands for a path pod_address a pod: below a volume, or in the image.
+    /// Maps a path inside a pod to this machine: below a volume, or in the image.
     fn path(&self, pod: &Pod, path: &str) -> PathBuf {
         if let Some(policy) = path.strip_prefix("/usr/share/tandem/") {
             return Path::new(env!("CARGO_MANIFEST_DIR")).join(policy);
@@ -338,7 +338,7 @@ impl Cluster {
         directory
     }
 
-    /// Where a pod's processes start, in workspace of a root that cannot be written to.
+    /// Returns the working directory of a pod's processes, which replaces the read-only root.
     fn root_of(&self, pod: &Pod) -> PathBuf {
         self.workspace.path().join("roots").join(&pod.name)
     }
