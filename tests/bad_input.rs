@@ -85,7 +85,10 @@ async fn attack(address: SocketAddr, service: &str) {
             assert!(refused || may_succeed, "{what}: {answer:?}");
             assert!(!matches!(&answer, Answer::Status(Code::Unknown, _)), "{what}: {answer:?}");
             if UNDECODABLE.contains(&name.as_str()) {
-                let is_explained = matches!(&answer, Answer::Status(Code::InvalidArgument, message) if message.contains("malformed"));
+                let is_explained = matches!(
+                    &answer,
+                    Answer::Status(Code::InvalidArgument, message) if message.contains("malformed")
+                );
                 assert!(is_explained, "{what} is the client's mistake: {answer:?}");
             }
         }

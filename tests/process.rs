@@ -140,7 +140,7 @@ fn eventually(holds: impl Fn() -> bool) -> bool {
 }
 
 fn run_directory() -> (TempDir, PathBuf) {
-    let keep = tempfile::tempdir().expect("a run_directory");
+    let keep = tempfile::tempdir().expect("a directory");
     let out = keep.path().join("run");
     (keep, out)
 }

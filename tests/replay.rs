@@ -320,12 +320,13 @@ fn a_changed_action_or_world_changes_the_replay() {
     );
 }
 
-/// Checks that a damaged log is refused and that its recovery is a prefix of the original. Returns the recovered length.
+/// Checks that a damaged log is refused and that its recovery is a prefix of the original. Returns the recovered
+/// length.
 fn check_damaged(whole: &EpisodeLog, bytes: &[u8], directory: &Path) -> Option<usize> {
-    let (damaged, mended) = (directory.join("damaged.mcap"), directory.join("mended.mcap"));
+    let (damaged, recovered) = (directory.join("damaged.mcap"), directory.join("recovered.mcap"));
     fs::write(&damaged, bytes).expect("written");
     assert!(read_episode(&damaged).is_err(), "{} bytes are accepted as complete", bytes.len());
-    let log = recover(&damaged, &mended).ok().map(|_| read_episode(&mended))?;
+    let log = recover(&damaged, &recovered).ok().map(|_| read_episode(&recovered))?;
     let Ok(log) = log else { return None };
     assert_eq!(log.metadata, whole.metadata);
     assert!(log.transitions == whole.transitions[..log.transitions.len()]);
@@ -346,7 +347,7 @@ fn a_log_truncated_anywhere_is_recovered_up_to_the_cut() {
             "{n_bytes} bytes give {n_steps:?} steps, fewer gave {n_before:?}"
         );
         if n_steps > n_before && n_steps > Some(0) {
-            let log = read_episode(&keep.path().join("mended.mcap")).expect("whole");
+            let log = read_episode(&keep.path().join("recovered.mcap")).expect("whole");
             assert!(replay_log(&log).is_ok(), "{n_bytes} bytes");
             n_before = n_steps;
         }
@@ -358,23 +359,23 @@ fn a_log_truncated_anywhere_is_recovered_up_to_the_cut() {
 fn the_program_refuses_and_recovers_truncated_logs() {
     let keep = tempfile::tempdir().expect("a directory");
     let bytes = fs::read(one_log(keep.path())).expect("readable");
-    let (cut, mended) = (keep.path().join("cut.mcap"), keep.path().join("mended.mcap"));
+    let (cut, recovered) = (keep.path().join("cut.mcap"), keep.path().join("recovered.mcap"));
     for n_bytes in [0, 7, 8, 100, 3000, bytes.len() / 2, bytes.len() - 1] {
         fs::write(&cut, &bytes[..n_bytes]).expect("written");
         let refused = tandem(&["replay", "--verify"], &[&cut]);
         assert_eq!(refused.status.code(), Some(65), "{n_bytes} bytes");
         assert!(error_line(&refused).contains("cut.mcap"));
-        let recovered = tandem(&["mcap", "recover"], &[&cut, Path::new("--to"), &mended]);
+        let recovered = tandem(&["mcap", "recover"], &[&cut, Path::new("--to"), &recovered]);
         let code = recovered.status.code();
         assert_eq!(code, Some(if n_bytes < 8 { 65 } else { 0 }), "{n_bytes} bytes");
-        assert_eq!(mended.exists(), n_bytes >= 8);
-        if mended.exists() {
-            let again = tandem(&["replay", "--json"], &[&mended]);
+        assert_eq!(recovered.exists(), n_bytes >= 8);
+        if recovered.exists() {
+            let again = tandem(&["replay", "--json"], &[&recovered]);
             let summary = summary(&again);
             let is_prefix = summary["equal"] == json!(1);
             assert_eq!(again.status.code(), Some(if is_prefix { 0 } else { 65 }), "{summary}");
             assert!(is_prefix == (n_bytes > 3000), "{n_bytes} bytes: {summary}");
-            fs::remove_file(&mended).expect("there");
+            fs::remove_file(&recovered).expect("there");
         }
     }
     let left: Vec<_> =

@@ -26,8 +26,8 @@ evaluation.every_env_steps = 800
 stop.max_env_steps = 1600
 ";
 
-/// A workspace directory with `token`, `ca.pem`, `tls.pem` with `tls.key`, another authority's `other.pem`, `other.key` and
-/// `run.toml`.
+/// A workspace directory with `token`, `ca.pem`, `tls.pem` with `tls.key`, another authority's `other.pem`, `other.key`
+/// and `run.toml`.
 pub(crate) struct Workspace(TempDir);
 
 impl Workspace {

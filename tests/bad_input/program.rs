@@ -112,8 +112,8 @@ fn prepare(directory: &Path) {
     assert!(made.expect("mkfifo runs").success());
 }
 
-/// Command lines, their exit codes and a part of the error message. `@name` is a prepared file or directory, `@empty/x` a
-/// path that cannot be written, `%name` a shipped policy and `BUSY` an address in use.
+/// Command lines, their exit codes and a part of the error message. `@name` is a prepared file or directory, `@empty/x`
+/// a path that cannot be written, `%name` a shipped policy and `BUSY` an address in use.
 const CASES: [(&str, i32, &str); 76] = [
     ("", 64, "Usage"),
     ("dance", 64, "dance"),

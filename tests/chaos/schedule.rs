@@ -111,8 +111,8 @@ pub(crate) struct Schedule {
 }
 
 impl Schedule {
-    /// Creates a schedule with a fault every `every` for a run with `n_workers`. Kills of workers are delayed until no other
-    /// fault is active.
+    /// Creates a schedule with a fault every `every` for a run with `n_workers`. Kills of workers are delayed until no
+    /// other fault is active.
     pub(crate) fn new(seed: u64, n_workers: usize, every: Duration) -> Self {
         Self {
             random: Random(seed),

@@ -12,8 +12,8 @@ use tandem_rl::config::{Recipe, former_keys};
 use tandem_rl::trainer::Counters;
 use toml::Table;
 
-/// Merges the run file's settings over the recipe's, so that settings of later versions have a value. The program treats
-/// former keys in the same way, see `a_run_resumes_and_ends_with_the_same_counts`.
+/// Merges the run file's settings over the recipe's, so that settings of later versions have a value. The program
+/// treats former keys in the same way, see `a_run_resumes_and_ends_with_the_same_counts`.
 fn configuration(run: &Path) -> RunConfig {
     let mut text = fs::read_to_string(run.join("run.toml")).expect("readable");
     let name = |key: &'static str| key.split_once('.').expect("a section").1;

@@ -125,8 +125,8 @@ impl Device {
         text.lines().map(str::to_owned).collect()
     }
 
-    /// Discards the data that was not synced before the power cut. File names remain, as on a file system with a metadata
-    /// journal.
+    /// Discards the data that was not synced before the power cut. File names remain, as on a file system with a
+    /// metadata journal.
     pub(crate) fn lose_unsynced(&self) {
         for path in files_below(&self.root()) {
             let inode = fs::metadata(&path).expect("a file").ino();

@@ -56,8 +56,8 @@ fn a_run_is_resumed_after_a_power_cut() {
     faults(Mode::Cut, &hits).iter().for_each(check);
 }
 
-/// Faults at calls of every kind in every mode. `TANDEM_DISK_SWEEP` lists the modes and the number of calls of each kind.
-/// 0 means every call, which takes a day:
+/// Faults at calls of every kind in every mode. `TANDEM_DISK_SWEEP` lists the modes and the number of calls of each
+/// kind. 0 means every call, which takes a day:
 ///
 /// ```text
 /// TANDEM_DISK_SWEEP=once,dead,kill,cut:0 cargo test --release --test disk -- --ignored --nocapture

@@ -1,6 +1,6 @@
-//! Runs each simulation in its own deterministic process: random numbers come from the simulation's seed and clocks show
-//! simulated time. Per-process state, such as the runtime counter from which tokio derives its random numbers, is then
-//! the same in every repetition.
+//! Runs each simulation in its own deterministic process: random numbers come from the simulation's seed and clocks
+//! show simulated time. Per-process state, such as the runtime counter from which tokio derives its random numbers, is
+//! then the same in every repetition.
 
 use std::fmt;
 use std::path::Path;

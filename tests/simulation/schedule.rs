@@ -58,8 +58,8 @@ impl Schedule {
         }
     }
 
-    /// Draws faults of `links`, `services` and `workers`. The first worker never leaves for good. Most faults start within
-    /// `span`, which is extended on slow networks.
+    /// Draws faults of `links`, `services` and `workers`. The first worker never leaves for good. Most faults start
+    /// within `span`, which is extended on slow networks.
     pub(crate) fn draw(
         seed: u64,
         links: &[(Host, Host)],

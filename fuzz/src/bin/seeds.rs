@@ -100,7 +100,8 @@ fn write_logs(to: &Path, scratch: &Path) -> Result<(), AnyError> {
     Ok(())
 }
 
-/// Returns a log with the transitions, outcome and metadata of `log` only, without schemas and with no metadata checksum.
+/// Returns a log with the transitions, outcome and metadata of `log` only, without schemas and with no metadata
+/// checksum.
 fn small_log(log: &[u8], compression: Option<mcap::Compression>) -> Result<Vec<u8>, AnyError> {
     let options = mcap::WriteOptions::new().compression(compression).compression_threads(0);
     let mut writer = options.create(std::io::Cursor::new(Vec::new()))?;
