@@ -4,7 +4,7 @@ use std::collections::BTreeSet;
 use std::fs;
 use std::path::{Path, PathBuf};
 
-const ALLOWED: [(&str, &[&str]); 13] = [
+const ALLOWED: [(&str, &[&str]); 14] = [
     ("core", &[]),
     ("kinematics", &["core"]),
     ("sim", &["core"]),
@@ -17,11 +17,12 @@ const ALLOWED: [(&str, &[&str]); 13] = [
     ("teacher", &["core", "policy", "proto", "telemetry", "net"]),
     ("worker", &["core", "sim", "policy", "proto", "telemetry", "net"]),
     ("report", &["core", "telemetry"]),
-    ("bridge", &["core", "kinematics", "policy", "sim", "telemetry", "proto", "net"]),
+    ("bridge", &["core", "kinematics", "proto", "net"]),
+    ("trials", &["core", "kinematics", "sim", "policy", "telemetry", "bridge"]),
 ];
 
 /// Directories of which every file is pure, and single pure files.
-const PURE: [&str; 28] = [
+const PURE: [&str; 25] = [
     "core/src",
     "kinematics/src",
     "sim/src",
@@ -38,17 +39,14 @@ const PURE: [&str; 28] = [
     "bridge/src/quarc/inbox.rs",
     "bridge/src/layout.rs",
     "bridge/src/service/execution.rs",
-    "bridge/src/service/paced.rs",
     "bridge/src/service/time.rs",
     "bridge/src/service/words.rs",
-    "bridge/src/simulated",
-    "bridge/src/trial.rs",
-    "bridge/src/trial",
     "learner/src/board.rs",
     "teacher/src/budget.rs",
     "teacher/src/maps.rs",
     "teacher/src/procedures.rs",
     "teacher/src/strategy.rs",
+    "trials/src",
     "worker/src/rollout.rs",
 ];
 

@@ -8,8 +8,7 @@
 //! **Whoever falls silent stops the arms.** A command holds for one period. Every driver has to see to it that the arms
 //! brake by themselves when no command has come for [`SILENCE_S`], also when its own process is killed:
 //!
-//! - The simulated pair counts simulated time since the last command and brakes
-//!   ([`SimulatedPair`](crate::simulated::SimulatedPair)).
+//! - The simulated pair (crate `tandem-trials`) counts simulated time since the last command and brakes.
 //! - **QUARC** (one vector of doubles per sample over TCP): the receiving model holds its last input, which would go on moving for ever. The
 //!   vector therefore carries the command's number, and the model on that side has to set the velocities to zero when the
 //!   number has not changed for [`SILENCE_S`] or its stream server reports a lost peer. The driver closes the socket when a vector is short, is

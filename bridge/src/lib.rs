@@ -1,9 +1,8 @@
 //! What moves a pair of arms: an executor that lets nothing but a checked motion through, and what stands behind it.
 //!
-//! From the bottom up: [`driver`] is the contract between the executor and a pair of arms, [`executor`] plays a motion
-//! through a driver and is the envelope round it while it moves, and [`simulated`] is a pair of Kinova Micos with physics of its own, which
-//! stands in where there are no arms. [`layout`] says how the arms stand and what their motions have to keep. [`service`] offers
-//! it all as `tandem.v1.Bridge`.
+//! [`driver`] is the contract between the executor and a pair of arms. [`executor`] plays a checked motion through a
+//! driver and enforces the limits of every command. [`layout`] places the arms and defines what their motions have to
+//! keep. [`service`] offers the arms as `tandem.v1.Bridge`.
 //!
 //! Drivers of real arms are [`quarc`], for arms that a Simulink model drives by way of QUARC, and [`kinova_ros`], for arms
 //! behind Kinova's ROS driver.
@@ -18,12 +17,9 @@ pub mod kinova_ros;
 pub mod layout;
 pub mod quarc;
 pub mod service;
-pub mod simulated;
-pub mod trial;
 
 pub use driver::{ArmCommand, ArmReading, Command, Driver, DriverError, Faults, Order, PairState};
 pub use executor::{
     CheckError, CheckedMotion, Checker, Executor, LeaseError, Phase, Progress, ResetError,
     Settings, StartError, Stop, StopCause, Token,
 };
-pub use simulated::{SimulatedConfig, SimulatedPair};

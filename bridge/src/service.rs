@@ -12,7 +12,6 @@ mod error;
 mod execution;
 mod messages;
 mod motion;
-mod paced;
 mod thread;
 mod time;
 mod words;
@@ -38,7 +37,6 @@ use thread::{ArmsHandle, ArmsThread, Snapshot};
 
 pub use error::Error;
 pub use motion::Refused;
-pub use paced::Paced;
 pub use thread::{AnyDriver, Dial};
 pub use time::Time;
 

@@ -3,8 +3,10 @@
 use std::sync::Arc;
 
 use tandem_bridge::layout::mico_cell;
-use tandem_bridge::service::{AnyDriver, Dial, Paced, Time};
-use tandem_bridge::{DriverError, Executor, Settings, SimulatedConfig, SimulatedPair};
+use tandem_bridge::service::{AnyDriver, Dial, Time};
+use tandem_bridge::{DriverError, Executor, Settings};
+use tandem_trials::simulated::Paced;
+use tandem_trials::{SimulatedConfig, SimulatedPair};
 
 use crate::cli::{BridgeServeArgs, DriverName};
 use crate::exit::{Exit, Failed, OrExit as _};

@@ -5,11 +5,6 @@ use std::path::{Path, PathBuf};
 use indicatif::ProgressBar;
 use rayon::iter::{IntoParallelIterator as _, IntoParallelRefIterator as _, ParallelIterator as _};
 use serde_json::json;
-use tandem_bridge::SimulatedConfig;
-use tandem_bridge::simulated::Block;
-use tandem_bridge::trial::{
-    Look, Mode, NoWitness, TrialConfig, TrialError, TrialReport, Trials, Witness,
-};
 use tandem_core::{Layout, Task};
 use tandem_kinematics::Joints;
 use tandem_policy::{Actor, Policy};
@@ -17,6 +12,11 @@ use tandem_report::{Comparison, Pictured, report_html};
 use tandem_telemetry::trial_log::{TrialLook, TrialMetadata, TrialOutcome, TrialRecorder};
 use tandem_telemetry::trials::TRIALS_FILE;
 use tandem_telemetry::{ToolsAt, TrialRow, TrialsLog};
+use tandem_trials::SimulatedConfig;
+use tandem_trials::simulated::Block;
+use tandem_trials::trial::{
+    Look, Mode, NoWitness, TrialConfig, TrialError, TrialReport, Trials, Witness,
+};
 
 use crate::bridge::file;
 use crate::cli::{ModeName, RecordName, TrialArgs};
@@ -321,7 +321,7 @@ fn places(tools: &[glam::DVec3]) -> Vec<[f64; 3]> {
     tools.iter().map(|tool| tool.to_array()).collect()
 }
 
-fn tools_at(point: &tandem_bridge::trial::PathPoint) -> ToolsAt {
+fn tools_at(point: &tandem_trials::trial::PathPoint) -> ToolsAt {
     ToolsAt {
         time_s: point.time_s,
         planned: places(&point.planned),

@@ -9,11 +9,12 @@ use std::time::Duration;
 use glam::DVec3;
 use tandem_bridge::layout::{check_settings, mico_cell};
 use tandem_bridge::{
-    Command, Driver, DriverError, Executor, PairState, Phase, ResetError, Settings,
-    SimulatedConfig, SimulatedPair, StopCause, Token,
+    Command, Driver, DriverError, Executor, PairState, Phase, ResetError, Settings, StopCause,
+    Token,
 };
 use tandem_core::ArmIndex;
 use tandem_kinematics::{ArmWayPoint, Joints, Motion, PlanSettings, WayPoint, check, plan};
+use tandem_trials::{SimulatedConfig, SimulatedPair};
 
 pub(crate) const OWNER: Token = Token(5);
 pub(crate) const PERIOD_S: f64 = 0.01;

@@ -4,11 +4,12 @@ use std::collections::BTreeMap;
 
 use glam::DVec3;
 use tandem_bridge::layout::mico_cell;
-use tandem_bridge::simulated::PERIOD_S;
-use tandem_bridge::{Phase, SimulatedConfig, StartError, StopCause};
+use tandem_bridge::{Phase, StartError, StopCause};
 use tandem_core::rng::{index, uniform};
 use tandem_core::{ArmIndex, Stream, episode_rng};
 use tandem_kinematics::{Joints, Motion, Posture};
+use tandem_trials::SimulatedConfig;
+use tandem_trials::simulated::PERIOD_S;
 
 use crate::injection::{KINDS, Kind, disturbance};
 use crate::observer::{Observer, Slack};

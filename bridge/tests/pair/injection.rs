@@ -4,10 +4,11 @@ use std::cell::RefCell;
 use std::collections::VecDeque;
 use std::rc::Rc;
 
-use tandem_bridge::simulated::Disturbance;
-use tandem_bridge::{Command, Driver, DriverError, PairState, SimulatedPair};
+use tandem_bridge::{Command, Driver, DriverError, PairState};
 use tandem_core::ArmIndex;
 use tandem_kinematics::Joints;
+use tandem_trials::SimulatedPair;
+use tandem_trials::simulated::Disturbance;
 
 /// What goes wrong.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

@@ -3,13 +3,11 @@
 use std::cell::RefCell;
 
 use tandem_bridge::layout::mico_cell;
-use tandem_bridge::simulated::{Disturbance, PERIOD_S};
-use tandem_bridge::{
-    ArmCommand, Command, Driver as _, Order, Phase, SimulatedConfig, SimulatedPair, StartError,
-    StopCause,
-};
+use tandem_bridge::{ArmCommand, Command, Driver as _, Order, Phase, StartError, StopCause};
 use tandem_core::ArmIndex;
 use tandem_kinematics::{ArmSample, Joints, Motion, Reason};
+use tandem_trials::simulated::{Disturbance, PERIOD_S};
+use tandem_trials::{SimulatedConfig, SimulatedPair};
 
 use crate::rig::{OWNER, Rig};
 

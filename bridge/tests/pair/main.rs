@@ -7,6 +7,5 @@ mod itself;
 mod observer;
 mod ownership;
 mod rig;
-mod simulated;
 mod tasks;
 mod undisturbed;

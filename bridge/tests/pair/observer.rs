@@ -1,10 +1,10 @@
 //! Somebody who looks at the true arms, period by period, and knows nothing of the executor.
 
-use tandem_bridge::SimulatedPair;
 use tandem_bridge::layout::mico_cell;
-use tandem_bridge::simulated::PERIOD_S;
 use tandem_core::ArmIndex;
 use tandem_kinematics::{Cell, Joints, Posture};
+use tandem_trials::SimulatedPair;
+use tandem_trials::simulated::PERIOD_S;
 
 /// Tool speed, metres per second; gaps, metres: as the executor's settings have them.
 const TOOL_MPS: f64 = 0.20;

@@ -2,11 +2,11 @@
 
 use tandem_bridge::layout::mico_cell;
 use tandem_bridge::{
-    Executor, LeaseError, Phase, ResetError, Settings, SimulatedConfig, StartError, StopCause,
-    Token,
+    Executor, LeaseError, Phase, ResetError, Settings, StartError, StopCause, Token,
 };
 use tandem_core::ArmIndex;
 use tandem_kinematics::Reason;
+use tandem_trials::SimulatedConfig;
 
 use crate::injection::Kind;
 use crate::rig::{OWNER, Rig, TASKS, walk};
@@ -167,7 +167,7 @@ fn settings_that_make_no_sense_are_refused() {
     let check = |settings: Settings, name: &str| {
         let motion = walk(TASKS, 1, 2);
         let at = [0, 1].map(|arm: usize| motion.arms[arm][0].angles);
-        let pair = tandem_bridge::SimulatedPair::new(mico_cell(), &at, 0.0, config());
+        let pair = tandem_trials::SimulatedPair::new(mico_cell(), &at, 0.0, config());
         let refused = Executor::new(mico_cell(), pair, settings).unwrap_err();
         assert_eq!(refused.name, name, "{refused}");
     };

@@ -5,14 +5,15 @@ use std::rc::Rc;
 
 use glam::DVec3;
 use tandem_bridge::layout::{check_settings, mico_cell};
-use tandem_bridge::simulated::PERIOD_S;
-use tandem_bridge::{Executor, Phase, Settings, SimulatedConfig, SimulatedPair, Token};
+use tandem_bridge::{Executor, Phase, Settings, Token};
 use tandem_core::rng::uniform;
 use tandem_core::{Stream, episode_rng};
 use tandem_kinematics::model::Joint;
 use tandem_kinematics::{
     ArmWayPoint, Cell, Joints, Motion, PlanSettings, Posture, WayPoint, check, plan,
 };
+use tandem_trials::simulated::PERIOD_S;
+use tandem_trials::{SimulatedConfig, SimulatedPair};
 
 use crate::injection::{Injection, Tap};
 

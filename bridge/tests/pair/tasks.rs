@@ -1,9 +1,9 @@
 //! Pushing, and grasping: both arms at once, from way points to where the objects end.
 
 use glam::DVec3;
-use tandem_bridge::SimulatedConfig;
 use tandem_bridge::layout::mico_cell;
-use tandem_bridge::simulated::Block;
+use tandem_trials::SimulatedConfig;
+use tandem_trials::simulated::Block;
 
 use crate::observer::{Observer, Slack};
 use crate::rig::{Rig, planned, tools};

@@ -1,8 +1,8 @@
 //! Motions that nothing disturbs are played to their ends, along their paths.
 
 use glam::DVec3;
-use tandem_bridge::SimulatedConfig;
 use tandem_bridge::layout::mico_cell;
+use tandem_trials::SimulatedConfig;
 
 use crate::observer::{Observer, Slack};
 use crate::rig::{Rig, TASKS, tools, walk};

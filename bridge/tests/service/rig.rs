@@ -6,15 +6,13 @@ use std::time::Duration;
 
 use tandem_bridge::layout::mico_cell;
 use tandem_bridge::service::{AnyDriver, Config, Dial, Error, Time, serve};
-use tandem_bridge::{
-    Command, Driver, DriverError, Executor, Order, PairState, Settings, SimulatedConfig,
-    SimulatedPair,
-};
+use tandem_bridge::{Command, Driver, DriverError, Executor, Order, PairState, Settings};
 use tandem_core::ArmIndex;
 use tandem_kinematics::{ArmSample, Joints, Motion};
 use tandem_net::Gate;
 use tandem_proto::pb;
 use tandem_proto::pb::bridge_client::BridgeClient;
+use tandem_trials::{SimulatedConfig, SimulatedPair};
 use tokio::net::TcpListener;
 use tokio::sync::mpsc;
 use tokio::task::JoinHandle;
@@ -167,7 +165,7 @@ impl Tap {
 
 impl Driver for Tap {
     fn period_s(&self) -> f64 {
-        tandem_bridge::simulated::PERIOD_S
+        tandem_trials::simulated::PERIOD_S
     }
 
     fn exchange(&mut self, command: &Command) -> Result<PairState, DriverError> {

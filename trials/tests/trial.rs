@@ -3,11 +3,11 @@
 
 use std::path::{Path, PathBuf};
 
-use tandem_bridge::SimulatedConfig;
-use tandem_bridge::simulated::Block;
-use tandem_bridge::trial::{Look, Mode, NoWitness, TrialConfig, TrialReport, Trials, Witness};
 use tandem_core::{Contacts, Layout, Task};
 use tandem_policy::{Actor, Policy};
+use tandem_trials::SimulatedConfig;
+use tandem_trials::simulated::Block;
+use tandem_trials::trial::{Look, Mode, NoWitness, TrialConfig, TrialReport, Trials, Witness};
 
 fn shipped(name: &str) -> Actor {
     let path: PathBuf = [env!("CARGO_MANIFEST_DIR"), "..", "policies", name].iter().collect();

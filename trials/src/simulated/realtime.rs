@@ -2,9 +2,9 @@
 
 use std::sync::Arc;
 
-use crate::driver::{Command, Driver, DriverError, PairState};
-use crate::service::time::Time;
 use crate::simulated::{PERIOD_S, SimulatedPair};
+use tandem_bridge::driver::{Command, Driver, DriverError, PairState};
+use tandem_bridge::service::Time;
 
 /// Most periods that are caught up with before an exchange. After so many without a command the drives have braked.
 const MOST_MISSED: u32 = 10;
@@ -65,8 +65,9 @@ mod tests {
     use std::sync::Mutex;
 
     use super::*;
-    use crate::layout::mico_cell;
-    use crate::{Order, SimulatedConfig};
+    use crate::SimulatedConfig;
+    use tandem_bridge::Order;
+    use tandem_bridge::layout::mico_cell;
 
     struct Set(Mutex<f64>);
 

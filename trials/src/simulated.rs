@@ -19,19 +19,21 @@ use tandem_core::{ArmIndex, Contacts, Stream, episode_rng};
 use tandem_kinematics::model::Anchor;
 use tandem_kinematics::{Cell, Gaps, Joints, Posture};
 
-use crate::driver::{Command, Driver, DriverError, Faults, Order, PairState};
 use crate::simulated::drives::Drives;
 use crate::simulated::sensors::Cameras;
 use crate::simulated::world::{Carried, World};
+use tandem_bridge::driver::{Command, Driver, DriverError, Faults, Order, PairState};
 
 pub use config::{
     Block, CameraConfig, Disturbance, GripperConfig, N_SUBSTEPS, PERIOD_S, SimulatedConfig,
 };
+pub use realtime::Paced;
 pub use sensors::ObjectPose;
 pub use world::MAX_OPENING_M;
 
 mod config;
 mod drives;
+mod realtime;
 mod scene;
 mod sensors;
 mod world;

@@ -15,9 +15,9 @@ use tandem_core::{Contacts, Layout};
 use tandem_kinematics::{Joints, WayPoint};
 use tandem_sim::SimError;
 
-use crate::driver::PairState;
-use crate::executor::Phase;
 use crate::simulated::{Block, SimulatedConfig};
+use tandem_bridge::driver::PairState;
+use tandem_bridge::executor::Phase;
 
 pub use judge::{Cause, ObjectCourse, RefusedBy};
 pub use mapping::Mapping;
@@ -194,5 +194,5 @@ pub enum TrialError {
     },
     /// The executor does not let the arms go.
     #[error("the arms were not let go")]
-    Reset(#[from] crate::executor::ResetError),
+    Reset(#[from] tandem_bridge::executor::ResetError),
 }

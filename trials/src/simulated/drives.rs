@@ -7,8 +7,8 @@ use tandem_core::Contacts;
 use tandem_core::rng::index;
 use tandem_kinematics::{ArmModel, Cell, Gaps, Joints};
 
-use crate::driver::{ArmCommand, Command, Order, SILENCE_S};
 use crate::simulated::config::{Disturbance, N_SUBSTEPS, PERIOD_S, SimulatedConfig};
+use tandem_bridge::driver::{ArmCommand, Command, Order, SILENCE_S};
 
 /// Time of a physics step, seconds.
 pub(crate) const SUBSTEP_S: f64 = PERIOD_S / N_SUBSTEPS as f64;

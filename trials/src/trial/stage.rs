@@ -5,10 +5,10 @@ use tandem_core::scene::Scene;
 use tandem_core::{ArmIndex, Contacts};
 use tandem_kinematics::{Cell, Joints, Motion, Posture};
 
-use crate::executor::{Executor, Phase, Settings, Token};
 use crate::simulated::{ObjectPose, PERIOD_S, SimulatedPair};
 use crate::trial::judge::{Cause, RefusedBy};
 use crate::trial::{Look, PathPoint, TrialError, Witness};
+use tandem_bridge::executor::{Executor, Phase, Settings, Token};
 
 /// The one owner.
 const OWNER: Token = Token(1);

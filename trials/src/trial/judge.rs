@@ -5,7 +5,7 @@ use tandem_core::layout::GOAL_TOLERANCE_M;
 use tandem_core::{Contacts, Task};
 use tandem_kinematics::{PlanError, Refusal};
 
-use crate::executor::{StartError, Stop};
+use tandem_bridge::executor::{StartError, Stop};
 
 /// Raised by more than this an object was lifted, metres.
 const LIFTED_M: f64 = 0.03;

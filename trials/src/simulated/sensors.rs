@@ -7,9 +7,9 @@ use rand_chacha::ChaCha8Rng;
 use tandem_core::rng::standard_normal;
 use tandem_kinematics::Joints;
 
-use crate::driver::{ArmReading, Faults};
 use crate::simulated::config::{CameraConfig, SimulatedConfig};
 use crate::simulated::drives::ArmDrives;
+use tandem_bridge::driver::{ArmReading, Faults};
 
 /// An object as it is or was seen.
 #[derive(Debug, Clone, Copy, PartialEq)]

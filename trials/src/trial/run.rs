@@ -7,7 +7,6 @@ use tandem_kinematics::{
 };
 use tandem_sim::SimError;
 
-use crate::layout::{check_settings, mico_cell};
 use crate::simulated::{
     Block, CameraConfig, GripperConfig, ObjectPose, SimulatedConfig, SimulatedPair,
 };
@@ -19,6 +18,7 @@ use crate::trial::stage::Stage;
 use crate::trial::{
     Decide, Mode, NoWitness, Places, TrialConfig, TrialError, TrialReport, Witness,
 };
+use tandem_bridge::layout::{check_settings, mico_cell};
 
 /// Samples of a motion per second.
 const RATE_HZ: f64 = 100.0;

@@ -1,12 +1,12 @@
 //! The simulated pair by itself.
+#![expect(clippy::unwrap_used, reason = "a test panics where it fails")]
 
 use tandem_bridge::layout::mico_cell;
-use tandem_bridge::simulated::{Block, CameraConfig, PERIOD_S};
-use tandem_bridge::{
-    ArmCommand, Command, Driver as _, DriverError, Order, PairState, SimulatedConfig, SimulatedPair,
-};
+use tandem_bridge::{ArmCommand, Command, Driver as _, DriverError, Order, PairState};
 use tandem_core::{ArmIndex, Contacts};
 use tandem_kinematics::Joints;
+use tandem_trials::simulated::{Block, CameraConfig, PERIOD_S};
+use tandem_trials::{SimulatedConfig, SimulatedPair};
 
 const ARMS: [ArmIndex; 2] = [ArmIndex(0), ArmIndex(1)];
 
