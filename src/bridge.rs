@@ -42,15 +42,15 @@ fn serve(args: BridgeServeArgs) -> Result<(), Failed> {
     let runtime = runtime().or_exit(Exit::TryAgain, String::new)?;
     runtime.block_on(async move {
         let shutdown = services::shutdown(args.listen.exit_with_stdin)?;
-        let time = Arc::new(clock::Ticking::new());
-        let (executor, dial) = arms::arms(&args, time.clone())?;
+        let clock = Arc::new(clock::Ticking::new());
+        let (executor, reconnect) = arms::arms(&args, clock.clone())?;
         let listener = services::listen(&args.listen).await?;
         let config = Config {
             driver: arms::name(args.driver).to_owned(),
             version: services::VERSION.to_owned(),
             speed: args.speed,
-            time,
-            dial,
+            clock,
+            reconnect,
             secret,
         };
         let served =

@@ -3,7 +3,7 @@
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
-use tandem_bridge::service::Time;
+use tandem_bridge::service::Clock;
 
 /// The time since this function was called, for those who take time as an argument.
 pub(crate) fn since_now() -> Arc<dyn Fn() -> Duration + Send + Sync> {
@@ -33,7 +33,7 @@ impl Ticking {
     }
 }
 
-impl Time for Ticking {
+impl Clock for Ticking {
     fn now_s(&self) -> f64 {
         self.0.elapsed().as_secs_f64()
     }

@@ -27,7 +27,7 @@ use tandem_bridge::driver::{Command, Driver, DriverError, Faults, Order, PairSta
 pub use config::{
     Block, CameraConfig, Disturbance, GripperConfig, N_SUBSTEPS, PERIOD_S, SimulatedConfig,
 };
-pub use realtime::Paced;
+pub use realtime::RealTimePair;
 pub use sensors::ObjectPose;
 pub use world::MAX_OPENING_M;
 
@@ -102,9 +102,9 @@ impl SimulatedPair {
         }
     }
 
-    /// Lets a period pass in which no command comes, and reads the arms.
-    pub fn pass(&mut self) -> PairState {
-        self.let_pass();
+    /// Simulates a period without a command and returns the state.
+    pub fn skip_period(&mut self) -> PairState {
+        self.simulate_period();
         self.read()
     }
 
@@ -177,7 +177,7 @@ impl SimulatedPair {
         scene::scene(&self.cell, &angles, &self.world, &self.config.blocks, self.time_s())
     }
 
-    fn let_pass(&mut self) {
+    fn simulate_period(&mut self) {
         self.drives.begin_period();
         self.contacts = Contacts::NONE;
         self.self_contacts.fill(false);
@@ -255,7 +255,7 @@ impl Driver for SimulatedPair {
     fn exchange(&mut self, command: &Command) -> Result<PairState, DriverError> {
         self.check_shape(command)?;
         self.drives.hand_over(command.clone(), self.config.latency_periods);
-        self.let_pass();
+        self.simulate_period();
         if !self.world.is_finite() {
             return Err(DriverError::Malformed { what: "an object is nowhere".into() });
         }

@@ -1,7 +1,7 @@
 //! The simulated pair by itself.
 #![expect(clippy::unwrap_used, reason = "a test panics where it fails")]
 
-use tandem_bridge::layout::mico_cell;
+use tandem_bridge::work_cell::mico_cell;
 use tandem_bridge::{ArmCommand, Command, Driver as _, DriverError, Order, PairState};
 use tandem_core::{ArmIndex, Contacts};
 use tandem_kinematics::Joints;
@@ -57,7 +57,7 @@ fn drives_that_hear_nothing_brake_and_wait_for_a_stop() {
     let mut silent_s = PERIOD_S;
     while !at_rest(&pair) {
         assert!(silent_s < 0.1, "still moving");
-        pair.pass();
+        pair.skip_period();
         silent_s += PERIOD_S;
     }
     assert!(silent_s > 0.05, "they wait for 50 ms: {silent_s}");

@@ -95,7 +95,7 @@ pub(crate) struct Ros {
 impl Side {
     pub(crate) fn new(pair: &SharedPair) -> Self {
         let listener = TcpListener::bind("127.0.0.1:0").unwrap();
-        let opening = pair.lock().unwrap().pass().arms[0].opening;
+        let opening = pair.lock().unwrap().skip_period().arms[0].opening;
         let node = || Node { opening, ..Node::default() };
         let ros = Ros {
             nodes: [node(), node()],

@@ -225,7 +225,7 @@ fn arms_whose_commander_dies_brake_by_themselves() {
 fn arms_whose_commander_hangs_brake_by_themselves() {
     let test = Test::moving();
     for _ in 0..10 {
-        test.side.pair.lock().unwrap().pass();
+        test.side.pair.lock().unwrap().skip_period();
     }
     assert!(at_rest(&test.side.pair));
 }
@@ -285,7 +285,7 @@ fn commands_do_not_pile_up_before_arms_that_do_not_read() {
         wait: Duration::ZERO,
         ..QuarcConfig::at(listener.local_addr().unwrap().to_string())
     };
-    let state = pair_at(&sweep(OPENINGS)).lock().unwrap().pass();
+    let state = pair_at(&sweep(OPENINGS)).lock().unwrap().skip_period();
     let server = thread::spawn(move || {
         let (mut stream, _) = listener.accept().unwrap();
         stream.write_all(&to_bytes(&encode_state(&state).unwrap())).unwrap();
@@ -317,7 +317,7 @@ fn a_connection_that_brings_no_states_says_what_to_look_at() {
         assert!(error.contains(expected), "{error}");
     };
     check(vec![], "sent 0 bytes, a state has 304");
-    let state = pair_at(&sweep(OPENINGS)).lock().unwrap().pass();
+    let state = pair_at(&sweep(OPENINGS)).lock().unwrap().skip_period();
     let vector = encode_state(&state).unwrap();
     check(to_bytes(&vector)[..296].to_vec(), "sent 296 bytes, a state has 304");
     let big_endian = vector.iter().flat_map(|number| number.to_be_bytes()).collect();

@@ -86,7 +86,7 @@ fn serve(listener: &TcpListener, mut model: Model, n_ended: &AtomicUsize) {
     for stream in listener.incoming() {
         model.talk(stream.unwrap());
         for _ in 0..20 {
-            model.pair.lock().unwrap().pass();
+            model.pair.lock().unwrap().skip_period();
         }
         n_ended.fetch_add(1, Ordering::SeqCst);
     }
@@ -103,7 +103,7 @@ impl Model {
     fn talk(&mut self, mut stream: TcpStream) {
         stream.set_nodelay(true).unwrap();
         let (mut number, mut obeys) = (0, false);
-        let state = self.pair.lock().unwrap().pass();
+        let state = self.pair.lock().unwrap().skip_period();
         if !self.send(&mut stream, state) {
             return;
         }
@@ -119,7 +119,7 @@ impl Model {
             }
             number = command.number;
             let mut pair = self.pair.lock().unwrap();
-            let state = if obeys { pair.exchange(&command).unwrap() } else { pair.pass() };
+            let state = if obeys { pair.exchange(&command).unwrap() } else { pair.skip_period() };
             drop(pair);
             if !self.send(&mut stream, state) {
                 return;
@@ -153,7 +153,7 @@ impl Model {
                 bytes.drain(..100);
             }
             Some(Fault::Twice) => {
-                let later = self.pair.lock().unwrap().pass();
+                let later = self.pair.lock().unwrap().skip_period();
                 bytes.extend(to_bytes(&encode_state(&self.counted(later)).unwrap()));
             }
             _ => {}

@@ -7,7 +7,7 @@ use std::thread;
 use std::time::Duration;
 
 use glam::DVec3;
-use tandem_bridge::layout::{check_settings, mico_cell};
+use tandem_bridge::work_cell::{check_settings, mico_cell};
 use tandem_bridge::{
     Command, Driver, DriverError, Executor, PairState, Phase, ResetError, Settings, StopCause,
     Token,

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 
 use glam::DVec3;
-use tandem_bridge::layout::mico_cell;
+use tandem_bridge::work_cell::mico_cell;
 use tandem_bridge::{Phase, StartError, StopCause};
 use tandem_core::rng::{index, uniform};
 use tandem_core::{ArmIndex, Stream, episode_rng};
@@ -113,7 +113,7 @@ impl Plan {
         match self.kind {
             Kind::StateLost => matches!(cause, StopCause::StateStale(_)),
             Kind::StateFrozen => matches!(cause, StopCause::Frozen(_) | StopCause::Tracking(_)),
-            Kind::StateLate => matches!(cause, StopCause::StateOld(_)),
+            Kind::StateLate => matches!(cause, StopCause::StateDelayed(_)),
             Kind::StateNotFinite => matches!(cause, StopCause::StateNotFinite),
             Kind::SequenceJump => matches!(cause, StopCause::SequenceJump { .. }),
             Kind::EncoderJump => matches!(cause, StopCause::AngleJump(_)),

@@ -179,7 +179,7 @@ impl Driver for Tap {
 
     fn exchange(&mut self, command: &Command) -> Result<PairState, DriverError> {
         let (mut pair, mut injection) = (self.pair.borrow_mut(), self.injection.borrow_mut());
-        let state = if injection.cut() { pair.pass() } else { pair.exchange(command)? };
+        let state = if injection.cut() { pair.skip_period() } else { pair.exchange(command)? };
         let state = injection.spoil(state, pair.time_s());
         if injection.kind == Some(Kind::DriverError) {
             return Err(DriverError::Disconnected { what: "closed by the peer".into() });

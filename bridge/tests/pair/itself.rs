@@ -2,7 +2,7 @@
 
 use std::cell::RefCell;
 
-use tandem_bridge::layout::mico_cell;
+use tandem_bridge::work_cell::mico_cell;
 use tandem_bridge::{ArmCommand, Command, Driver as _, Order, Phase, StartError, StopCause};
 use tandem_core::ArmIndex;
 use tandem_kinematics::{ArmSample, Joints, Motion, Reason};

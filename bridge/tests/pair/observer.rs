@@ -1,6 +1,6 @@
 //! Somebody who looks at the true arms, period by period, and knows nothing of the executor.
 
-use tandem_bridge::layout::mico_cell;
+use tandem_bridge::work_cell::mico_cell;
 use tandem_core::ArmIndex;
 use tandem_kinematics::{Cell, Joints, Posture};
 use tandem_trials::SimulatedPair;

@@ -1,6 +1,6 @@
 //! Who may do what, and when.
 
-use tandem_bridge::layout::mico_cell;
+use tandem_bridge::work_cell::mico_cell;
 use tandem_bridge::{
     Executor, LeaseError, Phase, ResetError, Settings, StartError, StopCause, Token,
 };
@@ -23,7 +23,7 @@ fn nothing_moves_before_somebody_lets_the_arms_go() {
     let mut rig = Rig::new(&motion, config());
     let at = rig.angles();
     let start = |rig: &mut Rig| rig.executor.start(OWNER, motion.clone(), 1.0, rig.now_s);
-    assert_eq!(start(&mut rig), Err(StartError::Lease(LeaseError::Nobody)));
+    assert_eq!(start(&mut rig), Err(StartError::Lease(LeaseError::NotOwned)));
     rig.executor.acquire(OWNER, rig.now_s).unwrap();
     assert_eq!(start(&mut rig), Err(StartError::NotIdle(Phase::Stopped)));
     let reset = rig.executor.reset(OWNER, rig.now_s);
@@ -80,7 +80,7 @@ fn an_owner_who_leaves_stops_the_motion_and_a_lease_ends_by_itself() {
     rig.executor.start(OWNER, motion, 1.0, rig.now_s).unwrap();
     rig.tick_owned();
     rig.executor.release(OWNER, rig.now_s).unwrap();
-    assert_eq!(rig.executor.stopped_by().unwrap().cause, StopCause::OwnerLeft);
+    assert_eq!(rig.executor.stopped_by().unwrap().cause, StopCause::OwnerReleased);
     rig.executor.acquire(STRANGER, rig.now_s).unwrap();
     for _ in 0..510 {
         rig.tick();
@@ -158,7 +158,7 @@ fn whoever_ticks_too_late_stops_the_arms() {
         rig.now_s += pause_s;
         rig.executor.tick(rig.now_s);
         let cause = rig.executor.stopped_by().map(|stop| stop.cause.clone());
-        assert_eq!(matches!(cause, Some(StopCause::Late(_))), late, "{pause_s}: {cause:?}");
+        assert_eq!(matches!(cause, Some(StopCause::TickLate(_))), late, "{pause_s}: {cause:?}");
     }
 }
 
@@ -212,7 +212,7 @@ fn a_checked_motion_starts_where_it_was_checked_for_and_nowhere_else() {
 fn a_lease_is_renewed_by_its_owner_only_and_says_how_long_it_holds() {
     let motion = walk(TASKS, 7, 3);
     let mut rig = Rig::new(&motion, config());
-    assert_eq!(rig.executor.renew(OWNER, rig.now_s), Err(LeaseError::Nobody));
+    assert_eq!(rig.executor.renew(OWNER, rig.now_s), Err(LeaseError::NotOwned));
     assert_eq!(rig.executor.lease_left_s(rig.now_s), None);
     rig.executor.acquire(OWNER, rig.now_s).unwrap();
     rig.now_s += 3.0;
@@ -221,7 +221,7 @@ fn a_lease_is_renewed_by_its_owner_only_and_says_how_long_it_holds() {
     rig.executor.renew(OWNER, rig.now_s).unwrap();
     assert!((rig.executor.lease_left_s(rig.now_s).unwrap() - 5.0).abs() < 1e-9);
     rig.now_s += 5.0;
-    assert_eq!(rig.executor.renew(OWNER, rig.now_s), Err(LeaseError::Nobody));
+    assert_eq!(rig.executor.renew(OWNER, rig.now_s), Err(LeaseError::NotOwned));
     assert_eq!(rig.executor.lease_left_s(rig.now_s), None);
 }
 

@@ -4,7 +4,7 @@ use std::cell::RefCell;
 use std::rc::Rc;
 
 use glam::DVec3;
-use tandem_bridge::layout::{check_settings, mico_cell};
+use tandem_bridge::work_cell::{check_settings, mico_cell};
 use tandem_bridge::{Executor, Phase, Settings, Token};
 use tandem_core::rng::uniform;
 use tandem_core::{Stream, episode_rng};

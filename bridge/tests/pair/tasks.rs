@@ -1,7 +1,7 @@
 //! Pushing, and grasping: both arms at once, from way points to where the objects end.
 
 use glam::DVec3;
-use tandem_bridge::layout::mico_cell;
+use tandem_bridge::work_cell::mico_cell;
 use tandem_trials::SimulatedConfig;
 use tandem_trials::simulated::Block;
 

@@ -1,7 +1,7 @@
 //! Motions that nothing disturbs are played to their ends, along their paths.
 
 use glam::DVec3;
-use tandem_bridge::layout::mico_cell;
+use tandem_bridge::work_cell::mico_cell;
 use tandem_trials::SimulatedConfig;
 
 use crate::observer::{Observer, Slack};

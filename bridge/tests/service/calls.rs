@@ -1,6 +1,6 @@
 //! What clients can do with the arms.
 
-use tandem_bridge::layout::mico_cell;
+use tandem_bridge::work_cell::mico_cell;
 use tandem_kinematics::{ArmSample, ArmWayPoint, Joints, Motion, PlanSettings, plan};
 use tandem_proto::pb;
 use tonic::Code;

@@ -4,8 +4,8 @@ use std::net::SocketAddr;
 use std::sync::{Arc, Condvar, Mutex};
 use std::time::Duration;
 
-use tandem_bridge::layout::mico_cell;
-use tandem_bridge::service::{AnyDriver, Config, Dial, Error, Time, serve};
+use tandem_bridge::service::{BoxDriver, Clock, Config, Error, Reconnect, serve};
+use tandem_bridge::work_cell::mico_cell;
 use tandem_bridge::{Command, Driver, DriverError, Executor, Order, PairState, Settings};
 use tandem_core::ArmIndex;
 use tandem_kinematics::{ArmSample, Joints, Motion};
@@ -28,7 +28,7 @@ const TICK: Duration = Duration::from_micros(200);
 
 /// A clock whose time passes when somebody sleeps, up to where the test lets it.
 #[derive(Default)]
-pub(crate) struct Clock(Mutex<Hands>, Condvar);
+pub(crate) struct TestClock(Mutex<Hands>, Condvar);
 
 #[derive(Default)]
 struct Hands {
@@ -38,7 +38,7 @@ struct Hands {
     late_s: f64,
 }
 
-impl Clock {
+impl TestClock {
     /// Lets time pass as fast as it goes.
     pub(crate) fn free(&self) {
         self.0.lock().unwrap().until_s = None;
@@ -65,7 +65,7 @@ impl Clock {
     }
 }
 
-impl Time for Clock {
+impl Clock for TestClock {
     fn now_s(&self) -> f64 {
         self.0.lock().unwrap().now_s
     }
@@ -213,7 +213,7 @@ pub(crate) fn patient() -> Settings {
 /// A running service.
 pub(crate) struct Rig {
     pub(crate) client: BridgeClient<Channel>,
-    pub(crate) clock: Arc<Clock>,
+    pub(crate) clock: Arc<TestClock>,
     pub(crate) tap: Tap,
     pub(crate) shutdown: CancellationToken,
     pub(crate) served: JoinHandle<Result<(), Error>>,
@@ -235,7 +235,7 @@ impl Rig {
     pub(crate) async fn dialling(settings: Settings) -> Self {
         Self::start(settings, 1.0, |tap| {
             let tap = tap.clone();
-            Some(Arc::new(move || tap.dial().map(|tap| Box::new(tap) as AnyDriver)))
+            Some(Arc::new(move || tap.dial().map(|tap| Box::new(tap) as BoxDriver)))
         })
         .await
     }
@@ -245,18 +245,22 @@ impl Rig {
         Self::start(settings, speed, |_| None).await
     }
 
-    async fn start(settings: Settings, speed: f64, dial: fn(&Tap) -> Option<Dial>) -> Self {
+    async fn start(
+        settings: Settings,
+        speed: f64,
+        reconnect: fn(&Tap) -> Option<Reconnect>,
+    ) -> Self {
         let listener = TcpListener::bind(SocketAddr::from(([127, 0, 0, 1], 0))).await.unwrap();
         let address = listener.local_addr().unwrap();
-        let (clock, tap) = (Arc::new(Clock::default()), Tap::new(1));
+        let (clock, tap) = (Arc::new(TestClock::default()), Tap::new(1));
         let executor = Executor::new(mico_cell(), Box::new(tap.clone()) as _, settings).unwrap();
         let shutdown = CancellationToken::new();
         let config = Config {
             driver: "sim".to_owned(),
             version: "0.0.0-test".to_owned(),
             speed,
-            time: clock.clone(),
-            dial: dial(&tap),
+            clock: clock.clone(),
+            reconnect: reconnect(&tap),
             secret: [7; 32],
         };
         let ends = shutdown.clone();

@@ -18,7 +18,7 @@ use crate::trial::stage::Stage;
 use crate::trial::{
     Decide, Mode, NoWitness, Places, TrialConfig, TrialError, TrialReport, Witness,
 };
-use tandem_bridge::layout::{check_settings, mico_cell};
+use tandem_bridge::work_cell::{check_settings, mico_cell};
 
 /// Samples of a motion per second.
 const RATE_HZ: f64 = 100.0;
