@@ -29,7 +29,7 @@
 //!
 //! **Grippers** move only while their arms stand, see [`FingerSettings`]. A motion should rest for a second where it opens or closes a gripper.
 //!
-//! **States.** A state of the pair is new when both arms have told anew, and has the older one's stamp. The arms do not tell faults. Efforts count as torques only where [`KinovaRosConfig::tells_torques`] says
+//! **States.** A state of the pair is new when both arms have told anew, and has the older one's stamp. The arms do not tell faults. Efforts count as torques only where [`KinovaRosConfig::reports_torques`] says
 //! that they are without the arm's own weight.
 //!
 //! A driver is for one connection. Whatever cannot be understood, a service that refuses or does not answer, and a lost connection end it: the
@@ -73,7 +73,7 @@ pub struct KinovaRosConfig {
     pub skew_s: f64,
     /// Whether the nodes have `torque_parameters/publish_torque_with_gravity_compensation` set, so that efforts are torques
     /// beyond those that carry the arm. Default false: torques are not used.
-    pub tells_torques: bool,
+    pub reports_torques: bool,
     /// When grippers get goals.
     pub fingers: FingerSettings,
 }
@@ -106,7 +106,7 @@ impl KinovaRosConfig {
             connect_timeout: Duration::from_secs(3),
             answer_exchanges: 100,
             skew_s: 0.1,
-            tells_torques: false,
+            reports_torques: false,
             fingers: FingerSettings::default(),
         }
     }
@@ -384,7 +384,7 @@ fn reading(config: &KinovaRosConfig, arm: usize) -> Reading<'_> {
     Reading {
         prefix: &config.arms[arm].joint_prefix,
         shut_turns: config.fingers.shut_turns,
-        tells_torques: config.tells_torques,
+        reports_torques: config.reports_torques,
     }
 }
 

@@ -10,7 +10,7 @@ use tandem_report::{Comparison, Pictured, report_html};
 use tandem_telemetry::trials::TRIALS_FILE;
 use tandem_telemetry::{TrialRow, TrialsLog};
 use tandem_trials::simulated::Block;
-use tandem_trials::trial::{Mode, TrialConfig, TrialError, TrialReport};
+use tandem_trials::trial::{TrialConfig, TrialError, TrialMode, TrialReport};
 use tandem_trials::{Series, SeriesError, SimulatedConfig, Subject};
 
 use crate::bridge::file;
@@ -68,11 +68,11 @@ pub(crate) fn trial(args: &TrialArgs) -> Result<(), Failed> {
     show(args, all, &file)
 }
 
-const fn mode_of(name: ModeName) -> Mode {
+const fn mode_of(name: ModeName) -> TrialMode {
     match name {
-        ModeName::ClosedLoop => Mode::ClosedLoop,
-        ModeName::OpenLoop => Mode::OpenLoop,
-        ModeName::Twin => Mode::Twin,
+        ModeName::ClosedLoop => TrialMode::ClosedLoop,
+        ModeName::OpenLoop => TrialMode::OpenLoop,
+        ModeName::Twin => TrialMode::Twin,
     }
 }
 

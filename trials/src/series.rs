@@ -10,7 +10,7 @@ use tandem_telemetry::trial_log::{TrialLook, TrialMetadata, TrialOutcome, TrialR
 use tandem_telemetry::{ToolsAt, TrialRow};
 
 use crate::trial::{
-    Look, NoWitness, PathPoint, TrialConfig, TrialError, TrialReport, Trials, Witness,
+    Frame, NoObserver, PathPoint, TrialConfig, TrialError, TrialObserver, TrialReport, TrialRunner,
 };
 
 /// The largest number of path points in a row.
@@ -69,14 +69,14 @@ impl Series<'_> {
         done: impl Fn(&TrialReport, &mut TrialRow) -> Result<(), E> + Sync,
     ) -> Result<Vec<TrialRow>, E> {
         let actor = self.subject.policy.actor().map_err(SeriesError::from)?;
-        let trial = |(trials, actor): &mut (Result<Trials, SimError>, Actor), number| {
-            let trials = trials.as_mut().map_err(|error| SeriesError::World(error.clone()))?;
-            let report = attempt(trials, actor, number, &mut NoWitness)?;
+        let trial = |(runner, actor): &mut (Result<TrialRunner, SimError>, Actor), number| {
+            let runner = runner.as_mut().map_err(|error| SeriesError::World(error.clone()))?;
+            let report = attempt(runner, actor, number, &mut NoObserver)?;
             let mut row = self.row(&report);
             done(&report, &mut row)?;
             Ok(row)
         };
-        let prepare = || (Trials::new(self.config.clone()), actor.clone());
+        let prepare = || (TrialRunner::new(self.config.clone()), actor.clone());
         (0..n_trials).into_par_iter().map_init(prepare, trial).collect()
     }
 
@@ -87,9 +87,9 @@ impl Series<'_> {
     pub fn record(&self, row: &TrialRow, path: &Path) -> Result<(), SeriesError> {
         let recorder = TrialRecorder::create(path, &self.metadata(row.trial))?;
         let mut recording = Recording { recorder, failure: None };
-        let mut trials = Trials::new(self.config.clone())?;
+        let mut runner = TrialRunner::new(self.config.clone())?;
         let mut actor = self.subject.policy.actor()?;
-        attempt(&mut trials, &mut actor, row.trial, &mut recording)?;
+        attempt(&mut runner, &mut actor, row.trial, &mut recording)?;
         recording.finish(row)
     }
 
@@ -126,9 +126,9 @@ impl Series<'_> {
             n_shortened: report.n_shortened as u64,
             arms_gap_m: report.arms_gap_m.is_finite().then_some(report.arms_gap_m),
             table_gap_m: report.table_gap_m,
-            starts: report.places.iter().map(|places| places.start.to_array()).collect(),
-            goals: report.places.iter().map(|places| places.goal.to_array()).collect(),
-            ends: report.places.iter().map(|places| places.end.to_array()).collect(),
+            starts: report.positions.iter().map(|object| object.start.to_array()).collect(),
+            goals: report.positions.iter().map(|object| object.goal.to_array()).collect(),
+            ends: report.positions.iter().map(|object| object.end.to_array()).collect(),
             path: report.path.iter().step_by(every).map(tools_at).collect(),
             log: None,
         }
@@ -136,15 +136,15 @@ impl Series<'_> {
 }
 
 fn attempt(
-    trials: &mut Trials,
+    runner: &mut TrialRunner,
     actor: &mut Actor,
     number: u64,
-    witness: &mut dyn Witness,
+    observer: &mut dyn TrialObserver,
 ) -> Result<TrialReport, SeriesError> {
-    let mut decide = |observation: &[f32], goal: &[f32], action: &mut [f32]| {
+    let mut act = |observation: &[f32], goal: &[f32], action: &mut [f32]| {
         actor.act(observation, goal, action);
     };
-    let report = trials.run(number, &mut decide, witness);
+    let report = runner.run(number, &mut act, observer);
     report.map_err(|source| SeriesError::Trial { number, source })
 }
 
@@ -155,22 +155,22 @@ struct Recording {
     failure: Option<tandem_telemetry::Error>,
 }
 
-impl Witness for Recording {
-    fn look(&mut self, look: &Look<'_>) {
+impl TrialObserver for Recording {
+    fn on_frame(&mut self, frame: &Frame<'_>) {
         if self.failure.is_some() {
             return;
         }
         let joints = |angles: &Joints| angles.iter().copied().collect::<Vec<f64>>();
         let planned: Option<Vec<Vec<f64>>> =
-            look.planned.map(|planned| planned.iter().map(joints).collect());
-        let arms = look.measured.map(|state| state.arms.as_slice()).unwrap_or_default();
+            frame.planned.map(|planned| planned.iter().map(joints).collect());
+        let arms = frame.measured.map(|state| state.arms.as_slice()).unwrap_or_default();
         let measured: Vec<Vec<f64>> = arms.iter().map(|arm| joints(&arm.angles)).collect();
         let openings: Vec<f64> = arms.iter().map(|arm| arm.opening).collect();
         let [planned_tools, measured_tools] =
-            [&look.tools.planned, &look.tools.measured].map(|tools| points(tools));
+            [&frame.tools.planned, &frame.tools.measured].map(|tools| points(tools));
         let written = self.recorder.look(&TrialLook {
-            time_s: look.time_s,
-            scene: &look.scene,
+            time_s: frame.time_s,
+            scene: &frame.scene,
             planned_joints: planned.as_deref(),
             measured_joints: &measured,
             planned_tools: &planned_tools,

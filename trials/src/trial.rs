@@ -1,13 +1,14 @@
-//! Trials: whether what a policy learned in the training world works on other arms.
+//! Trials: tests of a trained policy on arms that differ from the training world.
 //!
-//! A trial draws a start and goals as the training world does and puts blocks of their true size on the simulated pair's table
-//! ([`rollout`]). [`Mode::OpenLoop`] is the paper's way (section 4.3): the policy's whole episode in the training world becomes one
-//! motion, which is planned, checked and executed without a look at the objects. [`Mode::ClosedLoop`] asks the policy
-//! again after every step, with what the cameras and encoders say; each step is planned and checked as a motion of its own, from rest to
-//! rest. [`Mode::Twin`] is an open loop whose motion was made by a closed loop on a copy of the pair: blind too, but made for these
-//! arms. The executor's envelope is the same for all. [`judge`] then looks at where the objects are.
+//! A trial draws a start and goals as the training world does and places blocks of their true size on the simulated
+//! pair's table ([`rehearsal`]). [`TrialMode::OpenLoop`] is the paper's method (section 4.3): the policy's whole episode in
+//! the training world becomes one motion, which is planned, checked and executed without observing the objects.
+//! [`TrialMode::ClosedLoop`] queries the policy before every step with the measurements of cameras and encoders; each step
+//! is planned and checked as a separate motion, from rest to rest. [`TrialMode::Twin`] is an open loop whose motion was
+//! computed by a closed loop on a copy of the pair. All modes use the same executor and envelope. [`outcome`] then evaluates
+//! the final positions of the objects.
 //!
-//! [`mapping`] says how the policy's world lies on the table.
+//! [`mapping`] relates the policy's world to the table.
 
 use glam::DVec3;
 use tandem_core::scene::Scene;
@@ -19,44 +20,45 @@ use crate::simulated::{Block, SimulatedConfig};
 use tandem_bridge::driver::PairState;
 use tandem_bridge::executor::Phase;
 
-pub use judge::{Cause, ObjectCourse, RefusedBy};
 pub use mapping::Mapping;
-pub use rollout::{Rehearsal, Rollout, TrialStart};
-pub use run::Trials;
+pub use outcome::{FailureCause, MotionRefusal, ObjectResult};
+pub use rehearsal::{Rehearsal, Rollout, TrialStart};
+pub use runner::TrialRunner;
 
-pub mod judge;
 pub mod mapping;
-pub mod rollout;
+pub mod outcome;
+pub mod rehearsal;
 
-mod closed;
-mod run;
-mod shape;
-mod stage;
+mod block_avoidance;
+mod closed_loop;
+mod rig;
+mod runner;
 
-/// Whoever decides what the arms do.
-pub trait Decide {
-    /// Writes the action for one observation and goal, each in [−1, 1]. Shapes: those of the layout, one row.
-    fn decide(&mut self, observation: &[f32], goal: &[f32], action: &mut [f32]);
+/// Chooses the actions of a trial.
+pub trait ActionSource {
+    /// Writes the action for one observation and goal, each element in [−1, 1]. Shapes: `[n_observation]`, `[n_goal]` and
+    /// `[n_action]` of the layout.
+    fn act(&mut self, observation: &[f32], goal: &[f32], action: &mut [f32]);
 }
 
-impl<F: FnMut(&[f32], &[f32], &mut [f32])> Decide for F {
-    fn decide(&mut self, observation: &[f32], goal: &[f32], action: &mut [f32]) {
+impl<F: FnMut(&[f32], &[f32], &mut [f32])> ActionSource for F {
+    fn act(&mut self, observation: &[f32], goal: &[f32], action: &mut [f32]) {
         self(observation, goal, action);
     }
 }
 
-/// Whether the policy sees what its actions come to.
+/// The way in which a trial uses the policy.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Mode {
-    /// One motion, made of an episode in the training world.
+pub enum TrialMode {
+    /// One motion, computed from an episode in the training world.
     OpenLoop,
-    /// One motion, made of a closed loop on a copy of the pair that differs from it as a model does from the arms.
+    /// One motion, computed by a closed loop on a copy of the pair without noise and latency and with 20 % less friction.
     Twin,
-    /// A look at the table before every step.
+    /// One motion per step, with an observation of the table before each.
     ClosedLoop,
 }
 
-impl Mode {
+impl TrialMode {
     /// The mode's name in tables and files.
     #[must_use]
     pub const fn name(self) -> &'static str {
@@ -68,131 +70,131 @@ impl Mode {
     }
 }
 
-/// What trials have in common.
+/// The configuration of a series of trials.
 #[derive(Debug, Clone, PartialEq)]
 pub struct TrialConfig {
-    /// Task and number of arms.
+    /// The task and the number of arms.
     pub layout: Layout,
-    /// Whether the policy sees the table.
-    pub mode: Mode,
-    /// The blocks; where they lie is drawn.
+    /// The way in which the policy is used.
+    pub mode: TrialMode,
+    /// The size and mass of the blocks. Their positions are drawn.
     pub block: Block,
-    /// Decides starts, goals, latencies and noise.
+    /// The seed of starts, goals, latencies and noise.
     pub seed: u64,
-    /// Share of the fastest speed, in (0, 1].
+    /// The share of the highest speed, in (0, 1].
     pub speed: f64,
-    /// The simulated pair, whose seed and blocks are the trial's.
+    /// The simulated pair. Each trial sets its own seed and blocks.
     pub simulated: SimulatedConfig,
-    /// Longest trial, seconds of simulated time at full speed.
+    /// The longest trial, seconds of simulated time at full speed.
     pub time_limit_s: f64,
 }
 
-/// What happened in a trial.
+/// The result of a trial.
 #[derive(Debug, Clone, PartialEq)]
 pub struct TrialReport {
     /// The trial's number.
     pub number: u64,
-    /// Why it failed; `None` is success.
-    pub cause: Option<Cause>,
-    /// What happened to each object, arm by arm.
-    pub objects: Vec<ObjectCourse>,
-    /// Where the objects lay, should go and ended in the world, arm by arm.
-    pub places: Vec<Places>,
-    /// How far from their goals the objects were after the rehearsal, metres; not in the closed loop.
+    /// The cause of a failure; `None` is success.
+    pub cause: Option<FailureCause>,
+    /// The results of the objects in the arms' own frames, arm by arm.
+    pub objects: Vec<ObjectResult>,
+    /// The positions of the objects in the world frame, arm by arm.
+    pub positions: Vec<ObjectPositions>,
+    /// The distances of the objects from their goals after the rehearsal, metres; `None` in a closed loop.
     pub rehearsed_m: Option<Vec<f64>>,
-    /// How long the arms took, seconds of simulated time.
+    /// The duration of the trial, seconds of simulated time.
     pub duration_s: f64,
-    /// Steps that the policy was asked for.
+    /// The number of actions that the policy chose.
     pub n_steps: usize,
-    /// Steps that the check allowed in part or not at all; closed loop only.
+    /// The number of steps that the check allowed only in part or not at all; 0 without a closed loop.
     pub n_shortened: usize,
-    /// What touched what.
+    /// All contacts of the arms.
     pub touched: Contacts,
-    /// The smallest gap between the arms that was measured, metres.
+    /// The smallest gap between the arms, metres.
     pub arms_gap_m: f64,
     /// The smallest gap between an arm and the table, metres.
     pub table_gap_m: f64,
-    /// Where the tools went, or should have gone, from way point to way point; empty when nothing could be planned.
+    /// The waypoints of the tools; empty if no motion was planned.
     pub way_points: Vec<WayPoint>,
-    /// Where the tools were and where the motion had them, some twenty times a second.
+    /// The measured and planned positions of the tools, 25 times per second.
     pub path: Vec<PathPoint>,
 }
 
-/// An object's places, world frame, metres.
+/// The positions of one object, world frame, metres.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Places {
-    /// Where it lay at first.
+pub struct ObjectPositions {
+    /// The initial position.
     pub start: DVec3,
-    /// Where it should go.
+    /// The goal.
     pub goal: DVec3,
-    /// Where it ended.
+    /// The final position.
     pub end: DVec3,
 }
 
-/// Where the tools were at one time and where they should have been; world frame, metres.
+/// The measured and planned positions of the tools at one time; world frame, metres.
 #[derive(Debug, Clone, PartialEq)]
 pub struct PathPoint {
     /// Simulated time since the trial's start, seconds.
     pub time_s: f64,
-    /// By the motion, arm by arm; empty while there is none.
+    /// The positions by the motion, arm by arm; empty while there is none.
     pub planned: Vec<DVec3>,
-    /// In truth.
+    /// The true positions, arm by arm.
     pub measured: Vec<DVec3>,
 }
 
-/// The table at one moment, for whoever keeps records.
+/// The state of a trial at one time, for observers.
 #[derive(Debug)]
-pub struct Look<'a> {
+pub struct Frame<'a> {
     /// Simulated time since the trial's start, seconds.
     pub time_s: f64,
-    /// What the executor does.
+    /// The phase of the executor.
     pub phase: Phase,
-    /// Everything as it truly is.
+    /// The true scene.
     pub scene: Scene,
-    /// Where the motion has the joints, radians, while there is one.
+    /// The joint angles by the motion, radians, while there is one.
     pub planned: Option<&'a [Joints]>,
-    /// What the arms said last.
+    /// The newest reported state of the arms.
     pub measured: Option<&'a PairState>,
-    /// Where the tools are by the motion and in truth.
+    /// The planned and true positions of the tools.
     pub tools: &'a PathPoint,
 }
 
-/// Somebody who watches a trial.
-pub trait Witness {
-    /// The table some twenty-five times a second.
-    fn look(&mut self, look: &Look<'_>);
+/// Receives the frames of a trial while it runs.
+pub trait TrialObserver {
+    /// Receives the next frame. Called 25 times per simulated second.
+    fn on_frame(&mut self, frame: &Frame<'_>);
 }
 
-/// Nobody watches.
+/// An observer that ignores all frames.
 #[derive(Debug, Clone, Copy)]
-pub struct NoWitness;
+pub struct NoObserver;
 
-impl Witness for NoWitness {
-    fn look(&mut self, _: &Look<'_>) {}
+impl TrialObserver for NoObserver {
+    fn on_frame(&mut self, _: &Frame<'_>) {}
 }
 
-/// Why a trial could not be carried out at all.
+/// The reason why a trial could not be carried out.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum TrialError {
-    /// The training world cannot be built or broke.
+    /// The training world cannot be built or has failed.
     #[error("the training world failed")]
     World(#[from] SimError),
     /// The blocks are too large for the tasks' area.
     #[error("no start has room for blocks with half an edge of {half_m} m")]
     NoRoom {
-        /// Half an edge, metres.
+        /// Half the edge of a block, metres.
         half_m: f64,
     },
-    /// The arms cannot be where the trial starts.
-    #[error("arm {arm} cannot be where the trial starts")]
+    /// An arm cannot reach the start of the trial.
+    #[error("arm {arm} cannot reach the start of the trial")]
     Start {
         /// The arm, from 0.
         arm: usize,
-        /// Why not.
+        /// The reason.
         source: tandem_kinematics::ReachError,
     },
-    /// The executor does not let the arms go.
-    #[error("the arms were not let go")]
+    /// The executor refuses to reset the arms.
+    #[error("the arms were not reset")]
     Reset(#[from] tandem_bridge::executor::ResetError),
 }

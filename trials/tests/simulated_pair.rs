@@ -42,7 +42,7 @@ fn the_same_seed_and_commands_give_the_same_bits() {
         let mut pair = pair(SimulatedConfig { seed, blocks, ..SimulatedConfig::default() });
         let exchange = |number| pair.exchange(&moving(number, [0.1, 0.05, -0.1, 0.2])).unwrap();
         let states: Vec<PairState> = (1..60).map(exchange).collect();
-        (states, pair.objects(), pair.seen().to_vec(), pair.scene())
+        (states, pair.objects(), pair.observed_objects().to_vec(), pair.scene())
     };
     assert_eq!(run(3), run(3));
     assert_ne!(run(3).0, run(4).0);
@@ -130,11 +130,11 @@ fn cameras_see_late_and_not_exactly() {
     let (mut off_m, mut n) = (0.0, 0);
     for number in 1..=300 {
         pair.exchange(&moving(number, [0.0; 4])).unwrap();
-        let late_s = pair.time_s() - pair.seen()[0].time_s;
+        let late_s = pair.time_s() - pair.observed_objects()[0].time_s;
         if number > 10 {
             assert!((0.049..0.081).contains(&late_s), "{late_s}");
             let is = pair.objects();
-            off_m += pair.seen()[1].at_m.distance_squared(is[1].at_m);
+            off_m += pair.observed_objects()[1].at_m.distance_squared(is[1].at_m);
             n += 1;
         }
     }

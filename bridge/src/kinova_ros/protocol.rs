@@ -140,7 +140,7 @@ pub(crate) struct Reading<'a> {
     /// Turns of a finger that is shut.
     pub(crate) shut_turns: f64,
     /// Whether efforts are torques without those that carry the arm.
-    pub(crate) tells_torques: bool,
+    pub(crate) reports_torques: bool,
 }
 
 impl Reading<'_> {
@@ -167,7 +167,7 @@ impl Reading<'_> {
         let of_joints = |numbers: &[f64]| Joints::from_fn(N_JOINTS, |joint| numbers[joints[joint]]);
         let positions = numbers("position")?;
         let torques_nm =
-            if self.tells_torques { Some(of_joints(&numbers("effort")?)) } else { None };
+            if self.reports_torques { Some(of_joints(&numbers("effort")?)) } else { None };
         let turns = fingers.map(|finger| positions[finger].to_degrees() / FINGER_DEGREES_PER_TURN);
         let turns = turns.iter().sum::<f64>() / N_FINGERS as f64;
         let reading = ArmReading {
@@ -248,7 +248,7 @@ mod tests {
     use super::*;
 
     const READING: Reading<'static> =
-        Reading { prefix: "m1n4s200_", shut_turns: 6400.0, tells_torques: false };
+        Reading { prefix: "m1n4s200_", shut_turns: 6400.0, reports_torques: false };
 
     /// What the driver of a `m1n4s200` publishes.
     fn joint_state() -> Value {
@@ -278,7 +278,7 @@ mod tests {
         // 0.6571 rad are 37.65 degrees, at 80 degrees for 6800 turns 3200 turns of 6400.
         assert!((told.reading.opening - 0.5).abs() < 1e-3, "{}", told.reading.opening);
 
-        let torques = Reading { tells_torques: true, ..READING };
+        let torques = Reading { reports_torques: true, ..READING };
         let read = torques.joint_state(&joint_state()).unwrap();
         assert_eq!(read.reading.torques_nm, Some(Joints::new(&[0.5, 6.0, 2.0, -0.25])));
 

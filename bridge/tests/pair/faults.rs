@@ -144,8 +144,8 @@ struct Ending {
 /// Plays the plan's motion up to the fault, and on until the arms have stood still for a while.
 fn execute(plan: &Plan) -> Ending {
     let what = format!("{:?} {}", plan.kind, plan.seed);
-    let tells_torques = plan.kind != Kind::BlockedJoint;
-    let config = SimulatedConfig { seed: plan.seed, tells_torques, ..SimulatedConfig::default() };
+    let reports_torques = plan.kind != Kind::BlockedJoint;
+    let config = SimulatedConfig { seed: plan.seed, reports_torques, ..SimulatedConfig::default() };
     let mut rig = Rig::ready(&plan.motion, config);
     let mut observer = Observer::new(plan.slack());
     rig.executor.start(OWNER, plan.motion.clone(), plan.speed, rig.now_s).unwrap();
@@ -223,7 +223,7 @@ fn abandon(rig: Rig, plan: &Plan, mut observer: Observer, began_s: f64) -> Endin
         _ => std::mem::forget(rig.executor),
     }
     for _ in 0..N_AFTER {
-        pair.borrow_mut().pass();
+        pair.borrow_mut().skip_period();
         observer.look(&pair.borrow(), &format!("{:?} {}", plan.kind, plan.seed));
     }
     Ending { cause: None, stopped_s: observer.moved_s + PERIOD_S - began_s }

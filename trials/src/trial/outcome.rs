@@ -1,4 +1,4 @@
-//! How a trial ended, judged by where the objects are.
+//! The outcome of a trial, determined from the final positions of the objects.
 
 use glam::DVec3;
 use tandem_core::layout::GOAL_TOLERANCE_M;
@@ -7,24 +7,24 @@ use tandem_kinematics::{PlanError, Refusal};
 
 use tandem_bridge::executor::{StartError, Stop};
 
-/// Raised by more than this an object was lifted, metres.
+/// An object that rises by more than this was lifted, metres.
 const LIFTED_M: f64 = 0.03;
-/// Farther than this from the centre of its arm's workspace, along x or y, an object is out of reach, metres.
+/// An object farther than this from the centre of its arm's workspace, along x or y, is out of reach, metres.
 const REACH_M: f64 = 0.27;
 
-/// Why a trial failed.
+/// The cause of a failed trial.
 #[derive(Debug, Clone, PartialEq)]
 #[non_exhaustive]
-pub enum Cause {
-    /// The motion could not be planned, or the check refused it: nothing moved.
-    Refused(RefusedBy),
+pub enum FailureCause {
+    /// The motion could not be planned, or the check refused it. Nothing moved.
+    Refused(MotionRefusal),
     /// The envelope stopped the arms.
     Stopped(Stop),
     /// Parts of both arms touched.
     ArmsTouched,
     /// An arm touched the table.
     TableTouched,
-    /// The time was over before the policy was done.
+    /// The time limit passed before the policy was done.
     TimedOut,
     /// An object fell from the gripper or out of reach.
     ObjectLost,
@@ -32,22 +32,22 @@ pub enum Cause {
     NotReached,
 }
 
-/// Who refused a motion.
+/// The reason why a motion was refused.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 #[non_exhaustive]
-pub enum RefusedBy {
-    /// No trajectory leads there.
+pub enum MotionRefusal {
+    /// No trajectory leads through the waypoints.
     #[error(transparent)]
     Plan(#[from] PlanError),
-    /// The check of the whole motion.
+    /// The check refused the motion.
     #[error(transparent)]
     Check(#[from] Refusal),
-    /// The executor, before it started.
+    /// The executor refused to start the motion.
     #[error("{0}")]
     Start(String),
 }
 
-impl From<StartError> for RefusedBy {
+impl From<StartError> for MotionRefusal {
     fn from(error: StartError) -> Self {
         match error {
             StartError::Refused(refusal) => Self::Check(refusal),
@@ -56,8 +56,8 @@ impl From<StartError> for RefusedBy {
     }
 }
 
-impl Cause {
-    /// The cause's name in tables and files.
+impl FailureCause {
+    /// Returns the cause's name in tables and files.
     #[must_use]
     pub const fn name(&self) -> &'static str {
         match self {
@@ -71,7 +71,7 @@ impl Cause {
         }
     }
 
-    /// Every name, in the order of the table.
+    /// All names, in the order of the table.
     pub const NAMES: [&'static str; 7] = [
         "not-reached",
         "object-lost",
@@ -82,7 +82,7 @@ impl Cause {
         "stopped",
     ];
 
-    /// What there is to say beyond the name.
+    /// Returns the details beyond the name, if there are any.
     #[must_use]
     pub fn detail(&self) -> Option<String> {
         match self {
@@ -93,21 +93,21 @@ impl Cause {
     }
 }
 
-/// What happened to one object; own frame of its arm, metres.
+/// The result of one object; own frame of its arm, metres.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct ObjectCourse {
-    /// Where it lay at first.
+pub struct ObjectResult {
+    /// The initial position.
     pub start: DVec3,
-    /// Where it shall be.
+    /// The goal.
     pub goal: DVec3,
-    /// Where it ended.
+    /// The final position.
     pub end: DVec3,
-    /// The highest it was.
+    /// The largest height.
     pub highest_m: f64,
 }
 
-impl ObjectCourse {
-    /// How far it ended from its goal, metres.
+impl ObjectResult {
+    /// The final distance from the goal, metres.
     #[must_use]
     pub fn goal_distance_m(&self) -> f64 {
         (self.end - self.goal).length()
@@ -122,28 +122,32 @@ impl ObjectCourse {
     }
 }
 
-/// What arms may not do, however the trial ends.
-pub(crate) fn forbidden(touched: Contacts) -> Option<Cause> {
+/// Returns the failure that a contact of the arms causes, regardless of how the trial ends.
+pub(crate) fn contact_failure(touched: Contacts) -> Option<FailureCause> {
     if touched.contains(Contacts::ARM_ARM) {
-        Some(Cause::ArmsTouched)
+        Some(FailureCause::ArmsTouched)
     } else if touched.contains(Contacts::ARM_TABLE) {
-        Some(Cause::TableTouched)
+        Some(FailureCause::TableTouched)
     } else {
         None
     }
 }
 
-/// What became of a trial that was carried out to its end or to `time_over`; `None` is success.
-pub(crate) fn judge(task: Task, objects: &[ObjectCourse], time_over: bool) -> Option<Cause> {
-    let missed = |object: &&ObjectCourse| object.goal_distance_m() > f64::from(GOAL_TOLERANCE_M);
+/// Returns the failure of a trial that was carried out to its end or timed out; `None` is success.
+pub(crate) fn object_failure(
+    task: Task,
+    objects: &[ObjectResult],
+    timed_out: bool,
+) -> Option<FailureCause> {
+    let missed = |object: &&ObjectResult| object.goal_distance_m() > f64::from(GOAL_TOLERANCE_M);
     let mut missed = objects.iter().filter(missed).peekable();
     missed.peek()?;
     if missed.any(|object| object.lost(task)) {
-        Some(Cause::ObjectLost)
-    } else if time_over {
-        Some(Cause::TimedOut)
+        Some(FailureCause::ObjectLost)
+    } else if timed_out {
+        Some(FailureCause::TimedOut)
     } else {
-        Some(Cause::NotReached)
+        Some(FailureCause::NotReached)
     }
 }
 
@@ -152,28 +156,28 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_touch_counts_before_the_stop_that_it_leads_to() {
+    fn a_contact_takes_precedence_over_the_stop_that_it_causes() {
         let both = Contacts::ARM_ARM | Contacts::ARM_TABLE;
-        assert_eq!(forbidden(both), Some(Cause::ArmsTouched));
-        assert_eq!(forbidden(Contacts::ARM_TABLE), Some(Cause::TableTouched));
-        assert_eq!(forbidden(Contacts::NONE), None);
+        assert_eq!(contact_failure(both), Some(FailureCause::ArmsTouched));
+        assert_eq!(contact_failure(Contacts::ARM_TABLE), Some(FailureCause::TableTouched));
+        assert_eq!(contact_failure(Contacts::NONE), None);
     }
 
     #[test]
-    fn an_object_that_fell_is_lost_and_one_that_lies_elsewhere_was_not_brought() {
-        let course = |end: DVec3, highest_m| ObjectCourse {
+    fn an_object_that_fell_is_lost_and_one_elsewhere_has_not_reached_its_goal() {
+        let object = |end: DVec3, highest_m| ObjectResult {
             start: DVec3::new(0.0, 0.0, 0.0225),
             goal: DVec3::new(0.1, 0.0, 0.2),
             end,
             highest_m,
         };
-        let check = |object: ObjectCourse, time_over, expected: Option<Cause>| {
-            assert_eq!(judge(Task::PickAndPlace, &[object], time_over), expected);
+        let check = |object: ObjectResult, timed_out, expected: Option<FailureCause>| {
+            assert_eq!(object_failure(Task::PickAndPlace, &[object], timed_out), expected);
         };
-        check(course(DVec3::new(0.1, 0.03, 0.18), 0.2), false, None);
-        check(course(DVec3::new(0.05, 0.0, 0.0225), 0.15), false, Some(Cause::ObjectLost));
-        check(course(DVec3::new(0.0, 0.0, 0.0225), 0.0225), false, Some(Cause::NotReached));
-        check(course(DVec3::new(0.0, 0.0, 0.0225), 0.0225), true, Some(Cause::TimedOut));
-        check(course(DVec3::new(0.4, 0.0, 0.0225), 0.0225), true, Some(Cause::ObjectLost));
+        check(object(DVec3::new(0.1, 0.03, 0.18), 0.2), false, None);
+        check(object(DVec3::new(0.05, 0.0, 0.0225), 0.15), false, Some(FailureCause::ObjectLost));
+        check(object(DVec3::new(0.0, 0.0, 0.0225), 0.0225), false, Some(FailureCause::NotReached));
+        check(object(DVec3::new(0.0, 0.0, 0.0225), 0.0225), true, Some(FailureCause::TimedOut));
+        check(object(DVec3::new(0.4, 0.0, 0.0225), 0.0225), true, Some(FailureCause::ObjectLost));
     }
 }
