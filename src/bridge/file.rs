@@ -1,4 +1,4 @@
-//! A motion as a file: JSON that people write.
+//! Motion files: JSON for `tandem bridge move`.
 
 use std::path::Path;
 
@@ -10,40 +10,40 @@ use tandem_proto::pb;
 use crate::exit::{Exit, Failed, OrExit as _};
 use crate::input;
 
-/// Time between way points of the training world, seconds.
+/// Time between waypoints in the training world, seconds.
 const STEP_S: f64 = 0.04;
 
-/// What a file holds; unknown keys are refused.
+/// The contents of a file. Unknown keys are refused.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct MotionFile {
-    /// Share of the motion's own speed, in (0, 1].
+    /// The share of the motion's own speed, in (0, 1].
     speed: f64,
-    /// Places of the tools, one entry an arm in each.
+    /// The positions of the tools, with one entry per arm in each.
     way_points: Option<Vec<Vec<FileWayPoint>>>,
-    /// Whether the way begins where the tools are; with way points only. True when left out.
+    /// Whether the motion starts at the present position of the tools; with waypoints only. Default true.
     from_here: Option<bool>,
-    /// The motion is never faster than one way point in this time, seconds; with way points only. 0.04 when left out.
+    /// The shortest time per waypoint, seconds; with waypoints only. Default 0.04.
     step_s: Option<f64>,
-    /// Angles of the joints, in place of way points.
+    /// The angles of the joints, instead of waypoints.
     joint_motion: Option<FileJointMotion>,
 }
 
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct FileWayPoint {
-    /// Where the tool shall be in the world: x, y, z, metres.
+    /// The position of the tool in the world frame: x, y, z, metres.
     tool_m: [f64; 3],
-    /// How far the gripper shall be open, 0 to 1.
+    /// The opening of the gripper, 0 to 1.
     opening: f64,
 }
 
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct FileJointMotion {
-    /// Time from one sample to the next, seconds.
+    /// The time between two samples, seconds.
     period_s: f64,
-    /// Samples of every arm.
+    /// The samples of each arm.
     arms: Vec<Vec<FileSample>>,
 }
 
@@ -55,7 +55,7 @@ struct FileSample {
     opening: f64,
 }
 
-/// Writes a motion through `way_points` at `speed` as such a file.
+/// Writes a motion through `way_points` at `speed` to a file.
 pub(super) fn write(path: &Path, speed: f64, way_points: &[WayPoint]) -> Result<(), Failed> {
     let arm = |arm: &ArmWayPoint| {
         let round = |number: f64| (number * 1e5).round() * 1e-5;
@@ -68,7 +68,7 @@ pub(super) fn write(path: &Path, speed: f64, way_points: &[WayPoint]) -> Result<
     std::fs::write(path, text + "\n").or_cannot_write(|| format!("cannot write {}", path.display()))
 }
 
-/// The motion in the file `path`, at `speed` when it is given.
+/// Reads the motion in the file `path`. `speed` overrides the speed in the file.
 pub(super) fn read(path: &Path, speed: Option<f64>) -> Result<pb::MotionRequest, Failed> {
     let cannot_read = || format!("cannot read {path:?}");
     let text = input::text(path).or_exit(Exit::Data, cannot_read)?;
@@ -127,7 +127,7 @@ mod tests {
     }
 
     #[test]
-    fn a_file_holds_way_points_or_angles_and_nothing_else() {
+    fn a_file_contains_either_waypoints_or_angles() {
         let places = r#"[[{"tool_m": [0, 0, 0.1], "opening": 1}]]"#;
         let whole = parsed(&format!(r#"{{"speed": 1, "way_points": {places}}}"#)).unwrap();
         let pb::motion_request::Motion::WayPoints(way) = whole else { panic!("{whole:?}") };

@@ -1,4 +1,4 @@
-//! `tandem bridge trial`: policies on the simulated pair, judged by where the objects are.
+//! `tandem bridge trial`: runs policies on the simulated pair.
 
 use std::path::{Path, PathBuf};
 
@@ -24,16 +24,17 @@ use crate::output;
 const DENSITY_KGPM3: f32 = 683.3;
 /// Lightest and heaviest block, kilograms.
 const MASS_KG: [f32; 2] = [0.05, 0.25];
-/// Smallest and largest block, centimetres: what the training world knows.
+/// Smallest and largest block, centimetres, as in the training world.
 const BLOCK_CM: [f32; 2] = [3.0, 9.0];
 /// Longest trial, seconds.
 const TIME_LIMIT_S: f64 = 120.0;
+
 pub(crate) fn trial(args: &TrialArgs) -> Result<(), Failed> {
     let (task, subjects) = subjects(args)?;
     let block = block(args.block_cm)?;
     if !(args.speed > 0.0 && args.speed <= 1.0) {
-        let told = format!("--speed {}: expected more than 0 and at most 1", args.speed);
-        return Err(Failed::usage(told));
+        let message = format!("--speed {}: expected more than 0 and at most 1", args.speed);
+        return Err(Failed::usage(message));
     }
     let all_modes = [ModeName::ClosedLoop, ModeName::Twin, ModeName::OpenLoop];
     let modes = if args.modes.is_empty() { &all_modes[..] } else { &args.modes };
@@ -76,7 +77,7 @@ const fn mode_of(name: ModeName) -> TrialMode {
     }
 }
 
-/// The task, and everybody who is to do it.
+/// Loads the policies and determines their common task.
 fn subjects(args: &TrialArgs) -> Result<(Task, Vec<Subject>), Failed> {
     let mut subjects = Vec::new();
     for path in &args.policies {
@@ -101,16 +102,15 @@ fn subjects(args: &TrialArgs) -> Result<(Task, Vec<Subject>), Failed> {
         }
         subjects.push(Subject { name: format!("composed-{}", name_of(path)), policy });
     }
-    let found = |subject: &Subject| subject.policy.layout.task;
-    let wanted = args.task.map(task);
-    let first = wanted.or_else(|| subjects.first().map(found));
+    let task_of = |subject: &Subject| subject.policy.layout.task;
+    let first = args.task.map(task).or_else(|| subjects.first().map(task_of));
     let Some(task) = first else {
         return Err(Failed::usage("give --policy or --composed-teachers"));
     };
-    match subjects.iter().find(|subject| found(subject) != task) {
+    match subjects.iter().find(|subject| task_of(subject) != task) {
         Some(other) => {
-            let told = format!("{} is for {}, not {task}", other.name, found(other));
-            Err(Failed::usage(told))
+            let message = format!("{} is for {}, not {task}", other.name, task_of(other));
+            Err(Failed::usage(message))
         }
         None => Ok((task, subjects)),
     }
@@ -206,7 +206,7 @@ fn show(args: &TrialArgs, rows: Vec<TrialRow>, file: &Path) -> Result<(), Failed
     Ok(())
 }
 
-/// The name of a policy's file, or of the run directory in which it lies.
+/// Returns the name of a policy's file, or of the run directory that contains it.
 fn name_of(path: &Path) -> String {
     let of_run = path.parent().filter(|directory| directory.ends_with("policy"));
     let named = of_run.and_then(Path::parent).and_then(Path::file_name);

@@ -16,7 +16,7 @@ fn pair(config: SimulatedConfig) -> SimulatedPair {
     SimulatedPair::new(cell, &at, 1.0, config)
 }
 
-/// Both arms at these joint velocities, grippers shut.
+/// A command with the same joint velocities for both arms and closed grippers.
 fn moving(number: u64, velocities: [f64; 4]) -> Command {
     let arm = ArmCommand { velocities: Joints::new(&velocities), opening: 0.0 };
     Command { number, order: Order::Move(vec![arm, arm]) }
@@ -49,7 +49,7 @@ fn the_same_seed_and_commands_give_the_same_bits() {
 }
 
 #[test]
-fn drives_that_hear_nothing_brake_and_wait_for_a_stop() {
+fn drives_without_commands_brake_and_wait_for_a_stop() {
     let mut pair = pair(SimulatedConfig::default());
     for number in 1..=20 {
         pair.exchange(&moving(number, [0.3, 0.0, 0.0, 0.0])).unwrap();
@@ -93,7 +93,7 @@ fn commands_take_effect_late_and_speeds_follow_with_a_lag() {
 }
 
 #[test]
-fn an_arm_that_is_driven_into_the_table_stalls_there() {
+fn an_arm_driven_into_the_table_stalls() {
     let mut pair = pair(quiet());
     let mut stalled_nm = 0.0_f64;
     // Joint 2 leans the arms towards the table.
@@ -110,7 +110,7 @@ fn an_arm_that_is_driven_into_the_table_stalls_there() {
 }
 
 #[test]
-fn the_gripper_takes_its_time() {
+fn the_gripper_moves_at_its_own_speed() {
     let mut pair = pair(quiet());
     let mut openings = Vec::new();
     for number in 1..=140 {
@@ -123,7 +123,7 @@ fn the_gripper_takes_its_time() {
 }
 
 #[test]
-fn cameras_see_late_and_not_exactly() {
+fn cameras_have_latency_and_noise() {
     let camera = CameraConfig { latency_periods: 5, ..CameraConfig::default() };
     let blocks = vec![Block::small([-0.12, 0.1]), Block::large([0.12, 0.2])];
     let mut pair = pair(SimulatedConfig { blocks, camera, ..SimulatedConfig::default() });

@@ -1,4 +1,4 @@
-//! TrialRunner with policies that ship.
+//! Trials with the shipped policies.
 #![expect(clippy::unwrap_used, reason = "a test panics where it fails")]
 
 use std::path::{Path, PathBuf};

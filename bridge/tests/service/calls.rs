@@ -1,4 +1,4 @@
-//! What clients can do with the arms.
+//! The calls of the service.
 
 use tandem_bridge::work_cell::mico_cell;
 use tandem_kinematics::{ArmSample, ArmWayPoint, Joints, Motion, PlanSettings, plan};
@@ -23,7 +23,7 @@ async fn the_arms_are_described() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_motion_is_played_to_where_it_leads() {
+async fn a_motion_ends_at_its_last_waypoint() {
     let mut rig = Rig::new(patient()).await;
     let token = rig.ready().await;
     let mut playing = rig.execute(&token, through(&[UP_M], 1.0)).await.unwrap();
@@ -91,7 +91,7 @@ async fn no_motion_is_faster_than_the_bound() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_check_says_what_is_wrong_and_moves_nothing() {
+async fn a_check_returns_the_fault_and_moves_nothing() {
     use pb::check_response::Verdict;
     let mut rig = Rig::new(patient()).await;
     let check = |motion| pb::CheckRequest { motion: Some(motion) };
@@ -140,7 +140,7 @@ async fn a_check_says_what_is_wrong_and_moves_nothing() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_check_waits_for_the_next_state_when_the_newest_was_not_believed() {
+async fn a_check_waits_for_the_next_state_after_an_invalid_one() {
     let mut rig = Rig::new(patient()).await;
     rig.eventually(|status| !status.arms.is_empty()).await;
     rig.tap.fail(Fault::Untrue);
@@ -191,7 +191,7 @@ async fn a_motion_into_the_arms_own_base_is_refused_by_name() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_long_motion_is_checked_beside_the_ticks() {
+async fn the_check_of_a_long_motion_does_not_delay_ticks() {
     let mut rig = Rig::new(patient()).await;
     rig.eventually(|status| !status.arms.is_empty()).await;
     // No tick can come: whoever needed one to check would wait for ever.

@@ -1,4 +1,4 @@
-//! Every way in which a motion ends before its time: the drives are stopped, and nothing moves before a reset.
+//! Motions that end early: the drives are stopped, and nothing moves before a reset.
 
 use tandem_bridge::service::Error;
 use tandem_bridge::{Command, Order, Settings};
@@ -7,7 +7,7 @@ use tonic::Code;
 
 use crate::rig::{Fault, Rig, UP_M, patient, request, slow, through};
 
-/// Nothing moves, no motion begins, and after a reset all is well again.
+/// Asserts that nothing moves and no motion starts before a reset, and that motions work after it.
 async fn assert_stopped_until_reset(rig: &mut Rig, name: &str) {
     let is_stopped = |status: &pb::BridgeStatusResponse| status.phase() == pb::BridgePhase::Stopped;
     let status = rig.eventually(is_stopped).await;
@@ -36,7 +36,7 @@ async fn nothing_moves_before_a_reset() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn anyone_stops_the_arms() {
+async fn any_client_stops_the_arms() {
     let mut rig = Rig::new(patient()).await;
     let token = rig.ready().await;
     let mut playing = rig.moving(&token).await;
@@ -52,7 +52,7 @@ async fn anyone_stops_the_arms() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_stop_queues_behind_nothing() {
+async fn a_stop_waits_in_no_queue() {
     let mut rig = Rig::new(patient()).await;
     let token = rig.ready().await;
     let mut playing = rig.moving(&token).await;
@@ -90,7 +90,7 @@ async fn a_stream_that_breaks_stops_the_arms() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_client_that_ends_its_signs_of_life_stops_the_arms_and_hears_of_it() {
+async fn a_client_that_ends_its_signs_of_life_stops_the_arms_and_receives_the_outcome() {
     let mut rig = Rig::new(patient()).await;
     let token = rig.ready().await;
     let mut playing = rig.moving(&token).await;
@@ -111,7 +111,7 @@ async fn a_second_start_on_one_stream_is_no_sign_of_life() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn an_owner_who_gives_the_arms_up_stops_them() {
+async fn a_release_by_the_owner_stops_the_arms() {
     let mut rig = Rig::new(patient()).await;
     let token = rig.ready().await;
     let mut playing = rig.moving(&token).await;
@@ -183,7 +183,7 @@ async fn signs_of_life_keep_a_motion_going() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn the_services_end_stops_the_arms_first() {
+async fn a_shutdown_stops_the_arms_first() {
     let mut rig = Rig::new(patient()).await;
     let token = rig.ready().await;
     let mut playing = rig.moving(&token).await;
@@ -216,7 +216,7 @@ async fn a_driver_that_fails_stops_the_arms() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_reset_connects_again_and_nothing_moves_by_it() {
+async fn a_reset_reconnects_without_moving_the_arms() {
     let mut rig = Rig::dialling(patient()).await;
     let token = rig.ready().await;
     let mut playing = rig.moving(&token).await;
@@ -249,7 +249,7 @@ async fn a_reset_connects_again_and_nothing_moves_by_it() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_stop_that_does_not_get_through_is_told() {
+async fn a_stop_that_fails_is_reported() {
     let mut rig = Rig::new(patient()).await;
     let token = rig.ready().await;
     let mut playing = rig.moving(&token).await;
@@ -263,7 +263,7 @@ async fn a_stop_that_does_not_get_through_is_told() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_driver_that_hangs_is_told_of_and_keeps_nobody_waiting() {
+async fn a_driver_that_hangs_is_reported_and_blocks_no_client() {
     let mut rig = Rig::new(patient()).await;
     let token = rig.ready().await;
     let mut playing = rig.moving(&token).await;
@@ -291,7 +291,7 @@ async fn a_bug_in_a_driver_stops_the_drives_and_ends_the_service() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_thread_that_oversleeps_stops_the_arms() {
+async fn an_oversleeping_thread_stops_the_arms() {
     let mut rig = Rig::new(patient()).await;
     let token = rig.ready().await;
     let mut playing = rig.moving(&token).await;
