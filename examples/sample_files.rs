@@ -1,6 +1,6 @@
-//! Writes samples of what no short run leaves: a ledger with open leases, and encoded messages of every type.
+//! Writes sample files that no short run produces: a ledger with open leases, and encoded messages of every type.
 //!
-//! `scripts/make-corpus` calls it with the directory to write to.
+//! `scripts/make-corpus` runs it with the output directory as argument.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -10,12 +10,12 @@ use prost_reflect::{
     DescriptorPool, DynamicMessage, FieldDescriptor, Kind, MessageDescriptor, Value,
 };
 use serde_json::json;
-use tandem_teacher::budget::{Terms, Wish};
-use tandem_teacher::ledger::{Bill, Charge, Ledger as _, SqliteLedger};
+use tandem_teacher::budget::{AccountTerms, Charge};
+use tandem_teacher::ledger::{ChargeRequest, Ledger as _, SqliteLedger};
 
 type AnyError = Box<dyn std::error::Error>;
 
-/// No message has more alternatives in a `oneof`.
+/// Largest number of alternatives in a `oneof`.
 const N_VARIANTS: usize = 4;
 
 fn main() -> Result<(), AnyError> {
@@ -24,21 +24,27 @@ fn main() -> Result<(), AnyError> {
     write_messages(&directory.join("messages.json"))
 }
 
-/// Two accounts: one without leases and one with a settled lease, an open one and charges under both.
+/// Writes two accounts: one without leases, and one with a settled lease, an open lease and charges under both.
 fn write_ledger(path: &Path) -> Result<(), AnyError> {
     if path.exists() {
-        return Err(format!("{path:?} exists already").into());
+        return Err(format!("{path:?} already exists").into());
     }
     let mut ledger = SqliteLedger::open(path)?;
-    ledger.open("unleased", Terms { budget: 10, strategy: "mc-q:0.1".parse()? })?;
-    ledger.open("leased", Terms { budget: 1000, strategy: "eamc:0.25".parse()? })?;
+    ledger.open("unleased", AccountTerms { budget: 10, strategy: "mc-q:0.1".parse()? })?;
+    ledger.open("leased", AccountTerms { budget: 1000, strategy: "eamc:0.25".parse()? })?;
     ledger.open_leases("leased", &[0, 1], 50)?;
-    let charges = |account: &str, episode, steps: std::ops::Range<u32>, wish| Bill {
+    let charges = |account: &str, episode, steps: std::ops::Range<u32>, wanted| ChargeRequest {
         account: account.to_owned(),
-        charges: steps.map(|step| Charge { episode, step, wish }).collect(),
+        charges: steps
+            .map(|step| Charge {
+                episode,
+                step,
+                wanted_in_first_half: wanted,
+                wanted_in_second_half: wanted,
+            })
+            .collect(),
     };
-    let always = Wish { first: true, second: true };
-    let never = Wish { first: false, second: false };
+    let (always, never) = (true, false);
     for bill in [
         charges("unleased", 3, 0..12, always),
         charges("leased", 0, 0..20, always),
@@ -53,7 +59,7 @@ fn write_ledger(path: &Path) -> Result<(), AnyError> {
     Ok(())
 }
 
-/// Every message type of the package with every field set: once for each alternative of its `oneof`s.
+/// Writes every message type of the package with every field set, once for each alternative of its `oneof`s.
 fn write_messages(path: &Path) -> Result<(), AnyError> {
     let pool = DescriptorPool::decode(tandem_proto::FILE_DESCRIPTOR_SET)?;
     let mut samples = Vec::new();
@@ -75,7 +81,8 @@ fn write_messages(path: &Path) -> Result<(), AnyError> {
     Ok(())
 }
 
-/// A message with every field set, of each `oneof` the alternative `variant`. `n` counts values: all of them differ.
+/// Creates a message with every field set, and alternative `variant` of each `oneof`. `n` counts values, so that all
+/// differ.
 fn filled(message: &MessageDescriptor, variant: usize, n: &mut u32) -> DynamicMessage {
     let mut filled = DynamicMessage::new(message.clone());
     for field in message.fields().filter(|field| is_chosen(field, variant)) {

@@ -14,7 +14,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     let out = PathBuf::from(std::env::var_os("OUT_DIR").ok_or("cargo sets OUT_DIR")?);
     std::fs::write(out.join("tandem_descriptor.bin"), files.encode_to_vec())?;
     tonic_prost_build::configure().build_server(false).compile_fds(files.clone())?;
-    // Servers refuse requests that they cannot decode otherwise than clients do answers, so their codec is another one.
+    // Servers and clients report malformed messages with different status codes, so servers have a codec of their own.
     let servers = out.join("servers");
     std::fs::create_dir_all(&servers)?;
     tonic_prost_build::configure()

@@ -66,7 +66,7 @@ def torch_update():
     adam_a = torch.optim.Adam(actor.parameters(), lr=1e-3, fused=True)
     adam_c = torch.optim.Adam(critic.parameters(), lr=1e-3, fused=True)
     s, s2 = torch.rand(BATCH, OBSERVATION + GOAL), torch.rand(BATCH, OBSERVATION + GOAL)
-    a, r, cloned = torch.rand(BATCH, ACTION), -torch.ones(BATCH, HEADS), torch.zeros(BATCH, ACTION)
+    a, r, bc_mask = torch.rand(BATCH, ACTION), -torch.ones(BATCH, HEADS), torch.zeros(BATCH, ACTION)
 
     def update():
         with torch.no_grad():
@@ -76,7 +76,7 @@ def torch_update():
         grads_c = torch.autograd.grad(loss_c, list(critic.parameters()))
         u = torch.tanh(actor(s))
         loss_a = -critic(torch.cat([s, u], 1)).sum(1).mean() + 0.1 * (u**2).mean()
-        loss_a = loss_a + 2.0 * (cloned * (u - a) ** 2).sum(1).mean()
+        loss_a = loss_a + 2.0 * (bc_mask * (u - a) ** 2).sum(1).mean()
         grads_a = torch.autograd.grad(loss_a, list(actor.parameters()))
         for net, grads, adam in ((critic, grads_c, adam_c), (actor, grads_a, adam_a)):
             for p, g in zip(net.parameters(), grads):

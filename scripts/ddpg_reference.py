@@ -14,7 +14,7 @@ import numpy as np
 
 N_INPUT, N_ACTION, N_HEADS = 31, 3, 2  # one arm, push; two heads whatever the layout
 N_HIDDEN, N_HIDDEN_LAYERS, BATCH = 5, 2, 6
-DISCOUNT, ACTION_PENALTY, CLONING_WEIGHT, POLYAK_KEEP = 0.9, 0.7, 1.5, 0.8
+DISCOUNT, ACTION_PENALTY, BC_WEIGHT, POLYAK_KEEP = 0.9, 0.7, 1.5, 0.8
 RATES = {"actor": 0.002, "critic": 0.003}
 KINK_MARGIN = 1e-4
 
@@ -82,10 +82,10 @@ def gradients(state, batch, clamped):
     raw_action, actor_seen = forward(net["actor.online"], batch["inputs"])
     action = np.tanh(raw_action)
     q, seen = forward(net["critic.online"], np.hstack([batch["inputs"], action]))
-    error = batch["cloned"] * (action - batch["actions"])
-    actor_loss = -q.sum() / b + ACTION_PENALTY * (action**2).mean() + CLONING_WEIGHT * (error**2).sum() / b
+    error = batch["bc_mask"] * (action - batch["actions"])
+    actor_loss = -q.sum() / b + ACTION_PENALTY * (action**2).mean() + BC_WEIGHT * (error**2).sum() / b
     _, d_input = backward(net["critic.online"], seen, np.full_like(q, -1 / b))
-    d_action = d_input[:, N_INPUT:] + 2 * ACTION_PENALTY * action / action.size + 2 * CLONING_WEIGHT * error / b
+    d_action = d_input[:, N_INPUT:] + 2 * ACTION_PENALTY * action / action.size + 2 * BC_WEIGHT * error / b
     actor_gradient, _ = backward(net["actor.online"], actor_seen, d_action * (1 - action**2))
     losses = {"critic_loss": critic_loss, "actor_loss": actor_loss, "mean_q": q.mean()}
     return losses, {"actor": actor_gradient, "critic": critic_gradient}
@@ -120,13 +120,13 @@ def main(seed):
         batch = {"inputs": decimals((BATCH, N_INPUT), 1), "next_inputs": decimals((BATCH, N_INPUT), 1)}
         batch["actions"] = decimals((BATCH, N_ACTION), 1)
         batch["rewards"] = rng.integers(-1, 1, (BATCH, N_HEADS)).astype(float)
-        batch["cloned"] = (rng.uniform(size=(BATCH, 1)) < 0.5) * np.ones((1, N_ACTION))
+        batch["bc_mask"] = (rng.uniform(size=(BATCH, 1)) < 0.5) * np.ones((1, N_ACTION))
         losses, gradient = gradients(state, batch, clamped)
         after = step(state, gradient, t)
         updates.append({"before": state, "batch": batch, "losses": losses, "gradient": gradient, "after": after})
         state = {key: to_f32(value) for key, value in after.items()}
     assert all(clamped.values()), clamped
-    config = {"discount": DISCOUNT, "action_penalty": ACTION_PENALTY, "cloning_weight": CLONING_WEIGHT}
+    config = {"discount": DISCOUNT, "action_penalty": ACTION_PENALTY, "bc_weight": BC_WEIGHT}
     config |= {"polyak_keep": POLYAK_KEEP, "batch_size": BATCH, "n_hidden": N_HIDDEN, "n_hidden_layers": N_HIDDEN_LAYERS}
     config |= {f"{name}_learning_rate": rate for name, rate in RATES.items()}
     flat = lambda x: [float(f"{v:.9g}") for v in x.ravel()] if isinstance(x, np.ndarray) else float(x)

@@ -6,7 +6,7 @@ use clap::ValueEnum as _;
 use serde_json::{Value, json};
 use tandem_core::layout::EPISODE_STEPS;
 use tandem_core::rng::{Stream, episode_rng, uniform};
-use tandem_core::{Layout, Task};
+use tandem_core::{Layout, Task, WorldSettings};
 use tandem_policy::{Matrix, MatrixMut, MlpShape, NormalizerSnapshot, multiply};
 use tandem_rl::RunConfig;
 use tandem_rl::config::Recipe;
@@ -14,7 +14,7 @@ use tandem_rl::ddpg::{Batch, Ddpg, Rewards};
 use tandem_rl::her::{Sampler, Statistics};
 use tandem_rl::replay::{ReplayBuffer, drifting_episode};
 use tandem_rl::trainer::Trainer;
-use tandem_sim::{Env, Starts, WorldConfig};
+use tandem_sim::{Env, WorldConfig};
 
 use crate::cli::{BenchArgs, BenchName};
 use crate::exit::{Exit, Failed, OrExit as _};
@@ -96,7 +96,7 @@ fn sim() -> Result<Vec<Figure>, Failed> {
         let mut n_episodes = 0;
         let mut broken = None;
         let episodes_per_s = rate(|| {
-            world.reset(&mut episode_rng(1, n_episodes, Stream::Reset), Starts::default());
+            world.reset(&mut episode_rng(1, n_episodes, Stream::Reset), WorldSettings::default());
             n_episodes += 1;
             for _ in 0..EPISODE_STEPS {
                 action.iter_mut().for_each(|component| *component = uniform(&mut rng, -1.0, 1.0));

@@ -150,8 +150,8 @@ pub(crate) struct TrainArgs {
     #[arg(long, value_name = "DIR")]
     pub(crate) out: Option<PathBuf>,
     /// Resumes the run in --out from its newest checkpoint. The settings and the teacher remain those of the run; only
-    /// its end (--max-env-steps, --max-minutes, --until-success), checkpoint.*, evaluation.recorded_episodes and
-    /// --workers can change. A rejected --resume changes nothing.
+    /// its end (--max-env-steps, --max-minutes, --until-success), checkpoint.*, evaluation.recorded_episodes,
+    /// evaluation.test_episodes and --workers can change. A rejected --resume changes nothing.
     #[arg(long, requires = "out")]
     pub(crate) resume: bool,
     /// Prints the summary as one JSON object on the last line of standard output.
@@ -200,7 +200,7 @@ pub(crate) struct ReportArgs {
     /// Run directories, directories that contain runs or trials, or single metrics and trials files.
     #[arg(required = true, value_name = "DIR|FILE")]
     pub(crate) paths: Vec<PathBuf>,
-    /// HTML page; curves and pictures of trials are written next to it as SVG files [default: report.html, in the
+    /// HTML page; curves and plots of trials are written next to it as SVG files [default: report.html, in the
     /// directory of the sweep or trials if that is the only one].
     #[arg(long, value_name = "FILE.html")]
     pub(crate) out: Option<PathBuf>,
@@ -244,7 +244,7 @@ pub(crate) struct EvalArgs {
     /// Number of episodes, one per goal.
     #[arg(long, default_value_t = 240, value_parser = clap::value_parser!(u64).range(1..=1_000_000))]
     pub(crate) episodes: u64,
-    /// Seed of the goals. Runs choose their best policy by goals of another seed.
+    /// Seed of the test goals. Runs select their best policy on validation goals of another seed.
     #[arg(long, default_value_t = 777)]
     pub(crate) seed: u64,
     /// Records the first episode to this MCAP file.
@@ -340,8 +340,8 @@ pub(crate) struct LearnerArgs {
     /// Run directory.
     #[arg(long, value_name = "DIR")]
     pub(crate) out: PathBuf,
-    /// Resumes from the newest checkpoint. Only the settings stop.*, checkpoint.* and evaluation.recorded_episodes can
-    /// differ from those of the run.
+    /// Resumes from the newest checkpoint. Only the settings stop.*, checkpoint.*, evaluation.recorded_episodes and
+    /// evaluation.test_episodes can differ from those of the run.
     #[arg(long)]
     pub(crate) resume: bool,
     /// Writes the resolved settings to run.toml in the run directory.

@@ -5,8 +5,10 @@ use std::path::Path;
 
 use rayon::iter::{IntoParallelRefIterator as _, ParallelIterator as _};
 use serde_json::{Value, json};
-use tandem_core::work::{EpisodeOrder, Exploration, RunTerms, WorldTerms};
-use tandem_core::{Episode, EpisodeOutcome, EvaluationSummary, Layout, Task, Wilson};
+use tandem_core::work::{EpisodeOrder, RunTerms};
+use tandem_core::{
+    Episode, EpisodeOutcome, EvaluationSummary, Exploration, Layout, Task, Wilson, WorldSettings,
+};
 use tandem_policy::Policy;
 use tandem_sim::WorldConfig;
 use tandem_telemetry::EpisodeMetadata;
@@ -166,14 +168,12 @@ pub(crate) fn eval(args: &EvalArgs) -> Result<(), Failed> {
 
 /// The terms on which an evaluation plays.
 fn terms(subject: &Subject) -> RunTerms {
-    let world = WorldTerms {
-        gripped_start_share: 0.0,
-        wide_start_share: 0.0,
-        substeps: WorldConfig::default().substeps,
-    };
-    let exploration =
-        Exploration { noise_std: 0.0, random_share: 0.0, random_hold_mean_steps: 1.0 };
-    RunTerms { layout: subject.layout(), account: None, exploration, world }
+    RunTerms {
+        layout: subject.layout(),
+        account: None,
+        exploration: Exploration::NONE,
+        world: WorldSettings::default(),
+    }
 }
 
 /// Writes the log of one episode of the goals that `seed` fixes.

@@ -3,6 +3,7 @@
 use std::process::ExitCode;
 
 use rustix::io::Errno;
+use tandem_core::text::error_chain;
 
 use crate::output;
 
@@ -83,25 +84,10 @@ impl Failed {
     /// Prints the one line and gives the exit code.
     pub(crate) fn report(&self) -> ExitCode {
         if !matches!(self.exit, Exit::Interrupted | Exit::Unread) {
-            let causes: Vec<String> = self.error.chain().map(ToString::to_string).collect();
-            output::message(format_args!("tandem: {}", one_line(&causes)));
+            output::message(format_args!("tandem: {}", error_chain(self.error.as_ref())));
         }
         self.exit.into()
     }
-}
-
-/// Joins an error's causes, leaving out those that the one before already says.
-fn one_line(causes: &[String]) -> String {
-    let mut line = String::new();
-    for cause in causes {
-        if !line.contains(cause.as_str()) {
-            if !line.is_empty() {
-                line.push_str(": ");
-            }
-            line.push_str(&cause.replace('\n', " "));
-        }
-    }
-    line
 }
 
 /// Says which exit code an error means.
@@ -153,12 +139,5 @@ mod tests {
         never.into_iter().for_each(|errno| check(errno, Exit::Usage));
         let later = [Errno::NOSPC, Errno::DQUOT, Errno::FBIG, Errno::IO, Errno::ROFS, Errno::MFILE];
         later.into_iter().for_each(|errno| check(errno, Exit::TryAgain));
-    }
-
-    #[test]
-    fn a_cause_that_repeats_the_line_is_left_out() {
-        let causes =
-            ["cannot read \"x\": gone".to_owned(), "gone".to_owned(), "two\nlines".to_owned()];
-        assert_eq!(one_line(&causes), "cannot read \"x\": gone: two lines");
     }
 }

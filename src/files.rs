@@ -7,6 +7,7 @@ use anyhow::anyhow;
 use indicatif::ProgressBar;
 use rayon::iter::{IntoParallelIterator as _, ParallelIterator as _};
 use serde_json::{Value, json};
+use tandem_core::text::error_chain;
 use tandem_policy::Policy;
 use tandem_telemetry::{LoggedTransition, read_episode};
 use tandem_worker::record::{RecordError, replay_log};
@@ -65,9 +66,7 @@ pub(crate) fn mcap(args: &McapArgs) -> Result<(), Failed> {
     }
     let recovered = tandem_telemetry::recover(file, &to);
     let counts = match recovered {
-        Err(E::WriteLog { .. } | E::Io { action: "create" | "rename", .. }) => {
-            recovered.or_cannot_write(String::new)
-        }
+        Err(E::WriteLog { .. }) => recovered.or_cannot_write(String::new),
         _ => recovered.or_exit(Exit::Data, String::new),
     }?;
     output::print(format_args!(
@@ -159,15 +158,10 @@ impl Replayed {
         let error = self.outcome.as_ref().err()?;
         let file = self.file.display();
         Some(match error {
-            RecordError::Log(_) => causes(error),
-            _ => format!("{file}: {}", causes(error)),
+            RecordError::Log(_) => error_chain(error),
+            _ => format!("{file}: {}", error_chain(error)),
         })
     }
-}
-
-/// An error and what it came from, in one line.
-fn causes(error: &RecordError) -> String {
-    anyhow::Chain::new(error).map(ToString::to_string).collect::<Vec<_>>().join(": ")
 }
 
 fn print_steps(file: &Path) -> Result<(), Failed> {

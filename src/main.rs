@@ -12,7 +12,6 @@ mod bench;
 mod bridge;
 mod cli;
 mod clock;
-mod descriptors;
 mod eval;
 mod exit;
 mod files;

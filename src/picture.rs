@@ -1,8 +1,9 @@
 //! `tandem picture`: the arms at work, as an SVG picture.
 
+use tandem_core::WorldSettings;
 use tandem_core::rng::{Stream, episode_rng};
 use tandem_report::View;
-use tandem_sim::{Env, Starts, WorldConfig};
+use tandem_sim::{Env, WorldConfig};
 
 use crate::cli::PictureArgs;
 use crate::eval::{Subject, composed};
@@ -19,7 +20,7 @@ pub(crate) fn picture(args: &PictureArgs) -> Result<(), Failed> {
     let episode = subject.play(1, args.seed)?.remove(0);
     let mut world =
         Env::new(subject.layout(), &WorldConfig::default()).or_exit(Exit::Bug, String::new)?;
-    world.reset(&mut episode_rng(args.seed, 0, Stream::Reset), Starts::default());
+    world.reset(&mut episode_rng(args.seed, 0, Stream::Reset), WorldSettings::default());
     for step_idx in 0..args.step as usize {
         world.step(episode.action(step_idx)).or_exit(Exit::Bug, String::new)?;
     }

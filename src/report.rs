@@ -4,7 +4,8 @@ use std::path::{Path, PathBuf};
 
 use serde_json::json;
 use tandem_report::{
-    Baseline, Comparison, HeldOut, Pictured, Trials, Written, records, report_html, run, trials,
+    Baseline, Comparison, PlottedTrials, ReportFiles, ReportInputs, TestEvaluation, Trials, export,
+    report_html, trials,
 };
 
 use crate::cli::ReportArgs;
@@ -13,53 +14,54 @@ use crate::exit::{Exit, Failed, OrExit as _};
 use crate::files::load_policy;
 use crate::output;
 
-/// Held-out goals on which composed teachers are measured: those of `tandem eval` and of a run's end.
-const HELD_OUT_SEED: u64 = 777;
-const HELD_OUT_EPISODES: u64 = 240;
+/// Test goals for the evaluation of composed teachers: those of `tandem eval` and of the end of a run.
+const TEST_SEED: u64 = 777;
+const TEST_EPISODES: u64 = 240;
 
 pub(crate) fn report(args: &ReportArgs) -> Result<(), Failed> {
-    let found = run::find(&args.paths).or_exit(Exit::Data, String::new)?;
-    let trials = Trials::of(found.trials);
-    warn(found.warnings.iter().chain(&trials.warnings));
-    let comparison = Comparison::of(found.runs, baselines(args)?);
+    let inputs = ReportInputs::load(&args.paths).or_exit(Exit::Data, String::new)?;
+    let trials = Trials::of(inputs.trials);
+    warn(inputs.warnings.iter().chain(&trials.warnings));
+    let comparison = Comparison::of(inputs.runs, baselines(args)?);
     let page = args.out.clone().unwrap_or_else(|| default_page(&args.paths));
-    let pictured = if args.all_trials { Pictured::All } else { Pictured::Failures };
-    let written =
-        report_html(&comparison, &trials, pictured, &page).or_cannot_write(String::new)?;
+    let plotted = if args.all_trials { PlottedTrials::All } else { PlottedTrials::Failed };
+    let files = report_html(&comparison, &trials, plotted, &page).or_cannot_write(String::new)?;
     if let Some(path) = &args.csv {
-        std::fs::write(path, records::csv(&comparison))
+        std::fs::write(path, export::csv(&comparison))
             .or_cannot_write(|| format!("cannot write {}", path.display()))?;
     }
-    print(args, &comparison, &trials, &written)
+    print(args, &comparison, &trials, &files)
 }
 
 fn print(
     args: &ReportArgs,
     comparison: &Comparison,
     trials: &Trials,
-    written: &Written,
+    files: &ReportFiles,
 ) -> Result<(), Failed> {
     if args.json {
-        let mut value = records::json(comparison);
+        let mut value = export::json(comparison);
         value["trials"] = trials::json(trials);
-        value["report"] = json!(written.page);
-        value["figures"] = json!(written.figures);
+        value["report"] = json!(files.page);
+        value["figures"] = json!(files.plots);
         return output::print(value);
     }
     if !trials.groups.is_empty() {
         output::print(trials.text())?;
-        output::print("median time: of all trials, failures too; [95 % interval of the share]")?;
+        output::print(
+            "median time: over all trials, including failures; [95 % interval of the share]",
+        )?;
     }
     if !comparison.sections.is_empty() {
         output::print(comparison.text())?;
         output::print(
-            "of several runs: mean (smallest–largest); [95 % interval of all their episodes]",
+            "several runs: mean (smallest–largest); [95 % interval over the episodes of all runs]",
         )?;
     }
-    let n_pictures = written.figures.len();
+    let n_plots = files.plots.len();
     output::print(format_args!(
-        "report        {}, {n_pictures} pictures beside it",
-        written.page.display()
+        "report        {}; plots in the same directory: {n_plots}",
+        files.page.display()
     ))?;
     if let Some(path) = &args.csv {
         output::print(format_args!("csv           {}", path.display()))?;
@@ -77,21 +79,21 @@ fn warn<'a>(warnings: impl Iterator<Item = &'a String>) {
 fn baselines(args: &ReportArgs) -> Result<Vec<Baseline>, Failed> {
     let mut baselines = Vec::new();
     for path in &args.evals {
-        let held_out = HeldOut::load(path).or_exit(Exit::Data, String::new)?;
-        baselines.push(Baseline { label: stem(path), held_out });
+        let test = TestEvaluation::load(path).or_exit(Exit::Data, String::new)?;
+        baselines.push(Baseline { label: stem(path), test });
     }
     for path in &args.composed_teachers {
         let subject = composed(load_policy(path)?, 2, path)?;
-        let measured = measure(&subject, HELD_OUT_EPISODES, HELD_OUT_SEED)?;
+        let measured = measure(&subject, TEST_EPISODES, TEST_SEED)?;
         let label = format!("composed {}", stem(path));
-        baselines.push(Baseline { label, held_out: held_out(&measured) });
+        baselines.push(Baseline { label, test: test_evaluation(&measured) });
     }
     Ok(baselines)
 }
 
-fn held_out(measured: &Measured) -> HeldOut {
+fn test_evaluation(measured: &Measured) -> TestEvaluation {
     let summary = &measured.summary;
-    HeldOut {
+    TestEvaluation {
         task: measured.layout.task,
         n_arms: measured.layout.n_arms,
         n_episodes: summary.n_episodes as u64,

@@ -4,17 +4,21 @@ use std::path::Path;
 
 use anyhow::{Context as _, anyhow, bail};
 use tandem_core::Task;
-use tandem_learner::atomic;
+use tandem_core::settings::OutOfRange;
 use tandem_rl::RunConfig;
-use tandem_rl::config::{ConfigError, INIT_TEACHER, Recipe};
+use tandem_rl::config::{ConfigError, INIT_TEACHER, Recipe, former_keys};
+use tandem_system::atomic_file;
 use tandem_teacher::{Strategy, UnknownStrategy};
 use toml::{Table, Value};
 
 use crate::exit::{Exit, Failed, OrExit as _};
 use crate::input;
+use former::{current_keys, is_removed};
+
+mod former;
 
 /// Longer texts are cut where a message shows them.
-const MAX_SHOWN_BYTES: usize = 80;
+const MAX_SHOWN_CHARS: usize = 80;
 
 /// Reads a run file and lays `settings` (`key=value`) over it; what both leave out takes the recipe's values.
 pub(crate) fn resolve(
@@ -48,7 +52,7 @@ pub(crate) fn to_text(config: &RunConfig) -> Result<String, Failed> {
 
 /// Writes the configuration with every setting, whole or not at all.
 pub(crate) fn save(config: &RunConfig, path: &Path) -> Result<(), Failed> {
-    let written = atomic::write(path, to_text(config)?.as_bytes());
+    let written = atomic_file::replace(path, to_text(config)?.as_bytes());
     written.or_cannot_write(|| format!("cannot write {}", path.display()))
 }
 
@@ -84,9 +88,11 @@ fn parse(text: &str) -> Result<Table, String> {
 }
 
 fn overlay(from_file: Table, settings: &[(String, Value)]) -> anyhow::Result<RunConfig> {
-    let mut changes = from_file;
+    let mut changes = current_keys(from_file)?;
     for (key, value) in settings {
-        set(&mut changes, key, value.clone())?;
+        if !is_removed(key, value)? {
+            set(&mut changes, former_keys::current(key), value.clone())?;
+        }
     }
     let defaults = Table::try_from(defaults_for(&changes)?)?;
     let mut resolved = defaults.clone();
@@ -110,7 +116,7 @@ fn overlay(from_file: Table, settings: &[(String, Value)]) -> anyhow::Result<Run
 /// Says what is out of its range without repeating a long text.
 fn in_one_line(error: ConfigError) -> anyhow::Error {
     match error {
-        ConfigError::OutOfRange { key, value, expected } => {
+        ConfigError::OutOfRange(OutOfRange { key, value, expected }) => {
             let value = shortened(&value.escape_debug().to_string());
             anyhow!("{key} is {value}: expected {expected}")
         }
@@ -243,29 +249,14 @@ fn names_below(table: &Table, path: &str) -> Vec<String> {
 
 /// The known setting that `name` may have been meant for: its last part stands elsewhere, or a few letters differ.
 fn nearest<'a>(name: &str, known: &'a [String]) -> Option<&'a String> {
-    if name.len() > MAX_SHOWN_BYTES {
+    if name.len() > MAX_SHOWN_CHARS {
         return None;
     }
     let last = |name: &str| name.rsplit('.').next().map(str::to_owned);
     let elsewhere = known.iter().find(|known| last(known) == last(name));
-    let distances = known.iter().map(|known| (edits(name, known), known));
+    let distances = known.iter().map(|known| (strsim::levenshtein(name, known), known));
     let close = distances.min().filter(|(n_edits, _)| *n_edits <= 2.max(name.len() / 5));
     elsewhere.or(close.map(|(_, known)| known))
-}
-
-/// Letters to insert, remove or exchange to make `from` into `to` (Levenshtein's distance).
-fn edits(from: &str, to: &str) -> usize {
-    let to: Vec<char> = to.chars().collect();
-    let mut row: Vec<usize> = (0..=to.len()).collect();
-    for (from_idx, from_char) in from.chars().enumerate() {
-        let mut diagonal = std::mem::replace(&mut row[0], from_idx + 1);
-        for (to_idx, to_char) in to.iter().enumerate() {
-            let exchanged = diagonal + usize::from(from_char != *to_char);
-            diagonal = row[to_idx + 1];
-            row[to_idx + 1] = exchanged.min(diagonal + 1).min(row[to_idx] + 1);
-        }
-    }
-    row[to.len()]
 }
 
 /// A value as a message shows it.
@@ -275,11 +266,7 @@ fn shown(value: &Value) -> String {
 
 /// The beginning of a text that is too long for a line.
 fn shortened(text: &str) -> String {
-    if text.len() <= MAX_SHOWN_BYTES {
-        return text.to_owned();
-    }
-    let beginning: String = text.chars().take(MAX_SHOWN_BYTES / 2).collect();
-    format!("{beginning}... ({} bytes)", text.len())
+    tandem_core::text::shortened(text, MAX_SHOWN_CHARS)
 }
 
 #[cfg(test)]

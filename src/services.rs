@@ -9,6 +9,7 @@ use anyhow::Context as _;
 use tandem_learner::checkpoint::CheckpointError;
 use tandem_learner::{AfterTheEnd, Beside, Error as LearnerError};
 use tandem_net::{Capacity, Incoming, Pacing};
+use tandem_system::fd_limit;
 use tandem_teacher::Advisor;
 use tandem_teacher::ledger::SqliteLedger;
 use tandem_teacher::policy::OneArmPolicy;
@@ -19,7 +20,7 @@ use tokio_util::sync::CancellationToken;
 
 use crate::cli::{Cli, Command, LearnerArgs, ListenArgs, RelayArgs, TeacherArgs, WorkerArgs};
 use crate::exit::{Exit, Failed, OrExit as _};
-use crate::{access, clock, descriptors, output, run_directory, run_file, signals};
+use crate::{access, clock, output, run_directory, run_file, signals};
 
 /// Version and commit of this program.
 pub(crate) const VERSION: &str = env!("TANDEM_VERSION");
@@ -157,7 +158,7 @@ pub(crate) fn runtime() -> anyhow::Result<Runtime> {
 }
 
 fn run(service: impl Future<Output = Result<(), Failed>>) -> Result<(), Failed> {
-    descriptors::raise();
+    fd_limit::raise();
     runtime().or_exit(Exit::TryAgain, String::new)?.block_on(service)
 }
 
@@ -169,7 +170,7 @@ pub(crate) fn shutdown(exit_with_stdin: bool) -> Result<CancellationToken, Faile
 /// Binds and prints the address, on one line of standard output. A service whose line cannot be written serves all the
 /// same. It keeps as many connections as the process may have open files.
 pub(crate) async fn listen(args: &ListenArgs) -> Result<Incoming, Failed> {
-    let capacity = Capacity::for_open_files(descriptors::raise());
+    let capacity = Capacity::for_open_files(fd_limit::raise());
     let bind = async {
         let listener = TcpListener::bind(args.listen).await?;
         let address: SocketAddr = listener.local_addr()?;
@@ -188,7 +189,7 @@ pub(crate) fn teacher_failed(error: tandem_teacher::Error) -> Failed {
     use tandem_teacher::Error as E;
     use tandem_teacher::ledger::OpenError;
     let exit = match &error {
-        E::OpenLedger(OpenError::NotAPlace(_) | OpenError::BadPath { .. }) => Exit::Usage,
+        E::OpenLedger(OpenError::InvalidLocation(_) | OpenError::BadPath { .. }) => Exit::Usage,
         E::OpenLedger(OpenError::InUse(_) | OpenError::Io { .. } | OpenError::Server { .. }) => {
             Exit::TryAgain
         }

@@ -1,4 +1,4 @@
-//! Compiles the schemas of our own MCAP channels without an installed `protoc`.
+//! Compiles the schemas of Tandem's own MCAP channels without an installed `protoc`.
 
 use std::error::Error;
 use std::path::PathBuf;

@@ -221,7 +221,7 @@ fn a_motion_that_cannot_be_is_refused_and_moves_nothing() {
     try_out(r#"{"speed": 1.0}"#, "either way_points or joint_motion");
     try_out(&at([-0.12, 0.0, 0.02], 0.5), "mm above the table, at least 4.0");
     try_out(&at([-0.12, 0.0, 0.1], 1.5), "arms[0].opening: expected a number in [0, 1], got 1.5");
-    try_out(&at([-0.12, 0.9, 0.1], 0.5), "way point 0 of arm 0");
+    try_out(&at([-0.12, 0.9, 0.1], 0.5), "waypoint 0 of arm 0");
     let one_arm = json!({"speed": 1.0, "way_points": [[{"tool_m": [0, 0, 0], "opening": 1}]]});
     try_out(&one_arm.to_string(), "way_points[0].arms: expected 2 arms, got 1 arms");
     let missing = Path::new("no-such-motion.json").to_string_lossy();

@@ -15,6 +15,7 @@ fn train(more: &[&str], out: &Path) -> Output {
         "rounds.warmup_env_steps=0",
         "evaluation.every_env_steps=1600",
         "evaluation.episodes=40",
+        "evaluation.test_episodes=8",
         "evaluation.recorded_episodes=0",
     ] {
         command.args(["--set", setting]);

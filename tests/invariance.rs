@@ -12,7 +12,7 @@ const STRATEGIES: [(&str, u64); 4] =
 const EAMC: (&str, u64) = ("eamc:0.1", 900);
 const N_WORKERS: [usize; 4] = [1, 2, 5, 16];
 /// Ten rounds of sixteen slots, so that sixteen workers have something to do; the policy is judged after each.
-const SMALL: [&str; 18] = [
+const SMALL: [&str; 20] = [
     "--max-env-steps",
     "8000",
     "--set",
@@ -27,6 +27,8 @@ const SMALL: [&str; 18] = [
     "ddpg.n_hidden=32",
     "--set",
     "evaluation.episodes=2",
+    "--set",
+    "evaluation.test_episodes=8",
     "--set",
     "evaluation.every_env_steps=800",
     "--set",
@@ -44,9 +46,7 @@ struct Left {
 
 #[test]
 fn one_worker_and_five_give_the_same_bits_when_advised_early() {
-    for advice in &STRATEGIES[..2] {
-        check(*advice, 1, &[1, 5]);
-    }
+    check(STRATEGIES[0], 1, &[1, 5]);
 }
 
 #[test]
@@ -57,9 +57,9 @@ fn one_worker_and_five_give_the_same_bits_when_advised_on_mistakes() {
 }
 
 #[test]
-fn sixteen_workers_give_the_bits_of_two_with_either_lag() {
+fn sixteen_workers_give_the_bits_of_one_and_of_five_with_either_lag() {
     check(EAMC, 0, &[2, 16]);
-    check(EAMC, 1, &[2, 16]);
+    check(EAMC, 1, &[1, 5, 16]);
 }
 
 #[test]

@@ -18,7 +18,7 @@ arms = 1
 advice.strategy = "none"
 rounds.slots = 2
 ddpg = { n_hidden = 16, n_hidden_layers = 1, batch_size = 32 }
-evaluation = { every_env_steps = 800, episodes = 4 }
+evaluation = { every_env_steps = 800, episodes = 4, test_episodes = 4 }
 stop.max_env_steps = 1600
 "#;
 

@@ -10,7 +10,7 @@ use serde_json::Value;
 use tempfile::TempDir;
 
 /// A small advised run of 16 rounds whose budget runs out on the way.
-const SMALL: [&str; 16] = [
+const SMALL: [&str; 18] = [
     "--max-env-steps",
     "12800",
     "--set",
@@ -19,6 +19,8 @@ const SMALL: [&str; 16] = [
     "ddpg.n_hidden=32",
     "--set",
     "evaluation.episodes=8",
+    "--set",
+    "evaluation.test_episodes=8",
     "--set",
     "evaluation.every_env_steps=4000",
     "--set",

@@ -7,8 +7,11 @@ use std::process::{Command, Output};
 use proptest::prelude::{ProptestConfig, any, prop_assert, proptest};
 use serde_json::{Value, json};
 use tandem_core::layout::EPISODE_STEPS;
-use tandem_core::work::{EpisodeOrder, Exploration, RunTerms, SlotOrder, WorldTerms};
-use tandem_core::{ArmAdvice, Contacts, EpisodeKind, Layout, StepAdvice, StepQuery, Task};
+use tandem_core::work::{EpisodeOrder, RunTerms, SlotOrder};
+use tandem_core::{
+    ArmAdvice, Contacts, EpisodeKind, Exploration, Layout, StepAdvice, StepQuery, Task,
+    WorldSettings,
+};
 use tandem_policy::{Actor, Policy};
 use tandem_sim::{Env, WorldConfig};
 use tandem_telemetry::{
@@ -70,18 +73,22 @@ impl EagerTeacher {
 }
 
 impl Advisor for EagerTeacher {
-    fn advise(&mut self, queries: &[StepQuery]) -> Result<Vec<StepAdvice>, AdvisorGone> {
+    fn advise(&mut self, queries: Vec<StepQuery>) -> Result<Vec<StepAdvice>, AdvisorGone> {
         Ok(queries.iter().map(|query| self.verdict(query)).collect())
     }
 }
 
 fn terms(layout: Layout, kind: Kind, substeps: u32) -> RunTerms {
-    let share = if kind == Kind::SpecialStart { 1.0 } else { 0.3 };
+    let prob = if kind == Kind::SpecialStart { 1.0 } else { 0.3 };
     RunTerms {
         layout,
         account: Some("replay".to_owned()),
-        exploration: Exploration { noise_std: 0.2, random_share: 0.3, random_hold_mean_steps: 4.0 },
-        world: WorldTerms { gripped_start_share: share, wide_start_share: share, substeps },
+        exploration: Exploration {
+            noise_std: 0.2,
+            random_action_prob: 0.3,
+            sticky_random_mean_steps: 4.0,
+        },
+        world: WorldSettings { grasped_start_prob: prob, substeps },
     }
 }
 

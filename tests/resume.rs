@@ -13,7 +13,7 @@ use tandem_policy::Policy;
 use tempfile::TempDir;
 
 /// A small advised run of 12 rounds.
-const SMALL: [&str; 14] = [
+const SMALL: [&str; 16] = [
     "--max-env-steps",
     "9600",
     "--set",
@@ -22,6 +22,8 @@ const SMALL: [&str; 14] = [
     "ddpg.n_hidden=32",
     "--set",
     "evaluation.episodes=8",
+    "--set",
+    "evaluation.test_episodes=8",
     "--set",
     "evaluation.every_env_steps=4000",
     "--set",

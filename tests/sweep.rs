@@ -8,11 +8,12 @@ use std::time::{Duration, SystemTime};
 use serde_json::Value;
 
 /// Settings of small runs of 10 rounds.
-const SMALL: [(&str, &str); 8] = [
+const SMALL: [(&str, &str); 9] = [
     ("stop.max_env_steps", "8000"),
     ("ddpg.n_hidden", "32"),
     ("rounds.updates_per_env_step", "0.1"),
     ("evaluation.episodes", "8"),
+    ("evaluation.test_episodes", "8"),
     ("evaluation.every_env_steps", "1600"),
     ("evaluation.recorded_episodes", "0"),
     ("checkpoint.every_rounds", "2"),
@@ -193,7 +194,7 @@ fn report_has_every_run(out: &Path, directory: &Path) {
         let n_evaluations: u32 = cells[6].parse().expect("a count");
         let was_disturbed = [RUNS[0], RUNS[2]].contains(&cells[4]);
         assert!(if was_disturbed { n_evaluations > 0 } else { n_evaluations == 5 }, "{line}");
-        assert!(!cells[24].is_empty(), "held-out success in {line}");
+        assert!(!cells[24].is_empty(), "test success in {line}");
     }
     let page = fs::read_to_string(out.join("report.html")).expect("written");
     assert!(page.contains("<svg") && page.contains("push, 2 arms"));

@@ -4,19 +4,20 @@ use std::collections::BTreeSet;
 use std::fs;
 use std::path::{Path, PathBuf};
 
-const ALLOWED: [(&str, &[&str]); 14] = [
+const ALLOWED: [(&str, &[&str]); 15] = [
     ("core", &[]),
+    ("system", &[]),
     ("kinematics", &["core"]),
     ("sim", &["core"]),
-    ("policy", &["core"]),
+    ("policy", &["core", "system"]),
     ("proto", &["core"]),
-    ("telemetry", &["core"]),
-    ("net", &["proto"]),
+    ("telemetry", &["core", "system"]),
+    ("net", &["core", "proto"]),
     ("rl", &["core", "policy"]),
-    ("learner", &["core", "policy", "rl", "proto", "telemetry", "net"]),
+    ("learner", &["core", "system", "policy", "rl", "proto", "telemetry", "net"]),
     ("teacher", &["core", "policy", "proto", "telemetry", "net"]),
     ("worker", &["core", "sim", "policy", "proto", "telemetry", "net"]),
-    ("report", &["core", "telemetry"]),
+    ("report", &["core", "system", "telemetry"]),
     ("bridge", &["core", "kinematics", "proto", "net"]),
     ("trials", &["core", "kinematics", "sim", "policy", "telemetry", "bridge"]),
 ];

@@ -16,7 +16,7 @@
 //! **The drives always stop.** A dropped executor commands a stop. The drives of a killed process brake because they
 //! receive no commands (see [`driver`](crate::driver)).
 
-use tandem_kinematics::{Cell, Excess, Joints, Motion};
+use tandem_kinematics::{Excess, Joints, Motion, WorkCell};
 
 use crate::driver::{Driver, DriverError, Order, PairState};
 use crate::executor::commands::CommandHistory;
@@ -50,7 +50,7 @@ mod stop;
 /// Moves a pair of arms. The executor is the only user of their driver.
 #[derive(Debug)]
 pub struct Executor<D: Driver> {
-    cell: Cell,
+    cell: WorkCell,
     settings: Settings,
     checker: Checker,
     driver: D,
@@ -72,7 +72,7 @@ impl<D: Driver> Executor<D> {
     ///
     /// # Errors
     /// Returns the first setting that is out of its range.
-    pub fn new(cell: Cell, driver: D, settings: Settings) -> Result<Self, BadSetting> {
+    pub fn new(cell: WorkCell, driver: D, settings: Settings) -> Result<Self, BadSetting> {
         let period_s = driver.period_s();
         let settings = settings.checked(&cell, period_s)?;
         Ok(Self {

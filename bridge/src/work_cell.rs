@@ -11,13 +11,13 @@
 //!
 //! Motions may therefore tilt the gripper by up to 45 degrees.
 
-use tandem_kinematics::{Cell, CheckSettings, TaskFrame};
+use tandem_kinematics::{CheckSettings, TaskFrame, WorkCell};
 
 /// Returns the work cell of two Micos with four joints that face each other, with a task frame of scale 1.
 #[must_use]
-pub fn mico_cell() -> Cell {
-    let half = Cell::mico_pair();
-    Cell { task_frame: TaskFrame { scale: 1.0, ..TaskFrame::MICO_4 }, ..half }
+pub fn mico_cell() -> WorkCell {
+    let half = WorkCell::mico_pair();
+    WorkCell { task_frame: TaskFrame { scale: 1.0, ..TaskFrame::MICO_4 }, ..half }
 }
 
 /// Returns the limits of the check before a motion: a tilt of at most 45 degrees, 4 mm above the table, 20 mm between arms,

@@ -1,4 +1,4 @@
-//! What is asked of a teacher and what it answers.
+//! Queries to a teacher and its advice.
 
 /// One step on which a student asks for advice.
 #[derive(Debug, Clone, PartialEq)]
@@ -11,14 +11,14 @@ pub struct StepQuery {
     pub observation: Vec<f32>,
     /// Shape `[n_goal]`.
     pub goal: Vec<f32>,
-    /// What the student is about to execute, exploration included, shape `[n_action]`.
+    /// The action that the student is about to execute, exploration included, shape `[n_action]`.
     pub proposed_action: Vec<f32>,
 }
 
 /// The teacher's answer for one arm.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ArmAdvice {
-    /// What the teacher would do, shape `[action_per_arm]`.
+    /// The teacher's action, shape `[action_per_arm]`.
     pub teacher_action: Vec<f32>,
     /// The teacher's value of its own action.
     pub q_teacher: f32,
@@ -26,25 +26,25 @@ pub struct ArmAdvice {
     pub q_student: f32,
     /// `q_teacher − q_student` (equation 10).
     pub importance: f32,
-    /// Euclidean distance of the two actions.
+    /// The Euclidean distance of the two actions.
     pub distance: f32,
-    /// Whether the teacher's action takes the place of the student's.
+    /// Whether the teacher's action replaces the student's.
     pub overridden: bool,
 }
 
 /// The teacher's answer for one step.
 #[derive(Debug, Clone, PartialEq)]
 pub struct StepAdvice {
-    /// What to execute, shape `[n_action]`.
+    /// The action to execute, shape `[n_action]`.
     pub action: Vec<f32>,
     /// Whether the step cost a unit of the budget.
     pub charged: bool,
-    /// Arm by arm, in arm order.
+    /// The advice for each arm, in arm order.
     pub arms: Vec<ArmAdvice>,
 }
 
 impl StepAdvice {
-    /// Bit `a` set when arm `a` was overridden.
+    /// Returns a bit mask with bit `a` set if arm `a` was overridden.
     #[must_use]
     pub fn overridden_arms(&self) -> u8 {
         self.arms.iter().enumerate().map(|(arm, advice)| u8::from(advice.overridden) << arm).sum()

@@ -1,28 +1,28 @@
-//! The largest numbers that an observation or a goal can hold.
+//! Bounds on the numbers of observations and goals.
 //!
-//! A number beyond its bound comes from a bug or a lie and not from a world. One such number would enter the running
-//! statistics that normalise every later input, so episodes that hold one are refused. The bounds leave room for
-//! everything that can happen in an episode of 2 s, such as an object that falls off the table.
+//! A number beyond its bound cannot come from a correct simulation. It would distort the running statistics that
+//! normalise every later input, so the learner refuses episodes that contain one. The bounds leave room for everything
+//! that can happen in an episode of 2 s, such as an object that falls off the table.
 
 use crate::layout::{Layout, OBSERVATION_PER_ARM, Task};
 
-/// The largest magnitude of any number of any observation or goal: bounds what a student of unknown origin sends.
-pub const LARGEST_MAGNITUDE: f32 = 1000.0;
+/// Bound on the magnitude of any number in any observation or goal. It applies to students of unknown origin.
+pub const MAX_MAGNITUDE: f32 = 1000.0;
 
-/// Positions of an end effector, and goals, metres: an arm reaches 0.7 m.
+/// Positions of end effectors, and goals, metres. An arm reaches 0.7 m.
 const REACH_M: f32 = 2.0;
-/// Positions of an object, metres: a free fall of a whole episode covers 20 m.
+/// Positions of objects, metres. A free fall during a whole episode covers 20 m.
 const FALL_M: f32 = 25.0;
 /// Finger openings and their rates, metres and metres per control step.
 const OPENING_M: f32 = 1.0;
 /// Components of a unit quaternion.
 const UNIT: f32 = 1.01;
-/// Velocities, metres per control step: 50 m/s.
+/// Velocities, metres per control step; equals 50 m/s.
 const SPEED: f32 = 2.0;
-/// Angular velocities, radians per control step: 120 turns a second.
+/// Angular velocities, radians per control step; equals 120 revolutions per second.
 const SPIN: f32 = 30.0;
 
-/// One arm's bounds in the order of its observation, for the tasks with an object on a table.
+/// The bounds of one arm's observation, in its order, for the tasks with an object on a table.
 const TABLE_TOP: [f32; OBSERVATION_PER_ARM] = {
     let parts = [
         (0, 3, REACH_M),
@@ -49,17 +49,17 @@ const TABLE_TOP: [f32; OBSERVATION_PER_ARM] = {
 };
 
 impl Layout {
-    /// The largest magnitude that number `idx` of an observation can have.
+    /// Returns the largest magnitude that number `idx` of an observation can have.
     #[must_use]
-    pub const fn largest_observation(self, idx: usize) -> f32 {
+    pub const fn observation_bound(self, idx: usize) -> f32 {
         match self.task {
             Task::Push | Task::PickAndPlace => TABLE_TOP[idx % OBSERVATION_PER_ARM],
         }
     }
 
-    /// The largest magnitude that a number of a desired goal can have, metres.
+    /// Returns the largest magnitude that a number of a desired goal can have, metres.
     #[must_use]
-    pub const fn largest_goal(self) -> f32 {
+    pub const fn goal_bound(self) -> f32 {
         match self.task {
             Task::Push | Task::PickAndPlace => REACH_M,
         }
@@ -72,16 +72,16 @@ mod tests {
     use crate::layout::{HAND_POSITION, OBJECT_POSITION};
 
     #[test]
-    fn every_number_has_a_bound_of_its_kind_for_every_arm() {
+    fn every_number_of_every_arm_has_the_bound_of_its_quantity() {
         for task in Task::ALL {
             let layout = Layout::new(task, 3);
             for idx in 0..layout.n_observation() {
-                let bound = layout.largest_observation(idx);
-                assert!(bound > 0.0 && bound < LARGEST_MAGNITUDE, "number {idx}: {bound}");
-                assert_eq!(bound, layout.largest_observation(idx % OBSERVATION_PER_ARM));
+                let bound = layout.observation_bound(idx);
+                assert!(bound > 0.0 && bound < MAX_MAGNITUDE, "number {idx}: {bound}");
+                assert_eq!(bound, layout.observation_bound(idx % OBSERVATION_PER_ARM));
             }
-            assert_eq!(layout.largest_observation(HAND_POSITION.start), REACH_M);
-            assert_eq!(layout.largest_observation(OBJECT_POSITION.end - 1), FALL_M);
+            assert_eq!(layout.observation_bound(HAND_POSITION.start), REACH_M);
+            assert_eq!(layout.observation_bound(OBJECT_POSITION.end - 1), FALL_M);
         }
     }
 }

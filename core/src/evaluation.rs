@@ -1,29 +1,30 @@
-//! What an evaluation counts, and how sure one can be of it.
+//! Outcomes of evaluation episodes, success rates and their confidence intervals.
 
 use crate::episode::{Contacts, Episode};
 use crate::layout::EPISODE_STEPS;
+use crate::reward::is_success;
 
-/// What is kept of one evaluation episode.
+/// The outcome of one evaluation episode.
 #[derive(Debug, Clone, PartialEq)]
 pub struct EpisodeOutcome {
-    /// Every object within the tolerance of its goal after the last step.
+    /// Every object was within the tolerance of its goal after the last step.
     pub success: bool,
-    /// The joint norm within the tolerance after the last step.
+    /// The norm over all arms' distances together was within the tolerance after the last step.
     pub success_joint: bool,
-    /// Each arm's own success.
+    /// The success of each arm, in arm order.
     pub success_per_arm: Vec<bool>,
-    /// At least one arm–arm or arm–table contact.
+    /// There was at least one arm–arm or arm–table contact.
     pub collided: bool,
-    /// At least one such contact before every object had arrived for good.
+    /// There was at least one such contact before all objects were at their goals to stay.
     pub collided_before_success: bool,
-    /// At least one object displaced.
+    /// At least one object was displaced by more than [`MOVED_M`](crate::episode::MOVED_M).
     pub moved: bool,
-    /// Sum of the joint rewards.
+    /// Sum of the joint rewards, undiscounted.
     pub episode_return: f32,
 }
 
 impl EpisodeOutcome {
-    /// Reads an episode's outcome from its transitions.
+    /// Derives the outcome of `episode` from its transitions.
     #[must_use]
     pub fn of(episode: &Episode) -> Self {
         let collided = episode.contacts.iter().any(|contacts| contacts.any());
@@ -36,28 +37,23 @@ impl EpisodeOutcome {
             collided,
             collided_before_success: first_contact.is_some_and(|step_idx| step_idx < settled_after),
             moved: episode.moved(),
-            episode_return: (0..EPISODE_STEPS)
-                .map(|step_idx| episode.joint_reward_after(step_idx))
-                .sum(),
+            episode_return: (0..EPISODE_STEPS).map(|step_idx| episode.joint_reward(step_idx)).sum(),
         }
     }
 }
 
-/// Steps after which every object stays within the tolerance of its goal; `EPISODE_STEPS` when that never happens.
+/// Returns the number of steps after which every object stays within the tolerance of its goal, `EPISODE_STEPS` if that
+/// never happens.
 fn steps_until_settled(episode: &Episode) -> usize {
-    let at_goal = |step_idx: usize| {
-        episode.layout.arms().all(|arm| {
-            let goal = &episode.goal[episode.layout.goal_of(arm)];
-            crate::reward::sparse_reward(episode.achieved(step_idx, arm), goal) > -0.5
-        })
-    };
+    let at_goal =
+        |step_idx| is_success(episode.layout, episode.observation(step_idx), &episode.goal);
     (0..EPISODE_STEPS)
         .rev()
         .find(|step_idx| !at_goal(step_idx + 1))
         .map_or(0, |last_bad| last_bad + 1)
 }
 
-/// Wilson's 95 % interval of a share.
+/// The Wilson score interval of a proportion, at a confidence of 95 %.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Wilson {
     /// Lower end, in [0, 1].
@@ -67,7 +63,7 @@ pub struct Wilson {
 }
 
 impl Wilson {
-    /// The interval for `n_hits` of `n_trials`; without trials it is all of [0, 1].
+    /// Computes the interval for `n_hits` successes in `n_trials` trials; without trials it is [0, 1].
     #[must_use]
     pub fn of(n_hits: usize, n_trials: usize) -> Self {
         const Z: f64 = 1.959_963_984_540_054;
@@ -86,42 +82,42 @@ impl Wilson {
     }
 }
 
-/// The figures of an evaluation: shares of its episodes.
+/// The result of an evaluation. Rates are fractions of its episodes, in [0, 1].
 #[derive(Debug, Clone, PartialEq)]
 pub struct EvaluationSummary {
-    /// How many episodes were played.
+    /// Number of episodes.
     pub n_episodes: usize,
-    /// Share with every object at its goal.
+    /// Fraction with every object at its goal.
     pub success: f64,
-    /// Its 95 % interval.
+    /// The 95 % interval of `success`.
     pub interval: Wilson,
-    /// Share with the joint norm within the tolerance.
+    /// Fraction with the joint norm within the tolerance.
     pub success_joint: f64,
-    /// Each arm's share.
+    /// Success rate of each arm, in arm order.
     pub success_per_arm: Vec<f64>,
-    /// Share with at least one arm–arm or arm–table contact.
+    /// Fraction with at least one arm–arm or arm–table contact.
     pub collision_rate: f64,
-    /// Share with such a contact before every object had arrived for good.
+    /// Fraction with such a contact before all objects were at their goals to stay.
     pub collision_rate_before_success: f64,
-    /// Share in which an object was displaced.
+    /// Fraction in which at least one object was displaced.
     pub moved: f64,
     /// Mean sum of joint rewards.
     pub mean_return: f64,
 }
 
 impl EvaluationSummary {
-    /// The 95 % interval of one of this evaluation's shares.
+    /// Returns the 95 % interval of `share`, which is one of this evaluation's rates.
     #[must_use]
     #[expect(
         clippy::cast_possible_truncation,
         clippy::cast_sign_loss,
-        reason = "a share of few episodes"
+        reason = "a fraction of few episodes"
     )]
     pub fn interval_of(&self, share: f64) -> Wilson {
         Wilson::of((share * self.n_episodes as f64).round() as usize, self.n_episodes)
     }
 
-    /// Sums up `outcomes` of one layout; all shares are 0 when there are none.
+    /// Summarises `outcomes`, which belong to one layout. Without outcomes all rates are 0.
     #[must_use]
     pub fn of(outcomes: &[EpisodeOutcome]) -> Self {
         let n = outcomes.len().max(1) as f64;
@@ -155,7 +151,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn wilsons_interval_has_the_textbook_values() {
+    fn the_wilson_interval_has_the_textbook_values() {
         let check = |hits, trials, low: f64, high: f64| {
             let interval = Wilson::of(hits, trials);
             assert!(

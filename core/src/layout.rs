@@ -1,39 +1,40 @@
-//! Which numbers of an observation, a goal and an action belong to which arm.
+//! The layout of observations, goals and actions: the length of each vector and the range that belongs to each arm.
 
 use std::fmt;
 use std::ops::Range;
 use std::str::FromStr;
 
-/// Numbers that describe one arm and its object (section 4.1 of the paper: R28).
+/// Length of one arm's part of an observation (section 4.1 of the paper).
 pub const OBSERVATION_PER_ARM: usize = 28;
-/// Numbers of one arm's goal: where its object shall be, metres, in the arm's own frame.
+/// Length of one arm's part of a goal: the desired position of its object, arm frame, metres.
 pub const GOAL_PER_ARM: usize = 3;
-/// Where the end effector's position stands within its arm's part of the observation.
+/// Range of the end effector's position within its arm's part of an observation.
 pub const HAND_POSITION: Range<usize> = 0..3;
-/// Where an object's position stands within its arm's part of the observation.
+/// Range of the object's position within its arm's part of an observation.
 pub const OBJECT_POSITION: Range<usize> = 3..6;
-/// Distance between the centres of two arms' workspaces, the origins of their own frames, metres. The second arm is
-/// the first turned by half a turn, so each arm's x points at the other.
-pub const WORKSPACES_APART_M: f32 = 0.24;
-/// Control steps of an episode.
+/// Distance between the workspace centres of two arms, which are the origins of their frames, metres.
+///
+/// The second arm is the first one rotated by 180° about z, so each arm's x axis points at the other arm.
+pub const WORKSPACE_DISTANCE_M: f32 = 0.24;
+/// Control steps per episode.
 pub const EPISODE_STEPS: usize = 50;
-/// Distance between object and goal, metres, within which the goal counts as achieved.
+/// Distance between object and goal up to which the goal counts as achieved, metres.
 pub const GOAL_TOLERANCE_M: f32 = 0.05;
 
-/// What the arms have to do (section 4.1 of the paper).
+/// A manipulation task (section 4.1 of the paper).
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Task {
-    /// Push an object over the table to its goal, gripper locked shut.
+    /// Push an object across the table to its goal with a closed gripper.
     Push,
-    /// Grasp an object and bring it to its goal, on the table or in the air.
+    /// Grasp an object and move it to its goal, on the table or in the air.
     PickAndPlace,
 }
 
 impl Task {
-    /// Every task, in the order of the paper.
+    /// All tasks, in the order of the paper.
     pub const ALL: [Self; 2] = [Self::Push, Self::PickAndPlace];
 
-    /// The name used on the command line and in files.
+    /// Returns the name used on the command line and in files.
     #[must_use]
     pub const fn name(self) -> &'static str {
         match self {
@@ -42,7 +43,8 @@ impl Task {
         }
     }
 
-    /// Numbers of one arm's action: end-effector displacement (3) and, when the gripper is used, its input (1).
+    /// Returns the length of one arm's part of an action: a displacement of the end effector (3) and, in pick and
+    /// place, the gripper's input (1).
     #[must_use]
     pub const fn action_per_arm(self) -> usize {
         match self {
@@ -58,7 +60,7 @@ impl fmt::Display for Task {
     }
 }
 
-/// A name that is no task's.
+/// An unknown name of a task.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("unknown task {0:?}: expected push or pick-and-place")]
 pub struct UnknownTask(pub String);
@@ -74,77 +76,77 @@ impl FromStr for Task {
     }
 }
 
-/// One of a layout's arms, counted from 0.
+/// The index of an arm within a layout, from 0.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct ArmIndex(pub usize);
 
-/// A task and the number of arms that do it: fixes the length of every vector.
+/// A task and the number of arms, which together determine the length of every vector.
 ///
-/// Vectors of several arms are the arms' own vectors one after another, in arm order (the paper's `d_1 || d_2`).
-/// Each arm's numbers are in its own frame, so a part can be handed to a policy for one arm as it is.
+/// The vector of several arms is the concatenation of the vectors of each arm, in arm order (`d_1 || d_2` in the
+/// paper). Each arm's numbers are in the arm's own frame, so a one-arm policy can use an arm's part unchanged.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct Layout {
-    /// What the arms do.
+    /// The task.
     pub task: Task,
-    /// How many arms do it, 1 or more.
+    /// Number of arms, at least 1.
     pub n_arms: usize,
 }
 
 impl Layout {
-    /// A layout of `n_arms` arms doing `task`.
+    /// Creates the layout of `n_arms` arms that perform `task`.
     #[must_use]
     pub const fn new(task: Task, n_arms: usize) -> Self {
         Self { task, n_arms }
     }
 
-    /// The layout of one of the arms alone: the teacher's.
+    /// Returns the layout of one arm with the same task, which is the layout of the teacher.
     #[must_use]
     pub const fn single_arm(self) -> Self {
         Self { task: self.task, n_arms: 1 }
     }
 
-    /// Length of an observation.
+    /// Returns the length of an observation.
     #[must_use]
     pub const fn n_observation(self) -> usize {
         OBSERVATION_PER_ARM * self.n_arms
     }
 
-    /// Length of a goal, achieved or desired.
+    /// Returns the length of a goal, achieved or desired.
     #[must_use]
     pub const fn n_goal(self) -> usize {
         GOAL_PER_ARM * self.n_arms
     }
 
-    /// Length of an action.
+    /// Returns the length of an action.
     #[must_use]
     pub const fn n_action(self) -> usize {
         self.task.action_per_arm() * self.n_arms
     }
 
-    /// The arms, in order.
+    /// Returns the indices of the arms, in order.
     pub fn arms(self) -> impl ExactSizeIterator<Item = ArmIndex> {
         (0..self.n_arms).map(ArmIndex)
     }
 
-    /// Where `arm`'s numbers stand in an observation: the paper's state map `f_i^s` (equation 7).
+    /// Returns the range of `arm`'s part of an observation: the paper's state map `f_i^s` (equation 7).
     #[must_use]
     pub const fn observation_of(self, arm: ArmIndex) -> Range<usize> {
         arm.0 * OBSERVATION_PER_ARM..(arm.0 + 1) * OBSERVATION_PER_ARM
     }
 
-    /// Where `arm`'s numbers stand in a goal.
+    /// Returns the range of `arm`'s part of a goal.
     #[must_use]
     pub const fn goal_of(self, arm: ArmIndex) -> Range<usize> {
         arm.0 * GOAL_PER_ARM..(arm.0 + 1) * GOAL_PER_ARM
     }
 
-    /// Where `arm`'s numbers stand in an action: the paper's maps `f^a` and `h_i^a` (equations 8 and 9).
+    /// Returns the range of `arm`'s part of an action: the paper's maps `f^a` and `h_i^a` (equations 8 and 9).
     #[must_use]
     pub const fn action_of(self, arm: ArmIndex) -> Range<usize> {
         arm.0 * self.task.action_per_arm()..(arm.0 + 1) * self.task.action_per_arm()
     }
 
-    /// Where `arm`'s object position, its achieved goal, stands in an observation.
+    /// Returns the range of the position of `arm`'s object, its achieved goal, in an observation.
     #[must_use]
     pub const fn achieved_goal_of(self, arm: ArmIndex) -> Range<usize> {
         arm.0 * OBSERVATION_PER_ARM + OBJECT_POSITION.start
@@ -169,7 +171,7 @@ mod tests {
     }
 
     #[test]
-    fn the_arms_parts_cover_every_vector_once() {
+    fn the_parts_of_the_arms_cover_every_vector_once() {
         let layout = Layout::new(Task::PickAndPlace, 3);
         let covered = |part: &dyn Fn(ArmIndex) -> Range<usize>| {
             layout.arms().flat_map(part).collect::<Vec<_>>()
@@ -181,7 +183,7 @@ mod tests {
     }
 
     #[test]
-    fn a_task_is_read_back_from_its_name() {
+    fn a_task_parses_from_its_name() {
         for task in Task::ALL {
             assert_eq!(task.name().parse(), Ok(task));
         }

@@ -1,7 +1,95 @@
-//! The words that the other crates share: tasks and layouts, episodes, the sparse reward, random number streams.
+//! The types that Tandem's other crates share: tasks and the layout of vectors, the sparse reward, episodes and their
+//! outcomes, and random number streams.
 //!
-//! Nothing here does input or output, reads a clock or knows a wire format, and a thing lives here only
-//! when two crates need it.
+//! A type lives here only if two crates need it. The crate performs no input or output, reads no clock and knows no
+//! wire format. The environments are in `tandem_sim`, the networks in `tandem_policy`, the learning algorithm in
+//! `tandem_rl`.
+//!
+//! # Layouts
+//!
+//! A [`Layout`] is a [`Task`] and a number of arms. It determines the length of every vector: with two arms, an
+//! observation has 56 numbers, a goal 6 and an action 6 (push) or 8 (pick and place).
+//!
+//! ```
+//! use tandem_core::{ArmIndex, Layout, Task};
+//!
+//! let layout = Layout::new(Task::PickAndPlace, 2);
+//! assert_eq!(layout.n_observation(), 56);
+//! assert_eq!(layout.n_goal(), 6);
+//! assert_eq!(layout.n_action(), 8);
+//! ```
+//!
+//! The vector of several arms is the concatenation of the vectors of each arm. Positions are metres, angles radians and
+//! actions numbers in [−1, 1]; each arm's part is in the arm's own frame (origin on the table in the centre of its
+//! workspace, x away from the base, z up). A policy for one arm can therefore use a part unchanged, which is how a
+//! one-arm teacher advises a two-arm student:
+//!
+//! ```
+//! # use tandem_core::{ArmIndex, Layout, Task};
+//! # let layout = Layout::new(Task::PickAndPlace, 2);
+//! let observation = vec![0.0_f32; layout.n_observation()];
+//! let second_arm = &observation[layout.observation_of(ArmIndex(1))];
+//! assert_eq!(second_arm.len(), layout.single_arm().n_observation());
+//! ```
+//!
+//! # Rewards
+//!
+//! The [`reward`] is sparse: 0 if the objects are within 5 cm of their goals and −1 otherwise. One function serves
+//! success rates and hindsight relabelling alike.
+//!
+//! ```
+//! use tandem_core::reward::{REWARD_ACHIEVED, REWARD_PENDING, sparse_reward};
+//!
+//! let goal = [0.10, 0.05, 0.02];
+//! assert_eq!(sparse_reward(&[0.11, 0.05, 0.02], &goal), REWARD_ACHIEVED);
+//! assert_eq!(sparse_reward(&[0.20, 0.05, 0.02], &goal), REWARD_PENDING);
+//! ```
+//!
+//! # Random numbers
+//!
+//! [`episode_rng`] is the only way to create a generator. It takes the run's seed, the episode's number and the
+//! [`Stream`], so an episode repeats on any worker and any thread.
+//!
+//! ```
+//! use tandem_core::{Stream, episode_rng, rng};
+//!
+//! let mut first = episode_rng(7, 3, Stream::Exploration);
+//! let mut second = episode_rng(7, 3, Stream::Exploration);
+//! assert_eq!(rng::uniform(&mut first, -1.0, 1.0), rng::uniform(&mut second, -1.0, 1.0));
+//! ```
+//!
+//! # Episodes and evaluations
+//!
+//! Workers return whole [`Episode`]s. An [`EpisodeOutcome`] is derived from an episode's transitions, and an
+//! [`EvaluationSummary`] aggregates outcomes into rates with [`Wilson`] intervals.
+//!
+//! ```
+//! use tandem_core::layout::EPISODE_STEPS;
+//! use tandem_core::{Contacts, Episode, EpisodeKind, EpisodeOutcome, EvaluationSummary, Layout, Task};
+//!
+//! let layout = Layout::new(Task::Push, 1);
+//! let episode = Episode {
+//!     number: 0,
+//!     kind: EpisodeKind::Evaluation,
+//!     parameter_version: 0,
+//!     layout,
+//!     observations: vec![0.0; (EPISODE_STEPS + 1) * layout.n_observation()],
+//!     goal: vec![0.0, 0.0, 0.02],
+//!     actions: vec![0.0; EPISODE_STEPS * layout.n_action()],
+//!     advised_arms: vec![0; EPISODE_STEPS],
+//!     contacts: vec![Contacts::NONE; EPISODE_STEPS],
+//!     advice_charged: 0,
+//! };
+//! let summary = EvaluationSummary::of(&[EpisodeOutcome::of(&episode)]);
+//! assert_eq!(summary.success, 1.0);
+//! assert!(summary.interval.low < 0.3, "one episode proves little");
+//! ```
+//!
+//! # Modules in reading order
+//!
+//! [`layout`], [`reward`], [`rng`], [`episode`], [`evaluation`]; then [`settings`] and [`work`] (what a learner assigns
+//! to workers), [`advice`] (queries to a teacher and its answers), [`bounds`] (plausible ranges of observations),
+//! [`scene`] (snapshots for pictures and logs) and [`text`] (texts in messages).
 #![warn(missing_docs)]
 
 pub mod advice;
@@ -12,6 +100,8 @@ pub mod layout;
 pub mod reward;
 pub mod rng;
 pub mod scene;
+pub mod settings;
+pub mod text;
 pub mod work;
 
 pub use advice::{ArmAdvice, StepAdvice, StepQuery};
@@ -19,3 +109,4 @@ pub use episode::{Contacts, Episode, EpisodeKind};
 pub use evaluation::{EpisodeOutcome, EvaluationSummary, Wilson};
 pub use layout::{ArmIndex, Layout, Task};
 pub use rng::{Stream, episode_rng};
+pub use settings::{Exploration, WorldSettings};

@@ -1,36 +1,56 @@
-//! The sparse reward: −1 until the goal is achieved, 0 when it is.
+//! The sparse reward: 0 if the goal is achieved, −1 otherwise.
 
 use crate::layout::{GOAL_TOLERANCE_M, Layout};
 
-/// The reward of a step on which the goal is not achieved.
+/// The reward of a step after which the goal is not achieved.
 pub const REWARD_PENDING: f32 = -1.0;
-/// The reward of a step on which the goal is achieved.
+/// The reward of a step after which the goal is achieved.
 pub const REWARD_ACHIEVED: f32 = 0.0;
 
-/// Euclidean distance of two points of any dimension, in their unit.
+/// Returns the Euclidean distance between two points of any dimension, in the points' unit.
 ///
 /// # Panics
-/// When the points differ in dimension.
+/// If the points differ in dimension.
 #[must_use]
 pub fn distance(a: &[f32], b: &[f32]) -> f32 {
     assert_eq!(a.len(), b.len(), "points of different dimension");
     a.iter().zip(b).map(|(a, b)| (a - b) * (a - b)).sum::<f32>().sqrt()
 }
 
-/// `−(‖achieved − desired‖ > ε)`, section 4.1 of the paper. Given both arms' goals it is the joint reward, given
-/// one arm's it is that arm's own.
+/// Returns the sparse reward `−(‖achieved − desired‖ > ε)` of section 4.1 of the paper.
+///
+/// `ε` is [`GOAL_TOLERANCE_M`]. Given the goals of all arms, shape `[n_goal]`, the result is the joint reward; given
+/// those of one arm, it is the arm's own reward.
+///
+/// # Panics
+/// If the two goals differ in length.
 #[must_use]
 pub fn sparse_reward(achieved: &[f32], desired: &[f32]) -> f32 {
     sparse_reward_within(GOAL_TOLERANCE_M, distance(achieved, desired))
 }
 
-/// The sparse reward of an object at a distance from its goal, both in metres, for another tolerance.
+/// Returns the sparse reward of an object that is `distance_m` away from its goal, for any tolerance in metres.
 #[must_use]
 pub fn sparse_reward_within(tolerance_m: f32, distance_m: f32) -> f32 {
     if distance_m > tolerance_m { REWARD_PENDING } else { REWARD_ACHIEVED }
 }
 
-/// The goals that an observation has achieved: every object's position, arm after arm, shape `[n_goal]`.
+/// Returns `true` if every object is within [`GOAL_TOLERANCE_M`] of its goal.
+///
+/// `observation` has shape `[n_observation]`, `goal` shape `[n_goal]`. An episode is a success if this holds after its
+/// last step. With several arms the criterion is weaker than a joint reward of 0.
+///
+/// # Panics
+/// If a slice is too short for `layout`.
+#[must_use]
+pub fn is_success(layout: Layout, observation: &[f32], goal: &[f32]) -> bool {
+    layout.arms().all(|arm| {
+        let object = &observation[layout.achieved_goal_of(arm)];
+        distance(object, &goal[layout.goal_of(arm)]) <= GOAL_TOLERANCE_M
+    })
+}
+
+/// Returns the goal that `observation` achieves: the positions of all objects, in arm order, shape `[n_goal]`.
 pub fn achieved_goal(layout: Layout, observation: &[f32]) -> impl Iterator<Item = f32> {
     layout.arms().flat_map(move |arm| observation[layout.achieved_goal_of(arm)].iter().copied())
 }
@@ -49,7 +69,7 @@ mod tests {
     }
 
     #[test]
-    fn the_joint_norm_is_stricter_than_every_arm_alone() {
+    fn the_joint_reward_is_stricter_than_the_reward_of_each_arm() {
         let (achieved, goal) = ([0.04, 0.0, 0.0, 0.0, 0.04, 0.0], [0.0; 6]);
         assert_eq!(sparse_reward(&achieved[..3], &goal[..3]), REWARD_ACHIEVED);
         assert_eq!(sparse_reward(&achieved[3..], &goal[3..]), REWARD_ACHIEVED);
@@ -57,7 +77,7 @@ mod tests {
     }
 
     #[test]
-    fn achieved_goals_are_the_objects_positions() {
+    fn achieved_goals_are_the_positions_of_the_objects() {
         let observation: Vec<f32> = (0_u8..56).map(f32::from).collect();
         let achieved: Vec<f32> = achieved_goal(Layout::new(Task::Push, 2), &observation).collect();
         assert_eq!(achieved, [3.0, 4.0, 5.0, 31.0, 32.0, 33.0]);

@@ -1,30 +1,32 @@
-//! Where randomness comes from: every draw has an address of run seed, number and stream.
+//! Random number streams: a generator is determined by a run's seed, a number and the purpose of the draws.
 
 use rand::{Rng, RngExt as _};
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng as _;
 use rand_distr::{Distribution as _, StandardNormal};
 
-/// What a generator is for. Streams of one episode are independent; append only, the numbers enter every result.
+/// The purpose of a generator. The streams of one episode are independent of each other.
+///
+/// The discriminants enter every result, so variants are only ever appended.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[repr(u64)]
 pub enum Stream {
-    /// Start state and goal of an episode.
+    /// Initial state and goal of an episode.
     Reset = 0,
     /// Exploration noise and random actions of an episode.
     Exploration = 1,
-    /// Batches drawn from the replay buffer; the number is the round's.
+    /// Batches drawn from the replay buffer; the number is that of the round.
     Replay = 2,
-    /// Initial weights; the number is the network's.
+    /// Initial weights; the number is that of the network.
     Initialisation = 3,
-    /// Hindsight goals with which an episode feeds the normaliser.
+    /// Hindsight goals that an episode adds to the statistics of the goal normaliser.
     Normaliser = 4,
 }
 
-/// The generator for `stream` of number `number` (an episode's, a round's, a network's) in run `run_seed`.
+/// Returns the generator for `stream` of episode (or round, or network) `number` in the run with seed `run_seed`.
 ///
-/// Neither a worker's index nor the order in which episodes finish enters the seed, so an episode can be played
-/// again alone, on any worker.
+/// The seed does not depend on the worker that plays an episode or on the order in which episodes finish, so any
+/// episode can be replayed in isolation.
 #[must_use]
 pub fn episode_rng(run_seed: u64, number: u64, stream: Stream) -> ChaCha8Rng {
     let mut seed = [0; 32];
@@ -35,26 +37,26 @@ pub fn episode_rng(run_seed: u64, number: u64, stream: Stream) -> ChaCha8Rng {
     rng
 }
 
-/// A number in `[low, high)`.
+/// Draws a number from `[low, high)`.
 pub fn uniform(rng: &mut impl Rng, low: f32, high: f32) -> f32 {
     low + (high - low) * rng.random::<f32>()
 }
 
-/// Whether a coin that shows heads with probability `probability` shows heads.
-pub fn coin(rng: &mut impl Rng, probability: f32) -> bool {
+/// Draws from the Bernoulli distribution: returns `true` with probability `probability`.
+pub fn bernoulli(rng: &mut impl Rng, probability: f32) -> bool {
     rng.random::<f32>() < probability
 }
 
-/// An index in `0..n`.
+/// Draws an index from `0..n`.
 ///
 /// # Panics
-/// When `n` is 0.
+/// If `n` is 0.
 pub fn index(rng: &mut impl Rng, n: usize) -> usize {
     assert!(n > 0, "no index below 0");
     rng.random_range(0..n)
 }
 
-/// A draw from the normal distribution of mean 0 and standard deviation 1.
+/// Draws from the normal distribution with mean 0 and standard deviation 1.
 pub fn standard_normal(rng: &mut impl Rng) -> f32 {
     StandardNormal.sample(rng)
 }
@@ -64,7 +66,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn an_address_gives_the_same_draws_and_another_gives_others() {
+    fn draws_repeat_for_equal_seeds_numbers_and_streams_only() {
         let draws = |seed, number, stream| {
             let mut rng = episode_rng(seed, number, stream);
             [uniform(&mut rng, 0.0, 1.0), uniform(&mut rng, 0.0, 1.0)]
@@ -81,7 +83,7 @@ mod tests {
     }
 
     #[test]
-    fn normal_draws_have_mean_zero_and_deviation_one() {
+    fn normal_draws_have_mean_zero_and_standard_deviation_one() {
         let mut rng = episode_rng(1, 0, Stream::Exploration);
         let draws: Vec<f32> = (0..20_000).map(|_| standard_normal(&mut rng)).collect();
         let mean = draws.iter().sum::<f32>() / 20_000.0;

@@ -1,9 +1,9 @@
-//! What a world looks like at one moment, for pictures and logs.
+//! A snapshot of a simulated world, for pictures and logs.
 
-/// A point or direction in the world's frame, metres: origin in the middle of the table top, z up.
+/// A point in the world frame, metres. The origin is the centre of the table top, and z points up.
 pub type Point = [f32; 3];
 
-/// A bar with round ends.
+/// A cylinder with hemispherical ends.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Capsule {
     /// One end of the axis.
@@ -14,44 +14,44 @@ pub struct Capsule {
     pub radius_m: f32,
 }
 
-/// A box.
+/// A box with any orientation.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Cuboid {
-    /// Its centre.
+    /// Its centre, metres.
     pub centre: Point,
-    /// Its orientation, quaternion (x, y, z, w).
+    /// Its orientation in the world frame, quaternion (x, y, z, w).
     pub orientation: [f32; 4],
-    /// Half its edges, metres.
+    /// Half the lengths of its edges, metres.
     pub half_extents_m: [f32; 3],
 }
 
-/// One arm as drawn: links, hand and fingers.
+/// One arm: links, hand and fingers.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ArmScene {
-    /// Where the arm stands.
+    /// The origin of the arm's base frame.
     pub base: Point,
-    /// Joint angles, radians, base to wrist.
+    /// Joint angles, radians, from base to wrist.
     pub joint_angles_rad: [f64; 6],
-    /// Where the joints and at last the tool are, base first.
+    /// Positions of the base, the joints and the tool, in this order.
     pub joint_points: Vec<Point>,
-    /// The links and the hand's wrist.
+    /// The links and the wrist.
     pub links: Vec<Capsule>,
-    /// Palm plate and finger pads.
+    /// The palm plate and the finger pads.
     pub hand: Vec<Cuboid>,
     /// The centre between the finger pads.
     pub end_effector: Point,
 }
 
-/// Everything in a world.
+/// All bodies of a world at one moment.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Scene {
-    /// Simulated time since the episode's start, seconds.
+    /// Simulated time since the start of the episode, seconds.
     pub time_s: f64,
     /// The arms, in order.
     pub arms: Vec<ArmScene>,
-    /// The objects, one an arm, in arm order.
+    /// The objects, one per arm, in arm order.
     pub objects: Vec<Cuboid>,
-    /// Where the objects shall be, in arm order.
+    /// Goal positions of the objects, in arm order.
     pub goals: Vec<Point>,
     /// The table.
     pub table: Cuboid,

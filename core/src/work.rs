@@ -1,88 +1,67 @@
-//! What a learner asks of its workers.
+//! Work that a learner assigns to its workers.
 
 use crate::episode::EpisodeKind;
 use crate::layout::Layout;
+use crate::settings::{Exploration, WorldSettings};
 
-/// What holds for every episode of a run.
+/// Settings that apply to every episode of a run.
 #[derive(Debug, Clone, PartialEq)]
 pub struct RunTerms {
     /// Task and arms.
     pub layout: Layout,
-    /// The teacher's account; `None` when nobody is to be asked.
+    /// The account at the teacher; `None` if the run takes no advice.
     pub account: Option<String>,
-    /// How training episodes explore.
+    /// Exploration in training episodes.
     pub exploration: Exploration,
-    /// How episodes start and how finely they are simulated.
-    pub world: WorldTerms,
+    /// Initial states and physics.
+    pub world: WorldSettings,
 }
 
-/// How training episodes explore.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Exploration {
-    /// Standard deviation of the Gaussian added to every action component.
-    pub noise_std: f32,
-    /// Share of an arm's steps that take random actions.
-    pub random_share: f32,
-    /// How many steps a random action is kept, on average; 1 draws a new one each step.
-    pub random_hold_mean_steps: f32,
-}
-
-/// How training episodes start and how finely all are simulated.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct WorldTerms {
-    /// Share of training episodes that start with the objects grasped (pick and place).
-    pub gripped_start_share: f32,
-    /// Share of training episodes that start with the hand anywhere above the table.
-    pub wide_start_share: f32,
-    /// Physics steps per control step of 0.04 s.
-    pub substeps: u32,
-}
-
-/// One episode to play.
+/// An episode to play.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct EpisodeOrder {
-    /// Its number.
+    /// Number within the run (training) or within the goal set (evaluation).
     pub number: u64,
-    /// With the number, the address of its random draws.
+    /// Seed of its random draws, together with the number.
     pub seed: u64,
-    /// Whether to ask the teacher.
+    /// Whether to ask the teacher for advice.
     pub advised: bool,
-    /// Whether every action is random (warm-up).
+    /// Whether all actions are uniformly random (warm-up).
     pub uniform: bool,
-    /// Whether to write a log of it.
+    /// Whether to record the episode in a log.
     pub record: bool,
 }
 
-/// Episodes stepped in lock step by one worker.
+/// A slot to play: episodes that one worker steps in lock step.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct SlotOrder {
-    /// The slot's number within the run.
+    /// Number of the slot within the run.
     pub slot: u64,
-    /// Version of the parameters that act.
+    /// Version of the parameters to act with.
     pub parameter_version: u64,
-    /// What the episodes are for.
+    /// The purpose of the episodes.
     pub kind: EpisodeKind,
     /// The episodes.
     pub episodes: Vec<EpisodeOrder>,
 }
 
-/// An actor's parameters as published by the learner.
+/// An actor's parameters and input normalisation, as the learner publishes them.
 #[derive(Debug, Clone, PartialEq)]
 pub struct PublishedActor {
-    /// Counts up by one a round.
+    /// Version, incremented by one per round.
     pub version: u64,
     /// Units of each hidden layer.
     pub n_hidden: usize,
-    /// Hidden layers.
+    /// Number of hidden layers.
     pub n_hidden_layers: usize,
-    /// Weight `[out, in]` and bias of each layer in turn.
+    /// Weight `[out, in]`, row-major, and bias `[out]` of each layer in turn.
     pub actor: Vec<f32>,
-    /// Shape `[n_observation]`.
+    /// Mean of observations, shape `[n_observation]`.
     pub observation_mean: Vec<f32>,
-    /// Shape `[n_observation]`.
+    /// Standard deviation of observations, shape `[n_observation]`.
     pub observation_std: Vec<f32>,
-    /// Shape `[n_goal]`.
+    /// Mean of goals, shape `[n_goal]`.
     pub goal_mean: Vec<f32>,
-    /// Shape `[n_goal]`.
+    /// Standard deviation of goals, shape `[n_goal]`.
     pub goal_std: Vec<f32>,
 }

@@ -1,16 +1,16 @@
-//! Prints how much of the tasks' area the Mico with four joints reaches, and how its gripper tilts there.
+//! Prints the share of the tasks' area that the Mico with four joints reaches, and the tilt of its gripper there.
 #![expect(clippy::print_stdout, reason = "its output")]
 
-use glam::DVec3;
+use nalgebra::Point3;
 use tandem_core::rng::uniform;
 use tandem_core::{Stream, episode_rng};
-use tandem_kinematics::{Cell, Joints, MICO_4, TaskFrame, ToolTarget};
+use tandem_kinematics::{Joints, MICO_4, TaskFrame, ToolTarget, WorkCell};
 
 const N_POINTS: u32 = 20_000;
 const TILTS_DEG: [f64; 6] = [10.0, 15.0, 20.0, 25.0, 30.0, 40.0];
 /// Half the area of objects and goals along x and y, training world, metres.
 const AREA_M: f32 = 0.12;
-/// Heights of the tool: as it works on the table, and up to the highest goal.
+/// Heights of the tool: working on the table, and up to the highest goal.
 const HEIGHTS_M: [[f32; 2]; 2] = [[0.022, 0.06], [0.022, 0.27]];
 
 fn main() {
@@ -29,17 +29,18 @@ fn main() {
     }
 }
 
-/// Shares of points drawn evenly from the area.
+/// Prints shares of points drawn uniformly from the area.
 fn print_row(frame: TaskFrame, heights_m: [f32; 2]) {
     let mut rng = episode_rng(1, 0, Stream::Reset);
-    let near = Joints::new(MICO_4.elbow_up_rad);
+    let seed = Joints::new(MICO_4.elbow_up_rad);
     let (mut reached, mut within) = (0, [0; TILTS_DEG.len()]);
     for _ in 0..N_POINTS {
         let mut between = |low, high| f64::from(uniform(&mut rng, low, high));
         let (x, y) = (between(-AREA_M, AREA_M), between(-AREA_M, AREA_M));
-        let own = DVec3::new(x, y, between(heights_m[0], heights_m[1]));
-        let target = ToolTarget { at_m: frame.base_from_own(own), yaw_rad: Cell::FINGERS_YAW_RAD };
-        if let Ok(solution) = MICO_4.nearest(&target, &near) {
+        let own = Point3::new(x, y, between(heights_m[0], heights_m[1]));
+        let position_m = frame.base_from_own(&own);
+        let target = ToolTarget { position_m, yaw_rad: WorkCell::FINGERS_YAW_RAD };
+        if let Ok(solution) = MICO_4.inverse_kinematics(&target, &seed) {
             reached += 1;
             for (count, tilt) in within.iter_mut().zip(TILTS_DEG) {
                 *count += u32::from(solution.tilt_rad.to_degrees() <= tilt);

@@ -1,14 +1,14 @@
-//! One number for each joint of an arm.
+//! One value per joint of an arm.
 
 use std::fmt;
 use std::ops::{Deref, DerefMut};
 
-/// Most joints that an arm of ours has.
+/// The largest number of joints of an arm.
 pub const MAX_JOINTS: usize = 6;
 
-/// One number for each joint of an arm, base to wrist: angles in radians, or their rates in radians per second.
+/// One value per joint of an arm, base to wrist: angles in radians, or velocities in radians per second.
 ///
-/// Reads as a slice of as many numbers as the arm has joints.
+/// Dereferences to a slice of `n_joints` values.
 #[derive(Clone, Copy, PartialEq)]
 pub struct Joints {
     values: [f64; MAX_JOINTS],
@@ -16,19 +16,19 @@ pub struct Joints {
 }
 
 impl Joints {
-    /// The numbers of `values`, base to wrist.
+    /// Copies `values`, base to wrist.
     ///
     /// # Panics
-    /// When there are more than [`MAX_JOINTS`].
+    /// If there are more than [`MAX_JOINTS`] values.
     #[must_use]
     pub fn new(values: &[f64]) -> Self {
         Self::from_fn(values.len(), |joint| values[joint])
     }
 
-    /// `n_joints` numbers, each given by its joint's index.
+    /// Calls `value` with the index of each of `n_joints` joints.
     ///
     /// # Panics
-    /// When there are more than [`MAX_JOINTS`].
+    /// If `n_joints` exceeds [`MAX_JOINTS`].
     #[must_use]
     pub fn from_fn(n_joints: usize, mut value: impl FnMut(usize) -> f64) -> Self {
         assert!(n_joints <= MAX_JOINTS, "{n_joints} joints, at most {MAX_JOINTS}");
@@ -36,13 +36,13 @@ impl Joints {
         Self { values, n: n_joints }
     }
 
-    /// Whether every number is finite.
+    /// Returns `true` if every value is finite.
     #[must_use]
     pub fn is_finite(&self) -> bool {
         self.iter().all(|value| value.is_finite())
     }
 
-    /// The largest difference between these angles and `other` in any joint, radians.
+    /// Returns the largest absolute difference to `other` over all joints, in the unit of the values.
     #[must_use]
     pub fn largest_difference(&self, other: &Self) -> f64 {
         self.iter().zip(other.iter()).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max)

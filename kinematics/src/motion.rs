@@ -1,40 +1,40 @@
-//! A motion as it is handed to the arms: samples at even times, and the cubic between them.
+//! Sampled motions of the arms, and the cubic interpolation between samples.
 
 use crate::joints::Joints;
 
-/// One arm at one sample.
+/// The state of one arm at one sample.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ArmSample {
     /// Joint angles, radians.
     pub angles: Joints,
-    /// Their rates, radians per second.
+    /// Joint velocities, radians per second.
     pub velocities: Joints,
-    /// How far the gripper is open: 0 is shut, 1 open.
-    pub opening: f64,
+    /// Opening of the gripper: 0 is shut, 1 open.
+    pub gripper_opening: f64,
 }
 
-/// The motion of all arms as samples. Between two samples each joint follows the cubic that has the angles and rates of
-/// both.
+/// The motion of all arms as equidistant samples. Between two samples each joint follows the cubic Hermite polynomial with
+/// the angles and velocities of both.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Motion {
     /// Time from one sample to the next, seconds.
     pub period_s: f64,
-    /// Samples of every arm, the first at time 0; as many for each.
+    /// Samples per arm, the first at time 0. All arms have the same number.
     pub arms: Vec<Vec<ArmSample>>,
 }
 
 impl Motion {
-    /// How long it takes, seconds.
+    /// Returns the duration, seconds.
     #[must_use]
     pub fn duration_s(&self) -> f64 {
         let n_samples = self.arms.first().map_or(0, Vec::len);
         n_samples.saturating_sub(1) as f64 * self.period_s
     }
 
-    /// Every arm at `time_s`; before the start and after the end the arms are where they begin and end.
+    /// Returns the state of every arm at `time_s` (seconds). Times are clamped to the motion.
     ///
     /// # Panics
-    /// When an arm has fewer than two samples, or the samples of an arm differ in their joints.
+    /// If an arm has fewer than two samples, or its samples differ in their numbers of joints.
     #[must_use]
     pub fn at(&self, time_s: f64) -> Vec<ArmSample> {
         self.arms.iter().map(|samples| arm_at(samples, self.period_s, time_s)).collect()
@@ -56,20 +56,21 @@ fn arm_at(samples: &[ArmSample], period_s: f64, time_s: f64) -> ArmSample {
     ArmSample {
         angles: Joints::from_fn(from.angles.len(), |joint| cubic(joint).angle(share * period_s)),
         velocities: Joints::from_fn(from.angles.len(), |joint| cubic(joint).rate(share * period_s)),
-        opening: from.opening + share * (to.opening - from.opening),
+        gripper_opening: from.gripper_opening + share * (to.gripper_opening - from.gripper_opening),
     }
 }
 
-/// A joint's motion between two samples, time counted from the first, seconds.
+/// The motion of a joint between two samples. Times are seconds since the first.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Cubic {
     from_rad: f64,
-    /// Rates at the ends and the middle control value between them, radians per second: a quadratic in Bernstein's form.
+    /// Bernstein coefficients of the velocity, a quadratic, radians per second.
     rates: [f64; 3],
     period_s: f64,
 }
 
 impl Cubic {
+    /// Interpolates joint `joint` of two samples that are `period_s` apart.
     pub(crate) fn between(from: &ArmSample, to: &ArmSample, joint: usize, period_s: f64) -> Self {
         let mean = (to.angles[joint] - from.angles[joint]) / period_s;
         let (first, last) = (from.velocities[joint], to.velocities[joint]);
@@ -77,6 +78,7 @@ impl Cubic {
         Self { from_rad: from.angles[joint], rates, period_s }
     }
 
+    /// Returns the angle, radians.
     pub(crate) fn angle(&self, time_s: f64) -> f64 {
         let [a, b, c] = self.rates;
         let t = time_s / self.period_s;
@@ -84,18 +86,19 @@ impl Cubic {
         self.from_rad + of_period * self.period_s
     }
 
+    /// Returns the velocity, radians per second.
     pub(crate) fn rate(&self, time_s: f64) -> f64 {
         let [a, b, c] = self.rates;
         let t = time_s / self.period_s;
         a + t * (2.0 * (b - a) + t * (a - 2.0 * b + c))
     }
 
-    /// A bound of the absolute rate, radians per second.
+    /// Returns an upper bound on the absolute velocity, radians per second.
     pub(crate) fn rate_bound(&self) -> f64 {
         self.rates.iter().fold(0.0, |max: f64, rate| max.max(rate.abs()))
     }
 
-    /// The largest absolute rate, radians per second.
+    /// Returns the largest absolute velocity, radians per second.
     pub(crate) fn largest_rate(&self) -> f64 {
         let [a, b, c] = self.rates;
         let ends = a.abs().max(c.abs());
@@ -103,37 +106,38 @@ impl Cubic {
         if top > 0.0 && top < 1.0 { ends.max(self.rate(top * self.period_s).abs()) } else { ends }
     }
 
-    /// The largest absolute rate of the rate, radians per second squared.
+    /// Returns the largest absolute acceleration, radians per second squared.
     pub(crate) fn largest_acceleration(&self) -> f64 {
         let [a, b, c] = self.rates;
         2.0 * (b - a).abs().max((c - b).abs()) / self.period_s
     }
 
-    /// The smallest acceleration limit with which any motion could go from one sample to the next, radians per second
+    /// Returns the smallest acceleration limit under which some motion connects the two samples, radians per second
     /// squared.
     ///
-    /// That motion accelerates fully one way and then the other. With A the limit, h the period, a the mean
-    /// acceleration and d the way in excess of that at even acceleration, d = h² (A² − a²) / 4 A.
+    /// That motion is bang-bang: full acceleration in one direction, then in the other. With the limit A, the period h, the
+    /// mean acceleration a and the distance d beyond that of constant acceleration, d = h² (A² − a²) / 4 A.
     pub(crate) fn least_acceleration(&self) -> f64 {
         let [first, middle, last] = self.rates;
         let mean = (last - first) / self.period_s;
-        let excess_m = (middle - 0.5 * (first + last)) / 3.0 * self.period_s;
-        let part = 2.0 * excess_m.abs() / (self.period_s * self.period_s);
+        let excess_rad = (middle - 0.5 * (first + last)) / 3.0 * self.period_s;
+        let part = 2.0 * excess_rad.abs() / (self.period_s * self.period_s);
         part + libm::hypot(part, mean)
     }
 
-    /// The smallest and the largest angle, radians.
+    /// Returns the smallest and the largest angle, radians.
     pub(crate) fn angle_bounds(&self) -> [f64; 2] {
         let ends = [self.from_rad, self.angle(self.period_s)];
-        let turns = self.turns_at().into_iter().filter(|share| *share > 0.0 && *share < 1.0);
-        let angles = turns.map(|share| self.angle(share * self.period_s)).chain(ends);
+        let stationary =
+            self.stationary_shares().into_iter().filter(|share| *share > 0.0 && *share < 1.0);
+        let angles = stationary.map(|share| self.angle(share * self.period_s)).chain(ends);
         angles.fold([f64::INFINITY, f64::NEG_INFINITY], |[low, high], angle| {
             [low.min(angle), high.max(angle)]
         })
     }
 
-    /// Shares of the period at which the rate would be 0; what is none of the period or no number does not count.
-    fn turns_at(&self) -> [f64; 2] {
+    /// Returns the roots of the velocity as shares of the period. Values outside (0, 1), NaN included, are to be ignored.
+    fn stationary_shares(&self) -> [f64; 2] {
         let [a, b, c] = self.rates;
         let (square, half) = (a - 2.0 * b + c, b - a);
         let root = (half * half - square * a).sqrt();
@@ -150,13 +154,13 @@ mod tests {
         let [from, to] = [0, 1].map(|end| ArmSample {
             angles: Joints::new(&[angles[end]]),
             velocities: Joints::new(&[rates[end]]),
-            opening: 0.0,
+            gripper_opening: 0.0,
         });
         Cubic::between(&from, &to, 0, period_s)
     }
 
     #[test]
-    fn the_cubic_has_the_angles_and_rates_of_both_samples() {
+    fn the_cubic_has_the_angles_and_velocities_of_both_samples() {
         let cubic = cubic([1.0, 1.3], [0.5, -2.0], 0.1);
         let close = |a: f64, b: f64| assert!((a - b).abs() < 1e-12, "{a} {b}");
         close(cubic.angle(0.0), 1.0);
@@ -179,11 +183,11 @@ mod tests {
     }
 
     #[test]
-    fn a_motion_passes_its_samples_and_rests_beyond_its_ends() {
-        let sample = |angle, rate, opening| ArmSample {
+    fn a_motion_interpolates_its_samples_and_is_constant_outside() {
+        let sample = |angle, rate, gripper_opening| ArmSample {
             angles: Joints::new(&[angle]),
             velocities: Joints::new(&[rate]),
-            opening,
+            gripper_opening,
         };
         let samples = vec![sample(0.0, 0.0, 0.2), sample(0.1, 0.5, 0.4), sample(0.3, 0.0, 0.4)];
         let motion = Motion { period_s: 0.2, arms: vec![samples.clone()] };
@@ -194,11 +198,11 @@ mod tests {
             assert!((got.velocities[0] - expected.velocities[0]).abs() < 1e-12, "{time_s}");
         }
         let middle = motion.at(0.1)[0];
-        assert!((middle.opening - 0.3).abs() < 1e-12 && middle.angles[0] < 0.05);
+        assert!((middle.gripper_opening - 0.3).abs() < 1e-12 && middle.angles[0] < 0.05);
     }
 
     #[test]
-    fn the_least_acceleration_is_that_of_full_thrust_one_way_and_then_the_other() {
+    fn the_least_acceleration_is_that_of_a_bang_bang_motion() {
         // With 3 rad/s² for 0.7 of a period and then −3 rad/s² for the rest, from 0.2 rad/s.
         let (period_s, limit, share) = (0.01_f64, 3.0_f64, 0.7_f64);
         let (first_s, then_s) = (share * period_s, (1.0 - share) * period_s);

@@ -1,66 +1,66 @@
-//! Way points become a trajectory that the arms can follow.
+//! The planner: from waypoints to a trajectory that the arms can follow.
 //!
-//! 1. Way points are joined by straight lines of the tool, cut into equal pieces of at most
-//!    [`PlanSettings::piece_m`]; inverse kinematics, each time near the angles before, gives joint angles for every cut.
-//! 2. These angles and the openings are the control points of one cubic B-spline for all arms together. The tool leaves the
-//!    line at corners only, by at most a third of a piece where it turns straight back, less where it turns less: 2 mm
-//!    with pieces of 6 mm.
+//! 1. Straight lines of the tool connect the waypoints and are cut into equal pieces of at most [`PlanSettings::piece_m`].
+//!    Inverse kinematics, seeded with the previous angles, gives the joint angles at every cut.
+//! 2. These angles and the gripper openings are the control points of one cubic B-spline for all arms together. The tool
+//!    deviates from the line at corners only: by at most a third of a piece in a full reversal, 2 mm with pieces of 6 mm,
+//!    and less in smaller turns.
 //! 3. The path is followed as fast as the limits allow, from rest to rest, with one time scaling for all arms and
-//!    grippers: what was simultaneous stays so. It is never followed faster than the way points say. `speed` then
-//!    slows all of it down.
+//!    grippers, so that simultaneous waypoints stay simultaneous. The path is never followed faster than one waypoint per
+//!    [`PlanSettings::step_s`]. [`PlanSettings::speed`] then scales the whole motion.
 //!
-//! The limits hold between samples too: speeds and accelerations of the joints by bounds of the spline's
-//! derivatives (see `retime.rs`), the tool's speed by values at nine points of each span and a bound on its change
-//! between them. Two per cent are left for whatever comes after: sampling, and its check.
+//! The limits hold between samples too. Speeds and accelerations of the joints use bounds on the spline's derivatives; the
+//! tool's speed uses values at nine points of each span and a bound on its change between them. The planner uses 98 per
+//! cent of every limit; the rest is left for sampling and its check.
 
-use glam::DVec3;
+mod error;
+
+use nalgebra::Point3;
 use tandem_core::ArmIndex;
 
-use crate::cell::{Cell, PlacedArm};
-use crate::inverse::ReachError;
-use crate::joints::Joints;
+pub use self::error::PlanError;
+use crate::forward::ForwardKinematics;
+use crate::inverse::MAX_CONTINUOUS_STEP_RAD;
+use crate::joints::{Joints, MAX_JOINTS};
 use crate::limits::Limits;
-use crate::posture::Posture;
 use crate::retime::{SpanBounds, fastest_rates};
 use crate::spline::Spline;
 use crate::trajectory::{Channels, Trajectory};
+use crate::work_cell::{PlacedArm, WorkCell};
 
-/// Share of every limit that a plan uses.
+/// The share of every limit that a plan uses.
 const USED_SHARE: f64 = 0.98;
-/// Least pieces of a line between way points: a gripper that closes while the hand waits needs some too.
-const LEAST_PIECES: f64 = 8.0;
-/// Pieces of a span at whose ends the tool's speed is looked at.
-const SPEED_PIECES: u32 = 8;
-/// Largest change of a joint from one control point to the next, radians. More is another solution of the
-/// inverse kinematics, or a place close to a singular posture.
-const MAX_JUMP_RAD: f64 = crate::inverse::MOVES_ON_RAD;
-/// Largest distance of consecutive way points, metres.
+/// The smallest number of pieces per line. A hand that waits for its gripper needs some too.
+const MIN_PIECES: f64 = 8.0;
+/// The number of intervals per span at whose ends the tool's speed is evaluated.
+const SPEED_INTERVALS: u32 = 8;
+/// The largest distance between consecutive waypoints, metres.
 pub const MAX_STEP_M: f64 = 0.25;
-/// Most way points of a plan.
-pub const MAX_WAY_POINTS: usize = 1000;
+/// The largest number of waypoints of a plan.
+pub const MAX_WAYPOINTS: usize = 1000;
 
-/// Where one arm shall be at a way point.
+/// One arm's part of a waypoint.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct ArmWayPoint {
-    /// The tool's origin in the world, metres.
-    pub tool_in_world_m: DVec3,
-    /// How far the gripper is open: 0 is shut, 1 open.
-    pub opening: f64,
+pub struct ArmWaypoint {
+    /// Position of the tool's origin in the world, metres.
+    pub tool_in_world_m: Point3<f64>,
+    /// Opening of the gripper: 0 is shut, 1 open.
+    pub gripper_opening: f64,
 }
 
-/// Where every arm shall be at one time, in the order of the cell's arms.
-pub type WayPoint = Vec<ArmWayPoint>;
+/// The simultaneous positions of all arms, in the order of the cell.
+pub type Waypoint = Vec<ArmWaypoint>;
 
-/// How way points become a trajectory.
+/// The settings of the planner.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PlanSettings {
-    /// What the arms may do.
+    /// Limits that the trajectory keeps.
     pub limits: Limits,
-    /// Time from one way point to the next as they were made, seconds: 0.04 in the training world.
+    /// Shortest time from one waypoint to the next, seconds: 0.04 in the training world.
     pub step_s: f64,
-    /// Share of the fastest possible speed, in (0, 1].
+    /// Share of the largest possible speed, in (0, 1].
     pub speed: f64,
-    /// Longest piece of a straight line between control points, metres, in [0.001, 0.05].
+    /// Longest piece of a line between control points, metres, in [0.001, 0.05].
     pub piece_m: f64,
 }
 
@@ -70,91 +70,22 @@ impl Default for PlanSettings {
     }
 }
 
-/// Why way points cannot become a trajectory.
-#[derive(Debug, Clone, PartialEq, thiserror::Error)]
-#[non_exhaustive]
-pub enum PlanError {
-    /// A setting is out of its range.
-    #[error("{name} is {value}, which is out of its range")]
-    Setting {
-        /// The setting.
-        name: &'static str,
-        /// Its value.
-        value: f64,
-    },
-    /// Too few or too many way points.
-    #[error("{got} way points, expected 2 to {MAX_WAY_POINTS}")]
-    WayPoints {
-        /// How many there are.
-        got: usize,
-    },
-    /// A way point, or the start, is not of as many arms and joints as the cell has.
-    #[error("way point {way_point} is of {got} arms, the cell has {expected}")]
-    Arms {
-        /// The way point, counted from 0.
-        way_point: usize,
-        /// Its arms, or the start's.
-        got: usize,
-        /// The cell's.
-        expected: usize,
-    },
-    /// An opening is not in [0, 1], or not a number.
-    #[error("way point {way_point} of arm {}: opening {opening}, expected 0 to 1", arm.0)]
-    Opening {
-        /// The way point, counted from 0.
-        way_point: usize,
-        /// The arm.
-        arm: ArmIndex,
-        /// The opening.
-        opening: f64,
-    },
-    /// Two way points are farther apart than [`MAX_STEP_M`], or one is not finite.
-    #[error("way point {way_point} of arm {} is {step_m:.3} m from the one before, at most {MAX_STEP_M} m", arm.0)]
-    Step {
-        /// The later way point, counted from 0.
-        way_point: usize,
-        /// The arm.
-        arm: ArmIndex,
-        /// The distance, metres.
-        step_m: f64,
-    },
-    /// The arm cannot be there, or on the way there from the way point before.
-    #[error("arm {} cannot reach way point {way_point} or the way there", arm.0)]
-    Unreachable {
-        /// The way point, counted from 0.
-        way_point: usize,
-        /// The arm.
-        arm: ArmIndex,
-        /// Why not.
-        source: ReachError,
-    },
-    /// The way passes a singular posture: a joint would have to jump.
-    #[error("on the way to way point {way_point} joint {} of arm {} jumps by {jump_rad:.2} rad", .joint + 1, arm.0)]
-    Jump {
-        /// The way point, counted from 0.
-        way_point: usize,
-        /// The arm.
-        arm: ArmIndex,
-        /// The joint, counted from 0.
-        joint: usize,
-        /// By how much, radians.
-        jump_rad: f64,
-    },
-}
-
-/// The trajectory of `cell`'s arms through `way_points`, the arms' angles near `start` (radians) at the first.
+/// Plans a trajectory of the arms of `cell` through `waypoints`. `start` gives joint angles (radians, arm by arm) near
+/// those at the first waypoint and selects the branch of the inverse kinematics.
 ///
 /// # Errors
-/// Says which way point cannot be reached, or what else is wrong.
+/// Returns the first waypoint that an arm cannot reach, or the first invalid input.
 pub fn plan(
-    cell: &Cell,
-    way_points: &[WayPoint],
+    cell: &WorkCell,
+    waypoints: &[Waypoint],
     start: &[Joints],
     settings: &PlanSettings,
 ) -> Result<Trajectory, PlanError> {
-    let n_pieces = checked_pieces(cell, way_points, start, settings)?;
+    check_settings(settings)?;
+    check_start(cell, start)?;
+    let n_pieces = n_pieces(longest_step_m(cell, waypoints)?, settings.piece_m);
     let channels = Channels::of(cell);
-    let points = control_points(cell, way_points, start, n_pieces)?;
+    let points = control_points(cell, waypoints, start, n_pieces)?;
     let path = Spline::following(channels.n_channels(), &points);
     let fastest = f64::from(n_pieces) / settings.step_s;
     let spans: Vec<SpanBounds> = (0..path.n_spans())
@@ -163,49 +94,6 @@ pub fn plan(
         .collect();
     let rates = fastest_rates(&spans).into_iter().map(|rate| rate * settings.speed).collect();
     Ok(Trajectory::new(channels, path, rates, n_pieces))
-}
-
-/// How many pieces each line between way points is cut into, when all that is given makes sense.
-fn checked_pieces(
-    cell: &Cell,
-    way_points: &[WayPoint],
-    start: &[Joints],
-    settings: &PlanSettings,
-) -> Result<u32, PlanError> {
-    check_settings(settings)?;
-    if !(2..=MAX_WAY_POINTS).contains(&way_points.len()) {
-        return Err(PlanError::WayPoints { got: way_points.len() });
-    }
-    let expected = cell.arms.len();
-    let fits = start.iter().zip(&cell.arms).all(|(q, arm)| q.len() == arm.model.n_joints());
-    if start.len() != expected || !fits {
-        return Err(PlanError::Arms { way_point: 0, got: start.len(), expected });
-    }
-    let mut longest_m: f64 = 0.0;
-    for (way_point, at) in way_points.iter().enumerate() {
-        if at.len() != expected {
-            return Err(PlanError::Arms { way_point, got: at.len(), expected });
-        }
-        let before = &way_points[way_point.saturating_sub(1)];
-        for (arm, (at, before)) in at.iter().zip(before).enumerate() {
-            let (arm, opening) = (ArmIndex(arm), at.opening);
-            if !(0.0..=1.0).contains(&opening) {
-                return Err(PlanError::Opening { way_point, arm, opening });
-            }
-            let step_m = (at.tool_in_world_m - before.tool_in_world_m).length();
-            if step_m.is_nan() || step_m > MAX_STEP_M {
-                return Err(PlanError::Step { way_point, arm, step_m });
-            }
-            longest_m = longest_m.max(step_m);
-        }
-    }
-    #[expect(
-        clippy::cast_possible_truncation,
-        clippy::cast_sign_loss,
-        reason = "between 8 and 250 by the checks above"
-    )]
-    let n_pieces = (longest_m / settings.piece_m).ceil().max(LEAST_PIECES) as u32;
-    Ok(n_pieces)
 }
 
 fn check_settings(settings: &PlanSettings) -> Result<(), PlanError> {
@@ -225,33 +113,80 @@ fn check_settings(settings: &PlanSettings) -> Result<(), PlanError> {
     Ok(())
 }
 
-/// All channels at every cut of the lines between way points, shape `[n_points, n_channels]`.
+fn check_start(cell: &WorkCell, start: &[Joints]) -> Result<(), PlanError> {
+    let expected = cell.arms.len();
+    let fits = start.iter().zip(&cell.arms).all(|(q, arm)| q.len() == arm.model.n_joints());
+    if start.len() != expected || !fits {
+        return Err(PlanError::Arms { waypoint: 0, got: start.len(), expected });
+    }
+    Ok(())
+}
+
+/// Checks the waypoints and returns the largest distance between consecutive ones, metres.
+fn longest_step_m(cell: &WorkCell, waypoints: &[Waypoint]) -> Result<f64, PlanError> {
+    if !(2..=MAX_WAYPOINTS).contains(&waypoints.len()) {
+        return Err(PlanError::WaypointCount { got: waypoints.len() });
+    }
+    let expected = cell.arms.len();
+    let mut longest_m: f64 = 0.0;
+    for (waypoint, at) in waypoints.iter().enumerate() {
+        if at.len() != expected {
+            return Err(PlanError::Arms { waypoint, got: at.len(), expected });
+        }
+        let before = &waypoints[waypoint.saturating_sub(1)];
+        for (arm, (at, before)) in at.iter().zip(before).enumerate() {
+            let (arm, gripper_opening) = (ArmIndex(arm), at.gripper_opening);
+            if !(0.0..=1.0).contains(&gripper_opening) {
+                return Err(PlanError::GripperOpening { waypoint, arm, gripper_opening });
+            }
+            let step_m = (at.tool_in_world_m - before.tool_in_world_m).norm();
+            if step_m.is_nan() || step_m > MAX_STEP_M {
+                return Err(PlanError::Step { waypoint, arm, step_m });
+            }
+            longest_m = longest_m.max(step_m);
+        }
+    }
+    Ok(longest_m)
+}
+
+/// Returns the number of pieces per line.
+#[expect(
+    clippy::cast_possible_truncation,
+    clippy::cast_sign_loss,
+    reason = "between 8 and 250, given a step of at most 0.25 m and pieces of at least 0.001 m"
+)]
+fn n_pieces(longest_m: f64, piece_m: f64) -> u32 {
+    (longest_m / piece_m).ceil().max(MIN_PIECES) as u32
+}
+
+/// Returns all channels at every cut of the lines between waypoints, shape `[n_points, n_channels]`.
 fn control_points(
-    cell: &Cell,
-    way_points: &[WayPoint],
+    cell: &WorkCell,
+    waypoints: &[Waypoint],
     start: &[Joints],
     n_pieces: u32,
 ) -> Result<Vec<f64>, PlanError> {
-    let mut near = start.to_vec();
+    let mut seeds = start.to_vec();
     let mut points = Vec::new();
-    for (way_point, to) in way_points.iter().enumerate() {
-        let from = &way_points[way_point.saturating_sub(1)];
-        let first = if way_point == 0 { n_pieces } else { 1 };
+    for (waypoint, to) in waypoints.iter().enumerate() {
+        let from = &waypoints[waypoint.saturating_sub(1)];
+        let first = if waypoint == 0 { n_pieces } else { 1 };
         for piece in first..=n_pieces {
             let share = f64::from(piece) / f64::from(n_pieces);
             for (arm, placed) in cell.indexed() {
                 let (from, to) = (&from[arm.0], &to[arm.0]);
-                let tool_m = from.tool_in_world_m.lerp(to.tool_in_world_m, share);
+                let tool_m = from.tool_in_world_m.lerp(&to.tool_in_world_m, share);
                 let solution = placed
                     .model
-                    .nearest(&placed.target(tool_m), &near[arm.0])
-                    .map_err(|source| PlanError::Unreachable { way_point, arm, source })?;
-                if way_point > 0 {
-                    check_jump(way_point, arm, &near[arm.0], &solution.angles)?;
+                    .inverse_kinematics(&placed.target(&tool_m), &seeds[arm.0])
+                    .map_err(|source| PlanError::Unreachable { waypoint, arm, source })?;
+                if waypoint > 0 {
+                    check_jump(waypoint, arm, &seeds[arm.0], &solution.angles)?;
                 }
-                near[arm.0] = solution.angles;
+                seeds[arm.0] = solution.angles;
                 points.extend_from_slice(&solution.angles);
-                points.push(from.opening + share * (to.opening - from.opening));
+                let opens_by = to.gripper_opening - from.gripper_opening;
+                points.push(from.gripper_opening + share * opens_by);
             }
         }
     }
@@ -259,56 +194,54 @@ fn control_points(
 }
 
 fn check_jump(
-    way_point: usize,
+    waypoint: usize,
     arm: ArmIndex,
     before: &Joints,
     after: &Joints,
 ) -> Result<(), PlanError> {
     for (joint, (before, after)) in before.iter().zip(after.iter()).enumerate() {
         let jump_rad = after - before;
-        if jump_rad.abs() > MAX_JUMP_RAD {
-            return Err(PlanError::Jump { way_point, arm, joint, jump_rad });
+        if jump_rad.abs() > MAX_CONTINUOUS_STEP_RAD {
+            return Err(PlanError::Jump { waypoint, arm, joint, jump_rad });
         }
     }
     Ok(())
 }
 
-/// What limits the path's rate in one span.
+/// Returns the bounds on the path's rate in one span.
 fn span_bounds(
-    cell: &Cell,
+    cell: &WorkCell,
     channels: &Channels,
     path: &Spline,
     span: usize,
     limits: &Limits,
 ) -> SpanBounds {
     let mut bounds = SpanBounds { x: f64::INFINITY, joints: Vec::new() };
-    let mut rate_within = |largest: f64, per_span: f64| {
+    let mut limit_rate = |largest: f64, per_span: f64| {
         let rate = USED_SHARE * largest / per_span;
         bounds.x = bounds.x.min(rate * rate);
     };
     for (arm, placed) in cell.indexed() {
-        let mut per_span = [[0.0; 2]; crate::joints::MAX_JOINTS];
-        for (joint, per_span) in per_span.iter_mut().enumerate().take(placed.model.n_joints()) {
-            *per_span = path.bounds(span, channels.joint(arm, joint));
-            rate_within(placed.model.joints[joint].speed_radps, per_span[0]);
+        let joints = &placed.model.joints;
+        let per_span: Vec<[f64; 2]> =
+            (0..joints.len()).map(|joint| path.bounds(span, channels.joint(arm, joint))).collect();
+        for (joint, [first, _]) in joints.iter().zip(&per_span) {
+            limit_rate(joint.speed_radps, *first);
         }
-        rate_within(limits.opening_per_s, path.bounds(span, channels.opening(arm))[0]);
-        let per_span = &per_span[..placed.model.n_joints()];
-        let tool_m = tool_per_span(placed, path, span, channels.joint(arm, 0), per_span);
-        rate_within(limits.tool_speed_mps, tool_m);
-        let accelerations =
-            placed.model.joints.iter().map(|joint| joint.speed_radps / limits.ramp_s);
-        let of_limit = per_span.iter().zip(accelerations);
-        bounds.joints.extend(of_limit.map(|([first, second], limit)| {
-            let limit = USED_SHARE * limit;
+        limit_rate(limits.gripper_opening_per_s, path.bounds(span, channels.gripper(arm))[0]);
+        let tool_m = tool_per_span_m(placed, path, span, channels.joint(arm, 0), &per_span);
+        limit_rate(limits.tool_speed_mps, tool_m);
+        bounds.joints.extend(joints.iter().zip(per_span).map(|(joint, [first, second])| {
+            let limit = USED_SHARE * (joint.speed_radps / limits.ramp_s);
             [first / limit, second / limit]
         }));
     }
     bounds
 }
 
-/// A bound on the tool's way per unit of the path in one span, metres.
-fn tool_per_span(
+/// Returns an upper bound on the distance that the tool covers per unit of the path in one span, metres. `per_span` bounds
+/// the first and second derivative of each joint.
+fn tool_per_span_m(
     placed: &PlacedArm,
     path: &Spline,
     span: usize,
@@ -324,16 +257,14 @@ fn tool_per_span(
             change_m += levers[joint.max(other)] * first * other_first;
         }
     }
-    let largest_seen_m = (0..=SPEED_PIECES)
-        .map(|piece| {
-            let t = f64::from(piece) / f64::from(SPEED_PIECES);
-            let jets: [_; crate::joints::MAX_JOINTS] = std::array::from_fn(|joint| {
-                path.at(span, t, first_channel + joint.min(n_joints - 1))
-            });
-            let angles = Joints::from_fn(n_joints, |joint| jets[joint].value);
-            let rates = Joints::from_fn(n_joints, |joint| jets[joint].first);
-            Posture::of(placed.model, &angles).tool_velocity(&rates).length()
-        })
-        .fold(0.0, f64::max);
-    largest_seen_m + change_m * 0.5 / f64::from(SPEED_PIECES)
+    let speed_m = |interval: u32| {
+        let t = f64::from(interval) / f64::from(SPEED_INTERVALS);
+        let jets: [_; MAX_JOINTS] =
+            std::array::from_fn(|joint| path.at(span, t, first_channel + joint.min(n_joints - 1)));
+        let angles = Joints::from_fn(n_joints, |joint| jets[joint].value);
+        let rates = Joints::from_fn(n_joints, |joint| jets[joint].first);
+        ForwardKinematics::new(placed.model, &angles).tool_velocity(&rates).norm()
+    };
+    let largest_seen_m = (0..=SPEED_INTERVALS).map(speed_m).fold(0.0, f64::max);
+    largest_seen_m + change_m * 0.5 / f64::from(SPEED_INTERVALS)
 }

@@ -1,44 +1,44 @@
-//! Why a motion is refused.
+//! Refusals of the check.
 
 use tandem_core::ArmIndex;
 
-/// The first limit that a motion breaks.
+/// The first limit that a motion violates.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
 #[error("at {when_s:.3} s arm {}: {reason}", arm.0)]
 pub struct Refusal {
-    /// When, seconds since the start of the motion.
+    /// Time of the violation, seconds since the start of the motion.
     pub when_s: f64,
-    /// Which arm; of two that come too near, the first.
+    /// The arm; the first one if two arms come too close.
     pub arm: ArmIndex,
-    /// What is wrong.
+    /// The violation.
     pub reason: Reason,
 }
 
-/// A number and the limit that it breaks, in the unit of the variant it belongs to.
+/// A value and the limit that it violates, in the unit of the variant that holds it.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Excess {
-    /// What the motion has.
+    /// Value of the motion.
     pub got: f64,
-    /// What is allowed.
+    /// Limit.
     pub allowed: f64,
 }
 
-/// What is wrong. Joints are counted from 0 here and from 1 in messages, as Kinova does.
+/// The violated limit. Joints are counted from 0 here and from 1 in messages, as Kinova does.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
 #[non_exhaustive]
 pub enum Reason {
     /// A setting of the check itself is out of its range: its name and value.
     #[error("the setting {0} is {1}, which is out of its range")]
     Setting(&'static str, f64),
-    /// The motion, or the place where the arms are, is of `got` arms and not of `expected`.
-    #[error("a motion of {got} arms, the cell has {expected}")]
+    /// The motion, or the present position, has `got` arms instead of `expected`.
+    #[error("the motion has {got} arms, the cell has {expected}")]
     Arms {
         /// Arms of the motion.
         got: usize,
         /// Arms of the cell.
         expected: usize,
     },
-    /// A sample, or the place where the arm is, is not of as many joints as the arm has.
+    /// A sample, or the present position, has another number of joints than the arm.
     #[error("{got} joints, expected {expected}")]
     Joints {
         /// Joints of the sample.
@@ -46,7 +46,7 @@ pub enum Reason {
         /// Joints of the arm.
         expected: usize,
     },
-    /// The arm has not as many samples as the first one, or fewer than two.
+    /// The arm has another number of samples than the first one, or fewer than two.
     #[error("{got} samples, expected {expected}")]
     Samples {
         /// Samples of this arm.
@@ -54,21 +54,21 @@ pub enum Reason {
         /// Samples of the first arm, or two.
         expected: usize,
     },
-    /// The motion takes too long, or no time; seconds.
+    /// The motion takes too long or no time; seconds.
     #[error("the motion takes {} s, expected more than 0 and at most {} s", .0.got, .0.allowed)]
     Duration(Excess),
-    /// An angle, a rate or an opening is infinite or not a number.
+    /// An angle, a velocity or an opening is infinite or NaN.
     #[error("a number is not finite")]
     NotFinite,
-    /// A joint is elsewhere than the motion begins; radians apart.
-    #[error("joint {} is {:.2} degrees from where the motion begins, at most {:.2}",
+    /// A joint is too far from the first sample; radians.
+    #[error("joint {} is {:.2} degrees from the start of the motion, at most {:.2}",
         .0 + 1, .1.got.to_degrees(), .1.allowed.to_degrees())]
     Start(usize, Excess),
     /// A joint moves at the start or at the end; radians per second.
-    #[error("joint {} moves at {:.3} degrees/s where the motion shall rest", .0 + 1, .1.to_degrees())]
+    #[error("joint {} moves at {:.3} degrees/s where the motion must rest", .0 + 1, .1.to_degrees())]
     NotAtRest(usize, f64),
-    /// A joint leaves its range: its angle, and the range; radians.
-    #[error("joint {} is at {:.2} degrees, it has {:.0} to {:.0}",
+    /// A joint leaves its range: its angle and the range; radians.
+    #[error("joint {} is at {:.2} degrees, its range is {:.0} to {:.0}",
         .0 + 1, .1.to_degrees(), .2[0].to_degrees(), .2[1].to_degrees())]
     JointRange(usize, f64, [f64; 2]),
     /// A joint is too fast; radians per second.
@@ -79,12 +79,12 @@ pub enum Reason {
     #[error("joint {} accelerates by {:.1} degrees/s2, at most {:.1}",
         .0 + 1, .1.got.to_degrees(), .1.allowed.to_degrees())]
     JointAcceleration(usize, Excess),
-    /// The gripper is commanded beyond shut (0) or open (1).
-    #[error("the gripper is open by {0}, expected 0 to 1")]
-    Opening(f64),
-    /// The gripper is commanded faster than it is; 1/s.
-    #[error("the opening changes by {:.3}/s, at most {:.3}/s", .0.got, .0.allowed)]
-    OpeningSpeed(Excess),
+    /// The gripper opening is not between 0 (shut) and 1 (open).
+    #[error("the gripper opening is {0}, expected 0 to 1")]
+    GripperOpening(f64),
+    /// The gripper opening changes too fast; 1/s.
+    #[error("the gripper opening changes by {:.3}/s, at most {:.3}/s", .0.got, .0.allowed)]
+    GripperSpeed(Excess),
     /// The tool is too fast; metres per second.
     #[error("the tool moves at {:.4} m/s, at most {:.4}", .0.got, .0.allowed)]
     ToolSpeed(Excess),
@@ -95,22 +95,22 @@ pub enum Reason {
     #[error("the gripper tilts by {:.2} degrees, at most {:.2}",
         .0.got.to_degrees(), .0.allowed.to_degrees())]
     Tilt(Excess),
-    /// A part of the arm, named, is too near to the table; metres.
+    /// A part of the arm, named, is too close to the table; metres.
     #[error("the {} is {:.1} mm above the table, at least {:.1}", .0, .1.got * 1e3, .1.allowed * 1e3)]
     TableGap(&'static str, Excess),
-    /// A part of the arm is too near to a part of another one: that arm, both parts, metres.
+    /// Parts of two arms are too close to each other: the other arm, both parts; metres.
     #[error("the {} is {:.1} mm from the {} of arm {}, at least {:.1}",
         .1[0], .2.got * 1e3, .1[1], .0.0, .2.allowed * 1e3)]
     ArmsGap(ArmIndex, [&'static str; 2], Excess),
-    /// Two parts of one arm, named, are too near to each other; metres.
+    /// Two parts of one arm, named, are too close to each other; metres.
     #[error("the {} is {:.1} mm from the arm's own {}, at least {:.1}",
         .0[1], .1.got * 1e3, .0[0], .1.allowed * 1e3)]
     SelfGap([&'static str; 2], Excess),
 }
 
 impl Reason {
-    /// This reason for `arm` at `when_s`.
-    pub(crate) fn of(self, arm: ArmIndex, when_s: f64) -> Refusal {
+    /// Returns the refusal of `arm` at `when_s` for this reason.
+    pub(crate) fn at(self, arm: ArmIndex, when_s: f64) -> Refusal {
         Refusal { when_s, arm, reason: self }
     }
 }

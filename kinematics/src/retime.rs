@@ -1,33 +1,33 @@
-//! How fast a path may be followed: the fastest time scaling within bounds that hold everywhere, not at samples only.
+//! Time-optimal path parameterization: the fastest time scaling of a path within limits that hold everywhere, not only at
+//! samples.
 //!
-//! Let s be the length along the path in spans, v its rate and x = v². In every span s is accelerated evenly by u, so x
-//! changes linearly from its value at one end to that at the other. In a span where |dq/ds| <= V and
-//! |d²q/ds²| <= C for a joint:
+//! Let s be the path parameter in spans, v its rate and x = v². The acceleration u of s is constant in every span, so x
+//! changes linearly from one end to the other. In a span where |dq/ds| <= V and |d²q/ds²| <= C for a joint:
 //!
 //! - its speed |dq/ds| v is at most V √x, and x is largest at an end of the span;
 //! - its acceleration |dq/ds u + d²q/ds² x| is at most V |u| + C x.
 //!
-//! Both are kept within the limits with the larger x of the two ends. The first gives a bound of x at each end of
-//! spans, and so does the second for u = 0. One pass forwards then lowers what cannot be reached from rest at
-//! the start, one pass backwards what cannot be left for rest at the end (the phase plane of time-optimal path
-//! following). Lowering x never breaks a bound of another span, so the result holds all of them.
+//! Both limits are applied to the larger x of the two ends. The first bounds x at each end of a span, and so does the
+//! second for u = 0. A forward pass then lowers values that cannot be reached from rest at the start, a backward pass
+//! values from which the path cannot come to rest at the end (as in numerical integration in the phase plane). Lowering
+//! x never violates a bound of another span, so the result keeps all of them.
 
-/// Bounds of one span, per unit of the path.
+/// Bounds within one span, per unit of the path parameter.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct SpanBounds {
     /// Largest x = v².
     pub(crate) x: f64,
-    /// For each joint |dq/ds| and |d²q/ds²|, both divided by the acceleration limit.
+    /// |dq/ds| and |d²q/ds²| of each joint, both divided by the acceleration limit.
     pub(crate) joints: Vec<[f64; 2]>,
 }
 
 impl SpanBounds {
-    /// The largest x at which every joint can follow the path's curvature.
+    /// Returns the largest x at which every joint can follow the path's curvature.
     fn curvature_x(&self) -> f64 {
         self.joints.iter().map(|[_, second]| 1.0 / second).fold(self.x, f64::min)
     }
 
-    /// The largest x at one end of the span when it is `x` at the other, and the span may be accelerated in.
+    /// Returns the largest x at one end of the span that is reachable from `x` at the other.
     fn reached_from(&self, x: f64) -> f64 {
         let rise =
             |[first, second]: &[f64; 2]| 2.0 * (1.0 - second * x).max(0.0) / (first + 2.0 * second);
@@ -35,10 +35,10 @@ impl SpanBounds {
     }
 }
 
-/// The rate v at each end of spans, from rest to rest: one more than there are spans, spans per second.
+/// Returns the rate v at the ends of the spans, from rest to rest, spans per second; shape `[n_spans + 1]`.
 ///
 /// # Panics
-/// When there are fewer than two spans: with rest at both ends one span would take for ever.
+/// If there are fewer than two spans: a single span with rest at both ends would take for ever.
 pub(crate) fn fastest_rates(spans: &[SpanBounds]) -> Vec<f64> {
     assert!(spans.len() >= 2, "at least two spans from rest to rest");
     let mut xs: Vec<f64> = vec![f64::INFINITY; spans.len() + 1];
@@ -62,7 +62,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_straight_path_is_a_trapezoid() {
+    fn a_straight_path_has_a_trapezoidal_profile() {
         // One joint, one radian per span, 1 rad/s² and 2 rad/s at most.
         let span = SpanBounds { x: 4.0, joints: vec![[1.0, 0.0]] };
         let rates = fastest_rates(&[span.clone(), span.clone(), span.clone(), span.clone(), span]);

@@ -1,11 +1,11 @@
-//! The path: a uniform cubic B-spline in all joints of all arms and the grippers' openings.
+//! Uniform cubic B-splines in all joints of all arms and the openings of the grippers.
 //!
-//! Between two control points lies a span of length 1. A B-spline does not pass through its points but follows them: at a
-//! corner it stays away by a sixth of the second difference, and where points lie on a line evenly it is that line.
-//! It is twice continuously differentiable, and its first and second derivatives lie within bounds that the
-//! points give directly: the first between three known values, the second between two.
+//! The span between two control points has length 1. A B-spline approximates its control points: at a corner it deviates
+//! by a sixth of the second difference, and it is exact where points are equidistant on a line. It is twice continuously
+//! differentiable. Its first derivative lies in the convex hull of three values and its second between two, all given
+//! directly by the control points.
 
-/// Control points; each is a row of `n_channels` numbers.
+/// A path as control points, each a row of `n_channels` values.
 #[derive(Debug, Clone)]
 pub(crate) struct Spline {
     n_channels: usize,
@@ -13,7 +13,7 @@ pub(crate) struct Spline {
     rows: Vec<f64>,
 }
 
-/// A number of the path and its derivatives by the path's length in spans.
+/// A value of the path and its derivatives by the path parameter, which counts spans.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Jet {
     pub(crate) value: f64,
@@ -22,11 +22,11 @@ pub(crate) struct Jet {
 }
 
 impl Spline {
-    /// The path that begins at the first of `points` (shape `[n_spans + 1, n_channels]`), follows them and ends at the
-    /// last: a point before the first and one behind the last go on in a straight line.
+    /// Creates the path from the first to the last of `points` (shape `[n_spans + 1, n_channels]`). Linear extrapolation adds
+    /// a control point at each end, so that the path starts and ends exactly at these points.
     ///
     /// # Panics
-    /// When there are fewer than two points.
+    /// If there are fewer than two points.
     pub(crate) fn following(n_channels: usize, points: &[f64]) -> Self {
         assert!(points.len() >= 2 * n_channels, "a path has a beginning and an end");
         let beyond = |from: &[f64], to: &[f64]| -> Vec<f64> {
@@ -40,11 +40,12 @@ impl Spline {
         Self { n_channels, rows }
     }
 
+    /// Returns the number of spans.
     pub(crate) fn n_spans(&self) -> usize {
         self.rows.len() / self.n_channels - 3
     }
 
-    /// One channel at share `t` of a span.
+    /// Evaluates `channel` at parameter `t` in [0, 1] of `span`.
     pub(crate) fn at(&self, span: usize, t: f64, channel: usize) -> Jet {
         let [a, b, c, d] = self.points(span, channel);
         let rest = 1.0 - t;
@@ -58,7 +59,7 @@ impl Spline {
         Jet { value: value / 6.0, first: first / 2.0, second }
     }
 
-    /// Bounds of the absolute values of a channel's first and second derivative in a span.
+    /// Returns upper bounds on the absolute first and second derivative of `channel` in `span`.
     pub(crate) fn bounds(&self, span: usize, channel: usize) -> [f64; 2] {
         let [a, b, c, d] = self.points(span, channel);
         let first = [0.5 * (c - a), c - b, 0.5 * (d - b)];
@@ -79,7 +80,7 @@ mod tests {
     const POINTS: [f64; 7] = [0.0, 1.0, 1.0, 0.2, 0.9, 0.0, 0.3];
 
     #[test]
-    fn the_path_joins_its_ends_twice_differentiably() {
+    fn the_path_starts_and_ends_at_its_points_and_is_twice_differentiable() {
         let path = Spline::following(1, &POINTS);
         assert_eq!(path.n_spans(), 6);
         assert!((path.at(0, 0.0, 0).value).abs() < 1e-15);
@@ -93,7 +94,7 @@ mod tests {
     }
 
     #[test]
-    fn derivatives_are_right_and_within_their_bounds() {
+    fn derivatives_match_differences_and_stay_within_their_bounds() {
         let path = Spline::following(1, &POINTS);
         for span in 0..path.n_spans() {
             let [first, second] = path.bounds(span, 0);

@@ -1,19 +1,19 @@
-//! A planned motion of all arms over time, at any time and as samples.
+//! Planned motions of all arms, evaluated at any time or sampled.
 
 use tandem_core::ArmIndex;
 
-use crate::cell::Cell;
 use crate::joints::Joints;
 use crate::motion::{ArmSample, Motion};
 use crate::spline::Spline;
+use crate::work_cell::WorkCell;
 
-/// Samples per second that the arms want.
+/// The default number of samples per second.
 pub const DEFAULT_RATE_HZ: f64 = 100.0;
 
-/// Which channels of a path are whose: each arm's joints, then its gripper's opening.
+/// The layout of a path's channels: for each arm its joints, then its gripper's opening.
 #[derive(Debug, Clone)]
 pub(crate) struct Channels {
-    /// For each arm its first channel, and last the number of channels.
+    /// First channel of each arm, then the number of channels.
     firsts: Vec<usize>,
 }
 
@@ -22,29 +22,30 @@ pub(crate) struct Channels {
 pub struct Trajectory {
     channels: Channels,
     path: Spline,
-    /// Rate of the path at each end of spans, spans per second, and the time of it, seconds.
+    /// Rate of the path at the ends of the spans, spans per second.
     rates: Vec<f64>,
+    /// Times of these ends, seconds.
     times_s: Vec<f64>,
     n_pieces: u32,
 }
 
-/// One arm at one time.
+/// The state of one arm at one time.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ArmState {
     /// Joint angles, radians.
     pub angles: Joints,
-    /// Their rates, radians per second.
+    /// Joint velocities, radians per second.
     pub velocities: Joints,
-    /// The rates' rates, radians per second squared.
+    /// Joint accelerations, radians per second squared.
     pub accelerations: Joints,
-    /// How far the gripper is open: 0 is shut, 1 open.
-    pub opening: f64,
-    /// The opening's change, 1/s.
-    pub opening_per_s: f64,
+    /// Opening of the gripper: 0 is shut, 1 open.
+    pub gripper_opening: f64,
+    /// Rate of change of the opening, 1/s.
+    pub gripper_opening_per_s: f64,
 }
 
-/// A place on the path and how it is passed.
-struct Place {
+/// A point of the path and the rate and acceleration of the path parameter there.
+struct PathPoint {
     span: usize,
     share: f64,
     rate: f64,
@@ -62,58 +63,58 @@ impl Trajectory {
         Self { channels, path, rates, times_s, n_pieces }
     }
 
-    /// How long it takes, seconds.
+    /// Returns the duration, seconds.
     #[must_use]
     pub fn duration_s(&self) -> f64 {
         self.times_s[self.times_s.len() - 1]
     }
 
-    /// How many way points it was made of.
+    /// Returns the number of waypoints.
     #[must_use]
-    pub fn n_way_points(&self) -> usize {
+    pub fn n_waypoints(&self) -> usize {
         self.path.n_spans() / self.n_pieces as usize + 1
     }
 
-    /// When the tools are at way point `idx`, counted from 0, or nearest to it where they turn a corner; seconds.
+    /// Returns the time at which the tools are at waypoint `idx` (counted from 0), or closest to it in a corner, seconds.
     ///
     /// # Panics
-    /// When there is no such way point.
+    /// If there is no such waypoint.
     #[must_use]
-    pub fn way_point_s(&self, idx: usize) -> f64 {
+    pub fn waypoint_s(&self, idx: usize) -> f64 {
         self.times_s[idx * self.n_pieces as usize]
     }
 
-    /// Every arm at `time_s`; before the start and after the end the arms rest.
+    /// Returns the state of every arm at `time_s` (seconds). The arms rest before the start and after the end.
     #[must_use]
     pub fn at(&self, time_s: f64) -> Vec<ArmState> {
-        let place = self.place(time_s);
-        (0..self.channels.n_arms()).map(|arm| self.state(&place, ArmIndex(arm))).collect()
+        let point = self.path_point(time_s);
+        (0..self.channels.n_arms()).map(|arm| self.state(&point, ArmIndex(arm))).collect()
     }
 
-    /// The motion as samples, `rate_hz` a second, the last at or just after the end.
+    /// Samples the motion `rate_hz` times a second. The last sample is at or just after the end.
     ///
     /// # Panics
-    /// When `rate_hz` is not positive and finite.
+    /// If `rate_hz` is not positive and finite.
     #[must_use]
     pub fn sampled(&self, rate_hz: f64) -> Motion {
         assert!(rate_hz > 0.0 && rate_hz.is_finite(), "{rate_hz} samples a second");
         #[expect(
             clippy::cast_possible_truncation,
             clippy::cast_sign_loss,
-            reason = "a finite number of samples that has to fit in memory all the same"
+            reason = "a finite number of samples that must fit in memory anyway"
         )]
         let n_periods = (self.duration_s() * rate_hz).ceil() as u32;
         let mut arms = vec![Vec::new(); self.channels.n_arms()];
         for sample in 0..=n_periods {
             for (arm, state) in arms.iter_mut().zip(self.at(f64::from(sample) / rate_hz)) {
-                let ArmState { angles, velocities, opening, .. } = state;
-                arm.push(ArmSample { angles, velocities, opening });
+                let ArmState { angles, velocities, gripper_opening, .. } = state;
+                arm.push(ArmSample { angles, velocities, gripper_opening });
             }
         }
         Motion { period_s: 1.0 / rate_hz, arms }
     }
 
-    fn place(&self, time_s: f64) -> Place {
+    fn path_point(&self, time_s: f64) -> PathPoint {
         let n_spans = self.path.n_spans();
         let time_s = time_s.clamp(0.0, self.duration_s());
         let span = self.times_s.partition_point(|start_s| *start_s <= time_s);
@@ -123,31 +124,31 @@ impl Trajectory {
         let since_s = time_s - self.times_s[span];
         let share = (from + 0.5 * acceleration * since_s) * since_s;
         let rate = from + acceleration * since_s;
-        Place { span, share: share.clamp(0.0, 1.0), rate: rate.max(0.0), acceleration }
+        PathPoint { span, share: share.clamp(0.0, 1.0), rate: rate.max(0.0), acceleration }
     }
 
-    fn state(&self, place: &Place, arm: ArmIndex) -> ArmState {
-        let jet = |channel| self.path.at(place.span, place.share, channel);
+    fn state(&self, point: &PathPoint, arm: ArmIndex) -> ArmState {
+        let jet = |channel| self.path.at(point.span, point.share, channel);
         let n_joints = self.channels.n_joints(arm);
-        let of_joints = |number: &dyn Fn(usize) -> f64| {
-            Joints::from_fn(n_joints, |joint| number(self.channels.joint(arm, joint)))
+        let of_joints = |value: &dyn Fn(usize) -> f64| {
+            Joints::from_fn(n_joints, |joint| value(self.channels.joint(arm, joint)))
         };
-        let opening = jet(self.channels.opening(arm));
+        let opening = jet(self.channels.gripper(arm));
         ArmState {
             angles: of_joints(&|channel| jet(channel).value),
-            velocities: of_joints(&|channel| jet(channel).first * place.rate),
+            velocities: of_joints(&|channel| jet(channel).first * point.rate),
             accelerations: of_joints(&|channel| {
                 let jet = jet(channel);
-                jet.second * place.rate * place.rate + jet.first * place.acceleration
+                jet.second * point.rate * point.rate + jet.first * point.acceleration
             }),
-            opening: opening.value.clamp(0.0, 1.0),
-            opening_per_s: opening.first * place.rate,
+            gripper_opening: opening.value.clamp(0.0, 1.0),
+            gripper_opening_per_s: opening.first * point.rate,
         }
     }
 }
 
 impl Channels {
-    pub(crate) fn of(cell: &Cell) -> Self {
+    pub(crate) fn of(cell: &WorkCell) -> Self {
         let mut firsts = vec![0];
         let mut next = 0;
         for arm in &cell.arms {
@@ -165,12 +166,12 @@ impl Channels {
         self.firsts[arm.0] + joint
     }
 
-    pub(crate) fn opening(&self, arm: ArmIndex) -> usize {
+    pub(crate) fn gripper(&self, arm: ArmIndex) -> usize {
         self.firsts[arm.0 + 1] - 1
     }
 
     fn n_joints(&self, arm: ArmIndex) -> usize {
-        self.opening(arm) - self.firsts[arm.0]
+        self.gripper(arm) - self.firsts[arm.0]
     }
 
     fn n_arms(&self) -> usize {

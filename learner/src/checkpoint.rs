@@ -12,8 +12,8 @@ use std::io;
 use std::path::{Path, PathBuf};
 
 use tandem_core::work::PublishedActor;
+use tandem_system::atomic_file::{self, TEMPORARY_EXTENSION};
 
-use crate::atomic::sync_directory;
 use crate::records::{Judged, Pending};
 use crate::settings::{self, ADVICE, Changed};
 use sealed::{FORMAT, Refused, Tensor};
@@ -118,20 +118,16 @@ pub fn save(
     keep: usize,
 ) -> Result<Saved, CheckpointError> {
     let path = directory.join(format!("{:08}.safetensors", trainer.counters().round));
-    let unfinished = path.with_extension("tmp");
     let owned = state::small_tensors(trainer, resumption);
     let mut tensors: Vec<Tensor<'_>> = owned
         .iter()
         .map(|(name, dtype, bytes)| Tensor { name: name.clone(), dtype: *dtype, bytes })
         .collect();
     tensors.extend(state::large_tensors(trainer));
-    let written = make(directory)
-        .and_then(|()| sealed::write(&unfinished, &state::metadata(trainer, resumption), &tensors))
-        .and_then(|seal| fs::rename(&unfinished, &path).map(|()| seal))
-        .and_then(|seal| sync_directory(directory).map(|()| seal));
-    if written.is_err() {
-        drop(fs::remove_file(&unfinished));
-    }
+    let metadata = state::metadata(trainer, resumption);
+    let written = atomic_file::create_directory(directory).and_then(|()| {
+        atomic_file::replace_with(&path, |file| sealed::write(file, &metadata, &tensors))
+    });
     let seal = written.map_err(|source| CheckpointError::Io {
         action: "write",
         path: path.clone(),
@@ -139,15 +135,6 @@ pub fn save(
     })?;
     prune(directory, &path, keep);
     Ok(Saved { path, seal })
-}
-
-/// Makes `directory`, and sure that it is on the disk.
-pub(crate) fn make(directory: &Path) -> io::Result<()> {
-    if directory.is_dir() {
-        return Ok(());
-    }
-    fs::create_dir_all(directory)?;
-    directory.parent().filter(|parent| parent.is_dir()).map_or(Ok(()), sync_directory)
 }
 
 /// Removes all but the newest `keep` checkpoints, `newest` being the first of them.
@@ -196,7 +183,7 @@ pub fn load_newest(
 ) -> Result<Option<Restored>, CheckpointError> {
     let unreadable =
         |source| CheckpointError::Io { action: "look for a", path: directory.to_owned(), source };
-    for unfinished in files(directory, "tmp").map_err(unreadable)? {
+    for unfinished in files(directory, TEMPORARY_EXTENSION).map_err(unreadable)? {
         tracing::info!(path = ?unfinished, "unfinished checkpoint removed");
         fs::remove_file(&unfinished).map_err(|source| CheckpointError::Io {
             action: "remove the unfinished",

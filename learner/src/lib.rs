@@ -4,15 +4,13 @@
 //! are or how a teacher decides.
 //!
 //! Reading order: [`board`] (the queue of work), [`records`] (results of evaluations), [`checkpoint`], [`settings`] (what
-//! a resumed run must keep), [`lock`] (the lock on a run directory), [`atomic`] (files that are replaced as a whole),
+//! a resumed run must keep),
 //! [`service`] (the gRPC shell and the thread that learns), [`relay`] (a proxy between a learner and many workers).
 
-pub mod atomic;
 pub mod board;
 pub mod checkpoint;
 mod drive;
 mod error;
-pub mod lock;
 mod metrics;
 pub mod records;
 pub mod relay;

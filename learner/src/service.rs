@@ -10,10 +10,11 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use tandem_core::Episode;
+use tandem_core::text::error_chain;
 use tandem_net::{Hangup, Incoming, Page, Prepared};
 use tandem_proto::pb;
 use tandem_proto::pb::learner_server::{Learner, LearnerServer};
-use tandem_proto::{decode_episode, encode_slot, encode_terms};
+use tandem_proto::{decode_episode, encode_run_terms, encode_slot};
 use tandem_telemetry::events::WorkerJoined;
 use tokio::net::TcpListener;
 use tokio_stream::wrappers::WatchStream;
@@ -190,7 +191,8 @@ fn learn(
 ) -> Result<Ended, Error> {
     let run = AssertUnwindSafe(|| drive::run(config, shared, runtime, shutdown));
     let ended = std::panic::catch_unwind(run).unwrap_or(Err(Error::Panicked));
-    let reason = ended.as_ref().map_or_else(with_causes, |ended| ended.reason.clone());
+    let reason =
+        ended.as_ref().map_or_else(|error| error_chain(error), |ended| ended.reason.clone());
     let interrupted = !is_complete(&ended);
     shared.lock().finish(pb::Finished { reason: reason.clone(), interrupted });
     shared.work.notify_waiters();
@@ -201,20 +203,6 @@ fn learn(
             ended.as_ref().map_or_else(|_| String::new(), |ended| ended.digest.clone());
     });
     ended
-}
-
-/// An error and what caused it, on one line.
-fn with_causes(error: &Error) -> String {
-    let mut line = error.to_string();
-    let mut cause = std::error::Error::source(error);
-    while let Some(inner) = cause {
-        let text = inner.to_string();
-        if !line.contains(&text) {
-            line = format!("{line}: {text}");
-        }
-        cause = inner.source();
-    }
-    line
 }
 
 /// Waits until a connection has ended and hands the slots of its workers to the next that ask: a round need not wait
@@ -271,7 +259,7 @@ impl Learner for LearnerService {
         if lines.this {
             WorkerJoined { worker_id, name: &name }.emit();
         }
-        let terms = Some(encode_terms(&terms));
+        let terms = Some(encode_run_terms(&terms));
         Ok(Response::new(pb::JoinResponse { worker_id, terms, learner: self.start }))
     }
 

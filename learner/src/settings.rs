@@ -4,11 +4,12 @@ use std::fmt;
 
 use serde_json::Value;
 
-use tandem_rl::config::RunConfig;
+use tandem_rl::config::{RunConfig, former_keys};
 
 /// What a run may go on with another value of: when it ends, what is saved and what is logged. Everything else decides
 /// what it learns.
-const FREE: [&str; 3] = ["stop.", "checkpoint.", "evaluation.recorded_episodes"];
+const FREE: [&str; 4] =
+    ["stop.", "checkpoint.", "evaluation.recorded_episodes", "evaluation.test_episodes"];
 
 /// A setting with which a run cannot go on.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -29,8 +30,8 @@ impl fmt::Display for Changed {
 }
 
 /// What to do about a setting that differs.
-pub const ADVICE: &str = "only stop.*, checkpoint.* and evaluation.recorded_episodes may change when a run goes on: \
-                          take the value that it began with, or start a new run";
+pub const ADVICE: &str = "only stop.*, checkpoint.*, evaluation.recorded_episodes and evaluation.test_episodes may \
+                          change when a run is resumed: keep the original value, or start a new run";
 
 /// The settings as one JSON object, numbers as a person writes them.
 #[must_use]
@@ -38,25 +39,41 @@ pub fn to_json(config: &RunConfig) -> String {
     serde_json::to_string(config).expect("numbers and names can be written")
 }
 
-/// The first setting that decides what a run learns and has another value in `config` than in `began_with`, a text by
-/// [`to_json`]. What only one of the two has is passed over: programs of two versions may know different settings.
+/// Returns the first setting that affects learning and has another value in `config` than in `began_with`, a text
+/// written by [`to_json`]. A setting that only one of the two has is skipped: programs of two versions may know different
+/// settings. `began_with` may use former keys.
 ///
 /// # Errors
-/// When `began_with` is no such text.
+/// When `began_with` is not such a text.
 pub fn first_change(
     config: &RunConfig,
     began_with: &str,
 ) -> Result<Option<Changed>, serde_json::Error> {
     let there: Value = serde_json::from_str(began_with)?;
-    // Both take the way through text: a value that was read has no more digits than it was written with.
+    // Both pass through text: a value that was read has no more digits than it was written with.
     let here: Value = serde_json::from_str(&to_json(config))?;
     let settings = below(&here, String::new()).into_iter();
     let mut fixed = settings.filter(|(key, _)| !FREE.iter().any(|free| key.starts_with(free)));
-    Ok(fixed.find_map(|(key, here)| {
-        let pointer = format!("/{}", key.replace('.', "/"));
-        let there = there.pointer(&pointer).filter(|there| **there != here)?;
-        Some(Changed { key, here: here.to_string(), there: there.to_string() })
-    }))
+    let changed = fixed.find_map(|(key, here)| {
+        let under_former_key = || lookup(&there, former_keys::former(&key)?);
+        let there = lookup(&there, &key).or_else(under_former_key);
+        let there = there.filter(|there| **there != here)?.to_string();
+        Some(Changed { key, here: here.to_string(), there })
+    });
+    Ok(changed.or_else(|| removed_setting(&there)))
+}
+
+/// Returns a setting that no longer exists and whose value was not 0.
+fn removed_setting(there: &Value) -> Option<Changed> {
+    former_keys::REMOVED.into_iter().find_map(|key| {
+        let value = lookup(there, key)?.as_f64().filter(|value| *value != 0.0)?;
+        Some(Changed { key: key.to_owned(), here: "0".to_owned(), there: value.to_string() })
+    })
+}
+
+/// Returns the value of the setting with the dotted name `key`.
+fn lookup<'a>(settings: &'a Value, key: &str) -> Option<&'a Value> {
+    settings.pointer(&format!("/{}", key.replace('.', "/")))
 }
 
 /// Dotted names and values of all settings in and below `value`, which is called `name`.
@@ -108,7 +125,23 @@ mod tests {
         changed.checkpoint.every_rounds = 7;
         changed.checkpoint.keep = 9;
         changed.evaluation.recorded_episodes = 0;
+        changed.evaluation.test_episodes = 1;
         assert_eq!(first_change(&changed, &to_json(&config())).expect("JSON"), None);
+    }
+
+    #[test]
+    fn former_keys_are_compared_with_the_current_ones() {
+        let former = to_json(&config())
+            .replace("\"bc_weight\"", "\"cloning_weight\"")
+            .replace("\"substeps\"", "\"wide_start_share\":0.0,\"substeps\"");
+        assert_eq!(first_change(&config(), &former).expect("JSON"), None);
+        let mut changed = config();
+        changed.ddpg.bc_weight = 1.0;
+        let found = first_change(&changed, &former).expect("JSON").expect("it differs");
+        assert_eq!(found.to_string(), "ddpg.bc_weight is 1.0 here and 2.0 in the run");
+        let wide = former.replace("\"wide_start_share\":0.0", "\"wide_start_share\":0.5");
+        let found = first_change(&config(), &wide).expect("JSON").expect("it differs");
+        assert_eq!(found.to_string(), "world.wide_start_share is 0 here and 0.5 in the run");
     }
 
     #[test]

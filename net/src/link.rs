@@ -1,13 +1,13 @@
 //! A connection that shows the token, and says in one line what is wrong when a call does not get through.
 
 use std::error::Error;
-use std::fmt;
 use std::future::Future;
 use std::pin::Pin;
 use std::sync::Arc;
 use std::task::{Context, Poll};
 
 use http::header::{AUTHORIZATION, HeaderValue};
+use tandem_core::text;
 use tonic::body::Body;
 use tonic::transport::Channel;
 use tonic::{Code, Status};
@@ -94,7 +94,7 @@ impl Peer {
 
     /// What to tell when a call did not get through.
     fn unreachable(&self, error: tonic::transport::Error) -> Status {
-        let (address, causes) = (&self.address, Causes(&error).to_string());
+        let (address, causes) = (&self.address, text::error_chain(&error));
         let message = match (self.by_tls, self.heard.is_tls()) {
             (true, Some(false)) => format!(
                 "{address} does not speak TLS: leave --tls-ca out, or start it with --tls-cert and --tls-key"
@@ -116,7 +116,7 @@ impl Peer {
 
 /// Whether the service's certificate is what is wrong.
 fn is_certificate_refused(error: &(dyn Error + 'static)) -> bool {
-    chain(error).any(|cause| {
+    text::causes(error).any(|cause| {
         // An I/O error's source is the source of what it wraps, not what it wraps.
         let wrapped = cause.downcast_ref::<std::io::Error>().and_then(|error| error.get_ref());
         let tls = match wrapped {
@@ -125,28 +125,4 @@ fn is_certificate_refused(error: &(dyn Error + 'static)) -> bool {
         };
         matches!(tls, Some(rustls::Error::InvalidCertificate(_)))
     })
-}
-
-/// An error and its causes, outermost first.
-fn chain<'a>(
-    error: &'a (dyn Error + 'static),
-) -> impl Iterator<Item = &'a (dyn Error + 'static)> + use<'a> {
-    std::iter::successors(Some(error), |&error| error.source())
-}
-
-/// An error and what caused it, on one line; what a cause repeats is said once.
-struct Causes<'a>(&'a (dyn Error + 'static));
-
-impl fmt::Display for Causes<'_> {
-    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let mut line = String::new();
-        for cause in chain(self.0) {
-            let text = cause.to_string().replace('\n', " ");
-            if !line.contains(&text) {
-                let between = if line.is_empty() { "" } else { ": " };
-                line = format!("{line}{between}{text}");
-            }
-        }
-        formatter.write_str(&line)
-    }
 }

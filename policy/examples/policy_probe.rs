@@ -1,7 +1,7 @@
-//! Prints what a policy file computes for arbitrary inputs, for `scripts/check_policy.py` to compare:
+//! Prints the outputs of a policy file for arbitrary inputs, which `scripts/check_policy.py` compares with its own:
 //! `cargo run --release -p tandem-policy --example policy_probe -- FILE > probe.json`.
 
-#![expect(clippy::print_stdout, reason = "its output is its purpose")]
+#![expect(clippy::print_stdout, reason = "an example that prints its results")]
 
 use std::path::Path;
 

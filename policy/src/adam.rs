@@ -1,4 +1,4 @@
-//! Adam, and the slow copy that target networks are.
+//! The Adam optimiser, and Polyak averaging for target networks.
 
 use pulp::Arch;
 
@@ -6,12 +6,12 @@ use crate::elementwise::blend;
 
 const FIRST_DECAY: f32 = 0.9;
 const SECOND_DECAY: f32 = 0.999;
-/// What a new gradient counts; `1 - SECOND_DECAY` in single precision would be 1.3e-5 off.
+/// Weights of a new gradient. Computed in single precision, `1 - SECOND_DECAY` would have a relative error of 1.3e-5.
 const FIRST_SHARE: f32 = 0.1;
 const SECOND_SHARE: f32 = 0.001;
 const EPSILON: f32 = 1e-8;
 
-/// Adam (Kingma & Ba 2015) with bias correction; decays 0.9 and 0.999, epsilon 1e-8.
+/// The Adam optimiser (Kingma & Ba 2015) with bias correction, `beta1 = 0.9`, `beta2 = 0.999` and `epsilon = 1e-8`.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Adam {
     learning_rate: f32,
@@ -21,7 +21,7 @@ pub struct Adam {
 }
 
 impl Adam {
-    /// An optimiser for `n_parameters` that has not stepped yet.
+    /// Creates an optimiser for `n_parameters` parameters.
     #[must_use]
     pub fn new(n_parameters: usize, learning_rate: f32) -> Self {
         Self {
@@ -32,10 +32,10 @@ impl Adam {
         }
     }
 
-    /// Moves `parameters` against `gradient`, both of shape `[n_parameters]`.
+    /// Updates `parameters` with `gradient`, both of shape `[n_parameters]`, so that the loss decreases.
     ///
     /// # Panics
-    /// When a vector has another length.
+    /// If a vector has another length.
     pub fn step(&mut self, parameters: &mut [f32], gradient: &[f32]) {
         let n = self.first_moments.len();
         assert_eq!((parameters.len(), gradient.len()), (n, n), "an optimiser for another network");
@@ -55,34 +55,36 @@ impl Adam {
         });
     }
 
-    /// Goes on with another learning rate; the moments stay.
+    /// Sets the learning rate of the following steps. The moments are kept.
     pub const fn set_learning_rate(&mut self, learning_rate: f32) {
         self.learning_rate = learning_rate;
     }
 
-    /// How many steps were taken.
+    /// Returns the number of steps so far.
     #[must_use]
     pub const fn n_steps(&self) -> u64 {
         self.n_steps
     }
 
-    /// Running means of the gradient and of its square, each of shape `[n_parameters]`.
+    /// Returns the first and second moments (running means of the gradient and of its square), each of shape
+    /// `[n_parameters]`.
     #[must_use]
     pub fn moments(&self) -> [&[f32]; 2] {
         [&self.first_moments, &self.second_moments]
     }
 
-    /// Goes on from stored moments.
+    /// Restores the state of an optimiser: its number of steps and its [`moments`](Self::moments).
     ///
     /// # Panics
-    /// When a vector has another length.
+    /// If a vector has another length.
     pub fn restore(&mut self, n_steps: u64, [first_moments, second_moments]: [&[f32]; 2]) {
         self.n_steps = n_steps;
         self.first_moments.copy_from_slice(first_moments);
         self.second_moments.copy_from_slice(second_moments);
     }
 
-    /// The learning rate over the first moment's correction, and the factor that corrects the second moment's root.
+    /// Returns the learning rate divided by the bias correction of the first moment, and the factor that corrects the
+    /// square root of the second moment.
     #[expect(clippy::cast_possible_truncation, reason = "both lie well within f32")]
     fn bias_corrected(&self) -> (f32, f32) {
         let n_steps = self.n_steps as f64;
@@ -98,7 +100,7 @@ impl Adam {
 /// the `tau` of CleanRL and Stable-Baselines3 is `1 - keep`.
 ///
 /// # Panics
-/// When the two vectors differ in length: the caller mixed two networks.
+/// If the two vectors differ in length.
 pub fn polyak_update(target: &mut [f32], online: &[f32], keep: f32) {
     assert_eq!(target.len(), online.len(), "target and online network differ");
     blend(target, online, keep);
@@ -135,7 +137,7 @@ mod tests {
     }
 
     #[test]
-    fn a_restored_optimiser_goes_on_alike() {
+    fn a_restored_optimiser_continues_with_the_same_bits() {
         let mut first = Adam::new(2, 0.1);
         let (mut a, mut b) = ([1.0, 2.0], [0.0; 2]);
         first.step(&mut a, &[0.3, -0.4]);
@@ -148,7 +150,7 @@ mod tests {
     }
 
     #[test]
-    fn polyak_averaging_keeps_its_share_of_the_target() {
+    fn polyak_averaging_keeps_a_fraction_of_the_target() {
         let mut target = [1.0, -2.0];
         polyak_update(&mut target, &[3.0, 2.0], 0.75);
         assert_eq!(target, [1.5, -1.0]);

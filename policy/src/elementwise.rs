@@ -1,19 +1,18 @@
-//! The loops between matrix products, compiled for each instruction set and chosen at run time.
+//! Elementwise loops, compiled for several instruction sets of which one is chosen at run time.
 //!
-//! None of them adds up across lanes and none contracts a product and a sum, so every instruction set gives the same
-//! bits.
+//! No loop sums across lanes or fuses a product with a sum, so all instruction sets give the same bits.
 
 use pulp::Arch;
 
 use crate::matrix::MatrixMut;
 
-/// Hyperbolic tangent, the same bits on every platform.
+/// Computes the hyperbolic tangent, with the same bits on every platform.
 #[must_use]
 pub fn tanh(x: f32) -> f32 {
     libm::tanhf(x)
 }
 
-/// Whether no number is infinite or NaN.
+/// Returns `true` if no number is infinite or NaN.
 #[must_use]
 pub fn all_finite(numbers: &[f32]) -> bool {
     const INFINITY_BITS: u32 = f32::INFINITY.to_bits();
@@ -23,7 +22,7 @@ pub fn all_finite(numbers: &[f32]) -> bool {
     })
 }
 
-/// `rows = max(rows + bias, 0)`; `rows` has shape `[n, bias.len()]`.
+/// Computes `rows = max(rows + bias, 0)`. `rows` has shape `[n, bias.len()]`.
 pub(crate) fn add_bias_relu(rows: &mut [f32], bias: &[f32]) {
     #[inline(always)]
     fn row_kernel(row: &mut [f32], bias: &[f32]) {
@@ -47,7 +46,7 @@ pub(crate) fn add_bias(rows: &mut MatrixMut<'_>, bias: &[f32]) {
     }
 }
 
-/// Back through a ReLU: clears `delta` where the unit was off.
+/// Propagates a gradient through a ReLU: sets `delta` to 0 where the activation is not positive.
 pub(crate) fn mask(delta: &mut [f32], activations: &[f32]) {
     Arch::new().dispatch(|| {
         for (delta, activation) in delta.iter_mut().zip(activations) {
@@ -56,7 +55,8 @@ pub(crate) fn mask(delta: &mut [f32], activations: &[f32]) {
     });
 }
 
-/// As [`mask`], and adds up each column of the result: the bias gradient, shape `[n_units]`.
+/// Like [`mask`], and also writes the sums of the result's columns, the gradient of the bias, to `sums`, shape
+/// `[n_units]`.
 pub(crate) fn mask_and_sum(delta: &mut [f32], activations: &[f32], sums: &mut [f32]) {
     #[inline(always)]
     fn row_kernel(delta: &mut [f32], activations: &[f32], sums: &mut [f32]) {
@@ -77,7 +77,7 @@ pub(crate) fn mask_and_sum(delta: &mut [f32], activations: &[f32], sums: &mut [f
     });
 }
 
-/// The sum of each column of `rows`, shape `[n, sums.len()]`.
+/// Writes the sum of each column of `rows`, shape `[n, sums.len()]`, to `sums`.
 pub(crate) fn column_sums(rows: &[f32], sums: &mut [f32]) {
     sums.fill(0.0);
     for row in rows.chunks_exact(sums.len()) {
@@ -87,11 +87,11 @@ pub(crate) fn column_sums(rows: &[f32], sums: &mut [f32]) {
     }
 }
 
-/// `into = keep * into + (1 - keep) * from`.
-pub(crate) fn blend(into: &mut [f32], from: &[f32], keep: f32) {
+/// Computes `target = keep * target + (1 - keep) * source`.
+pub(crate) fn blend(target: &mut [f32], source: &[f32], keep: f32) {
     Arch::new().dispatch(|| {
-        for (into, from) in into.iter_mut().zip(from) {
-            *into = keep * *into + (1.0 - keep) * *from;
+        for (target, source) in target.iter_mut().zip(source) {
+            *target = keep * *target + (1.0 - keep) * *source;
         }
     });
 }
@@ -101,7 +101,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn infinities_and_nans_are_found_wherever_they_stand() {
+    fn infinities_and_nans_are_found_at_any_position() {
         for position in [0, 37, 99] {
             for bad in [f32::NAN, -f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
                 let mut numbers = [f32::MAX; 100];

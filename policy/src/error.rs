@@ -1,40 +1,40 @@
-//! What can go wrong with a policy.
+//! Errors of creating, reading and writing policies.
 
 use std::path::PathBuf;
 
-/// Why a policy cannot be made, read or written.
+/// An error of creating, reading or writing a policy.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
-    /// A vector does not have the length that the layout and the network's sizes ask for.
+    /// A vector does not have the length that follows from the layout and the network's sizes.
     #[error("{name} has {got} numbers, expected {expected}")]
     WrongLength {
-        /// Which vector.
+        /// Name of the vector.
         name: &'static str,
         /// Its length.
         got: usize,
-        /// What the sizes ask for.
+        /// Required length.
         expected: usize,
     },
     /// A parameter is infinite or NaN.
     #[error("{name} holds a number that is not finite")]
     NotFinite {
-        /// Which vector.
+        /// Name of the vector.
         name: &'static str,
     },
     /// A standard deviation is zero or negative.
     #[error("{name} holds a number that is not above 0")]
     NotPositive {
-        /// Which vector.
+        /// Name of the vector.
         name: &'static str,
     },
-    /// A network has no units, no layers, no heads, or absurdly many.
+    /// A number of units, layers or heads is out of range.
     #[error("{name} is {got}, expected 1 to {most}")]
     Size {
-        /// Which size.
+        /// Name of the size.
         name: &'static str,
         /// Its value.
         got: usize,
-        /// The largest that is accepted.
+        /// Largest accepted value.
         most: usize,
     },
     /// The file cannot be read.
@@ -42,78 +42,78 @@ pub enum Error {
     Read {
         /// The file.
         path: PathBuf,
-        /// What the system said.
+        /// Error of the operating system.
         source: std::io::Error,
     },
-    /// The file cannot be written; an older one under the same name is untouched.
+    /// The file cannot be written. An existing file at this path is unchanged.
     #[error("cannot write policy file {path:?}")]
     Write {
         /// The file.
         path: PathBuf,
-        /// What the system said.
+        /// Error of the operating system.
         source: std::io::Error,
     },
-    /// The file was read but is no policy that can be used.
+    /// The file was read but does not contain a valid policy.
     #[error("{path:?} is not a usable policy file")]
     Refused {
         /// The file.
         path: PathBuf,
-        /// Why.
+        /// The reason.
         source: Box<FormatError>,
     },
 }
 
-/// Why the bytes of a file are no policy.
+/// The reason why a file is not a valid policy file.
 #[derive(Debug, thiserror::Error)]
 pub enum FormatError {
-    /// Not a safetensors file, or one that was cut short.
-    #[error("not a whole safetensors file")]
+    /// The file is not a safetensors file, or it is truncated.
+    #[error("not a complete safetensors file")]
     NotSafetensors {
-        /// What the parser said.
+        /// Error of the parser.
         source: safetensors::SafeTensorError,
     },
-    /// A metadata entry that every policy file has is missing.
+    /// A required metadata entry is missing.
     #[error("metadata {key:?} is missing")]
     MissingMetadata {
-        /// The entry.
+        /// Key of the entry.
         key: &'static str,
     },
-    /// A metadata entry has a value that this version cannot use.
+    /// A metadata entry has a value that this version does not support.
     #[error("metadata {key:?} is {got:?}, expected {expected}")]
     Metadata {
-        /// The entry.
+        /// Key of the entry.
         key: &'static str,
         /// Its value.
         got: String,
-        /// What it may be.
+        /// Supported values.
         expected: String,
     },
     /// A tensor is missing.
     #[error("tensor {name:?} is missing")]
     MissingTensor {
-        /// The tensor.
+        /// Name of the tensor.
         name: String,
     },
-    /// A tensor is none of this format's: ignoring it could change what the policy does.
+    /// A tensor is not part of the format. It is not ignored, because it could change the policy's behaviour.
     #[error("tensor {name:?} is unknown")]
     UnknownTensor {
-        /// The tensor.
+        /// Name of the tensor.
         name: String,
     },
-    /// A tensor has another type or shape than the sizes ask for.
+    /// A tensor does not have the type or shape that follows from the sizes.
     #[error("tensor {name:?} is {got}, expected {expected}")]
     TensorShape {
-        /// The tensor.
+        /// Name of the tensor.
         name: String,
         /// Its type and shape.
         got: String,
-        /// What the sizes ask for.
+        /// Required type and shape.
         expected: String,
     },
-    /// The numbers were read but cannot be used.
+    /// A size or a number is invalid.
     #[error(transparent)]
     Unusable(#[from] Error),
-    /// The tensors are not those that were written.
+    /// The tensors were changed after the file was written.
     #[error("the tensors' digest is {got}, the file was written with {expected}")]
     Digest {
         /// Digest of the tensors as read.

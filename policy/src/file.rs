@@ -1,14 +1,14 @@
-//! The policy file: one safetensors file. `docs/policy-format.md` says what stands in it and how to compute with it.
+//! The policy file, a safetensors file. `docs/policy-format.md` specifies the format.
 
 use std::collections::BTreeMap;
-use std::fs::{self, File};
-use std::io::{self, Write as _};
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use safetensors::tensor::TensorView;
 use safetensors::{Dtype, SafeTensors};
 use serde_json::{Map, Value, json};
+use tandem_core::text::shortened;
 use tandem_core::{Layout, Task};
+use tandem_system::{atomic_file, regular_file};
 
 use crate::error::{Error, FormatError};
 use crate::mlp::MlpShape;
@@ -18,44 +18,42 @@ use crate::policy::{MAX_HEADS, MAX_HIDDEN, MAX_HIDDEN_LAYERS, Policy, little_end
 #[cfg(test)]
 mod tests;
 
-/// What metadata `format` says.
+/// Value of the metadata entry `format`.
 pub const FORMAT: &str = "tandem-policy";
-/// What metadata `format_version` says; another version is refused.
+/// Value of the metadata entry `format_version`. Files of other versions are refused.
 pub const FORMAT_VERSION: &str = "1";
 
 const MAX_ARMS: usize = 64;
-/// The largest networks that a run file can ask for take half of it.
-const MAX_BYTES: u64 = 4 << 30;
-/// Letters of a file's own words that a refusal repeats; a digest has 64.
+/// Largest number of characters of a file's entry in an error message. A digest has 64.
 const MAX_SHOWN_CHARS: usize = 80;
-/// The header's length is a little-endian `u64`, and headers are filled up to this many bytes.
+/// Headers are padded to a multiple of this number of bytes. A header's length precedes it as a little-endian `u64`.
 const HEADER_ALIGNMENT: usize = 8;
 
 impl Policy {
-    /// Writes the policy to `path`, whole or not at all.
+    /// Writes the policy to `path` atomically.
     ///
     /// # Errors
-    /// When a number cannot be used (see [`Policy::check`]) or the file cannot be written.
+    /// Returns an error if the policy is invalid (see [`Policy::check`]) or the file cannot be written.
     pub fn save(&self, path: &Path) -> Result<(), Error> {
         self.check()?;
-        write_atomically(path, &encode(self))
+        atomic_file::replace(path, &encode(self))
             .map_err(|source| Error::Write { path: path.to_owned(), source })
     }
 
-    /// Reads the policy that `path` holds.
+    /// Reads a policy from `path`.
     ///
     /// # Errors
-    /// When there is no such file, it was cut short or altered, has another format or version, or any tensor does
-    /// not fit the task, the arms and the networks' sizes.
+    /// Returns an error if the file cannot be read, was truncated or altered, has another format or version, or if a
+    /// tensor does not match the task, the number of arms and the networks' sizes.
     pub fn load(path: &Path) -> Result<Self, Error> {
-        let bytes =
-            read_regular(path).map_err(|source| Error::Read { path: path.to_owned(), source })?;
+        let bytes = regular_file::read(path)
+            .map_err(|source| Error::Read { path: path.to_owned(), source })?;
         decode(&bytes)
             .map_err(|source| Error::Refused { path: path.to_owned(), source: Box::new(source) })
     }
 }
 
-/// The bytes of a policy file; equal policies give equal bytes.
+/// Encodes a policy file. Equal policies give equal bytes.
 fn encode(policy: &Policy) -> Vec<u8> {
     let mut header = Map::new();
     header.insert("__metadata__".to_owned(), json!(metadata(policy)));
@@ -75,14 +73,14 @@ fn encode(policy: &Policy) -> Vec<u8> {
     bytes
 }
 
-/// The policy's own metadata and the format's entries.
+/// Returns the policy's own metadata and the entries that the format defines.
 fn metadata(policy: &Policy) -> BTreeMap<String, String> {
     let mut metadata = policy.metadata.clone();
     metadata.extend(reserved(policy).map(|(key, value)| (key.to_owned(), value)));
     metadata
 }
 
-/// The format's entries in the order in which a reader checks them.
+/// Returns the entries that the format defines, in the order in which a reader checks them.
 fn reserved(policy: &Policy) -> [(&'static str, String); 15] {
     let layout = policy.layout;
     [
@@ -120,7 +118,7 @@ fn decode(bytes: &[u8]) -> Result<Policy, FormatError> {
     check_reserved(policy)
 }
 
-/// Reads sizes and tensors; the sizes are believed only as far as the tensors bear them out.
+/// Reads sizes and tensors. Every tensor must have the shape that follows from the sizes.
 fn read_policy(
     file: &SafeTensors<'_>,
     metadata: BTreeMap<String, String>,
@@ -155,18 +153,25 @@ fn read_policy(
     })
 }
 
-/// Compares the format's entries with what this version writes for the same tensors, then drops them from the
-/// policy's own. A file without a digest is taken as it is: other programs may write one.
+/// Compares the entries that the format defines with those that this version writes for the same tensors, and removes
+/// them from the policy's metadata. The digest may be missing, as in files of other programs.
 fn check_reserved(mut policy: Policy) -> Result<Policy, FormatError> {
     for (key, expected) in reserved(&policy) {
         match (key, policy.metadata.remove(key)) {
             (_, Some(got)) if got == expected => {}
             ("digest", None) => {}
             ("digest", Some(written)) => {
-                return Err(FormatError::Digest { got: expected, expected: shortened(&written) });
+                return Err(FormatError::Digest {
+                    got: expected,
+                    expected: shortened(&written, MAX_SHOWN_CHARS),
+                });
             }
             (_, Some(got)) => {
-                return Err(FormatError::Metadata { key, got: shortened(&got), expected });
+                return Err(FormatError::Metadata {
+                    key,
+                    got: shortened(&got, MAX_SHOWN_CHARS),
+                    expected,
+                });
             }
             (_, None) => return Err(FormatError::MissingMetadata { key }),
         }
@@ -190,14 +195,21 @@ fn expect_entry(
     if got == expected {
         return Ok(());
     }
-    Err(FormatError::Metadata { key, got: shortened(got), expected: format!("{expected:?}") })
+    Err(FormatError::Metadata {
+        key,
+        got: shortened(got, MAX_SHOWN_CHARS),
+        expected: format!("{expected:?}"),
+    })
 }
 
 fn parse_task(metadata: &BTreeMap<String, String>) -> Result<Task, FormatError> {
     let got = entry(metadata, "task")?;
     let expected = || Task::ALL.map(Task::name).join(" or ");
-    let refusal =
-        |_unknown| FormatError::Metadata { key: "task", got: shortened(got), expected: expected() };
+    let refusal = |_unknown| FormatError::Metadata {
+        key: "task",
+        got: shortened(got, MAX_SHOWN_CHARS),
+        expected: expected(),
+    };
     got.parse().map_err(refusal)
 }
 
@@ -211,13 +223,13 @@ fn parse_size(
         Ok(size) if (1..=most).contains(&size) => Ok(size),
         _ => Err(FormatError::Metadata {
             key,
-            got: shortened(got),
+            got: shortened(got, MAX_SHOWN_CHARS),
             expected: format!("1 to {most}"),
         }),
     }
 }
 
-/// A network's parameters: its tensors one after another.
+/// Reads a network's parameters, the concatenation of its tensors.
 fn read_network(
     file: &SafeTensors<'_>,
     prefix: &str,
@@ -261,42 +273,7 @@ fn refuse_unknown_tensors(file: &SafeTensors<'_>, policy: &Policy) -> Result<(),
     let mut names = file.names();
     names.sort_unstable();
     match names.into_iter().find(|name| !known.iter().any(|known| known == name)) {
-        Some(name) => Err(FormatError::UnknownTensor { name: shortened(name) }),
+        Some(name) => Err(FormatError::UnknownTensor { name: shortened(name, MAX_SHOWN_CHARS) }),
         None => Ok(()),
     }
-}
-
-/// The beginning of a text of the file's that may be of any length.
-fn shortened(text: &str) -> String {
-    match text.char_indices().nth(MAX_SHOWN_CHARS) {
-        Some((end, _)) => format!("{}...", &text[..end]),
-        None => text.to_owned(),
-    }
-}
-
-/// Reads a regular file: a pipe or a device may never end, and opening a pipe waits for its writer.
-fn read_regular(path: &Path) -> io::Result<Vec<u8>> {
-    let file = fs::metadata(path)?;
-    if !file.is_file() && !file.is_dir() {
-        return Err(io::Error::new(io::ErrorKind::InvalidInput, "it is not a regular file"));
-    }
-    if file.len() > MAX_BYTES {
-        return Err(io::Error::new(io::ErrorKind::FileTooLarge, "it has more than 4 GiB"));
-    }
-    fs::read(path)
-}
-
-/// Writes beside `path` and renames, so that `path` is always a whole file, old or new.
-fn write_atomically(path: &Path, bytes: &[u8]) -> io::Result<()> {
-    let file_name = path.file_name().ok_or(io::ErrorKind::InvalidFilename)?;
-    let mut temporary_name = file_name.to_owned();
-    temporary_name.push(format!(".{}.tmp", std::process::id()));
-    let temporary: PathBuf = path.with_file_name(temporary_name);
-    let written = File::create(&temporary)
-        .and_then(|mut file| file.write_all(bytes).and_then(|()| file.sync_all()))
-        .and_then(|()| fs::rename(&temporary, path));
-    if written.is_err() {
-        drop(fs::remove_file(&temporary));
-    }
-    written
 }

@@ -1,4 +1,4 @@
-//! Actor and critic as workers, teachers and evaluations use them: a few observations at a time.
+//! Actor and critic for inference on a few observations at a time.
 
 use tandem_core::Layout;
 use tandem_core::work::PublishedActor;
@@ -8,9 +8,9 @@ use crate::error::Error;
 use crate::mlp::MlpShape;
 use crate::normalizer::NormalizerSnapshot;
 use crate::packed::{MAX_ROWS, PackedMlp};
-use crate::policy::{check_network_size, check_normalizer, check_parameters};
+use crate::validation::{check_network_size, check_normalizer, check_parameters};
 
-/// How observations and goals are normalised before a network sees them.
+/// Normalisation of observations and goals for the input of a network.
 #[derive(Debug, Clone)]
 struct Inputs {
     layout: Layout,
@@ -33,7 +33,7 @@ impl Inputs {
         Ok(Self { layout, observation, goal })
     }
 
-    /// How many rows `observations` and `goals` have.
+    /// Returns the number of rows of `observations` and `goals`.
     fn n_rows(&self, observations: &[f32], goals: &[f32]) -> usize {
         let n_rows = observations.len() / self.layout.n_observation();
         let expected = (n_rows * self.layout.n_observation(), n_rows * self.layout.n_goal());
@@ -55,9 +55,9 @@ impl Inputs {
     }
 }
 
-/// Chooses actions.
+/// An actor, which chooses actions.
 ///
-/// An observation gives the same bits whatever batch it stands in, on every machine with fused multiply-add.
+/// The action for an observation has the same bits in any batch, and on every machine with fused multiply-add.
 #[derive(Debug, Clone)]
 pub struct Actor {
     version: u64,
@@ -66,10 +66,10 @@ pub struct Actor {
 }
 
 impl Actor {
-    /// The actor that a learner published.
+    /// Creates an actor from parameters that a learner published.
     ///
     /// # Errors
-    /// When the parameters do not fit `layout` or are not finite.
+    /// Returns an error if the parameters do not match `layout` or are not finite.
     pub fn new(layout: Layout, published: PublishedActor) -> Result<Self, Error> {
         let PublishedActor { version, n_hidden, n_hidden_layers, actor, .. } = published;
         check_network_size(n_hidden, n_hidden_layers)?;
@@ -82,23 +82,23 @@ impl Actor {
         Ok(Self { version, inputs, network: PackedMlp::new(&shape, &actor) })
     }
 
-    /// The published version that these parameters are.
+    /// Returns the version under which the parameters were published.
     #[must_use]
     pub const fn version(&self) -> u64 {
         self.version
     }
 
-    /// Task and arms that the actor is for.
+    /// Returns the task and the number of arms.
     #[must_use]
     pub const fn layout(&self) -> Layout {
         self.inputs.layout
     }
 
-    /// Writes the actions, in [-1, 1], shape `[n, n_action]`, for `observations`, shape `[n, n_observation]`, and
+    /// Writes the actions, in [−1, 1], shape `[n, n_action]`, for `observations`, shape `[n, n_observation]`, and
     /// `goals`, shape `[n, n_goal]`.
     ///
     /// # Panics
-    /// When the lengths do not fit the layout or each other.
+    /// If the lengths do not match the layout or each other.
     pub fn act(&mut self, observations: &[f32], goals: &[f32], actions: &mut [f32]) {
         let n_rows = self.inputs.n_rows(observations, goals);
         let n_action = self.inputs.layout.n_action();
@@ -120,9 +120,9 @@ impl Actor {
     }
 }
 
-/// Values actions: expected discounted reward, one number per head.
+/// A critic, which estimates the expected discounted return of actions, one number per head.
 ///
-/// As for [`Actor`], the batch does not enter a row's bits.
+/// As for [`Actor`], the bits of a row do not depend on the batch.
 #[derive(Debug, Clone)]
 pub struct Critic {
     n_heads: usize,
@@ -131,10 +131,10 @@ pub struct Critic {
 }
 
 impl Critic {
-    /// A critic with `shape`'s parameters for inputs normalised by `observation` and `goal`.
+    /// Creates a critic from `parameters`, shape `[n_parameters]` of `shape`, with the normalisation of its inputs.
     ///
     /// # Errors
-    /// When the parameters do not fit `layout` or are not finite.
+    /// Returns an error if the parameters do not match `layout` or are not finite.
     pub fn new(
         layout: Layout,
         shape: &MlpShape,
@@ -157,7 +157,7 @@ impl Critic {
         Ok(Self { n_heads: shape.n_output, inputs, network: PackedMlp::new(shape, parameters) })
     }
 
-    /// Values per action: 1, or one per arm.
+    /// Returns the number of values per action: 1, or one per arm.
     #[must_use]
     pub const fn n_heads(&self) -> usize {
         self.n_heads
@@ -167,7 +167,7 @@ impl Critic {
     /// `[n, n_observation]`, and `goals`, shape `[n, n_goal]`.
     ///
     /// # Panics
-    /// When the lengths do not fit the layout or each other.
+    /// If the lengths do not match the layout or each other.
     pub fn q(&mut self, observations: &[f32], goals: &[f32], actions: &[f32], q: &mut [f32]) {
         let n_rows = self.inputs.n_rows(observations, goals);
         let (n_action, n_heads) = (self.inputs.layout.n_action(), self.n_heads);
@@ -207,7 +207,7 @@ mod tests {
     }
 
     #[test]
-    fn a_long_batch_is_the_same_as_its_rows_one_by_one() {
+    fn a_batch_gives_the_same_bits_as_its_rows_one_by_one() {
         let policy = Policy::sample(Layout::new(Task::PickAndPlace, 2), 2);
         let layout = policy.layout;
         let (n_observation, n_goal, n_action) =
@@ -233,7 +233,7 @@ mod tests {
     }
 
     #[test]
-    fn the_critic_sees_the_action() {
+    fn a_value_depends_on_its_own_action_only() {
         let policy = Policy::sample(Layout::new(Task::Push, 1), 1);
         let [observations, goals, mut actions] = inputs(policy.layout);
         let mut critic = policy.critic().unwrap();
@@ -247,7 +247,7 @@ mod tests {
     }
 
     #[test]
-    fn parameters_that_do_not_fit_are_refused() {
+    fn parameters_that_do_not_match_are_refused() {
         let policy = Policy::sample(Layout::new(Task::Push, 1), 1);
         let check = |spoil: fn(&mut PublishedActor), expected: &str| {
             let mut published = policy.published(3);

@@ -1,4 +1,4 @@
-//! Matrices inside flat slices, and their product.
+//! Matrices as views of flat slices, and their product.
 
 #[cfg(miri)]
 mod interpreted;
@@ -9,7 +9,7 @@ use gemm::gemm;
 use interpreted::gemm;
 use pulp::Arch;
 
-/// A matrix that reads from a slice; any strides.
+/// A read-only view of a slice as a matrix, with any strides.
 #[derive(Debug, Clone, Copy)]
 pub struct Matrix<'a> {
     data: &'a [f32],
@@ -20,26 +20,26 @@ pub struct Matrix<'a> {
 }
 
 impl<'a> Matrix<'a> {
-    /// A row-major matrix without gaps.
+    /// Creates a contiguous row-major matrix of shape `[n_rows, n_cols]`.
     ///
     /// # Panics
-    /// When `data` is too short.
+    /// If `data` is too short or a dimension is 0.
     #[must_use]
     pub fn new(data: &'a [f32], n_rows: usize, n_cols: usize) -> Self {
         Self::with_stride(data, n_rows, n_cols, n_cols)
     }
 
-    /// A row-major matrix whose rows start `row_stride` apart.
+    /// Creates a row-major matrix of shape `[n_rows, n_cols]` whose rows start `row_stride` numbers apart.
     ///
     /// # Panics
-    /// When `data` is too short.
+    /// If `data` is too short or a dimension is 0.
     #[must_use]
     pub fn with_stride(data: &'a [f32], n_rows: usize, n_cols: usize, row_stride: usize) -> Self {
         assert!(fits(data.len(), n_rows, n_cols, row_stride), "a matrix larger than its data");
         Self { data, n_rows, n_cols, row_stride, col_stride: 1 }
     }
 
-    /// The same numbers with rows and columns exchanged.
+    /// Returns the transpose, a view of the same numbers.
     #[must_use]
     pub const fn transposed(self) -> Self {
         Self {
@@ -51,14 +51,14 @@ impl<'a> Matrix<'a> {
         }
     }
 
-    /// Number of rows.
+    /// Returns the number of rows.
     #[must_use]
     pub const fn n_rows(&self) -> usize {
         self.n_rows
     }
 }
 
-/// A row-major matrix that writes into a slice.
+/// A mutable view of a slice as a row-major matrix.
 #[derive(Debug)]
 pub struct MatrixMut<'a> {
     data: &'a mut [f32],
@@ -68,19 +68,19 @@ pub struct MatrixMut<'a> {
 }
 
 impl<'a> MatrixMut<'a> {
-    /// A matrix without gaps.
+    /// Creates a contiguous matrix of shape `[n_rows, n_cols]`.
     ///
     /// # Panics
-    /// When `data` is too short.
+    /// If `data` is too short or a dimension is 0.
     #[must_use]
     pub fn new(data: &'a mut [f32], n_rows: usize, n_cols: usize) -> Self {
         Self::with_stride(data, n_rows, n_cols, n_cols)
     }
 
-    /// A matrix whose rows start `row_stride` apart.
+    /// Creates a matrix of shape `[n_rows, n_cols]` whose rows start `row_stride` numbers apart.
     ///
     /// # Panics
-    /// When `data` is too short or rows overlap.
+    /// If `data` is too short, rows overlap or a dimension is 0.
     #[must_use]
     pub fn with_stride(
         data: &'a mut [f32],
@@ -93,14 +93,14 @@ impl<'a> MatrixMut<'a> {
         Self { data, n_rows, n_cols, row_stride }
     }
 
-    /// The rows, in order.
+    /// Returns the rows, in order.
     pub fn rows_mut(&mut self) -> impl Iterator<Item = &mut [f32]> {
         let n_cols = self.n_cols;
         self.data.chunks_mut(self.row_stride).take(self.n_rows).map(move |row| &mut row[..n_cols])
     }
 }
 
-/// Whether the last element of a row-major matrix lies within `len` numbers.
+/// Returns `true` if the last element of a row-major matrix lies within `len` numbers.
 fn fits(len: usize, n_rows: usize, n_cols: usize, row_stride: usize) -> bool {
     n_rows > 0
         && n_cols > 0
@@ -110,13 +110,13 @@ fn fits(len: usize, n_rows: usize, n_cols: usize, row_stride: usize) -> bool {
             .is_some_and(|end| end <= len)
 }
 
-/// `product = lhs · rhs` on one thread.
+/// Computes `product = lhs · rhs` on the calling thread.
 ///
-/// The kernel is chosen at run time for the processor at hand. On one machine the result depends on nothing but the
-/// operands; another machine may add up in another order.
+/// The kernel is chosen at run time for the processor. On one machine, the result depends on the operands only; a
+/// machine with another instruction set may sum in another order.
 ///
 /// # Panics
-/// When the shapes do not match.
+/// If the shapes do not match.
 pub fn multiply(product: &mut MatrixMut<'_>, lhs: Matrix<'_>, rhs: Matrix<'_>) {
     let shapes = (product.n_rows, lhs.n_cols, rhs.n_cols);
     assert_eq!(
@@ -156,7 +156,7 @@ pub fn multiply(product: &mut MatrixMut<'_>, lhs: Matrix<'_>, rhs: Matrix<'_>) {
 /// Writes the transpose of `source`, shape `[n_rows, n_cols]`, to `transposed`, shape `[n_cols, n_rows]`.
 ///
 /// # Panics
-/// When a slice is too short.
+/// If a slice is too short.
 pub(crate) fn transpose(source: &[f32], transposed: &mut [f32], n_rows: usize, n_cols: usize) {
     Arch::new().dispatch(|| transpose_kernel(source, transposed, n_rows, n_cols));
 }
@@ -183,10 +183,10 @@ fn transpose_kernel(source: &[f32], transposed: &mut [f32], n_rows: usize, n_col
     }
 }
 
-/// Side of a square that fits the registers.
+/// Side of a square tile that fits the registers.
 const TILE: usize = 16;
 
-/// Transposes one square; rows of `source` and of `transposed` start a stride apart.
+/// Transposes one tile. Rows of `source` and of `transposed` start their stride apart.
 #[inline(always)]
 fn transpose_tile(
     source: &[f32],
@@ -227,7 +227,7 @@ mod tests {
     }
 
     #[test]
-    fn a_transpose_has_every_number_in_its_place() {
+    fn a_transpose_exchanges_rows_and_columns() {
         for (n_rows, n_cols) in [(1, 3), (16, 16), (33, 50), (256, 62)] {
             let source: Vec<f32> = (0..n_rows * n_cols).map(|i| i as f32).collect();
             let mut transposed = vec![0.0; source.len()];

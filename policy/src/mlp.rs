@@ -1,4 +1,4 @@
-//! A multilayer perceptron over batches: ReLU between layers, linear output, gradients by hand.
+//! Multilayer perceptrons over batches: ReLU between layers, linear output, hand-written gradients.
 
 use std::ops::Range;
 
@@ -9,30 +9,31 @@ use tandem_core::rng::uniform;
 use crate::elementwise::{add_bias, add_bias_relu, column_sums, mask, mask_and_sum};
 use crate::matrix::{Matrix, MatrixMut, multiply, transpose};
 
-/// Sizes of a network: input, equal hidden layers, output.
+/// The sizes of a network: input, hidden layers of equal width, output.
 ///
-/// Its parameters are one flat vector: per layer the weight, shape `[out, in]`, then the bias, shape `[out]`.
+/// Its parameters are one flat vector: for each layer the weight, shape `[out, in]`, then the bias, shape `[out]`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct MlpShape {
     /// Length of an input row.
     pub n_input: usize,
     /// Units of each hidden layer.
     pub n_hidden: usize,
-    /// Hidden layers.
+    /// Number of hidden layers.
     pub n_hidden_layers: usize,
     /// Length of an output row.
     pub n_output: usize,
 }
 
 impl MlpShape {
-    /// An actor: normalised observation and goal to an action before its tanh.
+    /// Returns the shape of an actor, which maps normalised observation and goal to an action before its tanh.
     #[must_use]
     pub const fn actor(layout: Layout, n_hidden: usize, n_hidden_layers: usize) -> Self {
         let n_input = layout.n_observation() + layout.n_goal();
         Self { n_input, n_hidden, n_hidden_layers, n_output: layout.n_action() }
     }
 
-    /// A critic: normalised observation and goal, then the action, to one value per head.
+    /// Returns the shape of a critic, which maps normalised observation and goal, then the action, to one value per
+    /// head.
     #[must_use]
     pub const fn critic(
         layout: Layout,
@@ -44,45 +45,45 @@ impl MlpShape {
         Self { n_input, n_hidden, n_hidden_layers, n_output: n_heads }
     }
 
-    /// Length of the parameter vector.
+    /// Returns the length of the parameter vector.
     #[must_use]
     pub const fn n_parameters(&self) -> usize {
         self.layer_start(self.n_layers())
     }
 
-    /// Hidden layers and the output layer.
+    /// Returns the number of layers: the hidden layers and the output layer.
     #[must_use]
     pub const fn n_layers(&self) -> usize {
         self.n_hidden_layers + 1
     }
 
-    /// Length of the rows that layer `layer` takes.
+    /// Returns the length of an input row of layer `layer`.
     #[must_use]
     pub const fn layer_input(&self, layer: usize) -> usize {
         if layer == 0 { self.n_input } else { self.n_hidden }
     }
 
-    /// Length of the rows that layer `layer` gives.
+    /// Returns the length of an output row of layer `layer`.
     #[must_use]
     pub const fn layer_output(&self, layer: usize) -> usize {
         if layer == self.n_hidden_layers { self.n_output } else { self.n_hidden }
     }
 
-    /// Where the weight of layer `layer`, shape `[out, in]`, stands among the parameters.
+    /// Returns the range of the weight of layer `layer`, shape `[out, in]`, within the parameters.
     #[must_use]
     pub const fn weight(&self, layer: usize) -> Range<usize> {
         let start = self.layer_start(layer);
         start..start + self.layer_input(layer) * self.layer_output(layer)
     }
 
-    /// Where the bias of layer `layer`, shape `[out]`, stands among the parameters.
+    /// Returns the range of the bias of layer `layer`, shape `[out]`, within the parameters.
     #[must_use]
     pub const fn bias(&self, layer: usize) -> Range<usize> {
         let start = self.weight(layer).end;
         start..start + self.layer_output(layer)
     }
 
-    /// Fresh parameters: Xavier-uniform weights, zero biases.
+    /// Draws initial parameters: Xavier-uniform weights (Glorot & Bengio 2010) and zero biases, shape `[n_parameters]`.
     #[must_use]
     pub fn initialise(&self, rng: &mut ChaCha8Rng) -> Vec<f32> {
         let mut parameters = vec![0.0; self.n_parameters()];
@@ -114,21 +115,21 @@ impl MlpShape {
     }
 }
 
-/// Memory for the passes of one network over at most `max_batch` rows.
+/// Scratch memory for the passes of one network over at most `max_batch` rows.
 ///
-/// A forward pass leaves its hidden activations here for the backward pass that follows.
+/// A forward pass stores its hidden activations here for the backward passes that follow.
 #[derive(Debug, Clone)]
 pub struct Workspace {
-    /// Per hidden layer, after its ReLU, shape `[max_batch, n_hidden]`.
+    /// Activations of each hidden layer after its ReLU, shape `[max_batch, n_hidden]`.
     hidden: Vec<Vec<f32>>,
-    /// Gradients by a layer's output and by its input, each `[max_batch, n_hidden or n_output]`.
+    /// Gradients with respect to a layer's output and input, each `[max_batch, n_hidden or n_output]`.
     deltas: [Vec<f32>; 2],
-    /// A layer's weight, shape `[in, out]`: a product with it is faster than one with a transposed view.
+    /// The transposed weight of a layer, shape `[in, out]`. A product with it is faster than with a transposed view.
     weight: Vec<f32>,
 }
 
 impl Workspace {
-    /// Memory for `shape` and batches of up to `max_batch` rows.
+    /// Allocates memory for `shape` and batches of up to `max_batch` rows.
     #[must_use]
     pub fn new(shape: &MlpShape, max_batch: usize) -> Self {
         let widest = shape.n_hidden.max(shape.n_output);
@@ -144,7 +145,7 @@ impl Workspace {
 /// Computes `output`, shape `[batch, n_output]`, from `input`, shape `[batch, n_input]`.
 ///
 /// # Panics
-/// When a size does not fit `shape` or the batch is larger than the workspace's.
+/// If a size does not match `shape` or the batch exceeds the workspace.
 pub fn forward(
     shape: &MlpShape,
     parameters: &[f32],
@@ -169,7 +170,7 @@ pub fn forward(
     add_bias(output, &parameters[shape.bias(last)]);
 }
 
-/// The weight of layer `layer` as a matrix of shape `[in, out]`, written to `memory`.
+/// Writes the weight of layer `layer` to `memory` as a matrix of shape `[in, out]`, and returns it.
 fn transposed_weight<'a>(
     shape: &MlpShape,
     parameters: &[f32],
@@ -181,11 +182,13 @@ fn transposed_weight<'a>(
     Matrix::new(memory, n_in, n_out)
 }
 
-/// Computes the loss's gradient by the parameters, shape `[n_parameters]`, from its gradient by the output, shape
-/// `[batch, n_output]`. `workspace` comes from the forward pass of the same `input`.
+/// Computes the gradient of the loss with respect to the parameters, shape `[n_parameters]`, from its gradient with
+/// respect to the output, shape `[batch, n_output]`.
+///
+/// `workspace` must hold the activations of a [`forward`] pass over the same `input`.
 ///
 /// # Panics
-/// When a size does not fit `shape` or the batch is larger than the workspace's.
+/// If a size does not match `shape` or the batch exceeds the workspace.
 pub fn backward_parameters(
     shape: &MlpShape,
     parameters: &[f32],
@@ -224,11 +227,13 @@ pub fn backward_parameters(
     }
 }
 
-/// Computes the loss's gradient by the input's `columns`, shape `[batch, columns.len()]`, from its gradient by the
-/// output, shape `[batch, n_output]`. `workspace` comes from the forward pass.
+/// Computes the gradient of the loss with respect to the input's `columns`, shape `[batch, columns.len()]`, from its
+/// gradient with respect to the output, shape `[batch, n_output]`.
+///
+/// `workspace` must hold the activations of a [`forward`] pass.
 ///
 /// # Panics
-/// When a size does not fit `shape` or the batch is larger than the workspace's.
+/// If a size does not match `shape` or the batch exceeds the workspace.
 pub fn backward_input(
     shape: &MlpShape,
     parameters: &[f32],
@@ -272,7 +277,7 @@ mod tests {
     const N_ROWS: usize = 4;
 
     #[test]
-    fn the_layers_parts_cover_the_parameters_once() {
+    fn weights_and_biases_cover_the_parameters_once() {
         let parts =
             (0..SHAPE.n_layers()).flat_map(|layer| [SHAPE.weight(layer), SHAPE.bias(layer)]);
         assert_eq!(
@@ -283,7 +288,7 @@ mod tests {
     }
 
     #[test]
-    fn fresh_weights_fill_xaviers_range_and_biases_are_zero() {
+    fn initial_weights_fill_the_xavier_range_and_biases_are_zero() {
         let parameters = SHAPE.initialise(&mut episode_rng(1, 0, Stream::Initialisation));
         let bound = (6.0_f32 / 12.0).sqrt();
         let largest = parameters[SHAPE.weight(0)]
@@ -293,7 +298,7 @@ mod tests {
         assert_eq!(parameters[SHAPE.bias(1)], [0.0; 7]);
     }
 
-    /// The slow, obvious network in double precision.
+    /// A slow and simple forward pass in double precision.
     fn reference(parameters: &[f64], input: &[f64]) -> Vec<f64> {
         let mut row = input.to_vec();
         for layer in 0..SHAPE.n_layers() {
@@ -308,13 +313,13 @@ mod tests {
         row
     }
 
-    /// A loss that is linear in the output, so that its gradient by the output is `slopes`.
+    /// A loss that is linear in the output, so its gradient with respect to the output is `slopes`.
     fn loss(parameters: &[f64], input: &[f64], slopes: &[f32]) -> f64 {
         let outputs = input.chunks(SHAPE.n_input).flat_map(|row| reference(parameters, row));
         outputs.zip(slopes).map(|(output, slope)| output * f64::from(*slope)).sum()
     }
 
-    /// The loss's slope along each of `at`'s coordinates, by central differences.
+    /// The gradient of `loss` at `at`, by central differences.
     fn differences(at: &[f64], loss: impl Fn(&[f64]) -> f64) -> Vec<f64> {
         const STEP: f64 = 1e-6;
         let along = |i: usize, step: f64| {
@@ -336,7 +341,7 @@ mod tests {
     }
 
     #[test]
-    fn both_passes_agree_with_double_precision_and_finite_differences() {
+    fn passes_agree_with_double_precision_and_finite_differences() {
         let mut rng = episode_rng(2, 0, Stream::Initialisation);
         let mut parameters = SHAPE.initialise(&mut rng);
         for layer in 0..SHAPE.n_layers() {

@@ -1,30 +1,30 @@
-//! Running mean and standard deviation of a network's inputs.
+//! Input normalisation with a running mean and standard deviation.
 
-/// No standard deviation counts as smaller than this.
+/// Lower bound on standard deviations.
 pub const STD_FLOOR: f32 = 0.01;
 /// Normalised numbers are clipped to `[-CLIP, CLIP]`.
 pub const CLIP: f32 = 5.0;
 
-/// Mean and standard deviation as they are at one moment.
+/// The mean and standard deviation by which inputs are normalised.
 #[derive(Debug, Clone, PartialEq)]
 pub struct NormalizerSnapshot {
-    /// Shape `[size]`.
+    /// Mean of each column, shape `[size]`.
     pub mean: Vec<f32>,
-    /// Shape `[size]`, above 0.
+    /// Standard deviation of each column, shape `[size]`, positive.
     pub std: Vec<f32>,
 }
 
 impl NormalizerSnapshot {
-    /// Leaves numbers as they are, up to clipping.
+    /// Creates the normalisation with mean 0 and standard deviation 1, which only clips.
     #[must_use]
     pub fn identity(size: usize) -> Self {
         Self { mean: vec![0.0; size], std: vec![1.0; size] }
     }
 
-    /// `clip((raw - mean) / std)`, shape `[size]`.
+    /// Writes `clip((raw - mean) / std, -CLIP, CLIP)` to `normalized`. Both rows have shape `[size]`.
     ///
     /// # Panics
-    /// When a length differs.
+    /// If a row has another length.
     pub fn normalize(&self, raw: &[f32], normalized: &mut [f32]) {
         let size = self.mean.len();
         assert_eq!((raw.len(), normalized.len()), (size, size), "a row of another size");
@@ -36,47 +36,47 @@ impl NormalizerSnapshot {
     }
 }
 
-/// What a [`Normalizer`] has seen, for checkpoints.
+/// The state of a [`Normalizer`], for checkpoints.
 #[derive(Debug, Clone, PartialEq)]
-pub struct NormalizerParts {
-    /// Rows seen.
+pub struct NormalizerState {
+    /// Number of rows.
     pub count: u64,
     /// Sum of each column, shape `[size]`.
     pub sum: Vec<f64>,
-    /// Sum of each column's squares, shape `[size]`.
+    /// Sum of squares of each column, shape `[size]`.
     pub sum_of_squares: Vec<f64>,
 }
 
-/// Mean and standard deviation of every row seen so far.
+/// The running mean and standard deviation of all rows so far.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Normalizer {
-    parts: NormalizerParts,
+    state: NormalizerState,
     snapshot: NormalizerSnapshot,
 }
 
 impl Normalizer {
-    /// A normaliser for rows of `size` numbers; until it has seen one it only clips.
+    /// Creates a normaliser for rows of `size` numbers. Without data it only clips.
     #[must_use]
     pub fn new(size: usize) -> Self {
-        let parts =
-            NormalizerParts { count: 0, sum: vec![0.0; size], sum_of_squares: vec![0.0; size] };
-        Self { parts, snapshot: NormalizerSnapshot::identity(size) }
+        let state =
+            NormalizerState { count: 0, sum: vec![0.0; size], sum_of_squares: vec![0.0; size] };
+        Self { state, snapshot: NormalizerSnapshot::identity(size) }
     }
 
-    /// Goes on from stored parts.
+    /// Creates a normaliser from stored state.
     ///
     /// # Panics
-    /// When the two sums differ in length.
+    /// If the two sums differ in length.
     #[must_use]
-    pub fn from_parts(parts: NormalizerParts) -> Self {
-        assert_eq!(parts.sum.len(), parts.sum_of_squares.len(), "sums of different sizes");
-        let snapshot = NormalizerSnapshot::identity(parts.sum.len());
-        let mut normalizer = Self { parts, snapshot };
+    pub fn from_state(state: NormalizerState) -> Self {
+        assert_eq!(state.sum.len(), state.sum_of_squares.len(), "sums of different sizes");
+        let snapshot = NormalizerSnapshot::identity(state.sum.len());
+        let mut normalizer = Self { state, snapshot };
         normalizer.refresh();
         normalizer
     }
 
-    /// Goes on as if `count` rows with `snapshot`'s means and standard deviations had been seen.
+    /// Creates a normaliser as if it had seen `count` rows with the mean and standard deviation of `snapshot`.
     #[must_use]
     pub fn from_snapshot(snapshot: &NormalizerSnapshot, count: u64) -> Self {
         let rows = count as f64;
@@ -85,54 +85,54 @@ impl Normalizer {
         let square = |x: f32| f64::from(x) * f64::from(x);
         let sum_of_squares =
             columns().map(|(mean, std)| (square(*mean) + square(*std)) * rows).collect();
-        Self::from_parts(NormalizerParts { count, sum, sum_of_squares })
+        Self::from_state(NormalizerState { count, sum, sum_of_squares })
     }
 
-    /// What was seen.
+    /// Returns the state, for checkpoints.
     #[must_use]
-    pub const fn parts(&self) -> &NormalizerParts {
-        &self.parts
+    pub const fn state(&self) -> &NormalizerState {
+        &self.state
     }
 
-    /// Takes in rows, shape `[n, size]`.
+    /// Adds rows to the statistics, shape `[n, size]`.
     ///
     /// # Panics
-    /// When the last row is cut short.
+    /// If the length of `rows` is not a multiple of `size`.
     pub fn update(&mut self, rows: &[f32]) {
-        let size = self.parts.sum.len();
+        let size = self.state.sum.len();
         assert_eq!(rows.len() % size, 0, "a row of another size");
         for row in rows.chunks_exact(size) {
-            let sums = self.parts.sum.iter_mut().zip(&mut self.parts.sum_of_squares);
+            let sums = self.state.sum.iter_mut().zip(&mut self.state.sum_of_squares);
             for ((sum, sum_of_squares), x) in sums.zip(row) {
                 *sum += f64::from(*x);
                 *sum_of_squares += f64::from(*x) * f64::from(*x);
             }
-            self.parts.count += 1;
+            self.state.count += 1;
         }
         self.refresh();
     }
 
-    /// Mean and standard deviation now.
+    /// Returns the current mean and standard deviation.
     #[must_use]
     pub const fn snapshot(&self) -> &NormalizerSnapshot {
         &self.snapshot
     }
 
-    /// Normalises one row, shape `[size]`, as [`NormalizerSnapshot::normalize`] does.
+    /// Normalises one row, shape `[size]`; see [`NormalizerSnapshot::normalize`].
     ///
     /// # Panics
-    /// When a length differs.
+    /// If a row has another length.
     pub fn normalize(&self, raw: &[f32], normalized: &mut [f32]) {
         self.snapshot.normalize(raw, normalized);
     }
 
     #[expect(clippy::cast_possible_truncation, reason = "means of f32 numbers are within f32")]
     fn refresh(&mut self) {
-        if self.parts.count == 0 {
+        if self.state.count == 0 {
             return;
         }
-        let count = self.parts.count as f64;
-        let sums = self.parts.sum.iter().zip(&self.parts.sum_of_squares);
+        let count = self.state.count as f64;
+        let sums = self.state.sum.iter().zip(&self.state.sum_of_squares);
         for ((mean, std), (sum, sum_of_squares)) in
             self.snapshot.mean.iter_mut().zip(&mut self.snapshot.std).zip(sums)
         {
@@ -156,7 +156,7 @@ mod tests {
     }
 
     #[test]
-    fn it_agrees_with_a_two_pass_computation() {
+    fn running_statistics_agree_with_a_two_pass_computation() {
         let rows = rows();
         let mut normalizer = Normalizer::new(3);
         normalizer.update(&rows[..300]);
@@ -178,7 +178,7 @@ mod tests {
     }
 
     #[test]
-    fn a_constant_column_hits_the_floor_and_outliers_the_clip() {
+    fn standard_deviations_have_a_floor_and_outliers_are_clipped() {
         let mut normalizer = Normalizer::new(3);
         normalizer.update(&rows());
         let mut normalized = [0.0; 3];
@@ -195,14 +195,14 @@ mod tests {
     }
 
     #[test]
-    fn a_normalizer_survives_being_taken_apart() {
+    fn a_normalizer_is_restored_from_its_state() {
         let mut normalizer = Normalizer::new(3);
         normalizer.update(&rows());
-        assert_eq!(Normalizer::from_parts(normalizer.parts().clone()), normalizer);
+        assert_eq!(Normalizer::from_state(normalizer.state().clone()), normalizer);
     }
 
     #[test]
-    fn a_snapshot_goes_on_as_the_rows_that_it_came_from_would() {
+    fn a_normalizer_from_a_snapshot_weighs_it_like_its_rows() {
         let snapshot = NormalizerSnapshot { mean: vec![0.3, -2.0], std: vec![0.5, 1.5] };
         let mut normalizer = Normalizer::from_snapshot(&snapshot, 1000);
         for (got, expected) in [

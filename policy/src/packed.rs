@@ -1,19 +1,19 @@
-//! A network rearranged for a few rows at a time.
+//! A memory layout of a network for inference on a few rows at a time.
 //!
-//! Every output is one chain of fused multiply-adds over the inputs in order, starting from the bias. Neither the
-//! number of rows nor the width of the vector registers enters it, so a row gives the same bits in any batch and on
-//! any machine that rounds a fused multiply-add correctly.
+//! Every output is a chain of fused multiply-adds over the inputs in order, starting from the bias. The chain does not
+//! depend on the number of rows or the width of the vector registers, so a row gives the same bits in any batch and on
+//! any machine with a correctly rounded fused multiply-add.
 
 use pulp::{Arch, Simd, WithSimd};
 
 use crate::mlp::MlpShape;
 
-/// Rows that one pass takes at most.
+/// Largest number of rows of a pass.
 pub(crate) const MAX_ROWS: usize = 32;
-/// Outputs computed side by side.
+/// Number of outputs computed side by side.
 const PANEL: usize = 32;
 
-/// Outputs of a layer in groups of [`PANEL`], the last one filled up with zeros.
+/// The parameters of a layer, with outputs in groups of [`PANEL`]; the last group is padded with zeros.
 #[derive(Debug, Clone)]
 struct PackedLayer {
     n_input: usize,
@@ -23,17 +23,17 @@ struct PackedLayer {
     biases: Vec<[f32; PANEL]>,
 }
 
-/// A network's parameters, packed, and the memory for a pass.
+/// The packed parameters of a network, and the memory for a pass.
 #[derive(Debug, Clone)]
 pub(crate) struct PackedMlp {
     layers: Vec<PackedLayer>,
     n_input: usize,
     n_output: usize,
-    /// Numbers from one row of `input` or `output` to the next.
+    /// Distance between rows of `input` and of `output`, in numbers.
     row_stride: usize,
-    /// Rows that go into a layer, shape `[MAX_ROWS, row_stride]`.
+    /// Input rows of a layer, shape `[MAX_ROWS, row_stride]`.
     input: Vec<f32>,
-    /// Rows that come out of a layer, shape `[MAX_ROWS, row_stride]`.
+    /// Output rows of a layer, shape `[MAX_ROWS, row_stride]`.
     output: Vec<f32>,
 }
 
@@ -54,19 +54,19 @@ impl PackedMlp {
         }
     }
 
-    /// Where row `row_idx`, shape `[n_input]`, is to be written before [`Self::run`].
+    /// Returns input row `row_idx`, shape `[n_input]`, to be filled before [`Self::run`].
     pub(crate) fn input_row(&mut self, row_idx: usize) -> &mut [f32] {
         let start = row_idx * self.row_stride;
         &mut self.input[start..start + self.n_input]
     }
 
-    /// What row `row_idx` gave in [`Self::run`], shape `[n_output]`.
+    /// Returns output row `row_idx`, shape `[n_output]`, after [`Self::run`].
     pub(crate) fn output_row(&self, row_idx: usize) -> &[f32] {
         let start = row_idx * self.row_stride;
         &self.output[start..start + self.n_output]
     }
 
-    /// Passes the first `n_rows` rows, at most [`MAX_ROWS`], through the network.
+    /// Passes the first `n_rows` input rows, at most [`MAX_ROWS`], through the network.
     pub(crate) fn run(&mut self, n_rows: usize) {
         Arch::new().dispatch(Pass { network: self, n_rows });
     }
@@ -76,14 +76,14 @@ impl PackedMlp {
         for (layer_idx, layer) in self.layers.iter().enumerate() {
             if layer_idx > 0 {
                 std::mem::swap(&mut self.input, &mut self.output);
-                rectify(&mut self.input[..n_rows * self.row_stride]);
+                relu(&mut self.input[..n_rows * self.row_stride]);
             }
             layer.apply(&self.input, &mut self.output, self.row_stride, n_rows);
         }
     }
 }
 
-/// What [`PackedMlp::run`] has compiled for each instruction set: a closure as long as this would stay a call.
+/// The pass that [`PackedMlp::run`] compiles for each instruction set. A closure of this size would not be inlined.
 struct Pass<'a> {
     network: &'a mut PackedMlp,
     n_rows: usize,
@@ -136,7 +136,7 @@ impl PackedLayer {
     }
 }
 
-/// Computes one panel of outputs for `ROWS` rows; gives back `ROWS`.
+/// Computes one panel of outputs for `ROWS` rows and returns `ROWS`.
 #[inline(always)]
 fn tile<const ROWS: usize>(
     weights: &[[f32; PANEL]],
@@ -163,7 +163,7 @@ fn tile<const ROWS: usize>(
 }
 
 #[inline(always)]
-fn rectify(rows: &mut [f32]) {
+fn relu(rows: &mut [f32]) {
     for x in rows {
         *x = x.max(0.0);
     }
@@ -180,7 +180,7 @@ mod tests {
 
     const SHAPE: MlpShape = MlpShape { n_input: 31, n_hidden: 70, n_hidden_layers: 3, n_output: 4 };
 
-    /// A network and `MAX_ROWS` rows of input.
+    /// A network, its parameters and `MAX_ROWS` input rows.
     fn network() -> (PackedMlp, Vec<f32>, Vec<f32>) {
         let mut rng = episode_rng(3, 0, Stream::Initialisation);
         let mut parameters = SHAPE.initialise(&mut rng);
@@ -221,12 +221,12 @@ mod tests {
         assert_eq!(
             dispatched,
             outputs(&mut network, &rows, PackedMlp::pass),
-            "baseline instructions only"
+            "baseline instructions"
         );
     }
 
     #[test]
-    fn it_agrees_with_the_forward_pass_that_learning_uses() {
+    fn packed_inference_agrees_with_the_forward_pass_of_training() {
         let (mut network, parameters, rows) = network();
         let packed = outputs(&mut network, &rows, PackedMlp::run);
         let mut learned = vec![0.0; packed.len()];

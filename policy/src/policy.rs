@@ -1,91 +1,86 @@
-//! A whole policy: both networks, how their inputs are normalised, and how it came to be.
+//! A policy: actor and critic, the normalisation of their inputs, and metadata.
 
 use std::collections::BTreeMap;
-use std::fmt::Write as _;
 
 use sha2::{Digest as _, Sha256};
 use tandem_core::Layout;
+use tandem_core::text::hex;
 use tandem_core::work::PublishedActor;
 
-use crate::elementwise::all_finite;
 use crate::error::Error;
 use crate::inference::{Actor, Critic};
 use crate::mlp::MlpShape;
 use crate::normalizer::NormalizerSnapshot;
+use crate::validation::{check_network_size, check_normalizer, check_parameters, check_size};
 
-/// Most units of a layer that are accepted.
-pub const MAX_HIDDEN: usize = 1 << 14;
-/// Most hidden layers that are accepted.
-pub const MAX_HIDDEN_LAYERS: usize = 64;
-/// Most heads of a critic that are accepted.
-pub const MAX_HEADS: usize = 64;
+pub use crate::validation::{MAX_HEADS, MAX_HIDDEN, MAX_HIDDEN_LAYERS};
 
-/// Everything that chooses and values actions.
+/// A trained policy: the networks that choose and value actions, with everything needed to evaluate them.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Policy {
     /// Task and arms.
     pub layout: Layout,
-    /// Units of each hidden layer, of both networks.
+    /// Units of each hidden layer of both networks.
     pub n_hidden: usize,
-    /// Hidden layers of both networks.
+    /// Number of hidden layers of both networks.
     pub n_hidden_layers: usize,
-    /// Values that the critic gives: 1, or one per arm.
+    /// Number of values that the critic returns: 1, or one per arm.
     pub n_heads: usize,
-    /// Parameters of the shape [`Policy::actor_shape`].
+    /// Parameters of the actor, shape `[n_parameters]` of [`Policy::actor_shape`].
     pub actor: Vec<f32>,
-    /// Parameters of the shape [`Policy::critic_shape`].
+    /// Parameters of the critic, shape `[n_parameters]` of [`Policy::critic_shape`].
     pub critic: Vec<f32>,
-    /// How observations are normalised.
+    /// Normalisation of observations, shape `[n_observation]`.
     pub observation_normalizer: NormalizerSnapshot,
-    /// How goals are normalised.
+    /// Normalisation of goals, shape `[n_goal]`.
     pub goal_normalizer: NormalizerSnapshot,
-    /// How the policy was trained and how it did. The format's own entries are not among them.
+    /// Free-form entries about training and success rates. The entries that the file format defines are not included.
     pub metadata: BTreeMap<String, String>,
 }
 
 /// One named array of a policy.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Tensor<'a> {
-    /// Its name in a policy file.
+    /// Name in a policy file.
     pub name: String,
-    /// Its shape; row-major.
+    /// Shape, row-major.
     pub shape: Vec<usize>,
-    /// Its numbers.
+    /// Numbers, in row-major order.
     pub data: &'a [f32],
 }
 
 impl Policy {
-    /// The actor's sizes.
+    /// Returns the sizes of the actor.
     #[must_use]
     pub const fn actor_shape(&self) -> MlpShape {
         MlpShape::actor(self.layout, self.n_hidden, self.n_hidden_layers)
     }
 
-    /// The critic's sizes.
+    /// Returns the sizes of the critic.
     #[must_use]
     pub const fn critic_shape(&self) -> MlpShape {
         MlpShape::critic(self.layout, self.n_hidden, self.n_hidden_layers, self.n_heads)
     }
 
-    /// What chooses actions.
+    /// Creates the actor, which chooses actions.
     ///
     /// # Errors
-    /// When a vector has the wrong length or holds a number that cannot be used.
+    /// Returns an error if a vector has the wrong length or contains an invalid number.
     pub fn actor(&self) -> Result<Actor, Error> {
         Actor::new(self.layout, self.published(0))
     }
 
-    /// What values actions.
+    /// Creates the critic, which values actions.
     ///
     /// # Errors
-    /// When a vector has the wrong length or holds a number that cannot be used.
+    /// Returns an error if a vector has the wrong length or contains an invalid number.
     pub fn critic(&self) -> Result<Critic, Error> {
         let (observation, goal) =
             (self.observation_normalizer.clone(), self.goal_normalizer.clone());
         Critic::new(self.layout, &self.critic_shape(), &self.critic, observation, goal)
     }
 
-    /// The actor as a learner hands it to its workers, under the number `version`.
+    /// Returns the actor in the form that a learner publishes to workers, as version `version`.
     #[must_use]
     pub fn published(&self, version: u64) -> PublishedActor {
         PublishedActor {
@@ -100,10 +95,11 @@ impl Policy {
         }
     }
 
-    /// Checks what the types cannot.
+    /// Validates sizes, lengths and numbers.
     ///
     /// # Errors
-    /// When a vector has the wrong length or holds a number that cannot be used.
+    /// Returns an error if a size is out of range, a vector has the wrong length, a number is not finite, or a standard
+    /// deviation is not positive.
     pub fn check(&self) -> Result<(), Error> {
         check_network_size(self.n_hidden, self.n_hidden_layers)?;
         check_size("n_heads", self.n_heads, MAX_HEADS)?;
@@ -118,10 +114,10 @@ impl Policy {
         check_normalizer(["goal mean", "goal std"], &self.goal_normalizer, n_goal)
     }
 
-    /// All tensors in their fixed order: actor, critic, observation and goal normaliser.
+    /// Returns all tensors in the order of the file format: actor, critic, observation and goal normalisation.
     ///
     /// # Panics
-    /// When [`Policy::check`] would fail.
+    /// If a parameter vector is too short for its network; see [`Policy::check`].
     #[must_use]
     pub fn tensors(&self) -> Vec<Tensor<'_>> {
         let mut tensors = network_tensors("actor", &self.actor_shape(), &self.actor);
@@ -140,10 +136,11 @@ impl Policy {
         tensors
     }
 
-    /// SHA-256 over all tensors in their fixed order, each as its name and its little-endian numbers; hexadecimal.
+    /// Computes the SHA-256 digest over the names and little-endian numbers of all [`tensors`](Self::tensors), in
+    /// hexadecimal.
     ///
     /// # Panics
-    /// When [`Policy::check`] would fail.
+    /// If a parameter vector is too short for its network; see [`Policy::check`].
     #[must_use]
     pub fn digest(&self) -> String {
         let mut hasher = Sha256::new();
@@ -151,14 +148,11 @@ impl Policy {
             hasher.update(tensor.name.as_bytes());
             hasher.update(little_endian(tensor.data));
         }
-        hasher.finalize().iter().fold(String::new(), |mut text, byte| {
-            write!(text, "{byte:02x}").expect("a string takes any text");
-            text
-        })
+        hex(&hasher.finalize())
     }
 }
 
-/// The tensors that a network's flat parameters consist of, in their order.
+/// Splits a network's flat parameters into the tensors of its layers.
 fn network_tensors<'a>(prefix: &str, shape: &MlpShape, parameters: &'a [f32]) -> Vec<Tensor<'a>> {
     let layer_tensors = |layer| {
         let (n_out, n_in) = (shape.layer_output(layer), shape.layer_input(layer));
@@ -175,48 +169,14 @@ fn network_tensors<'a>(prefix: &str, shape: &MlpShape, parameters: &'a [f32]) ->
     (0..shape.n_layers()).flat_map(layer_tensors).collect()
 }
 
-/// The bytes of `numbers` as files and digests have them.
+/// Encodes `numbers` as little-endian bytes, as in files and digests.
 pub(crate) fn little_endian(numbers: &[f32]) -> Vec<u8> {
     numbers.iter().flat_map(|number| number.to_le_bytes()).collect()
 }
 
-pub(crate) fn check_network_size(n_hidden: usize, n_hidden_layers: usize) -> Result<(), Error> {
-    check_size("n_hidden", n_hidden, MAX_HIDDEN)?;
-    check_size("n_hidden_layers", n_hidden_layers, MAX_HIDDEN_LAYERS)
-}
-
-const fn check_size(name: &'static str, got: usize, most: usize) -> Result<(), Error> {
-    if got == 0 || got > most { Err(Error::Size { name, got, most }) } else { Ok(()) }
-}
-
-pub(crate) fn check_parameters(
-    name: &'static str,
-    parameters: &[f32],
-    expected: usize,
-) -> Result<(), Error> {
-    if parameters.len() != expected {
-        return Err(Error::WrongLength { name, got: parameters.len(), expected });
-    }
-    if all_finite(parameters) { Ok(()) } else { Err(Error::NotFinite { name }) }
-}
-
-pub(crate) fn check_normalizer(
-    [mean, std]: [&'static str; 2],
-    normalizer: &NormalizerSnapshot,
-    size: usize,
-) -> Result<(), Error> {
-    check_parameters(mean, &normalizer.mean, size)?;
-    check_parameters(std, &normalizer.std, size)?;
-    if normalizer.std.iter().all(|std| *std > 0.0) {
-        Ok(())
-    } else {
-        Err(Error::NotPositive { name: std })
-    }
-}
-
 #[cfg(test)]
 impl Policy {
-    /// A small policy with arbitrary numbers, two hidden layers of 32 units.
+    /// Creates a small policy with arbitrary numbers and two hidden layers of 32 units.
     pub(crate) fn sample(layout: Layout, n_heads: usize) -> Self {
         use tandem_core::rng::uniform;
         use tandem_core::{Stream, episode_rng};

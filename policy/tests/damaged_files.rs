@@ -1,4 +1,4 @@
-//! Policy files that were damaged, cut, rewritten or made up: refused by name, and never read as another policy.
+//! Damaged, truncated and forged policy files are refused with a reason and never load as a different policy.
 
 use std::collections::BTreeMap;
 use std::error::Error as _;
@@ -15,7 +15,7 @@ use serde_json::{Map, Value, json};
 use tandem_core::{Layout, Task};
 use tandem_policy::{Error, FormatError, MlpShape, NormalizerSnapshot, Policy};
 
-/// A policy of few numbers, no two of them equal.
+/// A small policy whose numbers are all different.
 fn policy() -> Policy {
     let layout = Layout::new(Task::Push, 1);
     let (actor, critic) = (MlpShape::actor(layout, 3, 1), MlpShape::critic(layout, 3, 1, 1));
@@ -43,7 +43,7 @@ fn policy() -> Policy {
     }
 }
 
-/// The policy's file.
+/// The file of this policy.
 fn whole() -> Vec<u8> {
     static WHOLE: LazyLock<Vec<u8>> = LazyLock::new(|| {
         let directory = tempfile::tempdir().expect("a directory");
@@ -54,7 +54,7 @@ fn whole() -> Vec<u8> {
     WHOLE.clone()
 }
 
-/// What loading these bytes gives; a refusal names the file, and what is wrong, in a line of readable length.
+/// Loads a policy from `bytes`. An error must name the file and give a reason of readable length.
 fn load(bytes: &[u8]) -> Result<Policy, FormatError> {
     let mut file = tempfile::Builder::new().prefix("policy-").tempfile().expect("a file");
     file.write_all(bytes).expect("written");
@@ -68,13 +68,13 @@ fn load(bytes: &[u8]) -> Result<Policy, FormatError> {
     })
 }
 
-/// Whether two policies act and value alike, however they came to be.
-fn alike(one: &Policy, other: &Policy) -> bool {
+/// Returns `true` if two policies are equal except for their metadata.
+fn equal_networks(one: &Policy, other: &Policy) -> bool {
     Policy { metadata: BTreeMap::new(), ..one.clone() }
         == Policy { metadata: BTreeMap::new(), ..other.clone() }
 }
 
-/// The file's header and the numbers behind it.
+/// Splits a file into its header and its numbers.
 fn split(bytes: &[u8]) -> (Map<String, Value>, &[u8]) {
     let (length, rest) = bytes.split_first_chunk::<8>().expect("a length");
     let n_bytes = usize::try_from(u64::from_le_bytes(*length)).expect("a small header");
@@ -87,7 +87,7 @@ fn joined(header: &str, numbers: &[u8]) -> Vec<u8> {
 }
 
 #[test]
-fn a_bit_that_flips_never_makes_another_policy() {
+fn a_flipped_bit_never_gives_a_different_policy() {
     let whole = whole();
     let n_header = 8 + usize::from(u16::from_le_bytes([whole[0], whole[1]]));
     let mut bytes = whole.clone();
@@ -97,7 +97,7 @@ fn a_bit_that_flips_never_makes_another_policy() {
             match load(&bytes) {
                 Ok(loaded) => {
                     assert!(at < n_header, "number at byte {at}, bit {bit}");
-                    assert!(alike(&loaded, &policy()), "byte {at}, bit {bit}");
+                    assert!(equal_networks(&loaded, &policy()), "byte {at}, bit {bit}");
                 }
                 Err(FormatError::Digest { .. }) => {}
                 Err(error) => {
@@ -111,10 +111,10 @@ fn a_bit_that_flips_never_makes_another_policy() {
 }
 
 #[test]
-fn a_file_that_is_cut_or_prolonged_is_no_policy() {
+fn truncated_and_extended_files_are_refused() {
     let whole = whole();
     for n_bytes in 0..whole.len() {
-        let error = load(&whole[..n_bytes]).expect_err("cut");
+        let error = load(&whole[..n_bytes]).expect_err("truncated");
         assert!(matches!(error, FormatError::NotSafetensors { .. }), "{n_bytes} bytes: {error}");
     }
     for n_more in [1, 4, 4096] {
@@ -123,7 +123,7 @@ fn a_file_that_is_cut_or_prolonged_is_no_policy() {
 }
 
 #[test]
-fn headers_that_lie_about_their_length_are_refused() {
+fn headers_with_a_wrong_length_are_refused() {
     let whole = whole();
     for length in [0, 1, 7, 100_000_001, 1 << 40, u64::MAX - 7, u64::MAX] {
         let bytes = [&length.to_le_bytes(), &whole[8..]].concat();
@@ -136,7 +136,7 @@ fn headers_that_lie_about_their_length_are_refused() {
 }
 
 #[test]
-fn a_tensor_that_stands_in_the_header_twice_does_no_harm() {
+fn a_duplicate_tensor_never_gives_a_different_policy() {
     let whole = whole();
     let (header, numbers) = split(&whole);
     let text = Value::Object(header.clone()).to_string();
@@ -146,14 +146,14 @@ fn a_tensor_that_stands_in_the_header_twice_does_no_harm() {
         for second in [entry.to_string(), other.to_string()] {
             let doubled = text.replacen('{', &format!("{{{name:?}:{second},"), 1);
             if let Ok(loaded) = load(&joined(&doubled, numbers)) {
-                assert!(alike(&loaded, &policy()), "{name}: {second}");
+                assert!(equal_networks(&loaded, &policy()), "{name}: {second}");
             }
         }
     }
 }
 
 #[test]
-fn numbers_in_another_type_are_refused() {
+fn tensors_of_another_type_are_refused() {
     let whole = whole();
     for dtype in ["F16", "BF16", "F64", "I32", "U32", "I64", "BOOL", "F8_E4M3", "f32", "", "X"] {
         let (mut header, numbers) = split(&whole);
@@ -168,7 +168,7 @@ fn numbers_in_another_type_are_refused() {
 }
 
 #[test]
-fn a_reason_is_short_however_long_the_entry() {
+fn reasons_are_short_for_long_entries() {
     let whole = whole();
     let long = "long ".repeat(50_000);
     for key in ["format", "format_version", "task", "n_arms", "n_hidden", "activation", "digest"] {
@@ -185,10 +185,12 @@ fn a_reason_is_short_however_long_the_entry() {
 }
 
 #[test]
-fn every_policy_that_ships_carries_its_digest() {
+fn every_shipped_policy_has_its_digest() {
     let directory = Path::new(env!("CARGO_MANIFEST_DIR")).join("../policies");
     let mut n_policies = 0;
-    for path in std::fs::read_dir(directory).expect("ships").flatten().map(|entry| entry.path()) {
+    for path in
+        std::fs::read_dir(directory).expect("shipped policies").flatten().map(|entry| entry.path())
+    {
         let loaded = Policy::load(&path).expect("usable");
         let (header, _) = {
             let bytes = std::fs::read(&path).expect("readable");
@@ -201,7 +203,7 @@ fn every_policy_that_ships_carries_its_digest() {
     assert!(n_policies >= 3);
 }
 
-/// A place in a header's JSON and what is put there.
+/// A change of a header's JSON.
 #[derive(Debug, Clone)]
 enum Edit {
     Remove(usize),
@@ -279,18 +281,18 @@ proptest! {
     #![proptest_config(ProptestConfig { cases: 1500, failure_persistence: None, ..ProptestConfig::default() })]
 
     #[test]
-    fn a_rewritten_header_never_makes_another_policy(edits in vec(any_edit(), 1..4)) {
+    fn an_edited_header_never_gives_a_different_policy(edits in vec(any_edit(), 1..4)) {
         let whole = whole();
         let (mut header, numbers) = split(&whole);
         edits.into_iter().for_each(|edit| apply(&mut header, edit));
         let bytes = joined(&Value::Object(header).to_string(), numbers);
         if let Ok(loaded) = load(&bytes) {
-            prop_assert!(alike(&loaded, &policy()));
+            prop_assert!(equal_networks(&loaded, &policy()));
         }
     }
 
     #[test]
-    fn bytes_at_random_are_no_policy(bytes in vec(any::<u8>(), 0..200), n_header in 0_u64..64) {
+    fn random_bytes_are_refused(bytes in vec(any::<u8>(), 0..200), n_header in 0_u64..64) {
         prop_assert!(load(&bytes).is_err());
         prop_assert!(load(&[&n_header.to_le_bytes(), bytes.as_slice()].concat()).is_err());
     }

@@ -1,22 +1,22 @@
-//! Matrix products at the very ends of their slices. Under a sanitizer or Miri, an access one number too far fails.
+//! Matrix products whose operands end with their slices. Under a sanitizer or Miri, an access beyond the end fails.
 
 use tandem_policy::{Matrix, MatrixMut, multiply};
 
-/// Sizes on both sides of the kernels' tiles; Miri interprets every access, so it gets fewer.
+/// Sizes below and above those of the kernels' tiles. Miri interprets every access, so it runs fewer.
 const SIZES: &[usize] = if cfg!(miri) { &[1, 2, 5] } else { &[1, 2, 3, 7, 8, 9, 16, 17, 31, 33] };
 
-/// Numbers that differ, so that no two places can be confused.
+/// Numbers that distinguish neighbouring elements.
 fn numbers(n: usize) -> Box<[f32]> {
-    // A boxed slice has no spare capacity behind its end.
+    // A boxed slice has no spare capacity beyond its end.
     (0..n).map(|i| (i % 13) as f32 - 6.0).collect()
 }
 
-/// The numbers that a row-major matrix spans whose rows start `row_stride` apart: none after the last row's end.
+/// Returns the length of a row-major matrix whose rows start `row_stride` apart, without padding after the last row.
 fn span(n_rows: usize, n_cols: usize, row_stride: usize) -> usize {
     (n_rows - 1) * row_stride + n_cols
 }
 
-/// The product's element at (`row`, `col`) by the definition.
+/// Computes an element of the product by definition.
 fn element(lhs: impl Fn(usize) -> f32, rhs: impl Fn(usize) -> f32, n_inner: usize) -> f32 {
     (0..n_inner).map(|inner| lhs(inner) * rhs(inner)).sum()
 }
@@ -52,7 +52,7 @@ fn check_product([n_rows, n_inner, n_cols]: [usize; 3], gap: usize, transposed: 
 }
 
 #[test]
-fn a_product_stays_within_slices_that_end_with_the_last_number() {
+fn a_product_stays_within_its_slices() {
     for n_rows in SIZES {
         for n_inner in SIZES {
             for n_cols in SIZES {
@@ -65,7 +65,7 @@ fn a_product_stays_within_slices_that_end_with_the_last_number() {
 }
 
 #[test]
-fn slices_that_are_one_number_short_are_refused() {
+fn slices_that_are_one_number_too_short_are_refused() {
     let refuses = |n_rows: usize, n_cols: usize, row_stride: usize| {
         let mut short = numbers(span(n_rows, n_cols, row_stride) - 1);
         let reads = std::panic::catch_unwind(|| {

@@ -1,6 +1,6 @@
-//! `teacher.proto`: what is asked of a teacher and what it answers.
+//! Conversions for `teacher.proto`: queries to a teacher and its advice.
 
-use tandem_core::bounds::LARGEST_MAGNITUDE;
+use tandem_core::bounds::MAX_MAGNITUDE;
 use tandem_core::layout::OBSERVATION_PER_ARM;
 use tandem_core::{ArmAdvice, Layout, StepAdvice, StepQuery, Task};
 
@@ -8,16 +8,16 @@ use crate::error::DecodeError;
 use crate::numbers::{actions, bounded, one_finite, one_within};
 use crate::pb;
 
-/// Arms that a layout on the wire may have: an episode keeps one bit an arm.
+/// Largest number of arms of a layout. An episode has one bit per arm and step.
 pub const MAX_ARMS: usize = 8;
 
-/// Bytes that an account's name may have.
+/// Largest length of an account's name, bytes.
 const MAX_NAME_BYTES: usize = 256;
 
-/// The name of an account, in field `field`, when it is one.
+/// Checks the name of an account, from field `field`.
 ///
 /// # Errors
-/// When the name is empty or longer than 256 bytes.
+/// Returns an error if the name is empty or longer than 256 bytes.
 pub fn decode_account_name(field: &str, name: String) -> Result<String, DecodeError> {
     match name.len() {
         1..=MAX_NAME_BYTES => Ok(name),
@@ -27,10 +27,10 @@ pub fn decode_account_name(field: &str, name: String) -> Result<String, DecodeEr
     }
 }
 
-/// The layout of the student that asks, as far as the length of its observation tells.
+/// Derives the layout of a student from the length of its observation.
 ///
 /// # Errors
-/// When no layout of 1 to [`MAX_ARMS`] arms has observations of that length.
+/// Returns an error if no layout of 1 to [`MAX_ARMS`] arms has observations of this length.
 pub fn layout_of_query(query: &pb::StepQuery, task: Task) -> Result<Layout, DecodeError> {
     let n_numbers = query.observation.len();
     let n_arms = n_numbers / OBSERVATION_PER_ARM;
@@ -42,7 +42,7 @@ pub fn layout_of_query(query: &pb::StepQuery, task: Task) -> Result<Layout, Deco
     Err(DecodeError::new("observation", expected, format_args!("{n_numbers} numbers")))
 }
 
-/// A query as a message.
+/// Encodes a query.
 #[must_use]
 pub fn encode_query(query: &StepQuery) -> pb::StepQuery {
     pb::StepQuery {
@@ -54,16 +54,16 @@ pub fn encode_query(query: &StepQuery) -> pb::StepQuery {
     }
 }
 
-/// The query of a student with `layout`.
+/// Decodes the query of a student with `layout`.
 ///
-/// Any step is taken: how long an episode may be is the matter of whoever keeps its account.
+/// Any step number is valid; the teacher's account limits the length of an episode.
 ///
 /// # Errors
-/// When a vector has the wrong length, a number is not finite or beyond [`LARGEST_MAGNITUDE`], or the proposed action
-/// leaves [−1, 1].
+/// Returns an error if a vector has the wrong length, a number is not finite or beyond [`MAX_MAGNITUDE`], or the
+/// proposed action is outside [−1, 1].
 pub fn decode_query(query: pb::StepQuery, layout: Layout) -> Result<StepQuery, DecodeError> {
-    // Students of other trainers ask as well, so the bound is that of any world.
-    let largest = |_| LARGEST_MAGNITUDE;
+    // Students may be trained by other programs in other worlds, so the bound is not that of a task.
+    let largest = |_| MAX_MAGNITUDE;
     Ok(StepQuery {
         episode: query.episode,
         step: query.step,
@@ -73,7 +73,7 @@ pub fn decode_query(query: pb::StepQuery, layout: Layout) -> Result<StepQuery, D
     })
 }
 
-/// Advice as a message.
+/// Encodes advice.
 #[must_use]
 pub fn encode_advice(advice: &StepAdvice) -> pb::StepAdvice {
     pb::StepAdvice {
@@ -94,10 +94,11 @@ fn encode_arm(arm: &ArmAdvice) -> pb::ArmAdvice {
     }
 }
 
-/// The advice to a student with `layout`.
+/// Decodes advice to a student with `layout`.
 ///
 /// # Errors
-/// When a length is not the layout's, a number is not finite, an action leaves [−1, 1] or a distance is negative.
+/// Returns an error if a length does not match the layout, a number is not finite, an action is outside [−1, 1] or a
+/// distance is negative.
 pub fn decode_advice(advice: pb::StepAdvice, layout: Layout) -> Result<StepAdvice, DecodeError> {
     if advice.arms.len() != layout.n_arms {
         let expected = format_args!("{} arms", layout.n_arms).to_string();
@@ -163,7 +164,7 @@ mod tests {
         }
     }
 
-    /// The message as it is after crossing a wire.
+    /// Encodes and decodes a message.
     fn sent<M: prost::Message + Default>(message: &M) -> M {
         M::decode(message.encode_to_vec().as_slice()).unwrap()
     }
@@ -180,10 +181,10 @@ mod tests {
 
     #[test]
     fn a_malformed_query_is_refused_by_name() {
-        let check = |spoil: fn(&mut pb::StepQuery), message: &str| {
-            let mut spoilt = encode_query(&query());
-            spoil(&mut spoilt);
-            assert_eq!(decode_query(spoilt, LAYOUT).unwrap_err().to_string(), message);
+        let check = |corrupt: fn(&mut pb::StepQuery), message: &str| {
+            let mut malformed = encode_query(&query());
+            corrupt(&mut malformed);
+            assert_eq!(decode_query(malformed, LAYOUT).unwrap_err().to_string(), message);
         };
         check(|q| q.observation.truncate(55), "observation: expected 56 numbers, got 55 numbers");
         check(|q| q.goal.push(0.0), "goal: expected 6 numbers, got 7 numbers");
@@ -206,10 +207,10 @@ mod tests {
 
     #[test]
     fn malformed_advice_is_refused_by_name() {
-        let check = |spoil: fn(&mut pb::StepAdvice), message: &str| {
-            let mut spoilt = encode_advice(&advice());
-            spoil(&mut spoilt);
-            assert_eq!(decode_advice(spoilt, LAYOUT).unwrap_err().to_string(), message);
+        let check = |corrupt: fn(&mut pb::StepAdvice), message: &str| {
+            let mut malformed = encode_advice(&advice());
+            corrupt(&mut malformed);
+            assert_eq!(decode_advice(malformed, LAYOUT).unwrap_err().to_string(), message);
         };
         check(|a| a.arms.truncate(1), "arms: expected 2 arms, got 1 arms");
         check(|a| a.action[3] = 1.5, "action[3]: expected a number in [-1, 1], got 1.5");
@@ -232,7 +233,7 @@ mod tests {
     }
 
     #[test]
-    fn the_length_of_an_observation_tells_the_number_of_arms() {
+    fn the_number_of_arms_follows_from_the_length_of_an_observation() {
         let layout_of = |n_numbers| {
             layout_of_query(
                 &pb::StepQuery { observation: vec![0.0; n_numbers], ..Default::default() },
@@ -250,13 +251,13 @@ mod tests {
     }
 
     #[test]
-    fn an_account_has_a_name() {
+    fn the_name_of_an_account_has_1_to_256_bytes() {
         assert_eq!(decode_account_name("name", "run-7".to_owned()), Ok("run-7".to_owned()));
         assert!(decode_account_name("name", String::new()).is_err());
         assert!(decode_account_name("name", "x".repeat(257)).is_err());
     }
 
-    /// One `AdviseRequest` as the first version of the protocol wrote it.
+    /// An `AdviseRequest` as encoded by the first version of the protocol.
     const STORED_REQUEST: &str = "\
         0a0572756e2d3712930108ac0210071a70000000000000803e0000003f0000403f0000803f0000a03f0000c03f0000e03f00\
         00004000001040000020400000304000004040000050400000604000007040000080400000884000009040000098400000a0\

@@ -1,4 +1,4 @@
-//! How servers read requests.
+//! The codec of servers.
 
 use std::marker::PhantomData;
 
@@ -7,10 +7,10 @@ use tonic::Status;
 use tonic::codec::{Codec, DecodeBuf, Decoder};
 use tonic_prost::ProstEncoder;
 
-/// Reads requests of type `U` and writes answers of type `T`, as Protobuf.
+/// Decodes requests of type `U` and encodes responses of type `T`, as Protobuf.
 ///
-/// A request that is no `U` is the client's mistake, `INVALID_ARGUMENT`. Clients use `ProstCodec`, where an answer that
-/// cannot be decoded is `INTERNAL`.
+/// A malformed request is the client's error, so the status is `INVALID_ARGUMENT`. Clients use `ProstCodec`, which
+/// reports a malformed response as `INTERNAL`.
 #[derive(Debug)]
 pub(crate) struct RequestCodec<T, U>(PhantomData<(T, U)>);
 
@@ -39,7 +39,7 @@ where
     }
 }
 
-/// Reads requests of type `U`.
+/// Decodes requests of type `U`.
 #[derive(Debug)]
 pub(crate) struct RequestDecoder<U>(PhantomData<U>);
 

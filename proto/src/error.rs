@@ -1,33 +1,33 @@
-//! What a decoder says when it refuses a message.
+//! The error of decoders.
 
 use std::fmt::Display;
 
-/// A field that does not hold what it must.
+/// A field of a message has an invalid value.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("{field}: expected {expected}, got {got}")]
 pub struct DecodeError {
-    /// Path of the field from the message's root, as in `steps[0].observation`.
+    /// Path of the field from the root of the message, such as `steps[0].observation`.
     pub field: String,
-    /// What the field must hold.
+    /// Valid values.
     pub expected: String,
-    /// What came instead.
+    /// The received value.
     pub got: String,
 }
 
 impl DecodeError {
-    /// An error about `field`: it must hold `expected` and held `got`.
+    /// Creates an error about `field`, which must be `expected` and is `got`.
     pub fn new(field: impl Into<String>, expected: impl Display, got: impl Display) -> Self {
         Self { field: field.into(), expected: expected.to_string(), got: got.to_string() }
     }
 
-    /// The same error seen from the message that holds the erring one in field `parent`.
+    /// Prefixes the field's path with `parent`, the field of the enclosing message.
     #[must_use]
     pub fn within(mut self, parent: impl Display) -> Self {
         self.field = format!("{parent}.{}", self.field);
         self
     }
 
-    /// A sub-message that is not there.
+    /// Creates the error of a missing sub-message.
     pub(crate) fn missing(field: &str) -> Self {
         Self::new(field, "a message", "none")
     }
@@ -44,7 +44,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn an_error_names_the_whole_path() {
+    fn an_error_contains_the_path_of_the_field() {
         let error = DecodeError::new("observation", "56 numbers", "55 numbers").within("steps[3]");
         assert_eq!(error.to_string(), "steps[3].observation: expected 56 numbers, got 55 numbers");
         let status = tonic::Status::from(error);

@@ -1,13 +1,13 @@
-//! Checked numbers, and float vectors as bytes (little-endian float32).
+//! Validation of numbers, and conversion of float vectors to bytes (little-endian float32).
 
 use std::ops::RangeInclusive;
 
 use crate::error::DecodeError;
 
-/// How far an action may leave [−1, 1]: rounding on the sender's side.
+/// Tolerance for actions outside [−1, 1] because of rounding by the sender.
 const ACTION_SLACK: f32 = 1e-6;
 
-/// The bytes of `values`, little-endian.
+/// Encodes `values` as little-endian bytes.
 pub(crate) fn to_bytes(values: &[f32]) -> Vec<u8> {
     if cfg!(target_endian = "little") {
         bytemuck::cast_slice(values).to_vec()
@@ -16,7 +16,7 @@ pub(crate) fn to_bytes(values: &[f32]) -> Vec<u8> {
     }
 }
 
-/// The `n` finite numbers that `bytes` hold.
+/// Decodes `n` finite numbers.
 pub(crate) fn finite_from_bytes(
     field: &str,
     bytes: &[u8],
@@ -25,7 +25,7 @@ pub(crate) fn finite_from_bytes(
     finite(field, from_bytes(field, bytes, n)?, n)
 }
 
-/// The `n` numbers that `bytes` hold, each finite and of at most the magnitude that `largest` gives for its index.
+/// Decodes `n` finite numbers. `largest` returns the bound on the magnitude of the number at an index.
 pub(crate) fn bounded_from_bytes(
     field: &str,
     bytes: &[u8],
@@ -35,7 +35,7 @@ pub(crate) fn bounded_from_bytes(
     bounded(field, from_bytes(field, bytes, n)?, n, largest)
 }
 
-/// The `n` action components that `bytes` hold.
+/// Decodes `n` components of actions.
 pub(crate) fn actions_from_bytes(
     field: &str,
     bytes: &[u8],
@@ -47,7 +47,7 @@ pub(crate) fn actions_from_bytes(
 fn from_bytes(field: &str, bytes: &[u8], n: usize) -> Result<Vec<f32>, DecodeError> {
     let (words, rest) = bytes.as_chunks::<4>();
     if !rest.is_empty() {
-        let expected = format_args!("{} bytes, 4 a number", 4 * n).to_string();
+        let expected = format_args!("{} bytes, 4 per number", 4 * n).to_string();
         return Err(DecodeError::new(field, expected, format_args!("{} bytes", bytes.len())));
     }
     if words.len() != n {
@@ -56,12 +56,12 @@ fn from_bytes(field: &str, bytes: &[u8], n: usize) -> Result<Vec<f32>, DecodeErr
     Ok(words.iter().map(|word| f32::from_le_bytes(*word)).collect())
 }
 
-/// `values` when they are `n` finite numbers.
+/// Checks that `values` are `n` finite numbers.
 pub(crate) fn finite(field: &str, values: Vec<f32>, n: usize) -> Result<Vec<f32>, DecodeError> {
     checked(field, values, n, "a finite number", f32::is_finite)
 }
 
-/// `values` when they are `n` finite numbers, each of at most the magnitude that `largest` gives for its index.
+/// Checks that `values` are `n` finite numbers. `largest` returns the bound on the magnitude of the number at an index.
 pub(crate) fn bounded(
     field: &str,
     values: Vec<f32>,
@@ -80,12 +80,12 @@ pub(crate) fn bounded(
     }
 }
 
-/// `values` when they are `n` finite numbers above 0.
+/// Checks that `values` are `n` finite numbers above 0.
 pub(crate) fn positive(field: &str, values: Vec<f32>, n: usize) -> Result<Vec<f32>, DecodeError> {
     checked(field, values, n, "a finite number above 0", |value| value.is_finite() && value > 0.0)
 }
 
-/// `values` when they are `n` numbers in [−1, 1].
+/// Checks that `values` are `n` numbers in [−1, 1].
 pub(crate) fn actions(field: &str, values: Vec<f32>, n: usize) -> Result<Vec<f32>, DecodeError> {
     checked(field, values, n, "a number in [-1, 1]", |value| value.abs() <= 1.0 + ACTION_SLACK)
 }
@@ -110,7 +110,7 @@ fn wrong_length(field: &str, expected: usize, got: usize) -> DecodeError {
     DecodeError::new(field, format_args!("{expected} numbers"), format_args!("{got} numbers"))
 }
 
-/// `value` when it is finite.
+/// Checks that `value` is finite.
 pub(crate) fn one_finite(field: &str, value: f32) -> Result<f32, DecodeError> {
     if value.is_finite() {
         Ok(value)
@@ -119,7 +119,7 @@ pub(crate) fn one_finite(field: &str, value: f32) -> Result<f32, DecodeError> {
     }
 }
 
-/// `value` when it is a finite number of `range`.
+/// Checks that `value` is finite and in `range`.
 pub(crate) fn one_within(
     field: &str,
     value: f32,
@@ -135,7 +135,7 @@ pub(crate) fn one_within(
     Err(DecodeError::new(field, expected, value))
 }
 
-/// `value` when it is an integer of `range`.
+/// Checks that `value` is in `range`.
 pub(crate) fn count_within(
     field: &str,
     value: u32,
@@ -158,11 +158,11 @@ mod tests {
     }
 
     #[test]
-    fn what_is_wrong_with_a_vector_is_named() {
+    fn errors_name_the_index_and_the_value() {
         let check = |outcome: Result<Vec<f32>, DecodeError>, message: &str| {
             assert_eq!(outcome.unwrap_err().to_string(), message);
         };
-        check(finite_from_bytes("x", &[0; 9], 2), "x: expected 8 bytes, 4 a number, got 9 bytes");
+        check(finite_from_bytes("x", &[0; 9], 2), "x: expected 8 bytes, 4 per number, got 9 bytes");
         check(finite_from_bytes("x", &[0; 12], 2), "x: expected 2 numbers, got 3 numbers");
         check(finite("x", vec![0.0, f32::NAN], 2), "x[1]: expected a finite number, got NaN");
         check(finite("x", vec![f32::NEG_INFINITY], 1), "x[0]: expected a finite number, got -inf");
@@ -185,13 +185,13 @@ mod tests {
     }
 
     #[test]
-    fn a_number_at_its_bound_and_a_denormal_are_taken() {
+    fn numbers_at_their_bound_and_denormals_are_accepted() {
         let values = vec![2.5, -2.5, 1e-45, -0.0];
         assert_eq!(bounded("x", values.clone(), 4, |_| 2.5), Ok(values));
     }
 
     #[test]
-    fn an_action_may_leave_its_range_by_rounding_only() {
+    fn an_action_may_exceed_its_range_by_rounding_only() {
         assert!(actions("x", vec![1.0 + 5e-7, -1.0 - 5e-7], 2).is_ok());
     }
 

@@ -1,11 +1,9 @@
-//! `learner.proto`: what a learner asks of its workers and what they bring back.
+//! Conversions for `learner.proto`: work that a learner assigns, parameters, and episodes that workers return.
 
 mod episode;
 
-use tandem_core::work::{
-    EpisodeOrder, Exploration, PublishedActor, RunTerms, SlotOrder, WorldTerms,
-};
-use tandem_core::{EpisodeKind, Layout, Task};
+use tandem_core::work::{EpisodeOrder, PublishedActor, RunTerms, SlotOrder};
+use tandem_core::{EpisodeKind, Exploration, Layout, Task, WorldSettings};
 
 use crate::advice::{MAX_ARMS, decode_account_name};
 use crate::error::DecodeError;
@@ -14,31 +12,25 @@ use crate::pb;
 
 pub use episode::{decode_episode, encode_episode};
 
-/// Letters of an unknown name that a refusal repeats: it travels in a header.
+/// Largest number of characters of an unknown name in an error message, which is sent in a header.
 const MAX_SHOWN_CHARS: usize = 40;
-/// Episodes that one slot may step together.
+/// Largest number of episodes per slot.
 const MAX_SLOT_EPISODES: usize = 1024;
-/// Units that a hidden layer may have.
+/// Largest number of units per hidden layer.
 const MAX_HIDDEN: u32 = 16_384;
-/// Hidden layers that a network may have.
+/// Largest number of hidden layers.
 const MAX_HIDDEN_LAYERS: u32 = 64;
-/// Physics steps that a control step may have.
+/// Largest number of physics steps per control step.
 const MAX_SUBSTEPS: u32 = 10_000;
 
-/// The kind of an episode as a message's number.
-#[must_use]
-pub const fn encode_kind(kind: EpisodeKind) -> pb::EpisodeKind {
+const fn encode_episode_kind(kind: EpisodeKind) -> pb::EpisodeKind {
     match kind {
         EpisodeKind::Training => pb::EpisodeKind::Training,
         EpisodeKind::Evaluation => pb::EpisodeKind::Evaluation,
     }
 }
 
-/// The kind of an episode that a field `kind` holds.
-///
-/// # Errors
-/// When the number stands for no kind.
-pub fn decode_kind(kind: i32) -> Result<EpisodeKind, DecodeError> {
+fn decode_episode_kind(kind: i32) -> Result<EpisodeKind, DecodeError> {
     match pb::EpisodeKind::try_from(kind) {
         Ok(pb::EpisodeKind::Training) => Ok(EpisodeKind::Training),
         Ok(pb::EpisodeKind::Evaluation) => Ok(EpisodeKind::Evaluation),
@@ -48,34 +40,34 @@ pub fn decode_kind(kind: i32) -> Result<EpisodeKind, DecodeError> {
     }
 }
 
-/// A run's terms as a message.
+/// Encodes the terms of a run.
 ///
 /// # Panics
-/// When the layout has more than [`MAX_ARMS`] arms.
+/// If the number of arms exceeds `u32`.
 #[must_use]
-pub fn encode_terms(terms: &RunTerms) -> pb::RunTerms {
+pub fn encode_run_terms(terms: &RunTerms) -> pb::RunTerms {
     pb::RunTerms {
         task: terms.layout.task.name().to_owned(),
         n_arms: u32::try_from(terms.layout.n_arms).expect("a layout has few arms"),
         account: terms.account.clone().unwrap_or_default(),
         exploration: Some(pb::Exploration {
             noise_std: terms.exploration.noise_std,
-            random_share: terms.exploration.random_share,
-            random_hold_mean_steps: terms.exploration.random_hold_mean_steps,
+            random_share: terms.exploration.random_action_prob,
+            random_hold_mean_steps: terms.exploration.sticky_random_mean_steps,
         }),
         world: Some(pb::WorldTerms {
-            gripped_start_share: terms.world.gripped_start_share,
-            wide_start_share: terms.world.wide_start_share,
+            gripped_start_share: terms.world.grasped_start_prob,
+            wide_start_share: 0.0,
             substeps: terms.world.substeps,
         }),
     }
 }
 
-/// The terms of a run.
+/// Decodes the terms of a run.
 ///
 /// # Errors
-/// When the task is unknown, a part is missing or a number is out of its range.
-pub fn decode_terms(terms: pb::RunTerms) -> Result<RunTerms, DecodeError> {
+/// Returns an error if the task is unknown, a sub-message is missing or a number is out of range.
+pub fn decode_run_terms(terms: pb::RunTerms) -> Result<RunTerms, DecodeError> {
     let exploration = terms.exploration.ok_or_else(|| DecodeError::missing("exploration"))?;
     let world = terms.world.ok_or_else(|| DecodeError::missing("world"))?;
     let account = (!terms.account.is_empty()).then_some(terms.account);
@@ -104,26 +96,31 @@ fn decode_exploration(exploration: pb::Exploration) -> Result<Exploration, Decod
     let hold = exploration.random_hold_mean_steps;
     Ok(Exploration {
         noise_std: one_within("noise_std", exploration.noise_std, &(0.0..=f32::INFINITY))?,
-        random_share: one_within("random_share", exploration.random_share, &(0.0..=1.0))?,
-        random_hold_mean_steps: one_within("random_hold_mean_steps", hold, &(1.0..=f32::INFINITY))?,
+        random_action_prob: one_within("random_share", exploration.random_share, &(0.0..=1.0))?,
+        sticky_random_mean_steps: one_within(
+            "random_hold_mean_steps",
+            hold,
+            &(1.0..=f32::INFINITY),
+        )?,
     })
 }
 
-fn decode_world(world: pb::WorldTerms) -> Result<WorldTerms, DecodeError> {
-    Ok(WorldTerms {
-        gripped_start_share: one_within(
+fn decode_world(world: pb::WorldTerms) -> Result<WorldSettings, DecodeError> {
+    if world.wide_start_share != 0.0 {
+        let expected = "0, there are no such starts any more";
+        return Err(DecodeError::new("wide_start_share", expected, world.wide_start_share));
+    }
+    Ok(WorldSettings {
+        grasped_start_prob: one_within(
             "gripped_start_share",
             world.gripped_start_share,
             &(0.0..=1.0),
         )?,
-        wide_start_share: one_within("wide_start_share", world.wide_start_share, &(0.0..=1.0))?,
         substeps: count_within("substeps", world.substeps, &(1..=MAX_SUBSTEPS))?,
     })
 }
 
-/// An order for one episode as a message.
-#[must_use]
-pub const fn encode_order(order: &EpisodeOrder) -> pb::EpisodeOrder {
+const fn encode_episode_order(order: &EpisodeOrder) -> pb::EpisodeOrder {
     pb::EpisodeOrder {
         number: order.number,
         seed: order.seed,
@@ -133,9 +130,8 @@ pub const fn encode_order(order: &EpisodeOrder) -> pb::EpisodeOrder {
     }
 }
 
-/// An order for one episode; every value of its fields is one.
-#[must_use]
-pub const fn decode_order(order: pb::EpisodeOrder) -> EpisodeOrder {
+/// Decodes an order. All values of its fields are valid.
+const fn decode_episode_order(order: pb::EpisodeOrder) -> EpisodeOrder {
     EpisodeOrder {
         number: order.number,
         seed: order.seed,
@@ -145,21 +141,21 @@ pub const fn decode_order(order: pb::EpisodeOrder) -> EpisodeOrder {
     }
 }
 
-/// A slot's order as a message.
+/// Encodes a slot.
 #[must_use]
 pub fn encode_slot(slot: &SlotOrder) -> pb::Slot {
     pb::Slot {
         slot: slot.slot,
         parameter_version: slot.parameter_version,
-        kind: encode_kind(slot.kind).into(),
-        episodes: slot.episodes.iter().map(encode_order).collect(),
+        kind: encode_episode_kind(slot.kind).into(),
+        episodes: slot.episodes.iter().map(encode_episode_order).collect(),
     }
 }
 
-/// A slot's order.
+/// Decodes a slot.
 ///
 /// # Errors
-/// When the kind is unknown or the slot has no episode or more than 1024.
+/// Returns an error if the kind is unknown or the slot does not have 1 to 1024 episodes.
 pub fn decode_slot(slot: pb::Slot) -> Result<SlotOrder, DecodeError> {
     if !(1..=MAX_SLOT_EPISODES).contains(&slot.episodes.len()) {
         let expected = format_args!("1 to {MAX_SLOT_EPISODES} episodes").to_string();
@@ -168,15 +164,15 @@ pub fn decode_slot(slot: pb::Slot) -> Result<SlotOrder, DecodeError> {
     Ok(SlotOrder {
         slot: slot.slot,
         parameter_version: slot.parameter_version,
-        kind: decode_kind(slot.kind)?,
-        episodes: slot.episodes.into_iter().map(decode_order).collect(),
+        kind: decode_episode_kind(slot.kind)?,
+        episodes: slot.episodes.into_iter().map(decode_episode_order).collect(),
     })
 }
 
-/// An actor's parameters as a message.
+/// Encodes an actor's parameters.
 ///
 /// # Panics
-/// When a size exceeds `u32`.
+/// If a size exceeds `u32`.
 #[must_use]
 pub fn encode_actor(actor: &PublishedActor) -> pb::Parameters {
     pb::Parameters {
@@ -192,11 +188,11 @@ pub fn encode_actor(actor: &PublishedActor) -> pb::Parameters {
     }
 }
 
-/// The parameters of an actor for `layout`.
+/// Decodes the parameters of an actor for `layout`.
 ///
 /// # Errors
-/// When a length does not follow from the layout and the network's size, a number is not finite or a standard
-/// deviation is not above 0.
+/// Returns an error if a length does not match the layout and the network's size, a number is not finite or a standard
+/// deviation is not positive.
 pub fn decode_actor(
     parameters: &pb::Parameters,
     layout: Layout,
@@ -226,14 +222,15 @@ pub fn decode_actor(
     })
 }
 
-/// Weights and biases of an actor for `layout` with `n_hidden_layers` of `n_hidden` units, 1 or more layers.
+/// Returns the number of parameters of an actor for `layout` with `n_hidden_layers >= 1` hidden layers of `n_hidden`
+/// units.
 const fn n_parameters(layout: Layout, n_hidden: usize, n_hidden_layers: usize) -> usize {
     let first = (layout.n_observation() + layout.n_goal() + 1) * n_hidden;
     let inner = (n_hidden + 1) * n_hidden * (n_hidden_layers - 1);
     first + inner + (n_hidden + 1) * layout.n_action()
 }
 
-/// A checked small count as an index.
+/// Converts a count that is known to be small.
 fn to_usize(count: u32) -> usize {
     usize::try_from(count).expect("indices have 32 bits or more")
 }
@@ -250,10 +247,10 @@ mod tests {
             account: Some("run-7".to_owned()),
             exploration: Exploration {
                 noise_std: 0.2,
-                random_share: 0.3,
-                random_hold_mean_steps: 4.0,
+                random_action_prob: 0.3,
+                sticky_random_mean_steps: 4.0,
             },
-            world: WorldTerms { gripped_start_share: 0.0, wide_start_share: 1.0, substeps: 20 },
+            world: WorldSettings { grasped_start_prob: 1.0, substeps: 20 },
         }
     }
 
@@ -287,26 +284,26 @@ mod tests {
         }
     }
 
-    /// The message as it is after crossing a wire.
+    /// Encodes and decodes a message.
     fn sent<M: prost::Message + Default>(message: &M) -> M {
         M::decode(message.encode_to_vec().as_slice()).unwrap()
     }
 
     #[test]
     fn every_message_round_trips() {
-        assert_eq!(decode_terms(sent(&encode_terms(&terms()))), Ok(terms()));
+        assert_eq!(decode_run_terms(sent(&encode_run_terms(&terms()))), Ok(terms()));
         let unadvised = RunTerms { account: None, ..terms() };
-        assert_eq!(decode_terms(sent(&encode_terms(&unadvised))), Ok(unadvised));
+        assert_eq!(decode_run_terms(sent(&encode_run_terms(&unadvised))), Ok(unadvised));
         assert_eq!(decode_slot(sent(&encode_slot(&slot()))), Ok(slot()));
         assert_eq!(decode_actor(&sent(&encode_actor(&actor())), LAYOUT), Ok(actor()));
     }
 
     #[test]
     fn malformed_terms_are_refused_by_name() {
-        let check = |spoil: fn(&mut pb::RunTerms), message: &str| {
-            let mut spoilt = encode_terms(&terms());
-            spoil(&mut spoilt);
-            assert_eq!(decode_terms(spoilt).unwrap_err().to_string(), message);
+        let check = |corrupt: fn(&mut pb::RunTerms), message: &str| {
+            let mut malformed = encode_run_terms(&terms());
+            corrupt(&mut malformed);
+            assert_eq!(decode_run_terms(malformed).unwrap_err().to_string(), message);
         };
         check(
             |t| t.task = "pick".to_owned(),
@@ -321,25 +318,29 @@ mod tests {
             "world.substeps: expected 1 to 10000, got 0",
         );
         check(
-            |t| t.world.as_mut().unwrap().wide_start_share = f32::NAN,
-            "world.wide_start_share: expected a number in [0, 1], got NaN",
+            |t| t.world.as_mut().unwrap().gripped_start_share = f32::NAN,
+            "world.gripped_start_share: expected a number in [0, 1], got NaN",
         );
-        let mut spoilt = encode_terms(&terms());
-        spoilt.exploration = Some(pb::Exploration {
+        check(
+            |t| t.world.as_mut().unwrap().wide_start_share = 0.5,
+            "world.wide_start_share: expected 0, there are no such starts any more, got 0.5",
+        );
+        let mut malformed = encode_run_terms(&terms());
+        malformed.exploration = Some(pb::Exploration {
             random_hold_mean_steps: 0.5,
-            ..spoilt.exploration.take().unwrap()
+            ..malformed.exploration.take().unwrap()
         });
         let message =
             "exploration.random_hold_mean_steps: expected a finite number, 1 or more, got 0.5";
-        assert_eq!(decode_terms(spoilt).unwrap_err().to_string(), message);
+        assert_eq!(decode_run_terms(malformed).unwrap_err().to_string(), message);
     }
 
     #[test]
     fn a_malformed_slot_is_refused_by_name() {
-        let check = |spoil: fn(&mut pb::Slot), message: &str| {
-            let mut spoilt = encode_slot(&slot());
-            spoil(&mut spoilt);
-            assert_eq!(decode_slot(spoilt).unwrap_err().to_string(), message);
+        let check = |corrupt: fn(&mut pb::Slot), message: &str| {
+            let mut malformed = encode_slot(&slot());
+            corrupt(&mut malformed);
+            assert_eq!(decode_slot(malformed).unwrap_err().to_string(), message);
         };
         check(|s| s.kind = 0, "kind: expected 1 (training) or 2 (evaluation), got 0");
         check(|s| s.kind = 3, "kind: expected 1 (training) or 2 (evaluation), got 3");
@@ -348,15 +349,18 @@ mod tests {
 
     #[test]
     fn a_malformed_actor_is_refused_by_name() {
-        let check = |spoil: fn(&mut pb::Parameters), message: &str| {
-            let mut spoilt = encode_actor(&actor());
-            spoil(&mut spoilt);
-            assert_eq!(decode_actor(&spoilt, LAYOUT).unwrap_err().to_string(), message);
+        let check = |corrupt: fn(&mut pb::Parameters), message: &str| {
+            let mut malformed = encode_actor(&actor());
+            corrupt(&mut malformed);
+            assert_eq!(decode_actor(&malformed, LAYOUT).unwrap_err().to_string(), message);
         };
         check(|p| p.n_hidden = 6, "actor: expected 504 numbers, got 411 numbers");
         check(|p| p.n_hidden = u32::MAX, "n_hidden: expected 1 to 16384, got 4294967295");
         check(|p| p.n_layers = 0, "n_layers: expected 1 to 64, got 0");
-        check(|p| p.actor.truncate(1643), "actor: expected 1644 bytes, 4 a number, got 1643 bytes");
+        check(
+            |p| p.actor.truncate(1643),
+            "actor: expected 1644 bytes, 4 per number, got 1643 bytes",
+        );
         check(|p| p.goal_std[4..8].fill(0), "goal_std[1]: expected a finite number above 0, got 0");
         check(|p| p.goal_mean[8..12].fill(0xff), "goal_mean[2]: expected a finite number, got NaN");
         check(

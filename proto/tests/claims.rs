@@ -1,5 +1,5 @@
-//! What a message claims to hold costs nothing: memory is taken for what is there.
-#![expect(unsafe_code, reason = "an allocator that counts is an unsafe trait to implement")]
+//! Decoders allocate memory for the bytes that a message has, not for the length that it claims.
+#![expect(unsafe_code, reason = "GlobalAlloc is an unsafe trait")]
 
 use std::alloc::{GlobalAlloc, Layout as Memory, System};
 use std::sync::atomic::{AtomicUsize, Ordering};
@@ -8,12 +8,12 @@ use prost::Message as _;
 use tandem_core::{Layout, Task};
 use tandem_proto::pb;
 
-/// The largest piece of memory that was asked for since the last reset.
+/// The largest allocation since the last reset, bytes.
 static LARGEST: AtomicUsize = AtomicUsize::new(0);
 
 struct Counting;
 
-// SAFETY: every call is handed to the system's allocator unchanged.
+// SAFETY: every call is forwarded to the system's allocator unchanged.
 unsafe impl GlobalAlloc for Counting {
     unsafe fn alloc(&self, memory: Memory) -> *mut u8 {
         LARGEST.fetch_max(memory.size(), Ordering::Relaxed);
@@ -36,14 +36,14 @@ unsafe impl GlobalAlloc for Counting {
 #[global_allocator]
 static ALLOCATOR: Counting = Counting;
 
-/// The largest piece of memory that `work` asks for.
+/// Returns the largest allocation of `work`, bytes.
 fn largest(work: impl FnOnce()) -> usize {
     LARGEST.store(0, Ordering::Relaxed);
     work();
     LARGEST.load(Ordering::Relaxed)
 }
 
-/// `field` as a length-delimited field that claims to have `n_bytes` and has 3.
+/// Encodes a length-delimited field that claims to have `n_bytes` and has 3.
 fn claim(field: u8, n_bytes: u64) -> Vec<u8> {
     let mut bytes = vec![field << 3 | 2];
     let mut rest = n_bytes;
@@ -57,12 +57,12 @@ fn claim(field: u8, n_bytes: u64) -> Vec<u8> {
 }
 
 #[test]
-fn a_claim_takes_no_memory() {
+fn a_claimed_length_allocates_no_memory() {
     let layout = Layout::new(Task::Push, 2);
     for n_bytes in [1 << 20, 1 << 31, u64::from(u32::MAX), 1 << 62] {
         for field in 1..16 {
             let bytes = claim(field, n_bytes);
-            let taken = largest(|| {
+            let allocated = largest(|| {
                 assert!(pb::StepQuery::decode(bytes.as_slice()).is_err());
                 assert!(pb::AdviseRequest::decode(bytes.as_slice()).is_err());
                 assert!(pb::Episode::decode(bytes.as_slice()).is_err());
@@ -70,7 +70,10 @@ fn a_claim_takes_no_memory() {
                 assert!(pb::OpenLeasesRequest::decode(bytes.as_slice()).is_err());
                 assert!(pb::SubmitEpisodesRequest::decode(bytes.as_slice()).is_err());
             });
-            assert!(taken < 4096, "field {field}, {n_bytes} bytes claimed: {taken} bytes taken");
+            assert!(
+                allocated < 4096,
+                "field {field}, {n_bytes} bytes claimed: {allocated} bytes allocated"
+            );
         }
     }
     let actor = pb::Parameters {
@@ -80,6 +83,9 @@ fn a_claim_takes_no_memory() {
         actor: vec![0; 64],
         ..pb::Parameters::default()
     };
-    let taken = largest(|| assert!(tandem_proto::decode_actor(&actor, layout).is_err()));
-    assert!(taken < 4096, "{taken} bytes for a network of 64 bytes that claims 70 GB");
+    let allocated = largest(|| assert!(tandem_proto::decode_actor(&actor, layout).is_err()));
+    assert!(
+        allocated < 4096,
+        "{allocated} bytes allocated for a network of 64 bytes that claims 70 GB"
+    );
 }

@@ -1,4 +1,4 @@
-//! Whatever comes over the wire: a decoder takes a message whole or refuses it by the name of a field.
+//! For arbitrary input, a decoder either accepts a message unchanged or refuses it with the name of a field.
 
 use proptest::collection::{size_range, vec};
 use proptest::prelude::{
@@ -11,8 +11,8 @@ use tandem_core::layout::EPISODE_STEPS;
 use tandem_core::{Layout, Task};
 use tandem_proto::{DecodeError, MAX_ARMS, pb};
 
-/// Longest text of a refusal: it travels in a header.
-const MAX_REFUSAL_BYTES: usize = 400;
+/// Largest length of an error message, which is sent in a header.
+const MAX_ERROR_BYTES: usize = 400;
 
 fn settings(cases: u32) -> ProptestConfig {
     ProptestConfig { cases, failure_persistence: None, ..ProptestConfig::default() }
@@ -22,7 +22,7 @@ fn any_layout() -> impl Strategy<Value = Layout> {
     (select(Task::ALL.to_vec()), 1..=MAX_ARMS).prop_map(|(task, n_arms)| Layout::new(task, n_arms))
 }
 
-/// One of `n` numbers, nearly all of them plain, so that most vectors are fine from end to end.
+/// One of `n` numbers. Nearly all are ordinary, so most vectors are valid.
 fn any_number(n: usize) -> BoxedStrategy<f32> {
     let edges = [
         f32::NAN,
@@ -40,12 +40,12 @@ fn any_number(n: usize) -> BoxedStrategy<f32> {
     prop_oneof![plain => -1.0_f32..1.0, 1 => select(edges.to_vec()), 1 => any::<f32>()].boxed()
 }
 
-/// A single number; edges are as likely as plain ones.
+/// A single number; edge cases are as likely as ordinary numbers.
 fn one_number() -> BoxedStrategy<f32> {
     prop_oneof![4 => 0.0_f32..1.5, 1 => any::<f32>(), 1 => select(vec![f32::NAN, -0.0, f32::INFINITY])].boxed()
 }
 
-/// Mostly `n` numbers, else one more, one less, none or half of them.
+/// Mostly `n` numbers, otherwise one more, one less, none or half of them.
 fn numbers(n: usize) -> BoxedStrategy<Vec<f32>> {
     length_near(n).prop_flat_map(|n| vec(any_number(n), size_range(n))).boxed()
 }
@@ -54,7 +54,7 @@ fn length_near(n: usize) -> BoxedStrategy<usize> {
     prop_oneof![20 => Just(n), 1 => Just(n + 1), 1 => Just(n.saturating_sub(1)), 1 => Just(0), 1 => Just(n / 2)].boxed()
 }
 
-/// The same as bytes, now and then with a part of a number at the end.
+/// The same as bytes, sometimes with an incomplete number at the end.
 fn number_bytes(n: usize) -> BoxedStrategy<Vec<u8>> {
     let rest = prop_oneof![20 => Just(0_usize), 1 => 1_usize..4];
     (numbers(n), rest)
@@ -134,7 +134,8 @@ fn terms() -> impl Strategy<Value = pb::RunTerms> {
             random_share,
             random_hold_mean_steps,
         });
-    let world = (one_number(), one_number(), any_count(10_000)).prop_map(
+    let removed = prop_oneof![4 => Just(0.0), 1 => one_number()];
+    let world = (one_number(), removed, any_count(10_000)).prop_map(
         |(gripped_start_share, wide_start_share, substeps)| pb::WorldTerms {
             gripped_start_share,
             wide_start_share,
@@ -215,7 +216,7 @@ fn parameters(layout: Layout) -> impl Strategy<Value = pb::Parameters> {
     })
 }
 
-/// Layer by layer, as the format's description counts.
+/// The number of parameters, layer by layer.
 fn n_parameters(layout: Layout, n_hidden: usize, n_layers: usize) -> usize {
     let mut widths = vec![layout.n_observation() + layout.n_goal()];
     widths.extend(std::iter::repeat_n(n_hidden, n_layers));
@@ -258,20 +259,20 @@ fn episode(layout: Layout) -> impl Strategy<Value = pb::Episode> {
         })
 }
 
-/// A decoder's verdict, with what it took as a message again: it must be the message that came.
+/// Checks a decoder's result, encoded again: it is either the original message or an error about one of its fields.
 fn check<M: Message + std::fmt::Debug>(
-    came: &M,
-    verdict: Result<M, DecodeError>,
+    original: &M,
+    result: Result<M, DecodeError>,
 ) -> Result<(), TestCaseError> {
-    match verdict {
-        Ok(again) => prop_assert_eq!(again.encode_to_vec(), came.encode_to_vec()),
+    match result {
+        Ok(again) => prop_assert_eq!(again.encode_to_vec(), original.encode_to_vec()),
         Err(error) => {
             let head = error.field.split(['.', '[']).next().unwrap_or_default();
-            let debug = format!("{came:?}");
+            let debug = format!("{original:?}");
             prop_assert!(!head.is_empty() && debug.contains(&format!("{head}: ")), "{error}");
             prop_assert!(!error.expected.is_empty() && !error.got.is_empty(), "{error}");
             prop_assert!(
-                error.to_string().len() < MAX_REFUSAL_BYTES,
+                error.to_string().len() < MAX_ERROR_BYTES,
                 "{} bytes",
                 error.to_string().len()
             );
@@ -280,37 +281,37 @@ fn check<M: Message + std::fmt::Debug>(
     Ok(())
 }
 
-fn check_query(came: &pb::StepQuery, layout: Layout) -> Result<(), TestCaseError> {
-    let verdict = tandem_proto::decode_query(came.clone(), layout);
-    check(came, verdict.map(|query| tandem_proto::encode_query(&query)))
+fn check_query(original: &pb::StepQuery, layout: Layout) -> Result<(), TestCaseError> {
+    let result = tandem_proto::decode_query(original.clone(), layout);
+    check(original, result.map(|query| tandem_proto::encode_query(&query)))
 }
 
-fn check_advice(came: &pb::StepAdvice, layout: Layout) -> Result<(), TestCaseError> {
-    let verdict = tandem_proto::decode_advice(came.clone(), layout);
-    check(came, verdict.map(|advice| tandem_proto::encode_advice(&advice)))
+fn check_advice(original: &pb::StepAdvice, layout: Layout) -> Result<(), TestCaseError> {
+    let result = tandem_proto::decode_advice(original.clone(), layout);
+    check(original, result.map(|advice| tandem_proto::encode_advice(&advice)))
 }
 
-fn check_terms(came: &pb::RunTerms) -> Result<(), TestCaseError> {
-    let verdict = tandem_proto::decode_terms(came.clone());
-    check(came, verdict.map(|terms| tandem_proto::encode_terms(&terms)))
+fn check_terms(original: &pb::RunTerms) -> Result<(), TestCaseError> {
+    let result = tandem_proto::decode_run_terms(original.clone());
+    check(original, result.map(|terms| tandem_proto::encode_run_terms(&terms)))
 }
 
-fn check_slot(came: &pb::Slot) -> Result<(), TestCaseError> {
-    let verdict = tandem_proto::decode_slot(came.clone());
-    check(came, verdict.map(|slot| tandem_proto::encode_slot(&slot)))
+fn check_slot(original: &pb::Slot) -> Result<(), TestCaseError> {
+    let result = tandem_proto::decode_slot(original.clone());
+    check(original, result.map(|slot| tandem_proto::encode_slot(&slot)))
 }
 
-fn check_parameters(came: &pb::Parameters, layout: Layout) -> Result<(), TestCaseError> {
-    let verdict = tandem_proto::decode_actor(came, layout);
-    check(came, verdict.map(|actor| tandem_proto::encode_actor(&actor)))
+fn check_parameters(original: &pb::Parameters, layout: Layout) -> Result<(), TestCaseError> {
+    let result = tandem_proto::decode_actor(original, layout);
+    check(original, result.map(|actor| tandem_proto::encode_actor(&actor)))
 }
 
-fn check_episode(came: &pb::Episode, layout: Layout) -> Result<(), TestCaseError> {
-    let verdict = tandem_proto::decode_episode(came.clone(), layout);
-    check(came, verdict.map(|episode| tandem_proto::encode_episode(&episode)))
+fn check_episode(original: &pb::Episode, layout: Layout) -> Result<(), TestCaseError> {
+    let result = tandem_proto::decode_episode(original.clone(), layout);
+    check(original, result.map(|episode| tandem_proto::encode_episode(&episode)))
 }
 
-/// Reads `bytes` as every message there is, and hands to its decoder what has one.
+/// Decodes `bytes` as every message type, and passes the messages to their decoders.
 fn read_as_everything(bytes: &[u8], layout: Layout) -> Result<(), TestCaseError> {
     macro_rules! read_as {
         ($($message:ident),*) => {$(
@@ -360,7 +361,7 @@ fn read_as_everything(bytes: &[u8], layout: Layout) -> Result<(), TestCaseError>
     Ok(())
 }
 
-/// Bytes of a message with some of them exchanged, and cut or prolonged.
+/// The bytes of a message, some of them changed, truncated or extended.
 fn mutated<M: Message + 'static>(
     message: impl Strategy<Value = M>,
 ) -> impl Strategy<Value = Vec<u8>> {
@@ -370,7 +371,7 @@ fn mutated<M: Message + 'static>(
         let mut bytes = message.encode_to_vec();
         bytes.extend(more);
         for (at, byte) in edits {
-            // Most of a message is numbers; what stands at its head says what the rest is.
+            // Most bytes of a message are numbers; the first ones determine the meaning of the rest.
             let at = if at % 2 == 0 { at / 2 % 16 } else { at / 2 };
             if let Some(place) = bytes.len().checked_sub(1).map(|last| at % (last + 1)) {
                 bytes[place] = byte;
@@ -388,7 +389,7 @@ proptest! {
     #![proptest_config(settings(1500))]
 
     #[test]
-    fn queries(
+    fn a_query_is_accepted_or_refused(
         (layout, query) in any_layout().prop_flat_map(|layout| (Just(layout), query(layout))),
         task in select(Task::ALL.to_vec()),
     ) {
@@ -400,22 +401,22 @@ proptest! {
     }
 
     #[test]
-    fn advice_of_every_kind(
+    fn advice_is_accepted_or_refused(
         (layout, advice) in any_layout().prop_flat_map(|layout| (Just(layout), advice(layout))),
     ) {
         check_advice(&advice, layout)?;
     }
 
     #[test]
-    fn terms_of_runs(terms in terms()) {
+    fn run_terms_are_accepted_or_refused(terms in terms()) {
         check_terms(&terms)?;
     }
 
     #[test]
-    fn names_of_accounts(name in any_text()) {
-        let verdict = tandem_proto::decode_account_name("account", name.clone());
-        prop_assert_eq!(verdict.is_ok(), (1..=256).contains(&name.len()));
-        if let Ok(kept) = verdict {
+    fn names_of_accounts_are_accepted_by_length(name in any_text()) {
+        let result = tandem_proto::decode_account_name("account", name.clone());
+        prop_assert_eq!(result.is_ok(), (1..=256).contains(&name.len()));
+        if let Ok(kept) = result {
             prop_assert_eq!(kept, name);
         }
     }
@@ -425,26 +426,26 @@ proptest! {
     #![proptest_config(settings(300))]
 
     #[test]
-    fn slots(slot in slot()) {
+    fn a_slot_is_accepted_or_refused(slot in slot()) {
         check_slot(&slot)?;
     }
 
     #[test]
-    fn parameters_of_actors(
+    fn parameters_are_accepted_or_refused(
         (layout, parameters) in any_layout().prop_flat_map(|layout| (Just(layout), parameters(layout))),
     ) {
         check_parameters(&parameters, layout)?;
     }
 
     #[test]
-    fn whole_episodes(
+    fn an_episode_is_accepted_or_refused(
         (layout, episode) in any_layout().prop_flat_map(|layout| (Just(layout), episode(layout))),
     ) {
         check_episode(&episode, layout)?;
     }
 
     #[test]
-    fn altered_bytes(
+    fn altered_messages_are_accepted_or_refused(
         layout in any_layout(),
         query in mutated(query(Layout::new(Task::Push, 2))),
         advice in mutated(advice(Layout::new(Task::Push, 2))),
@@ -461,7 +462,7 @@ proptest! {
     #![proptest_config(settings(3000))]
 
     #[test]
-    fn any_bytes_at_all(bytes in vec(any::<u8>(), 0..80), layout in any_layout()) {
+    fn arbitrary_bytes_are_accepted_or_refused(bytes in vec(any::<u8>(), 0..80), layout in any_layout()) {
         read_as_everything(&bytes, layout)?;
     }
 }

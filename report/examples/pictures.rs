@@ -1,4 +1,4 @@
-//! Draws a made-up scene and learning curves into the directory named on the command line, to look at.
+//! Draws a synthetic scene and learning curves into the directory given on the command line.
 
 use std::path::PathBuf;
 
@@ -12,10 +12,9 @@ use tandem_telemetry::{MetricsLog, MetricsRow};
 mod synthetic;
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {
-    let dir =
-        std::env::args_os().nth(1).map(PathBuf::from).ok_or("where shall the pictures go?")?;
+    let dir = std::env::args_os().nth(1).map(PathBuf::from).ok_or("usage: pictures DIR")?;
     for (name, progress) in [("start", 0.0), ("middle", 0.5), ("end", 1.0)] {
-        let view = View { caption: Some(format!("made-up episode, {name}")), ..View::default() };
+        let view = View { caption: Some(format!("synthetic episode, {name}")), ..View::default() };
         std::fs::write(
             dir.join(format!("scene-{name}.svg")),
             scene_svg(&synthetic::scene(progress), &view),
@@ -39,7 +38,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     Ok(())
 }
 
-/// A learning curve that rises faster the larger `speed` is.
+/// Returns a synthetic learning curve; a larger `speed` makes it rise faster.
 fn rows(speed: f64) -> Vec<MetricsRow> {
     let row = |evaluation: u32| {
         let progress = f64::from(evaluation) / 24.0;

@@ -10,7 +10,7 @@ use tandem_telemetry::MetricsRow;
 use crate::error::Error;
 use crate::table::short_number;
 
-/// One colour a series, apart for colour-blind eyes too; a further series starts again.
+/// Colours of the series, distinguishable by colour-blind readers; further series reuse them.
 const COLORS: [RGBColor; 6] = [
     RGBColor(0x1f, 0x6f, 0xb8),
     RGBColor(0xe0, 0x7b, 0x28),
@@ -24,25 +24,25 @@ pub(crate) const FAINT_INK: RGBColor = RGBColor(0x6a, 0x73, 0x7d);
 pub(crate) const GRID: RGBColor = RGBColor(0xe6, 0xe9, 0xed);
 /// Left edge of the legend, pixels.
 const LEGEND_LEFT_PX: i32 = 20;
-/// Height of a line of the legend, pixels.
+/// Height of a legend line, pixels.
 pub(crate) const LEGEND_LINE_PX: i32 = 20;
 pub(crate) const FONT: &str = "-apple-system, 'Segoe UI', Helvetica, Arial, sans-serif";
 
-/// What a curve is drawn against.
+/// The horizontal axis of a curve.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Axis {
-    /// Training steps of all episodes.
+    /// Environment steps of training.
     EnvSteps,
     /// Updates of the networks.
     Updates,
-    /// Wall time.
+    /// Wall time, minutes.
     Minutes,
     /// Epochs as the paper counts them.
     PaperEpochs,
 }
 
 impl Axis {
-    /// What stands below the axis.
+    /// Returns the label of the axis.
     #[must_use]
     pub const fn label(self) -> &'static str {
         match self {
@@ -53,6 +53,7 @@ impl Axis {
         }
     }
 
+    /// Returns the coordinate of `row` on this axis.
     pub(crate) fn of(self, row: &MetricsRow) -> f64 {
         match self {
             Self::EnvSteps => row.env_steps as f64,
@@ -63,12 +64,12 @@ impl Axis {
     }
 }
 
-/// Which of a run's figures a curve shows.
+/// The metric that a curve shows.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Quantity {
     /// Evaluation success, with its 95 % interval.
     Success,
-    /// Success by the joint norm.
+    /// Evaluation success by the joint norm.
     SuccessJoint,
     /// Success of the training episodes.
     TrainingSuccess,
@@ -76,15 +77,16 @@ pub enum Quantity {
     Moved,
     /// Share of evaluation episodes with a contact.
     CollisionRate,
-    /// Share with a contact before every object had arrived.
+    /// Share of evaluation episodes with a contact before all objects were at their goals.
     CollisionRateBeforeSuccess,
-    /// Mean value that the critic gives to the policy's actions.
+    /// Mean Q-value of the policy's actions.
     MeanQ,
     /// Units of advice spent.
     AdviceSpent,
 }
 
 impl Quantity {
+    /// Returns the value of this metric in `row`.
     pub(crate) fn of(self, row: &MetricsRow) -> f64 {
         match self {
             Self::Success => row.success,
@@ -102,25 +104,25 @@ impl Quantity {
 /// A point of a curve.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct CurvePoint {
-    /// Along the axis.
+    /// Coordinate on the horizontal axis.
     pub x: f64,
-    /// The figure.
+    /// Value.
     pub y: f64,
-    /// Lower and upper end of its interval, when it has one.
+    /// Lower and upper bound of its interval, if it has one.
     pub band: Option<(f64, f64)>,
 }
 
 /// One curve.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Series {
-    /// Its name in the legend.
+    /// Name in the legend.
     pub name: String,
-    /// Its points, from left to right.
+    /// Points, from left to right.
     pub points: Vec<CurvePoint>,
 }
 
 impl Series {
-    /// The curve of `quantity` against `axis`; rows without the figure are left out.
+    /// Creates the curve of `quantity` against `axis`. Rows without a finite value are omitted.
     #[must_use]
     pub fn of(name: &str, rows: &[MetricsRow], axis: Axis, quantity: Quantity) -> Self {
         let point = |row: &MetricsRow| CurvePoint {
@@ -134,14 +136,14 @@ impl Series {
     }
 }
 
-/// How curves are drawn.
+/// Options of a plot of curves.
 #[derive(Debug, Clone, PartialEq)]
 pub struct CurveOptions {
-    /// Above the curves.
+    /// Title, above the curves.
     pub title: String,
-    /// Below the horizontal axis.
+    /// Label of the horizontal axis.
     pub x_label: String,
-    /// Whether the figures are shares: the vertical axis is then 0 to 100 %.
+    /// Whether the values are shares: the vertical axis is then 0 to 100 %.
     pub percent: bool,
     /// Width, pixels.
     pub width: u32,
@@ -150,7 +152,7 @@ pub struct CurveOptions {
 }
 
 impl CurveOptions {
-    /// Shares against `axis`, at the size of a README's picture.
+    /// Returns options for shares against `axis`, 760 by 400 pixels.
     #[must_use]
     pub fn shares(title: &str, axis: Axis) -> Self {
         Self {
@@ -162,17 +164,17 @@ impl CurveOptions {
         }
     }
 
-    /// Other figures against `axis`, at the same size.
+    /// Returns options for other values against `axis`, of the same size.
     #[must_use]
-    pub fn figures(title: &str, axis: Axis) -> Self {
+    pub fn values(title: &str, axis: Axis) -> Self {
         Self { percent: false, ..Self::shares(title, axis) }
     }
 }
 
-/// Draws `series` with their bands and a legend.
+/// Draws `series` with their bands and a legend as SVG.
 ///
 /// # Errors
-/// When the plotting library fails, for instance because the picture is too small for its labels.
+/// If the plotting library fails, for example because the plot is too small for its labels.
 pub fn curve_svg(series: &[Series], options: &CurveOptions) -> Result<String, Error> {
     let mut svg = String::new();
     draw(series, options, &mut svg).map_err(|error| Error::Draw {
@@ -183,13 +185,13 @@ pub fn curve_svg(series: &[Series], options: &CurveOptions) -> Result<String, Er
 }
 
 type Area<'a> = DrawingArea<SVGBackend<'a>, Shift>;
-type Drawn = Result<(), Box<dyn std::error::Error>>;
+type DrawResult = Result<(), Box<dyn std::error::Error>>;
 
-fn draw(series: &[Series], options: &CurveOptions, svg: &mut String) -> Drawn {
+fn draw(series: &[Series], options: &CurveOptions, svg: &mut String) -> DrawResult {
     let root = SVGBackend::with_string(svg, (options.width, options.height)).into_drawing_area();
     root.fill(&WHITE)?;
     let legend = legend(series, options.width);
-    draw_head(&root, &legend, options)?;
+    draw_header(&root, &legend, options)?;
     let n_lines = legend.last().map_or(0, |entry| entry.line + 1);
     let (_, plot) = root.split_vertically(46 + LEGEND_LINE_PX * n_lines);
     draw_plot(&plot, series, options)?;
@@ -197,44 +199,44 @@ fn draw(series: &[Series], options: &CurveOptions, svg: &mut String) -> Drawn {
     Ok(())
 }
 
-/// A curve's name in the legend.
+/// Position of a curve's name in the legend.
 #[derive(Debug, PartialEq)]
 struct LegendEntry<'a> {
     name: &'a str,
     /// Left edge, pixels.
     left: i32,
-    /// Line, from 0.
+    /// Legend line, from 0.
     line: i32,
 }
 
-/// Places the names of several curves on as many lines as it takes; a single curve needs none.
+/// Lays out the legend on as many lines as needed. A single curve has no legend.
 fn legend(series: &[Series], width_px: u32) -> Vec<LegendEntry<'_>> {
     let named = || series.iter().filter(|_| series.len() > 1).map(|one| one.name.as_str());
-    let places = legend_places(named(), width_px);
-    named().zip(places).map(|(name, (left, line))| LegendEntry { name, left, line }).collect()
+    let positions = legend_positions(named(), width_px);
+    named().zip(positions).map(|(name, (left, line))| LegendEntry { name, left, line }).collect()
 }
 
-/// Left edges (pixels) and lines, from 0, of a legend's entries, each a sign of 22 pixels and a name.
-pub(crate) fn legend_places<'a>(
+/// Returns the left edge (pixels) and the line (from 0) of each legend entry: a marker, 22 pixels wide, and a name.
+pub(crate) fn legend_positions<'a>(
     names: impl Iterator<Item = &'a str>,
     width_px: u32,
 ) -> Vec<(i32, i32)> {
     let width_px = i32::try_from(width_px).unwrap_or(i32::MAX);
     let (mut left, mut line) = (LEGEND_LEFT_PX, 0);
-    let place = |name| {
+    let position = |name| {
         let entry_px = 22 + estimated_width_px(name, 13);
         if left > LEGEND_LEFT_PX && left + entry_px > width_px {
             (left, line) = (LEGEND_LEFT_PX, line + 1);
         }
-        let place = (left, line);
+        let position = (left, line);
         left += entry_px + 20;
-        place
+        position
     };
-    names.map(place).collect()
+    names.map(position).collect()
 }
 
-/// The title and the legend.
-fn draw_head(root: &Area<'_>, legend: &[LegendEntry<'_>], options: &CurveOptions) -> Drawn {
+/// Draws the title and the legend.
+fn draw_header(root: &Area<'_>, legend: &[LegendEntry<'_>], options: &CurveOptions) -> DrawResult {
     let title = (FONT, 17).into_font().style(plotters::style::FontStyle::Bold).color(&INK);
     root.draw(&Text::new(options.title.clone(), (20, 16), title))?;
     for (LegendEntry { name, left, line }, color) in legend.iter().zip(COLORS.iter().cycle()) {
@@ -245,7 +247,7 @@ fn draw_head(root: &Area<'_>, legend: &[LegendEntry<'_>], options: &CurveOptions
     Ok(())
 }
 
-fn draw_plot(plot: &Area<'_>, series: &[Series], options: &CurveOptions) -> Drawn {
+fn draw_plot(plot: &Area<'_>, series: &[Series], options: &CurveOptions) -> DrawResult {
     let (x_max, y_range) = (x_max(series), y_range(series, options.percent));
     let mut chart = ChartBuilder::on(plot)
         .margin_left(8)
@@ -284,7 +286,7 @@ fn draw_plot(plot: &Area<'_>, series: &[Series], options: &CurveOptions) -> Draw
     Ok(())
 }
 
-/// The outline of a curve's intervals, when it has them.
+/// Returns the outline of a curve's band, if it has one.
 fn band(series: &Series) -> impl Iterator<Item = Vec<(f64, f64)>> {
     let side = |end: fn((f64, f64)) -> f64| {
         series
@@ -327,7 +329,7 @@ fn text_style(size_px: u32, color: RGBColor) -> TextStyle<'static> {
     (FONT, size_px).into_font().color(&color)
 }
 
-/// The width of `text` in a usual sans-serif font: viewers choose the font, so it cannot be known.
+/// Estimates the width of `text` in a sans-serif font. The viewer chooses the font, so the exact width is unknown.
 pub(crate) fn estimated_width_px(text: &str, size_px: u32) -> i32 {
     let n_chars = u32::try_from(text.chars().count()).unwrap_or(u32::MAX);
     i32::try_from(n_chars.saturating_mul(size_px) / 2).unwrap_or(i32::MAX / 2)
@@ -338,7 +340,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_row_without_the_figure_is_left_out_of_its_curve() {
+    fn a_row_without_a_value_is_omitted_from_the_curve() {
         let row = |mean_q| MetricsRow { mean_q, ..MetricsRow::default() };
         let series =
             Series::of("run", &[row(f64::NAN), row(-3.0)], Axis::EnvSteps, Quantity::MeanQ);
@@ -346,21 +348,21 @@ mod tests {
     }
 
     #[test]
-    fn a_legend_takes_as_many_lines_as_its_names_need() {
+    fn a_legend_has_as_many_lines_as_its_names_need() {
         let named = |name: &str| Series { name: name.to_owned(), points: Vec::new() };
-        let places = |names: &[&str]| {
+        let positions = |names: &[&str]| {
             let series: Vec<Series> = names.iter().map(|name| named(name)).collect();
             legend(&series, 300).iter().map(|entry| (entry.left, entry.line)).collect::<Vec<_>>()
         };
-        assert_eq!(places(&["alone"]), []);
+        assert_eq!(positions(&["alone"]), []);
         let long = "0123456789";
-        assert_eq!(places(&[long, long, long]), [(20, 0), (127, 0), (20, 1)]);
+        assert_eq!(positions(&[long, long, long]), [(20, 0), (127, 0), (20, 1)]);
         let longest = long.repeat(6);
-        assert_eq!(places(&[&longest, long]), [(20, 0), (20, 1)]);
+        assert_eq!(positions(&[&longest, long]), [(20, 0), (20, 1)]);
     }
 
     #[test]
-    fn the_axis_of_other_figures_shows_all_of_them_and_zero() {
+    fn the_value_axis_covers_all_values_and_zero() {
         let series = |values: &[f64]| Series {
             name: String::new(),
             points: values.iter().map(|y| CurvePoint { x: 1.0, y: *y, band: None }).collect(),

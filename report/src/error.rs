@@ -1,46 +1,46 @@
-//! What can go wrong while reporting.
+//! Errors of reports.
 
 use std::path::PathBuf;
 
-/// What can go wrong while reporting.
+/// An error while making a report.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
     /// A file operation failed.
     #[error("cannot {action} {path:?}")]
     Io {
-        /// What was attempted: "read", "write".
+        /// The operation: `read` or `write`.
         action: &'static str,
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
-        /// Why it failed.
+        /// The cause.
         source: std::io::Error,
     },
-    /// Nothing that a report could show.
+    /// A directory contains neither runs nor trials.
     #[error(
-        "{path:?} holds no run and no trials: expected a metrics.jsonl or a trials.jsonl in it or below"
+        "no runs and no trials in {path:?}: expected a metrics.jsonl or a trials.jsonl in it or in a subdirectory"
     )]
-    NoRun {
-        /// Where one was looked for.
+    NoResults {
+        /// The directory.
         path: PathBuf,
     },
-    /// A file of trials without a single one.
-    #[error("{path:?} holds no trial: {problem}")]
-    NoTrial {
-        /// The file.
+    /// A trials file contains no trial.
+    #[error("no trials in {path:?}: {problem}")]
+    NoTrials {
+        /// Path of the file.
         path: PathBuf,
-        /// What stands there instead.
+        /// What the file contains instead.
         problem: String,
     },
-    /// A metrics file without a single row.
-    #[error("{path:?} holds no metrics: its first line is no metrics row")]
-    NoRow {
-        /// The file.
+    /// A metrics file contains no row.
+    #[error("no metrics rows in {path:?}: its first line is not one")]
+    NoMetrics {
+        /// Path of the file.
         path: PathBuf,
     },
-    /// A file is no result of an evaluation.
-    #[error("{path:?} is no result of `tandem eval --json`: {problem}")]
-    NoEvaluation {
-        /// The file.
+    /// A file is not the result of an evaluation.
+    #[error("{path:?} is not the output of `tandem eval --json`: {problem}")]
+    InvalidEvaluation {
+        /// Path of the file.
         path: PathBuf,
         /// What is wrong with it.
         problem: String,
@@ -48,9 +48,9 @@ pub enum Error {
     /// A curve could not be drawn.
     #[error("cannot draw the curve {title:?}: {problem}")]
     Draw {
-        /// The curve's title.
+        /// Title of the curve.
         title: String,
-        /// What the plotting library says.
+        /// Message of the plotting library.
         problem: String,
     },
 }

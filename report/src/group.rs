@@ -1,4 +1,4 @@
-//! Runs that differ in nothing but their seed, and what they say together.
+//! Groups of runs that differ only in their seed, and statistics over them.
 
 use tandem_core::{Task, Wilson};
 use tandem_telemetry::MetricsRow;
@@ -8,27 +8,27 @@ use crate::measures::{LearningMeasures, first_reaching};
 use crate::paper::PaperRow;
 use crate::run::Run;
 
-/// Successes of which a report tells what it cost to reach them.
+/// Success rates for which reports give the cost of reaching them.
 pub const MILESTONES: [f64; 3] = [0.5, 0.9, 0.95];
-/// Settings in which runs of one group may differ: they decide no result.
+/// Settings in which runs of one group may differ, besides the number of recorded episodes. None affects a result.
 const FREE_SETTINGS: [&str; 3] = ["name", "seed", "checkpoint"];
 
-/// What a run's arms do: runs of one subject stand in one table. `None` is unknown, and comes last.
+/// Task and number of arms. Runs with the same task setup share tables. Unknown values sort last.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Subject {
+pub struct TaskSetup {
     /// The task.
     pub task: Option<Task>,
-    /// Arms of the learning policy.
+    /// Number of arms of the policy.
     pub n_arms: Option<u64>,
 }
 
-impl Subject {
+impl TaskSetup {
     fn of(run: &Run, settings: &Table) -> Self {
         let n_arms = settings.get("arms").and_then(Value::as_integer);
         Self { task: run.task(), n_arms: n_arms.and_then(|n| u64::try_from(n).ok()) }
     }
 
-    /// As a heading: "push, 2 arms".
+    /// Returns a heading such as "push, 2 arms".
     #[must_use]
     pub fn title(&self) -> String {
         let task = self.task.map_or("unknown task", Task::name);
@@ -39,55 +39,58 @@ impl Subject {
         }
     }
 
-    /// As part of a file's name: "push-2".
+    /// Returns a part of a file name, such as "push-2".
     pub(crate) fn slug(&self) -> String {
         let task = self.task.map_or("unknown", Task::name);
         self.n_arms.map_or_else(|| task.to_owned(), |n_arms| format!("{task}-{n_arms}"))
     }
 
-    pub(crate) fn order(&self) -> (bool, Option<Task>, bool, std::cmp::Reverse<Option<u64>>) {
+    /// Returns the key by which task setups are sorted: by task, two arms before one.
+    pub(crate) fn sort_key(&self) -> (bool, Option<Task>, bool, std::cmp::Reverse<Option<u64>>) {
         (self.task.is_none(), self.task, self.n_arms.is_none(), std::cmp::Reverse(self.n_arms))
     }
 }
 
-/// Runs that differ in nothing but their seed.
+/// Runs that differ only in their seed.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Group {
-    /// The strategy, or the runs' common name where that says more.
+pub struct SeedGroup {
+    /// Label in tables and legends: the strategy if it identifies the runs, else their common name.
     pub label: String,
-    /// What the arms do.
-    pub subject: Subject,
-    /// Who was asked for advice, and when, as on the command line; by the configuration, or else by the runs' name.
+    /// Task and number of arms.
+    pub setup: TaskSetup,
+    /// Advising strategy as on the command line, from the configuration or else from the runs' name.
     pub strategy: Option<String>,
-    /// The runs, by seed.
+    /// The runs, sorted by seed.
     pub runs: Vec<Run>,
 }
 
-/// Sorts runs into groups: those with a configuration by it, others by their name without the seed. Groups come in the
-/// order of subjects, then of the paper's Table 2, then by label.
+/// Groups runs that differ only in their seed.
+///
+/// Runs with a configuration are compared by it, others by their name without the seed. Groups are sorted by task
+/// setup, then by their row in the paper's Table 2, then by label.
 #[must_use]
-pub fn groups(runs: Vec<Run>) -> Vec<Group> {
-    let mut keyed: Vec<(String, Group)> = Vec::new();
+pub fn group_by_settings(runs: Vec<Run>) -> Vec<SeedGroup> {
+    let mut keyed: Vec<(String, SeedGroup)> = Vec::new();
     for run in runs {
-        let key = key(&run);
+        let key = settings_key(&run);
         match keyed.iter_mut().find(|(other, _)| *other == key) {
             Some((_, group)) => group.runs.push(run),
-            None => keyed.push((key, Group::of(run))),
+            None => keyed.push((key, SeedGroup::of(run))),
         }
     }
-    let mut groups: Vec<Group> = keyed.into_iter().map(|(_, group)| group).collect();
+    let mut groups: Vec<SeedGroup> = keyed.into_iter().map(|(_, group)| group).collect();
     for group in &mut groups {
         group.runs.sort_by_key(|run| (run.seed(), run.name.clone()));
     }
     groups.sort_by_key(|group| {
-        (group.subject.order(), group.paper_index().unwrap_or(usize::MAX), group.label.clone())
+        (group.setup.sort_key(), group.paper_index().unwrap_or(usize::MAX), group.label.clone())
     });
-    number_equal_labels(&mut groups);
+    number_duplicate_labels(&mut groups);
     groups
 }
 
-/// What the runs of a group have in common.
-fn key(run: &Run) -> String {
+/// Returns a key that is equal for runs that differ only in their seed.
+fn settings_key(run: &Run) -> String {
     let mut settings = run.settings();
     if settings.is_empty() {
         return format!("named {}", run.stem());
@@ -95,59 +98,60 @@ fn key(run: &Run) -> String {
     for free in FREE_SETTINGS {
         settings.remove(free);
     }
-    // How many evaluated episodes leave a log changes nothing that a report shows.
+    // These do not affect training. The intervals show the number of test episodes.
     if let Some(evaluation) = settings.get_mut("evaluation").and_then(Value::as_table_mut) {
         evaluation.remove("recorded_episodes");
+        evaluation.remove("test_episodes");
     }
     settings.to_string()
 }
 
-/// Two groups of one subject never look the same.
-fn number_equal_labels(groups: &mut [Group]) {
+/// Numbers equal labels within a task setup from the second on: `NAME (#2)`.
+fn number_duplicate_labels(groups: &mut [SeedGroup]) {
     for idx in 1..groups.len() {
         let (before, rest) = groups.split_at_mut(idx);
         let group = &mut rest[0];
-        let same = |other: &&Group| {
-            other.subject == group.subject
+        let has_same_label = |other: &&SeedGroup| {
+            other.setup == group.setup
                 && other.label.split(" (#").next() == Some(group.label.as_str())
         };
-        let n_same = before.iter().filter(same).count();
+        let n_same = before.iter().filter(has_same_label).count();
         if n_same > 0 {
             group.label = format!("{} (#{})", group.label, n_same + 1);
         }
     }
 }
 
-impl Group {
+impl SeedGroup {
     fn of(run: Run) -> Self {
         let settings = run.settings();
-        let subject = Subject::of(&run, &settings);
+        let setup = TaskSetup::of(&run, &settings);
         let configured = settings
             .get("advice")
             .and_then(|advice| advice.get("strategy"))
             .and_then(Value::as_str)
             .map(str::to_owned);
-        let label = label(run.stem(), &subject, configured.as_deref());
-        let strategy = configured.or_else(|| named_strategy(run.stem()));
-        Self { label, subject, strategy, runs: vec![run] }
+        let label = label(run.stem(), &setup, configured.as_deref());
+        let strategy = configured.or_else(|| strategy_from_name(run.stem()));
+        Self { label, setup, strategy, runs: vec![run] }
     }
 
-    /// Whether the label is the strategy and nothing else sets these runs apart.
+    /// Returns whether the strategy alone identifies these runs.
     #[must_use]
     pub fn is_plain_strategy(&self) -> bool {
         self.strategy.as_ref() == Some(&self.label)
     }
 
-    /// Whether nobody was asked for advice.
+    /// Returns whether these runs got no advice.
     #[must_use]
     pub fn is_from_scratch(&self) -> bool {
         self.strategy.as_deref() == Some("none")
     }
 
-    /// The paper's row for these runs: two arms and a strategy of its Table 2.
+    /// Returns the row of the paper's Table 2 for these runs, if they have two arms and one of its strategies.
     #[must_use]
     pub fn paper(&self) -> Option<&'static PaperRow> {
-        let is_student = self.subject.n_arms.is_none_or(|n_arms| n_arms == 2);
+        let is_student = self.setup.n_arms.is_none_or(|n_arms| n_arms == 2);
         let strategy = self.strategy.as_ref().filter(|_| is_student)?;
         Some(PaperRow::of(strategy)?.1)
     }
@@ -156,26 +160,28 @@ impl Group {
         Some(PaperRow::of(self.strategy.as_ref()?)?.0)
     }
 
-    /// A figure of each run, where it has one.
-    pub fn spread(&self, figure: impl Fn(&Run) -> Option<f64>) -> Spread {
+    /// Returns the spread of a value over the runs that have one.
+    pub fn spread(&self, value: impl Fn(&Run) -> Option<f64>) -> Spread {
         let values: Vec<f64> =
-            self.runs.iter().filter_map(figure).filter(|value| value.is_finite()).collect();
+            self.runs.iter().filter_map(value).filter(|value| value.is_finite()).collect();
         Spread::of(&values, self.runs.len())
     }
 
-    /// One of the paper's measures.
+    /// Returns the spread of one of the paper's measures.
     pub fn measure(&self, measure: impl Fn(&LearningMeasures) -> Option<f64>) -> Spread {
         self.spread(|run| {
             measure(&LearningMeasures::of(&run.rows)).filter(|_| !run.rows.is_empty())
         })
     }
 
-    /// Something of the evaluation that first reached `success`.
-    pub fn at_milestone(&self, success: f64, figure: impl Fn(&MetricsRow) -> f64) -> Spread {
-        self.spread(|run| first_reaching(&run.rows, success).map(&figure))
+    /// Returns the spread of a value of each run's first evaluation with at least `success`.
+    pub fn at_milestone(&self, success: f64, value: impl Fn(&MetricsRow) -> f64) -> Spread {
+        self.spread(|run| first_reaching(&run.rows, success).map(&value))
     }
 
-    /// A share that `pick` finds in each run, with the 95 % interval of all their episodes together.
+    /// Returns the spread of a share, and its 95 % interval over the episodes of all runs.
+    ///
+    /// `pick` returns a run's share, in [0, 1], and the number of its episodes.
     pub fn share(&self, pick: impl Fn(&Run) -> Option<(f64, u64)>) -> (Spread, Option<Wilson>) {
         let picked: Vec<(f64, u64)> = self.runs.iter().filter_map(pick).collect();
         let n_episodes: u64 = picked.iter().map(|(_, n)| n).sum();
@@ -187,7 +193,7 @@ impl Group {
     }
 }
 
-/// The whole number of episodes that a share stands for.
+/// Returns the number of episodes that a share corresponds to.
 #[expect(
     clippy::cast_possible_truncation,
     clippy::cast_sign_loss,
@@ -197,23 +203,23 @@ fn hits(share: f64, n_episodes: u64) -> u64 {
     (share.clamp(0.0, 1.0) * n_episodes as f64).round() as u64
 }
 
-/// Mean and range of a figure over the runs that have it.
+/// Mean and range of a value over the runs that have it.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Spread {
-    /// Runs that have the figure.
+    /// Number of runs that have the value.
     pub n: usize,
-    /// Runs of the group.
+    /// Number of runs of the group.
     pub n_runs: usize,
-    /// Its mean over those that have it; NaN where none has.
+    /// Mean over the runs that have it; NaN if none has.
     pub mean: f64,
-    /// The smallest; NaN where none has it.
+    /// Smallest value; NaN if no run has it.
     pub min: f64,
-    /// The largest; NaN where none has it.
+    /// Largest value; NaN if no run has it.
     pub max: f64,
 }
 
 impl Spread {
-    /// The spread of `values`, those of `n_runs` runs that have one.
+    /// Computes the spread of `values`, which belong to some of `n_runs` runs.
     #[must_use]
     pub fn of(values: &[f64], n_runs: usize) -> Self {
         Self {
@@ -226,11 +232,12 @@ impl Spread {
     }
 }
 
-/// The strategy where the name says no more than it, else the name without what the table's heading says.
-fn label(stem: &str, subject: &Subject, strategy: Option<&str>) -> String {
-    let task = subject.task.map_or("", Task::name);
+/// Returns the label of a table row: the strategy if it identifies the run, else the run name minus the task of the
+/// heading.
+fn label(stem: &str, setup: &TaskSetup, strategy: Option<&str>) -> String {
+    let task = setup.task.map_or("", Task::name);
     let rest = without_prefix(stem, task);
-    let n_arms = subject.n_arms.map(|n| n.to_string()).unwrap_or_default();
+    let n_arms = setup.n_arms.map(|n| n.to_string()).unwrap_or_default();
     let shortest = without_prefix(rest, &n_arms);
     match strategy {
         Some(strategy) if shortest == dashed(strategy) || rest == dashed(strategy) => {
@@ -240,7 +247,7 @@ fn label(stem: &str, subject: &Subject, strategy: Option<&str>) -> String {
     }
 }
 
-/// `text` without `prefix-`; whole where there would be nothing left.
+/// Removes `prefix-` from `text`, unless nothing would remain.
 fn without_prefix<'a>(text: &'a str, prefix: &str) -> &'a str {
     if prefix.is_empty() {
         return text;
@@ -251,21 +258,21 @@ fn without_prefix<'a>(text: &'a str, prefix: &str) -> &'a str {
         .unwrap_or(text)
 }
 
-/// A strategy as it stands in the name of a directory.
+/// Returns a strategy as it is written in directory names.
 fn dashed(strategy: &str) -> String {
     strategy.replace(':', "-")
 }
 
-/// The strategy of the paper's table with which a name ends; for files that stand by themselves.
-fn named_strategy(stem: &str) -> Option<String> {
-    let written = crate::paper::TABLE_2.iter().map(|row| match row.threshold {
+/// Returns the strategy of the paper's Table 2 with which a run name ends, for runs without a configuration.
+fn strategy_from_name(stem: &str) -> Option<String> {
+    let strategies = crate::paper::TABLE_2.iter().map(|row| match row.threshold {
         Some(threshold) => format!("{}:{threshold}", row.strategy),
         None => row.strategy.to_owned(),
     });
-    let mut ending = written.filter(|strategy| {
+    let mut matching = strategies.filter(|strategy| {
         stem.strip_suffix(&dashed(strategy)).is_some_and(|rest| rest.ends_with('-'))
     });
-    ending.next()
+    matching.next()
 }
 
 #[cfg(test)]
@@ -286,7 +293,7 @@ mod tests {
             name: name.to_owned(),
             rows: (1..).zip(successes).map(row).collect(),
             configuration: (!settings.is_empty()).then(|| settings.to_owned()),
-            held_out: None,
+            test: None,
         }
     }
 
@@ -300,13 +307,13 @@ mod tests {
 
     #[test]
     fn runs_that_differ_only_in_their_seed_form_a_group() {
-        let groups = groups(vec![
+        let groups = group_by_settings(vec![
             run("push-mc-q-0.1-seed2", &settings("mc-q:0.1", 2, 0.98), &[0.5]),
             run("push-none-seed1", &settings("none", 1, 0.98), &[0.0]),
             run("push-short-sighted-seed1", &settings("mc-q:0.1", 1, 0.9), &[0.5]),
             run("push-mc-q-0.1-seed1", &settings("mc-q:0.1", 1, 0.98), &[0.5]),
         ]);
-        let seen: Vec<(&str, Vec<Option<u64>>)> = groups
+        let actual: Vec<(&str, Vec<Option<u64>>)> = groups
             .iter()
             .map(|group| (group.label.as_str(), group.runs.iter().map(Run::seed).collect()))
             .collect();
@@ -315,31 +322,31 @@ mod tests {
             ("mc-q:0.1", vec![Some(1), Some(2)]),
             ("short-sighted", vec![Some(1)]),
         ];
-        assert_eq!(seen, expected);
+        assert_eq!(actual, expected);
         assert_eq!(groups[1].paper().map(|row| row.name), Some("MC-Q01"));
         assert_eq!(groups[2].paper().map(|row| row.name), Some("MC-Q01"));
     }
 
     #[test]
-    fn bare_metrics_are_grouped_by_their_name_without_the_seed() {
-        let groups = groups(vec![
+    fn metrics_files_are_grouped_by_their_name_without_the_seed() {
+        let groups = group_by_settings(vec![
             run("student-push-mc-q-0.1-seed1", "", &[0.5]),
             run("student-push-mc-q-0.1-seed2", "", &[0.5]),
             run("teacher-push-seed1", "", &[0.5]),
         ]);
-        let seen: Vec<(&str, usize, Option<&str>)> = groups
+        let actual: Vec<(&str, usize, Option<&str>)> = groups
             .iter()
             .map(|group| (group.label.as_str(), group.runs.len(), group.strategy.as_deref()))
             .collect();
         assert_eq!(
-            seen,
+            actual,
             [("student-push-mc-q-0.1", 2, Some("mc-q:0.1")), ("teacher-push", 1, None)]
         );
     }
 
     #[test]
-    fn groups_of_one_name_are_told_apart() {
-        let groups = groups(vec![
+    fn groups_with_equal_labels_are_numbered() {
+        let groups = group_by_settings(vec![
             run("push-2-mc-q-0.1-seed1", &settings("mc-q:0.1", 1, 0.9), &[]),
             run("push-2-mc-q-0.1-seed1", &settings("mc-q:0.1", 1, 0.95), &[]),
             run("push-2-mc-q-0.1-seed1", &settings("mc-q:0.1", 1, 0.98), &[]),
@@ -349,8 +356,8 @@ mod tests {
     }
 
     #[test]
-    fn seeds_give_mean_and_range_and_say_how_many_got_there() {
-        let group = groups(vec![
+    fn a_milestone_has_mean_range_and_number_of_runs_that_reached_it() {
+        let group = group_by_settings(vec![
             run("push-ea-seed1", &settings("ea", 1, 0.98), &[0.0, 0.3, 0.9, 0.96]),
             run("push-ea-seed2", &settings("ea", 2, 0.98), &[0.2, 0.5, 0.5, 0.6]),
         ])
@@ -370,8 +377,8 @@ mod tests {
     }
 
     #[test]
-    fn the_interval_of_a_group_is_that_of_all_its_episodes() {
-        let group = groups(vec![
+    fn the_interval_of_a_group_covers_the_episodes_of_all_runs() {
+        let group = group_by_settings(vec![
             run("push-ea-seed1", &settings("ea", 1, 0.98), &[0.5]),
             run("push-ea-seed2", &settings("ea", 2, 0.98), &[0.75]),
         ])

@@ -1,31 +1,48 @@
-//! Makes figures for people out of run directories and records of trials: tables, curves, pictures of the scene, HTML pages.
+//! Reports on runs and trials: tables, curves and plots as text, SVG and HTML, and exports as JSON and CSV.
 //!
-//! Reads what `tandem-telemetry` wrote and knows nothing of how runs are made.
+//! The crate reads the files that `tandem-telemetry` writes, and does not depend on how runs are made. A report is made
+//! in three steps: [`ReportInputs::load`] reads runs and trials, [`Comparison::of`] and [`Trials::of`] group them, and
+//! [`report_html`] writes the page and its plots. [`run_report_html`] writes the page of a single run.
+//!
+//! ```
+//! use tandem_report::{Comparison, Run};
+//! use tandem_telemetry::MetricsRow;
+//!
+//! let evaluation = MetricsRow { env_steps: 20_000, success: 0.75, n_episodes: 240, ..MetricsRow::default() };
+//! let run = Run { name: "push-seed1".to_owned(), rows: vec![evaluation], ..Run::default() };
+//! let comparison = Comparison::of(vec![run], Vec::new());
+//! assert!(comparison.text().contains("0.750"));
+//! ```
+#![warn(missing_docs)]
 
 pub mod comparison;
 pub mod curve;
 mod error;
-pub mod figures;
+pub mod export;
+mod files;
 pub mod group;
-pub mod held_out;
-pub mod html;
+mod html;
+pub mod inputs;
 pub mod measures;
+pub mod pages;
 pub mod paper;
-pub mod records;
+pub mod plots;
 pub mod run;
 pub mod scene;
 pub mod table;
+pub mod test_evaluation;
 pub mod trials;
 
 pub use comparison::{Baseline, Comparison, Section};
 pub use curve::{Axis, CurveOptions, CurvePoint, Quantity, Series, curve_svg};
 pub use error::Error;
-pub use figures::Figure;
-pub use group::{Group, Spread, Subject};
-pub use held_out::HeldOut;
-pub use html::{Written, report_html, run_report_html};
+pub use group::{SeedGroup, Spread, TaskSetup};
+pub use inputs::ReportInputs;
 pub use measures::LearningMeasures;
-pub use run::{Found, Run};
+pub use pages::{ReportFiles, report_html, run_report_html};
+pub use plots::Plot;
+pub use run::Run;
 pub use scene::{View, scene_svg};
 pub use table::Table;
-pub use trials::{Pictured, TrialGroup, Trials, trial_svg};
+pub use test_evaluation::TestEvaluation;
+pub use trials::{PlottedTrials, TrialGroup, Trials, trial_svg};

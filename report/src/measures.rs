@@ -1,29 +1,31 @@
-//! The paper's measures of a learning curve (Table 2), and what it cost to reach a success.
+//! The paper's measures of a learning curve (Table 2).
 
 use tandem_telemetry::MetricsRow;
 
-/// Share of the maximum success at which learning counts as begun.
+/// Share of the maximum success that defines IE and the start of RT.
 const INSPIRED_SHARE: f64 = 0.1;
-/// Share of the maximum success at which learning counts as done.
+/// Share of the maximum success that defines the end of RT, and ELR.
 const RISEN_SHARE: f64 = 0.9;
-/// Shares are whole numbers of episodes; a product of two may miss the very share it stands for by a rounding.
+/// Tolerance of comparisons: the product of two shares may miss the share it equals by rounding.
 const ROUNDING: f64 = 1e-9;
 
-/// The paper's measures of a learning curve, in paper epochs. A curve that never leaves zero has only `max_success`.
+/// The paper's measures of a learning curve (Table 2), in paper epochs.
+///
+/// A curve that never leaves zero has only `max_success`.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct LearningMeasures {
     /// IE: the epoch at which success first reaches 10 % of its maximum.
     pub inspired_epoch: Option<f64>,
-    /// RT: epochs from 10 % to 90 % of the maximum.
+    /// RT: number of epochs from 10 % to 90 % of the maximum.
     pub rising_epochs: Option<f64>,
-    /// MSR: the maximum success.
+    /// MSR: the maximum success, in [0, 1].
     pub max_success: f64,
-    /// ELR: 90 % of the maximum, divided by the epochs it took to reach it.
+    /// ELR: 90 % of the maximum, divided by the number of epochs until it was reached.
     pub learning_rate: Option<f64>,
 }
 
 impl LearningMeasures {
-    /// Measures a run's evaluations, in order.
+    /// Computes the measures of a run's evaluations, which are in order.
     #[must_use]
     pub fn of(rows: &[MetricsRow]) -> Self {
         let max_success = rows.iter().map(|row| row.success).fold(0.0, f64::max);
@@ -43,7 +45,7 @@ impl LearningMeasures {
     }
 }
 
-/// The first evaluation of which the success is `success` or more.
+/// Returns the first evaluation with a success of at least `success`.
 #[must_use]
 pub fn first_reaching(rows: &[MetricsRow], success: f64) -> Option<&MetricsRow> {
     rows.iter().find(|row| row.success >= success - ROUNDING)
@@ -63,7 +65,7 @@ mod tests {
     }
 
     #[test]
-    fn a_rising_curve_has_the_measures_that_the_paper_defines() {
+    fn a_rising_curve_has_the_measures_of_the_paper() {
         let measures = LearningMeasures::of(&rows(&[0.0, 0.05, 0.2, 0.5, 0.73, 0.8, 0.7]));
         assert_eq!(measures.inspired_epoch, Some(20.0));
         assert_eq!(measures.rising_epochs, Some(20.0));
@@ -82,7 +84,7 @@ mod tests {
     }
 
     #[test]
-    fn exactly_ten_and_ninety_per_cent_count_whatever_the_rounding() {
+    fn exactly_ten_and_ninety_per_cent_count_despite_rounding() {
         for n_tenths in 1..=24 {
             let share = |n_hits: i32| f64::from(n_hits) / 240.0;
             let curve = [0.0, share(n_tenths), share(9 * n_tenths), share(10 * n_tenths)];

@@ -1,8 +1,8 @@
-//! The paper's own results, to stand beside ours.
+//! Results of the paper, which reports show beside those of Tandem's runs.
 
 use tandem_core::Task;
 
-/// Where the values of [`TABLE_2`] and [`TABLE_4`] come from.
+/// Citation for the values of [`TABLE_2`] and [`TABLE_4`].
 pub const SOURCE: &str = "H. Ren, P. Ben-Tzvi: Advising reinforcement learning toward scaling agents in continuous control \
      environments with sparse rewards. Engineering Applications of Artificial Intelligence, 2020, Tables 2 and 4; \
      https://doi.org/10.1016/j.engappai.2020.103515";
@@ -10,32 +10,32 @@ pub const SOURCE: &str = "H. Ren, P. Ben-Tzvi: Advising reinforcement learning t
 /// A row of the paper's Table 2.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PaperRow {
-    /// As the paper prints it.
+    /// Name of the strategy in the paper.
     pub name: &'static str,
-    /// The strategy's name on our command line.
+    /// Name of the strategy on Tandem's command line, without a threshold.
     pub strategy: &'static str,
-    /// Its threshold; `None` where it has none or the paper does not say which.
+    /// Threshold of the strategy; `None` if it has none or the paper does not state it.
     pub threshold: Option<f64>,
-    /// The push task.
+    /// Measures for push.
     pub push: PaperMeasures,
-    /// The pick and place task.
+    /// Measures for pick and place.
     pub pick_and_place: PaperMeasures,
 }
 
-/// What the paper gives of a strategy on a task; epochs are the paper's.
+/// Measures of one strategy on one task, in the paper's epochs.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PaperMeasures {
-    /// IE: the epoch reaching 10 % of the maximum success. `None` where the paper prints NaN.
+    /// IE: the epoch at which success reaches 10 % of its maximum. `None` where the paper prints NaN.
     pub inspired_epoch: Option<f64>,
-    /// RT: epochs from 10 % to 90 %. `None` where the paper prints NaN.
+    /// RT: number of epochs from 10 % to 90 % of the maximum. `None` where the paper prints NaN.
     pub rising_epochs: Option<f64>,
     /// MSR: the maximum success, in [0, 1].
     pub max_success: f64,
-    /// ELR: 90 % of the maximum over the epochs it took.
+    /// ELR: 90 % of the maximum, divided by the number of epochs until it was reached.
     pub learning_rate: f64,
 }
 
-/// The paper's Table 2, whole.
+/// The paper's Table 2.
 pub const TABLE_2: [PaperRow; 12] = [
     PaperRow {
         name: "NA",
@@ -113,25 +113,25 @@ pub const TABLE_2: [PaperRow; 12] = [
 /// A row of the paper's Table 4: trials on two real arms.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct PaperTrials {
-    /// What is said of the policies.
+    /// Description of the policies in the paper.
     pub name: &'static str,
-    /// Successes of [`N_PAPER_TRIALS`] in the push task.
+    /// Number of successes in [`N_PAPER_TRIALS`] trials of push.
     pub push: usize,
-    /// Successes of [`N_PAPER_TRIALS`] in the pick and place task.
+    /// Number of successes in [`N_PAPER_TRIALS`] trials of pick and place.
     pub pick_and_place: usize,
 }
 
-/// How often the paper tried each policy of its Table 4.
+/// Number of trials of each policy in the paper's Table 4.
 pub const N_PAPER_TRIALS: usize = 50;
 
-/// The paper's Table 4, whole.
+/// The paper's Table 4.
 pub const TABLE_4: [PaperTrials; 2] = [
     PaperTrials { name: "proposed method", push: 40, pick_and_place: 38 },
     PaperTrials { name: "from scratch", push: 0, pick_and_place: 30 },
 ];
 
 impl PaperTrials {
-    /// Successes in `task`.
+    /// Returns the number of successes for `task`.
     #[must_use]
     pub const fn n_successes(&self, task: Task) -> usize {
         match task {
@@ -142,16 +142,16 @@ impl PaperTrials {
 }
 
 impl PaperRow {
-    /// The row of `strategy` as it is written on the command line, such as `mc-q:0.05`, with its index.
+    /// Returns the row of a strategy such as `mc-q:0.05`, as it is written on the command line, and its index.
     #[must_use]
     pub fn of(strategy: &str) -> Option<(usize, &'static Self)> {
-        let (name, threshold) = split(strategy);
+        let (name, threshold) = split_strategy(strategy);
         TABLE_2.iter().enumerate().find(|(_, row)| {
             row.strategy == name && (row.threshold.is_none() || row.threshold == threshold)
         })
     }
 
-    /// What the paper gives for `task`.
+    /// Returns the measures for `task`.
     #[must_use]
     pub const fn measures(&self, task: Task) -> &PaperMeasures {
         match task {
@@ -161,15 +161,15 @@ impl PaperRow {
     }
 }
 
-/// A strategy's name and threshold; 0.1 is the threshold of one that is named without.
-pub(crate) fn split(strategy: &str) -> (&str, Option<f64>) {
+/// Splits a strategy into name and threshold. The default threshold is 0.1.
+pub(crate) fn split_strategy(strategy: &str) -> (&str, Option<f64>) {
     match strategy.split_once(':') {
         Some((name, threshold)) => (name, threshold.parse().ok()),
         None => (strategy, (!matches!(strategy, "none" | "ea")).then_some(0.1)),
     }
 }
 
-/// A row without a hole; the numbers stand in the paper's order: IE, RT, MSR, ELR.
+/// Creates a row in which the paper gives all values, in its order: IE, RT, MSR, ELR.
 const fn row(
     name: &'static str,
     strategy: &'static str,
@@ -206,7 +206,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_strategy_finds_its_row() {
+    fn each_strategy_has_its_row() {
         let name = |strategy: &str| PaperRow::of(strategy).map(|(_, row)| row.name);
         assert_eq!(
             ["none", "ea", "eamc:0.1", "mc-q:0.05", "mc-q", "mc-q:0.10", "mc-act-abs:0.01"]
@@ -218,15 +218,15 @@ mod tests {
 
     #[test]
     fn effective_learning_rates_agree_with_the_other_columns() {
-        let mut deviating = Vec::new();
+        let mut deviations = Vec::new();
         for (row, task) in TABLE_2.iter().flat_map(|row| Task::ALL.map(|task| (row, task))) {
             let given = row.measures(task);
             let epochs = given.inspired_epoch.zip(given.rising_epochs).map(|(ie, rt)| ie + rt);
             let rate = epochs.map_or(0.0, |epochs| 0.9 * given.max_success / epochs);
             if (rate - given.learning_rate).abs() > 0.000_06 {
-                deviating.push((row.name, task, given.learning_rate, rate));
+                deviations.push((row.name, task, given.learning_rate, rate));
             }
         }
-        assert!(deviating.is_empty(), "{deviating:?}");
+        assert!(deviations.is_empty(), "{deviations:?}");
     }
 }

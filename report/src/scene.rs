@@ -1,4 +1,4 @@
-//! A picture of the scene as SVG: table, arms, objects and goals in perspective, far things first.
+//! A picture of a scene as SVG: table, arms, objects and goals in perspective.
 
 mod camera;
 mod color;
@@ -11,20 +11,20 @@ use camera::{Camera, Vec3};
 use color::Rgb;
 use paint::Painter;
 
-/// From where the scene is seen and how large the picture is.
+/// Camera position and size of a picture.
 #[derive(Debug, Clone, PartialEq)]
 pub struct View {
-    /// Direction from which one looks, about the vertical, degrees: 0 looks along +y, from the table's long side.
+    /// Azimuth of the view, degrees: 0 looks along +y, from the long side of the table.
     pub azimuth_deg: f64,
-    /// How far above the horizontal one stands, degrees, in (0, 90).
+    /// Elevation of the camera above the horizontal, degrees, in (0, 90).
     pub elevation_deg: f64,
-    /// Distance from the middle of the scene, metres: the nearer, the stronger the perspective.
+    /// Distance of the camera from the centre of the scene, metres.
     pub distance_m: f64,
     /// Width, pixels.
     pub width: u32,
     /// Height, pixels.
     pub height: u32,
-    /// A line of text in the upper left corner.
+    /// Text in the upper left corner.
     pub caption: Option<String>,
 }
 
@@ -41,30 +41,30 @@ impl Default for View {
     }
 }
 
-/// One colour for each arm and what belongs to it; a further arm starts again.
+/// Colours of the arms and of their objects and goals; further arms reuse them.
 const ARM_COLORS: [Rgb; 3] = [Rgb(0x2f, 0x78, 0xbd), Rgb(0xe0, 0x80, 0x33), Rgb(0x3c, 0x9a, 0x66)];
 const TABLE_COLOR: Rgb = Rgb(0xe9, 0xe4, 0xdb);
 const LINK_COLOR: Rgb = Rgb(0xee, 0xf0, 0xf3);
 const HAND_COLOR: Rgb = Rgb(0x4a, 0x52, 0x5c);
 const PEDESTAL_COLOR: Rgb = Rgb(0x59, 0x61, 0x6b);
-/// Height above its base that an arm may need in the picture, metres.
+/// Height above the base of an arm that the picture includes, metres.
 const ARM_HEIGHT_M: f64 = 0.75;
-/// How far ahead of its base an arm's workspace ends, and half its width, metres.
+/// Depth and half width of an arm's workspace that the picture includes, metres.
 const REACH_M: f64 = 0.62;
 const HALF_WORKSPACE_M: f64 = 0.36;
-/// Room beside a base, metres.
-const STANDING_ROOM_M: f64 = 0.16;
+/// Margin beside a base, metres.
+const BASE_MARGIN_M: f64 = 0.16;
 const PEDESTAL_RADIUS_M: f64 = 0.075;
 const PEDESTAL_HEIGHT_M: f32 = 0.035;
-/// How much wider than its links a joint is drawn.
+/// Ratio of the radius of a joint to that of its links.
 const JOINT_WIDENING: f64 = 1.12;
 
-/// The colour of an arm and of what belongs to it, as SVG writes it; darker below a `brightness` of 1, lighter above.
+/// Returns the colour of an arm for SVG; darker for a `brightness` below 1, lighter above 1.
 pub(crate) fn arm_color(arm: usize, brightness: f64) -> String {
     ARM_COLORS[arm % ARM_COLORS.len()].lit(brightness).hex()
 }
 
-/// Draws `scene` as seen by `view`.
+/// Draws `scene` as seen from `view`, as SVG.
 #[must_use]
 pub fn scene_svg(scene: &Scene, view: &View) -> String {
     let camera = Camera::fitted(view, &framed_points(scene));
@@ -105,15 +105,16 @@ fn draw_arm(painter: &mut Painter, arm: &ArmScene, color: Rgb) {
     }
 }
 
-/// The links, and first the post on which they stand when they begin above the base.
+/// Returns the links of an arm, preceded by a post if they start above the base.
 fn links_from_base(arm: &ArmScene) -> Vec<Capsule> {
     let post = arm.links.first().filter(|link| link.from != arm.base);
     let post = post.map(|link| Capsule { from: arm.base, to: link.from, radius_m: link.radius_m });
     post.into_iter().chain(arm.links.iter().copied()).collect()
 }
 
-/// What must be in the picture: where the arms stand, what they reach, and how high they rise. It does not move with
-/// the arms, so that pictures of one episode match.
+/// Returns points that the picture includes: the bases, workspaces and heights of the arms, and the goals.
+///
+/// They do not depend on the arms' joints, so that all pictures of an episode have the same view.
 fn framed_points(scene: &Scene) -> Vec<Vec3> {
     let table_z_m = table_height_m(scene);
     let around = |arm: &ArmScene| {
@@ -122,8 +123,8 @@ fn framed_points(scene: &Scene) -> Vec<Vec3> {
         let beside = |x_m: f64, side_m: f64| [x_m, y + side_m, table_z_m];
         [
             [x, y, z + ARM_HEIGHT_M],
-            beside(x, -STANDING_ROOM_M),
-            beside(x, STANDING_ROOM_M),
+            beside(x, -BASE_MARGIN_M),
+            beside(x, BASE_MARGIN_M),
             beside(x + ahead_m, -HALF_WORKSPACE_M),
             beside(x + ahead_m, HALF_WORKSPACE_M),
         ]
@@ -134,7 +135,7 @@ fn framed_points(scene: &Scene) -> Vec<Vec3> {
         .collect()
 }
 
-/// `link`, its round end raised when it would stick out below the pedestal.
+/// Returns `link` with its lower end raised if it would extend below the pedestal.
 fn on_pedestal(link: &Capsule, base: Point) -> Capsule {
     let lowest_m = base[2] + PEDESTAL_HEIGHT_M + 0.6 * link.radius_m;
     let [x, y, z] = link.from;

@@ -1,35 +1,35 @@
-//! Tables of figures, as plain text and for pages.
+//! Tables, as plain text and for HTML pages, and the format of their values.
 
 use tandem_core::Wilson;
 use tandem_telemetry::MetricsRow;
 
 use crate::group::Spread;
 
-/// What stands for a number that does not exist.
+/// Shown for a value that does not exist.
 pub(crate) const NONE: &str = "–";
 
-/// A table: a heading, heads of columns, and lines of as many cells.
+/// A table with a title, a header and rows of as many cells.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct Table {
-    /// What it shows.
+    /// Title, shown above the table.
     pub title: String,
-    /// Heads of the columns.
+    /// Header cells.
     pub header: Vec<String>,
-    /// A cell a column each.
-    pub lines: Vec<Vec<String>>,
+    /// Rows, each with one cell per column.
+    pub rows: Vec<Vec<String>>,
 }
 
 impl Table {
-    /// A table without lines.
+    /// Creates a table without rows.
     pub(crate) fn new(title: String, header: &[&str]) -> Self {
         let header = header.iter().map(|head| (*head).to_owned()).collect();
-        Self { title, header, lines: Vec::new() }
+        Self { title, header, rows: Vec::new() }
     }
 
-    /// The table for a terminal: columns line up, the first to the left, the others to the right.
+    /// Formats the table for a terminal. The first column is left-aligned, the others are right-aligned.
     #[must_use]
     pub fn text(&self) -> String {
-        let lines: Vec<&Vec<String>> = std::iter::once(&self.header).chain(&self.lines).collect();
+        let lines: Vec<&Vec<String>> = std::iter::once(&self.header).chain(&self.rows).collect();
         let width = |column: usize| {
             lines.iter().filter_map(|line| line.get(column)).map(|cell| cell.chars().count()).max()
         };
@@ -49,21 +49,22 @@ impl Table {
     }
 }
 
-/// A figure over a group's runs: its mean and, of several runs, its range and how many have it.
-pub(crate) fn spread(spread: &Spread, written: impl Fn(f64) -> String) -> String {
+/// Formats a value over the runs of a group: the mean and, for several runs, the range and the number of runs that have
+/// it.
+pub(crate) fn spread(spread: &Spread, format: impl Fn(f64) -> String) -> String {
     let Spread { n, n_runs, mean, min, max } = *spread;
     if n == 0 {
         return NONE.to_owned();
     }
     let range = match n {
         1 => String::new(),
-        _ => format!(" ({}–{})", written(min), written(max)),
+        _ => format!(" ({}–{})", format(min), format(max)),
     };
     let how_many = if n < n_runs { format!(", {n} of {n_runs}") } else { String::new() };
-    format!("{}{range}{how_many}", written(mean))
+    format!("{}{range}{how_many}", format(mean))
 }
 
-/// The same of a share, with the interval of all episodes together.
+/// Formats a share like [`spread`], with the 95 % interval over the episodes of all runs.
 pub(crate) fn share_spread((values, interval): &(Spread, Option<Wilson>)) -> String {
     let text = spread(values, |share| format!("{share:.3}"));
     match interval {
@@ -72,27 +73,27 @@ pub(crate) fn share_spread((values, interval): &(Spread, Option<Wilson>)) -> Str
     }
 }
 
-/// A figure that may not exist.
-pub(crate) fn optional(value: Option<f64>, written: impl Fn(f64) -> String) -> String {
-    value.map_or_else(|| NONE.to_owned(), written)
+/// Formats a value that may not exist.
+pub(crate) fn optional(value: Option<f64>, format: impl Fn(f64) -> String) -> String {
+    value.map_or_else(|| NONE.to_owned(), format)
 }
 
-/// A share in per cent.
+/// Formats a share in per cent.
 pub(crate) fn share(share: f64) -> String {
     if share.is_finite() { format!("{:.1} %", 100.0 * share) } else { NONE.to_owned() }
 }
 
-/// Any other number.
+/// Formats a number with three decimals.
 pub(crate) fn number(value: f64) -> String {
     if value.is_finite() { format!("{value:.3}") } else { NONE.to_owned() }
 }
 
-/// The 95 % interval of an evaluation's success.
+/// Formats the 95 % interval of an evaluation's success in per cent.
 pub(crate) fn interval(row: &MetricsRow) -> String {
     format!("{:.1}–{:.1} %", 100.0 * row.success_low, 100.0 * row.success_high)
 }
 
-/// A count with its thousands set apart.
+/// Formats a count with thousands separators.
 pub(crate) fn thousands(count: u64) -> String {
     let digits = count.to_string();
     let mut text = String::with_capacity(digits.len() + digits.len() / 3);
@@ -105,7 +106,7 @@ pub(crate) fn thousands(count: u64) -> String {
     text
 }
 
-/// 1500000 as 1.5M, 20000 as 20k.
+/// Formats a number with a unit prefix: 1500000 as 1.5M, 20000 as 20k.
 pub(crate) fn short_number(value: f64) -> String {
     let (scaled, unit) = match value.abs() {
         size if size >= 999_500.0 => (value / 1e6, "M"),
@@ -117,7 +118,7 @@ pub(crate) fn short_number(value: f64) -> String {
     format!("{}{unit}", if text == "-0" { "0" } else { text })
 }
 
-/// A span of time in hours, minutes and seconds.
+/// Formats a duration as hours and minutes, or as minutes and seconds below one hour.
 pub(crate) fn duration(seconds: f64) -> String {
     let whole = std::time::Duration::try_from_secs_f64(seconds).unwrap_or_default().as_secs();
     let (hours, minutes, seconds) = (whole / 3600, whole / 60 % 60, whole % 60);
@@ -132,7 +133,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn counts_and_times_are_easy_to_read() {
+    fn counts_and_durations_are_formatted_for_people() {
         assert_eq!([0, 999, 1000, 1_234_567].map(thousands), ["0", "999", "1,000", "1,234,567"]);
         assert_eq!(
             [0.4, 59.9, 61.0, 3725.0, f64::NAN].map(duration),
@@ -145,22 +146,22 @@ mod tests {
     }
 
     #[test]
-    fn a_spread_says_how_many_runs_it_is_of() {
-        let written = |values: &[f64], n_runs| {
+    fn a_spread_shows_how_many_runs_have_the_value() {
+        let text = |values: &[f64], n_runs| {
             spread(&Spread::of(values, n_runs), |value| format!("{value:.1}"))
         };
-        assert_eq!(written(&[2.0], 1), "2.0");
-        assert_eq!(written(&[1.0, 3.0], 2), "2.0 (1.0–3.0)");
-        assert_eq!(written(&[1.0, 3.0], 3), "2.0 (1.0–3.0), 2 of 3");
-        assert_eq!(written(&[2.0], 3), "2.0, 1 of 3");
-        assert_eq!(written(&[], 3), NONE);
+        assert_eq!(text(&[2.0], 1), "2.0");
+        assert_eq!(text(&[1.0, 3.0], 2), "2.0 (1.0–3.0)");
+        assert_eq!(text(&[1.0, 3.0], 3), "2.0 (1.0–3.0), 2 of 3");
+        assert_eq!(text(&[2.0], 3), "2.0, 1 of 3");
+        assert_eq!(text(&[], 3), NONE);
     }
 
     #[test]
-    fn columns_line_up() {
+    fn columns_are_aligned() {
         let mut table = Table::new("heading".to_owned(), &["strategy", "IE"]);
-        table.lines = vec![vec!["a-long-name".to_owned(), "1.0–2.0".to_owned()]];
-        table.lines.push(vec!["b".to_owned(), "3".to_owned()]);
+        table.rows = vec![vec!["a-long-name".to_owned(), "1.0–2.0".to_owned()]];
+        table.rows.push(vec!["b".to_owned(), "3".to_owned()]);
         let text = table.text();
         let ends: Vec<usize> = text.lines().skip(1).map(|line| line.chars().count()).collect();
         assert_eq!(ends, [20, 20, 20], "{text}");

@@ -1,8 +1,7 @@
-//! Trials on arms: whose they were, how many succeeded, and why the others did not.
+//! Trials on arms: success rates and causes of failure, by policy and mode.
 
 mod json;
-mod page;
-mod picture;
+mod plot;
 mod table;
 
 use std::collections::{BTreeMap, BTreeSet};
@@ -10,13 +9,13 @@ use std::collections::{BTreeMap, BTreeSet};
 use tandem_core::{Task, Wilson};
 use tandem_telemetry::TrialRow;
 
-use crate::figures::Figure;
+use crate::plots::Plot;
 
 pub use json::json;
-pub(crate) use page::trials_body;
-pub use picture::trial_svg;
+pub(crate) use plot::millimetres;
+pub use plot::trial_svg;
 
-/// Why trials fail, in the order of the tables.
+/// Causes of failure, in the order of the tables.
 pub const CAUSES: [&str; 7] = [
     "not-reached",
     "object-lost",
@@ -26,95 +25,95 @@ pub const CAUSES: [&str; 7] = [
     "refused",
     "stopped",
 ];
-/// What stands for every other cause, and for a failure that has none.
+/// Column of all other causes, and of failures without a cause.
 pub const OTHER_CAUSES: &str = "other";
 
-/// Trials of one subject at one task in one mode.
+/// Trials of one policy in one task and mode.
 #[derive(Debug, Clone, PartialEq)]
 pub struct TrialGroup {
     /// `push` or `pick-and-place`.
     pub task: String,
-    /// Whose trials they are: a policy's name.
-    pub subject: String,
+    /// Name of the policy.
+    pub policy: String,
     /// `open-loop` or `closed-loop`.
     pub mode: String,
-    /// The trials, by seed and number.
+    /// Trials, sorted by seed and number.
     pub rows: Vec<TrialRow>,
 }
 
 /// All trials of a report.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Trials {
-    /// Push before pick and place, then by subject and mode.
+    /// Groups, push before pick and place, then by policy and mode.
     pub groups: Vec<TrialGroup>,
-    /// What makes the figures less than they seem, a line each.
+    /// One line for each problem that limits what the values mean.
     pub warnings: Vec<String>,
 }
 
-/// Which trials are drawn.
+/// Which trials a report plots.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub enum Pictured {
-    /// Those that failed.
+pub enum PlottedTrials {
+    /// Failed trials.
     #[default]
-    Failures,
-    /// Every one.
+    Failed,
+    /// All trials.
     All,
 }
 
 impl Trials {
-    /// Puts `rows` into their groups.
+    /// Groups `rows` by task, policy and mode.
     #[must_use]
     pub fn of(rows: Vec<TrialRow>) -> Self {
         let mut by_group: BTreeMap<_, Vec<TrialRow>> = BTreeMap::new();
         for row in rows {
             let key =
-                (task_order(&row.task), row.task.clone(), row.subject.clone(), row.mode.clone());
+                (task_order(&row.task), row.task.clone(), row.policy.clone(), row.mode.clone());
             by_group.entry(key).or_default().push(row);
         }
-        let group = |((_, task, subject, mode), mut rows): ((usize, _, _, _), Vec<TrialRow>)| {
+        let group = |((_, task, policy, mode), mut rows): ((usize, _, _, _), Vec<TrialRow>)| {
             rows.sort_by_key(|row| (row.seed, row.trial));
-            TrialGroup { task, subject, mode, rows }
+            TrialGroup { task, policy, mode, rows }
         };
         let groups: Vec<TrialGroup> = by_group.into_iter().map(group).collect();
-        let warnings = groups.iter().filter_map(TrialGroup::repeated).collect();
+        let warnings = groups.iter().filter_map(TrialGroup::repetition_warning).collect();
         Self { groups, warnings }
     }
 
-    /// A picture of each trial that failed, or of each.
+    /// Draws the failed trials, or all trials.
     #[must_use]
-    pub fn pictures(&self, pictured: Pictured) -> Vec<Figure> {
+    pub fn plots(&self, plotted: PlottedTrials) -> Vec<Plot> {
         let mut names = BTreeMap::new();
         let rows = self.groups.iter().flat_map(|group| &group.rows);
-        let drawn = rows.filter(|row| pictured == Pictured::All || !succeeded(row));
-        drawn.map(|row| picture(row, &mut names)).collect()
+        let drawn = rows.filter(|row| plotted == PlottedTrials::All || !succeeded(row));
+        drawn.map(|row| plot(row, &mut names)).collect()
     }
 }
 
 impl TrialGroup {
-    /// Subject and mode, for tables.
+    /// Returns policy and mode, for tables.
     #[must_use]
     pub fn label(&self) -> String {
-        format!("{}, {}", self.subject, self.mode)
+        format!("{}, {}", self.policy, self.mode)
     }
 
-    /// How many trials succeeded.
+    /// Returns the number of successful trials.
     #[must_use]
     pub fn n_successes(&self) -> usize {
         self.rows.iter().filter(|row| succeeded(row)).count()
     }
 
-    /// The 95 % interval of the share of successes.
+    /// Returns Wilson's 95 % interval of the success rate.
     #[must_use]
     pub fn interval(&self) -> Wilson {
         Wilson::of(self.n_successes(), self.rows.len())
     }
 
-    /// The trials that failed.
+    /// Returns the failed trials.
     pub fn failed(&self) -> impl Iterator<Item = &TrialRow> {
         self.rows.iter().filter(|row| !succeeded(row))
     }
 
-    /// How many trials failed by each of [`CAUSES`], and at last by any other.
+    /// Returns the number of failures by each of [`CAUSES`], and last by any other cause.
     #[must_use]
     pub fn n_failed_by(&self) -> [usize; CAUSES.len() + 1] {
         let mut counts = [0; CAUSES.len() + 1];
@@ -125,27 +124,27 @@ impl TrialGroup {
         counts
     }
 
-    /// Half of the trials took no longer, seconds; failures count. `None` without trials.
+    /// Returns the median duration of all trials, failures included, in seconds. `None` without trials.
     #[must_use]
     pub fn median_duration_s(&self) -> Option<f64> {
         median(self.rows.iter().map(|row| row.duration_s).collect())
     }
 
-    /// The same of the successes alone.
+    /// Returns the median duration of the successful trials, in seconds. `None` without successes.
     #[must_use]
     pub fn median_success_duration_s(&self) -> Option<f64> {
         let successes = self.rows.iter().filter(|row| succeeded(row));
         median(successes.map(|row| row.duration_s).collect())
     }
 
-    /// A warning when the same start was tried more than once.
-    fn repeated(&self) -> Option<String> {
+    /// Returns a warning if some trials have the same seed and number.
+    fn repetition_warning(&self) -> Option<String> {
         let starts: BTreeSet<_> = self.rows.iter().map(|row| (row.seed, row.trial)).collect();
         let n_repeated = self.rows.len() - starts.len();
         (n_repeated > 0).then(|| {
             format!(
-                "{}, {}: {n_repeated} of {} trials repeat another's seed and number; all are counted, so the interval is \
-                 narrower than it should be",
+                "{}, {}: {n_repeated} of {} trials repeat the seed and number of another; all are counted, so the interval \
+                 is too narrow",
                 self.task,
                 self.label(),
                 self.rows.len()
@@ -154,13 +153,13 @@ impl TrialGroup {
     }
 }
 
-/// Whether nothing at all went wrong.
+/// Returns whether a trial succeeded. A trial with a cause is a failure, whatever its other fields are.
 fn succeeded(row: &TrialRow) -> bool {
     row.success && row.cause.is_none()
 }
 
-/// How a trial ended, in a word.
-fn verdict(row: &TrialRow) -> &str {
+/// Returns the outcome of a trial as one word: `success`, the cause of failure, or `failure`.
+pub(crate) fn outcome(row: &TrialRow) -> &str {
     match &row.cause {
         Some(cause) => cause,
         None if row.success => "success",
@@ -172,7 +171,7 @@ fn task_order(name: &str) -> usize {
     Task::ALL.iter().position(|task| task.name() == name).unwrap_or(Task::ALL.len())
 }
 
-/// The middle value, or the mean of the middle two.
+/// Returns the median; for an even number of values, the mean of the middle two.
 fn median(mut values: Vec<f64>) -> Option<f64> {
     values.sort_by(f64::total_cmp);
     let middle = values.len() / 2;
@@ -183,21 +182,21 @@ fn median(mut values: Vec<f64>) -> Option<f64> {
     }
 }
 
-/// The picture of a trial, under a name that no picture in `names` has.
-fn picture(row: &TrialRow, names: &mut BTreeMap<String, u32>) -> Figure {
-    let TrialRow { task, subject, mode, seed, trial, .. } = row;
-    let stem = slug(&format!("trial-{task}-{subject}-{mode}-seed{seed}-{trial}"));
-    let n_before = names.entry(stem.clone()).or_insert(0);
-    *n_before += 1;
-    let file_name = match *n_before {
+/// Draws a trial. `names` counts the uses of each file name, so that every plot gets its own.
+fn plot(row: &TrialRow, names: &mut BTreeMap<String, u32>) -> Plot {
+    let TrialRow { task, policy, mode, seed, trial, .. } = row;
+    let stem = slug(&format!("trial-{task}-{policy}-{mode}-seed{seed}-{trial}"));
+    let n_uses = names.entry(stem.clone()).or_insert(0);
+    *n_uses += 1;
+    let file_name = match *n_uses {
         1 => format!("{stem}.svg"),
         n => format!("{stem}-again{n}.svg"),
     };
-    let title = format!("{task}, {subject}, {mode}, trial {trial}: {}", verdict(row));
-    Figure { file_name, title, svg: trial_svg(row) }
+    let title = format!("{task}, {policy}, {mode}, trial {trial}: {}", outcome(row));
+    Plot { file_name, title, svg: trial_svg(row) }
 }
 
-/// A name that every file system takes.
+/// Returns a name that is valid on every file system.
 fn slug(text: &str) -> String {
     let safe = |c: char| match c {
         'a'..='z' | '0'..='9' | '-' | '_' | '.' => c,
@@ -212,7 +211,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_median_is_in_the_middle() {
+    fn the_median_is_the_middle_value_or_the_mean_of_two() {
         let of = |values: &[f64]| median(values.to_vec());
         assert_eq!(of(&[]), None);
         assert_eq!(of(&[3.0]), Some(3.0));
@@ -222,7 +221,7 @@ mod tests {
     }
 
     #[test]
-    fn a_files_name_has_no_odd_signs() {
+    fn a_file_name_has_no_special_characters() {
         assert_eq!(slug("trial-Push/../x y-é-1.5"), "trial-push-..-x-y---1.5");
     }
 }

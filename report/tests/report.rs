@@ -1,11 +1,11 @@
-//! Pictures and pages: well-formed, complete, and not to be broken by names or numbers.
+//! Plots and pages: well-formed and complete, whatever the names and numbers.
 #![expect(clippy::unwrap_used, reason = "a test that cannot go on may end")]
 
 use std::path::Path;
 
 use tandem_report::{
-    Axis, Comparison, CurveOptions, CurvePoint, Pictured, Quantity, Series, Trials, View,
-    curve_svg, report_html, run, run_report_html, scene_svg,
+    Axis, Comparison, CurveOptions, CurvePoint, PlottedTrials, Quantity, ReportInputs, Series,
+    Trials, View, curve_svg, report_html, run_report_html, scene_svg,
 };
 use tandem_telemetry::{MetricsLog, MetricsRow};
 
@@ -44,7 +44,7 @@ fn run_dir(rows: &[MetricsRow]) -> tempfile::TempDir {
 }
 
 #[test]
-fn several_curves_have_their_bands_and_a_legend() {
+fn several_curves_have_bands_and_a_legend() {
     let rows = [row(0, 0), row(10, 120), row(20, 216)];
     let series = ["none", "mc-q:0.1 <&>"]
         .map(|name| Series::of(name, &rows, Axis::EnvSteps, Quantity::Success));
@@ -59,11 +59,11 @@ fn several_curves_have_their_bands_and_a_legend() {
 }
 
 #[test]
-fn a_single_curve_has_no_legend_and_nothing_at_all_is_drawn_too() {
+fn a_single_curve_has_no_legend_and_may_be_empty() {
     let point = CurvePoint { x: 1.0, y: -2.0, band: None };
     let check = |points: Vec<CurvePoint>| {
         let series = [Series { name: "hidden".to_owned(), points }];
-        let svg = curve_svg(&series, &CurveOptions::figures("Mean Q", Axis::Updates)).unwrap();
+        let svg = curve_svg(&series, &CurveOptions::values("Mean Q", Axis::Updates)).unwrap();
         assert_well_formed(&svg);
         assert!(!svg.contains("hidden") && svg.contains("Mean Q") && svg.contains("updates"));
     };
@@ -98,8 +98,8 @@ fn a_scene_shows_every_body_from_every_side() {
 }
 
 #[test]
-fn what_stands_in_front_is_drawn_last() {
-    // The fill of the first face drawn, with the first object at `y` and the second behind or before it.
+fn nearer_bodies_are_drawn_last() {
+    // Returns the fill of the first face drawn, with the first object at `y` and the second at `-y`.
     let first_fill = |y: f32| {
         let mut scene = synthetic::scene(0.5);
         (scene.arms, scene.goals) = (Vec::new(), Vec::new());
@@ -114,7 +114,7 @@ fn what_stands_in_front_is_drawn_last() {
 }
 
 #[test]
-fn a_runs_page_needs_nothing_but_itself() {
+fn the_page_of_a_run_loads_nothing_from_elsewhere() {
     let dir = run_dir(&[row(0, 0), row(5, 60), row(10, 225)]);
     std::fs::write(dir.path().join("run.toml"), "name = \"<push>\"\n").unwrap();
     let path = run_report_html(dir.path()).unwrap();
@@ -137,7 +137,7 @@ fn a_runs_page_needs_nothing_but_itself() {
 }
 
 #[test]
-fn a_run_without_an_evaluation_has_a_page_too() {
+fn a_run_without_an_evaluation_has_a_page() {
     let dir = run_dir(&[]);
     let page = std::fs::read_to_string(run_report_html(dir.path()).unwrap()).unwrap();
     assert!(page.contains("No evaluation yet"));
@@ -156,28 +156,29 @@ fn seed_of(parent: &Path, strategy: &str, seed: u64, rows: &[MetricsRow]) {
 }
 
 #[test]
-fn a_sweeps_page_has_its_tables_its_curves_and_the_papers_values() {
+fn the_page_of_a_sweep_has_tables_curves_and_the_papers_values() {
     let dir = tempfile::tempdir().unwrap();
     seed_of(dir.path(), "mc-q:0.1", 1, &[row(0, 0), row(5, 120), row(10, 230)]);
     seed_of(dir.path(), "mc-q:0.1", 2, &[row(0, 0), row(5, 60)]);
     seed_of(dir.path(), "none", 1, &[row(0, 0), row(5, 0)]);
-    let found = run::find(&[dir.path().to_owned()]).unwrap();
-    let comparison = Comparison::of(found.runs, Vec::new());
+    let inputs = ReportInputs::load(&[dir.path().to_owned()]).unwrap();
+    let comparison = Comparison::of(inputs.runs, Vec::new());
     let page = dir.path().join("report.html");
-    let written = report_html(&comparison, &Trials::default(), Pictured::Failures, &page).unwrap();
+    let written =
+        report_html(&comparison, &Trials::default(), PlottedTrials::Failed, &page).unwrap();
     let page = std::fs::read_to_string(&written.page).unwrap();
-    assert_eq!(page.matches("<svg").count(), written.figures.len());
-    assert_eq!(written.figures.len(), 5, "three of success, one of mean Q, one of advice");
+    assert_eq!(page.matches("<svg").count(), written.plots.len());
+    assert_eq!(written.plots.len(), 5, "three of success, one of mean Q, one of advice");
     for text in ["MC-ACTABS005", "0.9625", "push, 2 arms", "0.9583", "1 of 2", "10.1016/j.engappai"]
     {
         assert!(page.contains(text), "{text}");
     }
-    for svg in &written.figures {
+    for svg in &written.plots {
         let svg = std::fs::read_to_string(svg).unwrap();
         assert_well_formed(&svg);
         assert!(svg.contains("mc-q:0.1") && svg.contains("none"));
     }
-    let success = std::fs::read_to_string(&written.figures[0]).unwrap();
+    let success = std::fs::read_to_string(&written.plots[0]).unwrap();
     assert!(success.contains("<polygon"), "a band over the seeds");
     for reference in ["<script", "<link", "src=", "@import", "url(http"] {
         assert!(!page.contains(reference), "{reference}");

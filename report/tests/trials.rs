@@ -1,27 +1,27 @@
-//! Trials: counted, drawn, told of on a page.
+//! Reports on trials: tables, plots, pages and JSON.
 #![expect(clippy::unwrap_used, reason = "a test that cannot go on may end")]
 
-use tandem_report::{Comparison, Pictured, Trials, report_html, trial_svg, trials};
-use tandem_telemetry::{ToolsAt, TrialRow};
+use tandem_report::{Comparison, PlottedTrials, Trials, report_html, trial_svg, trials};
+use tandem_telemetry::{ToolPathPoint, TrialRow};
 
 #[path = "support/well_formed.rs"]
 mod well_formed;
 
 use well_formed::assert_well_formed;
 
-/// A trial of two arms that push; the ways have a place each centimetre, the planned ones stop at two thirds.
+/// A trial of push with two arms. Paths have a point per centimetre; the planned ones end after two thirds.
 fn row(trial: u64, cause: Option<&str>) -> TrialRow {
     let tools = |step: u32, off_m: f64| {
         let x = 0.01 * f64::from(step);
         vec![[x - 0.2, 0.1 + off_m, 0.05], [0.2 - x, off_m - 0.1, 0.05]]
     };
-    let path = (0..30).map(|step| ToolsAt {
+    let path = (0..30).map(|step| ToolPathPoint {
         time_s: 0.04 * f64::from(step),
         planned: if step < 20 { tools(step, 0.0) } else { Vec::new() },
         measured: tools(step, 0.004),
     });
     TrialRow {
-        subject: "student-push".to_owned(),
+        policy: "student-push".to_owned(),
         mode: "closed-loop".to_owned(),
         task: "push".to_owned(),
         trial,
@@ -44,13 +44,13 @@ fn row(trial: u64, cause: Option<&str>) -> TrialRow {
     }
 }
 
-/// The numbers of points of every polyline, in order.
+/// Number of points of each polyline, in order.
 fn points_of_polylines(svg: &str) -> Vec<usize> {
     let lines = svg.split("<polyline points=\"").skip(1);
     lines.map(|line| line.split('"').next().unwrap().split_whitespace().count()).collect()
 }
 
-/// Two successes and a failure of each cause, in an order that is nobody's.
+/// Two successes and one failure of each cause, unsorted.
 fn of_every_cause() -> Vec<TrialRow> {
     let causes = trials::CAUSES.iter().rev().map(|cause| Some(*cause));
     (0..).zip(causes.chain([None, None])).map(|(trial, cause)| row(trial, cause)).collect()
@@ -65,7 +65,7 @@ fn the_table_has_successes_intervals_causes_and_the_papers_rows() {
     let text = Trials::of(rows).text();
     let expected = "\
 push: trials, as the paper's Table 4
-subject, mode               success  share [95 % interval]  not-reached  object-lost  timed-out  arms-touched  table-touched  refused  stopped  median time
+policy, mode                success  share [95 % interval]  not-reached  object-lost  timed-out  arms-touched  table-touched  refused  stopped  median time
 student-push, closed-loop       2/9      22.2 % [6.3–54.7]            1            1          1             1              1        1        1       14.0 s
 student-push, open-loop         4/4   100.0 % [51.0–100.0]            0            0          0             0              0        0        0       11.5 s
 the paper, proposed method    40/50     80.0 % [67.0–88.8]            –            –          –             –              –        –        –            –
@@ -75,10 +75,10 @@ the paper, from scratch        0/50        0.0 % [0.0–7.1]            –     
 }
 
 #[test]
-fn pick_and_place_comes_after_push_and_causes_that_nobody_knows_last() {
+fn pick_and_place_follows_push_and_unknown_causes_are_last() {
     let other_task = |trial, cause| TrialRow {
         task: "pick-and-place".to_owned(),
-        subject: "a".to_owned(),
+        policy: "a".to_owned(),
         ..row(trial, cause)
     };
     let mut without_cause = row(3, None);
@@ -97,23 +97,23 @@ fn pick_and_place_comes_after_push_and_causes_that_nobody_knows_last() {
     assert!(tables[0].title.starts_with("push:") && tables[1].title.starts_with("pick-and-place:"));
     let cell = |head: &str| {
         let column = tables[0].header.iter().position(|cell| cell == head).unwrap();
-        tables[0].lines[0][column].as_str()
+        tables[0].rows[0][column].as_str()
     };
     assert_eq!(
         ["success", "not-reached", "stopped", "other"].map(cell),
         ["0/4", "1", "1", "2"],
-        "a trial that names a cause is no success"
+        "a trial with a cause is not a success"
     );
     assert!(!tables[1].header.contains(&"other".to_owned()));
-    let papers: Vec<&str> = tables[1].lines[1..].iter().map(|line| line[1].as_str()).collect();
+    let papers: Vec<&str> = tables[1].rows[1..].iter().map(|line| line[1].as_str()).collect();
     assert_eq!(papers, ["38/50", "30/50"]);
 }
 
 #[test]
-fn one_arm_is_not_set_beside_the_papers_two() {
+fn trials_with_one_arm_are_not_compared_with_the_papers_two() {
     let mut lone = row(1, Some("timed-out"));
-    for places in [&mut lone.starts, &mut lone.goals, &mut lone.ends] {
-        places.truncate(1);
+    for positions in [&mut lone.starts, &mut lone.goals, &mut lone.ends] {
+        positions.truncate(1);
     }
     for tools in &mut lone.path {
         tools.planned.truncate(1);
@@ -121,7 +121,7 @@ fn one_arm_is_not_set_beside_the_papers_two() {
     }
     (lone.arms_gap_m, lone.goal_distances_m, lone.detail) = (None, vec![0.07], None);
     let trials = Trials::of(vec![lone.clone()]);
-    assert_eq!(trials.tables()[0].lines.len(), 1);
+    assert_eq!(trials.tables()[0].rows.len(), 1);
     let svg = trial_svg(&lone);
     assert_well_formed(&svg);
     assert_eq!(points_of_polylines(&svg), [30, 20, 30, 20]);
@@ -129,7 +129,7 @@ fn one_arm_is_not_set_beside_the_papers_two() {
 }
 
 #[test]
-fn a_picture_has_both_ways_of_both_arms_in_both_views() {
+fn a_plot_has_both_paths_of_both_arms_in_both_views() {
     let svg = trial_svg(&row(7, Some("arms-touched")));
     assert_well_formed(&svg);
     assert_eq!(points_of_polylines(&svg), [30, 20, 30, 20, 30, 20, 30, 20]);
@@ -137,23 +137,23 @@ fn a_picture_has_both_ways_of_both_arms_in_both_views() {
         .split("<polyline")
         .skip(1)
         .filter(|line| line.split("/>").next().unwrap().contains("stroke-dasharray"));
-    assert_eq!(dashed.count(), 4, "what was planned");
+    assert_eq!(dashed.count(), 4, "planned paths");
     for text in [
         "push, trial 7: arms-touched",
         "12 / 83 mm",
         "arms-touched &amp; more: arm 0 &lt; arm 1",
         "3 of them shortened",
         "10 cm",
-        "where it stopped",
+        "when the trial failed",
     ] {
         assert!(svg.contains(text), "{text}");
     }
     let success = trial_svg(&row(8, None));
-    assert!(success.contains("trial 8: success") && !success.contains("where it stopped"));
+    assert!(success.contains("trial 8: success") && !success.contains("when the trial failed"));
 }
 
 #[test]
-fn a_trial_that_never_moved_is_drawn_and_so_is_one_of_which_nothing_is_known() {
+fn a_trial_without_motion_or_without_positions_is_drawn() {
     let still = TrialRow { path: Vec::new(), ..row(1, Some("refused")) };
     let unknown = TrialRow {
         starts: Vec::new(),
@@ -170,7 +170,7 @@ fn a_trial_that_never_moved_is_drawn_and_so_is_one_of_which_nothing_is_known() {
 }
 
 #[test]
-fn an_object_that_flew_away_does_not_shrink_the_picture() {
+fn an_object_far_away_does_not_change_the_scale() {
     let circle = |row: &TrialRow| {
         let svg = trial_svg(row);
         assert_well_formed(&svg);
@@ -185,14 +185,14 @@ fn an_object_that_flew_away_does_not_shrink_the_picture() {
 }
 
 #[test]
-fn the_page_shows_every_failure_and_lists_every_trial() {
+fn the_page_plots_every_failure_and_lists_every_trial() {
     let dir = tempfile::tempdir().unwrap();
     let trials = Trials::of(of_every_cause());
     let comparison = Comparison::of(Vec::new(), Vec::new());
     let page = dir.path().join("report.html");
-    let written = report_html(&comparison, &trials, Pictured::Failures, &page).unwrap();
-    assert_eq!(written.figures.len(), trials::CAUSES.len());
-    assert!(written.figures.iter().all(|path| path.exists()));
+    let written = report_html(&comparison, &trials, PlottedTrials::Failed, &page).unwrap();
+    assert_eq!(written.plots.len(), trials::CAUSES.len());
+    assert!(written.plots.iter().all(|path| path.exists()));
     let html = std::fs::read_to_string(&written.page).unwrap();
     assert_eq!(html.matches("<svg").count(), trials::CAUSES.len());
     for (trial, cause) in trials::CAUSES.iter().rev().enumerate() {
@@ -201,23 +201,20 @@ fn the_page_shows_every_failure_and_lists_every_trial() {
     for number in 0..9 {
         assert!(html.contains(&format!("<td>trial-{number}.mcap</td>")), "{number}");
     }
-    assert!(html.contains("Trials compared") && html.contains("Tables 2 and 4"));
-    assert!(
-        !html.contains("Table 2</h2>"),
-        "without a run the paper's Table 2 is beside the point"
-    );
-    let all = report_html(&comparison, &trials, Pictured::All, &page).unwrap();
-    assert_eq!(all.figures.len(), 9);
+    assert!(html.contains("Comparison of trials") && html.contains("Tables 2 and 4"));
+    assert!(!html.contains("Table 2</h2>"), "the paper's Table 2 is about runs");
+    let all = report_html(&comparison, &trials, PlottedTrials::All, &page).unwrap();
+    assert_eq!(all.plots.len(), 9);
 }
 
 #[test]
-fn trials_that_repeat_another_are_told_of_and_keep_their_pictures() {
+fn repeated_trials_add_a_warning_and_keep_their_plots() {
     let rows = vec![row(1, Some("stopped")), row(1, Some("stopped")), row(2, None)];
     let trials = Trials::of(rows);
     let [warning] = &trials.warnings[..] else { panic!("{:?}", trials.warnings) };
     assert!(warning.contains("1 of 3 trials repeat"), "{warning}");
     let names: Vec<String> =
-        trials.pictures(Pictured::Failures).into_iter().map(|figure| figure.file_name).collect();
+        trials.plots(PlottedTrials::Failed).into_iter().map(|plot| plot.file_name).collect();
     assert_eq!(
         names,
         [
@@ -229,7 +226,7 @@ fn trials_that_repeat_another_are_told_of_and_keep_their_pictures() {
 }
 
 #[test]
-fn programs_get_every_groups_figures() {
+fn json_has_the_statistics_of_every_group() {
     let value = trials::json(&Trials::of(of_every_cause()));
     let group = &value["groups"][0];
     assert_eq!((&group["trials"], &group["successes"]), (&9.into(), &2.into()));

@@ -30,7 +30,7 @@ pub struct Batch {
     /// After the step, with the same goal, shape `[b, n_observation + n_goal]`.
     pub next_inputs: Vec<f32>,
     /// 1 where the executed component was the teacher's, else 0, shape `[b, n_action]`.
-    pub cloned: Vec<f32>,
+    pub bc_mask: Vec<f32>,
 }
 
 impl Batch {
@@ -43,7 +43,7 @@ impl Batch {
             actions: vec![0.0; batch_size * layout.n_action()],
             rewards: vec![0.0; batch_size * n_heads],
             next_inputs: vec![0.0; batch_size * n_input],
-            cloned: vec![0.0; batch_size * layout.n_action()],
+            bc_mask: vec![0.0; batch_size * layout.n_action()],
         }
     }
 }
@@ -387,18 +387,18 @@ impl ActorHalf {
     fn add_action_terms(&mut self, config: &DdpgConfig, batch: &Batch, n_input: usize) -> f64 {
         let n_action = self.action_gradient.len() / config.batch_size;
         let penalty = config.action_penalty / self.action_gradient.len() as f32;
-        let cloning = config.cloning_weight / config.batch_size as f32;
+        let cloning = config.bc_weight / config.batch_size as f32;
         let mut loss = 0.0;
         let executed_rows =
-            batch.actions.chunks_exact(n_action).zip(batch.cloned.chunks_exact(n_action));
+            batch.actions.chunks_exact(n_action).zip(batch.bc_mask.chunks_exact(n_action));
         let rows = self
             .action_gradient
             .chunks_exact_mut(n_action)
             .zip(self.input.chunks_exact(n_input + n_action));
-        for ((gradient, input), (executed, cloned)) in rows.zip(executed_rows) {
+        for ((gradient, input), (executed, bc_mask)) in rows.zip(executed_rows) {
             for i in 0..n_action {
                 let action = input[n_input + i];
-                let error = cloned[i] * (action - executed[i]);
+                let error = bc_mask[i] * (action - executed[i]);
                 gradient[i] += 2.0 * penalty * action + 2.0 * cloning * error;
                 gradient[i] *= 1.0 - action * action;
                 loss += f64::from(penalty * action * action + cloning * error * error);

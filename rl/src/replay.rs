@@ -12,8 +12,7 @@ pub struct ReplayBuffer {
     capacity_episodes: usize,
     next: usize,
     parts: ReplayParts,
-    moved_episodes: Vec<usize>,
-    advised_episodes: Vec<usize>,
+    displaced_episodes: Vec<usize>,
 }
 
 /// The buffer's contents as they are stored.
@@ -43,8 +42,7 @@ impl ReplayBuffer {
             capacity_episodes,
             next: 0,
             parts: ReplayParts::default(),
-            moved_episodes: Vec::new(),
-            advised_episodes: Vec::new(),
+            displaced_episodes: Vec::new(),
         }
     }
 
@@ -96,14 +94,8 @@ impl ReplayBuffer {
 
     /// The stored episodes in which an object was displaced.
     #[must_use]
-    pub fn moved_episodes(&self) -> &[usize] {
-        &self.moved_episodes
-    }
-
-    /// The stored episodes in which an arm executed an action of the teacher's.
-    #[must_use]
-    pub fn advised_episodes(&self) -> &[usize] {
-        &self.advised_episodes
+    pub fn displaced_episodes(&self) -> &[usize] {
+        &self.displaced_episodes
     }
 
     /// Stores an episode, in the place of the oldest when the buffer is full.
@@ -123,10 +115,7 @@ impl ReplayBuffer {
             parts.contacts.extend_from_slice(&contacts);
             parts.moved.push(moved);
             if moved == 1 {
-                self.moved_episodes.push(self.next);
-            }
-            if is_advised(&episode.advised_arms) {
-                self.advised_episodes.push(self.next);
+                self.displaced_episodes.push(self.next);
             }
         } else {
             overwrite(&mut parts.observations, self.next, &episode.observations);
@@ -187,7 +176,7 @@ impl ReplayBuffer {
     }
 
     fn index_episodes(&mut self) {
-        self.moved_episodes.clear();
+        self.displaced_episodes.clear();
         let moved = self
             .parts
             .moved
@@ -195,17 +184,8 @@ impl ReplayBuffer {
             .enumerate()
             .filter(|(_, moved)| **moved == 1)
             .map(|(episode, _)| episode);
-        self.moved_episodes.extend(moved);
-        self.advised_episodes.clear();
-        let steps = self.parts.advised_arms.chunks_exact(EPISODE_STEPS);
-        let advised = steps.enumerate().filter(|(_, steps)| is_advised(steps));
-        self.advised_episodes.extend(advised.map(|(episode, _)| episode));
+        self.displaced_episodes.extend(moved);
     }
-}
-
-/// Whether an arm executed an action of the teacher's on one of the steps.
-fn is_advised(advised_arms: &[u8]) -> bool {
-    advised_arms.iter().any(|arms| *arms != 0)
 }
 
 /// Puts `row` in the place of row `row_idx` of a table with rows of that length.
@@ -256,7 +236,7 @@ mod tests {
         let second_x: Vec<f32> =
             (0..3).map(|episode| buffer.achieved(episode, 1, ArmIndex(0))[0]).collect();
         assert_eq!(second_x, [0.03, 0.0, 0.0], "episodes 3, 4, 2");
-        assert_eq!(buffer.moved_episodes(), [0]);
+        assert_eq!(buffer.displaced_episodes(), [0]);
     }
 
     #[test]

@@ -9,7 +9,8 @@ use sha2::{Digest as _, Sha256};
 use tandem_core::Episode;
 use tandem_core::episode::EpisodeKind;
 use tandem_core::layout::{EPISODE_STEPS, Layout, OBJECT_POSITION};
-use tandem_core::rng::{Stream, coin, episode_rng, index};
+use tandem_core::rng::{Stream, bernoulli, episode_rng, index};
+use tandem_core::text::hex;
 use tandem_core::work::{EpisodeOrder, PublishedActor, SlotOrder};
 use tandem_policy::{Normalizer, NormalizerSnapshot, Policy};
 
@@ -114,7 +115,7 @@ impl Trainer {
                 teacher.layout.task, teacher.n_heads
             ));
         }
-        let copies = teacher.copies(self.layout.n_arms);
+        let copies = teacher.replicated(self.layout.n_arms);
         let sizes = |policy: &Policy| (policy.n_hidden, policy.n_hidden_layers, policy.n_heads);
         let ddpg = &self.config.ddpg;
         let n_heads = self.config.replay.reward.n_heads(self.layout);
@@ -212,11 +213,11 @@ impl Trainer {
     /// normalised with it are all alike, and the policy learns nothing.
     #[must_use]
     pub fn absurd_statistic(&self) -> Option<String> {
-        let largest_of_object = self.layout.largest_observation(OBJECT_POSITION.start);
-        let largest_goal = self.layout.largest_goal().max(largest_of_object);
+        let largest_of_object = self.layout.observation_bound(OBJECT_POSITION.start);
+        let goal_bound = self.layout.goal_bound().max(largest_of_object);
         let observation = self.observation_normalizer.snapshot();
-        first_absurd("observations", observation, |idx| self.layout.largest_observation(idx))
-            .or_else(|| first_absurd("goals", self.goal_normalizer.snapshot(), |_| largest_goal))
+        first_absurd("observations", observation, |idx| self.layout.observation_bound(idx))
+            .or_else(|| first_absurd("goals", self.goal_normalizer.snapshot(), |_| goal_bound))
     }
 
     /// Makes a round's updates. `on_update` hears how many are done.
@@ -306,7 +307,7 @@ impl Trainer {
             hash.update(bytemuck::cast_slice::<f32, u8>(values));
         }
         for normalizer in [&self.observation_normalizer, &self.goal_normalizer] {
-            let seen = normalizer.parts();
+            let seen = normalizer.state();
             hash.update(seen.count.to_le_bytes());
             seen.sum
                 .iter()
@@ -323,7 +324,7 @@ impl Trainer {
         {
             hash.update(count.to_le_bytes());
         }
-        hash.finalize().iter().map(|byte| format!("{byte:02x}")).collect()
+        hex(&hash.finalize())
     }
 
     /// Every large float vector of the state, by name, in a fixed order.
@@ -343,7 +344,7 @@ impl Trainer {
     /// Feeds the normalisers with an episode's observations and with goals relabelled as in a batch.
     fn feed_normalizers(&mut self, episode: &Episode) {
         let mut rng = episode_rng(self.config.seed, episode.number, Stream::Normaliser);
-        let both_orders = self.config.replay.swap_share > 0.0 && self.layout.n_arms == 2;
+        let both_orders = self.config.replay.arm_swap_prob > 0.0 && self.layout.n_arms == 2;
         let (mut observations, mut goals) = (Vec::new(), Vec::new());
         for step_idx in 0..EPISODE_STEPS {
             let goal = self.relabelled_goal(episode, step_idx, &mut rng);
@@ -367,7 +368,7 @@ impl Trainer {
     ) -> Vec<f32> {
         let mut goal = episode.goal.clone();
         for arm in self.layout.arms() {
-            let hindsight = coin(rng, self.config.replay.her_future_share);
+            let hindsight = bernoulli(rng, self.config.replay.her_ratio);
             let moment = step_idx + 1 + index(rng, EPISODE_STEPS - step_idx);
             if hindsight {
                 goal[self.layout.goal_of(arm)].copy_from_slice(episode.achieved(moment, arm));

@@ -28,7 +28,7 @@ fn batch(stored: &Value) -> Batch {
         actions: f32s(&stored["actions"]),
         rewards: f32s(&stored["rewards"]),
         next_inputs: f32s(&stored["next_inputs"]),
-        cloned: f32s(&stored["cloned"]),
+        bc_mask: f32s(&stored["bc_mask"]),
     }
 }
 

@@ -1,16 +1,16 @@
-//! Prints how many control steps per second one core simulates, for each environment.
+//! Prints the number of control steps per second that one core simulates, for each environment.
 #![expect(
     clippy::print_stdout,
     clippy::disallowed_methods,
-    reason = "a benchmark: its output, and its clock"
+    reason = "a benchmark prints its results and reads the clock"
 )]
 
 use std::time::Instant;
 
 use tandem_core::layout::EPISODE_STEPS;
 use tandem_core::rng::uniform;
-use tandem_core::{Layout, Stream, Task, episode_rng};
-use tandem_sim::{Env, SimError, Starts, WorldConfig};
+use tandem_core::{Layout, Stream, Task, WorldSettings, episode_rng};
+use tandem_sim::{Env, SimError, WorldConfig};
 
 const EPISODES: u64 = 40;
 
@@ -29,14 +29,14 @@ fn main() -> Result<(), SimError> {
     Ok(())
 }
 
-/// Episodes of held random actions, resets included.
+/// Measures episodes with random actions that are held for four steps, including resets.
 fn steps_per_s(layout: Layout, config: &WorldConfig) -> Result<f64, SimError> {
     let mut env = Env::new(layout, config)?;
     let mut action = vec![0.0; layout.n_action()];
     let mut observation = vec![0.0; layout.n_observation()];
     let start = Instant::now();
     for episode in 0..EPISODES {
-        env.reset(&mut episode_rng(1, episode, Stream::Reset), Starts::default());
+        env.reset(&mut episode_rng(1, episode, Stream::Reset), WorldSettings::default());
         let mut exploration = episode_rng(1, episode, Stream::Exploration);
         for step in 0..EPISODE_STEPS {
             if step % 4 == 0 {

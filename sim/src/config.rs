@@ -1,41 +1,43 @@
-//! What a world is made of, how its episodes start, and what can go wrong with it.
+//! Configuration of the world, initial states of episodes, and errors.
 
 use serde::{Deserialize, Serialize};
-use tandem_core::Task;
+use tandem_core::{Task, WorldSettings};
 
-/// Simulated time of a control step, seconds.
+/// Duration of a control step in simulated time, seconds.
 pub const CONTROL_STEP_S: f32 = 0.04;
 /// Control steps per second of simulated time.
 pub(crate) const CONTROL_STEPS_PER_S: f64 = 25.0;
 
-/// How finely a world is simulated and what its objects are made of.
+/// Physics parameters of a world.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct WorldConfig {
-    /// Physics steps per control step of 0.04 s, in [10, 80]. The paper's 0.002 s are 20; 10 doubles the speed.
+    /// Physics steps per control step of 0.04 s, in [10, 80]. 20 corresponds to the paper's 0.002 s; 10 is twice as
+    /// fast.
     pub substeps: u32,
     /// Iterations of the contact solver per physics step, in [1, 16].
     pub solver_iterations: usize,
-    /// Half the edge of the cubes, metres, in [0.015, 0.045].
+    /// Half the edge length of the cubes, metres, in [0.015, 0.045].
     pub object_half_size_m: f32,
     /// Mass of a cube, kilograms, in [0.02, 1].
     pub object_mass_kg: f32,
-    /// Largest force with which each side of the gripper presses, newtons, in [0.1, 60].
+    /// Largest force of each side of the gripper, newtons, in [0.1, 60].
     pub grip_force_n: f32,
-    /// Surfaces of the push task: smoother than the table, so that objects are pushed and not dragged from above.
+    /// Friction in the push task. It is lower than the table's, so a hand pushes objects and cannot drag them from
+    /// above.
     pub push: Friction,
-    /// Surfaces of the pick-and-place task.
+    /// Friction in the pick-and-place task.
     pub pick_and_place: Friction,
 }
 
-/// Coulomb friction coefficients, each in [0, 2]. Of two touching surfaces the larger coefficient counts; the
-/// table's is 0.6, so a cube never slides on it with less.
+/// Coulomb friction coefficients, each in [0, 2]. A contact has the larger coefficient of its two surfaces. That of the
+/// table is 0.6, which is therefore a lower bound for a cube that slides on it.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Friction {
-    /// Of the finger pads.
+    /// Coefficient of the finger pads.
     pub pads: f32,
-    /// Of the cubes.
+    /// Coefficient of the cubes.
     pub object: f32,
 }
 
@@ -53,11 +55,17 @@ impl Default for WorldConfig {
     }
 }
 
+impl From<WorldSettings> for WorldConfig {
+    fn from(settings: WorldSettings) -> Self {
+        Self { substeps: settings.substeps, ..Self::default() }
+    }
+}
+
 impl WorldConfig {
-    /// The configuration, when every value is in its range; NaN is in none.
+    /// Returns the configuration if every value is in its range. NaN is in no range.
     ///
     /// # Errors
-    /// Names the first value out of range.
+    /// Returns an error that names the first value out of range.
     pub fn checked(self) -> Result<Self, SimError> {
         check("substeps", f64::from(self.substeps), 10.0, 80.0)?;
         #[expect(
@@ -75,14 +83,14 @@ impl WorldConfig {
         Ok(self)
     }
 
-    /// Simulated time of a physics step, seconds.
+    /// Returns the duration of a physics step in simulated time, seconds.
     pub(crate) fn substep_s(&self) -> f32 {
         #[expect(clippy::cast_precision_loss, reason = "at most 80")]
         let substeps = self.substeps as f32;
         CONTROL_STEP_S / substeps
     }
 
-    /// The surfaces that `task` is done with.
+    /// Returns the friction coefficients for `task`.
     pub(crate) fn friction(&self, task: Task) -> Friction {
         match task {
             Task::Push => self.push,
@@ -91,7 +99,7 @@ impl WorldConfig {
     }
 }
 
-/// Passes `value` when it lies in `[low, high]`, with the slack of a number given in single precision.
+/// Checks that `value` is in `[low, high]`, up to the rounding of a single-precision number.
 fn check(key: &'static str, value: f64, low: f64, high: f64) -> Result<(), SimError> {
     let slack = 1e-6 * high;
     if (low - slack..=high + slack).contains(&value) {
@@ -101,16 +109,7 @@ fn check(key: &'static str, value: f64, low: f64, high: f64) -> Result<(), SimEr
     }
 }
 
-/// How often training episodes start otherwise than evaluated ones. Shares of episodes, in [0, 1].
-#[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub struct Starts {
-    /// Share that starts with every object held by its arm, anywhere in reach. Pick and place only.
-    pub gripped_share: f32,
-    /// Share that starts with the hands anywhere in the lower workspace.
-    pub wide_share: f32,
-}
-
-/// Why a world cannot be built or stepped.
+/// An error of creating or stepping a world.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 #[non_exhaustive]
 pub enum SimError {
@@ -126,7 +125,7 @@ pub enum SimError {
         /// Largest value allowed.
         high: f64,
     },
-    /// Worlds have one arm or two.
+    /// The layout does not have one or two arms.
     #[error("{0} arms, expected 1 or 2")]
     Arms(usize),
     /// The action has the wrong length.
@@ -140,7 +139,7 @@ pub enum SimError {
     /// A number of the action is NaN or infinite.
     #[error("action[{index}] is {value}")]
     ActionNotFinite {
-        /// Where the number stands.
+        /// Index of the number.
         index: usize,
         /// The number.
         value: f32,
@@ -148,9 +147,9 @@ pub enum SimError {
     /// The physics step gave a NaN or infinite position or velocity.
     #[error("the {part} of arm {arm} has no finite position and velocity")]
     StateNotFinite {
-        /// Which body.
+        /// Name of the body.
         part: &'static str,
-        /// The arm it belongs to.
+        /// Index of its arm.
         arm: usize,
     },
 }

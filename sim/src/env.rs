@@ -1,43 +1,45 @@
-//! The environment: start, observe, act.
+//! The environment: reset, observe, step.
 
 use rand_chacha::ChaCha8Rng;
 use rapier3d::math::Vector;
 use tandem_core::scene::Scene;
-use tandem_core::{ArmIndex, Contacts, Layout, Task};
+use tandem_core::{ArmIndex, Contacts, Layout, Task, WorldSettings};
 
 use crate::arm::Command;
-use crate::config::{CONTROL_STEPS_PER_S, SimError, Starts, WorldConfig};
+use crate::config::{CONTROL_STEPS_PER_S, SimError, WorldConfig};
 use crate::observation::observe_arm;
 use crate::scene::scene;
-use crate::start::{ArmStart, draw};
+use crate::start::{ArmStart, sample_starts};
 use crate::world::{MAX_ARMS, World};
 
-/// Least gap between two arms' links at the start of an episode, metres.
+/// Smallest gap between the links of two arms at the start of an episode, metres.
 const START_LINK_GAP_M: f32 = 0.02;
 
-/// One of the four environments: push or pick and place, by one arm or two.
+/// One of the four environments: push or pick and place, with one arm or two.
 ///
-/// What happens is a function of the random numbers given to [`reset`](Self::reset) and of the actions, bit for bit,
-/// whatever the environment was used for before and whichever thread it runs on.
+/// An episode is a function of the random numbers passed to [`reset`](Self::reset) and of the actions, bit for bit. It
+/// depends neither on earlier episodes nor on the thread.
 ///
-/// A new environment has to be [`reset`](Self::reset) before its first step.
+/// Call [`reset`](Self::reset) before the first step. The environment has no time limit of its own: an episode lasts
+/// [`EPISODE_STEPS`](tandem_core::layout::EPISODE_STEPS) steps by convention. It computes no rewards either; see
+/// [`tandem_core::reward`].
 #[derive(Clone)]
 pub struct Env {
     layout: Layout,
     object_half_m: f32,
-    /// A world that is never stepped: what a world leaves behind in rapier's caches would enter the next episode.
+    /// A world that is never stepped: the state of rapier's caches after a step would affect the next episode.
     prototype: World,
     world: World,
-    /// Shape `[n_goal]`, own frames, metres.
+    /// Shape `[n_goal]`, arm frames, metres.
     goal: Vec<f32>,
     n_steps: u32,
 }
 
 impl Env {
-    /// Builds the world of `layout`.
+    /// Creates the environment of `layout`.
     ///
     /// # Errors
-    /// When `layout` has neither one arm nor two, or a value of `config` is out of its range.
+    /// Returns an error if `layout` does not have one or two arms, or if a value of `config` is out of range.
     pub fn new(layout: Layout, config: &WorldConfig) -> Result<Self, SimError> {
         if !(1..=MAX_ARMS).contains(&layout.n_arms) {
             return Err(SimError::Arms(layout.n_arms));
@@ -54,19 +56,22 @@ impl Env {
         })
     }
 
-    /// Task and number of arms.
+    /// Returns the task and the number of arms.
     #[must_use]
     pub fn layout(&self) -> Layout {
         self.layout
     }
 
-    /// Starts an episode: everything at rest in random places and with random goals, nothing touching anything but
-    /// the table or the fingers that hold it.
-    pub fn reset(&mut self, rng: &mut ChaCha8Rng, starts: Starts) {
+    /// Starts an episode with random positions of hands and objects and with random goals.
+    ///
+    /// All bodies are at rest. An object touches nothing but the table or, in a grasped start, the fingers that hold
+    /// it. Only `grasped_start_prob` of `settings` has an effect: the physics steps per control step are those of the
+    /// [`WorldConfig`].
+    pub fn reset(&mut self, rng: &mut ChaCha8Rng, settings: WorldSettings) {
         self.world = self.prototype.clone();
         self.n_steps = 0;
         loop {
-            let arms = draw(rng, self.layout, self.object_half_m, starts);
+            let arms = sample_starts(rng, self.layout, self.object_half_m, settings);
             self.place(&arms);
             if self.world.link_gap_m() >= START_LINK_GAP_M {
                 return;
@@ -74,43 +79,59 @@ impl Env {
         }
     }
 
-    /// Writes what the arms see, arm after arm, each in its own frame, shape `[n_observation]`.
+    /// Writes the current observation, shape `[n_observation]`: 28 numbers per arm, in arm order, each in the arm's
+    /// frame.
+    ///
+    /// | numbers | quantity | unit |
+    /// |---|---|---|
+    /// | 0–2 | position of the end effector | m |
+    /// | 3–5 | position of the object | m |
+    /// | 6–8 | position of the object relative to the end effector | m |
+    /// | 9–11 | openings of the three fingers | m |
+    /// | 12–15 | orientation of the object, quaternion (x, y, z, w) with w ≥ 0 | – |
+    /// | 16–18 | velocity of the object relative to the end effector | m per control step |
+    /// | 19–21 | angular velocity of the object | rad per control step |
+    /// | 22–24 | velocity of the end effector | m per control step |
+    /// | 25–27 | rates of the openings | m per control step |
     ///
     /// # Panics
-    /// When `observation` has another length.
+    /// If `observation` does not have length `n_observation`.
     pub fn observe(&self, observation: &mut [f32]) {
-        assert_eq!(observation.len(), self.layout.n_observation(), "observation of another layout");
+        assert_eq!(observation.len(), self.layout.n_observation(), "length of the observation");
         for arm in self.layout.arms() {
             observe_arm(&self.world, arm, &mut observation[self.layout.observation_of(arm)]);
         }
     }
 
-    /// Where the objects shall be, arm after arm, each in its own frame, metres, shape `[n_goal]`.
+    /// Returns the goal positions of the objects, in arm order, each in the arm's frame, metres, shape `[n_goal]`.
     #[must_use]
     pub fn goal(&self) -> &[f32] {
         &self.goal
     }
 
-    /// Acts for one control step and tells which parts of the arms touched each other or the table in it.
+    /// Executes `action` for one control step of [`CONTROL_STEP_S`](crate::CONTROL_STEP_S) and returns the contacts of
+    /// the arms during it.
     ///
-    /// Arms touch when palms, wrists or fingers press on each other in any physics step, or when the gap between a link
-    /// and a part of the other arm falls below zero. An arm touches the table when palm, wrist or fingers press on it;
-    /// the links stay 0.2 m above it, as the gripper points down. By itself an arm stops 2 mm above the table, so that
-    /// takes being pushed down.
+    /// `action` has shape `[n_action]`, in arm frames, and is clamped to [−1, 1]. Each arm's part is a displacement of
+    /// the end effector along x, y and z in units of 5 cm and, in pick and place, the gripper's input: positive values
+    /// open the gripper, −1 closes it and holds.
     ///
-    /// `action` has shape `[n_action]`, own frames, and is cut to [−1, 1]: per arm three displacements of the end
-    /// effector in units of 5 cm and, in pick and place, the gripper's input: positive opens, −1 closes and holds.
+    /// Two arms are in contact if palms, wrists or fingers press on each other in any physics step, or if the gap
+    /// between a link and a part of the other arm falls below zero. An arm is in contact with the table if palm, wrist
+    /// or fingers press on it; the links stay 0.2 m above it, as the gripper points down. The workspace ends 2 mm above
+    /// the table, so an arm touches the table only if it is pushed down.
     ///
     /// # Errors
-    /// When `action` has another length or a number that is not finite, or the step gave such a number. The
-    /// environment then has to be reset.
+    /// Returns an error if `action` has the wrong length or contains a number that is not finite; the state is then
+    /// unchanged. Also returns an error if the physics produces such a number; reset the environment before the next
+    /// step.
     pub fn step(&mut self, action: &[f32]) -> Result<Contacts, SimError> {
         let commands = self.commands(action)?;
         self.n_steps += 1;
         self.world.step(&commands)
     }
 
-    /// What the world looks like now, in the world's frame. Looking changes nothing.
+    /// Returns a snapshot of all bodies, world frame. It does not affect the simulation.
     #[must_use]
     pub fn scene(&self) -> Scene {
         let time_s = f64::from(self.n_steps) / CONTROL_STEPS_PER_S;
@@ -123,7 +144,7 @@ impl Env {
             self.world.place_object(arm, start.object);
             self.goal[self.layout.goal_of(arm)].copy_from_slice(&start.goal.to_array());
         }
-        self.world.arm_guard();
+        self.world.reset_link_avoidance();
     }
 
     fn commands(&self, action: &[f32]) -> Result<[Command; MAX_ARMS], SimError> {
@@ -165,13 +186,13 @@ mod tests {
     const N_STEPS: usize = 12;
     const NUDGE_M: Vector = Vector::splat(1e-7);
 
-    /// A vector of two arms with their halves in each other's place.
+    /// Exchanges the parts of the two arms in a vector.
     fn swapped(both: &[f32]) -> Vec<f32> {
         let (first, second) = both.split_at(both.len() / 2);
         [second, first].concat()
     }
 
-    /// What two arms see on the way from `arms`, each going for its own object with some noise.
+    /// The observations of two arms that start at `arms` and approach their own objects with some noise.
     fn observations(env: &mut Env, arms: &[ArmStart], noise: &[Vec<f32>]) -> Vec<Vec<f32>> {
         env.world = env.prototype.clone();
         env.place(arms);
@@ -196,19 +217,19 @@ mod tests {
             .collect()
     }
 
-    /// Step by step, the largest difference of a place, of hands or objects, between two courses of events, metres.
-    fn apart_m(layout: Layout, one: &[Vec<f32>], other: &[Vec<f32>]) -> Vec<f32> {
-        let places: Vec<usize> =
+    /// For each step the largest difference in a position of a hand or an object between two trajectories, metres.
+    fn difference_m(layout: Layout, one: &[Vec<f32>], other: &[Vec<f32>]) -> Vec<f32> {
+        let positions: Vec<usize> =
             layout.arms().flat_map(|arm| layout.observation_of(arm).take(6)).collect();
         let largest = |one: &[f32], other: &[f32]| {
-            places.iter().map(|&idx| (one[idx] - other[idx]).abs()).fold(0.0, f32::max)
+            positions.iter().map(|&idx| (one[idx] - other[idx]).abs()).fold(0.0, f32::max)
         };
         one.iter().zip(other).map(|(one, other)| largest(one, other)).collect()
     }
 
-    /// What nine of ten episodes do not exceed at `step`.
-    fn usually_m(apart_m: &[Vec<f32>], step: usize) -> f32 {
-        let mut sorted: Vec<f32> = apart_m.iter().map(|episode| episode[step]).collect();
+    /// The 90th percentile over episodes of the difference at `step`.
+    fn percentile_90_m(differences_m: &[Vec<f32>], step: usize) -> f32 {
+        let mut sorted: Vec<f32> = differences_m.iter().map(|episode| episode[step]).collect();
         sorted.sort_by(f32::total_cmp);
         sorted[sorted.len() * 9 / 10]
     }
@@ -217,21 +238,21 @@ mod tests {
         World::build(Layout::new(Task::PickAndPlace, 2), &WorldConfig::default())
     }
 
-    /// What touches when the hands, at `hands` in own frames, stay there for a control step.
+    /// The contacts of hands that stay at `hands`, in arm frames, for a control step.
     fn contacts_at(hands: [Vector; 2]) -> Contacts {
         let mut world = world_of_two();
         for (arm, hand) in [ArmIndex(0), ArmIndex(1)].into_iter().zip(hands) {
             world.place_arm(arm, hand, MAX_OPENING_M);
             world.place_object(arm, Vector::new(-0.1, 0.2, 0.0225));
         }
-        world.arm_guard();
+        world.reset_link_avoidance();
         let stay = world.arms.iter().map(|arm| arm.hand.end_effector(&world.physics));
         let commands: Vec<Command> = stay.map(|target| Command { target, gripper: 1.0 }).collect();
         world.step(&[commands[0], commands[1]]).unwrap()
     }
 
     #[test]
-    fn contacts_of_hands_are_told_apart() {
+    fn contacts_between_hands_and_with_the_table_are_distinguished() {
         let high = Vector::new(0.0, 0.0, 0.15);
         assert_eq!(contacts_at([high, high]), Contacts::NONE);
         let lowest = Vector::new(0.0, 0.0, WORKSPACE_LOW.z);
@@ -247,18 +268,21 @@ mod tests {
         assert_eq!(contacts_at([meeting, meeting]), Contacts::ARM_ARM);
     }
 
-    /// Rounding grows by contact, so exactness shows only before the first one; after it the symmetry may be broken by
-    /// no more than a displacement of the objects by 0.1 µm changes the course of events.
+    /// Contacts amplify rounding errors, so the symmetry is exact only before the first contact. After it, swapping may
+    /// change a trajectory by no more than a displacement of the objects by 0.1 µm does.
     #[test]
-    fn swapping_the_arms_data_is_a_symmetry() {
+    fn swapping_the_arms_is_a_symmetry() {
         for task in Task::ALL {
             let layout = Layout::new(task, 2);
             let mut env = Env::new(layout, &WorldConfig::default()).unwrap();
             let (mut by_swapping, mut by_nudging) = (Vec::new(), Vec::new());
             for episode in 0..240 {
                 let mut rng = episode_rng(2, episode, Stream::Reset);
-                let starts = Starts { gripped_share: 0.3, wide_share: 0.3 };
-                let [first, second] = draw(&mut rng, layout, env.object_half_m, starts)[..] else {
+                let settings =
+                    WorldSettings { grasped_start_prob: 0.3, ..WorldSettings::default() };
+                let [first, second] =
+                    sample_starts(&mut rng, layout, env.object_half_m, settings)[..]
+                else {
                     panic!()
                 };
                 let mut noise =
@@ -271,8 +295,8 @@ mod tests {
                 let original = observations(&mut env, &[first, second], &noise);
                 let mirrored = observations(&mut env, &[second, first], &noise_swapped);
                 let mirrored: Vec<_> = mirrored.iter().map(|both| swapped(both)).collect();
-                by_swapping.push(apart_m(layout, &original, &mirrored));
-                by_nudging.push(apart_m(
+                by_swapping.push(difference_m(layout, &original, &mirrored));
+                by_nudging.push(difference_m(
                     layout,
                     &original,
                     &observations(&mut env, &nudged, &noise),
@@ -280,16 +304,16 @@ mod tests {
             }
             for step in 0..N_STEPS {
                 let (swapping, nudging) =
-                    (usually_m(&by_swapping, step), usually_m(&by_nudging, step));
+                    (percentile_90_m(&by_swapping, step), percentile_90_m(&by_nudging, step));
                 assert!(
                     swapping <= 1.5 * nudging,
-                    "{task}, step {step}: {swapping} m apart, {nudging} m by a nudge"
+                    "{task}, step {step}: {swapping} m by swapping, {nudging} m by nudging"
                 );
             }
             assert!(
-                usually_m(&by_swapping, 0) < 5e-6,
-                "{task}: {} m at once",
-                usually_m(&by_swapping, 0)
+                percentile_90_m(&by_swapping, 0) < 5e-6,
+                "{task}: {} m after one step",
+                percentile_90_m(&by_swapping, 0)
             );
         }
     }

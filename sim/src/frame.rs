@@ -1,31 +1,31 @@
-//! Each arm's own frame and its place in the world.
+//! The frame of each arm and its pose in the world.
 
 use rapier3d::math::{Matrix, Rotation, Vector};
 use tandem_core::ArmIndex;
-use tandem_core::layout::WORKSPACES_APART_M;
+use tandem_core::layout::WORKSPACE_DISTANCE_M;
 
-/// Distance of two arms' workspace centres from the world's origin, metres.
-const CENTRE_X_M: f32 = WORKSPACES_APART_M / 2.0;
-/// The arm's base in its own frame, metres: behind the workspace's centre, at table height.
-pub(crate) const BASE_IN_OWN: Vector = Vector::new(-0.40, 0.0, 0.0);
-/// Lower corner of where the end effector may be, own frame, metres.
+/// Distance of each workspace centre from the world's origin if there are two arms, metres.
+const CENTRE_X_M: f32 = WORKSPACE_DISTANCE_M / 2.0;
+/// Position of the arm's base, arm frame, metres: behind the centre of the workspace, at the height of the table.
+pub(crate) const BASE_IN_ARM: Vector = Vector::new(-0.40, 0.0, 0.0);
+/// Lower corner of the end effector's workspace, arm frame, metres.
 pub(crate) const WORKSPACE_LOW: Vector = Vector::new(-0.20, -0.25, 0.022);
-/// Upper corner of where the end effector may be, own frame, metres.
+/// Upper corner of the end effector's workspace, arm frame, metres.
 pub(crate) const WORKSPACE_HIGH: Vector = Vector::new(0.20, 0.25, 0.35);
 
-/// An arm's own frame: origin in the centre of its workspace on the table, x away from its base, z up.
+/// The frame of an arm: origin on the table in the centre of the arm's workspace, x away from its base, z up.
 ///
-/// The second of two arms is the first turned by half a turn about z, so numbers in own frames do not tell the arms
-/// apart.
+/// The second of two arms is the first one rotated by 180° about z, so coordinates in arm frames do not distinguish
+/// them.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(crate) struct OwnFrame {
+pub(crate) struct ArmFrame {
     centre_x_m: f32,
-    /// 1, or −1 when turned by half a turn.
+    /// 1, or −1 if rotated by 180°.
     sign: f32,
 }
 
-impl OwnFrame {
-    pub(crate) fn of(arm: ArmIndex, n_arms: usize) -> Self {
+impl ArmFrame {
+    pub(crate) fn new(arm: ArmIndex, n_arms: usize) -> Self {
         match (n_arms, arm) {
             (1, _) => Self { centre_x_m: 0.0, sign: 1.0 },
             (_, ArmIndex(0)) => Self { centre_x_m: -CENTRE_X_M, sign: 1.0 },
@@ -33,35 +33,35 @@ impl OwnFrame {
         }
     }
 
-    pub(crate) fn world_from_own(self, point_in_own: Vector) -> Vector {
-        self.turned(point_in_own) + Vector::new(self.centre_x_m, 0.0, 0.0)
+    pub(crate) fn world_from_arm(self, point_in_arm: Vector) -> Vector {
+        self.rotate(point_in_arm) + Vector::new(self.centre_x_m, 0.0, 0.0)
     }
 
-    pub(crate) fn own_from_world(self, point_in_world: Vector) -> Vector {
-        self.turned(point_in_world - Vector::new(self.centre_x_m, 0.0, 0.0))
+    pub(crate) fn arm_from_world(self, point_in_world: Vector) -> Vector {
+        self.rotate(point_in_world - Vector::new(self.centre_x_m, 0.0, 0.0))
     }
 
-    /// A direction of this frame in the world's, and the other way round: half a turn is its own inverse.
-    pub(crate) fn turned(self, direction: Vector) -> Vector {
+    /// Rotates a direction from this frame to the world frame, or back: a rotation by 180° is its own inverse.
+    pub(crate) fn rotate(self, direction: Vector) -> Vector {
         Vector::new(self.sign * direction.x, self.sign * direction.y, direction.z)
     }
 
-    /// A linear map between directions of this frame as one between directions of the world.
-    pub(crate) fn map_in_world(self, map_in_own: Matrix) -> Matrix {
+    /// Expresses a linear map between directions of this frame in the world frame.
+    pub(crate) fn jacobian_in_world(self, jacobian_in_arm: Matrix) -> Matrix {
         let turn = Matrix::from_diagonal(Vector::new(self.sign, self.sign, 1.0));
-        turn * map_in_own * turn
+        turn * jacobian_in_arm * turn
     }
 
-    /// The orientation in the world of what is not turned in this frame.
+    /// Returns the orientation of this frame in the world.
     pub(crate) fn orientation_in_world(self) -> Rotation {
         if self.sign > 0.0 { Rotation::IDENTITY } else { Rotation::from_xyzw(0.0, 0.0, 1.0, 0.0) }
     }
 
-    /// A body's orientation in this frame, quaternion (x, y, z, w) with w >= 0.
-    pub(crate) fn orientation_in_own(self, in_world: Rotation) -> [f32; 4] {
+    /// Expresses a body's orientation in this frame, as a quaternion (x, y, z, w) with w >= 0.
+    pub(crate) fn orientation_in_arm(self, in_world: Rotation) -> [f32; 4] {
         let Rotation { x, y, z, w } = in_world;
-        let in_own = if self.sign > 0.0 { [x, y, z, w] } else { [-y, x, w, -z] };
-        if in_own[3] < 0.0 { in_own.map(|component| -component) } else { in_own }
+        let in_arm = if self.sign > 0.0 { [x, y, z, w] } else { [-y, x, w, -z] };
+        if in_arm[3] < 0.0 { in_arm.map(|component| -component) } else { in_arm }
     }
 }
 
@@ -71,23 +71,23 @@ mod tests {
 
     #[test]
     fn the_second_arm_faces_the_first() {
-        let first = OwnFrame::of(ArmIndex(0), 2);
-        let second = OwnFrame::of(ArmIndex(1), 2);
-        let base = |frame: OwnFrame| frame.world_from_own(BASE_IN_OWN).to_array();
+        let first = ArmFrame::new(ArmIndex(0), 2);
+        let second = ArmFrame::new(ArmIndex(1), 2);
+        let base = |frame: ArmFrame| frame.world_from_arm(BASE_IN_ARM).to_array();
         assert_eq!(base(first), [-0.52, 0.0, 0.0]);
         assert_eq!(base(second), [0.52, 0.0, 0.0]);
         let ahead = Vector::new(0.12, 0.05, 0.1);
-        assert_eq!(first.world_from_own(ahead).to_array(), [0.0, 0.05, 0.1]);
-        assert_eq!(second.world_from_own(ahead).to_array(), [0.0, -0.05, 0.1]);
-        assert_eq!(second.own_from_world(second.world_from_own(ahead)), ahead);
+        assert_eq!(first.world_from_arm(ahead).to_array(), [0.0, 0.05, 0.1]);
+        assert_eq!(second.world_from_arm(ahead).to_array(), [0.0, -0.05, 0.1]);
+        assert_eq!(second.arm_from_world(second.world_from_arm(ahead)), ahead);
     }
 
     #[test]
-    fn an_orientation_reads_the_same_in_both_frames_when_turned_with_the_arm() {
+    fn orientations_that_rotate_with_the_arm_are_equal_in_both_arm_frames() {
         let tilted = Rotation::from_xyzw(0.1, 0.2, -0.3, 0.927_361_8);
         for arm in [ArmIndex(0), ArmIndex(1)] {
-            let frame = OwnFrame::of(arm, 2);
-            let read = frame.orientation_in_own(frame.orientation_in_world() * tilted);
+            let frame = ArmFrame::new(arm, 2);
+            let read = frame.orientation_in_arm(frame.orientation_in_world() * tilted);
             for (got, expected) in read.into_iter().zip(tilted.to_array()) {
                 assert!((got - expected).abs() < 1e-6, "{read:?}");
             }

@@ -1,55 +1,55 @@
-//! The hand: a palm that flies where its servo pushes it, and three fingers that open and close as one.
+//! The hand: a palm that a servo moves, and three fingers that open and close together.
 //!
-//! Palm and fingers are rapier bodies that cannot turn. The arm's motors appear as one bounded force on the palm, the
-//! fingers are held in their places by forces whose reaction the palm feels; there are no joints. A locked gripper is
-//! one rigid piece with the palm: fingers that could give way would hook over an object's edge and drag it along.
+//! Palm and fingers are rapier bodies with locked rotations. One bounded force on the palm models the arm's motors.
+//! Forces hold the fingers in their places, and the palm receives the reaction; there are no joints. A locked gripper
+//! forms one rigid body with the palm, because compliant fingers would hook over an object's edge and drag it along.
 
 use rapier3d::dynamics::{CoefficientCombineRule, RigidBodyBuilder, RigidBodyHandle};
 use rapier3d::geometry::ColliderBuilder;
 use rapier3d::math::{Pose, Vector};
 use tandem_core::ArmIndex;
 
-use crate::frame::OwnFrame;
+use crate::frame::ArmFrame;
 use crate::physics::{Part, Physics, collides};
 
-/// How far each side opens, metres.
+/// Largest opening of each side of the gripper, metres.
 pub(crate) const MAX_OPENING_M: f32 = 0.040;
-/// Half extents of a finger pad: x, closing direction, z; metres.
+/// Half extents of a finger pad (x, closing direction, z), metres.
 pub(crate) const PAD_HALF_M: Vector = Vector::new(0.010, 0.010, 0.020);
 /// Half extents of the palm plate, metres.
 pub(crate) const PALM_HALF_M: Vector = Vector::new(0.035, 0.06, 0.015);
-/// The palm plate's centre above the end effector, metres.
+/// Height of the palm plate's centre above the end effector, metres.
 pub(crate) const PALM_ABOVE_M: f32 = 0.065;
-/// The wrist: a capsule from here to there above the end effector, metres.
+/// Heights of the ends of the wrist's capsule above the end effector, metres.
 pub(crate) const WRIST_ABOVE_M: [f32; 2] = [0.10, 0.20];
-/// The wrist's radius, metres.
+/// Radius of the wrist, metres.
 pub(crate) const WRIST_RADIUS_M: f32 = 0.035;
 
 /// Speed of each side at full gripper input, metres per second.
 const OPENING_SPEED_MPS: f32 = 0.25;
-/// Share of the way to an end of the opening's range that one physics step may cover.
+/// Fraction of the distance to an end of the opening's range that one physics step may cover.
 const OPENING_END_GAIN: f32 = 0.2;
 const PALM_MASS_KG: f32 = 1.0;
-/// Largest force of the palm's servo on each axis, newtons.
+/// Largest force of the palm's servo along each axis, newtons.
 const PALM_FORCE_N: f32 = 40.0;
 /// Largest force that holds a finger in its place, newtons.
 const FINGER_HOLD_FORCE_N: f32 = 200.0;
-/// How fast a finger returns to its place, 1/s.
+/// Gain of the force that returns a finger to its place, 1/s.
 const FINGER_HOLD_GAIN: f32 = 250.0;
 
-/// Where a finger sits and what it carries.
-struct FingerPlan {
-    /// Side of the hand on which it closes, own frame: 1 or −1 along y.
+/// Position and mass of a finger.
+struct FingerGeometry {
+    /// Side of the hand, arm frame: 1 or −1 along y.
     side: f32,
     x_m: f32,
     mass_kg: f32,
 }
 
-/// Two fingers against one. The masses balance, so that closing does not push the hand aside.
-const FINGERS: [FingerPlan; 3] = [
-    FingerPlan { side: 1.0, x_m: 0.016, mass_kg: 0.1 },
-    FingerPlan { side: 1.0, x_m: -0.016, mass_kg: 0.1 },
-    FingerPlan { side: -1.0, x_m: 0.0, mass_kg: 0.2 },
+/// Two fingers oppose one. Their masses balance, so closing the gripper does not move the hand sideways.
+const FINGERS: [FingerGeometry; 3] = [
+    FingerGeometry { side: 1.0, x_m: 0.016, mass_kg: 0.1 },
+    FingerGeometry { side: 1.0, x_m: -0.016, mass_kg: 0.1 },
+    FingerGeometry { side: -1.0, x_m: 0.0, mass_kg: 0.2 },
 ];
 /// Mass of all fingers, kilograms.
 const FINGERS_MASS_KG: f32 = 0.4;
@@ -57,19 +57,19 @@ const FINGERS_MASS_KG: f32 = 0.4;
 /// Number of fingers.
 pub(crate) const N_FINGERS: usize = FINGERS.len();
 
-/// What the fingers are to the palm.
+/// The connection between fingers and palm.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Gripper {
-    /// Shut, and one rigid piece with the palm.
+    /// The fingers are closed and part of the palm's body.
     Locked,
-    /// Bodies of their own that open and close.
+    /// The fingers are separate bodies that open and close.
     Driven,
 }
 
-/// The bodies of a hand, all as of one physics step.
+/// The bodies of a hand.
 #[derive(Clone)]
 pub(crate) struct Hand {
-    frame: OwnFrame,
+    frame: ArmFrame,
     palm: RigidBodyHandle,
     gripper: Gripper,
     fingers: [Finger; N_FINGERS],
@@ -78,73 +78,74 @@ pub(crate) struct Hand {
 
 #[derive(Clone, Copy)]
 struct Finger {
-    /// The palm's own body when the gripper is locked.
+    /// The palm's body if the gripper is locked.
     body: RigidBodyHandle,
     mass_kg: f32,
-    /// Share of the mass, and of the common opening's measure.
-    share: f32,
-    /// Where the finger is when shut, relative to the palm, world frame, metres.
-    shut_offset: Vector,
-    /// The direction of opening along the world's y: 1 or −1.
+    /// Fraction of the mass of all fingers, and weight in the mean opening.
+    mass_fraction: f32,
+    /// Position of the closed finger relative to the palm, world frame, metres.
+    closed_offset: Vector,
+    /// Direction of opening along the world's y axis: 1 or −1.
     outward: f32,
 }
 
-/// One finger's deviation from its place.
+/// The state of a finger relative to the palm.
 #[derive(Clone, Copy, Default)]
 struct FingerState {
     opening_m: f32,
     opening_rate_mps: f32,
-    /// World frame, metres, relative to where it is when shut.
+    /// Position relative to that of the closed finger, world frame, metres.
     offset: Vector,
-    /// World frame, metres per second, relative to the palm.
+    /// Velocity relative to the palm, world frame, metres per second.
     velocity: Vector,
 }
 
 impl Hand {
-    /// Adds a hand with pads of friction `pad_friction` to `physics`.
+    /// Adds a hand whose pads have friction `pad_friction` to `physics`.
     pub(crate) fn build(
         physics: &mut Physics,
         arm: ArmIndex,
-        frame: OwnFrame,
+        frame: ArmFrame,
         gripper: Gripper,
         pad_friction: f32,
         grip_force_n: f32,
     ) -> Self {
         let palm = build_palm(physics, arm, frame);
-        let fingers = FINGERS.map(|plan| match gripper {
-            Gripper::Locked => attach_finger(physics, arm, frame, palm, &plan, pad_friction),
-            Gripper::Driven => build_finger(physics, arm, frame, &plan, pad_friction),
+        let fingers = FINGERS.map(|geometry| match gripper {
+            Gripper::Locked => attach_finger(physics, arm, frame, palm, &geometry, pad_friction),
+            Gripper::Driven => build_finger(physics, arm, frame, &geometry, pad_friction),
         });
         Self { frame, palm, gripper, fingers, grip_force_n }
     }
 
-    /// Puts the hand, at rest, where its end effector is at `end_effector_in_own` and each side is open by `opening_m`.
-    pub(crate) fn place(&self, physics: &mut Physics, end_effector_in_own: Vector, opening_m: f32) {
-        let at = self.frame.world_from_own(end_effector_in_own);
+    /// Places the hand, at rest, with its end effector at `end_effector_in_arm` (metres) and each side open by
+    /// `opening_m`.
+    pub(crate) fn place(&self, physics: &mut Physics, end_effector_in_arm: Vector, opening_m: f32) {
+        let at = self.frame.world_from_arm(end_effector_in_arm);
         let palm = &mut physics.bodies[self.palm];
         palm.set_translation(at, true);
         palm.set_linvel(Vector::ZERO, true);
         for finger in self.driven_fingers() {
             let body = &mut physics.bodies[finger.body];
             body.set_translation(
-                at + finger.shut_offset + Vector::Y * (finger.outward * opening_m),
+                at + finger.closed_offset + Vector::Y * (finger.outward * opening_m),
                 true,
             );
             body.set_linvel(Vector::ZERO, true);
         }
     }
 
-    /// Centre between the pads, world frame, metres.
+    /// Returns the position of the end effector, the centre between the pads; world frame, metres.
     pub(crate) fn end_effector(&self, physics: &Physics) -> Vector {
         physics.bodies[self.palm].translation()
     }
 
-    /// World frame, metres per second.
+    /// Returns the velocity of the palm, world frame, metres per second.
     pub(crate) fn velocity(&self, physics: &Physics) -> Vector {
         physics.bodies[self.palm].linvel()
     }
 
-    /// How far each finger is open (metres) and how fast it opens (metres per second).
+    /// Returns the opening (metres) and the opening rate (metres per second) of each finger.
     pub(crate) fn openings(&self, physics: &Physics) -> [(f32, f32); N_FINGERS] {
         if self.gripper == Gripper::Locked {
             return [(0.0, 0.0); N_FINGERS];
@@ -153,15 +154,15 @@ impl Hand {
         self.finger_states(physics, velocity).map(|state| (state.opening_m, state.opening_rate_mps))
     }
 
-    /// The pads' centres, world frame, metres.
+    /// Returns the centres of the pads, world frame, metres.
     pub(crate) fn pads(&self, physics: &Physics) -> [Vector; N_FINGERS] {
         self.fingers.map(|finger| match self.gripper {
-            Gripper::Locked => self.end_effector(physics) + finger.shut_offset,
+            Gripper::Locked => self.end_effector(physics) + finger.closed_offset,
             Gripper::Driven => physics.bodies[finger.body].translation(),
         })
     }
 
-    /// Whether all positions and velocities are finite.
+    /// Returns `true` if all positions and velocities are finite.
     pub(crate) fn is_finite(&self, physics: &Physics) -> bool {
         std::iter::once(self.palm).chain(self.fingers.map(|finger| finger.body)).all(|body| {
             let body = &physics.bodies[body];
@@ -169,7 +170,7 @@ impl Hand {
         })
     }
 
-    /// Lets the palm move with `palm` (world frame) and each finger open with its rate, metres per second.
+    /// Sets the velocity of the palm (world frame) and the opening rate of each finger, metres per second.
     #[cfg(test)]
     pub(crate) fn set_velocities(
         &self,
@@ -184,20 +185,20 @@ impl Hand {
         }
     }
 
-    /// Sets the forces of the next physics step.
+    /// Sets the forces for the next physics step.
     ///
-    /// `velocity` is what the palm shall do (world frame, metres per second), `gripper` the gripper's input in
-    /// [−1, 1]: positive opens, −1 closes and holds.
+    /// `velocity` is the desired velocity of the palm (world frame, metres per second), `gripper` the input of the
+    /// gripper in [−1, 1]: positive values open it, −1 closes it and holds.
     pub(crate) fn drive(&self, physics: &mut Physics, velocity: Vector, gripper: f32) {
         let substep_s = physics.substep_s();
-        let moved_mass_kg = PALM_MASS_KG + FINGERS_MASS_KG;
+        let total_mass_kg = PALM_MASS_KG + FINGERS_MASS_KG;
         let palm_velocity = self.velocity(physics);
         let palm_force =
-            bounded((velocity - palm_velocity) * (moved_mass_kg / substep_s), PALM_FORCE_N);
+            bounded((velocity - palm_velocity) * (total_mass_kg / substep_s), PALM_FORCE_N);
         if self.gripper == Gripper::Locked {
             return apply(physics, self.palm, palm_force);
         }
-        let palm_velocity_next = palm_velocity + palm_force * (substep_s / moved_mass_kg);
+        let palm_velocity_next = palm_velocity + palm_force * (substep_s / total_mass_kg);
 
         let finger_forces = self.finger_forces(physics, palm_velocity_next, gripper);
         for (finger, force) in self.fingers.iter().zip(finger_forces) {
@@ -207,10 +208,10 @@ impl Hand {
         apply(physics, self.palm, palm_force - reaction);
     }
 
-    /// Forces that open or close the fingers as one and keep each in its place, world frame, newtons.
+    /// Returns the forces that open or close the fingers together and hold each in its place, world frame, newtons.
     ///
-    /// Without the term that ties the fingers' openings together, force-limited fingers and what they hold would have
-    /// nothing to centre them.
+    /// The term `balancing_n` equalises the openings. Without it, nothing would centre a grasped object between
+    /// force-limited fingers.
     fn finger_forces(
         &self,
         physics: &Physics,
@@ -223,32 +224,33 @@ impl Hand {
             self.fingers
                 .iter()
                 .zip(&states)
-                .map(|(finger, state)| finger.share * value(state))
+                .map(|(finger, state)| finger.mass_fraction * value(state))
                 .sum()
         };
         let opening_m = mean(|state| state.opening_m);
         let rate_mps = mean(|state| state.opening_rate_mps);
-        let to_end = OPENING_END_GAIN / substep_s;
-        let rate_wanted_mps = (gripper * OPENING_SPEED_MPS)
-            .max(-opening_m * to_end)
-            .min((MAX_OPENING_M - opening_m) * to_end);
-        let side_force_n = (0.5 * FINGERS_MASS_KG * (rate_wanted_mps - rate_mps) / substep_s)
+        let end_gain = OPENING_END_GAIN / substep_s;
+        let desired_rate_mps = (gripper * OPENING_SPEED_MPS)
+            .max(-opening_m * end_gain)
+            .min((MAX_OPENING_M - opening_m) * end_gain);
+        let side_force_n = (0.5 * FINGERS_MASS_KG * (desired_rate_mps - rate_mps) / substep_s)
             .clamp(-self.grip_force_n, self.grip_force_n);
         std::array::from_fn(|idx| {
             let (finger, state) = (&self.fingers[idx], &states[idx]);
             let gain = finger.mass_kg / substep_s;
             let lateral = (state.offset * -FINGER_HOLD_GAIN - state.velocity) * gain;
-            let evening_n = (gain
+            let balancing_n = (gain
                 * (FINGER_HOLD_GAIN * (opening_m - state.opening_m) + rate_mps
                     - state.opening_rate_mps))
                 .clamp(-FINGER_HOLD_FORCE_N, FINGER_HOLD_FORCE_N);
-            let closing_n = finger.outward * (2.0 * finger.share * side_force_n + evening_n);
+            let closing_n =
+                finger.outward * (2.0 * finger.mass_fraction * side_force_n + balancing_n);
             let held = bounded(lateral, FINGER_HOLD_FORCE_N);
             Vector::new(held.x, closing_n, held.z)
         })
     }
 
-    /// The fingers that move by themselves.
+    /// Returns the fingers that are separate bodies.
     fn driven_fingers(&self) -> &[Finger] {
         match self.gripper {
             Gripper::Locked => &[],
@@ -257,10 +259,10 @@ impl Hand {
     }
 
     fn finger_states(&self, physics: &Physics, palm_velocity: Vector) -> [FingerState; N_FINGERS] {
-        let palm_at = self.end_effector(physics);
+        let palm_position = self.end_effector(physics);
         self.fingers.map(|finger| {
             let body = &physics.bodies[finger.body];
-            let offset = body.translation() - palm_at - finger.shut_offset;
+            let offset = body.translation() - palm_position - finger.closed_offset;
             let velocity = body.linvel() - palm_velocity;
             FingerState {
                 opening_m: offset.y * finger.outward,
@@ -272,7 +274,7 @@ impl Hand {
     }
 }
 
-fn build_palm(physics: &mut Physics, arm: ArmIndex, frame: OwnFrame) -> RigidBodyHandle {
+fn build_palm(physics: &mut Physics, arm: ArmIndex, frame: ArmFrame) -> RigidBodyHandle {
     let palm = physics.bodies.insert(weightless_body(frame));
     let part = |shape: ColliderBuilder, mass_kg: f32, above_m: f32| {
         shape
@@ -300,53 +302,54 @@ fn build_palm(physics: &mut Physics, arm: ArmIndex, frame: OwnFrame) -> RigidBod
 fn build_finger(
     physics: &mut Physics,
     arm: ArmIndex,
-    frame: OwnFrame,
-    plan: &FingerPlan,
+    frame: ArmFrame,
+    geometry: &FingerGeometry,
     friction: f32,
 ) -> Finger {
     let body = physics.bodies.insert(weightless_body(frame));
-    let pad = pad(arm, plan, friction);
+    let pad = pad(arm, geometry, friction);
     physics.colliders.insert_with_parent(pad, body, &mut physics.bodies);
-    finger_on(body, frame, plan)
+    finger(body, frame, geometry)
 }
 
-/// A finger that is part of the palm. The palm's body is turned with the arm, so the pad's place is the arm's own.
+/// Attaches a finger to the palm's body. That body is rotated with the arm, so the pad's position is in the arm's
+/// frame.
 fn attach_finger(
     physics: &mut Physics,
     arm: ArmIndex,
-    frame: OwnFrame,
+    frame: ArmFrame,
     palm: RigidBodyHandle,
-    plan: &FingerPlan,
+    geometry: &FingerGeometry,
     friction: f32,
 ) -> Finger {
-    let pad = pad(arm, plan, friction).translation(shut_offset_in_own(plan));
+    let pad = pad(arm, geometry, friction).translation(closed_offset_in_arm(geometry));
     physics.colliders.insert_with_parent(pad, palm, &mut physics.bodies);
-    finger_on(palm, frame, plan)
+    finger(palm, frame, geometry)
 }
 
-fn pad(arm: ArmIndex, plan: &FingerPlan, friction: f32) -> ColliderBuilder {
+fn pad(arm: ArmIndex, geometry: &FingerGeometry, friction: f32) -> ColliderBuilder {
     ColliderBuilder::cuboid(PAD_HALF_M.x, PAD_HALF_M.y, PAD_HALF_M.z)
-        .mass(plan.mass_kg)
+        .mass(geometry.mass_kg)
         .friction(friction)
         .friction_combine_rule(CoefficientCombineRule::Max)
         .collision_groups(collides(Part::Hand, arm))
 }
 
-fn shut_offset_in_own(plan: &FingerPlan) -> Vector {
-    Vector::new(plan.x_m, plan.side * PAD_HALF_M.y, 0.0)
+fn closed_offset_in_arm(geometry: &FingerGeometry) -> Vector {
+    Vector::new(geometry.x_m, geometry.side * PAD_HALF_M.y, 0.0)
 }
 
-fn finger_on(body: RigidBodyHandle, frame: OwnFrame, plan: &FingerPlan) -> Finger {
+fn finger(body: RigidBodyHandle, frame: ArmFrame, geometry: &FingerGeometry) -> Finger {
     Finger {
         body,
-        mass_kg: plan.mass_kg,
-        share: plan.mass_kg / FINGERS_MASS_KG,
-        shut_offset: frame.turned(shut_offset_in_own(plan)),
-        outward: frame.turned(Vector::Y * plan.side).y,
+        mass_kg: geometry.mass_kg,
+        mass_fraction: geometry.mass_kg / FINGERS_MASS_KG,
+        closed_offset: frame.rotate(closed_offset_in_arm(geometry)),
+        outward: frame.rotate(Vector::Y * geometry.side).y,
     }
 }
 
-fn weightless_body(frame: OwnFrame) -> RigidBodyBuilder {
+fn weightless_body(frame: ArmFrame) -> RigidBodyBuilder {
     RigidBodyBuilder::dynamic()
         .pose(Pose::from_parts(Vector::ZERO, frame.orientation_in_world()))
         .lock_rotations()
@@ -354,7 +357,7 @@ fn weightless_body(frame: OwnFrame) -> RigidBodyBuilder {
         .can_sleep(false)
 }
 
-/// Replaces the body's forces: rapier keeps those of the step before.
+/// Replaces the forces on a body. rapier keeps those of the previous step otherwise.
 fn apply(physics: &mut Physics, body: RigidBodyHandle, force_n: Vector) {
     let body = &mut physics.bodies[body];
     body.reset_forces(false);

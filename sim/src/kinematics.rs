@@ -1,46 +1,45 @@
-//! Kinova's Jaco with six joints and the gripper pointing down: where its joints are, which angles reach a point, and
-//! how the links move when the gripper does.
+//! Forward and inverse kinematics of Kinova's Jaco with six joints, with the gripper pointing down.
 //!
-//! All numbers are in the arm's base frame: x away from the base along the own frame's x, z up. `f64` throughout, and
-//! sums in a fixed order, so that the angles have the same bits on every machine.
+//! All quantities are in the arm's base frame, whose axes are parallel to those of the arm frame. The module computes
+//! in `f64` and sums in a fixed order, so joint angles have the same bits on every machine.
 
 use std::f64::consts::{FRAC_PI_2, PI};
 
 use rapier3d::glamx::{DMat3, DVec3};
 
-/// Joint angles, radians, base to wrist, by Kinova's convention (joints 2 and 3 are stretched at π).
+/// Joint angles, radians, from base to wrist, by Kinova's convention (joints 2 and 3 are straight at π).
 pub(crate) type JointAngles = [f64; 6];
 
-/// Angles with the gripper down 0.40 m ahead of the base and 0.15 m above the table, elbow high: the best of 60
-/// solutions from random starts.
+/// Home posture: gripper pointing down, 0.40 m ahead of the base and 0.15 m above the table, elbow high. It is the best
+/// of 60 solutions from random initial angles.
 pub(crate) const HOME: JointAngles =
     [-0.208_556_86, 2.506_949_69, 5.075_284_33, 2.970_589_41, 0.665_106_14, -0.379_560_43];
 
-/// Damping of the least squares, in the mixed unit of metres and radians.
+/// Damping factor of the least squares, in mixed units of metres and radians.
 const DAMPING: f64 = 0.03;
 /// Largest change of an angle per iteration, radians.
 const MAX_ANGLE_STEP_RAD: f64 = 0.3;
-/// Sum of squared errors at which the iteration ends.
-const SOLVED: f64 = 1e-10;
+/// Sum of squared errors below which the iteration ends.
+const SQUARED_ERROR_TOLERANCE: f64 = 1e-10;
 
-/// One row of the arm's Denavit-Hartenberg table. The twists are multiples of 30 degrees, given by sine and cosine.
-struct Row {
+/// A row of the Denavit–Hartenberg table. Twists are multiples of 30° and given by sine and cosine.
+struct DhRow {
     sin_twist: f64,
     cos_twist: f64,
     length_m: f64,
     offset_m: f64,
-    /// Joint angle at which the table's angle is 0, and the direction in which it counts.
+    /// The table's angle is `direction * joint angle + zero_rad`.
     zero_rad: f64,
     direction: f64,
 }
 
 const SIN_60: f64 = 0.866_025_403_784_438_6;
-/// Half of a wrist bend's part of the link offsets: `sin 30° / sin 60°` of a wrist link of 0.0741 m.
+/// Contribution of half a wrist bend to the link offsets: `sin 30° / sin 60°` times the wrist link of 0.0741 m.
 const BEND_M: f64 = 0.0741 * 0.5 / SIN_60;
 
-/// Jaco with the 60 degree wrist: Kinova's classic parameters of the arm `j2n6s300`.
-const ROWS: [Row; 6] = [
-    Row {
+/// The Jaco with the 60° wrist: Kinova's classic parameters of the arm `j2n6s300`.
+const DH_TABLE: [DhRow; 6] = [
+    DhRow {
         sin_twist: 1.0,
         cos_twist: 0.0,
         length_m: 0.0,
@@ -48,7 +47,7 @@ const ROWS: [Row; 6] = [
         zero_rad: 0.0,
         direction: -1.0,
     },
-    Row {
+    DhRow {
         sin_twist: 0.0,
         cos_twist: -1.0,
         length_m: 0.41,
@@ -56,7 +55,7 @@ const ROWS: [Row; 6] = [
         zero_rad: -FRAC_PI_2,
         direction: 1.0,
     },
-    Row {
+    DhRow {
         sin_twist: 1.0,
         cos_twist: 0.0,
         length_m: 0.0,
@@ -64,7 +63,7 @@ const ROWS: [Row; 6] = [
         zero_rad: FRAC_PI_2,
         direction: 1.0,
     },
-    Row {
+    DhRow {
         sin_twist: SIN_60,
         cos_twist: 0.5,
         length_m: 0.0,
@@ -72,7 +71,7 @@ const ROWS: [Row; 6] = [
         zero_rad: 0.0,
         direction: 1.0,
     },
-    Row {
+    DhRow {
         sin_twist: SIN_60,
         cos_twist: 0.5,
         length_m: 0.0,
@@ -80,7 +79,7 @@ const ROWS: [Row; 6] = [
         zero_rad: -PI,
         direction: 1.0,
     },
-    Row {
+    DhRow {
         sin_twist: 0.0,
         cos_twist: -1.0,
         length_m: 0.0,
@@ -90,39 +89,40 @@ const ROWS: [Row; 6] = [
     },
 ];
 
-/// A coordinate system fixed to a link.
+/// The pose of a link.
 #[derive(Clone, Copy)]
 struct LinkFrame {
     axes: DMat3,
     origin: DVec3,
 }
 
-/// The arm in one posture.
-pub(crate) struct Posture {
-    /// Base first, tool last; joint `i` turns about the z axis of frame `i`.
+/// The poses of all links for given joint angles.
+pub(crate) struct ForwardKinematics {
+    /// From base to tool; joint `i` rotates about the z axis of frame `i`.
     frames: [LinkFrame; 7],
 }
 
-impl Posture {
-    pub(crate) fn of(angles: &JointAngles) -> Self {
+impl ForwardKinematics {
+    pub(crate) fn new(angles: &JointAngles) -> Self {
         let mut frames = [LinkFrame { axes: DMat3::IDENTITY, origin: DVec3::ZERO }; 7];
-        for (idx, (row, angle)) in ROWS.iter().zip(angles).enumerate() {
+        for (idx, (row, angle)) in DH_TABLE.iter().zip(angles).enumerate() {
             frames[idx + 1] = frames[idx].next(row, *angle);
         }
         Self { frames }
     }
 
-    /// Where frame `idx` has its origin, metres: 0 the base, 1 to 5 the joints, 6 the tool.
+    /// Returns the origin of frame `idx`, metres: 0 is the base, 1 to 5 are the joints, 6 is the tool.
     pub(crate) fn point(&self, idx: usize) -> DVec3 {
         self.frames[idx].origin
     }
 
-    /// The axis of joint `idx` in the direction in which its angle counts.
+    /// Returns the axis of joint `idx`, about which its angle counts positively.
     fn axis(&self, idx: usize) -> DVec3 {
-        self.frames[idx].axes.z_axis * ROWS[idx].direction
+        self.frames[idx].axes.z_axis * DH_TABLE[idx].direction
     }
 
-    /// Position (metres) and turn (radians) by which the tool misses `target` and pointing down.
+    /// Returns the error of the tool's position (metres) with respect to `target` and of its orientation (rotation
+    /// vector, radians) with respect to pointing down.
     fn tool_error(&self, target: DVec3) -> [f64; 6] {
         let tool = &self.frames[6];
         let position = target - tool.origin;
@@ -133,7 +133,7 @@ impl Posture {
         [position.x, position.y, position.z, turn.x, turn.y, turn.z]
     }
 
-    /// The tool's velocity and turning rate per joint rate: one row a component, one column a joint.
+    /// Returns the geometric Jacobian of the tool: rows are linear and angular velocity, columns are joints.
     fn jacobian(&self) -> [[f64; 6]; 6] {
         let mut jacobian = [[0.0; 6]; 6];
         for joint in 0..6 {
@@ -147,29 +147,29 @@ impl Posture {
         jacobian
     }
 
-    /// How the origins of `frames` move per metre of the tool, the gripper kept down. Column `c` of each matrix
-    /// belongs to a move along axis `c`.
-    pub(crate) fn motion_of<const N: usize>(&self, frames: [usize; N]) -> [DMat3; N] {
-        let mut moves = [[0.0; 3]; 6];
-        for (axis, row) in moves.iter_mut().take(3).enumerate() {
+    /// Returns, for the origin of each of `frames`, its Jacobian with respect to the tool's position while the gripper
+    /// keeps pointing down. Column `c` belongs to a displacement of the tool along axis `c`.
+    pub(crate) fn point_jacobians<const N: usize>(&self, frames: [usize; N]) -> [DMat3; N] {
+        let mut displacements = [[0.0; 3]; 6];
+        for (axis, row) in displacements.iter_mut().take(3).enumerate() {
             row[axis] = 1.0;
         }
-        let rates = joint_changes(&self.jacobian(), moves);
+        let rates = joint_changes(&self.jacobian(), displacements);
         frames.map(|frame| {
-            let mut motion = [DVec3::ZERO; 3];
+            let mut jacobian = [DVec3::ZERO; 3];
             for (joint, rate) in rates.iter().enumerate().take(frame) {
                 let swing = self.axis(joint).cross(self.point(frame) - self.point(joint));
-                for (column, rate) in motion.iter_mut().zip(rate) {
+                for (column, rate) in jacobian.iter_mut().zip(rate) {
                     *column += swing * *rate;
                 }
             }
-            DMat3::from_cols(motion[0], motion[1], motion[2])
+            DMat3::from_cols(jacobian[0], jacobian[1], jacobian[2])
         })
     }
 }
 
 impl LinkFrame {
-    fn next(&self, row: &Row, angle: f64) -> Self {
+    fn next(&self, row: &DhRow, angle: f64) -> Self {
         let (sin, cos) = libm::sincos(row.direction * angle + row.zero_rad);
         let (sin_twist, cos_twist) = (row.sin_twist, row.cos_twist);
         let axes = DMat3::from_cols(
@@ -182,16 +182,17 @@ impl LinkFrame {
     }
 }
 
-/// Angles near `start` that bring the tool to `target` (metres) with the gripper down, by damped least squares.
-pub(crate) fn solve(start: JointAngles, target: DVec3, n_iterations: usize) -> JointAngles {
+/// Returns joint angles near `start` that bring the tool to `target` (metres) with the gripper pointing down, by damped
+/// least squares.
+pub(crate) fn solve_inverse(start: JointAngles, target: DVec3, n_iterations: usize) -> JointAngles {
     let mut angles = start;
     for _ in 0..n_iterations {
-        let posture = Posture::of(&angles);
-        let error = posture.tool_error(target);
-        if error.iter().map(|e| e * e).sum::<f64>() < SOLVED {
+        let forward = ForwardKinematics::new(&angles);
+        let error = forward.tool_error(target);
+        if error.iter().map(|e| e * e).sum::<f64>() < SQUARED_ERROR_TOLERANCE {
             break;
         }
-        let changes = joint_changes(&posture.jacobian(), error.map(|e| [e]));
+        let changes = joint_changes(&forward.jacobian(), error.map(|e| [e]));
         for (angle, [change]) in angles.iter_mut().zip(changes) {
             *angle += change.clamp(-MAX_ANGLE_STEP_RAD, MAX_ANGLE_STEP_RAD);
         }
@@ -199,17 +200,17 @@ pub(crate) fn solve(start: JointAngles, target: DVec3, n_iterations: usize) -> J
     angles
 }
 
-/// Joint changes for each column of `tool_moves`: `Jᵀ (J Jᵀ + damping²)⁻¹ tool_moves`.
+/// Returns the joint changes for each column of tool displacements: `Jᵀ (J Jᵀ + damping²)⁻¹ displacements`.
 fn joint_changes<const N: usize>(
     jacobian: &[[f64; 6]; 6],
-    tool_moves: [[f64; N]; 6],
+    displacements: [[f64; N]; 6],
 ) -> [[f64; N]; 6] {
     let dot = |a: &[f64; 6], b: &[f64; 6]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
     let mut normal = jacobian.map(|row| jacobian.map(|other| dot(&row, &other)));
     for (idx, row) in normal.iter_mut().enumerate() {
         row[idx] += DAMPING * DAMPING;
     }
-    let weights = solve_positive_definite(normal, tool_moves);
+    let weights = solve_positive_definite(normal, displacements);
     std::array::from_fn(|joint| {
         std::array::from_fn(|column| {
             (0..6).map(|row| jacobian[row][joint] * weights[row][column]).sum()
@@ -217,7 +218,7 @@ fn joint_changes<const N: usize>(
     })
 }
 
-/// Solves `matrix · x = sides` for every column by elimination; a positive definite matrix needs no pivots.
+/// Solves `matrix · x = sides` for every column by Gaussian elimination. A positive definite matrix needs no pivoting.
 fn solve_positive_definite<const N: usize>(
     mut matrix: [[f64; 6]; 6],
     mut sides: [[f64; N]; 6],
@@ -252,34 +253,36 @@ mod tests {
     use tandem_core::rng::uniform;
     use tandem_core::{Stream, episode_rng};
 
-    /// Distance by which the tool misses `target`, metres.
-    fn miss_m(angles: &JointAngles, target: DVec3) -> f64 {
-        (Posture::of(angles).point(6) - target).length()
+    /// The distance between the tool and `target`, metres.
+    fn error_m(angles: &JointAngles, target: DVec3) -> f64 {
+        (ForwardKinematics::new(angles).point(6) - target).length()
     }
 
     #[test]
-    fn stretched_out_the_arm_points_straight_up() {
-        let posture = Posture::of(&[0.0, PI, PI, 0.0, PI, 0.0]);
-        assert!((posture.point(2) - DVec3::new(0.0, 0.0, 0.2755 + 0.41)).length() < 1e-9);
-        assert!((posture.point(4).z - (0.2755 + 0.41 + 0.2073 + BEND_M)).abs() < 1e-9);
+    fn the_straight_arm_points_up() {
+        let forward = ForwardKinematics::new(&[0.0, PI, PI, 0.0, PI, 0.0]);
+        assert!((forward.point(2) - DVec3::new(0.0, 0.0, 0.2755 + 0.41)).length() < 1e-9);
+        assert!((forward.point(4).z - (0.2755 + 0.41 + 0.2073 + BEND_M)).abs() < 1e-9);
     }
 
     #[test]
     fn at_home_the_gripper_points_down_and_the_elbow_is_high() {
         let target = DVec3::new(0.40, 0.0, 0.15);
-        let error = Posture::of(&HOME).tool_error(target);
+        let error = ForwardKinematics::new(&HOME).tool_error(target);
         assert!(error.iter().all(|e| e.abs() < 1e-5), "{error:?}");
-        assert!(Posture::of(&HOME).point(2).z > 0.5);
+        assert!(ForwardKinematics::new(&HOME).point(2).z > 0.5);
     }
 
     #[test]
-    fn the_jacobian_is_the_derivative_of_the_posture() {
-        let jacobian = Posture::of(&HOME).jacobian();
+    fn the_jacobian_is_the_derivative_of_the_tool_position() {
+        let jacobian = ForwardKinematics::new(&HOME).jacobian();
         let step = 1e-6;
         for joint in 0..6 {
             let mut turned = HOME;
             turned[joint] += step;
-            let moved = (Posture::of(&turned).point(6) - Posture::of(&HOME).point(6)) / step;
+            let moved = (ForwardKinematics::new(&turned).point(6)
+                - ForwardKinematics::new(&HOME).point(6))
+                / step;
             for axis in 0..3 {
                 assert!(
                     (moved[axis] - jacobian[axis][joint]).abs() < 1e-5,
@@ -296,26 +299,28 @@ mod tests {
             let mut between = |low, high| f64::from(uniform(&mut rng, low, high));
             let target =
                 DVec3::new(0.40 + between(-0.20, 0.20), between(-0.25, 0.25), between(0.022, 0.35));
-            let angles = solve(HOME, target, 100);
+            let angles = solve_inverse(HOME, target, 100);
             assert!(
-                miss_m(&angles, target) < 1e-4,
-                "{target} missed by {}",
-                miss_m(&angles, target)
+                error_m(&angles, target) < 1e-4,
+                "{target}: error of {} m",
+                error_m(&angles, target)
             );
-            let posture = Posture::of(&angles);
-            let lowest_m = (1..6).map(|idx| posture.point(idx).z).fold(f64::INFINITY, f64::min);
+            let forward = ForwardKinematics::new(&angles);
+            let lowest_m = (1..6).map(|idx| forward.point(idx).z).fold(f64::INFINITY, f64::min);
             assert!(lowest_m > 0.2, "a joint at {lowest_m} m for {target}");
         }
     }
 
     #[test]
-    fn joint_points_move_with_the_tool_as_predicted() {
+    fn link_frames_move_with_the_tool_as_their_jacobians_predict() {
         let (from, to) = (DVec3::new(0.40, 0.0, 0.15), DVec3::new(0.41, -0.01, 0.16));
-        let (before, after) =
-            (Posture::of(&solve(HOME, from, 100)), Posture::of(&solve(HOME, to, 100)));
-        let motions = before.motion_of([2, 4, 5]);
-        for (motion, frame) in motions.into_iter().zip([2, 4, 5]) {
-            let predicted = before.point(frame) + motion * (to - from);
+        let (before, after) = (
+            ForwardKinematics::new(&solve_inverse(HOME, from, 100)),
+            ForwardKinematics::new(&solve_inverse(HOME, to, 100)),
+        );
+        let jacobians = before.point_jacobians([2, 4, 5]);
+        for (jacobian, frame) in jacobians.into_iter().zip([2, 4, 5]) {
+            let predicted = before.point(frame) + jacobian * (to - from);
             assert!((after.point(frame) - predicted).length() < 2e-3, "frame {frame}");
         }
     }

@@ -1,35 +1,24 @@
-//! The 28 numbers that an arm's policy sees, in the arm's own frame.
+//! The part of an observation that belongs to one arm.
 
 use tandem_core::ArmIndex;
 
 use crate::config::CONTROL_STEP_S;
 use crate::world::World;
 
-/// Writes what `arm` sees, shape `[28]`. Velocities are given as metres or radians per control step.
-///
-/// | numbers | meaning |
-/// |---|---|
-/// | 0–2 | end effector |
-/// | 3–5 | object |
-/// | 6–8 | object relative to the end effector |
-/// | 9–11 | openings of the fingers |
-/// | 12–15 | object's orientation, quaternion (x, y, z, w), w >= 0 |
-/// | 16–18 | object's velocity relative to the end effector |
-/// | 19–21 | object's angular velocity |
-/// | 22–24 | end effector's velocity |
-/// | 25–27 | rates of the fingers' openings |
+/// Writes `arm`'s part of the observation, shape `[28]`, in the order that `Env::observe` documents.
 pub(crate) fn observe_arm(world: &World, arm: ArmIndex, observation: &mut [f32]) {
     let (state, object) = (&world.arms[arm.0], world.object(arm));
     let frame = state.frame;
-    let (hand_at, hand_velocity) =
+    let (hand_position, hand_velocity) =
         (state.hand.end_effector(&world.physics), state.hand.velocity(&world.physics));
-    let per_step = |velocity| (frame.turned(velocity) * CONTROL_STEP_S).to_array();
+    let per_step = |velocity| (frame.rotate(velocity) * CONTROL_STEP_S).to_array();
     let fingers = state.hand.openings(&world.physics);
 
-    observation[0..3].copy_from_slice(&frame.own_from_world(hand_at).to_array());
-    observation[3..6].copy_from_slice(&frame.own_from_world(object.translation()).to_array());
-    observation[6..9].copy_from_slice(&frame.turned(object.translation() - hand_at).to_array());
-    observation[12..16].copy_from_slice(&frame.orientation_in_own(*object.rotation()));
+    observation[0..3].copy_from_slice(&frame.arm_from_world(hand_position).to_array());
+    observation[3..6].copy_from_slice(&frame.arm_from_world(object.translation()).to_array());
+    observation[6..9]
+        .copy_from_slice(&frame.rotate(object.translation() - hand_position).to_array());
+    observation[12..16].copy_from_slice(&frame.orientation_in_arm(*object.rotation()));
     observation[16..19].copy_from_slice(&per_step(object.linvel() - hand_velocity));
     observation[19..22].copy_from_slice(&per_step(object.angvel()));
     observation[22..25].copy_from_slice(&per_step(hand_velocity));
@@ -47,16 +36,16 @@ mod tests {
     use tandem_core::{Layout, Task};
 
     use crate::config::WorldConfig;
-    use crate::frame::OwnFrame;
+    use crate::frame::ArmFrame;
 
     const ARMS: [ArmIndex; 2] = [ArmIndex(0), ArmIndex(1)];
     const OBJECT: Vector = Vector::new(0.05, -0.08, 0.0225);
     const HAND: Vector = Vector::new(-0.01, 0.02, 0.12);
 
-    /// What both arms see after `change` was made to the world at arm `arm`, each in its place as given above.
-    fn seen(
+    /// The observations of both arms after `change` was applied to the world of `HAND` and `OBJECT` at `arm`.
+    fn observed_after(
         arm: ArmIndex,
-        change: impl Fn(&mut World, OwnFrame),
+        change: impl Fn(&mut World, ArmFrame),
     ) -> [[f32; OBSERVATION_PER_ARM]; 2] {
         let mut world = World::build(Layout::new(Task::PickAndPlace, 2), &WorldConfig::default());
         for arm in ARMS {
@@ -72,11 +61,11 @@ mod tests {
         })
     }
 
-    /// Asserts that `change`, made at either arm, changes just the numbers in `expected`, and only that arm's.
-    fn check(change: impl Fn(&mut World, ArmIndex, OwnFrame), expected: &[(usize, f32)]) {
+    /// Asserts that `change`, applied at either arm, changes the numbers in `expected` and no others.
+    fn check(change: impl Fn(&mut World, ArmIndex, ArmFrame), expected: &[(usize, f32)]) {
         for arm in ARMS {
-            let before = seen(arm, |_, _| ());
-            let after = seen(arm, |world, frame| change(world, arm, frame));
+            let before = observed_after(arm, |_, _| ());
+            let after = observed_after(arm, |world, frame| change(world, arm, frame));
             assert_eq!(before[1 - arm.0], after[1 - arm.0], "the other arm's numbers changed");
             for idx in 0..OBSERVATION_PER_ARM {
                 let difference = after[arm.0][idx] - before[arm.0][idx];
@@ -90,8 +79,8 @@ mod tests {
     }
 
     #[test]
-    fn at_rest_every_number_says_where_things_are() {
-        for numbers in seen(ArmIndex(0), |_, _| ()) {
+    fn at_rest_the_observation_holds_positions_only() {
+        for numbers in observed_after(ArmIndex(0), |_, _| ()) {
             let mut expected = [0.0; OBSERVATION_PER_ARM];
             expected[0..3].copy_from_slice(&HAND.to_array());
             expected[3..6].copy_from_slice(&OBJECT.to_array());
@@ -105,7 +94,7 @@ mod tests {
     }
 
     #[test]
-    fn places() {
+    fn positions_and_openings_have_their_indices() {
         let step = Vector::new(0.01, 0.02, 0.03);
         check(
             |world, arm, _| world.place_arm(arm, HAND + step, 0.03),
@@ -122,12 +111,12 @@ mod tests {
     }
 
     #[test]
-    fn orientation_has_a_positive_w() {
+    fn the_quaternion_has_a_positive_w() {
         let turn = Rotation::from_xyzw(0.6, 0.0, 0.0, -0.8);
         check(
             |world, arm, frame| {
                 let pose = Pose::from_parts(
-                    frame.world_from_own(OBJECT),
+                    frame.world_from_arm(OBJECT),
                     frame.orientation_in_world() * turn,
                 );
                 world.object_mut(arm).set_position(pose, true);
@@ -143,18 +132,18 @@ mod tests {
         let at =
             |first: usize, sign: f32| [0, 1, 2].map(|axis| (first + axis, sign * per_step[axis]));
         check(
-            |world, arm, frame| world.object_mut(arm).set_linvel(frame.turned(velocity), true),
+            |world, arm, frame| world.object_mut(arm).set_linvel(frame.rotate(velocity), true),
             &at(16, 1.0),
         );
         check(
-            |world, arm, frame| world.object_mut(arm).set_angvel(frame.turned(velocity), true),
+            |world, arm, frame| world.object_mut(arm).set_angvel(frame.rotate(velocity), true),
             &at(19, 1.0),
         );
         let hand_moves = [at(16, -1.0), at(22, 1.0)].concat();
         check(
             |world, arm, frame| {
                 let hand = world.arms[arm.0].hand.clone();
-                hand.set_velocities(&mut world.physics, frame.turned(velocity), [0.0; 3]);
+                hand.set_velocities(&mut world.physics, frame.rotate(velocity), [0.0; 3]);
             },
             &hand_moves,
         );

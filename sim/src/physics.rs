@@ -1,4 +1,4 @@
-//! rapier's sets, bundled so that they can be cloned, with settings for bodies of centimetres.
+//! A rapier world that can be cloned, with settings for bodies of centimetres.
 
 use rapier3d::dynamics::{
     CCDSolver, FrictionModel, ImpulseJointSet, IntegrationParameters, IslandManager,
@@ -14,17 +14,17 @@ use tandem_core::{ArmIndex, Contacts};
 
 use crate::config::WorldConfig;
 
-/// Collision groups of the tables, one an arm.
+/// Collision groups of the tables, one per arm.
 const TABLES: [Group; 2] = [Group::GROUP_1, Group::GROUP_2];
 /// Collision groups of the objects, in arm order.
 const OBJECTS: [Group; 2] = [Group::GROUP_3, Group::GROUP_4];
 /// Collision groups of the arms' hands, in arm order.
 const HANDS: [Group; 2] = [Group::GROUP_5, Group::GROUP_6];
 
-/// What a collider belongs to.
+/// The owner of a collider.
 #[derive(Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Part {
-    /// The table, as far as an arm's own object and hand are concerned.
+    /// The table that an arm's object and hand collide with.
     Table,
     /// The arm's object.
     Object,
@@ -32,8 +32,8 @@ pub(crate) enum Part {
     Hand,
 }
 
-/// What `part` of `arm` collides with: everything that is the arm's or the other's, except that a hand's parts pass
-/// through each other and that each arm has a table of its own.
+/// Returns the collision groups of `part` of `arm`. Every part collides with every other one, except that the parts of
+/// one hand pass through each other and that each arm has its own table.
 pub(crate) fn collides(part: Part, arm: ArmIndex) -> InteractionGroups {
     let movable = OBJECTS[0] | OBJECTS[1] | HANDS[0] | HANDS[1];
     let (group, filter) = match part {
@@ -46,8 +46,8 @@ pub(crate) fn collides(part: Part, arm: ArmIndex) -> InteractionGroups {
 
 /// A rapier world without joints.
 ///
-/// A world that was stepped keeps contact and broad-phase caches, so putting its bodies back is not the same as
-/// starting anew, bit for bit: clone a world that was never stepped instead.
+/// A world that was stepped has filled contact and broad-phase caches, so resetting its bodies does not reproduce the
+/// bits of a new world. Clone a world that was never stepped instead.
 pub(crate) struct Physics {
     pub(crate) bodies: RigidBodySet,
     pub(crate) colliders: ColliderSet,
@@ -79,7 +79,7 @@ impl Physics {
         }
     }
 
-    /// Lets one physics step pass.
+    /// Simulates one physics step.
     pub(crate) fn step(&mut self) {
         self.pipeline.step(
             Vector::new(0.0, 0.0, -9.81),
@@ -98,12 +98,12 @@ impl Physics {
         );
     }
 
-    /// Time of a physics step, seconds.
+    /// Returns the duration of a physics step, seconds.
     pub(crate) fn substep_s(&self) -> f32 {
         self.parameters.dt
     }
 
-    /// Which hands pressed on each other or on the table in the last physics step.
+    /// Returns the contacts between hands, and between hands and the table, in the last physics step.
     pub(crate) fn hand_contacts(&self) -> Contacts {
         self.narrow_phase
             .contact_pairs()
@@ -118,7 +118,7 @@ impl Physics {
             .fold(Contacts::NONE, |all, one| all | one)
     }
 
-    /// What a contact of this pair would count as.
+    /// Classifies a contact of this pair.
     fn kind_of(&self, pair: &ContactPair) -> Contacts {
         let group =
             |collider: ColliderHandle| self.colliders[collider].collision_groups().memberships;
@@ -134,7 +134,7 @@ impl Physics {
 }
 
 impl Clone for Physics {
-    /// The pipeline is a workspace without state of its own, so the clone gets a fresh one.
+    /// Clones the world. The pipeline is scratch memory without state, so the clone gets a new one.
     fn clone(&self) -> Self {
         Self {
             bodies: self.bodies.clone(),
@@ -158,7 +158,8 @@ fn pipeline() -> PhysicsPipeline {
     pipeline
 }
 
-/// rapier's defaults are for bodies of metres: they let a cube of centimetres sink in by a third of its size.
+/// Returns parameters for bodies of centimetres. With rapier's defaults, which are for bodies of metres, a cube sinks
+/// into the table by a third of its size.
 fn integration_parameters(config: &WorldConfig) -> IntegrationParameters {
     let softness = SpringCoefficients::new(200.0, 5.0);
     IntegrationParameters {

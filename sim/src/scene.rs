@@ -1,4 +1,4 @@
-//! The world as pictures and logs show it.
+//! Snapshots of the world for pictures and logs.
 
 use rapier3d::math::{Rotation, Vector};
 use tandem_core::scene::{ArmScene, Capsule, Cuboid, Point, Scene};
@@ -6,16 +6,17 @@ use tandem_core::{ArmIndex, Layout};
 
 use crate::arm::Arm;
 use crate::capsule::{LINK_FRAMES, LINK_RADII_M};
-use crate::frame::BASE_IN_OWN;
-
+use crate::frame::BASE_IN_ARM;
 use crate::hand::{PAD_HALF_M, PALM_ABOVE_M, PALM_HALF_M, WRIST_ABOVE_M, WRIST_RADIUS_M};
-use crate::kinematics::Posture;
+use crate::kinematics::ForwardKinematics;
 use crate::world::{TABLE_HALF_M, World};
 
-/// Iterations of the inverse kinematics from the posture at the start of a control step to where the hand is now.
+/// Iterations of the inverse kinematics from the joint angles at the start of a control step to the current hand
+/// position.
 const ITERATIONS: usize = 20;
 
-/// What `world` looks like `time_s` after the episode's start; `goal` has shape `[n_goal]`, own frames.
+/// Returns a snapshot of `world`, `time_s` after the start of the episode. `goal` has shape `[n_goal]`, arm frames; the
+/// objects are cubes with half edges `half_m`.
 pub(crate) fn scene(
     world: &World,
     layout: Layout,
@@ -24,8 +25,8 @@ pub(crate) fn scene(
     time_s: f64,
 ) -> Scene {
     let goal_in_world = |arm: ArmIndex| {
-        let in_own = Vector::from_slice(&goal[layout.goal_of(arm)]);
-        world.arms[arm.0].frame.world_from_own(in_own).to_array()
+        let in_arm = Vector::from_slice(&goal[layout.goal_of(arm)]);
+        world.arms[arm.0].frame.world_from_arm(in_arm).to_array()
     };
     let object = |arm: ArmIndex| {
         let body = world.object(arm);
@@ -42,9 +43,9 @@ pub(crate) fn scene(
 
 fn arm_scene(world: &World, arm: &Arm) -> ArmScene {
     let joint_angles_rad = arm.angles_now(&world.physics, ITERATIONS);
-    let posture = Posture::of(&joint_angles_rad);
+    let forward = ForwardKinematics::new(&joint_angles_rad);
     let joint_points: Vec<Point> =
-        (0..7).map(|idx| arm.world_from_base(posture.point(idx)).to_array()).collect();
+        (0..7).map(|idx| arm.world_from_base(forward.point(idx)).to_array()).collect();
     let end_effector = arm.hand.end_effector(&world.physics);
     let mut links: Vec<Capsule> = LINK_FRAMES
         .windows(2)
@@ -57,11 +58,11 @@ fn arm_scene(world: &World, arm: &Arm) -> ArmScene {
         .collect();
     let [from, to] = WRIST_ABOVE_M.map(|above_m| (end_effector + Vector::Z * above_m).to_array());
     links.push(Capsule { from, to, radius_m: WRIST_RADIUS_M });
-    let turned = arm.frame.orientation_in_world();
-    let mut hand = vec![cuboid(end_effector + Vector::Z * PALM_ABOVE_M, turned, PALM_HALF_M)];
-    hand.extend(arm.hand.pads(&world.physics).map(|pad| cuboid(pad, turned, PAD_HALF_M)));
+    let orientation = arm.frame.orientation_in_world();
+    let mut hand = vec![cuboid(end_effector + Vector::Z * PALM_ABOVE_M, orientation, PALM_HALF_M)];
+    hand.extend(arm.hand.pads(&world.physics).map(|pad| cuboid(pad, orientation, PAD_HALF_M)));
     ArmScene {
-        base: arm.frame.world_from_own(BASE_IN_OWN).to_array(),
+        base: arm.frame.world_from_arm(BASE_IN_ARM).to_array(),
         joint_angles_rad,
         joint_points,
         links,

@@ -1,39 +1,35 @@
-//! Where an episode starts and where its objects shall go.
+//! Initial states: positions of hands and objects, and goals.
 
 use rand_chacha::ChaCha8Rng;
 use rapier3d::math::Vector;
-use tandem_core::rng::{coin, uniform};
-use tandem_core::{ArmIndex, Layout, Task};
+use tandem_core::rng::{bernoulli, uniform};
+use tandem_core::{ArmIndex, Layout, Task, WorldSettings};
 
-use crate::config::Starts;
-use crate::frame::{OwnFrame, WORKSPACE_HIGH, WORKSPACE_LOW};
-use crate::hand::{MAX_OPENING_M, PAD_HALF_M, PALM_HALF_M};
+use crate::frame::{ArmFrame, WORKSPACE_LOW};
+use crate::hand::MAX_OPENING_M;
 
-/// Half the area of objects and goals along x, own frame, metres.
+/// Half extent along x of the area of objects and goals, arm frame, metres.
 const AREA_X_M: f32 = 0.12;
-/// The same along y, for one arm and for two.
+/// Half extent along y of this area for one arm and for two, metres.
 const AREA_Y_M: [f32; 2] = [0.15, 0.12];
-/// Least horizontal distance of an object from any hand that starts above the middle, metres.
+/// Smallest horizontal distance between an object and a hand above the centre, metres.
 const HAND_CLEARANCE_M: f32 = 0.10;
-/// Least distance of an object from its goal, metres.
+/// Smallest distance between an object and its goal, metres.
 const GOAL_DISTANCE_M: f32 = 0.05;
-/// Least distance of two objects, and of two goals, metres.
-const APART_M: f32 = 0.07;
-/// Least horizontal distance of two hands, metres.
-const HANDS_APART_M: f32 = 0.17;
-/// Share of pick-and-place goals that are above the table, and up to how far, metres.
-const AIR_SHARE: f32 = 0.5;
-const AIR_M: f32 = 0.25;
-/// Room to spare between a widely placed hand and an object, metres.
-const MARGIN_M: f32 = 0.006;
-/// Highest end effector of a wide start, metres.
-const WIDE_HIGH_M: f32 = 0.20;
-/// Highest end effector of a gripped start, metres.
-const GRIPPED_HIGH_M: f32 = 0.30;
-/// How far a gripped object may be off the pads' centre along x and z, metres.
-const GRIPPED_OFF_M: [f32; 2] = [0.005, 0.008];
+/// Smallest distance between two objects, and between two goals, metres.
+const SEPARATION_M: f32 = 0.07;
+/// Smallest horizontal distance between two hands, metres.
+const HAND_SEPARATION_M: f32 = 0.17;
+/// Probability that a pick-and-place goal is above the table.
+const AIR_GOAL_PROB: f32 = 0.5;
+/// Largest height of such a goal above the table, metres.
+const AIR_GOAL_HIGH_M: f32 = 0.25;
+/// Largest height of the end effector in a grasped start, metres.
+const GRASPED_HIGH_M: f32 = 0.30;
+/// Largest offset of a grasped object from the centre of the pads along x and z, metres.
+const GRASPED_OFFSET_M: [f32; 2] = [0.005, 0.008];
 
-/// How one arm starts: own frame, metres.
+/// The initial state of one arm, arm frame, metres.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct ArmStart {
     pub(crate) end_effector: Vector,
@@ -42,57 +38,53 @@ pub(crate) struct ArmStart {
     pub(crate) goal: Vector,
 }
 
-/// How the hands of an episode start.
+/// The initial position of the hands.
 #[derive(Clone, Copy, PartialEq)]
-enum Kind {
-    /// Above the middle of the workspace: as evaluated.
-    Middle,
-    /// Anywhere in the lower workspace.
-    Wide,
-    /// With the object held.
-    Gripped,
+enum HandStart {
+    /// Above the centre of the workspace, as in all evaluation episodes.
+    Centred,
+    /// At an object, which is grasped.
+    Grasping,
 }
 
-/// Draws how every arm starts: objects, goals and hands apart from each other, nothing achieved yet.
-pub(crate) fn draw(
+/// Draws the initial state of every arm. Objects, goals and hands are apart from each other, and no goal is achieved.
+pub(crate) fn sample_starts(
     rng: &mut ChaCha8Rng,
     layout: Layout,
     object_half_m: f32,
-    starts: Starts,
+    settings: WorldSettings,
 ) -> Vec<ArmStart> {
-    let gripped = coin(rng, starts.gripped_share);
-    let wide = coin(rng, starts.wide_share);
+    let grasped = bernoulli(rng, settings.grasped_start_prob);
+    // An episode's later draws keep their place in the random stream: this one belonged to a removed hand_start of
+    // start.
+    let _: bool = bernoulli(rng, 0.0);
     let can_hold = layout.task == Task::PickAndPlace && object_half_m < MAX_OPENING_M;
-    let kind = match (gripped && can_hold, wide) {
-        (true, _) => Kind::Gripped,
-        (false, true) => Kind::Wide,
-        (false, false) => Kind::Middle,
-    };
-    let area = Area { layout, object_half_m };
+    let hand_start = if grasped && can_hold { HandStart::Grasping } else { HandStart::Centred };
+    let sampler = StartSampler { layout, object_half_m };
     loop {
-        let arms: Vec<ArmStart> = layout.arms().map(|_| area.arm_start(rng, kind)).collect();
-        if area.is_free(&arms, kind) {
+        let arms: Vec<ArmStart> =
+            layout.arms().map(|_| sampler.arm_start(rng, hand_start)).collect();
+        if sampler.is_valid(&arms, hand_start) {
             return arms;
         }
     }
 }
 
-/// What the draws depend on.
-struct Area {
+/// The parameters of the distributions.
+struct StartSampler {
     layout: Layout,
     object_half_m: f32,
 }
 
-impl Area {
-    fn arm_start(&self, rng: &mut ChaCha8Rng, kind: Kind) -> ArmStart {
+impl StartSampler {
+    fn arm_start(&self, rng: &mut ChaCha8Rng, hand_start: HandStart) -> ArmStart {
         let on_table = self.point_on_table(rng);
         let goal = self.goal(rng);
-        let (end_effector, opening_m, object) = match kind {
-            Kind::Middle => (self.hand_in_the_middle(rng), self.free_opening_m(), on_table),
-            Kind::Wide => (wide_hand(rng), self.free_opening_m(), on_table),
-            Kind::Gripped => {
-                let hand = self.holding_hand(rng);
-                (hand, self.object_half_m, self.held_object(rng, hand))
+        let (end_effector, opening_m, object) = match hand_start {
+            HandStart::Centred => (self.centred_hand(rng), self.empty_opening_m(), on_table),
+            HandStart::Grasping => {
+                let hand = self.grasping_hand(rng);
+                (hand, self.object_half_m, self.grasped_object(rng, hand))
             }
         };
         ArmStart { end_effector, opening_m, object, goal }
@@ -109,14 +101,14 @@ impl Area {
 
     fn goal(&self, rng: &mut ChaCha8Rng) -> Vector {
         let on_table = self.point_on_table(rng);
-        if self.layout.task == Task::PickAndPlace && coin(rng, AIR_SHARE) {
-            on_table + Vector::Z * uniform(rng, 0.0, AIR_M)
+        if self.layout.task == Task::PickAndPlace && bernoulli(rng, AIR_GOAL_PROB) {
+            on_table + Vector::Z * uniform(rng, 0.0, AIR_GOAL_HIGH_M)
         } else {
             on_table
         }
     }
 
-    fn hand_in_the_middle(&self, rng: &mut ChaCha8Rng) -> Vector {
+    fn centred_hand(&self, rng: &mut ChaCha8Rng) -> Vector {
         let (x, y) = (uniform(rng, -0.02, 0.02), uniform(rng, -0.02, 0.02));
         let z = match self.layout.task {
             Task::Push => 0.06,
@@ -125,36 +117,40 @@ impl Area {
         Vector::new(x, y, z)
     }
 
-    fn holding_hand(&self, rng: &mut ChaCha8Rng) -> Vector {
+    fn grasping_hand(&self, rng: &mut ChaCha8Rng) -> Vector {
         let area_y_m = self.area_y_m();
-        let lowest_m = self.object_half_m.max(WORKSPACE_LOW.z) + GRIPPED_OFF_M[1];
+        let lowest_m = self.object_half_m.max(WORKSPACE_LOW.z) + GRASPED_OFFSET_M[1];
         Vector::new(
             uniform(rng, -AREA_X_M, AREA_X_M),
             uniform(rng, -area_y_m, area_y_m),
-            uniform(rng, lowest_m, GRIPPED_HIGH_M),
+            uniform(rng, lowest_m, GRASPED_HIGH_M),
         )
     }
 
-    fn held_object(&self, rng: &mut ChaCha8Rng, hand: Vector) -> Vector {
-        let [off_x_m, off_z_m] = GRIPPED_OFF_M;
-        hand + Vector::new(uniform(rng, -off_x_m, off_x_m), 0.0, uniform(rng, -off_z_m, off_z_m))
+    fn grasped_object(&self, rng: &mut ChaCha8Rng, hand: Vector) -> Vector {
+        let [offset_x_m, offset_z_m] = GRASPED_OFFSET_M;
+        hand + Vector::new(
+            uniform(rng, -offset_x_m, offset_x_m),
+            0.0,
+            uniform(rng, -offset_z_m, offset_z_m),
+        )
     }
 
     fn area_y_m(&self) -> f32 {
         AREA_Y_M[usize::from(self.layout.n_arms > 1)]
     }
 
-    /// How far a hand that holds nothing is open.
-    fn free_opening_m(&self) -> f32 {
+    /// Returns the opening of each side of an empty gripper, metres.
+    fn empty_opening_m(&self) -> f32 {
         match self.layout.task {
             Task::Push => 0.0,
             Task::PickAndPlace => MAX_OPENING_M,
         }
     }
 
-    fn is_free(&self, arms: &[ArmStart], kind: Kind) -> bool {
+    fn is_valid(&self, arms: &[ArmStart], hand_start: HandStart) -> bool {
         let in_world = |arm: usize, point| {
-            OwnFrame::of(ArmIndex(arm), self.layout.n_arms).world_from_own(point)
+            ArmFrame::new(ArmIndex(arm), self.layout.n_arms).world_from_arm(point)
         };
         let points = |part: fn(&ArmStart) -> Vector| -> Vec<Vector> {
             arms.iter().enumerate().map(|(arm, start)| in_world(arm, part(start))).collect()
@@ -164,42 +160,24 @@ impl Area {
             points(|start| start.object),
             points(|start| start.goal),
         );
-        let clear_of = |hand: Vector, object: Vector| match kind {
-            Kind::Middle => horizontal(hand - object) >= HAND_CLEARANCE_M,
-            Kind::Wide => self.is_beside_or_above(hand, object),
-            Kind::Gripped => true,
+        let clear_of = |hand: Vector, object: Vector| match hand_start {
+            HandStart::Centred => horizontal(hand - object) >= HAND_CLEARANCE_M,
+            HandStart::Grasping => true,
         };
         arms.iter().all(|start| (start.object - start.goal).length() >= GOAL_DISTANCE_M)
-            && apart(&objects, |offset| offset.length() >= APART_M)
-            && apart(&goals, |offset| offset.length() >= APART_M)
-            && apart(&hands, |offset| horizontal(offset) >= HANDS_APART_M)
+            && all_pairs(&objects, |offset| offset.length() >= SEPARATION_M)
+            && all_pairs(&goals, |offset| offset.length() >= SEPARATION_M)
+            && all_pairs(&hands, |offset| horizontal(offset) >= HAND_SEPARATION_M)
             && hands.iter().all(|hand| objects.iter().all(|object| clear_of(*hand, *object)))
     }
-
-    /// Whether a hand, anywhere, does not touch an object that lies on the table.
-    fn is_beside_or_above(&self, hand: Vector, object: Vector) -> bool {
-        let room_m = self.object_half_m + MARGIN_M;
-        let offset = (hand - object).abs();
-        offset.x > PALM_HALF_M.x + room_m
-            || offset.y > PALM_HALF_M.y + room_m
-            || hand.z - PAD_HALF_M.z > object.z + room_m
-    }
-}
-
-fn wide_hand(rng: &mut ChaCha8Rng) -> Vector {
-    Vector::new(
-        uniform(rng, WORKSPACE_LOW.x, WORKSPACE_HIGH.x),
-        uniform(rng, WORKSPACE_LOW.y, WORKSPACE_HIGH.y),
-        uniform(rng, WORKSPACE_LOW.z, WIDE_HIGH_M),
-    )
 }
 
 fn horizontal(offset: Vector) -> f32 {
     Vector::new(offset.x, offset.y, 0.0).length()
 }
 
-/// Whether every two of `points` are far enough from each other.
-fn apart(points: &[Vector], far_enough: impl Fn(Vector) -> bool) -> bool {
+/// Returns `true` if every two of `points` are far enough from each other.
+fn all_pairs(points: &[Vector], far_enough: impl Fn(Vector) -> bool) -> bool {
     points
         .iter()
         .enumerate()

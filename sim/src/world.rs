@@ -1,4 +1,4 @@
-//! The world: table, objects and arms, and what passes in one control step.
+//! The simulated world: table, objects and arms, and the sequence of a control step.
 
 use rapier3d::dynamics::{CoefficientCombineRule, RigidBody, RigidBodyBuilder, RigidBodyHandle};
 use rapier3d::geometry::ColliderBuilder;
@@ -7,72 +7,73 @@ use tandem_core::{ArmIndex, Contacts, Layout};
 
 use crate::arm::{Arm, Command};
 use crate::config::{SimError, WorldConfig};
-use crate::frame::OwnFrame;
-use crate::guard::LinkGuard;
+use crate::frame::ArmFrame;
+use crate::link_avoidance::VelocityDamper;
 use crate::physics::{Part, Physics, collides};
 
-/// Most arms a world can have.
+/// Largest number of arms in a world.
 pub(crate) const MAX_ARMS: usize = 2;
 /// Half extents of the table, metres; its top is at z = 0.
 pub(crate) const TABLE_HALF_M: Vector = Vector::new(0.8, 0.6, 0.05);
 const TABLE_FRICTION: f32 = 0.6;
 
-/// Everything that moves, and what it moves on. One object an arm, in arm order.
+/// The state of all bodies. There is one object per arm, in arm order.
 #[derive(Clone)]
 pub(crate) struct World {
     pub(crate) physics: Physics,
     pub(crate) arms: Vec<Arm>,
     objects: Vec<RigidBodyHandle>,
-    /// Between two arms; a single arm needs none.
-    guard: Option<LinkGuard>,
+    /// Present if there are two arms.
+    damper: Option<VelocityDamper>,
     substeps: u32,
 }
 
 impl World {
-    /// A world in which nothing has its place yet.
+    /// Creates a world whose bodies have not been placed yet.
     pub(crate) fn build(layout: Layout, config: &WorldConfig) -> Self {
         let friction = config.friction(layout.task);
         let mut physics = Physics::new(config);
         let mut arms = Vec::with_capacity(layout.n_arms);
         let mut objects = Vec::with_capacity(layout.n_arms);
         for arm in layout.arms() {
-            let frame = OwnFrame::of(arm, layout.n_arms);
+            let frame = ArmFrame::new(arm, layout.n_arms);
             add_table(&mut physics, arm, frame);
             arms.push(Arm::build(&mut physics, arm, frame, layout.task, config));
             objects.push(add_object(&mut physics, arm, config, friction.object));
         }
-        Self { physics, arms, objects, guard: None, substeps: config.substeps }
+        Self { physics, arms, objects, damper: None, substeps: config.substeps }
     }
 
-    /// Puts `arm`'s object, at rest and not turned in the arm's own frame, to `at_in_own`, metres.
-    pub(crate) fn place_object(&mut self, arm: ArmIndex, at_in_own: Vector) {
+    /// Places `arm`'s object at `at_in_arm` (metres), at rest and aligned with the arm's frame.
+    pub(crate) fn place_object(&mut self, arm: ArmIndex, at_in_arm: Vector) {
         let frame = self.arms[arm.0].frame;
-        let pose = Pose::from_parts(frame.world_from_own(at_in_own), frame.orientation_in_world());
+        let pose = Pose::from_parts(frame.world_from_arm(at_in_arm), frame.orientation_in_world());
         let body = &mut self.physics.bodies[self.objects[arm.0]];
         body.set_position(pose, true);
         body.set_linvel(Vector::ZERO, true);
         body.set_angvel(Vector::ZERO, true);
     }
 
-    /// Puts `arm`, at rest, where its end effector is at `end_effector_in_own` (metres).
-    pub(crate) fn place_arm(&mut self, arm: ArmIndex, end_effector_in_own: Vector, opening_m: f32) {
-        self.arms[arm.0].place(&mut self.physics, end_effector_in_own, opening_m);
+    /// Places `arm`, at rest, with its end effector at `end_effector_in_arm` (metres).
+    pub(crate) fn place_arm(&mut self, arm: ArmIndex, end_effector_in_arm: Vector, opening_m: f32) {
+        self.arms[arm.0].place(&mut self.physics, end_effector_in_arm, opening_m);
     }
 
-    /// Sets up what watches over the arms, once they are in their places.
-    pub(crate) fn arm_guard(&mut self) {
-        self.guard = match self.arms.as_slice() {
-            [first, second] => Some(LinkGuard::new([first, second], &self.physics)),
+    /// Starts link avoidance anew. To be called once all arms are in place.
+    pub(crate) fn reset_link_avoidance(&mut self) {
+        self.damper = match self.arms.as_slice() {
+            [first, second] => Some(VelocityDamper::new([first, second], &self.physics)),
             _ => None,
         };
     }
 
-    /// The smallest gap between two arms' links during the last control step, metres; infinite for one arm.
+    /// Returns the smallest gap between the links of two arms during the last control step, metres; infinite for one
+    /// arm.
     pub(crate) fn link_gap_m(&self) -> f32 {
-        self.guard.as_ref().map_or(f32::INFINITY, LinkGuard::smallest_gap_m)
+        self.damper.as_ref().map_or(f32::INFINITY, VelocityDamper::min_gap_m)
     }
 
-    /// `arm`'s object.
+    /// Returns the body of `arm`'s object.
     pub(crate) fn object(&self, arm: ArmIndex) -> &RigidBody {
         &self.physics.bodies[self.objects[arm.0]]
     }
@@ -82,13 +83,13 @@ impl World {
         &mut self.physics.bodies[self.objects[arm.0]]
     }
 
-    /// Lets one control step pass. `commands` has one entry an arm; further ones are not read.
+    /// Simulates one control step. `commands` has one entry per arm; further entries are ignored.
     pub(crate) fn step(&mut self, commands: &[Command; MAX_ARMS]) -> Result<Contacts, SimError> {
         for arm in &mut self.arms {
             arm.track(&self.physics);
         }
-        if let (Some(guard), [first, second]) = (&mut self.guard, self.arms.as_slice()) {
-            guard.pose([first, second], &self.physics);
+        if let (Some(damper), [first, second]) = (&mut self.damper, self.arms.as_slice()) {
+            damper.update_posture([first, second], &self.physics);
         }
         let mut contacts = Contacts::NONE;
         for _ in 0..self.substeps {
@@ -103,15 +104,15 @@ impl World {
         Ok(contacts)
     }
 
-    /// Sets the hands' forces for the next physics step.
+    /// Sets the forces on the hands for the next physics step.
     fn drive(&mut self, commands: &[Command; MAX_ARMS]) {
         let mut velocities = [Vector::ZERO; MAX_ARMS];
         for ((arm, command), velocity) in self.arms.iter().zip(commands).zip(&mut velocities) {
             *velocity = arm.velocity_to(&self.physics, command.target);
         }
-        if let (Some(guard), [first, second]) = (&mut self.guard, self.arms.as_slice()) {
+        if let (Some(damper), [first, second]) = (&mut self.damper, self.arms.as_slice()) {
             let palms = [first, second].map(|arm| arm.hand.end_effector(&self.physics));
-            velocities = guard.limit(palms, velocities);
+            velocities = damper.limit(palms, velocities);
         }
         for ((arm, command), velocity) in self.arms.iter().zip(commands).zip(velocities) {
             arm.hand.drive(&mut self.physics, velocity, command.gripper);
@@ -133,12 +134,13 @@ impl World {
     }
 }
 
-/// Adds the table that `arm`'s hand and object stand on: in the same place for every arm, but turned with the arm.
+/// Adds the table that `arm`'s hand and object collide with. Each arm has one, at the same place but rotated with the
+/// arm.
 ///
-/// rapier solves a cube's four corners on the table in an order that depends on the table's axes, which pushes a resting
-/// cube by a micrometre. On a table of its own the second arm's cube is pushed to the other side, as the symmetry of the
-/// two arms demands.
-fn add_table(physics: &mut Physics, arm: ArmIndex, frame: OwnFrame) {
+/// rapier solves the contacts of a cube's four corners in an order that depends on the table's axes, which displaces a
+/// resting cube by a micrometre. With a table per arm, the cubes of the two arms are displaced in opposite directions,
+/// which preserves the symmetry of the arms.
+fn add_table(physics: &mut Physics, arm: ArmIndex, frame: ArmFrame) {
     let top_at_zero = Vector::new(0.0, 0.0, -TABLE_HALF_M.z);
     let table = ColliderBuilder::cuboid(TABLE_HALF_M.x, TABLE_HALF_M.y, TABLE_HALF_M.z)
         .position(Pose::from_parts(top_at_zero, frame.orientation_in_world()))

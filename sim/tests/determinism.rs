@@ -1,17 +1,17 @@
-//! The same draws and actions give the same bits.
+//! Equal draws and actions give equal bits.
 
 use std::thread;
 
 use tandem_core::rng::uniform;
-use tandem_core::{Contacts, Layout, Stream, Task, episode_rng};
-use tandem_sim::{Env, SimError, Starts, WorldConfig};
+use tandem_core::{Contacts, Layout, Stream, Task, WorldSettings, episode_rng};
+use tandem_sim::{Env, SimError, WorldConfig};
 
-const STARTS: Starts = Starts { gripped_share: 0.3, wide_share: 0.3 };
+const SETTINGS: WorldSettings = WorldSettings { grasped_start_prob: 0.3, substeps: 20 };
 
-/// Every observation's bits, and the contacts, of one episode of held random actions.
+/// The bits of all observations and the contacts of an episode with held random actions.
 fn trace(env: &mut Env, episode: u64) -> (Vec<u32>, Vec<Contacts>) {
     let layout = env.layout();
-    env.reset(&mut episode_rng(5, episode, Stream::Reset), STARTS);
+    env.reset(&mut episode_rng(5, episode, Stream::Reset), SETTINGS);
     let mut exploration = episode_rng(5, episode, Stream::Exploration);
     let mut observation = vec![0.0; layout.n_observation()];
     let mut action = vec![0.0; layout.n_action()];
@@ -45,13 +45,13 @@ fn an_episode_is_a_function_of_its_draws_and_actions() {
             let traced = trace(&mut used, other);
             assert_eq!(traced == fresh, other == 3, "{layout:?}, episode {other}");
         }
-        assert!(trace(&mut used.clone(), 3) == fresh, "{layout:?}: a clone went another way");
-        assert!(trace(&mut used, 3) == fresh, "{layout:?}: what came before entered");
+        assert!(trace(&mut used.clone(), 3) == fresh, "{layout:?}: a clone differs");
+        assert!(trace(&mut used, 3) == fresh, "{layout:?}: earlier episodes have an influence");
     }
 }
 
 #[test]
-fn threads_change_nothing() {
+fn threads_do_not_affect_the_bits() {
     let layout = Layout::new(Task::PickAndPlace, 2);
     let prototype = new_env(layout);
     let alone: Vec<_> = (0..4).map(|episode| trace(&mut prototype.clone(), episode)).collect();
@@ -66,11 +66,11 @@ fn threads_change_nothing() {
 }
 
 #[test]
-fn looking_changes_nothing() {
+fn snapshots_do_not_affect_the_simulation() {
     for layout in layouts() {
         let run = |look: bool| {
             let mut env = new_env(layout);
-            env.reset(&mut episode_rng(1, 1, Stream::Reset), Starts::default());
+            env.reset(&mut episode_rng(1, 1, Stream::Reset), WorldSettings::default());
             let action = vec![0.7; layout.n_action()];
             for _ in 0..20 {
                 if look {
@@ -104,10 +104,10 @@ fn a_hundred_thousand_random_steps_stay_finite() {
 }
 
 #[test]
-fn bad_actions_are_named_and_change_nothing() {
+fn invalid_actions_are_errors_and_leave_the_state_unchanged() {
     let layout = Layout::new(Task::PickAndPlace, 1);
     let mut env = new_env(layout);
-    env.reset(&mut episode_rng(1, 1, Stream::Reset), Starts::default());
+    env.reset(&mut episode_rng(1, 1, Stream::Reset), WorldSettings::default());
     let before = env.scene();
     assert_eq!(env.step(&[0.0; 3]), Err(SimError::ActionLength { got: 3, expected: 4 }));
     let error = env.step(&[0.0, f32::INFINITY, 0.0, 0.0]).unwrap_err();
@@ -124,10 +124,10 @@ fn bad_actions_are_named_and_change_nothing() {
 }
 
 #[test]
-fn actions_are_cut_to_one() {
+fn actions_are_clamped_to_one() {
     let run = |size: f32| {
         let mut env = new_env(Layout::new(Task::PickAndPlace, 1));
-        env.reset(&mut episode_rng(1, 1, Stream::Reset), Starts::default());
+        env.reset(&mut episode_rng(1, 1, Stream::Reset), WorldSettings::default());
         env.step(&[size, -size, size, -size]).unwrap();
         env.scene()
     };

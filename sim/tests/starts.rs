@@ -1,23 +1,25 @@
-//! How episodes start: in reach, touching nothing, apart from each other, with something left to do.
+//! Initial states: in reach, without contacts, apart from each other, and with goals not yet achieved.
 
 use tandem_core::layout::{GOAL_TOLERANCE_M, Layout, OBSERVATION_PER_ARM, Task};
 use tandem_core::reward::{REWARD_PENDING, distance, sparse_reward};
-use tandem_core::{ArmIndex, Contacts, Stream, episode_rng};
-use tandem_sim::{Env, Starts, WorldConfig};
+use tandem_core::{ArmIndex, Contacts, Stream, WorldSettings, episode_rng};
+use tandem_sim::{Env, WorldConfig};
 
 const N_SEEDS: u64 = 1000;
 const HALF_M: f32 = 0.0225;
+/// Every episode starts with the objects grasped where the task allows it.
+const GRASPED: WorldSettings = WorldSettings { grasped_start_prob: 1.0, substeps: 20 };
 
 fn layouts() -> impl Iterator<Item = Layout> {
     Task::ALL.into_iter().flat_map(|task| [1, 2].map(|n_arms| Layout::new(task, n_arms)))
 }
 
-/// Calls `look` with every start of `N_SEEDS`.
-fn each_start(layout: Layout, starts: Starts, mut look: impl FnMut(&mut Env, &[f32])) {
+/// Calls `look` with the initial state of each of `N_SEEDS` seeds.
+fn each_start(layout: Layout, settings: WorldSettings, mut look: impl FnMut(&mut Env, &[f32])) {
     let mut env = Env::new(layout, &WorldConfig::default()).expect("a valid world");
     let mut observation = vec![0.0; layout.n_observation()];
     for seed in 0..N_SEEDS {
-        env.reset(&mut episode_rng(seed, 0, Stream::Reset), starts);
+        env.reset(&mut episode_rng(seed, 0, Stream::Reset), settings);
         env.observe(&mut observation);
         look(&mut env, &observation);
     }
@@ -29,10 +31,10 @@ fn idle(layout: Layout, gripper: f32) -> Vec<f32> {
 }
 
 #[test]
-fn starts_as_evaluated_are_in_reach_apart_and_not_yet_done() {
+fn evaluation_starts_are_in_reach_apart_and_not_yet_successful() {
     for layout in layouts() {
         let area_y_m = if layout.n_arms == 1 { 0.15 } else { 0.12 };
-        each_start(layout, Starts::default(), |env, observation| {
+        each_start(layout, WorldSettings::default(), |env, observation| {
             for arm in layout.arms() {
                 let seen = &observation[layout.observation_of(arm)];
                 let goal = &env.goal()[layout.goal_of(arm)];
@@ -62,7 +64,7 @@ fn starts_as_evaluated_are_in_reach_apart_and_not_yet_done() {
                 let in_world = distance(&scene.objects[arm.0].centre, &scene.goals[arm.0]);
                 assert!(
                     (in_own - in_world).abs() < 1e-6,
-                    "goal and object are in different frames"
+                    "goal and object are given in different frames"
                 );
             }
             let apart = |a: [f32; 3], b: [f32; 3]| assert!(distance(&a, &b) >= 0.0699);
@@ -75,67 +77,43 @@ fn starts_as_evaluated_are_in_reach_apart_and_not_yet_done() {
 }
 
 #[test]
-fn half_of_the_places_to_put_an_object_are_in_the_air() {
+fn half_of_the_goals_are_in_the_air() {
     let layout = Layout::new(Task::PickAndPlace, 1);
     let mut n_high = 0;
-    each_start(layout, Starts::default(), |env, _| {
+    each_start(layout, WorldSettings::default(), |env, _| {
         n_high += u32::from(env.goal()[2] > HALF_M + GOAL_TOLERANCE_M);
     });
     assert!((350..450).contains(&n_high), "{n_high} of 1000, expected half of four fifths");
 }
 
 #[test]
-fn nothing_touches_at_the_start_however_it_starts() {
-    let wide = Starts { gripped_share: 0.0, wide_share: 1.0 };
+fn no_start_has_a_contact() {
     for layout in layouts() {
-        for starts in [Starts::default(), wide] {
-            let gripper = 1.0;
-            each_start(layout, starts, |env, before| {
-                let mut after = before.to_vec();
-                assert_eq!(env.step(&idle(layout, gripper)).unwrap(), Contacts::NONE);
-                env.observe(&mut after);
-                for arm in layout.arms() {
-                    let object = layout.achieved_goal_of(arm);
-                    let moved_m = distance(&before[object.clone()], &after[object]);
-                    assert!(
-                        moved_m < 2e-4,
-                        "{layout:?} {starts:?}: the object moved by {moved_m} m by itself"
-                    );
-                }
-            });
-        }
+        let gripper = 1.0;
+        each_start(layout, WorldSettings::default(), |env, before| {
+            let mut after = before.to_vec();
+            assert_eq!(env.step(&idle(layout, gripper)).unwrap(), Contacts::NONE);
+            env.observe(&mut after);
+            for arm in layout.arms() {
+                let object = layout.achieved_goal_of(arm);
+                let moved_m = distance(&before[object.clone()], &after[object]);
+                assert!(
+                    moved_m < 2e-4,
+                    "{layout:?}: the object moved by {moved_m} m without contact"
+                );
+            }
+        });
     }
 }
 
 #[test]
-fn wide_starts_use_the_lower_workspace() {
-    let layout = Layout::new(Task::Push, 2);
-    let (mut nearest, mut farthest, mut lowest) = (f32::INFINITY, f32::NEG_INFINITY, f32::INFINITY);
-    each_start(layout, Starts { gripped_share: 0.0, wide_share: 1.0 }, |_, observation| {
-        for arm in layout.arms() {
-            let hand = &observation[layout.observation_of(arm)][..3];
-            assert!(
-                hand[0].abs() <= 0.2001
-                    && hand[1].abs() <= 0.2501
-                    && (0.0219..0.2001).contains(&hand[2])
-            );
-            nearest = nearest.min(hand[0]);
-            farthest = farthest.max(hand[0]);
-            lowest = lowest.min(hand[2]);
-        }
-    });
-    assert!(nearest < -0.18 && farthest > 0.15 && lowest < 0.03, "{nearest} {farthest} {lowest}");
-}
-
-#[test]
-fn gripped_starts_keep_holding_while_the_hand_moves() {
-    let starts = Starts { gripped_share: 1.0, wide_share: 0.0 };
+fn grasped_starts_keep_holding_while_the_hand_moves() {
     for n_arms in [1, 2] {
         let layout = Layout::new(Task::PickAndPlace, n_arms);
         let mut env = Env::new(layout, &WorldConfig::default()).expect("a valid world");
         let mut observation = vec![0.0; layout.n_observation()];
         for seed in 0..60 {
-            env.reset(&mut episode_rng(seed, 0, Stream::Reset), starts);
+            env.reset(&mut episode_rng(seed, 0, Stream::Reset), GRASPED);
             env.observe(&mut observation);
             let before = observation.clone();
             let mut action = idle(layout, -1.0);
@@ -161,9 +139,9 @@ fn gripped_starts_keep_holding_while_the_hand_moves() {
 }
 
 #[test]
-fn pushers_never_start_with_something_in_the_gripper() {
+fn push_episodes_never_start_with_a_grasped_object() {
     let layout = Layout::new(Task::Push, 1);
-    each_start(layout, Starts { gripped_share: 1.0, wide_share: 0.0 }, |_, observation| {
+    each_start(layout, GRASPED, |_, observation| {
         assert!(observation[9..12].iter().all(|opening_m| opening_m.abs() < 1e-7));
         assert!(observation[5] < HALF_M + 1e-6);
     });

@@ -1,4 +1,4 @@
-//! Both tasks can be done, by one arm and by two, and what does the work is friction.
+//! Scripted controllers solve both tasks, with one arm and with two, by friction alone.
 
 mod scripted;
 
@@ -7,7 +7,7 @@ use tandem_core::{Contacts, Layout, Task};
 use tandem_sim::{Friction, WorldConfig};
 
 #[test]
-fn one_arm_does_either_task_by_rule() {
+fn a_scripted_arm_solves_either_task() {
     for task in Task::ALL {
         let episodes = play(Layout::new(task, 1), &WorldConfig::default(), 200);
         let rate = success_rate(&episodes);
@@ -15,13 +15,13 @@ fn one_arm_does_either_task_by_rule() {
         assert!(rate >= 0.97, "{task}: {rate}");
         assert!(
             episodes.iter().all(|played| !played.contacts.any()),
-            "{task}: contact of an arm that is alone"
+            "{task}: contact of a single arm"
         );
     }
 }
 
 #[test]
-fn two_arms_blind_to_each_other_mostly_do_either_task() {
+fn two_independent_scripted_arms_mostly_solve_either_task() {
     for task in Task::ALL {
         let episodes = play(Layout::new(task, 2), &WorldConfig::default(), 200);
         let n_with =
@@ -29,15 +29,15 @@ fn two_arms_blind_to_each_other_mostly_do_either_task() {
         let (n_arm_arm, n_arm_table) = (n_with(Contacts::ARM_ARM), n_with(Contacts::ARM_TABLE));
         let rate = success_rate(&episodes);
         println!(
-            "{task}, 2 arms: {rate}; arms touch in {n_arm_arm}, the table is touched in {n_arm_table} of 200"
+            "{task}, 2 arms: {rate}; contacts between arms in {n_arm_arm}, with the table in {n_arm_table} of 200"
         );
         assert!(rate >= 0.80, "{task}: {rate}");
-        assert!((1..100).contains(&n_arm_arm), "{task}: arms touch in {n_arm_arm} of 200");
+        assert!((1..100).contains(&n_arm_arm), "{task}: contacts in {n_arm_arm} of 200");
     }
 }
 
 #[test]
-fn half_as_many_physics_steps_do_as_well() {
+fn ten_physics_steps_per_control_step_suffice() {
     let config = WorldConfig { substeps: 10, ..WorldConfig::default() };
     for task in Task::ALL {
         let rate = success_rate(&play(Layout::new(task, 1), &config, 100));

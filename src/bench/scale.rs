@@ -4,7 +4,6 @@
 mod children;
 mod idle;
 mod measures;
-mod process;
 mod real;
 mod row;
 
@@ -13,11 +12,12 @@ use std::time::Duration;
 use anyhow::Context as _;
 use tandem_core::layout::EPISODE_STEPS;
 use tandem_learner::Clock;
+use tandem_system::fd_limit;
 
 use super::Figure;
 use crate::cli::ScaleArgs;
 use crate::exit::{Exit, Failed, OrExit as _};
-use crate::{clock, descriptors, output, services};
+use crate::{clock, output, services};
 use children::{Place, Service};
 use idle::Crowd;
 use row::{Reading, Rounds, Row, Scale};
@@ -36,7 +36,7 @@ pub(super) fn scale(args: &ScaleArgs) -> Result<Scale, Failed> {
         return Err(Failed::usage(format!("--updates-per-env-step {updates}: expected 0 to 100")));
     }
     let n_needed = u64::from(args.idle) + n_joining as u64 + OTHER_DESCRIPTORS;
-    if let Some(n_allowed) = descriptors::raise().filter(|n| *n < n_needed) {
+    if let Some(n_allowed) = fd_limit::raise().filter(|n| *n < n_needed) {
         return Err(Failed::usage(format!(
             "--idle {} needs {n_needed} open files and {n_allowed} are allowed: raise that with `ulimit -n`",
             args.idle

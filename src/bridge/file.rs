@@ -4,7 +4,7 @@ use std::path::Path;
 
 use serde::Deserialize;
 use serde_json::{Value, json};
-use tandem_kinematics::{ArmWayPoint, WayPoint};
+use tandem_kinematics::{ArmWaypoint, Waypoint};
 use tandem_proto::pb;
 
 use crate::exit::{Exit, Failed, OrExit as _};
@@ -56,11 +56,11 @@ struct FileSample {
 }
 
 /// Writes a motion through `way_points` at `speed` to a file.
-pub(super) fn write(path: &Path, speed: f64, way_points: &[WayPoint]) -> Result<(), Failed> {
-    let arm = |arm: &ArmWayPoint| {
+pub(super) fn write(path: &Path, speed: f64, way_points: &[Waypoint]) -> Result<(), Failed> {
+    let arm = |arm: &ArmWaypoint| {
         let round = |number: f64| (number * 1e5).round() * 1e-5;
-        let tool_m = arm.tool_in_world_m.to_array().map(round);
-        json!({ "tool_m": tool_m, "opening": round(arm.opening) })
+        let tool_m = <[f64; 3]>::from(arm.tool_in_world_m).map(round);
+        json!({ "tool_m": tool_m, "opening": round(arm.gripper_opening) })
     };
     let way_points: Vec<Vec<Value>> =
         way_points.iter().map(|arms| arms.iter().map(arm).collect()).collect();

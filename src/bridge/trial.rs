@@ -6,7 +6,7 @@ use indicatif::ProgressBar;
 use rayon::iter::{IntoParallelRefIterator as _, ParallelIterator as _};
 use serde_json::json;
 use tandem_core::{Layout, Task};
-use tandem_report::{Comparison, Pictured, report_html};
+use tandem_report::{Comparison, PlottedTrials, report_html};
 use tandem_telemetry::trials::TRIALS_FILE;
 use tandem_telemetry::{TrialRow, TrialsLog};
 use tandem_trials::simulated::Block;
@@ -134,7 +134,7 @@ fn run(series: &Series<'_>, args: &TrialArgs, out: &Path) -> Result<Vec<TrialRow
     let style = indicatif::ProgressStyle::with_template("{prefix} {wide_bar} {pos} of {len}");
     let bar = bar.with_style(style.or_exit(Exit::Bug, String::new)?);
     let rows = series.run(args.trials, |report, row| {
-        let name = format!("{}-{}-{:04}", row.subject, row.mode, row.trial);
+        let name = format!("{}-{}-{:04}", row.policy, row.mode, row.trial);
         if args.motions {
             write_motion(report, series.config.speed, &out.join(format!("motions/{name}.json")))
                 .map_err(SeriesFailed)?;
@@ -187,8 +187,8 @@ fn show(args: &TrialArgs, rows: Vec<TrialRow>, file: &Path) -> Result<(), Failed
     let trials = tandem_report::Trials::of(rows);
     let page = file.with_file_name("report.html");
     let nothing = Comparison::of(Vec::new(), Vec::new());
-    let written =
-        report_html(&nothing, &trials, Pictured::Failures, &page).or_cannot_write(String::new)?;
+    let written = report_html(&nothing, &trials, PlottedTrials::Failed, &page)
+        .or_cannot_write(String::new)?;
     if args.json {
         let mut value = json!({ "trials": tandem_report::trials::json(&trials) });
         value["file"] = json!(file);
@@ -199,9 +199,9 @@ fn show(args: &TrialArgs, rows: Vec<TrialRow>, file: &Path) -> Result<(), Failed
     output::print(trials.text())?;
     output::print(format_args!("trials        {}", file.display()))?;
     output::print(format_args!(
-        "report        {}, {} pictures beside it",
+        "report        {}; plots in the same directory: {}",
         page.display(),
-        written.figures.len()
+        written.plots.len()
     ))?;
     Ok(())
 }

@@ -73,6 +73,42 @@ fn what_is_wrong_is_named() {
 }
 
 #[test]
+fn former_keys_still_set_what_they_named() {
+    let file = "[replay]\nmoved_share = 0.25\nadvised_share = 0.0\n[ddpg]\ncloning_weight = 3\n";
+    let config = from_text(file).expect("valid");
+    assert_eq!((config.replay.displaced_fraction, config.ddpg.bc_weight), (0.25, 3.0));
+    let layered = |setting: &str| {
+        let setting = parse_setting(setting).expect("KEY=VALUE");
+        overlay(parse(file).expect("TOML"), &[setting]).expect("valid").replay.displaced_fraction
+    };
+    assert_eq!(layered("replay.displaced_fraction=0.75"), 0.75, "the new key over the former one");
+    assert_eq!(layered("replay.moved_share=1"), 1.0, "the former key over itself");
+    for (former, current) in former_keys::RENAMED {
+        let message = resolved(&[&format!("{former}=-1")]).expect_err("out of range");
+        assert!(message.contains(current) && !message.contains(former), "{message:?}");
+        let written = to_toml(&resolved(&[]).expect("valid")).expect("writes");
+        let (_, name) = former.split_once('.').expect("a section");
+        assert!(!written.contains(name), "{name} is written");
+    }
+    let both = "[replay]\nmoved_share = 0.25\ndisplaced_fraction = 0.25\n";
+    assert_eq!(
+        from_text(both),
+        Err("replay.moved_share is the former name of replay.displaced_fraction: give one of them"
+            .to_owned())
+    );
+}
+
+#[test]
+fn removed_settings_may_be_zero_only() {
+    let expected =
+        "world.wide_start_share is 0.5: the setting no longer exists, only 0 is accepted";
+    assert_eq!(from_text("[world]\nwide_start_share = 0.5\n"), Err(expected.to_owned()));
+    assert_eq!(resolved(&["world.wide_start_share=0.5"]), Err(expected.to_owned()));
+    let config = resolved(&["world.wide_start_share=0", "replay.advised_share=0.0"]);
+    assert_eq!(config, resolved(&[]));
+}
+
+#[test]
 fn minutes_that_are_given_take_the_place_of_the_recipes_steps() {
     let limits = |settings: &[&str]| {
         let stop = resolved(settings).expect("valid").stop;

@@ -107,7 +107,7 @@ fn style(template: &str) -> ProgressStyle {
 pub(super) fn reached(summary: &Value) -> String {
     let number = |key: &str| summary[key].as_f64().unwrap_or(f64::NAN);
     format!(
-        "success {:.3} [{:.3}, {:.3}] on held-out goals, {} env steps in {:.1} minutes",
+        "success {:.3} [{:.3}, {:.3}] on test goals, {} env steps in {:.1} minutes",
         number("success"),
         number("success_low"),
         number("success_high"),
@@ -137,7 +137,7 @@ mod tests {
         });
         assert_eq!(
             reached(&summary),
-            "success 0.963 [0.930, 0.980] on held-out goals, 940,000 env steps in 30.1 minutes"
+            "success 0.963 [0.930, 0.980] on test goals, 940,000 env steps in 30.1 minutes"
         );
     }
 

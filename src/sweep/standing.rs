@@ -4,9 +4,9 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context as _, anyhow};
 use serde_json::Value as Json;
-use tandem_learner::{atomic, checkpoint};
+use tandem_learner::checkpoint;
 use tandem_rl::RunConfig;
-use tandem_telemetry::read_regular;
+use tandem_system::{atomic_file, regular_file};
 use toml::{Table, Value};
 
 use super::file::{PlannedRun, flattened};
@@ -59,7 +59,7 @@ impl Standing {
     /// Keeps what a run reached: from now on it is finished. The file is whole or not there.
     pub(super) fn finish(&mut self, summary: Json) -> anyhow::Result<()> {
         let path = self.dir.join("summary.json");
-        let written = atomic::write(&path, format!("{summary}\n").as_bytes());
+        let written = atomic_file::replace(&path, format!("{summary}\n").as_bytes());
         written.with_context(|| format!("cannot write {}", path.display()))?;
         drop(std::fs::remove_file(failure_path(&self.dir)));
         (self.state, self.failure) = (State::Finished(summary), None);
@@ -126,9 +126,9 @@ fn written(value: &Value) -> String {
 /// Whether the run's copy of its teacher is the teacher that the sweep file names.
 fn same_teacher(run: &PlannedRun, dir: &Path) -> bool {
     let Some(teacher) = &run.teacher else { return true };
-    let copy = read_regular(&dir.join("policy/teacher.safetensors"));
+    let copy = regular_file::read(&dir.join("policy/teacher.safetensors"));
     // A file that is missing is reported by the run itself.
-    let named = read_regular(teacher);
+    let named = regular_file::read(teacher);
     copy.ok().zip(named.ok()).is_none_or(|(copy, named)| copy == named)
 }
 

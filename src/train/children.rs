@@ -12,6 +12,7 @@ use std::process::{ExitStatus, Stdio};
 use std::time::{Duration, Instant};
 
 use anyhow::{Context as _, anyhow};
+use tandem_system::process::ResidentMemory;
 use tokio::io::{AsyncBufReadExt as _, BufReader};
 use tokio::process::{Child, Command};
 use tokio::task::JoinSet;
@@ -165,7 +166,8 @@ impl Children {
                 Role::Learner => &mut self.peak.learner_mib,
                 Role::Worker => &mut self.peak.worker_mib,
             };
-            *peak = peak_resident_mib(child).max(*peak);
+            let peak_kib = child.id().map_or(0, |pid| ResidentMemory::of(pid).peak_kib);
+            *peak = (peak_kib / 1024).max(*peak);
         }
     }
 
@@ -409,16 +411,6 @@ async fn end_within(mut child: Child, deadline: Duration) {
     if tokio::time::timeout(deadline, child.wait()).await.is_err() {
         drop(child.kill().await);
     }
-}
-
-/// `VmHWM` of a process, MiB; 0 when it is gone or the system keeps no such account.
-fn peak_resident_mib(child: &Child) -> u64 {
-    let status =
-        child.id().and_then(|pid| std::fs::read_to_string(format!("/proc/{pid}/status")).ok());
-    let status = status.unwrap_or_default();
-    let line = status.lines().find_map(|line| line.strip_prefix("VmHWM:"));
-    let kib = line.and_then(|line| line.split_whitespace().next()?.parse::<u64>().ok());
-    kib.unwrap_or(0) / 1024
 }
 
 /// What a process said as it ended: the last line from `log_from` on that is meant for a person.

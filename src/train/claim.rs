@@ -3,7 +3,7 @@
 use std::path::Path;
 use std::time::Duration;
 
-use tandem_learner::lock::DirectoryLock;
+use tandem_system::DirectoryLock;
 use tandem_teacher::ledger::{OpenError, SqliteLedger};
 
 use super::plan::Plan;

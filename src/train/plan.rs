@@ -2,9 +2,10 @@
 
 use std::path::{Path, PathBuf};
 
-use tandem_learner::{atomic, checkpoint, settings};
+use tandem_learner::{checkpoint, settings};
 use tandem_policy::Policy;
 use tandem_rl::RunConfig;
+use tandem_system::atomic_file;
 use toml::Value;
 
 use crate::cli::{RecipeName, TrainArgs};
@@ -123,7 +124,7 @@ impl Plan {
         }
         let written = std::fs::create_dir_all(self.out.join("policy"))
             .and_then(|()| std::fs::read(&teacher.path))
-            .and_then(|bytes| atomic::write(&copy, &bytes));
+            .and_then(|bytes| atomic_file::replace(&copy, &bytes));
         written.or_cannot_write(|| format!("cannot write {}", copy.display()))
     }
 

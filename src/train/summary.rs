@@ -15,19 +15,19 @@ use crate::exit::{Exit, Failed, OrExit as _};
 use crate::files::load_policy;
 use crate::output;
 
-/// Held-out goals on which the best policy is judged at the end; no run chooses by them.
+/// Test goals for the final evaluation of the best policy; no run selects its policy by them.
 const REPORT_SEED: u64 = 777;
-const REPORT_EPISODES: u64 = 240;
 
-/// Judges the best policy on held-out goals, draws the curve, and prints where everything lies.
+/// Evaluates the best policy on test goals, draws the curve, and prints where everything lies.
 pub(super) fn print(
     plan: &Plan,
     last: &pb::Progress,
     memory: Memory,
     as_json: bool,
 ) -> Result<(), Failed> {
+    let n_test_episodes = plan.config.evaluation.test_episodes;
     let path = plan.best_policy();
-    let measured = measure(&Subject::Policy(load_policy(&path)?), REPORT_EPISODES, REPORT_SEED)?;
+    let measured = measure(&Subject::Policy(load_policy(&path)?), n_test_episodes, REPORT_SEED)?;
     let rows =
         MetricsLog::read_all(&plan.out.join("metrics.jsonl")).or_exit(Exit::Data, String::new)?;
     let drawn = Drawn {
@@ -58,7 +58,8 @@ fn summary_lines(
     let mut lines = vec![
         format!("done: {}", last.end_reason),
         format!(
-            "best policy on {REPORT_EPISODES} held-out goals (seed {REPORT_SEED}), alone: no noise, no advice"
+            "best policy on {} test goals (seed {REPORT_SEED}), alone: no noise, no advice",
+            plan.config.evaluation.test_episodes
         ),
     ];
     lines.extend(measured.lines().iter().map(|line| format!("  {line}")));

@@ -1,6 +1,6 @@
-//! The teacher as a whole: policy, maps, strategy and budget answer students' queries.
+//! The advisor, which answers students' queries with the policy, the maps, the strategy and the budget.
 
-mod judge;
+mod inference;
 
 use std::collections::BTreeMap;
 
@@ -8,57 +8,57 @@ use tandem_core::layout::EPISODE_STEPS;
 use tandem_core::{ArmAdvice, Layout, StepAdvice, StepQuery};
 use tandem_proto::{DecodeError, MAX_ARMS};
 
-use crate::budget::{Balance, Half, Lease, Terms, Verdict, Wish};
+use crate::budget::{AccountTerms, Balance, BudgetHalf, Charge, Lease};
 use crate::error::Error;
-use crate::ledger::{Bill, Charge, Ledger, LedgerError, Receipt};
+use crate::ledger::{ChargeRequest, ChargeResult, Ledger, LedgerError};
 use crate::maps::Maps;
 use crate::policy::TeacherPolicy;
 use crate::strategy::Strategy;
-use judge::Judge;
+use inference::TeacherInference;
 
-/// Accounts whose strategies are remembered; with one more, all of them are looked up again.
-const MAX_REMEMBERED: usize = 4096;
+/// The number of accounts whose strategies are cached. When it is reached, the cache is cleared.
+const MAX_CACHED_STRATEGIES: usize = 4096;
 
-/// Answers queries and keeps accounts, for one caller at a time.
+/// Answers requests for advice and manages accounts, for one caller at a time.
 pub struct Advisor {
-    profile: Profile,
-    judge: Judge,
+    info: TeacherInfo,
+    inference: TeacherInference,
     ledger: Box<dyn Ledger>,
-    /// By account. An account's terms never change.
+    /// A cache by account. The terms of an account never change.
     strategies: BTreeMap<String, Strategy>,
 }
 
-/// What a teacher tells of itself.
+/// A description of the teacher.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Profile {
-    /// The policy's task, and one arm.
+pub struct TeacherInfo {
+    /// The layout of the policy, for one arm.
     pub layout: Layout,
-    /// The policy's digest.
+    /// The digest of the policy.
     pub digest: String,
-    /// Where each arm's numbers stand in a student's vectors.
+    /// The maps from a student's vectors to each arm's.
     pub maps: Maps,
 }
 
 /// One request for advice.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Question {
+pub struct AdviceRequest {
     /// The name of the account that pays.
     pub account: String,
-    /// The steps asked about.
+    /// The steps on which the student asks for advice.
     pub queries: Vec<StepQuery>,
 }
 
-/// The answers to the queries of one request.
+/// The answer to one [`AdviceRequest`].
 #[derive(Debug, Clone, PartialEq)]
 pub struct Advice {
-    /// One answer per query, in order.
+    /// One answer for each query, in order.
     pub steps: Vec<StepAdvice>,
-    /// Units of the account that are neither spent nor set aside.
+    /// Units of the account that are neither spent nor leased.
     pub budget_left: u64,
 }
 
 impl Advisor {
-    /// An advisor with the accounts of `ledger`.
+    /// Creates an advisor with the accounts of `ledger`.
     ///
     /// # Errors
     /// When the policy is not for one arm.
@@ -67,46 +67,47 @@ impl Advisor {
         if layout.n_arms != 1 {
             return Err(Error::NotOneArm { n_arms: layout.n_arms, n_values: 1 });
         }
-        let profile = Profile {
+        let info = TeacherInfo {
             layout,
             digest: policy.digest().to_owned(),
             maps: Maps::new(Layout::new(layout.task, MAX_ARMS)),
         };
-        Ok(Self { profile, judge: Judge::new(policy), ledger, strategies: BTreeMap::new() })
+        let inference = TeacherInference::new(policy);
+        Ok(Self { info, inference, ledger, strategies: BTreeMap::new() })
     }
 
-    /// What the teacher tells of itself.
+    /// Returns the description of the teacher.
     #[must_use]
-    pub const fn profile(&self) -> &Profile {
-        &self.profile
+    pub const fn info(&self) -> &TeacherInfo {
+        &self.info
     }
 
-    /// Opens account `name`, or finds it open on the same terms.
+    /// Opens account `name`, or returns it if it is open with the same terms.
     ///
     /// # Errors
-    /// When it is open on other terms, the budget is too large, or the ledger cannot be used.
-    pub fn open_account(&mut self, name: &str, terms: Terms) -> Result<Balance, Error> {
+    /// When it is open with other terms, the budget is too large, or the ledger cannot be used.
+    pub fn open_account(&mut self, name: &str, terms: AccountTerms) -> Result<Balance, Error> {
         Ok(self.ledger.open(name, terms)?)
     }
 
-    /// How account `name` stands.
+    /// Returns the balance of account `name`.
     ///
     /// # Errors
-    /// When nobody opened it, or the ledger cannot be used.
+    /// When the account is not open, or the ledger cannot be used.
     pub fn balance(&mut self, name: &str) -> Result<Balance, Error> {
         Ok(self.ledger.balance(name)?)
     }
 
-    /// Why the ledger cannot be written, if the last attempt failed.
+    /// Returns the reason why the ledger could not be written, if the last attempt failed.
     #[must_use]
     pub fn warning(&self) -> Option<&str> {
         self.ledger.warning()
     }
 
-    /// Sets units of account `name` aside for `episodes`, in their order; see [`Account::open_leases`].
+    /// Reserves units of account `name` for `episodes`, in their order; see [`Account::open_leases`].
     ///
     /// # Errors
-    /// When nobody opened the account, or the ledger cannot be used.
+    /// When the account is not open, or the ledger cannot be used.
     ///
     /// [`Account::open_leases`]: crate::budget::Account::open_leases
     pub fn open_leases(
@@ -118,59 +119,62 @@ impl Advisor {
         Ok(self.ledger.open_leases(name, episodes, units_per_episode)?)
     }
 
-    /// Returns what `episodes` did not spend to account `name`.
+    /// Returns the unspent units of `episodes` to account `name`.
     ///
     /// # Errors
-    /// When nobody opened the account, or the ledger cannot be used.
+    /// When the account is not open, or the ledger cannot be used.
     pub fn settle_leases(&mut self, name: &str, episodes: &[u64]) -> Result<Balance, Error> {
         Ok(self.ledger.settle(name, episodes)?)
     }
 
-    /// Answers `questions`, in their order, with one forward pass and one visit to the ledger for all of them.
+    /// Answers `requests`, in their order, with one batch of inference and one call to the ledger for all of them.
     ///
-    /// The advice is that which each would get alone, in the same order. A question is answered as a whole or, on an
-    /// error, not at all and charges nothing; another question's error does not touch it.
+    /// The answers are the same as if each request came alone, in the same order. A refused request charges nothing and
+    /// does not affect the others.
     ///
     /// # Errors
-    /// Per question: when nobody opened its account, a step lies beyond the end of an episode that has a lease, the
-    /// networks give numbers for it that are not finite, or the ledger cannot be used.
+    /// Per request: when its account is not open, a step lies beyond the end of an episode that has a lease, the
+    /// networks return a number that is not finite, or the ledger cannot be used.
     ///
     /// # Panics
-    /// When a query's lengths are of no layout of the teacher's task with 1 to [`MAX_ARMS`] arms, or the ledger does
-    /// not answer every bill.
-    pub fn advise(&mut self, questions: &[Question]) -> Vec<Result<Advice, Error>> {
-        let judged = self.judge(questions);
-        let bills: Vec<Bill> = judged.iter().flatten().filter_map(Judged::bill).collect();
-        let mut receipts = self.charge(&bills).into_iter();
-        let mut answer = |judged: Judged<'_>| {
-            let receipt = if judged.arms.is_empty() {
-                self.ledger.balance(&judged.question.account).map(nothing_charged)
+    /// When a query's lengths match no layout of the teacher's task with 1 to [`MAX_ARMS`] arms, or the ledger does not
+    /// answer every charge.
+    pub fn advise(&mut self, requests: &[AdviceRequest]) -> Vec<Result<Advice, Error>> {
+        let scored = self.score(requests);
+        let charges: Vec<ChargeRequest> =
+            scored.iter().flatten().filter_map(ScoredRequest::charge_request).collect();
+        let mut charged = self.charge(&charges).into_iter();
+        let mut answer = |scored: ScoredRequest<'_>| {
+            let charged = if scored.arms.is_empty() {
+                let balance = self.ledger.balance(&scored.request.account);
+                balance.map(|balance| ChargeResult { verdicts: Vec::new(), left: balance.left })
             } else {
-                receipts.next().expect("one receipt per bill")
+                charged.next().expect("one result for each request")
             };
-            judged.decide(&self.profile.maps, receipt)
+            scored.into_advice(&self.info.maps, charged)
         };
-        judged.into_iter().map(|judged| answer(judged?)).collect()
+        scored.into_iter().map(|scored| answer(scored?)).collect()
     }
 
-    /// What the teacher thinks of each of `questions`.
-    fn judge<'a>(&mut self, questions: &'a [Question]) -> Vec<Result<Judged<'a>, Error>> {
+    /// Scores the steps of all requests whose accounts are open.
+    fn score<'a>(
+        &mut self,
+        requests: &'a [AdviceRequest],
+    ) -> Vec<Result<ScoredRequest<'a>, Error>> {
         let strategies: Vec<Result<Strategy, Error>> =
-            questions.iter().map(|question| self.strategy(&question.account)).collect();
-        let known = questions.iter().zip(&strategies).filter(|(_, strategy)| strategy.is_ok());
-        let maps = &self.profile.maps;
-        let mut opinions =
-            self.judge.judge(maps, known.flat_map(|(question, _)| &question.queries));
-        let mut judge = |question: &'a Question, strategy| {
-            let opinions: Vec<Result<Vec<ArmAdvice>, Error>> =
-                question.queries.iter().map(|query| opinions.next(maps, query)).collect();
-            let arms = opinions.into_iter().collect::<Result<_, _>>()?;
-            Ok(Judged { question, strategy, arms })
+            requests.iter().map(|request| self.strategy(&request.account)).collect();
+        let open = requests.iter().zip(&strategies).filter(|(_, strategy)| strategy.is_ok());
+        let queries = open.flat_map(|(request, _)| &request.queries);
+        let mut arms = self.inference.score(&self.info.maps, queries).into_iter();
+        let mut score = |request: &'a AdviceRequest, strategy| {
+            let arms: Vec<_> = arms.by_ref().take(request.queries.len()).collect();
+            let arms = arms.into_iter().collect::<Result<_, _>>()?;
+            Ok(ScoredRequest { request, strategy, arms })
         };
-        questions
+        requests
             .iter()
             .zip(strategies)
-            .map(|(question, strategy)| judge(question, strategy?))
+            .map(|(request, strategy)| score(request, strategy?))
             .collect()
     }
 
@@ -179,76 +183,79 @@ impl Advisor {
             return Ok(*strategy);
         }
         let strategy = self.ledger.balance(account)?.terms.strategy;
-        if self.strategies.len() >= MAX_REMEMBERED {
+        if self.strategies.len() >= MAX_CACHED_STRATEGIES {
             self.strategies.clear();
         }
         self.strategies.insert(account.to_owned(), strategy);
         Ok(strategy)
     }
 
-    fn charge(&mut self, bills: &[Bill]) -> Vec<Result<Receipt, LedgerError>> {
-        if bills.is_empty() {
+    fn charge(&mut self, requests: &[ChargeRequest]) -> Vec<Result<ChargeResult, LedgerError>> {
+        if requests.is_empty() {
             return Vec::new();
         }
-        let receipts = self.ledger.charge(bills);
-        assert_eq!(receipts.len(), bills.len(), "a ledger answers every bill");
-        receipts
+        let results = self.ledger.charge(requests);
+        assert_eq!(results.len(), requests.len(), "a ledger answers every request");
+        results
     }
 }
 
-/// A question, and what the teacher thinks of it.
-struct Judged<'a> {
-    question: &'a Question,
+/// A request with the teacher's scores of its steps.
+struct ScoredRequest<'a> {
+    request: &'a AdviceRequest,
     strategy: Strategy,
-    /// By query, then by arm; nothing overridden yet.
+    /// By query, then by arm. Nothing is overridden yet.
     arms: Vec<Vec<ArmAdvice>>,
 }
 
-impl Judged<'_> {
-    /// What the question may cost, unless it asks about no step.
-    fn bill(&self) -> Option<Bill> {
-        let charges = self.question.queries.iter().zip(&self.arms).map(|(query, arms)| Charge {
+impl ScoredRequest<'_> {
+    /// Returns the charges that the request may cause, unless it has no steps.
+    fn charge_request(&self) -> Option<ChargeRequest> {
+        let charges = self.request.queries.iter().zip(&self.arms).map(|(query, arms)| Charge {
             episode: query.episode,
             step: query.step,
-            wish: Wish {
-                first: picks_any(self.strategy, Half::First, arms),
-                second: picks_any(self.strategy, Half::Second, arms),
-            },
+            wanted_in_first_half: overrides_any(self.strategy, BudgetHalf::First, arms),
+            wanted_in_second_half: overrides_any(self.strategy, BudgetHalf::Second, arms),
         });
         let charges: Vec<Charge> = charges.collect();
-        (!charges.is_empty()).then(|| Bill { account: self.question.account.clone(), charges })
+        let account = || self.request.account.clone();
+        (!charges.is_empty()).then(|| ChargeRequest { account: account(), charges })
     }
 
-    /// The answer, now that it is known what was paid for.
-    fn decide(self, maps: &Maps, receipt: Result<Receipt, LedgerError>) -> Result<Advice, Error> {
-        let queries = &self.question.queries;
-        let receipt = receipt.map_err(|error| named(error, queries))?;
-        assert_eq!(receipt.verdicts.len(), queries.len(), "a ledger decides on every charge");
-        let decided = queries.iter().zip(self.arms).zip(receipt.verdicts);
+    /// Returns the answer, given the verdicts on the charges.
+    fn into_advice(
+        self,
+        maps: &Maps,
+        charged: Result<ChargeResult, LedgerError>,
+    ) -> Result<Advice, Error> {
+        let queries = &self.request.queries;
+        let charged = charged.map_err(|error| with_step(error, queries))?;
+        assert_eq!(charged.verdicts.len(), queries.len(), "a ledger decides on every charge");
+        let decided = queries.iter().zip(self.arms).zip(charged.verdicts);
         let steps = decided
-            .map(|((query, arms), verdict)| decide(self.strategy, maps, query, arms, verdict));
-        Ok(Advice { steps: steps.collect(), budget_left: receipt.left })
+            .map(|((query, arms), verdict)| step_advice(self.strategy, maps, query, arms, verdict));
+        Ok(Advice { steps: steps.collect(), budget_left: charged.left })
     }
 }
 
-/// Overrides those of `arms` that the strategy picks, when there was a unit to pay for it.
-fn decide(
+/// Overrides the arms that the strategy selects, if a unit was charged for the step.
+fn step_advice(
     strategy: Strategy,
     maps: &Maps,
     query: &StepQuery,
     mut arms: Vec<ArmAdvice>,
-    verdict: Verdict,
+    verdict: Option<BudgetHalf>,
 ) -> StepAdvice {
-    if let Verdict::Charged(half) = verdict {
+    if let Some(half) = verdict {
         for arm in &mut arms {
-            arm.overridden = picks(strategy, half, arm);
+            arm.overridden = overrides(strategy, half, arm);
         }
     }
     let action = compose(maps, &query.proposed_action, &arms);
-    StepAdvice { action, charged: verdict != Verdict::Uncharged, arms }
+    StepAdvice { action, charged: verdict.is_some(), arms }
 }
 
-/// The last line of every procedure: `a = f^a(a_1, …, a_n)`.
+/// Composes the joint action, as in the last line of every procedure: `a = f^a(a_1, …, a_n)`.
 fn compose(maps: &Maps, proposed_action: &[f32], arms: &[ArmAdvice]) -> Vec<f32> {
     let chosen = maps.of_student(proposed_action.len()).zip(arms).map(|(map, arm)| {
         if arm.overridden { arm.teacher_action.as_slice() } else { map.arm_action(proposed_action) }
@@ -256,20 +263,16 @@ fn compose(maps: &Maps, proposed_action: &[f32], arms: &[ArmAdvice]) -> Vec<f32>
     maps.joint_action(proposed_action.len(), chosen)
 }
 
-fn picks(strategy: Strategy, half: Half, arm: &ArmAdvice) -> bool {
+fn overrides(strategy: Strategy, half: BudgetHalf, arm: &ArmAdvice) -> bool {
     strategy.procedure(half).is_some_and(|procedure| procedure.overrides(arm))
 }
 
-fn picks_any(strategy: Strategy, half: Half, arms: &[ArmAdvice]) -> bool {
-    arms.iter().any(|arm| picks(strategy, half, arm))
+fn overrides_any(strategy: Strategy, half: BudgetHalf, arms: &[ArmAdvice]) -> bool {
+    arms.iter().any(|arm| overrides(strategy, half, arm))
 }
 
-fn nothing_charged(balance: Balance) -> Receipt {
-    Receipt { verdicts: Vec::new(), left: balance.left }
-}
-
-/// A refusal that says which of `queries` it is about.
-fn named(error: LedgerError, queries: &[StepQuery]) -> Error {
+/// Adds the step of a refused charge to the error.
+fn with_step(error: LedgerError, queries: &[StepQuery]) -> Error {
     let LedgerError::BeyondEnd { charge_idx } = error else { return error.into() };
     let expected = format!("0 to {} in an episode that has a lease", EPISODE_STEPS - 1);
     let step = queries.get(charge_idx).map_or(0, |query| query.step);

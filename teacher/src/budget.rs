@@ -1,112 +1,103 @@
-//! The budget of advice: accounts, leases and charges, as plain data.
+//! The advice budget: accounts, leases and charges, as plain data.
 //!
-//! An account never spends more than its budget, and a step of an episode is charged at most once: its verdict is
-//! remembered, so that asking again gives the same one. Units are numbered in the order in which they are handed
-//! out, which for leases is the order of the episodes: which steps are advised, and in which half of the budget,
-//! does not depend on the order in which the episodes' steps arrive.
+//! An account never spends more than its budget. It remembers its verdict on each step, so a step is charged at most
+//! once and a repeated request gets the same verdict. Units are numbered in the order in which they are assigned, which
+//! for leases is the order of the episodes. Therefore the advised steps, and the half of the budget that pays for each
+//! of them, do not depend on the order in which the steps of different episodes arrive.
 
 mod account;
-mod verdicts;
+mod transaction;
+mod verdict_bits;
 
 pub use account::Account;
-pub(crate) use account::{Changes, Checksum, LeaseRecord};
-pub(crate) use verdicts::{Word, WordIndex};
+pub(crate) use account::LeaseRecord;
+pub(crate) use transaction::{Changes, Transaction};
+pub(crate) use verdict_bits::{VerdictBits, VerdictIndex};
 
+pub use crate::strategy::BudgetHalf;
 use crate::strategy::Strategy;
 
-/// The largest budget that an account may have.
+/// The largest budget of an account, in units.
 pub const MAX_BUDGET: u64 = 1_000_000_000_000;
 
-/// What an account is opened for.
+/// The budget and the strategy of an account. They never change.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Terms {
+pub struct AccountTerms {
     /// Units of advice, at most [`MAX_BUDGET`].
     pub budget: u64,
-    /// How they are spent.
+    /// Decides which steps are worth a unit.
     pub strategy: Strategy,
 }
 
-/// How an account stands.
+/// The state of an account, in units.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Balance {
-    /// What it was opened for.
-    pub terms: Terms,
+    /// Budget and strategy.
+    pub terms: AccountTerms,
     /// Units charged.
     pub spent: u64,
-    /// Units set aside for open episodes and not yet spent.
+    /// Unspent units of open leases.
     pub leased: u64,
     /// `budget − spent − leased`.
     pub left: u64,
 }
 
-/// Units set aside for one episode.
+/// Units reserved for one episode.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Lease {
     /// The episode's number.
     pub episode: u64,
-    /// Units set aside.
+    /// Units reserved.
     pub units: u32,
-    /// How many of them, the first to be spent, lie in the first half of the budget.
+    /// The number of these units that lie in the first half of the budget. They are spent first.
     pub early_units: u32,
 }
 
-/// In which half of the budget a unit lies. A unit is of the first half when more than half of the budget is left
-/// before it is handed out.
+/// One step that may cost a unit, with the halves of the budget in which the strategy would override an arm.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Half {
-    /// The half that is handed out first.
-    First,
-    /// The other one.
-    Second,
+pub struct Charge {
+    /// The episode's number.
+    pub episode: u64,
+    /// The step, from 0.
+    pub step: u32,
+    /// Whether the step is worth a unit of the first half.
+    pub wanted_in_first_half: bool,
+    /// Whether the step is worth a unit of the second half.
+    pub wanted_in_second_half: bool,
 }
 
-/// Whether a step is worth a unit of either half.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Wish {
-    /// Worth a unit of the first half.
-    pub first: bool,
-    /// Worth a unit of the second half.
-    pub second: bool,
-}
-
-impl Wish {
-    const fn covers(self, half: Half) -> bool {
+impl Charge {
+    const fn is_wanted_in(&self, half: BudgetHalf) -> bool {
         match half {
-            Half::First => self.first,
-            Half::Second => self.second,
+            BudgetHalf::First => self.wanted_in_first_half,
+            BudgetHalf::Second => self.wanted_in_second_half,
         }
     }
 }
 
-/// What a step cost; the same however often it is asked for.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Verdict {
-    /// Nothing: it was not worth a unit, or there was none.
-    Uncharged,
-    /// One unit, of this half.
-    Charged(Half),
-}
-
-/// Why an account cannot be opened or found.
+/// The reason why an account cannot be opened or used.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum BudgetError {
-    /// Nobody opened it.
+    /// No account has this name.
     #[error("unknown account {0:?}: open it first")]
     UnknownAccount(String),
-    /// It was opened for something else.
+    /// The account is open with another budget or strategy.
     #[error(
         "account {name:?} is open with budget {} and strategy {}, not with budget {} and strategy {}",
-        open.budget, open.strategy, asked.budget, asked.strategy
+        open.budget, open.strategy, requested.budget, requested.strategy
     )]
     OtherTerms {
-        /// The account.
+        /// The account's name.
         name: String,
-        /// What it was opened for.
-        open: Terms,
-        /// What it was asked to be.
-        asked: Terms,
+        /// The terms of the account.
+        open: AccountTerms,
+        /// The terms of the request.
+        requested: AccountTerms,
     },
-    /// More than any account may have.
+    /// The budget exceeds [`MAX_BUDGET`].
     #[error("budget: expected 0 to {MAX_BUDGET}, got {0}")]
     BudgetTooLarge(u64),
 }
+
+#[cfg(test)]
+mod tests;

@@ -1,4 +1,4 @@
-//! What can go wrong in a teacher.
+//! The errors of a teacher.
 
 use std::time::Duration;
 
@@ -7,57 +7,57 @@ use tandem_proto::DecodeError;
 use crate::ledger::{LedgerError, OpenError};
 use crate::strategy::UnknownStrategy;
 
-/// Why a teacher cannot start or cannot answer.
+/// The reason why a teacher cannot start or cannot answer.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
-    /// The policy cannot be used.
+    /// The policy cannot be loaded.
     #[error("cannot use the teacher's policy")]
     Policy(#[from] tandem_policy::Error),
-    /// The policy is a student's.
+    /// The policy is not for one arm with one value.
     #[error(
         "a teacher needs a policy for 1 arm with 1 value, this one is for {n_arms} with {n_values}"
     )]
     NotOneArm {
-        /// Arms that the policy is for.
+        /// The number of arms of the policy.
         n_arms: usize,
-        /// Values that its critic gives.
+        /// The number of values of its critic.
         n_values: usize,
     },
-    /// A request does not hold what it must.
+    /// A request is invalid.
     #[error(transparent)]
     Request(#[from] DecodeError),
-    /// A request names no strategy.
+    /// A request has an unknown strategy.
     #[error("strategy: {0}")]
     Strategy(#[from] UnknownStrategy),
-    /// The ledger declines or is away.
+    /// The ledger refuses an operation or is unavailable.
     #[error(transparent)]
     Ledger(#[from] LedgerError),
     /// The ledger cannot be opened.
     #[error(transparent)]
     OpenLedger(#[from] OpenError),
-    /// The teacher's networks gave infinity or NaN.
+    /// The teacher's networks returned infinity or NaN.
     #[error(
-        "the teacher's networks gave a number that is not finite for step {step} of episode {episode}"
+        "the teacher's networks returned a number that is not finite for step {step} of episode {episode}"
     )]
     NotFinite {
-        /// The episode asked about.
+        /// The episode of the query.
         episode: u64,
-        /// Its step.
+        /// The step of the query.
         step: u32,
     },
-    /// Nobody answered in time: the ledger is stuck, or too many ask.
+    /// The answer took too long: the ledger blocks, or there are too many requests.
     #[error("no answer within {0:?}: ask again")]
-    Overdue(Duration),
+    Timeout(Duration),
     /// The thread that owns the networks and the ledger has panicked, and the service ends.
-    #[error("the teacher has a bug and ends: its log says more")]
+    #[error("the teacher has a bug and ends: see its log")]
     Panicked,
     /// The thread that owns the networks and the ledger cannot be started.
     #[error("cannot start a thread")]
     Thread(#[source] std::io::Error),
-    /// The service cannot be offered.
+    /// The server cannot be configured.
     #[error(transparent)]
     Gate(#[from] tandem_net::GateError),
-    /// The server stopped unasked.
+    /// The server failed.
     #[error("cannot serve")]
     Transport(#[from] tonic::transport::Error),
 }

@@ -1,11 +1,11 @@
-//! A teacher whose every answer can be computed by hand.
+//! A teacher for tests whose answers can be computed by hand.
 
 use tandem_core::{ArmIndex, Layout, StepQuery, Task};
 
 use crate::policy::TeacherPolicy;
 
-/// Pushes with the first three numbers of the observation plus the goal as its action; an action is worth minus its
-/// squared distance from that.
+/// A policy whose action is the first three numbers of the observation plus the goal. The value of an action is minus
+/// its squared distance from that.
 pub(crate) struct FakePolicy;
 
 const LAYOUT: Layout = Layout::new(Task::Push, 1);
@@ -43,7 +43,7 @@ impl TeacherPolicy for FakePolicy {
     }
 }
 
-/// A query of two arms that want to do nothing, where the teacher would act `(x, 0, 0)` and `(0, y, 0)`.
+/// Returns a query of two arms with the proposed action 0. The teacher's actions are `(x, 0, 0)` and `(0, y, 0)`.
 pub(crate) fn query(episode: u64, step: u32, x: f32, y: f32) -> StepQuery {
     let mut observation = vec![0.0; 56];
     observation[0] = x;

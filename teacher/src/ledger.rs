@@ -1,8 +1,8 @@
-//! Where accounts are kept: one trait, whatever remembers them.
+//! Ledgers, which store accounts.
 //!
-//! What an operation means is said by [`crate::budget`]; a ledger makes it durable and lets several clients at it.
-//! [`open()`] picks one by name: [`MemoryLedger`] forgets, [`SqliteLedger`] keeps accounts in a file that one teacher
-//! owns, [`RedisLedger`] on a server that several teachers share.
+//! [`crate::budget`] defines the operations on an account; a ledger makes them durable. [`open()`] selects a ledger by
+//! its location: [`MemoryLedger`] keeps accounts for the life of the process, [`SqliteLedger`] in a file that one
+//! teacher owns, and [`RedisLedger`] on a server that several teachers share.
 
 mod memory;
 mod redis;
@@ -12,83 +12,76 @@ use std::path::{Path, PathBuf};
 
 use tandem_core::layout::EPISODE_STEPS;
 
-use crate::budget::{Account, Balance, BudgetError, Lease, MAX_BUDGET, Terms, Verdict, Wish};
+use crate::budget::{
+    AccountTerms, Balance, BudgetError, BudgetHalf, Charge, Lease, MAX_BUDGET, Transaction,
+};
 
 pub use memory::MemoryLedger;
 pub use redis::RedisLedger;
 pub use sqlite::SqliteLedger;
 
-/// One step that may cost a unit.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Charge {
-    /// The step's episode.
-    pub episode: u64,
-    /// Its number in the episode.
-    pub step: u32,
-    /// Whether it is worth a unit.
-    pub wish: Wish,
-}
-
-/// The charges of one request: all of them are made, in their order, or none is.
+/// The charges of one request for advice to one account. Either all of them are made, in their order, or none.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Bill {
+pub struct ChargeRequest {
     /// The account's name.
     pub account: String,
-    /// At least one.
+    /// At least one step.
     pub charges: Vec<Charge>,
 }
 
-/// What became of a bill.
+/// The answer to a [`ChargeRequest`].
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
-pub struct Receipt {
-    /// By charge.
-    pub verdicts: Vec<Verdict>,
-    /// Units neither spent nor set aside after the bill.
+pub struct ChargeResult {
+    /// The verdict on each charge: the half of the budget whose unit the step cost, or `None` if it cost nothing.
+    pub verdicts: Vec<Option<BudgetHalf>>,
+    /// Units that are neither spent nor leased after the charges.
     pub left: u64,
 }
 
-/// Why a ledger does not do what it is asked.
+/// The reason why a ledger refuses an operation.
 #[derive(Debug, thiserror::Error)]
 pub enum LedgerError {
-    /// The account is unknown, or not as asked for. Nothing has changed.
+    /// The account is unknown or has other terms. Nothing has changed.
     #[error(transparent)]
     Budget(#[from] BudgetError),
     /// A step lies beyond the end of an episode that has a lease. Nothing has changed.
     #[error("charge {charge_idx} is for a step beyond the end of an episode that has a lease")]
     BeyondEnd {
-        /// Which of the bill's charges.
+        /// The index of the charge in its request.
         charge_idx: usize,
     },
-    /// What remembers the accounts cannot be reached or written. Asking again may help and does no harm: if the
-    /// operation was done after all, it is not done twice.
-    #[error("the ledger cannot be used now: {what}{}", because(source.as_deref()))]
+    /// The file or the server cannot be used. The caller may repeat the operation: if it was done after all, it is not
+    /// done twice.
+    #[error("the ledger cannot be used now: {what}{}", cause(source.as_deref()))]
     Unavailable {
-        /// What failed.
+        /// The attempt that failed.
         what: String,
-        /// Why, when something else says so.
+        /// The underlying error, if there is one.
         source: Option<Box<dyn std::error::Error + Send + Sync>>,
     },
 }
 
-/// All accounts by name. Whatever an operation has answered survives the end of the process, however it ends, unless
-/// the implementation says otherwise. Every operation may be repeated.
+/// Accounts by name.
+///
+/// An operation that has returned survives the end of the process at any moment, unless the implementation documents
+/// otherwise. Every operation may be repeated.
 pub trait Ledger: Send {
-    /// Opens account `name`, or finds it open on the same terms.
+    /// Opens account `name`, or returns it if it is open with the same terms.
     ///
     /// # Errors
-    /// When it is open on other terms, or the budget is too large.
-    fn open(&mut self, name: &str, terms: Terms) -> Result<Balance, LedgerError>;
+    /// When it is open with other terms, or the budget is too large.
+    fn open(&mut self, name: &str, terms: AccountTerms) -> Result<Balance, LedgerError>;
 
-    /// How account `name` stands.
+    /// Returns the balance of account `name`.
     ///
     /// # Errors
-    /// When nobody opened it.
+    /// When the account is not open.
     fn balance(&mut self, name: &str) -> Result<Balance, LedgerError>;
 
-    /// Sets aside units for `episodes`, in their order; see [`crate::budget::Account::open_leases`].
+    /// Reserves units for `episodes`, in their order; see [`crate::budget::Account::open_leases`].
     ///
     /// # Errors
-    /// When nobody opened the account.
+    /// When the account is not open.
     fn open_leases(
         &mut self,
         name: &str,
@@ -96,41 +89,42 @@ pub trait Ledger: Send {
         units_per_episode: u32,
     ) -> Result<(Vec<Lease>, Balance), LedgerError>;
 
-    /// Returns what `episodes` did not spend; see [`crate::budget::Account::settle`].
+    /// Returns the unspent units of `episodes` to the budget; see [`crate::budget::Account::settle`].
     ///
     /// # Errors
-    /// When nobody opened the account.
+    /// When the account is not open.
     fn settle(&mut self, name: &str, episodes: &[u64]) -> Result<Balance, LedgerError>;
 
-    /// Charges `bills` in their order, each by itself; see [`crate::budget::Account::charge`]. One outcome per bill.
-    fn charge(&mut self, bills: &[Bill]) -> Vec<Result<Receipt, LedgerError>>;
+    /// Executes `requests` in their order, and returns one result for each; see [`crate::budget::Account::charge`].
+    ///
+    /// A refused request does not affect the others, unless the ledger cannot be used.
+    fn charge(&mut self, requests: &[ChargeRequest]) -> Vec<Result<ChargeResult, LedgerError>>;
 
-    /// Why nothing can be charged, if the last attempt to write failed. For ledgers that answer [`Self::balance`] all the
-    /// same.
+    /// Returns the reason why the last attempt to write failed, for ledgers that answer [`Self::balance`] nevertheless.
     fn warning(&self) -> Option<&str> {
         None
     }
 }
 
-/// Why a ledger cannot be opened.
+/// The reason why a ledger cannot be opened.
 #[derive(Debug, thiserror::Error)]
 pub enum OpenError {
-    /// The name means no ledger.
+    /// The location does not name a ledger.
     #[error(
         "expected memory, redis://[USER:PASSWORD@]HOST[:PORT][/DB] or a file as the ledger: {0}"
     )]
-    NotAPlace(String),
-    /// Another ledger has the file open, in another process or in this one. It may be free a moment later.
+    InvalidLocation(String),
+    /// Another ledger, in this process or in another one, has the file open. A later attempt may succeed.
     #[error(
         "another teacher uses the ledger {0:?}: end that one, or give this one a ledger of its own"
     )]
     InUse(PathBuf),
-    /// No ledger can be kept under this name.
+    /// The path cannot hold a ledger.
     #[error("cannot keep a ledger at {path:?}: {what}")]
     BadPath {
-        /// The name.
+        /// The path.
         path: PathBuf,
-        /// What is wrong with it.
+        /// The reason.
         what: String,
     },
     /// The file cannot be read or written.
@@ -138,89 +132,89 @@ pub enum OpenError {
     Io {
         /// The file.
         path: PathBuf,
-        /// Why.
+        /// The underlying error.
         source: std::io::Error,
     },
-    /// The file is something else.
+    /// The file is not a ledger.
     #[error("{path:?} is no ledger but {found}: move it away or name another file")]
     NotALedger {
         /// The file.
         path: PathBuf,
-        /// What it is.
+        /// A description of the file.
         found: &'static str,
     },
-    /// Another version of this program made the file.
+    /// A newer version of the program wrote the file.
     #[error(
         "the ledger {path:?} has version {found}, this program reads versions 1 to {newest}: use the program that wrote it, or name another file"
     )]
     Version {
         /// The file.
         path: PathBuf,
-        /// Its version.
+        /// The version of the file.
         found: i64,
-        /// The newest version that can be read.
+        /// The newest version that this program reads.
         newest: i64,
     },
-    /// The file was a ledger.
+    /// The contents of the file are inconsistent.
     #[error(
         "the ledger {path:?} is damaged ({what}): put a copy in its place, or move it away to begin with no accounts"
     )]
     Damaged {
         /// The file.
         path: PathBuf,
-        /// How that shows.
+        /// The first inconsistency found.
         what: String,
     },
-    /// The server cannot be reached or does not let us in.
+    /// The server cannot be reached or refuses access.
     #[error("cannot use the ledger {server}")]
     Server {
-        /// Where it should be, without the password.
+        /// The server's address, without the password.
         server: String,
-        /// Why.
+        /// The underlying error.
         source: Box<dyn std::error::Error + Send + Sync>,
     },
 }
 
-/// Opens the ledger called `place`: `memory`, `redis://[USER:PASSWORD@]HOST[:PORT][/DB]`, or else a file, which is
-/// made when there is none.
+/// Opens the ledger at `location`: `memory`, `redis://[USER:PASSWORD@]HOST[:PORT][/DB]`, or the path of a file, which
+/// is created if it does not exist.
 ///
 /// # Errors
-/// When the name means nothing, when the file is not a ledger of this version or is in use, or when the server cannot
-/// be reached.
-pub fn open(place: &str) -> Result<Box<dyn Ledger>, OpenError> {
-    if place == "memory" {
-        tracing::info!("accounts are kept in memory and forgotten when this process ends");
+/// When the location is invalid, when the file is not a ledger of a known version or is in use, or when the server
+/// cannot be reached.
+pub fn open(location: &str) -> Result<Box<dyn Ledger>, OpenError> {
+    if location == "memory" {
+        tracing::info!("accounts are kept in memory and lost when this process ends");
         return Ok(Box::new(MemoryLedger::default()));
     }
-    if place.starts_with("redis://") {
-        return Ok(Box::new(RedisLedger::open(place)?));
+    if location.starts_with("redis://") {
+        return Ok(Box::new(RedisLedger::open(location)?));
     }
-    if let Some((scheme, _)) = place.split_once("://") {
-        let told = if scheme == "rediss" {
-            "rediss:// is not spoken here, reach a server with TLS through a tunnel".to_owned()
+    if let Some((scheme, _)) = location.split_once("://") {
+        let reason = if scheme == "rediss" {
+            "rediss:// is not supported, reach a server with TLS through a tunnel".to_owned()
         } else {
             format!("there is no ledger of the kind {scheme:?}")
         };
-        return Err(OpenError::NotAPlace(told));
+        return Err(OpenError::InvalidLocation(reason));
     }
-    if place.is_empty() {
-        return Err(OpenError::NotAPlace("the name is empty".to_owned()));
+    if location.is_empty() {
+        return Err(OpenError::InvalidLocation("the name is empty".to_owned()));
     }
-    Ok(Box::new(SqliteLedger::open(Path::new(place))?))
+    Ok(Box::new(SqliteLedger::open(Path::new(location))?))
 }
 
-/// Refuses a budget that no account may have.
-fn check_budget(terms: Terms) -> Result<(), BudgetError> {
+/// Refuses a budget that exceeds [`MAX_BUDGET`].
+fn check_budget(terms: AccountTerms) -> Result<(), BudgetError> {
     if terms.budget > MAX_BUDGET {
         return Err(BudgetError::BudgetTooLarge(terms.budget));
     }
     Ok(())
 }
 
-/// Refuses to open account `name` on other terms than those it is open on.
-fn check_terms(name: &str, open: Terms, asked: Terms) -> Result<(), BudgetError> {
-    if open != asked {
-        return Err(BudgetError::OtherTerms { name: name.to_owned(), open, asked });
+/// Refuses to open account `name` with other terms than it is open with.
+fn check_terms(name: &str, open: AccountTerms, requested: AccountTerms) -> Result<(), BudgetError> {
+    if open != requested {
+        return Err(BudgetError::OtherTerms { name: name.to_owned(), open, requested });
     }
     Ok(())
 }
@@ -230,33 +224,36 @@ fn unknown_account(name: &str) -> LedgerError {
 }
 
 /// Makes all of `charges`, or refuses all of them.
-fn charge_all(account: &mut Account, charges: &[Charge]) -> Result<Receipt, LedgerError> {
-    if let Some(charge_idx) = charges.iter().position(|charge| is_beyond(account, charge)) {
+fn charge_all(
+    account: &mut Transaction<'_>,
+    charges: &[Charge],
+) -> Result<ChargeResult, LedgerError> {
+    if let Some(charge_idx) = charges.iter().position(|charge| is_beyond_end(account, charge)) {
         return Err(LedgerError::BeyondEnd { charge_idx });
     }
-    let charge = |charge: &Charge| account.charge(charge.episode, charge.step, charge.wish);
-    let verdicts = charges.iter().map(charge).collect();
-    Ok(Receipt { verdicts, left: account.left() })
+    let verdicts = charges.iter().map(|charge| account.charge(*charge)).collect();
+    Ok(ChargeResult { verdicts, left: account.left() })
 }
 
-/// Episodes of a run, which have leases, have [`EPISODE_STEPS`] steps; how long others are is their owner's matter.
-fn is_beyond(account: &Account, charge: &Charge) -> bool {
-    is_beyond_episode(charge.step) && account.has_lease(charge.episode)
+/// Returns whether the step lies beyond the end of an episode with a lease. Episodes of a run have leases and
+/// [`EPISODE_STEPS`] steps; other episodes may have any length.
+fn is_beyond_end(account: &Transaction<'_>, charge: &Charge) -> bool {
+    exceeds_episode(charge.step) && account.has_lease(charge.episode)
 }
 
-fn is_beyond_episode(step: u32) -> bool {
+fn exceeds_episode(step: u32) -> bool {
     usize::try_from(step).map_or(true, |step| step >= EPISODE_STEPS)
 }
 
-/// What an error's source adds to its message.
-fn because(source: Option<&(dyn std::error::Error + Send + Sync)>) -> String {
+/// Formats an error's source for its message.
+fn cause(source: Option<&(dyn std::error::Error + Send + Sync)>) -> String {
     source.map(|source| format!(": {}", printable(&source.to_string()))).unwrap_or_default()
 }
 
-/// Characters of a foreign text that are shown.
+/// The number of characters of a foreign text that are shown.
 const MAX_SHOWN_CHARS: usize = 300;
 
-/// The beginning of a text that comes from a file or a server, on one line and without control characters.
+/// Returns the beginning of a text from a file or a server, on one line and with control characters escaped.
 fn printable(text: &str) -> String {
     let mut shown = String::new();
     for character in text.chars().take(MAX_SHOWN_CHARS) {

@@ -1,30 +1,30 @@
-//! Which of a student's numbers belong to which arm (equations 7 to 9 of the paper), as data.
+//! The maps between a student's vectors and those of a teacher for one arm (equations 7 to 9 of the paper), as data.
 
 use std::ops::Range;
 
 use tandem_core::Layout;
 
-/// Where one arm's numbers stand in a student's vectors.
+/// The index ranges of one arm in a student's vectors.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct ArmMap {
-    /// In an observation.
+    /// The range in an observation.
     pub observation: Range<usize>,
-    /// In a goal.
+    /// The range in a goal.
     pub goal: Range<usize>,
-    /// In an action.
+    /// The range in an action.
     pub action: Range<usize>,
 }
 
 /// The maps between a student's layout and the teacher's, arm by arm.
 ///
-/// A student with fewer arms uses the first ones: how many there are shows in the length of its vectors.
+/// A student with fewer arms uses the first ones. The length of its vectors determines the number of its arms.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Maps {
     arms: Vec<ArmMap>,
 }
 
 impl Maps {
-    /// The maps of students whose vectors are laid out as `largest`'s are.
+    /// Creates the maps of students with up to as many arms as `largest`.
     #[must_use]
     pub fn new(largest: Layout) -> Self {
         let map_of = |arm| ArmMap {
@@ -35,22 +35,22 @@ impl Maps {
         Self { arms: largest.arms().map(map_of).collect() }
     }
 
-    /// Every arm's map, in arm order.
+    /// Returns the maps of all arms, in arm order.
     #[must_use]
     pub fn arms(&self) -> &[ArmMap] {
         &self.arms
     }
 
-    /// The maps of the arms of a student whose actions have `n_action` numbers, in arm order.
+    /// Returns the maps of the arms of a student whose actions have `n_action` numbers, in arm order.
     pub fn of_student(&self, n_action: usize) -> impl ExactSizeIterator<Item = &ArmMap> {
         let n_arms = self.arms.partition_point(|arm| arm.action.end <= n_action);
         self.arms[..n_arms].iter()
     }
 
-    /// `f^a` (equation 8): the student's action made of the arms' own, shape `[n_action]`.
+    /// Composes a student's action, shape `[n_action]`, from the actions of its arms: `f^a` (equation 8).
     ///
     /// # Panics
-    /// When an arm's action has not the length of its place.
+    /// When the length of an arm's action differs from that of its range.
     #[must_use]
     pub fn joint_action<'a>(
         &self,
@@ -66,7 +66,7 @@ impl Maps {
 }
 
 impl ArmMap {
-    /// `f_i^sg` (equation 7): the teacher's observation and goal within the student's.
+    /// Returns the arm's observation and goal: `f_i^sg` (equation 7).
     #[must_use]
     pub fn teacher_state<'a>(
         &self,
@@ -76,7 +76,7 @@ impl ArmMap {
         (&observation[self.observation.clone()], &goal[self.goal.clone()])
     }
 
-    /// `h_i^a` (equation 9): the arm's own action within the student's.
+    /// Returns the arm's action: `h_i^a` (equation 9).
     #[must_use]
     pub fn arm_action<'a>(&self, action: &'a [f32]) -> &'a [f32] {
         &action[self.action.clone()]
@@ -104,7 +104,7 @@ mod tests {
     }
 
     #[test]
-    fn composing_what_was_taken_apart_gives_the_same_action() {
+    fn composing_the_parts_of_an_action_restores_it() {
         let maps = Maps::new(Layout::new(Task::Push, 8));
         for n_arms in 1..=8 {
             let action = ramp(3 * n_arms);

@@ -1,4 +1,4 @@
-//! What an advisor needs of its policy.
+//! The teacher's policy.
 
 use std::path::Path;
 
@@ -7,23 +7,23 @@ use tandem_policy::{Actor, Critic, Policy};
 
 use crate::error::Error;
 
-/// A policy that can advise: it acts, and it values actions. Rows are states of one arm.
+/// A policy for one arm with an actor and a critic. Rows are states of one arm.
 pub trait TeacherPolicy: Send {
-    /// The task, and one arm.
+    /// Returns the task's layout for one arm.
     fn layout(&self) -> Layout;
 
-    /// Names the policy: SHA-256 of its parameters, hexadecimal.
+    /// Returns the SHA-256 of the parameters, hexadecimal.
     fn digest(&self) -> &str;
 
-    /// `π_tr`: writes the actions, shape `[n, n_action]`, for `observations`, shape `[n, n_observation]`, and
+    /// Writes the actions of `π_tr`, shape `[n, n_action]`, for `observations`, shape `[n, n_observation]`, and
     /// `goals`, shape `[n, n_goal]`.
     fn act(&mut self, observations: &[f32], goals: &[f32], actions: &mut [f32]);
 
-    /// `Q_tr`: writes the values, shape `[n]`, of `actions`, shape `[n, n_action]`, in the same states.
+    /// Writes the values of `Q_tr`, shape `[n]`, of `actions`, shape `[n, n_action]`, in the same states.
     fn q(&mut self, observations: &[f32], goals: &[f32], actions: &[f32], q: &mut [f32]);
 }
 
-/// A policy for one arm, ready to run.
+/// A loaded policy for one arm.
 pub struct OneArmPolicy {
     digest: String,
     actor: Actor,
@@ -31,18 +31,18 @@ pub struct OneArmPolicy {
 }
 
 impl OneArmPolicy {
-    /// Reads the policy that file `path` holds.
+    /// Loads the policy file at `path`.
     ///
     /// # Errors
-    /// When the file holds no usable policy, or one that cannot teach.
+    /// When the file is not a valid policy, or [`Self::new`] refuses the policy.
     pub fn load(path: &Path) -> Result<Self, Error> {
         Self::new(&Policy::load(path)?)
     }
 
-    /// Makes `policy` a teacher's.
+    /// Prepares `policy` for inference.
     ///
     /// # Errors
-    /// When it is not for one arm, or its critic gives several values.
+    /// When the policy is not for one arm, or its critic has several values.
     pub fn new(policy: &Policy) -> Result<Self, Error> {
         if policy.layout.n_arms != 1 || policy.n_heads != 1 {
             return Err(Error::NotOneArm {
@@ -81,7 +81,7 @@ mod tests {
 
     use super::*;
 
-    /// A network of one unit whose weights are all `weight`.
+    /// Returns a policy whose networks have one hidden unit and the same value for all weights.
     fn policy(n_arms: usize, n_heads: usize, weight: f32) -> Policy {
         let layout = Layout::new(Task::Push, n_arms);
         let identity = |n| NormalizerSnapshot { mean: vec![0.0; n], std: vec![1.0; n] };

@@ -1,12 +1,13 @@
-//! Procedures 1 to 3 of the paper's section 3.2: whether the teacher's action replaces the student's on one arm.
+//! Procedures 1 to 3 of section 3.2 of the paper, which decide whether the teacher's action replaces the student's on
+//! one arm.
 //!
-//! The loop over the arms and `a = f^a(a_1, …, a_n)` are [`crate::advisor`]'s, the test `n_b > 0` and the decrement
-//! are [`crate::budget`]'s. What is judged is the action that the student is about to execute.
+//! [`crate::advisor`] has the loop over the arms and `a = f^a(a_1, …, a_n)`; [`crate::budget`] has the test `n_b > 0`
+//! and the decrement. The procedures judge the action that the student is about to execute, exploration included.
 
 use tandem_core::ArmAdvice;
 use tandem_core::reward::distance;
 
-/// A rule that picks the arms to override.
+/// A rule that selects the arms to override.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Procedure {
     /// Procedure 1.
@@ -20,23 +21,23 @@ pub enum Procedure {
     MistakeCorrectingAction(ActionFilter),
 }
 
-/// How procedure 3 gets its radius `t_a` (equation 11, whose formula is followed, not the words before it).
+/// The radius `t_a` of procedure 3, by the formula of equation 11 (the words before it disagree).
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum ActionFilter {
     /// `t_a = α`.
     McAct {
-        /// A distance of actions.
+        /// `α`, a Euclidean distance of actions.
         alpha: f32,
     },
     /// `t_a = α · ‖π_tr(ŝ)‖₂`.
     McActAbs {
-        /// A share of the teacher's action's length.
+        /// `α`, a multiple of the length of the teacher's action.
         alpha: f32,
     },
 }
 
 impl Procedure {
-    /// Whether the teacher's action takes the place of the student's on an arm judged as `arm`.
+    /// Returns whether the teacher's action replaces the student's on an arm with these scores.
     #[must_use]
     pub fn overrides(self, arm: &ArmAdvice) -> bool {
         match self {
@@ -52,7 +53,7 @@ impl Procedure {
 }
 
 impl ActionFilter {
-    /// `t_a` of equation 11 where the teacher would act `teacher_action`.
+    /// Returns `t_a` of equation 11 for `teacher_action`, shape `[action_per_arm]`.
     #[must_use]
     pub fn radius(self, teacher_action: &[f32]) -> f32 {
         match self {
@@ -62,7 +63,7 @@ impl ActionFilter {
     }
 }
 
-/// Procedure 1, lines 4 to 9: always.
+/// Procedure 1, lines 4 to 9: returns `true`.
 #[must_use]
 pub const fn early_advising() -> bool {
     true
@@ -80,11 +81,11 @@ pub fn mistake_correcting_action(distance: f32, radius: f32) -> bool {
     distance > radius
 }
 
-/// What the teacher thinks of one arm of one step, nothing overridden yet.
+/// Scores the student's action on one arm of one step, with nothing overridden.
 ///
-/// Both actions have shape `[action_per_arm]`; the values are the teacher's critic's.
+/// Both actions have shape `[action_per_arm]`; the values are those of the teacher's critic.
 #[must_use]
-pub fn judge_arm(
+pub fn score_arm(
     teacher_action: &[f32],
     student_action: &[f32],
     q_teacher: f32,
@@ -110,20 +111,20 @@ mod tests {
 
     /// A teacher that acts (0.375, 0.5, 0), of length 0.625, for a value of −1.
     fn arm(student_action: [f32; 3], q_student: f32) -> ArmAdvice {
-        judge_arm(&[0.375, 0.5, 0.0], &student_action, -1.0, q_student)
+        score_arm(&[0.375, 0.5, 0.0], &student_action, -1.0, q_student)
     }
 
     #[test]
     fn importance_is_the_value_lost_and_distance_is_euclidean() {
-        let judged = arm([0.375, 0.25, 0.0], -1.75);
-        assert_eq!((judged.importance, judged.distance, judged.overridden), (0.75, 0.25, false));
+        let scores = arm([0.375, 0.25, 0.0], -1.75);
+        assert_eq!((scores.importance, scores.distance, scores.overridden), (0.75, 0.25, false));
         assert_eq!(arm([0.0; 3], -0.5).importance, -0.5);
     }
 
     #[test]
-    fn each_procedure_overrides_what_it_says() {
-        let check = |procedure: Procedure, judged: &ArmAdvice, overrides: bool| {
-            assert_eq!(procedure.overrides(judged), overrides, "{procedure:?}");
+    fn each_procedure_overrides_by_its_own_rule() {
+        let check = |procedure: Procedure, scores: &ArmAdvice, overrides: bool| {
+            assert_eq!(procedure.overrides(scores), overrides, "{procedure:?}");
         };
         let same = arm([0.375, 0.5, 0.0], -1.0);
         let worse_by_half = arm([0.0; 3], -1.5);

@@ -1,7 +1,7 @@
-//! The service `tandem.v1.Teacher`: a thin shell round an [`Advisor`].
+//! The gRPC service `tandem.v1.Teacher` around an [`Advisor`].
 
-mod answers;
-mod messages;
+mod advice;
+mod convert;
 mod thread;
 
 use std::path::PathBuf;
@@ -14,41 +14,41 @@ use tokio_util::sync::CancellationToken;
 use tonic::{Request, Response, Status, Streaming};
 
 use crate::advisor::Advisor;
-use crate::budget::{BudgetError, Terms};
+use crate::budget::{AccountTerms, BudgetError};
 use crate::error::Error;
 use crate::ledger::{self, LedgerError};
 use crate::policy::OneArmPolicy;
-use answers::{AnswerStream, answer, answer_all};
-use messages::{check_episodes, describe, encode_balance, encode_lease};
+use advice::{AdviceStream, advise, advise_stream};
+use convert::{check_episodes, describe, encode_balance, encode_lease};
 use thread::{AdvisorHandle, AdvisorThread};
 
-/// Bytes that a request may have: some thousands of steps.
+/// The largest request: some thousands of steps.
 const MAX_REQUEST_BYTES: usize = 4 << 20;
-/// How long a call waits for its answer: less than a learner waits for a call.
-const PATIENCE: Duration = Duration::from_secs(4);
+/// The time limit for the answer to a call, shorter than a learner's deadline.
+const ANSWER_TIMEOUT: Duration = Duration::from_secs(4);
 
-/// What a teacher service needs to know.
+/// The configuration of a teacher service.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Config {
-    /// The file of the policy that teaches.
+    /// The teacher's policy file.
     pub policy: PathBuf,
-    /// Where its accounts are kept; see [`ledger::open`].
+    /// The location of the ledger; see [`ledger::open`].
     pub ledger: String,
 }
 
-/// The advisor of `config`, with its policy loaded and its ledger open.
+/// Loads the policy and opens the ledger of `config`.
 ///
 /// # Errors
-/// When the policy cannot teach, or the ledger cannot be opened.
+/// When the policy cannot be loaded, or the ledger cannot be opened.
 pub fn open(config: &Config) -> Result<Advisor, Error> {
     let policy = OneArmPolicy::load(&config.policy)?;
     Advisor::new(Box::new(policy), ledger::open(&config.ledger)?)
 }
 
-/// Serves the teacher of `config` to those whom `gate` lets in, until `shutdown` is cancelled.
+/// Serves the teacher of `config`, with the access control of `gate`, until `shutdown` is cancelled.
 ///
 /// # Errors
-/// When the policy cannot teach, the ledger cannot be opened, or the server fails.
+/// When the policy cannot be loaded, the ledger cannot be opened, or the server fails.
 pub async fn serve(
     config: Config,
     incoming: impl Into<Incoming>,
@@ -58,10 +58,10 @@ pub async fn serve(
     serve_advisor(open(&config)?, incoming, gate, shutdown, Pacing::Concurrent).await
 }
 
-/// Serves `advisor` to those whom `gate` lets in, until `shutdown` is cancelled.
+/// Serves `advisor`, with the access control of `gate`, until `shutdown` is cancelled.
 ///
-/// The advisor gets a thread of its own, or under [`Pacing::Lockstep`] a task. Should that panic, calls under way fail
-/// and the service ends.
+/// The advisor runs on its own thread, or under [`Pacing::Lockstep`] as a task. If it panics, pending calls fail and
+/// the service ends.
 ///
 /// # Errors
 /// When the server fails, or the advisor has panicked.
@@ -73,8 +73,8 @@ pub async fn serve_advisor(
     pacing: Pacing,
 ) -> Result<(), Error> {
     let stop = shutdown.child_token();
-    let (thread, advisor) =
-        AdvisorThread::spawn(advisor, PATIENCE, stop.clone(), pacing).map_err(Error::Thread)?;
+    let (thread, advisor) = AdvisorThread::spawn(advisor, ANSWER_TIMEOUT, stop.clone(), pacing)
+        .map_err(Error::Thread)?;
     let service = TeacherService { advisor, stop: stop.clone() };
     let teacher = TeacherServer::new(service).max_decoding_message_size(MAX_REQUEST_BYTES);
     let router = gate.router(teacher).await?;
@@ -82,22 +82,22 @@ pub async fn serve_advisor(
     thread.join(SHUTDOWN_GRACE).await
 }
 
-/// What the generated server calls.
+/// The implementation of the generated server trait.
 struct TeacherService {
     advisor: AdvisorHandle,
-    /// Cancelled when the service shall end, or must.
+    /// Cancelled on shutdown and when the advisor panics.
     stop: CancellationToken,
 }
 
 #[tonic::async_trait]
 impl Teacher for TeacherService {
-    type AdviseStreamStream = AnswerStream;
+    type AdviseStreamStream = AdviceStream;
 
     async fn describe(
         &self,
         _: Request<pb::DescribeRequest>,
     ) -> Result<Response<pb::DescribeResponse>, Status> {
-        Ok(Response::new(describe(self.advisor.profile())))
+        Ok(Response::new(describe(self.advisor.info())))
     }
 
     async fn open_account(
@@ -122,15 +122,15 @@ impl Teacher for TeacherService {
         &self,
         request: Request<pb::AdviseRequest>,
     ) -> Result<Response<pb::AdviseResponse>, Status> {
-        answer(&self.advisor, request.into_inner()).await.map(Response::new)
+        advise(&self.advisor, request.into_inner()).await.map(Response::new)
     }
 
     async fn advise_stream(
         &self,
         request: Request<Streaming<pb::AdviseRequest>>,
-    ) -> Result<Response<AnswerStream>, Status> {
-        let answers = answer_all(self.advisor.clone(), request.into_inner(), self.stop.clone());
-        Ok(Response::new(answers))
+    ) -> Result<Response<AdviceStream>, Status> {
+        let requests = request.into_inner();
+        Ok(Response::new(advise_stream(self.advisor.clone(), requests, self.stop.clone())))
     }
 
     async fn open_leases(
@@ -157,7 +157,7 @@ async fn open_account(
     request: pb::OpenAccountRequest,
 ) -> Result<pb::Account, Error> {
     let name = decode_account_name("name", request.name)?;
-    let terms = Terms { budget: request.budget, strategy: request.strategy.parse()? };
+    let terms = AccountTerms { budget: request.budget, strategy: request.strategy.parse()? };
     let account = name.clone();
     let balance = advisor.run(move |advisor| advisor.open_account(&account, terms)).await?;
     tracing::info!(account = name, budget = terms.budget, strategy = %terms.strategy, "account opened");
@@ -170,10 +170,10 @@ async fn get_account(
 ) -> Result<pb::Account, Error> {
     let name = decode_account_name("name", request.name)?;
     let account = name.clone();
-    let look = move |advisor: &mut Advisor| {
+    let read = move |advisor: &mut Advisor| {
         Ok((advisor.balance(&account)?, advisor.warning().unwrap_or_default().to_owned()))
     };
-    let (balance, warning) = advisor.run(look).await?;
+    let (balance, warning) = advisor.run(read).await?;
     Ok(pb::Account { warning, ..encode_balance(name, &balance) })
 }
 
@@ -206,7 +206,7 @@ async fn settle_leases(
     Ok(encode_balance(name, &balance))
 }
 
-/// What a client is told of an error.
+/// Maps an error to the status that the client receives.
 fn status(error: &Error) -> Status {
     let message = error.to_string();
     match error {
@@ -221,7 +221,7 @@ fn status(error: &Error) -> Status {
         Error::Ledger(LedgerError::Budget(BudgetError::OtherTerms { .. })) => {
             Status::already_exists(message)
         }
-        Error::Ledger(LedgerError::Unavailable { .. }) | Error::Overdue(_) => {
+        Error::Ledger(LedgerError::Unavailable { .. }) | Error::Timeout(_) => {
             tracing::error!(%error, "request failed");
             Status::unavailable(message)
         }
@@ -240,6 +240,6 @@ fn status(error: &Error) -> Status {
 }
 
 #[cfg(test)]
-mod gated;
+mod gated_ledger;
 #[cfg(test)]
 mod tests;

@@ -3,13 +3,12 @@
 use std::fmt;
 use std::str::FromStr;
 
-use crate::budget::Half;
 use crate::procedures::{ActionFilter, Procedure};
 
-/// The threshold of a strategy that is named without one.
+/// The threshold of a strategy whose name omits it.
 pub const DEFAULT_THRESHOLD: f32 = 0.1;
 
-/// When the teacher advises.
+/// A rule for when the teacher advises.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Strategy {
     /// Never (NA).
@@ -18,40 +17,50 @@ pub enum Strategy {
     EarlyAdvising,
     /// On every step for the first half of the budget, then as [`Self::MistakeQ`] (EAMC).
     EarlyThenMistakeQ {
-        /// `t_I` of the second half.
+        /// `t_I` in the second half.
         threshold: f32,
     },
-    /// Where the student's action is worth clearly less than the teacher's (MC-Q).
+    /// When the teacher's action is worth more than the student's by a threshold (MC-Q).
     MistakeQ {
-        /// `t_I`: units of value.
+        /// `t_I`, a difference of values.
         threshold: f32,
     },
-    /// Where the student's action is far from the teacher's (MC-ACT).
+    /// When the student's action is far from the teacher's (MC-ACT).
     MistakeAction {
-        /// `α`: Euclidean distance of actions.
+        /// `α`, a Euclidean distance of actions.
         alpha: f32,
     },
-    /// The same, the distance measured in lengths of the teacher's action (MC-ACT-ABS).
+    /// As [`Self::MistakeAction`], with the distance relative to the length of the teacher's action (MC-ACT-ABS).
     MistakeActionAbs {
-        /// `α`: share of the teacher's action's length.
+        /// `α`, a multiple of the length of the teacher's action.
         alpha: f32,
     },
 }
 
+/// The half of the budget that a unit belongs to. A unit belongs to the first half if more than half of the budget is
+/// left before it is assigned.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum BudgetHalf {
+    /// The units that are assigned first.
+    First,
+    /// The other units.
+    Second,
+}
+
 impl Strategy {
-    /// The strategies as they are written, `T` and `A` standing for a threshold.
+    /// The names of the strategies; `T` and `A` are thresholds.
     pub const NAMES: [&str; 6] = ["none", "ea", "eamc:T", "mc-q:T", "mc-act:A", "mc-act-abs:A"];
 
-    /// The procedure that governs a step whose unit would come from `half` of the budget.
+    /// Returns the procedure for a step whose unit would come from `half` of the budget.
     #[must_use]
-    pub const fn procedure(self, half: Half) -> Option<Procedure> {
+    pub const fn procedure(self, half: BudgetHalf) -> Option<Procedure> {
         match (self, half) {
             (Self::NoAdvice, _) => None,
-            (Self::EarlyAdvising, _) | (Self::EarlyThenMistakeQ { .. }, Half::First) => {
+            (Self::EarlyAdvising, _) | (Self::EarlyThenMistakeQ { .. }, BudgetHalf::First) => {
                 Some(Procedure::EarlyAdvising)
             }
             (Self::MistakeQ { threshold }, _)
-            | (Self::EarlyThenMistakeQ { threshold }, Half::Second) => {
+            | (Self::EarlyThenMistakeQ { threshold }, BudgetHalf::Second) => {
                 Some(Procedure::MistakeCorrectingQ { threshold })
             }
             (Self::MistakeAction { alpha }, _) => {
@@ -77,10 +86,10 @@ impl fmt::Display for Strategy {
     }
 }
 
-/// How much of a text that names no strategy is repeated to whoever gave it.
-const MAX_TOLD_CHARS: usize = 80;
+/// The number of characters of an invalid text that the error repeats.
+const MAX_SHOWN_CHARS: usize = 80;
 
-/// A text that names no strategy.
+/// The error for a text that is not the name of a strategy.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("expected {names} (thresholds finite, 0 or more, 0.1 when left out), got {0:?}", names = Strategy::NAMES.join(", "))]
 pub struct UnknownStrategy(pub String);
@@ -89,7 +98,7 @@ impl FromStr for Strategy {
     type Err = UnknownStrategy;
 
     fn from_str(text: &str) -> Result<Self, UnknownStrategy> {
-        let unknown = || UnknownStrategy(text.chars().take(MAX_TOLD_CHARS).collect());
+        let unknown = || UnknownStrategy(text.chars().take(MAX_SHOWN_CHARS).collect());
         let (name, threshold_text) = match text.split_once(':') {
             Some((name, threshold)) => (name, Some(threshold)),
             None => (text, None),
@@ -108,7 +117,7 @@ impl FromStr for Strategy {
     }
 }
 
-/// A finite number, 0 or more; −0 is read as 0.
+/// Parses a finite number, at least 0. −0 becomes 0.
 fn parse_threshold(text: &str) -> Option<f32> {
     text.parse()
         .ok()
@@ -121,7 +130,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_strategy_is_read_back_from_its_name() {
+    fn a_strategy_is_parsed_from_its_name() {
         let check = |text: &str, strategy: Strategy| {
             assert_eq!(text.parse(), Ok(strategy), "{text}");
             assert_eq!(strategy.to_string().parse(), Ok(strategy), "{strategy}");
@@ -141,7 +150,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_strategy_is_refused_with_the_list_of_those_there_are() {
+    fn an_unknown_strategy_is_refused_with_the_list_of_names() {
         for text in [
             "",
             "MC-Q",
@@ -166,11 +175,11 @@ mod tests {
     #[test]
     fn eamc_changes_its_procedure_with_the_half_of_the_budget() {
         let eamc = Strategy::EarlyThenMistakeQ { threshold: 0.5 };
-        assert_eq!(eamc.procedure(Half::First), Some(Procedure::EarlyAdvising));
+        assert_eq!(eamc.procedure(BudgetHalf::First), Some(Procedure::EarlyAdvising));
         assert_eq!(
-            eamc.procedure(Half::Second),
+            eamc.procedure(BudgetHalf::Second),
             Some(Procedure::MistakeCorrectingQ { threshold: 0.5 })
         );
-        assert_eq!(Strategy::NoAdvice.procedure(Half::First), None);
+        assert_eq!(Strategy::NoAdvice.procedure(BudgetHalf::First), None);
     }
 }

@@ -1,4 +1,4 @@
-//! Writes a made-up episode to the MCAP file named on the command line, to try readers on.
+//! Writes a synthetic episode to the MCAP file given on the command line, to test readers.
 
 use std::path::PathBuf;
 
@@ -6,8 +6,7 @@ use std::path::PathBuf;
 mod synthetic;
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {
-    let path =
-        std::env::args_os().nth(1).map(PathBuf::from).ok_or("which file shall be written?")?;
+    let path = std::env::args_os().nth(1).map(PathBuf::from).ok_or("usage: sample_mcap FILE")?;
     synthetic::write_log(&path)?;
     Ok(())
 }

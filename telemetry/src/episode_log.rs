@@ -1,4 +1,4 @@
-//! Reads an episode's log back, to play the episode again or to look into it.
+//! Reading of an episode's MCAP log.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -7,57 +7,57 @@ use mcap::McapError;
 use mcap::read::ChannelAccumulator;
 use mcap::records::Record;
 use tandem_core::{ArmAdvice, Contacts, Layout};
+use tandem_system::regular_file;
 
 use crate::error::Error;
 use crate::messages::{EpisodeMetadata, METADATA_NAME, decode, pb};
 use crate::recorder::{OUTCOME_TOPIC, TRANSITION_TOPIC};
 use crate::records::Records;
-use crate::whole_file::read_regular;
 
 /// A recorded episode.
 #[derive(Debug, Clone, PartialEq)]
 pub struct EpisodeLog {
-    /// What is needed to play it again.
+    /// The inputs of the episode, from which it can be simulated again.
     pub metadata: EpisodeMetadata,
-    /// Its steps, in order from 0. A recovered log may have fewer than a whole episode.
+    /// Control steps, in order from 0. A recovered log may contain fewer than the episode had.
     pub transitions: Vec<LoggedTransition>,
-    /// After the last step, shape `[n_observation]`; `None` when the log ends before.
+    /// Observation after the last step, shape `[n_observation]`; `None` if the log is incomplete.
     pub last_observation: Option<Vec<f32>>,
 }
 
 /// One recorded control step.
 #[derive(Debug, Clone, PartialEq)]
 pub struct LoggedTransition {
-    /// Before the step, shape `[n_observation]`.
+    /// Observation before the step, shape `[n_observation]`.
     pub observation: Vec<f32>,
-    /// Shape `[n_goal]`.
+    /// Goal, shape `[n_goal]`.
     pub goal: Vec<f32>,
-    /// As executed, in [−1, 1], shape `[n_action]`.
+    /// Executed action, in [−1, 1], shape `[n_action]`.
     pub action: Vec<f32>,
-    /// The joint reward.
+    /// Joint reward of all arms.
     pub reward: f32,
-    /// Each arm's own reward, shape `[n_arms]`.
+    /// Reward of each arm, shape `[n_arms]`.
     pub rewards_per_arm: Vec<f32>,
-    /// Bit `a` set when arm `a` executed the teacher's action.
+    /// Bit `a` is set if arm `a` executed the teacher's action.
     pub advised_arms: u8,
-    /// What touched what during the step.
+    /// Contacts during the step.
     pub contacts: Contacts,
-    /// What the teacher said, arm by arm; empty when it was not asked.
+    /// Advice of the teacher in arm order; empty if it was not asked.
     pub advice: Vec<ArmAdvice>,
 }
 
-/// Reads the log `path` of an episode.
+/// Reads the episode in the MCAP log `path`.
 ///
 /// # Errors
-/// When the file cannot be read, is not whole, or is no log of an episode.
+/// If the file cannot be read, is incomplete, or is not the log of an episode.
 pub fn read_episode(path: &Path) -> Result<EpisodeLog, Error> {
-    let bytes = read_regular(path).map_err(Error::io("read", path))?;
+    let bytes = regular_file::read(path).map_err(Error::io("read", path))?;
     let not_an_episode = |problem| Error::NotAnEpisode { path: path.to_owned(), problem };
     let raw = read_raw(&bytes).map_err(Error::read_log(path))?;
-    checked(raw).map_err(not_an_episode)
+    decode_episode(raw).map_err(not_an_episode)
 }
 
-/// The parts of a log that matter here, as bytes.
+/// The parts of a log that make up an episode, not decoded.
 #[derive(Default)]
 struct RawLog {
     metadata: Option<BTreeMap<String, String>>,
@@ -69,9 +69,9 @@ fn read_raw(bytes: &[u8]) -> mcap::McapResult<RawLog> {
     let mut raw = RawLog::default();
     let mut channels = ChannelAccumulator::default();
     let mut in_summary = false;
-    for record in Records::of_whole(bytes) {
+    for record in Records::of_complete(bytes) {
         match record? {
-            // The summary repeats channels and schemas; it is read on only to be sure that the file is whole.
+            // The summary repeats channels and schemas; reading it verifies that the file is complete.
             Record::DataEnd(_) => in_summary = true,
             _ if in_summary => {}
             Record::Metadata(metadata) if metadata.name == METADATA_NAME => {
@@ -97,7 +97,7 @@ fn read_raw(bytes: &[u8]) -> mcap::McapResult<RawLog> {
     Ok(raw)
 }
 
-fn checked(raw: RawLog) -> Result<EpisodeLog, String> {
+fn decode_episode(raw: RawLog) -> Result<EpisodeLog, String> {
     let metadata =
         raw.metadata.ok_or_else(|| format!("it has no metadata record {METADATA_NAME:?}"))?;
     let metadata = EpisodeMetadata::from_map(&metadata)?;
@@ -105,42 +105,45 @@ fn checked(raw: RawLog) -> Result<EpisodeLog, String> {
     let transitions = raw.transitions.iter().enumerate();
     let transitions = transitions
         .map(|(step_idx, bytes)| {
-            transition(layout, step_idx, bytes)
+            decode_transition(layout, step_idx, bytes)
                 .map_err(|problem| format!("step {step_idx}: {problem}"))
         })
         .collect::<Result<_, _>>()?;
     let last_observation =
-        raw.outcomes.last().map(|bytes| last_observation(layout, bytes)).transpose()?;
+        raw.outcomes.last().map(|bytes| decode_last_observation(layout, bytes)).transpose()?;
     Ok(EpisodeLog { metadata, transitions, last_observation })
 }
 
-fn transition(layout: Layout, step_idx: usize, bytes: &[u8]) -> Result<LoggedTransition, String> {
+fn decode_transition(
+    layout: Layout,
+    step_idx: usize,
+    bytes: &[u8],
+) -> Result<LoggedTransition, String> {
     let message: pb::Transition = decode(bytes).map_err(|error| error.to_string())?;
     if usize::try_from(message.step) != Ok(step_idx) {
-        return Err(format!("is called step {}", message.step));
+        return Err(format!("has the number {}", message.step));
     }
     let advised_arms =
         u8::try_from(message.advised_arms).map_err(|error| format!("advised_arms: {error}"))?;
     let contacts = u8::try_from(message.contacts).ok().and_then(Contacts::from_bits);
     Ok(LoggedTransition {
-        observation: of_length("observation", message.observation, layout.n_observation())?,
-        goal: of_length("goal", message.goal, layout.n_goal())?,
-        action: of_length("action", message.action, layout.n_action())?,
+        observation: with_length("observation", message.observation, layout.n_observation())?,
+        goal: with_length("goal", message.goal, layout.n_goal())?,
+        action: with_length("action", message.action, layout.n_action())?,
         reward: message.reward,
-        rewards_per_arm: of_length("rewards_per_arm", message.rewards_per_arm, layout.n_arms)?,
+        rewards_per_arm: with_length("rewards_per_arm", message.rewards_per_arm, layout.n_arms)?,
         advised_arms,
-        contacts: contacts
-            .ok_or_else(|| format!("contacts {:#b} have no meaning", message.contacts))?,
+        contacts: contacts.ok_or_else(|| format!("unknown contacts {:#b}", message.contacts))?,
         advice: message.advice.into_iter().map(ArmAdvice::from).collect(),
     })
 }
 
-fn last_observation(layout: Layout, bytes: &[u8]) -> Result<Vec<f32>, String> {
+fn decode_last_observation(layout: Layout, bytes: &[u8]) -> Result<Vec<f32>, String> {
     let outcome: pb::Outcome = decode(bytes).map_err(|error| format!("outcome: {error}"))?;
-    of_length("last observation", outcome.observation, layout.n_observation())
+    with_length("last observation", outcome.observation, layout.n_observation())
 }
 
-fn of_length(field: &str, numbers: Vec<f32>, expected: usize) -> Result<Vec<f32>, String> {
+fn with_length(field: &str, numbers: Vec<f32>, expected: usize) -> Result<Vec<f32>, String> {
     match numbers.len() {
         got if got == expected => Ok(numbers),
         got => Err(format!("{field} has {got} numbers, the layout has {expected}")),
@@ -163,7 +166,7 @@ mod tests {
             let footer = record(op::FOOTER, &[0; 20]);
             [mcap::MAGIC, &header, message, &end, &footer, mcap::MAGIC].concat()
         };
-        assert!(read_raw(&file(&[])).is_ok(), "an empty log is whole");
+        assert!(read_raw(&file(&[])).is_ok(), "an empty log is complete");
         let message = record(op::MESSAGE, &[[2].as_slice(), &[0; 21]].concat());
         let refused = read_raw(&file(&message)).err();
         assert!(matches!(refused, Some(McapError::UnknownChannel(0, 2))), "{refused:?}");

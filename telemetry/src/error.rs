@@ -1,99 +1,99 @@
-//! What can go wrong with the records of a run.
+//! Errors of logs and metrics.
 
 use std::path::{Path, PathBuf};
 
-/// What can go wrong with the records of a run.
+/// An error while writing or reading logs and metrics, or while setting up logging.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
     /// A file operation failed.
     #[error("cannot {action} {path:?}")]
     Io {
-        /// What was attempted: "create", "rename" and the like.
+        /// The operation, such as `create` or `rename`.
         action: &'static str,
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
-        /// Why it failed.
+        /// The cause.
         source: std::io::Error,
     },
-    /// An episode's log could not be written.
+    /// A log could not be written.
     #[error("cannot write the log {path:?}")]
     WriteLog {
-        /// The log.
+        /// Path of the log.
         path: PathBuf,
-        /// Why it failed.
+        /// The cause.
         source: mcap::McapError,
     },
-    /// The file is no MCAP file, is cut short or damaged.
+    /// The file is not an MCAP file, or it is incomplete or damaged.
     #[error(
-        "{path:?} is not a whole MCAP file; `tandem mcap recover` mends what a killed writer left"
+        "{path:?} is not a complete MCAP file; `tandem mcap recover` recovers the log of a killed writer"
     )]
     ReadLog {
-        /// The log.
+        /// Path of the log.
         path: PathBuf,
-        /// What is wrong with it.
+        /// The cause.
         source: mcap::McapError,
     },
-    /// The file is an MCAP file, but not a log of an episode.
-    #[error("{path:?} is no log of an episode: {problem}")]
+    /// The file is an MCAP file, but not the log of an episode.
+    #[error("{path:?} is not the log of an episode: {problem}")]
     NotAnEpisode {
-        /// The log.
+        /// Path of the log.
         path: PathBuf,
         /// What is missing or wrong.
         problem: String,
     },
-    /// A vector handed to the recorder does not fit the episode's layout.
+    /// A vector does not fit the layout of the episode or trial.
     #[error("{field} has {got} numbers, the layout has {expected}")]
     Length {
-        /// Which vector.
+        /// Name of the vector.
         field: &'static str,
-        /// Its length.
+        /// Length of the vector.
         got: usize,
-        /// The layout's.
+        /// Length in the layout.
         expected: usize,
     },
-    /// A scene's time cannot stand in a log.
-    #[error("simulated time {time_s} s is not a time since the episode's start")]
+    /// A time is negative, not finite or too large for a log.
+    #[error("invalid time in a log: {time_s} s since its start")]
     Time {
         /// The time, seconds.
         time_s: f64,
     },
-    /// A whole line of the metrics is no row.
-    #[error("{path:?}, line {line}, is no metrics row")]
+    /// A complete line of a metrics file is not a row.
+    #[error("{path:?}, line {line}, is not a metrics row")]
     MetricsRow {
-        /// The metrics file.
+        /// Path of the metrics file.
         path: PathBuf,
-        /// The line, from 1.
+        /// Number of the line, from 1.
         line: usize,
-        /// What is wrong with it.
+        /// The cause.
         source: serde_json::Error,
     },
-    /// The log filter cannot be understood.
+    /// The log filter is malformed.
     #[error(
         "log filter {filter:?} is malformed: expected LEVEL or TARGET=LEVEL, separated by commas"
     )]
     LogFilter {
         /// The filter.
         filter: String,
-        /// What is wrong with it, where it has the form of directives.
+        /// The cause, if the filter has the form of directives.
         source: Option<tracing_subscriber::filter::ParseError>,
     },
-    /// Logging was set up twice in one process.
-    #[error("logging is already set up")]
+    /// Logging was initialised twice in one process.
+    #[error("logging is already initialised")]
     LoggingTwice(#[from] tracing_subscriber::util::TryInitError),
 }
 
 impl Error {
-    /// For `map_err` on file operations.
+    /// Returns a function for `map_err` on file operations.
     pub(crate) fn io(action: &'static str, path: &Path) -> impl FnOnce(std::io::Error) -> Self {
         move |source| Self::Io { action, path: path.to_owned(), source }
     }
 
-    /// For `map_err` on writing a log.
+    /// Returns a function for `map_err` on writing a log.
     pub(crate) fn write_log(path: &Path) -> impl FnOnce(mcap::McapError) -> Self {
         move |source| Self::WriteLog { path: path.to_owned(), source }
     }
 
-    /// For `map_err` on reading a log.
+    /// Returns a function for `map_err` on reading a log.
     pub(crate) fn read_log(path: &Path) -> impl FnOnce(mcap::McapError) -> Self {
         move |source| Self::ReadLog { path: path.to_owned(), source }
     }

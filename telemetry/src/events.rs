@@ -1,338 +1,244 @@
-//! What happens in a run, one type an event: the message is constant, what varies stands in fields.
+//! Events of a run. Each event is a type with its fields, a fixed level and a fixed message.
 //!
-//! `debug` for what happens each step, `info` for each episode and connection, `warn` for what was recovered from,
-//! `error` for what was given up.
+//! Levels: `debug` for steps, `info` for episodes and connections, `warn` for recovered faults, `error` for faults
+//! without recovery.
 
 use std::path::Path;
 
-/// The teacher's action took the place of the student's.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct StepAdvised {
-    /// The episode's number.
-    pub episode: u64,
-    /// The step, from 0.
-    pub step: u32,
-    /// Bit `a` set when arm `a` was overridden.
-    pub overridden_arms: u8,
+/// Declares an event: a struct, and the `tracing` call with which its method `emit` logs it.
+///
+/// The call takes the struct's fields by name. A field that it omits is an unused variable, which the compiler reports.
+macro_rules! event {
+    (
+        $(#[$meta:meta])*
+        pub struct $name:ident $(<$lifetime:lifetime>)? {
+            $($(#[$field_meta:meta])* pub $field:ident: $type:ty,)*
+        }
+        $level:ident!($($arguments:tt)*)
+    ) => {
+        $(#[$meta])*
+        #[derive(Debug, Clone, Copy, PartialEq)]
+        pub struct $name $(<$lifetime>)? {
+            $($(#[$field_meta])* pub $field: $type,)*
+        }
+
+        impl $(<$lifetime>)? $name $(<$lifetime>)? {
+            #[doc = concat!("Logs the event at level `", stringify!($level), "`.")]
+            pub fn emit(&self) {
+                let Self { $($field),* } = *self;
+                tracing::$level!($($arguments)*);
+            }
+        }
+    };
 }
 
-impl StepAdvised {
-    /// Logs the event.
-    pub fn emit(&self) {
-        tracing::debug!(
-            episode = self.episode,
-            step = self.step,
-            overridden_arms = self.overridden_arms,
-            "step advised"
-        );
+event! {
+    /// The teacher's action replaced the student's on at least one arm.
+    pub struct StepAdvised {
+        /// Number of the episode.
+        pub episode: u64,
+        /// Step of the episode, from 0.
+        pub step: u32,
+        /// Bit `a` is set if arm `a` was overridden.
+        pub overridden_arms: u8,
     }
+    debug!(episode, step, overridden_arms, "step advised")
 }
 
-/// A worker played an episode to its end.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct EpisodeFinished {
-    /// The episode's number.
-    pub episode: u64,
-    /// Version of the parameters that acted.
-    pub parameter_version: u64,
-    /// Whether every object is at its goal.
-    pub success: bool,
-    /// Units of advice charged.
-    pub advice_charged: u32,
-    /// Steps with an arm–arm or arm–table contact.
-    pub contact_steps: usize,
-}
-
-impl EpisodeFinished {
-    /// Logs the event.
-    pub fn emit(&self) {
-        tracing::info!(
-            episode = self.episode,
-            parameter_version = self.parameter_version,
-            success = self.success,
-            advice_charged = self.advice_charged,
-            contact_steps = self.contact_steps,
-            "episode finished"
-        );
+event! {
+    /// A worker played an episode to its end.
+    pub struct EpisodeFinished {
+        /// Number of the episode.
+        pub episode: u64,
+        /// Version of the parameters that acted.
+        pub parameter_version: u64,
+        /// Whether every object is at its goal.
+        pub success: bool,
+        /// Units of advice charged.
+        pub advice_charged: u32,
+        /// Number of steps with a contact between the arms, or between an arm and the table.
+        pub contact_steps: usize,
     }
+    info!(episode, parameter_version, success, advice_charged, contact_steps, "episode finished")
 }
 
-/// An episode's log is complete.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct EpisodeRecorded<'a> {
-    /// The episode's number.
-    pub episode: u64,
-    /// The log.
-    pub path: &'a Path,
-}
-
-impl EpisodeRecorded<'_> {
-    /// Logs the event.
-    pub fn emit(&self) {
-        tracing::info!(episode = self.episode, path = ?self.path, "episode recorded");
+event! {
+    /// The log of an episode is complete.
+    pub struct EpisodeRecorded<'a> {
+        /// Number of the episode.
+        pub episode: u64,
+        /// Path of the log.
+        pub path: &'a Path,
     }
+    info!(episode, ?path, "episode recorded")
 }
 
-/// All episodes of a round are in and learned from.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct RoundFinished {
-    /// The round.
-    pub round: u64,
-    /// Training steps so far.
-    pub env_steps: u64,
-    /// Updates so far.
-    pub updates: u64,
-    /// Share of the round's episodes that succeeded.
-    pub training_success: f64,
-    /// Share of the round's episodes in which an object was displaced.
-    pub training_moved: f64,
-    /// Units of advice spent so far.
-    pub advice_spent: u64,
-}
-
-impl RoundFinished {
-    /// Logs the event.
-    pub fn emit(&self) {
-        tracing::info!(
-            round = self.round,
-            env_steps = self.env_steps,
-            updates = self.updates,
-            training_success = self.training_success,
-            training_moved = self.training_moved,
-            advice_spent = self.advice_spent,
-            "round finished"
-        );
+event! {
+    /// The learner has filed all episodes of a round and made its updates.
+    pub struct RoundFinished {
+        /// Number of the round.
+        pub round: u64,
+        /// Environment steps of training so far.
+        pub env_steps: u64,
+        /// Updates so far.
+        pub updates: u64,
+        /// Success rate of the round's episodes, in [0, 1].
+        pub training_success: f64,
+        /// Share of the round's episodes in which an object was displaced, in [0, 1].
+        pub training_moved: f64,
+        /// Units of advice spent so far.
+        pub advice_spent: u64,
     }
+    info!(
+        round, env_steps, updates, training_success, training_moved, advice_spent,
+        "round finished"
+    )
 }
 
-/// A policy was evaluated.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct EvaluationFinished {
-    /// The round after which it was.
-    pub round: u64,
-    /// Training steps so far.
-    pub env_steps: u64,
-    /// Share of successful episodes.
-    pub success: f64,
-    /// Lower end of its 95 % interval.
-    pub success_low: f64,
-    /// Upper end of its 95 % interval.
-    pub success_high: f64,
-    /// Share of episodes with an arm–arm or arm–table contact.
-    pub collision_rate: f64,
-    /// Mean value that the critic gives to the policy's actions.
-    pub mean_q: f64,
-    /// Whether it is the best so far.
-    pub best: bool,
-}
-
-impl EvaluationFinished {
-    /// Logs the event.
-    pub fn emit(&self) {
-        tracing::info!(
-            round = self.round,
-            env_steps = self.env_steps,
-            success = self.success,
-            success_low = self.success_low,
-            success_high = self.success_high,
-            collision_rate = self.collision_rate,
-            mean_q = self.mean_q,
-            best = self.best,
-            "evaluation finished"
-        );
+event! {
+    /// The evaluation of a policy is complete.
+    pub struct EvaluationFinished {
+        /// Round after which the policy was evaluated.
+        pub round: u64,
+        /// Environment steps of training so far.
+        pub env_steps: u64,
+        /// Success rate, in [0, 1].
+        pub success: f64,
+        /// Lower bound of the 95 % interval of `success`.
+        pub success_low: f64,
+        /// Upper bound of the 95 % interval of `success`.
+        pub success_high: f64,
+        /// Share of episodes with a contact between the arms, or between an arm and the table.
+        pub collision_rate: f64,
+        /// Mean Q-value of the policy's actions.
+        pub mean_q: f64,
+        /// Whether this is the best policy so far.
+        pub best: bool,
     }
+    info!(
+        round, env_steps, success, success_low, success_high, collision_rate, mean_q, best,
+        "evaluation finished"
+    )
 }
 
-/// A worker joined the run.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct WorkerJoined<'a> {
-    /// Its number.
-    pub worker_id: u64,
-    /// Its label.
-    pub name: &'a str,
-}
-
-impl WorkerJoined<'_> {
-    /// Logs the event.
-    pub fn emit(&self) {
-        tracing::info!(worker_id = self.worker_id, name = self.name, "worker joined");
+event! {
+    /// A worker joined the run.
+    pub struct WorkerJoined<'a> {
+        /// Number of the worker.
+        pub worker_id: u64,
+        /// Label of the worker.
+        pub name: &'a str,
     }
+    info!(worker_id, name, "worker joined")
 }
 
-/// A worker was not heard of for the heartbeat timeout; its slots are assigned again.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct WorkerSilent<'a> {
-    /// Its number.
-    pub worker_id: u64,
-    /// Its label.
-    pub name: &'a str,
-    /// Slots that are assigned again.
-    pub n_slots: usize,
-}
-
-impl WorkerSilent<'_> {
-    /// Logs the event.
-    pub fn emit(&self) {
-        tracing::warn!(
-            worker_id = self.worker_id,
-            name = self.name,
-            n_slots = self.n_slots,
-            "worker silent"
-        );
+event! {
+    /// A worker sent nothing for the heartbeat timeout; its slots are reassigned.
+    pub struct WorkerSilent<'a> {
+        /// Number of the worker.
+        pub worker_id: u64,
+        /// Label of the worker.
+        pub name: &'a str,
+        /// Number of slots that are reassigned.
+        pub n_slots: usize,
     }
+    warn!(worker_id, name, n_slots, "worker silent")
 }
 
-/// Workers may fetch the parameters of a version.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct ParametersPublished {
-    /// The version.
-    pub version: u64,
-}
-
-impl ParametersPublished {
-    /// Logs the event.
-    pub fn emit(&self) {
-        tracing::debug!(version = self.version, "parameters published");
+event! {
+    /// Workers can fetch the parameters of a version.
+    pub struct ParametersPublished {
+        /// The parameter version.
+        pub version: u64,
     }
+    debug!(version, "parameters published")
 }
 
-/// The state of a run is on the disk.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct CheckpointSaved<'a> {
-    /// The round after which it was taken.
-    pub round: u64,
-    /// Where it is.
-    pub path: &'a Path,
-    /// SHA-256 over its contents.
-    pub digest: &'a str,
-}
-
-impl CheckpointSaved<'_> {
-    /// Logs the event.
-    pub fn emit(&self) {
-        tracing::info!(round = self.round, path = ?self.path, digest = self.digest, "checkpoint saved");
+event! {
+    /// A checkpoint of the run is on disk.
+    pub struct CheckpointSaved<'a> {
+        /// Round after which the checkpoint was taken.
+        pub round: u64,
+        /// Path of the checkpoint.
+        pub path: &'a Path,
+        /// SHA-256 of its contents.
+        pub digest: &'a str,
     }
+    info!(round, ?path, digest, "checkpoint saved")
 }
 
-/// A run goes on from a checkpoint.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct RunResumed<'a> {
-    /// The checkpoint's round.
-    pub round: u64,
-    /// Where the checkpoint is.
-    pub path: &'a Path,
-}
-
-impl RunResumed<'_> {
-    /// Logs the event.
-    pub fn emit(&self) {
-        tracing::info!(round = self.round, path = ?self.path, "run resumed");
+event! {
+    /// A run continues from a checkpoint.
+    pub struct RunResumed<'a> {
+        /// Round of the checkpoint.
+        pub round: u64,
+        /// Path of the checkpoint.
+        pub path: &'a Path,
     }
+    info!(round, ?path, "run resumed")
 }
 
-/// An account of advice was opened, or opened again.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct AdviceAccountOpened<'a> {
-    /// Its name.
-    pub account: &'a str,
-    /// Units in all.
-    pub budget: u64,
-    /// Units spent already.
-    pub spent: u64,
-    /// When the teacher advises.
-    pub strategy: &'a str,
-}
-
-impl AdviceAccountOpened<'_> {
-    /// Logs the event.
-    pub fn emit(&self) {
-        tracing::info!(
-            account = self.account,
-            budget = self.budget,
-            spent = self.spent,
-            strategy = self.strategy,
-            "advice account opened"
-        );
+event! {
+    /// An account of advice was opened or reopened.
+    pub struct AdviceAccountOpened<'a> {
+        /// Name of the account.
+        pub account: &'a str,
+        /// Budget, in units.
+        pub budget: u64,
+        /// Units spent already.
+        pub spent: u64,
+        /// Advising strategy.
+        pub strategy: &'a str,
     }
+    info!(account, budget, spent, strategy, "advice account opened")
 }
 
-/// The last unit of an account is spent: the student is on its own.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct BudgetExhausted<'a> {
-    /// The account's name.
-    pub account: &'a str,
-    /// Units it had.
-    pub budget: u64,
-}
-
-impl BudgetExhausted<'_> {
-    /// Logs the event.
-    pub fn emit(&self) {
-        tracing::info!(account = self.account, budget = self.budget, "advice budget exhausted");
+event! {
+    /// The last unit of an account is spent; the student acts without advice from now on.
+    pub struct BudgetExhausted<'a> {
+        /// Name of the account.
+        pub account: &'a str,
+        /// Budget, in units.
+        pub budget: u64,
     }
+    info!(account, budget, "advice budget exhausted")
 }
 
-/// A peer cannot be reached; it is tried again after a while.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Reconnecting<'a> {
-    /// The peer: "learner" or "teacher".
-    pub peer: &'a str,
-    /// How many attempts failed in a row.
-    pub attempt: u32,
-    /// The wait before the next.
-    pub wait_millis: u64,
-    /// Why the latest failed.
-    pub reason: &'a str,
-}
-
-impl Reconnecting<'_> {
-    /// Logs the event.
-    pub fn emit(&self) {
-        tracing::warn!(
-            peer = self.peer,
-            attempt = self.attempt,
-            wait_millis = self.wait_millis,
-            reason = self.reason,
-            "reconnecting"
-        );
+event! {
+    /// A peer is unreachable and will be retried.
+    pub struct Reconnecting<'a> {
+        /// The peer: `learner` or `teacher`.
+        pub peer: &'a str,
+        /// Number of consecutive failed attempts.
+        pub attempt: u32,
+        /// Delay before the next attempt, milliseconds.
+        pub wait_millis: u64,
+        /// Cause of the latest failure.
+        pub reason: &'a str,
     }
+    warn!(peer, attempt, wait_millis, reason, "reconnecting")
 }
 
-/// A peer answers again.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Reconnected<'a> {
-    /// The peer: "learner" or "teacher".
-    pub peer: &'a str,
-    /// How many attempts had failed.
-    pub attempts: u32,
-}
-
-impl Reconnected<'_> {
-    /// Logs the event.
-    pub fn emit(&self) {
-        tracing::info!(peer = self.peer, attempts = self.attempts, "reconnected");
+event! {
+    /// A peer is reachable again.
+    pub struct Reconnected<'a> {
+        /// The peer: `learner` or `teacher`.
+        pub peer: &'a str,
+        /// Number of attempts that failed.
+        pub attempts: u32,
     }
+    info!(peer, attempts, "reconnected")
 }
 
-/// A run ended.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct RunFinished<'a> {
-    /// Why it ended.
-    pub reason: &'a str,
-    /// Its last round.
-    pub round: u64,
-    /// SHA-256 over the learning state.
-    pub digest: &'a str,
-}
-
-impl RunFinished<'_> {
-    /// Logs the event.
-    pub fn emit(&self) {
-        tracing::info!(
-            reason = self.reason,
-            round = self.round,
-            digest = self.digest,
-            "run finished"
-        );
+event! {
+    /// A run ended.
+    pub struct RunFinished<'a> {
+        /// Why the run ended.
+        pub reason: &'a str,
+        /// Number of its last round.
+        pub round: u64,
+        /// SHA-256 of the learning state.
+        pub digest: &'a str,
     }
+    info!(reason, round, digest, "run finished")
 }

@@ -1,8 +1,9 @@
-//! What the services tell about themselves: typed events, the metrics of a run, and a log of every recorded episode
-//! that Foxglove opens and `tandem replay` plays again, and the records of trials on arms.
+//! Telemetry of Tandem's services: typed events, metrics of runs, MCAP logs of episodes and trials, and results of
+//! trials.
 //!
-//! Knows the layout of its files and nothing of who writes or reads them. No clock is read here: an episode's times
-//! are simulated, and a run's are handed in.
+//! Foxglove opens the logs; `tandem replay` simulates recorded episodes again. The crate defines the layout of its
+//! files, and does not depend on what writes or reads them. It reads no clock: the times of an episode are simulated,
+//! and those of a run are arguments.
 #![warn(missing_docs)]
 
 pub mod episode_log;
@@ -19,7 +20,6 @@ mod scene;
 pub mod standard_error;
 pub mod trial_log;
 pub mod trials;
-mod whole_file;
 
 pub use episode_log::{EpisodeLog, LoggedTransition, read_episode};
 pub use error::Error;
@@ -27,6 +27,5 @@ pub use messages::EpisodeMetadata;
 pub use metrics::{MetricsLog, MetricsRow};
 pub use recorder::{EpisodeRecorder, TransitionRecord};
 pub use recovery::{RecoveredCounts, recover};
-pub use trial_log::{LogLevel, TrialLook, TrialMetadata, TrialOutcome, TrialRecorder};
-pub use trials::{ToolsAt, TrialRow, TrialsLog, read_trials};
-pub use whole_file::read_regular;
+pub use trial_log::{LogLevel, TrialMetadata, TrialOutcome, TrialRecorder, TrialSnapshot};
+pub use trials::{ToolPathPoint, TrialRow, TrialsLog, read_trials};

@@ -1,4 +1,4 @@
-//! An MCAP file while it is being written: its names, its options, its channels.
+//! An MCAP file while it is written: its names, options and channels.
 
 use std::collections::BTreeMap;
 use std::fs::File;
@@ -9,13 +9,14 @@ use std::path::{Path, PathBuf};
 use foxglove::Encode;
 use foxglove::messages::{Log, Timestamp, log::Level};
 use mcap::records::{MessageHeader, Metadata};
+use tandem_system::atomic_file;
 
 use crate::error::Error;
 
-/// An MCAP writer, where its file is, and the buffer in which messages are encoded.
+/// An MCAP writer with the path of its file and a buffer for encoding messages.
 ///
-/// The file is called `NAME.part` until [`finish`](Self::finish), which syncs it first, so a file without that ending is
-/// always whole, also after a power cut.
+/// The file is named `NAME.part` until [`finish`](Self::finish) syncs and renames it, so a file without that suffix is
+/// complete even after a power cut.
 pub(crate) struct LogFile {
     path: PathBuf,
     part_path: PathBuf,
@@ -24,7 +25,7 @@ pub(crate) struct LogFile {
 }
 
 impl LogFile {
-    /// Starts the file that will be called `path`; an unfinished one of that name is overwritten.
+    /// Creates the file that will be named `path`. An incomplete file of that name is overwritten.
     pub(crate) fn create(path: &Path) -> Result<Self, Error> {
         let part_path = part_path(path);
         let file = File::create(&part_path).map_err(Error::io("create", &part_path))?;
@@ -33,7 +34,7 @@ impl LogFile {
         Ok(Self { path: path.to_owned(), part_path, writer, buffer: Vec::new() })
     }
 
-    /// For `map_err` on what is written here.
+    /// Returns a function for `map_err` on writing to this file.
     pub(crate) fn write_error(&self) -> impl FnOnce(mcap::McapError) -> Error {
         Error::write_log(&self.part_path)
     }
@@ -46,7 +47,7 @@ impl LogFile {
         self.writer.write_metadata(&Metadata { name: name.to_owned(), metadata })
     }
 
-    /// Brings everything so far onto the disk, where a dying process leaves it.
+    /// Flushes everything so far to the file, where it outlives the process.
     pub(crate) fn flush(&mut self) -> mcap::McapResult<()> {
         self.writer.flush()
     }
@@ -54,10 +55,9 @@ impl LogFile {
     /// Completes the file, gives it its name and returns that.
     pub(crate) fn finish(mut self) -> Result<PathBuf, Error> {
         self.writer.finish().map_err(Error::write_log(&self.part_path))?;
-        let synced = self.writer.into_inner().get_ref().sync_all();
-        synced.map_err(Error::io("sync", &self.part_path))?;
-        std::fs::rename(&self.part_path, &self.path)
-            .map_err(Error::io("rename", &self.part_path))?;
+        let file = self.writer.into_inner();
+        atomic_file::publish(file.get_ref(), &self.part_path, &self.path)
+            .map_err(Error::io("complete", &self.part_path))?;
         Ok(self.path)
     }
 }
@@ -105,14 +105,14 @@ impl<T: Encode> Channel<T> {
     }
 }
 
-/// The name of `path` while it is being written.
+/// Returns the name of `path` while it is written.
 fn part_path(path: &Path) -> PathBuf {
     let mut name = path.as_os_str().to_owned();
     name.push(".part");
     PathBuf::from(name)
 }
 
-/// The options of every log: no helper threads, as there are as many writers as episodes in flight.
+/// Returns the options of all logs: no helper threads, because there is one writer per episode in progress.
 pub(crate) fn write_options() -> mcap::WriteOptions {
     mcap::WriteOptions::new()
         .compression(Some(mcap::Compression::Zstd))
@@ -121,7 +121,7 @@ pub(crate) fn write_options() -> mcap::WriteOptions {
         .library(concat!("tandem/", env!("CARGO_PKG_VERSION")))
 }
 
-/// A line for a log's channel of text.
+/// Returns a line for a log channel.
 pub(crate) fn log_line(time_ns: u64, level: Level, message: &str) -> Log {
     Log {
         timestamp: Some(timestamp(time_ns)),
@@ -132,7 +132,10 @@ pub(crate) fn log_line(time_ns: u64, level: Level, message: &str) -> Log {
     }
 }
 
-/// Seconds since the start as a log's nanoseconds.
+/// Converts seconds since the start to nanoseconds.
+///
+/// # Errors
+/// If the time is negative, not finite or too large.
 pub(crate) fn nanoseconds(time_s: f64) -> Result<u64, Error> {
     let time = std::time::Duration::try_from_secs_f64(time_s).ok();
     time.and_then(|time| u64::try_from(time.as_nanos()).ok()).ok_or(Error::Time { time_s })

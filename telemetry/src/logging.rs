@@ -1,4 +1,4 @@
-//! Sets up where log lines go. Only a program calls this; libraries emit.
+//! Initialisation of logging. Only a program calls it; libraries emit events.
 
 use std::fs::OpenOptions;
 use std::io::IsTerminal as _;
@@ -12,28 +12,28 @@ use tracing_subscriber::layer::{Layer as _, SubscriberExt as _};
 use tracing_subscriber::util::SubscriberInitExt as _;
 
 use crate::error::Error;
-use crate::standard_error::Events;
+use crate::standard_error::EventWriter;
 
-/// Where log lines go and which ones.
+/// Destinations of log lines, and their filters.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct LogConfig {
-    /// The least severe level shown on standard error; `None` for none at all.
+    /// Least severe level that is written to standard error; `None` writes nothing there.
     pub console: Option<LevelFilter>,
-    /// A file that gets everything from `info` up; lines are added to what it has.
+    /// File to which lines of level `info` and above are appended.
     pub file: Option<PathBuf>,
-    /// Directives that take the place of the levels above: `LEVEL` or `TARGET=LEVEL`, separated by commas.
+    /// Directives that replace the levels of both destinations: `LEVEL` or `TARGET=LEVEL`, separated by commas.
     pub directives: Option<String>,
 }
 
-/// Sends the log lines of this process where `config` says. Lines that cannot be written are dropped.
+/// Initialises logging of this process. Lines that cannot be written are dropped.
 ///
 /// # Errors
-/// When the file cannot be opened, the directives are malformed or logging is already set up.
+/// If the file cannot be opened, the directives are malformed, or logging is already initialised.
 pub fn init(config: &LogConfig) -> Result<(), Error> {
     let console = match config.console {
         Some(level) => {
             let layer = fmt::layer()
-                .with_writer(Events::default)
+                .with_writer(EventWriter::default)
                 .with_ansi(std::io::stderr().is_terminal());
             Some(layer.with_filter(filter(level, config)?))
         }
@@ -55,7 +55,7 @@ pub fn init(config: &LogConfig) -> Result<(), Error> {
     Ok(())
 }
 
-/// Our own crates from `level` up, others' warnings.
+/// Returns the filter of `config`, by default Tandem's crates from `level` up and warnings of other crates.
 fn filter(level: LevelFilter, config: &LogConfig) -> Result<Targets, Error> {
     let directives = config.directives.clone().unwrap_or_else(|| format!("warn,tandem={level}"));
     match directives.parse::<Targets>() {
@@ -64,7 +64,7 @@ fn filter(level: LevelFilter, config: &LogConfig) -> Result<Targets, Error> {
     }
 }
 
-/// Whether `name` can be the path of a module.
+/// Returns whether `name` can be a module path.
 fn is_target(name: &str) -> bool {
     name.chars().all(|character| character.is_ascii_alphanumeric() || "_-:".contains(character))
 }
@@ -74,17 +74,18 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_filter_is_a_list_of_levels_and_modules() {
-        let check = |directives: &str, is_good: bool| {
+    fn a_filter_is_a_list_of_levels_and_module_levels() {
+        let check = |directives: &str, is_valid: bool| {
             let config =
                 LogConfig { directives: Some(directives.to_owned()), ..LogConfig::default() };
-            assert_eq!(filter(LevelFilter::INFO, &config).is_ok(), is_good, "{directives:?}");
+            assert_eq!(filter(LevelFilter::INFO, &config).is_ok(), is_valid, "{directives:?}");
         };
-        for good in ["info", "off", "tandem_learner=debug", "warn,tandem_net::link=trace,h2=info"] {
-            check(good, true);
+        for valid in ["info", "off", "tandem_learner=debug", "warn,tandem_net::link=trace,h2=info"]
+        {
+            check(valid, true);
         }
-        for bad in ["[[", "tandem=loud", "tandem[run]=info", "a=b=c", "in fo"] {
-            check(bad, false);
+        for malformed in ["[[", "tandem=loud", "tandem[run]=info", "a=b=c", "in fo"] {
+            check(malformed, false);
         }
     }
 }

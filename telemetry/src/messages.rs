@@ -1,4 +1,4 @@
-//! Our own messages in an episode's log, and the metadata that lets the episode be played again.
+//! Tandem's own messages in an episode's log, and the metadata from which the episode can be simulated again.
 
 use std::collections::BTreeMap;
 
@@ -13,7 +13,7 @@ pub(crate) mod pb {
 
 const DESCRIPTORS: &[u8] = include_bytes!(concat!(env!("OUT_DIR"), "/episode_log_descriptor.bin"));
 
-macro_rules! encode_with_our_schema {
+macro_rules! encode_with_tandem_schema {
     ($($message:ident),*) => {$(
         impl Encode for pb::$message {
             type Error = prost::EncodeError;
@@ -37,9 +37,9 @@ macro_rules! encode_with_our_schema {
     )*};
 }
 
-encode_with_our_schema!(Transition, Stats, Outcome);
+encode_with_tandem_schema!(Transition, Stats, Outcome);
 
-/// Decodes one of our messages.
+/// Decodes one of Tandem's messages.
 pub(crate) fn decode<M: prost::Message + Default>(bytes: &[u8]) -> Result<M, prost::DecodeError> {
     M::decode(bytes)
 }
@@ -70,24 +70,24 @@ impl From<pb::ArmAdvice> for tandem_core::ArmAdvice {
     }
 }
 
-/// What is needed to play an episode again. Stands in its log as the MCAP metadata record `tandem.episode`.
+/// The inputs of an episode, from which it can be simulated again. Logged as the MCAP metadata record `tandem.episode`.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct EpisodeMetadata {
-    /// The run's name.
+    /// Name of the run.
     pub run: String,
-    /// The episode's number.
+    /// Number of the episode.
     pub episode: u64,
-    /// With the number, the address of its random draws.
+    /// Seed; with the number, it determines all random numbers of the episode.
     pub seed: u64,
-    /// What it was played for.
+    /// Purpose of the episode.
     pub kind: EpisodeKind,
     /// Version of the parameters that acted.
     pub parameter_version: u64,
-    /// Task and arms.
+    /// Task and number of arms.
     pub layout: Layout,
     /// Digest of the policy that acted.
     pub policy_digest: String,
-    /// How the world was set up, by the names its owner gives.
+    /// Settings of the world by name.
     pub world: BTreeMap<String, String>,
 }
 
@@ -99,7 +99,7 @@ const CHECKSUM: &str = "checksum";
 
 impl EpisodeMetadata {
     pub(crate) fn to_map(&self) -> BTreeMap<String, String> {
-        let ours = [
+        let fields = [
             ("format", FORMAT.to_owned()),
             ("run", self.run.clone()),
             ("episode", self.episode.to_string()),
@@ -112,13 +112,13 @@ impl EpisodeMetadata {
         ];
         let world =
             self.world.iter().map(|(key, value)| (format!("{WORLD_PREFIX}{key}"), value.clone()));
-        let ours = ours.into_iter().map(|(key, value)| (key.to_owned(), value));
-        with_checksum(ours.chain(world).collect())
+        let fields = fields.into_iter().map(|(key, value)| (key.to_owned(), value));
+        with_checksum(fields.chain(world).collect())
     }
 
-    /// Reads what [`Self::to_map`] wrote; on failure says which entry is missing or wrong.
+    /// Parses the result of [`Self::to_map`]. The error names the entry that is missing or wrong.
     pub(crate) fn from_map(map: &BTreeMap<String, String>) -> Result<Self, String> {
-        let text = |key: &str| map.get(key).ok_or_else(|| format!("metadata lacks {key:?}"));
+        let text = |key: &str| map.get(key).ok_or_else(|| format!("metadata lack {key:?}"));
         let number = |key: &str| {
             let value = text(key)?;
             value.parse::<u64>().map_err(|error| format!("metadata {key} {value:?}: {error}"))
@@ -154,25 +154,26 @@ impl EpisodeMetadata {
     }
 }
 
-/// The entries and their checksum.
+/// Adds the checksum of the entries.
 pub(crate) fn with_checksum(mut map: BTreeMap<String, String>) -> BTreeMap<String, String> {
     map.insert(CHECKSUM.to_owned(), checksum(&map));
     map
 }
 
-/// Compares the entries with their checksum. A log without one is taken as it is: older programs wrote none.
+/// Verifies the checksum of the entries. A log without one is accepted, because older versions wrote none.
 fn check_checksum(map: &BTreeMap<String, String>) -> Result<(), String> {
     let expected = checksum(map);
     match map.get(CHECKSUM) {
         Some(got) if *got != expected => Err(format!(
-            "metadata were altered: their {CHECKSUM} is {expected}, the log says {got:?}"
+            "metadata are damaged: their {CHECKSUM} is {expected}, the log has {got:?}"
         )),
         _ => Ok(()),
     }
 }
 
-/// CRC-32, hexadecimal, of all entries but its own. MCAP's own checksum of metadata comes at the end of a file, which
-/// a mended one has lost.
+/// Computes the CRC-32, hexadecimal, of all entries except the checksum itself.
+///
+/// MCAP's own checksum of metadata is at the end of a file, which an incomplete file lacks.
 fn checksum(map: &BTreeMap<String, String>) -> String {
     let mut crc = crc32fast::Hasher::new();
     for (key, value) in map.iter().filter(|(key, _)| *key != CHECKSUM) {
@@ -184,7 +185,7 @@ fn checksum(map: &BTreeMap<String, String>) -> String {
     format!("{:08x}", crc.finalize())
 }
 
-/// One bit an arm in `advised_arms`.
+/// Maximum number of arms: `advised_arms` has one bit per arm.
 const MAX_ARMS: usize = 8;
 
 const fn kind_name(kind: EpisodeKind) -> &'static str {

@@ -1,49 +1,51 @@
-//! The metrics of a run: one JSON object a line, one line an evaluation.
+//! Metrics of a run: `metrics.jsonl`, one JSON object per evaluation.
 
 use std::fs::{File, OpenOptions};
 use std::io::Write as _;
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Deserializer, Serialize};
+use tandem_system::regular_file;
 
 use crate::error::Error;
-use crate::whole_file::read_regular;
 
-/// What is known after one evaluation. Shares are in [0, 1]; a number that does not exist (no update yet, no training
-/// episode) is NaN here and `null` in the file.
+/// Metrics after one evaluation.
+///
+/// Shares are in [0, 1]. A value that does not exist (no update yet, no training episode) is NaN here and `null` in the
+/// file.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct MetricsRow {
-    /// The round after which the evaluation took place.
+    /// Round after which the policy was evaluated.
     pub round: u64,
-    /// Training steps so far, of all episodes.
+    /// Environment steps of training so far.
     pub env_steps: u64,
     /// Training episodes so far.
     pub episodes: u64,
     /// Updates of the networks so far.
     pub updates: u64,
-    /// Rounds by the paper's measure, 50 an epoch.
+    /// The paper's epochs so far, of 50 rounds each.
     pub paper_epochs: f64,
-    /// Wall time of the whole run, seconds, resumed parts added up.
+    /// Wall time of the run, seconds, summed over resumed parts.
     pub wall_s: f64,
-    /// Share of evaluation episodes that end with every object at its goal.
+    /// Success rate: share of evaluation episodes that end with every object at its goal.
     pub success: f64,
-    /// Share that end with the joint norm within the tolerance.
+    /// Share of evaluation episodes that end with the joint norm within the tolerance.
     pub success_joint: f64,
-    /// Each arm's share.
+    /// Success rate of each arm, shape `[n_arms]`.
     pub success_per_arm: Vec<f64>,
-    /// Lower end of the 95 % interval of `success`.
+    /// Lower bound of the 95 % interval of `success`.
     pub success_low: f64,
-    /// Upper end of the 95 % interval of `success`.
+    /// Upper bound of the 95 % interval of `success`.
     pub success_high: f64,
-    /// Share of evaluation episodes with an arm–arm or arm–table contact.
+    /// Share of evaluation episodes with a contact between the arms, or between an arm and the table.
     pub collision_rate: f64,
-    /// Mean value that the critic gives to the policy's actions.
+    /// Mean Q-value of the policy's actions.
     #[serde(deserialize_with = "nan_from_null")]
     pub mean_q: f64,
-    /// Mean critic loss since the last row.
+    /// Mean critic loss since the previous row.
     #[serde(deserialize_with = "nan_from_null")]
     pub critic_loss: f64,
-    /// Mean actor loss since the last row.
+    /// Mean actor loss since the previous row.
     #[serde(deserialize_with = "nan_from_null")]
     pub actor_loss: f64,
     /// Units of advice spent so far.
@@ -52,18 +54,18 @@ pub struct MetricsRow {
     pub budget_left: u64,
     /// Share of evaluation episodes in which an object was displaced.
     pub moved: f64,
-    /// Share of evaluation episodes with such a contact before every object had arrived for good.
+    /// Share of evaluation episodes with such a contact before all objects were at their goals for good.
     pub collision_rate_before_success: f64,
-    /// Success of the training episodes since the last row.
+    /// Success rate of the training episodes since the previous row.
     #[serde(deserialize_with = "nan_from_null")]
     pub training_success: f64,
-    /// Share of the training episodes since the last row in which an object was displaced.
+    /// Share of training episodes since the previous row in which an object was displaced.
     #[serde(deserialize_with = "nan_from_null")]
     pub training_moved: f64,
-    /// Mean sum of joint rewards of the evaluation episodes.
+    /// Mean return of the evaluation episodes: the undiscounted sum of joint rewards.
     #[serde(deserialize_with = "nan_from_null")]
     pub mean_return: f64,
-    /// Evaluation episodes played.
+    /// Number of evaluation episodes.
     pub n_episodes: u64,
     /// Whether this is the best policy so far.
     pub best: bool,
@@ -73,7 +75,7 @@ fn nan_from_null<'de, D: Deserializer<'de>>(deserializer: D) -> Result<f64, D::E
     Ok(Option::deserialize(deserializer)?.unwrap_or(f64::NAN))
 }
 
-/// The metrics file of a run, open for appending.
+/// A metrics file, open for appending.
 #[derive(Debug)]
 pub struct MetricsLog {
     path: PathBuf,
@@ -81,10 +83,10 @@ pub struct MetricsLog {
 }
 
 impl MetricsLog {
-    /// Opens `path`, or creates it. A last line that a killed writer left half written is cut off, with a warning.
+    /// Opens `path`, or creates it. An incomplete last line of a killed writer is removed, with a warning.
     ///
     /// # Errors
-    /// When the file cannot be opened or a whole line is no row.
+    /// If the file cannot be opened or a complete line is not a row.
     pub fn open(path: &Path) -> Result<Self, Error> {
         let file = OpenOptions::new()
             .append(true)
@@ -93,15 +95,16 @@ impl MetricsLog {
             .map_err(Error::io("open", path))?;
         let log = Self { path: path.to_owned(), file };
         let rows = Rows::read(path)?;
-        log.set_len(rows.whole_bytes())?;
+        log.set_len(rows.n_bytes())?;
         Ok(log)
     }
 
-    /// Opens `path`, or creates it, so that its rows are the first of `rows`: what follows in the file, or is written
-    /// otherwise, is cut off. Gives how many rows are there.
+    /// Opens `path`, or creates it, and truncates it after the last line that agrees with `rows`.
+    ///
+    /// Returns the log and the number of rows that it contains, which are the first of `rows`.
     ///
     /// # Errors
-    /// When the file cannot be opened, read or cut.
+    /// If the file cannot be opened, read or truncated.
     pub fn restore(path: &Path, rows: &[MetricsRow]) -> Result<(Self, usize), Error> {
         let file = OpenOptions::new()
             .append(true)
@@ -109,10 +112,10 @@ impl MetricsLog {
             .open(path)
             .map_err(Error::io("open", path))?;
         let log = Self { path: path.to_owned(), file };
-        let bytes = read_regular(path).map_err(Error::io("read", path))?;
+        let bytes = regular_file::read(path).map_err(Error::io("read", path))?;
         let (mut end, mut n_rows) = (0, 0);
         for row in rows {
-            let line = line_of(row).map_err(Error::io("compare", path))?;
+            let line = encode_line(row).map_err(Error::io("compare", path))?;
             if !bytes[end..].starts_with(&line) {
                 break;
             }
@@ -125,55 +128,55 @@ impl MetricsLog {
         Ok((log, n_rows))
     }
 
-    /// Adds a row, whole or not at all.
+    /// Appends a row, as a whole or not at all.
     ///
     /// # Errors
-    /// When the file cannot be written.
+    /// If the file cannot be written.
     pub fn append(&mut self, row: &MetricsRow) -> Result<(), Error> {
         let write_error = |source| Error::io("append to", &self.path)(source);
-        let line = line_of(row).map_err(write_error)?;
+        let line = encode_line(row).map_err(write_error)?;
         let end = self.file.metadata().map_err(write_error)?.len();
         let written = self.file.write_all(&line).and_then(|()| self.file.sync_data());
         written.map_err(|source| {
-            // A disk that is full takes a part of a line and still lets files be cut.
+            // A full disk may accept part of a line, and still allows truncation.
             drop(self.file.set_len(end));
             write_error(source)
         })
     }
 
-    /// Every row of the metrics file `path`; a half-written last line is left out, with a warning.
+    /// Reads all rows of the metrics file `path`. An incomplete last line is ignored, with a warning.
     ///
     /// # Errors
-    /// When the file cannot be read or a whole line is no row.
+    /// If the file cannot be read or a complete line is not a row.
     pub fn read_all(path: &Path) -> Result<Vec<MetricsRow>, Error> {
         Ok(Rows::read(path)?.rows.into_iter().map(|(_, row)| row).collect())
     }
 
     fn set_len(&self, n_bytes: usize) -> Result<(), Error> {
-        self.file.set_len(n_bytes as u64).map_err(Error::io("cut", &self.path))
+        self.file.set_len(n_bytes as u64).map_err(Error::io("truncate", &self.path))
     }
 }
 
-/// A row as it stands in the file.
-fn line_of(row: &MetricsRow) -> std::io::Result<Vec<u8>> {
+/// Encodes a row as a line of the file.
+fn encode_line(row: &MetricsRow) -> std::io::Result<Vec<u8>> {
     let mut line = serde_json::to_vec(row)?;
     line.push(b'\n');
     Ok(line)
 }
 
-/// The rows of a file, each with the offset of the byte after its line.
+/// The rows of a file, each with the offset of the end of its line.
 struct Rows {
     rows: Vec<(usize, MetricsRow)>,
 }
 
 impl Rows {
     fn read(path: &Path) -> Result<Self, Error> {
-        let bytes = read_regular(path).map_err(Error::io("read", path))?;
+        let bytes = regular_file::read(path).map_err(Error::io("read", path))?;
         let mut rows = Vec::new();
         let mut end = 0;
         for (line_idx, line) in bytes.split_inclusive(|byte| *byte == b'\n').enumerate() {
             if !line.ends_with(b"\n") {
-                tracing::warn!(?path, line = line_idx + 1, "half-written metrics row left out");
+                tracing::warn!(?path, line = line_idx + 1, "incomplete metrics row ignored");
                 break;
             }
             end += line.len();
@@ -190,7 +193,8 @@ impl Rows {
         Ok(Self { rows })
     }
 
-    fn whole_bytes(&self) -> usize {
+    /// Returns the length of all complete lines, bytes.
+    fn n_bytes(&self) -> usize {
         self.rows.last().map_or(0, |(end, _)| *end)
     }
 }
@@ -222,7 +226,7 @@ mod tests {
     }
 
     #[test]
-    fn rows_are_read_back_as_they_were() {
+    fn rows_are_read_as_they_were_written() {
         let (_dir, path, log) = log_of(&[5, 10]);
         drop(log);
         MetricsLog::open(&path).unwrap().append(&row(15)).unwrap();
@@ -230,7 +234,7 @@ mod tests {
     }
 
     #[test]
-    fn a_number_that_does_not_exist_is_null_in_the_file_and_nan_again() {
+    fn a_missing_value_is_null_in_the_file_and_nan_when_read() {
         let (_dir, path, mut log) = log_of(&[]);
         log.append(&MetricsRow { mean_q: f64::NAN, ..row(5) }).unwrap();
         assert!(std::fs::read_to_string(&path).unwrap().contains(r#""mean_q":null"#));
@@ -238,7 +242,7 @@ mod tests {
     }
 
     #[test]
-    fn a_row_begins_with_the_keys_that_outsiders_rely_on() {
+    fn a_row_starts_with_the_documented_keys() {
         let text = serde_json::to_string(&row(5)).unwrap();
         let keys = "round env_steps episodes updates paper_epochs wall_s success success_joint success_per_arm success_low \
                     success_high collision_rate mean_q critic_loss actor_loss advice_spent budget_left";
@@ -248,12 +252,12 @@ mod tests {
     }
 
     #[test]
-    fn a_torn_last_line_is_dropped_at_every_length_and_never_glued_to_the_next() {
+    fn an_incomplete_last_line_is_removed_before_the_next_row() {
         let (_dir, path, _) = log_of(&[5, 10]);
-        let whole = std::fs::read(&path).unwrap();
-        let first = whole.iter().position(|byte| *byte == b'\n').unwrap() + 1;
-        for n_bytes in [first + 1, first + 40, whole.len() - 1] {
-            std::fs::write(&path, &whole[..n_bytes]).unwrap();
+        let complete = std::fs::read(&path).unwrap();
+        let first = complete.iter().position(|byte| *byte == b'\n').unwrap() + 1;
+        for n_bytes in [first + 1, first + 40, complete.len() - 1] {
+            std::fs::write(&path, &complete[..n_bytes]).unwrap();
             assert_eq!(rounds(&path), [5]);
             MetricsLog::open(&path).unwrap().append(&row(20)).unwrap();
             assert_eq!(rounds(&path), [5, 20]);
@@ -261,19 +265,19 @@ mod tests {
     }
 
     #[test]
-    fn a_whole_line_that_is_no_row_is_an_error_that_names_it() {
+    fn an_error_names_the_line_that_is_not_a_row() {
         let (_dir, path, _) = log_of(&[5]);
         OpenOptions::new().append(true).open(&path).unwrap().write_all(b"{\"round\":\n").unwrap();
         assert!(matches!(MetricsLog::read_all(&path), Err(Error::MetricsRow { line: 2, .. })));
     }
 
     #[test]
-    fn what_differs_from_the_rows_that_are_known_is_cut_off() {
-        let check = |known: &[u64], spoil: fn(&mut Vec<u8>), expected: &[u64]| {
+    fn restore_removes_what_differs_from_the_known_rows() {
+        let check = |known: &[u64], alter: fn(&mut Vec<u8>), expected: &[u64]| {
             let (_dir, path, log) = log_of(&[5, 10, 15]);
             drop(log);
             let mut bytes = std::fs::read(&path).unwrap();
-            spoil(&mut bytes);
+            alter(&mut bytes);
             std::fs::write(&path, bytes).unwrap();
             let known: Vec<MetricsRow> = known.iter().map(|round| row(*round)).collect();
             let (mut log, n_rows) = MetricsLog::restore(&path, &known).unwrap();
@@ -293,8 +297,8 @@ mod tests {
     }
 
     #[test]
-    fn a_number_is_the_same_bits_after_being_written_and_read() {
-        // A parser that rounds twice reads the third as its neighbour.
+    fn a_number_has_the_same_bits_after_writing_and_reading() {
+        // A parser that rounds twice reads a neighbour of the third number.
         for success in [0.1 + 0.2, 1.0 / 3.0, 1.234_567_890_123_456_7e-300, 5e-324] {
             let (_dir, path, mut log) = log_of(&[]);
             log.append(&MetricsRow { success, ..row(5) }).unwrap();

@@ -1,4 +1,4 @@
-//! Writes one episode into one MCAP file.
+//! Writing of an episode's MCAP log.
 
 use std::path::{Path, PathBuf};
 
@@ -13,40 +13,40 @@ use crate::log_file::{Channel, LogFile, check_length, log_line, nanoseconds, tim
 use crate::messages::{EpisodeMetadata, METADATA_NAME, pb};
 use crate::scene::{frame_transforms, joint_states, scene_update};
 
-/// Steps after which what was logged is on the disk even if the process dies.
+/// Number of steps after which the log is flushed to disk.
 const FLUSH_EVERY_STEPS: u32 = 10;
 
-/// Topics of our own schemas; the recorder writes them and [`crate::read_episode`] looks for them.
+/// Topics that [`crate::read_episode`] reads.
 pub(crate) const TRANSITION_TOPIC: &str = "/transition";
 pub(crate) const OUTCOME_TOPIC: &str = "/outcome";
 
-/// One control step, as the recorder takes it.
+/// One control step, for [`EpisodeRecorder::record_step`].
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct TransitionRecord<'a> {
-    /// The step, from 0.
+    /// Number of the step, from 0.
     pub step: u32,
-    /// Before the step, shape `[n_observation]`.
+    /// Observation before the step, shape `[n_observation]`.
     pub observation: &'a [f32],
-    /// Shape `[n_goal]`.
+    /// Goal, shape `[n_goal]`.
     pub goal: &'a [f32],
-    /// As executed, in [−1, 1], shape `[n_action]`.
+    /// Executed action, in [−1, 1], shape `[n_action]`.
     pub action: &'a [f32],
-    /// The joint reward.
+    /// Joint reward of all arms.
     pub reward: f32,
-    /// Each arm's own reward, shape `[n_arms]`.
+    /// Reward of each arm, shape `[n_arms]`.
     pub rewards_per_arm: &'a [f32],
-    /// Bit `a` set when arm `a` executed the teacher's action.
+    /// Bit `a` is set if arm `a` executed the teacher's action.
     pub advised_arms: u8,
-    /// What touched what during the step.
+    /// Contacts during the step.
     pub contacts: Contacts,
-    /// What the teacher said, arm by arm; empty when it was not asked.
+    /// Advice of the teacher in arm order; empty if it was not asked.
     pub advice: &'a [ArmAdvice],
 }
 
-/// Writes one episode into one MCAP file.
+/// Writes one episode to one MCAP file.
 ///
-/// The file is called `NAME.mcap.part` until [`finish`](Self::finish) gives it its name, so a file without that
-/// ending is always whole. Message times are simulated time since the episode's start.
+/// The file is named `NAME.mcap.part` until [`finish`](Self::finish) renames it, so a file without that suffix is
+/// always complete. Message times are simulated time since the start of the episode.
 pub struct EpisodeRecorder {
     layout: Layout,
     file: LogFile,
@@ -57,10 +57,10 @@ pub struct EpisodeRecorder {
 }
 
 impl EpisodeRecorder {
-    /// Starts the log `path` of the episode that `metadata` describes; an unfinished one of that name is overwritten.
+    /// Creates the log `path` of the episode with this `metadata`. An incomplete log of that name is overwritten.
     ///
     /// # Errors
-    /// When the file cannot be written.
+    /// If the file cannot be written.
     pub fn create(path: &Path, metadata: &EpisodeMetadata) -> Result<Self, Error> {
         let mut file = LogFile::create(path)?;
         let channels = Channels::start(&mut file, metadata).map_err(file.write_error())?;
@@ -74,10 +74,10 @@ impl EpisodeRecorder {
         })
     }
 
-    /// Logs one control step: the world before it and what was done.
+    /// Logs one control step and the scene before it.
     ///
     /// # Errors
-    /// When a vector does not fit the layout, or the file cannot be written.
+    /// If a vector does not fit the layout, or the file cannot be written.
     pub fn record_step(
         &mut self,
         scene: &Scene,
@@ -86,39 +86,39 @@ impl EpisodeRecorder {
         self.check_lengths(transition)?;
         self.time_ns = nanoseconds(scene.time_s)?;
         self.goal = transition.goal.to_vec();
-        self.count(scene, transition);
+        self.update_stats(scene, transition);
         let caption = step_caption(&self.stats, transition);
         self.write_step(scene, &caption, transition).map_err(self.file.write_error())
     }
 
-    /// Logs the world and the observation after the last step, shape `[n_observation]`, and what they amount to.
+    /// Logs the scene and the observation (shape `[n_observation]`) after the last step, and the outcome.
     ///
     /// # Errors
-    /// When the observation does not fit the layout, or the file cannot be written.
+    /// If the observation does not fit the layout, or the file cannot be written.
     pub fn record_outcome(&mut self, scene: &Scene, observation: &[f32]) -> Result<(), Error> {
         check_length("observation", observation.len(), self.layout.n_observation())?;
         self.time_ns = nanoseconds(scene.time_s)?;
         self.stats.goal_distance_m = goal_distances_m(scene);
         let outcome = self.outcome(observation);
-        let verdict = if outcome.success { "success" } else { "failure" };
-        let caption = format!("{verdict}\nreturn {:.0}", self.stats.episode_return);
+        let result = if outcome.success { "success" } else { "failure" };
+        let caption = format!("{result}\nreturn {:.0}", self.stats.episode_return);
         self.write_outcome(scene, &caption, &outcome).map_err(self.file.write_error())
     }
 
-    /// Adds a line to the episode's log channel, at the time of the latest step.
+    /// Adds a line to the log channel, at the time of the latest step.
     ///
     /// # Errors
-    /// When the file cannot be written.
+    /// If the file cannot be written.
     pub fn log(&mut self, message: &str) -> Result<(), Error> {
         let line = log_line(self.time_ns, Level::Info, message);
         let (file, now) = (&mut self.file, self.time_ns);
         self.channels.log.write(file, now, &line).map_err(self.file.write_error())
     }
 
-    /// Completes the file, gives it its name and returns that.
+    /// Completes the file, gives it its final name and returns its path.
     ///
     /// # Errors
-    /// When the file cannot be written or renamed.
+    /// If the file cannot be written or renamed.
     pub fn finish(self) -> Result<PathBuf, Error> {
         self.file.finish()
     }
@@ -134,7 +134,7 @@ impl EpisodeRecorder {
         Ok(())
     }
 
-    fn count(&mut self, scene: &Scene, transition: &TransitionRecord<'_>) {
+    fn update_stats(&mut self, scene: &Scene, transition: &TransitionRecord<'_>) {
         self.stats.step = transition.step;
         self.stats.episode_return += f64::from(transition.reward);
         self.stats.goal_distance_m = goal_distances_m(scene);
@@ -164,7 +164,7 @@ impl EpisodeRecorder {
         caption: &str,
         step: &TransitionRecord<'_>,
     ) -> mcap::McapResult<()> {
-        self.write_world(scene, caption)?;
+        self.write_scene(scene, caption)?;
         self.channels.transition.write(&mut self.file, self.time_ns, &transition_message(step))?;
         self.channels.stats.write(&mut self.file, self.time_ns, &self.stats)?;
         if (step.step + 1).is_multiple_of(FLUSH_EVERY_STEPS) {
@@ -179,12 +179,12 @@ impl EpisodeRecorder {
         caption: &str,
         outcome: &pb::Outcome,
     ) -> mcap::McapResult<()> {
-        self.write_world(scene, caption)?;
+        self.write_scene(scene, caption)?;
         self.channels.outcome.write(&mut self.file, self.time_ns, outcome)?;
         self.file.flush()
     }
 
-    fn write_world(&mut self, scene: &Scene, caption: &str) -> mcap::McapResult<()> {
+    fn write_scene(&mut self, scene: &Scene, caption: &str) -> mcap::McapResult<()> {
         let (file, now) = (&mut self.file, self.time_ns);
         let stamp = timestamp(now);
         self.channels.scene.write(file, now, &scene_update(scene, stamp, caption))?;
@@ -204,7 +204,7 @@ struct Channels {
 }
 
 impl Channels {
-    /// Puts metadata and channels at the head of `file` and onto the disk.
+    /// Writes metadata and channels to the start of `file` and flushes it.
     fn start(file: &mut LogFile, metadata: &EpisodeMetadata) -> mcap::McapResult<Self> {
         file.write_metadata(METADATA_NAME, metadata.to_map())?;
         let channels = Self {

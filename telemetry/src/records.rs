@@ -1,17 +1,18 @@
-//! Reads the records of an MCAP file that may be damaged.
+//! Reading of the records of an MCAP file that may be damaged.
 
 use mcap::McapError;
 use mcap::records::{Record, op};
 use mcap::sans_io::linear_reader::{LinearReadEvent, LinearReader, LinearReaderOptions};
 
-/// The largest record or chunk, also uncompressed: the reader allocates what a length declares. Our logs have chunks of
-/// less than 1 MiB.
+/// Maximum size of a record or an uncompressed chunk. The reader allocates as much as a length field declares. Chunks
+/// of Tandem's logs have less than 1 MiB.
 const MAX_RECORD_BYTES: usize = 16 << 20;
 
-/// The schemas, channels, messages, metadata and the end of the data of a file, in order, those inside chunks too. A
-/// chunk's records come only after its checksum was found right. After an error there is nothing more.
+/// An iterator over the schemas, channels, messages, metadata and the end of the data of a file, in order and including
+/// those within chunks.
 ///
-/// Other records are skipped unparsed: nothing here needs them, and the parser panics on an attachment that is too short.
+/// The checksum of a chunk is verified before its records are returned. The iterator ends after an error. Other records
+/// are skipped without parsing, because the parser panics on an attachment that is too short.
 pub(crate) struct Records<'a> {
     unread: &'a [u8],
     reader: LinearReader,
@@ -19,13 +20,13 @@ pub(crate) struct Records<'a> {
 }
 
 impl<'a> Records<'a> {
-    /// Of a file that must be whole: everything is checked, to the last byte.
-    pub(crate) fn of_whole(bytes: &'a [u8]) -> Self {
+    /// Reads a file that must be complete: everything is verified up to the last byte.
+    pub(crate) fn of_complete(bytes: &'a [u8]) -> Self {
         Self::new(bytes, LinearReaderOptions::default().with_check_finishes_after_end_magic(true))
     }
 
-    /// Of a file that may stop anywhere.
-    pub(crate) fn of_rest(bytes: &'a [u8]) -> Self {
+    /// Reads a file that may end anywhere.
+    pub(crate) fn of_partial(bytes: &'a [u8]) -> Self {
         Self::new(bytes, LinearReaderOptions::default().with_skip_end_magic(true))
     }
 
@@ -73,7 +74,7 @@ impl Iterator for Records<'_> {
     }
 }
 
-/// Parses a record whose declared lengths fit into its body: the parser reserves as much memory as a length declares.
+/// Parses a record, after checking that its length fields fit its body. The parser allocates as much as they declare.
 fn parse(opcode: u8, body: &[u8]) -> mcap::McapResult<Record<'_>> {
     match lengths_fit(opcode, body) {
         Some(()) => mcap::parse_record(opcode, body),
@@ -82,26 +83,26 @@ fn parse(opcode: u8, body: &[u8]) -> mcap::McapResult<Record<'_>> {
 }
 
 fn lengths_fit(opcode: u8, body: &[u8]) -> Option<()> {
-    // Numbers come first, then texts, then the data of a schema or a map of texts.
-    let (n_number_bytes, n_texts, has_map) = match opcode {
+    // A body has numbers, then strings, then the data of a schema or a map of strings.
+    let (n_number_bytes, n_strings, has_map) = match opcode {
         op::SCHEMA => (2, 2, false),
         op::CHANNEL => (4, 2, true),
         op::METADATA => (0, 1, true),
         _ => return Some(()),
     };
     let mut rest = body.get(n_number_bytes..)?;
-    for _ in 0..n_texts {
-        (_, rest) = split_text(rest)?;
+    for _ in 0..n_strings {
+        (_, rest) = split_string(rest)?;
     }
-    let (mut last, _) = split_text(rest)?;
+    let (mut last, _) = split_string(rest)?;
     while has_map && !last.is_empty() {
-        (_, last) = split_text(last)?;
+        (_, last) = split_string(last)?;
     }
     Some(())
 }
 
-/// The bytes behind a length, and what follows them.
-fn split_text(bytes: &[u8]) -> Option<(&[u8], &[u8])> {
+/// Splits off a string with its length prefix.
+fn split_string(bytes: &[u8]) -> Option<(&[u8], &[u8])> {
     let (length, rest) = bytes.split_first_chunk()?;
     rest.split_at_checked(usize::try_from(u32::from_le_bytes(*length)).ok()?)
 }
@@ -110,24 +111,24 @@ fn split_text(bytes: &[u8]) -> Option<(&[u8], &[u8])> {
 mod tests {
     use super::*;
 
-    /// A file with one record.
+    /// Returns a file with one record.
     fn file(opcode: u8, body: &[u8]) -> Vec<u8> {
         let length = (body.len() as u64).to_le_bytes();
         [mcap::MAGIC, &[opcode], length.as_slice(), body].concat()
     }
 
     fn read(opcode: u8, body: &[u8]) -> Vec<mcap::McapResult<Record<'static>>> {
-        Records::of_rest(&file(opcode, body)).collect()
+        Records::of_partial(&file(opcode, body)).collect()
     }
 
     #[test]
-    fn an_attachment_too_short_for_its_checksum_is_skipped() {
-        // Two times, two empty texts and a length of 0, without the checksum.
+    fn an_attachment_that_is_too_short_is_skipped() {
+        // Two times, two empty strings and a length of 0, without the checksum.
         assert!(read(op::ATTACHMENT, &[0; 32]).iter().all(Result::is_ok));
     }
 
     #[test]
-    fn a_chunk_that_declares_too_large_a_size_is_refused_before_memory_is_reserved() {
+    fn a_chunk_with_a_too_large_size_is_refused_before_allocation() {
         let chunk = |uncompressed_size: u64| {
             let (times, checksum) = ([0; 16], [1; 4]);
             let (compression, n_compressed) = (b"\x04\0\0\0zstd", [0; 8]);
@@ -141,7 +142,7 @@ mod tests {
     }
 
     #[test]
-    fn a_length_beyond_the_record_is_refused_before_memory_is_reserved() {
+    fn a_length_beyond_the_record_is_refused_before_allocation() {
         let huge = u32::MAX.to_le_bytes();
         let check = |opcode, before: &[u8]| {
             let records = read(opcode, &[before, &huge, b"text"].concat());

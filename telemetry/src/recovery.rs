@@ -1,68 +1,52 @@
-//! Makes a whole file of what a killed writer left.
+//! Recovery of the incomplete MCAP file of a killed writer.
 
 use std::fs::File;
 use std::io::BufWriter;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use mcap::McapError;
 use mcap::records::Record;
+use tandem_system::{atomic_file, regular_file};
 
 use crate::error::Error;
 use crate::log_file::write_options;
 use crate::records::Records;
-use crate::whole_file::read_regular;
 
-/// What [`recover`] saved.
+/// Contents of a recovered file.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct RecoveredCounts {
-    /// Messages of all channels.
+    /// Number of messages of all channels.
     pub messages: u64,
-    /// Metadata records.
+    /// Number of metadata records.
     pub metadata_records: u64,
-    /// Where the source ended, in the reader's words; `None` when it was whole.
+    /// Error at which reading of the source ended; `None` if it was complete.
     pub ended_by: Option<String>,
 }
 
-/// Copies everything that is readable of `source`, up to the first damage, into the whole file `destination`.
+/// Copies all readable records of `source`, up to the first damage, to the complete file `destination`.
 ///
-/// Works for any MCAP file. `source` is left as it is; `destination` appears when it is complete, so a failure leaves
-/// nothing half done.
+/// This works for any MCAP file. `source` is not modified. `destination` is created only when it is complete, so an
+/// error leaves no incomplete file.
 ///
 /// # Errors
-/// When `source` cannot be read or does not begin like an MCAP file, or `destination` cannot be written.
+/// If `source` cannot be read or does not start like an MCAP file, or if `destination` cannot be written.
 pub fn recover(source: &Path, destination: &Path) -> Result<RecoveredCounts, Error> {
-    let bytes = read_regular(source).map_err(Error::io("read", source))?;
+    let bytes = regular_file::read(source).map_err(Error::io("read", source))?;
     if !bytes.starts_with(mcap::MAGIC) {
         return Err(Error::ReadLog { path: source.to_owned(), source: McapError::BadMagic });
     }
-    let temporary = temporary_path(destination);
-    let file = File::create(&temporary).map_err(Error::io("create", &temporary))?;
-    let copied =
-        copy_readable(&bytes, file).map_err(Error::write_log(&temporary)).and_then(|counts| {
-            std::fs::rename(&temporary, destination).map_err(Error::io("rename", &temporary))?;
-            Ok(counts)
-        });
-    if copied.is_err() {
-        drop(std::fs::remove_file(&temporary));
-    }
-    copied
+    atomic_file::replace_with(destination, |file| copy_readable(&bytes, file))
+        .map_err(Error::write_log(destination))
 }
 
-/// Differs from the recorder's `.part`, which may well be the source.
-fn temporary_path(destination: &Path) -> PathBuf {
-    let mut name = destination.as_os_str().to_owned();
-    name.push(".recovering");
-    PathBuf::from(name)
-}
-
-fn copy_readable(bytes: &[u8], file: File) -> mcap::McapResult<RecoveredCounts> {
+fn copy_readable(bytes: &[u8], file: &File) -> mcap::McapResult<RecoveredCounts> {
     let mut copy = Copy {
         writer: write_options().create(BufWriter::new(file))?,
         counts: RecoveredCounts::default(),
     };
     copy.counts.ended_by = Some(McapError::UnexpectedEof.to_string());
-    for record in Records::of_rest(bytes) {
-        let refused = match record {
+    for record in Records::of_partial(bytes) {
+        let damage = match record {
             Ok(Record::DataEnd(_)) => {
                 copy.counts.ended_by = None;
                 break;
@@ -70,7 +54,7 @@ fn copy_readable(bytes: &[u8], file: File) -> mcap::McapResult<RecoveredCounts> 
             Ok(record) => copy.write(&record)?,
             Err(damage) => Some(damage),
         };
-        if let Some(damage) = refused {
+        if let Some(damage) = damage {
             copy.counts.ended_by = Some(damage.to_string());
             break;
         }
@@ -80,13 +64,13 @@ fn copy_readable(bytes: &[u8], file: File) -> mcap::McapResult<RecoveredCounts> 
 }
 
 /// The file that is being made whole.
-struct Copy {
-    writer: mcap::Writer<BufWriter<File>>,
+struct Copy<'a> {
+    writer: mcap::Writer<BufWriter<&'a File>>,
     counts: RecoveredCounts,
 }
 
-impl Copy {
-    /// Writes a record, or says why it cannot stand after those before it.
+impl Copy<'_> {
+    /// Writes a record, or returns why it contradicts the previous ones.
     fn write(&mut self, record: &Record<'_>) -> mcap::McapResult<Option<McapError>> {
         match self.try_write(record) {
             Ok(()) => Ok(None),

@@ -1,4 +1,4 @@
-//! A world as Foxglove's messages: primitives for the 3D panel, frames, joint states.
+//! A scene as Foxglove messages: primitives for the 3D panel, transforms and joint states.
 
 use foxglove::messages::{
     Color, CubePrimitive, CylinderPrimitive, FrameTransform, FrameTransforms, JointState,
@@ -12,16 +12,16 @@ pub(crate) use trail::Trails;
 
 mod trail;
 
-/// The frame in which everything is given.
+/// Frame of all positions.
 const WORLD: &str = "world";
 const NO_ROTATION: Quaternion = Quaternion { x: 0.0, y: 0.0, z: 0.0, w: 1.0 };
 const TABLE_COLOR: Color = rgb(0.82, 0.80, 0.77);
 const TEXT_COLOR: Color = rgb(0.15, 0.17, 0.20);
-/// One colour for each arm and what belongs to it; a further arm starts again.
+/// Colours of the arms and of their objects and goals; further arms reuse them.
 const ARM_COLORS: [Color; 3] =
     [rgb(0.16, 0.44, 0.73), rgb(0.87, 0.46, 0.16), rgb(0.27, 0.60, 0.35)];
 
-/// Everything in `scene` and a caption. Each message is complete, so that a viewer may jump to any time.
+/// Returns `scene` and a caption. Each message is complete, so that a viewer can jump to any time.
 pub(crate) fn scene_update(scene: &Scene, stamp: Timestamp, caption: &str) -> SceneUpdate {
     let entity = |id: String| SceneEntity {
         timestamp: Some(stamp),
@@ -54,7 +54,7 @@ pub(crate) fn scene_update(scene: &Scene, stamp: Timestamp, caption: &str) -> Sc
     }
 }
 
-/// Frames `arm{i}/base` (x toward the middle of the table), `arm{i}/end_effector`, `object{i}` and `goal{i}`.
+/// Returns the frames `arm{i}/base` (x towards the origin), `arm{i}/end_effector`, `object{i}` and `goal{i}`.
 pub(crate) fn frame_transforms(scene: &Scene, stamp: Timestamp) -> FrameTransforms {
     let frame = |name: String, origin: Point, rotation: Quaternion| FrameTransform {
         timestamp: Some(stamp),
@@ -65,7 +65,7 @@ pub(crate) fn frame_transforms(scene: &Scene, stamp: Timestamp) -> FrameTransfor
     };
     let arms = scene.arms.iter().enumerate().flat_map(|(i, arm)| {
         [
-            frame(format!("arm{i}/base"), arm.base, toward_the_middle(arm.base)),
+            frame(format!("arm{i}/base"), arm.base, toward_origin(arm.base)),
             frame(format!("arm{i}/end_effector"), arm.end_effector, NO_ROTATION),
         ]
     });
@@ -81,14 +81,14 @@ pub(crate) fn frame_transforms(scene: &Scene, stamp: Timestamp) -> FrameTransfor
     FrameTransforms { transforms: arms.chain(objects).chain(goals).collect() }
 }
 
-/// Joints `arm{i}/joint{j}`, `j` from 1 as the arm's maker counts, radians.
+/// Returns the joints `arm{i}/joint{j}`, with `j` from 1 as Kinova counts, radians.
 pub(crate) fn joint_states(scene: &Scene, stamp: Timestamp) -> JointStates {
     let angles_rad: Vec<&[f64]> =
         scene.arms.iter().map(|arm| arm.joint_angles_rad.as_slice()).collect();
     joint_states_of(&angles_rad, &[], stamp)
 }
 
-/// The same of joint angles (radians), arm by arm, and after them `arm{i}/gripper`, 0 shut to 1 open.
+/// Returns joint states of angles in arm order (radians), followed by `arm{i}/gripper`, 0 (closed) to 1 (open).
 pub(crate) fn joint_states_of<A: AsRef<[f64]>>(
     angles_rad: &[A],
     openings: &[f64],
@@ -110,7 +110,7 @@ pub(crate) fn joint_states_of<A: AsRef<[f64]>>(
     JointStates { timestamp: Some(stamp), joints: joints.chain(grippers).collect() }
 }
 
-/// The links, and the post on which the first of them stands; balls where they meet.
+/// Returns the links of an arm, the post below the first link, and spheres at the ends of links.
 fn arm_entity(arm: &ArmScene, color: Color, entity: SceneEntity) -> SceneEntity {
     let post = arm.links.first().map(|link| Capsule {
         from: arm.base,
@@ -162,7 +162,7 @@ fn sphere(centre: Point, radius_m: f32, color: Color) -> SpherePrimitive {
     }
 }
 
-/// The straight part of a capsule: Foxglove's cylinders stand along their z axis.
+/// Returns the cylindrical part of a capsule. Cylinders of Foxglove extend along their z axis.
 fn cylinder(capsule: &Capsule, color: Color) -> CylinderPrimitive {
     let (from, to) = (capsule.from.map(f64::from), capsule.to.map(f64::from));
     let axis: [f64; 3] = std::array::from_fn(|i| to[i] - from[i]);
@@ -181,7 +181,7 @@ fn cylinder(capsule: &Capsule, color: Color) -> CylinderPrimitive {
     }
 }
 
-/// The shortest rotation from the z axis to `direction`, a unit vector (or zero, for no rotation).
+/// Returns the shortest rotation from the z axis to `direction`, a unit vector or zero (no rotation).
 fn from_z_to(direction: [f64; 3]) -> Quaternion {
     let [x, y, z] = direction;
     let w = 1.0 + z;
@@ -192,8 +192,8 @@ fn from_z_to(direction: [f64; 3]) -> Quaternion {
     Quaternion { x: -y / norm, y: x / norm, z: 0.0, w: w / norm }
 }
 
-/// The turn about z that points x from `base` to the world's origin.
-fn toward_the_middle(base: Point) -> Quaternion {
+/// Returns the rotation about z that points the x axis from `base` to the origin of the world.
+fn toward_origin(base: Point) -> Quaternion {
     let half_yaw_rad = 0.5 * f64::from(-base[1]).atan2(f64::from(-base[0]));
     Quaternion { x: 0.0, y: 0.0, z: half_yaw_rad.sin(), w: half_yaw_rad.cos() }
 }
@@ -224,8 +224,8 @@ const fn darker(color: Color) -> Color {
 mod tests {
     use super::*;
 
-    /// `rotation` applied to the z axis.
-    fn turned_z(q: Quaternion) -> [f64; 3] {
+    /// Applies a rotation to the z axis.
+    fn rotated_z(q: Quaternion) -> [f64; 3] {
         [
             2.0 * (q.x * q.z + q.w * q.y),
             2.0 * (q.y * q.z - q.w * q.x),
@@ -234,14 +234,14 @@ mod tests {
     }
 
     #[test]
-    fn a_cylinder_stands_along_its_capsule() {
+    fn a_cylinder_extends_along_its_capsule() {
         let check = |from: Point, to: Point, direction: [f64; 3]| {
             let drawn = cylinder(&Capsule { from, to, radius_m: 0.04 }, TABLE_COLOR);
             let pose = drawn.pose.unwrap();
-            let turned = turned_z(pose.orientation.unwrap());
+            let rotated = rotated_z(pose.orientation.unwrap());
             assert!(
-                turned.iter().zip(direction).all(|(a, b)| (a - b).abs() < 1e-6),
-                "{turned:?} {direction:?}"
+                rotated.iter().zip(direction).all(|(a, b)| (a - b).abs() < 1e-6),
+                "{rotated:?} {direction:?}"
             );
             let size = drawn.size.unwrap();
             assert!((size.z - 0.5).abs() < 1e-6 && (size.x - 0.08).abs() < 1e-6);
@@ -253,7 +253,7 @@ mod tests {
     }
 
     #[test]
-    fn a_point_like_capsule_has_finite_numbers() {
+    fn a_capsule_of_length_zero_has_a_finite_rotation() {
         let drawn =
             cylinder(&Capsule { from: [1.0; 3], to: [1.0; 3], radius_m: 0.04 }, TABLE_COLOR);
         let q = drawn.pose.unwrap().orientation.unwrap();
@@ -262,7 +262,7 @@ mod tests {
 
     #[test]
     fn the_second_arms_base_faces_the_first() {
-        let q = toward_the_middle([0.52, 0.0, 0.0]);
+        let q = toward_origin([0.52, 0.0, 0.0]);
         let x_axis = [1.0 - 2.0 * q.z * q.z, 2.0 * q.w * q.z];
         assert!((x_axis[0] + 1.0).abs() < 1e-9 && x_axis[1].abs() < 1e-9, "{x_axis:?}");
     }

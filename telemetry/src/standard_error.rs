@@ -1,34 +1,34 @@
-//! Lines for standard error, written by a thread of its own.
+//! Lines for standard error, written by a separate thread.
 //!
-//! Standard error may be a file on a full disk, or a pipe whose reader has stopped reading. Neither may end the process
-//! or hold up a thread that has something to say. Lines that cannot be written are dropped and counted; a line with
-//! the count takes their place once writing works again.
+//! Standard error may be a file on a full disk, or a pipe whose reader has stopped. Neither ends the process or blocks
+//! a thread that logs. Lines that cannot be written are dropped and counted; once writing works again, a line with the
+//! count replaces them.
 
 use std::io::{self, ErrorKind, Write};
 use std::sync::{Arc, Condvar, LazyLock, Mutex, MutexGuard, PoisonError};
 use std::thread;
 use std::time::Duration;
 
-/// Bytes that wait to be written at most. Lines that find no room are dropped.
+/// Maximum number of bytes in the queue. Lines that do not fit are dropped.
 const CAPACITY: usize = 4 << 20;
 
-static STANDARD_ERROR: LazyLock<Lines> = LazyLock::new(|| Lines::to(io::stderr()));
+static STANDARD_ERROR: LazyLock<LineQueue> = LazyLock::new(|| LineQueue::new(io::stderr()));
 
-/// Adds `line` to what is written to standard error, without waiting.
+/// Queues `line` for standard error, without blocking.
 pub fn write_line(line: &str) {
     STANDARD_ERROR.push(format!("{line}\n").as_bytes());
 }
 
-/// Waits until all lines are written or dropped, at most for `patience`. For the end of a process.
-pub fn flush(patience: Duration) {
-    STANDARD_ERROR.flush(patience);
+/// Waits until all queued lines are written or dropped, or until `timeout` has passed. For the end of a process.
+pub fn flush(timeout: Duration) {
+    STANDARD_ERROR.flush(timeout);
 }
 
-/// Standard error for `tracing`: every write is one whole event and never fails.
+/// A writer to standard error for `tracing`. Each write is one event and never fails.
 #[derive(Debug, Clone, Copy, Default)]
-pub(crate) struct Events;
+pub(crate) struct EventWriter;
 
-impl Write for Events {
+impl Write for EventWriter {
     fn write(&mut self, event: &[u8]) -> io::Result<usize> {
         STANDARD_ERROR.push(event);
         Ok(event.len())
@@ -39,8 +39,8 @@ impl Write for Events {
     }
 }
 
-/// Lines on their way to a writer that may fail or never return.
-struct Lines(Arc<Shared>);
+/// A queue of lines for a writer that may fail or block.
+struct LineQueue(Arc<Shared>);
 
 #[derive(Default)]
 struct Shared {
@@ -50,20 +50,20 @@ struct Shared {
 
 #[derive(Default)]
 struct Queue {
-    /// Whole lines.
+    /// Complete lines.
     bytes: Vec<u8>,
     is_writing: bool,
-    /// Lines that found no room since the others were taken out.
+    /// Number of lines that did not fit since the queue was last emptied.
     n_dropped: usize,
 }
 
-impl Lines {
-    fn to(writer: impl Write + Send + 'static) -> Self {
+impl LineQueue {
+    fn new(writer: impl Write + Send + 'static) -> Self {
         let shared = Arc::new(Shared::default());
-        let theirs = Arc::clone(&shared);
+        let thread_shared = Arc::clone(&shared);
         let name = "standard error".to_owned();
-        // Without the thread, lines fill the queue and are dropped: the work goes on.
-        drop(thread::Builder::new().name(name).spawn(move || theirs.write_to(writer)));
+        // If the thread cannot be started, lines fill the queue and are dropped.
+        drop(thread::Builder::new().name(name).spawn(move || thread_shared.write_to(writer)));
         Self(shared)
     }
 
@@ -77,9 +77,9 @@ impl Lines {
         }
     }
 
-    fn flush(&self, patience: Duration) {
+    fn flush(&self, timeout: Duration) {
         let is_busy = |queue: &mut Queue| queue.is_writing || !queue.bytes.is_empty();
-        drop(self.0.changed.wait_timeout_while(self.0.lock(), patience, is_busy));
+        drop(self.0.changed.wait_timeout_while(self.0.lock(), timeout, is_busy));
     }
 }
 
@@ -88,7 +88,7 @@ impl Shared {
         self.queue.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Writes what is pushed, for ever.
+    /// Writes queued lines until the process ends.
     fn write_to(&self, mut writer: impl Write) {
         let mut ends_within_a_line = false;
         let mut n_failed = 0;
@@ -97,7 +97,7 @@ impl Shared {
             let waited = self.changed.wait_while(self.lock(), is_empty);
             let mut queue = waited.unwrap_or_else(PoisonError::into_inner);
             let lines = std::mem::take(&mut queue.bytes);
-            // They found the queue full, so they came after the lines that are in it.
+            // These lines found the queue full, so they are newer than the lines in it.
             let n_after = std::mem::take(&mut queue.n_dropped);
             queue.is_writing = true;
             drop(queue);
@@ -120,7 +120,7 @@ impl Shared {
     }
 }
 
-/// Says that lines are missing, where some are.
+/// Returns a line with the number of missing lines, or nothing if none is missing.
 fn notice(n_missing: usize) -> String {
     match n_missing {
         0 => String::new(),
@@ -128,7 +128,7 @@ fn notice(n_missing: usize) -> String {
     }
 }
 
-/// How many of `bytes` were written before the writer failed.
+/// Writes `bytes` until the writer fails, and returns the number of bytes written.
 fn write_up_to_an_error(writer: &mut impl Write, bytes: &[u8]) -> usize {
     let mut n_written = 0;
     while n_written < bytes.len() {
@@ -152,15 +152,15 @@ mod tests {
 
     use super::*;
 
-    const PATIENCE: Duration = Duration::from_secs(30);
+    const TIMEOUT: Duration = Duration::from_secs(30);
 
-    /// Takes `room` bytes and then fails, until it is given more.
+    /// A writer with limited space. It fails once the space is used up.
     #[derive(Clone, Default)]
     struct Disk(Arc<Mutex<(usize, Vec<u8>)>>);
 
     impl Disk {
-        fn give(&self, room: usize) {
-            self.0.lock().unwrap().0 = room;
+        fn set_space(&self, n_bytes: usize) {
+            self.0.lock().unwrap().0 = n_bytes;
         }
 
         fn text(&self) -> String {
@@ -186,38 +186,38 @@ mod tests {
     }
 
     #[test]
-    fn lines_that_find_no_room_are_counted_once_there_is_room_again() {
+    fn dropped_lines_are_counted_once_there_is_space_again() {
         let disk = Disk::default();
-        let lines = Lines::to(disk.clone());
-        let say = |line: &str| {
+        let lines = LineQueue::new(disk.clone());
+        let log = |line: &str| {
             lines.push(format!("{line}\n").as_bytes());
-            lines.flush(PATIENCE);
+            lines.flush(TIMEOUT);
         };
-        disk.give(9);
-        ["one", "two-and-a-half", "three", "four"].iter().for_each(|line| say(line));
-        disk.give(1000);
-        ["five", "six"].iter().for_each(|line| say(line));
+        disk.set_space(9);
+        ["one", "two-and-a-half", "three", "four"].iter().for_each(|line| log(line));
+        disk.set_space(1000);
+        ["five", "six"].iter().for_each(|line| log(line));
         let expected = "one\ntwo-a\ntandem: 3 lines could not be written here\nfive\nsix\n";
         assert_eq!(disk.text(), expected);
     }
 
     #[test]
-    fn a_count_that_is_cut_short_is_given_again() {
+    fn an_incomplete_count_is_repeated() {
         let disk = Disk::default();
-        let lines = Lines::to(disk.clone());
-        for (room, line) in [(0, "one\n"), (5, "two\n"), (1000, "three\n")] {
-            disk.give(room);
+        let lines = LineQueue::new(disk.clone());
+        for (n_bytes, line) in [(0, "one\n"), (5, "two\n"), (1000, "three\n")] {
+            disk.set_space(n_bytes);
             lines.push(line.as_bytes());
-            lines.flush(PATIENCE);
+            lines.flush(TIMEOUT);
         }
         let expected = "tande\ntandem: 2 lines could not be written here\nthree\n";
         assert_eq!(disk.text(), expected);
     }
 
-    /// A pipe whose reader does not read before it is told to.
-    struct Stuck(Receiver<()>, Disk);
+    /// A pipe whose reader blocks until the channel is closed.
+    struct BlockedPipe(Receiver<()>, Disk);
 
-    impl Write for Stuck {
+    impl Write for BlockedPipe {
         fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
             self.0.recv().ok();
             self.1.write(bytes)
@@ -229,18 +229,18 @@ mod tests {
     }
 
     #[test]
-    fn a_writer_that_is_stuck_holds_nobody_up() {
+    fn a_blocked_writer_blocks_no_caller() {
         let disk = Disk::default();
-        disk.give(usize::MAX);
-        let (go_on, is_to_go_on): (SyncSender<()>, _) = sync_channel(0);
-        let lines = Lines::to(Stuck(is_to_go_on, disk.clone()));
+        disk.set_space(usize::MAX);
+        let (unblock, unblocked): (SyncSender<()>, _) = sync_channel(0);
+        let lines = LineQueue::new(BlockedPipe(unblocked, disk.clone()));
         let line = [&[b'x'; 1023][..], b"\n"].concat();
         (0..10_000).for_each(|_| lines.push(&line));
         lines.flush(Duration::from_millis(1));
-        drop(go_on);
-        lines.flush(PATIENCE);
+        drop(unblock);
+        lines.flush(TIMEOUT);
         lines.push(b"last\n");
-        lines.flush(PATIENCE);
+        lines.flush(TIMEOUT);
         let text = disk.text();
         let n_missing = |line: &str| -> Option<usize> {
             line.strip_prefix("tandem: ")?
@@ -252,7 +252,7 @@ mod tests {
             text.lines().map(n_missing).partition(Option::is_some);
         let n_missing: usize = notices.into_iter().flatten().sum();
         assert!(n_missing > 1000, "{n_missing}");
-        assert_eq!(n_missing + written.len(), 10_001, "all are written or counted");
+        assert_eq!(n_missing + written.len(), 10_001, "every line is written or counted");
         assert!(text.ends_with("x\nlast\n") || text.ends_with("here\nlast\n"));
     }
 }

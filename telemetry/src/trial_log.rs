@@ -1,4 +1,4 @@
-//! Writes one trial on arms into one MCAP file.
+//! Writing of a trial's MCAP log.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -13,65 +13,65 @@ use crate::messages::with_checksum;
 use crate::scene::{Trails, frame_transforms, joint_states_of, scene_update};
 use crate::trials::TrialRow;
 
-/// Looks after which what was logged is on the disk even if the process dies.
-const FLUSH_EVERY_LOOKS: u32 = 25;
-/// Names of the metadata records: at the start, and at the end.
+/// Number of snapshots after which the log is flushed to disk.
+const FLUSH_EVERY_SNAPSHOTS: u32 = 25;
+/// Names of the metadata records at the start and at the end of a log.
 const METADATA_NAME: &str = "tandem.trial";
 const OUTCOME_NAME: &str = "tandem.trial.outcome";
 const FORMAT: &str = "1";
 
-/// What a trial is. Stands in its log as the MCAP metadata record `tandem.trial`.
+/// Metadata of a trial, logged as the MCAP metadata record `tandem.trial`.
 #[derive(Debug, Clone, PartialEq)]
 pub struct TrialMetadata {
-    /// Whose trial it is: a policy's name.
-    pub subject: String,
-    /// Task and arms.
+    /// Name of the policy, logged under the key `subject`.
+    pub policy: String,
+    /// Task and number of arms.
     pub layout: Layout,
     /// `open-loop` or `closed-loop`.
     pub mode: String,
-    /// The trial's number.
+    /// Number of the trial.
     pub trial: u64,
-    /// With the number, the address of its random draws.
+    /// Seed; with the number, it determines all random numbers of the trial.
     pub seed: u64,
-    /// Digest of the policy that decides.
+    /// Digest of the policy file.
     pub policy_digest: String,
-    /// What moves the arms, such as `simulated`.
+    /// Name of the driver, such as `simulated`.
     pub driver: String,
-    /// Share of the fastest speed, in (0, 1].
+    /// Share of full speed, in (0, 1].
     pub speed: f64,
-    /// Half the edge of the blocks, metres.
+    /// Half the edge length of the blocks, metres.
     pub block_half_m: f64,
 }
 
-/// The table and the arms at one moment. Places are metres in the world's frame, arm by arm.
+/// State of the table and the arms at one time. Positions are in the world frame, metres; vectors are in arm order.
 #[derive(Debug, Clone, Copy)]
-pub struct TrialLook<'a> {
-    /// Seconds since the trial's start.
+pub struct TrialSnapshot<'a> {
+    /// Time since the start of the trial, seconds.
     pub time_s: f64,
-    /// Everything as it truly is.
+    /// True state of the scene.
     pub scene: &'a Scene,
-    /// Where the motion has the joints, radians, while there is one.
+    /// Planned joint angles, radians; `None` while no motion is executed.
     pub planned_joints: Option<&'a [Vec<f64>]>,
-    /// What the encoders say, radians; empty before they said anything.
+    /// Measured joint angles, radians; empty before the first measurement.
     pub measured_joints: &'a [Vec<f64>],
-    /// Where the motion has the tools; empty while there is none.
+    /// Planned positions of the tools; empty while no motion is executed.
     pub planned_tools: &'a [[f64; 3]],
-    /// Where the tools are.
+    /// Measured positions of the tools.
     pub measured_tools: &'a [[f64; 3]],
-    /// How far the grippers are open, 0 to 1; empty when that is not known.
+    /// Openings of the grippers, 0 (closed) to 1 (open); empty if they are unknown.
     pub openings: &'a [f64],
 }
 
-/// What became of a trial. Stands in its log as the MCAP metadata record `tandem.trial.outcome`.
+/// Outcome of a trial, logged as the MCAP metadata record `tandem.trial.outcome`.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct TrialOutcome {
-    /// The name of what went wrong; `None` is success.
+    /// Cause of the failure; `None` for a success.
     pub cause: Option<String>,
-    /// What there is to say about it.
+    /// Details of the cause.
     pub detail: Option<String>,
-    /// How far each object ended from its goal, metres.
+    /// Final distance of each object from its goal, metres.
     pub goal_distances_m: Vec<f64>,
-    /// How long the arms took, seconds.
+    /// Duration of the arms' motion, seconds.
     pub duration_s: f64,
 }
 
@@ -86,14 +86,14 @@ impl From<&TrialRow> for TrialOutcome {
     }
 }
 
-/// How much a line of a trial's log matters.
+/// Severity of a line in a trial's log.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum LogLevel {
-    /// What was to be expected.
+    /// An expected event.
     Info,
-    /// What was recovered from, such as a step that was shortened.
+    /// A problem that was recovered from, such as a shortened step.
     Warning,
-    /// What ended the trial.
+    /// A problem that ended the trial.
     Error,
 }
 
@@ -107,33 +107,33 @@ impl From<LogLevel> for Level {
     }
 }
 
-/// Writes one trial into one MCAP file.
+/// Writes one trial to one MCAP file.
 ///
-/// The file is called `NAME.mcap.part` until [`finish`](Self::finish) gives it its name, so a file without that
-/// ending is always whole. Message times count from the trial's start.
+/// The file is named `NAME.mcap.part` until [`finish`](Self::finish) renames it, so a file without that suffix is
+/// always complete. Message times count from the start of the trial.
 pub struct TrialRecorder {
     file: LogFile,
     channels: Channels,
     n_arms: usize,
     title: String,
     trails: Trails,
-    n_looks: u32,
+    n_snapshots: u32,
     time_ns: u64,
-    /// Shown once more with the outcome above it.
-    last: Option<Last>,
+    /// Repeated at the end with the outcome as its caption.
+    last_scene: Option<LastScene>,
 }
 
-/// The last look.
-struct Last {
+/// The scene of the latest snapshot.
+struct LastScene {
     scene: Scene,
     planned_tools: Vec<[f64; 3]>,
 }
 
 impl TrialRecorder {
-    /// Starts the log `path` of the trial that `metadata` describes; an unfinished one of that name is overwritten.
+    /// Creates the log `path` of the trial with this `metadata`. An incomplete log of that name is overwritten.
     ///
     /// # Errors
-    /// When the file cannot be written.
+    /// If the file cannot be written.
     pub fn create(path: &Path, metadata: &TrialMetadata) -> Result<Self, Error> {
         let mut file = LogFile::create(path)?;
         let channels = Channels::start(&mut file, metadata).map_err(file.write_error())?;
@@ -144,90 +144,92 @@ impl TrialRecorder {
             n_arms,
             title: metadata.title(),
             trails: Trails::new(n_arms),
-            n_looks: 0,
+            n_snapshots: 0,
             time_ns: 0,
-            last: None,
+            last_scene: None,
         };
         recorder.log(LogLevel::Info, &metadata.start_line())?;
         recorder.file.flush().map_err(recorder.file.write_error())?;
         Ok(recorder)
     }
 
-    /// Logs the table and the arms at one moment. Times must not go back.
+    /// Logs the table and the arms at one time. Times must not decrease.
     ///
     /// # Errors
-    /// When something is said of more or fewer arms than the trial has, the time makes no sense, or the file cannot be
+    /// If a vector has another number of arms than the trial, the time is negative or not finite, or the file cannot be
     /// written.
-    pub fn look(&mut self, look: &TrialLook<'_>) -> Result<(), Error> {
-        self.check_lengths(look)?;
-        self.time_ns = nanoseconds(look.time_s)?;
-        self.trails.go_on(look.planned_tools, look.measured_tools);
-        self.n_looks += 1;
-        self.write_look(look).map_err(self.file.write_error())?;
-        self.last =
-            Some(Last { scene: look.scene.clone(), planned_tools: look.planned_tools.to_vec() });
+    pub fn record(&mut self, snapshot: &TrialSnapshot<'_>) -> Result<(), Error> {
+        self.check_lengths(snapshot)?;
+        self.time_ns = nanoseconds(snapshot.time_s)?;
+        self.trails.extend(snapshot.planned_tools, snapshot.measured_tools);
+        self.n_snapshots += 1;
+        self.write_snapshot(snapshot).map_err(self.file.write_error())?;
+        self.last_scene = Some(LastScene {
+            scene: snapshot.scene.clone(),
+            planned_tools: snapshot.planned_tools.to_vec(),
+        });
         Ok(())
     }
 
-    /// Adds a line to the trial's log channel, at the time of the latest look.
+    /// Adds a line to the log channel, at the time of the latest snapshot.
     ///
     /// # Errors
-    /// When the file cannot be written.
+    /// If the file cannot be written.
     pub fn log(&mut self, level: LogLevel, message: &str) -> Result<(), Error> {
         let line = log_line(self.time_ns, level.into(), message);
         let (file, now) = (&mut self.file, self.time_ns);
         self.channels.log.write(file, now, &line).map_err(self.file.write_error())
     }
 
-    /// Logs what became of the trial, completes the file, gives it its name and returns that.
+    /// Logs the outcome, completes the file, gives it its final name and returns its path.
     ///
     /// # Errors
-    /// When the file cannot be written or renamed.
+    /// If the file cannot be written or renamed.
     pub fn finish(mut self, outcome: &TrialOutcome) -> Result<PathBuf, Error> {
-        let verdict = outcome.verdict();
+        let text = outcome.text();
         let level = if outcome.cause.is_none() { LogLevel::Info } else { LogLevel::Error };
-        self.log(level, &verdict)?;
-        self.write_outcome(outcome, &verdict).map_err(self.file.write_error())?;
+        self.log(level, &text)?;
+        self.write_outcome(outcome, &text).map_err(self.file.write_error())?;
         self.file.finish()
     }
 
-    fn check_lengths(&self, look: &TrialLook<'_>) -> Result<(), Error> {
-        check_length("scene.arms", look.scene.arms.len(), self.n_arms)?;
-        let some_or_none = [
-            ("planned_joints", look.planned_joints.map_or(0, <[_]>::len)),
-            ("measured_joints", look.measured_joints.len()),
-            ("planned_tools", look.planned_tools.len()),
-            ("measured_tools", look.measured_tools.len()),
-            ("openings", look.openings.len()),
+    fn check_lengths(&self, snapshot: &TrialSnapshot<'_>) -> Result<(), Error> {
+        check_length("scene.arms", snapshot.scene.arms.len(), self.n_arms)?;
+        let optional = [
+            ("planned_joints", snapshot.planned_joints.map_or(0, <[_]>::len)),
+            ("measured_joints", snapshot.measured_joints.len()),
+            ("planned_tools", snapshot.planned_tools.len()),
+            ("measured_tools", snapshot.measured_tools.len()),
+            ("openings", snapshot.openings.len()),
         ];
-        for (field, got) in some_or_none.into_iter().filter(|(_, got)| *got > 0) {
+        for (field, got) in optional.into_iter().filter(|(_, got)| *got > 0) {
             check_length(field, got, self.n_arms)?;
         }
         Ok(())
     }
 
-    fn write_look(&mut self, look: &TrialLook<'_>) -> mcap::McapResult<()> {
-        let caption = format!("{}\n{:.2} s", self.title, look.time_s);
-        self.write_scene(look.scene, look.planned_tools, &caption)?;
+    fn write_snapshot(&mut self, snapshot: &TrialSnapshot<'_>) -> mcap::McapResult<()> {
+        let caption = format!("{}\n{:.2} s", self.title, snapshot.time_s);
+        self.write_scene(snapshot.scene, snapshot.planned_tools, &caption)?;
         let (file, now) = (&mut self.file, self.time_ns);
         let stamp = timestamp(now);
-        self.channels.tf.write(file, now, &frame_transforms(look.scene, stamp))?;
-        if !look.measured_joints.is_empty() {
-            let states = joint_states_of(look.measured_joints, look.openings, stamp);
+        self.channels.tf.write(file, now, &frame_transforms(snapshot.scene, stamp))?;
+        if !snapshot.measured_joints.is_empty() {
+            let states = joint_states_of(snapshot.measured_joints, snapshot.openings, stamp);
             self.channels.measured.write(file, now, &states)?;
         }
-        if let Some(planned) = look.planned_joints {
+        if let Some(planned) = snapshot.planned_joints {
             self.channels.planned.write(file, now, &joint_states_of(planned, &[], stamp))?;
         }
-        if self.n_looks.is_multiple_of(FLUSH_EVERY_LOOKS) {
+        if self.n_snapshots.is_multiple_of(FLUSH_EVERY_SNAPSHOTS) {
             self.file.flush()?;
         }
         Ok(())
     }
 
-    fn write_outcome(&mut self, outcome: &TrialOutcome, verdict: &str) -> mcap::McapResult<()> {
-        if let Some(Last { scene, planned_tools }) = self.last.take() {
-            let caption = format!("{}\n{verdict}", self.title);
+    fn write_outcome(&mut self, outcome: &TrialOutcome, text: &str) -> mcap::McapResult<()> {
+        if let Some(LastScene { scene, planned_tools }) = self.last_scene.take() {
+            let caption = format!("{}\n{text}", self.title);
             self.write_scene(&scene, &planned_tools, &caption)?;
         }
         self.file.write_metadata(OUTCOME_NAME, outcome.to_map())
@@ -255,7 +257,7 @@ struct Channels {
 }
 
 impl Channels {
-    /// Puts metadata and channels at the head of `file`.
+    /// Writes metadata and channels to the start of `file`.
     fn start(file: &mut LogFile, metadata: &TrialMetadata) -> mcap::McapResult<Self> {
         file.write_metadata(METADATA_NAME, metadata.to_map())?;
         Ok(Self {
@@ -270,13 +272,13 @@ impl Channels {
 
 impl TrialMetadata {
     fn title(&self) -> String {
-        let Self { subject, mode, trial, .. } = self;
-        format!("{subject}, {}, {mode}, trial {trial}", self.layout.task)
+        let Self { policy, mode, trial, .. } = self;
+        format!("{policy}, {}, {mode}, trial {trial}", self.layout.task)
     }
 
     fn start_line(&self) -> String {
         format!(
-            "{} of seed {} begins: driver {}, speed {}, blocks of {:.0} mm",
+            "{}, seed {}: driver {}, speed {}, blocks of {:.0} mm",
             self.title(),
             self.seed,
             self.driver,
@@ -288,7 +290,7 @@ impl TrialMetadata {
     fn to_map(&self) -> BTreeMap<String, String> {
         entries([
             ("format", FORMAT.to_owned()),
-            ("subject", self.subject.clone()),
+            ("subject", self.policy.clone()),
             ("task", self.layout.task.to_string()),
             ("arms", self.layout.n_arms.to_string()),
             ("mode", self.mode.clone()),
@@ -303,7 +305,8 @@ impl TrialMetadata {
 }
 
 impl TrialOutcome {
-    fn verdict(&self) -> String {
+    /// Returns `success`, or `failure` with its cause and details.
+    fn text(&self) -> String {
         match (&self.cause, &self.detail) {
             (None, _) => "success".to_owned(),
             (Some(cause), None) => format!("failure: {cause}"),

@@ -1,4 +1,4 @@
-//! What became of trials on arms: one JSON object a line, one line a trial.
+//! Results of trials on arms: `trials.jsonl`, one JSON object per trial.
 
 use std::fs::File;
 use std::io::{BufRead as _, BufReader, Write as _};
@@ -8,66 +8,67 @@ use serde::{Deserialize, Serialize};
 
 use crate::error::Error;
 
-/// The name of the file in a directory of trials.
+/// Name of the results file in a directory of trials.
 pub const TRIALS_FILE: &str = "trials.jsonl";
 
-/// One trial. Places are metres in the world's frame, arm by arm.
+/// The result of one trial. Positions are in the world frame, metres, in arm order.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct TrialRow {
-    /// Whose trial it was: a policy's name.
-    pub subject: String,
+    /// Name of the policy; the JSON key is `subject`.
+    #[serde(rename = "subject")]
+    pub policy: String,
     /// `open-loop` or `closed-loop`.
     pub mode: String,
     /// `push` or `pick-and-place`.
     pub task: String,
-    /// The trial's number; the same number of the same seed has the same start and goals for every subject and mode.
+    /// Number of the trial. Seed and number determine the starts and goals, for every policy and mode.
     pub trial: u64,
-    /// Decides starts, goals and noise.
+    /// Seed of starts, goals and noise.
     pub seed: u64,
-    /// Whether every object ended within the tolerance of its goal and nothing went wrong.
+    /// Whether every object ended within the tolerance of its goal and nothing failed.
     pub success: bool,
-    /// The name of what went wrong.
+    /// Cause of the failure; `None` for a success.
     pub cause: Option<String>,
-    /// What there is to say about it.
+    /// Details of the cause.
     pub detail: Option<String>,
-    /// How far each object ended from its goal, metres.
+    /// Final distance of each object from its goal, metres.
     pub goal_distances_m: Vec<f64>,
-    /// How far each object was from its goal at the end of the rehearsal in the training world, metres; open loop only.
+    /// Distance of each object from its goal at the end of the rehearsal, metres; blind modes only.
     pub rehearsed_m: Option<Vec<f64>>,
-    /// How long the arms took, seconds.
+    /// Duration of the arms' motion, seconds.
     pub duration_s: f64,
-    /// Steps that the policy was asked for.
+    /// Number of steps of the policy.
     pub n_steps: u64,
-    /// Steps that the check allowed in part or not at all.
+    /// Number of steps that the check shortened or refused.
     pub n_shortened: u64,
-    /// The smallest gap between the arms, metres; `null` with one arm.
+    /// Smallest gap between the arms, metres; `None` with one arm.
     pub arms_gap_m: Option<f64>,
-    /// The smallest gap between an arm and the table, metres.
+    /// Smallest gap between an arm and the table, metres.
     pub table_gap_m: f64,
-    /// Where the objects lay at first.
+    /// Initial positions of the objects.
     pub starts: Vec<[f64; 3]>,
-    /// Where they should go.
+    /// Goals of the objects.
     pub goals: Vec<[f64; 3]>,
-    /// Where they ended.
+    /// Final positions of the objects.
     pub ends: Vec<[f64; 3]>,
-    /// The tools' way.
-    pub path: Vec<ToolsAt>,
-    /// The trial's log, relative to this file, when there is one.
+    /// Path of the tools.
+    pub path: Vec<ToolPathPoint>,
+    /// Path of the trial's log, relative to this file, if there is one.
     pub log: Option<String>,
 }
 
-/// Where the tools were at one time.
+/// Positions of the tools at one time (world frame, metres), in arm order.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct ToolsAt {
-    /// Seconds since the trial's start.
+pub struct ToolPathPoint {
+    /// Time since the start of the trial, seconds.
     pub time_s: f64,
-    /// Where the motion had them; empty while there was none.
+    /// Planned positions; empty while no motion is executed.
     pub planned: Vec<[f64; 3]>,
-    /// Where they were.
+    /// Measured positions.
     pub measured: Vec<[f64; 3]>,
 }
 
-/// The file of a directory of trials, open for writing.
+/// A results file, open for writing.
 #[derive(Debug)]
 pub struct TrialsLog {
     path: PathBuf,
@@ -75,19 +76,19 @@ pub struct TrialsLog {
 }
 
 impl TrialsLog {
-    /// Starts the file `path` anew.
+    /// Creates `path`, or truncates it.
     ///
     /// # Errors
-    /// When it cannot be written.
+    /// If the file cannot be written.
     pub fn create(path: &Path) -> Result<Self, Error> {
         let file = File::create(path).map_err(Error::io("create", path))?;
         Ok(Self { path: path.to_owned(), file })
     }
 
-    /// Adds a trial.
+    /// Appends a trial.
     ///
     /// # Errors
-    /// When the file cannot be written.
+    /// If the file cannot be written.
     pub fn append(&mut self, row: &TrialRow) -> Result<(), Error> {
         let write_error = |source| Error::io("append to", &self.path)(source);
         let mut line =
@@ -97,10 +98,10 @@ impl TrialsLog {
     }
 }
 
-/// Every trial of the file `path`.
+/// Reads all trials of the file `path`.
 ///
 /// # Errors
-/// When it cannot be read, or names the line that is no trial.
+/// If the file cannot be read or a line is not a trial.
 pub fn read_trials(path: &Path) -> Result<Vec<TrialRow>, Error> {
     let file = File::open(path).map_err(Error::io("open", path))?;
     let mut rows = Vec::new();

@@ -1,4 +1,4 @@
-//! An episode's log: written, read back, cut short, mended.
+//! Logs of episodes: writing, reading and recovery.
 #![expect(clippy::unwrap_used, reason = "a test that cannot go on may end")]
 
 use std::path::Path;
@@ -10,24 +10,24 @@ use tandem_telemetry::{
 #[path = "support/synthetic.rs"]
 mod synthetic;
 
-/// What every MCAP file begins with.
+/// Length of the magic bytes of an MCAP file.
 const MAGIC_BYTES: usize = 8;
 
-/// Every number of a step as bits, so that NaN and −0 count too.
+/// Returns the bits of all numbers of a step, to compare NaN and −0 as well.
 fn bits(step: &LoggedTransition) -> Vec<u32> {
     let vectors = [&step.observation, &step.goal, &step.action, &step.rewards_per_arm];
     vectors.into_iter().flatten().chain([&step.reward]).map(|number| number.to_bits()).collect()
 }
 
-fn written() -> (tempfile::TempDir, Vec<u8>) {
+fn complete_log() -> (tempfile::TempDir, Vec<u8>) {
     let dir = tempfile::tempdir().unwrap();
     let path = synthetic::write_log(&dir.path().join("whole.mcap")).unwrap();
     let bytes = std::fs::read(path).unwrap();
     (dir, bytes)
 }
 
-/// Writes `bytes` as if a killed writer had left them, mends them, and reads what comes out.
-fn mended(dir: &Path, bytes: &[u8]) -> Result<(u64, Result<EpisodeLog, Error>), Error> {
+/// Writes `bytes` as the log of a killed writer, recovers it and reads the result.
+fn recovered(dir: &Path, bytes: &[u8]) -> Result<(u64, Result<EpisodeLog, Error>), Error> {
     let (source, destination) = (dir.join("cut.mcap.part"), dir.join("cut.mcap"));
     std::fs::write(&source, bytes).unwrap();
     let counts = recover(&source, &destination)?;
@@ -68,11 +68,11 @@ fn an_episode_is_read_back_bit_for_bit() {
 
 #[test]
 fn the_same_episode_gives_the_same_bytes() {
-    assert_eq!(written().1, written().1);
+    assert_eq!(complete_log().1, complete_log().1);
 }
 
 #[test]
-fn a_file_has_its_name_only_when_it_is_whole() {
+fn a_file_has_its_final_name_only_when_it_is_complete() {
     let dir = tempfile::tempdir().unwrap();
     let path = dir.path().join("e.mcap");
     let recorder = synthetic::recorded(&path).unwrap();
@@ -89,20 +89,20 @@ fn a_killed_writer_loses_at_most_the_last_steps() {
     for (step, transition) in (0..37).zip(&synthetic::transitions()) {
         recorder.record_step(&synthetic::scene(0.0), &synthetic::record(step, transition)).unwrap();
     }
-    // What is on the disk at this moment is what a kill would leave.
+    // A kill at this moment would leave what is on disk.
     let on_disk = std::fs::read(dir.path().join("e.mcap.part")).unwrap();
-    let (_, log) = mended(dir.path(), &on_disk).unwrap();
+    let (_, log) = recovered(dir.path(), &on_disk).unwrap();
     let log = log.unwrap();
     assert!((30..=37).contains(&log.transitions.len()), "{}", log.transitions.len());
     assert_eq!(log.transitions, synthetic::transitions()[..log.transitions.len()]);
 }
 
 #[test]
-fn a_file_cut_anywhere_is_mended_and_more_bytes_never_mean_less() {
-    let (dir, bytes) = written();
+fn a_file_cut_anywhere_is_recovered_and_more_bytes_give_no_fewer_messages() {
+    let (dir, bytes) = complete_log();
     let mut best = 0;
     for n_bytes in (MAGIC_BYTES..bytes.len()).step_by(307).chain([bytes.len() - 1, bytes.len()]) {
-        let (n_messages, log) = mended(dir.path(), &bytes[..n_bytes]).unwrap();
+        let (n_messages, log) = recovered(dir.path(), &bytes[..n_bytes]).unwrap();
         assert!(
             n_messages >= best,
             "{n_bytes} bytes gave {n_messages} messages, fewer gave {best}"
@@ -124,17 +124,17 @@ fn a_file_cut_anywhere_is_mended_and_more_bytes_never_mean_less() {
 }
 
 #[test]
-fn a_damaged_file_is_refused_and_mending_it_never_panics() {
-    let (dir, bytes) = written();
+fn a_damaged_file_is_refused_and_its_recovery_never_panics() {
+    let (dir, bytes) = complete_log();
     for offset in (0..120).chain((120..bytes.len()).step_by(307)) {
         let mut damaged = bytes.clone();
         damaged[offset] ^= 0x5a;
         let path = dir.path().join("damaged.mcap");
         std::fs::write(&path, &damaged).unwrap();
         assert!(read_episode(&path).is_err(), "byte {offset}");
-        let mended = mended(dir.path(), &damaged);
-        assert_eq!(mended.is_ok(), offset >= MAGIC_BYTES, "byte {offset}");
-        if let Ok((_, Ok(log))) = mended {
+        let recovered = recovered(dir.path(), &damaged);
+        assert_eq!(recovered.is_ok(), offset >= MAGIC_BYTES, "byte {offset}");
+        if let Ok((_, Ok(log))) = recovered {
             assert!(
                 log.transitions == synthetic::transitions()[..log.transitions.len()],
                 "byte {offset}"
@@ -144,23 +144,23 @@ fn a_damaged_file_is_refused_and_mending_it_never_panics() {
 }
 
 #[test]
-fn metadata_that_were_altered_do_not_pass_for_an_episodes() {
-    let (dir, bytes) = written();
+fn altered_metadata_are_refused() {
+    let (dir, bytes) = complete_log();
     let seed = synthetic::metadata().seed.to_string();
     let entry = [&4_u32.to_le_bytes(), &b"seed"[..], &[u8::try_from(seed.len()).unwrap(), 0, 0, 0]];
     let entry = [entry.concat().as_slice(), seed.as_bytes()].concat();
     let at = bytes.windows(entry.len()).position(|window| window == entry).unwrap();
     let mut altered = bytes[..bytes.len() - 100].to_vec();
     altered[at + entry.len() - 1] ^= 1;
-    let (n_messages, log) = mended(dir.path(), &altered).unwrap();
+    let (n_messages, log) = recovered(dir.path(), &altered).unwrap();
     let refusal = log.unwrap_err();
     assert!(matches!(refusal, Error::NotAnEpisode { .. }) && n_messages > 0, "{refusal:?}");
     assert!(refusal.to_string().contains("checksum"), "{refusal}");
 }
 
 #[test]
-fn what_is_no_log_of_an_episode_is_refused_in_one_sentence() {
-    let (dir, bytes) = written();
+fn a_file_that_is_not_the_log_of_an_episode_is_refused() {
+    let (dir, bytes) = complete_log();
     let path = dir.path().join("other.mcap");
     let refusal = |content: &[u8]| {
         std::fs::write(&path, content).unwrap();
@@ -169,7 +169,7 @@ fn what_is_no_log_of_an_episode_is_refused_in_one_sentence() {
     for content in
         [&b""[..], b"not an mcap file at all", &bytes[..bytes.len() / 2], &bytes[..bytes.len() - 3]]
     {
-        assert!(refusal(content).contains("not a whole MCAP file"), "{}", refusal(content));
+        assert!(refusal(content).contains("not a complete MCAP file"), "{}", refusal(content));
     }
     assert!(matches!(recover(&path, &dir.path().join("x")), Ok(_) | Err(Error::ReadLog { .. })));
     assert!(matches!(
@@ -179,10 +179,10 @@ fn what_is_no_log_of_an_episode_is_refused_in_one_sentence() {
 }
 
 #[test]
-fn garbage_is_not_mended_into_an_empty_file() {
+fn garbage_is_not_recovered_as_an_empty_file() {
     let dir = tempfile::tempdir().unwrap();
     std::fs::write(dir.path().join("garbage"), b"garbage").unwrap();
-    let destination = dir.path().join("mended.mcap");
+    let destination = dir.path().join("recovered.mcap");
     assert!(matches!(
         recover(&dir.path().join("garbage"), &destination),
         Err(Error::ReadLog { .. })
@@ -197,10 +197,10 @@ fn vectors_that_do_not_fit_the_layout_are_refused() {
         EpisodeRecorder::create(&dir.path().join("e.mcap"), &synthetic::metadata()).unwrap();
     let step = &synthetic::transitions()[0];
     let scene = synthetic::scene(0.0);
-    let mut check = |field: &str, spoil: &dyn Fn(&mut LoggedTransition)| {
-        let mut spoilt = step.clone();
-        spoil(&mut spoilt);
-        let error = recorder.record_step(&scene, &synthetic::record(0, &spoilt)).unwrap_err();
+    let mut check = |field: &str, alter: &dyn Fn(&mut LoggedTransition)| {
+        let mut altered = step.clone();
+        alter(&mut altered);
+        let error = recorder.record_step(&scene, &synthetic::record(0, &altered)).unwrap_err();
         assert!(error.to_string().starts_with(field), "{error}");
     };
     check("observation", &|step| step.observation.truncate(28));

@@ -1,4 +1,4 @@
-//! Where log lines go. One test, because a process sets up logging once.
+//! Initialisation of logging. There is one test because a process initialises logging once.
 
 use std::path::Path;
 
@@ -7,8 +7,8 @@ use tandem_telemetry::events::{BudgetExhausted, ParametersPublished, Reconnectin
 use tandem_telemetry::logging::{LogConfig, init};
 
 #[test]
-fn the_log_file_gets_events_from_info_up_with_their_fields() {
-    let dir = tempfile::tempdir().expect("a place for the log");
+fn the_log_file_contains_events_from_level_info_up_with_their_fields() {
+    let dir = tempfile::tempdir().expect("a temporary directory");
     let file = dir.path().join("tandem.log");
     let config = LogConfig { file: Some(file.clone()), ..LogConfig::default() };
     let malformed = LogConfig { directives: Some("tandem=loud".to_owned()), ..config.clone() };
@@ -19,7 +19,7 @@ fn the_log_file_gets_events_from_info_up_with_their_fields() {
     };
     assert!(matches!(init(&nowhere), Err(Error::Io { action: "open", .. })));
 
-    init(&config).expect("first set-up");
+    init(&config).expect("the first initialisation");
     assert!(matches!(init(&config), Err(Error::LoggingTwice(_))));
     BudgetExhausted { account: "run-7", budget: 500 }.emit();
     Reconnecting { peer: "learner", attempt: 2, wait_millis: 400, reason: "refused" }.emit();
@@ -35,5 +35,5 @@ fn the_log_file_gets_events_from_info_up_with_their_fields() {
     assert!(
         lines[1].contains("WARN") && lines[1].contains("reconnecting peer=\"learner\" attempt=2")
     );
-    assert!(!text.contains('\u{1b}'), "no colours in a file");
+    assert!(!text.contains('\u{1b}'), "a file has no colours");
 }

@@ -1,4 +1,4 @@
-//! A trial's log: written, read by others, cut short, mended.
+//! Logs of trials: writing, reading with the mcap crate, and recovery.
 #![expect(clippy::unwrap_used, reason = "a test that cannot go on may end")]
 
 use std::collections::BTreeMap;
@@ -10,18 +10,18 @@ use mcap::sans_io::linear_reader::{LinearReadEvent, LinearReader};
 use prost::Message as _;
 use tandem_core::{Layout, Task};
 use tandem_telemetry::{
-    Error, LogLevel, TrialLook, TrialMetadata, TrialOutcome, TrialRecorder, recover,
+    Error, LogLevel, TrialMetadata, TrialOutcome, TrialRecorder, TrialSnapshot, recover,
 };
 
 #[path = "support/synthetic.rs"]
-#[expect(dead_code, reason = "only the scene is shown")]
+#[expect(dead_code, reason = "only the scene is used")]
 mod synthetic;
 
-const N_LOOKS: u32 = 60;
+const N_SNAPSHOTS: u32 = 60;
 
 fn metadata() -> TrialMetadata {
     TrialMetadata {
-        subject: "student-push".to_owned(),
+        policy: "student-push".to_owned(),
         layout: Layout::new(Task::Push, 2),
         mode: "closed-loop".to_owned(),
         trial: 4,
@@ -45,22 +45,22 @@ fn outcome() -> TrialOutcome {
 /// Records a trial in which the motion ends after two thirds.
 fn recorded(path: &Path) -> TrialRecorder {
     let mut recorder = TrialRecorder::create(path, &metadata()).unwrap();
-    for look in 0..N_LOOKS {
-        let progress = look as f32 / N_LOOKS as f32;
+    for snapshot in 0..N_SNAPSHOTS {
+        let progress = snapshot as f32 / N_SNAPSHOTS as f32;
         let scene = synthetic::scene(progress);
         let tools: Vec<[f64; 3]> =
             scene.arms.iter().map(|arm| arm.end_effector.map(f64::from)).collect();
-        let joints = vec![vec![f64::from(look), 0.5, 0.25, 0.125]; 2];
-        let moving = look < 40;
+        let joints = vec![vec![f64::from(snapshot), 0.5, 0.25, 0.125]; 2];
+        let moving = snapshot < 40;
         recorder
-            .look(&TrialLook {
-                time_s: 0.04 * f64::from(look),
+            .record(&TrialSnapshot {
+                time_s: 0.04 * f64::from(snapshot),
                 scene: &scene,
                 planned_joints: moving.then_some(joints.as_slice()),
-                measured_joints: if look == 0 { &[] } else { &joints },
+                measured_joints: if snapshot == 0 { &[] } else { &joints },
                 planned_tools: if moving { &tools } else { &[] },
                 measured_tools: &tools,
-                openings: if look == 0 { &[] } else { &[0.5, 1.0] },
+                openings: if snapshot == 0 { &[] } else { &[0.5, 1.0] },
             })
             .unwrap();
     }
@@ -68,23 +68,23 @@ fn recorded(path: &Path) -> TrialRecorder {
     recorder
 }
 
-/// What somebody else's reader sees: messages by topic, schemas by topic, metadata records by name.
+/// Contents of a log: messages by topic, schemas by topic, metadata records by name.
 #[derive(Default)]
-struct Seen {
+struct LogContents {
     messages: BTreeMap<String, Vec<Vec<u8>>>,
     schemas: BTreeMap<String, String>,
     metadata: BTreeMap<String, BTreeMap<String, String>>,
 }
 
-fn read(path: &Path) -> Seen {
+fn read(path: &Path) -> LogContents {
     let bytes = std::fs::read(path).unwrap();
-    let mut seen = Seen::default();
+    let mut contents = LogContents::default();
     for message in mcap::MessageStream::new(&bytes).unwrap() {
         let message = message.unwrap();
         let topic = message.channel.topic.clone();
         let schema = message.channel.schema.as_ref().unwrap().name.clone();
-        seen.schemas.insert(topic.clone(), schema);
-        seen.messages.entry(topic).or_default().push(message.data.into_owned());
+        contents.schemas.insert(topic.clone(), schema);
+        contents.messages.entry(topic).or_default().push(message.data.into_owned());
     }
     let mut reader = LinearReader::new();
     let mut unread = bytes.as_slice();
@@ -98,27 +98,27 @@ fn read(path: &Path) -> Seen {
             }
             LinearReadEvent::Record { data, opcode } => {
                 if let Record::Metadata(record) = mcap::parse_record(opcode, data).unwrap() {
-                    seen.metadata.insert(record.name, record.metadata);
+                    contents.metadata.insert(record.name, record.metadata);
                 }
             }
         }
     }
-    seen
+    contents
 }
 
 #[test]
-fn a_trial_has_its_topics_its_metadata_and_its_name() {
+fn a_log_has_its_topics_metadata_and_final_name() {
     let dir = tempfile::tempdir().unwrap();
     let path = dir.path().join("trial.mcap");
     let recorder = recorded(&path);
     assert!(!path.exists() && dir.path().join("trial.mcap.part").exists());
     assert_eq!(recorder.finish(&outcome()).unwrap(), path);
     assert!(!dir.path().join("trial.mcap.part").exists());
-    let seen = read(&path);
-    let counts: Vec<(&str, &str, usize)> = seen
+    let contents = read(&path);
+    let counts: Vec<(&str, &str, usize)> = contents
         .messages
         .iter()
-        .map(|(topic, messages)| (topic.as_str(), seen.schemas[topic].as_str(), messages.len()))
+        .map(|(topic, messages)| (topic.as_str(), contents.schemas[topic].as_str(), messages.len()))
         .collect();
     assert_eq!(
         counts,
@@ -130,7 +130,8 @@ fn a_trial_has_its_topics_its_metadata_and_its_name() {
             ("/tf", "foxglove.FrameTransforms", 60),
         ]
     );
-    let [trial, ended] = ["tandem.trial", "tandem.trial.outcome"].map(|name| &seen.metadata[name]);
+    let [trial, ended] =
+        ["tandem.trial", "tandem.trial.outcome"].map(|name| &contents.metadata[name]);
     let entries = ["subject", "task", "arms", "mode", "trial", "seed", "policy_digest", "driver"];
     assert_eq!(
         entries.map(|key| trial[key].as_str()),
@@ -146,11 +147,11 @@ fn a_trial_has_its_topics_its_metadata_and_its_name() {
 }
 
 #[test]
-fn a_look_shows_both_ways_so_far_and_where_the_tools_should_be() {
+fn a_snapshot_shows_both_paths_so_far_and_the_planned_tool_positions() {
     let dir = tempfile::tempdir().unwrap();
     let path = recorded(&dir.path().join("trial.mcap")).finish(&outcome()).unwrap();
-    let seen = read(&path);
-    let scene = |idx: usize| SceneUpdate::decode(&*seen.messages["/scene"][idx]).unwrap();
+    let contents = read(&path);
+    let scene = |idx: usize| SceneUpdate::decode(&*contents.messages["/scene"][idx]).unwrap();
     let shape = |idx: usize, id: &str| {
         let scene = scene(idx);
         let entity = scene.entities.into_iter().find(|entity| entity.id == id).unwrap();
@@ -158,7 +159,7 @@ fn a_look_shows_both_ways_so_far_and_where_the_tools_should_be() {
     };
     let moving = shape(39, "planned0");
     assert!(moving.0 > 20 && moving.1 == 1, "{moving:?}");
-    assert_eq!(shape(59, "planned0"), (moving.0, 0), "the plan stays when the motion is over");
+    assert_eq!(shape(59, "planned0"), (moving.0, 0), "the planned path remains after the motion");
     assert!(shape(59, "measured1").0 > shape(39, "measured1").0);
     let [planned, measured] = ["planned1", "measured1"].map(|id| {
         let entity = scene(39).entities.into_iter().find(|entity| entity.id == id).unwrap();
@@ -174,12 +175,12 @@ fn a_look_shows_both_ways_so_far_and_where_the_tools_should_be() {
 }
 
 #[test]
-fn joints_and_lines_of_text_say_what_was_recorded() {
+fn joint_states_and_log_lines_contain_what_was_recorded() {
     let dir = tempfile::tempdir().unwrap();
     let path = recorded(&dir.path().join("trial.mcap")).finish(&outcome()).unwrap();
-    let seen = read(&path);
+    let contents = read(&path);
     let names = |topic: &str| {
-        let states = JointStates::decode(&*seen.messages[topic][7]).unwrap();
+        let states = JointStates::decode(&*contents.messages[topic][7]).unwrap();
         states.joints.into_iter().map(|joint| joint.name).collect::<Vec<_>>()
     };
     let joints: Vec<String> =
@@ -187,7 +188,7 @@ fn joints_and_lines_of_text_say_what_was_recorded() {
     assert_eq!(names("/planned/joint_states"), joints);
     assert_eq!(names("/joint_states")[..8], joints);
     assert_eq!(names("/joint_states")[8..], ["arm0/gripper", "arm1/gripper"]);
-    let lines: Vec<(i32, String)> = seen.messages["/log"]
+    let lines: Vec<(i32, String)> = contents.messages["/log"]
         .iter()
         .map(|bytes| Log::decode(bytes.as_slice()).unwrap())
         .map(|line| (line.level, line.message))
@@ -195,7 +196,7 @@ fn joints_and_lines_of_text_say_what_was_recorded() {
     let expected = [
         (
             2,
-            "student-push, push, closed-loop, trial 4 of seed 777 begins: driver simulated, speed 0.5, blocks of 90 mm",
+            "student-push, push, closed-loop, trial 4, seed 777: driver simulated, speed 0.5, blocks of 90 mm",
         ),
         (3, "the envelope stopped arm 1"),
         (4, "failure: stopped: arm 1 is too fast"),
@@ -204,42 +205,42 @@ fn joints_and_lines_of_text_say_what_was_recorded() {
 }
 
 #[test]
-fn what_a_killed_recorder_left_is_mended() {
+fn the_log_of_a_killed_recorder_is_recovered() {
     let dir = tempfile::tempdir().unwrap();
     let recorder = recorded(&dir.path().join("trial.mcap"));
-    // What is on the disk at this moment is what a kill would leave.
+    // A kill at this moment would leave what is on disk.
     let on_disk = std::fs::read(dir.path().join("trial.mcap.part")).unwrap();
     drop(recorder);
-    let (cut, mended) = (dir.path().join("cut.mcap.part"), dir.path().join("mended.mcap"));
+    let (cut, recovered) = (dir.path().join("cut.mcap.part"), dir.path().join("recovered.mcap"));
     for n_bytes in [on_disk.len(), on_disk.len() / 2] {
         std::fs::write(&cut, &on_disk[..n_bytes]).unwrap();
-        let counts = recover(&cut, &mended).unwrap();
+        let counts = recover(&cut, &recovered).unwrap();
         assert!(counts.ended_by.is_some() && counts.metadata_records == 1, "{counts:?}");
-        let seen = read(&mended);
-        assert_eq!(seen.metadata["tandem.trial"]["trial"], "4");
-        assert!(!seen.messages["/log"].is_empty());
+        let contents = read(&recovered);
+        assert_eq!(contents.metadata["tandem.trial"]["trial"], "4");
+        assert!(!contents.messages["/log"].is_empty());
     }
     std::fs::write(&cut, &on_disk).unwrap();
-    recover(&cut, &mended).unwrap();
-    assert!(read(&mended).messages["/scene"].len() >= 50);
+    recover(&cut, &recovered).unwrap();
+    assert!(read(&recovered).messages["/scene"].len() >= 50);
 }
 
 #[test]
-fn a_trial_that_never_moved_has_a_whole_log_too() {
+fn a_trial_without_motion_has_a_complete_log() {
     let dir = tempfile::tempdir().unwrap();
     let recorder = TrialRecorder::create(&dir.path().join("trial.mcap"), &metadata()).unwrap();
-    let seen = read(&recorder.finish(&TrialOutcome::default()).unwrap());
-    assert_eq!(seen.messages.keys().collect::<Vec<_>>(), ["/log"]);
-    assert_eq!(seen.metadata["tandem.trial.outcome"]["outcome"], "success");
+    let contents = read(&recorder.finish(&TrialOutcome::default()).unwrap());
+    assert_eq!(contents.messages.keys().collect::<Vec<_>>(), ["/log"]);
+    assert_eq!(contents.metadata["tandem.trial.outcome"]["outcome"], "success");
 }
 
 #[test]
-fn another_number_of_arms_and_times_without_sense_are_refused() {
+fn wrong_numbers_of_arms_and_invalid_times_are_refused() {
     let dir = tempfile::tempdir().unwrap();
     let mut recorder = TrialRecorder::create(&dir.path().join("trial.mcap"), &metadata()).unwrap();
     let scene = synthetic::scene(0.0);
     let joints = vec![vec![0.0; 4]];
-    let look = TrialLook {
+    let snapshot = TrialSnapshot {
         time_s: 0.0,
         scene: &scene,
         planned_joints: None,
@@ -248,18 +249,18 @@ fn another_number_of_arms_and_times_without_sense_are_refused() {
         measured_tools: &[],
         openings: &[],
     };
-    let mut refusal = |look: TrialLook<'_>| recorder.look(&look).unwrap_err();
-    for (field, spoilt) in [
-        ("planned_joints", TrialLook { planned_joints: Some(&joints), ..look }),
-        ("measured_joints", TrialLook { measured_joints: &joints, ..look }),
-        ("planned_tools", TrialLook { planned_tools: &[[0.0; 3]; 3], ..look }),
-        ("measured_tools", TrialLook { measured_tools: &[[0.0; 3]; 1], ..look }),
-        ("openings", TrialLook { openings: &[0.0; 3], ..look }),
+    let mut refusal = |snapshot: TrialSnapshot<'_>| recorder.record(&snapshot).unwrap_err();
+    for (field, invalid) in [
+        ("planned_joints", TrialSnapshot { planned_joints: Some(&joints), ..snapshot }),
+        ("measured_joints", TrialSnapshot { measured_joints: &joints, ..snapshot }),
+        ("planned_tools", TrialSnapshot { planned_tools: &[[0.0; 3]; 3], ..snapshot }),
+        ("measured_tools", TrialSnapshot { measured_tools: &[[0.0; 3]; 1], ..snapshot }),
+        ("openings", TrialSnapshot { openings: &[0.0; 3], ..snapshot }),
     ] {
-        let error = refusal(spoilt);
+        let error = refusal(invalid);
         assert!(error.to_string().starts_with(field), "{error}");
     }
     for time_s in [-0.1, f64::NAN, f64::INFINITY] {
-        assert!(matches!(refusal(TrialLook { time_s, ..look }), Error::Time { .. }));
+        assert!(matches!(refusal(TrialSnapshot { time_s, ..snapshot }), Error::Time { .. }));
     }
 }

@@ -10,8 +10,8 @@ use serde_json::Value;
 use tandem_core::{Layout, Task};
 use tandem_policy::Policy;
 use tandem_report::Run;
-use tandem_teacher::budget::Wish;
-use tandem_teacher::ledger::{Bill, Charge, Ledger as _, SqliteLedger};
+use tandem_teacher::budget::Charge;
+use tandem_teacher::ledger::{ChargeRequest, Ledger as _, SqliteLedger};
 use tandem_telemetry::{read_episode, read_trials, recover};
 use tempfile::TempDir;
 
@@ -67,10 +67,15 @@ fn a_ledger_keeps_its_accounts_leases_and_verdicts() {
         assert_eq!(balance("unleased"), ("mc-q:0.1".to_owned(), 10, 0, 0));
         assert_eq!(balance("leased"), ("eamc:0.25".to_owned(), 25, 45, 930));
         // A step that was charged is not charged again; the next one is charged to the open lease.
-        let wish = Wish { first: true, second: true };
-        let charge = |step| Charge { episode: 1, step, wish };
-        let bill = Bill { account: "leased".to_owned(), charges: vec![charge(4), charge(5)] };
-        ledger.charge(&[bill]).remove(0).expect("charged");
+        let charge = |step| Charge {
+            episode: 1,
+            step,
+            wanted_in_first_half: true,
+            wanted_in_second_half: true,
+        };
+        let charges = vec![charge(4), charge(5)];
+        let request = ChargeRequest { account: "leased".to_owned(), charges };
+        ledger.charge(&[request]).remove(0).expect("charged");
         let balance = ledger.balance("leased").expect("an account");
         assert_eq!((balance.spent, balance.leased, balance.left), (26, 44, 930));
     }

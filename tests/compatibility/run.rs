@@ -8,14 +8,21 @@ use serde_json::Value;
 use tandem_core::Task;
 use tandem_learner::checkpoint::load_newest;
 use tandem_rl::RunConfig;
-use tandem_rl::config::Recipe;
+use tandem_rl::config::{Recipe, former_keys};
 use tandem_rl::trainer::Counters;
 use toml::Table;
 
-/// The run file's settings over the recipe's, so that settings of later versions have a value.
+/// The run file's settings over the recipe's, so that settings of later versions have a value. The program does the same
+/// with former keys, see `a_run_resumes_and_ends_with_the_same_counts`.
 fn configuration(run: &Path) -> RunConfig {
-    let text = fs::read_to_string(run.join("run.toml")).expect("readable");
-    let settings: Table = text.parse().expect("TOML");
+    let mut text = fs::read_to_string(run.join("run.toml")).expect("readable");
+    let name = |key: &'static str| key.split_once('.').expect("a section").1;
+    for (former, current) in former_keys::RENAMED {
+        text = text.replace(&format!("\n{} =", name(former)), &format!("\n{} =", name(current)));
+    }
+    let is_kept = |line: &&str| !former_keys::REMOVED.iter().any(|key| line.starts_with(name(key)));
+    let text: Vec<&str> = text.lines().filter(is_kept).collect();
+    let settings: Table = text.join("\n").parse().expect("TOML");
     let defaults = RunConfig::defaults(Recipe::Tandem, Task::Push, 2);
     let mut resolved = Table::try_from(defaults).expect("a table");
     for (key, value) in settings {
@@ -76,7 +83,8 @@ fn a_run_resumes_and_ends_with_the_same_counts() {
         let run: PathBuf = directory.path().join("run");
         copy_directory(&version.join("run"), &run);
         let output = Command::new(env!("CARGO_BIN_EXE_tandem"))
-            .args(["train", "--resume", "--json", "--workers", "1", "--out"])
+            .args(["train", "--resume", "--json", "--workers", "1"])
+            .args(["--set", "evaluation.test_episodes=8", "--out"])
             .arg(&run)
             .output()
             .expect("runs");

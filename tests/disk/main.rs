@@ -23,7 +23,7 @@ fn faults(mode: Mode, hits: &[(&str, usize)]) -> Vec<Fault> {
 #[test]
 fn a_run_survives_calls_that_fail_once() {
     let hits = [
-        ("fsync run/checkpoint/#.tmp", 50),
+        ("fsync run/checkpoint/#.safetensors.tmp", 50),
         ("pwrite run/ledger.sqlite-wal", 60),
         ("write run/metrics.jsonl", 50),
     ];
@@ -32,7 +32,8 @@ fn a_run_survives_calls_that_fail_once() {
 
 #[test]
 fn a_run_on_a_disk_that_died_says_so_and_is_resumed_on_another() {
-    let hits = [("write run/checkpoint/#.tmp", 50), ("pwrite run/ledger.sqlite-wal", 30)];
+    let hits =
+        [("write run/checkpoint/#.safetensors.tmp", 50), ("pwrite run/ledger.sqlite-wal", 30)];
     faults(Mode::Dead, &hits).iter().for_each(check);
     let full = faults(Mode::Dead, &[("write run/policy/last", 50)]).remove(0);
     check(&Fault { errno: ENOSPC, ..full });
@@ -40,7 +41,8 @@ fn a_run_on_a_disk_that_died_says_so_and_is_resumed_on_another() {
 
 #[test]
 fn a_run_survives_processes_that_are_killed_as_they_write() {
-    let hits = [("write run/checkpoint/#.tmp", 70), ("pwrite run/ledger.sqlite-wal", 40)];
+    let hits =
+        [("write run/checkpoint/#.safetensors.tmp", 70), ("pwrite run/ledger.sqlite-wal", 40)];
     faults(Mode::Kill, &hits).iter().for_each(check);
 }
 

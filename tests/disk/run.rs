@@ -15,7 +15,7 @@ use tandem_telemetry::read_episode;
 use crate::device::{Device, Fault, Mode};
 
 /// A small advised run of 6 rounds with a checkpoint after each; its budget runs out on the way.
-const SMALL: [&str; 26] = [
+const SMALL: [&str; 28] = [
     "--arms",
     "1",
     "--strategy",
@@ -32,6 +32,8 @@ const SMALL: [&str; 26] = [
     "ddpg.n_hidden=16",
     "--set",
     "evaluation.episodes=4",
+    "--set",
+    "evaluation.test_episodes=8",
     "--set",
     "evaluation.every_env_steps=800",
     "--set",

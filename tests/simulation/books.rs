@@ -4,8 +4,10 @@ use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::{Arc, Mutex, MutexGuard};
 
-use tandem_teacher::budget::{Account, Balance, BudgetError, Lease, Terms, Verdict};
-use tandem_teacher::ledger::{Bill, Charge, Ledger, LedgerError, Receipt, SqliteLedger};
+use tandem_teacher::budget::{
+    Account, AccountTerms, Balance, BudgetError, BudgetHalf, Charge, Lease,
+};
+use tandem_teacher::ledger::{ChargeRequest, ChargeResult, Ledger, LedgerError, SqliteLedger};
 
 type Open = dyn Fn() -> Box<dyn Ledger>;
 
@@ -46,7 +48,7 @@ impl<L> Kept<L> {
 }
 
 impl<L: Ledger> Ledger for Kept<L> {
-    fn open(&mut self, name: &str, terms: Terms) -> Result<Balance, LedgerError> {
+    fn open(&mut self, name: &str, terms: AccountTerms) -> Result<Balance, LedgerError> {
         self.lock().open(name, terms)
     }
 
@@ -67,7 +69,7 @@ impl<L: Ledger> Ledger for Kept<L> {
         self.lock().settle(name, episodes)
     }
 
-    fn charge(&mut self, bills: &[Bill]) -> Vec<Result<Receipt, LedgerError>> {
+    fn charge(&mut self, bills: &[ChargeRequest]) -> Vec<Result<ChargeResult, LedgerError>> {
         self.lock().charge(bills)
     }
 }
@@ -86,19 +88,18 @@ impl ForgetfulLedger {
         Ok(self.accounts.get_mut(name).ok_or_else(unknown)?)
     }
 
-    fn charge_bill(&mut self, bill: &Bill) -> Result<Receipt, LedgerError> {
+    fn charge_bill(&mut self, bill: &ChargeRequest) -> Result<ChargeResult, LedgerError> {
         let first_step = self.next_step;
         self.next_step += u32::try_from(bill.charges.len()).expect("a bill is short");
         let account = self.account(&bill.account)?;
-        let charge =
-            |(step, charge): (u32, &Charge)| account.charge(charge.episode, step, charge.wish);
+        let charge = |(step, charge): (u32, &Charge)| account.charge(Charge { step, ..*charge });
         let verdicts = (first_step..).zip(&bill.charges).map(charge).collect();
-        Ok(Receipt { verdicts, left: account.left() })
+        Ok(ChargeResult { verdicts, left: account.left() })
     }
 }
 
 impl Ledger for ForgetfulLedger {
-    fn open(&mut self, name: &str, terms: Terms) -> Result<Balance, LedgerError> {
+    fn open(&mut self, name: &str, terms: AccountTerms) -> Result<Balance, LedgerError> {
         Ok(self.accounts.entry(name.to_owned()).or_insert_with(|| Account::new(terms)).balance())
     }
 
@@ -122,7 +123,7 @@ impl Ledger for ForgetfulLedger {
         Ok(account.balance())
     }
 
-    fn charge(&mut self, bills: &[Bill]) -> Vec<Result<Receipt, LedgerError>> {
+    fn charge(&mut self, bills: &[ChargeRequest]) -> Vec<Result<ChargeResult, LedgerError>> {
         bills.iter().map(|bill| self.charge_bill(bill)).collect()
     }
 }
@@ -130,7 +131,7 @@ impl Ledger for ForgetfulLedger {
 /// What a ledger was seen to do in a simulation.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Book {
-    verdicts: BTreeMap<(String, u64, u32), Verdict>,
+    verdicts: BTreeMap<(String, u64, u32), Option<BudgetHalf>>,
     spent: BTreeMap<String, u64>,
     /// Steps asked about again.
     pub(crate) n_repeats: u64,
@@ -146,8 +147,8 @@ impl Book {
 
     /// Steps of `account` that were charged.
     pub(crate) fn n_charged(&self, account: &str) -> u64 {
-        let is_charged = |((name, ..), verdict): &(&(String, u64, u32), &Verdict)| {
-            name == account && **verdict != Verdict::Uncharged
+        let is_charged = |((name, ..), verdict): &(&(String, u64, u32), &Option<BudgetHalf>)| {
+            name == account && verdict.is_some()
         };
         self.verdicts.iter().filter(is_charged).count() as u64
     }
@@ -163,7 +164,7 @@ impl Book {
         }
     }
 
-    fn note_verdict(&mut self, account: &str, charge: &Charge, verdict: Verdict) {
+    fn note_verdict(&mut self, account: &str, charge: &Charge, verdict: Option<BudgetHalf>) {
         let key = (account.to_owned(), charge.episode, charge.step);
         let Some(before) = self.verdicts.insert(key, verdict) else { return };
         self.n_repeats += 1;
@@ -198,7 +199,7 @@ impl Watched {
 }
 
 impl Ledger for Watched {
-    fn open(&mut self, name: &str, terms: Terms) -> Result<Balance, LedgerError> {
+    fn open(&mut self, name: &str, terms: AccountTerms) -> Result<Balance, LedgerError> {
         let balance = self.ledger.open(name, terms)?;
         Ok(self.noted(name, balance))
     }
@@ -223,7 +224,7 @@ impl Ledger for Watched {
         Ok(self.noted(name, balance))
     }
 
-    fn charge(&mut self, bills: &[Bill]) -> Vec<Result<Receipt, LedgerError>> {
+    fn charge(&mut self, bills: &[ChargeRequest]) -> Vec<Result<ChargeResult, LedgerError>> {
         let receipts = self.ledger.charge(bills);
         for (bill, receipt) in bills.iter().zip(&receipts) {
             let Ok(receipt) = receipt else { continue };

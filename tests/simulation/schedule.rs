@@ -4,7 +4,7 @@ use std::fmt;
 use std::time::Duration;
 
 use rand_chacha::ChaCha8Rng;
-use tandem_core::rng::{Stream, coin, episode_rng, index, uniform};
+use tandem_core::rng::{Stream, bernoulli, episode_rng, index, uniform};
 
 /// A machine of the simulation.
 pub(crate) type Host = &'static str;
@@ -114,7 +114,7 @@ impl Dice {
     }
 
     fn happens(&mut self, probability: f32) -> bool {
-        coin(&mut self.rng, probability)
+        bernoulli(&mut self.rng, probability)
     }
 
     /// A moment within the span.

@@ -6,8 +6,8 @@ use rayon::iter::{IntoParallelIterator as _, ParallelIterator as _};
 use tandem_kinematics::Joints;
 use tandem_policy::{Actor, Policy};
 use tandem_sim::SimError;
-use tandem_telemetry::trial_log::{TrialLook, TrialMetadata, TrialOutcome, TrialRecorder};
-use tandem_telemetry::{ToolsAt, TrialRow};
+use tandem_telemetry::trial_log::{TrialMetadata, TrialOutcome, TrialRecorder, TrialSnapshot};
+use tandem_telemetry::{ToolPathPoint, TrialRow};
 
 use crate::trial::{
     Frame, NoObserver, PathPoint, TrialConfig, TrialError, TrialObserver, TrialReport, TrialRunner,
@@ -95,7 +95,7 @@ impl Series<'_> {
 
     fn metadata(&self, number: u64) -> TrialMetadata {
         TrialMetadata {
-            subject: self.subject.name.clone(),
+            policy: self.subject.name.clone(),
             layout: self.config.layout,
             mode: self.config.mode.name().to_owned(),
             trial: number,
@@ -111,7 +111,7 @@ impl Series<'_> {
         let distances = report.objects.iter().map(|object| object.goal_distance_m());
         let every = report.path.len().div_ceil(PATH_POINTS).max(1);
         TrialRow {
-            subject: self.subject.name.clone(),
+            policy: self.subject.name.clone(),
             mode: self.config.mode.name().to_owned(),
             task: self.config.layout.task.name().to_owned(),
             trial: report.number,
@@ -168,7 +168,7 @@ impl TrialObserver for Recording {
         let openings: Vec<f64> = arms.iter().map(|arm| arm.opening).collect();
         let [planned_tools, measured_tools] =
             [&frame.tools.planned, &frame.tools.measured].map(|tools| points(tools));
-        let written = self.recorder.look(&TrialLook {
+        let written = self.recorder.record(&TrialSnapshot {
             time_s: frame.time_s,
             scene: &frame.scene,
             planned_joints: planned.as_deref(),
@@ -194,8 +194,8 @@ fn points(tools: &[glam::DVec3]) -> Vec<[f64; 3]> {
     tools.iter().map(|tool| tool.to_array()).collect()
 }
 
-fn tools_at(point: &PathPoint) -> ToolsAt {
-    ToolsAt {
+fn tools_at(point: &PathPoint) -> ToolPathPoint {
+    ToolPathPoint {
         time_s: point.time_s,
         planned: points(&point.planned),
         measured: points(&point.measured),

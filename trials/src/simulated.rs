@@ -12,12 +12,12 @@
 //!
 //! Time advances only in exchanges, by [`PERIOD_S`] each. The same seed and commands give the same bits.
 
-use glam::DVec3;
+use glam::{DMat3, DVec3};
 use rand_chacha::ChaCha8Rng;
 use tandem_core::scene::Scene;
 use tandem_core::{ArmIndex, Contacts, Stream, episode_rng};
 use tandem_kinematics::model::Anchor;
-use tandem_kinematics::{Cell, Gaps, Joints, Posture};
+use tandem_kinematics::{ForwardKinematics, Gaps, Joints, WorkCell};
 
 use crate::simulated::drives::Drives;
 use crate::simulated::physics::{ArmPoses, PhysicsWorld};
@@ -51,7 +51,7 @@ enum Source {
 
 /// Up to two simulated Micos with four joints, their table and the objects on it.
 pub struct SimulatedPair {
-    cell: Cell,
+    cell: WorkCell,
     config: SimulatedConfig,
     disturbance: Disturbance,
     drives: Drives,
@@ -77,7 +77,7 @@ impl SimulatedPair {
     /// # Panics
     /// Panics if there are more than two arms, an arm does not have four joints, or `at` does not match the arms.
     #[must_use]
-    pub fn new(cell: Cell, at: &[Joints], opening: f64, config: SimulatedConfig) -> Self {
+    pub fn new(cell: WorkCell, at: &[Joints], opening: f64, config: SimulatedConfig) -> Self {
         assert!(
             (1..=2).contains(&cell.arms.len()) && cell.arms.len() == at.len(),
             "one or two arms"
@@ -209,11 +209,12 @@ impl SimulatedPair {
     /// Converts a force on the tool (world frame, newtons) and the external torques of the disturbance to joint torques.
     fn torques(&self, arm: usize, force_n: DVec3) -> Joints {
         let placed = &self.cell.arms[arm];
-        let posture = Posture::of(placed.model, &self.drives.arms[arm].angles);
-        let in_base = placed.axes().transpose() * force_n;
+        let posture = ForwardKinematics::new(placed.model, &self.drives.arms[arm].angles);
+        let in_base = placed.world_from_base().inverse_transform_vector(&force_n.into());
+        let jacobian = posture.position_jacobian();
         let external = self.disturbance.torque_nm.get(arm);
         Joints::from_fn(placed.model.n_joints(), |joint| {
-            posture.tool_motion(joint).0.dot(in_base) + external.map_or(0.0, |nm| nm[joint])
+            jacobian.column(joint).dot(&in_base) + external.map_or(0.0, |nm| nm[joint])
         })
     }
 
@@ -271,16 +272,16 @@ impl Driver for SimulatedPair {
 }
 
 /// Returns the poses of the arms' bodies for joint angles `angles`, radians.
-fn arm_poses(cell: &Cell, angles: &[Joints]) -> impl Iterator<Item = ArmPoses> {
+fn arm_poses(cell: &WorkCell, angles: &[Joints]) -> impl Iterator<Item = ArmPoses> {
     cell.arms.iter().zip(angles).map(|(placed, angles)| {
-        let posture = Posture::of(placed.model, angles);
-        let tool = posture.tool();
+        let posture = ForwardKinematics::new(placed.model, angles);
+        let world_from_base = placed.world_from_base();
+        let world_from_tool = world_from_base * posture.tool();
         ArmPoses {
-            tool_m: placed.world_from_base(tool.origin_m),
-            tool_axes: placed.axes() * tool.axes,
+            tool_m: world_from_tool.translation.vector.into(),
+            tool_axes: DMat3::from_quat(world_from_tool.rotation.into()),
             forearm_m: FOREARM_FRAMES.map(|frame| {
-                let anchor = Anchor { frame, offset_m: DVec3::ZERO };
-                placed.world_from_base(posture.anchor(&anchor))
+                (world_from_base * posture.anchor_m(&Anchor::origin_of(frame))).into()
             }),
         }
     })

@@ -13,7 +13,7 @@
 use glam::DVec3;
 use tandem_core::scene::Scene;
 use tandem_core::{Contacts, Layout};
-use tandem_kinematics::{Joints, WayPoint};
+use tandem_kinematics::{Joints, Waypoint};
 use tandem_sim::SimError;
 
 use crate::simulated::{Block, SimulatedConfig};
@@ -115,7 +115,7 @@ pub struct TrialReport {
     /// The smallest gap between an arm and the table, metres.
     pub table_gap_m: f64,
     /// The waypoints of the tools; empty if no motion was planned.
-    pub way_points: Vec<WayPoint>,
+    pub way_points: Vec<Waypoint>,
     /// The measured and planned positions of the tools, 25 times per second.
     pub path: Vec<PathPoint>,
 }

@@ -3,8 +3,8 @@
 use std::num::NonZeroUsize;
 
 use tandem_core::layout::Layout;
-use tandem_core::work::{EpisodeOrder, Exploration, RunTerms, SlotOrder, WorldTerms};
-use tandem_core::{Episode, EpisodeKind};
+use tandem_core::work::{EpisodeOrder, RunTerms, SlotOrder};
+use tandem_core::{Episode, EpisodeKind, Exploration, WorldSettings};
 use tandem_sim::{Env, WorldConfig};
 
 use crate::ports::{Act, NoAdvisor, World};
@@ -90,8 +90,8 @@ fn evaluation_terms(layout: Layout) -> RunTerms {
     RunTerms {
         layout,
         account: None,
-        exploration: Exploration { noise_std: 0.0, random_share: 0.0, random_hold_mean_steps: 1.0 },
-        world: WorldTerms { gripped_start_share: 0.0, wide_start_share: 0.0, substeps: 0 },
+        exploration: Exploration::NONE,
+        world: WorldSettings::default(),
     }
 }
 

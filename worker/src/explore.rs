@@ -4,9 +4,9 @@
 //! and objects with it.
 
 use rand_chacha::ChaCha8Rng;
+use tandem_core::Exploration;
 use tandem_core::layout::Layout;
-use tandem_core::rng::{coin, standard_normal, uniform};
-use tandem_core::work::Exploration;
+use tandem_core::rng::{bernoulli, standard_normal, uniform};
 
 /// The exploration of one episode.
 ///
@@ -37,10 +37,10 @@ impl Explorer {
         Self {
             layout,
             noise_std: settings.noise_std,
-            hold_mean_steps: settings.random_hold_mean_steps,
+            hold_mean_steps: settings.sticky_random_mean_steps,
             start_probability: start_probability(
-                settings.random_share,
-                settings.random_hold_mean_steps,
+                settings.random_action_prob,
+                settings.sticky_random_mean_steps,
             ),
             held: vec![idle; layout.n_arms],
             rng,
@@ -50,7 +50,7 @@ impl Explorer {
     /// Exploration of a warm-up: every step of every arm takes a random action.
     #[must_use]
     pub fn uniform(layout: Layout, settings: Exploration, rng: ChaCha8Rng) -> Self {
-        Self::new(layout, Exploration { random_share: 1.0, ..settings }, rng)
+        Self::new(layout, Exploration { random_action_prob: 1.0, ..settings }, rng)
     }
 
     /// Turns the policy's action into what is to be executed, shape `[n_action]`, in [−1, 1].
@@ -76,7 +76,7 @@ impl Explorer {
 impl HeldAction {
     /// Goes on by one step: an action whose time is over may be followed by a new one.
     fn advance(&mut self, rng: &mut ChaCha8Rng, start_probability: f32, hold_mean_steps: f32) {
-        let starts = coin(rng, start_probability);
+        let starts = bernoulli(rng, start_probability);
         let n_steps = hold_steps(uniform(rng, 0.0, 1.0), hold_mean_steps);
         let free = self.n_steps_left <= 1;
         self.n_steps_left = match (free, starts) {
@@ -118,7 +118,7 @@ mod tests {
 
     const LAYOUT: Layout = Layout::new(Task::Push, 2);
     const SETTINGS: Exploration =
-        Exploration { noise_std: 0.0, random_share: 0.3, random_hold_mean_steps: 4.0 };
+        Exploration { noise_std: 0.0, random_action_prob: 0.3, sticky_random_mean_steps: 4.0 };
     /// What the policy does in these tests; no random action equals it.
     const POLICY_ACTION: [f32; 6] = [0.5; 6];
 
@@ -186,7 +186,7 @@ mod tests {
     fn a_warm_up_takes_random_actions_only_and_no_share_takes_none() {
         let all_random = arm_actions(Explorer::uniform(LAYOUT, SETTINGS, rng(0)), 500, 0);
         assert!(all_random.iter().all(is_random));
-        let none = Exploration { random_share: 0.0, ..SETTINGS };
+        let none = Exploration { random_action_prob: 0.0, ..SETTINGS };
         let policy_only = arm_actions(Explorer::new(LAYOUT, none, rng(0)), 500, 0);
         assert!(!policy_only.iter().any(is_random));
     }
@@ -194,7 +194,7 @@ mod tests {
     #[test]
     fn noise_has_its_deviation_and_stays_within_bounds() {
         let settings =
-            Exploration { noise_std: 0.2, random_share: 0.0, random_hold_mean_steps: 1.0 };
+            Exploration { noise_std: 0.2, random_action_prob: 0.0, sticky_random_mean_steps: 1.0 };
         let actions = arm_actions(Explorer::new(LAYOUT, settings, rng(0)), 20_000, 0);
         let offsets: Vec<f32> = actions.iter().map(|action| action[0] - 0.5).collect();
         let std = (offsets.iter().map(|offset| offset * offset).sum::<f32>() / 20_000.0).sqrt();

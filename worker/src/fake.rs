@@ -2,9 +2,11 @@
 
 use tandem_core::layout::{Layout, OBSERVATION_PER_ARM, Task};
 use tandem_core::rng::{Stream, episode_rng, uniform};
-use tandem_core::work::{EpisodeOrder, Exploration, RunTerms, SlotOrder, WorldTerms};
-use tandem_core::{ArmAdvice, Contacts, EpisodeKind, StepAdvice, StepQuery};
-use tandem_sim::{SimError, Starts};
+use tandem_core::work::{EpisodeOrder, RunTerms, SlotOrder};
+use tandem_core::{
+    ArmAdvice, Contacts, EpisodeKind, Exploration, StepAdvice, StepQuery, WorldSettings,
+};
+use tandem_sim::SimError;
 
 use crate::ports::{Act, Advisor, AdvisorGone, World};
 
@@ -24,9 +26,9 @@ impl FakeWorld {
 }
 
 impl World for FakeWorld {
-    fn reset(&mut self, order: EpisodeOrder, starts: Starts) {
+    fn reset(&mut self, order: EpisodeOrder, settings: WorldSettings) {
         let mut rng = episode_rng(order.seed, order.number, Stream::Reset);
-        let width = 0.5 + starts.wide_share;
+        let width = 0.5 + settings.grasped_start_prob;
         self.positions.fill_with(|| uniform(&mut rng, -width, width));
         self.goal.fill_with(|| uniform(&mut rng, -0.5, 0.5));
     }
@@ -113,9 +115,10 @@ impl<F: Fn(u64, u32, usize) -> bool> FakeTeacher<F> {
 }
 
 impl<F: Fn(u64, u32, usize) -> bool> Advisor for FakeTeacher<F> {
-    fn advise(&mut self, queries: &[StepQuery]) -> Result<Vec<StepAdvice>, AdvisorGone> {
-        self.questions.push(queries.to_vec());
-        Ok(queries.iter().map(|query| self.verdict(query)).collect())
+    fn advise(&mut self, queries: Vec<StepQuery>) -> Result<Vec<StepAdvice>, AdvisorGone> {
+        let answers = queries.iter().map(|query| self.verdict(query)).collect();
+        self.questions.push(queries);
+        Ok(answers)
     }
 }
 
@@ -124,8 +127,12 @@ pub(crate) fn terms() -> RunTerms {
     RunTerms {
         layout: LAYOUT,
         account: Some("run".to_owned()),
-        exploration: Exploration { noise_std: 0.2, random_share: 0.3, random_hold_mean_steps: 4.0 },
-        world: WorldTerms { gripped_start_share: 0.0, wide_start_share: 0.5, substeps: 20 },
+        exploration: Exploration {
+            noise_std: 0.2,
+            random_action_prob: 0.3,
+            sticky_random_mean_steps: 4.0,
+        },
+        world: WorldSettings { grasped_start_prob: 0.5, substeps: 20 },
     }
 }
 

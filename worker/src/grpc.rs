@@ -104,7 +104,7 @@ impl Learner {
         };
         let answer = within(self.patience.answer, self.client.join(request)).await?.into_inner();
         let terms = answer.terms.ok_or_else(|| missing("terms"))?;
-        Ok((answer.worker_id, tandem_proto::decode_terms(terms)?))
+        Ok((answer.worker_id, tandem_proto::decode_run_terms(terms)?))
     }
 
     pub(crate) async fn next_work(&mut self, worker_id: u64) -> Result<Work, CallError> {

@@ -5,13 +5,13 @@ use std::path::{Path, PathBuf};
 use tandem_core::work::{EpisodeOrder, PublishedActor, RunTerms, SlotOrder};
 use tandem_core::{Contacts, Episode, StepAdvice, StepQuery};
 use tandem_policy::Actor;
-use tandem_sim::{Env, SimError};
+use tandem_sim::{Env, SimError, WorldConfig};
 use tandem_telemetry::events::{EpisodeFinished, EpisodeRecorded};
 use tokio::sync::{mpsc, oneshot};
 
 use crate::ports::{Advisor, AdvisorGone};
 use crate::record::{log_name, metadata_of, record_episode};
-use crate::rollout::{RolloutError, play_slot, world_config};
+use crate::rollout::{RolloutError, play_slot};
 
 /// Plays slots on a thread of its own.
 pub(crate) struct Player {
@@ -23,7 +23,7 @@ pub(crate) struct Player {
 
 impl Player {
     pub(crate) fn new(terms: RunTerms, log_dir: Option<PathBuf>) -> Result<Self, SimError> {
-        let world = Env::new(terms.layout, &world_config(terms.world))?;
+        let world = Env::new(terms.layout, &WorldConfig::from(terms.world))?;
         Ok(Self { terms, world, actor: None, log_dir })
     }
 
@@ -111,11 +111,9 @@ impl Questions {
 }
 
 impl Advisor for Questions {
-    fn advise(&mut self, queries: &[StepQuery]) -> Result<Vec<StepAdvice>, AdvisorGone> {
+    fn advise(&mut self, queries: Vec<StepQuery>) -> Result<Vec<StepAdvice>, AdvisorGone> {
         let (answer, answered) = oneshot::channel();
-        self.0
-            .blocking_send(Question { queries: queries.to_vec(), answer })
-            .map_err(|_unsent| AdvisorGone)?;
+        self.0.blocking_send(Question { queries, answer }).map_err(|_unsent| AdvisorGone)?;
         answered.blocking_recv().map_err(|_closed| AdvisorGone)
     }
 }

@@ -2,9 +2,9 @@
 
 use tandem_core::rng::{Stream, episode_rng};
 use tandem_core::work::EpisodeOrder;
-use tandem_core::{Contacts, StepAdvice, StepQuery};
+use tandem_core::{Contacts, StepAdvice, StepQuery, WorldSettings};
 use tandem_policy::Actor;
-use tandem_sim::{Env, SimError, Starts};
+use tandem_sim::{Env, SimError};
 
 /// Chooses actions.
 pub trait Act {
@@ -23,7 +23,7 @@ pub trait Advisor {
     ///
     /// # Errors
     /// When no answer will come any more, because the worker is stopping.
-    fn advise(&mut self, queries: &[StepQuery]) -> Result<Vec<StepAdvice>, AdvisorGone>;
+    fn advise(&mut self, queries: Vec<StepQuery>) -> Result<Vec<StepAdvice>, AdvisorGone>;
 }
 
 /// No answer will come any more.
@@ -36,7 +36,7 @@ pub struct AdvisorGone;
 pub struct NoAdvisor;
 
 impl Advisor for NoAdvisor {
-    fn advise(&mut self, _queries: &[StepQuery]) -> Result<Vec<StepAdvice>, AdvisorGone> {
+    fn advise(&mut self, _queries: Vec<StepQuery>) -> Result<Vec<StepAdvice>, AdvisorGone> {
         Err(AdvisorGone)
     }
 }
@@ -44,7 +44,7 @@ impl Advisor for NoAdvisor {
 /// A world in which an episode is played. A clone plays the same episodes.
 pub trait World: Clone {
     /// Puts the world into the start state of an episode; what was played before has no influence on it.
-    fn reset(&mut self, order: EpisodeOrder, starts: Starts);
+    fn reset(&mut self, order: EpisodeOrder, settings: WorldSettings);
 
     /// Writes the observation, shape `[n_observation]`.
     fn observe(&self, observation: &mut [f32]);
@@ -60,8 +60,8 @@ pub trait World: Clone {
 }
 
 impl World for Env {
-    fn reset(&mut self, order: EpisodeOrder, starts: Starts) {
-        self.reset(&mut episode_rng(order.seed, order.number, Stream::Reset), starts);
+    fn reset(&mut self, order: EpisodeOrder, settings: WorldSettings) {
+        self.reset(&mut episode_rng(order.seed, order.number, Stream::Reset), settings);
     }
 
     fn observe(&self, observation: &mut [f32]) {

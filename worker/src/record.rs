@@ -3,25 +3,19 @@
 //! An episode is logged after it was played, by playing its actions once more: the simulator repeats itself bit for
 //! bit, which every log proves again.
 
-use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
-use std::str::FromStr;
 
 use tandem_core::layout::EPISODE_STEPS;
 use tandem_core::reward::{achieved_goal, sparse_reward};
 use tandem_core::rng::{Stream, episode_rng};
-use tandem_core::work::{EpisodeOrder, RunTerms, WorldTerms};
-use tandem_core::{Episode, EpisodeKind, Layout};
-use tandem_sim::{Env, SimError};
+use tandem_core::work::{EpisodeOrder, RunTerms};
+use tandem_core::{Episode, EpisodeKind, Layout, WorldSettings};
+use tandem_sim::{Env, SimError, WorldConfig};
 use tandem_telemetry::{
     EpisodeLog, EpisodeMetadata, EpisodeRecorder, LoggedTransition, TransitionRecord,
 };
 
-use crate::rollout::{starts, world_config};
-
-// Names under which a log's metadata keep the world's set-up.
-const SUBSTEPS: &str = "substeps";
-const GRIPPED_START_SHARE: &str = "gripped_start_share";
+/// A probability of earlier versions: training episodes that started with the hands anywhere above the table.
 const WIDE_START_SHARE: &str = "wide_start_share";
 
 /// Why an episode has no log or a log has no world.
@@ -66,6 +60,9 @@ pub enum RecordError {
         /// Its value, if there is one.
         got: Option<String>,
     },
+    /// The episode may have started in a way that only earlier versions simulate.
+    #[error("the log has {WIDE_START_SHARE} = {0}: this version has no such starts")]
+    RemovedStart(String),
 }
 
 /// Describes an ordered episode of a run, as its log keeps it.
@@ -79,20 +76,8 @@ pub fn metadata_of(order: EpisodeOrder, episode: &Episode, terms: &RunTerms) -> 
         parameter_version: episode.parameter_version,
         layout: episode.layout,
         policy_digest: String::new(),
-        world: world_entries(terms.world),
+        world: terms.world.log_entries().map(|(key, value)| (key.to_owned(), value)).into(),
     }
-}
-
-/// The set-up of a world as entries of a log's metadata.
-#[must_use]
-pub fn world_entries(terms: WorldTerms) -> BTreeMap<String, String> {
-    [
-        (SUBSTEPS, terms.substeps.to_string()),
-        (GRIPPED_START_SHARE, terms.gripped_start_share.to_string()),
-        (WIDE_START_SHARE, terms.wide_start_share.to_string()),
-    ]
-    .map(|(key, value)| (key.to_owned(), value))
-    .into()
 }
 
 /// The world of a logged episode, in the episode's start state.
@@ -100,21 +85,17 @@ pub fn world_entries(terms: WorldTerms) -> BTreeMap<String, String> {
 /// # Errors
 /// When the metadata lack an entry or the world cannot be built.
 pub fn world_of(metadata: &EpisodeMetadata) -> Result<Env, RecordError> {
-    let terms = WorldTerms {
-        gripped_start_share: entry(metadata, GRIPPED_START_SHARE)?,
-        wide_start_share: entry(metadata, WIDE_START_SHARE)?,
-        substeps: entry(metadata, SUBSTEPS)?,
-    };
-    let mut world = Env::new(metadata.layout, &world_config(terms))?;
+    let entry = |key: &str| metadata.world.get(key).map(String::as_str);
+    let settings = WorldSettings::from_log_entries(entry)
+        .map_err(|key| RecordError::Metadata { key, got: entry(key).map(str::to_owned) })?;
+    let is_training = metadata.kind == EpisodeKind::Training;
+    if let Some(share) = entry(WIDE_START_SHARE).filter(|share| is_training && *share != "0") {
+        return Err(RecordError::RemovedStart(share.to_owned()));
+    }
+    let mut world = Env::new(metadata.layout, &WorldConfig::from(settings))?;
     let mut rng = episode_rng(metadata.seed, metadata.episode, Stream::Reset);
-    world.reset(&mut rng, starts(metadata.kind, terms));
+    world.reset(&mut rng, settings.for_kind(metadata.kind));
     Ok(world)
-}
-
-fn entry<T: FromStr>(metadata: &EpisodeMetadata, key: &'static str) -> Result<T, RecordError> {
-    let got = metadata.world.get(key);
-    let malformed = || RecordError::Metadata { key, got: got.cloned() };
-    got.and_then(|value| value.parse().ok()).ok_or_else(malformed)
 }
 
 /// Name of an episode's log.
@@ -169,7 +150,7 @@ fn record_step(
         observation: episode.observation(step_idx),
         goal: &episode.goal,
         action: episode.action(step_idx),
-        reward: episode.joint_reward_after(step_idx),
+        reward: episode.joint_reward(step_idx),
         rewards_per_arm: &rewards_per_arm,
         advised_arms: episode.advised_arms[step_idx],
         contacts: episode.contacts[step_idx],
@@ -265,7 +246,7 @@ mod tests {
     fn played(kind: EpisodeKind) -> (EpisodeMetadata, Episode) {
         let order = SlotOrder { kind, ..slot(&[3], false) };
         let terms = terms();
-        let world = Env::new(terms.layout, &world_config(terms.world)).expect("in range");
+        let world = Env::new(terms.layout, &WorldConfig::from(terms.world)).expect("in range");
         let mut actor = FakeActor::Seeker;
         let episode = play_slot(&world, &order, &terms, &mut actor, &mut NoAdvisor)
             .expect("nothing breaks")

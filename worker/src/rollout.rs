@@ -2,9 +2,9 @@
 
 use tandem_core::layout::EPISODE_STEPS;
 use tandem_core::rng::{Stream, episode_rng};
-use tandem_core::work::{EpisodeOrder, RunTerms, SlotOrder, WorldTerms};
+use tandem_core::work::{EpisodeOrder, RunTerms, SlotOrder};
 use tandem_core::{Episode, EpisodeKind, StepAdvice, StepQuery};
-use tandem_sim::{SimError, Starts, WorldConfig};
+use tandem_sim::SimError;
 use tandem_telemetry::events::StepAdvised;
 
 use crate::explore::Explorer;
@@ -97,8 +97,8 @@ fn take_advice<W: World>(
     };
     let first_number = first.episode.number;
     let queries: Vec<StepQuery> = advised.iter().map(|rollout| rollout.query(step_idx)).collect();
-    let answers = advisor.advise(&queries)?;
-    check_count(first_number, step_idx, "steps", answers.len(), queries.len())?;
+    let answers = advisor.advise(queries)?;
+    check_count(first_number, step_idx, "steps", answers.len(), advised.len())?;
     for (rollout, advice) in advised.iter_mut().zip(&answers) {
         rollout.follow(advice, step_idx)?;
     }
@@ -137,7 +137,7 @@ struct Rollout<W> {
 impl<W: World> Rollout<W> {
     fn start(mut world: W, order: EpisodeOrder, slot: &SlotOrder, terms: &RunTerms) -> Self {
         let layout = terms.layout;
-        world.reset(order, starts(slot.kind, terms.world));
+        world.reset(order, terms.world.for_kind(slot.kind));
         let mut observation = vec![0.0; layout.n_observation()];
         world.observe(&mut observation);
         let mut observations = Vec::with_capacity((EPISODE_STEPS + 1) * layout.n_observation());
@@ -216,21 +216,6 @@ impl<W: World> Rollout<W> {
         self.episode.advised_arms.push(self.advised_arms);
         self.episode.contacts.push(contacts);
         Ok(())
-    }
-}
-
-/// The world that the terms ask for.
-pub(crate) fn world_config(terms: WorldTerms) -> WorldConfig {
-    WorldConfig { substeps: terms.substeps, ..WorldConfig::default() }
-}
-
-/// Evaluation episodes start as the task says, training episodes by the terms.
-pub(crate) fn starts(kind: EpisodeKind, terms: WorldTerms) -> Starts {
-    match kind {
-        EpisodeKind::Training => {
-            Starts { gripped_share: terms.gripped_start_share, wide_share: terms.wide_start_share }
-        }
-        EpisodeKind::Evaluation => Starts { gripped_share: 0.0, wide_share: 0.0 },
     }
 }
 
@@ -373,7 +358,7 @@ mod tests {
     }
 
     impl Advisor for Says {
-        fn advise(&mut self, queries: &[StepQuery]) -> Result<Vec<StepAdvice>, AdvisorGone> {
+        fn advise(&mut self, queries: Vec<StepQuery>) -> Result<Vec<StepAdvice>, AdvisorGone> {
             let mut teacher = FakeTeacher::new(|_, _, _| self.overridden);
             let answers = teacher.advise(queries)?.into_iter();
             Ok(answers.map(|advice| StepAdvice { charged: self.charged, ..advice }).collect())
@@ -410,7 +395,7 @@ mod tests {
     fn advice_about_other_steps_is_an_error() {
         struct Mute;
         impl Advisor for Mute {
-            fn advise(&mut self, _queries: &[StepQuery]) -> Result<Vec<StepAdvice>, AdvisorGone> {
+            fn advise(&mut self, _queries: Vec<StepQuery>) -> Result<Vec<StepAdvice>, AdvisorGone> {
                 Ok(Vec::new())
             }
         }

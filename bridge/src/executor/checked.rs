@@ -4,7 +4,7 @@
 use std::sync::Arc;
 
 use tandem_core::ArmIndex;
-use tandem_kinematics::{Cell, Excess, Joints, Motion, Reason, Refusal, check};
+use tandem_kinematics::{Excess, Joints, Motion, Reason, Refusal, WorkCell, check};
 
 use crate::executor::settings::Settings;
 
@@ -14,7 +14,7 @@ pub struct Checker(Arc<CheckerInner>);
 
 #[derive(Debug)]
 struct CheckerInner {
-    cell: Cell,
+    cell: WorkCell,
     settings: Settings,
 }
 
@@ -48,13 +48,13 @@ pub enum CheckError {
 }
 
 impl Checker {
-    pub(crate) fn new(cell: Cell, settings: Settings) -> Self {
+    pub(crate) fn new(cell: WorkCell, settings: Settings) -> Self {
         Self(Arc::new(CheckerInner { cell, settings }))
     }
 
     /// The arms that motions are checked for.
     #[must_use]
-    pub fn cell(&self) -> &Cell {
+    pub fn cell(&self) -> &WorkCell {
         &self.0.cell
     }
 

@@ -2,7 +2,7 @@
 
 use std::collections::VecDeque;
 
-use tandem_kinematics::{Cell, Joints};
+use tandem_kinematics::{Joints, WorkCell};
 
 use crate::driver::{ArmCommand, Command, Order, PairState};
 
@@ -25,7 +25,7 @@ pub(crate) struct CommandHistory {
 
 impl CommandHistory {
     /// An empty history of the arms of `cell`, which react within `reaction_periods`.
-    pub(crate) fn new(cell: &Cell, reaction_periods: usize) -> Self {
+    pub(crate) fn new(cell: &WorkCell, reaction_periods: usize) -> Self {
         let at_rest =
             |n_joints| ArmCommand { velocities: Joints::from_fn(n_joints, |_| 0.0), opening: 0.0 };
         Self {

@@ -15,7 +15,7 @@
 //! gripper is never wider between the two.
 
 use tandem_kinematics::model::Joint;
-use tandem_kinematics::{Cell, Excess, Joints, PlacedArm, Posture};
+use tandem_kinematics::{Excess, ForwardKinematics, Joints, PlacedArm, WorkCell};
 
 use crate::driver::{ArmCommand, PairState};
 use crate::executor::commands::VelocityHistory;
@@ -58,7 +58,7 @@ pub(crate) fn reachable(
 /// The envelope of one work cell.
 #[derive(Debug, Clone)]
 pub(crate) struct Envelope {
-    cell: Cell,
+    cell: WorkCell,
     settings: Settings,
     period_s: f64,
     /// For each arm and joint, an upper bound of the distance of the arm's points from the joint's axis, metres.
@@ -66,7 +66,7 @@ pub(crate) struct Envelope {
 }
 
 impl Envelope {
-    pub(crate) fn new(cell: &Cell, settings: &Settings, period_s: f64) -> Self {
+    pub(crate) fn new(cell: &WorkCell, settings: &Settings, period_s: f64) -> Self {
         let levers = |arm: &PlacedArm| arm.model.link_levers_m();
         Self {
             cell: cell.clone(),
@@ -136,8 +136,8 @@ impl Envelope {
     }
 
     fn check_tool(&self, arm: usize, command: &ArmCommand, at: &Joints) -> Result<(), Breach> {
-        let posture = Posture::of(self.cell.arms[arm].model, at);
-        let got = posture.tool_velocity(&command.velocities).length();
+        let posture = ForwardKinematics::new(self.cell.arms[arm].model, at);
+        let got = posture.tool_velocity(&command.velocities).norm();
         let allowed = self.settings.check.limits.tool_speed_mps;
         if got > allowed * (1.0 + TOOL_SPEED_SLACK) {
             return Err(StopCause::ToolSpeed(Excess { got, allowed }).of(arm));

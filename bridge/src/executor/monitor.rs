@@ -1,7 +1,7 @@
 //! The validation of the states that the arms report.
 
 use tandem_kinematics::joints::MAX_JOINTS;
-use tandem_kinematics::{ArmModel, Cell, Excess, Joints};
+use tandem_kinematics::{ArmModel, Excess, Joints, WorkCell};
 
 use crate::driver::{ArmReading, PairState};
 use crate::executor::settings::Settings;
@@ -41,7 +41,7 @@ pub(crate) struct ExpectedState<'a> {
 }
 
 impl Monitor {
-    pub(crate) fn new(cell: &Cell, settings: &Settings, period_s: f64) -> Self {
+    pub(crate) fn new(cell: &WorkCell, settings: &Settings, period_s: f64) -> Self {
         Self {
             models: cell.arms.iter().map(|arm| arm.model).collect(),
             settings: *settings,

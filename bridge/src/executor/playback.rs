@@ -2,7 +2,7 @@
 
 use std::collections::VecDeque;
 
-use tandem_kinematics::{Cell, Excess, Joints, Motion};
+use tandem_kinematics::{Excess, Joints, Motion, WorkCell};
 
 use crate::driver::{ArmCommand, PairState};
 use crate::executor::envelope::reachable;
@@ -27,7 +27,7 @@ pub(crate) struct Playback {
 
 /// The inputs of one tick.
 pub(crate) struct TickContext<'a> {
-    pub(crate) cell: &'a Cell,
+    pub(crate) cell: &'a WorkCell,
     pub(crate) settings: &'a Settings,
     pub(crate) period_s: f64,
     /// The newest state; `None` if it is too old for feedback.
@@ -73,7 +73,7 @@ impl Playback {
             Some(state) => Some(self.errors(context, state)?),
             None => None,
         };
-        let opening_step = context.settings.check.limits.opening_per_s * context.period_s;
+        let opening_step = context.settings.check.limits.gripper_opening_per_s * context.period_s;
         let from = self.references[0].clone();
         self.advance(context, paused);
         let to = self.motion.at(self.played_s);
@@ -84,7 +84,7 @@ impl Playback {
                 ahead + context.settings.gain_per_s * error
             });
             let last = context.last[arm].opening;
-            let opening = to[arm].opening.clamp(last - opening_step, last + opening_step);
+            let opening = to[arm].gripper_opening.clamp(last - opening_step, last + opening_step);
             ArmCommand { velocities: within_limits(context, arm, &ahead), opening }
         };
         let commands = (0..from.len()).map(command).collect();
@@ -173,8 +173,8 @@ fn within_limits(context: &TickContext<'_>, arm: usize, wanted: &Joints) -> Join
         wanted[joint].clamp(-fastest, fastest).clamp(low, high)
     });
     let Some(state) = context.state else { return velocities };
-    let posture = tandem_kinematics::Posture::of(placed.model, &state.arms[arm].angles);
-    let tool_mps = posture.tool_velocity(&velocities).length();
+    let posture = tandem_kinematics::ForwardKinematics::new(placed.model, &state.arms[arm].angles);
+    let tool_mps = posture.tool_velocity(&velocities).norm();
     if tool_mps > limits.tool_speed_mps {
         let share = limits.tool_speed_mps / tool_mps;
         for (velocity, [low, high]) in velocities.iter_mut().zip(&ranges) {

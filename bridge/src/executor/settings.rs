@@ -1,6 +1,6 @@
 //! The settings of the executor.
 
-use tandem_kinematics::{Cell, CheckSettings};
+use tandem_kinematics::{CheckSettings, WorkCell};
 
 use crate::work_cell::check_settings;
 
@@ -108,7 +108,7 @@ pub struct BadSetting {
 
 impl Settings {
     /// Checks the settings for `cell` and exchanges every `period_s` seconds.
-    pub(crate) fn checked(self, cell: &Cell, period_s: f64) -> Result<Self, BadSetting> {
+    pub(crate) fn checked(self, cell: &WorkCell, period_s: f64) -> Result<Self, BadSetting> {
         let positive = [
             ("period_s", period_s),
             ("table_gap_m", self.table_gap_m),

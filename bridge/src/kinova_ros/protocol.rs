@@ -3,6 +3,7 @@
 //! The formats are version 2 of rosbridge's protocol, ROS 1's message types, and kinova-ros as of February 2023.
 
 use serde_json::{Value, json};
+use tandem_core::text::shortened;
 use tandem_kinematics::Joints;
 
 use crate::driver::{ArmReading, DriverError, Faults};
@@ -11,6 +12,8 @@ use crate::driver::{ArmReading, DriverError, Faults};
 pub(crate) const N_JOINTS: usize = 4;
 /// The number of fingers of a gripper.
 const N_FINGERS: usize = 2;
+/// The largest number of characters of a message in an error.
+const MAX_SHOWN_CHARS: usize = 200;
 /// kinova-ros reports a finger's turns as an angle of its joint: degrees per turn.
 const FINGER_DEGREES_PER_TURN: f64 = 80.0 / 6800.0;
 
@@ -29,8 +32,9 @@ pub(crate) enum RosMessage {
 
 /// Parses a message of rosbridge.
 pub(crate) fn parse(text: &str) -> Result<RosMessage, DriverError> {
-    let message: Value = serde_json::from_str(text)
-        .map_err(|error| malformed(format!("not JSON: {error}: {}", shortened(text))))?;
+    let message: Value = serde_json::from_str(text).map_err(|error| {
+        malformed(format!("not JSON: {error}: {}", shortened(text, MAX_SHOWN_CHARS)))
+    })?;
     let word = |key: &str| message.get(key).and_then(Value::as_str).unwrap_or_default().to_owned();
     let value = |key: &str| message.get(key).cloned().unwrap_or(Value::Null);
     Ok(match word("op").as_str() {
@@ -40,7 +44,9 @@ pub(crate) fn parse(text: &str) -> Result<RosMessage, DriverError> {
             result: value("result").as_bool().unwrap_or(false),
             values: value("values"),
         },
-        "status" if word("level") == "error" => RosMessage::Error(shortened(&word("msg"))),
+        "status" if word("level") == "error" => {
+            RosMessage::Error(shortened(&word("msg"), MAX_SHOWN_CHARS))
+        }
         _ => RosMessage::Other,
     })
 }
@@ -199,7 +205,7 @@ impl ArmDecoder<'_> {
             *found_idx = match (found.next(), found.next()) {
                 (Some(idx), None) => idx,
                 (None, _) => {
-                    let known = shortened(&names.join(" "));
+                    let known = shortened(&names.join(" "), MAX_SHOWN_CHARS);
                     return Err(malformed(format!("no joint {name:?} among {known:?}")));
                 }
                 (Some(_), Some(_)) => return Err(malformed(format!("joint {name:?} twice"))),
@@ -230,11 +236,6 @@ fn stamp_s(msg: &Value) -> Result<f64, DriverError> {
 fn list<'a>(msg: &'a Value, key: &str) -> Result<&'a Vec<Value>, DriverError> {
     let value = msg.get(key).and_then(Value::as_array);
     value.ok_or_else(|| malformed(format!("a joint state without a list {key:?}")))
-}
-
-/// Shortens a text for an error message.
-fn shortened(text: &str) -> String {
-    text.chars().take(200).collect()
 }
 
 fn malformed(what: String) -> DriverError {

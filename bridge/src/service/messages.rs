@@ -1,8 +1,7 @@
 //! Conversions of the bridge's types to messages.
 
-use glam::DVec3;
-use tandem_kinematics::plan::{MAX_STEP_M, MAX_WAY_POINTS};
-use tandem_kinematics::{Cell, Gaps, Joints, Motion, PlacedArm, Posture};
+use tandem_kinematics::plan::{MAX_STEP_M, MAX_WAYPOINTS};
+use tandem_kinematics::{ForwardKinematics, Gaps, Joints, Motion, PlacedArm, WorkCell};
 use tandem_proto::{DecodeError, pb};
 
 use crate::driver::ArmReading;
@@ -42,13 +41,13 @@ pub(super) fn describe_arm(placed: &PlacedArm) -> pb::ArmDescription {
     };
     pb::ArmDescription {
         model: placed.model.name.to_owned(),
-        base_in_world_m: coordinates(placed.base_in_world_m),
+        base_in_world_m: coordinates(placed.base_in_world_m.into()),
         yaw_rad: placed.yaw_rad,
         joints: placed.model.joints.iter().map(joint).collect(),
     }
 }
 
-pub(super) fn task_frame(cell: &Cell) -> pb::TaskFrameDescription {
+pub(super) fn task_frame(cell: &WorkCell) -> pb::TaskFrameDescription {
     let frame = cell.task_frame;
     pb::TaskFrameDescription { scale: frame.scale, centre_m: frame.centre_m, lift_m: frame.lift_m }
 }
@@ -61,7 +60,7 @@ pub(super) fn limits(checker: &Checker, speed: f64) -> pb::BridgeLimits {
         speed,
         tool_speed_mps: check.limits.tool_speed_mps,
         ramp_s: check.limits.ramp_s,
-        opening_per_s: check.limits.opening_per_s,
+        opening_per_s: check.limits.gripper_opening_per_s,
         tilt_rad: check.tilt_rad,
         reach_share: check.reach_share,
         check_table_gap_m: check.table_gap_m,
@@ -76,7 +75,7 @@ pub(super) fn limits(checker: &Checker, speed: f64) -> pb::BridgeLimits {
         owner_hold_s: settings.owner_hold_s,
         owner_stop_s: settings.owner_stop_s,
         lease_s: settings.lease_s,
-        max_way_points: index(MAX_WAY_POINTS),
+        max_way_points: index(MAX_WAYPOINTS),
         max_step_m: MAX_STEP_M,
         check_self_gap_m: check.self_gap_m,
         self_gap_m: settings.self_gap_m,
@@ -84,7 +83,7 @@ pub(super) fn limits(checker: &Checker, speed: f64) -> pb::BridgeLimits {
 }
 
 /// Describes an accepted motion with the smallest gaps at its samples.
-pub(super) fn accepted(checked: &CheckedMotion, cell: &Cell, speed: f64) -> pb::AcceptedMotion {
+pub(super) fn accepted(checked: &CheckedMotion, cell: &WorkCell, speed: f64) -> pb::AcceptedMotion {
     let motion = checked.motion();
     let mut table_gap_m = vec![f64::INFINITY; cell.arms.len()];
     let mut arms_gap_m = f64::INFINITY;
@@ -103,10 +102,10 @@ pub(super) fn accepted(checked: &CheckedMotion, cell: &Cell, speed: f64) -> pb::
     pb::AcceptedMotion { duration_s, speed, table_gap_m, arms_gap_m, self_gap_m }
 }
 
-fn gaps_at(motion: &Motion, sample: usize, cell: &Cell) -> Gaps {
+fn gaps_at(motion: &Motion, sample: usize, cell: &WorkCell) -> Gaps {
     let samples = motion.arms.iter().map(|samples| &samples[sample]);
     let (angles, openings): (Vec<Joints>, Vec<f64>) =
-        samples.map(|sample| (sample.angles, sample.opening)).unzip();
+        samples.map(|sample| (sample.angles, sample.gripper_opening)).unzip();
     cell.gaps_with(&angles, &openings)
 }
 
@@ -172,7 +171,7 @@ pub(super) fn phase(phase: Phase) -> pb::BridgePhase {
 }
 
 /// The newest states of the arms; empty if there is no valid one.
-pub(super) fn arms(snapshot: &Snapshot, cell: &Cell) -> Vec<pb::ArmState> {
+pub(super) fn arms(snapshot: &Snapshot, cell: &WorkCell) -> Vec<pb::ArmState> {
     let Some(state) = &snapshot.state else { return Vec::new() };
     let reference = |arm: usize| snapshot.reference.as_ref().map(|all| all[arm]);
     let arms = state.arms.iter().zip(&cell.arms).enumerate();
@@ -181,7 +180,8 @@ pub(super) fn arms(snapshot: &Snapshot, cell: &Cell) -> Vec<pb::ArmState> {
 
 fn arm_state(reading: &ArmReading, placed: &PlacedArm, reference: Option<Joints>) -> pb::ArmState {
     let tool = |angles: &Joints| {
-        coordinates(placed.world_from_base(Posture::of(placed.model, angles).tool().origin_m))
+        let tool_in_base_m = ForwardKinematics::new(placed.model, angles).tool_m();
+        coordinates((placed.world_from_base() * tool_in_base_m).into())
     };
     pb::ArmState {
         angles_rad: reading.angles.to_vec(),
@@ -200,8 +200,8 @@ fn unit(values: Option<Values>) -> String {
     values.map_or_else(String::new, |values| values.unit.to_owned())
 }
 
-fn coordinates(point: DVec3) -> Vec<f64> {
-    point.to_array().to_vec()
+fn coordinates(point: [f64; 3]) -> Vec<f64> {
+    point.to_vec()
 }
 
 fn index(index: usize) -> u32 {

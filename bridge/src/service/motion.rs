@@ -1,9 +1,9 @@
 //! Turns a request into a checked motion.
 
-use glam::DVec3;
-use tandem_kinematics::plan::MAX_WAY_POINTS;
+use tandem_kinematics::plan::MAX_WAYPOINTS;
 use tandem_kinematics::{
-    ArmSample, ArmWayPoint, Cell, Joints, Motion, PlanError, PlanSettings, Posture, WayPoint, plan,
+    ArmSample, ArmWaypoint, ForwardKinematics, Joints, Motion, PlanError, PlanSettings, Waypoint,
+    WorkCell, plan,
 };
 use tandem_proto::{DecodeError, pb};
 
@@ -26,7 +26,7 @@ pub(super) struct MotionSpec {
 #[derive(Debug, Clone, PartialEq)]
 pub(super) enum MotionPath {
     /// Positions of the tools, to be planned.
-    Waypoints { way_points: Vec<WayPoint>, step_s: f64, from_here: bool },
+    Waypoints { way_points: Vec<Waypoint>, step_s: f64, from_here: bool },
     /// Samples of the joints' angles.
     JointSamples(Motion),
 }
@@ -52,7 +52,7 @@ fn cause_of(error: &PlanError) -> String {
 
 impl MotionSpec {
     /// Decodes `request` for the arms of `cell`. Errors name fields relative to the motion.
-    pub(super) fn decode(request: pb::MotionRequest, cell: &Cell) -> Result<Self, DecodeError> {
+    pub(super) fn decode(request: pb::MotionRequest, cell: &WorkCell) -> Result<Self, DecodeError> {
         use pb::motion_request::Motion as M;
         let speed = within("speed", request.speed, "more than 0 and at most 1", |speed| {
             speed > 0.0 && speed <= 1.0
@@ -98,13 +98,13 @@ impl MotionSpec {
 }
 
 /// The present positions of the tools.
-fn tool_positions(state: &PairState, cell: &Cell) -> WayPoint {
+fn tool_positions(state: &PairState, cell: &WorkCell) -> Waypoint {
     let arms = state.arms.iter().zip(&cell.arms);
     let way_point = |(arm, placed): (&crate::ArmReading, &tandem_kinematics::PlacedArm)| {
-        let tool = Posture::of(placed.model, &arm.angles).tool().origin_m;
-        ArmWayPoint {
-            tool_in_world_m: placed.world_from_base(tool),
-            opening: arm.opening.clamp(0.0, 1.0),
+        let tool = ForwardKinematics::new(placed.model, &arm.angles).tool_m();
+        ArmWaypoint {
+            tool_in_world_m: placed.world_from_base() * tool,
+            gripper_opening: arm.opening.clamp(0.0, 1.0),
         }
     };
     arms.map(way_point).collect()
@@ -114,22 +114,22 @@ fn tool_positions(state: &PairState, cell: &Cell) -> WayPoint {
 fn renumbered(error: PlanError, from_here: bool) -> PlanError {
     let client = |way_point: usize| way_point.saturating_sub(usize::from(from_here));
     match error {
-        PlanError::Step { way_point, arm, step_m } => {
-            PlanError::Step { way_point: client(way_point), arm, step_m }
+        PlanError::Step { waypoint, arm, step_m } => {
+            PlanError::Step { waypoint: client(waypoint), arm, step_m }
         }
-        PlanError::Unreachable { way_point, arm, source } => {
-            PlanError::Unreachable { way_point: client(way_point), arm, source }
+        PlanError::Unreachable { waypoint, arm, source } => {
+            PlanError::Unreachable { waypoint: client(waypoint), arm, source }
         }
-        PlanError::Jump { way_point, arm, joint, jump_rad } => {
-            PlanError::Jump { way_point: client(way_point), arm, joint, jump_rad }
+        PlanError::Jump { waypoint, arm, joint, jump_rad } => {
+            PlanError::Jump { waypoint: client(waypoint), arm, joint, jump_rad }
         }
         other => other,
     }
 }
 
-fn decode_waypoints(message: pb::WayPoints, cell: &Cell) -> Result<MotionPath, DecodeError> {
+fn decode_waypoints(message: pb::WayPoints, cell: &WorkCell) -> Result<MotionPath, DecodeError> {
     let (from_here, got) = (message.from_here, message.way_points.len());
-    let (least, most) = if from_here { (1, MAX_WAY_POINTS - 1) } else { (2, MAX_WAY_POINTS) };
+    let (least, most) = if from_here { (1, MAX_WAYPOINTS - 1) } else { (2, MAX_WAYPOINTS) };
     if !(least..=most).contains(&got) {
         return Err(DecodeError::new("way_points", format_args!("{least} to {most}"), got));
     }
@@ -149,7 +149,7 @@ fn decode_waypoints(message: pb::WayPoints, cell: &Cell) -> Result<MotionPath, D
     })
 }
 
-fn decode_way_point(message: pb::BridgeWayPoint, cell: &Cell) -> Result<WayPoint, DecodeError> {
+fn decode_way_point(message: pb::BridgeWayPoint, cell: &WorkCell) -> Result<Waypoint, DecodeError> {
     check_arms(message.arms.len(), cell)?;
     let decode_indexed = |(idx, arm): (usize, pb::ArmWayPoint)| {
         decode_arm(&arm).map_err(|error| error.within(format_args!("arms[{idx}]")))
@@ -157,7 +157,7 @@ fn decode_way_point(message: pb::BridgeWayPoint, cell: &Cell) -> Result<WayPoint
     message.arms.into_iter().enumerate().map(decode_indexed).collect()
 }
 
-fn decode_arm(message: &pb::ArmWayPoint) -> Result<ArmWayPoint, DecodeError> {
+fn decode_arm(message: &pb::ArmWayPoint) -> Result<ArmWaypoint, DecodeError> {
     let field = "tool_in_world_m";
     let numbers = &message.tool_in_world_m;
     let [x, y, z] = numbers[..] else {
@@ -168,13 +168,16 @@ fn decode_arm(message: &pb::ArmWayPoint) -> Result<ArmWayPoint, DecodeError> {
         ));
     };
     check_finite(field, numbers)?;
-    Ok(ArmWayPoint {
-        tool_in_world_m: DVec3::new(x, y, z),
-        opening: decode_opening(message.opening)?,
+    Ok(ArmWaypoint {
+        tool_in_world_m: [x, y, z].into(),
+        gripper_opening: decode_opening(message.opening)?,
     })
 }
 
-fn decode_joint_samples(message: pb::JointMotion, cell: &Cell) -> Result<MotionPath, DecodeError> {
+fn decode_joint_samples(
+    message: pb::JointMotion,
+    cell: &WorkCell,
+) -> Result<MotionPath, DecodeError> {
     let expected = "a number of seconds in [0.001, 0.1]";
     let period_s = within("period_s", message.period_s, expected, |period_s| {
         (0.001..=0.1).contains(&period_s)
@@ -214,11 +217,11 @@ fn decode_sample(message: &pb::JointSample, n_joints: usize) -> Result<ArmSample
     Ok(ArmSample {
         angles: joints("angles_rad", &message.angles_rad)?,
         velocities: joints("velocities_radps", &message.velocities_radps)?,
-        opening: decode_opening(message.opening)?,
+        gripper_opening: decode_opening(message.opening)?,
     })
 }
 
-fn check_arms(got: usize, cell: &Cell) -> Result<(), DecodeError> {
+fn check_arms(got: usize, cell: &WorkCell) -> Result<(), DecodeError> {
     let expected = cell.arms.len();
     if got == expected {
         return Ok(());

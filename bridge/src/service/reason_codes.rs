@@ -88,8 +88,8 @@ fn of_reason(reason: &Reason) -> ReasonCode {
         R::JointAcceleration(joint, e) => {
             code("joint-acceleration", Some(*joint), values(e, "rad/s2"))
         }
-        R::Opening(opening) => code("opening", None, number(*opening, "")),
-        R::OpeningSpeed(e) => code("opening-speed", None, values(e, "1/s")),
+        R::GripperOpening(opening) => code("opening", None, number(*opening, "")),
+        R::GripperSpeed(e) => code("opening-speed", None, values(e, "1/s")),
         R::ToolSpeed(e) => code("tool-speed", None, values(e, "m/s")),
         R::Reach(e) => code("reach", None, values(e, "m")),
         R::Tilt(e) => code("tilt", None, values(e, "rad")),
@@ -105,21 +105,21 @@ pub(super) fn of_plan(error: &PlanError) -> (ReasonCode, Option<usize>, Option<u
     use PlanError as P;
     match error {
         P::Setting { .. } => (code("setting", None, None), None, None),
-        P::WayPoints { .. } => (code("way-points", None, None), None, None),
-        P::Arms { way_point, .. } => (code("arms", None, None), Some(*way_point), None),
-        P::Opening { way_point, arm, opening } => {
-            (code("opening", None, number(*opening, "")), Some(*way_point), Some(arm.0))
+        P::WaypointCount { .. } => (code("way-points", None, None), None, None),
+        P::Arms { waypoint, .. } => (code("arms", None, None), Some(*waypoint), None),
+        P::GripperOpening { waypoint, arm, gripper_opening: opening } => {
+            (code("opening", None, number(*opening, "")), Some(*waypoint), Some(arm.0))
         }
-        P::Step { way_point, arm, step_m } => {
+        P::Step { waypoint, arm, step_m } => {
             let excess = Excess { got: *step_m, allowed: tandem_kinematics::plan::MAX_STEP_M };
-            (code("step", None, values(&excess, "m")), Some(*way_point), Some(arm.0))
+            (code("step", None, values(&excess, "m")), Some(*waypoint), Some(arm.0))
         }
-        P::Unreachable { way_point, arm, .. } => {
-            (code("unreachable", None, None), Some(*way_point), Some(arm.0))
+        P::Unreachable { waypoint, arm, .. } => {
+            (code("unreachable", None, None), Some(*waypoint), Some(arm.0))
         }
-        P::Jump { way_point, arm, joint, jump_rad } => {
+        P::Jump { waypoint, arm, joint, jump_rad } => {
             let code = code("jump", Some(*joint), number(*jump_rad, "rad"));
-            (code, Some(*way_point), Some(arm.0))
+            (code, Some(*waypoint), Some(arm.0))
         }
         _ => (code("plan", None, None), None, None),
     }

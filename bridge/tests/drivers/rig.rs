@@ -13,7 +13,7 @@ use tandem_bridge::{
     Token,
 };
 use tandem_core::ArmIndex;
-use tandem_kinematics::{ArmWayPoint, Joints, Motion, PlanSettings, WayPoint, check, plan};
+use tandem_kinematics::{ArmWaypoint, Joints, Motion, PlanSettings, Waypoint, check, plan};
 use tandem_trials::{SimulatedConfig, SimulatedPair};
 
 pub(crate) const OWNER: Token = Token(5);
@@ -147,7 +147,7 @@ pub(crate) fn failure(cause: &StopCause) -> &DriverError {
 /// Arms at rest at the start of `motion`.
 pub(crate) fn pair_at(motion: &Motion) -> SharedPair {
     let at: Vec<Joints> = motion.arms.iter().map(|samples| samples[0].angles).collect();
-    let opening = motion.arms[0][0].opening;
+    let opening = motion.arms[0][0].gripper_opening;
     Arc::new(Mutex::new(SimulatedPair::new(mico_cell(), &at, opening, SimulatedConfig::default())))
 }
 
@@ -193,10 +193,12 @@ pub(crate) fn sweep(openings: [f64; 4]) -> Motion {
         [DVec3::new(-0.05, 0.02, 0.10), DVec3::new(-0.02, -0.02, 0.10)],
     ];
     let way_point = |(own, opening): (&[DVec3; 2], f64)| {
-        let tool = |arm: usize| cell.world_from_own(ArmIndex(arm), own[arm]);
-        [0, 1].map(|arm| ArmWayPoint { tool_in_world_m: tool(arm), opening }).to_vec()
+        let tool = |arm: usize| cell.world_from_own(ArmIndex(arm), &own[arm].into());
+        [0, 1]
+            .map(|arm| ArmWaypoint { tool_in_world_m: tool(arm), gripper_opening: opening })
+            .to_vec()
     };
-    let way_points: Vec<WayPoint> = places.iter().zip(openings).map(way_point).collect();
+    let way_points: Vec<Waypoint> = places.iter().zip(openings).map(way_point).collect();
     let start = cell.ready(0.05).unwrap();
     let motion = plan(&cell, &way_points, &start, &PlanSettings::default()).unwrap().sampled(100.0);
     let at: Vec<Joints> = motion.arms.iter().map(|samples| samples[0].angles).collect();

@@ -7,7 +7,7 @@ use tandem_bridge::work_cell::mico_cell;
 use tandem_bridge::{Phase, StartError, StopCause};
 use tandem_core::rng::{index, uniform};
 use tandem_core::{ArmIndex, Stream, episode_rng};
-use tandem_kinematics::{Joints, Motion, Posture};
+use tandem_kinematics::{ForwardKinematics, Joints, Motion};
 use tandem_trials::SimulatedConfig;
 use tandem_trials::simulated::PERIOD_S;
 
@@ -99,9 +99,10 @@ impl Plan {
         };
         let drift = |arm: usize| {
             let placed = &cell.arms[arm];
-            let posture = Posture::of(placed.model, &angles[arm]);
-            let in_base = placed.axes().transpose() * along(arm);
-            let gain = Joints::from_fn(4, |joint| posture.tool_motion(joint).0.dot(in_base));
+            let posture = ForwardKinematics::new(placed.model, &angles[arm]);
+            let in_base = placed.world_from_base().inverse_transform_vector(&along(arm).into());
+            let jacobian = posture.position_jacobian();
+            let gain = Joints::from_fn(4, |joint| jacobian.column(joint).dot(&in_base));
             let most = gain.iter().fold(1e-9, |most: f64, gain| most.max(gain.abs()));
             Joints::from_fn(4, |joint| DRIFT_RADPS * gain[joint] / most)
         };

@@ -27,7 +27,7 @@ fn on_way(share: f64) -> Motion {
         ArmSample {
             angles: Joints::from_fn(4, |joint| ready[arm][joint] + moves * s * way(joint)),
             velocities: Joints::from_fn(4, |joint| moves * rate * way(joint)),
-            opening: OPENING,
+            gripper_opening: OPENING,
         }
     };
     let n = (DURATION_S / PERIOD_S).round();

@@ -2,7 +2,7 @@
 
 use tandem_bridge::work_cell::mico_cell;
 use tandem_core::ArmIndex;
-use tandem_kinematics::{Cell, Joints, Posture};
+use tandem_kinematics::{ForwardKinematics, Joints, WorkCell};
 use tandem_trials::SimulatedPair;
 use tandem_trials::simulated::PERIOD_S;
 
@@ -33,7 +33,7 @@ impl Slack {
 }
 
 pub(crate) struct Observer {
-    cell: Cell,
+    cell: WorkCell,
     slack: Slack,
     before: Option<Vec<Joints>>,
     /// The simulated time at which a joint last moved, seconds.
@@ -108,8 +108,8 @@ impl Observer {
                 );
             }
         }
-        let posture = Posture::of(placed.model, angles);
-        let tool_mps = posture.tool_velocity(rates).length();
+        let posture = ForwardKinematics::new(placed.model, angles);
+        let tool_mps = posture.tool_velocity(rates).norm();
         let drift_mps = self.slack.drift_radps * 3.0 * 0.6;
         self.tool_share = self.tool_share.max(tool_mps / TOOL_MPS);
         // The executor multiplies velocities by where the arm was some periods before.

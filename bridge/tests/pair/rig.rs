@@ -10,7 +10,7 @@ use tandem_core::rng::uniform;
 use tandem_core::{Stream, episode_rng};
 use tandem_kinematics::model::Joint;
 use tandem_kinematics::{
-    ArmWayPoint, Cell, Joints, Motion, PlanSettings, Posture, WayPoint, check, plan,
+    ArmWaypoint, ForwardKinematics, Joints, Motion, PlanSettings, Waypoint, WorkCell, check, plan,
 };
 use tandem_trials::simulated::PERIOD_S;
 use tandem_trials::{SimulatedConfig, SimulatedPair};
@@ -31,7 +31,7 @@ impl Rig {
     /// Arms at rest at the start of `motion`.
     pub(crate) fn new(motion: &Motion, config: SimulatedConfig) -> Self {
         let at: Vec<Joints> = motion.arms.iter().map(|samples| samples[0].angles).collect();
-        let pair = SimulatedPair::new(mico_cell(), &at, motion.arms[0][0].opening, config);
+        let pair = SimulatedPair::new(mico_cell(), &at, motion.arms[0][0].gripper_opening, config);
         let pair = Rc::new(RefCell::new(pair));
         let injection = Rc::new(RefCell::new(Injection::none()));
         let tap = Tap::new(Rc::clone(&pair), Rc::clone(&injection));
@@ -87,10 +87,10 @@ impl Rig {
 }
 
 /// The positions of the tools, world frame, metres.
-pub(crate) fn tools(cell: &Cell, angles: &[Joints]) -> Vec<DVec3> {
+pub(crate) fn tools(cell: &WorkCell, angles: &[Joints]) -> Vec<DVec3> {
     let tool = |(arm, angles): (usize, &Joints)| {
         let placed = &cell.arms[arm];
-        placed.world_from_base(Posture::of(placed.model, angles).tool().origin_m)
+        (placed.world_from_base() * ForwardKinematics::new(placed.model, angles).tool_m()).into()
     };
     angles.iter().enumerate().map(tool).collect()
 }
@@ -98,11 +98,13 @@ pub(crate) fn tools(cell: &Cell, angles: &[Joints]) -> Vec<DVec3> {
 /// Plans and checks the motion through points of the arms' base frames, metres.
 pub(crate) fn planned(points: &[([DVec3; 2], f64)]) -> Motion {
     let cell = mico_cell();
-    let way_points: Vec<WayPoint> = points
+    let way_points: Vec<Waypoint> = points
         .iter()
         .map(|(points, opening)| {
-            let in_world = |arm: usize| cell.arms[arm].world_from_base(points[arm]);
-            let way_point = |arm| ArmWayPoint { tool_in_world_m: in_world(arm), opening: *opening };
+            let in_world =
+                |arm: usize| cell.arms[arm].world_from_base().transform_point(&points[arm].into());
+            let way_point =
+                |arm| ArmWaypoint { tool_in_world_m: in_world(arm), gripper_opening: *opening };
             vec![way_point(0), way_point(1)]
         })
         .collect();
@@ -129,7 +131,7 @@ pub(crate) fn walk([low, high]: Area, seed: u64, n: usize) -> Motion {
     for attempt in 0.. {
         let mut rng = episode_rng(seed, attempt, Stream::Exploration);
         let mut own = [low.midpoint(high); 2];
-        let mut way_points: Vec<WayPoint> = Vec::new();
+        let mut way_points: Vec<Waypoint> = Vec::new();
         for idx in 0..n {
             let longest_m = if idx == 0 { 0.10 } else { 0.05 };
             for own in &mut own {
@@ -138,8 +140,10 @@ pub(crate) fn walk([low, high]: Area, seed: u64, n: usize) -> Motion {
                 *own = (*own + step).clamp(low, high);
             }
             let opening = f64::from(uniform(&mut rng, 0.0, 1.0));
-            let tool = |arm: usize| cell.world_from_own(tandem_core::ArmIndex(arm), own[arm]);
-            let way_point = |arm| ArmWayPoint { tool_in_world_m: tool(arm), opening };
+            let tool =
+                |arm: usize| cell.world_from_own(tandem_core::ArmIndex(arm), &own[arm].into());
+            let way_point =
+                |arm| ArmWaypoint { tool_in_world_m: tool(arm), gripper_opening: opening };
             way_points.push(vec![way_point(0), way_point(1)]);
         }
         let start = cell.ready(0.05).unwrap();

@@ -16,7 +16,8 @@ fn blocks(kinds: [fn([f32; 2]) -> Block; 2], at: [DVec3; 2]) -> Vec<Block> {
     let cell = mico_cell();
     (0..2)
         .map(|arm| {
-            let at = cell.arms[arm].world_from_base(at[arm]).as_vec3();
+            let at = cell.arms[arm].world_from_base().transform_point(&at[arm].into());
+            let at = DVec3::from(at).as_vec3();
             kinds[arm]([at.x, at.y])
         })
         .collect()
@@ -25,7 +26,10 @@ fn blocks(kinds: [fn([f32; 2]) -> Block; 2], at: [DVec3; 2]) -> Vec<Block> {
 /// The positions of the objects in the arms' base frames, metres.
 fn in_base(rig: &Rig) -> [DVec3; 2] {
     let objects = rig.pair.borrow().objects();
-    [0, 1].map(|arm| mico_cell().arms[arm].base_from_world(objects[arm].at_m))
+    [0, 1].map(|arm| {
+        let world_from_base = mico_cell().arms[arm].world_from_base();
+        world_from_base.inverse_transform_point(&objects[arm].at_m.into()).into()
+    })
 }
 
 fn both(point: [f64; 3]) -> [DVec3; 2] {

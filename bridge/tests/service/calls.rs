@@ -1,7 +1,7 @@
 //! The calls of the service.
 
 use tandem_bridge::work_cell::mico_cell;
-use tandem_kinematics::{ArmSample, ArmWayPoint, Joints, Motion, PlanSettings, plan};
+use tandem_kinematics::{ArmSample, ArmWaypoint, Joints, Motion, PlanSettings, plan};
 use tandem_proto::pb;
 use tonic::Code;
 
@@ -63,7 +63,9 @@ async fn a_motion_of_joints_is_played() {
     let token = rig.ready().await;
     let cell = mico_cell();
     let at = |arms_m: [[f64; 3]; 2]| {
-        arms_m.map(|at_m| ArmWayPoint { tool_in_world_m: at_m.into(), opening: 0.5 }).to_vec()
+        arms_m
+            .map(|at_m| ArmWaypoint { tool_in_world_m: at_m.into(), gripper_opening: 0.5 })
+            .to_vec()
     };
     let start = cell.ready(0.05).unwrap();
     let way = [at(READY_M), at(UP_M)];
@@ -172,7 +174,7 @@ async fn a_motion_into_the_arms_own_base_is_refused_by_name() {
         let way = way_deg.map(f64::to_radians);
         let velocities = Joints::from_fn(4, |joint| rate * way[joint]);
         let angles = Joints::from_fn(4, |joint| ready[arm][joint] + s * way[joint]);
-        ArmSample { angles, velocities, opening: 1.0 }
+        ArmSample { angles, velocities, gripper_opening: 1.0 }
     };
     let samples = |arm| (0..=600).map(|idx| sample(arm, idx)).collect();
     let motion = joint_request(&Motion { period_s: 0.01, arms: vec![samples(0), samples(1)] });
@@ -221,7 +223,7 @@ async fn a_refused_motion_is_not_played() {
     }
     let refused = rig.execute(&token, elsewhere).await.err().unwrap();
     assert_eq!(refused.code(), Code::FailedPrecondition);
-    assert!(refused.message().contains("from where the motion begins"), "{refused}");
+    assert!(refused.message().contains("from the start of the motion"), "{refused}");
     assert_eq!(rig.status().await.phase(), pb::BridgePhase::Idle);
     let moved = before.iter().zip(rig.tap.angles()).map(|(a, b)| a.largest_difference(&b));
     assert!(moved.fold(0.0, f64::max) < 1e-3);

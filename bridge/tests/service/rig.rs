@@ -432,7 +432,7 @@ pub(crate) fn joint_request(motion: &Motion) -> pb::MotionRequest {
     let sample = |sample: &ArmSample| pb::JointSample {
         angles_rad: sample.angles.to_vec(),
         velocities_radps: sample.velocities.to_vec(),
-        opening: sample.opening,
+        opening: sample.gripper_opening,
     };
     let samples =
         |arm: &Vec<ArmSample>| pb::ArmMotion { samples: arm.iter().map(sample).collect() };

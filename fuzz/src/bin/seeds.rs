@@ -8,10 +8,10 @@ use std::path::{Path, PathBuf};
 use libfuzzer_sys as _;
 use mcap::records::{MessageHeader, Record};
 use prost::Message as _;
-use tandem_core::work::{
-    EpisodeOrder, Exploration, PublishedActor, RunTerms, SlotOrder, WorldTerms,
+use tandem_core::work::{EpisodeOrder, PublishedActor, RunTerms, SlotOrder};
+use tandem_core::{
+    ArmAdvice, EpisodeKind, Exploration, Layout, StepAdvice, StepQuery, Task, WorldSettings,
 };
-use tandem_core::{ArmAdvice, EpisodeKind, Layout, StepAdvice, StepQuery, Task};
 use tandem_fuzz::sample;
 use tandem_learner::checkpoint::{self, Resumption};
 use tandem_learner::records::{Judged, Pending};
@@ -131,8 +131,12 @@ fn write_messages(to: &Path) -> Result<(), AnyError> {
     let terms = RunTerms {
         layout: LAYOUT,
         account: Some("run-7".to_owned()),
-        exploration: Exploration { noise_std: 0.2, random_share: 0.3, random_hold_mean_steps: 4.0 },
-        world: WorldTerms { gripped_start_share: 0.0, wide_start_share: 1.0, substeps: 20 },
+        exploration: Exploration {
+            noise_std: 0.2,
+            random_action_prob: 0.3,
+            sticky_random_mean_steps: 4.0,
+        },
+        world: WorldSettings { grasped_start_prob: 0.0, substeps: 20 },
     };
     let order = EpisodeOrder { number: 64, seed: 42, advised: true, uniform: false, record: true };
     let kind = EpisodeKind::Evaluation;

@@ -1,7 +1,7 @@
-//! Way points of two arms become motions within all limits, and what breaks one is refused.
+//! Planned motions of two arms keep all limits, and the check refuses motions that violate one.
 #![expect(clippy::unwrap_used, clippy::panic, reason = "a test panics where it fails")]
 
-mod led;
+mod collisions;
 mod plans;
 mod refusals;
 mod walks;

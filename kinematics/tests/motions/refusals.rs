@@ -1,13 +1,14 @@
-//! The check: good motions pass, and whatever is broken in one is told.
+//! The check accepts good motions and names the first violation of bad ones.
 
 use std::f64::consts::TAU;
 
-use glam::DVec3;
+use nalgebra::Point3;
 use rand::RngExt as _;
 use rand_chacha::ChaCha8Rng;
 use tandem_core::{ArmIndex, Stream, episode_rng};
 use tandem_kinematics::{
-    ArmSample, Cell, CheckSettings, Joints, MICO_4, Motion, Posture, Reason, Refusal, check,
+    ArmSample, CheckSettings, ForwardKinematics, Joints, MICO_4, Motion, Reason, Refusal, WorkCell,
+    check,
 };
 
 use crate::walks::{Area, sampled, walk};
@@ -18,8 +19,8 @@ pub(crate) const N_BROKEN: usize = 1000;
 pub(crate) const PERIOD_S: f64 = 0.01;
 
 #[test]
-fn a_thousand_good_walks_are_passed() {
-    let cell = Cell::mico_pair();
+fn a_thousand_good_walks_are_accepted() {
+    let cell = WorkCell::mico_pair();
     let (mut seconds, mut longest_s) = (0.0, 0.0_f64);
     for seed in 0..N_GOOD {
         let (motion, at) = sampled(&cell, &walk(&cell, Area::TASKS, seed, 50));
@@ -33,7 +34,7 @@ fn a_thousand_good_walks_are_passed() {
     println!("{N_GOOD} walks, {:.1} s each, {longest_s:.1} s the longest", seconds / N_GOOD as f64);
 }
 
-/// A motion to be broken, and where the arms are before.
+/// A motion to be broken, and the present joint angles.
 #[derive(Clone)]
 struct Case {
     motion: Motion,
@@ -46,11 +47,11 @@ impl Case {
         self.motion.arms[0].len()
     }
 
-    fn check(&self, cell: &Cell) -> Result<(), Refusal> {
+    fn check(&self, cell: &WorkCell) -> Result<(), Refusal> {
         check(cell, &self.motion, &self.at, &self.settings)
     }
 
-    /// A sample in the middle of the motion.
+    /// Returns a random sample other than the first and the last.
     fn sample(&mut self, rng: &mut ChaCha8Rng) -> (ArmIndex, usize, &mut ArmSample) {
         let arm = rng.random_range(0..2);
         let idx = rng.random_range(1..self.n_samples() - 1);
@@ -58,8 +59,8 @@ impl Case {
     }
 }
 
-/// Good motions far from each other, so that one thing can be broken without breaking another.
-fn pool(cell: &Cell) -> Vec<Case> {
+/// Returns good motions in which the arms are far apart, so that one limit can be violated without another.
+fn pool(cell: &WorkCell) -> Vec<Case> {
     (0..20)
         .map(|seed| {
             let (motion, at) = sampled(cell, &walk(cell, Area::FAR, seed, 6));
@@ -70,7 +71,7 @@ fn pool(cell: &Cell) -> Vec<Case> {
         .collect()
 }
 
-/// What must come of a broken motion: arm, earliest and latest time, and the kind of reason.
+/// The expected refusal: arm, earliest and latest time, and kind of reason.
 struct Expected {
     arm: ArmIndex,
     between_s: [f64; 2],
@@ -78,7 +79,7 @@ struct Expected {
 }
 
 impl Expected {
-    /// From the interval before sample `idx` to that sample.
+    /// Expects a refusal in the interval before sample `idx` or at that sample.
     fn around(arm: ArmIndex, idx: usize, reason: fn(&Reason) -> bool) -> Option<Self> {
         let at_s = idx as f64 * PERIOD_S;
         Some(Self { arm, between_s: [at_s - PERIOD_S, at_s], reason })
@@ -89,16 +90,16 @@ impl Expected {
     }
 }
 
-/// Breaks motions of the pool; `how` says what to expect, or that this motion does not suit.
+/// Breaks motions of the pool with `how`, which returns the expected refusal, or `None` if the motion is unsuitable.
 fn break_all(name: &str, how: impl Fn(&mut Case, &mut ChaCha8Rng) -> Option<Expected>) {
-    let cell = Cell::mico_pair();
+    let cell = WorkCell::mico_pair();
     let pool = pool(&cell);
     let mut rng = episode_rng(7, 0, Stream::Exploration);
     let (mut broken, mut tried) = (0, 0);
     while broken < N_BROKEN {
         let mut case = pool[tried % pool.len()].clone();
         tried += 1;
-        assert!(tried < 50 * N_BROKEN, "{name}: hardly any motion suits");
+        assert!(tried < 50 * N_BROKEN, "{name}: hardly any motion is suitable");
         let Some(expected) = how(&mut case, &mut rng) else { continue };
         broken += 1;
         let refusal = case.check(&cell).expect_err(name);
@@ -113,33 +114,33 @@ fn break_all(name: &str, how: impl Fn(&mut Case, &mut ChaCha8Rng) -> Option<Expe
 }
 
 #[test]
-fn numbers_that_are_none() {
+fn numbers_that_are_not_finite_are_refused() {
     break_all("not finite", |case, rng| {
         let none = [f64::NAN, f64::INFINITY, f64::NEG_INFINITY][rng.random_range(0..3)];
         let (arm, idx, sample) = case.sample(rng);
         match rng.random_range(0..9) {
             joint @ 0..4 => sample.angles[joint] = none,
             joint @ 4..8 => sample.velocities[joint - 4] = none,
-            _ => sample.opening = none,
+            _ => sample.gripper_opening = none,
         }
         Expected::around(arm, idx, |reason| *reason == Reason::NotFinite)
     });
 }
 
 #[test]
-fn openings_out_of_range_or_too_fast() {
+fn gripper_openings_out_of_range_or_too_fast_are_refused() {
     break_all("opening", |case, rng| {
         let beyond = rng.random_range(1e-6..0.5);
         let opening = if rng.random_bool(0.5) { 1.0 + beyond } else { -beyond };
         let (arm, idx, sample) = case.sample(rng);
-        sample.opening = opening;
-        Expected::around(arm, idx, |reason| matches!(reason, Reason::Opening(_)))
+        sample.gripper_opening = opening;
+        Expected::around(arm, idx, |reason| matches!(reason, Reason::GripperOpening(_)))
     });
     break_all("opening speed", |case, rng| {
         let by = rng.random_range(0.1..0.5);
         let (arm, idx, sample) = case.sample(rng);
-        sample.opening += if sample.opening < 0.5 { by } else { -by };
-        Expected::around(arm, idx, |reason| matches!(reason, Reason::OpeningSpeed(_)))
+        sample.gripper_opening += if sample.gripper_opening < 0.5 { by } else { -by };
+        Expected::around(arm, idx, |reason| matches!(reason, Reason::GripperSpeed(_)))
     });
 }
 
@@ -159,7 +160,7 @@ fn jumps_kicks_and_lost_samples() {
     });
     break_all("lost samples", |case, rng| {
         let idx = rng.random_range(10..case.n_samples() - 20);
-        // The first arm is told when it moves fast enough to be missed.
+        // Only a jump of the first arm that is fast enough is certain to be refused.
         let rates = &case.motion.arms[0][idx].velocities;
         if rates.iter().all(|rate| rate.abs() < 0.1) {
             return None;
@@ -172,9 +173,9 @@ fn jumps_kicks_and_lost_samples() {
 }
 
 #[test]
-fn joints_beyond_their_range() {
+fn joints_beyond_their_range_are_refused() {
     break_all("joint range", |case, rng| {
-        // A full turn more changes nothing but the angle.
+        // A full turn changes nothing but the angle.
         let arm = rng.random_range(0..2);
         let joint = [0, 3][rng.random_range(0..2)];
         let turn = if rng.random_bool(0.5) { TAU } else { -TAU };
@@ -191,7 +192,7 @@ fn joints_beyond_their_range() {
     });
 }
 
-/// The angle and rate of something that speeds up at `acceleration` for `ramp_s`, keeps its speed and slows down again.
+/// Returns angle and velocity of a trapezoidal profile that starts at time 0.
 fn trapezoid(time_s: f64, [ramp_s, flat_s]: [f64; 2], acceleration: f64) -> [f64; 2] {
     let speed = acceleration * ramp_s;
     let (flat_end_s, end_s) = (ramp_s + flat_s, 2.0 * ramp_s + flat_s);
@@ -210,7 +211,7 @@ fn trapezoid(time_s: f64, [ramp_s, flat_s]: [f64; 2], acceleration: f64) -> [f64
     }
 }
 
-/// Lets `joint` of an otherwise resting arm follow a trapezoid from 0.1 s on.
+/// Makes `joint` of an otherwise resting arm follow a trapezoidal profile from 0.1 s on.
 fn swing(case: &mut Case, arm: usize, joint: usize, ramp_s: f64, acceleration: f64) {
     let first = case.motion.arms[arm][0];
     for samples in &mut case.motion.arms {
@@ -226,8 +227,8 @@ fn swing(case: &mut Case, arm: usize, joint: usize, ramp_s: f64, acceleration: f
 }
 
 #[test]
-fn joints_that_are_too_fast_or_accelerate_too_much() {
-    // Joint 4 turns the fingers and nothing else.
+fn joints_that_are_too_fast_or_accelerate_too_much_are_refused() {
+    // Joint 4 rotates nothing but the fingers.
     let (speed, acceleration) = (48.0_f64.to_radians(), 4.0 * 48.0_f64.to_radians());
     break_all("joint speed", |case, rng| {
         let arm = rng.random_range(0..2);
@@ -248,27 +249,27 @@ fn joints_that_are_too_fast_or_accelerate_too_much() {
         Expected::around(ArmIndex(arm), 11, |r| matches!(r, Reason::JointAcceleration(3, _)))
     });
     break_all("neither", |case, rng| {
-        // The same within both limits is passed; then the speed limit is taken down below it.
+        // A motion within both limits is accepted; then the acceleration limit is lowered below it.
         let arm = rng.random_range(0..2);
         swing(case, arm, 3, 0.99 * speed / acceleration, 0.99 * acceleration);
-        assert_eq!(case.check(&Cell::mico_pair()), Ok(()));
+        assert_eq!(case.check(&WorkCell::mico_pair()), Ok(()));
         case.settings.limits.ramp_s *= 1.05;
         Expected::around(ArmIndex(arm), 11, |r| matches!(r, Reason::JointAcceleration(3, _)))
     });
 }
 
 #[test]
-fn tools_that_are_too_fast() {
-    let cell = Cell::mico_pair();
+fn tools_that_are_too_fast_are_refused() {
+    let cell = WorkCell::mico_pair();
     break_all("tool speed", |case, rng| {
-        // An arm stretched out sideways swings away from the other one; its joint is not too fast.
+        // An arm stretched out sideways swings away from the other one, within the speed limit of its joint.
         let arm = rng.random_range(0..2);
         let radius_m = rng.random_range(0.345..0.36);
-        let at_m = DVec3::new(0.6, 0.8, 0.0) * radius_m + DVec3::Z * rng.random_range(0.06..0.12);
+        let at_m = Point3::new(0.6 * radius_m, 0.8 * radius_m, rng.random_range(0.06..0.12));
         let placed = &cell.arms[arm];
-        let near = Joints::new(MICO_4.elbow_up_rad);
-        let target = placed.target(placed.world_from_base(at_m));
-        let angles = MICO_4.nearest(&target, &near).unwrap().angles;
+        let seed = Joints::new(MICO_4.elbow_up_rad);
+        let target = placed.target(&(placed.world_from_base() * at_m));
+        let angles = MICO_4.inverse_kinematics(&target, &seed).unwrap().angles;
         case.motion.arms[arm][0].angles = angles;
         case.at[arm] = angles;
         let (joint_speed, acceleration) = (0.62, 2.4);
@@ -283,7 +284,7 @@ fn tools_that_are_too_fast() {
 }
 
 #[test]
-fn motions_that_do_not_begin_or_end_at_rest_where_the_arms_are() {
+fn motions_that_do_not_start_at_the_arms_or_do_not_rest_at_both_ends_are_refused() {
     break_all("cut at the end", |case, rng| {
         let n = rng.random_range(20..case.n_samples() - 10);
         let moves =
@@ -308,7 +309,7 @@ fn motions_that_do_not_begin_or_end_at_rest_where_the_arms_are() {
         case.at[arm][joint] += if rng.random_bool(0.5) { by } else { -by };
         Expected::at_start(arm, |reason| matches!(reason, Reason::Start(..)))
     });
-    break_all("nowhere", |case, rng| {
+    break_all("no position", |case, rng| {
         let (arm, joint) = (rng.random_range(0..2), rng.random_range(0..4));
         case.at[arm][joint] = f64::NAN;
         Expected::at_start(arm, |reason| *reason == Reason::NotFinite)
@@ -316,7 +317,7 @@ fn motions_that_do_not_begin_or_end_at_rest_where_the_arms_are() {
 }
 
 #[test]
-fn motions_of_other_arms_or_of_no_sensible_length() {
+fn motions_of_other_arms_or_of_invalid_length_are_refused() {
     break_all("length", |case, rng| {
         let n = case.n_samples();
         case.settings.duration_s = n as f64 * PERIOD_S;
@@ -365,11 +366,11 @@ fn motions_of_other_arms_or_of_no_sensible_length() {
 }
 
 #[test]
-fn tools_that_reach_too_far() {
+fn tools_that_reach_too_far_are_refused() {
     let shoulder_m = MICO_4.shoulder_m();
-    let distance_m = |q: &Joints| (Posture::of(&MICO_4, q).tool().origin_m - shoulder_m).length();
+    let distance_m = |q: &Joints| (ForwardKinematics::new(&MICO_4, q).tool_m() - shoulder_m).norm();
     break_all("reach", |case, rng| {
-        // The limit is put between the least and the largest distance that the motion has.
+        // The limit lies between the smallest and the largest distance of the motion.
         let arms = &case.motion.arms;
         let at = |idx: usize| {
             arms.iter().map(|samples| distance_m(&samples[idx].angles)).fold(0.0, f64::max)
@@ -394,21 +395,21 @@ fn tools_that_reach_too_far() {
 }
 
 #[test]
-fn a_refusal_says_where_when_and_how_much() {
-    let cell = Cell::mico_pair();
+fn a_refusal_names_arm_time_value_and_limit() {
+    let cell = WorkCell::mico_pair();
     let (mut motion, at) = sampled(&cell, &walk(&cell, Area::FAR, 1, 6));
-    motion.arms[1][40].opening = 1.5;
+    motion.arms[1][40].gripper_opening = 1.5;
     let refusal = check(&cell, &motion, &at, &CheckSettings::default()).unwrap_err();
     assert_eq!(
         refusal.to_string(),
-        "at 0.400 s arm 1: the gripper is open by 1.5, expected 0 to 1"
+        "at 0.400 s arm 1: the gripper opening is 1.5, expected 0 to 1"
     );
-    motion.arms[1][40].opening = 0.5;
+    motion.arms[1][40].gripper_opening = 0.5;
     let elsewhere: Vec<Joints> =
         at.iter().map(|q| Joints::from_fn(4, |joint| q[joint] + 0.1)).collect();
     let refusal = check(&cell, &motion, &elsewhere, &CheckSettings::default()).unwrap_err();
     assert_eq!(
         refusal.to_string(),
-        "at 0.000 s arm 0: joint 1 is 5.73 degrees from where the motion begins, at most 1.00"
+        "at 0.000 s arm 0: joint 1 is 5.73 degrees from the start of the motion, at most 1.00"
     );
 }

@@ -11,6 +11,7 @@ use std::path::Path;
 use safetensors::{Dtype, SafeTensors};
 use serde_json::{Map, Value, json};
 use sha2::{Digest as _, Sha256};
+use tandem_core::text::hex;
 
 /// Version of the file's layout.
 pub(super) const FORMAT: &str = "3";
@@ -51,23 +52,21 @@ pub(super) enum Refused {
     Format(String),
 }
 
-/// Writes a file and makes sure that it is on the disk; gives its seal.
+/// Writes a checkpoint into `file` and returns its seal.
 pub(super) fn write(
-    path: &Path,
+    mut file: &File,
     metadata: &[(&str, String)],
     tensors: &[Tensor<'_>],
 ) -> io::Result<String> {
     let mut start = start(metadata, tensors)?;
     let mut hash = Sha256::new_with_prefix(&start);
     tensors.iter().for_each(|tensor| hash.update(tensor.bytes));
-    let seal = hex(hash);
+    let seal = hex(&hash.finalize());
     start[SEAL].copy_from_slice(seal.as_bytes());
-    let mut file = File::create(path)?;
     file.write_all(&start)?;
     for tensor in tensors {
         file.write_all(tensor.bytes)?;
     }
-    file.sync_all()?;
     Ok(seal)
 }
 
@@ -133,14 +132,10 @@ fn check_seal(bytes: &[u8]) -> Result<(), Refused> {
     let mut hash = Sha256::new_with_prefix(&bytes[..SEAL.start]);
     hash.update([b'0'; SEAL_CHARS]);
     hash.update(after);
-    if hex(hash).as_bytes() == seal {
+    if hex(&hash.finalize()).as_bytes() == seal {
         return Ok(());
     }
     Err(Refused::Damaged("its contents are not those that it was sealed with".to_owned()))
-}
-
-fn hex(hash: Sha256) -> String {
-    hash.finalize().iter().map(|byte| format!("{byte:02x}")).collect()
 }
 
 /// The bytes of a file whose contents were altered after it was written, with the seal that fits them.
@@ -148,7 +143,7 @@ fn hex(hash: Sha256) -> String {
 pub(super) fn seal_anew(mut bytes: Vec<u8>) -> Vec<u8> {
     if bytes.len() >= SEAL.end {
         bytes[SEAL].fill(b'0');
-        let seal = hex(Sha256::new_with_prefix(&bytes));
+        let seal = hex(&Sha256::digest(&bytes));
         bytes[SEAL].copy_from_slice(seal.as_bytes());
     }
     bytes

@@ -2,7 +2,7 @@
 
 use safetensors::Dtype;
 use tandem_core::work::PublishedActor;
-use tandem_policy::{Normalizer, NormalizerParts, NormalizerSnapshot, Policy};
+use tandem_policy::{Normalizer, NormalizerSnapshot, NormalizerState, Policy};
 use tandem_telemetry::MetricsRow;
 
 use super::Resumption;
@@ -37,8 +37,8 @@ pub(super) fn metadata(trainer: &Trainer, resumption: &Resumption) -> Vec<(&'sta
         ("updates", updates.to_string()),
         ("advice_spent", advice_spent.to_string()),
         ("ddpg.n_updates", trainer.ddpg.n_updates().to_string()),
-        ("normalizer.observation.count", trainer.observation_normalizer.parts().count.to_string()),
-        ("normalizer.goal.count", trainer.goal_normalizer.parts().count.to_string()),
+        ("normalizer.observation.count", trainer.observation_normalizer.state().count.to_string()),
+        ("normalizer.goal.count", trainer.goal_normalizer.state().count.to_string()),
         ("replay.next", next.to_string()),
         ("acting.version", resumption.acting.version.to_string()),
         ("pending", resumption.pending.len().to_string()),
@@ -50,7 +50,7 @@ pub(super) fn metadata(trainer: &Trainer, resumption: &Resumption) -> Vec<(&'sta
 /// The vectors of a state that are made for the file.
 pub(super) fn small_tensors(trainer: &Trainer, resumption: &Resumption) -> Vec<OwnedTensor> {
     let (observation, goal) =
-        (trainer.observation_normalizer.parts(), trainer.goal_normalizer.parts());
+        (trainer.observation_normalizer.state(), trainer.goal_normalizer.state());
     let Resumption { acting, judged, pending, .. } = resumption;
     let mut tensors = vec![
         f64s("figures", &figures(&trainer.figures())),
@@ -222,7 +222,7 @@ impl Reader<'_> {
         if sum.len() != n || sum_of_squares.len() != n {
             return Err(format!("the {of} normaliser has {} numbers, {n} are needed", sum.len()));
         }
-        Ok(Normalizer::from_parts(NormalizerParts { count, sum, sum_of_squares }))
+        Ok(Normalizer::from_state(NormalizerState { count, sum, sum_of_squares }))
     }
 
     fn acting(&self, trainer: &Trainer) -> Result<PublishedActor, String> {

@@ -127,7 +127,8 @@ fn without_a_checkpoint_there_is_nothing_to_restore_and_nothing_wrong() {
     assert!(load().expect("no error").is_none(), "no directory");
     fs::create_dir(directory.path().join("checkpoint")).expect("creates");
     assert!(load().expect("no error").is_none(), "an empty one");
-    fs::write(directory.path().join("checkpoint/00000001.tmp"), "half").expect("writes");
+    fs::write(directory.path().join("checkpoint/00000001.safetensors.tmp"), "half")
+        .expect("writes");
     assert!(load().expect("no error").is_none(), "an unfinished one");
     fs::remove_dir(directory.path().join("checkpoint")).expect("the unfinished one is removed");
     fs::write(directory.path().join("checkpoint"), "").expect("writes");
@@ -371,7 +372,7 @@ fn a_disk_that_refuses_leaves_the_former_checkpoint() {
     let (directory, mut trainer) = saved(1);
     train_round(&mut trainer);
     // A directory where the unfinished file would go: it can be neither written nor renamed.
-    let in_the_way = directory.path().join("00000002.tmp");
+    let in_the_way = directory.path().join("00000002.safetensors.tmp");
     fs::create_dir(&in_the_way).expect("creates");
     let refusal = save(directory.path(), &trainer, &resumption(&trainer), 1);
     assert!(matches!(refusal, Err(CheckpointError::Io { action: "write", .. })));

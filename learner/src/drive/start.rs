@@ -5,15 +5,14 @@ use std::time::Duration;
 
 use tandem_core::work::{PublishedActor, RunTerms};
 use tandem_proto::pb;
+use tandem_system::{DirectoryLock, atomic_file};
 use tandem_telemetry::events::RunResumed;
 use tokio_util::sync::CancellationToken;
 
 use super::keep::Keeping;
 use super::{Drive, UNITS_PER_EPISODE};
-use crate::atomic;
 use crate::checkpoint::{self, CheckpointError, Restored, Resumption};
 use crate::error::Error;
-use crate::lock::DirectoryLock;
 use crate::records::{Judged, Pending, Records};
 use crate::runtime::Runtime;
 use crate::shared::{LearnerConfig, Shared};
@@ -124,8 +123,8 @@ impl<'a> Drive<'a> {
         let terms = RunTerms {
             layout: trainer.layout,
             account: ledger.as_ref().map(|ledger| ledger.account().to_owned()),
-            exploration: config.run.exploration(),
-            world: config.run.world_terms(),
+            exploration: config.run.exploration,
+            world: config.run.world,
         };
         for Pending { counters, policy, .. } in &pending {
             shared.publish(&policy.published(counters.round));
@@ -174,7 +173,7 @@ pub(super) fn keep_run_file(config: &LearnerConfig) -> Result<(), Error> {
     if std::fs::read(&path).is_ok_and(|there| there == text.as_bytes()) {
         return Ok(());
     }
-    atomic::write(&path, text.as_bytes()).map_err(|error| Error::RunDirectory {
+    atomic_file::replace(&path, text.as_bytes()).map_err(|error| Error::RunDirectory {
         action: "write",
         path,
         source: error.into(),
@@ -222,7 +221,7 @@ fn lock(directory: &Path, is_over: &impl Fn() -> bool) -> Result<DirectoryLock, 
         let path: PathBuf = directory.to_owned();
         Error::RunDirectory { action: "lock", path, source }
     };
-    checkpoint::make(directory).map_err(|error| refused(error.into()))?;
+    atomic_file::create_directory(directory).map_err(|error| refused(error.into()))?;
     loop {
         match DirectoryLock::try_take(directory) {
             Ok(Some(lock)) => return Ok(lock),

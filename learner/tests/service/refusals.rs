@@ -38,11 +38,11 @@ const WRONG: [(Spoil, &str); 17] = [
     (|m| m.episodes[0].goal.clear(), "episode 0: goal: expected 3 numbers, got 0 numbers"),
     (
         |m| m.episodes[0].actions.push(0),
-        "episode 0: actions: expected 600 bytes, 4 a number, got 601 bytes",
+        "episode 0: actions: expected 600 bytes, 4 per number, got 601 bytes",
     ),
     (
         |m| m.episodes[0].contacts.clear(),
-        "episode 0: contacts: expected 50 bytes, one a step, got 0 bytes",
+        "episode 0: contacts: expected 50 bytes, one per step, got 0 bytes",
     ),
     (|m| m.episodes[0].kind = 0, "episode 0: kind: expected 1 (training) or 2 (evaluation), got 0"),
     (|m| m.episodes[0].kind = 2, "episode 0: kind: expected Training, got Evaluation"),

@@ -1,6 +1,7 @@
-//! What a policy file brings back, and what is refused.
+//! Round trips of policy files, and files that are refused.
 
 use std::error::Error as _;
+use std::fs;
 
 use super::*;
 
@@ -8,7 +9,7 @@ fn sample() -> Policy {
     Policy::sample(Layout::new(Task::Push, 2), 2)
 }
 
-/// The file's bytes with a header that `edit` has changed.
+/// Changes the header of a file with `edit`.
 fn with_header(bytes: &[u8], edit: impl FnOnce(&mut Map<String, Value>)) -> Vec<u8> {
     let (length, rest) = bytes.split_first_chunk::<8>().unwrap();
     let (header, data) = rest.split_at(usize::try_from(u64::from_le_bytes(*length)).unwrap());
@@ -29,7 +30,7 @@ fn with_metadata(bytes: &[u8], key: &str, value: Option<&str>) -> Vec<u8> {
 }
 
 #[test]
-fn a_policy_comes_back_as_it_was_saved() {
+fn a_policy_loads_as_it_was_saved() {
     let directory = tempfile::tempdir().unwrap();
     let path = directory.path().join("policy.safetensors");
     let policy = sample();
@@ -40,7 +41,7 @@ fn a_policy_comes_back_as_it_was_saved() {
     assert_eq!(fs::read(&path).unwrap(), encode(&loaded), "the same bytes again");
     let files: Vec<_> =
         fs::read_dir(directory.path()).unwrap().map(|entry| entry.unwrap().file_name()).collect();
-    assert_eq!(files, ["policy.safetensors"], "nothing else is left behind");
+    assert_eq!(files, ["policy.safetensors"], "no other file remains");
 }
 
 #[test]
@@ -58,7 +59,7 @@ fn every_number_enters_the_digest() {
 }
 
 #[test]
-fn a_policy_that_cannot_be_used_is_not_saved_over_one_that_can() {
+fn an_invalid_policy_does_not_overwrite_a_file() {
     let directory = tempfile::tempdir().unwrap();
     let path = directory.path().join("policy.safetensors");
     let policy = sample();
@@ -73,7 +74,7 @@ fn a_policy_that_cannot_be_used_is_not_saved_over_one_that_can() {
 }
 
 #[test]
-fn files_that_are_no_policy_are_refused() {
+fn files_that_are_not_policies_are_refused() {
     let directory = tempfile::tempdir().unwrap();
     let path = directory.path().join("policy.safetensors");
     assert!(matches!(Policy::load(&path), Err(Error::Read { .. })), "no such file");
@@ -86,9 +87,9 @@ fn files_that_are_no_policy_are_refused() {
         let error = Policy::load(&path).expect_err("must be refused");
         assert!(error.to_string().contains("policy.safetensors"), "{error}");
         let reason = error.source().unwrap().to_string();
-        assert_eq!(reason, "not a whole safetensors file", "{} bytes", bytes.len());
+        assert_eq!(reason, "not a complete safetensors file", "{} bytes", bytes.len());
     }
-    assert!(decode(&[whole.as_slice(), &[0]].concat()).is_err(), "a byte too many");
+    assert!(decode(&[whole.as_slice(), &[0]].concat()).is_err(), "one byte too many");
 }
 
 #[test]
@@ -173,7 +174,7 @@ fn tensors_that_are_not_as_expected_are_refused() {
 }
 
 #[test]
-fn numbers_that_cannot_be_used_or_were_altered_are_refused() {
+fn invalid_and_altered_numbers_are_refused() {
     let check = |change: fn(&mut Policy), expected: &str| {
         let mut policy = sample();
         change(&mut policy);

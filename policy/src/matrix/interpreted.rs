@@ -1,12 +1,12 @@
-//! The matrix product for Miri, which does not know the SIMD instructions of the `gemm` crate.
+//! The matrix product for Miri, which does not support the SIMD instructions of the `gemm` crate.
 
 use gemm::Parallelism;
 
-/// Reads and writes what `gemm::gemm` reads and writes, through the same pointers, one number at a time.
+/// Performs the accesses of `gemm::gemm` through the same pointers, one number at a time.
 ///
 /// # Safety
-/// As for `gemm::gemm`: every element of the three matrices can be read, and those of `product` written.
-#[expect(unsafe_code, reason = "Miri checks the accesses that the product's caller vouches for")]
+/// As for `gemm::gemm`: every element of the factors can be read, and every element of `product` written.
+#[expect(unsafe_code, reason = "Miri checks the accesses that the caller guarantees to be valid")]
 #[expect(clippy::too_many_arguments, reason = "the arguments of gemm::gemm")]
 #[expect(clippy::fn_params_excessive_bools, reason = "the arguments of gemm::gemm")]
 pub(super) unsafe fn gemm(
@@ -37,13 +37,13 @@ pub(super) unsafe fn gemm(
         for col in 0..n_cols {
             let mut sum = 0.0;
             for inner in 0..n_inner {
-                // SAFETY: the caller vouches for every element of both factors.
+                // SAFETY: the caller guarantees that every element of both factors is readable.
                 sum += unsafe {
                     *lhs.offset(at(row, lhs_row_stride, inner, lhs_col_stride))
                         * *rhs.offset(at(inner, rhs_row_stride, col, rhs_col_stride))
                 };
             }
-            // SAFETY: the caller vouches for every element of the product.
+            // SAFETY: the caller guarantees that every element of the product is writable.
             unsafe { *product.offset(at(row, product_row_stride, col, product_col_stride)) = sum };
         }
     }

@@ -1,19 +1,19 @@
-//! Whole episodes.
+//! Conversions of episodes.
 
 use tandem_core::layout::EPISODE_STEPS;
 use tandem_core::{Contacts, Episode, Layout};
 
-use super::{decode_kind, encode_kind};
+use super::{decode_episode_kind, encode_episode_kind};
 use crate::error::DecodeError;
 use crate::numbers::{actions_from_bytes, bounded_from_bytes, count_within, to_bytes};
 use crate::pb;
 
-/// An episode as a message.
+/// Encodes an episode.
 #[must_use]
 pub fn encode_episode(episode: &Episode) -> pb::Episode {
     pb::Episode {
         number: episode.number,
-        kind: encode_kind(episode.kind).into(),
+        kind: encode_episode_kind(episode.kind).into(),
         parameter_version: episode.parameter_version,
         observations: to_bytes(&episode.observations),
         goal: to_bytes(&episode.goal),
@@ -24,29 +24,27 @@ pub fn encode_episode(episode: &Episode) -> pb::Episode {
     }
 }
 
-/// An episode of a run with `layout`.
+/// Decodes an episode of a run with `layout`.
 ///
 /// # Errors
-/// When the kind is unknown, a length is not the layout's, a number is not finite or larger than any world of the layout
-/// has it ([`tandem_core::bounds`]), an action leaves [−1, 1], a bit stands for no arm or no contact, or more units were
-/// charged than the episode has steps.
+/// Returns an error if the kind is unknown, a length does not match the layout, a number is not finite or beyond its
+/// bound (see [`tandem_core::bounds`]), an action is outside [−1, 1], an undefined bit of `advised_arms` or `contacts`
+/// is set, or more units were charged than the episode has steps.
 pub fn decode_episode(episode: pb::Episode, layout: Layout) -> Result<Episode, DecodeError> {
     let n_observations = (EPISODE_STEPS + 1) * layout.n_observation();
     let max_charged = u32::try_from(EPISODE_STEPS).expect("an episode has few steps");
     Ok(Episode {
         number: episode.number,
-        kind: decode_kind(episode.kind)?,
+        kind: decode_episode_kind(episode.kind)?,
         parameter_version: episode.parameter_version,
         layout,
         observations: bounded_from_bytes(
             "observations",
             &episode.observations,
             n_observations,
-            |idx| layout.largest_observation(idx % layout.n_observation()),
+            |idx| layout.observation_bound(idx % layout.n_observation()),
         )?,
-        goal: bounded_from_bytes("goal", &episode.goal, layout.n_goal(), |_| {
-            layout.largest_goal()
-        })?,
+        goal: bounded_from_bytes("goal", &episode.goal, layout.n_goal(), |_| layout.goal_bound())?,
         actions: actions_from_bytes(
             "actions",
             &episode.actions,
@@ -59,7 +57,7 @@ pub fn decode_episode(episode: pb::Episode, layout: Layout) -> Result<Episode, D
 }
 
 fn decode_advised_arms(advised_arms: Vec<u8>, layout: Layout) -> Result<Vec<u8>, DecodeError> {
-    check_one_a_step("advised_arms", &advised_arms)?;
+    check_one_per_step("advised_arms", &advised_arms)?;
     let names_an_arm = |bits: u8| (u32::from(bits) >> layout.n_arms) == 0;
     match advised_arms.iter().position(|bits| !names_an_arm(*bits)) {
         None => Ok(advised_arms),
@@ -72,7 +70,7 @@ fn decode_advised_arms(advised_arms: Vec<u8>, layout: Layout) -> Result<Vec<u8>,
 }
 
 fn decode_contacts(contacts: &[u8]) -> Result<Vec<Contacts>, DecodeError> {
-    check_one_a_step("contacts", contacts)?;
+    check_one_per_step("contacts", contacts)?;
     let decode_step = |(step_idx, bits): (usize, &u8)| {
         let unknown = || {
             let got = format_args!("{bits:#010b}").to_string();
@@ -87,11 +85,11 @@ fn decode_contacts(contacts: &[u8]) -> Result<Vec<Contacts>, DecodeError> {
     contacts.iter().enumerate().map(decode_step).collect()
 }
 
-fn check_one_a_step(field: &str, bytes: &[u8]) -> Result<(), DecodeError> {
+fn check_one_per_step(field: &str, bytes: &[u8]) -> Result<(), DecodeError> {
     if bytes.len() == EPISODE_STEPS {
         return Ok(());
     }
-    let expected = format_args!("{EPISODE_STEPS} bytes, one a step").to_string();
+    let expected = format_args!("{EPISODE_STEPS} bytes, one per step").to_string();
     Err(DecodeError::new(field, expected, format_args!("{} bytes", bytes.len())))
 }
 
@@ -131,24 +129,24 @@ mod tests {
 
     #[test]
     fn a_malformed_episode_is_refused_by_name() {
-        let check = |spoil: fn(&mut pb::Episode), message: &str| {
-            let mut spoilt = encode_episode(&episode());
-            spoil(&mut spoilt);
-            assert_eq!(decode_episode(spoilt, LAYOUT).unwrap_err().to_string(), message);
+        let check = |corrupt: fn(&mut pb::Episode), message: &str| {
+            let mut malformed = encode_episode(&episode());
+            corrupt(&mut malformed);
+            assert_eq!(decode_episode(malformed, LAYOUT).unwrap_err().to_string(), message);
         };
         check(|e| e.kind = -1, "kind: expected 1 (training) or 2 (evaluation), got -1");
         check(
             |e| e.observations.truncate(50 * 56 * 4),
             "observations: expected 2856 numbers, got 2800 numbers",
         );
-        check(|e| e.goal.push(0), "goal: expected 24 bytes, 4 a number, got 25 bytes");
+        check(|e| e.goal.push(0), "goal: expected 24 bytes, 4 per number, got 25 bytes");
         check(
             |e| e.actions[4..8].copy_from_slice(&2.0_f32.to_le_bytes()),
             "actions[1]: expected a number in [-1, 1], got 2",
         );
         check(
             |e| e.advised_arms.truncate(49),
-            "advised_arms: expected 50 bytes, one a step, got 49 bytes",
+            "advised_arms: expected 50 bytes, one per step, got 49 bytes",
         );
         check(
             |e| e.advised_arms[2] = 4,

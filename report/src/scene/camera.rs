@@ -1,11 +1,11 @@
-//! Where a point of the world stands in the picture.
+//! Projection of points of the world onto the picture.
 
 use super::View;
 
 /// A point or direction, metres, world frame.
 pub(super) type Vec3 = [f64; 3];
 
-/// Share of the picture's width or height that a fitted camera fills.
+/// Share of the width or height of the picture that the fitted points fill.
 const FILLED_SHARE: f64 = 0.93;
 
 /// A perspective camera.
@@ -25,19 +25,19 @@ pub(super) struct Projected {
     pub(super) x: f64,
     /// Pixels from the top.
     pub(super) y: f64,
-    /// Distance from the eye along the view, metres.
+    /// Distance from the camera along the view direction, metres.
     pub(super) depth_m: f64,
-    /// Pixels a metre at that depth.
+    /// Scale at that depth, pixels per metre.
     pub(super) scale: f64,
 }
 
 impl Camera {
-    /// A camera that shows all of `points` as large as the picture allows.
+    /// Creates a camera that shows all of `points` as large as possible.
     ///
     /// # Panics
-    /// When there are no points.
+    /// If there are no points.
     pub(super) fn fitted(view: &View, points: &[Vec3]) -> Self {
-        assert!(!points.is_empty(), "a picture of nothing");
+        assert!(!points.is_empty(), "a picture needs at least one point");
         let target = scaled(points.iter().copied().fold([0.0; 3], sum), 1.0 / points.len() as f64);
         let mut camera = Self::new(view, target);
         let projected: Vec<Projected> = points.iter().map(|point| camera.project(*point)).collect();
@@ -75,6 +75,7 @@ impl Camera {
         }
     }
 
+    /// Projects a point (world, metres).
     pub(super) fn project(&self, point: Vec3) -> Projected {
         let offset = difference(point, self.eye);
         let depth_m = dot(offset, self.forward).max(1e-3);
@@ -87,7 +88,7 @@ impl Camera {
         }
     }
 
-    /// Whether a face at `point` with outward `normal` shows its front.
+    /// Returns whether a face at `point` with outward `normal` is visible.
     pub(super) fn sees(&self, point: Vec3, normal: Vec3) -> bool {
         dot(difference(point, self.eye), normal) < 0.0
     }
@@ -113,7 +114,7 @@ pub(super) fn cross(a: Vec3, b: Vec3) -> Vec3 {
     [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
 }
 
-/// `vector` turned by the unit quaternion `xyzw`.
+/// Rotates `vector` by the unit quaternion `xyzw`.
 pub(super) fn rotated(xyzw: [f32; 4], vector: Vec3) -> Vec3 {
     let [x, y, z, w] = xyzw.map(f64::from);
     let axis = [x, y, z];
@@ -126,7 +127,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_target_is_in_the_middle_and_up_is_up() {
+    fn the_target_is_in_the_centre_and_up_is_up() {
         for azimuth_deg in [-70.0, 0.0, 35.0, 180.0] {
             let view = View { azimuth_deg, ..View::default() };
             let camera = Camera::new(&view, [0.0, 0.0, 0.2]);
@@ -172,7 +173,7 @@ mod tests {
     }
 
     #[test]
-    fn a_quarter_turn_about_z_brings_x_to_y() {
+    fn a_quarter_turn_about_z_rotates_x_to_y() {
         let half = std::f32::consts::FRAC_1_SQRT_2;
         let turned = rotated([0.0, 0.0, half, half], [1.0, 0.0, 0.0]);
         assert!(difference(turned, [0.0, 1.0, 0.0]).iter().all(|x| x.abs() < 1e-6), "{turned:?}");

@@ -1,4 +1,4 @@
-//! Shaded shapes, collected with their depth and written out far ones first.
+//! Shaded shapes, drawn from far to near.
 
 use tandem_core::scene::{Capsule, Cuboid};
 
@@ -7,10 +7,10 @@ use super::camera::{Camera, Projected, Vec3, difference, rotated, scaled, sum};
 use super::color::{LIGHT, Rgb, brightness};
 
 const FONT: &str = "-apple-system, 'Segoe UI', Helvetica, Arial, sans-serif";
-/// Corners of a circle drawn as a polygon.
+/// Number of corners of a circle that is drawn as a polygon.
 const N_CORNERS: u32 = 48;
 
-/// Collects shapes and writes them far ones first.
+/// Collects shapes with their depth and draws them from far to near.
 pub(super) struct Painter {
     camera: Camera,
     table_z_m: f64,
@@ -34,7 +34,7 @@ impl Painter {
         }
     }
 
-    /// The table, below everything else.
+    /// Adds the table, below everything else.
     pub(super) fn table(&mut self, table: &Cuboid, color: Rgb) {
         for (corners, normal) in faces(table) {
             if normal[2] > 0.5 {
@@ -52,7 +52,7 @@ impl Painter {
         }
     }
 
-    /// A box with one flat tone a face.
+    /// Adds a box with flat shading.
     pub(super) fn cuboid(&mut self, cuboid: &Cuboid, color: Rgb) {
         let mut drawn = String::new();
         for (corners, normal) in faces(cuboid) {
@@ -67,7 +67,7 @@ impl Painter {
         self.shapes.push((depth_m, drawn));
     }
 
-    /// A bar with round ends, lighter where its side faces the light.
+    /// Adds a capsule, lighter on the side of the light.
     pub(super) fn capsule(&mut self, capsule: &Capsule, color: Rgb) {
         let radius_m = f64::from(capsule.radius_m);
         let (from, to) = (capsule.from.map(f64::from), capsule.to.map(f64::from));
@@ -77,7 +77,7 @@ impl Painter {
         if length_px < (radius_a - radius_b).abs() + 0.5 {
             let (nearer, depth_m) =
                 if a.depth_m < b.depth_m { (from, a.depth_m) } else { (to, b.depth_m) };
-            self.ball(nearer, radius_m, depth_m, color);
+            self.sphere(nearer, radius_m, depth_m, color);
             return;
         }
         let (side_x, side_y) = ((b.y - a.y) / length_px, -(b.x - a.x) / length_px);
@@ -98,18 +98,18 @@ impl Painter {
         self.shapes.push((self.middle_depth_m(capsule), drawn));
     }
 
-    /// A ball where `link` ends and `next` begins, in front of both.
+    /// Adds a sphere between `link` and `next`, in front of both.
     pub(super) fn joint(&mut self, link: &Capsule, next: &Capsule, widening: f64, color: Rgb) {
         let depth_m = [link, next]
             .map(|bar| self.middle_depth_m(bar))
             .into_iter()
             .fold(f64::INFINITY, f64::min);
         let radius_m = widening * f64::from(link.radius_m.max(next.radius_m));
-        self.ball(link.to.map(f64::from), radius_m, depth_m - 1e-3, color);
+        self.sphere(link.to.map(f64::from), radius_m, depth_m - 1e-3, color);
     }
 
-    /// A ball with a highlight; `depth_m` says what it is in front of.
-    fn ball(&mut self, centre: Vec3, radius_m: f64, depth_m: f64, color: Rgb) {
+    /// Adds a sphere with a highlight at the given depth.
+    fn sphere(&mut self, centre: Vec3, radius_m: f64, depth_m: f64, color: Rgb) {
         let at = self.camera.project(centre);
         let fill = self.gradient_ball(color);
         let radius = radius_m * at.scale;
@@ -120,7 +120,7 @@ impl Painter {
         self.shapes.push((depth_m, drawn));
     }
 
-    /// A translucent ball: where an object shall be. A ring below it shows where it stands over the table.
+    /// Adds a goal: a translucent sphere, and a ring on the table below it.
     pub(super) fn goal(&mut self, centre: Vec3, radius_m: f64, color: Rgb) {
         let below = [centre[0], centre[1], self.table_z_m];
         let ring = self.circle_on_table(below, radius_m);
@@ -142,7 +142,7 @@ impl Painter {
         self.shapes.push((at.depth_m - radius_m, drawn));
     }
 
-    /// A low round foot on the table.
+    /// Adds a pedestal on the table.
     pub(super) fn pedestal(&mut self, base: Vec3, radius_m: f64, height_m: f64, color: Rgb) {
         let top_centre = [base[0], base[1], base[2] + height_m];
         let (bottom, top) =
@@ -162,14 +162,14 @@ impl Painter {
         let (side, lid) = (color.lit(0.75).hex(), color.lit(1.1).hex());
         let drawn =
             format!(r#"<path d="{bottom}{wall}" fill="{side}"/><path d="{top}" fill="{lid}"/>"#);
-        // Its far rim: the arm stands on it.
+        // The depth of the far rim, so that the arm is drawn in front.
         self.shapes.push((low.depth_m + radius_m, drawn));
         let shadow =
             self.circle_on_table([base[0] + 0.02, base[1] + 0.02, self.table_z_m], 1.1 * radius_m);
         self.shadows.push_str(&format!(r#"<path d="{shadow}"/>"#));
     }
 
-    /// What `capsule` keeps the light from.
+    /// Adds the shadow of a capsule.
     pub(super) fn shadow_of_capsule(&mut self, capsule: &Capsule) {
         let [a, b] = [capsule.from, capsule.to]
             .map(|end| self.camera.project(self.shadow_point(end.map(f64::from))));
@@ -178,7 +178,7 @@ impl Painter {
             a.x, a.y, b.x, b.y));
     }
 
-    /// What `cuboid` keeps the light from.
+    /// Adds the shadow of a box.
     pub(super) fn shadow_of_cuboid(&mut self, cuboid: &Cuboid) {
         for (corners, _) in faces(cuboid) {
             let corners = corners.map(|corner| self.shadow_point(corner));
@@ -187,7 +187,7 @@ impl Painter {
         }
     }
 
-    /// The whole picture.
+    /// Returns the picture as SVG.
     pub(super) fn finish(mut self, view: &View) -> String {
         self.shapes.sort_by(|a, b| b.0.total_cmp(&a.0));
         let shapes: String = self.shapes.into_iter().map(|(_, shape)| shape).collect();
@@ -210,7 +210,7 @@ impl Painter {
         0.5 * (from + to)
     }
 
-    /// Where the shadow of `point` falls on the table.
+    /// Projects `point` onto the table along the light.
     fn shadow_point(&self, point: Vec3) -> Vec3 {
         let height_m = (point[2] - self.table_z_m).max(0.0);
         difference(point, scaled(LIGHT, height_m / LIGHT[2]))
@@ -234,7 +234,7 @@ impl Painter {
         self.outline(&(0..N_CORNERS).map(corner).collect::<Vec<_>>())
     }
 
-    /// Defines a gradient from one side of a bar to the other; `side` points from its axis to its left, pixels.
+    /// Defines a gradient across a capsule and returns its id. `side` points from the axis to the left side, pixels.
     fn gradient_across(&mut self, axis: &Projected, side: [f64; 2], color: Rgb) -> String {
         let id = self.next_id();
         // In the picture the light comes from the upper left.
@@ -283,7 +283,7 @@ fn caption(text: &str) -> String {
     )
 }
 
-/// The six faces of a box: corners in order round each, and outward normals.
+/// Returns the six faces of a box: their corners in order, and their outward normals.
 fn faces(cuboid: &Cuboid) -> [([Vec3; 4], Vec3); 6] {
     let half_m = cuboid.half_extents_m.map(f64::from);
     let centre = cuboid.centre.map(f64::from);
@@ -309,7 +309,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_boxs_faces_look_outward() {
+    fn the_normals_of_a_box_point_outward() {
         let half = std::f32::consts::FRAC_1_SQRT_2;
         let cuboid = Cuboid {
             centre: [1.0, 2.0, 3.0],

@@ -1,4 +1,4 @@
-//! Trials for programs.
+//! Export of trials as JSON.
 
 use serde_json::{Map, Value, json as value};
 use tandem_core::{Task, Wilson};
@@ -6,7 +6,9 @@ use tandem_core::{Task, Wilson};
 use super::{CAUSES, OTHER_CAUSES, TrialGroup, Trials};
 use crate::paper::{N_PAPER_TRIALS, TABLE_4};
 
-/// Trials as one JSON object: `groups`, each with its figures and its failures; durations are seconds.
+/// Returns trials as one JSON object: `groups`, each with its statistics and its failures. Durations are in seconds.
+///
+/// The key `subject` is the name of the policy.
 #[must_use]
 pub fn json(trials: &Trials) -> Value {
     value!({ "groups": trials.groups.iter().map(group_json).collect::<Vec<_>>() })
@@ -26,7 +28,7 @@ fn group_json(group: &TrialGroup) -> Value {
     });
     value!({
         "task": group.task,
-        "subject": group.subject,
+        "subject": group.policy,
         "mode": group.mode,
         "trials": group.rows.len(),
         "successes": n_successes,
@@ -41,7 +43,7 @@ fn group_json(group: &TrialGroup) -> Value {
     })
 }
 
-/// Successes of the paper's two arms; `null` for a task that it has not.
+/// Returns the paper's successes with two arms; `null` for a task that the paper does not have.
 fn paper_json(task: &str) -> Value {
     let Some(task) = Task::ALL.into_iter().find(|known| known.name() == task) else {
         return Value::Null;

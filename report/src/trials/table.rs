@@ -1,4 +1,4 @@
-//! Trials as tables: the paper's Table 4, with intervals and causes.
+//! Tables of trials: the paper's Table 4, with intervals and causes of failure.
 
 use tandem_core::{Task, Wilson};
 
@@ -6,54 +6,54 @@ use super::{CAUSES, OTHER_CAUSES, TrialGroup, Trials};
 use crate::paper::{N_PAPER_TRIALS, PaperTrials, TABLE_4};
 use crate::table::{NONE, Table, optional};
 
-/// Arms in the paper's trials.
+/// Number of arms in the paper's trials.
 const N_PAPER_ARMS: usize = 2;
 
 impl Trials {
-    /// A table for each task.
+    /// Returns one table per task.
     #[must_use]
     pub fn tables(&self) -> Vec<Table> {
         self.groups.chunk_by(|a, b| a.task == b.task).map(task_table).collect()
     }
 
-    /// Every table, ready for a terminal.
+    /// Formats all tables for a terminal.
     #[must_use]
     pub fn text(&self) -> String {
         self.tables().iter().map(Table::text).collect::<Vec<_>>().join("\n")
     }
 }
 
-/// The table of the groups of one task. The paper's rows stand below trials that are like the paper's.
+/// Returns the table of the groups of one task. The paper's rows follow if a group has as many arms as the paper.
 fn task_table(groups: &[TrialGroup]) -> Table {
     let task_name = groups.first().map_or("", |group| &group.task);
     let has_others = groups.iter().any(|group| group.n_failed_by()[CAUSES.len()] > 0);
     let causes: Vec<&str> = CAUSES.into_iter().chain(has_others.then_some(OTHER_CAUSES)).collect();
-    let mut header = vec!["subject, mode", "success", "share [95 % interval]"];
+    let mut header = vec!["policy, mode", "success", "share [95 % interval]"];
     header.extend(&causes);
     header.push("median time");
     let mut table = Table::new(format!("{task_name}: trials, as the paper's Table 4"), &header);
-    table.lines.extend(groups.iter().map(|group| line(group, causes.len())));
+    table.rows.extend(groups.iter().map(|group| row(group, causes.len())));
     let task = Task::ALL.into_iter().find(|task| task.name() == task_name);
-    let like_the_papers = groups.iter().any(|group| n_arms(group) == N_PAPER_ARMS);
-    for task in task.into_iter().filter(|_| like_the_papers) {
-        table.lines.extend(TABLE_4.iter().map(|row| paper_line(row, task, causes.len())));
+    let has_paper_arms = groups.iter().any(|group| n_arms(group) == N_PAPER_ARMS);
+    for task in task.into_iter().filter(|_| has_paper_arms) {
+        table.rows.extend(TABLE_4.iter().map(|row| paper_row(row, task, causes.len())));
     }
     table
 }
 
-fn line(group: &TrialGroup, n_causes: usize) -> Vec<String> {
-    let mut line = vec![group.label()];
-    line.extend(success_cells(group.n_successes(), group.rows.len()));
-    line.extend(group.n_failed_by().iter().take(n_causes).map(usize::to_string));
-    line.push(optional(group.median_duration_s(), |duration_s| format!("{duration_s:.1} s")));
-    line
+fn row(group: &TrialGroup, n_causes: usize) -> Vec<String> {
+    let mut row = vec![group.label()];
+    row.extend(success_cells(group.n_successes(), group.rows.len()));
+    row.extend(group.n_failed_by().iter().take(n_causes).map(usize::to_string));
+    row.push(optional(group.median_duration_s(), |duration_s| format!("{duration_s:.1} s")));
+    row
 }
 
-fn paper_line(row: &PaperTrials, task: Task, n_causes: usize) -> Vec<String> {
-    let mut line = vec![format!("the paper, {}", row.name)];
-    line.extend(success_cells(row.n_successes(task), N_PAPER_TRIALS));
-    line.extend((0..=n_causes).map(|_| NONE.to_owned()));
-    line
+fn paper_row(paper: &PaperTrials, task: Task, n_causes: usize) -> Vec<String> {
+    let mut row = vec![format!("the paper, {}", paper.name)];
+    row.extend(success_cells(paper.n_successes(task), N_PAPER_TRIALS));
+    row.extend((0..=n_causes).map(|_| NONE.to_owned()));
+    row
 }
 
 fn success_cells(n_successes: usize, n_trials: usize) -> [String; 2] {

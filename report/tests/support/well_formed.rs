@@ -1,4 +1,4 @@
-//! A minimal look at the form of XML.
+//! A minimal check of XML.
 
 /// Fails unless every tag is closed by its own, `&` begins an entity, and no number is NaN or infinite.
 pub(crate) fn assert_well_formed(xml: &str) {

@@ -14,7 +14,7 @@ fn small(change: impl FnOnce(&mut DdpgConfig)) -> DdpgConfig {
         n_hidden_layers: 2,
         batch_size: 5,
         action_penalty: 0.0,
-        cloning_weight: 0.0,
+        bc_weight: 0.0,
         ..DdpgConfig::default()
     };
     change(&mut config);
@@ -28,7 +28,7 @@ fn random_batch(n_heads: usize, batch_size: usize, number: u64) -> Batch {
         *x = uniform(&mut rng, -1.0, 1.0);
     }
     batch.rewards.fill_with(|| if index(&mut rng, 2) == 0 { -1.0 } else { 0.0 });
-    for row in batch.cloned.chunks_exact_mut(LAYOUT.n_action()) {
+    for row in batch.bc_mask.chunks_exact_mut(LAYOUT.n_action()) {
         row.fill(if index(&mut rng, 2) == 0 { 1.0 } else { 0.0 });
     }
     batch
@@ -92,9 +92,9 @@ fn actor_loss(ddpg: &Ddpg, actor: &[f64], batch: &Batch) -> f64 {
         loss -= q.iter().sum::<f64>() / b;
         for (i, action) in action.iter().enumerate() {
             loss += f64::from(config.action_penalty) * action * action / (b * 3.0);
-            if batch.cloned[row * 3 + i] > 0.0 {
+            if batch.bc_mask[row * 3 + i] > 0.0 {
                 let error = action - f64::from(batch.actions[row * 3 + i]);
-                loss += f64::from(config.cloning_weight) * error * error / b;
+                loss += f64::from(config.bc_weight) * error * error / b;
             }
         }
     }
@@ -137,8 +137,8 @@ fn both_gradients_agree_with_finite_differences() {
     check(1, |_| {});
     check(2, |_| {});
     check(1, |config| config.action_penalty = 3.0);
-    check(1, |config| config.cloning_weight = 4.0);
-    check(2, |config| (config.action_penalty, config.cloning_weight) = (0.5, 2.0));
+    check(1, |config| config.bc_weight = 4.0);
+    check(2, |config| (config.action_penalty, config.bc_weight) = (0.5, 2.0));
 }
 
 #[test]
@@ -260,11 +260,11 @@ fn numbers_that_are_not_finite_stop_the_learner() {
 fn settings_out_of_range_are_named() {
     assert_eq!(DdpgConfig::default().check(), Ok(()));
     let check = |change: fn(&mut DdpgConfig), key| {
-        assert_eq!(small(change).check().map_err(|(key, _, _)| key), Err(key));
+        assert_eq!(small(change).check().map_err(|error| error.key), Err(key));
     };
     check(|config| config.discount = 1.0, "ddpg.discount");
     check(|config| config.polyak_keep = f32::NAN, "ddpg.polyak_keep");
-    check(|config| config.cloning_weight = -1.0, "ddpg.cloning_weight");
+    check(|config| config.bc_weight = -1.0, "ddpg.bc_weight");
     check(|config| config.action_penalty = f32::INFINITY, "ddpg.action_penalty");
     check(|config| config.actor_learning_rate = 0.0, "ddpg.actor_learning_rate");
     check(|config| config.cooldown_share = 1.5, "ddpg.cooldown_share");

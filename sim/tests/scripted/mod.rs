@@ -1,41 +1,41 @@
-//! Controllers by rule, which see what a policy sees: one arm's 28 numbers and its goal, in the arm's own frame.
+//! Scripted controllers with the inputs of a policy: one arm's 28 numbers and its goal, in the arm's frame.
 
 use tandem_core::layout::EPISODE_STEPS;
-use tandem_core::reward::{REWARD_ACHIEVED, achieved_goal, distance, sparse_reward};
-use tandem_core::{ArmIndex, Contacts, Layout, Stream, Task, episode_rng};
-use tandem_sim::{Env, Starts, WorldConfig};
+use tandem_core::reward::{achieved_goal, distance, is_success};
+use tandem_core::{ArmIndex, Contacts, Layout, Stream, Task, WorldSettings, episode_rng};
+use tandem_sim::{Env, WorldConfig};
 
-/// Metres that an action of 1 asks for.
+/// Displacement for an action of 1, metres.
 const ACTION_M: f32 = 0.05;
 
-/// How one scripted episode went.
+/// The outcome of a scripted episode.
 pub(crate) struct Played {
-    /// Every object within the tolerance of its goal at the end.
+    /// Every object is within the tolerance of its goal at the end.
     pub(crate) success: bool,
     /// Largest distance of an object from its goal at the end, metres.
     pub(crate) miss_m: f32,
-    /// Everything that touched during the episode.
+    /// Contacts during the episode.
     pub(crate) contacts: Contacts,
 }
 
-/// Plays `n_episodes` with one controller an arm, the controllers blind to each other.
+/// Plays `n_episodes` with one controller per arm; controllers do not observe each other.
 pub(crate) fn play(layout: Layout, config: &WorldConfig, n_episodes: u64) -> Vec<Played> {
     let mut env = Env::new(layout, config).expect("a valid world");
     let mut observation = vec![0.0; layout.n_observation()];
     let mut action = vec![0.0; layout.n_action()];
     (0..n_episodes)
         .map(|episode| {
-            env.reset(&mut episode_rng(11, episode, Stream::Reset), Starts::default());
+            env.reset(&mut episode_rng(11, episode, Stream::Reset), WorldSettings::default());
             let mut controllers = vec![Controller::new(layout.task); layout.n_arms];
             let mut contacts = Contacts::NONE;
             for _ in 0..EPISODE_STEPS {
                 env.observe(&mut observation);
                 for (arm, controller) in layout.arms().zip(&mut controllers) {
-                    let (seen, goal) = (
+                    let (observation, goal) = (
                         &observation[layout.observation_of(arm)],
                         &env.goal()[layout.goal_of(arm)],
                     );
-                    let inputs = controller.act(seen, goal);
+                    let inputs = controller.act(observation, goal);
                     let part = &mut action[layout.action_of(arm)];
                     part.copy_from_slice(&inputs[..part.len()]);
                 }
@@ -47,7 +47,7 @@ pub(crate) fn play(layout: Layout, config: &WorldConfig, n_episodes: u64) -> Vec
         .collect()
 }
 
-/// Share of successes.
+/// Fraction of successful episodes.
 pub(crate) fn success_rate(episodes: &[Played]) -> f64 {
     let n_successes = u32::try_from(episodes.iter().filter(|played| played.success).count())
         .expect("few episodes");
@@ -58,24 +58,24 @@ fn outcome(layout: Layout, observation: &[f32], goal: &[f32], contacts: Contacts
     let achieved: Vec<f32> = achieved_goal(layout, observation).collect();
     let of = |arm: ArmIndex| (&achieved[layout.goal_of(arm)], &goal[layout.goal_of(arm)]);
     Played {
-        success: layout.arms().all(|arm| sparse_reward(of(arm).0, of(arm).1) == REWARD_ACHIEVED),
+        success: is_success(layout, observation, goal),
         miss_m: layout.arms().map(|arm| distance(of(arm).0, of(arm).1)).fold(0.0, f32::max),
         contacts,
     }
 }
 
-/// What an arm is busy with.
+/// The phase of a controller.
 #[derive(Clone, Copy)]
 enum Phase {
     /// Pick: moving above the object. Push: moving behind it.
     Approach,
     /// Pick: moving down to it.
     Descend,
-    /// Pick: closing on it, for so many steps already.
+    /// Pick: closing the gripper on it, for this number of steps so far.
     Grasp(u32),
     /// Pick: bringing it to the goal. Push: pushing it there.
     Bring,
-    /// Push: leaving it, to start again or to rest.
+    /// Push: moving away from it, to start again or to rest.
     Leave,
 }
 
@@ -94,9 +94,9 @@ impl Controller {
     }
 
     /// Three displacements and the gripper's input.
-    pub(crate) fn act(&mut self, seen: &[f32], goal: &[f32]) -> [f32; 4] {
-        let hand = [seen[0], seen[1], seen[2]];
-        let object = [seen[3], seen[4], seen[5]];
+    pub(crate) fn act(&mut self, observation: &[f32], goal: &[f32]) -> [f32; 4] {
+        let hand = [observation[0], observation[1], observation[2]];
+        let object = [observation[3], observation[4], observation[5]];
         match self.task {
             Task::PickAndPlace => self.pick_and_place(hand, object, goal),
             Task::Push => self.push(hand, object, goal),
@@ -155,7 +155,7 @@ impl Controller {
                 towards(hand, [target(0), target(1), PUSH_Z_M], 1.3, 0.0)
             }
             Phase::Leave => self.leave(behind, distance_m),
-            _ => self.get_behind(hand, object, along, behind),
+            _ => self.move_behind(hand, object, along, behind),
         }
     }
 
@@ -170,8 +170,8 @@ impl Controller {
         [0.5 * behind[0] / away_m.max(1e-6), 0.5 * behind[1] / away_m.max(1e-6), 0.0, 0.0]
     }
 
-    /// Over the object, never through it, to 7 cm behind it as seen from the goal.
-    fn get_behind(
+    /// Moves over the object, never through it, to 7 cm behind it as seen from the goal.
+    fn move_behind(
         &mut self,
         hand: [f32; 3],
         object: [f32; 3],

@@ -3,9 +3,10 @@
 use std::fmt;
 use std::time::Duration;
 
+use tandem_system::process::{ProcessUsage, ResidentMemory, machine_busy_s};
+
 use super::Figure;
 use super::measures::{Bound, Load, knee, median_and_longest};
-use super::process::{Spent, machine_busy_s, resident_mib};
 
 const MB: f64 = 1e6;
 
@@ -49,14 +50,14 @@ pub(super) struct Percentiles {
 /// The clocks of processes at one moment.
 pub(super) struct Reading {
     at: Duration,
-    learner: Spent,
-    workers: Spent,
+    learner: ProcessUsage,
+    workers: ProcessUsage,
     machine_s: f64,
 }
 
 impl Reading {
     pub(super) fn take(at: Duration, learner: u32, workers: &[u32]) -> Self {
-        let (learner, workers) = (Spent::of(learner), Spent::of_all(workers));
+        let (learner, workers) = (ProcessUsage::of(learner), ProcessUsage::of_all(workers));
         Self { at, learner, workers, machine_s: machine_busy_s() }
     }
 }
@@ -86,7 +87,7 @@ impl Row {
         };
         let rounds_per_s = began.len().saturating_sub(1) as f64 / rounds_s;
         let (median, longest) = median_and_longest(began).unwrap_or_default();
-        let (resident_mib, peak_mib) = resident_mib(learner);
+        let memory = ResidentMemory::of(learner);
         Self {
             name,
             n_workers,
@@ -101,8 +102,8 @@ impl Row {
                 machine: (after.machine_s - before.machine_s) / span_s,
                 n_cores,
             },
-            resident_mib,
-            peak_mib,
+            resident_mib: memory.current_kib as f64 / 1024.0,
+            peak_mib: memory.peak_kib as f64 / 1024.0,
             median_round_s: median.as_secs_f64(),
             longest_round_s: longest.as_secs_f64(),
             calls: None,

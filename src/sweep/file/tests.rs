@@ -112,7 +112,7 @@ fn every_sweep_that_ships_is_valid() {
         ("sweep-recipe", 24),
         ("sweep-recipe-cooldown", 2),
         ("sweep-recipe-long", 10),
-        ("sweep-recipe-starts", 6),
+        ("sweep-recipe-starts", 4),
         ("sweep-recipe-teachers", 12),
         ("sweep-small", 8),
         ("sweep-students", 6),

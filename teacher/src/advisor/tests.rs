@@ -5,30 +5,33 @@ use crate::ledger::MemoryLedger;
 fn advisor(budget: u64, strategy: &str) -> Advisor {
     let mut advisor =
         Advisor::new(Box::new(FakePolicy), Box::new(MemoryLedger::default())).unwrap();
-    advisor.open_account("run", Terms { budget, strategy: strategy.parse().unwrap() }).unwrap();
+    advisor
+        .open_account("run", AccountTerms { budget, strategy: strategy.parse().unwrap() })
+        .unwrap();
     advisor
 }
 
-fn question(account: &str, queries: &[StepQuery]) -> Question {
-    Question { account: account.to_owned(), queries: queries.to_vec() }
+fn request(account: &str, queries: &[StepQuery]) -> AdviceRequest {
+    AdviceRequest { account: account.to_owned(), queries: queries.to_vec() }
 }
 
-/// The answer to one question.
+/// Answers one request.
 fn advise(advisor: &mut Advisor, account: &str, queries: &[StepQuery]) -> Result<Advice, Error> {
-    advisor.advise(&[question(account, queries)]).remove(0)
+    advisor.advise(&[request(account, queries)]).remove(0)
 }
 
 fn ask(advisor: &mut Advisor, query: &StepQuery) -> StepAdvice {
     advise(advisor, "run", std::slice::from_ref(query)).unwrap().steps.remove(0)
 }
 
-/// The teacher would act (0.5, 0, 0) and (0, 0.25, 0): importances 0.25 and 0.0625, distances 0.5 and 0.25.
+/// Returns a query for which the teacher's actions are (0.5, 0, 0) and (0, 0.25, 0), with importances 0.25 and 0.0625
+/// and distances 0.5 and 0.25.
 fn two_arms(step: u32) -> StepQuery {
     query(1, step, 0.5, 0.25)
 }
 
 #[test]
-fn each_strategy_overrides_the_arms_that_its_procedure_picks() {
+fn each_strategy_overrides_the_arms_that_its_procedure_selects() {
     let check = |strategy: &str, overridden_arms: u8, action: [f32; 6]| {
         let advice = ask(&mut advisor(10, strategy), &two_arms(0));
         assert_eq!(advice.overridden_arms(), overridden_arms, "{strategy}");
@@ -51,17 +54,17 @@ fn each_strategy_overrides_the_arms_that_its_procedure_picks() {
 }
 
 #[test]
-fn every_strategy_tells_what_the_teacher_thinks() {
+fn every_strategy_returns_the_scores() {
     for strategy in ["none", "ea", "eamc", "mc-q", "mc-act", "mc-act-abs"] {
         for budget in [0, 10] {
             let advice = ask(&mut advisor(budget, strategy), &two_arms(0));
-            let thoughts: Vec<_> = advice
+            let scores: Vec<_> = advice
                 .arms
                 .iter()
                 .map(|arm| (arm.q_teacher, arm.q_student, arm.importance, arm.distance))
                 .collect();
             assert_eq!(
-                thoughts,
+                scores,
                 [(0.0, -0.25, 0.25, 0.5), (0.0, -0.0625, 0.0625, 0.25)],
                 "{strategy}"
             );
@@ -71,7 +74,7 @@ fn every_strategy_tells_what_the_teacher_thinks() {
 }
 
 #[test]
-fn without_budget_the_students_action_comes_back_uncharged() {
+fn without_budget_the_students_action_is_returned_uncharged() {
     for strategy in ["none", "ea", "eamc", "mc-q", "mc-act", "mc-act-abs"] {
         let advice = ask(&mut advisor(0, strategy), &two_arms(0));
         assert_eq!((advice.charged, advice.overridden_arms()), (false, 0), "{strategy}");
@@ -80,7 +83,7 @@ fn without_budget_the_students_action_comes_back_uncharged() {
 }
 
 #[test]
-fn eamc_goes_over_to_mistake_correcting_at_half_of_the_budget() {
+fn eamc_switches_to_mistake_correcting_at_half_of_the_budget() {
     let mut advisor = advisor(4, "eamc:0.1");
     let overridden: Vec<(u8, bool)> = (0..7)
         .map(|step| {
@@ -148,7 +151,7 @@ fn a_refused_request_charges_nothing() {
     assert!(matches!(unknown, Err(Error::Ledger(LedgerError::Budget(_)))));
 }
 
-/// Values at NaN whatever lies beyond 0.9 on the first axis.
+/// A policy whose values are NaN beyond 0.9 on the first axis.
 struct Broken;
 
 impl TeacherPolicy for Broken {
@@ -173,18 +176,18 @@ impl TeacherPolicy for Broken {
 }
 
 #[test]
-fn a_question_that_is_refused_leaves_the_others_of_its_batch_alone() {
+fn a_refused_request_does_not_affect_the_others_of_its_batch() {
     let mut advisor = Advisor::new(Box::new(Broken), Box::new(MemoryLedger::default())).unwrap();
-    let terms = Terms { budget: 10, strategy: Strategy::EarlyAdvising };
+    let terms = AccountTerms { budget: 10, strategy: Strategy::EarlyAdvising };
     advisor.open_account("run", terms).unwrap();
     advisor.open_leases("run", &[2], 5).unwrap();
     let answers = advisor.advise(&[
-        question("run", &[two_arms(0), two_arms(1)]),
-        question("walk", &[two_arms(2)]),
-        question("run", &[two_arms(3), query(1, 4, 0.95, 0.0), two_arms(5)]),
-        question("run", &[two_arms(6), query(2, 50, 0.5, 0.5)]),
-        question("run", &[]),
-        question("run", &[two_arms(0), two_arms(7)]),
+        request("run", &[two_arms(0), two_arms(1)]),
+        request("walk", &[two_arms(2)]),
+        request("run", &[two_arms(3), query(1, 4, 0.95, 0.0), two_arms(5)]),
+        request("run", &[two_arms(6), query(2, 50, 0.5, 0.5)]),
+        request("run", &[]),
+        request("run", &[two_arms(0), two_arms(7)]),
     ]);
     let outcomes: Vec<_> = answers
         .iter()
@@ -197,7 +200,9 @@ fn a_question_that_is_refused_leaves_the_others_of_its_batch_alone() {
     let expected = [
         Ok((2, 3)),
         refused("unknown account \"walk\": open it first"),
-        refused("the teacher's networks gave a number that is not finite for step 4 of episode 1"),
+        refused(
+            "the teacher's networks returned a number that is not finite for step 4 of episode 1",
+        ),
         refused("steps[1].step: expected 0 to 49 in an episode that has a lease, got 50"),
         Ok((0, 2)),
         Ok((2, 2)),
@@ -206,20 +211,20 @@ fn a_question_that_is_refused_leaves_the_others_of_its_batch_alone() {
     assert_eq!(advisor.balance("run").unwrap().spent, 3, "steps 0, 1 and 7");
 }
 
-/// Questions of several accounts and sizes, some of them about the same steps.
-fn many_questions() -> Vec<Question> {
+/// Returns requests of several accounts and sizes, some of them for the same steps.
+fn many_requests() -> Vec<AdviceRequest> {
     let step = |number: u16| {
         let (x, y) = (f32::from(number % 7) / 10.0, f32::from(number % 5) / 10.0);
         query(u64::from(number % 3), u32::from(number / 2), x, y)
     };
     (0..120_u16)
         .map(|number| {
-            let account = ["run", "walk", "nobody"][usize::from(number % 17 % 3)];
+            let account = ["run", "walk", "unknown"][usize::from(number % 17 % 3)];
             let queries: Vec<StepQuery> =
                 (0..number % 4).map(|idx| step(3 * number + 5 * idx)).collect();
-            question(account, &queries)
+            request(account, &queries)
         })
-        .filter(|question| !question.queries.is_empty())
+        .filter(|request| !request.queries.is_empty())
         .collect()
 }
 
@@ -227,7 +232,7 @@ fn many_questions() -> Vec<Question> {
 fn questions_answered_together_get_what_they_would_get_one_by_one() {
     let fresh = || {
         let mut advisor = advisor(40, "eamc:0.05");
-        let terms = Terms { budget: 30, strategy: Strategy::MistakeAction { alpha: 0.3 } };
+        let terms = AccountTerms { budget: 30, strategy: Strategy::MistakeAction { alpha: 0.3 } };
         advisor.open_account("walk", terms).unwrap();
         advisor.open_leases("run", &[0, 1], 8).unwrap();
         advisor
@@ -235,17 +240,17 @@ fn questions_answered_together_get_what_they_would_get_one_by_one() {
     let shown = |answers: Vec<Result<Advice, Error>>| -> Vec<Result<Advice, String>> {
         answers.into_iter().map(|answer| answer.map_err(|error| error.to_string())).collect()
     };
-    let questions = many_questions();
+    let requests = many_requests();
     let mut alone = fresh();
     let one_by_one: Vec<_> = shown(
-        questions.iter().map(|one| alone.advise(std::slice::from_ref(one)).remove(0)).collect(),
+        requests.iter().map(|one| alone.advise(std::slice::from_ref(one)).remove(0)).collect(),
     );
     assert!(one_by_one.iter().flatten().any(|advice| advice.steps.iter().any(|s| s.charged)));
     assert!(one_by_one.iter().any(Result::is_err));
-    for batch_size in [2, 7, questions.len()] {
+    for batch_size in [2, 7, requests.len()] {
         let mut together = fresh();
         let answers =
-            questions.chunks(batch_size).flat_map(|batch| together.advise(batch)).collect();
+            requests.chunks(batch_size).flat_map(|batch| together.advise(batch)).collect();
         assert_eq!(shown(answers), one_by_one, "in batches of {batch_size}");
         for account in ["run", "walk"] {
             assert_eq!(together.balance(account).unwrap(), alone.balance(account).unwrap());
@@ -254,14 +259,14 @@ fn questions_answered_together_get_what_they_would_get_one_by_one() {
 }
 
 #[test]
-fn the_ledger_is_asked_for_an_accounts_terms_once() {
+fn the_strategy_of_an_account_is_cached() {
     let mut advisor = advisor(10, "ea");
     ask(&mut advisor, &two_arms(0));
     assert_eq!(advisor.strategies.get("run"), Some(&Strategy::EarlyAdvising));
-    for number in 0..MAX_REMEMBERED {
+    for number in 0..MAX_CACHED_STRATEGIES {
         advisor.strategies.insert(number.to_string(), Strategy::NoAdvice);
     }
-    let terms = Terms { budget: 10, strategy: Strategy::NoAdvice };
+    let terms = AccountTerms { budget: 10, strategy: Strategy::NoAdvice };
     advisor.open_account("walk", terms).unwrap();
     let advice = advise(&mut advisor, "walk", &[two_arms(0)]).unwrap();
     assert_eq!((advice.steps[0].charged, advisor.strategies.len()), (false, 1));

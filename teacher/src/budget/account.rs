@@ -1,164 +1,173 @@
-//! One account: what is left of its budget, for whom units are set aside, and which steps were charged.
-
-mod checksum;
-mod journal;
+//! One account: its budget, its leases and its verdicts.
 
 use std::collections::BTreeMap;
 
-use super::verdicts::{Verdicts, index};
-use super::{Balance, Half, Lease, Terms, Verdict, Wish};
-use journal::Journal;
+use super::transaction::{Changes, Transaction};
+use super::verdict_bits::{VerdictBits, VerdictIndex, charged_units};
+use super::{AccountTerms, Balance, BudgetHalf, Charge, Lease};
 
-pub(crate) use checksum::Checksum;
-pub(crate) use journal::{Changes, LeaseRecord};
-
-/// One budget and everything that was charged to it.
-#[derive(Debug, Clone)]
+/// A budget with its leases and the verdicts on all steps that were asked about.
+#[derive(Debug, Clone, PartialEq)]
 pub struct Account {
-    terms: Terms,
+    terms: AccountTerms,
     spent: u64,
     /// Unspent units of open leases.
     leased: u64,
-    leases: BTreeMap<u64, LeaseState>,
-    verdicts: Verdicts,
-    /// What was changed since somebody began to record it.
-    journal: Option<Box<Journal>>,
+    /// By episode.
+    leases: BTreeMap<u64, LeaseRecord>,
+    verdicts: BTreeMap<VerdictIndex, VerdictBits>,
 }
 
-/// A lease and what became of it.
+/// The lease of one episode, as ledgers store it. The units spent of it follow from the verdicts.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-struct LeaseState {
-    units: u32,
-    early_units: u32,
-    spent: u32,
-    settled: bool,
+pub(crate) struct LeaseRecord {
+    /// Units reserved.
+    pub(crate) units: u32,
+    /// The number of these units in the first half of the budget.
+    pub(crate) early_units: u32,
+    /// Units charged to the episode before it had the lease.
+    pub(crate) charged_before: u64,
+    /// Whether the unspent units were returned to the budget.
+    pub(crate) settled: bool,
+}
+
+/// The reason why stored records do not form an account.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+pub(crate) enum AccountError {
+    /// The units of a lease contradict the verdicts on its episode.
+    #[error("the lease of episode {0} does not fit its verdicts")]
+    Lease(u64),
+    /// A step is charged that was not asked about.
+    #[error("the verdicts on episode {0} contradict one another")]
+    Verdicts(u64),
+    /// More units are spent and leased than the budget has.
+    #[error("more than the budget is handed out")]
+    Overspent,
 }
 
 impl Account {
-    /// An account of which nothing is spent.
+    /// Creates an account with an unspent budget.
     #[must_use]
-    pub fn new(terms: Terms) -> Self {
-        Self {
-            terms,
-            spent: 0,
-            leased: 0,
-            leases: BTreeMap::new(),
-            verdicts: Verdicts::default(),
-            journal: None,
-        }
+    pub const fn new(terms: AccountTerms) -> Self {
+        Self { terms, spent: 0, leased: 0, leases: BTreeMap::new(), verdicts: BTreeMap::new() }
     }
 
-    /// What it was opened for.
+    /// Restores an account from its stored records.
+    ///
+    /// # Errors
+    /// When the records contradict one another.
+    pub(crate) fn restore(
+        terms: AccountTerms,
+        leases: &[(u64, LeaseRecord)],
+        verdicts: &[(VerdictIndex, VerdictBits)],
+    ) -> Result<Self, AccountError> {
+        let mut account = Self::new(terms);
+        for (index, bits) in verdicts {
+            if !bits.is_consistent() {
+                return Err(AccountError::Verdicts(index.0));
+            }
+            account.spent += bits.n_charged();
+            account.verdicts.insert(*index, *bits);
+        }
+        for (episode, lease) in leases {
+            let unspent = lease.unspent(account.charged_units(*episode));
+            let unspent = unspent.ok_or(AccountError::Lease(*episode))?;
+            account.leased += if lease.settled { 0 } else { u64::from(unspent) };
+            account.leases.insert(*episode, *lease);
+        }
+        if account.spent + account.leased > terms.budget {
+            return Err(AccountError::Overspent);
+        }
+        Ok(account)
+    }
+
+    /// Returns the budget and the strategy.
     #[must_use]
-    pub const fn terms(&self) -> Terms {
+    pub const fn terms(&self) -> AccountTerms {
         self.terms
     }
 
-    /// Units neither spent nor set aside.
+    /// Returns the units that are neither spent nor leased.
     #[must_use]
     pub const fn left(&self) -> u64 {
-        self.terms.budget - self.handed_out()
+        self.balance().left
     }
 
-    /// How the account stands.
+    /// Returns the state of the account.
     #[must_use]
     pub const fn balance(&self) -> Balance {
-        Balance { terms: self.terms, spent: self.spent, leased: self.leased, left: self.left() }
+        let Self { terms, spent, leased, .. } = *self;
+        Balance { terms, spent, leased, left: terms.budget - spent - leased }
     }
 
-    /// Whether units were ever set aside for `episode`.
-    #[must_use]
-    pub fn has_lease(&self, episode: u64) -> bool {
-        self.leases.contains_key(&episode)
-    }
-
-    /// Sets aside `units_per_episode`, or what is left, for each of `episodes` in turn.
+    /// Reserves `units_per_episode`, or the units that are left, for each of `episodes` in turn.
     ///
     /// An episode that has a lease, open or settled, keeps it.
     pub fn open_leases(&mut self, episodes: &[u64], units_per_episode: u32) -> Vec<Lease> {
-        episodes.iter().map(|episode| self.open_lease(*episode, units_per_episode)).collect()
-    }
-
-    fn open_lease(&mut self, episode: u64, max_units: u32) -> Lease {
-        self.note_lease(episode);
-        let (handed_out, left) = (self.handed_out(), self.left());
-        let lease = self.leases.entry(episode).or_insert_with(|| {
-            let units = at_most(max_units, left);
-            let early_units =
-                at_most(units, first_half(self.terms.budget).saturating_sub(handed_out));
-            self.leased += u64::from(units);
-            LeaseState { units, early_units, spent: 0, settled: false }
-        });
-        Lease { episode, units: lease.units, early_units: lease.early_units }
+        self.update(|transaction| transaction.open_leases(episodes, units_per_episode))
     }
 
     /// Returns the unspent units of `episodes` to the budget. Episodes without an open lease have none.
     pub fn settle(&mut self, episodes: &[u64]) {
-        for episode in episodes {
-            self.note_lease(*episode);
-            if let Some(lease) = self.leases.get_mut(episode).filter(|lease| !lease.settled) {
-                lease.settled = true;
-                self.leased -= u64::from(lease.units - lease.spent);
-            }
-        }
+        self.update(|transaction| transaction.settle(episodes));
     }
 
-    /// Decides whether step `step` of `episode` costs a unit: when it is worth the next one that the episode may
-    /// spend. Asked again, it gives the same verdict, whatever the wish, and charges nothing.
+    /// Decides whether a step costs a unit, and returns the half of the budget that the unit belongs to.
     ///
-    /// An episode with a lease spends its lease's units and, settled, none; one without spends what is left.
-    pub fn charge(&mut self, episode: u64, step: u32, wish: Wish) -> Verdict {
-        if let Some(verdict) = self.verdicts.get(episode, step) {
-            return verdict;
-        }
-        self.note_word(index(episode, step));
-        let verdict = match self.next_unit(episode) {
-            Some(half) if wish.covers(half) => {
-                self.spend_unit(episode);
-                Verdict::Charged(half)
-            }
-            _ => Verdict::Uncharged,
-        };
-        self.verdicts.insert(episode, step, verdict);
-        verdict
+    /// A step costs a unit if the episode has one to spend and the step is worth it. An episode with a lease spends the
+    /// units of its lease and, once settled, none; an episode without a lease spends units that are left. A repeated
+    /// request gets the same verdict, whatever it wants now, and charges nothing.
+    pub fn charge(&mut self, charge: Charge) -> Option<BudgetHalf> {
+        self.update(|transaction| transaction.charge(charge))
     }
 
-    /// The half of the next unit that `episode` may spend, when there is one: `n_b > 0` of every procedure.
-    fn next_unit(&self, episode: u64) -> Option<Half> {
-        let (available, early) = match self.leases.get(&episode) {
-            Some(lease) => {
-                (!lease.settled && lease.spent < lease.units, lease.spent < lease.early_units)
-            }
-            None => (self.left() > 0, self.handed_out() < first_half(self.terms.budget)),
-        };
-        available.then_some(if early { Half::First } else { Half::Second })
+    /// Runs `operate` in a transaction and applies its changes.
+    pub(crate) fn update<T>(&mut self, operate: impl FnOnce(&mut Transaction<'_>) -> T) -> T {
+        let mut transaction = self.begin();
+        let output = operate(&mut transaction);
+        let changes = transaction.into_changes();
+        self.apply(changes);
+        output
     }
 
-    /// `n_b ← n_b − 1`: the one place where a unit is spent. There is one, [`Self::next_unit`] found it.
-    fn spend_unit(&mut self, episode: u64) {
-        self.note_lease(episode);
-        if let Some(lease) = self.leases.get_mut(&episode) {
-            lease.spent += 1;
-            self.leased -= 1;
-        }
-        self.spent += 1;
+    /// Begins a transaction. Dropping it discards its changes.
+    pub(crate) const fn begin(&self) -> Transaction<'_> {
+        Transaction::new(self)
     }
 
-    /// Units spent or set aside; also the number of the next unit, counted from 0.
-    const fn handed_out(&self) -> u64 {
-        self.spent + self.leased
+    /// Applies the changes of a transaction on this account.
+    pub(crate) fn apply(&mut self, changes: Changes) {
+        let Changes { spent, leased, leases, verdicts } = changes;
+        (self.spent, self.leased) = (spent, leased);
+        self.leases.extend(leases);
+        self.verdicts.extend(verdicts);
+    }
+
+    /// Returns the lease of `episode`, open or settled.
+    pub(crate) fn lease(&self, episode: u64) -> Option<&LeaseRecord> {
+        self.leases.get(&episode)
+    }
+
+    /// Returns the verdicts at `index`, if one of its steps was asked about.
+    pub(crate) fn verdicts_at(&self, index: VerdictIndex) -> Option<&VerdictBits> {
+        self.verdicts.get(&index)
+    }
+
+    /// Returns all verdicts.
+    pub(crate) const fn verdicts(&self) -> &BTreeMap<VerdictIndex, VerdictBits> {
+        &self.verdicts
+    }
+
+    fn charged_units(&self, episode: u64) -> u64 {
+        charged_units(&self.verdicts, episode).map(|(_, units)| units).sum()
     }
 }
 
-/// How many units of `budget` are handed out while more than half of it is left.
-const fn first_half(budget: u64) -> u64 {
-    budget.div_ceil(2)
+impl LeaseRecord {
+    /// Returns the unspent units when `charged_units` were charged to the episode in all, or `None` if that contradicts
+    /// the lease.
+    pub(crate) fn unspent(&self, charged_units: u64) -> Option<u32> {
+        let spent = u32::try_from(charged_units.checked_sub(self.charged_before)?).ok()?;
+        self.units.checked_sub(spent).filter(|_| self.early_units <= self.units)
+    }
 }
-
-/// The smaller of `units` and `limit`.
-fn at_most(units: u32, limit: u64) -> u32 {
-    u32::try_from(limit).map_or(units, |limit| units.min(limit))
-}
-
-#[cfg(test)]
-mod tests;

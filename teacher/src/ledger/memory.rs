@@ -1,13 +1,14 @@
-//! Accounts that live as long as the process.
+//! A ledger in memory.
 
 use std::collections::BTreeMap;
 
 use super::{
-    Bill, Ledger, LedgerError, Receipt, charge_all, check_budget, check_terms, unknown_account,
+    ChargeRequest, ChargeResult, Ledger, LedgerError, charge_all, check_budget, check_terms,
+    unknown_account,
 };
-use crate::budget::{Account, Balance, Lease, Terms};
+use crate::budget::{Account, AccountTerms, Balance, Lease};
 
-/// Accounts in memory: forgotten when the process ends.
+/// A ledger in memory. Its accounts are lost when the process ends.
 #[derive(Debug, Clone, Default)]
 pub struct MemoryLedger {
     accounts: BTreeMap<String, Account>,
@@ -20,7 +21,7 @@ impl MemoryLedger {
 }
 
 impl Ledger for MemoryLedger {
-    fn open(&mut self, name: &str, terms: Terms) -> Result<Balance, LedgerError> {
+    fn open(&mut self, name: &str, terms: AccountTerms) -> Result<Balance, LedgerError> {
         check_budget(terms)?;
         let account = self.accounts.entry(name.to_owned()).or_insert_with(|| Account::new(terms));
         check_terms(name, account.terms(), terms)?;
@@ -47,29 +48,32 @@ impl Ledger for MemoryLedger {
         Ok(account.balance())
     }
 
-    fn charge(&mut self, bills: &[Bill]) -> Vec<Result<Receipt, LedgerError>> {
-        let charge = |bill: &Bill| charge_all(self.account(&bill.account)?, &bill.charges);
-        bills.iter().map(charge).collect()
+    fn charge(&mut self, requests: &[ChargeRequest]) -> Vec<Result<ChargeResult, LedgerError>> {
+        let charge = |request: &ChargeRequest| {
+            let account = self.account(&request.account)?;
+            account.update(|transaction| charge_all(transaction, &request.charges))
+        };
+        requests.iter().map(charge).collect()
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::budget::{MAX_BUDGET, Wish};
-    use crate::ledger::Charge;
+    use crate::budget::{Charge, MAX_BUDGET};
     use crate::strategy::Strategy;
 
-    const TERMS: Terms = Terms { budget: 10, strategy: Strategy::EarlyAdvising };
+    const TERMS: AccountTerms = AccountTerms { budget: 10, strategy: Strategy::EarlyAdvising };
 
     #[test]
     fn an_account_is_opened_once() {
         let mut ledger = MemoryLedger::default();
         let fresh = Balance { terms: TERMS, spent: 0, leased: 0, left: 10 };
         assert_eq!(ledger.open("run", TERMS).unwrap(), fresh);
-        let charge = Charge { episode: 1, step: 0, wish: Wish { first: true, second: true } };
-        let bill = Bill { account: "run".to_owned(), charges: vec![charge] };
-        assert_eq!(ledger.charge(&[bill]).remove(0).unwrap().left, 9);
+        let charge =
+            Charge { episode: 1, step: 0, wanted_in_first_half: true, wanted_in_second_half: true };
+        let request = ChargeRequest { account: "run".to_owned(), charges: vec![charge] };
+        assert_eq!(ledger.charge(&[request]).remove(0).unwrap().left, 9);
         assert_eq!(ledger.open("run", TERMS).unwrap(), Balance { spent: 1, left: 9, ..fresh });
     }
 
@@ -77,8 +81,9 @@ mod tests {
     fn other_terms_are_refused_with_both_named() {
         let mut ledger = MemoryLedger::default();
         ledger.open("run", TERMS).unwrap();
-        let asked = Terms { budget: 11, strategy: Strategy::MistakeQ { threshold: 0.05 } };
-        let message = ledger.open("run", asked).unwrap_err().to_string();
+        let requested =
+            AccountTerms { budget: 11, strategy: Strategy::MistakeQ { threshold: 0.05 } };
+        let message = ledger.open("run", requested).unwrap_err().to_string();
         let expected = "account \"run\" is open with budget 10 and strategy ea, not with budget 11 and strategy mc-q:0.05";
         assert_eq!(message, expected);
     }
@@ -86,8 +91,8 @@ mod tests {
     #[test]
     fn the_largest_budget_is_ten_to_the_twelve() {
         let mut ledger = MemoryLedger::default();
-        assert!(ledger.open("run", Terms { budget: MAX_BUDGET, ..TERMS }).is_ok());
-        let too_large = Terms { budget: MAX_BUDGET + 1, ..TERMS };
+        assert!(ledger.open("run", AccountTerms { budget: MAX_BUDGET, ..TERMS }).is_ok());
+        let too_large = AccountTerms { budget: MAX_BUDGET + 1, ..TERMS };
         let refused = ledger.open("more", too_large).unwrap_err().to_string();
         assert_eq!(refused, "budget: expected 0 to 1000000000000, got 1000000000001");
         let unknown = ledger.balance("more").unwrap_err().to_string();

@@ -1,28 +1,28 @@
-//! Accounts on a Redis server, where several teachers share them.
+//! A ledger on a Redis server, which several teachers can share.
 //!
-//! Nothing is kept here: every operation is a script that the server runs from beginning to end, and all keys of an
-//! account have one hash tag. [`crate::budget::Account`] says what the scripts in `redis/` do; the tests hold them to
-//! it. A script may be run again when its answer was lost.
+//! The process keeps no accounts: each operation is a script that the server runs atomically, and all keys of an
+//! account have one hash tag. [`crate::budget::Account`] defines the scripts in `redis/`; the tests compare them with
+//! it. A script may be run again if its reply was lost.
 //!
-//! What survives is the server's matter. With an append-only file a killed server loses next to nothing, and after a
-//! loss of power, or when a replica takes over, the last second may be missing (`appendfsync everysec`). What was
-//! forgotten is then as [`super::SqliteLedger`] says of charges. Without such a file everything since the last snapshot
-//! is lost, hence the warning.
+//! Durability depends on the server. With an append-only file a killed server loses next to nothing; a power cut or a
+//! failover to a replica may lose the last second (`appendfsync everysec`). The consequences are those that
+//! [`super::SqliteLedger`] documents for lost charges. Without an append-only file everything since the last snapshot
+//! is lost, and the ledger logs a warning.
 
 mod server;
 
 use super::{
-    Bill, Charge, Ledger, LedgerError, OpenError, Receipt, check_budget, check_terms,
-    is_beyond_episode, printable, unknown_account,
+    ChargeRequest, ChargeResult, Ledger, LedgerError, OpenError, check_budget, check_terms,
+    exceeds_episode, printable, unknown_account,
 };
-use crate::budget::{Balance, Half, Lease, Terms, Verdict};
+use crate::budget::{AccountTerms, Balance, BudgetHalf, Charge, Lease};
 use crate::strategy::UnknownStrategy;
 use server::{Call, Reply, Script, Server};
 
-/// Steps whose verdicts share a field.
+/// Steps whose verdicts share a field of the hash.
 const STEPS_PER_FIELD: u32 = 64;
 
-/// Accounts on a Redis server.
+/// A ledger on a Redis server.
 #[derive(Debug)]
 pub struct RedisLedger {
     server: Server,
@@ -32,22 +32,22 @@ impl RedisLedger {
     /// Connects to the server at `url`, `redis://[USER:PASSWORD@]HOST[:PORT][/DB]`.
     ///
     /// # Errors
-    /// When the URL is no such URL, or the server cannot be reached or does not let us in.
+    /// When the URL is invalid, or the server cannot be reached or refuses access.
     pub fn open(url: &str) -> Result<Self, OpenError> {
-        let mut server = Server::at(url)?;
+        let mut server = Server::new(url)?;
         let refused = |server: &Server, source: redis::RedisError| OpenError::Server {
             server: server.name().to_owned(),
             source: printable(&source.to_string()).into(),
         };
-        let survey = server.survey().map_err(|error| refused(&server, error))?;
-        tracing::info!(ledger = server.name(), accounts = survey.n_accounts, "ledger opened");
-        if !survey.appends {
+        let properties = server.properties().map_err(|error| refused(&server, error))?;
+        tracing::info!(ledger = server.name(), accounts = properties.n_accounts, "ledger opened");
+        if !properties.has_append_only_file {
             tracing::warn!(
                 ledger = server.name(),
-                "the server has no append-only file: what it is not asked to save is lost when it ends; see its setting appendonly"
+                "the server has no append-only file and loses all changes since its last snapshot when it ends; see its setting appendonly"
             );
         }
-        if survey.evicts {
+        if properties.evicts_keys {
             tracing::warn!(
                 ledger = server.name(),
                 "the server drops keys when its memory is full: set its maxmemory-policy to noeviction"
@@ -56,10 +56,10 @@ impl RedisLedger {
         Ok(Self { server })
     }
 
-    /// Makes one call.
+    /// Runs one script.
     fn call(&mut self, call: Call) -> Result<Reply, LedgerError> {
         let mut replies = self.calls(&[call])?;
-        replies.pop().ok_or_else(|| self.garbled("no reply"))
+        replies.pop().ok_or_else(|| self.invalid("no reply"))
     }
 
     fn calls(&mut self, calls: &[Call]) -> Result<Vec<Reply>, LedgerError> {
@@ -71,51 +71,55 @@ impl RedisLedger {
         LedgerError::Unavailable { what, source: Some(Box::new(error)) }
     }
 
-    /// What the reply says of account `name`.
+    /// Returns the balance of account `name` from a reply.
     fn balance_in(&self, name: &str, reply: &Reply) -> Result<Balance, LedgerError> {
         let [budget, strategy, spent, leased] = match reply.fields.as_slice() {
             [] => return Err(unknown_account(name)),
             [Some(budget), Some(strategy), Some(spent), Some(leased)] => {
                 [budget, strategy, spent, leased]
             }
-            _ => return Err(self.garbled("an account without a budget")),
+            _ => return Err(self.invalid("an account without a budget")),
         };
-        let units = |text: &String| text.parse::<u64>().map_err(|_not_a_number| self.garbled(text));
-        let strategy = strategy.parse().map_err(|error: UnknownStrategy| self.garbled(&error.0))?;
+        let units = |text: &String| text.parse::<u64>().map_err(|_not_a_number| self.invalid(text));
+        let strategy = strategy.parse().map_err(|error: UnknownStrategy| self.invalid(&error.0))?;
         let (budget, spent, leased) = (units(budget)?, units(spent)?, units(leased)?);
-        let handed_out = spent.checked_add(leased).and_then(|units| budget.checked_sub(units));
-        let left = handed_out.ok_or_else(|| self.garbled("more spent than the budget"))?;
-        Ok(Balance { terms: Terms { budget, strategy }, spent, leased, left })
+        let left = spent.checked_add(leased).and_then(|assigned| budget.checked_sub(assigned));
+        let left = left.ok_or_else(|| self.invalid("more spent than the budget"))?;
+        Ok(Balance { terms: AccountTerms { budget, strategy }, spent, leased, left })
     }
 
-    fn receipt(&self, bill: &Bill, reply: &Reply) -> Result<Receipt, LedgerError> {
-        let balance = self.balance_in(&bill.account, reply)?;
+    fn charge_result(
+        &self,
+        request: &ChargeRequest,
+        reply: &Reply,
+    ) -> Result<ChargeResult, LedgerError> {
+        let balance = self.balance_in(&request.account, reply)?;
         if let Some(charge_idx) = reply.refused.first() {
             let charge_idx = usize::try_from(*charge_idx).unwrap_or(usize::MAX);
             return Err(LedgerError::BeyondEnd { charge_idx });
         }
         let verdict = |number: &u64| match number {
-            0 => Ok(Verdict::Uncharged),
-            1 => Ok(Verdict::Charged(Half::First)),
-            2 => Ok(Verdict::Charged(Half::Second)),
-            _ => Err(self.garbled("a verdict that there is not")),
+            0 => Ok(None),
+            1 => Ok(Some(BudgetHalf::First)),
+            2 => Ok(Some(BudgetHalf::Second)),
+            _ => Err(self.invalid("an unknown verdict")),
         };
         let verdicts = reply.numbers.iter().map(verdict).collect::<Result<Vec<_>, _>>()?;
-        if verdicts.len() != bill.charges.len() {
-            return Err(self.garbled("not one verdict a charge"));
+        if verdicts.len() != request.charges.len() {
+            return Err(self.invalid("not one verdict for each charge"));
         }
-        Ok(Receipt { verdicts, left: balance.left })
+        Ok(ChargeResult { verdicts, left: balance.left })
     }
 
-    /// The server holds or says what no ledger has written.
-    fn garbled(&self, what: &str) -> LedgerError {
-        let what = format!("{} holds what is no ledger: {what:?}", self.server.name());
+    /// Returns the error for a reply or a value that no ledger writes.
+    fn invalid(&self, what: &str) -> LedgerError {
+        let what = format!("{} has invalid data: {what:?}", self.server.name());
         LedgerError::Unavailable { what, source: None }
     }
 }
 
 impl Ledger for RedisLedger {
-    fn open(&mut self, name: &str, terms: Terms) -> Result<Balance, LedgerError> {
+    fn open(&mut self, name: &str, terms: AccountTerms) -> Result<Balance, LedgerError> {
         check_budget(terms)?;
         let call = Call::new(Script::Open, name).arg(terms.budget).arg(terms.strategy);
         let reply = self.call(call)?;
@@ -140,7 +144,7 @@ impl Ledger for RedisLedger {
         let balance = self.balance_in(name, &reply)?;
         let units = reply.numbers.iter().map(|units| u32::try_from(*units));
         let units = units.collect::<Result<Vec<_>, _>>();
-        let units = units.map_err(|_too_large| self.garbled("a lease that is too large"))?;
+        let units = units.map_err(|_too_large| self.invalid("a lease that is too large"))?;
         let leases = episodes.iter().zip(units.as_chunks::<2>().0);
         let leases = leases.map(|(episode, [units, early_units])| Lease {
             episode: *episode,
@@ -149,7 +153,7 @@ impl Ledger for RedisLedger {
         });
         let leases: Vec<Lease> = leases.collect();
         if leases.len() != episodes.len() {
-            return Err(self.garbled("not one lease an episode"));
+            return Err(self.invalid("not one lease for each episode"));
         }
         Ok((leases, balance))
     }
@@ -159,32 +163,35 @@ impl Ledger for RedisLedger {
         self.balance_in(name, &reply)
     }
 
-    fn charge(&mut self, bills: &[Bill]) -> Vec<Result<Receipt, LedgerError>> {
-        let calls: Vec<Call> = bills.iter().map(charge_call).collect();
+    fn charge(&mut self, requests: &[ChargeRequest]) -> Vec<Result<ChargeResult, LedgerError>> {
+        let calls: Vec<Call> = requests.iter().map(charge_call).collect();
         match self.server.run(&calls) {
             Ok(replies) => {
-                let paid = bills.iter().zip(&replies);
-                paid.map(|(bill, reply)| self.receipt(bill, reply)).collect()
+                let answered = requests.iter().zip(&replies);
+                answered.map(|(request, reply)| self.charge_result(request, reply)).collect()
             }
             Err(error) => {
                 let failed = |_| Err(self.unavailable(error.clone()));
-                bills.iter().map(failed).collect()
+                requests.iter().map(failed).collect()
             }
         }
     }
 }
 
-/// See `redis/charge.lua`.
-fn charge_call(bill: &Bill) -> Call {
-    let mut call = Call::new(Script::Charge, &bill.account);
-    for Charge { episode, step, wish } in &bill.charges {
+/// Encodes the arguments of `redis/charge.lua`.
+fn charge_call(request: &ChargeRequest) -> Call {
+    let mut call = Call::new(Script::Charge, &request.account);
+    for charge in &request.charges {
+        let Charge { episode, step, .. } = charge;
         let digit = |yes: bool| if yes { '1' } else { '0' };
+        let first = digit(charge.wanted_in_first_half);
+        let second = digit(charge.wanted_in_second_half);
         call = call
             .arg(episode)
             .arg(format_args!("{episode}:{}", step / STEPS_PER_FIELD))
             .arg(step % STEPS_PER_FIELD + 1)
-            .arg(format_args!("{}{}", digit(wish.first), digit(wish.second)))
-            .arg(digit(is_beyond_episode(*step)));
+            .arg(format_args!("{first}{second}"))
+            .arg(digit(exceeds_episode(*step)));
     }
     call
 }

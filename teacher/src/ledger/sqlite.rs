@@ -1,115 +1,128 @@
-//! Accounts in a file that one process owns.
+//! The ledger in an SQLite file.
 //!
-//! The accounts are in memory and every change goes to the file before it is answered: all bills of one call in one
-//! transaction. When the file cannot be written, the accounts are put back to what they were.
-//!
-//! What survives: the end of the process at any moment (`kill -9`) loses nothing that was answered. A loss of power
-//! loses no account, lease or settlement that was answered, and no charge that was answered before one of those. Of
-//! the charges after that it may lose those of the last [`file::MAX_UNSYNCED`] transactions:
-//!
-//! - Episodes with a lease: nothing is lost for good. Their steps get the same verdicts when they are asked about
-//!   again, because a lease does not depend on what others spend.
-//! - Episodes without a lease: what was forgotten is charged anew when it is asked about again, and may then get
-//!   another verdict; if it is not asked about again, so much more than the budget is spent.
-//!
-//! The file can be read with the `sqlite3` tool while the teacher runs. It must not be changed, at any time: each
-//! account has a checksum over its rows, and a ledger with another one is refused as damaged.
-//!
-//! One process at a time has the file, by whichever path. The lock is on the file itself: other files, such as the
-//! `.lock` file that earlier versions left beside it, have no part in it. A file with several names (hard links) is
-//! refused. After every transaction the path must still lead to the file, else nothing more is charged.
+//! The accounts are in memory. An operation collects its [`Changes`], which are written to the file in one transaction,
+//! for all requests of a call together, and applied to the accounts once the file has them. If the file cannot be
+//! written, the changes are dropped, in the file and in memory.
 
+mod checksum;
 mod file;
-mod hold;
+mod file_lock;
+mod load;
 mod rows;
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 use std::path::Path;
+use std::sync::Arc;
 
 use super::{
-    Bill, Ledger, LedgerError, OpenError, Receipt, charge_all, check_budget, check_terms,
-    unknown_account,
+    ChargeRequest, ChargeResult, Ledger, LedgerError, OpenError, charge_all, check_budget,
+    check_terms, unknown_account,
 };
-use crate::budget::{Account, Balance, Checksum, Lease, Terms};
-use file::{AccountChanges, Durability, LedgerFile, StoredAccount, WriteError};
+use crate::budget::{Account, AccountTerms, Balance, Changes, Lease, Transaction};
+use checksum::Checksum;
+use file::{Durability, LedgerFile, WriteError};
 
-/// Accounts in an SQLite file.
+/// A ledger in an SQLite file that one process owns.
+///
+/// The end of the process at any moment (`kill -9`) loses no operation that has returned. A power cut loses no account,
+/// lease or settlement that was returned, and no charge that was returned before one of those. It may lose charges of
+/// the last 256 transactions after them:
+///
+/// - In episodes with a lease, a repeated request restores the lost charges with the same verdicts, because a lease
+///   does not depend on what other episodes spend.
+/// - In episodes without a lease, a repeated request charges the step anew and may get another verdict. If it is not
+///   repeated, the lost units are spent in addition to the budget.
+///
+/// The `sqlite3` tool can read the file while the teacher runs. No other program may change it: each account has a
+/// checksum over its rows, and a ledger whose checksum does not match is refused as damaged.
+///
+/// One process at a time can open the file, by any path. The lock is on the file itself; other files, such as the
+/// `.lock` file that earlier versions left beside it, are not used. A file with several names (hard links) is refused.
+/// Before and after each transaction the path must lead to the file; otherwise the ledger refuses all further charges.
 #[derive(Debug)]
 pub struct SqliteLedger {
     file: LedgerFile,
-    accounts: BTreeMap<String, Kept>,
-    /// Why the last transaction failed, if it did.
+    accounts: BTreeMap<String, StoredAccount>,
+    /// The reason why the last transaction failed, if it did.
     warning: Option<String>,
 }
 
-/// An account, and its number and checksum in the file.
+/// An account with the key and the checksum of its rows in the file.
 #[derive(Debug)]
-struct Kept {
+struct StoredAccount {
     id: i64,
     checksum: Checksum,
     account: Account,
 }
 
+/// The changes to one account, with its checksum after them.
+struct AccountUpdate<'a> {
+    name: &'a str,
+    id: i64,
+    changes: Changes,
+    checksum: Checksum,
+}
+
 impl SqliteLedger {
-    /// Opens the ledger in `path`, which is made when there is none, and keeps other processes from opening it.
+    /// Opens the ledger at `path`, which is created if it does not exist, and locks it against other processes.
     ///
     /// # Errors
-    /// When another process has it open, when it cannot be read or written, or is not a sound ledger of this version.
+    /// When another process has it open, when it cannot be read or written, or when it is not an undamaged ledger of a
+    /// known version.
     pub fn open(path: &Path) -> Result<Self, OpenError> {
         let (file, accounts) = LedgerFile::open(path)?;
         tracing::info!(ledger = ?path, accounts = accounts.len(), "ledger opened");
-        let accounts = accounts.into_iter().map(|stored| {
-            let StoredAccount { id, name, checksum, account } = stored;
-            (name, Kept { id, checksum, account })
-        });
-        Ok(Self { file, accounts: accounts.collect(), warning: None })
+        Ok(Self { file, accounts, warning: None })
     }
 
-    fn account(&mut self, name: &str) -> Result<&mut Account, LedgerError> {
-        let kept = self.accounts.get_mut(name).ok_or_else(|| unknown_account(name))?;
-        Ok(&mut kept.account)
+    fn stored(&self, name: &str) -> Result<&StoredAccount, LedgerError> {
+        self.accounts.get(name).ok_or_else(|| unknown_account(name))
     }
 
-    /// Writes what changed in the accounts called `names`; when that fails, nothing has changed.
-    fn commit(&mut self, names: &BTreeSet<&str>, durability: Durability) -> Result<(), WriteError> {
-        let accounts = &self.accounts;
-        let changed = names.iter().filter_map(|name| accounts.get(*name)).map(Kept::changes);
-        let changed: Vec<_> = changed.filter(|changed| !changed.changes.is_empty()).collect();
-        let written =
-            if changed.is_empty() { Ok(()) } else { self.file.write(&changed, durability) };
-        let checksums: BTreeMap<i64, Checksum> =
-            changed.iter().map(|changed| (changed.id, changed.checksum)).collect();
-        if !changed.is_empty() {
-            self.note(&written);
-        }
-        for name in names {
-            if let Some(kept) = self.accounts.get_mut(*name) {
-                match written {
-                    Ok(()) => kept.keep(checksums.get(&kept.id)),
-                    Err(_) => kept.account.undo(),
-                }
-            }
-        }
-        written
-    }
-
-    /// Changes account `name` and writes that down for good.
-    fn change<T>(
+    /// Runs `operate` on account `name` and makes its changes durable.
+    fn update<T>(
         &mut self,
         name: &str,
-        change: impl FnOnce(&mut Account) -> T,
-    ) -> Result<T, LedgerError> {
-        let account = self.account(name)?;
-        account.record();
-        let answer = change(account);
-        match self.commit(&BTreeSet::from([name]), Durability::PowerCut) {
-            Ok(()) => Ok(answer),
-            Err(error) => Err(self.unavailable(error)),
-        }
+        operate: impl FnOnce(&mut Transaction<'_>) -> T,
+    ) -> Result<(T, Balance), LedgerError> {
+        let mut transaction = self.stored(name)?.account.begin();
+        let output = operate(&mut transaction);
+        let changes = [(name, transaction.into_changes())];
+        let written = self.commit(changes, Durability::PowerCut);
+        written.map_err(|error| self.unavailable(error))?;
+        Ok((output, self.stored(name)?.account.balance()))
     }
 
-    /// Remembers whether the file could be written, and logs when that changes.
-    fn note<T>(&mut self, written: &Result<T, WriteError>) {
+    /// Writes changes to accounts, by name, and then applies them. If the file cannot be written, nothing has changed.
+    fn commit<'a>(
+        &mut self,
+        changes: impl IntoIterator<Item = (&'a str, Changes)>,
+        durability: Durability,
+    ) -> Result<(), WriteError> {
+        let changes = changes.into_iter().filter(|(_, changes)| !changes.is_empty());
+        let update = |(name, changes)| {
+            let StoredAccount { id, checksum, account } = self.accounts.get(name)?;
+            let checksum = checksum.after(account, &changes);
+            Some(AccountUpdate { name, id: *id, changes, checksum })
+        };
+        let updates: Vec<AccountUpdate<'_>> = changes.filter_map(update).collect();
+        if updates.is_empty() {
+            return Ok(());
+        }
+        let written = self.file.write(&updates, durability);
+        self.report(&written);
+        written?;
+        for AccountUpdate { name, changes, checksum, .. } in updates {
+            if let Some(stored) = self.accounts.get_mut(name) {
+                stored.account.apply(changes);
+                stored.checksum = checksum;
+            }
+        }
+        Ok(())
+    }
+
+    /// Stores the outcome of a transaction as the warning, and logs when it differs from the previous one.
+    fn report<T>(&mut self, written: &Result<T, WriteError>) {
         let path = self.file.path();
         let warning = written.as_ref().err().map(|error| format!("cannot write {path:?}: {error}"));
         match (&self.warning, &warning) {
@@ -126,40 +139,25 @@ impl SqliteLedger {
     }
 }
 
-impl Kept {
-    /// What has changed since the last transaction.
-    fn changes(&self) -> AccountChanges {
-        let changes = self.account.recorded();
-        let checksum = self.checksum + changes.checksum;
-        AccountChanges { id: self.id, changes, checksum }
-    }
-
-    /// Notes that the changes are written, and with which checksum.
-    fn keep(&mut self, written: Option<&Checksum>) {
-        self.account.keep();
-        self.checksum = written.copied().unwrap_or(self.checksum);
-    }
-}
-
 impl Ledger for SqliteLedger {
-    fn open(&mut self, name: &str, terms: Terms) -> Result<Balance, LedgerError> {
+    fn open(&mut self, name: &str, terms: AccountTerms) -> Result<Balance, LedgerError> {
         check_budget(terms)?;
-        if let Some(kept) = self.accounts.get(name) {
-            check_terms(name, kept.account.terms(), terms)?;
-            return Ok(kept.account.balance());
+        if let Some(stored) = self.accounts.get(name) {
+            check_terms(name, stored.account.terms(), terms)?;
+            return Ok(stored.account.balance());
         }
         let checksum = Checksum::of_terms(name, terms);
         let added = self.file.add_account(name, terms, checksum);
-        self.note(&added);
+        self.report(&added);
         let id = added.map_err(|error| self.unavailable(error))?;
         let account = Account::new(terms);
         let balance = account.balance();
-        self.accounts.insert(name.to_owned(), Kept { id, checksum, account });
+        self.accounts.insert(name.to_owned(), StoredAccount { id, checksum, account });
         Ok(balance)
     }
 
     fn balance(&mut self, name: &str) -> Result<Balance, LedgerError> {
-        Ok(self.account(name)?.balance())
+        Ok(self.stored(name)?.account.balance())
     }
 
     fn open_leases(
@@ -168,32 +166,32 @@ impl Ledger for SqliteLedger {
         episodes: &[u64],
         units_per_episode: u32,
     ) -> Result<(Vec<Lease>, Balance), LedgerError> {
-        self.change(name, |account| {
-            (account.open_leases(episodes, units_per_episode), account.balance())
-        })
+        self.update(name, |account| account.open_leases(episodes, units_per_episode))
     }
 
     fn settle(&mut self, name: &str, episodes: &[u64]) -> Result<Balance, LedgerError> {
-        self.change(name, |account| {
-            account.settle(episodes);
-            account.balance()
-        })
+        let ((), balance) = self.update(name, |account| account.settle(episodes))?;
+        Ok(balance)
     }
 
-    fn charge(&mut self, bills: &[Bill]) -> Vec<Result<Receipt, LedgerError>> {
-        let charge = |bill: &Bill| {
-            let account = self.account(&bill.account)?;
-            account.record();
-            charge_all(account, &bill.charges)
-        };
-        let outcomes: Vec<_> = bills.iter().map(charge).collect();
-        let names = bills.iter().map(|bill| bill.account.as_str()).collect();
-        let Err(error) = self.commit(&names, Durability::Kill) else { return outcomes };
-        let error = std::sync::Arc::new(error);
-        let failed = |outcome: Result<Receipt, LedgerError>| {
-            outcome.and_then(|_| Err(self.unavailable(std::sync::Arc::clone(&error))))
-        };
-        outcomes.into_iter().map(failed).collect()
+    fn charge(&mut self, requests: &[ChargeRequest]) -> Vec<Result<ChargeResult, LedgerError>> {
+        let mut transactions: BTreeMap<&str, Transaction<'_>> = BTreeMap::new();
+        let mut results = Vec::with_capacity(requests.len());
+        for ChargeRequest { account: name, charges } in requests {
+            results.push(self.stored(name).and_then(|stored| {
+                let transaction =
+                    transactions.entry(name.as_str()).or_insert_with(|| stored.account.begin());
+                charge_all(transaction, charges)
+            }));
+        }
+        let changes: Vec<(&str, Changes)> = transactions
+            .into_iter()
+            .map(|(name, transaction)| (name, transaction.into_changes()))
+            .collect();
+        let Err(error) = self.commit(changes, Durability::Kill) else { return results };
+        let error = Arc::new(error);
+        let unavailable = |_| Err(self.unavailable(Arc::clone(&error)));
+        results.into_iter().map(|result| result.and_then(unavailable)).collect()
     }
 
     fn warning(&self) -> Option<&str> {

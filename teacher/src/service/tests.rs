@@ -13,7 +13,7 @@ use tonic::transport::Channel;
 use tonic_health::pb::health_check_response::ServingStatus;
 use tonic_health::pb::health_client::HealthClient;
 
-use super::gated::{GatedLedger, Mode, Watch};
+use super::gated_ledger::{GateControl, GatedLedger, Mode};
 use super::*;
 use crate::fake::{FakePolicy, query};
 
@@ -25,11 +25,11 @@ async fn serve_open(
     serve_advisor(advisor, listener, &Gate::default(), shutdown, Pacing::Concurrent).await
 }
 
-/// A running service and a client of it.
+/// A running service and its client.
 struct Fixture {
     client: TeacherClient<Channel>,
     channel: Channel,
-    watch: Watch,
+    gate: GateControl,
     shutdown: CancellationToken,
     served: JoinHandle<Result<(), Error>>,
 }
@@ -39,12 +39,12 @@ impl Fixture {
         let listener = TcpListener::bind(SocketAddr::from(([127, 0, 0, 1], 0))).await.unwrap();
         let address = listener.local_addr().unwrap();
         let shutdown = CancellationToken::new();
-        let watch = Watch::new();
-        let ledger = Box::new(GatedLedger::new(watch.clone()));
+        let gate = GateControl::new();
+        let ledger = Box::new(GatedLedger::new(gate.clone()));
         let advisor = Advisor::new(Box::new(FakePolicy), ledger).unwrap();
         let served = tokio::spawn(serve_open(advisor, listener, shutdown.clone()));
         let channel = Channel::from_shared(format!("http://{address}")).unwrap().connect_lazy();
-        Self { client: TeacherClient::new(channel.clone()), channel, watch, shutdown, served }
+        Self { client: TeacherClient::new(channel.clone()), channel, gate, shutdown, served }
     }
 
     async fn open(&mut self, budget: u64, strategy: &str) -> Result<pb::Account, Status> {
@@ -61,7 +61,7 @@ impl Fixture {
         self.client.advise(request).await.map(Response::into_inner)
     }
 
-    /// A stream on which requests can be sent one after another.
+    /// Opens a stream, and returns a sender of requests and the answers.
     async fn stream(&mut self) -> (mpsc::Sender<pb::AdviseRequest>, Streaming<pb::AdviseResponse>) {
         let (sender, receiver) = mpsc::channel(8);
         let answers = self.client.advise_stream(ReceiverStream::new(receiver)).await.unwrap();
@@ -79,14 +79,14 @@ fn step(step: u32) -> pb::StepQuery {
     encode_query(&query(1, step, 0.5, 0.25))
 }
 
-/// A refusal's code and message.
+/// Returns the code and message of a refusal.
 fn refusal<T: std::fmt::Debug>(outcome: Result<T, Status>) -> (Code, String) {
     let status = outcome.unwrap_err();
     (status.code(), status.message().to_owned())
 }
 
 #[tokio::test]
-async fn it_describes_itself() {
+async fn describe_returns_layout_maps_strategies_and_digest() {
     let mut fixture = Fixture::start().await;
     let description = fixture.client.describe(pb::DescribeRequest {}).await.unwrap().into_inner();
     assert_eq!(description.task, "push");
@@ -110,7 +110,7 @@ async fn it_describes_itself() {
 }
 
 #[tokio::test]
-async fn it_reports_its_health() {
+async fn the_service_reports_its_health() {
     let fixture = Fixture::start().await;
     let mut health = HealthClient::new(fixture.channel.clone());
     for service in ["", "tandem.v1.Teacher"] {
@@ -208,7 +208,7 @@ async fn an_open_stream_does_not_keep_the_service_alive() {
 }
 
 #[tokio::test]
-async fn bad_requests_are_refused_by_name() {
+async fn invalid_requests_are_refused_by_field() {
     let mut fixture = Fixture::start().await;
     fixture.open(10, "ea").await.unwrap();
     let check = |outcome: Result<pb::AdviseResponse, Status>, expected: &str| {
@@ -253,7 +253,7 @@ async fn bad_requests_are_refused_by_name() {
 #[tokio::test]
 async fn an_unknown_account_is_not_found() {
     let mut fixture = Fixture::start().await;
-    let name = || "nobody".to_owned();
+    let name = || "unknown".to_owned();
     let got = fixture.client.get_account(pb::GetAccountRequest { name: name() }).await;
     assert_eq!(refusal(got).0, Code::NotFound);
     assert_eq!(refusal(fixture.advise(vec![step(0)]).await).0, Code::NotFound);
@@ -293,20 +293,20 @@ async fn a_round_leases_spends_and_settles() {
 }
 
 #[tokio::test]
-async fn a_request_under_way_is_answered_before_the_service_ends() {
+async fn a_pending_request_is_answered_before_the_service_ends() {
     let ask = || pb::AdviseRequest { account: "run".to_owned(), steps: vec![step(0)] };
     let held_up = async || {
         let mut fixture = Fixture::start().await;
         fixture.open(10, "ea").await.unwrap();
-        // The account's terms are known from here on; to charge is what blocks.
+        // The strategy is cached now, so only the charge blocks.
         assert_eq!(fixture.advise(Vec::new()).await.unwrap().budget_left, 10);
-        fixture.watch.set(Mode::Block);
+        fixture.gate.set(Mode::Block);
         fixture
     };
     let let_end = async |fixture: &Fixture| {
-        fixture.watch.visited(1).await;
+        fixture.gate.charge_called(1).await;
         fixture.shutdown.cancel();
-        fixture.watch.set(Mode::Answer);
+        fixture.gate.set(Mode::Answer);
     };
 
     let mut fixture = held_up().await;
@@ -326,7 +326,7 @@ async fn a_request_under_way_is_answered_before_the_service_ends() {
     fixture.stop().await;
 }
 
-/// Code and message of the refusal that each kind of call gets.
+/// Returns the code and message with which each kind of call is refused.
 async fn refusals(fixture: &mut Fixture) -> Vec<(Code, String)> {
     let (sender, mut answers) = fixture.stream().await;
     let ask = pb::AdviseRequest { account: "run".to_owned(), steps: vec![step(0)] };
@@ -347,18 +347,18 @@ async fn refusals(fixture: &mut Fixture) -> Vec<(Code, String)> {
 }
 
 #[tokio::test]
-async fn a_ledger_that_cannot_be_used_is_unavailable_for_every_call_and_only_so_long() {
+async fn every_call_is_unavailable_while_the_ledger_is() {
     let mut fixture = Fixture::start().await;
     fixture.open(10, "ea").await.unwrap();
     for (mode, message) in [
         (Mode::Refuse, "the ledger cannot be used now: the disk is full"),
         (Mode::Block, "no answer within 4s: ask again"),
     ] {
-        fixture.watch.set(mode);
+        fixture.gate.set(mode);
         let expected = (Code::Unavailable, message.to_owned());
         assert_eq!(refusals(&mut fixture).await, vec![expected; 5]);
         fixture.client.describe(pb::DescribeRequest {}).await.unwrap();
-        fixture.watch.set(Mode::Answer);
+        fixture.gate.set(Mode::Answer);
         assert!(fixture.advise(vec![step(0)]).await.unwrap().steps[0].charged);
     }
     assert_eq!(fixture.open(10, "ea").await.unwrap().spent, 1);
@@ -370,13 +370,13 @@ async fn a_panic_is_an_internal_error_and_ends_the_service() {
     let mut fixture = Fixture::start().await;
     fixture.open(10, "ea").await.unwrap();
     let (sender, mut answers) = fixture.stream().await;
-    fixture.watch.set(Mode::Panic);
+    fixture.gate.set(Mode::Panic);
     let ask = pb::AdviseRequest { account: "run".to_owned(), steps: vec![step(0)] };
     sender.send(ask).await.unwrap();
     let (code, message) = refusal(answers.message().await);
     assert_eq!(
         (code, message.as_str()),
-        (Code::Internal, "the teacher has a bug and ends: its log says more")
+        (Code::Internal, "the teacher has a bug and ends: see its log")
     );
     let Fixture { client, channel, served, .. } = fixture;
     drop((client, channel, sender, answers));

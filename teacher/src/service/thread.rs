@@ -1,95 +1,95 @@
-//! The thread that owns the networks and the ledger, and how calls reach it. Under [`Pacing::Lockstep`] it is a task.
+//! The thread that owns the networks and the ledger, and its job queue. Under [`Pacing::Lockstep`] it is a task.
 
 use std::io;
 use std::sync::Arc;
-use std::thread::JoinHandle;
+use std::thread;
 use std::time::Duration;
 
 use tandem_net::Pacing;
 use tokio::sync::{mpsc, oneshot};
 use tokio_util::sync::{CancellationToken, DropGuard};
 
-use crate::advisor::{Advice, Advisor, Profile, Question};
+use crate::advisor::{Advice, AdviceRequest, Advisor, TeacherInfo};
 use crate::error::Error;
 
-/// Jobs that wait for the thread; further ones wait with their callers, one for each open call.
-const CAPACITY: usize = 256;
-/// Once it has so many steps to answer, the thread takes no further question before it answers.
+/// The capacity of the job queue. When it is full, calls wait to enqueue their jobs.
+const QUEUE_CAPACITY: usize = 256;
+/// The number of steps at which a batch takes no further request.
 const MAX_BATCH_STEPS: usize = 256;
 
 type Answer<T> = Result<T, Error>;
 
-/// What the thread is asked to do.
+/// A job for the thread.
 enum Job {
-    /// Answer a question, together with others.
-    Advise(Question, oneshot::Sender<Answer<Advice>>),
-    /// Anything else, by itself.
+    /// Answer a request for advice, in a batch with others.
+    Advise(AdviceRequest, oneshot::Sender<Answer<Advice>>),
+    /// Run any other operation.
     Run(Box<dyn FnOnce(&mut Advisor) + Send>),
 }
 
-/// A running thread.
+/// The running thread or task.
 pub(super) struct AdvisorThread {
-    place: Place,
+    handle: JoinHandle,
     ended: oneshot::Receiver<()>,
 }
 
-/// Where the advisor's jobs are done.
-enum Place {
-    Thread(JoinHandle<()>),
+/// The handle of the thread, or of the task under [`Pacing::Lockstep`].
+enum JoinHandle {
+    Thread(thread::JoinHandle<()>),
     Task(tokio::task::JoinHandle<()>),
 }
 
-/// Reaches the thread. It ends once nobody holds one of these any more.
+/// Sends jobs to the thread, which ends when all handles are dropped.
 #[derive(Clone)]
 pub(super) struct AdvisorHandle {
-    profile: Arc<Profile>,
+    info: Arc<TeacherInfo>,
     jobs: mpsc::Sender<Job>,
-    patience: Duration,
+    timeout: Duration,
 }
 
-/// Lets others know that the thread has ended, whichever way.
-struct Ending {
+/// Signals the end of the thread when it is dropped, also after a panic.
+struct EndSignal {
     _stop: DropGuard,
     _ended: oneshot::Sender<()>,
 }
 
 impl AdvisorThread {
-    /// Moves `advisor` to a thread of its own. Calls wait for it no longer than `patience`; when it ends, `stop` is
+    /// Moves `advisor` to its own thread or task. A call to it fails after `timeout`. When the thread ends, `stop` is
     /// cancelled.
     pub(super) fn spawn(
         advisor: Advisor,
-        patience: Duration,
+        timeout: Duration,
         stop: CancellationToken,
         pacing: Pacing,
     ) -> io::Result<(Self, AdvisorHandle)> {
-        let (jobs, waiting) = mpsc::channel(CAPACITY);
-        let (ending, ended) = oneshot::channel();
-        let profile = Arc::new(advisor.profile().clone());
-        let ending = Ending { _stop: stop.drop_guard(), _ended: ending };
-        let place = match pacing {
-            Pacing::Concurrent => Place::Thread(
-                std::thread::Builder::new().name("advisor".to_owned()).spawn(move || {
-                    let _ending = ending;
-                    work(advisor, waiting);
+        let (jobs, queue) = mpsc::channel(QUEUE_CAPACITY);
+        let (end_sender, ended) = oneshot::channel();
+        let info = Arc::new(advisor.info().clone());
+        let end_signal = EndSignal { _stop: stop.drop_guard(), _ended: end_sender };
+        let handle = match pacing {
+            Pacing::Concurrent => JoinHandle::Thread(
+                thread::Builder::new().name("advisor".to_owned()).spawn(move || {
+                    let _end_signal = end_signal;
+                    run_thread(advisor, queue);
                 })?,
             ),
-            Pacing::Lockstep => Place::Task(tokio::spawn(async move {
-                let _ending = ending;
-                work_as_a_task(advisor, waiting).await;
+            Pacing::Lockstep => JoinHandle::Task(tokio::spawn(async move {
+                let _end_signal = end_signal;
+                run_task(advisor, queue).await;
             })),
         };
-        Ok((Self { place, ended }, AdvisorHandle { profile, jobs, patience }))
+        Ok((Self { handle, ended }, AdvisorHandle { info, jobs, timeout }))
     }
 
-    /// Waits for the thread's end, no longer than `grace`; a thread that is still asked or stuck is left to itself.
+    /// Waits up to `grace` for the end of the thread. A thread that is still busy then is detached.
     ///
     /// # Errors
-    /// When it has panicked.
+    /// When the thread has panicked.
     pub(super) async fn join(self, grace: Duration) -> Result<(), Error> {
         match tokio::time::timeout(grace, self.ended).await {
-            Ok(_ended) => match self.place {
-                Place::Thread(thread) => thread.join().map_err(|_panic| Error::Panicked),
-                Place::Task(task) => task.await.map_err(|_panic| Error::Panicked),
+            Ok(_ended) => match self.handle {
+                JoinHandle::Thread(thread) => thread.join().map_err(|_panic| Error::Panicked),
+                JoinHandle::Task(task) => task.await.map_err(|_panic| Error::Panicked),
             },
             Err(_elapsed) => {
                 tracing::warn!("the ledger is still in use after the grace period");
@@ -100,18 +100,19 @@ impl AdvisorThread {
 }
 
 impl AdvisorHandle {
-    /// What the teacher tells of itself.
-    pub(super) fn profile(&self) -> &Profile {
-        &self.profile
+    /// Returns the description of the teacher.
+    pub(super) fn info(&self) -> &TeacherInfo {
+        &self.info
     }
 
-    /// The answer to `question`. Whoever drops the future before the thread has come to it charges nothing.
-    pub(super) async fn advise(&self, question: Question) -> Answer<Advice> {
+    /// Answers a request for advice. If the future is dropped before the thread has taken the request, nothing is
+    /// charged.
+    pub(super) async fn advise(&self, request: AdviceRequest) -> Answer<Advice> {
         let (reply, answer) = oneshot::channel();
-        self.ask(Job::Advise(question, reply), answer).await
+        self.send(Job::Advise(request, reply), answer).await
     }
 
-    /// What `work` gives, done in its turn.
+    /// Runs `work` on the thread, after the jobs before it.
     pub(super) async fn run<T: Send + 'static>(
         &self,
         work: impl FnOnce(&mut Advisor) -> Answer<T> + Send + 'static,
@@ -122,22 +123,22 @@ impl AdvisorHandle {
                 drop(reply.send(work(advisor)));
             }
         };
-        self.ask(Job::Run(Box::new(work)), answer).await
+        self.send(Job::Run(Box::new(work)), answer).await
     }
 
-    /// Hands in `job` and waits for its answer. The thread drops a job unanswered only when it panics.
-    async fn ask<T>(&self, job: Job, answer: oneshot::Receiver<Answer<T>>) -> Answer<T> {
-        let asked = async {
+    /// Enqueues `job` and waits for its answer. The thread drops a job unanswered only when it panics.
+    async fn send<T>(&self, job: Job, answer: oneshot::Receiver<Answer<T>>) -> Answer<T> {
+        let answered = async {
             self.jobs.send(job).await.map_err(|_unsent| Error::Panicked)?;
             answer.await.map_err(|_dropped| Error::Panicked)?
         };
-        let overdue = |_elapsed| Err(Error::Overdue(self.patience));
-        tokio::time::timeout(self.patience, asked).await.unwrap_or_else(overdue)
+        let timed_out = |_elapsed| Err(Error::Timeout(self.timeout));
+        tokio::time::timeout(self.timeout, answered).await.unwrap_or_else(timed_out)
     }
 }
 
-/// Does the jobs in their order: questions that wait together are answered together.
-fn work(mut advisor: Advisor, mut jobs: mpsc::Receiver<Job>) {
+/// Executes jobs in their order. Requests that wait together are answered in one batch.
+fn run_thread(mut advisor: Advisor, mut jobs: mpsc::Receiver<Job>) {
     let mut batch = Batch::default();
     while let Some(job) = jobs.blocking_recv() {
         batch.take_all(job, &mut jobs, &mut advisor);
@@ -145,8 +146,8 @@ fn work(mut advisor: Advisor, mut jobs: mpsc::Receiver<Job>) {
     }
 }
 
-/// [`work`] on the runtime of the calls: questions that arrive at one simulated moment are answered together.
-async fn work_as_a_task(mut advisor: Advisor, mut jobs: mpsc::Receiver<Job>) {
+/// As [`run_thread`], on the runtime of the calls: requests of one simulated moment are answered in one batch.
+async fn run_task(mut advisor: Advisor, mut jobs: mpsc::Receiver<Job>) {
     let mut batch = Batch::default();
     while let Some(job) = jobs.recv().await {
         batch.take_all(job, &mut jobs, &mut advisor);
@@ -154,16 +155,16 @@ async fn work_as_a_task(mut advisor: Advisor, mut jobs: mpsc::Receiver<Job>) {
     }
 }
 
-/// Questions that are answered together.
+/// Requests that are answered together.
 #[derive(Default)]
 struct Batch {
-    questions: Vec<Question>,
+    requests: Vec<AdviceRequest>,
     replies: Vec<oneshot::Sender<Answer<Advice>>>,
     n_steps: usize,
 }
 
 impl Batch {
-    /// Takes `job` and those that wait behind it, as many as are answered together.
+    /// Takes `job` and the jobs behind it until the batch is full or the queue is empty.
     fn take_all(&mut self, job: Job, jobs: &mut mpsc::Receiver<Job>, advisor: &mut Advisor) {
         self.take(job, advisor);
         while self.n_steps < MAX_BATCH_STEPS
@@ -173,14 +174,13 @@ impl Batch {
         }
     }
 
-    /// Adds a question, unless nobody waits for its answer any more. Anything else is done after the questions that
-    /// came before it.
+    /// Adds a request, unless its caller has gone. Any other job runs after the requests before it are answered.
     fn take(&mut self, job: Job, advisor: &mut Advisor) {
         match job {
             Job::Advise(_, reply) if reply.is_closed() => {}
-            Job::Advise(question, reply) => {
-                self.n_steps += question.queries.len();
-                self.questions.push(question);
+            Job::Advise(request, reply) => {
+                self.n_steps += request.queries.len();
+                self.requests.push(request);
                 self.replies.push(reply);
             }
             Job::Run(work) => {
@@ -191,14 +191,14 @@ impl Batch {
     }
 
     fn answer(&mut self, advisor: &mut Advisor) {
-        if self.questions.is_empty() {
+        if self.requests.is_empty() {
             return;
         }
-        let answers = advisor.advise(&self.questions);
-        self.questions.clear();
+        let answers = advisor.advise(&self.requests);
+        self.requests.clear();
         self.n_steps = 0;
         for (reply, answer) in self.replies.drain(..).zip(answers) {
-            // Whoever has gone asks again and gets the same verdicts.
+            // A caller that has gone repeats its request and gets the same verdicts.
             drop(reply.send(answer));
         }
     }

@@ -1,19 +1,19 @@
-//! A process that ends at any moment: what was answered is there, and nothing is charged twice.
+//! The end of the process at any moment: every answered operation survives, and nothing is charged twice.
 
 use std::fs;
 use std::path::Path;
 
-use tandem_teacher::budget::{Lease, Verdict, Wish};
-use tandem_teacher::ledger::{Charge, Ledger as _, SqliteLedger};
+use tandem_teacher::budget::{Charge, Lease};
+use tandem_teacher::ledger::{Ledger as _, SqliteLedger};
 
-use crate::place::{bill, charge, terms};
+use crate::fixture::{Verdict, charge, inverted, request, terms};
 
 const NAME: &str = "run";
 const BUDGET: u64 = 150;
 
-/// What a client was told, and what then stood on the disk.
+/// The answers that a client has received, and the files after the last of them.
 #[derive(Default, Clone)]
-struct Told {
+struct Snapshot {
     steps: Vec<(Charge, Verdict)>,
     leases: Vec<Lease>,
     settled: Vec<u64>,
@@ -23,47 +23,48 @@ struct Told {
     log: Vec<u8>,
 }
 
-/// Plays ten episodes with leases and one without; looks at the files after every answer.
-fn play(path: &Path) -> Vec<Told> {
+/// Runs ten episodes with leases and some without, and takes a snapshot after each answer.
+fn play(path: &Path) -> Vec<Snapshot> {
     let mut ledger = SqliteLedger::open(path).expect("a ledger");
     ledger.open(NAME, terms(BUDGET)).expect("an account");
-    let mut told = Told::default();
+    let mut snapshot = Snapshot::default();
     let mut history = Vec::new();
     for round in 0..5_u64 {
         let episodes = [2 * round, 2 * round + 1];
-        told.leases.extend(ledger.open_leases(NAME, &episodes, 40).expect("leases").0);
-        history.push(look(&mut ledger, path, &mut told));
+        snapshot.leases.extend(ledger.open_leases(NAME, &episodes, 40).expect("leases").0);
+        history.push(take_snapshot(&mut ledger, path, &mut snapshot));
         for step in 0..12_u32 {
-            let wish = |episode: u64| {
+            let wanted = |episode: u64| {
                 let first = !(episode + u64::from(step)).is_multiple_of(3);
-                charge(episode, step, Wish { first, second: true })
+                charge(episode, step, [first, true])
             };
-            let charges = [wish(episodes[0]), wish(episodes[1]), wish(999 + u64::from(step) * 64)];
-            let receipt = ledger.charge(&[bill(NAME, &charges)]).remove(0).expect("paid");
-            told.steps.extend(charges.into_iter().zip(receipt.verdicts));
-            history.push(look(&mut ledger, path, &mut told));
+            let unleased = 999 + u64::from(step) * 64;
+            let charges = [wanted(episodes[0]), wanted(episodes[1]), wanted(unleased)];
+            let result = ledger.charge(&[request(NAME, &charges)]).remove(0).expect("paid");
+            snapshot.steps.extend(charges.into_iter().zip(result.verdicts));
+            history.push(take_snapshot(&mut ledger, path, &mut snapshot));
         }
         ledger.settle(NAME, &episodes).expect("settled");
-        told.settled.extend(episodes);
-        history.push(look(&mut ledger, path, &mut told));
+        snapshot.settled.extend(episodes);
+        history.push(take_snapshot(&mut ledger, path, &mut snapshot));
     }
     history
 }
 
-fn look(ledger: &mut SqliteLedger, path: &Path, told: &mut Told) -> Told {
+fn take_snapshot(ledger: &mut SqliteLedger, path: &Path, snapshot: &mut Snapshot) -> Snapshot {
     let balance = ledger.balance(NAME).expect("an account");
-    told.state = (balance.spent, balance.leased, balance.left);
-    told.database = fs::read(path).expect("a database");
-    told.log = fs::read(log_of(path)).expect("its log");
-    told.clone()
+    snapshot.state = (balance.spent, balance.leased, balance.left);
+    snapshot.database = fs::read(path).expect("a database");
+    snapshot.log = fs::read(log_of(path)).expect("its log");
+    snapshot.clone()
 }
 
 fn log_of(path: &Path) -> std::path::PathBuf {
     path.with_file_name("ledger.sqlite-wal")
 }
 
-/// Opens a ledger of these bytes and compares it with what was told, asking for everything again.
-fn check(told: &Told, database: &[u8], log: &[u8]) {
+/// Opens a ledger with these bytes and checks that it repeats all answers of the snapshot.
+fn check(snapshot: &Snapshot, database: &[u8], log: &[u8]) {
     let directory = tempfile::tempdir().expect("a directory");
     let path = directory.path().join("ledger.sqlite");
     fs::write(&path, database).expect("written");
@@ -73,35 +74,30 @@ fn check(told: &Told, database: &[u8], log: &[u8]) {
         let balance = ledger.balance(NAME).expect("an account");
         (balance.spent, balance.leased, balance.left)
     };
-    assert_eq!(state(&mut ledger), told.state);
-    let swapped = |wish: Wish| Wish { first: !wish.first, second: !wish.second };
-    let again: Vec<Charge> = told
-        .steps
-        .iter()
-        .map(|(asked, _)| charge(asked.episode, asked.step, swapped(asked.wish)))
-        .collect();
-    let verdicts: Vec<Verdict> = told.steps.iter().map(|(_, verdict)| *verdict).collect();
-    let receipt = ledger.charge(&[bill(NAME, &again)]).remove(0).expect("paid");
-    assert_eq!(receipt.verdicts, verdicts);
-    let episodes: Vec<u64> = told.leases.iter().map(|lease| lease.episode).collect();
-    assert_eq!(ledger.open_leases(NAME, &episodes, 1).expect("leases").0, told.leases);
-    ledger.settle(NAME, &told.settled).expect("settled");
-    assert_eq!(state(&mut ledger), told.state, "nothing was new");
+    assert_eq!(state(&mut ledger), snapshot.state);
+    let again: Vec<Charge> = snapshot.steps.iter().map(|(charge, _)| inverted(charge)).collect();
+    let verdicts: Vec<Verdict> = snapshot.steps.iter().map(|(_, verdict)| *verdict).collect();
+    let result = ledger.charge(&[request(NAME, &again)]).remove(0).expect("paid");
+    assert_eq!(result.verdicts, verdicts);
+    let episodes: Vec<u64> = snapshot.leases.iter().map(|lease| lease.episode).collect();
+    assert_eq!(ledger.open_leases(NAME, &episodes, 1).expect("leases").0, snapshot.leases);
+    ledger.settle(NAME, &snapshot.settled).expect("settled");
+    assert_eq!(state(&mut ledger), snapshot.state, "nothing was new");
 }
 
 #[test]
-fn whatever_was_answered_is_in_the_files_at_that_moment() {
+fn every_answer_is_in_the_files_when_it_is_given() {
     let directory = tempfile::tempdir().expect("a directory");
     let history = play(&directory.path().join("ledger.sqlite"));
     assert_eq!(history.last().expect("answers").state.1, 0, "all leases are settled");
-    for told in &history {
-        check(told, &told.database, &told.log);
+    for snapshot in &history {
+        check(snapshot, &snapshot.database, &snapshot.log);
     }
 }
 
-/// The system may have written any part of a transaction when the process ends.
+/// The end of the process may leave any prefix of a transaction in the log.
 #[test]
-fn a_transaction_is_written_as_a_whole_or_not() {
+fn a_torn_transaction_is_discarded_as_a_whole() {
     let directory = tempfile::tempdir().expect("a directory");
     let history = play(&directory.path().join("ledger.sqlite"));
     let mut n_torn = 0;

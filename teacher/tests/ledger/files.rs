@@ -1,4 +1,4 @@
-//! The file of a ledger: who may open it, what is refused, what a person sees in it.
+//! The file of a ledger: opening, refusals, and its tables as seen by other tools.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -7,7 +7,7 @@ use rusqlite::Connection;
 use tandem_teacher::ledger::{self, Ledger as _, OpenError, SqliteLedger};
 use tempfile::TempDir;
 
-use crate::place::{BOTH, bill, charge, terms};
+use crate::fixture::{BOTH, charge, request, terms};
 
 fn directory() -> (TempDir, PathBuf) {
     let directory = tempfile::tempdir().expect("a directory");
@@ -15,28 +15,28 @@ fn directory() -> (TempDir, PathBuf) {
     (directory, path)
 }
 
-/// A closed ledger with some hundred episodes.
+/// Creates and closes a ledger with some hundred episodes.
 fn filled(path: &Path) {
     let mut ledger = SqliteLedger::open(path).expect("a ledger");
     ledger.open("run", terms(10_000)).expect("an account");
     let episodes: Vec<u64> = (0..600).collect();
     ledger.open_leases("run", &episodes, 10).expect("leases");
     let charges: Vec<_> = episodes.iter().map(|episode| charge(*episode, 7, BOTH)).collect();
-    ledger.charge(&[bill("run", &charges)]).remove(0).expect("paid");
+    ledger.charge(&[request("run", &charges)]).remove(0).expect("paid");
 }
 
-/// Opening must fail and leave the file as it is. Gives what is said, the path shortened.
+/// Checks that opening fails and leaves the file unchanged. Returns the message, with `FILE` for the path.
 fn refusal(path: &Path) -> String {
     let before = fs::read(path).ok();
     let error = SqliteLedger::open(path).expect_err("refused");
     assert_eq!(fs::read(path).ok(), before, "{error}");
-    let told = error.to_string();
-    assert!(!told.contains('\n'), "{told}");
-    told.replace(&format!("{:?}", path.display().to_string()), "FILE")
+    let message = error.to_string();
+    assert!(!message.contains('\n'), "{message}");
+    message.replace(&format!("{:?}", path.display().to_string()), "FILE")
 }
 
 #[test]
-fn a_file_that_is_no_ledger_is_refused_and_left_alone() {
+fn a_file_that_is_not_a_ledger_is_refused_and_unchanged() {
     let check = |bytes: &[u8]| {
         let (_directory, path) = directory();
         fs::write(&path, bytes).expect("written");
@@ -60,16 +60,16 @@ fn a_file_that_is_no_ledger_is_refused_and_left_alone() {
 }
 
 #[test]
-fn another_version_is_refused_by_its_number() {
+fn a_newer_version_is_refused_by_its_number() {
     let (_directory, path) = directory();
     filled(&path);
     let other = Connection::open(&path).expect("a database");
     other.pragma_update(None, "user_version", 3).expect("another version");
     drop(other);
-    let told = refusal(&path);
+    let message = refusal(&path);
     assert!(
-        told.starts_with("the ledger FILE has version 3, this program reads versions 1 to 2: "),
-        "{told}"
+        message.starts_with("the ledger FILE has version 3, this program reads versions 1 to 2: "),
+        "{message}"
     );
 }
 
@@ -81,11 +81,12 @@ fn a_damaged_file_is_refused() {
         let mut bytes = fs::read(&path).expect("bytes");
         change(&mut bytes);
         fs::write(&path, bytes).expect("written");
-        let told = refusal(&path);
-        assert!(told.starts_with("the ledger FILE is damaged ("), "{told}");
+        let message = refusal(&path);
+        assert!(message.starts_with("the ledger FILE is damaged ("), "{message}");
         assert!(
-            told.ends_with("): put a copy in its place, or move it away to begin with no accounts"),
-            "{told}"
+            message
+                .ends_with("): put a copy in its place, or move it away to begin with no accounts"),
+            "{message}"
         );
     };
     damage(&|bytes| bytes.truncate(bytes.len() / 2));
@@ -108,8 +109,8 @@ fn tables_that_contradict_one_another_are_damage() {
         let other = Connection::open(&path).expect("a database");
         other.execute_batch(sql).expect(sql);
         drop(other);
-        let told = refusal(&path);
-        assert!(told.contains(expected), "{sql}: {told}");
+        let message = refusal(&path);
+        assert!(message.contains(expected), "{sql}: {message}");
     };
     check("UPDATE accounts SET spent = 599", "account \"run\" has spent 599, its verdicts say 600");
     check("UPDATE accounts SET budget = 599", "more than the budget is handed out");
@@ -130,16 +131,16 @@ fn tables_that_contradict_one_another_are_damage() {
 }
 
 #[test]
-fn a_checksum_covers_what_the_tables_cannot_contradict() {
+fn the_checksum_detects_changes_that_contradict_no_other_row() {
     let check = |sql: &str| {
         let (_directory, path) = directory();
         filled(&path);
         let other = Connection::open(&path).expect("a database");
         other.execute_batch(sql).expect(sql);
         drop(other);
-        let told = refusal(&path);
+        let message = refusal(&path);
         let expected = "account \"run\": its rows do not match its checksum";
-        assert!(told.contains(expected), "{sql}: {told}");
+        assert!(message.contains(expected), "{sql}: {message}");
     };
     check("UPDATE accounts SET budget = 10001");
     check("UPDATE accounts SET strategy = 'ea'");
@@ -157,7 +158,7 @@ fn a_checksum_covers_what_the_tables_cannot_contradict() {
     );
 }
 
-/// Bytes of a damaged file must not reach a terminal as they are, nor break the one line.
+/// Bytes of a damaged file must not reach a terminal unescaped, nor split the line.
 #[test]
 fn a_refusal_has_no_control_characters_of_the_file() {
     let check = |sql: &str, expected: &str| {
@@ -166,8 +167,11 @@ fn a_refusal_has_no_control_characters_of_the_file() {
         let other = Connection::open(&path).expect("a database");
         other.execute_batch(sql).expect(sql);
         drop(other);
-        let told = refusal(&path);
-        assert!(told.contains(expected) && !told.contains(char::is_control), "{sql}: {told:?}");
+        let message = refusal(&path);
+        assert!(
+            message.contains(expected) && !message.contains(char::is_control),
+            "{sql}: {message:?}"
+        );
     };
     check(
         "UPDATE accounts SET name = 'a' || char(27) || '[31m' || char(10, 13, 133, 8238), spent = 1",
@@ -181,7 +185,7 @@ fn a_refusal_has_no_control_characters_of_the_file() {
 }
 
 #[test]
-fn a_place_where_no_file_can_be_is_refused() {
+fn a_path_that_cannot_hold_a_file_is_refused() {
     let (directory, path) = directory();
     let check = |path: &Path, expected: &str| {
         let error = SqliteLedger::open(path).expect_err("refused");
@@ -228,13 +232,13 @@ fn an_empty_file_becomes_a_ledger() {
 }
 
 #[test]
-fn a_name_that_is_no_place_is_refused() {
+fn an_invalid_location_is_refused() {
     let check = |place: &str, expected: &str| {
         let error = ledger::open(place).err().expect(place);
-        assert!(matches!(error, OpenError::NotAPlace(_)), "{place}: {error}");
-        let told = error.to_string();
-        assert!(told.contains(expected) && !told.contains("hunter2"), "{place}: {told}");
-        assert!(told.starts_with("expected memory, redis://"), "{place}: {told}");
+        assert!(matches!(error, OpenError::InvalidLocation(_)), "{place}: {error}");
+        let message = error.to_string();
+        assert!(message.contains(expected) && !message.contains("hunter2"), "{place}: {message}");
+        assert!(message.starts_with("expected memory, redis://"), "{place}: {message}");
     };
     check("", "the name is empty");
     check("postgres://user:hunter2@host/db", "there is no ledger of the kind \"postgres\"");
@@ -243,12 +247,15 @@ fn a_name_that_is_no_place_is_refused() {
     check("redis://user:hunter2@host:port/0", "the redis:// URL cannot be read");
     check("redis://user:hunter2@host/zero", "Invalid database number");
     check("redis://user:hunter2#@host/0", "the redis:// URL");
-    check("redis://user:hunter2@host/0?protocol=resp3", "which a password must have as %3F or %23");
+    check(
+        "redis://user:hunter2@host/0?protocol=resp3",
+        "which must be written as %3F or %23 in a password",
+    );
 }
 
-/// A person with the tool `sqlite3` reads the same.
+/// The `sqlite3` tool reads the same.
 #[test]
-fn the_tables_say_what_was_charged() {
+fn the_tables_list_the_charges() {
     let (_directory, path) = directory();
     let mut ledger = SqliteLedger::open(&path).expect("a ledger");
     ledger.open("run", terms(5)).expect("an account");
@@ -260,7 +267,7 @@ fn the_tables_say_what_was_charged() {
         charge(u64::MAX, 63, BOTH),
         charge(u64::MAX, 129, BOTH),
     ];
-    ledger.charge(&[bill("run", &charges)]).remove(0).expect("paid");
+    ledger.charge(&[request("run", &charges)]).remove(0).expect("paid");
     ledger.settle("run", &[3]).expect("settled");
     // While the ledger is open, too.
     let reader = Connection::open(&path).expect("a database");

@@ -1,4 +1,4 @@
-//! A full disk: what cannot be written is not done, and works again once there is room.
+//! A full disk: the ledger refuses what it cannot write, and works again once there is room.
 
 use std::fs;
 use std::path::PathBuf;
@@ -7,7 +7,7 @@ use std::process::{Command, Stdio};
 use tandem_teacher::ledger::{Ledger as _, LedgerError, MemoryLedger, SqliteLedger};
 use tempfile::TempDir;
 
-use crate::place::{BOTH, NEITHER, bill, charge, terms};
+use crate::fixture::{BOTH, NEITHER, charge, request, terms};
 
 /// A disk of 1 MiB.
 struct SmallDisk {
@@ -15,7 +15,7 @@ struct SmallDisk {
 }
 
 impl SmallDisk {
-    /// None where this process may not mount one.
+    /// Returns `None` if the process may not mount a disk.
     fn mount() -> Option<Self> {
         let directory = tempfile::tempdir().expect("a directory");
         let mounted = Command::new("mount")
@@ -51,13 +51,14 @@ fn a_full_disk_makes_the_ledger_unavailable_until_there_is_room() {
         ledger.open("run", terms(1_000_000)).expect("an account");
         ledger.open_leases("run", &[0, 1], 20).expect("leases");
     }
-    let bill_of = |episode: u64| bill("run", &[charge(episode, 1, BOTH), charge(episode, 2, BOTH)]);
+    let request_for =
+        |episode: u64| request("run", &[charge(episode, 1, BOTH), charge(episode, 2, BOTH)]);
     let mut episode = 0;
     let refused = loop {
-        match ledger.charge(&[bill_of(episode)]).remove(0) {
-            Ok(receipt) => {
-                let expected = model.charge(&[bill_of(episode)]).remove(0).expect("paid");
-                assert_eq!(receipt, expected);
+        match ledger.charge(&[request_for(episode)]).remove(0) {
+            Ok(result) => {
+                let expected = model.charge(&[request_for(episode)]).remove(0).expect("paid");
+                assert_eq!(result, expected);
             }
             Err(error) => break error,
         }
@@ -67,21 +68,22 @@ fn a_full_disk_makes_the_ledger_unavailable_until_there_is_room() {
     assert!(matches!(refused, LedgerError::Unavailable { .. }), "{refused}");
     assert!(refused.to_string().contains("full"), "{refused}");
     for attempt in 0..3 {
-        let unpaid = ledger.charge(&[bill_of(episode), bill_of(episode + attempt)]);
+        let unpaid = ledger.charge(&[request_for(episode), request_for(episode + attempt)]);
         assert!(unpaid.iter().all(Result::is_err), "{unpaid:?}");
         assert_eq!(ledger.balance("run").expect("known"), model.balance("run").expect("known"));
     }
-    // What stands already is still told.
-    let known = ledger.charge(&[bill("run", &[charge(0, 1, NEITHER)])]).remove(0).expect("known");
-    assert_eq!(known.verdicts, [crate::place::FIRST]);
+    // Verdicts from before are still returned.
+    let known =
+        ledger.charge(&[request("run", &[charge(0, 1, NEITHER)])]).remove(0).expect("known");
+    assert_eq!(known.verdicts, [crate::fixture::FIRST]);
 
     fs::remove_file(disk.path("filler")).expect("room");
     for ledger in [&mut ledger as &mut dyn tandem_teacher::ledger::Ledger, &mut model] {
         ledger.settle("run", &[0]).expect("settled");
         ledger.open_leases("run", &[2_000_000], 20).expect("leases");
-        // Had the bill that was refused left anything behind, these would not be charged.
-        let receipt = ledger.charge(&[bill_of(episode)]).remove(0).expect("paid");
-        assert_eq!(receipt.verdicts, [crate::place::FIRST; 2]);
+        // If the refused request had left a verdict, these steps would not be charged.
+        let result = ledger.charge(&[request_for(episode)]).remove(0).expect("paid");
+        assert_eq!(result.verdicts, [crate::fixture::FIRST; 2]);
     }
     let expected = model.balance("run").expect("known");
     assert_eq!(ledger.balance("run").expect("known"), expected);
@@ -89,8 +91,8 @@ fn a_full_disk_makes_the_ledger_unavailable_until_there_is_room() {
     let mut again = SqliteLedger::open(&disk.path("ledger.sqlite")).expect("a sound ledger");
     assert_eq!(again.balance("run").expect("known"), expected);
     for episode in 0..=episode {
-        let receipt = again.charge(&[bill_of(episode)]).remove(0).expect("known");
-        assert_eq!(receipt, model.charge(&[bill_of(episode)]).remove(0).expect("known"));
+        let result = again.charge(&[request_for(episode)]).remove(0).expect("known");
+        assert_eq!(result, model.charge(&[request_for(episode)]).remove(0).expect("known"));
     }
     assert_eq!(again.balance("run").expect("known"), expected);
 }

@@ -1,15 +1,15 @@
-//! Random operations, on a ledger and on accounts in memory: equal answers, whenever the ledger is closed and opened
-//! again.
+//! Random operations on a ledger and on a ledger in memory: equal answers, with the ledger closed and reopened in
+//! between.
 
 use proptest::collection::vec;
 use proptest::prelude::{Just, Strategy as _, any, prop_oneof};
 use proptest::test_runner::{Config, TestCaseError, TestRunner};
-use tandem_teacher::budget::Wish;
-use tandem_teacher::ledger::{Charge, Ledger, MemoryLedger};
+use tandem_teacher::budget::Charge;
+use tandem_teacher::ledger::{Ledger, MemoryLedger};
 
-use crate::place::{Place, bill, terms};
+use crate::fixture::{TestLedger, charge, request, terms};
 
-/// Series of operations that are tried.
+/// The number of random series of operations.
 const N_CASES: u32 = 48;
 
 #[derive(Debug, Clone)]
@@ -28,10 +28,8 @@ fn episode() -> impl proptest::strategy::Strategy<Value = u64> {
 
 fn operation() -> impl proptest::strategy::Strategy<Value = Operation> {
     let step = || prop_oneof![6 => 0..12_u32, 2 => 45..55_u32, 1 => 60..70_u32];
-    let charge = (episode(), step(), any::<(bool, bool)>()).prop_map(|(episode, step, wish)| {
-        let (first, second) = wish;
-        Charge { episode, step, wish: Wish { first, second } }
-    });
+    let charge = (episode(), step(), any::<[bool; 2]>())
+        .prop_map(|(episode, step, wanted)| charge(episode, step, wanted));
     let account = || 0..3_u8;
     let episodes = || vec(episode(), 0..4);
     prop_oneof![
@@ -46,7 +44,7 @@ fn operation() -> impl proptest::strategy::Strategy<Value = Operation> {
     ]
 }
 
-/// What the ledger answers, as text that two ledgers can be compared by.
+/// Returns the ledger's answer as text.
 fn answer(ledger: &mut dyn Ledger, case: u32, operation: &Operation) -> String {
     let name = |account: &u8| format!("case {case}, account {account}");
     match operation {
@@ -60,28 +58,30 @@ fn answer(ledger: &mut dyn Ledger, case: u32, operation: &Operation) -> String {
         Operation::Settle { account, episodes } => {
             format!("{:?}", ledger.settle(&name(account), episodes))
         }
-        Operation::Charge(bills) => {
-            let bills: Vec<_> =
-                bills.iter().map(|(account, charges)| bill(&name(account), charges)).collect();
-            format!("{:?}", ledger.charge(&bills))
+        Operation::Charge(requests) => {
+            let requests: Vec<_> = requests
+                .iter()
+                .map(|(account, charges)| request(&name(account), charges))
+                .collect();
+            format!("{:?}", ledger.charge(&requests))
         }
         Operation::Reopen => String::new(),
     }
 }
 
-pub(crate) fn it_does_what_an_account_in_memory_does(place: Place) {
-    let place = std::cell::RefCell::new((place, 0_u32));
+pub(crate) fn it_agrees_with_a_ledger_in_memory(fixture: TestLedger) {
+    let fixture = std::cell::RefCell::new((fixture, 0_u32));
     let config = Config { cases: N_CASES, failure_persistence: None, ..Config::default() };
     let outcome = TestRunner::new(config).run(&vec(operation(), 1..80), |operations| {
-        let (place, case) = &mut *place.borrow_mut();
+        let (fixture, case) = &mut *fixture.borrow_mut();
         *case += 1;
         let mut model = MemoryLedger::default();
         for (idx, operation) in operations.iter().enumerate() {
             if matches!(operation, Operation::Reopen) {
-                place.close();
+                fixture.close();
             }
             let expected = answer(&mut model, *case, operation);
-            let got = answer(place.ledger(), *case, operation);
+            let got = answer(fixture.ledger(), *case, operation);
             if got != expected {
                 let what = format!("operation {idx}: expected {expected}, got {got}");
                 return Err(TestCaseError::fail(what));

@@ -1,4 +1,4 @@
-//! Who may use a ledger's file, and what happens when the file is taken away.
+//! The lock on a ledger's file, and files that are moved away while in use.
 
 use std::fs;
 use std::os::unix::fs::MetadataExt as _;
@@ -8,7 +8,7 @@ use rusqlite::Connection;
 use tandem_teacher::ledger::{Ledger as _, LedgerError, OpenError, SqliteLedger};
 use tempfile::TempDir;
 
-use crate::place::{BOTH, FIRST, bill, charge, terms};
+use crate::fixture::{BOTH, FIRST, charge, request, terms};
 use crate::servers::Log;
 
 /// An open ledger with one unit of ten spent, by step 0 of episode 1.
@@ -22,8 +22,8 @@ fn opened() -> (TempDir, PathBuf, SqliteLedger) {
 }
 
 fn charge_step(ledger: &mut SqliteLedger, step: u32) -> Result<(), LedgerError> {
-    let receipt = ledger.charge(&[bill("run", &[charge(1, step, BOTH)])]).remove(0)?;
-    assert_eq!(receipt.verdicts, [FIRST]);
+    let result = ledger.charge(&[request("run", &[charge(1, step, BOTH)])]).remove(0)?;
+    assert_eq!(result.verdicts, [FIRST]);
     Ok(())
 }
 
@@ -31,7 +31,7 @@ fn beside(path: &Path, suffix: &str) -> PathBuf {
     path.with_file_name(format!("ledger.sqlite{suffix}"))
 }
 
-fn is_in_use(path: &Path) {
+fn check_in_use(path: &Path) {
     let error = SqliteLedger::open(path).expect_err("refused");
     assert!(matches!(error, OpenError::InUse(_)), "{error}");
     let expected = format!(
@@ -40,8 +40,8 @@ fn is_in_use(path: &Path) {
     assert_eq!(error.to_string(), expected);
 }
 
-/// Nothing more is charged, whatever is put back, and what was charged before is still told.
-fn is_given_up(ledger: &mut SqliteLedger, expected: &str) {
+/// Checks that nothing more is charged, whatever is put back, and that earlier verdicts are still returned.
+fn check_refuses_charges(ledger: &mut SqliteLedger, expected: &str) {
     for step in [1, 2] {
         let error = charge_step(ledger, step).expect_err("refused");
         assert!(matches!(error, LedgerError::Unavailable { .. }), "{error}");
@@ -54,29 +54,29 @@ fn is_given_up(ledger: &mut SqliteLedger, expected: &str) {
 }
 
 #[test]
-fn a_file_has_one_owner_at_a_time_by_whichever_name() {
+fn a_file_has_one_owner_at_a_time_under_all_names() {
     let (directory, path, first) = opened();
-    is_in_use(&path);
+    check_in_use(&path);
     let link = directory.path().join("link.sqlite");
     std::os::unix::fs::symlink(&path, &link).expect("a link");
-    is_in_use(&link);
+    check_in_use(&link);
     let twin = directory.path().join("twin.sqlite");
     fs::hard_link(&path, &twin).expect("a link");
-    is_in_use(&twin);
+    check_in_use(&twin);
     fs::remove_file(&twin).expect("removed");
     drop(first);
     assert_eq!(SqliteLedger::open(&link).expect("free").balance("run").expect("kept").spent, 1);
 }
 
 #[test]
-fn no_file_beside_the_ledger_decides_who_owns_it() {
+fn other_files_do_not_affect_the_lock() {
     let (_directory, path, first) = opened();
     for suffix in [".lock", "-shm", "-wal"] {
         drop(fs::remove_file(beside(&path, suffix)));
-        is_in_use(&path);
+        check_in_use(&path);
     }
     drop(first);
-    // Earlier versions left one behind and locked it.
+    // Earlier versions locked a file of this name and left it behind.
     let lock = fs::File::create(beside(&path, ".lock")).expect("a file");
     lock.lock().expect("locked");
     SqliteLedger::open(&path).expect("free");
@@ -84,7 +84,7 @@ fn no_file_beside_the_ledger_decides_who_owns_it() {
 
 /// The system releases a process's POSIX locks, such as SQLite's, when it closes any descriptor of the file.
 #[test]
-fn an_attempt_that_is_refused_releases_no_locks() {
+fn a_refused_attempt_releases_no_locks() {
     let (directory, path, _first) = opened();
     let inode = format!(":{} ", fs::metadata(&path).expect("a file").ino());
     let locks = || {
@@ -93,10 +93,10 @@ fn an_attempt_that_is_refused_releases_no_locks() {
     };
     let before = locks();
     assert!(before >= 2, "the ledger's own lock and SQLite's");
-    is_in_use(&path);
+    check_in_use(&path);
     let link = directory.path().join("link.sqlite");
     std::os::unix::fs::symlink(&path, &link).expect("a link");
-    is_in_use(&link);
+    check_in_use(&link);
     assert_eq!(locks(), before);
 }
 
@@ -104,7 +104,10 @@ fn an_attempt_that_is_refused_releases_no_locks() {
 fn nothing_is_charged_to_a_file_that_was_deleted() {
     let (_directory, path, mut ledger) = opened();
     fs::remove_file(&path).expect("removed");
-    is_given_up(&mut ledger, "deleted, moved or replaced while in use: put it back and restart");
+    check_refuses_charges(
+        &mut ledger,
+        "deleted, moved or replaced while in use: put it back and restart",
+    );
 }
 
 #[test]
@@ -114,22 +117,31 @@ fn nothing_is_charged_to_a_file_that_was_replaced() {
     fs::rename(&path, &aside).expect("moved");
     let mut second = SqliteLedger::open(&path).expect("a new ledger");
     second.open("run", terms(10)).expect("an account");
-    is_given_up(&mut ledger, "deleted, moved or replaced while in use: put it back and restart");
+    check_refuses_charges(
+        &mut ledger,
+        "deleted, moved or replaced while in use: put it back and restart",
+    );
     drop(second);
     fs::rename(&aside, &path).expect("moved back");
-    is_given_up(&mut ledger, "deleted, moved or replaced while in use: put it back and restart");
+    check_refuses_charges(
+        &mut ledger,
+        "deleted, moved or replaced while in use: put it back and restart",
+    );
 }
 
 #[test]
-fn what_was_answered_survives_the_deletion_of_the_log() {
+fn answered_charges_survive_the_deletion_of_the_log() {
     let (directory, path, mut ledger) = opened();
     fs::remove_file(beside(&path, "-wal")).expect("removed");
-    is_given_up(&mut ledger, "-wal file was deleted, moved or replaced while in use: restart");
+    check_refuses_charges(
+        &mut ledger,
+        "-wal file was deleted, moved or replaced while in use: restart",
+    );
     // As after kill -9: only the database is there.
     let copy = directory.path().join("copy.sqlite");
     fs::copy(&path, &copy).expect("copied");
     let mut again = SqliteLedger::open(&copy).expect("a sound ledger");
-    // The step whose answer was refused may be charged; it is so once.
+    // The step whose answer was refused may be charged, but only once.
     assert!([1, 2].contains(&again.balance("run").expect("an account").spent));
     charge_step(&mut again, 0).expect("known");
     charge_step(&mut again, 1).expect("paid");
@@ -137,7 +149,7 @@ fn what_was_answered_survives_the_deletion_of_the_log() {
 }
 
 #[test]
-fn a_log_that_a_reader_keeps_from_being_copied_is_reported() {
+fn a_log_that_cannot_be_copied_because_of_a_reader_is_reported() {
     for is_read in [false, true] {
         let (_directory, path, mut ledger) = opened();
         let reader = Connection::open(&path).expect("a database");

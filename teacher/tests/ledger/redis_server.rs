@@ -1,4 +1,4 @@
-//! A Redis server of a test's own.
+//! A Redis server for one test.
 
 use std::net::TcpListener;
 use std::path::Path;
@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use tempfile::TempDir;
 
-/// A running server with an append-only file; it ends with the test.
+/// A running server with an append-only file. It ends with the test.
 pub(crate) struct RedisServer {
     process: Child,
     port: u16,
@@ -16,13 +16,13 @@ pub(crate) struct RedisServer {
 }
 
 impl RedisServer {
-    /// None, with a line that says so, where Redis is not installed; there the test fails if
-    /// `TANDEM_REQUIRE_REDIS` is 1.
+    /// Starts a server. Returns `None` and prints a line if Redis is not installed; if `TANDEM_REQUIRE_REDIS` is 1, the
+    /// test fails instead.
     pub(crate) fn start() -> Option<Self> {
         Self::start_with(&["--appendonly", "yes"])
     }
 
-    /// A server with settings of its own.
+    /// Starts a server with other settings.
     pub(crate) fn start_with(settings: &[&str]) -> Option<Self> {
         if Command::new("redis-server").arg("--version").stdout(Stdio::null()).status().is_err() {
             #[expect(clippy::disallowed_methods, reason = "the one switch of the tests")]
@@ -33,7 +33,7 @@ impl RedisServer {
         }
         let directory = tempfile::tempdir().expect("a directory");
         let settings = settings.iter().map(|setting| (*setting).to_owned()).collect::<Vec<_>>();
-        // Between looking for a free port and taking it, somebody else may take it.
+        // Another process may take the free port before the server does.
         let started = (0..10).find_map(|_| {
             let port = TcpListener::bind("127.0.0.1:0").and_then(|listener| listener.local_addr());
             let port = port.expect("a port").port();
@@ -51,25 +51,25 @@ impl RedisServer {
         self.port
     }
 
-    /// Ends the server at once.
+    /// Kills the server.
     pub(crate) fn kill(&mut self) {
         self.process.kill().expect("killed");
         self.process.wait().expect("gone");
     }
 
-    /// Starts it again where it was, with what it wrote.
+    /// Restarts the server on the same port and directory.
     pub(crate) fn restart(&mut self) {
         let again = || run(self.port, self.directory.path(), &self.settings);
         self.process = (0..10).find_map(|_| again()).expect("redis-server starts again");
     }
 
-    /// Stops or continues the server's process.
+    /// Sends a signal to the server's process.
     pub(crate) fn signal(&self, signal: &str) {
         let pid = self.process.id().to_string();
         assert!(Command::new("kill").args([signal, &pid]).status().expect("kill runs").success());
     }
 
-    /// A connection of the test's own.
+    /// Opens a connection for the test.
     pub(crate) fn connection(&self) -> redis::Connection {
         let client = redis::Client::open(self.url()).expect("a URL");
         client.get_connection().expect("a connection")
@@ -83,7 +83,7 @@ impl Drop for RedisServer {
     }
 }
 
-/// Starts a server and waits until it answers; none when it ends first.
+/// Starts a server and waits until it answers. Returns `None` if it ends first.
 fn run(port: u16, directory: &Path, settings: &[String]) -> Option<Child> {
     let mut process = Command::new("redis-server")
         .args(["--port", &port.to_string(), "--bind", "127.0.0.1", "--save", "", "--dir"])
@@ -101,7 +101,7 @@ fn run(port: u16, directory: &Path, settings: &[String]) -> Option<Child> {
             .and_then(|mut connection| redis::cmd("PING").query::<String>(&mut connection));
         match answer {
             Ok(_) => return Some(process),
-            // It is there and wants a password.
+            // The server is up and requires a password.
             Err(error) if error.code() == Some("NOAUTH") => return Some(process),
             Err(_) => std::thread::sleep(Duration::from_millis(10)),
         }

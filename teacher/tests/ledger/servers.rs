@@ -8,7 +8,7 @@ use std::time::Duration;
 
 use tandem_teacher::ledger::{Ledger as _, LedgerError, RedisLedger};
 
-use crate::place::{BOTH, FIRST, NEITHER, NOTHING, bill, charge, terms};
+use crate::fixture::{BOTH, FIRST, NEITHER, NOTHING, charge, request, terms};
 use crate::redis_server::RedisServer;
 
 fn is_unavailable<T: std::fmt::Debug>(outcome: Result<T, LedgerError>) -> String {
@@ -29,8 +29,8 @@ fn teachers_share_an_account_and_never_overspend_it() {
             ledger.open("run", terms(budget)).expect("an account");
             let mut charged = Vec::new();
             for step in 0..400 {
-                // Episodes of its own, one that all ask about, and a round of leases now and then.
-                let asked = [
+                // Episodes of its own, one that all threads use, and sometimes a round of leases.
+                let charges = [
                     charge(number, step, BOTH),
                     charge(100, step, BOTH),
                     charge(200 + number, step % 50, BOTH),
@@ -41,9 +41,9 @@ fn teachers_share_an_account_and_never_overspend_it() {
                 if step == 300 {
                     ledger.settle("run", &[200 + number]).expect("settled");
                 }
-                let receipt = ledger.charge(&[bill("run", &asked)]).remove(0).expect("paid");
-                let steps = asked.map(|asked| (asked.episode, asked.step));
-                charged.extend(steps.into_iter().zip(receipt.verdicts));
+                let result = ledger.charge(&[request("run", &charges)]).remove(0).expect("paid");
+                let steps = charges.map(|charge| (charge.episode, charge.step));
+                charged.extend(steps.into_iter().zip(result.verdicts));
             }
             charged
         }
@@ -72,27 +72,28 @@ fn a_killed_server_is_unavailable_and_comes_back_with_everything() {
     let mut ledger = RedisLedger::open(&server.url()).expect("a ledger");
     ledger.open("run", terms(10)).expect("an account");
     ledger.open_leases("run", &[1], 3).expect("leases");
-    let asked = bill("run", &[charge(1, 0, BOTH), charge(2, 0, NEITHER), charge(2, 1, BOTH)]);
-    let receipt = ledger.charge(std::slice::from_ref(&asked)).remove(0).expect("paid");
+    let charges = request("run", &[charge(1, 0, BOTH), charge(2, 0, NEITHER), charge(2, 1, BOTH)]);
+    let result = ledger.charge(std::slice::from_ref(&charges)).remove(0).expect("paid");
     server.kill();
-    let told = is_unavailable(ledger.balance("run"));
+    let message = is_unavailable(ledger.balance("run"));
     assert!(
-        told.starts_with(&format!("the ledger cannot be used now: cannot use {}: ", server.url())),
-        "{told}"
+        message
+            .starts_with(&format!("the ledger cannot be used now: cannot use {}: ", server.url())),
+        "{message}"
     );
     is_unavailable(ledger.open("run", terms(10)));
     is_unavailable(ledger.open_leases("run", &[1], 3));
     is_unavailable(ledger.settle("run", &[1]));
-    let outcomes = ledger.charge(&[asked.clone(), asked.clone()]);
+    let outcomes = ledger.charge(&[charges.clone(), charges.clone()]);
     outcomes.into_iter().for_each(|outcome| drop(is_unavailable(outcome)));
     server.restart();
-    // The same ledger finds it again.
-    assert_eq!(ledger.charge(std::slice::from_ref(&asked)).remove(0).expect("paid"), receipt);
+    // The same ledger reconnects.
+    assert_eq!(ledger.charge(std::slice::from_ref(&charges)).remove(0).expect("paid"), result);
     let balance = ledger.settle("run", &[1]).expect("settled");
     assert_eq!((balance.spent, balance.leased, balance.left), (2, 0, 8));
 }
 
-/// Between two calls nobody notices that the server was started again or forgot the scripts.
+/// A restart of the server, or the loss of its scripts, between two calls has no effect on them.
 #[test]
 fn a_broken_connection_and_forgotten_scripts_are_mended_unseen() {
     let Some(mut server) = RedisServer::start() else { return };
@@ -101,8 +102,8 @@ fn a_broken_connection_and_forgotten_scripts_are_mended_unseen() {
     let flush =
         || redis::cmd("SCRIPT").arg("FLUSH").exec(&mut server.connection()).expect("flushed");
     flush();
-    let asked = [bill("run", &[charge(1, 0, BOTH)]), bill("run", &[charge(1, 1, BOTH)])];
-    let outcomes = ledger.charge(&asked);
+    let charges = [request("run", &[charge(1, 0, BOTH)]), request("run", &[charge(1, 1, BOTH)])];
+    let outcomes = ledger.charge(&charges);
     assert!(outcomes.iter().all(|outcome| outcome.as_ref().is_ok_and(|r| r.verdicts == [FIRST])));
     assert_eq!(ledger.balance("run").expect("known").spent, 2);
     server.kill();
@@ -115,23 +116,22 @@ fn a_server_that_hangs_is_unavailable_within_seconds() {
     let Some(server) = RedisServer::start() else { return };
     let mut ledger = RedisLedger::open(&server.url()).expect("a ledger");
     ledger.open("run", terms(10)).expect("an account");
-    let asked = [bill("run", &[charge(1, 0, BOTH)]), bill("run", &[charge(1, 1, BOTH)])];
+    let charges = [request("run", &[charge(1, 0, BOTH)]), request("run", &[charge(1, 1, BOTH)])];
     let mut connection = server.connection();
     let before = n_connections(&mut connection);
     server.signal("-STOP");
-    ledger.charge(&asked).into_iter().for_each(|outcome| drop(is_unavailable(outcome)));
+    ledger.charge(&charges).into_iter().for_each(|outcome| drop(is_unavailable(outcome)));
     server.signal("-CONT");
-    assert_eq!(n_connections(&mut connection), before, "what took too long is not asked again");
+    assert_eq!(n_connections(&mut connection), before, "a call that timed out is not repeated");
     server.signal("-STOP");
     is_unavailable(ledger.balance("run"));
     server.signal("-CONT");
-    // Whether the charges were made before the answers were lost is all the same, and no late answer is taken for
-    // that to another question.
-    let again = ledger.charge(&asked).pop().expect("an outcome").expect("paid");
+    // The charges may have been made before the replies were lost. No late reply is taken for that to another call.
+    let again = ledger.charge(&charges).pop().expect("an outcome").expect("paid");
     assert_eq!((again.verdicts.as_slice(), again.left), ([FIRST].as_slice(), 8));
 }
 
-/// Connections that the server has accepted since it started.
+/// Returns the number of connections that the server has accepted since it started.
 fn n_connections(connection: &mut redis::Connection) -> u64 {
     let stats: String = redis::cmd("INFO").arg("stats").query(connection).expect("an answer");
     let count = stats.lines().find_map(|line| line.strip_prefix("total_connections_received:"));
@@ -139,7 +139,7 @@ fn n_connections(connection: &mut redis::Connection) -> u64 {
 }
 
 #[test]
-fn a_password_is_used_and_never_told() {
+fn a_password_is_used_and_never_shown() {
     let Some(server) =
         RedisServer::start_with(&["--appendonly", "yes", "--requirepass", "hunter2"])
     else {
@@ -148,13 +148,16 @@ fn a_password_is_used_and_never_told() {
     let at = |userinfo: &str| format!("redis://{userinfo}127.0.0.1:{}/3", server.port());
     let log = Log::default();
     let refused = log.of(|| RedisLedger::open(&at(":hunter3@")).expect_err("wrong password"));
-    let told = format!("{refused}: {}", std::error::Error::source(&refused).expect("why"));
-    assert!(told.starts_with(&format!("cannot use the ledger {}: ", at(""))), "{told}");
-    assert!(!told.contains("hunter") && !format!("{refused:?}").contains("hunter"), "{refused:?}");
+    let message = format!("{refused}: {}", std::error::Error::source(&refused).expect("why"));
+    assert!(message.starts_with(&format!("cannot use the ledger {}: ", at(""))), "{message}");
+    assert!(
+        !message.contains("hunter") && !format!("{refused:?}").contains("hunter"),
+        "{refused:?}"
+    );
     assert!(RedisLedger::open(&at("")).is_err(), "no password");
     let mut ledger = log.of(|| RedisLedger::open(&at(":hunter2@")).expect("let in"));
     ledger.open("run", terms(10)).expect("an account");
-    assert!(format!("{ledger:?}").contains(&at("")), "the address is told: {ledger:?}");
+    assert!(format!("{ledger:?}").contains(&at("")), "the address is shown: {ledger:?}");
     assert!(!format!("{ledger:?}").contains("hunter"), "{ledger:?}");
     let logged = log.text();
     assert!(logged.contains("ledger opened") && !logged.contains("hunter"), "{logged}");
@@ -172,7 +175,7 @@ fn a_server_that_may_forget_is_warned_about() {
     ledger.open("run", terms(10)).expect("an account");
     ledger.open("walk", terms(10)).expect("an account");
 
-    // Keys are dropped only when there is a limit and a policy other than to refuse.
+    // The server evicts keys only with a memory limit and a policy that evicts.
     let careful: [&[&str]; 3] = [
         &["--appendonly", "yes"],
         &["--appendonly", "yes", "--maxmemory-policy", "allkeys-lru"],
@@ -198,7 +201,7 @@ fn the_keys_of_an_account_have_one_hash_tag_and_can_be_read() {
         ledger.open_leases(name, &[u64::MAX], 3).expect("leases");
         let charges =
             [charge(u64::MAX, 2, BOTH), charge(u64::MAX, 4, NEITHER), charge(9, 64, BOTH)];
-        ledger.charge(&[bill(name, &charges)]).remove(0).expect("paid");
+        ledger.charge(&[request(name, &charges)]).remove(0).expect("paid");
     }
     let mut connection = server.connection();
     let mut text = |command: &str, key: &str, field: &str| -> String {
@@ -214,27 +217,27 @@ fn the_keys_of_an_account_have_one_hash_tag_and_can_be_read() {
     }
 }
 
-/// Log lines of one thread.
+/// The log lines of one thread.
 #[derive(Clone, Default)]
 pub(crate) struct Log(Arc<Mutex<Vec<u8>>>);
 
 thread_local! {
-    /// Where this thread's log lines go.
-    static LISTENING: RefCell<Option<Log>> = const { RefCell::new(None) };
+    /// The log of this thread, if it collects one.
+    static CURRENT: RefCell<Option<Log>> = const { RefCell::new(None) };
 }
 
 impl Log {
-    /// One subscriber for all threads: with one for each, an event that another thread meets first, where nobody listens,
-    /// may be taken for one that nobody wants, here too.
+    /// Runs `call` and collects its log lines. All threads share one subscriber: with one for each, an event that first
+    /// occurs in a thread without a subscriber may be cached as disabled for all.
     pub(crate) fn of<T>(&self, call: impl FnOnce() -> T) -> T {
         static SUBSCRIBED: Once = Once::new();
         SUBSCRIBED.call_once(|| {
-            let writer = || LISTENING.with_borrow(|log| log.clone().unwrap_or_default());
+            let writer = || CURRENT.with_borrow(|log| log.clone().unwrap_or_default());
             tracing_subscriber::fmt().with_ansi(false).with_writer(writer).init();
         });
-        LISTENING.replace(Some(self.clone()));
+        CURRENT.replace(Some(self.clone()));
         let outcome = call();
-        LISTENING.replace(None);
+        CURRENT.replace(None);
         outcome
     }
 
@@ -253,15 +256,15 @@ impl Write for Log {
     }
 }
 
-/// A server that accepts and never answers is given up when the connection is made, too.
+/// Opening a connection to a server that accepts and never answers times out.
 #[test]
-fn a_port_where_nobody_answers_is_given_up() {
+fn a_silent_server_times_out() {
     let silent = std::net::TcpListener::bind("127.0.0.1:0").expect("a port");
     let url = format!("redis://{}", silent.local_addr().expect("an address"));
     let (send, receive) = std::sync::mpsc::sync_channel(1);
-    let open = move || send.send(RedisLedger::open(&url).map(drop)).expect("heard");
+    let open = move || send.send(RedisLedger::open(&url).map(drop)).expect("received");
     let opening = thread::spawn(open);
-    let outcome = receive.recv_timeout(Duration::from_secs(60)).expect("it does not wait for ever");
+    let outcome = receive.recv_timeout(Duration::from_secs(60)).expect("it times out");
     assert!(outcome.is_err());
     opening.join().expect("ended");
 }

@@ -1,13 +1,13 @@
-//! What a bill costs. Run with `cargo test --release -p tandem-teacher --test ledger -- --ignored --nocapture`.
+//! The time of a charge. Run with `cargo test --release -p tandem-teacher --test ledger -- --ignored --nocapture`.
 
 use std::time::Instant;
 
-use tandem_teacher::ledger::{Bill, Ledger, SqliteLedger};
+use tandem_teacher::ledger::{ChargeRequest, Ledger, SqliteLedger};
 
-use crate::place::{BOTH, Place, bill, charge, terms};
+use crate::fixture::{BOTH, TestLedger, charge, request, terms};
 
-/// Bills that are made in one call, and steps of each: as sixteen workers ask.
-const N_BILLS: u64 = 16;
+/// Requests of one call, as of sixteen workers.
+const N_REQUESTS: u64 = 16;
 
 #[expect(clippy::disallowed_methods, reason = "a measurement")]
 fn now() -> Instant {
@@ -17,27 +17,28 @@ fn now() -> Instant {
 /// 50 steps of 10,000 leased episodes, or fewer.
 fn measure(name: &str, ledger: &mut dyn Ledger, n_episodes: u64) {
     ledger.open("run", terms(1_000_000)).expect("an account");
-    let (mut charging, mut leasing, mut slowest_us, mut n_bills) = (0.0, 0.0, 0, 0_u32);
+    let (mut charging, mut leasing, mut slowest_us, mut n_requests) = (0.0, 0.0, 0, 0_u32);
     let mut calls_us = Vec::new();
-    for round in 0..n_episodes / (2 * N_BILLS) {
-        let episodes: Vec<u64> = (0..2 * N_BILLS).map(|idx| round * 2 * N_BILLS + idx).collect();
+    for round in 0..n_episodes / (2 * N_REQUESTS) {
+        let episodes: Vec<u64> =
+            (0..2 * N_REQUESTS).map(|idx| round * 2 * N_REQUESTS + idx).collect();
         let start = now();
         ledger.open_leases("run", &episodes, 50).expect("leases");
         leasing += start.elapsed().as_secs_f64();
         for step in 0..50 {
             let pair = |pair: &[u64]| {
                 let charges: Vec<_> = pair.iter().map(|e| charge(*e, step, BOTH)).collect();
-                bill("run", &charges)
+                request("run", &charges)
             };
-            let bills: Vec<Bill> = episodes.chunks(2).map(pair).collect();
+            let requests: Vec<ChargeRequest> = episodes.chunks(2).map(pair).collect();
             let start = now();
-            let outcomes = ledger.charge(&bills);
+            let outcomes = ledger.charge(&requests);
             let took = start.elapsed();
             assert!(outcomes.iter().all(Result::is_ok));
             charging += took.as_secs_f64();
             calls_us.push(took.as_micros());
             slowest_us = slowest_us.max(took.as_micros());
-            n_bills += 16;
+            n_requests += 16;
         }
         let start = now();
         ledger.settle("run", &episodes).expect("settled");
@@ -46,51 +47,51 @@ fn measure(name: &str, ledger: &mut dyn Ledger, n_episodes: u64) {
     calls_us.sort_unstable();
     let at = |share: usize| calls_us[calls_us.len() * share / 100];
     println!(
-        "{name}: {:.1} us a bill of 2 steps, a call of 16 p50 {} p99 {} max {slowest_us} us; a round's leases and settlement {:.0} us",
-        charging * 1e6 / f64::from(n_bills),
+        "{name}: {:.1} us a request of 2 steps, a call of 16 p50 {} p99 {} max {slowest_us} us; a round's leases and settlement {:.0} us",
+        charging * 1e6 / f64::from(n_requests),
         at(50),
         at(99),
-        leasing * 1e6 / f64::from(n_bills) * 16.0 * 50.0,
+        leasing * 1e6 / f64::from(n_requests) * 16.0 * 50.0,
     );
 }
 
 #[test]
 #[ignore = "a measurement"]
-fn a_bill() {
-    measure("memory", Place::memory().ledger(), 10_016);
-    measure("sqlite", Place::sqlite().ledger(), 10_016);
-    if let Some(mut place) = Place::redis() {
-        measure("redis", place.ledger(), 1_600);
+fn a_request() {
+    measure("memory", TestLedger::memory().ledger(), 10_016);
+    measure("sqlite", TestLedger::sqlite().ledger(), 10_016);
+    if let Some(mut fixture) = TestLedger::redis() {
+        measure("redis", fixture.ledger(), 1_600);
     }
 }
 
-/// One bill a call: a single client, which waits for every answer.
+/// One request in each call: a single client, which waits for every answer.
 fn measure_alone(name: &str, ledger: &mut dyn Ledger) {
     ledger.open("alone", terms(1_000_000)).expect("an account");
     let mut calls_us = Vec::new();
     for first in (0..4_000).step_by(2) {
         ledger.open_leases("alone", &[first, first + 1], 5).expect("leases");
         for step in 0..5 {
-            let bills =
-                [bill("alone", &[charge(first, step, BOTH), charge(first + 1, step, BOTH)])];
+            let requests =
+                [request("alone", &[charge(first, step, BOTH), charge(first + 1, step, BOTH)])];
             let start = now();
-            let outcomes = ledger.charge(&bills);
+            let outcomes = ledger.charge(&requests);
             calls_us.push(start.elapsed().as_micros());
             assert!(outcomes.iter().all(Result::is_ok));
         }
     }
     calls_us.sort_unstable();
     let at = |share: usize| calls_us[calls_us.len() * share / 100];
-    println!("{name}: a call with 1 bill of 2 steps p50 {} p99 {} us", at(50), at(99));
+    println!("{name}: a call with 1 request of 2 steps p50 {} p99 {} us", at(50), at(99));
 }
 
 #[test]
 #[ignore = "a measurement"]
-fn a_bill_alone() {
-    measure_alone("memory", Place::memory().ledger());
-    measure_alone("sqlite", Place::sqlite().ledger());
-    if let Some(mut place) = Place::redis() {
-        measure_alone("redis", place.ledger());
+fn a_request_alone() {
+    measure_alone("memory", TestLedger::memory().ledger());
+    measure_alone("sqlite", TestLedger::sqlite().ledger());
+    if let Some(mut fixture) = TestLedger::redis() {
+        measure_alone("redis", fixture.ledger());
     }
 }
 
@@ -109,7 +110,7 @@ fn a_file_with_100_000_episodes() {
         let charges: Vec<_> = (first..first + 1_000).map(|e| charge(e, 1, BOTH)).collect();
         let episodes: Vec<u64> = charges.iter().map(|charge| charge.episode).collect();
         ledger.open_leases("run", &episodes, 3).expect("leases");
-        ledger.charge(&[bill("run", &charges)]).remove(0).expect("paid");
+        ledger.charge(&[request("run", &charges)]).remove(0).expect("paid");
     }
     drop(ledger);
     let start = now();

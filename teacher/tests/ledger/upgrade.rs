@@ -5,54 +5,56 @@ use std::path::{Path, PathBuf};
 
 use rusqlite::Connection;
 use tandem_teacher::Strategy;
-use tandem_teacher::budget::{Balance, Lease, Terms, Verdict};
+use tandem_teacher::budget::{AccountTerms, Balance, Lease};
 use tandem_teacher::ledger::{Ledger, MemoryLedger, OpenError, SqliteLedger};
 use tempfile::TempDir;
 
-use crate::place::{BOTH, NEITHER, bill, charge, terms};
+use crate::fixture::{BOTH, NEITHER, Verdict, charge, request, terms};
 
 const LEASED: &str = "leased";
 const FREE: &str = "free \"quoted\"\n\u{1b}[31m";
 
-/// Makes the books of `tests/data/ledger-v1.sqlite`: leases that are open, settled and exhausted, episodes without a
-/// lease, numbers beyond 2^63, steps beyond the first word, and a name with quotes and control characters.
+/// Repeats the operations that created `tests/data/ledger-v1.sqlite`: leases that are open, settled and exhausted,
+/// episodes without a lease, numbers beyond 2^63, steps beyond the first word, and a name with quotes and control
+/// characters.
 fn play(ledger: &mut dyn Ledger) {
     ledger.open(LEASED, terms(100)).expect("an account");
-    let free = Terms { budget: 12, strategy: Strategy::MistakeQ { threshold: 0.05 } };
+    let free = AccountTerms { budget: 12, strategy: Strategy::MistakeQ { threshold: 0.05 } };
     ledger.open(FREE, free).expect("an account");
     ledger.open_leases(LEASED, &[0, 1, 2, u64::MAX], 15).expect("leases");
     for step in 0..20 {
-        let wish = if step % 3 == 0 { NEITHER } else { BOTH };
+        let wanted = if step % 3 == 0 { NEITHER } else { BOTH };
         let charges =
-            [charge(0, step, BOTH), charge(1, step, wish), charge(u64::MAX, 49 - step, wish)];
-        let free = [charge(7, 5 * step, wish), charge(1 << 63, step, BOTH)];
-        let outcomes = ledger.charge(&[bill(LEASED, &charges), bill(FREE, &free)]);
+            [charge(0, step, BOTH), charge(1, step, wanted), charge(u64::MAX, 49 - step, wanted)];
+        let free = [charge(7, 5 * step, wanted), charge(1 << 63, step, BOTH)];
+        let outcomes = ledger.charge(&[request(LEASED, &charges), request(FREE, &free)]);
         assert!(outcomes.iter().all(Result::is_ok));
     }
     ledger.settle(LEASED, &[0, u64::MAX]).expect("settled");
 }
 
-/// Makes what only the write-ahead log beside the file has.
+/// Repeats the operations that only its write-ahead log contains.
 fn play_on(ledger: &mut dyn Ledger) {
     ledger.open_leases(LEASED, &[3], 15).expect("leases");
-    ledger.charge(&[bill(LEASED, &[charge(3, 1, BOTH)])]).remove(0).expect("paid");
+    ledger.charge(&[request(LEASED, &[charge(3, 1, BOTH)])]).remove(0).expect("paid");
 }
 
-/// The answers to questions about everything that [`play`] touched, and about steps that are new.
-fn ask(ledger: &mut dyn Ledger) -> (Vec<Verdict>, Vec<Lease>, [Balance; 2]) {
+/// Returns the answers to requests for all steps and leases of [`play`], and for new ones.
+fn answers_of(ledger: &mut dyn Ledger) -> (Vec<Verdict>, Vec<Lease>, [Balance; 2]) {
     let steps = |episodes: &[u64]| {
         let steps = episodes.iter().flat_map(|episode| (0..50).map(|step| (*episode, step)));
         steps.map(|(episode, step)| charge(episode, step, BOTH)).collect::<Vec<_>>()
     };
-    let bills = [bill(LEASED, &steps(&[0, 1, 2, 3, u64::MAX])), bill(FREE, &steps(&[7, 1 << 63]))];
-    let receipts = ledger.charge(&bills).into_iter().map(|outcome| outcome.expect("paid"));
-    let verdicts = receipts.flat_map(|receipt| receipt.verdicts).collect();
+    let requests =
+        [request(LEASED, &steps(&[0, 1, 2, 3, u64::MAX])), request(FREE, &steps(&[7, 1 << 63]))];
+    let results = ledger.charge(&requests).into_iter().map(|outcome| outcome.expect("paid"));
+    let verdicts = results.flat_map(|result| result.verdicts).collect();
     let leases = ledger.open_leases(LEASED, &[0, 1, 2, 3, 4, u64::MAX], 15).expect("leases").0;
     let balances = [LEASED, FREE].map(|name| ledger.balance(name).expect("an account"));
     (verdicts, leases, balances)
 }
 
-/// A copy of the ledger as a killed teacher of version 1 left it, log included.
+/// Copies the ledger and the log that a killed teacher of version 1 left.
 fn copy() -> (TempDir, PathBuf) {
     let data = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data");
     let directory = tempfile::tempdir().expect("a directory");
@@ -69,7 +71,7 @@ fn version(path: &Path) -> i64 {
 }
 
 #[test]
-fn a_ledger_of_version_1_is_upgraded_and_keeps_its_books() {
+fn a_ledger_of_version_1_is_upgraded_and_keeps_its_accounts() {
     let (_directory, path) = copy();
     let mut model = MemoryLedger::default();
     play(&mut model);
@@ -78,12 +80,12 @@ fn a_ledger_of_version_1_is_upgraded_and_keeps_its_books() {
     let expected = [LEASED, FREE].map(|name| model.balance(name).expect("an account"));
     let balances = [LEASED, FREE].map(|name| ledger.balance(name).expect("an account"));
     assert_eq!(balances, expected);
-    let answers = ask(&mut ledger);
-    assert_eq!(answers, ask(&mut model));
+    let answers = answers_of(&mut ledger);
+    assert_eq!(answers, answers_of(&mut model));
     drop(ledger);
     assert_eq!(version(&path), 2);
     let mut again = SqliteLedger::open(&path).expect("a ledger");
-    assert_eq!(ask(&mut again), answers);
+    assert_eq!(answers_of(&mut again), answers);
 }
 
 #[test]

@@ -1,4 +1,4 @@
-//! The ways of the tools, planned and measured, as lines.
+//! The paths of the tools, planned and measured, as lines.
 
 use foxglove::messages::{
     Color, LinePrimitive, Point3, Pose, SceneEntity, SpherePrimitive, Timestamp, Vector3,
@@ -7,24 +7,24 @@ use foxglove::messages::{
 
 use super::{NO_ROTATION, WORLD, color_of};
 
-/// Displacement of a tool after which its line has another point, metres.
+/// Minimum distance between the points of a line, metres.
 const SPACING_M: f64 = 0.005;
-/// Points of a line; every look repeats them, so a longer way is drawn with fewer points for its length.
+/// Maximum number of points of a line. Every snapshot repeats them, so the points of a longer path are further apart.
 const MAX_POINTS: usize = 256;
 const PLANNED_TOOL_RADIUS_M: f64 = 0.012;
 const PLANNED_TOOL_ALPHA: f64 = 0.4;
 
-/// How one kind of line looks.
-struct Look {
+/// Style of a kind of line.
+struct LineStyle {
     name: &'static str,
     thickness_px: f64,
     alpha: f64,
 }
 
-const PLANNED: Look = Look { name: "planned", thickness_px: 1.5, alpha: 0.55 };
-const MEASURED: Look = Look { name: "measured", thickness_px: 4.0, alpha: 1.0 };
+const PLANNED: LineStyle = LineStyle { name: "planned", thickness_px: 1.5, alpha: 0.55 };
+const MEASURED: LineStyle = LineStyle { name: "measured", thickness_px: 4.0, alpha: 1.0 };
 
-/// The tools' ways so far, arm by arm.
+/// Paths of the tools so far, in arm order.
 pub(crate) struct Trails {
     planned: Vec<Trail>,
     measured: Vec<Trail>,
@@ -36,47 +36,50 @@ impl Trails {
         Self { planned: empty(), measured: empty() }
     }
 
-    /// Goes on to where the tools are now (world, metres); a slice without a place for an arm leaves that line as it is.
-    pub(crate) fn go_on(&mut self, planned: &[[f64; 3]], measured: &[[f64; 3]]) {
+    /// Extends the paths to the present positions of the tools (world, metres).
+    ///
+    /// The path of an arm that a slice does not contain stays as it is.
+    pub(crate) fn extend(&mut self, planned: &[[f64; 3]], measured: &[[f64; 3]]) {
         for (trails, tools) in [(&mut self.planned, planned), (&mut self.measured, measured)] {
             for (trail, tool) in trails.iter_mut().zip(tools) {
-                trail.go_on(*tool);
+                trail.extend(*tool);
             }
         }
     }
 
-    /// The lines `planned{i}`, thin and pale, and `measured{i}`, thick, and a ball where the motion has each tool now.
+    /// Returns the lines `planned{i}`, thin and pale, and `measured{i}`, thick, and a sphere at the planned position of
+    /// each tool.
     pub(crate) fn entities(&self, planned: &[[f64; 3]], stamp: Timestamp) -> Vec<SceneEntity> {
         let lines = [(&self.planned, PLANNED), (&self.measured, MEASURED)];
         let mut entities: Vec<SceneEntity> = lines
             .into_iter()
-            .flat_map(|(trails, look)| {
+            .flat_map(|(trails, style)| {
                 let trails = trails.iter().enumerate();
                 trails.map(move |(i, trail)| SceneEntity {
-                    lines: vec![trail.line(&look, i)],
-                    ..entity(format!("{}{i}", look.name), stamp)
+                    lines: vec![trail.line(&style, i)],
+                    ..entity(format!("{}{i}", style.name), stamp)
                 })
             })
             .collect();
         for (i, entity) in entities.iter_mut().take(self.planned.len()).enumerate() {
-            entity.spheres = planned.get(i).map(|tool| ball(*tool, i)).into_iter().collect();
+            entity.spheres = planned.get(i).map(|tool| sphere(*tool, i)).into_iter().collect();
         }
         entities
     }
 }
 
-/// The way of one tool.
+/// The path of one tool.
 #[derive(Default)]
 struct Trail {
-    /// Apart from each other by [`SPACING_M`] or a multiple of it.
+    /// At least [`SPACING_M`] times a power of two apart.
     points: Vec<[f64; 3]>,
     last: Option<[f64; 3]>,
-    /// How often every other point was left out.
+    /// How often every other point was removed.
     n_halved: u32,
 }
 
 impl Trail {
-    fn go_on(&mut self, tool: [f64; 3]) {
+    fn extend(&mut self, tool: [f64; 3]) {
         self.last = Some(tool);
         let spacing_m = SPACING_M * f64::from(1_u32 << self.n_halved.min(20));
         let is_near = |point: &[f64; 3]| distance_m(point, &tool) < spacing_m;
@@ -94,8 +97,8 @@ impl Trail {
         }
     }
 
-    /// The points and, at the end, where the tool is.
-    fn line(&self, look: &Look, arm: usize) -> LinePrimitive {
+    /// Returns the points and the present position as a line.
+    fn line(&self, style: &LineStyle, arm: usize) -> LinePrimitive {
         let point = |[x, y, z]: [f64; 3]| Point3 { x, y, z };
         LinePrimitive {
             r#type: Type::LineStrip.into(),
@@ -103,16 +106,16 @@ impl Trail {
                 position: Some(Vector3 { x: 0.0, y: 0.0, z: 0.0 }),
                 orientation: Some(NO_ROTATION),
             }),
-            thickness: look.thickness_px,
+            thickness: style.thickness_px,
             scale_invariant: true,
             points: self.points.iter().copied().chain(self.last).map(point).collect(),
-            color: Some(Color { a: look.alpha, ..color_of(arm) }),
+            color: Some(Color { a: style.alpha, ..color_of(arm) }),
             ..LinePrimitive::default()
         }
     }
 }
 
-fn ball(centre: [f64; 3], arm: usize) -> SpherePrimitive {
+fn sphere(centre: [f64; 3], arm: usize) -> SpherePrimitive {
     let [x, y, z] = centre;
     let diameter_m = 2.0 * PLANNED_TOOL_RADIUS_M;
     SpherePrimitive {
@@ -135,10 +138,10 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_line_of_any_length_has_few_points_and_ends_where_the_tool_is() {
+    fn a_line_of_any_length_has_few_points_and_ends_at_the_tool() {
         let mut trail = Trail::default();
         for step in 0..100_000_u32 {
-            trail.go_on([f64::from(step) * 1e-4, 0.0, 0.0]);
+            trail.extend([f64::from(step) * 1e-4, 0.0, 0.0]);
             assert!(trail.points.len() <= MAX_POINTS);
         }
         let line = trail.line(&MEASURED, 0);
@@ -150,15 +153,15 @@ mod tests {
     }
 
     #[test]
-    fn an_arm_that_stands_adds_no_points() {
+    fn an_arm_at_rest_adds_no_points() {
         let mut trails = Trails::new(2);
         for _ in 0..50 {
-            trails.go_on(&[], &[[0.1, 0.2, 0.3], [0.4, 0.5, 0.6]]);
+            trails.extend(&[], &[[0.1, 0.2, 0.3], [0.4, 0.5, 0.6]]);
         }
         let n_points = |id: &str| {
             let entities = trails.entities(&[], Timestamp::new(0, 0));
-            let found = entities.iter().find(|entity| entity.id == id).unwrap();
-            found.lines[0].points.len()
+            let entity = entities.iter().find(|entity| entity.id == id).unwrap();
+            entity.lines[0].points.len()
         };
         assert_eq!(["planned0", "planned1", "measured0", "measured1"].map(n_points), [0, 0, 2, 2]);
     }

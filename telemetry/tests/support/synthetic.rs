@@ -1,4 +1,4 @@
-//! A made-up episode of two arms that push: smooth motion, plausible bodies, no physics.
+//! A synthetic episode of two arms that push: smooth motion and plausible bodies without physics.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -26,7 +26,7 @@ pub(crate) fn metadata() -> EpisodeMetadata {
     }
 }
 
-/// The world at `progress` of the episode, 0 to 1.
+/// Returns the scene at `progress` of the episode, 0 to 1.
 pub(crate) fn scene(progress: f32) -> Scene {
     let arm_at = |side: f32| {
         let hand =
@@ -50,7 +50,7 @@ pub(crate) fn scene(progress: f32) -> Scene {
     }
 }
 
-/// Steps of a made-up episode; every number differs, so that none can be mistaken for another.
+/// Returns the steps of the episode. All numbers differ, so that a test detects swapped ones.
 pub(crate) fn transitions() -> Vec<LoggedTransition> {
     let numbers = |step: u32, offset: f32, n: usize| -> Vec<f32> {
         (0_u8..)
@@ -84,13 +84,13 @@ pub(crate) fn last_observation() -> Vec<f32> {
     vec![0.25; LAYOUT.n_observation()]
 }
 
-/// A recorder that has taken the whole episode and a line of text.
+/// Returns a recorder with the whole episode and a log line.
 pub(crate) fn recorded(path: &Path) -> Result<EpisodeRecorder, Error> {
     let mut recorder = EpisodeRecorder::create(path, &metadata())?;
     for (step, transition) in (0..).zip(transitions()) {
         recorder.record_step(&scene(step as f32 / N_STEPS as f32), &record(step, &transition))?;
     }
-    recorder.log("a made-up episode")?;
+    recorder.log("a synthetic episode")?;
     recorder.record_outcome(&scene(1.0), &last_observation())?;
     Ok(recorder)
 }
@@ -125,7 +125,8 @@ fn advice(step: u32, overridden: bool) -> ArmAdvice {
     }
 }
 
-/// An arm whose hand points down at `hand`: shoulder and elbow in the plane through base and hand.
+/// Returns an arm with its hand at `hand`, pointing down. Shoulder and elbow are in the vertical plane of base and
+/// hand.
 fn arm(base: Point, hand: Point) -> ArmScene {
     let (upper_m, lower_m) = (0.41_f32, 0.38_f32);
     let shoulder = [base[0], base[1], base[2] + 0.27];

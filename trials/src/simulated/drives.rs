@@ -6,7 +6,7 @@ use std::collections::VecDeque;
 use rand_chacha::ChaCha8Rng;
 use tandem_core::Contacts;
 use tandem_core::rng::index;
-use tandem_kinematics::{ArmModel, Cell, Gaps, Joints};
+use tandem_kinematics::{ArmModel, Gaps, Joints, WorkCell};
 
 use crate::simulated::config::{Disturbance, N_SUBSTEPS, PERIOD_S, SimulatedConfig};
 use tandem_bridge::driver::{ArmCommand, Command, Order, SILENCE_S};
@@ -55,7 +55,7 @@ struct PendingCommand {
 }
 
 impl Drives {
-    pub(crate) fn new(cell: &Cell, at: &[Joints], opening: f64, rng: ChaCha8Rng) -> Self {
+    pub(crate) fn new(cell: &WorkCell, at: &[Joints], opening: f64, rng: ChaCha8Rng) -> Self {
         let arm = |(placed, at): (&tandem_kinematics::PlacedArm, &Joints)| {
             let zero = Joints::from_fn(at.len(), |_| 0.0);
             let model = placed.model;
@@ -147,7 +147,7 @@ impl Drives {
     /// Simulates a physics step with the grippers at `openings` (0 to 1) and external torques `torques_nm`.
     pub(crate) fn step(
         &mut self,
-        cell: &Cell,
+        cell: &WorkCell,
         config: &SimulatedConfig,
         disturbance: &Disturbance,
         openings: &[f64],
@@ -170,7 +170,7 @@ impl Drives {
     /// Holds arms in place that would penetrate each other, the table or themselves more deeply.
     fn keep_apart(
         &mut self,
-        cell: &Cell,
+        cell: &WorkCell,
         config: &SimulatedConfig,
         openings: &[f64],
         before: &[Joints],

@@ -337,7 +337,7 @@ mod tests {
     #[test]
     fn the_pads_stay_within_the_capsule_of_the_fingers() {
         let fingers = &MICO_4.links[MICO_4.links.len() - 1];
-        let [from, to] = [0, 1].map(|end| fingers.ends[end].offset_m);
+        let [from, to] = [0, 1].map(|end| DVec3::from(fingers.ends[end].offset_m));
         let middle = 0.5 * (from + to);
         for opening in [0.0_f32, 0.25, 0.5, 0.75, 1.0] {
             let share = fingers.shut_share + f64::from(opening) * (1.0 - fingers.shut_share);

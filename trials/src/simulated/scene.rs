@@ -4,14 +4,14 @@ use glam::DVec3;
 use rapier3d::math::{Pose, Rotation, Vector};
 use tandem_core::scene::{ArmScene, Capsule, Cuboid, Point, Scene};
 use tandem_kinematics::model::Anchor;
-use tandem_kinematics::{Cell, Joints, PlacedArm, Posture};
+use tandem_kinematics::{ForwardKinematics, Joints, PlacedArm, WorkCell};
 
 use crate::simulated::config::Block;
 use crate::simulated::physics::{PhysicsWorld, TABLE_HALF_M};
 
 /// Returns the scene with the arms at joint angles `angles` (radians) at `time_s`, without goals.
 pub(crate) fn scene(
-    cell: &Cell,
+    cell: &WorkCell,
     angles: &[Joints],
     world: &PhysicsWorld,
     blocks: &[Block],
@@ -32,9 +32,10 @@ pub(crate) fn scene(
 }
 
 fn arm_scene(placed: &PlacedArm, angles: &Joints, hand: [(Pose, Vector); 3]) -> ArmScene {
-    let posture = Posture::of(placed.model, angles);
-    let point = |anchor: &Anchor| single(placed.world_from_base(posture.anchor(anchor)));
-    let origin = |frame| point(&Anchor { frame, offset_m: DVec3::ZERO });
+    let posture = ForwardKinematics::new(placed.model, angles);
+    let point =
+        |anchor: &Anchor| single((placed.world_from_base() * posture.anchor_m(anchor)).into());
+    let origin = |frame| point(&Anchor::origin_of(frame));
     let links = placed.model.links.iter().map(|link| Capsule {
         from: point(&link.ends[0]),
         to: point(&link.ends[1]),
@@ -42,7 +43,7 @@ fn arm_scene(placed: &PlacedArm, angles: &Joints, hand: [(Pose, Vector); 3]) -> 
     });
     let n_joints = angles.len();
     ArmScene {
-        base: single(placed.base_in_world_m),
+        base: single(placed.base_in_world_m.into()),
         joint_angles_rad: std::array::from_fn(|joint| angles.get(joint).copied().unwrap_or(0.0)),
         joint_points: (0..=n_joints + 1).map(origin).collect(),
         links: links.collect(),

@@ -3,7 +3,7 @@
 use glam::{DVec3, EulerRot};
 use tandem_core::ArmIndex;
 use tandem_core::layout::{EPISODE_STEPS, GOAL_TOLERANCE_M};
-use tandem_kinematics::{ArmWayPoint, Cell, Joints, Posture, ReachError, WayPoint};
+use tandem_kinematics::{ArmWaypoint, ForwardKinematics, Joints, ReachError, Waypoint, WorkCell};
 
 use crate::simulated::{MAX_OPENING_M, ObjectPose};
 use crate::trial::ActionSource;
@@ -62,7 +62,7 @@ struct LoopState {
     /// The number of consecutive observations with every object at its goal.
     n_done: usize,
     /// The waypoints of the tools so far.
-    way_points: Vec<WayPoint>,
+    way_points: Vec<Waypoint>,
 }
 
 impl TrialRunner {
@@ -175,10 +175,13 @@ impl TrialRunner {
             openings_m.iter().map(|opening_m| self.mapping.opening(*opening_m)).collect()
         };
         let here = tool_positions(cell, &state.at);
-        let first: WayPoint = here
+        let first: Waypoint = here
             .iter()
             .zip(openings(&state.openings_m))
-            .map(|(tool, opening)| ArmWayPoint { tool_in_world_m: *tool, opening })
+            .map(|(tool, opening)| ArmWaypoint {
+                tool_in_world_m: (*tool).into(),
+                gripper_opening: opening,
+            })
             .collect();
         let openings_m: Vec<f64> = wanted.iter().map(|(_, opening_m)| *opening_m).collect();
         for (attempt, parts) in ATTEMPTS.iter().enumerate() {
@@ -223,17 +226,17 @@ impl TrialRunner {
         openings_m: &[f64],
         state: &LoopState,
         blocks: &[ObservedBlock],
-    ) -> Result<[WayPoint; 3], ReachError> {
-        let mut step: [WayPoint; 3] = Default::default();
+    ) -> Result<[Waypoint; 3], ReachError> {
+        let mut step: [Waypoint; 3] = Default::default();
         for (arm, placed) in self.mapping.cell().arms.iter().enumerate() {
             let (idx, near) = (ArmIndex(arm), &state.at[arm]);
             let [before, opening] = [state.openings_m[arm], openings_m[arm]]
                 .map(|opening_m| self.mapping.opening(opening_m));
             let [from, to] = [from, to].map(|own| self.mapping.pads_in_world(idx, own[arm]));
             let (_, then) = self.mapping.tool_for_pads(idx, to, near)?;
-            let tilt_rad = |angles| Posture::of(placed.model, angles).tilt_rad();
+            let tilt_rad = |angles| ForwardKinematics::new(placed.model, angles).tilt_rad();
             let pads = Pads {
-                yaw_rad: placed.yaw_rad + Cell::FINGERS_YAW_RAD,
+                yaw_rad: placed.yaw_rad + WorkCell::FINGERS_YAW_RAD,
                 opening_m: before * f64::from(MAX_OPENING_M),
                 tilt_rad: tilt_rad(near).max(tilt_rad(&then)),
             };
@@ -246,7 +249,10 @@ impl TrialRunner {
             let points = [corner, end, end];
             for ((way_point, point), opening) in step.iter_mut().zip(points).zip(openings) {
                 let (tool_in_world_m, _) = self.mapping.tool_for_pads(idx, point, near)?;
-                way_point.push(ArmWayPoint { tool_in_world_m, opening });
+                way_point.push(ArmWaypoint {
+                    tool_in_world_m: tool_in_world_m.into(),
+                    gripper_opening: opening,
+                });
             }
         }
         Ok(step)
@@ -255,7 +261,7 @@ impl TrialRunner {
 
 impl LoopState {
     /// Appends a step's waypoints. The first one is the previous position of the tools.
-    fn append_waypoints(&mut self, step: [WayPoint; 4]) {
+    fn append_waypoints(&mut self, step: [Waypoint; 4]) {
         let n_known = usize::from(!self.way_points.is_empty());
         self.way_points.extend(step.into_iter().skip(n_known));
     }
@@ -267,9 +273,9 @@ impl LoopState {
     }
 }
 
-fn is_still(from: &WayPoint, to: &WayPoint) -> bool {
+fn is_still(from: &Waypoint, to: &Waypoint) -> bool {
     from.iter().zip(to).all(|(from, to)| {
-        (from.tool_in_world_m - to.tool_in_world_m).length() < STILL_M
-            && (from.opening - to.opening).abs() < STILL_OPENING
+        (from.tool_in_world_m - to.tool_in_world_m).norm() < STILL_M
+            && (from.gripper_opening - to.gripper_opening).abs() < STILL_OPENING
     })
 }

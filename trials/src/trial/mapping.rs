@@ -15,7 +15,7 @@
 
 use glam::{DQuat, DVec3};
 use tandem_core::{ArmIndex, Layout, Task};
-use tandem_kinematics::{Cell, Joints, PlacedArm, ReachError, TaskFrame};
+use tandem_kinematics::{Joints, PlacedArm, ReachError, TaskFrame, WorkCell};
 
 use crate::simulated::{Block, MAX_OPENING_M, ObjectPose};
 
@@ -52,9 +52,9 @@ const TILT_ROUNDS: usize = 4;
 /// The mapping of a policy's world into a work cell.
 #[derive(Debug, Clone)]
 pub struct Mapping {
-    cell: Cell,
+    cell: WorkCell,
     /// Work cells with one arm each, for the gaps to the table.
-    alone: Vec<Cell>,
+    alone: Vec<WorkCell>,
     layout: Layout,
     block_half_m: f64,
 }
@@ -77,24 +77,25 @@ pub struct ArmObservation {
 impl Mapping {
     /// Creates the mapping of the world of `layout`, with blocks like `block`, into `cell`.
     #[must_use]
-    pub fn new(cell: Cell, layout: Layout, block: &Block) -> Self {
+    pub fn new(cell: WorkCell, layout: Layout, block: &Block) -> Self {
         let task_frame = TaskFrame { scale: 1.0, lift_m: 0.0, ..cell.task_frame };
-        let cell = Cell { task_frame, ..cell };
-        let alone = |arm: &PlacedArm| Cell { arms: vec![*arm], ..cell.clone() };
+        let cell = WorkCell { task_frame, ..cell };
+        let alone = |arm: &PlacedArm| WorkCell { arms: vec![*arm], ..cell.clone() };
         let alone = cell.arms.iter().map(alone).collect();
         Self { cell, alone, layout, block_half_m: f64::from(block.half_m) }
     }
 
     /// The work cell, with the table as the origin of heights.
     #[must_use]
-    pub fn cell(&self) -> &Cell {
+    pub fn cell(&self) -> &WorkCell {
         &self.cell
     }
 
     /// Converts the position of an object or goal from the own frame of `arm` to the world frame, metres.
     #[must_use]
     pub fn object_in_world(&self, arm: ArmIndex, own: DVec3) -> DVec3 {
-        self.cell.world_from_own(arm, own + DVec3::Z * (self.block_half_m - TRAINED_HALF_M))
+        let own = own + DVec3::Z * (self.block_half_m - TRAINED_HALF_M);
+        self.cell.world_from_own(arm, &own.into()).into()
     }
 
     /// Converts the position of an object or goal from the world frame to the own frame of `arm`, metres.
@@ -121,7 +122,7 @@ impl Mapping {
     /// Converts an end effector at `own` (own frame of `arm`) to the point between the pads, world frame, metres.
     #[must_use]
     pub fn pads_in_world(&self, arm: ArmIndex, own: DVec3) -> DVec3 {
-        self.cell.world_from_own(arm, own + DVec3::Z * HAND_LIFT_M)
+        self.cell.world_from_own(arm, &(own + DVec3::Z * HAND_LIFT_M).into()).into()
     }
 
     /// As [`tool_in_world`](Self::tool_in_world), for a point between the pads in the world frame, metres.
@@ -138,7 +139,7 @@ impl Mapping {
         let mut tool = pads + DVec3::Z * PADS_AHEAD_M;
         let mut angles = *near;
         for _ in 0..TILT_ROUNDS {
-            angles = placed.model.nearest(&placed.target(tool), near)?.angles;
+            angles = placed.model.inverse_kinematics(&placed.target(&tool.into()), near)?.angles;
             let gap_m = self.alone[arm.0].gaps(&[angles]).table_m[0];
             pads.z += (TABLE_GAP_M - gap_m).max(0.0);
             tool = pads - pointing(placed, &angles) * PADS_AHEAD_M;
@@ -150,8 +151,8 @@ impl Mapping {
     #[must_use]
     pub fn hand_in_own(&self, arm: ArmIndex, angles: &Joints) -> DVec3 {
         let placed = &self.cell.arms[arm.0];
-        let posture = tandem_kinematics::Posture::of(placed.model, angles);
-        let tool = placed.world_from_base(posture.tool().origin_m);
+        let posture = tandem_kinematics::ForwardKinematics::new(placed.model, angles);
+        let tool = DVec3::from(placed.world_from_base() * posture.tool_m());
         let pads = tool + pointing(placed, angles) * PADS_AHEAD_M;
         self.own(arm, pads) - DVec3::Z * HAND_LIFT_M
     }
@@ -235,8 +236,9 @@ impl Mapping {
     }
 
     fn own(&self, arm: ArmIndex, in_world: DVec3) -> DVec3 {
-        let in_base = self.cell.arms[arm.0].base_from_world(in_world);
-        self.cell.task_frame.own_from_base(in_base)
+        let in_base =
+            self.cell.arms[arm.0].world_from_base().inverse_transform_point(&in_world.into());
+        self.cell.task_frame.own_from_base(&in_base).into()
     }
 }
 
@@ -278,5 +280,6 @@ pub fn write_observation(now: &ArmObservation, before: &ArmObservation, observat
 
 /// The direction of a gripper, world frame.
 fn pointing(placed: &PlacedArm, angles: &Joints) -> DVec3 {
-    placed.axes() * tandem_kinematics::Posture::of(placed.model, angles).tool().axes.z_axis
+    let posture = tandem_kinematics::ForwardKinematics::new(placed.model, angles);
+    (placed.world_from_base() * posture.pointing()).into()
 }

@@ -2,8 +2,8 @@
 
 use glam::DVec3;
 use tandem_core::layout::EPISODE_STEPS;
-use tandem_core::{ArmIndex, Contacts, Layout, Stream, Task, episode_rng};
-use tandem_sim::{Env, SimError, Starts, WorldConfig};
+use tandem_core::{ArmIndex, Contacts, Layout, Stream, Task, WorldSettings, episode_rng};
+use tandem_sim::{Env, SimError, WorldConfig};
 
 use crate::simulated::Block;
 use crate::trial::mapping::{OPENING_M, TRAINED_HALF_M};
@@ -75,7 +75,7 @@ impl Rehearsal {
     pub fn start(&mut self, seed: u64, number: u64) -> Result<TrialStart, TrialError> {
         let mut rng = episode_rng(seed, number, Stream::Reset);
         for _ in 0..N_DRAWS {
-            self.env.reset(&mut rng, Starts::default());
+            self.env.reset(&mut rng, WorldSettings::default());
             let start = self.current_start();
             if self.has_room(&start) {
                 return Ok(start);

@@ -3,7 +3,7 @@
 use glam::DVec3;
 use tandem_core::scene::Scene;
 use tandem_core::{ArmIndex, Contacts};
-use tandem_kinematics::{Cell, Joints, Motion, Posture};
+use tandem_kinematics::{ForwardKinematics, Joints, Motion, WorkCell};
 
 use crate::simulated::{ObjectPose, PERIOD_S, SimulatedPair};
 use crate::trial::outcome::{FailureCause, MotionRefusal};
@@ -20,7 +20,7 @@ const FRAME_PERIODS: u64 = 4;
 /// The arms of a trial and its measurements.
 pub(crate) struct TrialRig<'a> {
     executor: Executor<SimulatedPair>,
-    cell: Cell,
+    cell: WorkCell,
     observer: &'a mut dyn TrialObserver,
     goals: Vec<DVec3>,
     n_periods: u64,
@@ -35,7 +35,7 @@ pub(crate) struct TrialRig<'a> {
 impl<'a> TrialRig<'a> {
     /// Resets the arms of `pair`. `goals` (world frame, metres) only appear in the frames.
     pub(crate) fn new(
-        cell: Cell,
+        cell: WorkCell,
         pair: SimulatedPair,
         goals: Vec<DVec3>,
         observer: &'a mut dyn TrialObserver,
@@ -160,10 +160,10 @@ impl<'a> TrialRig<'a> {
 }
 
 /// Returns the positions of the tools at joint angles `angles` (radians), world frame, metres.
-pub(crate) fn tool_positions(cell: &Cell, angles: &[Joints]) -> Vec<DVec3> {
+pub(crate) fn tool_positions(cell: &WorkCell, angles: &[Joints]) -> Vec<DVec3> {
     let arms = cell.arms.iter().zip(angles);
     arms.map(|(placed, angles)| {
-        placed.world_from_base(Posture::of(placed.model, angles).tool().origin_m)
+        (placed.world_from_base() * ForwardKinematics::new(placed.model, angles).tool_m()).into()
     })
     .collect()
 }

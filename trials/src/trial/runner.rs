@@ -3,7 +3,7 @@
 use glam::DVec3;
 use tandem_core::ArmIndex;
 use tandem_kinematics::{
-    ArmWayPoint, CheckSettings, Joints, Motion, PlanSettings, WayPoint, check, plan,
+    ArmWaypoint, CheckSettings, Joints, Motion, PlanSettings, Waypoint, check, plan,
 };
 use tandem_sim::SimError;
 
@@ -50,7 +50,7 @@ pub(super) struct TrialExecution {
     pub(super) rehearsed_m: Option<Vec<f64>>,
     pub(super) timed_out: bool,
     /// The waypoints of the tools.
-    pub(super) way_points: Vec<WayPoint>,
+    pub(super) way_points: Vec<Waypoint>,
 }
 
 impl TrialRunner {
@@ -216,7 +216,7 @@ impl TrialRunner {
     /// Plans the motion through `way_points` from joint angles `at` (radians) and checks it with `settings`.
     pub(super) fn motion(
         &self,
-        way_points: &[WayPoint],
+        way_points: &[Waypoint],
         at: &[Joints],
         settings: &CheckSettings,
     ) -> Result<Motion, FailureCause> {
@@ -237,17 +237,20 @@ impl TrialRunner {
         hands: &[DVec3],
         openings_m: &[f64],
         near: &[Joints],
-    ) -> Result<WayPoint, FailureCause> {
+    ) -> Result<Waypoint, FailureCause> {
         let arm_way_point = |arm: usize| {
             let (tool_in_world_m, _) =
                 self.mapping.tool_in_world(ArmIndex(arm), hands[arm], &near[arm])?;
-            Ok(ArmWayPoint { tool_in_world_m, opening: self.mapping.opening(openings_m[arm]) })
+            Ok(ArmWaypoint {
+                tool_in_world_m: tool_in_world_m.into(),
+                gripper_opening: self.mapping.opening(openings_m[arm]),
+            })
         };
         let arms = (0..hands.len()).map(|arm| {
             arm_way_point(arm).map_err(|source| {
                 let arm = ArmIndex(arm);
                 FailureCause::Refused(MotionRefusal::Plan(
-                    tandem_kinematics::PlanError::Unreachable { way_point: 0, arm, source },
+                    tandem_kinematics::PlanError::Unreachable { waypoint: 0, arm, source },
                 ))
             })
         });
@@ -291,7 +294,7 @@ impl TrialRunner {
 
 /// A motion that was planned before its execution.
 struct PlannedMotion {
-    way_points: Result<Vec<WayPoint>, FailureCause>,
+    way_points: Result<Vec<Waypoint>, FailureCause>,
     /// The final distances of the objects from their goals in the rehearsal, metres.
     rehearsed_m: Vec<f64>,
     n_steps: usize,

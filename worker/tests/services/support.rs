@@ -7,10 +7,8 @@ use std::net::{SocketAddr, TcpListener};
 use std::sync::Arc;
 
 use tandem_core::rng::{Stream, episode_rng, uniform};
-use tandem_core::work::{
-    EpisodeOrder, Exploration, PublishedActor, RunTerms, SlotOrder, WorldTerms,
-};
-use tandem_core::{EpisodeKind, Layout, Task};
+use tandem_core::work::{EpisodeOrder, PublishedActor, RunTerms, SlotOrder};
+use tandem_core::{EpisodeKind, Exploration, Layout, Task, WorldSettings};
 use tandem_net::{Gate, GateError, Router};
 use tandem_proto::pb::learner_server::LearnerServer;
 use tandem_proto::pb::teacher_server::TeacherServer;
@@ -26,8 +24,12 @@ pub(crate) fn terms() -> RunTerms {
     RunTerms {
         layout: LAYOUT,
         account: Some("run".to_owned()),
-        exploration: Exploration { noise_std: 0.2, random_share: 0.3, random_hold_mean_steps: 4.0 },
-        world: WorldTerms { gripped_start_share: 0.0, wide_start_share: 0.5, substeps: 10 },
+        exploration: Exploration {
+            noise_std: 0.2,
+            random_action_prob: 0.3,
+            sticky_random_mean_steps: 4.0,
+        },
+        world: WorldSettings { grasped_start_prob: 0.0, substeps: 10 },
     }
 }
 

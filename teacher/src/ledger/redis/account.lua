@@ -1,18 +1,18 @@
--- What every operation on an account begins with.
+-- The prologue of every operation on an account.
 --
 -- KEYS are the account (a hash: budget, strategy, spent, leased), its leases (a hash by episode) and its verdicts (a
--- hash by episode and word of 64 steps). Episodes are 64 bits wide and stay text; units are at most 10^12 and exact as
--- numbers of Lua's.
+-- hash by episode and word of 64 steps). Episodes have 64 bits and remain text; units are at most 10^12, which a number
+-- of Lua represents exactly.
 --
--- Every operation answers with the account's fields, none when there is no such account, numbers, and the places of
--- what is refused.
+-- Every operation returns the account's fields (none if there is no such account), numbers, and the indices of refused
+-- charges.
 
 local fields = redis.call('HMGET', KEYS[1], 'budget', 'strategy', 'spent', 'leased')
 if not fields[1] then
   return {{}, {}, {}}
 end
 local budget, spent, leased = tonumber(fields[1]), tonumber(fields[3]), tonumber(fields[4])
--- How many units are handed out while more than half of the budget is left.
+-- The number of units in the first half of the budget.
 local first_half = math.ceil(budget / 2)
 
 local function decimal(units)
@@ -27,7 +27,7 @@ local function save_account()
   redis.call('HSET', KEYS[1], 'spent', decimal(spent), 'leased', decimal(leased))
 end
 
--- A lease is written as its units, its early units, what is spent of it, and 1 when it is settled.
+-- A lease is stored as its units, its early units, its spent units, and 1 if it is settled.
 local function load_lease(episode)
   local text = redis.call('HGET', KEYS[2], episode)
   if not text then

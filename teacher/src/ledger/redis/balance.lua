@@ -1,3 +1,3 @@
--- How an account stands.
+-- Returns the balance of an account.
 
 return {balance(), {}, {}}

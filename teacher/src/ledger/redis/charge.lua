@@ -1,10 +1,11 @@
--- Makes all charges of a bill, in their order, or refuses it. ARGV holds five texts a charge: the episode, the
--- verdicts' field, the step's place in it from 1 on, its wish, and 1 when an episode with a lease has no such step.
+-- Makes all charges of a request, in their order, or refuses all of them. ARGV has five texts for each charge: the
+-- episode, the field of its verdicts, the position of the step in it (from 1), the halves that want it, and 1 if an
+-- episode with a lease has no such step.
 --
--- A wish has two characters, for a unit of the first and of the second half: 1 when the step is worth it. A field holds
--- a character a step: - not asked about, 0 not charged, 1 and 2 charged a unit of that half.
+-- The halves are two characters, for a unit of the first and of the second half: 1 if the step is worth it. A field has
+-- one character for each step: - not asked about, 0 not charged, 1 and 2 charged a unit of that half.
 --
--- Numbers: the verdicts. Refused: the place, from 0 on, of a charge beyond its episode's end.
+-- Numbers: the verdicts. Refused: the index, from 0, of a charge beyond the end of its episode.
 
 local leases = {}
 for i = 1, #ARGV, 5 do
@@ -17,10 +18,10 @@ for i = 1, #ARGV, 5 do
   end
 end
 
--- The half of the next unit that an episode with this lease, or without one, may spend, when there is one.
+-- Returns the half of the next unit that an episode with this lease (or without one) may spend, if there is one.
 local function next_unit(lease)
-  local handed_out = spent + leased
-  local available, early = handed_out < budget, handed_out < first_half
+  local assigned = spent + leased
+  local available, early = assigned < budget, assigned < first_half
   if lease then
     available = not lease.settled and lease.spent < lease.units
     early = lease.spent < lease.early_units
@@ -30,14 +31,14 @@ end
 
 local words, changed_words, changed_leases, verdicts = {}, {}, {}, {}
 for i = 1, #ARGV, 5 do
-  local episode, field, place, wish = ARGV[i], ARGV[i + 1], tonumber(ARGV[i + 2]), ARGV[i + 3]
+  local episode, field, position, wanted = ARGV[i], ARGV[i + 1], tonumber(ARGV[i + 2]), ARGV[i + 3]
   local word = words[field] or redis.call('HGET', KEYS[3], field) or ''
-  local verdict = string.sub(word, place, place)
+  local verdict = string.sub(word, position, position)
   if verdict == '' or verdict == '-' then
     local lease = leases[episode]
     local half = next_unit(lease)
     verdict = '0'
-    if half and string.sub(wish, half, half) == '1' then
+    if half and string.sub(wanted, half, half) == '1' then
       verdict = tostring(half)
       spent = spent + 1
       if lease then
@@ -46,8 +47,8 @@ for i = 1, #ARGV, 5 do
         changed_leases[episode] = lease
       end
     end
-    word = word .. string.rep('-', place - 1 - #word)
-    word = string.sub(word, 1, place - 1) .. verdict .. string.sub(word, place + 1)
+    word = word .. string.rep('-', position - 1 - #word)
+    word = string.sub(word, 1, position - 1) .. verdict .. string.sub(word, position + 1)
     changed_words[field] = word
   end
   words[field] = word

@@ -1,4 +1,4 @@
--- Opens an account, unless it is open. KEYS: the account. ARGV: budget, strategy. Answers with the account's fields.
+-- Opens an account unless it is open. KEYS: the account. ARGV: budget, strategy. Returns the account's fields.
 
 local fields = redis.call('HMGET', KEYS[1], 'budget', 'strategy', 'spent', 'leased')
 if fields[1] then

@@ -1,13 +1,13 @@
--- Sets units aside for episodes, in their order. ARGV: units per episode, then episodes. Numbers: units and early units
+-- Reserves units for episodes, in their order. ARGV: units per episode, then episodes. Numbers: units and early units
 -- of each lease.
 
 local leases = {}
 for i = 2, #ARGV do
   local lease = load_lease(ARGV[i])
   if not lease then
-    local handed_out = spent + leased
-    local units = math.min(tonumber(ARGV[1]), budget - handed_out)
-    local early_units = math.min(units, math.max(first_half - handed_out, 0))
+    local assigned = spent + leased
+    local units = math.min(tonumber(ARGV[1]), budget - assigned)
+    local early_units = math.min(units, math.max(first_half - assigned, 0))
     lease = {units = units, early_units = early_units, spent = 0, settled = false}
     leased = leased + units
     save_lease(ARGV[i], lease)

@@ -1,4 +1,4 @@
-//! The connection to a Redis server: made when it is needed, and again when it broke.
+//! The connection to a Redis server, which is opened on demand and reopened after an error.
 
 use std::fmt;
 use std::time::Duration;
@@ -13,7 +13,7 @@ use crate::ledger::{OpenError, printable};
 const CONNECT_TIMEOUT: Duration = Duration::from_secs(2);
 const ANSWER_TIMEOUT: Duration = Duration::from_secs(2);
 
-/// The names of all accounts; for people, no operation reads it.
+/// The set of all account names. It is for people: no operation depends on it.
 const ACCOUNTS: &str = "tandem:accounts";
 
 macro_rules! on_account {
@@ -22,7 +22,7 @@ macro_rules! on_account {
     };
 }
 
-/// What the server can do with an account.
+/// An operation on an account.
 #[derive(Debug, Clone, Copy)]
 pub(super) enum Script {
     Open,
@@ -33,7 +33,7 @@ pub(super) enum Script {
 }
 
 impl Script {
-    /// In the order of the enum.
+    /// The source of each script, in the order of the enum.
     const CODE: [&str; 5] = [
         include_str!("open.lua"),
         on_account!("balance.lua"),
@@ -43,35 +43,35 @@ impl Script {
     ];
 }
 
-/// A script with the account that it works on and its arguments.
+/// A script with its account and its arguments.
 pub(super) struct Call {
     script: Script,
     account: String,
     args: Vec<String>,
 }
 
-/// What a script answers.
+/// The reply of a script.
 pub(super) struct Reply {
     /// Budget, strategy, spent, leased; empty when there is no such account.
     pub(super) fields: Vec<Option<String>>,
     pub(super) numbers: Vec<u64>,
-    /// Places of what is refused.
+    /// Indices of refused charges.
     pub(super) refused: Vec<u64>,
 }
 
-/// The same as it is sent.
-type Raw = (Vec<Option<String>>, Vec<u64>, Vec<u64>);
+/// A [`Reply`] as the server sends it.
+type RawReply = (Vec<Option<String>>, Vec<u64>, Vec<u64>);
 
-/// What a server is like.
-pub(super) struct Survey {
+/// Properties of a server.
+pub(super) struct ServerProperties {
     pub(super) n_accounts: u64,
     /// Whether it writes an append-only file.
-    pub(super) appends: bool,
-    /// Whether it drops keys when it runs out of memory.
-    pub(super) evicts: bool,
+    pub(super) has_append_only_file: bool,
+    /// Whether it evicts keys when it runs out of memory.
+    pub(super) evicts_keys: bool,
 }
 
-/// A server and the connection to it, if there is one.
+/// A server, with a connection to it if one is open.
 pub(super) struct Server {
     client: Client,
     name: String,
@@ -104,13 +104,13 @@ impl Call {
 }
 
 impl Server {
-    /// The server at `url`; nothing is sent to it yet.
-    pub(super) fn at(url: &str) -> Result<Self, OpenError> {
-        // The URL may hold a password: what is wrong is said without it.
-        let refused = |what: &str| OpenError::NotAPlace(format!("the redis:// URL {what}"));
+    /// Parses `url`. Sends nothing yet.
+    pub(super) fn new(url: &str) -> Result<Self, OpenError> {
+        // The URL may contain a password, so the message must not quote it.
+        let refused = |what: &str| OpenError::InvalidLocation(format!("the redis:// URL {what}"));
         let parsed = redis::parse_redis_url(url).ok_or_else(|| refused("cannot be read"))?;
         if parsed.query().is_some() || parsed.fragment().is_some() {
-            return Err(refused("has a ? or #, which a password must have as %3F or %23"));
+            return Err(refused("has a ? or #, which must be written as %3F or %23 in a password"));
         }
         let info = parsed.into_connection_info();
         let info = info.map_err(|error| {
@@ -130,25 +130,25 @@ impl Server {
         Ok(Self { client, name, scripts, connection: None })
     }
 
-    /// Its address without the password.
+    /// Returns the server's address without the password.
     pub(super) fn name(&self) -> &str {
         &self.name
     }
 
-    /// Looks what the server is like.
-    pub(super) fn survey(&mut self) -> RedisResult<Survey> {
-        let mut ask = redis::pipe();
-        ask.cmd("SCARD").arg(ACCOUNTS);
-        ask.cmd("INFO").arg("persistence").cmd("INFO").arg("memory");
-        let (n_accounts, persistence, memory): (u64, String, String) = self.query(&ask)?;
-        let appends = persistence.lines().any(|line| line == "aof_enabled:1");
+    /// Asks the server for its properties.
+    pub(super) fn properties(&mut self) -> RedisResult<ServerProperties> {
+        let mut pipeline = redis::pipe();
+        pipeline.cmd("SCARD").arg(ACCOUNTS);
+        pipeline.cmd("INFO").arg("persistence").cmd("INFO").arg("memory");
+        let (n_accounts, persistence, memory): (u64, String, String) = self.query(&pipeline)?;
+        let has_append_only_file = persistence.lines().any(|line| line == "aof_enabled:1");
         let policy = memory.lines().find_map(|line| line.strip_prefix("maxmemory_policy:"));
         let is_bounded = !memory.lines().any(|line| line == "maxmemory:0");
-        let evicts = is_bounded && policy.is_some_and(|policy| policy != "noeviction");
-        Ok(Survey { n_accounts, appends, evicts })
+        let evicts_keys = is_bounded && policy.is_some_and(|policy| policy != "noeviction");
+        Ok(ServerProperties { n_accounts, has_append_only_file, evicts_keys })
     }
 
-    /// Sends all calls, then reads all replies. An error is one for all of them; some may have been done.
+    /// Sends all calls, then reads all replies. After an error some of the calls may have been executed.
     pub(super) fn run(&mut self, calls: &[Call]) -> RedisResult<Vec<Reply>> {
         let mut pipeline = redis::pipe();
         for call in calls {
@@ -158,19 +158,19 @@ impl Server {
                 pipeline.cmd("SADD").arg(ACCOUNTS).arg(&call.account).ignore();
             }
         }
-        let replies: Vec<Raw> = self.query(&pipeline)?;
+        let replies: Vec<RawReply> = self.query(&pipeline)?;
         let reply = |(fields, numbers, refused)| Reply { fields, numbers, refused };
         Ok(replies.into_iter().map(reply).collect())
     }
 
-    /// Asks on the connection that there is or a new one, and once more when the former one turns out to be broken or
-    /// the server has forgotten the scripts. What took too long is not asked again here.
+    /// Runs a pipeline. If the open connection fails, or the server has lost the scripts, the pipeline is run once more
+    /// on a new connection. A pipeline that timed out is not repeated.
     fn query<T: redis::FromRedisValue>(&mut self, pipeline: &Pipeline) -> RedisResult<T> {
         if let Some(connection) = self.connection.as_mut() {
             match pipeline.query(connection) {
                 Err(error) if !error.is_timeout() => self.connection = None,
                 outcome => {
-                    self.keep_if_sound(&outcome);
+                    self.close_on_error(&outcome);
                     return outcome;
                 }
             }
@@ -178,12 +178,12 @@ impl Server {
         let connection = self.connect()?;
         let connection = self.connection.insert(connection);
         let outcome = pipeline.query(connection);
-        self.keep_if_sound(&outcome);
+        self.close_on_error(&outcome);
         outcome
     }
 
-    /// A connection on which something failed is not used again: the next reply might belong to the former question.
-    fn keep_if_sound<T>(&mut self, outcome: &Result<T, RedisError>) {
+    /// Closes the connection after an error, because the next reply on it might belong to an earlier call.
+    fn close_on_error<T>(&mut self, outcome: &Result<T, RedisError>) {
         if outcome.is_err() {
             self.connection = None;
         }

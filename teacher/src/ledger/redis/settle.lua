@@ -1,4 +1,4 @@
--- Returns the unspent units of episodes to the budget. ARGV: episodes. Those without an open lease have none.
+-- Returns the unspent units of episodes to the budget. ARGV: episodes. Episodes without an open lease have none.
 
 for i = 1, #ARGV do
   local lease = load_lease(ARGV[i])

@@ -1,5 +1,5 @@
--- Budgets of advice, in units; spent says how many were charged. The checksum is over the account's name and terms and
--- its rows in the other tables.
+-- Accounts: the budget and the units charged. The checksum covers the account's name, budget and strategy, and its rows
+-- in the other tables.
 CREATE TABLE accounts (
     id INTEGER PRIMARY KEY,
     name TEXT NOT NULL UNIQUE,
@@ -9,8 +9,8 @@ CREATE TABLE accounts (
     checksum INTEGER NOT NULL
 ) STRICT;
 
--- Units set aside for an episode; charged_before says how many the episode was charged before it had the lease.
--- An episode's number from 2^63 on stands here less 2^64.
+-- Units reserved for an episode; charged_before is the number of units charged to the episode before it had the lease.
+-- Episode numbers from 2^63 on are stored less 2^64.
 CREATE TABLE leases (
     account INTEGER NOT NULL REFERENCES accounts (id),
     episode INTEGER NOT NULL,
@@ -21,8 +21,8 @@ CREATE TABLE leases (
     PRIMARY KEY (account, episode)
 ) STRICT, WITHOUT ROWID;
 
--- Which steps were asked about, which of them were charged, and which of those with a unit of the budget's first
--- half: one bit a step. Bit b of word w is step 64 * w + b.
+-- The verdicts, one bit for each step: the steps asked about, those of them that were charged, and those of them whose
+-- unit belongs to the first half of the budget. Bit b of word w is step 64 * w + b.
 CREATE TABLE verdicts (
     account INTEGER NOT NULL REFERENCES accounts (id),
     episode INTEGER NOT NULL,
@@ -33,7 +33,7 @@ CREATE TABLE verdicts (
     PRIMARY KEY (account, episode, word)
 ) STRICT, WITHOUT ROWID;
 
--- One row for every unit that was charged.
+-- One row for each charged unit.
 CREATE VIEW charges (account, episode, step, half) AS
 WITH RECURSIVE bits (bit) AS (
     SELECT 0 UNION ALL SELECT bit + 1 FROM bits WHERE bit < 63

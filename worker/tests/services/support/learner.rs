@@ -148,7 +148,7 @@ impl pb::learner_server::Learner for FakeLearner {
         state.workers.insert(worker_id);
         Ok(Response::new(pb::JoinResponse {
             worker_id,
-            terms: Some(tandem_proto::encode_terms(&terms())),
+            terms: Some(tandem_proto::encode_run_terms(&terms())),
             learner: 1,
         }))
     }

@@ -1,0 +1,177 @@
+//! Settings of a run that its workers need as well: how training episodes explore and start, and how finely the world
+//! is simulated.
+//!
+//! Each struct is declared once: the run file contains it as a section, the learner sends it with the run's terms, and
+//! the simulator takes it as it is. Another world setting needs a field here, its conversion in `proto` and its effect
+//! in `sim`.
+
+use serde::{Deserialize, Serialize};
+
+use crate::episode::EpisodeKind;
+
+/// Section `[exploration]`: how training episodes explore.
+#[derive(Debug, Clone, Copy, PartialEq, Deserialize, Serialize)]
+#[serde(deny_unknown_fields)]
+pub struct Exploration {
+    /// Standard deviation of the Gaussian noise added to every action component, 0 to 10.
+    pub noise_std: f32,
+    /// Probability that an arm's step takes a random action, in [0, 1) (baselines HER: `random_eps`).
+    pub random_action_prob: f32,
+    /// Mean number of steps for which an arm repeats a random action, 1 to 50; 1 draws a new one each step.
+    pub sticky_random_mean_steps: f32,
+}
+
+impl Exploration {
+    /// The policy's actions as they are.
+    pub const NONE: Self =
+        Self { noise_std: 0.0, random_action_prob: 0.0, sticky_random_mean_steps: 1.0 };
+
+    /// Checks every range; NaN is in none.
+    ///
+    /// # Errors
+    /// Names the first setting that is out of its range.
+    pub fn check(&self) -> Result<(), OutOfRange> {
+        let Self { noise_std, random_action_prob, sticky_random_mean_steps } = *self;
+        let is_noise = (0.0..=10.0).contains(&noise_std);
+        OutOfRange::unless(is_noise, "exploration.noise_std", noise_std, "0 to 10")?;
+        let is_prob = (0.0..1.0).contains(&random_action_prob);
+        let key = "exploration.random_action_prob";
+        OutOfRange::unless(is_prob, key, random_action_prob, "a number in [0, 1)")?;
+        let is_mean = (1.0..=50.0).contains(&sticky_random_mean_steps);
+        let key = "exploration.sticky_random_mean_steps";
+        OutOfRange::unless(is_mean, key, sticky_random_mean_steps, "1 to 50")
+    }
+}
+
+/// Section `[world]`: how training episodes start, and how finely all episodes are simulated. The default is how
+/// policies are evaluated.
+#[derive(Debug, Clone, Copy, PartialEq, Deserialize, Serialize)]
+#[serde(deny_unknown_fields)]
+pub struct WorldSettings {
+    /// Probability that a training episode starts with the objects grasped (pick and place), in [0, 1].
+    pub grasped_start_prob: f32,
+    /// Physics steps per control step of 0.04 s: 20, or 10 for quick tests.
+    pub substeps: u32,
+}
+
+impl Default for WorldSettings {
+    fn default() -> Self {
+        Self { grasped_start_prob: 0.0, substeps: 20 }
+    }
+}
+
+/// Keys of the settings in the metadata of episode logs, which other programs read.
+const LOGGED_GRASPED_START_PROB: &str = "gripped_start_share";
+const LOGGED_SUBSTEPS: &str = "substeps";
+
+impl WorldSettings {
+    /// Checks every range; NaN is in none.
+    ///
+    /// # Errors
+    /// Names the first setting that is out of its range.
+    pub fn check(&self) -> Result<(), OutOfRange> {
+        let Self { grasped_start_prob, substeps } = *self;
+        let is_prob = (0.0..=1.0).contains(&grasped_start_prob);
+        let key = "world.grasped_start_prob";
+        OutOfRange::unless(is_prob, key, grasped_start_prob, "a number in [0, 1]")?;
+        OutOfRange::unless(matches!(substeps, 10 | 20), "world.substeps", substeps, "10 or 20")
+    }
+
+    /// Returns the settings for an episode of `kind`: evaluation episodes start as the task says.
+    #[must_use]
+    pub fn for_kind(self, kind: EpisodeKind) -> Self {
+        match kind {
+            EpisodeKind::Training => self,
+            EpisodeKind::Evaluation => Self { substeps: self.substeps, ..Self::default() },
+        }
+    }
+
+    /// Returns the settings as entries of an episode log's metadata.
+    #[must_use]
+    pub fn log_entries(self) -> [(&'static str, String); 2] {
+        [
+            (LOGGED_SUBSTEPS, self.substeps.to_string()),
+            (LOGGED_GRASPED_START_PROB, self.grasped_start_prob.to_string()),
+        ]
+    }
+
+    /// Reads the settings from an episode log's metadata; `entry` looks up an entry.
+    ///
+    /// # Errors
+    /// Returns the key of the first entry that is missing or not a number.
+    pub fn from_log_entries<'a>(
+        entry: impl Fn(&str) -> Option<&'a str>,
+    ) -> Result<Self, &'static str> {
+        let number = |key| entry(key).and_then(|text| text.parse().ok()).ok_or(key);
+        let count = |key| entry(key).and_then(|text| text.parse().ok()).ok_or(key);
+        Ok(Self {
+            grasped_start_prob: number(LOGGED_GRASPED_START_PROB)?,
+            substeps: count(LOGGED_SUBSTEPS)?,
+        })
+    }
+}
+
+/// A setting whose value cannot be used.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("{key} is {value}: expected {expected}")]
+pub struct OutOfRange {
+    /// Dotted name of the setting.
+    pub key: &'static str,
+    /// Its value.
+    pub value: String,
+    /// The values that can be used.
+    pub expected: &'static str,
+}
+
+impl OutOfRange {
+    /// Returns an error about the setting `key` unless `is_usable`.
+    ///
+    /// # Errors
+    /// When the value cannot be used.
+    pub fn unless(
+        is_usable: bool,
+        key: &'static str,
+        value: impl ToString,
+        expected: &'static str,
+    ) -> Result<(), Self> {
+        match is_usable {
+            true => Ok(()),
+            false => Err(Self { key, value: value.to_string(), expected }),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const WORLD: WorldSettings = WorldSettings { grasped_start_prob: 0.3, substeps: 10 };
+
+    #[test]
+    fn only_training_episodes_start_specially() {
+        assert_eq!(WORLD.for_kind(EpisodeKind::Training), WORLD);
+        let evaluated = WorldSettings { grasped_start_prob: 0.0, substeps: 10 };
+        assert_eq!(WORLD.for_kind(EpisodeKind::Evaluation), evaluated);
+    }
+
+    #[test]
+    fn log_entries_are_read_back_and_a_bad_one_is_named() {
+        let entries = WORLD.log_entries();
+        let lookup = |key: &str| {
+            entries.iter().find(|(name, _)| *name == key).map(|(_, value)| value.as_str())
+        };
+        assert_eq!(WorldSettings::from_log_entries(lookup), Ok(WORLD));
+        let spoilt = |key: &str| if key == "substeps" { Some("ten") } else { lookup(key) };
+        assert_eq!(WorldSettings::from_log_entries(spoilt), Err("substeps"));
+    }
+
+    #[test]
+    fn values_out_of_range_are_named() {
+        let world = WorldSettings { grasped_start_prob: f32::NAN, ..WORLD };
+        assert_eq!(world.check().map_err(|error| error.key), Err("world.grasped_start_prob"));
+        let exploration = Exploration { random_action_prob: 1.0, ..Exploration::NONE };
+        let message = exploration.check().expect_err("out of range").to_string();
+        assert_eq!(message, "exploration.random_action_prob is 1: expected a number in [0, 1)");
+        assert_eq!((Exploration::NONE.check(), WORLD.check()), (Ok(()), Ok(())));
+    }
+}

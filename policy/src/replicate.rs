@@ -1,0 +1,162 @@
+//! A policy for several arms that consists of copies of a one-arm policy.
+
+use std::collections::BTreeMap;
+
+use tandem_core::ArmIndex;
+use tandem_core::layout::Layout;
+
+use crate::mlp::MlpShape;
+use crate::normalizer::NormalizerSnapshot;
+use crate::policy::Policy;
+
+impl Policy {
+    /// Creates a policy for `n_arms` arms in which each arm acts, and is valued, as by this one-arm policy.
+    ///
+    /// The networks are `n_arms` times as wide and block-diagonal, and the critic has one head per arm. The metadata is
+    /// empty.
+    ///
+    /// # Panics
+    /// If this policy has several arms or critic heads, or if a vector has the wrong length; see [`Policy::check`].
+    #[must_use]
+    pub fn replicated(&self, n_arms: usize) -> Self {
+        assert_eq!(
+            (self.layout.n_arms, self.n_heads),
+            (1, 1),
+            "only a one-arm policy can be copied"
+        );
+        let layout = Layout::new(self.layout.task, n_arms);
+        let (n_hidden, n_heads) = (self.n_hidden * n_arms, n_arms);
+        let actor_shape = MlpShape::actor(layout, n_hidden, self.n_hidden_layers);
+        let critic_shape = MlpShape::critic(layout, n_hidden, self.n_hidden_layers, n_heads);
+        let mut actor = vec![0.0; actor_shape.n_parameters()];
+        let mut critic = vec![0.0; critic_shape.n_parameters()];
+        for arm in layout.arms() {
+            let inputs = state_columns(layout, arm);
+            let actions: Vec<usize> = layout.action_of(arm).collect();
+            let n_state = layout.n_observation() + layout.n_goal();
+            let joined: Vec<usize> =
+                inputs.iter().copied().chain(actions.iter().map(|i| n_state + i)).collect();
+            let source = (&self.actor_shape(), self.actor.as_slice());
+            write_block(source, (&actor_shape, &mut actor), (&inputs, &actions), arm);
+            let source = (&self.critic_shape(), self.critic.as_slice());
+            write_block(source, (&critic_shape, &mut critic), (&joined, &[arm.0]), arm);
+        }
+        Self {
+            layout,
+            n_hidden,
+            n_hidden_layers: self.n_hidden_layers,
+            n_heads,
+            actor,
+            critic,
+            observation_normalizer: repeated(&self.observation_normalizer, n_arms),
+            goal_normalizer: repeated(&self.goal_normalizer, n_arms),
+            metadata: BTreeMap::new(),
+        }
+    }
+}
+
+/// Returns the indices of `arm`'s numbers in the concatenation of observation and goal.
+fn state_columns(layout: Layout, arm: ArmIndex) -> Vec<usize> {
+    let goals = layout.goal_of(arm).map(|i| layout.n_observation() + i);
+    layout.observation_of(arm).chain(goals).collect()
+}
+
+/// Writes a network into another one as the block of `arm`. `inputs` are the columns of its inputs in the first layer,
+/// `outputs` the rows of its outputs in the last one.
+fn write_block(
+    (source_shape, source): (&MlpShape, &[f32]),
+    (shape, parameters): (&MlpShape, &mut [f32]),
+    (inputs, outputs): (&[usize], &[usize]),
+    arm: ArmIndex,
+) {
+    let first_hidden = arm.0 * source_shape.n_hidden;
+    let hidden: Vec<usize> = (first_hidden..first_hidden + source_shape.n_hidden).collect();
+    for layer in 0..shape.n_layers() {
+        let columns = if layer == 0 { inputs } else { &hidden };
+        let rows = if layer == shape.n_hidden_layers { outputs } else { &hidden };
+        let (weight, bias) = (shape.weight(layer), shape.bias(layer));
+        let source_rows = source[source_shape.weight(layer)].chunks_exact(columns.len());
+        let source_biases = &source[source_shape.bias(layer)];
+        for ((row, numbers), offset) in rows.iter().zip(source_rows).zip(source_biases) {
+            let start = weight.start + row * shape.layer_input(layer);
+            for (column, number) in columns.iter().zip(numbers) {
+                parameters[start + column] = *number;
+            }
+            parameters[bias.start + row] = *offset;
+        }
+    }
+}
+
+fn repeated(one: &NormalizerSnapshot, n: usize) -> NormalizerSnapshot {
+    NormalizerSnapshot { mean: one.mean.repeat(n), std: one.std.repeat(n) }
+}
+
+#[cfg(test)]
+mod tests {
+    use tandem_core::rng::uniform;
+    use tandem_core::{Stream, Task, episode_rng};
+
+    use super::*;
+
+    const LAYOUT: Layout = Layout::new(Task::PickAndPlace, 1);
+
+    fn one_arm() -> Policy {
+        let (n_hidden, n_hidden_layers) = (9, 2);
+        let mut rng = episode_rng(5, 0, Stream::Initialisation);
+        let mut draw = |n: usize, low: f32, high: f32| -> Vec<f32> {
+            (0..n).map(|_| uniform(&mut rng, low, high)).collect()
+        };
+        let actor = MlpShape::actor(LAYOUT, n_hidden, n_hidden_layers).n_parameters();
+        let critic = MlpShape::critic(LAYOUT, n_hidden, n_hidden_layers, 1).n_parameters();
+        let (n_observation, n_goal) = (LAYOUT.n_observation(), LAYOUT.n_goal());
+        Policy {
+            layout: LAYOUT,
+            n_hidden,
+            n_hidden_layers,
+            n_heads: 1,
+            actor: draw(actor, -0.5, 0.5),
+            critic: draw(critic, -0.5, 0.5),
+            observation_normalizer: NormalizerSnapshot {
+                mean: draw(n_observation, -0.2, 0.2),
+                std: draw(n_observation, 0.5, 2.0),
+            },
+            goal_normalizer: NormalizerSnapshot {
+                mean: draw(n_goal, -0.2, 0.2),
+                std: draw(n_goal, 0.5, 2.0),
+            },
+            metadata: BTreeMap::new(),
+        }
+    }
+
+    #[test]
+    fn each_arm_acts_and_is_valued_as_by_the_one_arm_policy() {
+        let one = one_arm();
+        let both = one.replicated(2);
+        both.check().unwrap();
+        let mut rng = episode_rng(6, 0, Stream::Initialisation);
+        let mut draw = |n: usize| (0..n).map(|_| uniform(&mut rng, -1.0, 1.0)).collect::<Vec<_>>();
+        let layout = both.layout;
+        let (observation, goal) = (draw(layout.n_observation()), draw(layout.n_goal()));
+        let actions_taken = draw(layout.n_action());
+
+        let (mut acting, mut valuing) = (both.actor().unwrap(), both.critic().unwrap());
+        let mut actions = vec![0.0; layout.n_action()];
+        acting.act(&observation, &goal, &mut actions);
+        let mut values = vec![0.0; 2];
+        valuing.q(&observation, &goal, &actions_taken, &mut values);
+        for arm in layout.arms() {
+            let (observation, goal) =
+                (&observation[layout.observation_of(arm)], &goal[layout.goal_of(arm)]);
+            let mut action = vec![0.0; LAYOUT.n_action()];
+            one.actor().unwrap().act(observation, goal, &mut action);
+            let mut value = vec![0.0];
+            let alone = &actions_taken[layout.action_of(arm)];
+            one.critic().unwrap().q(observation, goal, alone, &mut value);
+            for (got, expected) in actions[layout.action_of(arm)].iter().zip(&action) {
+                assert!((got - expected).abs() < 1e-5, "arm {arm:?}: {got} against {expected}");
+            }
+            let got = values[arm.0];
+            assert!((got - value[0]).abs() < 1e-5, "arm {arm:?}: {got} against {}", value[0]);
+        }
+    }
+}

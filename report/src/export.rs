@@ -1,0 +1,220 @@
+//! Export of a comparison as JSON and CSV.
+
+use serde_json::{Value, json};
+use tandem_core::Wilson;
+use tandem_telemetry::MetricsRow;
+
+use crate::comparison::{Comparison, Section};
+use crate::group::{MILESTONES, SeedGroup, Spread};
+use crate::measures::{LearningMeasures, first_reaching};
+use crate::run::Run;
+
+/// Header of [`csv`]. Steps are environment steps, epochs are the paper's, shares are in [0, 1].
+///
+/// The columns `held_out_*` are the evaluation on test goals.
+pub const CSV_HEADER: &str = "task,arms,group,strategy,run,seed,evaluations,env_steps,wall_s,inspired_epoch,rise_epochs,max_success,\
+     effective_learning_rate,env_steps_to_50,env_steps_to_90,env_steps_to_95,minutes_to_50,minutes_to_90,minutes_to_95,\
+     advice_spent,last_success,last_low,last_high,collision_rate,held_out_success,held_out_low,held_out_high,\
+     held_out_collision_rate";
+
+/// Returns a comparison as CSV with one line per run. Values that do not exist are empty.
+#[must_use]
+pub fn csv(comparison: &Comparison) -> String {
+    let mut text = format!("{CSV_HEADER}\n");
+    for section in &comparison.sections {
+        for (group, run) in
+            section.groups.iter().flat_map(|group| group.runs.iter().map(move |run| (group, run)))
+        {
+            let cells: Vec<String> =
+                run_cells(group, run).iter().map(|cell| quoted(cell)).collect();
+            text.push_str(&cells.join(","));
+            text.push('\n');
+        }
+    }
+    text
+}
+
+fn run_cells(group: &SeedGroup, run: &Run) -> Vec<String> {
+    let number = |value: Option<f64>| {
+        value.filter(|v| v.is_finite()).map(|v| v.to_string()).unwrap_or_default()
+    };
+    let count = |value: Option<u64>| value.map(|v| v.to_string()).unwrap_or_default();
+    let measures = Some(LearningMeasures::of(&run.rows)).filter(|_| !run.rows.is_empty());
+    let last = run.last();
+    let test = run.test.as_ref();
+    let mut cells = vec![
+        group.setup.task.map_or_else(String::new, |task| task.name().to_owned()),
+        count(group.setup.n_arms),
+        group.label.clone(),
+        group.strategy.clone().unwrap_or_default(),
+        run.name.clone(),
+        count(run.seed()),
+        run.rows.len().to_string(),
+        count(last.map(|row| row.env_steps)),
+        number(last.map(|row| row.wall_s)),
+        number(measures.and_then(|measures| measures.inspired_epoch)),
+        number(measures.and_then(|measures| measures.rising_epochs)),
+        number(measures.map(|measures| measures.max_success)),
+        number(measures.and_then(|measures| measures.learning_rate)),
+    ];
+    let reached = MILESTONES.map(|success| first_reaching(&run.rows, success));
+    cells.extend(reached.map(|row| count(row.map(|row| row.env_steps))));
+    cells.extend(reached.map(|row| number(row.map(|row| row.wall_s / 60.0))));
+    cells.push(count(last.map(|row| row.advice_spent)));
+    let of_last: [fn(&MetricsRow) -> f64; 4] = [
+        |row| row.success,
+        |row| row.success_low,
+        |row| row.success_high,
+        |row| row.collision_rate,
+    ];
+    cells.extend(of_last.map(|value| number(last.map(value))));
+    cells.extend([
+        number(test.map(|test| test.success)),
+        number(test.map(|test| test.interval.0)),
+        number(test.map(|test| test.interval.1)),
+        number(test.map(|test| test.collision_rate)),
+    ]);
+    cells
+}
+
+/// Quotes a cell if CSV requires it.
+fn quoted(cell: &str) -> String {
+    match cell.contains([',', '"', '\n']) {
+        true => format!("\"{}\"", cell.replace('"', "\"\"")),
+        false => cell.to_owned(),
+    }
+}
+
+/// Returns a comparison as one JSON object: `sections`, each with `groups` and `baselines`.
+///
+/// The key `held_out_success` is the success on test goals.
+#[must_use]
+pub fn json(comparison: &Comparison) -> Value {
+    json!({ "sections": comparison.sections.iter().map(section_json).collect::<Vec<_>>() })
+}
+
+fn section_json(section: &Section) -> Value {
+    let baselines = section.baselines.iter().map(|baseline| {
+        let test = &baseline.test;
+        json!({
+            "label": baseline.label, "episodes": test.n_episodes, "success": test.success,
+            "success_low": test.interval.0, "success_high": test.interval.1,
+            "success_joint": test.success_joint, "collision_rate": test.collision_rate,
+        })
+    });
+    json!({
+        "task": section.setup.task.map(tandem_core::Task::name),
+        "arms": section.setup.n_arms,
+        "groups": section.groups.iter().map(group_json).collect::<Vec<_>>(),
+        "baselines": baselines.collect::<Vec<_>>(),
+    })
+}
+
+fn group_json(group: &SeedGroup) -> Value {
+    let paper = group.paper().zip(group.setup.task).map(|(row, task)| {
+        let measures = row.measures(task);
+        json!({
+            "row": row.name, "inspired_epoch": measures.inspired_epoch, "rise_epochs": measures.rising_epochs,
+            "max_success": measures.max_success, "effective_learning_rate": measures.learning_rate,
+        })
+    });
+    let milestones = MILESTONES.map(|success| {
+        json!({
+            "success": success,
+            "env_steps": spread_json(&group.at_milestone(success, |row| row.env_steps as f64)),
+            "minutes": spread_json(&group.at_milestone(success, |row| row.wall_s / 60.0)),
+        })
+    });
+    json!({
+        "label": group.label,
+        "strategy": group.strategy,
+        "runs": group.runs.iter().map(|run| run.name.clone()).collect::<Vec<_>>(),
+        "inspired_epoch": spread_json(&group.measure(|measures| measures.inspired_epoch)),
+        "rise_epochs": spread_json(&group.measure(|measures| measures.rising_epochs)),
+        "max_success": spread_json(&group.measure(|measures| Some(measures.max_success))),
+        "effective_learning_rate": spread_json(&group.measure(|measures| measures.learning_rate)),
+        "paper": paper,
+        "milestones": milestones,
+        "env_steps": spread_json(&group.spread(|run| Some(run.last()?.env_steps as f64))),
+        "advice_spent": spread_json(&group.spread(|run| Some(run.last()?.advice_spent as f64))),
+        "last_success": share_json(group, |run| run.last().map(|row| (row.success, row.n_episodes))),
+        "best_success": share_json(group, |run| run.best().map(|row| (row.success, row.n_episodes))),
+        "held_out_success": share_json(group, |run| {
+            run.test.as_ref().map(|test| (test.success, test.n_episodes))
+        }),
+        "collision_rate": share_json(group, |run| {
+            run.last().map(|row| (row.collision_rate, row.n_episodes))
+        }),
+    })
+}
+
+/// Returns a spread as JSON; `null` if no run has the value.
+fn spread_json(spread: &Spread) -> Value {
+    match spread.n {
+        0 => Value::Null,
+        n => json!({"mean": spread.mean, "min": spread.min, "max": spread.max, "runs": n}),
+    }
+}
+
+fn share_json(group: &SeedGroup, pick: impl Fn(&Run) -> Option<(f64, u64)>) -> Value {
+    let (spread, interval) = group.share(pick);
+    let mut value = spread_json(&spread);
+    if let (Some(object), Some(Wilson { low, high })) = (value.as_object_mut(), interval) {
+        object.insert("low".to_owned(), json!(low));
+        object.insert("high".to_owned(), json!(high));
+    }
+    value
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn comparison() -> Comparison {
+        let row = |(idx, success): (u64, f64)| MetricsRow {
+            env_steps: 1000 * idx,
+            paper_epochs: idx as f64,
+            wall_s: 60.0 * idx as f64,
+            success,
+            n_episodes: 240,
+            ..MetricsRow::default()
+        };
+        let run = Run {
+            name: "odd, name-seed3".to_owned(),
+            rows: vec![row((1, 0.25)), row((2, 0.5))],
+            configuration: Some(
+                "task = \"push\"\narms = 2\nseed = 3\n[advice]\nstrategy = \"ea\"".to_owned(),
+            ),
+            test: None,
+        };
+        Comparison::of(
+            vec![run, Run { name: "push-empty-seed1".to_owned(), ..Run::default() }],
+            Vec::new(),
+        )
+    }
+
+    #[test]
+    fn every_csv_line_has_a_cell_in_every_column() {
+        let text = csv(&comparison());
+        let lines: Vec<&str> = text.lines().collect();
+        let n_columns = lines[0].split(',').count();
+        assert_eq!(lines.len(), 3);
+        assert_eq!(
+            lines[1],
+            "push,2,\"odd, name\",ea,\"odd, name-seed3\",3,2,2000,120,1,1,0.5,0.225,2000,,,2,,,0,0.5,0,0,0,,,,"
+        );
+        assert_eq!(lines[2].split(',').count(), n_columns);
+    }
+
+    #[test]
+    fn a_milestone_that_no_run_reached_is_null_in_json() {
+        let value = json(&comparison());
+        let group = &value["sections"][0]["groups"][0];
+        assert_eq!(group["milestones"][0]["env_steps"]["mean"], 2000.0);
+        assert!(group["milestones"][1]["env_steps"].is_null());
+        assert_eq!(group["paper"]["row"], "EA");
+        assert_eq!(group["last_success"]["mean"], 0.5);
+        assert_eq!(group["last_success"]["low"], json!(Wilson::of(120, 240).low));
+        assert!(group["held_out_success"].is_null());
+    }
+}

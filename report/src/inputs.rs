@@ -1,0 +1,298 @@
+//! Finds and reads the runs and trials of a report.
+
+use std::path::{Path, PathBuf};
+
+use tandem_telemetry::TrialRow;
+use tandem_telemetry::trials::TRIALS_FILE;
+
+use crate::error::Error;
+use crate::files::{InvalidLine, read_bytes, read_error, read_rows};
+use crate::run::Run;
+
+/// Depth to which directories are searched.
+const MAX_DEPTH: usize = 6;
+
+/// The runs and trials of a report.
+#[derive(Debug, Default)]
+pub struct ReportInputs {
+    /// Runs, in the order of the paths; those of one directory by name.
+    pub runs: Vec<Run>,
+    /// Trials of all files, in the same order.
+    pub trials: Vec<TrialRow>,
+    /// One line for each file that is ignored in part or as a whole.
+    pub warnings: Vec<String>,
+}
+
+impl ReportInputs {
+    /// Reads all runs and trials of `paths`: run directories, directories that contain runs or trials at any depth up
+    /// to six, and single metrics or trials files.
+    ///
+    /// Unusable runs and trials within a directory add to `warnings`.
+    ///
+    /// # Errors
+    /// If a path cannot be read or contains neither runs nor trials.
+    pub fn load(paths: &[PathBuf]) -> Result<Self, Error> {
+        let mut inputs = Self::default();
+        for path in paths {
+            if path.is_file() {
+                inputs.read_file(path)?;
+            } else {
+                inputs.read_directory(path)?;
+            }
+        }
+        Ok(inputs)
+    }
+
+    fn read_file(&mut self, path: &Path) -> Result<(), Error> {
+        if is_trials_file(path)? {
+            self.trials.extend(read_trials(path, &mut self.warnings)?);
+        } else {
+            self.runs.push(Run::load_file(path, &mut self.warnings)?);
+        }
+        Ok(())
+    }
+
+    fn read_directory(&mut self, path: &Path) -> Result<(), Error> {
+        let mut found = FoundPaths::default();
+        found.search(path, MAX_DEPTH, Parent::Directory)?;
+        if found.run_dirs.is_empty() && found.trials_files.is_empty() {
+            return Err(Error::NoResults { path: path.to_owned() });
+        }
+        let mut first_error = None;
+        let n_before = self.runs.len() + self.trials.len();
+        for dir in &found.run_dirs {
+            match Run::load(dir, &mut self.warnings) {
+                Ok(run) => self.runs.push(run),
+                Err(error) => {
+                    self.warnings.push(format!("{} is ignored: {error}", dir.display()));
+                }
+            }
+        }
+        for file in &found.trials_files {
+            match read_trials(file, &mut self.warnings) {
+                Ok(rows) => self.trials.extend(rows),
+                Err(error) => {
+                    self.warnings.push(format!("ignored: {error}"));
+                    first_error.get_or_insert(error);
+                }
+            }
+        }
+        let n_read = self.runs.len() + self.trials.len() - n_before;
+        first_error.filter(|_| n_read == 0).map_or(Ok(()), Err)
+    }
+}
+
+/// Paths of runs and trials in a directory.
+#[derive(Debug, Default)]
+struct FoundPaths {
+    run_dirs: Vec<PathBuf>,
+    trials_files: Vec<PathBuf>,
+}
+
+/// What a searched directory is part of. Within a run directory, only trials count.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Parent {
+    Directory,
+    Run,
+}
+
+impl FoundPaths {
+    /// Adds `dir` itself and its subdirectories, in alphabetical order.
+    fn search(&mut self, dir: &Path, depth: usize, parent: Parent) -> Result<(), Error> {
+        let is_run = parent == Parent::Directory && dir.join("metrics.jsonl").is_file();
+        if is_run {
+            self.run_dirs.push(dir.to_owned());
+        }
+        let trials_file = dir.join(TRIALS_FILE);
+        if trials_file.is_file() {
+            self.trials_files.push(trials_file);
+        }
+        let parent = if is_run { Parent::Run } else { parent };
+        let entries = std::fs::read_dir(dir).map_err(read_error(dir))?;
+        let is_dir =
+            |entry: &std::fs::DirEntry| entry.file_type().is_ok_and(|file_type| file_type.is_dir());
+        let mut children: Vec<PathBuf> =
+            entries.flatten().filter(is_dir).map(|entry| entry.path()).collect();
+        children.sort();
+        for child in children.iter().filter(|_| depth > 0) {
+            match self.search(child, depth - 1, parent) {
+                // An unreadable subdirectory of a run does not make the run unreadable.
+                Err(_) if parent == Parent::Run => {}
+                other => other?,
+            }
+        }
+        Ok(())
+    }
+}
+
+/// Returns whether a single file contains trials, judging by its name or else by its first line.
+fn is_trials_file(path: &Path) -> Result<bool, Error> {
+    if path.file_name().is_some_and(|name| name == TRIALS_FILE) {
+        return Ok(true);
+    }
+    let bytes = read_bytes(path)?;
+    let first = bytes.split(|byte| *byte == b'\n').next().unwrap_or_default();
+    Ok(serde_json::from_slice::<TrialRow>(first).is_ok())
+}
+
+/// Reads the trials of a file up to the first invalid line, which adds a warning. A file without a trial is an error.
+fn read_trials(path: &Path, warnings: &mut Vec<String>) -> Result<Vec<TrialRow>, Error> {
+    let (rows, invalid) = read_rows::<TrialRow>(path)?;
+    if rows.is_empty() {
+        let problem = invalid.map_or_else(
+            || "it is empty".to_owned(),
+            |InvalidLine { line, problem }| format!("line {line} is not a trial ({problem})"),
+        );
+        return Err(Error::NoTrials { path: path.to_owned(), problem });
+    }
+    warnings.extend(invalid.map(|invalid| invalid.warning(path, "trial")));
+    Ok(rows)
+}
+
+#[cfg(test)]
+mod tests {
+    use tandem_telemetry::MetricsRow;
+
+    use super::*;
+
+    fn line(round: u64) -> String {
+        let row = MetricsRow { round, success: 0.5, ..MetricsRow::default() };
+        serde_json::to_string(&row).unwrap() + "\n"
+    }
+
+    fn write(path: &Path, text: &str) {
+        std::fs::create_dir_all(path.parent().unwrap()).unwrap();
+        std::fs::write(path, text).unwrap();
+    }
+
+    #[test]
+    fn runs_are_found_at_any_depth_of_a_directory() {
+        let dir = tempfile::tempdir().unwrap();
+        write(&dir.path().join("b/metrics.jsonl"), &line(1));
+        write(&dir.path().join("deep/a/metrics.jsonl"), &line(1));
+        write(&dir.path().join("deep/a/checkpoint/metrics.jsonl"), &line(1));
+        write(&dir.path().join("lone.jsonl"), &line(1));
+        let inputs =
+            ReportInputs::load(&[dir.path().to_owned(), dir.path().join("lone.jsonl")]).unwrap();
+        let names: Vec<&str> = inputs.runs.iter().map(|run| run.name.as_str()).collect();
+        assert_eq!(names, ["b", "a", "lone"]);
+        assert!(inputs.warnings.is_empty(), "{:?}", inputs.warnings);
+    }
+
+    #[test]
+    fn a_metrics_file_is_read_up_to_the_first_invalid_line() {
+        let check = |tail: &str| {
+            let dir = tempfile::tempdir().unwrap();
+            write(&dir.path().join("metrics.jsonl"), &(line(1) + &line(2) + tail));
+            let inputs = ReportInputs::load(&[dir.path().to_owned()]).unwrap();
+            let rounds: Vec<u64> = inputs.runs[0].rows.iter().map(|row| row.round).collect();
+            assert_eq!(rounds, [1, 2], "{tail:?}");
+            assert_eq!(inputs.warnings.len(), 1, "{:?}", inputs.warnings);
+            assert!(inputs.warnings[0].contains("line 3"), "{:?}", inputs.warnings);
+        };
+        check(&line(3)[..40]);
+        check(&(line(3)[..40].to_owned() + "\n" + &line(4)));
+        check("nonsense\n");
+        check("\u{0}\n");
+    }
+
+    fn trial(trial: u64) -> String {
+        let row = TrialRow {
+            policy: "student".to_owned(),
+            mode: "open-loop".to_owned(),
+            task: "push".to_owned(),
+            trial,
+            seed: 1,
+            success: true,
+            cause: None,
+            detail: None,
+            goal_distances_m: vec![0.01],
+            rehearsed_m: None,
+            duration_s: 2.0,
+            n_steps: 50,
+            n_shortened: 0,
+            arms_gap_m: None,
+            table_gap_m: 0.01,
+            starts: Vec::new(),
+            goals: Vec::new(),
+            ends: Vec::new(),
+            path: Vec::new(),
+            log: None,
+        };
+        serde_json::to_string(&row).unwrap() + "\n"
+    }
+
+    #[test]
+    fn trials_are_found_within_runs_in_other_directories_and_as_single_files() {
+        let dir = tempfile::tempdir().unwrap();
+        write(&dir.path().join("a/metrics.jsonl"), &line(1));
+        write(&dir.path().join("a/trials/trials.jsonl"), &trial(1));
+        write(&dir.path().join("b/trials.jsonl"), &(trial(2) + &trial(3)));
+        write(&dir.path().join("kept.jsonl"), &trial(4));
+        let inputs =
+            ReportInputs::load(&[dir.path().to_owned(), dir.path().join("kept.jsonl")]).unwrap();
+        let numbers: Vec<u64> = inputs.trials.iter().map(|row| row.trial).collect();
+        assert_eq!((numbers, inputs.runs.len()), (vec![1, 2, 3, 4], 1));
+        assert!(inputs.warnings.is_empty(), "{:?}", inputs.warnings);
+    }
+
+    #[test]
+    fn a_trials_file_is_read_up_to_the_first_invalid_line() {
+        let dir = tempfile::tempdir().unwrap();
+        for tail in [&trial(3)[..200], "nonsense\n", &trial(3).replace("\"seed\":1", "\"seed\":-1")]
+        {
+            write(&dir.path().join("trials.jsonl"), &(trial(1) + &trial(2) + tail));
+            let inputs = ReportInputs::load(&[dir.path().to_owned()]).unwrap();
+            assert_eq!(inputs.trials.len(), 2, "{tail:?}");
+            let [warning] = &inputs.warnings[..] else { panic!("{:?}", inputs.warnings) };
+            assert!(warning.contains("trials.jsonl, line 3, is not a trial ("), "{warning}");
+            assert!(!warning.contains("line 1"), "{warning}");
+        }
+    }
+
+    #[test]
+    fn a_file_without_trials_is_an_error_unless_the_directory_has_other_results() {
+        let dir = tempfile::tempdir().unwrap();
+        let file = dir.path().join("mine/trials.jsonl");
+        for (content, reason) in
+            [("", "it is empty"), ("{}\n", "line 1 is not a trial (missing field")]
+        {
+            write(&file, content);
+            for path in [dir.path().to_owned(), file.clone()] {
+                let error = ReportInputs::load(&[path]).unwrap_err();
+                assert!(matches!(error, Error::NoTrials { .. }), "{error:?}");
+                assert!(error.to_string().contains(reason), "{error}");
+            }
+        }
+        write(&dir.path().join("a/metrics.jsonl"), &line(1));
+        let inputs = ReportInputs::load(&[dir.path().to_owned()]).unwrap();
+        assert_eq!((inputs.runs.len(), inputs.trials.len(), inputs.warnings.len()), (1, 0, 1));
+    }
+
+    #[test]
+    fn a_metrics_file_without_rows_is_an_error_alone_and_an_empty_run_in_its_directory() {
+        let dir = tempfile::tempdir().unwrap();
+        let file = dir.path().join("metrics.jsonl");
+        for content in ["", "\u{1b}[31mred\n"] {
+            write(&file, content);
+            assert!(
+                matches!(
+                    ReportInputs::load(std::slice::from_ref(&file)),
+                    Err(Error::NoMetrics { .. })
+                ),
+                "{content:?}"
+            );
+            assert!(ReportInputs::load(&[dir.path().to_owned()]).unwrap().runs[0].rows.is_empty());
+        }
+    }
+
+    #[test]
+    fn a_path_without_results_is_an_error() {
+        let dir = tempfile::tempdir().unwrap();
+        assert!(matches!(
+            ReportInputs::load(&[dir.path().to_owned()]),
+            Err(Error::NoResults { .. })
+        ));
+        assert!(matches!(ReportInputs::load(&[dir.path().join("missing")]), Err(Error::Io { .. })));
+    }
+}

@@ -1,0 +1,337 @@
+//! Plots of a comparison: the curves of the paper's Figures 4 to 8 for Tandem's runs, with bands over seeds.
+
+use std::collections::BTreeMap;
+
+use tandem_core::Task;
+use tandem_telemetry::MetricsRow;
+
+use crate::comparison::{Comparison, Section};
+use crate::curve::{Axis, CurveOptions, CurvePoint, Quantity, Series, curve_svg};
+use crate::error::Error;
+use crate::group::SeedGroup;
+use crate::paper::split_strategy;
+
+/// Maximum number of curves in a plot of other runs, or of learning from scratch.
+const MAX_CURVES: usize = 6;
+/// Threshold that represents a strategy where strategies are compared (the paper's Figures 5a to 8a).
+const USUAL_THRESHOLD: f64 = 0.1;
+
+/// A plot and the name of its file.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Plot {
+    /// File name, without a directory.
+    pub file_name: String,
+    /// Title.
+    pub title: String,
+    /// The plot as SVG.
+    pub svg: String,
+}
+
+/// Groups that share a plot.
+#[derive(Debug, Clone)]
+struct Panel<'a> {
+    /// Part of the file name.
+    slug: String,
+    /// Part of the title.
+    title: String,
+    /// Letter of this panel in the paper's figures, `a` to `d`, if the paper has it.
+    letter: Option<char>,
+    groups: Vec<&'a SeedGroup>,
+}
+
+/// Plots of each panel: name, quantity, axis, and the number of the paper's figure for push and for pick and place.
+const VIEWS: [(&str, Quantity, Axis, Option<[u32; 2]>); 5] = [
+    ("success", Quantity::Success, Axis::PaperEpochs, Some([5, 7])),
+    ("success", Quantity::Success, Axis::EnvSteps, None),
+    ("success", Quantity::Success, Axis::Minutes, None),
+    ("mean Q", Quantity::MeanQ, Axis::PaperEpochs, Some([6, 8])),
+    ("advice spent", Quantity::AdviceSpent, Axis::EnvSteps, None),
+];
+
+/// Draws all plots of a comparison.
+///
+/// # Errors
+/// If the plotting library fails.
+pub fn comparison_plots(comparison: &Comparison) -> Result<Vec<Plot>, Error> {
+    let mut plots = from_scratch(comparison)?;
+    for section in &comparison.sections {
+        plots.extend(section_plots(section)?);
+    }
+    Ok(plots)
+}
+
+/// Draws the plots of one section.
+fn section_plots(section: &Section) -> Result<Vec<Plot>, Error> {
+    let mut plots = Vec::new();
+    for panel in panels(&section.groups) {
+        for (name, quantity, axis, paper) in VIEWS {
+            let reference = paper.zip(panel.letter).zip(section.setup.task);
+            let reference = reference.filter(|_| section.setup.n_arms != Some(1));
+            let reference =
+                reference.map_or_else(String::new, |(([push, other], letter), task)| {
+                    let number = if task == Task::Push { push } else { other };
+                    format!(" (the paper's Figure {number}{letter})")
+                });
+            let title = format!("{}: {name}, {}{reference}", section.setup.title(), panel.title);
+            let slug = format!("{}-{name}-{}-{}", section.setup.slug(), axis.label(), panel.slug);
+            plots.push(draw(&panel.groups, &title, &slug, quantity, axis)?);
+        }
+    }
+    Ok(plots)
+}
+
+/// Draws learning without advice, with one arm and with two (the paper's Figure 4).
+fn from_scratch(comparison: &Comparison) -> Result<Vec<Plot>, Error> {
+    let mut plots = Vec::new();
+    for (task, letter) in Task::ALL.into_iter().zip(['a', 'b']) {
+        let of_task = comparison.sections.iter().filter(|one| one.setup.task == Some(task));
+        let groups: Vec<SeedGroup> = of_task
+            .flat_map(|section| &section.groups)
+            .filter(|group| group.is_from_scratch())
+            .map(|group| SeedGroup {
+                label: format!("{}, {}", group.label, group.setup.title()),
+                ..group.clone()
+            })
+            .collect();
+        let n_one_arm = groups.iter().filter(|group| group.setup.n_arms == Some(1)).count();
+        if n_one_arm == 0 {
+            continue;
+        }
+        let shown: Vec<&SeedGroup> = groups.iter().take(MAX_CURVES).collect();
+        let title = format!("{task}: success from scratch (the paper's Figure 4{letter})");
+        let slug = format!("{task}-from-scratch");
+        plots.push(draw(&shown, &title, &slug, Quantity::Success, Axis::PaperEpochs)?);
+    }
+    Ok(plots)
+}
+
+fn draw(
+    groups: &[&SeedGroup],
+    title: &str,
+    slug: &str,
+    quantity: Quantity,
+    axis: Axis,
+) -> Result<Plot, Error> {
+    let series: Vec<Series> = groups.iter().map(|group| series(group, axis, quantity)).collect();
+    let options = match quantity {
+        Quantity::Success => CurveOptions::shares(title, axis),
+        _ => CurveOptions::values(title, axis),
+    };
+    let svg = curve_svg(&series, &options)?;
+    let file_name = format!("{}.svg", slug.to_lowercase().replace(' ', "-"));
+    Ok(Plot { file_name, title: title.to_owned(), svg })
+}
+
+/// Returns a group's curve.
+///
+/// The band of a single run is its 95 % interval. Several runs are drawn as their mean, with a band from the smallest
+/// to the largest value. Rows are matched by environment steps; a point covers the runs that have a row there.
+fn series(group: &SeedGroup, axis: Axis, quantity: Quantity) -> Series {
+    if let [run] = group.runs.as_slice() {
+        return Series::of(&group.label, &run.rows, axis, quantity);
+    }
+    let mut rows_at: BTreeMap<u64, Vec<&MetricsRow>> = BTreeMap::new();
+    for row in group.runs.iter().flat_map(|run| &run.rows) {
+        rows_at.entry(row.env_steps).or_default().push(row);
+    }
+    let point = |rows: Vec<&MetricsRow>| {
+        let points: Vec<(f64, f64)> = rows
+            .iter()
+            .map(|row| (axis.of(row), quantity.of(row)))
+            .filter(|(x, y)| x.is_finite() && y.is_finite())
+            .collect();
+        let n = points.len() as f64;
+        let ys = || points.iter().map(|(_, y)| *y);
+        (!points.is_empty()).then(|| CurvePoint {
+            x: points.iter().map(|(x, _)| x).sum::<f64>() / n,
+            y: ys().sum::<f64>() / n,
+            band: Some((
+                ys().fold(f64::INFINITY, f64::min),
+                ys().fold(f64::NEG_INFINITY, f64::max),
+            )),
+        })
+    };
+    Series { name: group.label.clone(), points: rows_at.into_values().filter_map(point).collect() }
+}
+
+/// Distributes all groups over panels: strategies, thresholds of each strategy, and other runs.
+fn panels(groups: &[SeedGroup]) -> Vec<Panel<'_>> {
+    let plain: Vec<&SeedGroup> = groups.iter().filter(|group| group.is_plain_strategy()).collect();
+    let mut panels = Vec::new();
+    let strategies: Vec<&SeedGroup> =
+        plain.iter().filter(|group| represents_strategy(group, &plain)).copied().collect();
+    if !strategies.is_empty() {
+        panels.push(Panel {
+            slug: "strategies".to_owned(),
+            title: "strategies".to_owned(),
+            letter: Some('a'),
+            groups: strategies,
+        });
+    }
+    for (family, letter) in [("mc-q", 'b'), ("mc-act", 'c'), ("mc-act-abs", 'd')] {
+        let members: Vec<&SeedGroup> =
+            plain.iter().filter(|group| strategy_name(group) == family).copied().collect();
+        if members.len() > 1 {
+            panels.push(Panel {
+                slug: family.to_owned(),
+                title: format!("thresholds of {family}"),
+                letter: Some(letter),
+                groups: members,
+            });
+        }
+    }
+    let is_shown = |group: &&SeedGroup| {
+        panels.iter().any(|panel| panel.groups.iter().any(|shown| std::ptr::eq(*shown, *group)))
+    };
+    let others: Vec<&SeedGroup> = groups.iter().filter(|group| !is_shown(group)).collect();
+    let further = others.chunks(MAX_CURVES - 2).enumerate().map(|(idx, others)| Panel {
+        slug: format!("others-{}", idx + 1),
+        title: "other runs".to_owned(),
+        letter: None,
+        groups: with_their_strategies(others, &plain),
+    });
+    panels.extend(further.collect::<Vec<_>>());
+    panels
+}
+
+/// Returns `others`, preceded by the plain strategies of which they are variants.
+fn with_their_strategies<'a>(
+    others: &[&'a SeedGroup],
+    plain: &[&'a SeedGroup],
+) -> Vec<&'a SeedGroup> {
+    let is_origin = |group: &&&SeedGroup| {
+        others.iter().any(|other| {
+            (&other.strategy, other.setup) == (&group.strategy, group.setup)
+                && !std::ptr::eq(**group, *other)
+        })
+    };
+    plain.iter().filter(is_origin).chain(others).copied().collect()
+}
+
+/// Returns whether a group represents its strategy: it has the usual threshold, or the largest if no group has that.
+fn represents_strategy(group: &SeedGroup, all: &[&SeedGroup]) -> bool {
+    let threshold =
+        |group: &SeedGroup| split_strategy(group.strategy.as_deref().unwrap_or_default()).1;
+    let Some(own) = threshold(group) else { return true };
+    let family: Vec<f64> = all
+        .iter()
+        .filter(|other| strategy_name(other) == strategy_name(group))
+        .filter_map(|other| threshold(other))
+        .collect();
+    let has_usual = family.contains(&USUAL_THRESHOLD);
+    let chosen = if has_usual { USUAL_THRESHOLD } else { family.into_iter().fold(own, f64::max) };
+    own == chosen
+}
+
+fn strategy_name(group: &SeedGroup) -> &str {
+    split_strategy(group.strategy.as_deref().unwrap_or_default()).0
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::group::group_by_settings;
+    use crate::run::Run;
+
+    fn run(strategy: &str, seed: u64, name: &str, curve: &[(u64, f64, f64)]) -> Run {
+        let row = |(env_steps, wall_s, success): &(u64, f64, f64)| MetricsRow {
+            env_steps: *env_steps,
+            wall_s: *wall_s,
+            success: *success,
+            mean_q: f64::NAN,
+            ..MetricsRow::default()
+        };
+        Run {
+            name: format!("push-{name}-seed{seed}"),
+            rows: curve.iter().map(row).collect(),
+            configuration: Some(format!(
+                "task = \"push\"\narms = 2\nseed = {seed}\ncopy = \"{name}\"\n[advice]\nstrategy = \"{strategy}\""
+            )),
+            test: None,
+        }
+    }
+
+    fn plain(strategy: &str) -> Run {
+        run(strategy, 1, &strategy.replace(':', "-"), &[(1000, 60.0, 0.5)])
+    }
+
+    #[test]
+    fn seeds_become_a_mean_with_a_band() {
+        let groups = group_by_settings(vec![
+            run("ea", 1, "ea", &[(1000, 60.0, 0.2), (2000, 120.0, 0.6)]),
+            run("ea", 2, "ea", &[(1000, 120.0, 0.4), (2000, 240.0, 0.8), (3000, 360.0, 0.9)]),
+        ]);
+        let drawn = series(&groups[0], Axis::Minutes, Quantity::Success);
+        let [first, second, third] = drawn.points[..] else { panic!("{drawn:?}") };
+        assert!((first.x - 1.5).abs() < 1e-12 && (first.y - 0.3).abs() < 1e-12, "{first:?}");
+        assert_eq!(second.band, Some((0.6, 0.8)));
+        assert_eq!((third.x, third.y, third.band), (6.0, 0.9, Some((0.9, 0.9))));
+        assert!(series(&groups[0], Axis::EnvSteps, Quantity::MeanQ).points.is_empty());
+    }
+
+    #[test]
+    fn panels_are_those_of_the_paper_and_show_every_group() {
+        let strategies = [
+            "none",
+            "ea",
+            "eamc:0.1",
+            "mc-q:0.01",
+            "mc-q:0.05",
+            "mc-q:0.1",
+            "mc-act:0.01",
+            "mc-act:0.05",
+            "mc-act-abs:0.1",
+        ];
+        let mut runs: Vec<Run> = strategies.map(plain).into();
+        runs.push(run("mc-q:0.1", 1, "no-cloning", &[(1000, 60.0, 0.5)]));
+        let groups = group_by_settings(runs);
+        let actual: Vec<(String, Option<char>, Vec<&str>)> = panels(&groups)
+            .into_iter()
+            .map(|panel| {
+                let labels = panel.groups.iter().map(|group| group.label.as_str()).collect();
+                (panel.slug, panel.letter, labels)
+            })
+            .collect();
+        let expected = [
+            (
+                "strategies",
+                Some('a'),
+                vec!["none", "ea", "eamc:0.1", "mc-q:0.1", "mc-act:0.05", "mc-act-abs:0.1"],
+            ),
+            ("mc-q", Some('b'), vec!["mc-q:0.01", "mc-q:0.05", "mc-q:0.1"]),
+            ("mc-act", Some('c'), vec!["mc-act:0.01", "mc-act:0.05"]),
+            ("others-1", None, vec!["mc-q:0.1", "no-cloning"]),
+        ];
+        assert_eq!(
+            actual,
+            expected.map(|(slug, letter, labels)| (slug.to_owned(), letter, labels))
+        );
+    }
+
+    #[test]
+    fn plots_have_unique_names_and_refer_to_the_papers_figures() {
+        let runs = vec![plain("none"), plain("mc-q:0.05"), plain("mc-q:0.1")];
+        let plots = comparison_plots(&Comparison::of(runs, Vec::new())).unwrap();
+        let mut names: Vec<&str> = plots.iter().map(|plot| plot.file_name.as_str()).collect();
+        assert_eq!(names.len(), 10);
+        assert_eq!(names[0], "push-2-success-paper-epochs-strategies.svg");
+        assert!(plots[0].title.ends_with("(the paper's Figure 5a)"), "{}", plots[0].title);
+        assert!(plots[8].title.ends_with("(the paper's Figure 6b)"), "{}", plots[8].title);
+        names.sort_unstable();
+        names.dedup();
+        assert_eq!(names.len(), 10);
+    }
+
+    #[test]
+    fn one_and_two_arms_from_scratch_share_a_plot() {
+        let mut one_arm = plain("none");
+        one_arm.configuration =
+            one_arm.configuration.map(|text| text.replace("arms = 2", "arms = 1"));
+        let comparison = Comparison::of(vec![plain("none"), one_arm], Vec::new());
+        let drawn = from_scratch(&comparison).unwrap();
+        assert_eq!(drawn.len(), 1);
+        assert!(drawn[0].svg.contains("1 arm") && drawn[0].svg.contains("2 arms"));
+        let without = Comparison::of(vec![plain("none")], Vec::new());
+        assert!(from_scratch(&without).unwrap().is_empty());
+    }
+}

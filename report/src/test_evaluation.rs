@@ -1,0 +1,95 @@
+//! Evaluations on test goals: a run's `summary.json`, or the output of `tandem eval --json`.
+
+use std::path::Path;
+
+use serde_json::Value;
+use tandem_core::Task;
+
+use crate::error::Error;
+use crate::files::{read_error, read_text};
+
+/// The evaluation of a policy on test goals, which no run uses to select its best policy.
+#[derive(Debug, Clone, PartialEq)]
+pub struct TestEvaluation {
+    /// Task of the policy.
+    pub task: Task,
+    /// Number of arms.
+    pub n_arms: usize,
+    /// Number of episodes, one per goal.
+    pub n_episodes: u64,
+    /// Success rate: share of episodes with every object at its goal, in [0, 1].
+    pub success: f64,
+    /// Lower and upper bound of the 95 % interval of `success`.
+    pub interval: (f64, f64),
+    /// Share of episodes with the joint norm within the tolerance, in [0, 1].
+    pub success_joint: f64,
+    /// Share of episodes with at least one contact between the arms, or between an arm and the table.
+    pub collision_rate: f64,
+}
+
+impl TestEvaluation {
+    /// Reads the JSON object on the last line of `path`.
+    ///
+    /// # Errors
+    /// If the file cannot be read, or its last line is not the result of an evaluation.
+    pub fn load(path: &Path) -> Result<Self, Error> {
+        let text = read_text(path).map_err(read_error(path))?;
+        Self::parse(&text)
+            .map_err(|problem| Error::InvalidEvaluation { path: path.to_owned(), problem })
+    }
+
+    /// Parses the JSON object on the last line of `text`. The error names the field.
+    fn parse(text: &str) -> Result<Self, String> {
+        let line = text.lines().rfind(|line| !line.trim().is_empty()).unwrap_or_default();
+        let object: Value = serde_json::from_str(line)
+            .map_err(|error| format!("the last line is not a JSON object ({error})"))?;
+        let number =
+            |key: &str| object[key].as_f64().ok_or_else(|| format!("{key:?} is not a number"));
+        let count =
+            |key: &str| object[key].as_u64().ok_or_else(|| format!("{key:?} is not a count"));
+        let task = object["task"].as_str().unwrap_or_default();
+        Ok(Self {
+            task: task.parse::<Task>().map_err(|error| error.to_string())?,
+            n_arms: usize::try_from(count("arms")?).map_err(|error| error.to_string())?,
+            n_episodes: count("episodes")?,
+            success: number("success")?,
+            interval: (number("success_low")?, number("success_high")?),
+            success_joint: number("success_joint")?,
+            collision_rate: number("collision_rate")?,
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const LINE: &str = r#"{"task":"push","arms":2,"episodes":240,"success":0.958,"success_low":0.925,"success_high":0.977,
+        "success_joint":0.9,"collision_rate":0.175}"#;
+
+    #[test]
+    fn the_last_line_is_read() {
+        let test =
+            TestEvaluation::parse(&format!("chatter\n{}\n", LINE.replace('\n', ""))).unwrap();
+        assert_eq!((test.task, test.n_arms, test.n_episodes), (Task::Push, 2, 240));
+        assert_eq!((test.success, test.interval), (0.958, (0.925, 0.977)));
+        assert_eq!((test.success_joint, test.collision_rate), (0.9, 0.175));
+    }
+
+    #[test]
+    fn an_error_names_the_missing_field() {
+        let check = |text: &str, word: &str| {
+            let problem = TestEvaluation::parse(text).unwrap_err();
+            assert!(problem.contains(word), "{problem:?} lacks {word:?}");
+        };
+        check("", "JSON");
+        check("{}", "task");
+        check(&LINE.replace("success_low", "low").replace('\n', ""), "success_low");
+    }
+
+    #[test]
+    fn a_device_is_not_read() {
+        let error = TestEvaluation::load(Path::new("/dev/zero")).unwrap_err();
+        assert!(matches!(error, Error::Io { .. }), "{error:?}");
+    }
+}

@@ -1,0 +1,83 @@
+//! Checks of ranges; NaN is in none.
+
+use tandem_core::settings::OutOfRange;
+
+use super::{ConfigError, RunConfig};
+
+impl RunConfig {
+    /// Returns the configuration if every setting is in its range.
+    ///
+    /// # Errors
+    /// Names the first setting that cannot be used, its value and its range.
+    pub fn checked(self) -> Result<Self, ConfigError> {
+        self.layout()?;
+        self.check_run()?;
+        self.check_advice()?;
+        self.check_rounds()?;
+        self.check_stop()?;
+        self.exploration.check()?;
+        self.world.check()?;
+        self.replay.check()?;
+        self.ddpg.check()?;
+        Ok(self)
+    }
+
+    fn check_run(&self) -> Result<(), OutOfRange> {
+        check("arms", self.arms, (1..=2).contains(&self.arms), "1 or 2")?;
+        let is_named = is_name(&self.name);
+        check("name", &self.name, is_named, "1 to 100 letters, digits, '-', '_' or '.'")?;
+        let is_own = self.seed != self.evaluation.seed;
+        check("seed", self.seed, is_own, "another than evaluation.seed")?;
+        let episodes = self.evaluation.episodes;
+        let is_count = (1..=100_000).contains(&episodes);
+        check("evaluation.episodes", episodes, is_count, "1 to 100,000")?;
+        let test_episodes = self.evaluation.test_episodes;
+        let is_count = (1..=100_000).contains(&test_episodes);
+        check("evaluation.test_episodes", test_episodes, is_count, "1 to 100,000")?;
+        let every_rounds = self.checkpoint.every_rounds;
+        check("checkpoint.every_rounds", every_rounds, every_rounds > 0, "at least 1")?;
+        check("checkpoint.keep", self.checkpoint.keep, self.checkpoint.keep > 0, "at least 1")
+    }
+
+    fn check_advice(&self) -> Result<(), OutOfRange> {
+        let (share, budget) = (self.advice.share, self.advice.budget);
+        check("advice.share", share, (0.0..=1.0).contains(&share), "a number in [0, 1]")?;
+        check("advice.budget", budget, budget <= 1_000_000_000_000, "at most 10^12")
+    }
+
+    fn check_rounds(&self) -> Result<(), OutOfRange> {
+        let rounds = &self.rounds;
+        check("rounds.slots", rounds.slots, (1..=4096).contains(&rounds.slots), "1 to 4096")?;
+        let is_slot = (1..=64).contains(&rounds.rollouts);
+        check("rounds.rollouts", rounds.rollouts, is_slot, "1 to 64")?;
+        check("rounds.lag", rounds.lag, rounds.lag <= 1, "0 or 1")?;
+        let updates = rounds.updates_per_env_step;
+        let is_rate = (1e-9..=100.0).contains(&updates);
+        check("rounds.updates_per_env_step", updates, is_rate, "1e-9 to 100")
+    }
+
+    fn check_stop(&self) -> Result<(), OutOfRange> {
+        let until = self.stop.until_success;
+        check("stop.until_success", until, (0.0..=1.0).contains(&until), "a number in [0, 1]")?;
+        let minutes = self.stop.max_minutes;
+        let is_time = minutes >= 0.0 && minutes.is_finite();
+        check("stop.max_minutes", minutes, is_time, "0 (never) or more")
+    }
+}
+
+/// Names a setting unless its value `is_usable`.
+pub(crate) fn check(
+    key: &'static str,
+    value: impl ToString,
+    is_usable: bool,
+    expected: &'static str,
+) -> Result<(), OutOfRange> {
+    OutOfRange::unless(is_usable, key, value, expected)
+}
+
+/// Returns true if `name` can be the name of a run: 1 to 100 letters, digits, '-', '_' or '.'.
+#[must_use]
+pub fn is_name(name: &str) -> bool {
+    (1..=100).contains(&name.len())
+        && name.chars().all(|c| c.is_ascii_alphanumeric() || "-_.".contains(c))
+}

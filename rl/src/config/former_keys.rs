@@ -1,0 +1,31 @@
+//! Keys of settings that earlier versions used.
+//!
+//! Run files, checkpoints and `--set` may use a former key; files are written with current keys only.
+
+/// Settings that have a new key: former and current dotted name.
+pub const RENAMED: [(&str, &str); 8] = [
+    ("exploration.random_share", "exploration.random_action_prob"),
+    ("exploration.random_hold_mean_steps", "exploration.sticky_random_mean_steps"),
+    ("world.gripped_start_share", "world.grasped_start_prob"),
+    ("replay.her_future_share", "replay.her_ratio"),
+    ("replay.moved_share", "replay.displaced_fraction"),
+    ("replay.recombined_share", "replay.coda_fraction"),
+    ("replay.swap_share", "replay.arm_swap_prob"),
+    ("ddpg.cloning_weight", "ddpg.bc_weight"),
+];
+
+/// Settings that no longer exist. Their value was 0 in every recipe, so a file that sets one to 0 means the same run
+/// without it.
+pub const REMOVED: [&str; 2] = ["world.wide_start_share", "replay.advised_share"];
+
+/// Returns the current name of the setting `key`, which may be a former one.
+#[must_use]
+pub fn current(key: &str) -> &str {
+    RENAMED.iter().find(|(former, _)| *former == key).map_or(key, |(_, current)| current)
+}
+
+/// Returns the former name of the setting whose current name is `key`, if it has one.
+#[must_use]
+pub fn former(key: &str) -> Option<&'static str> {
+    RENAMED.iter().find(|(_, current)| *current == key).map(|(former, _)| *former)
+}

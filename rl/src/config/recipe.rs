@@ -1,0 +1,141 @@
+//! The values that a recipe gives to every setting.
+
+use serde::{Deserialize, Serialize};
+use tandem_core::layout::{GOAL_TOLERANCE_M, Task};
+use tandem_core::{Exploration, WorldSettings};
+
+use super::{
+    AdviceConfig, Behaviour, CheckpointConfig, EvaluationConfig, PolyakEvery, RoundsConfig,
+    RunConfig, StopConfig,
+};
+use crate::ddpg::DdpgConfig;
+use crate::her::{ReplayConfig, RewardKind};
+
+/// A named set of values for all settings.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize, Serialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Recipe {
+    /// The paper's DDPG + HER, with the values of the HER reference implementation where the paper gives none.
+    Paper,
+    /// The values that learn fastest on two cores.
+    Tandem,
+}
+
+impl RunConfig {
+    /// Returns the recipe's settings for a task and a number of arms.
+    ///
+    /// Sources of [`Recipe::Paper`]: section 4 of the paper and the HER reference implementation (OpenAI baselines).
+    #[must_use]
+    pub fn defaults(recipe: Recipe, task: Task, n_arms: usize) -> Self {
+        let tandem = recipe == Recipe::Tandem;
+        Self {
+            name: format!("{task}-{n_arms}"),
+            task: task.name().to_owned(),
+            arms: n_arms,
+            seed: 1,
+            recipe,
+            behaviour: Behaviour::Target,
+            advice: AdviceConfig {
+                strategy: if n_arms == 1 { "none" } else { "mc-q:0.1" }.to_owned(),
+                budget: 500_000,
+                share: if tandem { 0.5 } else { 1.0 },
+            },
+            rounds: rounds(recipe),
+            exploration: Exploration {
+                noise_std: 0.2,
+                random_action_prob: 0.3,
+                sticky_random_mean_steps: if tandem { 4.0 } else { 1.0 },
+            },
+            world: world(recipe, task),
+            replay: replay(recipe, n_arms),
+            ddpg: ddpg(recipe, n_arms),
+            evaluation: EvaluationConfig {
+                every_env_steps: 20_000,
+                episodes: 240,
+                seed: 240_240,
+                recorded_episodes: 2,
+                test_episodes: 240,
+            },
+            stop: stop(recipe, task, n_arms),
+            checkpoint: CheckpointConfig { every_rounds: 50, keep: 2 },
+        }
+    }
+
+    /// Gives the networks the size of copies of the recipe's teacher: its depth, and its width for each arm. A run with
+    /// strategy [`INIT_TEACHER`](super::INIT_TEACHER) requires this size.
+    #[must_use]
+    pub fn sized_for_copies(mut self, task: Task) -> Self {
+        let teacher = Self::defaults(self.recipe, task, 1).ddpg;
+        self.ddpg.n_hidden = teacher.n_hidden * self.arms;
+        self.ddpg.n_hidden_layers = teacher.n_hidden_layers;
+        self
+    }
+}
+
+const fn rounds(recipe: Recipe) -> RoundsConfig {
+    match recipe {
+        Recipe::Tandem => RoundsConfig {
+            slots: 8,
+            rollouts: 2,
+            lag: 1,
+            updates_per_env_step: 0.5,
+            polyak_every: PolyakEvery::Update,
+            warmup_env_steps: 2000,
+        },
+        Recipe::Paper => RoundsConfig {
+            slots: 16,
+            rollouts: 2,
+            lag: 0,
+            updates_per_env_step: 0.025,
+            polyak_every: PolyakEvery::Round,
+            warmup_env_steps: 0,
+        },
+    }
+}
+
+/// The paper's recipe ends by wall time, because two cores would take days to converge with it.
+const fn stop(recipe: Recipe, task: Task, n_arms: usize) -> StopConfig {
+    let max_env_steps = match (recipe, task, n_arms) {
+        (Recipe::Paper, ..) => 0,
+        (Recipe::Tandem, Task::Push, 1) => 200_000,
+        (Recipe::Tandem, ..) => 300_000,
+    };
+    let max_minutes = if max_env_steps == 0 { 30.0 } else { 0.0 };
+    StopConfig { until_success: 0.0, max_env_steps, max_minutes }
+}
+
+fn world(recipe: Recipe, task: Task) -> WorldSettings {
+    let starts_grasped = recipe == Recipe::Tandem && task == Task::PickAndPlace;
+    WorldSettings {
+        grasped_start_prob: if starts_grasped { 0.2 } else { 0.0 },
+        ..WorldSettings::default()
+    }
+}
+
+fn replay(recipe: Recipe, n_arms: usize) -> ReplayConfig {
+    let tandem = recipe == Recipe::Tandem;
+    ReplayConfig {
+        capacity_transitions: 1_000_000,
+        her_ratio: 0.8,
+        displaced_fraction: if tandem { 0.5 } else { 0.0 },
+        coda_fraction: if tandem && n_arms == 2 { 1.0 } else { 0.0 },
+        arm_swap_prob: if tandem && n_arms == 2 { 0.5 } else { 0.0 },
+        reward: if tandem { RewardKind::PerArm } else { RewardKind::Joint },
+        goal_tolerance_m: if tandem { 0.04 } else { GOAL_TOLERANCE_M },
+        contact_cost: if tandem && n_arms == 2 { 1.0 } else { 0.0 },
+        contact_foresight_steps: if tandem && n_arms == 2 { 5 } else { 0 },
+    }
+}
+
+fn ddpg(recipe: Recipe, n_arms: usize) -> DdpgConfig {
+    let tandem = recipe == Recipe::Tandem;
+    DdpgConfig {
+        n_hidden: 256,
+        n_hidden_layers: if n_arms == 1 { 3 } else { 4 },
+        discount: if tandem { 0.95 } else { 0.98 },
+        action_penalty: if tandem { 0.1 } else { 1.0 },
+        bc_weight: if tandem && n_arms > 1 { 2.0 } else { 0.0 },
+        cooldown_share: if tandem { 0.2 } else { 0.0 },
+        ..DdpgConfig::default()
+    }
+}

@@ -1,0 +1,56 @@
+//! Recipes, derived numbers and refused values.
+
+use tandem_core::Task;
+
+use super::*;
+
+#[test]
+fn every_recipe_passes_its_own_checks() {
+    for (recipe, task, n_arms) in [
+        (Recipe::Tandem, Task::Push, 1),
+        (Recipe::Tandem, Task::PickAndPlace, 2),
+        (Recipe::Paper, Task::Push, 2),
+        (Recipe::Paper, Task::PickAndPlace, 1),
+    ] {
+        assert!(RunConfig::defaults(recipe, task, n_arms).checked().is_ok());
+    }
+}
+
+#[test]
+fn the_papers_round_has_forty_updates() {
+    let paper = RunConfig::defaults(Recipe::Paper, Task::Push, 2);
+    assert_eq!((paper.episodes_per_round(), paper.updates_per_round()), (32, 40));
+}
+
+#[test]
+fn a_run_cools_down_over_its_last_fifth_if_it_has_an_end() {
+    let mut config = RunConfig::defaults(Recipe::Tandem, Task::Push, 2);
+    config.stop.max_env_steps = 10_000;
+    let first = (0..100).find(|round| config.is_cooldown(*round));
+    assert_eq!((config.env_steps_per_round(), first), (800, Some(10)), "8,000 of 10,000");
+    config.ddpg.cooldown_share = 0.0;
+    assert!((0..=12).all(|round| !config.is_cooldown(round)), "no share of it");
+    config.stop.max_env_steps = 0;
+    assert!((0..100).all(|round| !config.is_cooldown(round)), "without an end");
+}
+
+#[test]
+fn a_bad_value_is_named() {
+    let check = |change: fn(&mut RunConfig), key| {
+        let mut config = RunConfig::defaults(Recipe::Tandem, Task::Push, 2);
+        change(&mut config);
+        let message = config.checked().expect_err("must be refused").to_string();
+        assert!(message.contains(key), "{message:?} does not name {key:?}");
+    };
+    check(|config| config.arms = 3, "arms");
+    check(|config| config.task = "shove".to_owned(), "shove");
+    check(|config| config.advice.share = f64::NAN, "advice.share");
+    check(|config| config.rounds.updates_per_env_step = 0.0, "rounds.updates_per_env_step");
+    check(|config| config.rounds.updates_per_env_step = 1e-300, "updates_per_env_step");
+    check(|config| config.replay.goal_tolerance_m = 1e-30, "replay.goal_tolerance_m");
+    check(|config| config.stop.max_minutes = f64::INFINITY, "stop.max_minutes");
+    check(|config| config.ddpg.actor_learning_rate = 1e-40, "ddpg.actor_learning_rate");
+    check(|config| config.exploration.random_action_prob = 1.0, "exploration.random_action_prob");
+    check(|config| config.name = "a/b".to_owned(), "name");
+    check(|config| config.ddpg.discount = 1.0, "ddpg.discount");
+}

@@ -1,0 +1,89 @@
+//! Section `[replay]` of the run file.
+
+use serde::{Deserialize, Serialize};
+use tandem_core::layout::{EPISODE_STEPS, Layout};
+use tandem_core::settings::OutOfRange;
+
+/// The reward that the critic learns.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize, Serialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum RewardKind {
+    /// One reward: 0 if the norm over all arms' goal distances is within the tolerance, else -1.
+    Joint,
+    /// One reward per arm, and a critic head for each.
+    PerArm,
+}
+
+impl RewardKind {
+    /// Returns the number of the critic's heads.
+    #[must_use]
+    pub const fn n_heads(self, layout: Layout) -> usize {
+        match self {
+            Self::Joint => 1,
+            Self::PerArm => layout.n_arms,
+        }
+    }
+}
+
+/// Section `[replay]` of the run file: the replay buffer, and how batches are sampled from it.
+#[derive(Debug, Clone, PartialEq, Deserialize, Serialize)]
+#[serde(deny_unknown_fields)]
+pub struct ReplayConfig {
+    /// Capacity in transitions, at least one episode's 50 (baselines HER: 1,000,000).
+    pub capacity_transitions: usize,
+    /// Fraction of transitions that get a hindsight goal, in [0, 1]: k/(k + 1) for k goals per transition (Andrychowicz
+    /// et al. 2017: k = 4).
+    pub her_ratio: f32,
+    /// Fraction of transitions sampled from episodes in which an object was displaced, in [0, 1].
+    pub displaced_fraction: f32,
+    /// Fraction of two-arm transitions that combine the arms of two steps, in [0, 1]: counterfactual data augmentation
+    /// (CoDA, Pitis et al. 2020). A combination in which the arms are near each other is rejected. It takes effect with
+    /// [`RewardKind::PerArm`] only.
+    pub coda_fraction: f32,
+    /// Probability that the arms of a two-arm transition exchange places, in [0, 1]: the world's exact symmetry.
+    pub arm_swap_prob: f32,
+    /// The reward that the critic learns.
+    pub reward: RewardKind,
+    /// Distance between an object and its goal, metres, within which training rewards it, 0.0001 to 1 (paper: 0.05,
+    /// which always defines success). A smaller distance leaves room for the motion of an object after its release.
+    pub goal_tolerance_m: f32,
+    /// Cost to every arm of a step on which an arm touches the other or the table, 0 to 100; a pending goal costs 1
+    /// (paper: 0).
+    pub contact_cost: f32,
+    /// Advice is not cloned on the last steps before a contact: this many, counting the step of the contact, 0 to 50
+    /// (paper: 0).
+    pub contact_foresight_steps: usize,
+}
+
+impl ReplayConfig {
+    /// Returns the lowest reward of a step.
+    #[must_use]
+    pub const fn lowest_reward(&self) -> f32 {
+        -1.0 - self.contact_cost
+    }
+
+    /// Checks every range; NaN is in none.
+    ///
+    /// # Errors
+    /// Names the first setting that is out of its range.
+    pub fn check(&self) -> Result<(), OutOfRange> {
+        let fractions = [
+            ("replay.her_ratio", self.her_ratio),
+            ("replay.displaced_fraction", self.displaced_fraction),
+            ("replay.coda_fraction", self.coda_fraction),
+            ("replay.arm_swap_prob", self.arm_swap_prob),
+        ];
+        for (key, value) in fractions {
+            let is_fraction = (0.0..=1.0).contains(&value);
+            OutOfRange::unless(is_fraction, key, value, "a number in [0, 1]")?;
+        }
+        let (key, tolerance_m) = ("replay.goal_tolerance_m", self.goal_tolerance_m);
+        OutOfRange::unless((1e-4..=1.0).contains(&tolerance_m), key, tolerance_m, "0.0001 to 1")?;
+        let (key, cost) = ("replay.contact_cost", self.contact_cost);
+        OutOfRange::unless((0.0..=100.0).contains(&cost), key, cost, "0 to 100")?;
+        let (key, n_steps) = ("replay.contact_foresight_steps", self.contact_foresight_steps);
+        OutOfRange::unless(n_steps <= EPISODE_STEPS, key, n_steps, "0 to 50")?;
+        let (key, capacity) = ("replay.capacity_transitions", self.capacity_transitions);
+        OutOfRange::unless(capacity >= EPISODE_STEPS, key, capacity, "at least 50")
+    }
+}

@@ -1,0 +1,201 @@
+use tandem_core::reward::sparse_reward;
+use tandem_core::rng::{Stream, episode_rng};
+use tandem_core::{Contacts, Episode, Task};
+
+use super::*;
+use crate::replay::drifting_episode;
+
+const LAYOUT: Layout = Layout::new(Task::Push, 2);
+const N_DRAWS: usize = 4000;
+
+fn config(reward: RewardKind) -> ReplayConfig {
+    ReplayConfig {
+        capacity_transitions: 1000,
+        her_ratio: 0.8,
+        displaced_fraction: 0.5,
+        coda_fraction: 0.0,
+        arm_swap_prob: 0.5,
+        reward,
+        goal_tolerance_m: 0.05,
+        contact_cost: 0.0,
+        contact_foresight_steps: 0,
+    }
+}
+
+/// Arm 0's object drifts; goals are far away; every action component is its own index plus the step.
+fn episode() -> Episode {
+    let mut episode = drifting_episode(LAYOUT, 0, 0.01);
+    episode.goal.fill(9.0);
+    for (component, value) in episode.actions.iter_mut().enumerate() {
+        *value = component as f32;
+    }
+    episode.advised_arms.fill(0b01);
+    episode
+}
+
+fn sampled(reward: RewardKind, check: impl Fn(&Sampler, &ReplayBuffer)) {
+    let mut buffer = ReplayBuffer::new(LAYOUT, 1000);
+    buffer.push(&episode());
+    buffer.push(&drifting_episode(LAYOUT, 1, 0.0));
+    let mut sampler = Sampler::new(&config(reward), LAYOUT);
+    let mut rng = episode_rng(1, 0, Stream::Replay);
+    for _ in 0..N_DRAWS {
+        sampler.draw(&buffer, &mut rng);
+        check(&sampler, &buffer);
+    }
+}
+
+#[test]
+fn a_hindsight_goal_was_achieved_strictly_later() {
+    sampled(RewardKind::PerArm, |sampler, buffer| {
+        let drawn = &sampler.drawn;
+        let x = drawn.goal[0];
+        if drawn.steps[0].episode_idx == 0 && x < 9.0 {
+            assert!(
+                x > buffer.achieved(0, drawn.steps[0].step_idx, ArmIndex(0))[0] + 0.005,
+                "not later: {drawn:?}"
+            );
+        }
+    });
+}
+
+#[test]
+fn rewards_follow_from_the_goal_that_was_drawn() {
+    sampled(RewardKind::PerArm, |sampler, buffer| {
+        for arm in LAYOUT.arms() {
+            let achieved = buffer.achieved(
+                sampler.drawn.steps[0].episode_idx,
+                sampler.drawn.steps[0].step_idx + 1,
+                arm,
+            );
+            let goal = &sampler.drawn.goal[LAYOUT.goal_of(arm)];
+            assert_eq!(sampler.drawn.rewards[arm.0], sparse_reward(achieved, goal));
+        }
+    });
+    sampled(RewardKind::Joint, |sampler, buffer| {
+        let observation = buffer
+            .observation(sampler.drawn.steps[0].episode_idx, sampler.drawn.steps[0].step_idx + 1);
+        let achieved: Vec<f32> = tandem_core::reward::achieved_goal(LAYOUT, observation).collect();
+        assert_eq!(sampler.drawn.rewards[0], sparse_reward(&achieved, &sampler.drawn.goal));
+    });
+}
+
+#[test]
+fn shares_are_as_configured() {
+    let count = |reward, holds: fn(&Relabelled) -> bool| {
+        let hits = std::cell::Cell::new(0_usize);
+        sampled(reward, |sampler, _| hits.set(hits.get() + usize::from(holds(&sampler.drawn))));
+        hits.get() as f64 / N_DRAWS as f64
+    };
+    let near = |share: f64, expected: f64| {
+        assert!((share - expected).abs() < 0.03, "{share} is not {expected}");
+    };
+    near(count(RewardKind::PerArm, |drawn| drawn.swapped), 0.5);
+    near(count(RewardKind::PerArm, |drawn| drawn.steps[0].episode_idx == 0), 0.75);
+    near(
+        count(RewardKind::PerArm, |drawn| drawn.steps[0].episode_idx == 0 && drawn.goal[0] < 9.0),
+        0.6,
+    );
+    let one_arm_only = |drawn: &Relabelled| {
+        drawn.steps[0].episode_idx == 0 && (drawn.goal[0] < 9.0) != (drawn.goal[3] < 9.0)
+    };
+    near(count(RewardKind::PerArm, one_arm_only), 0.75 * 2.0 * 0.8 * 0.2);
+    near(count(RewardKind::Joint, one_arm_only), 0.0);
+}
+
+#[test]
+fn swapped_rows_exchange_everything_the_arms_own() {
+    let mut buffer = ReplayBuffer::new(LAYOUT, 1000);
+    buffer.push(&episode());
+    let mut sampler = Sampler::new(&config(RewardKind::PerArm), LAYOUT);
+    let identity = |n: usize| NormalizerSnapshot { mean: vec![0.0; n], std: vec![10.0; n] };
+    let (observation, goal) = (identity(LAYOUT.n_observation()), identity(LAYOUT.n_goal()));
+    let mut batch = Batch::new(LAYOUT, 2, 64);
+    let statistics = Statistics { observation: &observation, goal: &goal };
+    sampler.fill(&buffer, statistics, &mut episode_rng(3, 0, Stream::Replay), &mut batch);
+    let mut n_swapped = 0;
+    for row in 0..64 {
+        let (actions, cloned) =
+            (&batch.actions[row * 6..row * 6 + 6], &batch.bc_mask[row * 6..row * 6 + 6]);
+        let swapped = actions[0] > actions[3];
+        n_swapped += usize::from(swapped);
+        let advised_half =
+            if swapped { [0.0, 0.0, 0.0, 1.0, 1.0, 1.0] } else { [1.0, 1.0, 1.0, 0.0, 0.0, 0.0] };
+        assert_eq!(cloned, advised_half);
+        let input = &batch.inputs[row * 62..row * 62 + 62];
+        let drifting_x = if swapped { input[31] } else { input[3] };
+        let still_x = if swapped { input[3] } else { input[31] };
+        assert!(still_x == 0.0 && drifting_x >= 0.0);
+        let steps = actions[if swapped { 3 } else { 0 }] / 6.0;
+        assert!(
+            (drifting_x * 10.0 - steps * 0.01).abs() < 1e-5,
+            "observation and action of different steps"
+        );
+    }
+    assert!((10..54).contains(&n_swapped));
+}
+
+/// A batch of 256 rows from `buffer`, its numbers as they are.
+fn filled(change: impl FnOnce(&mut ReplayConfig), buffer: &ReplayBuffer) -> Batch {
+    let mut config = config(RewardKind::PerArm);
+    change(&mut config);
+    let mut sampler = Sampler::new(&config, LAYOUT);
+    let identity = |n: usize| NormalizerSnapshot { mean: vec![0.0; n], std: vec![1.0; n] };
+    let (observation, goal) = (identity(LAYOUT.n_observation()), identity(LAYOUT.n_goal()));
+    let mut batch = Batch::new(LAYOUT, 2, 256);
+    let statistics = Statistics { observation: &observation, goal: &goal };
+    sampler.fill(buffer, statistics, &mut episode_rng(3, 0, Stream::Replay), &mut batch);
+    batch
+}
+
+#[test]
+fn a_contact_costs_both_arms_and_ends_cloning_before_it() {
+    let mut episode = episode();
+    episode.contacts[20] = Contacts::ARM_ARM;
+    let mut buffer = ReplayBuffer::new(LAYOUT, 1000);
+    buffer.push(&episode);
+    let change = |config: &mut ReplayConfig| {
+        config.arm_swap_prob = 0.0;
+        config.her_ratio = 0.0;
+        (config.contact_cost, config.contact_foresight_steps) = (0.75, 3);
+    };
+    let batch = filled(change, &buffer);
+    let mut seen = [false; EPISODE_STEPS];
+    for (row, rewards) in batch.rewards.chunks_exact(2).enumerate() {
+        let of_step = |step: &usize| batch.actions[row * 6] == (*step * 6) as f32;
+        let step = (0..EPISODE_STEPS).find(of_step).expect("the action of a step");
+        seen[step] = true;
+        assert_eq!(rewards, if step == 20 { [-1.75; 2] } else { [-1.0; 2] }, "step {step}");
+        let cloned = if (18..=20).contains(&step) { 0.0 } else { 1.0 };
+        assert_eq!(batch.bc_mask[row * 6], cloned, "step {step}");
+    }
+    assert!(seen[17..=21].iter().all(|seen| *seen), "too few draws");
+}
+
+#[test]
+fn arms_of_different_steps_are_put_together_where_they_cannot_meet() {
+    let mut touching = drifting_episode(LAYOUT, 1, 0.0);
+    touching.contacts.fill(Contacts::ARM_ARM);
+    let mut buffer = ReplayBuffer::new(LAYOUT, 1000);
+    buffer.push(&episode());
+    buffer.push(&touching);
+    let mut config = config(RewardKind::PerArm);
+    config.coda_fraction = 1.0;
+    let mut sampler = Sampler::new(&config, LAYOUT);
+    let mut rng = episode_rng(1, 0, Stream::Replay);
+    let (mut n_recombined, mut largest_x) = (0, 0.0_f32);
+    for _ in 0..N_DRAWS {
+        sampler.draw(&buffer, &mut rng);
+        let [first, second] = sampler.drawn.steps[..] else { panic!("two arms") };
+        if first == second {
+            continue;
+        }
+        n_recombined += 1;
+        assert_eq!((first.episode_idx, second.episode_idx), (0, 0), "one of them touches");
+        largest_x = largest_x.max(buffer.achieved(0, first.step_idx + 1, ArmIndex(0))[0]);
+        let goal = sampler.drawn.goal[LAYOUT.goal_of(ArmIndex(0))][0];
+        assert!(goal > buffer.achieved(0, first.step_idx, ArmIndex(0))[0], "another's future");
+    }
+    assert!(n_recombined > N_DRAWS / 10);
+    assert!((largest_x - 0.14).abs() < 0.005, "0.24 m apart, {largest_x} m towards the other");
+}
