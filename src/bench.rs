@@ -6,13 +6,13 @@ use clap::ValueEnum as _;
 use serde_json::{Value, json};
 use tandem_core::layout::EPISODE_STEPS;
 use tandem_core::rng::{Stream, episode_rng, uniform};
-use tandem_core::{Layout, Task, WorldSettings};
+use tandem_core::{ArmIndex, Episode, Layout, Task, WorldSettings};
 use tandem_policy::{Matrix, MatrixMut, MlpShape, NormalizerSnapshot, multiply};
 use tandem_rl::RunConfig;
 use tandem_rl::config::Recipe;
 use tandem_rl::ddpg::{Batch, Ddpg, Rewards};
 use tandem_rl::her::{Sampler, Statistics};
-use tandem_rl::replay::{ReplayBuffer, drifting_episode};
+use tandem_rl::replay::ReplayBuffer;
 use tandem_rl::trainer::Trainer;
 use tandem_sim::{Env, WorldConfig};
 
@@ -190,6 +190,17 @@ fn replay() -> Vec<Figure> {
     let mut rng = episode_rng(1, 0, Stream::Replay);
     let per_s = rate(|| sampler.fill(&buffer, statistics, &mut rng, &mut batch));
     vec![Figure { name: "replay/batch-256".to_owned(), value: 1e6 / per_s, unit: "us" }]
+}
+
+/// Returns an episode in which the object of the first arm moves by `drift_m` per step along x.
+fn drifting_episode(layout: Layout, number: u64, drift_m: f32) -> Episode {
+    let mut episode = Episode::zeros(layout, number);
+    let x = layout.achieved_goal_of(ArmIndex(0)).start;
+    let rows = episode.observations.chunks_exact_mut(layout.n_observation());
+    for (position, row) in std::iter::successors(Some(0.0), |x| Some(x + drift_m)).zip(rows) {
+        row[x] = position;
+    }
+    episode
 }
 
 /// The main job for 30 rounds, evaluations included: its rates and the memory of its processes.

@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 
 use anyhow::Context as _;
 use tandem_learner::checkpoint::CheckpointError;
-use tandem_learner::{AfterTheEnd, Beside, Error as LearnerError};
+use tandem_learner::{Error as LearnerError, LingerPolicy, ServeOptions};
 use tandem_net::{Capacity, Incoming, Pacing};
 use tandem_system::fd_limit;
 use tandem_teacher::Advisor;
@@ -79,7 +79,7 @@ pub(crate) fn learner(args: LearnerArgs) -> Result<(), Failed> {
     let run_file = keeps_run_file.then(|| run_file::to_text(&run_config)).transpose()?;
     run(async move {
         let shutdown = shutdown(args.listen.exit_with_stdin)?;
-        let beside = beside(&args).await?;
+        let options = serve_options(&args).await?;
         let listener = listen(&args.listen).await?;
         let config = tandem_learner::LearnerConfig {
             run: run_config,
@@ -97,7 +97,7 @@ pub(crate) fn learner(args: LearnerArgs) -> Result<(), Failed> {
             first_worker: clock::unix_millis() << 12,
             pacing: Pacing::Concurrent,
         };
-        let served = tandem_learner::serve_beside(config, listener, shutdown, beside).await;
+        let served = tandem_learner::serve_with(config, listener, shutdown, options).await;
         let ended = served.map_err(learner_failed)?;
         if ended.interrupted {
             Err(Failed::new(Exit::Interrupted, anyhow::anyhow!(ended.reason)))
@@ -107,8 +107,8 @@ pub(crate) fn learner(args: LearnerArgs) -> Result<(), Failed> {
     })
 }
 
-/// What the command line asks for beside the service.
-async fn beside(args: &LearnerArgs) -> Result<Beside, Failed> {
+/// Returns the options of the service that the command line asks for.
+async fn serve_options(args: &LearnerArgs) -> Result<ServeOptions, Failed> {
     let metrics = match args.metrics_listen {
         Some(address) => {
             let bound = TcpListener::bind(address).await;
@@ -120,8 +120,8 @@ async fn beside(args: &LearnerArgs) -> Result<Beside, Failed> {
     if let Some(Ok(address)) = metrics.as_ref().map(TcpListener::local_addr) {
         tracing::info!(%address, "figures for Prometheus, without a token");
     }
-    let after_the_end = if args.stay { AfterTheEnd::Stay } else { AfterTheEnd::default() };
-    Ok(Beside { metrics, after_the_end })
+    let linger = if args.stay { LingerPolicy::UntilShutdown } else { LingerPolicy::default() };
+    Ok(ServeOptions { metrics, linger })
 }
 
 pub(crate) fn worker(args: WorkerArgs) -> Result<(), Failed> {

@@ -42,7 +42,7 @@ const PURE: [&str; 25] = [
     "bridge/src/service/execution.rs",
     "bridge/src/service/clock.rs",
     "bridge/src/service/reason_codes.rs",
-    "learner/src/board.rs",
+    "learner/src/work_queue.rs",
     "teacher/src/budget.rs",
     "teacher/src/maps.rs",
     "teacher/src/procedures.rs",

@@ -88,6 +88,23 @@ pub struct Episode {
 }
 
 impl Episode {
+    /// Returns a training episode in which every number is zero, to be filled in.
+    #[must_use]
+    pub fn zeros(layout: Layout, number: u64) -> Self {
+        Self {
+            number,
+            kind: EpisodeKind::Training,
+            parameter_version: 0,
+            layout,
+            observations: vec![0.0; (EPISODE_STEPS + 1) * layout.n_observation()],
+            goal: vec![0.0; layout.n_goal()],
+            actions: vec![0.0; EPISODE_STEPS * layout.n_action()],
+            advised_arms: vec![0; EPISODE_STEPS],
+            contacts: vec![Contacts::NONE; EPISODE_STEPS],
+            advice_charged: 0,
+        }
+    }
+
     /// Returns the observation before step `step_idx`, shape `[n_observation]`; `EPISODE_STEPS` gives the final one.
     ///
     /// # Panics

@@ -5,6 +5,8 @@
 //! the simulator takes it as it is. Another world setting needs a field here, its conversion in `proto` and its effect
 //! in `sim`.
 
+use std::fmt::Display;
+
 use serde::{Deserialize, Serialize};
 
 use crate::episode::EpisodeKind;
@@ -127,11 +129,12 @@ impl OutOfRange {
     /// Returns an error about the setting `key` unless `is_usable`.
     ///
     /// # Errors
-    /// When the value cannot be used.
+    /// Returns an error unless `is_usable`.
+    #[expect(clippy::needless_pass_by_value, reason = "nearly all values are numbers")]
     pub fn unless(
         is_usable: bool,
         key: &'static str,
-        value: impl ToString,
+        value: impl Display + Copy,
         expected: &'static str,
     ) -> Result<(), Self> {
         match is_usable {

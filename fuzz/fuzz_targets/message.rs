@@ -30,7 +30,8 @@ fn read(message: u8, layout: Layout, bytes: &[u8]) {
             tandem_proto::decode_advice(advice, layout).map(|it| tandem_proto::encode_advice(&it))
         }),
         2 => check(bytes, |terms: pb::RunTerms| {
-            tandem_proto::decode_run_terms(terms).map(|terms| tandem_proto::encode_run_terms(&terms))
+            tandem_proto::decode_run_terms(terms)
+                .map(|terms| tandem_proto::encode_run_terms(&terms))
         }),
         3 => check(bytes, |slot: pb::Slot| {
             tandem_proto::decode_slot(slot).map(|slot| tandem_proto::encode_slot(&slot))

@@ -30,8 +30,8 @@ fn main() {
     }
 }
 
-/// Returns the smallest gap of a pair over the ranges, including its allowance, metres, and the share of uniformly drawn
-/// configurations that are refused because of it, per cent.
+/// Returns the smallest gap of a pair over the ranges, including its allowance, metres, and the share of uniformly
+/// drawn configurations that are refused because of it, per cent.
 fn least(pair: usize) -> (f64, f64) {
     let gap_m = |angles: Joints| MICO_4.pair_gap_m(pair, &angles, 1.0);
     let all = uniform_angles().chain(angles_at_ends());

@@ -1,19 +1,19 @@
 //! The check: accepts a motion or refuses it with the first time at which it violates a limit.
 //!
-//! The check examines the samples that the arms receive ([`Motion`]), regardless of their origin, and the cubics between
-//! them. No limit is checked at samples only:
+//! The check examines the samples that the arms receive ([`Motion`]), regardless of their origin, and the cubics
+//! between them. No limit is checked at samples only:
 //!
 //! - Angles, speeds and gripper openings: the extremes of the cubic.
 //! - Accelerations: the smallest limit under which any motion connects the two samples. A jump of an angle needs a very
 //!   large one.
 //! - Tool speed, tilt, reach and gaps: a continuous check, which bounds how fast each quantity can change between the
-//!   points at which it is evaluated. It bisects an interval until at most a stated tolerance is left: 0.1 mm for gaps and
-//!   reach, 0.1 degrees for tilt, 2 mm/s for the tool's speed. Up to these tolerances the whole swept volume keeps its
-//!   gaps.
+//!   points at which it is evaluated. It bisects an interval until at most a stated tolerance is left: 0.1 mm for gaps
+//!   and reach, 0.1 degrees for tilt, 2 mm/s for the tool's speed. Up to these tolerances the whole swept volume keeps
+//!   its gaps.
 //!
 //! Violations of the motion as a whole (numbers of arms and samples, duration, start) are reported first, then the
-//! earliest interval that violates a limit. Within one interval (10 ms) numbers and grippers come first, then joints, then
-//! the arms' shape, each arm by arm.
+//! earliest interval that violates a limit. Within one interval (10 ms) numbers and grippers come first, then joints,
+//! then the arms' shape, each arm by arm.
 //!
 //! Gaps between parts of one arm use the wider gripper opening of an interval's two ends. The jerk is not limited: an
 //! acceleration may change from one sample to the next.

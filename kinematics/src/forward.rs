@@ -35,7 +35,8 @@ impl ForwardKinematics {
         Self { frames, n_joints }
     }
 
-    /// Returns the pose of the tool, metres. The fingers close along its x axis, and the gripper points along its z axis.
+    /// Returns the pose of the tool, metres. The fingers close along its x axis, and the gripper points along its z
+    /// axis.
     #[must_use]
     pub fn tool(&self) -> &Isometry3<f64> {
         &self.frames[self.n_joints + 1]
@@ -86,7 +87,8 @@ impl ForwardKinematics {
         jacobian
     }
 
-    /// Returns the velocity of the tool's origin at joint velocities `velocities` (radians per second), metres per second.
+    /// Returns the velocity of the tool's origin at joint velocities `velocities` (radians per second), metres per
+    /// second.
     #[must_use]
     pub fn tool_velocity(&self, velocities: &Joints) -> Vector3<f64> {
         let jacobian = self.position_jacobian();

@@ -21,8 +21,8 @@ use crate::manipulability::manipulability_m;
 use crate::model::ArmModel;
 use crate::self_collision::SELF_GAP_M;
 
-/// Configurations with a smaller manipulability are singular, metres per radian. The Mico has this manipulability when its
-/// elbow is bent by 8 degrees, 1.5 mm short of its reach.
+/// Configurations with a smaller manipulability are singular, metres per radian. The Mico has this manipulability when
+/// its elbow is bent by 8 degrees, 1.5 mm short of its reach.
 pub const MIN_MANIPULABILITY_M: f64 = 0.02;
 /// The largest difference to the seed, in any joint, of a solution that continues a motion, radians. Larger ones belong
 /// to another branch of solutions or pass close to a singular configuration.
@@ -96,10 +96,10 @@ pub enum ReachError {
 }
 
 impl ArmModel {
-    /// Returns the solution for `target` nearest to `seed` (joint angles, radians) by squared distance. Continuous joints
-    /// take the shorter way round. Solutions in which the arm is too close to itself come last, except within
-    /// 0.35 rad of the seed: there the arm continues its motion, another solution would be a jump, and the motion's check
-    /// decides about the collision.
+    /// Returns the solution for `target` nearest to `seed` (joint angles, radians) by squared distance. Continuous
+    /// joints take the shorter way round. Solutions in which the arm is too close to itself come last, except within
+    /// 0.35 rad of the seed: there the arm continues its motion, another solution would be a jump, and the motion's
+    /// check decides about the collision.
     ///
     /// # Errors
     /// Returns the reason why no solution exists.

@@ -52,7 +52,8 @@
 //!
 //! Lengths are metres, angles radians, times seconds, all `f64`. Transforms are nalgebra's and named `a_from_b`; points
 //! convert from and to glam's vectors with `From`. Trigonometry is `libm`'s and all matrices have static sizes, so the
-//! same input gives the same bits on every machine. The crate does no input or output, reads no clock and knows no driver.
+//! same input gives the same bits on every machine. The crate does no input or output, reads no clock and knows no
+//! driver.
 #![warn(missing_docs)]
 
 pub mod check;

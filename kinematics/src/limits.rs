@@ -7,14 +7,15 @@
 pub struct Limits {
     /// Largest speed of the tool's origin, metres per second. The paper's arms move at 0.20.
     pub tool_speed_mps: f64,
-    /// Time in which a joint may accelerate from rest to its largest speed, seconds. It defines the largest acceleration.
+    /// Time in which a joint may accelerate from rest to its largest speed, seconds. It defines the largest
+    /// acceleration.
     ///
-    /// Kinova publishes no accelerations. The default of 0.25 s allows 144 and 192 degrees per second squared: one joint
-    /// alone accelerates the tool of an outstretched Mico by at most 0.15 g, so that inertia adds little to the static
-    /// load of the motors, and a stop from full speed takes 5 degrees.
+    /// Kinova publishes no accelerations. The default of 0.25 s allows 144 and 192 degrees per second squared: one
+    /// joint alone accelerates the tool of an outstretched Mico by at most 0.15 g, so that inertia adds little to the
+    /// static load of the motors, and a stop from full speed takes 5 degrees.
     pub ramp_s: f64,
-    /// Largest change of a gripper's opening per second, where 0 is shut and 1 open. The default of 0.8 is a choice: the
-    /// arm's description gives no speed of the fingers.
+    /// Largest change of a gripper's opening per second, where 0 is shut and 1 open. The default of 0.8 is a choice:
+    /// the arm's description gives no speed of the fingers.
     pub gripper_opening_per_s: f64,
 }
 

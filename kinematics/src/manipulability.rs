@@ -2,8 +2,8 @@
 
 use crate::forward::PositionJacobian;
 
-/// Returns the smallest singular value of `jacobian`, metres per radian: the speed of the tool in its worst direction per
-/// speed of all joints together. It is 0 in a singular configuration.
+/// Returns the smallest singular value of `jacobian`, metres per radian: the speed of the tool in its worst direction
+/// per speed of all joints together. It is 0 in a singular configuration.
 pub(crate) fn manipulability_m(jacobian: &PositionJacobian) -> f64 {
     let gram = jacobian * jacobian.transpose();
     gram.symmetric_eigenvalues().min().max(0.0).sqrt()

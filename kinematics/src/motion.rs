@@ -13,8 +13,8 @@ pub struct ArmSample {
     pub gripper_opening: f64,
 }
 
-/// The motion of all arms as equidistant samples. Between two samples each joint follows the cubic Hermite polynomial with
-/// the angles and velocities of both.
+/// The motion of all arms as equidistant samples. Between two samples each joint follows the cubic Hermite polynomial
+/// with the angles and velocities of both.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Motion {
     /// Time from one sample to the next, seconds.
@@ -115,8 +115,8 @@ impl Cubic {
     /// Returns the smallest acceleration limit under which some motion connects the two samples, radians per second
     /// squared.
     ///
-    /// That motion is bang-bang: full acceleration in one direction, then in the other. With the limit A, the period h, the
-    /// mean acceleration a and the distance d beyond that of constant acceleration, d = h² (A² − a²) / 4 A.
+    /// That motion is bang-bang: full acceleration in one direction, then in the other. With the limit A, the period h,
+    /// the mean acceleration a and the distance d beyond that of constant acceleration, d = h² (A² − a²) / 4 A.
     pub(crate) fn least_acceleration(&self) -> f64 {
         let [first, middle, last] = self.rates;
         let mean = (last - first) / self.period_s;
@@ -136,7 +136,8 @@ impl Cubic {
         })
     }
 
-    /// Returns the roots of the velocity as shares of the period. Values outside (0, 1), NaN included, are to be ignored.
+    /// Returns the roots of the velocity as shares of the period. Values outside (0, 1), NaN included, are to be
+    /// ignored.
     fn stationary_shares(&self) -> [f64; 2] {
         let [a, b, c] = self.rates;
         let (square, half) = (a - 2.0 * b + c, b - a);

@@ -1,17 +1,18 @@
 //! The planner: from waypoints to a trajectory that the arms can follow.
 //!
-//! 1. Straight lines of the tool connect the waypoints and are cut into equal pieces of at most [`PlanSettings::piece_m`].
-//!    Inverse kinematics, seeded with the previous angles, gives the joint angles at every cut.
-//! 2. These angles and the gripper openings are the control points of one cubic B-spline for all arms together. The tool
-//!    deviates from the line at corners only: by at most a third of a piece in a full reversal, 2 mm with pieces of 6 mm,
-//!    and less in smaller turns.
+//! 1. Straight lines of the tool connect the waypoints and are cut into equal pieces of at most
+//!    [`PlanSettings::piece_m`]. Inverse kinematics, seeded with the previous angles, gives the joint angles at every
+//!    cut.
+//! 2. These angles and the gripper openings are the control points of one cubic B-spline for all arms together. The
+//!    tool deviates from the line at corners only: by at most a third of a piece in a full reversal, 2 mm with pieces
+//!    of 6 mm, and less in smaller turns.
 //! 3. The path is followed as fast as the limits allow, from rest to rest, with one time scaling for all arms and
-//!    grippers, so that simultaneous waypoints stay simultaneous. The path is never followed faster than one waypoint per
-//!    [`PlanSettings::step_s`]. [`PlanSettings::speed`] then scales the whole motion.
+//!    grippers, so that simultaneous waypoints stay simultaneous. The path is never followed faster than one waypoint
+//!    per [`PlanSettings::step_s`]. [`PlanSettings::speed`] then scales the whole motion.
 //!
-//! The limits hold between samples too. Speeds and accelerations of the joints use bounds on the spline's derivatives; the
-//! tool's speed uses values at nine points of each span and a bound on its change between them. The planner uses 98 per
-//! cent of every limit; the rest is left for sampling and its check.
+//! The limits hold between samples too. Speeds and accelerations of the joints use bounds on the spline's derivatives;
+//! the tool's speed uses values at nine points of each span and a bound on its change between them. The planner uses 98
+//! per cent of every limit; the rest is left for sampling and its check.
 
 mod error;
 
@@ -239,8 +240,8 @@ fn span_bounds(
     bounds
 }
 
-/// Returns an upper bound on the distance that the tool covers per unit of the path in one span, metres. `per_span` bounds
-/// the first and second derivative of each joint.
+/// Returns an upper bound on the distance that the tool covers per unit of the path in one span, metres. `per_span`
+/// bounds the first and second derivative of each joint.
 fn tool_per_span_m(
     placed: &PlacedArm,
     path: &Spline,

@@ -1,5 +1,5 @@
-//! Time-optimal path parameterization: the fastest time scaling of a path within limits that hold everywhere, not only at
-//! samples.
+//! Time-optimal path parameterization: the fastest time scaling of a path within limits that hold everywhere, not only
+//! at samples.
 //!
 //! Let s be the path parameter in spans, v its rate and x = v². The acceleration u of s is constant in every span, so x
 //! changes linearly from one end to the other. In a span where |dq/ds| <= V and |d²q/ds²| <= C for a joint:

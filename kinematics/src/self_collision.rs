@@ -3,12 +3,12 @@
 //! Adjacent parts share a joint and always overlap; the joint's range keeps them apart. A model lists every other pair
 //! that can collide ([`ArmModel::self_pairs`]).
 //!
-//! **Allowances.** A capsule is about a centimetre larger than the part it models, so two capsules can overlap where the
-//! parts do not. Example `self_gaps` prints the smallest gap of every pair over the joints' ranges. In one pair the
+//! **Allowances.** A capsule is about a centimetre larger than the part it models, so two capsules can overlap where
+//! the parts do not. Example `self_gaps` prints the smallest gap of every pair over the joints' ranges. In one pair the
 //! capsules overlap within Kinova's own ranges: the gap between the hand and the upper arm of the Mico with four joints
-//! depends on joint 3 alone, and the capsules overlap by 23.9 mm at 35 degrees, the end of its range. The actuators there
-//! have radii of 37.5 and 29 mm and are 4.6 mm apart. That pair is therefore judged by the actuators' radii, which are
-//! 28.5 mm less than those of the capsules. No other pair has an allowance: overlapping capsules are refused.
+//! depends on joint 3 alone, and the capsules overlap by 23.9 mm at 35 degrees, the end of its range. The actuators
+//! there have radii of 37.5 and 29 mm and are 4.6 mm apart. That pair is therefore judged by the actuators' radii,
+//! which are 28.5 mm less than those of the capsules. No other pair has an allowance: overlapping capsules are refused.
 
 use nalgebra::Isometry3;
 

@@ -1,9 +1,9 @@
 //! Uniform cubic B-splines in all joints of all arms and the openings of the grippers.
 //!
-//! The span between two control points has length 1. A B-spline approximates its control points: at a corner it deviates
-//! by a sixth of the second difference, and it is exact where points are equidistant on a line. It is twice continuously
-//! differentiable. Its first derivative lies in the convex hull of three values and its second between two, all given
-//! directly by the control points.
+//! The span between two control points has length 1. A B-spline approximates its control points: at a corner it
+//! deviates by a sixth of the second difference, and it is exact where points are equidistant on a line. It is twice
+//! continuously differentiable. Its first derivative lies in the convex hull of three values and its second between
+//! two, all given directly by the control points.
 
 /// A path as control points, each a row of `n_channels` values.
 #[derive(Debug, Clone)]
@@ -22,8 +22,8 @@ pub(crate) struct Jet {
 }
 
 impl Spline {
-    /// Creates the path from the first to the last of `points` (shape `[n_spans + 1, n_channels]`). Linear extrapolation adds
-    /// a control point at each end, so that the path starts and ends exactly at these points.
+    /// Creates the path from the first to the last of `points` (shape `[n_spans + 1, n_channels]`). Linear
+    /// extrapolation adds a control point at each end, so that the path starts and ends exactly at these points.
     ///
     /// # Panics
     /// If there are fewer than two points.

@@ -2,13 +2,13 @@
 //!
 //! **The training world** gives every number in an arm's own frame: origin on the table in the centre of the arm's
 //! workspace, x away from its base, z up, metres. The second arm's frame is the first's rotated by half a turn. Objects
-//! and goals lie within 0.12 m of the centre along x and y and up to 0.27 m high (two arms); the tool moves within 0.20 m,
-//! 0.25 m and 0.35 m. The gripper's fingers close along y.
+//! and goals lie within 0.12 m of the centre along x and y and up to 0.27 m high (two arms); the tool moves within 0.20
+//! m, 0.25 m and 0.35 m. The gripper's fingers close along y.
 //!
 //! **The Mico with four joints** points nearly down in a narrow ring only (see [`inverse`](crate::inverse)), and the
 //! training world's base, 0.40 m behind the centre, is outside that ring. A [`TaskFrame`] scales own frames about their
-//! centre and moves the centre into the ring. The table gives the share of points, drawn uniformly from the tasks' area,
-//! at which the gripper tilts by at most 15, 20, 25, 30 and 40 degrees (measured by example `area`):
+//! centre and moves the centre into the ring. The table gives the share of points, drawn uniformly from the tasks'
+//! area, at which the gripper tilts by at most 15, 20, 25, 30 and 40 degrees (measured by example `area`):
 //!
 //! | scale | base behind centre | lift | heights | 15° | 20° | 25° | 30° | 40° | reached |
 //! |---|---|---|---|---|---|---|---|---|---|
@@ -18,11 +18,11 @@
 //! | 1 | 0.27 m | 45 mm | up to the highest goal | 42 % | 57 % | 71 % | 82 % | 95 % | 98 % |
 //! | 1 | 0.40 m | 45 mm | on the table | 27 % | 37 % | 48 % | 58 % | 77 % | 100 % |
 //!
-//! [`TaskFrame::MICO_4`] is the first of these: everything is within 20 degrees. In exchange, 1 m of the policy is 0.5 m
-//! on the table, so objects must be half as large as in the training world, or the policy must be trained with larger
-//! ones. The lift accounts for the real fingers, which extend 44 mm beyond the tool's origin where those of the training
-//! world extend 20 mm. The centres stay 0.24 m apart at any scale: that distance is the room for the hands, which are not
-//! scaled.
+//! [`TaskFrame::MICO_4`] is the first of these: everything is within 20 degrees. In exchange, 1 m of the policy is 0.5
+//! m on the table, so objects must be half as large as in the training world, or the policy must be trained with larger
+//! ones. The lift accounts for the real fingers, which extend 44 mm beyond the tool's origin where those of the
+//! training world extend 20 mm. The centres stay 0.24 m apart at any scale: that distance is the room for the hands,
+//! which are not scaled.
 
 use nalgebra::{Point3, Vector3};
 

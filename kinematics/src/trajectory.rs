@@ -75,7 +75,8 @@ impl Trajectory {
         self.path.n_spans() / self.n_pieces as usize + 1
     }
 
-    /// Returns the time at which the tools are at waypoint `idx` (counted from 0), or closest to it in a corner, seconds.
+    /// Returns the time at which the tools are at waypoint `idx` (counted from 0), or closest to it in a corner,
+    /// seconds.
     ///
     /// # Panics
     /// If there is no such waypoint.

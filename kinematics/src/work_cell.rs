@@ -100,8 +100,8 @@ impl WorkCell {
         self.gaps_with(at, &vec![1.0; at.len()])
     }
 
-    /// Returns the gaps of the arms at joint angles `at` (radians, arm by arm) with grippers open by `gripper_openings` (0
-    /// to 1).
+    /// Returns the gaps of the arms at joint angles `at` (radians, arm by arm) with grippers open by `gripper_openings`
+    /// (0 to 1).
     ///
     /// Openings count between parts of the same arm only. All other gaps are those of wide open grippers.
     ///

@@ -339,10 +339,10 @@ fn solutions_in_which_the_arm_collides_with_itself_come_last() {
         assert!(clear(&taken) || !any || continues, "{taken:?} from {seed:?}");
         n_avoided += u32::from(clear(&taken) && all.iter().any(|s| !clear(&s.angles)));
         // An arm that continues a motion keeps its elbow on the same side.
-        let beside = MICO_4.inverse_kinematics(&target, &all[0].angles).expect("the same");
-        assert!(beside.angles.largest_difference(&all[0].angles) < 1e-6);
+        let again = MICO_4.inverse_kinematics(&target, &all[0].angles).expect("the same");
+        assert!(again.angles.largest_difference(&all[0].angles) < 1e-6);
         n_followed += u32::from(!clear(&all[0].angles));
     }
-    // Most targets that one solution reaches only by collision with the base are so for all solutions.
+    // Where one solution collides with the base, usually all of them do.
     assert!(n_avoided > 10 && n_followed > 500, "{n_avoided} {n_followed}");
 }

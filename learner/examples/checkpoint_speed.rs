@@ -9,12 +9,11 @@ use std::path::PathBuf;
 use std::time::Instant;
 
 use tandem_core::layout::EPISODE_STEPS;
-use tandem_core::{Layout, Task};
+use tandem_core::{Episode, Layout, Task};
 use tandem_learner::checkpoint::{self, Resumption};
-use tandem_learner::records::Judged;
+use tandem_learner::evaluation_store::EvaluationHistory;
 use tandem_rl::RunConfig;
 use tandem_rl::config::Recipe;
-use tandem_rl::replay::drifting_episode;
 use tandem_rl::trainer::Trainer;
 
 const N_TRANSITIONS: usize = 300_000;
@@ -26,13 +25,13 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let directory = directory.join(format!("checkpoint-speed-{}", std::process::id()));
     let config = RunConfig::defaults(Recipe::Tandem, Task::Push, 2);
     let mut trainer = Trainer::new(config.clone())?;
-    let episode = drifting_episode(Layout::new(Task::Push, 2), 0, 0.01);
+    let episode = Episode::zeros(Layout::new(Task::Push, 2), 0);
     for _ in 0..N_TRANSITIONS / EPISODE_STEPS {
         trainer.ingest(std::slice::from_ref(&episode));
     }
     let resumption = Resumption {
         acting: trainer.publish(),
-        judged: Judged::default(),
+        history: EvaluationHistory::default(),
         pending: Vec::new(),
         wall_s: 0.0,
     };

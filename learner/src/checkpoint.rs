@@ -1,8 +1,8 @@
-//! The whole learning state in one file, written whole or not at all.
+//! Checkpoints: the whole learning state in one file, replaced atomically.
 //!
-//! A checkpoint is a safetensors file `checkpoint/{round}.safetensors` under a seal: every tensor of the state, what
-//! the evaluations have brought and those that are under way, and metadata with the counters. Together with the run
-//! file it is all that a run needs to go on as if nothing had happened. The former one stays until the new one is whole.
+//! A checkpoint is a safetensors file `checkpoint/{round}.safetensors` with a checksum (the seal). It contains every
+//! tensor of the state, complete and pending evaluations, and metadata with the counters. A run resumed from it and its
+//! run file continues with the same bits. The previous checkpoint stays until the new one is complete.
 
 mod sealed;
 mod state;
@@ -12,49 +12,49 @@ use std::io;
 use std::path::{Path, PathBuf};
 
 use tandem_core::work::PublishedActor;
-use tandem_system::atomic_file::{self, TEMPORARY_EXTENSION};
-
-use crate::records::{Judged, Pending};
-use crate::settings::{self, ADVICE, Changed};
-use sealed::{FORMAT, Refused, Tensor};
 use tandem_rl::config::{ConfigError, RunConfig};
 use tandem_rl::trainer::Trainer;
+use tandem_system::atomic_file::{self, TEMPORARY_EXTENSION};
 
-/// What a checkpoint holds beside the trainer.
+use crate::evaluation_store::{EvaluationHistory, PendingEvaluation};
+use crate::settings::{self, ADVICE, Changed};
+use sealed::{FORMAT, Refused, Tensor};
+
+/// The contents of a checkpoint besides the trainer.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Resumption {
-    /// The parameters with which the round after the checkpoint is played.
+    /// The parameters that play the round after the checkpoint.
     pub acting: PublishedActor,
-    /// What the evaluations have brought.
-    pub judged: Judged,
-    /// Evaluations whose episodes are not all in, oldest first.
-    pub pending: Vec<Pending>,
-    /// Seconds that the run has taken so far.
+    /// The results of complete evaluations.
+    pub history: EvaluationHistory,
+    /// Pending evaluations, oldest first.
+    pub pending: Vec<PendingEvaluation>,
+    /// Wall time of the run so far, seconds.
     pub wall_s: f64,
 }
 
-/// Why a checkpoint could not be written or read.
+/// An error about a checkpoint.
 #[derive(Debug, thiserror::Error)]
 pub enum CheckpointError {
-    /// The file system refused.
+    /// The file system returned an error.
     #[error("cannot {action} checkpoint {path:?}")]
     Io {
-        /// What was attempted.
+        /// The attempted action.
         action: &'static str,
-        /// On which file.
+        /// The file.
         path: PathBuf,
-        /// Why not.
+        /// The cause.
         source: io::Error,
     },
-    /// Not a whole checkpoint.
+    /// The file is truncated or altered.
     #[error("checkpoint {path:?} is damaged: {what}")]
     Damaged {
         /// The file.
         path: PathBuf,
-        /// What is wrong with it.
+        /// The damage.
         what: String,
     },
-    /// Written by another version of the program.
+    /// The file has the format of another version of the program.
     #[error("checkpoint {path:?} is of format {got:?}, this program reads {FORMAT:?}")]
     Format {
         /// The file.
@@ -62,43 +62,43 @@ pub enum CheckpointError {
         /// Its format.
         got: String,
     },
-    /// A whole checkpoint that the run cannot go on from.
+    /// The checkpoint is whole and does not fit the run.
     #[error("checkpoint {path:?} does not fit the run: {what}")]
     OtherRun {
         /// The file.
         path: PathBuf,
-        /// What does not fit.
+        /// The mismatch.
         what: String,
     },
-    /// A whole checkpoint of a run that began with another value of a setting which it must keep.
+    /// The run started with another value of a setting that must not change.
     #[error("{setting}'s checkpoint {path:?}: {ADVICE}")]
     OtherSettings {
         /// The file.
         path: PathBuf,
-        /// What differs.
+        /// The setting.
         setting: Changed,
     },
-    /// A run that is to start anew in a directory that holds one.
+    /// A new run was to start in the directory of another.
     #[error("{0:?} holds a run already: resume it, or choose another directory")]
     RunExists(PathBuf),
-    /// The run file cannot be used.
+    /// A setting of the run file cannot be used.
     #[error(transparent)]
     Config(#[from] ConfigError),
 }
 
-/// A checkpoint as it was saved.
+/// A saved checkpoint.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Saved {
-    /// Where it is.
+    /// Its path.
     pub path: PathBuf,
-    /// SHA-256 over the file with zeros in its own place, hexadecimal.
+    /// SHA-256 over the file with zeros in place of the seal, hexadecimal.
     pub seal: String,
 }
 
-/// A checkpoint as it was restored.
+/// A restored checkpoint.
 #[derive(Debug)]
 pub struct Restored {
-    /// Where it is.
+    /// Its path.
     pub path: PathBuf,
     /// The learning state.
     pub trainer: Trainer,
@@ -106,11 +106,11 @@ pub struct Restored {
     pub resumption: Resumption,
 }
 
-/// Writes a checkpoint into `directory` and removes the oldest, so that `keep` stay, this one among them. What cannot
-/// be removed is left, with a warning.
+/// Writes a checkpoint to `directory` and removes old ones, so that `keep` remain, including this one. A file that
+/// cannot be removed stays, with a warning.
 ///
 /// # Errors
-/// When the file system refuses; former checkpoints are then untouched.
+/// When the file cannot be written; former checkpoints are unchanged then.
 pub fn save(
     directory: &Path,
     trainer: &Trainer,
@@ -137,7 +137,7 @@ pub fn save(
     Ok(Saved { path, seal })
 }
 
-/// Removes all but the newest `keep` checkpoints, `newest` being the first of them.
+/// Removes all but the newest `keep` checkpoints, `newest` among them.
 fn prune(directory: &Path, newest: &Path, keep: usize) {
     let mut former = list(directory);
     former.retain(|path| path != newest);
@@ -148,13 +148,13 @@ fn prune(directory: &Path, newest: &Path, keep: usize) {
     }
 }
 
-/// The checkpoints in `directory`, oldest first; none when it cannot be read.
+/// Returns the checkpoints in `directory`, oldest first; none if it cannot be read.
 #[must_use]
 pub fn list(directory: &Path) -> Vec<PathBuf> {
     files(directory, "safetensors").unwrap_or_default()
 }
 
-/// The files of `directory` that end so, by name; a directory that is not there has none.
+/// Returns the files of `directory` with this extension, by name; a missing directory has none.
 fn files(directory: &Path, extension: &str) -> io::Result<Vec<PathBuf>> {
     let entries = match fs::read_dir(directory) {
         Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(Vec::new()),
@@ -171,12 +171,12 @@ fn files(directory: &Path, extension: &str) -> io::Result<Vec<PathBuf>> {
     Ok(paths)
 }
 
-/// Restores the newest checkpoint in `directory` of a run with `config`; `None` when there is none. Removes what a
-/// killed writer left unfinished.
+/// Restores the newest checkpoint in `directory` of a run with `config`; returns `None` if there is none. Removes
+/// unfinished files of a killed process.
 ///
 /// # Errors
-/// When the directory cannot be read, or the newest is damaged or does not fit the run; the message names the file and
-/// the former one.
+/// When the directory cannot be read, or the newest checkpoint is damaged or does not fit the run. The message names
+/// the file and, if the file is damaged, the previous one.
 pub fn load_newest(
     directory: &Path,
     config: &RunConfig,
@@ -205,7 +205,7 @@ pub fn load_newest(
 /// Restores one checkpoint.
 ///
 /// # Errors
-/// When it cannot be read, is damaged, of another format, or does not fit the run.
+/// When it cannot be read, is damaged, has another format, or does not fit the run.
 pub fn load(path: &Path, config: &RunConfig) -> Result<Restored, CheckpointError> {
     let bytes = fs::read(path).map_err(|source| CheckpointError::Io {
         action: "read",
@@ -229,19 +229,19 @@ pub fn load(path: &Path, config: &RunConfig) -> Result<Restored, CheckpointError
     }
 }
 
-/// The setting in which `config` differs from `began_with`; a text that cannot be read tells of none.
+/// Returns the setting in which `config` differs from `began_with`; none if the text cannot be parsed.
 fn changed(config: &RunConfig, began_with: &str) -> Option<Changed> {
     settings::first_change(config, began_with).ok().flatten()
 }
 
-/// Refuses settings with which the run whose checkpoints are in `directory` cannot go on, as far as the newest one's
-/// header tells; gives whether it does. Whether that checkpoint is sound is for [`load_newest`] to say.
+/// Compares settings with the header of the newest checkpoint in `directory`, without verifying the checkpoint. Returns
+/// false if there is none to compare with.
 ///
 /// # Errors
-/// When a setting differs that a run must keep.
+/// When a setting differs that must not change.
 pub fn check_settings(directory: &Path, config: &RunConfig) -> Result<bool, CheckpointError> {
-    let told = list(directory).pop().and_then(|path| Some((sealed::settings_of(&path)?, path)));
-    let Some((began_with, path)) = told else { return Ok(false) };
+    let newest = list(directory).pop().and_then(|path| Some((sealed::settings_of(&path)?, path)));
+    let Some((began_with, path)) = newest else { return Ok(false) };
     match changed(config, &began_with) {
         Some(setting) => Err(CheckpointError::OtherSettings { path, setting }),
         None => Ok(true),

@@ -1,53 +1,53 @@
-//! Why a learner gives up.
+//! Errors of a learner.
 
 use std::path::PathBuf;
-
-use crate::checkpoint::CheckpointError;
-use crate::teacher::TeacherError;
 use tandem_rl::config::{ConfigError, INIT_TEACHER};
 use tandem_rl::ddpg::DdpgError;
 
-/// Why a learner gave up.
+use crate::advice_account::TeacherError;
+use crate::checkpoint::CheckpointError;
+
+/// An error that ends a learner.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
-    /// The run file cannot be used.
+    /// A setting of the run file cannot be used.
     #[error(transparent)]
     Config(#[from] ConfigError),
-    /// The state could not be saved or restored.
+    /// The state cannot be saved or restored.
     #[error(transparent)]
     Checkpoint(#[from] CheckpointError),
-    /// Something in the run directory could not be read or written.
+    /// A file in the run directory cannot be read or written.
     #[error("cannot {action} {path:?}")]
     RunDirectory {
-        /// What was attempted.
+        /// The attempted action.
         action: &'static str,
-        /// On what.
+        /// The file or directory.
         path: PathBuf,
-        /// Why not.
+        /// The cause.
         source: Box<dyn std::error::Error + Send + Sync>,
     },
-    /// The teacher declined, or its address is none.
+    /// The teacher refused, or its address is malformed.
     #[error(transparent)]
     Teacher(#[from] TeacherError),
-    /// The run asks for advice and no teacher is named.
+    /// The run asks for advice and has no teacher.
     #[error("strategy {0:?} needs a teacher: give its address")]
     NoTeacher(String),
-    /// The run cannot start from the teacher that was given, or none was.
+    /// The run cannot start from the given teacher, or none was given.
     #[error("strategy {INIT_TEACHER:?} {0}")]
     StartFrom(String),
     /// Learning diverged.
     #[error(transparent)]
     Diverged(#[from] DdpgError),
-    /// The service cannot be offered.
+    /// The service cannot be configured.
     #[error(transparent)]
     Gate(#[from] tandem_net::GateError),
-    /// A relay cannot call its learner.
+    /// The address of a relay's learner is malformed.
     #[error(transparent)]
     Address(#[from] tandem_net::DialError),
-    /// The network refused.
+    /// The server failed.
     #[error("cannot serve")]
     Serve(#[from] tonic::transport::Error),
-    /// The thread that learns panicked: a bug.
+    /// The learning thread panicked, which is a bug.
     #[error("the learning thread panicked")]
     Panicked,
 }

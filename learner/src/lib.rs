@@ -1,27 +1,30 @@
 //! The learner: the training loop over rounds, checkpoints, evaluations, and the `Learner` service.
 //!
-//! The learning algorithm is in `tandem-rl`. The crate does not know how an episode is simulated, how many workers there
-//! are or how a teacher decides.
+//! The learning algorithm is in `tandem-rl`. The crate does not know how an episode is simulated, how many workers
+//! there are or how a teacher decides.
 //!
-//! Reading order: [`board`] (the queue of work), [`records`] (results of evaluations), [`checkpoint`], [`settings`] (what
-//! a resumed run must keep),
-//! [`service`] (the gRPC shell and the thread that learns), [`relay`] (a proxy between a learner and many workers).
+//! Reading order: [`work_queue`] (the assignment of slots to workers), [`evaluation_store`] (results of evaluations),
+//! [`checkpoint`], [`settings`] (settings that a resumed run keeps), [`service`] (the gRPC service, next to the
+//! learning thread), [`relay`] (a proxy between a learner and many workers).
+#![warn(missing_docs)]
 
-pub mod board;
+mod advice_account;
 pub mod checkpoint;
-mod drive;
+mod connections;
 mod error;
+pub mod evaluation_store;
 mod metrics;
-pub mod records;
+mod progress;
 pub mod relay;
 mod runtime;
 pub mod service;
 pub mod settings;
 mod shared;
-mod teacher;
+mod training_loop;
 mod warnings;
+pub mod work_queue;
 
-pub use drive::Ended;
 pub use error::Error;
-pub use service::{AfterTheEnd, Beside, serve, serve_beside};
+pub use service::{LingerPolicy, ServeOptions, serve, serve_with};
 pub use shared::{Clock, LearnerConfig};
+pub use training_loop::RunOutcome;

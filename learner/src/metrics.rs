@@ -1,7 +1,7 @@
-//! The run in figures, as Prometheus reads them (OpenMetrics text).
+//! The run's metrics for Prometheus (OpenMetrics text).
 //!
-//! They are for dashboards and for whoever decides how many workers there shall be. Nobody needs a token to read them, so
-//! nothing here may be a secret, and no worker's own label is given.
+//! They are meant for dashboards and autoscalers. Reading them requires no token, so they contain no secret and no
+//! worker's own label.
 
 use std::time::Duration;
 
@@ -10,20 +10,21 @@ use prometheus_client::metrics::counter::ConstCounter;
 use prometheus_client::metrics::gauge::ConstGauge;
 use prometheus_client::metrics::info::Info;
 use prometheus_client::registry::Registry;
-use tandem_proto::pb;
+use tandem_rl::trainer::Counters;
 
-use crate::board::Board;
+use crate::progress::Progress;
 use crate::shared::Shared;
+use crate::work_queue::WorkQueue;
 
 pub(crate) const PATH: &str = "/metrics";
 pub(crate) const CONTENT_TYPE: &str = "application/openmetrics-text; version=1.0.0; charset=utf-8";
 
-/// How things stand.
+/// Returns the metrics page.
 pub(crate) fn page(shared: &Shared) -> String {
     let progress = shared.progress.borrow().clone();
     let mut registry = Registry::with_prefix("tandem");
     let state = shared.lock();
-    add_board(&mut registry, &state.board, (shared.clock)());
+    add_queue(&mut registry, &state.queue, (shared.clock)());
     let n_replay_episodes = state.n_replay_episodes;
     drop(state);
     gauge(
@@ -33,29 +34,29 @@ pub(crate) fn page(shared: &Shared) -> String {
         n_replay_episodes as f64,
     );
     add_progress(&mut registry, &progress);
-    add_judgement(&mut registry, &progress);
+    add_evaluations(&mut registry, &progress);
     let mut page = String::new();
-    encode(&mut page, &registry).expect("a text takes whatever is written to it");
+    encode(&mut page, &registry).expect("writing to a string succeeds");
     page
 }
 
-/// What is to be played, and by how many.
-fn add_board(registry: &mut Registry, board: &Board, now: Duration) {
-    let (waiting, playing) = (board.n_waiting() as f64, board.n_out() as f64);
+/// Adds the slots and the workers.
+fn add_queue(registry: &mut Registry, queue: &WorkQueue, now: Duration) {
+    let (waiting, playing) = (queue.n_waiting() as f64, queue.n_assigned() as f64);
     gauge(registry, "assignments_waiting", "Slots that wait for a worker", waiting);
     gauge(registry, "assignments_playing", "Slots that a worker plays", playing);
-    gauge(registry, "workers", "Workers that are heard of", board.n_alive(now) as f64);
+    gauge(registry, "workers", "Workers that call", queue.n_alive(now) as f64);
 }
 
-/// How far the run has come.
-fn add_progress(registry: &mut Registry, progress: &pb::Progress) {
+/// Adds the counters and rates of the run.
+fn add_progress(registry: &mut Registry, progress: &Progress) {
     let labels = vec![
         ("task", progress.task.clone()),
         ("arms", progress.n_arms.to_string()),
         ("strategy", progress.strategy.clone()),
     ];
     registry.register("run", "What is learned, and how it is advised", Info::new(labels));
-    let pb::Progress { round, env_steps, episodes, updates, advice_spent, .. } = *progress;
+    let Counters { round, env_steps, episodes, updates, advice_spent } = progress.counters;
     counter(registry, "rounds", "Rounds that were learned", round);
     counter(registry, "env_steps", "Training steps in environments", env_steps);
     counter(registry, "episodes", "Training episodes", episodes);
@@ -72,21 +73,26 @@ fn add_progress(registry: &mut Registry, progress: &pb::Progress) {
     let (steps_per_s, updates_per_s) = (progress.env_steps_per_s, progress.updates_per_s);
     gauge(registry, "env_steps_per_second", "Training steps a second, of late", steps_per_s);
     gauge(registry, "updates_per_second", "Updates a second, of late", updates_per_s);
-    gauge(registry, "ended", "1 once the run has ended", f64::from(u8::from(progress.ended)));
-    let needs_a_person = f64::from(u8::from(!progress.warning.is_empty()));
+    gauge(
+        registry,
+        "ended",
+        "1 once the run has ended",
+        f64::from(u8::from(progress.end.is_some())),
+    );
+    let needs_attention = f64::from(u8::from(!progress.warning.is_empty()));
     gauge(
         registry,
         "needs_attention",
-        "1 while something needs a person, see Status",
-        needs_a_person,
+        "1 while something requires an operator, see Status",
+        needs_attention,
     );
 }
 
-/// How good the policy is; what has not been judged yet is left out.
-fn add_judgement(registry: &mut Registry, progress: &pb::Progress) {
+/// Adds success rates, as far as there are any.
+fn add_evaluations(registry: &mut Registry, progress: &Progress) {
     let training = "Share of the latest training episodes that succeeded";
     gauge(registry, "training_success_ratio", training, progress.training_success);
-    if let Some(evaluation) = &progress.evaluation {
+    if let Some(evaluation) = &progress.latest {
         let latest = "Share of the latest evaluation's episodes that succeeded";
         gauge(registry, "evaluation_success_ratio", latest, evaluation.success);
     }

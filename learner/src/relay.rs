@@ -1,8 +1,8 @@
-//! A relay: a learner to its workers, a client to the learner.
+//! A relay: a proxy between a learner and many workers.
 //!
-//! Parameters are fetched once a version and handed out from here; everything else is passed on. So a learner with a
-//! thousand workers behind ten relays sends ten copies of a version and not a thousand. A relay keeps nothing that a
-//! run needs: one that dies is started again, and its workers ask again meanwhile.
+//! A relay fetches each version of the parameters once and forwards all other calls. A learner with a thousand workers
+//! behind ten relays sends ten copies of a version instead of a thousand. A relay has no state that a run needs: it can
+//! be restarted at any time, and its workers retry meanwhile.
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -20,13 +20,13 @@ use crate::error::Error;
 use crate::service::{MAX_MESSAGE_BYTES, check_version};
 use crate::shared::KEPT_VERSIONS;
 
-/// How long the learner may take to answer; a question for work is held there for some seconds.
-const ANSWER: Duration = Duration::from_secs(20);
+/// Deadline of a call to the learner, which holds a request for work for up to 2 s.
+const CALL_DEADLINE: Duration = Duration::from_secs(20);
 
-/// Serves workers at `incoming` on behalf of the learner at `learner`, until `shutdown` is cancelled.
+/// Serves workers at `incoming` on behalf of the learner at `learner` until `shutdown` is cancelled.
 ///
 /// # Errors
-/// When `learner` is no address, or the relay can no longer be reached.
+/// When `learner` is not an address, or the server fails.
 pub async fn serve(
     learner: &str,
     dial: &Dial,
@@ -49,34 +49,34 @@ struct Relay {
     cache: Mutex<Cache>,
 }
 
-/// The parameters that one start of a learner has published.
+/// The parameters published by one start of a learner.
 #[derive(Debug, Default)]
 struct Cache {
-    /// Which start that is; another learner's version 3 is another one.
+    /// Identifies the start: version 3 of another one has other parameters.
     learner: u64,
     versions: BTreeMap<u64, Arc<OnceCell<Prepared>>>,
 }
 
 impl Cache {
-    /// Forgets everything when `learner` is another start than the one that is known.
-    fn belongs_to(&mut self, learner: u64) {
+    /// Clears the cache if `learner` is another start.
+    fn switch_to(&mut self, learner: u64) {
         if self.learner != learner {
             *self = Self { learner, versions: BTreeMap::new() };
         }
     }
 
-    /// The place of a version: all that want it wait there for the one that fetches it.
-    fn place_of(&mut self, version: u64) -> Arc<OnceCell<Prepared>> {
-        let place = self.versions.entry(version).or_default().clone();
+    /// Returns the cell of a version: one caller fetches it, the others wait.
+    fn cell(&mut self, version: u64) -> Arc<OnceCell<Prepared>> {
+        let cell = self.versions.entry(version).or_default().clone();
         while self.versions.len() > KEPT_VERSIONS {
             self.versions.pop_first();
         }
-        place
+        cell
     }
 
-    /// Frees the place of a version that could not be fetched: any number can be asked for.
-    fn free(&mut self, version: u64) {
-        if self.versions.get(&version).is_some_and(|place| !place.initialized()) {
+    /// Removes the cell of a version that could not be fetched, because clients may ask for any number.
+    fn remove_empty(&mut self, version: u64) {
+        if self.versions.get(&version).is_some_and(|cell| !cell.initialized()) {
             self.versions.remove(&version);
         }
     }
@@ -104,10 +104,10 @@ impl Learner for Relay {
         request: Request<pb::JoinRequest>,
     ) -> Result<Response<pb::JoinResponse>, Status> {
         let request = request.into_inner();
-        // Of what another version says, this one would pass on only what it knows itself.
+        // A relay would drop the fields that another version has added.
         check_version(&request.worker, &request.version, "relay")?;
         let answer = within(self.client.clone().join(request)).await?;
-        self.cache().belongs_to(answer.get_ref().learner);
+        self.cache().switch_to(answer.get_ref().learner);
         Ok(answer)
     }
 
@@ -123,11 +123,11 @@ impl Learner for Relay {
         request: Request<pb::GetParametersRequest>,
     ) -> Result<Response<pb::Parameters>, Status> {
         let version = request.into_inner().version;
-        let place = self.cache().place_of(version);
-        match place.get_or_try_init(|| self.fetch(version)).await {
+        let cell = self.cache().cell(version);
+        match cell.get_or_try_init(|| self.fetch(version)).await {
             Ok(prepared) => Ok(prepared.clone().answer()),
             Err(status) => {
-                self.cache().free(version);
+                self.cache().remove_empty(version);
                 Err(status)
             }
         }
@@ -155,13 +155,14 @@ impl Learner for Relay {
     }
 }
 
-/// Waits for the learner no longer than a worker would.
+/// Applies the deadline to a call.
 async fn within<T>(
     call: impl Future<Output = Result<Response<T>, Status>>,
 ) -> Result<Response<T>, Status> {
-    let lapsed =
-        |_elapsed| Status::unavailable(format!("no answer of the learner within {ANSWER:?}"));
-    let answer = tokio::time::timeout(ANSWER, call).await.map_err(lapsed)??;
-    // The learner's own headers, such as its date, are not this answer's.
+    let lapsed = |_elapsed| {
+        Status::unavailable(format!("no answer of the learner within {CALL_DEADLINE:?}"))
+    };
+    let answer = tokio::time::timeout(CALL_DEADLINE, call).await.map_err(lapsed)??;
+    // The headers of the learner's response, such as its date, do not apply to this one.
     Ok(Response::new(answer.into_inner()))
 }

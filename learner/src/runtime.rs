@@ -1,4 +1,4 @@
-//! The runtime as the thread that learns sees it.
+//! Access to the async runtime from a thread.
 
 use std::io;
 use std::pin::Pin;
@@ -11,7 +11,7 @@ use tokio::sync::mpsc;
 
 type Call = Pin<Box<dyn Future<Output = ()> + Send>>;
 
-/// Lets a thread of its own use the runtime that it was started from.
+/// A handle with which a thread uses the runtime that started it.
 #[derive(Debug, Clone)]
 pub(crate) struct Runtime {
     handle: Handle,
@@ -19,8 +19,8 @@ pub(crate) struct Runtime {
 }
 
 impl Runtime {
-    /// Lets the runtime do `work` and waits for its outcome; `None` when the runtime ends first. Not to be called on one
-    /// of the runtime's own threads.
+    /// Runs `work` on the runtime and blocks until it completes; returns `None` if the runtime ends first. Must not be
+    /// called on a thread of the runtime.
     pub(crate) fn wait_on<T: Send + 'static>(
         &self,
         work: impl Future<Output = T> + Send + 'static,
@@ -31,21 +31,21 @@ impl Runtime {
         outcome.recv().ok()
     }
 
-    /// Lets the runtime do `work`, and waits for nothing.
+    /// Spawns `work` on the runtime.
     pub(crate) fn spawn(&self, work: impl Future<Output = ()> + Send + 'static) {
         self.handle.spawn(work);
     }
 
-    /// For what wants to know its runtime when it is made.
+    /// Enters the runtime, for constructors that require one.
     pub(crate) fn enter(&self) -> EnterGuard<'_> {
         self.handle.enter()
     }
 }
 
-/// Does `work` on a thread called `name` and, until it is done, what it asks the runtime for, one call at a time.
+/// Runs `work` on a thread called `name`, and serves its calls to the runtime one at a time until it is done.
 ///
 /// # Errors
-/// When no thread can be started. The inner result is an error when `work` panics.
+/// When no thread can be started. The inner result is an error if `work` panics.
 pub(crate) async fn on_a_thread<T: Send + 'static>(
     name: &str,
     pacing: Pacing,
@@ -57,6 +57,6 @@ pub(crate) async fn on_a_thread<T: Send + 'static>(
     while let Some(call) = pacing.next(called.recv()).await {
         call.await;
     }
-    // The thread has dropped its end of the channel, which is the last that it does.
+    // The thread has dropped its end of the channel, which is the last thing that it does.
     Ok(thread.join())
 }

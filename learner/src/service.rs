@@ -1,6 +1,6 @@
-//! The `Learner` service: a thin shell round the board and the thread that learns.
+//! The `Learner` service: gRPC calls on the work queue, next to the learning thread.
 
-mod connections;
+mod messages;
 mod refusals;
 
 use std::panic::AssertUnwindSafe;
@@ -22,136 +22,124 @@ use tokio_stream::{Stream, StreamExt as _};
 use tokio_util::sync::CancellationToken;
 use tonic::{Request, Response, Status};
 
-use crate::board::check_count;
-use crate::drive::{self, Ended};
 use crate::error::Error;
 use crate::metrics;
+use crate::progress::RunEnd;
 use crate::runtime::{Runtime, on_a_thread};
 use crate::shared::{LearnerConfig, Shared};
-pub(crate) use connections::{Connections, LogQuota};
+use crate::training_loop::{self, Context, RunOutcome};
+use crate::work_queue::check_count;
+use messages::{encode_finished, encode_progress};
 pub(crate) use refusals::check_version;
 use refusals::{check_name, malformed, refusal};
 
-/// How long a worker's question for work is held before it is told to wait.
+/// Longest time that a request for work is held before it is answered with `Wait`.
 const WORK_POLL: Duration = Duration::from_secs(2);
-/// How long the service stays after the run's end, so that all can hear of it.
+/// Time for which the service stays after the end of the run, so that clients learn of it.
 const LINGER: Duration = Duration::from_millis(1500);
-/// Pause between two looks whether all workers have heard of it.
+/// Pause between two checks whether all workers know of the end.
 const LINGER_TICK: Duration = Duration::from_millis(50);
-/// Largest message taken in; a slot of 64 two-arm episodes has 1 MB.
+/// Largest message that the service accepts; a slot of 64 two-arm episodes takes 1 MB.
 pub(crate) const MAX_MESSAGE_BYTES: usize = 64 << 20;
 
-/// What goes with the service.
+/// Options of the service.
 #[derive(Debug, Default)]
-pub struct Beside {
-    /// Where the run's figures stand at `/metrics`, for anybody who can reach it: no token is asked for.
+pub struct ServeOptions {
+    /// Serves metrics at `/metrics`, without a token.
     pub metrics: Option<TcpListener>,
-    /// How long the service stays once the run is complete.
-    pub after_the_end: AfterTheEnd,
+    /// The stay of the service after a complete run.
+    pub linger: LingerPolicy,
 }
 
-/// How long a service stays once its run is complete. It stays for a moment only after one that was interrupted or failed.
+/// The stay of the service after a complete run. After a run that was interrupted or failed it stays for at most
+/// 1.5 s.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum AfterTheEnd {
-    /// For a while, so that all can hear of it.
-    Linger(Duration),
-    /// Until it is told to end.
-    Stay,
+pub enum LingerPolicy {
+    /// For a fixed time, so that clients learn of the end.
+    For(Duration),
+    /// Until shutdown.
+    UntilShutdown,
 }
 
-impl Default for AfterTheEnd {
+impl Default for LingerPolicy {
     fn default() -> Self {
-        Self::Linger(LINGER)
+        Self::For(LINGER)
     }
 }
 
-/// Serves a run until it ends or `shutdown` is cancelled; the state is saved either way.
+/// Serves a run with default options.
 ///
 /// # Errors
-/// When the run cannot start, its state cannot be saved, or learning diverges.
+/// See [`serve_with`].
 pub async fn serve(
     config: LearnerConfig,
     incoming: impl Into<Incoming>,
     shutdown: CancellationToken,
-) -> Result<Ended, Error> {
-    serve_beside(config, incoming, shutdown, Beside::default()).await
+) -> Result<RunOutcome, Error> {
+    serve_with(config, incoming, shutdown, ServeOptions::default()).await
 }
 
-/// [`serve`], staying for `linger` after the run's end.
+/// Serves a run until it ends or `shutdown` is cancelled; saves the state in both cases.
 ///
 /// # Errors
 /// When the run cannot start, its state cannot be saved, or learning diverges.
-pub async fn serve_and_linger(
+pub async fn serve_with(
     config: LearnerConfig,
     incoming: impl Into<Incoming>,
     shutdown: CancellationToken,
-    linger: Duration,
-) -> Result<Ended, Error> {
-    let beside = Beside { after_the_end: AfterTheEnd::Linger(linger), metrics: None };
-    serve_beside(config, incoming, shutdown, beside).await
-}
-
-/// [`serve`], with what `beside` asks for.
-///
-/// # Errors
-/// When the run cannot start, its state cannot be saved, or learning diverges.
-pub async fn serve_beside(
-    config: LearnerConfig,
-    incoming: impl Into<Incoming>,
-    shutdown: CancellationToken,
-    beside: Beside,
-) -> Result<Ended, Error> {
+    options: ServeOptions,
+) -> Result<RunOutcome, Error> {
     let shared = Arc::new(Shared::new(config.clock.clone()));
-    shared.lock().board.start_workers_at(config.first_worker);
+    shared.lock().queue.start_workers_at(config.first_worker);
     let learner =
         LearnerServer::new(LearnerService { shared: shared.clone(), start: config.first_worker })
             .max_decoding_message_size(MAX_MESSAGE_BYTES);
     let router = config.gate.router(learner).await?;
     let stop_serving = CancellationToken::new();
-    let showing = show_figures(beside.metrics, shared.clone());
+    let serving_metrics = serve_metrics(options.metrics, shared.clone());
     let learning = {
         let (pacing, stop) = (config.pacing, stop_serving.clone());
         let shutdown = shutdown.clone();
         on_a_thread("learn", pacing, move |runtime| {
             let _stop = stop.drop_guard();
-            let ended = learn(&config, &shared, &runtime, &shutdown);
-            runtime.wait_on(linger(beside.after_the_end));
-            if is_complete(&ended) {
+            let outcome = learn(&config, &shared, &runtime, &shutdown);
+            runtime.wait_on(linger(options.linger));
+            if is_complete(&outcome) {
                 runtime.wait_on(until_workers_know(shared.clone(), shutdown.clone()));
-                runtime.wait_on(stay(beside.after_the_end, shutdown));
+                runtime.wait_on(stay(options.linger, shutdown));
             }
-            // Watchers' streams close at the first message after the one that says so.
+            // The streams of watchers close at the first message after the one that reports the end.
             shared.progress.send_modify(|_| ());
-            ended
+            outcome
         })
     };
     let serving = async {
         let served = tokio::select! {
             served = tandem_net::serve(router, incoming, stop_serving) => served,
-            () = showing => Ok(()),
+            () = serving_metrics => Ok(()),
         };
-        // A server that fails takes the run with it: nobody can reach it any more.
+        // A server that fails ends the run: no worker can reach it any more.
         shutdown.cancel();
         served
     };
     let (joined, served) = tokio::join!(learning, serving);
-    let ended = joined.map_err(|source| Error::RunDirectory {
+    let outcome = joined.map_err(|source| Error::RunDirectory {
         action: "start a thread for",
         path: PathBuf::from("learning"),
         source: source.into(),
     })?;
     served?;
-    ended.unwrap_or(Err(Error::Panicked))
+    outcome.unwrap_or(Err(Error::Panicked))
 }
 
-fn is_complete(ended: &Result<Ended, Error>) -> bool {
-    ended.as_ref().is_ok_and(|ended| !ended.interrupted)
+fn is_complete(outcome: &Result<RunOutcome, Error>) -> bool {
+    outcome.as_ref().is_ok_and(|outcome| !outcome.interrupted)
 }
 
-/// Waits until every worker that was playing when the run ended has asked for work and been told, or counts as dead:
-/// who is not told waits for the learner for ever.
+/// Waits until every worker that was playing at the end of the run has asked for work and received the end, or counts
+/// as dead. A worker that does not know of the end would wait for the learner forever.
 async fn until_workers_know(shared: Arc<Shared>, shutdown: CancellationToken) {
-    while shared.lock().is_awaited((shared.clock)()) {
+    while shared.lock().awaits_workers((shared.clock)()) {
         tokio::select! {
             () = tokio::time::sleep(LINGER_TICK) => (),
             () = shutdown.cancelled() => return,
@@ -159,71 +147,71 @@ async fn until_workers_know(shared: Arc<Shared>, shutdown: CancellationToken) {
     }
 }
 
-/// Shows the run's figures for as long as it is polled.
-async fn show_figures(listener: Option<TcpListener>, shared: Arc<Shared>) {
+/// Serves the metrics while it is polled.
+async fn serve_metrics(listener: Option<TcpListener>, shared: Arc<Shared>) {
     let Some(listener) = listener else { return std::future::pending().await };
     let write = Arc::new(move || metrics::page(&shared));
     let page = Page { path: metrics::PATH, content_type: metrics::CONTENT_TYPE, write };
     page.serve(listener).await;
 }
 
-/// Waits until those who ask now and then have heard of the run's end.
-async fn linger(after_the_end: AfterTheEnd) {
-    match after_the_end {
-        AfterTheEnd::Linger(linger) => tokio::time::sleep(linger).await,
-        AfterTheEnd::Stay => tokio::time::sleep(LINGER).await,
+/// Waits until clients that poll have learned of the end.
+async fn linger(policy: LingerPolicy) {
+    match policy {
+        LingerPolicy::For(duration) => tokio::time::sleep(duration).await,
+        LingerPolicy::UntilShutdown => tokio::time::sleep(LINGER).await,
     }
 }
 
-/// Waits for `shutdown` where a service is to stay until then.
-async fn stay(after_the_end: AfterTheEnd, shutdown: CancellationToken) {
-    if after_the_end == AfterTheEnd::Stay {
+/// Waits for `shutdown` if the policy asks for it.
+async fn stay(policy: LingerPolicy, shutdown: CancellationToken) {
+    if policy == LingerPolicy::UntilShutdown {
         shutdown.cancelled().await;
     }
 }
 
-/// Runs the run and tells workers and watchers how it ended, even when that is by a bug.
+/// Runs the run and reports its end to workers and watchers, after a panic too.
 fn learn(
     config: &LearnerConfig,
     shared: &Shared,
     runtime: &Runtime,
     shutdown: &CancellationToken,
-) -> Result<Ended, Error> {
-    let run = AssertUnwindSafe(|| drive::run(config, shared, runtime, shutdown));
-    let ended = std::panic::catch_unwind(run).unwrap_or(Err(Error::Panicked));
-    let reason =
-        ended.as_ref().map_or_else(|error| error_chain(error), |ended| ended.reason.clone());
-    let interrupted = !is_complete(&ended);
-    shared.lock().finish(pb::Finished { reason: reason.clone(), interrupted });
+) -> Result<RunOutcome, Error> {
+    let context = Context { config, shared, runtime, shutdown };
+    let run = AssertUnwindSafe(|| training_loop::run(context));
+    let outcome = std::panic::catch_unwind(run).unwrap_or(Err(Error::Panicked));
+    let end = RunEnd {
+        reason: outcome
+            .as_ref()
+            .map_or_else(|error| error_chain(error), |outcome| outcome.reason.clone()),
+        interrupted: !is_complete(&outcome),
+        digest: outcome.as_ref().ok().map(|outcome| outcome.digest.clone()),
+    };
+    shared.lock().finish(end.clone());
     shared.work.notify_waiters();
-    shared.progress.send_modify(|progress| {
-        progress.ended = true;
-        progress.end_reason = reason;
-        progress.digest =
-            ended.as_ref().map_or_else(|_| String::new(), |ended| ended.digest.clone());
-    });
-    ended
+    shared.progress.send_modify(|progress| progress.end = Some(end));
+    outcome
 }
 
-/// Waits until a connection has ended and hands the slots of its workers to the next that ask: a round need not wait
-/// until they count as slow. A worker that was only cut off delivers all the same.
-async fn give_to_others(shared: Arc<Shared>, connection: u64, hangup: Hangup) {
+/// Waits for the end of a connection and returns the slots of its workers to the queue, so that a round does not wait
+/// until they count as slow. A worker that was only disconnected may still submit its episodes.
+async fn requeue_at_hangup(shared: Arc<Shared>, connection: u64, hangup: Hangup) {
     hangup.wait().await;
     let mut state = shared.lock();
-    state.connections.ended(connection);
-    let gave_back = state.board.connection_ended(connection);
+    state.connections.remove(connection);
+    let requeued = state.queue.remove_connection(connection);
     drop(state);
-    for worker_id in &gave_back {
-        tracing::info!(worker_id, "connection has ended, its slot goes to another worker");
+    for worker_id in &requeued {
+        tracing::info!(worker_id, "connection closed, its slot goes to another worker");
     }
-    if !gave_back.is_empty() {
+    if !requeued.is_empty() {
         shared.work.notify_waiters();
     }
 }
 
 struct LearnerService {
     shared: Arc<Shared>,
-    /// Which start of a learner this is.
+    /// Identifies this start of the learner.
     start: u64,
 }
 
@@ -243,20 +231,20 @@ impl Learner for LearnerService {
         let mut state = self.shared.lock();
         let terms =
             state.terms.clone().ok_or_else(|| Status::unavailable("the run is starting"))?;
-        let connection = hangup.as_ref().map(|hangup| state.connections.number_of(hangup));
+        let connection = hangup.as_ref().map(|hangup| state.connections.register(hangup));
         if let (Some(hangup), Some((number, true))) = (hangup, connection) {
-            tokio::spawn(give_to_others(self.shared.clone(), number, hangup));
+            tokio::spawn(requeue_at_hangup(self.shared.clone(), number, hangup));
         }
         let worker_id = state
-            .board
+            .queue
             .join(name.clone(), connection.map(|(number, _)| number), now)
             .map_err(|error| Status::resource_exhausted(error.to_string()))?;
-        let lines = state.join_lines.count(now);
+        let decision = state.join_lines.count(now);
         drop(state);
-        if let Some(n) = lines.left_out {
+        if let Some(n) = decision.n_skipped {
             tracing::info!(n, "more workers joined");
         }
-        if lines.this {
+        if decision.log {
             WorkerJoined { worker_id, name: &name }.emit();
         }
         let terms = Some(encode_run_terms(&terms));
@@ -271,12 +259,12 @@ impl Learner for LearnerService {
         let search = async {
             loop {
                 let notified = self.shared.work.notified();
-                let (work, look_again_in) = self.work_for(worker_id)?;
+                let (work, retry_in) = self.work_for(worker_id)?;
                 if let Some(work) = work {
                     return Ok::<_, Status>(work);
                 }
-                // Either way it is looked again: there is news, or a slot is out for too long.
-                drop(tokio::time::timeout(look_again_in, notified).await);
+                // Retries in both cases: there may be new slots, or a slot to play a second time.
+                drop(tokio::time::timeout(retry_in, notified).await);
             }
         };
         let work =
@@ -306,55 +294,55 @@ impl Learner for LearnerService {
         &self,
         _: Request<pb::StatusRequest>,
     ) -> Result<Response<pb::Progress>, Status> {
-        Ok(Response::new(self.shared.progress.borrow().clone()))
+        Ok(Response::new(encode_progress(&self.shared.progress.borrow())))
     }
 
     async fn watch(
         &self,
         _: Request<pb::WatchRequest>,
     ) -> Result<Response<Self::WatchStream>, Status> {
-        let mut told_the_end = false;
+        let mut has_ended = false;
         let progress =
             WatchStream::new(self.shared.progress.subscribe()).take_while(move |progress| {
-                let goes_on = !told_the_end;
-                told_the_end = progress.ended;
-                goes_on
+                let is_open = !has_ended;
+                has_ended = progress.end.is_some();
+                is_open
             });
-        Ok(Response::new(Box::pin(progress.map(Ok))))
+        Ok(Response::new(Box::pin(progress.map(|progress| Ok(encode_progress(&progress))))))
     }
 }
 
 use pb::next_work_response::Work;
 
 impl LearnerService {
-    /// What a worker is to do, and in what time it is worth looking again.
+    /// Returns the work for a worker, and the time after which to retry if there is none.
     fn work_for(&self, worker_id: u64) -> Result<(Option<Work>, Duration), Status> {
         let now = (self.shared.clock)();
         let mut state = self.shared.lock();
-        if let Some(finished) = state.finished.clone() {
-            state.untold.remove(&worker_id);
-            return Ok((Some(Work::Finished(finished)), WORK_POLL));
+        if let Some(end) = state.end.clone() {
+            state.uninformed.remove(&worker_id);
+            return Ok((Some(Work::Finished(encode_finished(&end))), WORK_POLL));
         }
-        let order = state.board.next(worker_id, now).map_err(|error| refusal(&error, None))?;
-        let look_again_in = state.board.cover_in(now).unwrap_or(WORK_POLL);
+        let order = state.queue.next(worker_id, now).map_err(|error| refusal(&error, None))?;
+        let retry_in = state.queue.next_cover_in(now).unwrap_or(WORK_POLL);
         drop(state);
-        Ok((order.map(|order| Work::Slot(encode_slot(&order))), look_again_in))
+        Ok((order.map(|order| Work::Slot(encode_slot(&order))), retry_in))
     }
 
-    /// Takes a slot's episodes when every one of them is as ordered; what is in already is not looked at.
+    /// Accepts a slot's episodes if all of them match the order. Episodes that were submitted before are ignored.
     fn submit(&self, request: pb::SubmitEpisodesRequest) -> Result<(), Status> {
         let pb::SubmitEpisodesRequest { worker_id, slot, episodes } = request;
         let now = (self.shared.clock)();
         let mut state = self.shared.lock();
         let layout =
             state.terms.as_ref().ok_or_else(|| Status::unavailable("the run is starting"))?.layout;
-        let worker = state.board.worker(worker_id).map(|worker| (worker_id, worker.name.clone()));
+        let worker = state.queue.worker(worker_id).map(|worker| (worker_id, worker.name.clone()));
         let refused = |error| refusal(&error, worker.as_ref());
-        let Some(order) = state.board.ordered(worker_id, slot, now).map_err(refused)? else {
+        let Some(order) = state.queue.order_of(worker_id, slot, now).map_err(refused)? else {
             return Ok(());
         };
         check_count(order, episodes.len()).map_err(refused)?;
-        // A slot's episodes take a while to read; other calls are answered meanwhile.
+        // Decoding takes a while, so the lock is released for other calls.
         drop(state);
         let decode = |episode: pb::Episode| {
             let number = episode.number;
@@ -362,7 +350,7 @@ impl LearnerService {
                 .map_err(|error| malformed(&error, number, worker.as_ref()))
         };
         let episodes: Vec<Episode> = episodes.into_iter().map(decode).collect::<Result<_, _>>()?;
-        self.shared.lock().board.submit(worker_id, slot, episodes, now).map_err(refused)?;
+        self.shared.lock().queue.submit(worker_id, slot, episodes, now).map_err(refused)?;
         self.shared.arrived.notify_one();
         Ok(())
     }

@@ -1,24 +1,23 @@
-//! Settings that a run keeps, and which of them differ.
+//! Settings that must not change when a run resumes.
 
 use std::fmt;
 
 use serde_json::Value;
-
 use tandem_rl::config::{RunConfig, former_keys};
 
-/// What a run may go on with another value of: when it ends, what is saved and what is logged. Everything else decides
-/// what it learns.
+/// Settings that may change when a run resumes: its limits, and what is saved, logged and tested. All others affect
+/// learning.
 const FREE: [&str; 4] =
     ["stop.", "checkpoint.", "evaluation.recorded_episodes", "evaluation.test_episodes"];
 
-/// A setting with which a run cannot go on.
+/// A setting that differs from the one that the run started with.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Changed {
     /// Its dotted name.
     pub key: String,
-    /// The value that was asked for.
+    /// The requested value.
     pub here: String,
-    /// The value that the run began with.
+    /// The value that the run started with.
     pub there: String,
 }
 
@@ -29,19 +28,19 @@ impl fmt::Display for Changed {
     }
 }
 
-/// What to do about a setting that differs.
+/// Advice about a setting that differs.
 pub const ADVICE: &str = "only stop.*, checkpoint.*, evaluation.recorded_episodes and evaluation.test_episodes may \
                           change when a run is resumed: keep the original value, or start a new run";
 
-/// The settings as one JSON object, numbers as a person writes them.
+/// Returns the settings as one JSON object, with the shortest form of each number.
 #[must_use]
 pub fn to_json(config: &RunConfig) -> String {
     serde_json::to_string(config).expect("numbers and names can be written")
 }
 
 /// Returns the first setting that affects learning and has another value in `config` than in `began_with`, a text
-/// written by [`to_json`]. A setting that only one of the two has is skipped: programs of two versions may know different
-/// settings. `began_with` may use former keys.
+/// written by [`to_json`]. A setting that only one of the two has is skipped: programs of two versions may know
+/// different settings. `began_with` may use former keys.
 ///
 /// # Errors
 /// When `began_with` is not such a text.
@@ -76,7 +75,7 @@ fn lookup<'a>(settings: &'a Value, key: &str) -> Option<&'a Value> {
     settings.pointer(&format!("/{}", key.replace('.', "/")))
 }
 
-/// Dotted names and values of all settings in and below `value`, which is called `name`.
+/// Returns the dotted names and the values of all settings in `value`, which is called `name`.
 fn below(value: &Value, name: String) -> Vec<(String, Value)> {
     let Value::Object(section) = value else { return vec![(name, value.clone())] };
     let dotted = |key: &String| match name.as_str() {
@@ -98,7 +97,7 @@ mod tests {
     }
 
     #[test]
-    fn a_setting_that_decides_what_is_learned_is_named_with_both_values() {
+    fn a_changed_setting_that_affects_learning_is_named_with_both_values() {
         let check = |change: fn(&mut RunConfig), expected: &str| {
             let mut changed = config();
             change(&mut changed);
@@ -117,7 +116,7 @@ mod tests {
     }
 
     #[test]
-    fn when_a_run_ends_and_what_is_kept_of_it_may_change() {
+    fn limits_and_saving_may_change() {
         let mut changed = config();
         changed.stop.max_env_steps += 1;
         changed.stop.until_success = 0.5;
@@ -145,7 +144,7 @@ mod tests {
     }
 
     #[test]
-    fn settings_that_only_one_version_knows_are_passed_over() {
+    fn settings_that_only_one_version_knows_are_skipped() {
         let text = to_json(&config()).replace("\"n_hidden\"", "\"n_units\"");
         assert_eq!(first_change(&config(), &text).expect("JSON"), None);
         assert!(first_change(&config(), "no JSON").is_err());

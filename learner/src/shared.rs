@@ -1,4 +1,4 @@
-//! What the service's calls and the thread that learns share, and what both are told at the start.
+//! The configuration of a learner, and the state that the service shares with the learning thread.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
@@ -8,102 +8,106 @@ use std::time::Duration;
 use tandem_core::work::{PublishedActor, RunTerms};
 use tandem_net::{Dial, Gate, Pacing, Prepared};
 use tandem_policy::Policy;
-use tandem_proto::{encode_actor, pb};
+use tandem_proto::encode_actor;
+use tandem_rl::config::RunConfig;
 use tokio::sync::{Notify, watch};
 
-use crate::board::{Board, Worker};
-use crate::service::{Connections, LogQuota};
+use crate::connections::{Connections, LogQuota};
+use crate::progress::{Progress, RunEnd};
 use crate::warnings::Warnings;
-use tandem_rl::config::RunConfig;
+use crate::work_queue::{WorkQueue, Worker};
 
-/// Parameter versions kept for workers that lag behind.
+/// Parameter versions that are kept for workers that lag behind.
 pub(crate) const KEPT_VERSIONS: usize = 16;
 
-/// The time since some start; passed in so that nothing here reads a clock.
+/// Returns the time since a fixed start. Passed in, so that nothing in this crate reads a clock.
 pub type Clock = Arc<dyn Fn() -> Duration + Send + Sync>;
 
-/// What a learner needs to run.
+/// The configuration of a learner.
 #[derive(Clone)]
 pub struct LearnerConfig {
     /// The run.
     pub run: RunConfig,
-    /// Who may call.
+    /// Access control and TLS of the service.
     pub gate: Gate,
-    /// How the teacher is called.
+    /// Token and TLS of calls to the teacher.
     pub dial: Dial,
-    /// The teacher's address, `HOST:PORT` or a URI; needed when the run asks for advice.
+    /// The teacher's address, `HOST:PORT` or a URI; required if the run asks for advice.
     pub teacher: Option<String>,
-    /// The one-arm policy whose copies a run of strategy `init:teacher` starts from.
+    /// The one-arm policy whose copies a run with strategy `init:teacher` starts from.
     pub start_from: Option<Policy>,
     /// The run directory.
     pub out: PathBuf,
-    /// Whether to go on from the newest checkpoint, or from the beginning where there is none.
+    /// Resumes from the newest checkpoint, or starts anew if there is none.
     pub resume: bool,
-    /// Whether somebody else, such as the parent process, holds the lock of the run directory for this learner.
+    /// True if another process, such as the parent, holds the lock of the run directory for this learner.
     pub out_is_locked: bool,
-    /// What `run.toml` in the run directory holds from the moment on in which it is certain that the run goes on with
-    /// these settings; `None` leaves the file alone.
+    /// Text of `run.toml`, which is written once it is certain that the run continues with these settings; `None`
+    /// leaves the file unchanged.
     pub run_file: Option<String>,
     /// Threads of the update, 1 or 2.
     pub n_threads: usize,
     /// Time since the process started.
     pub clock: Clock,
-    /// Version of the program, kept in what it writes.
+    /// Version of the program, stored in policy files.
     pub version: String,
-    /// Where workers' numbers start; another one for each start of a learner, so that a worker of the learner before
-    /// is not taken for one of this.
+    /// First number of a worker. It differs for each start of a learner, so that a worker of the previous learner is
+    /// not mistaken for one of this.
     pub first_worker: u64,
-    /// How the service and the thread that learns take turns.
+    /// Scheduling of the service and the learning thread.
     pub pacing: Pacing,
 }
 
-/// State shared by the service's calls and the thread that learns.
+/// State shared by the service's calls and the learning thread.
 pub(crate) struct Shared {
     state: Mutex<State>,
-    /// Signalled whenever episodes come in.
+    /// Signalled when episodes arrive.
     pub(crate) arrived: Arc<Notify>,
-    /// Signalled whenever there may be work.
+    /// Signalled when there may be work.
     pub(crate) work: Notify,
-    pub(crate) progress: watch::Sender<pb::Progress>,
+    pub(crate) progress: watch::Sender<Progress>,
     pub(crate) warnings: Warnings,
     pub(crate) clock: Clock,
 }
 
+/// The part of the shared state behind the lock.
 #[derive(Default)]
 pub(crate) struct State {
-    pub(crate) board: Board,
+    pub(crate) queue: WorkQueue,
+    /// The run's terms; `None` before the run starts.
     pub(crate) terms: Option<RunTerms>,
+    /// Published parameters by version, encoded.
     pub(crate) published: BTreeMap<u64, Prepared>,
-    /// What workers are told once nothing more is to be done.
-    pub(crate) finished: Option<pb::Finished>,
-    /// Workers that were playing when the run ended and have not been told yet.
-    pub(crate) untold: BTreeSet<u64>,
+    /// The end of the run, once there is no more work.
+    pub(crate) end: Option<RunEnd>,
+    /// Workers that were playing at the end of the run and have not received it yet.
+    pub(crate) uninformed: BTreeSet<u64>,
     /// The connections over which workers have joined.
     pub(crate) connections: Connections,
-    /// Log lines about workers that join.
+    /// Limits the log lines about workers that join.
     pub(crate) join_lines: LogQuota,
     /// Episodes in the replay buffer.
     pub(crate) n_replay_episodes: usize,
 }
 
 impl State {
-    /// Notes how the run ended, and who is to be told.
-    pub(crate) fn finish(&mut self, finished: pb::Finished) {
+    /// Records the end of the run and the workers that have to receive it.
+    pub(crate) fn finish(&mut self, end: RunEnd) {
         let is_playing = |worker: &Worker| worker.slot.is_some() && !worker.silent;
-        let playing = self.board.workers().filter(|(_, worker)| is_playing(worker));
-        self.untold = playing.map(|(worker_id, _)| worker_id).collect();
-        self.finished = Some(finished);
+        let playing = self.queue.workers().filter(|(_, worker)| is_playing(worker));
+        self.uninformed = playing.map(|(worker_id, _)| worker_id).collect();
+        self.end = Some(end);
     }
 
-    /// Whether a worker that counts as alive does not know yet that the run has ended.
-    pub(crate) fn is_awaited(&self, now: Duration) -> bool {
-        self.untold.iter().any(|worker_id| !self.board.is_silent(*worker_id, now))
+    /// Returns true if a worker that counts as alive has not received the end of the run yet.
+    pub(crate) fn awaits_workers(&self, now: Duration) -> bool {
+        self.uninformed.iter().any(|worker_id| !self.queue.is_silent(*worker_id, now))
     }
 }
 
 impl Shared {
     pub(crate) fn new(clock: Clock) -> Self {
-        let (progress, _) = watch::channel(pb::Progress::default());
+        let (progress, _) = watch::channel(Progress::default());
         Self {
             state: Mutex::default(),
             arrived: Arc::default(),
@@ -118,7 +122,7 @@ impl Shared {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Hands out an actor from now on, and forgets the oldest.
+    /// Publishes an actor, and drops the oldest beyond [`KEPT_VERSIONS`].
     pub(crate) fn publish(&self, actor: &PublishedActor) {
         let prepared = Prepared::of(&encode_actor(actor));
         let mut state = self.lock();

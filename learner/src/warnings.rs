@@ -1,29 +1,35 @@
-//! What needs a person's attention, gathered from those who notice it and shown in the progress.
+//! Problems that require an operator, joined in the progress.
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, PoisonError};
 
-use tandem_proto::pb;
 use tokio::sync::watch;
 
-/// Who notices what is wrong.
+use crate::progress::Progress;
+
+/// The subject of a warning, in the order in which the progress lists them.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub(crate) enum Source {
-    /// The thread that learns.
-    Learner,
+    /// Files that cannot be written.
+    Disk,
+    /// Episodes that claim other charges than the teacher's account has.
+    Advice,
+    /// A statistic of the normalisers is out of all proportion.
+    Statistics,
     /// The teacher.
     Teacher,
 }
 
-/// The latest warning of each source, joined in `Progress.warning`.
+/// The latest warning of each source. Clones share it.
 #[derive(Debug, Clone)]
 pub(crate) struct Warnings {
     by_source: Arc<Mutex<BTreeMap<Source, String>>>,
-    progress: watch::Sender<pb::Progress>,
+    progress: watch::Sender<Progress>,
 }
 
 impl Warnings {
-    pub(crate) fn new(progress: watch::Sender<pb::Progress>) -> Self {
+    /// Creates an empty set of warnings that appear in `progress`.
+    pub(crate) fn new(progress: watch::Sender<Progress>) -> Self {
         Self { by_source: Arc::default(), progress }
     }
 
@@ -38,6 +44,19 @@ impl Warnings {
         let all: Vec<&str> = all.into_iter().filter(|warning| !warning.is_empty()).collect();
         self.progress.send_modify(|progress| progress.warning = all.join("; "));
     }
+
+    /// Logs and sets the first warning of `source`; later ones are logged at level debug only.
+    pub(crate) fn set_first(&self, source: Source, warning: &str) {
+        let by_source = self.by_source.lock().unwrap_or_else(PoisonError::into_inner);
+        let is_known = by_source.contains_key(&source);
+        drop(by_source);
+        if is_known {
+            tracing::debug!(kind = ?source, text = warning, "needs attention again");
+            return;
+        }
+        tracing::warn!(kind = ?source, text = warning, "needs attention");
+        self.set(source, warning);
+    }
 }
 
 #[cfg(test)]
@@ -45,16 +64,25 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_source_that_has_nothing_to_say_does_not_withdraw_the_warning_of_another() {
-        let (progress, shown) = watch::channel(pb::Progress::default());
+    fn withdrawing_a_warning_leaves_those_of_other_sources() {
+        let (progress, shown) = watch::channel(Progress::default());
         let warnings = Warnings::new(progress);
         let check = |source, warning, expected| {
             warnings.set(source, warning);
             assert_eq!(shown.borrow().warning, expected);
         };
         check(Source::Teacher, "no ledger", "no ledger");
-        check(Source::Learner, "no disk", "no disk; no ledger");
-        check(Source::Learner, "", "no ledger");
+        check(Source::Disk, "no disk", "no disk; no ledger");
+        check(Source::Disk, "", "no ledger");
         check(Source::Teacher, "", "");
+    }
+
+    #[test]
+    fn a_source_that_warns_once_keeps_its_first_warning() {
+        let (progress, shown) = watch::channel(Progress::default());
+        let warnings = Warnings::new(progress);
+        warnings.set_first(Source::Advice, "round 3");
+        warnings.set_first(Source::Advice, "round 4");
+        assert_eq!(shown.borrow().warning, "round 3");
     }
 }

@@ -143,7 +143,7 @@ pub struct CurveOptions {
     pub title: String,
     /// Label of the horizontal axis.
     pub x_label: String,
-    /// Whether the values are shares: the vertical axis is then 0 to 100 %.
+    /// `true` if the values are shares, which are drawn on an axis from 0 to 100 %.
     pub percent: bool,
     /// Width, pixels.
     pub width: u32,

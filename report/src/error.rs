@@ -28,7 +28,7 @@ pub enum Error {
     NoTrials {
         /// Path of the file.
         path: PathBuf,
-        /// What the file contains instead.
+        /// The actual content.
         problem: String,
     },
     /// A metrics file contains no row.
@@ -42,7 +42,7 @@ pub enum Error {
     InvalidEvaluation {
         /// Path of the file.
         path: PathBuf,
-        /// What is wrong with it.
+        /// The missing or invalid part.
         problem: String,
     },
     /// A curve could not be drawn.

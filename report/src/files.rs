@@ -13,7 +13,7 @@ use crate::error::Error;
 pub(crate) struct InvalidLine {
     /// Number of the line, from 1.
     pub(crate) line: usize,
-    /// Why it is not a row.
+    /// The cause.
     pub(crate) problem: String,
 }
 

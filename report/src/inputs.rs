@@ -89,7 +89,7 @@ struct FoundPaths {
     trials_files: Vec<PathBuf>,
 }
 
-/// What a searched directory is part of. Within a run directory, only trials count.
+/// The kind of directory that contains a searched one. Within a run directory, only trials count.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Parent {
     Directory,

@@ -39,9 +39,9 @@ pub struct RunConfig {
     pub advice: AdviceConfig,
     /// The composition of a round.
     pub rounds: RoundsConfig,
-    /// How training episodes explore.
+    /// Exploration in training episodes.
     pub exploration: Exploration,
-    /// How training episodes start, and how finely all are simulated.
+    /// Starts of training episodes, and the resolution of the simulation.
     pub world: WorldSettings,
     /// The replay buffer, and how batches are sampled from it.
     pub replay: ReplayConfig,

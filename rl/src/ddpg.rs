@@ -1,8 +1,8 @@
 //! One update of DDPG (Lillicrap et al. 2016) with a value per arm and behaviour cloning of advice.
 //!
-//! Section 2.1 of the paper, in its order: the critic's target from the target networks, the critic's loss, the
-//! actor's loss, a step of Adam for each, and the targets' slow move after them. Both gradients are taken at the same
-//! parameters, so the critic's half and the actor's half of an update can run side by side.
+//! The order is that of section 2.1 of the paper: the critic's target from the target networks, the critic's loss, the
+//! actor's loss, a step of Adam for each, and Polyak averaging of the target networks. Both gradients are taken at the
+//! same parameters, so the critic's half and the actor's half of an update can run in parallel.
 
 use rand_chacha::ChaCha8Rng;
 use tandem_core::{Layout, Stream, episode_rng};
@@ -18,23 +18,23 @@ mod tests;
 
 pub use config::DdpgConfig;
 
-/// Transitions as the update takes them, `b` of them; "input" is a normalised observation and goal.
+/// A batch of `b` transitions. An input is a normalised observation followed by a normalised goal.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Batch {
-    /// Before the step, shape `[b, n_observation + n_goal]`.
+    /// Inputs before the step, shape `[b, n_observation + n_goal]`.
     pub inputs: Vec<f32>,
-    /// What was executed, in [-1, 1], shape `[b, n_action]`.
+    /// Executed actions, in [-1, 1], shape `[b, n_action]`.
     pub actions: Vec<f32>,
-    /// One reward per head, shape `[b, n_heads]`.
+    /// One reward per critic head, shape `[b, n_heads]`.
     pub rewards: Vec<f32>,
-    /// After the step, with the same goal, shape `[b, n_observation + n_goal]`.
+    /// Inputs after the step, with the same goal, shape `[b, n_observation + n_goal]`.
     pub next_inputs: Vec<f32>,
-    /// 1 where the executed component was the teacher's, else 0, shape `[b, n_action]`.
+    /// Mask of behaviour cloning: 1 where the executed component was the teacher's, else 0, shape `[b, n_action]`.
     pub bc_mask: Vec<f32>,
 }
 
 impl Batch {
-    /// A batch of zeros, to be filled again and again.
+    /// Creates a batch of zeros, to be filled repeatedly.
     #[must_use]
     pub fn new(layout: Layout, n_heads: usize, batch_size: usize) -> Self {
         let n_input = layout.n_observation() + layout.n_goal();
@@ -48,36 +48,36 @@ impl Batch {
     }
 }
 
-/// What an update measured, before it changed anything.
+/// Losses of an update, at the parameters before it.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct UpdateLosses {
     /// Squared error of the critic: mean over the batch, sum over the heads.
     pub critic_loss: f64,
-    /// The actor's loss: value, action penalty and cloning together.
+    /// The actor's loss: negative value, action penalty and behaviour cloning.
     pub actor_loss: f64,
     /// Value of the actor's own actions: mean over the batch and the heads.
     pub mean_q: f64,
 }
 
-/// Why learning cannot go on.
+/// An error that ends learning.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum DdpgError {
-    /// The update gave an infinite number or NaN; the parameters are of no more use.
+    /// An update gave an infinite number or NaN; the parameters are useless from then on.
     #[error("update {update} left {what} that is not finite")]
     NotFinite {
-        /// What holds the number.
+        /// The location of the number.
         what: &'static str,
         /// The update, from 1.
         update: u64,
     },
-    /// A stored state lacks a vector, or has one of another length.
+    /// A stored state lacks a vector or has one of another length.
     #[error("stored {name:?} has {got} numbers, expected {expected}")]
     Restore {
         /// The vector.
         name: &'static str,
-        /// Its length, 0 where there is none.
+        /// Its length, 0 if it is missing.
         got: usize,
-        /// The length that the networks have.
+        /// The length in the networks.
         expected: usize,
     },
 }
@@ -94,7 +94,7 @@ pub struct Ddpg {
     critic_half: CriticHalf,
 }
 
-/// A network and its slow copy.
+/// A network and its target network, as flat parameter vectors.
 #[derive(Debug, Clone)]
 struct Network {
     shape: MlpShape,
@@ -110,7 +110,7 @@ impl Network {
 }
 
 impl Ddpg {
-    /// Fresh networks for `layout`, drawn from `run_seed`; the critic has a value for each of the rewards' heads.
+    /// Creates networks for `layout`, initialised from `run_seed`. The critic has one head per reward.
     #[must_use]
     pub fn new(config: DdpgConfig, layout: Layout, rewards: Rewards, run_seed: u64) -> Self {
         let (n_hidden, n_hidden_layers) = (config.n_hidden, config.n_hidden_layers);
@@ -125,13 +125,13 @@ impl Ddpg {
         Self { config, n_threads: 1, n_updates: 0, actor, critic, actor_half, critic_half }
     }
 
-    /// One gradient step of critic and actor on `batch`.
+    /// Makes one gradient step of critic and actor on `batch`.
     ///
     /// # Errors
     /// When a loss or a parameter is no longer finite.
     ///
     /// # Panics
-    /// When the batch is not of the configured size and layout.
+    /// When the batch does not have the configured size and layout.
     pub fn update(&mut self, batch: &Batch) -> Result<UpdateLosses, DdpgError> {
         let Self { config, n_threads, actor, critic, actor_half, critic_half, .. } = self;
         let (critic_loss, (actor_loss, mean_q)) = join(
@@ -139,8 +139,11 @@ impl Ddpg {
             || critic_half.differentiate(config, actor, critic, batch),
             || actor_half.differentiate(config, actor, critic, batch),
         );
-        let (critic_finite, actor_finite) =
-            join(*n_threads, || critic_half.step.apply(critic), || actor_half.step.apply(actor));
+        let (critic_finite, actor_finite) = join(
+            *n_threads,
+            || critic_half.optimizer.apply(critic),
+            || actor_half.optimizer.apply(actor),
+        );
         self.n_updates += 1;
         let checks = [
             ("a critic loss", critic_loss.is_finite()),
@@ -154,7 +157,7 @@ impl Ddpg {
         }
     }
 
-    /// Moves both target networks toward the online ones, keeping the configured share of the old.
+    /// Moves both target networks toward the online ones: `target = polyak_keep * target + (1 - polyak_keep) * online`.
     pub fn polyak(&mut self) {
         let Self { config, n_threads, actor, critic, .. } = self;
         let move_target = |network: &mut Network| {
@@ -163,31 +166,32 @@ impl Ddpg {
         join(*n_threads, || move_target(critic), || move_target(actor));
     }
 
-    /// Whether the next updates are made at the cooldown's learning rate.
+    /// Switches between the usual learning rates and that of the cooldown.
     pub fn set_cooldown(&mut self, is_cooldown: bool) {
         let Self { config, actor_half, critic_half, .. } = self;
         let rate = |usual| if is_cooldown { config.cooldown_learning_rate } else { usual };
-        actor_half.step.adam.set_learning_rate(rate(config.actor_learning_rate));
-        critic_half.step.adam.set_learning_rate(rate(config.critic_learning_rate));
+        actor_half.optimizer.adam.set_learning_rate(rate(config.actor_learning_rate));
+        critic_half.optimizer.adam.set_learning_rate(rate(config.critic_learning_rate));
     }
 
-    /// Whether the two halves of an update run one after the other (1) or side by side (2); the bits are the same.
+    /// Sets whether the two halves of an update run one after the other (1) or in parallel (2). The results are the
+    /// same, bit for bit.
     pub const fn set_threads(&mut self, n_threads: usize) {
         self.n_threads = n_threads;
     }
 }
 
-/// What the critic values.
+/// The rewards that the critic learns the value of.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Rewards {
-    /// Rewards of a step, 1 or one per arm.
+    /// Rewards per step: 1, or one per arm.
     pub n_heads: usize,
-    /// The lowest that one of them can be; the highest is 0.
+    /// The lowest possible reward; the highest is 0.
     pub lowest: f32,
 }
 
 impl Rewards {
-    /// Of -1 while a goal is pending, else 0.
+    /// Returns rewards of -1 while a goal is pending, else 0.
     #[must_use]
     pub const fn sparse(n_heads: usize) -> Self {
         Self { n_heads, lowest: -1.0 }
@@ -203,15 +207,15 @@ struct CriticHalf {
     input: Vec<f32>,
     /// Next input and the target actor's action.
     next_input: Vec<f32>,
-    /// Value of what was executed, shape `[b, n_heads]`.
+    /// Values of the executed actions, shape `[b, n_heads]`.
     q: Vec<f32>,
-    /// The target networks' value of what comes next, shape `[b, n_heads]`.
+    /// The target networks' values of the next inputs, shape `[b, n_heads]`.
     next_q: Vec<f32>,
     /// The loss's gradient by `q`.
     q_gradient: Vec<f32>,
     actor_workspace: Workspace,
     critic_workspace: Workspace,
-    step: Step,
+    optimizer: NetworkOptimizer,
 }
 
 impl CriticHalf {
@@ -226,11 +230,11 @@ impl CriticHalf {
             q_gradient: vec![0.0; b * critic.n_output],
             actor_workspace: Workspace::new(actor, b),
             critic_workspace: Workspace::new(critic, b),
-            step: Step::new(critic, config.critic_learning_rate),
+            optimizer: NetworkOptimizer::new(critic, config.critic_learning_rate),
         }
     }
 
-    /// Leaves the gradient of the critic's loss in `step` and gives the loss.
+    /// Stores the gradient of the critic's loss in `optimizer` and returns the loss.
     fn differentiate(
         &mut self,
         config: &DdpgConfig,
@@ -272,7 +276,7 @@ impl CriticHalf {
         forward(&critic.shape, &critic.online, joined, &mut self.critic_workspace, &mut q);
 
         // Mean over the batch of (Q - y)^2, and its gradient.
-        assert_eq!(batch.rewards.len(), self.q.len(), "rewards of another number of heads");
+        assert_eq!(batch.rewards.len(), self.q.len(), "rewards for another number of heads");
         let mut loss = 0.0;
         let values = self.q.iter().zip(&self.next_q).zip(&batch.rewards);
         for (gradient, ((q, next_q), reward)) in self.q_gradient.iter_mut().zip(values) {
@@ -280,7 +284,7 @@ impl CriticHalf {
             loss += f64::from(error) * f64::from(error);
             *gradient = 2.0 * error / b as f32;
         }
-        let gradient = &mut self.step.gradient;
+        let gradient = &mut self.optimizer.gradient;
         backward_parameters(
             &critic.shape,
             &critic.online,
@@ -293,9 +297,10 @@ impl CriticHalf {
     }
 }
 
-/// `y = r + discount * Q'(s', pi'(s'))`, clipped to what rewards from the lowest to 0 can add up to.
+/// Returns the critic's target `y = r + discount * Q'(s', pi'(s'))`, clipped to the range of discounted sums of rewards
+/// from the lowest to 0.
 ///
-/// Episodes end by their time limit only, and the world would have gone on: there is always a next value.
+/// Episodes end by their time limit only, which is no terminal state, so the target always bootstraps.
 fn critic_target(discount: f32, lowest_reward: f32, reward: f32, next_q: f32) -> f32 {
     (reward + discount * next_q).clamp(lowest_reward / (1.0 - discount), 0.0)
 }
@@ -313,7 +318,7 @@ struct ActorHalf {
     action_gradient: Vec<f32>,
     actor_workspace: Workspace,
     critic_workspace: Workspace,
-    step: Step,
+    optimizer: NetworkOptimizer,
 }
 
 impl ActorHalf {
@@ -326,11 +331,11 @@ impl ActorHalf {
             action_gradient: vec![0.0; b * actor.n_output],
             actor_workspace: Workspace::new(actor, b),
             critic_workspace: Workspace::new(critic, b),
-            step: Step::new(actor, config.actor_learning_rate),
+            optimizer: NetworkOptimizer::new(actor, config.actor_learning_rate),
         }
     }
 
-    /// Leaves the gradient of the actor's loss in `step` and gives the loss and the mean value.
+    /// Stores the gradient of the actor's loss in `optimizer` and returns the loss and the mean value.
     fn differentiate(
         &mut self,
         config: &DdpgConfig,
@@ -368,7 +373,7 @@ impl ActorHalf {
             &mut self.action_gradient,
         );
         let action_loss = self.add_action_terms(config, batch, n_input);
-        let gradient = &mut self.step.gradient;
+        let gradient = &mut self.optimizer.gradient;
         let workspace = &mut self.actor_workspace;
         backward_parameters(
             &actor.shape,
@@ -382,8 +387,9 @@ impl ActorHalf {
         (action_loss - sum_q / b as f64, sum_q / self.q.len() as f64)
     }
 
-    /// Adds what the loss says about the action itself, takes the gradient back through the tanh, and gives that part
-    /// of the loss: the mean squared action, and the squared error to the teacher's where that was executed.
+    /// Adds the terms of the loss that depend on the action directly, propagates the gradient back through the tanh,
+    /// and returns these terms: the mean squared action, and the squared error to the teacher's action where that was
+    /// executed.
     fn add_action_terms(&mut self, config: &DdpgConfig, batch: &Batch, n_input: usize) -> f64 {
         let n_action = self.action_gradient.len() / config.batch_size;
         let penalty = config.action_penalty / self.action_gradient.len() as f32;
@@ -410,18 +416,18 @@ impl ActorHalf {
 
 /// A network's gradient and optimiser.
 #[derive(Debug, Clone)]
-struct Step {
+struct NetworkOptimizer {
     gradient: Vec<f32>,
     adam: Adam,
 }
 
-impl Step {
+impl NetworkOptimizer {
     fn new(shape: &MlpShape, learning_rate: f32) -> Self {
         let n_parameters = shape.n_parameters();
         Self { gradient: vec![0.0; n_parameters], adam: Adam::new(n_parameters, learning_rate) }
     }
 
-    /// Moves the network against its gradient; whether all parameters are still finite.
+    /// Makes a step of Adam; returns true if all parameters are still finite.
     fn apply(&mut self, network: &mut Network) -> bool {
         self.adam.step(&mut network.online, &self.gradient);
         all_finite(&network.online)
@@ -442,7 +448,7 @@ fn write_columns(
     }
 }
 
-/// The columns of a critic's input that hold the action.
+/// Returns the columns of a critic's input that contain the action.
 fn action_columns<'a>(
     input: &'a mut [f32],
     actor: &MlpShape,
@@ -452,7 +458,7 @@ fn action_columns<'a>(
     MatrixMut::with_stride(&mut input[actor.n_input..], b, actor.n_output, n_joined)
 }
 
-/// Takes every action through its tanh.
+/// Applies tanh to every action.
 fn squash(actions: &mut MatrixMut<'_>) {
     for row in actions.rows_mut() {
         for component in row {
@@ -461,7 +467,7 @@ fn squash(actions: &mut MatrixMut<'_>) {
     }
 }
 
-/// Runs both, side by side when there are two threads.
+/// Runs both closures, in parallel if there are two threads.
 fn join<A: Send, B: Send>(
     n_threads: usize,
     a: impl FnOnce() -> A + Send,

@@ -1,11 +1,12 @@
-//! The replay buffer: whole episodes, the oldest overwritten first.
+//! The replay buffer: a ring of whole episodes.
 
 use std::ops::Range;
 
+use tandem_core::Episode;
 use tandem_core::layout::{ArmIndex, EPISODE_STEPS, Layout};
-use tandem_core::{Contacts, Episode, EpisodeKind};
 
-/// Whole episodes in flat arrays; episode `e` of `n` lies at `e * stride` of each.
+/// The replay buffer: whole episodes in flat arrays, episode `e` at `e * stride` of each. A full buffer overwrites the
+/// oldest episode.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ReplayBuffer {
     layout: Layout,
@@ -15,7 +16,7 @@ pub struct ReplayBuffer {
     displaced_episodes: Vec<usize>,
 }
 
-/// The buffer's contents as they are stored.
+/// The contents of a buffer, as a checkpoint stores them.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct ReplayParts {
     /// Shape `[n_episodes, EPISODE_STEPS + 1, n_observation]`.
@@ -24,16 +25,16 @@ pub struct ReplayParts {
     pub goals: Vec<f32>,
     /// Shape `[n_episodes, EPISODE_STEPS, n_action]`.
     pub actions: Vec<f32>,
-    /// Shape `[n_episodes, EPISODE_STEPS]`, bit `a`: arm `a` executed the teacher's action.
+    /// Shape `[n_episodes, EPISODE_STEPS]`; bit `a` is set if arm `a` executed the teacher's action.
     pub advised_arms: Vec<u8>,
     /// Shape `[n_episodes, EPISODE_STEPS]`, [`Contacts::bits`] of the step.
     pub contacts: Vec<u8>,
-    /// Shape `[n_episodes]`, 1 where an object was displaced.
+    /// Shape `[n_episodes]`; 1 if an object was displaced, else 0.
     pub moved: Vec<u8>,
 }
 
 impl ReplayBuffer {
-    /// An empty buffer for at most `capacity_transitions`, rounded down to whole episodes but at least one.
+    /// Creates an empty buffer for at most `capacity_transitions`, rounded down to whole episodes but at least one.
     #[must_use]
     pub fn new(layout: Layout, capacity_transitions: usize) -> Self {
         let capacity_episodes = (capacity_transitions / EPISODE_STEPS).max(1);
@@ -46,7 +47,8 @@ impl ReplayBuffer {
         }
     }
 
-    /// A buffer with stored contents; `next` is where the next episode goes.
+    /// Restores a buffer from its contents and the index of the next episode; returns `None` if they do not fit
+    /// together.
     #[must_use]
     pub fn from_parts(
         layout: Layout,
@@ -56,7 +58,7 @@ impl ReplayBuffer {
     ) -> Option<Self> {
         let mut buffer = Self::new(layout, capacity_transitions);
         let n = parts.moved.len();
-        // A buffer that is not full grows at its end; a full one goes round.
+        // A buffer that is not full grows at its end; a full one wraps around.
         let expected_next = if n < buffer.capacity_episodes { n..n + 1 } else { 0..n };
         let fits = n <= buffer.capacity_episodes
             && expected_next.contains(&next)
@@ -74,34 +76,34 @@ impl ReplayBuffer {
         Some(buffer)
     }
 
-    /// What is stored, and where the next episode goes.
+    /// Returns the contents, and the index of the next episode.
     #[must_use]
     pub const fn parts(&self) -> (&ReplayParts, usize) {
         (&self.parts, self.next)
     }
 
-    /// Tasks and arms of the stored episodes.
+    /// Returns the layout of the stored episodes.
     #[must_use]
     pub const fn layout(&self) -> Layout {
         self.layout
     }
 
-    /// How many episodes are stored.
+    /// Returns the number of stored episodes.
     #[must_use]
     pub fn n_episodes(&self) -> usize {
         self.parts.moved.len()
     }
 
-    /// The stored episodes in which an object was displaced.
+    /// Returns the indices of the stored episodes in which an object was displaced.
     #[must_use]
     pub fn displaced_episodes(&self) -> &[usize] {
         &self.displaced_episodes
     }
 
-    /// Stores an episode, in the place of the oldest when the buffer is full.
+    /// Stores an episode, in place of the oldest if the buffer is full.
     ///
     /// # Panics
-    /// When the episode is of another layout.
+    /// When the episode has another layout.
     pub fn push(&mut self, episode: &Episode) {
         assert_eq!(episode.layout, self.layout, "an episode of another layout");
         let moved = u8::from(episode.moved());
@@ -129,7 +131,8 @@ impl ReplayBuffer {
         self.next = (self.next + 1) % self.capacity_episodes;
     }
 
-    /// The observation before step `step_idx` of a stored episode; `EPISODE_STEPS` gives the last.
+    /// Returns the observation before step `step_idx` of a stored episode, shape `[n_observation]`; `EPISODE_STEPS`
+    /// gives the last one.
     #[must_use]
     pub fn observation(&self, episode_idx: usize, step_idx: usize) -> &[f32] {
         let n = self.layout.n_observation();
@@ -137,20 +140,20 @@ impl ReplayBuffer {
         &self.parts.observations[start..start + n]
     }
 
-    /// Where `arm`'s object is before step `step_idx`, in the arm's own frame, metres.
+    /// Returns the position of `arm`'s object before step `step_idx`, in the arm's own frame, metres, shape `[3]`.
     #[must_use]
     pub fn achieved(&self, episode_idx: usize, step_idx: usize, arm: ArmIndex) -> &[f32] {
         &self.observation(episode_idx, step_idx)[self.layout.achieved_goal_of(arm)]
     }
 
-    /// A stored episode's desired goal.
+    /// Returns the desired goal of a stored episode, shape `[n_goal]`.
     #[must_use]
     pub fn goal(&self, episode_idx: usize) -> &[f32] {
         let n = self.layout.n_goal();
         &self.parts.goals[episode_idx * n..(episode_idx + 1) * n]
     }
 
-    /// The action executed on step `step_idx` of a stored episode.
+    /// Returns the action executed on step `step_idx` of a stored episode, shape `[n_action]`.
     #[must_use]
     pub fn action(&self, episode_idx: usize, step_idx: usize) -> &[f32] {
         let n = self.layout.n_action();
@@ -158,13 +161,13 @@ impl ReplayBuffer {
         &self.parts.actions[start..start + n]
     }
 
-    /// Bit `a` set where arm `a` executed the teacher's action on that step.
+    /// Returns a mask with bit `a` set if arm `a` executed the teacher's action on that step.
     #[must_use]
     pub fn advised_arms(&self, episode_idx: usize, step_idx: usize) -> u8 {
         self.parts.advised_arms[episode_idx * EPISODE_STEPS + step_idx]
     }
 
-    /// Whether an arm touched the other or the table on one of the steps of an episode.
+    /// Returns true if an arm touched the other or the table on one of the steps of a stored episode.
     #[must_use]
     pub fn has_contact(&self, steps: Range<usize>, episode_idx: usize) -> bool {
         let start = episode_idx * EPISODE_STEPS;
@@ -188,33 +191,26 @@ impl ReplayBuffer {
     }
 }
 
-/// Puts `row` in the place of row `row_idx` of a table with rows of that length.
+/// Replaces row `row_idx` of a table with rows of the same length.
 fn overwrite<T: Copy>(table: &mut [T], row_idx: usize, row: &[T]) {
     table[row_idx * row.len()..(row_idx + 1) * row.len()].copy_from_slice(row);
 }
 
-/// An episode of zeros, for benchmarks and tests: the object of arm 0 drifts by `drift_m` a step along x.
-#[must_use]
-pub fn drifting_episode(layout: Layout, number: u64, drift_m: f32) -> Episode {
-    let n_observation = layout.n_observation();
-    let mut observations = vec![0.0; (EPISODE_STEPS + 1) * n_observation];
-    let x = layout.achieved_goal_of(ArmIndex(0)).start;
-    let mut position = 0.0;
-    for observation in observations.chunks_exact_mut(n_observation) {
-        observation[x] = position;
-        position += drift_m;
-    }
-    Episode {
-        number,
-        kind: EpisodeKind::Training,
-        parameter_version: 0,
-        layout,
-        observations,
-        goal: vec![0.0; layout.n_goal()],
-        actions: vec![0.0; EPISODE_STEPS * layout.n_action()],
-        advised_arms: vec![0; EPISODE_STEPS],
-        contacts: vec![Contacts::NONE; EPISODE_STEPS],
-        advice_charged: 0,
+#[cfg(test)]
+pub(crate) mod fixtures {
+    use super::*;
+
+    /// Returns an episode in which the object of arm 0 moves by `drift_m` per step along x, and everything else is
+    /// zero.
+    pub(crate) fn drifting_episode(layout: Layout, number: u64, drift_m: f32) -> Episode {
+        let mut episode = Episode::zeros(layout, number);
+        let x = layout.achieved_goal_of(ArmIndex(0)).start;
+        let mut position = 0.0;
+        for observation in episode.observations.chunks_exact_mut(layout.n_observation()) {
+            observation[x] = position;
+            position += drift_m;
+        }
+        episode
     }
 }
 
@@ -222,12 +218,13 @@ pub fn drifting_episode(layout: Layout, number: u64, drift_m: f32) -> Episode {
 mod tests {
     use tandem_core::Task;
 
+    use super::fixtures::drifting_episode;
     use super::*;
 
     const LAYOUT: Layout = Layout::new(Task::Push, 2);
 
     #[test]
-    fn the_oldest_episode_gives_way() {
+    fn a_full_buffer_overwrites_the_oldest_episode() {
         let mut buffer = ReplayBuffer::new(LAYOUT, 3 * EPISODE_STEPS);
         for number in 0_u8..5 {
             let drift_m = if number % 2 == 0 { 0.0 } else { 0.01 * f32::from(number) };
@@ -240,7 +237,7 @@ mod tests {
     }
 
     #[test]
-    fn a_buffer_survives_being_taken_apart() {
+    fn a_buffer_is_restored_from_its_parts() {
         let mut buffer = ReplayBuffer::new(LAYOUT, 2 * EPISODE_STEPS);
         for number in 0..3 {
             buffer.push(&drifting_episode(LAYOUT, number, 0.02));

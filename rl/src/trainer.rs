@@ -1,6 +1,6 @@
-//! The learning state and what happens to it in a round: orders, new episodes, updates, parameters.
+//! The learning state and the steps of a round: orders, new episodes, updates, published parameters.
 //!
-//! Pure: the result depends on the configuration and the episodes, in their order, and on nothing else.
+//! Pure: the result depends only on the configuration and on the episodes in their order.
 
 use std::collections::BTreeMap;
 
@@ -22,51 +22,51 @@ use crate::replay::ReplayBuffer;
 /// Episodes of an evaluation slot.
 const EVALUATION_SLOT_EPISODES: usize = 8;
 
-/// As how many rows a teacher's normalisation counts in a run that starts from it: some 2,000 episodes.
-const TEACHERS_ROWS: u64 = 100_000;
+/// Number of rows that a teacher's normaliser counts for in a run that starts from it: about 2,000 episodes.
+const TEACHER_NORMALIZER_ROWS: u64 = 100_000;
 
-/// How far a run has come.
+/// Counters of a run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Counters {
     /// Rounds learned.
     pub round: u64,
-    /// Training steps taken in environments.
+    /// Environment steps of training.
     pub env_steps: u64,
-    /// Training episodes.
+    /// Episodes of training.
     pub episodes: u64,
-    /// Updates.
+    /// Updates of the networks.
     pub updates: u64,
-    /// Units of the advice budget that training episodes were charged.
+    /// Units of the advice budget charged for training episodes.
     pub advice_spent: u64,
 }
 
-/// What a round showed.
+/// Statistics of a round.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub struct RoundFigures {
-    /// Mean over the round's updates.
+pub struct RoundStats {
+    /// The critic's loss, mean over the round's updates.
     pub critic_loss: f64,
-    /// Mean over the round's updates.
+    /// The actor's loss, mean over the round's updates.
     pub actor_loss: f64,
-    /// Mean value of the policy's own actions over the round's batches, mean over heads.
+    /// Value of the policy's own actions, mean over the round's batches and the critic's heads.
     pub mean_q: f64,
-    /// Share of the round's episodes that succeeded.
+    /// Fraction of the round's episodes that succeeded.
     pub training_success: f64,
-    /// Share of the round's episodes in which an object was displaced.
+    /// Fraction of the round's episodes in which an object was displaced.
     pub training_moved: f64,
 }
 
-/// Everything that learning changes. Fields are public so that a checkpoint can save and restore them.
+/// The learning state of a run. Fields are public so that a checkpoint can save and restore them.
 #[derive(Debug)]
 pub struct Trainer {
     /// The run's settings, checked.
     pub config: RunConfig,
-    /// Arms and task, from the settings.
+    /// The layout of the learning policy, from the settings.
     pub layout: Layout,
-    /// Rounds, environment steps, episodes, updates and units of advice so far.
+    /// The run's counters.
     pub counters: Counters,
     /// The replay buffer.
     pub replay: ReplayBuffer,
-    /// Networks, target networks and optimizer states.
+    /// Networks, target networks and optimisers.
     pub ddpg: Ddpg,
     /// Running mean and deviation of observations.
     pub observation_normalizer: Normalizer,
@@ -74,15 +74,15 @@ pub struct Trainer {
     pub goal_normalizer: Normalizer,
     sampler: Sampler,
     batch: Batch,
-    /// Statistics of the last round.
-    pub figures: RoundFigures,
+    /// Statistics of the latest round.
+    pub stats: RoundStats,
 }
 
 impl Trainer {
-    /// The state before the first round.
+    /// Creates the state before the first round.
     ///
     /// # Errors
-    /// When the configuration cannot be used.
+    /// When a setting is out of its range.
     pub fn new(config: RunConfig) -> Result<Self, ConfigError> {
         let config = config.checked()?;
         let layout = config.layout()?;
@@ -97,16 +97,16 @@ impl Trainer {
             goal_normalizer: Normalizer::new(layout.n_goal()),
             sampler: Sampler::new(&config.replay, layout),
             batch: Batch::new(layout, n_heads, config.ddpg.batch_size),
-            figures: RoundFigures::default(),
+            stats: RoundStats::default(),
             config,
         })
     }
 
-    /// Starts from a copy of `teacher` for each arm: networks and how their inputs are normalised. Meant for a run that
-    /// has not begun.
+    /// Initialises networks and normalisers with a copy of `teacher` for each arm. Intended for a run that has not
+    /// started.
     ///
     /// # Errors
-    /// Says what does not fit: the teacher's task, its arms or its sizes, or a critic of one head for several arms.
+    /// Describes the mismatch: the teacher's task, arms or sizes, or a critic with one head for several arms.
     pub fn start_from(&mut self, teacher: &Policy) -> Result<(), String> {
         if teacher.layout != self.layout.single_arm() || teacher.n_heads != 1 {
             let (task, n_arms) = (self.layout.task, teacher.layout.n_arms);
@@ -128,35 +128,36 @@ impl Trainer {
         }
         self.ddpg.start_from(&copies);
         self.observation_normalizer =
-            Normalizer::from_snapshot(&copies.observation_normalizer, TEACHERS_ROWS);
-        self.goal_normalizer = Normalizer::from_snapshot(&copies.goal_normalizer, TEACHERS_ROWS);
+            Normalizer::from_snapshot(&copies.observation_normalizer, TEACHER_NORMALIZER_ROWS);
+        self.goal_normalizer =
+            Normalizer::from_snapshot(&copies.goal_normalizer, TEACHER_NORMALIZER_ROWS);
         Ok(())
     }
 
-    /// The configuration of the run.
+    /// Returns the configuration of the run.
     #[must_use]
     pub const fn config(&self) -> &RunConfig {
         &self.config
     }
 
-    /// How far the run has come.
+    /// Returns the counters of the run.
     #[must_use]
     pub const fn counters(&self) -> Counters {
         self.counters
     }
 
-    /// What the latest round showed.
+    /// Returns the statistics of the latest round.
     #[must_use]
-    pub const fn figures(&self) -> RoundFigures {
-        self.figures
+    pub const fn stats(&self) -> RoundStats {
+        self.stats
     }
 
-    /// Lets the update use `n_threads`, 1 or 2; the results are the same.
+    /// Sets the threads of the update, 1 or 2; the results are the same.
     pub fn set_threads(&mut self, n_threads: usize) {
         self.ddpg.set_threads(n_threads);
     }
 
-    /// The training slots of round `round`, to be played with `version`.
+    /// Returns the training slots of round `round`, for parameter version `version`.
     #[must_use]
     pub fn training_orders(&self, round: u64, version: u64) -> Vec<SlotOrder> {
         let per_round = self.config.episodes_per_round();
@@ -173,7 +174,7 @@ impl Trainer {
         slots(&orders, self.config.rounds.rollouts, EpisodeKind::Training, version)
     }
 
-    /// The slots of an evaluation of `version` on the run's fixed goals.
+    /// Returns the slots of an evaluation of parameter version `version` on the run's fixed goals.
     #[must_use]
     pub fn evaluation_orders(&self, version: u64) -> Vec<SlotOrder> {
         let evaluation = &self.config.evaluation;
@@ -188,29 +189,29 @@ impl Trainer {
         slots(&orders, EVALUATION_SLOT_EPISODES, EpisodeKind::Evaluation, version)
     }
 
-    /// Takes in a round's episodes, which must be in episode order.
+    /// Adds a round's episodes, in episode order, to the replay buffer, the normalisers and the counters.
     pub fn ingest(&mut self, episodes: &[Episode]) {
         for episode in episodes {
             self.replay.push(episode);
-            self.feed_normalizers(episode);
+            self.update_normalizers(episode);
             self.counters.advice_spent += u64::from(episode.advice_charged);
         }
         self.counters.episodes += episodes.len() as u64;
         self.counters.env_steps += (episodes.len() * EPISODE_STEPS) as u64;
         let share = |hits: usize| hits as f64 / episodes.len().max(1) as f64;
-        self.figures.training_success =
+        self.stats.training_success =
             share(episodes.iter().filter(|episode| episode.succeeded()).count());
-        self.figures.training_moved =
+        self.stats.training_moved =
             share(episodes.iter().filter(|episode| episode.moved()).count());
     }
 
-    /// Sets the units of advice spent, where the teacher's account contradicts the episodes' claims.
+    /// Sets the units of advice spent, which the teacher's account determines.
     pub const fn correct_advice_spent(&mut self, units: u64) {
         self.counters.advice_spent = units;
     }
 
-    /// Names the first statistic of the normalisers that is not finite or beyond everything that a world shows. Inputs
-    /// normalised with it are all alike, and the policy learns nothing.
+    /// Returns a description of the first statistic of the normalisers that is not finite or exceeds every value that a
+    /// world can produce. Inputs normalised with it are indistinguishable, so the policy cannot learn.
     #[must_use]
     pub fn absurd_statistic(&self) -> Option<String> {
         let largest_of_object = self.layout.observation_bound(OBJECT_POSITION.start);
@@ -220,11 +221,11 @@ impl Trainer {
             .or_else(|| first_absurd("goals", self.goal_normalizer.snapshot(), |_| goal_bound))
     }
 
-    /// Makes a round's updates. `on_update` hears how many are done.
+    /// Makes a round's updates. Calls `on_update` with their number after each.
     ///
     /// # Errors
     /// When a loss or a parameter is no longer finite.
-    pub fn learn(&mut self, mut on_update: impl FnMut(u64)) -> Result<RoundFigures, DdpgError> {
+    pub fn learn(&mut self, mut on_update: impl FnMut(u64)) -> Result<RoundStats, DdpgError> {
         let mut rng = episode_rng(self.config.seed, self.counters.round, Stream::Replay);
         let statistics = Statistics {
             observation: self.observation_normalizer.snapshot(),
@@ -232,7 +233,7 @@ impl Trainer {
         };
         self.ddpg.set_cooldown(self.config.is_cooldown(self.counters.round));
         let n_updates = self.config.updates_per_round();
-        let mut sums = RoundFigures::default();
+        let mut sums = RoundStats::default();
         for update in 1..=n_updates {
             self.sampler.fill(&self.replay, statistics, &mut rng, &mut self.batch);
             let losses = self.ddpg.update(&self.batch)?;
@@ -249,13 +250,13 @@ impl Trainer {
         }
         self.counters.updates += n_updates;
         self.counters.round += 1;
-        self.figures.critic_loss = sums.critic_loss / n_updates as f64;
-        self.figures.actor_loss = sums.actor_loss / n_updates as f64;
-        self.figures.mean_q = sums.mean_q / n_updates as f64;
-        Ok(self.figures)
+        self.stats.critic_loss = sums.critic_loss / n_updates as f64;
+        self.stats.actor_loss = sums.actor_loss / n_updates as f64;
+        self.stats.mean_q = sums.mean_q / n_updates as f64;
+        Ok(self.stats)
     }
 
-    /// The actor as workers are to use it; its version is the number of rounds learned.
+    /// Returns the actor for the workers; its version is the number of rounds learned.
     #[must_use]
     pub fn publish(&self) -> PublishedActor {
         let actor = match self.config.behaviour {
@@ -278,7 +279,7 @@ impl Trainer {
         }
     }
 
-    /// The policy that acts now, with the critic that belongs to it, as it would be shipped.
+    /// Returns the policy that acts now, with its critic and normalisers.
     #[must_use]
     pub fn policy(&self, metadata: BTreeMap<String, String>) -> Policy {
         let (actor, critic) = match self.config.behaviour {
@@ -298,7 +299,7 @@ impl Trainer {
         }
     }
 
-    /// SHA-256 over parameters, optimiser, normalisers, replay buffer and counters, in a fixed order, hexadecimal.
+    /// Returns SHA-256 over parameters, optimisers, normalisers, replay buffer and counters, hexadecimal.
     #[must_use]
     pub fn digest(&self) -> String {
         let mut hash = Sha256::new();
@@ -327,7 +328,7 @@ impl Trainer {
         hex(&hash.finalize())
     }
 
-    /// Every large float vector of the state, by name, in a fixed order.
+    /// Returns the large float vectors of the state by name, in a fixed order.
     #[must_use]
     pub fn tensors(&self) -> Vec<(String, &[f32])> {
         let (parts, _) = self.replay.parts();
@@ -341,8 +342,8 @@ impl Trainer {
         ddpg.chain(replay.map(|(name, values)| (name.to_owned(), values))).collect()
     }
 
-    /// Feeds the normalisers with an episode's observations and with goals relabelled as in a batch.
-    fn feed_normalizers(&mut self, episode: &Episode) {
+    /// Updates the normalisers with an episode's observations, and with goals relabelled as in a batch.
+    fn update_normalizers(&mut self, episode: &Episode) {
         let mut rng = episode_rng(self.config.seed, episode.number, Stream::Normaliser);
         let both_orders = self.config.replay.arm_swap_prob > 0.0 && self.layout.n_arms == 2;
         let (mut observations, mut goals) = (Vec::new(), Vec::new());
@@ -369,9 +370,9 @@ impl Trainer {
         let mut goal = episode.goal.clone();
         for arm in self.layout.arms() {
             let hindsight = bernoulli(rng, self.config.replay.her_ratio);
-            let moment = step_idx + 1 + index(rng, EPISODE_STEPS - step_idx);
+            let later_step = step_idx + 1 + index(rng, EPISODE_STEPS - step_idx);
             if hindsight {
-                goal[self.layout.goal_of(arm)].copy_from_slice(episode.achieved(moment, arm));
+                goal[self.layout.goal_of(arm)].copy_from_slice(episode.achieved(later_step, arm));
             }
         }
         goal
@@ -383,19 +384,19 @@ fn first_absurd(
     snapshot: &NormalizerSnapshot,
     largest: impl Fn(usize) -> f32,
 ) -> Option<String> {
-    // A mean or a standard deviation of bounded numbers exceeds their bound by rounding only.
+    // A mean or a standard deviation of bounded numbers exceeds their bound only by rounding.
     let is_sane = |value: f32, idx| value.abs() <= 1.001 * largest(idx);
     let numbers = snapshot.mean.iter().zip(&snapshot.std).enumerate();
     let (idx, (mean, std)) = numbers
         .into_iter()
         .find(|(idx, (mean, std))| !(is_sane(**mean, *idx) && is_sane(**std, *idx)))?;
     Some(format!(
-        "number {idx} of the {what} has mean {mean:e} and standard deviation {std:e} over the run, which no world shows: \
+        "number {idx} of the {what} has mean {mean:e} and standard deviation {std:e} over the run, which no world produces: \
          the policy cannot learn from it"
     ))
 }
 
-/// Whether episode `number` is one of the advised ones: a share of any run of episodes, evenly spread.
+/// Returns true if episode `number` is advised. Advised episodes are evenly spread.
 #[expect(
     clippy::cast_possible_truncation,
     clippy::cast_sign_loss,
@@ -406,7 +407,7 @@ fn is_advised(number: u64, share: f64) -> bool {
     advised_before(number + 1) > advised_before(number)
 }
 
-/// Cuts orders into slots of `n_episodes`; the board numbers them.
+/// Splits orders into slots of `n_episodes`; the learner's queue numbers them.
 fn slots(
     orders: &[EpisodeOrder],
     n_episodes: usize,
@@ -422,7 +423,7 @@ fn slots(
     orders.chunks(n_episodes).map(slot).collect()
 }
 
-/// The two halves of a two-arm vector in the other order.
+/// Returns the two halves of a two-arm vector in reverse order.
 fn swapped(vector: &[f32]) -> Vec<f32> {
     let (first, second) = vector.split_at(vector.len() / 2);
     [second, first].concat()
@@ -434,7 +435,7 @@ mod tests {
     use crate::config::Recipe;
 
     #[test]
-    fn a_statistic_that_one_absurd_number_has_ruined_is_named() {
+    fn a_statistic_ruined_by_one_absurd_number_is_named() {
         let mut config = RunConfig::defaults(Recipe::Tandem, tandem_core::Task::Push, 2);
         config.ddpg.n_hidden = 4;
         let mut trainer = Trainer::new(config).expect("valid");

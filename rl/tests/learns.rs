@@ -12,7 +12,7 @@ use tandem_rl::config::Recipe;
 use tandem_rl::trainer::Trainer;
 
 const LAYOUT: Layout = Layout::new(Task::Push, 1);
-/// How far an action of 1 moves the object, metres.
+/// Displacement of the object by an action of 1, metres.
 const ACTION_M: f32 = 0.02;
 /// Starts and goals lie within this of the origin on each axis, metres.
 const REACH_M: f32 = 0.15;
@@ -92,7 +92,7 @@ fn train(n_rounds: u64) -> Trainer {
 }
 
 #[test]
-fn from_sparse_rewards_alone_the_goal_is_reached() {
+fn the_goal_is_reached_from_sparse_rewards_alone() {
     let before = success(&train(0));
     let trained = train(25);
     let after = success(&trained);

@@ -38,7 +38,7 @@ pub enum Error {
     NotAnEpisode {
         /// Path of the log.
         path: PathBuf,
-        /// What is missing or wrong.
+        /// The missing or invalid part.
         problem: String,
     },
     /// A vector does not fit the layout of the episode or trial.

@@ -52,7 +52,7 @@ event! {
         pub episode: u64,
         /// Version of the parameters that acted.
         pub parameter_version: u64,
-        /// Whether every object is at its goal.
+        /// `true` if every object is at its goal.
         pub success: bool,
         /// Units of advice charged.
         pub advice_charged: u32,
@@ -112,7 +112,7 @@ event! {
         pub collision_rate: f64,
         /// Mean Q-value of the policy's actions.
         pub mean_q: f64,
-        /// Whether this is the best policy so far.
+        /// `true` for the best policy so far.
         pub best: bool,
     }
     info!(
@@ -233,7 +233,7 @@ event! {
 event! {
     /// A run ended.
     pub struct RunFinished<'a> {
-        /// Why the run ended.
+        /// Reason of the end.
         pub reason: &'a str,
         /// Number of its last round.
         pub round: u64,

@@ -67,7 +67,7 @@ pub struct MetricsRow {
     pub mean_return: f64,
     /// Number of evaluation episodes.
     pub n_episodes: u64,
-    /// Whether this is the best policy so far.
+    /// `true` for the best policy so far.
     pub best: bool,
 }
 

@@ -63,7 +63,7 @@ fn copy_readable(bytes: &[u8], file: &File) -> mcap::McapResult<RecoveredCounts>
     Ok(copy.counts)
 }
 
-/// The file that is being made whole.
+/// The recovered file while it is written.
 struct Copy<'a> {
     writer: mcap::Writer<BufWriter<&'a File>>,
     counts: RecoveredCounts,

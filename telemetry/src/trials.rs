@@ -25,7 +25,7 @@ pub struct TrialRow {
     pub trial: u64,
     /// Seed of starts, goals and noise.
     pub seed: u64,
-    /// Whether every object ended within the tolerance of its goal and nothing failed.
+    /// `true` if every object ended within the tolerance of its goal and nothing failed.
     pub success: bool,
     /// Cause of the failure; `None` for a success.
     pub cause: Option<String>,

@@ -14,7 +14,7 @@ use tandem_core::{
 };
 use tandem_fuzz::sample;
 use tandem_learner::checkpoint::{self, Resumption};
-use tandem_learner::records::{Judged, Pending};
+use tandem_learner::evaluation_store::{EvaluationHistory, PendingEvaluation};
 use tandem_proto::pb;
 use tandem_rl::trainer::Trainer;
 use tandem_telemetry::MetricsRow;
@@ -47,15 +47,19 @@ fn write_checkpoints(to: &Path, scratch: &Path) -> Result<(), AnyError> {
 fn resumption(trainer: &Trainer) -> Resumption {
     let policy = trainer.policy(BTreeMap::from([("name".to_owned(), "sample".to_owned())]));
     let row = MetricsRow { round: 1, success_per_arm: vec![0.5], ..MetricsRow::default() };
-    let pending = Pending {
+    let pending = PendingEvaluation {
         counters: trainer.counters(),
-        figures: trainer.figures(),
+        stats: trainer.figures(),
         wall_s: 1.5,
         policy: policy.clone(),
     };
     Resumption {
         acting: trainer.publish(),
-        judged: Judged { rows: vec![row], best: Some(policy.clone()), last: Some(policy) },
+        history: EvaluationHistory {
+            rows: vec![row],
+            best: Some(policy.clone()),
+            last: Some(policy),
+        },
         pending: vec![pending],
         wall_s: 2.5,
     }

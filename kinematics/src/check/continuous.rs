@@ -1,10 +1,10 @@
 //! The continuous check: tool speed, reach, tilt and gaps, bounded over whole intervals between samples.
 //!
-//! A quantity with margin m in the middle of an interval of length h that changes by at most L per second keeps its limit
-//! throughout the interval if m >= L h / 2. Otherwise both halves are checked, until L h / 2 is below the tolerance
-//! (continuous collision checking by bisection). The rates L follow from bounds on the joints' velocities in the interval
-//! and from levers: upper bounds, over all configurations, on the distance of any point of interest from a joint's axis
-//! ([`ArmModel::link_levers_m`](crate::model::ArmModel::link_levers_m)).
+//! A quantity with margin m in the middle of an interval of length h that changes by at most L per second keeps its
+//! limit throughout the interval if m >= L h / 2. Otherwise both halves are checked, until L h / 2 is below the
+//! tolerance (continuous collision checking by bisection). The rates L follow from bounds on the joints' velocities in
+//! the interval and from levers: upper bounds, over all configurations, on the distance of any point of interest from a
+//! joint's axis ([`ArmModel::link_levers_m`](crate::model::ArmModel::link_levers_m)).
 
 use tandem_core::ArmIndex;
 
@@ -169,8 +169,8 @@ impl<'a> ContinuousCheck<'a> {
         evaluation.at_least(arm, &gap, |excess| Reason::TableGap(name, excess));
     }
 
-    /// Evaluates the gaps within one arm. Joint 1 moves all its parts together, so distances between parts change no faster
-    /// than heights.
+    /// Evaluates the gaps within one arm. Joint 1 moves all its parts together, so distances between parts change no
+    /// faster than heights.
     fn evaluate_self(&self, evaluation: &mut Evaluation, arm: ArmIndex, links: &LinkCapsules) {
         let (model, interval) = (self.cell.arms[arm.0].model, &self.arms[arm.0]);
         let (gap_m, nearest) = links.self_gap_m(model, interval.gripper_opening);
@@ -211,8 +211,8 @@ impl Evaluation {
     }
 
     /// A margin that exceeds the largest possible change is sufficient for the whole interval. A smaller one leaves the
-    /// interval undecided until the possible change is within the tolerance; the limit is then violated if the margin is
-    /// negative.
+    /// interval undecided until the possible change is within the tolerance; the limit is then violated if the margin
+    /// is negative.
     fn note(
         &mut self,
         arm: ArmIndex,

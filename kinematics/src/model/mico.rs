@@ -1,7 +1,7 @@
 //! Kinova's Mico with four joints.
 //!
-//! Frames of joints, limits and speeds are those of Kinova's package `kinova_description` (kinova-ros, BSD licence, state
-//! of February 2023), file `m1n4s200.xacro`. The numbers were read off; nothing of the file is used.
+//! Frames of joints, limits and speeds are those of Kinova's package `kinova_description` (kinova-ros, BSD licence,
+//! state of February 2023), file `m1n4s200.xacro`. The numbers were read off; nothing of the file is used.
 
 use std::f64::consts::{FRAC_1_SQRT_2, PI, TAU};
 
@@ -41,8 +41,8 @@ static JOINTS: [Joint; 4] = [
 ];
 
 /// Radii, metres. Kinova's actuators have diameters of 75 mm (joints 1 to 3) and 58 mm (joint 4), according to their
-/// names; the links are shells no wider than these. About a centimetre is added for the shell, cables and the ends of the
-/// actuators, which lie across the links.
+/// names; the links are shells no wider than these. About a centimetre is added for the shell, cables and the ends of
+/// the actuators, which lie across the links.
 const BASE_RADIUS_M: f64 = 0.060;
 const UPPER_ARM_RADIUS_M: f64 = 0.050;
 const FOREARM_RADIUS_M: f64 = 0.045;
@@ -54,8 +54,8 @@ const HAND_LENGTH_M: f64 = 0.10;
 const FINGERS_RADIUS_M: f64 = 0.035;
 const FINGERS_ASIDE_M: f64 = 0.0525;
 const FINGERS_AHEAD_M: f64 = 0.0085;
-/// A shut gripper extends 52.5 mm to each side: the hinges are 31 mm from the middle, the fingers about 10 mm thick, and
-/// a centimetre is added. The modelled width is linear in the opening, and the hinged fingers are never wider.
+/// A shut gripper extends 52.5 mm to each side: the hinges are 31 mm from the middle, the fingers about 10 mm thick,
+/// and a centimetre is added. The modelled width is linear in the opening, and the hinged fingers are never wider.
 const FINGERS_SHUT_SHARE: f64 = 1.0 / 3.0;
 
 static LINKS: [Link; 5] = [
@@ -74,7 +74,8 @@ static LINKS: [Link; 5] = [
     },
 ];
 
-/// The extra width of the hand's and the upper arm's capsules over Kinova's actuators of 75 and 58 mm in diameter, metres.
+/// The extra width of the hand's and the upper arm's capsules over Kinova's actuators of 75 and 58 mm in diameter,
+/// metres.
 const FOLDED_ALLOWANCE_M: f64 = (0.050 - 0.0375) + (0.045 - 0.029);
 
 /// All pairs of parts that do not share a joint, except forearm and gripper: joint 4 rotates the gripper about the

@@ -14,7 +14,8 @@ use tandem_kinematics::{
 use crate::refusals::{N_BROKEN, PERIOD_S};
 use crate::walks::{Area, walk};
 
-/// Plans waypoints changed by `change` and compares the time of the refusal with the time at which `margin` is violated.
+/// Plans waypoints changed by `change` and compares the time of the refusal with the time at which `margin` is
+/// violated.
 fn break_waypoints(
     name: &str,
     settings: &CheckSettings,

@@ -1,7 +1,7 @@
-//! The checkpoint's file: safetensors, with a seal over every byte.
+//! The file of a checkpoint: safetensors, with a checksum over every byte (the seal).
 //!
-//! The header begins with the seal, the SHA-256 of the whole file with zeros in the seal's place. Whatever bit of the
-//! file is another, in the header, the metadata or a tensor, the seal is not its.
+//! The header begins with the seal, the SHA-256 of the whole file with zeros in place of the seal. Any flipped bit, in
+//! the header, the metadata or a tensor, invalidates it.
 
 use std::collections::BTreeMap;
 use std::fs::File;
@@ -15,18 +15,18 @@ use tandem_core::text::hex;
 
 /// Version of the file's layout.
 pub(super) const FORMAT: &str = "3";
-/// How a header begins; the seal follows.
+/// The beginning of a header; the seal follows.
 const BEFORE_SEAL: &str = r#"{"__metadata__":{"seal":""#;
 const SEAL_CHARS: usize = 64;
-/// The header's length is a little-endian `u64`; headers are filled up to a multiple of this.
+/// Size of the header's length, a little-endian `u64`. Headers are padded to a multiple of it.
 const WORD_BYTES: usize = 8;
-/// Where the seal stands in a file.
+/// The position of the seal in a file.
 const SEAL: std::ops::Range<usize> =
     WORD_BYTES + BEFORE_SEAL.len()..WORD_BYTES + BEFORE_SEAL.len() + SEAL_CHARS;
 
-/// Where the metadata has the settings that the run began with. Checkpoints of older programs lack them.
+/// The metadata key of the settings that the run started with. Checkpoints of old versions lack it.
 pub(super) const SETTINGS: &str = "settings";
-/// No header is longer.
+/// Largest size of a header.
 const MAX_HEADER_BYTES: u64 = 100 << 20;
 
 /// A named vector.
@@ -37,13 +37,13 @@ pub(super) struct Tensor<'a> {
     pub(super) bytes: &'a [u8],
 }
 
-/// What a file holds, once its seal was found whole.
+/// The contents of a file whose seal is valid.
 pub(super) struct Contents<'a> {
     pub(super) metadata: BTreeMap<String, String>,
     pub(super) tensors: SafeTensors<'a>,
 }
 
-/// Why a file is no checkpoint.
+/// A file that cannot be read as a checkpoint.
 #[derive(Debug, PartialEq, Eq)]
 pub(super) enum Refused {
     /// Cut short or altered.
@@ -70,7 +70,7 @@ pub(super) fn write(
     Ok(seal)
 }
 
-/// Everything before the tensors' bytes, with zeros for a seal.
+/// Returns the part of the file before the tensors, with zeros in place of the seal.
 fn start(metadata: &[(&str, String)], tensors: &[Tensor<'_>]) -> io::Result<Vec<u8>> {
     let mut entries = Map::new();
     entries.insert("seal".to_owned(), Value::String("0".repeat(SEAL_CHARS)));
@@ -93,7 +93,7 @@ fn start(metadata: &[(&str, String)], tensors: &[Tensor<'_>]) -> io::Result<Vec<
     Ok([(header.len() as u64).to_le_bytes().as_slice(), &header].concat())
 }
 
-/// Reads a file's bytes.
+/// Parses the bytes of a file and verifies its seal.
 pub(super) fn open(bytes: &[u8]) -> Result<Contents<'_>, Refused> {
     if bytes.get(WORD_BYTES..SEAL.start) == Some(BEFORE_SEAL.as_bytes()) {
         check_seal(bytes)?;
@@ -104,16 +104,16 @@ pub(super) fn open(bytes: &[u8]) -> Result<Contents<'_>, Refused> {
         header.metadata().clone().unwrap_or_default().into_iter().collect();
     match metadata.get("format").map(String::as_str) {
         Some(FORMAT) if metadata.contains_key("seal") => {}
-        Some(FORMAT) | None => return Err(Refused::Damaged("it bears no seal".to_owned())),
+        Some(FORMAT) | None => return Err(Refused::Damaged("it has no seal".to_owned())),
         Some(format) => return Err(Refused::Format(format.to_owned())),
     }
     if bytes.get(WORD_BYTES..SEAL.start) != Some(BEFORE_SEAL.as_bytes()) {
-        return Err(Refused::Damaged("its seal is not where it should be".to_owned()));
+        return Err(Refused::Damaged("its seal is misplaced".to_owned()));
     }
     Ok(Contents { metadata, tensors: SafeTensors::deserialize(bytes).map_err(damaged)? })
 }
 
-/// The settings in a file's header, of which nothing else is read or checked.
+/// Reads the settings from a file's header, without verifying the file.
 pub(super) fn settings_of(path: &Path) -> Option<String> {
     let mut file = File::open(path).ok()?;
     let mut n_bytes = [0; WORD_BYTES];
@@ -135,12 +135,12 @@ fn check_seal(bytes: &[u8]) -> Result<(), Refused> {
     if hex(&hash.finalize()).as_bytes() == seal {
         return Ok(());
     }
-    Err(Refused::Damaged("its contents are not those that it was sealed with".to_owned()))
+    Err(Refused::Damaged("its contents do not match its seal".to_owned()))
 }
 
-/// The bytes of a file whose contents were altered after it was written, with the seal that fits them.
+/// Replaces the seal of altered bytes by the valid one.
 #[cfg(test)]
-pub(super) fn seal_anew(mut bytes: Vec<u8>) -> Vec<u8> {
+pub(super) fn reseal(mut bytes: Vec<u8>) -> Vec<u8> {
     if bytes.len() >= SEAL.end {
         bytes[SEAL].fill(b'0');
         let seal = hex(&Sha256::digest(&bytes));

@@ -1,27 +1,27 @@
-//! The learning state as named vectors and numbers, and back.
+//! Conversion of the learning state to named vectors and numbers, and back.
 
 use safetensors::Dtype;
 use tandem_core::work::PublishedActor;
 use tandem_policy::{Normalizer, NormalizerSnapshot, NormalizerState, Policy};
+use tandem_rl::replay::{ReplayBuffer, ReplayParts};
+use tandem_rl::trainer::{Counters, RoundStats, Trainer};
 use tandem_telemetry::MetricsRow;
 
 use super::Resumption;
 use super::sealed::{Contents, SETTINGS, Tensor};
-use crate::records::{Judged, Pending};
+use crate::evaluation_store::{EvaluationHistory, PendingEvaluation};
 use crate::settings;
-use tandem_rl::replay::{ReplayBuffer, ReplayParts};
-use tandem_rl::trainer::{Counters, RoundFigures, Trainer};
 
-/// No count of a run is larger, so that none overflows when it is multiplied with the size of a round.
+/// Largest count of a run: none overflows when it is multiplied by the size of a round.
 const MAX_COUNT: u64 = 1 << 48;
-/// No run has more rounds.
+/// Largest number of rounds.
 const MAX_ROUNDS: u64 = 1 << 32;
-/// No more evaluations are under way at a time.
+/// Largest number of pending evaluations.
 const MAX_PENDING: usize = 64;
 
 type OwnedTensor = (String, Dtype, Vec<u8>);
 
-/// The numbers and words of a state, in a fixed order.
+/// Returns the numbers and names of a state, in a fixed order.
 pub(super) fn metadata(trainer: &Trainer, resumption: &Resumption) -> Vec<(&'static str, String)> {
     let Counters { round, env_steps, episodes, updates, advice_spent } = trainer.counters();
     let (_, next) = trainer.replay.parts();
@@ -47,20 +47,20 @@ pub(super) fn metadata(trainer: &Trainer, resumption: &Resumption) -> Vec<(&'sta
     ]
 }
 
-/// The vectors of a state that are made for the file.
+/// Returns the vectors of a state that are created for the file.
 pub(super) fn small_tensors(trainer: &Trainer, resumption: &Resumption) -> Vec<OwnedTensor> {
     let (observation, goal) =
         (trainer.observation_normalizer.state(), trainer.goal_normalizer.state());
-    let Resumption { acting, judged, pending, .. } = resumption;
+    let Resumption { acting, history, pending, .. } = resumption;
     let mut tensors = vec![
-        f64s("figures", &figures(&trainer.figures())),
+        f64s("figures", &stats_vector(&trainer.stats())),
         f64s("normalizer.observation.sum", &observation.sum),
         f64s("normalizer.observation.sum_of_squares", &observation.sum_of_squares),
         f64s("normalizer.goal.sum", &goal.sum),
         f64s("normalizer.goal.sum_of_squares", &goal.sum_of_squares),
     ];
     for (idx, pending) in pending.iter().enumerate() {
-        let numbers = [figures(&pending.figures).as_slice(), &[pending.wall_s]].concat();
+        let numbers = [stats_vector(&pending.stats).as_slice(), &[pending.wall_s]].concat();
         tensors.push(f64s(&format!("pending.{idx}.figures"), &numbers));
         let Counters { round, env_steps, episodes, updates, advice_spent } = pending.counters;
         let counts = [round, env_steps, episodes, updates, advice_spent];
@@ -74,18 +74,18 @@ pub(super) fn small_tensors(trainer: &Trainer, resumption: &Resumption) -> Vec<O
         f32s("acting.goal_mean", &acting.goal_mean),
         f32s("acting.goal_std", &acting.goal_std),
     ]);
-    let kept = [("best", &judged.best), ("last", &judged.last)];
+    let kept = [("best", &history.best), ("last", &history.last)];
     for (name, policy) in kept {
         tensors.extend(policy.iter().flat_map(|policy| policy_tensors(name, policy)));
     }
     for (idx, pending) in pending.iter().enumerate() {
         tensors.extend(policy_tensors(&format!("pending.{idx}"), &pending.policy));
     }
-    tensors.push(("metrics".to_owned(), Dtype::U8, json_lines(&judged.rows)));
+    tensors.push(("metrics".to_owned(), Dtype::U8, json_lines(&history.rows)));
     tensors
 }
 
-/// The vectors of a state that lie in the trainer as they are written: nearly all of it.
+/// Returns the vectors that the trainer stores in the format of the file: nearly all of the state.
 pub(super) fn large_tensors(trainer: &Trainer) -> Vec<Tensor<'_>> {
     let (parts, _) = trainer.replay.parts();
     let floats = trainer.tensors().into_iter().map(|(name, values)| Tensor {
@@ -117,9 +117,8 @@ fn policy_tensors(of: &str, policy: &Policy) -> Vec<OwnedTensor> {
     ]
 }
 
-const fn figures(figures: &RoundFigures) -> [f64; 5] {
-    let RoundFigures { critic_loss, actor_loss, mean_q, training_success, training_moved } =
-        *figures;
+const fn stats_vector(stats: &RoundStats) -> [f64; 5] {
+    let RoundStats { critic_loss, actor_loss, mean_q, training_success, training_moved } = *stats;
     [critic_loss, actor_loss, mean_q, training_success, training_moved]
 }
 
@@ -136,13 +135,13 @@ fn json_lines(values: &[impl serde::Serialize]) -> Vec<u8> {
     values.iter().map(|value| line(value) + "\n").collect::<String>().into_bytes()
 }
 
-/// Reads a state from what a file holds. Every refusal says what does not fit.
+/// Reads a state from the contents of a file. Errors describe the mismatch.
 pub(super) struct Reader<'a> {
     pub(super) contents: Contents<'a>,
 }
 
 impl Reader<'_> {
-    /// Puts the learning state into `trainer`, which is new, and gives the rest.
+    /// Restores the learning state of `trainer`, which is new, and returns the rest.
     pub(super) fn restore(&self, trainer: &mut Trainer) -> Result<Resumption, String> {
         self.check_run(trainer)?;
         trainer.counters = Counters {
@@ -154,24 +153,24 @@ impl Reader<'_> {
         };
         let [critic_loss, actor_loss, mean_q, training_success, training_moved] =
             self.numbers("figures")?;
-        trainer.figures =
-            RoundFigures { critic_loss, actor_loss, mean_q, training_success, training_moved };
+        trainer.stats =
+            RoundStats { critic_loss, actor_loss, mean_q, training_success, training_moved };
         self.restore_networks(trainer)?;
         trainer.observation_normalizer =
             self.normalizer("observation", trainer.layout.n_observation())?;
         trainer.goal_normalizer = self.normalizer("goal", trainer.layout.n_goal())?;
         self.restore_replay(trainer)?;
-        let judged = Judged {
+        let history = EvaluationHistory {
             rows: self.rows()?,
-            best: self.kept_policy("best", trainer)?,
-            last: self.kept_policy("last", trainer)?,
+            best: self.stored_policy("best", trainer)?,
+            last: self.stored_policy("last", trainer)?,
         };
         let wall_s = self.text("wall_s")?.parse().ok();
         Ok(Resumption {
             acting: self.acting(trainer)?,
-            judged,
+            history,
             pending: self.pending(trainer)?,
-            wall_s: wall_s.filter(is_time).ok_or("its wall_s is no time")?,
+            wall_s: wall_s.filter(is_time).ok_or("its wall_s is not a time")?,
         })
     }
 
@@ -195,8 +194,8 @@ impl Reader<'_> {
             .map(|vector| vector.map(|(name, values)| (name.to_owned(), values)))
             .collect::<Result<_, String>>()?;
         let n_updates = self.count("ddpg.n_updates")?;
-        let told = "the run file gives ddpg.n_hidden or ddpg.n_hidden_layers another value than the run began with";
-        trainer.ddpg.restore(&state, n_updates).map_err(|error| format!("{error}; {told}"))
+        let hint = "the run file gives ddpg.n_hidden or ddpg.n_hidden_layers another value than the run began with";
+        trainer.ddpg.restore(&state, n_updates).map_err(|error| format!("{error}; {hint}"))
     }
 
     fn restore_replay(&self, trainer: &mut Trainer) -> Result<(), String> {
@@ -236,41 +235,39 @@ impl Reader<'_> {
             goal_mean: self.f32s("acting.goal_mean")?,
             goal_std: self.f32s("acting.goal_std")?,
         };
-        // An actor that workers would refuse is refused here, where it can be named.
+        // Workers would refuse an unusable actor later; here the error names the checkpoint.
         match tandem_policy::Actor::new(trainer.layout, acting.clone()) {
             Ok(_) => Ok(acting),
             Err(error) => Err(format!("its acting parameters cannot be used: {error}")),
         }
     }
 
-    fn pending(&self, trainer: &Trainer) -> Result<Vec<Pending>, String> {
+    fn pending(&self, trainer: &Trainer) -> Result<Vec<PendingEvaluation>, String> {
         let n: usize = usize::try_from(self.count("pending")?).unwrap_or(usize::MAX);
         if n > MAX_PENDING {
-            return Err(format!("it has {n} evaluations under way"));
+            return Err(format!("it has {n} pending evaluations"));
         }
-        (0..n).map(|idx| self.one_pending(&format!("pending.{idx}"), trainer)).collect()
+        (0..n).map(|idx| self.pending_evaluation(&format!("pending.{idx}"), trainer)).collect()
     }
 
-    fn one_pending(&self, name: &str, trainer: &Trainer) -> Result<Pending, String> {
+    fn pending_evaluation(
+        &self,
+        name: &str,
+        trainer: &Trainer,
+    ) -> Result<PendingEvaluation, String> {
         let counters = self.bytes(&format!("{name}.counters"), Dtype::U64)?;
         let counts: Vec<u64> = bytemuck::pod_collect_to_vec(counters);
         let [round, env_steps, episodes, updates, advice_spent] =
             exactly(&format!("{name}.counters"), counts)?;
         if round > trainer.counters.round {
-            return Err(format!("{name} is of round {round}, which is to come"));
+            return Err(format!("{name} is of round {round}, which the run has not reached"));
         }
         let [critic_loss, actor_loss, mean_q, training_success, training_moved, wall_s] =
             self.numbers(&format!("{name}.figures"))?;
-        let policy = self.kept_policy(name, trainer)?;
-        Ok(Pending {
+        let policy = self.stored_policy(name, trainer)?;
+        Ok(PendingEvaluation {
             counters: Counters { round, env_steps, episodes, updates, advice_spent },
-            figures: RoundFigures {
-                critic_loss,
-                actor_loss,
-                mean_q,
-                training_success,
-                training_moved,
-            },
+            stats: RoundStats { critic_loss, actor_loss, mean_q, training_success, training_moved },
             wall_s,
             policy: policy.ok_or_else(|| format!("{name} has no policy"))?,
         })
@@ -284,8 +281,8 @@ impl Reader<'_> {
             .collect()
     }
 
-    /// The policy that is kept under `of`, if there is one.
-    fn kept_policy(&self, of: &str, trainer: &Trainer) -> Result<Option<Policy>, String> {
+    /// Returns the policy stored under `of`, if there is one.
+    fn stored_policy(&self, of: &str, trainer: &Trainer) -> Result<Option<Policy>, String> {
         let named = |name: &str| format!("{of}.policy.{name}");
         if self.contents.tensors.tensor(&named("actor")).is_err() {
             return Ok(None);

@@ -1,17 +1,28 @@
-//! Checkpoints that are whole, cut, altered, of others and hostile.
+//! Whole, truncated, altered, foreign and hostile checkpoints.
 
 use std::collections::BTreeMap;
 
 use proptest::prelude::{Strategy, any};
 use proptest::test_runner::{Config, TestCaseError, TestRunner};
-use tandem_core::Task;
+use tandem_core::{ArmIndex, Episode, Layout, Task};
+use tandem_rl::config::Recipe;
+use tandem_rl::trainer::RoundStats;
 use tandem_telemetry::MetricsRow;
 use tempfile::TempDir;
 
 use super::*;
-use tandem_rl::config::Recipe;
-use tandem_rl::replay::drifting_episode;
-use tandem_rl::trainer::RoundFigures;
+
+/// Returns an episode in which the object of arm 0 moves by `drift_m` per step along x.
+fn drifting_episode(layout: Layout, number: u64, drift_m: f32) -> Episode {
+    let mut episode = Episode::zeros(layout, number);
+    let x = layout.achieved_goal_of(ArmIndex(0)).start;
+    let mut position = 0.0;
+    for observation in episode.observations.chunks_exact_mut(layout.n_observation()) {
+        observation[x] = position;
+        position += drift_m;
+    }
+    episode
+}
 
 fn small_config() -> RunConfig {
     let mut config = RunConfig::defaults(Recipe::Tandem, Task::Push, 1);
@@ -23,7 +34,7 @@ fn small_config() -> RunConfig {
     config
 }
 
-fn train_round(trainer: &mut Trainer) -> RoundFigures {
+fn train_round(trainer: &mut Trainer) -> RoundStats {
     let round = trainer.counters().round;
     let episodes: Vec<_> = (round * 2..round * 2 + 2)
         .map(|number| drifting_episode(trainer.layout, number, 0.002 * number as f32))
@@ -32,7 +43,7 @@ fn train_round(trainer: &mut Trainer) -> RoundFigures {
     trainer.learn(|_| ()).expect("finite")
 }
 
-/// What a run has beside its trainer in the middle of an evaluation.
+/// Returns the state of a run besides its trainer, with a pending evaluation.
 fn resumption(trainer: &Trainer) -> Resumption {
     let policy =
         |name: &str| trainer.policy(BTreeMap::from([("name".to_owned(), name.to_owned())]));
@@ -46,14 +57,14 @@ fn resumption(trainer: &Trainer) -> Resumption {
     };
     Resumption {
         acting: trainer.publish(),
-        judged: Judged {
+        history: EvaluationHistory {
             rows: vec![row(1, true), row(2, false)],
             best: Some(policy("best")),
             last: Some(policy("last")),
         },
-        pending: vec![Pending {
+        pending: vec![PendingEvaluation {
             counters: trainer.counters(),
-            figures: trainer.figures(),
+            stats: trainer.stats(),
             wall_s: 11.25,
             policy: policy("pending"),
         }],
@@ -85,14 +96,14 @@ fn restored(directory: &TempDir) -> Restored {
 }
 
 #[test]
-fn everything_comes_back_and_leads_to_the_same_bits() {
+fn a_restored_run_continues_with_the_same_bits() {
     let (directory, mut uninterrupted) = saved(2);
     let Restored { mut trainer, resumption: loaded, path } = restored(&directory);
     assert_eq!(path, newest(&directory));
-    assert_eq!(trainer.figures(), uninterrupted.figures());
+    assert_eq!(trainer.stats(), uninterrupted.stats());
     // NaN is not itself: rows are compared as they are written.
     let take_rows = |resumption: &mut Resumption| {
-        serde_json::to_string(&std::mem::take(&mut resumption.judged.rows)).expect("written")
+        serde_json::to_string(&std::mem::take(&mut resumption.history.rows)).expect("written")
     };
     let (mut got, mut expected) = (loaded, resumption(&uninterrupted));
     assert_eq!(take_rows(&mut got), take_rows(&mut expected));
@@ -104,7 +115,7 @@ fn everything_comes_back_and_leads_to_the_same_bits() {
 }
 
 #[test]
-fn the_newest_stay_and_the_one_just_written_among_them() {
+fn the_newest_checkpoints_stay_including_the_one_just_written() {
     let (directory, mut trainer) = saved(3);
     let rounds = || -> Vec<String> {
         let name = |path: &PathBuf| Some(path.file_stem()?.to_str()?.to_owned());
@@ -121,7 +132,7 @@ fn the_newest_stay_and_the_one_just_written_among_them() {
 }
 
 #[test]
-fn without_a_checkpoint_there_is_nothing_to_restore_and_nothing_wrong() {
+fn a_missing_checkpoint_is_no_error() {
     let directory = tempfile::tempdir().expect("a directory");
     let load = || load_newest(&directory.path().join("checkpoint"), &small_config());
     assert!(load().expect("no error").is_none(), "no directory");
@@ -170,7 +181,7 @@ fn a_checkpoint_cut_at_any_byte_is_refused_by_name_and_the_former_offered() {
 }
 
 #[test]
-fn a_flipped_bit_anywhere_is_found() {
+fn a_flipped_bit_anywhere_is_detected() {
     let (directory, _) = saved(1);
     let path = newest(&directory);
     let mut bytes = fs::read(&path).expect("readable");
@@ -216,9 +227,9 @@ fn another_format_is_refused_by_name() {
     let message = write(r#"{"__metadata__":{"round":"50","format":"1"}}"#);
     assert!(message.ends_with(r#"is of format "1", this program reads "3""#), "{message}");
     let message = write(r#"{"__metadata__":{"round":"50","format":"3"}}"#);
-    assert!(message.contains("it bears no seal"), "{message}");
+    assert!(message.contains("it has no seal"), "{message}");
     let message = write(r#"{"__metadata__":{"round":"50","format":"3","seal":"0"}}"#);
-    assert!(message.contains("seal is not where it should be"), "{message}");
+    assert!(message.contains("its seal is misplaced"), "{message}");
     let message = write("{}");
     assert!(message.contains("is damaged"), "{message}");
 }
@@ -235,7 +246,7 @@ fn a_checkpoint_of_another_run_is_refused() {
         assert!(!refusal.to_string().contains("Some("), "{refusal}");
     };
     without_settings(&newest(&directory));
-    assert!(!check_settings(directory.path(), &small_config()).expect("nothing told"));
+    assert!(!check_settings(directory.path(), &small_config()).expect("no settings"));
     check(|config| config.seed = 2, "seed");
     check(|config| config.arms = 2, "arms");
     check(|config| config.task = "pick-and-place".to_owned(), "task");
@@ -251,20 +262,20 @@ fn without_settings(path: &Path) {
     let key = b"\"settings\"";
     let at = bytes.windows(key.len()).position(|window| window == key).expect("they are kept");
     bytes[at + 1] = b'x';
-    fs::write(path, sealed::seal_anew(bytes)).expect("writes");
+    fs::write(path, sealed::reseal(bytes)).expect("writes");
 }
 
 #[test]
-fn a_run_keeps_the_settings_that_decide_what_it_learns() {
+fn settings_that_affect_learning_must_stay() {
     let (directory, _) = saved(1);
-    let check = |change: fn(&mut RunConfig), told: &str| {
+    let check = |change: fn(&mut RunConfig), message: &str| {
         let mut config = small_config();
         change(&mut config);
         let whole = load_newest(directory.path(), &config).expect_err("must be refused");
         let by_header = check_settings(directory.path(), &config).expect_err("must be refused");
         for refusal in [whole, by_header] {
             assert!(matches!(refusal, CheckpointError::OtherSettings { .. }), "{refusal}");
-            assert!(refusal.to_string().starts_with(told), "{refusal}");
+            assert!(refusal.to_string().starts_with(message), "{refusal}");
         }
     };
     check(|c| c.ddpg.n_hidden = 4, "ddpg.n_hidden is 4 here and 3 in the run's checkpoint \"");
@@ -308,7 +319,7 @@ fn load_hostile(name: &str, n_cases: u32, hostile: impl Strategy<Value = Vec<u8>
     let outcome = TestRunner::new(config).run(&hostile, |bytes| {
         fs::write(&path, bytes).map_err(|error| TestCaseError::fail(error.to_string()))?;
         if let Ok(Restored { mut trainer, resumption, .. }) = load(&path, &small_config()) {
-            // What is taken can be gone on with.
+            // A state that loads can be trained.
             train_with_whatever(&mut trainer);
             drop(save(&directory.path().join("again"), &trainer, &resumption, 1));
         }
@@ -336,7 +347,7 @@ fn no_bytes_make_loading_panic() {
     let (directory, _) = saved(1);
     let whole = fs::read(newest(&directory)).expect("readable");
     load_hostile("altered", 200, spoiled(whole.clone()));
-    load_hostile("altered and sealed", 600, spoiled(whole).prop_map(sealed::seal_anew));
+    load_hostile("altered and sealed", 600, spoiled(whole).prop_map(sealed::reseal));
 }
 
 #[test]
@@ -353,7 +364,7 @@ fn no_number_in_the_metadata_makes_loading_panic() {
             let header = text.replace(&old, &new).into_bytes();
             let length = (header.len() as u64).to_le_bytes();
             let bytes = [length.as_slice(), &header, &whole[8 + n_header..]].concat();
-            load_hostile_once(&sealed::seal_anew(bytes));
+            load_hostile_once(&sealed::reseal(bytes));
         }
     }
 }
@@ -368,7 +379,7 @@ fn load_hostile_once(bytes: &[u8]) {
 }
 
 #[test]
-fn a_disk_that_refuses_leaves_the_former_checkpoint() {
+fn a_failed_write_leaves_the_former_checkpoint() {
     let (directory, mut trainer) = saved(1);
     train_round(&mut trainer);
     // A directory where the unfinished file would go: it can be neither written nor renamed.

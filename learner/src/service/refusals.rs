@@ -1,21 +1,21 @@
-//! What the service refuses, and how it says so.
+//! Requests that the service refuses, as gRPC statuses.
 
 use tandem_proto::DecodeError;
 use tonic::Status;
 
-use crate::board::SubmitError;
+use crate::work_queue::SubmitError;
 
 /// Longest label of a worker.
 const MAX_NAME_BYTES: usize = 256;
-/// Letters of a version that a refusal repeats: it travels in a header.
+/// Characters of a version that a refusal repeats: the message is sent in a header.
 const MAX_SHOWN_CHARS: usize = 40;
-/// The version that workers must have: what an episode is may change with any.
+/// The version that workers must have, because any version may change the meaning of an episode.
 const VERSION: &str = env!("CARGO_PKG_VERSION");
 
 /// Number and label of a worker.
 type Worker = (u64, String);
 
-/// Refuses labels that are too long, or that would do something to a terminal or a log.
+/// Refuses labels that are too long, or contain characters with an effect on a terminal or a log.
 pub(super) fn check_name(name: &str) -> Result<(), Status> {
     if name.len() > MAX_NAME_BYTES {
         let message =
@@ -33,7 +33,7 @@ pub(super) fn check_name(name: &str) -> Result<(), Status> {
     }
 }
 
-/// Control characters, line separators and those that turn the direction of writing.
+/// Returns true for control characters, line separators and characters that change the writing direction.
 fn is_control(c: char) -> bool {
     c.is_control()
         || matches!(c, '\u{200e}' | '\u{200f}' | '\u{2028}'..='\u{202e}' | '\u{2066}'..='\u{2069}')
@@ -50,12 +50,12 @@ pub(crate) fn check_version(name: &str, version: &str, this: &str) -> Result<(),
     )))
 }
 
-/// What the sender of a malformed episode is told.
+/// Returns the status for a malformed episode.
 pub(super) fn malformed(error: &DecodeError, episode: u64, worker: Option<&Worker>) -> Status {
     Status::invalid_argument(format!("{}episode {episode}: {error}", prefix(worker)))
 }
 
-/// What the board's refusal means to a worker.
+/// Returns the status for a refusal of the work queue.
 pub(super) fn refusal(error: &SubmitError, worker: Option<&Worker>) -> Status {
     match error {
         SubmitError::UnknownWorker(_) => Status::not_found(error.to_string()),

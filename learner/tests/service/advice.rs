@@ -75,7 +75,7 @@ async fn calm(run: RunConfig) -> (Left, FakeTeacher) {
 const N_ADVISED: u64 = 36;
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_teacher_that_loses_the_account_is_given_what_is_left() {
+async fn a_lost_account_is_reopened_with_the_remaining_budget() {
     for lag in [0, 1] {
         for lost_after in [1, 6, 13, 30] {
             let directory = tempfile::tempdir().expect("a directory");
@@ -93,7 +93,7 @@ async fn a_teacher_that_loses_the_account_is_given_what_is_left() {
                     teacher.books().accounts.clear();
                 }
             }
-            let ended = served.end().await.expect("the run goes on to its end");
+            let ended = served.end().await.expect("the run ends");
             assert!(!ended.interrupted);
             let books = teacher.books();
             let [(first, _), (second, left)] = books.opened.as_slice() else {
@@ -110,7 +110,7 @@ async fn a_teacher_that_loses_the_account_is_given_what_is_left() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_teacher_that_is_away_is_waited_for_and_the_run_can_be_stopped_meanwhile() {
+async fn a_run_waits_for_its_teacher_and_can_be_stopped_meanwhile() {
     for lag in [0, 1] {
         let (expected, teacher) = calm(advised(lag, AMPLE)).await;
         assert_eq!(teacher.books().charged_ever, N_ADVISED * u64::from(UNITS));
@@ -138,7 +138,7 @@ async fn a_teacher_that_is_away_is_waited_for_and_the_run_can_be_stopped_meanwhi
             let again = Served::start(with_teacher(run, directory.path(), true, address)).await;
             let mut toy = again.join("toy").await;
             while play_one(&mut toy, &teacher).await {}
-            let ended = again.end().await.expect("goes on");
+            let ended = again.end().await.expect("continues");
             let left = Left::behind(&ended, directory.path());
             assert_eq!(left, expected, "lag {lag}, away after {away_after}");
         }
@@ -146,7 +146,7 @@ async fn a_teacher_that_is_away_is_waited_for_and_the_run_can_be_stopped_meanwhi
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_teacher_that_refuses_ends_the_run_and_what_was_learned_is_saved() {
+async fn a_refusal_of_the_teacher_ends_the_run_after_saving() {
     let (expected, _) = calm(advised(1, AMPLE)).await;
     let other_terms = "account \"toy\" is open with budget 1";
     for (status, reason) in [
@@ -167,15 +167,15 @@ async fn a_teacher_that_refuses_ends_the_run_and_what_was_learned_is_saved() {
         while play_one(&mut toy, &teacher).await {}
         let error = served.end().await.expect_err("the run ends");
         assert!(matches!(error, Error::Teacher(_)), "{error}");
-        let told = error.to_string();
-        assert!(told.starts_with("the teacher refuses to "), "{told}");
-        assert!(told.ends_with(reason), "{told}");
+        let message = error.to_string();
+        assert!(message.starts_with("the teacher refuses to "), "{message}");
+        assert!(message.ends_with(reason), "{message}");
         assert!(!checkpoint::list(&directory.path().join("checkpoint")).is_empty());
         teacher.books().refusal = None;
         let again = Served::start(with_teacher(run, directory.path(), true, address)).await;
         let mut toy = again.join("toy").await;
         while play_one(&mut toy, &teacher).await {}
-        let ended = again.end().await.expect("goes on");
+        let ended = again.end().await.expect("continues");
         assert_eq!(Left::behind(&ended, directory.path()), expected);
     }
 }
@@ -183,7 +183,7 @@ async fn a_teacher_that_refuses_ends_the_run_and_what_was_learned_is_saved() {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_resumed_run_finds_its_account_in_every_state_of_the_ledger() {
     let half = config(0).stop.max_env_steps / 2;
-    // What becomes of the ledger between two runs, and the accounts that are there afterwards.
+    // Changes of the ledger between two runs, and the accounts after them.
     type Change = fn(&mut FakeTeacher);
     let kept: Change = |_| ();
     let lost: Change = |teacher| teacher.books().accounts.clear();
@@ -221,7 +221,7 @@ async fn a_resumed_run_finds_its_account_in_every_state_of_the_ledger() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_run_that_is_stopped_before_its_teacher_answers_tells_its_digest() {
+async fn a_run_stopped_before_its_teacher_answers_reports_its_digest() {
     let directory = tempfile::tempdir().expect("a directory");
     // Nobody answers there: connections are accepted and nothing is said.
     let silent = TcpListener::bind("127.0.0.1:0").await.expect("a port");

@@ -13,7 +13,7 @@ use crate::toy::config;
 
 const SKIPPED: &str = "skipped: no disk can be mounted here, that needs root";
 
-/// A disk of a megabyte, for whoever may mount one.
+/// A disk of one megabyte; mounting it requires privileges.
 struct SmallDisk {
     path: PathBuf,
     _keep: tempfile::TempDir,
@@ -107,7 +107,7 @@ async fn play_until_warned(toy: &mut Toy, is_awaited: impl Fn(&str) -> bool) -> 
 const TO_THE_FIRST_CHECKPOINT: usize = 14;
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_full_disk_is_told_of_and_nothing_is_lost_when_there_is_room_again() {
+async fn a_full_disk_is_reported_and_nothing_is_lost_once_there_is_room() {
     let Some(disk) = SmallDisk::mount() else {
         println!("{SKIPPED}");
         return;
@@ -118,8 +118,9 @@ async fn a_full_disk_is_told_of_and_nothing_is_lost_when_there_is_room_again() {
     let mut toy = served.join("toy").await;
     play_to_the_first_checkpoint(&mut toy, &out).await;
     disk.fill();
-    let told = play_until_warned(&mut toy, |told| told.contains("checkpoint")).await;
-    assert!(told.contains("cannot be written: No space left on device"), "{told}");
+    let warning_text =
+        play_until_warned(&mut toy, |warning_text| warning_text.contains("checkpoint")).await;
+    assert!(warning_text.contains("cannot be written: No space left on device"), "{warning_text}");
     assert!(!checkpoint::list(&out.join("checkpoint")).is_empty(), "the former one stays");
     disk.make_room();
     while toy.play_one().await {}
@@ -142,18 +143,18 @@ async fn a_disk_that_stays_full_ends_the_run_with_an_error_and_it_can_be_resumed
     while toy.play_one().await {}
     let error = served.end().await.expect_err("not everything is written");
     let Error::RunDirectory { source, .. } = &error else { panic!("{error}") };
-    let told = source.to_string();
+    let warning_text = source.to_string();
     for what in ["the checkpoint of round 9", "No space left on device"] {
-        assert!(told.contains(what), "{told}");
+        assert!(warning_text.contains(what), "{warning_text}");
     }
     disk.make_room();
     let again = Served::start(learner_config(config(0), &out, true)).await;
-    let ended = again.finish(1).await.expect("goes on");
+    let ended = again.finish(1).await.expect("continues");
     assert_eq!(Left::behind(&ended, &out), expected);
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_disk_that_becomes_read_only_is_told_of_and_written_to_when_it_is_well_again() {
+async fn a_read_only_disk_is_reported_and_written_once_it_recovers() {
     let Some(disk) = SmallDisk::mount() else {
         println!("{SKIPPED}");
         return;
@@ -167,13 +168,13 @@ async fn a_disk_that_becomes_read_only_is_told_of_and_written_to_when_it_is_well
     let (order, episodes) = toy.take().await.expect("a slot");
     disk.remount("ro");
     toy.deliver(order.slot, &episodes).await.expect("taken");
-    let mut told = String::new();
-    while told.is_empty() {
-        assert!(toy.play_one().await, "told before the run is over");
+    let mut warning_text = String::new();
+    while warning_text.is_empty() {
+        assert!(toy.play_one().await, "no warning before the end of the run");
         let progress = toy.client.status(pb::StatusRequest {}).await.expect("it lives");
-        told = progress.into_inner().warning;
+        warning_text = progress.into_inner().warning;
     }
-    assert!(told.contains("Read-only file system"), "{told}");
+    assert!(warning_text.contains("Read-only file system"), "{warning_text}");
     disk.remount("rw");
     while toy.play_one().await {}
     let ended = served.end().await.expect("everything is written");
@@ -181,7 +182,7 @@ async fn a_disk_that_becomes_read_only_is_told_of_and_written_to_when_it_is_well
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn files_that_cannot_be_made_are_made_when_what_is_in_their_way_is_gone() {
+async fn blocked_files_are_written_once_the_obstacle_is_gone() {
     let expected = calm(config(0)).await;
     let directory = tempfile::tempdir().expect("a directory");
     let out = directory.path();
@@ -189,8 +190,9 @@ async fn files_that_cannot_be_made_are_made_when_what_is_in_their_way_is_gone() 
     in_the_way.iter().for_each(|path| std::fs::write(path, "").expect("writes"));
     let served = Served::start(impatient(out, false)).await;
     let mut toy = served.join("toy").await;
-    let both =
-        |told: &str| told.contains("the checkpoint of round") && told.contains("policy/best");
+    let both = |warning_text: &str| {
+        warning_text.contains("the checkpoint of round") && warning_text.contains("policy/best")
+    };
     play_until_warned(&mut toy, both).await;
     in_the_way.iter().for_each(|path| std::fs::remove_file(path).expect("removes"));
     while toy.play_one().await {}
@@ -199,7 +201,7 @@ async fn files_that_cannot_be_made_are_made_when_what_is_in_their_way_is_gone() 
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_learner_writes_nothing_to_a_directory_that_has_taken_its_place() {
+async fn a_learner_writes_nothing_to_a_replaced_run_directory() {
     let expected = calm(config(0)).await;
     let keep = tempfile::tempdir().expect("a directory");
     let (out, moved) = (keep.path().join("run"), keep.path().join("moved"));
@@ -208,8 +210,12 @@ async fn a_learner_writes_nothing_to_a_directory_that_has_taken_its_place() {
     play_to_the_first_checkpoint(&mut toy, &out).await;
     std::fs::rename(&out, &moved).expect("moves");
     std::fs::create_dir(&out).expect("creates");
-    let told = play_until_warned(&mut toy, |told| told.contains("checkpoint")).await;
-    assert!(told.contains("the run directory was moved, removed or replaced"), "{told}");
+    let warning_text =
+        play_until_warned(&mut toy, |warning_text| warning_text.contains("checkpoint")).await;
+    assert!(
+        warning_text.contains("the run directory was moved, removed or replaced"),
+        "{warning_text}"
+    );
     std::fs::remove_dir(&out).expect("nothing was written there");
     std::fs::rename(&moved, &out).expect("moves back");
     while toy.play_one().await {}

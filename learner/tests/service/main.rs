@@ -2,7 +2,7 @@
 
 mod advice;
 mod disk;
-mod lies;
+mod false_claims;
 mod metrics;
 mod order;
 mod refusals;

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::net::SocketAddr;
 use std::time::Duration;
 
-use tandem_learner::{AfterTheEnd, Beside, serve_beside};
+use tandem_learner::{LingerPolicy, ServeOptions, serve_with};
 use tandem_proto::pb;
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tokio::net::{TcpListener, TcpStream};
@@ -13,7 +13,7 @@ use tokio_util::sync::CancellationToken;
 use crate::run::{DEADLINE, Toy, client_of, learner_config};
 use crate::toy;
 
-/// What stands at `/metrics`: values by name and labels.
+/// Returns the values at `/metrics` by name and labels.
 async fn scrape(address: SocketAddr) -> BTreeMap<String, f64> {
     let mut caller = TcpStream::connect(address).await.expect("it listens");
     let question = b"GET /metrics HTTP/1.1\r\nhost: learner\r\n\r\n";
@@ -51,17 +51,17 @@ async fn comes_true(address: SocketAddr, name: &str, expected: f64) -> BTreeMap<
 }
 
 #[tokio::test]
-async fn figures_say_who_waits_and_how_far_the_run_is_and_stay_after_its_end() {
+async fn metrics_follow_the_run_and_stay_after_its_end() {
     let directory = tempfile::tempdir().expect("a directory");
     let shutdown = CancellationToken::new();
     let listener = TcpListener::bind("127.0.0.1:0").await.expect("a port");
     let address = listener.local_addr().expect("bound");
     let metrics = TcpListener::bind("127.0.0.1:0").await.expect("a port");
     let metrics_at = metrics.local_addr().expect("bound");
-    let beside = Beside { metrics: Some(metrics), after_the_end: AfterTheEnd::Stay };
+    let beside = ServeOptions { metrics: Some(metrics), linger: LingerPolicy::UntilShutdown };
     // Without lag no round is opened before the last is learned, so that the counts are what they are.
     let config = learner_config(toy::config(0), directory.path(), false);
-    let serving = tokio::spawn(serve_beside(config, listener, shutdown.clone(), beside));
+    let serving = tokio::spawn(serve_with(config, listener, shutdown.clone(), beside));
 
     let figures = comes_true(metrics_at, "tandem_assignments_waiting", 4.0).await;
     assert_eq!(figures["tandem_workers"], 0.0);
@@ -106,7 +106,7 @@ async fn figures_say_who_waits_and_how_far_the_run_is_and_stay_after_its_end() {
     }
     assert!(figures["tandem_rounds_total"] > 8.0 && figures["tandem_updates_total"] > 0.0);
 
-    assert!(!serving.is_finished(), "it stays until it is told to end");
+    assert!(!serving.is_finished(), "it stays until shutdown");
     shutdown.cancel();
     let ended = tokio::time::timeout(DEADLINE, serving).await.expect("it ends in time");
     assert!(!ended.expect("no panic").expect("a whole run").interrupted);

@@ -29,7 +29,7 @@ async fn play_restlessly(mut toy: Toy, mut rng: ChaCha8Rng, all_ids: Vec<u64>) {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn whatever_order_episodes_arrive_in_the_run_is_the_same() {
+async fn the_order_of_arrival_does_not_affect_the_run() {
     for lag in [0, 1] {
         let expected = calm(config(lag)).await;
         assert_eq!(expected.rows.len(), 5, "after rounds 2, 4, 6, 8 and 9");

@@ -1,4 +1,4 @@
-//! What workers may not send, and that nothing of it is used.
+//! Refused messages of workers, none of which has an effect.
 
 use tandem_core::Episode;
 use tandem_proto::{encode_episode, pb};
@@ -9,7 +9,7 @@ use crate::toy::config;
 
 type Spoil = fn(&mut pb::SubmitEpisodesRequest);
 
-/// A message that is wrong in one place, and what its sender is told after "worker NAME (ID): ".
+/// A message that is wrong in one place, and the refusal that its sender receives after "worker NAME (ID): ".
 const WRONG: [(Spoil, &str); 17] = [
     (
         |m| put(&mut m.episodes[1].observations, 5, f32::NAN),
@@ -50,7 +50,7 @@ const WRONG: [(Spoil, &str); 17] = [
     (|m| m.episodes[1].parameter_version = 5, "episode 1: parameter_version: expected 0, got 5"),
     (
         |m| m.episodes[1].advice_charged = 1,
-        "episode 1: advice_charged: expected 0, as nobody was to be asked, got 1",
+        "episode 1: advice_charged: expected 0, as no advice was ordered, got 1",
     ),
     (|m| m.episodes.extend(m.episodes.clone()), "episodes: expected the 2 of slot 0, got 4"),
     (|m| m.episodes.clear(), "episodes: expected the 2 of slot 0, got 0"),
@@ -79,22 +79,22 @@ async fn a_wrong_message_is_refused_by_name_and_changes_nothing() {
     let mut toy = served.join("arm \"3\"").await;
     let (order, episodes) = toy.take().await.expect("a slot");
     assert_eq!(order.slot, 0);
-    for (spoil, told) in WRONG {
+    for (spoil, refusal) in WRONG {
         let mut wrong = message(&toy, order.slot, &episodes);
         spoil(&mut wrong);
         let status = toy.client.submit_episodes(wrong).await.expect_err("must be refused");
-        let told = format!("worker \"arm \\\"3\\\"\" ({}): {told}", toy.id);
-        assert_refused(&status, Code::InvalidArgument, &told);
+        let refusal = format!("worker \"arm \\\"3\\\"\" ({}): {refusal}", toy.id);
+        assert_refused(&status, Code::InvalidArgument, &refusal);
     }
     for stranger in [0, 1, toy.id + 1, u64::MAX] {
         let wrong =
             pb::SubmitEpisodesRequest { worker_id: stranger, ..message(&toy, 0, &episodes) };
         let status = toy.client.submit_episodes(wrong).await.expect_err("must be refused");
-        let told = format!("worker {stranger} is unknown here: join first");
-        assert_refused(&status, Code::NotFound, &told);
+        let refusal = format!("worker {stranger} is unknown here: join first");
+        assert_refused(&status, Code::NotFound, &refusal);
         let request = pb::NextWorkRequest { worker_id: stranger };
         let status = toy.client.next_work(request).await.expect_err("must be refused");
-        assert_refused(&status, Code::NotFound, &told);
+        assert_refused(&status, Code::NotFound, &refusal);
     }
     toy.deliver(order.slot, &episodes).await.expect("the right one is taken");
     toy.deliver(order.slot, &[]).await.expect("what is in is not looked at");
@@ -104,7 +104,7 @@ async fn a_wrong_message_is_refused_by_name_and_changes_nothing() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn workers_that_cannot_take_part_are_told_why() {
+async fn workers_that_cannot_join_get_the_reason() {
     let directory = tempfile::tempdir().expect("a directory");
     let served = Served::start(learner_config(config(0), directory.path(), false)).await;
     let mut toy = served.join("").await;
@@ -112,7 +112,7 @@ async fn workers_that_cannot_take_part_are_told_why() {
         let request = pb::JoinRequest { worker: worker.to_owned(), version: version.to_owned() };
         toy.client.join(request).await.map(drop)
     };
-    for (name, told) in [
+    for (name, refusal) in [
         ("a\nb", "worker: expected no control characters, got U+000A in \"a\\nb\""),
         ("\u{1b}[2J", "worker: expected no control characters, got U+001B in \"\\u{1b}[2J\""),
         ("x\u{0}", "worker: expected no control characters, got U+0000 in \"x\\0\""),
@@ -120,15 +120,15 @@ async fn workers_that_cannot_take_part_are_told_why() {
         (&"n".repeat(257), "worker: expected at most 256 bytes, got 257"),
     ] {
         let status = join(name, VERSION).await.expect_err("must be refused");
-        assert_refused(&status, Code::InvalidArgument, told);
+        assert_refused(&status, Code::InvalidArgument, refusal);
     }
     for version in ["", "0.0.9", &"9".repeat(100_000)] {
         let status = join("toy", version).await.expect_err("must be refused");
         let shown: String = version.chars().take(40).collect();
-        let told = format!(
+        let refusal = format!(
             "worker \"toy\" is of version \"{shown}\", this learner of version \"{VERSION}\": both must be the same"
         );
-        assert_refused(&status, Code::FailedPrecondition, &told);
+        assert_refused(&status, Code::FailedPrecondition, &refusal);
     }
     join(&"Arm №3 – left ".repeat(8), VERSION).await.expect("any other label will do");
     served.shutdown.cancel();

@@ -54,8 +54,8 @@ async fn a_run_whose_workers_call_relays_is_the_same() {
         tokio::spawn(async move { while toy.play_one().await {} });
     }
     let mut progress = client(first).await;
-    let told = progress.status(pb::StatusRequest {}).await.expect("is passed on").into_inner();
-    assert_eq!(told.task, "push");
+    let status = progress.status(pb::StatusRequest {}).await.expect("is forwarded").into_inner();
+    assert_eq!(status.task, "push");
     let mut watched = progress.watch(pb::WatchRequest {}).await.expect("a stream").into_inner();
     let ended = served.end().await.expect("a run");
     assert_eq!(Left::behind(&ended, directory.path()), expected);
@@ -161,7 +161,7 @@ async fn parameters(
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_version_is_fetched_once_however_many_ask() {
+async fn a_version_is_fetched_once_for_all_workers() {
     let fake = Fake::default();
     fake.n_versions.store(5, Ordering::SeqCst);
     let (address, _relay) = relay(fake.serve().await).await;
@@ -180,7 +180,7 @@ async fn a_version_is_fetched_once_however_many_ask() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn what_a_learner_does_not_have_is_asked_for_again() {
+async fn a_failed_fetch_is_repeated() {
     let fake = Fake::default();
     let (address, _relay) = relay(fake.serve().await).await;
     let client = client(address).await;
@@ -191,7 +191,7 @@ async fn what_a_learner_does_not_have_is_asked_for_again() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn nothing_of_a_former_learner_is_handed_out() {
+async fn parameters_of_a_former_learner_are_dropped() {
     let fake = Fake::default();
     fake.n_versions.store(1, Ordering::SeqCst);
     let (address, _relay) = relay(fake.serve().await).await;
@@ -207,7 +207,7 @@ async fn nothing_of_a_former_learner_is_handed_out() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn refusals_are_passed_on_and_another_version_is_refused() {
+async fn refusals_are_forwarded_and_another_version_is_refused() {
     let fake = Fake::default();
     let (address, _relay) = relay(fake.serve().await).await;
     let mut client = client(address).await;
@@ -224,11 +224,11 @@ async fn refusals_are_passed_on_and_another_version_is_refused() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_learner_that_is_away_is_said_to_be() {
-    let (listener, nobody) = bound().await;
+async fn an_absent_learner_is_reported() {
+    let (listener, absent) = bound().await;
     drop(listener);
-    let (address, _relay) = relay(nobody).await;
-    let status = parameters(&client(address).await, 0).await.expect_err("nobody is there");
+    let (address, _relay) = relay(absent).await;
+    let status = parameters(&client(address).await, 0).await.expect_err("no learner listens");
     assert_eq!(status.code(), Code::Unavailable);
-    assert!(status.message().contains(&nobody.to_string()), "{}", status.message());
+    assert!(status.message().contains(&absent.to_string()), "{}", status.message());
 }

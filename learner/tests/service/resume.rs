@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use tandem_learner::checkpoint::{self, CheckpointError};
-use tandem_learner::{Ended, Error, LearnerConfig};
+use tandem_learner::{Error, LearnerConfig, RunOutcome};
 use tandem_rl::RunConfig;
 use tandem_telemetry::MetricsLog;
 use tempfile::TempDir;
@@ -12,7 +12,7 @@ use tempfile::TempDir;
 use crate::run::{Left, Served, calm, copy_all, learner_config, real_clock};
 use crate::toy::config;
 
-async fn resume(run: RunConfig, out: &Path) -> Result<Ended, Error> {
+async fn resume(run: RunConfig, out: &Path) -> Result<RunOutcome, Error> {
     Served::start(learner_config(run, out, true)).await.finish(2).await
 }
 
@@ -61,18 +61,18 @@ async fn check_every_moment(run: RunConfig, step: usize) {
     let (_keep, copies) = moments(run.clone()).await;
     assert!(copies.len() > 30, "{} moments", copies.len());
     for (n, out) in copies.iter().enumerate().step_by(step) {
-        let ended = resume(run.clone(), out).await.expect("goes on");
+        let ended = resume(run.clone(), out).await.expect("continues");
         assert_eq!(Left::behind(&ended, out), expected, "from moment {n}");
     }
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_learner_killed_at_any_moment_goes_on_to_the_same_bits() {
+async fn a_learner_killed_at_any_moment_ends_with_the_same_bits() {
     check_every_moment(config(0), 3).await;
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_learner_a_round_ahead_killed_at_any_moment_goes_on_to_the_same_bits() {
+async fn a_learner_with_lag_killed_at_any_moment_ends_with_the_same_bits() {
     check_every_moment(config(1), 3).await;
 }
 
@@ -91,7 +91,7 @@ async fn a_run_that_ends_with_a_success_rate_ends_with_the_same_one_when_resumed
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_run_interrupted_again_and_again_goes_on_to_the_same_bits() {
+async fn a_run_interrupted_repeatedly_ends_with_the_same_bits() {
     for lag in [0, 1] {
         let expected = calm(config(lag)).await;
         let directory = tempfile::tempdir().expect("a directory");
@@ -108,7 +108,7 @@ async fn a_run_interrupted_again_and_again_goes_on_to_the_same_bits() {
             }
             served.shutdown.cancel();
             let ended = served.end().await.expect("saved");
-            assert_eq!(ended.digest.len(), 64, "told on interruption, too");
+            assert_eq!(ended.digest.len(), 64, "reported after an interruption too");
             if !ended.interrupted {
                 break ended;
             }
@@ -148,7 +148,7 @@ async fn a_damaged_checkpoint_is_refused_until_it_is_removed() {
     assert_eq!(path, newest);
     assert!(what.contains("remove it to continue from"), "{what}");
     std::fs::remove_file(&newest).expect("removes");
-    let ended = resume(run, out).await.expect("goes on from the former");
+    let ended = resume(run, out).await.expect("continues from the former one");
     assert_eq!(Left::behind(&ended, out), expected);
 }
 

@@ -8,8 +8,9 @@ use std::time::Duration;
 
 use tandem_core::Episode;
 use tandem_core::work::SlotOrder;
-use tandem_learner::service::serve_and_linger;
-use tandem_learner::{Clock, Ended, Error, LearnerConfig};
+use tandem_learner::{
+    Clock, Error, LearnerConfig, LingerPolicy, RunOutcome, ServeOptions, serve_with,
+};
 use tandem_net::{Dial, Gate, Pacing};
 use tandem_policy::{Actor, Policy};
 use tandem_proto::pb::learner_client::LearnerClient;
@@ -57,7 +58,7 @@ pub(crate) fn learner_config(run: RunConfig, out: &Path, resume: bool) -> Learne
 pub(crate) struct Served {
     pub(crate) address: SocketAddr,
     pub(crate) shutdown: CancellationToken,
-    ended: JoinHandle<Result<Ended, Error>>,
+    ended: JoinHandle<Result<RunOutcome, Error>>,
 }
 
 /// Connects at the first call. To connect here would compile the client again, for this file.
@@ -71,8 +72,9 @@ impl Served {
         let listener = TcpListener::bind("127.0.0.1:0").await.expect("a port");
         let address = listener.local_addr().expect("bound");
         let shutdown = CancellationToken::new();
-        let serving =
-            serve_and_linger(config, listener, shutdown.clone(), Duration::from_millis(30));
+        let linger = LingerPolicy::For(Duration::from_millis(30));
+        let options = ServeOptions { linger, metrics: None };
+        let serving = serve_with(config, listener, shutdown.clone(), options);
         Self { address, shutdown, ended: tokio::spawn(serving) }
     }
 
@@ -84,13 +86,13 @@ impl Served {
         Toy::join(self.client().await, name).await.expect("it lives")
     }
 
-    pub(crate) async fn end(self) -> Result<Ended, Error> {
+    pub(crate) async fn end(self) -> Result<RunOutcome, Error> {
         let ended = tokio::time::timeout(DEADLINE, self.ended).await.expect("the run ends in time");
         ended.expect("serving does not panic")
     }
 
     /// Lets `n` plain workers play to the end.
-    pub(crate) async fn finish(self, n: usize) -> Result<Ended, Error> {
+    pub(crate) async fn finish(self, n: usize) -> Result<RunOutcome, Error> {
         let mut workers = Vec::new();
         for _ in 0..n {
             let client = self.client().await;
@@ -187,7 +189,7 @@ pub(crate) async fn deliver_as(
     client.submit_episodes(request).await.map(drop)
 }
 
-/// What a run leaves that does not depend on wall time.
+/// The results of a run that do not depend on wall time.
 #[derive(Debug, PartialEq)]
 pub(crate) struct Left {
     pub(crate) digest: String,
@@ -197,7 +199,7 @@ pub(crate) struct Left {
 }
 
 impl Left {
-    pub(crate) fn behind(ended: &Ended, out: &Path) -> Self {
+    pub(crate) fn behind(ended: &RunOutcome, out: &Path) -> Self {
         let mut rows = MetricsLog::read_all(&out.join("metrics.jsonl")).expect("rows");
         rows.iter_mut().for_each(|row| row.wall_s = 0.0);
         let policies = ["best", "last"].map(|name| {

@@ -12,7 +12,7 @@ use crate::run::{DEADLINE, Left, Served, calm, learner_config, real_clock};
 use crate::toy::config;
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_dead_workers_slot_is_played_by_another_soon() {
+async fn a_dead_workers_slot_is_played_by_another_within_seconds() {
     let expected = calm(config(0)).await;
     let directory = tempfile::tempdir().expect("a directory");
     let served = Served::start(learner_config(config(0), directory.path(), false)).await;
@@ -35,7 +35,7 @@ async fn a_dead_workers_slot_is_played_by_another_soon() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_worker_that_plays_beyond_the_runs_end_is_told_of_it() {
+async fn a_worker_that_plays_beyond_the_end_receives_it() {
     let directory = tempfile::tempdir().expect("a directory");
     let served = Served::start(learner_config(config(0), directory.path(), false)).await;
     let (mut slow, mut fast) = (served.join("slow").await, served.join("fast").await);
@@ -52,10 +52,10 @@ async fn a_worker_that_plays_beyond_the_runs_end_is_told_of_it() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn the_slot_of_a_worker_that_hangs_up_is_played_by_another_at_once() {
+async fn a_disconnected_workers_slot_is_played_by_another_at_once() {
     let expected = calm(config(0)).await;
     let directory = tempfile::tempdir().expect("a directory");
-    // Time stands still: nobody is ever slow or silent here.
+    // The clock does not advance, so no worker is slow or silent.
     let clock = Arc::new(|| Duration::ZERO);
     let config = LearnerConfig { clock, ..learner_config(config(0), directory.path(), false) };
     let served = Served::start(config).await;
@@ -69,7 +69,7 @@ async fn the_slot_of_a_worker_that_hangs_up_is_played_by_another_at_once() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_bug_in_the_learning_thread_ends_the_run_and_holds_nobody() {
+async fn a_panic_of_the_learning_thread_ends_the_run_for_all_workers() {
     let directory = tempfile::tempdir().expect("a directory");
     let (broken, clock) = (Arc::new(AtomicBool::new(false)), real_clock());
     let breaks = broken.clone();

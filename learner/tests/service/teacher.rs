@@ -19,7 +19,7 @@ pub(crate) struct FakeTeacher {
 #[derive(Default)]
 pub(crate) struct Books {
     pub(crate) accounts: BTreeMap<String, Account>,
-    /// What every call is answered with, when it is set.
+    /// The error that every call returns, if set.
     pub(crate) refusal: Option<Status>,
     /// Units charged by all accounts that there ever were, lost ones included.
     pub(crate) charged_ever: u64,

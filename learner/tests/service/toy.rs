@@ -11,7 +11,7 @@ use tandem_rl::config::Recipe;
 pub(crate) const LAYOUT: Layout = Layout::new(Task::Push, 1);
 /// Units that every advised episode is charged: its first steps are advised.
 pub(crate) const UNITS: u32 = 7;
-/// How far an action of 1 moves the object, metres.
+/// Displacement of the object by an action of 1, metres.
 const ACTION_M: f32 = 0.02;
 /// Starts and goals lie within this of the origin on each axis, metres.
 const REACH_M: f32 = 0.06;

@@ -1,5 +1,7 @@
 //! Checks of ranges; NaN is in none.
 
+use std::fmt::Display;
+
 use tandem_core::settings::OutOfRange;
 
 use super::{ConfigError, RunConfig};
@@ -68,7 +70,7 @@ impl RunConfig {
 /// Names a setting unless its value `is_usable`.
 pub(crate) fn check(
     key: &'static str,
-    value: impl ToString,
+    value: impl Display + Copy,
     is_usable: bool,
     expected: &'static str,
 ) -> Result<(), OutOfRange> {

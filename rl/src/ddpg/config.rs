@@ -10,7 +10,8 @@ use tandem_core::settings::OutOfRange;
 pub struct DdpgConfig {
     /// Discount per control step, in [0, 1) (paper, section 4.1: 0.98).
     pub discount: f32,
-    /// Weight of the mean squared action in the actor's loss, 0 or more (HER reference implementation: `action_l2` = 1).
+    /// Weight of the mean squared action in the actor's loss, 0 or more (HER reference implementation: `action_l2` =
+    /// 1).
     pub action_penalty: f32,
     /// Weight of behaviour cloning in the actor's loss: of the squared error to the teacher's action where that was
     /// executed, 0 or more (paper: 0).

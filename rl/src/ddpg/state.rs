@@ -1,65 +1,66 @@
-//! What a checkpoint keeps, and what a policy is made of.
+//! Access to the networks and their optimisers, for checkpoints and policies.
 
 use tandem_policy::{MlpShape, Policy};
 
 use super::{Ddpg, DdpgConfig, DdpgError};
 
 impl Ddpg {
-    /// The settings.
+    /// Returns the settings.
     #[must_use]
     pub const fn config(&self) -> &DdpgConfig {
         &self.config
     }
 
-    /// Updates so far.
+    /// Returns the number of updates so far.
     #[must_use]
     pub const fn n_updates(&self) -> u64 {
         self.n_updates
     }
 
-    /// The actor's sizes.
+    /// Returns the shape of the actor.
     #[must_use]
     pub const fn actor_shape(&self) -> &MlpShape {
         &self.actor.shape
     }
 
-    /// The critic's sizes.
+    /// Returns the shape of the critic.
     #[must_use]
     pub const fn critic_shape(&self) -> &MlpShape {
         &self.critic.shape
     }
 
-    /// The actor that is being updated, flat.
+    /// Returns the actor's parameters, flat.
     #[must_use]
     pub fn actor(&self) -> &[f32] {
         &self.actor.online
     }
 
-    /// The actor's target network, flat.
+    /// Returns the parameters of the actor's target network, flat.
     #[must_use]
     pub fn target_actor(&self) -> &[f32] {
         &self.actor.target
     }
 
-    /// The critic that is being updated, flat.
+    /// Returns the critic's parameters, flat.
     #[must_use]
     pub fn critic(&self) -> &[f32] {
         &self.critic.online
     }
 
-    /// The critic's target network, flat.
+    /// Returns the parameters of the critic's target network, flat.
     #[must_use]
     pub fn target_critic(&self) -> &[f32] {
         &self.critic.target
     }
 
-    /// The gradients of the last update: the actor's and the critic's.
+    /// Returns the gradients of the last update: the actor's and the critic's.
     #[must_use]
     pub fn gradients(&self) -> [&[f32]; 2] {
-        [&self.actor_half.step.gradient, &self.critic_half.step.gradient]
+        [&self.actor_half.optimizer.gradient, &self.critic_half.optimizer.gradient]
     }
 
-    /// Starts all networks, online and target, from a policy's. Meant for a learner that has made no update.
+    /// Initialises all networks, online and target, with those of a policy. Intended for a learner that has made no
+    /// update.
     ///
     /// # Panics
     /// When the policy's networks have other sizes.
@@ -74,8 +75,8 @@ impl Ddpg {
     /// whole state.
     #[must_use]
     pub fn state(&self) -> [(&'static str, &[f32]); 8] {
-        let [actor_first, actor_second] = self.actor_half.step.adam.moments();
-        let [critic_first, critic_second] = self.critic_half.step.adam.moments();
+        let [actor_first, actor_second] = self.actor_half.optimizer.adam.moments();
+        let [critic_first, critic_second] = self.critic_half.optimizer.adam.moments();
         [
             ("actor.online", &self.actor.online),
             ("actor.target", &self.actor.target),
@@ -88,10 +89,10 @@ impl Ddpg {
         ]
     }
 
-    /// Goes on from vectors and a count that [`Ddpg::state`] and [`Ddpg::n_updates`] gave.
+    /// Restores the vectors and the count returned by [`Ddpg::state`] and [`Ddpg::n_updates`].
     ///
     /// # Errors
-    /// When a vector is missing or has another length; nothing has changed then.
+    /// When a vector is missing or has another length. The learner is unchanged then.
     pub fn restore(
         &mut self,
         stored: &[(String, Vec<f32>)],
@@ -122,17 +123,17 @@ impl Ddpg {
         ] = vectors;
         self.actor.online.copy_from_slice(actor);
         self.actor.target.copy_from_slice(target_actor);
-        self.actor_half.step.adam.restore(n_updates, [actor_first, actor_second]);
+        self.actor_half.optimizer.adam.restore(n_updates, [actor_first, actor_second]);
         self.critic.online.copy_from_slice(critic);
         self.critic.target.copy_from_slice(target_critic);
-        self.critic_half.step.adam.restore(n_updates, [critic_first, critic_second]);
+        self.critic_half.optimizer.adam.restore(n_updates, [critic_first, critic_second]);
         self.n_updates = n_updates;
         Ok(())
     }
 
-    /// Floating-point operations of one update's matrix products, two per multiply-add, counting only what has to
-    /// be done: five forward passes, the critic's and the actor's gradient, and the way through the critic to the
-    /// action.
+    /// Returns the floating-point operations of an update's matrix products, two per multiply-add. It counts the
+    /// necessary ones: five forward passes, the gradients of critic and actor, and the backward pass through the critic
+    /// to the action.
     #[must_use]
     pub const fn flops_per_update(&self) -> u64 {
         let (actor, critic) = (&self.actor.shape, &self.critic.shape);
@@ -147,7 +148,7 @@ impl Ddpg {
     }
 }
 
-/// Multiply-adds of one row's forward pass.
+/// Returns the multiply-adds of one row's forward pass.
 const fn products(shape: &MlpShape) -> usize {
     let mut sum = 0;
     let mut layer = 0;

@@ -1,4 +1,4 @@
-//! The update against finite differences of a slow, obvious loss in double precision, and what must repeat.
+//! Comparison of the update with finite differences of a simple loss in double precision, and tests of repeatability.
 
 use tandem_core::rng::{index, uniform};
 use tandem_core::{Layout, Stream, Task, episode_rng};
@@ -158,12 +158,12 @@ fn one_and_two_threads_give_the_same_bits() {
 }
 
 #[test]
-fn the_critic_learns_what_its_target_says() {
+fn the_critic_fits_a_fixed_target() {
     let mut ddpg = Ddpg::new(small(|config| config.n_hidden = 32), LAYOUT, Rewards::sparse(1), 1);
     let batch = random_batch(1, 5, 0);
     let first = ddpg.update(&batch).unwrap().critic_loss;
     let last = (0..200).map(|_| ddpg.update(&batch).unwrap().critic_loss).last().unwrap();
-    assert!(last < 1e-3 * first, "the targets stand still, the loss went from {first} to {last}");
+    assert!(last < 1e-3 * first, "the target is fixed, the loss went from {first} to {last}");
 }
 
 #[test]
@@ -186,7 +186,7 @@ fn polyak_averaging_moves_only_the_targets() {
 }
 
 #[test]
-fn targets_reach_as_low_as_the_lowest_reward_goes_on_for_ever() {
+fn targets_are_clipped_to_the_sum_of_lowest_rewards() {
     assert_eq!(super::critic_target(0.5, -1.0, -1.0, -9.0), -2.0);
     assert_eq!(super::critic_target(0.5, -3.0, -1.0, -9.0), -5.5);
     assert_eq!(super::critic_target(0.5, -3.0, -3.0, -9.0), -6.0);
@@ -194,7 +194,7 @@ fn targets_reach_as_low_as_the_lowest_reward_goes_on_for_ever() {
 }
 
 #[test]
-fn a_restored_learner_goes_on_alike() {
+fn a_restored_learner_continues_with_the_same_bits() {
     let config = small(|_| {});
     let mut first = Ddpg::new(config.clone(), LAYOUT, Rewards::sparse(2), 1);
     for number in 0..3 {
@@ -211,7 +211,7 @@ fn a_restored_learner_goes_on_alike() {
 }
 
 #[test]
-fn a_cooldown_changes_the_learning_rate_and_nothing_else() {
+fn a_cooldown_changes_only_the_learning_rate() {
     let batch = random_batch(2, 5, 0);
     let cooled = |usual: f32, is_cooldown| {
         let config = small(|config| {
@@ -245,7 +245,7 @@ fn a_state_that_does_not_fit_is_refused_and_changes_nothing() {
 }
 
 #[test]
-fn numbers_that_are_not_finite_stop_the_learner() {
+fn non_finite_numbers_are_errors() {
     let check = |spoil: fn(&mut Batch), what| {
         let mut ddpg = Ddpg::new(small(|_| {}), LAYOUT, Rewards::sparse(1), 1);
         let mut batch = random_batch(1, 5, 0);

@@ -3,7 +3,7 @@ use tandem_core::rng::{Stream, episode_rng};
 use tandem_core::{Contacts, Episode, Task};
 
 use super::*;
-use crate::replay::drifting_episode;
+use crate::replay::fixtures::drifting_episode;
 
 const LAYOUT: Layout = Layout::new(Task::Push, 2);
 const N_DRAWS: usize = 4000;
@@ -40,15 +40,15 @@ fn sampled(reward: RewardKind, check: impl Fn(&Sampler, &ReplayBuffer)) {
     let mut sampler = Sampler::new(&config(reward), LAYOUT);
     let mut rng = episode_rng(1, 0, Stream::Replay);
     for _ in 0..N_DRAWS {
-        sampler.draw(&buffer, &mut rng);
+        sampler.sample_transition(&buffer, &mut rng);
         check(&sampler, &buffer);
     }
 }
 
 #[test]
-fn a_hindsight_goal_was_achieved_strictly_later() {
+fn a_hindsight_goal_was_achieved_later_in_the_episode() {
     sampled(RewardKind::PerArm, |sampler, buffer| {
-        let drawn = &sampler.drawn;
+        let drawn = &sampler.sample;
         let x = drawn.goal[0];
         if drawn.steps[0].episode_idx == 0 && x < 9.0 {
             assert!(
@@ -60,31 +60,31 @@ fn a_hindsight_goal_was_achieved_strictly_later() {
 }
 
 #[test]
-fn rewards_follow_from_the_goal_that_was_drawn() {
+fn rewards_match_the_sampled_goal() {
     sampled(RewardKind::PerArm, |sampler, buffer| {
         for arm in LAYOUT.arms() {
             let achieved = buffer.achieved(
-                sampler.drawn.steps[0].episode_idx,
-                sampler.drawn.steps[0].step_idx + 1,
+                sampler.sample.steps[0].episode_idx,
+                sampler.sample.steps[0].step_idx + 1,
                 arm,
             );
-            let goal = &sampler.drawn.goal[LAYOUT.goal_of(arm)];
-            assert_eq!(sampler.drawn.rewards[arm.0], sparse_reward(achieved, goal));
+            let goal = &sampler.sample.goal[LAYOUT.goal_of(arm)];
+            assert_eq!(sampler.sample.rewards[arm.0], sparse_reward(achieved, goal));
         }
     });
     sampled(RewardKind::Joint, |sampler, buffer| {
         let observation = buffer
-            .observation(sampler.drawn.steps[0].episode_idx, sampler.drawn.steps[0].step_idx + 1);
+            .observation(sampler.sample.steps[0].episode_idx, sampler.sample.steps[0].step_idx + 1);
         let achieved: Vec<f32> = tandem_core::reward::achieved_goal(LAYOUT, observation).collect();
-        assert_eq!(sampler.drawn.rewards[0], sparse_reward(&achieved, &sampler.drawn.goal));
+        assert_eq!(sampler.sample.rewards[0], sparse_reward(&achieved, &sampler.sample.goal));
     });
 }
 
 #[test]
-fn shares_are_as_configured() {
+fn fractions_are_as_configured() {
     let count = |reward, holds: fn(&Relabelled) -> bool| {
         let hits = std::cell::Cell::new(0_usize);
-        sampled(reward, |sampler, _| hits.set(hits.get() + usize::from(holds(&sampler.drawn))));
+        sampled(reward, |sampler, _| hits.set(hits.get() + usize::from(holds(&sampler.sample))));
         hits.get() as f64 / N_DRAWS as f64
     };
     let near = |share: f64, expected: f64| {
@@ -104,7 +104,7 @@ fn shares_are_as_configured() {
 }
 
 #[test]
-fn swapped_rows_exchange_everything_the_arms_own() {
+fn swapped_rows_exchange_all_data_of_the_arms() {
     let mut buffer = ReplayBuffer::new(LAYOUT, 1000);
     buffer.push(&episode());
     let mut sampler = Sampler::new(&config(RewardKind::PerArm), LAYOUT);
@@ -149,7 +149,7 @@ fn filled(change: impl FnOnce(&mut ReplayConfig), buffer: &ReplayBuffer) -> Batc
 }
 
 #[test]
-fn a_contact_costs_both_arms_and_ends_cloning_before_it() {
+fn a_contact_costs_both_arms_and_stops_cloning_before_it() {
     let mut episode = episode();
     episode.contacts[20] = Contacts::ARM_ARM;
     let mut buffer = ReplayBuffer::new(LAYOUT, 1000);
@@ -173,7 +173,7 @@ fn a_contact_costs_both_arms_and_ends_cloning_before_it() {
 }
 
 #[test]
-fn arms_of_different_steps_are_put_together_where_they_cannot_meet() {
+fn arms_of_different_steps_are_combined_where_they_cannot_meet() {
     let mut touching = drifting_episode(LAYOUT, 1, 0.0);
     touching.contacts.fill(Contacts::ARM_ARM);
     let mut buffer = ReplayBuffer::new(LAYOUT, 1000);
@@ -183,19 +183,19 @@ fn arms_of_different_steps_are_put_together_where_they_cannot_meet() {
     config.coda_fraction = 1.0;
     let mut sampler = Sampler::new(&config, LAYOUT);
     let mut rng = episode_rng(1, 0, Stream::Replay);
-    let (mut n_recombined, mut largest_x) = (0, 0.0_f32);
+    let (mut n_combined, mut largest_x) = (0, 0.0_f32);
     for _ in 0..N_DRAWS {
-        sampler.draw(&buffer, &mut rng);
-        let [first, second] = sampler.drawn.steps[..] else { panic!("two arms") };
+        sampler.sample_transition(&buffer, &mut rng);
+        let [first, second] = sampler.sample.steps[..] else { panic!("two arms") };
         if first == second {
             continue;
         }
-        n_recombined += 1;
+        n_combined += 1;
         assert_eq!((first.episode_idx, second.episode_idx), (0, 0), "one of them touches");
         largest_x = largest_x.max(buffer.achieved(0, first.step_idx + 1, ArmIndex(0))[0]);
-        let goal = sampler.drawn.goal[LAYOUT.goal_of(ArmIndex(0))][0];
+        let goal = sampler.sample.goal[LAYOUT.goal_of(ArmIndex(0))][0];
         assert!(goal > buffer.achieved(0, first.step_idx, ArmIndex(0))[0], "another's future");
     }
-    assert!(n_recombined > N_DRAWS / 10);
+    assert!(n_combined > N_DRAWS / 10);
     assert!((largest_x - 0.14).abs() < 0.005, "0.24 m apart, {largest_x} m towards the other");
 }

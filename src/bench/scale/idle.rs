@@ -8,13 +8,12 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use anyhow::Context as _;
-use tandem_core::{Layout, Task};
+use tandem_core::{Episode, Layout, Task};
 use tandem_learner::Clock;
 use tandem_net::{Dial, Link};
 use tandem_proto::pb::learner_client::LearnerClient;
 use tandem_proto::pb::next_work_response::Work;
 use tandem_proto::{encode_episode, pb};
-use tandem_rl::replay::drifting_episode;
 use tokio::sync::watch;
 use tokio::task::JoinHandle;
 use tonic::{Code, Status};
@@ -71,7 +70,7 @@ impl Crowd {
         episodes_per_round: usize,
         clock: Clock,
     ) -> Self {
-        let episode = encode_episode(&drifting_episode(Layout::new(Task::Push, 2), 0, 1e-3));
+        let episode = encode_episode(&Episode::zeros(Layout::new(Task::Push, 2), 0));
         let common = Common {
             addresses,
             dial: Dial::default(),

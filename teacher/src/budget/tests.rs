@@ -179,13 +179,14 @@ struct Model {
 
 impl Model {
     fn charged(&self, episode: u64) -> u64 {
-        let charged =
-            |(of, _, verdict): &&(u64, u32, Option<BudgetHalf>)| *of == episode && *verdict != None;
+        let charged = |(of, _, verdict): &&(u64, u32, Option<BudgetHalf>)| {
+            *of == episode && verdict.is_some()
+        };
         u64::try_from(self.steps.iter().filter(charged).count()).unwrap()
     }
 
     fn spent(&self) -> u64 {
-        u64::try_from(self.steps.iter().filter(|step| step.2 != None).count()).unwrap()
+        u64::try_from(self.steps.iter().filter(|step| step.2.is_some()).count()).unwrap()
     }
 
     /// No episode of the test is charged both before and after it gets a lease.

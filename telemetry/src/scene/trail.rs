@@ -74,7 +74,7 @@ struct Trail {
     /// At least [`SPACING_M`] times a power of two apart.
     points: Vec<[f64; 3]>,
     last: Option<[f64; 3]>,
-    /// How often every other point was removed.
+    /// Number of times that every other point was removed.
     n_halved: u32,
 }
 

@@ -1,11 +1,11 @@
-//! Workers that claim what is not so, and workers that keep others out.
+//! Workers that claim advice falsely, and workers that crowd out others.
 
 use std::net::SocketAddr;
 use std::path::Path;
 
 use tandem_core::work::SlotOrder;
 use tandem_core::{Episode, EpisodeKind};
-use tandem_learner::{Ended, LearnerConfig};
+use tandem_learner::{LearnerConfig, RunOutcome};
 use tandem_proto::pb::learner_client::LearnerClient;
 use tandem_proto::{encode_episode, pb};
 use tokio::task::JoinHandle;
@@ -21,7 +21,7 @@ use crate::toy::{UNITS, claim, config};
 /// More than the toy spends.
 const BUDGET: u64 = 2000;
 
-/// Follows a run to its end and gives every warning that there was.
+/// Follows a run to its end and returns its warnings.
 fn follow(mut client: LearnerClient<Channel>) -> JoinHandle<Vec<String>> {
     tokio::spawn(async move {
         let mut warnings: Vec<String> = Vec::new();
@@ -36,39 +36,44 @@ fn follow(mut client: LearnerClient<Channel>) -> JoinHandle<Vec<String>> {
     })
 }
 
-/// What a worker claims of an advised episode, whatever the teacher was asked before.
-type Lie = fn(&mut Episode);
+/// Changes what a worker claims about an advised episode, regardless of the charges.
+type FalseClaim = fn(&mut Episode);
 
-/// Plays a slot, telling lies about its advised episodes; `asks` says whether the teacher is asked at all.
-async fn lie_once(toy: &mut Toy, teacher: &FakeTeacher, asks: bool, lie: Lie) -> bool {
+/// Plays a slot with false claims about its advised episodes; charges the teacher if it `asks`.
+async fn claim_once(
+    toy: &mut Toy,
+    teacher: &FakeTeacher,
+    asks: bool,
+    false_claim: FalseClaim,
+) -> bool {
     let Some((order, mut episodes)) = toy.take().await else { return false };
     if asks {
         charge(teacher, &order, &mut episodes).await;
     }
     for (ordered, episode) in order.episodes.iter().zip(&mut episodes) {
         if ordered.advised && order.kind == EpisodeKind::Training {
-            lie(episode);
+            false_claim(episode);
         }
     }
     toy.deliver(order.slot, &episodes).await.is_ok()
 }
 
-/// A run whose only worker lies: how it ended and every warning.
-async fn run_of_a_liar(
+/// Runs a run whose only worker claims falsely; returns its outcome and its warnings.
+async fn run_with_false_claims(
     config: LearnerConfig,
     teacher: &FakeTeacher,
     asks: bool,
-    lie: Lie,
-) -> (Ended, Vec<String>) {
+    false_claim: FalseClaim,
+) -> (RunOutcome, Vec<String>) {
     let served = Served::start(config).await;
-    let mut toy = served.join("liar").await;
+    let mut toy = served.join("claimant").await;
     let warnings = follow(served.client().await);
-    while lie_once(&mut toy, teacher, asks, lie).await {}
+    while claim_once(&mut toy, teacher, asks, false_claim).await {}
     let ended = served.end().await.expect("a run");
     (ended, warnings.await.expect("followed"))
 }
 
-fn spent(out: &Path, ended: &Ended) -> (u64, u64) {
+fn spent(out: &Path, ended: &RunOutcome) -> (u64, u64) {
     let rows = Left::behind(ended, out).rows;
     rows.last().map(|row| (row.advice_spent, row.budget_left)).expect("rows")
 }
@@ -77,10 +82,10 @@ fn spent(out: &Path, ended: &Ended) -> (u64, u64) {
 async fn a_claim_that_the_teachers_account_contradicts_is_reported_and_the_account_counts() {
     // 9 rounds of 4 advised episodes.
     let charged_in_all = 36 * u64::from(UNITS);
-    let all_advised: Lie = |episode| claim(episode, 50);
-    let none_advised: Lie = |episode| claim(episode, 0);
-    let one_less: Lie = |episode| claim(episode, UNITS - 1);
-    for (asks, lie, charged, claimed_in_round) in [
+    let all_advised: FalseClaim = |episode| claim(episode, 50);
+    let none_advised: FalseClaim = |episode| claim(episode, 0);
+    let one_less: FalseClaim = |episode| claim(episode, UNITS - 1);
+    for (asks, false_claim, charged, claimed_in_round) in [
         (false, all_advised, 0, 200),
         (true, none_advised, charged_in_all, 0),
         (true, one_less, charged_in_all, 4 * u64::from(UNITS - 1)),
@@ -90,7 +95,8 @@ async fn a_claim_that_the_teachers_account_contradicts_is_reported_and_the_accou
             let (out, teacher) = (directory.path(), FakeTeacher::default());
             let address = teacher.serve().await;
             let config = with_teacher(advised(lag, BUDGET), out, false, address);
-            let (ended, warnings) = run_of_a_liar(config, &teacher, asks, lie).await;
+            let (ended, warnings) =
+                run_with_false_claims(config, &teacher, asks, false_claim).await;
             let charged_in_round = charged / 9;
             let expected = format!(
                 "the episodes of round 0 claim {claimed_in_round} units of advice, the teacher's account \"toy\" was \
@@ -103,7 +109,7 @@ async fn a_claim_that_the_teachers_account_contradicts_is_reported_and_the_accou
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_run_resumed_after_false_claims_goes_on_with_its_account() {
+async fn a_run_resumed_after_false_claims_continues_with_its_account() {
     let directory = tempfile::tempdir().expect("a directory");
     let (out, teacher) = (directory.path(), FakeTeacher::default());
     let address = teacher.serve().await;
@@ -111,11 +117,11 @@ async fn a_run_resumed_after_false_claims_goes_on_with_its_account() {
     let mut half = whole.clone();
     half.stop.max_env_steps /= 2;
     let config = with_teacher(half, out, false, address);
-    run_of_a_liar(config, &teacher, false, |episode| claim(episode, 50)).await;
+    run_with_false_claims(config, &teacher, false, |episode| claim(episode, 50)).await;
     let served = Served::start(with_teacher(whole, out, true, address)).await;
     let mut toy = served.join("honest").await;
     let warnings = follow(served.client().await);
-    while lie_once(&mut toy, &teacher, true, |_| ()).await {}
+    while claim_once(&mut toy, &teacher, true, |_| ()).await {}
     let ended = served.end().await.expect("a run");
     assert_eq!(warnings.await.expect("followed"), [""; 0]);
     let charged = 16 * u64::from(UNITS);
@@ -124,7 +130,7 @@ async fn a_run_resumed_after_false_claims_goes_on_with_its_account() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn claims_that_contradict_themselves_are_refused_and_the_right_ones_taken() {
+async fn contradictory_claims_are_refused_and_true_ones_accepted() {
     let teacher = FakeTeacher::default();
     let directory = tempfile::tempdir().expect("a directory");
     // Enough for the first episode of a round and a part of the second.
@@ -137,15 +143,15 @@ async fn claims_that_contradict_themselves_are_refused_and_the_right_ones_taken(
         slots.push(toy.take().await.expect("a slot"));
     }
     slots.sort_by_key(|(order, _)| order.slot);
-    let mut refused = async |slot: usize, spoil: fn(&mut Episode), told: &str| {
+    let mut refused = async |slot: usize, spoil: fn(&mut Episode), refusal: &str| {
         let (order, mut episodes) = slots[slot].clone();
         let at = order.episodes.iter().position(|ordered| ordered.advised).expect("one is");
         spoil(&mut episodes[at]);
         let status = toys[0].deliver(order.slot, &episodes).await.expect_err("must be refused");
         assert_eq!(status.code(), Code::InvalidArgument);
         let number = episodes[at].number;
-        let told = format!("episode {number}: advice_charged: {told}");
-        assert!(status.message().ends_with(&told), "{}", status.message());
+        let refusal = format!("episode {number}: advice_charged: {refusal}");
+        assert!(status.message().ends_with(&refusal), "{}", status.message());
     };
     let claims_without_arms: fn(&mut Episode) = |episode| {
         claim(episode, 0);
@@ -157,18 +163,18 @@ async fn claims_that_contradict_themselves_are_refused_and_the_right_ones_taken(
         episode.advice_charged = 0;
     };
     refused(0, hides_arms, "expected 7, the steps with an advised arm, got 0").await;
-    let beyond = "expected at most 10, the units set aside for it, got 11";
+    let beyond = "expected at most 10, the units reserved for it, got 11";
     refused(1, |episode| claim(episode, 11), beyond).await;
     served.shutdown.cancel();
     served.end().await.expect("interrupted");
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn arms_advised_where_nobody_was_asked_and_absurd_numbers_are_refused() {
+async fn advice_without_an_order_and_absurd_numbers_are_refused() {
     let expected = calm(config(0)).await;
     let directory = tempfile::tempdir().expect("a directory");
     let served = Served::start(learner_config(config(0), directory.path(), false)).await;
-    let mut toy = served.join("liar").await;
+    let mut toy = served.join("claimant").await;
     let put = |bytes: &mut [u8], at: usize, value: f32| {
         bytes[4 * at..4 * at + 4].copy_from_slice(&value.to_le_bytes());
     };
@@ -180,7 +186,7 @@ async fn arms_advised_where_nobody_was_asked_and_absurd_numbers_are_refused() {
     let all = [
         (
             arm,
-            "advised_arms: expected no advised arm, as nobody was to be asked, got 0b00000001 on step 3",
+            "advised_arms: expected no advised arm, as no advice was ordered, got 0b00000001 on step 3",
         ),
         (far, "observations[31]: expected a number in [-25, 25], got 1e29"),
         (goal, "goal[2]: expected a number in [-2, 2], got -3e38"),
@@ -190,7 +196,7 @@ async fn arms_advised_where_nobody_was_asked_and_absurd_numbers_are_refused() {
     let mut kinds = Vec::new();
     while let Some((order, episodes)) = toy.take().await {
         kinds.push(order.kind);
-        for (spoil, told) in &all {
+        for (spoil, refusal) in &all {
             let mut messages: Vec<pb::Episode> = episodes.iter().map(encode_episode).collect();
             spoil(&mut messages[0]);
             let request = pb::SubmitEpisodesRequest {
@@ -200,8 +206,8 @@ async fn arms_advised_where_nobody_was_asked_and_absurd_numbers_are_refused() {
             };
             let refused = toy.client.submit_episodes(request).await.expect_err("must be refused");
             assert_eq!(refused.code(), Code::InvalidArgument);
-            let told = format!("episode {}: {told}", episodes[0].number);
-            assert!(refused.message().ends_with(&told), "{}", refused.message());
+            let refusal = format!("episode {}: {refusal}", episodes[0].number);
+            assert!(refused.message().ends_with(&refusal), "{}", refused.message());
         }
         toy.deliver(order.slot, &episodes).await.expect("the right ones are taken");
     }
@@ -216,7 +222,7 @@ async fn join_by(client: &mut LearnerClient<Channel>) -> Result<u64, Status> {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn ten_thousand_joins_keep_nobody_out() {
+async fn ten_thousand_joins_do_not_keep_other_workers_out() {
     let expected = calm(config(0)).await;
     let directory = tempfile::tempdir().expect("a directory");
     let served = Served::start(learner_config(config(0), directory.path(), false)).await;
@@ -270,13 +276,13 @@ async fn resume(
     let served = Served::start(with_teacher(advised(lag, budget), out, true, address)).await;
     let mut toy = served.join("honest").await;
     let warnings = follow(served.client().await);
-    while lie_once(&mut toy, teacher, true, |_| ()).await {}
+    while claim_once(&mut toy, teacher, true, |_| ()).await {}
     let ended = served.end().await.expect("a run");
     (Left::behind(&ended, out), warnings.await.expect("followed"))
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn an_honest_run_raises_no_alarm_wherever_it_is_resumed() {
+async fn an_honest_run_raises_no_warning_wherever_it_is_resumed() {
     // With a budget that runs out, and with one that does not.
     for (lag, budget) in [(0, 150), (1, 150), (0, BUDGET), (1, BUDGET)] {
         let keep = tempfile::tempdir().expect("a directory");
@@ -286,7 +292,7 @@ async fn an_honest_run_raises_no_alarm_wherever_it_is_resumed() {
         let mut toy = served.join("honest").await;
         let warnings = follow(served.client().await);
         let mut moments = copies_of(&out, keep.path());
-        while lie_once(&mut toy, &teacher, true, |_| ()).await {
+        while claim_once(&mut toy, &teacher, true, |_| ()).await {
             moments.copy();
         }
         let ended = served.end().await.expect("a run");

@@ -1,4 +1,4 @@
-//! Random lives of a board against a model.
+//! Random lives of a queue against a model.
 
 use std::collections::BTreeMap;
 use std::ops::Range;
@@ -8,7 +8,7 @@ use proptest::test_runner::{Config, TestRunner};
 
 use super::*;
 
-/// One thing that happens to a board. Workers and slots are chosen among those that there are.
+/// One thing that happens to a queue. Workers and slots are chosen among those that there are.
 #[derive(Debug, Clone)]
 enum Happening {
     Order { kind: EpisodeKind, n_slots: u64 },
@@ -59,7 +59,7 @@ struct Slot {
 }
 
 struct Member {
-    heard_at: Duration,
+    last_seen: Duration,
     silent: bool,
     has_asked: bool,
     given: Option<u64>,
@@ -73,7 +73,7 @@ struct Model {
     joined: Vec<u64>,
     n_episodes: u64,
     now: Duration,
-    /// How long slots took of late.
+    /// Moving average of the time that a slot takes.
     took: Option<Duration>,
 }
 
@@ -81,7 +81,7 @@ impl Model {
     fn next(&mut self, worker: u64) -> Result<Option<u64>, SubmitError> {
         let now = self.now;
         let member = self.members.get_mut(&worker).ok_or(SubmitError::UnknownWorker(worker))?;
-        (member.heard_at, member.silent, member.has_asked) = (now, false, true);
+        (member.last_seen, member.silent, member.has_asked) = (now, false, true);
         let is_own = |slot: &u64| self.slots[slot].place.is_with(worker);
         if let Some(own) = member.given.filter(is_own) {
             return Ok(Some(own));
@@ -106,7 +106,7 @@ impl Model {
 
     fn submit(&mut self, worker: u64, slot: u64) -> Result<bool, SubmitError> {
         let member = self.members.get_mut(&worker).ok_or(SubmitError::UnknownWorker(worker))?;
-        (member.heard_at, member.silent, member.has_asked) = (self.now, false, true);
+        (member.last_seen, member.silent, member.has_asked) = (self.now, false, true);
         member.given = member.given.filter(|given| *given != slot);
         let open = self.slots.get_mut(&slot).filter(|slot| slot.place.is_open());
         let Some(slot) = open else { return Ok(false) };
@@ -121,10 +121,10 @@ impl Model {
     fn reclaim(&mut self) -> Vec<(u64, usize)> {
         let mut fell_silent = Vec::new();
         let now = self.now;
-        let is_silent = |member: &Member| now - member.heard_at >= SILENT_AFTER;
+        let is_silent = |member: &Member| now - member.last_seen >= SILENT_AFTER;
         self.members.retain(|_, member| member.has_asked || !is_silent(member));
         for (id, member) in &mut self.members {
-            if member.silent || self.now - member.heard_at < SILENT_AFTER {
+            if member.silent || self.now - member.last_seen < SILENT_AFTER {
                 continue;
             }
             (member.silent, member.given) = (true, None);
@@ -137,13 +137,13 @@ impl Model {
             }
             fell_silent.push((*id, n_slots));
         }
-        self.members.retain(|_, member| self.now - member.heard_at < FORGET_AFTER);
+        self.members.retain(|_, member| self.now - member.last_seen < FORGET_AFTER);
         fell_silent
     }
 }
 
 struct Both {
-    board: Board,
+    queue: WorkQueue,
     model: Model,
     /// Every round and evaluation ordered: its kind, its version and its slots.
     batches: Vec<(EpisodeKind, u64, Range<u64>)>,
@@ -158,23 +158,23 @@ impl Both {
             self.model.n_episodes += 2;
             let episodes = numbers.flat_map(|number| order(number, kind).episodes).collect();
             let order = SlotOrder { slot, parameter_version: version, kind, episodes };
-            self.board.add(SlotOrder { slot: 0, ..order.clone() });
+            self.queue.push(SlotOrder { slot: 0, ..order.clone() });
             self.model.slots.insert(slot, Slot { order, place: Place::Waiting });
         }
         self.batches.push((kind, version, first..first + n_slots));
     }
 
     fn join(&mut self) -> u64 {
-        let id = join(&mut self.board, self.model.now);
-        let heard_at = self.model.now;
-        let member = Member { heard_at, silent: false, has_asked: false, given: None };
+        let id = join(&mut self.queue, self.model.now);
+        let last_seen = self.model.now;
+        let member = Member { last_seen, silent: false, has_asked: false, given: None };
         self.model.members.insert(id, member);
         self.model.joined.push(id);
         id
     }
 
     fn ask(&mut self, worker: u64) -> Option<u64> {
-        let got = self.board.next(worker, self.model.now);
+        let got = self.queue.next(worker, self.model.now);
         let got = got.map(|order| order.map(|order| order.slot));
         assert_eq!(got, self.model.next(worker));
         got.ok().flatten()
@@ -188,12 +188,12 @@ impl Both {
             ..played(ordered.number).remove(0)
         };
         let episodes = order.episodes.iter().map(episode).collect();
-        let got = self.board.submit(worker, slot, episodes, self.model.now);
+        let got = self.queue.submit(worker, slot, episodes, self.model.now);
         assert_eq!(got, self.model.submit(worker, slot));
     }
 
     fn reclaim(&mut self) {
-        let got = self.board.reclaim(self.model.now);
+        let got = self.queue.reclaim(self.model.now);
         let got: Vec<_> =
             got.into_iter().map(|silent| (silent.worker_id, silent.n_slots)).collect();
         assert_eq!(got, self.model.reclaim());
@@ -205,9 +205,9 @@ impl Both {
             let slots = slots.clone();
             let is_complete =
                 !self.model.slots.range(slots.clone()).any(|(_, s)| s.place.is_open());
-            assert_eq!(self.board.is_complete(*kind, *version), is_complete);
+            assert_eq!(self.queue.is_complete(*kind, *version), is_complete);
             if is_complete {
-                let got = self.board.take(*kind, *version);
+                let got = self.queue.take(*kind, *version);
                 let got: Vec<u64> = got.iter().map(|episode| episode.number).collect();
                 let mut ordered = Vec::new();
                 for (_, slot) in self.model.slots.range_mut(slots) {
@@ -226,10 +226,10 @@ impl Both {
         let count = |place: fn(&Place) -> bool| {
             self.model.slots.values().filter(|slot| place(&slot.place)).count()
         };
-        assert_eq!(self.board.waiting.len(), count(|place| *place == Place::Waiting));
-        assert_eq!(self.board.out.len(), count(|place| matches!(place, Place::Out { .. })));
-        assert_eq!(self.board.finished.len(), count(|place| *place == Place::In));
-        assert_eq!(self.board.workers.len(), self.model.members.len());
+        assert_eq!(self.queue.waiting.len(), count(|place| *place == Place::Waiting));
+        assert_eq!(self.queue.assigned.len(), count(|place| matches!(place, Place::Out { .. })));
+        assert_eq!(self.queue.finished.len(), count(|place| *place == Place::In));
+        assert_eq!(self.queue.workers.len(), self.model.members.len());
     }
 
     fn happens(&mut self, happening: &Happening) {
@@ -260,13 +260,13 @@ impl Both {
 }
 
 #[test]
-fn whatever_happens_every_episode_comes_once_and_in_order() {
+fn every_episode_is_taken_once_and_in_order() {
     let mut runner =
         TestRunner::new(Config { failure_persistence: None, ..Config::with_cases(300) });
     let lives = proptest::collection::vec(happening(), 0..150);
     let outcome = runner.run(&lives, |life| {
         let mut both =
-            Both { board: Board::default(), model: Model::default(), batches: Vec::new() };
+            Both { queue: WorkQueue::default(), model: Model::default(), batches: Vec::new() };
         life.iter().for_each(|happening| both.happens(happening));
         let last = both.join();
         while both.model.slots.values().any(|slot| slot.place.is_open()) {

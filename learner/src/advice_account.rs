@@ -1,5 +1,5 @@
-//! The learner's side of the advice budget: an account for the run, leases for its rounds, and the comparison of what
-//! episodes claim with what the account was charged.
+//! The run's account at the teacher: leases for its rounds, and the comparison of the units that episodes claim with
+//! the charges of the account.
 
 mod audit;
 
@@ -25,45 +25,45 @@ const CALL_DEADLINE: Duration = Duration::from_secs(5);
 /// First pause before an unreachable teacher is tried again; doubled up to [`LONGEST_PAUSE`].
 const FIRST_PAUSE: Duration = Duration::from_millis(100);
 const LONGEST_PAUSE: Duration = Duration::from_secs(1);
-/// How often it is looked whether the teacher still knows the account: workers whose account is lost wait until it is
-/// opened again.
-const LOOK_EVERY: Duration = Duration::from_secs(1);
+/// Pause between two checks whether the teacher still knows the account. Workers wait for a lost account to be opened
+/// again.
+const CHECK_PERIOD: Duration = Duration::from_secs(1);
 
-/// What the learner needs of a teacher that does not come from its own configuration.
+/// A failed call to the teacher.
 #[derive(Debug, thiserror::Error)]
 pub enum TeacherError {
-    /// Not an address.
+    /// The address is malformed.
     #[error("the teacher cannot be called")]
     Address(#[from] DialError),
-    /// The teacher understood and declined; asking again would not help.
+    /// The teacher refused; a retry would not help.
     #[error("the teacher refuses to {what}: {reason}")]
     Refused {
-        /// What was asked for.
+        /// The request.
         what: &'static str,
-        /// What it said.
+        /// The reason that it gave.
         reason: String,
     },
     /// The teacher does not know the account.
     #[error("the teacher does not know the account: {0}")]
     UnknownAccount(String),
-    /// The run was stopped while the teacher could not be reached.
+    /// The run was stopped while the teacher was unreachable.
     #[error("stopped while waiting for the teacher")]
     Stopped,
 }
 
-/// Where a run stands when its account is opened.
+/// The start of a run, for the opening of its account.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Run {
-    /// At its beginning.
+pub(crate) enum RunStart {
+    /// Without a checkpoint.
     New,
-    /// On its way; it has learned from so many units of advice.
+    /// From a checkpoint.
     Resumed {
-        /// Units.
+        /// Units of advice of the episodes that it has learned.
         spent: u64,
     },
 }
 
-/// Units set aside for an episode: the most that it can claim.
+/// The units reserved for an episode, which is the most that it can claim.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct Allowance {
     /// The episode's number.
@@ -72,89 +72,107 @@ pub(crate) struct Allowance {
     pub(crate) units: u32,
 }
 
-/// What the settled episodes of a round cost.
+/// The cost of a round's episodes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) struct Settled {
-    /// Units that count as spent by the run.
+pub(crate) struct Settlement {
+    /// Units that count as spent.
     pub(crate) units: u64,
-    /// What the episodes claim and what the account was charged for them, when the claim cannot be true.
+    /// Set if the claims of the episodes cannot be true.
     pub(crate) mismatch: Option<Mismatch>,
 }
 
-/// A claim that the teacher's account contradicts.
+/// Claims that the teacher's account contradicts.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct Mismatch {
     /// Units that the episodes claim.
     pub(crate) claimed: u64,
-    /// Units that the account was charged.
+    /// Units charged to the account.
     pub(crate) charged: u64,
 }
 
-/// An account at a teacher, used from the thread that learns.
+/// Options for [`AdviceAccount::open`].
+pub(crate) struct AccountOptions<'a> {
+    /// Token and TLS of the calls.
+    pub(crate) dial: &'a Dial,
+    /// The teacher's address.
+    pub(crate) address: &'a str,
+    /// Name, budget and strategy, from the run file.
+    pub(crate) terms: pb::OpenAccountRequest,
+    /// Units that an episode can use.
+    pub(crate) units_per_episode: u32,
+    /// The start of the run.
+    pub(crate) start: RunStart,
+}
+
+/// The run's account at the teacher, used by the learning thread.
 #[derive(Debug)]
-pub(crate) struct Ledger {
+pub(crate) struct AdviceAccount {
     client: TeacherClient<Link>,
     runtime: Runtime,
     shutdown: CancellationToken,
-    /// What the run file says.
+    /// Name, budget and strategy, from the run file.
     terms: pb::OpenAccountRequest,
     units_per_episode: u32,
     /// Advised episodes whose leases are open.
-    under_way: Vec<u64>,
-    /// The budget that an account of this name has unless it was lost and opened anew.
+    open_episodes: Vec<u64>,
+    /// The budget of an account of this name that was never lost.
     full_budget: u64,
     audit: Audit,
-    /// Whether the teacher was seen not to know the account.
+    /// True after the teacher reported that it does not know the account.
     lost: Arc<AtomicBool>,
     _watch: DropGuard,
 }
 
-impl Ledger {
-    /// Opens the account that `terms` name, or goes on with it when it exists.
+impl AdviceAccount {
+    /// Opens the account, or continues with it if it exists.
+    ///
+    /// # Errors
+    /// When the address is malformed, the teacher refuses, or the run is stopped meanwhile.
     pub(crate) fn open(
-        (dial, address): (&Dial, &str),
-        terms: &pb::OpenAccountRequest,
-        units_per_episode: u32,
-        (run, warnings): (Run, &Warnings),
-        (runtime, shutdown): (&Runtime, &CancellationToken),
+        options: AccountOptions<'_>,
+        warnings: &Warnings,
+        runtime: &Runtime,
+        shutdown: &CancellationToken,
     ) -> Result<Self, TeacherError> {
+        let AccountOptions { dial, address, terms, units_per_episode, start } = options;
         let inside = runtime.enter();
         let client = TeacherClient::new(dial.link(address)?);
         drop(inside);
         let (lost, stop_watching) = (Arc::new(AtomicBool::new(false)), CancellationToken::new());
-        let mut ledger = Self {
+        let budget = terms.budget;
+        let mut account = Self {
             client: client.clone(),
             runtime: runtime.clone(),
             shutdown: shutdown.clone(),
-            terms: terms.clone(),
+            terms,
             units_per_episode,
-            under_way: Vec::new(),
-            full_budget: terms.budget,
+            open_episodes: Vec::new(),
+            full_budget: budget,
             audit: Audit::new(Statement { spent: 0, leased: 0 }, 0, true),
             lost: lost.clone(),
             _watch: stop_watching.clone().drop_guard(),
         };
-        match run {
-            Run::New => ledger.open_account(terms.budget, 0)?,
-            Run::Resumed { spent } => ledger.resume(spent)?,
+        match start {
+            RunStart::New => account.open_account(budget, 0)?,
+            RunStart::Resumed { spent } => account.resume(spent)?,
         }
-        let watch = watch_account(client, ledger.terms.name.clone(), lost, warnings.clone());
+        let watch = watch_account(client, account.terms.name.clone(), lost, warnings.clone());
         runtime.spawn(async move {
             tokio::select! {
                 () = watch => (),
                 () = stop_watching.cancelled() => (),
             }
         });
-        Ok(ledger)
+        Ok(account)
     }
 
-    /// The name under which workers ask.
-    pub(crate) fn account(&self) -> &str {
+    /// Returns the name under which workers ask for advice.
+    pub(crate) fn name(&self) -> &str {
         &self.terms.name
     }
 
-    /// Sets units aside for a round's advised episodes, in their order, and gives them. `spent` is what the run has
-    /// learned from.
+    /// Reserves units for a round's advised episodes, in their order, and returns the reserved units. `spent` counts
+    /// the units of the episodes learned so far.
     pub(crate) fn open_leases(
         &mut self,
         episodes: Vec<u64>,
@@ -165,13 +183,13 @@ impl Ledger {
         }
         let opened = match self.call_open_leases(&episodes) {
             Err(TeacherError::UnknownAccount(_)) => {
-                self.find_account(spent)?;
+                self.open_or_reopen(spent)?;
                 self.renew_leases()?;
                 self.call_open_leases(&episodes)?
             }
             opened => opened?,
         };
-        self.under_way.extend(episodes);
+        self.open_episodes.extend(episodes);
         if let Some(account) = &opened.account {
             let units = opened.leases.iter().map(|lease| u64::from(lease.units)).sum();
             self.audit.leases_opened(units, statement(account));
@@ -179,23 +197,23 @@ impl Ledger {
         Ok(self.allowances(&opened.leases))
     }
 
-    /// What the episodes of `leases` can claim. In an account that was opened anew workers may have been charged before
-    /// the lease was there, so leases bound nothing.
+    /// Returns the units that the episodes of `leases` can claim. In a reopened account workers may have been charged
+    /// before the lease existed, so leases limit nothing.
     fn allowances(&self, leases: &[pb::Lease]) -> Vec<Allowance> {
         let allowance =
             |lease: &pb::Lease| Allowance { episode: lease.episode, units: lease.units };
         if self.audit.is_whole() { leases.iter().map(allowance).collect() } else { Vec::new() }
     }
 
-    /// Returns the unspent units of finished episodes to the budget and gives what they cost. `spent` is what the run
-    /// has learned from, them not counted. No other episode may be under way.
+    /// Returns the unspent units of finished episodes to the budget, and the cost of the episodes to the caller.
+    /// `spent` counts the units of the episodes learned so far, without these. No other lease may be open.
     pub(crate) fn settle(
         &mut self,
         episodes: &[Episode],
         spent: u64,
-    ) -> Result<Settled, TeacherError> {
+    ) -> Result<Settlement, TeacherError> {
         let numbers: Vec<u64> = episodes.iter().map(|episode| episode.number).collect();
-        self.under_way.retain(|number| !numbers.contains(number));
+        self.open_episodes.retain(|number| !numbers.contains(number));
         let request =
             pb::SettleLeasesRequest { account: self.terms.name.clone(), episodes: numbers };
         let settled = self.call("settle leases", move |mut client| {
@@ -205,34 +223,34 @@ impl Ledger {
         let claimed = episodes.iter().map(|episode| u64::from(episode.advice_charged)).sum();
         match settled {
             Err(TeacherError::UnknownAccount(_)) => {
-                self.find_account(spent + claimed)?;
+                self.open_or_reopen(spent + claimed)?;
                 self.renew_leases()?;
-                Ok(Settled { units: claimed, mismatch: None })
+                Ok(Settlement { units: claimed, mismatch: None })
             }
             settled => {
                 let Cost { units, instead } = self.audit.settled(claimed, statement(&settled?));
                 let mismatch = instead.map(|charged| Mismatch { claimed, charged });
-                Ok(Settled { units, mismatch })
+                Ok(Settlement { units, mismatch })
             }
         }
     }
 
-    /// Whether the teacher was seen not to know the account.
+    /// Returns true if the teacher has reported that it does not know the account.
     pub(crate) fn is_lost(&self) -> bool {
         self.lost.load(Ordering::Relaxed)
     }
 
-    /// Opens the account again when the teacher has lost it. `spent` is what the run has learned from.
-    pub(crate) fn mend(&mut self, spent: u64) -> Result<(), TeacherError> {
+    /// Opens the account again if the teacher has lost it. `spent` counts the units of the episodes learned so far.
+    pub(crate) fn restore_if_lost(&mut self, spent: u64) -> Result<(), TeacherError> {
         if self.lost.swap(false, Ordering::Relaxed) {
-            self.find_account(spent)?;
+            self.open_or_reopen(spent)?;
             self.renew_leases()?;
         }
         Ok(())
     }
 
-    /// Finds the account, or opens one under another name when more is left in it than the run may spend: a ledger
-    /// that was put back to an earlier state. Nobody asks under the old name yet.
+    /// Continues with the account. If it has more units left than the run may spend, because the ledger was restored to
+    /// an earlier state, opens another one under a new name; no worker uses the old name yet.
     fn resume(&mut self, spent: u64) -> Result<(), TeacherError> {
         let left = self.terms.budget.saturating_sub(spent);
         match self.balance()? {
@@ -240,29 +258,29 @@ impl Ledger {
                 let name = format!("{}.from-{spent}", self.terms.name);
                 warn!(
                     account = self.terms.name,
-                    name, left, "spending is forgotten, another account"
+                    name, left, "the ledger lost charges, opening another account"
                 );
                 self.terms.name = name;
                 self.full_budget = left;
                 self.open_account(left, spent)
             }
-            _ => self.find_account(spent),
+            _ => self.open_or_reopen(spent),
         }
     }
 
-    /// Goes on with the account, or opens one of what is left when the teacher knows none.
+    /// Continues with the account, or opens it with the remaining budget if the teacher does not know it.
     ///
-    /// What episodes under way were charged is not known here, so as much as they may have been is written off: a
-    /// budget is never overspent.
-    fn find_account(&mut self, spent: u64) -> Result<(), TeacherError> {
-        let written_off = self.under_way.len() as u64 * u64::from(self.units_per_episode);
+    /// The charges of open episodes are unknown then, so their largest possible sum is written off: a budget is never
+    /// overspent.
+    fn open_or_reopen(&mut self, spent: u64) -> Result<(), TeacherError> {
+        let written_off = self.open_episodes.len() as u64 * u64::from(self.units_per_episode);
         let left = self.terms.budget.saturating_sub(spent);
         let name = self.terms.name.clone();
         match self.balance()? {
             Some(found) if units_left(&found) <= left => {
                 if found.budget < self.terms.budget {
                     let (got, asked) = (found.budget, self.terms.budget);
-                    warn!(account = name, budget = got, asked, "going on with a smaller account");
+                    warn!(account = name, budget = got, asked, "continuing with a smaller account");
                 }
                 self.open_account(found.budget.min(self.terms.budget), spent)
             }
@@ -273,22 +291,22 @@ impl Ledger {
             }
             None => {
                 let budget = left.saturating_sub(written_off);
-                warn!(account = name, budget, "the teacher has lost the account, opening it anew");
+                warn!(account = name, budget, "the teacher has lost the account, opening it again");
                 self.open_account(budget, spent)
             }
         }
     }
 
-    /// Opens the leases of episodes under way at a teacher that may have forgotten them; it keeps those that it knows.
+    /// Opens the leases of open episodes at a teacher that may have lost them; it keeps those that it knows.
     fn renew_leases(&self) -> Result<(), TeacherError> {
-        if self.under_way.is_empty() {
+        if self.open_episodes.is_empty() {
             return Ok(());
         }
-        self.call_open_leases(&self.under_way).map(drop)
+        self.call_open_leases(&self.open_episodes).map(drop)
     }
 
-    /// Opens the account with `budget`, or finds it open, and begins to compare with it; the run has learned from
-    /// `learned` units.
+    /// Opens the account with `budget`, or finds it open, and restarts the audit. `learned` counts the units of the
+    /// episodes learned so far.
     fn open_account(&mut self, budget: u64, learned: u64) -> Result<(), TeacherError> {
         let terms = pb::OpenAccountRequest { budget, ..self.terms.clone() };
         let account = self.call("open the account", move |mut client| {
@@ -303,7 +321,7 @@ impl Ledger {
         Ok(())
     }
 
-    /// How the account stands; `None` when the teacher does not know it.
+    /// Returns the balance of the account; `None` if the teacher does not know it.
     fn balance(&self) -> Result<Option<pb::Account>, TeacherError> {
         let request = pb::GetAccountRequest { name: self.terms.name.clone() };
         let account = self.call("look at the account", move |mut client| {
@@ -329,7 +347,7 @@ impl Ledger {
         })
     }
 
-    /// Calls until the teacher answers or the run is stopped. What is asked may be asked again.
+    /// Calls until the teacher answers or the run is stopped. The request must be idempotent.
     fn call<T, F>(
         &self,
         what: &'static str,
@@ -393,7 +411,7 @@ const fn statement(account: &pb::Account) -> Statement {
     Statement { spent: account.spent, leased: account.leased }
 }
 
-/// Sets `lost` whenever the teacher answers that it does not know the account, and passes on its warning.
+/// Sets `lost` when the teacher reports that it does not know the account, and forwards the teacher's warning.
 async fn watch_account(
     mut client: TeacherClient<Link>,
     name: String,
@@ -401,7 +419,7 @@ async fn watch_account(
     warnings: Warnings,
 ) {
     loop {
-        tokio::time::sleep(LOOK_EVERY).await;
+        tokio::time::sleep(CHECK_PERIOD).await;
         let look = client.get_account(pb::GetAccountRequest { name: name.clone() });
         match tokio::time::timeout(CALL_DEADLINE, look).await {
             Ok(Ok(account)) => warnings.set(Source::Teacher, &account.into_inner().warning),

@@ -1,61 +1,62 @@
-//! The comparison of the advice that episodes claim with what the teacher's account was charged.
+//! Compares the units of advice that episodes claim with the charges of the teacher's account.
 //!
-//! Workers report what their episodes were charged; the teacher's ledger knows. In most rounds both are equal. Three
-//! things make an account run ahead of the episodes that have been learned, and none of them is a false report:
+//! Workers report the charges of their episodes; the teacher's ledger is authoritative. Both agree in most rounds. The
+//! account can be ahead of the learned episodes for three reasons, none of which is a false report:
 //!
-//! - A learner that died had workers charge episodes after its newest checkpoint. The resumed learner orders these
-//!   episodes again, and the ledger charges nothing for them a second time.
-//! - Workers that have not noticed yet that the learner died go on with such an episode under its lease.
-//! - A lost account is opened anew with a smaller budget, because nobody knows what was charged last.
+//! - Workers of a dead learner charged episodes after its newest checkpoint. The resumed learner orders these episodes
+//!   again, and the ledger does not charge them twice.
+//! - Workers that have not noticed the death of the learner continue such an episode under its lease.
+//! - A lost account is opened again with a smaller budget, because the last charges are unknown.
 //!
-//! Pure: it sees the account's statements in the order in which the teacher made them.
+//! Pure: statements of the account are arguments, in the order in which the teacher made them.
 
-/// How an account stands by an answer of the teacher.
+/// The state of the account in a response of the teacher.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Statement {
     /// Units charged.
     pub(super) spent: u64,
-    /// Units set aside for open episodes and not spent.
+    /// Units reserved for open episodes and not spent.
     pub(super) leased: u64,
 }
 
-/// What the account's statements allow the next round's episodes to claim.
+/// Derives from the account's statements what the next round's episodes can claim.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Audit {
-    /// The latest statement that was made while no episode of this learner was under way.
+    /// The latest statement made while no episode of this learner was open.
     latest: Statement,
-    /// Units charged that no learned episode accounts for, most probably by episodes that will be ordered again.
+    /// Charged units that no learned episode accounts for; most likely they belong to episodes that will be ordered
+    /// again.
     ahead: u64,
-    /// Units charged that are known to belong to no episode any more, and are not counted yet.
+    /// Charged units that certainly belong to no future episode and are not counted yet.
     unclaimed: u64,
-    /// Whether the account has been charged for everything since the run's beginning, or since a name of its own.
+    /// True if the account has all charges since the start of the run or since it got its own name.
     is_whole: bool,
 }
 
-/// What a round's episodes cost.
+/// The cost of a round's episodes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Cost {
     /// Units that count as spent.
     pub(super) units: u64,
-    /// What the account was charged instead of the claim, when the claim cannot be true.
+    /// The charges of the account, if the claim cannot be true.
     pub(super) instead: Option<u64>,
 }
 
 impl Audit {
-    /// Begins with an account that was charged `ahead` units more than the learned episodes account for.
+    /// Starts with an account that was charged `ahead` units more than the learned episodes account for.
     pub(super) const fn new(latest: Statement, ahead: u64, is_whole: bool) -> Self {
         Self { latest, ahead, unclaimed: 0, is_whole }
     }
 
-    /// Whether the account was charged for everything: only then a lease bounds what its episode can claim.
+    /// Returns true if the account has all charges. Only then does a lease limit the claim of its episode.
     pub(super) const fn is_whole(&self) -> bool {
         self.is_whole
     }
 
-    /// Takes note of a round's leases, which have `units` in all.
+    /// Records a round's leases of `units` in total.
     ///
-    /// When all of them are new, no earlier learner had ordered this round. So nothing that was charged before is for
-    /// an episode yet to come: what is unaccounted for then has no episode.
+    /// If all of them are new, no earlier learner has ordered this round. Then no earlier charge is for a future
+    /// episode, so charges without an episode never get one.
     pub(super) const fn leases_opened(&mut self, units: u64, now: Statement) {
         let handed_out_before = self.latest.spent + self.latest.leased;
         let are_new = units > 0 && now.spent + now.leased == handed_out_before + units;
@@ -65,16 +66,16 @@ impl Audit {
         }
     }
 
-    /// Compares what a round's episodes claim with the account once they are settled and none is under way.
+    /// Compares the claims of a round's episodes with the account after they are settled, when no lease is open.
     pub(super) fn settled(&mut self, claimed: u64, now: Statement) -> Cost {
         let before = std::mem::replace(&mut self.latest, now);
         let unclaimed = std::mem::take(&mut self.unclaimed);
         let Some(charged) = now.spent.checked_sub(before.spent) else {
-            // A ledger that was put back to an earlier state proves nothing.
+            // A ledger that was restored to an earlier state proves nothing.
             self.is_whole = false;
             return Cost { units: claimed + unclaimed, instead: None };
         };
-        // Units set aside for episodes of an earlier learner may have been spent on these.
+        // These may be charges to leases of an earlier learner.
         let elsewhere = if self.is_whole { before.leased.min(charged) } else { charged };
         let counted = claimed.clamp(charged - elsewhere, charged + self.ahead);
         self.ahead = self.ahead + charged - counted;
@@ -106,7 +107,7 @@ mod tests {
     }
 
     #[test]
-    fn true_claims_are_counted_as_they_are() {
+    fn true_claims_count_unchanged() {
         let mut audit = NEW;
         for units in [37, 0, 400, 1] {
             assert_eq!(round(&mut audit, 400, units, units), true_cost(units));
@@ -115,16 +116,16 @@ mod tests {
     }
 
     #[test]
-    fn what_was_charged_counts_whatever_workers_claim() {
+    fn charges_count_regardless_of_claims() {
         let mut audit = NEW;
         assert_eq!(round(&mut audit, 400, 0, 400), Cost { units: 0, instead: Some(0) });
         assert_eq!(round(&mut audit, 400, 90, 0), Cost { units: 90, instead: Some(90) });
         assert_eq!(round(&mut audit, 400, 90, 91), Cost { units: 90, instead: Some(90) });
-        assert_eq!(round(&mut audit, 400, 90, 90), true_cost(90), "and it goes on from there");
+        assert_eq!(round(&mut audit, 400, 90, 90), true_cost(90), "and continues from there");
     }
 
     #[test]
-    fn rounds_that_are_played_again_are_charged_already() {
+    fn repeated_rounds_are_charged_already() {
         // The checkpoint had 100 units; rounds of 30, 40 and an unfinished one of 25 followed.
         let mut audit = Audit::new(stand(195, 175), 95, true);
         assert_eq!(audit.settled(30, stand(195, 175)), true_cost(30));
@@ -144,7 +145,7 @@ mod tests {
     }
 
     #[test]
-    fn a_resumed_run_that_plays_otherwise_counts_what_it_was_charged_before() {
+    fn a_resumed_run_that_differs_counts_its_earlier_charges() {
         let mut audit = Audit::new(stand(130, 0), 30, true);
         assert_eq!(audit.settled(12, stand(130, 0)), true_cost(12));
         assert_eq!(round(&mut audit, 400, 50, 50), true_cost(68), "with 18 units of no episode");
@@ -152,13 +153,13 @@ mod tests {
     }
 
     #[test]
-    fn claims_beyond_a_replay_are_noticed() {
+    fn claims_beyond_repeated_rounds_are_detected() {
         let mut audit = Audit::new(stand(130, 0), 30, true);
         assert_eq!(audit.settled(31, stand(130, 0)), Cost { units: 30, instead: Some(30) });
     }
 
     #[test]
-    fn an_account_that_was_opened_anew_proves_too_many_claims_only() {
+    fn a_reopened_account_disproves_excessive_claims_only() {
         // Two episodes were under way, and 100 units are written off for them.
         let mut audit = Audit::new(stand(0, 0), 100, false);
         assert_eq!(audit.settled(70, stand(40, 0)), true_cost(70), "30 in the lost account");
@@ -170,7 +171,7 @@ mod tests {
     }
 
     #[test]
-    fn a_ledger_that_was_put_back_proves_nothing() {
+    fn a_restored_ledger_proves_nothing() {
         let mut audit = Audit::new(stand(500, 0), 0, true);
         assert_eq!(audit.settled(40, stand(300, 0)), true_cost(40));
         assert!(!audit.is_whole());

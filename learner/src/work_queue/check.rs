@@ -1,20 +1,20 @@
-//! What is taken of a worker: the episodes that were ordered, with claims of advice that can be true.
+//! Checks of delivered episodes: they must match the order, and their claims of advice must be possible.
 
 use std::collections::BTreeMap;
 
 use tandem_core::work::{EpisodeOrder, SlotOrder};
 use tandem_core::{Episode, EpisodeKind};
 
-/// Why a worker's episodes are not taken. Nothing of them is used.
+/// A refusal of a worker's call or episodes. None of the episodes is used.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum SubmitError {
     /// The worker must join first.
     #[error("worker {0} is unknown here: join first")]
     UnknownWorker(u64),
-    /// Nobody was given such a slot.
+    /// The slot was never ordered.
     #[error("slot: expected one of the {n_slots} that were ordered, got {slot}")]
     UnknownSlot {
-        /// What came.
+        /// The slot that was named.
         slot: u64,
         /// Slots ordered so far.
         n_slots: u64,
@@ -26,27 +26,27 @@ pub enum SubmitError {
         slot: u64,
         /// Episodes ordered.
         expected: usize,
-        /// Episodes that came.
+        /// Episodes received.
         got: usize,
     },
-    /// An episode that was not ordered so.
+    /// An episode does not match its order.
     #[error("episode {number}: {field}: expected {expected}, got {got}")]
     WrongEpisode {
-        /// The episode's number as it came.
+        /// The episode's number as received.
         number: u64,
-        /// What of it was not ordered.
+        /// The field that does not match.
         field: &'static str,
-        /// What was ordered.
+        /// The ordered value.
         expected: String,
-        /// What came.
+        /// The received value.
         got: String,
     },
 }
 
-/// Refuses a number of episodes that is not the slot's.
+/// Checks the number of episodes of a slot.
 ///
 /// # Errors
-/// When it is another.
+/// When it differs from the order.
 pub fn check_count(order: &SlotOrder, got: usize) -> Result<(), SubmitError> {
     let expected = order.episodes.len();
     if got == expected {
@@ -85,8 +85,8 @@ fn check_episode(
     check_advice(order, ordered, episode)
 }
 
-/// Refuses claims of advice that contradict each other or the order. A unit pays for one step however many arms are
-/// overridden on it, and a step on which no arm is overridden costs nothing.
+/// Checks that the claims of advice agree with each other and with the order. A unit pays for one step regardless of
+/// the number of overridden arms, and a step without an overridden arm costs nothing.
 fn check_advice(
     order: &SlotOrder,
     ordered: &EpisodeOrder,
@@ -105,36 +105,36 @@ fn check_advice(
         return refuse("advice_charged", expected, claimed.to_string());
     }
     if claimed > 0 {
-        let expected = "0, as nobody was to be asked".to_owned();
+        let expected = "0, as no advice was ordered".to_owned();
         return refuse("advice_charged", expected, claimed.to_string());
     }
     match episode.advised_arms.iter().position(|arms| *arms != 0) {
         None => Ok(()),
         Some(step_idx) => {
-            let expected = "no advised arm, as nobody was to be asked".to_owned();
+            let expected = "no advised arm, as no advice was ordered".to_owned();
             let got = format!("{:#010b} on step {step_idx}", episode.advised_arms[step_idx]);
             refuse("advised_arms", expected, got)
         }
     }
 }
 
-/// Refuses an episode that claims more units of advice than `allowances` has for it.
-pub(super) fn check_allowances(
-    allowances: &BTreeMap<u64, u32>,
+/// Checks that no episode claims more units of advice than `limits` has for it.
+pub(super) fn check_claims(
+    limits: &BTreeMap<u64, u32>,
     order: &SlotOrder,
     episodes: &[Episode],
 ) -> Result<(), SubmitError> {
-    // Evaluation episodes have numbers of their own and claim nothing.
+    // Evaluation episodes are numbered separately and claim nothing.
     if order.kind != EpisodeKind::Training {
         return Ok(());
     }
     for episode in episodes {
         let (number, claimed) = (episode.number, episode.advice_charged);
-        if let Some(units) = allowances.get(&number).filter(|units| claimed > **units) {
+        if let Some(units) = limits.get(&number).filter(|units| claimed > **units) {
             return Err(SubmitError::WrongEpisode {
                 number,
                 field: "advice_charged",
-                expected: format!("at most {units}, the units set aside for it"),
+                expected: format!("at most {units}, the units reserved for it"),
                 got: claimed.to_string(),
             });
         }

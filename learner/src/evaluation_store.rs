@@ -1,118 +1,119 @@
-//! What evaluations bring: rows of metrics and the policies that are kept.
+//! The results of evaluations: rows of metrics, and the best and the latest policy.
 //!
-//! The checkpoint holds all of it; the files in the run directory are copies for people. A copy that cannot be written
-//! stays due until there is room.
+//! A checkpoint contains all of them; the files in the run directory are copies for users. A copy that cannot be
+//! written stays due until the write succeeds.
 
 use std::path::{Path, PathBuf};
 
 use tandem_policy::Policy;
+use tandem_rl::trainer::{Counters, RoundStats};
 use tandem_telemetry::{MetricsLog, MetricsRow};
 
-use tandem_rl::trainer::{Counters, RoundFigures};
-
-/// What the evaluations have brought so far. It grows by a row each.
+/// The results of all complete evaluations.
 #[derive(Debug, Clone, PartialEq, Default)]
-pub struct Judged {
-    /// Every row of metrics, oldest first.
+pub struct EvaluationHistory {
+    /// One row of metrics per evaluation, oldest first.
     pub rows: Vec<MetricsRow>,
-    /// The policy of the latest row that is marked best.
+    /// The policy of the latest row that is marked as best.
     pub best: Option<Policy>,
     /// The policy of the latest row.
     pub last: Option<Policy>,
 }
 
-impl Judged {
-    /// The row of the best policy.
+impl EvaluationHistory {
+    /// Returns the row of the best policy.
     #[must_use]
     pub fn best_row(&self) -> Option<&MetricsRow> {
         self.rows.iter().rfind(|row| row.best)
     }
 
-    /// The first success rate of at least `until`, which is above 0.
+    /// Returns the first success rate of at least `until`; `None` if `until` is 0.
     #[must_use]
-    pub fn reached(&self, until: f64) -> Option<f64> {
+    pub fn first_reaching(&self, until: f64) -> Option<f64> {
         let enough = self.rows.iter().map(|row| row.success).find(|success| *success >= until);
         enough.filter(|_| until > 0.0)
     }
 }
 
-/// An evaluation whose episodes are being played: everything that its row will need.
+/// An evaluation whose episodes are being played, with the data for its row.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Pending {
-    /// How far the run was; the round is also the version that plays.
+pub struct PendingEvaluation {
+    /// The run's counters when it was scheduled; the round is also the parameter version.
     pub counters: Counters,
-    /// What the round before showed.
-    pub figures: RoundFigures,
-    /// Seconds that the run had taken.
+    /// Statistics of the round before it.
+    pub stats: RoundStats,
+    /// Wall time of the run when it was scheduled, seconds.
     pub wall_s: f64,
-    /// What is judged.
+    /// The policy that is evaluated.
     pub policy: Policy,
 }
 
 /// A file that cannot be written.
 #[derive(Debug)]
-pub(crate) struct Unwritten {
-    /// In words.
+pub(crate) struct UnwrittenFile {
+    /// Its description.
     pub(crate) what: String,
-    /// Why not.
+    /// The error.
     pub(crate) cause: String,
 }
 
-/// Everything judged, and its copies in the run directory.
+/// The results, and their copies in the run directory.
 #[derive(Debug)]
-pub(crate) struct Records {
+pub(crate) struct EvaluationStore {
     out: PathBuf,
-    judged: Judged,
+    history: EvaluationHistory,
     metrics_due: bool,
     best_due: bool,
     last_due: bool,
 }
 
-impl Records {
-    /// Goes on from `judged`; the copies in `out` are due, since others may be there.
-    pub(crate) fn new(out: &Path, judged: Judged) -> Self {
+impl EvaluationStore {
+    /// Continues with `history`. All copies in `out` are due, because those there may be of another state.
+    pub(crate) fn new(out: &Path, history: EvaluationHistory) -> Self {
         Self {
             out: out.to_owned(),
             metrics_due: true,
-            best_due: judged.best.is_some(),
-            last_due: judged.last.is_some(),
-            judged,
+            best_due: history.best.is_some(),
+            last_due: history.last.is_some(),
+            history,
         }
     }
 
-    pub(crate) const fn judged(&self) -> &Judged {
-        &self.judged
+    /// Returns the results.
+    pub(crate) const fn history(&self) -> &EvaluationHistory {
+        &self.history
     }
 
-    /// Adds an evaluation's row and what was judged.
+    /// Adds an evaluation's row and its policy.
     pub(crate) fn add(&mut self, row: MetricsRow, policy: Policy) {
         if row.best {
-            self.judged.best = Some(policy.clone());
+            self.history.best = Some(policy.clone());
             self.best_due = true;
         }
-        self.judged.rows.push(row);
-        self.judged.last = Some(policy);
+        self.history.rows.push(row);
+        self.history.last = Some(policy);
         (self.metrics_due, self.last_due) = (true, true);
     }
 
-    /// Writes what is due; gives what could not be written.
-    pub(crate) fn write(&mut self) -> Vec<Unwritten> {
+    /// Writes the copies that are due; returns those that could not be written.
+    pub(crate) fn write(&mut self) -> Vec<UnwrittenFile> {
         let mut unwritten = Vec::new();
         if self.metrics_due {
-            let written = write_rows(&self.out.join("metrics.jsonl"), &self.judged.rows);
-            self.metrics_due = note(written, "metrics.jsonl", &mut unwritten);
+            let written = write_rows(&self.out.join("metrics.jsonl"), &self.history.rows);
+            self.metrics_due = still_due(written, "metrics.jsonl", &mut unwritten);
         }
         for (policy, due, name) in [
-            (&self.judged.best, &mut self.best_due, "policy/best.safetensors"),
-            (&self.judged.last, &mut self.last_due, "policy/last.safetensors"),
+            (&self.history.best, &mut self.best_due, "policy/best.safetensors"),
+            (&self.history.last, &mut self.last_due, "policy/last.safetensors"),
         ] {
             if let Some(policy) = policy.as_ref().filter(|_| *due) {
-                *due = note(write_policy(&self.out.join(name), policy), name, &mut unwritten);
+                *due = still_due(write_policy(&self.out.join(name), policy), name, &mut unwritten);
             }
         }
         unwritten
     }
 
+    /// Returns true if a copy is due.
     pub(crate) const fn is_due(&self) -> bool {
         self.metrics_due || self.best_due || self.last_due
     }
@@ -120,10 +121,14 @@ impl Records {
 
 type AnyError = Box<dyn std::error::Error + Send + Sync>;
 
-/// Whether a file is still due, and why.
-fn note(written: Result<(), AnyError>, what: &str, unwritten: &mut Vec<Unwritten>) -> bool {
+/// Returns true if the file is still due, and adds it to `unwritten`.
+fn still_due(
+    written: Result<(), AnyError>,
+    what: &str,
+    unwritten: &mut Vec<UnwrittenFile>,
+) -> bool {
     let Err(error) = written else { return false };
-    unwritten.push(Unwritten { what: what.to_owned(), cause: innermost(error.as_ref()) });
+    unwritten.push(UnwrittenFile { what: what.to_owned(), cause: innermost(error.as_ref()) });
     true
 }
 
@@ -145,7 +150,7 @@ fn write_policy(path: &Path, policy: &Policy) -> Result<(), AnyError> {
     Ok(policy.save(path)?)
 }
 
-/// The cause of an error that has no cause itself: for a file, what the file system says.
+/// Returns the root cause of an error, such as the message of the file system.
 pub(crate) fn innermost(error: &(dyn std::error::Error + 'static)) -> String {
     let mut cause = error;
     while let Some(inner) = cause.source() {
@@ -159,10 +164,10 @@ mod tests {
     use std::collections::BTreeMap;
 
     use tandem_core::Task;
-
-    use super::*;
     use tandem_rl::config::{Recipe, RunConfig};
     use tandem_rl::trainer::Trainer;
+
+    use super::*;
 
     fn row(round: u64, best: bool) -> MetricsRow {
         MetricsRow { round, best, success: round as f64 / 10.0, ..MetricsRow::default() }
@@ -185,11 +190,11 @@ mod tests {
     }
 
     #[test]
-    fn what_cannot_be_written_is_named_and_written_in_order_when_it_can() {
+    fn unwritten_files_are_named_and_written_in_order_later() {
         let directory = tempfile::tempdir().expect("a directory");
         let out = directory.path().join("run");
         std::fs::write(&out, "a file where a directory should be").expect("writes");
-        let mut records = Records::new(&out, Judged::default());
+        let mut records = EvaluationStore::new(&out, EvaluationHistory::default());
         records.add(row(1, true), policy("first"));
         records.add(row(2, false), policy("second"));
         let unwritten: Vec<String> = records.write().into_iter().map(|file| file.what).collect();
@@ -208,27 +213,29 @@ mod tests {
     }
 
     #[test]
-    fn what_a_lost_future_left_gives_way() {
+    fn files_of_a_lost_future_are_replaced() {
         let directory = tempfile::tempdir().expect("a directory");
         let out = directory.path();
-        let mut lost = Records::new(out, Judged::default());
+        let mut lost = EvaluationStore::new(out, EvaluationHistory::default());
         lost.add(row(1, true), policy("first"));
-        let kept = lost.judged().clone();
+        let kept = lost.history().clone();
         lost.add(row(2, true), policy("second"));
         assert!(lost.write().is_empty());
-        assert!(Records::new(out, kept).write().is_empty());
+        assert!(EvaluationStore::new(out, kept).write().is_empty());
         assert_eq!(rounds(out), [1]);
         assert_eq!(name_of(&out.join("policy/best.safetensors")), "first");
         assert_eq!(name_of(&out.join("policy/last.safetensors")), "first");
     }
 
     #[test]
-    fn a_success_rate_is_reached_by_the_first_row_that_has_it() {
-        let judged =
-            Judged { rows: vec![row(1, true), row(5, true), row(3, false)], ..Judged::default() };
-        assert_eq!(judged.reached(0.3), Some(0.5));
-        assert_eq!(judged.reached(0.6), None);
-        assert_eq!(judged.reached(0.0), None, "never");
-        assert_eq!(judged.best_row().map(|row| row.round), Some(5));
+    fn the_first_row_with_enough_success_reaches_a_rate() {
+        let history = EvaluationHistory {
+            rows: vec![row(1, true), row(5, true), row(3, false)],
+            ..EvaluationHistory::default()
+        };
+        assert_eq!(history.first_reaching(0.3), Some(0.5));
+        assert_eq!(history.first_reaching(0.6), None);
+        assert_eq!(history.first_reaching(0.0), None, "never");
+        assert_eq!(history.best_row().map(|row| row.round), Some(5));
     }
 }

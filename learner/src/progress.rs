@@ -1,0 +1,80 @@
+//! The progress of a run, as the learning thread reports it. The service turns it into messages and metrics.
+
+use tandem_rl::trainer::Counters;
+use tandem_telemetry::MetricsRow;
+
+/// A snapshot of the run.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub(crate) struct Progress {
+    /// Name of the task.
+    pub(crate) task: String,
+    /// Arms of the learning policy.
+    pub(crate) n_arms: usize,
+    /// Advising strategy.
+    pub(crate) strategy: String,
+    /// Rounds, environment steps, episodes, updates and units of advice so far.
+    pub(crate) counters: Counters,
+    /// Seconds of wall time, summed over resumed parts.
+    pub(crate) wall_s: f64,
+    /// Recent environment steps per second.
+    pub(crate) env_steps_per_s: f64,
+    /// Recent updates per second.
+    pub(crate) updates_per_s: f64,
+    /// Units of advice that the run may still spend.
+    pub(crate) budget_left: u64,
+    /// The current activity; `None` before the run starts.
+    pub(crate) phase: Option<Phase>,
+    /// Fraction of the latest round's episodes that succeeded.
+    pub(crate) training_success: f64,
+    /// The workers, by number.
+    pub(crate) workers: Vec<WorkerProgress>,
+    /// The latest evaluation.
+    pub(crate) latest: Option<MetricsRow>,
+    /// The best evaluation.
+    pub(crate) best: Option<MetricsRow>,
+    /// The end of the run, once it has ended.
+    pub(crate) end: Option<RunEnd>,
+    /// Problems that require an operator; empty if there are none.
+    pub(crate) warning: String,
+}
+
+/// The activity of the learning thread.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Phase {
+    Starting,
+    Collecting,
+    Updating,
+    Evaluating,
+    Ended,
+}
+
+/// The end of a run.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) struct RunEnd {
+    /// The limit that was reached, or the error.
+    pub(crate) reason: String,
+    /// True if the run was stopped before its end, or failed.
+    pub(crate) interrupted: bool,
+    /// SHA-256 over the learning state; `None` after an error.
+    pub(crate) digest: Option<String>,
+}
+
+/// A worker as the progress shows it.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) struct WorkerProgress {
+    pub(crate) worker_id: u64,
+    pub(crate) name: String,
+    pub(crate) n_episodes: u64,
+    pub(crate) activity: Activity,
+}
+
+/// The activity of a worker.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Activity {
+    /// Plays the slot of this number.
+    Slot(u64),
+    /// Waits for a slot.
+    Waiting,
+    /// Has sent nothing for [`SILENT_AFTER`](crate::work_queue::SILENT_AFTER).
+    Silent,
+}

@@ -1,0 +1,404 @@
+//! The learning thread: opens rounds, waits for their episodes, learns, publishes, evaluates, saves.
+//!
+//! [`LearnerLoop`] owns the trainer and three parts with state of their own: the evaluations, the persistence of the
+//! run directory, and the publisher of the progress.
+
+mod evaluations;
+mod initial_state;
+mod persistence;
+mod progress_publisher;
+mod run_lock;
+
+use std::time::Duration;
+
+use tandem_core::layout::EPISODE_STEPS;
+use tandem_core::work::{PublishedActor, SlotOrder};
+use tandem_core::{Episode, EpisodeKind};
+use tandem_rl::trainer::{RoundStats, Trainer};
+use tandem_telemetry::events::{ParametersPublished, RoundFinished, RunFinished, WorkerSilent};
+use tokio_util::sync::CancellationToken;
+
+use crate::advice_account::{AdviceAccount, Mismatch, TeacherError};
+use crate::error::Error;
+use crate::progress::Phase;
+use crate::runtime::Runtime;
+use crate::shared::{LearnerConfig, Shared};
+use crate::warnings::Source;
+use crate::work_queue::SilentWorker;
+use evaluations::Evaluations;
+use initial_state::{InitialState, write_run_file};
+use persistence::{LoopState, Persistence};
+use progress_publisher::ProgressPublisher;
+
+/// Pause between two checks for silent workers and a lost account while episodes are awaited.
+const WAIT_TICK: Duration = Duration::from_millis(200);
+/// Workers that are logged by name if they fall silent at the same time.
+const MAX_SILENT_LINES: usize = 100;
+/// Units of advice that an episode can use: one per step.
+#[expect(clippy::cast_possible_truncation, reason = "an episode has 50 steps")]
+const UNITS_PER_EPISODE: u32 = EPISODE_STEPS as u32;
+
+/// The outcome of a run.
+#[derive(Debug, Clone, PartialEq)]
+pub struct RunOutcome {
+    /// The limit that ended the run, or `interrupted`.
+    pub reason: String,
+    /// True if the run was stopped before its end and can be resumed.
+    pub interrupted: bool,
+    /// SHA-256 over the whole learning state, hexadecimal.
+    pub digest: String,
+}
+
+/// The environment of the learning thread.
+#[derive(Clone, Copy)]
+pub(crate) struct Context<'a> {
+    pub(crate) config: &'a LearnerConfig,
+    pub(crate) shared: &'a Shared,
+    pub(crate) runtime: &'a Runtime,
+    pub(crate) shutdown: &'a CancellationToken,
+}
+
+/// Runs the whole run on the calling thread.
+pub(crate) fn run(context: Context<'_>) -> Result<RunOutcome, Error> {
+    let initial = InitialState::load(context)?;
+    let account = match initial.open_account(context) {
+        Err(Error::Teacher(TeacherError::Stopped)) => {
+            let (round, digest) = (initial.trainer.counters().round, initial.trainer.digest());
+            let reason = "interrupted".to_owned();
+            RunFinished { reason: &reason, round, digest: &digest }.emit();
+            return Ok(RunOutcome { reason, interrupted: true, digest });
+        }
+        account => account?,
+    };
+    write_run_file(context.config)?;
+    let mut learner = LearnerLoop::new(context, initial, account);
+    match learner.run_rounds() {
+        Ok(stop) => learner.finish(stop),
+        Err(error) => {
+            // A state with numbers that are not finite is useless; a run can resume from any other.
+            if !matches!(error, Error::Diverged(_)) {
+                learner.save();
+            }
+            Err(error)
+        }
+    }
+}
+
+/// The reason for which the loop ends.
+#[derive(Debug, Clone, PartialEq, Eq)]
+enum StopReason {
+    Reached(String),
+    Interrupted,
+}
+
+/// The training loop over rounds.
+struct LearnerLoop<'a> {
+    context: Context<'a>,
+    trainer: Trainer,
+    /// The parameters that play the round that is being awaited.
+    acting: PublishedActor,
+    account: Option<AdviceAccount>,
+    evaluations: Evaluations<'a>,
+    persistence: Persistence<'a>,
+    progress: ProgressPublisher<'a>,
+}
+
+impl LearnerLoop<'_> {
+    /// Learns round after round until a limit is reached or the run is interrupted.
+    fn run_rounds(&mut self) -> Result<StopReason, Error> {
+        if let Some(stop) = self.stop_reason() {
+            return Ok(stop);
+        }
+        if !self.open_round(self.trainer.counters().round, self.acting.version)? {
+            return Ok(StopReason::Interrupted);
+        }
+        loop {
+            if let Some(stop) = self.stop_reason() {
+                return Ok(stop);
+            }
+            if !self.run_round()? {
+                return Ok(StopReason::Interrupted);
+            }
+            let (persistence, mut state) = self.persistence_and_state();
+            persistence.persist_if_due(&mut state);
+        }
+    }
+
+    /// Awaits the open round, learns from it and opens the next one; returns false if the run is interrupted. After
+    /// false, and after any error but divergence, the run can resume from the present state.
+    fn run_round(&mut self) -> Result<bool, Error> {
+        let Some(episodes) = self.wait_for(EpisodeKind::Training, self.acting.version)? else {
+            return Ok(false);
+        };
+        let Some(spent) = self.settle(&episodes)? else { return Ok(false) };
+        let round = self.trainer.counters().round;
+        let lagged = self.context.config.run.rounds.lag == 1;
+        if lagged && !self.open_round_after(round + 1, round, spent)? {
+            return Ok(false);
+        }
+        // Nothing is awaited from here to the end of learning: a round is learned completely or not at all.
+        let before = self.trainer.publish();
+        let stats = self.learn(&episodes, spent)?;
+        let newest = self.trainer.publish();
+        self.context.shared.publish(&newest);
+        self.acting = if lagged { before } else { newest };
+        if self.evaluations.is_due(self.trainer.counters().round) {
+            self.schedule_evaluation(&stats);
+        }
+        if !lagged && !self.open_round(round + 1, round + 1)? {
+            return Ok(false);
+        }
+        self.order_evaluation();
+        self.complete_overdue_evaluations()
+    }
+
+    /// Settles the leases of a round's episodes and returns the units of advice spent so far; `None` if the run is
+    /// interrupted. The teacher's account, not the worker, determines what an episode has cost.
+    fn settle(&mut self, episodes: &[Episode]) -> Result<Option<u64>, Error> {
+        let spent = self.trainer.counters().advice_spent;
+        let Some(account) = &mut self.account else { return Ok(Some(spent)) };
+        let Some(settlement) = unless_stopped(account.settle(episodes, spent))? else {
+            return Ok(None);
+        };
+        if let Some(Mismatch { claimed, charged }) = settlement.mismatch {
+            let (round, name) = (self.trainer.counters().round, account.name());
+            let warning = format!(
+                "the episodes of round {round} claim {claimed} units of advice, the teacher's account {name:?} was \
+                 charged {charged}: the account counts"
+            );
+            self.context.shared.warnings.set_first(Source::Advice, &warning);
+        }
+        Ok(Some(spent + settlement.units))
+    }
+
+    fn learn(&mut self, episodes: &[Episode], advice_spent: u64) -> Result<RoundStats, Error> {
+        self.trainer.ingest(episodes);
+        self.trainer.correct_advice_spent(advice_spent);
+        if let Some(absurd) = self.trainer.absurd_statistic() {
+            self.context.shared.warnings.set_first(Source::Statistics, &absurd);
+        }
+        self.publish_progress(Phase::Updating);
+        let on_update = self.progress.on_update(self.trainer.counters());
+        let stats = self.trainer.learn(on_update)?;
+        let counters = self.trainer.counters();
+        self.progress.record_round(counters);
+        self.publish_progress(Phase::Collecting);
+        RoundFinished {
+            round: counters.round,
+            env_steps: counters.env_steps,
+            updates: counters.updates,
+            training_success: stats.training_success,
+            training_moved: stats.training_moved,
+            advice_spent: counters.advice_spent,
+        }
+        .emit();
+        ParametersPublished { version: counters.round }.emit();
+        Ok(stats)
+    }
+
+    /// Orders the slots of a round, after opening its leases; returns false if the run is interrupted.
+    fn open_round(&mut self, round: u64, version: u64) -> Result<bool, Error> {
+        self.open_round_after(round, version, self.trainer.counters().advice_spent)
+    }
+
+    /// Does the same as [`Self::open_round`] after `spent` units of advice.
+    fn open_round_after(&mut self, round: u64, version: u64, spent: u64) -> Result<bool, Error> {
+        if self.is_beyond_end(round) {
+            return Ok(true);
+        }
+        let orders = self.trainer.training_orders(round, version);
+        if let Some(account) = &mut self.account {
+            let ordered = orders.iter().flat_map(|slot| &slot.episodes);
+            let advised = ordered.filter(|order| order.advised).map(|order| order.number).collect();
+            let Some(allowances) = unless_stopped(account.open_leases(advised, spent))? else {
+                return Ok(false);
+            };
+            let allowances = allowances.iter().map(|each| (each.episode, each.units));
+            self.context.shared.lock().queue.limit_claims(allowances);
+        }
+        self.order(orders);
+        Ok(true)
+    }
+
+    /// Returns true if the limit of environment steps ends the run before `round`.
+    fn is_beyond_end(&self, round: u64) -> bool {
+        let run = &self.context.config.run;
+        let max = run.stop.max_env_steps;
+        max > 0 && round * run.env_steps_per_round() >= max
+    }
+
+    /// Adds slots to the queue and wakes the workers that wait for one.
+    fn order(&self, orders: Vec<SlotOrder>) {
+        let mut state = self.context.shared.lock();
+        orders.into_iter().for_each(|order| state.queue.push(order));
+        drop(state);
+        self.context.shared.work.notify_waiters();
+    }
+
+    /// Waits for all episodes of `kind` with parameter version `version`; returns `None` if the run is interrupted.
+    fn wait_for(&mut self, kind: EpisodeKind, version: u64) -> Result<Option<Vec<Episode>>, Error> {
+        let Context { config, shared, runtime, shutdown } = self.context;
+        let mut checked_at = None;
+        loop {
+            if !self.restore_lost_account()? {
+                return Ok(None);
+            }
+            let mut state = shared.lock();
+            if state.queue.is_complete(kind, version) {
+                return Ok(Some(state.queue.take(kind, version)));
+            }
+            if shutdown.is_cancelled() {
+                return Ok(None);
+            }
+            let now = (config.clock)();
+            // The check visits all workers, so it does not run for every slot that arrives.
+            if checked_at.is_none_or(|before| now.saturating_sub(before) >= WAIT_TICK) {
+                checked_at = Some(now);
+                report_silent(&state.queue.reclaim(now));
+            }
+            drop(state);
+            let arrived = shared.arrived.clone();
+            let next = async move { tokio::time::timeout(WAIT_TICK, arrived.notified()).await };
+            if runtime.wait_on(next).is_none() {
+                return Ok(None);
+            }
+        }
+    }
+
+    /// Opens the account again if the teacher has lost it; returns false if the run is interrupted meanwhile.
+    fn restore_lost_account(&mut self) -> Result<bool, Error> {
+        let spent = self.trainer.counters().advice_spent;
+        let Some(account) = self.account.as_mut().filter(|account| account.is_lost()) else {
+            return Ok(true);
+        };
+        // A reopened account may charge an episode beyond its first lease.
+        self.context.shared.lock().queue.lift_claim_limits();
+        Ok(unless_stopped(account.restore_if_lost(spent))?.is_some())
+    }
+
+    fn stop_reason(&self) -> Option<StopReason> {
+        let stop = &self.context.config.run.stop;
+        if self.context.shutdown.is_cancelled() {
+            return Some(StopReason::Interrupted);
+        }
+        if let Some(success) = self.evaluations.history().first_reaching(stop.until_success) {
+            return Some(StopReason::Reached(format!("success rate {success:.3} reached")));
+        }
+        if self.is_beyond_end(self.trainer.counters().round) {
+            let reason = format!("{} environment steps reached", stop.max_env_steps);
+            return Some(StopReason::Reached(reason));
+        }
+        if stop.max_minutes > 0.0 && self.progress.wall_s() >= stop.max_minutes * 60.0 {
+            return Some(StopReason::Reached(format!("{} minutes are over", stop.max_minutes)));
+        }
+        None
+    }
+
+    /// Evaluates the final parameters, saves everything and returns the outcome.
+    fn finish(&mut self, stop: StopReason) -> Result<RunOutcome, Error> {
+        let round = self.trainer.counters().round;
+        let reached = match stop {
+            StopReason::Interrupted => None,
+            StopReason::Reached(reason) => {
+                if round > 0 && !self.evaluations.covers(round) {
+                    self.schedule_evaluation(&self.trainer.stats());
+                    self.order_evaluation();
+                }
+                // The learning state is saved before anything else is awaited.
+                self.save();
+                self.publish_progress(Phase::Evaluating);
+                while self.complete_evaluation()? {}
+                self.evaluations.pending().is_empty().then_some(reason)
+            }
+        };
+        let interrupted = reached.is_none();
+        let reason = reached.unwrap_or_else(|| "interrupted".to_owned());
+        self.save();
+        let digest = self.trainer.digest();
+        RunFinished { reason: &reason, round, digest: &digest }.emit();
+        self.publish_progress(Phase::Ended);
+        self.persistence.check_written()?;
+        Ok(RunOutcome { reason, interrupted, digest })
+    }
+
+    fn schedule_evaluation(&mut self, stats: &RoundStats) {
+        self.evaluations.schedule(&self.trainer, stats, self.progress.wall_s());
+    }
+
+    /// Orders the episodes of the evaluation that was scheduled after the latest round, if there is one.
+    fn order_evaluation(&self) {
+        let round = self.trainer.counters().round;
+        if self.evaluations.is_pending(round) {
+            self.order(self.trainer.evaluation_orders(round));
+        }
+    }
+
+    /// Completes the evaluations that must be complete by now; returns false if the run is interrupted.
+    fn complete_overdue_evaluations(&mut self) -> Result<bool, Error> {
+        while self.evaluations.is_overdue(self.trainer.counters().round) {
+            if !self.complete_evaluation()? {
+                return Ok(false);
+            }
+        }
+        Ok(true)
+    }
+
+    /// Waits for the oldest pending evaluation and completes it; returns false if there is none or the run is
+    /// interrupted.
+    fn complete_evaluation(&mut self) -> Result<bool, Error> {
+        let Some(version) = self.evaluations.oldest_version() else { return Ok(false) };
+        let Some(episodes) = self.wait_for(EpisodeKind::Evaluation, version)? else {
+            return Ok(false);
+        };
+        self.evaluations.complete(&episodes);
+        self.write_records();
+        self.progress.publish_evaluations(self.evaluations.history());
+        Ok(true)
+    }
+
+    fn publish_progress(&self, phase: Phase) {
+        self.progress.publish(phase, &self.trainer, &self.trainer.stats());
+    }
+
+    fn write_records(&mut self) {
+        self.persistence.write_records(&mut self.evaluations, self.progress.wall_s());
+    }
+
+    fn save(&mut self) {
+        let (persistence, mut state) = self.persistence_and_state();
+        persistence.save(&mut state);
+    }
+}
+
+impl<'a> LearnerLoop<'a> {
+    /// Borrows the persistence together with the state that it writes.
+    fn persistence_and_state(&mut self) -> (&mut Persistence<'a>, LoopState<'_, 'a>) {
+        let state = LoopState {
+            trainer: &self.trainer,
+            acting: &self.acting,
+            evaluations: &mut self.evaluations,
+            wall_s: self.progress.wall_s(),
+        };
+        (&mut self.persistence, state)
+    }
+}
+
+/// Logs the workers that fell silent, the first [`MAX_SILENT_LINES`] by name: there can be thousands.
+fn report_silent(fell_silent: &[SilentWorker]) {
+    let n_logged = fell_silent.len().min(MAX_SILENT_LINES);
+    let (logged, rest) = fell_silent.split_at(n_logged);
+    for SilentWorker { worker_id, name, n_slots } in logged {
+        WorkerSilent { worker_id: *worker_id, name, n_slots: *n_slots }.emit();
+    }
+    if !rest.is_empty() {
+        tracing::warn!(n = rest.len(), "more workers silent");
+    }
+}
+
+/// Returns the teacher's answer; `None` if the call was cancelled because the run stops.
+fn unless_stopped<T>(outcome: Result<T, TeacherError>) -> Result<Option<T>, TeacherError> {
+    match outcome {
+        Err(TeacherError::Stopped) => Ok(None),
+        outcome => outcome.map(Some),
+    }
+}

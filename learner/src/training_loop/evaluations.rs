@@ -1,0 +1,213 @@
+//! Evaluations of the policy: their schedule, their rows of metrics, and the choice of the best policy.
+
+use std::collections::{BTreeMap, VecDeque};
+
+use tandem_core::{Episode, EpisodeOutcome, EvaluationSummary};
+use tandem_policy::Policy;
+use tandem_rl::config::Recipe;
+use tandem_rl::trainer::{RoundStats, Trainer};
+use tandem_telemetry::MetricsRow;
+use tandem_telemetry::events::EvaluationFinished;
+
+use super::progress_publisher::budget_left;
+use crate::evaluation_store::{
+    EvaluationHistory, EvaluationStore, PendingEvaluation, UnwrittenFile,
+};
+use crate::shared::LearnerConfig;
+
+/// Rounds after which an evaluation must be complete. Until then its slots fill the workers' idle time.
+const MAX_PENDING_ROUNDS: u64 = 4;
+/// Rounds of the paper's epoch: 50 cycles of the HER reference implementation (decision 005).
+const ROUNDS_PER_PAPER_EPOCH: f64 = 50.0;
+
+/// The run's evaluations, pending and complete.
+pub(super) struct Evaluations<'a> {
+    config: &'a LearnerConfig,
+    store: EvaluationStore,
+    /// Oldest first.
+    pending: VecDeque<PendingEvaluation>,
+}
+
+impl<'a> Evaluations<'a> {
+    /// Continues with the evaluations of a checkpoint.
+    pub(super) fn new(
+        config: &'a LearnerConfig,
+        history: EvaluationHistory,
+        pending: Vec<PendingEvaluation>,
+    ) -> Self {
+        let store = EvaluationStore::new(&config.out, history);
+        Self { config, store, pending: pending.into() }
+    }
+
+    /// Returns the complete evaluations.
+    pub(super) const fn history(&self) -> &EvaluationHistory {
+        self.store.history()
+    }
+
+    /// Returns the pending evaluations, oldest first.
+    pub(super) const fn pending(&self) -> &VecDeque<PendingEvaluation> {
+        &self.pending
+    }
+
+    /// Returns true if an evaluation follows the round that was learned last.
+    pub(super) fn is_due(&self, round: u64) -> bool {
+        round.is_multiple_of(self.config.run.rounds_per_evaluation())
+    }
+
+    /// Schedules an evaluation of the present parameters. The caller orders its episodes; a checkpoint in between
+    /// contains it.
+    pub(super) fn schedule(&mut self, trainer: &Trainer, stats: &RoundStats, wall_s: f64) {
+        self.pending.push_back(PendingEvaluation {
+            counters: trainer.counters(),
+            stats: *stats,
+            wall_s,
+            policy: trainer.policy(BTreeMap::new()),
+        });
+    }
+
+    /// Returns true if the newest pending evaluation is that of the parameters after `round`.
+    pub(super) fn is_pending(&self, round: u64) -> bool {
+        self.pending.back().is_some_and(|pending| pending.counters.round == round)
+    }
+
+    /// Returns true if the parameters after `round` are evaluated or being evaluated.
+    pub(super) fn covers(&self, round: u64) -> bool {
+        let rows = &self.history().rows;
+        self.is_pending(round) || rows.last().is_some_and(|row| row.round == round)
+    }
+
+    /// Returns the parameter version of the oldest pending evaluation.
+    pub(super) fn oldest_version(&self) -> Option<u64> {
+        self.pending.front().map(|pending| pending.counters.round)
+    }
+
+    /// Returns true if an evaluation must be complete after `round`. It depends on the round alone, because the
+    /// result of an evaluation may end the run.
+    pub(super) fn is_overdue(&self, round: u64) -> bool {
+        self.oldest_version().is_some_and(|version| round >= version + MAX_PENDING_ROUNDS)
+    }
+
+    /// Completes the oldest pending evaluation with its episodes: adds its row, and its policy if it is the best.
+    pub(super) fn complete(&mut self, episodes: &[Episode]) {
+        let Some(pending) = self.pending.pop_front() else { return };
+        let mut row = self.training_row(&pending);
+        let outcomes: Vec<EpisodeOutcome> = episodes.iter().map(EpisodeOutcome::of).collect();
+        add_summary(&mut row, &EvaluationSummary::of(&outcomes));
+        let is_cooldown = row.round > 0 && self.config.run.is_cooldown(row.round - 1);
+        let best = self.history().best_row();
+        row.best = best.is_none_or(|best| is_better(&row, best, is_cooldown));
+        EvaluationFinished {
+            round: row.round,
+            env_steps: row.env_steps,
+            success: row.success,
+            success_low: row.success_low,
+            success_high: row.success_high,
+            collision_rate: row.collision_rate,
+            mean_q: row.mean_q,
+            best: row.best,
+        }
+        .emit();
+        let policy = Policy { metadata: self.metadata(&row), ..pending.policy };
+        self.store.add(row, policy);
+    }
+
+    /// Writes the files that are out of date; returns those that could not be written.
+    pub(super) fn write(&mut self) -> Vec<UnwrittenFile> {
+        self.store.write()
+    }
+
+    /// Returns true if a file is out of date.
+    pub(super) const fn has_unwritten(&self) -> bool {
+        self.store.is_due()
+    }
+
+    /// Returns the metadata of an evaluated policy's file.
+    fn metadata(&self, row: &MetricsRow) -> BTreeMap<String, String> {
+        let run = &self.config.run;
+        let entries = [
+            ("run", run.name.clone()),
+            ("seed", run.seed.to_string()),
+            ("recipe", if run.recipe == Recipe::Tandem { "tandem" } else { "paper" }.to_owned()),
+            ("strategy", run.advice.strategy.clone()),
+            ("advice_share", run.advice.share.to_string()),
+            ("substeps", run.world.substeps.to_string()),
+            ("program", self.config.version.clone()),
+            ("env_steps", row.env_steps.to_string()),
+            ("updates", row.updates.to_string()),
+            ("advice_spent", row.advice_spent.to_string()),
+            ("wall_s", format!("{:.1}", row.wall_s)),
+            ("evaluation_seed", run.evaluation.seed.to_string()),
+            ("evaluation_episodes", row.n_episodes.to_string()),
+            ("evaluation_success", row.success.to_string()),
+        ];
+        entries.into_iter().map(|(key, value)| (key.to_owned(), value)).collect()
+    }
+
+    /// Returns a row with the state of training and without the evaluation's results.
+    fn training_row(&self, pending: &PendingEvaluation) -> MetricsRow {
+        let PendingEvaluation { counters, stats, wall_s, .. } = pending;
+        MetricsRow {
+            round: counters.round,
+            env_steps: counters.env_steps,
+            episodes: counters.episodes,
+            updates: counters.updates,
+            paper_epochs: counters.round as f64 / ROUNDS_PER_PAPER_EPOCH,
+            wall_s: *wall_s,
+            mean_q: stats.mean_q,
+            critic_loss: stats.critic_loss,
+            actor_loss: stats.actor_loss,
+            advice_spent: counters.advice_spent,
+            budget_left: budget_left(self.config, *counters),
+            training_success: stats.training_success,
+            training_moved: stats.training_moved,
+            ..MetricsRow::default()
+        }
+    }
+}
+
+fn add_summary(row: &mut MetricsRow, summary: &EvaluationSummary) {
+    row.n_episodes = summary.n_episodes as u64;
+    row.success = summary.success;
+    row.success_low = summary.interval.low;
+    row.success_high = summary.interval.high;
+    row.success_joint = summary.success_joint;
+    row.success_per_arm.clone_from(&summary.success_per_arm);
+    row.collision_rate = summary.collision_rate;
+    row.collision_rate_before_success = summary.collision_rate_before_success;
+    row.moved = summary.moved;
+    row.mean_return = summary.mean_return;
+}
+
+/// Returns true if an evaluation is better than an earlier one: more success, or the same with fewer contacts. During
+/// the cooldown the policy improves by less than 240 goals can measure, so the later one wins unless the intervals are
+/// disjoint.
+fn is_better(row: &MetricsRow, than: &MetricsRow, is_cooldown: bool) -> bool {
+    if is_cooldown && row.success_high >= than.success_low {
+        return true;
+    }
+    row.success > than.success
+        || (row.success >= than.success && row.collision_rate < than.collision_rate)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_later_of_two_similar_policies_is_best_only_in_the_cooldown() {
+        let row = |success, [success_low, success_high]: [f64; 2], collision_rate| MetricsRow {
+            success,
+            success_low,
+            success_high,
+            collision_rate,
+            ..MetricsRow::default()
+        };
+        let lucky = row(1.0, [0.984, 1.0], 0.02);
+        let similar = row(0.983, [0.958, 0.994], 0.02);
+        let worse = row(0.9, [0.856, 0.932], 0.0);
+        assert!(is_better(&similar, &lucky, true));
+        assert!(!is_better(&similar, &lucky, false));
+        assert!(!is_better(&worse, &lucky, true));
+        assert!(is_better(&row(1.0, [0.984, 1.0], 0.01), &lucky, false), "fewer contacts");
+    }
+}

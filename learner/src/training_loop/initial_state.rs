@@ -1,0 +1,178 @@
+//! The state with which a run starts: new, or from its newest checkpoint.
+
+use std::path::Path;
+
+use tandem_core::work::{PublishedActor, RunTerms};
+use tandem_proto::pb;
+use tandem_rl::trainer::Trainer;
+use tandem_system::atomic_file;
+use tandem_telemetry::events::RunResumed;
+
+use super::evaluations::Evaluations;
+use super::persistence::Persistence;
+use super::progress_publisher::ProgressPublisher;
+use super::run_lock::RunLock;
+use super::{Context, LearnerLoop, UNITS_PER_EPISODE};
+use crate::advice_account::{AccountOptions, AdviceAccount, RunStart};
+use crate::checkpoint::{self, CheckpointError, Restored, Resumption};
+use crate::error::Error;
+use crate::evaluation_store::{EvaluationHistory, PendingEvaluation};
+use crate::progress::Phase;
+use crate::shared::LearnerConfig;
+
+/// The state with which a run starts.
+pub(super) struct InitialState {
+    pub(super) trainer: Trainer,
+    resumption: Resumption,
+    is_resumed: bool,
+    lock: RunLock,
+}
+
+impl InitialState {
+    /// Locks the run directory and loads the newest checkpoint, or creates the state of a new run.
+    pub(super) fn load(context: Context<'_>) -> Result<Self, Error> {
+        let config = context.config;
+        let lock = RunLock::take(config, context.shutdown)?;
+        let checkpoints = config.out.join("checkpoint");
+        let restored = if config.resume {
+            checkpoint::load_newest(&checkpoints, &config.run)?
+        } else {
+            refuse_former_run(&config.out)?;
+            None
+        };
+        let is_resumed = restored.is_some();
+        let (mut trainer, resumption) = match restored {
+            Some(Restored { path, trainer, resumption }) => {
+                RunResumed { round: trainer.counters().round, path: &path }.emit();
+                (trainer, resumption)
+            }
+            None => {
+                if config.resume {
+                    tracing::info!(path = ?checkpoints, "no checkpoint yet, the run starts anew");
+                }
+                new_run(config)?
+            }
+        };
+        trainer.set_threads(config.n_threads);
+        Ok(Self { trainer, resumption, is_resumed, lock })
+    }
+
+    /// Opens the run's account at the teacher if the run asks for advice.
+    pub(super) fn open_account(
+        &self,
+        context: Context<'_>,
+    ) -> Result<Option<AdviceAccount>, Error> {
+        let config = context.config;
+        let advice = &config.run.advice;
+        if !advice.asks() {
+            return Ok(None);
+        }
+        let address =
+            config.teacher.as_deref().ok_or_else(|| Error::NoTeacher(advice.strategy.clone()))?;
+        let options = AccountOptions {
+            dial: &config.dial,
+            address,
+            terms: pb::OpenAccountRequest {
+                name: config.run.name.clone(),
+                budget: advice.budget,
+                strategy: advice.strategy.clone(),
+            },
+            units_per_episode: UNITS_PER_EPISODE,
+            start: match self.is_resumed {
+                true => RunStart::Resumed { spent: self.trainer.counters().advice_spent },
+                false => RunStart::New,
+            },
+        };
+        let warnings = &context.shared.warnings;
+        Ok(Some(AdviceAccount::open(options, warnings, context.runtime, context.shutdown)?))
+    }
+}
+
+/// Returns the state before the first round.
+fn new_run(config: &LearnerConfig) -> Result<(Trainer, Resumption), Error> {
+    let mut trainer = Trainer::new(config.run.clone())?;
+    if config.run.advice.starts_from_teacher() {
+        let none = || {
+            let needs = "needs the teacher's policy file: give it by --start-from";
+            Error::StartFrom(needs.to_owned())
+        };
+        let teacher = config.start_from.as_ref().ok_or_else(none)?;
+        trainer.start_from(teacher).map_err(Error::StartFrom)?;
+    }
+    let (acting, history) = (trainer.publish(), EvaluationHistory::default());
+    Ok((trainer, Resumption { acting, history, pending: Vec::new(), wall_s: 0.0 }))
+}
+
+impl<'a> LearnerLoop<'a> {
+    /// Creates the loop, publishes the parameters that workers need, and orders pending evaluations again.
+    pub(super) fn new(
+        context: Context<'a>,
+        initial: InitialState,
+        account: Option<AdviceAccount>,
+    ) -> Self {
+        let Context { config, shared, .. } = context;
+        let InitialState { trainer, resumption, lock, .. } = initial;
+        let Resumption { acting, history, pending, wall_s } = resumption;
+        let terms = RunTerms {
+            layout: trainer.layout,
+            account: account.as_ref().map(|account| account.name().to_owned()),
+            exploration: config.run.exploration,
+            world: config.run.world,
+        };
+        publish_parameters(context, &pending, &acting, &trainer);
+        let mut learner = Self {
+            context,
+            trainer,
+            acting,
+            account,
+            evaluations: Evaluations::new(config, history, pending),
+            persistence: Persistence::new(config, &shared.warnings, lock),
+            progress: ProgressPublisher::new(config, shared, wall_s),
+        };
+        for pending in learner.evaluations.pending() {
+            learner.order(learner.trainer.evaluation_orders(pending.counters.round));
+        }
+        learner.write_records();
+        learner.publish_progress(Phase::Starting);
+        learner.progress.publish_evaluations(learner.evaluations.history());
+        shared.lock().terms = Some(terms);
+        learner
+    }
+}
+
+/// Publishes the parameters of pending evaluations, of the next round, and the newest ones.
+fn publish_parameters(
+    context: Context<'_>,
+    pending: &[PendingEvaluation],
+    acting: &PublishedActor,
+    trainer: &Trainer,
+) {
+    for PendingEvaluation { counters, policy, .. } in pending {
+        context.shared.publish(&policy.published(counters.round));
+    }
+    context.shared.publish(acting);
+    context.shared.publish(&trainer.publish());
+}
+
+/// Refuses to start a new run in the directory of another, which it would overwrite.
+fn refuse_former_run(out: &Path) -> Result<(), CheckpointError> {
+    let has_rows = std::fs::metadata(out.join("metrics.jsonl")).is_ok_and(|file| file.len() > 0);
+    if has_rows || !checkpoint::list(&out.join("checkpoint")).is_empty() {
+        return Err(CheckpointError::RunExists(out.to_owned()));
+    }
+    Ok(())
+}
+
+/// Writes the settings with which the run continues.
+pub(super) fn write_run_file(config: &LearnerConfig) -> Result<(), Error> {
+    let Some(text) = &config.run_file else { return Ok(()) };
+    let path = config.out.join("run.toml");
+    if std::fs::read(&path).is_ok_and(|there| there == text.as_bytes()) {
+        return Ok(());
+    }
+    atomic_file::replace(&path, text.as_bytes()).map_err(|error| Error::RunDirectory {
+        action: "write",
+        path,
+        source: error.into(),
+    })
+}
