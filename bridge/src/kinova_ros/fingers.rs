@@ -110,7 +110,7 @@ mod tests {
     /// Openings of goals and the exchanges in which they were sent; each is under way for `lasts` exchanges.
     fn goals(
         wanted: impl Fn(u32) -> f64,
-        stands: impl Fn(u32) -> bool,
+        stationary: impl Fn(u32) -> bool,
         lasts: u32,
     ) -> Vec<(u32, f64)> {
         let mut fingers = Fingers::new(FingerSettings::default());
@@ -119,8 +119,8 @@ mod tests {
             if ends == Some(n) {
                 fingers.goal_ended(&n.to_string());
             }
-            if let Some(opening) = fingers.next(wanted(n), stands(n)) {
-                assert!(!fingers.busy() && stands(n));
+            if let Some(opening) = fingers.next(wanted(n), stationary(n)) {
+                assert!(!fingers.busy() && stationary(n));
                 fingers.goal_sent((n + lasts).to_string());
                 ends = Some(n + lasts);
                 goals.push((n, opening));

@@ -180,7 +180,7 @@ fn a_malformed_state_ends_the_connection_and_stops_the_arms() {
         let error = failure(&cause).to_string();
         assert!(error.contains(expected), "{error}");
         test.assert_rests();
-        // Whoever tells the arms to stop does so before the socket is shut.
+        // The driver stops the arms before it closes the socket.
         if fault != Fault::Close {
             eventually("the stops arrive", || {
                 test.side.pass();
@@ -362,7 +362,7 @@ fn commands_do_not_accumulate_if_rosbridge_does_not_read() {
         driver.exchange(&moves(number)).unwrap();
         side.ros().nodes.iter().all(|node| node.n_velocities > 0)
     });
-    // From here on nobody reads.
+    // From here on the peer does not read.
     let error = (number..10_000_000).find_map(|number| driver.exchange(&moves(number)).err());
     assert!(error.unwrap().to_string().contains("rosbridge holds 100 velocities"));
 }

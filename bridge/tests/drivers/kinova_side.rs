@@ -167,9 +167,9 @@ impl Ros {
         self.finish_starts();
         let starting = self.nodes.iter().any(|node| node.starting.is_some());
         let due = self.n_passes.is_multiple_of(self.every) && !starting;
-        let told = due && self.socket.is_some() && self.tell(&state);
+        let published = due && self.socket.is_some() && self.publish(&state);
         self.before = Some(state);
-        told
+        published
     }
 
     /// Reads all messages that have arrived.
@@ -287,7 +287,7 @@ impl Ros {
     }
 
     /// Publishes the states of the arms. Returns whether both were published.
-    fn tell(&mut self, state: &PairState) -> bool {
+    fn publish(&mut self, state: &PairState) -> bool {
         match self.fault {
             Some(Fault::Close) => {
                 self.socket = None;

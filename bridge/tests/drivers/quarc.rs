@@ -80,7 +80,7 @@ impl Test {
         for _ in 0..20 {
             assert_eq!(self.rig.tick(), Phase::Stopped);
         }
-        // The first stop stands, and no reset helps: this driver is done.
+        // The first stop is kept, and a reset fails: this driver cannot be used again.
         assert_eq!(self.rig.executor.stopped_by().unwrap().cause, cause);
         let reset = self.rig.executor.reset(OWNER, self.rig.now_s);
         assert!(matches!(reset, Err(ResetError::States { .. })), "{reset:?}");
@@ -171,7 +171,7 @@ fn arms_that_fall_silent_are_stopped() {
     test.waits.set(false);
     let cause = test.rig.until_stopped();
     assert!(matches!(cause, StopCause::StateStale(_)), "{cause}");
-    // The connection stands: the order to stop gets through.
+    // The connection still works: the order to stop arrives.
     eventually("the arms rest", || {
         test.rig.tick();
         at_rest(&test.side.pair)

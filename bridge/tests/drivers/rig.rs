@@ -99,7 +99,7 @@ impl<D: Driver> Rig<D> {
         for _ in 0..15 {
             assert_eq!(self.tick(), Phase::Stopped);
         }
-        // Some arms tell less often than others.
+        // Some arms report less often than others.
         for _ in 0..100 {
             if let Err(ResetError::States { .. }) = self.executor.reset(OWNER, self.now_s) {
                 self.tick();

@@ -126,7 +126,7 @@ impl Plan {
             Kind::BlockedJoint => matches!(cause, StopCause::Frozen(_) | StopCause::Tracking(_)),
             Kind::TorqueOfContact => matches!(cause, StopCause::Torque(_)),
             Kind::ReportedContact => matches!(cause, StopCause::ContactReported),
-            // A drift that undoes what a joint is told looks like an encoder that is stuck.
+            // A drift that cancels a joint's command looks like a stuck encoder.
             Kind::DriftTogether | Kind::DriftDown => {
                 too_near || matches!(cause, StopCause::Tracking(_) | StopCause::Frozen(_))
             }
@@ -241,7 +241,7 @@ fn two_hundred_of_every_fault_stop_the_arms_within_their_limits() {
     execute_each_kind(N_PER_KIND_WITH_TIME);
 }
 
-#[expect(clippy::print_stdout, reason = "what was seen, for whoever asks with --nocapture")]
+#[expect(clippy::print_stdout, reason = "measurements for --nocapture")]
 fn execute_each_kind(n_per_kind: usize) {
     let (mut n, mut slowest, mut causes) = (0, BTreeMap::new(), BTreeMap::new());
     for idx in 0..n_per_kind * KINDS.len() {

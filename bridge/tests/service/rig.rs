@@ -223,7 +223,7 @@ pub(crate) struct Rig {
 /// A running motion with its signs of life and progress.
 pub(crate) struct Playing {
     pub(crate) signs: mpsc::Sender<pb::ExecuteRequest>,
-    pub(crate) told: Streaming<pb::ExecuteResponse>,
+    pub(crate) responses: Streaming<pb::ExecuteResponse>,
 }
 
 impl Rig {
@@ -332,8 +332,8 @@ impl Rig {
         let (signs, requests) = mpsc::channel(8);
         let start = pb::ExecuteStart { token: token.to_owned(), motion: Some(motion) };
         signs.send(request(pb::execute_request::Request::Start(start))).await.unwrap();
-        let told = self.client.execute(ReceiverStream::new(requests)).await;
-        told.map(Response::into_inner).map(|told| Playing { signs, told })
+        let responses = self.client.execute(ReceiverStream::new(requests)).await;
+        responses.map(Response::into_inner).map(|responses| Playing { signs, responses })
     }
 
     /// Starts a motion that takes minutes.
@@ -363,7 +363,7 @@ impl Playing {
     }
 
     pub(crate) async fn next(&mut self) -> Result<pb::ExecuteResponse, Status> {
-        let next = tokio::time::timeout(DEADLINE, self.told.message()).await.unwrap();
+        let next = tokio::time::timeout(DEADLINE, self.responses.message()).await.unwrap();
         next.map(|response| response.expect("an outcome comes before the end"))
     }
 
@@ -379,7 +379,10 @@ impl Playing {
                 phases.push(phase);
             }
             if response.outcome.is_some() {
-                assert!(self.told.message().await.unwrap().is_none(), "nothing after the outcome");
+                assert!(
+                    self.responses.message().await.unwrap().is_none(),
+                    "nothing after the outcome"
+                );
                 return Ok((response, phases));
             }
         }
