@@ -1,22 +1,23 @@
 //! The contract between the executor and a pair of arms, simulated or real.
 //!
-//! **One exchange per period.** The executor calls [`Driver::exchange`] once every [`Driver::period_s`]: the driver sends a
-//! command and returns the newest state. The call waits at most one period. If no new state has arrived, it returns the
-//! previous one again, with the same sequence number. Angles, rates and torques are those of the joints, from base to
-//! wrist, by Kinova's convention (see [`tandem_kinematics::model`]), in radians, radians per second and newton metres.
+//! **One exchange per period.** The executor calls [`Driver::exchange`] once every [`Driver::period_s`]: the driver
+//! sends a command and returns the newest state. The call waits at most one period. If no new state has arrived, it
+//! returns the previous one again, with the same sequence number. Angles, rates and torques are those of the joints,
+//! from base to wrist, by Kinova's convention (see [`tandem_kinematics::model`]), in radians, radians per second and
+//! newton metres.
 //!
-//! **Silence stops the arms.** A command holds for one period. Every driver must ensure that the arms brake by themselves if
-//! no command arrives for [`SILENCE_S`], including when its own process is killed:
+//! **Silence stops the arms.** A command holds for one period. Every driver must ensure that the arms brake by
+//! themselves if no command arrives for [`SILENCE_S`], including when its own process is killed:
 //!
 //! - The simulated pair (crate `tandem-trials`) counts simulated time since the last command and brakes.
-//! - **QUARC** (one vector of doubles per sample over TCP): the receiving model holds its last input and would continue to
-//!   move. The vector therefore contains the command's number, and the model must set the velocities to zero if the number
-//!   has not changed for [`SILENCE_S`] or its stream server reports a lost peer. The driver closes the socket if a vector
-//!   is incomplete, not finite or out of sequence.
+//! - **QUARC** (one vector of doubles per sample over TCP): the receiving model holds its last input and would continue
+//!   to move. The vector therefore contains the command's number, and the model must set the velocities to zero if the
+//!   number has not changed for [`SILENCE_S`] or its stream server reports a lost peer. The driver closes the socket if
+//!   a vector is incomplete, not finite or out of sequence.
 //! - **kinova-ros**: the arm follows joint velocities only while they are published at 100 Hz, and stops otherwise. The
-//!   driver publishes once per exchange and at no other time, so a killed process is silent at once. On [`Order::Stop`] it
-//!   publishes nothing and calls the node's `in/stop`. Queues in between (rosbridge) must have length 1, because the arm
-//!   would execute all commands of a longer queue.
+//!   driver publishes once per exchange and at no other time, so a killed process is silent at once. On [`Order::Stop`]
+//!   it publishes nothing and calls the node's `in/stop`. Queues in between (rosbridge) must have length 1, because the
+//!   arm would execute all commands of a longer queue.
 
 use tandem_kinematics::Joints;
 
@@ -34,8 +35,8 @@ pub trait Driver {
     /// Returns an error if the connection fails. The arms may still be moving: call [`stop`](Self::stop).
     fn exchange(&mut self, command: &Command) -> Result<PairState, DriverError>;
 
-    /// Stops the drives by all available means, without waiting for the next exchange. May be called at any time and any
-    /// number of times.
+    /// Stops the drives by all available means, without waiting for the next exchange. May be called at any time and
+    /// any number of times.
     ///
     /// # Errors
     /// Returns an error if the command could not be sent. The drives then brake after [`SILENCE_S`] without commands.
@@ -86,8 +87,8 @@ pub struct ArmCommand {
 /// The state of the arms at one time.
 #[derive(Debug, Clone, PartialEq)]
 pub struct PairState {
-    /// The sequence number of the state. A repeated number means that no new state has arrived; a step other than 1 means
-    /// that states were lost or the arms have restarted.
+    /// The sequence number of the state. A repeated number means that no new state has arrived; a step other than 1
+    /// means that states were lost or the arms have restarted.
     pub sequence: u64,
     /// The time of the measurement by the arms' own clock, seconds.
     pub stamp_s: f64,

@@ -1,14 +1,14 @@
 //! Plays a checked motion through a driver, period by period, and stops the arms on any fault.
 //!
 //! **States.** The arms start *stopped*. [`reset`](Executor::reset) makes them *idle* and [`start`](Executor::start)
-//! *moving*; at the end of the motion they *settle* and are idle again. While the owner or the states are late, a motion
-//! *holds*: it comes to rest on its path and resumes by itself. Every other fault, in any state, and every call of
-//! [`stop`](Executor::stop) makes the arms *stopped*: each later command is [`Order::Stop`] until an owner resets them. A
-//! [`Stop`] records the time, the place and the cause; later causes do not replace the first one.
+//! *moving*; at the end of the motion they *settle* and are idle again. While the owner or the states are late, a
+//! motion *holds*: it comes to rest on its path and resumes by itself. Every other fault, in any state, and every call
+//! of [`stop`](Executor::stop) makes the arms *stopped*: each later command is [`Order::Stop`] until an owner resets
+//! them. A [`Stop`] records the time, the place and the cause; later causes do not replace the first one.
 //!
-//! **Each tick** sends one command and receives one state. `playback.rs` computes the motion's velocities, corrects them
-//! by the tracking error and keeps them within the limits; `envelope.rs` then checks the result independently; `monitor.rs`
-//! validates the state that comes back.
+//! **Each tick** sends one command and receives one state. `playback.rs` computes the motion's velocities, corrects
+//! them by the tracking error and keeps them within the limits; `envelope.rs` then checks the result independently;
+//! `monitor.rs` validates the state that comes back.
 //!
 //! **Ownership.** The client with the token owns the arms as long as it renews its lease
 //! ([`acquire`](Executor::acquire)). Only the owner starts motions and resets. Any caller may stop the arms.
@@ -134,8 +134,8 @@ impl<D: Driver> Executor<D> {
         &self.checker
     }
 
-    /// Checks `motion` and starts it from the position of the arms, at `speed` (in (0, 1], a share of the motion's own).
-    /// The check of a long motion takes longer than a period: see [`start_checked`](Self::start_checked).
+    /// Checks `motion` and starts it from the position of the arms, at `speed` (in (0, 1], a share of the motion's
+    /// own). The check of a long motion takes longer than a period: see [`start_checked`](Self::start_checked).
     ///
     /// # Errors
     /// Returns the fault of the motion, or the reason why no motion can start now. Nothing moves then.
@@ -231,8 +231,8 @@ impl<D: Driver> Executor<D> {
         Ok(())
     }
 
-    /// Replaces a driver that has failed by one with a new connection to the same arms. The arms stay stopped, the first
-    /// commands of the new driver are stops, commands are counted from 1, and earlier states are discarded.
+    /// Replaces a driver that has failed by one with a new connection to the same arms. The arms stay stopped, the
+    /// first commands of the new driver are stops, commands are counted from 1, and earlier states are discarded.
     ///
     /// # Errors
     /// Returns an error if the client with `token` does not own the arms, they are not stopped, or the driver has not

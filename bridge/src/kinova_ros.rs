@@ -12,32 +12,32 @@
 //! | `fingers_action/finger_positions/result` | `kinova_msgs/SetFingersPositionActionResult` | subscribed |
 //! | `in/stop`, `in/start` | `kinova_msgs/Stop`, `kinova_msgs/Start` | called; `in/stop` also empties the arm's queue |
 //!
-//! `joint7` of a velocity, which the arms lack, carries the command's number in millionths. `in/clear_trajectories` is not
-//! called: `in/stop` includes its effect, and its response is meaningless because its handler returns none.
+//! `joint7` of a velocity, which the arms lack, carries the command's number in millionths. `in/clear_trajectories` is
+//! not called: `in/stop` includes its effect, and its response is meaningless because its handler returns none.
 //!
-//! **Velocities** are published once per exchange and arm, and at no other time. The arms require exactly 100 Hz: a lower
-//! rate slows them down, and a higher one fills a queue of 2000 entries in the arm, all of which are executed. A velocity
-//! that cannot be written at once is an error and is discarded.
+//! **Velocities** are published once per exchange and arm, and at no other time. The arms require exactly 100 Hz: a
+//! lower rate slows them down, and a higher one fills a queue of 2000 entries in the arm, all of which are executed. A
+//! velocity that cannot be written at once is an error and is discarded.
 //!
-//! **No backlog** may form in rosbridge either, because the arm would execute all of it. The driver therefore subscribes to
-//! its own velocities: a command has taken effect ([`PairState::newest_command`]) once the velocities of all arms were
-//! published in ROS. An executor stops if commands are in flight for too long, and cannot be reset while there are any. A
-//! velocity of another publisher ends the connection.
+//! **No backlog** may form in rosbridge either, because the arm would execute all of it. The driver therefore
+//! subscribes to its own velocities: a command has taken effect ([`PairState::newest_command`]) once the velocities of
+//! all arms were published in ROS. An executor stops if commands are in flight for too long, and cannot be reset while
+//! there are any. A velocity of another publisher ends the connection.
 //!
-//! **To stop**, the driver ceases to publish and calls `in/stop`. The arm stops because it receives no velocities, also when
-//! the process is killed, and the service prevents other clients from moving it. On the first [`Order::Move`] after a stop,
-//! which an executor sends only after a reset, the driver calls `in/start` and publishes velocities after its response.
-//! kinova-ros reports no states for about 50 ms meanwhile; [`settings`] allows for that.
+//! **To stop**, the driver ceases to publish and calls `in/stop`. The arm stops because it receives no velocities, also
+//! when the process is killed, and the service prevents other clients from moving it. On the first [`Order::Move`]
+//! after a stop, which an executor sends only after a reset, the driver calls `in/start` and publishes velocities after
+//! its response. kinova-ros reports no states for about 50 ms meanwhile; [`settings`] allows for that.
 //!
-//! **Grippers** move only while their arms are stationary, see [`FingerSettings`]. A motion should pause for a second where
-//! it opens or closes a gripper.
+//! **Grippers** move only while their arms are stationary, see [`FingerSettings`]. A motion should pause for a second
+//! where it opens or closes a gripper.
 //!
-//! **States.** A state of the pair is new once both arms have reported, and has the older time stamp. The arms report no
-//! faults. Efforts count as torques only if [`KinovaRosConfig::reports_torques`] is set.
+//! **States.** A state of the pair is new once both arms have reported, and has the older time stamp. The arms report
+//! no faults. Efforts count as torques only if [`KinovaRosConfig::reports_torques`] is set.
 //!
-//! A driver serves one connection. A malformed message, a service that fails or does not respond, and a lost connection end
-//! it: the driver stops the arms if it still can, and every later exchange returns that first error. To continue, create a
-//! new driver and reset the executor.
+//! A driver serves one connection. A malformed message, a service that fails or does not respond, and a lost connection
+//! end it: the driver stops the arms if it still can, and every later exchange returns that first error. To continue,
+//! create a new driver and reset the executor.
 
 use std::time::Duration;
 
@@ -74,8 +74,8 @@ pub struct KinovaRosConfig {
     pub answer_exchanges: u32,
     /// Largest difference between the time stamps of the two arms' states, seconds. Default 0.1.
     pub skew_s: f64,
-    /// Whether the nodes have `torque_parameters/publish_torque_with_gravity_compensation` set, so that efforts are torques
-    /// without the arm's own weight. Default false: torques are not used.
+    /// Whether the nodes have `torque_parameters/publish_torque_with_gravity_compensation` set, so that efforts are
+    /// torques without the arm's own weight. Default false: torques are not used.
     pub reports_torques: bool,
     /// The goals of the grippers.
     pub fingers: FingerSettings,
@@ -86,7 +86,8 @@ pub struct KinovaRosConfig {
 pub struct KinovaArm {
     /// The driver's node, such as `/left/m1n4s200_driver`. Topics and services are below it.
     pub node: String,
-    /// The prefix of the joints' names, such as `m1n4s200_`: the node's parameter `robot_name` or else its type, and `_`.
+    /// The prefix of the joints' names, such as `m1n4s200_`: the node's parameter `robot_name` or else its type, and
+    /// `_`.
     pub joint_prefix: String,
 }
 
@@ -175,8 +176,8 @@ impl KinovaRosDriver {
         Err(DriverError::Disconnected { what })
     }
 
-    /// Returns the newest state, and waits at most `timeout` for a new one. Sends no command, so it suits arms that are only
-    /// monitored.
+    /// Returns the newest state, and waits at most `timeout` for a new one. Sends no command, so it suits arms that are
+    /// only monitored.
     ///
     /// # Errors
     /// As [`Driver::exchange`].
@@ -304,8 +305,8 @@ impl KinovaRosDriver {
         self.socket.send(velocities)
     }
 
-    /// Returns the newest state with the number of the newest command that was published for all arms; `number` is the last
-    /// command.
+    /// Returns the newest state with the number of the newest command that was published for all arms; `number` is the
+    /// last command.
     fn state(&self, number: u64) -> PairState {
         let oldest = self.arms.iter().filter_map(|arm| arm.in_flight.front());
         let newest = oldest.map(|(number, _)| number - 1).min().unwrap_or(number);

@@ -4,11 +4,12 @@
 //! driver and enforces the limits of every command. [`work_cell`] places the arms and defines the limits of their
 //! motions. [`service`] offers the arms as `tandem.v1.Bridge`.
 //!
-//! The drivers of real arms are [`quarc`], for arms behind a Simulink model with QUARC, and [`kinova_ros`], for arms behind
-//! Kinova's ROS driver. The crate knows neither policies nor a simulator; crate `tandem-trials` has a simulated driver.
+//! The drivers of real arms are [`quarc`], for arms behind a Simulink model with QUARC, and [`kinova_ros`], for arms
+//! behind Kinova's ROS driver. The crate knows neither policies nor a simulator; crate `tandem-trials` has a simulated
+//! driver.
 //!
-//! The crate reads no clock: callers pass the time in seconds since an arbitrary start. Only the service and the drivers of
-//! real arms know a wire format.
+//! The crate reads no clock: callers pass the time in seconds since an arbitrary start. Only the service and the
+//! drivers of real arms know a wire format.
 #![warn(missing_docs)]
 
 pub mod driver;

@@ -1,14 +1,14 @@
 //! Arms behind Quanser's QUARC: a Simulink model that communicates through a stream block.
 //!
-//! **The wire** is TCP (`tcpip://host:port` in QUARC's notation). It carries only vectors of doubles, one per sample in each
-//! direction, without header or length. [`codec`] has the tables. The model sends a state in every sample, with or without
-//! a command.
+//! **The wire** is TCP (`tcpip://host:port` in QUARC's notation). It carries only vectors of doubles, one per sample in
+//! each direction, without header or length. [`codec`] has the tables. The model sends a state in every sample, with or
+//! without a command.
 //!
 //! **Requirements of the model**, because a stream block repeats its last value:
 //!
 //! 1. Set all velocities to zero until an order to stop arrives if the command's number has not changed for
-//!    [`SILENCE_S`](crate::driver::SILENCE_S), if the stream block is not connected, and in every sample before the first
-//!    command of a connection.
+//!    [`SILENCE_S`](crate::driver::SILENCE_S), if the stream block is not connected, and in every sample before the
+//!    first command of a connection.
 //! 2. Do the same, and report a drive fault, on a command that does not start with its mark, has a number that is not
 //!    finite, or an order other than 0 and 1.
 //! 3. Brake at once on order 0, regardless of its number, which may repeat that of the previous command.
@@ -17,14 +17,14 @@
 //! 5. Report the number of the newest command in effect. The executor stops if commands have no effect.
 //! 6. Enforce the arms' own limits (speed, torque, range). The bridge enforces them too; neither relies on the other.
 //!
-//! **A driver serves one connection.** A number that is not finite, an unknown flag, a jump in the sequence, a vector that
-//! stays incomplete, a command that cannot be written at once and a closed connection end it: the driver stops the arms if
-//! it still can, closes the socket and returns that first error from every later exchange. To continue, connect again and
-//! give the new driver to the executor, which stays stopped until a reset. Connecting moves nothing: the driver refuses a
-//! motion before an order to stop was exchanged, and commands are counted from 1.
+//! **A driver serves one connection.** A number that is not finite, an unknown flag, a jump in the sequence, a vector
+//! that stays incomplete, a command that cannot be written at once and a closed connection end it: the driver stops the
+//! arms if it still can, closes the socket and returns that first error from every later exchange. To continue, connect
+//! again and give the new driver to the executor, which stays stopped until a reset. Connecting moves nothing: the
+//! driver refuses a motion before an order to stop was exchanged, and commands are counted from 1.
 //!
-//! **Either side may connect.** [`QuarcDriver::connect`] connects to a Stream Server block. If a Stream Client block connects
-//! to the bridge, accept its connection and pass it to [`QuarcDriver::over`].
+//! **Either side may connect.** [`QuarcDriver::connect`] connects to a Stream Server block. If a Stream Client block
+//! connects to the bridge, accept its connection and pass it to [`QuarcDriver::over`].
 
 use std::io::{ErrorKind, Read as _, Write as _};
 use std::net::{Shutdown, TcpStream, ToSocketAddrs as _};
@@ -51,8 +51,8 @@ pub struct QuarcConfig {
     pub period_s: f64,
     /// Time limit of the connection, and then of the first state. Default 3 s each.
     pub connect_timeout: Duration,
-    /// Time for which an exchange waits for a state if none has arrived. Default 2 ms; must be shorter than the period. It
-    /// compensates for the jitter of two clocks with the same period.
+    /// Time for which an exchange waits for a state if none has arrived. Default 2 ms; must be shorter than the period.
+    /// It compensates for the jitter of two clocks with the same period.
     pub wait: Duration,
     /// Exchanges after which an incomplete vector ends the connection. Default 3.
     pub partial_exchanges: u32,
@@ -126,8 +126,8 @@ impl QuarcDriver {
         Err(unreachable(why))
     }
 
-    /// Takes over an existing connection and waits for its first state. Sends nothing. The configured address only appears in
-    /// messages.
+    /// Takes over an existing connection and waits for its first state. Sends nothing. The configured address only
+    /// appears in messages.
     ///
     /// # Errors
     /// Returns an error if the connection does not send states.
@@ -152,8 +152,8 @@ impl QuarcDriver {
         })
     }
 
-    /// Returns the newest state, and waits at most `timeout` for a new one. Sends no command, so it suits arms that are only
-    /// monitored.
+    /// Returns the newest state, and waits at most `timeout` for a new one. Sends no command, so it suits arms that are
+    /// only monitored.
     ///
     /// # Errors
     /// As [`Driver::exchange`].
@@ -179,8 +179,8 @@ impl QuarcDriver {
         })
     }
 
-    /// Writes a whole command without waiting. The rest of a partly written command would arrive late, and a late command is
-    /// wrong.
+    /// Writes a whole command without waiting. The rest of a partly written command would arrive late, and a late
+    /// command is wrong.
     fn send(&mut self, command: &Command) -> Result<(), DriverError> {
         let bytes = codec::to_bytes(&codec::encode_command(command, self.config.period_s)?);
         match self.stream.write(&bytes) {
@@ -274,7 +274,8 @@ impl Driver for QuarcDriver {
         })
     }
 
-    /// Sends an order to stop. If that fails, the socket is closed and the model brakes because it receives no commands.
+    /// Sends an order to stop. If that fails, the socket is closed and the model brakes because it receives no
+    /// commands.
     fn stop(&mut self) -> Result<(), DriverError> {
         let stop = Command { number: self.number, order: Order::Stop };
         self.unless_failed(|driver| driver.send(&stop))

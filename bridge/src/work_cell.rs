@@ -1,8 +1,8 @@
 //! The placement of the arms and the limits of their motions.
 //!
-//! Lengths are not scaled: a metre of the training world is a metre here. The bases are 0.27 m behind the centres of their
-//! workspaces, where the gripper of the Mico with four joints tilts least. Measured on points drawn uniformly from the
-//! tasks' area (example `area` of `tandem-kinematics`):
+//! Lengths are not scaled: a metre of the training world is a metre here. The bases are 0.27 m behind the centres of
+//! their workspaces, where the gripper of the Mico with four joints tilts least. Measured on points drawn uniformly
+//! from the tasks' area (example `area` of `tandem-kinematics`):
 //!
 //! | share of points with a tilt of at most | 15° | 25° | 40° |
 //! |---|---|---|---|
@@ -20,8 +20,8 @@ pub fn mico_cell() -> WorkCell {
     WorkCell { task_frame: TaskFrame { scale: 1.0, ..TaskFrame::MICO_4 }, ..half }
 }
 
-/// Returns the limits of the check before a motion: a tilt of at most 45 degrees, 4 mm above the table, 20 mm between arms,
-/// 5 mm between parts of one arm.
+/// Returns the limits of the check before a motion: a tilt of at most 45 degrees, 4 mm above the table, 20 mm between
+/// arms, 5 mm between parts of one arm.
 ///
 /// The gaps are larger than those of the envelope during the motion (1, 12 and 2 mm), so that the stopping paths of a
 /// motion along these limits keep the envelope's limits.

@@ -27,8 +27,8 @@ pub(crate) const fn name(driver: DriverName) -> &'static str {
 /// Connects to the real arms at an address.
 type Connect = fn(&str) -> Result<BoxDriver, DriverError>;
 
-/// Returns an executor for the arms that the command line names, and the function that connects to them again. Simulated
-/// arms do not lose their connection.
+/// Returns an executor for the arms that the command line names, and the function that connects to them again.
+/// Simulated arms do not lose their connection.
 pub(crate) fn arms(
     args: &BridgeServeArgs,
     clock: Arc<dyn Clock>,

@@ -1,14 +1,14 @@
 //! A simulated pair of Kinova Micos with its own physics.
 //!
-//! The pair replaces real arms in trials, so it differs from the training world on purpose: it has joints instead of a free
-//! hand, a gripper that tilts with the joints, two fingers, delayed commands, speeds that follow with a lag, noisy encoders
-//! and delayed cameras. The arms' shapes are those of `tandem-kinematics`, whose capsules include about a centimetre of
-//! margin. Contacts between arms, with the table and within one arm are those of the capsules; objects collide with thinner
-//! shells. An arm that touches itself reports a contact.
+//! The pair replaces real arms in trials, so it differs from the training world on purpose: it has joints instead of a
+//! free hand, a gripper that tilts with the joints, two fingers, delayed commands, speeds that follow with a lag, noisy
+//! encoders and delayed cameras. The arms' shapes are those of `tandem-kinematics`, whose capsules include about a
+//! centimetre of margin. Contacts between arms, with the table and within one arm are those of the capsules; objects
+//! collide with thinner shells. An arm that touches itself reports a contact.
 //!
 //! **The gripper** has two pads that slide straight along the closing direction, from 0 to 62 mm each, and extend 36 mm
-//! beyond the tool's origin. At every opening they stay within the capsule of the fingers in `tandem-kinematics`. Kinova's
-//! fingers are hinged and extend up to 44 mm when closed.
+//! beyond the tool's origin. At every opening they stay within the capsule of the fingers in `tandem-kinematics`.
+//! Kinova's fingers are hinged and extend up to 44 mm when closed.
 //!
 //! Time advances only in exchanges, by [`PERIOD_S`] each. The same seed and commands give the same bits.
 
@@ -72,7 +72,8 @@ impl std::fmt::Debug for SimulatedPair {
 }
 
 impl SimulatedPair {
-    /// Creates the arms of `cell` at rest at joint angles `at` (radians, arm by arm), with the grippers at `opening` (0 to 1).
+    /// Creates the arms of `cell` at rest at joint angles `at` (radians, arm by arm), with the grippers at `opening` (0
+    /// to 1).
     ///
     /// # Panics
     /// Panics if there are more than two arms, an arm does not have four joints, or `at` does not match the arms.
@@ -206,7 +207,8 @@ impl SimulatedPair {
         self.cameras.advance(self.drives.n_periods(), || objects(&self.world, time_s));
     }
 
-    /// Converts a force on the tool (world frame, newtons) and the external torques of the disturbance to joint torques.
+    /// Converts a force on the tool (world frame, newtons) and the external torques of the disturbance to joint
+    /// torques.
     fn torques(&self, arm: usize, force_n: DVec3) -> Joints {
         let placed = &self.cell.arms[arm];
         let posture = ForwardKinematics::new(placed.model, &self.drives.arms[arm].angles);

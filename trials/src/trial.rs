@@ -1,12 +1,12 @@
 //! Trials: tests of a trained policy on arms that differ from the training world.
 //!
 //! A trial draws a start and goals as the training world does and places blocks of their true size on the simulated
-//! pair's table ([`rehearsal`]). [`TrialMode::OpenLoop`] is the paper's method (section 4.3): the policy's whole episode in
-//! the training world becomes one motion, which is planned, checked and executed without observing the objects.
-//! [`TrialMode::ClosedLoop`] queries the policy before every step with the measurements of cameras and encoders; each step
-//! is planned and checked as a separate motion, from rest to rest. [`TrialMode::Twin`] is an open loop whose motion was
-//! computed by a closed loop on a copy of the pair. All modes use the same executor and envelope. [`outcome`] then evaluates
-//! the final positions of the objects.
+//! pair's table ([`rehearsal`]). [`TrialMode::OpenLoop`] is the paper's method (section 4.3): the policy's whole
+//! episode in the training world becomes one motion, which is planned, checked and executed without observing the
+//! objects. [`TrialMode::ClosedLoop`] queries the policy before every step with the measurements of cameras and
+//! encoders; each step is planned and checked as a separate motion, from rest to rest. [`TrialMode::Twin`] is an open
+//! loop whose motion was computed by a closed loop on a copy of the pair. All modes use the same executor and envelope.
+//! [`outcome`] then evaluates the final positions of the objects.
 //!
 //! [`mapping`] relates the policy's world to the table.
 
@@ -36,8 +36,8 @@ mod runner;
 
 /// Chooses the actions of a trial.
 pub trait ActionSource {
-    /// Writes the action for one observation and goal, each element in [−1, 1]. Shapes: `[n_observation]`, `[n_goal]` and
-    /// `[n_action]` of the layout.
+    /// Writes the action for one observation and goal, each element in [−1, 1]. Shapes: `[n_observation]`, `[n_goal]`
+    /// and `[n_action]` of the layout.
     fn act(&mut self, observation: &[f32], goal: &[f32], action: &mut [f32]);
 }
 
@@ -52,7 +52,8 @@ impl<F: FnMut(&[f32], &[f32], &mut [f32])> ActionSource for F {
 pub enum TrialMode {
     /// One motion, computed from an episode in the training world.
     OpenLoop,
-    /// One motion, computed by a closed loop on a copy of the pair without noise and latency and with 20 % less friction.
+    /// One motion, computed by a closed loop on a copy of the pair without noise and latency and with 20 % less
+    /// friction.
     Twin,
     /// One motion per step, with an observation of the table before each.
     ClosedLoop,

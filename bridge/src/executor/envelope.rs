@@ -1,18 +1,18 @@
 //! The limits of every command, checked independently of its source.
 //!
-//! The envelope checks each command before it is sent, at the measured position of the arms. Speeds and accelerations are
-//! those of the command itself. Ranges and gaps are checked along the **stopping path**: from the measured angles, through
-//! the commands that have not taken effect yet and the new command, to the position where the arms come to rest if they
-//! brake after it. If every command has a stopping path within the limits, the arms can stop within the limits at any
-//! time, along the path of the previous command.
+//! The envelope checks each command before it is sent, at the measured position of the arms. Speeds and accelerations
+//! are those of the command itself. Ranges and gaps are checked along the **stopping path**: from the measured angles,
+//! through the commands that have not taken effect yet and the new command, to the position where the arms come to rest
+//! if they brake after it. If every command has a stopping path within the limits, the arms can stop within the limits
+//! at any time, along the path of the previous command.
 //!
 //! The path is a sequence of joint configurations connected by straight lines in joint space. On a line that turns the
-//! joints by `d`, no point of an arm moves farther than the sum of `d` times the joints' levers. If the gap in the middle
-//! exceeds the limit by half of that, the limit holds on the whole line. Otherwise both halves are checked, down to a
-//! tenth of a millimetre.
+//! joints by `d`, no point of an arm moves farther than the sum of `d` times the joints' levers. If the gap in the
+//! middle exceeds the limit by half of that, the limit holds on the whole line. Otherwise both halves are checked, down
+//! to a tenth of a millimetre.
 //!
-//! For gaps between parts of one arm, the width of a gripper is the larger of its measured and its commanded opening. The
-//! gripper is never wider between the two.
+//! For gaps between parts of one arm, the width of a gripper is the larger of its measured and its commanded opening.
+//! The gripper is never wider between the two.
 
 use tandem_kinematics::model::Joint;
 use tandem_kinematics::{Excess, ForwardKinematics, Joints, PlacedArm, WorkCell};
@@ -33,8 +33,8 @@ const RESOLUTION_M: f64 = 1e-4;
 /// Number of configurations on the braking part of a stopping path.
 const N_BRAKING: u32 = 4;
 
-/// Returns the lowest and highest velocity that a joint may be commanded next, radians per second, if its last command was
-/// `before`. It accelerates no harder than motions do and decelerates no harder than the drives brake.
+/// Returns the lowest and highest velocity that a joint may be commanded next, radians per second, if its last command
+/// was `before`. It accelerates no harder than motions do and decelerates no harder than the drives brake.
 pub(crate) fn reachable(
     joint: &Joint,
     before: f64,
@@ -76,7 +76,8 @@ impl Envelope {
         }
     }
 
-    /// Checks that `commands` keep every limit. `state` is the newest state, `stale_s` its age beyond one period, seconds.
+    /// Checks that `commands` keep every limit. `state` is the newest state, `stale_s` its age beyond one period,
+    /// seconds.
     pub(crate) fn check(
         &self,
         commands: &[ArmCommand],

@@ -63,7 +63,8 @@ pub struct Settings {
 }
 
 impl Default for Settings {
-    /// Values for the simulated pair and for similar arms: commands take effect within 30 ms, joints brake within 50 ms.
+    /// Values for the simulated pair and for similar arms: commands take effect within 30 ms, joints brake within 50
+    /// ms.
     fn default() -> Self {
         Self {
             check: check_settings(),

@@ -1,18 +1,19 @@
 //! The goals of a gripper. Pure.
 //!
-//! kinova-ros moves fingers by an action whose goal is a point in the arm's own queue. The point holds the arm in place, and
-//! velocities that arrive meanwhile wait behind it. A goal that replaces another one, and a goal that ends because the
-//! fingers stall, restart the arm's interface. Therefore:
+//! kinova-ros moves fingers by an action whose goal is a point in the arm's own queue. The point holds the arm in
+//! place, and velocities that arrive meanwhile wait behind it. A goal that replaces another one, and a goal that ends
+//! because the fingers stall, restart the arm's interface. Therefore:
 //!
 //! - a goal is sent only while the arm is commanded to be stationary and no other goal is active;
 //! - the arm receives no velocities while a goal is active, so it is stationary;
-//! - a goal is sent if the desired opening differs from the last goal by a step, or by less and has not changed for a while.
+//! - a goal is sent if the desired opening differs from the last goal by a step, or by less and has not changed for a
+//!   while.
 
 /// The conditions under which goals are sent.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct FingerSettings {
-    /// Turns (kinova-ros' unit of a finger's position) of a closed gripper; open is 0. Kinova recommends 6400; the thread
-    /// ends at 6800. Default 6400.
+    /// Turns (kinova-ros' unit of a finger's position) of a closed gripper; open is 0. Kinova recommends 6400; the
+    /// thread ends at 6800. Default 6400.
     pub shut_turns: f64,
     /// Change of the opening, 0 to 1, that causes a goal at once. Default 0.05.
     pub step: f64,

@@ -35,8 +35,8 @@ impl StateMerger {
         }
     }
 
-    /// Returns a state of the pair once every arm has reported. Its time stamp is the oldest one. An arm whose time stamp is
-    /// too far behind the others has to report again first.
+    /// Returns a state of the pair once every arm has reported. Its time stamp is the oldest one. An arm whose time
+    /// stamp is too far behind the others has to report again first.
     pub(crate) fn take(&mut self) -> Result<Option<PairState>, DriverError> {
         if !self.new.iter().all(|new| *new) {
             return Ok(None);

@@ -1,5 +1,5 @@
-//! The websocket to rosbridge. All waits have a time limit, and messages are not queued: a message that cannot be written
-//! at once is an error.
+//! The websocket to rosbridge. All waits have a time limit, and messages are not queued: a message that cannot be
+//! written at once is an error.
 
 use std::io::ErrorKind;
 use std::net::{Shutdown, TcpStream, ToSocketAddrs as _};

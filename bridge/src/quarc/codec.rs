@@ -1,6 +1,7 @@
 //! Commands and states as vectors of doubles. Pure.
 //!
-//! A vector is a sequence of IEEE 754 doubles, little-endian, without header or padding. Both vectors have a fixed length.
+//! A vector is a sequence of IEEE 754 doubles, little-endian, without header or padding. Both vectors have a fixed
+//! length.
 //!
 //! **Command**, [`COMMAND_LEN`] doubles, to the arms:
 //!

@@ -5,7 +5,8 @@ pub trait Clock: Send + Sync {
     /// Returns the seconds since an arbitrary start. Never decreases.
     fn now_s(&self) -> f64;
 
-    /// Blocks the calling thread until [`now_s`](Self::now_s) reaches `when_s`. Returns at once if that time has passed.
+    /// Blocks the calling thread until [`now_s`](Self::now_s) reaches `when_s`. Returns at once if that time has
+    /// passed.
     fn sleep_until(&self, when_s: f64);
 }
 

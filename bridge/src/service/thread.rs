@@ -99,8 +99,8 @@ struct EndGuard {
 }
 
 impl ArmsThread {
-    /// Moves `executor` to a new thread, which ticks it by `clock` until `ends` is cancelled and then stops the arms. If
-    /// the thread ends for another reason, it cancels `ends`.
+    /// Moves `executor` to a new thread, which ticks it by `clock` until `ends` is cancelled and then stops the arms.
+    /// If the thread ends for another reason, it cancels `ends`.
     pub(super) fn spawn(
         executor: Executor<BoxDriver>,
         clock: Arc<dyn Clock>,
@@ -281,7 +281,8 @@ impl ArmsHandle {
         tokio::time::timeout(CALL_TIMEOUT, snapshots.wait_for(condition)).await.ok();
     }
 
-    /// Runs `work` on the thread before a tick and returns its result. Dropping the future before that cancels the work.
+    /// Runs `work` on the thread before a tick and returns its result. Dropping the future before that cancels the
+    /// work.
     pub(super) async fn run<T: Send + 'static, E: Into<Error> + Send + 'static>(
         &self,
         work: impl FnOnce(&mut ControlLoop, f64) -> Result<T, E> + Send + 'static,

@@ -1,5 +1,5 @@
-//! A stand-in for rosbridge and two nodes of kinova-ros: follows velocities only while they are published, moves fingers
-//! by goals, and serves `in/stop` and `in/start`.
+//! A stand-in for rosbridge and two nodes of kinova-ros: follows velocities only while they are published, moves
+//! fingers by goals, and serves `in/stop` and `in/start`.
 
 use std::collections::BTreeMap;
 use std::net::{SocketAddr, TcpListener, TcpStream};

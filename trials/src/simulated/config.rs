@@ -22,7 +22,8 @@ pub struct SimulatedConfig {
     pub motor_radps2: f64,
     /// Time in which a drive brakes a joint from its highest speed to rest, seconds.
     pub brake_s: f64,
-    /// The opposing torque at which a joint stalls, newton metres, base to wrist. Kinova specifies peaks of 30.5 and 6.8 N m.
+    /// The opposing torque at which a joint stalls, newton metres, base to wrist. Kinova specifies peaks of 30.5 and
+    /// 6.8 N m.
     pub stall_nm: [f64; 4],
     /// Whether the arms report their torques.
     pub reports_torques: bool,
@@ -136,8 +137,8 @@ impl Default for CameraConfig {
 pub struct Disturbance {
     /// A joint that is blocked.
     pub blocked: Option<(ArmIndex, usize)>,
-    /// Errors that the servos add to commanded velocities, radians per second, arm by arm; empty for none. Braking drives
-    /// do not drift.
+    /// Errors that the servos add to commanded velocities, radians per second, arm by arm; empty for none. Braking
+    /// drives do not drift.
     pub drift_radps: Vec<Joints>,
     /// External torques on the joints, newton metres, arm by arm; empty for none.
     pub torque_nm: Vec<Joints>,

@@ -1,5 +1,5 @@
-//! The simulated drives: commands take effect with a delay, joints follow with a lag, and brake by themselves if no command
-//! arrives.
+//! The simulated drives: commands take effect with a delay, joints follow with a lag, and brake by themselves if no
+//! command arrives.
 
 use std::collections::VecDeque;
 

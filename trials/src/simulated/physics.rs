@@ -1,8 +1,8 @@
 //! Table, objects and hands in rapier.
 //!
-//! Hands and forearms are kinematic bodies that follow the joints exactly, including their tilt. Each finger is a separate
-//! body on a prismatic joint along the closing direction, driven by a spring with limited force. The forces of objects on a
-//! hand are converted to torques of the joints.
+//! Hands and forearms are kinematic bodies that follow the joints exactly, including their tilt. Each finger is a
+//! separate body on a prismatic joint along the closing direction, driven by a spring with limited force. The forces of
+//! objects on a hand are converted to torques of the joints.
 
 use glam::{DMat3, DVec3};
 use rapier3d::dynamics::{
@@ -152,8 +152,8 @@ impl PhysicsWorld {
         );
     }
 
-    /// Returns the contact force of objects on a hand in the last physics step, world frame, newtons. Friction, and thus the
-    /// weight of a held object, is excluded.
+    /// Returns the contact force of objects on a hand in the last physics step, world frame, newtons. Friction, and
+    /// thus the weight of a held object, is excluded.
     pub(crate) fn force_n(&self, arm: usize) -> DVec3 {
         let mut impulse = Vector::ZERO;
         for collider in &self.hands[arm].colliders {
@@ -203,7 +203,8 @@ impl PhysicsWorld {
         })
     }
 
-    /// Sets the targets of the fingers' springs. The finger that is ahead is held back, so that a held object stays centred.
+    /// Sets the targets of the fingers' springs. The finger that is ahead is held back, so that a held object stays
+    /// centred.
     fn drive_fingers(&mut self, arm: usize, wanted_m: f32, gripper: &GripperConfig) {
         let openings = self.openings_m(arm);
         let mean_m = 0.5 * (openings[0] + openings[1]);
@@ -295,8 +296,8 @@ impl ArmPoses {
     }
 }
 
-/// Returns `pose` with the quaternion of its rotation that is nearer to `from`. Rapier would interpret the other one as a
-/// full turn.
+/// Returns `pose` with the quaternion of its rotation that is nearer to `from`. Rapier would interpret the other one as
+/// a full turn.
 fn nearest(pose: &Pose, from: &Pose) -> Pose {
     let turn = if pose.rotation.dot(from.rotation) < 0.0 { -pose.rotation } else { pose.rotation };
     Pose::from_parts(pose.translation, turn)

@@ -9,8 +9,8 @@ use tandem_bridge::service::Clock;
 /// The largest number of missed periods that an exchange simulates. After that many the drives have braked.
 const MAX_MISSED: u32 = 10;
 
-/// A simulated pair that does not wait for commands. Before a late command the arms continue to move like real ones, and
-/// they brake by themselves if no command arrives for too long.
+/// A simulated pair that does not wait for commands. Before a late command the arms continue to move like real ones,
+/// and they brake by themselves if no command arrives for too long.
 ///
 /// Only exchanges return states; the periods between them are not reported.
 pub struct RealTimePair {

@@ -1,9 +1,9 @@
 //! The path of one step around the blocks: sideways before down, and down only where there is room.
 //!
-//! In the training world a hand that descends on a block rests on it and slides along. An arm would press until the envelope
-//! stops it. A hand above a block's top therefore moves sideways first, and stays just above a block that its pads would
-//! touch. A hand beside a block moves down first and then sideways, because pads that descend along a block's side press it
-//! onto the table. A hand that holds a block lowers it to the table and no further.
+//! In the training world a hand that descends on a block rests on it and slides along. An arm would press until the
+//! envelope stops it. A hand above a block's top therefore moves sideways first, and stays just above a block that its
+//! pads would touch. A hand beside a block moves down first and then sideways, because pads that descend along a
+//! block's side press it onto the table. A hand that holds a block lowers it to the table and no further.
 
 use glam::{DVec2, DVec3};
 

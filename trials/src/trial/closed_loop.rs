@@ -14,8 +14,8 @@ use crate::trial::rehearsal::TrialStart;
 use crate::trial::rig::{TrialRig, tool_positions};
 use crate::trial::runner::{REST_S, TrialExecution, TrialRunner};
 
-/// A policy is done after this many consecutive observations in which every object was within this share of the tolerance
-/// of its goal.
+/// A policy is done after this many consecutive observations in which every object was within this share of the
+/// tolerance of its goal.
 const DONE_SHARE: f64 = 0.6;
 const DONE_OBSERVATIONS: usize = 5;
 /// Displacements (metres) and changes of the opening (shares) below which a step needs no motion.
@@ -217,8 +217,9 @@ impl TrialRunner {
         Ok(false)
     }
 
-    /// Returns the waypoints of the tools for end effectors that move from `from` to `to` (own frames, metres): a corner,
-    /// the end, and the end again with closed grippers. A gripper that closed while it moves would drag its object along.
+    /// Returns the waypoints of the tools for end effectors that move from `from` to `to` (own frames, metres): a
+    /// corner, the end, and the end again with closed grippers. A gripper that closed while it moves would drag its
+    /// object along.
     fn step_waypoints(
         &self,
         from: &[DVec3],

@@ -1,17 +1,17 @@
 //! The mapping between the policy's observations and actions and the real table.
 //!
 //! **Positions.** Lengths are not scaled. The policy's end effector is the point between the pads. The tool's origin is
-//! [`PADS_AHEAD_M`] behind it along the tilted gripper, and [`HAND_LIFT_M`] higher than in the training world, because the
-//! real fingers extend beyond their pads. Objects and goals keep their positions; heights are measured from a block that
-//! rests on the table, so blocks of any size start at the height that the policy knows.
+//! [`PADS_AHEAD_M`] behind it along the tilted gripper, and [`HAND_LIFT_M`] higher than in the training world, because
+//! the real fingers extend beyond their pads. Objects and goals keep their positions; heights are measured from a block
+//! that rests on the table, so blocks of any size start at the height that the policy knows.
 //!
 //! **Time.** The arms are slower than the training world's hands, and a step takes as long as the arms need. The policy
-//! expects a hand with inertia, so the training world's servo continues its hand ([`Mapping::hand_after`]): the arm moves to
-//! the position of that hand after the step, and the policy observes its velocity. Objects have the hand's velocity to the
-//! extent that they moved with it.
+//! expects a hand with inertia, so the training world's servo continues its hand ([`Mapping::hand_after`]): the arm
+//! moves to the position of that hand after the step, and the policy observes its velocity. Objects have the hand's
+//! velocity to the extent that they moved with it.
 //!
-//! **Openings.** The policy knows a gripper that opens by [`OPENING_M`] on each side and blocks of one size. Three openings
-//! correspond: closed, open, and just touching the block. Openings in between are interpolated linearly.
+//! **Openings.** The policy knows a gripper that opens by [`OPENING_M`] on each side and blocks of one size. Three
+//! openings correspond: closed, open, and just touching the block. Openings in between are interpolated linearly.
 
 use glam::{DQuat, DVec3};
 use tandem_core::{ArmIndex, Layout, Task};
@@ -39,8 +39,8 @@ const SUBSTEP_S: f64 = 0.002;
 const N_SUBSTEPS: u32 = 20;
 /// The duration of a control step, seconds.
 const CONTROL_STEP_S: f64 = 0.04;
-/// The velocity at the end of a step per displacement in it, for objects that move by themselves: the remaining distance
-/// times the servo's gain.
+/// The velocity at the end of a step per displacement in it, for objects that move by themselves: the remaining
+/// distance times the servo's gain.
 const END_VELOCITY_SHARE: f64 = 0.556;
 /// The change of the training world's gripper opening in a step with an action of 1, metres.
 const OPENING_STEP_M: f64 = 0.010;
@@ -104,9 +104,9 @@ impl Mapping {
         self.own(arm, in_world) - DVec3::Z * (self.block_half_m - TRAINED_HALF_M)
     }
 
-    /// Returns the tool's origin (world frame, metres) for the policy's end effector at `own` (own frame, metres), and the
-    /// joint angles near `near` that reach it, radians. Hands that would come nearer to the table than [`TABLE_GAP_M`] are
-    /// raised.
+    /// Returns the tool's origin (world frame, metres) for the policy's end effector at `own` (own frame, metres), and
+    /// the joint angles near `near` that reach it, radians. Hands that would come nearer to the table than
+    /// [`TABLE_GAP_M`] are raised.
     ///
     /// # Errors
     /// Returns an error if the arm cannot reach the position.
@@ -205,8 +205,8 @@ impl Mapping {
         }
     }
 
-    /// Returns the position and velocity of the training world's hand after a step with `action` (one arm's, in [−1, 1])
-    /// from `hand` with `velocity`; own frame, metres and metres per second.
+    /// Returns the position and velocity of the training world's hand after a step with `action` (one arm's, in [−1,
+    /// 1]) from `hand` with `velocity`; own frame, metres and metres per second.
     #[must_use]
     pub fn hand_after(&self, hand: DVec3, velocity: DVec3, action: &[f32]) -> (DVec3, DVec3) {
         let asked = DVec3::from_array([0, 1, 2].map(|axis| f64::from(action[axis])));
@@ -222,8 +222,8 @@ impl Mapping {
         (inside, velocity)
     }
 
-    /// Returns the desired opening of each side of the gripper after a step with `action` from `opening_m`, metres. Objects
-    /// between the pads are ignored: a gripper that holds an object is commanded to close.
+    /// Returns the desired opening of each side of the gripper after a step with `action` from `opening_m`, metres.
+    /// Objects between the pads are ignored: a gripper that holds an object is commanded to close.
     #[must_use]
     pub fn opening_after(&self, opening_m: f64, action: &[f32]) -> f64 {
         match self.layout.task {
