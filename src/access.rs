@@ -1,17 +1,17 @@
-//! Tokens and certificates, from the files that the command line names.
+//! Tokens and certificates from the files that the command line names.
 
 use std::path::Path;
 
-use tandem_net::{AccessError, Dial, Gate, Token, is_exposed};
+use tandem_net::{AccessError, ClientConfig, ServerConfig, Token, is_exposed};
 use tracing::warn;
 
 use crate::cli::{DialArgs, ListenArgs, SecretArgs};
 use crate::exit::{Exit, Failed, OrExit as _};
 use crate::input;
 
-/// Who may call the service; refuses an address that others can reach and nothing protects.
-pub(crate) fn gate(listen: &ListenArgs, secret: &SecretArgs) -> Result<Gate, Failed> {
-    let mut gate = Gate::default();
+/// Returns the access rules of a service; rejects an unprotected address that other machines can reach.
+pub(crate) fn gate(listen: &ListenArgs, secret: &SecretArgs) -> Result<ServerConfig, Failed> {
+    let mut gate = ServerConfig::default();
     if let Some(token) = token(secret)? {
         gate = gate.with_token(token);
     }
@@ -25,25 +25,25 @@ pub(crate) fn gate(listen: &ListenArgs, secret: &SecretArgs) -> Result<Gate, Fai
     }
     if is_exposed(listen.listen) && secret.token_file.is_some() && gate.is_plain() {
         let address = listen.listen;
-        warn!(%address, "without --tls-cert the network can read all that is said, the token included");
+        warn!(%address, "without --tls-cert, others on the network can read all messages and the token");
     }
     Ok(gate)
 }
 
-/// How other services are called.
-pub(crate) fn dial(args: &DialArgs, secret: &SecretArgs) -> Result<Dial, Failed> {
-    let calls = trusting(args)?;
+/// Returns how to call other services.
+pub(crate) fn dial(args: &DialArgs, secret: &SecretArgs) -> Result<ClientConfig, Failed> {
+    let calls = dial_without_token(args)?;
     Ok(match token(secret)? {
         Some(token) => calls.with_token(&token),
         None => calls,
     })
 }
 
-/// How services are called that want no token.
-pub(crate) fn trusting(args: &DialArgs) -> Result<Dial, Failed> {
-    let Some(authority) = &args.tls_ca else { return Ok(Dial::default()) };
+/// Returns how to call services that require no token.
+pub(crate) fn dial_without_token(args: &DialArgs) -> Result<ClientConfig, Failed> {
+    let Some(authority) = &args.tls_ca else { return Ok(ClientConfig::default()) };
     let what = || format!("cannot trust --tls-ca {authority:?}");
-    Dial::default().with_authority(&read(authority)?).or_exit(Exit::Usage, what)
+    ClientConfig::default().with_authority(&read(authority)?).or_exit(Exit::Usage, what)
 }
 
 fn token(secret: &SecretArgs) -> Result<Option<Token>, Failed> {
@@ -58,7 +58,7 @@ fn token(secret: &SecretArgs) -> Result<Option<Token>, Failed> {
     Ok(Some(token))
 }
 
-/// Whether the file's mode lets everybody read it.
+/// Returns whether the mode of the file lets all users read it.
 #[cfg(unix)]
 fn is_readable_by_all(path: &Path) -> bool {
     use std::os::unix::fs::PermissionsExt as _;

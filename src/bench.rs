@@ -1,4 +1,4 @@
-//! `tandem bench`: how fast the parts are on this machine, as rates and as ratios within one run.
+//! `tandem bench`: measures the performance of the parts on this machine, as rates and as ratios within one run.
 
 use std::time::Duration;
 
@@ -23,10 +23,10 @@ use crate::{clock, output};
 mod scale;
 mod teacher;
 
-/// How long one sample of a rate is taken, and how many samples; the best is printed, as the least disturbed.
+/// Duration of a sample and number of samples of a rate. The best sample is printed, as the least disturbed one.
 const SAMPLE: Duration = Duration::from_millis(600);
 const N_SAMPLES: usize = 5;
-/// Edge of the square matrices whose product is the measure of the machine.
+/// Edge of the square matrices whose product is the reference for the machine.
 const SGEMM_EDGE: usize = 256;
 
 /// One measured figure.
@@ -66,7 +66,7 @@ pub(crate) fn bench(args: &BenchArgs) -> Result<(), Failed> {
     Ok(())
 }
 
-/// Calls of `work` a second: the best of several samples.
+/// Returns the calls of `work` per second, the best of several samples.
 fn rate(mut work: impl FnMut()) -> f64 {
     work();
     let sample = |work: &mut dyn FnMut()| {
@@ -81,7 +81,7 @@ fn rate(mut work: impl FnMut()) -> f64 {
     (0..N_SAMPLES).map(|_| sample(&mut work)).fold(0.0, f64::max)
 }
 
-/// Environment steps a second on one core, with random actions, resets and observations included.
+/// Environment steps per second on one core with random actions, including resets and observations.
 fn sim() -> Result<Vec<Figure>, Failed> {
     let mut figures = Vec::new();
     for (task, n_arms) in
@@ -94,17 +94,17 @@ fn sim() -> Result<Vec<Figure>, Failed> {
         let (mut observation, mut action) =
             (vec![0.0; layout.n_observation()], vec![0.0; layout.n_action()]);
         let mut n_episodes = 0;
-        let mut broken = None;
+        let mut failure = None;
         let episodes_per_s = rate(|| {
             world.reset(&mut episode_rng(1, n_episodes, Stream::Reset), WorldSettings::default());
             n_episodes += 1;
             for _ in 0..EPISODE_STEPS {
                 action.iter_mut().for_each(|component| *component = uniform(&mut rng, -1.0, 1.0));
-                broken = world.step(&action).err().or(broken.take());
+                failure = world.step(&action).err().or(failure.take());
                 world.observe(&mut observation);
             }
         });
-        if let Some(error) = broken {
+        if let Some(error) = failure {
             return Err(Failed::new(Exit::Bug, error));
         }
         let value = episodes_per_s * EPISODE_STEPS as f64;
@@ -139,7 +139,7 @@ fn inference() -> Result<Vec<Figure>, Failed> {
     Ok(figures)
 }
 
-/// Updates a second of the two-arm student, with one thread and with two, beside the machine's matrix product.
+/// Updates of the two-arm student per second, with one and with two threads, and their ratio to the matrix product.
 fn update() -> Vec<Figure> {
     let layout = Layout::new(Task::Push, 2);
     let config = RunConfig::defaults(Recipe::Tandem, Task::Push, 2).ddpg;
@@ -172,7 +172,7 @@ fn update() -> Vec<Figure> {
     ]
 }
 
-/// Time to draw one batch by hindsight from a buffer of 2,000 episodes.
+/// Time to sample one batch with hindsight from a buffer of 2,000 episodes.
 fn replay() -> Vec<Figure> {
     let layout = Layout::new(Task::Push, 2);
     let config = RunConfig::defaults(Recipe::Tandem, Task::Push, 2);
@@ -203,7 +203,7 @@ fn drifting_episode(layout: Layout, number: u64, drift_m: f32) -> Episode {
     episode
 }
 
-/// The main job for 30 rounds, evaluations included: its rates and the memory of its processes.
+/// Rates and memory of a training run of 30 rounds with evaluations.
 fn end_to_end() -> Result<Vec<Figure>, Failed> {
     let directory = std::env::temp_dir().join(format!("tandem-bench-{}", std::process::id()));
     let program = std::env::current_exe().or_exit(Exit::Bug, String::new)?;
@@ -214,9 +214,8 @@ fn end_to_end() -> Result<Vec<Figure>, Failed> {
         .output();
     drop(std::fs::remove_dir_all(&directory));
     let output = run.or_exit(Exit::TryAgain, || "cannot start a run".to_owned())?;
-    let summary: Value = serde_json::from_slice(&output.stdout).or_exit(Exit::TryAgain, || {
-        "the short run did not end well; try `tandem train`".to_owned()
-    })?;
+    let summary: Value = serde_json::from_slice(&output.stdout)
+        .or_exit(Exit::TryAgain, || "the short run failed; try `tandem train`".to_owned())?;
     let number = |key: &str| summary[key].as_f64().unwrap_or_default();
     let figure =
         |name: &str, value, unit| Figure { name: format!("end-to-end/{name}"), value, unit };
@@ -229,8 +228,9 @@ fn end_to_end() -> Result<Vec<Figure>, Failed> {
     ])
 }
 
-/// Floating-point operations that one update cannot do without: five forward passes, the critic's two gradients, the
-/// way through the critic to the action columns, the actor's two gradients; a multiplication and an addition count two.
+/// Counts the floating-point operations of one update: five forward passes, the two gradients of the critic, the
+/// gradient through the critic to the actions, and the two gradients of the actor. A multiplication and an addition
+/// count as two operations.
 fn update_flop(
     layout: Layout,
     n_hidden: usize,

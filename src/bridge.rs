@@ -1,4 +1,4 @@
-//! `tandem bridge`: serves a pair of arms, and what operators do with one.
+//! `tandem bridge`: serves a pair of arms, and operates it.
 
 use std::fs::File;
 use std::io::Read as _;
@@ -10,7 +10,8 @@ use tokio::runtime::{Builder, Runtime};
 
 use crate::cli::{BridgeArgs, BridgeCommand, BridgeServeArgs};
 use crate::exit::{Exit, Failed, OrExit as _};
-use crate::{access, clock, services};
+use crate::version::VERSION;
+use crate::{access, clock, service, signals};
 
 mod arms;
 mod file;
@@ -19,9 +20,9 @@ mod play;
 mod show;
 mod trial;
 
-/// Where the system's secrets come from.
+/// The system's source of random secrets.
 const ENTROPY: &str = "/dev/urandom";
-/// Threads for sockets.
+/// Number of threads for sockets.
 const SOCKET_THREADS: usize = 2;
 
 pub(crate) fn bridge(args: BridgeArgs) -> Result<(), Failed> {
@@ -41,13 +42,13 @@ fn serve(args: BridgeServeArgs) -> Result<(), Failed> {
     let secret = secret().or_exit(Exit::TryAgain, || format!("cannot read {ENTROPY}"))?;
     let runtime = runtime().or_exit(Exit::TryAgain, String::new)?;
     runtime.block_on(async move {
-        let shutdown = services::shutdown(args.listen.exit_with_stdin)?;
-        let clock = Arc::new(clock::Ticking::new());
+        let shutdown = signals::shutdown_token(args.listen.exit_with_stdin)?;
+        let clock = Arc::new(clock::BridgeClock::new());
         let (executor, reconnect) = arms::arms(&args, clock.clone())?;
-        let listener = services::listen(&args.listen).await?;
+        let listener = service::listen(&args.listen).await?;
         let config = Config {
             driver: arms::name(args.driver).to_owned(),
-            version: services::VERSION.to_owned(),
+            version: VERSION.to_owned(),
             speed: args.speed,
             clock,
             reconnect,
@@ -59,13 +60,13 @@ fn serve(args: BridgeServeArgs) -> Result<(), Failed> {
     })
 }
 
-/// A runtime whose sockets do not wait for one another: a stop is heard while a long motion is being read.
+/// Creates a runtime with several threads, so that a stop is handled while a long motion is decoded.
 fn runtime() -> anyhow::Result<Runtime> {
     let mut runtime = Builder::new_multi_thread();
     runtime.worker_threads(SOCKET_THREADS).enable_all().build().context("cannot start the runtime")
 }
 
-/// What nobody can guess.
+/// Returns a secret that cannot be guessed.
 fn secret() -> std::io::Result<[u8; 32]> {
     let mut secret = [0; 32];
     File::open(ENTROPY)?.read_exact(&mut secret)?;

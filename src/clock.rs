@@ -1,39 +1,39 @@
-//! The program's only clock.
+//! The only clock of the program.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
 use tandem_bridge::service::Clock;
 
-/// The time since this function was called, for those who take time as an argument.
+/// Returns a clock that counts from this call, for libraries that take the time as an argument.
 pub(crate) fn since_now() -> Arc<dyn Fn() -> Duration + Send + Sync> {
     let start = now();
     Arc::new(move || start.elapsed())
 }
 
-/// Now, for measuring how long something takes.
+/// Returns the current instant, for measuring time spans.
 #[expect(clippy::disallowed_methods, reason = "the clock")]
 pub(crate) fn now() -> Instant {
     Instant::now()
 }
 
-/// Milliseconds since 1970: another number at every start.
+/// Returns the milliseconds since 1970, a different number at every start.
 #[expect(clippy::disallowed_methods, reason = "the clock")]
 pub(crate) fn unix_millis() -> u64 {
     let since = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default();
     u64::try_from(since.as_millis()).unwrap_or_default()
 }
 
-/// The clock by which arms are moved. It begins with its making.
-pub(crate) struct Ticking(Instant);
+/// The clock of a bridge. It counts from its creation.
+pub(crate) struct BridgeClock(Instant);
 
-impl Ticking {
+impl BridgeClock {
     pub(crate) fn new() -> Self {
         Self(now())
     }
 }
 
-impl Clock for Ticking {
+impl Clock for BridgeClock {
     fn now_s(&self) -> f64 {
         self.0.elapsed().as_secs_f64()
     }

@@ -1,34 +1,32 @@
-//! Exit codes that mean something, and the one line a person reads when something is wrong.
+//! Exit codes, and errors that determine one.
 
 use std::process::ExitCode;
 
 use rustix::io::Errno;
 use tandem_core::text::error_chain;
 
-use crate::output;
-
-/// How the program ends when it is not done (sysexits.h).
+/// Exit codes of a program that fails (sysexits.h).
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Exit {
     /// Wrong command line or configuration.
     Usage = 64,
-    /// Input that cannot be used: a damaged file, say.
+    /// Unusable input, such as a damaged file.
     Data = 65,
     /// A bug.
     Bug = 70,
     /// The result cannot be written to standard output.
     Output = 74,
-    /// A peer cannot be reached, a disk is full: try again.
+    /// A temporary failure: a peer is unreachable, a disk is full.
     TryAgain = 75,
     /// Interrupted; the state is saved.
     Interrupted = 130,
-    /// Standard output has no reader any more, as behind `| head`. The code that a shell gives a process ended by SIGPIPE.
+    /// The reader of standard output has closed it, as `head` does. Shells report this code for SIGPIPE.
     Unread = 141,
 }
 
 impl Exit {
-    /// The exit code of a write that failed. A place that can never be written is a mistake of the command line; for
-    /// everything else, such as a full disk, another attempt may help.
+    /// Returns the exit code of a failed write. A path that can never be written is a mistake on the command line; for
+    /// other errors, such as a full disk, another attempt may succeed.
     fn of_write(error: &anyhow::Error) -> Self {
         use std::io::ErrorKind as Kind;
         let is_final = |error: &std::io::Error| {
@@ -49,7 +47,7 @@ impl From<Exit> for ExitCode {
     }
 }
 
-/// What went wrong and the exit code that says so.
+/// An error and the exit code of the program.
 #[derive(Debug)]
 pub(crate) struct Failed {
     exit: Exit,
@@ -61,7 +59,7 @@ impl Failed {
         Self { exit, error: error.into() }
     }
 
-    /// A write that failed.
+    /// A failed write, with the exit code that fits its cause.
     pub(crate) fn of_write(error: impl Into<anyhow::Error>) -> Self {
         let error = error.into();
         Self { exit: Exit::of_write(&error), error }
@@ -71,31 +69,32 @@ impl Failed {
         Self::new(Exit::Usage, anyhow::anyhow!("{message}"))
     }
 
-    /// The same failure, with `what` said before it.
+    /// Adds `what` before the error.
     pub(crate) fn context(self, what: String) -> Self {
         Self { error: self.error.context(what), ..self }
     }
 
-    /// The error without its exit code, for those who tell of it themselves.
+    /// Returns the error without its exit code.
     pub(crate) fn into_error(self) -> anyhow::Error {
         self.error
     }
 
-    /// Prints the one line and gives the exit code.
-    pub(crate) fn report(&self) -> ExitCode {
-        if !matches!(self.exit, Exit::Interrupted | Exit::Unread) {
-            output::message(format_args!("tandem: {}", error_chain(self.error.as_ref())));
-        }
-        self.exit.into()
+    pub(crate) const fn exit(&self) -> Exit {
+        self.exit
+    }
+
+    /// Returns the error and its causes on one line.
+    pub(crate) fn line(&self) -> String {
+        error_chain(self.error.as_ref())
     }
 }
 
-/// Says which exit code an error means.
+/// Attaches exit codes to errors.
 pub(crate) trait OrExit<T> {
-    /// Ends with `exit`, saying `what` was attempted.
+    /// Attaches `exit`, and `what` as context unless it is empty.
     fn or_exit(self, exit: Exit, what: impl FnOnce() -> String) -> Result<T, Failed>;
 
-    /// Ends with the exit code that the error of a write means, saying `what` was attempted.
+    /// Attaches the exit code of a failed write, and `what` as context unless it is empty.
     fn or_cannot_write(self, what: impl FnOnce() -> String) -> Result<T, Failed>;
 }
 
@@ -121,7 +120,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_place_that_can_never_be_written_is_not_tried_again() {
+    fn paths_that_can_never_be_written_are_usage_errors() {
         let check = |errno: Errno, expected| {
             let error = anyhow::Error::new(std::io::Error::from(errno)).context("cannot write x");
             assert_eq!(Exit::of_write(&error), expected, "{errno:?}");

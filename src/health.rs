@@ -1,18 +1,18 @@
-//! `tandem health`: whether a service serves, for people, containers and probes.
+//! `tandem health`: checks the health of a service, for operators, containers and probes.
 
 use serde_json::json;
 use tandem_net::check_health;
 
 use crate::cli::HealthArgs;
 use crate::exit::{Exit, Failed, OrExit as _};
-use crate::{access, output, services};
+use crate::{access, output, runtime};
 
 pub(crate) fn health(args: &HealthArgs) -> Result<(), Failed> {
     let HealthArgs { address, service, .. } = args;
-    let dial = access::trusting(&args.dial)?;
-    let runtime = services::runtime().or_exit(Exit::TryAgain, String::new)?;
+    let dial = access::dial_without_token(&args.dial)?;
+    let runtime = runtime::new().or_exit(Exit::TryAgain, String::new)?;
     let answer = runtime.block_on(async {
-        let link = dial.link(address).or_exit(Exit::Usage, String::new)?;
+        let link = dial.channel(address).or_exit(Exit::Usage, String::new)?;
         Ok(check_health(link, service, args.timeout_s).await)
     })?;
     if args.json {

@@ -1,6 +1,6 @@
-//! Texts that the command line names: run files, sweep files, motions, certificates, tokens.
+//! Reads files that the command line names: run files, sweep files, motions, certificates, tokens.
 //!
-//! They may come from a pipe, as in `--run <(generate)`, but neither without end nor never.
+//! They may come from a pipe, as in `--run <(generate)`, whose size and time are limited.
 
 use std::fs::File;
 use std::io::{self, ErrorKind, Read as _};
@@ -8,10 +8,10 @@ use std::path::Path;
 use std::sync::mpsc::sync_channel;
 use std::time::Duration;
 
-/// More bytes than any of these texts has; a long motion has some megabytes.
+/// Size limit of a file; a long motion has some megabytes.
 const MAX_BYTES: usize = 16 << 20;
-/// How long a pipe or a device may take to deliver everything.
-const PATIENCE: Duration = Duration::from_secs(10);
+/// Time in which a pipe or a device must reach its end.
+const TIMEOUT: Duration = Duration::from_secs(10);
 
 /// Reads a text file.
 ///
@@ -39,10 +39,10 @@ pub(crate) fn bytes(path: &Path) -> io::Result<Vec<u8>> {
     })?
 }
 
-/// Runs `read`, which reads `path`. Pipes and devices have limited time: opening a pipe waits for its writer.
+/// Runs `read`, which reads `path`, with a timeout for pipes and devices: opening a pipe waits for its writer.
 ///
 /// # Errors
-/// When the time is over. The thread that waits ends with the process.
+/// When the time is over. The waiting thread ends with the process.
 pub(crate) fn in_time<T: Send + 'static>(
     path: &Path,
     read: impl FnOnce() -> T + Send + 'static,
@@ -50,9 +50,9 @@ pub(crate) fn in_time<T: Send + 'static>(
     if std::fs::metadata(path).is_ok_and(|file| !file.is_file() && !file.is_dir()) {
         let (sender, receiver) = sync_channel(1);
         std::thread::Builder::new().spawn(move || sender.send(read()).ok())?;
-        let what = format!("no end of it came within {PATIENCE:?}");
+        let what = format!("no end of it came within {TIMEOUT:?}");
         return receiver
-            .recv_timeout(PATIENCE)
+            .recv_timeout(TIMEOUT)
             .map_err(|_elapsed| io::Error::new(ErrorKind::TimedOut, what));
     }
     Ok(read())
@@ -63,7 +63,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_file_is_read_whole_or_refused() {
+    fn a_file_is_read_whole_or_rejected() {
         let directory = tempfile::tempdir().expect("a directory");
         let path = directory.path().join("text");
         let read = |content: &[u8]| {
@@ -80,7 +80,7 @@ mod tests {
     }
 
     #[test]
-    fn a_device_without_end_is_refused() {
+    fn an_endless_device_is_rejected() {
         let error = bytes(Path::new("/dev/zero")).expect_err("endless").to_string();
         assert_eq!(error, "it has more than 16 MiB");
         assert_eq!(bytes(Path::new("/dev/null")).expect("is empty"), b"");

@@ -1,7 +1,7 @@
-//! `tandem`: teaches robots with two arms by letting a robot with one arm advise them.
+//! `tandem`: trains policies for two robot arms with advice from a one-arm policy.
 //!
-//! The only place that reads the clock, the environment and the command line, starts processes and chooses exit
-//! codes. What it starts are libraries: see `ARCHITECTURE.md`.
+//! Only this crate reads the clock, the environment and the command line, starts processes and chooses exit codes. The
+//! work is done by the libraries of the workspace: see `ARCHITECTURE.md`.
 
 use std::process::ExitCode;
 
@@ -13,28 +13,36 @@ mod bridge;
 mod cli;
 mod clock;
 mod eval;
+mod evaluation;
 mod exit;
-mod files;
 mod health;
 mod input;
+mod launch;
+mod logging;
+mod mcap;
 mod output;
 mod picture;
+mod policy_file;
+mod progress_text;
+mod replay;
 mod report;
 mod run_directory;
 mod run_file;
-mod services;
+mod runtime;
+mod service;
 mod signals;
 mod status;
 mod sweep;
 mod train;
+mod version;
 
 use cli::{Cli, Command};
 use exit::{Exit, Failed};
 
 fn main() -> ExitCode {
-    signals::survive_a_limit_of_file_sizes();
+    signals::ignore_file_size_signal();
     let code = run();
-    output::finish();
+    output::flush_messages();
     code
 }
 
@@ -45,34 +53,35 @@ fn run() -> ExitCode {
             drop(error.print());
             return Exit::Usage.into();
         }
-        Err(help) => return ended(output::print_help(&help)),
+        Err(help) => return exit_code(output::print_help(&help)),
     };
-    if let Err(failed) = services::start_logging(&cli) {
-        return failed.report();
-    }
-    ended(match cli.command {
+    exit_code(logging::start(&cli).and_then(|()| dispatch(cli.command)))
+}
+
+fn dispatch(command: Command) -> Result<(), Failed> {
+    match command {
         Command::Train(args) => train::train(&args),
         Command::Eval(args) => eval::eval(&args),
         Command::Sweep(args) => sweep::sweep(&args),
         Command::Report(args) => report::report(&args),
-        Command::Teacher(args) => services::teacher(args),
-        Command::Learner(args) => services::learner(args),
-        Command::Worker(args) => services::worker(args),
-        Command::Relay(args) => services::relay(args),
+        Command::Teacher(args) => service::teacher(args),
+        Command::Learner(args) => service::learner(args),
+        Command::Worker(args) => service::worker(args),
+        Command::Relay(args) => service::relay(args),
         Command::Bridge(args) => bridge::bridge(args),
         Command::Health(args) => health::health(&args),
         Command::Status(args) => status::status(&args),
         Command::Bench(args) => bench::bench(&args),
-        Command::Policy(args) => files::policy(&args),
-        Command::Mcap(args) => files::mcap(&args),
-        Command::Replay(args) => files::replay(&args),
+        Command::Policy(args) => policy_file::policy(&args),
+        Command::Mcap(args) => mcap::mcap(&args),
+        Command::Replay(args) => replay::replay(&args),
         Command::Picture(args) => picture::picture(&args),
-    })
+    }
 }
 
-fn ended(done: Result<(), Failed>) -> ExitCode {
-    match done {
+fn exit_code(result: Result<(), Failed>) -> ExitCode {
+    match result {
         Ok(()) => ExitCode::SUCCESS,
-        Err(failed) => failed.report(),
+        Err(failed) => output::report(&failed),
     }
 }

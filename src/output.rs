@@ -1,18 +1,19 @@
-//! What the program prints: results on standard output, everything else on standard error. No other module prints.
+//! Output: results go to standard output, everything else to standard error. No other module prints.
 //!
-//! A result that cannot be written is an error with an exit code of its own. Messages that cannot be written are dropped:
-//! no run and no service ends because of them.
+//! A result that cannot be written is an error with its own exit code. Messages that cannot be written are dropped, so
+//! they end no run and no service.
 
 use std::fmt::Display;
 use std::io::{self, ErrorKind, Write as _};
+use std::process::ExitCode;
 use std::time::Duration;
 
 use tandem_telemetry::standard_error;
 
 use crate::exit::{Exit, Failed};
 
-/// How long the end of the program waits for messages to be written.
-const LAST_MESSAGES: Duration = Duration::from_secs(2);
+/// Time that the program waits at its end for messages to be written.
+const FLUSH_TIMEOUT: Duration = Duration::from_secs(2);
 
 /// Prints a line of a command's result.
 ///
@@ -24,7 +25,7 @@ pub(crate) fn print(line: impl Display) -> Result<(), Failed> {
     checked(output.write_all(text.as_bytes()).and_then(|()| output.flush()))
 }
 
-/// Prints what the command line asked for: `--help` or `--version`.
+/// Prints the text of `--help` or `--version`.
 ///
 /// # Errors
 /// As for [`print()`].
@@ -42,17 +43,25 @@ fn checked(written: io::Result<()>) -> Result<(), Failed> {
     })
 }
 
-/// Adds a line to standard error, without waiting.
+/// Writes a line to standard error without waiting.
 pub(crate) fn message(line: impl Display) {
     standard_error::write_line(&escaped(&line.to_string()));
 }
 
-/// Waits a while until messages are written: what the end of the program must not cut off.
-pub(crate) fn finish() {
-    standard_error::flush(LAST_MESSAGES);
+/// Prints an error as one line on standard error and returns its exit code. Interruptions are not reported.
+pub(crate) fn report(failed: &Failed) -> ExitCode {
+    if !matches!(failed.exit(), Exit::Interrupted | Exit::Unread) {
+        message(format_args!("tandem: {}", failed.line()));
+    }
+    failed.exit().into()
 }
 
-/// The text with its control characters escaped: what files and peers say must not steer a terminal.
+/// Waits until all messages are written, for at most 2 s.
+pub(crate) fn flush_messages() {
+    standard_error::flush(FLUSH_TIMEOUT);
+}
+
+/// Escapes control characters: text from files and peers must not control the terminal.
 pub(crate) fn escaped(text: &str) -> String {
     let mut shown = String::with_capacity(text.len());
     for character in text.chars() {

@@ -1,4 +1,4 @@
-//! `tandem picture`: the arms at work, as an SVG picture.
+//! `tandem picture`: renders a step of an episode as an SVG picture.
 
 use tandem_core::WorldSettings;
 use tandem_core::rng::{Stream, episode_rng};
@@ -6,15 +6,14 @@ use tandem_report::View;
 use tandem_sim::{Env, WorldConfig};
 
 use crate::cli::PictureArgs;
-use crate::eval::{Subject, composed};
+use crate::evaluation::EvaluatedPolicy;
 use crate::exit::{Exit, Failed, OrExit as _};
-use crate::files::load_policy;
-use crate::output;
+use crate::{output, policy_file};
 
 pub(crate) fn picture(args: &PictureArgs) -> Result<(), Failed> {
     let subject = match (&args.policy, &args.composed_teachers) {
-        (Some(path), _) => Subject::Policy(load_policy(path)?),
-        (None, Some(path)) => composed(load_policy(path)?, 2, path)?,
+        (Some(path), _) => EvaluatedPolicy::Policy(policy_file::load(path)?),
+        (None, Some(path)) => EvaluatedPolicy::composed(policy_file::load(path)?, 2, path)?,
         (None, None) => return Err(Failed::usage("give --policy or --composed-teachers")),
     };
     let episode = subject.play(1, args.seed)?.remove(0);

@@ -1,4 +1,4 @@
-//! `tandem report`: runs and trials side by side, on the terminal, as a page, as JSON and CSV.
+//! `tandem report`: compares runs and trials on the terminal, as an HTML page, as JSON and as CSV.
 
 use std::path::{Path, PathBuf};
 
@@ -9,10 +9,9 @@ use tandem_report::{
 };
 
 use crate::cli::ReportArgs;
-use crate::eval::{Measured, composed, measure};
+use crate::evaluation::{EvaluatedPolicy, EvaluationResult, measure};
 use crate::exit::{Exit, Failed, OrExit as _};
-use crate::files::load_policy;
-use crate::output;
+use crate::{output, policy_file};
 
 /// Test goals for the evaluation of composed teachers: those of `tandem eval` and of the end of a run.
 const TEST_SEED: u64 = 777;
@@ -75,7 +74,7 @@ fn warn<'a>(warnings: impl Iterator<Item = &'a String>) {
     }
 }
 
-/// Policies that no run of the report trained.
+/// Returns the results of policies that no run of the report has trained.
 fn baselines(args: &ReportArgs) -> Result<Vec<Baseline>, Failed> {
     let mut baselines = Vec::new();
     for path in &args.evals {
@@ -83,19 +82,19 @@ fn baselines(args: &ReportArgs) -> Result<Vec<Baseline>, Failed> {
         baselines.push(Baseline { label: stem(path), test });
     }
     for path in &args.composed_teachers {
-        let subject = composed(load_policy(path)?, 2, path)?;
-        let measured = measure(&subject, TEST_EPISODES, TEST_SEED)?;
+        let composed = EvaluatedPolicy::composed(policy_file::load(path)?, 2, path)?;
+        let result = measure(&composed, TEST_EPISODES, TEST_SEED)?;
         let label = format!("composed {}", stem(path));
-        baselines.push(Baseline { label, test: test_evaluation(&measured) });
+        baselines.push(Baseline { label, test: test_evaluation(&result) });
     }
     Ok(baselines)
 }
 
-fn test_evaluation(measured: &Measured) -> TestEvaluation {
-    let summary = &measured.summary;
+fn test_evaluation(result: &EvaluationResult) -> TestEvaluation {
+    let summary = &result.summary;
     TestEvaluation {
-        task: measured.layout.task,
-        n_arms: measured.layout.n_arms,
+        task: result.layout.task,
+        n_arms: result.layout.n_arms,
         n_episodes: summary.n_episodes as u64,
         success: summary.success,
         interval: (summary.interval.low, summary.interval.high),
@@ -108,7 +107,8 @@ fn stem(path: &Path) -> String {
     path.file_stem().unwrap_or(path.as_os_str()).to_string_lossy().into_owned()
 }
 
-/// In the directory that is reported on, unless there are several or it is a run's own, which has a page already.
+/// Returns `report.html` in the directory of the report, unless there are several directories or it is that of a single
+/// run, which has its own page.
 fn default_page(paths: &[PathBuf]) -> PathBuf {
     match paths {
         [dir] if dir.is_dir() && !dir.join("metrics.jsonl").exists() => dir.join("report.html"),

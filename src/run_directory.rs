@@ -1,4 +1,4 @@
-//! The place of a run directory.
+//! Run directories.
 
 use std::io::ErrorKind;
 use std::path::Path;
@@ -7,8 +7,8 @@ use anyhow::anyhow;
 
 use crate::exit::{Exit, Failed};
 
-/// Refuses a place where no directory can be: a file, or something below one.
-pub(crate) fn check_place(out: &Path) -> Result<(), Failed> {
+/// Rejects a path at which no directory can be created: a file, or a path below one.
+pub(crate) fn check_path(out: &Path) -> Result<(), Failed> {
     let is_in_the_way = |path: &&Path| path.exists() && !path.is_dir();
     match out.ancestors().find(is_in_the_way) {
         Some(file) if file == out => Err(Failed::usage(format!(
@@ -24,14 +24,14 @@ pub(crate) fn check_place(out: &Path) -> Result<(), Failed> {
     }
 }
 
-/// Makes the directory `out` where there is none.
-pub(crate) fn make(out: &Path) -> Result<(), Failed> {
-    check_place(out)?;
+/// Creates the directory `out` unless it exists.
+pub(crate) fn create(out: &Path) -> Result<(), Failed> {
+    check_path(out)?;
     std::fs::create_dir_all(out).map_err(|error| {
         let exit = match error.kind() {
             ErrorKind::InvalidFilename | ErrorKind::InvalidInput => Exit::Usage,
             _ => Exit::TryAgain,
         };
-        Failed::new(exit, anyhow!(error).context(format!("cannot make {}", out.display())))
+        Failed::new(exit, anyhow!(error).context(format!("cannot create {}", out.display())))
     })
 }

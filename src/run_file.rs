@@ -47,7 +47,7 @@ pub(crate) fn parse_setting(setting: &str) -> Result<(String, Value), Failed> {
 /// The text of a run file with every setting.
 pub(crate) fn to_text(config: &RunConfig) -> Result<String, Failed> {
     let text = to_toml(config).or_exit(Exit::Bug, String::new)?;
-    Ok(format!("# tandem {}\n{text}", crate::services::VERSION))
+    Ok(format!("# tandem {}\n{text}", crate::version::VERSION))
 }
 
 /// Writes the configuration with every setting, whole or not at all.

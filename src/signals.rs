@@ -1,13 +1,17 @@
-//! When a process is asked to end.
+//! Signals, and the end of standard input.
 
 use tokio::signal::unix::{SignalKind, signal};
 use tokio_util::sync::CancellationToken;
 
-/// A token that is cancelled by SIGINT or SIGTERM, and when standard input closes if `exit_with_stdin`.
-pub(crate) fn shutdown_token(exit_with_stdin: bool) -> std::io::Result<CancellationToken> {
+use crate::exit::{Exit, Failed, OrExit as _};
+
+/// Returns a token that is cancelled by SIGINT or SIGTERM and, if `exit_with_stdin`, when standard input closes.
+pub(crate) fn shutdown_token(exit_with_stdin: bool) -> Result<CancellationToken, Failed> {
+    let watch =
+        |kind| signal(kind).or_exit(Exit::TryAgain, || "cannot watch for signals".to_owned());
     let token = CancellationToken::new();
     let (mut interrupt, mut terminate) =
-        (signal(SignalKind::interrupt())?, signal(SignalKind::terminate())?);
+        (watch(SignalKind::interrupt())?, watch(SignalKind::terminate())?);
     let cancel = token.clone();
     tokio::spawn(async move {
         tokio::select! {
@@ -20,19 +24,19 @@ pub(crate) fn shutdown_token(exit_with_stdin: bool) -> std::io::Result<Cancellat
     Ok(token)
 }
 
-/// Makes a write beyond the limit of file sizes (`ulimit -f`) an error like that of a full disk. Without this the system
-/// ends the process.
-pub(crate) fn survive_a_limit_of_file_sizes() {
+/// Handles SIGXFSZ, so that a write beyond the file size limit (`ulimit -f`) is an error like that of a full disk and
+/// does not end the process.
+pub(crate) fn ignore_file_size_signal() {
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build();
-    // Where it cannot be done, the system's own rule holds.
+    // If this fails, the default action of the signal stays in force.
     if let Ok(runtime) = runtime {
         let _within = runtime.enter();
         drop(signal(SignalKind::from_raw(rustix::process::Signal::XFSZ.as_raw())));
     }
 }
 
-/// Waits until standard input closes. A thread of its own reads it: that may take for ever, and a runtime does not end
-/// before its own blocked reads do.
+/// Waits until standard input closes. A separate thread reads it, because a runtime does not shut down before its own
+/// blocking reads return.
 async fn standard_input_closed(is_watched: bool) {
     if !is_watched {
         std::future::pending::<()>().await;

@@ -1,37 +1,37 @@
-//! `tandem status`: how far a run is, from wherever its learner can be reached.
+//! `tandem status`: shows the progress of a run, from any machine that can reach its learner.
 
 use std::time::Duration;
 
 use anyhow::anyhow;
 use serde_json::{Value, json};
-use tandem_net::Link;
+use tandem_net::AuthChannel;
 use tandem_proto::pb;
 use tandem_proto::pb::learner_client::LearnerClient;
 use tonic::{Code, Response, Status};
 
 use crate::cli::StatusArgs;
 use crate::exit::{Exit, Failed, OrExit as _};
-use crate::train::{counts_line, evaluation_line, grouped};
-use crate::{access, output, services};
+use crate::progress_text::{counts_line, evaluation_line, grouped};
+use crate::{access, output, runtime};
 
-/// How long the learner may take to answer.
-const DEADLINE: Duration = Duration::from_secs(10);
-/// Seconds of run time between two lines without news.
+/// Timeout of a call.
+const TIMEOUT: Duration = Duration::from_secs(10);
+/// Seconds of run time after which a line is printed even without news.
 const LINE_EVERY_S: f64 = 30.0;
 
 pub(crate) fn status(args: &StatusArgs) -> Result<(), Failed> {
     let dial = access::dial(&args.dial, &args.secret)?;
-    let runtime = services::runtime().or_exit(Exit::TryAgain, String::new)?;
+    let runtime = runtime::new().or_exit(Exit::TryAgain, String::new)?;
     runtime.block_on(async {
-        let link = dial.link(&args.address).or_exit(Exit::Usage, String::new)?;
+        let link = dial.channel(&args.address).or_exit(Exit::Usage, String::new)?;
         let mut learner = LearnerClient::new(link);
         if args.watch { watch(&mut learner, args).await } else { show(&mut learner, args).await }
     })
 }
 
-/// What the learner says now.
-async fn show(learner: &mut LearnerClient<Link>, args: &StatusArgs) -> Result<(), Failed> {
-    let progress = answer(learner.status(pb::StatusRequest {})).await?;
+/// Prints the current progress.
+async fn show(learner: &mut LearnerClient<AuthChannel>, args: &StatusArgs) -> Result<(), Failed> {
+    let progress = call_with_timeout(learner.status(pb::StatusRequest {})).await?;
     if args.json {
         output::print(progress_json(&progress))?;
     } else {
@@ -40,20 +40,20 @@ async fn show(learner: &mut LearnerClient<Link>, args: &StatusArgs) -> Result<()
     Ok(())
 }
 
-/// A line for each evaluation and every half minute, or each message as JSON, until the run has ended.
-async fn watch(learner: &mut LearnerClient<Link>, args: &StatusArgs) -> Result<(), Failed> {
-    let mut stream = answer(learner.watch(pb::WatchRequest {})).await?;
-    let (mut told_round, mut told_at_s) = (None, f64::NEG_INFINITY);
+/// Prints a line for each evaluation and every half minute, or each message as JSON, until the run has ended.
+async fn watch(learner: &mut LearnerClient<AuthChannel>, args: &StatusArgs) -> Result<(), Failed> {
+    let mut stream = call_with_timeout(learner.watch(pb::WatchRequest {})).await?;
+    let (mut printed_round, mut printed_at_s) = (None, f64::NEG_INFINITY);
     while let Some(progress) = stream.message().await.map_err(|status| failed(&status))? {
         if args.json {
             output::print(progress_json(&progress))?;
         } else if let Some(evaluation) = progress.evaluation.as_ref()
-            && told_round != Some(evaluation.round)
+            && printed_round != Some(evaluation.round)
         {
-            (told_round, told_at_s) = (Some(evaluation.round), progress.wall_s);
+            (printed_round, printed_at_s) = (Some(evaluation.round), progress.wall_s);
             output::print(evaluation_line(&progress, evaluation))?;
-        } else if progress.wall_s - told_at_s >= LINE_EVERY_S {
-            told_at_s = progress.wall_s;
+        } else if progress.wall_s - printed_at_s >= LINE_EVERY_S {
+            printed_at_s = progress.wall_s;
             output::print(counts_line(&progress))?;
         }
         if progress.ended {
@@ -63,15 +63,17 @@ async fn watch(learner: &mut LearnerClient<Link>, args: &StatusArgs) -> Result<(
             return Ok(());
         }
     }
-    Err(Failed::new(Exit::TryAgain, anyhow!("the learner has gone before the run's end")))
+    Err(Failed::new(Exit::TryAgain, anyhow!("the learner is gone before the end of the run")))
 }
 
-/// The answer to a call, in time.
-async fn answer<T>(call: impl Future<Output = Result<Response<T>, Status>>) -> Result<T, Failed> {
-    match tokio::time::timeout(DEADLINE, call).await {
-        Ok(answer) => answer.map(Response::into_inner).map_err(|status| failed(&status)),
+/// Runs a call with a timeout.
+async fn call_with_timeout<T>(
+    call: impl Future<Output = Result<Response<T>, Status>>,
+) -> Result<T, Failed> {
+    match tokio::time::timeout(TIMEOUT, call).await {
+        Ok(response) => response.map(Response::into_inner).map_err(|status| failed(&status)),
         Err(_elapsed) => {
-            let what = anyhow!("the learner has not answered within {DEADLINE:?}");
+            let what = anyhow!("the learner did not respond within {TIMEOUT:?}");
             Err(Failed::new(Exit::TryAgain, what))
         }
     }
@@ -143,7 +145,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_person_sees_workers_that_are_silent_and_a_warning() {
+    fn silent_workers_and_a_warning_are_shown() {
         let worker =
             |doing: &str| pb::WorkerProgress { doing: doing.to_owned(), ..Default::default() };
         let progress = pb::Progress {

@@ -1,13 +1,14 @@
-//! `tandem train`: one command that starts learner, teacher and workers as processes, watches them and reports.
+//! `tandem train`: starts a learner, a teacher and workers as processes, supervises them and reports the result.
 
-mod children;
-mod claim;
+mod arguments;
 mod display;
-mod in_use;
+mod inputs;
 mod plan;
-mod restarts;
+mod processes;
+mod progress_stream;
+mod restart_policy;
+mod run_lock;
 mod summary;
-mod watch;
 
 use std::time::{Duration, Instant};
 
@@ -18,95 +19,96 @@ use tokio_util::sync::CancellationToken;
 
 use crate::cli::TrainArgs;
 use crate::exit::{Exit, Failed, OrExit as _};
-use crate::{clock, services, signals};
-use children::{Broken, Children, Memory};
-use claim::Claim;
+use crate::{clock, runtime, signals};
 use display::Display;
-pub(crate) use display::{counts_line, evaluation_line, grouped};
-use in_use::InUse;
+use inputs::RunInputs;
 use plan::Plan;
-pub(crate) use plan::shipped_teacher;
-use watch::Heard;
+use processes::{PeakMemory, RunFailure, RunProcesses};
+use progress_stream::ProgressUpdate;
+use run_lock::RunLock;
 
-/// How long a process may take to say where it listens.
-const START_DEADLINE: Duration = Duration::from_secs(60);
-/// How long processes may take to save and end.
-const END_DEADLINE: Duration = Duration::from_secs(60);
-/// How often it is looked whether all processes live.
-const LOOK_EVERY: Duration = Duration::from_millis(100);
-/// How often it is looked how large they are.
-const MEASURE_EVERY: Duration = Duration::from_millis(500);
+/// Timeout of the start of all processes.
+const START_TIMEOUT: Duration = Duration::from_secs(60);
+/// Time that the learner has to save and exit.
+const END_TIMEOUT: Duration = Duration::from_secs(60);
+/// Time between two checks of the processes.
+const CHECK_EVERY: Duration = Duration::from_millis(100);
+/// Time between two samples of their memory.
+const SAMPLE_EVERY: Duration = Duration::from_millis(500);
+/// End reason of an interrupted run.
+const INTERRUPTED: &str = "interrupted";
 
 pub(crate) fn train(args: &TrainArgs) -> Result<(), Failed> {
     let plan = Plan::of(args)?;
-    let claim = Claim::take(&plan)?;
-    let quiet = claim.wait_for_former(&plan)?;
+    let lock = RunLock::take(&plan)?;
+    let service_locks = lock.wait_for_leftovers(&plan)?;
     plan.prepare()?;
-    let in_use = InUse::write(&plan)?;
-    drop(quiet);
-    let runtime = services::runtime().or_exit(Exit::TryAgain, String::new)?;
+    let inputs = RunInputs::write(&plan)?;
+    drop(service_locks);
+    let runtime = runtime::new().or_exit(Exit::TryAgain, String::new)?;
     let (last, memory) = runtime.block_on(async {
-        let interrupted =
-            signals::shutdown_token(args.exit_with_stdin).or_exit(Exit::TryAgain, String::new)?;
-        run((&plan, &claim), &interrupted).await
+        let interrupted = signals::shutdown_token(args.exit_with_stdin)?;
+        run((&plan, &lock), &interrupted).await
     })?;
-    drop(in_use);
+    drop(inputs);
     if last.end_reason == INTERRUPTED {
-        summary::interrupted(&plan);
+        summary::print_interrupted(&plan);
         return Err(Failed::new(Exit::Interrupted, anyhow!(INTERRUPTED)));
     }
     summary::print(&plan, &last, memory, args.json)
 }
 
-/// Why a run ends that somebody stopped.
-const INTERRUPTED: &str = "interrupted";
-
-/// Starts every process, watches until the run has ended, and ends every process.
+/// Starts all processes, supervises them until the run has ended, and ends them.
 async fn run(
-    (plan, claim): (&Plan, &Claim),
+    (plan, lock): (&Plan, &RunLock),
     interrupted: &CancellationToken,
-) -> Result<(pb::Progress, Memory), Failed> {
+) -> Result<(pb::Progress, PeakMemory), Failed> {
     let mut display = Display::new(plan);
-    let mut children = Children::new(plan).or_cannot_write(String::new)?;
-    let last = tokio::select! {
-        started = start(plan, &mut children, &display) => started,
+    let mut processes = RunProcesses::new(plan).or_cannot_write(String::new)?;
+    let started = tokio::select! {
+        started = start(plan, &mut processes, &display) => started,
         () = interrupted.cancelled() => Ok(()),
     };
-    let last = match last {
-        Ok(()) => Watch::new((plan, claim), &mut children, &mut display).follow(interrupted).await,
-        Err(broken) => Err(broken),
+    let last = match started {
+        Ok(()) => {
+            let supervisor = Supervisor::new((plan, lock), &mut processes, &mut display);
+            supervisor.run(interrupted).await
+        }
+        Err(failure) => Err(failure),
     };
     display.close();
     if interrupted.is_cancelled() {
-        display.say("interrupted: saving, a second Ctrl-C ends at once");
+        display.print("interrupted: saving, a second Ctrl-C ends at once");
     }
-    let again = signals::shutdown_token(false).or_exit(Exit::TryAgain, String::new)?;
+    let interrupted_again = signals::shutdown_token(false)?;
     tokio::select! {
-        () = children.end(END_DEADLINE) => (),
-        () = again.cancelled() => (),
+        () = processes.end(END_TIMEOUT) => (),
+        () = interrupted_again.cancelled() => (),
     }
-    let last = match last {
-        Ok(last) => last,
-        Err(Broken { exit, error }) => {
-            return Err(Failed::new(exit, error.context(broke_off(plan, exit))));
-        }
-    };
+    let last = last.map_err(|RunFailure { exit, error }| {
+        Failed::new(exit, error.context(failure_context(plan, exit)))
+    })?;
     if last.ended && !interrupted.is_cancelled() {
-        return Ok((last, children.memory()));
+        return Ok((last, processes.peak_memory()));
     }
-    Ok((pb::Progress { end_reason: INTERRUPTED.to_owned(), ..last }, children.memory()))
+    let last = pb::Progress { end_reason: INTERRUPTED.to_owned(), ..last };
+    Ok((last, processes.peak_memory()))
 }
 
-/// Starts every process in time.
-async fn start(plan: &Plan, children: &mut Children, display: &Display) -> Result<(), Broken> {
-    let started = tokio::time::timeout(START_DEADLINE, children.start(plan, display)).await;
+/// Starts all processes in time.
+async fn start(
+    plan: &Plan,
+    processes: &mut RunProcesses,
+    display: &Display,
+) -> Result<(), RunFailure> {
+    let started = tokio::time::timeout(START_TIMEOUT, processes.start(plan, display)).await;
     started.unwrap_or_else(|_elapsed| {
-        Err(anyhow!("a process did not say in time where it listens").into())
+        Err(anyhow!("a process did not print its address within {START_TIMEOUT:?}").into())
     })
 }
 
-/// Says how to go on, where that can help, and where to look.
-fn broke_off(plan: &Plan, exit: Exit) -> String {
+/// Describes how to resume the run, if that can help, and which log to read.
+fn failure_context(plan: &Plan, exit: Exit) -> String {
     let (log, out) = (plan.log_path(), plan.out.display());
     let log = log.display();
     match exit {
@@ -119,97 +121,98 @@ fn broke_off(plan: &Plan, exit: Exit) -> String {
     }
 }
 
-/// What is known of a run that goes on.
-struct Watch<'a> {
+/// Supervises a run: displays its progress and restarts its processes.
+struct Supervisor<'a> {
     plan: &'a Plan,
-    claim: &'a Claim,
-    children: &'a mut Children,
+    lock: &'a RunLock,
+    processes: &'a mut RunProcesses,
     display: &'a mut Display,
     last: pb::Progress,
-    /// How many streams of progress had been opened before the latest message's.
-    n_streams: u32,
-    /// Whether the learner was started again and has not been heard of since.
+    /// The stream that delivered the latest message.
+    stream: u32,
+    /// The learner was restarted and has not sent a message since.
     awaits_learner: bool,
     started_at: Instant,
-    /// Seconds that the run had taken before this start; known once the learner has told.
-    wall_before_s: Option<f64>,
+    /// Seconds that the run had taken before this start, once a message has reported them.
+    earlier_wall_s: Option<f64>,
 }
 
-impl<'a> Watch<'a> {
+impl<'a> Supervisor<'a> {
     fn new(
-        (plan, claim): (&'a Plan, &'a Claim),
-        children: &'a mut Children,
+        (plan, lock): (&'a Plan, &'a RunLock),
+        processes: &'a mut RunProcesses,
         display: &'a mut Display,
     ) -> Self {
         Self {
             plan,
-            claim,
-            children,
+            lock,
+            processes,
             display,
             last: pb::Progress::default(),
-            n_streams: 0,
+            stream: 0,
             awaits_learner: false,
             started_at: clock::now(),
-            wall_before_s: None,
+            earlier_wall_s: None,
         }
     }
 
-    /// Follows the learner's progress to its end, and keeps the processes alive.
-    async fn follow(mut self, interrupted: &CancellationToken) -> Result<pb::Progress, Broken> {
+    /// Follows the learner's progress until the run ends or is interrupted, and returns the last message.
+    async fn run(mut self, interrupted: &CancellationToken) -> Result<pb::Progress, RunFailure> {
         if interrupted.is_cancelled() {
             return Ok(self.last);
         }
-        let mut heard: mpsc::Receiver<Heard> = watch::follow(self.children.learner_address())?;
-        let mut look = tokio::time::interval(LOOK_EVERY);
-        let mut measure = tokio::time::interval(MEASURE_EVERY);
+        let mut updates: mpsc::Receiver<ProgressUpdate> =
+            progress_stream::follow(self.processes.learner_address())?;
+        let mut check = tokio::time::interval(CHECK_EVERY);
+        let mut sample = tokio::time::interval(SAMPLE_EVERY);
         loop {
             tokio::select! {
-                Some(heard) = heard.recv() => {
-                    self.hear(heard);
+                Some(update) = updates.recv() => {
+                    self.handle_update(update);
                     if self.last.ended {
                         return Ok(self.last);
                     }
                 }
-                _ = look.tick() => {
-                    if self.look_after_processes()? {
+                _ = check.tick() => {
+                    if self.check_processes()? {
                         return Ok(self.last);
                     }
                 }
-                _ = measure.tick() => self.children.sample_memory(),
+                _ = sample.tick() => self.processes.sample_memory(),
                 () = interrupted.cancelled() => return Ok(self.last),
             }
         }
     }
 
-    /// Takes in a message. A learner that starts, or that tells of an error as it ends, has nothing to add: what
-    /// follows from its end is decided when it has ended.
-    fn hear(&mut self, Heard { n_streams_before, progress }: Heard) {
-        let is_new = n_streams_before != self.n_streams;
+    /// Displays a message. Messages of a learner that is starting, or that ends with an error, are ignored: the exit
+    /// code of the process determines what follows.
+    fn handle_update(&mut self, ProgressUpdate { stream, progress }: ProgressUpdate) {
+        let is_new_stream = stream != self.stream;
         if progress.task.is_empty() || (progress.ended && progress.digest.is_empty()) {
             return;
         }
-        self.n_streams = n_streams_before;
+        self.stream = stream;
         if self.last.task.is_empty()
             && let Err(failed) = self.plan.keep_teacher()
         {
-            self.display.say(&format!("{:#}", failed.into_error()));
+            self.display.print(&format!("{:#}", failed.into_error()));
         }
-        if self.awaits_learner && is_new {
+        if self.awaits_learner && is_new_stream {
             self.awaits_learner = false;
-            self.display.say(&format!("the learner continues from round {}", progress.round));
+            self.display.print(&format!("the learner continues from round {}", progress.round));
         }
-        // A learner that was started again has forgotten the time since its last checkpoint and that of its absence.
+        // A restarted learner knows neither the time since its last checkpoint nor the time until its restart.
         let elapsed_s = self.started_at.elapsed().as_secs_f64();
-        let before_s = *self.wall_before_s.get_or_insert((progress.wall_s - elapsed_s).max(0.0));
-        self.last = pb::Progress { wall_s: before_s + elapsed_s, ..progress };
+        let earlier_s = *self.earlier_wall_s.get_or_insert((progress.wall_s - elapsed_s).max(0.0));
+        self.last = pb::Progress { wall_s: earlier_s + elapsed_s, ..progress };
         self.display.show(&self.last);
     }
 
-    /// Starts dead processes again. Gives whether the learner was interrupted.
-    fn look_after_processes(&mut self) -> Result<bool, Broken> {
-        let news = self.children.check(self.plan, self.claim)?;
-        news.lines.iter().for_each(|line| self.display.say(line));
-        self.awaits_learner |= news.learner_restarted;
-        Ok(news.interrupted)
+    /// Restarts processes that have ended. Returns whether the learner was interrupted.
+    fn check_processes(&mut self) -> Result<bool, RunFailure> {
+        let events = self.processes.check(self.plan, self.lock)?;
+        events.lines.iter().for_each(|line| self.display.print(line));
+        self.awaits_learner |= events.learner_restarted;
+        Ok(events.interrupted)
     }
 }

@@ -277,9 +277,13 @@ fn who_speaks_otherwise_says_what_to_do_and_goes_on_asking() {
         ("plain-learner", learner(&tls.address), "speaks TLS"),
         ("tls-learner", trusting(learner(&plain.address)), "does not speak TLS"),
     ] {
-        let mut running = place.start(name, &command);
+        let debug = ["--log".to_owned(), "tandem_net::retry=debug".to_owned()];
+        let mut running = place.start(name, &[command, debug.to_vec()].concat());
         let told_twice = || running.log().matches(told).count() >= 2;
         assert!(eventually(told_twice), "{name}: {}", running.log());
+        let warnings =
+            |log: &str| log.lines().filter(|line| line.contains("call failed, ")).count();
+        assert_eq!(warnings(&running.log()), 1, "{name}: {}", running.log());
         assert!(running.log().contains("--tls-ca"), "{name}: {}", running.log());
         assert!(running.is_alive(), "{name}: {}", running.log());
     }

@@ -258,7 +258,7 @@ fn a_bridge_with_a_token_obeys_nobody_without() {
     let token = token.to_string_lossy();
     let bridge = Bridge::serve(&["--token-file", &token]);
     for what in ["status", "stop", "describe", "reset"] {
-        fails_with(64, &bridge.run(&[what]), "wants a token: name its file in --token-file");
+        fails_with(64, &bridge.run(&[what]), "requires a token: name its file in --token-file");
         let known = bridge.run(&[what, "--token-file", &token]);
         assert_ne!(known.status.code(), Some(64), "{}", said(&known));
     }

@@ -116,7 +116,7 @@ fn kill_one(run: &Child, role: &str) {
     let former = pids(run.id(), role);
     signal("-KILL", former[0]);
     let is_back = || pids(run.id(), role).iter().any(|pid| !former.contains(pid));
-    assert!(eventually(is_back), "the {role} is not started again");
+    assert!(eventually(is_back), "the {role} is not restarted");
 }
 
 /// Waits until the run directory holds a checkpoint: the run is then in full swing.
@@ -173,10 +173,10 @@ fn whoever_dies_is_started_again_and_the_run_ends_as_a_calm_one() {
     check_as_calm(&ended, &out);
     let told = said(&ended);
     for line in [
-        "the learner was killed by signal 9 and is started again",
+        "the learner was killed by signal 9 and is restarted",
         "the learner continues from round",
-        "the teacher was killed by signal 9 and is started again",
-        "was killed by signal 9 and is started again",
+        "the teacher was killed by signal 9 and is restarted",
+        "was killed by signal 9 and is restarted",
     ] {
         assert!(told.lines().any(|said| said.contains(line)), "{line:?} is not in {told}");
     }
@@ -209,7 +209,7 @@ fn processes_that_stand_still_for_a_while_are_left_alone() {
     }
     let ended = finish(run);
     check_as_calm(&ended, &out);
-    assert!(!said(&ended).contains("started again"), "{}", said(&ended));
+    assert!(!said(&ended).contains("restarted"), "{}", said(&ended));
 }
 
 #[test]
@@ -258,7 +258,7 @@ fn a_learner_that_cannot_go_on_ends_the_run_with_its_own_words() {
     let ended = finish(run);
     let told = said(&ended);
     assert_eq!(ended.status.code(), Some(65), "{told}");
-    assert_eq!(told.matches("started again").count(), 1, "{told}");
+    assert_eq!(told.matches("restarted").count(), 1, "{told}");
     let last = told.lines().last().expect("a line");
     assert!(last.contains("the learner ended with exit code 65: checkpoint"), "{told}");
 }

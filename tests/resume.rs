@@ -113,7 +113,7 @@ fn kill_one(run: &Child, role: &str) {
     let former = pids(run, role);
     signal("-KILL", former[0]);
     let is_back = || pids(run, role).iter().any(|pid| !former.contains(pid));
-    assert!(eventually(is_back), "the {role} is not started again");
+    assert!(eventually(is_back), "the {role} is not restarted");
 }
 
 /// Waits until the run is in full swing.
@@ -162,7 +162,7 @@ fn a_refused_resume_does_not_reach_the_run_that_is_under_way() {
         }
     }
     for more in [&[][..], &["--set", "ddpg.discount=0.5"], &["--teacher", &other]] {
-        check_refused(&resume(&out, more), 75, "another process is at work in");
+        check_refused(&resume(&out, more), 75, "another process uses");
         assert_eq!(kept(&out), before, "{more:?}");
     }
     kill_one(&run, "learner");
@@ -279,7 +279,7 @@ fn a_teacher_that_is_killed_as_it_starts_is_started_again() {
     }));
     let ended = run.wait_with_output().expect("ends");
     assert_eq!(digest(&ended), CALM.1);
-    let line = "the teacher was killed by signal 9 and is started again";
+    let line = "the teacher was killed by signal 9 and is restarted";
     assert!(said(&ended).contains(line), "{}", said(&ended));
 }
 

@@ -12,7 +12,7 @@ const ALLOWED: [(&str, &[&str]); 15] = [
     ("policy", &["core", "system"]),
     ("proto", &["core"]),
     ("telemetry", &["core", "system"]),
-    ("net", &["core", "proto"]),
+    ("net", &["core"]),
     ("rl", &["core", "policy"]),
     ("learner", &["core", "system", "policy", "rl", "proto", "telemetry", "net"]),
     ("teacher", &["core", "policy", "proto", "telemetry", "net"]),

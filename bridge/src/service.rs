@@ -20,7 +20,7 @@ use std::time::Duration;
 
 use rand_chacha::ChaCha20Rng;
 use rand_chacha::rand_core::{Rng as _, SeedableRng as _};
-use tandem_net::{Gate, Incoming, SHUTDOWN_GRACE};
+use tandem_net::{Incoming, SHUTDOWN_GRACE, ServerConfig};
 use tandem_proto::pb::bridge_server::{Bridge, BridgeServer};
 use tandem_proto::{DecodeError, pb};
 use tokio::sync::{Semaphore, watch};
@@ -73,7 +73,7 @@ pub async fn serve(
     executor: Executor<BoxDriver>,
     config: Config,
     incoming: impl Into<Incoming>,
-    gate: &Gate,
+    gate: &ServerConfig,
     shutdown: CancellationToken,
 ) -> Result<(), Error> {
     assert!(config.speed > 0.0 && config.speed <= 1.0, "speed {}", config.speed);
@@ -85,7 +85,7 @@ pub async fn serve(
     tokio::spawn(log_stops(arms.watch()));
     let service = BridgeService::new(arms, config);
     let bridge = BridgeServer::new(service).max_decoding_message_size(MAX_REQUEST_BYTES);
-    let router = gate.router(bridge).await?;
+    let router = gate.router(bridge, tandem_proto::FILE_DESCRIPTOR_SET).await?;
     let served = tandem_net::serve(router, incoming, ends.clone()).await;
     ends.cancel();
     thread.join(SHUTDOWN_GRACE).await?;

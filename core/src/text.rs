@@ -35,9 +35,6 @@ pub fn shortened(text: &str, max_chars: usize) -> String {
 }
 
 /// Encodes bytes as lower-case hexadecimal digits, two per byte.
-///
-/// # Panics
-/// Never: writing to a string cannot fail.
 #[must_use]
 pub fn hex(bytes: &[u8]) -> String {
     bytes.iter().fold(String::with_capacity(2 * bytes.len()), |mut digits, byte| {

@@ -7,6 +7,8 @@ use crate::settings::{Exploration, WorldSettings};
 /// Settings that apply to every episode of a run.
 #[derive(Debug, Clone, PartialEq)]
 pub struct RunTerms {
+    /// The run's name; empty outside a run.
+    pub run: String,
     /// Task and arms.
     pub layout: Layout,
     /// The account at the teacher; `None` if the run takes no advice.

@@ -8,10 +8,10 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use tandem_core::Episode;
-use tandem_net::{Dial, DialError, Link};
+use tandem_net::{AuthChannel, Backoff, ClientConfig, ClientConfigError, Operation, retry, within};
 use tandem_proto::pb;
 use tandem_proto::pb::teacher_client::TeacherClient;
-use tandem_telemetry::events::{AdviceAccountOpened, Reconnected, Reconnecting};
+use tandem_telemetry::events::AdviceAccountOpened;
 use tokio_util::sync::{CancellationToken, DropGuard};
 use tonic::{Code, Status};
 use tracing::warn;
@@ -22,9 +22,9 @@ use audit::{Audit, Cost, Statement};
 
 /// Deadline of a call.
 const CALL_DEADLINE: Duration = Duration::from_secs(5);
-/// First pause before an unreachable teacher is tried again; doubled up to [`LONGEST_PAUSE`].
-const FIRST_PAUSE: Duration = Duration::from_millis(100);
-const LONGEST_PAUSE: Duration = Duration::from_secs(1);
+/// Pauses before a failed call is repeated.
+const BACKOFF: Backoff =
+    Backoff { first_pause: Duration::from_millis(100), max_pause: Duration::from_secs(1) };
 /// Pause between two checks whether the teacher still knows the account. Workers wait for a lost account to be opened
 /// again.
 const CHECK_PERIOD: Duration = Duration::from_secs(1);
@@ -34,7 +34,7 @@ const CHECK_PERIOD: Duration = Duration::from_secs(1);
 pub enum TeacherError {
     /// The address is malformed.
     #[error("the teacher cannot be called")]
-    Address(#[from] DialError),
+    Address(#[from] ClientConfigError),
     /// The teacher refused; a retry would not help.
     #[error("the teacher refuses to {what}: {reason}")]
     Refused {
@@ -49,6 +49,17 @@ pub enum TeacherError {
     /// The run was stopped while the teacher was unreachable.
     #[error("stopped while waiting for the teacher")]
     Stopped,
+}
+
+impl TeacherError {
+    /// Returns the error for a status that a retry would not cure.
+    fn of(what: &'static str, status: &Status) -> Self {
+        let reason = status.message().to_owned();
+        match status.code() {
+            Code::NotFound => Self::UnknownAccount(reason),
+            _ => Self::Refused { what, reason },
+        }
+    }
 }
 
 /// The start of a run, for the opening of its account.
@@ -93,7 +104,7 @@ pub(crate) struct Mismatch {
 /// Options for [`AdviceAccount::open`].
 pub(crate) struct AccountOptions<'a> {
     /// Token and TLS of the calls.
-    pub(crate) dial: &'a Dial,
+    pub(crate) dial: &'a ClientConfig,
     /// The teacher's address.
     pub(crate) address: &'a str,
     /// Name, budget and strategy, from the run file.
@@ -107,7 +118,7 @@ pub(crate) struct AccountOptions<'a> {
 /// The run's account at the teacher, used by the learning thread.
 #[derive(Debug)]
 pub(crate) struct AdviceAccount {
-    client: TeacherClient<Link>,
+    client: TeacherClient<AuthChannel>,
     runtime: Runtime,
     shutdown: CancellationToken,
     /// Name, budget and strategy, from the run file.
@@ -136,7 +147,7 @@ impl AdviceAccount {
     ) -> Result<Self, TeacherError> {
         let AccountOptions { dial, address, terms, units_per_episode, start } = options;
         let inside = runtime.enter();
-        let client = TeacherClient::new(dial.link(address)?);
+        let client = TeacherClient::new(dial.channel(address)?);
         drop(inside);
         let (lost, stop_watching) = (Arc::new(AtomicBool::new(false)), CancellationToken::new());
         let budget = terms.budget;
@@ -351,7 +362,7 @@ impl AdviceAccount {
     fn call<T, F>(
         &self,
         what: &'static str,
-        request: impl Fn(TeacherClient<Link>) -> F + Send + 'static,
+        request: impl Fn(TeacherClient<AuthChannel>) -> F + Send + 'static,
     ) -> Result<T, TeacherError>
     where
         T: Send + 'static,
@@ -359,48 +370,17 @@ impl AdviceAccount {
     {
         let (client, shutdown) = (self.client.clone(), self.shutdown.clone());
         let call = async move {
+            let operation = Operation { peer: "teacher", purpose: what };
+            let answered =
+                retry(BACKOFF, CALL_DEADLINE, operation, move || request(client.clone()));
             tokio::select! {
-                answer = ask_until_answered(client, what, request) => answer,
+                answer = answered => answer.map_err(|status| TeacherError::of(what, &status)),
                 () = shutdown.cancelled_owned() => Err(TeacherError::Stopped),
             }
         };
-        self.runtime.wait_on(call).unwrap_or(Err(TeacherError::Stopped))
+        let answer = self.runtime.wait_on(call).unwrap_or(Err(TeacherError::Stopped));
+        answer.map(tonic::Response::into_inner)
     }
-}
-
-async fn ask_until_answered<T, F>(
-    client: TeacherClient<Link>,
-    what: &'static str,
-    request: impl Fn(TeacherClient<Link>) -> F + Send,
-) -> Result<T, TeacherError>
-where
-    F: Future<Output = Result<tonic::Response<T>, Status>> + Send,
-{
-    let mut pause = FIRST_PAUSE;
-    for attempt in 1.. {
-        let answer = tokio::time::timeout(CALL_DEADLINE, request(client.clone())).await;
-        let status = match answer {
-            Ok(Ok(response)) => {
-                if attempt > 1 {
-                    Reconnected { peer: "teacher", attempts: attempt - 1 }.emit();
-                }
-                return Ok(response.into_inner());
-            }
-            Ok(Err(status)) => status,
-            Err(_elapsed) => Status::deadline_exceeded("no answer in time"),
-        };
-        let reason = status.message();
-        match fate(status.code()) {
-            Fate::Passing => {}
-            Fate::UnknownAccount => return Err(TeacherError::UnknownAccount(reason.to_owned())),
-            Fate::Final => return Err(TeacherError::Refused { what, reason: reason.to_owned() }),
-        }
-        let wait_millis = u64::try_from(pause.as_millis()).unwrap_or(u64::MAX);
-        Reconnecting { peer: "teacher", attempt, wait_millis, reason }.emit();
-        tokio::time::sleep(pause).await;
-        pause = (pause * 2).min(LONGEST_PAUSE);
-    }
-    Err(TeacherError::Stopped)
 }
 
 const fn units_left(account: &pb::Account) -> u64 {
@@ -413,7 +393,7 @@ const fn statement(account: &pb::Account) -> Statement {
 
 /// Sets `lost` when the teacher reports that it does not know the account, and forwards the teacher's warning.
 async fn watch_account(
-    mut client: TeacherClient<Link>,
+    mut client: TeacherClient<AuthChannel>,
     name: String,
     lost: Arc<AtomicBool>,
     warnings: Warnings,
@@ -421,38 +401,10 @@ async fn watch_account(
     loop {
         tokio::time::sleep(CHECK_PERIOD).await;
         let look = client.get_account(pb::GetAccountRequest { name: name.clone() });
-        match tokio::time::timeout(CALL_DEADLINE, look).await {
-            Ok(Ok(account)) => warnings.set(Source::Teacher, &account.into_inner().warning),
-            Ok(Err(status)) if status.code() == Code::NotFound => {
-                lost.store(true, Ordering::Relaxed);
-            }
-            _ => {}
+        match within(CALL_DEADLINE, look).await {
+            Ok(account) => warnings.set(Source::Teacher, &account.into_inner().warning),
+            Err(status) if status.code() == Code::NotFound => lost.store(true, Ordering::Relaxed),
+            Err(_) => {}
         }
-    }
-}
-
-/// What a failed call means.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Fate {
-    /// It may go through later.
-    Passing,
-    /// The account is to be opened first.
-    UnknownAccount,
-    /// It will not go through.
-    Final,
-}
-
-const fn fate(code: Code) -> Fate {
-    match code {
-        Code::NotFound => Fate::UnknownAccount,
-        Code::InvalidArgument
-        | Code::FailedPrecondition
-        | Code::OutOfRange
-        | Code::AlreadyExists
-        | Code::PermissionDenied
-        | Code::Unauthenticated
-        | Code::Unimplemented
-        | Code::DataLoss => Fate::Final,
-        _ => Fate::Passing,
     }
 }

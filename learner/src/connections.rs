@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::time::Duration;
 
-use tandem_net::Hangup;
+use tandem_net::ConnectionClosed;
 
 /// Log lines of one kind per [`QUOTA_SPAN`].
 const QUOTA: u64 = 100;
@@ -13,12 +13,12 @@ const QUOTA_SPAN: Duration = Duration::from_secs(10);
 #[derive(Debug, Default)]
 pub(crate) struct Connections {
     n_ever: u64,
-    open: BTreeMap<u64, Hangup>,
+    open: BTreeMap<u64, ConnectionClosed>,
 }
 
 impl Connections {
     /// Returns the number of a connection, and true if the connection is new.
-    pub(crate) fn register(&mut self, hangup: &Hangup) -> (u64, bool) {
+    pub(crate) fn register(&mut self, hangup: &ConnectionClosed) -> (u64, bool) {
         if let Some((number, _)) = self.open.iter().rfind(|(_, known)| known.is_same(hangup)) {
             return (*number, false);
         }

@@ -40,10 +40,10 @@ pub enum Error {
     Diverged(#[from] DdpgError),
     /// The service cannot be configured.
     #[error(transparent)]
-    Gate(#[from] tandem_net::GateError),
+    Gate(#[from] tandem_net::ServerConfigError),
     /// The address of a relay's learner is malformed.
     #[error(transparent)]
-    Address(#[from] tandem_net::DialError),
+    Address(#[from] tandem_net::ClientConfigError),
     /// The server failed.
     #[error("cannot serve")]
     Serve(#[from] tonic::transport::Error),

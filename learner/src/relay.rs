@@ -8,7 +8,9 @@ use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
-use tandem_net::{Dial, Gate, Incoming, Link, Prepared};
+use tandem_net::{
+    AuthChannel, ClientConfig, EncodedResponse, Incoming, MAX_MESSAGE_BYTES, ServerConfig, within,
+};
 use tandem_proto::pb;
 use tandem_proto::pb::learner_client::LearnerClient;
 use tandem_proto::pb::learner_server::{Learner, LearnerServer};
@@ -17,7 +19,7 @@ use tokio_util::sync::CancellationToken;
 use tonic::{Request, Response, Status, Streaming};
 
 use crate::error::Error;
-use crate::service::{MAX_MESSAGE_BYTES, check_version};
+use crate::service::check_version;
 use crate::shared::KEPT_VERSIONS;
 
 /// Deadline of a call to the learner, which holds a request for work for up to 2 s.
@@ -29,23 +31,23 @@ const CALL_DEADLINE: Duration = Duration::from_secs(20);
 /// When `learner` is not an address, or the server fails.
 pub async fn serve(
     learner: &str,
-    dial: &Dial,
-    gate: &Gate,
+    dial: &ClientConfig,
+    gate: &ServerConfig,
     incoming: impl Into<Incoming>,
     shutdown: CancellationToken,
 ) -> Result<(), Error> {
-    let link = dial.link(learner).map_err(Error::Address)?;
+    let link = dial.channel(learner).map_err(Error::Address)?;
     let client = LearnerClient::new(link)
         .max_decoding_message_size(MAX_MESSAGE_BYTES)
         .max_encoding_message_size(MAX_MESSAGE_BYTES);
     let relay = Relay { client, cache: Mutex::default() };
     let server = LearnerServer::new(relay).max_decoding_message_size(MAX_MESSAGE_BYTES);
-    let router = gate.router(server).await?;
+    let router = gate.router(server, tandem_proto::FILE_DESCRIPTOR_SET).await?;
     Ok(tandem_net::serve(router, incoming, shutdown).await?)
 }
 
 struct Relay {
-    client: LearnerClient<Link>,
+    client: LearnerClient<AuthChannel>,
     cache: Mutex<Cache>,
 }
 
@@ -54,7 +56,7 @@ struct Relay {
 struct Cache {
     /// Identifies the start: version 3 of another one has other parameters.
     learner: u64,
-    versions: BTreeMap<u64, Arc<OnceCell<Prepared>>>,
+    versions: BTreeMap<u64, Arc<OnceCell<EncodedResponse>>>,
 }
 
 impl Cache {
@@ -66,7 +68,7 @@ impl Cache {
     }
 
     /// Returns the cell of a version: one caller fetches it, the others wait.
-    fn cell(&mut self, version: u64) -> Arc<OnceCell<Prepared>> {
+    fn cell(&mut self, version: u64) -> Arc<OnceCell<EncodedResponse>> {
         let cell = self.versions.entry(version).or_default().clone();
         while self.versions.len() > KEPT_VERSIONS {
             self.versions.pop_first();
@@ -87,11 +89,11 @@ impl Relay {
         self.cache.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    async fn fetch(&self, version: u64) -> Result<Prepared, Status> {
+    async fn fetch(&self, version: u64) -> Result<EncodedResponse, Status> {
         let mut client = self.client.clone();
         let request = pb::GetParametersRequest { version };
-        let parameters = within(client.get_parameters(request)).await?;
-        Ok(Prepared::of(parameters.get_ref()))
+        let parameters = forward(client.get_parameters(request)).await?;
+        Ok(EncodedResponse::encode(parameters.get_ref()))
     }
 }
 
@@ -106,7 +108,7 @@ impl Learner for Relay {
         let request = request.into_inner();
         // A relay would drop the fields that another version has added.
         check_version(&request.worker, &request.version, "relay")?;
-        let answer = within(self.client.clone().join(request)).await?;
+        let answer = forward(self.client.clone().join(request)).await?;
         self.cache().switch_to(answer.get_ref().learner);
         Ok(answer)
     }
@@ -115,7 +117,7 @@ impl Learner for Relay {
         &self,
         request: Request<pb::NextWorkRequest>,
     ) -> Result<Response<pb::NextWorkResponse>, Status> {
-        within(self.client.clone().next_work(request.into_inner())).await
+        forward(self.client.clone().next_work(request.into_inner())).await
     }
 
     async fn get_parameters(
@@ -125,7 +127,7 @@ impl Learner for Relay {
         let version = request.into_inner().version;
         let cell = self.cache().cell(version);
         match cell.get_or_try_init(|| self.fetch(version)).await {
-            Ok(prepared) => Ok(prepared.clone().answer()),
+            Ok(prepared) => Ok(prepared.clone().into_response()),
             Err(status) => {
                 self.cache().remove_empty(version);
                 Err(status)
@@ -137,32 +139,28 @@ impl Learner for Relay {
         &self,
         request: Request<pb::SubmitEpisodesRequest>,
     ) -> Result<Response<pb::SubmitEpisodesResponse>, Status> {
-        within(self.client.clone().submit_episodes(request.into_inner())).await
+        forward(self.client.clone().submit_episodes(request.into_inner())).await
     }
 
     async fn status(
         &self,
         request: Request<pb::StatusRequest>,
     ) -> Result<Response<pb::Progress>, Status> {
-        within(self.client.clone().status(request.into_inner())).await
+        forward(self.client.clone().status(request.into_inner())).await
     }
 
     async fn watch(
         &self,
         request: Request<pb::WatchRequest>,
     ) -> Result<Response<Self::WatchStream>, Status> {
-        within(self.client.clone().watch(request.into_inner())).await
+        forward(self.client.clone().watch(request.into_inner())).await
     }
 }
 
-/// Applies the deadline to a call.
-async fn within<T>(
+/// Applies the deadline to a call of the learner.
+async fn forward<T>(
     call: impl Future<Output = Result<Response<T>, Status>>,
 ) -> Result<Response<T>, Status> {
-    let lapsed = |_elapsed| {
-        Status::unavailable(format!("no answer of the learner within {CALL_DEADLINE:?}"))
-    };
-    let answer = tokio::time::timeout(CALL_DEADLINE, call).await.map_err(lapsed)??;
     // The headers of the learner's response, such as its date, do not apply to this one.
-    Ok(Response::new(answer.into_inner()))
+    Ok(Response::new(within(CALL_DEADLINE, call).await?.into_inner()))
 }

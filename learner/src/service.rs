@@ -11,7 +11,7 @@ use std::time::Duration;
 
 use tandem_core::Episode;
 use tandem_core::text::error_chain;
-use tandem_net::{Hangup, Incoming, Page, Prepared};
+use tandem_net::{ConnectionClosed, EncodedResponse, Incoming, MAX_MESSAGE_BYTES, TextEndpoint};
 use tandem_proto::pb;
 use tandem_proto::pb::learner_server::{Learner, LearnerServer};
 use tandem_proto::{decode_episode, encode_run_terms, encode_slot};
@@ -39,8 +39,6 @@ const WORK_POLL: Duration = Duration::from_secs(2);
 const LINGER: Duration = Duration::from_millis(1500);
 /// Pause between two checks whether all workers know of the end.
 const LINGER_TICK: Duration = Duration::from_millis(50);
-/// Largest message that the service accepts; a slot of 64 two-arm episodes takes 1 MB.
-pub(crate) const MAX_MESSAGE_BYTES: usize = 64 << 20;
 
 /// Options of the service.
 #[derive(Debug, Default)]
@@ -94,7 +92,7 @@ pub async fn serve_with(
     let learner =
         LearnerServer::new(LearnerService { shared: shared.clone(), start: config.first_worker })
             .max_decoding_message_size(MAX_MESSAGE_BYTES);
-    let router = config.gate.router(learner).await?;
+    let router = config.gate.router(learner, tandem_proto::FILE_DESCRIPTOR_SET).await?;
     let stop_serving = CancellationToken::new();
     let serving_metrics = serve_metrics(options.metrics, shared.clone());
     let learning = {
@@ -151,7 +149,7 @@ async fn until_workers_know(shared: Arc<Shared>, shutdown: CancellationToken) {
 async fn serve_metrics(listener: Option<TcpListener>, shared: Arc<Shared>) {
     let Some(listener) = listener else { return std::future::pending().await };
     let write = Arc::new(move || metrics::page(&shared));
-    let page = Page { path: metrics::PATH, content_type: metrics::CONTENT_TYPE, write };
+    let page = TextEndpoint { path: metrics::PATH, content_type: metrics::CONTENT_TYPE, write };
     page.serve(listener).await;
 }
 
@@ -195,8 +193,8 @@ fn learn(
 
 /// Waits for the end of a connection and returns the slots of its workers to the queue, so that a round does not wait
 /// until they count as slow. A worker that was only disconnected may still submit its episodes.
-async fn requeue_at_hangup(shared: Arc<Shared>, connection: u64, hangup: Hangup) {
-    hangup.wait().await;
+async fn requeue_when_closed(shared: Arc<Shared>, connection: u64, closed: ConnectionClosed) {
+    closed.wait().await;
     let mut state = shared.lock();
     state.connections.remove(connection);
     let requeued = state.queue.remove_connection(connection);
@@ -223,7 +221,7 @@ impl Learner for LearnerService {
         &self,
         request: Request<pb::JoinRequest>,
     ) -> Result<Response<pb::JoinResponse>, Status> {
-        let hangup = Hangup::of(request.extensions());
+        let hangup = ConnectionClosed::from_extensions(request.extensions());
         let pb::JoinRequest { worker: name, version } = request.into_inner();
         check_name(&name)?;
         check_version(&name, &version, "learner")?;
@@ -233,7 +231,7 @@ impl Learner for LearnerService {
             state.terms.clone().ok_or_else(|| Status::unavailable("the run is starting"))?;
         let connection = hangup.as_ref().map(|hangup| state.connections.register(hangup));
         if let (Some(hangup), Some((number, true))) = (hangup, connection) {
-            tokio::spawn(requeue_at_hangup(self.shared.clone(), number, hangup));
+            tokio::spawn(requeue_when_closed(self.shared.clone(), number, hangup));
         }
         let worker_id = state
             .queue
@@ -279,7 +277,7 @@ impl Learner for LearnerService {
         let version = request.into_inner().version;
         let prepared = self.shared.lock().published.get(&version).cloned();
         let gone = || Status::not_found(format!("parameter version {version} is not kept"));
-        prepared.map(Prepared::answer).ok_or_else(gone)
+        prepared.map(EncodedResponse::into_response).ok_or_else(gone)
     }
 
     async fn submit_episodes(

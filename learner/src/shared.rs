@@ -6,7 +6,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use tandem_core::work::{PublishedActor, RunTerms};
-use tandem_net::{Dial, Gate, Pacing, Prepared};
+use tandem_net::{ClientConfig, EncodedResponse, Pacing, ServerConfig};
 use tandem_policy::Policy;
 use tandem_proto::encode_actor;
 use tandem_rl::config::RunConfig;
@@ -29,9 +29,9 @@ pub struct LearnerConfig {
     /// The run.
     pub run: RunConfig,
     /// Access control and TLS of the service.
-    pub gate: Gate,
+    pub gate: ServerConfig,
     /// Token and TLS of calls to the teacher.
-    pub dial: Dial,
+    pub dial: ClientConfig,
     /// The teacher's address, `HOST:PORT` or a URI; required if the run asks for advice.
     pub teacher: Option<String>,
     /// The one-arm policy whose copies a run with strategy `init:teacher` starts from.
@@ -77,7 +77,7 @@ pub(crate) struct State {
     /// The run's terms; `None` before the run starts.
     pub(crate) terms: Option<RunTerms>,
     /// Published parameters by version, encoded.
-    pub(crate) published: BTreeMap<u64, Prepared>,
+    pub(crate) published: BTreeMap<u64, EncodedResponse>,
     /// The end of the run, once there is no more work.
     pub(crate) end: Option<RunEnd>,
     /// Workers that were playing at the end of the run and have not received it yet.
@@ -124,7 +124,7 @@ impl Shared {
 
     /// Publishes an actor, and drops the oldest beyond [`KEPT_VERSIONS`].
     pub(crate) fn publish(&self, actor: &PublishedActor) {
-        let prepared = Prepared::of(&encode_actor(actor));
+        let prepared = EncodedResponse::encode(&encode_actor(actor));
         let mut state = self.lock();
         state.published.insert(actor.version, prepared);
         while state.published.len() > KEPT_VERSIONS {

@@ -1,4 +1,4 @@
-//! Secrets and where a service may listen.
+//! Tokens, and the addresses on which a service requires one.
 
 use std::fmt;
 use std::fs::File;
@@ -6,53 +6,53 @@ use std::io::Read as _;
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 
-/// Fewest characters of a token.
+/// The minimum length of a token, in characters.
 const MIN_CHARS: usize = 16;
-/// Most characters of a token: it travels in a header of every call.
+/// The maximum length of a token, in characters: every call carries it in a header.
 const MAX_CHARS: usize = 1024;
-/// Bytes of a token file that are read; blanks round the token included.
+/// The maximum size of a token file, in bytes, including surrounding whitespace.
 const MAX_FILE_BYTES: u64 = 64 << 10;
-/// What stands before the token in the header, in any case.
+/// The prefix of the token in the header, case-insensitive.
 const SCHEME: &str = "Bearer ";
 
-/// What a caller must show: `authorization: Bearer TOKEN`. Never printed.
+/// The secret that callers send as `authorization: Bearer TOKEN`. `Debug` does not print it.
 #[derive(Clone, PartialEq, Eq)]
 pub struct Token(String);
 
-/// Why a text is no token.
+/// An error in the text of a token.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
-pub enum TokenRefused {
-    /// There is nothing.
+pub enum TokenError {
+    /// The text is empty.
     #[error("it is empty")]
     Empty,
-    /// Too easily guessed, or too long for a header.
+    /// The text is too short to be secure, or too long for a header.
     #[error("it has {0} characters, a token has {MIN_CHARS} to {MAX_CHARS}")]
     Length(usize),
-    /// A header cannot hold it.
+    /// A header cannot contain a character of the text. The position is in bytes, from 1.
     #[error("byte {0} of it is a blank, a control character or not ASCII")]
     Character(usize),
 }
 
-/// Why a service may not be offered, or a secret not be used.
+/// An error in a service's access configuration.
 #[derive(Debug, thiserror::Error)]
 pub enum AccessError {
-    /// A secret or certificate cannot be read.
+    /// A token or certificate cannot be read.
     #[error("cannot read {path:?}")]
     Read {
         /// The file.
         path: PathBuf,
-        /// Why not.
+        /// The cause.
         source: std::io::Error,
     },
-    /// A file does not hold a token.
+    /// The content of a file is not a token.
     #[error("{path:?} does not hold a token")]
     Token {
         /// The file.
         path: PathBuf,
-        /// Why not.
-        source: TokenRefused,
+        /// The cause.
+        source: TokenError,
     },
-    /// The address can be reached from other machines and nothing protects the service.
+    /// Other machines can reach the address, and no token protects the service.
     #[error(
         "{0} can be reached from other machines: give --token-file FILE (and --tls-cert, --tls-key), or --insecure to do without"
     )]
@@ -60,48 +60,48 @@ pub enum AccessError {
 }
 
 impl Token {
-    /// A token from its text.
+    /// Parses a token.
     ///
     /// # Errors
-    /// When the text is short or long, or holds what a header cannot.
-    pub fn new(text: &str) -> Result<Self, TokenRefused> {
+    /// When the text has an invalid length or character.
+    pub fn new(text: &str) -> Result<Self, TokenError> {
         if text.is_empty() {
-            return Err(TokenRefused::Empty);
+            return Err(TokenError::Empty);
         }
         if let Some(idx) = text.bytes().position(|byte| !byte.is_ascii_graphic()) {
-            return Err(TokenRefused::Character(idx + 1));
+            return Err(TokenError::Character(idx + 1));
         }
         if !(MIN_CHARS..=MAX_CHARS).contains(&text.len()) {
-            return Err(TokenRefused::Length(text.len()));
+            return Err(TokenError::Length(text.len()));
         }
         Ok(Self(text.to_owned()))
     }
 
-    /// The token in a file; blanks round it do not count.
+    /// Reads the token in a file, without surrounding whitespace.
     ///
     /// # Errors
-    /// When the file cannot be read or holds no token.
+    /// When the file cannot be read or does not contain a token.
     pub fn read(path: &Path) -> Result<Self, AccessError> {
         let mut bytes = Vec::new();
         File::open(path)
             .and_then(|file| file.take(MAX_FILE_BYTES).read_to_end(&mut bytes))
             .map_err(|source| AccessError::Read { path: path.to_owned(), source })?;
-        // What is not UTF-8 is not ASCII either, and no token.
+        // Text that is not UTF-8 is not ASCII and is rejected with the replacement characters.
         Self::new(String::from_utf8_lossy(bytes.trim_ascii()).as_ref())
             .map_err(|source| AccessError::Token { path: path.to_owned(), source })
     }
 
-    /// The header's value.
+    /// Returns the value of the `authorization` header.
     pub(crate) fn header(&self) -> String {
         format!("{SCHEME}{}", self.0)
     }
 
-    /// Whether `header` shows this token, in a time that does not tell how much of it was right.
-    pub(crate) fn is_shown_by(&self, header: &[u8]) -> bool {
-        let Some((scheme, shown)) = header.split_at_checked(SCHEME.len()) else { return false };
-        let differences = self.0.bytes().zip(shown).fold(0, |sum, (a, b)| sum | (a ^ b));
+    /// Returns whether `header` carries this token, in a time that does not depend on where it differs.
+    pub(crate) fn matches(&self, header: &[u8]) -> bool {
+        let Some((scheme, token)) = header.split_at_checked(SCHEME.len()) else { return false };
+        let differences = self.0.bytes().zip(token).fold(0, |sum, (a, b)| sum | (a ^ b));
         scheme.eq_ignore_ascii_case(SCHEME.as_bytes())
-            && self.0.len() == shown.len()
+            && self.0.len() == token.len()
             && std::hint::black_box(differences) == 0
     }
 }
@@ -112,7 +112,7 @@ impl fmt::Debug for Token {
     }
 }
 
-/// Whether other machines can reach a service that listens on `address`.
+/// Returns whether other machines can reach a service that listens on `address`.
 #[must_use]
 pub fn is_exposed(address: SocketAddr) -> bool {
     !address.ip().to_canonical().is_loopback()
@@ -125,23 +125,23 @@ mod tests {
     const SECRET: &str = "0123456789abcdef";
 
     #[test]
-    fn what_a_header_cannot_hold_or_anybody_could_guess_is_no_token() {
+    fn a_token_with_an_invalid_length_or_character_is_rejected() {
         let check = |text: &str, expected| {
             assert_eq!(Token::new(text).map(|_| ()), Err(expected), "{text:?}");
         };
-        check("", TokenRefused::Empty);
-        check("0123456789abcde", TokenRefused::Length(15));
-        check(&"x".repeat(1025), TokenRefused::Length(1025));
-        check("0123456789abcdef\0", TokenRefused::Character(17));
-        check("0123456789 abcdef", TokenRefused::Character(11));
-        check("0123456789abcdé", TokenRefused::Character(15));
+        check("", TokenError::Empty);
+        check("0123456789abcde", TokenError::Length(15));
+        check(&"x".repeat(1025), TokenError::Length(1025));
+        check("0123456789abcdef\0", TokenError::Character(17));
+        check("0123456789 abcdef", TokenError::Character(11));
+        check("0123456789abcdé", TokenError::Character(15));
         for fits in [SECRET, &"x".repeat(1024), "+/=~!\"#$%&'()*,-"] {
             assert!(Token::new(fits).is_ok(), "{fits}");
         }
     }
 
     #[test]
-    fn a_file_holds_a_token_between_blanks() {
+    fn whitespace_around_the_token_in_a_file_is_ignored() {
         let directory = tempfile::tempdir().expect("a directory");
         let path = directory.path().join("token");
         let read = |bytes: &[u8]| {
@@ -159,10 +159,10 @@ mod tests {
     }
 
     #[test]
-    fn a_token_is_shown_whole_or_not_at_all() {
+    fn only_the_whole_token_matches() {
         let token = Token::new(SECRET).expect("a token");
-        let check = |header: &str, shown| {
-            assert_eq!(token.is_shown_by(header.as_bytes()), shown, "{header:?}");
+        let check = |header: &str, expected| {
+            assert_eq!(token.matches(header.as_bytes()), expected, "{header:?}");
         };
         check("Bearer 0123456789abcdef", true);
         check("bearer 0123456789abcdef", true);
@@ -176,13 +176,13 @@ mod tests {
     }
 
     #[test]
-    fn a_token_is_not_printed() {
+    fn debug_output_does_not_contain_the_token() {
         let token = Token::new(SECRET).expect("a token");
         assert!(!format!("{token:?}").contains("0123"));
     }
 
     #[test]
-    fn only_loopback_addresses_are_out_of_reach() {
+    fn all_addresses_but_loopback_are_exposed() {
         for (address, exposed) in [
             ("127.0.0.1:0", false),
             ("127.8.8.8:7000", false),

@@ -1,9 +1,9 @@
-//! Which connections a service keeps: how many it admits, and which of them it drops to admit a newcomer.
+//! Admission control: the number of connections that a service keeps, and which one it evicts to admit another.
 //!
-//! A newcomer is always admitted. When there is no room for it, the connection that has proven least is evicted: first
+//! A new connection is always admitted. When the capacity is exhausted, the least trusted connection is evicted: first
 //! one that has not made a request in a while, then one that has made no authenticated call, the oldest first. An
-//! authenticated connection is never evicted, and some places are never given to authenticated connections. So a
-//! caller who can authenticate gets through whatever others hold open.
+//! authenticated connection is never evicted, and a reserve of connections is never given to authenticated ones. A
+//! client with the token therefore gets through, regardless of the connections that others hold open.
 
 use std::collections::BTreeMap;
 use std::future::Future as _;
@@ -20,28 +20,28 @@ use tokio::time::{Instant, Sleep};
 
 use crate::throttle::Throttle;
 
-/// The time until a connection must have made its first request, the TLS handshake included.
+/// The deadline of the first request on a connection, including the TLS handshake.
 pub(crate) const FIRST_REQUEST: Duration = Duration::from_secs(10);
-/// The time for which a connection without a request is not the first to be evicted.
+/// The age up to which a connection without a request is not the first to be evicted.
 const FRESH: Duration = Duration::from_secs(1);
-/// The time between two log lines about evictions.
+/// The minimum time between two log lines about evictions.
 const LOG_EVERY: Duration = Duration::from_secs(60);
 
-/// The most connections of a service that has as many open files as it likes.
+/// The maximum number of connections of a service without a limit on open files.
 const MOST: usize = 16_384;
-/// Open files that a service needs beside its connections: its ledger or run directory, logs, other connections.
+/// The open files that a service needs besides its connections: ledger or run directory, logs, outgoing connections.
 const OTHER_FILES: usize = 64;
-/// Places that authenticated connections cannot take.
+/// The number of connections that is reserved for unauthenticated ones.
 const RESERVE: usize = 32;
 
-/// How many connections a service keeps.
+/// The number of connections that a service keeps.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Capacity {
-    /// All connections.
+    /// The limit on all connections.
     total: usize,
-    /// Authenticated connections.
+    /// The limit on authenticated connections.
     authenticated: usize,
-    /// Connections of one address that have made no authenticated call. Loopback addresses have no such limit.
+    /// The limit per address on connections without an authenticated call. Loopback addresses have no such limit.
     unauthenticated_per_peer: usize,
 }
 
@@ -54,7 +54,7 @@ impl Capacity {
         Self { total, authenticated: total - reserve, unauthenticated_per_peer: total / 2 }
     }
 
-    /// Returns the capacity of a process that may have `limit` open files; `None` means any number.
+    /// Returns the capacity of a process with a limit of `limit` open files; `None` means no limit.
     #[must_use]
     pub fn for_open_files(limit: Option<u64>) -> Self {
         let limit = limit.and_then(|limit| usize::try_from(limit).ok()).unwrap_or(usize::MAX);
@@ -68,15 +68,15 @@ impl Default for Capacity {
     }
 }
 
-/// What a connection has proven, least first.
+/// The trust in a connection, in ascending order.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 #[repr(u8)]
-enum Standing {
-    /// No request has come.
-    Unproven,
-    /// A request has come that needed no token, or had a wrong one, or there is no room for an authenticated one.
+enum Trust {
+    /// No request has arrived.
+    New,
+    /// A request has arrived, but without a valid token, or the limit on authenticated connections was reached.
     Requested,
-    /// A call has passed the guard.
+    /// A call has passed the token check.
     Authenticated,
 }
 
@@ -84,20 +84,20 @@ enum Standing {
 #[derive(Debug)]
 pub(crate) struct Admission {
     capacity: Capacity,
-    book: Mutex<Book>,
+    registry: Mutex<Registry>,
 }
 
 #[derive(Debug, Default)]
-struct Book {
+struct Registry {
     next_id: u64,
-    /// Connections that can be evicted, by standing and age.
-    evictable: BTreeMap<(Standing, u64), Evictable>,
+    /// Connections that can be evicted, by trust and age.
+    evictable: BTreeMap<(Trust, u64), Evictable>,
     /// The number of evictable connections of each address.
     per_peer: BTreeMap<IpAddr, usize>,
     n_authenticated: usize,
-    /// Connections that hold a file, those being evicted included.
+    /// The number of connections that hold a file, including those being evicted.
     n_open: usize,
-    /// Woken when a connection has closed.
+    /// The task that is woken when a connection has closed.
     waiting: Option<Waker>,
     log: Throttle,
 }
@@ -111,49 +111,50 @@ struct Evictable {
 
 impl Admission {
     pub(crate) fn new(capacity: Capacity) -> Arc<Self> {
-        Arc::new(Self { capacity, book: Mutex::default() })
+        Arc::new(Self { capacity, registry: Mutex::default() })
     }
 
-    fn book(&self) -> MutexGuard<'_, Book> {
-        self.book.lock().unwrap_or_else(PoisonError::into_inner)
+    fn registry(&self) -> MutexGuard<'_, Registry> {
+        self.registry.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// The number of open connections.
+    /// Returns the number of open connections.
     pub(crate) fn n_open(&self) -> usize {
-        self.book().n_open
+        self.registry().n_open
     }
 
-    /// Waits until evicted connections have closed: until then there are more than the capacity allows.
+    /// Waits until the number of open connections is within the capacity, that is, until evicted ones have closed.
     pub(crate) fn poll_room(&self, context: &Context<'_>) -> Poll<()> {
-        let mut book = self.book();
-        if book.n_open <= self.capacity.total {
+        let mut registry = self.registry();
+        if registry.n_open <= self.capacity.total {
             return Poll::Ready(());
         }
-        book.waiting = Some(context.waker().clone());
+        registry.waiting = Some(context.waker().clone());
         Poll::Pending
     }
 
-    /// Admits a connection from `peer`, evicting another one where that is needed.
-    pub(crate) fn admit(self: &Arc<Self>, peer: Option<IpAddr>) -> Seat {
+    /// Admits a connection from `peer`, evicting another one if necessary.
+    pub(crate) fn admit(self: &Arc<Self>, peer: Option<IpAddr>) -> AdmissionPermit {
         let now = Instant::now();
-        let peer = peer.and_then(counted);
-        let mut book = self.book();
-        let of_peer = peer.and_then(|peer| book.per_peer.get(&peer)).copied().unwrap_or_default();
+        let peer = peer.and_then(counting_key);
+        let mut registry = self.registry();
+        let of_peer =
+            peer.and_then(|peer| registry.per_peer.get(&peer)).copied().unwrap_or_default();
         let evicts = if of_peer >= self.capacity.unauthenticated_per_peer {
-            book.evict(peer, now)
-        } else if book.n_open >= self.capacity.total {
-            book.evict(None, now)
+            registry.evict(peer, now)
+        } else if registry.n_open >= self.capacity.total {
+            registry.evict(None, now)
         } else {
             false
         };
-        let logged = if evicts { book.log.pass(now, LOG_EVERY) } else { None };
+        let logged = if evicts { registry.log.pass(now, LOG_EVERY) } else { None };
         let (evict, evicted) = oneshot::channel();
-        let id = book.next_id;
-        book.next_id += 1;
-        book.n_open += 1;
-        book.add((Standing::Unproven, id), Evictable { peer, since: now, evict });
-        let n_open = book.n_open;
-        drop(book);
+        let id = registry.next_id;
+        registry.next_id += 1;
+        registry.n_open += 1;
+        registry.add((Trust::New, id), Evictable { peer, since: now, evict });
+        let n_open = registry.n_open;
+        drop(registry);
         if let Some(n_evicted) = logged {
             let limit = self.capacity.total;
             tracing::warn!(
@@ -163,30 +164,30 @@ impl Admission {
                 "too many connections, dropping those without an authenticated call"
             );
         }
-        let standing = AtomicU8::new(Standing::Unproven as u8);
-        Seat {
-            place: Arc::new(Place { admission: Arc::clone(self), id, standing }),
+        let trust = AtomicU8::new(Trust::New as u8);
+        AdmissionPermit {
+            handle: Arc::new(AdmissionHandle { admission: Arc::clone(self), id, trust }),
             evicted: Some(evicted),
             deadline: Some(Box::pin(tokio::time::sleep(FIRST_REQUEST))),
-            ended: None,
+            closing: None,
         }
     }
 
     /// Evicts a connection because the system has no room for another one.
     pub(crate) fn make_room(&self) {
-        self.book().evict(None, Instant::now());
+        self.registry().evict(None, Instant::now());
     }
 }
 
-impl Book {
-    fn add(&mut self, key: (Standing, u64), evictable: Evictable) {
+impl Registry {
+    fn add(&mut self, key: (Trust, u64), evictable: Evictable) {
         if let Some(peer) = evictable.peer {
             *self.per_peer.entry(peer).or_default() += 1;
         }
         self.evictable.insert(key, evictable);
     }
 
-    fn remove(&mut self, key: (Standing, u64)) -> Option<Evictable> {
+    fn remove(&mut self, key: (Trust, u64)) -> Option<Evictable> {
         let removed = self.evictable.remove(&key)?;
         if let Some(peer) = removed.peer
             && let Some(n) = self.per_peer.get_mut(&peer)
@@ -199,32 +200,33 @@ impl Book {
         Some(removed)
     }
 
-    /// Evicts the connection that has proven least, of `peer` if one is given; returns whether there was one.
+    /// Evicts the least trusted connection, of `peer` if one is given; returns whether there was one.
     fn evict(&mut self, peer: Option<IpAddr>, now: Instant) -> bool {
         let Some(key) = self.victim(peer, now) else { return false };
         let Some(victim) = self.remove(key) else { return false };
-        // A connection that has closed meanwhile needs no telling.
+        // Fails only for a connection that has closed meanwhile.
         victim.evict.send(()).ok();
         true
     }
 
-    fn victim(&self, peer: Option<IpAddr>, now: Instant) -> Option<(Standing, u64)> {
+    fn victim(&self, peer: Option<IpAddr>, now: Instant) -> Option<(Trust, u64)> {
         let is_of_peer = |evictable: &Evictable| peer.is_none() || evictable.peer == peer;
-        let oldest = |standing| {
-            let mut found = self.evictable.range((standing, 0)..=(standing, u64::MAX));
+        let oldest = |trust| {
+            let mut found = self.evictable.range((trust, 0)..=(trust, u64::MAX));
             found.find(|(_, evictable)| is_of_peer(evictable))
         };
-        let unproven = oldest(Standing::Unproven);
+        let unproven = oldest(Trust::New);
         let silent = unproven.filter(|(_, found)| now.duration_since(found.since) >= FRESH);
-        let victim = silent.or_else(|| oldest(Standing::Requested)).or(unproven);
+        let victim = silent.or_else(|| oldest(Trust::Requested)).or(unproven);
         victim.map(|(key, _)| *key)
     }
 }
 
-/// The address under which connections of `peer` are counted together; `None` for those that are not counted.
+/// Returns the address under which connections of `peer` are counted together; `None` for loopback addresses, which all
+/// local clients share.
 ///
-/// A host has a whole /64 of IPv6 addresses at its disposal. On loopback all clients have the same address.
-fn counted(peer: IpAddr) -> Option<IpAddr> {
+/// IPv6 addresses are counted by /64 prefix, because one host may use all addresses of a prefix.
+fn counting_key(peer: IpAddr) -> Option<IpAddr> {
     match peer.to_canonical() {
         peer if peer.is_loopback() => None,
         IpAddr::V6(peer) => Some(Ipv6Addr::from_bits(peer.to_bits() >> 64 << 64).into()),
@@ -232,127 +234,126 @@ fn counted(peer: IpAddr) -> Option<IpAddr> {
     }
 }
 
-/// A connection's place among those of its service, shared with the calls that come over it.
+/// A handle to a connection's entry in the registry, shared with the calls on that connection.
 #[derive(Debug)]
-pub(crate) struct Place {
+pub(crate) struct AdmissionHandle {
     admission: Arc<Admission>,
     id: u64,
-    /// Changed under the book's lock only.
-    standing: AtomicU8,
+    /// Changed only while the registry is locked.
+    trust: AtomicU8,
 }
 
-impl Place {
-    /// Notes that a complete request has come.
-    pub(crate) fn requested(&self) {
-        self.rise(Standing::Requested);
+impl AdmissionHandle {
+    /// Records that a complete request has arrived.
+    pub(crate) fn mark_requested(&self) {
+        self.promote(Trust::Requested);
     }
 
-    /// Notes that a call has passed the guard.
-    pub(crate) fn authenticated(&self) {
-        self.rise(Standing::Authenticated);
+    /// Records that a call has passed the token check.
+    pub(crate) fn mark_authenticated(&self) {
+        self.promote(Trust::Authenticated);
     }
 
-    fn standing(&self) -> Standing {
-        match self.standing.load(Ordering::Acquire) {
-            0 => Standing::Unproven,
-            1 => Standing::Requested,
-            _ => Standing::Authenticated,
+    fn trust(&self) -> Trust {
+        match self.trust.load(Ordering::Acquire) {
+            0 => Trust::New,
+            1 => Trust::Requested,
+            _ => Trust::Authenticated,
         }
     }
 
-    fn rise(&self, to: Standing) {
-        if self.standing() >= to {
+    fn promote(&self, to: Trust) {
+        if self.trust() >= to {
             return;
         }
-        let mut book = self.admission.book();
-        let from = self.standing();
-        let has_room = book.n_authenticated < self.admission.capacity.authenticated;
-        let to = if has_room { to } else { to.min(Standing::Requested) };
+        let mut registry = self.admission.registry();
+        let from = self.trust();
+        let has_room = registry.n_authenticated < self.admission.capacity.authenticated;
+        let to = if has_room { to } else { to.min(Trust::Requested) };
         if from >= to {
             return;
         }
-        // One that is being evicted stays what it was.
-        let Some(evictable) = book.remove((from, self.id)) else { return };
-        if to == Standing::Authenticated {
-            book.n_authenticated += 1;
+        // A connection that is being evicted is no longer in the registry and keeps its trust.
+        let Some(evictable) = registry.remove((from, self.id)) else { return };
+        if to == Trust::Authenticated {
+            registry.n_authenticated += 1;
         } else {
-            book.add((to, self.id), evictable);
+            registry.add((to, self.id), evictable);
         }
-        self.standing.store(to as u8, Ordering::Release);
+        self.trust.store(to as u8, Ordering::Release);
     }
 
     fn leave(&self) {
-        let mut book = self.admission.book();
-        match self.standing() {
-            Standing::Authenticated => book.n_authenticated -= 1,
-            standing => drop(book.remove((standing, self.id))),
+        let mut registry = self.admission.registry();
+        match self.trust() {
+            Trust::Authenticated => registry.n_authenticated -= 1,
+            trust => drop(registry.remove((trust, self.id))),
         }
-        book.n_open -= 1;
-        let waiting = book.waiting.take();
-        drop(book);
+        registry.n_open -= 1;
+        let waiting = registry.waiting.take();
+        drop(registry);
         if let Some(waiting) = waiting {
             waiting.wake();
         }
     }
 }
 
-/// A connection's own side of its place: says when it must close.
+/// A connection's permit. It signals when the connection must close, and releases its entry when it is dropped.
 #[derive(Debug)]
-pub(crate) struct Seat {
-    pub(crate) place: Arc<Place>,
-    /// `None` once the connection cannot be evicted any more.
+pub(crate) struct AdmissionPermit {
+    pub(crate) handle: Arc<AdmissionHandle>,
+    /// `None` once the connection can no longer be evicted.
     evicted: Option<oneshot::Receiver<()>>,
-    /// `None` once a request has come.
+    /// `None` once a request has arrived.
     deadline: Option<Pin<Box<Sleep>>>,
-    /// Why the connection must close.
-    ended: Option<Ended>,
+    closing: Option<CloseReason>,
 }
 
 #[derive(Debug, Clone, Copy)]
-enum Ended {
+enum CloseReason {
     Evicted,
     Overdue,
 }
 
-impl Seat {
-    /// Fails when the connection must close; else wakes the task once it must.
+impl AdmissionPermit {
+    /// Returns an error when the connection must close; otherwise registers the task to be woken when it must.
     pub(crate) fn check(&mut self, context: &mut Context<'_>) -> io::Result<()> {
-        if self.ended.is_none() {
-            self.ended = self.poll_end(context);
+        if self.closing.is_none() {
+            self.closing = self.poll_close(context);
         }
-        match self.ended {
+        match self.closing {
             None => Ok(()),
-            Some(Ended::Evicted) => Err(io::Error::new(
+            Some(CloseReason::Evicted) => Err(io::Error::new(
                 io::ErrorKind::ConnectionAborted,
                 "evicted: there are too many connections",
             )),
-            Some(Ended::Overdue) => Err(io::Error::new(
+            Some(CloseReason::Overdue) => Err(io::Error::new(
                 io::ErrorKind::TimedOut,
                 format!("no request within {FIRST_REQUEST:?}"),
             )),
         }
     }
 
-    fn poll_end(&mut self, context: &mut Context<'_>) -> Option<Ended> {
+    fn poll_close(&mut self, context: &mut Context<'_>) -> Option<CloseReason> {
         if let Some(evicted) = &mut self.evicted {
             match Pin::new(evicted).poll(context) {
-                Poll::Ready(Ok(())) => return Some(Ended::Evicted),
+                Poll::Ready(Ok(())) => return Some(CloseReason::Evicted),
                 Poll::Ready(Err(_)) => self.evicted = None,
                 Poll::Pending => {}
             }
         }
         let deadline = self.deadline.as_mut()?;
-        if self.place.standing() != Standing::Unproven {
+        if self.handle.trust() != Trust::New {
             self.deadline = None;
             return None;
         }
-        deadline.as_mut().poll(context).is_ready().then_some(Ended::Overdue)
+        deadline.as_mut().poll(context).is_ready().then_some(CloseReason::Overdue)
     }
 }
 
-impl Drop for Seat {
+impl Drop for AdmissionPermit {
     fn drop(&mut self) {
-        self.place.leave();
+        self.handle.leave();
     }
 }
 

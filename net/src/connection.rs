@@ -1,4 +1,4 @@
-//! A connection over any network, on either side, and what its calls can know of it.
+//! A connection over any network, at either end, and the information that its calls carry.
 
 use std::fmt;
 use std::io;
@@ -13,7 +13,7 @@ use tonic::Extensions;
 use tonic::transport::server::Connected;
 use tower::{Layer, Service};
 
-use crate::admission::{Admission, Place, Seat};
+use crate::admission::{Admission, AdmissionHandle, AdmissionPermit};
 
 /// A connection over any network.
 pub struct Connection {
@@ -21,36 +21,35 @@ pub struct Connection {
     /// Dropped with the connection.
     open: watch::Sender<()>,
     peer: Option<IpAddr>,
-    /// Held by connections that a service has admitted.
-    seat: Option<Seat>,
+    /// The permit of a connection that a service has admitted.
+    permit: Option<AdmissionPermit>,
 }
 
 trait Duplex: AsyncRead + AsyncWrite + Send {}
 impl<T: AsyncRead + AsyncWrite + Send> Duplex for T {}
 
 impl Connection {
-    /// A connection over `stream`.
+    /// Creates a connection over `stream`.
     pub fn new(stream: impl AsyncRead + AsyncWrite + Send + 'static) -> Self {
-        Self { stream: Box::pin(stream), open: watch::Sender::new(()), peer: None, seat: None }
+        Self { stream: Box::pin(stream), open: watch::Sender::new(()), peer: None, permit: None }
     }
 
-    /// Names the other side's address: a service bounds how many connections without an authenticated call one address
-    /// has.
+    /// Sets the peer's address. Services limit the number of connections without an authenticated call per address.
     #[must_use]
     pub fn with_peer(mut self, peer: IpAddr) -> Self {
         self.peer = Some(peer);
         self
     }
 
-    /// Takes a place among the connections of a service.
+    /// Admits the connection to a service.
     pub(crate) fn admitted_to(mut self, admission: &Arc<Admission>) -> Self {
-        self.seat = Some(admission.admit(self.peer));
+        self.permit = Some(admission.admit(self.peer));
         self
     }
 
-    /// Fails when the connection has to close.
+    /// Returns an error when the connection must close.
     fn check(&mut self, context: &mut Context<'_>) -> io::Result<()> {
-        self.seat.as_mut().map_or(Ok(()), |seat| seat.check(context))
+        self.permit.as_mut().map_or(Ok(()), |permit| permit.check(context))
     }
 }
 
@@ -61,55 +60,56 @@ impl fmt::Debug for Connection {
 }
 
 impl Connected for Connection {
-    type ConnectInfo = Caller;
+    type ConnectInfo = ConnectInfo;
 
-    fn connect_info(&self) -> Caller {
-        let place = self.seat.as_ref().map(|seat| Arc::clone(&seat.place));
-        Caller { hangup: Hangup(self.open.subscribe()), place }
+    fn connect_info(&self) -> ConnectInfo {
+        let handle = self.permit.as_ref().map(|permit| Arc::clone(&permit.handle));
+        ConnectInfo { closed: ConnectionClosed(self.open.subscribe()), handle }
     }
 }
 
-/// The connection over which a call came.
+/// The connection of a call, available in the extensions of every request.
 #[derive(Debug, Clone)]
-pub struct Caller {
-    hangup: Hangup,
-    place: Option<Arc<Place>>,
+pub struct ConnectInfo {
+    closed: ConnectionClosed,
+    handle: Option<Arc<AdmissionHandle>>,
 }
 
-impl Caller {
-    /// Notes that a complete request has come.
-    pub(crate) fn requested(&self) {
-        if let Some(place) = &self.place {
-            place.requested();
+impl ConnectInfo {
+    /// Records that a complete request has arrived.
+    pub(crate) fn mark_requested(&self) {
+        if let Some(handle) = &self.handle {
+            handle.mark_requested();
         }
     }
 
-    /// Notes that a call has passed the guard.
-    pub(crate) fn authenticated(&self) {
-        if let Some(place) = &self.place {
-            place.authenticated();
+    /// Records that a call has passed the token check.
+    pub(crate) fn mark_authenticated(&self) {
+        if let Some(handle) = &self.handle {
+            handle.mark_authenticated();
         }
     }
 }
 
-/// Tells when a connection has ended.
+/// A signal that a connection has closed.
 #[derive(Debug, Clone)]
-pub struct Hangup(watch::Receiver<()>);
+pub struct ConnectionClosed(watch::Receiver<()>);
 
-impl Hangup {
-    /// Of the connection over which a request with these extensions came; `None` when it came otherwise.
+impl ConnectionClosed {
+    /// Returns the signal of the connection that delivered a request with these extensions; `None` if the request did
+    /// not arrive over a [`Connection`].
     #[must_use]
-    pub fn of(extensions: &Extensions) -> Option<Self> {
-        extensions.get::<Caller>().map(|caller| caller.hangup.clone())
+    pub fn from_extensions(extensions: &Extensions) -> Option<Self> {
+        extensions.get::<ConnectInfo>().map(|info| info.closed.clone())
     }
 
-    /// Whether both are of the same connection.
+    /// Returns whether both signals belong to the same connection.
     #[must_use]
     pub fn is_same(&self, other: &Self) -> bool {
         self.0.same_channel(&other.0)
     }
 
-    /// Waits until the connection has ended, from whichever side.
+    /// Waits until either end has closed the connection.
     pub async fn wait(mut self) {
         while self.0.changed().await.is_ok() {}
     }
@@ -160,23 +160,23 @@ impl AsyncWrite for Connection {
     }
 }
 
-/// Makes a service note that a connection has made a request.
+/// A layer that records which connections have made a request.
 #[derive(Debug, Clone, Copy)]
-pub struct Noting;
+pub struct MarkRequestLayer;
 
-/// A service that notes of each connection that it has made a request.
+/// The service that [`MarkRequestLayer`] makes.
 #[derive(Debug, Clone)]
-pub struct NotingRequests<S>(S);
+pub struct MarkRequest<S>(S);
 
-impl<S> Layer<S> for Noting {
-    type Service = NotingRequests<S>;
+impl<S> Layer<S> for MarkRequestLayer {
+    type Service = MarkRequest<S>;
 
-    fn layer(&self, service: S) -> NotingRequests<S> {
-        NotingRequests(service)
+    fn layer(&self, service: S) -> MarkRequest<S> {
+        MarkRequest(service)
     }
 }
 
-impl<S: Service<http::Request<B>>, B> Service<http::Request<B>> for NotingRequests<S> {
+impl<S: Service<http::Request<B>>, B> Service<http::Request<B>> for MarkRequest<S> {
     type Response = S::Response;
     type Error = S::Error;
     type Future = S::Future;
@@ -186,8 +186,8 @@ impl<S: Service<http::Request<B>>, B> Service<http::Request<B>> for NotingReques
     }
 
     fn call(&mut self, request: http::Request<B>) -> S::Future {
-        if let Some(caller) = request.extensions().get::<Caller>() {
-            caller.requested();
+        if let Some(info) = request.extensions().get::<ConnectInfo>() {
+            info.mark_requested();
         }
         self.0.call(request)
     }

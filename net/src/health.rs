@@ -1,4 +1,4 @@
-//! Asking a service whether it serves (`grpc.health.v1`).
+//! A client for the standard health service (`grpc.health.v1`).
 
 use std::time::Duration;
 
@@ -7,41 +7,45 @@ use tonic_health::pb::HealthCheckRequest;
 use tonic_health::pb::health_check_response::ServingStatus;
 use tonic_health::pb::health_client::HealthClient;
 
-use crate::link::Link;
+use crate::channel::AuthChannel;
 
-/// Why a service does not count as serving.
+/// The result of a health check that did not succeed.
 #[derive(Debug, thiserror::Error)]
-pub enum Unwell {
-    /// It says so.
+pub enum HealthError {
+    /// The service reports that it is not serving.
     #[error("not serving")]
     NotServing,
-    /// There is no such service at that address.
+    /// The server does not offer this service.
     #[error("there is no service {0:?}")]
-    NoSuchService(String),
-    /// No answer in time.
+    UnknownService(String),
+    /// The server did not answer before the deadline.
     #[error("no answer within {0:?}")]
-    Silent(Duration),
-    /// It cannot be asked.
+    Timeout(Duration),
+    /// The call failed.
     #[error("{}", .0.message())]
     Unreachable(Status),
 }
 
-/// Asks whether `service`, or all there is when it is empty, serves; waits for an answer no longer than `deadline`.
+/// Checks that `service` is serving, or the whole server if `service` is empty.
 ///
 /// # Errors
-/// When it does not serve, or does not say so in time.
-pub async fn check_health(link: Link, service: &str, deadline: Duration) -> Result<(), Unwell> {
+/// When the service is not serving, is unknown, or does not answer before the deadline.
+pub async fn check_health(
+    channel: AuthChannel,
+    service: &str,
+    deadline: Duration,
+) -> Result<(), HealthError> {
     let request = HealthCheckRequest { service: service.to_owned() };
-    let mut client = HealthClient::new(link);
+    let mut client = HealthClient::new(channel);
     let answer = tokio::time::timeout(deadline, client.check(request))
         .await
-        .map_err(|_elapsed| Unwell::Silent(deadline))?;
+        .map_err(|_elapsed| HealthError::Timeout(deadline))?;
     match answer {
         Ok(answer) if answer.get_ref().status() == ServingStatus::Serving => Ok(()),
-        Ok(_) => Err(Unwell::NotServing),
+        Ok(_) => Err(HealthError::NotServing),
         Err(status) if status.code() == Code::NotFound => {
-            Err(Unwell::NoSuchService(service.to_owned()))
+            Err(HealthError::UnknownService(service.to_owned()))
         }
-        Err(status) => Err(Unwell::Unreachable(status)),
+        Err(status) => Err(HealthError::Unreachable(status)),
     }
 }

@@ -1,4 +1,4 @@
-//! The connections that reach a service.
+//! Incoming connections of a service.
 
 use std::fmt;
 use std::future::Future as _;
@@ -16,15 +16,15 @@ use crate::admission::{Admission, Capacity};
 use crate::connection::Connection;
 use crate::throttle::Throttle;
 
-/// The pause after the system has refused to hand over a connection; doubled up to [`LONGEST_PAUSE`].
+/// The pause after a failed `accept`; it doubles up to [`LONGEST_PAUSE`].
 const FIRST_PAUSE: Duration = Duration::from_millis(5);
 const LONGEST_PAUSE: Duration = Duration::from_secs(1);
-/// The time between two log lines about such refusals.
+/// The minimum time between two log lines about failed accepts.
 const LOG_EVERY: Duration = Duration::from_secs(60);
 
-/// The connections that reach a service, as they come and as far as there is room.
+/// The stream of connections to a service, within its [`Capacity`].
 ///
-/// A connection that makes no request within 10 s is closed. [`Capacity`] says how many are kept.
+/// A connection that makes no request within 10 s is closed.
 pub struct Incoming {
     accepted: Pin<Box<dyn Stream<Item = io::Result<Connection>> + Send>>,
     admission: Arc<Admission>,
@@ -34,7 +34,7 @@ pub struct Incoming {
 }
 
 impl Incoming {
-    /// Connections over any network.
+    /// Creates a stream from the connections of any network.
     pub fn new(connections: impl Stream<Item = io::Result<Connection>> + Send + 'static) -> Self {
         Self {
             accepted: Box::pin(connections),
@@ -45,14 +45,14 @@ impl Incoming {
         }
     }
 
-    /// Keeps as many connections as `capacity` allows. To be called before any has come.
+    /// Sets the capacity. Must be called before the first connection is accepted.
     #[must_use]
     pub fn with_capacity(mut self, capacity: Capacity) -> Self {
         self.admission = Admission::new(capacity);
         self
     }
 
-    /// Waits a while before the next try: whatever the system lacks, asking at once again finds it lacking.
+    /// Pauses before the next `accept` and evicts a connection, since an immediate attempt would find the same shortage.
     fn back_off(&mut self, error: &io::Error) {
         self.admission.make_room();
         if self.log.pass(Instant::now(), LOG_EVERY).is_some() {
@@ -64,7 +64,7 @@ impl Incoming {
     }
 }
 
-/// Whether an error is one connection's, which ended before it was accepted.
+/// Returns whether the error concerns a single connection that ended before it was accepted.
 fn is_of_one_connection(error: &io::Error) -> bool {
     use io::ErrorKind as E;
     matches!(error.kind(), E::ConnectionAborted | E::ConnectionReset | E::Interrupted)
@@ -76,7 +76,7 @@ impl From<TcpListener> for Incoming {
     }
 }
 
-/// The connections that reach a socket.
+/// The connections to a listening socket.
 struct Accepting(TcpListener);
 
 impl Stream for Accepting {
@@ -85,7 +85,7 @@ impl Stream for Accepting {
     fn poll_next(self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<Option<Self::Item>> {
         let accepted = ready!(self.0.poll_accept(context));
         Poll::Ready(Some(accepted.map(|(stream, peer)| {
-            // Without it the connection is slower; one that has closed already fails when it is read.
+            // Optional: without it the connection is slower, and a closed connection fails on the first read.
             stream.set_nodelay(true).ok();
             Connection::new(stream).with_peer(peer.ip())
         })))

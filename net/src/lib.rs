@@ -1,38 +1,54 @@
-//! How processes reach one another: who may call a service, how a service is offered, how it is called.
+//! Connections between processes: access control, TLS, keep-alive, health, reflection and retries.
 //!
-//! [`Gate`] is a service's side: its token, its certificate, and what it offers beside its calls (health, reflection,
-//! keep-alive); [`serve()`] runs it until it is shut down. An answer that goes to many clients is [`Prepared`] once.
-//! [`Dial`] is a client's side; its [`Link`]s say what to do when a call fails. [`Incoming`] and [`Dial::through`] let
-//! both run over any network, a simulated one included; [`Pacing`] is how services and their threads take turns on it.
-//! [`Page`] is what a service shows to programs that speak plain HTTP. The messages themselves are not known here.
+//! The server's side:
+//! - [`ServerConfig`] holds a service's token and certificate, and builds its [`Router`]; [`serve()`] runs the router
+//!   until shutdown.
+//! - [`Incoming`] accepts connections from any network, within a [`Capacity`].
+//! - [`EncodedResponse`] is encoded once and sent to many clients.
+//! - [`TextEndpoint`] serves a text over plain HTTP.
+//!
+//! The client's side:
+//! - [`ClientConfig`] holds a token and the trusted authority, and opens [`AuthChannel`]s, whose errors name the
+//!   address and the remedy.
+//! - [`Retrier`] and [`retry()`] repeat failed calls; [`within`] sets a deadline.
+//!
+//! [`ServerConfig`] and [`ClientConfig`] run over any network, including a simulated one. [`Pacing`] determines whether
+//! a runtime serves sockets while threads compute. The crate does not know the messages that connections carry.
+#![warn(missing_docs)]
 
 mod access;
 mod admission;
+mod channel;
+mod client;
 mod connection;
-mod dial;
-mod elsewhere;
-mod gate;
+mod encoded_response;
 mod health;
-mod heard;
 mod incoming;
-mod link;
 mod pacing;
-mod page;
-mod prepared;
+mod retry;
 mod serve;
+mod server;
+mod text_endpoint;
 mod throttle;
 mod tls;
+mod tls_probe;
+mod wrong_service;
 
-pub use access::{AccessError, Token, TokenRefused, is_exposed};
+pub use access::{AccessError, Token, TokenError, is_exposed};
 pub use admission::Capacity;
-pub use connection::{Caller, Connection, Hangup, Noting, NotingRequests};
-pub use dial::{Dial, DialError};
-pub use gate::{Gate, GateError, Guard, Router};
-pub use health::{Unwell, check_health};
+pub use channel::AuthChannel;
+pub use client::{ClientConfig, ClientConfigError};
+pub use connection::{ConnectInfo, Connection, ConnectionClosed, MarkRequest, MarkRequestLayer};
+pub use encoded_response::EncodedResponse;
+pub use health::{HealthError, check_health};
 pub use incoming::Incoming;
-pub use link::Link;
 pub use pacing::Pacing;
-pub use page::Page;
-pub use prepared::Prepared;
+pub use retry::{Backoff, Operation, Retrier, Retryability, retry, within};
 pub use serve::{SHUTDOWN_GRACE, serve};
+pub use server::{Router, ServerConfig, ServerConfigError, TokenInterceptor};
+pub use text_endpoint::TextEndpoint;
 pub use tls::TlsError;
+
+/// The largest message that services and clients accept, in bytes: several times the episodes of a slot or the
+/// parameters of a large actor.
+pub const MAX_MESSAGE_BYTES: usize = 64 << 20;

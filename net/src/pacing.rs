@@ -1,25 +1,25 @@
-//! How tasks and the threads that compute for them take turns.
+//! Scheduling of tasks and the threads that compute for them.
 
-/// What a runtime does while a thread computes for one of its tasks.
+/// The behaviour of a runtime while a thread computes for one of its tasks.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub enum Pacing {
-    /// Runs other tasks: sockets are served while threads compute.
+    /// The runtime runs other tasks, so sockets are served while threads compute.
     #[default]
     Concurrent,
-    /// Waits for the thread. Computing then takes no simulated time, so that a simulation always takes the same course.
-    /// Of no use outside simulations: nothing is served meanwhile.
+    /// The runtime blocks until the thread is done. Computation then takes no simulated time, which makes simulations
+    /// reproducible. Not for production: no socket is served meanwhile.
     Lockstep,
 }
 
 impl Pacing {
-    /// The output of `message`, the next one that a thread sends to the calling task.
+    /// Waits for `message`, the next message from a thread to the calling task.
     ///
-    /// Under [`Self::Lockstep`] the runtime is blocked until then. The thread must not wait for any other task of that
-    /// runtime before it sends.
+    /// Under [`Self::Lockstep`] this blocks the runtime, so the thread must send without waiting for another task of the
+    /// runtime.
     pub async fn next<F: Future>(self, message: F) -> F::Output {
         match self {
             Self::Concurrent => message.await,
-            // A task that has used up its share of the runtime would never be woken here.
+            // A task that has exhausted its cooperative budget would never be woken here.
             Self::Lockstep => pollster::block_on(tokio::task::unconstrained(message)),
         }
     }
@@ -34,7 +34,7 @@ mod tests {
 
     use super::*;
 
-    /// Whether another task runs while a thread computes.
+    /// Returns whether another task runs while a thread computes.
     async fn runs_others(pacing: Pacing) -> bool {
         let (begin, ran) = (Arc::new(Barrier::new(2)), Arc::new(AtomicBool::new(false)));
         let (sender, answer) = oneshot::channel();
@@ -58,24 +58,24 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn only_in_lockstep_other_tasks_wait_for_a_thread() {
+    async fn other_tasks_wait_for_a_thread_only_in_lockstep() {
         assert!(runs_others(Pacing::Concurrent).await);
         assert!(!runs_others(Pacing::Lockstep).await);
     }
 
     #[tokio::test]
-    async fn a_task_in_lockstep_hears_more_messages_than_it_may_take_in_one_go() {
+    async fn a_task_in_lockstep_receives_more_messages_than_its_cooperative_budget() {
         let (sender, mut receiver) = tokio::sync::mpsc::channel(1);
         let thread = std::thread::spawn(move || {
             for message in 0..1000 {
                 sender.blocking_send(message).unwrap();
             }
         });
-        let mut n_heard = 0;
+        let mut n_received = 0;
         while Pacing::Lockstep.next(receiver.recv()).await.is_some() {
-            n_heard += 1;
+            n_received += 1;
         }
-        assert_eq!(n_heard, 1000);
+        assert_eq!(n_received, 1000);
         thread.join().unwrap();
     }
 }

@@ -1,20 +1,20 @@
-//! The server loop of every service, with its graceful shutdown.
+//! The server loop of every service, with graceful shutdown.
 
 use std::pin::Pin;
 use std::time::Duration;
 
 use tokio_util::sync::CancellationToken;
 
-use crate::gate::Router;
 use crate::incoming::Incoming;
+use crate::server::Router;
 
-/// How long open calls may run on after the shutdown: a client that stops reading would keep its call open for ever.
+/// The time that open calls have to end after a shutdown. A client that stops reading would keep its call open forever.
 pub const SHUTDOWN_GRACE: Duration = Duration::from_secs(5);
 
 /// Serves `router` to the connections of `incoming` until `shutdown` is cancelled.
 ///
-/// From then on no connection is accepted and no call is begun. Calls that are still open after [`SHUTDOWN_GRACE`] are
-/// cut off.
+/// Then no further connection or call is accepted, and calls that are still open after [`SHUTDOWN_GRACE`] are
+/// cancelled.
 ///
 /// # Errors
 /// When the server fails.
@@ -24,14 +24,14 @@ pub async fn serve(
     shutdown: CancellationToken,
 ) -> Result<(), tonic::transport::Error> {
     let served = server(router, incoming.into(), shutdown.clone());
-    let grace_is_over = async {
+    let grace_ends = async {
         shutdown.cancelled().await;
         tokio::time::sleep(SHUTDOWN_GRACE).await;
     };
     tokio::select! {
         served = served => served,
-        () = grace_is_over => {
-            tracing::warn!(grace_s = SHUTDOWN_GRACE.as_secs(), "open calls were cut off");
+        () = grace_ends => {
+            tracing::warn!(grace_s = SHUTDOWN_GRACE.as_secs(), "cancelled open calls");
             Ok(())
         }
     }
@@ -39,7 +39,7 @@ pub async fn serve(
 
 type Served = Pin<Box<dyn Future<Output = Result<(), tonic::transport::Error>> + Send>>;
 
-/// The HTTP/2 server behind a pointer, so that it is compiled in this crate and not again in each that serves.
+/// Boxes the HTTP/2 server, so that it is compiled in this crate only and not in every crate that serves.
 fn server(router: Router, incoming: Incoming, shutdown: CancellationToken) -> Served {
     Box::pin(router.serve_with_incoming_shutdown(incoming, shutdown.cancelled_owned()))
 }

@@ -1,10 +1,10 @@
-//! Log lines about what may happen thousands of times a second.
+//! Rate limiting of log lines about events that may occur thousands of times per second.
 
 use std::time::Duration;
 
 use tokio::time::Instant;
 
-/// Lets one log line through and then none for a while.
+/// A rate limiter for one log line.
 #[derive(Debug, Default)]
 pub(crate) struct Throttle {
     last: Option<Instant>,
@@ -12,7 +12,7 @@ pub(crate) struct Throttle {
 }
 
 impl Throttle {
-    /// Notes that something has happened; returns how often it has since the last line when a line is due.
+    /// Counts an event. If a line is due, returns the number of events since the previous line.
     pub(crate) fn pass(&mut self, now: Instant, every: Duration) -> Option<u64> {
         self.n_since += 1;
         if self.last.is_some_and(|last| now.duration_since(last) < every) {
@@ -28,7 +28,7 @@ mod tests {
     use super::*;
 
     #[tokio::test(start_paused = true)]
-    async fn a_line_is_due_at_first_and_then_once_in_a_while_with_the_count() {
+    async fn a_line_is_due_at_the_first_event_and_then_once_per_interval_with_the_count() {
         let mut throttle = Throttle::default();
         let every = Duration::from_secs(60);
         let mut pass = || throttle.pass(Instant::now(), every);

@@ -1,4 +1,4 @@
-//! Certificates and keys, looked at before they are used.
+//! Validation of certificates and keys before they are used.
 
 use rustls::RootCertStore;
 use rustls::crypto::ring;
@@ -6,27 +6,27 @@ use rustls::pki_types::pem::PemObject as _;
 use rustls::pki_types::{CertificateDer, PrivateKeyDer};
 use rustls::sign::CertifiedKey;
 
-/// Why a certificate or key cannot be used.
+/// An error in a certificate or key.
 #[derive(Debug, thiserror::Error)]
 pub enum TlsError {
-    /// There is no certificate.
+    /// The PEM contains no certificate.
     #[error("there is no certificate in PEM (-----BEGIN CERTIFICATE-----)")]
     NoCertificate,
-    /// There is no key.
+    /// The PEM contains no unencrypted private key.
     #[error("there is no private key in PEM that is not encrypted (-----BEGIN PRIVATE KEY-----)")]
     NoKey,
-    /// PEM that breaks off or is not base64.
+    /// The PEM is truncated or not base64.
     #[error("the PEM is damaged")]
     Damaged(#[source] rustls::pki_types::pem::Error),
-    /// The certificate was made for another key.
+    /// The certificate belongs to another key.
     #[error("the private key is not the certificate's")]
     OtherKey,
-    /// A certificate or key of a kind that is not known, or damaged.
+    /// The certificate or key is damaged or of an unsupported kind.
     #[error("it cannot be used")]
     Unusable(#[source] rustls::Error),
 }
 
-/// Looks whether a service can use this certificate chain with this key (PEM).
+/// Checks that a service can use this certificate chain with this key (PEM).
 pub(crate) fn check_identity(certificate: &[u8], key: &[u8]) -> Result<(), TlsError> {
     let chain = certificates(certificate)?;
     let key = PrivateKeyDer::from_pem_slice(key).map_err(|error| match error {
@@ -40,7 +40,7 @@ pub(crate) fn check_identity(certificate: &[u8], key: &[u8]) -> Result<(), TlsEr
     }
 }
 
-/// Looks whether a client can trust what these certificates (PEM) have signed.
+/// Checks that a client can use these certificates (PEM) as trusted authorities.
 pub(crate) fn check_authority(authority: &[u8]) -> Result<(), TlsError> {
     let mut trusted = RootCertStore::empty();
     certificates(authority)?
@@ -66,7 +66,7 @@ mod tests {
         (made.cert.pem(), made.signing_key.serialize_pem())
     }
 
-    /// The middle of a PEM text replaced: still base64, no longer a certificate.
+    /// Replaces the content of a PEM text by other base64, which is not a certificate.
     fn garbled(pem: &str) -> String {
         let lines: Vec<&str> = pem.lines().collect();
         let (first, last) = (lines[0], lines[lines.len() - 1]);
@@ -74,7 +74,7 @@ mod tests {
     }
 
     #[test]
-    fn a_certificate_needs_its_own_key() {
+    fn a_certificate_requires_its_own_key() {
         let ((certificate, key), (_, other_key)) = (pair(), pair());
         let check = |certificate: &str, key: &str| {
             check_identity(certificate.as_bytes(), key.as_bytes()).map_err(|e| format!("{e:?}"))
@@ -89,13 +89,13 @@ mod tests {
             (&garbled(&certificate), &key, "Unusable"),
             (&certificate, &garbled(&key), "Unusable"),
         ] {
-            let told = check(certificate, key).expect_err("must be refused");
-            assert!(told.starts_with(expected), "{told} is not {expected}");
+            let error = check(certificate, key).expect_err("must be refused");
+            assert!(error.starts_with(expected), "{error} is not {expected}");
         }
     }
 
     #[test]
-    fn an_authority_is_at_least_one_certificate_and_all_of_them_whole() {
+    fn an_authority_needs_at_least_one_certificate_and_no_invalid_one() {
         let ((one, key), (other, _)) = (pair(), pair());
         let check = |pem: &str| check_authority(pem.as_bytes()).map_err(|e| format!("{e:?}"));
         assert_eq!(check(&one), Ok(()));
@@ -107,8 +107,8 @@ mod tests {
             (&format!("{one}{}", garbled(&other)), "Unusable"),
             (&one[..one.len() / 2], "Damaged"),
         ] {
-            let told = check(pem).expect_err("must be refused");
-            assert!(told.starts_with(expected), "{told} is not {expected}");
+            let error = check(pem).expect_err("must be refused");
+            assert!(error.starts_with(expected), "{error} is not {expected}");
         }
     }
 }

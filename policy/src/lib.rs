@@ -102,4 +102,4 @@ pub use inference::{Actor, Critic};
 pub use matrix::{Matrix, MatrixMut, multiply};
 pub use mlp::{MlpShape, Workspace, backward_input, backward_parameters, forward};
 pub use normalizer::{Normalizer, NormalizerSnapshot, NormalizerState};
-pub use policy::Policy;
+pub use policy::{Policy, actor_digest};

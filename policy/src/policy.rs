@@ -122,17 +122,11 @@ impl Policy {
     pub fn tensors(&self) -> Vec<Tensor<'_>> {
         let mut tensors = network_tensors("actor", &self.actor_shape(), &self.actor);
         tensors.extend(network_tensors("critic.0", &self.critic_shape(), &self.critic));
-        let normalizers =
-            [("observation", &self.observation_normalizer), ("goal", &self.goal_normalizer)];
-        for (name, normalizer) in normalizers {
-            for (part, data) in [("mean", &normalizer.mean), ("std", &normalizer.std)] {
-                tensors.push(Tensor {
-                    name: format!("normalizer.{name}.{part}"),
-                    shape: vec![data.len()],
-                    data,
-                });
-            }
-        }
+        let (observation, goal) = (&self.observation_normalizer, &self.goal_normalizer);
+        tensors.extend(normalizer_tensors([
+            [&observation.mean, &observation.std],
+            [&goal.mean, &goal.std],
+        ]));
         tensors
     }
 
@@ -143,13 +137,43 @@ impl Policy {
     /// If a parameter vector is too short for its network; see [`Policy::check`].
     #[must_use]
     pub fn digest(&self) -> String {
-        let mut hasher = Sha256::new();
-        for tensor in self.tensors() {
-            hasher.update(tensor.name.as_bytes());
-            hasher.update(little_endian(tensor.data));
-        }
-        hex(&hasher.finalize())
+        digest_of(&self.tensors())
     }
+}
+
+/// Returns the digest of a published actor: [`Policy::digest`] over the tensors of the actor and of the normalisation alone.
+///
+/// # Panics
+/// If the parameter vector is too short for the network; see [`Actor::new`].
+#[must_use]
+pub fn actor_digest(layout: Layout, published: &PublishedActor) -> String {
+    let shape = MlpShape::actor(layout, published.n_hidden, published.n_hidden_layers);
+    let mut tensors = network_tensors("actor", &shape, &published.actor);
+    tensors.extend(normalizer_tensors([
+        [&published.observation_mean, &published.observation_std],
+        [&published.goal_mean, &published.goal_std],
+    ]));
+    digest_of(&tensors)
+}
+
+fn digest_of(tensors: &[Tensor<'_>]) -> String {
+    let mut hasher = Sha256::new();
+    for tensor in tensors {
+        hasher.update(tensor.name.as_bytes());
+        hasher.update(little_endian(tensor.data));
+    }
+    hex(&hasher.finalize())
+}
+
+/// Returns the tensors of the normalisation, given mean and standard deviation of observations, then of goals.
+fn normalizer_tensors(normalizers: [[&[f32]; 2]; 2]) -> impl Iterator<Item = Tensor<'_>> {
+    ["observation", "goal"].into_iter().zip(normalizers).flat_map(|(name, parts)| {
+        ["mean", "std"].into_iter().zip(parts).map(move |(part, data)| Tensor {
+            name: format!("normalizer.{name}.{part}"),
+            shape: vec![data.len()],
+            data,
+        })
+    })
 }
 
 /// Splits a network's flat parameters into the tensors of its layers.

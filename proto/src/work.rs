@@ -47,6 +47,7 @@ fn decode_episode_kind(kind: i32) -> Result<EpisodeKind, DecodeError> {
 #[must_use]
 pub fn encode_run_terms(terms: &RunTerms) -> pb::RunTerms {
     pb::RunTerms {
+        run: terms.run.clone(),
         task: terms.layout.task.name().to_owned(),
         n_arms: u32::try_from(terms.layout.n_arms).expect("a layout has few arms"),
         account: terms.account.clone().unwrap_or_default(),
@@ -72,12 +73,18 @@ pub fn decode_run_terms(terms: pb::RunTerms) -> Result<RunTerms, DecodeError> {
     let world = terms.world.ok_or_else(|| DecodeError::missing("world"))?;
     let account = (!terms.account.is_empty()).then_some(terms.account);
     Ok(RunTerms {
+        run: decode_run_name(terms.run)?,
         layout: decode_layout(&terms.task, terms.n_arms)?,
         account: account.map(|name| decode_account_name("account", name)).transpose()?,
         exploration: decode_exploration(exploration)
             .map_err(|error| error.within("exploration"))?,
         world: decode_world(world).map_err(|error| error.within("world"))?,
     })
+}
+
+/// The name of a run; empty from a learner that does not send it.
+fn decode_run_name(name: String) -> Result<String, DecodeError> {
+    if name.is_empty() { Ok(name) } else { decode_account_name("run", name) }
 }
 
 fn decode_layout(task: &str, n_arms: u32) -> Result<Layout, DecodeError> {
@@ -243,6 +250,7 @@ mod tests {
 
     fn terms() -> RunTerms {
         RunTerms {
+            run: "run-7".to_owned(),
             layout: LAYOUT,
             account: Some("run-7".to_owned()),
             exploration: Exploration {
@@ -292,7 +300,7 @@ mod tests {
     #[test]
     fn every_message_round_trips() {
         assert_eq!(decode_run_terms(sent(&encode_run_terms(&terms()))), Ok(terms()));
-        let unadvised = RunTerms { account: None, ..terms() };
+        let unadvised = RunTerms { account: None, run: String::new(), ..terms() };
         assert_eq!(decode_run_terms(sent(&encode_run_terms(&unadvised))), Ok(unadvised));
         assert_eq!(decode_slot(sent(&encode_slot(&slot()))), Ok(slot()));
         assert_eq!(decode_actor(&sent(&encode_actor(&actor())), LAYOUT), Ok(actor()));

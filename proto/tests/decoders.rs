@@ -149,13 +149,15 @@ fn terms() -> impl Strategy<Value = pb::RunTerms> {
         any_text(),
         proptest::option::weighted(part, exploration),
         proptest::option::weighted(part, world),
+        any_text(),
     )
-        .prop_map(|(task, n_arms, account, exploration, world)| pb::RunTerms {
+        .prop_map(|(task, n_arms, account, exploration, world, run)| pb::RunTerms {
             task,
             n_arms,
             account,
             exploration,
             world,
+            run,
         })
 }
 

@@ -1,6 +1,6 @@
-//! The teacher as a service on the loopback, its ledger in a file: time of a request, steps a second, and beside them
-//! a service that takes and gives the same messages and thinks nothing. Both run in this process, each on a thread and
-//! a runtime of its own; the clients share another.
+//! Latency and throughput of the teacher service on the loopback interface, with its ledger in a file, compared with an
+//! echo service of the same messages. Both services run in this process, each on its own thread and runtime. The clients
+//! share a third runtime.
 
 use std::net::{Ipv4Addr, SocketAddr};
 use std::thread;
@@ -9,7 +9,7 @@ use std::time::Duration;
 use anyhow::Context as _;
 use tandem_core::rng::{Stream, episode_rng, uniform};
 use tandem_core::{Layout, StepQuery, Task};
-use tandem_net::{Dial, Gate, Link};
+use tandem_net::{AuthChannel, ClientConfig, ServerConfig};
 use tandem_proto::pb::teacher_client::TeacherClient;
 use tandem_proto::{encode_query, pb};
 use tokio::net::TcpListener;
@@ -20,41 +20,41 @@ use tonic::Streaming;
 
 use super::Figure;
 use crate::exit::{Exit, Failed, OrExit as _};
-use crate::{clock, services, train};
+use crate::{clock, policy_file, runtime};
 
 mod echo;
 
-/// How long one sample is taken, and how many; the best is printed, as the least disturbed.
+/// Duration of a sample and number of samples. The best sample is printed, as the least disturbed one.
 const SAMPLE: Duration = Duration::from_millis(500);
 const N_SAMPLES: usize = 5;
-/// Streams that ask at the same time, each with a connection of its own and one request under way.
+/// Number of concurrent streams, each with its own connection and one pending request.
 const N_STREAMS: u16 = 16;
-/// Steps of a request: two episodes in lock step, as a worker asks.
+/// Steps per request: two episodes in lock step, as a worker sends them.
 const STEPS_PER_REQUEST: u64 = 2;
 const ACCOUNT: &str = "bench";
 
-/// Latency and throughput of the teacher and of the echo, in turn.
+/// Measures the teacher and the echo service alternately.
 pub(super) fn teacher() -> Result<Vec<Figure>, Failed> {
-    let policy = train::shipped_teacher(Task::Push.name())?;
+    let policy = policy_file::shipped_teacher(Task::Push.name())?;
     let name = format!("tandem-bench-teacher-{}", std::process::id());
     let directory = std::env::temp_dir().join(name);
     let made = std::fs::create_dir_all(&directory);
-    made.or_exit(Exit::TryAgain, || format!("cannot make {}", directory.display()))?;
+    made.or_exit(Exit::TryAgain, || format!("cannot create {}", directory.display()))?;
     let ledger = directory.join("ledger.sqlite").to_string_lossy().into_owned();
     let config = tandem_teacher::Config { policy, ledger };
-    let figures = services::runtime().and_then(|runtime| runtime.block_on(measure(config)));
+    let figures = runtime::new().and_then(|runtime| runtime.block_on(measure(config)));
     drop(std::fs::remove_dir_all(&directory));
     figures.or_exit(Exit::TryAgain, || "cannot measure the teacher".to_owned())
 }
 
 async fn measure(config: tandem_teacher::Config) -> anyhow::Result<Vec<Figure>> {
     let teacher = Server::start(async move |listener, shutdown| {
-        tandem_teacher::serve(config, listener, &Gate::default(), shutdown)
+        tandem_teacher::serve(config, listener, &ServerConfig::default(), shutdown)
             .await
             .map_err(Into::into)
     })?;
     let mut teacher_bench = Bench::new(teacher.address)?;
-    let answer = teacher_bench.open_and_ask().await?;
+    let answer = teacher_bench.open_account().await?;
     let echo = Server::start(async move |listener, shutdown| {
         echo::serve(answer, listener, shutdown).await
     })?;
@@ -98,7 +98,7 @@ fn figures(teacher: &Best, echo: &Best) -> Vec<Figure> {
     figures
 }
 
-/// A service on a thread and a runtime of its own, as the program runs one.
+/// A service on its own thread and runtime, as in the program.
 struct Server {
     address: SocketAddr,
     shutdown: CancellationToken,
@@ -118,13 +118,12 @@ impl Server {
         let shutdown = CancellationToken::new();
         let ended = shutdown.clone();
         let thread = thread::spawn(move || {
-            services::runtime()?
-                .block_on(async { serve(TcpListener::from_std(listener)?, ended).await })
+            runtime::new()?.block_on(async { serve(TcpListener::from_std(listener)?, ended).await })
         });
         Ok(Self { address, shutdown, thread })
     }
 
-    /// Ends the service. The connections that were dropped before are closed by this runtime meanwhile.
+    /// Ends the service. Meanwhile, this runtime closes the connections that were dropped before.
     async fn stop(self) -> anyhow::Result<()> {
         self.shutdown.cancel();
         let joined = tokio::task::spawn_blocking(|| self.thread.join()).await?;
@@ -132,7 +131,7 @@ impl Server {
     }
 }
 
-/// Times of calls, in microseconds.
+/// Latencies of calls, in microseconds.
 #[derive(Debug, Clone, Copy)]
 struct Latency {
     p50_us: f64,
@@ -155,97 +154,97 @@ impl Latency {
     }
 }
 
-/// The best of the samples so far.
+/// The best samples so far.
 struct Best {
     unary: Latency,
     stream: Latency,
     steps_per_s: f64,
 }
 
-/// A client, or several, of one service.
+/// Clients of one service.
 struct Bench {
-    client: TeacherClient<Link>,
-    asker: Asker,
-    streams: Vec<(TeacherClient<Link>, Asker)>,
+    client: TeacherClient<AuthChannel>,
+    requests: Requests,
+    streams: Vec<(TeacherClient<AuthChannel>, Requests)>,
     best: Best,
 }
 
 impl Bench {
-    /// Clients of the service at `address`, which connect when they ask. To be called inside a runtime.
+    /// Creates clients of the service at `address`, which connect at their first call. Must be called inside a runtime.
     fn new(address: SocketAddr) -> anyhow::Result<Self> {
-        let dial = Dial::default();
-        let connect = || dial.link(&address.to_string()).map(TeacherClient::new);
-        let streams = (1..=N_STREAMS).map(|idx| Ok((connect()?, Asker::new(idx))));
+        let dial = ClientConfig::default();
+        let connect = || dial.channel(&address.to_string()).map(TeacherClient::new);
+        let streams = (1..=N_STREAMS).map(|idx| Ok((connect()?, Requests::new(idx))));
         Ok(Self {
             client: connect()?,
-            asker: Asker::new(0),
+            requests: Requests::new(0),
             streams: streams.collect::<anyhow::Result<_>>()?,
             best: Best { unary: Latency::WORST, stream: Latency::WORST, steps_per_s: 0.0 },
         })
     }
 
-    /// Opens the account; gives an answer as they will be.
-    async fn open_and_ask(&mut self) -> anyhow::Result<pb::AdviseResponse> {
+    /// Opens the account and returns a typical response.
+    async fn open_account(&mut self) -> anyhow::Result<pb::AdviseResponse> {
         let terms = pb::OpenAccountRequest {
             name: ACCOUNT.to_owned(),
             budget: 1_000_000_000,
             strategy: "mc-q:0.1".to_owned(),
         };
         self.client.open_account(terms).await?;
-        Ok(self.client.advise(self.asker.next()).await?.into_inner())
+        Ok(self.client.advise(self.requests.next()).await?.into_inner())
     }
 
-    /// Disconnects.
+    /// Disconnects the clients and returns the best samples.
     fn end(self) -> Best {
         self.best
     }
 
-    /// Measures each figure once more.
+    /// Takes one more sample of each quantity.
     async fn sample(&mut self) -> anyhow::Result<()> {
         let unary = self.unary().await?;
         self.best.unary = self.best.unary.min(unary);
-        let stream = Self::stream(self.client.clone(), &mut self.asker).await?;
+        let stream = Self::stream(self.client.clone(), &mut self.requests).await?;
         self.best.stream = self.best.stream.min(Latency::of(stream));
         let steps_per_s = self.many_streams().await?;
         self.best.steps_per_s = self.best.steps_per_s.max(steps_per_s);
         Ok(())
     }
 
-    /// Times of single calls, one after another.
+    /// Measures single calls, one after another.
     async fn unary(&mut self) -> anyhow::Result<Latency> {
         let (start, mut times) = (clock::now(), Vec::new());
         while start.elapsed() < SAMPLE {
-            let request = self.asker.next();
-            let asked = clock::now();
+            let request = self.requests.next();
+            let sent_at = clock::now();
             self.client.advise(request).await?;
-            times.push(asked.elapsed());
+            times.push(sent_at.elapsed());
         }
         Ok(Latency::of(times))
     }
 
-    /// Times of requests on one stream, one after another.
+    /// Measures requests on one stream, one after another.
     async fn stream(
-        client: TeacherClient<Link>,
-        asker: &mut Asker,
+        client: TeacherClient<AuthChannel>,
+        requests: &mut Requests,
     ) -> anyhow::Result<Vec<Duration>> {
-        let mut conversation = Conversation::open(client).await?;
+        let mut stream = AdviceStream::open(client).await?;
         let (start, mut times) = (clock::now(), Vec::new());
         while start.elapsed() < SAMPLE {
-            let request = asker.next();
-            let asked = clock::now();
-            conversation.ask(request).await?;
-            times.push(asked.elapsed());
+            let request = requests.next();
+            let sent_at = clock::now();
+            stream.ask(request).await?;
+            times.push(sent_at.elapsed());
         }
         Ok(times)
     }
 
-    /// Steps a second over all streams at once.
+    /// Measures the steps per second of all streams together.
     async fn many_streams(&mut self) -> anyhow::Result<f64> {
         let (start, mut asking) = (clock::now(), JoinSet::new());
-        for (client, mut asker) in self.streams.drain(..) {
+        for (client, mut requests) in self.streams.drain(..) {
             asking.spawn(async move {
-                let times = Self::stream(client.clone(), &mut asker).await?;
-                anyhow::Ok(((client, asker), times.len() as u64))
+                let times = Self::stream(client.clone(), &mut requests).await?;
+                anyhow::Ok(((client, requests), times.len() as u64))
             });
         }
         let mut n_requests = 0;
@@ -259,37 +258,37 @@ impl Bench {
     }
 }
 
-/// A stream with one request under way.
-struct Conversation {
-    questions: tokio::sync::mpsc::Sender<pb::AdviseRequest>,
-    answers: Streaming<pb::AdviseResponse>,
+/// A stream with one pending request.
+struct AdviceStream {
+    requests: tokio::sync::mpsc::Sender<pb::AdviseRequest>,
+    responses: Streaming<pb::AdviseResponse>,
 }
 
-impl Conversation {
-    async fn open(mut client: TeacherClient<Link>) -> anyhow::Result<Self> {
-        let (questions, receiver) = tokio::sync::mpsc::channel(1);
-        let answers = client.advise_stream(ReceiverStream::new(receiver)).await?.into_inner();
-        Ok(Self { questions, answers })
+impl AdviceStream {
+    async fn open(mut client: TeacherClient<AuthChannel>) -> anyhow::Result<Self> {
+        let (requests, receiver) = tokio::sync::mpsc::channel(1);
+        let responses = client.advise_stream(ReceiverStream::new(receiver)).await?.into_inner();
+        Ok(Self { requests, responses })
     }
 
     async fn ask(&mut self, request: pb::AdviseRequest) -> anyhow::Result<pb::AdviseResponse> {
-        self.questions.send(request).await.context("the stream has ended")?;
-        self.answers.message().await?.context("the stream has ended")
+        self.requests.send(request).await.context("the stream has ended")?;
+        self.responses.message().await?.context("the stream has ended")
     }
 }
 
-/// Asks about two episodes in lock step, then about the next two.
-struct Asker {
+/// Generates requests about two episodes in lock step, then about the next two.
+struct Requests {
     request: pb::AdviseRequest,
 }
 
-impl Asker {
-    /// Episodes that no other asker has, two arms, numbers such as observations hold.
-    fn new(asker_idx: u16) -> Self {
+impl Requests {
+    /// Creates a generator whose episode numbers differ from those of other generators.
+    fn new(generator_idx: u16) -> Self {
         let layout = Layout::new(Task::Push, 2);
-        let mut rng = episode_rng(u64::from(asker_idx), 0, Stream::Exploration);
+        let mut rng = episode_rng(u64::from(generator_idx), 0, Stream::Exploration);
         let mut numbers = |n: usize| (0..n).map(|_| uniform(&mut rng, -0.3, 0.3)).collect();
-        let first = u64::from(asker_idx) << 32;
+        let first = u64::from(generator_idx) << 32;
         let steps = (0..STEPS_PER_REQUEST).map(|rollout| {
             encode_query(&StepQuery {
                 episode: first + rollout,

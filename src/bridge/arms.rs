@@ -1,4 +1,4 @@
-//! Creates the driver of the arms that a bridge serves.
+//! The arms of a bridge. Only this module creates drivers.
 
 use std::sync::Arc;
 
@@ -11,11 +11,12 @@ use tandem_trials::{SimulatedConfig, SimulatedPair};
 use crate::cli::{BridgeServeArgs, DriverName};
 use crate::exit::{Exit, Failed, OrExit as _};
 
-/// The initial height of a simulated tool above its workspace, metres, and the initial opening of its gripper.
+/// Initial height of a simulated tool above its workspace, metres.
 const READY_M: f64 = 0.05;
+/// Initial opening of a simulated gripper, 0 to 1.
 const READY_OPENING: f64 = 0.5;
 
-/// The name of the driver for clients.
+/// Returns the name of the driver that clients see.
 pub(crate) const fn name(driver: DriverName) -> &'static str {
     match driver {
         DriverName::Sim => "sim",
@@ -27,8 +28,7 @@ pub(crate) const fn name(driver: DriverName) -> &'static str {
 /// Connects to the real arms at an address.
 type Connect = fn(&str) -> Result<BoxDriver, DriverError>;
 
-/// Returns an executor for the arms that the command line names, and the function that connects to them again.
-/// Simulated arms do not lose their connection.
+/// Creates the executor of the arms and, for real arms, a function that reconnects to them.
 pub(crate) fn arms(
     args: &BridgeServeArgs,
     clock: Arc<dyn Clock>,
@@ -51,7 +51,7 @@ fn executor(driver: BoxDriver, settings: Settings) -> Result<Executor<BoxDriver>
     Executor::new(mico_cell(), driver, settings).or_exit(Exit::Bug, String::new)
 }
 
-/// Creates a simulated pair in real time, its tools above their workspaces.
+/// Creates a simulated pair in real time, with its tools above their workspaces.
 fn simulated(seed: u64, clock: Arc<dyn Clock>) -> Result<BoxDriver, Failed> {
     let cell = mico_cell();
     let at = cell.ready(READY_M).or_exit(Exit::Bug, String::new)?;
@@ -60,7 +60,7 @@ fn simulated(seed: u64, clock: Arc<dyn Clock>) -> Result<BoxDriver, Failed> {
     Ok(Box::new(RealTimePair::new(pair, clock)))
 }
 
-/// Arms behind a Simulink model.
+/// Returns how to connect to arms behind a Simulink model.
 fn quarc() -> Result<(Connect, Settings), Failed> {
     use tandem_bridge::quarc::{QuarcConfig, QuarcDriver};
     fn connect(address: &str) -> Result<BoxDriver, DriverError> {
@@ -69,7 +69,7 @@ fn quarc() -> Result<(Connect, Settings), Failed> {
     Ok((connect, Settings::default()))
 }
 
-/// Arms behind Kinova's ROS driver.
+/// Returns how to connect to arms behind Kinova's ROS driver.
 fn kinova_ros() -> Result<(Connect, Settings), Failed> {
     use tandem_bridge::kinova_ros::{KinovaRosConfig, KinovaRosDriver, settings};
     fn connect(address: &str) -> Result<BoxDriver, DriverError> {

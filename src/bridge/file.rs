@@ -1,4 +1,4 @@
-//! Motion files: JSON for `tandem bridge move`.
+//! Motion files: JSON, written by hand or by `tandem bridge trial --motions`.
 
 use std::path::Path;
 
@@ -10,40 +10,40 @@ use tandem_proto::pb;
 use crate::exit::{Exit, Failed, OrExit as _};
 use crate::input;
 
-/// Time between waypoints in the training world, seconds.
+/// Default time between waypoints, as in the training world, seconds.
 const STEP_S: f64 = 0.04;
 
-/// The contents of a file. Unknown keys are refused.
+/// The contents of a motion file; unknown keys are rejected.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct MotionFile {
-    /// The share of the motion's own speed, in (0, 1].
+    /// Fraction of the motion's own speed, in (0, 1].
     speed: f64,
-    /// The positions of the tools, with one entry per arm in each.
+    /// Positions of the tools; each waypoint has one entry per arm.
     way_points: Option<Vec<Vec<FileWayPoint>>>,
-    /// Whether the motion starts at the present position of the tools; with waypoints only. Default true.
+    /// Whether the path begins at the current positions of the tools; only with waypoints. The default is true.
     from_here: Option<bool>,
-    /// The shortest time per waypoint, seconds; with waypoints only. Default 0.04.
+    /// Minimum time per waypoint, seconds; only with waypoints. The default is 0.04.
     step_s: Option<f64>,
-    /// The angles of the joints, instead of waypoints.
+    /// Samples of the joints, instead of waypoints.
     joint_motion: Option<FileJointMotion>,
 }
 
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct FileWayPoint {
-    /// The position of the tool in the world frame: x, y, z, metres.
+    /// Position of the tool in the world: x, y, z, metres.
     tool_m: [f64; 3],
-    /// The opening of the gripper, 0 to 1.
+    /// Opening of the gripper, 0 to 1.
     opening: f64,
 }
 
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct FileJointMotion {
-    /// The time between two samples, seconds.
+    /// Time between two samples, seconds.
     period_s: f64,
-    /// The samples of each arm.
+    /// Samples of each arm.
     arms: Vec<Vec<FileSample>>,
 }
 
@@ -55,7 +55,7 @@ struct FileSample {
     opening: f64,
 }
 
-/// Writes a motion through `way_points` at `speed` to a file.
+/// Writes a motion file with `way_points` and `speed`.
 pub(super) fn write(path: &Path, speed: f64, way_points: &[Waypoint]) -> Result<(), Failed> {
     let arm = |arm: &ArmWaypoint| {
         let round = |number: f64| (number * 1e5).round() * 1e-5;
@@ -68,7 +68,7 @@ pub(super) fn write(path: &Path, speed: f64, way_points: &[Waypoint]) -> Result<
     std::fs::write(path, text + "\n").or_cannot_write(|| format!("cannot write {}", path.display()))
 }
 
-/// Reads the motion in the file `path`. `speed` overrides the speed in the file.
+/// Reads the motion file `path`; `speed` overrides the speed in the file.
 pub(super) fn read(path: &Path, speed: Option<f64>) -> Result<pb::MotionRequest, Failed> {
     let cannot_read = || format!("cannot read {path:?}");
     let text = input::text(path).or_exit(Exit::Data, cannot_read)?;
@@ -127,7 +127,7 @@ mod tests {
     }
 
     #[test]
-    fn a_file_contains_either_waypoints_or_angles() {
+    fn a_file_contains_either_way_points_or_joint_samples() {
         let places = r#"[[{"tool_m": [0, 0, 0.1], "opening": 1}]]"#;
         let whole = parsed(&format!(r#"{{"speed": 1, "way_points": {places}}}"#)).unwrap();
         let pb::motion_request::Motion::WayPoints(way) = whole else { panic!("{whole:?}") };

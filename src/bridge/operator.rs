@@ -1,9 +1,9 @@
-//! What operators ask of a bridge.
+//! Commands of an operator: status, describe, stop and reset.
 
 use std::time::Duration;
 
 use serde_json::json;
-use tandem_net::Link;
+use tandem_net::AuthChannel;
 use tandem_proto::pb;
 use tandem_proto::pb::bridge_client::BridgeClient;
 use tonic::{Code, Response, Status};
@@ -11,41 +11,41 @@ use tonic::{Code, Response, Status};
 use super::show;
 use crate::cli::{ConnectArgs, OperatorArgs};
 use crate::exit::{Exit, Failed, OrExit as _};
-use crate::{access, output, services};
+use crate::{access, output, runtime};
 
-/// How long a call may take.
-const DEADLINE: Duration = Duration::from_secs(10);
+/// Timeout of a call.
+const TIMEOUT: Duration = Duration::from_secs(10);
 
-pub(super) type Client = BridgeClient<Link>;
+pub(super) type Client = BridgeClient<AuthChannel>;
 
-/// Runs `work` with a client of the bridge that `args` name.
+/// Runs `work` with a client of the bridge in `args`.
 pub(super) fn with_client<F: Future<Output = Result<(), Failed>>>(
     args: &ConnectArgs,
     work: impl FnOnce(Client) -> F,
 ) -> Result<(), Failed> {
     let dial = access::dial(&args.dial, &args.secret)?;
-    let runtime = services::runtime().or_exit(Exit::TryAgain, String::new)?;
+    let runtime = runtime::new().or_exit(Exit::TryAgain, String::new)?;
     runtime.block_on(async {
-        let link = dial.link(&args.connect).or_exit(Exit::Usage, String::new)?;
+        let link = dial.channel(&args.connect).or_exit(Exit::Usage, String::new)?;
         work(BridgeClient::new(link)).await
     })
 }
 
-/// The answer to a call, in time.
-pub(super) async fn answer<T>(
+/// Runs a call with a timeout.
+pub(super) async fn call_with_timeout<T>(
     call: impl Future<Output = Result<Response<T>, Status>>,
 ) -> Result<T, Failed> {
-    match tokio::time::timeout(DEADLINE, call).await {
-        Ok(Ok(answer)) => Ok(answer.into_inner()),
+    match tokio::time::timeout(TIMEOUT, call).await {
+        Ok(Ok(response)) => Ok(response.into_inner()),
         Ok(Err(status)) => Err(failed(&status)),
         Err(_elapsed) => {
-            let what = anyhow::anyhow!("the bridge has not answered within {DEADLINE:?}");
+            let what = anyhow::anyhow!("the bridge did not respond within {TIMEOUT:?}");
             Err(Failed::new(Exit::TryAgain, what))
         }
     }
 }
 
-/// What a person is told of a call that failed.
+/// Converts the status of a failed call.
 pub(super) fn failed(status: &Status) -> Failed {
     let exit = match status.code() {
         Code::Unauthenticated | Code::Unimplemented => Exit::Usage,
@@ -56,19 +56,19 @@ pub(super) fn failed(status: &Status) -> Failed {
     Failed::new(exit, anyhow::anyhow!("{}", status.message()))
 }
 
-/// A lease of its own.
+/// Acquires the lease on the arms and returns its token.
 pub(super) async fn acquire(client: &mut Client) -> Result<String, Failed> {
-    Ok(answer(client.acquire(pb::AcquireRequest::default())).await?.token)
+    Ok(call_with_timeout(client.acquire(pb::AcquireRequest::default())).await?.token)
 }
 
-/// Gives the arms up. Whoever cannot loses them soon anyway.
+/// Releases the lease. If the call fails, the lease expires soon.
 pub(super) async fn release(client: &mut Client, token: String) {
-    answer(client.release(pb::ReleaseRequest { token })).await.ok();
+    call_with_timeout(client.release(pb::ReleaseRequest { token })).await.ok();
 }
 
 pub(super) fn status(args: &OperatorArgs) -> Result<(), Failed> {
     with_client(&args.connect, async |mut client: Client| {
-        let status = answer(client.status(pb::BridgeStatusRequest {})).await?;
+        let status = call_with_timeout(client.status(pb::BridgeStatusRequest {})).await?;
         if args.json {
             output::print(show::status_json(&status))?;
         } else {
@@ -80,11 +80,11 @@ pub(super) fn status(args: &OperatorArgs) -> Result<(), Failed> {
 
 pub(super) fn describe(args: &OperatorArgs) -> Result<(), Failed> {
     with_client(&args.connect, async |mut client: Client| {
-        let told = answer(client.describe(pb::DescribeBridgeRequest {})).await?;
+        let description = call_with_timeout(client.describe(pb::DescribeBridgeRequest {})).await?;
         if args.json {
-            output::print(show::description_json(&told))?;
+            output::print(show::description_json(&description))?;
         } else {
-            show::description_lines(&told).iter().try_for_each(output::print)?;
+            show::description_lines(&description).iter().try_for_each(output::print)?;
         }
         Ok(())
     })
@@ -92,13 +92,13 @@ pub(super) fn describe(args: &OperatorArgs) -> Result<(), Failed> {
 
 pub(super) fn stop(args: &OperatorArgs) -> Result<(), Failed> {
     with_client(&args.connect, async |mut client: Client| {
-        let stopped = answer(client.stop(pb::StopRequest {})).await?.stopped;
+        let stopped = call_with_timeout(client.stop(pb::StopRequest {})).await?.stopped;
         if args.json {
             output::print(json!({"stopped": stopped.as_ref().map(show::stop_json)}))?;
         } else {
             output::print("stopped")?;
             if let Some(stop) = stopped.filter(|stop| stop.name != "requested") {
-                output::print(format_args!("they were stopped before: {}", stop.sentence))?;
+                output::print(format_args!("the arms were already stopped: {}", stop.sentence))?;
             }
         }
         Ok(())
@@ -108,13 +108,14 @@ pub(super) fn stop(args: &OperatorArgs) -> Result<(), Failed> {
 pub(super) fn reset(args: &OperatorArgs) -> Result<(), Failed> {
     with_client(&args.connect, async |mut client: Client| {
         let token = acquire(&mut client).await?;
-        let reset = answer(client.reset(pb::ResetRequest { token: token.clone() })).await;
+        let reset =
+            call_with_timeout(client.reset(pb::ResetRequest { token: token.clone() })).await;
         release(&mut client, token).await;
         reset?;
         if args.json {
             output::print(json!({"reset": true}))?;
         } else {
-            output::print("reset: the arms stay where they are until a motion begins")?;
+            output::print("reset: the arms hold their position until a motion begins")?;
         }
         Ok(())
     })

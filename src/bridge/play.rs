@@ -1,4 +1,4 @@
-//! `tandem bridge move`: a motion from a file, watched to its end.
+//! `tandem bridge move`: executes the motion in a file.
 
 use std::io::IsTerminal as _;
 use std::time::Duration;
@@ -11,17 +11,17 @@ use tokio_stream::wrappers::ReceiverStream;
 use tokio_util::sync::CancellationToken;
 use tonic::{Code, Status, Streaming};
 
-use super::operator::{Client, acquire, answer, failed, release, with_client};
+use super::operator::{Client, acquire, call_with_timeout, failed, release, with_client};
 use super::{file, show};
 use crate::cli::MoveArgs;
 use crate::exit::{Exit, Failed, OrExit as _};
 use crate::{output, signals};
 
-/// Time from one sign of life to the next: the bridge wants one every 100 ms.
-const SIGN: Duration = Duration::from_millis(40);
-/// The bridge reports twenty times a second; whoever hears nothing for this long gives up.
-const SILENCE: Duration = Duration::from_secs(5);
-/// Seconds of a motion's own time between two plain lines.
+/// Time between two keep-alive messages; the bridge requires one every 100 ms.
+const KEEP_ALIVE_EVERY: Duration = Duration::from_millis(40);
+/// Timeout of the stream of reports, of which the bridge sends twenty per second.
+const REPORT_TIMEOUT: Duration = Duration::from_secs(5);
+/// Seconds of the motion's own time between two plain lines.
 const PLAIN_EVERY_S: f64 = 1.0;
 
 pub(super) fn play(args: &MoveArgs) -> Result<(), Failed> {
@@ -36,16 +36,16 @@ pub(super) fn play(args: &MoveArgs) -> Result<(), Failed> {
             }
             return Ok(());
         }
-        let status = answer(client.status(pb::BridgeStatusRequest {})).await?;
+        let status = call_with_timeout(client.status(pb::BridgeStatusRequest {})).await?;
         if let Some(stop) = &status.stopped {
             return Err(stopped(stop));
         }
-        let mut watched = Watched::new(&accepted);
-        watched.say(&accepted_line(&accepted));
+        let mut display = MotionDisplay::new(&accepted);
+        display.print(&accepted_line(&accepted));
         let token = acquire(&mut client).await?;
-        let done = execute(&mut client, &token, motion, &mut watched).await;
+        let done = execute(&mut client, &token, motion, &mut display).await;
         release(&mut client, token).await;
-        watched.close();
+        display.close();
         let last = done?;
         if args.json {
             output::print(json!({"done": true, "progress": show::progress_json(&last)}))?;
@@ -56,7 +56,7 @@ pub(super) fn play(args: &MoveArgs) -> Result<(), Failed> {
     })
 }
 
-/// The motion as the bridge accepts it.
+/// Checks the motion on the bridge, without moving anything.
 async fn check(
     client: &mut Client,
     motion: &pb::MotionRequest,
@@ -64,7 +64,7 @@ async fn check(
 ) -> Result<pb::AcceptedMotion, Failed> {
     use pb::check_response::Verdict;
     let request = pb::CheckRequest { motion: Some(motion.clone()) };
-    match answer(client.check(request)).await?.verdict {
+    match call_with_timeout(client.check(request)).await?.verdict {
         Some(Verdict::Accepted(accepted)) => Ok(accepted),
         Some(Verdict::Refused(refused)) => {
             if as_json {
@@ -73,7 +73,7 @@ async fn check(
             let what = anyhow::anyhow!("the motion is refused: {}", refused.sentence);
             Err(Failed::new(Exit::Data, what))
         }
-        None => Err(Failed::new(Exit::Bug, anyhow::anyhow!("the bridge has judged nothing"))),
+        None => Err(Failed::new(Exit::Bug, anyhow::anyhow!("the bridge sent no verdict"))),
     }
 }
 
@@ -96,78 +96,78 @@ fn accepted_line(accepted: &pb::AcceptedMotion) -> String {
 fn stopped(stop: &pb::BridgeStop) -> Failed {
     let sentence = &stop.sentence;
     let what = anyhow::anyhow!(
-        "the arms are stopped: {sentence} (look at them, then `tandem bridge reset`)"
+        "the arms are stopped: {sentence} (inspect them, then run `tandem bridge reset`)"
     );
     Failed::new(Exit::TryAgain, what)
 }
 
-/// What a person is told when the stream of a motion ends with an error. One that the bridge has not sent is the connection's.
-fn broken(status: &Status) -> Failed {
+/// Converts the error of a stream of reports. An error that the bridge has not sent is one of the connection.
+fn stream_failed(status: &Status) -> Failed {
     if status.code() != Code::Unknown {
         return failed(status);
     }
     let what = anyhow::anyhow!(
-        "the connection to the bridge broke: {} (the arms are stopped by that; look at them)",
+        "the connection to the bridge broke: {} (this stops the arms; inspect them)",
         status.message()
     );
     Failed::new(Exit::TryAgain, what)
 }
 
-/// Plays the motion; gives where it has led.
+/// Executes the motion and returns the last report.
 async fn execute(
     client: &mut Client,
     token: &str,
     motion: pb::MotionRequest,
-    watched: &mut Watched,
+    display: &mut MotionDisplay,
 ) -> Result<pb::MotionProgress, Failed> {
-    let interrupted = signals::shutdown_token(false)
-        .or_exit(Exit::TryAgain, || "cannot watch for signals".to_owned())?;
-    let (signs, requests) = mpsc::channel(4);
+    let interrupted = signals::shutdown_token(false)?;
+    let (sender, requests) = mpsc::channel(4);
     let start = pb::ExecuteStart { token: token.to_owned(), motion: Some(motion) };
     let start = request(pb::execute_request::Request::Start(start));
-    signs.try_send(start).or_exit(Exit::Bug, String::new)?;
-    tokio::spawn(give_signs(signs));
+    sender.try_send(start).or_exit(Exit::Bug, String::new)?;
+    tokio::spawn(send_keep_alives(sender));
     let mut stopper = client.clone();
-    let told = tokio::select! {
-        told = client.execute(ReceiverStream::new(requests)) => {
-            told.map_err(|status| failed(&status))?.into_inner()
+    let reports = tokio::select! {
+        reports = client.execute(ReceiverStream::new(requests)) => {
+            reports.map_err(|status| failed(&status))?.into_inner()
         }
         () = interrupted.cancelled() => return Err(interrupt(&mut stopper).await),
     };
-    watch(told, &interrupted, &mut stopper, watched).await
+    watch(reports, &interrupted, &mut stopper, display).await
 }
 
 async fn watch(
-    mut told: Streaming<pb::ExecuteResponse>,
+    mut reports: Streaming<pb::ExecuteResponse>,
     interrupted: &CancellationToken,
     client: &mut Client,
-    watched: &mut Watched,
+    display: &mut MotionDisplay,
 ) -> Result<pb::MotionProgress, Failed> {
     loop {
         let next = tokio::select! {
-            next = tokio::time::timeout(SILENCE, told.message()) => next,
+            next = tokio::time::timeout(REPORT_TIMEOUT, reports.message()) => next,
             () = interrupted.cancelled() => {
-                watched.close();
+                display.close();
                 return Err(interrupt(client).await);
             }
         };
-        let next = next.or_exit(Exit::TryAgain, || "the bridge says nothing more".to_owned())?;
-        let Some(next) = next.map_err(|status| broken(&status))? else {
-            let what = anyhow::anyhow!("the bridge has not said how the motion ended");
+        let next =
+            next.or_exit(Exit::TryAgain, || "the bridge sends no more reports".to_owned())?;
+        let Some(next) = next.map_err(|status| stream_failed(&status))? else {
+            let what = anyhow::anyhow!("the bridge did not report how the motion ended");
             return Err(Failed::new(Exit::TryAgain, what));
         };
         let progress = next.progress.unwrap_or_default();
         match next.outcome.and_then(|outcome| outcome.outcome) {
-            None => watched.look(&progress),
+            None => display.update(&progress),
             Some(pb::motion_outcome::Outcome::Done(_)) => return Ok(progress),
             Some(pb::motion_outcome::Outcome::Stopped(stop)) => return Err(stopped(&stop)),
         }
     }
 }
 
-/// Stops the arms and says whether that was heard.
+/// Stops the arms and reports whether the bridge received the command.
 async fn interrupt(client: &mut Client) -> Failed {
-    match answer(client.stop(pb::StopRequest {})).await {
+    match call_with_timeout(client.stop(pb::StopRequest {})).await {
         Ok(_) => output::message("tandem: interrupted: the arms are stopped"),
         Err(failed) => output::message(format_args!(
             "tandem: interrupted, and the arms could NOT be stopped, use the emergency stop: {:#}",
@@ -177,15 +177,15 @@ async fn interrupt(client: &mut Client) -> Failed {
     Failed::new(Exit::Interrupted, anyhow::anyhow!("interrupted"))
 }
 
-/// Lets the bridge hear of us until nobody listens any more.
-async fn give_signs(signs: mpsc::Sender<pb::ExecuteRequest>) {
-    let mut pace = tokio::time::interval(SIGN);
+/// Sends keep-alive messages until the stream is closed.
+async fn send_keep_alives(sender: mpsc::Sender<pb::ExecuteRequest>) {
+    let mut pace = tokio::time::interval(KEEP_ALIVE_EVERY);
     pace.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
-    while !signs.is_closed() {
+    while !sender.is_closed() {
         pace.tick().await;
         let alive = request(pb::execute_request::Request::Alive(pb::SignOfLife {}));
-        // A sign that finds no room is not needed: others wait.
-        signs.try_send(alive).ok();
+        // A message that does not fit into the queue is not needed: others are waiting.
+        sender.try_send(alive).ok();
     }
 }
 
@@ -193,31 +193,31 @@ fn request(request: pb::execute_request::Request) -> pb::ExecuteRequest {
     pb::ExecuteRequest { request: Some(request) }
 }
 
-/// What a person sees: a bar on a terminal, plain lines elsewhere.
-struct Watched {
+/// The display of a motion: a bar on a terminal, plain lines elsewhere.
+struct MotionDisplay {
     bar: Option<ProgressBar>,
-    told_s: f64,
+    printed_s: f64,
     phase: pb::BridgePhase,
 }
 
-impl Watched {
+impl MotionDisplay {
     fn new(accepted: &pb::AcceptedMotion) -> Self {
         let bar = std::io::stderr().is_terminal().then(|| {
             let bar = ProgressBar::new(millis(accepted.duration_s));
             let style = ProgressStyle::with_template("[{bar:32}] {msg}");
             bar.with_style(style.unwrap_or_else(|_| ProgressStyle::default_bar()))
         });
-        Self { bar, told_s: f64::NEG_INFINITY, phase: pb::BridgePhase::Unspecified }
+        Self { bar, printed_s: f64::NEG_INFINITY, phase: pb::BridgePhase::Unspecified }
     }
 
-    fn say(&self, line: &str) {
+    fn print(&self, line: &str) {
         match &self.bar {
             Some(bar) => bar.println(output::escaped(line)),
             None => output::message(line),
         }
     }
 
-    fn look(&mut self, progress: &pb::MotionProgress) {
+    fn update(&mut self, progress: &pb::MotionProgress) {
         let line = format!(
             "{} {:.1} of {:.1} s",
             show::phase(progress.phase()),
@@ -227,10 +227,11 @@ impl Watched {
         if let Some(bar) = &self.bar {
             bar.set_position(millis(progress.played_s));
             bar.set_message(line);
-        } else if progress.phase() != self.phase || progress.played_s >= self.told_s + PLAIN_EVERY_S
+        } else if progress.phase() != self.phase
+            || progress.played_s >= self.printed_s + PLAIN_EVERY_S
         {
-            (self.phase, self.told_s) = (progress.phase(), progress.played_s);
-            self.say(&line);
+            (self.phase, self.printed_s) = (progress.phase(), progress.played_s);
+            self.print(&line);
         }
     }
 
@@ -244,7 +245,7 @@ impl Watched {
 #[expect(
     clippy::cast_possible_truncation,
     clippy::cast_sign_loss,
-    reason = "minutes at most, and a bar only"
+    reason = "a few minutes at most, for a progress bar"
 )]
 fn millis(seconds: f64) -> u64 {
     (1e3 * seconds) as u64

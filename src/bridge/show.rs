@@ -1,9 +1,9 @@
-//! What a bridge says, for people and as JSON.
+//! Formats the messages of a bridge as text and as JSON.
 
 use serde_json::{Value, json};
 use tandem_proto::pb;
 
-/// A phase in one word.
+/// Returns the name of a phase.
 pub(super) fn phase(phase: pb::BridgePhase) -> &'static str {
     match phase {
         pb::BridgePhase::Unspecified => "unknown",
@@ -16,7 +16,7 @@ pub(super) fn phase(phase: pb::BridgePhase) -> &'static str {
 }
 
 pub(super) fn status_lines(status: &pb::BridgeStatusResponse) -> Vec<String> {
-    let why =
+    let reason =
         status.stopped.as_ref().map_or_else(String::new, |stop| format!(": {}", stop.sentence));
     let rests = match (status.at_rest, status.arms.is_empty()) {
         (true, _) => "at rest",
@@ -29,7 +29,7 @@ pub(super) fn status_lines(status: &pb::BridgeStatusResponse) -> Vec<String> {
         "none".to_owned()
     };
     let mut lines = vec![
-        format!("phase   {}{why}", phase(status.phase())),
+        format!("phase   {}{reason}", phase(status.phase())),
         format!("joints  {rests}"),
         format!("owner   {owner}"),
         format!(
@@ -57,7 +57,7 @@ fn arm_line(idx: usize, arm: &pb::ArmState) -> String {
     let mut line = format!(
         "arm {idx}   joints {} degrees, tool at {} m, gripper {:.0} % open",
         degrees.join(" "),
-        place(&arm.tool_in_world_m),
+        position(&arm.tool_in_world_m),
         100.0 * arm.opening
     );
     for (fault, what) in [
@@ -73,39 +73,39 @@ fn arm_line(idx: usize, arm: &pb::ArmState) -> String {
     line
 }
 
-/// Metres, to the millimetre; nothing is -0.000.
-fn place(metres: &[f64]) -> String {
+/// Formats a position in metres, rounded to millimetres, without negative zeros.
+fn position(metres: &[f64]) -> String {
     let rounded = metres.iter().map(|metres| (metres * 1e3).round() / 1e3 + 0.0);
     let numbers: Vec<String> = rounded.map(|metres| format!("{metres:.3}")).collect();
     numbers.join(" ")
 }
 
-pub(super) fn description_lines(told: &pb::DescribeBridgeResponse) -> Vec<String> {
+pub(super) fn description_lines(description: &pb::DescribeBridgeResponse) -> Vec<String> {
     let mut lines = vec![format!(
         "driver  {}, version {}, a command every {:.0} ms",
-        told.driver,
-        told.version,
-        1e3 * told.period_s
+        description.driver,
+        description.version,
+        1e3 * description.period_s
     )];
-    for (idx, arm) in told.arms.iter().enumerate() {
+    for (idx, arm) in description.arms.iter().enumerate() {
         lines.push(format!(
             "arm {idx}   {}, base at {} m, turned by {:.0} degrees",
             arm.model,
-            place(&arm.base_in_world_m),
+            position(&arm.base_in_world_m),
             arm.yaw_rad.to_degrees()
         ));
-        lines.extend(arm.joints.iter().enumerate().map(|(joint, told)| {
+        lines.extend(arm.joints.iter().enumerate().map(|(joint, limits)| {
             format!(
                 "        joint {}: {:.0} to {:.0} degrees, {:.0} degrees/s",
                 joint + 1,
-                told.low_rad.to_degrees(),
-                told.high_rad.to_degrees(),
-                told.speed_radps.to_degrees()
+                limits.low_rad.to_degrees(),
+                limits.high_rad.to_degrees(),
+                limits.speed_radps.to_degrees()
             )
         }));
     }
-    lines.push(format!("table   at a height of {:.3} m", told.table_z_m));
-    if let Some(limits) = &told.limits {
+    lines.push(format!("table   at a height of {:.3} m", description.table_z_m));
+    if let Some(limits) = &description.limits {
         lines.extend(limit_lines(limits));
     }
     lines
@@ -194,7 +194,7 @@ pub(super) fn status_json(status: &pb::BridgeStatusResponse) -> Value {
     })
 }
 
-pub(super) fn description_json(told: &pb::DescribeBridgeResponse) -> Value {
+pub(super) fn description_json(description: &pb::DescribeBridgeResponse) -> Value {
     let joint = |joint: &pb::JointDescription| {
         json!({
             "low_rad": joint.low_rad, "high_rad": joint.high_rad,
@@ -207,13 +207,13 @@ pub(super) fn description_json(told: &pb::DescribeBridgeResponse) -> Value {
             "joints": arm.joints.iter().map(joint).collect::<Vec<_>>(),
         })
     };
-    let frame = told.task_frame.as_ref().map(
+    let frame = description.task_frame.as_ref().map(
         |frame| json!({"scale": frame.scale, "centre_m": frame.centre_m, "lift_m": frame.lift_m}),
     );
     json!({
-        "driver": told.driver, "version": told.version, "period_s": told.period_s,
-        "arms": told.arms.iter().map(arm).collect::<Vec<_>>(), "table_z_m": told.table_z_m,
-        "task_frame": frame, "limits": told.limits.as_ref().map(limits_json),
+        "driver": description.driver, "version": description.version, "period_s": description.period_s,
+        "arms": description.arms.iter().map(arm).collect::<Vec<_>>(), "table_z_m": description.table_z_m,
+        "task_frame": frame, "limits": description.limits.as_ref().map(limits_json),
     })
 }
 

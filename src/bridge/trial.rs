@@ -15,10 +15,8 @@ use tandem_trials::{Series, SeriesError, SimulatedConfig, Subject};
 
 use crate::bridge::file;
 use crate::cli::{ModeName, RecordName, TrialArgs};
-use crate::eval::task;
 use crate::exit::{Exit, Failed, OrExit as _};
-use crate::files::load_policy;
-use crate::output;
+use crate::{output, policy_file};
 
 /// Density of the blocks, kilograms per cubic metre: a block of 5.6 cm has 0.12 kg.
 const DENSITY_KGPM3: f32 = 683.3;
@@ -81,7 +79,7 @@ const fn mode_of(name: ModeName) -> TrialMode {
 fn subjects(args: &TrialArgs) -> Result<(Task, Vec<Subject>), Failed> {
     let mut subjects = Vec::new();
     for path in &args.policies {
-        let policy = load_policy(path)?;
+        let policy = policy_file::load(path)?;
         if policy.layout.n_arms != 2 {
             return Err(Failed::usage(format!(
                 "{} drives {} arm(s), the bridge has 2: a one-arm policy goes with --composed-teachers",
@@ -92,7 +90,7 @@ fn subjects(args: &TrialArgs) -> Result<(Task, Vec<Subject>), Failed> {
         subjects.push(Subject { name: name_of(path), policy });
     }
     for path in &args.composed_teachers {
-        let policy = load_policy(path)?;
+        let policy = policy_file::load(path)?;
         if policy.layout.n_arms != 1 {
             return Err(Failed::usage(format!(
                 "{} drives {} arms: a teacher drives one",
@@ -103,7 +101,7 @@ fn subjects(args: &TrialArgs) -> Result<(Task, Vec<Subject>), Failed> {
         subjects.push(Subject { name: format!("composed-{}", name_of(path)), policy });
     }
     let task_of = |subject: &Subject| subject.policy.layout.task;
-    let first = args.task.map(task).or_else(|| subjects.first().map(task_of));
+    let first = args.task.map(Task::from).or_else(|| subjects.first().map(task_of));
     let Some(task) = first else {
         return Err(Failed::usage("give --policy or --composed-teachers"));
     };

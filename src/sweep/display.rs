@@ -1,4 +1,4 @@
-//! What a person sees of a sweep: a line for every run that ends, and on a terminal how the others are.
+//! The display of a sweep: a line for each run that ends and, on a terminal, a live line for each running one.
 
 use std::fs::File;
 use std::io::{IsTerminal as _, Read as _, Seek as _, SeekFrom};
@@ -8,10 +8,10 @@ use std::time::Duration;
 use indicatif::{HumanCount, MultiProgress, ProgressBar, ProgressStyle};
 use serde_json::Value;
 
-use super::child::last_line;
+use crate::launch::last_line;
 use crate::output;
 
-/// Enough of a log's end for its last line.
+/// Bytes at the end of a log that are searched for its last line.
 const TAIL_BYTES: u64 = 4096;
 
 pub(super) struct Display {
@@ -38,20 +38,20 @@ impl Display {
         Self { live, n_runs, n_ended: n_finished }
     }
 
-    /// A run was started that writes its lines to `log`.
+    /// Adds a run that writes its lines to `log`.
     pub(super) fn started(&mut self, name: &str, log: PathBuf) {
         if let Some(live) = &mut self.live {
             let line = live.all.add(ProgressBar::new_spinner());
             line.set_style(style("  {msg}"));
-            line.set_message(format!("{name}: starts"));
+            line.set_message(format!("{name}: starting"));
             live.running.push(Running { name: name.to_owned(), log, line });
         }
     }
 
-    /// A run ended; `how` is what there is to say.
-    pub(super) fn ended(&mut self, name: &str, how: &str) {
+    /// Prints how a run ended and removes its live line.
+    pub(super) fn ended(&mut self, name: &str, outcome: &str) {
         self.n_ended += 1;
-        self.say(&format!("[{} of {}] {name}: {how}", self.n_ended, self.n_runs));
+        self.print(&format!("[{} of {}] {name}: {outcome}", self.n_ended, self.n_runs));
         if let Some(live) = &mut self.live {
             live.bar.set_position(self.n_ended as u64);
             for running in live.running.extract_if(.., |running| running.name == name) {
@@ -60,24 +60,25 @@ impl Display {
         }
     }
 
-    /// Shows the last line of every run under way.
+    /// Shows the last line of each running run.
     pub(super) fn refresh(&self) {
         for Running { name, log, line } in self.live.iter().flat_map(|live| &live.running) {
-            if let Some(said) = tail(log).as_deref().and_then(last_line) {
-                line.set_message(output::escaped(&format!("{name}: {said}")));
+            let text = tail(log).unwrap_or_default();
+            if let Some(last) = last_line(&text) {
+                line.set_message(output::escaped(&format!("{name}: {last}")));
             }
         }
     }
 
-    /// Prints one line that stays.
-    pub(super) fn say(&self, line: &str) {
+    /// Prints a line that stays on the screen.
+    pub(super) fn print(&self, line: &str) {
         match &self.live {
             Some(live) => drop(live.all.println(output::escaped(line))),
             None => output::message(line),
         }
     }
 
-    /// Takes the live lines away; what is said from now on is plain.
+    /// Removes the live lines. From now on, lines are printed plainly.
     pub(super) fn close(&mut self) {
         if let Some(live) = self.live.take() {
             live.bar.finish_and_clear();
@@ -103,8 +104,8 @@ fn style(template: &str) -> ProgressStyle {
         .progress_chars("=> ")
 }
 
-/// What a finished run reached, from its summary.
-pub(super) fn reached(summary: &Value) -> String {
+/// Returns the results in a summary on one line.
+pub(super) fn summary_line(summary: &Value) -> String {
     let number = |key: &str| summary[key].as_f64().unwrap_or(f64::NAN);
     format!(
         "success {:.3} [{:.3}, {:.3}] on test goals, {} env steps in {:.1} minutes",
@@ -116,14 +117,14 @@ pub(super) fn reached(summary: &Value) -> String {
     )
 }
 
-/// The end of a file.
-fn tail(path: &Path) -> Option<Vec<u8>> {
+/// Returns the end of a text file.
+fn tail(path: &Path) -> Option<String> {
     let mut file = File::open(path).ok()?;
     let n_bytes = file.metadata().ok()?.len();
     file.seek(SeekFrom::Start(n_bytes.saturating_sub(TAIL_BYTES))).ok()?;
     let mut bytes = Vec::new();
     file.read_to_end(&mut bytes).ok()?;
-    Some(bytes)
+    Some(String::from_utf8_lossy(&bytes).into_owned())
 }
 
 #[cfg(test)]
@@ -131,22 +132,22 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_summary_is_told_in_one_line() {
+    fn a_summary_fits_on_one_line() {
         let summary = serde_json::json!({
             "success": 0.9625, "success_low": 0.93, "success_high": 0.98, "env_steps": 940_000, "wall_s": 1803.0
         });
         assert_eq!(
-            reached(&summary),
+            summary_line(&summary),
             "success 0.963 [0.930, 0.980] on test goals, 940,000 env steps in 30.1 minutes"
         );
     }
 
     #[test]
-    fn the_end_of_a_long_log_is_enough() {
+    fn only_the_end_of_a_long_log_is_read() {
         let dir = tempfile::tempdir().expect("a directory");
         let log = dir.path().join("log");
         std::fs::write(&log, "x".repeat(10_000) + "\nlast\n").expect("writes");
         let tail = tail(&log).expect("there");
-        assert_eq!((tail.len(), last_line(&tail).as_deref()), (4096, Some("last")));
+        assert_eq!((tail.len(), last_line(&tail)), (4096, Some("last")));
     }
 }

@@ -1,4 +1,4 @@
-//! What a person sees while a run goes on: live lines on a terminal, plain ones elsewhere.
+//! The display of a running `tandem train`: live lines on a terminal, plain lines elsewhere.
 
 use std::io::IsTerminal as _;
 use std::time::Duration;
@@ -8,16 +8,19 @@ use tandem_proto::pb;
 
 use super::plan::Plan;
 use crate::output;
+use crate::progress_text::{clock_text, counts_line, evaluation_line, grouped};
 
-/// Seconds of run time between two plain lines without news.
+/// Seconds of run time after which a plain line is printed even without news.
 const PLAIN_EVERY_S: f64 = 30.0;
 
 pub(crate) struct Display {
     live: Option<Live>,
-    until: Until,
-    told_at_s: f64,
-    told_evaluation: Option<u64>,
-    told_warning: String,
+    limit: Limit,
+    /// Run time of the latest plain line.
+    printed_at_s: f64,
+    /// Round of the latest evaluation that was printed.
+    printed_evaluation: Option<u64>,
+    printed_warning: String,
 }
 
 struct Live {
@@ -26,8 +29,8 @@ struct Live {
     lines: [ProgressBar; 3],
 }
 
-/// What the bar fills up to.
-enum Until {
+/// The limit of the run that a full bar represents.
+enum Limit {
     Minutes(f64),
     EnvSteps(u64),
     Open,
@@ -36,20 +39,20 @@ enum Until {
 impl Display {
     pub(crate) fn new(plan: &Plan) -> Self {
         let stop = &plan.config.stop;
-        let until = match (stop.max_env_steps, stop.max_minutes) {
-            (0, minutes) if minutes > 0.0 => Until::Minutes(minutes),
-            (0, _) => Until::Open,
-            (env_steps, _) => Until::EnvSteps(env_steps),
+        let limit = match (stop.max_env_steps, stop.max_minutes) {
+            (0, minutes) if minutes > 0.0 => Limit::Minutes(minutes),
+            (0, _) => Limit::Open,
+            (env_steps, _) => Limit::EnvSteps(env_steps),
         };
         let display = Self {
             live: std::io::stderr().is_terminal().then(Live::new),
-            until,
-            told_at_s: -PLAIN_EVERY_S,
-            told_evaluation: None,
-            told_warning: String::new(),
+            limit,
+            printed_at_s: -PLAIN_EVERY_S,
+            printed_evaluation: None,
+            printed_warning: String::new(),
         };
         let config = &plan.config;
-        display.say(&format!(
+        display.print(&format!(
             "training {} with {} arm(s), strategy {}, seed {}, {} worker process(es); run directory {}",
             config.task,
             config.arms,
@@ -65,34 +68,34 @@ impl Display {
         if progress.task.is_empty() {
             return;
         }
-        if progress.warning != self.told_warning {
-            self.told_warning.clone_from(&progress.warning);
-            self.say(&warning_line(progress));
+        if progress.warning != self.printed_warning {
+            self.printed_warning.clone_from(&progress.warning);
+            self.print(&warning_line(progress));
         }
         if let Some(evaluation) = &progress.evaluation
-            && self.told_evaluation != Some(evaluation.round)
+            && self.printed_evaluation != Some(evaluation.round)
         {
-            self.told_evaluation = Some(evaluation.round);
-            self.told_at_s = progress.wall_s;
-            self.say(&evaluation_line(progress, evaluation));
-        } else if self.live.is_none() && progress.wall_s - self.told_at_s >= PLAIN_EVERY_S {
-            self.told_at_s = progress.wall_s;
-            self.say(&counts_line(progress));
+            self.printed_evaluation = Some(evaluation.round);
+            self.printed_at_s = progress.wall_s;
+            self.print(&evaluation_line(progress, evaluation));
+        } else if self.live.is_none() && progress.wall_s - self.printed_at_s >= PLAIN_EVERY_S {
+            self.printed_at_s = progress.wall_s;
+            self.print(&counts_line(progress));
         }
         if let Some(live) = &self.live {
-            live.show(progress, self.share_done(progress));
+            live.show(progress, self.fraction_done(progress));
         }
     }
 
-    /// Prints one line that stays.
-    pub(crate) fn say(&self, line: &str) {
+    /// Prints a line that stays on the screen.
+    pub(crate) fn print(&self, line: &str) {
         match &self.live {
             Some(live) => drop(live.all.println(output::escaped(line))),
             None => output::message(line),
         }
     }
 
-    /// Takes the live lines away; what is said from now on is plain.
+    /// Removes the live lines. From now on, lines are printed plainly.
     pub(crate) fn close(&mut self) {
         if let Some(live) = self.live.take() {
             live.bar.finish_and_clear();
@@ -100,11 +103,11 @@ impl Display {
         }
     }
 
-    fn share_done(&self, progress: &pb::Progress) -> f64 {
-        match self.until {
-            Until::Minutes(minutes) => progress.wall_s / (minutes * 60.0),
-            Until::EnvSteps(env_steps) => progress.env_steps as f64 / env_steps as f64,
-            Until::Open => 0.0,
+    fn fraction_done(&self, progress: &pb::Progress) -> f64 {
+        match self.limit {
+            Limit::Minutes(minutes) => progress.wall_s / (minutes * 60.0),
+            Limit::EnvSteps(env_steps) => progress.env_steps as f64 / env_steps as f64,
+            Limit::Open => 0.0,
         }
     }
 }
@@ -128,8 +131,8 @@ impl Live {
         clippy::cast_sign_loss,
         reason = "clamped to the bar's length"
     )]
-    fn show(&self, progress: &pb::Progress, share_done: f64) {
-        self.bar.set_position((share_done.clamp(0.0, 1.0) * 1000.0) as u64);
+    fn show(&self, progress: &pb::Progress, fraction_done: f64) {
+        self.bar.set_position((fraction_done.clamp(0.0, 1.0) * 1000.0) as u64);
         self.bar.set_message(counts_line(progress));
         let best = progress.best.as_ref().map_or_else(
             || "none yet".to_owned(),
@@ -164,65 +167,12 @@ fn style(template: &str) -> ProgressStyle {
         .progress_chars("=> ")
 }
 
-/// How far a run is.
-pub(crate) fn counts_line(progress: &pb::Progress) -> String {
-    format!(
-        "{} round {}, {} env steps ({:.0}/s), {} updates ({:.0}/s)",
-        clock_text(progress.wall_s),
-        progress.round,
-        grouped(progress.env_steps),
-        progress.env_steps_per_s,
-        grouped(progress.updates),
-        progress.updates_per_s
-    )
-}
-
 fn warning_line(progress: &pb::Progress) -> String {
     let clock = clock_text(progress.wall_s);
     match progress.warning.as_str() {
-        "" => format!("{clock} what was wrong is mended"),
+        "" => format!("{clock} the problem is solved"),
         warning => format!("{clock} warning: {warning}"),
     }
-}
-
-/// What an evaluation has brought.
-pub(crate) fn evaluation_line(progress: &pb::Progress, evaluation: &pb::Evaluation) -> String {
-    format!(
-        "{} success {:.3} [{:.3}, {:.3}] at {} env steps; joint {:.3}, contacts {:.3}, mean Q {:.2}, advice {} of {}",
-        clock_text(progress.wall_s),
-        evaluation.success,
-        evaluation.success_low,
-        evaluation.success_high,
-        grouped(evaluation.env_steps),
-        evaluation.success_joint,
-        evaluation.collision_rate,
-        evaluation.mean_q,
-        grouped(progress.advice_spent),
-        grouped(progress.advice_spent + progress.budget_left)
-    )
-}
-
-/// Minutes and seconds.
-#[expect(
-    clippy::cast_possible_truncation,
-    clippy::cast_sign_loss,
-    reason = "a run's seconds are positive and few"
-)]
-pub(crate) fn clock_text(seconds: f64) -> String {
-    let seconds = seconds.max(0.0) as u64;
-    format!("{:02}:{:02}", seconds / 60, seconds % 60)
-}
-
-/// A number with its thousands set apart.
-pub(crate) fn grouped(number: u64) -> String {
-    let digits = number.to_string();
-    let groups: Vec<&str> = digits
-        .as_bytes()
-        .rchunks(3)
-        .rev()
-        .filter_map(|group| std::str::from_utf8(group).ok())
-        .collect();
-    groups.join(",")
 }
 
 #[cfg(test)]
@@ -230,23 +180,11 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_warning_is_told_and_its_end_too() {
+    fn a_warning_and_its_end_are_printed() {
         let of = |warning: &str| {
             warning_line(&pb::Progress { warning: warning.to_owned(), ..Default::default() })
         };
         assert_eq!(of("the disk is full"), "00:00 warning: the disk is full");
-        assert_eq!(of(""), "00:00 what was wrong is mended");
-    }
-
-    #[test]
-    fn numbers_and_times_are_written_for_people() {
-        assert_eq!(
-            [grouped(0), grouped(999), grouped(1_000), grouped(12_345_678)],
-            ["0", "999", "1,000", "12,345,678"]
-        );
-        assert_eq!(
-            [clock_text(0.0), clock_text(61.9), clock_text(3600.0)],
-            ["00:00", "01:01", "60:00"]
-        );
+        assert_eq!(of(""), "00:00 the problem is solved");
     }
 }

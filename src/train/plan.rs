@@ -1,7 +1,8 @@
-//! What a run is to be, where it is kept and which processes it takes.
+//! The plan of a run: its settings, its directory, its teacher and the number of workers.
 
 use std::path::{Path, PathBuf};
 
+use tandem_core::Task;
 use tandem_learner::{checkpoint, settings};
 use tandem_policy::Policy;
 use tandem_rl::RunConfig;
@@ -10,7 +11,7 @@ use toml::Value;
 
 use crate::cli::{RecipeName, TrainArgs};
 use crate::exit::{Exit, Failed, OrExit as _};
-use crate::{eval, files, run_directory, run_file};
+use crate::{policy_file, run_directory, run_file};
 
 /// A run that can be started.
 pub(crate) struct Plan {
@@ -21,14 +22,14 @@ pub(crate) struct Plan {
     pub(crate) resume: bool,
 }
 
-/// A policy that teaches, as it was when it was read.
+/// The policy of the teacher, as read from its file.
 pub(crate) struct TeacherFile {
     path: PathBuf,
     pub(crate) policy: Policy,
 }
 
 impl Plan {
-    /// Decides everything, and refuses what cannot be started.
+    /// Resolves the command line, and rejects a run that cannot be started.
     pub(crate) fn of(args: &TrainArgs) -> Result<Self, Failed> {
         let config = config(args)?;
         let out = match &args.out {
@@ -52,7 +53,7 @@ impl Plan {
         Ok(plan)
     }
 
-    /// Refuses a run directory that holds a run where none is expected, or none where one is.
+    /// Rejects a new run in a directory that contains a run, and a resume in one that does not.
     fn check_directory(&self) -> Result<(), Failed> {
         let shown = self.out.display();
         match (self.run_file().exists(), self.resume) {
@@ -64,8 +65,8 @@ impl Plan {
         }
     }
 
-    /// Checks the plan against what the run directory holds, and writes what a new run is made of. The directory of a
-    /// run that goes on stays as it is: its learner writes changed settings down once the run does go on.
+    /// Checks the plan against the run directory, and writes the files of a new run. The directory of a resumed run is
+    /// not changed: its learner writes changed settings once the run continues.
     pub(crate) fn prepare(&self) -> Result<(), Failed> {
         self.check_directory()?;
         if self.resume {
@@ -74,20 +75,20 @@ impl Plan {
         }
         let failed = || format!("cannot write to {}", self.out.display());
         std::fs::create_dir_all(self.out.join("policy")).or_cannot_write(failed)?;
-        // The run file comes last: a directory without it holds no run, and one with it can be resumed.
+        // The run file comes last: a directory with a run file can be resumed.
         self.keep_teacher()?;
         run_file::save(&self.config, &self.run_file())
     }
 
-    /// Refuses settings with which the run did not begin, by its newest checkpoint or else by its run file.
+    /// Rejects settings that differ from those of the newest checkpoint or, without one, from those of the run file.
     fn check_settings(&self) -> Result<(), Failed> {
-        let is_told = checkpoint::check_settings(&self.checkpoints(), &self.config);
-        if is_told.or_exit(Exit::Usage, String::new)? {
+        let is_checked = checkpoint::check_settings(&self.checkpoints(), &self.config);
+        if is_checked.or_exit(Exit::Usage, String::new)? {
             return Ok(());
         }
-        let Ok(began_with) = run_file::resolve(Some(&self.run_file()), &[]) else { return Ok(()) };
-        let began_with = settings::to_json(&began_with);
-        match settings::first_change(&self.config, &began_with).or_exit(Exit::Bug, String::new)? {
+        let Ok(original) = run_file::resolve(Some(&self.run_file()), &[]) else { return Ok(()) };
+        let original = settings::to_json(&original);
+        match settings::first_change(&self.config, &original).or_exit(Exit::Bug, String::new)? {
             Some(changed) => {
                 let path = self.run_file();
                 Err(Failed::usage(format!("{changed}'s run file {path:?}: {}", settings::ADVICE)))
@@ -96,13 +97,13 @@ impl Plan {
         }
     }
 
-    /// Refuses another teacher than the run's own.
+    /// Rejects a teacher other than the run's own.
     fn check_teacher(&self) -> Result<(), Failed> {
         let copy = self.teacher_copy();
         let Some(teacher) = self.teacher.as_ref().filter(|teacher| teacher.path != copy) else {
             return Ok(());
         };
-        // A copy that is missing or damaged gives way.
+        // A missing or damaged copy is replaced.
         match Policy::load(&copy) {
             Ok(own) if own.digest() != teacher.policy.digest() => Err(Failed::usage(format!(
                 "--teacher {}: the run's own teacher, {}, is another policy: leave --teacher out, or start a new run",
@@ -113,7 +114,7 @@ impl Plan {
         }
     }
 
-    /// Keeps the teacher's file with the run where it is not there yet, or not whole.
+    /// Copies the teacher's file to the run directory, unless an intact copy exists.
     pub(crate) fn keep_teacher(&self) -> Result<(), Failed> {
         let copy = self.teacher_copy();
         let Some(teacher) = self.teacher.as_ref().filter(|teacher| teacher.path != copy) else {
@@ -140,17 +141,17 @@ impl Plan {
         self.out.join("policy/best.safetensors")
     }
 
-    /// The directory of its checkpoints.
+    /// Returns the directory of the checkpoints.
     pub(crate) fn checkpoints(&self) -> PathBuf {
         self.out.join("checkpoint")
     }
 
-    /// The ledger of its teacher.
+    /// Returns the path of the teacher's ledger.
     pub(crate) fn ledger(&self) -> PathBuf {
         self.out.join("ledger.sqlite")
     }
 
-    /// The teacher's policy, kept with the run.
+    /// Returns the path of the run's copy of the teacher.
     pub(crate) fn teacher_copy(&self) -> PathBuf {
         teacher_copy(&self.out)
     }
@@ -160,19 +161,19 @@ fn teacher_copy(out: &Path) -> PathBuf {
     out.join("policy/teacher.safetensors")
 }
 
-/// The settings of the run, by its own run file where it goes on.
+/// Resolves the settings; those of a resumed run come from its own run file.
 fn config(args: &TrainArgs) -> Result<RunConfig, Failed> {
     let own_file = args.out.as_ref().filter(|_| args.resume).map(|out| out.join("run.toml"));
     if let Some((file, out)) = own_file.as_ref().zip(args.out.as_ref())
         && !file.exists()
     {
-        run_directory::check_place(out)?;
+        run_directory::check_path(out)?;
         return Err(Failed::usage(format!("{} holds no run to resume", out.display())));
     }
     let settings = settings_of(args)?;
     let config = run_file::resolve(args.run.as_deref().or(own_file.as_deref()), &settings)?;
     let is_named = settings.iter().any(|(key, _)| key == "name");
-    // A run keeps its name, which its run directory gave it, also where another run file is given again.
+    // A resumed run keeps the name in its own run file, even if --run names another one.
     match own_file.filter(|_| args.run.is_some() && !is_named) {
         Some(own_file) => match run_file::resolve(Some(&own_file), &[]) {
             Ok(RunConfig { name, .. }) => Ok(RunConfig { name, ..config }),
@@ -182,46 +183,46 @@ fn config(args: &TrainArgs) -> Result<RunConfig, Failed> {
     }
 }
 
-/// What the command line says, as settings of the run file; flags come after `--set`.
+/// Converts the flags to settings of the run file, after those of `--set`.
 fn settings_of(args: &TrainArgs) -> Result<Vec<(String, Value)>, Failed> {
     let mut settings = args
         .settings
         .iter()
         .map(|setting| run_file::parse_setting(setting))
         .collect::<Result<Vec<_>, _>>()?;
-    let whole =
+    let integer =
         |n: u64| i64::try_from(n).map_or_else(|_| Value::String(n.to_string()), Value::Integer);
     let recipe = args.recipe.map(|recipe| match recipe {
         RecipeName::Tandem => "tandem",
         RecipeName::Paper => "paper",
     });
     let flags = [
-        ("task", args.task.map(|task| Value::String(eval::task(task).name().to_owned()))),
-        ("arms", args.arms.map(|n| whole(n as u64))),
+        ("task", args.task.map(|task| Value::String(Task::from(task).name().to_owned()))),
+        ("arms", args.arms.map(|n| integer(n as u64))),
         ("recipe", recipe.map(|name| Value::String(name.to_owned()))),
         ("advice.strategy", args.strategy.clone().map(Value::String)),
-        ("advice.budget", args.budget.map(whole)),
-        ("seed", args.seed.map(whole)),
+        ("advice.budget", args.budget.map(integer)),
+        ("seed", args.seed.map(integer)),
         ("stop.until_success", args.until_success.map(Value::Float)),
-        ("stop.max_env_steps", args.max_env_steps.map(whole)),
+        ("stop.max_env_steps", args.max_env_steps.map(integer)),
         ("stop.max_minutes", args.max_minutes.map(Value::Float)),
     ];
     settings.extend(flags.into_iter().filter_map(|(key, value)| Some((key.to_owned(), value?))));
     Ok(settings)
 }
 
-/// One worker a core, but no more than there are slots.
+/// Returns one worker per core, at most one per slot.
 fn default_workers(config: &RunConfig) -> usize {
     std::thread::available_parallelism().map_or(1, std::num::NonZero::get).min(config.rounds.slots)
 }
 
-/// The run directory's own name, where it can be the name of an account at a teacher.
+/// Returns the name of the run directory, if it is a valid name of a teacher's account.
 fn account_name(out: &Path) -> Option<String> {
     let name = out.file_name()?.to_str()?;
     tandem_rl::config::is_name(name).then(|| name.to_owned())
 }
 
-/// `runs/TASK-ARMS-STRATEGY-seedN`, with a number behind it when that is taken.
+/// Returns `runs/TASK-ARMS-STRATEGY-seedN`, with a number appended if that exists.
 fn free_run_directory(config: &RunConfig) -> PathBuf {
     let strategy = config.advice.strategy.replace(':', "-");
     let name = format!("{}-{}-{strategy}-seed{}", config.task, config.arms, config.seed);
@@ -230,14 +231,14 @@ fn free_run_directory(config: &RunConfig) -> PathBuf {
     std::iter::once(base.clone()).chain(numbered).find(|path| !path.exists()).unwrap_or(base)
 }
 
-/// The teacher's file, checked: it must be a one-arm policy for the task.
+/// Loads the teacher, which must be a one-arm policy for the task.
 fn teacher_file(args: &TrainArgs, config: &RunConfig, out: &Path) -> Result<TeacherFile, Failed> {
     let path = match &args.teacher {
         Some(path) => path.clone(),
         None if args.resume && teacher_copy(out).exists() => teacher_copy(out),
-        None => shipped_teacher(&config.task)?,
+        None => policy_file::shipped_teacher(&config.task)?,
     };
-    let policy = files::load_policy(&path)?;
+    let policy = policy_file::load(&path)?;
     let shown = path.display();
     if policy.layout.n_arms != 1 {
         return Err(Failed::usage(format!(
@@ -252,22 +253,4 @@ fn teacher_file(args: &TrainArgs, config: &RunConfig, out: &Path) -> Result<Teac
         )));
     }
     Ok(TeacherFile { path, policy })
-}
-
-/// The teacher that ships: beside the caller, beside the program, or in the program's source tree.
-pub(crate) fn shipped_teacher(task: &str) -> Result<PathBuf, Failed> {
-    let name = format!("policies/teacher-{task}.safetensors");
-    let beside_program =
-        std::env::current_exe().ok().and_then(|exe| Some(exe.parent()?.join(&name)));
-    let places = [
-        Some(PathBuf::from(&name)),
-        beside_program,
-        Some(Path::new(env!("CARGO_MANIFEST_DIR")).join(&name)),
-    ];
-    places.into_iter().flatten().find(|path| path.exists()).ok_or_else(|| {
-        Failed::usage(format!(
-            "no teacher for {task} ships at {name}: train one with `tandem train --arms 1 --task {task}` and give its \
-             policy/best.safetensors with --teacher"
-        ))
-    })
 }

@@ -1,4 +1,4 @@
-//! What stands at the end of a run.
+//! The end of a run: its summary, curve and report.
 
 use std::path::PathBuf;
 
@@ -7,43 +7,43 @@ use tandem_proto::pb;
 use tandem_report::{Axis, CurveOptions, Quantity, Series};
 use tandem_telemetry::{MetricsLog, MetricsRow};
 
-use super::children::Memory;
-use super::display::{clock_text, grouped};
 use super::plan::Plan;
-use crate::eval::{Measured, Subject, measure};
+use super::processes::PeakMemory;
+use crate::evaluation::{EvaluatedPolicy, EvaluationResult, measure};
 use crate::exit::{Exit, Failed, OrExit as _};
-use crate::files::load_policy;
-use crate::output;
+use crate::progress_text::{clock_text, grouped};
+use crate::{output, policy_file};
 
-/// Test goals for the final evaluation of the best policy; no run selects its policy by them.
+/// Seed of the test goals. No run selects its best policy by them.
 const REPORT_SEED: u64 = 777;
 
-/// Evaluates the best policy on test goals, draws the curve, and prints where everything lies.
+/// Evaluates the best policy on the test goals, draws the curve and prints the summary.
 pub(super) fn print(
     plan: &Plan,
     last: &pb::Progress,
-    memory: Memory,
+    memory: PeakMemory,
     as_json: bool,
 ) -> Result<(), Failed> {
     let n_test_episodes = plan.config.evaluation.test_episodes;
     let path = plan.best_policy();
-    let measured = measure(&Subject::Policy(load_policy(&path)?), n_test_episodes, REPORT_SEED)?;
+    let result =
+        measure(&EvaluatedPolicy::Policy(policy_file::load(&path)?), n_test_episodes, REPORT_SEED)?;
     let rows =
         MetricsLog::read_all(&plan.out.join("metrics.jsonl")).or_exit(Exit::Data, String::new)?;
-    let drawn = Drawn {
+    let pictures = Pictures {
         curve: draw_curve(plan, &rows)?,
         report: tandem_report::run_report_html(&plan.out).or_cannot_write(String::new)?,
     };
     let summary = match as_json {
-        true => summary_json(plan, last, memory, &measured).to_string(),
-        false => summary_lines(plan, last, memory, &measured, &drawn).join("\n"),
+        true => summary_json(plan, last, memory, &result).to_string(),
+        false => summary_lines(plan, last, memory, &result, &pictures).join("\n"),
     };
     let saved = || format!("the run is complete and saved in {}", plan.out.display());
     output::print(summary).map_err(|failed| failed.context(saved()))
 }
 
-/// The pictures of a run that has ended.
-struct Drawn {
+/// Files written at the end of a run.
+struct Pictures {
     curve: PathBuf,
     report: PathBuf,
 }
@@ -51,9 +51,9 @@ struct Drawn {
 fn summary_lines(
     plan: &Plan,
     last: &pb::Progress,
-    memory: Memory,
-    measured: &Measured,
-    drawn: &Drawn,
+    memory: PeakMemory,
+    result: &EvaluationResult,
+    pictures: &Pictures,
 ) -> Vec<String> {
     let mut lines = vec![
         format!("done: {}", last.end_reason),
@@ -62,7 +62,7 @@ fn summary_lines(
             plan.config.evaluation.test_episodes
         ),
     ];
-    lines.extend(measured.lines().iter().map(|line| format!("  {line}")));
+    lines.extend(result.lines().iter().map(|line| format!("  {line}")));
     lines.extend([
         format!(
             "training      {} env steps, {} updates, {} rounds in {}",
@@ -81,31 +81,31 @@ fn summary_lines(
             memory.learner_mib, memory.teacher_mib, memory.worker_mib
         ),
         format!("policy        {}", plan.best_policy().display()),
-        format!("curve         {}", drawn.curve.display()),
-        format!("report        {}", drawn.report.display()),
+        format!("curve         {}", pictures.curve.display()),
+        format!("report        {}", pictures.report.display()),
         format!("logs          {}, {}", plan.out.join("mcap").display(), plan.log_path().display()),
         format!("digest        {}", last.digest),
     ]);
     lines
 }
 
-/// Says how to go on with an interrupted run.
-pub(super) fn interrupted(plan: &Plan) {
+/// Prints the command that resumes an interrupted run.
+pub(super) fn print_interrupted(plan: &Plan) {
     let out = plan.out.display();
     let saved = tandem_learner::checkpoint::list(&plan.checkpoints());
     let round = saved.last().and_then(|path| path.file_stem()?.to_str()?.parse::<u64>().ok());
     match round {
         Some(round) => {
             output::message(format_args!(
-                "interrupted; the state after round {round} is saved. Go on with:"
+                "interrupted; the state after round {round} is saved. Resume with:"
             ));
         }
-        None => output::message("interrupted before anything was saved. Start over with:"),
+        None => output::message("interrupted before the first checkpoint. Start over with:"),
     }
     output::message(format_args!("  tandem train --resume --out {out}"));
 }
 
-/// Draws success against environment steps into the run directory.
+/// Draws the success rate over environment steps.
 fn draw_curve(plan: &Plan, rows: &[MetricsRow]) -> Result<PathBuf, Failed> {
     let config = &plan.config;
     let name = format!("{}, {} arm(s), {}", config.task, config.arms, config.advice.strategy);
@@ -117,8 +117,13 @@ fn draw_curve(plan: &Plan, rows: &[MetricsRow]) -> Result<PathBuf, Failed> {
     Ok(path)
 }
 
-fn summary_json(plan: &Plan, last: &pb::Progress, memory: Memory, measured: &Measured) -> Value {
-    let mut summary = measured.json();
+fn summary_json(
+    plan: &Plan,
+    last: &pb::Progress,
+    memory: PeakMemory,
+    result: &EvaluationResult,
+) -> Value {
+    let mut summary = result.json();
     let more = json!({
         "env_steps": last.env_steps,
         "updates": last.updates,

@@ -7,7 +7,7 @@ mod thread;
 use std::path::PathBuf;
 use std::time::Duration;
 
-use tandem_net::{Gate, Incoming, Pacing, SHUTDOWN_GRACE};
+use tandem_net::{Incoming, Pacing, SHUTDOWN_GRACE, ServerConfig};
 use tandem_proto::pb::teacher_server::{Teacher, TeacherServer};
 use tandem_proto::{decode_account_name, pb};
 use tokio_util::sync::CancellationToken;
@@ -52,7 +52,7 @@ pub fn open(config: &Config) -> Result<Advisor, Error> {
 pub async fn serve(
     config: Config,
     incoming: impl Into<Incoming>,
-    gate: &Gate,
+    gate: &ServerConfig,
     shutdown: CancellationToken,
 ) -> Result<(), Error> {
     serve_advisor(open(&config)?, incoming, gate, shutdown, Pacing::Concurrent).await
@@ -68,7 +68,7 @@ pub async fn serve(
 pub async fn serve_advisor(
     advisor: Advisor,
     incoming: impl Into<Incoming>,
-    gate: &Gate,
+    gate: &ServerConfig,
     shutdown: CancellationToken,
     pacing: Pacing,
 ) -> Result<(), Error> {
@@ -77,7 +77,7 @@ pub async fn serve_advisor(
         .map_err(Error::Thread)?;
     let service = TeacherService { advisor, stop: stop.clone() };
     let teacher = TeacherServer::new(service).max_decoding_message_size(MAX_REQUEST_BYTES);
-    let router = gate.router(teacher).await?;
+    let router = gate.router(teacher, tandem_proto::FILE_DESCRIPTOR_SET).await?;
     tandem_net::serve(router, incoming, stop).await?;
     thread.join(SHUTDOWN_GRACE).await
 }

@@ -205,32 +205,6 @@ event! {
 }
 
 event! {
-    /// A peer is unreachable and will be retried.
-    pub struct Reconnecting<'a> {
-        /// The peer: `learner` or `teacher`.
-        pub peer: &'a str,
-        /// Number of consecutive failed attempts.
-        pub attempt: u32,
-        /// Delay before the next attempt, milliseconds.
-        pub wait_millis: u64,
-        /// Cause of the latest failure.
-        pub reason: &'a str,
-    }
-    warn!(peer, attempt, wait_millis, reason, "reconnecting")
-}
-
-event! {
-    /// A peer is reachable again.
-    pub struct Reconnected<'a> {
-        /// The peer: `learner` or `teacher`.
-        pub peer: &'a str,
-        /// Number of attempts that failed.
-        pub attempts: u32,
-    }
-    info!(peer, attempts, "reconnected")
-}
-
-event! {
     /// A run ended.
     pub struct RunFinished<'a> {
         /// Reason of the end.

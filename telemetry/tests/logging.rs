@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use tandem_telemetry::Error;
-use tandem_telemetry::events::{BudgetExhausted, ParametersPublished, Reconnecting};
+use tandem_telemetry::events::{BudgetExhausted, ParametersPublished};
 use tandem_telemetry::logging::{LogConfig, init};
 
 #[test]
@@ -22,7 +22,7 @@ fn the_log_file_contains_events_from_level_info_up_with_their_fields() {
     init(&config).expect("the first initialisation");
     assert!(matches!(init(&config), Err(Error::LoggingTwice(_))));
     BudgetExhausted { account: "run-7", budget: 500 }.emit();
-    Reconnecting { peer: "learner", attempt: 2, wait_millis: 400, reason: "refused" }.emit();
+    tracing::warn!(peer = "learner", attempt = 2, "call failed, retrying");
     ParametersPublished { version: 3 }.emit();
 
     let text = std::fs::read_to_string(&file).expect("the log");
@@ -33,7 +33,8 @@ fn the_log_file_contains_events_from_level_info_up_with_their_fields() {
             && lines[0].contains("advice budget exhausted account=\"run-7\" budget=500")
     );
     assert!(
-        lines[1].contains("WARN") && lines[1].contains("reconnecting peer=\"learner\" attempt=2")
+        lines[1].contains("WARN")
+            && lines[1].contains("call failed, retrying peer=\"learner\" attempt=2")
     );
     assert!(!text.contains('\u{1b}'), "a file has no colours");
 }

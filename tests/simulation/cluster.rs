@@ -12,13 +12,13 @@ use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 use tandem_learner::{LearnerConfig, checkpoint};
-use tandem_net::{Gate, Pacing};
+use tandem_net::{Pacing, ServerConfig};
 use tandem_policy::Policy;
 use tandem_rl::RunConfig;
 use tandem_teacher::policy::OneArmPolicy;
 use tandem_teacher::{Advisor, serve_advisor};
 use tandem_telemetry::MetricsLog;
-use tandem_worker::{Patience, WorkerConfig, run_with};
+use tandem_worker::{WorkerConfig, run};
 use tokio_util::sync::CancellationToken;
 
 use crate::books::{Ledgers, SharedBook, Watched};
@@ -187,7 +187,7 @@ impl Stage {
         let life = self.house.life_of(LEARNER);
         let config = LearnerConfig {
             run: self.run.clone(),
-            gate: Gate::default(),
+            gate: ServerConfig::default(),
             dial: dial(),
             teacher: Some(address(TEACHER)),
             start_from: None,
@@ -220,7 +220,7 @@ impl Stage {
         self.course.update(|course| Course { n_teachers: course.n_teachers + 1, ..course });
         let policy = OneArmPolicy::new(teacher_policy())?;
         let advisor = Advisor::new(Box::new(policy), Box::new(ledger))?;
-        let (gate, for_ever) = (Gate::default(), CancellationToken::new());
+        let (gate, for_ever) = (ServerConfig::default(), CancellationToken::new());
         let served =
             serve_advisor(advisor, listen().await?, &gate, for_ever, Pacing::Lockstep).await;
         if let Err(error) = served {
@@ -232,14 +232,14 @@ impl Stage {
     async fn worker(self: Rc<Self>, host: Host) -> turmoil::Result {
         self.course.update(|course| Course { n_workers: course.n_workers + 1, ..course });
         let config = WorkerConfig {
-            dial: dial(),
+            client: dial(),
             learner: address(LEARNER),
             teacher: Some(address(TEACHER)),
             name: host.to_owned(),
             log_dir: None,
             pacing: Pacing::Lockstep,
         };
-        if let Err(error) = run_with(config, Patience::default(), self.house.leave_of(host)).await {
+        if let Err(error) = run(config, self.house.leave_of(host)).await {
             self.house.complain(with_causes(host, &error));
         }
         Ok(())

@@ -7,7 +7,7 @@ use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use tandem_core::{Layout, StepQuery, Task};
-use tandem_net::{Gate, Link, Pacing};
+use tandem_net::{AuthChannel, Pacing, ServerConfig};
 use tandem_proto::pb::teacher_client::TeacherClient;
 use tandem_proto::{encode_query, pb};
 use tandem_teacher::{Advisor, TeacherPolicy, serve_advisor};
@@ -98,7 +98,7 @@ impl Default for Stage {
 impl Stage {
     async fn teacher(self: Rc<Self>, ledger: Watched) -> turmoil::Result {
         let advisor = Advisor::new(Box::new(Still), Box::new(ledger))?;
-        let (gate, for_ever) = (Gate::default(), CancellationToken::new());
+        let (gate, for_ever) = (ServerConfig::default(), CancellationToken::new());
         let served =
             serve_advisor(advisor, listen().await?, &gate, for_ever, Pacing::Lockstep).await;
         if let Err(error) = served {
@@ -108,7 +108,7 @@ impl Stage {
     }
 
     async fn client(self: Rc<Self>, client_idx: usize) -> turmoil::Result {
-        let client = TeacherClient::new(dial().link(&address(TEACHER))?);
+        let client = TeacherClient::new(dial().channel(&address(TEACHER))?);
         let account = pb::OpenAccountRequest {
             name: ACCOUNT.to_owned(),
             budget: BUDGET,
@@ -172,7 +172,10 @@ impl Stage {
 }
 
 /// Asks until there is an answer.
-async fn ask<T, F>(client: &TeacherClient<Link>, call: impl Fn(TeacherClient<Link>) -> F) -> T
+async fn ask<T, F>(
+    client: &TeacherClient<AuthChannel>,
+    call: impl Fn(TeacherClient<AuthChannel>) -> F,
+) -> T
 where
     F: Future<Output = Result<Response<T>, Status>>,
 {

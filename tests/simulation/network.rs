@@ -3,7 +3,7 @@
 use std::net::Ipv4Addr;
 use std::time::Duration;
 
-use tandem_net::{Connection, Dial, Incoming};
+use tandem_net::{ClientConfig, Connection, Incoming};
 use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
 use turmoil::net::{TcpListener, TcpStream};
@@ -19,8 +19,8 @@ pub(crate) fn address(host: &str) -> String {
 }
 
 /// Calls services over the simulated network.
-pub(crate) fn dial() -> Dial {
-    Dial::default().through(|uri| async move {
+pub(crate) fn dial() -> ClientConfig {
+    ClientConfig::default().with_connector(|uri| async move {
         let host = uri.host().expect("an address has a host").to_owned();
         let port = uri.port_u16().expect("an address has a port");
         TcpStream::connect((host, port)).await.map(Connection::new)

@@ -1,59 +1,62 @@
-//! Why a worker gives up.
+//! Errors of a worker.
 
 use std::path::PathBuf;
 
+use tandem_net::Operation;
+use tandem_proto::DecodeError;
 use tandem_sim::SimError;
+use tonic::Status;
 
 use crate::rollout::RolloutError;
 
-/// Why a worker gave up. None of it mends by waiting.
+/// An error that ends a worker. Waiting does not cure any of them.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
-    /// Not an address.
+    /// An address cannot be called.
     #[error("the {role} cannot be called")]
     Address {
-        /// Whose address.
+        /// The peer with this address.
         role: &'static str,
-        /// What is wrong with it.
-        source: tandem_net::DialError,
+        /// The cause.
+        source: tandem_net::ClientConfigError,
     },
-    /// The place for logs cannot be made.
+    /// The directory for logs cannot be created.
     #[error("cannot create the log directory {path:?}")]
     LogDir {
-        /// As configured.
+        /// The configured path.
         path: PathBuf,
-        /// What the system says.
+        /// The cause.
         source: std::io::Error,
     },
-    /// A peer refuses or answers what cannot be understood.
+    /// A peer rejected a call, or its response cannot be used.
     #[error("cannot {attempted}")]
     Protocol {
-        /// What was attempted.
+        /// The purpose of the call.
         attempted: &'static str,
-        /// The peer's answer.
-        source: Box<dyn std::error::Error + Send + Sync>,
+        /// The cause.
+        source: CallError,
     },
-    /// The run takes advice and the worker was given no teacher.
+    /// The run takes advice, but the worker has no teacher.
     #[error("the run takes advice on account {account:?}, but no teacher's address was given")]
     NoTeacher {
         /// The teacher's account.
         account: String,
     },
-    /// The learner ordered advice in a run that has no account for it.
+    /// The learner ordered advice in a run without an account.
     #[error("slot {slot} is to be advised, but the run's terms name no account")]
     NoAccount {
         /// The slot's number.
         slot: u64,
     },
-    /// The run's world cannot be built.
+    /// The run's simulator cannot be built.
     #[error("the run's world cannot be built")]
     World(#[from] SimError),
-    /// The parameters are no actor of the run's layout.
+    /// The published parameters do not fit the run's layout.
     #[error("parameters of version {version} cannot be used")]
     Parameters {
-        /// Their version.
+        /// The version of the parameters.
         version: u64,
-        /// What is wrong with them.
+        /// The cause.
         source: tandem_policy::Error,
     },
     /// A slot could not be played.
@@ -61,13 +64,46 @@ pub enum Error {
     Rollout {
         /// The slot's number.
         slot: u64,
-        /// What went wrong.
+        /// The cause.
         source: RolloutError,
     },
-    /// The system gives no thread for a rollout.
+    /// The system cannot start a thread for a rollout.
     #[error("cannot start a thread for a rollout")]
     Thread(#[source] std::io::Error),
     /// A bug: the rollout's thread panicked.
     #[error("the rollout's thread panicked")]
     Panicked(#[from] tokio::sync::oneshot::error::RecvError),
+}
+
+impl Error {
+    pub(crate) fn protocol(operation: Operation, source: impl Into<CallError>) -> Self {
+        Self::Protocol { attempted: operation.purpose, source: source.into() }
+    }
+}
+
+/// A failure of a call that repetition does not cure.
+#[derive(Debug, thiserror::Error)]
+pub enum CallError {
+    /// The peer rejected the call.
+    #[error("refused")]
+    Refused(#[from] Status),
+    /// The response cannot be decoded.
+    #[error("the response cannot be read")]
+    Malformed(#[from] DecodeError),
+    /// The response is to another request.
+    #[error("the response does not fit the request: expected {expected}, got {got}")]
+    Mismatch {
+        /// The requested subject.
+        expected: String,
+        /// The subject of the response.
+        got: String,
+    },
+}
+
+/// Checks that a response is about `expected`, a number of `what`.
+pub(crate) fn expect_same(what: &str, expected: u64, got: u64) -> Result<(), CallError> {
+    if expected == got {
+        return Ok(());
+    }
+    Err(CallError::Mismatch { expected: format!("{what} {expected}"), got: got.to_string() })
 }

@@ -1,4 +1,4 @@
-//! Plays a fixed set of evaluation episodes: no exploration, no advice, any number of threads.
+//! Evaluation of a policy on a fixed set of episodes, without exploration or advice, on any number of threads.
 
 use std::num::NonZeroUsize;
 
@@ -7,13 +7,13 @@ use tandem_core::work::{EpisodeOrder, RunTerms, SlotOrder};
 use tandem_core::{Episode, EpisodeKind, Exploration, WorldSettings};
 use tandem_sim::{Env, WorldConfig};
 
-use crate::ports::{Act, NoAdvisor, World};
+use crate::ports::{Act, Environment, NoAdvisor};
 use crate::rollout::{RolloutError, play_slot};
 
 /// The composed teachers `f^a(π_tr(ŝ_1), π_tr(ŝ_2))`: a policy for one arm that acts for every arm of a layout.
 ///
-/// Each arm's numbers stand together and in the arm's own frame, so a row of the layout's vectors is `n_arms` rows of
-/// the policy's.
+/// A layout's vectors concatenate the arms' vectors, each in the arm's own frame, so a row of the layout consists of
+/// `n_arms` rows of the policy.
 #[derive(Debug, Clone)]
 pub struct ComposedTeachers<A>(pub A);
 
@@ -23,12 +23,12 @@ impl<A: Act> Act for ComposedTeachers<A> {
     }
 }
 
-/// Plays `n_episodes` episodes, numbered from 0, whose starts and goals `seed` fixes; returns them by number.
+/// Plays `n_episodes` episodes, numbered from 0, and returns them by number. `seed` determines their starts and goals.
 ///
-/// Each of `n_threads` threads has an actor and a world of its own; the result does not depend on their number.
+/// Each of `n_threads` threads has an actor and a world of its own. The result does not depend on their number.
 ///
 /// # Errors
-/// When a world cannot be built or breaks.
+/// When the world cannot be built or a step fails.
 pub fn evaluate<A: Act>(
     make_actor: impl Fn() -> A + Sync,
     layout: Layout,
@@ -37,12 +37,12 @@ pub fn evaluate<A: Act>(
     seed: u64,
     n_threads: NonZeroUsize,
 ) -> Result<Vec<Episode>, RolloutError> {
-    let world = Env::new(layout, world).map_err(RolloutError::NoWorld)?;
-    evaluate_in(&world, make_actor, layout, n_episodes, seed, n_threads)
+    let env = Env::new(layout, world).map_err(RolloutError::NoEnvironment)?;
+    evaluate_in(&env, make_actor, layout, n_episodes, seed, n_threads)
 }
 
-fn evaluate_in<W: World + Sync, A: Act>(
-    world: &W,
+fn evaluate_in<E: Environment + Sync, A: Act>(
+    env: &E,
     make_actor: impl Fn() -> A + Sync,
     layout: Layout,
     n_episodes: u64,
@@ -53,7 +53,7 @@ fn evaluate_in<W: World + Sync, A: Act>(
     let n_per_thread = numbers.len().div_ceil(n_threads.get()).max(1);
     let play = |numbers: &[u64]| {
         let mut actor = make_actor();
-        let play_one = |number: &u64| play_alone(world, &mut actor, layout, seed, *number);
+        let play_one = |number: &u64| play_alone(env, &mut actor, layout, seed, *number);
         numbers.iter().map(play_one).collect::<Result<Vec<Episode>, RolloutError>>()
     };
     let parts: Vec<_> = std::thread::scope(|scope| {
@@ -67,8 +67,8 @@ fn evaluate_in<W: World + Sync, A: Act>(
     parts.into_iter().collect::<Result<Vec<_>, _>>().map(|parts| parts.concat())
 }
 
-fn play_alone<W: World>(
-    world: &W,
+fn play_alone<E: Environment>(
+    env: &E,
     actor: &mut impl Act,
     layout: Layout,
     seed: u64,
@@ -81,13 +81,14 @@ fn play_alone<W: World>(
         kind: EpisodeKind::Evaluation,
         episodes: vec![order],
     };
-    let mut episodes = play_slot(world, &slot, &evaluation_terms(layout), actor, &mut NoAdvisor)?;
+    let mut episodes = play_slot(env, &slot, &evaluation_terms(layout), actor, &mut NoAdvisor)?;
     Ok(episodes.remove(0))
 }
 
-/// Terms of which an evaluation uses the layout alone; the world is built already.
+/// Returns terms for evaluations, which use only the layout: the world is built already.
 fn evaluation_terms(layout: Layout) -> RunTerms {
     RunTerms {
+        run: String::new(),
         layout,
         account: None,
         exploration: Exploration::NONE,
@@ -98,12 +99,19 @@ fn evaluation_terms(layout: Layout) -> RunTerms {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::fake::{FakeActor, FakeWorld, LAYOUT};
+    use crate::fakes::{FakeActor, FakeEnvironment, LAYOUT};
 
     fn evaluate_fake(n_episodes: u64, seed: u64, n_threads: usize) -> Vec<Episode> {
         let n_threads = NonZeroUsize::new(n_threads).expect("1 or more");
-        evaluate_in(&FakeWorld::new(), || FakeActor::Seeker, LAYOUT, n_episodes, seed, n_threads)
-            .expect("nothing breaks")
+        evaluate_in(
+            &FakeEnvironment::new(),
+            || FakeActor::Seeker,
+            LAYOUT,
+            n_episodes,
+            seed,
+            n_threads,
+        )
+        .expect("no step fails")
     }
 
     #[test]
@@ -126,17 +134,17 @@ mod tests {
     }
 
     #[test]
-    fn simulated_worlds_do_not_mind_threads_either() {
+    fn the_number_of_threads_changes_no_simulation() {
         let evaluate_on = |n_threads| {
             let n_threads = NonZeroUsize::new(n_threads).expect("1 or more");
             evaluate(|| FakeActor::Seeker, LAYOUT, &WorldConfig::default(), 3, 5, n_threads)
-                .expect("nothing breaks")
+                .expect("no step fails")
         };
         assert_eq!(evaluate_on(1), evaluate_on(2));
     }
 
     #[test]
-    fn composed_teachers_give_each_arm_its_own_teacher() {
+    fn composed_teachers_act_for_each_arm_separately() {
         let (mut observations, mut goals) = (vec![0.0; 2 * 56], vec![0.0; 2 * 6]);
         for (row, value) in [0.1, 0.2, 0.3, 0.4].into_iter().enumerate() {
             observations[28 * row] = value;

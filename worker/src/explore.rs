@@ -1,7 +1,7 @@
-//! How a training episode explores: Gaussian noise on every action, and random actions that are held for a while.
+//! Exploration in training episodes: Gaussian noise on every action, and random actions that are held for several steps.
 //!
-//! A random action that lasts one step hardly moves a hand; held for some steps it carries the hand to new places
-//! and objects with it.
+//! A random action of one step hardly moves a hand. Held for several steps, it carries the hand, and objects with it, to
+//! new places.
 
 use rand_chacha::ChaCha8Rng;
 use tandem_core::Exploration;
@@ -10,8 +10,8 @@ use tandem_core::rng::{bernoulli, standard_normal, uniform};
 
 /// The exploration of one episode.
 ///
-/// Every step draws the same numbers whatever they are used for, so neither advice nor a held action shifts what
-/// the following steps draw.
+/// Every step draws the same number of random numbers, whether it uses them or not, so neither advice nor a held action
+/// changes the draws of later steps.
 #[derive(Debug, Clone)]
 pub struct Explorer {
     layout: Layout,
@@ -22,7 +22,7 @@ pub struct Explorer {
     rng: ChaCha8Rng,
 }
 
-/// A random action of one arm and how long it still lasts.
+/// A random action of one arm, and the number of steps for which it is still held.
 #[derive(Debug, Clone)]
 struct HeldAction {
     n_steps_left: u32,
@@ -30,7 +30,7 @@ struct HeldAction {
 }
 
 impl Explorer {
-    /// Exploration by `settings`, drawing from `rng`.
+    /// Creates an explorer with these settings that draws from `rng`.
     #[must_use]
     pub fn new(layout: Layout, settings: Exploration, rng: ChaCha8Rng) -> Self {
         let idle = HeldAction { n_steps_left: 0, action: vec![0.0; layout.task.action_per_arm()] };
@@ -47,13 +47,13 @@ impl Explorer {
         }
     }
 
-    /// Exploration of a warm-up: every step of every arm takes a random action.
+    /// Creates an explorer for a warm-up: every arm takes a random action on every step.
     #[must_use]
     pub fn uniform(layout: Layout, settings: Exploration, rng: ChaCha8Rng) -> Self {
         Self::new(layout, Exploration { random_action_prob: 1.0, ..settings }, rng)
     }
 
-    /// Turns the policy's action into what is to be executed, shape `[n_action]`, in [−1, 1].
+    /// Turns the policy's action into the action to execute, shape `[n_action]`, in [-1, 1].
     pub fn explore(&mut self, action: &mut [f32]) {
         for arm in self.layout.arms() {
             self.held[arm.0].advance(&mut self.rng, self.start_probability, self.hold_mean_steps);
@@ -74,7 +74,7 @@ impl Explorer {
 }
 
 impl HeldAction {
-    /// Goes on by one step: an action whose time is over may be followed by a new one.
+    /// Advances by one step. A new action may start when the previous one is no longer held.
     fn advance(&mut self, rng: &mut ChaCha8Rng, start_probability: f32, hold_mean_steps: f32) {
         let starts = bernoulli(rng, start_probability);
         let n_steps = hold_steps(uniform(rng, 0.0, 1.0), hold_mean_steps);
@@ -93,13 +93,13 @@ impl HeldAction {
     }
 }
 
-/// The probability of a start, on a step that is free for one, with which `share` of all steps become random when
-/// each start takes `hold_mean_steps` steps on average.
+/// Returns the probability that a random action starts on a free step, such that `share` of all steps are random if
+/// each action is held for `hold_mean_steps` steps on average.
 fn start_probability(share: f32, hold_mean_steps: f32) -> f32 {
     share / (hold_mean_steps * (1.0 - share) + share)
 }
 
-/// A length in `1..=2 · mean − 1`, each equally likely, from a draw in [0, 1).
+/// Maps a draw in [0, 1) to a length in `1..=2 * mean - 1`, each equally likely.
 #[expect(
     clippy::cast_possible_truncation,
     clippy::cast_sign_loss,
@@ -119,14 +119,14 @@ mod tests {
     const LAYOUT: Layout = Layout::new(Task::Push, 2);
     const SETTINGS: Exploration =
         Exploration { noise_std: 0.0, random_action_prob: 0.3, sticky_random_mean_steps: 4.0 };
-    /// What the policy does in these tests; no random action equals it.
+    /// The policy's action, which no random action equals.
     const POLICY_ACTION: [f32; 6] = [0.5; 6];
 
     fn is_random(action: &[f32; 3]) -> bool {
         action.iter().any(|component| *component != 0.5)
     }
 
-    /// The actions of `arm_idx` over one long episode.
+    /// Returns the actions of arm `arm_idx` over one long episode.
     fn arm_actions(mut explorer: Explorer, n_steps: usize, arm_idx: usize) -> Vec<[f32; 3]> {
         let step = |_| {
             let mut action = POLICY_ACTION;
@@ -141,7 +141,7 @@ mod tests {
     }
 
     #[test]
-    fn random_actions_take_their_share_of_steps_and_are_held_as_long_as_told() {
+    fn random_actions_take_their_share_of_steps_and_are_held_as_long_as_configured() {
         for arm_idx in 0..2 {
             let actions = arm_actions(Explorer::new(LAYOUT, SETTINGS, rng(0)), 40_000, arm_idx);
             let n_random = actions.iter().filter(|action| is_random(action)).count();
@@ -169,7 +169,7 @@ mod tests {
     }
 
     #[test]
-    fn the_arms_draw_their_random_actions_apart() {
+    fn the_arms_draw_their_random_actions_independently() {
         let random_steps = |arm_idx| {
             let actions = arm_actions(Explorer::new(LAYOUT, SETTINGS, rng(0)), 2_000, arm_idx);
             actions.iter().map(is_random).collect::<Vec<_>>()
@@ -203,7 +203,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_executed_does_not_shift_the_draws() {
+    fn the_executed_action_does_not_change_later_draws() {
         let settings = Exploration { noise_std: 0.2, ..SETTINGS };
         let mut undisturbed = Explorer::new(LAYOUT, settings, rng(0));
         let mut disturbed = undisturbed.clone();

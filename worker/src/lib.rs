@@ -1,29 +1,28 @@
-//! Plays the episodes that a learner orders: asks the learner for parameters and the teacher for advice, and sends
-//! whole episodes back.
+//! The worker: plays the episodes that a learner orders, with a teacher's advice, and returns whole episodes.
 //!
-//! A worker knows neither how learning is done nor what advice costs. It waits for whoever is away and asks again, for
-//! ever: no step goes unadvised and no episode is lost because a peer was slow, so a result never depends on timing.
+//! A worker knows neither how learning works nor what advice costs. It waits for a peer that is away and repeats its
+//! calls, so no step goes unadvised and no episode is lost because a peer was slow: results do not depend on timing.
 //!
-//! Start at [`rollout`], the life of an episode. It talks to the world, the policy and the teacher through
-//! [`ports`] and cannot tell a network from a test; [`run()`] is the shell of sockets round it.
+//! Start at [`rollout`], the life of an episode. It uses the simulator, the policy and the teacher through [`ports`] and
+//! cannot distinguish a network from a test. [`run()`] connects it to the learner and the teacher.
 #![warn(missing_docs)]
 
+mod config;
 mod error;
 mod evaluate;
 pub mod explore;
 #[cfg(test)]
-mod fake;
-mod grpc;
-mod peers;
+mod fakes;
+mod learner;
 mod player;
 pub mod ports;
 pub mod record;
-pub mod retry;
 pub mod rollout;
 mod run;
+mod teacher;
 
+pub use config::{Timeouts, WorkerConfig};
 pub use error::Error;
 pub use evaluate::{ComposedTeachers, evaluate};
 pub use ports::{Act, Advisor};
-pub use retry::Patience;
-pub use run::{WorkerConfig, run, run_with};
+pub use run::{run, run_with};

@@ -1,4 +1,4 @@
-//! What a rollout needs from outside, so that it cannot tell a network from a test.
+//! The interfaces that a rollout uses, so that it cannot distinguish a network from a test.
 
 use tandem_core::rng::{Stream, episode_rng};
 use tandem_core::work::EpisodeOrder;
@@ -6,32 +6,32 @@ use tandem_core::{Contacts, StepAdvice, StepQuery, WorldSettings};
 use tandem_policy::Actor;
 use tandem_sim::{Env, SimError};
 
-/// Chooses actions.
+/// A source of actions, such as an actor network.
 pub trait Act {
-    /// Writes what is to be done for each of n observations.
+    /// Writes the actions for n observations.
     ///
     /// Shapes: `observations` `[n, n_observation]`, `goals` `[n, n_goal]`, `actions` `[n, n_action]`; actions are
-    /// in [−1, 1].
+    /// in [-1, 1].
     fn act(&mut self, observations: &[f32], goals: &[f32], actions: &mut [f32]);
 }
 
-/// Answers for a teacher.
+/// A source of advice, such as a connection to a teacher.
 pub trait Advisor {
-    /// The teacher's verdict on each of the steps, in their order.
+    /// Returns the teacher's advice on each of `queries`, in their order.
     ///
-    /// Returns only with the whole answer: a teacher that is away is waited for.
+    /// Blocks until the teacher has answered, even if it is away.
     ///
     /// # Errors
-    /// When no answer will come any more, because the worker is stopping.
+    /// When the worker is stopping and the teacher can no longer be asked.
     fn advise(&mut self, queries: Vec<StepQuery>) -> Result<Vec<StepAdvice>, AdvisorGone>;
 }
 
-/// No answer will come any more.
+/// The error of an advisor that can no longer ask the teacher.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 #[error("the teacher can no longer be asked, the worker is stopping")]
 pub struct AdvisorGone;
 
-/// The advisor of those who ask nobody: evaluations and runs without a teacher.
+/// The advisor of evaluations and of runs without a teacher, which never ask for advice. Every request is an error.
 #[derive(Debug, Clone, Copy)]
 pub struct NoAdvisor;
 
@@ -41,25 +41,25 @@ impl Advisor for NoAdvisor {
     }
 }
 
-/// A world in which an episode is played. A clone plays the same episodes.
-pub trait World: Clone {
-    /// Puts the world into the start state of an episode; what was played before has no influence on it.
+/// An environment in which episodes are played. A clone behaves identically.
+pub trait Environment: Clone {
+    /// Resets the environment to the start of an episode, independent of the episodes before it.
     fn reset(&mut self, order: EpisodeOrder, settings: WorldSettings);
 
     /// Writes the observation, shape `[n_observation]`.
     fn observe(&self, observation: &mut [f32]);
 
-    /// Where the objects shall be, shape `[n_goal]`.
+    /// Returns the goal, shape `[n_goal]`: a target position for each object, in metres.
     fn goal(&self) -> &[f32];
 
-    /// Executes an action, shape `[n_action]`, and tells what touched what meanwhile.
+    /// Executes an action, shape `[n_action]`, and returns the contacts during this step.
     ///
     /// # Errors
     /// When the state is no longer finite.
     fn step(&mut self, action: &[f32]) -> Result<Contacts, SimError>;
 }
 
-impl World for Env {
+impl Environment for Env {
     fn reset(&mut self, order: EpisodeOrder, settings: WorldSettings) {
         self.reset(&mut episode_rng(order.seed, order.number, Stream::Reset), settings);
     }

@@ -1,7 +1,7 @@
-//! Logs of single episodes, and the worlds in which logged episodes are played again.
+//! Logs of single episodes, and their replay.
 //!
-//! An episode is logged after it was played, by playing its actions once more: the simulator repeats itself bit for
-//! bit, which every log proves again.
+//! An episode is logged after it was played, by simulating its actions again. Every log thereby verifies that the
+//! simulator is deterministic, bit for bit.
 
 use std::path::{Path, PathBuf};
 
@@ -18,46 +18,48 @@ use tandem_telemetry::{
 /// A probability of earlier versions: training episodes that started with the hands anywhere above the table.
 const WIDE_START_SHARE: &str = "wide_start_share";
 
-/// Why an episode has no log or a log has no world.
+/// An error in recording or replaying an episode.
 #[derive(Debug, thiserror::Error)]
 pub enum RecordError {
-    /// The world cannot be built or broke.
+    /// The world cannot be built, or a step failed.
     #[error(transparent)]
     World(#[from] SimError),
     /// The log cannot be written.
     #[error(transparent)]
     Log(#[from] tandem_telemetry::Error),
-    /// Played again, the episode took another course.
-    #[error("episode {episode}, played again, differs before step {step}")]
+    /// The replayed episode differs from the original.
+    #[error("episode {episode}, simulated again, differs before step {step}")]
     Diverged {
         /// The episode's number.
         episode: u64,
-        /// The first step before which the observation is another one; 0 is the start.
+        /// The first step before which the observation differs; 0 is the start.
         step: usize,
     },
-    /// A log's episode, played again, takes another course than the log tells.
-    #[error("step {step}: {field}[{component}] is {logged} in the log, {played} when played again")]
+    /// The replayed episode differs from its log.
+    #[error(
+        "step {step}: {field}[{component}] is {logged} in the log, {played} when simulated again"
+    )]
     Differs {
-        /// The first step that differs, from 0; the number of steps stands for the end of the episode.
+        /// The first step that differs, from 0; the number of steps means the final observation.
         step: usize,
-        /// Which of the step's vectors.
+        /// The step's vector that differs.
         field: &'static str,
-        /// Index within the vector.
+        /// The index within the vector.
         component: usize,
-        /// The log's number.
+        /// The value in the log.
         logged: f32,
-        /// The number that the simulator gives.
+        /// The simulated value.
         played: f32,
     },
-    /// The log has no step that could be compared.
+    /// The log contains no steps to compare.
     #[error("the log holds no step")]
     NoSteps,
-    /// The log's metadata do not describe a world.
+    /// The log's metadata lack a part of the world's configuration.
     #[error("metadata entry {key:?} of the world is {got:?}, expected a number")]
     Metadata {
-        /// The entry.
+        /// The key of the entry.
         key: &'static str,
-        /// Its value, if there is one.
+        /// The value, if there is one.
         got: Option<String>,
     },
     /// The episode may have started in a way that only earlier versions simulate.
@@ -65,22 +67,30 @@ pub enum RecordError {
     RemovedStart(String),
 }
 
-/// Describes an ordered episode of a run, as its log keeps it.
+/// Returns the metadata of an episode that was played by `order`.
+///
+/// `policy_digest` is the digest of the parameters that played it: [`tandem_policy::actor_digest`] in a run,
+/// [`Policy::digest`](tandem_policy::Policy::digest) where the whole policy is at hand.
 #[must_use]
-pub fn metadata_of(order: EpisodeOrder, episode: &Episode, terms: &RunTerms) -> EpisodeMetadata {
+pub fn metadata_of(
+    order: EpisodeOrder,
+    episode: &Episode,
+    terms: &RunTerms,
+    policy_digest: String,
+) -> EpisodeMetadata {
     EpisodeMetadata {
-        run: terms.account.clone().unwrap_or_default(),
+        run: terms.run.clone(),
         episode: order.number,
         seed: order.seed,
         kind: episode.kind,
         parameter_version: episode.parameter_version,
         layout: episode.layout,
-        policy_digest: String::new(),
+        policy_digest,
         world: terms.world.log_entries().map(|(key, value)| (key.to_owned(), value)).into(),
     }
 }
 
-/// The world of a logged episode, in the episode's start state.
+/// Builds the world of a logged episode, in the episode's start state.
 ///
 /// # Errors
 /// When the metadata lack an entry or the world cannot be built.
@@ -98,7 +108,7 @@ pub fn world_of(metadata: &EpisodeMetadata) -> Result<Env, RecordError> {
     Ok(world)
 }
 
-/// Name of an episode's log.
+/// Returns the file name of an episode's log.
 #[must_use]
 pub fn log_name(episode: &Episode) -> String {
     match episode.kind {
@@ -111,10 +121,11 @@ pub fn log_name(episode: &Episode) -> String {
     }
 }
 
-/// Plays `episode` again in the world that `metadata` describes and logs it as `path`; gives the finished file's name.
+/// Simulates `episode` again in the world that `metadata` describes, logs it at `path` and returns the finished file's
+/// path.
 ///
 /// # Errors
-/// When the episode does not repeat itself or the log cannot be written; no file of that name is left then.
+/// When the replay differs from `episode` or the log cannot be written. In that case no log remains.
 pub fn record_episode(
     metadata: &EpisodeMetadata,
     episode: &Episode,
@@ -123,13 +134,13 @@ pub fn record_episode(
     let mut world = world_of(metadata)?;
     let mut recorder = EpisodeRecorder::create(path, metadata)?;
     for step_idx in 0..EPISODE_STEPS {
-        check_repeats(&world, episode, step_idx)?;
+        check_replay(&world, episode, step_idx)?;
         record_step(&mut recorder, &world, episode, step_idx)?;
         if world.step(episode.action(step_idx))? != episode.contacts[step_idx] {
             return Err(RecordError::Diverged { episode: episode.number, step: step_idx + 1 });
         }
     }
-    check_repeats(&world, episode, EPISODE_STEPS)?;
+    check_replay(&world, episode, EPISODE_STEPS)?;
     recorder.record_outcome(&world.scene(), episode.observation(EPISODE_STEPS))?;
     Ok(recorder.finish()?)
 }
@@ -159,8 +170,8 @@ fn record_step(
     Ok(recorder.record_step(&world.scene(), &transition)?)
 }
 
-/// Checks that the world is, bit for bit, where the episode was before step `step_idx`.
-fn check_repeats(world: &Env, episode: &Episode, step_idx: usize) -> Result<(), RecordError> {
+/// Checks that the world's observation equals the episode's before step `step_idx`, bit for bit.
+fn check_replay(world: &Env, episode: &Episode, step_idx: usize) -> Result<(), RecordError> {
     let expected = episode.observation(step_idx);
     let mut observation = vec![0.0; expected.len()];
     world.observe(&mut observation);
@@ -173,12 +184,12 @@ fn check_repeats(world: &Env, episode: &Episode, step_idx: usize) -> Result<(), 
     }
 }
 
-/// Plays a log's actions again and compares, bit for bit, whatever the simulator gives with what the log holds:
-/// observations, goals, contacts and rewards. A log that is cut short is compared as far as it goes.
+/// Simulates a log's actions again and compares observations, goals, contacts and rewards with the log, bit for bit. A
+/// truncated log is compared up to its end.
 ///
 /// # Errors
-/// [`RecordError::Differs`] names the first number that is another one; the others say that the log's world cannot be
-/// built or broke.
+/// [`RecordError::Differs`] with the first value that differs. Other errors mean that the log's world cannot be built or
+/// simulated.
 pub fn replay_log(log: &EpisodeLog) -> Result<(), RecordError> {
     if log.transitions.is_empty() {
         return Err(RecordError::NoSteps);
@@ -202,7 +213,7 @@ pub fn replay_log(log: &EpisodeLog) -> Result<(), RecordError> {
     })
 }
 
-/// Compares the rewards of a step after which `observation` was made.
+/// Compares the rewards of the step before `observation`.
 fn compare_rewards(
     step_idx: usize,
     logged: &LoggedTransition,
@@ -239,7 +250,7 @@ mod tests {
     use tandem_telemetry::read_episode;
 
     use super::*;
-    use crate::fake::{FakeActor, slot, terms};
+    use crate::fakes::{FakeActor, slot, terms};
     use crate::ports::NoAdvisor;
     use crate::rollout::play_slot;
 
@@ -249,13 +260,13 @@ mod tests {
         let world = Env::new(terms.layout, &WorldConfig::from(terms.world)).expect("in range");
         let mut actor = FakeActor::Seeker;
         let episode = play_slot(&world, &order, &terms, &mut actor, &mut NoAdvisor)
-            .expect("nothing breaks")
+            .expect("no step fails")
             .remove(0);
-        (metadata_of(order.episodes[0], &episode, &terms), episode)
+        (metadata_of(order.episodes[0], &episode, &terms, "5f3a".to_owned()), episode)
     }
 
     #[test]
-    fn a_log_holds_the_episode_and_its_world() {
+    fn a_log_contains_the_episode_and_its_world() {
         for kind in [EpisodeKind::Evaluation, EpisodeKind::Training] {
             let (metadata, episode) = played(kind);
             let directory = tempfile::tempdir().expect("a directory");
@@ -263,6 +274,10 @@ mod tests {
             assert_eq!(record_episode(&metadata, &episode, &path).expect("recorded"), path);
             let log = read_episode(&path).expect("whole");
             assert_eq!(log.metadata, metadata);
+            assert_eq!(
+                (log.metadata.run.as_str(), log.metadata.policy_digest.as_str()),
+                ("run-7", "5f3a")
+            );
             let actions: Vec<f32> =
                 log.transitions.iter().flat_map(|step| step.action.clone()).collect();
             assert_eq!(actions, episode.actions);
@@ -274,7 +289,7 @@ mod tests {
     }
 
     #[test]
-    fn an_episode_that_does_not_repeat_itself_gets_no_log() {
+    fn an_episode_whose_replay_differs_gets_no_log() {
         let (metadata, mut episode) = played(EpisodeKind::Evaluation);
         let n_observation = episode.layout.n_observation();
         episode.observations[7 * n_observation] += 1e-3;

@@ -8,28 +8,28 @@ use tandem_sim::SimError;
 use tandem_telemetry::events::StepAdvised;
 
 use crate::explore::Explorer;
-use crate::ports::{Act, Advisor, AdvisorGone, World};
+use crate::ports::{Act, Advisor, AdvisorGone, Environment};
 
-/// Why a slot was not played to its end.
+/// An error that ends a slot.
 #[derive(Debug, thiserror::Error)]
 pub enum RolloutError {
-    /// The worker stops while the teacher is being asked.
+    /// The worker is stopping while a request for advice is pending.
     #[error(transparent)]
     AdvisorGone(#[from] AdvisorGone),
-    /// The world cannot be built.
-    #[error("the world cannot be built")]
-    NoWorld(#[source] SimError),
-    /// The world broke.
-    #[error("episode {episode} broke at step {step}")]
-    World {
+    /// The environment cannot be built.
+    #[error("the environment cannot be built")]
+    NoEnvironment(#[source] SimError),
+    /// A step of the environment failed.
+    #[error("step {step} of episode {episode} failed")]
+    Step {
         /// The episode's number.
         episode: u64,
         /// The step, from 0.
         step: usize,
-        /// What the world says.
+        /// The cause.
         source: SimError,
     },
-    /// The teacher answered about other steps or another layout than it was asked about.
+    /// The teacher's response is about other steps or another layout than the request.
     #[error(
         "the teacher's advice on episode {episode}, step {step}, has {got} {field} where {expected} were expected"
     )]
@@ -38,16 +38,16 @@ pub enum RolloutError {
         episode: u64,
         /// The step, from 0.
         step: usize,
-        /// What was counted.
+        /// The counted items.
         field: &'static str,
-        /// How many came.
+        /// Their number in the response.
         got: usize,
-        /// How many were expected.
+        /// Their expected number.
         expected: usize,
     },
-    /// The teacher put its action in the place of the student's without charging for it.
-    #[error("the teacher overrides arms of episode {episode} on step {step} and charges nothing")]
-    UnpaidAdvice {
+    /// The teacher replaced the student's action without a charge.
+    #[error("the teacher overrides arms of episode {episode} on step {step} without a charge")]
+    UnchargedAdvice {
         /// The episode's number.
         episode: u64,
         /// The step, from 0.
@@ -55,23 +55,23 @@ pub enum RolloutError {
     },
 }
 
-/// Plays the episodes of `order` in lock step, so that one question to the teacher is about all of them, and returns
-/// them in the order's order.
+/// Plays the episodes of `order` in lock step, so that one request for advice serves all of them, and returns them in
+/// that order.
 ///
-/// An episode depends on its own order, the actor, the terms and the teacher's verdicts on it, on nothing else: the
-/// actor is asked about one observation at a time, so not even the rounding of a batch ties episodes together.
+/// An episode depends only on its own order, the actor, the terms and the teacher's advice on it. The actor sees one
+/// observation at a time, so not even the rounding within a batch makes episodes depend on each other.
 ///
 /// # Errors
-/// When the advisor is gone or answers in the wrong shape, or a world breaks.
-pub fn play_slot<W: World>(
-    world: &W,
+/// When the advisor is gone or answers in the wrong shape, or a step of the environment fails.
+pub fn play_slot<E: Environment>(
+    env: &E,
     order: &SlotOrder,
     terms: &RunTerms,
     actor: &mut impl Act,
     advisor: &mut impl Advisor,
 ) -> Result<Vec<Episode>, RolloutError> {
-    let start = |episode: &EpisodeOrder| Rollout::start(world.clone(), *episode, order, terms);
-    let mut rollouts: Vec<Rollout<W>> = order.episodes.iter().map(start).collect();
+    let start = |episode: &EpisodeOrder| Rollout::start(env.clone(), *episode, order, terms);
+    let mut rollouts: Vec<Rollout<E>> = order.episodes.iter().map(start).collect();
     for step_idx in 0..EPISODE_STEPS {
         for rollout in &mut rollouts {
             rollout.choose_action(actor);
@@ -84,13 +84,13 @@ pub fn play_slot<W: World>(
     Ok(rollouts.into_iter().map(|rollout| rollout.episode).collect())
 }
 
-/// Lets the teacher judge what the advised among the rollouts are about to do.
-fn take_advice<W: World>(
-    rollouts: &mut [Rollout<W>],
+/// Asks the teacher about the next actions of the advised rollouts, and applies its advice.
+fn take_advice<E: Environment>(
+    rollouts: &mut [Rollout<E>],
     step_idx: usize,
     advisor: &mut impl Advisor,
 ) -> Result<(), RolloutError> {
-    let mut advised: Vec<&mut Rollout<W>> =
+    let mut advised: Vec<&mut Rollout<E>> =
         rollouts.iter_mut().filter(|rollout| rollout.advised).collect();
     let Some(first) = advised.first() else {
         return Ok(());
@@ -100,7 +100,7 @@ fn take_advice<W: World>(
     let answers = advisor.advise(queries)?;
     check_count(first_number, step_idx, "steps", answers.len(), advised.len())?;
     for (rollout, advice) in advised.iter_mut().zip(&answers) {
-        rollout.follow(advice, step_idx)?;
+        rollout.apply_advice(advice, step_idx)?;
     }
     Ok(())
 }
@@ -120,26 +120,26 @@ fn check_count(
 }
 
 /// An episode being played.
-struct Rollout<W> {
-    world: W,
+struct Rollout<E> {
+    env: E,
     explorer: Option<Explorer>,
     advised: bool,
-    /// Before the next step, shape `[n_observation]`.
+    /// The observation before the next step, shape `[n_observation]`.
     observation: Vec<f32>,
-    /// Of the next step, shape `[n_action]`.
+    /// The action of the next step, shape `[n_action]`.
     action: Vec<f32>,
-    /// Of the next step.
+    /// The arms whose action of the next step is the teacher's, as a bit mask.
     advised_arms: u8,
-    /// What has been played so far.
+    /// The steps played so far.
     episode: Episode,
 }
 
-impl<W: World> Rollout<W> {
-    fn start(mut world: W, order: EpisodeOrder, slot: &SlotOrder, terms: &RunTerms) -> Self {
+impl<E: Environment> Rollout<E> {
+    fn start(mut env: E, order: EpisodeOrder, slot: &SlotOrder, terms: &RunTerms) -> Self {
         let layout = terms.layout;
-        world.reset(order, terms.world.for_kind(slot.kind));
+        env.reset(order, terms.world.for_kind(slot.kind));
         let mut observation = vec![0.0; layout.n_observation()];
-        world.observe(&mut observation);
+        env.observe(&mut observation);
         let mut observations = Vec::with_capacity((EPISODE_STEPS + 1) * layout.n_observation());
         observations.extend_from_slice(&observation);
         let episode = Episode {
@@ -148,14 +148,14 @@ impl<W: World> Rollout<W> {
             parameter_version: slot.parameter_version,
             layout,
             observations,
-            goal: world.goal().to_vec(),
+            goal: env.goal().to_vec(),
             actions: Vec::with_capacity(EPISODE_STEPS * layout.n_action()),
             advised_arms: Vec::with_capacity(EPISODE_STEPS),
             contacts: Vec::with_capacity(EPISODE_STEPS),
             advice_charged: 0,
         };
         Self {
-            world,
+            env,
             explorer: explorer(order, slot.kind, terms),
             advised: order.advised && slot.kind == EpisodeKind::Training,
             observation,
@@ -165,7 +165,7 @@ impl<W: World> Rollout<W> {
         }
     }
 
-    /// Fills in the action that the student is about to execute, exploration included.
+    /// Chooses the student's next action, including exploration.
     fn choose_action(&mut self, actor: &mut impl Act) {
         actor.act(&self.observation, &self.episode.goal, &mut self.action);
         self.advised_arms = 0;
@@ -184,33 +184,33 @@ impl<W: World> Rollout<W> {
         }
     }
 
-    /// Puts the teacher's verdict in the place of the proposed action.
-    fn follow(&mut self, advice: &StepAdvice, step_idx: usize) -> Result<(), RolloutError> {
+    /// Replaces the proposed action by the teacher's advice.
+    fn apply_advice(&mut self, advice: &StepAdvice, step_idx: usize) -> Result<(), RolloutError> {
         let (number, layout) = (self.episode.number, self.episode.layout);
         check_count(number, step_idx, "action components", advice.action.len(), layout.n_action())?;
         check_count(number, step_idx, "arms", advice.arms.len(), layout.n_arms)?;
         self.action.copy_from_slice(&advice.action);
         self.advised_arms = advice.overridden_arms();
         if self.advised_arms != 0 && !advice.charged {
-            return Err(RolloutError::UnpaidAdvice { episode: number, step: step_idx });
+            return Err(RolloutError::UnchargedAdvice { episode: number, step: step_idx });
         }
         if self.advised_arms != 0 {
             let step = u32::try_from(step_idx).expect("an episode's steps are few");
             StepAdvised { episode: number, step, overridden_arms: self.advised_arms }.emit();
         }
-        // A step can have cost a unit when a former worker asked, whose student acted otherwise; now no arm is overridden.
-        // The teacher's account knows of the unit, the episode is not advised on this step.
+        // A step without overridden arms may carry a charge, from a previous worker whose student acted differently. The
+        // teacher's account includes that unit, but this episode is not advised on the step.
         self.episode.advice_charged += u32::from(self.advised_arms != 0);
         Ok(())
     }
 
     fn execute(&mut self, step_idx: usize) -> Result<(), RolloutError> {
-        let contacts = self.world.step(&self.action).map_err(|source| RolloutError::World {
+        let contacts = self.env.step(&self.action).map_err(|source| RolloutError::Step {
             episode: self.episode.number,
             step: step_idx,
             source,
         })?;
-        self.world.observe(&mut self.observation);
+        self.env.observe(&mut self.observation);
         self.episode.observations.extend_from_slice(&self.observation);
         self.episode.actions.extend_from_slice(&self.action);
         self.episode.advised_arms.push(self.advised_arms);
@@ -231,12 +231,14 @@ fn explorer(order: EpisodeOrder, kind: EpisodeKind, terms: &RunTerms) -> Option<
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::fake::{FakeActor, FakeTeacher, FakeWorld, LAYOUT, TEACHER_ACTION, slot, terms};
+    use crate::fakes::{
+        FakeActor, FakeEnvironment, FakeTeacher, LAYOUT, TEACHER_ACTION, slot, terms,
+    };
     use crate::ports::NoAdvisor;
 
     fn play(order: &SlotOrder, actor: FakeActor, advisor: &mut impl Advisor) -> Vec<Episode> {
-        play_slot(&FakeWorld::new(), order, &terms(), &mut { actor }, advisor)
-            .expect("nothing breaks")
+        play_slot(&FakeEnvironment::new(), order, &terms(), &mut { actor }, advisor)
+            .expect("no step fails")
     }
 
     #[test]
@@ -256,7 +258,7 @@ mod tests {
     }
 
     #[test]
-    fn an_episode_has_every_step_and_obeys_the_world() {
+    fn an_episode_has_every_step_and_follows_the_environment() {
         let episode = play(&slot(&[3], false), FakeActor::Seeker, &mut NoAdvisor).remove(0);
         assert_eq!((episode.number, episode.parameter_version), (3, 4));
         assert_eq!(episode.observations.len(), 51 * LAYOUT.n_observation());
@@ -279,12 +281,12 @@ mod tests {
         let overrides = |_, step: u32, arm: usize| (step as usize % 4) >> arm & 1 == 1;
         let mut teacher = FakeTeacher::new(overrides);
         let episode = play(&slot(&[3], true), FakeActor::Seeker, &mut teacher).remove(0);
-        for (step_idx, question) in teacher.questions.iter().enumerate() {
+        for (step_idx, request) in teacher.requests.iter().enumerate() {
             let expected_arms = [0, 1, 2, 3][step_idx % 4];
             assert_eq!(episode.advised_arms[step_idx], expected_arms);
             for arm in LAYOUT.arms() {
                 let executed = &episode.action(step_idx)[LAYOUT.action_of(arm)];
-                let proposed = &question[0].proposed_action[LAYOUT.action_of(arm)];
+                let proposed = &request[0].proposed_action[LAYOUT.action_of(arm)];
                 let overridden = expected_arms >> arm.0 & 1 == 1;
                 assert_eq!(executed, if overridden { &TEACHER_ACTION } else { proposed });
             }
@@ -301,7 +303,7 @@ mod tests {
         let mut teacher = FakeTeacher::new(|_, step, _| step % 2 == 0);
         let advised = play(&slot(&[3], true), FakeActor::Constant(0.1), &mut teacher).remove(0);
         for step_idx in 0..EPISODE_STEPS {
-            assert_eq!(teacher.questions[step_idx][0].proposed_action, free.action(step_idx));
+            assert_eq!(teacher.requests[step_idx][0].proposed_action, free.action(step_idx));
             let overridden = step_idx % 2 == 0;
             assert_eq!(
                 advised.action(step_idx) == free.action(step_idx),
@@ -312,24 +314,24 @@ mod tests {
     }
 
     #[test]
-    fn one_question_is_about_every_advised_episode_and_no_other() {
+    fn one_request_covers_every_advised_episode_and_no_other() {
         let mut order = slot(&[3, 8, 9], true);
         order.episodes[1].advised = false;
         let mut teacher = FakeTeacher::new(|_, _, _| true);
         let episodes = play(&order, FakeActor::Seeker, &mut teacher);
-        assert_eq!(teacher.questions.len(), EPISODE_STEPS);
-        for (step_idx, question) in teacher.questions.iter().enumerate() {
+        assert_eq!(teacher.requests.len(), EPISODE_STEPS);
+        for (step_idx, request) in teacher.requests.iter().enumerate() {
             let asked: Vec<(u64, usize)> =
-                question.iter().map(|q| (q.episode, q.step as usize)).collect();
+                request.iter().map(|q| (q.episode, q.step as usize)).collect();
             assert_eq!(asked, [(3, step_idx), (9, step_idx)]);
-            assert_eq!(question[1].observation, episodes[2].observation(step_idx));
-            assert_eq!(question[1].goal, episodes[2].goal);
+            assert_eq!(request[1].observation, episodes[2].observation(step_idx));
+            assert_eq!(request[1].goal, episodes[2].goal);
         }
         assert_eq!(episodes.iter().map(|e| e.advice_charged).collect::<Vec<_>>(), [50, 0, 50]);
     }
 
     #[test]
-    fn an_evaluation_follows_the_policy_alone() {
+    fn an_evaluation_executes_the_policy_without_exploration_or_advice() {
         let mut order = slot(&[3], true);
         order.kind = EpisodeKind::Evaluation;
         order.episodes[0].uniform = true;
@@ -342,7 +344,7 @@ mod tests {
     }
 
     #[test]
-    fn a_warm_up_leaves_the_policy_aside() {
+    fn a_warm_up_ignores_the_policy() {
         let mut order = slot(&[3], false);
         order.episodes[0].uniform = true;
         let actions =
@@ -351,13 +353,13 @@ mod tests {
         assert!(actions(0.1).iter().any(|component| component.abs() > 0.9));
     }
 
-    /// Answers with the student's own actions, and with what it is told to about arms and charges.
-    struct Says {
+    /// An advisor that returns the student's own actions, with fixed flags.
+    struct FixedFlags {
         overridden: bool,
         charged: bool,
     }
 
-    impl Advisor for Says {
+    impl Advisor for FixedFlags {
         fn advise(&mut self, queries: Vec<StepQuery>) -> Result<Vec<StepAdvice>, AdvisorGone> {
             let mut teacher = FakeTeacher::new(|_, _, _| self.overridden);
             let answers = teacher.advise(queries)?.into_iter();
@@ -366,9 +368,9 @@ mod tests {
     }
 
     #[test]
-    fn a_step_that_was_charged_before_and_is_not_overridden_now_is_not_claimed() {
-        let mut remembers = Says { overridden: false, charged: true };
-        let episode = play(&slot(&[3], true), FakeActor::Seeker, &mut remembers).remove(0);
+    fn a_step_that_was_charged_before_but_is_not_overridden_now_is_not_claimed() {
+        let mut advisor = FixedFlags { overridden: false, charged: true };
+        let episode = play(&slot(&[3], true), FakeActor::Seeker, &mut advisor).remove(0);
         assert_eq!(
             (episode.advised_arms.as_slice(), episode.advice_charged),
             ([0; 50].as_slice(), 0)
@@ -376,35 +378,35 @@ mod tests {
     }
 
     #[test]
-    fn a_teacher_that_overrides_for_nothing_is_an_error() {
-        let mut generous = Says { overridden: true, charged: false };
+    fn an_override_without_a_charge_is_an_error() {
+        let mut advisor = FixedFlags { overridden: true, charged: false };
         let played = play_slot(
-            &FakeWorld::new(),
+            &FakeEnvironment::new(),
             &slot(&[3], true),
             &terms(),
             &mut FakeActor::Seeker,
-            &mut generous,
+            &mut advisor,
         );
         assert_eq!(
-            played.expect_err("nobody paid").to_string(),
-            "the teacher overrides arms of episode 3 on step 0 and charges nothing"
+            played.expect_err("no charge").to_string(),
+            "the teacher overrides arms of episode 3 on step 0 without a charge"
         );
     }
 
     #[test]
     fn advice_about_other_steps_is_an_error() {
-        struct Mute;
-        impl Advisor for Mute {
+        struct Silent;
+        impl Advisor for Silent {
             fn advise(&mut self, _queries: Vec<StepQuery>) -> Result<Vec<StepAdvice>, AdvisorGone> {
                 Ok(Vec::new())
             }
         }
         let played = play_slot(
-            &FakeWorld::new(),
+            &FakeEnvironment::new(),
             &slot(&[3], true),
             &terms(),
             &mut FakeActor::Seeker,
-            &mut Mute,
+            &mut Silent,
         );
         let error = played.expect_err("one step was asked about");
         assert_eq!(

@@ -1,57 +1,37 @@
-//! A worker's life: join, take a slot, play it, deliver it, until the run has ended.
-
-use std::path::PathBuf;
+//! The worker's main loop: join the run, then take, play and deliver slots until the run has ended.
 
 use tandem_core::Episode;
 use tandem_core::work::SlotOrder;
-use tandem_net::{Dial, Pacing};
 use tokio::sync::oneshot;
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 
+use crate::config::{Timeouts, WorkerConfig};
 use crate::error::Error;
-use crate::grpc::Work;
-use crate::peers::Peers;
-use crate::player::{Player, Questions};
-use crate::retry::Patience;
+use crate::learner::{Learner, Work};
+use crate::player::{AdviceChannel, Player};
+use crate::teacher::Teacher;
 
-/// Where a worker works.
-#[derive(Debug, Clone)]
-pub struct WorkerConfig {
-    /// How learner and teacher are called.
-    pub dial: Dial,
-    /// The learner's address, `HOST:PORT` or a URI.
-    pub learner: String,
-    /// The teacher's address; needed when the run has one.
-    pub teacher: Option<String>,
-    /// A label for people; two workers may share one.
-    pub name: String,
-    /// Where logs of recorded episodes go, made if need be; without it none are written.
-    pub log_dir: Option<PathBuf>,
-    /// How sockets and rollouts take turns.
-    pub pacing: Pacing,
-}
-
-/// Plays slots for a learner until the run has ended or `shutdown` is cancelled; a slot in hand is then delivered
-/// first, if that takes a few seconds at most.
+/// Plays slots for a learner until the run has ended or `shutdown` is cancelled. After a shutdown signal the current
+/// slot is delivered first, if that takes a few seconds at most.
 ///
-/// A learner or teacher that cannot be reached is waited for, for ever, and so is a learner that was stopped before the
-/// run's end. Rollouts run on a thread of their own; a
-/// current-thread runtime with time and IO enabled is enough.
+/// The worker waits indefinitely for a learner or teacher that cannot be reached, and for a learner that was stopped
+/// before the end of the run. Rollouts run on a thread of their own; a current-thread runtime with time and IO enabled
+/// is sufficient.
 ///
 /// # Errors
-/// When something is wrong that waiting does not mend.
+/// When waiting cannot cure the error.
 pub async fn run(config: WorkerConfig, shutdown: CancellationToken) -> Result<(), Error> {
-    run_with(config, Patience::default(), shutdown).await
+    run_with(config, Timeouts::default(), shutdown).await
 }
 
-/// [`run`] with other waiting times.
+/// Runs a worker as [`run`], with other timeouts.
 ///
 /// # Errors
-/// When something is wrong that waiting does not mend.
+/// When waiting cannot cure the error.
 pub async fn run_with(
     config: WorkerConfig,
-    patience: Patience,
+    timeouts: Timeouts,
     shutdown: CancellationToken,
 ) -> Result<(), Error> {
     if let Some(path) = &config.log_dir {
@@ -59,14 +39,15 @@ pub async fn run_with(
             .map_err(|source| Error::LogDir { path: path.clone(), source })?;
     }
     let rollouts = TaskTracker::new();
-    let (peers, pacing) = (Peers::new(&config, patience)?, config.pacing);
-    let mut worker = Worker { config, patience, peers, rollouts: rollouts.clone() };
+    let (learner, teacher) = (Learner::new(&config, timeouts)?, Teacher::new(&config, timeouts)?);
+    let pacing = config.pacing;
+    let mut worker = Worker { config, timeouts, learner, teacher, rollouts: rollouts.clone() };
     let drained = async {
         shutdown.cancelled().await;
-        tokio::time::sleep(patience.drain).await;
+        tokio::time::sleep(timeouts.drain).await;
     };
     let outcome = tokio::select! {
-        outcome = worker.work(&shutdown) => outcome,
+        outcome = worker.play_slots(&shutdown) => outcome,
         () = drained => Ok(()),
     };
     rollouts.close();
@@ -77,21 +58,22 @@ pub async fn run_with(
 /// A worker and its peers.
 struct Worker {
     config: WorkerConfig,
-    patience: Patience,
-    peers: Peers,
+    timeouts: Timeouts,
+    learner: Learner,
+    teacher: Option<Teacher>,
     rollouts: TaskTracker,
 }
 
-/// What a learner that has been joined gives.
+/// The result of joining a run.
 struct Membership {
     worker_id: u64,
-    /// Boxed: a world is large to carry through futures.
+    /// Boxed to keep futures small: a world is large.
     player: Box<Player>,
 }
 
 impl Worker {
-    /// Works until the run has ended; once `shutdown` is cancelled no new slot is begun.
-    async fn work(&mut self, shutdown: &CancellationToken) -> Result<(), Error> {
+    /// Plays slots until the run has ended. Begins no new slot once `shutdown` is cancelled.
+    async fn play_slots(&mut self, shutdown: &CancellationToken) -> Result<(), Error> {
         let mut membership = None;
         loop {
             let slot = tokio::select! {
@@ -100,11 +82,11 @@ impl Worker {
                 slot = self.next_slot(membership) => slot?,
             };
             let Some((member, order)) = slot else { return Ok(()) };
-            membership = self.serve(member, order).await?;
+            membership = self.play_and_deliver(member, order).await?;
         }
     }
 
-    /// Waits for a slot, joining first where that is needed; `None` when the run has ended.
+    /// Waits for a slot, joining the run first if necessary. Returns `None` when the run has ended.
     async fn next_slot(
         &mut self,
         mut membership: Option<Membership>,
@@ -114,15 +96,18 @@ impl Worker {
                 Some(member) => member,
                 None => self.join().await?,
             };
-            membership = match self.peers.next_work(member.worker_id).await? {
+            membership = match self.learner.next_work(member.worker_id).await? {
                 Some(Work::Slot(order)) => return Ok(Some((member, order))),
                 Some(Work::Finished(reason)) => {
                     tracing::info!(reason, "run ended");
                     return Ok(None);
                 }
                 Some(Work::Interrupted(reason)) => {
-                    tracing::warn!(reason, "learner stopped before the run's end, waiting for it");
-                    tokio::time::sleep(self.patience.longest_pause).await;
+                    tracing::warn!(
+                        reason,
+                        "learner stopped before the end of the run, waiting for it"
+                    );
+                    tokio::time::sleep(self.timeouts.backoff.max_pause).await;
                     None
                 }
                 Some(Work::Wait) => Some(member),
@@ -134,13 +119,13 @@ impl Worker {
                     None
                 }
             };
-            tokio::time::sleep(self.patience.first_pause).await;
+            tokio::time::sleep(self.timeouts.backoff.first_pause).await;
         }
     }
 
     async fn join(&mut self) -> Result<Membership, Error> {
-        let (worker_id, terms) = self.peers.join(&self.config.name).await?;
-        if let Some(account) = terms.account.as_ref().filter(|_| !self.peers.has_teacher()) {
+        let (worker_id, terms) = self.learner.join(&self.config.name).await?;
+        if let Some(account) = terms.account.as_ref().filter(|_| self.teacher.is_none()) {
             return Err(Error::NoTeacher { account: account.clone() });
         }
         tracing::info!(worker_id, task = %terms.layout.task, n_arms = terms.layout.n_arms, "run joined");
@@ -150,8 +135,8 @@ impl Worker {
         })
     }
 
-    /// Plays a slot and delivers it. The membership is gone when the learner no longer knows the worker.
-    async fn serve(
+    /// Plays and delivers a slot. Returns `None` if the learner no longer knows the worker.
+    async fn play_and_deliver(
         &mut self,
         mut member: Membership,
         order: SlotOrder,
@@ -161,33 +146,33 @@ impl Worker {
             tracing::warn!(
                 slot,
                 version = order.parameter_version,
-                "parameters gone, asking for other work"
+                "parameters no longer available, asking for other work"
             );
-            tokio::time::sleep(self.patience.first_pause).await;
+            tokio::time::sleep(self.timeouts.backoff.first_pause).await;
             return Ok(Some(member));
         }
         let (player, episodes) = self.play(member.player, order).await?;
-        let taken = self.peers.submit(worker_id, slot, &episodes).await?;
+        let taken = self.learner.submit(worker_id, slot, &episodes).await?;
         if taken.is_none() {
-            // A learner that has forgotten the worker has forgotten what it plays: these episodes are ordered again.
+            // Such a learner does not know the slot either and orders its episodes again.
             tracing::warn!(worker_id, slot, "unknown to the learner, joining again");
         }
         Ok(taken.map(|()| Membership { worker_id, player }))
     }
 
-    /// Sees to it that the player acts with `version`; gives false when the learner no longer has it.
+    /// Loads the parameters of `version` into the player. Returns false if the learner no longer has them.
     async fn fetch_parameters(&mut self, player: &mut Player, version: u64) -> Result<bool, Error> {
         if player.has_version(version) {
             return Ok(true);
         }
-        let Some(published) = self.peers.parameters(version, player.terms().layout).await? else {
+        let Some(published) = self.learner.parameters(version, player.terms().layout).await? else {
             return Ok(false);
         };
         player.load(published).map_err(|source| Error::Parameters { version, source })?;
         Ok(true)
     }
 
-    /// Plays a slot on a thread of its own, passing its questions on to the teacher.
+    /// Plays a slot on a thread of its own, and forwards its requests for advice to the teacher.
     async fn play(
         &mut self,
         mut player: Box<Player>,
@@ -195,23 +180,25 @@ impl Worker {
     ) -> Result<(Box<Player>, Vec<Episode>), Error> {
         let slot = order.slot;
         let (account, layout) = (player.terms().account.clone(), player.terms().layout);
-        let (questions, mut asked) = Questions::channel();
+        let (advisor, mut requests) = AdviceChannel::new();
         let (finished, playing) = oneshot::channel();
-        let counted = self.rollouts.token();
+        let tracked = self.rollouts.token();
         let rollout = std::thread::Builder::new().name("rollout".to_owned());
         rollout
             .spawn(move || {
-                let _counted = counted;
-                let episodes = player.play(&order, questions);
-                // Nobody waits for the episodes any more when the worker has ended meanwhile.
+                let _tracked = tracked;
+                let episodes = player.play(&order, advisor);
+                // Fails only if the worker has ended meanwhile.
                 drop(finished.send((player, episodes)));
             })
             .map_err(Error::Thread)?;
-        // Ends when the player has dropped its end, played to the end or not.
-        while let Some(question) = self.config.pacing.next(asked.recv()).await {
+        // Ends when the player drops the channel, after the slot or after an error.
+        while let Some(pending) = self.config.pacing.next(requests.recv()).await {
             let account = account.as_deref().ok_or(Error::NoAccount { slot })?;
-            let advice = self.peers.advise(account, layout, &question.queries).await?;
-            if question.answer.send(advice).is_err() {
+            let no_teacher = || Error::NoTeacher { account: account.to_owned() };
+            let teacher = self.teacher.as_mut().ok_or_else(no_teacher)?;
+            let advice = teacher.advise(account, layout, &pending.queries).await?;
+            if pending.response.send(advice).is_err() {
                 break;
             }
         }

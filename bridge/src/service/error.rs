@@ -63,7 +63,7 @@ pub enum Error {
     Thread(#[source] std::io::Error),
     /// The service cannot be set up.
     #[error(transparent)]
-    Gate(#[from] tandem_net::GateError),
+    Gate(#[from] tandem_net::ServerConfigError),
     /// The server failed.
     #[error("cannot serve")]
     Transport(#[from] tonic::transport::Error),

@@ -9,7 +9,7 @@ use tandem_bridge::work_cell::mico_cell;
 use tandem_bridge::{Command, Driver, DriverError, Executor, Order, PairState, Settings};
 use tandem_core::ArmIndex;
 use tandem_kinematics::{ArmSample, Joints, Motion};
-use tandem_net::Gate;
+use tandem_net::ServerConfig;
 use tandem_proto::pb;
 use tandem_proto::pb::bridge_client::BridgeClient;
 use tandem_trials::{SimulatedConfig, SimulatedPair};
@@ -264,10 +264,9 @@ impl Rig {
             secret: [7; 32],
         };
         let ends = shutdown.clone();
-        let served =
-            tokio::spawn(
-                async move { serve(executor, config, listener, &Gate::default(), ends).await },
-            );
+        let served = tokio::spawn(async move {
+            serve(executor, config, listener, &ServerConfig::default(), ends).await
+        });
         let client = connect(address);
         Self { client, clock, tap, shutdown, served, address }
     }

@@ -133,6 +133,7 @@ fn small_log(log: &[u8], compression: Option<mcap::Compression>) -> Result<Vec<u
 
 fn write_messages(to: &Path) -> Result<(), AnyError> {
     let terms = RunTerms {
+        run: "run-7".to_owned(),
         layout: LAYOUT,
         account: Some("run-7".to_owned()),
         exploration: Exploration {

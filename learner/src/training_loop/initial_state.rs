@@ -114,6 +114,7 @@ impl<'a> LearnerLoop<'a> {
         let InitialState { trainer, resumption, lock, .. } = initial;
         let Resumption { acting, history, pending, wall_s } = resumption;
         let terms = RunTerms {
+            run: config.run.name.clone(),
             layout: trainer.layout,
             account: account.as_ref().map(|account| account.name().to_owned()),
             exploration: config.run.exploration,

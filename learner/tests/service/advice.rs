@@ -150,7 +150,7 @@ async fn a_refusal_of_the_teacher_ends_the_run_after_saving() {
     let (expected, _) = calm(advised(1, AMPLE)).await;
     let other_terms = "account \"toy\" is open with budget 1";
     for (status, reason) in [
-        (Status::unauthenticated("no"), "wants a token: name its file in --token-file"),
+        (Status::unauthenticated("no"), "requires a token: name its file in --token-file"),
         (Status::already_exists(other_terms), other_terms),
     ] {
         let directory = tempfile::tempdir().expect("a directory");

@@ -5,7 +5,7 @@ use std::pin::Pin;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
-use tandem_net::{Dial, Gate};
+use tandem_net::{ClientConfig, ServerConfig};
 use tandem_proto::pb;
 use tandem_proto::pb::learner_client::LearnerClient;
 use tandem_proto::pb::learner_server::{Learner, LearnerServer};
@@ -31,7 +31,8 @@ async fn relay(learner: SocketAddr) -> (SocketAddr, tokio_util::sync::DropGuard)
     let shutdown = CancellationToken::new();
     let guard = shutdown.clone().drop_guard();
     tokio::spawn(async move {
-        let (learner, dial, gate) = (learner.to_string(), Dial::default(), Gate::default());
+        let (learner, dial, gate) =
+            (learner.to_string(), ClientConfig::default(), ServerConfig::default());
         let served = tandem_learner::relay::serve(&learner, &dial, &gate, listener, shutdown);
         served.await.expect("relays");
     });
@@ -141,8 +142,10 @@ impl Learner for Fake {
 impl Fake {
     async fn serve(&self) -> SocketAddr {
         let (listener, address) = bound().await;
-        let router =
-            Gate::default().router(LearnerServer::new(self.clone())).await.expect("serves");
+        let router = ServerConfig::default()
+            .router(LearnerServer::new(self.clone()), tandem_proto::FILE_DESCRIPTOR_SET)
+            .await
+            .expect("serves");
         tokio::spawn(tandem_net::serve(router, listener, CancellationToken::new()));
         address
     }

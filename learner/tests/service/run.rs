@@ -11,7 +11,7 @@ use tandem_core::work::SlotOrder;
 use tandem_learner::{
     Clock, Error, LearnerConfig, LingerPolicy, RunOutcome, ServeOptions, serve_with,
 };
-use tandem_net::{Dial, Gate, Pacing};
+use tandem_net::{ClientConfig, Pacing, ServerConfig};
 use tandem_policy::{Actor, Policy};
 use tandem_proto::pb::learner_client::LearnerClient;
 use tandem_proto::pb::next_work_response::Work;
@@ -38,8 +38,8 @@ pub(crate) fn real_clock() -> Clock {
 pub(crate) fn learner_config(run: RunConfig, out: &Path, resume: bool) -> LearnerConfig {
     LearnerConfig {
         run,
-        gate: Gate::default(),
-        dial: Dial::default(),
+        gate: ServerConfig::default(),
+        dial: ClientConfig::default(),
         teacher: None,
         start_from: None,
         out: out.to_owned(),

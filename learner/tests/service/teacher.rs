@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::net::SocketAddr;
 use std::sync::{Arc, Mutex, MutexGuard};
 
-use tandem_net::Gate;
+use tandem_net::ServerConfig;
 use tandem_proto::pb;
 use tandem_proto::pb::teacher_server::{Teacher, TeacherServer};
 use tokio::net::TcpListener;
@@ -80,7 +80,9 @@ impl FakeTeacher {
     pub(crate) async fn serve(&self) -> SocketAddr {
         let listener = TcpListener::bind("127.0.0.1:0").await.expect("a port");
         let address = listener.local_addr().expect("bound");
-        let router = Gate::default().router(TeacherServer::new(self.clone())).await;
+        let router = ServerConfig::default()
+            .router(TeacherServer::new(self.clone()), tandem_proto::FILE_DESCRIPTOR_SET)
+            .await;
         let router = router.expect("can be offered");
         tokio::spawn(tandem_net::serve(router, listener, CancellationToken::new()));
         address

@@ -1,23 +1,23 @@
 use super::*;
 
-const ELSEWHERE: &str = "192.0.2.7";
+const OTHER_HOST: &str = "192.0.2.7";
 
 fn peer(text: &str) -> Option<IpAddr> {
     Some(text.parse().unwrap())
 }
 
-fn strangers(admission: &Arc<Admission>, peer: Option<IpAddr>, n: usize) -> Vec<Seat> {
+fn admit_all(admission: &Arc<Admission>, peer: Option<IpAddr>, n: usize) -> Vec<AdmissionPermit> {
     (0..n).map(|_| admission.admit(peer)).collect()
 }
 
-/// Whether each connection may stay.
-fn stay(seats: &mut [Seat]) -> Vec<bool> {
+/// Returns for each connection whether it may stay open.
+fn stay(permits: &mut [AdmissionPermit]) -> Vec<bool> {
     let mut context = Context::from_waker(Waker::noop());
-    seats.iter_mut().map(|seat| seat.check(&mut context).is_ok()).collect()
+    permits.iter_mut().map(|permit| permit.check(&mut context).is_ok()).collect()
 }
 
 #[test]
-fn a_process_keeps_files_for_other_things_and_places_for_newcomers() {
+fn the_capacity_reserves_files_and_unauthenticated_connections() {
     let check = |limit, total, authenticated| {
         let capacity = Capacity::for_open_files(limit);
         assert_eq!((capacity.total, capacity.authenticated), (total, authenticated), "{limit:?}");
@@ -32,9 +32,9 @@ fn a_process_keeps_files_for_other_things_and_places_for_newcomers() {
 }
 
 #[test]
-fn an_address_is_counted_by_host_and_not_at_all_on_loopback() {
+fn connections_are_counted_by_host_and_not_at_all_on_loopback() {
     let check = |address: &str, expected: Option<&str>| {
-        assert_eq!(counted(address.parse().unwrap()), expected.and_then(peer), "{address}");
+        assert_eq!(counting_key(address.parse().unwrap()), expected.and_then(peer), "{address}");
     };
     check("127.0.0.1", None);
     check("127.8.8.8", None);
@@ -46,78 +46,78 @@ fn an_address_is_counted_by_host_and_not_at_all_on_loopback() {
 }
 
 #[tokio::test(start_paused = true)]
-async fn the_connection_that_has_proven_least_for_longest_makes_room() {
+async fn the_oldest_of_the_least_trusted_connections_is_evicted() {
     let admission = Admission::new(Capacity::of(8));
-    let mut seats = strangers(&admission, None, 8);
-    seats[0].place.authenticated();
-    for seat in &seats[1..4] {
-        seat.place.requested();
+    let mut permits = admit_all(&admission, None, 8);
+    permits[0].handle.mark_authenticated();
+    for permit in &permits[1..4] {
+        permit.handle.mark_requested();
     }
     tokio::time::advance(FRESH).await;
-    let evicted_by_newcomers = |seats: &mut Vec<Seat>, n_newcomers| {
-        let before = stay(seats);
-        let newcomers = strangers(&admission, None, n_newcomers);
-        let after = stay(seats);
-        seats.extend(newcomers);
+    let evicted_by_newcomers = |permits: &mut Vec<AdmissionPermit>, n_newcomers| {
+        let before = stay(permits);
+        let newcomers = admit_all(&admission, None, n_newcomers);
+        let after = stay(permits);
+        permits.extend(newcomers);
         let changed = before.iter().zip(&after).enumerate().filter(|(_, (a, b))| a != b);
         changed.map(|(idx, _)| idx).collect::<Vec<_>>()
     };
-    // Those without a request, the oldest first; newcomers are given a second to make one.
-    assert_eq!(evicted_by_newcomers(&mut seats, 4), [4, 5, 6, 7]);
-    assert_eq!(evicted_by_newcomers(&mut seats, 3), [1, 2, 3]);
-    assert_eq!(evicted_by_newcomers(&mut seats, 2), [8, 9]);
-    assert!(stay(&mut seats)[0], "an authenticated connection is never evicted");
+    // Connections without a request are evicted first, the oldest before the others, unless they are younger than 1 s.
+    assert_eq!(evicted_by_newcomers(&mut permits, 4), [4, 5, 6, 7]);
+    assert_eq!(evicted_by_newcomers(&mut permits, 3), [1, 2, 3]);
+    assert_eq!(evicted_by_newcomers(&mut permits, 2), [8, 9]);
+    assert!(stay(&mut permits)[0], "an authenticated connection is never evicted");
 }
 
 #[tokio::test(start_paused = true)]
-async fn authenticated_connections_leave_places_to_newcomers() {
+async fn a_reserve_is_kept_from_authenticated_connections() {
     let admission = Admission::new(Capacity::of(8));
-    let mut seats = strangers(&admission, None, 8);
-    seats.iter().for_each(|seat| seat.place.authenticated());
+    let mut permits = admit_all(&admission, None, 8);
+    permits.iter().for_each(|permit| permit.handle.mark_authenticated());
     let mut newcomer = admission.admit(None);
-    assert_eq!(stay(&mut seats), [true, true, true, true, true, true, true, false]);
+    assert_eq!(stay(&mut permits), [true, true, true, true, true, true, true, false]);
     assert_eq!(stay(std::slice::from_mut(&mut newcomer)), [true]);
-    // Once one of them has gone, the next call of the newcomer proves it.
-    newcomer.place.authenticated();
-    assert_eq!(newcomer.place.standing(), Standing::Requested);
-    seats.remove(0);
-    newcomer.place.authenticated();
-    assert_eq!(newcomer.place.standing(), Standing::Authenticated);
+    // Once one of them has closed, the next call of the new connection authenticates it.
+    newcomer.handle.mark_authenticated();
+    assert_eq!(newcomer.handle.trust(), Trust::Requested);
+    permits.remove(0);
+    newcomer.handle.mark_authenticated();
+    assert_eq!(newcomer.handle.trust(), Trust::Authenticated);
 }
 
 #[tokio::test(start_paused = true)]
-async fn an_address_cannot_take_more_than_half_of_the_places_without_an_authenticated_call() {
+async fn one_address_has_at_most_half_of_the_connections_without_an_authenticated_call() {
     let admission = Admission::new(Capacity::of(8));
-    let mut others = strangers(&admission, peer("10.0.0.1"), 2);
-    let mut crowd = strangers(&admission, peer(ELSEWHERE), 6);
+    let mut others = admit_all(&admission, peer("10.0.0.1"), 2);
+    let mut crowd = admit_all(&admission, peer(OTHER_HOST), 6);
     assert_eq!(stay(&mut crowd), [false, false, true, true, true, true]);
     assert_eq!(stay(&mut others), [true, true]);
-    crowd[2].place.authenticated();
-    crowd.push(admission.admit(peer(ELSEWHERE)));
+    crowd[2].handle.mark_authenticated();
+    crowd.push(admission.admit(peer(OTHER_HOST)));
     assert_eq!(stay(&mut crowd), [false, false, true, true, true, true, true]);
     drop(crowd);
     drop(others);
-    let book = admission.book();
-    assert_eq!((book.n_open, book.n_authenticated, book.evictable.len()), (0, 0, 0));
-    assert!(book.per_peer.is_empty(), "{:?}", book.per_peer);
+    let registry = admission.registry();
+    assert_eq!((registry.n_open, registry.n_authenticated, registry.evictable.len()), (0, 0, 0));
+    assert!(registry.per_peer.is_empty(), "{:?}", registry.per_peer);
 }
 
 #[tokio::test(start_paused = true)]
-async fn one_machine_may_have_as_many_workers_as_there_is_room_for() {
+async fn authenticated_connections_of_one_machine_are_limited_by_the_capacity_alone() {
     let admission = Admission::new(Capacity::of(4096));
-    let mut workers = strangers(&admission, peer("127.0.0.1"), 4000);
-    workers.iter().for_each(|seat| seat.place.authenticated());
+    let mut workers = admit_all(&admission, peer("127.0.0.1"), 4000);
+    workers.iter().for_each(|permit| permit.handle.mark_authenticated());
     assert!(stay(&mut workers).iter().all(|stays| *stays));
 }
 
 #[tokio::test(start_paused = true)]
-async fn an_evicted_connection_stays_what_it_was() {
+async fn an_evicted_connection_cannot_be_promoted() {
     let admission = Admission::new(Capacity::of(2));
-    let mut seats = strangers(&admission, None, 3);
-    seats[0].place.authenticated();
-    assert_eq!(stay(&mut seats), [false, true, true]);
-    assert_eq!(admission.book().n_authenticated, 0);
+    let mut permits = admit_all(&admission, None, 3);
+    permits[0].handle.mark_authenticated();
+    assert_eq!(stay(&mut permits), [false, true, true]);
+    assert_eq!(admission.registry().n_authenticated, 0);
     assert!(admission.poll_room(&Context::from_waker(Waker::noop())).is_pending());
-    seats.remove(0);
+    permits.remove(0);
     assert!(admission.poll_room(&Context::from_waker(Waker::noop())).is_ready());
 }

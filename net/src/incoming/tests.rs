@@ -9,7 +9,7 @@ use tonic::transport::server::Connected as _;
 use super::*;
 use crate::admission::FIRST_REQUEST;
 
-/// A service's side of a connection, and its client's.
+/// Returns both ends of a connection: the service's and the client's.
 async fn connected() -> (Connection, DuplexStream) {
     let (near, far) = tokio::io::duplex(64);
     let mut incoming = Incoming::new(tokio_stream::once(Ok(Connection::new(near))));
@@ -17,7 +17,7 @@ async fn connected() -> (Connection, DuplexStream) {
 }
 
 #[tokio::test(start_paused = true)]
-async fn a_client_that_says_nothing_is_hung_up_on() {
+async fn a_client_that_sends_nothing_is_disconnected() {
     let (mut connection, _silent) = connected().await;
     let started = Instant::now();
     let refused = connection.read_u8().await.unwrap_err();
@@ -26,7 +26,7 @@ async fn a_client_that_says_nothing_is_hung_up_on() {
 }
 
 #[tokio::test(start_paused = true)]
-async fn a_client_that_says_a_byte_a_second_is_hung_up_on_without_a_request() {
+async fn a_client_that_sends_a_byte_per_second_but_no_request_is_disconnected() {
     let (mut connection, mut client) = connected().await;
     let dripping = tokio::spawn(async move {
         while client.write_u8(b'P').await.is_ok() {
@@ -47,26 +47,26 @@ async fn a_client_that_says_a_byte_a_second_is_hung_up_on_without_a_request() {
 }
 
 #[tokio::test(start_paused = true)]
-async fn a_client_that_reads_nothing_is_hung_up_on_without_a_request() {
-    let (mut connection, _deaf) = connected().await;
+async fn a_client_that_reads_nothing_and_sends_no_request_is_disconnected() {
+    let (mut connection, _client) = connected().await;
     let refused = connection.write_all(&[0; 65]).await.unwrap_err();
     assert_eq!(refused.kind(), io::ErrorKind::TimedOut);
 }
 
 #[tokio::test(start_paused = true)]
-async fn a_client_that_has_made_a_request_may_be_silent_for_long() {
+async fn a_client_that_has_made_a_request_may_stay_idle() {
     let (mut connection, mut client) = connected().await;
     let caller = connection.connect_info();
     let later = async {
         tokio::time::sleep(FIRST_REQUEST / 2).await;
-        caller.requested();
+        caller.mark_requested();
         tokio::time::sleep(100 * FIRST_REQUEST).await;
         client.write_u8(2).await.unwrap();
     };
     assert_eq!(tokio::join!(connection.read_u8(), later).0.unwrap(), 2);
 }
 
-/// A listener that fails with `kind` whenever it is asked, and how often it was asked.
+/// Returns a listener whose every accept fails with `kind`, and the number of accepts.
 fn failing(kind: io::ErrorKind) -> (Incoming, Arc<AtomicUsize>) {
     let n_asked = Arc::new(AtomicUsize::new(0));
     let count = Arc::clone(&n_asked);
@@ -78,7 +78,7 @@ fn failing(kind: io::ErrorKind) -> (Incoming, Arc<AtomicUsize>) {
 }
 
 #[tokio::test(start_paused = true)]
-async fn a_system_that_hands_over_no_connections_is_asked_less_and_less_often() {
+async fn failed_accepts_are_repeated_with_growing_pauses() {
     let (mut incoming, n_asked) = failing(io::ErrorKind::Other);
     let minute = tokio::time::timeout(Duration::from_secs(60), incoming.next()).await;
     minute.unwrap_err();
@@ -88,7 +88,7 @@ async fn a_system_that_hands_over_no_connections_is_asked_less_and_less_often() 
 }
 
 #[tokio::test(start_paused = true)]
-async fn connections_come_again_once_the_system_hands_them_over() {
+async fn connections_are_accepted_again_after_failures() {
     let (sender, accepted) = mpsc::channel(16);
     let mut incoming = Incoming::new(ReceiverStream::new(accepted));
     for _ in 0..3 {

@@ -1,4 +1,4 @@
-//! A service that counts its calls, and certificates made on the spot.
+//! A service that counts its calls, and generated certificates.
 
 use std::net::SocketAddr;
 use std::pin::Pin;
@@ -6,7 +6,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
 use rcgen::{BasicConstraints, CertificateParams, CertifiedIssuer, DnType, IsCa, KeyPair};
-use tandem_net::{Gate, Incoming, Token};
+use tandem_net::{Incoming, ServerConfig, Token};
 use tandem_proto::pb;
 use tandem_proto::pb::teacher_server::{Teacher, TeacherServer};
 use tokio::net::TcpListener;
@@ -22,7 +22,7 @@ pub(crate) fn token(text: &str) -> Token {
     Token::new(text).expect("a token")
 }
 
-/// Counts calls and answers with nothing.
+/// A service that counts its calls and returns empty responses.
 #[derive(Clone, Default)]
 pub(crate) struct Counter(Arc<AtomicU64>);
 
@@ -93,7 +93,7 @@ impl Teacher for Counter {
     }
 }
 
-/// A counter that is served until it is dropped.
+/// A server of a [`Counter`], which stops when it is dropped.
 pub(crate) struct Served {
     pub(crate) counter: Counter,
     pub(crate) address: SocketAddr,
@@ -101,21 +101,21 @@ pub(crate) struct Served {
 }
 
 impl Served {
-    pub(crate) async fn start(gate: &Gate) -> Self {
-        Self::start_on(TcpListener::bind("127.0.0.1:0").await.expect("a port"), gate).await
+    pub(crate) async fn start(config: &ServerConfig) -> Self {
+        Self::start_on(TcpListener::bind("127.0.0.1:0").await.expect("a port"), config).await
     }
 
-    pub(crate) async fn start_on(listener: TcpListener, gate: &Gate) -> Self {
+    pub(crate) async fn start_on(listener: TcpListener, config: &ServerConfig) -> Self {
         let address = listener.local_addr().expect("bound");
-        let (counter, serving) = serve(listener, gate).await;
+        let (counter, serving) = serve(listener, config).await;
         Self { counter, address, serving }
     }
 
-    /// Ends the service with all its connections; gives a new socket on the same address.
+    /// Stops the server, closes its connections and returns a new listener on the same address.
     pub(crate) async fn stop(mut self) -> TcpListener {
         self.serving.abort();
         drop((&mut self.serving).await);
-        TcpListener::bind(self.address).await.expect("nobody else has taken the port meanwhile")
+        TcpListener::bind(self.address).await.expect("the port is still free")
     }
 }
 
@@ -125,10 +125,16 @@ impl Drop for Served {
     }
 }
 
-/// Serves a counter to what comes in.
-pub(crate) async fn serve(incoming: impl Into<Incoming>, gate: &Gate) -> (Counter, JoinHandle<()>) {
+/// Serves a counter to `incoming`.
+pub(crate) async fn serve(
+    incoming: impl Into<Incoming>,
+    config: &ServerConfig,
+) -> (Counter, JoinHandle<()>) {
     let counter = Counter::default();
-    let router = gate.router(TeacherServer::new(counter.clone())).await.expect("can be offered");
+    let router = config
+        .router(TeacherServer::new(counter.clone()), tandem_proto::FILE_DESCRIPTOR_SET)
+        .await
+        .expect("valid");
     let incoming = incoming.into();
     let serving = tokio::spawn(async move {
         tandem_net::serve(router, incoming, CancellationToken::new()).await.expect("serves");
@@ -136,7 +142,7 @@ pub(crate) async fn serve(incoming: impl Into<Incoming>, gate: &Gate) -> (Counte
     (counter, serving)
 }
 
-/// Signs certificates.
+/// A certificate authority.
 pub(crate) struct Authority(CertifiedIssuer<'static, KeyPair>);
 
 /// A certificate and its key (PEM).
@@ -158,12 +164,12 @@ impl Authority {
         self.0.pem()
     }
 
-    /// A certificate for `name` that is valid for long.
+    /// Signs a certificate for `name` with a distant expiry.
     pub(crate) fn sign(&self, name: &str) -> Identity {
         self.sign_until(name, 4000)
     }
 
-    /// A certificate for `name` that was valid until the first day of `year`.
+    /// Signs a certificate for `name` that expires on the first day of `year`.
     pub(crate) fn sign_until(&self, name: &str, year: i32) -> Identity {
         let mut params = CertificateParams::new([name.to_owned()]).expect("a name");
         params.not_after = rcgen::date_time_ymd(year, 1, 1);
@@ -174,8 +180,8 @@ impl Authority {
 }
 
 impl Identity {
-    /// `gate`, speaking TLS as this one.
-    pub(crate) fn gate(&self, gate: Gate) -> Gate {
-        gate.with_certificate(self.certificate.as_bytes(), self.key.as_bytes()).expect("fits")
+    /// Adds this identity to `config`.
+    pub(crate) fn add_to(&self, config: ServerConfig) -> ServerConfig {
+        config.with_certificate(self.certificate.as_bytes(), self.key.as_bytes()).expect("fits")
     }
 }

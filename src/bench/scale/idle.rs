@@ -1,7 +1,7 @@
-//! Workers that wait instead of simulating: they take slots, fetch parameters and deliver whole episodes as real ones
-//! do, each over a connection of its own, and all of them fit into one process.
+//! Workers that wait instead of simulating. They take slots, fetch parameters and deliver whole episodes as real
+//! workers do, each over its own connection, and all of them fit into one process.
 
-mod book;
+mod timings;
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -10,60 +10,58 @@ use std::time::Duration;
 use anyhow::Context as _;
 use tandem_core::{Episode, Layout, Task};
 use tandem_learner::Clock;
-use tandem_net::{Dial, Link};
+use tandem_net::{AuthChannel, ClientConfig, MAX_MESSAGE_BYTES, Retryability, within};
 use tandem_proto::pb::learner_client::LearnerClient;
 use tandem_proto::pb::next_work_response::Work;
 use tandem_proto::{encode_episode, pb};
 use tokio::sync::watch;
 use tokio::task::JoinHandle;
-use tonic::{Code, Status};
+use tonic::Status;
 
-pub(super) use book::Book;
+pub(super) use timings::LoadTimings;
 
-/// What workers and learner must have in common; a commit is not part of it.
+/// The version that workers and learner must share; it does not contain the commit.
 const VERSION: &str = env!("CARGO_PKG_VERSION");
-/// As long as a real worker waits for an answer.
-const ANSWER: Duration = Duration::from_secs(20);
-/// Pause before a call that failed is made again.
-const PAUSE: Duration = Duration::from_millis(100);
-/// As much as a real worker takes in.
-const MAX_MESSAGE_BYTES: usize = 64 << 20;
+/// Timeout of a call, as for a real worker.
+const CALL_TIMEOUT: Duration = Duration::from_secs(20);
+/// Pause before a failed call is repeated.
+const RETRY_PAUSE: Duration = Duration::from_millis(100);
 
-/// Many idle workers.
-pub(super) struct Crowd {
-    common: Arc<Common>,
-    members: Vec<Member>,
+/// Idle workers of one learner.
+pub(super) struct IdleWorkers {
+    shared: Arc<Shared>,
+    workers: Vec<WorkerHandle>,
     n_spawned: usize,
 }
 
-struct Common {
-    /// A worker calls one of these, in turn.
+struct Shared {
+    /// Addresses of the learner or of relays, which workers use in turn.
     addresses: Vec<String>,
-    dial: Dial,
+    dial: ClientConfig,
     slot_time: Duration,
     episodes_per_round: u64,
     clock: Clock,
     episode: pb::Episode,
-    book: Mutex<Book>,
-    /// The latest round of which a slot was taken.
-    latest: watch::Sender<u64>,
+    timings: Mutex<LoadTimings>,
+    /// The latest round of which a worker has taken a slot.
+    latest_round: watch::Sender<u64>,
     n_joined: watch::Sender<usize>,
-    /// Why the learner takes none of these workers, if it does not.
-    refused: watch::Sender<Option<String>>,
+    /// The reason if the learner rejects these workers.
+    rejection: watch::Sender<Option<String>>,
 }
 
-struct Member {
+struct WorkerHandle {
     task: JoinHandle<()>,
-    state: Arc<MemberState>,
+    state: Arc<WorkerState>,
 }
 
 #[derive(Default)]
-struct MemberState {
+struct WorkerState {
     is_playing: AtomicBool,
-    shall_leave: AtomicBool,
+    must_leave: AtomicBool,
 }
 
-impl Crowd {
+impl IdleWorkers {
     pub(super) fn new(
         addresses: Vec<String>,
         slot_time: Duration,
@@ -71,98 +69,98 @@ impl Crowd {
         clock: Clock,
     ) -> Self {
         let episode = encode_episode(&Episode::zeros(Layout::new(Task::Push, 2), 0));
-        let common = Common {
+        let shared = Shared {
             addresses,
-            dial: Dial::default(),
+            dial: ClientConfig::default(),
             slot_time,
             episodes_per_round: episodes_per_round as u64,
             clock,
             episode,
-            book: Mutex::default(),
-            latest: watch::Sender::new(0),
+            timings: Mutex::default(),
+            latest_round: watch::Sender::new(0),
             n_joined: watch::Sender::new(0),
-            refused: watch::Sender::new(None),
+            rejection: watch::Sender::new(None),
         };
-        Self { common: Arc::new(common), members: Vec::new(), n_spawned: 0 }
+        Self { shared: Arc::new(shared), workers: Vec::new(), n_spawned: 0 }
     }
 
-    /// Lets `n` more join.
+    /// Starts `n` more workers.
     pub(super) fn join(&mut self, n: usize) -> anyhow::Result<()> {
         for _ in 0..n {
-            let address = &self.common.addresses[self.n_spawned % self.common.addresses.len()];
-            let link = self.common.dial.link(address).context("cannot call the learner")?;
-            let state = Arc::<MemberState>::default();
+            let address = &self.shared.addresses[self.n_spawned % self.shared.addresses.len()];
+            let link = self.shared.dial.channel(address).context("cannot call the learner")?;
+            let state = Arc::<WorkerState>::default();
             let worker = Worker {
                 name: format!("idle-{}", self.n_spawned),
-                common: self.common.clone(),
+                shared: self.shared.clone(),
                 state: state.clone(),
                 client: LearnerClient::new(link).max_decoding_message_size(MAX_MESSAGE_BYTES),
                 version: None,
             };
-            self.members.push(Member { task: tokio::spawn(worker.live()), state });
+            self.workers.push(WorkerHandle { task: tokio::spawn(worker.run()), state });
             self.n_spawned += 1;
         }
         Ok(())
     }
 
-    /// Lets `n` leave: half of them once they have delivered what they have in hand, half of them in the middle of a
-    /// slot, without a word.
+    /// Removes `n` workers that are playing: one half at once, in the middle of a slot, and the other half after they
+    /// have delivered their slots.
     pub(super) fn leave(&mut self, n: usize) {
         let (n_silently, mut n_left) = (n / 2, 0);
-        self.members.retain(|member| {
-            let is_playing = member.state.is_playing.load(Ordering::Relaxed);
+        self.workers.retain(|worker| {
+            let is_playing = worker.state.is_playing.load(Ordering::Relaxed);
             let stays = n_left >= n || !is_playing;
             if !stays && n_left < n_silently {
-                member.task.abort();
+                worker.task.abort();
             } else if !stays {
-                member.state.shall_leave.store(true, Ordering::Relaxed);
+                worker.state.must_leave.store(true, Ordering::Relaxed);
             }
             n_left += usize::from(!stays);
             stays
         });
     }
 
-    /// Waits until all that were ever let in have joined.
+    /// Waits until all workers that were started have joined.
     ///
     /// # Errors
-    /// When the learner refuses them.
+    /// When the learner rejects them.
     pub(super) async fn all_joined(&self) -> anyhow::Result<()> {
-        let mut n_joined = self.common.n_joined.subscribe();
-        let mut refused = self.common.refused.subscribe();
+        let mut n_joined = self.shared.n_joined.subscribe();
+        let mut rejection = self.shared.rejection.subscribe();
         tokio::select! {
             joined = n_joined.wait_for(|n| *n >= self.n_spawned) => drop(joined?),
-            refused = refused.wait_for(Option::is_some) => {
-                anyhow::bail!("the learner refuses workers: {}", refused?.as_deref().unwrap_or_default());
+            rejection = rejection.wait_for(Option::is_some) => {
+                anyhow::bail!("the learner rejects workers: {}", rejection?.as_deref().unwrap_or_default());
             }
         }
         Ok(())
     }
 
-    /// The latest round of which a slot was taken.
+    /// Returns the latest round of which a worker has taken a slot.
     pub(super) fn round(&self) -> u64 {
-        *self.common.latest.borrow()
+        *self.shared.latest_round.borrow()
     }
 
-    /// Waits until a slot of `round` is taken.
-    pub(super) async fn until(&self, round: u64) -> anyhow::Result<()> {
-        self.common.latest.subscribe().wait_for(|latest| *latest >= round).await?;
+    /// Waits until a worker has taken a slot of `round`.
+    pub(super) async fn wait_for_round(&self, round: u64) -> anyhow::Result<()> {
+        self.shared.latest_round.subscribe().wait_for(|latest| *latest >= round).await?;
         Ok(())
     }
 
-    pub(super) fn book(&self) -> MutexGuard<'_, Book> {
-        self.common.book()
+    pub(super) fn timings(&self) -> MutexGuard<'_, LoadTimings> {
+        self.shared.timings()
     }
 }
 
-impl Drop for Crowd {
+impl Drop for IdleWorkers {
     fn drop(&mut self) {
-        self.members.iter().for_each(|member| member.task.abort());
+        self.workers.iter().for_each(|worker| worker.task.abort());
     }
 }
 
-impl Common {
-    fn book(&self) -> MutexGuard<'_, Book> {
-        self.book.lock().unwrap_or_else(PoisonError::into_inner)
+impl Shared {
+    fn timings(&self) -> MutexGuard<'_, LoadTimings> {
+        self.timings.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     fn now(&self) -> Duration {
@@ -172,19 +170,19 @@ impl Common {
 
 struct Worker {
     name: String,
-    common: Arc<Common>,
-    state: Arc<MemberState>,
-    client: LearnerClient<Link>,
-    /// Of the parameters that it has.
+    shared: Arc<Shared>,
+    state: Arc<WorkerState>,
+    client: LearnerClient<AuthChannel>,
+    /// Version of the worker's parameters.
     version: Option<u64>,
 }
 
 impl Worker {
-    /// Works until told to leave. A call that fails is made again, as a real worker does.
-    async fn live(mut self) {
+    /// Works until it must leave. Failed calls are repeated, as by a real worker.
+    async fn run(mut self) {
         let mut worker_id = None;
-        let mut was_in = false;
-        while !self.state.shall_leave.load(Ordering::Relaxed) {
+        let mut has_joined = false;
+        while !self.state.must_leave.load(Ordering::Relaxed) {
             let outcome = match worker_id {
                 None => self.join().await.map(Some),
                 Some(id) => self.work(id).await.map(|()| Some(id)),
@@ -193,58 +191,60 @@ impl Worker {
             match outcome {
                 Ok(id) => worker_id = id,
                 Err(status) => {
-                    // Before anybody is in, the run is only starting.
-                    if *self.common.n_joined.borrow() > 0 {
-                        self.common.book().fail(&status);
+                    // Until a worker has joined, the run is still starting.
+                    if *self.shared.n_joined.borrow() > 0 {
+                        self.shared.timings().record_failure(&status);
                     }
-                    match status.code() {
-                        Code::NotFound => worker_id = None,
-                        Code::FailedPrecondition if worker_id.is_none() => {
+                    match Retryability::of(status.code()) {
+                        Retryability::NotFound => worker_id = None,
+                        Retryability::Final if worker_id.is_none() => {
                             let reason = status.message().to_owned();
-                            self.common.refused.send_replace(Some(reason));
+                            self.shared.rejection.send_replace(Some(reason));
                             return;
                         }
                         _ => {}
                     }
-                    tokio::time::sleep(PAUSE).await;
+                    tokio::time::sleep(RETRY_PAUSE).await;
                 }
             }
-            if worker_id.is_some() && !was_in {
-                was_in = true;
-                self.common.n_joined.send_modify(|n| *n += 1);
+            if worker_id.is_some() && !has_joined {
+                has_joined = true;
+                self.shared.n_joined.send_modify(|n| *n += 1);
             }
         }
     }
 
     async fn join(&mut self) -> Result<u64, Status> {
         let request = pb::JoinRequest { worker: self.name.clone(), version: VERSION.to_owned() };
-        Ok(within(self.client.join(request)).await?.worker_id)
+        Ok(within(CALL_TIMEOUT, self.client.join(request)).await?.into_inner().worker_id)
     }
 
-    /// Asks for a slot and plays it, if there is one.
+    /// Requests a slot and plays it, if there is one.
     async fn work(&mut self, worker_id: u64) -> Result<(), Status> {
-        let asked = self.common.now();
-        let answer = within(self.client.next_work(pb::NextWorkRequest { worker_id })).await?;
-        let answered = self.common.now();
+        let requested = self.shared.now();
+        let answer = within(CALL_TIMEOUT, self.client.next_work(pb::NextWorkRequest { worker_id }))
+            .await?
+            .into_inner();
+        let answered = self.shared.now();
         let slot = match answer.work {
             Some(Work::Slot(slot)) => slot,
             Some(Work::Finished(_)) => {
-                self.state.shall_leave.store(true, Ordering::Relaxed);
+                self.state.must_leave.store(true, Ordering::Relaxed);
                 return Ok(());
             }
             Some(Work::Wait(_)) | None => return Ok(()),
         };
         self.state.is_playing.store(true, Ordering::Relaxed);
         let first = slot.episodes.first().map_or(0, |order| order.number);
-        let round = first / self.common.episodes_per_round;
-        self.common.book().take(round, slot.slot, (asked, answered));
-        self.common.latest.send_if_modified(|latest| {
+        let round = first / self.shared.episodes_per_round;
+        self.shared.timings().record_assignment(round, slot.slot, (requested, answered));
+        self.shared.latest_round.send_if_modified(|latest| {
             let is_new = round > *latest;
             *latest = round.max(*latest);
             is_new
         });
         self.fetch(round, slot.parameter_version).await?;
-        tokio::time::sleep(self.common.slot_time).await;
+        tokio::time::sleep(self.shared.slot_time).await;
         self.deliver(worker_id, round, &slot).await
     }
 
@@ -252,10 +252,11 @@ impl Worker {
         if self.version == Some(version) {
             return Ok(());
         }
-        let asked = self.common.now();
-        within(self.client.get_parameters(pb::GetParametersRequest { version })).await?;
+        let requested = self.shared.now();
+        within(CALL_TIMEOUT, self.client.get_parameters(pb::GetParametersRequest { version }))
+            .await?;
         self.version = Some(version);
-        self.common.book().fetched(round, self.common.now().saturating_sub(asked));
+        self.shared.timings().record_fetch(round, self.shared.now().saturating_sub(requested));
         Ok(())
     }
 
@@ -264,21 +265,13 @@ impl Worker {
             number: order.number,
             kind: slot.kind,
             parameter_version: slot.parameter_version,
-            ..self.common.episode.clone()
+            ..self.shared.episode.clone()
         };
         let episodes = slot.episodes.iter().map(episode).collect();
         let request = pb::SubmitEpisodesRequest { worker_id, slot: slot.slot, episodes };
-        let sent = self.common.now();
-        within(self.client.submit_episodes(request)).await?;
-        self.common.book().deliver(round, (sent, self.common.now()));
+        let sent = self.shared.now();
+        within(CALL_TIMEOUT, self.client.submit_episodes(request)).await?.into_inner();
+        self.shared.timings().record_delivery(round, (sent, self.shared.now()));
         Ok(())
     }
-}
-
-async fn within<T>(
-    call: impl Future<Output = Result<tonic::Response<T>, Status>>,
-) -> Result<T, Status> {
-    let lapsed = |_elapsed| Status::deadline_exceeded("no answer in time");
-    let answer = tokio::time::timeout(ANSWER, call).await.map_err(lapsed)??;
-    Ok(answer.into_inner())
 }

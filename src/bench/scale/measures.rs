@@ -1,13 +1,13 @@
-//! What is made of the times and counts that were measured. Pure.
+//! Statistics of the measurements. Pure.
 
 use std::time::Duration;
 
-/// Less gain in throughput than this is none.
-const GAIN: f64 = 1.1;
-/// A thread that computes for so much of the time leaves no more room.
-const BUSY: f64 = 0.8;
+/// Throughput gains below 10 % count as saturation.
+const MIN_GAIN: f64 = 1.1;
+/// Load above which a thread, or the machine, counts as saturated.
+const SATURATED: f64 = 0.8;
 
-/// The time that `share` of `times` do not exceed; 0 when there are none.
+/// Returns the quantile `share` of `times`; 0 if there are none.
 pub(super) fn quantile(times: &mut [Duration], share: f64) -> Duration {
     times.sort_unstable();
     #[expect(
@@ -19,7 +19,7 @@ pub(super) fn quantile(times: &mut [Duration], share: f64) -> Duration {
     times.get(rank.saturating_sub(1)).copied().unwrap_or_default()
 }
 
-/// The median and the longest of the times between moments that follow one another; `None` for fewer than two.
+/// Returns the median and the longest of the spans between successive moments; `None` for fewer than two moments.
 pub(super) fn median_and_longest(moments: &[Duration]) -> Option<(Duration, Duration)> {
     let mut spans: Vec<Duration> =
         moments.windows(2).map(|pair| pair[1].saturating_sub(pair[0])).collect();
@@ -27,52 +27,52 @@ pub(super) fn median_and_longest(moments: &[Duration]) -> Option<(Duration, Dura
     Some((quantile(&mut spans, 0.5), longest))
 }
 
-/// The first of `points` (workers and throughput, by rising number of workers) that no later one exceeds by a tenth;
-/// `None` when that is the last one, and it is open how much more would help.
+/// Returns the index of the first of `points` (number of workers, in ascending order, and throughput) that no later one
+/// exceeds by 10 %; `None` if that is the last one, so that the knee is not reached.
 pub(super) fn knee(points: &[(usize, f64)]) -> Option<usize> {
     let is_knee = |idx: &usize| {
-        points[idx + 1..].iter().all(|(_, throughput)| *throughput < GAIN * points[*idx].1)
+        points[idx + 1..].iter().all(|(_, throughput)| *throughput < MIN_GAIN * points[*idx].1)
     };
     (0..points.len().saturating_sub(1)).find(is_knee)
 }
 
-/// Cores that were busy.
+/// Number of busy cores.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct Load {
-    /// The learner's thread of sockets.
+    /// Of the learner's socket thread.
     pub(super) serving: f64,
-    /// The learner's other threads.
+    /// Of the learner's other threads.
     pub(super) learning: f64,
-    /// The workers together.
+    /// Of all workers.
     pub(super) workers: f64,
-    /// The machine, others' work included.
+    /// Of the machine, including other programs.
     pub(super) machine: f64,
-    /// Cores that there are.
+    /// Number of cores of the machine.
     pub(super) n_cores: f64,
 }
 
-/// What keeps more workers from bringing more.
+/// The bottleneck that limits the throughput.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Bound {
-    /// Cores for the workers' simulation.
+    /// The cores, which the workers' simulations use.
     Simulation,
-    /// The learner's updates, and taking in a round.
+    /// The learner's updates.
     Update,
-    /// The learner's thread of sockets.
+    /// The learner's socket thread.
     Wire,
-    /// Nobody is at work all the time: everybody waits for the slowest of a round.
+    /// The rounds: all processes wait for the slowest slot.
     Rounds,
 }
 
 impl Bound {
-    /// What is busy. A machine without an idle core is bound by whoever of ours takes most of it.
+    /// Determines the bottleneck. Without an idle core, it is the part of the run that uses most of the machine.
     pub(super) fn of(load: &Load) -> Self {
         let Load { serving, learning, workers, machine, n_cores } = *load;
-        if serving >= BUSY {
+        if serving >= SATURATED {
             return Self::Wire;
         }
-        if machine < BUSY * n_cores {
-            return if learning >= BUSY { Self::Update } else { Self::Rounds };
+        if machine < SATURATED * n_cores {
+            return if learning >= SATURATED { Self::Update } else { Self::Rounds };
         }
         if workers >= learning && workers >= serving {
             Self::Simulation
@@ -83,12 +83,12 @@ impl Bound {
         }
     }
 
-    pub(super) const fn words(self) -> &'static str {
+    pub(super) const fn text(self) -> &'static str {
         match self {
             Self::Simulation => "simulation: no core is left for more workers",
             Self::Update => "updates: the learner's own computing takes the time",
             Self::Wire => "wire: the learner's thread of sockets takes the time",
-            Self::Rounds => "rounds: everybody waits for the slowest slot of a round",
+            Self::Rounds => "rounds: all processes wait for the slowest slot of a round",
         }
     }
 }
@@ -117,14 +117,14 @@ mod tests {
     }
 
     #[test]
-    fn a_stall_shows_beside_the_median() {
+    fn a_stall_is_the_longest_span() {
         assert_eq!(median_and_longest(&millis(&[5])), None);
         let expected = Some((Duration::from_millis(100), Duration::from_millis(900)));
         assert_eq!(median_and_longest(&millis(&[0, 100, 190, 1090, 1200])), expected);
     }
 
     #[test]
-    fn the_knee_is_where_no_more_workers_bring_a_tenth_more() {
+    fn the_knee_is_where_more_workers_gain_less_than_a_tenth() {
         let check = |throughputs: &[f64], expected: Option<usize>| {
             let points: Vec<_> = throughputs.iter().copied().enumerate().collect();
             assert_eq!(knee(&points), expected, "{throughputs:?}");
@@ -134,14 +134,14 @@ mod tests {
         check(&[100.0, 200.0, 400.0], None);
         check(&[100.0, 200.0, 210.0, 205.0], Some(1));
         check(&[100.0, 90.0, 80.0], Some(0));
-        // A dip is not the knee when more workers bring more after all.
+        // A dip is not the knee if more workers gain more.
         check(&[100.0, 95.0, 150.0, 151.0], Some(2));
-        // Small gains that add up are gains.
+        // Small gains add up.
         check(&[100.0, 108.0, 116.0, 117.0], Some(1));
     }
 
     #[test]
-    fn the_bound_is_what_is_busy() {
+    fn the_bottleneck_is_the_saturated_part() {
         let idle = Load { serving: 0.1, learning: 0.1, workers: 0.1, machine: 0.4, n_cores: 4.0 };
         let check = |load, expected| assert_eq!(Bound::of(&load), expected, "{load:?}");
         check(idle, Bound::Rounds);

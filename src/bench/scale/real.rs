@@ -5,24 +5,24 @@ use std::time::Duration;
 use anyhow::Context as _;
 use tandem_core::layout::EPISODE_STEPS;
 use tandem_learner::Clock;
-use tandem_net::Dial;
+use tandem_net::ClientConfig;
 use tandem_proto::pb;
 use tandem_proto::pb::learner_client::LearnerClient;
 use tonic::Streaming;
 
 use super::ROLLOUTS;
-use super::children::{self, Place, Process, Service};
 use super::row::{Reading, Rounds, Row};
+use super::workspace::{Process, Service, Workspace};
 
-/// A learner that is to be given workers.
-pub(super) struct Stage<'a> {
-    pub(super) place: &'a Place,
+/// Measures rounds of real workers of one learner.
+pub(super) struct RealWorkerBench<'a> {
+    pub(super) workspace: &'a Workspace,
     pub(super) learner: &'a Service,
     pub(super) n_slots: usize,
 }
 
-impl Stage<'_> {
-    /// Starts workers, measures `n_rounds` rounds from the end of one that all of them were in, and ends them.
+impl RealWorkerBench<'_> {
+    /// Starts workers, measures `n_rounds` rounds after one in which all of them took part, and ends the workers.
     pub(super) async fn run(
         &self,
         n_workers: usize,
@@ -30,24 +30,24 @@ impl Stage<'_> {
         clock: &Clock,
     ) -> anyhow::Result<Row> {
         let name = |idx| format!("{n_workers}-{idx}");
-        let start = |idx| children::worker(self.place, &self.learner.address, &name(idx));
+        let start = |idx| self.workspace.worker(&self.learner.address, &name(idx));
         let mut workers = (0..n_workers).map(start).collect::<anyhow::Result<Vec<Process>>>()?;
         let pids: Vec<u32> = workers.iter().map(|worker| worker.pid).collect();
         let learner = self.learner.process.pid;
-        let mut marks = Marks::of(&self.learner.address, clock).await?;
-        marks.all_joined(&format!("{n_workers}-"), n_workers).await?;
-        marks.next().await?;
-        let mut began = vec![marks.next().await?];
+        let mut round_ends = RoundEnds::of(&self.learner.address, clock).await?;
+        round_ends.all_joined(&format!("{n_workers}-"), n_workers).await?;
+        round_ends.next().await?;
+        let mut starts = vec![round_ends.next().await?];
         let before = Reading::take(clock(), learner, &pids);
         for _ in 0..n_rounds {
-            began.push(marks.next().await?);
+            starts.push(round_ends.next().await?);
         }
         let after = Reading::take(clock(), learner, &pids);
         let env_steps = self.n_slots * ROLLOUTS * EPISODE_STEPS;
-        let rounds = Rounds { env_steps, began };
+        let rounds = Rounds { env_steps, starts };
         let named = (format!("workers-{n_workers}"), n_workers);
         let row = Row::between((&before, &after), named, &rounds, learner);
-        anyhow::ensure!(workers.iter_mut().all(Process::is_alive), "a worker has ended by itself");
+        anyhow::ensure!(workers.iter_mut().all(Process::is_alive), "a worker has ended");
         let ending = workers.into_iter().map(|worker| tokio::spawn(worker.end()));
         for ended in ending.collect::<Vec<_>>() {
             ended.await?;
@@ -56,21 +56,21 @@ impl Stage<'_> {
     }
 }
 
-/// The ends of rounds, as the learner tells of them.
-struct Marks<'a> {
+/// The ends of rounds, from the learner's progress.
+struct RoundEnds<'a> {
     progress: Streaming<pb::Progress>,
     round: Option<u64>,
     clock: &'a Clock,
 }
 
-impl<'a> Marks<'a> {
+impl<'a> RoundEnds<'a> {
     async fn of(learner: &str, clock: &'a Clock) -> anyhow::Result<Self> {
-        let mut client = LearnerClient::new(Dial::default().link(learner)?);
+        let mut client = LearnerClient::new(ClientConfig::default().channel(learner)?);
         let progress = client.watch(pb::WatchRequest {}).await?.into_inner();
         Ok(Self { progress, round: None, clock })
     }
 
-    /// Waits until `n` workers are there whose names begin with `prefix`.
+    /// Waits until `n` workers have joined whose names begin with `prefix`.
     async fn all_joined(&mut self, prefix: &str, n: usize) -> anyhow::Result<()> {
         loop {
             let progress = self.message().await?;
@@ -82,7 +82,7 @@ impl<'a> Marks<'a> {
         }
     }
 
-    /// When the next round has ended.
+    /// Waits for the end of the next round and returns its time.
     async fn next(&mut self) -> anyhow::Result<Duration> {
         loop {
             let round = self.message().await?.round;

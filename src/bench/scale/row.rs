@@ -1,4 +1,4 @@
-//! One setting's figures, and the tables that people read.
+//! Results of one setting, and their table.
 
 use std::fmt;
 use std::time::Duration;
@@ -10,7 +10,7 @@ use super::measures::{Bound, Load, knee, median_and_longest};
 
 const MB: f64 = 1e6;
 
-/// What a number of workers came to.
+/// Results for one number of workers.
 #[derive(Debug, Clone)]
 pub(super) struct Row {
     pub(super) name: String,
@@ -24,21 +24,21 @@ pub(super) struct Row {
     pub(super) peak_mib: f64,
     pub(super) median_round_s: f64,
     pub(super) longest_round_s: f64,
-    /// Only of workers in this process.
+    /// Only for workers in this process.
     pub(super) calls: Option<Calls>,
 }
 
-/// How long calls took, and what went wrong.
+/// Latencies of calls, and counts of failures.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Calls {
-    /// From the moment at which a slot was there and a worker had asked to the worker's having it.
+    /// From the moment at which a slot was available and requested until it was assigned.
     pub(super) assignment: Percentiles,
     pub(super) parameters: Percentiles,
     pub(super) delivery: Percentiles,
-    /// Calls that failed and were made again.
+    /// Failed calls, which were repeated.
     pub(super) n_failed: u64,
-    /// Slots that were given to a second worker.
-    pub(super) n_covered: u64,
+    /// Slots that were assigned to a second worker.
+    pub(super) n_reassigned: u64,
 }
 
 #[derive(Debug, Clone, Copy, Default)]
@@ -47,7 +47,7 @@ pub(super) struct Percentiles {
     pub(super) p99: Duration,
 }
 
-/// The clocks of processes at one moment.
+/// Usage of the processes and of the machine at one moment.
 pub(super) struct Reading {
     at: Duration,
     learner: ProcessUsage,
@@ -62,14 +62,15 @@ impl Reading {
     }
 }
 
-/// The rounds that were measured: when each began, the first and the last that bound the span included.
+/// The measured rounds.
 pub(super) struct Rounds {
     pub(super) env_steps: usize,
-    pub(super) began: Vec<Duration>,
+    /// When each round started, from the first one to the one after the last.
+    pub(super) starts: Vec<Duration>,
 }
 
 impl Row {
-    /// What happened between two readings.
+    /// Computes the results between two readings.
     pub(super) fn between(
         (before, after): (&Reading, &Reading),
         (name, n_workers): (String, usize),
@@ -80,13 +81,13 @@ impl Row {
         let (spent, of_workers) =
             (after.learner.since(before.learner), after.workers.since(before.workers));
         let n_cores = std::thread::available_parallelism().map_or(1, std::num::NonZero::get) as f64;
-        let began = &rounds.began;
-        let rounds_s = match (began.first(), began.last()) {
+        let starts = &rounds.starts;
+        let rounds_s = match (starts.first(), starts.last()) {
             (Some(first), Some(last)) if last > first => (*last - *first).as_secs_f64(),
             _ => f64::INFINITY,
         };
-        let rounds_per_s = began.len().saturating_sub(1) as f64 / rounds_s;
-        let (median, longest) = median_and_longest(began).unwrap_or_default();
+        let rounds_per_s = starts.len().saturating_sub(1) as f64 / rounds_s;
+        let (median, longest) = median_and_longest(starts).unwrap_or_default();
         let memory = ResidentMemory::of(learner);
         Self {
             name,
@@ -140,7 +141,7 @@ impl Row {
                 figures.push(figure(&format!("{what}/p99"), millis(p99), "ms"));
             }
             figures.push(figure("failed-calls", calls.n_failed as f64, "calls"));
-            figures.push(figure("covered-slots", calls.n_covered as f64, "slots"));
+            figures.push(figure("covered-slots", calls.n_reassigned as f64, "slots"));
         }
         figures
     }
@@ -150,17 +151,17 @@ fn millis(time: Duration) -> f64 {
     1e3 * time.as_secs_f64()
 }
 
-/// Everything that was measured.
+/// All results.
 #[derive(Debug, Default)]
 pub(in crate::bench) struct Scale {
     pub(super) real: Vec<Row>,
     pub(super) idle: Vec<Row>,
-    /// How long it took until every idle worker had joined.
+    /// Seconds until all idle workers had joined.
     pub(super) joined_s: Option<f64>,
 }
 
 impl Scale {
-    /// The knee's number of workers, and what bounds the numbers beyond it.
+    /// Returns the number of workers beyond which throughput saturates, and the bottleneck there.
     fn knee(&self) -> Option<(usize, Bound)> {
         let points: Vec<_> =
             self.real.iter().map(|row| (row.n_workers, row.env_steps_per_s)).collect();
@@ -176,7 +177,7 @@ impl Scale {
         }
         if let Some((n_workers, bound)) = self.knee() {
             let name = "scale/knee".to_owned();
-            figures.push(Figure { name, value: n_workers as f64, unit: bound.words() });
+            figures.push(Figure { name, value: n_workers as f64, unit: bound.text() });
         }
         figures
     }
@@ -211,14 +212,14 @@ impl fmt::Display for Scale {
             ] {
                 write!(out, "{what} p50 {:.1} p99 {:.1} ms, ", millis(p50), millis(p99))?;
             }
-            writeln!(out, "{} calls failed, {} slots covered", calls.n_failed, calls.n_covered)?;
+            writeln!(out, "{} calls failed, {} slots covered", calls.n_failed, calls.n_reassigned)?;
         }
         if let Some(seconds) = self.joined_s {
             writeln!(out, "all idle workers had joined after {seconds:.2} s")?;
         }
         match self.knee() {
             Some((n_workers, bound)) => {
-                writeln!(out, "knee: {n_workers} real workers; {}", bound.words())
+                writeln!(out, "knee: {n_workers} real workers; {}", bound.text())
             }
             None if self.real.len() > 1 => writeln!(out, "knee: not reached"),
             None => Ok(()),

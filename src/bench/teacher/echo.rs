@@ -1,8 +1,8 @@
-//! A teacher that gives everybody the same answer: what the messages themselves cost.
+//! A teacher service that returns a constant response, to measure the cost of the messages alone.
 
 use std::pin::Pin;
 
-use tandem_net::Gate;
+use tandem_net::ServerConfig;
 use tandem_proto::pb;
 use tandem_proto::pb::teacher_server::{Teacher, TeacherServer};
 use tokio::net::TcpListener;
@@ -10,18 +10,20 @@ use tokio_stream::{Stream, StreamExt as _};
 use tokio_util::sync::CancellationToken;
 use tonic::{Request, Response, Status, Streaming};
 
-/// Answers every question with `answer`, until `shutdown` is cancelled.
+/// Responds to every request with `response` until `shutdown` is cancelled.
 pub(super) async fn serve(
-    answer: pb::AdviseResponse,
+    response: pb::AdviseResponse,
     listener: TcpListener,
     shutdown: CancellationToken,
 ) -> anyhow::Result<()> {
-    let router = Gate::default().router(TeacherServer::new(Echo { answer })).await?;
+    let router = ServerConfig::default()
+        .router(TeacherServer::new(Echo { response }), tandem_proto::FILE_DESCRIPTOR_SET)
+        .await?;
     Ok(tandem_net::serve(router, listener, shutdown).await?)
 }
 
 struct Echo {
-    answer: pb::AdviseResponse,
+    response: pb::AdviseResponse,
 }
 
 #[tonic::async_trait]
@@ -33,50 +35,50 @@ impl Teacher for Echo {
         &self,
         _: Request<pb::AdviseRequest>,
     ) -> Result<Response<pb::AdviseResponse>, Status> {
-        Ok(Response::new(self.answer.clone()))
+        Ok(Response::new(self.response.clone()))
     }
 
     async fn advise_stream(
         &self,
         requests: Request<Streaming<pb::AdviseRequest>>,
     ) -> Result<Response<Self::AdviseStreamStream>, Status> {
-        let answer = self.answer.clone();
-        let answers = requests.into_inner().map(move |request| request.map(|_| answer.clone()));
-        Ok(Response::new(Box::pin(answers)))
+        let response = self.response.clone();
+        let responses = requests.into_inner().map(move |request| request.map(|_| response.clone()));
+        Ok(Response::new(Box::pin(responses)))
     }
 
     async fn describe(
         &self,
         _: Request<pb::DescribeRequest>,
     ) -> Result<Response<pb::DescribeResponse>, Status> {
-        Err(Status::unimplemented("an echo only"))
+        Err(Status::unimplemented("not supported by the echo service"))
     }
 
     async fn open_account(
         &self,
         _: Request<pb::OpenAccountRequest>,
     ) -> Result<Response<pb::Account>, Status> {
-        Err(Status::unimplemented("an echo only"))
+        Err(Status::unimplemented("not supported by the echo service"))
     }
 
     async fn get_account(
         &self,
         _: Request<pb::GetAccountRequest>,
     ) -> Result<Response<pb::Account>, Status> {
-        Err(Status::unimplemented("an echo only"))
+        Err(Status::unimplemented("not supported by the echo service"))
     }
 
     async fn open_leases(
         &self,
         _: Request<pb::OpenLeasesRequest>,
     ) -> Result<Response<pb::OpenLeasesResponse>, Status> {
-        Err(Status::unimplemented("an echo only"))
+        Err(Status::unimplemented("not supported by the echo service"))
     }
 
     async fn settle_leases(
         &self,
         _: Request<pb::SettleLeasesRequest>,
     ) -> Result<Response<pb::Account>, Status> {
-        Err(Status::unimplemented("an echo only"))
+        Err(Status::unimplemented("not supported by the echo service"))
     }
 }

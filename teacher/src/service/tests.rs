@@ -22,7 +22,7 @@ async fn serve_open(
     listener: TcpListener,
     shutdown: CancellationToken,
 ) -> Result<(), Error> {
-    serve_advisor(advisor, listener, &Gate::default(), shutdown, Pacing::Concurrent).await
+    serve_advisor(advisor, listener, &ServerConfig::default(), shutdown, Pacing::Concurrent).await
 }
 
 /// A running service and its client.

@@ -1,4 +1,4 @@
-//! A worker against a learner and a teacher on the loopback interface that fail in every way they can.
+//! A worker with a learner and a teacher on the loopback interface that fail in various ways.
 
 mod support;
 
@@ -7,19 +7,23 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use tandem_core::{Episode, EpisodeKind};
-use tandem_net::Pacing;
-use tandem_worker::{Error, Patience, WorkerConfig, run_with};
+use tandem_net::{Backoff, ClientConfig, Pacing};
+use tandem_policy::actor_digest;
+use tandem_telemetry::read_episode;
+use tandem_worker::{Error, Timeouts, WorkerConfig, run_with};
 use tokio_util::sync::CancellationToken;
 use tonic::Status;
 
 use support::learner::{Call, FakeLearner, Fault};
 use support::teacher::FakeTeacher;
-use support::{Server, orders, terms};
+use support::{LAYOUT, Server, actor, orders, terms};
 
-const PATIENCE: Patience = Patience {
-    first_pause: Duration::from_millis(1),
-    longest_pause: Duration::from_millis(10),
-    answer: Duration::from_secs(20),
+const TIMEOUTS: Timeouts = Timeouts {
+    backoff: Backoff {
+        first_pause: Duration::from_millis(1),
+        max_pause: Duration::from_millis(10),
+    },
+    call: Duration::from_secs(20),
     work: Duration::from_secs(20),
     advice: Duration::from_secs(20),
     drain: Duration::from_millis(20),
@@ -27,7 +31,7 @@ const PATIENCE: Patience = Patience {
 
 fn config(learner: &Server, teacher: Option<&Server>) -> WorkerConfig {
     WorkerConfig {
-        dial: tandem_net::Dial::default(),
+        client: ClientConfig::default(),
         learner: learner.address(),
         teacher: teacher.map(Server::address),
         name: "test".to_owned(),
@@ -36,26 +40,26 @@ fn config(learner: &Server, teacher: Option<&Server>) -> WorkerConfig {
     }
 }
 
-/// Works for `learner` until its slots are all in; gives the episodes that it took, by kind and number.
-async fn work_through(
+/// Runs a worker until all slots of `learner` are delivered; returns the delivered episodes by kind and number.
+async fn play_run(
     learner: &Arc<FakeLearner>,
     teacher: &Arc<FakeTeacher>,
 ) -> BTreeMap<(bool, u64), Episode> {
     let (learner_server, teacher_server) = (Server::learner(learner), Server::teacher(teacher));
     let config = config(&learner_server, Some(&teacher_server));
-    run_with(config, PATIENCE, CancellationToken::new()).await.expect("the run ends");
+    run_with(config, TIMEOUTS, CancellationToken::new()).await.expect("the run ends");
     learner.episodes()
 }
 
-async fn undisturbed() -> BTreeMap<(bool, u64), Episode> {
-    work_through(&Arc::new(FakeLearner::new(orders())), &Arc::new(FakeTeacher::default())).await
+async fn episodes_without_faults() -> BTreeMap<(bool, u64), Episode> {
+    play_run(&Arc::new(FakeLearner::new(orders())), &Arc::new(FakeTeacher::default())).await
 }
 
 #[tokio::test]
 async fn every_slot_is_played_and_delivered() {
     let teacher = Arc::new(FakeTeacher::default());
     let learner = Arc::new(FakeLearner::new(orders()));
-    let episodes = work_through(&learner, &teacher).await;
+    let episodes = play_run(&learner, &teacher).await;
     let played: Vec<(bool, u64)> = episodes.keys().copied().collect();
     assert_eq!(played, [(false, 0), (false, 1), (false, 2), (false, 3), (true, 0), (true, 1)]);
     for ((is_evaluation, number), episode) in &episodes {
@@ -70,11 +74,11 @@ async fn every_slot_is_played_and_delivered() {
 }
 
 #[tokio::test]
-async fn a_learner_that_fails_now_and_then_gets_the_same_episodes() {
-    let expected = undisturbed().await;
+async fn a_learner_with_failing_calls_gets_the_same_episodes() {
+    let expected = episodes_without_faults().await;
     let check = async |call, nth, fault| {
         let learner = Arc::new(FakeLearner::new(orders()).with_fault(call, nth, fault));
-        let episodes = work_through(&learner, &Arc::new(FakeTeacher::default())).await;
+        let episodes = play_run(&learner, &Arc::new(FakeTeacher::default())).await;
         assert_eq!(episodes, expected, "{call:?} {nth}");
         learner
     };
@@ -95,13 +99,13 @@ async fn a_learner_that_fails_now_and_then_gets_the_same_episodes() {
 }
 
 #[tokio::test]
-async fn a_learner_that_dies_and_comes_back_gets_the_same_episodes() {
-    let expected = undisturbed().await;
+async fn a_restarted_learner_gets_the_same_episodes() {
+    let expected = episodes_without_faults().await;
     let (learner, mut at_fault) = FakeLearner::new(orders()).hanging_at(Call::Submit, 1);
     let (learner, teacher) = (Arc::new(learner), Arc::new(FakeTeacher::default()));
     let (first_life, teacher_server) = (Server::learner(&learner), Server::teacher(&teacher));
     let config = config(&first_life, Some(&teacher_server));
-    let worker = tokio::spawn(run_with(config, PATIENCE, CancellationToken::new()));
+    let worker = tokio::spawn(run_with(config, TIMEOUTS, CancellationToken::new()));
     at_fault.recv().await.expect("the learner gets there");
     let listener = first_life.kill();
     learner.forget_workers();
@@ -111,8 +115,8 @@ async fn a_learner_that_dies_and_comes_back_gets_the_same_episodes() {
 }
 
 #[tokio::test]
-async fn a_stream_that_breaks_within_an_episode_costs_nothing() {
-    let expected = undisturbed().await;
+async fn a_stream_that_breaks_within_an_episode_changes_nothing() {
+    let expected = episodes_without_faults().await;
     for fault in [
         Status::unavailable("restarting"),
         Status::not_found("no account yet"),
@@ -120,36 +124,41 @@ async fn a_stream_that_breaks_within_an_episode_costs_nothing() {
     ] {
         let teacher = Arc::new(FakeTeacher::default().failing_at([0, 7, 8, 60], &fault));
         let learner = Arc::new(FakeLearner::new(orders()));
-        assert_eq!(work_through(&learner, &teacher).await, expected, "{fault:?}");
+        assert_eq!(play_run(&learner, &teacher).await, expected, "{fault:?}");
         assert_eq!(learner.n_calls(Call::Join), 1);
     }
 }
 
 #[tokio::test]
-async fn an_episode_to_be_recorded_gets_a_log() {
+async fn a_recorded_episode_gets_a_log_with_its_run_and_policy() {
     let logs = tempfile::tempdir().expect("a directory");
     let (learner, teacher) =
         (Arc::new(FakeLearner::new(orders())), Arc::new(FakeTeacher::default()));
     let (learner_server, teacher_server) = (Server::learner(&learner), Server::teacher(&teacher));
     let log_dir = Some(logs.path().join("mcap"));
     let config = WorkerConfig { log_dir, ..config(&learner_server, Some(&teacher_server)) };
-    run_with(config, PATIENCE, CancellationToken::new()).await.expect("the run ends");
+    run_with(config, TIMEOUTS, CancellationToken::new()).await.expect("the run ends");
     let names: Vec<_> = std::fs::read_dir(logs.path().join("mcap"))
         .expect("made by the worker")
         .map(|entry| entry.expect("readable").file_name())
         .collect();
     assert_eq!(names, ["eval-000002-001.mcap"]);
+    let log = read_episode(&logs.path().join("mcap").join("eval-000002-001.mcap"));
+    let metadata = log.expect("a whole log").metadata;
+    assert_eq!(metadata.run, "run-7", "the run's name, not the account's");
+    assert_eq!(metadata.policy_digest, actor_digest(LAYOUT, &actor(2)));
+    assert_ne!(metadata.policy_digest, actor_digest(LAYOUT, &actor(1)));
 }
 
 #[tokio::test]
-async fn a_teacher_that_never_answers_is_asked_again() {
-    let expected = undisturbed().await;
+async fn a_request_without_an_answer_is_repeated() {
+    let expected = episodes_without_faults().await;
     let (teacher, _at_fault) = FakeTeacher::default().hanging_at(3);
     let (learner, teacher) = (Arc::new(FakeLearner::new(orders())), Arc::new(teacher));
     let (learner_server, teacher_server) = (Server::learner(&learner), Server::teacher(&teacher));
     let config = config(&learner_server, Some(&teacher_server));
-    let patience = Patience { advice: Duration::from_millis(40), ..PATIENCE };
-    run_with(config, patience, CancellationToken::new()).await.expect("the run ends");
+    let timeouts = Timeouts { advice: Duration::from_millis(40), ..TIMEOUTS };
+    run_with(config, timeouts, CancellationToken::new()).await.expect("the run ends");
     assert_eq!(learner.episodes(), expected);
 }
 
@@ -160,7 +169,7 @@ async fn advice_on_other_steps_ends_the_worker() {
     let (learner_server, teacher_server) = (Server::learner(&learner), Server::teacher(&teacher));
     let config = config(&learner_server, Some(&teacher_server));
     let error =
-        run_with(config, PATIENCE, CancellationToken::new()).await.expect_err("one answer of two");
+        run_with(config, TIMEOUTS, CancellationToken::new()).await.expect_err("one answer of two");
     assert_eq!(error.to_string(), "cannot ask the teacher");
     assert!(learner.episodes().is_empty());
 }
@@ -173,7 +182,7 @@ async fn refusals_end_the_worker_with_one_clear_error() {
         Fault::Answer(Status::failed_precondition("this run needs version 9")),
     ));
     let server = Server::learner(&learner);
-    let error = run_with(config(&server, None), PATIENCE, CancellationToken::new())
+    let error = run_with(config(&server, None), TIMEOUTS, CancellationToken::new())
         .await
         .expect_err("refused");
     assert!(matches!(error, Error::Protocol { .. }), "{error:?}");
@@ -184,7 +193,7 @@ async fn refusals_end_the_worker_with_one_clear_error() {
 #[tokio::test]
 async fn an_advised_run_needs_a_teacher() {
     let server = Server::learner(&Arc::new(FakeLearner::new(orders())));
-    let error = run_with(config(&server, None), PATIENCE, CancellationToken::new())
+    let error = run_with(config(&server, None), TIMEOUTS, CancellationToken::new())
         .await
         .expect_err("no teacher");
     assert!(
@@ -199,7 +208,7 @@ async fn a_worker_that_waits_for_its_teacher_can_be_stopped() {
     let (learner_server, teacher_server) = (Server::learner(&learner), Server::teacher(&teacher));
     let shutdown = CancellationToken::new();
     let config = config(&learner_server, Some(&teacher_server));
-    let worker = tokio::spawn(run_with(config, PATIENCE, shutdown.clone()));
+    let worker = tokio::spawn(run_with(config, TIMEOUTS, shutdown.clone()));
     at_fault.recv().await.expect("the teacher gets there");
     shutdown.cancel();
     worker.await.expect("no panic").expect("stops without an error");
@@ -207,15 +216,15 @@ async fn a_worker_that_waits_for_its_teacher_can_be_stopped() {
 }
 
 #[tokio::test]
-async fn a_worker_that_is_told_to_stop_delivers_what_it_plays() {
+async fn a_worker_that_is_stopped_delivers_its_slot() {
     let learner = Arc::new(FakeLearner::new(orders()));
-    let (teacher, mut at_fault) = FakeTeacher::default().telling_at(3);
+    let (teacher, mut at_fault) = FakeTeacher::default().signalling_at(3);
     let teacher = Arc::new(teacher);
     let (learner_server, teacher_server) = (Server::learner(&learner), Server::teacher(&teacher));
     let shutdown = CancellationToken::new();
     let config = config(&learner_server, Some(&teacher_server));
-    let patience = Patience { drain: Duration::from_secs(20), ..PATIENCE };
-    let worker = tokio::spawn(run_with(config, patience, shutdown.clone()));
+    let timeouts = Timeouts { drain: Duration::from_secs(20), ..TIMEOUTS };
+    let worker = tokio::spawn(run_with(config, timeouts, shutdown.clone()));
     at_fault.recv().await.expect("the teacher gets there");
     shutdown.cancel();
     worker.await.expect("no panic").expect("stops without an error");

@@ -1,4 +1,4 @@
-//! Fake services and the little run that they serve.
+//! Fake services and the small run that they serve.
 
 pub(crate) mod learner;
 pub(crate) mod teacher;
@@ -9,7 +9,7 @@ use std::sync::Arc;
 use tandem_core::rng::{Stream, episode_rng, uniform};
 use tandem_core::work::{EpisodeOrder, PublishedActor, RunTerms, SlotOrder};
 use tandem_core::{EpisodeKind, Exploration, Layout, Task, WorldSettings};
-use tandem_net::{Gate, GateError, Router};
+use tandem_net::{Router, ServerConfig, ServerConfigError};
 use tandem_proto::pb::learner_server::LearnerServer;
 use tandem_proto::pb::teacher_server::TeacherServer;
 use tokio::runtime::Runtime;
@@ -22,6 +22,7 @@ pub(crate) const LAYOUT: Layout = Layout::new(Task::Push, 2);
 
 pub(crate) fn terms() -> RunTerms {
     RunTerms {
+        run: "run-7".to_owned(),
         layout: LAYOUT,
         account: Some("run".to_owned()),
         exploration: Exploration {
@@ -33,8 +34,8 @@ pub(crate) fn terms() -> RunTerms {
     }
 }
 
-/// Two slots of training, of which episode 3 goes without advice, and one of evaluation with later parameters, of
-/// which episode 1 is to be recorded.
+/// Returns the orders of two training slots, in which episode 3 is not advised, and of one evaluation slot with later
+/// parameters, in which episode 1 is recorded.
 pub(crate) fn orders() -> Vec<SlotOrder> {
     let slot = |slot, parameter_version, kind, numbers: [u64; 2]| SlotOrder {
         slot,
@@ -60,7 +61,7 @@ fn order(number: u64, kind: EpisodeKind) -> EpisodeOrder {
     }
 }
 
-/// A small network whose weights follow from its version.
+/// Returns a small network whose weights are determined by its version.
 pub(crate) fn actor(version: u64) -> PublishedActor {
     let (n_inputs, n_hidden) = (LAYOUT.n_observation() + LAYOUT.n_goal(), 8);
     let n_parameters = (n_inputs + 1) * n_hidden + (n_hidden + 1) * LAYOUT.n_action();
@@ -77,7 +78,7 @@ pub(crate) fn actor(version: u64) -> PublishedActor {
     }
 }
 
-/// A service with threads of its own, so that it can be killed as a process is.
+/// A service on its own runtime, which can be killed like a process.
 pub(crate) struct Server {
     runtime: Option<Runtime>,
     address: SocketAddr,
@@ -90,27 +91,31 @@ impl Server {
 
     pub(crate) fn learner_on(listener: TcpListener, learner: &Arc<FakeLearner>) -> Self {
         let service = LearnerServer::from_arc(Arc::clone(learner));
-        Self::serve(listener, async { Gate::default().router(service).await })
+        Self::serve(listener, async {
+            ServerConfig::default().router(service, tandem_proto::FILE_DESCRIPTOR_SET).await
+        })
     }
 
     pub(crate) fn teacher(teacher: &Arc<FakeTeacher>) -> Self {
         let listener = TcpListener::bind("127.0.0.1:0").expect("loopback");
         let service = TeacherServer::from_arc(Arc::clone(teacher));
-        Self::serve(listener, async { Gate::default().router(service).await })
+        Self::serve(listener, async {
+            ServerConfig::default().router(service, tandem_proto::FILE_DESCRIPTOR_SET).await
+        })
     }
 
     fn serve(
         listener: TcpListener,
-        router: impl Future<Output = Result<Router, GateError>> + Send + 'static,
+        router: impl Future<Output = Result<Router, ServerConfigError>> + Send + 'static,
     ) -> Self {
         let address = listener.local_addr().expect("bound");
-        listener.set_nonblocking(true).expect("a socket can be made so");
+        listener.set_nonblocking(true).expect("can be set");
         let runtime =
             tokio::runtime::Builder::new_multi_thread().worker_threads(1).enable_all().build();
         let runtime = runtime.expect("a runtime");
         runtime.spawn(async move {
             let listener = tokio::net::TcpListener::from_std(listener).expect("within a runtime");
-            let router = router.await.expect("can be offered");
+            let router = router.await.expect("valid");
             tandem_net::serve(router, listener, CancellationToken::new()).await
         });
         Self { runtime: Some(runtime), address }
@@ -120,11 +125,11 @@ impl Server {
         self.address.to_string()
     }
 
-    /// Drops every connection at once; gives a new socket on the same address.
+    /// Closes all connections at once and returns a new listener on the same address.
     pub(crate) fn kill(mut self) -> TcpListener {
         let runtime = self.runtime.take().expect("taken once, here");
         std::thread::spawn(move || drop(runtime)).join().expect("no panic");
-        TcpListener::bind(self.address).expect("nobody else has taken the port meanwhile")
+        TcpListener::bind(self.address).expect("the port is still free")
     }
 }
 

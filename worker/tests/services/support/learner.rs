@@ -1,4 +1,4 @@
-//! A learner that has a few slots to be played and fails where it is told to.
+//! A learner with a few slots, which fails at configured calls.
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::sync::{Mutex, MutexGuard};
@@ -11,7 +11,7 @@ use tonic::{Request, Response, Status};
 
 use super::{LAYOUT, actor, terms};
 
-/// The calls that can go wrong.
+/// The calls that can fail.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub(crate) enum Call {
     Join,
@@ -20,18 +20,18 @@ pub(crate) enum Call {
     Submit,
 }
 
-/// How a call goes wrong.
+/// The failure of a call.
 #[derive(Debug, Clone)]
 pub(crate) enum Fault {
-    /// Nothing is done.
+    /// The call has no effect and returns this status.
     Answer(Status),
-    /// All is done, but the worker does not hear of it.
+    /// The call takes effect, but its response is lost.
     AnswerLost,
-    /// The learner has lost all memory of its workers and of the slots they play.
+    /// The learner forgets its workers and their slots.
     WorkersForgotten,
-    /// The learner is stopped before the run's end, and another goes on with the run.
+    /// The learner is stopped before the end of the run, and another one continues the run.
     Stopped,
-    /// Never answered.
+    /// The call never returns.
     Hang(mpsc::Sender<()>),
 }
 
@@ -77,12 +77,12 @@ impl FakeLearner {
         Self { state: Mutex::new(state), fault: None }
     }
 
-    /// Lets the `nth` call of a kind, counted from 0, go wrong.
+    /// Adds a fault to the `nth` call of a kind, counted from 0.
     pub(crate) fn with_fault(self, call: Call, nth: usize, fault: Fault) -> Self {
         Self { fault: Some((call, nth, fault)), ..self }
     }
 
-    /// Leaves one call without an answer, and tells when it has come.
+    /// Leaves one call without a response. The receiver gets a message when the call arrives.
     pub(crate) fn hanging_at(self, call: Call, nth: usize) -> (Self, mpsc::Receiver<()>) {
         let (reached, at_fault) = mpsc::channel(1);
         (self.with_fault(call, nth, Fault::Hang(reached)), at_fault)
@@ -96,7 +96,7 @@ impl FakeLearner {
         self.state().n_calls.get(&call).copied().unwrap_or(0)
     }
 
-    /// What has been delivered, by whether it is an evaluation and number.
+    /// Returns the delivered episodes, by whether they are evaluations and by number.
     pub(crate) fn episodes(&self) -> BTreeMap<(bool, u64), Episode> {
         self.state().episodes.clone()
     }
@@ -105,7 +105,7 @@ impl FakeLearner {
         self.state.lock().expect("no handler panics")
     }
 
-    /// Counts a call; gives whether its answer shall be lost.
+    /// Counts a call and applies its fault; returns whether the response is to be lost.
     async fn arrive(&self, call: Call) -> Result<bool, Status> {
         let nth = {
             let mut state = self.state();

@@ -1,4 +1,4 @@
-//! A teacher whose verdicts follow from the question alone, on a stream that breaks where it is told to.
+//! A teacher whose advice depends on the request alone, on a stream that fails at configured requests.
 
 use std::collections::BTreeSet;
 use std::sync::Arc;
@@ -18,7 +18,7 @@ pub(crate) struct FakeTeacher(Arc<Inner>);
 
 #[derive(Default)]
 struct Inner {
-    n_questions: Mutex<usize>,
+    n_requests: Mutex<usize>,
     charged: Mutex<BTreeSet<(u64, u32)>>,
     faults: Vec<(usize, Fault)>,
 }
@@ -26,33 +26,33 @@ struct Inner {
 enum Fault {
     /// The stream ends with this status.
     End(Status),
-    /// Never answered.
+    /// The request gets no response.
     Hang(mpsc::Sender<()>),
-    /// Answered, but not before this was told.
-    Tell(mpsc::Sender<()>),
-    /// Answered, but for the last step.
+    /// The response follows this message.
+    Signal(mpsc::Sender<()>),
+    /// The response lacks the last step.
     Forget,
 }
 
 impl FakeTeacher {
-    /// Ends the stream when these questions come, counted from 0 over all streams.
-    pub(crate) fn failing_at(self, questions: [usize; 4], status: &Status) -> Self {
-        Self::with_faults(questions.map(|nth| (nth, Fault::End(status.clone()))).into())
+    /// Ends the stream at these requests, counted from 0 over all streams.
+    pub(crate) fn failing_at(self, requests: [usize; 4], status: &Status) -> Self {
+        Self::with_faults(requests.map(|nth| (nth, Fault::End(status.clone()))).into())
     }
 
-    /// Leaves a question without an answer, and tells when it has come.
+    /// Leaves a request without a response. The receiver gets a message when the request arrives.
     pub(crate) fn hanging_at(self, nth: usize) -> (Self, mpsc::Receiver<()>) {
         let (reached, at_fault) = mpsc::channel(1);
         (Self::with_faults(vec![(nth, Fault::Hang(reached))]), at_fault)
     }
 
-    /// Tells when a question has come, and answers it.
-    pub(crate) fn telling_at(self, nth: usize) -> (Self, mpsc::Receiver<()>) {
+    /// Answers a request. The receiver gets a message when the request arrives.
+    pub(crate) fn signalling_at(self, nth: usize) -> (Self, mpsc::Receiver<()>) {
         let (reached, at_fault) = mpsc::channel(1);
-        (Self::with_faults(vec![(nth, Fault::Tell(reached))]), at_fault)
+        (Self::with_faults(vec![(nth, Fault::Signal(reached))]), at_fault)
     }
 
-    /// Leaves the last step out of an answer.
+    /// Omits the last step of a response.
     pub(crate) fn forgetful_at(self, nth: usize) -> Self {
         Self::with_faults(vec![(nth, Fault::Forget)])
     }
@@ -61,7 +61,7 @@ impl FakeTeacher {
         Self(Arc::new(Inner { faults, ..Inner::default() }))
     }
 
-    /// Units charged to an episode.
+    /// Returns the units charged to an episode.
     pub(crate) fn n_charged(&self, episode: u64) -> u32 {
         let charged = self.0.charged.lock().expect("no handler panics");
         charged.iter().map(|(charged_to, _)| u32::from(*charged_to == episode)).sum()
@@ -103,9 +103,9 @@ impl Inner {
     }
 
     fn next_fault(&self) -> Option<&Fault> {
-        let mut n_questions = self.n_questions.lock().expect("no handler panics");
-        let nth = *n_questions;
-        *n_questions += 1;
+        let mut n_requests = self.n_requests.lock().expect("no handler panics");
+        let nth = *n_requests;
+        *n_requests += 1;
         self.faults.iter().find(|(at, _)| *at == nth).map(|(_, fault)| fault)
     }
 
@@ -127,7 +127,7 @@ impl Inner {
                     reached.send(()).await.ok();
                     std::future::pending::<()>().await;
                 }
-                Some(Fault::Tell(reached)) => {
+                Some(Fault::Signal(reached)) => {
                     reached.send(()).await.ok();
                 }
                 Some(Fault::Forget) => {

@@ -1,0 +1,125 @@
+//! A channel to a service that sends the token and reports failures in one line.
+
+use std::error::Error;
+use std::future::Future;
+use std::pin::Pin;
+use std::sync::Arc;
+use std::task::{Context, Poll};
+
+use http::header::{AUTHORIZATION, HeaderValue};
+use tandem_core::text::{causes, error_chain};
+use tonic::body::Body;
+use tonic::transport::Channel;
+use tonic::{Code, Status};
+use tower::Service;
+
+use crate::tls_probe::FirstByte;
+use crate::wrong_service::unknown_call;
+
+/// A channel that connects on first use, reconnects after a loss, and sends the token, if there is one, with each call.
+///
+/// A call that does not reach the service, or that the service rejects for its token, fails with a status whose message
+/// names the address and the remedy: `UNAVAILABLE`, which may pass, or `UNAUTHENTICATED`, which is final. A call that
+/// the service does not know fails with `UNIMPLEMENTED` and a message that names the service at that address.
+#[derive(Debug, Clone)]
+pub struct AuthChannel {
+    channel: Channel,
+    target: Arc<Target>,
+}
+
+/// The service that a channel calls.
+#[derive(Debug)]
+pub(crate) struct Target {
+    /// The address as the caller gave it.
+    pub(crate) address: String,
+    /// Set if the channel uses TLS.
+    pub(crate) uses_tls: bool,
+    /// The header with the token.
+    pub(crate) authorization: Option<HeaderValue>,
+    /// The first byte that the latest connection received.
+    pub(crate) first_byte: FirstByte,
+}
+
+impl AuthChannel {
+    pub(crate) fn new(channel: Channel, target: Target) -> Self {
+        Self { channel, target: Arc::new(target) }
+    }
+}
+
+impl Service<http::Request<Body>> for AuthChannel {
+    type Response = http::Response<Body>;
+    type Error = Status;
+    type Future = Pin<Box<dyn Future<Output = Result<Self::Response, Status>> + Send>>;
+
+    fn poll_ready(&mut self, context: &mut Context<'_>) -> Poll<Result<(), Status>> {
+        self.channel.poll_ready(context).map_err(|error| self.target.unavailable(error))
+    }
+
+    fn call(&mut self, mut request: http::Request<Body>) -> Self::Future {
+        if let Some(authorization) = &self.target.authorization {
+            request.headers_mut().insert(AUTHORIZATION, authorization.clone());
+        }
+        let path = request.uri().path().to_owned();
+        let (call, target) = (self.channel.call(request), Arc::clone(&self.target));
+        Box::pin(async move {
+            match call.await {
+                Ok(response) => target.rejection(&path, &response).map_or(Ok(response), Err),
+                Err(error) => Err(target.unavailable(error)),
+            }
+        })
+    }
+}
+
+impl Target {
+    /// Returns the status of a call that was rejected for its token or its path; `None` when it was accepted.
+    fn rejection(&self, path: &str, response: &http::Response<Body>) -> Option<Status> {
+        let address = &self.address;
+        if let Some(status) = unknown_call(address, path, response) {
+            return Some(status);
+        }
+        Status::from_header_map(response.headers())
+            .filter(|status| status.code() == Code::Unauthenticated)
+            .map(|_| {
+                Status::unauthenticated(match self.authorization {
+                    Some(_) => format!(
+                        "{address} does not accept the token: name the file with the service's own token in --token-file"
+                    ),
+                    None => format!("{address} requires a token: name its file in --token-file"),
+                })
+            })
+    }
+
+    /// Returns the status of a call that did not reach the service.
+    fn unavailable(&self, error: tonic::transport::Error) -> Status {
+        let (address, chain) = (&self.address, error_chain(&error));
+        let message = match (self.uses_tls, self.first_byte.is_tls()) {
+            (true, Some(false)) => format!(
+                "{address} does not speak TLS: leave --tls-ca out, or start it with --tls-cert and --tls-key"
+            ),
+            (false, Some(true)) => {
+                format!("{address} speaks TLS: name its authority's certificate in --tls-ca")
+            }
+            (true, _) if is_certificate_rejected(&error) => {
+                format!("{address} is not trusted, see --tls-ca: {chain}")
+            }
+            _ => format!("{address} does not answer: {chain}"),
+        };
+        match Status::from_error(Box::new(error)).code() {
+            code @ (Code::Cancelled | Code::DeadlineExceeded) => Status::new(code, message),
+            _ => Status::unavailable(message),
+        }
+    }
+}
+
+/// Returns whether the client rejected the service's certificate.
+fn is_certificate_rejected(error: &(dyn Error + 'static)) -> bool {
+    causes(error).any(|cause| {
+        // `io::Error::source` skips the wrapped error and returns that error's source.
+        let wrapped = cause.downcast_ref::<std::io::Error>().and_then(|error| error.get_ref());
+        let tls = match wrapped {
+            Some(wrapped) => wrapped.downcast_ref(),
+            None => cause.downcast_ref(),
+        };
+        matches!(tls, Some(rustls::Error::InvalidCertificate(_)))
+    })
+}

@@ -1,0 +1,64 @@
+//! The command line of `tandem health` and `tandem status`.
+
+use std::time::Duration;
+
+use clap::Args;
+
+use super::{DialArgs, SecretArgs};
+
+#[derive(Debug, Args)]
+#[command(after_help = "\
+Examples:
+  tandem health 127.0.0.1:7000
+  tandem health learner:7000 --service tandem.v1.Learner --tls-ca ca.pem --timeout-s 1
+  tandem health learner:7000 --json
+
+Prints `serving` and exits with code 0, or prints the reason and exits with code 75. No token is required.")]
+pub(crate) struct HealthArgs {
+    /// Address of the service.
+    #[arg(value_name = "ADDR")]
+    pub(crate) address: String,
+    /// Name of one service: tandem.v1.Teacher, tandem.v1.Learner or tandem.v1.Bridge [default: the whole server].
+    #[arg(long, default_value = "", hide_default_value = true, value_name = "NAME")]
+    pub(crate) service: String,
+    /// Timeout in seconds.
+    #[arg(long, default_value = "3", value_name = "S", value_parser = seconds)]
+    pub(crate) timeout_s: Duration,
+    #[command(flatten)]
+    pub(crate) dial: DialArgs,
+    /// Prints one JSON object: address, service, serving, reason.
+    #[arg(long)]
+    pub(crate) json: bool,
+}
+
+#[derive(Debug, Args)]
+#[command(after_help = "\
+Examples:
+  tandem status 127.0.0.1:7000
+  tandem status learner:7000 --token-file token --watch
+  tandem status learner:7000 --token-file token --json
+
+Exit codes: 0 success (with --watch, the run has ended), 64 wrong token, 75 the learner cannot be
+reached.")]
+pub(crate) struct StatusArgs {
+    /// Address of the learner or relay.
+    #[arg(value_name = "ADDR")]
+    pub(crate) address: String,
+    /// Follows the run until it ends: a line for each evaluation, and one every half minute.
+    #[arg(long)]
+    pub(crate) watch: bool,
+    /// Prints one JSON object; with --watch, one per message.
+    #[arg(long)]
+    pub(crate) json: bool,
+    #[command(flatten)]
+    pub(crate) dial: DialArgs,
+    #[command(flatten)]
+    pub(crate) secret: SecretArgs,
+}
+
+/// Parses a positive number of seconds.
+fn seconds(text: &str) -> Result<Duration, String> {
+    let span = text.parse().ok().and_then(|seconds| Duration::try_from_secs_f64(seconds).ok());
+    let span = span.filter(|span| !span.is_zero());
+    span.ok_or_else(|| "expected a number of seconds, more than 0".to_owned())
+}

@@ -1,0 +1,156 @@
+//! The command line of `tandem eval`, `tandem report`, `tandem replay` and the commands for files.
+
+use std::path::PathBuf;
+
+use clap::{Args, Subcommand};
+
+use super::TaskName;
+
+#[derive(Debug, Args)]
+#[command(group = clap::ArgGroup::new("who").required(true), after_help = "\
+Examples:
+  tandem eval --policy policies/student-push.safetensors
+  tandem eval --policy FILE --episodes 400 --seed 7 --json
+  tandem eval --composed-teachers policies/teacher-push.safetensors
+  tandem eval --policy FILE --episodes 1 --record episode.mcap")]
+pub(crate) struct EvalArgs {
+    /// Policy to evaluate.
+    #[arg(long, value_name = "FILE", group = "who")]
+    pub(crate) policy: Option<PathBuf>,
+    /// One-arm policy that controls each arm separately: the baseline without a student.
+    #[arg(long, value_name = "FILE", group = "who")]
+    pub(crate) composed_teachers: Option<PathBuf>,
+    /// Fails unless the policy is for this task.
+    #[arg(long, value_enum)]
+    pub(crate) task: Option<TaskName>,
+    /// Number of arms [default: the policy's; 2 for composed teachers].
+    #[arg(long)]
+    pub(crate) arms: Option<usize>,
+    /// Number of episodes, one per goal.
+    #[arg(long, default_value_t = 240, value_parser = clap::value_parser!(u64).range(1..=1_000_000))]
+    pub(crate) episodes: u64,
+    /// Seed of the test goals. Runs select their best policy on validation goals of another seed.
+    #[arg(long, default_value_t = 777)]
+    pub(crate) seed: u64,
+    /// Records the first episode to this MCAP file.
+    #[arg(long, value_name = "FILE.mcap")]
+    pub(crate) record: Option<PathBuf>,
+    /// Records all episodes to MCAP files in this directory.
+    #[arg(long, value_name = "DIR")]
+    pub(crate) record_dir: Option<PathBuf>,
+    /// Prints one JSON object on the last line of standard output.
+    #[arg(long)]
+    pub(crate) json: bool,
+}
+
+#[derive(Debug, Args)]
+#[command(after_help = "\
+Examples:
+  tandem report runs/sweep-table2
+  tandem report runs/a runs/b --out compared.html --csv compared.csv
+  tandem report trials/student-push --all-trials
+  tandem report docs/results/students --composed-teachers policies/teacher-push.safetensors")]
+pub(crate) struct ReportArgs {
+    /// Run directories, directories that contain runs or trials, or single metrics and trials files.
+    #[arg(required = true, value_name = "DIR|FILE")]
+    pub(crate) paths: Vec<PathBuf>,
+    /// HTML page; curves and plots of trials are written next to it as SVG files [default: report.html, in the
+    /// directory of the sweep or trials if that is the only one].
+    #[arg(long, value_name = "FILE.html")]
+    pub(crate) out: Option<PathBuf>,
+    /// Also writes a CSV file with one line per run.
+    #[arg(long, value_name = "FILE.csv")]
+    pub(crate) csv: Option<PathBuf>,
+    /// Output of `tandem eval --json`, shown as a row with the file's name; can be repeated.
+    #[arg(long = "eval", value_name = "FILE.json")]
+    pub(crate) evals: Vec<PathBuf>,
+    /// Evaluates a one-arm policy on both arms, the baseline without a student; can be repeated.
+    #[arg(long, value_name = "POLICY")]
+    pub(crate) composed_teachers: Vec<PathBuf>,
+    /// Draws all trials, not only failed ones.
+    #[arg(long)]
+    pub(crate) all_trials: bool,
+    /// Prints one JSON object on the last line of standard output.
+    #[arg(long)]
+    pub(crate) json: bool,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct PolicyArgs {
+    #[command(subcommand)]
+    pub(crate) command: PolicyCommand,
+}
+
+#[derive(Debug, Subcommand)]
+pub(crate) enum PolicyCommand {
+    /// Shows sizes, training settings and the digest.
+    Show {
+        /// The policy file.
+        file: PathBuf,
+        /// Prints one JSON object.
+        #[arg(long)]
+        json: bool,
+    },
+}
+
+#[derive(Debug, Args)]
+#[command(after_help = "\
+Examples:
+  tandem replay runs/NAME/mcap/eval-000100-000.mcap     step by step
+  tandem replay runs --verify                           all *.mcap files below
+  tandem replay FILE.mcap --verify --json
+
+All numbers from the simulator are compared bit for bit with the log. The exit code is 65 if one
+differs or a log cannot be read.")]
+pub(crate) struct ReplayArgs {
+    /// Recorded episodes, or directories to search for *.mcap files.
+    #[arg(required = true, value_name = "FILE|DIR")]
+    pub(crate) files: Vec<PathBuf>,
+    /// Compares only. By default a single log is also printed step by step.
+    #[arg(long)]
+    pub(crate) verify: bool,
+    /// Prints one JSON object on the last line of standard output.
+    #[arg(long)]
+    pub(crate) json: bool,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct McapArgs {
+    #[command(subcommand)]
+    pub(crate) command: McapCommand,
+}
+
+#[derive(Debug, Subcommand)]
+pub(crate) enum McapCommand {
+    /// Recovers the log of a writer that was killed.
+    Recover {
+        /// Incomplete log.
+        file: PathBuf,
+        /// Recovered log [default: FILE with `.recovered.mcap` appended].
+        #[arg(long, value_name = "FILE")]
+        to: Option<PathBuf>,
+    },
+}
+
+#[derive(Debug, Args)]
+#[command(after_help = "\
+Examples:
+  tandem picture --policy policies/student-push.safetensors --out arms.svg
+  tandem picture --composed-teachers policies/teacher-push.safetensors --step 20 --out arms.svg")]
+pub(crate) struct PictureArgs {
+    /// Policy that controls the arms.
+    #[arg(long, value_name = "FILE", required_unless_present = "composed_teachers")]
+    pub(crate) policy: Option<PathBuf>,
+    /// One-arm policy that controls both arms.
+    #[arg(long, value_name = "FILE", conflicts_with = "policy")]
+    pub(crate) composed_teachers: Option<PathBuf>,
+    /// Number of the episode, which determines start and goal.
+    #[arg(long, default_value_t = 777)]
+    pub(crate) seed: u64,
+    /// Control step to draw, 0 to 50.
+    #[arg(long, default_value_t = 12, value_parser = clap::value_parser!(u32).range(0..=50))]
+    pub(crate) step: u32,
+    /// Output file.
+    #[arg(long, value_name = "FILE.svg")]
+    pub(crate) out: PathBuf,
+}

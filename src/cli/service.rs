@@ -1,0 +1,166 @@
+//! The command line of `tandem teacher`, `tandem learner`, `tandem worker` and `tandem relay`.
+
+use std::ffi::OsString;
+use std::net::SocketAddr;
+use std::path::PathBuf;
+
+use clap::Args;
+
+/// Access token.
+#[derive(Debug, Args)]
+pub(crate) struct SecretArgs {
+    /// File with the access token of the run's services; required to listen on non-loopback addresses.
+    #[arg(long, value_name = "FILE", env = "TANDEM_TOKEN_FILE")]
+    pub(crate) token_file: Option<PathBuf>,
+}
+
+/// Options of a service.
+#[derive(Debug, Args)]
+pub(crate) struct ListenArgs {
+    /// Address to listen on; port 0 selects a free port. The address is printed as `listening on ADDR`.
+    #[arg(long, default_value = "127.0.0.1:0", value_name = "ADDR")]
+    pub(crate) listen: SocketAddr,
+    /// Enables TLS with this certificate chain (PEM).
+    #[arg(long, value_name = "FILE.pem", requires = "tls_key")]
+    pub(crate) tls_cert: Option<PathBuf>,
+    /// Private key of the certificate (PEM).
+    #[arg(long, value_name = "FILE.pem", requires = "tls_cert")]
+    pub(crate) tls_key: Option<PathBuf>,
+    /// Allows calls without a token from anyone who can reach the address.
+    #[arg(long)]
+    pub(crate) insecure: bool,
+    /// Exits when standard input closes, which happens when the parent process dies.
+    #[arg(long, hide = true)]
+    pub(crate) exit_with_stdin: bool,
+}
+
+/// TLS options of a client.
+#[derive(Debug, Args)]
+pub(crate) struct DialArgs {
+    /// Connects by TLS and trusts certificates signed by this authority (PEM).
+    #[arg(long, value_name = "FILE.pem")]
+    pub(crate) tls_ca: Option<PathBuf>,
+}
+
+#[derive(Debug, Args)]
+#[command(after_help = "\
+Examples:
+  tandem teacher --policy policies/teacher-push.safetensors --listen 127.0.0.1:7001
+  tandem teacher --policy FILE --ledger runs/mine/ledger.sqlite
+  tandem teacher --policy FILE --ledger redis://:PASSWORD@redis:6379   several teachers, one budget
+  tandem teacher --policy FILE --ledger memory                          lost at exit")]
+pub(crate) struct TeacherArgs {
+    /// Policy file of the one-arm teacher.
+    #[arg(long, value_name = "FILE")]
+    pub(crate) policy: PathBuf,
+    /// Storage of the accounts: an SQLite file that no other teacher uses, `redis://[USER:PASSWORD@]HOST[:PORT][/DB]`,
+    /// or `memory`.
+    #[arg(
+        long,
+        value_name = "WHERE",
+        default_value = "ledger.sqlite",
+        env = "TANDEM_LEDGER",
+        hide_env_values = true
+    )]
+    pub(crate) ledger: OsString,
+    #[command(flatten)]
+    pub(crate) listen: ListenArgs,
+    #[command(flatten)]
+    pub(crate) secret: SecretArgs,
+}
+
+#[derive(Debug, Args)]
+#[command(after_help = "\
+Examples:
+  tandem learner --run runs/mine/run.toml --listen 0.0.0.0:7000 --teacher 127.0.0.1:7001 --out runs/mine
+  tandem learner --run runs/mine/run.toml --out runs/mine --resume --teacher 127.0.0.1:7001
+  tandem learner --run run.toml --out runs/mine --start-or-resume --teacher teacher:7001   under a supervisor")]
+pub(crate) struct LearnerArgs {
+    /// Run file (TOML); settings that it omits take the recipe's values.
+    #[arg(long, value_name = "FILE.toml")]
+    pub(crate) run: PathBuf,
+    /// Address of the teacher, if the run uses advice.
+    #[arg(long, value_name = "ADDR")]
+    pub(crate) teacher: Option<String>,
+    /// One-arm policy from which a run of strategy init:teacher starts.
+    #[arg(long, value_name = "FILE")]
+    pub(crate) start_from: Option<PathBuf>,
+    /// Run directory.
+    #[arg(long, value_name = "DIR")]
+    pub(crate) out: PathBuf,
+    /// Resumes from the newest checkpoint. Only the settings stop.*, checkpoint.*, evaluation.recorded_episodes and
+    /// evaluation.test_episodes can differ from those of the run.
+    #[arg(long)]
+    pub(crate) resume: bool,
+    /// Writes the resolved settings to run.toml in the run directory.
+    #[arg(long, hide = true)]
+    pub(crate) keep_run_file: bool,
+    /// The parent process holds the lock on the run directory.
+    #[arg(long, hide = true)]
+    pub(crate) out_is_locked: bool,
+    /// Starts the run, or resumes the one in the run directory: for supervisors that repeat the same command. Writes
+    /// the resolved settings to run.toml in the run directory. If the run is complete, exits at once with code 0.
+    #[arg(long, conflicts_with = "resume")]
+    pub(crate) start_or_resume: bool,
+    /// Number of threads of the update, 1 or 2. It does not affect the result.
+    #[arg(long, default_value_t = 2, value_parser = clap::value_parser!(u8).range(1..=2))]
+    pub(crate) threads: u8,
+    /// Serves Prometheus metrics at http://ADDR/metrics. No token is required: do not expose the address.
+    #[arg(long, value_name = "ADDR")]
+    pub(crate) metrics_listen: Option<SocketAddr>,
+    /// Keeps serving after the run is complete, until the process is asked to exit.
+    #[arg(long)]
+    pub(crate) stay: bool,
+    #[command(flatten)]
+    pub(crate) listen: ListenArgs,
+    #[command(flatten)]
+    pub(crate) dial: DialArgs,
+    #[command(flatten)]
+    pub(crate) secret: SecretArgs,
+}
+
+#[derive(Debug, Args)]
+#[command(after_help = "\
+Examples:
+  tandem worker --connect 127.0.0.1:7000 --teacher 127.0.0.1:7001
+  tandem worker --connect learner:7000 --teacher teacher:7001 --name bench-3")]
+pub(crate) struct WorkerArgs {
+    /// Address of the learner or relay.
+    #[arg(long, value_name = "ADDR")]
+    pub(crate) connect: String,
+    /// Address of the teacher, if the run uses advice.
+    #[arg(long, value_name = "ADDR")]
+    pub(crate) teacher: Option<String>,
+    /// Name of the worker in logs and displays.
+    #[arg(long, default_value = "worker")]
+    pub(crate) name: String,
+    /// Directory for recorded episodes.
+    #[arg(long, value_name = "DIR")]
+    pub(crate) log_dir: Option<PathBuf>,
+    #[command(flatten)]
+    pub(crate) dial: DialArgs,
+    #[command(flatten)]
+    pub(crate) secret: SecretArgs,
+    /// Exits when standard input closes, which happens when the parent process dies.
+    #[arg(long, hide = true)]
+    pub(crate) exit_with_stdin: bool,
+}
+
+#[derive(Debug, Args)]
+#[command(after_help = "\
+Examples:
+  tandem relay --connect learner:7000 --listen 0.0.0.0:7000 --token-file token
+  tandem worker --connect relay:7000 --teacher teacher:7001 --token-file token
+
+Workers connect to a relay as they would to the learner. docs/scale.md shows when relays help.")]
+pub(crate) struct RelayArgs {
+    /// Address of the learner.
+    #[arg(long, value_name = "ADDR")]
+    pub(crate) connect: String,
+    #[command(flatten)]
+    pub(crate) listen: ListenArgs,
+    #[command(flatten)]
+    pub(crate) dial: DialArgs,
+    #[command(flatten)]
+    pub(crate) secret: SecretArgs,
+}

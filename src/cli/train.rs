@@ -1,0 +1,117 @@
+//! The command line of `tandem train` and `tandem sweep`.
+
+use std::path::PathBuf;
+
+use clap::{Args, ValueEnum};
+
+use super::TaskName;
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub(crate) enum RecipeName {
+    /// Tandem's recipe, which needs few environment steps and minutes on two cores.
+    Tandem,
+    /// The paper's DDPG + HER with the reference implementation's values.
+    Paper,
+}
+
+#[derive(Debug, Args)]
+#[command(after_help = "\
+Examples:
+  tandem train                                        two arms, push, strategy mc-q:0.1, shipped teacher
+  tandem train --arms 1 --task push --until-success 0.97
+  tandem train --strategy ea --budget 50000 --seed 2 --max-minutes 20
+  tandem train --set ddpg.discount=0.98 --set rounds.slots=16
+  tandem train --run my-run.toml --out runs/mine
+  tandem train --resume --out runs/mine               resumes the run
+  tandem train --resume --out runs/mine --max-env-steps 600000    resumes it for longer")]
+pub(crate) struct TrainArgs {
+    /// Task [default: push].
+    #[arg(long, value_enum)]
+    pub(crate) task: Option<TaskName>,
+    /// Number of arms of the trained policy, 1 or 2 [default: 2].
+    #[arg(long)]
+    pub(crate) arms: Option<usize>,
+    /// Advising strategy: none, ea, eamc:T, mc-q:T, mc-act:A or mc-act-abs:A. With init:teacher the student starts as
+    /// copies of the teacher and gets no advice
+    /// [default: mc-q:0.1 with two arms, none with one].
+    #[arg(long, value_name = "NAME[:THRESHOLD]")]
+    pub(crate) strategy: Option<String>,
+    /// Policy file of the teacher [default: the shipped teacher of the task].
+    #[arg(long, value_name = "FILE")]
+    pub(crate) teacher: Option<PathBuf>,
+    /// Advice budget of the run, in environment steps with advice [default: 500000].
+    #[arg(long, value_name = "N")]
+    pub(crate) budget: Option<u64>,
+    /// Number of worker processes [default: one per core, at most one per slot].
+    #[arg(long, value_name = "N")]
+    pub(crate) workers: Option<usize>,
+    /// Seed of all random numbers [default: 1].
+    #[arg(long, value_name = "N")]
+    pub(crate) seed: Option<u64>,
+    /// Stops when an evaluation reaches this success rate, 0 to 1.
+    #[arg(long, value_name = "P")]
+    pub(crate) until_success: Option<f64>,
+    /// Stops after this many environment steps; 0 for no limit [default: the recipe's].
+    #[arg(long, value_name = "N")]
+    pub(crate) max_env_steps: Option<u64>,
+    /// Stops after this many minutes instead; 0 for no limit.
+    #[arg(long, value_name = "N")]
+    pub(crate) max_minutes: Option<f64>,
+    /// Recipe that gives the defaults of all settings [default: tandem].
+    #[arg(long, value_enum)]
+    pub(crate) recipe: Option<RecipeName>,
+    /// Run file (TOML) with any of the settings; unknown keys are rejected.
+    #[arg(long, value_name = "FILE.toml")]
+    pub(crate) run: Option<PathBuf>,
+    /// Overrides one setting, for example ddpg.discount=0.98; can be repeated.
+    #[arg(long = "set", value_name = "KEY=VALUE")]
+    pub(crate) settings: Vec<String>,
+    /// Run directory [default: runs/TASK-ARMS-STRATEGY-seedN].
+    #[arg(long, value_name = "DIR")]
+    pub(crate) out: Option<PathBuf>,
+    /// Resumes the run in --out from its newest checkpoint. The settings and the teacher remain those of the run; only
+    /// its end (--max-env-steps, --max-minutes, --until-success), checkpoint.*, evaluation.recorded_episodes,
+    /// evaluation.test_episodes and --workers can change. A rejected --resume changes nothing.
+    #[arg(long, requires = "out")]
+    pub(crate) resume: bool,
+    /// Prints the summary as one JSON object on the last line of standard output.
+    #[arg(long)]
+    pub(crate) json: bool,
+    /// Interrupts the run when standard input closes, which happens when the parent process dies.
+    #[arg(long, hide = true)]
+    pub(crate) exit_with_stdin: bool,
+}
+
+#[derive(Debug, Args)]
+#[command(after_help = "\
+Examples:
+  tandem sweep deploy/sweep-small.toml --dry-run      lists the runs
+  tandem sweep deploy/sweep-small.toml                starts them, or resumes them
+  tandem report runs/sweep-small
+
+docs/sweep.md describes the file. The exit code is 75 if runs failed; the next start tries each of
+them once more.")]
+pub(crate) struct SweepArgs {
+    /// Sweep file (TOML): settings of all runs, and lists of values to combine.
+    #[arg(value_name = "FILE.toml")]
+    pub(crate) file: PathBuf,
+    /// Parent of the run directories [default: runs/NAME, after the file].
+    #[arg(long, value_name = "DIR", value_parser = utf8_path())]
+    pub(crate) out: Option<PathBuf>,
+    /// Number of concurrent runs; they share the cores.
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..=256))]
+    pub(crate) jobs: u16,
+    /// Prints one JSON object on the last line of standard output.
+    #[arg(long)]
+    pub(crate) json: bool,
+    /// Lists the runs and the progress of each, and starts none.
+    #[arg(long)]
+    pub(crate) dry_run: bool,
+}
+
+/// Parses a UTF-8 path, which can be part of an address.
+fn utf8_path() -> impl clap::builder::TypedValueParser<Value = PathBuf> {
+    use clap::builder::{OsStringValueParser, TypedValueParser as _};
+    OsStringValueParser::new()
+        .try_map(|path| path.into_string().map(PathBuf::from).map_err(|_raw| "expected UTF-8"))
+}

@@ -1,0 +1,87 @@
+//! `tandem learner`.
+
+use tandem_learner::checkpoint::CheckpointError;
+use tandem_learner::{Error, LearnerConfig, LingerPolicy, ServeOptions};
+use tandem_net::Pacing;
+use tokio::net::TcpListener;
+
+use super::{listen, run};
+use crate::cli::LearnerArgs;
+use crate::exit::{Exit, Failed, OrExit as _};
+use crate::version::VERSION;
+use crate::{access, clock, policy_file, run_directory, run_file, signals};
+
+pub(crate) fn learner(args: LearnerArgs) -> Result<(), Failed> {
+    let run_config = run_file::resolve(Some(&args.run), &[])?;
+    let start_from = args.start_from.as_deref().map(policy_file::load).transpose()?;
+    let gate = access::gate(&args.listen, &args.secret)?;
+    let dial = access::dial(&args.dial, &args.secret)?;
+    run_directory::check_path(&args.out)?;
+    let keeps_run_file = args.start_or_resume || args.keep_run_file;
+    let run_file = keeps_run_file.then(|| run_file::to_text(&run_config)).transpose()?;
+    run(async move {
+        let shutdown = signals::shutdown_token(args.listen.exit_with_stdin)?;
+        let options = serve_options(&args).await?;
+        let listener = listen(&args.listen).await?;
+        let config = LearnerConfig {
+            run: run_config,
+            gate,
+            dial,
+            teacher: args.teacher,
+            start_from,
+            out: args.out,
+            resume: args.resume || args.start_or_resume,
+            out_is_locked: args.out_is_locked,
+            run_file,
+            n_threads: usize::from(args.threads),
+            clock: clock::since_now(),
+            version: VERSION.to_owned(),
+            first_worker: clock::unix_millis() << 12,
+            pacing: Pacing::Concurrent,
+        };
+        let served = tandem_learner::serve_with(config, listener, shutdown, options).await;
+        let ended = served.map_err(learner_failed)?;
+        match ended.interrupted {
+            true => Err(Failed::new(Exit::Interrupted, anyhow::anyhow!(ended.reason))),
+            false => Ok(()),
+        }
+    })
+}
+
+/// Binds the address of the metrics, if there is one.
+async fn serve_options(args: &LearnerArgs) -> Result<ServeOptions, Failed> {
+    let metrics = match args.metrics_listen {
+        Some(address) => {
+            let bound = TcpListener::bind(address).await;
+            let cannot = || format!("cannot listen on {address} for --metrics-listen");
+            Some(bound.or_exit(Exit::TryAgain, cannot)?)
+        }
+        None => None,
+    };
+    if let Some(Ok(address)) = metrics.as_ref().map(TcpListener::local_addr) {
+        tracing::info!(%address, "serving Prometheus metrics, without a token");
+    }
+    let linger = if args.stay { LingerPolicy::UntilShutdown } else { LingerPolicy::default() };
+    Ok(ServeOptions { metrics, linger })
+}
+
+/// Chooses the exit code of an error of a learner or a relay.
+pub(super) fn learner_failed(error: Error) -> Failed {
+    if let error @ (Error::RunDirectory { .. } | Error::Checkpoint(CheckpointError::Io { .. })) =
+        error
+    {
+        return Failed::of_write(error);
+    }
+    let exit = match error {
+        Error::Config(_)
+        | Error::NoTeacher(_)
+        | Error::Teacher(_)
+        | Error::StartFrom(_)
+        | Error::Checkpoint(CheckpointError::OtherSettings { .. }) => Exit::Usage,
+        Error::Checkpoint(_) => Exit::Data,
+        Error::RunDirectory { .. } | Error::Serve(_) => Exit::TryAgain,
+        Error::Gate(_) | Error::Address(_) => Exit::Usage,
+        Error::Diverged(_) | Error::Panicked => Exit::Bug,
+    };
+    Failed::new(exit, error)
+}

@@ -1,0 +1,27 @@
+//! The address of a service.
+
+use tandem_net::{Capacity, Incoming};
+use tandem_system::fd_limit;
+use tokio::net::TcpListener;
+
+use crate::cli::ListenArgs;
+use crate::exit::{Exit, Failed, OrExit as _};
+use crate::output;
+
+/// Binds the address and prints it as one line of standard output. If that line cannot be written, the service runs all
+/// the same. The service keeps as many connections as the limit of open files allows.
+pub(crate) async fn listen(args: &ListenArgs) -> Result<Incoming, Failed> {
+    let capacity = Capacity::for_open_files(fd_limit::raise());
+    let bind = async {
+        let listener = TcpListener::bind(args.listen).await?;
+        let address = listener.local_addr()?;
+        Ok::<_, std::io::Error>((listener, address))
+    };
+    let (listener, address) =
+        bind.await.or_exit(Exit::TryAgain, || format!("cannot listen on {}", args.listen))?;
+    if let Err(failed) = output::print(format_args!("listening on {address}")) {
+        let error = failed.into_error();
+        tracing::warn!(%address, "cannot print the address: {error:#}");
+    }
+    Ok(Incoming::from(listener).with_capacity(capacity))
+}

@@ -1,0 +1,19 @@
+//! `tandem relay`.
+
+use super::learner::learner_failed;
+use super::{listen, run};
+use crate::cli::RelayArgs;
+use crate::exit::Failed;
+use crate::{access, signals};
+
+pub(crate) fn relay(args: RelayArgs) -> Result<(), Failed> {
+    let gate = access::gate(&args.listen, &args.secret)?;
+    let dial = access::dial(&args.dial, &args.secret)?;
+    run(async move {
+        let shutdown = signals::shutdown_token(args.listen.exit_with_stdin)?;
+        let listener = listen(&args.listen).await?;
+        let relayed =
+            tandem_learner::relay::serve(&args.connect, &dial, &gate, listener, shutdown).await;
+        relayed.map_err(learner_failed)
+    })
+}

@@ -1,0 +1,49 @@
+//! `tandem worker`.
+
+use tandem_net::Pacing;
+use tandem_worker::{Error, WorkerConfig};
+use tonic::{Code, Status};
+
+use super::run;
+use crate::cli::WorkerArgs;
+use crate::exit::{Exit, Failed};
+use crate::{access, signals};
+
+pub(crate) fn worker(args: WorkerArgs) -> Result<(), Failed> {
+    let dial = access::dial(&args.dial, &args.secret)?;
+    run(async move {
+        let shutdown = signals::shutdown_token(args.exit_with_stdin)?;
+        let config = WorkerConfig {
+            client: dial,
+            learner: args.connect,
+            teacher: args.teacher,
+            name: args.name,
+            log_dir: args.log_dir,
+            pacing: Pacing::Concurrent,
+        };
+        tandem_worker::run(config, shutdown).await.map_err(worker_failed)
+    })
+}
+
+fn worker_failed(error: Error) -> Failed {
+    use Error as E;
+    let exit = match error {
+        E::Address { .. } | E::NoTeacher { .. } => Exit::Usage,
+        E::Rollout { .. } | E::World(_) | E::Panicked(_) | E::NoAccount { .. } => Exit::Bug,
+        E::Protocol { .. } | E::Parameters { .. } | E::LogDir { .. } | E::Thread(_) => {
+            Exit::TryAgain
+        }
+    };
+    let error = anyhow::Error::from(error);
+    match configuration_problem(&error) {
+        Some(problem) => Failed::usage(format!("{error}: {problem}")),
+        None => Failed::new(exit, error),
+    }
+}
+
+/// Returns the message of a peer that requires another token or is another service.
+fn configuration_problem(error: &anyhow::Error) -> Option<&str> {
+    let mut statuses = error.chain().filter_map(|cause| cause.downcast_ref::<Status>());
+    let is_final = |code| matches!(code, Code::Unauthenticated | Code::Unimplemented);
+    statuses.find(|status| is_final(status.code())).map(Status::message)
+}

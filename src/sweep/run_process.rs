@@ -1,0 +1,213 @@
+//! One run of the sweep: a `tandem train` process.
+//!
+//! The run saves and exits when the sweep closes its standard input or dies. Its lines go to `sweep.log` in the run
+//! directory, which stays locked as long as a process has it open, so a run that is still saving is not started again.
+
+use std::ffi::OsString;
+use std::fs::TryLockError;
+use std::path::{Path, PathBuf};
+use std::pin::pin;
+use std::process::{ExitStatus, Stdio};
+use std::time::Duration;
+
+use anyhow::{Context as _, bail};
+use serde_json::Value;
+use tokio::io::AsyncReadExt as _;
+use tokio_util::sync::CancellationToken;
+
+use super::run_status::{RunStatus, State};
+use crate::launch::{Launcher, ProcessLog, last_line};
+use crate::run_file;
+
+/// Time that a run has to save and exit.
+const END_TIMEOUT: Duration = Duration::from_secs(150);
+/// Time between two attempts to lock the log.
+const RETRY_EVERY: Duration = Duration::from_millis(100);
+
+/// A run that can be started.
+#[derive(Debug)]
+pub(super) struct RunProcess {
+    pub(super) name: String,
+    dir: PathBuf,
+    args: Vec<OsString>,
+}
+
+/// How a run ended.
+#[derive(Debug, PartialEq)]
+pub(super) enum RunOutcome {
+    /// The run is complete, with this summary on the last line of its output.
+    Complete(Value),
+    /// The run was asked to exit and is saved.
+    Interrupted,
+    /// The run failed for this reason.
+    Failed(String),
+}
+
+impl RunProcess {
+    /// Prepares the directory of an unfinished run. With `n_workers` of `None`, `tandem train` chooses the number.
+    pub(super) fn prepare(status: &RunStatus, n_workers: Option<usize>) -> anyhow::Result<Self> {
+        let RunStatus { run, dir, state, .. } = status;
+        std::fs::create_dir_all(dir).with_context(|| format!("cannot create {}", dir.display()))?;
+        let mut args: Vec<OsString> = vec![
+            "train".into(),
+            "--exit-with-stdin".into(),
+            "--json".into(),
+            "--out".into(),
+            dir.into(),
+        ];
+        if *state == State::Started {
+            args.push("--resume".into());
+        } else {
+            args.extend(["--run".into(), write_run_file(status)?.into()]);
+        }
+        if let Some(teacher) = run.teacher.as_ref().filter(|_| *state != State::Started) {
+            args.extend(["--teacher".into(), teacher.into()]);
+        }
+        if let Some(n_workers) = n_workers {
+            args.extend(["--workers".into(), n_workers.to_string().into()]);
+        }
+        Ok(Self { name: run.name.clone(), dir: dir.clone(), args })
+    }
+
+    /// Runs to the end, or until `stop` asks the run to save and exit.
+    pub(super) async fn run(self, stop: CancellationToken) -> RunOutcome {
+        match self.try_run(&stop).await {
+            Ok(outcome) => outcome,
+            Err(error) => RunOutcome::Failed(format!("{error:#}")),
+        }
+    }
+
+    async fn try_run(&self, stop: &CancellationToken) -> anyhow::Result<RunOutcome> {
+        let log = ProcessLog::open(&self.log_path())?;
+        if !lock(&log, &self.dir, stop).await? {
+            return Ok(RunOutcome::Interrupted);
+        }
+        let launcher = Launcher::new(log)?;
+        let mut child =
+            launcher.spawn(&self.args, Stdio::piped()).context("cannot start tandem train")?;
+        let log_offset = child.log_offset();
+        let stdin = child.take_input();
+        let mut stdout = child.take_output()?;
+        let mut output = Vec::new();
+        let status = {
+            let read = async { tokio::join!(child.wait(), stdout.read_to_end(&mut output)).0 };
+            let mut ended = pin!(read);
+            tokio::select! {
+                status = &mut ended => status,
+                () = stop.cancelled() => {
+                    drop(stdin);
+                    let in_time = tokio::time::timeout(END_TIMEOUT, ended).await;
+                    in_time.unwrap_or_else(|late| Err(late.into()))
+                }
+            }
+        };
+        let status = status.context("the run did not exit in time and is killed")?;
+        let log = launcher.log();
+        Ok(outcome(status, &output, || last_log_line(log, log_offset), stop))
+    }
+
+    /// Returns the path of the run's log.
+    pub(super) fn log_path(&self) -> PathBuf {
+        self.dir.join("sweep.log")
+    }
+}
+
+fn outcome(
+    status: ExitStatus,
+    output: &[u8],
+    last_log_line: impl FnOnce() -> String,
+    stop: &CancellationToken,
+) -> RunOutcome {
+    let summary = || -> Option<Value> {
+        let text = std::str::from_utf8(output).ok()?;
+        let summary: Value = serde_json::from_str(text.lines().last()?).ok()?;
+        summary.get("digest").is_some().then_some(summary)
+    };
+    match (status.success().then(summary).flatten(), status.code()) {
+        (Some(summary), _) => RunOutcome::Complete(summary),
+        (None, Some(130)) if stop.is_cancelled() => RunOutcome::Interrupted,
+        (None, _) => RunOutcome::Failed(format!("{status}: {}", last_log_line())),
+    }
+}
+
+/// Writes the resolved settings of a new run next to the run file of `tandem train`.
+fn write_run_file(status: &RunStatus) -> anyhow::Result<PathBuf> {
+    let path = status.dir.join("sweep.toml");
+    let leftover = status.dir.join("run.toml");
+    if leftover.exists() {
+        // A run of `State::New` has learned nothing, so its run file can be replaced.
+        std::fs::remove_file(&leftover)
+            .with_context(|| format!("cannot remove {}", leftover.display()))?;
+    }
+    let text = run_file::to_toml(&status.run.config)?;
+    std::fs::write(&path, text).with_context(|| format!("cannot write {}", path.display()))?;
+    Ok(path)
+}
+
+/// Locks the log of the run in `dir`. Returns `false` if `stop` is cancelled first.
+async fn lock(log: &ProcessLog, dir: &Path, stop: &CancellationToken) -> anyhow::Result<bool> {
+    let n_attempts = END_TIMEOUT.as_millis() / RETRY_EVERY.as_millis();
+    for _ in 0..n_attempts {
+        match log.file().try_lock() {
+            Ok(()) => return Ok(true),
+            Err(TryLockError::WouldBlock) => {}
+            Err(TryLockError::Error(error)) => {
+                let path = log.path().display();
+                return Err(error).with_context(|| format!("cannot lock {path}"));
+            }
+        }
+        tokio::select! {
+            () = tokio::time::sleep(RETRY_EVERY) => {}
+            () = stop.cancelled() => return Ok(false),
+        }
+    }
+    bail!("a run of an earlier sweep still uses {}", dir.display())
+}
+
+/// Returns the last line of the log since it had `offset` bytes.
+fn last_log_line(log: &ProcessLog, offset: u64) -> String {
+    last_line(&log.text_since(offset)).unwrap_or("it logged nothing").to_owned()
+}
+
+#[cfg(test)]
+mod tests {
+    use std::os::unix::process::ExitStatusExt as _;
+
+    use super::*;
+
+    #[test]
+    fn the_outcome_follows_from_the_exit_code_and_the_last_line() {
+        let stopped = CancellationToken::new();
+        stopped.cancel();
+        let running = CancellationToken::new();
+        let last_log_line = || "tandem: no".to_owned();
+        let check = |code: i32, output: &str, stop: &CancellationToken, expected: &RunOutcome| {
+            let status = ExitStatus::from_raw(code << 8);
+            assert_eq!(
+                outcome(status, output.as_bytes(), last_log_line, stop),
+                *expected,
+                "{code} {output:?}"
+            );
+        };
+        let done = RunOutcome::Complete(serde_json::json!({"digest": "d"}));
+        check(0, "chatter\n{\"digest\":\"d\"}\n", &running, &done);
+        check(0, "{\"digest\":\"d\"}\n", &stopped, &done);
+        check(130, "", &stopped, &RunOutcome::Interrupted);
+        let failed = |code: i32| RunOutcome::Failed(format!("exit status: {code}: tandem: no"));
+        check(130, "", &running, &failed(130));
+        check(75, "", &stopped, &failed(75));
+        check(0, "no summary", &running, &failed(0));
+        check(70, "{\"digest\":\"d\"}", &running, &failed(70));
+    }
+
+    #[test]
+    fn the_last_line_is_one_of_this_start() {
+        let dir = tempfile::tempdir().expect("a directory");
+        let path = dir.path().join("sweep.log");
+        std::fs::write(&path, "tandem: before\n").expect("writes");
+        let log = ProcessLog::open(&path).expect("opens");
+        assert_eq!(last_log_line(&log, 15), "it logged nothing");
+        std::fs::write(&path, "tandem: before\n00:01 round 1\ntandem: now\n\n").expect("writes");
+        assert_eq!(last_log_line(&log, 15), "tandem: now");
+    }
+}

@@ -1,0 +1,225 @@
+//! The status of a run of the sweep, as found in its directory.
+
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context as _, anyhow};
+use serde_json::Value as Json;
+use tandem_learner::checkpoint;
+use tandem_rl::RunConfig;
+use tandem_system::{atomic_file, regular_file};
+use toml::{Table, Value};
+
+use super::sweep_file::{PlannedRun, flattened};
+use crate::run_file;
+
+/// A run and its status.
+#[derive(Debug)]
+pub(super) struct RunStatus {
+    pub(super) run: PlannedRun,
+    /// The run directory.
+    pub(super) dir: PathBuf,
+    pub(super) state: State,
+    /// Why the latest attempt failed.
+    pub(super) failure: Option<String>,
+}
+
+/// The progress of a run.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) enum State {
+    /// The run has learned nothing yet.
+    New,
+    /// The run can be resumed from its newest checkpoint.
+    Started,
+    /// The run is complete, with this summary of `tandem train --json`.
+    Finished(Json),
+}
+
+impl RunStatus {
+    /// Reads the status from the run's directory in `out`.
+    ///
+    /// # Errors
+    /// When the directory contains a run with other settings, which the error names, or cannot be read.
+    pub(super) fn of(run: PlannedRun, out: &Path) -> anyhow::Result<Self> {
+        let dir = out.join(&run.name);
+        let state = state(&run, &dir)?;
+        let failure = std::fs::read_to_string(failure_path(&dir)).ok();
+        let failure = failure.filter(|_| !matches!(state, State::Finished(_)));
+        Ok(Self { run, dir, state, failure })
+    }
+
+    /// Returns the name of the state.
+    pub(super) const fn state_name(&self) -> &'static str {
+        match self.state {
+            State::New => "new",
+            State::Started => "begun",
+            State::Finished(_) => "finished",
+        }
+    }
+
+    /// Stores the summary of a run, which is finished from now on.
+    pub(super) fn finish(&mut self, summary: Json) -> anyhow::Result<()> {
+        let path = self.dir.join("summary.json");
+        let written = atomic_file::replace(&path, format!("{summary}\n").as_bytes());
+        written.with_context(|| format!("cannot write {}", path.display()))?;
+        drop(std::fs::remove_file(failure_path(&self.dir)));
+        (self.state, self.failure) = (State::Finished(summary), None);
+        Ok(())
+    }
+
+    /// Stores the reason of a failure, which the next start reports.
+    pub(super) fn fail(&mut self, why: String) -> anyhow::Result<()> {
+        let path = failure_path(&self.dir);
+        std::fs::write(&path, &why).with_context(|| format!("cannot write {}", path.display()))?;
+        self.failure = Some(why);
+        Ok(())
+    }
+}
+
+fn failure_path(dir: &Path) -> PathBuf {
+    dir.join("failure.txt")
+}
+
+fn state(run: &PlannedRun, dir: &Path) -> anyhow::Result<State> {
+    let run_toml = dir.join("run.toml");
+    if !run_toml.exists() {
+        return Ok(State::New);
+    }
+    let differences = match run_file::resolve(Some(&run_toml), &[]) {
+        Ok(config) => differences(&config, &run.config)?,
+        Err(failed) => vec![format!("{:#}", failed.into_error())],
+    };
+    let summary = summary(dir)?;
+    if !differences.is_empty() || !same_teacher(run, dir) {
+        if summary.is_none() && !has_learned(dir) {
+            return Ok(State::New);
+        }
+        let differences = match differences.is_empty() {
+            true => "its teacher".to_owned(),
+            false => differences.join(", "),
+        };
+        return Err(anyhow!("{} was made with other settings: {differences}", run.name));
+    }
+    Ok(summary.map_or(State::Started, State::Finished))
+}
+
+/// Lists the settings in which the configuration of an existing run differs from the sweep file.
+fn differences(existing: &RunConfig, planned: &RunConfig) -> anyhow::Result<Vec<String>> {
+    let [existing, planned] = [existing, planned].map(Table::try_from);
+    let (existing, planned) = (flattened(&existing?), flattened(&planned?));
+    let differing = existing.iter().zip(&planned).filter(|(existing, planned)| existing != planned);
+    let texts = differing.map(|((key, existing), (_, planned))| {
+        format!("{key} is {} there, {} now", shortest(existing), shortest(planned))
+    });
+    Ok(texts.collect())
+}
+
+/// Formats a value without the digits that a single-precision setting has in double precision only.
+#[expect(clippy::cast_possible_truncation, reason = "compared with the original")]
+fn shortest(value: &Value) -> String {
+    match value {
+        Value::Float(double) if f64::from(*double as f32) == *double => {
+            (*double as f32).to_string()
+        }
+        value => value.to_string(),
+    }
+}
+
+/// Returns whether the run's copy of its teacher equals the file that the sweep file names.
+fn same_teacher(run: &PlannedRun, dir: &Path) -> bool {
+    let Some(teacher) = &run.teacher else { return true };
+    let copy = regular_file::read(&dir.join("policy/teacher.safetensors"));
+    // The run itself reports a missing file.
+    let named = regular_file::read(teacher);
+    copy.ok().zip(named.ok()).is_none_or(|(copy, named)| copy == named)
+}
+
+fn has_learned(dir: &Path) -> bool {
+    let n_metrics = std::fs::metadata(dir.join("metrics.jsonl")).map_or(0, |file| file.len());
+    n_metrics > 0 || !checkpoint::list(&dir.join("checkpoint")).is_empty()
+}
+
+fn summary(dir: &Path) -> anyhow::Result<Option<Json>> {
+    let path = dir.join("summary.json");
+    if !path.exists() {
+        return Ok(None);
+    }
+    let text = std::fs::read_to_string(&path);
+    let text = text.with_context(|| format!("cannot read {}", path.display()))?;
+    let summary = serde_json::from_str(&text);
+    summary.map(Some).with_context(|| format!("{} is damaged: remove it", path.display()))
+}
+
+#[cfg(test)]
+mod tests {
+    use serde_json::json;
+    use tandem_core::Task;
+    use tandem_rl::config::Recipe;
+
+    use super::*;
+
+    fn planned(discount: f32) -> PlannedRun {
+        let mut config = RunConfig::defaults(Recipe::Tandem, Task::Push, 2);
+        config.name = "push-ea-seed1".to_owned();
+        config.ddpg.discount = discount;
+        PlannedRun { name: config.name.clone(), config, teacher: None }
+    }
+
+    fn made_with(out: &Path, discount: f32) {
+        let dir = out.join("push-ea-seed1");
+        std::fs::create_dir_all(&dir).expect("a directory");
+        let text = run_file::to_toml(&planned(discount).config).expect("writes");
+        std::fs::write(dir.join("run.toml"), text).expect("writes");
+    }
+
+    fn status(out: &Path, discount: f32) -> Result<RunStatus, String> {
+        RunStatus::of(planned(discount), out).map_err(|error| error.to_string())
+    }
+
+    #[test]
+    fn a_run_is_new_then_begun_then_finished() {
+        let out = tempfile::tempdir().expect("a directory");
+        let out = out.path();
+        assert_eq!(status(out, 0.95).expect("fits").state, State::New);
+        made_with(out, 0.95);
+        let mut begun = status(out, 0.95).expect("fits");
+        assert_eq!(begun.state, State::Started);
+        begun.fail("the disk is full".to_owned()).expect("writes");
+        assert_eq!(status(out, 0.95).expect("fits").failure.as_deref(), Some("the disk is full"));
+        begun.finish(json!({"digest": "d"})).expect("writes");
+        let finished = status(out, 0.95).expect("fits");
+        assert_eq!(finished.state, State::Finished(json!({"digest": "d"})));
+        assert_eq!(finished.failure, None);
+    }
+
+    #[test]
+    fn what_was_learned_with_other_settings_is_refused_by_name() {
+        let out = tempfile::tempdir().expect("a directory");
+        made_with(out.path(), 0.9);
+        assert_eq!(status(out.path(), 0.95).expect("nothing was learned").state, State::New);
+        std::fs::write(out.path().join("push-ea-seed1/metrics.jsonl"), "{}\n").expect("writes");
+        let message = status(out.path(), 0.95).expect_err("other settings");
+        for word in ["push-ea-seed1", "ddpg.discount is 0.9", "0.95"] {
+            assert!(message.contains(word), "{message:?} lacks {word:?}");
+        }
+        assert_eq!(status(out.path(), 0.9).expect("fits").state, State::Started);
+    }
+
+    #[test]
+    fn a_run_of_another_teacher_is_refused() {
+        let out = tempfile::tempdir().expect("a directory");
+        made_with(out.path(), 0.95);
+        let dir = out.path().join("push-ea-seed1");
+        std::fs::create_dir(dir.join("policy")).expect("a directory");
+        for (path, text) in
+            [("metrics.jsonl", "{}\n"), ("policy/teacher.safetensors", "one"), ("mine", "two")]
+        {
+            std::fs::write(dir.join(path), text).expect("writes");
+        }
+        let with = |teacher: &str| {
+            let run = PlannedRun { teacher: Some(dir.join(teacher)), ..planned(0.95) };
+            RunStatus::of(run, out.path()).map_err(|error| error.to_string())
+        };
+        assert!(with("mine").expect_err("another teacher").contains("teacher"));
+        assert_eq!(with("policy/teacher.safetensors").expect("the same").state, State::Started);
+    }
+}

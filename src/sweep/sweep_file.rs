@@ -1,0 +1,260 @@
+//! The sweep file: settings of all runs, and lists whose combinations are the runs.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context as _, anyhow, bail, ensure};
+use serde::Deserialize;
+use tandem_rl::RunConfig;
+use toml::{Table, Value};
+
+use crate::exit::{Exit, Failed, OrExit as _};
+use crate::{input, run_file};
+
+/// A larger number of runs is treated as a mistake.
+const MAX_RUNS: usize = 10_000;
+
+/// The contents of a sweep file. Lists must not be empty.
+#[derive(Debug, Clone, PartialEq, Default, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+struct SweepFile {
+    /// Tasks; without a list, the task of `[run]`.
+    tasks: Option<Vec<String>>,
+    /// Values of `advice.strategy`; each is a column of the sweep, like each variant.
+    strategies: Option<Vec<String>>,
+    /// Seeds; without a list, the seed of `[run]`.
+    seeds: Option<Vec<u64>>,
+    /// Further settings to combine; each table has one setting with its list of values.
+    axis: Option<Vec<Table>>,
+    /// Named sets of settings that override `[run]`.
+    variant: Option<Vec<Variant>>,
+    /// Settings of all runs, as in a run file.
+    run: Table,
+    /// Teacher policy files by task; the default is the shipped teacher.
+    teachers: BTreeMap<String, PathBuf>,
+}
+
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Variant {
+    name: String,
+    #[serde(default)]
+    set: Table,
+}
+
+/// A run of the sweep.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct PlannedRun {
+    /// Name of its directory.
+    pub(super) name: String,
+    /// The resolved settings, which with the teacher determine the result.
+    pub(super) config: RunConfig,
+    /// The teacher policy file, if the sweep file names one.
+    pub(super) teacher: Option<PathBuf>,
+}
+
+/// Settings with a name that becomes part of the name of the run directory.
+#[derive(Debug, Clone)]
+struct Choice {
+    name: String,
+    settings: Vec<(String, Value)>,
+}
+
+/// Reads the sweep file `path` and returns its runs in order. Seeds are the outermost loop, so a sweep that is stopped
+/// early has one seed of every combination.
+pub(super) fn read(path: &Path) -> Result<Vec<PlannedRun>, Failed> {
+    let context = || format!("sweep file {path:?}");
+    let text = input::text(path).context("cannot be read").or_exit(Exit::Usage, context)?;
+    runs(&text).or_exit(Exit::Usage, context)
+}
+
+/// Returns all combinations that `text` lists.
+fn runs(text: &str) -> anyhow::Result<Vec<PlannedRun>> {
+    let file: SweepFile = toml::from_str(text).map_err(|error| parse_error(text, &error))?;
+    reject_empty(&file)?;
+    let base = flattened(&file.run);
+    let (tasks, seeds) =
+        (tasks(&file), choices("seed", listed(&file.seeds).iter().map(seed_value)));
+    let (columns, axes) = (columns(&file, &base)?, axes(&file)?);
+    let n_runs = [tasks.len(), seeds.len(), columns.len(), axes.len()].iter().product::<usize>();
+    ensure!(n_runs <= MAX_RUNS, "lists {n_runs} runs: expected at most {MAX_RUNS}");
+    let mut runs = Vec::with_capacity(n_runs);
+    for (seed, task) in pairs(&seeds, &tasks) {
+        for (column, axis) in pairs(&columns, &axes) {
+            let mut settings = base.clone();
+            for choice in [task, column, axis, seed] {
+                settings.extend(choice.settings.iter().cloned());
+            }
+            runs.push(planned(&settings, &column.name, &axis.name, &file.teachers)?);
+        }
+    }
+    reject_equal_names(&runs)?;
+    Ok(runs)
+}
+
+/// Rejects an empty file and empty lists, which would otherwise mean a single run.
+fn reject_empty(file: &SweepFile) -> anyhow::Result<()> {
+    ensure!(
+        *file != SweepFile::default(),
+        "is empty: expected lists to combine, such as seeds = [1, 2]"
+    );
+    let lengths = [
+        ("tasks", file.tasks.as_ref().map(Vec::len)),
+        ("strategies", file.strategies.as_ref().map(Vec::len)),
+        ("seeds", file.seeds.as_ref().map(Vec::len)),
+        ("axis", file.axis.as_ref().map(Vec::len)),
+        ("variant", file.variant.as_ref().map(Vec::len)),
+    ];
+    match lengths.iter().find(|(_, length)| *length == Some(0)) {
+        Some((key, _)) => {
+            bail!("{key} is an empty list: expected at least one entry, or no {key} at all")
+        }
+        None => Ok(()),
+    }
+}
+
+fn planned(
+    settings: &[(String, Value)],
+    column: &str,
+    axis: &str,
+    teachers: &BTreeMap<String, PathBuf>,
+) -> anyhow::Result<PlannedRun> {
+    let mut settings = settings.to_vec();
+    let limits_time = settings.iter().any(|(key, _)| key == "stop.max_minutes");
+    if !limits_time {
+        // Runs that are compared have no time limit unless the sweep file sets one.
+        settings.push(("stop.max_minutes".to_owned(), Value::Float(0.0)));
+    }
+    let resolved = run_file::resolve(None, &settings).map_err(Failed::into_error)?;
+    let column =
+        if column.is_empty() { sanitized(&resolved.advice.strategy) } else { column.to_owned() };
+    let name = format!("{}-{column}{axis}-seed{}", resolved.task, resolved.seed);
+    ensure!(
+        tandem_rl::config::is_name(&name),
+        "{name:?} is no name of a run: expected 1 to 100 letters, digits, '-', '_' or '.'"
+    );
+    let stop = &resolved.stop;
+    ensure!(
+        stop.max_env_steps > 0 || stop.max_minutes > 0.0,
+        "{name} may never end: set stop.max_env_steps or stop.max_minutes in [run]"
+    );
+    let teacher = teachers.get(&resolved.task).filter(|_| resolved.advice.needs_teacher()).cloned();
+    Ok(PlannedRun { config: RunConfig { name: name.clone(), ..resolved }, name, teacher })
+}
+
+fn reject_equal_names(runs: &[PlannedRun]) -> anyhow::Result<()> {
+    let mut seen = BTreeSet::new();
+    match runs.iter().find(|run| !seen.insert(&run.name)) {
+        Some(run) => bail!("two runs would be called {}: something is listed twice", run.name),
+        None => Ok(()),
+    }
+}
+
+/// Returns the entries of an optional list.
+fn listed<T>(list: &Option<Vec<T>>) -> &[T] {
+    list.as_deref().unwrap_or_default()
+}
+
+fn tasks(file: &SweepFile) -> Vec<Choice> {
+    choices("task", listed(&file.tasks).iter().cloned().map(Value::String))
+}
+
+/// Returns a choice for each value of `key`, or one without settings if there are no values.
+fn choices(key: &str, values: impl Iterator<Item = Value>) -> Vec<Choice> {
+    let choice =
+        |value: Value| Choice { name: String::new(), settings: vec![(key.to_owned(), value)] };
+    or_default_choice(values.map(choice).collect())
+}
+
+fn or_default_choice(choices: Vec<Choice>) -> Vec<Choice> {
+    match choices.is_empty() {
+        true => vec![Choice { name: String::new(), settings: Vec::new() }],
+        false => choices,
+    }
+}
+
+/// Returns the strategies, then the variants.
+fn columns(file: &SweepFile, base: &[(String, Value)]) -> anyhow::Result<Vec<Choice>> {
+    const STRATEGY: &str = "advice.strategy";
+    if file.strategies.is_some()
+        && base.iter().any(|(key, _)| key == STRATEGY)
+        && file.variant.is_none()
+    {
+        bail!("{STRATEGY} is set in [run] and in `strategies`: expected one of them");
+    }
+    let mut columns: Vec<Choice> = listed(&file.strategies)
+        .iter()
+        .map(|strategy| Choice {
+            name: sanitized(strategy),
+            settings: vec![(STRATEGY.to_owned(), Value::String(strategy.clone()))],
+        })
+        .collect();
+    for Variant { name, set } in listed(&file.variant) {
+        ensure!(!name.is_empty(), "a variant has no name");
+        columns.push(Choice { name: name.clone(), settings: flattened(set) });
+    }
+    Ok(or_default_choice(columns))
+}
+
+/// Returns all combinations of the values of the axes. Each value adds `-KEY-VALUE` to the name, without the section of
+/// the key.
+fn axes(file: &SweepFile) -> anyhow::Result<Vec<Choice>> {
+    let mut combinations = or_default_choice(Vec::new());
+    for axis in listed(&file.axis) {
+        let [(key, Value::Array(values))] = &flattened(axis)[..] else {
+            let held = axis.to_string().trim().replace('\n', ", ");
+            bail!("[[axis]] holds {held}: expected one setting with a list of values");
+        };
+        ensure!(!values.is_empty(), "the list of axis {key} is empty");
+        let short = key.rsplit('.').next().unwrap_or(key);
+        let with = |(before, value): (&Choice, &Value)| Choice {
+            name: format!("{}-{short}-{}", before.name, sanitized(&unquoted(value))),
+            settings: [before.settings.clone(), vec![(key.clone(), value.clone())]].concat(),
+        };
+        combinations = pairs(&combinations, values).map(with).collect();
+    }
+    Ok(combinations)
+}
+
+/// Formats a value for a name: text has no quotes.
+fn unquoted(value: &Value) -> String {
+    value.as_str().map_or_else(|| value.to_string(), str::to_owned)
+}
+
+/// Replaces characters that do not belong in the name of a directory by dashes.
+fn sanitized(text: &str) -> String {
+    let letter = |c: char| if c.is_ascii_alphanumeric() || "-_.".contains(c) { c } else { '-' };
+    text.chars().map(letter).collect()
+}
+
+/// Returns the dotted names and the values of all settings in `table`.
+pub(super) fn flattened(table: &Table) -> Vec<(String, Value)> {
+    let below = |(key, value): (&String, &Value)| match value {
+        Value::Table(inner) => flattened(inner)
+            .into_iter()
+            .map(|(rest, value)| (format!("{key}.{rest}"), value))
+            .collect(),
+        value => vec![(key.clone(), value.clone())],
+    };
+    table.iter().flat_map(below).collect()
+}
+
+/// Returns all pairs of an element of `outer` and one of `inner`, in order.
+fn pairs<'a, A, B>(outer: &'a [A], inner: &'a [B]) -> impl Iterator<Item = (&'a A, &'a B)> {
+    outer.iter().flat_map(move |a| inner.iter().map(move |b| (a, b)))
+}
+
+/// Converts a seed to TOML. A seed too large for TOML becomes text, which the check of the settings rejects.
+fn seed_value(n: &u64) -> Value {
+    i64::try_from(*n).map_or_else(|_| Value::String(n.to_string()), Value::Integer)
+}
+
+/// Converts an error of the TOML parser to one line with the line number.
+fn parse_error(text: &str, error: &toml::de::Error) -> anyhow::Error {
+    let start = error.span().map_or(0, |span| span.start);
+    let line_idx = text.get(..start).unwrap_or(text).matches('\n').count();
+    anyhow!("line {}: {}", line_idx + 1, error.message().replace('\n', " "))
+}
+
+#[cfg(test)]
+mod tests;

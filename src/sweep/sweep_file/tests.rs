@@ -1,0 +1,124 @@
+use super::*;
+
+const LIMIT: &str = "[run.stop]\nmax_env_steps = 1000\n";
+
+fn names(text: &str) -> Vec<String> {
+    runs(text).expect("valid").into_iter().map(|run| run.name).collect()
+}
+
+#[test]
+fn every_combination_is_a_run_and_seeds_are_the_outermost_loop() {
+    let text = "tasks = [\"push\", \"pick-and-place\"]\nstrategies = [\"none\", \"mc-q:0.1\"]\nseeds = [3, 4]\n";
+    let seen = names(&format!("{text}{LIMIT}"));
+    let expected = [
+        "push-none-seed3",
+        "push-mc-q-0.1-seed3",
+        "pick-and-place-none-seed3",
+        "pick-and-place-mc-q-0.1-seed3",
+        "push-none-seed4",
+        "push-mc-q-0.1-seed4",
+        "pick-and-place-none-seed4",
+        "pick-and-place-mc-q-0.1-seed4",
+    ];
+    assert_eq!(seen, expected);
+}
+
+#[test]
+fn variants_are_added_to_strategies_and_axes_multiply_both() {
+    let text = "strategies = [\"ea\"]\n[[variant]]\nname = \"no-cloning\"\nset = { advice.strategy = \"mc-q:0.05\", advice.share = 1 }\n\
+                [[axis]]\n\"ddpg.polyak_keep\" = [0.95, 0.99]\n[[axis]]\nrounds.lag = [0, 1]\n";
+    let planned = runs(&format!("{text}{LIMIT}")).expect("valid");
+    let seen: Vec<&str> = planned.iter().map(|run| run.name.as_str()).collect();
+    assert_eq!(seen.len(), 8);
+    assert_eq!(
+        [seen[0], seen[7]],
+        ["push-ea-polyak_keep-0.95-lag-0-seed1", "push-no-cloning-polyak_keep-0.99-lag-1-seed1"]
+    );
+    let last = &planned[7].config;
+    assert_eq!(
+        (last.advice.strategy.as_str(), last.advice.share, last.rounds.lag),
+        ("mc-q:0.05", 1.0, 1)
+    );
+    assert!((last.ddpg.polyak_keep - 0.99).abs() < 1e-6);
+    assert_eq!(last.name, planned[7].name);
+}
+
+#[test]
+fn runs_have_no_time_limit_unless_one_is_set() {
+    let minutes = |text: &str| runs(text).expect("valid")[0].config.stop.max_minutes;
+    assert_eq!(minutes(LIMIT), 0.0);
+    assert_eq!(minutes("[run]\nstop.max_minutes = 2"), 2.0);
+}
+
+#[test]
+fn a_teacher_is_named_if_the_run_needs_one() {
+    let text = "strategies = [\"none\", \"ea\"]\n[teachers]\npush = \"mine.safetensors\"\n";
+    let teachers: Vec<_> = runs(&format!("{text}{LIMIT}"))
+        .expect("valid")
+        .into_iter()
+        .map(|run| run.teacher)
+        .collect();
+    assert_eq!(teachers, [None, Some(PathBuf::from("mine.safetensors"))]);
+}
+
+#[test]
+fn errors_fit_on_one_line() {
+    let check = |text: &str, words: &[&str]| {
+        let error = runs(&format!("{text}\n{LIMIT}")).expect_err("must be refused");
+        let message = format!("{error:#}");
+        assert!(!message.contains('\n'), "{message}");
+        words.iter().for_each(|word| assert!(message.contains(word), "{message:?} lacks {word:?}"));
+    };
+    check("nonsense = 1", &["line 1", "nonsense"]);
+    check("seeds = [", &["line"]);
+    check("tasks = [\"fold\"]", &["fold", "push"]);
+    check("strategies = [\"mc-q:x\"]", &["mc-q:x"]);
+    check("seeds = [1, 1]", &["push-mc-q-0.1-seed1", "twice"]);
+    check("seeds = [18446744073709551615]", &["seed"]);
+    check("[[axis]]\n\"ddpg.polyak_keep\" = 0.9", &["axis", "list"]);
+    check("[[axis]]\n\"ddpg.polyak\" = [0.9]", &["ddpg.polyak"]);
+    check("[[axis]]\nseed = []", &["seed", "empty"]);
+    for key in ["tasks", "strategies", "seeds", "axis", "variant"] {
+        check(&format!("{key} = []"), &[key, "is an empty list"]);
+    }
+    check("[[variant]]\nname = \"a/b\"", &["a/b"]);
+    check("strategies = [\"ea\"]\n[run.advice]\nstrategy = \"none\"", &["advice.strategy"]);
+    let unlimited = runs("[run]\nrecipe = \"paper\"").expect_err("must be refused").to_string();
+    assert!(unlimited.contains("max_env_steps"), "{unlimited}");
+    let many: Vec<String> = (0..10_001).map(|seed| seed.to_string()).collect();
+    check(&format!("seeds = [{}]", many.join(",")), &["10001", "at most"]);
+}
+
+#[test]
+fn an_empty_file_is_rejected() {
+    for text in ["", "\n\n", "# nothing yet\n"] {
+        let error = runs(text).expect_err("must be refused").to_string();
+        assert!(error.starts_with("is empty: expected"), "{text:?}: {error}");
+    }
+}
+
+#[test]
+fn every_shipped_sweep_file_is_valid() {
+    let directory = Path::new(env!("CARGO_MANIFEST_DIR")).join("deploy");
+    let files = std::fs::read_dir(directory).expect("ships").flatten().map(|entry| entry.path());
+    let counts: BTreeMap<String, usize> = files
+        .filter(|path| path.to_string_lossy().contains("/sweep-"))
+        .map(|path| {
+            let name = path.file_stem().expect("named").to_string_lossy().into_owned();
+            (name, read(&path).expect("valid").len())
+        })
+        .collect();
+    let expected = [
+        ("sweep-recipe", 24),
+        ("sweep-recipe-cooldown", 2),
+        ("sweep-recipe-long", 10),
+        ("sweep-recipe-starts", 4),
+        ("sweep-recipe-teachers", 12),
+        ("sweep-small", 8),
+        ("sweep-students", 6),
+        ("sweep-table2", 72),
+        ("sweep-teachers", 6),
+    ];
+    let counts: Vec<_> = counts.iter().map(|(name, count)| (name.as_str(), *count)).collect();
+    assert_eq!(counts, expected);
+}

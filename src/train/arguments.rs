@@ -1,0 +1,61 @@
+//! Command lines of the processes of a run.
+
+use std::ffi::OsString;
+use std::path::Path;
+
+use super::inputs;
+use super::plan::Plan;
+
+/// Returns the arguments of the teacher.
+pub(super) fn teacher(plan: &Plan) -> Vec<OsString> {
+    let mut args = command("teacher");
+    push_path(&mut args, "--policy", &inputs::teacher(&plan.out));
+    push_path(&mut args, "--ledger", &plan.ledger());
+    args
+}
+
+/// Returns the arguments of the learner. `resume` is set if the run directory contains a run.
+pub(super) fn learner(plan: &Plan, teacher_address: Option<&str>, resume: bool) -> Vec<OsString> {
+    let mut args = command("learner");
+    args.push("--out-is-locked".into());
+    push_path(&mut args, "--run", &inputs::settings(&plan.out));
+    push_path(&mut args, "--out", &plan.out);
+    push_address(&mut args, "--teacher", teacher_address);
+    if plan.config.advice.starts_from_teacher() {
+        push_path(&mut args, "--start-from", &inputs::teacher(&plan.out));
+    }
+    if resume {
+        args.push("--resume".into());
+    }
+    args
+}
+
+/// Returns the arguments of the worker `name`.
+pub(super) fn worker(
+    plan: &Plan,
+    name: &str,
+    learner_address: &str,
+    teacher_address: Option<&str>,
+) -> Vec<OsString> {
+    let mut args = command("worker");
+    args.extend(["--name".into(), name.into()]);
+    push_address(&mut args, "--connect", Some(learner_address));
+    push_path(&mut args, "--log-dir", &plan.out.join("mcap"));
+    push_address(&mut args, "--teacher", teacher_address);
+    args
+}
+
+/// Adds the option `name` with an address, if there is one.
+pub(super) fn push_address(args: &mut Vec<OsString>, name: &str, address: Option<&str>) {
+    if let Some(address) = address {
+        args.extend([name.into(), address.into()]);
+    }
+}
+
+fn push_path(args: &mut Vec<OsString>, name: &str, path: &Path) {
+    args.extend([name.into(), path.into()]);
+}
+
+fn command(name: &str) -> Vec<OsString> {
+    vec![name.into(), "--exit-with-stdin".into()]
+}

@@ -1,0 +1,51 @@
+//! Files that the processes of a run read: copies of the settings and of the teacher.
+//!
+//! A restarted process reads the same copies, even if `run.toml` or the teacher's file has changed since.
+
+use std::path::{Path, PathBuf};
+
+use super::plan::Plan;
+use crate::exit::{Exit, Failed, OrExit as _};
+use crate::run_file;
+
+/// The copies of one start, in the subdirectory `in-use`. Dropping this value removes them.
+#[derive(Debug)]
+pub(super) struct RunInputs {
+    directory: PathBuf,
+}
+
+impl RunInputs {
+    /// Writes the copies. The caller holds the lock on the run directory.
+    pub(super) fn write(plan: &Plan) -> Result<Self, Failed> {
+        let inputs = Self { directory: directory(&plan.out) };
+        let failed = || format!("cannot write to {}", plan.out.display());
+        std::fs::create_dir_all(&inputs.directory).or_exit(Exit::TryAgain, failed)?;
+        let text = run_file::to_text(&plan.config)?;
+        std::fs::write(settings(&plan.out), text).or_exit(Exit::TryAgain, failed)?;
+        if let Some(teacher) = &plan.teacher {
+            let saved = teacher.policy.save(&self::teacher(&plan.out));
+            saved.or_exit(Exit::TryAgain, failed)?;
+        }
+        Ok(inputs)
+    }
+}
+
+impl Drop for RunInputs {
+    fn drop(&mut self) {
+        drop(std::fs::remove_dir_all(&self.directory));
+    }
+}
+
+fn directory(out: &Path) -> PathBuf {
+    out.join("in-use")
+}
+
+/// Returns the path of the settings.
+pub(super) fn settings(out: &Path) -> PathBuf {
+    directory(out).join("settings.toml")
+}
+
+/// Returns the path of the teacher's policy.
+pub(super) fn teacher(out: &Path) -> PathBuf {
+    directory(out).join("teacher.safetensors")
+}

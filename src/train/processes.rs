@@ -1,0 +1,330 @@
+//! The processes of a run: started in order, restarted when they die, ended together.
+
+use std::ffi::OsString;
+use std::process::Stdio;
+use std::time::{Duration, Instant};
+
+use anyhow::{Context as _, anyhow};
+use tandem_system::process::ResidentMemory;
+use tokio::task::JoinSet;
+
+use super::arguments;
+use super::display::Display;
+use super::plan::Plan;
+use super::restart_policy::{Decision, RestartPolicy, Role};
+use super::run_lock::RunLock;
+use crate::clock;
+use crate::exit::Exit;
+use crate::launch::{ChildProcess, Launcher, ProcessEnd, ProcessLog};
+
+/// Time that the teacher and the workers have to exit after the learner.
+const GRACE: Duration = Duration::from_secs(5);
+
+pub(crate) struct RunProcesses {
+    launcher: Launcher,
+    /// The teacher, if the run has one, the learner, the workers.
+    processes: Vec<Process>,
+    /// Addresses of the services, which stay the same after a restart.
+    teacher_address: Option<String>,
+    learner_address: String,
+    peak: PeakMemory,
+}
+
+/// Largest resident memory of each kind of process, MiB; 0 if there is none or it is unknown.
+#[derive(Debug, Clone, Copy, Default)]
+pub(crate) struct PeakMemory {
+    pub(crate) learner_mib: u64,
+    pub(crate) teacher_mib: u64,
+    pub(crate) worker_mib: u64,
+}
+
+/// Why a run cannot continue.
+#[derive(Debug)]
+pub(crate) struct RunFailure {
+    pub(crate) exit: Exit,
+    pub(crate) error: anyhow::Error,
+}
+
+impl From<anyhow::Error> for RunFailure {
+    fn from(error: anyhow::Error) -> Self {
+        Self { exit: Exit::TryAgain, error }
+    }
+}
+
+/// Events found by [`RunProcesses::check`].
+#[derive(Debug, Default)]
+pub(crate) struct ProcessEvents {
+    /// One line per restart.
+    pub(crate) lines: Vec<String>,
+    pub(crate) learner_restarted: bool,
+    /// The learner was interrupted by a signal and has saved its state.
+    pub(crate) interrupted: bool,
+}
+
+struct Process {
+    role: Role,
+    name: String,
+    state: State,
+    policy: RestartPolicy,
+}
+
+enum State {
+    Running(ChildProcess),
+    Waiting { until: Instant, end: ProcessEnd },
+}
+
+/// A service that ended before it printed its address.
+struct FailedStart {
+    name: String,
+    child: ChildProcess,
+    end: ProcessEnd,
+}
+
+impl RunProcesses {
+    /// Prepares a run whose processes log to the plan's log file.
+    pub(crate) fn new(plan: &Plan) -> anyhow::Result<Self> {
+        Ok(Self {
+            launcher: Launcher::new(ProcessLog::open(&plan.log_path())?)?,
+            processes: Vec::new(),
+            teacher_address: None,
+            learner_address: String::new(),
+            peak: PeakMemory::default(),
+        })
+    }
+
+    /// Starts the teacher, the learner and the workers, in this order.
+    pub(crate) async fn start(&mut self, plan: &Plan, display: &Display) -> Result<(), RunFailure> {
+        if plan.config.advice.asks() {
+            let args = arguments::teacher(plan);
+            self.teacher_address = Some(self.start_service(Role::Teacher, &args, display).await?);
+        }
+        let mut args = arguments::learner(plan, self.teacher_address.as_deref(), plan.resume);
+        args.push("--keep-run-file".into());
+        self.learner_address = self.start_service(Role::Learner, &args, display).await?;
+        for number in 1..=plan.n_workers {
+            let name = format!("worker-{number}");
+            let child = self.spawn(&name, &self.worker_args(plan, &name), Stdio::null())?;
+            self.processes.push(Process::new(Role::Worker, name, child));
+        }
+        Ok(())
+    }
+
+    pub(crate) fn learner_address(&self) -> &str {
+        &self.learner_address
+    }
+
+    /// Restarts processes that have ended.
+    ///
+    /// # Errors
+    /// When a process has ended that must not be restarted.
+    pub(crate) fn check(
+        &mut self,
+        plan: &Plan,
+        lock: &RunLock,
+    ) -> Result<ProcessEvents, RunFailure> {
+        let mut events = ProcessEvents::default();
+        for idx in 0..self.processes.len() {
+            let process = &mut self.processes[idx];
+            if let State::Running(child) = &mut process.state
+                && let Some(end) = child.try_wait()?
+            {
+                process.handle_end(end, self.launcher.log(), &mut events)?;
+            }
+            if let State::Waiting { until, end } = process.state
+                && until <= clock::now()
+            {
+                if !lock.is_in_place() {
+                    return Err(displaced(plan, &process.name, end));
+                }
+                events.lines.push(format!("{} {end} and is restarted", process.name));
+                events.learner_restarted |= process.role == Role::Learner;
+                self.restart(idx, plan)?;
+            }
+        }
+        Ok(events)
+    }
+
+    /// Returns the largest sizes sampled so far.
+    pub(crate) const fn peak_memory(&self) -> PeakMemory {
+        self.peak
+    }
+
+    /// Samples the memory of the processes.
+    pub(crate) fn sample_memory(&mut self) {
+        for process in &self.processes {
+            let State::Running(child) = &process.state else { continue };
+            let peak = match process.role {
+                Role::Teacher => &mut self.peak.teacher_mib,
+                Role::Learner => &mut self.peak.learner_mib,
+                Role::Worker => &mut self.peak.worker_mib,
+            };
+            let peak_kib = child.pid().map_or(0, |pid| ResidentMemory::of(pid).peak_kib);
+            *peak = (peak_kib / 1024).max(*peak);
+        }
+    }
+
+    /// Asks all processes to exit and waits for them. The learner, which saves its state, has until `deadline`. The
+    /// teacher, which settles the learner's leases, ends after it.
+    pub(crate) async fn end(&mut self, deadline: Duration) {
+        let mut learner = None;
+        let mut teacher = None;
+        let mut workers = JoinSet::new();
+        for process in self.processes.drain(..) {
+            let State::Running(child) = process.state else { continue };
+            match process.role {
+                Role::Learner => learner = Some(child),
+                Role::Teacher => teacher = Some(child),
+                Role::Worker => drop(workers.spawn(child.end(GRACE))),
+            }
+        }
+        if let Some(learner) = learner {
+            learner.end(deadline).await;
+        }
+        if let Some(teacher) = teacher {
+            teacher.end(GRACE).await;
+        }
+        workers.join_all().await;
+    }
+
+    /// Starts a service and returns its address. A service that a signal kills before it prints its address is
+    /// restarted.
+    async fn start_service(
+        &mut self,
+        role: Role,
+        args: &[OsString],
+        display: &Display,
+    ) -> Result<String, RunFailure> {
+        let mut policy = RestartPolicy::new(role);
+        loop {
+            let FailedStart { name, child, end } = match self.try_start_service(role, args).await? {
+                Ok((process, address)) => {
+                    self.processes.push(Process { policy, ..process });
+                    return Ok(address);
+                }
+                Err(failed) => failed,
+            };
+            let log = self.launcher.log();
+            match (end, policy.decide(end, child.uptime())) {
+                (ProcessEnd::Signal(_), Decision::Restart { after }) => {
+                    display.print(&format!("{name} {end} and is restarted"));
+                    tokio::time::sleep(after).await;
+                }
+                (ProcessEnd::Signal(_), Decision::GiveUp { n_times }) => {
+                    return Err(given_up(&name, n_times, end, log, &child).into());
+                }
+                _ => {
+                    let reason = log.last_error_since(child.log_offset());
+                    let error = anyhow!("{name} {end}: {reason}");
+                    return Err(RunFailure { exit: exit_code(end), error });
+                }
+            }
+        }
+    }
+
+    /// Starts a service and waits until it prints its address or ends.
+    async fn try_start_service(
+        &self,
+        role: Role,
+        args: &[OsString],
+    ) -> anyhow::Result<Result<(Process, String), FailedStart>> {
+        let name = format!("the {}", role.name());
+        let mut child = self.spawn(&name, args, Stdio::piped())?;
+        let address = child.service_address().await;
+        match address.with_context(|| format!("cannot read the address of {name}"))? {
+            Some(address) => Ok(Ok((Process::new(role, name, child), address))),
+            None => {
+                let end = child.wait().await?.into();
+                Ok(Err(FailedStart { name, child, end }))
+            }
+        }
+    }
+
+    /// Restarts a process. A service gets its former address, so its clients find it again.
+    fn restart(&mut self, idx: usize, plan: &Plan) -> anyhow::Result<()> {
+        let Process { role, name, .. } = &self.processes[idx];
+        let teacher = self.teacher_address.as_deref();
+        let (mut args, address) = match role {
+            Role::Teacher => (arguments::teacher(plan), teacher),
+            Role::Learner => {
+                (arguments::learner(plan, teacher, true), Some(self.learner_address.as_str()))
+            }
+            Role::Worker => (self.worker_args(plan, name), None),
+        };
+        arguments::push_address(&mut args, "--listen", address);
+        let child = self.spawn(name, &args, Stdio::null())?;
+        self.processes[idx].state = State::Running(child);
+        Ok(())
+    }
+
+    fn worker_args(&self, plan: &Plan, name: &str) -> Vec<OsString> {
+        arguments::worker(plan, name, &self.learner_address, self.teacher_address.as_deref())
+    }
+
+    fn spawn(&self, name: &str, args: &[OsString], stdout: Stdio) -> anyhow::Result<ChildProcess> {
+        self.launcher.spawn(args, stdout).with_context(|| format!("cannot start {name}"))
+    }
+}
+
+impl Process {
+    const fn new(role: Role, name: String, child: ChildProcess) -> Self {
+        Self { role, name, state: State::Running(child), policy: RestartPolicy::new(role) }
+    }
+
+    /// Decides what follows from the end of the process.
+    fn handle_end(
+        &mut self,
+        end: ProcessEnd,
+        log: &ProcessLog,
+        events: &mut ProcessEvents,
+    ) -> Result<(), RunFailure> {
+        let State::Running(child) = &self.state else { return Ok(()) };
+        let name = &self.name;
+        match self.policy.decide(end, child.uptime()) {
+            Decision::Restart { after } => {
+                self.state = State::Waiting { until: clock::now() + after, end };
+                Ok(())
+            }
+            Decision::Interrupted => {
+                events.interrupted = true;
+                Ok(())
+            }
+            Decision::Fail(exit) => {
+                let reason = log.last_error_since(child.log_offset());
+                Err(RunFailure { exit, error: anyhow!("{name} {end}: {reason}") })
+            }
+            Decision::GiveUp { n_times } => Err(given_up(name, n_times, end, log, child).into()),
+        }
+    }
+}
+
+/// The error about a process that is not restarted once more.
+fn given_up(
+    name: &str,
+    n_times: u32,
+    end: ProcessEnd,
+    log: &ProcessLog,
+    child: &ChildProcess,
+) -> anyhow::Error {
+    let error = anyhow!("{name} died {n_times} times in a row; the last time it {end}");
+    match end {
+        ProcessEnd::Code(_) => anyhow!("{error}: {}", log.last_error_since(child.log_offset())),
+        ProcessEnd::Signal(_) => error,
+    }
+}
+
+/// The error about a process that cannot be restarted because the run directory is no longer this run's.
+fn displaced(plan: &Plan, name: &str, end: ProcessEnd) -> RunFailure {
+    let out = plan.out.display();
+    let error = anyhow!("{name} {end}, and {out} was moved, removed or replaced");
+    RunFailure { exit: Exit::Usage, error }
+}
+
+/// Returns the exit code of a run whose service did not start.
+const fn exit_code(end: ProcessEnd) -> Exit {
+    match end {
+        ProcessEnd::Code(64) => Exit::Usage,
+        ProcessEnd::Code(65) => Exit::Data,
+        ProcessEnd::Code(70) => Exit::Bug,
+        _ => Exit::TryAgain,
+    }
+}

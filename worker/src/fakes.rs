@@ -1,0 +1,155 @@
+//! An environment, actors and a teacher for tests, simple enough to follow by hand.
+
+use tandem_core::layout::{Layout, OBSERVATION_PER_ARM, Task};
+use tandem_core::rng::{Stream, episode_rng, uniform};
+use tandem_core::work::{EpisodeOrder, RunTerms, SlotOrder};
+use tandem_core::{
+    ArmAdvice, Contacts, EpisodeKind, Exploration, StepAdvice, StepQuery, WorldSettings,
+};
+use tandem_sim::SimError;
+
+use crate::ports::{Act, Advisor, AdvisorGone, Environment};
+
+pub(crate) const LAYOUT: Layout = Layout::new(Task::Push, 2);
+
+/// Hands that move by the action. Hands at the same place touch.
+#[derive(Debug, Clone)]
+pub(crate) struct FakeEnvironment {
+    positions: Vec<f32>,
+    goal: Vec<f32>,
+}
+
+impl FakeEnvironment {
+    pub(crate) fn new() -> Self {
+        Self { positions: vec![9.0; LAYOUT.n_action()], goal: vec![9.0; LAYOUT.n_goal()] }
+    }
+}
+
+impl Environment for FakeEnvironment {
+    fn reset(&mut self, order: EpisodeOrder, settings: WorldSettings) {
+        let mut rng = episode_rng(order.seed, order.number, Stream::Reset);
+        let width = 0.5 + settings.grasped_start_prob;
+        self.positions.fill_with(|| uniform(&mut rng, -width, width));
+        self.goal.fill_with(|| uniform(&mut rng, -0.5, 0.5));
+    }
+
+    fn observe(&self, observation: &mut [f32]) {
+        for (arm, part) in observation.chunks_mut(OBSERVATION_PER_ARM).enumerate() {
+            part.fill(0.0);
+            part[..3].copy_from_slice(&self.positions[3 * arm..3 * arm + 3]);
+        }
+    }
+
+    fn goal(&self) -> &[f32] {
+        &self.goal
+    }
+
+    fn step(&mut self, action: &[f32]) -> Result<Contacts, SimError> {
+        for (position, input) in self.positions.iter_mut().zip(action) {
+            *position += 0.05 * input;
+        }
+        let meet = (self.positions[0] - self.positions[3]).abs() < 0.05;
+        Ok(if meet { Contacts::ARM_ARM } else { Contacts::NONE })
+    }
+}
+
+/// An actor that moves towards the goal, or always takes the same action.
+#[derive(Debug, Clone, Copy)]
+pub(crate) enum FakeActor {
+    Seeker,
+    Constant(f32),
+}
+
+impl Act for FakeActor {
+    fn act(&mut self, observations: &[f32], goals: &[f32], actions: &mut [f32]) {
+        let arms = observations
+            .chunks(OBSERVATION_PER_ARM)
+            .zip(goals.chunks(3))
+            .zip(actions.chunks_mut(3));
+        for ((observation, goal), action) in arms {
+            for axis in 0..3 {
+                action[axis] = match self {
+                    Self::Seeker => (goal[axis] - observation[axis]).clamp(-1.0, 1.0),
+                    Self::Constant(input) => *input,
+                };
+            }
+        }
+    }
+}
+
+/// A teacher that overrides the arms for which `overrides` returns true, given episode, step and arm. Records requests.
+pub(crate) struct FakeTeacher<F> {
+    pub(crate) overrides: F,
+    pub(crate) requests: Vec<Vec<StepQuery>>,
+}
+
+/// The teacher's action, which no proposal equals.
+pub(crate) const TEACHER_ACTION: [f32; 3] = [0.75, -0.75, 0.25];
+
+impl<F: Fn(u64, u32, usize) -> bool> FakeTeacher<F> {
+    pub(crate) const fn new(overrides: F) -> Self {
+        Self { overrides, requests: Vec::new() }
+    }
+
+    fn verdict(&self, query: &StepQuery) -> StepAdvice {
+        let mut action = query.proposed_action.clone();
+        let arms: Vec<ArmAdvice> = LAYOUT
+            .arms()
+            .map(|arm| {
+                let overridden = (self.overrides)(query.episode, query.step, arm.0);
+                if overridden {
+                    action[LAYOUT.action_of(arm)].copy_from_slice(&TEACHER_ACTION);
+                }
+                ArmAdvice {
+                    teacher_action: TEACHER_ACTION.to_vec(),
+                    q_teacher: 0.0,
+                    q_student: -1.0,
+                    importance: 1.0,
+                    distance: 1.0,
+                    overridden,
+                }
+            })
+            .collect();
+        StepAdvice { action, charged: arms.iter().any(|arm| arm.overridden), arms }
+    }
+}
+
+impl<F: Fn(u64, u32, usize) -> bool> Advisor for FakeTeacher<F> {
+    fn advise(&mut self, queries: Vec<StepQuery>) -> Result<Vec<StepAdvice>, AdvisorGone> {
+        let advice = queries.iter().map(|query| self.verdict(query)).collect();
+        self.requests.push(queries);
+        Ok(advice)
+    }
+}
+
+/// Returns terms with every kind of exploration.
+pub(crate) fn terms() -> RunTerms {
+    RunTerms {
+        run: "run-7".to_owned(),
+        layout: LAYOUT,
+        account: Some("run".to_owned()),
+        exploration: Exploration {
+            noise_std: 0.2,
+            random_action_prob: 0.3,
+            sticky_random_mean_steps: 4.0,
+        },
+        world: WorldSettings { grasped_start_prob: 0.5, substeps: 20 },
+    }
+}
+
+/// Returns a slot of training episodes with these numbers.
+pub(crate) fn slot(numbers: &[u64], advised: bool) -> SlotOrder {
+    let order = |number: &u64| EpisodeOrder {
+        number: *number,
+        seed: 11,
+        advised,
+        uniform: false,
+        record: false,
+    };
+    SlotOrder {
+        slot: 0,
+        parameter_version: 4,
+        kind: EpisodeKind::Training,
+        episodes: numbers.iter().map(order).collect(),
+    }
+}

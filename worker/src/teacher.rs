@@ -1,0 +1,113 @@
+//! The client of the teacher.
+
+use tandem_core::{Layout, StepAdvice, StepQuery};
+use tandem_net::{AuthChannel, MAX_MESSAGE_BYTES, Operation, Retrier, within};
+use tandem_proto::pb;
+use tandem_proto::pb::teacher_client::TeacherClient;
+use tokio::sync::mpsc;
+use tokio_stream::wrappers::ReceiverStream;
+use tonic::{Code, Status, Streaming};
+
+use crate::config::{Timeouts, WorkerConfig};
+use crate::error::{CallError, Error, expect_same};
+
+const ADVISE: Operation = Operation { peer: "teacher", purpose: "ask the teacher" };
+/// The capacity of an advice stream, in requests. One request is open at a time, so the worker never waits for room.
+const STREAM_CAPACITY: usize = 1;
+
+/// The teacher of a run, asked over one stream. Requests are repeated until the teacher answers.
+#[derive(Debug)]
+pub(crate) struct Teacher {
+    client: TeacherClient<AuthChannel>,
+    timeouts: Timeouts,
+    stream: Option<AdviceStream>,
+}
+
+#[derive(Debug)]
+struct AdviceStream {
+    requests: mpsc::Sender<pb::AdviseRequest>,
+    responses: Streaming<pb::AdviseResponse>,
+}
+
+impl Teacher {
+    /// Creates a client, which connects on its first call; `None` if the configuration names no teacher.
+    pub(crate) fn new(config: &WorkerConfig, timeouts: Timeouts) -> Result<Option<Self>, Error> {
+        let Some(address) = &config.teacher else { return Ok(None) };
+        let channel = config.client.channel(address);
+        let channel = channel.map_err(|source| Error::Address { role: "teacher", source })?;
+        let client = TeacherClient::new(channel)
+            .max_decoding_message_size(MAX_MESSAGE_BYTES)
+            .max_encoding_message_size(MAX_MESSAGE_BYTES);
+        Ok(Some(Self { client, timeouts, stream: None }))
+    }
+
+    /// Returns the teacher's advice on `queries`, charged to `account`. A repeated request is not charged again.
+    pub(crate) async fn advise(
+        &mut self,
+        account: &str,
+        layout: Layout,
+        queries: &[StepQuery],
+    ) -> Result<Vec<StepAdvice>, Error> {
+        let steps = queries.iter().map(tandem_proto::encode_query).collect();
+        let request = pb::AdviseRequest { account: account.to_owned(), steps };
+        let response = self.exchange_until_answered(request).await;
+        let response = response.map_err(|status| Error::protocol(ADVISE, status))?;
+        let decode = || {
+            expect_same("steps", queries.len() as u64, response.steps.len() as u64)?;
+            let decode = |advice| tandem_proto::decode_advice(advice, layout);
+            Ok::<_, CallError>(response.steps.into_iter().map(decode).collect::<Result<_, _>>()?)
+        };
+        decode().map_err(|error| Error::protocol(ADVISE, error))
+    }
+
+    async fn exchange_until_answered(
+        &mut self,
+        request: pb::AdviseRequest,
+    ) -> Result<pb::AdviseResponse, Status> {
+        let mut retrier = Retrier::new(self.timeouts.backoff, ADVISE);
+        loop {
+            let outcome = within(self.timeouts.advice, self.exchange(request.clone())).await;
+            if let Some(outcome) = retrier.settle(outcome).await {
+                return outcome;
+            }
+        }
+    }
+
+    /// Sends one request and waits for its response.
+    ///
+    /// A stream that failed or was abandoned is not reused: its next response could be to an earlier request.
+    async fn exchange(&mut self, request: pb::AdviseRequest) -> Result<pb::AdviseResponse, Status> {
+        let mut stream = match self.stream.take() {
+            Some(stream) => {
+                stream.requests.send(request).await.map_err(|_unsent| closed())?;
+                stream
+            }
+            None => self.open(request).await.map_err(without_account)?,
+        };
+        let response = stream.responses.message().await.map_err(without_account)?;
+        let response = response.ok_or_else(closed)?;
+        self.stream = Some(stream);
+        Ok(response)
+    }
+
+    /// Opens a stream with its first request, because some servers do not answer before they have one.
+    async fn open(&mut self, first: pb::AdviseRequest) -> Result<AdviceStream, Status> {
+        let (requests, outgoing) = mpsc::channel(STREAM_CAPACITY);
+        requests.send(first).await.map_err(|_unsent| closed())?;
+        let responses =
+            self.client.advise_stream(ReceiverStream::new(outgoing)).await?.into_inner();
+        Ok(AdviceStream { requests, responses })
+    }
+}
+
+/// Marks an unknown account as transient: the learner opens the account again after the teacher has lost it.
+fn without_account(status: Status) -> Status {
+    match status.code() {
+        Code::NotFound => Status::unavailable(status.message()),
+        _ => status,
+    }
+}
+
+fn closed() -> Status {
+    Status::unavailable("the teacher closed the advice stream")
+}
