@@ -4,7 +4,7 @@ use std::collections::BTreeSet;
 use std::fs;
 use std::path::{Path, PathBuf};
 
-const ALLOWED: [(&str, &[&str]); 14] = [
+const ALLOWED: [(&str, &[&str]); 15] = [
     ("core", &[]),
     ("system", &[]),
     ("kinematics", &["core"]),
@@ -18,11 +18,12 @@ const ALLOWED: [(&str, &[&str]); 14] = [
     ("teacher", &["core", "policy", "proto", "telemetry", "net"]),
     ("worker", &["core", "sim", "policy", "proto", "telemetry", "net"]),
     ("report", &["core", "system", "telemetry"]),
-    ("bridge", &["core", "kinematics", "policy", "sim", "telemetry", "proto", "net"]),
+    ("bridge", &["core", "kinematics", "proto", "net"]),
+    ("trials", &["core", "kinematics", "sim", "policy", "telemetry", "bridge"]),
 ];
 
 /// Directories of which every file is pure, and single pure files.
-const PURE: [&str; 28] = [
+const PURE: [&str; 25] = [
     "core/src",
     "kinematics/src",
     "sim/src",
@@ -36,20 +37,17 @@ const PURE: [&str; 28] = [
     "bridge/src/kinova_ros/node.rs",
     "bridge/src/kinova_ros/protocol.rs",
     "bridge/src/quarc/codec.rs",
-    "bridge/src/quarc/inbox.rs",
-    "bridge/src/layout.rs",
+    "bridge/src/quarc/state_buffer.rs",
+    "bridge/src/work_cell.rs",
     "bridge/src/service/execution.rs",
-    "bridge/src/service/paced.rs",
-    "bridge/src/service/time.rs",
-    "bridge/src/service/words.rs",
-    "bridge/src/simulated",
-    "bridge/src/trial.rs",
-    "bridge/src/trial",
+    "bridge/src/service/clock.rs",
+    "bridge/src/service/reason_codes.rs",
     "learner/src/work_queue.rs",
     "teacher/src/budget.rs",
     "teacher/src/maps.rs",
     "teacher/src/procedures.rs",
     "teacher/src/strategy.rs",
+    "trials/src",
     "worker/src/rollout.rs",
 ];
 
