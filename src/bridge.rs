@@ -38,7 +38,7 @@ pub(crate) fn bridge(args: BridgeArgs) -> Result<(), Failed> {
 }
 
 fn serve(args: BridgeServeArgs) -> Result<(), Failed> {
-    let gate = access::gate(&args.listen, &args.secret)?;
+    let server_config = access::server_config(&args.listen, &args.secret)?;
     let secret = secret().or_exit(Exit::TryAgain, || format!("cannot read {ENTROPY}"))?;
     let runtime = runtime().or_exit(Exit::TryAgain, String::new)?;
     runtime.block_on(async move {
@@ -55,7 +55,8 @@ fn serve(args: BridgeServeArgs) -> Result<(), Failed> {
             secret,
         };
         let served =
-            tandem_bridge::service::serve(executor, config, listener, &gate, shutdown).await;
+            tandem_bridge::service::serve(executor, config, listener, &server_config, shutdown)
+                .await;
         served.map_err(bridge_failed)
     })
 }
@@ -76,7 +77,7 @@ fn secret() -> std::io::Result<[u8; 32]> {
 fn bridge_failed(error: Error) -> Failed {
     let exit = match &error {
         Error::Panicked => Exit::Bug,
-        Error::Gate(_) => Exit::Usage,
+        Error::ServerConfig(_) => Exit::Usage,
         _ => Exit::TryAgain,
     };
     Failed::new(exit, error)

@@ -1,7 +1,7 @@
 //! The service `tandem.v1.Bridge`: a thin shell around an [`Executor`] on its own thread.
 //!
-//! No client can delay a tick: motions are planned and checked on other threads, one at a time; calls are handled
-//! between ticks; progress is published without waiting for readers. A stop waits in no queue.
+//! No client can delay a tick: motions are planned and checked on other threads, one at a time; calls are handled between
+//! ticks; progress is published without waiting for readers. A stop waits in no queue.
 //!
 //! **The drives always stop**: when the service shuts down, a stream ends or breaks, the owner falls silent, a driver
 //! fails, or the arms' thread panics. The drives of a killed process brake because they receive no commands.
@@ -61,8 +61,8 @@ pub struct Config {
     pub secret: [u8; 32],
 }
 
-/// Serves the arms of `executor` to the clients that `gate` admits until `shutdown` is cancelled, and then stops the
-/// arms.
+/// Serves the arms of `executor` to the clients that `server_config` admits until `shutdown` is cancelled, and then
+/// stops the arms.
 ///
 /// # Errors
 /// Returns an error if the server fails, the arms' thread has panicked, or the driver hangs.
@@ -73,7 +73,7 @@ pub async fn serve(
     executor: Executor<BoxDriver>,
     config: Config,
     incoming: impl Into<Incoming>,
-    gate: &ServerConfig,
+    server_config: &ServerConfig,
     shutdown: CancellationToken,
 ) -> Result<(), Error> {
     assert!(config.speed > 0.0 && config.speed <= 1.0, "speed {}", config.speed);
@@ -85,7 +85,7 @@ pub async fn serve(
     tokio::spawn(log_stops(arms.watch()));
     let service = BridgeService::new(arms, config);
     let bridge = BridgeServer::new(service).max_decoding_message_size(MAX_REQUEST_BYTES);
-    let router = gate.router(bridge, tandem_proto::FILE_DESCRIPTOR_SET).await?;
+    let router = server_config.router(bridge, tandem_proto::FILE_DESCRIPTOR_SET).await?;
     let served = tandem_net::serve(router, incoming, ends.clone()).await;
     ends.cancel();
     thread.join(SHUTDOWN_GRACE).await?;

@@ -23,7 +23,7 @@ use tokio_util::sync::CancellationToken;
 
 use crate::books::{Ledgers, SharedBook, Watched};
 use crate::machines::{House, Machines, with_causes};
-use crate::network::{address, dial, listen};
+use crate::network::{address, client_config, listen};
 use crate::schedule::{Host, Schedule};
 use crate::system;
 
@@ -187,8 +187,8 @@ impl Stage {
         let life = self.house.life_of(LEARNER);
         let config = LearnerConfig {
             run: self.run.clone(),
-            gate: ServerConfig::default(),
-            dial: dial(),
+            server_config: ServerConfig::default(),
+            client_config: client_config(),
             teacher: Some(address(TEACHER)),
             start_from: None,
             out,
@@ -220,9 +220,10 @@ impl Stage {
         self.course.update(|course| Course { n_teachers: course.n_teachers + 1, ..course });
         let policy = OneArmPolicy::new(teacher_policy())?;
         let advisor = Advisor::new(Box::new(policy), Box::new(ledger))?;
-        let (gate, for_ever) = (ServerConfig::default(), CancellationToken::new());
+        let (server_config, for_ever) = (ServerConfig::default(), CancellationToken::new());
         let served =
-            serve_advisor(advisor, listen().await?, &gate, for_ever, Pacing::Lockstep).await;
+            serve_advisor(advisor, listen().await?, &server_config, for_ever, Pacing::Lockstep)
+                .await;
         if let Err(error) = served {
             self.house.complain(with_causes(TEACHER, &error));
         }
@@ -232,7 +233,7 @@ impl Stage {
     async fn worker(self: Rc<Self>, host: Host) -> turmoil::Result {
         self.course.update(|course| Course { n_workers: course.n_workers + 1, ..course });
         let config = WorkerConfig {
-            client: dial(),
+            client: client_config(),
             learner: address(LEARNER),
             teacher: Some(address(TEACHER)),
             name: host.to_owned(),

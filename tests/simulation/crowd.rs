@@ -16,7 +16,7 @@ use tonic::{Response, Status};
 
 use crate::books::{Ledgers, SharedBook, Watched};
 use crate::machines::{House, Machines, with_causes};
-use crate::network::{address, dial, listen};
+use crate::network::{address, client_config, listen};
 use crate::schedule::{Host, Schedule};
 
 const TEACHER: Host = "teacher";
@@ -98,9 +98,10 @@ impl Default for Stage {
 impl Stage {
     async fn teacher(self: Rc<Self>, ledger: Watched) -> turmoil::Result {
         let advisor = Advisor::new(Box::new(Still), Box::new(ledger))?;
-        let (gate, for_ever) = (ServerConfig::default(), CancellationToken::new());
+        let (server_config, for_ever) = (ServerConfig::default(), CancellationToken::new());
         let served =
-            serve_advisor(advisor, listen().await?, &gate, for_ever, Pacing::Lockstep).await;
+            serve_advisor(advisor, listen().await?, &server_config, for_ever, Pacing::Lockstep)
+                .await;
         if let Err(error) = served {
             self.house.complain(with_causes(TEACHER, &error));
         }
@@ -108,7 +109,7 @@ impl Stage {
     }
 
     async fn client(self: Rc<Self>, client_idx: usize) -> turmoil::Result {
-        let client = TeacherClient::new(dial().channel(&address(TEACHER))?);
+        let client = TeacherClient::new(client_config().channel(&address(TEACHER))?);
         let account = pb::OpenAccountRequest {
             name: ACCOUNT.to_owned(),
             budget: BUDGET,

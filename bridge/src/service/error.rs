@@ -63,7 +63,7 @@ pub enum Error {
     Thread(#[source] std::io::Error),
     /// The service cannot be set up.
     #[error(transparent)]
-    Gate(#[from] tandem_net::ServerConfigError),
+    ServerConfig(#[from] tandem_net::ServerConfigError),
     /// The server failed.
     #[error("cannot serve")]
     Transport(#[from] tonic::transport::Error),
@@ -98,7 +98,7 @@ pub(super) fn status(error: &Error) -> Status {
         Error::Panicked
         | Error::DriverHung
         | Error::Thread(_)
-        | Error::Gate(_)
+        | Error::ServerConfig(_)
         | Error::Transport(_) => {
             tracing::error!(%error, "request failed");
             Status::internal(message)

@@ -131,7 +131,7 @@ impl Tap {
     }
 
     /// Creates a new connection if the previous one is lost.
-    fn dial(&self) -> Result<Self, DriverError> {
+    fn client_config(&self) -> Result<Self, DriverError> {
         let mut bench = self.0.0.lock().unwrap();
         if bench.fault != Fault::Lost {
             return Err(DriverError::Disconnected { what: "no response".into() });
@@ -235,7 +235,7 @@ impl Rig {
     pub(crate) async fn dialling(settings: Settings) -> Self {
         Self::start(settings, 1.0, |tap| {
             let tap = tap.clone();
-            Some(Arc::new(move || tap.dial().map(|tap| Box::new(tap) as BoxDriver)))
+            Some(Arc::new(move || tap.client_config().map(|tap| Box::new(tap) as BoxDriver)))
         })
         .await
     }
