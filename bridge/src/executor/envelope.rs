@@ -405,7 +405,7 @@ mod tests {
         let breach = check(&at, [towards, REST]).unwrap_err();
         assert!(matches!(breach.cause, StopCause::SelfGap(_)), "{breach:?}");
         assert_eq!(breach.arm.map(|arm| arm.0), Some(0));
-        // With room for four periods and the braking it may go on.
+        // With room for four periods and the braking it may continue.
         let (at, towards) = near_own_base(0.008);
         assert_eq!(check(&at, [towards, REST]), Ok(()));
     }
