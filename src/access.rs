@@ -5,34 +5,41 @@ use std::path::Path;
 use tandem_net::{AccessError, ClientConfig, ServerConfig, Token, is_exposed};
 use tracing::warn;
 
-use crate::cli::{DialArgs, ListenArgs, SecretArgs};
+use crate::cli::{ClientArgs, ListenArgs, SecretArgs};
 use crate::exit::{Exit, Failed, OrExit as _};
 use crate::input;
 
 /// Returns the access rules of a service; rejects an unprotected address that other machines can reach.
-pub(crate) fn gate(listen: &ListenArgs, secret: &SecretArgs) -> Result<ServerConfig, Failed> {
-    let mut gate = ServerConfig::default();
+pub(crate) fn server_config(
+    listen: &ListenArgs,
+    secret: &SecretArgs,
+) -> Result<ServerConfig, Failed> {
+    let mut server_config = ServerConfig::default();
     if let Some(token) = token(secret)? {
-        gate = gate.with_token(token);
+        server_config = server_config.with_token(token);
     }
     if let (Some(certificate), Some(key)) = (&listen.tls_cert, &listen.tls_key) {
         let what = || format!("cannot serve with --tls-cert {certificate:?} --tls-key {key:?}");
-        gate =
-            gate.with_certificate(&read(certificate)?, &read(key)?).or_exit(Exit::Usage, what)?;
+        server_config = server_config
+            .with_certificate(&read(certificate)?, &read(key)?)
+            .or_exit(Exit::Usage, what)?;
     }
     if !listen.insecure {
-        gate.check_address(listen.listen).or_exit(Exit::Usage, String::new)?;
+        server_config.check_address(listen.listen).or_exit(Exit::Usage, String::new)?;
     }
-    if is_exposed(listen.listen) && secret.token_file.is_some() && gate.is_plain() {
+    if is_exposed(listen.listen) && secret.token_file.is_some() && server_config.is_plain() {
         let address = listen.listen;
         warn!(%address, "without --tls-cert, others on the network can read all messages and the token");
     }
-    Ok(gate)
+    Ok(server_config)
 }
 
 /// Returns how to call other services.
-pub(crate) fn dial(args: &DialArgs, secret: &SecretArgs) -> Result<ClientConfig, Failed> {
-    let calls = dial_without_token(args)?;
+pub(crate) fn client_config(
+    args: &ClientArgs,
+    secret: &SecretArgs,
+) -> Result<ClientConfig, Failed> {
+    let calls = client_config_without_token(args)?;
     Ok(match token(secret)? {
         Some(token) => calls.with_token(&token),
         None => calls,
@@ -40,7 +47,7 @@ pub(crate) fn dial(args: &DialArgs, secret: &SecretArgs) -> Result<ClientConfig,
 }
 
 /// Returns how to call services that require no token.
-pub(crate) fn dial_without_token(args: &DialArgs) -> Result<ClientConfig, Failed> {
+pub(crate) fn client_config_without_token(args: &ClientArgs) -> Result<ClientConfig, Failed> {
     let Some(authority) = &args.tls_ca else { return Ok(ClientConfig::default()) };
     let what = || format!("cannot trust --tls-ca {authority:?}");
     ClientConfig::default().with_authority(&read(authority)?).or_exit(Exit::Usage, what)

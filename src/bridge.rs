@@ -38,24 +38,25 @@ pub(crate) fn bridge(args: BridgeArgs) -> Result<(), Failed> {
 }
 
 fn serve(args: BridgeServeArgs) -> Result<(), Failed> {
-    let gate = access::gate(&args.listen, &args.secret)?;
+    let server_config = access::server_config(&args.listen, &args.secret)?;
     let secret = secret().or_exit(Exit::TryAgain, || format!("cannot read {ENTROPY}"))?;
     let runtime = runtime().or_exit(Exit::TryAgain, String::new)?;
     runtime.block_on(async move {
         let shutdown = signals::shutdown_token(args.listen.exit_with_stdin)?;
-        let time = Arc::new(clock::BridgeClock::new());
-        let (executor, dial) = arms::arms(&args, time.clone())?;
+        let clock = Arc::new(clock::BridgeClock::new());
+        let (executor, reconnect) = arms::arms(&args, clock.clone())?;
         let listener = service::listen(&args.listen).await?;
         let config = Config {
             driver: arms::name(args.driver).to_owned(),
             version: VERSION.to_owned(),
             speed: args.speed,
-            time,
-            dial,
+            clock,
+            reconnect,
             secret,
         };
         let served =
-            tandem_bridge::service::serve(executor, config, listener, &gate, shutdown).await;
+            tandem_bridge::service::serve(executor, config, listener, &server_config, shutdown)
+                .await;
         served.map_err(bridge_failed)
     })
 }
@@ -76,7 +77,7 @@ fn secret() -> std::io::Result<[u8; 32]> {
 fn bridge_failed(error: Error) -> Failed {
     let exit = match &error {
         Error::Panicked => Exit::Bug,
-        Error::Gate(_) => Exit::Usage,
+        Error::ServerConfig(_) => Exit::Usage,
         _ => Exit::TryAgain,
     };
     Failed::new(exit, error)

@@ -22,7 +22,7 @@ pub(crate) use results::{
     EvalArgs, McapArgs, McapCommand, PictureArgs, PolicyArgs, PolicyCommand, ReplayArgs, ReportArgs,
 };
 pub(crate) use service::{
-    DialArgs, LearnerArgs, ListenArgs, RelayArgs, SecretArgs, TeacherArgs, WorkerArgs,
+    ClientArgs, LearnerArgs, ListenArgs, RelayArgs, SecretArgs, TeacherArgs, WorkerArgs,
 };
 pub(crate) use train::{RecipeName, SweepArgs, TrainArgs};
 pub(crate) use trial::{ModeName, RecordName, TrialArgs};

@@ -3,7 +3,7 @@
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
-use tandem_bridge::service::Time;
+use tandem_bridge::service::Clock;
 
 /// Returns a clock that counts from this call, for libraries that take the time as an argument.
 pub(crate) fn since_now() -> Arc<dyn Fn() -> Duration + Send + Sync> {
@@ -33,7 +33,7 @@ impl BridgeClock {
     }
 }
 
-impl Time for BridgeClock {
+impl Clock for BridgeClock {
     fn now_s(&self) -> f64 {
         self.0.elapsed().as_secs_f64()
     }

@@ -9,10 +9,10 @@ use crate::{access, output, runtime};
 
 pub(crate) fn health(args: &HealthArgs) -> Result<(), Failed> {
     let HealthArgs { address, service, .. } = args;
-    let dial = access::dial_without_token(&args.dial)?;
+    let client_config = access::client_config_without_token(&args.client_config)?;
     let runtime = runtime::new().or_exit(Exit::TryAgain, String::new)?;
     let answer = runtime.block_on(async {
-        let link = dial.channel(address).or_exit(Exit::Usage, String::new)?;
+        let link = client_config.channel(address).or_exit(Exit::Usage, String::new)?;
         Ok(check_health(link, service, args.timeout_s).await)
     })?;
     if args.json {

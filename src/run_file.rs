@@ -29,8 +29,8 @@ pub(crate) fn resolve(
         Some(path) => read(path).or_exit(Exit::Usage, String::new)?,
         None => Table::new(),
     };
-    let told = || file.map_or_else(String::new, |path| format!("run file {}", path.display()));
-    overlay(from_file, settings).or_exit(Exit::Usage, told)
+    let context = || file.map_or_else(String::new, |path| format!("run file {}", path.display()));
+    overlay(from_file, settings).or_exit(Exit::Usage, context)
 }
 
 /// Splits `key=value`; the value is TOML where it can be read as such, else text.

@@ -20,10 +20,10 @@ const TIMEOUT: Duration = Duration::from_secs(10);
 const LINE_EVERY_S: f64 = 30.0;
 
 pub(crate) fn status(args: &StatusArgs) -> Result<(), Failed> {
-    let dial = access::dial(&args.dial, &args.secret)?;
+    let client_config = access::client_config(&args.client_config, &args.secret)?;
     let runtime = runtime::new().or_exit(Exit::TryAgain, String::new)?;
     runtime.block_on(async {
-        let link = dial.channel(&args.address).or_exit(Exit::Usage, String::new)?;
+        let link = client_config.channel(&args.address).or_exit(Exit::Usage, String::new)?;
         let mut learner = LearnerClient::new(link);
         if args.watch { watch(&mut learner, args).await } else { show(&mut learner, args).await }
     })

@@ -155,7 +155,7 @@ impl IdleClients {
         let path = "/grpc.health.v1.Health/Watch".parse::<http::uri::PathAndQuery>();
         let path = path.expect("a path");
         for _ in 0..N_CLIENTS {
-            let Some((channel, mut caller)) = dial(address).await else { continue };
+            let Some((channel, mut caller)) = connect(address).await else { continue };
             let codec = tonic_prost::ProstCodec::<(), ()>::default();
             let watch = caller.server_streaming(Request::new(()), path.clone(), codec);
             if let Ok(Ok(watch)) = tokio::time::timeout(DEADLINE, watch).await {
@@ -170,7 +170,7 @@ impl IdleClients {
         let path = "/tandem.v1.Bridge/Status".parse::<http::uri::PathAndQuery>();
         let path = path.expect("a path");
         for _ in 0..N_CLIENTS {
-            let Some((channel, mut caller)) = dial(address).await else { continue };
+            let Some((channel, mut caller)) = connect(address).await else { continue };
             let codec = tonic_prost::ProstCodec::<(), ()>::default();
             let call = caller.unary(Request::new(()), path.clone(), codec);
             drop(tokio::time::timeout(DEADLINE, call).await);
@@ -179,7 +179,7 @@ impl IdleClients {
     }
 }
 
-async fn dial(address: SocketAddr) -> Option<(Channel, tonic::client::Grpc<Channel>)> {
+async fn connect(address: SocketAddr) -> Option<(Channel, tonic::client::Grpc<Channel>)> {
     let endpoint = Endpoint::from_shared(format!("http://{address}")).expect("an address");
     let channel = endpoint.connect().await.ok()?;
     let mut caller = tonic::client::Grpc::new(channel.clone());

@@ -365,8 +365,8 @@ fn the_program_refuses_and_recovers_truncated_logs() {
         let refused = tandem(&["replay", "--verify"], &[&cut]);
         assert_eq!(refused.status.code(), Some(65), "{n_bytes} bytes");
         assert!(error_line(&refused).contains("cut.mcap"));
-        let recovered = tandem(&["mcap", "recover"], &[&cut, Path::new("--to"), &recovered]);
-        let code = recovered.status.code();
+        let output = tandem(&["mcap", "recover"], &[&cut, Path::new("--to"), &recovered]);
+        let code = output.status.code();
         assert_eq!(code, Some(if n_bytes < 8 { 65 } else { 0 }), "{n_bytes} bytes");
         assert_eq!(recovered.exists(), n_bytes >= 8);
         if recovered.exists() {

@@ -48,7 +48,7 @@ fn policies_are_tried_judged_and_recorded() {
 
 #[test]
 fn reports_know_every_cause_of_failure() {
-    assert_eq!(tandem_report::trials::CAUSES, tandem_bridge::trial::Cause::NAMES);
+    assert_eq!(tandem_report::trials::CAUSES, tandem_trials::trial::FailureCause::NAMES);
 }
 
 #[test]

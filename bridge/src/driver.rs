@@ -1,45 +1,45 @@
 //! The contract between the executor and a pair of arms, simulated or real.
 //!
-//! **One exchange a period.** The executor calls [`Driver::exchange`] once every [`Driver::period_s`]: a command goes out,
-//! the newest state comes back. The call does not wait longer than a period; when nothing new has come it
-//! returns the state before once more, and its sequence number tells. Angles, their rates and torques are those of the joints, base to
-//! wrist, by Kinova's convention (see [`tandem_kinematics::model`]); radians, radians per second, newton metres.
+//! **One exchange per period.** The executor calls [`Driver::exchange`] once every [`Driver::period_s`]: the driver
+//! sends a command and returns the newest state. The call waits at most one period. If no new state has arrived, it
+//! returns the previous one again, with the same sequence number. Angles, rates and torques are those of the joints,
+//! from base to wrist, by Kinova's convention (see [`tandem_kinematics::model`]), in radians, radians per second and
+//! newton metres.
 //!
-//! **Whoever falls silent stops the arms.** A command holds for one period. Every driver has to see to it that the arms
-//! brake by themselves when no command has come for [`SILENCE_S`], also when its own process is killed:
+//! **Silence stops the arms.** A command holds for one period. Every driver must ensure that the arms brake by
+//! themselves if no command arrives for [`SILENCE_S`], including when its own process is killed:
 //!
-//! - The simulated pair counts simulated time since the last command and brakes
-//!   ([`SimulatedPair`](crate::simulated::SimulatedPair)).
-//! - **QUARC** (one vector of doubles per sample over TCP): the receiving model holds its last input, which would go on moving for ever. The
-//!   vector therefore carries the command's number, and the model on that side has to set the velocities to zero when the
-//!   number has not changed for [`SILENCE_S`] or its stream server reports a lost peer. The driver closes the socket when a vector is short, is
-//!   not finite or jumps in its number.
-//! - **kinova-ros**: the arm follows joint velocities only while they are published at 100 Hz and stops when that ends.
-//!   The driver publishes once per exchange and nothing in between, so that a killed process is silent at once. On
-//!   [`Order::Stop`] it publishes nothing and calls the driver's `in/stop`. A queue that lies
-//!   between (rosbridge) has to be of length 1: a deep one would be played to its end.
+//! - The simulated pair (crate `tandem-trials`) counts simulated time since the last command and brakes.
+//! - **QUARC** (one vector of doubles per sample over TCP): the receiving model holds its last input and would continue
+//!   to move. The vector therefore contains the command's number, and the model must set the velocities to zero if the
+//!   number has not changed for [`SILENCE_S`] or its stream server reports a lost peer. The driver closes the socket if
+//!   a vector is incomplete, not finite or out of sequence.
+//! - **kinova-ros**: the arm follows joint velocities only while they are published at 100 Hz, and stops otherwise. The
+//!   driver publishes once per exchange and at no other time, so a killed process is silent at once. On [`Order::Stop`]
+//!   it publishes nothing and calls the node's `in/stop`. Queues in between (rosbridge) must have length 1, because the
+//!   arm would execute all commands of a longer queue.
 
 use tandem_kinematics::Joints;
 
 /// Time without a command after which the drives brake by themselves, seconds.
 pub const SILENCE_S: f64 = 0.050;
 
-/// A pair of arms, or any number of arms that share a table.
+/// A connection to a pair of arms, or to any number of arms in one work cell.
 pub trait Driver {
     /// Time from one exchange to the next, seconds.
     fn period_s(&self) -> f64;
 
-    /// Hands over the command of the coming period and returns the newest state.
+    /// Sends the command of the coming period and returns the newest state.
     ///
     /// # Errors
-    /// Says what happened to the connection. The arms may be moving then: call [`stop`](Self::stop).
+    /// Returns an error if the connection fails. The arms may still be moving: call [`stop`](Self::stop).
     fn exchange(&mut self, command: &Command) -> Result<PairState, DriverError>;
 
-    /// Lets the drives brake, by every means there is and without waiting for the next exchange. May be called at any time and
+    /// Stops the drives by all available means, without waiting for the next exchange. May be called at any time and
     /// any number of times.
     ///
     /// # Errors
-    /// When the drives could not be told. What is left then is that they fall silent.
+    /// Returns an error if the command could not be sent. The drives then brake after [`SILENCE_S`] without commands.
     fn stop(&mut self) -> Result<(), DriverError>;
 }
 
@@ -57,101 +57,101 @@ impl<D: Driver + ?Sized> Driver for Box<D> {
     }
 }
 
-/// What the arms shall do in the coming period.
+/// A command for the coming period.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Command {
-    /// Counts the commands of one executor, from 1.
+    /// The number of the command, counted from 1 by each executor.
     pub number: u64,
-    /// What to do.
+    /// The order.
     pub order: Order,
 }
 
-/// What the arms are told.
+/// The order of a command.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Order {
-    /// The drives brake as fast as they may and stay where they are; grippers keep what they hold.
+    /// The drives brake as fast as possible and hold their position; grippers do not move.
     Stop,
-    /// One entry an arm, in the order of the cell.
+    /// The arms move. One entry per arm, in the order of the work cell.
     Move(Vec<ArmCommand>),
 }
 
-/// What one arm shall do in the coming period.
+/// The command of one arm for the coming period.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ArmCommand {
     /// Joint velocities, radians per second.
     pub velocities: Joints,
-    /// How far the gripper shall be open: 0 is shut, 1 open.
+    /// The desired opening of the gripper: 0 is closed, 1 is open.
     pub opening: f64,
 }
 
-/// The arms at one time, as far as they have told.
+/// The state of the arms at one time.
 #[derive(Debug, Clone, PartialEq)]
 pub struct PairState {
-    /// Counts the states. The same number again means that nothing new has come; any other step than 1 means that some
-    /// were lost or that the arms have started anew.
+    /// The sequence number of the state. A repeated number means that no new state has arrived; a step other than 1
+    /// means that states were lost or the arms have restarted.
     pub sequence: u64,
-    /// When the state was true, seconds by a clock of the arms' own.
+    /// The time of the measurement by the arms' own clock, seconds.
     pub stamp_s: f64,
-    /// The newest command that had taken effect by then; `None` where the arms do not tell.
+    /// The number of the newest command that had taken effect; `None` if the arms do not report it.
     pub newest_command: Option<u64>,
-    /// One entry an arm, in the order of the cell.
+    /// One entry per arm, in the order of the work cell.
     pub arms: Vec<ArmReading>,
 }
 
-/// What one arm says of itself.
+/// The measurements of one arm.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ArmReading {
     /// Joint angles, radians.
     pub angles: Joints,
     /// Their rates, radians per second.
     pub velocities: Joints,
-    /// Torques beyond those that carry the arm itself, newton metres; `None` where the arm does not tell.
+    /// Torques without those that carry the arm's own weight, newton metres; `None` if the arm does not report them.
     pub torques_nm: Option<Joints>,
-    /// How far the gripper is open: 0 is shut, 1 open.
+    /// The opening of the gripper: 0 is closed, 1 is open.
     pub opening: f64,
-    /// What the arm complains about.
+    /// The reported faults.
     pub faults: Faults,
 }
 
-/// What an arm complains about.
+/// The faults that an arm reports.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Faults {
     /// A drive has failed, was switched off or has braked by itself.
     pub drive: bool,
-    /// Something touches the arm where nothing should, as a sensor or a person says.
+    /// An unintended contact with the arm, reported by a sensor or an operator.
     pub contact: bool,
     /// The emergency stop at the arm is pressed.
     pub emergency_stop: bool,
 }
 
-/// Why an exchange failed.
+/// The reason why an exchange failed.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[non_exhaustive]
 pub enum DriverError {
     /// There is no connection, or it has ended.
     #[error("the arms are not connected: {what}")]
     Disconnected {
-        /// What happened, in the words of what lies below.
+        /// The description of the failure by the lower layer.
         what: String,
     },
-    /// The arms said what cannot be understood.
-    #[error("the arms sent what is not a state: {what}")]
+    /// The arms sent a malformed state.
+    #[error("the arms sent a malformed state: {what}")]
     Malformed {
-        /// What is wrong with it.
+        /// The fault of the state.
         what: String,
     },
-    /// The arms, or the way to them, do not take the command.
-    #[error("the arms do not take this: {what}")]
+    /// The arms, or a program between, refuse the command.
+    #[error("the arms refuse the command: {what}")]
     Refused {
-        /// What is wrong, and what to do.
+        /// The problem, and its remedy if known.
         what: String,
     },
-    /// The command does not fit the arms.
+    /// The command is for a different number of arms or joints.
     #[error("a command for {got} arms or joints, expected {expected}")]
     Shape {
-        /// What the command is for.
+        /// The number in the command.
         got: usize,
-        /// What there is.
+        /// The number that exists.
         expected: usize,
     },
 }

@@ -1,75 +1,53 @@
-//! Plays a checked motion through a driver, period by period, and stops whenever anything is not as it should be.
+//! Plays a checked motion through a driver, period by period, and stops the arms on any fault.
 //!
-//! **States.** The arms begin *stopped*. [`reset`](Executor::reset) makes them *idle*, [`start`](Executor::start) *moving*, and
-//! at the motion's end they *settle* and are idle again. A moving pair *holds* (comes to rest on its
-//! path, and goes on by itself) while its owner or its states are late. Everything else that goes wrong, in any state, and
-//! [`stop`](Executor::stop) by anyone, makes them *stopped*: every later command is [`Order::Stop`] until an owner resets
-//! them. A stop says when, where and why ([`Stop`]), and the first one stands.
+//! **States.** The arms start *stopped*. [`reset`](Executor::reset) makes them *idle* and [`start`](Executor::start)
+//! *moving*; at the end of the motion they *settle* and are idle again. While the owner or the states are late, a
+//! motion *holds*: it comes to rest on its path and resumes by itself. Every other fault, in any state, and every call
+//! of [`stop`](Executor::stop) makes the arms *stopped*: each later command is [`Order::Stop`] until an owner resets
+//! them. A [`Stop`] records the time, the place and the cause; later causes do not replace the first one.
 //!
-//! **Each tick** sends one command and takes one state. The motion's own velocities, corrected by how far the arms are from
-//! where it has them, are kept within the limits (`playback.rs`); the envelope then looks at what came of it as if
-//! it did not know where it came from (`envelope.rs`); the state that comes back is judged (`monitor.rs`).
+//! **Each tick** sends one command and receives one state. `playback.rs` computes the motion's velocities, corrects
+//! them by the tracking error and keeps them within the limits; `envelope.rs` then checks the result independently;
+//! `monitor.rs` validates the state that comes back.
 //!
-//! **Ownership.** Whoever has the token owns the arms, as long as they are heard ([`acquire`](Executor::acquire) again). Only the
-//! owner starts and resets. Stopping is free for all.
+//! **Ownership.** The client with the token owns the arms as long as it renews its lease
+//! ([`acquire`](Executor::acquire)). Only the owner starts motions and resets. Any caller may stop the arms.
 //!
-//! **Every way out stops the drives**: when the executor is dropped it tells them, and when its process is killed they
-//! fall silent (see [`driver`](crate::driver)).
+//! **The drives always stop.** A dropped executor commands a stop. The drives of a killed process brake because they
+//! receive no commands (see [`driver`](crate::driver)).
 
 use tandem_kinematics::{Excess, Joints, Motion, WorkCell};
 
-use crate::driver::{ArmCommand, Command, Driver, DriverError, Order, PairState};
-use crate::executor::envelope::{Envelope, History};
+use crate::driver::{Driver, DriverError, Order, PairState};
+use crate::executor::commands::CommandHistory;
+use crate::executor::envelope::Envelope;
 use crate::executor::lease::Lease;
-use crate::executor::monitor::{Monitor, Told};
-use crate::executor::playback::{Moment, Playback};
+use crate::executor::monitor::{ExpectedState, Monitor};
+use crate::executor::playback::{Playback, TickContext};
+use crate::executor::state::ArmsState;
 use crate::executor::stop::Breach;
 
 pub use checked::{CheckError, CheckedMotion, Checker};
+pub use errors::{ResetError, StartError};
 pub use lease::{LeaseError, Token};
-pub use refused::{ResetError, StartError};
 pub use settings::{BadSetting, Settings};
+pub use state::{Phase, Progress};
 pub use stop::{Stop, StopCause};
 
-pub(crate) use refused::GOOD_STATES;
+pub(crate) use errors::GOOD_STATES;
 
 mod checked;
+mod commands;
 mod envelope;
+mod errors;
 mod lease;
 mod monitor;
 mod playback;
-mod refused;
 mod settings;
+mod state;
 mod stop;
 
-/// Commands that are remembered beyond a reaction.
-const REMEMBERED_BEYOND: usize = 8;
-
-/// What the arms are doing.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Phase {
-    /// The drives brake or have braked; nothing moves before a reset.
-    Stopped,
-    /// The arms stay where they are and wait for a motion.
-    Idle,
-    /// A motion is being played.
-    Moving,
-    /// A motion pauses because its owner or the states are late.
-    Holding,
-    /// The motion is over and the arms come to rest at its end.
-    Settling,
-}
-
-/// How far a motion has come.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Progress {
-    /// What has been played of it, seconds of the motion's own time.
-    pub played_s: f64,
-    /// How long it is, seconds of its own time.
-    pub duration_s: f64,
-}
-
-/// Moves a pair of arms; nothing else may talk to their driver.
+/// Moves a pair of arms. The executor is the only user of their driver.
 #[derive(Debug)]
 pub struct Executor<D: Driver> {
     cell: WorkCell,
@@ -80,54 +58,32 @@ pub struct Executor<D: Driver> {
     lease: Lease,
     monitor: Monitor,
     envelope: Envelope,
-    state: State,
-    number: u64,
-    history: History,
-    before: Vec<ArmCommand>,
+    state: ArmsState,
+    commands: CommandHistory,
     ticked_s: Option<f64>,
-    /// Why the drives could not be told to stop, until they were.
-    untold: Option<DriverError>,
-    /// Why the last exchange failed, if it did.
-    failed: Option<DriverError>,
-}
-
-/// What the arms are doing, and what goes with it.
-#[derive(Debug)]
-enum State {
-    Stopped(Stop),
-    Idle {
-        /// Where the arms shall stay, radians.
-        at: Vec<Joints>,
-    },
-    Playing {
-        playback: Box<Playback>,
-        holding: bool,
-    },
+    /// The error of the last attempt to stop the drives, until a command gets through.
+    stop_error: Option<DriverError>,
+    /// The error of the last exchange.
+    exchange_error: Option<DriverError>,
 }
 
 impl<D: Driver> Executor<D> {
-    /// Takes over the arms of `cell` behind `driver`. They are stopped until somebody resets them.
+    /// Takes over the arms of `cell` behind `driver`. They are stopped until an owner resets them.
     ///
     /// # Errors
-    /// Names a setting that makes no sense.
+    /// Returns the first setting that is out of its range.
     pub fn new(cell: WorkCell, driver: D, settings: Settings) -> Result<Self, BadSetting> {
         let period_s = driver.period_s();
         let settings = settings.checked(&cell, period_s)?;
-        let still =
-            |n_joints| ArmCommand { velocities: Joints::from_fn(n_joints, |_| 0.0), opening: 0.0 };
-        let before: Vec<ArmCommand> =
-            cell.arms.iter().map(|arm| still(arm.model.n_joints())).collect();
         Ok(Self {
             lease: Lease::default(),
             monitor: Monitor::new(&cell, &settings, period_s),
             envelope: Envelope::new(&cell, &settings, period_s),
-            state: State::Stopped(StopCause::NotReset.anywhere().at(0.0)),
-            number: 0,
-            history: History::new(),
-            before,
+            state: ArmsState::Stopped(StopCause::NotReset.anywhere().at(0.0)),
+            commands: CommandHistory::new(&cell, reaction_periods(&settings, period_s)),
             ticked_s: None,
-            untold: None,
-            failed: None,
+            stop_error: None,
+            exchange_error: None,
             checker: Checker::new(cell.clone(), settings),
             cell,
             settings,
@@ -136,30 +92,31 @@ impl<D: Driver> Executor<D> {
         })
     }
 
-    /// Makes whoever has `token` the owner when nobody else is, and notes that they were heard: the sign of life of a motion.
+    /// Makes the client with `token` the owner if the arms have none, and renews its lease. During a motion this is the
+    /// owner's sign of life.
     ///
     /// # Errors
-    /// When somebody else owns the arms.
+    /// Returns an error if another client owns the arms.
     pub fn acquire(&mut self, token: Token, now_s: f64) -> Result<(), LeaseError> {
         self.lease.acquire(token, now_s, self.settings.lease_s)
     }
 
-    /// Notes that the owner was heard.
+    /// Renews the owner's lease.
     ///
     /// # Errors
-    /// When whoever has `token` does not own the arms, or does no longer.
+    /// Returns an error if the client with `token` does not own the arms, or its lease has ended.
     pub fn renew(&mut self, token: Token, now_s: f64) -> Result<(), LeaseError> {
         self.lease.renew(token, now_s, self.settings.lease_s)
     }
 
-    /// Gives the arms up. A motion is stopped.
+    /// Releases the arms. A motion is stopped.
     ///
     /// # Errors
-    /// When whoever asks does not own them.
+    /// Returns an error if the client with `token` does not own the arms.
     pub fn release(&mut self, token: Token, now_s: f64) -> Result<(), LeaseError> {
-        self.lease.renew(token, now_s, self.settings.lease_s)?;
-        if matches!(self.state, State::Playing { .. }) {
-            self.halt(StopCause::OwnerLeft.anywhere(), now_s);
+        self.renew(token, now_s)?;
+        if matches!(self.state, ArmsState::Playing { .. }) {
+            self.halt(StopCause::OwnerReleased.anywhere(), now_s);
         }
         self.lease.release();
         Ok(())
@@ -171,17 +128,17 @@ impl<D: Driver> Executor<D> {
         self.period_s
     }
 
-    /// What checks motions for this executor.
+    /// The checker whose motions this executor accepts.
     #[must_use]
     pub fn checker(&self) -> &Checker {
         &self.checker
     }
 
-    /// Checks `motion` and starts it from where the arms are, at `speed` (in (0, 1], a share of the motion's own). The
-    /// check of a long motion takes longer than a period: see [`start_checked`](Self::start_checked).
+    /// Checks `motion` and starts it from the position of the arms, at `speed` (in (0, 1], a share of the motion's
+    /// own). The check of a long motion takes longer than a period: see [`start_checked`](Self::start_checked).
     ///
     /// # Errors
-    /// Says what is wrong with the motion, or why this is not the time. Nothing moves then.
+    /// Returns the fault of the motion, or the reason why no motion can start now. Nothing moves then.
     pub fn start(
         &mut self,
         token: Token,
@@ -195,7 +152,7 @@ impl<D: Driver> Executor<D> {
         Ok(())
     }
 
-    /// Starts a motion that the [`checker`](Self::checker) has passed, if the arms are still where it begins.
+    /// Starts a motion that the [`checker`](Self::checker) has passed, if the arms are still at its beginning.
     ///
     /// # Errors
     /// As [`start`](Self::start).
@@ -215,14 +172,14 @@ impl<D: Driver> Executor<D> {
         Ok(())
     }
 
-    /// Where the arms are, joint angles in radians, when a motion may start now.
+    /// Returns the joint angles of the arms, radians, if a motion may start now.
     fn startable(
         &mut self,
         token: Token,
         speed: f64,
         now_s: f64,
     ) -> Result<Vec<Joints>, StartError> {
-        self.lease.renew(token, now_s, self.settings.lease_s)?;
+        self.renew(token, now_s)?;
         if self.phase() != Phase::Idle {
             return Err(StartError::NotIdle(self.phase()));
         }
@@ -240,25 +197,25 @@ impl<D: Driver> Executor<D> {
 
     fn play(&mut self, motion: CheckedMotion, speed: f64) {
         let playback = Box::new(Playback::new(motion.into_motion(), speed));
-        self.state = State::Playing { playback, holding: false };
+        self.state = ArmsState::Playing { playback, holding: false };
     }
 
-    /// Stops the arms. Anyone may at any time.
+    /// Stops the arms on request. No ownership is needed.
     pub fn stop(&mut self, now_s: f64) {
         self.halt(StopCause::Requested.anywhere(), now_s);
     }
 
-    /// Stops the arms because whoever ticks the executor is about to end.
+    /// Stops the arms because the program that ticks the executor is about to end.
     pub fn shut_down(&mut self, now_s: f64) {
         self.halt(StopCause::ShutDown.anywhere(), now_s);
     }
 
-    /// Lets stopped arms go: they stay where they are until a motion is started.
+    /// Makes stopped arms idle. They hold their position until a motion is started.
     ///
     /// # Errors
-    /// When whoever asks does not own the arms, or the arms are not well.
+    /// Returns an error if the client with `token` does not own the arms, or their states are not good.
     pub fn reset(&mut self, token: Token, now_s: f64) -> Result<(), ResetError> {
-        self.lease.renew(token, now_s, self.settings.lease_s)?;
+        self.renew(token, now_s)?;
         if self.phase() != Phase::Stopped {
             return Err(ResetError::NotStopped(self.phase()));
         }
@@ -269,156 +226,139 @@ impl<D: Driver> Executor<D> {
         if !self.monitor.at_rest() {
             return Err(ResetError::Moving);
         }
-        for (before, arm) in self.before.iter_mut().zip(&state.arms) {
-            before.opening = arm.opening.clamp(0.0, 1.0);
-        }
-        self.state = State::Idle { at: state.arms.iter().map(|arm| arm.angles).collect() };
+        self.commands.keep_openings(state);
+        self.state = ArmsState::Idle { at: state.arms.iter().map(|arm| arm.angles).collect() };
         Ok(())
     }
 
-    /// Puts a driver with a new connection to the same arms in the place of one that has failed. The arms stay stopped, its
-    /// first commands are stops, commands are counted from 1, and nothing is believed of what the driver before has told.
+    /// Replaces a driver that has failed by one with a new connection to the same arms. The arms stay stopped, the
+    /// first commands of the new driver are stops, commands are counted from 1, and earlier states are discarded.
     ///
     /// # Errors
-    /// When whoever asks does not own the arms, they are not stopped, or the driver has not failed.
+    /// Returns an error if the client with `token` does not own the arms, they are not stopped, or the driver has not
+    /// failed.
     pub fn replace_driver(
         &mut self,
         token: Token,
         driver: D,
         now_s: f64,
     ) -> Result<(), ResetError> {
-        self.lease.renew(token, now_s, self.settings.lease_s)?;
-        if self.phase() != Phase::Stopped || self.failed.is_none() {
+        self.renew(token, now_s)?;
+        if self.phase() != Phase::Stopped || self.exchange_error.is_none() {
             return Err(ResetError::Connected);
         }
         self.driver = driver;
         self.monitor = Monitor::new(&self.cell, &self.settings, self.period_s);
-        self.history = History::new();
-        self.number = 0;
-        (self.untold, self.failed) = (None, None);
+        self.commands.restart();
+        (self.stop_error, self.exchange_error) = (None, None);
         Ok(())
     }
 
-    /// Lets one period begin at `now_s`: sends a command and takes a state. To be called once a period.
+    /// Starts a period at `now_s`: sends a command and receives a state. Must be called once per period.
     pub fn tick(&mut self, now_s: f64) -> Phase {
         let order = self.next_order(now_s).unwrap_or_else(|breach| {
             self.halt(breach, now_s);
             Order::Stop
         });
-        self.number += 1;
-        self.remember(&order);
-        match self.driver.exchange(&Command { number: self.number, order }) {
+        let command = self.commands.push(order);
+        match self.driver.exchange(&command) {
             Ok(state) => {
-                (self.untold, self.failed) = (None, None);
-                let ago = self.history.len().min(self.lag_periods()) - 1;
-                let told = Told { number: self.number, velocities: &self.history[ago] };
-                if let Err(breach) = self.monitor.take(now_s, state, &told) {
+                (self.stop_error, self.exchange_error) = (None, None);
+                let expected = ExpectedState {
+                    number: self.commands.number(),
+                    velocities: self.commands.visible_velocities(),
+                };
+                if let Err(breach) = self.monitor.accept(now_s, state, &expected) {
                     self.halt(breach, now_s);
                 }
             }
             Err(error) => {
-                self.monitor.miss();
-                self.failed = Some(error.clone());
+                self.monitor.exchange_failed();
+                self.exchange_error = Some(error.clone());
                 self.halt(StopCause::Driver(error).anywhere(), now_s);
             }
         }
         self.phase()
     }
 
-    /// What the arms are doing.
+    /// The phase of the arms.
     #[must_use]
     pub fn phase(&self) -> Phase {
-        match &self.state {
-            State::Stopped(_) => Phase::Stopped,
-            State::Idle { .. } => Phase::Idle,
-            State::Playing { holding: true, .. } => Phase::Holding,
-            State::Playing { playback, .. } if playback.over_s() > 0.0 => Phase::Settling,
-            State::Playing { .. } => Phase::Moving,
-        }
+        self.state.phase()
     }
 
-    /// Why the arms are stopped, while they are.
+    /// The stop that the arms are in, while they are stopped.
     #[must_use]
     pub fn stopped_by(&self) -> Option<&Stop> {
-        match &self.state {
-            State::Stopped(stop) => Some(stop),
-            _ => None,
-        }
+        self.state.stop()
     }
 
-    /// Why the drives could not be told to stop, as long as they were not.
+    /// The error of the last attempt to stop the drives, until a command gets through.
     #[must_use]
-    pub fn untold(&self) -> Option<&DriverError> {
-        self.untold.as_ref()
+    pub fn stop_error(&self) -> Option<&DriverError> {
+        self.stop_error.as_ref()
     }
 
-    /// Why the last exchange failed, if it did. A driver that has failed may never work again.
+    /// The error of the last exchange, if it failed. A driver that has failed may never work again.
     #[must_use]
-    pub fn failed(&self) -> Option<&DriverError> {
-        self.failed.as_ref()
+    pub fn exchange_error(&self) -> Option<&DriverError> {
+        self.exchange_error.as_ref()
     }
 
-    /// How many states in a row were good.
+    /// The number of consecutive good states.
     #[must_use]
     pub fn n_good(&self) -> u32 {
         self.monitor.n_good()
     }
 
-    /// How long the present owner's lease holds unless it is renewed, seconds; `None` when nobody owns the arms.
+    /// The time until the present lease ends unless it is renewed, seconds; `None` if the arms have no owner.
     #[must_use]
     pub fn lease_left_s(&self, now_s: f64) -> Option<f64> {
         let left_s = self.settings.lease_s - self.lease.silent_s(now_s);
         (left_s > 0.0).then_some(left_s)
     }
 
-    /// How far the present motion has come.
+    /// The progress of the present motion.
     #[must_use]
     pub fn progress(&self) -> Option<Progress> {
-        match &self.state {
-            State::Playing { playback, .. } => {
-                let (played_s, duration_s) = (playback.played_s(), playback.duration_s());
-                Some(Progress { played_s, duration_s })
-            }
-            _ => None,
-        }
+        let playback = self.state.playback()?;
+        let (played_s, duration_s) = (playback.played_s(), playback.duration_s());
+        Some(Progress { played_s, duration_s })
     }
 
-    /// Where the present motion has the arms, radians, arm by arm.
+    /// The joint angles that the present motion prescribes now, radians, arm by arm.
     #[must_use]
     pub fn reference(&self) -> Option<&[Joints]> {
-        match &self.state {
-            State::Playing { playback, .. } => Some(playback.reference()),
-            _ => None,
-        }
+        self.state.playback().map(Playback::reference)
     }
 
-    /// What stands behind, to look at.
+    /// The driver, for inspection.
     #[must_use]
     pub fn driver(&self) -> &D {
         &self.driver
     }
 
-    /// The newest state of the arms that was believed.
+    /// The newest valid state of the arms.
     #[must_use]
     pub fn state(&self) -> Option<&PairState> {
         self.monitor.state()
     }
 
-    /// Whether the arms were last seen at rest.
+    /// Returns whether all joints were at rest in the newest state.
     #[must_use]
     pub fn at_rest(&self) -> bool {
         self.monitor.at_rest()
     }
 
-    /// What to tell the arms, when nothing speaks against it.
+    /// Returns the order of the coming period, or the limit that it would break.
     fn next_order(&mut self, now_s: f64) -> Result<Order, Breach> {
         let since_s = self.ticked_s.replace(now_s).map_or(self.period_s, |before| now_s - before);
-        if matches!(self.state, State::Stopped(_)) {
+        if matches!(self.state, ArmsState::Stopped(_)) {
             return Ok(Order::Stop);
         }
         let allowed = self.settings.tick_s;
         if !(since_s > 0.0 && since_s <= allowed) {
-            return Err(StopCause::Late(Excess { got: since_s, allowed }).anywhere());
+            return Err(StopCause::TickLate(Excess { got: since_s, allowed }).anywhere());
         }
         let stale_s = self.monitor.stale_s(now_s);
         let allowed = self.settings.state_stop_s;
@@ -428,12 +368,12 @@ impl<D: Driver> Executor<D> {
         };
         let fresh = stale_s <= self.settings.state_hold_s;
         let commands = match &mut self.state {
-            State::Stopped(_) => return Ok(Order::Stop),
-            State::Idle { at } => {
-                stays(at, state, self.settings.tracking_rad)?;
-                self.before.iter().map(still).collect()
+            ArmsState::Stopped(_) => return Ok(Order::Stop),
+            ArmsState::Idle { at } => {
+                check_in_place(at, state, self.settings.tracking_rad)?;
+                self.commands.stationary()
             }
-            State::Playing { playback, holding } => {
+            ArmsState::Playing { playback, holding } => {
                 let silent_s = self.lease.silent_s(now_s);
                 let allowed = self.settings.owner_stop_s;
                 if silent_s > allowed {
@@ -441,90 +381,71 @@ impl<D: Driver> Executor<D> {
                     return Err(StopCause::OwnerSilent(excess).anywhere());
                 }
                 *holding = !fresh || silent_s > self.settings.owner_hold_s;
-                let moment = Moment {
+                let context = TickContext {
                     cell: &self.cell,
                     settings: &self.settings,
                     period_s: self.period_s,
                     state: fresh.then_some(state),
-                    before: &self.before,
+                    last: self.commands.last(),
                 };
-                playback.next(&moment, *holding)?
+                playback.next(&context, *holding)?
             }
         };
-        self.envelope.check(&commands, &self.history, state, stale_s)?;
+        self.envelope.check(&commands, self.commands.velocities(), state, stale_s)?;
         self.settle()?;
         Ok(Order::Move(commands))
     }
 
     /// Ends a motion whose arms rest at its end.
     fn settle(&mut self) -> Result<(), Breach> {
-        let (State::Playing { playback, holding: false }, Some(state)) =
+        let (ArmsState::Playing { playback, holding: false }, Some(state)) =
             (&self.state, self.monitor.state())
         else {
             return Ok(());
         };
-        if playback.over_s() <= 0.0 {
+        if playback.since_end_s() <= 0.0 {
             return Ok(());
         }
         let (got, allowed) = (playback.distance_to_end(state), self.settings.settled_rad);
-        let resting = self
-            .before
-            .iter()
-            .all(|arm| arm.velocities.iter().all(|rate| rate.abs() <= self.settings.rest_radps));
-        if got <= allowed && resting && self.monitor.at_rest() {
-            self.state = State::Idle { at: playback.reference().to_vec() };
-        } else if playback.over_s() > self.settings.settle_s {
+        let at_rest = self.commands.at_rest(self.settings.rest_radps) && self.monitor.at_rest();
+        if got <= allowed && at_rest {
+            self.state = ArmsState::Idle { at: playback.reference().to_vec() };
+        } else if playback.since_end_s() > self.settings.settle_s {
             return Err(StopCause::NotSettled(Excess { got, allowed }).anywhere());
         }
         Ok(())
     }
 
-    /// Notes what the arms are told.
-    fn remember(&mut self, order: &Order) {
-        let commands = match order {
-            Order::Move(commands) => commands.clone(),
-            Order::Stop => self.before.iter().map(still).collect(),
-        };
-        self.history.push_front(commands.iter().map(|arm| arm.velocities).collect());
-        self.history.truncate(self.lag_periods() + REMEMBERED_BEYOND);
-        self.before = commands;
-    }
-
-    /// Stops the arms, by the fastest way there is. The first stop stands.
+    /// Stops the arms in the fastest way. The first cause is kept.
     fn halt(&mut self, breach: Breach, now_s: f64) {
-        if !matches!(self.state, State::Stopped(_)) {
-            self.state = State::Stopped(breach.at(now_s));
+        if !matches!(self.state, ArmsState::Stopped(_)) {
+            self.state = ArmsState::Stopped(breach.at(now_s));
         }
-        // When this fails, the next command says it again, and without one the drives brake by themselves.
-        self.untold = self.driver.stop().err();
-    }
-
-    /// A reaction in periods.
-    fn lag_periods(&self) -> usize {
-        #[expect(
-            clippy::cast_possible_truncation,
-            clippy::cast_sign_loss,
-            reason = "a reaction is some periods"
-        )]
-        let periods = (self.settings.reaction_s / self.period_s).ceil() as usize;
-        periods.max(1)
+        // If this fails, the next command repeats the stop, and without commands the drives brake by themselves.
+        self.stop_error = self.driver.stop().err();
     }
 }
 
 impl<D: Driver> Drop for Executor<D> {
-    /// The arms brake.
+    /// Stops the drives.
     fn drop(&mut self) {
         self.driver.stop().ok();
     }
 }
 
-/// The command to stay, with the gripper as it is.
-fn still(before: &ArmCommand) -> ArmCommand {
-    ArmCommand { velocities: Joints::from_fn(before.velocities.len(), |_| 0.0), ..*before }
+/// The reaction time in periods, at least one.
+fn reaction_periods(settings: &Settings, period_s: f64) -> usize {
+    #[expect(
+        clippy::cast_possible_truncation,
+        clippy::cast_sign_loss,
+        reason = "a reaction takes a few periods"
+    )]
+    let periods = (settings.reaction_s / period_s).ceil() as usize;
+    periods.max(1)
 }
 
-/// Idle arms are where they shall stay.
-fn stays(at: &[Joints], state: &PairState, allowed: f64) -> Result<(), Breach> {
+/// Checks that idle arms are at most `allowed` radians from the position that they hold.
+fn check_in_place(at: &[Joints], state: &PairState, allowed: f64) -> Result<(), Breach> {
     for (arm, (at, reading)) in at.iter().zip(&state.arms).enumerate() {
         for (joint, (at, angle)) in at.iter().zip(reading.angles.iter()).enumerate() {
             let got = (at - angle).abs();

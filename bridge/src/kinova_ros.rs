@@ -1,94 +1,98 @@
-//! Arms behind Kinova's ROS 1 driver (`kinova-ros`), by way of rosbridge's websocket.
+//! Arms behind Kinova's ROS 1 driver (`kinova-ros`), through rosbridge's websocket.
 //!
-//! Two nodes, one an arm, and one rosbridge. Below a node's name the driver uses (types, units and behaviour as of kinova-ros in
-//! February 2023, read in its `kinova_arm.cpp`, `kinova_comm.cpp` and `kinova_fingers_action.cpp`):
+//! There are two nodes, one per arm, and one rosbridge. The driver uses the following names below a node's name. Types,
+//! units and behaviour are those of kinova-ros in February 2023 (`kinova_arm.cpp`, `kinova_comm.cpp`,
+//! `kinova_fingers_action.cpp`).
 //!
-//! | name | type | what |
+//! | name | type | use |
 //! |---|---|---|
-//! | `in/joint_velocity` | `kinova_msgs/JointVelocity` | published, and heard again: degrees per second; `joint7`, which the arms lack, carries the command's number in millionths |
-//! | `out/joint_state` | `sensor_msgs/JointState` | heard: radians, radians per second, newton metres; fingers as joints |
-//! | `fingers_action/finger_positions/goal`, `…/result` | `kinova_msgs/SetFingersPositionAction…` | published and heard: turns of the fingers |
-//! | `in/stop`, `in/start` | `kinova_msgs/Stop`, `kinova_msgs/Start` | called; `in/stop` empties the arm's queue as well |
+//! | `in/joint_velocity` | `kinova_msgs/JointVelocity` | published and subscribed: degrees per second |
+//! | `out/joint_state` | `sensor_msgs/JointState` | subscribed: rad, rad/s, N m; fingers as joints |
+//! | `fingers_action/finger_positions/goal` | `kinova_msgs/SetFingersPositionActionGoal` | published: turns of the fingers |
+//! | `fingers_action/finger_positions/result` | `kinova_msgs/SetFingersPositionActionResult` | subscribed |
+//! | `in/stop`, `in/start` | `kinova_msgs/Stop`, `kinova_msgs/Start` | called; `in/stop` also empties the arm's queue |
 //!
-//! `in/clear_trajectories` is not called: `in/stop` does the same and more, and the answer of the former means nothing (its handler
-//! ends without one).
+//! `joint7` of a velocity, which the arms lack, carries the command's number in millionths. `in/clear_trajectories` is
+//! not called: `in/stop` includes its effect, and its response is meaningless because its handler returns none.
 //!
-//! **Velocities** are published once per exchange and arm, and at no other time. The arms want them at 100 Hz exactly: less often moves them
-//! slower, more often fills a queue of 2000 in the arm, which is played to its end. A velocity that cannot be written at once is an error and not kept.
+//! **Velocities** are published once per exchange and arm, and at no other time. The arms require exactly 100 Hz: a
+//! lower rate slows them down, and a higher one fills a queue of 2000 entries in the arm, all of which are executed. A
+//! velocity that cannot be written at once is an error and is discarded.
 //!
-//! **Nothing may pile up** in rosbridge either, because a burst of velocities is played to its end. The driver therefore hears its own
-//! velocities: a command counts as done ([`PairState::newest_command`]) when those of all arms were published in ROS. An
-//! executor stops when commands are too long under way, and cannot be reset while any is. A velocity that is heard and not the driver's own ends
-//! the connection: somebody else is moving the arm.
+//! **No backlog** may form in rosbridge either, because the arm would execute all of it. The driver therefore
+//! subscribes to its own velocities: a command has taken effect ([`PairState::newest_command`]) once the velocities of
+//! all arms were published in ROS. An executor stops if commands are in flight for too long, and cannot be reset while
+//! there are any. A velocity of another publisher ends the connection.
 //!
-//! **To stop** nothing is published any more, and `in/stop` is called. The arm stops because nothing comes (the dead-man's switch:
-//! a killed process publishes nothing), and the service keeps everybody else from moving it. With the first
-//! [`Order::Move`] after a stop, which an executor gives only after a reset, `in/start` is called, and velocities are
-//! published when it has answered. That takes kinova-ros some 50 ms in which it tells no states; [`settings`]
-//! allow for that.
+//! **To stop**, the driver ceases to publish and calls `in/stop`. The arm stops because it receives no velocities, also
+//! when the process is killed, and the service prevents other clients from moving it. On the first [`Order::Move`]
+//! after a stop, which an executor sends only after a reset, the driver calls `in/start` and publishes velocities after
+//! its response. kinova-ros reports no states for about 50 ms meanwhile; [`settings`] allows for that.
 //!
-//! **Grippers** move only while their arms stand, see [`FingerSettings`]. A motion should rest for a second where it opens or closes a gripper.
+//! **Grippers** move only while their arms are stationary, see [`FingerSettings`]. A motion should pause for a second
+//! where it opens or closes a gripper.
 //!
-//! **States.** A state of the pair is new when both arms have told anew, and has the older one's stamp. The arms do not tell faults. Efforts count as torques only where [`KinovaRosConfig::tells_torques`] says
-//! that they are without the arm's own weight.
+//! **States.** A state of the pair is new once both arms have reported, and has the older time stamp. The arms report
+//! no faults. Efforts count as torques only if [`KinovaRosConfig::reports_torques`] is set.
 //!
-//! A driver is for one connection. Whatever cannot be understood, a service that refuses or does not answer, and a lost connection end it: the
-//! arms are told to stop if they still can be, and every later exchange fails with that first error. Going on takes a new
-//! connection and a reset.
+//! A driver serves one connection. A malformed message, a service that fails or does not respond, and a lost connection
+//! end it: the driver stops the arms if it still can, and every later exchange returns that first error. To continue,
+//! create a new driver and reset the executor.
 
 use std::time::Duration;
 
 use crate::driver::{ArmCommand, Command, Driver, DriverError, Order, PairState};
 use crate::executor::Settings;
-use crate::kinova_ros::link::Link;
-use crate::kinova_ros::merge::Merge;
-use crate::kinova_ros::node::{Arm, Control, MOST_UNDER_WAY, Service};
-use crate::kinova_ros::protocol::{Heard, Reading};
+use crate::kinova_ros::merge::StateMerger;
+use crate::kinova_ros::node::{ArmNode, Control, MAX_IN_FLIGHT, Service};
+use crate::kinova_ros::protocol::{ArmDecoder, RosMessage};
+use crate::kinova_ros::websocket::RosbridgeSocket;
 
 pub use fingers::FingerSettings;
 
 mod fingers;
-mod link;
 mod merge;
 mod node;
 mod protocol;
+mod websocket;
 
-/// Time from one exchange to the next, seconds. The arms take velocities at this rate and no other.
+/// Time from one exchange to the next, seconds. The arms take velocities at this rate only.
 pub const PERIOD_S: f64 = 0.01;
-/// Slices of the time in which the first state has to come.
+/// Number of waits in the time limit of the first state.
 const N_FIRST_WAITS: u32 = 100;
 
-/// How to reach the arms.
+/// The configuration of the driver.
 #[derive(Debug, Clone, PartialEq)]
 pub struct KinovaRosConfig {
-    /// Where rosbridge listens: `host:port` or `ws://host:port`. Its own default port is 9090.
+    /// The address of rosbridge: `host:port` or `ws://host:port`. Rosbridge's default port is 9090.
     pub address: String,
-    /// The arms, in the order of the cell.
+    /// The arms, in the order of the work cell.
     pub arms: [KinovaArm; 2],
-    /// How long to wait for the connection, and then for the first state. Default 3 s each.
+    /// Time limit of the connection, and then of the first state. Default 3 s each.
     pub connect_timeout: Duration,
-    /// Exchanges within which a service has to answer. Default 100.
+    /// Exchanges within which a service has to respond. Default 100.
     pub answer_exchanges: u32,
-    /// What the stamps of the two arms' states may be apart, seconds. Default 0.1.
+    /// Largest difference between the time stamps of the two arms' states, seconds. Default 0.1.
     pub skew_s: f64,
-    /// Whether the nodes have `torque_parameters/publish_torque_with_gravity_compensation` set, so that efforts are torques
-    /// beyond those that carry the arm. Default false: torques are not used.
-    pub tells_torques: bool,
-    /// When grippers get goals.
+    /// Whether the nodes have `torque_parameters/publish_torque_with_gravity_compensation` set, so that efforts are
+    /// torques without the arm's own weight. Default false: torques are not used.
+    pub reports_torques: bool,
+    /// The goals of the grippers.
     pub fingers: FingerSettings,
 }
 
-/// An arm's names in ROS.
+/// The names of an arm in ROS.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct KinovaArm {
-    /// The driver's node, `/left/m1n4s200_driver`: topics and services are below it.
+    /// The driver's node, such as `/left/m1n4s200_driver`. Topics and services are below it.
     pub node: String,
-    /// What the names of its joints begin with, `m1n4s200_`: the node's parameter `robot_name`, or else its type, and `_`.
+    /// The prefix of the joints' names, such as `m1n4s200_`: the node's parameter `robot_name` or else its type, and
+    /// `_`.
     pub joint_prefix: String,
 }
 
 impl KinovaArm {
-    /// A `m1n4s200` whose driver is the node `node`.
+    /// Returns the names of an `m1n4s200` whose driver is the node `node`.
     #[must_use]
     pub fn mico(node: impl Into<String>) -> Self {
         Self { node: node.into(), joint_prefix: "m1n4s200_".into() }
@@ -96,7 +100,7 @@ impl KinovaArm {
 }
 
 impl KinovaRosConfig {
-    /// Defaults for two `m1n4s200` behind rosbridge at `address`, under `/left/m1n4s200_driver` and
+    /// Returns the defaults for two `m1n4s200` behind rosbridge at `address`, under `/left/m1n4s200_driver` and
     /// `/right/m1n4s200_driver`.
     #[must_use]
     pub fn at(address: impl Into<String>) -> Self {
@@ -106,14 +110,14 @@ impl KinovaRosConfig {
             connect_timeout: Duration::from_secs(3),
             answer_exchanges: 100,
             skew_s: 0.1,
-            tells_torques: false,
+            reports_torques: false,
             fingers: FingerSettings::default(),
         }
     }
 }
 
-/// Settings of the executor to begin with. They allow for states that come at 40 Hz (what a USB connection gives), for
-/// the 50 ms of `in/start` and for 60 ms through rosbridge; reaction and lag are guesses until somebody has measured the arms.
+/// Returns initial settings of the executor. They allow for states at 40 Hz (the rate over USB), for the 50 ms of
+/// `in/start` and for 60 ms through rosbridge. Reaction and lag are estimates until they are measured on the arms.
 #[must_use]
 pub fn settings() -> Settings {
     Settings {
@@ -126,37 +130,37 @@ pub fn settings() -> Settings {
     }
 }
 
-/// The arms behind one rosbridge.
+/// The driver of the arms behind one rosbridge.
 #[derive(Debug)]
 pub struct KinovaRosDriver {
     config: KinovaRosConfig,
-    link: Link,
-    arms: Vec<Arm>,
-    merge: Merge,
+    socket: RosbridgeSocket,
+    arms: Vec<ArmNode>,
+    merge: StateMerger,
     newest: PairState,
-    /// Number of the last command.
+    /// The number of the last command.
     number: u64,
-    /// Names for calls and goals.
+    /// Counts the identifiers of calls and goals.
     n_ids: u64,
-    /// Why the connection has ended.
+    /// The error that ended the connection.
     failure: Option<DriverError>,
 }
 
 impl KinovaRosDriver {
-    /// Dials rosbridge and waits for the first state of both arms. Moves and stops nothing.
+    /// Connects to rosbridge and waits for the first state of both arms. Neither moves nor stops the arms.
     ///
     /// # Errors
-    /// Says which address does not answer, or which arm does not tell where it is.
+    /// Returns an error if the address does not respond or an arm reports no state.
     pub fn connect(config: KinovaRosConfig) -> Result<Self, DriverError> {
         let address = config.address.trim_start_matches("ws://").trim_end_matches('/');
-        let link = Link::connect(address, config.connect_timeout)?;
-        let arm = |arm: &KinovaArm| Arm::new(&arm.node, config.fingers);
-        let arms: Vec<Arm> = config.arms.iter().map(arm).collect();
-        let merge = Merge::new(arms.len(), config.skew_s);
+        let socket = RosbridgeSocket::connect(address, config.connect_timeout)?;
+        let arm = |arm: &KinovaArm| ArmNode::new(&arm.node, config.fingers);
+        let arms: Vec<ArmNode> = config.arms.iter().map(arm).collect();
+        let merge = StateMerger::new(arms.len(), config.skew_s);
         let newest = PairState { sequence: 0, stamp_s: 0.0, newest_command: None, arms: vec![] };
         let mut driver =
-            Self { config, link, arms, merge, newest, number: 0, n_ids: 0, failure: None };
-        driver.introduce()?;
+            Self { config, socket, arms, merge, newest, number: 0, n_ids: 0, failure: None };
+        driver.register_topics()?;
         let slice = driver.config.connect_timeout / N_FIRST_WAITS;
         for _ in 0..N_FIRST_WAITS {
             if driver.receive(slice)? {
@@ -172,90 +176,90 @@ impl KinovaRosDriver {
         Err(DriverError::Disconnected { what })
     }
 
-    /// Returns the newest state, and waits for at most `patience` when it is known already. Sends nothing: for looking at arms that
-    /// nobody commands.
+    /// Returns the newest state, and waits at most `timeout` for a new one. Sends no command, so it suits arms that are
+    /// only monitored.
     ///
     /// # Errors
-    /// As an exchange.
-    pub fn listen(&mut self, patience: Duration) -> Result<PairState, DriverError> {
+    /// As [`Driver::exchange`].
+    pub fn listen(&mut self, timeout: Duration) -> Result<PairState, DriverError> {
         self.unless_failed(|driver| {
-            driver.receive(patience)?;
+            driver.receive(timeout)?;
             Ok(driver.state(driver.number))
         })
     }
 
-    /// Says what will be published and what shall be heard.
-    fn introduce(&mut self) -> Result<(), DriverError> {
+    /// Advertises and subscribes to the topics of all arms.
+    fn register_topics(&mut self) -> Result<(), DriverError> {
         for arm in &self.arms {
             let velocity = arm.velocity_topic();
             let kind = "kinova_msgs/JointVelocity";
             let state = arm.topic("out/joint_state");
             let goal = "kinova_msgs/SetFingersPositionActionGoal";
             let result = "kinova_msgs/SetFingersPositionActionResult";
-            self.link.say(protocol::advertise(&velocity, kind))?;
-            self.link.say(protocol::subscribe_to_all(&velocity, kind))?;
-            self.link.say(protocol::advertise(&arm.goal_topic(), goal))?;
-            self.link.say(protocol::subscribe(&arm.result_topic(), result))?;
-            self.link.say(protocol::subscribe(&state, "sensor_msgs/JointState"))?;
+            self.socket.send(protocol::advertise(&velocity, kind))?;
+            self.socket.send(protocol::subscribe_to_all(&velocity, kind))?;
+            self.socket.send(protocol::advertise(&arm.goal_topic(), goal))?;
+            self.socket.send(protocol::subscribe(&arm.result_topic(), result))?;
+            self.socket.send(protocol::subscribe(&state, "sensor_msgs/JointState"))?;
         }
         Ok(())
     }
 
-    /// Does something that ends the connection when it fails.
+    /// Runs `action` unless the connection has failed. An error ends the connection and is kept.
     fn unless_failed<T>(
         &mut self,
-        act: impl FnOnce(&mut Self) -> Result<T, DriverError>,
+        action: impl FnOnce(&mut Self) -> Result<T, DriverError>,
     ) -> Result<T, DriverError> {
         if let Some(failure) = &self.failure {
             return Err(failure.clone());
         }
-        act(self).inspect_err(|failure| {
+        action(self).inspect_err(|failure| {
             for arm in 0..self.arms.len() {
-                self.halt(arm).ok();
+                self.stop_arm(arm).ok();
             }
-            self.link.close();
+            self.socket.close();
             self.failure = Some(failure.clone());
         })
     }
 
-    /// Takes what has come; waits once when that is no new state. Says whether there is one.
-    fn receive(&mut self, patience: Duration) -> Result<bool, DriverError> {
+    /// Receives all waiting messages, and waits once if they complete no state. Returns whether there is a new state.
+    fn receive(&mut self, timeout: Duration) -> Result<bool, DriverError> {
         if self.drain()? {
             return Ok(true);
         }
-        if patience.is_zero() {
+        if timeout.is_zero() {
             return Ok(false);
         }
-        self.link.wait(patience)?;
+        self.socket.wait(timeout)?;
         self.drain()
     }
 
     fn drain(&mut self) -> Result<bool, DriverError> {
-        let Self { link, arms, merge, config, .. } = self;
-        link.drain(|heard| take(heard, arms, merge, config))?;
+        let Self { socket, arms, merge, config, .. } = self;
+        socket.drain(|message| handle(message, arms, merge, config))?;
         let Some(state) = self.merge.take()? else { return Ok(false) };
         self.newest = state;
         Ok(true)
     }
 
     /// Calls a service of an arm's node.
-    fn ask(&mut self, arm: usize, service: Service) -> Result<(), DriverError> {
+    fn call_service(&mut self, arm: usize, service: Service) -> Result<(), DriverError> {
         let id = self.next_id();
         let topic = self.arms[arm].topic(service.name());
-        self.arms[arm].control = Control::Asked { id: id.clone(), service, n: 0 };
-        self.link.say(protocol::call(&id, &topic))
+        self.arms[arm].control = Control::Pending { id: id.clone(), service, n: 0 };
+        self.socket.send(protocol::call(&id, &topic))
     }
 
-    /// Stops an arm, unless that was asked for already.
-    fn halt(&mut self, arm: usize) -> Result<(), DriverError> {
+    /// Stops an arm, unless that was requested already.
+    fn stop_arm(&mut self, arm: usize) -> Result<(), DriverError> {
         self.arms[arm].fingers.stop();
-        if self.arms[arm].asked_to_stop() {
+        if self.arms[arm].is_stopping() {
             return Ok(());
         }
-        self.ask(arm, Service::Stop)
+        self.call_service(arm, Service::Stop)
     }
 
-    /// Hands on what an arm shall do.
+    /// Forwards a command to an arm.
     fn drive(&mut self, arm: usize, number: u64, command: &ArmCommand) -> Result<(), DriverError> {
         if !(0.0..=1.0).contains(&command.opening) {
             let what = format!("opening {}, expected 0 to 1", command.opening);
@@ -263,16 +267,16 @@ impl KinovaRosDriver {
         }
         match self.arms[arm].control {
             Control::Unknown => {
-                let what = "a new connection has to begin with an order to stop".into();
+                let what = "a new connection has to start with an order to stop".into();
                 Err(DriverError::Refused { what })
             }
-            Control::Asked { .. } => Ok(()),
-            Control::Stopped => self.ask(arm, Service::Start),
+            Control::Pending { .. } => Ok(()),
+            Control::Stopped => self.call_service(arm, Service::Start),
             Control::Started => self.publish(arm, number, command),
         }
     }
 
-    /// Publishes velocities, or a goal for the fingers.
+    /// Publishes velocities, or a goal of the fingers.
     fn publish(
         &mut self,
         arm: usize,
@@ -281,30 +285,31 @@ impl KinovaRosDriver {
     ) -> Result<(), DriverError> {
         let topic = self.arms[arm].velocity_topic();
         let velocities = protocol::velocities(&topic, number, &command.velocities)?;
-        let standing_radps = self.config.fingers.standing_radps;
-        let stands = command.velocities.iter().all(|rate| rate.abs() <= standing_radps);
-        if let Some(opening) = self.arms[arm].fingers.next(command.opening, stands) {
+        let stationary_radps = self.config.fingers.stationary_radps;
+        let stationary = command.velocities.iter().all(|rate| rate.abs() <= stationary_radps);
+        if let Some(opening) = self.arms[arm].fingers.next(command.opening, stationary) {
             let id = self.next_id();
-            let turns = reading(&self.config, arm).turns(opening);
-            self.link.say(protocol::finger_goal(&self.arms[arm].goal_topic(), &id, turns))?;
-            self.arms[arm].fingers.sent(id);
+            let turns = decoder(&self.config, arm).turns(opening);
+            self.socket.send(protocol::finger_goal(&self.arms[arm].goal_topic(), &id, turns))?;
+            self.arms[arm].fingers.goal_sent(id);
         }
         if self.arms[arm].fingers.busy() {
             return Ok(());
         }
-        if self.arms[arm].under_way.len() >= MOST_UNDER_WAY {
+        if self.arms[arm].in_flight.len() >= MAX_IN_FLIGHT {
             let what =
-                format!("rosbridge holds {MOST_UNDER_WAY} velocities and does not publish them");
+                format!("rosbridge holds {MAX_IN_FLIGHT} velocities and does not publish them");
             return Err(DriverError::Disconnected { what });
         }
-        self.arms[arm].under_way.push_back((number, command.velocities));
-        self.link.say(velocities)
+        self.arms[arm].in_flight.push_back((number, command.velocities));
+        self.socket.send(velocities)
     }
 
-    /// The newest state, and the newest command of which all is done when `number` was the last one.
+    /// Returns the newest state with the number of the newest command that was published for all arms; `number` is the
+    /// last command.
     fn state(&self, number: u64) -> PairState {
-        let oldest = self.arms.iter().filter_map(|arm| arm.under_way.front());
-        let newest = oldest.map(|(under_way, _)| under_way - 1).min().unwrap_or(number);
+        let oldest = self.arms.iter().filter_map(|arm| arm.in_flight.front());
+        let newest = oldest.map(|(number, _)| number - 1).min().unwrap_or(number);
         PairState { newest_command: Some(newest), ..self.newest.clone() }
     }
 
@@ -323,7 +328,7 @@ impl Driver for KinovaRosDriver {
         let number = command.number;
         self.unless_failed(|driver| {
             match &command.order {
-                Order::Stop => (0..driver.arms.len()).try_for_each(|arm| driver.halt(arm))?,
+                Order::Stop => (0..driver.arms.len()).try_for_each(|arm| driver.stop_arm(arm))?,
                 Order::Move(commands) => {
                     let (got, expected) = (commands.len(), driver.arms.len());
                     if got != expected {
@@ -335,61 +340,61 @@ impl Driver for KinovaRosDriver {
                 }
             }
             driver.receive(Duration::ZERO)?;
-            let most = driver.config.answer_exchanges;
-            driver.arms.iter_mut().try_for_each(|arm| arm.await_answer(most))?;
+            let max_exchanges = driver.config.answer_exchanges;
+            driver.arms.iter_mut().try_for_each(|arm| arm.count_exchange(max_exchanges))?;
             driver.number = number;
             Ok(driver.state(number))
         })
     }
 
     fn stop(&mut self) -> Result<(), DriverError> {
-        self.unless_failed(|driver| (0..driver.arms.len()).try_for_each(|arm| driver.halt(arm)))
+        self.unless_failed(|driver| (0..driver.arms.len()).try_for_each(|arm| driver.stop_arm(arm)))
     }
 }
 
-/// Takes what rosbridge says.
-fn take(
-    heard: Heard,
-    arms: &mut [Arm],
-    merge: &mut Merge,
+/// Handles a message of rosbridge.
+fn handle(
+    message: RosMessage,
+    arms: &mut [ArmNode],
+    merge: &mut StateMerger,
     config: &KinovaRosConfig,
 ) -> Result<(), DriverError> {
-    match heard {
-        Heard::Message { topic, msg } => {
+    match message {
+        RosMessage::Publish { topic, msg } => {
             for (idx, arm) in arms.iter_mut().enumerate() {
                 if topic == arm.topic("out/joint_state") {
-                    let told = reading(config, idx).joint_state(&msg);
-                    merge.note(idx, told.map_err(|error| of_node(error, &arm.node))?);
+                    let state = decoder(config, idx).joint_state(&msg);
+                    merge.push(idx, state.map_err(|error| with_node(error, &arm.node))?);
                 } else if topic == arm.velocity_topic() {
-                    arm.published(&msg)?;
+                    arm.handle_velocity(&msg)?;
                 } else if topic == arm.result_topic()
                     && let Some(id) = protocol::ended_goal(&msg)
                 {
-                    arm.fingers.ended(id);
+                    arm.fingers.goal_ended(id);
                 }
             }
             Ok(())
         }
-        Heard::Answer { id, result, values } => {
+        RosMessage::ServiceResponse { id, result, values } => {
             let values = values.to_string();
-            arms.iter_mut().try_for_each(|arm| arm.answered(&id, result, &values))
+            arms.iter_mut().try_for_each(|arm| arm.handle_response(&id, result, &values))
         }
-        Heard::Complaint(what) => Err(DriverError::Refused { what: format!("rosbridge: {what}") }),
-        Heard::Other => Ok(()),
+        RosMessage::Error(what) => Err(DriverError::Refused { what: format!("rosbridge: {what}") }),
+        RosMessage::Other => Ok(()),
     }
 }
 
-/// How to read what an arm tells.
-fn reading(config: &KinovaRosConfig, arm: usize) -> Reading<'_> {
-    Reading {
+/// Returns the decoder of an arm's messages.
+fn decoder(config: &KinovaRosConfig, arm: usize) -> ArmDecoder<'_> {
+    ArmDecoder {
         prefix: &config.arms[arm].joint_prefix,
         shut_turns: config.fingers.shut_turns,
-        tells_torques: config.tells_torques,
+        reports_torques: config.reports_torques,
     }
 }
 
-/// The same error, and whose it is.
-fn of_node(error: DriverError, node: &str) -> DriverError {
+/// Adds the name of the node to a malformed message's error.
+fn with_node(error: DriverError, node: &str) -> DriverError {
     match error {
         DriverError::Malformed { what } => {
             DriverError::Malformed { what: format!("{node}: {what}") }

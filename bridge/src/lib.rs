@@ -1,29 +1,26 @@
-//! What moves a pair of arms: an executor that lets nothing but a checked motion through, and what stands behind it.
+//! Moves a pair of robot arms along checked motions.
 //!
-//! From the bottom up: [`driver`] is the contract between the executor and a pair of arms, [`executor`] plays a motion
-//! through a driver and is the envelope round it while it moves, and [`simulated`] is a pair of Kinova Micos with physics of its own, which
-//! stands in where there are no arms. [`layout`] says how the arms stand and what their motions have to keep. [`service`] offers
-//! it all as `tandem.v1.Bridge`.
+//! [`driver`] is the contract between the executor and a pair of arms. [`executor`] plays a checked motion through a
+//! driver and enforces the limits of every command. [`work_cell`] places the arms and defines the limits of their
+//! motions. [`service`] offers the arms as `tandem.v1.Bridge`.
 //!
-//! Drivers of real arms are [`quarc`], for arms that a Simulink model drives by way of QUARC, and [`kinova_ros`], for arms
-//! behind Kinova's ROS driver.
+//! The drivers of real arms are [`quarc`], for arms behind a Simulink model with QUARC, and [`kinova_ros`], for arms
+//! behind Kinova's ROS driver. The crate knows neither policies nor a simulator; crate `tandem-trials` has a simulated
+//! driver.
 //!
-//! Nothing here reads a clock, and but for the service and the drivers of real arms nothing knows a wire: whoever ticks the
-//! executor says what time it is, in seconds since a start of their own.
+//! The crate reads no clock: callers pass the time in seconds since an arbitrary start. Only the service and the
+//! drivers of real arms know a wire format.
 #![warn(missing_docs)]
 
 pub mod driver;
 pub mod executor;
 pub mod kinova_ros;
-pub mod layout;
 pub mod quarc;
 pub mod service;
-pub mod simulated;
-pub mod trial;
+pub mod work_cell;
 
 pub use driver::{ArmCommand, ArmReading, Command, Driver, DriverError, Faults, Order, PairState};
 pub use executor::{
     CheckError, CheckedMotion, Checker, Executor, LeaseError, Phase, Progress, ResetError,
     Settings, StartError, Stop, StopCause, Token,
 };
-pub use simulated::{SimulatedConfig, SimulatedPair};

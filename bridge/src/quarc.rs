@@ -1,29 +1,30 @@
-//! Arms behind Quanser's QUARC: a Simulink model that talks to us through a stream block.
+//! Arms behind Quanser's QUARC: a Simulink model that communicates through a stream block.
 //!
-//! **The wire** is TCP (`tcpip://host:port` in QUARC's words) that carries vectors of doubles and nothing else: no header, no
-//! length, one vector a sample each way. [`codec`] has the tables. The arms' side sends a state in every sample of its own,
-//! whether a command has come or not.
+//! **The wire** is TCP (`tcpip://host:port` in QUARC's notation). It carries only vectors of doubles, one per sample in
+//! each direction, without header or length. [`codec`] has the tables. The model sends a state in every sample, with or
+//! without a command.
 //!
-//! **What the model on that side has to do**, because a stream block goes on giving out what it got last:
+//! **Requirements of the model**, because a stream block repeats its last value:
 //!
-//! 1. Set all velocities to zero, and keep them there until an order to stop has come, when the command's number has not changed for
-//!    [`SILENCE_S`](crate::driver::SILENCE_S), when its stream block is not connected, and in every sample before the first command of a connection.
-//! 2. Do the same with a command that does not begin with its mark, has a number that is not finite, or an order that is
-//!    neither 0 nor 1; and report a drive fault.
-//! 3. Brake at once on order 0, whatever its number is. Such a vector may repeat the number of the command before.
-//! 4. Receive into a buffer for one vector, and send states only while connected, so that nothing piles up. The sequence
-//!    grows by 1 with each vector that was sent.
-//! 5. Report the number of the newest command that it obeys. The executor stops when commands have no effect.
-//! 6. Keep the arms' own limits (speed, torque, range). This side keeps them too, and neither relies on the other.
+//! 1. Set all velocities to zero until an order to stop arrives if the command's number has not changed for
+//!    [`SILENCE_S`](crate::driver::SILENCE_S), if the stream block is not connected, and in every sample before the
+//!    first command of a connection.
+//! 2. Do the same, and report a drive fault, on a command that does not start with its mark, has a number that is not
+//!    finite, or an order other than 0 and 1.
+//! 3. Brake at once on order 0, regardless of its number, which may repeat that of the previous command.
+//! 4. Receive into a buffer for one vector and send states only while connected, so that no backlog forms. The sequence
+//!    increases by 1 with each vector sent.
+//! 5. Report the number of the newest command in effect. The executor stops if commands have no effect.
+//! 6. Enforce the arms' own limits (speed, torque, range). The bridge enforces them too; neither relies on the other.
 //!
-//! **Here**, a number that is not finite, an unknown flag, a jump in the sequence, a vector that stays short, a command that cannot be written
-//! at once and a closed connection all end the connection: the driver tells the arms to stop if it still can, shuts the socket and
-//! answers every later exchange with that first error. **A driver is for one connection.** Whoever wants to go on connects anew and
-//! gives the new driver to the executor, which stays stopped until somebody resets it. Nothing moves by connecting:
-//! the driver refuses to hand on a motion before an order to stop was exchanged, and the numbers of commands begin at 1.
+//! **A driver serves one connection.** A number that is not finite, an unknown flag, a jump in the sequence, a vector
+//! that stays incomplete, a command that cannot be written at once and a closed connection end it: the driver stops the
+//! arms if it still can, closes the socket and returns that first error from every later exchange. To continue, connect
+//! again and give the new driver to the executor, which stays stopped until a reset. Connecting moves nothing: the
+//! driver refuses a motion before an order to stop was exchanged, and commands are counted from 1.
 //!
-//! **Who dials** is free. [`QuarcDriver::connect`] dials a Stream Server block; where a Stream Client block dials us,
-//! accept its connection and pass it to [`QuarcDriver::over`].
+//! **Either side may connect.** [`QuarcDriver::connect`] connects to a Stream Server block. If a Stream Client block
+//! connects to the bridge, accept its connection and pass it to [`QuarcDriver::over`].
 
 use std::io::{ErrorKind, Read as _, Write as _};
 use std::net::{Shutdown, TcpStream, ToSocketAddrs as _};
@@ -31,34 +32,34 @@ use std::time::Duration;
 
 use crate::driver::{Command, Driver, DriverError, Order, PairState};
 use crate::quarc::codec::STATE_BYTES;
-use crate::quarc::inbox::Inbox;
+use crate::quarc::state_buffer::StateBuffer;
 
 pub mod codec;
-mod inbox;
+mod state_buffer;
 
-/// Bytes that are taken in one exchange at most. More is not a state a sample.
-const MOST_BYTES: usize = 4096 * STATE_BYTES;
-/// Reads in which the first state has to come.
+/// The largest number of bytes in one exchange. The model sends one state per sample.
+const MAX_BYTES: usize = 4096 * STATE_BYTES;
+/// The number of reads in which the first state has to arrive.
 const N_FIRST_READS: u32 = 100;
 
-/// How to reach the arms, and how patient to be.
+/// The address and the time limits of a driver.
 #[derive(Debug, Clone, PartialEq)]
 pub struct QuarcConfig {
-    /// Where the stream server listens: `host:port` or `tcpip://host:port`.
+    /// The address of the stream server: `host:port` or `tcpip://host:port`.
     pub address: String,
     /// Time from one exchange to the next, seconds: the model's sample time. Default 0.01.
     pub period_s: f64,
-    /// How long to wait for the connection, and then for the first state. Default 3 s each.
+    /// Time limit of the connection, and then of the first state. Default 3 s each.
     pub connect_timeout: Duration,
-    /// How long an exchange waits for a state when none has come. Default 2 ms; has to be shorter than the period.
-    /// It evens out the jitter of two clocks with the same period.
+    /// Time for which an exchange waits for a state if none has arrived. Default 2 ms; must be shorter than the period.
+    /// It compensates for the jitter of two clocks with the same period.
     pub wait: Duration,
-    /// Exchanges after which a vector that is still short ends the connection. Default 3.
-    pub short_exchanges: u32,
+    /// Exchanges after which an incomplete vector ends the connection. Default 3.
+    pub partial_exchanges: u32,
 }
 
 impl QuarcConfig {
-    /// Defaults for the stream server at `address`.
+    /// Returns the defaults for the stream server at `address`.
     #[must_use]
     pub fn at(address: impl Into<String>) -> Self {
         Self {
@@ -66,46 +67,45 @@ impl QuarcConfig {
             period_s: 0.01,
             connect_timeout: Duration::from_secs(3),
             wait: Duration::from_millis(2),
-            short_exchanges: 3,
+            partial_exchanges: 3,
         }
     }
 
-    /// Passes values that make sense.
+    /// Checks the values.
     fn checked(self) -> Result<Self, DriverError> {
         let wait_s = self.wait.as_secs_f64();
         if !(self.period_s.is_finite() && self.period_s > 0.0 && wait_s < self.period_s) {
             let period_s = self.period_s;
-            let what = format!(
-                "period {period_s} s with a wait of {wait_s} s: the wait has to be shorter"
-            );
+            let what =
+                format!("period {period_s} s with a wait of {wait_s} s: the wait must be shorter");
             return Err(DriverError::Refused { what });
         }
         Ok(self)
     }
 }
 
-/// The arms at the other end of one connection.
+/// The driver of the arms at one connection.
 #[derive(Debug)]
 pub struct QuarcDriver {
     config: QuarcConfig,
     stream: TcpStream,
-    inbox: Inbox,
+    buffered: StateBuffer,
     newest: PairState,
-    /// Exchanges in which a vector was begun and none completed, since the last state.
-    n_short: u32,
-    /// Number of the newest command that was sent.
+    /// Exchanges with an incomplete vector since the last state.
+    n_partial: u32,
+    /// The number of the newest command that was sent.
     number: u64,
     /// Whether an order to stop was exchanged over this connection.
     stopped_once: bool,
-    /// Why the connection has ended.
+    /// The error that ended the connection.
     failure: Option<DriverError>,
 }
 
 impl QuarcDriver {
-    /// Dials a stream server and waits for its first state. Sends nothing.
+    /// Connects to a stream server and waits for its first state. Sends nothing.
     ///
     /// # Errors
-    /// Says which address does not answer, or what it sends instead of states.
+    /// Returns an error if the address does not respond or does not send states.
     pub fn connect(config: QuarcConfig) -> Result<Self, DriverError> {
         let config = config.checked()?;
         let bare = config.address.trim_start_matches("tcpip://").trim_end_matches('/');
@@ -126,23 +126,24 @@ impl QuarcDriver {
         Err(unreachable(why))
     }
 
-    /// Takes over a connection that exists and waits for its first state; the configured address is for messages only. Sends nothing.
+    /// Takes over an existing connection and waits for its first state. Sends nothing. The configured address only
+    /// appears in messages.
     ///
     /// # Errors
-    /// Says what comes instead of states.
+    /// Returns an error if the connection does not send states.
     pub fn over(stream: TcpStream, config: QuarcConfig) -> Result<Self, DriverError> {
         let config = config.checked()?;
         let failed = |error: std::io::Error| lost(&format!("{:?}", config.address), &error);
         stream.set_nodelay(true).map_err(failed)?;
-        let mut inbox = Inbox::default();
+        let mut buffered = StateBuffer::default();
         let mut stream = stream;
-        let newest = first_state(&mut stream, &mut inbox, &config)?;
+        let newest = first_state(&mut stream, &mut buffered, &config)?;
         stream.set_nonblocking(true).map_err(failed)?;
         Ok(Self {
-            inbox,
-            // What is handed on is counted from 1.
+            buffered,
+            // The executor receives states counted from 1.
             newest: PairState { sequence: 1, ..newest },
-            n_short: 0,
+            n_partial: 0,
             number: 0,
             stopped_once: false,
             failure: None,
@@ -151,34 +152,35 @@ impl QuarcDriver {
         })
     }
 
-    /// Returns the newest state, and waits for at most `patience` when it is known already. Sends nothing: for looking at arms that
-    /// nobody commands.
+    /// Returns the newest state, and waits at most `timeout` for a new one. Sends no command, so it suits arms that are
+    /// only monitored.
     ///
     /// # Errors
-    /// As an exchange.
-    pub fn listen(&mut self, patience: Duration) -> Result<PairState, DriverError> {
+    /// As [`Driver::exchange`].
+    pub fn listen(&mut self, timeout: Duration) -> Result<PairState, DriverError> {
         self.unless_failed(|driver| {
-            driver.receive(patience)?;
+            driver.receive(timeout)?;
             Ok(driver.newest.clone())
         })
     }
 
-    /// Does something that ends the connection when it fails.
+    /// Runs `action` unless the connection has failed. An error ends the connection and is kept.
     fn unless_failed<T>(
         &mut self,
-        act: impl FnOnce(&mut Self) -> Result<T, DriverError>,
+        action: impl FnOnce(&mut Self) -> Result<T, DriverError>,
     ) -> Result<T, DriverError> {
         if let Some(failure) = &self.failure {
             return Err(failure.clone());
         }
-        act(self).inspect_err(|failure| {
+        action(self).inspect_err(|failure| {
             self.send(&Command { number: self.number, order: Order::Stop }).ok();
             self.stream.shutdown(Shutdown::Both).ok();
             self.failure = Some(failure.clone());
         })
     }
 
-    /// Writes a command, all of it at once. What does not fit now would arrive late, and a late command is a wrong one.
+    /// Writes a whole command without waiting. The rest of a partly written command would arrive late, and a late
+    /// command is wrong.
     fn send(&mut self, command: &Command) -> Result<(), DriverError> {
         let bytes = codec::to_bytes(&codec::encode_command(command, self.config.period_s)?);
         match self.stream.write(&bytes) {
@@ -189,28 +191,28 @@ impl QuarcDriver {
         }
     }
 
-    /// Takes what has come; waits once when that is no whole state. Says whether the newest state is a new one.
-    fn receive(&mut self, patience: Duration) -> Result<bool, DriverError> {
+    /// Receives all waiting bytes, and waits once if they complete no state. Returns whether there is a new state.
+    fn receive(&mut self, timeout: Duration) -> Result<bool, DriverError> {
         if self.drain()? {
             return Ok(true);
         }
-        if patience.is_zero() {
+        if timeout.is_zero() {
             return Ok(false);
         }
         let failed = |error: std::io::Error| lost("the socket", &error);
-        self.stream.set_read_timeout(Some(patience)).map_err(failed)?;
+        self.stream.set_read_timeout(Some(timeout)).map_err(failed)?;
         self.stream.set_nonblocking(false).map_err(failed)?;
-        // Only waits: bytes are taken by what follows.
-        let came = self.stream.peek(&mut [0]);
+        // Only waits: `drain` reads the bytes.
+        let peeked = self.stream.peek(&mut [0]);
         self.stream.set_nonblocking(true).map_err(failed)?;
-        match came {
+        match peeked {
             Ok(_) => self.drain(),
-            Err(error) if waited(&error) => Ok(false),
+            Err(error) if is_timeout(&error) => Ok(false),
             Err(error) => Err(lost("reading a state", &error)),
         }
     }
 
-    /// Takes all bytes that have come. Says whether a state was completed.
+    /// Reads all bytes that have arrived. Returns whether they completed a state.
     fn drain(&mut self) -> Result<bool, DriverError> {
         let (mut buffer, mut n_taken, mut new) = ([0; 16 * STATE_BYTES], 0, None);
         loop {
@@ -218,12 +220,12 @@ impl QuarcDriver {
                 Ok(0) => return Err(closed()),
                 Ok(n) => {
                     n_taken += n;
-                    new = self.inbox.take(&buffer[..n])?.or(new);
+                    new = self.buffered.push(&buffer[..n])?.or(new);
                 }
-                Err(error) if waited(&error) => break,
+                Err(error) if is_timeout(&error) => break,
                 Err(error) => return Err(lost("reading a state", &error)),
             }
-            if n_taken > MOST_BYTES {
+            if n_taken > MAX_BYTES {
                 let what =
                     format!("{n_taken} bytes at once: the arms send faster than they are read");
                 return Err(DriverError::Malformed { what });
@@ -232,14 +234,14 @@ impl QuarcDriver {
         let Some(state) = new else { return Ok(false) };
         let sequence = self.newest.sequence + 1;
         self.newest = PairState { sequence, ..state };
-        self.n_short = 0;
+        self.n_partial = 0;
         Ok(true)
     }
 
-    fn judge_short(&mut self, new: bool) -> Result<(), DriverError> {
-        let n_bytes = self.inbox.n_short();
-        self.n_short += u32::from(!new && n_bytes > 0);
-        if self.n_short > self.config.short_exchanges {
+    fn check_partial(&mut self, new: bool) -> Result<(), DriverError> {
+        let n_bytes = self.buffered.n_partial();
+        self.n_partial += u32::from(!new && n_bytes > 0);
+        if self.n_partial > self.config.partial_exchanges {
             let what = format!(
                 "a vector of {n_bytes} bytes instead of {STATE_BYTES}: check the width and the data type of the stream block's signal"
             );
@@ -259,7 +261,7 @@ impl Driver for QuarcDriver {
             match &command.order {
                 Order::Stop => driver.stopped_once = true,
                 Order::Move(_) if !driver.stopped_once => {
-                    let what = "a new connection has to begin with an order to stop".into();
+                    let what = "a new connection has to start with an order to stop".into();
                     return Err(DriverError::Refused { what });
                 }
                 Order::Move(_) => {}
@@ -267,13 +269,13 @@ impl Driver for QuarcDriver {
             driver.send(command)?;
             driver.number = command.number;
             let new = driver.receive(driver.config.wait)?;
-            driver.judge_short(new)?;
+            driver.check_partial(new)?;
             Ok(driver.newest.clone())
         })
     }
 
-    /// Sends an order to stop on top of all that was sent. When that cannot be done the socket is shut, and the model brakes
-    /// because it hears nothing more.
+    /// Sends an order to stop. If that fails, the socket is closed and the model brakes because it receives no
+    /// commands.
     fn stop(&mut self) -> Result<(), DriverError> {
         let stop = Command { number: self.number, order: Order::Stop };
         self.unless_failed(|driver| driver.send(&stop))
@@ -283,7 +285,7 @@ impl Driver for QuarcDriver {
 /// Waits for the first whole state.
 fn first_state(
     stream: &mut TcpStream,
-    inbox: &mut Inbox,
+    buffered: &mut StateBuffer,
     config: &QuarcConfig,
 ) -> Result<PairState, DriverError> {
     let failed = |error: std::io::Error| lost(&format!("{:?}", config.address), &error);
@@ -295,23 +297,23 @@ fn first_state(
         match stream.read(&mut buffer) {
             Ok(0) => return Err(closed()),
             Ok(n) => {
-                if let Some(state) = inbox.take(&buffer[..n])? {
+                if let Some(state) = buffered.push(&buffer[..n])? {
                     return Ok(state);
                 }
             }
-            Err(error) if waited(&error) => {}
+            Err(error) if is_timeout(&error) => {}
             Err(error) => return Err(failed(error)),
         }
     }
-    let (address, got) = (&config.address, inbox.n_short());
+    let (address, got) = (&config.address, buffered.n_partial());
     let what = format!(
-        "{address:?} took the connection and sent {got} bytes, a state has {STATE_BYTES}: does the model run, and is its signal as wide as the table says?"
+        "{address:?} accepted the connection and sent {got} bytes, a state has {STATE_BYTES}: is the model running, and does its signal have the documented width?"
     );
     Err(DriverError::Malformed { what })
 }
 
-/// Whether nothing had come, which is no failure.
-fn waited(error: &std::io::Error) -> bool {
+/// Returns whether an error only means that no data has arrived.
+fn is_timeout(error: &std::io::Error) -> bool {
     matches!(error.kind(), ErrorKind::WouldBlock | ErrorKind::TimedOut | ErrorKind::Interrupted)
 }
 
@@ -323,8 +325,8 @@ fn lost(doing: &str, error: &std::io::Error) -> DriverError {
     DriverError::Disconnected { what: format!("{doing}: {error}") }
 }
 
-/// A command did not fit into the socket's buffer. Shuts the socket: half a command may be in it.
+/// Closes the socket after a command did not fit into its buffer, which may contain a part of it.
 fn blocked(stream: &TcpStream) -> DriverError {
     stream.shutdown(Shutdown::Both).ok();
-    DriverError::Disconnected { what: "the arms do not take commands any more".into() }
+    DriverError::Disconnected { what: "the arms no longer accept commands".into() }
 }

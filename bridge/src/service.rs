@@ -1,21 +1,19 @@
-//! The service `tandem.v1.Bridge`: a thin shell round an [`Executor`] on a thread of its own.
+//! The service `tandem.v1.Bridge`: a thin shell around an [`Executor`] on its own thread.
 //!
-//! Nothing that a client does delays a tick: motions are planned and checked on other threads, one at a time, and handed
-//! over whole; what calls ask for is done between ticks; progress is published and never waited for. A stop does not
-//! queue behind anything.
+//! No client can delay a tick: motions are planned and checked on other threads, one at a time; calls are handled between
+//! ticks; progress is published without waiting for readers. A stop waits in no queue.
 //!
-//! **Every way out stops the drives**: the service's end, a stream that ends or breaks, an owner who is silent, a driver
-//! that fails, a panic of the thread that ticks. A killed process is silent, and drives brake on silence.
+//! **The drives always stop**: when the service shuts down, a stream ends or breaks, the owner falls silent, a driver
+//! fails, or the arms' thread panics. The drives of a killed process brake because they receive no commands.
 
-mod attend;
+mod clock;
 mod error;
+mod execute_stream;
 mod execution;
 mod messages;
 mod motion;
-mod paced;
+mod reason_codes;
 mod thread;
-mod time;
-mod words;
 
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
@@ -33,190 +31,192 @@ use tonic::{Request, Response, Status, Streaming};
 use crate::executor::{CheckedMotion, Executor, GOOD_STATES, Stop, StopCause, Token};
 use error::status;
 use messages::{decode_token, token_text};
-use motion::Wanted;
+use motion::MotionSpec;
 use thread::{ArmsHandle, ArmsThread, Snapshot};
 
+pub use clock::Clock;
 pub use error::Error;
-pub use motion::Refused;
-pub use paced::Paced;
-pub use thread::{AnyDriver, Dial};
-pub use time::Time;
+pub use motion::MotionError;
+pub use thread::{BoxDriver, Reconnect};
 
-/// Bytes that a request may have: joint motions of ten minutes.
+/// The largest request in bytes: a joint motion of ten minutes.
 const MAX_REQUEST_BYTES: usize = 16 << 20;
-/// How long a motion waits until it is its turn to be checked.
-const CHECK_QUEUE: Duration = Duration::from_secs(4);
+/// The longest time that a motion waits for its check.
+const CHECK_TIMEOUT: Duration = Duration::from_secs(4);
 
-/// What a bridge service needs to know beside its arms.
+/// The configuration of a bridge service.
 #[derive(Clone)]
 pub struct Config {
-    /// What stands behind the executor, for those who ask: "sim".
+    /// The name of the driver for clients, such as "sim".
     pub driver: String,
     /// The program's version.
     pub version: String,
-    /// No motion is played faster than this share of its own speed, in (0, 1].
+    /// The largest share of a motion's own speed at which it is played, in (0, 1].
     pub speed: f64,
-    /// What the arms are ticked by.
-    pub time: Arc<dyn Time>,
-    /// Connects again when a reset finds that the driver has failed; `None` for arms that do not lose their connection.
-    pub dial: Option<Dial>,
-    /// Makes tokens hard to guess: different at every start, and known to nobody.
+    /// The clock of the ticks.
+    pub clock: Arc<dyn Clock>,
+    /// Replaces the driver if a reset finds that it has failed; `None` for arms that cannot lose their connection.
+    pub reconnect: Option<Reconnect>,
+    /// The secret seed of the tokens, which must differ at every start.
     pub secret: [u8; 32],
 }
 
-/// Serves the arms behind `executor` to those whom `gate` lets in, until `shutdown` is cancelled. The arms are then
-/// stopped, before anything else.
+/// Serves the arms of `executor` to the clients that `server_config` admits until `shutdown` is cancelled, and then
+/// stops the arms.
 ///
 /// # Errors
-/// When the server fails, the thread that moves the arms has panicked, or the driver does not come back.
+/// Returns an error if the server fails, the arms' thread has panicked, or the driver hangs.
 ///
 /// # Panics
-/// When the speed is not in (0, 1].
+/// Panics if the speed is not in (0, 1].
 pub async fn serve(
-    executor: Executor<AnyDriver>,
+    executor: Executor<BoxDriver>,
     config: Config,
     incoming: impl Into<Incoming>,
-    gate: &ServerConfig,
+    server_config: &ServerConfig,
     shutdown: CancellationToken,
 ) -> Result<(), Error> {
     assert!(config.speed > 0.0 && config.speed <= 1.0, "speed {}", config.speed);
     let ends = shutdown.child_token();
-    // Whatever becomes of the server: without it nobody can stop the arms.
+    // Without the server no client could stop the arms, so the thread ends with it.
     let _ends = ends.clone().drop_guard();
-    let (thread, arms) = ArmsThread::spawn(executor, Arc::clone(&config.time), ends.clone())
+    let (thread, arms) = ArmsThread::spawn(executor, Arc::clone(&config.clock), ends.clone())
         .map_err(Error::Thread)?;
     tokio::spawn(log_stops(arms.watch()));
     let service = BridgeService::new(arms, config);
     let bridge = BridgeServer::new(service).max_decoding_message_size(MAX_REQUEST_BYTES);
-    let router = gate.router(bridge, tandem_proto::FILE_DESCRIPTOR_SET).await?;
+    let router = server_config.router(bridge, tandem_proto::FILE_DESCRIPTOR_SET).await?;
     let served = tandem_net::serve(router, incoming, ends.clone()).await;
     ends.cancel();
     thread.join(SHUTDOWN_GRACE).await?;
     Ok(served?)
 }
 
-/// Logs why the arms were stopped. The thread that ticks does not: it must not wait for a log.
+/// Logs stops and resets. The arms' thread does not log, because it must not wait.
 async fn log_stops(mut snapshots: watch::Receiver<Arc<Snapshot>>) {
-    let mut told: Option<Stop> = None;
+    let mut logged: Option<Stop> = None;
     while snapshots.changed().await.is_ok() {
         let stopped = snapshots.borrow_and_update().stopped.clone();
         match &stopped {
-            Some(stop) if stopped != told => match stop.cause {
+            Some(stop) if stopped != logged => match stop.cause {
                 StopCause::NotReset => {}
                 StopCause::Requested | StopCause::ShutDown => {
                     tracing::info!(%stop, "the arms were stopped");
                 }
                 _ => tracing::warn!(%stop, "the arms were stopped"),
             },
-            None if told.is_some() => tracing::info!("the arms were let go"),
+            None if logged.is_some() => tracing::info!("the arms were reset"),
             _ => {}
         }
-        told = stopped;
+        logged = stopped;
     }
 }
 
-/// What the generated server calls.
+/// The implementation of the generated trait.
 struct BridgeService {
     arms: ArmsHandle,
     config: Config,
     tokens: Mutex<ChaCha20Rng>,
-    /// Motions are checked one at a time: the arms' thread needs a processor as well.
+    /// Motions are checked one at a time, so that the arms' thread keeps a processor.
     checks: Arc<Semaphore>,
-    /// One connection is made at a time.
-    dials: Semaphore,
+    /// One connection is replaced at a time.
+    reconnects: Semaphore,
 }
 
 impl BridgeService {
     fn new(arms: ArmsHandle, config: Config) -> Self {
         let tokens = Mutex::new(ChaCha20Rng::from_seed(config.secret));
-        let (checks, dials) = (Arc::new(Semaphore::new(1)), Semaphore::new(1));
-        Self { arms, config, tokens, checks, dials }
+        let (checks, reconnects) = (Arc::new(Semaphore::new(1)), Semaphore::new(1));
+        Self { arms, config, tokens, checks, reconnects }
     }
 
     fn new_token(&self) -> Token {
-        // A generator is whole at any time.
+        // The generator is valid even if a holder of the lock panicked.
         let mut tokens = self.tokens.lock().unwrap_or_else(PoisonError::into_inner);
         Token(u128::from(tokens.next_u64()) << 64 | u128::from(tokens.next_u64()))
     }
 
-    async fn acquire_lease(&self, shown: &str) -> Result<Token, Error> {
-        if shown.is_empty() {
+    async fn acquire_lease(&self, token: &str) -> Result<Token, Error> {
+        if token.is_empty() {
             let token = self.new_token();
             self.arms.run(move |arms, now_s| arms.executor.acquire(token, now_s)).await?;
-            tracing::info!("the arms have an owner");
+            tracing::info!("the arms were acquired");
             return Ok(token);
         }
-        let token = decode_token("token", shown)?;
+        let token = decode_token("token", token)?;
         self.arms.run(move |arms, now_s| arms.executor.renew(token, now_s)).await?;
         Ok(token)
     }
 
-    async fn release_lease(&self, shown: &str) -> Result<(), Error> {
-        let token = decode_token("token", shown)?;
+    async fn release_lease(&self, token: &str) -> Result<(), Error> {
+        let token = decode_token("token", token)?;
         self.arms.run(move |arms, now_s| arms.executor.release(token, now_s)).await
     }
 
-    async fn reset_arms(&self, shown: &str) -> Result<(), Error> {
-        let token = decode_token("token", shown)?;
-        if let Some(dial) = self.config.dial.as_ref().filter(|_| self.arms.newest().failed) {
-            self.connect_again(Arc::clone(dial), token).await?;
+    async fn reset_arms(&self, token: &str) -> Result<(), Error> {
+        let token = decode_token("token", token)?;
+        if let Some(reconnect) = &self.config.reconnect
+            && self.arms.newest().exchange_failed
+        {
+            self.replace_driver(Arc::clone(reconnect), token).await?;
         }
         self.arms.run(move |arms, now_s| arms.executor.reset(token, now_s)).await
     }
 
-    /// Gives the arms a new connection in the place of one that has failed, and waits for good states. Nothing moves by it.
-    async fn connect_again(&self, dial: Dial, token: Token) -> Result<(), Error> {
-        let _turn = self.dials.acquire().await.map_err(|_closed| Error::Ended)?;
+    /// Replaces a failed driver and waits for good states. The arms do not move.
+    async fn replace_driver(&self, reconnect: Reconnect, token: Token) -> Result<(), Error> {
+        let _turn = self.reconnects.acquire().await.map_err(|_closed| Error::ShuttingDown)?;
         self.arms.run(move |arms, now_s| arms.executor.renew(token, now_s)).await?;
-        if !self.arms.newest().failed {
+        if !self.arms.newest().exchange_failed {
             return Ok(());
         }
-        let dialled = tokio::task::spawn_blocking(move || dial()).await;
-        let driver = dialled.map_err(|_panic| Error::Panicked)?.map_err(Error::Dial)?;
+        let connected = tokio::task::spawn_blocking(move || reconnect()).await;
+        let driver = connected.map_err(|_panic| Error::Panicked)?.map_err(Error::Reconnect)?;
         self.arms.run(move |arms, now_s| arms.replace_driver(token, driver, now_s)).await?;
-        tracing::info!("the arms have a new connection");
-        self.arms.until(|newest| newest.failed || newest.n_good >= GOOD_STATES).await;
+        tracing::info!("the driver was replaced");
+        self.arms.wait_until(|newest| newest.exchange_failed || newest.n_good >= GOOD_STATES).await;
         Ok(())
     }
 
-    /// What `request` wants, as field `field` of its message.
-    fn decode(&self, field: &str, request: Option<pb::MotionRequest>) -> Result<Wanted, Error> {
+    /// Decodes `request`, which is field `field` of its message.
+    fn decode(&self, field: &str, request: Option<pb::MotionRequest>) -> Result<MotionSpec, Error> {
         let request = request.ok_or_else(|| DecodeError::new(field, "a message", "none"))?;
-        let wanted = Wanted::decode(request, self.arms.checker.cell());
-        Ok(wanted.map_err(|error| error.within(field))?)
+        let spec = MotionSpec::decode(request, self.arms.checker.cell());
+        Ok(spec.map_err(|error| error.within(field))?)
     }
 
-    /// The share of a motion's own speed at which it is played.
-    fn bounded(&self, speed: f64) -> f64 {
+    /// Returns the share of a motion's own speed at which it is played if a client requests `speed`.
+    fn limited_speed(&self, speed: f64) -> f64 {
         speed.min(self.config.speed)
     }
 
-    /// Checks a motion from where the arms are, and looks at it with `look` on the same thread.
+    /// Checks a motion from the position of the arms, and passes it to `then` on the same thread.
     async fn check_motion<T: Send + 'static>(
         &self,
-        wanted: Wanted,
-        look: impl FnOnce(CheckedMotion) -> T + Send + 'static,
+        spec: MotionSpec,
+        then: impl FnOnce(CheckedMotion) -> T + Send + 'static,
     ) -> Result<T, Error> {
-        // After a state that was not believed there is none until the next one has come.
-        self.arms.until(|newest| newest.state.is_some()).await;
-        let turn = tokio::time::timeout(CHECK_QUEUE, Arc::clone(&self.checks).acquire_owned());
-        let turn = turn.await.map_err(|_elapsed| Error::Busy)?.map_err(|_closed| Error::Ended)?;
+        // After an invalid state there is none until the next one arrives.
+        self.arms.wait_until(|newest| newest.state.is_some()).await;
+        let turn = tokio::time::timeout(CHECK_TIMEOUT, Arc::clone(&self.checks).acquire_owned());
+        let turn =
+            turn.await.map_err(|_elapsed| Error::Busy)?.map_err(|_closed| Error::ShuttingDown)?;
         let newest = self.arms.newest();
         let state = newest.state.clone().ok_or(Error::NoState)?;
         let checker = self.arms.checker.clone();
         let checking = tokio::task::spawn_blocking(move || {
             let _turn = turn;
-            wanted.prepare(&state, &checker).map(look)
+            spec.prepare(&state, &checker).map(then)
         });
         Ok(checking.await.map_err(|_panic| Error::Panicked)??)
     }
 
-    async fn judge(&self, request: pb::CheckRequest) -> Result<pb::CheckResponse, Error> {
+    async fn check_request(&self, request: pb::CheckRequest) -> Result<pb::CheckResponse, Error> {
         use pb::check_response::Verdict;
-        let wanted = self.decode("motion", request.motion)?;
-        let (speed, cell) = (self.bounded(wanted.speed), self.arms.checker.cell().clone());
-        let look = move |motion: CheckedMotion| messages::accepted(&motion, &cell, speed);
-        let verdict = match self.check_motion(wanted, look).await {
+        let spec = self.decode("motion", request.motion)?;
+        let (speed, cell) = (self.limited_speed(spec.speed), self.arms.checker.cell().clone());
+        let describe = move |motion: CheckedMotion| messages::accepted(&motion, &cell, speed);
+        let verdict = match self.check_motion(spec, describe).await {
             Ok(accepted) => Verdict::Accepted(accepted),
             Err(Error::Refused(refused)) => Verdict::Refused(messages::refusal(&refused)),
             Err(error) => return Err(error),
@@ -237,7 +237,7 @@ impl BridgeService {
         }
     }
 
-    fn present(&self) -> pb::BridgeStatusResponse {
+    fn current_status(&self) -> pb::BridgeStatusResponse {
         let newest = self.arms.newest();
         let motion = newest.progress.map(|progress| pb::MotionProgress {
             phase: messages::phase(newest.phase).into(),
@@ -255,7 +255,7 @@ impl BridgeService {
             arms: messages::arms(&newest, self.arms.checker.cell()),
             motion,
             now_s: newest.now_s,
-            since_tick_s: (self.arms.time.now_s() - newest.now_s).max(0.0),
+            since_tick_s: (self.arms.clock.now_s() - newest.now_s).max(0.0),
         }
     }
 }
@@ -303,7 +303,7 @@ impl Bridge for BridgeService {
         &self,
         request: Request<pb::CheckRequest>,
     ) -> Result<Response<pb::CheckResponse>, Status> {
-        let verdict = self.judge(request.into_inner()).await;
+        let verdict = self.check_request(request.into_inner()).await;
         verdict.map(Response::new).map_err(|error| status(&error))
     }
 
@@ -311,8 +311,8 @@ impl Bridge for BridgeService {
         &self,
         request: Request<Streaming<pb::ExecuteRequest>>,
     ) -> Result<Response<Self::ExecuteStream>, Status> {
-        let told = attend::begin(self, request.into_inner()).await;
-        told.map(Response::new).map_err(|error| status(&error))
+        let reports = execute_stream::begin(self, request.into_inner()).await;
+        reports.map(Response::new).map_err(|error| status(&error))
     }
 
     async fn stop(
@@ -328,6 +328,6 @@ impl Bridge for BridgeService {
         &self,
         _: Request<pb::BridgeStatusRequest>,
     ) -> Result<Response<pb::BridgeStatusResponse>, Status> {
-        Ok(Response::new(self.present()))
+        Ok(Response::new(self.current_status()))
     }
 }

@@ -130,7 +130,6 @@ impl OutOfRange {
     ///
     /// # Errors
     /// Returns an error unless `is_usable`.
-    #[expect(clippy::needless_pass_by_value, reason = "nearly all values are numbers")]
     pub fn unless(
         is_usable: bool,
         key: &'static str,

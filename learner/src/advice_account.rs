@@ -104,7 +104,7 @@ pub(crate) struct Mismatch {
 /// Options for [`AdviceAccount::open`].
 pub(crate) struct AccountOptions<'a> {
     /// Token and TLS of the calls.
-    pub(crate) dial: &'a ClientConfig,
+    pub(crate) client_config: &'a ClientConfig,
     /// The teacher's address.
     pub(crate) address: &'a str,
     /// Name, budget and strategy, from the run file.
@@ -145,9 +145,9 @@ impl AdviceAccount {
         runtime: &Runtime,
         shutdown: &CancellationToken,
     ) -> Result<Self, TeacherError> {
-        let AccountOptions { dial, address, terms, units_per_episode, start } = options;
+        let AccountOptions { client_config, address, terms, units_per_episode, start } = options;
         let inside = runtime.enter();
-        let client = TeacherClient::new(dial.channel(address)?);
+        let client = TeacherClient::new(client_config.channel(address)?);
         drop(inside);
         let (lost, stop_watching) = (Arc::new(AtomicBool::new(false)), CancellationToken::new());
         let budget = terms.budget;

@@ -40,7 +40,7 @@ pub enum Error {
     Diverged(#[from] DdpgError),
     /// The service cannot be configured.
     #[error(transparent)]
-    Gate(#[from] tandem_net::ServerConfigError),
+    ServerConfig(#[from] tandem_net::ServerConfigError),
     /// The address of a relay's learner is malformed.
     #[error(transparent)]
     Address(#[from] tandem_net::ClientConfigError),

@@ -31,18 +31,18 @@ const CALL_DEADLINE: Duration = Duration::from_secs(20);
 /// When `learner` is not an address, or the server fails.
 pub async fn serve(
     learner: &str,
-    dial: &ClientConfig,
-    gate: &ServerConfig,
+    client_config: &ClientConfig,
+    server_config: &ServerConfig,
     incoming: impl Into<Incoming>,
     shutdown: CancellationToken,
 ) -> Result<(), Error> {
-    let link = dial.channel(learner).map_err(Error::Address)?;
+    let link = client_config.channel(learner).map_err(Error::Address)?;
     let client = LearnerClient::new(link)
         .max_decoding_message_size(MAX_MESSAGE_BYTES)
         .max_encoding_message_size(MAX_MESSAGE_BYTES);
     let relay = Relay { client, cache: Mutex::default() };
     let server = LearnerServer::new(relay).max_decoding_message_size(MAX_MESSAGE_BYTES);
-    let router = gate.router(server, tandem_proto::FILE_DESCRIPTOR_SET).await?;
+    let router = server_config.router(server, tandem_proto::FILE_DESCRIPTOR_SET).await?;
     Ok(tandem_net::serve(router, incoming, shutdown).await?)
 }
 

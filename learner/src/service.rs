@@ -92,7 +92,7 @@ pub async fn serve_with(
     let learner =
         LearnerServer::new(LearnerService { shared: shared.clone(), start: config.first_worker })
             .max_decoding_message_size(MAX_MESSAGE_BYTES);
-    let router = config.gate.router(learner, tandem_proto::FILE_DESCRIPTOR_SET).await?;
+    let router = config.server_config.router(learner, tandem_proto::FILE_DESCRIPTOR_SET).await?;
     let stop_serving = CancellationToken::new();
     let serving_metrics = serve_metrics(options.metrics, shared.clone());
     let learning = {

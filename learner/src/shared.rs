@@ -29,9 +29,9 @@ pub struct LearnerConfig {
     /// The run.
     pub run: RunConfig,
     /// Access control and TLS of the service.
-    pub gate: ServerConfig,
+    pub server_config: ServerConfig,
     /// Token and TLS of calls to the teacher.
-    pub dial: ClientConfig,
+    pub client_config: ClientConfig,
     /// The teacher's address, `HOST:PORT` or a URI; required if the run asks for advice.
     pub teacher: Option<String>,
     /// The one-arm policy whose copies a run with strategy `init:teacher` starts from.

@@ -172,8 +172,8 @@ struct Bench {
 impl Bench {
     /// Creates clients of the service at `address`, which connect at their first call. Must be called inside a runtime.
     fn new(address: SocketAddr) -> anyhow::Result<Self> {
-        let dial = ClientConfig::default();
-        let connect = || dial.channel(&address.to_string()).map(TeacherClient::new);
+        let client_config = ClientConfig::default();
+        let connect = || client_config.channel(&address.to_string()).map(TeacherClient::new);
         let streams = (1..=N_STREAMS).map(|idx| Ok((connect()?, Requests::new(idx))));
         Ok(Self {
             client: connect()?,

@@ -2,9 +2,11 @@
 
 use std::sync::Arc;
 
-use tandem_bridge::layout::mico_cell;
-use tandem_bridge::service::{AnyDriver, Dial, Paced, Time};
-use tandem_bridge::{DriverError, Executor, Settings, SimulatedConfig, SimulatedPair};
+use tandem_bridge::service::{BoxDriver, Clock, Reconnect};
+use tandem_bridge::work_cell::mico_cell;
+use tandem_bridge::{DriverError, Executor, Settings};
+use tandem_trials::simulated::RealTimePair;
+use tandem_trials::{SimulatedConfig, SimulatedPair};
 
 use crate::cli::{BridgeServeArgs, DriverName};
 use crate::exit::{Exit, Failed, OrExit as _};
@@ -23,45 +25,45 @@ pub(crate) const fn name(driver: DriverName) -> &'static str {
     }
 }
 
-/// Connects to real arms at an address.
-type Connect = fn(&str) -> Result<AnyDriver, DriverError>;
+/// Connects to the real arms at an address.
+type Connect = fn(&str) -> Result<BoxDriver, DriverError>;
 
 /// Creates the executor of the arms and, for real arms, a function that reconnects to them.
 pub(crate) fn arms(
     args: &BridgeServeArgs,
-    time: Arc<dyn Time>,
-) -> Result<(Executor<AnyDriver>, Option<Dial>), Failed> {
+    clock: Arc<dyn Clock>,
+) -> Result<(Executor<BoxDriver>, Option<Reconnect>), Failed> {
     let (connect, settings) = match args.driver {
         DriverName::Sim => {
-            let driver = simulated(args.seed, time)?;
+            let driver = simulated(args.seed, clock)?;
             return Ok((executor(driver, Settings::default())?, None));
         }
         DriverName::Quarc => quarc()?,
         DriverName::KinovaRos => kinova_ros()?,
     };
     let address = args.arms_at.clone().unwrap_or_default();
-    let dial: Dial = Arc::new(move || connect(&address));
-    let driver = dial().or_exit(Exit::TryAgain, String::new)?;
-    Ok((executor(driver, settings)?, Some(dial)))
+    let reconnect: Reconnect = Arc::new(move || connect(&address));
+    let driver = reconnect().or_exit(Exit::TryAgain, String::new)?;
+    Ok((executor(driver, settings)?, Some(reconnect)))
 }
 
-fn executor(driver: AnyDriver, settings: Settings) -> Result<Executor<AnyDriver>, Failed> {
+fn executor(driver: BoxDriver, settings: Settings) -> Result<Executor<BoxDriver>, Failed> {
     Executor::new(mico_cell(), driver, settings).or_exit(Exit::Bug, String::new)
 }
 
 /// Creates a simulated pair in real time, with its tools above their workspaces.
-fn simulated(seed: u64, time: Arc<dyn Time>) -> Result<AnyDriver, Failed> {
+fn simulated(seed: u64, clock: Arc<dyn Clock>) -> Result<BoxDriver, Failed> {
     let cell = mico_cell();
     let at = cell.ready(READY_M).or_exit(Exit::Bug, String::new)?;
     let config = SimulatedConfig { seed, ..SimulatedConfig::default() };
     let pair = SimulatedPair::new(cell, &at, READY_OPENING, config);
-    Ok(Box::new(Paced::new(pair, time)))
+    Ok(Box::new(RealTimePair::new(pair, clock)))
 }
 
 /// Returns how to connect to arms behind a Simulink model.
 fn quarc() -> Result<(Connect, Settings), Failed> {
     use tandem_bridge::quarc::{QuarcConfig, QuarcDriver};
-    fn connect(address: &str) -> Result<AnyDriver, DriverError> {
+    fn connect(address: &str) -> Result<BoxDriver, DriverError> {
         Ok(Box::new(QuarcDriver::connect(QuarcConfig::at(address))?))
     }
     Ok((connect, Settings::default()))
@@ -70,7 +72,7 @@ fn quarc() -> Result<(Connect, Settings), Failed> {
 /// Returns how to connect to arms behind Kinova's ROS driver.
 fn kinova_ros() -> Result<(Connect, Settings), Failed> {
     use tandem_bridge::kinova_ros::{KinovaRosConfig, KinovaRosDriver, settings};
-    fn connect(address: &str) -> Result<AnyDriver, DriverError> {
+    fn connect(address: &str) -> Result<BoxDriver, DriverError> {
         Ok(Box::new(KinovaRosDriver::connect(KinovaRosConfig::at(address))?))
     }
     Ok((connect, settings()))

@@ -23,10 +23,10 @@ pub(super) fn with_client<F: Future<Output = Result<(), Failed>>>(
     args: &ConnectArgs,
     work: impl FnOnce(Client) -> F,
 ) -> Result<(), Failed> {
-    let dial = access::dial(&args.dial, &args.secret)?;
+    let client_config = access::client_config(&args.client_config, &args.secret)?;
     let runtime = runtime::new().or_exit(Exit::TryAgain, String::new)?;
     runtime.block_on(async {
-        let link = dial.channel(&args.connect).or_exit(Exit::Usage, String::new)?;
+        let link = client_config.channel(&args.connect).or_exit(Exit::Usage, String::new)?;
         work(BridgeClient::new(link)).await
     })
 }

@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use clap::{Args, Subcommand, ValueEnum};
 
-use super::{DialArgs, ListenArgs, SecretArgs, TrialArgs};
+use super::{ClientArgs, ListenArgs, SecretArgs, TrialArgs};
 
 /// Default address of a bridge.
 const ADDRESS: &str = "127.0.0.1:7002";
@@ -88,7 +88,7 @@ pub(crate) struct ConnectArgs {
     #[arg(long, value_name = "ADDR", default_value = ADDRESS)]
     pub(crate) connect: String,
     #[command(flatten)]
-    pub(crate) dial: DialArgs,
+    pub(crate) client_config: ClientArgs,
     #[command(flatten)]
     pub(crate) secret: SecretArgs,
 }

@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use clap::Args;
 
-use super::{DialArgs, SecretArgs};
+use super::{ClientArgs, SecretArgs};
 
 #[derive(Debug, Args)]
 #[command(after_help = "\
@@ -25,7 +25,7 @@ pub(crate) struct HealthArgs {
     #[arg(long, default_value = "3", value_name = "S", value_parser = seconds)]
     pub(crate) timeout_s: Duration,
     #[command(flatten)]
-    pub(crate) dial: DialArgs,
+    pub(crate) client_config: ClientArgs,
     /// Prints one JSON object: address, service, serving, reason.
     #[arg(long)]
     pub(crate) json: bool,
@@ -51,7 +51,7 @@ pub(crate) struct StatusArgs {
     #[arg(long)]
     pub(crate) json: bool,
     #[command(flatten)]
-    pub(crate) dial: DialArgs,
+    pub(crate) client_config: ClientArgs,
     #[command(flatten)]
     pub(crate) secret: SecretArgs,
 }

@@ -36,7 +36,7 @@ pub(crate) struct ListenArgs {
 
 /// TLS options of a client.
 #[derive(Debug, Args)]
-pub(crate) struct DialArgs {
+pub(crate) struct ClientArgs {
     /// Connects by TLS and trusts certificates signed by this authority (PEM).
     #[arg(long, value_name = "FILE.pem")]
     pub(crate) tls_ca: Option<PathBuf>,
@@ -114,7 +114,7 @@ pub(crate) struct LearnerArgs {
     #[command(flatten)]
     pub(crate) listen: ListenArgs,
     #[command(flatten)]
-    pub(crate) dial: DialArgs,
+    pub(crate) client_config: ClientArgs,
     #[command(flatten)]
     pub(crate) secret: SecretArgs,
 }
@@ -138,7 +138,7 @@ pub(crate) struct WorkerArgs {
     #[arg(long, value_name = "DIR")]
     pub(crate) log_dir: Option<PathBuf>,
     #[command(flatten)]
-    pub(crate) dial: DialArgs,
+    pub(crate) client_config: ClientArgs,
     #[command(flatten)]
     pub(crate) secret: SecretArgs,
     /// Exits when standard input closes, which happens when the parent process dies.
@@ -160,7 +160,7 @@ pub(crate) struct RelayArgs {
     #[command(flatten)]
     pub(crate) listen: ListenArgs,
     #[command(flatten)]
-    pub(crate) dial: DialArgs,
+    pub(crate) client_config: ClientArgs,
     #[command(flatten)]
     pub(crate) secret: SecretArgs,
 }

@@ -14,8 +14,8 @@ use crate::{access, clock, policy_file, run_directory, run_file, signals};
 pub(crate) fn learner(args: LearnerArgs) -> Result<(), Failed> {
     let run_config = run_file::resolve(Some(&args.run), &[])?;
     let start_from = args.start_from.as_deref().map(policy_file::load).transpose()?;
-    let gate = access::gate(&args.listen, &args.secret)?;
-    let dial = access::dial(&args.dial, &args.secret)?;
+    let server_config = access::server_config(&args.listen, &args.secret)?;
+    let client_config = access::client_config(&args.client_config, &args.secret)?;
     run_directory::check_path(&args.out)?;
     let keeps_run_file = args.start_or_resume || args.keep_run_file;
     let run_file = keeps_run_file.then(|| run_file::to_text(&run_config)).transpose()?;
@@ -25,8 +25,8 @@ pub(crate) fn learner(args: LearnerArgs) -> Result<(), Failed> {
         let listener = listen(&args.listen).await?;
         let config = LearnerConfig {
             run: run_config,
-            gate,
-            dial,
+            server_config,
+            client_config,
             teacher: args.teacher,
             start_from,
             out: args.out,
@@ -80,7 +80,7 @@ pub(super) fn learner_failed(error: Error) -> Failed {
         | Error::Checkpoint(CheckpointError::OtherSettings { .. }) => Exit::Usage,
         Error::Checkpoint(_) => Exit::Data,
         Error::RunDirectory { .. } | Error::Serve(_) => Exit::TryAgain,
-        Error::Gate(_) | Error::Address(_) => Exit::Usage,
+        Error::ServerConfig(_) | Error::Address(_) => Exit::Usage,
         Error::Diverged(_) | Error::Panicked => Exit::Bug,
     };
     Failed::new(exit, error)

@@ -15,14 +15,19 @@ use crate::{access, policy_file, signals};
 
 pub(crate) fn teacher(args: TeacherArgs) -> Result<(), Failed> {
     policy_file::load(&args.policy)?;
-    let gate = access::gate(&args.listen, &args.secret)?;
+    let server_config = access::server_config(&args.listen, &args.secret)?;
     run(async move {
         let shutdown = signals::shutdown_token(args.listen.exit_with_stdin)?;
         let advisor = advisor(args.policy, args.ledger).map_err(teacher_failed)?;
         let listener = listen(&args.listen).await?;
-        let served =
-            tandem_teacher::serve_advisor(advisor, listener, &gate, shutdown, Pacing::Concurrent)
-                .await;
+        let served = tandem_teacher::serve_advisor(
+            advisor,
+            listener,
+            &server_config,
+            shutdown,
+            Pacing::Concurrent,
+        )
+        .await;
         served.map_err(teacher_failed)
     })
 }

@@ -10,11 +10,11 @@ use crate::exit::{Exit, Failed};
 use crate::{access, signals};
 
 pub(crate) fn worker(args: WorkerArgs) -> Result<(), Failed> {
-    let dial = access::dial(&args.dial, &args.secret)?;
+    let client_config = access::client_config(&args.client_config, &args.secret)?;
     run(async move {
         let shutdown = signals::shutdown_token(args.exit_with_stdin)?;
         let config = WorkerConfig {
-            client: dial,
+            client: client_config,
             learner: args.connect,
             teacher: args.teacher,
             name: args.name,

@@ -56,7 +56,7 @@ pub enum Error {
     Thread(#[source] std::io::Error),
     /// The server cannot be configured.
     #[error(transparent)]
-    Gate(#[from] tandem_net::ServerConfigError),
+    ServerConfig(#[from] tandem_net::ServerConfigError),
     /// The server failed.
     #[error("cannot serve")]
     Transport(#[from] tonic::transport::Error),

@@ -45,20 +45,20 @@ pub fn open(config: &Config) -> Result<Advisor, Error> {
     Advisor::new(Box::new(policy), ledger::open(&config.ledger)?)
 }
 
-/// Serves the teacher of `config`, with the access control of `gate`, until `shutdown` is cancelled.
+/// Serves the teacher of `config`, with the access control of `server_config`, until `shutdown` is cancelled.
 ///
 /// # Errors
 /// When the policy cannot be loaded, the ledger cannot be opened, or the server fails.
 pub async fn serve(
     config: Config,
     incoming: impl Into<Incoming>,
-    gate: &ServerConfig,
+    server_config: &ServerConfig,
     shutdown: CancellationToken,
 ) -> Result<(), Error> {
-    serve_advisor(open(&config)?, incoming, gate, shutdown, Pacing::Concurrent).await
+    serve_advisor(open(&config)?, incoming, server_config, shutdown, Pacing::Concurrent).await
 }
 
-/// Serves `advisor`, with the access control of `gate`, until `shutdown` is cancelled.
+/// Serves `advisor`, with the access control of `server_config`, until `shutdown` is cancelled.
 ///
 /// The advisor runs on its own thread, or under [`Pacing::Lockstep`] as a task. If it panics, pending calls fail and
 /// the service ends.
@@ -68,7 +68,7 @@ pub async fn serve(
 pub async fn serve_advisor(
     advisor: Advisor,
     incoming: impl Into<Incoming>,
-    gate: &ServerConfig,
+    server_config: &ServerConfig,
     shutdown: CancellationToken,
     pacing: Pacing,
 ) -> Result<(), Error> {
@@ -77,7 +77,7 @@ pub async fn serve_advisor(
         .map_err(Error::Thread)?;
     let service = TeacherService { advisor, stop: stop.clone() };
     let teacher = TeacherServer::new(service).max_decoding_message_size(MAX_REQUEST_BYTES);
-    let router = gate.router(teacher, tandem_proto::FILE_DESCRIPTOR_SET).await?;
+    let router = server_config.router(teacher, tandem_proto::FILE_DESCRIPTOR_SET).await?;
     tandem_net::serve(router, incoming, stop).await?;
     thread.join(SHUTDOWN_GRACE).await
 }
@@ -231,7 +231,7 @@ fn status(error: &Error) -> Status {
         | Error::NotFinite { .. }
         | Error::Panicked
         | Error::Thread(_)
-        | Error::Gate(_)
+        | Error::ServerConfig(_)
         | Error::Transport(_) => {
             tracing::error!(%error, "request failed");
             Status::internal(message)

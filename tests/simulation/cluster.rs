@@ -23,7 +23,7 @@ use tokio_util::sync::CancellationToken;
 
 use crate::ledgers::{Ledgers, ObservedLedger, SharedRecord};
 use crate::machines::{Machines, ProcessTracker, with_causes};
-use crate::network::{address, dial, listen};
+use crate::network::{address, client_config, listen};
 use crate::schedule::{Host, Schedule};
 use crate::system;
 
@@ -189,8 +189,8 @@ impl PersistentState {
         let lifetime = self.tracker.lifetime_token(LEARNER);
         let config = LearnerConfig {
             run: self.run.clone(),
-            gate: ServerConfig::default(),
-            dial: dial(),
+            server_config: ServerConfig::default(),
+            client_config: client_config(),
             teacher: Some(address(TEACHER)),
             start_from: None,
             out,
@@ -225,9 +225,10 @@ impl PersistentState {
         });
         let policy = OneArmPolicy::new(teacher_policy())?;
         let advisor = Advisor::new(Box::new(policy), Box::new(ledger))?;
-        let (gate, shutdown) = (ServerConfig::default(), CancellationToken::new());
+        let (server_config, shutdown) = (ServerConfig::default(), CancellationToken::new());
         let served =
-            serve_advisor(advisor, listen().await?, &gate, shutdown, Pacing::Lockstep).await;
+            serve_advisor(advisor, listen().await?, &server_config, shutdown, Pacing::Lockstep)
+                .await;
         if let Err(error) = served {
             self.tracker.report_violation(with_causes(TEACHER, &error));
         }
@@ -238,7 +239,7 @@ impl PersistentState {
         self.statistics
             .update(|statistics| Statistics { n_workers: statistics.n_workers + 1, ..statistics });
         let config = WorkerConfig {
-            client: dial(),
+            client: client_config(),
             learner: address(LEARNER),
             teacher: Some(address(TEACHER)),
             name: host.to_owned(),

@@ -16,7 +16,7 @@ use tonic::{Response, Status};
 
 use crate::ledgers::{Ledgers, ObservedLedger, SharedRecord};
 use crate::machines::{Machines, ProcessTracker, with_causes};
-use crate::network::{address, dial, listen};
+use crate::network::{address, client_config, listen};
 use crate::schedule::{Host, Schedule};
 
 const TEACHER: Host = "teacher";
@@ -97,9 +97,10 @@ impl Default for CrowdState {
 impl CrowdState {
     async fn teacher(self: Rc<Self>, ledger: ObservedLedger) -> turmoil::Result {
         let advisor = Advisor::new(Box::new(StillTeacher), Box::new(ledger))?;
-        let (gate, shutdown) = (ServerConfig::default(), CancellationToken::new());
+        let (server_config, shutdown) = (ServerConfig::default(), CancellationToken::new());
         let served =
-            serve_advisor(advisor, listen().await?, &gate, shutdown, Pacing::Lockstep).await;
+            serve_advisor(advisor, listen().await?, &server_config, shutdown, Pacing::Lockstep)
+                .await;
         if let Err(error) = served {
             self.tracker.report_violation(with_causes(TEACHER, &error));
         }
@@ -107,7 +108,7 @@ impl CrowdState {
     }
 
     async fn client(self: Rc<Self>, client_idx: usize) -> turmoil::Result {
-        let client = TeacherClient::new(dial().channel(&address(TEACHER))?);
+        let client = TeacherClient::new(client_config().channel(&address(TEACHER))?);
         let account = pb::OpenAccountRequest {
             name: ACCOUNT.to_owned(),
             budget: BUDGET,

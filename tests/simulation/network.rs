@@ -19,7 +19,7 @@ pub(crate) fn address(host: &str) -> String {
 }
 
 /// Returns a client configuration that connects over the simulated network.
-pub(crate) fn dial() -> ClientConfig {
+pub(crate) fn client_config() -> ClientConfig {
     ClientConfig::default().with_connector(|uri| async move {
         let host = uri.host().expect("an address has a host").to_owned();
         let port = uri.port_u16().expect("an address has a port");

@@ -1,4 +1,5 @@
-//! Motions that have passed the check before they reach the executor, which must not wait for it.
+//! Motions that have passed the check. The executor cannot wait for a check, so it receives motions that were checked
+//! before.
 
 use std::sync::Arc;
 
@@ -7,74 +8,73 @@ use tandem_kinematics::{Excess, Joints, Motion, Reason, Refusal, WorkCell, check
 
 use crate::executor::settings::Settings;
 
-/// Checks motions for one executor, on any thread: long motions take far longer than a period.
+/// Checks motions for one executor, on any thread. The check of a long motion takes far longer than a period.
 #[derive(Debug, Clone)]
-pub struct Checker(Arc<Terms>);
+pub struct Checker(Arc<CheckerInner>);
 
-/// What a motion has to keep, and for which arms.
 #[derive(Debug)]
-struct Terms {
+struct CheckerInner {
     cell: WorkCell,
     settings: Settings,
 }
 
-/// A motion that has passed the check of an executor's own [`Checker`]; there is no other way to have one.
+/// A motion that has passed the check of an executor's own [`Checker`], which is the only way to create one.
 #[derive(Debug, Clone)]
 pub struct CheckedMotion {
     motion: Motion,
     passed: Checker,
 }
 
-/// What is wrong with a motion.
+/// The fault of a motion.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
 #[non_exhaustive]
 pub enum CheckError {
-    /// It breaks a limit.
+    /// The motion breaks a limit.
     #[error(transparent)]
     Refused(#[from] Refusal),
-    /// It comes too near to the end of a joint's range; radians.
+    /// The motion comes too near to the end of a joint's range; radians.
     #[error("at {when_s:.3} s arm {}: joint {} comes within {:.2} degrees of the end of its range, at least {:.2}",
         .arm.0, .joint + 1, .excess.got.to_degrees(), .excess.allowed.to_degrees())]
     RangeMargin {
-        /// When, seconds since the start of the motion.
+        /// The time since the start of the motion, seconds.
         when_s: f64,
         /// The arm.
         arm: ArmIndex,
         /// The joint, counted from 0.
         joint: usize,
-        /// How near it comes, and what it has to stay away.
+        /// The distance to the end of the range, and the smallest allowed one.
         excess: Excess,
     },
 }
 
 impl Checker {
     pub(crate) fn new(cell: WorkCell, settings: Settings) -> Self {
-        Self(Arc::new(Terms { cell, settings }))
+        Self(Arc::new(CheckerInner { cell, settings }))
     }
 
-    /// The arms.
+    /// The arms that motions are checked for.
     #[must_use]
     pub fn cell(&self) -> &WorkCell {
         &self.0.cell
     }
 
-    /// What they may do.
+    /// The limits that motions have to keep.
     #[must_use]
     pub fn settings(&self) -> &Settings {
         &self.0.settings
     }
 
-    /// Passes a motion that keeps every limit from where the arms are: `at`, joint angles in radians, arm by arm.
+    /// Accepts a motion that starts at the joint angles `at` (radians, arm by arm) and keeps every limit.
     ///
     /// # Errors
-    /// Names the first limit that is broken.
+    /// Returns the first limit that the motion breaks.
     pub fn check(&self, motion: Motion, at: &[Joints]) -> Result<CheckedMotion, CheckError> {
         check(self.cell(), &motion, at, &self.settings().check)?;
         self.check_margins(&motion)?;
         Ok(CheckedMotion { motion, passed: self.clone() })
     }
 
-    /// Whether every sample stays away from the ends of the joints' ranges.
+    /// Checks that every sample keeps the margin to the ends of the joints' ranges.
     fn check_margins(&self, motion: &Motion) -> Result<(), CheckError> {
         let allowed = self.settings().range_margin_rad;
         for (arm, (samples, placed)) in motion.arms.iter().zip(&self.cell().arms).enumerate() {
@@ -105,18 +105,18 @@ impl CheckedMotion {
         self.motion
     }
 
-    /// Whether it was checked for the executor that `checker` belongs to.
+    /// Returns whether the motion was checked for the executor that `checker` belongs to.
     pub(crate) fn passed(&self, checker: &Checker) -> bool {
         Arc::ptr_eq(&self.passed.0, &checker.0)
     }
 
-    /// Whether it begins where the arms are now: `at`, radians, arm by arm.
+    /// Checks that the motion begins at the joint angles `at`, radians, arm by arm.
     pub(crate) fn begins_at(&self, at: &[Joints]) -> Result<(), Refusal> {
         let allowed = self.passed.settings().check.start_rad;
         for (arm, (samples, at)) in self.motion.arms.iter().zip(at).enumerate() {
             for (joint, (begins, at)) in samples[0].angles.iter().zip(at.iter()).enumerate() {
                 let got = (begins - at).abs();
-                // NaN is nowhere.
+                // NaN is no position.
                 if got.is_nan() || got > allowed {
                     let reason = Reason::Start(joint, Excess { got, allowed });
                     return Err(Refusal { when_s: 0.0, arm: ArmIndex(arm), reason });

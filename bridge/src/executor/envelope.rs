@@ -1,40 +1,40 @@
-//! What no command may do, whoever made it.
+//! The limits of every command, checked independently of its source.
 //!
-//! Every command is looked at before it leaves, with the arms where they really are. Numbers, speeds and accelerations are
-//! those of the command itself. Ranges and gaps are those of the **stopping way**: from the angles that were read, through what
-//! the arms were told already and what they would be told now, to where they stand still when they brake
-//! after that. As long as each command has a stopping way within the limits, there is a way to stop within the limits at
-//! every time: the one of the command before.
+//! The envelope checks each command before it is sent, at the measured position of the arms. Speeds and accelerations
+//! are those of the command itself. Ranges and gaps are checked along the **stopping path**: from the measured angles,
+//! through the commands that have not taken effect yet and the new command, to the position where the arms come to rest
+//! if they brake after it. If every command has a stopping path within the limits, the arms can stop within the limits
+//! at any time, along the path of the previous command.
 //!
-//! The way is a chain of postures with straight lines of the joints between them. On a line that turns the joints by d, no
-//! point of an arm moves farther than the sum of d times lever; a gap in the middle that is larger than the limit
-//! by half of that keeps the limit on the whole line. Otherwise both halves are looked at, down to a tenth of a millimetre.
+//! The path is a sequence of joint configurations connected by straight lines in joint space. On a line that turns the
+//! joints by `d`, no point of an arm moves farther than the sum of `d` times the joints' levers. If the gap in the
+//! middle exceeds the limit by half of that, the limit holds on the whole line. Otherwise both halves are checked, down
+//! to a tenth of a millimetre.
 //!
-//! For gaps between parts of one arm, the width of a gripper is the larger of its measured and its commanded opening. It
-//! is never wider on its way between the two.
-
-use std::collections::VecDeque;
+//! For gaps between parts of one arm, the width of a gripper is the larger of its measured and its commanded opening.
+//! The gripper is never wider between the two.
 
 use tandem_kinematics::model::Joint;
 use tandem_kinematics::{Excess, ForwardKinematics, Joints, PlacedArm, WorkCell};
 
 use crate::driver::{ArmCommand, PairState};
+use crate::executor::commands::VelocityHistory;
 use crate::executor::settings::Settings;
 use crate::executor::stop::{Breach, StopCause};
 
-/// Slack for rounding.
+/// Relative slack for rounding.
 const ROUNDING: f64 = 1e-9;
-/// The tool's speed is looked at with the angles of the newest state, which are some periods old; share of its limit.
+/// Relative slack of the tool's speed limit: the speed is computed from angles that are a few periods old.
 const TOOL_SPEED_SLACK: f64 = 0.02;
-/// What a joint's speed may differ from what it was told because of its lag and of noise, radians per second.
+/// The deviation of a joint's speed from its commands that lag and noise explain, radians per second.
 const EXPLAINED_RADPS: f64 = 2.5 * std::f64::consts::PI / 180.0;
-/// What may hide between two looks at the gaps, metres.
-const HIDES_M: f64 = 1e-4;
-/// Postures of the way on which the drives brake.
+/// Half the movement below which a line is not divided further, metres.
+const RESOLUTION_M: f64 = 1e-4;
+/// Number of configurations on the braking part of a stopping path.
 const N_BRAKING: u32 = 4;
 
-/// The velocities at which a joint may be told to move next, radians per second, when it was told `before`: it speeds
-/// up no harder than motions do, and slows down no harder than the drives brake.
+/// Returns the lowest and highest velocity that a joint may be commanded next, radians per second, if its last command
+/// was `before`. It accelerates no harder than motions do and decelerates no harder than the drives brake.
 pub(crate) fn reachable(
     joint: &Joint,
     before: f64,
@@ -44,7 +44,7 @@ pub(crate) fn reachable(
     let faster = joint.speed_radps / settings.check.limits.ramp_s * period_s;
     let slower = joint.speed_radps / settings.brake_s * period_s;
     let towards_zero = |speed: f64| {
-        // Braking comes first; what is left of the period is for speeding up the other way.
+        // Braking comes first; the rest of the period is available for accelerating in the other direction.
         if speed >= slower { slower } else { speed + faster * (1.0 - speed / slower) }
     };
     let [down, up] = if before >= 0.0 {
@@ -55,18 +55,15 @@ pub(crate) fn reachable(
     [before - down, before + up]
 }
 
-/// The envelope of one cell.
+/// The envelope of one work cell.
 #[derive(Debug, Clone)]
 pub(crate) struct Envelope {
     cell: WorkCell,
     settings: Settings,
     period_s: f64,
-    /// For each arm, a distance that no point of it has from a joint's axis, metres.
+    /// For each arm and joint, an upper bound of the distance of the arm's points from the joint's axis, metres.
     levers_m: Vec<Joints>,
 }
-
-/// What the arms were told, the newest first: one entry a period, each with velocities arm by arm.
-pub(crate) type History = VecDeque<Vec<Joints>>;
 
 impl Envelope {
     pub(crate) fn new(cell: &WorkCell, settings: &Settings, period_s: f64) -> Self {
@@ -79,30 +76,31 @@ impl Envelope {
         }
     }
 
-    /// Passes `commands` when they keep every limit. `state` is the newest one, `stale_s` how much later than usual it is.
+    /// Checks that `commands` keep every limit. `state` is the newest state, `stale_s` its age beyond one period,
+    /// seconds.
     pub(crate) fn check(
         &self,
         commands: &[ArmCommand],
-        history: &History,
+        history: &VelocityHistory,
         state: &PairState,
         stale_s: f64,
     ) -> Result<(), Breach> {
         for (arm, command) in commands.iter().enumerate() {
-            self.check_numbers(arm, command, history.front().map(|told| &told[arm]))?;
+            self.check_numbers(arm, command, history.front().map(|velocities| &velocities[arm]))?;
             self.check_tool(arm, command, &state.arms[arm].angles)?;
         }
-        let ways = self.stopping_ways(commands, history, state, stale_s);
-        for (arm, way) in ways.iter().enumerate() {
-            self.check_ranges(arm, way)?;
+        let paths = self.stopping_paths(commands, history, state, stale_s);
+        for (arm, path) in paths.iter().enumerate() {
+            self.check_ranges(arm, path)?;
         }
         let openings: Vec<f64> = commands
             .iter()
             .zip(&state.arms)
             .map(|(command, arm)| command.opening.max(arm.opening).clamp(0.0, 1.0))
             .collect();
-        let n_postures = ways[0].len();
-        for step in 1..n_postures {
-            let ends = [step - 1, step].map(|idx| ways.iter().map(|way| way[idx]).collect());
+        let n_steps = paths[0].len();
+        for step in 1..n_steps {
+            let ends = [step - 1, step].map(|idx| paths.iter().map(|path| path[idx]).collect());
             self.check_gaps(&ends, &openings)?;
         }
         Ok(())
@@ -148,50 +146,54 @@ impl Envelope {
         Ok(())
     }
 
-    /// For each arm the postures of its stopping way, as many for each.
-    fn stopping_ways(
+    /// The stopping path of each arm, joint angles in radians. All paths have the same length.
+    fn stopping_paths(
         &self,
         commands: &[ArmCommand],
-        history: &History,
+        history: &VelocityHistory,
         state: &PairState,
         stale_s: f64,
     ) -> Vec<Vec<Joints>> {
         #[expect(
             clippy::cast_possible_truncation,
             clippy::cast_sign_loss,
-            reason = "a reaction is some periods"
+            reason = "a reaction takes a few periods"
         )]
-        let n_told =
+        let n_pending =
             ((self.settings.reaction_s + stale_s.max(0.0)) / self.period_s - 1e-6).ceil() as usize;
-        let way = |(arm, command): (usize, &ArmCommand)| {
+        let path = |(arm, command): (usize, &ArmCommand)| {
             let (reading, model) = (&state.arms[arm], self.cell.arms[arm].model);
             let unexplained = unexplained(&reading.velocities, arm, history);
             let mut at = reading.angles;
-            let mut way = vec![at];
-            let told = history.iter().take(n_told.saturating_sub(1)).rev().map(|told| &told[arm]);
-            for velocities in told.chain([&command.velocities]) {
+            let mut path = vec![at];
+            let pending = history
+                .iter()
+                .take(n_pending.saturating_sub(1))
+                .rev()
+                .map(|velocities| &velocities[arm]);
+            for velocities in pending.chain([&command.velocities]) {
                 at = Joints::from_fn(at.len(), |joint| {
                     at[joint] + (velocities[joint] + unexplained[joint]) * self.period_s
                 });
-                way.push(at);
+                path.push(at);
             }
             for step in 1..=N_BRAKING {
                 let since_s = self.settings.brake_s * f64::from(step) / f64::from(N_BRAKING);
-                way.push(Joints::from_fn(at.len(), |joint| {
+                path.push(Joints::from_fn(at.len(), |joint| {
                     let speed = command.velocities[joint] + unexplained[joint];
                     let brake = model.joints[joint].speed_radps / self.settings.brake_s;
-                    at[joint] + braking_way(speed, brake, since_s)
+                    at[joint] + braking_angle(speed, brake, since_s)
                 }));
             }
-            way
+            path
         };
-        commands.iter().enumerate().map(way).collect()
+        commands.iter().enumerate().map(path).collect()
     }
 
-    fn check_ranges(&self, arm: usize, way: &[Joints]) -> Result<(), Breach> {
+    fn check_ranges(&self, arm: usize, path: &[Joints]) -> Result<(), Breach> {
         for (idx, joint) in self.cell.arms[arm].model.joints.iter().enumerate() {
             let [low, high] = joint.range_rad;
-            for angles in way {
+            for angles in path {
                 let got = angles[idx];
                 if !(low..=high).contains(&got) {
                     let allowed = if got > high { high } else { low };
@@ -202,7 +204,7 @@ impl Envelope {
         Ok(())
     }
 
-    /// The gaps on the straight line of the joints between two postures of all arms.
+    /// Checks the gaps on the straight line in joint space between two configurations of all arms.
     fn check_gaps(&self, [from, to]: &[Vec<Joints>; 2], openings: &[f64]) -> Result<(), Breach> {
         let moved_m = |arm: usize| -> f64 {
             let levers = self.levers_m[arm].iter().zip(from[arm].iter().zip(to[arm].iter()));
@@ -218,7 +220,7 @@ impl Envelope {
         let mut settled = true;
         for (arm, half_m) in half_m.iter().enumerate() {
             let mut keeps = |got: f64, allowed: f64| {
-                settled &= got - half_m >= allowed || *half_m <= HIDES_M;
+                settled &= got - half_m >= allowed || *half_m <= RESOLUTION_M;
                 if got < allowed { Err(Excess { got, allowed }) } else { Ok(()) }
             };
             keeps(gaps.table_m[arm], self.settings.table_gap_m)
@@ -228,7 +230,7 @@ impl Envelope {
         }
         let (got, allowed) = (gaps.arms_m, self.settings.arms_gap_m);
         let both_m: f64 = half_m.iter().sum();
-        settled &= got - both_m >= allowed || both_m <= HIDES_M;
+        settled &= got - both_m >= allowed || both_m <= RESOLUTION_M;
         if got < allowed {
             return Err(StopCause::ArmsGap(Excess { got, allowed }).anywhere());
         }
@@ -240,18 +242,18 @@ impl Envelope {
     }
 }
 
-/// What a joint does that none of its last commands explains, radians per second.
-fn unexplained(measured: &Joints, arm: usize, history: &History) -> Joints {
+/// The part of the measured joint velocities that no recent command explains, radians per second.
+fn unexplained(measured: &Joints, arm: usize, history: &VelocityHistory) -> Joints {
     Joints::from_fn(measured.len(), |joint| {
-        let told = || history.iter().map(|told| told[arm][joint]);
-        let low = told().fold(0.0, f64::min) - EXPLAINED_RADPS;
-        let high = told().fold(0.0, f64::max) + EXPLAINED_RADPS;
+        let sent = || history.iter().map(|sent| sent[arm][joint]);
+        let low = sent().fold(0.0, f64::min) - EXPLAINED_RADPS;
+        let high = sent().fold(0.0, f64::max) + EXPLAINED_RADPS;
         measured[joint] - measured[joint].clamp(low, high)
     })
 }
 
-/// How far a joint turns in `since_s` when it brakes from `speed`, radians.
-fn braking_way(speed: f64, brake: f64, since_s: f64) -> f64 {
+/// The angle by which a joint turns within `since_s` if it brakes from `speed`, radians.
+fn braking_angle(speed: f64, brake: f64, since_s: f64) -> f64 {
     let since_s = since_s.min(speed.abs() / brake);
     (speed.abs() - 0.5 * brake * since_s) * since_s * speed.signum()
 }
@@ -260,13 +262,13 @@ fn braking_way(speed: f64, brake: f64, since_s: f64) -> f64 {
 mod tests {
     use super::*;
     use crate::driver::{ArmReading, Faults};
-    use crate::layout::mico_cell;
+    use crate::work_cell::mico_cell;
     use tandem_kinematics::MICO_4;
 
     const PERIOD_S: f64 = 0.01;
     const DEGREE: f64 = std::f64::consts::PI / 180.0;
 
-    /// Both arms where `at` is, at rest.
+    /// Both arms at rest at `at`.
     fn state(at: &[Joints]) -> PairState {
         let zero = Joints::new(&[0.0; 4]);
         let reading = |angles: &Joints| ArmReading {
@@ -280,17 +282,17 @@ mod tests {
         PairState { sequence: 1, stamp_s: 0.0, newest_command: None, arms }
     }
 
-    /// What the envelope says of velocities in degrees per second that the arms were told for a while already.
+    /// Checks velocities in degrees per second that were also the last commands.
     fn check(at: &[Joints], degrees: [[f64; 4]; 2]) -> Result<(), Breach> {
         let velocities = degrees.map(|arm| Joints::new(&arm.map(|rate| rate * DEGREE)));
-        let history: History = (0..8).map(|_| velocities.to_vec()).collect();
+        let history: VelocityHistory = (0..8).map(|_| velocities.to_vec()).collect();
         check_after(at, velocities, &history)
     }
 
     fn check_after(
         at: &[Joints],
         velocities: [Joints; 2],
-        history: &History,
+        history: &VelocityHistory,
     ) -> Result<(), Breach> {
         let envelope = Envelope::new(&mico_cell(), &Settings::default(), PERIOD_S);
         let commands = velocities.map(|velocities| ArmCommand { velocities, opening: 0.5 });
@@ -304,7 +306,7 @@ mod tests {
     const REST: [f64; 4] = [0.0; 4];
 
     #[test]
-    fn what_keeps_all_limits_passes() {
+    fn commands_within_all_limits_pass() {
         assert_eq!(check(&ready(), [REST, REST]), Ok(()));
         assert_eq!(check(&ready(), [[10.0, 5.0, -5.0, 40.0], REST]), Ok(()));
     }
@@ -364,7 +366,7 @@ mod tests {
         let envelope = Envelope::new(&cell, &Settings::default(), PERIOD_S);
         let check = |rate: f64| {
             let lean = Joints::new(&[0.0, rate * DEGREE, 0.0, 0.0]);
-            let history: History = (0..8).map(|_| vec![lean; 2]).collect();
+            let history: VelocityHistory = (0..8).map(|_| vec![lean; 2]).collect();
             let commands = [ArmCommand { velocities: lean, opening: 0.0 }; 2];
             envelope.check(&commands, &history, &state(&at), 0.0)
         };
@@ -403,20 +405,20 @@ mod tests {
         let breach = check(&at, [towards, REST]).unwrap_err();
         assert!(matches!(breach.cause, StopCause::SelfGap(_)), "{breach:?}");
         assert_eq!(breach.arm.map(|arm| arm.0), Some(0));
-        // With room for four periods and the braking it may go on.
+        // With room for four periods and the braking it may continue.
         let (at, towards) = near_own_base(0.008);
         assert_eq!(check(&at, [towards, REST]), Ok(()));
     }
 
     #[test]
-    fn a_gripper_is_as_wide_as_it_is_and_not_as_it_was_told() {
+    fn self_gaps_use_the_measured_width_of_a_gripper_that_is_wider_than_commanded() {
         let (at, _) = near_own_base(0.003);
         let envelope = Envelope::new(&mico_cell(), &Settings::default(), PERIOD_S);
         let command = ArmCommand { velocities: Joints::new(&REST), opening: 0.5 };
         let check = |opening: f64| {
             let mut state = state(&at);
             state.arms[0].opening = opening;
-            envelope.check(&[command; 2], &History::new(), &state, 0.0)
+            envelope.check(&[command; 2], &VelocityHistory::new(), &state, 0.0)
         };
         assert_eq!(check(0.4), Ok(()));
         let breach = check(0.9).unwrap_err();
@@ -427,7 +429,7 @@ mod tests {
     fn commands_are_numbers_within_speed_and_acceleration() {
         let at = ready();
         let zero = Joints::new(&REST);
-        let still: History = (0..8).map(|_| vec![zero; 2]).collect();
+        let still: VelocityHistory = (0..8).map(|_| vec![zero; 2]).collect();
         let from_rest = |rate: f64| {
             let velocities = Joints::new(&[0.0, 0.0, 0.0, rate * DEGREE]);
             check_after(&at, [velocities, zero], &still).map_err(|breach| breach.cause)
@@ -464,7 +466,7 @@ mod tests {
 
     #[test]
     fn drifts_lengthen_the_stopping_way() {
-        let history: History = (0..8).map(|_| vec![Joints::new(&REST); 2]).collect();
+        let history: VelocityHistory = (0..8).map(|_| vec![Joints::new(&REST); 2]).collect();
         let measured = Joints::new(&[2.0 * DEGREE, -10.0 * DEGREE, 0.0, 3.0 * DEGREE]);
         let drift = unexplained(&measured, 0, &history);
         for (got, expected) in drift.iter().zip([0.0, -7.5, 0.0, 0.5]) {

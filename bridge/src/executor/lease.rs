@@ -1,33 +1,33 @@
-//! One owner at a time.
+//! The lease of the arms: one owner at a time.
 
-/// What an owner is known by. Whoever makes tokens has to make them hard to guess.
+/// Identifies an owner. Tokens must be hard to guess.
 #[derive(Clone, Copy, PartialEq, Eq)]
 pub struct Token(pub u128);
 
 impl std::fmt::Debug for Token {
-    /// A token is a secret.
+    /// Hides the token, which is a secret.
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         f.write_str("Token(..)")
     }
 }
 
-/// Why somebody may not do what only the owner may.
+/// A client asked for something that only the owner may do.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
 pub enum LeaseError {
-    /// Somebody else owns the arms.
+    /// Another client owns the arms.
     #[error(
         "the arms are owned by another client for another {expires_in_s:.1} s unless it renews its lease"
     )]
     Held {
-        /// When the lease ends if its owner stays silent, seconds from now.
+        /// The time until the lease ends unless its owner renews it, seconds.
         expires_in_s: f64,
     },
-    /// Nobody owns the arms: the lease has ended, or there was none.
+    /// The arms have no owner: the lease has ended, or there was none.
     #[error("the arms have no owner: acquire them first")]
-    Nobody,
+    NotOwned,
 }
 
-/// Who owns the arms, and since when they have been silent.
+/// The owner of the arms and the time of its last sign of life.
 #[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct Lease {
     held: Option<Held>,
@@ -36,11 +36,11 @@ pub(crate) struct Lease {
 #[derive(Debug, Clone, Copy)]
 struct Held {
     token: Token,
-    heard_s: f64,
+    renewed_s: f64,
 }
 
 impl Lease {
-    /// Makes whoever has `token` the owner, or renews their lease.
+    /// Makes the client with `token` the owner, or renews its lease.
     pub(crate) fn acquire(
         &mut self,
         token: Token,
@@ -48,17 +48,17 @@ impl Lease {
         lease_s: f64,
     ) -> Result<(), LeaseError> {
         match self.held {
-            Some(held) if held.token != token && now_s - held.heard_s < lease_s => {
-                Err(LeaseError::Held { expires_in_s: held.heard_s + lease_s - now_s })
+            Some(held) if held.token != token && now_s - held.renewed_s < lease_s => {
+                Err(LeaseError::Held { expires_in_s: held.renewed_s + lease_s - now_s })
             }
             _ => {
-                self.held = Some(Held { token, heard_s: now_s });
+                self.held = Some(Held { token, renewed_s: now_s });
                 Ok(())
             }
         }
     }
 
-    /// Notes that the owner was heard.
+    /// Renews the owner's lease.
     pub(crate) fn renew(
         &mut self,
         token: Token,
@@ -66,9 +66,9 @@ impl Lease {
         lease_s: f64,
     ) -> Result<(), LeaseError> {
         match self.held {
-            Some(held) if now_s - held.heard_s >= lease_s => Err(LeaseError::Nobody),
+            Some(held) if now_s - held.renewed_s >= lease_s => Err(LeaseError::NotOwned),
             Some(_) => self.acquire(token, now_s, lease_s),
-            None => Err(LeaseError::Nobody),
+            None => Err(LeaseError::NotOwned),
         }
     }
 
@@ -76,9 +76,9 @@ impl Lease {
         self.held = None;
     }
 
-    /// How long the owner has been silent, seconds; infinite when there is none.
+    /// The time since the owner's last sign of life, seconds; infinite if there is no owner.
     pub(crate) fn silent_s(&self, now_s: f64) -> f64 {
-        self.held.map_or(f64::INFINITY, |held| now_s - held.heard_s)
+        self.held.map_or(f64::INFINITY, |held| now_s - held.renewed_s)
     }
 }
 
@@ -93,7 +93,7 @@ mod tests {
     #[test]
     fn the_arms_have_one_owner_at_a_time() {
         let mut lease = Lease::default();
-        assert_eq!(lease.renew(ANN, 0.0, LEASE_S), Err(LeaseError::Nobody));
+        assert_eq!(lease.renew(ANN, 0.0, LEASE_S), Err(LeaseError::NotOwned));
         assert_eq!(lease.acquire(ANN, 0.0, LEASE_S), Ok(()));
         let held = Err(LeaseError::Held { expires_in_s: 3.0 });
         assert_eq!(lease.acquire(BOB, 2.0, LEASE_S), held);
@@ -104,10 +104,10 @@ mod tests {
     }
 
     #[test]
-    fn a_lease_that_has_ended_is_anybodys() {
+    fn any_client_can_acquire_a_lease_that_has_ended() {
         let mut lease = Lease::default();
         lease.acquire(ANN, 0.0, LEASE_S).unwrap();
-        assert_eq!(lease.renew(ANN, 5.0, LEASE_S), Err(LeaseError::Nobody));
+        assert_eq!(lease.renew(ANN, 5.0, LEASE_S), Err(LeaseError::NotOwned));
         assert_eq!(lease.acquire(BOB, 5.0, LEASE_S), Ok(()));
         assert!(lease.renew(ANN, 5.1, LEASE_S).is_err());
         lease.release();

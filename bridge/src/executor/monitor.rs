@@ -1,4 +1,4 @@
-//! What states of the arms have to be like to be believed.
+//! The validation of the states that the arms report.
 
 use tandem_kinematics::joints::MAX_JOINTS;
 use tandem_kinematics::{ArmModel, Excess, Joints, WorkCell};
@@ -7,34 +7,34 @@ use crate::driver::{ArmReading, PairState};
 use crate::executor::settings::Settings;
 use crate::executor::stop::{Breach, StopCause};
 
-/// As many equal angles in a row, bit for bit, are not a moving joint's.
-const MOST_EQUAL: u32 = 4;
-/// How far the arms' clock may run behind ours, seconds per second.
+/// A moving joint does not report this many bit-identical angles in a row.
+const MAX_EQUAL_ANGLES: u32 = 4;
+/// The largest drift of the arms' clock behind the local one, seconds per second.
 const CLOCK_DRIFT: f64 = 1e-3;
 
-/// What was seen of the arms, and how good it was.
+/// Validates states and keeps the newest valid one.
 #[derive(Debug, Clone)]
 pub(crate) struct Monitor {
     models: Vec<&'static ArmModel>,
     settings: Settings,
     period_s: f64,
-    newest: Option<Seen>,
-    /// Smallest time that states took to come, by clocks that do not agree: seconds.
+    newest: Option<ReceivedState>,
+    /// The smallest delay of a state, seconds. It contains the offset between the two clocks.
     usual_delay_s: f64,
-    /// For each arm and joint how often the angle was the same in a row.
-    equal: Vec<[u32; MAX_JOINTS]>,
+    /// The number of consecutive equal angles of each arm and joint.
+    n_equal: Vec<[u32; MAX_JOINTS]>,
     n_good: u32,
 }
 
 #[derive(Debug, Clone)]
-struct Seen {
+struct ReceivedState {
     state: PairState,
     at_s: f64,
 }
 
-/// What the arms were told, as far as a state can be judged by it.
-pub(crate) struct Told<'a> {
-    /// Number of the newest command.
+/// The commands that a state should reflect.
+pub(crate) struct ExpectedState<'a> {
+    /// The number of the newest command.
     pub(crate) number: u64,
     /// Velocities that the state should show, arm by arm, radians per second.
     pub(crate) velocities: &'a [Joints],
@@ -48,32 +48,32 @@ impl Monitor {
             period_s,
             newest: None,
             usual_delay_s: f64::INFINITY,
-            equal: vec![[0; MAX_JOINTS]; cell.arms.len()],
+            n_equal: vec![[0; MAX_JOINTS]; cell.arms.len()],
             n_good: 0,
         }
     }
 
-    /// The newest state that was believed.
+    /// The newest valid state.
     pub(crate) fn state(&self) -> Option<&PairState> {
         self.newest.as_ref().map(|seen| &seen.state)
     }
 
-    /// How many states in a row were good and came in time.
+    /// The number of consecutive valid states that arrived in time.
     pub(crate) fn n_good(&self) -> u32 {
         self.n_good
     }
 
-    /// Notes that no state has come because the driver failed: good ones have to come anew.
-    pub(crate) fn miss(&mut self) {
+    /// Counts good states from 0 again, because an exchange failed.
+    pub(crate) fn exchange_failed(&mut self) {
         self.n_good = 0;
     }
 
-    /// By how much more than a period the newest state is past, seconds; infinite when there is none.
+    /// The age of the newest state beyond one period, seconds; infinite if there is none.
     pub(crate) fn stale_s(&self, now_s: f64) -> f64 {
         self.newest.as_ref().map_or(f64::INFINITY, |seen| now_s - seen.at_s - self.period_s)
     }
 
-    /// Whether every joint was last seen at rest.
+    /// Returns whether every joint was at rest in the newest state.
     pub(crate) fn at_rest(&self) -> bool {
         let rests = |arm: &ArmReading| {
             arm.velocities.iter().all(|rate| rate.abs() <= self.settings.rest_radps)
@@ -81,49 +81,54 @@ impl Monitor {
         self.state().is_some_and(|state| state.arms.iter().all(rests))
     }
 
-    /// Takes a state that has come at `now_s`.
-    pub(crate) fn take(
+    /// Accepts a state received at `now_s` if it is valid.
+    pub(crate) fn accept(
         &mut self,
         now_s: f64,
         state: PairState,
-        told: &Told<'_>,
+        expected: &ExpectedState<'_>,
     ) -> Result<(), Breach> {
         let known = self.newest.as_ref().map(|seen| seen.state.sequence);
         if known == Some(state.sequence) {
-            // Arms may tell less often than once a period.
+            // Arms may report less often than once per period.
             if self.stale_s(now_s) > self.settings.state_hold_s {
                 self.n_good = 0;
             }
             return Ok(());
         }
-        let judged = self.judge(now_s, &state, told);
-        if judged.is_ok() {
+        let validated = self.validate(now_s, &state, expected);
+        if validated.is_ok() {
             self.n_good += 1;
-            self.newest = Some(Seen { state, at_s: now_s });
+            self.newest = Some(ReceivedState { state, at_s: now_s });
         } else {
-            // What comes next is a new beginning: the reason for this stop stands already.
+            // The next state starts a new sequence: the cause of this stop is already recorded.
             let settings = self.settings;
             let models = std::mem::take(&mut self.models);
-            let equal = vec![[0; MAX_JOINTS]; models.len()];
+            let n_equal = vec![[0; MAX_JOINTS]; models.len()];
             let (newest, usual_delay_s) = (None, f64::INFINITY);
-            *self = Self { models, settings, newest, usual_delay_s, equal, n_good: 0, ..*self };
+            *self = Self { models, settings, newest, usual_delay_s, n_equal, n_good: 0, ..*self };
         }
-        judged
+        validated
     }
 
-    fn judge(&mut self, now_s: f64, state: &PairState, told: &Told<'_>) -> Result<(), Breach> {
-        self.judge_shape(state)?;
-        let late_s = self.judge_order(now_s, state)?;
+    fn validate(
+        &mut self,
+        now_s: f64,
+        state: &PairState,
+        expected: &ExpectedState<'_>,
+    ) -> Result<(), Breach> {
+        self.check_shape(state)?;
+        let late_s = self.check_order(now_s, state)?;
         for (arm, reading) in state.arms.iter().enumerate() {
-            judge_faults(arm, reading)?;
-            self.judge_torques(arm, reading)?;
-            self.judge_motion(arm, state.stamp_s, reading)?;
-            self.judge_frozen(arm, reading, &told.velocities[arm])?;
+            check_faults(arm, reading)?;
+            self.check_torques(arm, reading)?;
+            self.check_motion(arm, state.stamp_s, reading)?;
+            self.check_frozen(arm, reading, &expected.velocities[arm])?;
         }
-        self.judge_answer(state, told.number, late_s)
+        self.check_effect(state, expected.number, late_s)
     }
 
-    fn judge_shape(&self, state: &PairState) -> Result<(), Breach> {
+    fn check_shape(&self, state: &PairState) -> Result<(), Breach> {
         let (got, expected) = (state.arms.len(), self.models.len());
         if got != expected {
             return Err(StopCause::Shape { got, expected }.anywhere());
@@ -149,8 +154,8 @@ impl Monitor {
         Ok(())
     }
 
-    /// Numbers and times go on as they should. How much later than usual the state is, seconds.
-    fn judge_order(&mut self, now_s: f64, state: &PairState) -> Result<f64, Breach> {
+    /// Checks sequence number and time stamp. Returns the delay of the state beyond the usual one, seconds.
+    fn check_order(&mut self, now_s: f64, state: &PairState) -> Result<f64, Breach> {
         let delay_s = now_s - state.stamp_s;
         if let Some(seen) = &self.newest {
             let expected = seen.state.sequence.wrapping_add(1);
@@ -159,19 +164,19 @@ impl Monitor {
                 return Err(StopCause::SequenceJump { got, expected }.anywhere());
             }
             if state.stamp_s <= seen.state.stamp_s {
-                return Err(StopCause::TimeStands { stamp_s: state.stamp_s }.anywhere());
+                return Err(StopCause::StampNotAdvancing { stamp_s: state.stamp_s }.anywhere());
             }
             self.usual_delay_s += CLOCK_DRIFT * (now_s - seen.at_s);
         }
         self.usual_delay_s = self.usual_delay_s.min(delay_s);
         let (got, allowed) = (delay_s - self.usual_delay_s, self.settings.state_stop_s);
         if got > allowed {
-            return Err(StopCause::StateOld(Excess { got, allowed }).anywhere());
+            return Err(StopCause::StateDelayed(Excess { got, allowed }).anywhere());
         }
         Ok(got)
     }
 
-    fn judge_torques(&self, arm: usize, reading: &ArmReading) -> Result<(), Breach> {
+    fn check_torques(&self, arm: usize, reading: &ArmReading) -> Result<(), Breach> {
         let allowed = self.settings.torque_nm;
         let torques = reading.torques_nm.iter().flat_map(|torques| torques.iter());
         for (joint, torque) in torques.enumerate() {
@@ -183,8 +188,8 @@ impl Monitor {
         Ok(())
     }
 
-    /// Joints are not faster than they can be, by their rates and by their angles.
-    fn judge_motion(&self, arm: usize, stamp_s: f64, reading: &ArmReading) -> Result<(), Breach> {
+    /// Checks that no joint is faster than it can be, by its rate and by the change of its angle.
+    fn check_motion(&self, arm: usize, stamp_s: f64, reading: &ArmReading) -> Result<(), Breach> {
         for (joint, limits) in self.models[arm].joints.iter().enumerate() {
             let allowed = self.settings.overspeed_share * limits.speed_radps;
             let got = reading.velocities[joint].abs();
@@ -204,30 +209,34 @@ impl Monitor {
         Ok(())
     }
 
-    fn judge_frozen(
+    fn check_frozen(
         &mut self,
         arm: usize,
         reading: &ArmReading,
-        told: &Joints,
+        commanded: &Joints,
     ) -> Result<(), Breach> {
         let before = self.newest.as_ref().map(|seen| seen.state.arms[arm].angles);
-        for (joint, told_radps) in told.iter().enumerate() {
+        for (joint, commanded_radps) in commanded.iter().enumerate() {
             let angle = reading.angles[joint];
             let same = before.is_some_and(|before| before[joint].to_bits() == angle.to_bits());
-            let count = &mut self.equal[arm][joint];
-            *count =
-                if same && told_radps.abs() > self.settings.frozen_radps { *count + 1 } else { 0 };
-            if *count >= MOST_EQUAL {
+            let count = &mut self.n_equal[arm][joint];
+            *count = if same && commanded_radps.abs() > self.settings.frozen_radps {
+                *count + 1
+            } else {
+                0
+            };
+            if *count >= MAX_EQUAL_ANGLES {
                 return Err(StopCause::Frozen(angle).of_joint(arm, joint));
             }
         }
         Ok(())
     }
 
-    /// Commands take effect in time, where the arms tell. A late state cannot know the newest ones.
-    fn judge_answer(&self, state: &PairState, number: u64, late_s: f64) -> Result<(), Breach> {
+    /// Checks that commands take effect in time, if the arms report that. A delayed state cannot reflect the newest
+    /// commands.
+    fn check_effect(&self, state: &PairState, number: u64, late_s: f64) -> Result<(), Breach> {
         let Some(newest) = state.newest_command else { return Ok(()) };
-        // A larger number is of somebody else's command.
+        // A larger number belongs to the command of another client.
         let newest = if newest > number { 0 } else { newest };
         let unknown = (late_s / self.period_s).round();
         let got = (number - newest) as f64 - unknown;
@@ -239,7 +248,7 @@ impl Monitor {
     }
 }
 
-fn judge_faults(arm: usize, reading: &ArmReading) -> Result<(), Breach> {
+fn check_faults(arm: usize, reading: &ArmReading) -> Result<(), Breach> {
     let faults = reading.faults;
     if faults.emergency_stop {
         Err(StopCause::EmergencyStop.of(arm))

@@ -1,4 +1,4 @@
-//! A motion being played: where it has the arms at any time, and which velocities bring them there.
+//! The playback of a motion: the reference positions over time and the velocities that follow them.
 
 use std::collections::VecDeque;
 
@@ -9,39 +9,39 @@ use crate::executor::envelope::reachable;
 use crate::executor::settings::Settings;
 use crate::executor::stop::{Breach, StopCause};
 
-/// A motion and how far it has come.
+/// A motion and its progress.
 #[derive(Debug, Clone)]
 pub(crate) struct Playback {
     motion: Motion,
-    /// Share of the motion's own speed at which it shall be played.
+    /// The requested share of the motion's own speed.
     speed: f64,
-    /// Share of the motion's own speed at which it is played now.
+    /// The present share of the motion's own speed.
     rate: f64,
-    /// How much of the motion has been played, seconds of its own time.
+    /// The part of the motion that has been played, seconds of its own time.
     played_s: f64,
-    /// How long the motion has been over, seconds.
-    over_s: f64,
-    /// Where the motion had the arms, the newest first: one entry a period.
-    past: VecDeque<Vec<Joints>>,
+    /// The time since the end of the motion, seconds.
+    since_end_s: f64,
+    /// The references of the last periods, the newest first.
+    references: VecDeque<Vec<Joints>>,
 }
 
-/// What surrounds one tick.
-pub(crate) struct Moment<'a> {
+/// The inputs of one tick.
+pub(crate) struct TickContext<'a> {
     pub(crate) cell: &'a WorkCell,
     pub(crate) settings: &'a Settings,
     pub(crate) period_s: f64,
-    /// The newest state; `None` when it is too old to be steered by.
+    /// The newest state; `None` if it is too old for feedback.
     pub(crate) state: Option<&'a PairState>,
-    /// The command before.
-    pub(crate) before: &'a [ArmCommand],
+    /// The last command, arm by arm.
+    pub(crate) last: &'a [ArmCommand],
 }
 
 impl Playback {
     /// Plays `motion` from its beginning at `speed`, in (0, 1].
     pub(crate) fn new(motion: Motion, speed: f64) -> Self {
         let at: Vec<Joints> = motion.at(0.0).into_iter().map(|sample| sample.angles).collect();
-        let past = VecDeque::from([at]);
-        Self { motion, speed, rate: speed, played_s: 0.0, over_s: 0.0, past }
+        let references = VecDeque::from([at]);
+        Self { motion, speed, rate: speed, played_s: 0.0, since_end_s: 0.0, references }
     }
 
     pub(crate) fn played_s(&self) -> f64 {
@@ -52,45 +52,44 @@ impl Playback {
         self.motion.duration_s()
     }
 
-    /// How long the motion has been over, seconds; 0 while it is being played.
-    pub(crate) fn over_s(&self) -> f64 {
-        self.over_s
+    /// The time since the end of the motion, seconds; 0 before the end.
+    pub(crate) fn since_end_s(&self) -> f64 {
+        self.since_end_s
     }
 
-    /// Where the motion has the arms now, radians.
+    /// The joint angles that the motion prescribes now, radians.
     pub(crate) fn reference(&self) -> &[Joints] {
-        &self.past[0]
+        &self.references[0]
     }
 
-    /// The next command, before the envelope has looked at it. The motion goes on by a period, or comes to rest on its way
-    /// when `paused`.
+    /// Advances the motion by a period, or brings it to rest on its path if `paused`, and returns the next command. The
+    /// envelope still has to check it.
     pub(crate) fn next(
         &mut self,
-        moment: &Moment<'_>,
+        context: &TickContext<'_>,
         paused: bool,
     ) -> Result<Vec<ArmCommand>, Breach> {
-        let errors = match moment.state {
-            Some(state) => Some(self.errors(moment, state)?),
+        let errors = match context.state {
+            Some(state) => Some(self.errors(context, state)?),
             None => None,
         };
-        let opening_step = moment.settings.check.limits.gripper_opening_per_s * moment.period_s;
-        let from = self.past[0].clone();
-        self.go_on(moment, paused);
+        let opening_step = context.settings.check.limits.gripper_opening_per_s * context.period_s;
+        let from = self.references[0].clone();
+        self.advance(context, paused);
         let to = self.motion.at(self.played_s);
         let command = |arm: usize| {
             let ahead = Joints::from_fn(from[arm].len(), |joint| {
                 let error = errors.as_ref().map_or(0.0, |errors| errors[arm][joint]);
-                let ahead = (to[arm].angles[joint] - from[arm][joint]) / moment.period_s;
-                ahead + moment.settings.gain_per_s * error
+                let ahead = (to[arm].angles[joint] - from[arm][joint]) / context.period_s;
+                ahead + context.settings.gain_per_s * error
             });
-            let before = moment.before[arm].opening;
-            let opening =
-                to[arm].gripper_opening.clamp(before - opening_step, before + opening_step);
-            ArmCommand { velocities: within_limits(moment, arm, &ahead), opening }
+            let last = context.last[arm].opening;
+            let opening = to[arm].gripper_opening.clamp(last - opening_step, last + opening_step);
+            ArmCommand { velocities: within_limits(context, arm, &ahead), opening }
         };
         let commands = (0..from.len()).map(command).collect();
-        self.past.push_front(to.into_iter().map(|sample| sample.angles).collect());
-        self.past.truncate(self.n_past(moment));
+        self.references.push_front(to.into_iter().map(|sample| sample.angles).collect());
+        self.references.truncate(self.n_references(context));
         Ok(commands)
     }
 
@@ -101,28 +100,28 @@ impl Playback {
         distances.map(|(end, arm)| end.angles.largest_difference(&arm.angles)).fold(0.0, f64::max)
     }
 
-    fn go_on(&mut self, moment: &Moment<'_>, paused: bool) {
+    fn advance(&mut self, context: &TickContext<'_>, paused: bool) {
         let (wanted, seconds) = if paused {
-            (0.0, moment.settings.pause_s)
+            (0.0, context.settings.pause_s)
         } else {
-            (self.speed, moment.settings.resume_s)
+            (self.speed, context.settings.resume_s)
         };
-        let step = moment.period_s / seconds;
+        let step = context.period_s / seconds;
         let rate = wanted.clamp(self.rate - step, self.rate + step);
-        self.played_s += 0.5 * (self.rate + rate) * moment.period_s;
+        self.played_s += 0.5 * (self.rate + rate) * context.period_s;
         self.rate = rate;
         if self.played_s >= self.duration_s() {
             self.played_s = self.duration_s();
-            self.over_s += moment.period_s;
+            self.since_end_s += context.period_s;
         }
     }
 
-    /// How far each joint is from where the motion had it when what is seen now was told, radians.
-    fn errors(&self, moment: &Moment<'_>, state: &PairState) -> Result<Vec<Joints>, Breach> {
-        let allowed = moment.settings.tracking_rad;
+    /// The tracking errors, radians: the references one lag ago minus the measured angles.
+    fn errors(&self, context: &TickContext<'_>, state: &PairState) -> Result<Vec<Joints>, Breach> {
+        let allowed = context.settings.tracking_rad;
         let mut errors = Vec::with_capacity(state.arms.len());
         for (arm, reading) in state.arms.iter().enumerate() {
-            let then = self.reference_ago(moment, arm);
+            let then = self.reference_ago(context, arm);
             let error = Joints::from_fn(then.len(), |joint| then[joint] - reading.angles[joint]);
             for (joint, error) in error.iter().enumerate() {
                 let got = error.abs();
@@ -135,45 +134,45 @@ impl Playback {
         Ok(errors)
     }
 
-    /// Where the motion had `arm` one lag ago.
-    fn reference_ago(&self, moment: &Moment<'_>, arm: usize) -> Joints {
-        let periods = moment.settings.lag_s / moment.period_s;
-        let newer = self.n_past(moment) - 2;
+    /// The reference of `arm` one lag ago, radians.
+    fn reference_ago(&self, context: &TickContext<'_>, arm: usize) -> Joints {
+        let periods = context.settings.lag_s / context.period_s;
+        let newer = self.n_references(context) - 2;
         let share = periods - newer as f64;
-        let past = |ago: usize| &self.past[ago.min(self.past.len() - 1)][arm];
-        let (newer, older) = (past(newer), past(newer + 1));
+        let reference = |ago: usize| &self.references[ago.min(self.references.len() - 1)][arm];
+        let (newer, older) = (reference(newer), reference(newer + 1));
         Joints::from_fn(newer.len(), |joint| newer[joint] + share * (older[joint] - newer[joint]))
     }
 
-    /// How many references are kept: as far back as one lag.
-    fn n_past(&self, moment: &Moment<'_>) -> usize {
+    /// The number of references to keep, which covers one lag.
+    fn n_references(&self, context: &TickContext<'_>) -> usize {
         #[expect(
             clippy::cast_possible_truncation,
             clippy::cast_sign_loss,
-            reason = "a lag is some periods"
+            reason = "a lag is a few periods"
         )]
-        let periods = (moment.settings.lag_s / moment.period_s) as usize;
+        let periods = (context.settings.lag_s / context.period_s) as usize;
         periods + 2
     }
 }
 
-/// The velocities nearest to `wanted` that keep the joints' and the tool's limits and can stop within the joints' ranges.
-fn within_limits(moment: &Moment<'_>, arm: usize, wanted: &Joints) -> Joints {
-    let placed = &moment.cell.arms[arm];
-    let (limits, before) = (&moment.settings.check.limits, &moment.before[arm].velocities);
+/// Returns the velocities nearest to `wanted` that keep the speed and acceleration limits of joints and tool.
+fn within_limits(context: &TickContext<'_>, arm: usize, wanted: &Joints) -> Joints {
+    let placed = &context.cell.arms[arm];
+    let (limits, last) = (&context.settings.check.limits, &context.last[arm].velocities);
     let ranges: Vec<[f64; 2]> = placed
         .model
         .joints
         .iter()
-        .zip(before.iter())
-        .map(|(joint, before)| reachable(joint, *before, moment.settings, moment.period_s))
+        .zip(last.iter())
+        .map(|(joint, last)| reachable(joint, *last, context.settings, context.period_s))
         .collect();
     let mut velocities = Joints::from_fn(wanted.len(), |joint| {
         let fastest = placed.model.joints[joint].speed_radps;
         let [low, high] = ranges[joint];
         wanted[joint].clamp(-fastest, fastest).clamp(low, high)
     });
-    let Some(state) = moment.state else { return velocities };
+    let Some(state) = context.state else { return velocities };
     let posture = tandem_kinematics::ForwardKinematics::new(placed.model, &state.arms[arm].angles);
     let tool_mps = posture.tool_velocity(&velocities).norm();
     if tool_mps > limits.tool_speed_mps {

@@ -1,69 +1,70 @@
-//! What the executor allows.
+//! The settings of the executor.
 
 use tandem_kinematics::{CheckSettings, WorkCell};
 
-use crate::layout::check_settings;
+use crate::work_cell::check_settings;
 
-/// What the executor allows, and what it takes for granted about the drives.
+/// The limits of the executor and its assumptions about the drives.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Settings {
-    /// What a motion has to keep to be started; also the largest speeds and accelerations while it is played.
+    /// The limits that a motion has to keep to be started, and the largest speeds and accelerations during playback.
     pub check: CheckSettings,
-    /// Smallest gap between the table and any part of an arm but its base, until it could stand still; metres.
+    /// Smallest gap between the table and any part of an arm except its base on the stopping path, metres.
     pub table_gap_m: f64,
-    /// Smallest gap between the parts of two arms, until both could stand still; metres.
+    /// Smallest gap between the parts of two arms on their stopping paths, metres.
     pub arms_gap_m: f64,
-    /// Smallest gap between parts of one arm that can meet, until it could stand still; metres.
+    /// Smallest gap between parts of one arm that can collide on its stopping path, metres.
     pub self_gap_m: f64,
-    /// A motion has to stay this far from the ends of the joints' ranges, radians. The envelope itself goes to the ends.
+    /// Smallest distance of a motion from the ends of the joints' ranges, radians. The envelope allows the full ranges.
     pub range_margin_rad: f64,
-    /// Longest time from what a state says to the moment at which a command given upon it takes effect, seconds.
+    /// Longest time from the measurement of a state until a command based on it takes effect, seconds.
     pub reaction_s: f64,
-    /// Time in which the drives brake a joint from its largest speed to rest, seconds.
+    /// Time in which the drives brake a joint from its highest speed to rest, seconds.
     pub brake_s: f64,
-    /// Usual time from a command to the moment at which angles are read that show it, seconds.
+    /// Usual time from a command until measured angles reflect it, seconds.
     pub lag_s: f64,
-    /// How fast an error of a joint's angle is corrected, 1/s.
+    /// Feedback gain of the joints' angles, 1/s.
     pub gain_per_s: f64,
-    /// Largest distance of a joint from where the motion has it, radians.
+    /// Largest tracking error of a joint, radians.
     pub tracking_rad: f64,
-    /// A joint at its goal is at most this far from it, radians.
+    /// Largest distance of a settled joint from the motion's end, radians.
     pub settled_rad: f64,
-    /// Longest time that the arms may take to settle after the motion's end, seconds.
+    /// Longest time for the arms to settle after the motion's end, seconds.
     pub settle_s: f64,
-    /// What an angle may change from state to state beyond what the largest speed explains, radians.
+    /// Largest change of an angle between two states beyond what the highest speed explains, radians.
     pub jump_rad: f64,
-    /// Largest measured speed of a joint, as a share of its limit.
+    /// Highest measured speed of a joint, as a share of its limit.
     pub overspeed_share: f64,
-    /// Largest torque that may be left unexplained, newton metres.
+    /// Largest external torque, newton metres.
     pub torque_nm: f64,
-    /// A joint that is told to move faster than this has to report new angles, radians per second.
+    /// A joint that is commanded to move faster than this has to report changing angles, radians per second.
     pub frozen_radps: f64,
-    /// A joint that moves slower than this rests, radians per second.
+    /// Highest speed of a joint at rest, radians per second.
     pub rest_radps: f64,
-    /// The motion pauses when no new state has come for this much longer than a period, seconds.
+    /// The motion pauses if the newest state is older than a period plus this, seconds.
     pub state_hold_s: f64,
-    /// The arms are stopped when no new state has come for this much longer than a period, or the newest is older than
-    /// states were by this much; seconds.
+    /// The arms are stopped if the newest state is older than a period plus this, or delayed by this much more than
+    /// earlier states; seconds.
     pub state_stop_s: f64,
-    /// Commands have to take effect within this time, where the arms tell; seconds.
+    /// Longest time until a command takes effect, if the arms report that; seconds.
     pub command_s: f64,
-    /// The motion pauses when its owner has not been heard for this long, seconds.
+    /// The motion pauses after the owner was silent for this long, seconds.
     pub owner_hold_s: f64,
-    /// The arms are stopped when the owner of a motion has not been heard for this long, seconds.
+    /// The arms are stopped after the owner of a motion was silent for this long, seconds.
     pub owner_stop_s: f64,
-    /// A lease ends when its owner has not been heard for this long, seconds.
+    /// A lease ends after its owner was silent for this long, seconds.
     pub lease_s: f64,
-    /// Longest time from one tick to the next, seconds: the drives brake by themselves soon after.
+    /// Longest time from one tick to the next, seconds. The drives brake by themselves soon after.
     pub tick_s: f64,
     /// Time in which a pause brings a motion to rest along its path, seconds.
     pub pause_s: f64,
-    /// Time in which a motion takes up its full speed again, seconds.
+    /// Time in which a motion returns to its full speed, seconds.
     pub resume_s: f64,
 }
 
 impl Default for Settings {
-    /// Values for the simulated pair and for arms like it: commands take effect within 30 ms, joints brake within 50 ms.
+    /// Values for the simulated pair and for similar arms: commands take effect within 30 ms, joints brake within 50
+    /// ms.
     fn default() -> Self {
         Self {
             check: check_settings(),
@@ -96,18 +97,18 @@ impl Default for Settings {
     }
 }
 
-/// A setting that makes no sense.
+/// A setting is out of its range.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
 #[error("{name} is {value}, which is out of its range")]
 pub struct BadSetting {
-    /// The setting.
+    /// The name of the setting.
     pub name: &'static str,
     /// Its value.
     pub value: f64,
 }
 
 impl Settings {
-    /// Passes settings that make sense for `cell` and exchanges every `period_s` seconds.
+    /// Checks the settings for `cell` and exchanges every `period_s` seconds.
     pub(crate) fn checked(self, cell: &WorkCell, period_s: f64) -> Result<Self, BadSetting> {
         let positive = [
             ("period_s", period_s),
@@ -146,10 +147,10 @@ impl Settings {
         }
     }
 
-    /// A setting that does not go with the others.
+    /// Returns a setting that contradicts the others.
     fn bad_relation(&self, period_s: f64) -> Option<(&'static str, f64)> {
         let fits = [
-            // A feedback that answers faster than its delay swings.
+            // Feedback that is faster than its delay oscillates.
             (
                 "gain_per_s",
                 self.gain_per_s,
@@ -157,7 +158,7 @@ impl Settings {
             ),
             ("lag_s", self.lag_s, (0.0..=self.reaction_s).contains(&self.lag_s)),
             ("reaction_s", self.reaction_s, self.reaction_s >= period_s),
-            // The emergency brake is at least as hard as what motions use.
+            // The emergency brake decelerates at least as hard as motions do.
             ("brake_s", self.brake_s, self.brake_s <= self.check.limits.ramp_s),
             ("pause_s", self.pause_s, self.pause_s >= 2.0 * self.brake_s),
             ("arms_gap_m", self.arms_gap_m, self.arms_gap_m < self.check.arms_gap_m),

@@ -1,29 +1,30 @@
-//! When a gripper gets a new goal. Pure.
+//! The goals of a gripper. Pure.
 //!
-//! kinova-ros moves fingers by an action whose goal is a point in the arm's own queue: it holds the arm where it was told to be
-//! last, and velocities that come meanwhile wait behind it. A goal that replaces another, and one that ends
-//! because the fingers are stalled, restart the arm's interface. So here:
+//! kinova-ros moves fingers by an action whose goal is a point in the arm's own queue. The point holds the arm in
+//! place, and velocities that arrive meanwhile wait behind it. A goal that replaces another one, and a goal that ends
+//! because the fingers stall, restart the arm's interface. Therefore:
 //!
-//! - a goal is sent only while the arm is told to stand, and no goal while another one is under way;
-//! - while one is under way the arm gets no velocities, and so stands;
-//! - a goal is sent when the wanted opening is a step away from the last goal, or has rested somewhere else for a while.
+//! - a goal is sent only while the arm is commanded to be stationary and no other goal is active;
+//! - the arm receives no velocities while a goal is active, so it is stationary;
+//! - a goal is sent if the desired opening differs from the last goal by a step, or by less and has not changed for a
+//!   while.
 
-/// When goals are sent.
+/// The conditions under which goals are sent.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct FingerSettings {
-    /// Turns (kinova-ros' unit of a finger's way) of a gripper that is shut; open is 0. Kinova gives 6400 as a good value and
-    /// 6800 as the end of the thread. Default 6400.
+    /// Turns (kinova-ros' unit of a finger's position) of a closed gripper; open is 0. Kinova recommends 6400; the
+    /// thread ends at 6800. Default 6400.
     pub shut_turns: f64,
-    /// Change of the opening, 0 to 1, that is worth a goal at once. Default 0.05.
+    /// Change of the opening, 0 to 1, that causes a goal at once. Default 0.05.
     pub step: f64,
-    /// Change of the opening that is worth a goal when it stays; the action itself is content within 0.01. Default 0.015.
+    /// Change of the opening that causes a goal once it persists; the action's own tolerance is 0.01. Default 0.015.
     pub rest: f64,
-    /// Exchanges from one goal to the next at least, and those after which an opening has come to rest. Default 20.
+    /// Smallest number of exchanges between two goals, and the number after which a change persists. Default 20.
     pub pause_exchanges: u32,
-    /// Exchanges after which a goal without a result is given up. Default 1000.
-    pub patience_exchanges: u32,
-    /// An arm stands when no joint is told to move faster than this, radians per second. Default 0.5 degrees per second.
-    pub standing_radps: f64,
+    /// Exchanges after which a goal without a result is abandoned. Default 1000.
+    pub timeout_exchanges: u32,
+    /// Highest commanded speed of the joints of a stationary arm, radians per second. Default 0.5 degrees per second.
+    pub stationary_radps: f64,
 }
 
 impl Default for FingerSettings {
@@ -33,8 +34,8 @@ impl Default for FingerSettings {
             step: 0.05,
             rest: 0.015,
             pause_exchanges: 20,
-            patience_exchanges: 1000,
-            standing_radps: 0.5_f64.to_radians(),
+            timeout_exchanges: 1000,
+            stationary_radps: 0.5_f64.to_radians(),
         }
     }
 }
@@ -43,13 +44,13 @@ impl Default for FingerSettings {
 #[derive(Debug, Clone)]
 pub(crate) struct Fingers {
     settings: FingerSettings,
-    /// Opening of the last goal, or what it was when the arm was let go.
+    /// The opening of the last goal, or the initial one after a reset.
     at: Option<f64>,
-    /// The goal that is under way, and for how many exchanges.
-    under_way: Option<(String, u32)>,
+    /// The active goal and the number of exchanges since it was sent.
+    active: Option<(String, u32)>,
     wanted: f64,
-    /// Exchanges for which the wanted opening has not changed.
-    n_rested: u32,
+    /// Exchanges since the desired opening has changed.
+    n_unchanged: u32,
     /// Exchanges since the last goal.
     n_since: u32,
 }
@@ -57,49 +58,48 @@ pub(crate) struct Fingers {
 impl Fingers {
     pub(crate) fn new(settings: FingerSettings) -> Self {
         let n_since = settings.pause_exchanges;
-        Self { settings, at: None, under_way: None, wanted: 0.0, n_rested: 0, n_since }
+        Self { settings, at: None, active: None, wanted: 0.0, n_unchanged: 0, n_since }
     }
 
-    /// The arm was stopped: goals have ended, and what it holds is what it shall hold.
+    /// Forgets all goals, because the arm was stopped. The gripper keeps its position.
     pub(crate) fn stop(&mut self) {
         *self = Self::new(self.settings);
     }
 
-    /// Whether a goal is under way, so that the arm must not be told to move.
+    /// Returns whether a goal is active, so that the arm must receive no velocities.
     pub(crate) fn busy(&self) -> bool {
-        self.under_way.is_some()
+        self.active.is_some()
     }
 
-    /// The goal of this name was sent.
-    pub(crate) fn sent(&mut self, id: String) {
-        self.under_way = Some((id, 0));
+    /// Records that goal `id` was sent.
+    pub(crate) fn goal_sent(&mut self, id: String) {
+        self.active = Some((id, 0));
         self.at = Some(self.wanted);
         self.n_since = 0;
     }
 
-    /// The goal of this name has ended.
-    pub(crate) fn ended(&mut self, id: &str) {
-        self.under_way.take_if(|(name, _)| name == id);
+    /// Records that goal `id` has ended.
+    pub(crate) fn goal_ended(&mut self, id: &str) {
+        self.active.take_if(|(name, _)| name == id);
     }
 
-    /// Lets an exchange pass in which the gripper shall be open by `wanted` and the arm stands or does not. The opening of a goal, when
-    /// it is time for one.
-    pub(crate) fn next(&mut self, wanted: f64, stands: bool) -> Option<f64> {
+    /// Counts an exchange with the desired opening `wanted`. Returns the opening of a new goal if one is due.
+    pub(crate) fn next(&mut self, wanted: f64, stationary: bool) -> Option<f64> {
         let settings = self.settings;
         let rested = (wanted - self.wanted).abs() < 1e-6;
-        self.n_rested = if rested { self.n_rested.saturating_add(1) } else { 0 };
+        self.n_unchanged = if rested { self.n_unchanged.saturating_add(1) } else { 0 };
         self.n_since = self.n_since.saturating_add(1);
         self.wanted = wanted;
-        if let Some((_, n)) = &mut self.under_way {
+        if let Some((_, n)) = &mut self.active {
             *n += 1;
-            if *n > settings.patience_exchanges {
-                self.under_way = None;
+            if *n > settings.timeout_exchanges {
+                self.active = None;
             }
             return None;
         }
         let change = (wanted - *self.at.get_or_insert(wanted)).abs();
-        let rests = self.n_rested >= settings.pause_exchanges && change >= settings.rest;
-        let due = stands && self.n_since >= settings.pause_exchanges;
+        let rests = self.n_unchanged >= settings.pause_exchanges && change >= settings.rest;
+        let due = stationary && self.n_since >= settings.pause_exchanges;
         (due && (change >= settings.step || rests)).then_some(wanted)
     }
 }
@@ -111,18 +111,18 @@ mod tests {
     /// Openings of goals and the exchanges in which they were sent; each is under way for `lasts` exchanges.
     fn goals(
         wanted: impl Fn(u32) -> f64,
-        stands: impl Fn(u32) -> bool,
+        stationary: impl Fn(u32) -> bool,
         lasts: u32,
     ) -> Vec<(u32, f64)> {
         let mut fingers = Fingers::new(FingerSettings::default());
         let (mut goals, mut ends) = (Vec::new(), None);
         for n in 0..400 {
             if ends == Some(n) {
-                fingers.ended(&n.to_string());
+                fingers.goal_ended(&n.to_string());
             }
-            if let Some(opening) = fingers.next(wanted(n), stands(n)) {
-                assert!(!fingers.busy() && stands(n));
-                fingers.sent((n + lasts).to_string());
+            if let Some(opening) = fingers.next(wanted(n), stationary(n)) {
+                assert!(!fingers.busy() && stationary(n));
+                fingers.goal_sent((n + lasts).to_string());
                 ends = Some(n + lasts);
                 goals.push((n, opening));
             }
@@ -156,13 +156,13 @@ mod tests {
 
     #[test]
     fn a_goal_without_a_result_is_given_up() {
-        let settings = FingerSettings { patience_exchanges: 50, ..FingerSettings::default() };
+        let settings = FingerSettings { timeout_exchanges: 50, ..FingerSettings::default() };
         let mut fingers = Fingers::new(settings);
         fingers.next(1.0, true);
         let first = (0..).find(|_| fingers.next(0.0, true).is_some()).unwrap();
         assert!(first <= 20);
-        fingers.sent("a".into());
-        fingers.ended("b");
+        fingers.goal_sent("a".into());
+        fingers.goal_ended("b");
         assert!(fingers.busy());
         let n = (1..200).find(|_| fingers.next(0.0, true).is_none() && !fingers.busy());
         assert_eq!(n, Some(51));
@@ -172,7 +172,7 @@ mod tests {
     fn a_stopped_arm_keeps_what_it_holds() {
         let mut fingers = Fingers::new(FingerSettings::default());
         fingers.next(1.0, true);
-        fingers.sent("a".into());
+        fingers.goal_sent("a".into());
         fingers.stop();
         assert!(!fingers.busy());
         for _ in 0..100 {

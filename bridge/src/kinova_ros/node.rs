@@ -1,4 +1,4 @@
-//! What is known of one arm's node: its names, whether it lets the arm move, and what it was told. Pure.
+//! The state of one arm's node: its names, whether it lets the arm move, and the commands in flight. Pure.
 
 use std::collections::VecDeque;
 
@@ -9,47 +9,47 @@ use crate::driver::DriverError;
 use crate::kinova_ros::fingers::{FingerSettings, Fingers};
 use crate::kinova_ros::protocol;
 
-/// Velocities that may be under way to ROS at most: a second. An executor stops much earlier.
-pub(crate) const MOST_UNDER_WAY: usize = 100;
+/// The largest number of velocities in flight to ROS: those of one second. An executor stops much earlier.
+pub(crate) const MAX_IN_FLIGHT: usize = 100;
 
-/// What is known of one arm's node.
+/// The state of one arm's node.
 #[derive(Debug)]
-pub(crate) struct Arm {
+pub(crate) struct ArmNode {
     pub(crate) node: String,
     pub(crate) control: Control,
     pub(crate) fingers: Fingers,
-    /// Numbers of commands, and their velocities, that were sent and not heard again; oldest first.
-    pub(crate) under_way: VecDeque<(u64, Joints)>,
+    /// Numbers and velocities of the commands that were sent and are not published yet; oldest first.
+    pub(crate) in_flight: VecDeque<(u64, Joints)>,
 }
 
 /// Whether a node lets its arm move.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) enum Control {
-    /// Nobody has asked for anything over this connection.
+    /// No service was called over this connection.
     Unknown,
-    /// A service was called that has not answered for some exchanges.
-    Asked { id: String, service: Service, n: u32 },
+    /// A service was called and has not responded for `n` exchanges.
+    Pending { id: String, service: Service, n: u32 },
     /// The arm is stopped.
     Stopped,
     /// The arm follows velocities.
     Started,
 }
 
-/// What a node can be asked for.
+/// The services of a node.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Service {
     Stop,
     Start,
 }
 
-impl Arm {
-    /// The arm whose driver is the node `node`.
+impl ArmNode {
+    /// Creates the state of node `node`.
     pub(crate) fn new(node: &str, fingers: FingerSettings) -> Self {
         Self {
             node: node.trim_end_matches('/').to_owned(),
             control: Control::Unknown,
             fingers: Fingers::new(fingers),
-            under_way: VecDeque::new(),
+            in_flight: VecDeque::new(),
         }
     }
 
@@ -69,19 +69,19 @@ impl Arm {
         self.topic("fingers_action/finger_positions/result")
     }
 
-    pub(crate) fn asked_to_stop(&self) -> bool {
-        matches!(self.control, Control::Stopped | Control::Asked { service: Service::Stop, .. })
+    pub(crate) fn is_stopping(&self) -> bool {
+        matches!(self.control, Control::Stopped | Control::Pending { service: Service::Stop, .. })
     }
 
-    /// Notes the answer of a service.
-    pub(crate) fn answered(
+    /// Handles the response of a service.
+    pub(crate) fn handle_response(
         &mut self,
         id: &str,
         result: bool,
         values: &str,
     ) -> Result<(), DriverError> {
-        let Control::Asked { id: asked, service, .. } = &self.control else { return Ok(()) };
-        if asked != id {
+        let Control::Pending { id: pending, service, .. } = &self.control else { return Ok(()) };
+        if pending != id {
             return Ok(());
         }
         if !result {
@@ -95,25 +95,26 @@ impl Arm {
         Ok(())
     }
 
-    /// Notes velocities that were published in ROS. They have to be some that were sent; those before them were overtaken and dropped.
-    pub(crate) fn published(&mut self, msg: &Value) -> Result<(), DriverError> {
-        let is_it = |(number, rates): &(u64, Joints)| protocol::is_of(msg, *number, rates);
-        let Some(place) = self.under_way.iter().position(is_it) else {
+    /// Handles velocities that were published in ROS. They must be in flight; earlier ones were overtaken and dropped.
+    pub(crate) fn handle_velocity(&mut self, msg: &Value) -> Result<(), DriverError> {
+        let matches =
+            |(number, rates): &(u64, Joints)| protocol::is_velocity_of(msg, *number, rates);
+        let Some(idx) = self.in_flight.iter().position(matches) else {
             let what = format!("another node publishes {}", self.velocity_topic());
             return Err(DriverError::Refused { what });
         };
-        self.under_way.drain(..=place);
+        self.in_flight.drain(..=idx);
         Ok(())
     }
 
-    /// Lets an exchange pass. A service has to answer in time.
-    pub(crate) fn await_answer(&mut self, most: u32) -> Result<(), DriverError> {
+    /// Counts an exchange. Returns an error if a service has not responded within `max_exchanges`.
+    pub(crate) fn count_exchange(&mut self, max_exchanges: u32) -> Result<(), DriverError> {
         let node = &self.node;
-        if let Control::Asked { service, n, .. } = &mut self.control {
+        if let Control::Pending { service, n, .. } = &mut self.control {
             *n += 1;
-            if *n > most {
+            if *n > max_exchanges {
                 let what = format!(
-                    "{node}/{} did not answer for {most} exchanges: does the node run?",
+                    "{node}/{} did not answer for {max_exchanges} exchanges: does the node run?",
                     service.name()
                 );
                 return Err(DriverError::Refused { what });

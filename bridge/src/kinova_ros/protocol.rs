@@ -1,6 +1,6 @@
-//! What is said to rosbridge and what it says: JSON to our types and back. Pure.
+//! The JSON messages to and from rosbridge. Pure.
 //!
-//! The words are those of version 2 of rosbridge's protocol, ROS 1's message types, and kinova-ros (state of February 2023).
+//! The formats are version 2 of rosbridge's protocol, ROS 1's message types, and kinova-ros as of February 2023.
 
 use serde_json::{Value, json};
 use tandem_core::text::shortened;
@@ -8,60 +8,60 @@ use tandem_kinematics::Joints;
 
 use crate::driver::{ArmReading, DriverError, Faults};
 
-/// Joints of an arm.
+/// The number of joints of an arm.
 pub(crate) const N_JOINTS: usize = 4;
-/// Fingers of a gripper.
+/// The number of fingers of a gripper.
 const N_FINGERS: usize = 2;
-/// Characters of a message that an error repeats.
+/// The largest number of characters of a message in an error.
 const MAX_SHOWN_CHARS: usize = 200;
-/// kinova-ros tells a finger's turn as an angle of its joint: degrees for each unit of turn.
+/// kinova-ros reports a finger's turns as an angle of its joint: degrees per turn.
 const FINGER_DEGREES_PER_TURN: f64 = 80.0 / 6800.0;
 
-/// A message that has come.
+/// A message of rosbridge.
 #[derive(Debug, Clone, PartialEq)]
-pub(crate) enum Heard {
-    /// Somebody published.
-    Message { topic: String, msg: Value },
-    /// A service has answered.
-    Answer { id: String, result: bool, values: Value },
-    /// rosbridge could not do what it was asked for.
-    Complaint(String),
-    /// What needs no attention.
+pub(crate) enum RosMessage {
+    /// A published message.
+    Publish { topic: String, msg: Value },
+    /// The response of a service.
+    ServiceResponse { id: String, result: bool, values: Value },
+    /// An error reported by rosbridge.
+    Error(String),
+    /// Any other message, which is ignored.
     Other,
 }
 
-/// Reads what rosbridge says.
-pub(crate) fn hear(text: &str) -> Result<Heard, DriverError> {
+/// Parses a message of rosbridge.
+pub(crate) fn parse(text: &str) -> Result<RosMessage, DriverError> {
     let message: Value = serde_json::from_str(text).map_err(|error| {
         malformed(format!("not JSON: {error}: {}", shortened(text, MAX_SHOWN_CHARS)))
     })?;
     let word = |key: &str| message.get(key).and_then(Value::as_str).unwrap_or_default().to_owned();
     let value = |key: &str| message.get(key).cloned().unwrap_or(Value::Null);
     Ok(match word("op").as_str() {
-        "publish" => Heard::Message { topic: word("topic"), msg: value("msg") },
-        "service_response" => Heard::Answer {
+        "publish" => RosMessage::Publish { topic: word("topic"), msg: value("msg") },
+        "service_response" => RosMessage::ServiceResponse {
             id: word("id"),
             result: value("result").as_bool().unwrap_or(false),
             values: value("values"),
         },
         "status" if word("level") == "error" => {
-            Heard::Complaint(shortened(&word("msg"), MAX_SHOWN_CHARS))
+            RosMessage::Error(shortened(&word("msg"), MAX_SHOWN_CHARS))
         }
-        _ => Heard::Other,
+        _ => RosMessage::Other,
     })
 }
 
-/// Announces that `topic` will be published. No queue that is longer than one message.
+/// Advertises `topic` with a queue of one message.
 pub(crate) fn advertise(topic: &str, kind: &str) -> String {
     json!({"op": "advertise", "topic": topic, "type": kind, "queue_size": 1}).to_string()
 }
 
-/// Asks for the newest messages of `topic`: a queue of one message forgets the older one.
+/// Subscribes to the newest messages of `topic`: the queue has one entry, which newer messages replace.
 pub(crate) fn subscribe(topic: &str, kind: &str) -> String {
     subscribe_with(topic, kind, 1)
 }
 
-/// Asks for every message of `topic`.
+/// Subscribes to all messages of `topic`.
 pub(crate) fn subscribe_to_all(topic: &str, kind: &str) -> String {
     subscribe_with(topic, kind, 0)
 }
@@ -74,14 +74,15 @@ fn subscribe_with(topic: &str, kind: &str, queue_length: u32) -> String {
     .to_string()
 }
 
-/// Calls a service that takes nothing.
+/// Calls a service without arguments.
 pub(crate) fn call(id: &str, service: &str) -> String {
     json!({"op": "call_service", "id": id, "service": service}).to_string()
 }
 
 /// Publishes velocities (radians per second) as `kinova_msgs/JointVelocity` (degrees per second).
 ///
-/// Joint 7, which these arms do not have, carries the number of the command: its last three digits, in millionths of a degree per second.
+/// Joint 7, which these arms lack, carries the last three digits of the command's number, in millionths of a degree per
+/// second.
 pub(crate) fn velocities(topic: &str, number: u64, rates: &Joints) -> Result<String, DriverError> {
     let (got, expected) = (rates.len(), N_JOINTS);
     if got != expected {
@@ -98,16 +99,16 @@ pub(crate) fn velocities(topic: &str, number: u64, rates: &Joints) -> Result<Str
     Ok(json!({"op": "publish", "topic": topic, "msg": msg}).to_string())
 }
 
-/// What joint 7 is told in the command of this number, degrees per second.
+/// The velocity of joint 7 in command `number`, degrees per second.
 fn label(number: u64) -> f64 {
     (number % 1000) as f64 * 1e-6
 }
 
-/// Whether a message of `kinova_msgs/JointVelocity` is that of this command. It has single precision.
-pub(crate) fn is_of(msg: &Value, number: u64, rates: &Joints) -> bool {
-    let near = |joint: usize, expected: f64, most: f64| {
-        let told = msg.get(format!("joint{joint}")).and_then(Value::as_f64);
-        told.is_some_and(|told| (told - expected).abs() < most)
+/// Returns whether a message of `kinova_msgs/JointVelocity`, which has single precision, is that of command `number`.
+pub(crate) fn is_velocity_of(msg: &Value, number: u64, rates: &Joints) -> bool {
+    let near = |joint: usize, expected: f64, tolerance: f64| {
+        let got = msg.get(format!("joint{joint}")).and_then(Value::as_f64);
+        got.is_some_and(|got| (got - expected).abs() < tolerance)
     };
     let rates = rates.iter().map(|rate| rate.to_degrees());
     (1..).zip(rates).all(|(joint, rate)| near(joint, rate, 1e-3)) && near(7, label(number), 1e-7)
@@ -119,45 +120,45 @@ pub(crate) fn finger_goal(topic: &str, id: &str, turns: f64) -> String {
     let msg = json!({
         "header": {"seq": 0, "stamp": now, "frame_id": ""},
         "goal_id": {"stamp": now, "id": id},
-        // A third finger that a gripper does not have has to be told 0.
+        // The third finger, which the gripper lacks, must be 0.
         "goal": {"fingers": {"finger1": turns, "finger2": turns, "finger3": 0.0}},
     });
     json!({"op": "publish", "topic": topic, "msg": msg}).to_string()
 }
 
-/// The goal that has ended, of a message of `kinova_msgs/SetFingersPositionActionResult`.
+/// Returns the identifier of the goal that has ended from a message of `kinova_msgs/SetFingersPositionActionResult`.
 pub(crate) fn ended_goal(msg: &Value) -> Option<&str> {
     msg.pointer("/status/goal_id/id")?.as_str()
 }
 
-/// An arm at one time.
+/// The state of an arm at one time.
 #[derive(Debug, Clone, PartialEq)]
-pub(crate) struct Told {
-    /// By ROS' clock, seconds.
+pub(crate) struct ArmMessage {
+    /// The time stamp by ROS' clock, seconds.
     pub(crate) stamp_s: f64,
     pub(crate) reading: ArmReading,
 }
 
-/// How an arm's messages are to be read.
+/// Decodes the messages of an arm.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Reading<'a> {
-    /// Joints are named this, `joint_` and a number.
+pub(crate) struct ArmDecoder<'a> {
+    /// The prefix of the joints' names, before `joint_` and a number.
     pub(crate) prefix: &'a str,
-    /// Turns of a finger that is shut.
+    /// The turns of a closed finger.
     pub(crate) shut_turns: f64,
-    /// Whether efforts are torques without those that carry the arm.
-    pub(crate) tells_torques: bool,
+    /// Whether efforts are torques without the arm's own weight.
+    pub(crate) reports_torques: bool,
 }
 
-impl Reading<'_> {
-    /// Reads a message of `sensor_msgs/JointState`: angles in radians, rates in radians per second, efforts in newton metres,
-    /// in any order, by names.
-    pub(crate) fn joint_state(&self, msg: &Value) -> Result<Told, DriverError> {
+impl ArmDecoder<'_> {
+    /// Decodes a message of `sensor_msgs/JointState` with joints in any order: angles in radians, rates in radians per
+    /// second, efforts in newton metres.
+    pub(crate) fn joint_state(&self, msg: &Value) -> Result<ArmMessage, DriverError> {
         let names = list(msg, "name")?;
         let names: Vec<&str> = names.iter().map(|name| name.as_str().unwrap_or("")).collect();
-        let joints = self.places::<N_JOINTS>(&names, "joint_")?;
-        let fingers = self.places::<N_FINGERS>(&names, "joint_finger_")?;
-        self.nothing_else(&names)?;
+        let joints = self.indices::<N_JOINTS>(&names, "joint_")?;
+        let fingers = self.indices::<N_FINGERS>(&names, "joint_finger_")?;
+        self.check_no_other_joints(&names)?;
         let numbers = |key: &str| -> Result<Vec<f64>, DriverError> {
             let values = list(msg, key)?;
             if values.len() != names.len() {
@@ -173,7 +174,7 @@ impl Reading<'_> {
         let of_joints = |numbers: &[f64]| Joints::from_fn(N_JOINTS, |joint| numbers[joints[joint]]);
         let positions = numbers("position")?;
         let torques_nm =
-            if self.tells_torques { Some(of_joints(&numbers("effort")?)) } else { None };
+            if self.reports_torques { Some(of_joints(&numbers("effort")?)) } else { None };
         let turns = fingers.map(|finger| positions[finger].to_degrees() / FINGER_DEGREES_PER_TURN);
         let turns = turns.iter().sum::<f64>() / N_FINGERS as f64;
         let reading = ArmReading {
@@ -183,26 +184,26 @@ impl Reading<'_> {
             opening: 1.0 - turns / self.shut_turns,
             faults: Faults::default(),
         };
-        Ok(Told { stamp_s: stamp_s(msg)?, reading })
+        Ok(ArmMessage { stamp_s: stamp_s(msg)?, reading })
     }
 
-    /// Turns of the fingers for an opening.
+    /// Returns the turns of the fingers for an opening, 0 to 1.
     pub(crate) fn turns(&self, opening: f64) -> f64 {
         (1.0 - opening.clamp(0.0, 1.0)) * self.shut_turns
     }
 
-    /// Where joints 1 to `N` stand among `names`.
-    fn places<const N: usize>(
+    /// Returns the indices of joints 1 to `N` in `names`.
+    fn indices<const N: usize>(
         &self,
         names: &[&str],
-        word: &str,
+        kind: &str,
     ) -> Result<[usize; N], DriverError> {
-        let mut places = [0; N];
-        for (idx, place) in places.iter_mut().enumerate() {
-            let name = format!("{}{word}{}", self.prefix, idx + 1);
-            let mut found = (0..names.len()).filter(|place| names[*place] == name);
-            *place = match (found.next(), found.next()) {
-                (Some(place), None) => place,
+        let mut indices = [0; N];
+        for (joint, found_idx) in indices.iter_mut().enumerate() {
+            let name = format!("{}{kind}{}", self.prefix, joint + 1);
+            let mut found = (0..names.len()).filter(|idx| names[*idx] == name);
+            *found_idx = match (found.next(), found.next()) {
+                (Some(idx), None) => idx,
                 (None, _) => {
                     let known = shortened(&names.join(" "), MAX_SHOWN_CHARS);
                     return Err(malformed(format!("no joint {name:?} among {known:?}")));
@@ -210,11 +211,11 @@ impl Reading<'_> {
                 (Some(_), Some(_)) => return Err(malformed(format!("joint {name:?} twice"))),
             };
         }
-        Ok(places)
+        Ok(indices)
     }
 
-    /// The arm has no joints beyond those that it should have.
-    fn nothing_else(&self, names: &[&str]) -> Result<(), DriverError> {
+    /// Checks that the arm has no other joints.
+    fn check_no_other_joints(&self, names: &[&str]) -> Result<(), DriverError> {
         let tips = |name: &&str| {
             name.strip_prefix(self.prefix).is_some_and(|name| name.starts_with("joint_finger_tip_"))
         };
@@ -248,8 +249,8 @@ mod tests {
 
     use super::*;
 
-    const READING: Reading<'static> =
-        Reading { prefix: "m1n4s200_", shut_turns: 6400.0, tells_torques: false };
+    const DECODER: ArmDecoder<'static> =
+        ArmDecoder { prefix: "m1n4s200_", shut_turns: 6400.0, reports_torques: false };
 
     /// What the driver of a `m1n4s200` publishes.
     fn joint_state() -> Value {
@@ -271,15 +272,15 @@ mod tests {
 
     #[test]
     fn a_joint_state_is_read_by_names() {
-        let told = READING.joint_state(&joint_state()).unwrap();
-        assert_eq!(told.stamp_s, 1_700_000_000.25);
-        assert_eq!(told.reading.angles, Joints::new(&[4.5, 3.25, 1.5, -0.5]));
-        assert_eq!(told.reading.velocities, Joints::new(&[0.1, -0.2, 0.3, 0.0]));
-        assert_eq!(told.reading.torques_nm, None);
+        let message = DECODER.joint_state(&joint_state()).unwrap();
+        assert_eq!(message.stamp_s, 1_700_000_000.25);
+        assert_eq!(message.reading.angles, Joints::new(&[4.5, 3.25, 1.5, -0.5]));
+        assert_eq!(message.reading.velocities, Joints::new(&[0.1, -0.2, 0.3, 0.0]));
+        assert_eq!(message.reading.torques_nm, None);
         // 0.6571 rad are 37.65 degrees, at 80 degrees for 6800 turns 3200 turns of 6400.
-        assert!((told.reading.opening - 0.5).abs() < 1e-3, "{}", told.reading.opening);
+        assert!((message.reading.opening - 0.5).abs() < 1e-3, "{}", message.reading.opening);
 
-        let torques = Reading { tells_torques: true, ..READING };
+        let torques = ArmDecoder { reports_torques: true, ..DECODER };
         let read = torques.joint_state(&joint_state()).unwrap();
         assert_eq!(read.reading.torques_nm, Some(Joints::new(&[0.5, 6.0, 2.0, -0.25])));
 
@@ -287,15 +288,15 @@ mod tests {
         for key in ["name", "position", "velocity", "effort"] {
             turned[key].as_array_mut().unwrap().reverse();
         }
-        assert_eq!(READING.joint_state(&turned).unwrap(), told);
+        assert_eq!(DECODER.joint_state(&turned).unwrap(), message);
     }
 
     #[test]
-    fn what_is_no_joint_state_of_this_arm_says_why() {
+    fn a_malformed_joint_state_is_refused_with_its_fault() {
         let check = |spoil: &dyn Fn(&mut Value), expected: &str| {
             let mut msg = joint_state();
             spoil(&mut msg);
-            let error = READING.joint_state(&msg).unwrap_err().to_string();
+            let error = DECODER.joint_state(&msg).unwrap_err().to_string();
             assert!(error.contains(expected), "{error}");
         };
         check(&|msg| msg["position"][2] = Value::Null, "position of m1n4s200_joint_3 is null");
@@ -312,7 +313,7 @@ mod tests {
     }
 
     #[test]
-    fn velocities_leave_in_degrees_per_second() {
+    fn velocities_are_sent_in_degrees_per_second() {
         let rates = Joints::new(&[0.1, -0.2, 0.0, std::f64::consts::PI / 6.0]);
         let sent: Value =
             serde_json::from_str(&velocities("/a/in/joint_velocity", 41_234, &rates).unwrap())
@@ -325,11 +326,14 @@ mod tests {
             assert!((joint(nth) - expected).abs() < 5e-7, "joint {nth}: {sent}");
         }
         assert_eq!(sent["msg"].as_object().unwrap().len(), 7);
-        assert!(is_of(&sent["msg"], 41_234, &rates) && is_of(&sent["msg"], 234, &rates));
-        assert!(!is_of(&sent["msg"], 41_235, &rates));
+        assert!(
+            is_velocity_of(&sent["msg"], 41_234, &rates)
+                && is_velocity_of(&sent["msg"], 234, &rates)
+        );
+        assert!(!is_velocity_of(&sent["msg"], 41_235, &rates));
         let other = Joints::from_fn(4, |joint| rates[joint] + if joint == 2 { 0.001 } else { 0.0 });
-        assert!(!is_of(&sent["msg"], 41_234, &other));
-        assert!(!is_of(&json!({"joint1": 0.0}), 0, &Joints::new(&[0.0; 4])));
+        assert!(!is_velocity_of(&sent["msg"], 41_234, &other));
+        assert!(!is_velocity_of(&json!({"joint1": 0.0}), 0, &Joints::new(&[0.0; 4])));
         let nan = Joints::new(&[0.0, f64::NAN, 0.0, 0.0]);
         assert!(matches!(velocities("/a", 1, &nan), Err(DriverError::Refused { .. })));
         assert!(matches!(
@@ -339,9 +343,9 @@ mod tests {
     }
 
     #[test]
-    fn openings_and_turns_go_together() {
+    fn openings_and_turns_correspond() {
         for (opening, turns) in [(1.0, 0.0), (0.0, 6400.0), (0.75, 1600.0), (1.5, 0.0)] {
-            assert_eq!(READING.turns(opening), turns);
+            assert_eq!(DECODER.turns(opening), turns);
         }
         let sent: Value = serde_json::from_str(&finger_goal("/a/goal", "7", 1600.0)).unwrap();
         assert_eq!(
@@ -357,23 +361,23 @@ mod tests {
 
     #[test]
     fn rosbridge_is_understood() {
-        let check = |text: &str, expected: Heard| assert_eq!(hear(text).unwrap(), expected);
+        let check = |text: &str, expected: RosMessage| assert_eq!(parse(text).unwrap(), expected);
         check(
             r#"{"op": "publish", "topic": "/t", "msg": {"a": 1}}"#,
-            Heard::Message { topic: "/t".into(), msg: json!({"a": 1}) },
+            RosMessage::Publish { topic: "/t".into(), msg: json!({"a": 1}) },
         );
         check(
             r#"{"op": "service_response", "id": "3", "service": "/s", "values": "no", "result": false}"#,
-            Heard::Answer { id: "3".into(), result: false, values: json!("no") },
+            RosMessage::ServiceResponse { id: "3".into(), result: false, values: json!("no") },
         );
         check(
             r#"{"op": "status", "level": "error", "msg": "no such type"}"#,
-            Heard::Complaint("no such type".into()),
+            RosMessage::Error("no such type".into()),
         );
-        check(r#"{"op": "status", "level": "warning", "msg": "well"}"#, Heard::Other);
-        check("[]", Heard::Other);
+        check(r#"{"op": "status", "level": "warning", "msg": "well"}"#, RosMessage::Other);
+        check("[]", RosMessage::Other);
         // Python writes numbers that are none like this.
-        assert!(hear(r#"{"op": "publish", "topic": "/t", "msg": {"position": [NaN]}}"#).is_err());
+        assert!(parse(r#"{"op": "publish", "topic": "/t", "msg": {"position": [NaN]}}"#).is_err());
     }
 
     #[test]
@@ -392,11 +396,11 @@ mod tests {
                 }
             }
             let text = String::from_utf8(text).unwrap();
-            match hear(&text) {
-                Ok(Heard::Message { msg, .. }) => match READING.joint_state(&msg) {
-                    Ok(told) => {
+            match parse(&text) {
+                Ok(RosMessage::Publish { msg, .. }) => match DECODER.joint_state(&msg) {
+                    Ok(message) => {
                         n_read += 1;
-                        let reading = told.reading;
+                        let reading = message.reading;
                         let numbers = reading.angles.iter().chain(reading.velocities.iter());
                         assert!(numbers.chain([&reading.opening]).all(|n| n.is_finite()), "{text}");
                     }

@@ -1,36 +1,36 @@
-//! Commands and states as vectors of doubles. Pure: bytes in, our types out.
+//! Commands and states as vectors of doubles. Pure.
 //!
-//! A vector is as many IEEE 754 doubles, little-endian, one after the other without anything between or before them. Both
-//! are as long as the tables say, always.
+//! A vector is a sequence of IEEE 754 doubles, little-endian, without header or padding. Both vectors have a fixed
+//! length.
 //!
 //! **Command**, [`COMMAND_LEN`] doubles, to the arms:
 //!
-//! | index | what | unit |
+//! | index | number | unit |
 //! |---|---|---|
-//! | 0 | [`COMMAND_MARK`]: tells a command of this layout from everything else | – |
+//! | 0 | [`COMMAND_MARK`]: identifies a command of this layout | – |
 //! | 1 | number of the command | 1, 2, 3, … |
 //! | 2 | time of the command: its number times the period | s |
 //! | 3 | order: 0 stop, 1 move | – |
 //! | 4–7 | velocities of joints 1–4 of arm 0 | rad/s |
-//! | 8 | opening of gripper 0: 0 shut, 1 open | – |
+//! | 8 | opening of gripper 0: 0 closed, 1 open | – |
 //! | 9–12 | velocities of joints 1–4 of arm 1 | rad/s |
 //! | 13 | opening of gripper 1 | – |
 //!
-//! With order 0 the numbers from index 4 are 0 and mean nothing: the drives brake and the grippers stay as they are.
+//! With order 0 the numbers from index 4 are 0 and have no meaning: the drives brake and the grippers do not move.
 //!
 //! **State**, [`STATE_LEN`] doubles, from the arms:
 //!
-//! | index | what | unit |
+//! | index | number | unit |
 //! |---|---|---|
-//! | 0 | [`STATE_MARK`]: tells a state of this layout from everything else | – |
-//! | 1 | sequence: one more with every vector that is sent | counts |
-//! | 2 | stamp: when the state was true, by the arms' clock | s |
+//! | 0 | [`STATE_MARK`]: identifies a state of this layout | – |
+//! | 1 | sequence: increases by 1 with every vector sent | – |
+//! | 2 | time stamp of the measurement by the arms' clock | s |
 //! | 3 | number of the newest command that has taken effect, 0 before the first | – |
 //! | 4–7 | angles of joints 1–4 of arm 0, Kinova's convention | rad |
 //! | 8–11 | their rates | rad/s |
-//! | 12–15 | torques beyond those that carry the arm; 0 where index 17 is 0 | N m |
-//! | 16 | opening of gripper 0: 0 shut, 1 open | – |
-//! | 17 | whether the torques are told: 0 or 1 | – |
+//! | 12–15 | torques without the arm's own weight; 0 if index 17 is 0 | N m |
+//! | 16 | opening of gripper 0: 0 closed, 1 open | – |
+//! | 17 | whether the torques are reported: 0 or 1 | – |
 //! | 18 | drive fault: 0 or 1 | – |
 //! | 19 | contact: 0 or 1 | – |
 //! | 20 | emergency stop: 0 or 1 | – |
@@ -40,15 +40,15 @@ use tandem_kinematics::Joints;
 
 use crate::driver::{ArmCommand, ArmReading, Command, DriverError, Faults, Order, PairState};
 
-/// Arms of a vector.
+/// The number of arms in a vector.
 pub const N_ARMS: usize = 2;
-/// Joints of an arm.
+/// The number of joints of an arm.
 pub const N_JOINTS: usize = 4;
-/// Doubles of a command.
+/// The number of doubles in a command.
 pub const COMMAND_LEN: usize = HEAD_LEN + N_ARMS * ARM_COMMAND_LEN;
-/// Doubles of a state.
+/// The number of doubles in a state.
 pub const STATE_LEN: usize = HEAD_LEN + N_ARMS * ARM_STATE_LEN;
-/// Bytes of a state.
+/// The number of bytes in a state.
 pub const STATE_BYTES: usize = STATE_LEN * size_of::<f64>();
 /// First number of a command.
 pub const COMMAND_MARK: f64 = 20_001.0;
@@ -58,13 +58,13 @@ pub const STATE_MARK: f64 = 20_002.0;
 const HEAD_LEN: usize = 4;
 const ARM_COMMAND_LEN: usize = N_JOINTS + 1;
 const ARM_STATE_LEN: usize = 3 * N_JOINTS + 5;
-/// Doubles count exactly up to here.
+/// The largest count that doubles represent exactly.
 const LARGEST_COUNT: f64 = 9_007_199_254_740_992.0;
 
-/// The vector of `command`; periods last `period_s` seconds.
+/// Encodes `command`; a period takes `period_s` seconds.
 ///
 /// # Errors
-/// When the command is not for two arms with four joints, or has a number that no arm may get.
+/// Returns an error if the command is not for two arms with four joints, or a number is not finite or out of its range.
 pub fn encode_command(command: &Command, period_s: f64) -> Result<[f64; COMMAND_LEN], DriverError> {
     let mut vector = [0.0; COMMAND_LEN];
     let number = command.number as f64;
@@ -89,13 +89,13 @@ pub fn encode_command(command: &Command, period_s: f64) -> Result<[f64; COMMAND_
     Ok(vector)
 }
 
-/// The command of a vector: what the arms' side reads.
+/// Decodes a command, as the arms' side does.
 ///
 /// # Errors
-/// When the vector is none of a command.
+/// Returns an error if the vector is not a command.
 pub fn decode_command(vector: &[f64; COMMAND_LEN]) -> Result<Command, DriverError> {
     all_finite(vector)?;
-    marked(vector[0], COMMAND_MARK)?;
+    check_mark(vector[0], COMMAND_MARK)?;
     let number = count(vector[1], "the command's number")?;
     if !flag(vector[3], "the order")? {
         return Ok(Command { number, order: Order::Stop });
@@ -108,10 +108,10 @@ pub fn decode_command(vector: &[f64; COMMAND_LEN]) -> Result<Command, DriverErro
     Ok(Command { number, order: Order::Move(blocks.iter().map(arm).collect()) })
 }
 
-/// The vector of `state`: what the arms' side sends.
+/// Encodes `state`, as the arms' side does.
 ///
 /// # Errors
-/// When the state is not of two arms with four joints.
+/// Returns an error if the state is not of two arms with four joints.
 pub fn encode_state(state: &PairState) -> Result<[f64; STATE_LEN], DriverError> {
     same(state.arms.len(), N_ARMS)?;
     let mut vector = [0.0; STATE_LEN];
@@ -122,12 +122,13 @@ pub fn encode_state(state: &PairState) -> Result<[f64; STATE_LEN], DriverError> 
     for (block, arm) in blocks.iter_mut().zip(&state.arms) {
         same(arm.angles.len(), N_JOINTS)?;
         same(arm.velocities.len(), N_JOINTS)?;
-        let told = arm.torques_nm.is_some();
+        let reports_torques = arm.torques_nm.is_some();
         let torques = arm.torques_nm.unwrap_or_else(|| Joints::from_fn(N_JOINTS, |_| 0.0));
         same(torques.len(), N_JOINTS)?;
         let joints = arm.angles.iter().chain(arm.velocities.iter()).chain(torques.iter());
         let Faults { drive, contact, emergency_stop } = arm.faults;
-        let flags = [told, drive, contact, emergency_stop].map(|set| f64::from(u8::from(set)));
+        let flags =
+            [reports_torques, drive, contact, emergency_stop].map(|set| f64::from(u8::from(set)));
         let rest = std::iter::once(arm.opening).chain(flags);
         for (number, value) in block.iter_mut().zip(joints.copied().chain(rest)) {
             *number = value;
@@ -136,12 +137,12 @@ pub fn encode_state(state: &PairState) -> Result<[f64; STATE_LEN], DriverError> 
     Ok(vector)
 }
 
-/// The state of a vector.
+/// Decodes a state.
 ///
 /// # Errors
-/// When the vector is none of a state: says which number is wrong.
+/// Returns an error that names the malformed number if the vector is not a state.
 pub fn decode_state(vector: &[f64; STATE_LEN]) -> Result<PairState, DriverError> {
-    marked(vector[0], STATE_MARK)?;
+    check_mark(vector[0], STATE_MARK)?;
     all_finite(vector)?;
     let (blocks, _) = vector[HEAD_LEN..].as_chunks::<ARM_STATE_LEN>();
     Ok(PairState {
@@ -154,13 +155,13 @@ pub fn decode_state(vector: &[f64; STATE_LEN]) -> Result<PairState, DriverError>
 
 fn decode_arm(block: &[f64; ARM_STATE_LEN]) -> Result<ArmReading, DriverError> {
     let joints = |nth: usize| Joints::new(&block[nth * N_JOINTS..(nth + 1) * N_JOINTS]);
-    let [opening, told, drive, contact, emergency_stop] =
+    let [opening, reports_torques, drive, contact, emergency_stop] =
         std::array::from_fn(|idx| block[3 * N_JOINTS + idx]);
-    let told = flag(told, "whether torques are told")?;
+    let reports_torques = flag(reports_torques, "whether torques are reported")?;
     Ok(ArmReading {
         angles: joints(0),
         velocities: joints(1),
-        torques_nm: told.then(|| joints(2)),
+        torques_nm: reports_torques.then(|| joints(2)),
         opening,
         faults: Faults {
             drive: flag(drive, "the drive fault")?,
@@ -170,13 +171,13 @@ fn decode_arm(block: &[f64; ARM_STATE_LEN]) -> Result<ArmReading, DriverError> {
     })
 }
 
-/// The bytes of a vector, `8 * N` of them.
+/// Converts a vector to `8 * N` bytes.
 #[must_use]
 pub fn to_bytes<const N: usize>(vector: &[f64; N]) -> Vec<u8> {
     vector.iter().flat_map(|number| number.to_le_bytes()).collect()
 }
 
-/// The vector of `8 * N` bytes; numbers that are not there are 0.
+/// Converts `8 * N` bytes to a vector. Missing numbers are 0.
 #[must_use]
 pub fn from_bytes<const N: usize>(bytes: &[u8]) -> [f64; N] {
     let (words, _) = bytes.as_chunks::<8>();
@@ -195,8 +196,8 @@ fn all_finite(vector: &[f64]) -> Result<(), DriverError> {
     }
 }
 
-/// Whether a vector begins as it should. What is read at the wrong place or in the wrong byte order does not.
-fn marked(got: f64, mark: f64) -> Result<(), DriverError> {
+/// Checks the mark of a vector. A wrong offset or byte order gives another number.
+fn check_mark(got: f64, mark: f64) -> Result<(), DriverError> {
     let mirrored = f64::from_bits(got.to_bits().swap_bytes());
     if got.to_bits() == mark.to_bits() {
         Ok(())
@@ -256,7 +257,7 @@ pub(crate) mod tests {
     }
 
     #[test]
-    fn what_is_written_is_read_again() {
+    fn vectors_round_trip() {
         for sequence in [0, 1, 1 << 40] {
             let vector = encode_state(&state(sequence)).unwrap();
             assert_eq!(from_bytes(&to_bytes(&vector)), vector);
@@ -270,7 +271,7 @@ pub(crate) mod tests {
     }
 
     #[test]
-    fn numbers_stand_where_the_tables_say() {
+    fn numbers_are_at_the_documented_indices() {
         let vector = encode_command(&command(), 0.5).unwrap();
         let expected =
             [20_001.0, 41.0, 20.5, 1.0, -1.0, -0.75, -0.5, -0.25, 0.5, 0.5, 0.75, 1.0, 1.25, 0.5];
@@ -284,7 +285,7 @@ pub(crate) mod tests {
     }
 
     #[test]
-    fn a_command_that_no_arm_may_get_is_not_written() {
+    fn a_command_out_of_range_is_not_encoded() {
         let spoil = |change: fn(&mut Vec<ArmCommand>)| {
             let mut command = command();
             if let Order::Move(arms) = &mut command.order {
@@ -303,7 +304,7 @@ pub(crate) mod tests {
     }
 
     #[test]
-    fn a_vector_that_is_none_says_why() {
+    fn a_malformed_vector_is_refused_with_its_fault() {
         let good = encode_state(&state(3)).unwrap();
         let check = |idx: usize, value: f64, expected: &str| {
             let mut vector = good;
@@ -320,7 +321,7 @@ pub(crate) mod tests {
         check(3, 0.5, "newest command");
         check(6, f64::NAN, "number 6 of the vector is NaN");
         check(37, f64::NEG_INFINITY, "number 37 of the vector is -inf");
-        check(17, 2.0, "whether torques are told is 2, expected 0 or 1");
+        check(17, 2.0, "whether torques are reported is 2, expected 0 or 1");
         check(20, 0.5, "the emergency stop is 0.5");
         let mut garbled = encode_command(&command(), 0.01).unwrap();
         garbled[3] = 2.0;

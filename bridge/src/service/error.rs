@@ -1,4 +1,4 @@
-//! What can go wrong with the service.
+//! The errors of the service.
 
 use std::time::Duration;
 
@@ -7,69 +7,69 @@ use tonic::Status;
 
 use crate::driver::DriverError;
 use crate::executor::{CheckError, LeaseError, ResetError, StartError};
-use crate::service::motion::Refused;
+use crate::service::motion::MotionError;
 
-/// Why a call was not done, or the service ended.
+/// The reason why a call failed or the service ended.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum Error {
-    /// A request does not hold what it must.
+    /// A request is malformed.
     #[error(transparent)]
     Request(#[from] DecodeError),
-    /// Whoever asks does not own the arms.
+    /// The client does not own the arms.
     #[error(transparent)]
     Lease(#[from] LeaseError),
-    /// The arms were not let go.
+    /// The arms were not reset.
     #[error(transparent)]
     Reset(#[from] ResetError),
-    /// No new connection could be made in the place of one that has failed.
+    /// A failed connection could not be replaced.
     #[error("{0}")]
-    Dial(#[source] DriverError),
+    Reconnect(#[source] DriverError),
     /// The motion was not started.
     #[error(transparent)]
     Start(#[from] StartError),
     /// The motion is refused.
     #[error("the motion is refused: {0}")]
-    Refused(#[from] Refused),
+    Refused(#[from] MotionError),
     /// The position of the arms is not known, so no motion can be checked.
     #[error("the position of the arms is not known: see the status")]
     NoState,
-    /// The drives could not be told to stop.
+    /// The drives could not be commanded to stop.
     #[error("the drives could NOT be commanded to stop, use the emergency stop: {0}")]
-    Untold(#[source] DriverError),
+    StopFailed(#[source] DriverError),
     /// The thread that moves the arms has not answered.
     #[error("the thread that moves the arms has not answered within {0:?}: see the status")]
-    Overdue(Duration),
+    Timeout(Duration),
     /// The stream of a motion ended before it began.
-    #[error("the stream ended, or said nothing of use, before the motion began")]
-    Left,
+    #[error("the stream ended, or sent no start message, before the motion began")]
+    StreamEnded,
     /// The stream of a motion broke before it began.
     #[error("the stream broke before the motion began: {}", .0.message())]
-    Broken(Status),
-    /// The check of another motion takes its time.
+    StreamBroken(Status),
+    /// Other motions are being checked.
     #[error("other motions are being checked: try again")]
     Busy,
-    /// The thread that moves the arms has ended, and with it the service.
-    #[error("the bridge ends and has stopped the drives")]
-    Ended,
+    /// The service shuts down.
+    #[error("the bridge is shutting down and has stopped the drives")]
+    ShuttingDown,
     /// The thread that moves the arms has panicked, and the service ends.
-    #[error("the bridge has a bug, has stopped the drives and ends: its log says more")]
+    #[error("the bridge has a bug, has stopped the drives and shuts down: see its log")]
     Panicked,
     /// The thread that moves the arms did not end in time.
-    #[error("the driver did not come back: the drives were not told to stop by the service's end")]
-    Stuck,
+    #[error("the driver hangs: the service ended without stopping the drives")]
+    DriverHung,
     /// The thread that moves the arms cannot be started.
     #[error("cannot start a thread")]
     Thread(#[source] std::io::Error),
-    /// The service cannot be offered.
+    /// The service cannot be set up.
     #[error(transparent)]
-    Gate(#[from] tandem_net::ServerConfigError),
-    /// The server stopped unasked.
+    ServerConfig(#[from] tandem_net::ServerConfigError),
+    /// The server failed.
     #[error("cannot serve")]
     Transport(#[from] tonic::transport::Error),
 }
 
-/// What a client is told of an error.
+/// Converts an error to the status that clients receive.
 pub(super) fn status(error: &Error) -> Status {
     let message = error.to_string();
     match error {
@@ -78,27 +78,27 @@ pub(super) fn status(error: &Error) -> Status {
         | Error::Reset(ResetError::Lease(error))
         | Error::Start(StartError::Lease(error)) => match error {
             LeaseError::Held { .. } => Status::permission_denied(message),
-            LeaseError::Nobody => Status::failed_precondition(message),
+            LeaseError::NotOwned => Status::failed_precondition(message),
         },
         Error::Start(StartError::Refused(refusal)) => {
-            // The refusal itself stands in the error's source.
+            // The message does not contain the refusal, which is the error's source.
             Status::failed_precondition(format!("{message}: {refusal}"))
         }
         Error::Reset(_) | Error::Start(_) | Error::Refused(_) | Error::NoState => {
             Status::failed_precondition(message)
         }
-        Error::Left => Status::cancelled(message),
-        Error::Broken(status) => Status::new(status.code(), message),
+        Error::StreamEnded => Status::cancelled(message),
+        Error::StreamBroken(status) => Status::new(status.code(), message),
         Error::Busy => Status::resource_exhausted(message),
-        Error::Ended | Error::Dial(_) => Status::unavailable(message),
-        Error::Overdue(_) | Error::Untold(_) => {
+        Error::ShuttingDown | Error::Reconnect(_) => Status::unavailable(message),
+        Error::Timeout(_) | Error::StopFailed(_) => {
             tracing::error!(%error, "request failed");
             Status::unavailable(message)
         }
         Error::Panicked
-        | Error::Stuck
+        | Error::DriverHung
         | Error::Thread(_)
-        | Error::Gate(_)
+        | Error::ServerConfig(_)
         | Error::Transport(_) => {
             tracing::error!(%error, "request failed");
             Status::internal(message)

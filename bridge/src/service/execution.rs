@@ -1,59 +1,59 @@
-//! A motion that a client executes: what its stream tells the thread that ticks, and the other way round.
+//! The motion that a client executes: the state shared by its stream and the arms' thread.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, OnceLock};
 
 use crate::executor::{Stop, Token};
 
-/// How a motion ended.
+/// The outcome of a motion.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) enum Outcome {
     Done,
     Stopped(Stop),
 }
 
-/// What a stream and the thread that ticks share. Neither ever waits for the other.
+/// The state shared by a stream and the arms' thread. Neither waits for the other.
 #[derive(Debug)]
 pub(super) struct Execution {
     pub(super) token: Token,
-    /// Share of the motion's own speed, in (0, 1].
+    /// The share of the motion's own speed, in (0, 1].
     pub(super) speed: f64,
-    heard: AtomicBool,
-    left: AtomicBool,
+    alive: AtomicBool,
+    abandoned: AtomicBool,
     outcome: OnceLock<Outcome>,
 }
 
-/// The stream's side: once it is dropped, the client has left.
+/// The stream's side: dropping it abandons the motion.
 #[derive(Debug)]
-pub(super) struct Attended(pub(super) Arc<Execution>);
+pub(super) struct AbandonOnDrop(pub(super) Arc<Execution>);
 
 impl Execution {
     pub(super) fn new(token: Token, speed: f64) -> Self {
-        let (heard, left) = (AtomicBool::new(false), AtomicBool::new(false));
-        Self { token, speed, heard, left, outcome: OnceLock::new() }
+        let (alive, abandoned) = (AtomicBool::new(false), AtomicBool::new(false));
+        Self { token, speed, alive, abandoned, outcome: OnceLock::new() }
     }
 
-    /// The client gave a sign of life.
-    pub(super) fn hear(&self) {
-        self.heard.store(true, Ordering::Release);
+    /// Records a sign of life of the client.
+    pub(super) fn mark_alive(&self) {
+        self.alive.store(true, Ordering::Release);
     }
 
-    /// Whether the client gave a sign of life since this was asked last.
-    pub(super) fn was_heard(&self) -> bool {
-        self.heard.swap(false, Ordering::AcqRel)
+    /// Returns whether the client gave a sign of life since the last call.
+    pub(super) fn take_alive(&self) -> bool {
+        self.alive.swap(false, Ordering::AcqRel)
     }
 
-    /// The client's stream has ended or is broken.
-    pub(super) fn leave(&self) {
-        self.left.store(true, Ordering::Release);
+    /// Records that the client's stream has ended or is broken.
+    pub(super) fn abandon(&self) {
+        self.abandoned.store(true, Ordering::Release);
     }
 
-    pub(super) fn is_left(&self) -> bool {
-        self.left.load(Ordering::Acquire)
+    pub(super) fn is_abandoned(&self) -> bool {
+        self.abandoned.load(Ordering::Acquire)
     }
 
-    /// The first end stands.
-    pub(super) fn end(&self, outcome: Outcome) {
+    /// Records the outcome. Later calls have no effect.
+    pub(super) fn finish(&self, outcome: Outcome) {
         self.outcome.set(outcome).ok();
     }
 
@@ -62,8 +62,8 @@ impl Execution {
     }
 }
 
-impl Drop for Attended {
+impl Drop for AbandonOnDrop {
     fn drop(&mut self) {
-        self.0.leave();
+        self.0.abandon();
     }
 }

@@ -1,4 +1,4 @@
-//! The bridge's own words as messages.
+//! Conversions of the bridge's types to messages.
 
 use tandem_kinematics::plan::{MAX_STEP_M, MAX_WAYPOINTS};
 use tandem_kinematics::{ForwardKinematics, Gaps, Joints, Motion, PlacedArm, WorkCell};
@@ -7,27 +7,27 @@ use tandem_proto::{DecodeError, pb};
 use crate::driver::ArmReading;
 use crate::executor::{CheckError, CheckedMotion, Checker, Phase, Stop, Token};
 use crate::service::execution::Outcome;
-use crate::service::motion::Refused;
+use crate::service::motion::MotionError;
+use crate::service::reason_codes::{self, Values};
 use crate::service::thread::Snapshot;
-use crate::service::words::{self, Numbers};
 
 /// Hexadecimal digits of a token.
 const TOKEN_DIGITS: usize = 32;
 
-/// A token as clients show it.
+/// Encodes a token as text.
 pub(super) fn token_text(token: Token) -> String {
     format!("{:032x}", token.0)
 }
 
-/// The token in field `field`.
+/// Decodes the token in field `field`.
 pub(super) fn decode_token(field: &str, text: &str) -> Result<Token, DecodeError> {
     let is_token = text.len() == TOKEN_DIGITS && text.bytes().all(|b| b.is_ascii_hexdigit());
     match u128::from_str_radix(text, 16) {
         Ok(token) if is_token => Ok(Token(token)),
-        // A token is a secret: what came instead is not repeated.
+        // The error must not repeat a token, which is a secret.
         _ => {
             let got = format_args!("{} bytes", text.len()).to_string();
-            Err(DecodeError::new(field, "the token that Acquire gave", got))
+            Err(DecodeError::new(field, "the token that Acquire returned", got))
         }
     }
 }
@@ -41,7 +41,7 @@ pub(super) fn describe_arm(placed: &PlacedArm) -> pb::ArmDescription {
     };
     pb::ArmDescription {
         model: placed.model.name.to_owned(),
-        base_in_world_m: numbers_of(placed.base_in_world_m.into()),
+        base_in_world_m: coordinates(placed.base_in_world_m.into()),
         yaw_rad: placed.yaw_rad,
         joints: placed.model.joints.iter().map(joint).collect(),
     }
@@ -52,7 +52,7 @@ pub(super) fn task_frame(cell: &WorkCell) -> pb::TaskFrameDescription {
     pb::TaskFrameDescription { scale: frame.scale, centre_m: frame.centre_m, lift_m: frame.lift_m }
 }
 
-/// What the arms may do; `speed` is the bound of all motions.
+/// The limits of the arms; `speed` is the upper bound of all motions.
 pub(super) fn limits(checker: &Checker, speed: f64) -> pb::BridgeLimits {
     let settings = checker.settings();
     let check = &settings.check;
@@ -82,7 +82,7 @@ pub(super) fn limits(checker: &Checker, speed: f64) -> pb::BridgeLimits {
     }
 }
 
-/// An accepted motion, with the smallest gaps at its samples.
+/// Describes an accepted motion with the smallest gaps at its samples.
 pub(super) fn accepted(checked: &CheckedMotion, cell: &WorkCell, speed: f64) -> pb::AcceptedMotion {
     let motion = checked.motion();
     let mut table_gap_m = vec![f64::INFINITY; cell.arms.len()];
@@ -109,45 +109,45 @@ fn gaps_at(motion: &Motion, sample: usize, cell: &WorkCell) -> Gaps {
     cell.gaps_with(&angles, &openings)
 }
 
-/// A refused motion.
-pub(super) fn refusal(refused: &Refused) -> pb::MotionRefusal {
-    let (word, when_s, arm, way_point) = match refused {
-        Refused::Plan(error) => {
-            let (word, way_point, arm) = words::of_plan(error);
-            (word, None, arm, way_point)
+/// Describes a refused motion.
+pub(super) fn refusal(refused: &MotionError) -> pb::MotionRefusal {
+    let (code, when_s, arm, way_point) = match refused {
+        MotionError::Plan(error) => {
+            let (code, way_point, arm) = reason_codes::of_plan(error);
+            (code, None, arm, way_point)
         }
-        Refused::Check(error) => {
+        MotionError::Check(error) => {
             let (when_s, arm) = match error {
                 CheckError::Refused(refusal) => (refusal.when_s, refusal.arm),
                 CheckError::RangeMargin { when_s, arm, .. } => (*when_s, *arm),
             };
-            (words::of_check(error), Some(when_s), Some(arm.0), None)
+            (reason_codes::of_check(error), Some(when_s), Some(arm.0), None)
         }
     };
     pb::MotionRefusal {
-        name: word.name.to_owned(),
+        name: code.name.to_owned(),
         sentence: refused.to_string(),
         when_s,
         arm: arm.map(index),
-        joint: word.joint.map(index),
+        joint: code.joint.map(index),
         way_point: way_point.map(index),
-        got: word.numbers.map(|numbers| numbers.got),
-        allowed: word.numbers.and_then(|numbers| numbers.allowed),
-        unit: unit(word.numbers),
+        got: code.values.map(|values| values.got),
+        allowed: code.values.and_then(|values| values.allowed),
+        unit: unit(code.values),
     }
 }
 
 pub(super) fn stop(stop: &Stop) -> pb::BridgeStop {
-    let (name, numbers) = words::of_cause(&stop.cause);
+    let (name, values) = reason_codes::of_cause(&stop.cause);
     pb::BridgeStop {
         name: name.to_owned(),
         sentence: stop.to_string(),
         when_s: stop.when_s,
         arm: stop.arm.map(|arm| index(arm.0)),
         joint: stop.joint.map(index),
-        got: numbers.map(|numbers| numbers.got),
-        allowed: numbers.and_then(|numbers| numbers.allowed),
-        unit: unit(numbers),
+        got: values.map(|values| values.got),
+        allowed: values.and_then(|values| values.allowed),
+        unit: unit(values),
     }
 }
 
@@ -170,7 +170,7 @@ pub(super) fn phase(phase: Phase) -> pb::BridgePhase {
     }
 }
 
-/// The arms as they were last seen; empty when their position is not known.
+/// The newest states of the arms; empty if there is no valid one.
 pub(super) fn arms(snapshot: &Snapshot, cell: &WorkCell) -> Vec<pb::ArmState> {
     let Some(state) = &snapshot.state else { return Vec::new() };
     let reference = |arm: usize| snapshot.reference.as_ref().map(|all| all[arm]);
@@ -181,7 +181,7 @@ pub(super) fn arms(snapshot: &Snapshot, cell: &WorkCell) -> Vec<pb::ArmState> {
 fn arm_state(reading: &ArmReading, placed: &PlacedArm, reference: Option<Joints>) -> pb::ArmState {
     let tool = |angles: &Joints| {
         let tool_in_base_m = ForwardKinematics::new(placed.model, angles).tool_m();
-        numbers_of((placed.world_from_base() * tool_in_base_m).into())
+        coordinates((placed.world_from_base() * tool_in_base_m).into())
     };
     pb::ArmState {
         angles_rad: reading.angles.to_vec(),
@@ -196,14 +196,14 @@ fn arm_state(reading: &ArmReading, placed: &PlacedArm, reference: Option<Joints>
     }
 }
 
-fn unit(numbers: Option<Numbers>) -> String {
-    numbers.map_or_else(String::new, |numbers| numbers.unit.to_owned())
+fn unit(values: Option<Values>) -> String {
+    values.map_or_else(String::new, |values| values.unit.to_owned())
 }
 
-fn numbers_of(point: [f64; 3]) -> Vec<f64> {
+fn coordinates(point: [f64; 3]) -> Vec<f64> {
     point.to_vec()
 }
 
 fn index(index: usize) -> u32 {
-    u32::try_from(index).expect("arms, joints and way points are some thousand at most")
+    u32::try_from(index).expect("arms, joints and waypoints number a few thousand at most")
 }

@@ -1,4 +1,4 @@
-//! From a request to a motion that has passed the check.
+//! Turns a request into a checked motion.
 
 use tandem_kinematics::plan::MAX_WAYPOINTS;
 use tandem_kinematics::{
@@ -10,83 +10,84 @@ use tandem_proto::{DecodeError, pb};
 use crate::driver::PairState;
 use crate::executor::{CheckError, CheckedMotion, Checker};
 
-/// Most samples of a joint motion: more than ten minutes at 100 a second have.
+/// The largest number of samples of a joint motion: ten minutes at 100 samples per second.
 const MAX_SAMPLES: usize = 60_001;
-/// Samples a second of what is planned here.
+/// Samples per second of planned motions.
 const RATE_HZ: f64 = 100.0;
 
-/// What a client wants the arms to do.
+/// The motion that a client requests.
 #[derive(Debug, Clone, PartialEq)]
-pub(super) struct Wanted {
-    pub(super) way: Way,
-    /// Share of the motion's own speed, in (0, 1].
+pub(super) struct MotionSpec {
+    pub(super) path: MotionPath,
+    /// The share of the motion's own speed, in (0, 1].
     pub(super) speed: f64,
 }
 
 #[derive(Debug, Clone, PartialEq)]
-pub(super) enum Way {
-    /// Places of the tools.
-    Tools { way_points: Vec<Waypoint>, step_s: f64, from_here: bool },
-    /// Angles of the joints.
-    Joints(Motion),
+pub(super) enum MotionPath {
+    /// Positions of the tools, to be planned.
+    Waypoints { way_points: Vec<Waypoint>, step_s: f64, from_here: bool },
+    /// Samples of the joints' angles.
+    JointSamples(Motion),
 }
 
-/// Why the arms do not do it.
+/// The reason why a motion is refused.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
-pub enum Refused {
-    /// There is no way through these way points.
-    #[error("{}{}", .0, because(.0))]
+pub enum MotionError {
+    /// No trajectory leads through the waypoints.
+    #[error("{}{}", .0, cause_of(.0))]
     Plan(PlanError),
     /// The motion breaks a limit.
     #[error(transparent)]
     Check(#[from] CheckError),
 }
 
-/// What stands behind a plan's error.
-fn because(error: &PlanError) -> String {
+/// The cause of a planning error, to be appended to its message.
+fn cause_of(error: &PlanError) -> String {
     match error {
         PlanError::Unreachable { source, .. } => format!(": {source}"),
         _ => String::new(),
     }
 }
 
-impl Wanted {
-    /// What `request` wants of the arms of `cell`; fields are named from the motion on.
+impl MotionSpec {
+    /// Decodes `request` for the arms of `cell`. Errors name fields relative to the motion.
     pub(super) fn decode(request: pb::MotionRequest, cell: &WorkCell) -> Result<Self, DecodeError> {
         use pb::motion_request::Motion as M;
         let speed = within("speed", request.speed, "more than 0 and at most 1", |speed| {
             speed > 0.0 && speed <= 1.0
         })?;
-        let way = match request.motion {
+        let path = match request.motion {
             Some(M::WayPoints(message)) => {
-                decode_tools(message, cell).map_err(|error| error.within("way_points"))?
+                decode_waypoints(message, cell).map_err(|error| error.within("way_points"))?
             }
             Some(M::JointMotion(message)) => {
-                decode_joints(message, cell).map_err(|error| error.within("joint_motion"))?
+                decode_joint_samples(message, cell).map_err(|error| error.within("joint_motion"))?
             }
             None => return Err(DecodeError::new("motion", "way_points or joint_motion", "none")),
         };
-        Ok(Self { way, speed })
+        Ok(Self { path, speed })
     }
 
-    /// The motion from where the arms are, checked.
+    /// Plans the motion from the position of the arms, if necessary, and checks it.
     pub(super) fn prepare(
         self,
         state: &PairState,
         checker: &Checker,
-    ) -> Result<CheckedMotion, Refused> {
+    ) -> Result<CheckedMotion, MotionError> {
         let at: Vec<Joints> = state.arms.iter().map(|arm| arm.angles).collect();
-        let motion = match self.way {
-            Way::Joints(motion) => motion,
-            Way::Tools { mut way_points, step_s, from_here } => {
+        let motion = match self.path {
+            MotionPath::JointSamples(motion) => motion,
+            MotionPath::Waypoints { mut way_points, step_s, from_here } => {
                 if from_here {
-                    way_points.insert(0, here(state, checker.cell()));
+                    way_points.insert(0, tool_positions(state, checker.cell()));
                 }
                 let limits = checker.settings().check.limits;
                 let settings = PlanSettings { limits, step_s, ..PlanSettings::default() };
                 let planned = plan(checker.cell(), &way_points, &at, &settings);
-                let planned = planned.map_err(|error| Refused::Plan(numbered(error, from_here)))?;
-                // Refused before it is sampled, which takes memory.
+                let planned =
+                    planned.map_err(|error| MotionError::Plan(renumbered(error, from_here)))?;
+                // The check will refuse a long motion: do not spend memory on its samples.
                 let longest_s = checker.settings().check.duration_s;
                 let rate_hz = if planned.duration_s() > 2.0 * longest_s { 1.0 } else { RATE_HZ };
                 planned.sampled(rate_hz)
@@ -96,8 +97,8 @@ impl Wanted {
     }
 }
 
-/// Where the tools are.
-fn here(state: &PairState, cell: &WorkCell) -> Waypoint {
+/// The present positions of the tools.
+fn tool_positions(state: &PairState, cell: &WorkCell) -> Waypoint {
     let arms = state.arms.iter().zip(&cell.arms);
     let way_point = |(arm, placed): (&crate::ArmReading, &tandem_kinematics::PlacedArm)| {
         let tool = ForwardKinematics::new(placed.model, &arm.angles).tool_m();
@@ -109,9 +110,9 @@ fn here(state: &PairState, cell: &WorkCell) -> Waypoint {
     arms.map(way_point).collect()
 }
 
-/// The error with way points counted as the client counts them.
-fn numbered(error: PlanError, from_here: bool) -> PlanError {
-    let client = |waypoint: usize| waypoint.saturating_sub(usize::from(from_here));
+/// Returns the error with waypoints counted as the client counts them.
+fn renumbered(error: PlanError, from_here: bool) -> PlanError {
+    let client = |way_point: usize| way_point.saturating_sub(usize::from(from_here));
     match error {
         PlanError::Step { waypoint, arm, step_m } => {
             PlanError::Step { waypoint: client(waypoint), arm, step_m }
@@ -126,7 +127,7 @@ fn numbered(error: PlanError, from_here: bool) -> PlanError {
     }
 }
 
-fn decode_tools(message: pb::WayPoints, cell: &WorkCell) -> Result<Way, DecodeError> {
+fn decode_waypoints(message: pb::WayPoints, cell: &WorkCell) -> Result<MotionPath, DecodeError> {
     let (from_here, got) = (message.from_here, message.way_points.len());
     let (least, most) = if from_here { (1, MAX_WAYPOINTS - 1) } else { (2, MAX_WAYPOINTS) };
     if !(least..=most).contains(&got) {
@@ -141,7 +142,11 @@ fn decode_tools(message: pb::WayPoints, cell: &WorkCell) -> Result<Way, DecodeEr
             .map_err(|error| error.within(format_args!("way_points[{idx}]")))
     };
     let way_points = message.way_points.into_iter().enumerate().map(decode_indexed);
-    Ok(Way::Tools { way_points: way_points.collect::<Result<_, _>>()?, step_s, from_here })
+    Ok(MotionPath::Waypoints {
+        way_points: way_points.collect::<Result<_, _>>()?,
+        step_s,
+        from_here,
+    })
 }
 
 fn decode_way_point(message: pb::BridgeWayPoint, cell: &WorkCell) -> Result<Waypoint, DecodeError> {
@@ -169,7 +174,10 @@ fn decode_arm(message: &pb::ArmWayPoint) -> Result<ArmWaypoint, DecodeError> {
     })
 }
 
-fn decode_joints(message: pb::JointMotion, cell: &WorkCell) -> Result<Way, DecodeError> {
+fn decode_joint_samples(
+    message: pb::JointMotion,
+    cell: &WorkCell,
+) -> Result<MotionPath, DecodeError> {
     let expected = "a number of seconds in [0.001, 0.1]";
     let period_s = within("period_s", message.period_s, expected, |period_s| {
         (0.001..=0.1).contains(&period_s)
@@ -194,7 +202,7 @@ fn decode_joints(message: pb::JointMotion, cell: &WorkCell) -> Result<Way, Decod
         let samples = message.samples.into_iter().enumerate().map(decode_indexed);
         arms.push(samples.collect::<Result<_, _>>()?);
     }
-    Ok(Way::Joints(Motion { period_s, arms }))
+    Ok(MotionPath::JointSamples(Motion { period_s, arms }))
 }
 
 fn decode_sample(message: &pb::JointSample, n_joints: usize) -> Result<ArmSample, DecodeError> {
@@ -234,7 +242,7 @@ fn decode_opening(opening: f64) -> Result<f64, DecodeError> {
     within("opening", opening, "a number in [0, 1]", |opening| (0.0..=1.0).contains(&opening))
 }
 
-/// `value` when it `fits`, which no NaN does.
+/// Returns `value` if it `fits`. NaN fits no range.
 fn within(
     field: &str,
     value: f64,

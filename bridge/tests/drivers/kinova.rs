@@ -68,7 +68,7 @@ impl Test {
         test
     }
 
-    /// Resets and waits until both nodes are started.
+    /// Resets and waits until both nodes have started.
     fn let_go(&mut self) {
         self.rig.reset();
         for _ in 0..30 {
@@ -93,7 +93,7 @@ impl Test {
         self.side.ros().nodes.each_ref().map(|node| *node.calls.get(service).unwrap_or(&0))
     }
 
-    /// Nothing is published any more, and the arms rest and stay.
+    /// Asserts that nothing is published and the arms stay at rest.
     fn assert_rests(&mut self) {
         for _ in 0..30 {
             self.rig.tick();
@@ -143,7 +143,7 @@ fn arms_that_tell_at_50_hz_are_moved_as_well() {
 }
 
 #[test]
-fn grippers_move_while_the_arms_stand() {
+fn grippers_move_while_the_arms_are_stationary() {
     let mut test = Test::new([0.8, 0.8, 0.4, 0.4]);
     test.let_go();
     test.rig.start(&test.motion);
@@ -164,7 +164,7 @@ fn grippers_move_while_the_arms_stand() {
 }
 
 #[test]
-fn states_that_come_again_or_late_are_not_new() {
+fn repeated_and_late_states_are_not_new() {
     let mut test = Test::moving();
     test.side.begin(Fault::Again);
     test.rig.play();
@@ -172,7 +172,7 @@ fn states_that_come_again_or_late_are_not_new() {
 }
 
 #[test]
-fn what_is_no_state_ends_the_connection_and_the_arms_rest() {
+fn a_malformed_state_ends_the_connection_and_stops_the_arms() {
     let ends = |fault: Fault, expected: &str| {
         let mut test = Test::moving();
         test.side.begin(fault);
@@ -180,7 +180,7 @@ fn what_is_no_state_ends_the_connection_and_the_arms_rest() {
         let error = failure(&cause).to_string();
         assert!(error.contains(expected), "{error}");
         test.assert_rests();
-        // Whoever tells the arms to stop does so before the socket is shut.
+        // The driver stops the arms before it closes the socket.
         if fault != Fault::Close {
             eventually("the stops arrive", || {
                 test.side.pass();
@@ -215,7 +215,7 @@ fn silent_arms_are_stopped() {
 }
 
 #[test]
-fn velocities_that_are_stuck_stop_the_arms_and_prevent_a_reset() {
+fn undelivered_velocities_stop_the_arms_and_prevent_a_reset() {
     let mut test = Test::moving();
     test.side.begin(Fault::Lags);
     let cause = test.rig.until_stopped();
@@ -227,7 +227,7 @@ fn velocities_that_are_stuck_stop_the_arms_and_prevent_a_reset() {
 }
 
 #[test]
-fn velocities_that_are_dropped_do_not_add_up() {
+fn dropped_velocities_do_not_accumulate() {
     let mut test = Test::moving();
     test.side.begin(Fault::Drops);
     test.rig.play();
@@ -238,7 +238,7 @@ fn velocities_that_are_dropped_do_not_add_up() {
 }
 
 #[test]
-fn stopped_arms_go_on_after_a_reset_and_not_before() {
+fn stopped_arms_move_again_only_after_a_reset() {
     let mut test = Test::moving();
     test.rig.executor.stop(test.rig.now_s);
     test.assert_rests();
@@ -248,7 +248,7 @@ fn stopped_arms_go_on_after_a_reset_and_not_before() {
 }
 
 #[test]
-fn a_service_that_refuses_or_does_not_answer_ends_the_connection() {
+fn a_service_that_fails_or_does_not_respond_ends_the_connection() {
     let ends = |fault: Fault, expected: &str| {
         let mut test = Test::moving();
         test.side.begin(fault);
@@ -284,7 +284,7 @@ fn a_service_that_refuses_or_does_not_answer_ends_the_connection() {
 }
 
 #[test]
-fn arms_whose_commander_hangs_or_is_killed_stand_still() {
+fn arms_stop_when_the_bridge_hangs_or_is_killed() {
     let test = Test::moving();
     let n_velocities = test.n_velocities();
     for _ in 0..30 {
@@ -334,7 +334,7 @@ fn nothing_moves_over_a_new_connection_before_a_reset() {
 }
 
 #[test]
-fn a_connection_has_to_begin_with_a_stop() {
+fn a_connection_has_to_start_with_a_stop() {
     let side = Side::new(&pair_at(&sweep(STEADY)));
     let mut driver = connected(&side);
     let arm = ArmCommand { velocities: Joints::from_fn(4, |_| 0.3), opening: 0.5 };
@@ -349,7 +349,7 @@ fn a_connection_has_to_begin_with_a_stop() {
 }
 
 #[test]
-fn commands_do_not_pile_up_before_a_rosbridge_that_does_not_read() {
+fn commands_do_not_accumulate_if_rosbridge_does_not_read() {
     let side = Side::new(&pair_at(&sweep(STEADY)));
     let mut driver = connected(&side);
     let arm = ArmCommand { velocities: Joints::from_fn(4, |_| 0.0), opening: 0.8 };
@@ -362,13 +362,13 @@ fn commands_do_not_pile_up_before_a_rosbridge_that_does_not_read() {
         driver.exchange(&moves(number)).unwrap();
         side.ros().nodes.iter().all(|node| node.n_velocities > 0)
     });
-    // From here on nobody reads.
+    // From here on the peer does not read.
     let error = (number..10_000_000).find_map(|number| driver.exchange(&moves(number)).err());
     assert!(error.unwrap().to_string().contains("rosbridge holds 100 velocities"));
 }
 
 #[test]
-fn a_connection_without_states_says_what_to_look_at() {
+fn a_connection_without_states_suggests_what_to_check() {
     let config = |address: String| KinovaRosConfig {
         connect_timeout: Duration::from_millis(300),
         ..KinovaRosConfig::at(address)

@@ -1,5 +1,5 @@
-//! A stand-in for rosbridge and two nodes of kinova-ros: follows velocities only while they are published, moves fingers by goals, and serves
-//! `in/stop` and `in/start`.
+//! A stand-in for rosbridge and two nodes of kinova-ros: follows velocities only while they are published, moves
+//! fingers by goals, and serves `in/stop` and `in/start`.
 
 use std::collections::BTreeMap;
 use std::net::{SocketAddr, TcpListener, TcpStream};
@@ -15,12 +15,12 @@ use tungstenite::{Message, WebSocket};
 use crate::rig::SharedPair;
 
 pub(crate) const NODES: [&str; 2] = ["/left/m1n4s200_driver", "/right/m1n4s200_driver"];
-/// Periods that `in/start` takes, in which a node does nothing else.
+/// The duration of `in/start` in periods, in which a node does nothing else.
 const START_PERIODS: u32 = 5;
-/// Seconds of ROS' clock at the beginning.
+/// The initial time of ROS' clock, seconds.
 const EPOCH_S: u64 = 1_700_000_000;
 
-/// What goes wrong from now on.
+/// A fault of the arms' side.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) enum Fault {
     /// A position is `null`.
@@ -31,23 +31,23 @@ pub(crate) enum Fault {
     Names,
     /// The connection is closed.
     Close,
-    /// This many arms tell nothing.
+    /// This many arms report nothing.
     Silent(usize),
-    /// Every state comes twice, and the one before once more.
+    /// Every state is sent twice, followed by the previous one.
     Again,
     /// The second arm's clock is two seconds ahead.
     Clock,
     /// A service fails.
     Refuses(&'static str),
-    /// Services do not answer.
+    /// Services do not respond.
     NoAnswers,
-    /// rosbridge says that something is wrong.
+    /// rosbridge reports an error.
     Complains,
-    /// rosbridge does not hand on velocities.
+    /// rosbridge does not publish velocities.
     Lags,
     /// rosbridge drops some velocities, as a queue of length 1 does.
     Drops,
-    /// Somebody else moves the first arm.
+    /// Another node moves the first arm.
     Stranger,
 }
 
@@ -62,15 +62,15 @@ pub(crate) struct Side {
 #[derive(Default)]
 pub(crate) struct Node {
     pub(crate) stopped: bool,
-    /// Velocities of this period, radians per second.
+    /// The velocities of this period, radians per second.
     rates: Option<Joints>,
     opening: f64,
     goal: Option<(String, u32)>,
-    /// The call of `in/start` that is under way, and the periods until it is done.
+    /// The pending call of `in/start` and the periods until its response.
     starting: Option<(Value, u32)>,
     /// Messages with velocities.
     pub(crate) n_velocities: usize,
-    /// Those that came while the fingers moved.
+    /// Velocities that arrived while the fingers moved.
     pub(crate) n_while_busy: usize,
     /// Goals for the fingers, in turns.
     pub(crate) goals: Vec<Value>,
@@ -82,9 +82,9 @@ pub(crate) struct Ros {
     pub(crate) nodes: [Node; 2],
     pub(crate) pair: SharedPair,
     pub(crate) fault: Option<Fault>,
-    /// States are told in every so many periods.
+    /// Periods between two states.
     pub(crate) every: u64,
-    /// Whether the test lets periods pass, and not a thread.
+    /// Whether the test advances time instead of a thread.
     by_hand: bool,
     socket: Option<WebSocket<TcpStream>>,
     subscribed: Vec<String>,
@@ -95,7 +95,7 @@ pub(crate) struct Ros {
 impl Side {
     pub(crate) fn new(pair: &SharedPair) -> Self {
         let listener = TcpListener::bind("127.0.0.1:0").unwrap();
-        let opening = pair.lock().unwrap().pass().arms[0].opening;
+        let opening = pair.lock().unwrap().skip_period().arms[0].opening;
         let node = || Node { opening, ..Node::default() };
         let ros = Ros {
             nodes: [node(), node()],
@@ -114,7 +114,7 @@ impl Side {
         side
     }
 
-    /// Takes one peer after the other. Until the test takes over, time passes by itself.
+    /// Serves one peer after the other. Time advances by itself until the test takes over.
     fn serve(&self, listener: &TcpListener) {
         for stream in listener.incoming() {
             let Ok(socket) = tungstenite::accept(stream.unwrap()) else { continue };
@@ -142,14 +142,14 @@ impl Side {
         self.ros().fault = Some(fault);
     }
 
-    /// Lets a period pass. Whether both arms have told a state.
+    /// Simulates a period. Returns whether both arms have published a state.
     pub(crate) fn pass(&self) -> bool {
         self.ros().pass()
     }
 }
 
 impl Ros {
-    /// Whether somebody is connected.
+    /// Returns whether a peer is connected.
     pub(crate) fn connected(&mut self) -> bool {
         self.hear();
         self.socket.is_some()
@@ -167,12 +167,12 @@ impl Ros {
         self.finish_starts();
         let starting = self.nodes.iter().any(|node| node.starting.is_some());
         let due = self.n_passes.is_multiple_of(self.every) && !starting;
-        let told = due && self.socket.is_some() && self.tell(&state);
+        let published = due && self.socket.is_some() && self.publish(&state);
         self.before = Some(state);
-        told
+        published
     }
 
-    /// Reads all that has come.
+    /// Reads all messages that have arrived.
     fn hear(&mut self) {
         while let Some(socket) = &mut self.socket {
             match socket.read() {
@@ -271,7 +271,7 @@ impl Ros {
         }
     }
 
-    /// Goals end when fingers are where they shall be, or stalled.
+    /// Ends goals whose fingers have arrived or stall.
     fn end_goals(&mut self, state: &PairState) {
         for (arm, name) in NODES.iter().enumerate() {
             let node = &mut self.nodes[arm];
@@ -286,8 +286,8 @@ impl Ros {
         }
     }
 
-    /// Publishes where the arms are. Whether both have been told.
-    fn tell(&mut self, state: &PairState) -> bool {
+    /// Publishes the states of the arms. Returns whether both were published.
+    fn publish(&mut self, state: &PairState) -> bool {
         match self.fault {
             Some(Fault::Close) => {
                 self.socket = None;
@@ -367,7 +367,7 @@ impl Ros {
 }
 
 impl Node {
-    /// What the arm does in the coming period: nothing without a velocity.
+    /// The command of the arm for the coming period: no motion without a velocity.
     fn command(&mut self) -> ArmCommand {
         let rates = self.rates.take().filter(|_| !self.stopped);
         ArmCommand {

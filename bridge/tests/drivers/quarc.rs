@@ -69,7 +69,7 @@ impl Test {
         assert!(!at_rest(&self.side.pair));
     }
 
-    /// The connection ends, and with it the motion.
+    /// Asserts that the connection ends and the motion stops.
     fn assert_ends(mut self, expected: &str) {
         let cause = self.rig.until_stopped();
         let error = failure(&cause).to_string();
@@ -80,7 +80,7 @@ impl Test {
         for _ in 0..20 {
             assert_eq!(self.rig.tick(), Phase::Stopped);
         }
-        // The first stop stands, and no reset helps: this driver is done.
+        // The first stop is kept, and a reset fails: this driver cannot be used again.
         assert_eq!(self.rig.executor.stopped_by().unwrap().cause, cause);
         let reset = self.rig.executor.reset(OWNER, self.rig.now_s);
         assert!(matches!(reset, Err(ResetError::States { .. })), "{reset:?}");
@@ -106,7 +106,7 @@ fn a_motion_is_played_to_its_end() {
 }
 
 #[test]
-fn vectors_that_come_in_pieces_or_two_at_once_are_taken() {
+fn vectors_in_pieces_or_two_at_once_are_accepted() {
     let mut test = Test::new();
     test.side.begin(Fault::Split);
     test.rig.reset();
@@ -129,7 +129,7 @@ fn vectors_that_come_in_pieces_or_two_at_once_are_taken() {
 }
 
 #[test]
-fn what_is_no_state_ends_the_connection_and_the_arms_rest() {
+fn a_malformed_state_ends_the_connection_and_stops_the_arms() {
     let ends = |fault: Fault, expected: &str| {
         let test = Test::moving();
         test.side.begin(fault);
@@ -144,7 +144,7 @@ fn what_is_no_state_ends_the_connection_and_the_arms_rest() {
 }
 
 #[test]
-fn vectors_of_another_length_end_the_connection_and_the_arms_rest() {
+fn vectors_of_another_length_end_the_connection_and_stop_the_arms() {
     let ends = |fault: Fault, expected: &str| {
         let side = Side::new(&pair_at(&sweep(OPENINGS)));
         let mut driver = connected(&side);
@@ -171,7 +171,7 @@ fn arms_that_fall_silent_are_stopped() {
     test.waits.set(false);
     let cause = test.rig.until_stopped();
     assert!(matches!(cause, StopCause::StateStale(_)), "{cause}");
-    // The connection stands: the order to stop gets through.
+    // The connection still works: the order to stop arrives.
     eventually("the arms rest", || {
         test.rig.tick();
         at_rest(&test.side.pair)
@@ -180,7 +180,7 @@ fn arms_that_fall_silent_are_stopped() {
 }
 
 #[test]
-fn stopped_arms_go_on_over_the_same_connection_after_a_reset() {
+fn stopped_arms_move_again_over_the_same_connection_after_a_reset() {
     let mut test = Test::moving();
     test.rig.executor.stop(test.rig.now_s);
     let n_commands = test.side.commands.lock().unwrap().len();
@@ -201,7 +201,7 @@ fn stopped_arms_go_on_over_the_same_connection_after_a_reset() {
 }
 
 #[test]
-fn arms_whose_commander_dies_brake_by_themselves() {
+fn arms_brake_by_themselves_when_the_bridge_is_killed() {
     let motion = sweep(OPENINGS);
     let side = Side::new(&pair_at(&motion));
     let stream = TcpStream::connect(side.address).unwrap();
@@ -222,10 +222,10 @@ fn arms_whose_commander_dies_brake_by_themselves() {
 }
 
 #[test]
-fn arms_whose_commander_hangs_brake_by_themselves() {
+fn arms_brake_by_themselves_when_the_bridge_hangs() {
     let test = Test::moving();
     for _ in 0..10 {
-        test.side.pair.lock().unwrap().pass();
+        test.side.pair.lock().unwrap().skip_period();
     }
     assert!(at_rest(&test.side.pair));
 }
@@ -263,7 +263,7 @@ fn nothing_moves_over_a_new_connection_before_a_reset() {
 }
 
 #[test]
-fn a_connection_has_to_begin_with_a_stop() {
+fn a_connection_has_to_start_with_a_stop() {
     let motion = sweep(OPENINGS);
     let side = Side::new(&pair_at(&motion));
     let mut driver = connected(&side);
@@ -279,13 +279,13 @@ fn a_connection_has_to_begin_with_a_stop() {
 }
 
 #[test]
-fn commands_do_not_pile_up_before_arms_that_do_not_read() {
+fn commands_do_not_accumulate_if_the_arms_do_not_read() {
     let listener = TcpListener::bind("127.0.0.1:0").unwrap();
     let config = QuarcConfig {
         wait: Duration::ZERO,
         ..QuarcConfig::at(listener.local_addr().unwrap().to_string())
     };
-    let state = pair_at(&sweep(OPENINGS)).lock().unwrap().pass();
+    let state = pair_at(&sweep(OPENINGS)).lock().unwrap().skip_period();
     let server = thread::spawn(move || {
         let (mut stream, _) = listener.accept().unwrap();
         stream.write_all(&to_bytes(&encode_state(&state).unwrap())).unwrap();
@@ -295,12 +295,12 @@ fn commands_do_not_pile_up_before_arms_that_do_not_read() {
     let _unread = server.join().unwrap();
     let stop = |number| Command { number, order: Order::Stop };
     let error = (1..10_000_000).find_map(|number| driver.exchange(&stop(number)).err());
-    assert!(error.unwrap().to_string().contains("do not take commands any more"));
+    assert!(error.unwrap().to_string().contains("no longer accept commands"));
     assert!(driver.stop().is_err());
 }
 
 #[test]
-fn a_connection_that_brings_no_states_says_what_to_look_at() {
+fn a_connection_without_states_suggests_what_to_check() {
     let check = |sends: Vec<u8>, expected: &str| {
         let listener = TcpListener::bind("127.0.0.1:0").unwrap();
         let config = QuarcConfig {
@@ -317,7 +317,7 @@ fn a_connection_that_brings_no_states_says_what_to_look_at() {
         assert!(error.contains(expected), "{error}");
     };
     check(vec![], "sent 0 bytes, a state has 304");
-    let state = pair_at(&sweep(OPENINGS)).lock().unwrap().pass();
+    let state = pair_at(&sweep(OPENINGS)).lock().unwrap().skip_period();
     let vector = encode_state(&state).unwrap();
     check(to_bytes(&vector)[..296].to_vec(), "sent 296 bytes, a state has 304");
     let big_endian = vector.iter().flat_map(|number| number.to_be_bytes()).collect();

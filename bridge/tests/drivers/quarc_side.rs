@@ -1,4 +1,4 @@
-//! A stand-in for the Simulink model: reads commands and sends states as a stream server does, and brakes when it should.
+//! A stand-in for the Simulink model: a stream server that reads commands, sends states and brakes as required.
 
 use std::io::{Read as _, Write as _};
 use std::net::{SocketAddr, TcpListener, TcpStream};
@@ -14,24 +14,24 @@ use tandem_bridge::{Command, Driver as _, Order, PairState};
 
 use crate::rig::SharedPair;
 
-/// What goes wrong with the states that are sent from now on.
+/// A fault of the states that are sent.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) enum Fault {
-    /// Half of a vector, and then nothing.
+    /// Half of a vector and no further data.
     Short,
     /// A vector that lacks its last number.
     Narrow,
-    /// This number is this value.
+    /// The number at this index has this value.
     Number(usize, f64),
     /// The sequence jumps.
     Jump,
     /// The connection is closed.
     Close,
-    /// States do not come any more.
+    /// No states are sent.
     Mute,
-    /// Bytes come in two packets.
+    /// A state is sent in two packets.
     Split,
-    /// Two states come at once.
+    /// Two states are sent at once.
     Twice,
 }
 
@@ -40,14 +40,14 @@ pub(crate) struct Side {
     pub(crate) address: SocketAddr,
     pub(crate) pair: SharedPair,
     pub(crate) fault: Arc<Mutex<Option<Fault>>>,
-    /// Connections that have ended and whose arms were left alone for a while.
+    /// The number of ended connections after which the arms were without commands for a while.
     pub(crate) n_ended: Arc<AtomicUsize>,
     /// The commands of all connections.
     pub(crate) commands: Arc<Mutex<Vec<Command>>>,
 }
 
 impl Side {
-    /// Listens on a port of its own.
+    /// Listens on a free port.
     pub(crate) fn new(pair: &SharedPair) -> Self {
         let listener = TcpListener::bind("127.0.0.1:0").unwrap();
         let side = Self {
@@ -81,12 +81,12 @@ impl Side {
     }
 }
 
-/// Takes one peer after the other. Samples go on without a peer.
+/// Serves one peer after the other. Sampling continues without a peer.
 fn serve(listener: &TcpListener, mut model: Model, n_ended: &AtomicUsize) {
     for stream in listener.incoming() {
         model.talk(stream.unwrap());
         for _ in 0..20 {
-            model.pair.lock().unwrap().pass();
+            model.pair.lock().unwrap().skip_period();
         }
         n_ended.fetch_add(1, Ordering::SeqCst);
     }
@@ -103,7 +103,7 @@ impl Model {
     fn talk(&mut self, mut stream: TcpStream) {
         stream.set_nodelay(true).unwrap();
         let (mut number, mut obeys) = (0, false);
-        let state = self.pair.lock().unwrap().pass();
+        let state = self.pair.lock().unwrap().skip_period();
         if !self.send(&mut stream, state) {
             return;
         }
@@ -119,7 +119,7 @@ impl Model {
             }
             number = command.number;
             let mut pair = self.pair.lock().unwrap();
-            let state = if obeys { pair.exchange(&command).unwrap() } else { pair.pass() };
+            let state = if obeys { pair.exchange(&command).unwrap() } else { pair.skip_period() };
             drop(pair);
             if !self.send(&mut stream, state) {
                 return;
@@ -127,7 +127,7 @@ impl Model {
         }
     }
 
-    /// Sends a state, or what has become of it. Says whether to go on.
+    /// Sends a state with the present fault. Returns whether to continue.
     fn send(&mut self, stream: &mut TcpStream, state: PairState) -> bool {
         let fault = *self.fault.lock().unwrap();
         let mut vector = encode_state(&self.counted(state)).unwrap();
@@ -153,7 +153,7 @@ impl Model {
                 bytes.drain(..100);
             }
             Some(Fault::Twice) => {
-                let later = self.pair.lock().unwrap().pass();
+                let later = self.pair.lock().unwrap().skip_period();
                 bytes.extend(to_bytes(&encode_state(&self.counted(later)).unwrap()));
             }
             _ => {}

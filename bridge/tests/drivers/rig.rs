@@ -1,4 +1,4 @@
-//! An executor on a driver of real arms, with time that passes in exchanges and not by a clock.
+//! An executor on a driver of real arms. Time advances with exchanges and not by a clock.
 
 use std::cell::Cell;
 use std::rc::Rc;
@@ -7,21 +7,22 @@ use std::thread;
 use std::time::Duration;
 
 use glam::DVec3;
-use tandem_bridge::layout::{check_settings, mico_cell};
+use tandem_bridge::work_cell::{check_settings, mico_cell};
 use tandem_bridge::{
-    Command, Driver, DriverError, Executor, PairState, Phase, ResetError, Settings,
-    SimulatedConfig, SimulatedPair, StopCause, Token,
+    Command, Driver, DriverError, Executor, PairState, Phase, ResetError, Settings, StopCause,
+    Token,
 };
 use tandem_core::ArmIndex;
 use tandem_kinematics::{ArmWaypoint, Joints, Motion, PlanSettings, Waypoint, check, plan};
+use tandem_trials::{SimulatedConfig, SimulatedPair};
 
 pub(crate) const OWNER: Token = Token(5);
 pub(crate) const PERIOD_S: f64 = 0.01;
 
-/// Sequence of the state that a driver has got by connecting.
+/// The sequence number of the state that a driver receives by connecting.
 const FIRST: u64 = 1;
 
-/// A pair that a stand-in moves and a test looks at.
+/// A pair that a stand-in moves and a test inspects.
 pub(crate) type SharedPair = Arc<Mutex<SimulatedPair>>;
 
 /// A driver that can wait for a state.
@@ -29,12 +30,12 @@ pub(crate) trait Listen: Driver {
     fn listen(&mut self, patience: Duration) -> Result<PairState, DriverError>;
 }
 
-/// Exchanges, lets a period pass on the other side, and waits for the state that comes of it, however slow the machine is.
+/// Exchanges, simulates a period on the other side, and waits for its state on machines of any speed.
 pub(crate) struct Patient<D> {
     pub(crate) inner: D,
-    /// Lets a period pass on the other side, where that does not do so by itself.
+    /// Simulates a period on the other side, unless time advances there by itself.
     pass: Box<dyn FnMut()>,
-    /// Whether to wait; a test that lets states fail to come does not.
+    /// Whether to wait for states; false in tests without states.
     waits: Rc<Cell<bool>>,
     seen: u64,
 }
@@ -80,14 +81,14 @@ impl<D: Driver> Rig<D> {
         Self { executor: Executor::new(mico_cell(), driver, settings).unwrap(), now_s: 77.0 }
     }
 
-    /// Lets a period pass in which the owner is heard.
+    /// Simulates a period with a sign of life of the owner.
     pub(crate) fn tick(&mut self) -> Phase {
         self.now_s += PERIOD_S;
         self.executor.acquire(OWNER, self.now_s).unwrap();
         self.executor.tick(self.now_s)
     }
 
-    /// Lets go what is stopped.
+    /// Resets stopped arms.
     pub(crate) fn reset(&mut self) {
         let phase = self.try_reset();
         assert_eq!(phase, Phase::Idle, "{:?}", self.executor.stopped_by());
@@ -98,7 +99,7 @@ impl<D: Driver> Rig<D> {
         for _ in 0..15 {
             assert_eq!(self.tick(), Phase::Stopped);
         }
-        // Some arms tell less often than others.
+        // Some arms report less often than others.
         for _ in 0..100 {
             if let Err(ResetError::States { .. }) = self.executor.reset(OWNER, self.now_s) {
                 self.tick();
@@ -112,7 +113,7 @@ impl<D: Driver> Rig<D> {
         self.executor.start(OWNER, motion.clone(), 1.0, self.now_s).unwrap();
     }
 
-    /// Plays what was started to its end; the number of ticks.
+    /// Plays the motion to its end. Returns the number of ticks.
     pub(crate) fn play(&mut self) -> usize {
         for n in 1..100_000 {
             match self.tick() {
@@ -124,7 +125,7 @@ impl<D: Driver> Rig<D> {
         panic!("no end");
     }
 
-    /// Ticks until the executor stops, and says why.
+    /// Ticks until the executor stops. Returns the cause.
     pub(crate) fn until_stopped(&mut self) -> StopCause {
         for _ in 0..2000 {
             if self.tick() == Phase::Stopped {
@@ -135,7 +136,7 @@ impl<D: Driver> Rig<D> {
     }
 }
 
-/// What the driver failed by.
+/// The error of the driver.
 pub(crate) fn failure(cause: &StopCause) -> &DriverError {
     match cause {
         StopCause::Driver(error) => error,
@@ -143,7 +144,7 @@ pub(crate) fn failure(cause: &StopCause) -> &DriverError {
     }
 }
 
-/// Arms at rest where `motion` begins.
+/// Arms at rest at the start of `motion`.
 pub(crate) fn pair_at(motion: &Motion) -> SharedPair {
     let at: Vec<Joints> = motion.arms.iter().map(|samples| samples[0].angles).collect();
     let opening = motion.arms[0][0].gripper_opening;
@@ -156,14 +157,14 @@ pub(crate) fn angles(pair: &SharedPair) -> Vec<Joints> {
     [0, 1].map(|arm| *pair.angles(ArmIndex(arm))).to_vec()
 }
 
-/// Whether nothing moves. Arms that follow a velocity of zero come to rest little by little.
+/// Returns whether nothing moves. Arms that follow a velocity of zero come to rest gradually.
 pub(crate) fn at_rest(pair: &SharedPair) -> bool {
     let pair = pair.lock().unwrap();
     let rest = |arm| pair.velocities(ArmIndex(arm)).iter().all(|rate| rate.abs() < 1e-4);
     rest(0) && rest(1)
 }
 
-/// The arms are where `motion` ends.
+/// Asserts that the arms are at the end of `motion`.
 pub(crate) fn assert_ended(pair: &SharedPair, motion: &Motion) {
     for (samples, angles) in motion.arms.iter().zip(angles(pair)) {
         let off_rad = samples[samples.len() - 1].angles.largest_difference(&angles);
@@ -171,7 +172,7 @@ pub(crate) fn assert_ended(pair: &SharedPair, motion: &Motion) {
     }
 }
 
-/// Waits until something is so, on machines of any speed.
+/// Waits until a condition holds, on machines of any speed.
 pub(crate) fn eventually(what: &str, mut so: impl FnMut() -> bool) {
     for _ in 0..12_000 {
         if so() {
@@ -182,7 +183,7 @@ pub(crate) fn eventually(what: &str, mut so: impl FnMut() -> bool) {
     panic!("{what}: not in two minutes");
 }
 
-/// Both arms out and back over the table, with grippers that close on the way where `openings` says so.
+/// Both arms out and back above the table, with gripper openings by `openings`.
 pub(crate) fn sweep(openings: [f64; 4]) -> Motion {
     let cell = mico_cell();
     let places = [

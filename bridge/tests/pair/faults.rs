@@ -1,36 +1,37 @@
-//! Whatever goes wrong, the arms stand still soon after, within their limits, and stay there.
+//! After any fault the arms come to rest within their limits and stay there.
 
 use std::collections::BTreeMap;
 
 use glam::DVec3;
-use tandem_bridge::layout::mico_cell;
-use tandem_bridge::simulated::PERIOD_S;
-use tandem_bridge::{Phase, SimulatedConfig, StartError, StopCause};
+use tandem_bridge::work_cell::mico_cell;
+use tandem_bridge::{Phase, StartError, StopCause};
 use tandem_core::rng::{index, uniform};
 use tandem_core::{ArmIndex, Stream, episode_rng};
 use tandem_kinematics::{ForwardKinematics, Joints, Motion};
+use tandem_trials::SimulatedConfig;
+use tandem_trials::simulated::PERIOD_S;
 
 use crate::injection::{KINDS, Kind, disturbance};
 use crate::observer::{Observer, Slack};
 use crate::rig::{LOW, MIDDLE, OWNER, Rig, TASKS, tools, walk};
 
-/// Executions with each kind of fault, every day and when there is time.
+/// The number of executions with each kind of fault, in the quick and in the long test.
 const N_PER_KIND: usize = 15;
 const N_PER_KIND_WITH_TIME: usize = 200;
-/// Time from when a fault can be seen until nothing moves, seconds.
+/// The longest time from a detectable fault until the arms are at rest, seconds.
 const STOPPED_S: f64 = 0.100;
-/// How long the arms are watched afterwards, periods.
+/// The number of periods for which the arms are observed afterwards.
 const N_AFTER: u32 = 40;
-/// How fast servos drift, radians per second.
+/// The drift of servos, radians per second.
 const DRIFT_RADPS: f64 = 12.0 * std::f64::consts::PI / 180.0;
-/// Speed of a joint that is said to move, radians per second.
+/// The smallest speed of a moving joint, radians per second.
 const MOVING_RADPS: f64 = 6.0 * std::f64::consts::PI / 180.0;
 /// The executor's limit of the distance from the motion, and its lag in periods.
 const TRACKING_RAD: f64 = 2.0 * std::f64::consts::PI / 180.0;
 const LAG_PERIODS: usize = 3;
 const OWNER_STOP_S: f64 = 1.0;
 
-/// When, to whom and what.
+/// The time, place and kind of a fault.
 struct Plan {
     kind: Kind,
     seed: u64,
@@ -65,7 +66,7 @@ impl Plan {
         panic!("no joint moves in walk {seed}");
     }
 
-    /// Whether the joint moves for some time then, one way.
+    /// Whether the joint moves in one direction for some time then.
     fn moves(&self) -> bool {
         let rate = |later: usize| {
             let time_s = (self.at_period + later) as f64 * PERIOD_S * self.speed;
@@ -113,7 +114,7 @@ impl Plan {
         match self.kind {
             Kind::StateLost => matches!(cause, StopCause::StateStale(_)),
             Kind::StateFrozen => matches!(cause, StopCause::Frozen(_) | StopCause::Tracking(_)),
-            Kind::StateLate => matches!(cause, StopCause::StateOld(_)),
+            Kind::StateLate => matches!(cause, StopCause::StateDelayed(_)),
             Kind::StateNotFinite => matches!(cause, StopCause::StateNotFinite),
             Kind::SequenceJump => matches!(cause, StopCause::SequenceJump { .. }),
             Kind::EncoderJump => matches!(cause, StopCause::AngleJump(_)),
@@ -125,7 +126,7 @@ impl Plan {
             Kind::BlockedJoint => matches!(cause, StopCause::Frozen(_) | StopCause::Tracking(_)),
             Kind::TorqueOfContact => matches!(cause, StopCause::Torque(_)),
             Kind::ReportedContact => matches!(cause, StopCause::ContactReported),
-            // A drift that undoes what a joint is told looks like an encoder that is stuck.
+            // A drift that cancels a joint's command looks like a stuck encoder.
             Kind::DriftTogether | Kind::DriftDown => {
                 too_near || matches!(cause, StopCause::Tracking(_) | StopCause::Frozen(_))
             }
@@ -134,18 +135,18 @@ impl Plan {
     }
 }
 
-/// How an execution ended.
+/// The outcome of an execution.
 struct Ending {
     cause: Option<StopCause>,
-    /// From when the fault could be seen, or was seen, to when nothing moved; seconds.
+    /// The time from the detectable or detected fault until the arms were at rest, seconds.
     stopped_s: f64,
 }
 
-/// Plays the plan's motion up to the fault, and on until the arms have stood still for a while.
+/// Plays the plan's motion until the arms have been at rest for a while after the fault.
 fn execute(plan: &Plan) -> Ending {
     let what = format!("{:?} {}", plan.kind, plan.seed);
-    let tells_torques = plan.kind != Kind::BlockedJoint;
-    let config = SimulatedConfig { seed: plan.seed, tells_torques, ..SimulatedConfig::default() };
+    let reports_torques = plan.kind != Kind::BlockedJoint;
+    let config = SimulatedConfig { seed: plan.seed, reports_torques, ..SimulatedConfig::default() };
     let mut rig = Rig::ready(&plan.motion, config);
     let mut observer = Observer::new(plan.slack());
     rig.executor.start(OWNER, plan.motion.clone(), plan.speed, rig.now_s).unwrap();
@@ -196,7 +197,7 @@ fn execute(plan: &Plan) -> Ending {
     Ending { cause: Some(stop.cause), stopped_s: observer.moved_s + PERIOD_S - shown_s }
 }
 
-/// The arms come to rest and no longer move, whatever is asked for.
+/// Asserts that the arms come to rest and no request moves them.
 fn stays_stopped(rig: &mut Rig, plan: &Plan, observer: &mut Observer) {
     let what = format!("{:?} {} afterwards", plan.kind, plan.seed);
     for _ in 0..12 {
@@ -215,7 +216,7 @@ fn stays_stopped(rig: &mut Rig, plan: &Plan, observer: &mut Observer) {
     }
 }
 
-/// Nobody is left to tick, and time passes for the arms alone.
+/// Simulates the arms without an executor.
 fn abandon(rig: Rig, plan: &Plan, mut observer: Observer, began_s: f64) -> Ending {
     let pair = rig.pair;
     match plan.kind {
@@ -223,7 +224,7 @@ fn abandon(rig: Rig, plan: &Plan, mut observer: Observer, began_s: f64) -> Endin
         _ => std::mem::forget(rig.executor),
     }
     for _ in 0..N_AFTER {
-        pair.borrow_mut().pass();
+        pair.borrow_mut().skip_period();
         observer.look(&pair.borrow(), &format!("{:?} {}", plan.kind, plan.seed));
     }
     Ending { cause: None, stopped_s: observer.moved_s + PERIOD_S - began_s }
@@ -236,11 +237,11 @@ fn every_fault_at_any_time_stops_the_arms_within_their_limits() {
 
 #[test]
 #[ignore = "takes a minute"]
-fn two_hundred_of_every_fault_at_any_time_stop_the_arms_within_their_limits() {
+fn two_hundred_of_every_fault_stop_the_arms_within_their_limits() {
     execute_each_kind(N_PER_KIND_WITH_TIME);
 }
 
-#[expect(clippy::print_stdout, reason = "what was seen, for whoever asks with --nocapture")]
+#[expect(clippy::print_stdout, reason = "measurements for --nocapture")]
 fn execute_each_kind(n_per_kind: usize) {
     let (mut n, mut slowest, mut causes) = (0, BTreeMap::new(), BTreeMap::new());
     for idx in 0..n_per_kind * KINDS.len() {

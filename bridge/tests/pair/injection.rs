@@ -1,15 +1,16 @@
-//! A driver between the executor and the pair that spoils what passes.
+//! A driver between the executor and the pair that injects faults.
 
 use std::cell::RefCell;
 use std::collections::VecDeque;
 use std::rc::Rc;
 
-use tandem_bridge::simulated::Disturbance;
-use tandem_bridge::{Command, Driver, DriverError, PairState, SimulatedPair};
+use tandem_bridge::{Command, Driver, DriverError, PairState};
 use tandem_core::ArmIndex;
 use tandem_kinematics::Joints;
+use tandem_trials::SimulatedPair;
+use tandem_trials::simulated::Disturbance;
 
-/// What goes wrong.
+/// The kind of a fault.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Kind {
     StateLost,
@@ -51,18 +52,18 @@ pub(crate) const KINDS: [Kind; 17] = [
     Kind::ProcessKilled,
 ];
 
-/// What goes wrong with the connection, and since when it can be seen.
+/// The present fault of the connection and the time since when it is detectable.
 pub(crate) struct Injection {
     kind: Option<Kind>,
     arm: ArmIndex,
     joint: usize,
     /// States since then.
     n_spoiled: u32,
-    /// States that the executor never got: the driver does not count them.
+    /// States that the executor never received and the driver does not count.
     n_lost: u64,
     held: Option<PairState>,
     late: VecDeque<PairState>,
-    /// Simulated time at which what the executor gets is wrong beyond what its settings allow, seconds.
+    /// The simulated time at which the fault exceeds the executor's settings, seconds.
     pub(crate) shown_s: Option<f64>,
 }
 
@@ -80,17 +81,17 @@ impl Injection {
         }
     }
 
-    /// From now on `kind` happens, to this joint where it is one.
+    /// Starts a fault, at this joint if it concerns one.
     pub(crate) fn begin(&mut self, kind: Kind, arm: ArmIndex, joint: usize) {
         (self.kind, self.arm, self.joint) = (Some(kind), arm, joint);
     }
 
-    /// From now on all is well.
+    /// Ends the fault.
     pub(crate) fn end(&mut self) {
         self.kind = None;
     }
 
-    /// What becomes of a state at simulated time `time_s`.
+    /// Applies the fault to a state at simulated time `time_s`.
     fn spoil(&mut self, mut state: PairState, time_s: f64) -> PairState {
         state.sequence -= self.n_lost;
         let held = self.held.get_or_insert_with(|| state.clone()).clone();
@@ -146,13 +147,13 @@ impl Injection {
         state
     }
 
-    /// Whether nothing reaches the arms any more.
+    /// Returns whether the connection to the arms is cut.
     fn cut(&self) -> bool {
         matches!(self.kind, Some(Kind::CommandLost | Kind::DriverError))
     }
 }
 
-/// Passes on what the executor and the pair say to each other.
+/// Forwards commands and states between the executor and the pair.
 #[derive(Clone)]
 pub(crate) struct Tap {
     pair: Rc<RefCell<SimulatedPair>>,
@@ -178,7 +179,7 @@ impl Driver for Tap {
 
     fn exchange(&mut self, command: &Command) -> Result<PairState, DriverError> {
         let (mut pair, mut injection) = (self.pair.borrow_mut(), self.injection.borrow_mut());
-        let state = if injection.cut() { pair.pass() } else { pair.exchange(command)? };
+        let state = if injection.cut() { pair.skip_period() } else { pair.exchange(command)? };
         let state = injection.spoil(state, pair.time_s());
         if injection.kind == Some(Kind::DriverError) {
             return Err(DriverError::Disconnected { what: "closed by the peer".into() });
@@ -194,7 +195,7 @@ impl Driver for Tap {
     }
 }
 
-/// What `kind` does to the arms themselves; `directions` are those of the drift, arm by arm.
+/// The disturbance of the arms by `kind`; `directions` are those of the drift, arm by arm.
 pub(crate) fn disturbance(
     kind: Kind,
     arm: ArmIndex,

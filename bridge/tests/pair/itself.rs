@@ -1,24 +1,22 @@
-//! Arms that are led, pushed or driven into themselves.
+//! Arms that are commanded, pushed or driven into themselves.
 
 use std::cell::RefCell;
 
-use tandem_bridge::layout::mico_cell;
-use tandem_bridge::simulated::{Disturbance, PERIOD_S};
-use tandem_bridge::{
-    ArmCommand, Command, Driver as _, Order, Phase, SimulatedConfig, SimulatedPair, StartError,
-    StopCause,
-};
+use tandem_bridge::work_cell::mico_cell;
+use tandem_bridge::{ArmCommand, Command, Driver as _, Order, Phase, StartError, StopCause};
 use tandem_core::ArmIndex;
 use tandem_kinematics::{ArmSample, Joints, Motion, Reason};
+use tandem_trials::simulated::{Disturbance, PERIOD_S};
+use tandem_trials::{SimulatedConfig, SimulatedPair};
 
 use crate::rig::{OWNER, Rig};
 
-/// By how much the joints turn from the ready posture until the gripper is 14 mm deep in the arm's own base; degrees.
+/// The turns of the joints from the ready position until the gripper is 14 mm inside the arm's own base, degrees.
 const WAY_DEG: [f64; 4] = [0.0, -11.3, 27.0, 90.3];
 const DURATION_S: f64 = 6.0;
 const OPENING: f64 = 0.5;
 
-/// The first arm on a share of its way into its own base, from rest to rest; the other one rests.
+/// Moves the first arm along a share of the path into its own base, from rest to rest; the other one rests.
 fn on_way(share: f64) -> Motion {
     let ready = mico_cell().ready(0.05).unwrap();
     let way = |joint: usize| share * WAY_DEG[joint].to_radians();
@@ -37,7 +35,7 @@ fn on_way(share: f64) -> Motion {
     Motion { period_s: PERIOD_S, arms: vec![samples(0), samples(1)] }
 }
 
-/// The largest share of the way at whose end the arm keeps `gap_m` to itself.
+/// The largest share of the path at whose end the arm keeps `gap_m` to itself.
 fn share_with(gap_m: f64) -> f64 {
     let cell = mico_cell();
     let keeps = |share: &f64| {
@@ -48,7 +46,7 @@ fn share_with(gap_m: f64) -> f64 {
 }
 
 #[test]
-fn a_motion_that_leads_the_gripper_into_the_arms_own_base_is_refused_and_not_played() {
+fn a_motion_of_the_gripper_into_its_own_base_is_refused() {
     let motion = on_way(1.0);
     let mut rig = Rig::ready(&motion, SimulatedConfig::default());
     let before = rig.angles();
@@ -65,7 +63,7 @@ fn a_motion_that_leads_the_gripper_into_the_arms_own_base_is_refused_and_not_pla
 }
 
 #[test]
-fn an_arm_that_drifts_towards_itself_is_stopped_before_it_touches() {
+fn an_arm_that_drifts_towards_itself_is_stopped_before_contact() {
     for (joint, sign) in [(1, -1.0), (2, 1.0), (3, 1.0)] {
         let near = on_way(share_with(0.0055));
         let mut rig = Rig::ready(&near, SimulatedConfig::default());
@@ -100,7 +98,7 @@ fn an_arm_that_drifts_towards_itself_is_stopped_before_it_touches() {
 }
 
 #[test]
-fn an_arm_that_is_driven_into_itself_goes_no_deeper_and_reports_a_contact() {
+fn an_arm_driven_into_itself_stalls_and_reports_a_contact() {
     let at: Vec<Joints> = on_way(0.5).arms.iter().map(|samples| samples[600].angles).collect();
     let mut pair = SimulatedPair::new(mico_cell(), &at, OPENING, SimulatedConfig::default());
     let into = Joints::from_fn(4, |joint| WAY_DEG[joint].to_radians() / DURATION_S);

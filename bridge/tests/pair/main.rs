@@ -1,4 +1,4 @@
-//! The executor on the simulated pair: tasks, ownership, and everything that can go wrong.
+//! The executor on the simulated pair: tasks, ownership and faults.
 #![expect(clippy::unwrap_used, clippy::panic, reason = "a test panics where it fails")]
 
 mod faults;
@@ -7,6 +7,5 @@ mod itself;
 mod observer;
 mod ownership;
 mod rig;
-mod simulated;
 mod tasks;
 mod undisturbed;

@@ -1,10 +1,10 @@
-//! Somebody who looks at the true arms, period by period, and knows nothing of the executor.
+//! An observer of the true arms, period by period, independent of the executor.
 
-use tandem_bridge::SimulatedPair;
-use tandem_bridge::layout::mico_cell;
-use tandem_bridge::simulated::PERIOD_S;
+use tandem_bridge::work_cell::mico_cell;
 use tandem_core::ArmIndex;
 use tandem_kinematics::{ForwardKinematics, Joints, WorkCell};
+use tandem_trials::SimulatedPair;
+use tandem_trials::simulated::PERIOD_S;
 
 /// Tool speed, metres per second; gaps, metres: as the executor's settings have them.
 const TOOL_MPS: f64 = 0.20;
@@ -15,10 +15,10 @@ const RAMP_S: f64 = 0.25;
 /// Time in which the simulated drives brake, seconds.
 const BRAKE_S: f64 = 0.040;
 
-/// What may be exceeded, and why.
+/// The allowed excess of the limits.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Slack {
-    /// What a fault itself adds to a joint's speed, radians per second.
+    /// The part of a joint's speed that the fault itself causes, radians per second.
     pub(crate) drift_radps: f64,
     /// The executor knows angles with a noise of 0.015 degrees, three times of which are 0.5 mm at a lever of 0.57 m. A
     /// drift that begins is known and braked some 50 ms later: 12 degrees/s make 3 mm at 0.3 m. The rest of the
@@ -36,7 +36,7 @@ pub(crate) struct Observer {
     cell: WorkCell,
     slack: Slack,
     before: Option<Vec<Joints>>,
-    /// When a joint was last seen to move, seconds of simulated time.
+    /// The simulated time at which a joint last moved, seconds.
     pub(crate) moved_s: f64,
     /// Largest shares of limits.
     pub(crate) tool_share: f64,
@@ -57,7 +57,7 @@ impl Observer {
         }
     }
 
-    /// Sees that no limit is exceeded; `what` is for messages.
+    /// Asserts that no limit is exceeded; `what` appears in messages.
     pub(crate) fn look(&mut self, pair: &SimulatedPair, what: &str) {
         let [angles, rates]: [Vec<Joints>; 2] = [
             [0, 1].map(|arm| *pair.angles(ArmIndex(arm))).to_vec(),

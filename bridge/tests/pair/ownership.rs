@@ -1,12 +1,12 @@
-//! Who may do what, and when.
+//! Ownership, phases and timing.
 
-use tandem_bridge::layout::mico_cell;
+use tandem_bridge::work_cell::mico_cell;
 use tandem_bridge::{
-    Executor, LeaseError, Phase, ResetError, Settings, SimulatedConfig, StartError, StopCause,
-    Token,
+    Executor, LeaseError, Phase, ResetError, Settings, StartError, StopCause, Token,
 };
 use tandem_core::ArmIndex;
 use tandem_kinematics::Reason;
+use tandem_trials::SimulatedConfig;
 
 use crate::injection::Kind;
 use crate::rig::{OWNER, Rig, TASKS, walk};
@@ -18,12 +18,12 @@ fn config() -> SimulatedConfig {
 }
 
 #[test]
-fn nothing_moves_before_somebody_lets_the_arms_go() {
+fn nothing_moves_before_a_reset_by_the_owner() {
     let motion = walk(TASKS, 1, 3);
     let mut rig = Rig::new(&motion, config());
     let at = rig.angles();
     let start = |rig: &mut Rig| rig.executor.start(OWNER, motion.clone(), 1.0, rig.now_s);
-    assert_eq!(start(&mut rig), Err(StartError::Lease(LeaseError::Nobody)));
+    assert_eq!(start(&mut rig), Err(StartError::Lease(LeaseError::NotOwned)));
     rig.executor.acquire(OWNER, rig.now_s).unwrap();
     assert_eq!(start(&mut rig), Err(StartError::NotIdle(Phase::Stopped)));
     let reset = rig.executor.reset(OWNER, rig.now_s);
@@ -40,7 +40,7 @@ fn nothing_moves_before_somebody_lets_the_arms_go() {
 }
 
 #[test]
-fn only_the_owner_starts_and_anyone_stops() {
+fn only_the_owner_starts_and_any_client_stops() {
     let motion = walk(TASKS, 2, 3);
     let mut rig = Rig::ready(&motion, config());
     let held = |result| matches!(result, Err(LeaseError::Held { .. }));
@@ -74,13 +74,13 @@ fn only_the_owner_starts_and_anyone_stops() {
 }
 
 #[test]
-fn an_owner_who_leaves_stops_the_motion_and_a_lease_ends_by_itself() {
+fn a_release_stops_the_motion_and_a_lease_expires() {
     let motion = walk(TASKS, 3, 3);
     let mut rig = Rig::ready(&motion, config());
     rig.executor.start(OWNER, motion, 1.0, rig.now_s).unwrap();
     rig.tick_owned();
     rig.executor.release(OWNER, rig.now_s).unwrap();
-    assert_eq!(rig.executor.stopped_by().unwrap().cause, StopCause::OwnerLeft);
+    assert_eq!(rig.executor.stopped_by().unwrap().cause, StopCause::OwnerReleased);
     rig.executor.acquire(STRANGER, rig.now_s).unwrap();
     for _ in 0..510 {
         rig.tick();
@@ -90,7 +90,7 @@ fn an_owner_who_leaves_stops_the_motion_and_a_lease_ends_by_itself() {
 }
 
 #[test]
-fn a_motion_waits_for_an_owner_who_is_late_and_goes_on() {
+fn a_motion_pauses_for_a_late_owner_and_resumes() {
     let motion = walk(TASKS, 4, 3);
     let end = [0, 1].map(|arm: usize| motion.arms[arm][motion.arms[arm].len() - 1].angles);
     let mut rig = Rig::ready(&motion, config());
@@ -118,7 +118,7 @@ fn a_motion_waits_for_an_owner_who_is_late_and_goes_on() {
 }
 
 #[test]
-fn a_motion_outlives_a_short_silence_of_the_arms() {
+fn a_motion_survives_a_short_silence_of_the_arms() {
     let motion = walk(TASKS, 5, 3);
     let mut rig = Rig::ready(&motion, config());
     rig.executor.start(OWNER, motion, 1.0, rig.now_s).unwrap();
@@ -149,7 +149,7 @@ fn a_motion_at_half_speed_takes_twice_as_long() {
 }
 
 #[test]
-fn whoever_ticks_too_late_stops_the_arms() {
+fn a_late_tick_stops_the_arms() {
     for (pause_s, late) in [(0.044, false), (0.046, true), (0.0, true), (-1.0, true)] {
         let motion = walk(TASKS, 7, 3);
         let mut rig = Rig::ready(&motion, config());
@@ -158,16 +158,16 @@ fn whoever_ticks_too_late_stops_the_arms() {
         rig.now_s += pause_s;
         rig.executor.tick(rig.now_s);
         let cause = rig.executor.stopped_by().map(|stop| stop.cause.clone());
-        assert_eq!(matches!(cause, Some(StopCause::Late(_))), late, "{pause_s}: {cause:?}");
+        assert_eq!(matches!(cause, Some(StopCause::TickLate(_))), late, "{pause_s}: {cause:?}");
     }
 }
 
 #[test]
-fn settings_that_make_no_sense_are_refused() {
+fn inconsistent_settings_are_refused() {
     let check = |settings: Settings, name: &str| {
         let motion = walk(TASKS, 1, 2);
         let at = [0, 1].map(|arm: usize| motion.arms[arm][0].angles);
-        let pair = tandem_bridge::SimulatedPair::new(mico_cell(), &at, 0.0, config());
+        let pair = tandem_trials::SimulatedPair::new(mico_cell(), &at, 0.0, config());
         let refused = Executor::new(mico_cell(), pair, settings).unwrap_err();
         assert_eq!(refused.name, name, "{refused}");
     };
@@ -182,7 +182,7 @@ fn settings_that_make_no_sense_are_refused() {
 }
 
 #[test]
-fn a_checked_motion_starts_where_it_was_checked_for_and_nowhere_else() {
+fn a_checked_motion_starts_only_with_its_executor_and_position() {
     let motion = walk(TASKS, 6, 3);
     let mut rig = Rig::ready(&motion, config());
     let at: Vec<_> = motion.arms.iter().map(|samples| samples[0].angles).collect();
@@ -209,10 +209,10 @@ fn a_checked_motion_starts_where_it_was_checked_for_and_nowhere_else() {
 }
 
 #[test]
-fn a_lease_is_renewed_by_its_owner_only_and_says_how_long_it_holds() {
+fn only_its_owner_renews_a_lease_which_reports_its_remaining_time() {
     let motion = walk(TASKS, 7, 3);
     let mut rig = Rig::new(&motion, config());
-    assert_eq!(rig.executor.renew(OWNER, rig.now_s), Err(LeaseError::Nobody));
+    assert_eq!(rig.executor.renew(OWNER, rig.now_s), Err(LeaseError::NotOwned));
     assert_eq!(rig.executor.lease_left_s(rig.now_s), None);
     rig.executor.acquire(OWNER, rig.now_s).unwrap();
     rig.now_s += 3.0;
@@ -221,12 +221,12 @@ fn a_lease_is_renewed_by_its_owner_only_and_says_how_long_it_holds() {
     rig.executor.renew(OWNER, rig.now_s).unwrap();
     assert!((rig.executor.lease_left_s(rig.now_s).unwrap() - 5.0).abs() < 1e-9);
     rig.now_s += 5.0;
-    assert_eq!(rig.executor.renew(OWNER, rig.now_s), Err(LeaseError::Nobody));
+    assert_eq!(rig.executor.renew(OWNER, rig.now_s), Err(LeaseError::NotOwned));
     assert_eq!(rig.executor.lease_left_s(rig.now_s), None);
 }
 
 #[test]
-fn after_a_failure_of_the_driver_a_reset_wants_good_states_anew() {
+fn a_reset_after_a_driver_failure_requires_new_good_states() {
     let motion = walk(TASKS, 8, 3);
     let mut rig = Rig::ready(&motion, config());
     rig.injection.borrow_mut().begin(Kind::DriverError, ArmIndex(0), 0);

@@ -1,18 +1,19 @@
-//! A simulated pair behind an executor, with somebody looking at both.
+//! A simulated pair behind an executor.
 
 use std::cell::RefCell;
 use std::rc::Rc;
 
 use glam::DVec3;
-use tandem_bridge::layout::{check_settings, mico_cell};
-use tandem_bridge::simulated::PERIOD_S;
-use tandem_bridge::{Executor, Phase, Settings, SimulatedConfig, SimulatedPair, Token};
+use tandem_bridge::work_cell::{check_settings, mico_cell};
+use tandem_bridge::{Executor, Phase, Settings, Token};
 use tandem_core::rng::uniform;
 use tandem_core::{Stream, episode_rng};
 use tandem_kinematics::model::Joint;
 use tandem_kinematics::{
     ArmWaypoint, ForwardKinematics, Joints, Motion, PlanSettings, Waypoint, WorkCell, check, plan,
 };
+use tandem_trials::simulated::PERIOD_S;
+use tandem_trials::{SimulatedConfig, SimulatedPair};
 
 use crate::injection::{Injection, Tap};
 
@@ -27,7 +28,7 @@ pub(crate) struct Rig {
 }
 
 impl Rig {
-    /// Arms at rest where `motion` begins.
+    /// Arms at rest at the start of `motion`.
     pub(crate) fn new(motion: &Motion, config: SimulatedConfig) -> Self {
         let at: Vec<Joints> = motion.arms.iter().map(|samples| samples[0].angles).collect();
         let pair = SimulatedPair::new(mico_cell(), &at, motion.arms[0][0].gripper_opening, config);
@@ -39,7 +40,7 @@ impl Rig {
         Self { executor, pair, injection, now_s: 1234.5 }
     }
 
-    /// The same, owned and let go.
+    /// The same, owned and reset.
     pub(crate) fn ready(motion: &Motion, config: SimulatedConfig) -> Self {
         let mut rig = Self::new(motion, config);
         rig.executor.acquire(OWNER, rig.now_s).unwrap();
@@ -51,13 +52,13 @@ impl Rig {
         rig
     }
 
-    /// Lets a period pass.
+    /// Simulates a period.
     pub(crate) fn tick(&mut self) -> Phase {
         self.now_s += PERIOD_S;
         self.executor.tick(self.now_s)
     }
 
-    /// Lets a period pass in which the owner is heard.
+    /// Simulates a period with a sign of life of the owner.
     pub(crate) fn tick_owned(&mut self) -> Phase {
         let owned = self.executor.acquire(OWNER, self.now_s);
         assert_eq!(owned, Ok(()));
@@ -85,7 +86,7 @@ impl Rig {
     }
 }
 
-/// Where the tools are, world frame, metres.
+/// The positions of the tools, world frame, metres.
 pub(crate) fn tools(cell: &WorkCell, angles: &[Joints]) -> Vec<DVec3> {
     let tool = |(arm, angles): (usize, &Joints)| {
         let placed = &cell.arms[arm];
@@ -94,7 +95,7 @@ pub(crate) fn tools(cell: &WorkCell, angles: &[Joints]) -> Vec<DVec3> {
     angles.iter().enumerate().map(tool).collect()
 }
 
-/// The motion through points of the arms' base frames (metres, the same for both) that the check passes.
+/// Plans and checks the motion through points of the arms' base frames, metres.
 pub(crate) fn planned(points: &[([DVec3; 2], f64)]) -> Motion {
     let cell = mico_cell();
     let way_points: Vec<Waypoint> = points
@@ -114,17 +115,17 @@ pub(crate) fn planned(points: &[([DVec3; 2], f64)]) -> Motion {
     motion
 }
 
-/// Where tools walk in the arms' own frames: low and high corner, metres.
+/// An area of random motions in the arms' own frames: low and high corner, metres.
 pub(crate) type Area = [DVec3; 2];
 
-/// All of the tasks' area.
+/// The whole area of the tasks.
 pub(crate) const TASKS: Area = [DVec3::new(-0.12, -0.12, 0.005), DVec3::new(0.12, 0.12, 0.20)];
-/// Low above the table.
+/// The area close to the table.
 pub(crate) const LOW: Area = [DVec3::new(-0.06, -0.12, 0.005), DVec3::new(0.04, 0.12, 0.012)];
-/// Where the arms meet.
+/// The area between the arms.
 pub(crate) const MIDDLE: Area = [DVec3::new(0.06, -0.08, 0.02), DVec3::new(0.09, 0.08, 0.10)];
 
-/// A random motion of both arms that the check passes: `n` way points up to 5 cm apart.
+/// A random motion of both arms that the check passes: `n` waypoints up to 5 cm apart.
 pub(crate) fn walk([low, high]: Area, seed: u64, n: usize) -> Motion {
     let cell = mico_cell();
     for attempt in 0.. {

@@ -1,14 +1,14 @@
-//! Pushing, and grasping: both arms at once, from way points to where the objects end.
+//! Pushing and grasping with both arms at once, from waypoints to the final positions of the objects.
 
 use glam::DVec3;
-use tandem_bridge::SimulatedConfig;
-use tandem_bridge::layout::mico_cell;
-use tandem_bridge::simulated::Block;
+use tandem_bridge::work_cell::mico_cell;
+use tandem_trials::SimulatedConfig;
+use tandem_trials::simulated::Block;
 
 use crate::observer::{Observer, Slack};
 use crate::rig::{Rig, planned, tools};
 
-/// How high the tool works over the table, metres.
+/// The height of the tool above the table, metres.
 const WORK_M: f64 = 0.050;
 
 /// A block for each arm, at these points of the base frames.
@@ -23,7 +23,7 @@ fn blocks(kinds: [fn([f32; 2]) -> Block; 2], at: [DVec3; 2]) -> Vec<Block> {
         .collect()
 }
 
-/// Where the objects are in the arms' base frames, metres.
+/// The positions of the objects in the arms' base frames, metres.
 fn in_base(rig: &Rig) -> [DVec3; 2] {
     let objects = rig.pair.borrow().objects();
     [0, 1].map(|arm| {
@@ -43,7 +43,7 @@ fn path_error_m(rig: &Rig) -> f64 {
     wanted.iter().zip(are).map(|(wanted, is)| (*wanted - is).length()).fold(0.0, f64::max)
 }
 
-/// Pushes both blocks by 10 cm along `along` (base frame) with shut grippers.
+/// Pushes both blocks by 10 cm along `along` (base frame) with closed grippers.
 fn push(kinds: [fn([f32; 2]) -> Block; 2], from: DVec3, along: DVec3, gap_m: f64) {
     let lengths: Vec<f64> = vec![0.0, 0.25, 0.5, 0.75, 1.0];
     let behind = [0, 1].map(|arm| {

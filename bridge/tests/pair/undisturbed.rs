@@ -1,18 +1,18 @@
-//! Motions that nothing disturbs are played to their ends, along their paths.
+//! Undisturbed motions are played to their ends along their paths.
 
 use glam::DVec3;
-use tandem_bridge::SimulatedConfig;
-use tandem_bridge::layout::mico_cell;
+use tandem_bridge::work_cell::mico_cell;
+use tandem_trials::SimulatedConfig;
 
 use crate::observer::{Observer, Slack};
 use crate::rig::{Rig, TASKS, tools, walk};
 
 const N_EXECUTIONS: usize = 200;
-/// How far tools may be from their planned paths, metres.
+/// The largest distance of the tools from their planned paths, metres.
 const PATH_M: f64 = 0.004;
 
 #[test]
-fn two_hundred_walks_are_not_stopped() {
+fn two_hundred_random_motions_are_not_stopped() {
     let cell = mico_cell();
     let (mut worst_m, mut tool_share, mut arms_m, mut table_m) =
         (0.0_f64, 0.0_f64, f64::INFINITY, f64::INFINITY);

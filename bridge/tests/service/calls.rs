@@ -1,6 +1,6 @@
-//! What clients can do with the arms.
+//! The calls of the service.
 
-use tandem_bridge::layout::mico_cell;
+use tandem_bridge::work_cell::mico_cell;
 use tandem_kinematics::{ArmSample, ArmWaypoint, Joints, Motion, PlanSettings, plan};
 use tandem_proto::pb;
 use tonic::Code;
@@ -10,32 +10,32 @@ use crate::rig::{DEADLINE, Fault, READY_M, Rig, UP_M, joint_request, patient, sl
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn the_arms_are_described() {
     let mut rig = Rig::bounded(patient(), 0.25).await;
-    let told = rig.client.describe(pb::DescribeBridgeRequest {}).await.unwrap().into_inner();
-    assert_eq!((told.driver.as_str(), told.arms.len()), ("sim", 2));
-    for (arm, base_m) in told.arms.iter().zip([-0.39, 0.39]) {
+    let response = rig.client.describe(pb::DescribeBridgeRequest {}).await.unwrap().into_inner();
+    assert_eq!((response.driver.as_str(), response.arms.len()), ("sim", 2));
+    for (arm, base_m) in response.arms.iter().zip([-0.39, 0.39]) {
         assert_eq!((arm.model.as_str(), arm.joints.len()), ("m1n4s200", 4));
         assert!((arm.base_in_world_m[0] - base_m).abs() < 1e-6, "{arm:?}");
         assert!(arm.joints.iter().all(|joint| joint.low_rad < joint.high_rad));
     }
-    let limits = told.limits.unwrap();
+    let limits = response.limits.unwrap();
     assert!((limits.speed - 0.25).abs() < 1e-12 && (limits.tool_speed_mps - 0.2).abs() < 1e-12);
-    assert!((told.task_frame.unwrap().scale - 1.0).abs() < 1e-12);
+    assert!((response.task_frame.unwrap().scale - 1.0).abs() < 1e-12);
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_motion_is_played_to_where_it_leads() {
+async fn a_motion_ends_at_its_last_waypoint() {
     let mut rig = Rig::new(patient()).await;
     let token = rig.ready().await;
     let mut playing = rig.execute(&token, through(&[UP_M], 1.0)).await.unwrap();
     let (mut played_s, mut n_reports) = (0.0, 0);
     let last = loop {
-        let told = playing.next().await.unwrap();
-        let progress = told.progress.clone().unwrap();
+        let response = playing.next().await.unwrap();
+        let progress = response.progress.clone().unwrap();
         assert!(progress.played_s >= played_s, "{progress:?}");
         (played_s, n_reports) = (progress.played_s, n_reports + 1);
         playing.alive().await;
-        if told.outcome.is_some() {
-            break told;
+        if response.outcome.is_some() {
+            break response;
         }
         let [arm, _] = &progress.arms[..] else { panic!("{progress:?}") };
         let apart = arm.angles_rad.iter().zip(&arm.reference_rad).map(|(a, b)| (a - b).abs());
@@ -93,11 +93,11 @@ async fn no_motion_is_faster_than_the_bound() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_check_says_what_is_wrong_and_moves_nothing() {
+async fn a_check_returns_the_fault_and_moves_nothing() {
     use pb::check_response::Verdict;
     let mut rig = Rig::new(patient()).await;
     let check = |motion| pb::CheckRequest { motion: Some(motion) };
-    // The arms need not be let go to be asked about.
+    // A check does not require a reset.
     rig.eventually(|status| !status.arms.is_empty()).await;
     let before = rig.tap.angles();
     let verdict = async |rig: &mut Rig, motion| {
@@ -142,7 +142,7 @@ async fn a_check_says_what_is_wrong_and_moves_nothing() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_check_waits_for_the_next_state_when_the_newest_was_not_believed() {
+async fn a_check_waits_for_the_next_state_after_an_invalid_one() {
     let mut rig = Rig::new(patient()).await;
     rig.eventually(|status| !status.arms.is_empty()).await;
     rig.tap.fail(Fault::Untrue);
@@ -193,10 +193,10 @@ async fn a_motion_into_the_arms_own_base_is_refused_by_name() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_long_motion_is_checked_beside_the_ticks() {
+async fn the_check_of_a_long_motion_does_not_delay_ticks() {
     let mut rig = Rig::new(patient()).await;
     rig.eventually(|status| !status.arms.is_empty()).await;
-    // No tick can come: whoever needed one to check would wait for ever.
+    // No tick is possible: a check that needed one would wait forever.
     rig.clock.hold();
     let long = through(&[UP_M, READY_M].repeat(200), 1.0);
     let checking = rig.client.check(pb::CheckRequest { motion: Some(long) });
@@ -255,7 +255,7 @@ async fn the_arms_have_one_owner_at_a_time() {
     let status = rig.status().await;
     assert!(status.is_owned && status.lease_left_s > 0.0 && status.lease_left_s <= 60.0);
 
-    // Whoever is silent for long loses the arms, and a lease that has ended is not renewed.
+    // A silent owner loses the arms, and an expired lease cannot be renewed.
     rig.eventually(|status| !status.is_owned).await;
     let gone = rig.client.acquire(pb::AcquireRequest { token: token.clone() }).await.unwrap_err();
     assert_eq!(gone.code(), Code::FailedPrecondition);

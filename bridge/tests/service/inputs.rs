@@ -1,11 +1,11 @@
-//! What cannot be meant is refused by the name of its field, and moves nothing.
+//! Malformed requests are refused by the name of the field and move nothing.
 
 use tandem_proto::pb;
 use tonic::Code;
 
 use crate::rig::{READY_M, Rig, UP_M, patient, through};
 
-/// A good request that is spoiled.
+/// A modification of a valid request.
 fn way(spoil: impl FnOnce(&mut pb::WayPoints)) -> pb::MotionRequest {
     let mut request = through(&[UP_M, READY_M], 1.0);
     if let Some(pb::motion_request::Motion::WayPoints(way)) = &mut request.motion {
@@ -103,7 +103,7 @@ fn motions_of_joints() -> Vec<(pb::MotionRequest, &'static str)> {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn what_cannot_be_meant_is_refused_by_its_name() {
+async fn malformed_fields_are_refused_by_name() {
     let mut rig = Rig::new(patient()).await;
     let token = rig.ready().await;
     let before = rig.tap.angles();
@@ -124,7 +124,7 @@ async fn what_cannot_be_meant_is_refused_by_its_name() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn what_is_no_token_is_refused_and_not_repeated() {
+async fn a_malformed_token_is_refused_and_not_repeated() {
     let mut rig = Rig::new(patient()).await;
     let long = "f".repeat(33);
     for token in
@@ -144,7 +144,7 @@ async fn what_is_no_token_is_refused_and_not_repeated() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_stream_begins_with_what_is_wanted() {
+async fn a_stream_starts_with_a_start_message() {
     let mut rig = Rig::new(patient()).await;
     let alive = pb::ExecuteRequest {
         request: Some(pb::execute_request::Request::Alive(pb::SignOfLife {})),

@@ -1,20 +1,18 @@
-//! A running service, its clients, its clock, and what stands behind it.
+//! A running service with its clients, its clock and its arms.
 
 use std::net::SocketAddr;
 use std::sync::{Arc, Condvar, Mutex};
 use std::time::Duration;
 
-use tandem_bridge::layout::mico_cell;
-use tandem_bridge::service::{AnyDriver, Config, Dial, Error, Time, serve};
-use tandem_bridge::{
-    Command, Driver, DriverError, Executor, Order, PairState, Settings, SimulatedConfig,
-    SimulatedPair,
-};
+use tandem_bridge::service::{BoxDriver, Clock, Config, Error, Reconnect, serve};
+use tandem_bridge::work_cell::mico_cell;
+use tandem_bridge::{Command, Driver, DriverError, Executor, Order, PairState, Settings};
 use tandem_core::ArmIndex;
 use tandem_kinematics::{ArmSample, Joints, Motion};
 use tandem_net::ServerConfig;
 use tandem_proto::pb;
 use tandem_proto::pb::bridge_client::BridgeClient;
+use tandem_trials::{SimulatedConfig, SimulatedPair};
 use tokio::net::TcpListener;
 use tokio::sync::mpsc;
 use tokio::task::JoinHandle;
@@ -23,37 +21,37 @@ use tokio_util::sync::CancellationToken;
 use tonic::transport::Channel;
 use tonic::{Response, Status, Streaming};
 
-/// Longer than anything takes, even on a machine that is busy with other things.
+/// A time limit that even a busy machine keeps.
 pub(crate) const DEADLINE: Duration = Duration::from_secs(120);
-/// What a tick takes at least, so that tests leave the processor to one another.
+/// The shortest duration of a tick, so that tests share the processor.
 const TICK: Duration = Duration::from_micros(200);
 
-/// A clock whose time passes when somebody sleeps, up to where the test lets it.
+/// A clock that advances when a thread sleeps, up to a limit set by the test.
 #[derive(Default)]
-pub(crate) struct Clock(Mutex<Hands>, Condvar);
+pub(crate) struct TestClock(Mutex<Hands>, Condvar);
 
 #[derive(Default)]
 struct Hands {
     now_s: f64,
-    /// `None` for as far as it goes.
+    /// `None` for no limit.
     until_s: Option<f64>,
     late_s: f64,
 }
 
-impl Clock {
-    /// Lets time pass as fast as it goes.
+impl TestClock {
+    /// Lets time advance without limit.
     pub(crate) fn free(&self) {
         self.0.lock().unwrap().until_s = None;
         self.1.notify_all();
     }
 
-    /// Lets no time pass from now on.
+    /// Holds the time.
     pub(crate) fn hold(&self) {
         let mut hands = self.0.lock().unwrap();
         hands.until_s = Some(hands.now_s);
     }
 
-    /// Lets `seconds` pass beyond what was allowed before.
+    /// Raises the limit by `seconds`.
     pub(crate) fn pass(&self, seconds: f64) {
         let mut hands = self.0.lock().unwrap();
         let until_s = hands.until_s.unwrap_or(hands.now_s);
@@ -61,13 +59,13 @@ impl Clock {
         self.1.notify_all();
     }
 
-    /// The next sleep takes longer by this.
+    /// Lengthens the next sleep by `seconds`.
     pub(crate) fn oversleep(&self, seconds: f64) {
         self.0.lock().unwrap().late_s = seconds;
     }
 }
 
-impl Time for Clock {
+impl Clock for TestClock {
     fn now_s(&self) -> f64 {
         self.0.lock().unwrap().now_s
     }
@@ -81,38 +79,38 @@ impl Time for Clock {
     }
 }
 
-/// What goes wrong with the driver.
+/// A fault of the driver.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Fault {
     None,
     /// An exchange fails; stopping works.
     Exchange,
-    /// Nothing gets through any more.
+    /// All communication fails.
     Dead,
     /// An exchange panics.
     Panic,
-    /// An exchange does not come back before the fault is over.
+    /// An exchange blocks until the fault ends.
     Hang,
     /// The present connection never works again; new ones do.
     Lost,
-    /// States come, but no number of them is one.
+    /// States contain NaN.
     Untrue,
 }
 
-/// A simulated pair that a test can look at and spoil.
+/// A simulated pair that a test can inspect and disturb.
 pub(crate) struct Bench {
     pair: SimulatedPair,
     fault: Fault,
-    /// How often the drives were told to stop past all exchanges.
+    /// The number of stops outside of exchanges.
     n_stops: usize,
     newest: Order,
     /// The connection that works, counted from 0.
     connection: usize,
-    /// What the present connection was told first.
+    /// The first command of the present connection.
     first: Option<Command>,
 }
 
-/// The bench, and which connection to it this is.
+/// The bench and the number of this connection to it.
 #[derive(Clone)]
 pub(crate) struct Tap(Arc<(Mutex<Bench>, Condvar)>, usize);
 
@@ -132,18 +130,18 @@ impl Tap {
         self.0.1.notify_all();
     }
 
-    /// A new connection, when the one before is lost.
-    fn dial(&self) -> Result<Self, DriverError> {
+    /// Creates a new connection if the previous one is lost.
+    fn client_config(&self) -> Result<Self, DriverError> {
         let mut bench = self.0.0.lock().unwrap();
         if bench.fault != Fault::Lost {
-            return Err(DriverError::Disconnected { what: "nobody answers".into() });
+            return Err(DriverError::Disconnected { what: "no response".into() });
         }
         (bench.fault, bench.first) = (Fault::None, None);
         bench.connection += 1;
         Ok(Self(Arc::clone(&self.0), bench.connection))
     }
 
-    /// How many connections were made anew, and what the present one was told first.
+    /// The number of new connections and the first command of the present one.
     pub(crate) fn dialled(&self) -> (usize, Option<Command>) {
         let bench = self.0.0.lock().unwrap();
         (bench.connection, bench.first.clone())
@@ -153,7 +151,7 @@ impl Tap {
         self.0.0.lock().unwrap().n_stops
     }
 
-    /// The newest command that has got through.
+    /// The newest command that has arrived.
     pub(crate) fn newest(&self) -> Order {
         self.0.0.lock().unwrap().newest.clone()
     }
@@ -167,7 +165,7 @@ impl Tap {
 
 impl Driver for Tap {
     fn period_s(&self) -> f64 {
-        tandem_bridge::simulated::PERIOD_S
+        tandem_trials::simulated::PERIOD_S
     }
 
     fn exchange(&mut self, command: &Command) -> Result<PairState, DriverError> {
@@ -207,7 +205,7 @@ impl Driver for Tap {
     }
 }
 
-/// Settings with which no test's client is too slow.
+/// Settings for which no client is too slow.
 pub(crate) fn patient() -> Settings {
     Settings { owner_hold_s: 1e6, owner_stop_s: 1e6, lease_s: 1e6, ..Settings::default() }
 }
@@ -215,17 +213,17 @@ pub(crate) fn patient() -> Settings {
 /// A running service.
 pub(crate) struct Rig {
     pub(crate) client: BridgeClient<Channel>,
-    pub(crate) clock: Arc<Clock>,
+    pub(crate) clock: Arc<TestClock>,
     pub(crate) tap: Tap,
     pub(crate) shutdown: CancellationToken,
     pub(crate) served: JoinHandle<Result<(), Error>>,
     address: SocketAddr,
 }
 
-/// A motion under way: signs of life go in, progress comes out.
+/// A running motion with its signs of life and progress.
 pub(crate) struct Playing {
     pub(crate) signs: mpsc::Sender<pb::ExecuteRequest>,
-    pub(crate) told: Streaming<pb::ExecuteResponse>,
+    pub(crate) responses: Streaming<pb::ExecuteResponse>,
 }
 
 impl Rig {
@@ -233,11 +231,11 @@ impl Rig {
         Self::bounded(settings, 1.0).await
     }
 
-    /// A service that can connect to its arms again.
+    /// A service that can reconnect to its arms.
     pub(crate) async fn dialling(settings: Settings) -> Self {
         Self::start(settings, 1.0, |tap| {
             let tap = tap.clone();
-            Some(Arc::new(move || tap.dial().map(|tap| Box::new(tap) as AnyDriver)))
+            Some(Arc::new(move || tap.client_config().map(|tap| Box::new(tap) as BoxDriver)))
         })
         .await
     }
@@ -247,18 +245,22 @@ impl Rig {
         Self::start(settings, speed, |_| None).await
     }
 
-    async fn start(settings: Settings, speed: f64, dial: fn(&Tap) -> Option<Dial>) -> Self {
+    async fn start(
+        settings: Settings,
+        speed: f64,
+        reconnect: fn(&Tap) -> Option<Reconnect>,
+    ) -> Self {
         let listener = TcpListener::bind(SocketAddr::from(([127, 0, 0, 1], 0))).await.unwrap();
         let address = listener.local_addr().unwrap();
-        let (clock, tap) = (Arc::new(Clock::default()), Tap::new(1));
+        let (clock, tap) = (Arc::new(TestClock::default()), Tap::new(1));
         let executor = Executor::new(mico_cell(), Box::new(tap.clone()) as _, settings).unwrap();
         let shutdown = CancellationToken::new();
         let config = Config {
             driver: "sim".to_owned(),
             version: "0.0.0-test".to_owned(),
             speed,
-            time: clock.clone(),
-            dial: dial(&tap),
+            clock: clock.clone(),
+            reconnect: reconnect(&tap),
             secret: [7; 32],
         };
         let ends = shutdown.clone();
@@ -269,7 +271,7 @@ impl Rig {
         Self { client, clock, tap, shutdown, served, address }
     }
 
-    /// A client of its own connection.
+    /// Returns a client with a separate connection.
     pub(crate) async fn stranger(&self) -> BridgeClient<Channel> {
         connect(self.address)
     }
@@ -279,14 +281,14 @@ impl Rig {
         answer.into_inner().token
     }
 
-    /// Owned and let go.
+    /// Acquires and resets the arms.
     pub(crate) async fn ready(&mut self) -> String {
         let token = self.acquire().await;
         self.reset(&token).await.unwrap();
         token
     }
 
-    /// Lets the arms go as soon as they are well.
+    /// Resets the arms as soon as their states are good.
     pub(crate) async fn reset(&mut self, token: &str) -> Result<(), Status> {
         let deadline = tokio::time::sleep(DEADLINE);
         tokio::pin!(deadline);
@@ -305,7 +307,7 @@ impl Rig {
         self.client.status(pb::BridgeStatusRequest {}).await.unwrap().into_inner()
     }
 
-    /// Waits until the status is as wanted.
+    /// Waits until the status meets a condition.
     pub(crate) async fn eventually(
         &mut self,
         wanted: impl Fn(&pb::BridgeStatusResponse) -> bool,
@@ -329,18 +331,18 @@ impl Rig {
         let (signs, requests) = mpsc::channel(8);
         let start = pb::ExecuteStart { token: token.to_owned(), motion: Some(motion) };
         signs.send(request(pb::execute_request::Request::Start(start))).await.unwrap();
-        let told = self.client.execute(ReceiverStream::new(requests)).await;
-        told.map(Response::into_inner).map(|told| Playing { signs, told })
+        let responses = self.client.execute(ReceiverStream::new(requests)).await;
+        responses.map(Response::into_inner).map(|responses| Playing { signs, responses })
     }
 
-    /// A motion that takes minutes, under way.
+    /// Starts a motion that takes minutes.
     pub(crate) async fn moving(&mut self, token: &str) -> Playing {
         let mut playing = self.execute(token, slow()).await.unwrap();
         while playing.next().await.unwrap().progress.unwrap().played_s <= 0.0 {}
         playing
     }
 
-    /// The drives have braked, and nothing moves whatever time passes.
+    /// Asserts that the drives have braked and nothing moves.
     pub(crate) async fn assert_nothing_moves(&mut self) {
         let since_s = self.status().await.now_s;
         self.eventually(|status| status.now_s > since_s + 0.5).await;
@@ -353,18 +355,18 @@ impl Rig {
 }
 
 impl Playing {
-    /// A sign of life; nobody hears it after the end.
+    /// Sends a sign of life, which has no effect after the end.
     pub(crate) async fn alive(&self) {
         let alive = pb::execute_request::Request::Alive(pb::SignOfLife {});
         self.signs.send(request(alive)).await.ok();
     }
 
     pub(crate) async fn next(&mut self) -> Result<pb::ExecuteResponse, Status> {
-        let next = tokio::time::timeout(DEADLINE, self.told.message()).await.unwrap();
+        let next = tokio::time::timeout(DEADLINE, self.responses.message()).await.unwrap();
         next.map(|response| response.expect("an outcome comes before the end"))
     }
 
-    /// What the stream tells last, and all phases on the way.
+    /// Returns the last response and all phases before it.
     pub(crate) async fn last(
         &mut self,
     ) -> Result<(pb::ExecuteResponse, Vec<pb::BridgePhase>), Status> {
@@ -376,13 +378,16 @@ impl Playing {
                 phases.push(phase);
             }
             if response.outcome.is_some() {
-                assert!(self.told.message().await.unwrap().is_none(), "nothing after the outcome");
+                assert!(
+                    self.responses.message().await.unwrap().is_none(),
+                    "nothing after the outcome"
+                );
                 return Ok((response, phases));
             }
         }
     }
 
-    /// Why the motion was stopped.
+    /// Returns the cause of the motion's stop.
     pub(crate) async fn stopped(&mut self) -> pb::BridgeStop {
         let (last, _) = self.last().await.unwrap();
         match last.outcome.unwrap().outcome.unwrap() {
@@ -401,11 +406,11 @@ pub(crate) fn request(request: pb::execute_request::Request) -> pb::ExecuteReque
     pb::ExecuteRequest { request: Some(request) }
 }
 
-/// Where the tools are before anything has moved, and up and towards the middle from there: metres.
+/// The initial positions of the tools, and positions further up and towards the middle; metres.
 pub(crate) const READY_M: [[f64; 3]; 2] = [[-0.12, 0.0, 0.095], [0.12, 0.0, 0.095]];
 pub(crate) const UP_M: [[f64; 3]; 2] = [[-0.10, 0.02, 0.115], [0.10, -0.02, 0.115]];
 
-/// A way of both tools through `places` from where they are.
+/// A motion of both tools from their present positions through `places`.
 pub(crate) fn through(places: &[[[f64; 3]; 2]], speed: f64) -> pb::MotionRequest {
     let arm = |at_m: &[f64; 3]| pb::ArmWayPoint { tool_in_world_m: at_m.to_vec(), opening: 0.8 };
     let way_points = pb::WayPoints {
@@ -419,12 +424,12 @@ pub(crate) fn through(places: &[[[f64; 3]; 2]], speed: f64) -> pb::MotionRequest
     pb::MotionRequest { motion: Some(pb::motion_request::Motion::WayPoints(way_points)), speed }
 }
 
-/// Up and back, in minutes.
+/// A motion up and back that takes minutes.
 pub(crate) fn slow() -> pb::MotionRequest {
     through(&[UP_M, READY_M, UP_M, READY_M], 0.005)
 }
 
-/// A motion of joints at its own speed.
+/// A joint motion at its own speed.
 pub(crate) fn joint_request(motion: &Motion) -> pb::MotionRequest {
     let sample = |sample: &ArmSample| pb::JointSample {
         angles_rad: sample.angles.to_vec(),

@@ -1,4 +1,4 @@
-//! Every way in which a motion ends before its time: the drives are stopped, and nothing moves before a reset.
+//! Motions that end early: the drives are stopped, and nothing moves before a reset.
 
 use tandem_bridge::service::Error;
 use tandem_bridge::{Command, Order, Settings};
@@ -7,7 +7,7 @@ use tonic::Code;
 
 use crate::rig::{Fault, Rig, UP_M, patient, request, slow, through};
 
-/// Nothing moves, no motion begins, and after a reset all is well again.
+/// Asserts that nothing moves and no motion starts before a reset, and that motions work after it.
 async fn assert_stopped_until_reset(rig: &mut Rig, name: &str) {
     let is_stopped = |status: &pb::BridgeStatusResponse| status.phase() == pb::BridgePhase::Stopped;
     let status = rig.eventually(is_stopped).await;
@@ -36,13 +36,13 @@ async fn nothing_moves_before_a_reset() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn anyone_stops_the_arms() {
+async fn any_client_stops_the_arms() {
     let mut rig = Rig::new(patient()).await;
     let token = rig.ready().await;
     let mut playing = rig.moving(&token).await;
     let n_stops = rig.tap.n_stops();
     let stopped = rig.stranger().await.stop(pb::StopRequest {}).await.unwrap().into_inner();
-    assert!(rig.tap.n_stops() > n_stops, "the drives were told before the answer");
+    assert!(rig.tap.n_stops() > n_stops, "the drives were stopped before the response");
     assert_eq!(rig.tap.newest(), Order::Stop);
     assert_eq!(stopped.stopped.unwrap().name, "requested");
     let why = playing.stopped().await;
@@ -52,7 +52,7 @@ async fn anyone_stops_the_arms() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_stop_queues_behind_nothing() {
+async fn a_stop_waits_in_no_queue() {
     let mut rig = Rig::new(patient()).await;
     let token = rig.ready().await;
     let mut playing = rig.moving(&token).await;
@@ -90,7 +90,7 @@ async fn a_stream_that_breaks_stops_the_arms() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_client_that_ends_its_signs_of_life_stops_the_arms_and_hears_of_it() {
+async fn a_client_that_ends_its_signs_of_life_stops_the_arms_and_receives_the_outcome() {
     let mut rig = Rig::new(patient()).await;
     let token = rig.ready().await;
     let mut playing = rig.moving(&token).await;
@@ -111,7 +111,7 @@ async fn a_second_start_on_one_stream_is_no_sign_of_life() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn an_owner_who_gives_the_arms_up_stops_them() {
+async fn a_release_by_the_owner_stops_the_arms() {
     let mut rig = Rig::new(patient()).await;
     let token = rig.ready().await;
     let mut playing = rig.moving(&token).await;
@@ -151,8 +151,8 @@ async fn signs_of_life_keep_a_motion_going() {
         let start = pb::ExecuteStart { token, motion: Some(slow()) };
         signs.send(request(pb::execute_request::Request::Start(start))).await.unwrap();
         let requests = tokio_stream::wrappers::ReceiverStream::new(requests);
-        let told = client.execute(requests).await.unwrap().into_inner();
-        crate::rig::Playing { signs, told }
+        let responses = client.execute(requests).await.unwrap().into_inner();
+        crate::rig::Playing { signs, responses }
     });
     while !playing.is_finished() {
         clock.pass(0.01);
@@ -183,7 +183,7 @@ async fn signs_of_life_keep_a_motion_going() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn the_services_end_stops_the_arms_first() {
+async fn a_shutdown_stops_the_arms_first() {
     let mut rig = Rig::new(patient()).await;
     let token = rig.ready().await;
     let mut playing = rig.moving(&token).await;
@@ -207,7 +207,7 @@ async fn a_driver_that_fails_stops_the_arms() {
     assert_eq!(why.name, "driver");
     assert!(why.sentence.contains("the test pulled the plug"), "{why:?}");
     assert!(rig.tap.n_stops() > n_stops);
-    // Nobody resets arms that say nothing.
+    // Silent arms cannot be reset.
     let refused = rig.client.reset(pb::ResetRequest { token: token.clone() }).await.unwrap_err();
     assert_eq!(refused.code(), Code::FailedPrecondition);
     rig.tap.fail(Fault::None);
@@ -216,21 +216,21 @@ async fn a_driver_that_fails_stops_the_arms() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_reset_connects_again_and_nothing_moves_by_it() {
+async fn a_reset_reconnects_without_moving_the_arms() {
     let mut rig = Rig::dialling(patient()).await;
     let token = rig.ready().await;
     let mut playing = rig.moving(&token).await;
     rig.tap.fail(Fault::Dead);
     assert_eq!(playing.stopped().await.name, "driver");
-    // Nobody is there to connect to.
+    // The arms do not accept connections.
     let refused = rig.client.reset(pb::ResetRequest { token: token.clone() }).await.unwrap_err();
     assert_eq!(refused.code(), Code::Unavailable);
-    assert!(refused.message().contains("not connected: nobody answers"), "{refused}");
+    assert!(refused.message().contains("not connected: no response"), "{refused}");
 
     rig.tap.fail(Fault::Lost);
     let since_s = rig.status().await.now_s;
     rig.eventually(|status| status.now_s > since_s + 1.0).await;
-    assert_eq!(rig.tap.dialled().0, 0, "nobody connects unasked");
+    assert_eq!(rig.tap.dialled().0, 0, "the service reconnects only on a reset");
     // Who does not own the arms connects nothing either.
     let unknown = pb::ResetRequest { token: "0".repeat(32) };
     assert!(rig.client.reset(unknown).await.is_err());
@@ -249,28 +249,28 @@ async fn a_reset_connects_again_and_nothing_moves_by_it() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_stop_that_does_not_get_through_is_told() {
+async fn a_stop_that_fails_is_reported() {
     let mut rig = Rig::new(patient()).await;
     let token = rig.ready().await;
     let mut playing = rig.moving(&token).await;
     rig.tap.fail(Fault::Dead);
     assert_eq!(playing.stopped().await.name, "driver");
-    let told = rig.client.stop(pb::StopRequest {}).await.unwrap_err();
-    assert_eq!(told.code(), Code::Unavailable);
-    assert!(told.message().contains("could NOT be commanded to stop"), "{told}");
+    let status = rig.client.stop(pb::StopRequest {}).await.unwrap_err();
+    assert_eq!(status.code(), Code::Unavailable);
+    assert!(status.message().contains("could NOT be commanded to stop"), "{status}");
     rig.tap.fail(Fault::None);
     rig.client.stop(pb::StopRequest {}).await.unwrap();
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_driver_that_hangs_is_told_of_and_keeps_nobody_waiting() {
+async fn a_driver_that_hangs_is_reported_and_blocks_no_client() {
     let mut rig = Rig::new(patient()).await;
     let token = rig.ready().await;
     let mut playing = rig.moving(&token).await;
     rig.tap.fail(Fault::Hang);
-    let told = rig.client.stop(pb::StopRequest {}).await.unwrap_err();
-    assert_eq!(told.code(), Code::Unavailable);
-    assert!(told.message().contains("has not answered"), "{told}");
+    let status = rig.client.stop(pb::StopRequest {}).await.unwrap_err();
+    assert_eq!(status.code(), Code::Unavailable);
+    assert!(status.message().contains("has not answered"), "{status}");
     assert_eq!(rig.status().await.phase(), pb::BridgePhase::Moving, "what was known last");
     rig.tap.fail(Fault::None);
     assert_eq!(playing.stopped().await.name, "requested");
@@ -283,19 +283,19 @@ async fn a_bug_in_a_driver_stops_the_drives_and_ends_the_service() {
     let mut playing = rig.moving(&token).await;
     let n_stops = rig.tap.n_stops();
     rig.tap.fail(Fault::Panic);
-    let told = playing.last().await.unwrap_err();
-    assert_eq!(told.code(), Code::Unavailable, "{told}");
+    let status = playing.last().await.unwrap_err();
+    assert_eq!(status.code(), Code::Unavailable, "{status}");
     drop((playing, rig.client));
     assert!(matches!(rig.served.await.unwrap(), Err(Error::Panicked)));
-    assert!(rig.tap.n_stops() > n_stops, "the drives were told");
+    assert!(rig.tap.n_stops() > n_stops, "the drives were stopped");
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_thread_that_oversleeps_stops_the_arms() {
+async fn an_oversleeping_thread_stops_the_arms() {
     let mut rig = Rig::new(patient()).await;
     let token = rig.ready().await;
     let mut playing = rig.moving(&token).await;
-    // The pair's time stands meanwhile, and its states would be old as well: lateness is found first.
+    // The pair's time stops meanwhile and its states become old too, but the late tick is detected first.
     rig.clock.oversleep(0.05);
     let why = playing.stopped().await;
     assert_eq!(why.name, "late");

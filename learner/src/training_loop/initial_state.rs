@@ -70,7 +70,7 @@ impl InitialState {
         let address =
             config.teacher.as_deref().ok_or_else(|| Error::NoTeacher(advice.strategy.clone()))?;
         let options = AccountOptions {
-            dial: &config.dial,
+            client_config: &config.client_config,
             address,
             terms: pb::OpenAccountRequest {
                 name: config.run.name.clone(),

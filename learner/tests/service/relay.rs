@@ -31,9 +31,15 @@ async fn relay(learner: SocketAddr) -> (SocketAddr, tokio_util::sync::DropGuard)
     let shutdown = CancellationToken::new();
     let guard = shutdown.clone().drop_guard();
     tokio::spawn(async move {
-        let (learner, dial, gate) =
+        let (learner, client_config, server_config) =
             (learner.to_string(), ClientConfig::default(), ServerConfig::default());
-        let served = tandem_learner::relay::serve(&learner, &dial, &gate, listener, shutdown);
+        let served = tandem_learner::relay::serve(
+            &learner,
+            &client_config,
+            &server_config,
+            listener,
+            shutdown,
+        );
         served.await.expect("relays");
     });
     (address, guard)

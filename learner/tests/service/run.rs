@@ -38,8 +38,8 @@ pub(crate) fn real_clock() -> Clock {
 pub(crate) fn learner_config(run: RunConfig, out: &Path, resume: bool) -> LearnerConfig {
     LearnerConfig {
         run,
-        gate: ServerConfig::default(),
-        dial: ClientConfig::default(),
+        server_config: ServerConfig::default(),
+        client_config: ClientConfig::default(),
         teacher: None,
         start_from: None,
         out: out.to_owned(),

@@ -37,7 +37,7 @@ pub(super) struct IdleWorkers {
 struct Shared {
     /// Addresses of the learner or of relays, which workers use in turn.
     addresses: Vec<String>,
-    dial: ClientConfig,
+    client_config: ClientConfig,
     slot_time: Duration,
     episodes_per_round: u64,
     clock: Clock,
@@ -71,7 +71,7 @@ impl IdleWorkers {
         let episode = encode_episode(&Episode::zeros(Layout::new(Task::Push, 2), 0));
         let shared = Shared {
             addresses,
-            dial: ClientConfig::default(),
+            client_config: ClientConfig::default(),
             slot_time,
             episodes_per_round: episodes_per_round as u64,
             clock,
@@ -88,7 +88,8 @@ impl IdleWorkers {
     pub(super) fn join(&mut self, n: usize) -> anyhow::Result<()> {
         for _ in 0..n {
             let address = &self.shared.addresses[self.n_spawned % self.shared.addresses.len()];
-            let link = self.shared.dial.channel(address).context("cannot call the learner")?;
+            let link =
+                self.shared.client_config.channel(address).context("cannot call the learner")?;
             let state = Arc::<WorkerState>::default();
             let worker = Worker {
                 name: format!("idle-{}", self.n_spawned),

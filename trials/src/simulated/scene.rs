@@ -1,4 +1,4 @@
-//! The simulated pair as pictures show it.
+//! The scene of the simulated pair for pictures and logs.
 
 use glam::DVec3;
 use rapier3d::math::{Pose, Rotation, Vector};
@@ -7,13 +7,13 @@ use tandem_kinematics::model::Anchor;
 use tandem_kinematics::{ForwardKinematics, Joints, PlacedArm, WorkCell};
 
 use crate::simulated::config::Block;
-use crate::simulated::world::{TABLE_HALF_M, World};
+use crate::simulated::physics::{PhysicsWorld, TABLE_HALF_M};
 
-/// What the arms at `angles` and the world look like `time_s` after the start; there are no goals.
+/// Returns the scene with the arms at joint angles `angles` (radians) at `time_s`, without goals.
 pub(crate) fn scene(
     cell: &WorkCell,
     angles: &[Joints],
-    world: &World,
+    world: &PhysicsWorld,
     blocks: &[Block],
     time_s: f64,
 ) -> Scene {

@@ -1,52 +1,52 @@
-//! The simulated pair behind an executor, with a clock of its own and somebody who keeps account.
+//! The simulated pair behind an executor, with a simulated clock, measurements and an observer.
 
 use glam::DVec3;
 use tandem_core::scene::Scene;
 use tandem_core::{ArmIndex, Contacts};
 use tandem_kinematics::{ForwardKinematics, Joints, Motion, WorkCell};
 
-use crate::executor::{Executor, Phase, Settings, Token};
 use crate::simulated::{ObjectPose, PERIOD_S, SimulatedPair};
-use crate::trial::judge::{Cause, RefusedBy};
-use crate::trial::{Look, PathPoint, TrialError, Witness};
+use crate::trial::outcome::{FailureCause, MotionRefusal};
+use crate::trial::{Frame, PathPoint, TrialError, TrialObserver};
+use tandem_bridge::executor::{Executor, Phase, Settings, Token};
 
-/// The one owner.
+/// The only owner.
 const OWNER: Token = Token(1);
-/// Periods until enough good states have come for a reset.
+/// Periods until there are enough good states for a reset.
 const N_WARM_UP: usize = 15;
-/// Periods from one look to the next.
-const LOOK_EVERY: u64 = 4;
+/// Periods between two frames.
+const FRAME_PERIODS: u64 = 4;
 
-/// What moves, and what is noted about it.
-pub(crate) struct Stage<'a> {
+/// The arms of a trial and its measurements.
+pub(crate) struct TrialRig<'a> {
     executor: Executor<SimulatedPair>,
     cell: WorkCell,
-    witness: &'a mut dyn Witness,
+    observer: &'a mut dyn TrialObserver,
     goals: Vec<DVec3>,
     n_periods: u64,
     pub(crate) touched: Contacts,
     pub(crate) arms_gap_m: f64,
     pub(crate) table_gap_m: f64,
-    /// The highest each object was, world frame, metres.
+    /// The largest height of each object, world frame, metres.
     pub(crate) highest_m: Vec<f64>,
     pub(crate) path: Vec<PathPoint>,
 }
 
-impl<'a> Stage<'a> {
-    /// Lets the arms of `pair` go; `goals` (world, metres) are for pictures only.
+impl<'a> TrialRig<'a> {
+    /// Resets the arms of `pair`. `goals` (world frame, metres) only appear in the frames.
     pub(crate) fn new(
         cell: WorkCell,
         pair: SimulatedPair,
         goals: Vec<DVec3>,
-        witness: &'a mut dyn Witness,
+        observer: &'a mut dyn TrialObserver,
     ) -> Result<Self, TrialError> {
         let highest_m = vec![f64::NEG_INFINITY; pair.objects().len()];
         let executor = Executor::new(cell.clone(), pair, Settings::default());
-        let executor = executor.expect("the default settings make sense");
-        let mut stage = Self {
+        let executor = executor.expect("the default settings are valid");
+        let mut rig = Self {
             executor,
             cell,
-            witness,
+            observer,
             goals,
             n_periods: 0,
             touched: Contacts::NONE,
@@ -56,30 +56,30 @@ impl<'a> Stage<'a> {
             path: Vec::new(),
         };
         for _ in 0..N_WARM_UP {
-            stage.tick();
+            rig.tick();
         }
-        stage.executor.reset(OWNER, stage.now_s())?;
-        Ok(stage)
+        rig.executor.reset(OWNER, rig.now_s())?;
+        Ok(rig)
     }
 
-    /// Time since the start, seconds.
+    /// The time since the start, seconds.
     pub(crate) fn now_s(&self) -> f64 {
         self.n_periods as f64 * PERIOD_S
     }
 
     /// Plays `motion` to its end.
-    pub(crate) fn play(&mut self, motion: Motion, speed: f64) -> Result<(), Cause> {
+    pub(crate) fn play(&mut self, motion: Motion, speed: f64) -> Result<(), FailureCause> {
         let now_s = self.now_s();
         let started = self.executor.start(OWNER, motion, speed, now_s);
-        started.map_err(|error| Cause::Refused(RefusedBy::from(error)))?;
+        started.map_err(|error| FailureCause::Refused(MotionRefusal::from(error)))?;
         while self.tick() != Phase::Idle {
             self.check()?;
         }
         Ok(())
     }
 
-    /// Lets `time_s` pass in which nothing is commanded.
-    pub(crate) fn wait(&mut self, time_s: f64) -> Result<(), Cause> {
+    /// Waits for `time_s` without a motion.
+    pub(crate) fn wait(&mut self, time_s: f64) -> Result<(), FailureCause> {
         let until_s = self.now_s() + time_s;
         while self.now_s() < until_s {
             self.tick();
@@ -88,13 +88,13 @@ impl<'a> Stage<'a> {
         Ok(())
     }
 
-    /// The objects in a picture that was taken from now on.
-    pub(crate) fn look(&mut self) -> Result<Vec<ObjectPose>, Cause> {
+    /// Returns the objects in the next camera picture.
+    pub(crate) fn observe_objects(&mut self) -> Result<Vec<ObjectPose>, FailureCause> {
         let from_s = self.pair().time_s();
         loop {
             self.tick();
             self.check()?;
-            let seen = self.pair().seen();
+            let seen = self.pair().observed_objects();
             if seen.iter().all(|object| object.time_s >= from_s) {
                 return Ok(seen.to_vec());
             }
@@ -105,15 +105,15 @@ impl<'a> Stage<'a> {
         self.executor.driver()
     }
 
-    /// What the encoders say: angles (radians) and openings, arm by arm.
+    /// The measured angles (radians) and gripper openings, arm by arm.
     pub(crate) fn encoders(&self) -> Vec<(Joints, f64)> {
         let arms = self.executor.state().map(|state| state.arms.as_slice()).unwrap_or_default();
         arms.iter().map(|arm| (arm.angles, arm.opening)).collect()
     }
 
-    fn check(&self) -> Result<(), Cause> {
+    fn check(&self) -> Result<(), FailureCause> {
         match self.executor.stopped_by() {
-            Some(stop) => Err(Cause::Stopped(stop.clone())),
+            Some(stop) => Err(FailureCause::Stopped(stop.clone())),
             None => Ok(()),
         }
     }
@@ -122,13 +122,13 @@ impl<'a> Stage<'a> {
         self.n_periods += 1;
         let now_s = self.now_s();
         let owned = self.executor.acquire(OWNER, now_s);
-        debug_assert!(owned.is_ok(), "there is one owner only");
+        debug_assert!(owned.is_ok(), "there is only one owner");
         let phase = self.executor.tick(now_s);
-        self.note(phase);
+        self.record(phase);
         phase
     }
 
-    fn note(&mut self, phase: Phase) {
+    fn record(&mut self, phase: Phase) {
         let pair = self.executor.driver();
         self.touched = self.touched | pair.contacts();
         let gaps = pair.gaps();
@@ -137,12 +137,12 @@ impl<'a> Stage<'a> {
         for (highest_m, object) in self.highest_m.iter_mut().zip(pair.objects()) {
             *highest_m = highest_m.max(object.at_m.z);
         }
-        if !self.n_periods.is_multiple_of(LOOK_EVERY) {
+        if !self.n_periods.is_multiple_of(FRAME_PERIODS) {
             return;
         }
         let time_s = self.n_periods as f64 * PERIOD_S;
         let planned = self.executor.reference();
-        let at = |angles: &[Joints]| tools(&self.cell, angles);
+        let at = |angles: &[Joints]| tool_positions(&self.cell, angles);
         let n_arms = self.cell.arms.len();
         let angles: Vec<Joints> = (0..n_arms).map(|arm| *pair.angles(ArmIndex(arm))).collect();
         let tools = PathPoint {
@@ -153,14 +153,14 @@ impl<'a> Stage<'a> {
         let goals = self.goals.iter().map(|goal| goal.as_vec3().to_array()).collect();
         let scene = Scene { goals, time_s, ..pair.scene() };
         let measured = self.executor.state();
-        let look = Look { time_s, phase, scene, planned, measured, tools: &tools };
-        self.witness.look(&look);
+        let frame = Frame { time_s, phase, scene, planned, measured, tools: &tools };
+        self.observer.on_frame(&frame);
         self.path.push(tools);
     }
 }
 
-/// Where the tools are, world frame, metres.
-pub(crate) fn tools(cell: &WorkCell, angles: &[Joints]) -> Vec<DVec3> {
+/// Returns the positions of the tools at joint angles `angles` (radians), world frame, metres.
+pub(crate) fn tool_positions(cell: &WorkCell, angles: &[Joints]) -> Vec<DVec3> {
     let arms = cell.arms.iter().zip(angles);
     arms.map(|(placed, angles)| {
         (placed.world_from_base() * ForwardKinematics::new(placed.model, angles).tool_m()).into()

@@ -1,4 +1,4 @@
-//! The closed loop: a look, a decision and a motion at a time.
+//! The closed loop: repeats observation, action and motion.
 
 use glam::{DVec3, EulerRot};
 use tandem_core::ArmIndex;
@@ -6,38 +6,36 @@ use tandem_core::layout::{EPISODE_STEPS, GOAL_TOLERANCE_M};
 use tandem_kinematics::{ArmWaypoint, ForwardKinematics, Joints, ReachError, Waypoint, WorkCell};
 
 use crate::simulated::{MAX_OPENING_M, ObjectPose};
-use crate::trial::Decide;
-use crate::trial::judge::Cause;
-use crate::trial::mapping::{ArmMoment, observe_arm};
-use crate::trial::rollout::TrialStart;
-use crate::trial::run::{Course, REST_S, Trials};
-use crate::trial::shape::{Pads, SeenBlock, way};
-use crate::trial::stage::{Stage, tools};
+use crate::trial::ActionSource;
+use crate::trial::block_avoidance::{ObservedBlock, Pads, avoid_blocks};
+use crate::trial::mapping::{ArmObservation, write_observation};
+use crate::trial::outcome::FailureCause;
+use crate::trial::rehearsal::TrialStart;
+use crate::trial::rig::{TrialRig, tool_positions};
+use crate::trial::runner::{REST_S, TrialExecution, TrialRunner};
 
-/// A policy is done when every object was this near to its goal, as a share of the tolerance, so many times in a row.
+/// A policy is done after this many consecutive observations in which every object was within this share of the
+/// tolerance of its goal.
 const DONE_SHARE: f64 = 0.6;
-const DONE_LOOKS: usize = 5;
-/// Displacements and openings below which a step is no motion, metres and shares.
+const DONE_OBSERVATIONS: usize = 5;
+/// Displacements (metres) and changes of the opening (shares) below which a step needs no motion.
 const STILL_M: f64 = 5e-4;
 const STILL_OPENING: f64 = 0.005;
-/// Room between the arms that a step keeps where it can, metres: more than the check asks for, so that the next one
-/// can begin.
-pub(super) const STEP_GAP_M: f64 = 0.025;
-/// Where an arm goes that has to make room, own frame, metres.
+/// The displacement of an arm that makes room, own frame, metres.
 const BACK_M: DVec3 = DVec3::new(-0.03, 0.0, 0.015);
 
-/// What an arm does of a step.
+/// The part of a step that an arm carries out.
 #[derive(Clone, Copy)]
-enum Part {
-    /// This share of what the policy asked for.
+enum StepPart {
+    /// This share of the policy's displacement.
     Share(f64),
-    /// It makes room for the other one.
+    /// Makes room for the other arm.
     Back,
 }
 
-/// What is tried, one after the other, until the check allows it.
-const ATTEMPTS: [[Part; 2]; 10] = {
-    use Part::{Back, Share};
+/// The attempts at a step, in order, until the check allows one.
+const ATTEMPTS: [[StepPart; 2]; 10] = {
+    use StepPart::{Back, Share};
     [
         [Share(1.0), Share(1.0)],
         [Share(0.5), Share(0.5)],
@@ -52,39 +50,39 @@ const ATTEMPTS: [[Part; 2]; 10] = {
     ]
 };
 
-/// What the closed loop remembers.
-struct Hands {
-    /// Joint angles where the arms were told to be, radians.
+/// The state of the closed loop.
+struct LoopState {
+    /// The commanded joint angles, radians.
     at: Vec<Joints>,
-    /// Openings that were told, metres on each side.
+    /// The commanded openings, metres on each side.
     openings_m: Vec<f64>,
-    /// What the training world's hands would have, own frames, metres per second.
+    /// The velocities of the training world's hands, own frames, metres per second.
     velocities: Vec<DVec3>,
-    before: Option<Vec<ArmMoment>>,
-    /// Looks in a row at which every object was at its goal.
+    before: Option<Vec<ArmObservation>>,
+    /// The number of consecutive observations with every object at its goal.
     n_done: usize,
-    /// Where the tools went so far.
+    /// The waypoints of the tools so far.
     way_points: Vec<Waypoint>,
 }
 
-impl Trials {
-    /// A look, a decision and a motion at a time.
+impl TrialRunner {
+    /// Runs the closed loop until the policy is done, the episode ends or a step fails.
     pub(super) fn closed_loop(
         &self,
-        stage: &mut Stage<'_>,
+        rig: &mut TrialRig<'_>,
         start: &TrialStart,
         at: &[Joints],
-        policy: &mut dyn Decide,
-    ) -> Course {
-        let mut course = Course {
+        policy: &mut dyn ActionSource,
+    ) -> TrialExecution {
+        let mut execution = TrialExecution {
             ended: Ok(()),
             n_steps: 0,
             n_shortened: 0,
             rehearsed_m: None,
-            time_over: false,
+            timed_out: false,
             way_points: Vec::new(),
         };
-        let mut hands = Hands {
+        let mut state = LoopState {
             at: at.to_vec(),
             openings_m: vec![start.opening_m; at.len()],
             velocities: vec![DVec3::ZERO; at.len()],
@@ -93,93 +91,93 @@ impl Trials {
             way_points: Vec::new(),
         };
         let time_limit_s = self.config.time_limit_s / self.config.speed;
-        while course.n_steps < EPISODE_STEPS && hands.n_done < DONE_LOOKS {
-            if stage.now_s() > time_limit_s {
-                course.time_over = true;
+        while execution.n_steps < EPISODE_STEPS && state.n_done < DONE_OBSERVATIONS {
+            if rig.now_s() > time_limit_s {
+                execution.timed_out = true;
                 break;
             }
-            course.n_steps += 1;
-            match self.step(stage, start, &mut hands, policy) {
-                Ok(whole) => course.n_shortened += usize::from(!whole),
+            execution.n_steps += 1;
+            match self.step(rig, start, &mut state, policy) {
+                Ok(whole) => execution.n_shortened += usize::from(!whole),
                 Err(cause) => {
-                    course.ended = Err(cause);
+                    execution.ended = Err(cause);
                     break;
                 }
             }
         }
-        course.ended = course.ended.and_then(|()| stage.wait(REST_S));
-        course.way_points = hands.way_points;
-        course
+        execution.ended = execution.ended.and_then(|()| rig.wait(REST_S));
+        execution.way_points = state.way_points;
+        execution
     }
 
-    /// One step of the closed loop; tells whether the arms did all of what the policy asked for.
+    /// Carries out one step. Returns whether the arms carried out the policy's whole action.
     fn step(
         &self,
-        stage: &mut Stage<'_>,
+        rig: &mut TrialRig<'_>,
         start: &TrialStart,
-        hands: &mut Hands,
-        policy: &mut dyn Decide,
-    ) -> Result<bool, Cause> {
+        state: &mut LoopState,
+        policy: &mut dyn ActionSource,
+    ) -> Result<bool, FailureCause> {
         let layout = self.config.layout;
-        let seen = stage.look()?;
-        let now: Vec<ArmMoment> = stage
+        let objects = rig.observe_objects()?;
+        let now: Vec<ArmObservation> = rig
             .encoders()
             .iter()
-            .zip(&seen)
+            .zip(&objects)
             .enumerate()
             .map(|(arm, ((angles, opening), object))| {
-                let velocity = hands.velocities[arm];
-                self.mapping.moment(ArmIndex(arm), angles, *opening, velocity, object)
+                let velocity = state.velocities[arm];
+                self.mapping.observe(ArmIndex(arm), angles, *opening, velocity, object)
             })
             .collect();
-        hands.count_done(&now, &start.goals);
-        let before = hands.before.replace(now.clone()).unwrap_or_else(|| now.clone());
+        state.count_done(&now, &start.goals);
+        let before = state.before.replace(now.clone()).unwrap_or_else(|| now.clone());
         let mut observation = vec![0.0; layout.n_observation()];
         let mut goal = vec![0.0; layout.n_goal()];
         for arm in layout.arms() {
             let numbers = &mut observation[layout.observation_of(arm)];
-            observe_arm(&now[arm.0], &before[arm.0], numbers);
+            write_observation(&now[arm.0], &before[arm.0], numbers);
             goal[layout.goal_of(arm)].copy_from_slice(&start.goals[arm.0].as_vec3().to_array());
         }
         let mut action = vec![0.0; layout.n_action()];
-        policy.decide(&observation, &goal, &mut action);
+        policy.act(&observation, &goal, &mut action);
         let mut wanted: Vec<(DVec3, f64)> = Vec::new();
         for arm in layout.arms() {
             let action = &action[layout.action_of(arm)];
-            let opening_m = self.mapping.opening_after(hands.openings_m[arm.0], action);
-            let velocity = &mut hands.velocities[arm.0];
+            let opening_m = self.mapping.opening_after(state.openings_m[arm.0], action);
+            let velocity = &mut state.velocities[arm.0];
             let (hand, then) = self.mapping.hand_after(now[arm.0].hand, *velocity, action);
             *velocity = then;
             wanted.push((hand, opening_m));
         }
-        let block = |object: &ObjectPose| SeenBlock {
+        let block = |object: &ObjectPose| ObservedBlock {
             at: object.at_m,
             yaw_rad: object.turn.to_euler(EulerRot::ZYX).0,
             half_m: f64::from(self.config.block.half_m),
         };
-        let blocks: Vec<SeenBlock> = seen.iter().map(block).collect();
-        self.go(stage, hands, &wanted, &blocks)
+        let blocks: Vec<ObservedBlock> = objects.iter().map(block).collect();
+        self.move_hands(rig, state, &wanted, &blocks)
     }
 
-    /// Moves the hands to where they are `wanted`, or as far as the check allows.
-    fn go(
+    /// Moves the hands to the `wanted` positions, or as far as the check allows. Returns whether they arrived.
+    fn move_hands(
         &self,
-        stage: &mut Stage<'_>,
-        hands: &mut Hands,
+        rig: &mut TrialRig<'_>,
+        state: &mut LoopState,
         wanted: &[(DVec3, f64)],
-        blocks: &[SeenBlock],
-    ) -> Result<bool, Cause> {
+        blocks: &[ObservedBlock],
+    ) -> Result<bool, FailureCause> {
         let cell = self.mapping.cell();
         let from: Vec<DVec3> = (0..wanted.len())
-            .map(|arm| self.mapping.hand_in_own(ArmIndex(arm), &hands.at[arm]))
+            .map(|arm| self.mapping.hand_in_own(ArmIndex(arm), &state.at[arm]))
             .collect();
         let openings = |openings_m: &[f64]| -> Vec<f64> {
             openings_m.iter().map(|opening_m| self.mapping.opening(*opening_m)).collect()
         };
-        let here = tools(cell, &hands.at);
+        let here = tool_positions(cell, &state.at);
         let first: Waypoint = here
             .iter()
-            .zip(openings(&hands.openings_m))
+            .zip(openings(&state.openings_m))
             .map(|(tool, opening)| ArmWaypoint {
                 tool_in_world_m: (*tool).into(),
                 gripper_opening: opening,
@@ -189,48 +187,51 @@ impl Trials {
         for (attempt, parts) in ATTEMPTS.iter().enumerate() {
             let to: Vec<DVec3> = (0..wanted.len())
                 .map(|arm| match parts[arm] {
-                    Part::Share(share) => from[arm].lerp(wanted[arm].0, share),
-                    Part::Back => from[arm] + BACK_M,
+                    StepPart::Share(share) => from[arm].lerp(wanted[arm].0, share),
+                    StepPart::Back => from[arm] + BACK_M,
                 })
                 .collect();
-            let Ok([corner, end, last]) = self.ways(&from, &to, &openings_m, hands, blocks) else {
+            let Ok([corner, end, last]) =
+                self.step_waypoints(&from, &to, &openings_m, state, blocks)
+            else {
                 continue;
             };
             if is_still(&first, &corner) && is_still(&first, &last) {
-                hands.openings_m = openings_m;
+                state.openings_m = openings_m;
                 return Ok(attempt == 0);
             }
             let way_points = [first.clone(), corner, end, last];
-            let makes_room = parts.iter().any(|part| matches!(part, Part::Back));
+            let makes_room = parts.iter().any(|part| matches!(part, StepPart::Back));
             let check = if makes_room { &self.check } else { &self.step_check };
-            let Ok(motion) = self.motion(&way_points, &hands.at, check) else { continue };
+            let Ok(motion) = self.motion(&way_points, &state.at, check) else { continue };
             let ends: Vec<Joints> =
                 motion.arms.iter().map(|samples| samples[samples.len() - 1].angles).collect();
-            match stage.play(motion, self.config.speed) {
-                Err(Cause::Refused(_)) => continue,
+            match rig.play(motion, self.config.speed) {
+                Err(FailureCause::Refused(_)) => continue,
                 played => played?,
             }
-            hands.follow(way_points);
-            (hands.at, hands.openings_m) = (ends, openings_m);
+            state.append_waypoints(way_points);
+            (state.at, state.openings_m) = (ends, openings_m);
             return Ok(attempt == 0);
         }
         Ok(false)
     }
 
-    /// Where the tools go on their way from end effectors `from` to `to` (own frames, metres): a corner, the end, and the
-    /// end once more, where grippers close that are to close. One that closes on its way would drag what it holds along.
-    fn ways(
+    /// Returns the waypoints of the tools for end effectors that move from `from` to `to` (own frames, metres): a
+    /// corner, the end, and the end again with closed grippers. A gripper that closed while it moves would drag its
+    /// object along.
+    fn step_waypoints(
         &self,
         from: &[DVec3],
         to: &[DVec3],
         openings_m: &[f64],
-        hands: &Hands,
-        blocks: &[SeenBlock],
+        state: &LoopState,
+        blocks: &[ObservedBlock],
     ) -> Result<[Waypoint; 3], ReachError> {
-        let mut ways: [Waypoint; 3] = Default::default();
+        let mut step: [Waypoint; 3] = Default::default();
         for (arm, placed) in self.mapping.cell().arms.iter().enumerate() {
-            let (idx, near) = (ArmIndex(arm), &hands.at[arm]);
-            let [before, opening] = [hands.openings_m[arm], openings_m[arm]]
+            let (idx, near) = (ArmIndex(arm), &state.at[arm]);
+            let [before, opening] = [state.openings_m[arm], openings_m[arm]]
                 .map(|opening_m| self.mapping.opening(opening_m));
             let [from, to] = [from, to].map(|own| self.mapping.pads_in_world(idx, own[arm]));
             let (_, then) = self.mapping.tool_for_pads(idx, to, near)?;
@@ -240,33 +241,33 @@ impl Trials {
                 opening_m: before * f64::from(MAX_OPENING_M),
                 tilt_rad: tilt_rad(near).max(tilt_rad(&then)),
             };
-            let [corner, end] = way(from, to, &pads, blocks);
+            let [corner, end] = avoid_blocks(from, to, &pads, blocks);
             let openings = if opening < before {
                 [before, before, opening]
             } else {
                 [0.5 * (before + opening), opening, opening]
             };
             let points = [corner, end, end];
-            for ((way, point), opening) in ways.iter_mut().zip(points).zip(openings) {
+            for ((way_point, point), opening) in step.iter_mut().zip(points).zip(openings) {
                 let (tool_in_world_m, _) = self.mapping.tool_for_pads(idx, point, near)?;
-                way.push(ArmWaypoint {
+                way_point.push(ArmWaypoint {
                     tool_in_world_m: tool_in_world_m.into(),
                     gripper_opening: opening,
                 });
             }
         }
-        Ok(ways)
+        Ok(step)
     }
 }
 
-impl Hands {
-    /// Adds a step's way points, of which the first is where the tools were.
-    fn follow(&mut self, step: [Waypoint; 4]) {
-        let known = usize::from(!self.way_points.is_empty());
-        self.way_points.extend(step.into_iter().skip(known));
+impl LoopState {
+    /// Appends a step's waypoints. The first one is the previous position of the tools.
+    fn append_waypoints(&mut self, step: [Waypoint; 4]) {
+        let n_known = usize::from(!self.way_points.is_empty());
+        self.way_points.extend(step.into_iter().skip(n_known));
     }
 
-    fn count_done(&mut self, now: &[ArmMoment], goals: &[DVec3]) {
+    fn count_done(&mut self, now: &[ArmObservation], goals: &[DVec3]) {
         let near_m = DONE_SHARE * f64::from(GOAL_TOLERANCE_M);
         let done = now.iter().zip(goals).all(|(now, goal)| (now.object - *goal).length() <= near_m);
         self.n_done = if done { self.n_done + 1 } else { 0 };

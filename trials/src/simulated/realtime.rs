@@ -2,48 +2,48 @@
 
 use std::sync::Arc;
 
-use crate::driver::{Command, Driver, DriverError, PairState};
-use crate::service::time::Time;
 use crate::simulated::{PERIOD_S, SimulatedPair};
+use tandem_bridge::driver::{Command, Driver, DriverError, PairState};
+use tandem_bridge::service::Clock;
 
-/// Most periods that are caught up with before an exchange. After so many without a command the drives have braked.
-const MOST_MISSED: u32 = 10;
+/// The largest number of missed periods that an exchange simulates. After that many the drives have braked.
+const MAX_MISSED: u32 = 10;
 
-/// A simulated pair that does not wait for commands: when one comes late, the arms have gone on meanwhile as real ones
-/// do, and brake by themselves when none has come for too long.
+/// A simulated pair that does not wait for commands. Before a late command the arms continue to move like real ones,
+/// and they brake by themselves if no command arrives for too long.
 ///
-/// States are those of exchanges: what passed between them is not told.
-pub struct Paced {
+/// Only exchanges return states; the periods between them are not reported.
+pub struct RealTimePair {
     pair: SimulatedPair,
-    time: Arc<dyn Time>,
-    /// When the pair's own time was 0, by the clock, seconds; `None` before the first exchange.
+    clock: Arc<dyn Clock>,
+    /// The clock's time at the pair's time 0, seconds; `None` before the first exchange.
     began_s: Option<f64>,
     n_exchanges: u64,
 }
 
-impl Paced {
-    /// `pair` by the clock of `time`.
+impl RealTimePair {
+    /// Runs `pair` in the time of `clock`.
     #[must_use]
-    pub fn new(pair: SimulatedPair, time: Arc<dyn Time>) -> Self {
-        Self { pair, time, began_s: None, n_exchanges: 0 }
+    pub fn new(pair: SimulatedPair, clock: Arc<dyn Clock>) -> Self {
+        Self { pair, clock, began_s: None, n_exchanges: 0 }
     }
 
-    /// Lets the periods pass in which no command came.
+    /// Simulates the periods in which no command arrived.
     fn catch_up(&mut self) {
-        let (now_s, coming_s) = (self.time.now_s(), self.pair.time_s() + PERIOD_S);
+        let (now_s, coming_s) = (self.clock.now_s(), self.pair.time_s() + PERIOD_S);
         let began_s = self.began_s.get_or_insert(now_s - coming_s);
         let missed = ((now_s - *began_s - coming_s) / PERIOD_S).round();
-        let caught_up = missed.clamp(0.0, f64::from(MOST_MISSED));
+        let caught_up = missed.clamp(0.0, f64::from(MAX_MISSED));
         *began_s += (missed - caught_up).max(0.0) * PERIOD_S;
         let mut passed = 0.0;
         while passed < caught_up {
-            self.pair.pass();
+            self.pair.skip_period();
             passed += 1.0;
         }
     }
 }
 
-impl Driver for Paced {
+impl Driver for RealTimePair {
     fn period_s(&self) -> f64 {
         PERIOD_S
     }
@@ -65,12 +65,13 @@ mod tests {
     use std::sync::Mutex;
 
     use super::*;
-    use crate::layout::mico_cell;
-    use crate::{Order, SimulatedConfig};
+    use crate::SimulatedConfig;
+    use tandem_bridge::Order;
+    use tandem_bridge::work_cell::mico_cell;
 
-    struct Set(Mutex<f64>);
+    struct ManualClock(Mutex<f64>);
 
-    impl Time for Set {
+    impl Clock for ManualClock {
         fn now_s(&self) -> f64 {
             *self.0.lock().unwrap()
         }
@@ -79,17 +80,17 @@ mod tests {
     }
 
     #[test]
-    fn the_arms_live_on_while_no_command_comes() {
+    fn the_arms_continue_to_move_between_commands() {
         let cell = mico_cell();
         let at = cell.ready(0.05).unwrap();
         let pair = SimulatedPair::new(cell, &at, 0.5, SimulatedConfig::default());
-        let time = Arc::new(Set(Mutex::new(100.0)));
-        let mut paced = Paced::new(pair, time.clone());
+        let clock = Arc::new(ManualClock(Mutex::new(100.0)));
+        let mut realtime = RealTimePair::new(pair, clock.clone());
         let mut number = 0;
         let mut exchange = |now_s: f64| {
-            *time.0.lock().unwrap() = now_s;
+            *clock.0.lock().unwrap() = now_s;
             number += 1;
-            paced.exchange(&Command { number, order: Order::Stop }).unwrap()
+            realtime.exchange(&Command { number, order: Order::Stop }).unwrap()
         };
         let check = |state: PairState, sequence, stamp_s: f64| {
             assert_eq!(state.sequence, sequence);
@@ -98,7 +99,7 @@ mod tests {
         check(exchange(100.0), 1, 0.01);
         check(exchange(100.0104), 2, 0.02);
         check(exchange(100.0496), 3, 0.06);
-        // Nobody waits for a minute of simulation.
+        // An exchange does not simulate a whole minute.
         check(exchange(160.0), 4, 0.17);
         check(exchange(160.01), 5, 0.18);
     }

@@ -1,20 +1,20 @@
-//! Why the executor does not do what it is asked to.
+//! The errors of starts and resets.
 
 use tandem_core::ArmIndex;
 use tandem_kinematics::{Excess, Refusal};
 
-use crate::executor::Phase;
 use crate::executor::checked::CheckError;
 use crate::executor::lease::LeaseError;
+use crate::executor::state::Phase;
 
-/// Good states in a row that a reset asks for.
+/// The number of consecutive good states that a reset requires.
 pub(crate) const GOOD_STATES: u32 = 10;
 
-/// Why a motion was not started.
+/// The reason why a motion was not started.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 #[non_exhaustive]
 pub enum StartError {
-    /// Whoever asks does not own the arms.
+    /// The client does not own the arms.
     #[error(transparent)]
     Lease(#[from] LeaseError),
     /// The arms are not idle.
@@ -23,7 +23,7 @@ pub enum StartError {
     /// The speed is not in (0, 1].
     #[error("speed {0}, expected more than 0 and at most 1")]
     Speed(f64),
-    /// No state is known, or it is too old.
+    /// There is no valid state, or it is too old.
     #[error("the position of the arms is not known")]
     NoState,
     /// The motion breaks a limit.
@@ -33,13 +33,13 @@ pub enum StartError {
     #[error("the motion is refused: at {when_s:.3} s arm {}: joint {} comes within {:.2} degrees of the end of its range, at least {:.2}",
         .arm.0, .joint + 1, .excess.got.to_degrees(), .excess.allowed.to_degrees())]
     RangeMargin {
-        /// When, seconds since the start of the motion.
+        /// The time since the start of the motion, seconds.
         when_s: f64,
         /// The arm.
         arm: ArmIndex,
         /// The joint, counted from 0.
         joint: usize,
-        /// How near it comes, and what it has to stay away.
+        /// The distance to the end of the range, and the smallest allowed one.
         excess: Excess,
     },
     /// A joint still moves.
@@ -61,26 +61,26 @@ impl From<CheckError> for StartError {
     }
 }
 
-/// Why stopped arms were not let go.
+/// The reason why stopped arms were not reset.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
 #[non_exhaustive]
 pub enum ResetError {
-    /// Whoever asks does not own the arms.
+    /// The client does not own the arms.
     #[error(transparent)]
     Lease(#[from] LeaseError),
     /// The arms are not stopped.
     #[error("the arms are not stopped but {0:?}")]
     NotStopped(Phase),
-    /// The arms' states have not been good for long enough.
+    /// There have been too few consecutive good states.
     #[error("{got} good states in a row, at least {GOOD_STATES} are needed")]
     States {
-        /// Good states in a row.
+        /// The number of consecutive good states.
         got: u32,
     },
     /// A joint still moves.
     #[error("the arms still move")]
     Moving,
-    /// The connection works, and needs no new one.
+    /// The connection works and is not replaced.
     #[error("the arms are connected: reset them")]
     Connected,
 }

@@ -1,19 +1,17 @@
-//! What the policy sees and asks for, and where that is on the real table.
+//! The mapping between the policy's observations and actions and the real table.
 //!
-//! **Places.** A metre of the training world is a metre here. What the policy calls the end effector is the point between the
-//! pads: the tool's origin stands [`PADS_AHEAD_M`] behind it, along the tilted gripper, and [`HAND_LIFT_M`] higher than the
-//! training world has it, because the real fingers are longer than their pads. Objects and goals lie where the
-//! policy has them, with the difference that a block that lies on the table is as high as it is: heights are counted from
-//! a resting block.
+//! **Positions.** Lengths are not scaled. The policy's end effector is the point between the pads. The tool's origin is
+//! [`PADS_AHEAD_M`] behind it along the tilted gripper, and [`HAND_LIFT_M`] higher than in the training world, because
+//! the real fingers extend beyond their pads. Objects and goals keep their positions; heights are measured from a block
+//! that rests on the table, so blocks of any size start at the height that the policy knows.
 //!
-//! **Time.** Arms are slower than the training world's hands, and a step of a policy takes as long as the arms need for it.
-//! The policy counts on a hand with inertia, so its hand is played on by the training world's servo ([`Mapping::hand_after`]): the arm is
-//! sent to where that hand would be after the step, and the policy is told the velocity that it would have. Objects have
-//! the velocity of the hand as far as they moved with it.
+//! **Time.** The arms are slower than the training world's hands, and a step takes as long as the arms need. The policy
+//! expects a hand with inertia, so the training world's servo continues its hand ([`Mapping::hand_after`]): the arm
+//! moves to the position of that hand after the step, and the policy observes its velocity. Objects have the hand's
+//! velocity to the extent that they moved with it.
 //!
-//! **Openings.** The policy knows a gripper that opens by [`OPENING_M`] on each side and blocks of one size. Where its
-//! pads would touch such a block the real ones touch the real block, where they are shut they are shut, and
-//! where they are open they are open; between, openings are in proportion.
+//! **Openings.** The policy knows a gripper that opens by [`OPENING_M`] on each side and blocks of one size. Three
+//! openings correspond: closed, open, and just touching the block. Openings in between are interpolated linearly.
 
 use glam::{DQuat, DVec3};
 use tandem_core::{ArmIndex, Layout, Task};
@@ -21,62 +19,63 @@ use tandem_kinematics::{Joints, PlacedArm, ReachError, TaskFrame, WorkCell};
 
 use crate::simulated::{Block, MAX_OPENING_M, ObjectPose};
 
-/// Distance from the tool's origin to the point between the pads, metres.
+/// The distance from the tool's origin to the point between the pads, metres.
 pub const PADS_AHEAD_M: f64 = 0.021;
-/// How much higher the point between the pads is than the policy's end effector, metres.
+/// The height of the point between the pads above the policy's end effector, metres.
 pub const HAND_LIFT_M: f64 = 0.009;
-/// Gap between an arm's parts and the table that hands keep, metres: more than the check asks for.
+/// The gap between an arm's parts and the table that hands keep, metres; more than the check requires.
 pub const TABLE_GAP_M: f64 = 0.006;
-/// How far each side of the training world's gripper opens, metres.
+/// The largest opening of each side of the training world's gripper, metres.
 pub const OPENING_M: f64 = 0.040;
 /// Half the edge of the training world's blocks, metres.
 pub const TRAINED_HALF_M: f64 = 0.0225;
-/// Displacement that an action of 1 asks for, metres.
+/// The displacement of an action of 1, metres.
 const ACTION_M: f64 = 0.05;
-/// The training world's servo: share of the way to its target per second (1/s), largest acceleration along an axis (metres per
-/// second squared), time of a physics step (seconds) and steps in a control step.
+/// The training world's servo: gain (1/s), largest acceleration along an axis (metres per second squared), physics step
+/// (seconds) and number of physics steps in a control step.
 const APPROACH_GAIN: f64 = 27.0;
 const ACCELERATION_MPS2: f64 = 40.0 / 1.4;
 const SUBSTEP_S: f64 = 0.002;
 const N_SUBSTEPS: u32 = 20;
-/// Time of a control step, seconds.
+/// The duration of a control step, seconds.
 const CONTROL_STEP_S: f64 = 0.04;
-/// Velocity at a step's end per way covered in it, for what moves by itself: what is left of the way, times the servo's gain.
+/// The velocity at the end of a step per displacement in it, for objects that move by themselves: the remaining
+/// distance times the servo's gain.
 const END_VELOCITY_SHARE: f64 = 0.556;
-/// How far the training world's gripper moves in a step with an action of 1, metres.
+/// The change of the training world's gripper opening in a step with an action of 1, metres.
 const OPENING_STEP_M: f64 = 0.010;
-/// Where the policy's end effectors may be, own frames: low and high corner, metres.
+/// The workspace of the policy's end effectors, own frames: low and high corner, metres.
 const WORKSPACE_M: [DVec3; 2] = [DVec3::new(-0.20, -0.25, 0.022), DVec3::new(0.20, 0.25, 0.35)];
-/// Rounds in which the tool's place is found for a point between the pads.
+/// The number of iterations that determine the tool's position for a point between the pads.
 const TILT_ROUNDS: usize = 4;
 
-/// How a policy's world lies in a cell.
+/// The mapping of a policy's world into a work cell.
 #[derive(Debug, Clone)]
 pub struct Mapping {
     cell: WorkCell,
-    /// Each arm alone, for its gap to the table.
+    /// Work cells with one arm each, for the gaps to the table.
     alone: Vec<WorkCell>,
     layout: Layout,
     block_half_m: f64,
 }
 
-/// What one arm and its object are like at one moment, as a policy knows them.
+/// One arm and its object at one time, in the policy's terms.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct ArmMoment {
-    /// End effector, own frame, metres.
+pub struct ArmObservation {
+    /// The end effector, own frame, metres.
     pub hand: DVec3,
-    /// Its velocity as the training world has it, metres per second.
+    /// The velocity of the training world's end effector, metres per second.
     pub hand_velocity: DVec3,
-    /// How far each side of the gripper is open, metres.
+    /// The opening of each side of the gripper, metres.
     pub opening_m: f64,
-    /// Object, own frame, metres.
+    /// The object, own frame, metres.
     pub object: DVec3,
-    /// How the object is turned in the own frame.
+    /// The orientation of the object, own frame.
     pub turn: DQuat,
 }
 
 impl Mapping {
-    /// The mapping of `layout`'s world with blocks like `block` into `cell`.
+    /// Creates the mapping of the world of `layout`, with blocks like `block`, into `cell`.
     #[must_use]
     pub fn new(cell: WorkCell, layout: Layout, block: &Block) -> Self {
         let task_frame = TaskFrame { scale: 1.0, lift_m: 0.0, ..cell.task_frame };
@@ -86,30 +85,31 @@ impl Mapping {
         Self { cell, alone, layout, block_half_m: f64::from(block.half_m) }
     }
 
-    /// The cell, with the table as the origin of heights.
+    /// The work cell, with the table as the origin of heights.
     #[must_use]
     pub fn cell(&self) -> &WorkCell {
         &self.cell
     }
 
-    /// Where an object or goal at `own` (own frame of `arm`, metres) is in the world.
+    /// Converts the position of an object or goal from the own frame of `arm` to the world frame, metres.
     #[must_use]
     pub fn object_in_world(&self, arm: ArmIndex, own: DVec3) -> DVec3 {
         let own = own + DVec3::Z * (self.block_half_m - TRAINED_HALF_M);
         self.cell.world_from_own(arm, &own.into()).into()
     }
 
-    /// Where the policy has an object that is at `in_world`, metres.
+    /// Converts the position of an object or goal from the world frame to the own frame of `arm`, metres.
     #[must_use]
     pub fn object_in_own(&self, arm: ArmIndex, in_world: DVec3) -> DVec3 {
         self.own(arm, in_world) - DVec3::Z * (self.block_half_m - TRAINED_HALF_M)
     }
 
-    /// Where the tool's origin has to be in the world, and the angles near `near` with which it is there, so that the point between
-    /// the pads is where the policy has its end effector: `own`, metres. Lower than [`TABLE_GAP_M`] allows no hand goes.
+    /// Returns the tool's origin (world frame, metres) for the policy's end effector at `own` (own frame, metres), and
+    /// the joint angles near `near` that reach it, radians. Hands that would come nearer to the table than
+    /// [`TABLE_GAP_M`] are raised.
     ///
     /// # Errors
-    /// Says why the arm cannot be there.
+    /// Returns an error if the arm cannot reach the position.
     pub fn tool_in_world(
         &self,
         arm: ArmIndex,
@@ -119,16 +119,16 @@ impl Mapping {
         self.tool_for_pads(arm, self.pads_in_world(arm, own), near)
     }
 
-    /// Where the point between the pads is in the world for an end effector at `own` (own frame of `arm`), metres.
+    /// Converts an end effector at `own` (own frame of `arm`) to the point between the pads, world frame, metres.
     #[must_use]
     pub fn pads_in_world(&self, arm: ArmIndex, own: DVec3) -> DVec3 {
         self.cell.world_from_own(arm, &(own + DVec3::Z * HAND_LIFT_M).into()).into()
     }
 
-    /// As [`tool_in_world`](Self::tool_in_world), for a point between the pads in the world, metres.
+    /// As [`tool_in_world`](Self::tool_in_world), for a point between the pads in the world frame, metres.
     ///
     /// # Errors
-    /// Says why the arm cannot be there.
+    /// Returns an error if the arm cannot reach the position.
     pub fn tool_for_pads(
         &self,
         arm: ArmIndex,
@@ -147,7 +147,7 @@ impl Mapping {
         Ok((tool, angles))
     }
 
-    /// The policy's end effector when the joints of `arm` are at `angles`, radians; own frame, metres.
+    /// Returns the policy's end effector for joint angles `angles` (radians) of `arm`, own frame, metres.
     #[must_use]
     pub fn hand_in_own(&self, arm: ArmIndex, angles: &Joints) -> DVec3 {
         let placed = &self.cell.arms[arm.0];
@@ -157,7 +157,7 @@ impl Mapping {
         self.own(arm, pads) - DVec3::Z * HAND_LIFT_M
     }
 
-    /// The real gripper's opening (0 to 1) for one that the policy has at `opening_m` on each side.
+    /// Returns the real gripper's opening (0 to 1) for the policy's opening of `opening_m` on each side.
     #[must_use]
     pub fn opening(&self, opening_m: f64) -> f64 {
         let touching = self.block_half_m / f64::from(MAX_OPENING_M);
@@ -169,7 +169,7 @@ impl Mapping {
         }
     }
 
-    /// What the policy is told of a real gripper that is open by `opening`, 0 to 1; metres on each side.
+    /// Returns the policy's opening (metres on each side) for the real gripper's `opening`, 0 to 1.
     #[must_use]
     pub fn opening_in_own(&self, opening: f64) -> f64 {
         let touching = self.block_half_m / f64::from(MAX_OPENING_M);
@@ -181,22 +181,22 @@ impl Mapping {
         }
     }
 
-    /// What `arm` and its object are like to the policy.
+    /// Converts measurements of `arm` and its object to the policy's terms.
     #[must_use]
-    pub fn moment(
+    pub fn observe(
         &self,
         arm: ArmIndex,
         angles: &Joints,
         opening: f64,
         hand_velocity: DVec3,
         seen: &ObjectPose,
-    ) -> ArmMoment {
+    ) -> ArmObservation {
         let upright = DQuat::from_rotation_z(-self.cell.arms[arm.0].yaw_rad);
         let opening_m = match self.layout.task {
             Task::Push => 0.0,
             Task::PickAndPlace => self.opening_in_own(opening),
         };
-        ArmMoment {
+        ArmObservation {
             hand: self.hand_in_own(arm, angles),
             hand_velocity,
             opening_m,
@@ -205,8 +205,8 @@ impl Mapping {
         }
     }
 
-    /// Where the training world's hand would be after a step with `action` (one arm's, in [−1, 1]) from `hand` with `velocity`,
-    /// and its velocity then; own frame, metres and metres per second.
+    /// Returns the position and velocity of the training world's hand after a step with `action` (one arm's, in [−1,
+    /// 1]) from `hand` with `velocity`; own frame, metres and metres per second.
     #[must_use]
     pub fn hand_after(&self, hand: DVec3, velocity: DVec3, action: &[f32]) -> (DVec3, DVec3) {
         let asked = DVec3::from_array([0, 1, 2].map(|axis| f64::from(action[axis])));
@@ -222,8 +222,8 @@ impl Mapping {
         (inside, velocity)
     }
 
-    /// How far each side of the gripper shall be open after a step with `action` from `opening_m`, metres. What is in the way does
-    /// not count: a gripper that holds something is told to shut.
+    /// Returns the desired opening of each side of the gripper after a step with `action` from `opening_m`, metres.
+    /// Objects between the pads are ignored: a gripper that holds an object is commanded to close.
     #[must_use]
     pub fn opening_after(&self, opening_m: f64, action: &[f32]) -> f64 {
         match self.layout.task {
@@ -242,9 +242,9 @@ impl Mapping {
     }
 }
 
-/// Writes what the policy sees of one arm, shape `[28]`, as the training world does: `now`, and how it came there from one
-/// step `before`.
-pub fn observe_arm(now: &ArmMoment, before: &ArmMoment, observation: &mut [f32]) {
+/// Writes the policy's observation of one arm, shape `[28]`, in the training world's format. Velocities follow from the
+/// difference between `now` and one step `before`.
+pub fn write_observation(now: &ArmObservation, before: &ArmObservation, observation: &mut [f32]) {
     let hand_velocity = now.hand_velocity * CONTROL_STEP_S;
     let (hand_way, object_way) = (now.hand - before.hand, now.object - before.object);
     let together = object_way.dot(hand_way) / hand_way.length_squared().max(1e-6);
@@ -278,7 +278,7 @@ pub fn observe_arm(now: &ArmMoment, before: &ArmMoment, observation: &mut [f32])
     }
 }
 
-/// The way a gripper points, world frame.
+/// The direction of a gripper, world frame.
 fn pointing(placed: &PlacedArm, angles: &Joints) -> DVec3 {
     let posture = tandem_kinematics::ForwardKinematics::new(placed.model, angles);
     (placed.world_from_base() * posture.pointing()).into()

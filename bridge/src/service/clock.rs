@@ -1,17 +1,18 @@
-//! Time, as the service is given it.
+//! The clock that the service receives.
 
-/// A clock, and a way to wait for it.
-pub trait Time: Send + Sync {
-    /// Seconds since a start of the clock's own; never less than before.
+/// A monotonic clock and a way to wait for it.
+pub trait Clock: Send + Sync {
+    /// Returns the seconds since an arbitrary start. Never decreases.
     fn now_s(&self) -> f64;
 
-    /// Blocks the calling thread until [`now_s`](Self::now_s) is `when_s`, as exactly as it can; not at all when that is past.
+    /// Blocks the calling thread until [`now_s`](Self::now_s) reaches `when_s`. Returns at once if that time has
+    /// passed.
     fn sleep_until(&self, when_s: f64);
 }
 
-/// The next of the times `from_s`, `from_s` + period, ... that is still to come at `now_s`, all in seconds.
+/// Returns the first of the times `from_s` + period, `from_s` + 2 periods, ... after `now_s`, all in seconds.
 ///
-/// Times that are past are left out: commands that come late must not come in a burst.
+/// Missed times are skipped: late commands must not be sent in a burst.
 pub(super) fn next_time(from_s: f64, period_s: f64, now_s: f64) -> f64 {
     let next_s = from_s + period_s;
     if next_s > now_s {
@@ -25,7 +26,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn ticks_keep_their_times_and_missed_ones_are_left_out() {
+    fn ticks_keep_their_times_and_missed_ones_are_skipped() {
         let check = |from_s: f64, now_s: f64, expected: f64| {
             let next_s = next_time(from_s, 0.01, now_s);
             assert!((next_s - expected).abs() < 1e-9, "{from_s} {now_s}: {next_s}");

@@ -1,9 +1,9 @@
-//! The way of one step round the blocks: sideways before down, and down only where there is room.
+//! The path of one step around the blocks: sideways before down, and down only where there is room.
 //!
-//! In the training world a hand that comes down on a block is held up by it and slides on. An arm would press until the
-//! envelope stops it. So a hand above a block's top goes sideways first; where its pads would then come down on
-//! a block it stays just above. A hand beside a block goes down first and then sideways: pads that come down along a block's
-//! side press it on the table. And what a hand holds it lowers to the table and no further.
+//! In the training world a hand that descends on a block rests on it and slides along. An arm would press until the
+//! envelope stops it. A hand above a block's top therefore moves sideways first, and stays just above a block that its
+//! pads would touch. A hand beside a block moves down first and then sideways, because pads that descend along a
+//! block's side press it onto the table. A hand that holds a block lowers it to the table and no further.
 
 use glam::{DVec2, DVec3};
 
@@ -11,52 +11,57 @@ use glam::{DVec2, DVec3};
 const PAD_HALF_M: DVec2 = DVec2::new(0.008, 0.005);
 /// The pads' lower ends below the point between them, metres.
 const PADS_BELOW_M: f64 = 0.015;
-/// Room that is kept beside a block, and above it, metres.
+/// Distances that are kept beside and above a block, metres.
 const BESIDE_M: f64 = 0.003;
 const ABOVE_M: f64 = 0.004;
-/// A block between shut pads is held when its centre is so near, horizontally, metres.
+/// Closed pads hold a block whose centre is horizontally within this distance, metres.
 const HELD_WITHIN_M: f64 = 0.025;
-/// Height above the table at which a block that is held counts as set down, metres: cameras are not exact.
+/// Height above the table at which a held block counts as set down, metres, because cameras are not exact.
 const SET_DOWN_M: f64 = 0.002;
-/// Room to be added beside a block for pads that are not upright, metres for a gripper that lies.
+/// Additional distance beside a block for tilted pads, metres at a tilt of 90 degrees.
 const TILTED_M: f64 = 0.010;
 
-/// A block as it was seen, world frame.
+/// A block as observed, world frame.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(crate) struct SeenBlock {
-    /// Its centre, metres.
+pub(crate) struct ObservedBlock {
+    /// The centre, metres.
     pub(crate) at: DVec3,
-    /// How it is turned about the upright axis, radians.
+    /// The rotation about the vertical axis, radians.
     pub(crate) yaw_rad: f64,
-    /// Half an edge, metres.
+    /// Half the edge, metres.
     pub(crate) half_m: f64,
 }
 
 /// The pads of a hand that is to move.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Pads {
-    /// Direction in which they close, world frame, as an angle about the upright axis, radians.
+    /// The closing direction, world frame, as an angle about the vertical axis, radians.
     pub(crate) yaw_rad: f64,
-    /// How far each side is open, metres.
+    /// The opening of each side, metres.
     pub(crate) opening_m: f64,
-    /// The largest angle between the gripper and straight down on the way, radians.
+    /// The largest angle between the gripper and the vertical on the path, radians.
     pub(crate) tilt_rad: f64,
 }
 
-/// Where the point between the pads shall go on its way from `from` to `to`, world frame, metres: a corner and the end.
-pub(crate) fn way(from: DVec3, to: DVec3, pads: &Pads, blocks: &[SeenBlock]) -> [DVec3; 2] {
-    let room_m = blocks.iter().filter(|block| pads.hold(from, block)).map(SeenBlock::room_m);
+/// Returns the path of the point between the pads from `from` towards `to`, world frame, metres: a corner and the end.
+pub(crate) fn avoid_blocks(
+    from: DVec3,
+    to: DVec3,
+    pads: &Pads,
+    blocks: &[ObservedBlock],
+) -> [DVec3; 2] {
+    let room_m = blocks.iter().filter(|block| pads.hold(from, block)).map(ObservedBlock::room_m);
     let to = to.with_z(to.z.max(from.z - room_m.fold(f64::INFINITY, f64::min)));
     let (sin, cos) = libm::sincos(pads.tilt_rad);
     let reach_m = PADS_BELOW_M * cos + PAD_HALF_M.x * sin;
-    let was_above = |block: &&SeenBlock| from.z - reach_m >= block.top_m() - ABOVE_M;
+    let was_above = |block: &&ObservedBlock| from.z - reach_m >= block.top_m() - ABOVE_M;
     if to.z >= from.z {
         return [from.midpoint(to), to];
     }
     if blocks.iter().filter(was_above).count() == 0 {
         return [from.with_z(to.z), to];
     }
-    let blocked = |block: &&SeenBlock| pads.overlap(to, block);
+    let blocked = |block: &&ObservedBlock| pads.overlap(to, block);
     let lowest_m = blocks
         .iter()
         .filter(was_above)
@@ -67,8 +72,8 @@ pub(crate) fn way(from: DVec3, to: DVec3, pads: &Pads, blocks: &[SeenBlock]) -> 
     [end.with_z(from.z), end]
 }
 
-impl SeenBlock {
-    /// How far it may be lowered, metres.
+impl ObservedBlock {
+    /// The distance by which the block can be lowered, metres.
     fn room_m(&self) -> f64 {
         (self.at.z - self.half_m - SET_DOWN_M).max(0.0)
     }
@@ -79,16 +84,16 @@ impl SeenBlock {
 }
 
 impl Pads {
-    /// Whether pads about `centre` hold `block`.
-    fn hold(&self, centre: DVec3, block: &SeenBlock) -> bool {
+    /// Returns whether pads around `centre` hold `block`.
+    fn hold(&self, centre: DVec3, block: &ObservedBlock) -> bool {
         let offset = block.at - centre;
         self.opening_m <= block.half_m
             && offset.truncate().length() < HELD_WITHIN_M
             && offset.z.abs() < block.half_m
     }
 
-    /// Whether pads about `centre` stand over `block` or too near beside it.
-    fn overlap(&self, centre: DVec3, block: &SeenBlock) -> bool {
+    /// Returns whether pads around `centre` are above `block` or too near to it.
+    fn overlap(&self, centre: DVec3, block: &ObservedBlock) -> bool {
         let room_m = BESIDE_M + TILTED_M * libm::sin(self.tilt_rad);
         let closing = direction(self.yaw_rad);
         let cube = Rectangle {
@@ -108,7 +113,7 @@ impl Pads {
 /// A rectangle on the table.
 struct Rectangle {
     at: DVec2,
-    /// Direction of its first edge.
+    /// The direction of the first edge.
     along: DVec2,
     half: DVec2,
 }
@@ -120,7 +125,7 @@ impl Rectangle {
         axes.iter().all(|axis| apart.dot(*axis).abs() < self.width(*axis) + other.width(*axis))
     }
 
-    /// Half its width along `axis`.
+    /// Half the width along `axis`.
     fn width(&self, axis: DVec2) -> f64 {
         self.half.x * self.along.dot(axis).abs() + self.half.y * self.along.perp().dot(axis).abs()
     }
@@ -135,42 +140,42 @@ fn direction(angle_rad: f64) -> DVec2 {
 mod tests {
     use super::*;
 
-    const BLOCK: SeenBlock =
-        SeenBlock { at: DVec3::new(0.1, 0.0, 0.028), yaw_rad: 0.0, half_m: 0.028 };
+    const BLOCK: ObservedBlock =
+        ObservedBlock { at: DVec3::new(0.1, 0.0, 0.028), yaw_rad: 0.0, half_m: 0.028 };
     const OPEN: Pads =
         Pads { yaw_rad: std::f64::consts::FRAC_PI_2, opening_m: 0.05, tilt_rad: 0.0 };
 
     #[test]
-    fn open_pads_come_down_round_a_block_and_shut_ones_stay_above() {
+    fn open_pads_descend_around_a_block_and_closed_ones_stay_above() {
         let (from, to) = (DVec3::new(0.07, 0.0, 0.12), DVec3::new(0.1, 0.0, 0.03));
         let corner = DVec3::new(0.1, 0.0, 0.12);
-        assert_eq!(way(from, to, &OPEN, &[BLOCK]), [corner, to]);
+        assert_eq!(avoid_blocks(from, to, &OPEN, &[BLOCK]), [corner, to]);
         let shut = Pads { opening_m: 0.0, ..OPEN };
-        let [_, end] = way(from, to, &shut, &[BLOCK]);
+        let [_, end] = avoid_blocks(from, to, &shut, &[BLOCK]);
         assert!((end.z - (0.056 + PADS_BELOW_M + ABOVE_M)).abs() < 1e-12, "{end}");
-        let turned = SeenBlock { yaw_rad: std::f64::consts::FRAC_PI_4, ..BLOCK };
+        let turned = ObservedBlock { yaw_rad: std::f64::consts::FRAC_PI_4, ..BLOCK };
         let narrow = Pads { opening_m: 0.033, ..OPEN };
-        assert_eq!(way(from, to, &narrow, &[BLOCK])[1], to);
-        assert!(way(from, to, &narrow, &[turned])[1].z > 0.07, "a corner is under a pad");
+        assert_eq!(avoid_blocks(from, to, &narrow, &[BLOCK])[1], to);
+        assert!(avoid_blocks(from, to, &narrow, &[turned])[1].z > 0.07, "a corner is under a pad");
     }
 
     #[test]
-    fn what_is_held_is_lowered_to_the_table_and_no_further() {
-        let held = SeenBlock { at: BLOCK.at.with_z(0.06), ..BLOCK };
+    fn a_held_block_is_lowered_to_the_table_and_no_further() {
+        let held = ObservedBlock { at: BLOCK.at.with_z(0.06), ..BLOCK };
         let from = DVec3::new(0.1, 0.005, 0.07);
         let to = from.with_z(0.03);
         let shut = Pads { opening_m: 0.02, ..OPEN };
-        let [_, end] = way(from, to, &shut, &[held]);
+        let [_, end] = avoid_blocks(from, to, &shut, &[held]);
         assert!((end.z - (0.07 - (0.06 - 0.028 - SET_DOWN_M))).abs() < 1e-12, "{end}");
-        let [_, end] = way(from, from.with_z(0.04), &OPEN, &[BLOCK]);
+        let [_, end] = avoid_blocks(from, from.with_z(0.04), &OPEN, &[BLOCK]);
         assert!((end.z - 0.04).abs() < 1e-12, "nothing is held by an open gripper");
     }
 
     #[test]
-    fn a_hand_beside_a_block_goes_down_before_it_pushes() {
+    fn a_hand_beside_a_block_moves_down_before_it_pushes() {
         let (from, to) = (DVec3::new(0.04, 0.0, 0.04), DVec3::new(0.08, 0.0, 0.03));
-        assert_eq!(way(from, to, &OPEN, &[BLOCK]), [from.with_z(0.03), to]);
+        assert_eq!(avoid_blocks(from, to, &OPEN, &[BLOCK]), [from.with_z(0.03), to]);
         let up = from.with_z(0.1);
-        assert_eq!(way(from, up, &OPEN, &[BLOCK]), [from.midpoint(up), up]);
+        assert_eq!(avoid_blocks(from, up, &OPEN, &[BLOCK]), [from.midpoint(up), up]);
     }
 }

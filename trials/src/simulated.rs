@@ -1,16 +1,16 @@
-//! A pair of Kinova Micos with physics of its own, for where there are no arms.
+//! A simulated pair of Kinova Micos with its own physics.
 //!
-//! It stands for the real world in trials, so it is unlike the training world on purpose: joints instead of a hand that flies,
-//! a gripper that tilts as the joints tilt it, two fingers, commands that arrive late, speeds that follow with a lag,
-//! encoders with noise, cameras that see late. The arms' shapes are those of `tandem-kinematics`, whose capsules include
-//! about a centimetre of margin: two arms touch, and an arm touches the table or itself, when these do. Objects are touched by
-//! thinner shells. An arm that touches itself reports a contact.
+//! The pair replaces real arms in trials, so it differs from the training world on purpose: it has joints instead of a
+//! free hand, a gripper that tilts with the joints, two fingers, delayed commands, speeds that follow with a lag, noisy
+//! encoders and delayed cameras. The arms' shapes are those of `tandem-kinematics`, whose capsules include about a
+//! centimetre of margin. Contacts between arms, with the table and within one arm are those of the capsules; objects
+//! collide with thinner shells. An arm that touches itself reports a contact.
 //!
-//! **The gripper** has two pads that slide straight along the closing direction, from 0 to 62 mm each, and reach 36 mm beyond
-//! the tool's origin: in every opening they stay within the capsule that kinematics has for the fingers. Kinova's
-//! fingers are hinged and reach up to 44 mm when shut.
+//! **The gripper** has two pads that slide straight along the closing direction, from 0 to 62 mm each, and extend 36 mm
+//! beyond the tool's origin. At every opening they stay within the capsule of the fingers in `tandem-kinematics`.
+//! Kinova's fingers are hinged and extend up to 44 mm when closed.
 //!
-//! Time passes only in exchanges, [`PERIOD_S`] each. The same seed and commands give the same bits.
+//! Time advances only in exchanges, by [`PERIOD_S`] each. The same seed and commands give the same bits.
 
 use glam::{DMat3, DVec3};
 use rand_chacha::ChaCha8Rng;
@@ -19,27 +19,29 @@ use tandem_core::{ArmIndex, Contacts, Stream, episode_rng};
 use tandem_kinematics::model::Anchor;
 use tandem_kinematics::{ForwardKinematics, Gaps, Joints, WorkCell};
 
-use crate::driver::{Command, Driver, DriverError, Faults, Order, PairState};
 use crate::simulated::drives::Drives;
+use crate::simulated::physics::{ArmPoses, PhysicsWorld};
 use crate::simulated::sensors::Cameras;
-use crate::simulated::world::{Carried, World};
+use tandem_bridge::driver::{Command, Driver, DriverError, Faults, Order, PairState};
 
 pub use config::{
     Block, CameraConfig, Disturbance, GripperConfig, N_SUBSTEPS, PERIOD_S, SimulatedConfig,
 };
+pub use physics::MAX_OPENING_M;
+pub use realtime::RealTimePair;
 pub use sensors::ObjectPose;
-pub use world::MAX_OPENING_M;
 
 mod config;
 mod drives;
+mod physics;
+mod realtime;
 mod scene;
 mod sensors;
-mod world;
 
-/// Frames at the ends of the forearm.
+/// The frames at the ends of the forearm.
 const FOREARM_FRAMES: [usize; 2] = [3, 4];
 
-/// What random numbers are for; each has its own stream.
+/// The sources of random numbers; each has its own stream.
 #[derive(Clone, Copy)]
 enum Source {
     Latency,
@@ -47,18 +49,18 @@ enum Source {
     Cameras,
 }
 
-/// Two simulated Micos with four joints, their table and what lies on it.
+/// Up to two simulated Micos with four joints, their table and the objects on it.
 pub struct SimulatedPair {
     cell: WorkCell,
     config: SimulatedConfig,
     disturbance: Disturbance,
     drives: Drives,
-    world: World,
+    world: PhysicsWorld,
     cameras: Cameras,
-    /// What the arms touched in the last period, as torques of the joints, newton metres.
+    /// The external torques of the joints in the last period, newton metres.
     torques_nm: Vec<Joints>,
     contacts: Contacts,
-    /// For each arm whether two of its own parts touched in the last period.
+    /// Whether parts of each arm touched each other in the last period.
     self_contacts: Vec<bool>,
     rng: ChaCha8Rng,
 }
@@ -70,10 +72,11 @@ impl std::fmt::Debug for SimulatedPair {
 }
 
 impl SimulatedPair {
-    /// Arms of `cell` at rest at joint angles `at` (radians, arm by arm), grippers open by `opening` (0 to 1).
+    /// Creates the arms of `cell` at rest at joint angles `at` (radians, arm by arm), with the grippers at `opening` (0
+    /// to 1).
     ///
     /// # Panics
-    /// When the cell's arms do not have four joints each, there are more than two, or `at` is of others.
+    /// Panics if there are more than two arms, an arm does not have four joints, or `at` does not match the arms.
     #[must_use]
     pub fn new(cell: WorkCell, at: &[Joints], opening: f64, config: SimulatedConfig) -> Self {
         assert!(
@@ -82,9 +85,9 @@ impl SimulatedPair {
         );
         assert!(at.iter().all(|angles| angles.len() == 4), "arms with four joints");
         let rng = |source| episode_rng(config.seed, source as u64, Stream::Reset);
-        let carried: Vec<Carried> = carried(&cell, at).collect();
+        let poses: Vec<ArmPoses> = arm_poses(&cell, at).collect();
         let opening = opening.clamp(0.0, 1.0);
-        let world = World::new(&config, &carried, DVec3::splat(opening).as_vec3().x);
+        let world = PhysicsWorld::new(&config, &poses, DVec3::splat(opening).as_vec3().x);
         let objects = objects(&world, 0.0);
         Self {
             drives: Drives::new(&cell, at, opening, rng(Source::Latency)),
@@ -100,18 +103,18 @@ impl SimulatedPair {
         }
     }
 
-    /// Lets a period pass in which no command comes, and reads the arms.
-    pub fn pass(&mut self) -> PairState {
-        self.let_pass();
+    /// Simulates a period without a command and returns the state.
+    pub fn skip_period(&mut self) -> PairState {
+        self.simulate_period();
         self.read()
     }
 
-    /// Does something to the arms from outside, from now on.
+    /// Applies a disturbance to the arms from now on.
     pub fn disturb(&mut self, disturbance: Disturbance) {
         self.disturbance = disturbance;
     }
 
-    /// Simulated time, seconds.
+    /// The simulated time, seconds.
     #[must_use]
     pub fn time_s(&self) -> f64 {
         self.drives.n_periods() as f64 * PERIOD_S
@@ -120,7 +123,7 @@ impl SimulatedPair {
     /// The true joint angles of an arm, radians.
     ///
     /// # Panics
-    /// When there is no such arm.
+    /// Panics if there is no such arm.
     #[must_use]
     pub fn angles(&self, arm: ArmIndex) -> &Joints {
         &self.drives.arms[arm.0].angles
@@ -129,53 +132,53 @@ impl SimulatedPair {
     /// The true joint velocities of an arm, radians per second.
     ///
     /// # Panics
-    /// When there is no such arm.
+    /// Panics if there is no such arm.
     #[must_use]
     pub fn velocities(&self, arm: ArmIndex) -> &Joints {
         &self.drives.arms[arm.0].velocities
     }
 
-    /// The true gaps round the arms, metres.
+    /// The true gaps around the arms, metres.
     #[must_use]
     pub fn gaps(&self) -> &Gaps {
         self.drives.gaps()
     }
 
-    /// What the arms touched in the last period: each other, or the table.
+    /// The contacts of the arms with each other and with the table in the last period.
     #[must_use]
     pub fn contacts(&self) -> Contacts {
         self.contacts
     }
 
-    /// Whether two parts of `arm` itself touched in the last period.
+    /// Returns whether parts of `arm` touched each other in the last period.
     ///
     /// # Panics
-    /// When there is no such arm.
+    /// Panics if there is no such arm.
     #[must_use]
     pub fn touches_itself(&self, arm: ArmIndex) -> bool {
         self.self_contacts[arm.0]
     }
 
-    /// Where the objects truly are.
+    /// The true poses of the objects.
     #[must_use]
     pub fn objects(&self) -> Vec<ObjectPose> {
         objects(&self.world, self.time_s())
     }
 
-    /// Where the cameras saw the objects in the newest picture that is known.
+    /// The poses of the objects in the newest camera picture that is available.
     #[must_use]
-    pub fn seen(&self) -> &[ObjectPose] {
-        self.cameras.seen()
+    pub fn observed_objects(&self) -> &[ObjectPose] {
+        self.cameras.objects()
     }
 
-    /// What everything looks like.
+    /// The scene for pictures and logs.
     #[must_use]
     pub fn scene(&self) -> Scene {
         let angles: Vec<Joints> = self.drives.arms.iter().map(|arm| arm.angles).collect();
         scene::scene(&self.cell, &angles, &self.world, &self.config.blocks, self.time_s())
     }
 
-    fn let_pass(&mut self) {
+    fn simulate_period(&mut self) {
         self.drives.begin_period();
         self.contacts = Contacts::NONE;
         self.self_contacts.fill(false);
@@ -186,9 +189,9 @@ impl SimulatedPair {
             let opened: Vec<f64> = (0..n_arms).map(|arm| self.world.opening(arm)).collect();
             self.drives.step(&self.cell, &self.config, &self.disturbance, &opened, &torques);
             let angles: Vec<Joints> = self.drives.arms.iter().map(|arm| arm.angles).collect();
-            let carried: Vec<Carried> = carried(&self.cell, &angles).collect();
+            let poses: Vec<ArmPoses> = arm_poses(&self.cell, &angles).collect();
             let openings: Vec<f64> = self.drives.arms.iter().map(|arm| arm.opening).collect();
-            self.world.step(&carried, &openings, &self.config.gripper);
+            self.world.step(&poses, &openings, &self.config.gripper);
             for (arm, force_n) in forces_n.iter_mut().enumerate() {
                 *force_n += self.world.force_n(arm) / f64::from(N_SUBSTEPS);
             }
@@ -201,18 +204,19 @@ impl SimulatedPair {
             self.torques_nm[arm] = self.torques(arm, force_n);
         }
         let time_s = self.time_s();
-        self.cameras.look(self.drives.n_periods(), || objects(&self.world, time_s));
+        self.cameras.advance(self.drives.n_periods(), || objects(&self.world, time_s));
     }
 
-    /// A force on the tool (world frame, newtons) and whoever leans on the arm, as torques of the joints.
+    /// Converts a force on the tool (world frame, newtons) and the external torques of the disturbance to joint
+    /// torques.
     fn torques(&self, arm: usize, force_n: DVec3) -> Joints {
         let placed = &self.cell.arms[arm];
         let posture = ForwardKinematics::new(placed.model, &self.drives.arms[arm].angles);
         let in_base = placed.world_from_base().inverse_transform_vector(&force_n.into());
         let jacobian = posture.position_jacobian();
-        let leaning = self.disturbance.torque_nm.get(arm);
+        let external = self.disturbance.torque_nm.get(arm);
         Joints::from_fn(placed.model.n_joints(), |joint| {
-            jacobian.column(joint).dot(&in_base) + leaning.map_or(0.0, |nm| nm[joint])
+            jacobian.column(joint).dot(&in_base) + external.map_or(0.0, |nm| nm[joint])
         })
     }
 
@@ -253,10 +257,12 @@ impl Driver for SimulatedPair {
 
     fn exchange(&mut self, command: &Command) -> Result<PairState, DriverError> {
         self.check_shape(command)?;
-        self.drives.hand_over(command.clone(), self.config.latency_periods);
-        self.let_pass();
+        self.drives.send(command.clone(), self.config.latency_periods);
+        self.simulate_period();
         if !self.world.is_finite() {
-            return Err(DriverError::Malformed { what: "an object is nowhere".into() });
+            return Err(DriverError::Malformed {
+                what: "the position of an object is not finite".into(),
+            });
         }
         Ok(self.read())
     }
@@ -267,13 +273,13 @@ impl Driver for SimulatedPair {
     }
 }
 
-/// Where joint angles bring what the physics knows of the arms.
-fn carried(cell: &WorkCell, angles: &[Joints]) -> impl Iterator<Item = Carried> {
+/// Returns the poses of the arms' bodies for joint angles `angles`, radians.
+fn arm_poses(cell: &WorkCell, angles: &[Joints]) -> impl Iterator<Item = ArmPoses> {
     cell.arms.iter().zip(angles).map(|(placed, angles)| {
         let posture = ForwardKinematics::new(placed.model, angles);
         let world_from_base = placed.world_from_base();
         let world_from_tool = world_from_base * posture.tool();
-        Carried {
+        ArmPoses {
             tool_m: world_from_tool.translation.vector.into(),
             tool_axes: DMat3::from_quat(world_from_tool.rotation.into()),
             forearm_m: FOREARM_FRAMES.map(|frame| {
@@ -283,7 +289,7 @@ fn carried(cell: &WorkCell, angles: &[Joints]) -> impl Iterator<Item = Carried> 
     })
 }
 
-fn objects(world: &World, time_s: f64) -> Vec<ObjectPose> {
+fn objects(world: &PhysicsWorld, time_s: f64) -> Vec<ObjectPose> {
     let pose = |idx| {
         let body = world.object(idx);
         let at_m = body.translation().as_dvec3();

@@ -1,5 +1,5 @@
-//! The websocket to rosbridge. Nothing here waits longer than it is told to, and nothing is queued: a message that cannot be written at
-//! once is an error.
+//! The websocket to rosbridge. All waits have a time limit, and messages are not queued: a message that cannot be
+//! written at once is an error.
 
 use std::io::ErrorKind;
 use std::net::{Shutdown, TcpStream, ToSocketAddrs as _};
@@ -9,21 +9,21 @@ use tungstenite::protocol::WebSocketConfig;
 use tungstenite::{Error, Message, WebSocket};
 
 use crate::driver::DriverError;
-use crate::kinova_ros::protocol::{Heard, hear};
+use crate::kinova_ros::protocol::{RosMessage, parse};
 
-/// Messages that are taken in one exchange at most.
-const MOST_MESSAGES: usize = 10_000;
-/// Longest message, bytes. A joint state has less than a thousand.
-const MOST_BYTES: usize = 1 << 20;
+/// The largest number of messages in one exchange.
+const MAX_MESSAGES: usize = 10_000;
+/// The longest message, bytes. A joint state has fewer than a thousand.
+const MAX_BYTES: usize = 1 << 20;
 
 /// A connection to rosbridge.
 #[derive(Debug)]
-pub(crate) struct Link {
+pub(crate) struct RosbridgeSocket {
     socket: WebSocket<TcpStream>,
 }
 
-impl Link {
-    /// Dials `address`, `host:port`.
+impl RosbridgeSocket {
+    /// Connects to `address`, `host:port`.
     pub(crate) fn connect(address: &str, timeout: Duration) -> Result<Self, DriverError> {
         let unreachable = |why: String| DriverError::Disconnected {
             what: format!("{address:?}: {why}; does rosbridge_websocket run, and at this address?"),
@@ -33,22 +33,24 @@ impl Link {
         let mut why = "the name has no address".to_owned();
         for place in addresses {
             match TcpStream::connect_timeout(&place, timeout) {
-                Ok(stream) => return Self::greet(stream, address, timeout).map_err(unreachable),
+                Ok(stream) => {
+                    return Self::handshake(stream, address, timeout).map_err(unreachable);
+                }
                 Err(error) => why = error.to_string(),
             }
         }
         Err(unreachable(why))
     }
 
-    /// Makes a websocket of a connection.
-    fn greet(stream: TcpStream, address: &str, timeout: Duration) -> Result<Self, String> {
+    /// Performs the websocket handshake.
+    fn handshake(stream: TcpStream, address: &str, timeout: Duration) -> Result<Self, String> {
         let prepared = stream.set_nodelay(true).and(stream.set_read_timeout(Some(timeout)));
         prepared.and(stream.set_write_timeout(Some(timeout))).map_err(|error| error.to_string())?;
         let config = WebSocketConfig::default()
             .write_buffer_size(0)
-            .max_write_buffer_size(MOST_BYTES)
-            .max_message_size(Some(MOST_BYTES))
-            .max_frame_size(Some(MOST_BYTES));
+            .max_write_buffer_size(MAX_BYTES)
+            .max_message_size(Some(MAX_BYTES))
+            .max_frame_size(Some(MAX_BYTES));
         let url = format!("ws://{address}/");
         let (socket, _) = tungstenite::client::client_with_config(url, stream, Some(config))
             .map_err(|error| format!("no websocket: {error}"))?;
@@ -56,56 +58,56 @@ impl Link {
         Ok(Self { socket })
     }
 
-    /// Writes a message, all of it at once.
-    pub(crate) fn say(&mut self, text: String) -> Result<(), DriverError> {
+    /// Writes a whole message without waiting.
+    pub(crate) fn send(&mut self, text: String) -> Result<(), DriverError> {
         self.socket.send(Message::text(text)).map_err(|error| match error {
-            Error::Io(error) if waited(&error) => blocked(),
+            Error::Io(error) if is_timeout(&error) => blocked(),
             Error::WriteBufferFull(_) => blocked(),
             error => lost(&error),
         })
     }
 
-    /// The next message that has come.
-    fn next(&mut self) -> Result<Option<Heard>, DriverError> {
+    /// Returns the next message that has arrived.
+    fn next(&mut self) -> Result<Option<RosMessage>, DriverError> {
         loop {
             match self.socket.read() {
-                Ok(Message::Text(text)) => return hear(&text).map(Some),
+                Ok(Message::Text(text)) => return parse(&text).map(Some),
                 Ok(Message::Binary(_)) => {
                     let what = "rosbridge sent binary data instead of JSON".into();
                     return Err(DriverError::Malformed { what });
                 }
                 Ok(_) => {}
-                Err(Error::Io(error)) if waited(&error) => return Ok(None),
+                Err(Error::Io(error)) if is_timeout(&error) => return Ok(None),
                 Err(error) => return Err(lost(&error)),
             }
         }
     }
 
-    /// Passes every message that has come to `take`.
+    /// Passes every message that has arrived to `handle`.
     pub(crate) fn drain(
         &mut self,
-        mut take: impl FnMut(Heard) -> Result<(), DriverError>,
+        mut handle: impl FnMut(RosMessage) -> Result<(), DriverError>,
     ) -> Result<(), DriverError> {
-        for _ in 0..MOST_MESSAGES {
+        for _ in 0..MAX_MESSAGES {
             match self.next()? {
-                Some(heard) => take(heard)?,
+                Some(message) => handle(message)?,
                 None => return Ok(()),
             }
         }
-        let what = format!("{MOST_MESSAGES} messages at once: rosbridge sends faster than is read");
+        let what = format!("{MAX_MESSAGES} messages at once: rosbridge sends faster than is read");
         Err(DriverError::Malformed { what })
     }
 
-    /// Waits for at most `patience` until something comes.
-    pub(crate) fn wait(&self, patience: Duration) -> Result<(), DriverError> {
+    /// Waits at most `timeout` for data.
+    pub(crate) fn wait(&self, timeout: Duration) -> Result<(), DriverError> {
         let stream = self.socket.get_ref();
         let failed = |error: std::io::Error| lost(&Error::Io(error));
-        stream.set_read_timeout(Some(patience.max(Duration::from_micros(1)))).map_err(failed)?;
+        stream.set_read_timeout(Some(timeout.max(Duration::from_micros(1)))).map_err(failed)?;
         stream.set_nonblocking(false).map_err(failed)?;
-        let came = stream.peek(&mut [0]);
+        let peeked = stream.peek(&mut [0]);
         stream.set_nonblocking(true).map_err(failed)?;
-        match came {
-            Err(error) if !waited(&error) => Err(failed(error)),
+        match peeked {
+            Err(error) if !is_timeout(&error) => Err(failed(error)),
             _ => Ok(()),
         }
     }
@@ -116,13 +118,13 @@ impl Link {
     }
 }
 
-/// Whether nothing had come, which is no failure.
-fn waited(error: &std::io::Error) -> bool {
+/// Returns whether an error only means that no data has arrived.
+fn is_timeout(error: &std::io::Error) -> bool {
     matches!(error.kind(), ErrorKind::WouldBlock | ErrorKind::TimedOut | ErrorKind::Interrupted)
 }
 
 fn blocked() -> DriverError {
-    DriverError::Disconnected { what: "rosbridge does not take messages any more".into() }
+    DriverError::Disconnected { what: "rosbridge no longer accepts messages".into() }
 }
 
 fn lost(error: &Error) -> DriverError {

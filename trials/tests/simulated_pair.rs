@@ -1,12 +1,12 @@
 //! The simulated pair by itself.
+#![expect(clippy::unwrap_used, reason = "a test panics where it fails")]
 
-use tandem_bridge::layout::mico_cell;
-use tandem_bridge::simulated::{Block, CameraConfig, PERIOD_S};
-use tandem_bridge::{
-    ArmCommand, Command, Driver as _, DriverError, Order, PairState, SimulatedConfig, SimulatedPair,
-};
+use tandem_bridge::work_cell::mico_cell;
+use tandem_bridge::{ArmCommand, Command, Driver as _, DriverError, Order, PairState};
 use tandem_core::{ArmIndex, Contacts};
 use tandem_kinematics::Joints;
+use tandem_trials::simulated::{Block, CameraConfig, PERIOD_S};
+use tandem_trials::{SimulatedConfig, SimulatedPair};
 
 const ARMS: [ArmIndex; 2] = [ArmIndex(0), ArmIndex(1)];
 
@@ -16,7 +16,7 @@ fn pair(config: SimulatedConfig) -> SimulatedPair {
     SimulatedPair::new(cell, &at, 1.0, config)
 }
 
-/// Both arms at these joint velocities, grippers shut.
+/// A command with the same joint velocities for both arms and closed grippers.
 fn moving(number: u64, velocities: [f64; 4]) -> Command {
     let arm = ArmCommand { velocities: Joints::new(&velocities), opening: 0.0 };
     Command { number, order: Order::Move(vec![arm, arm]) }
@@ -42,14 +42,14 @@ fn the_same_seed_and_commands_give_the_same_bits() {
         let mut pair = pair(SimulatedConfig { seed, blocks, ..SimulatedConfig::default() });
         let exchange = |number| pair.exchange(&moving(number, [0.1, 0.05, -0.1, 0.2])).unwrap();
         let states: Vec<PairState> = (1..60).map(exchange).collect();
-        (states, pair.objects(), pair.seen().to_vec(), pair.scene())
+        (states, pair.objects(), pair.observed_objects().to_vec(), pair.scene())
     };
     assert_eq!(run(3), run(3));
     assert_ne!(run(3).0, run(4).0);
 }
 
 #[test]
-fn drives_that_hear_nothing_brake_and_wait_for_a_stop() {
+fn drives_without_commands_brake_and_wait_for_a_stop() {
     let mut pair = pair(SimulatedConfig::default());
     for number in 1..=20 {
         pair.exchange(&moving(number, [0.3, 0.0, 0.0, 0.0])).unwrap();
@@ -57,7 +57,7 @@ fn drives_that_hear_nothing_brake_and_wait_for_a_stop() {
     let mut silent_s = PERIOD_S;
     while !at_rest(&pair) {
         assert!(silent_s < 0.1, "still moving");
-        pair.pass();
+        pair.skip_period();
         silent_s += PERIOD_S;
     }
     assert!(silent_s > 0.05, "they wait for 50 ms: {silent_s}");
@@ -93,7 +93,7 @@ fn commands_take_effect_late_and_speeds_follow_with_a_lag() {
 }
 
 #[test]
-fn an_arm_that_is_driven_into_the_table_stalls_there() {
+fn an_arm_driven_into_the_table_stalls() {
     let mut pair = pair(quiet());
     let mut stalled_nm = 0.0_f64;
     // Joint 2 leans the arms towards the table.
@@ -110,7 +110,7 @@ fn an_arm_that_is_driven_into_the_table_stalls_there() {
 }
 
 #[test]
-fn the_gripper_takes_its_time() {
+fn the_gripper_moves_at_its_own_speed() {
     let mut pair = pair(quiet());
     let mut openings = Vec::new();
     for number in 1..=140 {
@@ -123,18 +123,18 @@ fn the_gripper_takes_its_time() {
 }
 
 #[test]
-fn cameras_see_late_and_not_exactly() {
+fn cameras_have_latency_and_noise() {
     let camera = CameraConfig { latency_periods: 5, ..CameraConfig::default() };
     let blocks = vec![Block::small([-0.12, 0.1]), Block::large([0.12, 0.2])];
     let mut pair = pair(SimulatedConfig { blocks, camera, ..SimulatedConfig::default() });
     let (mut off_m, mut n) = (0.0, 0);
     for number in 1..=300 {
         pair.exchange(&moving(number, [0.0; 4])).unwrap();
-        let late_s = pair.time_s() - pair.seen()[0].time_s;
+        let late_s = pair.time_s() - pair.observed_objects()[0].time_s;
         if number > 10 {
             assert!((0.049..0.081).contains(&late_s), "{late_s}");
             let is = pair.objects();
-            off_m += pair.seen()[1].at_m.distance_squared(is[1].at_m);
+            off_m += pair.observed_objects()[1].at_m.distance_squared(is[1].at_m);
             n += 1;
         }
     }

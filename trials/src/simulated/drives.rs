@@ -1,4 +1,5 @@
-//! The drives: commands arrive late, joints follow with a lag, and brake by themselves when nothing arrives.
+//! The simulated drives: commands take effect with a delay, joints follow with a lag, and brake by themselves if no
+//! command arrives.
 
 use std::collections::VecDeque;
 
@@ -7,27 +8,27 @@ use tandem_core::Contacts;
 use tandem_core::rng::index;
 use tandem_kinematics::{ArmModel, Gaps, Joints, WorkCell};
 
-use crate::driver::{ArmCommand, Command, Order, SILENCE_S};
 use crate::simulated::config::{Disturbance, N_SUBSTEPS, PERIOD_S, SimulatedConfig};
+use tandem_bridge::driver::{ArmCommand, Command, Order, SILENCE_S};
 
-/// Time of a physics step, seconds.
+/// The duration of a physics step, seconds.
 pub(crate) const SUBSTEP_S: f64 = PERIOD_S / N_SUBSTEPS as f64;
 
-/// The drives of all arms, and where the joints truly are.
+/// The drives of all arms and the true state of the joints.
 pub(crate) struct Drives {
     /// Arm by arm.
     pub(crate) arms: Vec<ArmDrives>,
     gaps: Gaps,
-    /// What the arms touched in the last physics step.
+    /// The contacts of the arms in the last physics step.
     contacts: Contacts,
-    /// For each arm whether two of its own parts touched in the last physics step.
+    /// Whether parts of each arm touched each other in the last physics step.
     self_contacts: Vec<bool>,
-    waiting: VecDeque<Waiting>,
+    pending: VecDeque<PendingCommand>,
     order: Order,
     newest: u64,
     n_periods: u64,
     n_silent: u32,
-    /// The drives have braked by themselves and wait to be told to stop.
+    /// Whether the drives have braked by themselves and wait for an order to stop.
     tripped: bool,
     rng: ChaCha8Rng,
 }
@@ -40,14 +41,14 @@ pub(crate) struct ArmDrives {
     pub(crate) angles: Joints,
     /// Radians per second.
     pub(crate) velocities: Joints,
-    /// What stops a joint, newton metres; 0 for joints that turn freely.
+    /// The torque that stalls a joint, newton metres; 0 for joints that turn freely.
     pub(crate) stalled_nm: Joints,
-    /// What the gripper was told.
+    /// The commanded opening of the gripper.
     pub(crate) opening: f64,
 }
 
-/// A command on its way.
-struct Waiting {
+/// A command that has not taken effect yet.
+struct PendingCommand {
     due_period: u64,
     number: Option<u64>,
     order: Order,
@@ -65,7 +66,7 @@ impl Drives {
             gaps: cell.gaps_with(at, &vec![opening; at.len()]),
             contacts: Contacts::NONE,
             self_contacts: vec![false; at.len()],
-            waiting: VecDeque::new(),
+            pending: VecDeque::new(),
             order: Order::Stop,
             newest: 0,
             n_periods: 0,
@@ -75,58 +76,58 @@ impl Drives {
         }
     }
 
-    /// Number of the newest command that has taken effect.
+    /// The number of the newest command that has taken effect.
     pub(crate) fn newest(&self) -> u64 {
         self.newest
     }
 
-    /// How many periods have passed.
+    /// The number of periods that have passed.
     pub(crate) fn n_periods(&self) -> u64 {
         self.n_periods
     }
 
-    /// Whether the drives have braked by themselves.
+    /// Returns whether the drives have braked by themselves.
     pub(crate) fn tripped(&self) -> bool {
         self.tripped
     }
 
-    /// The gaps round the arms now.
+    /// The present gaps around the arms.
     pub(crate) fn gaps(&self) -> &Gaps {
         &self.gaps
     }
 
-    /// What the arms touched in the last physics step.
+    /// The contacts of the arms in the last physics step.
     pub(crate) fn contacts(&self) -> Contacts {
         self.contacts
     }
 
-    /// For each arm whether two of its own parts touched in the last physics step.
+    /// Whether parts of each arm touched each other in the last physics step.
     pub(crate) fn self_contacts(&self) -> &[bool] {
         &self.self_contacts
     }
 
-    /// Takes a command that will have effect later.
-    pub(crate) fn hand_over(&mut self, command: Command, latency_periods: [u32; 2]) {
+    /// Accepts a command, which takes effect after the latency.
+    pub(crate) fn send(&mut self, command: Command, latency_periods: [u32; 2]) {
         self.n_silent = 0;
-        self.wait(Some(command.number), command.order, latency_periods);
+        self.enqueue(Some(command.number), command.order, latency_periods);
     }
 
-    /// Takes the order to stop on the way beside the commands, which is as long.
+    /// Accepts an order to stop outside of an exchange, with the same latency.
     pub(crate) fn stop(&mut self, latency_periods: [u32; 2]) {
-        self.wait(None, Order::Stop, latency_periods);
+        self.enqueue(None, Order::Stop, latency_periods);
     }
 
-    fn wait(&mut self, number: Option<u64>, order: Order, [least, most]: [u32; 2]) {
+    fn enqueue(&mut self, number: Option<u64>, order: Order, [least, most]: [u32; 2]) {
         let extra = index(&mut self.rng, (most.max(least) - least) as usize + 1);
         let due_period = self.n_periods + u64::from(least) + extra as u64;
-        let due_period = self.waiting.back().map_or(0, |last| last.due_period).max(due_period);
-        self.waiting.push_back(Waiting { due_period, number, order });
+        let due_period = self.pending.back().map_or(0, |last| last.due_period).max(due_period);
+        self.pending.push_back(PendingCommand { due_period, number, order });
     }
 
-    /// Lets the next period begin: commands take effect, and silence is noticed.
+    /// Starts the next period: due commands take effect, and the drives brake after too long a silence.
     pub(crate) fn begin_period(&mut self) {
-        while self.waiting.front().is_some_and(|next| next.due_period <= self.n_periods) {
-            let Some(next) = self.waiting.pop_front() else { break };
+        while self.pending.front().is_some_and(|next| next.due_period <= self.n_periods) {
+            let Some(next) = self.pending.pop_front() else { break };
             self.newest = next.number.unwrap_or(self.newest);
             if next.order == Order::Stop {
                 self.tripped = false;
@@ -143,7 +144,7 @@ impl Drives {
         }
     }
 
-    /// Lets a physics step pass. `openings` are how far the grippers are open, `torques_nm` those of what the arms touch.
+    /// Simulates a physics step with the grippers at `openings` (0 to 1) and external torques `torques_nm`.
     pub(crate) fn step(
         &mut self,
         cell: &WorkCell,
@@ -159,14 +160,14 @@ impl Drives {
         };
         for (idx, arm) in self.arms.iter_mut().enumerate() {
             let drift = disturbance.drift_radps.get(idx);
-            let told = commands.map(|commands| told(&commands[idx], drift));
+            let target = commands.map(|commands| servo_target(&commands[idx], drift));
             let blocked = disturbance.blocked.filter(|(arm, _)| arm.0 == idx).map(|(_, j)| j);
-            arm.follow(told.as_ref(), config, blocked, &torques_nm[idx]);
+            arm.follow(target.as_ref(), config, blocked, &torques_nm[idx]);
         }
         self.keep_apart(cell, config, openings, &before);
     }
 
-    /// Shells do not pass through each other, the table or the arm's own parts: an arm that would go deeper does not move.
+    /// Holds arms in place that would penetrate each other, the table or themselves more deeply.
     fn keep_apart(
         &mut self,
         cell: &WorkCell,
@@ -198,21 +199,21 @@ impl Drives {
 }
 
 impl ArmDrives {
-    /// Moves the joints for one physics step: towards the velocities `told`, or braking when there are none.
+    /// Moves the joints for one physics step towards the `target` velocities, or brakes if there are none.
     fn follow(
         &mut self,
-        told: Option<&Joints>,
+        target: Option<&Joints>,
         config: &SimulatedConfig,
         blocked: Option<usize>,
         torques_nm: &Joints,
     ) {
         for (idx, joint) in self.model.joints.iter().enumerate() {
             let speed = self.velocities[idx];
-            let next = match told {
-                Some(told) => {
+            let next = match target {
+                Some(target) => {
                     let share = SUBSTEP_S / (config.lag_s + SUBSTEP_S);
                     let most = config.motor_radps2 * SUBSTEP_S;
-                    speed + (share * (told[idx] - speed)).clamp(-most, most)
+                    speed + (share * (target[idx] - speed)).clamp(-most, most)
                 }
                 None => {
                     let most = joint.speed_radps / config.brake_s * SUBSTEP_S;
@@ -225,7 +226,7 @@ impl ArmDrives {
             let angle = self.angles[idx] + next * SUBSTEP_S;
             let at_end = !(low..=high).contains(&angle);
             if blocked == Some(idx) || stalled || at_end {
-                let pushes = told.map_or(0.0, |told| told[idx]);
+                let pushes = target.map_or(0.0, |target| target[idx]);
                 self.stalled_nm[idx] =
                     -pushes.signum() * f64::from(pushes != 0.0) * config.stall_nm[idx];
                 self.velocities[idx] = 0.0;
@@ -237,7 +238,7 @@ impl ArmDrives {
         }
     }
 
-    /// Lets the joints stay at `angles`, where something is in their way.
+    /// Holds the joints at `angles`, where an obstacle blocks them.
     fn hold_at(&mut self, angles: &Joints, config: &SimulatedConfig) {
         self.angles = *angles;
         for joint in 0..angles.len() {
@@ -247,8 +248,8 @@ impl ArmDrives {
     }
 }
 
-/// The velocities that the servos try to keep.
-fn told(command: &ArmCommand, drift: Option<&Joints>) -> Joints {
+/// Returns the velocities that the servos try to keep.
+fn servo_target(command: &ArmCommand, drift: Option<&Joints>) -> Joints {
     Joints::from_fn(command.velocities.len(), |joint| {
         command.velocities[joint] + drift.map_or(0.0, |drift| drift[joint])
     })

@@ -1,8 +1,8 @@
-//! Table, objects and hands in rapier: hands are carried by the joints exactly, fingers slide on them and press.
+//! Table, objects and hands in rapier.
 //!
-//! Hands and forearms are kinematic bodies: they go where the joints bring them, tilted as these tilt them. Each finger is a
-//! body of its own on a sliding joint along the direction in which the fingers close, driven by a spring whose force is
-//! bounded. What objects press on a hand is turned into torques of the joints.
+//! Hands and forearms are kinematic bodies that follow the joints exactly, including their tilt. Each finger is a
+//! separate body on a prismatic joint along the closing direction, driven by a spring with limited force. The forces of
+//! objects on a hand are converted to torques of the joints.
 
 use glam::{DMat3, DVec3};
 use rapier3d::dynamics::{
@@ -19,35 +19,36 @@ use rapier3d::pipeline::PhysicsPipeline;
 
 use crate::simulated::config::{Block, GripperConfig, SimulatedConfig};
 
-/// How far each finger's pad opens, metres.
+/// The largest opening of each finger's pad, metres.
 pub const MAX_OPENING_M: f32 = 0.062;
-/// Half extents of a pad: along the fingers' closing, across, along the hand; metres.
+/// Half extents of a pad: along the closing direction, across it, along the hand; metres.
 pub(crate) const PAD_HALF_M: Vector = Vector::new(0.005, 0.008, 0.015);
-/// The pads' centres ahead of the tool's origin, metres.
+/// The distance of the pads' centres ahead of the tool's origin, metres.
 pub(crate) const PAD_AHEAD_M: f32 = 0.021;
 /// Half extents of the hand's shell, in the tool's axes, metres.
 pub(crate) const HAND_HALF_M: Vector = Vector::new(0.035, 0.030, 0.050);
-/// The shell's centre behind the tool's origin: from the last joint to where the fingers begin, metres.
+/// The distance of the shell's centre behind the tool's origin, metres. The shell reaches from the last joint to the
+/// fingers.
 pub(crate) const HAND_BEHIND_M: f32 = 0.110;
 /// Half extents of the table, metres; its top is at z = 0.
 pub(crate) const TABLE_HALF_M: Vector = Vector::new(0.9, 0.7, 0.05);
 /// Radius of the forearm's shell, metres.
 const FOREARM_RADIUS_M: f32 = 0.035;
 
-/// Time of a physics step, seconds: as the drives'.
+/// The duration of a physics step, seconds, as in the drives.
 const SUBSTEP_S: f32 = 0.0025;
-/// The spring that holds a finger at its place, newtons per metre and newton seconds per metre.
+/// Stiffness and damping of the spring that drives a finger, newtons per metre and newton seconds per metre.
 const FINGER_STIFFNESS: f32 = 4000.0;
 const FINGER_DAMPING: f32 = 30.0;
-/// Share of the grip that the spring may use to keep both fingers alike.
+/// Largest force of the spring as a multiple of the grip force. The excess keeps both fingers aligned.
 const FINGER_RESERVE: f32 = 3.0;
 
 const TABLE: Group = Group::GROUP_1;
 const OBJECTS: Group = Group::GROUP_2;
 const ARMS: [Group; 2] = [Group::GROUP_3, Group::GROUP_4];
 
-/// The bodies.
-pub(crate) struct World {
+/// The bodies of the simulation.
+pub(crate) struct PhysicsWorld {
     bodies: RigidBodySet,
     colliders: ColliderSet,
     joints: ImpulseJointSet,
@@ -63,12 +64,12 @@ pub(crate) struct World {
     objects: Vec<RigidBodyHandle>,
 }
 
-/// Where an arm's joints bring what the physics knows of it; world frame, metres.
+/// The poses of an arm's bodies; world frame, metres.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Carried {
+pub(crate) struct ArmPoses {
     pub(crate) tool_m: DVec3,
     pub(crate) tool_axes: DMat3,
-    /// Ends of the forearm.
+    /// The ends of the forearm.
     pub(crate) forearm_m: [DVec3; 2],
 }
 
@@ -77,19 +78,19 @@ struct Hand {
     forearm: RigidBodyHandle,
     fingers: [Finger; 2],
     colliders: Vec<ColliderHandle>,
-    /// What the fingers are told, on its way to what was commanded; metres.
+    /// The target of the fingers, which approaches the commanded opening; metres.
     opening_m: f32,
 }
 
 struct Finger {
     body: RigidBodyHandle,
     joint: ImpulseJointHandle,
-    /// Direction in which it opens, along x of the tool.
+    /// The opening direction, along x of the tool.
     side: f32,
 }
 
-impl World {
-    pub(crate) fn new(config: &SimulatedConfig, carried: &[Carried], opening: f32) -> Self {
+impl PhysicsWorld {
+    pub(crate) fn new(config: &SimulatedConfig, poses: &[ArmPoses], opening: f32) -> Self {
         let mut pipeline = PhysicsPipeline::new();
         pipeline.counters.disable();
         let mut world = Self {
@@ -113,8 +114,8 @@ impl World {
             .friction_combine_rule(CoefficientCombineRule::Min)
             .collision_groups(groups(TABLE, OBJECTS | ARMS[0] | ARMS[1]));
         world.colliders.insert(table);
-        for (arm, carried) in carried.iter().enumerate() {
-            world.add_hand(ARMS[arm % ARMS.len()], carried, &config.gripper, opening);
+        for (arm, poses) in poses.iter().enumerate() {
+            world.add_hand(ARMS[arm % ARMS.len()], poses, &config.gripper, opening);
         }
         for block in &config.blocks {
             world.add_block(block, config.table_friction);
@@ -122,11 +123,11 @@ impl World {
         world
     }
 
-    /// Lets a physics step pass in which the joints bring the arms to `carried` and the grippers shall be open by `openings`.
-    pub(crate) fn step(&mut self, carried: &[Carried], openings: &[f64], gripper: &GripperConfig) {
-        for (arm, carried) in carried.iter().enumerate() {
+    /// Simulates a physics step that moves the arms to `poses` and the grippers towards `openings` (0 to 1).
+    pub(crate) fn step(&mut self, poses: &[ArmPoses], openings: &[f64], gripper: &GripperConfig) {
+        for (arm, poses) in poses.iter().enumerate() {
             let hand = &self.hands[arm];
-            for (body, pose) in [(hand.body, carried.hand()), (hand.forearm, carried.forearm())] {
+            for (body, pose) in [(hand.body, poses.hand()), (hand.forearm, poses.forearm())] {
                 let body = &mut self.bodies[body];
                 let pose = nearest(&pose, body.position());
                 body.set_next_kinematic_position(pose);
@@ -151,8 +152,8 @@ impl World {
         );
     }
 
-    /// The force with which objects pressed on a hand in the last physics step, world frame, newtons. Friction, and so the
-    /// weight of what is held, is not part of it.
+    /// Returns the contact force of objects on a hand in the last physics step, world frame, newtons. Friction, and
+    /// thus the weight of a held object, is excluded.
     pub(crate) fn force_n(&self, arm: usize) -> DVec3 {
         let mut impulse = Vector::ZERO;
         for collider in &self.hands[arm].colliders {
@@ -164,7 +165,7 @@ impl World {
         (impulse / SUBSTEP_S).as_dvec3()
     }
 
-    /// How far a gripper is open: 0 is shut, 1 open.
+    /// Returns the opening of a gripper: 0 is closed, 1 is open.
     pub(crate) fn opening(&self, arm: usize) -> f64 {
         let [first, second] = self.openings_m(arm);
         f64::from(0.5 * (first + second) / MAX_OPENING_M).clamp(0.0, 1.0)
@@ -178,7 +179,7 @@ impl World {
         self.objects.len()
     }
 
-    /// Poses of a hand's shell and its pads.
+    /// The poses and half extents of a hand's shell and its pads.
     pub(crate) fn hand_parts(&self, arm: usize) -> [(Pose, Vector); 3] {
         let hand = &self.hands[arm];
         let at = self.bodies[hand.body].position();
@@ -187,7 +188,7 @@ impl World {
         [(shell, HAND_HALF_M), pad(&hand.fingers[0]), pad(&hand.fingers[1])]
     }
 
-    /// Whether every object is somewhere.
+    /// Returns whether the positions of all bodies are finite.
     pub(crate) fn is_finite(&self) -> bool {
         self.bodies.iter().all(|(_, body)| body.translation().is_finite())
     }
@@ -202,8 +203,8 @@ impl World {
         })
     }
 
-    /// Sets the fingers' springs. The one that is ahead of the other when both press is held back, so that what is held
-    /// stays in the middle.
+    /// Sets the targets of the fingers' springs. The finger that is ahead is held back, so that a held object stays
+    /// centred.
     fn drive_fingers(&mut self, arm: usize, wanted_m: f32, gripper: &GripperConfig) {
         let openings = self.openings_m(arm);
         let mean_m = 0.5 * (openings[0] + openings[1]);
@@ -221,16 +222,16 @@ impl World {
         }
     }
 
-    fn add_hand(&mut self, group: Group, carried: &Carried, gripper: &GripperConfig, opening: f32) {
+    fn add_hand(&mut self, group: Group, poses: &ArmPoses, gripper: &GripperConfig, opening: f32) {
         let others = (OBJECTS | TABLE | ARMS[0] | ARMS[1]) & !group;
         let kinematic = |pose| RigidBodyBuilder::kinematic_position_based().pose(pose);
-        let body = self.bodies.insert(kinematic(carried.hand()));
-        let forearm = self.bodies.insert(kinematic(carried.forearm()));
+        let body = self.bodies.insert(kinematic(poses.hand()));
+        let forearm = self.bodies.insert(kinematic(poses.forearm()));
         let shell = ColliderBuilder::cuboid(HAND_HALF_M.x, HAND_HALF_M.y, HAND_HALF_M.z)
             .translation(Vector::Z * -HAND_BEHIND_M)
             .friction(0.3)
             .collision_groups(groups(group, others));
-        let half_m = single(0.5 * (carried.forearm_m[1] - carried.forearm_m[0]).length());
+        let half_m = single(0.5 * (poses.forearm_m[1] - poses.forearm_m[0]).length());
         let bar = ColliderBuilder::capsule_z(half_m, FOREARM_RADIUS_M)
             .friction(0.3)
             .collision_groups(groups(group, others));
@@ -242,7 +243,7 @@ impl World {
         let fingers = [1.0, -1.0].map(|side| {
             let shut = Vector::new(side * PAD_HALF_M.x, 0.0, PAD_AHEAD_M);
             let offset = shut + Vector::X * (side * opening_m);
-            let pose = carried.hand() * Pose::from_parts(offset, Rotation::IDENTITY);
+            let pose = poses.hand() * Pose::from_parts(offset, Rotation::IDENTITY);
             let finger = self
                 .bodies
                 .insert(RigidBodyBuilder::dynamic().pose(pose).gravity_scale(0.0).can_sleep(false));
@@ -280,7 +281,7 @@ impl World {
     }
 }
 
-impl Carried {
+impl ArmPoses {
     fn hand(&self) -> Pose {
         let [x, y, z] = [self.tool_axes.x_axis, self.tool_axes.y_axis, self.tool_axes.z_axis];
         let axes = Matrix::from_cols(x.as_vec3(), y.as_vec3(), z.as_vec3());
@@ -295,14 +296,14 @@ impl Carried {
     }
 }
 
-/// `pose` with that of the two quaternions of its turn that is the nearer to `from`: rapier would take the other one for a
-/// full turn.
+/// Returns `pose` with the quaternion of its rotation that is nearer to `from`. Rapier would interpret the other one as
+/// a full turn.
 fn nearest(pose: &Pose, from: &Pose) -> Pose {
     let turn = if pose.rotation.dot(from.rotation) < 0.0 { -pose.rotation } else { pose.rotation };
     Pose::from_parts(pose.translation, turn)
 }
 
-/// In single precision, as the physics has it.
+/// Converts to the single precision of the physics.
 fn single(value: f64) -> f32 {
     DVec3::splat(value).as_vec3().x
 }
@@ -311,7 +312,7 @@ fn groups(member: Group, of: Group) -> InteractionGroups {
     InteractionGroups::new(member, of, InteractionTestMode::And)
 }
 
-/// Not the training world's settings: a longer step, more iterations, other softness.
+/// Returns integration parameters with a longer step, more iterations and softer contacts than the training world.
 fn integration_parameters() -> IntegrationParameters {
     let softness = SpringCoefficients::new(120.0, 4.0);
     IntegrationParameters {
@@ -335,7 +336,7 @@ mod tests {
     use tandem_kinematics::MICO_4;
 
     #[test]
-    fn the_pads_stay_within_what_kinematics_has_for_the_fingers() {
+    fn the_pads_stay_within_the_capsule_of_the_fingers() {
         let fingers = &MICO_4.links[MICO_4.links.len() - 1];
         let [from, to] = [0, 1].map(|end| DVec3::from(fingers.ends[end].offset_m));
         let middle = 0.5 * (from + to);

@@ -1,4 +1,4 @@
-//! The stream of a motion: signs of life come in, progress goes out.
+//! The stream of a motion: receives signs of life and sends progress.
 
 use std::future::Future;
 use std::sync::Arc;
@@ -12,53 +12,53 @@ use tonic::{Status, Streaming};
 use crate::executor::Token;
 use crate::service::BridgeService;
 use crate::service::error::{Error, status};
-use crate::service::execution::{Attended, Execution, Outcome};
+use crate::service::execution::{AbandonOnDrop, Execution, Outcome};
 use crate::service::messages::{self, decode_token};
 use crate::service::thread::{ArmsHandle, Snapshot};
 
-/// How long a client may take to say what it wants.
-const GREETING: Duration = Duration::from_secs(10);
-/// Time from one report to the next, seconds.
+/// The longest time until a client sends its start message.
+const START_TIMEOUT: Duration = Duration::from_secs(10);
+/// Time between two reports, seconds.
 const REPORT_S: f64 = 0.05;
-/// Reports that wait for a client; further ones are left out.
-const REPORTS: usize = 4;
+/// Reports that may wait for a client. Further ones are dropped.
+const REPORT_CAPACITY: usize = 4;
 
 type Requests = Streaming<pb::ExecuteRequest>;
-type Told = mpsc::Sender<Result<pb::ExecuteResponse, Status>>;
+type Responses = mpsc::Sender<Result<pb::ExecuteResponse, Status>>;
 
-/// Starts what the first of `requests` asks for; gives what is told of it until its end.
+/// Starts the motion in the first of `requests`. Returns the stream of its progress.
 pub(super) async fn begin(
     service: &BridgeService,
     mut requests: Requests,
 ) -> Result<ReceiverStream<Result<pb::ExecuteResponse, Status>>, Error> {
-    let start = first(&mut requests).await?;
+    let start = receive_start(&mut requests).await?;
     let token = decode_token("start.token", &start.token)?;
-    let wanted = service.decode("start.motion", start.motion)?;
-    let speed = service.bounded(wanted.speed);
+    let spec = service.decode("start.motion", start.motion)?;
+    let speed = service.limited_speed(spec.speed);
     let execution = Arc::new(Execution::new(token, speed));
-    let attended = Attended(Arc::clone(&execution));
+    let guard = AbandonOnDrop(Arc::clone(&execution));
     renew(&service.arms, token).await?;
-    let checking = service.check_motion(wanted, |checked| checked);
-    let checked = while_heard(&service.arms, &mut requests, token, checking).await??;
+    let checking = service.check_motion(spec, |checked| checked);
+    let checked = while_alive(&service.arms, &mut requests, token, checking).await??;
     let duration_s = checked.motion().duration_s();
     let arms = service.arms.clone();
     arms.run(move |arms, now_s| arms.start(&execution, checked, now_s)).await?;
-    tracing::info!(duration_s, speed, "a motion begins");
-    let (told, reports) = mpsc::channel(REPORTS);
-    tokio::spawn(attend(attended, duration_s, requests, arms, told));
+    tracing::info!(duration_s, speed, "motion started");
+    let (responses, reports) = mpsc::channel(REPORT_CAPACITY);
+    tokio::spawn(run_stream(guard, duration_s, requests, arms, responses));
     Ok(ReceiverStream::new(reports))
 }
 
-/// The first request, which has to say what is wanted.
-async fn first(requests: &mut Requests) -> Result<pb::ExecuteStart, Error> {
-    let first = tokio::time::timeout(GREETING, requests.message()).await;
+/// Receives the first request, which must be the start message.
+async fn receive_start(requests: &mut Requests) -> Result<pb::ExecuteStart, Error> {
+    let first = tokio::time::timeout(START_TIMEOUT, requests.message()).await;
     match first {
         Ok(Ok(Some(pb::ExecuteRequest {
             request: Some(pb::execute_request::Request::Start(start)),
         }))) => Ok(start),
         Ok(Ok(Some(_))) => Err(DecodeError::new("start", "a message", "none").into()),
-        Ok(Err(status)) => Err(Error::Broken(status)),
-        Ok(Ok(None)) | Err(_) => Err(Error::Left),
+        Ok(Err(status)) => Err(Error::StreamBroken(status)),
+        Ok(Ok(None)) | Err(_) => Err(Error::StreamEnded),
     }
 }
 
@@ -66,8 +66,8 @@ async fn renew(arms: &ArmsHandle, token: Token) -> Result<(), Error> {
     arms.run(move |arms, now_s| arms.executor.renew(token, now_s)).await
 }
 
-/// What `work` gives, while the client is heard of.
-async fn while_heard<T>(
+/// Runs `work` to its end as long as the client's stream is alive.
+async fn while_alive<T>(
     arms: &ArmsHandle,
     requests: &mut Requests,
     token: Token,
@@ -79,7 +79,7 @@ async fn while_heard<T>(
             done = &mut work => return Ok(done),
             request = requests.message() => {
                 if !is_alive(request) {
-                    return Err(Error::Left);
+                    return Err(Error::StreamEnded);
                 }
                 renew(arms, token).await?;
             }
@@ -87,78 +87,78 @@ async fn while_heard<T>(
     }
 }
 
-/// Whether what came is a sign of life.
+/// Returns whether the request is a sign of life.
 fn is_alive(request: Result<Option<pb::ExecuteRequest>, Status>) -> bool {
     let request = request.ok().flatten().and_then(|request| request.request);
     matches!(request, Some(pb::execute_request::Request::Alive(_)))
 }
 
-/// Hears the client and tells it how the motion goes on, until its end. The client has left when its stream ends, breaks
-/// or brings anything but signs of life; the outcome is told all the same where it can be.
-async fn attend(
-    attended: Attended,
+/// Forwards signs of life and reports progress until the end of the motion. A stream that ends, breaks or contains
+/// anything but signs of life abandons the motion; the outcome is still sent if possible.
+async fn run_stream(
+    guard: AbandonOnDrop,
     duration_s: f64,
     mut requests: Requests,
     arms: ArmsHandle,
-    told: Told,
+    responses: Responses,
 ) {
-    let execution = &attended.0;
-    let mut report = Report::new(duration_s, execution.speed);
+    let execution = &guard.0;
+    let mut reporter = ProgressReporter::new(duration_s, execution.speed);
     let mut snapshots = arms.watch();
     loop {
         tokio::select! {
-            request = requests.message(), if !execution.is_left() => {
-                if is_alive(request) { execution.hear() } else { execution.leave() }
+            request = requests.message(), if !execution.is_abandoned() => {
+                if is_alive(request) { execution.mark_alive() } else { execution.abandon() }
             }
-            () = told.closed() => return,
+            () = responses.closed() => return,
             changed = snapshots.changed() => {
                 if changed.is_err() {
-                    drop(told.send(Err(status(&Error::Ended))).await);
+                    drop(responses.send(Err(status(&Error::ShuttingDown))).await);
                     return;
                 }
                 let newest = Arc::clone(&snapshots.borrow_and_update());
-                let progress = report.look(&newest, &arms);
+                let progress = reporter.update(&newest, &arms);
                 if let Some(outcome) = execution.outcome() {
-                    drop(told.send(Ok(report.last(&newest, &arms, outcome))).await);
+                    drop(responses.send(Ok(reporter.last(&newest, &arms, outcome))).await);
                     return;
                 }
                 if let Some(progress) = progress {
-                    // A client that is slow to read misses some.
-                    told.try_send(Ok(progress)).ok();
+                    // A client that reads slowly misses some reports.
+                    responses.try_send(Ok(progress)).ok();
                 }
             }
         }
     }
 }
 
-/// What was told of a motion, and when.
-struct Report {
+/// Builds the reports of one motion.
+struct ProgressReporter {
     played_s: f64,
     duration_s: f64,
     speed: f64,
-    told_s: f64,
+    reported_s: f64,
     phase: pb::BridgePhase,
 }
 
-impl Report {
+impl ProgressReporter {
     fn new(duration_s: f64, speed: f64) -> Self {
-        let (played_s, told_s) = (0.0, f64::NEG_INFINITY);
-        Self { played_s, duration_s, speed, told_s, phase: pb::BridgePhase::Unspecified }
+        let (played_s, reported_s) = (0.0, f64::NEG_INFINITY);
+        Self { played_s, duration_s, speed, reported_s, phase: pb::BridgePhase::Unspecified }
     }
 
-    /// What to tell of `newest`, when it is time.
-    fn look(&mut self, newest: &Snapshot, arms: &ArmsHandle) -> Option<pb::ExecuteResponse> {
+    /// Returns a report of `newest` if one is due.
+    fn update(&mut self, newest: &Snapshot, arms: &ArmsHandle) -> Option<pb::ExecuteResponse> {
         let progress = newest.progress?;
         self.played_s = progress.played_s;
         let phase = messages::phase(newest.phase);
-        if phase == self.phase && newest.now_s - self.told_s < REPORT_S {
+        if phase == self.phase && newest.now_s - self.reported_s < REPORT_S {
             return None;
         }
-        (self.told_s, self.phase) = (newest.now_s, phase);
+        (self.reported_s, self.phase) = (newest.now_s, phase);
         Some(pb::ExecuteResponse { progress: Some(self.progress(newest, arms)), outcome: None })
     }
 
-    /// What to tell at the end.
+    /// Returns the last report, with the outcome.
     fn last(
         &mut self,
         newest: &Snapshot,
@@ -168,9 +168,9 @@ impl Report {
         match outcome {
             Outcome::Done => {
                 self.played_s = self.duration_s;
-                tracing::info!("the motion is done");
+                tracing::info!("motion done");
             }
-            Outcome::Stopped(stop) => tracing::info!(%stop, "the motion was stopped"),
+            Outcome::Stopped(stop) => tracing::info!(%stop, "motion stopped"),
         }
         pb::ExecuteResponse {
             progress: Some(self.progress(newest, arms)),

@@ -1,4 +1,4 @@
-//! What a policy does in the training world, and the start and goals of a trial.
+//! The start and goals of a trial, and the policy's episode in the training world.
 
 use glam::DVec3;
 use tandem_core::layout::EPISODE_STEPS;
@@ -7,32 +7,32 @@ use tandem_sim::{Env, SimError, WorldConfig};
 
 use crate::simulated::Block;
 use crate::trial::mapping::{OPENING_M, TRAINED_HALF_M};
-use crate::trial::{Decide, TrialError};
+use crate::trial::{ActionSource, TrialError};
 
-/// Least room between two blocks, and between a block and the place of another one's goal, metres.
+/// The smallest gap between two blocks, and between a block and the goal of another one, metres.
 const ROOM_M: f64 = 0.02;
-/// Starts that are drawn until one has room for the blocks.
+/// The largest number of starts that are drawn until one has room for the blocks.
 const N_DRAWS: usize = 1000;
 
-/// How a trial begins and where its objects shall go; own frames, metres.
+/// The start and goals of a trial; own frames, metres.
 #[derive(Debug, Clone, PartialEq)]
 pub struct TrialStart {
-    /// End effectors, arm by arm.
+    /// The end effectors, arm by arm.
     pub hands: Vec<DVec3>,
-    /// How far each side of the grippers is open, metres.
+    /// The opening of each side of the grippers, metres.
     pub opening_m: f64,
-    /// Objects, arm by arm, heights as those of the training world's blocks.
+    /// The objects, arm by arm. Heights are those of the training world's blocks.
     pub objects: Vec<DVec3>,
-    /// Goals, in the same way.
+    /// The goals, arm by arm, with the same heights.
     pub goals: Vec<DVec3>,
 }
 
 /// One step of a rollout, arm by arm.
 #[derive(Debug, Clone, PartialEq)]
 pub struct RolloutStep {
-    /// End effectors after it, own frames, metres.
+    /// The end effectors after the step, own frames, metres.
     pub hands: Vec<DVec3>,
-    /// The actions, arm after arm, shape `[n_action]`.
+    /// The actions of all arms, shape `[n_action]`.
     pub action: Vec<f32>,
 }
 
@@ -41,13 +41,13 @@ pub struct RolloutStep {
 pub struct Rollout {
     /// The steps, in order.
     pub steps: Vec<RolloutStep>,
-    /// How far each object is from its goal after the last step, metres.
+    /// The distance of each object from its goal after the last step, metres.
     pub goal_distances_m: Vec<f64>,
-    /// What touched what at any time.
+    /// All contacts of the episode.
     pub contacts: Contacts,
 }
 
-/// The training world, with blocks of the size of a trial's.
+/// The training world with blocks of the trial's size.
 pub struct Rehearsal {
     env: Env,
     layout: Layout,
@@ -55,10 +55,10 @@ pub struct Rehearsal {
 }
 
 impl Rehearsal {
-    /// The world of `layout` with blocks of the size and mass of `block`.
+    /// Creates the world of `layout` with blocks of the size and mass of `block`.
     ///
     /// # Errors
-    /// When there is no such world.
+    /// Returns an error if there is no such world.
     pub fn new(layout: Layout, block: &Block) -> Result<Self, SimError> {
         let world = WorldConfig {
             object_half_size_m: block.half_m,
@@ -68,15 +68,15 @@ impl Rehearsal {
         Ok(Self { env: Env::new(layout, &world)?, layout, half_m: f64::from(block.half_m) })
     }
 
-    /// Draws how trial `number` of `seed` starts: as the training world's episodes do, with room between the blocks.
+    /// Draws the start of trial `number` of `seed` as the training world does, with room between the blocks.
     ///
     /// # Errors
-    /// When no start has room for the blocks.
+    /// Returns an error if no start has room for the blocks.
     pub fn start(&mut self, seed: u64, number: u64) -> Result<TrialStart, TrialError> {
         let mut rng = episode_rng(seed, number, Stream::Reset);
         for _ in 0..N_DRAWS {
             self.env.reset(&mut rng, WorldSettings::default());
-            let start = self.started();
+            let start = self.current_start();
             if self.has_room(&start) {
                 return Ok(start);
             }
@@ -84,11 +84,11 @@ impl Rehearsal {
         Err(TrialError::NoRoom { half_m: self.half_m })
     }
 
-    /// Lets the policy act from the start that was drawn last.
+    /// Plays the policy's episode from the start that was drawn last.
     ///
     /// # Errors
-    /// When the world breaks.
-    pub fn play(&mut self, policy: &mut dyn Decide) -> Result<Rollout, SimError> {
+    /// Returns an error if the simulation fails.
+    pub fn play(&mut self, policy: &mut dyn ActionSource) -> Result<Rollout, SimError> {
         let mut observation = vec![0.0; self.layout.n_observation()];
         let goal = self.env.goal().to_vec();
         let mut contacts = Contacts::NONE;
@@ -96,31 +96,31 @@ impl Rehearsal {
         for _ in 0..EPISODE_STEPS {
             self.env.observe(&mut observation);
             let mut action = vec![0.0; self.layout.n_action()];
-            policy.decide(&observation, &goal, &mut action);
+            policy.act(&observation, &goal, &mut action);
             contacts = contacts | self.env.step(&action)?;
             self.env.observe(&mut observation);
-            steps.push(RolloutStep { hands: self.part(&observation, 0), action });
+            steps.push(RolloutStep { hands: self.points(&observation, 0), action });
         }
         let distance = |(at, goal): (DVec3, DVec3)| (at - goal).length();
-        let objects = self.above_rest(self.part(&observation, 3));
+        let objects = self.above_rest(self.points(&observation, 3));
         let goal_distances_m = objects.into_iter().zip(self.goals()).map(distance).collect();
         Ok(Rollout { steps, goal_distances_m, contacts })
     }
 
-    fn started(&self) -> TrialStart {
+    fn current_start(&self) -> TrialStart {
         let mut observation = vec![0.0; self.layout.n_observation()];
         self.env.observe(&mut observation);
         let opening_m = match self.layout.task {
             Task::Push => 0.0,
             Task::PickAndPlace => OPENING_M,
         };
-        let (hands, objects) = (self.part(&observation, 0), self.part(&observation, 3));
+        let (hands, objects) = (self.points(&observation, 0), self.points(&observation, 3));
         let objects = self.above_rest(objects);
         TrialStart { hands, opening_m, objects, goals: self.goals() }
     }
 
-    /// Three numbers of each arm's observation from `first` on.
-    fn part(&self, observation: &[f32], first: usize) -> Vec<DVec3> {
+    /// The point at index `first` of each arm's observation.
+    fn points(&self, observation: &[f32], first: usize) -> Vec<DVec3> {
         let of_arm = |arm: ArmIndex| &observation[self.layout.observation_of(arm)][first..];
         self.layout.arms().map(|arm| point(of_arm(arm))).collect()
     }
@@ -131,13 +131,13 @@ impl Rehearsal {
         self.above_rest(goals)
     }
 
-    /// Places of objects with heights as those of the training world's own blocks.
+    /// Lowers positions of objects to the heights of the training world's own blocks.
     fn above_rest(&self, places: Vec<DVec3>) -> Vec<DVec3> {
         let lower = DVec3::Z * (self.half_m - TRAINED_HALF_M);
         places.into_iter().map(|place| place - lower).collect()
     }
 
-    /// Whether blocks as they lie, and as they shall lie, leave room between each other however they are turned.
+    /// Returns whether the blocks have room between each other at the start and at the goals, in any orientation.
     fn has_room(&self, start: &TrialStart) -> bool {
         let scene = self.env.scene();
         let apart_m = 2.0 * self.half_m * std::f64::consts::SQRT_2 + ROOM_M;

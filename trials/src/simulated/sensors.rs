@@ -1,4 +1,4 @@
-//! What the joints report and what the cameras see: the truth with noise, in steps, and late.
+//! The simulated sensors: encoders with noise and limited resolution, cameras with noise and latency.
 
 use std::collections::VecDeque;
 
@@ -7,22 +7,22 @@ use rand_chacha::ChaCha8Rng;
 use tandem_core::rng::standard_normal;
 use tandem_kinematics::Joints;
 
-use crate::driver::{ArmReading, Faults};
 use crate::simulated::config::{CameraConfig, SimulatedConfig};
 use crate::simulated::drives::ArmDrives;
+use tandem_bridge::driver::{ArmReading, Faults};
 
-/// An object as it is or was seen.
+/// The true or observed pose of an object.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ObjectPose {
-    /// Its centre in the world, metres.
+    /// The centre, world frame, metres.
     pub at_m: DVec3,
-    /// How it is turned in the world.
+    /// The orientation, world frame.
     pub turn: DQuat,
-    /// When, seconds of simulated time.
+    /// The simulated time of the pose, seconds.
     pub time_s: f64,
 }
 
-/// What `arm` reports of itself.
+/// Returns the measurements of `arm`.
 pub(crate) fn read(
     arm: &ArmDrives,
     opening: f64,
@@ -45,7 +45,7 @@ pub(crate) fn read(
     ArmReading {
         angles,
         velocities,
-        torques_nm: config.tells_torques.then_some(torques),
+        torques_nm: config.reports_torques.then_some(torques),
         opening,
         faults,
     }
@@ -54,42 +54,42 @@ pub(crate) fn read(
 /// The cameras.
 pub(crate) struct Cameras {
     config: CameraConfig,
-    /// Pictures that are not known yet, and then the newest known one; oldest first.
+    /// The newest available picture, followed by the pictures that are not available yet.
     pictures: VecDeque<Picture>,
     rng: ChaCha8Rng,
 }
 
 struct Picture {
-    known_period: u64,
+    available_period: u64,
     objects: Vec<ObjectPose>,
 }
 
 impl Cameras {
     pub(crate) fn new(config: CameraConfig, objects: Vec<ObjectPose>, rng: ChaCha8Rng) -> Self {
         let mut cameras = Self { config, pictures: VecDeque::new(), rng };
-        let objects = cameras.blurred(objects);
-        cameras.pictures.push_back(Picture { known_period: 0, objects });
+        let objects = cameras.with_noise(objects);
+        cameras.pictures.push_back(Picture { available_period: 0, objects });
         cameras
     }
 
-    /// Takes a picture of `objects` when it is time.
-    pub(crate) fn look(&mut self, n_periods: u64, objects: impl FnOnce() -> Vec<ObjectPose>) {
+    /// Takes a picture of `objects` if one is due.
+    pub(crate) fn advance(&mut self, n_periods: u64, objects: impl FnOnce() -> Vec<ObjectPose>) {
         if n_periods.is_multiple_of(self.config.every_periods.max(1)) {
-            let known_period = n_periods + self.config.latency_periods;
-            let objects = self.blurred(objects());
-            self.pictures.push_back(Picture { known_period, objects });
+            let available_period = n_periods + self.config.latency_periods;
+            let objects = self.with_noise(objects());
+            self.pictures.push_back(Picture { available_period, objects });
         }
-        while self.pictures.get(1).is_some_and(|next| next.known_period <= n_periods) {
+        while self.pictures.get(1).is_some_and(|next| next.available_period <= n_periods) {
             self.pictures.pop_front();
         }
     }
 
-    /// The objects of the newest picture that is known.
-    pub(crate) fn seen(&self) -> &[ObjectPose] {
+    /// The objects in the newest available picture.
+    pub(crate) fn objects(&self) -> &[ObjectPose] {
         self.pictures.front().map_or(&[], |picture| &picture.objects)
     }
 
-    fn blurred(&mut self, mut objects: Vec<ObjectPose>) -> Vec<ObjectPose> {
+    fn with_noise(&mut self, mut objects: Vec<ObjectPose>) -> Vec<ObjectPose> {
         let CameraConfig { place_noise_m, turn_noise_rad, .. } = self.config;
         let mut normal = || f64::from(standard_normal(&mut self.rng));
         for object in &mut objects {

@@ -1,4 +1,4 @@
-//! One trial from its start to its end.
+//! Runs single trials.
 
 use glam::DVec3;
 use tandem_core::ArmIndex;
@@ -7,52 +7,57 @@ use tandem_kinematics::{
 };
 use tandem_sim::SimError;
 
-use crate::layout::{check_settings, mico_cell};
 use crate::simulated::{
     Block, CameraConfig, GripperConfig, ObjectPose, SimulatedConfig, SimulatedPair,
 };
-use crate::trial::closed::STEP_GAP_M;
-use crate::trial::judge::{Cause, ObjectCourse, RefusedBy, forbidden, judge};
 use crate::trial::mapping::Mapping;
-use crate::trial::rollout::{Rehearsal, TrialStart};
-use crate::trial::stage::Stage;
-use crate::trial::{
-    Decide, Mode, NoWitness, Places, TrialConfig, TrialError, TrialReport, Witness,
+use crate::trial::outcome::{
+    FailureCause, MotionRefusal, ObjectResult, contact_failure, object_failure,
 };
+use crate::trial::rehearsal::{Rehearsal, TrialStart};
+use crate::trial::rig::TrialRig;
+use crate::trial::{
+    ActionSource, NoObserver, ObjectPositions, TrialConfig, TrialError, TrialMode, TrialObserver,
+    TrialReport,
+};
+use tandem_bridge::work_cell::{check_settings, mico_cell};
 
-/// Samples of a motion per second.
+/// Samples per second of a motion.
 const RATE_HZ: f64 = 100.0;
-/// Time for objects to come to rest before they are judged, seconds.
+/// Time for objects to come to rest before they are evaluated, seconds.
 pub(super) const REST_S: f64 = 0.5;
-/// How much friction a model of the pair has, as a share of the pair's.
+/// Room between the arms that a step of the closed loop keeps, metres: more than the check requires, so that the next
+/// step can start.
+const STEP_GAP_M: f64 = 0.025;
+/// Friction of the twin, as a share of the pair's.
 const TWIN_FRICTION: f32 = 0.8;
 
-/// Trials that differ in their numbers only.
-pub struct Trials {
+/// Runs trials that differ in their numbers only.
+pub struct TrialRunner {
     pub(super) config: TrialConfig,
     pub(super) mapping: Mapping,
     rehearsal: Rehearsal,
     pub(super) check: CheckSettings,
-    /// For steps of the closed loop.
+    /// The check of a step of the closed loop.
     pub(super) step_check: CheckSettings,
 }
 
-/// How far a trial has come when it ends.
-pub(super) struct Course {
-    pub(super) ended: Result<(), Cause>,
+/// The execution of a trial up to its end.
+pub(super) struct TrialExecution {
+    pub(super) ended: Result<(), FailureCause>,
     pub(super) n_steps: usize,
     pub(super) n_shortened: usize,
     pub(super) rehearsed_m: Option<Vec<f64>>,
-    pub(super) time_over: bool,
-    /// Where the tools went, or should have gone.
+    pub(super) timed_out: bool,
+    /// The waypoints of the tools.
     pub(super) way_points: Vec<Waypoint>,
 }
 
-impl Trials {
+impl TrialRunner {
     /// Prepares trials of `config`.
     ///
     /// # Errors
-    /// When there is no training world for its layout and blocks.
+    /// Returns an error if there is no training world for its layout and blocks.
     pub fn new(config: TrialConfig) -> Result<Self, SimError> {
         let mut cell = mico_cell();
         cell.arms.truncate(config.layout.n_arms);
@@ -68,79 +73,83 @@ impl Trials {
     /// Carries out trial `number`.
     ///
     /// # Errors
-    /// When it cannot even begin.
+    /// Returns an error if the trial cannot start.
     pub fn run(
         &mut self,
         number: u64,
-        policy: &mut dyn Decide,
-        witness: &mut dyn Witness,
+        policy: &mut dyn ActionSource,
+        observer: &mut dyn TrialObserver,
     ) -> Result<TrialReport, TrialError> {
         let start = self.rehearsal.start(self.config.seed, number)?;
         let at = self.start_angles(&start)?;
-        let blind = match self.config.mode {
-            Mode::OpenLoop => Some(self.rehearse(&start, &at, policy)?),
-            Mode::Twin => Some(self.rehearse_on_twin(&start, &at, number, policy)?),
-            Mode::ClosedLoop => None,
+        let planned = match self.config.mode {
+            TrialMode::OpenLoop => Some(self.rehearse(&start, &at, policy)?),
+            TrialMode::Twin => Some(self.rehearse_on_twin(&start, &at, number, policy)?),
+            TrialMode::ClosedLoop => None,
         };
         let pair = self.pair(&start, &at, number, &self.config.simulated);
-        let lain: Vec<ObjectPose> = pair.objects();
+        let initial: Vec<ObjectPose> = pair.objects();
         let goals = self.in_world(&start.goals);
-        let mut stage = Stage::new(self.mapping.cell().clone(), pair, goals, witness)?;
-        let course = match blind {
-            Some(blind) => self.open_loop(&mut stage, &at, blind),
-            None => self.closed_loop(&mut stage, &start, &at, policy),
+        let mut rig = TrialRig::new(self.mapping.cell().clone(), pair, goals, observer)?;
+        let execution = match planned {
+            Some(motion) => self.open_loop(&mut rig, &at, motion),
+            None => self.closed_loop(&mut rig, &start, &at, policy),
         };
-        Ok(self.report(number, &start, &lain, &stage, course))
+        Ok(self.report(number, &start, &initial, &rig, execution))
     }
 
     fn report(
         &self,
         number: u64,
         start: &TrialStart,
-        lain: &[ObjectPose],
-        stage: &Stage<'_>,
-        course: Course,
+        initial: &[ObjectPose],
+        rig: &TrialRig<'_>,
+        execution: TrialExecution,
     ) -> TrialReport {
         let own = |arm: usize, at_m: DVec3| self.mapping.object_in_own(ArmIndex(arm), at_m);
-        let ends = stage.pair().objects();
-        let objects: Vec<ObjectCourse> = (0..ends.len())
-            .map(|arm| ObjectCourse {
-                start: own(arm, lain[arm].at_m),
+        let ends = rig.pair().objects();
+        let objects: Vec<ObjectResult> = (0..ends.len())
+            .map(|arm| ObjectResult {
+                start: own(arm, initial[arm].at_m),
                 goal: start.goals[arm],
                 end: own(arm, ends[arm].at_m),
-                highest_m: own(arm, DVec3::Z * stage.highest_m[arm]).z,
+                highest_m: own(arm, DVec3::Z * rig.highest_m[arm]).z,
             })
             .collect();
         let goals = self.in_world(&start.goals);
-        let places = (0..ends.len())
-            .map(|arm| Places { start: lain[arm].at_m, goal: goals[arm], end: ends[arm].at_m })
+        let positions = (0..ends.len())
+            .map(|arm| ObjectPositions {
+                start: initial[arm].at_m,
+                goal: goals[arm],
+                end: ends[arm].at_m,
+            })
             .collect();
-        let judged = || judge(self.config.layout.task, &objects, course.time_over);
-        let cause = forbidden(stage.touched).or(course.ended.err()).or_else(judged);
+        let unreached = || object_failure(self.config.layout.task, &objects, execution.timed_out);
+        let cause = contact_failure(rig.touched).or(execution.ended.err()).or_else(unreached);
         TrialReport {
             number,
             cause,
-            places,
-            rehearsed_m: course.rehearsed_m,
-            duration_s: stage.now_s(),
-            n_steps: course.n_steps,
-            n_shortened: course.n_shortened,
-            touched: stage.touched,
-            arms_gap_m: stage.arms_gap_m,
-            table_gap_m: stage.table_gap_m,
-            path: stage.path.clone(),
-            way_points: course.way_points,
+            positions,
+            rehearsed_m: execution.rehearsed_m,
+            duration_s: rig.now_s(),
+            n_steps: execution.n_steps,
+            n_shortened: execution.n_shortened,
+            touched: rig.touched,
+            arms_gap_m: rig.arms_gap_m,
+            table_gap_m: rig.table_gap_m,
+            path: rig.path.clone(),
+            way_points: execution.way_points,
             objects,
         }
     }
 
-    /// A policy's episode in the training world as way points.
+    /// Converts the policy's episode in the training world to waypoints.
     fn rehearse(
         &mut self,
         start: &TrialStart,
         at: &[Joints],
-        policy: &mut dyn Decide,
-    ) -> Result<Blind, TrialError> {
+        policy: &mut dyn ActionSource,
+    ) -> Result<PlannedMotion, TrialError> {
         let rollout = self.rehearsal.play(policy)?;
         let mut openings = vec![start.opening_m; start.hands.len()];
         let mut way_points = vec![self.way_point(&start.hands, &openings, at)];
@@ -151,78 +160,84 @@ impl Trials {
             }
             way_points.push(self.way_point(&step.hands, &openings, at));
         }
-        Ok(Blind {
+        Ok(PlannedMotion {
             way_points: way_points.into_iter().collect(),
             rehearsed_m: rollout.goal_distances_m,
             n_steps: rollout.steps.len(),
         })
     }
 
-    /// The way points of a closed loop on a copy of the pair.
+    /// Computes the waypoints by a closed loop on a copy of the pair.
     fn rehearse_on_twin(
         &self,
         start: &TrialStart,
         at: &[Joints],
         number: u64,
-        policy: &mut dyn Decide,
-    ) -> Result<Blind, TrialError> {
+        policy: &mut dyn ActionSource,
+    ) -> Result<PlannedMotion, TrialError> {
         let pair = self.pair(start, at, number, &twin_of(&self.config.simulated));
-        let mut nobody = NoWitness;
-        let mut stage = Stage::new(self.mapping.cell().clone(), pair, Vec::new(), &mut nobody)?;
-        let course = self.closed_loop(&mut stage, start, at, policy);
-        let ends = stage.pair().objects();
+        let mut observer = NoObserver;
+        let mut rig = TrialRig::new(self.mapping.cell().clone(), pair, Vec::new(), &mut observer)?;
+        let execution = self.closed_loop(&mut rig, start, at, policy);
+        let ends = rig.pair().objects();
         let distance = |(arm, goal): (usize, &DVec3)| {
             (self.mapping.object_in_own(ArmIndex(arm), ends[arm].at_m) - *goal).length()
         };
-        Ok(Blind {
-            way_points: course.ended.map(|()| course.way_points),
+        Ok(PlannedMotion {
+            way_points: execution.ended.map(|()| execution.way_points),
             rehearsed_m: start.goals.iter().enumerate().map(distance).collect(),
-            n_steps: course.n_steps,
+            n_steps: execution.n_steps,
         })
     }
 
-    /// One motion that was made before.
-    fn open_loop(&self, stage: &mut Stage<'_>, at: &[Joints], blind: Blind) -> Course {
-        let way_points = blind.way_points.clone().unwrap_or_default();
-        let ended = blind
+    /// Executes a motion that was planned before.
+    fn open_loop(
+        &self,
+        rig: &mut TrialRig<'_>,
+        at: &[Joints],
+        planned: PlannedMotion,
+    ) -> TrialExecution {
+        let way_points = planned.way_points.clone().unwrap_or_default();
+        let ended = planned
             .way_points
             .and_then(|way_points| self.motion(&way_points, at, &self.check))
-            .and_then(|motion| stage.play(motion, self.config.speed))
-            .and_then(|()| stage.wait(REST_S));
-        Course {
+            .and_then(|motion| rig.play(motion, self.config.speed))
+            .and_then(|()| rig.wait(REST_S));
+        TrialExecution {
             ended,
-            n_steps: blind.n_steps,
+            n_steps: planned.n_steps,
             n_shortened: 0,
-            rehearsed_m: Some(blind.rehearsed_m),
-            time_over: false,
+            rehearsed_m: Some(planned.rehearsed_m),
+            timed_out: false,
             way_points,
         }
     }
 
-    /// The motion through `way_points` from joint angles `at`, when it passes the check with `settings`.
+    /// Plans the motion through `way_points` from joint angles `at` (radians) and checks it with `settings`.
     pub(super) fn motion(
         &self,
         way_points: &[Waypoint],
         at: &[Joints],
         settings: &CheckSettings,
-    ) -> Result<Motion, Cause> {
+    ) -> Result<Motion, FailureCause> {
         let cell = self.mapping.cell();
         let planned = plan(cell, way_points, at, &PlanSettings::default());
-        let trajectory = planned.map_err(|error| Cause::Refused(RefusedBy::Plan(error)))?;
+        let trajectory =
+            planned.map_err(|error| FailureCause::Refused(MotionRefusal::Plan(error)))?;
         let motion = trajectory.sampled(RATE_HZ);
         let first: Vec<Joints> = motion.arms.iter().map(|samples| samples[0].angles).collect();
         check(cell, &motion, &first, settings)
-            .map_err(|refusal| Cause::Refused(RefusedBy::Check(refusal)))?;
+            .map_err(|refusal| FailureCause::Refused(MotionRefusal::Check(refusal)))?;
         Ok(motion)
     }
 
-    /// The way point for end effectors at `hands` (own frames, metres), near angles `near`.
+    /// Returns the waypoint for end effectors at `hands` (own frames, metres), near joint angles `near` (radians).
     pub(super) fn way_point(
         &self,
         hands: &[DVec3],
         openings_m: &[f64],
         near: &[Joints],
-    ) -> Result<Waypoint, Cause> {
+    ) -> Result<Waypoint, FailureCause> {
         let arm_way_point = |arm: usize| {
             let (tool_in_world_m, _) =
                 self.mapping.tool_in_world(ArmIndex(arm), hands[arm], &near[arm])?;
@@ -234,11 +249,9 @@ impl Trials {
         let arms = (0..hands.len()).map(|arm| {
             arm_way_point(arm).map_err(|source| {
                 let arm = ArmIndex(arm);
-                Cause::Refused(RefusedBy::Plan(tandem_kinematics::PlanError::Unreachable {
-                    waypoint: 0,
-                    arm,
-                    source,
-                }))
+                FailureCause::Refused(MotionRefusal::Plan(
+                    tandem_kinematics::PlanError::Unreachable { waypoint: 0, arm, source },
+                ))
             })
         });
         arms.collect()
@@ -279,15 +292,15 @@ impl Trials {
     }
 }
 
-/// A motion for arms that do not look.
-struct Blind {
-    way_points: Result<Vec<Waypoint>, Cause>,
-    /// How far the objects ended from their goals in the rehearsal, metres.
+/// A motion that was planned before its execution.
+struct PlannedMotion {
+    way_points: Result<Vec<Waypoint>, FailureCause>,
+    /// The final distances of the objects from their goals in the rehearsal, metres.
     rehearsed_m: Vec<f64>,
     n_steps: usize,
 }
 
-/// The pair as somebody who built a model of it would have it: no noise, no delay, other friction.
+/// Returns the configuration of the twin: the pair without noise and latency and with other friction.
 fn twin_of(simulated: &SimulatedConfig) -> SimulatedConfig {
     SimulatedConfig {
         latency_periods: [1, 1],
