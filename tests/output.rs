@@ -31,7 +31,7 @@ fn tandem(args: &[&str]) -> Command {
 
 /// Opens a file on a full disk.
 fn full_device() -> File {
-    File::options().write(true).open("/dev/full_device").expect("a device")
+    File::options().write(true).open("/dev/full").expect("a device")
 }
 
 fn directory() -> TempDir {
@@ -107,7 +107,7 @@ fn a_run_does_not_depend_on_room_for_its_messages_and_logs() {
     let expected = digest(&train(directory.path(), "undisturbed").output().expect("runs"));
     let out = directory.path().join("mute");
     fs::create_dir(&out).expect("a directory");
-    std::os::unix::fs::symlink("/dev/full_device", out.join("tandem.log")).expect("a link");
+    std::os::unix::fs::symlink("/dev/full", out.join("tandem.log")).expect("a link");
     let ended =
         train(directory.path(), "mute").stderr(full_device()).stdout(Stdio::piped()).output();
     assert_eq!(digest(&ended.expect("runs")), expected);
