@@ -27,7 +27,7 @@ pub struct ReplayParts {
     pub actions: Vec<f32>,
     /// Shape `[n_episodes, EPISODE_STEPS]`; bit `a` is set if arm `a` executed the teacher's action.
     pub advised_arms: Vec<u8>,
-    /// Shape `[n_episodes, EPISODE_STEPS]`, [`Contacts::bits`] of the step.
+    /// Shape `[n_episodes, EPISODE_STEPS]`, [`Contacts::bits`](tandem_core::Contacts::bits) of the step.
     pub contacts: Vec<u8>,
     /// Shape `[n_episodes]`; 1 if an object was displaced, else 0.
     pub moved: Vec<u8>,
