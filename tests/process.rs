@@ -9,10 +9,10 @@ use std::time::Duration;
 use serde_json::Value;
 use tempfile::TempDir;
 
-/// A small advised run of 16 rounds whose budget runs out on the way.
+/// A small advised run of 12 rounds whose budget runs out on the way.
 const SMALL: [&str; 18] = [
     "--max-env-steps",
-    "12800",
+    "9600",
     "--set",
     "rounds.updates_per_env_step=0.15",
     "--set",
@@ -184,7 +184,7 @@ fn killed_processes_are_restarted_and_the_run_ends_like_an_undisturbed_one() {
         );
     }
     let summary = String::from_utf8_lossy(&ended.stdout);
-    assert!(summary.contains("\"env_steps\":12800,"), "{summary}");
+    assert!(summary.contains("\"env_steps\":9600,"), "{summary}");
 }
 
 #[test]

@@ -49,7 +49,7 @@ fn resumption(trainer: &Trainer) -> Resumption {
     let row = MetricsRow { round: 1, success_per_arm: vec![0.5], ..MetricsRow::default() };
     let pending = PendingEvaluation {
         counters: trainer.counters(),
-        stats: trainer.figures(),
+        stats: trainer.stats(),
         wall_s: 1.5,
         policy: policy.clone(),
     };
@@ -160,7 +160,7 @@ fn write_messages(to: &Path) -> Result<(), AnyError> {
     let seeds = [
         ("query", query.encode_to_vec()),
         ("advice", tandem_proto::encode_advice(&advice()).encode_to_vec()),
-        ("terms", tandem_proto::encode_terms(&terms).encode_to_vec()),
+        ("terms", tandem_proto::encode_run_terms(&terms).encode_to_vec()),
         ("slot", tandem_proto::encode_slot(&slot).encode_to_vec()),
         ("parameters", tandem_proto::encode_actor(&actor).encode_to_vec()),
         ("episode", tandem_proto::encode_episode(&sample::episode(7)).encode_to_vec()),

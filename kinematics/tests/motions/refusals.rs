@@ -13,9 +13,9 @@ use tandem_kinematics::{
 
 use crate::walks::{Area, sampled, walk};
 
-const N_GOOD: u64 = 1000;
+const N_GOOD: u64 = 600;
 /// Motions broken in each way.
-pub(crate) const N_BROKEN: usize = 1000;
+pub(crate) const N_BROKEN: usize = 600;
 pub(crate) const PERIOD_S: f64 = 0.01;
 
 #[test]
