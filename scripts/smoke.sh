@@ -75,7 +75,7 @@ grep -q '^4 of 6 steps charged, 0 units left' "$work/asked"
 grep -q '^asked again: the same answers, 0 units left, 4 spent in all' "$work/asked"
 expect 64 'expected none, ea' ask --account other --strategy mc-x
 echo 'another-token-of-some-length' >"$work/other-token"
-expect 64 'the token is not' ask --token-file "$work/other-token"
+expect 64 'the token is wrong' ask --token-file "$work/other-token"
 kill -TERM "$teacher"
 wait "$teacher"
 expect 75 'does not answer' ask
