@@ -1,4 +1,4 @@
-//! Plots and pages: well-formed and complete, whatever the names and numbers.
+//! Plots and pages are well-formed and complete for any names and numbers.
 #![expect(clippy::unwrap_used, reason = "a test that cannot go on may end")]
 
 use std::path::Path;

@@ -116,7 +116,7 @@ impl Account {
     ///
     /// A step costs a unit if the episode has one to spend and the step is worth it. An episode with a lease spends the
     /// units of its lease and, once settled, none; an episode without a lease spends units that are left. A repeated
-    /// request gets the same verdict, whatever it wants now, and charges nothing.
+    /// request gets the same verdict and charges nothing, even if it wants something else.
     pub fn charge(&mut self, charge: Charge) -> Option<BudgetHalf> {
         self.update(|transaction| transaction.charge(charge))
     }

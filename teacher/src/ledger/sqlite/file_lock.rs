@@ -37,7 +37,7 @@ pub(super) struct FileLock {
     id: FileId,
     /// The given path, made absolute.
     path: PathBuf,
-    /// The path without symbolic links. SQLite creates its own files beside it.
+    /// The path without symbolic links. SQLite creates its own files in the same directory.
     resolved: PathBuf,
     /// SQLite's write-ahead log, once it exists.
     log: Option<FileId>,
@@ -152,7 +152,7 @@ fn check_free(metadata: &Metadata, held: &BTreeSet<FileId>, path: &Path) -> Resu
     Ok(())
 }
 
-/// Refuses a file with several names: SQLite's log lies beside one of them and is not found under another.
+/// Refuses a file with several names: SQLite names its log after one of them and does not find it under another.
 fn check_names(metadata: &Metadata, path: &Path) -> Result<(), OpenError> {
     if metadata.nlink() <= 1 {
         return Ok(());
