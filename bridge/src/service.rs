@@ -15,6 +15,7 @@ mod motion;
 mod reason_codes;
 mod thread;
 
+use std::pin::Pin;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
@@ -77,19 +78,32 @@ pub async fn serve(
     shutdown: CancellationToken,
 ) -> Result<(), Error> {
     assert!(config.speed > 0.0 && config.speed <= 1.0, "speed {}", config.speed);
-    let ends = shutdown.child_token();
-    // Without the server no client could stop the arms, so the thread ends with it.
-    let _ends = ends.clone().drop_guard();
-    let (thread, arms) = ArmsThread::spawn(executor, Arc::clone(&config.clock), ends.clone())
-        .map_err(Error::Thread)?;
-    tokio::spawn(log_stops(arms.watch()));
-    let service = BridgeService::new(arms, config);
-    let bridge = BridgeServer::new(service).max_decoding_message_size(MAX_REQUEST_BYTES);
-    let router = server_config.router(bridge, tandem_proto::FILE_DESCRIPTOR_SET).await?;
-    let served = tandem_net::serve(router, incoming, ends.clone()).await;
-    ends.cancel();
-    thread.join(SHUTDOWN_GRACE).await?;
-    Ok(served?)
+    serve_boxed(executor, config, incoming.into(), server_config, shutdown).await
+}
+
+/// Boxes the service, so that it is compiled in this crate only and not in every crate that serves.
+fn serve_boxed(
+    executor: Executor<BoxDriver>,
+    config: Config,
+    incoming: Incoming,
+    server_config: &ServerConfig,
+    shutdown: CancellationToken,
+) -> Pin<Box<dyn Future<Output = Result<(), Error>> + Send + '_>> {
+    Box::pin(async move {
+        let ends = shutdown.child_token();
+        // Without the server no client could stop the arms, so the thread ends with it.
+        let _ends = ends.clone().drop_guard();
+        let (thread, arms) = ArmsThread::spawn(executor, Arc::clone(&config.clock), ends.clone())
+            .map_err(Error::Thread)?;
+        tokio::spawn(log_stops(arms.watch()));
+        let service = BridgeService::new(arms, config);
+        let bridge = BridgeServer::new(service).max_decoding_message_size(MAX_REQUEST_BYTES);
+        let router = server_config.router(bridge, tandem_proto::FILE_DESCRIPTOR_SET).await?;
+        let served = tandem_net::serve(router, incoming, ends.clone()).await;
+        ends.cancel();
+        thread.join(SHUTDOWN_GRACE).await?;
+        Ok(served?)
+    })
 }
 
 /// Logs stops and resets. The arms' thread does not log, because it must not wait.

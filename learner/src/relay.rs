@@ -5,6 +5,7 @@
 //! be restarted at any time, and its workers retry meanwhile.
 
 use std::collections::BTreeMap;
+use std::pin::Pin;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
@@ -41,9 +42,21 @@ pub async fn serve(
         .max_decoding_message_size(MAX_MESSAGE_BYTES)
         .max_encoding_message_size(MAX_MESSAGE_BYTES);
     let relay = Relay { client, cache: Mutex::default() };
-    let server = LearnerServer::new(relay).max_decoding_message_size(MAX_MESSAGE_BYTES);
-    let router = server_config.router(server, tandem_proto::FILE_DESCRIPTOR_SET).await?;
-    Ok(tandem_net::serve(router, incoming, shutdown).await?)
+    serve_boxed(relay, server_config, incoming.into(), shutdown).await
+}
+
+/// Boxes the service, so that it is compiled in this crate only and not in every crate that serves.
+fn serve_boxed(
+    relay: Relay,
+    server_config: &ServerConfig,
+    incoming: Incoming,
+    shutdown: CancellationToken,
+) -> Pin<Box<dyn Future<Output = Result<(), Error>> + Send + '_>> {
+    Box::pin(async move {
+        let server = LearnerServer::new(relay).max_decoding_message_size(MAX_MESSAGE_BYTES);
+        let router = server_config.router(server, tandem_proto::FILE_DESCRIPTOR_SET).await?;
+        Ok(tandem_net::serve(router, incoming, shutdown).await?)
+    })
 }
 
 struct Relay {

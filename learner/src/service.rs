@@ -87,47 +87,62 @@ pub async fn serve_with(
     shutdown: CancellationToken,
     options: ServeOptions,
 ) -> Result<RunOutcome, Error> {
-    let shared = Arc::new(Shared::new(config.clock.clone()));
-    shared.lock().queue.start_workers_at(config.first_worker);
-    let learner =
-        LearnerServer::new(LearnerService { shared: shared.clone(), start: config.first_worker })
-            .max_decoding_message_size(MAX_MESSAGE_BYTES);
-    let router = config.server_config.router(learner, tandem_proto::FILE_DESCRIPTOR_SET).await?;
-    let stop_serving = CancellationToken::new();
-    let serving_metrics = serve_metrics(options.metrics, shared.clone());
-    let learning = {
-        let (pacing, stop) = (config.pacing, stop_serving.clone());
-        let shutdown = shutdown.clone();
-        on_a_thread("learn", pacing, move |runtime| {
-            let _stop = stop.drop_guard();
-            let outcome = learn(&config, &shared, &runtime, &shutdown);
-            runtime.wait_on(linger(options.linger));
-            if is_complete(&outcome) {
-                runtime.wait_on(until_workers_know(shared.clone(), shutdown.clone()));
-                runtime.wait_on(stay(options.linger, shutdown));
-            }
-            // The streams of watchers close at the first message after the one that reports the end.
-            shared.progress.send_modify(|_| ());
-            outcome
+    serve_boxed(config, incoming.into(), shutdown, options).await
+}
+
+/// Boxes the service, so that it is compiled in this crate only and not in every crate that serves.
+fn serve_boxed(
+    config: LearnerConfig,
+    incoming: Incoming,
+    shutdown: CancellationToken,
+    options: ServeOptions,
+) -> Pin<Box<dyn Future<Output = Result<RunOutcome, Error>> + Send>> {
+    Box::pin(async move {
+        let shared = Arc::new(Shared::new(config.clock.clone()));
+        shared.lock().queue.start_workers_at(config.first_worker);
+        let learner = LearnerServer::new(LearnerService {
+            shared: shared.clone(),
+            start: config.first_worker,
         })
-    };
-    let serving = async {
-        let served = tokio::select! {
-            served = tandem_net::serve(router, incoming, stop_serving) => served,
-            () = serving_metrics => Ok(()),
+        .max_decoding_message_size(MAX_MESSAGE_BYTES);
+        let router =
+            config.server_config.router(learner, tandem_proto::FILE_DESCRIPTOR_SET).await?;
+        let stop_serving = CancellationToken::new();
+        let serving_metrics = serve_metrics(options.metrics, shared.clone());
+        let learning = {
+            let (pacing, stop) = (config.pacing, stop_serving.clone());
+            let shutdown = shutdown.clone();
+            on_a_thread("learn", pacing, move |runtime| {
+                let _stop = stop.drop_guard();
+                let outcome = learn(&config, &shared, &runtime, &shutdown);
+                runtime.wait_on(linger(options.linger));
+                if is_complete(&outcome) {
+                    runtime.wait_on(until_workers_know(shared.clone(), shutdown.clone()));
+                    runtime.wait_on(stay(options.linger, shutdown));
+                }
+                // The streams of watchers close at the first message after the one that reports the end.
+                shared.progress.send_modify(|_| ());
+                outcome
+            })
         };
-        // A server that fails ends the run: no worker can reach it any more.
-        shutdown.cancel();
-        served
-    };
-    let (joined, served) = tokio::join!(learning, serving);
-    let outcome = joined.map_err(|source| Error::RunDirectory {
-        action: "start a thread for",
-        path: PathBuf::from("learning"),
-        source: source.into(),
-    })?;
-    served?;
-    outcome.unwrap_or(Err(Error::Panicked))
+        let serving = async {
+            let served = tokio::select! {
+                served = tandem_net::serve(router, incoming, stop_serving) => served,
+                () = serving_metrics => Ok(()),
+            };
+            // A server that fails ends the run: no worker can reach it any more.
+            shutdown.cancel();
+            served
+        };
+        let (joined, served) = tokio::join!(learning, serving);
+        let outcome = joined.map_err(|source| Error::RunDirectory {
+            action: "start a thread for",
+            path: PathBuf::from("learning"),
+            source: source.into(),
+        })?;
+        served?;
+        outcome.unwrap_or(Err(Error::Panicked))
+    })
 }
 
 fn is_complete(outcome: &Result<RunOutcome, Error>) -> bool {

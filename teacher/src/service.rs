@@ -5,6 +5,7 @@ mod convert;
 mod thread;
 
 use std::path::PathBuf;
+use std::pin::Pin;
 use std::time::Duration;
 
 use tandem_net::{Incoming, Pacing, SHUTDOWN_GRACE, ServerConfig};
@@ -72,14 +73,27 @@ pub async fn serve_advisor(
     shutdown: CancellationToken,
     pacing: Pacing,
 ) -> Result<(), Error> {
-    let stop = shutdown.child_token();
-    let (thread, advisor) = AdvisorThread::spawn(advisor, ANSWER_TIMEOUT, stop.clone(), pacing)
-        .map_err(Error::Thread)?;
-    let service = TeacherService { advisor, stop: stop.clone() };
-    let teacher = TeacherServer::new(service).max_decoding_message_size(MAX_REQUEST_BYTES);
-    let router = server_config.router(teacher, tandem_proto::FILE_DESCRIPTOR_SET).await?;
-    tandem_net::serve(router, incoming, stop).await?;
-    thread.join(SHUTDOWN_GRACE).await
+    serve_boxed(advisor, incoming.into(), server_config, shutdown, pacing).await
+}
+
+/// Boxes the service, so that it is compiled in this crate only and not in every crate that serves.
+fn serve_boxed(
+    advisor: Advisor,
+    incoming: Incoming,
+    server_config: &ServerConfig,
+    shutdown: CancellationToken,
+    pacing: Pacing,
+) -> Pin<Box<dyn Future<Output = Result<(), Error>> + Send + '_>> {
+    Box::pin(async move {
+        let stop = shutdown.child_token();
+        let (thread, advisor) = AdvisorThread::spawn(advisor, ANSWER_TIMEOUT, stop.clone(), pacing)
+            .map_err(Error::Thread)?;
+        let service = TeacherService { advisor, stop: stop.clone() };
+        let teacher = TeacherServer::new(service).max_decoding_message_size(MAX_REQUEST_BYTES);
+        let router = server_config.router(teacher, tandem_proto::FILE_DESCRIPTOR_SET).await?;
+        tandem_net::serve(router, incoming, stop).await?;
+        thread.join(SHUTDOWN_GRACE).await
+    })
 }
 
 /// The implementation of the generated server trait.
