@@ -12,7 +12,7 @@ const STRATEGIES: [(&str, u64); 4] =
 const EAMC: (&str, u64) = ("eamc:0.1", 900);
 const N_WORKERS: [usize; 4] = [1, 2, 5, 16];
 /// Ten rounds of sixteen slots, so that sixteen workers have something to do; the policy is evaluated after each.
-const SMALL: [&str; 20] = [
+const SMALL: [&str; 22] = [
     "--max-env-steps",
     "8000",
     "--set",
@@ -25,6 +25,8 @@ const SMALL: [&str; 20] = [
     "rounds.updates_per_env_step=0.05",
     "--set",
     "ddpg.n_hidden=32",
+    "--set",
+    "ddpg.batch_size=64",
     "--set",
     "evaluation.episodes=2",
     "--set",

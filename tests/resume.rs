@@ -13,7 +13,7 @@ use tandem_policy::Policy;
 use tempfile::TempDir;
 
 /// A small advised run of 12 rounds.
-const SMALL: [&str; 16] = [
+const SMALL: [&str; 20] = [
     "--max-env-steps",
     "9600",
     "--set",
@@ -30,6 +30,10 @@ const SMALL: [&str; 16] = [
     "checkpoint.every_rounds=2",
     "--set",
     "advice.budget=1500",
+    "--set",
+    "world.substeps=10",
+    "--set",
+    "ddpg.batch_size=64",
 ];
 
 /// The directory and digest of a complete undisturbed run.

@@ -8,9 +8,10 @@ use std::time::{Duration, SystemTime};
 use serde_json::Value;
 
 /// Settings of small runs with 10 rounds.
-const SMALL: [(&str, &str); 9] = [
+const SMALL: [(&str, &str); 10] = [
     ("stop.max_env_steps", "8000"),
     ("ddpg.n_hidden", "32"),
+    ("ddpg.batch_size", "64"),
     ("rounds.updates_per_env_step", "0.1"),
     ("evaluation.episodes", "8"),
     ("evaluation.test_episodes", "8"),

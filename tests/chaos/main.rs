@@ -37,7 +37,7 @@ struct Scale {
 
 #[test]
 fn a_run_under_faults_ends_with_the_bits_of_an_undisturbed_run() {
-    compare(&Scale { max_env_steps: 48_000, budget: 12_000, every: Duration::from_millis(1_750) });
+    compare(&Scale { max_env_steps: 30_000, budget: 6_000, every: Duration::from_millis(1_750) });
 }
 
 #[test]
@@ -58,7 +58,7 @@ fn run_file(scale: &Scale) -> String {
         advice = {{ strategy = "eamc:0.1", budget = {budget} }}
         rounds = {{ slots = 8, rollouts = 2, lag = 1 }}
         world = {{ substeps = 10 }}
-        ddpg = {{ n_hidden = 32 }}
+        ddpg = {{ n_hidden = 32, batch_size = 64 }}
         evaluation = {{ every_env_steps = 4000, episodes = 8, recorded_episodes = 0 }}
         checkpoint = {{ every_rounds = 4, keep = 2 }}
         stop = {{ max_env_steps = {max_env_steps}, max_minutes = 0 }}
