@@ -103,6 +103,21 @@ fn files_stay_readable() {
     }
 }
 
+/// Crates without examples spare the tests a pass of rustdoc.
+#[test]
+fn every_documentation_example_is_tested() {
+    for (name, _) in ALLOWED {
+        let manifest = fs::read_to_string(root().join(name).join("Cargo.toml")).expect("readable");
+        let is_tested = !manifest.lines().any(|line| line.trim() == "doctest = false");
+        let has_example = rust_files(&root().join(name).join("src")).iter().any(|path| {
+            let text = fs::read_to_string(path).expect("readable");
+            let mut lines = text.lines().map(str::trim_start);
+            lines.any(|line| line.starts_with("/// ```") || line.starts_with("//! ```"))
+        });
+        assert_eq!(is_tested, has_example, "{name}: `doctest` of its manifest");
+    }
+}
+
 #[test]
 fn the_image_is_of_this_version_and_toolchain() {
     let read = |name: &str| fs::read_to_string(root().join(name)).expect("readable");
