@@ -1,9 +1,9 @@
 #!/usr/bin/env python3
-"""Times a grpcio echo with messages of a teacher's size: the overhead of a service in Python.
+"""Measures a grpcio echo service with messages of a teacher's size: the overhead of a service in Python.
 
 Usage: python scripts/bench_grpc_echo.py [--rounds 3]     run it after `tandem bench teacher`, on the same machine
-Needs: pip install grpcio. Client and server are separate processes. The messages are bytes that are not decoded.
-Prints one JSON object a line (name, value, unit), the best of the rounds, for grpcio's server with threads and with
+Requires: pip install grpcio. Client and server are separate processes. The messages are not decoded.
+Prints one JSON object per line (name, value, unit), the best of the rounds, for grpcio's server with threads and with
 asyncio. A request asks about two steps of two arms.
 """
 
@@ -122,7 +122,7 @@ def measure(server, rounds):
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
-    parser.add_argument("--rounds", type=int, default=3, help="how often each is measured [%(default)s]")
+    parser.add_argument("--rounds", type=int, default=3, help="number of measurements of each server [%(default)s]")
     parser.add_argument("--serve", choices=["threads", "asyncio"], help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if arguments.serve == "threads":

@@ -1,5 +1,5 @@
-"""Checks the Kubernetes manifests: what Kubernetes' own schemas say, and what no schema knows: that names, labels, ports,
-secrets, addresses and policies of one manifest are those that the others mean. See scripts/check-manifests."""
+"""Checks the Kubernetes manifests against Kubernetes' own schemas, and checks the references between manifests, which no
+schema covers: names, labels, ports, secrets, addresses and policies. See scripts/check-manifests."""
 
 import argparse
 import json
@@ -219,7 +219,7 @@ class Checked:
         offered = {p["name"]: p["containerPort"] for w in behind for c in containers(w) for p in c.get("ports", [])}
         for port in spec["ports"]:
             self.expect(port["targetPort"] in offered, f"service {name}: no container offers {port['targetPort']}")
-            # The name of a headless service leads to pods, whose ports are their own.
+            # A headless service resolves to pods, so its ports must be those of the pods.
             same = offered.get(port["targetPort"]) == port["port"]
             self.expect(same or spec.get("clusterIP") != "None", f"service {name}: {port['port']} is not the pod's port")
 
@@ -298,7 +298,7 @@ def check_schemas(folder):
             assert by_key(others) == by_key(objects), f"{overlay.name}: kustomize builds something else"
         for found in objects:
             for version in VERSIONS:
-                # Without aliases and tuples, as an API server would be sent it.
+                # Without YAML aliases and tuples, as an API server receives it.
                 kubernetes_validate.validate(json.loads(json.dumps(found)), version, strict=True)
         how = "as kustomize builds them" if others is not None else "kustomize is not installed"
         print(f"{overlay.name}: {len(objects)} objects fit the schemas of Kubernetes {' and '.join(VERSIONS)}, {how}")

@@ -1,4 +1,4 @@
-//! From recipe, run file and command line to one checked configuration.
+//! Combines recipe, run file and command line into one checked configuration.
 
 use std::path::Path;
 
@@ -17,10 +17,10 @@ use former::{current_keys, is_removed};
 
 mod former;
 
-/// Longer texts are cut where a message shows them.
+/// The length to which texts in messages are shortened, in characters.
 const MAX_SHOWN_CHARS: usize = 80;
 
-/// Reads a run file and lays `settings` (`key=value`) over it; what both leave out takes the recipe's values.
+/// Reads a run file and overrides it with `settings` (`key=value`). All other settings have the recipe's values.
 pub(crate) fn resolve(
     file: Option<&Path>,
     settings: &[(String, Value)],
@@ -33,7 +33,7 @@ pub(crate) fn resolve(
     overlay(from_file, settings).or_exit(Exit::Usage, context)
 }
 
-/// Splits `key=value`; the value is TOML where it can be read as such, else text.
+/// Splits `key=value`. A value that is not valid TOML is a string.
 pub(crate) fn parse_setting(setting: &str) -> Result<(String, Value), Failed> {
     let Some((key, text)) = setting.split_once('=') else {
         return Err(Failed::usage(format!(
@@ -44,24 +44,24 @@ pub(crate) fn parse_setting(setting: &str) -> Result<(String, Value), Failed> {
     Ok((key.trim().to_owned(), parse_value(text.trim())))
 }
 
-/// The text of a run file with every setting.
+/// Returns the text of a run file with every setting.
 pub(crate) fn to_text(config: &RunConfig) -> Result<String, Failed> {
     let text = to_toml(config).or_exit(Exit::Bug, String::new)?;
     Ok(format!("# tandem {}\n{text}", crate::version::VERSION))
 }
 
-/// Writes the configuration with every setting, whole or not at all.
+/// Writes the configuration with every setting atomically.
 pub(crate) fn save(config: &RunConfig, path: &Path) -> Result<(), Failed> {
     let written = atomic_file::replace(path, to_text(config)?.as_bytes());
     written.or_cannot_write(|| format!("cannot write {}", path.display()))
 }
 
-/// The configuration as a TOML document with every setting.
+/// Returns the configuration as a TOML document with every setting.
 pub(crate) fn to_toml(config: &RunConfig) -> anyhow::Result<String> {
     Ok(toml::to_string_pretty(config)?)
 }
 
-/// The whole of `text` as a TOML value; what is more than a value, such as one with a comment behind it, is text.
+/// Parses the whole of `text` as a TOML value. Anything else, such as a value followed by a comment, is a string.
 fn parse_value(text: &str) -> Value {
     let as_text = || Value::String(text.to_owned());
     if text.contains(['#', '\n']) && !text.starts_with(['"', '\'']) {
@@ -75,7 +75,7 @@ fn read(path: &Path) -> anyhow::Result<Table> {
     parse(&text).map_err(|problem| anyhow!("run file {path:?}: {problem}"))
 }
 
-/// The tables of a run file, or in one line what is wrong where.
+/// Parses a run file. The error is one line with the position and the cause.
 fn parse(text: &str) -> Result<Table, String> {
     text.parse().map_err(|error: toml::de::Error| {
         let start = error.span().map_or(0, |span| span.start);
@@ -100,7 +100,7 @@ fn overlay(from_file: Table, settings: &[(String, Value)]) -> anyhow::Result<Run
     let mut config = typed(resolved).map_err(|error| blame(&defaults, &changes, &error))?;
     let is_set = |key| changes.get("stop").is_some_and(|stop| stop.get(key).is_some());
     if config.stop.max_minutes > 0.0 && is_set("max_minutes") && !is_set("max_env_steps") {
-        // Who gives a time wants that time, not the recipe's number of steps.
+        // A time limit that is set replaces the recipe's number of steps.
         config.stop.max_env_steps = 0;
     }
     let config = config.checked().map_err(in_one_line)?;
@@ -113,7 +113,7 @@ fn overlay(from_file: Table, settings: &[(String, Value)]) -> anyhow::Result<Run
     Ok(config)
 }
 
-/// Says what is out of its range without repeating a long text.
+/// Formats an error on one line, with long texts shortened.
 fn in_one_line(error: ConfigError) -> anyhow::Error {
     match error {
         ConfigError::OutOfRange(OutOfRange { key, value, expected }) => {
@@ -128,7 +128,7 @@ fn typed(table: Table) -> Result<RunConfig, toml::de::Error> {
     Value::Table(table).try_into()
 }
 
-/// Finds the change that alone keeps the configuration from being one.
+/// Describes the first change that is invalid by itself.
 fn blame(defaults: &Table, changes: &Table, error: &toml::de::Error) -> anyhow::Error {
     for (name, value) in settings_below(changes, "") {
         let mut alone = defaults.clone();
@@ -146,7 +146,7 @@ fn blame(defaults: &Table, changes: &Table, error: &toml::de::Error) -> anyhow::
     anyhow!("{}", shortened(error.message()))
 }
 
-/// The recipe's values for the task and arms that the changes choose.
+/// Returns the recipe's values for the task and the number of arms that `changes` select.
 fn defaults_for(changes: &Table) -> anyhow::Result<RunConfig> {
     let recipe = match changes.get("recipe").and_then(Value::as_str) {
         None | Some("tandem") => Recipe::Tandem,
@@ -192,8 +192,8 @@ fn set(table: &mut Table, key: &str, value: Value) -> anyhow::Result<()> {
     }
 }
 
-/// Lays `changes` over `base`; a key that `base` lacks is unknown. Whole numbers are taken where fractions are meant.
-/// `known` are all settings there are.
+/// Overrides values of `base` with `changes`. A key that `base` lacks is unknown. An integer is accepted for a float.
+/// `known` lists all settings.
 fn merge(base: &mut Table, changes: &Table, path: &str, known: &[String]) -> anyhow::Result<()> {
     for (key, change) in changes {
         let name = dotted(path, key);
@@ -234,7 +234,7 @@ fn dotted(path: &str, key: &str) -> String {
     if path.is_empty() { key.to_owned() } else { format!("{path}.{key}") }
 }
 
-/// Dotted names and values of all settings in and below `table`.
+/// Returns dotted names and values of all settings in and below `table`.
 fn settings_below(table: &Table, path: &str) -> Vec<(String, Value)> {
     let below = |(key, value): (&String, &Value)| match value {
         Value::Table(inner) => settings_below(inner, &dotted(path, key)),
@@ -247,7 +247,7 @@ fn names_below(table: &Table, path: &str) -> Vec<String> {
     settings_below(table, path).into_iter().map(|(name, _)| name).collect()
 }
 
-/// The known setting that `name` may have been meant for: its last part stands elsewhere, or a few letters differ.
+/// Returns the known setting most similar to `name`: one with the same last part, or one that differs in few letters.
 fn nearest<'a>(name: &str, known: &'a [String]) -> Option<&'a String> {
     if name.len() > MAX_SHOWN_CHARS {
         return None;
@@ -259,12 +259,12 @@ fn nearest<'a>(name: &str, known: &'a [String]) -> Option<&'a String> {
     elsewhere.or(close.map(|(_, known)| known))
 }
 
-/// A value as a message shows it.
+/// Formats a value for a message.
 fn shown(value: &Value) -> String {
     shortened(&value.to_string().replace('\n', " "))
 }
 
-/// The beginning of a text that is too long for a line.
+/// Shortens a text that is too long for a line.
 fn shortened(text: &str) -> String {
     tandem_core::text::shortened(text, MAX_SHOWN_CHARS)
 }

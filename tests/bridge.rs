@@ -1,7 +1,7 @@
-//! `tandem bridge` with the built program: a served pair of simulated arms, and operators who look, reset, move and stop.
+//! `tandem bridge` with the built program: a service with simulated arms, and the commands of operators.
 //!
-//! The arms move in real time. On a machine that is busy with other things the program may come too late for them, and then
-//! it stops them, as it should; these tests try again.
+//! The arms move in real time. On a busy machine the service may miss a deadline and stop them, as it should. The tests
+//! then try again.
 #![expect(clippy::panic, reason = "a test panics where it fails")]
 
 use std::io::{BufRead as _, BufReader};
@@ -12,16 +12,16 @@ use std::time::Duration;
 use serde_json::{Value, json};
 use tempfile::TempDir;
 
-/// What a busy machine may stop the arms for.
+/// The causes of stops that a busy machine may produce.
 const BUSY: [&str; 6] =
     ["late", "owner-silent", "state-old", "state-stale", "command-lost", "drive-fault"];
-/// Longer than anything takes: this many pauses.
-const MANY: usize = 1200;
+/// The limit of every wait, in pauses, sufficient for busy machines.
+const MAX_PAUSES: usize = 1200;
 const PAUSE: Duration = Duration::from_millis(50);
 
-/// A served pair, ended with the test.
+/// A bridge process that is killed on drop.
 struct Bridge {
-    served: Child,
+    process: Child,
     address: String,
     directory: TempDir,
 }
@@ -38,12 +38,12 @@ impl Bridge {
     fn serve(more: &[&str]) -> Self {
         let args = [&["bridge", "--driver", "sim", "--listen", "127.0.0.1:0"][..], more].concat();
         let directory = tempfile::tempdir().expect("a directory");
-        let mut served = tandem(&args).stderr(Stdio::inherit()).spawn().expect("starts");
+        let mut process = tandem(&args).stderr(Stdio::inherit()).spawn().expect("starts");
         let mut line = String::new();
-        let mut output = BufReader::new(served.stdout.take().expect("piped"));
+        let mut output = BufReader::new(process.stdout.take().expect("piped"));
         output.read_line(&mut line).expect("a line");
         let address = line.trim().strip_prefix("listening on ").expect("an address").to_owned();
-        Self { served, address, directory }
+        Self { process, address, directory }
     }
 
     fn command(&self, what: &[&str]) -> Command {
@@ -57,7 +57,7 @@ impl Bridge {
 
     fn json(&self, what: &[&str]) -> Value {
         let output = self.run(&[what, &["--json"]].concat());
-        assert_eq!(output.status.code(), Some(0), "{}", said(&output));
+        assert_eq!(output.status.code(), Some(0), "{}", stderr(&output));
         serde_json::from_slice(&output.stdout).expect("one JSON object")
     }
 
@@ -65,9 +65,9 @@ impl Bridge {
         self.json(&["status"])
     }
 
-    /// Waits until the status is as wanted; gives `None` when a busy machine has stopped the arms.
+    /// Waits until the status is as wanted. Returns `None` if a busy machine has stopped the arms.
     fn eventually(&self, wanted: impl Fn(&Value) -> bool) -> Option<Value> {
-        for _ in 0..MANY {
+        for _ in 0..MAX_PAUSES {
             let status = self.status();
             if wanted(&status) {
                 return Some(status);
@@ -80,20 +80,20 @@ impl Bridge {
         panic!("{}", self.status())
     }
 
-    /// Lets the arms go.
+    /// Resets the arms.
     fn reset(&self) {
-        for _ in 0..MANY {
+        for _ in 0..MAX_PAUSES {
             let output = self.run(&["reset"]);
-            if output.status.success() || said(&output).contains("not stopped but Idle") {
+            if output.status.success() || stderr(&output).contains("not stopped but Idle") {
                 return;
             }
-            assert_eq!(output.status.code(), Some(75), "{}", said(&output));
+            assert_eq!(output.status.code(), Some(75), "{}", stderr(&output));
             std::thread::sleep(PAUSE);
         }
         panic!("{}", self.status())
     }
 
-    /// Does `work` with arms that are let go, again as long as a busy machine stops them.
+    /// Runs `work` with arms that are not stopped, and repeats it if a busy machine stops them.
     fn with_arms<T>(&self, work: impl Fn() -> Option<T>) -> T {
         for _ in 0..20 {
             self.reset();
@@ -104,7 +104,7 @@ impl Bridge {
         panic!("{}", self.status())
     }
 
-    /// A motion under way, slowly; `None` when a busy machine has stopped it.
+    /// Starts a slow motion. Returns `None` if a busy machine has stopped it.
     fn moving(&self) -> Option<Child> {
         let slowly = ["move", "deploy/first-motion.json", "--speed", "0.05"];
         let mover = self.command(&slowly).spawn().expect("starts");
@@ -121,8 +121,8 @@ impl Bridge {
 
 impl Drop for Bridge {
     fn drop(&mut self) {
-        drop(self.served.kill());
-        drop(self.served.wait());
+        drop(self.process.kill());
+        drop(self.process.wait());
     }
 }
 
@@ -130,7 +130,7 @@ fn was_busy(status: &Value) -> bool {
     status["stopped"]["name"].as_str().is_some_and(|name| BUSY.contains(&name))
 }
 
-fn said(output: &Output) -> String {
+fn stderr(output: &Output) -> String {
     String::from_utf8_lossy(&output.stderr).into_owned()
 }
 
@@ -145,21 +145,24 @@ fn signal(child: &Child, signal: &str) {
 }
 
 fn fails_with(code: i32, output: &Output, expected: &str) {
-    let told = said(output);
-    assert_eq!(output.status.code(), Some(code), "{told}");
-    let line = told.lines().last().unwrap_or_default();
-    assert!(line.starts_with("tandem: ") && line.contains(expected), "{told}");
+    let message = stderr(output);
+    assert_eq!(output.status.code(), Some(code), "{message}");
+    let line = message.lines().last().unwrap_or_default();
+    assert!(line.starts_with("tandem: ") && line.contains(expected), "{message}");
 }
 
 #[test]
-fn operators_look_reset_move_and_stop() {
+fn operators_describe_reset_move_and_stop() {
     let bridge = Bridge::serve(&["--speed", "0.8"]);
-    let told = bridge.json(&["describe"]);
-    assert_eq!((&told["driver"], &told["arms"][1]["model"]), (&json!("sim"), &json!("m1n4s200")));
-    assert_eq!(told["limits"]["speed"], json!(0.8));
+    let described = bridge.json(&["describe"]);
+    assert_eq!(
+        (&described["driver"], &described["arms"][1]["model"]),
+        (&json!("sim"), &json!("m1n4s200"))
+    );
+    assert_eq!(described["limits"]["speed"], json!(0.8));
     assert_eq!(bridge.status()["stopped"]["name"], json!("not-reset"));
     let early = bridge.run(&["move", "deploy/first-motion.json"]);
-    if !said(&early).contains("the position of the arms is not known") {
+    if !stderr(&early).contains("the position of the arms is not known") {
         fails_with(75, &early, "tandem bridge reset");
     }
 
@@ -171,7 +174,7 @@ fn operators_look_reset_move_and_stop() {
         if moved.status.code() == Some(75) && was_busy(&bridge.status()) {
             return None;
         }
-        assert_eq!(moved.status.code(), Some(0), "{}", said(&moved));
+        assert_eq!(moved.status.code(), Some(0), "{}", stderr(&moved));
         let done: Value = serde_json::from_slice(&moved.stdout).expect("one JSON object");
         assert_eq!((&done["done"], &done["progress"]["speed"]), (&json!(true), &json!(0.8)));
         let at_m = &done["progress"]["arms"][0]["tool_in_world_m"];
@@ -194,13 +197,13 @@ fn operators_look_reset_move_and_stop() {
     let health = health.output().expect("runs");
     assert_eq!(health.stdout, b"serving\n");
     let mut bridge = bridge;
-    signal(&bridge.served, "-TERM");
-    assert_eq!(bridge.served.wait().expect("ends").code(), Some(0));
+    signal(&bridge.process, "-TERM");
+    assert_eq!(bridge.process.wait().expect("ends").code(), Some(0));
     fails_with(75, &bridge.run(&["stop"]), "does not answer");
 }
 
 #[test]
-fn a_motion_that_cannot_be_is_refused_and_moves_nothing() {
+fn an_impossible_motion_is_refused_and_moves_nothing() {
     let bridge = Bridge::serve(&[]);
     bridge.reset();
     let file = bridge.directory.path().join("motion.json");
@@ -231,7 +234,7 @@ fn a_motion_that_cannot_be_is_refused_and_moves_nothing() {
 }
 
 #[test]
-fn whoever_moves_the_arms_and_goes_stops_them() {
+fn the_arms_stop_when_the_client_of_a_motion_ends() {
     let bridge = Bridge::serve(&[]);
     let interrupted = bridge.with_arms(|| {
         let mover = bridge.moving()?;
@@ -239,8 +242,8 @@ fn whoever_moves_the_arms_and_goes_stops_them() {
         let ended = mover.wait_with_output().expect("ends");
         (ended.status.code() == Some(130) || !was_busy(&bridge.status())).then_some(ended)
     });
-    assert_eq!(interrupted.status.code(), Some(130), "{}", said(&interrupted));
-    assert!(said(&interrupted).contains("interrupted: the arms are stopped"));
+    assert_eq!(interrupted.status.code(), Some(130), "{}", stderr(&interrupted));
+    assert!(stderr(&interrupted).contains("interrupted: the arms are stopped"));
     assert!(bridge.status()["stopped"].is_object());
 
     let status = bridge.with_arms(|| {
@@ -251,7 +254,7 @@ fn whoever_moves_the_arms_and_goes_stops_them() {
 }
 
 #[test]
-fn a_bridge_with_a_token_obeys_nobody_without() {
+fn a_bridge_with_a_token_refuses_calls_without_it() {
     let directory = tempfile::tempdir().expect("a directory");
     let token = directory.path().join("token");
     std::fs::write(&token, "the-right-token-0123").expect("writes");
@@ -260,6 +263,6 @@ fn a_bridge_with_a_token_obeys_nobody_without() {
     for what in ["status", "stop", "describe", "reset"] {
         fails_with(64, &bridge.run(&[what]), "requires a token: name its file in --token-file");
         let known = bridge.run(&[what, "--token-file", &token]);
-        assert_ne!(known.status.code(), Some(64), "{}", said(&known));
+        assert_ne!(known.status.code(), Some(64), "{}", stderr(&known));
     }
 }

@@ -1,4 +1,4 @@
-//! The house keeps its order: who may depend on whom, which modules stay pure, what no file may say.
+//! Rules for the source: dependencies between crates and modules, purity, printing and the length of files.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
@@ -128,7 +128,7 @@ fn the_image_is_of_this_version_and_toolchain() {
     assert!(dockerfile.contains(&format!("FROM rust:{channel}-slim-")), "not Rust {channel}");
     let image = format!("image: tandem:{}\n", env!("CARGO_PKG_VERSION"));
     assert!(read("compose.yaml").contains(&image), "compose.yaml lacks {image:?}");
-    // The image is built from what is listed here, and from nothing else.
+    // The image is built only from the paths listed here.
     let context = read(".dockerignore");
     for name in
         ALLOWED.map(|(name, _)| name).iter().chain(&["src", "build.rs", "policies", "Cargo.lock"])

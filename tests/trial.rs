@@ -21,24 +21,25 @@ fn rows(out: &Path) -> Vec<Value> {
 }
 
 #[test]
-fn policies_are_tried_judged_and_recorded() {
+fn trials_are_evaluated_and_recorded() {
     let dir = tempfile::tempdir().expect("a directory");
     let args = ["--policy", STUDENT, "--composed-teachers", TEACHER, "--trials", "2", "--json"];
     let more = ["--record", "all", "--seed", "2", "--motions"];
     let output = trial(dir.path(), &[&args[..], &more].concat());
     assert_eq!(output.status.code(), Some(0), "{}", String::from_utf8_lossy(&output.stderr));
-    let told: Value = serde_json::from_slice(&output.stdout).expect("one object");
-    assert!(told["trials"].is_object() || told["trials"].is_array(), "{told}");
+    let printed: Value = serde_json::from_slice(&output.stdout).expect("one object");
+    assert!(printed["trials"].is_object() || printed["trials"].is_array(), "{printed}");
     let rows = rows(dir.path());
-    assert_eq!(rows.len(), 2 * 3 * 2, "subjects, modes, trials");
+    assert_eq!(rows.len(), 2 * 3 * 2, "policies, modes, trials");
     for row in &rows {
         let log = dir.path().join(row["log"].as_str().expect("a log"));
         assert!(log.metadata().expect("written").len() > 1000, "{}", log.display());
         let same_start = rows.iter().filter(|other| other["trial"] == row["trial"]);
         assert!(same_start.clone().all(|other| other["goals"] == row["goals"]));
     }
-    let looking = |row: &&Value| row["mode"] == "closed-loop" && row["subject"] == "student-push";
-    assert!(rows.iter().filter(looking).all(|row| row["success"] == true), "{rows:?}");
+    let is_closed_loop =
+        |row: &&Value| row["mode"] == "closed-loop" && row["subject"] == "student-push";
+    assert!(rows.iter().filter(is_closed_loop).all(|row| row["success"] == true), "{rows:?}");
     assert!(dir.path().join("report.html").exists());
     let motion = dir.path().join("motions/student-push-twin-0000.json");
     let motion = std::fs::read_to_string(motion).expect("written");
@@ -52,14 +53,14 @@ fn reports_know_every_cause_of_failure() {
 }
 
 #[test]
-fn what_cannot_be_tried_is_said_in_one_line() {
+fn unusable_arguments_are_reported_in_one_line() {
     let dir = tempfile::tempdir().expect("a directory");
-    let check = |args: &[&str], code: i32, said: &str| {
+    let check = |args: &[&str], code: i32, expected: &str| {
         let output = trial(dir.path(), args);
         let error = String::from_utf8_lossy(&output.stderr).into_owned();
         assert_eq!(output.status.code(), Some(code), "{args:?}: {error}");
-        assert!(error.contains(said), "{args:?}: {error}");
-        assert!(code == 64 && said.starts_with("--") || error.lines().count() == 1, "{error}");
+        assert!(error.contains(expected), "{args:?}: {error}");
+        assert!(code == 64 && expected.starts_with("--") || error.lines().count() == 1, "{error}");
     };
     check(&["--policy", TEACHER], 64, "drives 1 arm");
     check(&["--composed-teachers", STUDENT], 64, "a teacher drives one");

@@ -174,8 +174,8 @@ impl LearnerLoop<'_> {
     fn learn(&mut self, episodes: &[Episode], advice_spent: u64) -> Result<RoundStats, Error> {
         self.trainer.ingest(episodes);
         self.trainer.correct_advice_spent(advice_spent);
-        if let Some(absurd) = self.trainer.absurd_statistic() {
-            self.context.shared.warnings.set_first(Source::Statistics, &absurd);
+        if let Some(warning) = self.trainer.implausible_statistic() {
+            self.context.shared.warnings.set_first(Source::Statistics, &warning);
         }
         self.publish_progress(Phase::Updating);
         let on_update = self.progress.on_update(self.trainer.counters());

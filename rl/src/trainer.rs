@@ -213,12 +213,12 @@ impl Trainer {
     /// Returns a description of the first statistic of the normalisers that is not finite or exceeds every value that a
     /// world can produce. Inputs normalised with it are indistinguishable, so the policy cannot learn.
     #[must_use]
-    pub fn absurd_statistic(&self) -> Option<String> {
+    pub fn implausible_statistic(&self) -> Option<String> {
         let largest_of_object = self.layout.observation_bound(OBJECT_POSITION.start);
         let goal_bound = self.layout.goal_bound().max(largest_of_object);
         let observation = self.observation_normalizer.snapshot();
-        first_absurd("observations", observation, |idx| self.layout.observation_bound(idx))
-            .or_else(|| first_absurd("goals", self.goal_normalizer.snapshot(), |_| goal_bound))
+        first_implausible("observations", observation, |idx| self.layout.observation_bound(idx))
+            .or_else(|| first_implausible("goals", self.goal_normalizer.snapshot(), |_| goal_bound))
     }
 
     /// Makes a round's updates. Calls `on_update` with their number after each.
@@ -379,7 +379,7 @@ impl Trainer {
     }
 }
 
-fn first_absurd(
+fn first_implausible(
     what: &str,
     snapshot: &NormalizerSnapshot,
     largest: impl Fn(usize) -> f32,
@@ -435,23 +435,23 @@ mod tests {
     use crate::config::Recipe;
 
     #[test]
-    fn a_statistic_ruined_by_one_absurd_number_is_named() {
+    fn a_statistic_ruined_by_one_implausible_number_is_named() {
         let mut config = RunConfig::defaults(Recipe::Tandem, tandem_core::Task::Push, 2);
         config.ddpg.n_hidden = 4;
         let mut trainer = Trainer::new(config).expect("valid");
-        assert_eq!(trainer.absurd_statistic(), None);
+        assert_eq!(trainer.implausible_statistic(), None);
         let mut row = vec![0.0; trainer.layout.n_observation()];
         trainer.observation_normalizer.update(&row);
         row[31] = 25.0;
         trainer.observation_normalizer.update(&row);
-        assert_eq!(trainer.absurd_statistic(), None, "an object may fall");
+        assert_eq!(trainer.implausible_statistic(), None, "an object may fall");
         row[31] = 1e29;
         trainer.observation_normalizer.update(&row);
-        let named = trainer.absurd_statistic().expect("ruined");
+        let named = trainer.implausible_statistic().expect("ruined");
         assert!(named.starts_with("number 31 of the observations has mean 3.3"), "{named}");
         trainer.observation_normalizer = Normalizer::new(row.len());
         trainer.goal_normalizer.update(&[f32::NAN; 6]);
-        let named = trainer.absurd_statistic().expect("not finite");
+        let named = trainer.implausible_statistic().expect("not finite");
         assert!(named.starts_with("number 0 of the goals has mean NaN"), "{named}");
     }
 }

@@ -20,7 +20,7 @@ struct MotionFile {
     /// Fraction of the motion's own speed, in (0, 1].
     speed: f64,
     /// Positions of the tools; each waypoint has one entry per arm.
-    way_points: Option<Vec<Vec<FileWayPoint>>>,
+    way_points: Option<Vec<Vec<FileWaypoint>>>,
     /// Whether the path begins at the current positions of the tools; only with waypoints. The default is true.
     from_here: Option<bool>,
     /// Minimum time per waypoint, seconds; only with waypoints. The default is 0.04.
@@ -31,7 +31,7 @@ struct MotionFile {
 
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
-struct FileWayPoint {
+struct FileWaypoint {
     /// Position of the tool in the world: x, y, z, metres.
     tool_m: [f64; 3],
     /// Opening of the gripper, 0 to 1.
@@ -55,16 +55,16 @@ struct FileSample {
     opening: f64,
 }
 
-/// Writes a motion file with `way_points` and `speed`.
-pub(super) fn write(path: &Path, speed: f64, way_points: &[Waypoint]) -> Result<(), Failed> {
+/// Writes a motion file with `waypoints` and `speed`.
+pub(super) fn write(path: &Path, speed: f64, waypoints: &[Waypoint]) -> Result<(), Failed> {
     let arm = |arm: &ArmWaypoint| {
         let round = |number: f64| (number * 1e5).round() * 1e-5;
         let tool_m = <[f64; 3]>::from(arm.tool_in_world_m).map(round);
         json!({ "tool_m": tool_m, "opening": round(arm.gripper_opening) })
     };
-    let way_points: Vec<Vec<Value>> =
-        way_points.iter().map(|arms| arms.iter().map(arm).collect()).collect();
-    let text = json!({ "speed": speed, "way_points": way_points }).to_string();
+    let waypoints: Vec<Vec<Value>> =
+        waypoints.iter().map(|arms| arms.iter().map(arm).collect()).collect();
+    let text = json!({ "speed": speed, "way_points": waypoints }).to_string();
     std::fs::write(path, text + "\n").or_cannot_write(|| format!("cannot write {}", path.display()))
 }
 
@@ -83,8 +83,8 @@ pub(super) fn read(path: &Path, speed: Option<f64>) -> Result<pb::MotionRequest,
 fn motion(file: MotionFile) -> Result<pb::motion_request::Motion, &'static str> {
     use pb::motion_request::Motion as M;
     match (file.way_points, file.joint_motion) {
-        (Some(way_points), None) => {
-            let way_points = way_points.into_iter().map(way_point).collect();
+        (Some(waypoints), None) => {
+            let way_points = waypoints.into_iter().map(waypoint).collect();
             let step_s = file.step_s.unwrap_or(STEP_S);
             let from_here = file.from_here.unwrap_or(true);
             Ok(M::WayPoints(pb::WayPoints { way_points, step_s, from_here }))
@@ -100,8 +100,8 @@ fn motion(file: MotionFile) -> Result<pb::motion_request::Motion, &'static str> 
     }
 }
 
-fn way_point(arms: Vec<FileWayPoint>) -> pb::BridgeWayPoint {
-    let arm = |arm: FileWayPoint| pb::ArmWayPoint {
+fn waypoint(arms: Vec<FileWaypoint>) -> pb::BridgeWayPoint {
+    let arm = |arm: FileWaypoint| pb::ArmWayPoint {
         tool_in_world_m: arm.tool_m.to_vec(),
         opening: arm.opening,
     };

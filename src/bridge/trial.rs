@@ -11,7 +11,7 @@ use tandem_telemetry::trials::TRIALS_FILE;
 use tandem_telemetry::{TrialRow, TrialsLog};
 use tandem_trials::simulated::Block;
 use tandem_trials::trial::{TrialConfig, TrialError, TrialMode, TrialReport};
-use tandem_trials::{Series, SeriesError, SimulatedConfig, Subject};
+use tandem_trials::{NamedPolicy, Series, SeriesError, SimulatedConfig};
 
 use crate::bridge::file;
 use crate::cli::{ModeName, RecordName, TrialArgs};
@@ -28,7 +28,7 @@ const BLOCK_CM: [f32; 2] = [3.0, 9.0];
 const TIME_LIMIT_S: f64 = 120.0;
 
 pub(crate) fn trial(args: &TrialArgs) -> Result<(), Failed> {
-    let (task, subjects) = subjects(args)?;
+    let (task, policies) = policies(args)?;
     let block = block(args.block_cm)?;
     if !(args.speed > 0.0 && args.speed <= 1.0) {
         let message = format!("--speed {}: expected more than 0 and at most 1", args.speed);
@@ -44,7 +44,7 @@ pub(crate) fn trial(args: &TrialArgs) -> Result<(), Failed> {
     let file = out.join(TRIALS_FILE);
     let mut log = TrialsLog::create(&file).or_cannot_write(String::new)?;
     let mut all = Vec::new();
-    for subject in &subjects {
+    for policy in &policies {
         for mode in modes {
             let config = TrialConfig {
                 layout: Layout::new(task, 2),
@@ -55,7 +55,7 @@ pub(crate) fn trial(args: &TrialArgs) -> Result<(), Failed> {
                 simulated: SimulatedConfig::default(),
                 time_limit_s: TIME_LIMIT_S,
             };
-            let series = Series { subject, config };
+            let series = Series { policy, config };
             let rows = run(&series, args, &out)?;
             for row in &rows {
                 log.append(row).or_exit(Exit::TryAgain, String::new)?;
@@ -76,8 +76,8 @@ const fn mode_of(name: ModeName) -> TrialMode {
 }
 
 /// Loads the policies and determines their common task.
-fn subjects(args: &TrialArgs) -> Result<(Task, Vec<Subject>), Failed> {
-    let mut subjects = Vec::new();
+fn policies(args: &TrialArgs) -> Result<(Task, Vec<NamedPolicy>), Failed> {
+    let mut policies = Vec::new();
     for path in &args.policies {
         let policy = policy_file::load(path)?;
         if policy.layout.n_arms != 2 {
@@ -87,7 +87,7 @@ fn subjects(args: &TrialArgs) -> Result<(Task, Vec<Subject>), Failed> {
                 policy.layout.n_arms
             )));
         }
-        subjects.push(Subject { name: name_of(path), policy });
+        policies.push(NamedPolicy { name: name_of(path), policy });
     }
     for path in &args.composed_teachers {
         let policy = policy_file::load(path)?;
@@ -98,19 +98,19 @@ fn subjects(args: &TrialArgs) -> Result<(Task, Vec<Subject>), Failed> {
                 policy.layout.n_arms
             )));
         }
-        subjects.push(Subject { name: format!("composed-{}", name_of(path)), policy });
+        policies.push(NamedPolicy { name: format!("composed-{}", name_of(path)), policy });
     }
-    let task_of = |subject: &Subject| subject.policy.layout.task;
-    let first = args.task.map(Task::from).or_else(|| subjects.first().map(task_of));
+    let task_of = |named: &NamedPolicy| named.policy.layout.task;
+    let first = args.task.map(Task::from).or_else(|| policies.first().map(task_of));
     let Some(task) = first else {
         return Err(Failed::usage("give --policy or --composed-teachers"));
     };
-    match subjects.iter().find(|subject| task_of(subject) != task) {
+    match policies.iter().find(|named| task_of(named) != task) {
         Some(other) => {
             let message = format!("{} is for {}, not {task}", other.name, task_of(other));
             Err(Failed::usage(message))
         }
-        None => Ok((task, subjects)),
+        None => Ok((task, policies)),
     }
 }
 
@@ -127,7 +127,7 @@ fn block(edge_cm: f32) -> Result<Block, Failed> {
 
 /// Runs the trials of `series` with a progress bar and writes their motions if `args` ask for them.
 fn run(series: &Series<'_>, args: &TrialArgs, out: &Path) -> Result<Vec<TrialRow>, Failed> {
-    let label = format!("{}, {}", series.subject.name, series.config.mode.name());
+    let label = format!("{}, {}", series.policy.name, series.config.mode.name());
     let bar = ProgressBar::new(args.trials).with_prefix(label);
     let style = indicatif::ProgressStyle::with_template("{prefix} {wide_bar} {pos} of {len}");
     let bar = bar.with_style(style.or_exit(Exit::Bug, String::new)?);
@@ -151,10 +151,10 @@ fn run(series: &Series<'_>, args: &TrialArgs, out: &Path) -> Result<Vec<TrialRow
 }
 
 fn write_motion(report: &TrialReport, speed: f64, path: &Path) -> Result<(), Failed> {
-    if report.way_points.is_empty() {
+    if report.waypoints.is_empty() {
         return Ok(());
     }
-    file::write(path, speed, &report.way_points)
+    file::write(path, speed, &report.waypoints)
 }
 
 /// Writes the log of each row that names one.

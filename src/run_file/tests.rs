@@ -1,4 +1,4 @@
-//! What a run file or a setting may say, and what is said about one that cannot be used.
+//! Valid and invalid run files and settings, and the messages about invalid ones.
 
 use proptest::collection::vec;
 use proptest::prelude::{
@@ -15,13 +15,13 @@ fn resolved(settings: &[&str]) -> Result<RunConfig, String> {
     overlay(Table::new(), &settings).map_err(|error| error.to_string())
 }
 
-/// What a document with one line or more says.
+/// Resolves a run file with one or more lines.
 fn from_text(text: &str) -> Result<RunConfig, String> {
     overlay(parse(text)?, &[]).map_err(|error| error.to_string())
 }
 
 #[test]
-fn settings_change_what_they_name_and_nothing_else() {
+fn settings_change_only_what_they_name() {
     let config = resolved(&["arms=1", "ddpg.discount=0.9", "advice.budget=7"]).expect("valid");
     let mut expected = RunConfig::defaults(Recipe::Tandem, Task::Push, 1);
     expected.ddpg.discount = 0.9;
@@ -30,7 +30,7 @@ fn settings_change_what_they_name_and_nothing_else() {
 }
 
 #[test]
-fn what_is_wrong_is_named() {
+fn errors_name_the_setting() {
     let check = |setting: &str, words: &[&str]| {
         let message = resolved(&[setting]).expect_err("must be refused");
         words.iter().for_each(|word| assert!(message.contains(word), "{message:?} lacks {word:?}"));
@@ -109,7 +109,7 @@ fn removed_settings_may_be_zero_only() {
 }
 
 #[test]
-fn minutes_that_are_given_take_the_place_of_the_recipes_steps() {
+fn a_time_limit_replaces_the_recipes_number_of_steps() {
     let limits = |settings: &[&str]| {
         let stop = resolved(settings).expect("valid").stop;
         (stop.max_env_steps, stop.max_minutes)
@@ -142,7 +142,7 @@ fn a_written_configuration_is_read_back() {
 }
 
 #[test]
-fn what_is_wrong_with_a_document_is_said_with_its_line() {
+fn errors_in_a_document_are_reported_with_their_line() {
     let check = |text: &str, words: &[&str]| {
         let message = from_text(text).expect_err("must be refused");
         words.iter().for_each(|word| assert!(message.contains(word), "{message:?} lacks {word:?}"));
@@ -160,12 +160,12 @@ fn what_is_wrong_with_a_document_is_said_with_its_line() {
 }
 
 #[test]
-fn a_mark_of_byte_order_changes_nothing() {
+fn a_byte_order_mark_is_ignored() {
     assert_eq!(from_text("\u{feff}seed = 9").map(|config| config.seed), Ok(9));
 }
 
 #[test]
-fn a_file_that_is_no_text_is_refused_by_name() {
+fn a_file_that_is_not_text_is_refused_by_name() {
     let directory = tempfile::tempdir().expect("a directory");
     let path = directory.path().join("run.toml");
     let refusal = || format!("{:?}", resolve(Some(&path), &[]).expect_err("must be refused"));
@@ -188,7 +188,7 @@ fn a_setting_leaves_the_rest_of_its_section_alone() {
     assert_eq!((config.ddpg.n_hidden, config.ddpg.discount), (32, 0.5));
 }
 
-/// Every setting there is.
+/// Returns the names of all settings.
 fn known() -> Vec<String> {
     let defaults = RunConfig::defaults(Recipe::Tandem, Task::Push, 2);
     names_below(&Table::try_from(defaults).expect("a table"), "")
@@ -224,7 +224,7 @@ fn any_value() -> BoxedStrategy<Value> {
     prop_oneof![12 => scalar, 1 => array, 1 => table].boxed()
 }
 
-/// Puts a value where a dotted name says, whatever stands in the way.
+/// Sets the value of a dotted name and replaces anything that is in the way.
 fn put(table: &mut Table, name: &str, value: Value) {
     match name.split_once('.') {
         None => drop(table.insert(name.to_owned(), value)),
@@ -238,15 +238,15 @@ fn put(table: &mut Table, name: &str, value: Value) {
     }
 }
 
-/// Whether a configuration's setting is what a document said.
+/// Returns true if a configuration has the value that a document sets.
 #[expect(clippy::cast_possible_truncation, reason = "the configuration keeps some as f32")]
-fn is_kept(said: &Value, kept: &Value) -> bool {
+fn is_kept(given: &Value, kept: &Value) -> bool {
     let number = |value: &Value| value.as_float().or(value.as_integer().map(|whole| whole as f64));
-    match (number(said), number(kept), kept) {
-        (Some(said), Some(kept), Value::Float(_)) => {
-            said.to_bits() == kept.to_bits() || (said as f32).to_bits() == (kept as f32).to_bits()
+    match (number(given), number(kept), kept) {
+        (Some(given), Some(kept), Value::Float(_)) => {
+            given.to_bits() == kept.to_bits() || (given as f32).to_bits() == (kept as f32).to_bits()
         }
-        _ => said == kept,
+        _ => given == kept,
     }
 }
 
@@ -261,7 +261,7 @@ proptest! {
     #![proptest_config(ProptestConfig { cases: 2000, failure_persistence: None, ..ProptestConfig::default() })]
 
     #[test]
-    fn a_document_is_followed_to_the_letter_or_refused_by_name(
+    fn a_document_is_applied_exactly_or_refused_by_name(
         changes in vec((any_name(), any_value()), 0..6),
     ) {
         let mut document = Table::new();
@@ -272,9 +272,9 @@ proptest! {
         match from_text(&text) {
             Ok(config) => {
                 let kept = Table::try_from(&config).expect("a table");
-                for (name, said) in settings_below(&document, "") {
+                for (name, given) in settings_below(&document, "") {
                     let kept = lookup(&kept, &name);
-                    prop_assert!(kept.is_some_and(|kept| is_kept(&said, kept)), "{name} = {said} became {kept:?}");
+                    prop_assert!(kept.is_some_and(|kept| is_kept(&given, kept)), "{name} = {given} became {kept:?}");
                 }
                 prop_assert_eq!(from_text(&to_toml(&config).expect("written")), Ok(config));
             }

@@ -12,5 +12,5 @@ pub mod series;
 pub mod simulated;
 pub mod trial;
 
-pub use series::{Series, SeriesError, Subject};
+pub use series::{NamedPolicy, Series, SeriesError};
 pub use simulated::{SimulatedConfig, SimulatedPair};

@@ -18,7 +18,7 @@ const PATH_POINTS: usize = 150;
 
 /// A policy and the name under which its trials are reported.
 #[derive(Debug, Clone)]
-pub struct Subject {
+pub struct NamedPolicy {
     /// The name in tables and files.
     pub name: String,
     /// The policy.
@@ -28,8 +28,8 @@ pub struct Subject {
 /// The trials of one policy in one mode. A trial depends on its number only, not on the trials before it.
 #[derive(Debug)]
 pub struct Series<'a> {
-    /// The policy on trial.
-    pub subject: &'a Subject,
+    /// The policy under test.
+    pub policy: &'a NamedPolicy,
     /// The configuration of every trial.
     pub config: TrialConfig,
 }
@@ -68,7 +68,7 @@ impl Series<'_> {
         n_trials: u64,
         done: impl Fn(&TrialReport, &mut TrialRow) -> Result<(), E> + Sync,
     ) -> Result<Vec<TrialRow>, E> {
-        let actor = self.subject.policy.actor().map_err(SeriesError::from)?;
+        let actor = self.policy.policy.actor().map_err(SeriesError::from)?;
         let trial = |(runner, actor): &mut (Result<TrialRunner, SimError>, Actor), number| {
             let runner = runner.as_mut().map_err(|error| SeriesError::World(error.clone()))?;
             let report = attempt(runner, actor, number, &mut NoObserver)?;
@@ -88,19 +88,19 @@ impl Series<'_> {
         let recorder = TrialRecorder::create(path, &self.metadata(row.trial))?;
         let mut recording = Recording { recorder, failure: None };
         let mut runner = TrialRunner::new(self.config.clone())?;
-        let mut actor = self.subject.policy.actor()?;
+        let mut actor = self.policy.policy.actor()?;
         attempt(&mut runner, &mut actor, row.trial, &mut recording)?;
         recording.finish(row)
     }
 
     fn metadata(&self, number: u64) -> TrialMetadata {
         TrialMetadata {
-            policy: self.subject.name.clone(),
+            policy: self.policy.name.clone(),
             layout: self.config.layout,
             mode: self.config.mode.name().to_owned(),
             trial: number,
             seed: self.config.seed,
-            policy_digest: self.subject.policy.digest(),
+            policy_digest: self.policy.policy.digest(),
             driver: "sim".to_owned(),
             speed: self.config.speed,
             block_half_m: f64::from(self.config.block.half_m),
@@ -111,7 +111,7 @@ impl Series<'_> {
         let distances = report.objects.iter().map(|object| object.goal_distance_m());
         let every = report.path.len().div_ceil(PATH_POINTS).max(1);
         TrialRow {
-            policy: self.subject.name.clone(),
+            policy: self.policy.name.clone(),
             mode: self.config.mode.name().to_owned(),
             task: self.config.layout.task.name().to_owned(),
             trial: report.number,

@@ -116,7 +116,7 @@ pub struct TrialReport {
     /// The smallest gap between an arm and the table, metres.
     pub table_gap_m: f64,
     /// The waypoints of the tools; empty if no motion was planned.
-    pub way_points: Vec<Waypoint>,
+    pub waypoints: Vec<Waypoint>,
     /// The measured and planned positions of the tools, 25 times per second.
     pub path: Vec<PathPoint>,
 }

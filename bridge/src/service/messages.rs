@@ -111,10 +111,10 @@ fn gaps_at(motion: &Motion, sample: usize, cell: &WorkCell) -> Gaps {
 
 /// Describes a refused motion.
 pub(super) fn refusal(refused: &MotionError) -> pb::MotionRefusal {
-    let (code, when_s, arm, way_point) = match refused {
+    let (code, when_s, arm, waypoint) = match refused {
         MotionError::Plan(error) => {
-            let (code, way_point, arm) = reason_codes::of_plan(error);
-            (code, None, arm, way_point)
+            let (code, waypoint, arm) = reason_codes::of_plan(error);
+            (code, None, arm, waypoint)
         }
         MotionError::Check(error) => {
             let (when_s, arm) = match error {
@@ -130,7 +130,7 @@ pub(super) fn refusal(refused: &MotionError) -> pb::MotionRefusal {
         when_s,
         arm: arm.map(index),
         joint: code.joint.map(index),
-        way_point: way_point.map(index),
+        way_point: waypoint.map(index),
         got: code.values.map(|values| values.got),
         allowed: code.values.and_then(|values| values.allowed),
         unit: unit(code.values),

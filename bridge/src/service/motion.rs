@@ -26,7 +26,7 @@ pub(super) struct MotionSpec {
 #[derive(Debug, Clone, PartialEq)]
 pub(super) enum MotionPath {
     /// Positions of the tools, to be planned.
-    Waypoints { way_points: Vec<Waypoint>, step_s: f64, from_here: bool },
+    Waypoints { waypoints: Vec<Waypoint>, step_s: f64, from_here: bool },
     /// Samples of the joints' angles.
     JointSamples(Motion),
 }
@@ -78,13 +78,13 @@ impl MotionSpec {
         let at: Vec<Joints> = state.arms.iter().map(|arm| arm.angles).collect();
         let motion = match self.path {
             MotionPath::JointSamples(motion) => motion,
-            MotionPath::Waypoints { mut way_points, step_s, from_here } => {
+            MotionPath::Waypoints { mut waypoints, step_s, from_here } => {
                 if from_here {
-                    way_points.insert(0, tool_positions(state, checker.cell()));
+                    waypoints.insert(0, tool_positions(state, checker.cell()));
                 }
                 let limits = checker.settings().check.limits;
                 let settings = PlanSettings { limits, step_s, ..PlanSettings::default() };
-                let planned = plan(checker.cell(), &way_points, &at, &settings);
+                let planned = plan(checker.cell(), &waypoints, &at, &settings);
                 let planned =
                     planned.map_err(|error| MotionError::Plan(renumbered(error, from_here)))?;
                 // The check will refuse a long motion: do not spend memory on its samples.
@@ -100,19 +100,19 @@ impl MotionSpec {
 /// The present positions of the tools.
 fn tool_positions(state: &PairState, cell: &WorkCell) -> Waypoint {
     let arms = state.arms.iter().zip(&cell.arms);
-    let way_point = |(arm, placed): (&crate::ArmReading, &tandem_kinematics::PlacedArm)| {
+    let waypoint = |(arm, placed): (&crate::ArmReading, &tandem_kinematics::PlacedArm)| {
         let tool = ForwardKinematics::new(placed.model, &arm.angles).tool_m();
         ArmWaypoint {
             tool_in_world_m: placed.world_from_base() * tool,
             gripper_opening: arm.opening.clamp(0.0, 1.0),
         }
     };
-    arms.map(way_point).collect()
+    arms.map(waypoint).collect()
 }
 
 /// Returns the error with waypoints counted as the client counts them.
 fn renumbered(error: PlanError, from_here: bool) -> PlanError {
-    let client = |way_point: usize| way_point.saturating_sub(usize::from(from_here));
+    let client = |waypoint: usize| waypoint.saturating_sub(usize::from(from_here));
     match error {
         PlanError::Step { waypoint, arm, step_m } => {
             PlanError::Step { waypoint: client(waypoint), arm, step_m }
@@ -137,19 +137,15 @@ fn decode_waypoints(message: pb::WayPoints, cell: &WorkCell) -> Result<MotionPat
         within("step_s", message.step_s, "a number of seconds in [0.001, 10]", |step_s| {
             (0.001..=10.0).contains(&step_s)
         })?;
-    let decode_indexed = |(idx, way_point)| {
-        decode_way_point(way_point, cell)
+    let decode_indexed = |(idx, waypoint)| {
+        decode_waypoint(waypoint, cell)
             .map_err(|error| error.within(format_args!("way_points[{idx}]")))
     };
-    let way_points = message.way_points.into_iter().enumerate().map(decode_indexed);
-    Ok(MotionPath::Waypoints {
-        way_points: way_points.collect::<Result<_, _>>()?,
-        step_s,
-        from_here,
-    })
+    let waypoints = message.way_points.into_iter().enumerate().map(decode_indexed);
+    Ok(MotionPath::Waypoints { waypoints: waypoints.collect::<Result<_, _>>()?, step_s, from_here })
 }
 
-fn decode_way_point(message: pb::BridgeWayPoint, cell: &WorkCell) -> Result<Waypoint, DecodeError> {
+fn decode_waypoint(message: pb::BridgeWayPoint, cell: &WorkCell) -> Result<Waypoint, DecodeError> {
     check_arms(message.arms.len(), cell)?;
     let decode_indexed = |(idx, arm): (usize, pb::ArmWayPoint)| {
         decode_arm(&arm).map_err(|error| error.within(format_args!("arms[{idx}]")))

@@ -38,7 +38,7 @@ fn connected(side: &Side) -> KinovaRosDriver {
     let driver = KinovaRosDriver::connect(KinovaRosConfig::at(format!("ws://{}", side.address)));
     let mut driver = driver.unwrap();
     side.take_over();
-    // What is on its way still belongs to the time before.
+    // Messages in flight still belong to the time before.
     while driver.listen(Duration::from_millis(20)).unwrap().sequence
         != driver.listen(Duration::from_millis(20)).unwrap().sequence
     {}
@@ -124,11 +124,11 @@ fn a_motion_is_played_to_its_end() {
     let n_ticks = test.rig.play();
     test.side.pass();
     assert_ended(&test.side.ros().pair, &test.motion);
-    // One message an exchange and arm, no more and no less.
+    // Exactly one message per exchange and arm.
     assert_eq!(test.n_velocities(), before.map(|n| n + n_ticks));
     assert_eq!((test.n_calls("in/stop"), test.n_calls("in/start")), ([1, 1], [1, 1]));
     assert!(test.side.ros().nodes.iter().all(|node| node.goals.is_empty()));
-    // What the arms' own weight needs is not taken for a contact.
+    // The torque that carries the arm's own weight does not count as a contact.
     assert_eq!(test.rig.executor.state().unwrap().arms[0].torques_nm, None);
 }
 
@@ -254,7 +254,7 @@ fn a_service_that_fails_or_does_not_respond_ends_the_connection() {
         test.side.begin(fault);
         test.rig.executor.stop(test.rig.now_s);
         test.assert_rests();
-        // Only the first stop shows; that the connection has ended shows by the states.
+        // Only the first stop is reported. The states show that the connection has ended.
         eventually("states are missing", || {
             test.rig.tick();
             let reset = test.rig.executor.reset(OWNER, test.rig.now_s);
@@ -362,7 +362,7 @@ fn commands_do_not_accumulate_if_rosbridge_does_not_read() {
         driver.exchange(&moves(number)).unwrap();
         side.ros().nodes.iter().all(|node| node.n_velocities > 0)
     });
-    // From here on the peer does not read.
+    // The peer does not read from here on.
     let error = (number..10_000_000).find_map(|number| driver.exchange(&moves(number)).err());
     assert!(error.unwrap().to_string().contains("rosbridge holds 100 velocities"));
 }

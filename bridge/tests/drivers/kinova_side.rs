@@ -74,7 +74,7 @@ pub(crate) struct Node {
     pub(crate) n_while_busy: usize,
     /// Goals for the fingers, in turns.
     pub(crate) goals: Vec<Value>,
-    /// How often a service was called.
+    /// The number of calls of a service.
     pub(crate) calls: BTreeMap<String, usize>,
 }
 
@@ -84,7 +84,7 @@ pub(crate) struct Ros {
     pub(crate) fault: Option<Fault>,
     /// Periods between two states.
     pub(crate) every: u64,
-    /// Whether the test advances time instead of a thread.
+    /// True if the test advances time instead of a thread.
     by_hand: bool,
     socket: Option<WebSocket<TcpStream>>,
     subscribed: Vec<String>,
@@ -142,14 +142,14 @@ impl Side {
         self.ros().fault = Some(fault);
     }
 
-    /// Simulates a period. Returns whether both arms have published a state.
+    /// Simulates a period. Returns true if both arms have published a state.
     pub(crate) fn pass(&self) -> bool {
         self.ros().pass()
     }
 }
 
 impl Ros {
-    /// Returns whether a peer is connected.
+    /// Returns true if a peer is connected.
     pub(crate) fn connected(&mut self) -> bool {
         self.hear();
         self.socket.is_some()
@@ -199,7 +199,7 @@ impl Ros {
         match (message["op"].as_str().unwrap(), name.as_str()) {
             ("advertise", _) => assert_eq!(message["queue_size"], 1),
             ("subscribe", _) => {
-                // Old states would come first; of velocities none may be missing.
+                // A queue of states would deliver old ones first. No velocity may be dropped.
                 let expected = u32::from(name != "in/joint_velocity");
                 assert_eq!(message["queue_length"], expected);
                 self.subscribed.push(topic.to_owned());
@@ -286,7 +286,7 @@ impl Ros {
         }
     }
 
-    /// Publishes the states of the arms. Returns whether both were published.
+    /// Publishes the states of the arms. Returns true if both were published.
     fn publish(&mut self, state: &PairState) -> bool {
         match self.fault {
             Some(Fault::Close) => {
@@ -318,7 +318,7 @@ impl Ros {
         for arm in 0..n {
             self.tell_arm(arm, state);
         }
-        // Nothing new comes of states whose stamps are far apart.
+        // States whose stamps are far apart do not form a new sample.
         n == 2 && self.fault != Some(Fault::Clock)
     }
 
@@ -360,7 +360,7 @@ impl Ros {
 
     fn say_text(&mut self, text: String) {
         if let Some(socket) = &mut self.socket {
-            // A peer that has gone is seen when it is read.
+            // A closed connection is detected by the next read.
             socket.send(Message::text(text)).ok();
         }
     }

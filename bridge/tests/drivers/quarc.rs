@@ -96,7 +96,7 @@ fn a_motion_is_played_to_its_end() {
     let n_ticks = test.rig.play();
     assert_ended(&test.side.pair, &test.motion);
     let commands = test.side.commands.lock().unwrap();
-    // One command a tick, numbered without a gap, and stops before the first motion.
+    // One command per tick, numbered without gaps, and only stops before the first motion.
     let numbers: Vec<u64> = commands.iter().map(|command| command.number).collect();
     assert!(numbers.iter().zip(1..).all(|(got, expected)| *got == expected), "{numbers:?}");
     assert_eq!(commands.iter().filter(|command| command.order == Order::Stop).count(), 15);
@@ -171,7 +171,7 @@ fn arms_that_fall_silent_are_stopped() {
     test.waits.set(false);
     let cause = test.rig.until_stopped();
     assert!(matches!(cause, StopCause::StateStale(_)), "{cause}");
-    // The connection still works: the order to stop arrives.
+    // The connection still works: the stop command arrives.
     eventually("the arms rest", || {
         test.rig.tick();
         at_rest(&test.side.pair)
@@ -184,7 +184,7 @@ fn stopped_arms_move_again_over_the_same_connection_after_a_reset() {
     let mut test = Test::moving();
     test.rig.executor.stop(test.rig.now_s);
     let n_commands = test.side.commands.lock().unwrap().len();
-    // The order to stop has gone out between two ticks.
+    // The stop command was sent between two ticks.
     eventually("the stop arrives", || test.side.commands.lock().unwrap().len() == n_commands + 1);
     for _ in 0..10 {
         assert_eq!(test.rig.tick(), Phase::Stopped);
@@ -210,7 +210,7 @@ fn arms_brake_by_themselves_when_the_bridge_is_killed() {
     let driver = QuarcDriver::over(stream, config).unwrap();
     let mut test = Test::with(side, driver, motion);
     test.set_off();
-    // A killed process says nothing; its socket is closed.
+    // A killed process sends nothing, but its socket is closed.
     std::mem::forget(test.rig);
     socket.shutdown(Shutdown::Both).unwrap();
     eventually("the side sees the end", || test.side.n_ended() == 1);

@@ -113,7 +113,7 @@ impl Model {
             self.commands.lock().unwrap().push(command.clone());
             obeys |= command.order == Order::Stop;
             if command.number == number && command.order == Order::Stop {
-                // Beside the commands, between two samples.
+                // Arrives next to the commands, between two samples.
                 self.pair.lock().unwrap().stop().unwrap();
                 continue;
             }
@@ -127,7 +127,7 @@ impl Model {
         }
     }
 
-    /// Sends a state with the present fault. Returns whether to continue.
+    /// Sends a state with the present fault. Returns true to continue.
     fn send(&mut self, stream: &mut TcpStream, state: PairState) -> bool {
         let fault = *self.fault.lock().unwrap();
         let mut vector = encode_state(&self.counted(state)).unwrap();

@@ -35,7 +35,7 @@ pub(crate) struct Patient<D> {
     pub(crate) inner: D,
     /// Simulates a period on the other side, unless time advances there by itself.
     pass: Box<dyn FnMut()>,
-    /// Whether to wait for states; false in tests without states.
+    /// True to wait for states; false in tests without states.
     waits: Rc<Cell<bool>>,
     seen: u64,
 }
@@ -157,7 +157,7 @@ pub(crate) fn angles(pair: &SharedPair) -> Vec<Joints> {
     [0, 1].map(|arm| *pair.angles(ArmIndex(arm))).to_vec()
 }
 
-/// Returns whether nothing moves. Arms that follow a velocity of zero come to rest gradually.
+/// Returns true if nothing moves. Arms that follow a velocity of zero come to rest gradually.
 pub(crate) fn at_rest(pair: &SharedPair) -> bool {
     let pair = pair.lock().unwrap();
     let rest = |arm| pair.velocities(ArmIndex(arm)).iter().all(|rate| rate.abs() < 1e-4);
@@ -192,15 +192,15 @@ pub(crate) fn sweep(openings: [f64; 4]) -> Motion {
         [DVec3::new(-0.03, 0.04, 0.08), DVec3::new(-0.04, -0.05, 0.06)],
         [DVec3::new(-0.05, 0.02, 0.10), DVec3::new(-0.02, -0.02, 0.10)],
     ];
-    let way_point = |(own, opening): (&[DVec3; 2], f64)| {
+    let waypoint = |(own, opening): (&[DVec3; 2], f64)| {
         let tool = |arm: usize| cell.world_from_own(ArmIndex(arm), &own[arm].into());
         [0, 1]
             .map(|arm| ArmWaypoint { tool_in_world_m: tool(arm), gripper_opening: opening })
             .to_vec()
     };
-    let way_points: Vec<Waypoint> = places.iter().zip(openings).map(way_point).collect();
+    let waypoints: Vec<Waypoint> = places.iter().zip(openings).map(waypoint).collect();
     let start = cell.ready(0.05).unwrap();
-    let motion = plan(&cell, &way_points, &start, &PlanSettings::default()).unwrap().sampled(100.0);
+    let motion = plan(&cell, &waypoints, &start, &PlanSettings::default()).unwrap().sampled(100.0);
     let at: Vec<Joints> = motion.arms.iter().map(|samples| samples[0].angles).collect();
     check(&cell, &motion, &at, &check_settings()).unwrap();
     motion

@@ -66,7 +66,7 @@ impl Plan {
         panic!("no joint moves in walk {seed}");
     }
 
-    /// Whether the joint moves in one direction for some time then.
+    /// True if the joint then moves in one direction for some time.
     fn moves(&self) -> bool {
         let rate = |later: usize| {
             let time_s = (self.at_period + later) as f64 * PERIOD_S * self.speed;
@@ -193,7 +193,7 @@ fn execute(plan: &Plan) -> Ending {
     assert!(plan.expected(&stop.cause), "{what}: {stop}");
     stays_stopped(&mut rig, plan, &mut observer);
     let shown_s = shown_s.or(rig.injection.borrow().shown_s).unwrap_or(halted_s);
-    // They were seen to move at the end of one period and to rest at the end of the next.
+    // They moved at the end of one period and rested at the end of the next.
     Ending { cause: Some(stop.cause), stopped_s: observer.moved_s + PERIOD_S - shown_s }
 }
 
@@ -263,6 +263,6 @@ fn execute_each_kind(n_per_kind: usize) {
     println!("{n} executions, seconds to rest at most {slowest:.3?}");
     println!("stopped by {causes:?}");
     assert!(n >= 200);
-    // The drifts lead to all that keeps the arms apart from each other and from the table.
+    // The drifts lead to every limit that keeps the arms apart from each other and from the table.
     assert!(causes.contains_key("ArmsGap") && causes.contains_key("TableGap"), "{causes:?}");
 }

@@ -109,16 +109,16 @@ impl Injection {
             }
             Kind::StateFrozen => {
                 state.arms = held.arms;
-                // Four equal states in a row are what no moving joint reports.
+                // A moving joint never reports four equal states in a row.
                 shown_after = 4;
             }
             Kind::StateLate => {
                 self.late.push_back(state);
-                // Every other exchange brings the next state: states grow older by a period in two.
+                // Every other exchange returns the next state, so states age by one period in two.
                 let next = if self.n_spoiled % 2 == 1 { self.late.pop_front() } else { None };
                 state = next.unwrap_or(held);
                 self.held = Some(state.clone());
-                // The settings allow them to be older by 35 ms.
+                // The settings allow an age of 35 ms more.
                 shown_after = 7;
             }
             Kind::StateNotFinite => {
@@ -147,7 +147,7 @@ impl Injection {
         state
     }
 
-    /// Returns whether the connection to the arms is cut.
+    /// Returns true if the connection to the arms is cut.
     fn cut(&self) -> bool {
         matches!(self.kind, Some(Kind::CommandLost | Kind::DriverError))
     }

@@ -55,7 +55,7 @@ fn a_motion_of_the_gripper_into_its_own_base_is_refused() {
     assert!(matches!(refusal.reason, Reason::SelfGap(["base", "gripper"], _)), "{refusal}");
     assert_eq!((refusal.arm, rig.tick_owned()), (ArmIndex(0), Phase::Idle));
     assert_eq!(rig.angles(), before);
-    // As near as motions may come it is played to its end.
+    // A motion that keeps the smallest allowed gap is played to its end.
     let near = on_way(share_with(0.0055));
     rig.play(near, 1.0, |rig| {
         assert!(rig.pair.borrow().gaps().self_m[0] > 0.002);

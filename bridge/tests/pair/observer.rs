@@ -24,7 +24,7 @@ pub(crate) struct Slack {
     /// drift that begins is known and braked some 50 ms later: 12 degrees/s make 3 mm at 0.3 m. The rest of the
     /// gaps is there for this.
     pub(crate) gap_m: f64,
-    /// Whether a fault makes joints start or stop at once.
+    /// True if a fault makes joints start or stop at once.
     pub(crate) sudden: bool,
 }
 
@@ -81,7 +81,7 @@ impl Observer {
         self.least_arms_gap_m = self.least_arms_gap_m.min(gaps.arms_m);
         let allowed_m = ARMS_GAP_M - 2.0 * self.slack.gap_m;
         assert!(gaps.arms_m >= allowed_m, "{what}, {time_s:.2} s: {gaps:?}");
-        // The shapes are a centimetre larger than the arms: a drift may use up as much of that as the slack says.
+        // The shapes are a centimetre larger than the arms. A drift may use up a part of that, the slack.
         let may_graze = self.slack.gap_m > TABLE_GAP_M;
         assert!(may_graze || !pair.contacts().any(), "{what}, {time_s:.2} s: contact");
         let touches_itself = (0..2).any(|arm| pair.touches_itself(ArmIndex(arm)));
@@ -112,7 +112,7 @@ impl Observer {
         let tool_mps = posture.tool_velocity(rates).norm();
         let drift_mps = self.slack.drift_radps * 3.0 * 0.6;
         self.tool_share = self.tool_share.max(tool_mps / TOOL_MPS);
-        // The executor multiplies velocities by where the arm was some periods before.
+        // The executor computes tool velocities at a position that is some periods old.
         assert!(tool_mps <= 1.04 * TOOL_MPS + drift_mps, "{what}: tool at {tool_mps}");
     }
 }

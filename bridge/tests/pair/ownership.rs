@@ -62,7 +62,7 @@ fn only_the_owner_starts_and_any_client_stops() {
     let reset = rig.executor.reset(STRANGER, rig.now_s);
     assert!(matches!(reset, Err(ResetError::Lease(_))));
     rig.executor.reset(OWNER, rig.now_s).unwrap();
-    // From here the motion does not begin where the arms are.
+    // The motion no longer begins at the position of the arms.
     let motion = walk(TASKS, 2, 3);
     let refused = rig.executor.start(OWNER, motion, 1.0, rig.now_s);
     let refusal = refused.unwrap_err();
@@ -199,7 +199,7 @@ fn a_checked_motion_starts_only_with_its_executor_and_position() {
     while rig.tick_owned() != Phase::Idle {
         assert!(rig.executor.stopped_by().is_none(), "{:?}", rig.executor.stopped_by());
     }
-    // It was fine where it was checked, and the arms are elsewhere now.
+    // The motion passed its check at an earlier position of the arms.
     let refused = rig.executor.start_checked(OWNER, again, 1.0, rig.now_s);
     assert!(
         matches!(&refused, Err(StartError::Refused(refusal)) if matches!(refusal.reason, Reason::Start(..))),

@@ -36,7 +36,7 @@ impl Rig {
         let injection = Rc::new(RefCell::new(Injection::none()));
         let tap = Tap::new(Rc::clone(&pair), Rc::clone(&injection));
         let executor = Executor::new(mico_cell(), tap, Settings::default()).unwrap();
-        // The clocks of the arms and of the executor have nothing to do with each other.
+        // The clocks of the arms and of the executor are independent.
         Self { executor, pair, injection, now_s: 1234.5 }
     }
 
@@ -98,18 +98,18 @@ pub(crate) fn tools(cell: &WorkCell, angles: &[Joints]) -> Vec<DVec3> {
 /// Plans and checks the motion through points of the arms' base frames, metres.
 pub(crate) fn planned(points: &[([DVec3; 2], f64)]) -> Motion {
     let cell = mico_cell();
-    let way_points: Vec<Waypoint> = points
+    let waypoints: Vec<Waypoint> = points
         .iter()
         .map(|(points, opening)| {
             let in_world =
                 |arm: usize| cell.arms[arm].world_from_base().transform_point(&points[arm].into());
-            let way_point =
+            let waypoint =
                 |arm| ArmWaypoint { tool_in_world_m: in_world(arm), gripper_opening: *opening };
-            vec![way_point(0), way_point(1)]
+            vec![waypoint(0), waypoint(1)]
         })
         .collect();
     let start = cell.ready(0.05).unwrap();
-    let motion = plan(&cell, &way_points, &start, &PlanSettings::default()).unwrap().sampled(100.0);
+    let motion = plan(&cell, &waypoints, &start, &PlanSettings::default()).unwrap().sampled(100.0);
     let at: Vec<Joints> = motion.arms.iter().map(|samples| samples[0].angles).collect();
     check(&cell, &motion, &at, &check_settings()).unwrap();
     motion
@@ -118,7 +118,7 @@ pub(crate) fn planned(points: &[([DVec3; 2], f64)]) -> Motion {
 /// An area of random motions in the arms' own frames: low and high corner, metres.
 pub(crate) type Area = [DVec3; 2];
 
-/// The whole area of the tasks.
+/// The complete area of the tasks.
 pub(crate) const TASKS: Area = [DVec3::new(-0.12, -0.12, 0.005), DVec3::new(0.12, 0.12, 0.20)];
 /// The area close to the table.
 pub(crate) const LOW: Area = [DVec3::new(-0.06, -0.12, 0.005), DVec3::new(0.04, 0.12, 0.012)];
@@ -131,7 +131,7 @@ pub(crate) fn walk([low, high]: Area, seed: u64, n: usize) -> Motion {
     for attempt in 0.. {
         let mut rng = episode_rng(seed, attempt, Stream::Exploration);
         let mut own = [low.midpoint(high); 2];
-        let mut way_points: Vec<Waypoint> = Vec::new();
+        let mut waypoints: Vec<Waypoint> = Vec::new();
         for idx in 0..n {
             let longest_m = if idx == 0 { 0.10 } else { 0.05 };
             for own in &mut own {
@@ -142,17 +142,17 @@ pub(crate) fn walk([low, high]: Area, seed: u64, n: usize) -> Motion {
             let opening = f64::from(uniform(&mut rng, 0.0, 1.0));
             let tool =
                 |arm: usize| cell.world_from_own(tandem_core::ArmIndex(arm), &own[arm].into());
-            let way_point =
+            let waypoint =
                 |arm| ArmWaypoint { tool_in_world_m: tool(arm), gripper_opening: opening };
-            way_points.push(vec![way_point(0), way_point(1)]);
+            waypoints.push(vec![waypoint(0), waypoint(1)]);
         }
         let start = cell.ready(0.05).unwrap();
-        let Ok(trajectory) = plan(&cell, &way_points, &start, &PlanSettings::default()) else {
+        let Ok(trajectory) = plan(&cell, &waypoints, &start, &PlanSettings::default()) else {
             continue;
         };
         let motion = trajectory.sampled(100.0);
         let at: Vec<Joints> = motion.arms.iter().map(|samples| samples[0].angles).collect();
-        // The executor wants joints to stay one degree away from the ends of their ranges.
+        // The executor keeps joints one degree away from the ends of their ranges.
         let inner = |(angle, joint): (&f64, &Joint)| {
             let [low, high] = joint.range_rad;
             (low + 0.018..high - 0.018).contains(angle)

@@ -240,7 +240,7 @@ async fn the_arms_have_one_owner_at_a_time() {
     rig.clock.hold();
     assert!(token.len() == 32 && token.bytes().all(|byte| byte.is_ascii_hexdigit()), "{token}");
     rig.clock.free();
-    // A sign of life, in case the machine is slow.
+    // Renews the lease, in case the machine is slow.
     rig.client.acquire(pb::AcquireRequest { token: token.clone() }).await.unwrap();
     let denied = other.acquire(pb::AcquireRequest::default()).await.unwrap_err();
     assert_eq!(denied.code(), Code::PermissionDenied);
@@ -255,7 +255,7 @@ async fn the_arms_have_one_owner_at_a_time() {
     let status = rig.status().await;
     assert!(status.is_owned && status.lease_left_s > 0.0 && status.lease_left_s <= 60.0);
 
-    // A silent owner loses the arms, and an expired lease cannot be renewed.
+    // A silent owner loses its lease, and an expired lease cannot be renewed.
     rig.eventually(|status| !status.is_owned).await;
     let gone = rig.client.acquire(pb::AcquireRequest { token: token.clone() }).await.unwrap_err();
     assert_eq!(gone.code(), Code::FailedPrecondition);

@@ -413,7 +413,7 @@ pub(crate) const UP_M: [[f64; 3]; 2] = [[-0.10, 0.02, 0.115], [0.10, -0.02, 0.11
 /// A motion of both tools from their present positions through `places`.
 pub(crate) fn through(places: &[[[f64; 3]; 2]], speed: f64) -> pb::MotionRequest {
     let arm = |at_m: &[f64; 3]| pb::ArmWayPoint { tool_in_world_m: at_m.to_vec(), opening: 0.8 };
-    let way_points = pb::WayPoints {
+    let waypoints = pb::WayPoints {
         way_points: places
             .iter()
             .map(|arms| pb::BridgeWayPoint { arms: arms.iter().map(arm).collect() })
@@ -421,7 +421,7 @@ pub(crate) fn through(places: &[[[f64; 3]; 2]], speed: f64) -> pb::MotionRequest
         step_s: 0.04,
         from_here: true,
     };
-    pb::MotionRequest { motion: Some(pb::motion_request::Motion::WayPoints(way_points)), speed }
+    pb::MotionRequest { motion: Some(pb::motion_request::Motion::WayPoints(waypoints)), speed }
 }
 
 /// A motion up and back that takes minutes.

@@ -57,7 +57,7 @@ async fn a_stop_waits_in_no_queue() {
     let token = rig.ready().await;
     let mut playing = rig.moving(&token).await;
     rig.clock.hold();
-    // More than the queue takes, and none of it can be done while no time passes.
+    // More calls than the queue holds. None can be handled while no time passes.
     let flood: Vec<_> = (0..200)
         .map(|_| {
             let (mut client, token) = (rig.client.clone(), token.clone());
@@ -122,7 +122,7 @@ async fn a_release_by_the_owner_stops_the_arms() {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn the_motion_of_a_silent_owner_pauses_and_is_then_stopped() {
-    // Signs of life are counted by a clock that runs as fast as it goes, so none is sent at all.
+    // Silence is measured on a clock that is faster than real time, so no keep-alive message is sent.
     let settings = Settings { lease_s: 1e6, ..Settings::default() };
     let mut rig = Rig::new(settings).await;
     let token = rig.ready().await;
@@ -159,12 +159,12 @@ async fn signs_of_life_keep_a_motion_going() {
         tokio::time::sleep(std::time::Duration::from_millis(2)).await;
     }
     let mut playing = playing.await.unwrap();
-    // Three seconds of the arms' time; without signs of life one stops them.
+    // Three seconds of the arms' time; one second without keep-alive messages stops them.
     let since_s = rig.status().await.now_s;
     let mut now_s = since_s;
     while now_s < since_s + 3.0 {
         playing.alive().await;
-        // The lease is whole again when the sign has arrived: time passes in small steps until then.
+        // A keep-alive message renews the lease. Until it has arrived, time passes in small steps.
         loop {
             clock.pass(0.01);
             let status = rig.status().await;
@@ -231,7 +231,7 @@ async fn a_reset_reconnects_without_moving_the_arms() {
     let since_s = rig.status().await.now_s;
     rig.eventually(|status| status.now_s > since_s + 1.0).await;
     assert_eq!(rig.tap.dialled().0, 0, "the service reconnects only on a reset");
-    // Who does not own the arms connects nothing either.
+    // A client that does not own the arms cannot reconnect them.
     let unknown = pb::ResetRequest { token: "0".repeat(32) };
     assert!(rig.client.reset(unknown).await.is_err());
     assert_eq!(rig.tap.dialled().0, 0);

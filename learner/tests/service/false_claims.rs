@@ -170,7 +170,7 @@ async fn contradictory_claims_are_refused_and_true_ones_accepted() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn advice_without_an_order_and_absurd_numbers_are_refused() {
+async fn advice_without_an_order_and_implausible_numbers_are_refused() {
     let expected = calm(config(0)).await;
     let directory = tempfile::tempdir().expect("a directory");
     let served = Served::start(learner_config(config(0), directory.path(), false)).await;

@@ -62,7 +62,7 @@ struct LoopState {
     /// The number of consecutive observations with every object at its goal.
     n_done: usize,
     /// The waypoints of the tools so far.
-    way_points: Vec<Waypoint>,
+    waypoints: Vec<Waypoint>,
 }
 
 impl TrialRunner {
@@ -80,7 +80,7 @@ impl TrialRunner {
             n_shortened: 0,
             rehearsed_m: None,
             timed_out: false,
-            way_points: Vec::new(),
+            waypoints: Vec::new(),
         };
         let mut state = LoopState {
             at: at.to_vec(),
@@ -88,7 +88,7 @@ impl TrialRunner {
             velocities: vec![DVec3::ZERO; at.len()],
             before: None,
             n_done: 0,
-            way_points: Vec::new(),
+            waypoints: Vec::new(),
         };
         let time_limit_s = self.config.time_limit_s / self.config.speed;
         while execution.n_steps < EPISODE_STEPS && state.n_done < DONE_OBSERVATIONS {
@@ -106,7 +106,7 @@ impl TrialRunner {
             }
         }
         execution.ended = execution.ended.and_then(|()| rig.wait(REST_S));
-        execution.way_points = state.way_points;
+        execution.waypoints = state.waypoints;
         execution
     }
 
@@ -200,17 +200,17 @@ impl TrialRunner {
                 state.openings_m = openings_m;
                 return Ok(attempt == 0);
             }
-            let way_points = [first.clone(), corner, end, last];
+            let waypoints = [first.clone(), corner, end, last];
             let makes_room = parts.iter().any(|part| matches!(part, StepPart::Back));
             let check = if makes_room { &self.check } else { &self.step_check };
-            let Ok(motion) = self.motion(&way_points, &state.at, check) else { continue };
+            let Ok(motion) = self.motion(&waypoints, &state.at, check) else { continue };
             let ends: Vec<Joints> =
                 motion.arms.iter().map(|samples| samples[samples.len() - 1].angles).collect();
             match rig.play(motion, self.config.speed) {
                 Err(FailureCause::Refused(_)) => continue,
                 played => played?,
             }
-            state.append_waypoints(way_points);
+            state.append_waypoints(waypoints);
             (state.at, state.openings_m) = (ends, openings_m);
             return Ok(attempt == 0);
         }
@@ -248,9 +248,9 @@ impl TrialRunner {
                 [0.5 * (before + opening), opening, opening]
             };
             let points = [corner, end, end];
-            for ((way_point, point), opening) in step.iter_mut().zip(points).zip(openings) {
+            for ((waypoint, point), opening) in step.iter_mut().zip(points).zip(openings) {
                 let (tool_in_world_m, _) = self.mapping.tool_for_pads(idx, point, near)?;
-                way_point.push(ArmWaypoint {
+                waypoint.push(ArmWaypoint {
                     tool_in_world_m: tool_in_world_m.into(),
                     gripper_opening: opening,
                 });
@@ -263,8 +263,8 @@ impl TrialRunner {
 impl LoopState {
     /// Appends a step's waypoints. The first one is the previous position of the tools.
     fn append_waypoints(&mut self, step: [Waypoint; 4]) {
-        let n_known = usize::from(!self.way_points.is_empty());
-        self.way_points.extend(step.into_iter().skip(n_known));
+        let n_known = usize::from(!self.waypoints.is_empty());
+        self.waypoints.extend(step.into_iter().skip(n_known));
     }
 
     fn count_done(&mut self, now: &[ArmObservation], goals: &[DVec3]) {

@@ -50,7 +50,7 @@ pub(super) struct TrialExecution {
     pub(super) rehearsed_m: Option<Vec<f64>>,
     pub(super) timed_out: bool,
     /// The waypoints of the tools.
-    pub(super) way_points: Vec<Waypoint>,
+    pub(super) waypoints: Vec<Waypoint>,
 }
 
 impl TrialRunner {
@@ -138,7 +138,7 @@ impl TrialRunner {
             arms_gap_m: rig.arms_gap_m,
             table_gap_m: rig.table_gap_m,
             path: rig.path.clone(),
-            way_points: execution.way_points,
+            waypoints: execution.waypoints,
             objects,
         }
     }
@@ -152,16 +152,16 @@ impl TrialRunner {
     ) -> Result<PlannedMotion, TrialError> {
         let rollout = self.rehearsal.play(policy)?;
         let mut openings = vec![start.opening_m; start.hands.len()];
-        let mut way_points = vec![self.way_point(&start.hands, &openings, at)];
+        let mut waypoints = vec![self.waypoint(&start.hands, &openings, at)];
         for step in &rollout.steps {
             for (arm, opening_m) in openings.iter_mut().enumerate() {
                 let action = &step.action[self.config.layout.action_of(ArmIndex(arm))];
                 *opening_m = self.mapping.opening_after(*opening_m, action);
             }
-            way_points.push(self.way_point(&step.hands, &openings, at));
+            waypoints.push(self.waypoint(&step.hands, &openings, at));
         }
         Ok(PlannedMotion {
-            way_points: way_points.into_iter().collect(),
+            waypoints: waypoints.into_iter().collect(),
             rehearsed_m: rollout.goal_distances_m,
             n_steps: rollout.steps.len(),
         })
@@ -184,7 +184,7 @@ impl TrialRunner {
             (self.mapping.object_in_own(ArmIndex(arm), ends[arm].at_m) - *goal).length()
         };
         Ok(PlannedMotion {
-            way_points: execution.ended.map(|()| execution.way_points),
+            waypoints: execution.ended.map(|()| execution.waypoints),
             rehearsed_m: start.goals.iter().enumerate().map(distance).collect(),
             n_steps: execution.n_steps,
         })
@@ -197,10 +197,10 @@ impl TrialRunner {
         at: &[Joints],
         planned: PlannedMotion,
     ) -> TrialExecution {
-        let way_points = planned.way_points.clone().unwrap_or_default();
+        let waypoints = planned.waypoints.clone().unwrap_or_default();
         let ended = planned
-            .way_points
-            .and_then(|way_points| self.motion(&way_points, at, &self.check))
+            .waypoints
+            .and_then(|waypoints| self.motion(&waypoints, at, &self.check))
             .and_then(|motion| rig.play(motion, self.config.speed))
             .and_then(|()| rig.wait(REST_S));
         TrialExecution {
@@ -209,19 +209,19 @@ impl TrialRunner {
             n_shortened: 0,
             rehearsed_m: Some(planned.rehearsed_m),
             timed_out: false,
-            way_points,
+            waypoints,
         }
     }
 
-    /// Plans the motion through `way_points` from joint angles `at` (radians) and checks it with `settings`.
+    /// Plans the motion through `waypoints` from joint angles `at` (radians) and checks it with `settings`.
     pub(super) fn motion(
         &self,
-        way_points: &[Waypoint],
+        waypoints: &[Waypoint],
         at: &[Joints],
         settings: &CheckSettings,
     ) -> Result<Motion, FailureCause> {
         let cell = self.mapping.cell();
-        let planned = plan(cell, way_points, at, &PlanSettings::default());
+        let planned = plan(cell, waypoints, at, &PlanSettings::default());
         let trajectory =
             planned.map_err(|error| FailureCause::Refused(MotionRefusal::Plan(error)))?;
         let motion = trajectory.sampled(RATE_HZ);
@@ -232,13 +232,13 @@ impl TrialRunner {
     }
 
     /// Returns the waypoint for end effectors at `hands` (own frames, metres), near joint angles `near` (radians).
-    pub(super) fn way_point(
+    pub(super) fn waypoint(
         &self,
         hands: &[DVec3],
         openings_m: &[f64],
         near: &[Joints],
     ) -> Result<Waypoint, FailureCause> {
-        let arm_way_point = |arm: usize| {
+        let arm_waypoint = |arm: usize| {
             let (tool_in_world_m, _) =
                 self.mapping.tool_in_world(ArmIndex(arm), hands[arm], &near[arm])?;
             Ok(ArmWaypoint {
@@ -247,7 +247,7 @@ impl TrialRunner {
             })
         };
         let arms = (0..hands.len()).map(|arm| {
-            arm_way_point(arm).map_err(|source| {
+            arm_waypoint(arm).map_err(|source| {
                 let arm = ArmIndex(arm);
                 FailureCause::Refused(MotionRefusal::Plan(
                     tandem_kinematics::PlanError::Unreachable { waypoint: 0, arm, source },
@@ -294,7 +294,7 @@ impl TrialRunner {
 
 /// A motion that was planned before its execution.
 struct PlannedMotion {
-    way_points: Result<Vec<Waypoint>, FailureCause>,
+    waypoints: Result<Vec<Waypoint>, FailureCause>,
     /// The final distances of the objects from their goals in the rehearsal, metres.
     rehearsed_m: Vec<f64>,
     n_steps: usize,
