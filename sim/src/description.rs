@@ -35,6 +35,9 @@ pub struct WorldDescription {
     pub control_step_s: f32,
     /// Physics steps per control step.
     pub substeps: u32,
+    /// Equal parts of a physics step in which rapier solves contacts and integrates positions. Forces and the set of
+    /// contacts are those of the whole step.
+    pub solver_iterations: usize,
     /// Control steps per episode.
     pub episode_steps: usize,
     /// Distance between object and goal up to which the goal counts as achieved, metres.
@@ -225,6 +228,7 @@ pub(crate) fn describe(world: &World, layout: Layout, config: &WorldConfig) -> W
         task: layout.task.name(),
         control_step_s: CONTROL_STEP_S,
         substeps: config.substeps,
+        solver_iterations: config.solver_iterations,
         episode_steps: EPISODE_STEPS,
         goal_tolerance_m: GOAL_TOLERANCE_M,
         gravity_mps2: GRAVITY.to_array(),
