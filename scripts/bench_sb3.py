@@ -1,8 +1,8 @@
 #!/usr/bin/env python3
 """Trains Stable-Baselines3 with hindsight experience replay on a Gymnasium goal environment, as a reference.
 
-Writes DIRECTORY/progress.csv with a line per evaluation: env_steps, updates, wall_s, success, success_low, success_high.
-An evaluation plays the policy without exploration on fixed seeds. Success is the share of episodes whose last step
+Writes DIRECTORY/progress.csv with a line per evaluation: env_steps, updates, wall_s, success, success_low and
+success_high. An evaluation plays the policy without exploration on fixed seeds. Success is the share of episodes whose last step
 reports is_success. The clock includes evaluations and, in a resumed run, the time before the interruption.
 """
 
@@ -189,14 +189,15 @@ def main():
     else:
         if (run / "progress.csv").exists():
             sys.exit(f"bench_sb3: {run} holds a run already: choose another directory, or give --resume")
-        run.mkdir(parents=True, exist_ok=True)
         names = "algorithm env seed evaluate_every evaluation_episodes evaluation_seed save_every"
         settings = {name: getattr(arguments, name) for name in names.split()}
-        write_progress(run, [])
     try:
         env, evaluation_env = gymnasium.make(settings["env"]), gymnasium.make(settings["env"])
     except gymnasium.error.Error as error:
         sys.exit(f"bench_sb3: {error}")
+    if not arguments.resume:
+        run.mkdir(parents=True, exist_ok=True)
+        write_progress(run, [])
     if arguments.resume:
         kind = {"tqc": TQC, "ddpg": DDPG}[settings["algorithm"]]
         model = kind.load(run / "model.zip", env=env, device=arguments.device)
