@@ -61,6 +61,15 @@ cargo run --release --locked --quiet -p tandem-policy --example policy_probe -- 
 "$work/venv/bin/python" scripts/check_policy.py policies/teacher-push.safetensors "$work/probe.json"
 for log in "$work"/run/mcap/*.mcap; do "$tandem" replay "$log" --verify >/dev/null; done
 
+echo '- a policy pushes in another physics engine'
+"$work/venv/bin/pip" install --quiet --requirement scripts/requirements-mujoco.txt
+"$work/venv/bin/python" scripts/mujoco_transfer.py policies/teacher-push.safetensors --episodes 4 --json >"$work/transfer.json"
+python3 - "$work/transfer.json" <<'PY'
+import json, sys
+[result] = json.load(open(sys.argv[1]))
+assert result["rapier"]["success"] == 1.0 and result["mujoco"]["success"] >= 0.75, result
+PY
+
 echo '- a client that knows nothing of it talks to a teacher'
 head -c 32 /dev/urandom | base64 >"$work/token"
 "$tandem" teacher --policy policies/teacher-push.safetensors --listen 127.0.0.1:0 --ledger "$work/ledger.sqlite" \

@@ -9,6 +9,7 @@ mod bench;
 mod bridge;
 mod monitor;
 mod results;
+mod scene;
 mod service;
 mod train;
 mod trial;
@@ -21,6 +22,7 @@ pub(crate) use monitor::{HealthArgs, StatusArgs};
 pub(crate) use results::{
     EvalArgs, McapArgs, McapCommand, PictureArgs, PolicyArgs, PolicyCommand, ReplayArgs, ReportArgs,
 };
+pub(crate) use scene::SceneArgs;
 pub(crate) use service::{
     ClientArgs, LearnerArgs, ListenArgs, RelayArgs, SecretArgs, TeacherArgs, WorkerArgs,
 };
@@ -86,6 +88,8 @@ pub(crate) enum Command {
     Replay(ReplayArgs),
     /// Renders a step of an episode as an SVG picture.
     Picture(PictureArgs),
+    /// Prints the simulated world, and episodes in it, as JSON for other physics engines.
+    Scene(SceneArgs),
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]

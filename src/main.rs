@@ -29,6 +29,7 @@ mod report;
 mod run_directory;
 mod run_file;
 mod runtime;
+mod scene;
 mod service;
 mod signals;
 mod status;
@@ -76,6 +77,7 @@ fn dispatch(command: Command) -> Result<(), Failed> {
         Command::Mcap(args) => mcap::mcap(&args),
         Command::Replay(args) => replay::replay(&args),
         Command::Picture(args) => picture::picture(&args),
+        Command::Scene(args) => scene::scene(&args),
     }
 }
 

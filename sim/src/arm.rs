@@ -11,13 +11,13 @@ use crate::kinematics::{ForwardKinematics, HOME, JointAngles, solve_inverse};
 use crate::physics::Physics;
 
 /// Displacement of the end effector for an action of 1, metres.
-const ACTION_M: f32 = 0.05;
+pub(crate) const ACTION_M: f32 = 0.05;
 /// Proportional gain from the palm's distance to its target to its velocity, 1/s.
-const APPROACH_GAIN: f32 = 27.0;
+pub(crate) const APPROACH_GAIN: f32 = 27.0;
 /// Iterations of the inverse kinematics from the joint angles of one control step to those of the next.
-const TRACK_ITERATIONS: usize = 3;
+pub(crate) const TRACK_ITERATIONS: usize = 3;
 /// Iterations of the inverse kinematics from the home posture to any point of the workspace.
-const REACH_ITERATIONS: usize = 100;
+pub(crate) const REACH_ITERATIONS: usize = 100;
 
 /// The command to one arm for a control step.
 #[derive(Clone, Copy)]

@@ -15,9 +15,10 @@ pub(crate) const N_CAPSULES: usize = 5;
 /// Number of capsules that are links.
 pub(crate) const N_LINKS: usize = LINK_RADII_M.len();
 /// Ends of the capsule around palm plate and fingers, relative to the end effector, arm frame, metres.
-const GRIPPER_ENDS: [Vector; 2] = [Vector::new(0.0, -0.025, 0.03), Vector::new(0.0, 0.025, 0.03)];
+pub(crate) const GRIPPER_ENDS: [Vector; 2] =
+    [Vector::new(0.0, -0.025, 0.03), Vector::new(0.0, 0.025, 0.03)];
 /// Radius of this capsule, metres.
-const GRIPPER_RADIUS_M: f32 = 0.045;
+pub(crate) const GRIPPER_RADIUS_M: f32 = 0.045;
 
 /// A point of an arm, world frame, metres, and its Jacobian with respect to the palm's position.
 #[derive(Clone, Copy)]

@@ -7,6 +7,7 @@ use tandem_core::{ArmIndex, Contacts, Layout, Task, WorldSettings};
 
 use crate::arm::Command;
 use crate::config::{CONTROL_STEPS_PER_S, SimError, WorldConfig};
+use crate::description::{WorldDescription, describe};
 use crate::observation::observe_arm;
 use crate::scene::scene;
 use crate::start::{ArmStart, sample_starts};
@@ -26,7 +27,7 @@ const START_LINK_GAP_M: f32 = 0.02;
 #[derive(Clone)]
 pub struct Env {
     layout: Layout,
-    object_half_m: f32,
+    config: WorldConfig,
     /// A world that is never stepped: the state of rapier's caches after a step would affect the next episode.
     prototype: World,
     world: World,
@@ -48,7 +49,7 @@ impl Env {
         let prototype = World::build(layout, &config);
         Ok(Self {
             layout,
-            object_half_m: config.object_half_size_m,
+            config,
             world: prototype.clone(),
             prototype,
             goal: vec![0.0; layout.n_goal()],
@@ -71,7 +72,7 @@ impl Env {
         self.world = self.prototype.clone();
         self.n_steps = 0;
         loop {
-            let arms = sample_starts(rng, self.layout, self.object_half_m, settings);
+            let arms = sample_starts(rng, self.layout, self.config.object_half_size_m, settings);
             self.place(&arms);
             if self.world.link_gap_m() >= START_LINK_GAP_M {
                 return;
@@ -135,7 +136,14 @@ impl Env {
     #[must_use]
     pub fn scene(&self) -> Scene {
         let time_s = f64::from(self.n_steps) / CONTROL_STEPS_PER_S;
-        scene(&self.world, self.layout, &self.goal, self.object_half_m, time_s)
+        scene(&self.world, self.layout, &self.goal, self.config.object_half_size_m, time_s)
+    }
+
+    /// Returns the bodies, their shapes and the control law as data, so that another physics engine can simulate the
+    /// same world.
+    #[must_use]
+    pub fn description(&self) -> WorldDescription {
+        describe(&self.prototype, self.layout, &self.config)
     }
 
     fn place(&mut self, arms: &[ArmStart]) {
@@ -281,7 +289,7 @@ mod tests {
                 let settings =
                     WorldSettings { grasped_start_prob: 0.3, ..WorldSettings::default() };
                 let [first, second] =
-                    sample_starts(&mut rng, layout, env.object_half_m, settings)[..]
+                    sample_starts(&mut rng, layout, env.config.object_half_size_m, settings)[..]
                 else {
                     panic!()
                 };

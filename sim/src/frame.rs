@@ -19,9 +19,9 @@ pub(crate) const WORKSPACE_HIGH: Vector = Vector::new(0.20, 0.25, 0.35);
 /// them.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct ArmFrame {
-    centre_x_m: f32,
+    pub(crate) centre_x_m: f32,
     /// 1, or −1 if rotated by 180°.
-    sign: f32,
+    pub(crate) sign: f32,
 }
 
 impl ArmFrame {

@@ -26,16 +26,17 @@ pub(crate) const WRIST_ABOVE_M: [f32; 2] = [0.10, 0.20];
 pub(crate) const WRIST_RADIUS_M: f32 = 0.035;
 
 /// Speed of each side at full gripper input, metres per second.
-const OPENING_SPEED_MPS: f32 = 0.25;
+pub(crate) const OPENING_SPEED_MPS: f32 = 0.25;
 /// Fraction of the distance to an end of the opening's range that one physics step may cover.
-const OPENING_END_GAIN: f32 = 0.2;
-const PALM_MASS_KG: f32 = 1.0;
+pub(crate) const OPENING_END_GAIN: f32 = 0.2;
+/// Mass of palm and wrist, kilograms.
+pub(crate) const PALM_MASS_KG: f32 = 1.0;
 /// Largest force of the palm's servo along each axis, newtons.
-const PALM_FORCE_N: f32 = 40.0;
+pub(crate) const PALM_FORCE_N: f32 = 40.0;
 /// Largest force that holds a finger in its place, newtons.
-const FINGER_HOLD_FORCE_N: f32 = 200.0;
+pub(crate) const FINGER_HOLD_FORCE_N: f32 = 200.0;
 /// Gain of the force that returns a finger to its place, 1/s.
-const FINGER_HOLD_GAIN: f32 = 250.0;
+pub(crate) const FINGER_HOLD_GAIN: f32 = 250.0;
 
 /// Position and mass of a finger.
 struct FingerGeometry {
@@ -52,7 +53,7 @@ const FINGERS: [FingerGeometry; 3] = [
     FingerGeometry { side: -1.0, x_m: 0.0, mass_kg: 0.2 },
 ];
 /// Mass of all fingers, kilograms.
-const FINGERS_MASS_KG: f32 = 0.4;
+pub(crate) const FINGERS_MASS_KG: f32 = 0.4;
 
 /// Number of fingers.
 pub(crate) const N_FINGERS: usize = FINGERS.len();
@@ -70,23 +71,24 @@ pub(crate) enum Gripper {
 #[derive(Clone)]
 pub(crate) struct Hand {
     frame: ArmFrame,
-    palm: RigidBodyHandle,
-    gripper: Gripper,
-    fingers: [Finger; N_FINGERS],
+    pub(crate) palm: RigidBodyHandle,
+    pub(crate) gripper: Gripper,
+    pub(crate) fingers: [Finger; N_FINGERS],
     grip_force_n: f32,
 }
 
+/// A finger and its place at the palm.
 #[derive(Clone, Copy)]
-struct Finger {
+pub(crate) struct Finger {
     /// The palm's body if the gripper is locked.
-    body: RigidBodyHandle,
-    mass_kg: f32,
+    pub(crate) body: RigidBodyHandle,
+    pub(crate) mass_kg: f32,
     /// Fraction of the mass of all fingers, and weight in the mean opening.
-    mass_fraction: f32,
+    pub(crate) mass_fraction: f32,
     /// Position of the closed finger relative to the palm, world frame, metres.
-    closed_offset: Vector,
+    pub(crate) closed_offset: Vector,
     /// Direction of opening along the world's y axis: 1 or −1.
-    outward: f32,
+    pub(crate) outward: f32,
 }
 
 /// The state of a finger relative to the palm.

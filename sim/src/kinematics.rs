@@ -6,6 +6,7 @@
 use std::f64::consts::{FRAC_PI_2, PI};
 
 use rapier3d::glamx::{DMat3, DVec3};
+use serde::Serialize;
 
 /// Joint angles, radians, from base to wrist, by Kinova's convention (joints 2 and 3 are straight at π).
 pub(crate) type JointAngles = [f64; 6];
@@ -16,21 +17,27 @@ pub(crate) const HOME: JointAngles =
     [-0.208_556_86, 2.506_949_69, 5.075_284_33, 2.970_589_41, 0.665_106_14, -0.379_560_43];
 
 /// Damping factor of the least squares, in mixed units of metres and radians.
-const DAMPING: f64 = 0.03;
+pub(crate) const DAMPING: f64 = 0.03;
 /// Largest change of an angle per iteration, radians.
-const MAX_ANGLE_STEP_RAD: f64 = 0.3;
+pub(crate) const MAX_ANGLE_STEP_RAD: f64 = 0.3;
 /// Sum of squared errors below which the iteration ends.
-const SQUARED_ERROR_TOLERANCE: f64 = 1e-10;
+pub(crate) const SQUARED_ERROR_TOLERANCE: f64 = 1e-10;
 
 /// A row of the Denavit–Hartenberg table. Twists are multiples of 30° and given by sine and cosine.
-struct DhRow {
-    sin_twist: f64,
-    cos_twist: f64,
-    length_m: f64,
-    offset_m: f64,
-    /// The table's angle is `direction * joint angle + zero_rad`.
-    zero_rad: f64,
-    direction: f64,
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct DhRow {
+    /// Sine of the twist about the common normal.
+    pub sin_twist: f64,
+    /// Cosine of the twist.
+    pub cos_twist: f64,
+    /// Length of the common normal, metres.
+    pub length_m: f64,
+    /// Offset along the joint's axis, metres.
+    pub offset_m: f64,
+    /// The table's angle is `direction * joint angle + zero_rad`, radians.
+    pub zero_rad: f64,
+    /// 1, or −1 for a joint that turns the other way.
+    pub direction: f64,
 }
 
 const SIN_60: f64 = 0.866_025_403_784_438_6;
@@ -38,7 +45,7 @@ const SIN_60: f64 = 0.866_025_403_784_438_6;
 const BEND_M: f64 = 0.0741 * 0.5 / SIN_60;
 
 /// The Jaco with the 60° wrist: Kinova's classic parameters of the arm `j2n6s300`.
-const DH_TABLE: [DhRow; 6] = [
+pub(crate) const DH_TABLE: [DhRow; 6] = [
     DhRow {
         sin_twist: 1.0,
         cos_twist: 0.0,

@@ -87,13 +87,14 @@
 //!
 //! `env` (the interface), `world` and `physics` (a rapier world for bodies of centimetres), `hand` (palm and fingers,
 //! moved by forces), `arm` and `kinematics` (the joints follow the hand by inverse kinematics), `capsule` and
-//! `link_avoidance` (a velocity damper between the links of two arms), `frame`, `observation`, `start` (initial states)
-//! and `scene`.
+//! `link_avoidance` (a velocity damper between the links of two arms), `frame`, `observation`, `start` (initial states),
+//! `scene` and `description` (the world as data).
 #![warn(missing_docs)]
 
 mod arm;
 mod capsule;
 mod config;
+pub mod description;
 mod env;
 mod frame;
 mod hand;

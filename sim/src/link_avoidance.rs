@@ -18,21 +18,24 @@ use crate::physics::Physics;
 const N_PAIRS: usize = N_CAPSULES * N_CAPSULES - (N_CAPSULES - N_LINKS) * (N_CAPSULES - N_LINKS);
 
 /// Largest approach speed of an arm per metre of gap, 1/s.
-const APPROACH_GAIN: f32 = 20.0;
+pub(crate) const APPROACH_GAIN: f32 = 20.0;
 /// Largest speed of separation that an overlap demands, metres per second.
-const SEPARATION_MPS: f32 = 0.4;
+pub(crate) const SEPARATION_MPS: f32 = 0.4;
 /// Gap above which a pair imposes no limit, metres.
-const INFLUENCE_DISTANCE_M: f32 = 0.08;
+pub(crate) const INFLUENCE_DISTANCE_M: f32 = 0.08;
 /// Gap at the start of a control step above which a pair cannot come within [`INFLUENCE_DISTANCE_M`] during the step,
 /// metres.
-const ACTIVATION_DISTANCE_M: f32 = 0.24;
+pub(crate) const ACTIVATION_DISTANCE_M: f32 = 0.24;
 /// Distance between two axes below which the direction between them is undefined, metres.
-const CROSSING_M: f32 = 0.002;
+pub(crate) const CROSSING_M: f32 = 0.002;
 /// Lower bound on the norm of a limit's direction, as a fraction of the palm's motion. Without it, the palm would have
 /// to move very fast to displace a point that hardly follows it.
-const MIN_DIRECTION_NORM: f32 = 0.3;
+pub(crate) const MIN_DIRECTION_NORM: f32 = 0.3;
 /// Largest number of projections of a velocity before it is scaled down instead.
-const MAX_PROJECTIONS: usize = 12;
+pub(crate) const MAX_PROJECTIONS: usize = 12;
+
+/// Violation of a limit that counts as none, metres per second.
+pub(crate) const VIOLATION_TOLERANCE_MPS: f32 = 1e-4;
 
 /// A capsule of the first arm and one of the second.
 #[derive(Clone, Copy)]
@@ -176,7 +179,7 @@ impl Limits {
                 .iter()
                 .max_by(|a, b| a.violation_mps(velocity).total_cmp(&b.violation_mps(velocity)));
             match worst {
-                Some(limit) if limit.violation_mps(velocity) > 1e-4 => {
+                Some(limit) if limit.violation_mps(velocity) > VIOLATION_TOLERANCE_MPS => {
                     velocity = limit.project(velocity);
                 }
                 _ => return velocity,

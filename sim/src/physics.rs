@@ -5,15 +5,18 @@ use rapier3d::dynamics::{
     MultibodyJointSet, RigidBodySet, SoftBodySet, SpringCoefficients,
 };
 use rapier3d::geometry::{
-    BroadPhaseBvh, ColliderHandle, ColliderSet, ContactPair, Group, InteractionGroups,
+    BroadPhaseBvh, Collider, ColliderHandle, ColliderSet, ContactPair, Group, InteractionGroups,
     InteractionTestMode, NarrowPhase,
 };
 use rapier3d::math::Vector;
 use rapier3d::pipeline::PhysicsPipeline;
+use serde::Serialize;
 use tandem_core::{ArmIndex, Contacts};
 
 use crate::config::WorldConfig;
 
+/// Acceleration of gravity, metres per second squared.
+pub(crate) const GRAVITY: Vector = Vector::new(0.0, 0.0, -9.81);
 /// Collision groups of the tables, one per arm.
 const TABLES: [Group; 2] = [Group::GROUP_1, Group::GROUP_2];
 /// Collision groups of the objects, in arm order.
@@ -22,8 +25,9 @@ const OBJECTS: [Group; 2] = [Group::GROUP_3, Group::GROUP_4];
 const HANDS: [Group; 2] = [Group::GROUP_5, Group::GROUP_6];
 
 /// The owner of a collider.
-#[derive(Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Part {
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Part {
     /// The table that an arm's object and hand collide with.
     Table,
     /// The arm's object.
@@ -42,6 +46,18 @@ pub(crate) fn collides(part: Part, arm: ArmIndex) -> InteractionGroups {
         Part::Hand => (HANDS[arm.0], (movable & !HANDS[arm.0]) | TABLES[arm.0]),
     };
     InteractionGroups::new(group, filter, InteractionTestMode::And)
+}
+
+/// Returns the part and the arm to which `collider` belongs.
+pub(crate) fn owner(collider: &Collider) -> (Part, ArmIndex) {
+    let group = collider.collision_groups().memberships;
+    let owners = [(Part::Table, TABLES), (Part::Object, OBJECTS), (Part::Hand, HANDS)];
+    owners
+        .into_iter()
+        .flat_map(|(part, groups)| [(part, ArmIndex(0), groups[0]), (part, ArmIndex(1), groups[1])])
+        .find(|(_, _, its)| *its == group)
+        .map(|(part, arm, _)| (part, arm))
+        .expect("every collider has the groups of one part")
 }
 
 /// A rapier world without joints.
@@ -82,7 +98,7 @@ impl Physics {
     /// Simulates one physics step.
     pub(crate) fn step(&mut self) {
         self.pipeline.step(
-            Vector::new(0.0, 0.0, -9.81),
+            GRAVITY,
             &self.parameters,
             &mut self.islands,
             &mut self.broad_phase,

@@ -22,7 +22,7 @@ const TABLE_FRICTION: f32 = 0.6;
 pub(crate) struct World {
     pub(crate) physics: Physics,
     pub(crate) arms: Vec<Arm>,
-    objects: Vec<RigidBodyHandle>,
+    pub(crate) objects: Vec<RigidBodyHandle>,
     /// Present if there are two arms.
     damper: Option<VelocityDamper>,
     substeps: u32,
