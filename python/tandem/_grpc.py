@@ -15,7 +15,7 @@ from typing import Any
 os.environ.setdefault("GRPC_VERBOSITY", "NONE")  # Failures are raised; the library's own log would repeat them.
 
 try:
-    import grpc
+    import grpc as grpc
 except ImportError as error:
     raise ImportError("servers and clients of tandem need gRPC: pip install 'tandem-rl[grpc]'") from error
 
@@ -195,8 +195,10 @@ class _CallDetails(grpc.ClientCallDetails):  # type: ignore[misc]
         self.compression = getattr(details, "compression", None)
 
 
-class _SendToken(  # type: ignore[misc]
-    grpc.UnaryUnaryClientInterceptor, grpc.UnaryStreamClientInterceptor, grpc.StreamStreamClientInterceptor
+class _SendToken(
+    grpc.UnaryUnaryClientInterceptor,  # type: ignore[misc]
+    grpc.UnaryStreamClientInterceptor,  # type: ignore[misc]
+    grpc.StreamStreamClientInterceptor,  # type: ignore[misc]
 ):
     """Sends the token with every call."""
 

@@ -262,7 +262,8 @@ def _tolerance(env: gymnasium.Env[Any, Any]) -> float:
 
 
 def _episode_steps(env: gymnasium.Env[Any, Any], given: int | None) -> int:
-    steps = given if given is not None else env.spec and env.spec.max_episode_steps
+    own = None if env.spec is None else env.spec.max_episode_steps
+    steps = own if given is None else given
     if steps is None:
         raise ServiceError("the environment's spec has no max_episode_steps: give episode_steps")
     if not 1 <= steps <= 10_000:
