@@ -30,6 +30,8 @@ LISTEN_VARIABLE = "TANDEM_ENV_LISTEN"
 _PACKAGES = ("gymnasium_robotics", "panda_gym")
 """Packages that register environments when they are imported."""
 _FLOAT = np.dtype("<f4")
+ACTION_SLACK = 1e-6
+"""The distance by which rounding may move an action out of [-1, 1]."""
 
 
 def episode_seed(seed: int, episode: int) -> int:
@@ -96,6 +98,7 @@ class GymEnvironment:
         self._env.close()
 
     def _own_action(self, action: Floats) -> NDArray[Any]:
+        action = np.clip(action, -1, 1)
         if self._is_unscaled:
             return action.astype(self._dtype)
         return (self._low + (action.astype(np.float64) + 1) / 2 * self._range).astype(self._dtype)
@@ -307,7 +310,7 @@ def decode_floats(field: str, data: bytes, n_rows: int, n_columns: int) -> Float
 def check_actions(field: str, actions: Floats) -> None:
     """Refuses actions with a number outside [-1, 1], or one that is not a number."""
     flat = actions.ravel()
-    within = np.abs(flat) <= 1
+    within = np.abs(flat) <= 1 + ACTION_SLACK
     if not within.all():
         index = int(np.argmin(within))
         raise _invalid(f"{field}[{index}]: expected a number in [-1, 1], got {flat[index]:g}")

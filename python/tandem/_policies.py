@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from tandem._environments import check_actions, decode_floats, run
+from tandem._environments import ACTION_SLACK, check_actions, decode_floats, run
 from tandem._grpc import Path, Refused, Server, ServiceError, grpc
 from tandem._proto import policy_pb2, policy_pb2_grpc
 from tandem._task import Floats, Task
@@ -44,11 +44,11 @@ class _Policy:
         """Returns actions in [-1, 1], shape `[m, n_action]`."""
         shape = (self._task.n_action,)
         actions = self._rows("the policy", self._act, shape, observations, goals)
-        within = np.abs(actions) <= 1
+        within = np.abs(actions) <= 1 + ACTION_SLACK
         if not within.all():
             number = actions[~within][0]
             raise PolicyFailure(f"the policy returned {number:g}, expected numbers in [-1, 1]: clip its actions")
-        return actions
+        return np.clip(actions, -1, 1)
 
     def value(self, observations: Floats, goals: Floats, actions: Floats) -> Floats:
         """Returns the values of actions, shape `[m]`."""

@@ -48,10 +48,14 @@ Examples:
   tandem teacher --policy policies/teacher-push.safetensors --listen 127.0.0.1:7001
   tandem teacher --policy FILE --ledger runs/mine/ledger.sqlite
   tandem teacher --policy FILE --ledger redis://:PASSWORD@redis:6379   several teachers, one budget
-  tandem teacher --policy FILE --ledger memory                          lost at exit")]
+  tandem teacher --policy FILE --ledger memory                          lost at exit
+  tandem teacher --policy http://127.0.0.1:7005                         a policy in another process
+
+docs/python-services.md shows how to serve a policy from Python.")]
 pub(crate) struct TeacherArgs {
-    /// Policy file of the one-arm teacher.
-    #[arg(long, value_name = "FILE")]
+    /// Policy of the one-arm teacher: a file, or http://HOST:PORT (https:// with --tls-ca) of a server of
+    /// tandem.v1.Policy, which is called with the token of --token-file.
+    #[arg(long, value_name = "FILE|URL")]
     pub(crate) policy: PathBuf,
     /// Storage of the accounts: an SQLite file that no other teacher uses, `redis://[USER:PASSWORD@]HOST[:PORT][/DB]`,
     /// or `memory`.
@@ -65,6 +69,8 @@ pub(crate) struct TeacherArgs {
     pub(crate) ledger: OsString,
     #[command(flatten)]
     pub(crate) listen: ListenArgs,
+    #[command(flatten)]
+    pub(crate) client_config: ClientArgs,
     #[command(flatten)]
     pub(crate) secret: SecretArgs,
 }

@@ -3,10 +3,10 @@
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 
-use tandem_net::Pacing;
-use tandem_teacher::ledger::{OpenError, SqliteLedger};
+use tandem_net::{ClientConfig, Pacing};
+use tandem_teacher::ledger::{self, Ledger, OpenError, SqliteLedger};
 use tandem_teacher::policy::OneArmPolicy;
-use tandem_teacher::{Advisor, Error};
+use tandem_teacher::{Advisor, AnyPolicy, Error, PolicyTimeouts, RemoteError, RemotePolicy};
 
 use super::{listen, run};
 use crate::cli::TeacherArgs;
@@ -14,17 +14,28 @@ use crate::exit::{Exit, Failed};
 use crate::{access, policy_file, signals};
 
 pub(crate) fn teacher(args: TeacherArgs) -> Result<(), Failed> {
-    policy_file::load(&args.policy)?;
+    let source = PolicySource::of(args.policy);
+    if let PolicySource::File(file) = &source {
+        policy_file::load(file)?;
+    }
     let server_config = access::server_config(&args.listen, &args.secret)?;
+    let client_config = access::client_config(&args.client_config, &args.secret)?;
     run(async move {
         let shutdown = signals::shutdown_token(args.listen.exit_with_stdin)?;
-        let advisor = advisor(args.policy, args.ledger).map_err(teacher_failed)?;
+        let opened = async {
+            let policy = source.open(&client_config).await?;
+            Advisor::new(policy, open_ledger(args.ledger)?)
+        };
+        let advisor = tokio::select! {
+            advisor = opened => advisor.map_err(teacher_failed)?,
+            () = shutdown.cancelled() => return Ok(()),
+        };
         let listener = listen(&args.listen).await?;
         let served = tandem_teacher::serve_advisor(
             advisor,
             listener,
             &server_config,
-            shutdown,
+            shutdown.clone(),
             Pacing::Concurrent,
         )
         .await;
@@ -32,14 +43,39 @@ pub(crate) fn teacher(args: TeacherArgs) -> Result<(), Failed> {
     })
 }
 
-/// Opens the teacher's policy with its ledger. A ledger whose name is not UTF-8 can only be a file.
-fn advisor(policy: PathBuf, ledger: OsString) -> Result<Advisor, Error> {
-    match ledger.into_string() {
-        Ok(ledger) => tandem_teacher::open(&tandem_teacher::Config { policy, ledger }),
-        Err(file) => {
-            let policy = OneArmPolicy::load(&policy)?;
-            Advisor::new(Box::new(policy), Box::new(SqliteLedger::open(Path::new(&file))?))
+/// The kind of a policy, as the command line names it.
+enum PolicySource {
+    /// A policy file.
+    File(PathBuf),
+    /// The address of a server of `tandem.v1.Policy`.
+    Server(String),
+}
+
+impl PolicySource {
+    fn of(policy: PathBuf) -> Self {
+        let is_url = |text: &&str| text.starts_with("http://") || text.starts_with("https://");
+        match policy.to_str().filter(is_url) {
+            Some(address) => Self::Server(address.to_owned()),
+            None => Self::File(policy),
         }
+    }
+
+    async fn open(&self, client_config: &ClientConfig) -> Result<AnyPolicy, Error> {
+        match self {
+            Self::File(file) => Ok(Box::new(OneArmPolicy::load(file)?).into()),
+            Self::Server(address) => {
+                let timeouts = PolicyTimeouts::default();
+                Ok(RemotePolicy::connect(address, client_config, timeouts).await?.into())
+            }
+        }
+    }
+}
+
+/// Opens the ledger. A ledger whose name is not UTF-8 can only be a file.
+fn open_ledger(ledger: OsString) -> Result<Box<dyn Ledger>, Error> {
+    match ledger.into_string() {
+        Ok(location) => Ok(ledger::open(&location)?),
+        Err(file) => Ok(Box::new(SqliteLedger::open(Path::new(&file))?)),
     }
 }
 
@@ -51,6 +87,8 @@ pub(crate) fn teacher_failed(error: Error) -> Failed {
         E::OpenLedger(OpenError::InUse(_) | OpenError::Io { .. } | OpenError::Server { .. }) => {
             Exit::TryAgain
         }
+        E::RemotePolicy(RemoteError::Unavailable { .. }) => Exit::TryAgain,
+        E::RemotePolicy(RemoteError::Address(_) | RemoteError::Refused { .. }) => Exit::Usage,
         E::Transport(_) | E::Thread(_) => Exit::TryAgain,
         E::Panicked => Exit::Bug,
         _ => Exit::Data,

@@ -12,7 +12,7 @@ use crate::budget::{AccountTerms, Balance, BudgetHalf, Charge, Lease};
 use crate::error::Error;
 use crate::ledger::{ChargeRequest, ChargeResult, Ledger, LedgerError};
 use crate::maps::Maps;
-use crate::policy::TeacherPolicy;
+use crate::policy::AnyPolicy;
 use crate::strategy::Strategy;
 use inference::TeacherInference;
 
@@ -35,6 +35,8 @@ pub struct TeacherInfo {
     pub layout: Layout,
     /// The digest of the policy.
     pub digest: String,
+    /// Whether the policy values actions; without values, some strategies are not available.
+    pub has_values: bool,
     /// The maps from a student's vectors to each arm's.
     pub maps: Maps,
 }
@@ -62,7 +64,8 @@ impl Advisor {
     ///
     /// # Errors
     /// When the policy is not for one arm.
-    pub fn new(policy: Box<dyn TeacherPolicy>, ledger: Box<dyn Ledger>) -> Result<Self, Error> {
+    pub fn new(policy: impl Into<AnyPolicy>, ledger: Box<dyn Ledger>) -> Result<Self, Error> {
+        let policy = policy.into();
         let layout = policy.layout();
         if layout.n_arms != 1 {
             return Err(Error::NotOneArm { n_arms: layout.n_arms, n_values: 1 });
@@ -70,6 +73,7 @@ impl Advisor {
         let info = TeacherInfo {
             layout,
             digest: policy.digest().to_owned(),
+            has_values: policy.has_values(),
             maps: Maps::new(Layout::new(layout.task, MAX_ARMS)),
         };
         let inference = TeacherInference::new(policy);
@@ -85,8 +89,10 @@ impl Advisor {
     /// Opens account `name`, or returns it if it is open with the same terms.
     ///
     /// # Errors
-    /// When it is open with other terms, the budget is too large, or the ledger cannot be used.
+    /// When it is open with other terms, the budget is too large, the strategy needs values that the policy does not
+    /// give, or the ledger cannot be used.
     pub fn open_account(&mut self, name: &str, terms: AccountTerms) -> Result<Balance, Error> {
+        self.check_strategy(terms.strategy)?;
         Ok(self.ledger.open(name, terms)?)
     }
 
@@ -134,7 +140,7 @@ impl Advisor {
     ///
     /// # Errors
     /// Per request: when its account is not open, a step lies beyond the end of an episode that has a lease, the
-    /// networks return a number that is not finite, or the ledger cannot be used.
+    /// policy cannot be evaluated or returns a number that is not finite, or the ledger cannot be used.
     ///
     /// # Panics
     /// When a query's lengths match no layout of the teacher's task with 1 to [`MAX_ARMS`] arms, or the ledger does not
@@ -178,11 +184,20 @@ impl Advisor {
             .collect()
     }
 
+    /// Refuses a strategy that the policy cannot serve, also for accounts of an earlier teacher.
+    const fn check_strategy(&self, strategy: Strategy) -> Result<(), Error> {
+        if strategy.needs_values() && !self.info.has_values {
+            return Err(Error::NoValues { strategy });
+        }
+        Ok(())
+    }
+
     fn strategy(&mut self, account: &str) -> Result<Strategy, Error> {
         if let Some(strategy) = self.strategies.get(account) {
             return Ok(*strategy);
         }
         let strategy = self.ledger.balance(account)?.terms.strategy;
+        self.check_strategy(strategy)?;
         if self.strategies.len() >= MAX_CACHED_STRATEGIES {
             self.strategies.clear();
         }

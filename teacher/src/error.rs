@@ -5,7 +5,8 @@ use std::time::Duration;
 use tandem_proto::DecodeError;
 
 use crate::ledger::{LedgerError, OpenError};
-use crate::strategy::UnknownStrategy;
+use crate::remote_policy::RemoteError;
+use crate::strategy::{Strategy, UnknownStrategy};
 
 /// The reason why a teacher cannot start or cannot answer.
 #[derive(Debug, thiserror::Error)]
@@ -22,6 +23,17 @@ pub enum Error {
         n_arms: usize,
         /// The number of values of its critic.
         n_values: usize,
+    },
+    /// The policy is in another process, which cannot be used.
+    #[error(transparent)]
+    RemotePolicy(#[from] RemoteError),
+    /// The strategy compares values, and the policy has none.
+    #[error(
+        "strategy {strategy} needs the values of actions, which this teacher's policy does not give: use ea"
+    )]
+    NoValues {
+        /// The strategy.
+        strategy: Strategy,
     },
     /// A request is invalid.
     #[error(transparent)]

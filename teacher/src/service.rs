@@ -18,6 +18,7 @@ use crate::budget::{AccountTerms, BudgetError};
 use crate::error::Error;
 use crate::ledger::{self, LedgerError};
 use crate::policy::OneArmPolicy;
+use crate::remote_policy::RemoteError;
 use advice::{AdviceStream, advise, advise_stream};
 use convert::{check_episodes, describe, encode_balance, encode_lease};
 use thread::{AdvisorHandle, AdvisorThread};
@@ -221,7 +222,13 @@ fn status(error: &Error) -> Status {
         Error::Ledger(LedgerError::Budget(BudgetError::OtherTerms { .. })) => {
             Status::already_exists(message)
         }
-        Error::Ledger(LedgerError::Unavailable { .. }) | Error::Timeout(_) => {
+        Error::NoValues { .. } | Error::RemotePolicy(RemoteError::Changed { .. }) => {
+            tracing::error!(%error, "request refused");
+            Status::failed_precondition(message)
+        }
+        Error::Ledger(LedgerError::Unavailable { .. })
+        | Error::Timeout(_)
+        | Error::RemotePolicy(RemoteError::Unavailable { .. }) => {
             tracing::error!(%error, "request failed");
             Status::unavailable(message)
         }
@@ -229,6 +236,7 @@ fn status(error: &Error) -> Status {
         | Error::OpenLedger(_)
         | Error::NotOneArm { .. }
         | Error::NotFinite { .. }
+        | Error::RemotePolicy(_)
         | Error::Panicked
         | Error::Thread(_)
         | Error::ServerConfig(_)

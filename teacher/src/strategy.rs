@@ -51,6 +51,12 @@ impl Strategy {
     /// The names of the strategies; `T` and `A` are thresholds.
     pub const NAMES: [&str; 6] = ["none", "ea", "eamc:T", "mc-q:T", "mc-act:A", "mc-act-abs:A"];
 
+    /// Returns whether the strategy compares values of actions.
+    #[must_use]
+    pub const fn needs_values(self) -> bool {
+        matches!(self, Self::EarlyThenMistakeQ { .. } | Self::MistakeQ { .. })
+    }
+
     /// Returns the procedure for a step whose unit would come from `half` of the budget.
     #[must_use]
     pub const fn procedure(self, half: BudgetHalf) -> Option<Procedure> {

@@ -1,6 +1,7 @@
 use super::*;
 use crate::fake::{FakePolicy, query};
 use crate::ledger::MemoryLedger;
+use crate::policy::TeacherPolicy;
 
 fn advisor(budget: u64, strategy: &str) -> Advisor {
     let mut advisor =
