@@ -81,26 +81,27 @@ pub(crate) fn network(
         interpreter.values.insert(&tensor.name, Value::Constant(Constant::new(tensor)));
     }
     let inputs = interpreter.add_inputs(graph)?;
-    let needed = needed_nodes(graph, &output.name);
+    let needed = needed_nodes(graph, &output.name)?;
     for (_, node) in graph.node.iter().enumerate().filter(|(idx, _)| needed.contains(idx)) {
         let value = node::interpret(&mut interpreter, node)?;
         let name = node.output.first().map_or("", String::as_str);
         if interpreter.values.insert(name, value).is_some() {
-            return Err(ModelError::Model(format!("value {name:?} is assigned twice")));
+            return Err(node.refused(format!("an input or initializer is named {name:?} too")));
         }
     }
     interpreter.into_network(inputs, &output.name)
 }
 
 /// Returns the indices of the nodes that `output` depends on.
-fn needed_nodes(graph: &GraphProto, output: &str) -> BTreeSet<usize> {
-    let producers: BTreeMap<&str, usize> = graph
-        .node
-        .iter()
-        .enumerate()
-        .flat_map(|(idx, node)| node.output.iter().map(move |name| (name.as_str(), idx)))
-        .filter(|(name, _)| !name.is_empty())
-        .collect();
+fn needed_nodes(graph: &GraphProto, output: &str) -> Result<BTreeSet<usize>, ModelError> {
+    let mut producers = BTreeMap::new();
+    for (idx, node) in graph.node.iter().enumerate() {
+        for name in node.output.iter().filter(|name| !name.is_empty()) {
+            if producers.insert(name.as_str(), idx).is_some() {
+                return Err(node.refused(format!("an earlier node computes {name:?} too")));
+            }
+        }
+    }
     let mut needed = BTreeSet::new();
     let mut open = vec![output];
     while let Some(name) = open.pop() {
@@ -110,7 +111,7 @@ fn needed_nodes(graph: &GraphProto, output: &str) -> BTreeSet<usize> {
             open.extend(graph.node[idx].input.iter().map(String::as_str));
         }
     }
-    needed
+    Ok(needed)
 }
 
 /// Returns the output: the only one, or the first with a name that says what it is.

@@ -11,6 +11,7 @@ mod layers;
 use std::collections::BTreeMap;
 
 use tandem_core::Layout;
+use tandem_policy::policy::NO_CRITIC;
 use tandem_policy::{MlpShape, NormalizerSnapshot, Policy};
 
 use crate::binding::{BoundNetwork, Role, Source, policy_columns};
@@ -20,12 +21,7 @@ use crate::model::Model;
 use columns::{Normalized, normalized};
 use layers::{Dense, dense_layers};
 
-/// Key of the metadata entry that marks a policy without a critic, whose value is [`NO_CRITIC`]. All its values are 0.
-pub const CRITIC_KEY: &str = "critic";
-/// See [`CRITIC_KEY`].
-pub const NO_CRITIC: &str = "none";
-
-/// Creates the policy of an actor and, if there is one, a critic.
+/// Creates the policy of an actor and, if there is one, a critic. Without one the policy is marked with [`NO_CRITIC`].
 ///
 /// The metadata that [`export`](crate::export) wrote is restored if the policy is still the exported one.
 ///
@@ -84,7 +80,7 @@ fn metadata_of(policy: &Policy, actor: &Model, critic: Option<&Model>) -> BTreeM
     entries.insert("imported_actor".to_owned(), actor.digest.clone());
     match critic {
         Some(critic) => entries.insert("imported_critic".to_owned(), critic.digest.clone()),
-        None => entries.insert(CRITIC_KEY.to_owned(), NO_CRITIC.to_owned()),
+        None => entries.insert(NO_CRITIC.0.to_owned(), NO_CRITIC.1.to_owned()),
     };
     entries
 }

@@ -72,6 +72,14 @@ impl Model {
     }
 }
 
+/// Returns the SHA-256, hexadecimal, over the digests of several files.
+#[must_use]
+pub fn digest_of(digests: &[&str]) -> String {
+    let mut hasher = Sha256::new();
+    digests.iter().for_each(|digest| hasher.update(digest.as_bytes()));
+    hex(&hasher.finalize())
+}
+
 /// Returns the version of the standard operators.
 fn opset(model: &ModelProto) -> Result<i64, ModelError> {
     let standard = |domain: &str| domain.is_empty() || domain == "ai.onnx";

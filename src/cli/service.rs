@@ -47,12 +47,16 @@ pub(crate) struct ClientArgs {
 Examples:
   tandem teacher --policy policies/teacher-push.safetensors --listen 127.0.0.1:7001
   tandem teacher --policy FILE --ledger runs/mine/ledger.sqlite
+  tandem teacher --policy actor.onnx --critic critic.onnx               trained elsewhere
   tandem teacher --policy FILE --ledger redis://:PASSWORD@redis:6379   several teachers, one budget
   tandem teacher --policy FILE --ledger memory                          lost at exit")]
 pub(crate) struct TeacherArgs {
-    /// Policy file of the one-arm teacher.
+    /// Policy file of the one-arm teacher, or the ONNX model of an actor (*.onnx).
     #[arg(long, value_name = "FILE")]
     pub(crate) policy: PathBuf,
+    /// ONNX model of the actor's critic. Without it, strategies that compare values are not offered.
+    #[arg(long, value_name = "FILE.onnx")]
+    pub(crate) critic: Option<PathBuf>,
     /// Storage of the accounts: an SQLite file that no other teacher uses, `redis://[USER:PASSWORD@]HOST[:PORT][/DB]`,
     /// or `memory`.
     #[arg(

@@ -5,20 +5,20 @@ use std::path::{Path, PathBuf};
 
 use tandem_net::Pacing;
 use tandem_teacher::ledger::{OpenError, SqliteLedger};
-use tandem_teacher::policy::OneArmPolicy;
+use tandem_teacher::policy;
 use tandem_teacher::{Advisor, Error};
 
 use super::{listen, run};
 use crate::cli::TeacherArgs;
 use crate::exit::{Exit, Failed};
-use crate::{access, policy_file, signals};
+use crate::{access, signals};
 
 pub(crate) fn teacher(args: TeacherArgs) -> Result<(), Failed> {
-    policy_file::load(&args.policy)?;
+    policy::load(&args.policy, args.critic.as_deref()).map_err(teacher_failed)?;
     let server_config = access::server_config(&args.listen, &args.secret)?;
     run(async move {
         let shutdown = signals::shutdown_token(args.listen.exit_with_stdin)?;
-        let advisor = advisor(args.policy, args.ledger).map_err(teacher_failed)?;
+        let advisor = advisor(args.policy, args.critic, args.ledger).map_err(teacher_failed)?;
         let listener = listen(&args.listen).await?;
         let served = tandem_teacher::serve_advisor(
             advisor,
@@ -33,12 +33,12 @@ pub(crate) fn teacher(args: TeacherArgs) -> Result<(), Failed> {
 }
 
 /// Opens the teacher's policy with its ledger. A ledger whose name is not UTF-8 can only be a file.
-fn advisor(policy: PathBuf, ledger: OsString) -> Result<Advisor, Error> {
+fn advisor(policy: PathBuf, critic: Option<PathBuf>, ledger: OsString) -> Result<Advisor, Error> {
     match ledger.into_string() {
-        Ok(ledger) => tandem_teacher::open(&tandem_teacher::Config { policy, ledger }),
+        Ok(ledger) => tandem_teacher::open(&tandem_teacher::Config { policy, critic, ledger }),
         Err(file) => {
-            let policy = OneArmPolicy::load(&policy)?;
-            Advisor::new(Box::new(policy), Box::new(SqliteLedger::open(Path::new(&file))?))
+            let policy = policy::load(&policy, critic.as_deref())?;
+            Advisor::new(policy, Box::new(SqliteLedger::open(Path::new(&file))?))
         }
     }
 }
@@ -52,6 +52,7 @@ pub(crate) fn teacher_failed(error: Error) -> Failed {
             Exit::TryAgain
         }
         E::Transport(_) | E::Thread(_) => Exit::TryAgain,
+        E::SurplusCritic => Exit::Usage,
         E::Panicked => Exit::Bug,
         _ => Exit::Data,
     };

@@ -35,6 +35,8 @@ pub struct TeacherInfo {
     pub layout: Layout,
     /// The digest of the policy.
     pub digest: String,
+    /// Whether the policy values actions.
+    pub has_values: bool,
     /// The maps from a student's vectors to each arm's.
     pub maps: Maps,
 }
@@ -70,6 +72,7 @@ impl Advisor {
         let info = TeacherInfo {
             layout,
             digest: policy.digest().to_owned(),
+            has_values: policy.has_values(),
             maps: Maps::new(Layout::new(layout.task, MAX_ARMS)),
         };
         let inference = TeacherInference::new(policy);
@@ -85,8 +88,10 @@ impl Advisor {
     /// Opens account `name`, or returns it if it is open with the same terms.
     ///
     /// # Errors
-    /// When it is open with other terms, the budget is too large, or the ledger cannot be used.
+    /// When it is open with other terms, the budget is too large, the strategy needs values that the policy does not
+    /// have, or the ledger cannot be used.
     pub fn open_account(&mut self, name: &str, terms: AccountTerms) -> Result<Balance, Error> {
+        self.check_offered(terms.strategy)?;
         Ok(self.ledger.open(name, terms)?)
     }
 
@@ -183,11 +188,20 @@ impl Advisor {
             return Ok(*strategy);
         }
         let strategy = self.ledger.balance(account)?.terms.strategy;
+        self.check_offered(strategy)?;
         if self.strategies.len() >= MAX_CACHED_STRATEGIES {
             self.strategies.clear();
         }
         self.strategies.insert(account.to_owned(), strategy);
         Ok(strategy)
+    }
+
+    /// Refuses a strategy that needs values if the policy has none.
+    const fn check_offered(&self, strategy: Strategy) -> Result<(), Error> {
+        if strategy.needs_values() && !self.info.has_values {
+            return Err(Error::NoValues { strategy });
+        }
+        Ok(())
     }
 
     fn charge(&mut self, requests: &[ChargeRequest]) -> Vec<Result<ChargeResult, LedgerError>> {

@@ -1,11 +1,18 @@
 //! The teacher's policy.
 
+mod onnx;
+
 use std::path::Path;
 
 use tandem_core::Layout;
 use tandem_policy::{Actor, Critic, Policy};
 
 use crate::error::Error;
+
+pub use onnx::OnnxPolicy;
+
+/// Extension of the files that hold an ONNX model.
+const ONNX_EXTENSION: &str = "onnx";
 
 /// A policy for one arm with an actor and a critic. Rows are states of one arm.
 pub trait TeacherPolicy: Send {
@@ -15,6 +22,12 @@ pub trait TeacherPolicy: Send {
     /// Returns the SHA-256 of the parameters, hexadecimal.
     fn digest(&self) -> &str;
 
+    /// Returns true if the policy values actions. If not, the teacher refuses strategies that compare values, and does
+    /// not call [`q`](Self::q).
+    fn has_values(&self) -> bool {
+        true
+    }
+
     /// Writes the actions of `π_tr`, shape `[n, n_action]`, for `observations`, shape `[n, n_observation]`, and
     /// `goals`, shape `[n, n_goal]`.
     fn act(&mut self, observations: &[f32], goals: &[f32], actions: &mut [f32]);
@@ -23,9 +36,31 @@ pub trait TeacherPolicy: Send {
     fn q(&mut self, observations: &[f32], goals: &[f32], actions: &[f32], q: &mut [f32]);
 }
 
+/// Loads the policy at `policy`, of the kind that its extension says: an ONNX model of an actor, with the model of its
+/// critic in `critic`, or else a policy file.
+///
+/// # Errors
+/// When a file cannot be read or is not a valid policy for one arm, or `critic` is given with a policy file.
+pub fn load(policy: &Path, critic: Option<&Path>) -> Result<Box<dyn TeacherPolicy>, Error> {
+    if is_onnx(policy) {
+        return Ok(Box::new(OnnxPolicy::load(policy, critic)?));
+    }
+    match critic {
+        Some(_) => Err(Error::SurplusCritic),
+        None => Ok(Box::new(OneArmPolicy::load(policy)?)),
+    }
+}
+
+/// Returns true if the extension of `path` is that of an ONNX model.
+#[must_use]
+pub fn is_onnx(path: &Path) -> bool {
+    path.extension().is_some_and(|extension| extension.eq_ignore_ascii_case(ONNX_EXTENSION))
+}
+
 /// A loaded policy for one arm.
 pub struct OneArmPolicy {
     digest: String,
+    has_critic: bool,
     actor: Actor,
     critic: Critic,
 }
@@ -50,7 +85,12 @@ impl OneArmPolicy {
                 n_values: policy.n_heads,
             });
         }
-        Ok(Self { digest: policy.digest(), actor: policy.actor()?, critic: policy.critic()? })
+        Ok(Self {
+            digest: policy.digest(),
+            has_critic: policy.has_critic(),
+            actor: policy.actor()?,
+            critic: policy.critic()?,
+        })
     }
 }
 
@@ -61,6 +101,10 @@ impl TeacherPolicy for OneArmPolicy {
 
     fn digest(&self) -> &str {
         &self.digest
+    }
+
+    fn has_values(&self) -> bool {
+        self.has_critic
     }
 
     fn act(&mut self, observations: &[f32], goals: &[f32], actions: &mut [f32]) {

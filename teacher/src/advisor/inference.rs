@@ -87,7 +87,10 @@ impl TeacherInference {
         self.goals.extend_from_within(..);
         self.q.clear();
         self.q.resize(2 * n_rows, 0.0);
-        self.policy.q(&self.observations, &self.goals, &self.actions, &mut self.q);
+        // Without values they stay 0, which no offered strategy compares.
+        if self.policy.has_values() {
+            self.policy.q(&self.observations, &self.goals, &self.actions, &mut self.q);
+        }
     }
 
     fn score_row(&self, row: usize) -> ArmAdvice {
