@@ -5,19 +5,16 @@ use std::path::{Path, PathBuf};
 
 use tandem_net::{ClientConfig, Pacing};
 use tandem_teacher::ledger::{self, Ledger, OpenError, SqliteLedger};
-use tandem_teacher::policy::OneArmPolicy;
+use tandem_teacher::policy;
 use tandem_teacher::{Advisor, AnyPolicy, Error, PolicyTimeouts, RemoteError, RemotePolicy};
 
 use super::{listen, run};
 use crate::cli::TeacherArgs;
 use crate::exit::{Exit, Failed};
-use crate::{access, policy_file, signals};
+use crate::{access, signals};
 
 pub(crate) fn teacher(args: TeacherArgs) -> Result<(), Failed> {
-    let source = PolicySource::of(args.policy);
-    if let PolicySource::File(file) = &source {
-        policy_file::load(file)?;
-    }
+    let source = PolicySource::new(args.policy, args.critic)?;
     let server_config = access::server_config(&args.listen, &args.secret)?;
     let client_config = access::client_config(&args.client_config, &args.secret)?;
     run(async move {
@@ -35,7 +32,7 @@ pub(crate) fn teacher(args: TeacherArgs) -> Result<(), Failed> {
             advisor,
             listener,
             &server_config,
-            shutdown.clone(),
+            shutdown,
             Pacing::Concurrent,
         )
         .await;
@@ -45,24 +42,29 @@ pub(crate) fn teacher(args: TeacherArgs) -> Result<(), Failed> {
 
 /// The kind of a policy, as the command line names it.
 enum PolicySource {
-    /// A policy file.
-    File(PathBuf),
+    /// A policy file, or an ONNX model with its critic.
+    File { policy: PathBuf, critic: Option<PathBuf> },
     /// The address of a server of `tandem.v1.Policy`.
     Server(String),
 }
 
 impl PolicySource {
-    fn of(policy: PathBuf) -> Self {
+    /// Distinguishes URLs from files, and checks files before anything is bound.
+    fn new(policy: PathBuf, critic: Option<PathBuf>) -> Result<Self, Failed> {
         let is_url = |text: &&str| text.starts_with("http://") || text.starts_with("https://");
         match policy.to_str().filter(is_url) {
-            Some(address) => Self::Server(address.to_owned()),
-            None => Self::File(policy),
+            Some(_) if critic.is_some() => Err(teacher_failed(Error::SurplusCritic)),
+            Some(address) => Ok(Self::Server(address.to_owned())),
+            None => {
+                policy::load(&policy, critic.as_deref()).map_err(teacher_failed)?;
+                Ok(Self::File { policy, critic })
+            }
         }
     }
 
     async fn open(&self, client_config: &ClientConfig) -> Result<AnyPolicy, Error> {
         match self {
-            Self::File(file) => Ok(Box::new(OneArmPolicy::load(file)?).into()),
+            Self::File { policy, critic } => Ok(policy::load(policy, critic.as_deref())?.into()),
             Self::Server(address) => {
                 let timeouts = PolicyTimeouts::default();
                 Ok(RemotePolicy::connect(address, client_config, timeouts).await?.into())
@@ -90,6 +92,7 @@ pub(crate) fn teacher_failed(error: Error) -> Failed {
         E::RemotePolicy(RemoteError::Unavailable { .. }) => Exit::TryAgain,
         E::RemotePolicy(RemoteError::Address(_) | RemoteError::Refused { .. }) => Exit::Usage,
         E::Transport(_) | E::Thread(_) => Exit::TryAgain,
+        E::SurplusCritic => Exit::Usage,
         E::Panicked => Exit::Bug,
         _ => Exit::Data,
     };

@@ -35,7 +35,7 @@ pub struct TeacherInfo {
     pub layout: Layout,
     /// The digest of the policy.
     pub digest: String,
-    /// Whether the policy values actions; without values, some strategies are not available.
+    /// Whether the policy values actions.
     pub has_values: bool,
     /// The maps from a student's vectors to each arm's.
     pub maps: Maps,
@@ -90,9 +90,9 @@ impl Advisor {
     ///
     /// # Errors
     /// When it is open with other terms, the budget is too large, the strategy needs values that the policy does not
-    /// give, or the ledger cannot be used.
+    /// have, or the ledger cannot be used.
     pub fn open_account(&mut self, name: &str, terms: AccountTerms) -> Result<Balance, Error> {
-        self.check_strategy(terms.strategy)?;
+        self.check_offered(terms.strategy)?;
         Ok(self.ledger.open(name, terms)?)
     }
 
@@ -184,25 +184,25 @@ impl Advisor {
             .collect()
     }
 
-    /// Refuses a strategy that the policy cannot serve, also for accounts of an earlier teacher.
-    const fn check_strategy(&self, strategy: Strategy) -> Result<(), Error> {
-        if strategy.needs_values() && !self.info.has_values {
-            return Err(Error::NoValues { strategy });
-        }
-        Ok(())
-    }
-
     fn strategy(&mut self, account: &str) -> Result<Strategy, Error> {
         if let Some(strategy) = self.strategies.get(account) {
             return Ok(*strategy);
         }
         let strategy = self.ledger.balance(account)?.terms.strategy;
-        self.check_strategy(strategy)?;
+        self.check_offered(strategy)?;
         if self.strategies.len() >= MAX_CACHED_STRATEGIES {
             self.strategies.clear();
         }
         self.strategies.insert(account.to_owned(), strategy);
         Ok(strategy)
+    }
+
+    /// Refuses a strategy that needs values if the policy has none.
+    const fn check_offered(&self, strategy: Strategy) -> Result<(), Error> {
+        if strategy.needs_values() && !self.info.has_values {
+            return Err(Error::NoValues { strategy });
+        }
+        Ok(())
     }
 
     fn charge(&mut self, requests: &[ChargeRequest]) -> Vec<Result<ChargeResult, LedgerError>> {

@@ -24,12 +24,20 @@ pub enum Error {
         /// The number of values of its critic.
         n_values: usize,
     },
+    /// An ONNX model cannot be used as the teacher's policy.
+    #[error("cannot use the teacher's policy")]
+    Onnx(#[from] tandem_onnx::Error),
     /// The policy is in another process, which cannot be used.
     #[error(transparent)]
     RemotePolicy(#[from] RemoteError),
-    /// The strategy compares values, and the policy has none.
+    /// A critic is given besides a policy file.
+    #[error("a critic is given apart only for an ONNX model: a policy file contains its own")]
+    SurplusCritic,
+    /// A strategy compares values of actions, and the teacher's policy has none.
     #[error(
-        "strategy {strategy} needs the values of actions, which this teacher's policy does not give: use ea"
+        "strategy {strategy} compares values of actions, and the teacher's policy has no critic: use {usable}, or a \
+         teacher with a critic",
+        usable = Strategy::names(false).join(", ")
     )]
     NoValues {
         /// The strategy.

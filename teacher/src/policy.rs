@@ -1,5 +1,7 @@
 //! The teacher's policy.
 
+mod onnx;
+
 use std::path::Path;
 
 use tandem_core::Layout;
@@ -8,16 +10,21 @@ use tandem_policy::{Actor, Critic, Policy};
 use crate::error::Error;
 use crate::remote_policy::{RemoteError, RemotePolicy};
 
+pub use onnx::OnnxPolicy;
+
+/// Extension of the files that hold an ONNX model.
+const ONNX_EXTENSION: &str = "onnx";
+
 /// A policy for one arm with an actor and a critic. Rows are states of one arm.
 pub trait TeacherPolicy: Send {
     /// Returns the task's layout for one arm.
     fn layout(&self) -> Layout;
 
-    /// Returns the text that identifies the policy: the SHA-256 of its parameters, hexadecimal, if they are known.
+    /// Returns the text that identifies the policy: the SHA-256 of the parameters, hexadecimal.
     fn digest(&self) -> &str;
 
-    /// Returns whether the policy values actions. Without values, strategies that compare them are not available, and
-    /// all values are 0.
+    /// Returns true if the policy values actions. If not, the teacher refuses strategies that compare values, and does
+    /// not call [`q`](Self::q).
     fn has_values(&self) -> bool {
         true
     }
@@ -131,9 +138,31 @@ impl Batch {
     }
 }
 
+/// Loads the policy at `policy`, of the kind that its extension says: an ONNX model of an actor, with the model of its
+/// critic in `critic`, or else a policy file.
+///
+/// # Errors
+/// When a file cannot be read or is not a valid policy for one arm, or `critic` is given with a policy file.
+pub fn load(policy: &Path, critic: Option<&Path>) -> Result<Box<dyn TeacherPolicy>, Error> {
+    if is_onnx(policy) {
+        return Ok(Box::new(OnnxPolicy::load(policy, critic)?));
+    }
+    match critic {
+        Some(_) => Err(Error::SurplusCritic),
+        None => Ok(Box::new(OneArmPolicy::load(policy)?)),
+    }
+}
+
+/// Returns true if the extension of `path` is that of an ONNX model.
+#[must_use]
+pub fn is_onnx(path: &Path) -> bool {
+    path.extension().is_some_and(|extension| extension.eq_ignore_ascii_case(ONNX_EXTENSION))
+}
+
 /// A loaded policy for one arm.
 pub struct OneArmPolicy {
     digest: String,
+    has_critic: bool,
     actor: Actor,
     critic: Critic,
 }
@@ -158,7 +187,12 @@ impl OneArmPolicy {
                 n_values: policy.n_heads,
             });
         }
-        Ok(Self { digest: policy.digest(), actor: policy.actor()?, critic: policy.critic()? })
+        Ok(Self {
+            digest: policy.digest(),
+            has_critic: policy.has_critic(),
+            actor: policy.actor()?,
+            critic: policy.critic()?,
+        })
     }
 }
 
@@ -169,6 +203,10 @@ impl TeacherPolicy for OneArmPolicy {
 
     fn digest(&self) -> &str {
         &self.digest
+    }
+
+    fn has_values(&self) -> bool {
+        self.has_critic
     }
 
     fn act(&mut self, observations: &[f32], goals: &[f32], actions: &mut [f32]) {

@@ -17,7 +17,7 @@ use crate::advisor::Advisor;
 use crate::budget::{AccountTerms, BudgetError};
 use crate::error::Error;
 use crate::ledger::{self, LedgerError};
-use crate::policy::OneArmPolicy;
+use crate::policy;
 use crate::remote_policy::RemoteError;
 use advice::{AdviceStream, advise, advise_stream};
 use convert::{check_episodes, describe, encode_balance, encode_lease};
@@ -31,8 +31,10 @@ const ANSWER_TIMEOUT: Duration = Duration::from_secs(4);
 /// The configuration of a teacher service.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Config {
-    /// The teacher's policy file.
+    /// The teacher's policy; see [`policy::load`].
     pub policy: PathBuf,
+    /// The critic of a policy that is an ONNX model.
+    pub critic: Option<PathBuf>,
     /// The location of the ledger; see [`ledger::open`].
     pub ledger: String,
 }
@@ -42,8 +44,8 @@ pub struct Config {
 /// # Errors
 /// When the policy cannot be loaded, or the ledger cannot be opened.
 pub fn open(config: &Config) -> Result<Advisor, Error> {
-    let policy = OneArmPolicy::load(&config.policy)?;
-    Advisor::new(Box::new(policy), ledger::open(&config.ledger)?)
+    let policy = policy::load(&config.policy, config.critic.as_deref())?;
+    Advisor::new(policy, ledger::open(&config.ledger)?)
 }
 
 /// Serves the teacher of `config`, with the access control of `server_config`, until `shutdown` is cancelled.
@@ -213,6 +215,7 @@ fn status(error: &Error) -> Status {
     match error {
         Error::Request(_)
         | Error::Strategy(_)
+        | Error::NoValues { .. }
         | Error::Ledger(
             LedgerError::Budget(BudgetError::BudgetTooLarge(_)) | LedgerError::BeyondEnd { .. },
         ) => Status::invalid_argument(message),
@@ -222,7 +225,7 @@ fn status(error: &Error) -> Status {
         Error::Ledger(LedgerError::Budget(BudgetError::OtherTerms { .. })) => {
             Status::already_exists(message)
         }
-        Error::NoValues { .. } | Error::RemotePolicy(RemoteError::Changed { .. }) => {
+        Error::RemotePolicy(RemoteError::Changed { .. }) => {
             tracing::error!(%error, "request refused");
             Status::failed_precondition(message)
         }
@@ -233,6 +236,8 @@ fn status(error: &Error) -> Status {
             Status::unavailable(message)
         }
         Error::Policy(_)
+        | Error::Onnx(_)
+        | Error::SurplusCritic
         | Error::OpenLedger(_)
         | Error::NotOneArm { .. }
         | Error::NotFinite { .. }

@@ -232,7 +232,7 @@ async fn without_values_a_strategy_that_compares_them_is_refused() {
         for strategy in ["mc-q:0.1", "eamc:0.1"] {
             let terms = AccountTerms { budget: 1, strategy: strategy.parse().unwrap() };
             let error = advisor.open_account("other", terms).unwrap_err().to_string();
-            assert!(error.starts_with(&format!("strategy {strategy} needs the values")), "{error}");
+            assert!(error.starts_with(&format!("strategy {strategy} compares values")), "{error}");
         }
         let advice = advisor.advise(&[request(1)]).remove(0).unwrap();
         assert!(advice.steps[0].charged);

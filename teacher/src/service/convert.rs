@@ -49,22 +49,9 @@ pub(super) fn describe(info: &TeacherInfo) -> pb::DescribeResponse {
         n_goal_per_arm: index(layout.n_goal()),
         n_action_per_arm: index(layout.n_action()),
         arms: info.maps.arms().iter().map(encode_map).collect(),
-        strategies: available_strategies(info.has_values),
+        strategies: Strategy::names(info.has_values).into_iter().map(str::to_owned).collect(),
         policy_digest: info.digest.clone(),
     }
-}
-
-/// Returns the names of the strategies that a policy with or without values can serve.
-fn available_strategies(has_values: bool) -> Vec<String> {
-    let is_available = |name: &&str| {
-        let family = name.split(':').next().unwrap_or_default();
-        has_values || family.parse::<Strategy>().is_ok_and(|strategy| !strategy.needs_values())
-    };
-    Strategy::NAMES
-        .iter()
-        .filter(|name| is_available(name))
-        .map(|name| (*name).to_owned())
-        .collect()
 }
 
 fn encode_map(map: &ArmMap) -> pb::ArmMap {
