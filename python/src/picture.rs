@@ -8,7 +8,7 @@ mod shape;
 
 use glam::DVec3;
 use tandem_core::layout::GOAL_TOLERANCE_M;
-use tandem_core::scene::{ArmScene, Cuboid, Scene};
+use tandem_core::scene::{ArmScene, Capsule, Cuboid, Scene};
 
 use camera::{Camera, Rectangle};
 use shape::{Hit, Shape};
@@ -127,9 +127,10 @@ impl Painter {
     fn new(scene: &Scene, width: usize, height: usize) -> Self {
         let table_z_m = f64::from(scene.table.centre[2] + scene.table.half_extents_m[2]);
         let camera = Camera::fitted(&scene.arms, table_z_m, width, height);
-        let body = |(shape, color): (Shape, Rgb)| {
-            let (centre, radius_m) = shape.bounding_sphere();
-            Body { bounds: camera.bounds(centre, radius_m), shape, color }
+        let body = |(shape, color): (Shape, Rgb)| Body {
+            bounds: camera.bounds(shape.centre, shape.radius_m),
+            shape,
+            color,
         };
         let goal = |(position, color): (&[f32; 3], &Rgb)| {
             let position = DVec3::from(position.map(f64::from));
@@ -241,19 +242,15 @@ fn shapes_of(arm: &ArmScene, color: Rgb) -> Vec<(Shape, Rgb)> {
         orientation: [0.0, 0.0, 0.0, 1.0],
         half_extents_m: PEDESTAL_HALF_M,
     };
-    let links = arm.links.iter().map(|link| (Shape::capsule(link), LINK_COLOR));
-    let post = arm.links.first().map(|link| {
-        (
-            Shape::capsule(&tandem_core::scene::Capsule { from: arm.base, to: link.from, ..*link }),
-            LINK_COLOR,
-        )
-    });
-    let joints = arm.links.windows(2).filter_map(|pair| {
+    let post = arm.links.first().map(|link| Capsule { from: arm.base, to: link.from, ..*link });
+    let links: Vec<Capsule> = post.into_iter().chain(arm.links.iter().copied()).collect();
+    let joints = links.windows(2).filter_map(|pair| {
         let [link, next] = pair else { return None };
         let radius_m = JOINT_WIDENING * f64::from(link.radius_m.max(next.radius_m));
         Some((Shape::sphere(DVec3::from(link.to.map(f64::from)), radius_m), color))
     });
+    let bars = links.iter().map(|link| (Shape::capsule(link), LINK_COLOR));
     let hand = arm.hand.iter().map(|part| (Shape::cuboid(part), HAND_COLOR));
     let pedestal = std::iter::once((Shape::cuboid(&pedestal), PEDESTAL_COLOR));
-    pedestal.chain(post).chain(links).chain(joints).chain(hand).collect()
+    pedestal.chain(bars).chain(joints).chain(hand).collect()
 }

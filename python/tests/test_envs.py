@@ -98,8 +98,8 @@ def test_bad_actions_are_refused_and_change_nothing():
     before, _ = env.reset(seed=4)
     for action, message in [
         (np.zeros(5, np.float32), "5"),
-        (np.full(6, np.nan, np.float32), "finite"),
-        ([0.0] * 5 + [float("inf")], "finite"),
+        (np.full(6, np.nan, np.float32), "NaN"),
+        ([0.0] * 5 + [float("inf")], "inf"),
     ]:
         with pytest.raises(ValueError, match=message):
             env.step(action)

@@ -1,14 +1,22 @@
 //! Shapes and where rays meet them.
 
-use glam::{DQuat, DVec3};
+use glam::{DMat3, DQuat, DVec3};
 use tandem_core::scene::{Capsule, Cuboid};
 
 /// A solid, world frame, metres.
-pub(super) enum Shape {
+pub(super) struct Shape {
+    solid: Solid,
+    /// Centre of the solid.
+    pub(super) centre: DVec3,
+    /// Radius of a sphere around the centre that contains the solid.
+    pub(super) radius_m: f64,
+}
+
+enum Solid {
     /// A cylinder with hemispherical ends, or a sphere if both ends are the same point.
     Capsule { from: DVec3, to: DVec3, radius_m: f64 },
-    /// A box.
-    Cuboid { centre: DVec3, world_from_box: DQuat, half_m: DVec3 },
+    /// A box. The columns of the matrix are its axes.
+    Cuboid { world_from_box: DMat3, half_m: DVec3 },
 }
 
 /// The place where a ray enters a shape.
@@ -22,52 +30,46 @@ pub(super) struct Hit {
 impl Shape {
     pub(super) fn capsule(capsule: &Capsule) -> Self {
         let [from, to] = [capsule.from, capsule.to].map(|end| DVec3::from(end.map(f64::from)));
-        Self::Capsule { from, to, radius_m: capsule.radius_m.into() }
-    }
-
-    pub(super) fn sphere(centre: DVec3, radius_m: f64) -> Self {
-        Self::Capsule { from: centre, to: centre, radius_m }
-    }
-
-    pub(super) fn cuboid(cuboid: &Cuboid) -> Self {
-        Self::Cuboid {
-            centre: DVec3::from(cuboid.centre.map(f64::from)),
-            world_from_box: DQuat::from_array(cuboid.orientation.map(f64::from)).normalize(),
-            half_m: DVec3::from(cuboid.half_extents_m.map(f64::from)),
+        let radius_m = f64::from(capsule.radius_m);
+        Self {
+            centre: from.midpoint(to),
+            radius_m: 0.5 * from.distance(to) + radius_m,
+            solid: Solid::Capsule { from, to, radius_m },
         }
     }
 
-    /// Returns centre and radius of a sphere that contains the shape.
-    pub(super) fn bounding_sphere(&self) -> (DVec3, f64) {
-        match self {
-            Self::Capsule { from, to, radius_m } => {
-                (from.midpoint(*to), 0.5 * from.distance(*to) + radius_m)
-            }
-            Self::Cuboid { centre, half_m, .. } => (*centre, half_m.length()),
+    pub(super) fn sphere(centre: DVec3, radius_m: f64) -> Self {
+        Self { solid: Solid::Capsule { from: centre, to: centre, radius_m }, centre, radius_m }
+    }
+
+    pub(super) fn cuboid(cuboid: &Cuboid) -> Self {
+        let orientation = DQuat::from_array(cuboid.orientation.map(f64::from)).normalize();
+        let half_m = DVec3::from(cuboid.half_extents_m.map(f64::from));
+        Self {
+            centre: DVec3::from(cuboid.centre.map(f64::from)),
+            radius_m: half_m.length(),
+            solid: Solid::Cuboid { world_from_box: DMat3::from_quat(orientation), half_m },
         }
     }
 
     /// Returns where the ray from `origin` along the unit vector `direction` enters the shape. A ray that starts inside
     /// does not.
+    #[inline]
     pub(super) fn hit(&self, origin: DVec3, direction: DVec3) -> Option<Hit> {
-        let (centre, radius_m) = self.bounding_sphere();
-        let offset = centre - origin;
+        let offset = self.centre - origin;
         let along_m = offset.dot(direction);
-        if along_m < -radius_m || offset.length_squared() - along_m * along_m > radius_m * radius_m
-        {
+        let beside_m2 = offset.length_squared() - along_m * along_m;
+        if along_m < -self.radius_m || beside_m2 > self.radius_m * self.radius_m {
             return None;
         }
-        match self {
-            Self::Capsule { from, to, radius_m } => {
+        match &self.solid {
+            Solid::Capsule { from, to, radius_m } => {
                 hit_capsule(origin, direction, *from, *to, *radius_m)
             }
-            Self::Cuboid { centre, world_from_box, half_m } => {
-                let box_from_world = world_from_box.inverse();
-                let local = hit_box(
-                    box_from_world * (origin - centre),
-                    box_from_world * direction,
-                    *half_m,
-                )?;
+            Solid::Cuboid { world_from_box, half_m } => {
+                let box_from_world = world_from_box.transpose();
+                let local =
+                    hit_box(-(box_from_world * offset), box_from_world * direction, *half_m)?;
                 Some(Hit { normal: *world_from_box * local.normal, ..local })
             }
         }
