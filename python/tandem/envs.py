@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import Any, cast
 
 import gymnasium
 import numpy as np
@@ -50,7 +50,7 @@ class TandemEnv(gymnasium.Env[Observation, Action]):
         height: Height of pictures, pixels.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 25}
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 25}
 
     def __init__(
         self,
@@ -112,7 +112,7 @@ class TandemEnv(gymnasium.Env[Observation, Action]):
         """Returns the sparse rewards of goals of shape `[..., n_goal]`, shape `[...]`; `info` has no effect."""
         return compute_reward(achieved_goal, desired_goal)
 
-    def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
+    def render(self) -> NDArray[np.uint8] | None:
         """Draws the scene, shape `[height, width, 3]`, in render mode `rgb_array`."""
         return None if self.render_mode is None else self._simulation.render(*self._size)
 
@@ -136,7 +136,7 @@ def compute_reward(achieved_goal: ArrayLike, desired_goal: ArrayLike) -> float |
     return rewards.reshape(shape) if shape else float(rewards[0])
 
 
-def spaces_of(simulation: _native.Simulation) -> tuple[spaces.Dict, spaces.Box]:
+def spaces_of(simulation: _native.Simulation) -> tuple[spaces.Space[Observation], spaces.Space[Action]]:
     """Returns the spaces of observations and actions.
 
     Numbers of a correct simulation are within the bounds. Desired goals have the bounds of achieved ones, so that an
@@ -144,8 +144,11 @@ def spaces_of(simulation: _native.Simulation) -> tuple[spaces.Dict, spaces.Box]:
     """
     goal = simulation.goal_bounds
     bounds = {"observation": simulation.observation_bounds, "achieved_goal": goal, "desired_goal": goal}
-    observation = spaces.Dict({name: spaces.Box(-high, high, dtype=np.float32) for name, high in bounds.items()})
-    return observation, spaces.Box(-1.0, 1.0, (simulation.n_action,), dtype=np.float32)
+    boxes: dict[str, spaces.Space[Any]] = {
+        name: spaces.Box(-high, high, dtype=np.float32) for name, high in bounds.items()
+    }
+    action = spaces.Box(-1.0, 1.0, (simulation.n_action,), dtype=np.float32)
+    return cast(spaces.Space[Observation], spaces.Dict(boxes)), cast(spaces.Space[Action], action)
 
 
 def episode_option(options: dict[str, Any] | None) -> int | None:

@@ -38,11 +38,11 @@ def test_actions_and_values_are_those_of_the_file_format(path, rng):
     actions, state = policy.predict(observation)
     expected = np.tanh(network(tensors, "actor", normalized(tensors, observation)))
     assert state is None
-    np.testing.assert_allclose(actions, expected, atol=1e-5)
+    np.testing.assert_allclose(actions, expected, atol=5e-5)
     values = policy.q(observation, actions)
     expected = network(tensors, "critic.0", np.concatenate([normalized(tensors, observation), actions], axis=-1))
     assert values.shape == (70, policy.n_arms)
-    np.testing.assert_allclose(values, expected, atol=1e-5, rtol=1e-5)
+    np.testing.assert_allclose(values, expected, atol=5e-5, rtol=5e-5)
 
 
 def test_a_row_has_the_same_bits_in_any_batch(rng):
@@ -110,8 +110,8 @@ def test_a_torch_module_gives_the_same_numbers(rng):
     with torch.no_grad():
         actions = module(*tensors)
         values = module.q(*tensors, actions)
-    np.testing.assert_allclose(actions, policy.predict(observation)[0], atol=1e-5)
-    np.testing.assert_allclose(values, policy.q(observation, actions.numpy()), atol=1e-5, rtol=1e-5)
+    np.testing.assert_allclose(actions, policy.predict(observation)[0], atol=5e-5)
+    np.testing.assert_allclose(values, policy.q(observation, actions.numpy()), atol=5e-5, rtol=5e-5)
 
 
 def test_without_torch_the_error_says_what_to_install(monkeypatch):
