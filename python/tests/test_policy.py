@@ -1,5 +1,9 @@
 """Policies: the numbers of the file format, success in the simulator, and refused files."""
 
+import json
+import os
+import subprocess
+
 import gymnasium
 import numpy as np
 import pytest
@@ -43,6 +47,20 @@ def test_actions_and_values_are_those_of_the_file_format(path, rng):
     expected = network(tensors, "critic.0", np.concatenate([normalized(tensors, observation), actions], axis=-1))
     assert values.shape == (70, policy.n_arms)
     np.testing.assert_allclose(values, expected, atol=5e-5, rtol=5e-5)
+
+
+@pytest.mark.parametrize("path", POLICIES, ids=lambda path: path.stem)
+def test_actions_and_values_have_the_bits_of_rust(path):
+    program = os.environ.get("TANDEM_POLICY_PROBE")
+    if program is None:
+        pytest.skip("TANDEM_POLICY_PROBE names no program: cargo build --release -p tandem-policy --example policy_probe")
+    probe = json.loads(subprocess.run([program, path], stdout=subprocess.PIPE, check=True).stdout)
+    policy = tandem.load_policy(path)
+    observation = {"observation": probe["observations"], "desired_goal": probe["goals"]}
+    actions, _ = policy.predict(observation)
+    assert probe["digest"] == policy.digest
+    assert np.array_equal(actions, np.array(probe["actions"], np.float32))
+    assert np.array_equal(policy.q(observation, actions), np.array(probe["q"], np.float32))
 
 
 def test_a_row_has_the_same_bits_in_any_batch(rng):
