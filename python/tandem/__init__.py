@@ -1,7 +1,15 @@
-"""Two robot arms that learn with advice from a policy for one: environments and policies of Tandem."""
+"""Environments, policies and services of Tandem: two robot arms, and advice from a policy for one arm.
 
-import importlib
+Importing the package registers four environments with Gymnasium: `tandem/Push-v0`, `tandem/PickAndPlace-v0`,
+`tandem/TwoArmPush-v0` and `tandem/TwoArmPickAndPlace-v0`. Servers and clients need gRPC: `pip install
+'tandem-rl[grpc]'`.
+"""
+
 from typing import TYPE_CHECKING, Any
+
+from tandem.envs import TandemEnv, compute_reward, register_envs
+from tandem.policy import Policy, load_policy
+from tandem.vector import TandemVectorEnv
 
 if TYPE_CHECKING:
     from tandem._environments import EnvironmentServer as EnvironmentServer
@@ -19,28 +27,26 @@ if TYPE_CHECKING:
     from tandem.clients import Teacher as Teacher
     from tandem.clients import WayPoint as WayPoint
 
+__all__ = ["Policy", "TandemEnv", "TandemVectorEnv", "compute_reward", "load_policy"]
+
+register_envs()
+
 _SERVICES = {
-    "EnvironmentServer": "tandem._environments",
-    "serve": "tandem._environments",
-    "ServiceError": "tandem._grpc",
-    "PolicyServer": "tandem._policies",
-    "serve_policy": "tandem._policies",
-    "Arm": "tandem._task",
-    "Task": "tandem._task",
-    "Bridge": "tandem.clients",
-    "CallError": "tandem.clients",
-    "Learner": "tandem.clients",
-    "MotionStopped": "tandem.clients",
-    "Step": "tandem.clients",
-    "Teacher": "tandem.clients",
-    "WayPoint": "tandem.clients",
+    "_environments": ("EnvironmentServer", "serve"),
+    "_grpc": ("ServiceError",),
+    "_policies": ("PolicyServer", "serve_policy"),
+    "_task": ("Arm", "Task"),
+    "clients": ("Bridge", "CallError", "Learner", "MotionStopped", "Step", "Teacher", "WayPoint"),
 }
 """Names whose modules need gRPC, and are imported when they are first used."""
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _SERVICES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = getattr(importlib.import_module(_SERVICES[name]), name)
-    globals()[name] = value
-    return value
+    import importlib
+
+    for module, names in _SERVICES.items():
+        if name in names:
+            value = getattr(importlib.import_module(f"tandem.{module}"), name)
+            globals()[name] = value
+            return value
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -15,6 +15,7 @@ from tandem._environments import ACTION_SLACK, check_actions, decode_floats, run
 from tandem._grpc import Path, Refused, Server, ServiceError, grpc
 from tandem._proto import policy_pb2, policy_pb2_grpc
 from tandem._task import Floats, Task
+from tandem.policy import Policy
 
 PolicyFn = Callable[[Floats, Floats], ArrayLike]
 """Returns actions, shape `[m, n_action]`, for observations `[m, n_observation]` and goals `[m, n_goal]`."""
@@ -24,6 +25,21 @@ ValueFn = Callable[[Floats, Floats, Floats], ArrayLike]
 MAX_STATES = 256
 """The largest number of states of a request."""
 _N_FINGERPRINT = 64
+
+
+def _functions(policy: Policy) -> tuple[PolicyFn, ValueFn]:
+    """Returns the actor and the critic of a policy from a file."""
+
+    def inputs(observations: Floats, goals: Floats) -> dict[str, Floats]:
+        return {"observation": observations, "desired_goal": goals}
+
+    def act(observations: Floats, goals: Floats) -> ArrayLike:
+        return policy.predict(inputs(observations, goals), deterministic=True)[0]
+
+    def value(observations: Floats, goals: Floats, actions: Floats) -> ArrayLike:
+        return policy.q(inputs(observations, goals), actions)
+
+    return act, value
 
 
 class PolicyFailure(Exception):
@@ -173,9 +189,9 @@ class PolicyServer(Server):
 
     def __init__(
         self,
-        policy: PolicyFn,
+        policy: Policy | PolicyFn,
         *,
-        task: str | Task,
+        task: str | Task | None = None,
         value: ValueFn | None = None,
         name: str | None = None,
         digest: str | None = None,
@@ -186,6 +202,14 @@ class PolicyServer(Server):
         tls_key: Path | None = None,
         insecure: bool = False,
     ) -> None:
+        shown = name or str(getattr(policy, "__name__", type(policy).__name__))
+        if isinstance(policy, Policy):
+            if policy.n_arms != 1:
+                raise ServiceError(f"a teacher's policy drives 1 arm, this one drives {policy.n_arms}")
+            task, digest, batched = task or policy.task, digest or policy.digest, True
+            policy, value = _functions(policy)
+        if task is None:
+            raise ServiceError("give the task of the policy: push, pick-and-place or a Task")
         self.task = Task.built_in(task) if isinstance(task, str) else task
         if len(self.task.arms) != 1:
             raise ServiceError(f"a teacher's policy drives 1 arm, the task has {len(self.task.arms)}")
@@ -197,7 +221,6 @@ class PolicyServer(Server):
         self.digest = found if digest is None else digest
         if not re.fullmatch(r"[A-Za-z0-9._:-]{1,128}", self.digest):
             raise ServiceError(f"{digest!r} is not a digest: expected 1 to 128 letters, digits, '-', '_', '.' and ':'")
-        shown = name or str(getattr(policy, "__name__", type(policy).__name__))
         servicer = _Servicer(served, self.task, shown, self.digest)
         super().__init__(
             lambda server: policy_pb2_grpc.add_PolicyServicer_to_server(servicer, server),
@@ -209,14 +232,17 @@ class PolicyServer(Server):
         )
 
 
-def serve_policy(policy: PolicyFn, *, task: str | Task, listen: str = "127.0.0.1:0", **options: Any) -> None:
+def serve_policy(
+    policy: Policy | PolicyFn, *, task: str | Task | None = None, listen: str = "127.0.0.1:0", **options: Any
+) -> None:
     """Serves a policy until the process is asked to end, by SIGINT or SIGTERM.
 
     Prints `listening on http://HOST:PORT` once it serves.
 
     Arguments:
-      policy: a function of observations, shape `[m, n_observation]`, and goals, shape `[m, n_goal]`, that returns
-        actions in [-1, 1], shape `[m, n_action]`; all float32.
+      policy: a one-arm policy of `tandem.load_policy`, which needs no other argument; or a function of observations,
+        shape `[m, n_observation]`, and goals, shape `[m, n_goal]`, that returns actions in [-1, 1], shape
+        `[m, n_action]`; all float32.
       task: `push`, `pick-and-place` or a `tandem.Task` of one arm.
       value: a function of observations, goals and actions, shape `[m, n_action]`, that returns values, shape `[m]`;
         without it, strategies that compare values are not available.
