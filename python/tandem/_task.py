@@ -148,7 +148,7 @@ def describe(env: gymnasium.Env[Any, Any], options: TaskOptions) -> tuple[Task, 
     n_goal = int(spaces["achieved_goal"].shape[0])
     n_own = int(spaces["observation"].shape[0])
     indices = tuple(range(n_own, n_own + n_goal)) if found is None else found
-    tolerance = options.tolerance if options.tolerance is not None else _tolerance(env)
+    tolerance = options.tolerance if options.tolerance is not None else _tolerance(env, samples)
     n_action = int(action.shape[0])
     arms = options.arms
     if arms is None:
@@ -254,11 +254,31 @@ def _attribute(env: gymnasium.Env[Any, Any], name: str) -> Any:
         return getattr(getattr(env.unwrapped, "task", None), name, None)
 
 
-def _tolerance(env: gymnasium.Env[Any, Any]) -> float:
-    tolerance = _attribute(env, "distance_threshold")
-    if tolerance is None:
-        raise ServiceError("the environment has no distance_threshold: give the tolerance")
-    return float(tolerance)
+def _tolerance(env: gymnasium.Env[Any, Any], samples: list[_Sample]) -> float:
+    """Returns the environment's own tolerance, or measures the distance at which its reward changes.
+
+    A measured tolerance has four significant digits.
+    """
+    threshold = _attribute(env, "distance_threshold")
+    compute_reward = _attribute(env, "compute_reward")
+    if threshold is not None or compute_reward is None:
+        return float(threshold or 0.0)
+    achieved = samples[0].observation["achieved_goal"].astype(np.float64)
+
+    def is_achieved(distance: float) -> bool:
+        desired = achieved.copy()
+        desired[0] += distance
+        return float(compute_reward(achieved, desired, samples[0].info)) == 0.0
+
+    low, high = 0.0, 1e-6
+    while is_achieved(high) and high < 1e6:
+        low, high = high, 2 * high
+    if low == 0.0 or is_achieved(high):
+        raise ServiceError("the reward does not change with the distance of a goal: give the tolerance")
+    for _ in range(40):
+        middle = (low + high) / 2
+        low, high = (middle, high) if is_achieved(middle) else (low, middle)
+    return float(f"{low:.4g}")
 
 
 def _episode_steps(env: gymnasium.Env[Any, Any], given: int | None) -> int:
@@ -298,11 +318,11 @@ def _checked_norm(
     env: gymnasium.Env[Any, Any], samples: list[_Sample], tolerance: float, given: Norm | None
 ) -> Norm:
     """Returns the norm for which the environment's reward is -1 beyond the tolerance and 0 within it."""
-    if not (np.isfinite(tolerance) and tolerance > 0):
-        raise ServiceError(f"the tolerance must be a positive number, not {tolerance}")
     compute_reward = _attribute(env, "compute_reward")
     if compute_reward is None:
         raise ServiceError("the environment has no compute_reward(achieved_goal, desired_goal, info)")
+    if not (np.isfinite(tolerance) and tolerance > 0):
+        raise ServiceError(f"the tolerance must be a positive number, not {tolerance}")
     rewards = []
     for achieved, desired, info in _goal_pairs(samples, tolerance):
         reward = float(compute_reward(achieved, desired, info))

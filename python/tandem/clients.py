@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import threading
+import time
 from collections.abc import Iterable, Iterator, Sequence
 from types import TracebackType
 from typing import Any, TypeVar
@@ -45,6 +46,8 @@ _TEMPORARY = frozenset({"UNAVAILABLE", "DEADLINE_EXCEEDED", "RESOURCE_EXHAUSTED"
 _KEEP_ALIVE_S = 0.04
 """Time between two signs of life; the bridge requires one every 0.1 s."""
 _STEP_S = 0.04
+_RESET_ATTEMPTS = 11
+_RESET_PAUSE_S = 0.1
 
 _ClientT = TypeVar("_ClientT", bound="_Client")
 
@@ -348,8 +351,20 @@ class Lease:
         self._token = token
 
     def reset(self) -> None:
-        """Releases stopped arms, so that they accept motions. Inspect the arms first."""
-        self._bridge._call(self._bridge._stub.Reset, bridge_pb2.ResetRequest(token=self._token))
+        """Releases stopped arms, so that they accept motions. Inspect the arms first.
+
+        A bridge that has just started, or arms that still brake, refuse a reset; it is repeated for up to a second.
+        """
+        request = bridge_pb2.ResetRequest(token=self._token)
+        for _ in range(_RESET_ATTEMPTS - 1):
+            try:
+                self._bridge._call(self._bridge._stub.Reset, request)
+                return
+            except CallError as error:
+                if error.code != "FAILED_PRECONDITION":
+                    raise
+            time.sleep(_RESET_PAUSE_S)
+        self._bridge._call(self._bridge._stub.Reset, request)
 
     def renew(self) -> None:
         """Renews the lease, which otherwise ends some seconds after the last request."""

@@ -304,3 +304,18 @@ def test_fetch_push_is_served_with_its_bits() -> None:
         # Neither an earlier episode in the same environment nor the number of environments matters.
         again = client.play([reset([(0, 9)]), step(actions[0, :1]), reset([(0, 4)]), *[step(a[1:]) for a in actions]])
         assert [answer.observations[100:] for answer in first] == [answer.observations for answer in again[2:]]
+
+
+def test_a_tolerance_that_the_environment_does_not_name_is_measured() -> None:
+    env = PointEnv(threshold=0.175)
+    del env.distance_threshold
+    env.compute_reward = lambda achieved, desired, info: -float(np.linalg.norm(achieved - desired) > 0.175)  # type: ignore[method-assign]
+    task, _ = describe(env, TaskOptions(episode_steps=5))
+    assert (task.tolerance, task.norm, task.name) == (0.175, "euclidean", "pointenv")
+
+
+def test_the_packages_own_environments_can_be_served() -> None:
+    with tandem.EnvironmentServer("tandem/TwoArmPush-v0", norm="euclidean") as server:
+        task = server.task
+    assert (task.n_observation, task.n_action, task.episode_steps, task.tolerance) == (56, 6, 50, 0.05)
+    assert tuple(task.achieved_goal) == (3, 4, 5, 31, 32, 33)
