@@ -1,6 +1,6 @@
 """A small Gymnasium environment with goals, for tests of servers."""
 
-from typing import Any, cast
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -62,8 +62,11 @@ class PointEnv(gymnasium.Env[dict[str, NDArray[Any]], NDArray[Any]]):
     def _observation(self) -> dict[str, NDArray[Any]]:
         noise = self.np_random.uniform(-9, 9)
         parts = [noise, *self._position[::-1], 7.0] if self._contained else [noise, 7.0]
-        own = {"observation": np.array(parts), "achieved_goal": self._position.copy(), "desired_goal": self._goal.copy()}
-        return cast(dict[str, NDArray[Any]], own)
+        return {
+            "observation": np.array(parts),
+            "achieved_goal": self._position.copy(),
+            "desired_goal": self._goal.copy(),
+        }
 
 
 def point_env(**kwargs: Any) -> gymnasium.Env[Any, Any]:

@@ -1,5 +1,8 @@
 """Clients of the built program's services."""
 
+import shutil
+import subprocess
+
 import pytest
 
 pytest.importorskip("grpc")
@@ -8,6 +11,7 @@ import numpy as np
 import tandem
 from services import ROOT, service
 
+POLICY = str(ROOT / "policies/teacher-push.safetensors")
 HOME = (tandem.WayPoint((-0.10, 0.02, 0.12)), tandem.WayPoint((0.10, -0.02, 0.12)))
 BUSY = {"late", "owner-silent", "state-old", "state-stale", "command-lost", "drive-fault"}
 """Reasons for which a busy machine may stop the arms."""
@@ -15,7 +19,7 @@ BUSY = {"late", "owner-silent", "state-old", "state-stale", "command-lost", "dri
 
 def test_a_teacher_answers_and_its_refusals_are_errors():
     with (
-        service("teacher", "--ledger", "memory", "--policy", str(ROOT / "policies/teacher-push.safetensors")) as address,
+        service("teacher", "--ledger", "memory", "--policy", POLICY) as address,
         tandem.Teacher(address) as teacher,
     ):
         assert teacher.describe().task == "push"
@@ -74,3 +78,40 @@ def test_a_stop_ends_a_motion_with_its_reason():
                 bridge.stop()
         assert raised.value.name == "requested" or raised.value.name in BUSY
         assert bridge.status().HasField("stopped")
+
+
+def test_calls_use_tls_and_the_token(tmp_path):
+    if shutil.which("openssl") is None:
+        pytest.skip("there is no openssl")
+    key, certificate, token = (tmp_path / name for name in ("key.pem", "certificate.pem", "token"))
+    token.write_text("0123456789abcdef")
+    subprocess.run(
+        ["openssl", "req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:P-256", "-nodes", "-days", "2"]
+        + ["-subj", "/CN=localhost", "-addext", "subjectAltName=DNS:localhost"]
+        + ["-keyout", str(key), "-out", str(certificate)],
+        check=True,
+        capture_output=True,
+    )
+    options = ["--tls-cert", str(certificate), "--tls-key", str(key), "--token-file", str(token)]
+    with service("teacher", "--ledger", "memory", "--policy", POLICY, *options) as address:
+        address = address.replace("127.0.0.1", "localhost")
+        with tandem.Teacher(address, tls_ca=certificate, token_file=token) as teacher:
+            assert teacher.describe().task == "push"
+        with tandem.Teacher(address, tls_ca=certificate) as teacher:
+            with pytest.raises(tandem.CallError) as raised:
+                teacher.describe()
+            assert raised.value.code == "UNAUTHENTICATED"
+        with pytest.raises(tandem.ServiceError, match="requires TLS"):
+            tandem.Teacher(f"https://{address}")
+
+    def act(observation, goal):
+        return np.zeros((len(observation), 3))
+
+    tls = {"tls_cert": certificate, "tls_key": key, "token_file": token}
+    client = ["--tls-ca", str(certificate), "--token-file", str(token)]
+    with (
+        tandem.PolicyServer(act, task="push", listen="localhost:0", **tls) as server,
+        service("teacher", "--ledger", "memory", "--policy", server.address, *client) as address,
+        tandem.Teacher(address, token_file=token) as teacher,
+    ):
+        assert teacher.describe().policy_digest == server.digest

@@ -85,12 +85,14 @@ def test_an_episode_has_the_bits_of_the_environment_and_rescaled_actions(client:
     for index, episode in enumerate((8, 9)):
         env = PointEnv()
         observation, _ = env.reset(seed=episode_seed(5, episode))
-        assert answers[0].goals[8 * index : 8 * index + 8] == observation["desired_goal"].astype("<f4").tobytes()
+        goal = observation["desired_goal"].astype("<f4")
+        assert answers[0].goals[8 * index : 8 * index + 8] == goal.tobytes()
         for answer, action in zip(answers, [None, *actions]):
             if action is not None:
                 low, high = action[index].astype(np.float64)
                 observation = env.step(np.array([2 * low, (high + 1) / 2]))[0]
-            assert answer.observations[16 * index : 16 * index + 16] == observation["observation"].astype("<f4").tobytes()
+            expected = observation["observation"].astype("<f4")
+            assert answer.observations[16 * index : 16 * index + 16] == expected.tobytes()
         assert all(env.action_space.contains(action) for action in env.actions)
 
 
@@ -309,7 +311,7 @@ def test_fetch_push_is_served_with_its_bits() -> None:
 def test_a_tolerance_that_the_environment_does_not_name_is_measured() -> None:
     env = PointEnv(threshold=0.175)
     del env.distance_threshold
-    env.compute_reward = lambda achieved, desired, info: -float(np.linalg.norm(achieved - desired) > 0.175)  # type: ignore[method-assign]
+    env.compute_reward = lambda a, b, info: -float(np.linalg.norm(a - b) > 0.175)  # type: ignore[method-assign]
     task, _ = describe(env, TaskOptions(episode_steps=5))
     assert (task.tolerance, task.norm, task.name) == (0.175, "euclidean", "pointenv")
 

@@ -232,3 +232,8 @@ def test_a_teacher_refuses_what_is_not_a_policy_server(tmp_path):
     with service("bridge", "--driver", "sim") as bridge:
         code, line = refusal("teacher", "--ledger", "memory", "--policy", f"http://{bridge}")
         assert code == 64 and "cannot be used" in line, line
+
+
+def test_a_run_on_one_machine_needs_the_file_of_its_teacher(tmp_path):
+    code, line = refusal("train", "--teacher", "http://127.0.0.1:1", "--out", str(tmp_path / "run"))
+    assert code == 64 and "`tandem train` needs a file" in line, line

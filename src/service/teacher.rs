@@ -51,8 +51,7 @@ enum PolicySource {
 impl PolicySource {
     /// Distinguishes URLs from files, and checks files before anything is bound.
     fn new(policy: PathBuf, critic: Option<PathBuf>) -> Result<Self, Failed> {
-        let is_url = |text: &&str| text.starts_with("http://") || text.starts_with("https://");
-        match policy.to_str().filter(is_url) {
+        match policy_address(&policy) {
             Some(_) if critic.is_some() => Err(teacher_failed(Error::SurplusCritic)),
             Some(address) => Ok(Self::Server(address.to_owned())),
             None => {
@@ -71,6 +70,11 @@ impl PolicySource {
             }
         }
     }
+}
+
+/// Returns the address of the server that a policy's place on the command line names, if it is a URL.
+pub(crate) fn policy_address(policy: &Path) -> Option<&str> {
+    policy.to_str().filter(|text| text.starts_with("http://") || text.starts_with("https://"))
 }
 
 /// Opens the ledger. A ledger whose name is not UTF-8 can only be a file.

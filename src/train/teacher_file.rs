@@ -11,7 +11,7 @@ use tandem_teacher::{Error, Strategy, TeacherPolicy as _};
 
 use crate::exit::{Exit, Failed, OrExit as _};
 use crate::policy_file;
-use crate::service::teacher_failed;
+use crate::service::{policy_address, teacher_failed};
 
 /// File names of a teacher's copy: a policy file, or the models of an actor and of a critic.
 const POLICY_COPY: &str = "teacher.safetensors";
@@ -32,6 +32,12 @@ pub(crate) struct TeacherFile {
 impl TeacherFile {
     /// Loads a policy file, or the ONNX model of an actor with its critic.
     pub(super) fn load(path: PathBuf, critic: Option<PathBuf>) -> Result<Self, Failed> {
+        if let Some(address) = policy_address(&path) {
+            return Err(Failed::usage(format!(
+                "--teacher {address}: a run keeps a copy of its teacher, so `tandem train` needs a file; for a policy on \
+                 a server, start `tandem teacher --policy {address}`, `tandem learner` and `tandem worker`"
+            )));
+        }
         if is_onnx(&path) {
             let models = OnnxPolicy::load(&path, critic.as_deref()).map_err(teacher_failed)?;
             let (digest, layout) = (models.digest().to_owned(), models.layout());
