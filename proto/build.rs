@@ -8,7 +8,14 @@ use prost::Message as _;
 fn main() -> Result<(), Box<dyn Error>> {
     println!("cargo:rerun-if-changed=proto");
     let files = protox::compile(
-        ["tandem/v1/teacher.proto", "tandem/v1/learner.proto", "tandem/v1/bridge.proto"],
+        [
+            "tandem/v1/bridge.proto",
+            "tandem/v1/environment.proto",
+            "tandem/v1/learner.proto",
+            "tandem/v1/policy.proto",
+            "tandem/v1/task.proto",
+            "tandem/v1/teacher.proto",
+        ],
         ["proto"],
     )?;
     let out = PathBuf::from(std::env::var_os("OUT_DIR").ok_or("cargo sets OUT_DIR")?);

@@ -8,6 +8,7 @@ use crate::version::VERSION;
 mod bench;
 mod bridge;
 mod monitor;
+mod policy;
 mod results;
 mod scene;
 mod service;
@@ -19,9 +20,8 @@ pub(crate) use bridge::{
     BridgeArgs, BridgeCommand, BridgeServeArgs, ConnectArgs, DriverName, MoveArgs, OperatorArgs,
 };
 pub(crate) use monitor::{HealthArgs, StatusArgs};
-pub(crate) use results::{
-    EvalArgs, McapArgs, McapCommand, PictureArgs, PolicyArgs, PolicyCommand, ReplayArgs, ReportArgs,
-};
+pub(crate) use policy::{ExportArgs, ImportArgs, PolicyArgs, PolicyCommand, ShowArgs};
+pub(crate) use results::{EvalArgs, McapArgs, McapCommand, PictureArgs, ReplayArgs, ReportArgs};
 pub(crate) use scene::SceneArgs;
 pub(crate) use service::{
     ClientArgs, LearnerArgs, ListenArgs, RelayArgs, SecretArgs, TeacherArgs, WorkerArgs,
@@ -80,7 +80,7 @@ pub(crate) enum Command {
     Status(StatusArgs),
     /// Benchmarks the simulator, networks, updates, replay buffer and a short run on this machine.
     Bench(BenchArgs),
-    /// Inspects policy files.
+    /// Inspects policies, and converts them from and to ONNX.
     Policy(PolicyArgs),
     /// Repairs MCAP logs.
     Mcap(McapArgs),

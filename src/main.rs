@@ -22,6 +22,7 @@ mod logging;
 mod mcap;
 mod output;
 mod picture;
+mod policy;
 mod policy_file;
 mod progress_text;
 mod replay;
@@ -73,7 +74,7 @@ fn dispatch(command: Command) -> Result<(), Failed> {
         Command::Health(args) => health::health(&args),
         Command::Status(args) => status::status(&args),
         Command::Bench(args) => bench::bench(&args),
-        Command::Policy(args) => policy_file::policy(&args),
+        Command::Policy(args) => policy::policy(args.command),
         Command::Mcap(args) => mcap::mcap(&args),
         Command::Replay(args) => replay::replay(&args),
         Command::Picture(args) => picture::picture(&args),

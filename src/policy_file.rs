@@ -1,17 +1,20 @@
-//! Policy files: loading them, the shipped teachers, and `tandem policy`.
+//! Policy files: loading them, and the shipped teachers.
 
-use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-use serde_json::json;
 use tandem_policy::Policy;
+use tandem_teacher::policy::is_onnx;
 
-use crate::cli::{PolicyArgs, PolicyCommand};
 use crate::exit::{Exit, Failed, OrExit as _};
-use crate::output;
 
 /// Loads a policy file.
 pub(crate) fn load(path: &Path) -> Result<Policy, Failed> {
+    if is_onnx(path) {
+        let shown = path.display();
+        return Err(Failed::usage(format!(
+            "{shown} is an ONNX model: convert it with `tandem policy import {shown} --out FILE.safetensors`"
+        )));
+    }
     Policy::load(path).or_exit(Exit::Data, String::new)
 }
 
@@ -31,35 +34,4 @@ pub(crate) fn shipped_teacher(task: &str) -> Result<PathBuf, Failed> {
              and name its policy/best.safetensors with --teacher"
         ))
     })
-}
-
-/// `tandem policy show`.
-pub(crate) fn policy(args: &PolicyArgs) -> Result<(), Failed> {
-    let PolicyCommand::Show { file, json } = &args.command;
-    let policy = load(file)?;
-    let metadata: BTreeMap<_, _> = policy.metadata.iter().collect();
-    if *json {
-        return output::print(json!({
-            "task": policy.layout.task.name(), "arms": policy.layout.n_arms, "n_hidden": policy.n_hidden,
-            "n_hidden_layers": policy.n_hidden_layers, "critic_heads": policy.n_heads, "digest": policy.digest(),
-            "metadata": metadata,
-        }));
-    }
-    output::print(format_args!("task          {}", policy.layout.task))?;
-    output::print(format_args!("arms          {}", policy.layout.n_arms))?;
-    output::print(format_args!(
-        "networks      {} hidden layers of {}, critic heads {}",
-        policy.n_hidden_layers, policy.n_hidden, policy.n_heads
-    ))?;
-    output::print(format_args!(
-        "parameters    actor {}, critic {}",
-        policy.actor.len(),
-        policy.critic.len()
-    ))?;
-    output::print(format_args!("digest        {}", policy.digest()))?;
-    for (key, value) in metadata {
-        let [key, value] = [key, value].map(|text| output::escaped(text).replace('\n', "\\n"));
-        output::print(format_args!("{key:<22} {value}"))?;
-    }
-    Ok(())
 }

@@ -14,7 +14,7 @@ use crate::runtime;
 pub(crate) use learner::learner;
 pub(crate) use listen::listen;
 pub(crate) use relay::relay;
-pub(crate) use teacher::{teacher, teacher_failed};
+pub(crate) use teacher::{policy_address, teacher, teacher_failed};
 pub(crate) use worker::worker;
 
 /// Runs a service to its end on this thread.

@@ -9,6 +9,7 @@ mod progress_stream;
 mod restart_policy;
 mod run_lock;
 mod summary;
+mod teacher_file;
 
 use std::time::{Duration, Instant};
 

@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 use std::path::{Path, PathBuf};
 
-const ALLOWED: [(&str, &[&str]); 15] = [
+const ALLOWED: [(&str, &[&str]); 16] = [
     ("core", &[]),
     ("system", &[]),
     ("kinematics", &["core"]),
@@ -14,8 +14,9 @@ const ALLOWED: [(&str, &[&str]); 15] = [
     ("telemetry", &["core", "system"]),
     ("net", &["core"]),
     ("rl", &["core", "policy"]),
+    ("onnx", &["core", "policy"]),
     ("learner", &["core", "system", "policy", "rl", "proto", "telemetry", "net"]),
-    ("teacher", &["core", "policy", "proto", "telemetry", "net"]),
+    ("teacher", &["core", "policy", "proto", "telemetry", "net", "onnx"]),
     ("worker", &["core", "sim", "policy", "proto", "telemetry", "net"]),
     ("report", &["core", "system", "telemetry"]),
     ("bridge", &["core", "kinematics", "proto", "net"]),

@@ -38,6 +38,9 @@ pub struct Policy {
     pub metadata: BTreeMap<String, String>,
 }
 
+/// The metadata entry of a policy without a critic, whose values are all 0, such as an actor from another program.
+pub const NO_CRITIC: (&str, &str) = ("critic", "none");
+
 /// One named array of a policy.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Tensor<'a> {
@@ -78,6 +81,13 @@ impl Policy {
         let (observation, goal) =
             (self.observation_normalizer.clone(), self.goal_normalizer.clone());
         Critic::new(self.layout, &self.critic_shape(), &self.critic, observation, goal)
+    }
+
+    /// Returns true unless the metadata says that the policy has no critic; see [`NO_CRITIC`].
+    #[must_use]
+    pub fn has_critic(&self) -> bool {
+        let (key, value) = NO_CRITIC;
+        self.metadata.get(key).is_none_or(|critic| critic != value)
     }
 
     /// Returns the actor in the form that a learner publishes to workers, as version `version`.

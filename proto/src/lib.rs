@@ -31,6 +31,7 @@ pub mod advice;
 mod codec;
 mod error;
 mod numbers;
+pub mod policy;
 pub mod work;
 
 pub use advice::{
@@ -38,6 +39,10 @@ pub use advice::{
     layout_of_query,
 };
 pub use error::DecodeError;
+pub use policy::{
+    MAX_POLICY_STATES, PolicyAnswers, PolicyDescription, decode_policy_answers,
+    decode_policy_description, encode_policy_request,
+};
 pub use work::{
     decode_actor, decode_episode, decode_run_terms, decode_slot, encode_actor, encode_episode,
     encode_run_terms, encode_slot,

@@ -41,7 +41,7 @@ pub(super) fn teacher() -> Result<Vec<Figure>, Failed> {
     let made = std::fs::create_dir_all(&directory);
     made.or_exit(Exit::TryAgain, || format!("cannot create {}", directory.display()))?;
     let ledger = directory.join("ledger.sqlite").to_string_lossy().into_owned();
-    let config = tandem_teacher::Config { policy, ledger };
+    let config = tandem_teacher::Config { policy, critic: None, ledger };
     let figures = runtime::new().and_then(|runtime| runtime.block_on(measure(config)));
     drop(std::fs::remove_dir_all(&directory));
     figures.or_exit(Exit::TryAgain, || "cannot measure the teacher".to_owned())

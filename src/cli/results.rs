@@ -76,24 +76,6 @@ pub(crate) struct ReportArgs {
 }
 
 #[derive(Debug, Args)]
-pub(crate) struct PolicyArgs {
-    #[command(subcommand)]
-    pub(crate) command: PolicyCommand,
-}
-
-#[derive(Debug, Subcommand)]
-pub(crate) enum PolicyCommand {
-    /// Shows sizes, training settings and the digest.
-    Show {
-        /// The policy file.
-        file: PathBuf,
-        /// Prints one JSON object.
-        #[arg(long)]
-        json: bool,
-    },
-}
-
-#[derive(Debug, Args)]
 #[command(after_help = "\
 Examples:
   tandem replay runs/NAME/mcap/eval-000100-000.mcap     step by step

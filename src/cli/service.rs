@@ -47,12 +47,20 @@ pub(crate) struct ClientArgs {
 Examples:
   tandem teacher --policy policies/teacher-push.safetensors --listen 127.0.0.1:7001
   tandem teacher --policy FILE --ledger runs/mine/ledger.sqlite
+  tandem teacher --policy actor.onnx --critic critic.onnx               trained elsewhere
   tandem teacher --policy FILE --ledger redis://:PASSWORD@redis:6379   several teachers, one budget
-  tandem teacher --policy FILE --ledger memory                          lost at exit")]
+  tandem teacher --policy FILE --ledger memory                          lost at exit
+  tandem teacher --policy http://127.0.0.1:7005                         a policy in another process
+
+docs/python-services.md shows how to serve a policy from Python.")]
 pub(crate) struct TeacherArgs {
-    /// Policy file of the one-arm teacher.
-    #[arg(long, value_name = "FILE")]
+    /// Policy of the one-arm teacher: a policy file, the ONNX model of an actor (*.onnx), or http://HOST:PORT
+    /// (https:// with --tls-ca) of a server of tandem.v1.Policy, which is called with the token of --token-file.
+    #[arg(long, value_name = "FILE|URL")]
     pub(crate) policy: PathBuf,
+    /// ONNX model of the actor's critic. Without it, strategies that compare values are not offered.
+    #[arg(long, value_name = "FILE.onnx")]
+    pub(crate) critic: Option<PathBuf>,
     /// Storage of the accounts: an SQLite file that no other teacher uses, `redis://[USER:PASSWORD@]HOST[:PORT][/DB]`,
     /// or `memory`.
     #[arg(
@@ -65,6 +73,8 @@ pub(crate) struct TeacherArgs {
     pub(crate) ledger: OsString,
     #[command(flatten)]
     pub(crate) listen: ListenArgs,
+    #[command(flatten)]
+    pub(crate) client_config: ClientArgs,
     #[command(flatten)]
     pub(crate) secret: SecretArgs,
 }

@@ -20,6 +20,7 @@ Examples:
   tandem train                                        two arms, push, strategy mc-q:0.1, shipped teacher
   tandem train --arms 1 --task push --until-success 0.97
   tandem train --strategy ea --budget 50000 --seed 2 --max-minutes 20
+  tandem train --teacher actor.onnx --teacher-critic critic.onnx
   tandem train --set ddpg.discount=0.98 --set rounds.slots=16
   tandem train --run my-run.toml --out runs/mine
   tandem train --resume --out runs/mine               resumes the run
@@ -36,9 +37,12 @@ pub(crate) struct TrainArgs {
     /// [default: mc-q:0.1 with two arms, none with one].
     #[arg(long, value_name = "NAME[:THRESHOLD]")]
     pub(crate) strategy: Option<String>,
-    /// Policy file of the teacher [default: the shipped teacher of the task].
+    /// Policy file of the teacher, or the ONNX model of an actor (*.onnx) [default: the shipped teacher of the task].
     #[arg(long, value_name = "FILE")]
     pub(crate) teacher: Option<PathBuf>,
+    /// ONNX model of the teacher's critic. Without it, strategies that compare values cannot be used.
+    #[arg(long, value_name = "FILE.onnx", requires = "teacher")]
+    pub(crate) teacher_critic: Option<PathBuf>,
     /// Advice budget of the run, in environment steps with advice [default: 500000].
     #[arg(long, value_name = "N")]
     pub(crate) budget: Option<u64>,

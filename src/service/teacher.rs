@@ -3,22 +3,30 @@
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 
-use tandem_net::Pacing;
-use tandem_teacher::ledger::{OpenError, SqliteLedger};
-use tandem_teacher::policy::OneArmPolicy;
-use tandem_teacher::{Advisor, Error};
+use tandem_net::{ClientConfig, Pacing};
+use tandem_teacher::ledger::{self, Ledger, OpenError, SqliteLedger};
+use tandem_teacher::policy;
+use tandem_teacher::{Advisor, AnyPolicy, Error, PolicyTimeouts, RemoteError, RemotePolicy};
 
 use super::{listen, run};
 use crate::cli::TeacherArgs;
 use crate::exit::{Exit, Failed};
-use crate::{access, policy_file, signals};
+use crate::{access, signals};
 
 pub(crate) fn teacher(args: TeacherArgs) -> Result<(), Failed> {
-    policy_file::load(&args.policy)?;
+    let source = PolicySource::new(args.policy, args.critic)?;
     let server_config = access::server_config(&args.listen, &args.secret)?;
+    let client_config = access::client_config(&args.client_config, &args.secret)?;
     run(async move {
         let shutdown = signals::shutdown_token(args.listen.exit_with_stdin)?;
-        let advisor = advisor(args.policy, args.ledger).map_err(teacher_failed)?;
+        let opened = async {
+            let policy = source.open(&client_config).await?;
+            Advisor::new(policy, open_ledger(args.ledger)?)
+        };
+        let advisor = tokio::select! {
+            advisor = opened => advisor.map_err(teacher_failed)?,
+            () = shutdown.cancelled() => return Ok(()),
+        };
         let listener = listen(&args.listen).await?;
         let served = tandem_teacher::serve_advisor(
             advisor,
@@ -32,14 +40,48 @@ pub(crate) fn teacher(args: TeacherArgs) -> Result<(), Failed> {
     })
 }
 
-/// Opens the teacher's policy with its ledger. A ledger whose name is not UTF-8 can only be a file.
-fn advisor(policy: PathBuf, ledger: OsString) -> Result<Advisor, Error> {
-    match ledger.into_string() {
-        Ok(ledger) => tandem_teacher::open(&tandem_teacher::Config { policy, ledger }),
-        Err(file) => {
-            let policy = OneArmPolicy::load(&policy)?;
-            Advisor::new(Box::new(policy), Box::new(SqliteLedger::open(Path::new(&file))?))
+/// The kind of a policy, as the command line names it.
+enum PolicySource {
+    /// A policy file, or an ONNX model with its critic.
+    File { policy: PathBuf, critic: Option<PathBuf> },
+    /// The address of a server of `tandem.v1.Policy`.
+    Server(String),
+}
+
+impl PolicySource {
+    /// Distinguishes URLs from files, and checks files before anything is bound.
+    fn new(policy: PathBuf, critic: Option<PathBuf>) -> Result<Self, Failed> {
+        match policy_address(&policy) {
+            Some(_) if critic.is_some() => Err(teacher_failed(Error::SurplusCritic)),
+            Some(address) => Ok(Self::Server(address.to_owned())),
+            None => {
+                policy::load(&policy, critic.as_deref()).map_err(teacher_failed)?;
+                Ok(Self::File { policy, critic })
+            }
         }
+    }
+
+    async fn open(&self, client_config: &ClientConfig) -> Result<AnyPolicy, Error> {
+        match self {
+            Self::File { policy, critic } => Ok(policy::load(policy, critic.as_deref())?.into()),
+            Self::Server(address) => {
+                let timeouts = PolicyTimeouts::default();
+                Ok(RemotePolicy::connect(address, client_config, timeouts).await?.into())
+            }
+        }
+    }
+}
+
+/// Returns the address of the server that a policy's place on the command line names, if it is a URL.
+pub(crate) fn policy_address(policy: &Path) -> Option<&str> {
+    policy.to_str().filter(|text| text.starts_with("http://") || text.starts_with("https://"))
+}
+
+/// Opens the ledger. A ledger whose name is not UTF-8 can only be a file.
+fn open_ledger(ledger: OsString) -> Result<Box<dyn Ledger>, Error> {
+    match ledger.into_string() {
+        Ok(location) => Ok(ledger::open(&location)?),
+        Err(file) => Ok(Box::new(SqliteLedger::open(Path::new(&file))?)),
     }
 }
 
@@ -51,7 +93,10 @@ pub(crate) fn teacher_failed(error: Error) -> Failed {
         E::OpenLedger(OpenError::InUse(_) | OpenError::Io { .. } | OpenError::Server { .. }) => {
             Exit::TryAgain
         }
+        E::RemotePolicy(RemoteError::Unavailable { .. }) => Exit::TryAgain,
+        E::RemotePolicy(RemoteError::Address(_) | RemoteError::Refused { .. }) => Exit::Usage,
         E::Transport(_) | E::Thread(_) => Exit::TryAgain,
+        E::SurplusCritic => Exit::Usage,
         E::Panicked => Exit::Bug,
         _ => Exit::Data,
     };

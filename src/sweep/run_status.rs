@@ -7,6 +7,7 @@ use serde_json::Value as Json;
 use tandem_learner::checkpoint;
 use tandem_rl::RunConfig;
 use tandem_system::{atomic_file, regular_file};
+use tandem_teacher::policy::is_onnx;
 use toml::{Table, Value};
 
 use super::sweep_file::{PlannedRun, flattened};
@@ -127,7 +128,11 @@ fn shortest(value: &Value) -> String {
 /// Returns whether the run's copy of its teacher equals the file that the sweep file names.
 fn same_teacher(run: &PlannedRun, dir: &Path) -> bool {
     let Some(teacher) = &run.teacher else { return true };
-    let copy = regular_file::read(&dir.join("policy/teacher.safetensors"));
+    let copy = match is_onnx(teacher) {
+        true => "policy/teacher.onnx",
+        false => "policy/teacher.safetensors",
+    };
+    let copy = regular_file::read(&dir.join(copy));
     // The run itself reports a missing file.
     let named = regular_file::read(teacher);
     copy.ok().zip(named.ok()).is_none_or(|(copy, named)| copy == named)

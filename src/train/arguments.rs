@@ -9,7 +9,12 @@ use super::plan::Plan;
 /// Returns the arguments of the teacher.
 pub(super) fn teacher(plan: &Plan) -> Vec<OsString> {
     let mut args = command("teacher");
-    push_path(&mut args, "--policy", &inputs::teacher(&plan.out));
+    if let Some(teacher) = &plan.teacher {
+        push_path(&mut args, "--policy", &inputs::teacher(&plan.out, teacher));
+        if let Some(critic) = inputs::teacher_critic(&plan.out, teacher) {
+            push_path(&mut args, "--critic", &critic);
+        }
+    }
     push_path(&mut args, "--ledger", &plan.ledger());
     args
 }
@@ -21,8 +26,10 @@ pub(super) fn learner(plan: &Plan, teacher_address: Option<&str>, resume: bool) 
     push_path(&mut args, "--run", &inputs::settings(&plan.out));
     push_path(&mut args, "--out", &plan.out);
     push_address(&mut args, "--teacher", teacher_address);
-    if plan.config.advice.starts_from_teacher() {
-        push_path(&mut args, "--start-from", &inputs::teacher(&plan.out));
+    if let Some(teacher) =
+        plan.teacher.as_ref().filter(|_| plan.config.advice.starts_from_teacher())
+    {
+        push_path(&mut args, "--start-from", &inputs::teacher(&plan.out, teacher));
     }
     if resume {
         args.push("--resume".into());

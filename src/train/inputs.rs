@@ -5,6 +5,7 @@
 use std::path::{Path, PathBuf};
 
 use super::plan::Plan;
+use super::teacher_file::TeacherFile;
 use crate::exit::{Exit, Failed, OrExit as _};
 use crate::run_file;
 
@@ -23,8 +24,8 @@ impl RunInputs {
         let text = run_file::to_text(&plan.config)?;
         std::fs::write(settings(&plan.out), text).or_exit(Exit::TryAgain, failed)?;
         if let Some(teacher) = &plan.teacher {
-            let saved = teacher.policy.save(&self::teacher(&plan.out));
-            saved.or_exit(Exit::TryAgain, failed)?;
+            let written = teacher.write_to(&inputs.directory);
+            written.map_err(|failure| failure.context(failed()))?;
         }
         Ok(inputs)
     }
@@ -46,6 +47,11 @@ pub(super) fn settings(out: &Path) -> PathBuf {
 }
 
 /// Returns the path of the teacher's policy.
-pub(super) fn teacher(out: &Path) -> PathBuf {
-    directory(out).join("teacher.safetensors")
+pub(super) fn teacher(out: &Path, teacher: &TeacherFile) -> PathBuf {
+    teacher.copy_path(&directory(out))
+}
+
+/// Returns the path of the teacher's critic, if it has a file of its own.
+pub(super) fn teacher_critic(out: &Path, teacher: &TeacherFile) -> Option<PathBuf> {
+    teacher.critic_copy_path(&directory(out))
 }

@@ -4,11 +4,10 @@ use std::path::{Path, PathBuf};
 
 use tandem_core::Task;
 use tandem_learner::{checkpoint, settings};
-use tandem_policy::Policy;
 use tandem_rl::RunConfig;
-use tandem_system::atomic_file;
 use toml::Value;
 
+use super::teacher_file::TeacherFile;
 use crate::cli::{RecipeName, TrainArgs};
 use crate::exit::{Exit, Failed, OrExit as _};
 use crate::{policy_file, run_directory, run_file};
@@ -20,12 +19,6 @@ pub(crate) struct Plan {
     pub(crate) teacher: Option<TeacherFile>,
     pub(crate) n_workers: usize,
     pub(crate) resume: bool,
-}
-
-/// The policy of the teacher, as read from its file.
-pub(crate) struct TeacherFile {
-    path: PathBuf,
-    pub(crate) policy: Policy,
 }
 
 impl Plan {
@@ -99,34 +92,41 @@ impl Plan {
 
     /// Rejects a teacher other than the run's own.
     fn check_teacher(&self) -> Result<(), Failed> {
-        let copy = self.teacher_copy();
-        let Some(teacher) = self.teacher.as_ref().filter(|teacher| teacher.path != copy) else {
-            return Ok(());
-        };
+        let Some(teacher) = self.foreign_teacher() else { return Ok(()) };
         // A missing or damaged copy is replaced.
-        match Policy::load(&copy) {
-            Ok(own) if own.digest() != teacher.policy.digest() => Err(Failed::usage(format!(
+        match TeacherFile::copy_in(&self.policies()) {
+            Some(Ok(own)) if own.digest() != teacher.digest() => Err(Failed::usage(format!(
                 "--teacher {}: the run's own teacher, {}, is another policy: leave --teacher out, or start a new run",
-                teacher.path.display(),
-                copy.display()
+                teacher.path().display(),
+                own.path().display()
             ))),
             _ => Ok(()),
         }
     }
 
-    /// Copies the teacher's file to the run directory, unless an intact copy exists.
+    /// Copies the teacher's files to the run directory, unless an intact copy exists.
     pub(crate) fn keep_teacher(&self) -> Result<(), Failed> {
-        let copy = self.teacher_copy();
-        let Some(teacher) = self.teacher.as_ref().filter(|teacher| teacher.path != copy) else {
-            return Ok(());
-        };
-        if Policy::load(&copy).is_ok_and(|own| own.digest() == teacher.policy.digest()) {
+        let Some(teacher) = self.foreign_teacher() else { return Ok(()) };
+        let own = TeacherFile::copy_in(&self.policies());
+        if own.is_some_and(|own| own.is_ok_and(|own| own.digest() == teacher.digest())) {
             return Ok(());
         }
-        let written = std::fs::create_dir_all(self.out.join("policy"))
-            .and_then(|()| std::fs::read(&teacher.path))
-            .and_then(|bytes| atomic_file::replace(&copy, &bytes));
-        written.or_cannot_write(|| format!("cannot write {}", copy.display()))
+        let directory = self.policies();
+        std::fs::create_dir_all(&directory)
+            .or_cannot_write(|| format!("cannot write {}", directory.display()))?;
+        teacher.copy_to(&directory)
+    }
+
+    /// Returns the teacher, unless it is the run's own copy.
+    fn foreign_teacher(&self) -> Option<&TeacherFile> {
+        let is_foreign =
+            |teacher: &&TeacherFile| teacher.path() != teacher.copy_path(&self.policies());
+        self.teacher.as_ref().filter(is_foreign)
+    }
+
+    /// Returns the directory of the run's policies.
+    fn policies(&self) -> PathBuf {
+        self.out.join("policy")
     }
 
     pub(crate) fn run_file(&self) -> PathBuf {
@@ -150,15 +150,6 @@ impl Plan {
     pub(crate) fn ledger(&self) -> PathBuf {
         self.out.join("ledger.sqlite")
     }
-
-    /// Returns the path of the run's copy of the teacher.
-    pub(crate) fn teacher_copy(&self) -> PathBuf {
-        teacher_copy(&self.out)
-    }
-}
-
-fn teacher_copy(out: &Path) -> PathBuf {
-    out.join("policy/teacher.safetensors")
 }
 
 /// Resolves the settings; those of a resumed run come from its own run file.
@@ -233,24 +224,14 @@ fn free_run_directory(config: &RunConfig) -> PathBuf {
 
 /// Loads the teacher, which must be a one-arm policy for the task.
 fn teacher_file(args: &TrainArgs, config: &RunConfig, out: &Path) -> Result<TeacherFile, Failed> {
-    let path = match &args.teacher {
-        Some(path) => path.clone(),
-        None if args.resume && teacher_copy(out).exists() => teacher_copy(out),
-        None => policy_file::shipped_teacher(&config.task)?,
+    let own = || TeacherFile::copy_in(&out.join("policy"));
+    let teacher = match &args.teacher {
+        Some(path) => TeacherFile::load(path.clone(), args.teacher_critic.clone())?,
+        None => match args.resume.then(own).flatten() {
+            Some(own) => own?,
+            None => TeacherFile::load(policy_file::shipped_teacher(&config.task)?, None)?,
+        },
     };
-    let policy = policy_file::load(&path)?;
-    let shown = path.display();
-    if policy.layout.n_arms != 1 {
-        return Err(Failed::usage(format!(
-            "{shown} drives {} arms: a teacher drives one",
-            policy.layout.n_arms
-        )));
-    }
-    if policy.layout.task.name() != config.task {
-        return Err(Failed::usage(format!(
-            "{shown} is a teacher for {}, the run is for {}",
-            policy.layout.task, config.task
-        )));
-    }
-    Ok(TeacherFile { path, policy })
+    teacher.check(config)?;
+    Ok(teacher)
 }

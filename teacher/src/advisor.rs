@@ -12,7 +12,7 @@ use crate::budget::{AccountTerms, Balance, BudgetHalf, Charge, Lease};
 use crate::error::Error;
 use crate::ledger::{ChargeRequest, ChargeResult, Ledger, LedgerError};
 use crate::maps::Maps;
-use crate::policy::TeacherPolicy;
+use crate::policy::AnyPolicy;
 use crate::strategy::Strategy;
 use inference::TeacherInference;
 
@@ -35,6 +35,8 @@ pub struct TeacherInfo {
     pub layout: Layout,
     /// The digest of the policy.
     pub digest: String,
+    /// Whether the policy values actions.
+    pub has_values: bool,
     /// The maps from a student's vectors to each arm's.
     pub maps: Maps,
 }
@@ -62,7 +64,8 @@ impl Advisor {
     ///
     /// # Errors
     /// When the policy is not for one arm.
-    pub fn new(policy: Box<dyn TeacherPolicy>, ledger: Box<dyn Ledger>) -> Result<Self, Error> {
+    pub fn new(policy: impl Into<AnyPolicy>, ledger: Box<dyn Ledger>) -> Result<Self, Error> {
+        let policy = policy.into();
         let layout = policy.layout();
         if layout.n_arms != 1 {
             return Err(Error::NotOneArm { n_arms: layout.n_arms, n_values: 1 });
@@ -70,6 +73,7 @@ impl Advisor {
         let info = TeacherInfo {
             layout,
             digest: policy.digest().to_owned(),
+            has_values: policy.has_values(),
             maps: Maps::new(Layout::new(layout.task, MAX_ARMS)),
         };
         let inference = TeacherInference::new(policy);
@@ -85,8 +89,10 @@ impl Advisor {
     /// Opens account `name`, or returns it if it is open with the same terms.
     ///
     /// # Errors
-    /// When it is open with other terms, the budget is too large, or the ledger cannot be used.
+    /// When it is open with other terms, the budget is too large, the strategy needs values that the policy does not
+    /// have, or the ledger cannot be used.
     pub fn open_account(&mut self, name: &str, terms: AccountTerms) -> Result<Balance, Error> {
+        self.check_offered(terms.strategy)?;
         Ok(self.ledger.open(name, terms)?)
     }
 
@@ -134,7 +140,7 @@ impl Advisor {
     ///
     /// # Errors
     /// Per request: when its account is not open, a step lies beyond the end of an episode that has a lease, the
-    /// networks return a number that is not finite, or the ledger cannot be used.
+    /// policy cannot be evaluated or returns a number that is not finite, or the ledger cannot be used.
     ///
     /// # Panics
     /// When a query's lengths match no layout of the teacher's task with 1 to [`MAX_ARMS`] arms, or the ledger does not
@@ -183,11 +189,20 @@ impl Advisor {
             return Ok(*strategy);
         }
         let strategy = self.ledger.balance(account)?.terms.strategy;
+        self.check_offered(strategy)?;
         if self.strategies.len() >= MAX_CACHED_STRATEGIES {
             self.strategies.clear();
         }
         self.strategies.insert(account.to_owned(), strategy);
         Ok(strategy)
+    }
+
+    /// Refuses a strategy that needs values if the policy has none.
+    const fn check_offered(&self, strategy: Strategy) -> Result<(), Error> {
+        if strategy.needs_values() && !self.info.has_values {
+            return Err(Error::NoValues { strategy });
+        }
+        Ok(())
     }
 
     fn charge(&mut self, requests: &[ChargeRequest]) -> Vec<Result<ChargeResult, LedgerError>> {

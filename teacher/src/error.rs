@@ -5,7 +5,8 @@ use std::time::Duration;
 use tandem_proto::DecodeError;
 
 use crate::ledger::{LedgerError, OpenError};
-use crate::strategy::UnknownStrategy;
+use crate::remote_policy::RemoteError;
+use crate::strategy::{Strategy, UnknownStrategy};
 
 /// The reason why a teacher cannot start or cannot answer.
 #[derive(Debug, thiserror::Error)]
@@ -22,6 +23,25 @@ pub enum Error {
         n_arms: usize,
         /// The number of values of its critic.
         n_values: usize,
+    },
+    /// An ONNX model cannot be used as the teacher's policy.
+    #[error("cannot use the teacher's policy")]
+    Onnx(#[from] tandem_onnx::Error),
+    /// The policy is in another process, which cannot be used.
+    #[error(transparent)]
+    RemotePolicy(#[from] RemoteError),
+    /// A critic is given besides a policy file.
+    #[error("a critic is given apart only for an ONNX model: a policy file contains its own")]
+    SurplusCritic,
+    /// A strategy compares values of actions, and the teacher's policy has none.
+    #[error(
+        "strategy {strategy} compares values of actions, and the teacher's policy has no critic: use {usable}, or a \
+         teacher with a critic",
+        usable = Strategy::names(false).join(", ")
+    )]
+    NoValues {
+        /// The strategy.
+        strategy: Strategy,
     },
     /// A request is invalid.
     #[error(transparent)]

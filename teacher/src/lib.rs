@@ -8,7 +8,7 @@
 //! - [`maps`] relates a student's vectors to those of each arm.
 //! - [`strategy`] and [`procedures`] decide when an arm is overridden.
 //! - [`budget`] defines accounts, leases and charges; [`ledger`] stores them in memory, in a file or on a server.
-//! - [`advisor`] combines these with a [`TeacherPolicy`].
+//! - [`advisor`] combines these with a [`TeacherPolicy`]; [`remote_policy`] is one in another process.
 //! - [`service`] serves an [`Advisor`] as `tandem.v1.Teacher`.
 //!
 //! The first three are pure. The crate does not depend on the student's network, its learning or its simulator.
@@ -41,6 +41,7 @@ pub mod ledger;
 pub mod maps;
 pub mod policy;
 pub mod procedures;
+pub mod remote_policy;
 pub mod service;
 pub mod strategy;
 
@@ -49,6 +50,7 @@ mod fake;
 
 pub use advisor::{Advice, AdviceRequest, Advisor, TeacherInfo};
 pub use error::Error;
-pub use policy::TeacherPolicy;
+pub use policy::{AnyPolicy, TeacherPolicy};
+pub use remote_policy::{PolicyTimeouts, RemoteError, RemotePolicy};
 pub use service::{Config, open, serve, serve_advisor};
 pub use strategy::{Strategy, UnknownStrategy};

@@ -1,19 +1,33 @@
 //! The teacher's policy.
 
+mod onnx;
+
 use std::path::Path;
 
 use tandem_core::Layout;
 use tandem_policy::{Actor, Critic, Policy};
 
 use crate::error::Error;
+use crate::remote_policy::{RemoteError, RemotePolicy};
+
+pub use onnx::OnnxPolicy;
+
+/// Extension of the files that hold an ONNX model.
+const ONNX_EXTENSION: &str = "onnx";
 
 /// A policy for one arm with an actor and a critic. Rows are states of one arm.
 pub trait TeacherPolicy: Send {
     /// Returns the task's layout for one arm.
     fn layout(&self) -> Layout;
 
-    /// Returns the SHA-256 of the parameters, hexadecimal.
+    /// Returns the text that identifies the policy: the SHA-256 of the parameters, hexadecimal.
     fn digest(&self) -> &str;
+
+    /// Returns true if the policy values actions. If not, the teacher refuses strategies that compare values, and does
+    /// not call [`q`](Self::q).
+    fn has_values(&self) -> bool {
+        true
+    }
 
     /// Writes the actions of `π_tr`, shape `[n, n_action]`, for `observations`, shape `[n, n_observation]`, and
     /// `goals`, shape `[n, n_goal]`.
@@ -23,9 +37,132 @@ pub trait TeacherPolicy: Send {
     fn q(&mut self, observations: &[f32], goals: &[f32], actions: &[f32], q: &mut [f32]);
 }
 
+/// The policy that an advisor consults.
+pub enum AnyPolicy {
+    /// A policy in this process.
+    Local(Box<dyn TeacherPolicy>),
+    /// A policy in another process.
+    Remote(RemotePolicy),
+}
+
+impl AnyPolicy {
+    /// Returns the task's layout for one arm.
+    #[must_use]
+    pub fn layout(&self) -> Layout {
+        match self {
+            Self::Local(policy) => policy.layout(),
+            Self::Remote(policy) => policy.layout(),
+        }
+    }
+
+    /// Returns the text that identifies the policy.
+    #[must_use]
+    pub fn digest(&self) -> &str {
+        match self {
+            Self::Local(policy) => policy.digest(),
+            Self::Remote(policy) => policy.digest(),
+        }
+    }
+
+    /// Returns whether the policy values actions.
+    #[must_use]
+    pub fn has_values(&self) -> bool {
+        match self {
+            Self::Local(policy) => policy.has_values(),
+            Self::Remote(policy) => policy.has_values(),
+        }
+    }
+
+    /// Fills in the answers of `batch`. Without values, all values are 0.
+    ///
+    /// # Errors
+    /// When the policy is in another process, which does not answer, or not as it should.
+    pub(crate) fn evaluate(&mut self, batch: &mut Batch) -> Result<(), RemoteError> {
+        match self {
+            Self::Local(policy) => batch.evaluate(policy.as_mut()),
+            Self::Remote(policy) => policy.evaluate(batch)?,
+        }
+        Ok(())
+    }
+}
+
+impl From<Box<dyn TeacherPolicy>> for AnyPolicy {
+    fn from(policy: Box<dyn TeacherPolicy>) -> Self {
+        Self::Local(policy)
+    }
+}
+
+impl<P: TeacherPolicy + 'static> From<Box<P>> for AnyPolicy {
+    fn from(policy: Box<P>) -> Self {
+        Self::Local(policy)
+    }
+}
+
+impl From<RemotePolicy> for AnyPolicy {
+    fn from(policy: RemotePolicy) -> Self {
+        Self::Remote(policy)
+    }
+}
+
+/// States, the student's actions in them, and the teacher's answers. A row is one arm of one step.
+#[derive(Debug, Default)]
+pub(crate) struct Batch {
+    /// The number `n` of rows.
+    pub(crate) n_rows: usize,
+    /// Shape `[n, n_observation]`; after an evaluation in this process every state twice, for the two actions.
+    pub(crate) observations: Vec<f32>,
+    /// Shape `[n, n_goal]`; after an evaluation in this process every goal twice.
+    pub(crate) goals: Vec<f32>,
+    /// Shape `[n, n_action]`.
+    pub(crate) student_actions: Vec<f32>,
+    /// The teacher's actions, then the student's, shape `[2 n, n_action]`.
+    pub(crate) actions: Vec<f32>,
+    /// The values of these actions, shape `[2 n]`.
+    pub(crate) q: Vec<f32>,
+}
+
+impl Batch {
+    /// Runs the actor once on all states, and the critic once on all states with both actions.
+    fn evaluate(&mut self, policy: &mut dyn TeacherPolicy) {
+        self.actions.clear();
+        self.actions.resize(self.student_actions.len(), 0.0);
+        policy.act(&self.observations, &self.goals, &mut self.actions);
+        self.actions.extend_from_slice(&self.student_actions);
+        self.q.clear();
+        self.q.resize(2 * self.n_rows, 0.0);
+        if policy.has_values() {
+            self.observations.extend_from_within(..);
+            self.goals.extend_from_within(..);
+            policy.q(&self.observations, &self.goals, &self.actions, &mut self.q);
+        }
+    }
+}
+
+/// Loads the policy at `policy`, of the kind that its extension says: an ONNX model of an actor, with the model of its
+/// critic in `critic`, or else a policy file.
+///
+/// # Errors
+/// When a file cannot be read or is not a valid policy for one arm, or `critic` is given with a policy file.
+pub fn load(policy: &Path, critic: Option<&Path>) -> Result<Box<dyn TeacherPolicy>, Error> {
+    if is_onnx(policy) {
+        return Ok(Box::new(OnnxPolicy::load(policy, critic)?));
+    }
+    match critic {
+        Some(_) => Err(Error::SurplusCritic),
+        None => Ok(Box::new(OneArmPolicy::load(policy)?)),
+    }
+}
+
+/// Returns true if the extension of `path` is that of an ONNX model.
+#[must_use]
+pub fn is_onnx(path: &Path) -> bool {
+    path.extension().is_some_and(|extension| extension.eq_ignore_ascii_case(ONNX_EXTENSION))
+}
+
 /// A loaded policy for one arm.
 pub struct OneArmPolicy {
     digest: String,
+    has_critic: bool,
     actor: Actor,
     critic: Critic,
 }
@@ -50,7 +187,12 @@ impl OneArmPolicy {
                 n_values: policy.n_heads,
             });
         }
-        Ok(Self { digest: policy.digest(), actor: policy.actor()?, critic: policy.critic()? })
+        Ok(Self {
+            digest: policy.digest(),
+            has_critic: policy.has_critic(),
+            actor: policy.actor()?,
+            critic: policy.critic()?,
+        })
     }
 }
 
@@ -61,6 +203,10 @@ impl TeacherPolicy for OneArmPolicy {
 
     fn digest(&self) -> &str {
         &self.digest
+    }
+
+    fn has_values(&self) -> bool {
+        self.has_critic
     }
 
     fn act(&mut self, observations: &[f32], goals: &[f32], actions: &mut [f32]) {

@@ -18,7 +18,8 @@ use crate::advisor::Advisor;
 use crate::budget::{AccountTerms, BudgetError};
 use crate::error::Error;
 use crate::ledger::{self, LedgerError};
-use crate::policy::OneArmPolicy;
+use crate::policy;
+use crate::remote_policy::RemoteError;
 use advice::{AdviceStream, advise, advise_stream};
 use convert::{check_episodes, describe, encode_balance, encode_lease};
 use thread::{AdvisorHandle, AdvisorThread};
@@ -31,8 +32,10 @@ const ANSWER_TIMEOUT: Duration = Duration::from_secs(4);
 /// The configuration of a teacher service.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Config {
-    /// The teacher's policy file.
+    /// The teacher's policy; see [`policy::load`].
     pub policy: PathBuf,
+    /// The critic of a policy that is an ONNX model.
+    pub critic: Option<PathBuf>,
     /// The location of the ledger; see [`ledger::open`].
     pub ledger: String,
 }
@@ -42,8 +45,8 @@ pub struct Config {
 /// # Errors
 /// When the policy cannot be loaded, or the ledger cannot be opened.
 pub fn open(config: &Config) -> Result<Advisor, Error> {
-    let policy = OneArmPolicy::load(&config.policy)?;
-    Advisor::new(Box::new(policy), ledger::open(&config.ledger)?)
+    let policy = policy::load(&config.policy, config.critic.as_deref())?;
+    Advisor::new(policy, ledger::open(&config.ledger)?)
 }
 
 /// Serves the teacher of `config`, with the access control of `server_config`, until `shutdown` is cancelled.
@@ -226,6 +229,7 @@ fn status(error: &Error) -> Status {
     match error {
         Error::Request(_)
         | Error::Strategy(_)
+        | Error::NoValues { .. }
         | Error::Ledger(
             LedgerError::Budget(BudgetError::BudgetTooLarge(_)) | LedgerError::BeyondEnd { .. },
         ) => Status::invalid_argument(message),
@@ -235,14 +239,23 @@ fn status(error: &Error) -> Status {
         Error::Ledger(LedgerError::Budget(BudgetError::OtherTerms { .. })) => {
             Status::already_exists(message)
         }
-        Error::Ledger(LedgerError::Unavailable { .. }) | Error::Timeout(_) => {
+        Error::RemotePolicy(RemoteError::Changed { .. }) => {
+            tracing::error!(%error, "request refused");
+            Status::failed_precondition(message)
+        }
+        Error::Ledger(LedgerError::Unavailable { .. })
+        | Error::Timeout(_)
+        | Error::RemotePolicy(RemoteError::Unavailable { .. }) => {
             tracing::error!(%error, "request failed");
             Status::unavailable(message)
         }
         Error::Policy(_)
+        | Error::Onnx(_)
+        | Error::SurplusCritic
         | Error::OpenLedger(_)
         | Error::NotOneArm { .. }
         | Error::NotFinite { .. }
+        | Error::RemotePolicy(_)
         | Error::Panicked
         | Error::Thread(_)
         | Error::ServerConfig(_)

@@ -51,6 +51,20 @@ impl Strategy {
     /// The names of the strategies; `T` and `A` are thresholds.
     pub const NAMES: [&str; 6] = ["none", "ea", "eamc:T", "mc-q:T", "mc-act:A", "mc-act-abs:A"];
 
+    /// Returns the names of the strategies that a teacher offers which `has_values` of actions, or has none.
+    #[must_use]
+    pub fn names(has_values: bool) -> Vec<&'static str> {
+        let is_offered =
+            |name: &&str| has_values || !(name.starts_with("eamc") || name.starts_with("mc-q"));
+        Self::NAMES.into_iter().filter(is_offered).collect()
+    }
+
+    /// Returns true if the strategy compares values of actions.
+    #[must_use]
+    pub const fn needs_values(self) -> bool {
+        matches!(self, Self::EarlyThenMistakeQ { .. } | Self::MistakeQ { .. })
+    }
+
     /// Returns the procedure for a step whose unit would come from `half` of the budget.
     #[must_use]
     pub const fn procedure(self, half: BudgetHalf) -> Option<Procedure> {
@@ -169,6 +183,15 @@ mod tests {
                 "{message}"
             );
             assert!(message.ends_with(&format!("got {text:?}")), "{message}");
+        }
+    }
+
+    #[test]
+    fn a_teacher_without_values_offers_exactly_the_strategies_that_need_none() {
+        assert_eq!(Strategy::names(true), Strategy::NAMES);
+        for name in Strategy::NAMES {
+            let strategy: Strategy = name.split(':').next().unwrap().parse().unwrap();
+            assert_eq!(Strategy::names(false).contains(&name), !strategy.needs_values(), "{name}");
         }
     }
 

@@ -1,6 +1,7 @@
 use super::*;
 use crate::fake::{FakePolicy, query};
 use crate::ledger::MemoryLedger;
+use crate::policy::TeacherPolicy;
 
 fn advisor(budget: u64, strategy: &str) -> Advisor {
     let mut advisor =
@@ -271,4 +272,54 @@ fn the_strategy_of_an_account_is_cached() {
     let advice = advise(&mut advisor, "walk", &[two_arms(0)]).unwrap();
     assert_eq!((advice.steps[0].charged, advisor.strategies.len()), (false, 1));
     assert!(ask(&mut advisor, &two_arms(1)).charged, "looked up again");
+}
+
+/// A policy that values nothing: `q` must not be called.
+struct Valueless;
+
+impl TeacherPolicy for Valueless {
+    fn layout(&self) -> Layout {
+        FakePolicy.layout()
+    }
+
+    fn digest(&self) -> &str {
+        ""
+    }
+
+    fn has_values(&self) -> bool {
+        false
+    }
+
+    fn act(&mut self, observations: &[f32], goals: &[f32], actions: &mut [f32]) {
+        FakePolicy.act(observations, goals, actions);
+    }
+
+    fn q(&mut self, _observations: &[f32], _goals: &[f32], _actions: &[f32], _q: &mut [f32]) {
+        panic!("a policy without values is asked for them");
+    }
+}
+
+#[test]
+fn a_policy_without_values_advises_by_strategies_that_compare_none() {
+    let mut ledger = MemoryLedger::default();
+    let terms = |strategy: &str| AccountTerms { budget: 10, strategy: strategy.parse().unwrap() };
+    ledger.open("from-before", terms("mc-q:0.1")).unwrap();
+    let mut advisor = Advisor::new(Box::new(Valueless), Box::new(ledger)).unwrap();
+    for strategy in ["mc-q:0.1", "eamc:0.1"] {
+        let refusal = advisor.open_account(strategy, terms(strategy)).unwrap_err().to_string();
+        let expected = format!(
+            "strategy {strategy} compares values of actions, and the teacher's policy has no critic: use none, ea, \
+             mc-act:A, mc-act-abs:A, or a teacher with a critic"
+        );
+        assert_eq!(refusal, expected);
+    }
+    let refused = advise(&mut advisor, "from-before", &[two_arms(0)]);
+    assert!(matches!(refused, Err(Error::NoValues { .. })), "{refused:?}");
+    for strategy in ["ea", "mc-act:0.1", "mc-act-abs:0.1"] {
+        advisor.open_account(strategy, terms(strategy)).unwrap();
+        let advice = advise(&mut advisor, strategy, &[two_arms(0)]).unwrap();
+        assert!(advice.steps[0].charged, "{strategy}");
+        let scores = advice.steps[0].arms.iter().map(|arm| (arm.q_teacher, arm.importance));
+        assert!(scores.eq([(0.0, 0.0); 2]), "{strategy}");
+    }
 }

@@ -49,7 +49,7 @@ pub(super) fn describe(info: &TeacherInfo) -> pb::DescribeResponse {
         n_goal_per_arm: index(layout.n_goal()),
         n_action_per_arm: index(layout.n_action()),
         arms: info.maps.arms().iter().map(encode_map).collect(),
-        strategies: Strategy::NAMES.map(str::to_owned).to_vec(),
+        strategies: Strategy::names(info.has_values).into_iter().map(str::to_owned).collect(),
         policy_digest: info.digest.clone(),
     }
 }

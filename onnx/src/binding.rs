@@ -1,0 +1,236 @@
+//! Networks bound to the vectors of a layout.
+
+use std::collections::BTreeMap;
+use std::ops::Range;
+
+use tandem_core::{Layout, Task};
+
+use crate::error::ModelError;
+use crate::metadata;
+use crate::model::Model;
+use crate::network::{Input, Network};
+
+/// Largest number of arms that [`layout_of`] considers.
+const MAX_ARMS: usize = 8;
+
+/// What a network computes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Role {
+    /// Actions from observations and goals.
+    Actor,
+    /// Values from observations, goals and actions.
+    Critic,
+}
+
+/// Where a column of a network comes from. The number is an index in a row of the layout's vector.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Source {
+    /// A number of the observation.
+    Observation(usize),
+    /// A number of the goal.
+    Goal(usize),
+    /// A number of the action.
+    Action(usize),
+}
+
+/// A network whose inputs are the vectors of a layout.
+///
+/// The result for a row has the same bits in any batch and on every machine.
+#[derive(Debug, Clone)]
+pub struct BoundNetwork {
+    layout: Layout,
+    network: Network,
+    /// Source of each of the network's columns.
+    sources: Vec<Source>,
+    row: Vec<f32>,
+    scratch: Vec<f32>,
+}
+
+impl BoundNetwork {
+    /// Binds the network of `model` to `layout`.
+    ///
+    /// Inputs are recognised by their names: `observation` (or `obs`, `state`), `goal` (or `desired_goal`), `achieved_goal`,
+    /// which is a part of the observation, and `action` (or `actions`). A model with one input, or whose `observation`
+    /// is that long, takes observation and goal, and as a critic the action, concatenated in this order.
+    ///
+    /// # Errors
+    /// When an input has another name or length, or an actor's output is not as long as an action.
+    pub fn new(model: &Model, role: Role, layout: Layout) -> Result<Self, ModelError> {
+        let network = &model.network;
+        if role == Role::Actor && network.n_output != layout.n_action() {
+            return Err(ModelError::Value {
+                kind: "output",
+                name: network.output.clone(),
+                problem: format!(
+                    "it has {} numbers, an action of {} with {} arm(s) has {}",
+                    network.n_output,
+                    layout.task,
+                    layout.n_arms,
+                    layout.n_action()
+                ),
+            });
+        }
+        let is_only = network.inputs.len() == 1;
+        let inputs = network.inputs.iter().map(|input| sources(input, is_only, role, layout));
+        let inputs = inputs.collect::<Result<Vec<_>, _>>()?;
+        let sources = network.columns.iter().map(|column| inputs[column.input][column.index]);
+        let sources = sources.collect();
+        Ok(Self { layout, network: network.clone(), sources, row: Vec::new(), scratch: Vec::new() })
+    }
+
+    /// Returns the layout.
+    #[must_use]
+    pub const fn layout(&self) -> Layout {
+        self.layout
+    }
+
+    /// Returns the network.
+    #[must_use]
+    pub const fn network(&self) -> &Network {
+        &self.network
+    }
+
+    /// Returns the source of each column of the network.
+    #[must_use]
+    pub fn sources(&self) -> &[Source] {
+        &self.sources
+    }
+
+    /// Writes the outputs, shape `[n, n_output]`, for `observations`, shape `[n, n_observation]`, `goals`, shape
+    /// `[n, n_goal]`, and `actions`, shape `[n, n_action]`, or empty for an actor.
+    ///
+    /// # Panics
+    /// If the lengths do not match the layout or each other.
+    pub fn run(
+        &mut self,
+        observations: &[f32],
+        goals: &[f32],
+        actions: &[f32],
+        outputs: &mut [f32],
+    ) {
+        let (n_observation, n_goal) = (self.layout.n_observation(), self.layout.n_goal());
+        let (n_action, n_output) = (self.layout.n_action(), self.network.n_output);
+        let n_rows = observations.len() / n_observation;
+        let n_actions = if actions.is_empty() { 0 } else { n_rows * n_action };
+        assert_eq!(
+            (observations.len(), goals.len(), actions.len(), outputs.len()),
+            (n_rows * n_observation, n_rows * n_goal, n_actions, n_rows * n_output),
+            "rows of another layout"
+        );
+        for (row, output) in outputs.chunks_exact_mut(n_output).enumerate() {
+            let number = |source: &Source| match *source {
+                Source::Observation(i) => observations[row * n_observation + i],
+                Source::Goal(i) => goals[row * n_goal + i],
+                Source::Action(i) => actions[row * n_action + i],
+            };
+            let columns = self.network.columns.iter().zip(&self.sources);
+            self.row.clear();
+            self.row.extend(columns.map(|(column, source)| column.apply(number(source))));
+            self.network.run(&mut self.row, &mut self.scratch);
+            output.copy_from_slice(&self.row);
+        }
+    }
+}
+
+/// Returns the layout of `model`: the one in its metadata, or the only one whose vectors fit.
+///
+/// # Errors
+/// When no layout fits, or several do.
+pub fn layout_of(model: &Model, role: Role) -> Result<Layout, ModelError> {
+    if let Some(layout) = layout_in_metadata(&model.metadata)? {
+        return Ok(layout);
+    }
+    let candidates =
+        Task::ALL.into_iter().flat_map(|task| (1..=MAX_ARMS).map(move |n| Layout::new(task, n)));
+    let fitting = candidates.filter(|layout| BoundNetwork::new(model, role, *layout).is_ok());
+    let fitting: Vec<Layout> = fitting.collect();
+    match fitting.as_slice() {
+        [layout] => Ok(*layout),
+        // The error for one arm names the first input or output that does not fit.
+        [] => match BoundNetwork::new(model, role, Layout::new(Task::Push, 1)) {
+            Err(error) => Err(error),
+            Ok(_) => Err(ModelError::Model("it fits no task".to_owned())),
+        },
+        _ => Err(ModelError::Model(format!(
+            "its inputs and outputs fit several tasks: add the metadata entries {:?} and {:?}",
+            metadata::TASK,
+            metadata::N_ARMS
+        ))),
+    }
+}
+
+fn layout_in_metadata(entries: &BTreeMap<String, String>) -> Result<Option<Layout>, ModelError> {
+    let (Some(task), Some(n_arms)) = (entries.get(metadata::TASK), entries.get(metadata::N_ARMS))
+    else {
+        return Ok(None);
+    };
+    let refused = |key: &str, value: &str, expected: String| {
+        let value = tandem_core::text::shortened(value, 80);
+        ModelError::Model(format!("metadata {key:?} is {value:?}, expected {expected}"))
+    };
+    let task = task.parse::<Task>().map_err(|_unknown| {
+        refused(metadata::TASK, task, Task::ALL.map(Task::name).join(" or "))
+    })?;
+    match n_arms.parse::<usize>() {
+        Ok(n @ 1..=MAX_ARMS) => Ok(Some(Layout::new(task, n))),
+        _ => Err(refused(metadata::N_ARMS, n_arms, format!("1 to {MAX_ARMS}"))),
+    }
+}
+
+/// Returns the sources of the numbers of an input.
+fn sources(
+    input: &Input,
+    is_only: bool,
+    role: Role,
+    layout: Layout,
+) -> Result<Vec<Source>, ModelError> {
+    let observation = || (0..layout.n_observation()).map(Source::Observation);
+    let goal = || (0..layout.n_goal()).map(Source::Goal);
+    let action = || (0..layout.n_action()).map(Source::Action);
+    let achieved = || layout.arms().flat_map(|arm| layout.achieved_goal_of(arm));
+    let has_action = role == Role::Critic;
+    let mut candidates: Vec<Vec<Source>> = Vec::new();
+    let name = input.name.to_ascii_lowercase();
+    match name.as_str() {
+        "observation" | "observations" | "obs" | "state" => {
+            candidates.extend([observation().collect(), observation().chain(goal()).collect()]);
+        }
+        "goal" | "goals" | "desired_goal" => candidates.push(goal().collect()),
+        "achieved_goal" => candidates.push(achieved().map(Source::Observation).collect()),
+        "action" | "actions" if has_action => candidates.push(action().collect()),
+        _ => {}
+    }
+    if is_only {
+        let actions = action().take(if has_action { usize::MAX } else { 0 });
+        candidates.push(observation().chain(goal()).chain(actions).collect());
+    }
+    let refused = |problem| ModelError::Value { kind: "input", name: input.name.clone(), problem };
+    if candidates.is_empty() {
+        let names = match role {
+            Role::Actor => "observation, goal (desired_goal) or achieved_goal",
+            Role::Critic => "observation, goal (desired_goal), achieved_goal or action",
+        };
+        return Err(refused(format!("the name is unknown, expected {names}, or a single input")));
+    }
+    let lengths: Vec<String> = candidates.iter().map(|sources| sources.len().to_string()).collect();
+    let fitting = candidates.into_iter().find(|sources| sources.len() == input.width);
+    fitting.ok_or_else(|| {
+        refused(format!(
+            "it has {} numbers, {} with {} arm(s) has {}",
+            input.width,
+            layout.task,
+            layout.n_arms,
+            lengths.join(" or ")
+        ))
+    })
+}
+
+/// Returns the range of the observation, then of the goal and of the action, in an input row of a policy's network.
+pub(crate) fn policy_columns(layout: Layout) -> [Range<usize>; 3] {
+    let n_state = layout.n_observation() + layout.n_goal();
+    [
+        0..layout.n_observation(),
+        layout.n_observation()..n_state,
+        n_state..n_state + layout.n_action(),
+    ]
+}

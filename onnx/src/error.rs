@@ -1,0 +1,79 @@
+//! Errors of reading, running, importing and exporting models.
+
+use std::path::PathBuf;
+
+/// An error of reading a model from a file.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    /// The file cannot be read.
+    #[error("cannot read ONNX file {path:?}")]
+    Read {
+        /// The file.
+        path: PathBuf,
+        /// Error of the operating system.
+        source: std::io::Error,
+    },
+    /// The file was read but does not contain a usable model.
+    #[error("{path:?} is not a usable ONNX model")]
+    Refused {
+        /// The file.
+        path: PathBuf,
+        /// The reason.
+        source: Box<ModelError>,
+    },
+}
+
+/// The reason why a model is refused.
+#[derive(Debug, thiserror::Error)]
+pub enum ModelError {
+    /// The bytes are not a Protobuf message.
+    #[error("it is not a complete ONNX file")]
+    NotOnnx,
+    /// The file is larger, or has more parts, than a policy can have.
+    #[error("it has {got} {what}, expected at most {most}")]
+    TooLarge {
+        /// What is counted.
+        what: &'static str,
+        /// Its number.
+        got: usize,
+        /// The largest accepted number.
+        most: usize,
+    },
+    /// The model has no graph, or uses an unsupported version of the operators.
+    #[error("{0}")]
+    Model(String),
+    /// A node is not supported.
+    #[error("node {node:?} ({operator}): {problem}")]
+    Node {
+        /// The node's name, or that of its first output.
+        node: String,
+        /// The node's operator.
+        operator: String,
+        /// What is not supported, and what is.
+        problem: String,
+    },
+    /// A tensor is not supported.
+    #[error("tensor {tensor:?}: {problem}")]
+    Tensor {
+        /// The tensor's name.
+        tensor: String,
+        /// What is not supported, and what is.
+        problem: String,
+    },
+    /// An input or output of the model does not fit the layout or the role.
+    #[error("{kind} {name:?}: {problem}")]
+    Value {
+        /// `input` or `output`.
+        kind: &'static str,
+        /// The value's name.
+        name: String,
+        /// What is wrong, and what is expected.
+        problem: String,
+    },
+    /// The network is valid, but a policy file cannot represent it.
+    #[error("a policy file cannot represent it: {0}")]
+    NotRepresentable(String),
+    /// The policy has invalid sizes or numbers.
+    #[error(transparent)]
+    Policy(#[from] tandem_policy::Error),
+}

@@ -1,0 +1,90 @@
+//! An environment together with its current observation.
+
+use pyo3::PyErr;
+use pyo3::exceptions::{PyRuntimeError, PyValueError};
+use tandem_core::reward::{achieved_goal, is_success, sparse_reward};
+use tandem_core::{Contacts, Layout, Stream, Task, WorldSettings, episode_rng};
+use tandem_sim::{Env, SimError, WorldConfig};
+
+/// An environment, its observation and the result of its last step.
+#[derive(Clone)]
+pub(crate) struct Episode {
+    pub(crate) env: Env,
+    settings: WorldSettings,
+    /// Shape `[n_observation]`.
+    pub(crate) observation: Vec<f32>,
+    /// Shape `[n_goal]`.
+    pub(crate) achieved_goal: Vec<f32>,
+    pub(crate) reward: f32,
+    pub(crate) is_success: bool,
+    pub(crate) contacts: Contacts,
+}
+
+impl Episode {
+    /// Creates the environment of `task`, which must be reset before it is stepped.
+    ///
+    /// # Errors
+    /// Returns a `ValueError` if the task is unknown or a setting is out of range.
+    pub(crate) fn new(task: &str, n_arms: usize, settings: WorldSettings) -> Result<Self, PyErr> {
+        let task: Task = task.parse().map_err(value_error)?;
+        settings.check().map_err(value_error)?;
+        let layout = Layout::new(task, n_arms);
+        let env = Env::new(layout, &WorldConfig::from(settings)).map_err(value_error)?;
+        Ok(Self {
+            env,
+            settings,
+            observation: vec![0.0; layout.n_observation()],
+            achieved_goal: vec![0.0; layout.n_goal()],
+            reward: 0.0,
+            is_success: false,
+            contacts: Contacts::NONE,
+        })
+    }
+
+    pub(crate) fn layout(&self) -> Layout {
+        self.env.layout()
+    }
+
+    /// Starts episode `number` of the run with seed `seed`.
+    pub(crate) fn start(&mut self, seed: u64, number: u64) {
+        self.env.reset(&mut episode_rng(seed, number, Stream::Reset), self.settings);
+        self.contacts = Contacts::NONE;
+        self.observe();
+        self.reward = 0.0;
+    }
+
+    /// Executes `action`, shape `[n_action]`, and observes the result.
+    ///
+    /// # Errors
+    /// As [`Env::step`].
+    pub(crate) fn step(&mut self, action: &[f32]) -> Result<(), SimError> {
+        self.contacts = self.env.step(action)?;
+        self.observe();
+        Ok(())
+    }
+
+    /// Updates observation, achieved goal, reward and success.
+    pub(crate) fn observe(&mut self) {
+        let layout = self.layout();
+        self.env.observe(&mut self.observation);
+        for (to, from) in
+            self.achieved_goal.iter_mut().zip(achieved_goal(layout, &self.observation))
+        {
+            *to = from;
+        }
+        self.reward = sparse_reward(&self.achieved_goal, self.env.goal());
+        self.is_success = is_success(layout, &self.observation, self.env.goal());
+    }
+}
+
+/// Converts an error of a step: a bad action is a `ValueError`, diverging physics a `RuntimeError`.
+pub(crate) fn step_error(error: &SimError) -> PyErr {
+    match error {
+        SimError::ActionLength { .. } | SimError::ActionNotFinite { .. } => value_error(error),
+        _ => PyRuntimeError::new_err(error.to_string()),
+    }
+}
+
+pub(crate) fn value_error(error: impl std::fmt::Display) -> PyErr {
+    PyValueError::new_err(error.to_string())
+}

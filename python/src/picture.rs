@@ -1,0 +1,256 @@
+//! Pictures of scenes: table, arms, objects and goals in perspective, with shadows, computed by casting rays.
+//!
+//! The colours, the light and the direction of the view are those of the SVG pictures in reports. A ray caster draws
+//! bodies that penetrate each other, such as fingers around an object, in the right order at every pixel.
+
+mod camera;
+mod shape;
+
+use glam::DVec3;
+use tandem_core::layout::GOAL_TOLERANCE_M;
+use tandem_core::scene::{ArmScene, Capsule, Cuboid, Scene};
+
+use camera::{Camera, Rectangle};
+use shape::{Hit, Shape};
+
+/// Red, green and blue, 0 to 255.
+type Rgb = DVec3;
+
+/// Colours of the arms' joints and of their objects and goals; further arms reuse them.
+const ARM_COLORS: [Rgb; 3] = [
+    DVec3::new(47.0, 120.0, 189.0),
+    DVec3::new(224.0, 128.0, 51.0),
+    DVec3::new(60.0, 154.0, 102.0),
+];
+const TABLE_COLOR: Rgb = DVec3::new(233.0, 228.0, 219.0);
+const LINK_COLOR: Rgb = DVec3::new(238.0, 240.0, 243.0);
+const HAND_COLOR: Rgb = DVec3::new(74.0, 82.0, 92.0);
+const PEDESTAL_COLOR: Rgb = DVec3::new(89.0, 97.0, 107.0);
+const SKY_COLORS: [Rgb; 2] = [DVec3::new(247.0, 249.0, 251.0), DVec3::new(223.0, 229.0, 235.0)];
+/// Direction towards the light, a unit vector.
+const LIGHT: DVec3 = DVec3::new(-0.36, -0.48, 0.80);
+/// Ratio of the brightness in a shadow to that beside it.
+const SHADOW: f64 = 0.84;
+/// Opacity of goals.
+const GOAL_OPACITY: f64 = 0.34;
+/// Half the width of the ring on the table below a goal, metres.
+const RING_HALF_WIDTH_M: f64 = 0.0016;
+/// Half the lengths of the edges of a pedestal, metres.
+const PEDESTAL_HALF_M: [f32; 3] = [0.075, 0.075, 0.0175];
+/// Ratio of the radius of a joint to that of its links.
+const JOINT_WIDENING: f64 = 1.12;
+/// Samples along each edge of a pixel at the edge of a body.
+const N_SAMPLES: usize = 3;
+/// Distance from a surface at which the rays of its shadow start, metres.
+const SHADOW_OFFSET_M: f64 = 1e-4;
+/// Index of the table among the bodies.
+const TABLE: usize = 0;
+
+/// Draws `scene` and returns red, green and blue, shape `[height, width, 3]`.
+pub(crate) fn picture(scene: &Scene, width: usize, height: usize) -> Vec<u8> {
+    let painter = Painter::new(scene, width, height);
+    let bodies: Vec<Sample> =
+        pixels(width, height).map(|(x, y)| painter.sample(centre(x), centre(y))).collect();
+    let mut picture = Vec::with_capacity(3 * width * height);
+    for (x, y) in pixels(width, height) {
+        let here = &bodies[y * width + x];
+        let (right, below) = ((x + 1).min(width - 1), (y + 1).min(height - 1));
+        let (left, above) = (x.saturating_sub(1), y.saturating_sub(1));
+        let neighbours =
+            [y * width + right, y * width + left, below * width + x, above * width + x];
+        let is_edge = neighbours.iter().any(|idx| bodies[*idx].surface != here.surface);
+        let color = if is_edge { painter.smooth(x, y) } else { here.color };
+        picture.extend(color.to_array().map(to_u8));
+    }
+    picture
+}
+
+fn pixels(width: usize, height: usize) -> impl Iterator<Item = (usize, usize)> {
+    (0..height).flat_map(move |y| (0..width).map(move |x| (x, y)))
+}
+
+/// Returns the centre of a pixel.
+#[expect(clippy::cast_precision_loss, reason = "pixels of a picture that fits into memory")]
+fn centre(pixel: usize) -> f64 {
+    pixel as f64 + 0.5
+}
+
+#[expect(
+    clippy::cast_possible_truncation,
+    clippy::cast_sign_loss,
+    reason = "clamped to 0..=255 first"
+)]
+fn to_u8(value: f64) -> u8 {
+    value.round().clamp(0.0, 255.0) as u8
+}
+
+/// A body with its colour and the part of the picture that contains it.
+struct Body {
+    shape: Shape,
+    color: Rgb,
+    bounds: Rectangle,
+}
+
+struct Goal {
+    shape: Shape,
+    position: DVec3,
+    color: Rgb,
+    bounds: Rectangle,
+}
+
+/// What a ray meets.
+struct Sample {
+    color: Rgb,
+    surface: Surface,
+}
+
+/// What distinguishes the surfaces between which edges are smoothed.
+#[derive(PartialEq, Clone, Copy)]
+struct Surface {
+    body: Option<usize>,
+    is_lit: bool,
+    /// The normal in steps of a quarter, so that the faces of a box differ and those of a cylinder mostly do not.
+    face: [i8; 3],
+    /// A bit for each goal in front of the surface or around it on the table.
+    goals: u32,
+}
+
+struct Painter {
+    camera: Camera,
+    height: f64,
+    bodies: Vec<Body>,
+    goals: Vec<Goal>,
+    table_z_m: f64,
+}
+
+impl Painter {
+    fn new(scene: &Scene, width: usize, height: usize) -> Self {
+        let table_z_m = f64::from(scene.table.centre[2] + scene.table.half_extents_m[2]);
+        let camera = Camera::fitted(&scene.arms, table_z_m, width, height);
+        let body = |(shape, color): (Shape, Rgb)| Body {
+            bounds: camera.bounds(shape.centre, shape.radius_m),
+            shape,
+            color,
+        };
+        let goal = |(position, color): (&[f32; 3], &Rgb)| {
+            let position = DVec3::from(position.map(f64::from));
+            let radius_m = f64::from(GOAL_TOLERANCE_M);
+            let shape = Shape::sphere(position, radius_m);
+            Goal { bounds: camera.bounds(position, radius_m), shape, position, color: *color }
+        };
+        let colors = || ARM_COLORS.iter().cycle();
+        let arms = scene.arms.iter().zip(colors()).flat_map(|(arm, color)| shapes_of(arm, *color));
+        let objects = scene.objects.iter().zip(colors());
+        let objects = objects.map(|(object, color)| (Shape::cuboid(object), *color));
+        let table = (Shape::cuboid(&scene.table), TABLE_COLOR);
+        Self {
+            bodies: std::iter::once(table).chain(arms).chain(objects).map(body).collect(),
+            goals: scene.goals.iter().zip(colors()).map(goal).collect(),
+            height: centre(height) - 0.5,
+            camera,
+            table_z_m,
+        }
+    }
+
+    /// Returns the mean colour of a pixel at the edge of a surface.
+    fn smooth(&self, x: usize, y: usize) -> Rgb {
+        let offset = |sample| (centre(sample)) / (centre(N_SAMPLES) - 0.5) - 0.5;
+        let samples = pixels(N_SAMPLES, N_SAMPLES)
+            .map(|(i, j)| self.sample(centre(x) + offset(i), centre(y) + offset(j)).color);
+        samples.sum::<Rgb>() / (centre(N_SAMPLES * N_SAMPLES) - 0.5)
+    }
+
+    /// Returns the colour at a place in the picture, pixels from the upper left corner.
+    fn sample(&self, x: f64, y: f64) -> Sample {
+        let (origin, direction) = self.camera.ray(x, y);
+        let hit = self.nearest(x, y, origin, direction);
+        let depth_m = hit.as_ref().map_or(f64::INFINITY, |(_, hit)| hit.distance_m);
+        let (mut color, mut surface) = match &hit {
+            Some((idx, hit)) => self.shade(*idx, hit, origin + hit.distance_m * direction),
+            None => {
+                let surface = Surface { body: None, is_lit: true, face: [0; 3], goals: 0 };
+                (SKY_COLORS[0].lerp(SKY_COLORS[1], y / self.height), surface)
+            }
+        };
+        for (idx, goal) in self.goals.iter().enumerate().filter(|(_, it)| it.bounds.contains(x, y))
+        {
+            let front = goal.shape.hit(origin, direction).filter(|it| it.distance_m < depth_m);
+            if let Some(front) = front {
+                let rim = 1.0 - front.normal.dot(direction).abs();
+                let opacity = GOAL_OPACITY + 0.35 * rim * rim * rim;
+                color = color.lerp(lit(goal.color, 1.12), opacity);
+                surface.goals |= 1 << (idx % 32);
+            }
+        }
+        Sample { color, surface }
+    }
+
+    /// Returns the first body that a ray through pixel (`x`, `y`) meets, and where.
+    fn nearest(&self, x: f64, y: f64, origin: DVec3, direction: DVec3) -> Option<(usize, Hit)> {
+        let candidates = self.bodies.iter().enumerate().filter(|(_, it)| it.bounds.contains(x, y));
+        let hits =
+            candidates.filter_map(|(idx, body)| Some((idx, body.shape.hit(origin, direction)?)));
+        hits.min_by(|(_, a), (_, b)| a.distance_m.total_cmp(&b.distance_m))
+    }
+
+    fn shade(&self, idx: usize, hit: &Hit, point: DVec3) -> (Rgb, Surface) {
+        let start = point + SHADOW_OFFSET_M * hit.normal;
+        let is_facing_light = hit.normal.dot(LIGHT) > 0.0;
+        let is_blocked = |body: &Body| body.shape.hit(start, LIGHT).is_some();
+        let is_lit = is_facing_light && !self.bodies[1..].iter().any(is_blocked);
+        let brightness = 0.66 + 0.46 * hit.normal.dot(LIGHT).max(0.0);
+        let mut color = lit(self.bodies[idx].color, brightness);
+        let mut goals = 0;
+        if idx == TABLE && hit.normal.z > 0.5 {
+            for (goal_idx, goal) in self.goals.iter().enumerate() {
+                let below = goal.position.with_z(self.table_z_m);
+                let distance_m = point.distance(below) - f64::from(GOAL_TOLERANCE_M);
+                if distance_m.abs() < RING_HALF_WIDTH_M {
+                    color = lit(goal.color, 0.85);
+                    goals |= 1 << (goal_idx % 32);
+                } else if distance_m < 0.0 {
+                    color = color.lerp(goal.color, 0.14);
+                }
+            }
+        }
+        if !is_lit && is_facing_light {
+            color *= SHADOW;
+        }
+        (color, Surface { body: Some(idx), is_lit, face: face(hit.normal), goals })
+    }
+}
+
+#[expect(clippy::cast_possible_truncation, reason = "a unit vector, so from −2 to 2")]
+fn face(normal: DVec3) -> [i8; 3] {
+    (2.0 * normal).round().to_array().map(|component| component as i8)
+}
+
+/// Changes the brightness of a colour: 0 is black, 1 the colour itself, 2 white.
+fn lit(color: Rgb, brightness: f64) -> Rgb {
+    if brightness <= 1.0 {
+        color * brightness
+    } else {
+        color.lerp(DVec3::splat(255.0), brightness - 1.0)
+    }
+}
+
+/// Returns the parts of an arm.
+fn shapes_of(arm: &ArmScene, color: Rgb) -> Vec<(Shape, Rgb)> {
+    let [x, y, z] = arm.base;
+    let pedestal = Cuboid {
+        centre: [x, y, z + PEDESTAL_HALF_M[2]],
+        orientation: [0.0, 0.0, 0.0, 1.0],
+        half_extents_m: PEDESTAL_HALF_M,
+    };
+    let post = arm.links.first().map(|link| Capsule { from: arm.base, to: link.from, ..*link });
+    let links: Vec<Capsule> = post.into_iter().chain(arm.links.iter().copied()).collect();
+    let joints = links.windows(2).filter_map(|pair| {
+        let [link, next] = pair else { return None };
+        let radius_m = JOINT_WIDENING * f64::from(link.radius_m.max(next.radius_m));
+        Some((Shape::sphere(DVec3::from(link.to.map(f64::from)), radius_m), color))
+    });
+    let bars = links.iter().map(|link| (Shape::capsule(link), LINK_COLOR));
+    let hand = arm.hand.iter().map(|part| (Shape::cuboid(part), HAND_COLOR));
+    let pedestal = std::iter::once((Shape::cuboid(&pedestal), PEDESTAL_COLOR));
+    pedestal.chain(bars).chain(joints).chain(hand).collect()
+}

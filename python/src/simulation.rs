@@ -1,0 +1,191 @@
+//! One environment, and the reward.
+
+use numpy::{PyArray1, PyArray2, PyArray3, PyArrayMethods as _, PyReadonlyArray2};
+use pyo3::exceptions::PyRuntimeError;
+use pyo3::intern;
+use pyo3::prelude::*;
+use pyo3::types::PyDict;
+use tandem_core::reward::sparse_reward;
+use tandem_core::{Contacts, WorldSettings};
+use tandem_sim::SimError;
+
+use crate::episode::{Episode, step_error, value_error};
+use crate::picture::picture;
+
+/// Observation, reward, terminated, truncated and info, as `gymnasium.Env.step` returns them.
+type Step<'py> = (Bound<'py, PyDict>, f32, bool, bool, Bound<'py, PyDict>);
+
+/// One environment. `tandem.TandemEnv` gives it Gymnasium's interface.
+#[pyclass(module = "tandem._native")]
+pub(crate) struct Simulation {
+    episode: Episode,
+    is_started: bool,
+}
+
+#[pymethods]
+impl Simulation {
+    #[new]
+    #[pyo3(signature = (task, n_arms, *, substeps, grasped_start_prob))]
+    fn new(task: &str, n_arms: usize, substeps: u32, grasped_start_prob: f32) -> PyResult<Self> {
+        let settings = WorldSettings { grasped_start_prob, substeps };
+        Ok(Self { episode: Episode::new(task, n_arms, settings)?, is_started: false })
+    }
+
+    /// Length of an action.
+    #[getter]
+    fn n_action(&self) -> usize {
+        self.episode.layout().n_action()
+    }
+
+    /// Largest magnitude of each number of an observation, shape `[n_observation]`.
+    #[getter]
+    fn observation_bounds<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f32>> {
+        let layout = self.episode.layout();
+        let bounds = (0..layout.n_observation()).map(|idx| layout.observation_bound(idx));
+        PyArray1::from_iter(py, bounds)
+    }
+
+    /// Largest magnitude of each number of an achieved goal, shape `[n_goal]`.
+    #[getter]
+    fn goal_bounds<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f32>> {
+        let layout = self.episode.layout();
+        let indices = layout.arms().flat_map(|arm| layout.achieved_goal_of(arm));
+        PyArray1::from_iter(py, indices.map(|idx| layout.observation_bound(idx)))
+    }
+
+    /// Starts episode `number` of the run with seed `seed` and returns observation and info.
+    fn reset<'py>(
+        &mut self,
+        py: Python<'py>,
+        seed: u64,
+        number: u64,
+    ) -> PyResult<(Bound<'py, PyDict>, Bound<'py, PyDict>)> {
+        py.detach(|| self.episode.start(seed, number));
+        self.is_started = true;
+        Ok((self.observation(py)?, self.info(py)?))
+    }
+
+    /// Executes `action`, shape `[n_action]`.
+    fn step<'py>(&mut self, py: Python<'py>, action: &Bound<'py, PyAny>) -> PyResult<Step<'py>> {
+        self.step_by(py, action, Episode::step)
+    }
+
+    /// Does what `step` does, except for the physics: benchmarks measure the cost of the interface with it.
+    fn step_without_physics<'py>(
+        &mut self,
+        py: Python<'py>,
+        action: &Bound<'py, PyAny>,
+    ) -> PyResult<Step<'py>> {
+        self.step_by(py, action, |episode, _| {
+            episode.observe();
+            Ok(())
+        })
+    }
+
+    /// Executes `actions`, shape `[n, n_action]`, and returns the observations after each, shape `[n, n_observation]`.
+    fn play<'py>(
+        &mut self,
+        py: Python<'py>,
+        actions: PyReadonlyArray2<'py, f32>,
+    ) -> PyResult<Bound<'py, PyArray2<f32>>> {
+        self.check_started()?;
+        let (actions, n_action) =
+            (actions.as_array().iter().copied().collect::<Vec<f32>>(), self.n_action());
+        let mut observations = Vec::new();
+        let episode = &mut self.episode;
+        let mut play = || {
+            for action in actions.chunks(n_action) {
+                episode.step(action)?;
+                observations.extend_from_slice(&episode.observation);
+            }
+            Ok(())
+        };
+        py.detach(&mut play).map_err(|error: SimError| step_error(&error))?;
+        let n_observation = self.episode.observation.len();
+        let n_steps = observations.len() / n_observation;
+        PyArray1::from_vec(py, observations).reshape([n_steps, n_observation])
+    }
+
+    /// Draws the scene: red, green and blue, shape `[height, width, 3]`.
+    fn render<'py>(
+        &self,
+        py: Python<'py>,
+        width: usize,
+        height: usize,
+    ) -> PyResult<Bound<'py, PyArray3<u8>>> {
+        let pixels = py.detach(|| picture(&self.episode.env.scene(), width, height));
+        PyArray1::from_vec(py, pixels).reshape([height, width, 3])
+    }
+}
+
+impl Simulation {
+    fn step_by<'py>(
+        &mut self,
+        py: Python<'py>,
+        action: &Bound<'py, PyAny>,
+        step: fn(&mut Episode, &[f32]) -> Result<(), SimError>,
+    ) -> PyResult<Step<'py>> {
+        self.check_started()?;
+        let action = action_of(action)?;
+        let episode = &mut self.episode;
+        py.detach(|| step(episode, &action)).map_err(|error| step_error(&error))?;
+        Ok((self.observation(py)?, self.episode.reward, false, false, self.info(py)?))
+    }
+
+    fn check_started(&self) -> PyResult<()> {
+        if self.is_started {
+            return Ok(());
+        }
+        Err(PyRuntimeError::new_err("the environment has no episode yet: call reset first"))
+    }
+
+    fn observation<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
+        let Episode { env, observation, achieved_goal, .. } = &self.episode;
+        let dict = PyDict::new(py);
+        dict.set_item(intern!(py, "observation"), PyArray1::from_slice(py, observation))?;
+        dict.set_item(intern!(py, "achieved_goal"), PyArray1::from_slice(py, achieved_goal))?;
+        dict.set_item(intern!(py, "desired_goal"), PyArray1::from_slice(py, env.goal()))?;
+        Ok(dict)
+    }
+
+    fn info<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
+        let Episode { is_success, contacts, .. } = &self.episode;
+        let dict = PyDict::new(py);
+        dict.set_item(intern!(py, "is_success"), is_success)?;
+        dict.set_item(intern!(py, "arm_contact"), contacts.contains(Contacts::ARM_ARM))?;
+        dict.set_item(intern!(py, "table_contact"), contacts.contains(Contacts::ARM_TABLE))?;
+        Ok(dict)
+    }
+}
+
+/// Returns the numbers of an action: a float32 array, or any sequence of numbers.
+fn action_of(action: &Bound<'_, PyAny>) -> PyResult<Vec<f32>> {
+    match action.cast::<PyArray1<f32>>() {
+        Ok(array) => Ok(array.readonly().as_array().iter().copied().collect()),
+        Err(_) => action.extract(),
+    }
+}
+
+/// Returns the sparse rewards, shape `[n]`, of `achieved` and `desired` goals, both of shape `[n, n_goal]`.
+#[pyfunction]
+pub(crate) fn compute_reward<'py>(
+    py: Python<'py>,
+    achieved: PyReadonlyArray2<'py, f32>,
+    desired: PyReadonlyArray2<'py, f32>,
+) -> PyResult<Bound<'py, PyArray1<f32>>> {
+    let (achieved, desired) = (achieved.as_array(), desired.as_array());
+    if achieved.dim() != desired.dim() {
+        let shapes = (achieved.dim(), desired.dim());
+        return Err(value_error(format!(
+            "goals of different shapes: {:?} and {:?}",
+            shapes.0, shapes.1
+        )));
+    }
+    let (achieved, desired) = (achieved.as_standard_layout(), desired.as_standard_layout());
+    let rewards = achieved
+        .rows()
+        .into_iter()
+        .zip(desired.rows())
+        .map(|(achieved, desired)| sparse_reward(&achieved.to_vec(), &desired.to_vec()));
+    Ok(PyArray1::from_vec(py, rewards.collect()))
+}

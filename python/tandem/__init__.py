@@ -1,0 +1,52 @@
+"""Environments, policies and services of Tandem: two robot arms, and advice from a policy for one arm.
+
+Importing the package registers four environments with Gymnasium: `tandem/Push-v0`, `tandem/PickAndPlace-v0`,
+`tandem/TwoArmPush-v0` and `tandem/TwoArmPickAndPlace-v0`. Servers and clients need gRPC: `pip install
+'tandem-rl[grpc]'`.
+"""
+
+from typing import TYPE_CHECKING, Any
+
+from tandem.envs import TandemEnv, compute_reward, register_envs
+from tandem.policy import Policy, load_policy
+from tandem.vector import TandemVectorEnv
+
+if TYPE_CHECKING:
+    from tandem._environments import EnvironmentServer as EnvironmentServer
+    from tandem._environments import serve as serve
+    from tandem._grpc import ServiceError as ServiceError
+    from tandem._policies import PolicyServer as PolicyServer
+    from tandem._policies import serve_policy as serve_policy
+    from tandem._task import Arm as Arm
+    from tandem._task import Task as Task
+    from tandem.clients import Bridge as Bridge
+    from tandem.clients import CallError as CallError
+    from tandem.clients import Learner as Learner
+    from tandem.clients import MotionStopped as MotionStopped
+    from tandem.clients import Step as Step
+    from tandem.clients import Teacher as Teacher
+    from tandem.clients import WayPoint as WayPoint
+
+__all__ = ["Policy", "TandemEnv", "TandemVectorEnv", "compute_reward", "load_policy"]
+
+register_envs()
+
+_SERVICES = {
+    "_environments": ("EnvironmentServer", "serve"),
+    "_grpc": ("ServiceError",),
+    "_policies": ("PolicyServer", "serve_policy"),
+    "_task": ("Arm", "Task"),
+    "clients": ("Bridge", "CallError", "Learner", "MotionStopped", "Step", "Teacher", "WayPoint"),
+}
+"""Names whose modules need gRPC, and are imported when they are first used."""
+
+
+def __getattr__(name: str) -> Any:
+    import importlib
+
+    for module, names in _SERVICES.items():
+        if name in names:
+            value = getattr(importlib.import_module(f"tandem.{module}"), name)
+            globals()[name] = value
+            return value
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -1,0 +1,484 @@
+"""Gymnasium environments as a server of `tandem.v1.Environment`."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import importlib
+import multiprocessing
+import os
+import signal
+import struct
+import sys
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, cast
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+
+from tandem._grpc import Path, Refused, Server, ServiceError, grpc
+from tandem._proto import environment_pb2, environment_pb2_grpc
+from tandem._task import DEFAULT_BOUND, Arm, Floats, Norm, Task, TaskOptions, describe, distance
+
+EnvFn = str | tuple[str, dict[str, Any]] | Callable[[], gymnasium.Env[Any, Any]]
+"""An id for `gymnasium.make`, an id with arguments, or a function that creates an environment."""
+
+LISTEN_VARIABLE = "TANDEM_ENV_LISTEN"
+"""The environment variable with the address on which a worker wants its server to listen."""
+_PACKAGES = ("gymnasium_robotics", "panda_gym")
+"""Packages that register environments when they are imported."""
+_FLOAT = np.dtype("<f4")
+ACTION_SLACK = 1e-6
+"""The distance by which rounding may move an action out of [-1, 1]."""
+
+
+def episode_seed(seed: int, episode: int) -> int:
+    """Returns the seed of `env.reset` for an episode of a run: 32 bits, from 0.
+
+    It is the little-endian number in the first four bytes of SHA-256 of seed and episode, each as eight little-endian
+    bytes.
+    """
+    digest = hashlib.sha256(struct.pack("<QQ", seed, episode)).digest()
+    return int.from_bytes(digest[:4], "little")
+
+
+def make(env_fn: EnvFn) -> gymnasium.Env[Any, Any]:
+    """Creates an environment from its id or its constructor."""
+    if callable(env_fn):
+        return env_fn()
+    name, kwargs = (env_fn, {}) if isinstance(env_fn, str) else env_fn
+    try:
+        return gymnasium.make(name, **kwargs)
+    except (gymnasium.error.NameNotFound, gymnasium.error.NamespaceNotFound, gymnasium.error.VersionNotFound):
+        for package in _PACKAGES:
+            with contextlib.suppress(ImportError):
+                importlib.import_module(package)
+    try:
+        return gymnasium.make(name, **kwargs)
+    except (gymnasium.error.Error, ImportError) as error:
+        raise ServiceError(f"no environment {name!r}: {error}; MODULE:ID imports a module first") from error
+
+
+class GymEnvironment:
+    """A Gymnasium environment with the vectors of its task."""
+
+    def __init__(self, env: gymnasium.Env[Any, Any], task: Task, appends_goal: bool) -> None:
+        self._env = env
+        self._task = task
+        self._appends_goal = appends_goal
+        self._bounds = np.asarray(task.observation_bound, np.float32)
+        self._goal_bounds = np.asarray(task.goal_bound, np.float32)
+        space = cast(gymnasium.spaces.Box, env.action_space)
+        self._dtype = space.dtype
+        self._low = space.low.astype(np.float64)
+        self._range = space.high.astype(np.float64) - self._low
+        self._is_unscaled = bool((space.low == -1).all() and (space.high == 1).all())
+        self._n_steps = 0
+
+    def reset(self, seed: int) -> tuple[Floats, Floats]:
+        """Starts an episode. Returns the observation, shape `[n_observation]`, and the goal, shape `[n_goal]`."""
+        observation, _ = self._env.reset(seed=seed)
+        self._n_steps = 0
+        goal = np.asarray(observation["desired_goal"], np.float32)
+        _check_numbers("desired_goal", goal, self._goal_bounds)
+        return self._vector(observation), goal
+
+    def step(self, action: Floats) -> Floats:
+        """Executes an action in [-1, 1], shape `[n_action]`. Returns the observation, shape `[n_observation]`."""
+        observation, _, terminated, _, _ = self._env.step(self._own_action(action))
+        self._n_steps += 1
+        if terminated and self._n_steps < self._task.episode_steps:
+            self._check_termination(observation)
+        return self._vector(observation)
+
+    def close(self) -> None:
+        """Closes the environment."""
+        self._env.close()
+
+    def _own_action(self, action: Floats) -> NDArray[Any]:
+        action = np.clip(action, -1, 1)
+        if self._is_unscaled:
+            return action.astype(self._dtype)
+        return (self._low + (action.astype(np.float64) + 1) / 2 * self._range).astype(self._dtype)
+
+    def _vector(self, observation: dict[str, Any]) -> Floats:
+        parts = [observation["observation"]]
+        if self._appends_goal:
+            parts.append(observation["achieved_goal"])
+        vector = np.concatenate(parts).astype(np.float32)
+        _check_numbers("observation", vector, self._bounds)
+        return vector
+
+    def _check_termination(self, observation: dict[str, Any]) -> None:
+        """Accepts an end because the goal is achieved, after which the environment is stepped on."""
+        task = self._task
+        if distance(task.norm, observation["achieved_goal"], observation["desired_goal"]) > task.tolerance:
+            raise RuntimeError(
+                f"the environment terminated at step {self._n_steps} without its goal: "
+                f"an episode always has {task.episode_steps} steps"
+            )
+
+
+def _check_numbers(name: str, numbers: Floats, bounds: Floats) -> None:
+    # Written so that NaN fails the comparison.
+    within = np.abs(numbers) <= bounds
+    if not within.all():
+        index = int(np.argmin(within))
+        raise RuntimeError(f"{name}[{index}] is {numbers[index]:g}, beyond its bound {bounds[index]:g}")
+
+
+class _Environments:
+    """Environments of a stream, stepped one after the other. They are created when they are first reset."""
+
+    def __init__(self, create: Callable[[], GymEnvironment]) -> None:
+        self._create = create
+        self._environments: dict[int, GymEnvironment] = {}
+
+    def reset(self, resets: Sequence[tuple[int, int]]) -> list[tuple[Floats, Floats]]:
+        """Resets environments, given as pairs of index and seed."""
+        answers = []
+        for index, seed in resets:
+            with _named(index):
+                if index not in self._environments:
+                    self._environments[index] = self._create()
+                answers.append(self._environments[index].reset(seed))
+        return answers
+
+    def step(self, actions: Sequence[tuple[int, Floats]]) -> list[Floats]:
+        """Executes actions, given with the indices of their environments."""
+        answers = []
+        for index, action in actions:
+            with _named(index):
+                answers.append(self._environments[index].step(action))
+        return answers
+
+    def close(self) -> None:
+        for environment in self._environments.values():
+            environment.close()
+
+
+class EnvironmentFailure(Exception):
+    """An exception of an environment, with its text."""
+
+
+@contextlib.contextmanager
+def _named(index: int) -> Iterator[None]:
+    try:
+        yield
+    except Exception as error:
+        raise EnvironmentFailure(f"environment {index}: {type(error).__name__}: {error}") from error
+
+
+def _serve_pipe(pipe: Any, pickled: bytes) -> None:
+    """Runs environments in a process of their own, until the pipe is closed."""
+    import cloudpickle
+
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    environments = _Environments(cloudpickle.loads(pickled))
+    with contextlib.suppress(EOFError, BrokenPipeError):
+        while True:
+            method, argument = pipe.recv()
+            try:
+                pipe.send((True, getattr(environments, method)(argument)))
+            except EnvironmentFailure as error:
+                pipe.send((False, str(error)))
+    environments.close()
+
+
+class _ProcessPool:
+    """Environments of a stream, divided among processes that step them at the same time."""
+
+    def __init__(self, create: Callable[[], GymEnvironment], n_processes: int) -> None:
+        import cloudpickle
+
+        context = multiprocessing.get_context("spawn")
+        pickled = cloudpickle.dumps(create)
+        self._pipes = []
+        self._processes = []
+        for _ in range(n_processes):
+            pipe, theirs = context.Pipe()
+            process = context.Process(target=_serve_pipe, args=(theirs, pickled), daemon=True)
+            process.start()
+            theirs.close()
+            self._pipes.append(pipe)
+            self._processes.append(process)
+
+    def reset(self, resets: Sequence[tuple[int, int]]) -> list[Any]:
+        return self._divide("reset", resets)
+
+    def step(self, actions: Sequence[tuple[int, Floats]]) -> list[Any]:
+        return self._divide("step", actions)
+
+    def close(self) -> None:
+        for pipe in self._pipes:
+            pipe.close()
+        for process in self._processes:
+            process.join(5)
+            if process.is_alive():
+                process.kill()
+
+    def _divide(self, method: str, items: Sequence[tuple[int, Any]]) -> list[Any]:
+        """Sends each item to the process of its environment, and returns the answers in the order of the items."""
+        shares: dict[int, list[int]] = {}
+        for position, (index, _) in enumerate(items):
+            shares.setdefault(index % len(self._pipes), []).append(position)
+        answers: list[Any] = [None] * len(items)
+        failure = None
+        try:
+            for number, share in shares.items():
+                self._pipes[number].send((method, [items[position] for position in share]))
+            for number, share in shares.items():
+                succeeded, answer = self._pipes[number].recv()
+                if not succeeded:
+                    failure = failure or answer
+                    continue
+                for position, one in zip(share, answer):
+                    answers[position] = one
+        except (EOFError, OSError) as error:
+            raise EnvironmentFailure("a process of the environments ended unexpectedly") from error
+        if failure is not None:
+            raise EnvironmentFailure(failure)
+        return answers
+
+
+class _Stream:
+    """The state of one `Play` stream."""
+
+    def __init__(self, task: Task, environments: _Environments | _ProcessPool, max_environments: int) -> None:
+        self._task = task
+        self._environments = environments
+        self._max = max_environments
+        self._n = 0
+
+    def answer(self, request: environment_pb2.PlayRequest) -> environment_pb2.PlayResponse:
+        """Executes one request."""
+        command = request.WhichOneof("command")
+        if command == "reset":
+            return self._reset(request.reset)
+        if command == "step":
+            return self._step(request.step)
+        raise _invalid("command: expected reset or step")
+
+    def _reset(self, request: environment_pb2.ResetEnvironments) -> environment_pb2.PlayResponse:
+        resets = request.environments
+        indices = [reset.environment for reset in resets]
+        if self._n == 0:
+            self._check_first(indices)
+            self._n = len(indices)
+        for position, index in enumerate(indices):
+            field = f"reset.environments[{position}].environment"
+            if index >= self._n:
+                raise _invalid(f"{field}: expected 0 to {self._n - 1}, got {index}")
+            if index in indices[:position]:
+                raise _invalid(f"{field}: {index} is named twice")
+        pairs = [(reset.environment, episode_seed(reset.seed, reset.episode)) for reset in resets]
+        answers = self._environments.reset(pairs)
+        observations = b"".join(observation.astype(_FLOAT).tobytes() for observation, _ in answers)
+        goals = b"".join(goal.astype(_FLOAT).tobytes() for _, goal in answers)
+        return environment_pb2.PlayResponse(observations=observations, goals=goals)
+
+    def _check_first(self, indices: list[int]) -> None:
+        if not 1 <= len(indices) <= self._max:
+            raise _invalid(f"reset.environments: expected 1 to {self._max}, got {len(indices)}")
+        if indices != list(range(len(indices))):
+            raise _invalid("reset.environments: the first request resets environments 0, 1, ... in this order")
+
+    def _step(self, request: environment_pb2.StepEnvironments) -> environment_pb2.PlayResponse:
+        if self._n == 0:
+            raise _invalid("command: the first request must be reset")
+        actions = decode_floats("step.actions", request.actions, self._n, self._task.n_action)
+        check_actions("step.actions", actions)
+        answers = self._environments.step(list(enumerate(actions)))
+        observations = b"".join(observation.astype(_FLOAT).tobytes() for observation in answers)
+        return environment_pb2.PlayResponse(observations=observations)
+
+
+def _invalid(message: str) -> Refused:
+    return Refused(grpc.StatusCode.INVALID_ARGUMENT, message)
+
+
+def decode_floats(field: str, data: bytes, n_rows: int, n_columns: int) -> Floats:
+    """Returns the array in a field, shape `[n_rows, n_columns]`."""
+    expected = 4 * n_rows * n_columns
+    if len(data) != expected:
+        raise _invalid(f"{field}: expected {expected} bytes, got {len(data)}")
+    return np.frombuffer(data, _FLOAT).astype(np.float32).reshape(n_rows, n_columns)
+
+
+def check_actions(field: str, actions: Floats) -> None:
+    """Refuses actions with a number outside [-1, 1], or one that is not a number."""
+    flat = actions.ravel()
+    within = np.abs(flat) <= 1 + ACTION_SLACK
+    if not within.all():
+        index = int(np.argmin(within))
+        raise _invalid(f"{field}[{index}]: expected a number in [-1, 1], got {flat[index]:g}")
+
+
+class _Servicer(environment_pb2_grpc.EnvironmentServicer):
+    """The service `tandem.v1.Environment`."""
+
+    def __init__(
+        self,
+        task: Task,
+        create: Callable[[], GymEnvironment],
+        *,
+        n: int,
+        n_processes: int,
+        max_streams: int,
+    ) -> None:
+        self._task = task
+        self._create = create
+        self._n = n
+        self._n_processes = n_processes
+        self._room = threading.Semaphore(max_streams)
+        self._max_streams = max_streams
+
+    def Describe(self, request: Any, context: Any) -> environment_pb2.EnvironmentDescription:
+        return environment_pb2.EnvironmentDescription(
+            task=self._task.to_message(), server=server_name(), max_environments=self._n
+        )
+
+    def Play(self, requests: Any, context: Any) -> Iterator[environment_pb2.PlayResponse]:
+        if not self._room.acquire(blocking=False):
+            message = f"the server plays {self._max_streams} streams already"
+            context.abort(grpc.StatusCode.RESOURCE_EXHAUSTED, message)
+        try:
+            yield from self._play(requests)
+        except Refused as error:
+            context.abort(error.code, str(error))
+        except EnvironmentFailure as error:
+            context.abort(grpc.StatusCode.INTERNAL, str(error))
+        except grpc.RpcError:
+            pass  # The client has gone.
+        finally:
+            self._room.release()
+
+    def _play(self, requests: Any) -> Iterator[environment_pb2.PlayResponse]:
+        environments: _Environments | _ProcessPool
+        if self._n_processes > 1:
+            environments = _ProcessPool(self._create, self._n_processes)
+        else:
+            environments = _Environments(self._create)
+        with contextlib.closing(environments):
+            stream = _Stream(self._task, environments, self._n)
+            for request in requests:
+                yield stream.answer(request)
+
+
+def server_name() -> str:
+    """Returns name and version of this program, for logs."""
+    from importlib.metadata import PackageNotFoundError, version
+
+    try:
+        return f"tandem-python {version('tandem-rl')}"
+    except PackageNotFoundError:
+        return "tandem-python"
+
+
+class EnvironmentServer(Server):
+    """A running server of environments: a context manager, with its address in `address` and its task in `task`."""
+
+    def __init__(
+        self,
+        env_fn: EnvFn,
+        *,
+        listen: str = "127.0.0.1:0",
+        n: int = 64,
+        workers: int = 1,
+        max_streams: int = 16,
+        name: str | None = None,
+        arms: Sequence[Arm] | None = None,
+        interchangeable_arms: bool = False,
+        tolerance: float | None = None,
+        norm: Norm | None = None,
+        episode_steps: int | None = None,
+        bound: float = DEFAULT_BOUND,
+        token_file: Path | None = None,
+        tls_cert: Path | None = None,
+        tls_key: Path | None = None,
+        insecure: bool = False,
+    ) -> None:
+        if not 1 <= n <= 1024:
+            raise ServiceError(f"a stream has 1 to 1024 environments, not {n}")
+        if workers < 1 or max_streams < 1:
+            raise ServiceError("workers and max_streams must be at least 1")
+        options = TaskOptions(name, arms, interchangeable_arms, tolerance, norm, episode_steps, bound)
+        with contextlib.closing(make(env_fn)) as env:
+            self.task, appends_goal = describe(env, options)
+        task = self.task
+
+        def create() -> GymEnvironment:
+            return GymEnvironment(make(env_fn), task, appends_goal)
+
+        servicer = _Servicer(task, create, n=n, n_processes=workers, max_streams=max_streams)
+        super().__init__(
+            lambda server: environment_pb2_grpc.add_EnvironmentServicer_to_server(servicer, server),
+            listen=listen,
+            token_file=token_file,
+            tls_cert=tls_cert,
+            tls_key=tls_key,
+            insecure=insecure,
+            max_streams=max_streams,
+        )
+
+
+def serve(env_fn: EnvFn, *, listen: str | None = None, **options: Any) -> None:
+    """Serves environments until the process is asked to end, by SIGINT or SIGTERM.
+
+    Prints `listening on http://HOST:PORT` once it serves. `listen` defaults to the environment variable
+    `TANDEM_ENV_LISTEN`, or a free port of 127.0.0.1. If the variable is set, the server also ends when standard input
+    is closed.
+
+    Arguments:
+      env_fn: a function that creates a Gymnasium environment, or an id for `gymnasium.make`. The observation is a Dict
+        of observation, achieved_goal and desired_goal; the action space is a bounded Box.
+      n: the largest number of environments of a stream.
+      workers: the number of processes that step the environments of a stream; with 1, the server's own.
+      max_streams: the largest number of simultaneous streams.
+      name: the name of the task; by default the environment's id in lower case.
+      arms: the indices of each arm's part of the vectors (`tandem.Arm`); by default one arm with all of them.
+      interchangeable_arms: whether exchanging the parts of two arms gives another valid transition.
+      tolerance, norm: when a goal counts as achieved; by default `distance_threshold` of the environment, and the norm
+        with which its rewards agree.
+      episode_steps: control steps per episode; by default `max_episode_steps` of its spec.
+      bound: the largest magnitude of numbers for which the spaces have no bound.
+      token_file, tls_cert, tls_key, insecure: as the options of the same names of Tandem's services.
+
+    Raises:
+      ServiceError: if the environment cannot be used, or the address cannot be served.
+    """
+    variable = os.environ.get(LISTEN_VARIABLE)
+    address = listen or variable or "127.0.0.1:0"
+    run(lambda: EnvironmentServer(env_fn, listen=address, **options), ends_with_stdin=variable is not None)
+
+
+def run(start: Callable[[], Server], *, ends_with_stdin: bool = False) -> None:
+    """Starts a server, prints its address, and stops it when the process is asked to end."""
+    asked = threading.Event()
+    is_main = threading.current_thread() is threading.main_thread()
+    handlers = {}
+    if is_main:
+        for number in (signal.SIGINT, signal.SIGTERM):
+            handlers[number] = signal.signal(number, lambda _number, _frame: asked.set())
+    try:
+        if ends_with_stdin:
+            threading.Thread(target=_wait_for_end_of_stdin, args=(asked,), daemon=True).start()
+        with start() as server:
+            print(f"listening on {server.address}", flush=True)
+            while not asked.wait(0.5):
+                pass  # A short wait lets Python handle signals on all systems.
+    finally:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+
+
+def _wait_for_end_of_stdin(asked: threading.Event) -> None:
+    try:
+        descriptor = sys.stdin.fileno()
+        while os.read(descriptor, 4096):
+            pass
+    except (AttributeError, OSError, ValueError):
+        pass
+    asked.set()

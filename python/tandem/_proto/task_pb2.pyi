@@ -1,0 +1,59 @@
+from google.protobuf.internal import containers as _containers
+from google.protobuf.internal import enum_type_wrapper as _enum_type_wrapper
+from google.protobuf import descriptor as _descriptor
+from google.protobuf import message as _message
+from collections.abc import Iterable as _Iterable, Mapping as _Mapping
+from typing import ClassVar as _ClassVar, Optional as _Optional, Union as _Union
+
+DESCRIPTOR: _descriptor.FileDescriptor
+
+class Norm(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+    __slots__ = ()
+    NORM_UNSPECIFIED: _ClassVar[Norm]
+    NORM_EUCLIDEAN: _ClassVar[Norm]
+    NORM_MAXIMUM: _ClassVar[Norm]
+NORM_UNSPECIFIED: Norm
+NORM_EUCLIDEAN: Norm
+NORM_MAXIMUM: Norm
+
+class TaskDescription(_message.Message):
+    __slots__ = ("name", "n_observation", "n_goal", "n_action", "arms", "achieved_goal", "episode_steps", "tolerance", "norm", "interchangeable_arms", "reports_contacts", "observation_bound", "goal_bound")
+    NAME_FIELD_NUMBER: _ClassVar[int]
+    N_OBSERVATION_FIELD_NUMBER: _ClassVar[int]
+    N_GOAL_FIELD_NUMBER: _ClassVar[int]
+    N_ACTION_FIELD_NUMBER: _ClassVar[int]
+    ARMS_FIELD_NUMBER: _ClassVar[int]
+    ACHIEVED_GOAL_FIELD_NUMBER: _ClassVar[int]
+    EPISODE_STEPS_FIELD_NUMBER: _ClassVar[int]
+    TOLERANCE_FIELD_NUMBER: _ClassVar[int]
+    NORM_FIELD_NUMBER: _ClassVar[int]
+    INTERCHANGEABLE_ARMS_FIELD_NUMBER: _ClassVar[int]
+    REPORTS_CONTACTS_FIELD_NUMBER: _ClassVar[int]
+    OBSERVATION_BOUND_FIELD_NUMBER: _ClassVar[int]
+    GOAL_BOUND_FIELD_NUMBER: _ClassVar[int]
+    name: str
+    n_observation: int
+    n_goal: int
+    n_action: int
+    arms: _containers.RepeatedCompositeFieldContainer[TaskArm]
+    achieved_goal: _containers.RepeatedScalarFieldContainer[int]
+    episode_steps: int
+    tolerance: float
+    norm: Norm
+    interchangeable_arms: bool
+    reports_contacts: bool
+    observation_bound: _containers.RepeatedScalarFieldContainer[float]
+    goal_bound: _containers.RepeatedScalarFieldContainer[float]
+    def __init__(self, name: _Optional[str] = ..., n_observation: _Optional[int] = ..., n_goal: _Optional[int] = ..., n_action: _Optional[int] = ..., arms: _Optional[_Iterable[_Union[TaskArm, _Mapping]]] = ..., achieved_goal: _Optional[_Iterable[int]] = ..., episode_steps: _Optional[int] = ..., tolerance: _Optional[float] = ..., norm: _Optional[_Union[Norm, str]] = ..., interchangeable_arms: bool = ..., reports_contacts: bool = ..., observation_bound: _Optional[_Iterable[float]] = ..., goal_bound: _Optional[_Iterable[float]] = ...) -> None: ...
+
+class TaskArm(_message.Message):
+    __slots__ = ("observation", "goal", "action", "position")
+    OBSERVATION_FIELD_NUMBER: _ClassVar[int]
+    GOAL_FIELD_NUMBER: _ClassVar[int]
+    ACTION_FIELD_NUMBER: _ClassVar[int]
+    POSITION_FIELD_NUMBER: _ClassVar[int]
+    observation: _containers.RepeatedScalarFieldContainer[int]
+    goal: _containers.RepeatedScalarFieldContainer[int]
+    action: _containers.RepeatedScalarFieldContainer[int]
+    position: _containers.RepeatedScalarFieldContainer[int]
+    def __init__(self, observation: _Optional[_Iterable[int]] = ..., goal: _Optional[_Iterable[int]] = ..., action: _Optional[_Iterable[int]] = ..., position: _Optional[_Iterable[int]] = ...) -> None: ...

@@ -1,0 +1,414 @@
+"""Clients of Tandem's services: `Teacher`, `Learner` and `Bridge`.
+
+Addresses are `HOST:PORT` or URIs. A call waits up to `timeout_s` for a service that is away, and raises `CallError`.
+Every call may be repeated. Messages are those of `proto/proto/tandem/v1`, whose comments describe their fields.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import threading
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from types import TracebackType
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from tandem._grpc import Path, ServiceError, grpc, open_channel
+from tandem._proto import (
+    bridge_pb2,
+    bridge_pb2_grpc,
+    learner_pb2,
+    learner_pb2_grpc,
+    teacher_pb2,
+    teacher_pb2_grpc,
+)
+from tandem._task import Floats
+
+__all__ = [
+    "Account",
+    "Advice",
+    "ArmAdvice",
+    "Bridge",
+    "CallError",
+    "Learner",
+    "Lease",
+    "MotionStopped",
+    "Step",
+    "Teacher",
+    "WayPoint",
+]
+
+_TEMPORARY = frozenset({"UNAVAILABLE", "DEADLINE_EXCEEDED", "RESOURCE_EXHAUSTED", "ABORTED", "INTERNAL"})
+_KEEP_ALIVE_S = 0.04
+"""Time between two signs of life; the bridge requires one every 0.1 s."""
+_STEP_S = 0.04
+_RESET_ATTEMPTS = 11
+_RESET_PAUSE_S = 0.1
+
+_ClientT = TypeVar("_ClientT", bound="_Client")
+
+
+class CallError(ServiceError):
+    """A call that failed, with the name of its gRPC status code."""
+
+    def __init__(self, code: str, message: str) -> None:
+        super().__init__(message)
+        self.code = code
+        self.is_temporary = code in _TEMPORARY
+        """Whether the same call may succeed later."""
+
+
+class MotionStopped(ServiceError):
+    """A motion that ended because the arms were stopped. `name` is the reason's code; docs/bridge.md lists them."""
+
+    def __init__(self, name: str, sentence: str) -> None:
+        super().__init__(f"the arms are stopped: {sentence}")
+        self.name = name
+
+
+class _Client:
+    """A channel to a service: a context manager that closes it."""
+
+    def __init__(
+        self,
+        address: str,
+        *,
+        token_file: Path | None = None,
+        tls_ca: Path | None = None,
+        timeout_s: float = 10.0,
+    ) -> None:
+        self._address = address
+        self._timeout_s = timeout_s
+        self._channel = open_channel(address, token_file, tls_ca)
+
+    def close(self) -> None:
+        """Closes the channel. Open streams end."""
+        self._channel.close()
+
+    def __enter__(self: _ClientT) -> _ClientT:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _call(self, method: Any, request: Any) -> Any:
+        with self._errors():
+            return method(request, timeout=self._timeout_s, wait_for_ready=True)
+
+    @contextlib.contextmanager
+    def _errors(self) -> Iterator[None]:
+        try:
+            yield
+        except grpc.RpcError as error:
+            code, details = error.code().name, error.details()
+            if code == "DEADLINE_EXCEEDED":
+                details = f"no answer within {self._timeout_s:g} s"
+            raise CallError(code, f"{self._address}: {details}") from error
+
+
+@dataclasses.dataclass(frozen=True)
+class Step:
+    """A step for which a student asks for advice. Vectors of several arms are concatenated in arm order."""
+
+    episode: int
+    step: int
+    """From 0."""
+    observation: ArrayLike
+    """Shape `[n_observation]`."""
+    goal: ArrayLike
+    """Shape `[n_goal]`."""
+    proposed_action: ArrayLike
+    """The student's action, in [-1, 1], shape `[n_action]`."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ArmAdvice:
+    """The teacher's opinion on one arm."""
+
+    teacher_action: Floats
+    """Shape `[n_action_per_arm]`."""
+    q_teacher: float
+    q_student: float
+    importance: float
+    """`q_teacher - q_student`."""
+    distance: float
+    """The Euclidean distance between the two actions."""
+    overridden: bool
+
+
+@dataclasses.dataclass(frozen=True)
+class Advice:
+    """The answer to one step."""
+
+    action: Floats
+    """The action to execute, shape `[n_action]`."""
+    charged: bool
+    """Whether the step cost a unit of the budget."""
+    arms: tuple[ArmAdvice, ...]
+
+
+@dataclasses.dataclass(frozen=True)
+class Account:
+    """An account at a teacher, in units of advised steps."""
+
+    name: str
+    budget: int
+    strategy: str
+    spent: int
+    leased: int
+    left: int
+    warning: str
+    """The reason why the teacher's ledger cannot be written; empty if it can."""
+
+
+class Teacher(_Client):
+    """A client of `tandem teacher`.
+
+    >>> with tandem.Teacher("127.0.0.1:7001") as teacher:
+    ...     teacher.open_account("mine", budget=100, strategy="mc-q:0.1")
+    ...     advice = teacher.advise("mine", [tandem.Step(0, 0, observation, goal, action)])
+    """
+
+    def __init__(self, address: str, **options: Any) -> None:
+        super().__init__(address, **options)
+        self._stub = teacher_pb2_grpc.TeacherStub(self._channel)
+
+    def describe(self) -> teacher_pb2.DescribeResponse:
+        """Returns the teacher's task, the layout of vectors and the available strategies."""
+        response: teacher_pb2.DescribeResponse = self._call(self._stub.Describe, teacher_pb2.DescribeRequest())
+        return response
+
+    def open_account(self, name: str, *, budget: int, strategy: str) -> Account:
+        """Opens an account, or returns the existing one with this name and these terms."""
+        request = teacher_pb2.OpenAccountRequest(name=name, budget=budget, strategy=strategy)
+        return _account(self._call(self._stub.OpenAccount, request))
+
+    def account(self, name: str) -> Account:
+        """Returns an account."""
+        return _account(self._call(self._stub.GetAccount, teacher_pb2.GetAccountRequest(name=name)))
+
+    def advise(self, account: str, steps: Iterable[Step]) -> list[Advice]:
+        """Returns the advice on each step. A repeated step gets the same decision at no charge."""
+        request = teacher_pb2.AdviseRequest(account=account)
+        for step in steps:
+            request.steps.add(
+                episode=step.episode,
+                step=step.step,
+                observation=_floats(step.observation),
+                goal=_floats(step.goal),
+                proposed_action=_floats(step.proposed_action),
+            )
+        return [_advice(step) for step in self._call(self._stub.Advise, request).steps]
+
+
+def _floats(array: ArrayLike) -> Floats:
+    return np.asarray(array, np.float32).ravel()
+
+
+def _account(message: teacher_pb2.Account) -> Account:
+    return Account(
+        name=message.name,
+        budget=message.budget,
+        strategy=message.strategy,
+        spent=message.spent,
+        leased=message.leased,
+        left=message.left,
+        warning=message.warning,
+    )
+
+
+def _advice(message: teacher_pb2.StepAdvice) -> Advice:
+    arms = (
+        ArmAdvice(
+            teacher_action=np.array(arm.teacher_action, np.float32),
+            q_teacher=arm.q_teacher,
+            q_student=arm.q_student,
+            importance=arm.importance,
+            distance=arm.distance,
+            overridden=arm.overridden,
+        )
+        for arm in message.arms
+    )
+    return Advice(np.array(message.action, np.float32), message.charged, tuple(arms))
+
+
+class Learner(_Client):
+    """A client of `tandem learner`.
+
+    >>> with tandem.Learner("127.0.0.1:7000") as learner:
+    ...     for progress in learner.watch():
+    ...         print(progress.env_steps, progress.training_success)
+    """
+
+    def __init__(self, address: str, **options: Any) -> None:
+        super().__init__(address, **options)
+        self._stub = learner_pb2_grpc.LearnerStub(self._channel)
+
+    def status(self) -> learner_pb2.Progress:
+        """Returns the progress of the run."""
+        progress: learner_pb2.Progress = self._call(self._stub.Status, learner_pb2.StatusRequest())
+        return progress
+
+    def watch(self) -> Iterator[learner_pb2.Progress]:
+        """Yields the progress about once per second. The last message has `ended` set."""
+        with self._errors():
+            stream = self._stub.Watch(learner_pb2.WatchRequest(), wait_for_ready=True)
+            try:
+                for progress in stream:
+                    yield progress
+                    if progress.ended:
+                        return
+            finally:
+                stream.cancel()
+        raise CallError("UNAVAILABLE", f"{self._address}: the learner is gone before the end of the run")
+
+
+@dataclasses.dataclass(frozen=True)
+class WayPoint:
+    """A position of one arm's tool."""
+
+    tool_m: tuple[float, float, float]
+    """x, y and z in the world frame, metres."""
+    opening: float = 1.0
+    """The opening of the gripper, 0 (closed) to 1 (open)."""
+
+
+class Bridge(_Client):
+    """A client of `tandem bridge`, which moves a pair of arms.
+
+    >>> with tandem.Bridge("127.0.0.1:7002") as bridge, bridge.lease() as lease:
+    ...     lease.reset()
+    ...     lease.move([(tandem.WayPoint((-0.1, 0.02, 0.12)), tandem.WayPoint((0.1, -0.02, 0.12)))], speed=0.5)
+    """
+
+    def __init__(self, address: str, **options: Any) -> None:
+        super().__init__(address, **options)
+        self._stub = bridge_pb2_grpc.BridgeStub(self._channel)
+
+    def describe(self) -> bridge_pb2.DescribeBridgeResponse:
+        """Returns the model, the layout and the limits of the arms."""
+        response: bridge_pb2.DescribeBridgeResponse = self._call(
+            self._stub.Describe, bridge_pb2.DescribeBridgeRequest()
+        )
+        return response
+
+    def status(self) -> bridge_pb2.BridgeStatusResponse:
+        """Returns the state of the bridge and of the arms."""
+        response: bridge_pb2.BridgeStatusResponse = self._call(self._stub.Status, bridge_pb2.BridgeStatusRequest())
+        return response
+
+    def stop(self) -> bridge_pb2.BridgeStop:
+        """Stops the arms, at any time and without a lease. Returns the first reason since the last reset."""
+        response: bridge_pb2.StopResponse = self._call(self._stub.Stop, bridge_pb2.StopRequest())
+        return response.stopped
+
+    def check(self, motion: bridge_pb2.MotionRequest) -> bridge_pb2.CheckResponse:
+        """Checks a motion as if it started now. Nothing moves."""
+        request = bridge_pb2.CheckRequest(motion=motion)
+        response: bridge_pb2.CheckResponse = self._call(self._stub.Check, request)
+        return response
+
+    @contextlib.contextmanager
+    def lease(self) -> Iterator[Lease]:
+        """Makes the caller the owner of the arms within a `with` block."""
+        token = self._call(self._stub.Acquire, bridge_pb2.AcquireRequest()).token
+        try:
+            yield Lease(self, token)
+        finally:
+            with contextlib.suppress(CallError):
+                self._call(self._stub.Release, bridge_pb2.ReleaseRequest(token=token))
+
+
+def motion(
+    way_points: Sequence[Sequence[WayPoint]], *, speed: float, from_here: bool = True, step_s: float = _STEP_S
+) -> bridge_pb2.MotionRequest:
+    """Returns a motion through `way_points`, each with one entry per arm.
+
+    `speed` is the fraction of the motion's own speed, in (0, 1]; `from_here` inserts the current positions first;
+    `step_s` is the minimum time between waypoints, seconds.
+    """
+    request = bridge_pb2.MotionRequest(speed=speed)
+    request.way_points.step_s = step_s
+    request.way_points.from_here = from_here
+    for arms in way_points:
+        way_point = request.way_points.way_points.add()
+        for arm in arms:
+            way_point.arms.add(tool_in_world_m=arm.tool_m, opening=arm.opening)
+    return request
+
+
+class Lease:
+    """Ownership of the arms of a bridge."""
+
+    def __init__(self, bridge: Bridge, token: str) -> None:
+        self._bridge = bridge
+        self._token = token
+
+    def reset(self) -> None:
+        """Releases stopped arms, so that they accept motions. Inspect the arms first.
+
+        A bridge that has just started, or arms that still brake, refuse a reset; it is repeated for up to a second.
+        """
+        request = bridge_pb2.ResetRequest(token=self._token)
+        for _ in range(_RESET_ATTEMPTS - 1):
+            try:
+                self._bridge._call(self._bridge._stub.Reset, request)
+                return
+            except CallError as error:
+                if error.code != "FAILED_PRECONDITION":
+                    raise
+            time.sleep(_RESET_PAUSE_S)
+        self._bridge._call(self._bridge._stub.Reset, request)
+
+    def renew(self) -> None:
+        """Renews the lease, which otherwise ends some seconds after the last request."""
+        self._bridge._call(self._bridge._stub.Acquire, bridge_pb2.AcquireRequest(token=self._token))
+
+    def move(
+        self,
+        way_points: Sequence[Sequence[WayPoint]],
+        *,
+        speed: float,
+        from_here: bool = True,
+        step_s: float = _STEP_S,
+    ) -> bridge_pb2.MotionProgress:
+        """Plays a motion through `way_points` (see `motion`) to its end, and returns the last report.
+
+        Raises:
+          CallError: if the bridge refuses the motion.
+          MotionStopped: if the arms were stopped before the end.
+        """
+        progress = bridge_pb2.MotionProgress()
+        for progress in self.play(motion(way_points, speed=speed, from_here=from_here, step_s=step_s)):
+            pass
+        return progress
+
+    def play(self, motion: bridge_pb2.MotionRequest) -> Iterator[bridge_pb2.MotionProgress]:
+        """Plays a motion, and yields about twenty reports per second. If the iterator is closed, the arms stop."""
+        ended = threading.Event()
+
+        def requests() -> Iterator[bridge_pb2.ExecuteRequest]:
+            yield bridge_pb2.ExecuteRequest(start=bridge_pb2.ExecuteStart(token=self._token, motion=motion))
+            while not ended.wait(_KEEP_ALIVE_S):
+                yield bridge_pb2.ExecuteRequest(alive=bridge_pb2.SignOfLife())
+
+        with self._bridge._errors():
+            responses = self._bridge._stub.Execute(requests())
+            try:
+                for response in responses:
+                    yield response.progress
+                    if response.HasField("outcome"):
+                        if response.outcome.HasField("stopped"):
+                            stopped = response.outcome.stopped
+                            raise MotionStopped(stopped.name, stopped.sentence)
+                        return
+            finally:
+                ended.set()
+                responses.cancel()
+        raise CallError("UNAVAILABLE", f"{self._bridge._address}: the stream of the motion ended early")

@@ -1,0 +1,181 @@
+"""The simulated environments with Gymnasium's interface."""
+
+from __future__ import annotations
+
+from typing import Any, cast
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import ArrayLike, NDArray
+
+from tandem import _native
+
+Observation = dict[str, NDArray[np.float32]]
+Action = NDArray[np.float32]
+
+EPISODE_STEPS = 50
+"""Control steps of an episode, 0.04 s each."""
+
+_TASKS = {
+    "tandem/Push-v0": ("push", 1),
+    "tandem/PickAndPlace-v0": ("pick-and-place", 1),
+    "tandem/TwoArmPush-v0": ("push", 2),
+    "tandem/TwoArmPickAndPlace-v0": ("pick-and-place", 2),
+}
+
+
+class TandemEnv(gymnasium.Env[Observation, Action]):
+    """One or two simulated arms that push cubes, or pick and place them.
+
+    An observation has 28 float32 numbers per arm, a goal the 3 coordinates of each cube in metres, and an action 3
+    numbers per arm (`push`) or 4 (`pick-and-place`), each in [-1, 1]. Every arm's numbers are in its own frame. The
+    reward is 0 if the distance between all achieved and desired positions, taken together, is at most 5 cm, and -1
+    otherwise. `info["is_success"]` holds if each cube is within 5 cm of its goal; `info["arm_contact"]` and
+    `info["table_contact"]` report contacts between arms and with the table during the step.
+
+    An episode never terminates. `gymnasium.make` truncates it after 50 steps.
+
+    `reset(seed=s)` starts episode 0 of seed `s`, and each `reset()` after it the next episode. The number of an
+    episode can be chosen with `reset(options={"episode": k})`. Given seed and number, the episode has the same bits as
+    in the Rust crates.
+
+    Args:
+        task: `"push"` or `"pick-and-place"`.
+        n_arms: 1 or 2.
+        substeps: Physics steps per control step, 20 or 10.
+        grasped_start_prob: Probability that an episode of pick and place starts with the cubes grasped.
+        render_mode: `"rgb_array"` or None.
+        width: Width of pictures, pixels.
+        height: Height of pictures, pixels.
+    """
+
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 25}
+
+    def __init__(
+        self,
+        task: str = "push",
+        n_arms: int = 2,
+        *,
+        substeps: int = 20,
+        grasped_start_prob: float = 0.0,
+        render_mode: str | None = None,
+        width: int = 640,
+        height: int = 400,
+    ) -> None:
+        check_rendering(render_mode, width, height)
+        self._simulation = _native.Simulation(
+            task, n_arms, substeps=substeps, grasped_start_prob=grasped_start_prob
+        )
+        self.render_mode = render_mode
+        self._size = (width, height)
+        self.observation_space, self.action_space = spaces_of(self._simulation)
+        self._seed: int | None = None
+        self._episode = 0
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Starts an episode.
+
+        Args:
+            seed: Starts the sequence of episodes of this seed, in [0, 2**64). Without a seed the sequence continues;
+                the first reset draws a seed from the operating system's entropy.
+            options: `{"episode": k}` starts episode `k` of the sequence.
+
+        Returns:
+            Observation and info.
+        """
+        super().reset(seed=seed)
+        number = episode_option(options)
+        if seed is not None:
+            self._seed, self._episode = seed, 0
+        elif self._seed is None:
+            self._seed, self._episode = int(self.np_random.integers(2**63)), 0
+        else:
+            self._episode += 1
+        if number is not None:
+            self._episode = number
+        return self._simulation.reset(self._seed, self._episode)
+
+    def step(self, action: ArrayLike) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        """Executes `action`, shape `[n_action]`, for one control step of 0.04 s.
+
+        Raises:
+            ValueError: The action has another length or contains a number that is not finite; nothing has moved.
+        """
+        return self._simulation.step(action)
+
+    def compute_reward(
+        self, achieved_goal: ArrayLike, desired_goal: ArrayLike, info: Any
+    ) -> float | NDArray[np.float32]:
+        """Returns the sparse rewards of goals of shape `[..., n_goal]`, shape `[...]`; `info` has no effect."""
+        return compute_reward(achieved_goal, desired_goal)
+
+    def render(self) -> NDArray[np.uint8] | None:
+        """Draws the scene, shape `[height, width, 3]`, in render mode `rgb_array`."""
+        return None if self.render_mode is None else self._simulation.render(*self._size)
+
+
+def compute_reward(achieved_goal: ArrayLike, desired_goal: ArrayLike) -> float | NDArray[np.float32]:
+    """Returns the sparse reward of goals: 0 within 5 cm, -1 beyond.
+
+    Args:
+        achieved_goal: Achieved positions, shape `[..., n_goal]`, metres.
+        desired_goal: Desired positions, of the same shape.
+
+    Returns:
+        A float for two goals of shape `[n_goal]`, otherwise an array of shape `[...]`.
+    """
+    achieved, desired = (np.asarray(goal, dtype=np.float32) for goal in (achieved_goal, desired_goal))
+    if achieved.shape != desired.shape or achieved.ndim == 0:
+        raise ValueError(f"goals have shapes {achieved.shape} and {desired.shape}, expected equal ones [..., n_goal]")
+    shape = achieved.shape[:-1]
+    n_goal = achieved.shape[-1]
+    rewards = _native.compute_reward(achieved.reshape(-1, n_goal), desired.reshape(-1, n_goal))
+    return rewards.reshape(shape) if shape else float(rewards[0])
+
+
+def spaces_of(simulation: _native.Simulation) -> tuple[spaces.Space[Observation], spaces.Space[Action]]:
+    """Returns the spaces of observations and actions.
+
+    Numbers of a correct simulation are within the bounds. Desired goals have the bounds of achieved ones, so that an
+    observation whose goal was replaced in hindsight lies in the space as well.
+    """
+    goal = simulation.goal_bounds
+    bounds = {"observation": simulation.observation_bounds, "achieved_goal": goal, "desired_goal": goal}
+    boxes: dict[str, spaces.Space[Any]] = {
+        name: spaces.Box(-high, high, dtype=np.float32) for name, high in bounds.items()
+    }
+    action = spaces.Box(-1.0, 1.0, (simulation.n_action,), dtype=np.float32)
+    return cast(spaces.Space[Observation], spaces.Dict(boxes)), cast(spaces.Space[Action], action)
+
+
+def episode_option(options: dict[str, Any] | None) -> int | None:
+    """Returns the number of the episode that the options of a reset ask for."""
+    options = dict(options or {})
+    number = options.pop("episode", None)
+    if options:
+        raise ValueError(f"unknown options {sorted(options)}: expected episode")
+    return None if number is None else int(number)
+
+
+def check_rendering(render_mode: str | None, width: int, height: int) -> None:
+    """Raises a `ValueError` for a mode or a size of pictures that does not exist."""
+    if render_mode not in (None, "rgb_array"):
+        raise ValueError(f'unknown render mode {render_mode!r}: expected "rgb_array" or None')
+    if not (1 <= width <= 4096 and 1 <= height <= 4096):
+        raise ValueError(f"pictures of {width} x {height} pixels: expected 1 to 4096 each")
+
+
+def register_envs() -> None:
+    """Registers the four environments with Gymnasium, once."""
+    for env_id, (task, n_arms) in _TASKS.items():
+        if env_id not in gymnasium.registry:
+            gymnasium.register(
+                env_id,
+                entry_point="tandem.envs:TandemEnv",
+                vector_entry_point="tandem.vector:TandemVectorEnv",
+                max_episode_steps=EPISODE_STEPS,
+                kwargs={"task": task, "n_arms": n_arms},
+            )

@@ -1,0 +1,132 @@
+"""Policies from files: actions, values and conversion to PyTorch."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from tandem import _native
+
+if TYPE_CHECKING:
+    from tandem.torch_policy import TorchPolicy
+
+_Floats = NDArray[np.float32]
+
+
+class Policy:
+    """A trained policy: actor, critic and the normalisation of their inputs.
+
+    Inputs are dictionaries as the environments return them, with arrays of shape `[n]` or `[batch, n]`. Outputs have
+    the bits of the Rust implementation, and a row has the same bits in any batch. Any thread may call any method.
+    """
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        self._native = _native.Policy(path)
+
+    @property
+    def task(self) -> str:
+        """Name of the task: `push` or `pick-and-place`."""
+        return self._native.task
+
+    @property
+    def n_arms(self) -> int:
+        """Number of arms."""
+        return self._native.n_arms
+
+    @property
+    def env_id(self) -> str:
+        """Name of the environment with the policy's task, for `gymnasium.make`."""
+        arms = "TwoArm" if self.n_arms == 2 else ""
+        return f"tandem/{arms}{self.task.title().replace('-', '')}-v0"
+
+    @property
+    def metadata(self) -> dict[str, str]:
+        """Entries of the file about training and success rates."""
+        return self._native.metadata
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of the tensors, hexadecimal; `tandem` names policies by it."""
+        return self._native.digest
+
+    def tensors(self) -> dict[str, _Floats]:
+        """Returns copies of all tensors by their names in the file, which docs/policy-format.md specifies."""
+        return self._native.tensors()
+
+    def predict(
+        self,
+        observation: Mapping[str, ArrayLike],
+        state: Any = None,
+        episode_start: Any = None,
+        deterministic: bool = True,
+    ) -> tuple[_Floats, None]:
+        """Returns the actions, in [-1, 1], shape `[n_action]` or `[batch, n_action]`, and None.
+
+        The signature is that of Stable-Baselines3. A policy has no state and is always deterministic.
+
+        Args:
+            observation: Arrays `observation` and `desired_goal`, shapes `[n]` or `[batch, n]`.
+            state: Has no effect.
+            episode_start: Has no effect.
+            deterministic: Has no effect.
+
+        Raises:
+            ValueError: An array has another shape or contains a number that is not finite.
+        """
+        observations, goals, is_batch = self._inputs(observation)
+        actions = self._native.act(observations, goals)
+        return (actions if is_batch else actions[0]), None
+
+    def q(self, observation: Mapping[str, ArrayLike], action: ArrayLike) -> _Floats:
+        """Returns the values of actions, shape `[n_heads]` or `[batch, n_heads]`.
+
+        A value is the expected discounted return: one number per arm, of the arm's own rewards, or one for all arms.
+
+        Args:
+            observation: As for `predict`.
+            action: Actions in [-1, 1], shape `[n_action]` or `[batch, n_action]`.
+
+        Raises:
+            ValueError: An array has another shape or contains a number that is not finite.
+        """
+        observations, goals, is_batch = self._inputs(observation)
+        values = self._native.q(observations, goals, _rows(action))
+        return values if is_batch else values[0]
+
+    def to_torch(self) -> TorchPolicy:
+        """Returns the policy as a PyTorch module with modules `actor` and `critic`.
+
+        Raises:
+            ImportError: PyTorch is not installed.
+        """
+        try:
+            from tandem.torch_policy import TorchPolicy
+        except ImportError as error:
+            raise ImportError("to_torch needs PyTorch: pip install torch") from error
+        return TorchPolicy(self)
+
+    def _inputs(self, observation: Mapping[str, ArrayLike]) -> tuple[_Floats, _Floats, bool]:
+        is_batch = np.ndim(observation["observation"]) > 1
+        return _rows(observation["observation"]), _rows(observation["desired_goal"]), is_batch
+
+    def __repr__(self) -> str:
+        return f"Policy(task={self.task!r}, n_arms={self.n_arms}, digest={self.digest[:12]!r})"
+
+
+def load_policy(path: str | os.PathLike[str]) -> Policy:
+    """Loads a policy file, such as `policies/student-push.safetensors` or a run's `best.safetensors`.
+
+    Raises:
+        OSError: The file cannot be read.
+        ValueError: The file is no policy, is of another version, or was altered.
+    """
+    return Policy(path)
+
+
+def _rows(array: ArrayLike) -> _Floats:
+    """Returns an array of shape `[n]` or `[batch, n]` as `[batch, n]`."""
+    return np.atleast_2d(np.asarray(array, dtype=np.float32))

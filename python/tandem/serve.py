@@ -1,0 +1,68 @@
+"""Serves a Gymnasium environment: `python -m tandem.serve FetchPush-v4`."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+
+from tandem._environments import LISTEN_VARIABLE, serve
+from tandem._grpc import ServiceError
+from tandem._task import DEFAULT_BOUND
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m tandem.serve",
+        description="Serves a Gymnasium environment with goals, in which workers of Tandem play episodes.",
+        epilog="""examples:
+  python -m tandem.serve FetchPush-v4                        needs gymnasium-robotics and mujoco
+  python -m tandem.serve my_package:MyArm-v0 --listen 127.0.0.1:7010
+  python -m tandem.serve PandaReach-v3 --workers 4
+  tandem train --env-command 'python -m tandem.serve FetchPush-v4'
+
+Prints "listening on http://HOST:PORT" once it serves. Exit codes: 0 ended as asked, 64 the environment or an option
+cannot be used.""",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("env", help="id for gymnasium.make; MODULE:ID imports a module first")
+    parser.add_argument(
+        "--listen", metavar="HOST:PORT", help=f"address to listen on [{LISTEN_VARIABLE}, or a free port of 127.0.0.1]"
+    )
+    parser.add_argument("--kwargs", type=json.loads, default={}, help="arguments of the environment, a JSON object")
+    parser.add_argument("--n", type=int, default=64, help="largest number of environments of a stream [%(default)s]")
+    parser.add_argument(
+        "--workers", type=int, default=1, help="processes that step the environments of a stream [%(default)s]"
+    )
+    parser.add_argument("--max-streams", type=int, default=16, help="simultaneous streams [%(default)s]")
+    parser.add_argument("--name", help="name of the task [the id in lower case]")
+    parser.add_argument("--tolerance", type=float, help="distance up to which a goal counts as achieved")
+    parser.add_argument("--norm", choices=["euclidean", "maximum"], help="norm of that distance")
+    parser.add_argument("--episode-steps", type=int, help="control steps per episode [of the environment's spec]")
+    parser.add_argument(
+        "--bound", type=float, default=DEFAULT_BOUND, help="magnitude of numbers without a bound [%(default)g]"
+    )
+    parser.add_argument("--token-file", help="file with the access token; required on non-loopback addresses")
+    parser.add_argument("--tls-cert", help="certificate chain (PEM): enables TLS")
+    parser.add_argument("--tls-key", help="private key of the certificate (PEM)")
+    parser.add_argument("--insecure", action="store_true", help="allow calls without a token on any address")
+    return parser
+
+
+def main() -> int:
+    """Runs the command line, and returns the exit code."""
+    arguments = vars(_parser().parse_args())
+    env, kwargs = arguments.pop("env"), arguments.pop("kwargs")
+    if not isinstance(kwargs, dict):
+        print("tandem.serve: --kwargs: expected a JSON object", file=sys.stderr)
+        return 64
+    try:
+        serve((env, kwargs), **arguments)
+    except ServiceError as error:
+        print(f"tandem.serve: {error}", file=sys.stderr)
+        return 64
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

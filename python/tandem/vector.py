@@ -1,0 +1,176 @@
+"""Many environments that are stepped in parallel, with Gymnasium's vector interface."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+from numpy.typing import ArrayLike, NDArray
+
+from tandem import _native
+from tandem.envs import EPISODE_STEPS, Observation, check_rendering, compute_reward, spaces_of
+
+_AUTORESET = {
+    AutoresetMode.NEXT_STEP: "next_step",
+    AutoresetMode.SAME_STEP: "same_step",
+    AutoresetMode.DISABLED: "disabled",
+}
+
+
+class TandemVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
+    """Environments of one task, stepped by a pool of threads without the interpreter lock.
+
+    `gymnasium.make_vec("tandem/TwoArmPush-v0", num_envs=16)` creates one. Environment `i` after `reset(seed=s)` plays
+    the episodes of the single environment after `reset(seed=s + i)`, bit for bit, with any number of threads.
+
+    Args:
+        num_envs: Number of environments.
+        task: `"push"` or `"pick-and-place"`.
+        n_arms: 1 or 2.
+        max_episode_steps: Steps after which an episode is truncated.
+        autoreset_mode: When an environment whose episode is over starts the next one; Gymnasium's modes.
+        num_threads: Number of threads; by default one per processor, at most one per environment.
+        substeps: As for `TandemEnv`.
+        grasped_start_prob: As for `TandemEnv`.
+        render_mode: `"rgb_array"` or None.
+        width: Width of pictures, pixels.
+        height: Height of pictures, pixels.
+    """
+
+    metadata: dict[str, Any] = {
+        "render_modes": ["rgb_array"],
+        "render_fps": 25,
+        "autoreset_mode": AutoresetMode.NEXT_STEP,
+    }
+
+    def __init__(
+        self,
+        num_envs: int,
+        task: str = "push",
+        n_arms: int = 2,
+        *,
+        max_episode_steps: int = EPISODE_STEPS,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+        num_threads: int | None = None,
+        substeps: int = 20,
+        grasped_start_prob: float = 0.0,
+        render_mode: str | None = None,
+        width: int = 640,
+        height: int = 400,
+    ) -> None:
+        for name, count in (("num_envs", num_envs), ("max_episode_steps", max_episode_steps)):
+            if count < 1:
+                raise ValueError(f"{name} is {count}, expected at least 1")
+        check_rendering(render_mode, width, height)
+        mode = AutoresetMode(autoreset_mode)
+        self.metadata = {**type(self).metadata, "autoreset_mode": mode}
+        self.num_envs = num_envs
+        self.render_mode = render_mode
+        self._size = (width, height)
+        self._mode = mode
+        self._simulation = _native.VectorSimulation(
+            task,
+            n_arms,
+            num_envs,
+            substeps=substeps,
+            grasped_start_prob=grasped_start_prob,
+            max_episode_steps=max_episode_steps,
+            autoreset=_AUTORESET[mode],
+            num_threads=num_threads or os.cpu_count() or 1,
+        )
+        single = _native.Simulation(task, n_arms, substeps=substeps, grasped_start_prob=grasped_start_prob)
+        self.single_observation_space, self.single_action_space = spaces_of(single)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self._is_seeded = False
+
+    def reset(
+        self, *, seed: int | Sequence[int] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Starts an episode in every environment.
+
+        Args:
+            seed: A number `s` gives environment `i` seed `s + i`; a sequence gives each its own. Without a seed, every
+                environment starts the next episode of its seed.
+            options: `{"reset_mask": mask}`, shape `[num_envs]`, resets only the environments where it is true.
+
+        Returns:
+            Observations, each of shape `[num_envs, ...]`, and infos.
+        """
+        options = dict(options or {})
+        mask = np.asarray(options.pop("reset_mask", np.ones(self.num_envs, np.bool_)), dtype=np.bool_)
+        if options:
+            raise ValueError(f"unknown options {sorted(options)}: expected reset_mask")
+        super().reset(seed=seed if isinstance(seed, int) else None)
+        if seed is None and not self._is_seeded:
+            seed = [int(drawn) for drawn in self.np_random.integers(2**63, size=self.num_envs)]
+        elif isinstance(seed, (int, np.integer)):
+            seed = [int(seed) + idx for idx in range(self.num_envs)]
+        seeds = None if seed is None else [int(each) for each in seed]
+        observations, infos = self._simulation.reset(seeds, mask.tolist())
+        self._is_seeded = True
+        return _observation(observations), _info(infos)
+
+    def step(
+        self, actions: ArrayLike
+    ) -> tuple[Observation, NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
+        """Executes one action per environment, shape `[num_envs, n_action]`.
+
+        In mode `SAME_STEP` the last observations and infos of episodes that ended are in `final_obs` and `final_info`.
+
+        Raises:
+            ValueError: The actions have another shape or contain a number that is not finite, or an environment has no
+                episode; no environment has moved.
+        """
+        step = self._simulation.step(np.asarray(actions, dtype=np.float32))
+        observations, rewards, truncations, infos = step
+        info = _info(infos)
+        if self._mode is AutoresetMode.SAME_STEP and truncations.any():
+            self._add_final(info, truncations)
+        terminations = np.zeros(self.num_envs, np.bool_)
+        return _observation(observations), rewards, terminations, truncations, info
+
+    def compute_reward(
+        self, achieved_goal: ArrayLike, desired_goal: ArrayLike, info: Any
+    ) -> float | NDArray[np.float32]:
+        """Returns the sparse rewards of goals of shape `[..., n_goal]`, shape `[...]`; `info` has no effect."""
+        return compute_reward(achieved_goal, desired_goal)
+
+    def render(self) -> tuple[NDArray[np.uint8], ...] | None:
+        """Draws every scene, shape `[height, width, 3]` each, in render mode `rgb_array`."""
+        return None if self.render_mode is None else tuple(self._simulation.render(*self._size))
+
+    def _add_final(self, info: dict[str, Any], is_over: NDArray[np.bool_]) -> None:
+        """Adds what `SyncVectorEnv` reports about episodes that ended, in its form."""
+        lasts, infos = self._simulation.last()
+        final_obs = np.full(self.num_envs, None, dtype=object)
+        final_info: dict[str, Any] = {}
+        for row, idx in enumerate(np.flatnonzero(is_over)):
+            final_obs[idx] = {name: rows[row] for name, rows in _observation(lasts).items()}
+        for name, values in zip(_INFO_NAMES, infos, strict=True):
+            final_info[name] = np.zeros(self.num_envs, np.bool_)
+            final_info[name][is_over] = values
+            final_info[f"_{name}"] = is_over.copy()
+        info.update(
+            final_obs=final_obs, _final_obs=is_over.copy(), final_info=final_info, _final_info=is_over.copy()
+        )
+
+
+_INFO_NAMES = ("is_success", "arm_contact", "table_contact")
+
+
+def _observation(arrays: tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]) -> Observation:
+    observation, achieved, desired = arrays
+    return {"observation": observation, "achieved_goal": achieved, "desired_goal": desired}
+
+
+def _info(arrays: tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.bool_]]) -> dict[str, Any]:
+    """Returns infos with the masks that Gymnasium's vector interface asks for: every environment has each entry."""
+    info: dict[str, Any] = {}
+    for name, values in zip(_INFO_NAMES, arrays, strict=True):
+        info[name], info[f"_{name}"] = values, np.ones(len(values), np.bool_)
+    return info

@@ -1,0 +1,117 @@
+"""Clients of the built program's services."""
+
+import shutil
+import subprocess
+
+import pytest
+
+pytest.importorskip("grpc")
+
+import numpy as np
+import tandem
+from services import ROOT, service
+
+POLICY = str(ROOT / "policies/teacher-push.safetensors")
+HOME = (tandem.WayPoint((-0.10, 0.02, 0.12)), tandem.WayPoint((0.10, -0.02, 0.12)))
+BUSY = {"late", "owner-silent", "state-old", "state-stale", "command-lost", "drive-fault"}
+"""Reasons for which a busy machine may stop the arms."""
+
+
+def test_a_teacher_answers_and_its_refusals_are_errors():
+    with (
+        service("teacher", "--ledger", "memory", "--policy", POLICY) as address,
+        tandem.Teacher(address) as teacher,
+    ):
+        assert teacher.describe().task == "push"
+        account = teacher.open_account("mine", budget=3, strategy="ea")
+        assert (account.spent, account.left) == (0, 3)
+        step = tandem.Step(0, 0, np.zeros(28), np.zeros(3), np.zeros(3))
+        (advice,) = teacher.advise("mine", [step])
+        assert advice.charged and advice.action.shape == (3,)
+        assert np.array_equal(advice.action, advice.arms[0].teacher_action)
+        assert teacher.account("mine").left == 2
+        with pytest.raises(tandem.CallError, match="steps\\[0\\].goal") as raised:
+            teacher.advise("mine", [tandem.Step(0, 1, np.zeros(28), np.zeros(4), np.zeros(3))])
+        assert raised.value.code == "INVALID_ARGUMENT" and not raised.value.is_temporary
+
+
+def test_nothing_that_answers_is_an_error_within_the_timeout():
+    with (
+        tandem.Teacher("127.0.0.1:1", timeout_s=0.3) as teacher,
+        pytest.raises(tandem.CallError, match="no answer within 0.3 s") as raised,
+    ):
+        teacher.describe()
+    assert raised.value.is_temporary
+
+
+def test_a_motion_is_played_to_its_end():
+    with service("bridge", "--driver", "sim") as address, tandem.Bridge(address) as bridge:
+        assert bridge.describe().driver == "sim"
+        for _ in range(5):
+            try:
+                with bridge.lease() as lease:
+                    lease.reset()
+                    last = lease.move([HOME], speed=1.0)
+                break
+            except tandem.MotionStopped as stopped:
+                assert stopped.name in BUSY
+        else:
+            pytest.skip("the machine is too busy to move arms")
+        assert last.played_s == pytest.approx(last.duration_s)
+        for arm, way_point in zip(bridge.status().arms, HOME):
+            assert np.allclose(arm.tool_in_world_m, way_point.tool_m, atol=0.01)
+
+
+def test_a_motion_that_the_check_refuses_raises_an_error():
+    with service("bridge", "--driver", "sim") as address, tandem.Bridge(address) as bridge, bridge.lease() as lease:
+        lease.reset()
+        below_table = (tandem.WayPoint((-0.1, 0.0, -0.5)), tandem.WayPoint((0.1, 0.0, -0.5)))
+        with pytest.raises(tandem.ServiceError):
+            lease.move([below_table], speed=1.0)
+
+
+def test_a_stop_ends_a_motion_with_its_reason():
+    with service("bridge", "--driver", "sim") as address, tandem.Bridge(address) as bridge, bridge.lease() as lease:
+        lease.reset()
+        with pytest.raises(tandem.MotionStopped) as raised:
+            for _ in lease.play(tandem.clients.motion([HOME], speed=0.1)):
+                bridge.stop()
+        assert raised.value.name == "requested" or raised.value.name in BUSY
+        assert bridge.status().HasField("stopped")
+
+
+def test_calls_use_tls_and_the_token(tmp_path):
+    if shutil.which("openssl") is None:
+        pytest.skip("there is no openssl")
+    key, certificate, token = (tmp_path / name for name in ("key.pem", "certificate.pem", "token"))
+    token.write_text("0123456789abcdef")
+    subprocess.run(
+        ["openssl", "req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:P-256", "-nodes", "-days", "2"]
+        + ["-subj", "/CN=localhost", "-addext", "subjectAltName=DNS:localhost"]
+        + ["-keyout", str(key), "-out", str(certificate)],
+        check=True,
+        capture_output=True,
+    )
+    options = ["--tls-cert", str(certificate), "--tls-key", str(key), "--token-file", str(token)]
+    with service("teacher", "--ledger", "memory", "--policy", POLICY, *options) as address:
+        address = address.replace("127.0.0.1", "localhost")
+        with tandem.Teacher(address, tls_ca=certificate, token_file=token) as teacher:
+            assert teacher.describe().task == "push"
+        with tandem.Teacher(address, tls_ca=certificate) as teacher:
+            with pytest.raises(tandem.CallError) as raised:
+                teacher.describe()
+            assert raised.value.code == "UNAUTHENTICATED"
+        with pytest.raises(tandem.ServiceError, match="requires TLS"):
+            tandem.Teacher(f"https://{address}")
+
+    def act(observation, goal):
+        return np.zeros((len(observation), 3))
+
+    tls = {"tls_cert": certificate, "tls_key": key, "token_file": token}
+    client = ["--tls-ca", str(certificate), "--token-file", str(token)]
+    with (
+        tandem.PolicyServer(act, task="push", listen="localhost:0", **tls) as server,
+        service("teacher", "--ledger", "memory", "--policy", server.address, *client) as address,
+        tandem.Teacher(address, token_file=token) as teacher,
+    ):
+        assert teacher.describe().policy_digest == server.digest

@@ -1,0 +1,323 @@
+"""Environment servers, over the wire."""
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import goal_env
+import numpy as np
+import pytest
+from goal_env import STEPS, PointEnv
+
+pytest.importorskip("grpc")
+
+import grpc
+import tandem
+from tandem._environments import episode_seed, make
+from tandem._grpc import open_channel
+from tandem._proto import environment_pb2 as pb
+from tandem._proto import environment_pb2_grpc
+from tandem._task import TaskOptions, describe
+
+ID = "goal_env:Tandem/Point-v0"
+TESTS = Path(__file__).parent
+
+
+def reset(pairs: list[tuple[int, int]]) -> pb.PlayRequest:
+    """Returns a request that resets environments, given as pairs of index and episode."""
+    environments = [pb.EnvironmentReset(environment=index, seed=5, episode=episode) for index, episode in pairs]
+    return pb.PlayRequest(reset=pb.ResetEnvironments(environments=environments))
+
+
+def step(actions: Any) -> pb.PlayRequest:
+    return pb.PlayRequest(step=pb.StepEnvironments(actions=np.asarray(actions, "<f4").tobytes()))
+
+
+def floats(data: bytes) -> np.ndarray[Any, Any]:
+    return np.frombuffer(data, "<f4")
+
+
+class Client:
+    def __init__(self, server: tandem.EnvironmentServer) -> None:
+        self.stub = environment_pb2_grpc.EnvironmentStub(open_channel(server.address))
+
+    def play(self, requests: list[pb.PlayRequest]) -> list[pb.PlayResponse]:
+        return list(self.stub.Play(iter(requests), timeout=30))
+
+    def refusal(self, requests: list[pb.PlayRequest]) -> tuple[str, str]:
+        with pytest.raises(grpc.RpcError) as raised:
+            self.play(requests)
+        return raised.value.code().name, raised.value.details()
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[tandem.EnvironmentServer]:
+    with tandem.EnvironmentServer(ID, n=4) as running:
+        yield running
+
+
+@pytest.fixture(scope="module")
+def client(server: tandem.EnvironmentServer) -> Client:
+    return Client(server)
+
+
+def test_the_task_is_found_by_probing(client: Client) -> None:
+    described = client.stub.Describe(pb.DescribeEnvironmentRequest())
+    task = tandem.Task.from_message(described.task)
+    assert (task.name, task.n_observation, task.n_goal, task.n_action) == ("tandem/point-v0", 4, 2, 2)
+    assert tuple(task.achieved_goal) == (2, 1), "the position is observed in reverse order"
+    assert (task.episode_steps, task.tolerance, task.norm) == (STEPS, 0.25, "euclidean")
+    assert tuple(task.observation_bound) == (9.0, 1000.0, 1000.0, 1000.0)
+    assert tuple(task.goal_bound) == (1000.0, 1000.0)
+    assert len(task.arms) == 1
+    assert tuple(task.arms[0].observation) == (0, 1, 2, 3)
+    assert described.max_environments == 4
+
+
+def test_an_episode_has_the_bits_of_the_environment_and_rescaled_actions(client: Client) -> None:
+    random = np.random.default_rng(3)
+    actions = random.uniform(-1, 1, (STEPS, 2, 2)).astype(np.float32)
+    answers = client.play([reset([(0, 8), (1, 9)]), *map(step, actions)])
+    for index, episode in enumerate((8, 9)):
+        env = PointEnv()
+        observation, _ = env.reset(seed=episode_seed(5, episode))
+        goal = observation["desired_goal"].astype("<f4")
+        assert answers[0].goals[8 * index : 8 * index + 8] == goal.tobytes()
+        for answer, action in zip(answers, [None, *actions]):
+            if action is not None:
+                low, high = action[index].astype(np.float64)
+                observation = env.step(np.array([2 * low, (high + 1) / 2]))[0]
+            expected = observation["observation"].astype("<f4")
+            assert answer.observations[16 * index : 16 * index + 16] == expected.tobytes()
+        assert all(env.action_space.contains(action) for action in env.actions)
+
+
+def test_a_later_reset_may_name_some_environments(client: Client) -> None:
+    answers = client.play([reset([(0, 1), (1, 2)]), step([[0, 0], [1, 1]]), reset([(1, 1)]), step([[0, 0], [0, 0]])])
+    assert len(answers[2].observations) == 16
+    assert answers[2].observations == answers[0].observations[:16], "episode 1 in the other environment"
+    assert answers[3].observations[16:] == answers[1].observations[:16]
+
+
+def test_processes_give_the_same_bits() -> None:
+    requests = [reset([(0, 1), (1, 2), (2, 3)]), *[step(np.full((3, 2), 0.25)) for _ in range(STEPS)]]
+    with tandem.EnvironmentServer(ID) as one, tandem.EnvironmentServer(ID, workers=2) as two:
+        assert Client(one).play(requests) == Client(two).play(requests)
+
+
+def test_the_seed_of_an_episode_is_documented() -> None:
+    assert episode_seed(0, 0) == int.from_bytes(bytes.fromhex("374708ff"), "little")
+    assert episode_seed(1, 2) != episode_seed(2, 1)
+
+
+def test_malformed_requests_are_refused_by_field(client: Client) -> None:
+    started = reset([(0, 1), (1, 2)])
+    cases = {
+        "command: expected reset or step": [pb.PlayRequest()],
+        "command: the first request must be reset": [step([[0, 0]])],
+        "reset.environments: expected 1 to 4, got 5": [reset([(index, 1) for index in range(5)])],
+        "reset.environments: the first request resets environments 0, 1, ... in this order": [reset([(1, 1)])],
+        "reset.environments[0].environment: expected 0 to 1, got 2": [started, reset([(2, 1)])],
+        "reset.environments[1].environment: 0 is named twice": [started, reset([(0, 1), (0, 2)])],
+        "step.actions: expected 16 bytes, got 8": [started, step([[0, 0]])],
+        "step.actions[2]: expected a number in [-1, 1], got nan": [started, step([[0, 0], [np.nan, 0]])],
+        "step.actions[1]: expected a number in [-1, 1], got 1.5": [started, step([[0, 1.5], [0, 0]])],
+    }
+    for message, requests in cases.items():
+        assert client.refusal(requests) == ("INVALID_ARGUMENT", message)
+
+
+def test_faults_of_environments_are_reported_with_their_text() -> None:
+    """The probe plays 10 steps, so the environment fails at step 11."""
+    requests = [reset([(0, 1), (1, 2)]), *[step(np.zeros((2, 2))) for _ in range(11)]]
+    for workers in (1, 2):
+        with tandem.EnvironmentServer((ID, {"fails_at": 11}), workers=workers) as server:
+            client = Client(server)
+            for _ in range(2):
+                expected = "environment 0: RuntimeError: the motor is on fire"
+                assert client.refusal(requests) == ("INTERNAL", expected)
+            assert len(client.play(requests[:-1])) == 11
+    with tandem.EnvironmentServer((ID, {"terminates_at": 11})) as server:
+        code, message = Client(server).refusal(requests)
+        assert code == "INTERNAL" and "terminated at step 11 without its goal" in message
+
+
+def test_a_number_beyond_its_bound_is_an_error() -> None:
+    with tandem.EnvironmentServer(ID, bound=1.0) as server:
+        code, message = Client(server).refusal([reset([(0, 1)])])
+        assert code == "INTERNAL" and "observation[3] is 7, beyond its bound 1" in message
+
+
+def test_streams_beyond_the_limit_are_refused() -> None:
+    with tandem.EnvironmentServer(ID, max_streams=1) as server:
+        client = Client(server)
+        first = client.stub.Play(iter([reset([(0, 1)])]))
+        next(first)
+        held = client.stub.Play(_endless(reset([(0, 1)])))
+        # The first stream has ended or holds the room; a held stream keeps it for good.
+        while True:
+            try:
+                next(held)
+                break
+            except grpc.RpcError:
+                held = client.stub.Play(_endless(reset([(0, 1)])))
+        assert client.refusal([reset([(0, 1)])])[0] == "RESOURCE_EXHAUSTED"
+        held.cancel()
+
+
+def _endless(first: pb.PlayRequest) -> Iterator[pb.PlayRequest]:
+    import threading
+
+    yield first
+    threading.Event().wait(30)
+
+
+def test_an_achieved_goal_outside_the_observation_is_appended() -> None:
+    task, appends = describe(make((ID, {"contained": False})), TaskOptions())
+    assert appends
+    assert (task.n_observation, tuple(task.achieved_goal)) == (4, (2, 3))
+    arms = [tandem.Arm((0,), (0,), (0,)), tandem.Arm((1,), (1,), (1,))]
+    task, _ = describe(make((ID, {"contained": False})), TaskOptions(arms=arms))
+    assert [tuple(arm.observation) for arm in task.arms] == [(0, 2), (1, 3)]
+    with tandem.EnvironmentServer((ID, {"contained": False})) as server:
+        (answer,) = Client(server).play([reset([(0, 4)])])
+    env = PointEnv(contained=False)
+    observation, _ = env.reset(seed=episode_seed(5, 4))
+    assert list(floats(answer.observations)[2:]) == list(observation["achieved_goal"].astype(np.float32))
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "options", "message"),
+    [
+        ({"dense": True}, {}, "the reward is not sparse"),
+        ({}, {"tolerance": 0.3}, "compute_reward returned -1 at euclidean distance 0.2"),
+        ({}, {"norm": "maximum"}, "compute_reward returned -1 at maximum distance"),
+        ({}, {"tolerance": -1.0}, "the tolerance must be a positive number"),
+        ({}, {"name": "My env"}, "'My env' is not a name"),
+        ({}, {"arms": [tandem.Arm((0, 4), (0,), (0,))]}, "indices of the observation"),
+        ({}, {"arms": [tandem.Arm((0,), (0,), (0,)), tandem.Arm((1, 2), (1,), (1,))]}, "differ in length"),
+        ({}, {"n": 0}, "1 to 1024 environments"),
+        ({}, {"listen": "0.0.0.0:0"}, "can be reached from other machines"),
+        ({}, {"listen": "here"}, "'here' is not an address"),
+    ],
+)
+def test_an_environment_that_cannot_be_served_is_refused(
+    kwargs: dict[str, Any], options: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(tandem.ServiceError, match=message.replace("(", r"\(")):
+        tandem.EnvironmentServer((ID, kwargs), **options)
+
+
+def test_the_norm_is_found() -> None:
+    task, _ = describe(make((ID, {"maximum": True})), TaskOptions())
+    assert task.norm == "maximum"
+
+
+def test_environments_without_goals_and_unknown_ids_are_refused() -> None:
+    with pytest.raises(tandem.ServiceError, match="must be a Dict"):
+        tandem.EnvironmentServer("CartPole-v1")
+    with pytest.raises(tandem.ServiceError, match="no environment 'Nowhere-v0'"):
+        tandem.EnvironmentServer("Nowhere-v0")
+    with pytest.raises(tandem.ServiceError, match="give episode_steps"):
+        tandem.EnvironmentServer(goal_env.point_env)
+
+
+def test_calls_without_the_token_are_refused(tmp_path: Path) -> None:
+    token = tmp_path / "token"
+    token.write_text("0123456789abcdef\n")
+    with tandem.EnvironmentServer(ID, token_file=token) as server:
+        request = pb.DescribeEnvironmentRequest()
+        with_token = environment_pb2_grpc.EnvironmentStub(open_channel(server.address, token))
+        assert with_token.Describe(request).max_environments == 64
+        assert len(list(with_token.Play(iter([reset([(0, 1)])])))) == 1
+        without = Client(server)
+        assert without.refusal([reset([(0, 1)])])[0] == "UNAUTHENTICATED"
+        with pytest.raises(grpc.RpcError) as raised:
+            without.stub.Describe(request)
+        assert raised.value.code() == grpc.StatusCode.UNAUTHENTICATED
+    token.write_text("short")
+    with pytest.raises(tandem.ServiceError, match="does not hold a token"):
+        tandem.EnvironmentServer(ID, token_file=token)
+
+
+class Command:
+    """`python -m tandem.serve`."""
+
+    def __init__(self, *arguments: str, **environment: str) -> None:
+        path = os.pathsep.join(filter(None, [str(TESTS), os.environ.get("PYTHONPATH")]))
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "tandem.serve", *arguments],
+            env={**os.environ, "PYTHONPATH": path, **environment},
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+
+    def address(self) -> str:
+        assert self.process.stdout is not None
+        line = self.process.stdout.readline()
+        prefix = "listening on http://127.0.0.1:"
+        assert line.startswith(prefix), line + self.end()[1]
+        return line.removeprefix("listening on ").strip()
+
+    def end(self) -> tuple[int, str]:
+        _, errors = self.process.communicate(timeout=20)
+        return self.process.returncode, errors
+
+
+def test_the_command_serves_until_it_is_terminated() -> None:
+    command = Command(ID, "--n", "3", "--kwargs", '{"threshold": 0.5}')
+    stub = environment_pb2_grpc.EnvironmentStub(open_channel(command.address()))
+    described = stub.Describe(pb.DescribeEnvironmentRequest())
+    assert (described.max_environments, described.task.tolerance) == (3, 0.5)
+    command.process.send_signal(signal.SIGTERM)
+    assert command.end() == (0, "")
+
+
+def test_the_command_of_a_worker_ends_with_its_standard_input() -> None:
+    command = Command(ID, TANDEM_ENV_LISTEN="127.0.0.1:0")
+    command.address()
+    assert command.process.stdin is not None
+    command.process.stdin.close()
+    command.process.stdin = None
+    assert command.end()[0] == 0
+
+
+def test_the_command_reports_an_unusable_environment_in_one_line() -> None:
+    code, errors = Command(ID, "--kwargs", '{"dense": true}').end()
+    assert code == 64
+    assert errors.startswith("tandem.serve: the reward is not sparse") and errors.count("\n") == 1, errors
+
+
+def test_fetch_push_is_served_with_its_bits() -> None:
+    pytest.importorskip("gymnasium_robotics")
+    pytest.importorskip("mujoco")
+    with tandem.EnvironmentServer("FetchPush-v4") as server:
+        assert (server.task.n_observation, tuple(server.task.achieved_goal)) == (25, (3, 4, 5))
+        actions = np.random.default_rng(0).uniform(-1, 1, (50, 2, 4))
+        client = Client(server)
+        episode = [reset([(0, 3), (1, 4)]), *map(step, actions)]
+        first = client.play(episode)
+        # Neither an earlier episode in the same environment nor the number of environments matters.
+        again = client.play([reset([(0, 9)]), step(actions[0, :1]), reset([(0, 4)]), *[step(a[1:]) for a in actions]])
+        assert [answer.observations[100:] for answer in first] == [answer.observations for answer in again[2:]]
+
+
+def test_a_tolerance_that_the_environment_does_not_name_is_measured() -> None:
+    env = PointEnv(threshold=0.175)
+    del env.distance_threshold
+    env.compute_reward = lambda a, b, info: -float(np.linalg.norm(a - b) > 0.175)  # type: ignore[method-assign]
+    task, _ = describe(env, TaskOptions(episode_steps=5))
+    assert (task.tolerance, task.norm, task.name) == (0.175, "euclidean", "pointenv")
+
+
+def test_the_packages_own_environments_can_be_served() -> None:
+    with tandem.EnvironmentServer("tandem/TwoArmPush-v0", norm="euclidean") as server:
+        task = server.task
+    assert (task.n_observation, task.n_action, task.episode_steps, task.tolerance) == (56, 6, 50, 0.05)
+    assert tuple(task.achieved_goal) == (3, 4, 5, 31, 32, 33)

@@ -1,0 +1,169 @@
+"""The environments: Gymnasium's rules, the bits of Rust, rewards and seeds."""
+
+import subprocess
+
+import gymnasium
+import numpy as np
+import pytest
+from conftest import ENV_IDS
+from gymnasium.utils.env_checker import check_env
+
+import tandem
+
+
+def arrays_of(observation):
+    return [observation[name] for name in ("observation", "achieved_goal", "desired_goal")]
+
+
+@pytest.mark.parametrize("env_id", ENV_IDS)
+def test_gymnasiums_checker_accepts_the_environment(env_id):
+    check_env(gymnasium.make(env_id, render_mode="rgb_array").unwrapped)
+
+
+@pytest.mark.parametrize("env_id", ENV_IDS)
+def test_stable_baselines3s_checker_accepts_the_environment(env_id):
+    checker = pytest.importorskip("stable_baselines3.common.env_checker", reason="needs stable-baselines3")
+    checker.check_env(gymnasium.make(env_id).unwrapped, warn=True)
+
+
+@pytest.mark.parametrize("env_id", ENV_IDS)
+def test_seed_and_actions_give_the_bits_of_rust(env_id, rng, observe_program):
+    env = gymnasium.make(env_id)
+    spec = env.spec.kwargs
+    for seed, episode in [(1, 0), (7, 3), (2**64 - 1, 12)]:
+        n_steps = 50 if seed == 1 else 8
+        actions = rng.uniform(-1.2, 1.2, (n_steps, *env.action_space.shape)).astype(np.float32)
+        observation, _ = env.reset(seed=seed, options={"episode": episode})
+        observations = [observation["observation"]]
+        observations += [env.step(action)[0]["observation"] for action in actions]
+        command = [observe_program, spec["task"], str(spec["n_arms"]), str(seed), str(episode)]
+        expected = subprocess.run(command, input=actions.tobytes(), stdout=subprocess.PIPE, check=True).stdout
+        assert np.concatenate(observations).tobytes() == expected
+
+
+def test_resets_without_a_seed_continue_its_episodes():
+    env, other = gymnasium.make(ENV_IDS[2]), gymnasium.make(ENV_IDS[2])
+    env.reset(seed=5)
+    env.reset()
+    third, _ = env.reset()
+    chosen, _ = other.reset(seed=5, options={"episode": 2})
+    first, _ = other.reset(seed=5)
+    assert all(map(np.array_equal, arrays_of(third), arrays_of(chosen)))
+    assert not np.array_equal(third["observation"], first["observation"])
+
+
+def test_unseeded_environments_differ():
+    starts = [gymnasium.make(ENV_IDS[0]).reset()[0]["observation"] for _ in range(2)]
+    assert not np.array_equal(*starts)
+
+
+@pytest.mark.parametrize("env_id", ENV_IDS)
+def test_an_episode_is_truncated_after_fifty_steps(env_id):
+    env = gymnasium.make(env_id)
+    env.reset(seed=3)
+    ends = [env.step(env.action_space.sample())[2:4] for _ in range(50)]
+    assert ends == [(False, False)] * 49 + [(False, True)]
+
+
+def test_rewards_of_steps_are_those_of_compute_reward(rng):
+    env = gymnasium.make(ENV_IDS[0])
+    env.reset(seed=2)
+    for _ in range(20):
+        observation, reward, *_, info = env.step(env.action_space.sample())
+        goals = observation["achieved_goal"], observation["desired_goal"]
+        assert reward == env.unwrapped.compute_reward(*goals, info)
+        assert info["is_success"] == (np.linalg.norm(goals[0] - goals[1]) <= 0.05)
+
+
+def test_rewards_of_batches_change_at_five_centimetres(rng):
+    desired = rng.uniform(-0.2, 0.2, (4, 5, 6))
+    direction = rng.normal(size=desired.shape)
+    direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
+    near, far = desired + 0.0499 * direction, desired + 0.0501 * direction
+    assert np.array_equal(tandem.compute_reward(near, desired), np.zeros((4, 5)))
+    assert np.array_equal(tandem.compute_reward(far, desired), -np.ones((4, 5)))
+    single = tandem.compute_reward(far[0, 0], desired[0, 0])
+    assert type(single) is float and single == -1.0
+    assert tandem.compute_reward(np.zeros((0, 6)), np.zeros((0, 6))).shape == (0,)
+
+
+def test_each_arm_within_five_centimetres_is_a_success_but_the_reward_is_joint():
+    both = np.array([0.04, 0, 0, 0.04, 0, 0])
+    assert tandem.compute_reward(both, np.zeros(6)) == -1.0
+    assert tandem.compute_reward(both[:3], np.zeros(3)) == 0.0
+
+
+def test_bad_actions_are_refused_and_change_nothing():
+    env = tandem.TandemEnv("push", 2)
+    before, _ = env.reset(seed=4)
+    for action, message in [
+        (np.zeros(5, np.float32), "5"),
+        (np.full(6, np.nan, np.float32), "NaN"),
+        ([0.0] * 5 + [float("inf")], "inf"),
+    ]:
+        with pytest.raises(ValueError, match=message):
+            env.step(action)
+    after = env.step(np.zeros(6))[0]
+    env.reset(seed=4)
+    assert np.array_equal(after["observation"], env.step([0] * 6)[0]["observation"])
+    assert np.array_equal(before["desired_goal"], after["desired_goal"])
+
+
+def test_actions_of_other_types_have_the_same_effect(rng):
+    env = tandem.TandemEnv("pick-and-place", 2)
+    action = rng.uniform(-1, 1, 8).astype(np.float32)
+    strided = np.zeros((8, 2), np.float32)
+    strided[:, 0] = action
+    results = []
+    for given in (action, action.astype(np.float64), action.tolist(), strided[:, 0]):
+        env.reset(seed=1)
+        results.append(env.step(given)[0]["observation"])
+    assert all(np.array_equal(results[0], result) for result in results[1:])
+
+
+def test_wrong_arguments_name_what_is_wrong():
+    for arguments, message in [
+        ({"task": "lift"}, "unknown task"),
+        ({"n_arms": 3}, "3 arms"),
+        ({"substeps": 7}, "substeps"),
+        ({"grasped_start_prob": 2.0}, "grasped_start_prob"),
+        ({"render_mode": "human"}, "render mode"),
+        ({"width": 0}, "pixels"),
+    ]:
+        with pytest.raises(ValueError, match=message):
+            tandem.TandemEnv(**arguments)
+    env = tandem.TandemEnv()
+    with pytest.raises(RuntimeError, match="reset"):
+        env.step(np.zeros(6))
+    with pytest.raises(ValueError, match="unknown options"):
+        env.reset(options={"epsiode": 1})
+
+
+def test_grasped_starts_hold_the_cube_in_the_hand():
+    env = tandem.TandemEnv("pick-and-place", 1, grasped_start_prob=1.0)
+    gaps = [np.linalg.norm(env.reset(seed=seed)[0]["observation"][6:9]) for seed in range(10)]
+    assert max(gaps) < 0.03
+
+
+def test_contacts_with_the_other_arm_are_reported():
+    env = tandem.TandemEnv("pick-and-place", 2)
+    env.reset(seed=1)
+    towards = np.array([1, 0, 0, 1] * 2, np.float32)
+    infos = [env.step(towards)[4] for _ in range(30)]
+    assert not infos[0]["arm_contact"] and any(info["arm_contact"] for info in infos)
+    assert not any(info["table_contact"] for info in infos)
+
+
+def test_pictures_show_the_scene():
+    env = gymnasium.make(ENV_IDS[3], render_mode="rgb_array", width=320, height=200)
+    env.reset(seed=1)
+    before = env.render()
+    assert before.shape == (200, 320, 3) and before.dtype == np.uint8
+    assert np.array_equal(before, env.render())
+    for _ in range(10):
+        env.step(np.array([0.5, 0.5, 1, 1] * 2, np.float32))
+    changed = (before != env.render()).any(axis=-1)
+    assert 0.005 < changed.mean() < 0.5
+    # The arms' objects and goals are blue and orange.
+    red, _, blue = (before[..., channel].astype(int) for channel in range(3))
+    assert (blue - red > 60).sum() > 50 and (red - blue > 60).sum() > 50

@@ -1,0 +1,239 @@
+"""Policy servers, alone and behind a teacher."""
+
+import numpy as np
+import pytest
+
+pytest.importorskip("grpc")
+
+import grpc
+import tandem
+from services import ROOT, refusal, service
+from tandem._grpc import open_channel
+from tandem._proto import policy_pb2 as pb
+from tandem._proto import policy_pb2_grpc
+
+TEACHER = ROOT / "policies" / "teacher-push.safetensors"
+STUDENT = ROOT / "policies" / "student-push.safetensors"
+RNG = np.random.default_rng(4)
+
+
+def follow(observation, goal):
+    """Moves the hand toward the goal."""
+    return np.clip(5 * (goal - observation[:, :3]), -1, 1)
+
+
+def closeness(observation, goal, action):
+    return -np.linalg.norm(goal - observation[:, :3] - action, axis=1)
+
+
+def stub(server):
+    return policy_pb2_grpc.PolicyStub(open_channel(server.address))
+
+
+def evaluate(server, m=3, **changes):
+    fields = {
+        "observations": RNG.normal(size=(m, 28)).astype("<f4").tobytes(),
+        "goals": RNG.normal(size=(m, 3)).astype("<f4").tobytes(),
+        **changes,
+    }
+    return stub(server).Evaluate(pb.EvaluatePolicyRequest(**fields))
+
+
+def refused(server, **changes):
+    with pytest.raises(grpc.RpcError) as raised:
+        evaluate(server, **changes)
+    return raised.value.code().name, raised.value.details()
+
+
+def steps(n_steps, n_arms=2, episode=1):
+    random = np.random.default_rng(episode)
+    return [
+        tandem.Step(
+            episode,
+            step,
+            random.uniform(-0.2, 0.2, 28 * n_arms),
+            random.uniform(-0.2, 0.2, 3 * n_arms),
+            random.uniform(-1, 1, 3 * n_arms),
+        )
+        for step in range(n_steps)
+    ]
+
+
+def bits(advice):
+    """Returns every number of the advice as comparable bytes."""
+    return [
+        (
+            one.action.tobytes(),
+            one.charged,
+            [(arm.teacher_action.tobytes(), arm.q_teacher, arm.q_student, arm.overridden) for arm in one.arms],
+        )
+        for one in advice
+    ]
+
+
+def test_answers_are_those_of_the_functions():
+    with tandem.PolicyServer(follow, task="push", value=closeness) as server:
+        observations, goals = (RNG.normal(size=(5, n)).astype(np.float32) for n in (28, 3))
+        proposed = RNG.uniform(-1, 1, (5, 3)).astype(np.float32)
+        answer = evaluate(
+            server,
+            observations=observations.astype("<f4").tobytes(),
+            goals=goals.tobytes(),
+            actions=proposed.tobytes(),
+            digest=server.digest,
+        )
+        actions = follow(observations, goals)
+        assert answer.actions == actions.astype("<f4").tobytes()
+        assert answer.values == closeness(observations, goals, actions).astype("<f4").tobytes()
+        assert answer.proposed_values == closeness(observations, goals, proposed).astype("<f4").tobytes()
+
+
+def test_a_state_is_evaluated_alone_unless_the_policy_is_batched():
+    sizes = []
+
+    def act(observation, goal):
+        sizes.append(len(observation))
+        return follow(observation, goal)
+
+    for batched, expected in ((False, [1, 1, 1]), (True, [3])):
+        with tandem.PolicyServer(act, task="push", batched=batched) as server:
+            sizes.clear()
+            evaluate(server)
+            assert sizes == expected
+
+
+def test_the_digest_changes_with_the_policy():
+    def gentle(observation, goal):
+        return follow(observation, goal) / 2
+
+    def digest(policy, **options):
+        with tandem.PolicyServer(policy, task="push", **options) as server:
+            return stub(server).Describe(pb.DescribePolicyRequest()).digest
+
+    assert digest(follow) == digest(follow) != digest(gentle)
+    assert digest(follow, value=closeness) != digest(follow)
+    assert digest(follow, digest="v1") == "v1"
+
+
+def test_requests_are_validated():
+    with tandem.PolicyServer(follow, task="push") as server:
+        assert refused(server, digest="other")[0] == "FAILED_PRECONDITION"
+        assert refused(server, goals=bytes(4)) == ("INVALID_ARGUMENT", "goals: expected 36 bytes, got 4")
+        nan = np.full((3, 3), np.nan, "<f4").tobytes()
+        assert refused(server, goals=nan) == ("INVALID_ARGUMENT", "goals[0]: expected a finite number, got nan")
+        assert refused(server, actions=nan)[1] == "actions[0]: expected a number in [-1, 1], got nan"
+        assert refused(server, m=257)[1] == "observations: expected at most 256 states, got 257"
+
+
+def test_a_failing_policy_is_reported_and_the_server_goes_on():
+    faults = {
+        "raise": (lambda: 1 / 0, "the policy raised ZeroDivisionError: division by zero"),
+        "shape": (lambda: np.zeros((1, 4)), "the policy returned an array of shape [1, 4], expected [1, 3]"),
+        "range": (lambda: np.full((1, 3), 1.5), "the policy returned 1.5, expected numbers in [-1, 1]"),
+        "nan": (lambda: np.full((1, 3), np.nan), "the policy returned nan, expected numbers in [-1, 1]"),
+    }
+    fault = []
+
+    def act(observation, goal):
+        return faults[fault[0]][0]() if fault else follow(observation, goal)
+
+    with tandem.PolicyServer(act, task="push") as server:
+        for name, (_, message) in faults.items():
+            fault[:] = [name]
+            code, details = refused(server)
+            assert code == "INTERNAL" and details.startswith(message), details
+            fault.clear()
+            assert len(evaluate(server).actions) == 36
+
+
+@pytest.mark.parametrize(
+    ("policy", "options", "message"),
+    [
+        (lambda o, g: RNG.uniform(-1, 1, (len(o), 3)), {"task": "push"}, "not a function"),
+        (lambda o, g: 3 * follow(o, g), {"task": "push"}, "clip its actions"),
+        (follow, {"task": "lift"}, "unknown task 'lift'"),
+        (follow, {"task": "push", "digest": "a b"}, "'a b' is not a digest"),
+        (follow, {}, "give the task"),
+        (tandem.load_policy(STUDENT), {}, "drives 1 arm, this one drives 2"),
+    ],
+)
+def test_a_policy_that_cannot_be_served_is_refused(policy, options, message):
+    with pytest.raises(tandem.ServiceError, match=message):
+        tandem.PolicyServer(policy, **options)
+
+
+def test_a_teacher_gives_the_same_advice_from_a_server_as_from_the_file():
+    policy = tandem.load_policy(TEACHER)
+    with (
+        tandem.PolicyServer(policy) as server,
+        service("teacher", "--ledger", "memory", "--policy", server.address) as remote,
+        service("teacher", "--ledger", "memory", "--policy", str(TEACHER)) as local,
+        tandem.Teacher(remote) as remote_teacher,
+        tandem.Teacher(local) as local_teacher,
+    ):
+        assert remote_teacher.describe().policy_digest == policy.digest
+        for strategy in ("ea", "mc-q:0.1", "mc-act:0.5", "eamc:0.1"):
+            answers = []
+            for teacher in (remote_teacher, local_teacher):
+                teacher.open_account(strategy, budget=30, strategy=strategy)
+                answers.append(bits(teacher.advise(strategy, steps(40))))
+                assert answers[-1] == bits(teacher.advise(strategy, steps(40))), "asked again"
+            assert answers[0] == answers[1]
+            assert remote_teacher.account(strategy) == local_teacher.account(strategy)
+            assert remote_teacher.account(strategy).spent > 0
+
+
+def test_a_teacher_without_values_offers_no_strategy_that_compares_them():
+    with (
+        tandem.PolicyServer(follow, task="push") as server,
+        service("teacher", "--ledger", "memory", "--policy", server.address) as address,
+        tandem.Teacher(address) as teacher,
+    ):
+        assert "ea" in teacher.describe().strategies
+        assert not any(name.startswith(("mc-q", "eamc")) for name in teacher.describe().strategies)
+        with pytest.raises(tandem.CallError, match="strategy mc-q:0.1 compares values"):
+            teacher.open_account("mine", budget=10, strategy="mc-q:0.1")
+        teacher.open_account("mine", budget=10, strategy="ea")
+        (advice,) = teacher.advise("mine", steps(1))
+        assert advice.charged and all(arm.overridden for arm in advice.arms)
+
+
+def test_an_absent_policy_is_waited_for_and_another_one_is_refused():
+    server = tandem.PolicyServer(follow, task="push", digest="v1")
+    address = server.address.removeprefix("http://")
+    with (
+        service("teacher", "--ledger", "memory", "--policy", server.address) as teacher_address,
+        tandem.Teacher(teacher_address) as teacher,
+    ):
+        teacher.open_account("mine", budget=10, strategy="ea")
+        (before,) = teacher.advise("mine", steps(1))
+        server.stop()
+        with pytest.raises(tandem.CallError) as raised:
+            teacher.advise("mine", steps(2))
+        assert raised.value.code == "UNAVAILABLE" and raised.value.is_temporary
+        assert teacher.account("mine").spent == 1, "only the step before"
+
+        with tandem.PolicyServer(follow, task="push", digest="v2", listen=address):
+            with pytest.raises(tandem.CallError, match="has changed") as raised:
+                teacher.advise("mine", steps(2))
+            assert raised.value.code == "FAILED_PRECONDITION"
+        with tandem.PolicyServer(follow, task="push", digest="v1", listen=address):
+            after = teacher.advise("mine", steps(2))
+        assert bits(after[:1]) == bits([before])
+        assert teacher.account("mine").spent == 2
+
+
+def test_a_teacher_refuses_what_is_not_a_policy_server(tmp_path):
+    token = tmp_path / "token"
+    token.write_text("0123456789abcdef")
+    with tandem.PolicyServer(follow, task="push", token_file=token) as server:
+        code, line = refusal("teacher", "--ledger", "memory", "--policy", server.address)
+        assert code == 64 and "missing or wrong token" in line, line
+    with service("bridge", "--driver", "sim") as bridge:
+        code, line = refusal("teacher", "--ledger", "memory", "--policy", f"http://{bridge}")
+        assert code == 64 and "cannot be used" in line, line
+
+
+def test_a_run_on_one_machine_needs_the_file_of_its_teacher(tmp_path):
+    code, line = refusal("train", "--teacher", "http://127.0.0.1:1", "--out", str(tmp_path / "run"))
+    assert code == 64 and "`tandem train` needs a file" in line, line

@@ -1,0 +1,104 @@
+"""Vector environments: their episodes are those of single environments, in every mode and with any threads."""
+
+import gymnasium
+import numpy as np
+import pytest
+from conftest import ENV_IDS
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+
+import tandem
+
+
+def assert_equal(one, other):
+    assert type(one) is type(other) or not isinstance(one, dict), (one, other)
+    if isinstance(one, dict):
+        assert sorted(one) == sorted(other)
+        for name in one:
+            assert_equal(one[name], other[name])
+    elif isinstance(one, np.ndarray) and one.dtype == object:
+        for a, b in zip(one, other, strict=True):
+            assert_equal(a, b)
+    else:
+        assert np.array_equal(one, other), (one, other)
+
+
+def test_make_vec_uses_the_threads_of_rust():
+    envs = gymnasium.make_vec(ENV_IDS[0], num_envs=3)
+    assert isinstance(envs, tandem.TandemVectorEnv)
+    assert envs.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP
+    observations, _ = envs.reset(seed=1)
+    assert envs.observation_space.contains(observations)
+    assert envs.spec.id == ENV_IDS[0]
+
+
+@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
+@pytest.mark.parametrize("env_id", [ENV_IDS[1], ENV_IDS[2]])
+def test_gymnasiums_vector_of_single_environments_gives_the_same(env_id, mode):
+    limit = {"max_episode_steps": 6}
+    envs = gymnasium.make_vec(env_id, num_envs=3, autoreset_mode=mode, num_threads=2, **limit)
+    expected = SyncVectorEnv([lambda: gymnasium.make(env_id, **limit)] * 3, autoreset_mode=mode)
+    envs.action_space.seed(1)
+    for one, other in zip(envs.reset(seed=9), expected.reset(seed=9), strict=True):
+        assert_equal(one, other)
+    for _ in range(16):
+        actions = envs.action_space.sample()
+        for one, other in zip(envs.step(actions), expected.step(actions), strict=True):
+            assert_equal(one, other)
+
+
+def test_environments_that_are_not_reset_automatically_wait_for_a_reset():
+    envs = tandem.TandemVectorEnv(3, max_episode_steps=2, autoreset_mode="Disabled")
+    actions = np.zeros((3, 6), np.float32)
+    with pytest.raises(ValueError, match="environment 0 has no episode"):
+        envs.step(actions)
+    envs.reset(seed=[4, 5, 6])
+    envs.step(actions)
+    envs.reset(options={"reset_mask": np.array([False, True, False])})
+    *_, truncations, _ = envs.step(actions)
+    assert truncations.tolist() == [True, False, True]
+    with pytest.raises(ValueError, match="environment 0 has no episode"):
+        envs.step(actions)
+    observations, _ = envs.reset(seed=4)
+    single, _ = tandem.TandemEnv("push", 2).reset(seed=6)
+    assert np.array_equal(observations["observation"][2], single["observation"])
+
+
+def test_the_number_of_threads_changes_no_bit(rng):
+    actions = rng.uniform(-1, 1, (12, 5, 8))
+    courses = []
+    for num_threads in (1, 3):
+        envs = tandem.TandemVectorEnv(5, "pick-and-place", num_threads=num_threads)
+        envs.reset(seed=2)
+        courses.append([envs.step(action)[0]["observation"] for action in actions])
+    assert np.array_equal(*courses)
+
+
+def test_bad_actions_are_refused_and_move_no_environment():
+    envs = tandem.TandemVectorEnv(2, "push", 1)
+    envs.reset(seed=1)
+    bad = np.zeros((2, 3))
+    bad[1, 2] = np.nan
+    for actions, message in [(bad, "environment 1"), (np.zeros((2, 4)), r"\(2, 4\), expected \(2, 3\)")]:
+        with pytest.raises(ValueError, match=message):
+            envs.step(actions)
+    after = envs.step(np.ones((2, 3)))[0]["observation"]
+    single = tandem.TandemEnv("push", 1)
+    single.reset(seed=1)
+    assert np.array_equal(after[0], single.step(np.ones(3))[0]["observation"])
+
+
+def test_arguments_out_of_range_are_refused():
+    for arguments, message in [({"num_envs": 0}, "num_envs"), ({"num_envs": 1, "max_episode_steps": 0}, "max_ep")]:
+        with pytest.raises(ValueError, match=message):
+            tandem.TandemVectorEnv(**arguments)
+    with pytest.raises(ValueError, match="seeds has length 1"):
+        tandem.TandemVectorEnv(2).reset(seed=[1])
+
+
+def test_every_environment_is_drawn():
+    envs = tandem.TandemVectorEnv(2, render_mode="rgb_array", width=64, height=40)
+    envs.reset(seed=1)
+    pictures = envs.render()
+    single = tandem.TandemEnv(render_mode="rgb_array", width=64, height=40)
+    single.reset(seed=2)
+    assert len(pictures) == 2 and np.array_equal(pictures[1], single.render())

@@ -1,0 +1,133 @@
+//! `tandem policy export` and `tandem policy import`.
+
+use std::path::Path;
+
+use serde_json::json;
+use tandem_core::rng::uniform;
+use tandem_core::{Layout, Stream, Task, episode_rng};
+use tandem_onnx::binding::layout_of;
+use tandem_onnx::{
+    BoundNetwork, Error, Model, ModelError, Role, export as write, import as convert,
+};
+use tandem_policy::Policy;
+use tandem_system::atomic_file;
+
+use crate::cli::{ExportArgs, ImportArgs};
+use crate::exit::{Exit, Failed, OrExit as _};
+use crate::{output, policy_file};
+
+/// Number of random states on which an imported policy is compared with its models.
+const N_COMPARED: usize = 1000;
+/// Largest accepted difference, relative to values above 1.
+const TOLERANCE: f32 = 1e-4;
+
+pub(super) fn export(args: &ExportArgs) -> Result<(), Failed> {
+    let policy = policy_file::load(&args.file)?;
+    if args.critic_onnx.is_some() && !policy.has_critic() {
+        let shown = args.file.display();
+        return Err(Failed::usage(format!("--critic-onnx: {shown} has no critic")));
+    }
+    let mut written = Vec::new();
+    let networks: [(_, _, fn(&Policy) -> Result<Vec<u8>, tandem_policy::Error>); 2] =
+        [("actor", &args.onnx, write::actor), ("critic", &args.critic_onnx, write::critic)];
+    for (role, path, encode) in networks {
+        let Some(path) = path else { continue };
+        let file = encode(&policy).or_exit(Exit::Data, String::new)?;
+        let model = Model::decode(&file).or_exit(Exit::Bug, String::new)?;
+        atomic_file::replace(path, &file)
+            .or_cannot_write(|| format!("cannot write {}", path.display()))?;
+        written.push((role, path, model.digest));
+    }
+    if args.json {
+        let file = |(role, path, digest): &(&str, &std::path::PathBuf, String)| json!({ "role": role, "file": path, "digest": digest });
+        let files: Vec<_> = written.iter().map(file).collect();
+        return output::print(json!({ "policy_digest": policy.digest(), "files": files }));
+    }
+    for (role, path, digest) in &written {
+        output::print(format_args!("{role:<13} {}, SHA-256 {digest}", path.display()))?;
+    }
+    output::print(format_args!("policy digest {}", policy.digest()))
+}
+
+pub(super) fn import(args: &ImportArgs) -> Result<(), Failed> {
+    let actor = Model::load(&args.actor).or_exit(Exit::Data, String::new)?;
+    let critic = args.critic.as_deref().map(Model::load).transpose();
+    let critic = critic.or_exit(Exit::Data, String::new)?;
+    let refused = |source| refused(&args.actor, source);
+    let layout = match (args.task, args.arms) {
+        (Some(task), Some(n_arms)) => Layout::new(Task::from(task), usize::from(n_arms)),
+        _ => layout_of(&actor, Role::Actor).map_err(refused)?,
+    };
+    // The critic alone is bound first, so that an error names its file.
+    if let Some((critic, path)) = critic.as_ref().zip(args.critic.as_ref()) {
+        let bound = BoundNetwork::new(critic, Role::Critic, layout);
+        bound.map_err(|source| self::refused(path, source))?;
+    }
+    let policy = convert(&actor, critic.as_ref(), layout).map_err(refused)?;
+    let differences = compare(&policy, &actor, critic.as_ref()).map_err(refused)?;
+    if differences.iter().any(|difference| difference.is_nan() || *difference > TOLERANCE) {
+        return Err(Failed::new(
+            Exit::Data,
+            anyhow::anyhow!(
+                "{}: the policy differs from the model by {:.1e}, because its numbers are too large for float32",
+                args.actor.display(),
+                differences[0].max(differences[1])
+            ),
+        ));
+    }
+    policy.save(&args.out).or_cannot_write(String::new)?;
+    if args.json {
+        return output::print(json!({
+            "file": args.out, "task": layout.task.name(), "arms": layout.n_arms, "digest": policy.digest(),
+            "has_critic": policy.has_critic(), "action_difference": differences[0], "value_difference": differences[1],
+        }));
+    }
+    let (task, n_arms) = (layout.task, layout.n_arms);
+    output::print(format_args!("policy        {}", args.out.display()))?;
+    output::print(format_args!("task          {task}, arms {n_arms}"))?;
+    output::print(format_args!("digest        {}", policy.digest()))?;
+    let values = match policy.has_critic() {
+        true => format!(", values by {:.1e}", differences[1]),
+        false => "; it has no critic, so a teacher of it offers no strategy that compares values"
+            .to_owned(),
+    };
+    output::print(format_args!(
+        "compared      {N_COMPARED} random states: actions differ by {:.1e}{values}",
+        differences[0]
+    ))
+}
+
+fn refused(path: &Path, source: ModelError) -> Failed {
+    let error = Error::Refused { path: path.to_owned(), source: Box::new(source) };
+    Failed::new(Exit::Data, error)
+}
+
+/// Returns the largest differences of actions and of values between a policy and its models in random states.
+fn compare(policy: &Policy, actor: &Model, critic: Option<&Model>) -> Result<[f32; 2], ModelError> {
+    let layout = policy.layout;
+    let mut rng = episode_rng(0, 0, Stream::Reset);
+    let mut draw = |n: usize, most: f32| -> Vec<f32> {
+        (0..N_COMPARED * n).map(|_| uniform(&mut rng, -most, most)).collect()
+    };
+    let (observations, goals) = (draw(layout.n_observation(), 0.5), draw(layout.n_goal(), 0.5));
+    let proposed = draw(layout.n_action(), 1.0);
+    let mut expected = vec![0.0; proposed.len()];
+    let mut got = expected.clone();
+    BoundNetwork::new(actor, Role::Actor, layout)?.run(&observations, &goals, &[], &mut expected);
+    policy.actor()?.act(&observations, &goals, &mut got);
+    let action_difference = largest_difference(&got, &expected);
+    let Some(critic) = critic else { return Ok([action_difference, 0.0]) };
+    let mut expected = vec![0.0; N_COMPARED * policy.n_heads];
+    let mut got = expected.clone();
+    let mut bound = BoundNetwork::new(critic, Role::Critic, layout)?;
+    bound.run(&observations, &goals, &proposed, &mut expected);
+    policy.critic()?.q(&observations, &goals, &proposed, &mut got);
+    Ok([action_difference, largest_difference(&got, &expected)])
+}
+
+fn largest_difference(got: &[f32], expected: &[f32]) -> f32 {
+    let differences = got.iter().zip(expected);
+    let relative =
+        differences.map(|(got, expected)| (got - expected).abs() / expected.abs().max(1.0));
+    relative.fold(0.0, |largest: f32, next| if next.is_nan() { next } else { largest.max(next) })
+}

@@ -1,0 +1,122 @@
+//! `tandem policy show`.
+
+use std::collections::BTreeMap;
+use std::fmt::Display;
+use std::path::Path;
+
+use serde_json::json;
+use tandem_onnx::binding::layout_of;
+use tandem_onnx::network::{Op, Step};
+use tandem_onnx::{Model, Network, Role};
+use tandem_teacher::policy::is_onnx;
+
+use crate::cli::ShowArgs;
+use crate::exit::{Exit, Failed, OrExit as _};
+use crate::{output, policy_file};
+
+pub(super) fn show(args: &ShowArgs) -> Result<(), Failed> {
+    if is_onnx(&args.file) { show_model(&args.file, args.json) } else { show_policy(args) }
+}
+
+fn show_policy(args: &ShowArgs) -> Result<(), Failed> {
+    let policy = policy_file::load(&args.file)?;
+    if args.json {
+        return output::print(json!({
+            "task": policy.layout.task.name(), "arms": policy.layout.n_arms, "n_hidden": policy.n_hidden,
+            "n_hidden_layers": policy.n_hidden_layers, "critic_heads": policy.n_heads, "digest": policy.digest(),
+            "metadata": policy.metadata,
+        }));
+    }
+    line("task", policy.layout.task)?;
+    line("arms", policy.layout.n_arms)?;
+    let (n_layers, n_hidden, n_heads) = (policy.n_hidden_layers, policy.n_hidden, policy.n_heads);
+    let critic = match policy.has_critic() {
+        true => format!("critic heads {n_heads}"),
+        false => "no critic".to_owned(),
+    };
+    line("networks", format_args!("{n_layers} hidden layers of {n_hidden}, {critic}"))?;
+    let (n_actor, n_critic) = (policy.actor.len(), policy.critic.len());
+    line("parameters", format_args!("actor {n_actor}, critic {n_critic}"))?;
+    line("digest", policy.digest())?;
+    show_metadata(&policy.metadata)
+}
+
+fn show_model(file: &Path, as_json: bool) -> Result<(), Failed> {
+    let model = Model::load(file).or_exit(Exit::Data, String::new)?;
+    let network = &model.network;
+    let inputs = network.inputs.iter();
+    let roles = [(Role::Actor, "actor"), (Role::Critic, "critic")];
+    let mut fitting =
+        roles.iter().filter_map(|(role, name)| Some((*name, layout_of(&model, *role).ok()?)));
+    // A model in whose metadata the task is written fits as a critic whatever its inputs are.
+    let fit = fitting.find(|(name, layout)| {
+        let role = if *name == "actor" { Role::Actor } else { Role::Critic };
+        tandem_onnx::BoundNetwork::new(&model, role, *layout).is_ok()
+    });
+    if as_json {
+        let inputs: Vec<_> =
+            inputs.map(|input| json!({ "name": input.name, "width": input.width })).collect();
+        return output::print(json!({
+            "role": fit.map(|(name, _)| name),
+            "task": fit.map(|(_, layout)| layout.task.name()),
+            "arms": fit.map(|(_, layout)| layout.n_arms),
+            "inputs": inputs,
+            "output": { "name": network.output, "width": network.n_output },
+            "layers": layers(network),
+            "n_parameters": network.n_parameters(),
+            "producer": model.producer, "ir_version": model.ir_version, "opset": model.opset,
+            "digest": model.digest, "metadata": model.metadata,
+        }));
+    }
+    match fit {
+        Some((name, layout)) => {
+            let (task, n_arms) = (layout.task, layout.n_arms);
+            line("fits", format_args!("{name} for {task}, arms {n_arms}"))?;
+        }
+        None => line("fits", "no task")?,
+    }
+    let inputs: Vec<String> =
+        inputs.map(|input| format!("{} [batch, {}]", input.name, input.width)).collect();
+    line("inputs", output::escaped(&inputs.join(", ")))?;
+    line("output", format_args!("{} [batch, {}]", network.output, network.n_output))?;
+    line("layers", layers(network).join(", "))?;
+    line("parameters", network.n_parameters())?;
+    let (ir, opset) = (model.ir_version, model.opset);
+    line("format", format_args!("IR version {ir}, opset {opset}, written by {}", model.producer))?;
+    line("digest", &model.digest)?;
+    show_metadata(&model.metadata)
+}
+
+/// Describes each layer by its number of units and the operations after it.
+fn layers(network: &Network) -> Vec<String> {
+    let mut layers: Vec<String> = Vec::new();
+    for step in &network.steps {
+        match (step, layers.last_mut()) {
+            (Step::Layer(layer), _) => layers.push(layer.bias.len().to_string()),
+            (Step::Each(ops), Some(last)) => {
+                let name = match ops.first() {
+                    Some(Op::Relu) => "relu",
+                    Some(Op::Tanh) => "tanh",
+                    Some(Op::Clip(..)) => "clip",
+                    _ => "affine",
+                };
+                last.push(' ');
+                last.push_str(name);
+            }
+            (Step::Each(_), None) => {}
+        }
+    }
+    layers
+}
+
+fn show_metadata(metadata: &BTreeMap<String, String>) -> Result<(), Failed> {
+    for (key, value) in metadata {
+        let [key, value] = [key, value].map(|text| output::escaped(text).replace('\n', "\\n"));
+        output::print(format_args!("{key:<22} {value}"))?;
+    }
+    Ok(())
+}
+
+fn line(label: &str, value: impl Display) -> Result<(), Failed> {
+    output::print(format_args!("{label:<13} {}", value.to_string().replace('\n', "\\n")))
+}

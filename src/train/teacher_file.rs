@@ -1,0 +1,147 @@
+//! The teacher of a run: a policy file, or ONNX models.
+
+use std::path::{Path, PathBuf};
+
+use tandem_core::Layout;
+use tandem_policy::Policy;
+use tandem_rl::RunConfig;
+use tandem_system::atomic_file;
+use tandem_teacher::policy::{OnnxPolicy, is_onnx};
+use tandem_teacher::{Error, Strategy, TeacherPolicy as _};
+
+use crate::exit::{Exit, Failed, OrExit as _};
+use crate::policy_file;
+use crate::service::{policy_address, teacher_failed};
+
+/// File names of a teacher's copy: a policy file, or the models of an actor and of a critic.
+const POLICY_COPY: &str = "teacher.safetensors";
+const ACTOR_COPY: &str = "teacher.onnx";
+const CRITIC_COPY: &str = "teacher-critic.onnx";
+
+/// The policy of the teacher, as read from its files.
+pub(crate) struct TeacherFile {
+    path: PathBuf,
+    critic: Option<PathBuf>,
+    digest: String,
+    layout: Layout,
+    has_values: bool,
+    /// The policy, unless the files are ONNX models.
+    policy: Option<Policy>,
+}
+
+impl TeacherFile {
+    /// Loads a policy file, or the ONNX model of an actor with its critic.
+    pub(super) fn load(path: PathBuf, critic: Option<PathBuf>) -> Result<Self, Failed> {
+        if let Some(address) = policy_address(&path) {
+            return Err(Failed::usage(format!(
+                "--teacher {address}: a run keeps a copy of its teacher, so `tandem train` needs a file; for a policy on \
+                 a server, start `tandem teacher --policy {address}`, `tandem learner` and `tandem worker`"
+            )));
+        }
+        if is_onnx(&path) {
+            let models = OnnxPolicy::load(&path, critic.as_deref()).map_err(teacher_failed)?;
+            let (digest, layout) = (models.digest().to_owned(), models.layout());
+            let has_values = models.has_values();
+            return Ok(Self { path, critic, digest, layout, has_values, policy: None });
+        }
+        if critic.is_some() {
+            return Err(teacher_failed(Error::SurplusCritic));
+        }
+        let policy = policy_file::load(&path)?;
+        let (digest, layout) = (policy.digest(), policy.layout);
+        let has_values = policy.has_critic();
+        Ok(Self { path, critic, digest, layout, has_values, policy: Some(policy) })
+    }
+
+    /// Loads the copy in `directory`, if there is one.
+    pub(super) fn copy_in(directory: &Path) -> Option<Result<Self, Failed>> {
+        let [policy, actor, critic] =
+            [POLICY_COPY, ACTOR_COPY, CRITIC_COPY].map(|name| directory.join(name));
+        if policy.exists() {
+            return Some(Self::load(policy, None));
+        }
+        actor.exists().then(|| Self::load(actor, critic.exists().then_some(critic)))
+    }
+
+    /// Refuses a teacher that cannot advise the run of `config`.
+    pub(super) fn check(&self, config: &RunConfig) -> Result<(), Failed> {
+        let shown = self.path.display();
+        if self.layout.n_arms != 1 {
+            return Err(Failed::usage(format!(
+                "{shown} drives {} arms: a teacher drives one",
+                self.layout.n_arms
+            )));
+        }
+        if self.layout.task.name() != config.task {
+            return Err(Failed::usage(format!(
+                "{shown} is a teacher for {}, the run is for {}",
+                self.layout.task, config.task
+            )));
+        }
+        if config.advice.starts_from_teacher() && (self.policy.is_none() || !self.has_values) {
+            return Err(Failed::usage(format!(
+                "{shown}: a run of strategy {} starts from a policy file with a critic; `tandem policy import` converts \
+                 ONNX models of actor and critic",
+                config.advice.strategy
+            )));
+        }
+        match config.advice.strategy.parse::<Strategy>() {
+            Ok(strategy) if strategy.needs_values() && !self.has_values => {
+                Err(Failed::new(Exit::Usage, Error::NoValues { strategy })
+                    .context(shown.to_string()))
+            }
+            _ => Ok(()),
+        }
+    }
+
+    /// Returns the file of the policy, or of the actor's model.
+    pub(super) fn path(&self) -> &Path {
+        &self.path
+    }
+
+    pub(super) fn digest(&self) -> &str {
+        &self.digest
+    }
+
+    /// Returns the path of the copy in `directory`.
+    pub(super) fn copy_path(&self, directory: &Path) -> PathBuf {
+        directory.join(if self.policy.is_some() { POLICY_COPY } else { ACTOR_COPY })
+    }
+
+    /// Returns the path of the critic's copy in `directory`, if the critic has a file.
+    pub(super) fn critic_copy_path(&self, directory: &Path) -> Option<PathBuf> {
+        self.critic.as_ref().map(|_| directory.join(CRITIC_COPY))
+    }
+
+    /// Copies the files to `directory`, in place of the copy of any other teacher.
+    pub(super) fn copy_to(&self, directory: &Path) -> Result<(), Failed> {
+        let copies = [
+            (Some(&self.path), Some(self.copy_path(directory))),
+            (self.critic.as_ref(), self.critic_copy_path(directory)),
+        ];
+        let copies: Vec<_> = copies.into_iter().filter_map(|(from, to)| from.zip(to)).collect();
+        for name in [POLICY_COPY, ACTOR_COPY, CRITIC_COPY] {
+            let other = directory.join(name);
+            if copies.iter().all(|(from, to)| *to != other && **from != other) && other.exists() {
+                let removed = std::fs::remove_file(&other);
+                removed.or_cannot_write(|| format!("cannot remove {}", other.display()))?;
+            }
+        }
+        for (from, to) in copies {
+            let written = std::fs::read(from).and_then(|bytes| atomic_file::replace(&to, &bytes));
+            written.or_cannot_write(|| format!("cannot write {}", to.display()))?;
+        }
+        Ok(())
+    }
+
+    /// Writes the policy as it was read to `directory`.
+    pub(super) fn write_to(&self, directory: &Path) -> Result<(), Failed> {
+        match &self.policy {
+            Some(policy) => {
+                let saved = policy.save(&self.copy_path(directory));
+                saved.or_exit(Exit::TryAgain, String::new)
+            }
+            None => self.copy_to(directory),
+        }
+    }
+}
