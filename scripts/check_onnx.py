@@ -6,9 +6,11 @@
     tandem eval --policy FILE --episodes 20 --record-dir logs
     python3 scripts/check_onnx.py actor.onnx critic.onnx probe.json logs
 
-The probe has actions and values of arbitrary states, the logs have simulated observations and the policy's actions.
-Needs the packages of scripts/requirements.txt. Ends with code 1 and one line on standard error if a number differs by
-1e-5 or more (values: relative to values above 1).
+The logs have simulated observations and the policy's actions, which must agree to 1e-5. The probe has actions and values
+of arbitrary states. There the networks extrapolate and their numbers before the tanh reach 100, so both programs differ
+from exact arithmetic by up to 3e-5, the rounding of float32; these must agree to 1e-4. Values are compared relative to
+values above 1. Needs the packages of scripts/requirements.txt. Ends with code 1 and one line on standard error if the
+numbers do not agree.
 """
 
 import json
@@ -20,7 +22,8 @@ import onnxruntime
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
-TOLERANCE = 1e-5
+SIMULATED_TOLERANCE = 1e-5
+ARBITRARY_TOLERANCE = 1e-4
 
 
 def session(path):
@@ -49,13 +52,13 @@ def log_rows(directory):
     return [np.array(column, dtype=np.float32) for column in zip(*rows)]
 
 
-def compare(what, got, expected):
+def compare(what, got, expected, tolerance):
     if got.shape != expected.shape:
         sys.exit(f"{what}: shape {got.shape}, expected {expected.shape}")
     difference = float((np.abs(got - expected) / np.maximum(1.0, np.abs(expected))).max())
-    print(f"{len(expected)} {what} differ by {difference:.1e}")
-    if not difference < TOLERANCE:
-        sys.exit(f"{what}: differences of {TOLERANCE:.0e} or more")
+    print(f"{what}, {len(expected)} rows: differ by {difference:.1e}")
+    if not difference < tolerance:
+        sys.exit(f"{what}: differences of {tolerance:.0e} or more")
 
 
 def main(actor_path, critic_path, probe_path, log_directory):
@@ -68,13 +71,13 @@ def main(actor_path, critic_path, probe_path, log_directory):
 
     observations, goals, actions, values = probe_rows(probe_path)
     states = {"observation": observations, "goal": goals}
-    compare("actions in arbitrary states", actor.run(["action"], states)[0], actions)
-    compare("values of them", critic.run(["value"], states | {"action": actions})[0], values)
+    compare("actions in arbitrary states", actor.run(["action"], states)[0], actions, ARBITRARY_TOLERANCE)
+    compare("values of these actions", critic.run(["value"], states | {"action": actions})[0], values, ARBITRARY_TOLERANCE)
     one = {name: rows[:1] for name, rows in states.items()}
-    compare("action of a batch of one", actor.run(["action"], one)[0], actions[:1])
+    compare("actions of a batch of one", actor.run(["action"], one)[0], actions[:1], ARBITRARY_TOLERANCE)
     observations, goals, actions = log_rows(log_directory)
     states = {"observation": observations, "goal": goals}
-    compare("actions in simulated states", actor.run(["action"], states)[0], actions)
+    compare("actions in simulated states", actor.run(["action"], states)[0], actions, SIMULATED_TOLERANCE)
 
 
 if __name__ == "__main__":

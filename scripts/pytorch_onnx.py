@@ -106,7 +106,7 @@ def main(directory):
     observation = torch.rand(N_ROWS, N_OBSERVATION) - 0.5
     goal, action = torch.rand(N_ROWS, N_GOAL) - 0.5, 2.0 * torch.rand(N_ROWS, N_ACTION) - 1.0
     # The object's position, which is the achieved goal.
-    states = {"achieved_goal": observation[:, 3:6], "desired_goal": goal, "observation": observation}
+    states = {"achieved_goal": observation[:, 3:6].clone(), "desired_goal": goal, "observation": observation}
     joined = {"obs": torch.cat([observation, goal], dim=1)}
     models = [
         ("sb3-actor", MultiInputActor(), states, "action"),
