@@ -6,8 +6,8 @@
     tandem eval --policy FILE --episodes 20 --record-dir logs
     python3 scripts/check_onnx.py actor.onnx critic.onnx probe.json logs
 
-The logs have simulated observations and the policy's actions, which must agree to 1e-5. The probe has actions and values
-of arbitrary states. There the networks extrapolate and their numbers before the tanh reach 100, so both programs differ
+The logs have simulated observations and the policy's actions, which must agree to 1e-5. The probe has actions and
+values of arbitrary states. There the networks extrapolate and their numbers before the tanh reach 100, so both programs differ
 from exact arithmetic by up to 3e-5, the rounding of float32; these must agree to 1e-4. Values are compared relative to
 values above 1. Needs the packages of scripts/requirements.txt. Ends with code 1 and one line on standard error if the
 numbers do not agree.
@@ -72,7 +72,8 @@ def main(actor_path, critic_path, probe_path, log_directory):
     observations, goals, actions, values = probe_rows(probe_path)
     states = {"observation": observations, "goal": goals}
     compare("actions in arbitrary states", actor.run(["action"], states)[0], actions, ARBITRARY_TOLERANCE)
-    compare("values of these actions", critic.run(["value"], states | {"action": actions})[0], values, ARBITRARY_TOLERANCE)
+    got = critic.run(["value"], states | {"action": actions})[0]
+    compare("values of these actions", got, values, ARBITRARY_TOLERANCE)
     one = {name: rows[:1] for name, rows in states.items()}
     compare("actions of a batch of one", actor.run(["action"], one)[0], actions[:1], ARBITRARY_TOLERANCE)
     observations, goals, actions = log_rows(log_directory)

@@ -20,7 +20,7 @@ N_OBSERVATION, N_GOAL, N_ACTION, N_ROWS = 28, 3, 3, 8
 
 
 class MultiInputActor(nn.Module):
-    """As Stable-Baselines3's TD3 with MultiInputPolicy for HER: the dictionary's entries in the order of their names."""
+    """As Stable-Baselines3's TD3 with MultiInputPolicy for HER: the entries in the order of their names."""
 
     def __init__(self):
         super().__init__()
