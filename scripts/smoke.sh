@@ -25,6 +25,8 @@ expect 64 'ddpg.discont' "$tandem" train --set ddpg.discont=0.9 --out "$work/non
 expect 64 'cannot read run file' "$tandem" train --run "$work/missing.toml"
 expect 65 'missing.safetensors' "$tandem" eval --policy "$work/missing.safetensors"
 head -c 1000 policies/teacher-push.safetensors >"$work/torn.safetensors"
+head -c 1000 onnx/tests/pytorch/sb3-actor.dynamo.onnx >"$work/torn.onnx"
+expect 65 'not a complete ONNX file' "$tandem" policy show "$work/torn.onnx"
 expect 65 'torn.safetensors' "$tandem" eval --policy "$work/torn.safetensors"
 expect 64 'holds a run already' bash -c "mkdir -p '$work/taken' && touch '$work/taken/run.toml' && '$tandem' train --out '$work/taken'"
 
@@ -53,12 +55,30 @@ first, second = (json.loads(open(path).read().splitlines()[-1])["digest"] for pa
 assert first == second, f"{first} != {second}"
 PY
 
+echo '- a run advised by a network that PyTorch exported'
+foreign=onnx/tests/pytorch/normalized-tanh-actor.dynamo.onnx
+expect 64 'has no critic' "$tandem" train --teacher "$foreign" --out "$work/foreign"
+"$tandem" train --teacher "$foreign" --strategy ea --max-env-steps 2000 --workers 1 --out "$work/foreign" --json \
+  --set evaluation.episodes=8 --set evaluation.every_env_steps=1600 --set ddpg.n_hidden=16 >"$work/foreign.json"
+grep -q '"advice_spent":[1-9]' "$work/foreign.json"
+cmp "$foreign" "$work/foreign/policy/teacher.onnx"
+
 echo '- other programs read what it wrote'
 python3 -m venv "$work/venv"
 "$work/venv/bin/pip" install --quiet --requirement scripts/requirements.txt
 "$work/venv/bin/python" scripts/read_mcap.py "$work"/run/mcap/*.mcap
 cargo run --release --locked --quiet -p tandem-policy --example policy_probe -- policies/teacher-push.safetensors >"$work/probe.json"
 "$work/venv/bin/python" scripts/check_policy.py policies/teacher-push.safetensors "$work/probe.json"
+for name in teacher-push student-push teacher-pick-and-place student-pick-and-place; do
+  file=policies/$name.safetensors
+  "$tandem" policy export "$file" --onnx "$work/actor.onnx" --critic-onnx "$work/critic.onnx" >/dev/null
+  cargo run --release --locked --quiet -p tandem-policy --example policy_probe -- "$file" 1000 >"$work/probe.json"
+  "$tandem" eval --policy "$file" --episodes 20 --record-dir "$work/$name" >/dev/null
+  "$work/venv/bin/python" scripts/check_onnx.py "$work/actor.onnx" "$work/critic.onnx" "$work/probe.json" "$work/$name"
+  "$tandem" policy import "$work/actor.onnx" --critic "$work/critic.onnx" --out "$work/back.safetensors" >/dev/null
+  digest() { "$tandem" policy show "$1" --json | python3 -c 'import json, sys; print(json.load(sys.stdin)["digest"])'; }
+  [ "$(digest "$file")" = "$(digest "$work/back.safetensors")" ] || { echo "$name changed by export and import"; exit 1; }
+done
 for log in "$work"/run/mcap/*.mcap; do "$tandem" replay "$log" --verify >/dev/null; done
 
 echo '- a policy pushes in another physics engine'

@@ -11,7 +11,7 @@ mod layers;
 use std::collections::BTreeMap;
 
 use tandem_core::Layout;
-use tandem_policy::policy::NO_CRITIC;
+use tandem_policy::policy::{MAX_HIDDEN_LAYERS, NO_CRITIC};
 use tandem_policy::{MlpShape, NormalizerSnapshot, Policy};
 
 use crate::binding::{BoundNetwork, Role, Source, policy_columns};
@@ -20,6 +20,9 @@ use crate::metadata;
 use crate::model::Model;
 use columns::{Normalized, normalized};
 use layers::{Dense, dense_layers};
+
+/// Largest accepted number of parameters of a network after padding.
+const MAX_PARAMETERS: usize = 1 << 24;
 
 /// Creates the policy of an actor and, if there is one, a critic. Without one the policy is marked with [`NO_CRITIC`].
 ///
@@ -42,13 +45,14 @@ pub fn import(actor: &Model, critic: Option<&Model>, layout: Layout) -> Result<P
     let [observation, goal, _] = policy_columns(layout);
     let normalizers = shared_normalizers(layout, both())?;
     let critic_shape = MlpShape::critic(layout, n_hidden, n_hidden_layers, n_heads);
+    let actor_shape = MlpShape::actor(layout, n_hidden, n_hidden_layers);
+    check_size(n_hidden_layers, &[actor_shape, critic_shape])?;
     let mut policy = Policy {
         layout,
         n_hidden,
         n_hidden_layers,
         n_heads,
-        actor: actor_network
-            .parameters(layout, &MlpShape::actor(layout, n_hidden, n_hidden_layers)),
+        actor: actor_network.parameters(layout, &actor_shape),
         critic: match &critic_network {
             Some(critic) => critic.parameters(layout, &critic_shape),
             None => vec![0.0; critic_shape.n_parameters()],
@@ -60,6 +64,21 @@ pub fn import(actor: &Model, critic: Option<&Model>, layout: Layout) -> Result<P
     policy.check()?;
     policy.metadata = metadata_of(&policy, actor, critic);
     Ok(policy)
+}
+
+/// Refuses networks that padding would make larger than a policy can be.
+fn check_size(n_hidden_layers: usize, shapes: &[MlpShape]) -> Result<(), ModelError> {
+    if n_hidden_layers > MAX_HIDDEN_LAYERS {
+        return Err(ModelError::NotRepresentable(format!(
+            "it has {n_hidden_layers} hidden layers, expected at most {MAX_HIDDEN_LAYERS}"
+        )));
+    }
+    match shapes.iter().map(MlpShape::n_parameters).max() {
+        Some(n) if n > MAX_PARAMETERS => Err(ModelError::NotRepresentable(format!(
+            "with layers of equal width it has {n} parameters, expected at most {MAX_PARAMETERS}"
+        ))),
+        _ => Ok(()),
+    }
 }
 
 fn snapshot(columns: &[[f32; 2]]) -> NormalizerSnapshot {

@@ -1,5 +1,5 @@
 //! Prints the outputs of a policy file for arbitrary inputs, which `scripts/check_policy.py` compares with its own:
-//! `cargo run --release -p tandem-policy --example policy_probe -- FILE > probe.json`.
+//! `cargo run --release -p tandem-policy --example policy_probe -- FILE [ROWS] > probe.json`.
 
 #![expect(clippy::print_stdout, reason = "an example that prints its results")]
 
@@ -10,20 +10,21 @@ use tandem_core::rng::uniform;
 use tandem_core::{Stream, episode_rng};
 use tandem_policy::Policy;
 
-const N_ROWS: usize = 64;
+const DEFAULT_ROWS: usize = 64;
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {
-    let file = std::env::args().nth(1).ok_or("usage: policy_probe FILE")?;
+    let file = std::env::args().nth(1).ok_or("usage: policy_probe FILE [ROWS]")?;
+    let n_rows = std::env::args().nth(2).map_or(Ok(DEFAULT_ROWS), |rows| rows.parse::<usize>())?;
     let policy = Policy::load(Path::new(&file))?;
     let (mut actor, mut critic) = (policy.actor()?, policy.critic()?);
     let layout = policy.layout;
 
     let mut rng = episode_rng(0, 0, Stream::Reset);
     let mut draw =
-        |n: usize| (0..N_ROWS * n).map(|_| uniform(&mut rng, -0.5, 0.5)).collect::<Vec<f32>>();
+        |n: usize| (0..n_rows * n).map(|_| uniform(&mut rng, -0.5, 0.5)).collect::<Vec<f32>>();
     let (observations, goals) = (draw(layout.n_observation()), draw(layout.n_goal()));
-    let mut actions = vec![0.0; N_ROWS * layout.n_action()];
-    let mut q = vec![0.0; N_ROWS * critic.n_heads()];
+    let mut actions = vec![0.0; n_rows * layout.n_action()];
+    let mut q = vec![0.0; n_rows * critic.n_heads()];
     actor.act(&observations, &goals, &mut actions);
     critic.q(&observations, &goals, &actions, &mut q);
     let probe = json!({

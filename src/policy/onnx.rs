@@ -21,6 +21,9 @@ const N_COMPARED: usize = 1000;
 /// Largest accepted difference, relative to values above 1.
 const TOLERANCE: f32 = 1e-4;
 
+/// Encodes one of a policy's networks.
+type Encode = fn(&Policy) -> Result<Vec<u8>, tandem_policy::Error>;
+
 pub(super) fn export(args: &ExportArgs) -> Result<(), Failed> {
     let policy = policy_file::load(&args.file)?;
     if args.critic_onnx.is_some() && !policy.has_critic() {
@@ -28,7 +31,7 @@ pub(super) fn export(args: &ExportArgs) -> Result<(), Failed> {
         return Err(Failed::usage(format!("--critic-onnx: {shown} has no critic")));
     }
     let mut written = Vec::new();
-    let networks: [(_, _, fn(&Policy) -> Result<Vec<u8>, tandem_policy::Error>); 2] =
+    let networks: [(_, _, Encode); 2] =
         [("actor", &args.onnx, write::actor), ("critic", &args.critic_onnx, write::critic)];
     for (role, path, encode) in networks {
         let Some(path) = path else { continue };

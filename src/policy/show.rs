@@ -7,7 +7,7 @@ use std::path::Path;
 use serde_json::json;
 use tandem_onnx::binding::layout_of;
 use tandem_onnx::network::{Op, Step};
-use tandem_onnx::{Model, Network, Role};
+use tandem_onnx::{BoundNetwork, Model, Network, Role};
 use tandem_teacher::policy::is_onnx;
 
 use crate::cli::ShowArgs;
@@ -45,14 +45,11 @@ fn show_model(file: &Path, as_json: bool) -> Result<(), Failed> {
     let model = Model::load(file).or_exit(Exit::Data, String::new)?;
     let network = &model.network;
     let inputs = network.inputs.iter();
-    let roles = [(Role::Actor, "actor"), (Role::Critic, "critic")];
-    let mut fitting =
-        roles.iter().filter_map(|(role, name)| Some((*name, layout_of(&model, *role).ok()?)));
-    // A model in whose metadata the task is written fits as a critic whatever its inputs are.
-    let fit = fitting.find(|(name, layout)| {
-        let role = if *name == "actor" { Role::Actor } else { Role::Critic };
-        tandem_onnx::BoundNetwork::new(&model, role, *layout).is_ok()
-    });
+    let fit =
+        [(Role::Actor, "actor"), (Role::Critic, "critic")].into_iter().find_map(|(role, name)| {
+            let layout = layout_of(&model, role).ok()?;
+            BoundNetwork::new(&model, role, layout).is_ok().then_some((name, layout))
+        });
     if as_json {
         let inputs: Vec<_> =
             inputs.map(|input| json!({ "name": input.name, "width": input.width })).collect();

@@ -26,11 +26,12 @@ const LAYOUT: Layout = Layout::new(Task::Push, 1);
 fn main() -> Result<(), AnyError> {
     let seeds = std::env::args_os().nth(1).map(PathBuf::from).ok_or("expected a directory")?;
     let scratch = tempfile::tempdir()?;
-    for target in ["checkpoint", "policy", "log", "message"] {
+    for target in ["checkpoint", "policy", "onnx", "log", "message"] {
         fs::create_dir_all(seeds.join(target))?;
     }
     write_checkpoints(&seeds.join("checkpoint"), scratch.path())?;
     write_policies(&seeds.join("policy"))?;
+    write_models(&seeds.join("onnx"))?;
     write_logs(&seeds.join("log"), scratch.path())?;
     write_messages(&seeds.join("message"))
 }
@@ -73,6 +74,13 @@ fn write_policies(to: &Path) -> Result<(), AnyError> {
     let file = fs::read(&path)?;
     let entry = format!(r#","digest":"{}""#, policy.digest());
     fs::write(to.join("without-digest"), without_header_text(&file, &entry)?)?;
+    Ok(())
+}
+
+fn write_models(to: &Path) -> Result<(), AnyError> {
+    let policy = sample::trainer(0).policy(BTreeMap::new());
+    fs::write(to.join("actor"), tandem_onnx::export::actor(&policy)?)?;
+    fs::write(to.join("critic"), tandem_onnx::export::critic(&policy)?)?;
     Ok(())
 }
 

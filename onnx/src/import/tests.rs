@@ -195,6 +195,12 @@ fn networks_that_a_policy_file_cannot_represent_are_refused() {
         &[Op::Clip(0.0, f32::INFINITY)],
         "expected two finite bounds",
     );
+    let mut sizes = vec![31, 12_000];
+    sizes.extend([1; 20]);
+    sizes.push(3);
+    check(steps(&sizes, tanh, 1), &[], "with layers of equal width it has");
+    sizes.extend([3; 60]);
+    check(steps(&sizes, tanh, 1), &[], "it has 81 hidden layers, expected at most 64");
     let mut linear = steps(&[31, 8, 3], tanh, 1);
     linear.remove(1);
     check(linear, &[], "no activation follows layer 1");
