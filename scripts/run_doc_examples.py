@@ -25,7 +25,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 BLOCK = re.compile(r"(?:^<!-- example: (with|needs) (.*?) -->\n)?^```python\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 LISTEN = re.compile(r"--listen (\S+):(\d+)")
-TIMEOUT_S = 120
+TIMEOUT_S = 300
 START_TIMEOUT_S = 30
 
 
