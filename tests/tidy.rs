@@ -125,6 +125,35 @@ fn the_image_is_of_this_version_and_toolchain() {
     }
 }
 
+/// Other versions of what computes could give other bits.
+#[test]
+fn the_python_package_has_this_version_and_the_same_dependencies() {
+    let read = |name: &str| fs::read_to_string(root().join(name)).expect("readable");
+    let version = format!("version = \"{}\"\n", env!("CARGO_PKG_VERSION"));
+    assert!(read("python/Cargo.toml").contains(&version), "python/Cargo.toml lacks {version:?}");
+    let (ours, python) = (read("Cargo.lock"), read("python/Cargo.lock"));
+    let (ours, python) = (locked_versions(&ours), locked_versions(&python));
+    for (name, versions) in python.iter().filter(|(name, _)| ours.contains_key(*name)) {
+        let surplus: Vec<_> = versions.difference(&ours[name]).collect();
+        assert!(
+            surplus.is_empty(),
+            "python/Cargo.lock has {name} {surplus:?}, not {ours:?}",
+            ours = ours[name]
+        );
+    }
+}
+
+/// The versions of each package in a lock file.
+fn locked_versions(lock: &str) -> BTreeMap<&str, BTreeSet<&str>> {
+    let mut versions: BTreeMap<&str, BTreeSet<&str>> = BTreeMap::new();
+    for package in lock.split("[[package]]\n").skip(1) {
+        let mut values = package.lines().take(2).filter_map(|line| line.split('"').nth(1));
+        let (Some(name), Some(version)) = (values.next(), values.next()) else { continue };
+        versions.entry(name).or_default().insert(version);
+    }
+    versions
+}
+
 fn root() -> &'static Path {
     Path::new(env!("CARGO_MANIFEST_DIR"))
 }
