@@ -1,4 +1,6 @@
-"""Checks the dependencies in Cargo.lock against deny.toml: licences, banned crates and sources.
+"""Checks the dependencies of a workspace against deny.toml: licences, banned crates and sources.
+
+    python3 scripts/check_dependencies.py Cargo.toml
 
 Reads the part of cargo-deny's rules that deny.toml uses. Needs Python 3.11 and cargo.
 """
@@ -8,12 +10,13 @@ import re
 import subprocess
 import sys
 import tomllib
+from pathlib import Path
 
 
 def main() -> int:
     with open("deny.toml", "rb") as file:
         rules = tomllib.load(file)
-    packages = dependencies(rules["graph"]["targets"])
+    packages = dependencies(sys.argv[1], rules["graph"]["targets"])
     problems = [problem for package in packages for problem in problems_of(package, rules)]
     for problem in problems:
         print(f"error: {problem}", file=sys.stderr)
@@ -21,13 +24,18 @@ def main() -> int:
     return 1 if problems else 0
 
 
-def dependencies(targets: list[str]) -> list[dict]:
+def dependencies(manifest: str, targets: list[str]) -> list[dict]:
     """Returns every package outside the workspace that a build for `targets` with all features uses."""
-    command = ["cargo", "metadata", "--format-version=1", "--locked", "--all-features"]
+    command = ["cargo", "metadata", "--format-version=1", "--locked", "--all-features", f"--manifest-path={manifest}"]
     command += [f"--filter-platform={target}" for target in targets]
     metadata = json.loads(subprocess.check_output(command))
     used = {node["id"] for node in metadata["resolve"]["nodes"]} - set(metadata["workspace_members"])
-    return [package for package in metadata["packages"] if package["id"] in used]
+    return [package for package in metadata["packages"] if package["id"] in used and not is_ours(package)]
+
+
+def is_ours(package: dict) -> bool:
+    """Returns whether a package lies in this repository; those of other workspaces are no members."""
+    return package["source"] is None and Path(package["manifest_path"]).is_relative_to(Path.cwd())
 
 
 def problems_of(package: dict, rules: dict):

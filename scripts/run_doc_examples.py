@@ -5,13 +5,14 @@
 A comment in the line above a block changes how it is run:
 
     <!-- example: with tandem teacher --listen 127.0.0.1:7001 ... -->   starts a server for the block
-    <!-- example: skip REASON -->                                       lists the block without running it
+    <!-- example: needs torch -->                                       skips the block without this module
 
 A server's command has the program of this repository in its path and a temporary directory in `$WORK`. Exits with 1 if
 an example fails.
 """
 
 import contextlib
+import importlib.util
 import os
 import re
 import socket
@@ -22,9 +23,9 @@ import time
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-BLOCK = re.compile(r"(?:^<!-- example: (with|skip) (.*?) -->\n)?^```python\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+BLOCK = re.compile(r"(?:^<!-- example: (with|needs) (.*?) -->\n)?^```python\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 LISTEN = re.compile(r"--listen (\S+):(\d+)")
-TIMEOUT_S = 120
+TIMEOUT_S = 300
 START_TIMEOUT_S = 30
 
 
@@ -34,10 +35,10 @@ def main(paths: list[str]) -> int:
         text = Path(path).read_text()
         for match in BLOCK.finditer(text):
             place = f"{path}:{text.count(chr(10), 0, match.start(3))}"
-            if match[1] == "skip":
-                print(f"{place}: skipped, {match[2]}")
+            if match[1] == "needs" and importlib.util.find_spec(match[2]) is None:
+                print(f"{place}: skipped, needs {match[2]}")
                 continue
-            with server(match[2]) if match[1] else contextlib.nullcontext():
+            with server(match[2]) if match[1] == "with" else contextlib.nullcontext():
                 n_failed += not runs(place, match[3])
     return 1 if n_failed else 0
 

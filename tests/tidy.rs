@@ -23,6 +23,9 @@ const ALLOWED: [(&str, &[&str]); 16] = [
     ("trials", &["core", "kinematics", "sim", "policy", "telemetry", "bridge"]),
 ];
 
+/// The Python package, which has a workspace of its own and is in no image.
+const PYTHON: (&str, &[&str]) = ("python", &["core", "sim", "policy"]);
+
 /// Directories of which every file is pure, and single pure files.
 const PURE: [&str; 25] = [
     "core/src",
@@ -54,7 +57,7 @@ const PURE: [&str; 25] = [
 
 #[test]
 fn crates_depend_only_downward() {
-    for (name, allowed) in ALLOWED {
+    for (name, allowed) in ALLOWED.into_iter().chain([PYTHON]) {
         let ours: BTreeSet<String> = dependencies(name)
             .iter()
             .filter_map(|d| d.strip_prefix("tandem-").map(str::to_owned))
@@ -96,8 +99,8 @@ fn one_module_prints() {
 
 #[test]
 fn files_stay_readable() {
-    let dirs =
-        ALLOWED.iter().map(|(name, _)| root().join(name).join("src")).chain([root().join("src")]);
+    let crates = ALLOWED.iter().chain([&PYTHON]);
+    let dirs = crates.map(|(name, _)| root().join(name).join("src")).chain([root().join("src")]);
     for path in dirs.flat_map(|dir| rust_files(&dir)) {
         let n_lines = fs::read_to_string(&path).expect("readable").lines().count();
         assert!(n_lines <= 500, "{} has {n_lines} lines: split it", path.display());
@@ -136,6 +139,35 @@ fn the_image_is_of_this_version_and_toolchain() {
     {
         assert!(context.lines().any(|line| line == format!("!{name}")), "no {name} in the context");
     }
+}
+
+/// Other versions of what computes could give other bits.
+#[test]
+fn the_python_package_has_this_version_and_the_same_dependencies() {
+    let read = |name: &str| fs::read_to_string(root().join(name)).expect("readable");
+    let version = format!("version = \"{}\"\n", env!("CARGO_PKG_VERSION"));
+    assert!(read("python/Cargo.toml").contains(&version), "python/Cargo.toml lacks {version:?}");
+    let (ours, python) = (read("Cargo.lock"), read("python/Cargo.lock"));
+    let (ours, python) = (locked_versions(&ours), locked_versions(&python));
+    for (name, versions) in python.iter().filter(|(name, _)| ours.contains_key(*name)) {
+        let surplus: Vec<_> = versions.difference(&ours[name]).collect();
+        assert!(
+            surplus.is_empty(),
+            "python/Cargo.lock has {name} {surplus:?}, not {ours:?}",
+            ours = ours[name]
+        );
+    }
+}
+
+/// The versions of each package in a lock file.
+fn locked_versions(lock: &str) -> BTreeMap<&str, BTreeSet<&str>> {
+    let mut versions: BTreeMap<&str, BTreeSet<&str>> = BTreeMap::new();
+    for package in lock.split("[[package]]\n").skip(1) {
+        let mut values = package.lines().take(2).filter_map(|line| line.split('"').nth(1));
+        let (Some(name), Some(version)) = (values.next(), values.next()) else { continue };
+        versions.entry(name).or_default().insert(version);
+    }
+    versions
 }
 
 fn root() -> &'static Path {

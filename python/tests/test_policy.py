@@ -53,7 +53,7 @@ def test_actions_and_values_are_those_of_the_file_format(path, rng):
 def test_actions_and_values_have_the_bits_of_rust(path):
     program = os.environ.get("TANDEM_POLICY_PROBE")
     if program is None:
-        pytest.skip("TANDEM_POLICY_PROBE names no program: cargo build --release -p tandem-policy --example policy_probe")
+        pytest.skip("TANDEM_POLICY_PROBE names no program: scripts/test-python builds it")
     probe = json.loads(subprocess.run([program, path], stdout=subprocess.PIPE, check=True).stdout)
     policy = tandem.load_policy(path)
     observation = {"observation": probe["observations"], "desired_goal": probe["goals"]}
