@@ -1,11 +1,14 @@
 //! Conversions for `environment.proto`: episodes played in an environment of another process.
 
+use std::fmt::Display;
+
 use tandem_core::work::EpisodeStart;
 use tandem_core::{Contacts, EpisodeKind, Layout, WorldSettings};
 
 use crate::error::DecodeError;
 use crate::numbers::{actions_from_bytes, count_within, floats_from_bytes, one_within, to_bytes};
 use crate::pb;
+use crate::task::encode_task;
 use crate::work::{MAX_SLOT_EPISODES, MAX_SUBSTEPS, decode_contact};
 
 /// Largest number of environments of a stream.
@@ -36,6 +39,70 @@ pub struct StepReply {
     pub observations: Vec<f32>,
     /// Contacts during the step, shape `[n]`.
     pub contacts: Vec<Contacts>,
+}
+
+/// Encodes the description of a server, called `server`, with environments of `layout`.
+#[must_use]
+pub fn encode_environment(
+    layout: Layout,
+    server: &str,
+    max_environments: usize,
+) -> pb::EnvironmentDescription {
+    pb::EnvironmentDescription {
+        task: Some(encode_task(layout)),
+        server: server.to_owned(),
+        max_environments: u32::try_from(max_environments).unwrap_or(u32::MAX),
+    }
+}
+
+/// Checks that a server's task equals the run's.
+///
+/// # Errors
+/// Names the first field that differs.
+pub fn check_task(
+    expected: &pb::TaskDescription,
+    got: &pb::TaskDescription,
+) -> Result<(), DecodeError> {
+    let (e, g) = (expected, got);
+    same("name", &format!("{:?}", e.name), &format!("{:?}", g.name))?;
+    same("n_observation", &e.n_observation, &g.n_observation)?;
+    same("n_goal", &e.n_goal, &g.n_goal)?;
+    same("n_action", &e.n_action, &g.n_action)?;
+    same("number of arms", &e.arms.len(), &g.arms.len())?;
+    for (idx, (e, g)) in e.arms.iter().zip(&g.arms).enumerate() {
+        let parts = [
+            ("observation", &e.observation, &g.observation),
+            ("goal", &e.goal, &g.goal),
+            ("action", &e.action, &g.action),
+            ("position", &e.position, &g.position),
+        ];
+        for (part, e, g) in parts {
+            same_list(&format!("arms[{idx}].{part}"), e, g)?;
+        }
+    }
+    same_list("achieved_goal", &e.achieved_goal, &g.achieved_goal)?;
+    same("episode_steps", &e.episode_steps, &g.episode_steps)?;
+    same("tolerance", &e.tolerance, &g.tolerance)?;
+    same("norm", &e.norm().as_str_name(), &g.norm().as_str_name())?;
+    same("interchangeable_arms", &e.interchangeable_arms, &g.interchangeable_arms)?;
+    same("reports_contacts", &e.reports_contacts, &g.reports_contacts)?;
+    same_list("observation_bound", &e.observation_bound, &g.observation_bound)?;
+    same_list("goal_bound", &e.goal_bound, &g.goal_bound)
+}
+
+fn same<T: PartialEq + Display>(field: &str, expected: &T, got: &T) -> Result<(), DecodeError> {
+    if expected == got { Ok(()) } else { Err(DecodeError::new(field, expected, got)) }
+}
+
+fn same_list<T: PartialEq + Display>(
+    field: &str,
+    expected: &[T],
+    got: &[T],
+) -> Result<(), DecodeError> {
+    let count = |values: &[T]| format!("{} numbers", values.len());
+    same(field, &count(expected), &count(got))?;
+    let mut pairs = expected.iter().zip(got).enumerate();
+    pairs.try_for_each(|(idx, (e, g))| same(&format!("{field}[{idx}]"), e, g))
 }
 
 /// Encodes a request that resets environments 0 to `starts.len() - 1`.
@@ -124,7 +191,10 @@ fn decode_start(reset: &pb::EnvironmentReset) -> Result<EpisodeStart, DecodeErro
         kind: if reset.evaluation { EpisodeKind::Evaluation } else { EpisodeKind::Training },
         world: WorldSettings {
             grasped_start_prob: one_within("grasped_start_prob", prob, &(0.0..=1.0))?,
-            substeps: count_within("substeps", reset.substeps, &(1..=MAX_SUBSTEPS))?,
+            substeps: match reset.substeps {
+                0 => WorldSettings::default().substeps,
+                substeps => count_within("substeps", substeps, &(1..=MAX_SUBSTEPS))?,
+            },
         },
     })
 }
@@ -183,7 +253,12 @@ pub fn decode_step_reply(
     }
     Ok(StepReply {
         observations: decode_observations(&reply.observations, n, layout)?,
-        contacts: reply.contacts.iter().enumerate().map(decode_contact).collect::<Result<_, _>>()?,
+        contacts: reply
+            .contacts
+            .iter()
+            .enumerate()
+            .map(decode_contact)
+            .collect::<Result<_, _>>()?,
     })
 }
 
@@ -207,7 +282,8 @@ fn decode_rows(
         if let Some((idx, value)) = row.iter().enumerate().find(is_invalid) {
             let bound = largest(idx);
             let expected = format_args!("a number in [-{bound}, {bound}]").to_string();
-            return Err(DecodeError::new(format!("{field}[{row_idx}][{idx}]"), expected, value));
+            let field = format!("environment {row_idx}: {field}[{idx}]");
+            return Err(DecodeError::new(field, expected, value));
         }
     }
     Ok(values)
@@ -308,15 +384,11 @@ mod tests {
             "reset.environments[0].grasped_start_prob: expected a number in [0, 1], got NaN",
         );
         check(
-            reset(|resets| resets[1].substeps = 0),
+            reset(|resets| resets[1].substeps = 10_001),
             None,
-            "reset.environments[1].substeps: expected 1 to 10000, got 0",
+            "reset.environments[1].substeps: expected 1 to 10000, got 10001",
         );
-        check(
-            encode_step(&[0.0; 5]),
-            Some(2),
-            "step.actions: expected 6 numbers, got 5 numbers",
-        );
+        check(encode_step(&[0.0; 5]), Some(2), "step.actions: expected 6 numbers, got 5 numbers");
         check(
             encode_step(&[0.0, 0.0, 0.0, 0.0, f32::NAN, 0.0]),
             Some(2),
@@ -327,6 +399,27 @@ mod tests {
             Some(1),
             "step.actions[1]: expected a number in [-1, 1], got 1.5",
         );
+    }
+
+    #[test]
+    fn the_first_field_of_another_task_is_named() {
+        let check = |corrupt: fn(&mut pb::TaskDescription), message: &str| {
+            let (run, mut server) = (encode_task(LAYOUT), encode_task(LAYOUT));
+            corrupt(&mut server);
+            assert_eq!(check_task(&run, &server).unwrap_err().to_string(), message);
+        };
+        assert_eq!(check_task(&encode_task(LAYOUT), &encode_task(LAYOUT)), Ok(()));
+        check(|task| task.name = "reach".to_owned(), "name: expected \"push\", got \"reach\"");
+        check(|task| task.n_action = 4, "n_action: expected 3, got 4");
+        check(|task| task.arms.clear(), "number of arms: expected 1, got 0");
+        check(|task| task.arms[0].goal[1] = 7, "arms[0].goal[1]: expected 1, got 7");
+        check(
+            |task| task.achieved_goal.clear(),
+            "achieved_goal: expected 3 numbers, got 0 numbers",
+        );
+        check(|task| task.tolerance = 0.1, "tolerance: expected 0.05, got 0.1");
+        check(|task| task.norm = 2, "norm: expected NORM_EUCLIDEAN, got NORM_MAXIMUM");
+        check(|task| task.goal_bound[2] = 9.0, "goal_bound[2]: expected 2, got 9");
     }
 
     #[test]
@@ -350,11 +443,11 @@ mod tests {
         };
         check(
             |reply| reply.observations[4 * 33..4 * 34].fill(0xff),
-            "observations[1][5]: expected a number in [-25, 25], got NaN",
+            "environment 1: observations[5]: expected a number in [-25, 25], got NaN",
         );
         check(
             |reply| reply.observations[..4].copy_from_slice(&3.5_f32.to_le_bytes()),
-            "observations[0][0]: expected a number in [-2, 2], got 3.5",
+            "environment 0: observations[0]: expected a number in [-2, 2], got 3.5",
         );
         check(
             |reply| reply.observations.truncate(4 * 28),
@@ -371,6 +464,6 @@ mod tests {
         check(|reply| reply.goals = vec![0; 24], "goals: expected no bytes, got 24 bytes");
         let goals = encode_reset_reply(&[0.0; 28], &[0.0, f32::INFINITY, 0.0]);
         let error = decode_reset_reply(&goals, 1, LAYOUT).unwrap_err().to_string();
-        assert_eq!(error, "goals[0][1]: expected a number in [-2, 2], got inf");
+        assert_eq!(error, "environment 0: goals[1]: expected a number in [-2, 2], got inf");
     }
 }
