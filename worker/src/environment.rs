@@ -23,6 +23,14 @@ const STREAM_CAPACITY: usize = 1;
 /// The largest number of characters of a server's own name in messages.
 const MAX_NAME_CHARS: usize = 100;
 
+/// Waits for the server of `config` and checks that it serves the task of `layout`.
+///
+/// # Errors
+/// When the server cannot be started, does not answer after several attempts, or serves another task.
+pub async fn check_environments(config: EnvironmentConfig, layout: Layout) -> Result<(), Error> {
+    Environments::new(config).check(layout).await
+}
+
 /// The server of a worker's environments, called over one stream.
 ///
 /// A call that fails ends the slot; the caller [recovers](Self::recover) and plays the slot again from its start, which
@@ -176,7 +184,11 @@ impl Environments {
         if self.server.is_some() {
             return Ok(());
         }
-        let address = match self.config.server.address().await {
+        let address = match self.n_failures {
+            0 => self.config.server.address(),
+            _ => self.config.server.address_after_failure(),
+        };
+        let address = match address.await {
             Ok(address) => address,
             // A command that has worked before may work again.
             Err(error) if self.was_connected => {

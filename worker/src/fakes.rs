@@ -48,7 +48,7 @@ impl Environment for FakeEnvironment {
         for (start, goal) in starts.iter().zip(goals.chunks_mut(LAYOUT.n_goal())) {
             let mut rng = episode_rng(start.seed, start.number, Stream::Reset);
             let width = 0.5 + start.world.grasped_start_prob;
-            let mut draw = |width| uniform(&mut rng, -width, width);
+            let mut draw = |width: f32| uniform(&mut rng, -width, width);
             self.positions.extend((0..LAYOUT.n_action()).map(|_| draw(width)));
             goal.fill_with(|| draw(0.5));
         }
