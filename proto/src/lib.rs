@@ -31,6 +31,7 @@ pub mod advice;
 mod codec;
 mod error;
 mod numbers;
+pub mod task;
 pub mod work;
 
 pub use advice::{
@@ -38,6 +39,7 @@ pub use advice::{
     layout_of_query,
 };
 pub use error::DecodeError;
+pub use task::{decode_task, encode_task};
 pub use work::{
     decode_actor, decode_episode, decode_run_terms, decode_slot, encode_actor, encode_episode,
     encode_run_terms, encode_slot,
