@@ -4,7 +4,7 @@ use std::ffi::OsString;
 use std::sync::Arc;
 use std::time::Duration;
 
-use tandem_core::Layout;
+use tandem_core::TaskSpec;
 use tandem_net::ClientConfig;
 use tandem_worker::EnvironmentConfig;
 
@@ -52,10 +52,10 @@ impl EnvironmentSource {
         }
     }
 
-    /// Checks that the server, if there is one, can be called and serves the task of `layout`.
-    pub(crate) async fn check(&self, layout: Layout) -> Result<(), tandem_worker::Error> {
+    /// Checks that the server, if there is one, can be called and serves `task`.
+    pub(crate) async fn check(&self, task: &TaskSpec) -> Result<(), tandem_worker::Error> {
         let Some(config) = self.config() else { return Ok(()) };
-        tandem_worker::check_environments(config, layout).await
+        tandem_worker::check_environments(config, task).await
     }
 
     /// Ends the server if this process has started it.

@@ -68,7 +68,7 @@ fn check_environment(args: &TrainArgs, plan: &Plan) -> Result<(), Failed> {
     runtime.block_on(async {
         let source = EnvironmentSource::of(&args.environment, &ClientConfig::default())?;
         let layout = plan.config.layout().or_exit(Exit::Usage, String::new)?;
-        let checked = source.check(layout).await;
+        let checked = source.check(&layout.into()).await;
         source.end().await;
         checked.map_err(worker_failed)
     })

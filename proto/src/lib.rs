@@ -32,7 +32,7 @@ mod codec;
 pub mod environment;
 mod error;
 mod numbers;
-mod task;
+pub mod task;
 pub mod work;
 
 pub use advice::{
@@ -40,7 +40,7 @@ pub use advice::{
     layout_of_query,
 };
 pub use error::DecodeError;
-pub use task::encode_task;
+pub use task::{decode_task, encode_task};
 pub use work::{
     decode_actor, decode_episode, decode_run_terms, decode_slot, encode_actor, encode_episode,
     encode_run_terms, encode_slot,

@@ -49,6 +49,7 @@ fn decode_episode_kind(kind: i32) -> Result<EpisodeKind, DecodeError> {
 pub fn encode_run_terms(terms: &RunTerms) -> pb::RunTerms {
     pb::RunTerms {
         run: terms.run.clone(),
+        description: None,
         task: terms.layout.task.name().to_owned(),
         n_arms: u32::try_from(terms.layout.n_arms).expect("a layout has few arms"),
         account: terms.account.clone().unwrap_or_default(),

@@ -1,14 +1,14 @@
 //! The client of a server of environments.
 
-use tandem_core::Layout;
+use tandem_core::TaskSpec;
 use tandem_core::work::EpisodeStart;
 use tandem_net::{AuthChannel, MAX_MESSAGE_BYTES, Operation, Retrier, Retryability, within};
 use tandem_proto::environment::{
-    ResetReply, StepReply, check_task, decode_reset_reply, decode_step_reply, encode_reset,
+    ResetReply, StepReply, decode_environment, decode_reset_reply, decode_step_reply, encode_reset,
     encode_step,
 };
 use tandem_proto::pb::environment_client::EnvironmentClient;
-use tandem_proto::{DecodeError, encode_task, pb};
+use tandem_proto::{DecodeError, pb};
 use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
 use tonic::{Status, Streaming};
@@ -23,12 +23,12 @@ const STREAM_CAPACITY: usize = 1;
 /// The largest number of characters of a server's own name in messages.
 const MAX_NAME_CHARS: usize = 100;
 
-/// Waits for the server of `config` and checks that it serves the task of `layout`.
+/// Waits for the server of `config` and checks that it serves the given task.
 ///
 /// # Errors
 /// When the server cannot be started, does not answer after several attempts, or serves another task.
-pub async fn check_environments(config: EnvironmentConfig, layout: Layout) -> Result<(), Error> {
-    Environments::new(config).check(layout).await
+pub async fn check_environments(config: EnvironmentConfig, task: &TaskSpec) -> Result<(), Error> {
+    Environments::new(config).check(task).await
 }
 
 /// The server of a worker's environments, called over one stream.
@@ -55,7 +55,7 @@ pub(crate) struct Environments {
 #[derive(Debug)]
 struct Server {
     client: EnvironmentClient<AuthChannel>,
-    max_environments: u32,
+    max_environments: usize,
 }
 
 #[derive(Debug)]
@@ -90,9 +90,9 @@ impl Environments {
         }
     }
 
-    /// Waits for the server and checks that it serves the task of `layout`.
-    pub(crate) async fn check(&mut self, layout: Layout) -> Result<(), Error> {
-        while let Err(failure) = self.connect(layout).await {
+    /// Waits for the server and checks that it serves the given task.
+    pub(crate) async fn check(&mut self, task: &TaskSpec) -> Result<(), Error> {
+        while let Err(failure) = self.connect(task).await {
             self.recover(failure).await?;
         }
         Ok(())
@@ -102,25 +102,25 @@ impl Environments {
     pub(crate) async fn reset(
         &mut self,
         starts: &[EpisodeStart],
-        layout: Layout,
+        task: &TaskSpec,
     ) -> Result<ResetReply, Failure> {
         self.episodes = starts.iter().map(|start| start.number).collect();
         self.n_steps = 0;
         let n = starts.len();
-        let reply = self.exchange(n, encode_reset(starts), layout).await?;
-        decode_reset_reply(&reply, n, layout).map_err(|error| self.invalid(error))
+        let reply = self.exchange(n, encode_reset(starts), task).await?;
+        decode_reset_reply(&reply, n, task).map_err(|error| self.invalid(error))
     }
 
     /// Executes actions, shape `[n, n_action]`.
     pub(crate) async fn step(
         &mut self,
         actions: &[f32],
-        layout: Layout,
+        task: &TaskSpec,
     ) -> Result<StepReply, Failure> {
         self.n_steps += 1;
         let n = self.episodes.len();
-        let reply = self.exchange(n, encode_step(actions), layout).await?;
-        decode_step_reply(&reply, n, layout).map_err(|error| self.invalid(error))
+        let reply = self.exchange(n, encode_step(actions), task).await?;
+        decode_step_reply(&reply, n, task).map_err(|error| self.invalid(error))
     }
 
     /// Records that a slot was played.
@@ -153,12 +153,12 @@ impl Environments {
         &mut self,
         n: usize,
         request: pb::PlayRequest,
-        layout: Layout,
+        task: &TaskSpec,
     ) -> Result<pb::PlayResponse, Failure> {
         let stream = self.stream.take().filter(|stream| stream.n == n);
-        self.connect(layout).await?;
+        self.connect(task).await?;
         let Some(server) = &mut self.server else { return Err(Failure::Transient(closed())) };
-        if u32::try_from(n).is_ok_and(|n| n > server.max_environments) {
+        if n > server.max_environments {
             let (server, max) = (self.name.clone(), server.max_environments);
             let error = Error::TooFewEnvironments { server, max, needed: n };
             return Err(Failure::Final(Box::new(error)));
@@ -180,7 +180,7 @@ impl Environments {
     }
 
     /// Connects to the server and checks its task, unless it is connected.
-    async fn connect(&mut self, layout: Layout) -> Result<(), Failure> {
+    async fn connect(&mut self, task: &TaskSpec) -> Result<(), Failure> {
         if self.server.is_some() {
             return Ok(());
         }
@@ -206,14 +206,16 @@ impl Environments {
         let describe = client.describe(pb::DescribeEnvironmentRequest {});
         let described = within(self.config.reply_timeout, describe).await;
         let description = described.map_err(|status| self.failure(status))?.into_inner();
+        let description = decode_environment(description).map_err(|source| {
+            let (server, reply) = (self.name.clone(), "Describe".to_owned());
+            Failure::Final(Box::new(Error::InvalidReply { server, reply, source }))
+        })?;
         let program: String = description.server.chars().take(MAX_NAME_CHARS).collect();
         self.name = format!("{address} ({program})");
-        check_task(&encode_task(layout), &description.task.unwrap_or_default()).map_err(
-            |difference| {
-                let (server, difference) = (self.name.clone(), difference.to_string());
-                Failure::Final(Box::new(Error::OtherTask { server, difference }))
-            },
-        )?;
+        if let Some(difference) = task.difference(&description.task) {
+            let server = self.name.clone();
+            return Err(Failure::Final(Box::new(Error::OtherTask { server, difference })));
+        }
         tracing::info!(server = self.name, "environment server connected");
         self.was_connected = true;
         self.server = Some(Server { client, max_environments: description.max_environments });

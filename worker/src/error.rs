@@ -2,6 +2,7 @@
 
 use std::path::PathBuf;
 
+use tandem_core::task::TaskDifference;
 use tandem_net::Operation;
 use tandem_proto::DecodeError;
 use tandem_sim::SimError;
@@ -52,12 +53,15 @@ pub enum Error {
     #[error(transparent)]
     NoEnvironment(#[from] crate::config::ServerNotStarted),
     /// The server serves another task than the run's.
-    #[error("the environment server {server} serves another task than the run's: {difference}")]
+    #[error(
+        "the environment server {server} serves another task than the run's: {} is {} in the run and {} at the server",
+        difference.field, difference.first, difference.second
+    )]
     OtherTask {
         /// Address and program of the server.
         server: String,
         /// The first field that differs.
-        difference: String,
+        difference: TaskDifference,
     },
     /// The server serves fewer environments than a slot has episodes.
     #[error(
@@ -67,7 +71,7 @@ pub enum Error {
         /// Address and program of the server.
         server: String,
         /// The server's limit.
-        max: u32,
+        max: usize,
         /// The number of episodes of the slot.
         needed: usize,
     },

@@ -17,13 +17,18 @@ pub(crate) struct FakeEnvironment {
     /// Shape `[n, n_action]`.
     positions: Vec<f32>,
     /// Added to the first number of every observation after the first reset: an environment with a memory.
-    pub(crate) drift: f32,
+    drift: f32,
     n_resets: usize,
 }
 
 impl FakeEnvironment {
     pub(crate) fn new() -> Self {
         Self::default()
+    }
+
+    /// Creates an environment that adds `drift` from its second reset on.
+    pub(crate) fn drifting(drift: f32) -> Self {
+        Self { drift, ..Self::default() }
     }
 
     fn observe(&self, observations: &mut [f32]) {

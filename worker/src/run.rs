@@ -1,7 +1,7 @@
 //! The worker's main loop: join the run, then take, play and deliver slots until the run has ended.
 
 use tandem_core::work::SlotOrder;
-use tandem_core::{Layout, StepAdvice, StepQuery};
+use tandem_core::{Layout, StepAdvice, StepQuery, TaskSpec};
 use tokio::sync::oneshot;
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
@@ -149,7 +149,7 @@ impl Worker {
         let player = match &mut self.environments {
             None => Player::simulating(terms, log_dir)?,
             Some(environments) => {
-                environments.check(terms.layout).await?;
+                environments.check(&terms.layout.into()).await?;
                 Player::remote(terms, log_dir)
             }
         };
@@ -231,6 +231,7 @@ impl Worker {
     ) -> Result<(Box<Player>, Result<PlayedSlot, SlotFailure>), Error> {
         let slot = order.slot;
         let (account, layout) = (player.terms().account.clone(), player.terms().layout);
+        let task = TaskSpec::from(layout);
         let (peers, mut requests) = PeerChannel::new();
         let (finished, playing) = oneshot::channel();
         let tracked = self.rollouts.token();
@@ -252,7 +253,7 @@ impl Worker {
                     let advice = self.advise(account, layout, &queries).await?;
                     response.send(advice).is_ok()
                 }
-                request => match self.forward(request, layout).await {
+                request => match self.forward(request, &task).await {
                     Ok(answered) => answered,
                     Err(error) => {
                         failure = Some(error);
@@ -286,15 +287,15 @@ impl Worker {
     }
 
     /// Forwards a request to the server of the environments. Returns whether the player still waits for the response.
-    async fn forward(&mut self, request: PeerRequest, layout: Layout) -> Result<bool, Failure> {
+    async fn forward(&mut self, request: PeerRequest, task: &TaskSpec) -> Result<bool, Failure> {
         let no_server = || Failure::Final(Box::new(Error::NoServer));
         let environments = self.environments.as_mut().ok_or_else(no_server)?;
         Ok(match request {
             PeerRequest::Reset(starts, response) => {
-                response.send(environments.reset(&starts, layout).await?).is_ok()
+                response.send(environments.reset(&starts, task).await?).is_ok()
             }
             PeerRequest::Step(actions, response) => {
-                response.send(environments.step(&actions, layout).await?).is_ok()
+                response.send(environments.step(&actions, task).await?).is_ok()
             }
             PeerRequest::Advice(..) => false,
         })
