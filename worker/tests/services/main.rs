@@ -1,5 +1,6 @@
 //! A worker with a learner and a teacher on the loopback interface that fail in various ways.
 
+mod environments;
 mod support;
 
 use std::collections::BTreeMap;
