@@ -442,7 +442,9 @@ mod tests {
             "contacts[1]: expected bits 0 (arm and arm) and 1 (arm and table), got 0b00000100",
         );
         check(|reply| reply.goals = vec![0; 24], "goals: expected no bytes, got 24 bytes");
-        let silent = TaskDescription { reports_contacts: false, ..task().description().clone() };
+        let name = "silent".to_owned();
+        let silent =
+            TaskDescription { name, reports_contacts: false, ..task().description().clone() };
         let silent = TaskSpec::new(silent).unwrap();
         let reply = encode_step_reply(&[0.0; 28], &[Contacts::NONE]);
         let error = decode_step_reply(&reply, 1, &silent).unwrap_err().to_string();

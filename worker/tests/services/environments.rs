@@ -137,11 +137,10 @@ async fn an_invalid_reply_ends_the_worker_with_server_environment_field_and_valu
 
 #[tokio::test]
 async fn another_task_is_refused_and_its_field_named() {
-    let other = TaskDescription { episode_steps: 60, ..LAYOUT.description() };
+    let other = TaskDescription { name: "lab/push".to_owned(), ..LAYOUT.description() };
     let environments = FakeEnvironments::default().serving(TaskSpec::new(other).expect("valid"));
     let line = line_of_end(environments).await;
-    let expected =
-        "serves another task than the run's: episode_steps is 50 in the run and 60 at the server";
+    let expected = "serves another task than the run's: name is \"push\" in the run and \"lab/push\" at the server";
     assert!(line.ends_with(expected), "{line}");
 }
 
