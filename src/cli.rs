@@ -24,7 +24,8 @@ pub(crate) use policy::{ExportArgs, ImportArgs, PolicyArgs, PolicyCommand, ShowA
 pub(crate) use results::{EvalArgs, McapArgs, McapCommand, PictureArgs, ReplayArgs, ReportArgs};
 pub(crate) use scene::SceneArgs;
 pub(crate) use service::{
-    ClientArgs, LearnerArgs, ListenArgs, RelayArgs, SecretArgs, TeacherArgs, WorkerArgs,
+    ClientArgs, EnvArgs, EnvGuardArgs, EnvironmentArgs, LearnerArgs, ListenArgs, RelayArgs,
+    SecretArgs, TeacherArgs, WorkerArgs,
 };
 pub(crate) use train::{RecipeName, SweepArgs, TrainArgs};
 pub(crate) use trial::{ModeName, RecordName, TrialArgs};
@@ -70,6 +71,11 @@ pub(crate) enum Command {
     Learner(LearnerArgs),
     /// Plays episodes for a learner.
     Worker(WorkerArgs),
+    /// Serves the built-in environments to workers and other programs.
+    Env(EnvArgs),
+    /// Runs an environment command until standard input closes.
+    #[command(hide = true)]
+    EnvGuard(EnvGuardArgs),
     /// Distributes a learner's parameters to nearby workers, for runs with very many workers.
     Relay(RelayArgs),
     /// Serves a pair of arms, real or simulated, and operates it.

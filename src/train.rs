@@ -14,12 +14,15 @@ mod teacher_file;
 use std::time::{Duration, Instant};
 
 use anyhow::anyhow;
+use tandem_net::ClientConfig;
 use tandem_proto::pb;
 use tokio::sync::mpsc;
 use tokio_util::sync::CancellationToken;
 
 use crate::cli::TrainArgs;
+use crate::environment_server::EnvironmentSource;
 use crate::exit::{Exit, Failed, OrExit as _};
+use crate::service::worker_failed;
 use crate::{clock, runtime, signals};
 use display::Display;
 use inputs::RunInputs;
@@ -41,6 +44,7 @@ const INTERRUPTED: &str = "interrupted";
 
 pub(crate) fn train(args: &TrainArgs) -> Result<(), Failed> {
     let plan = Plan::of(args)?;
+    check_environment(args, &plan)?;
     let lock = RunLock::take(&plan)?;
     let service_locks = lock.wait_for_leftovers(&plan)?;
     plan.prepare()?;
@@ -57,6 +61,18 @@ pub(crate) fn train(args: &TrainArgs) -> Result<(), Failed> {
         return Err(Failed::new(Exit::Interrupted, anyhow!(INTERRUPTED)));
     }
     summary::print(&plan, &last, memory, args.json)
+}
+
+/// Checks the server of the environments, if there is one, before anything is written.
+fn check_environment(args: &TrainArgs, plan: &Plan) -> Result<(), Failed> {
+    let runtime = runtime::new().or_exit(Exit::TryAgain, String::new)?;
+    runtime.block_on(async {
+        let source = EnvironmentSource::of(&args.environment, &ClientConfig::default())?;
+        let layout = plan.config.layout().or_exit(Exit::Usage, String::new)?;
+        let checked = source.check(&layout.into()).await;
+        source.end().await;
+        checked.map_err(worker_failed)
+    })
 }
 
 /// Starts all processes, supervises them until the run has ended, and ends them.

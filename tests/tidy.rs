@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 use std::path::{Path, PathBuf};
 
-const ALLOWED: [(&str, &[&str]); 16] = [
+const ALLOWED: [(&str, &[&str]); 17] = [
     ("core", &[]),
     ("system", &[]),
     ("kinematics", &["core"]),
@@ -18,6 +18,7 @@ const ALLOWED: [(&str, &[&str]); 16] = [
     ("learner", &["core", "system", "policy", "rl", "proto", "telemetry", "net"]),
     ("teacher", &["core", "policy", "proto", "telemetry", "net", "onnx"]),
     ("worker", &["core", "sim", "policy", "proto", "telemetry", "net"]),
+    ("environment", &["core", "sim", "proto", "net"]),
     ("report", &["core", "system", "telemetry"]),
     ("bridge", &["core", "kinematics", "proto", "net"]),
     ("trials", &["core", "kinematics", "sim", "policy", "telemetry", "bridge"]),
@@ -27,7 +28,7 @@ const ALLOWED: [(&str, &[&str]); 16] = [
 const PYTHON: (&str, &[&str]) = ("python", &["core", "sim", "policy"]);
 
 /// Directories of which every file is pure, and single pure files.
-const PURE: [&str; 25] = [
+const PURE: [&str; 26] = [
     "core/src",
     "kinematics/src",
     "sim/src",
@@ -52,6 +53,7 @@ const PURE: [&str; 25] = [
     "teacher/src/procedures.rs",
     "teacher/src/strategy.rs",
     "trials/src",
+    "worker/src/determinism.rs",
     "worker/src/rollout.rs",
 ];
 

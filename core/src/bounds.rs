@@ -11,6 +11,8 @@ pub const MAX_MAGNITUDE: f32 = 1000.0;
 
 /// Positions of end effectors, and goals, metres. An arm reaches 0.7 m.
 const REACH_M: f32 = 2.0;
+/// Desired goals of the built-in tasks, metres.
+pub(crate) const GOAL_BOUND_M: f32 = REACH_M;
 /// Positions of objects, metres. A free fall during a whole episode covers 20 m.
 const FALL_M: f32 = 25.0;
 /// Finger openings and their rates, metres and metres per control step.
@@ -23,7 +25,7 @@ const SPEED: f32 = 2.0;
 const SPIN: f32 = 30.0;
 
 /// The bounds of one arm's observation, in its order, for the tasks with an object on a table.
-const TABLE_TOP: [f32; OBSERVATION_PER_ARM] = {
+pub(crate) const TABLE_TOP: [f32; OBSERVATION_PER_ARM] = {
     let parts = [
         (0, 3, REACH_M),
         (3, 9, FALL_M),

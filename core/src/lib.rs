@@ -101,6 +101,7 @@ pub mod reward;
 pub mod rng;
 pub mod scene;
 pub mod settings;
+pub mod task;
 pub mod text;
 pub mod work;
 
@@ -110,3 +111,4 @@ pub use evaluation::{EpisodeOutcome, EvaluationSummary, Wilson};
 pub use layout::{ArmIndex, Layout, Task};
 pub use rng::{Stream, episode_rng};
 pub use settings::{Exploration, WorldSettings};
+pub use task::{TaskDescription, TaskSpec};

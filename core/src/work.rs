@@ -34,6 +34,19 @@ pub struct EpisodeOrder {
     pub record: bool,
 }
 
+/// The start of an episode in an environment. Together with the actions it determines the episode.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct EpisodeStart {
+    /// Number within the run (training) or within the goal set (evaluation).
+    pub number: u64,
+    /// Seed of its random draws, together with the number.
+    pub seed: u64,
+    /// The purpose of the episode.
+    pub kind: EpisodeKind,
+    /// Initial states and physics of this episode.
+    pub world: WorldSettings,
+}
+
 /// A slot to play: episodes that one worker steps in lock step.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct SlotOrder {

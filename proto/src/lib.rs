@@ -29,9 +29,11 @@
 
 pub mod advice;
 mod codec;
+pub mod environment;
 mod error;
 mod numbers;
 pub mod policy;
+pub mod task;
 pub mod work;
 
 pub use advice::{
@@ -43,6 +45,7 @@ pub use policy::{
     MAX_POLICY_STATES, PolicyAnswers, PolicyDescription, decode_policy_answers,
     decode_policy_description, encode_policy_request,
 };
+pub use task::{decode_task, encode_task};
 pub use work::{
     decode_actor, decode_episode, decode_run_terms, decode_slot, encode_actor, encode_episode,
     encode_run_terms, encode_slot,

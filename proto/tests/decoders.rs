@@ -152,6 +152,7 @@ fn terms() -> impl Strategy<Value = pb::RunTerms> {
         any_text(),
     )
         .prop_map(|(task, n_arms, account, exploration, world, run)| pb::RunTerms {
+            description: None,
             task,
             n_arms,
             account,

@@ -1,5 +1,6 @@
 //! The plan of a run: its settings, its directory, its teacher and the number of workers.
 
+use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 
 use tandem_core::Task;
@@ -10,7 +11,7 @@ use toml::Value;
 use super::teacher_file::TeacherFile;
 use crate::cli::{RecipeName, TrainArgs};
 use crate::exit::{Exit, Failed, OrExit as _};
-use crate::{policy_file, run_directory, run_file};
+use crate::{environment_server, policy_file, run_directory, run_file};
 
 /// A run that can be started.
 pub(crate) struct Plan {
@@ -19,6 +20,8 @@ pub(crate) struct Plan {
     pub(crate) teacher: Option<TeacherFile>,
     pub(crate) n_workers: usize,
     pub(crate) resume: bool,
+    /// The arguments of workers that play in the environments of a server.
+    pub(crate) environment: Vec<OsString>,
 }
 
 impl Plan {
@@ -41,7 +44,8 @@ impl Plan {
         if !(1..=1024).contains(&n_workers) {
             return Err(Failed::usage(format!("--workers {n_workers}: expected 1 to 1024")));
         }
-        let plan = Self { config, out, teacher, n_workers, resume: args.resume };
+        let environment = environment_server::arguments(&args.environment);
+        let plan = Self { config, out, teacher, n_workers, resume: args.resume, environment };
         plan.check_directory()?;
         Ok(plan)
     }

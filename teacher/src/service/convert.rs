@@ -44,6 +44,7 @@ fn check_count(field: &str, count: usize, max: usize) -> Result<(), DecodeError>
 pub(super) fn describe(info: &TeacherInfo) -> pb::DescribeResponse {
     let layout = info.layout;
     pb::DescribeResponse {
+        task_description: None,
         task: layout.task.name().to_owned(),
         n_observation_per_arm: index(layout.n_observation()),
         n_goal_per_arm: index(layout.n_goal()),

@@ -1,5 +1,6 @@
 //! A worker with a learner and a teacher on the loopback interface that fail in various ways.
 
+mod environments;
 mod support;
 
 use std::collections::BTreeMap;
@@ -31,6 +32,7 @@ const TIMEOUTS: Timeouts = Timeouts {
 
 fn config(learner: &Server, teacher: Option<&Server>) -> WorkerConfig {
     WorkerConfig {
+        environment: None,
         client: ClientConfig::default(),
         learner: learner.address(),
         teacher: teacher.map(Server::address),

@@ -1,0 +1,420 @@
+//! Tasks as data: everything that the learner, the teacher and the workers know about a task.
+//!
+//! A [`TaskDescription`] is plain data from a file or a message; [`TaskSpec::new`] checks it. The built-in tasks have
+//! descriptions like any other.
+
+use std::sync::Arc;
+
+use crate::layout::{ArmIndex, Layout, Task};
+use crate::reward::sparse_reward_within;
+
+mod built_in;
+mod check;
+mod description;
+mod part;
+#[cfg(test)]
+mod tests;
+
+pub use check::InvalidTask;
+pub use description::{ArmDescription, Norm, TaskDescription, TaskDifference};
+pub use part::Part;
+
+/// Largest number of arms of a task. An episode has one bit per arm and step.
+pub const MAX_ARMS: usize = 8;
+/// Largest length of an observation, a goal or an action.
+pub const MAX_NUMBERS: usize = 4096;
+/// Largest number of control steps of an episode.
+pub const MAX_EPISODE_STEPS: usize = 10_000;
+
+/// A checked task. It determines the length of every vector and the part of each arm; a clone is cheap.
+#[derive(Debug, Clone)]
+pub struct TaskSpec(Arc<Checked>);
+
+#[derive(Debug)]
+struct Checked {
+    description: TaskDescription,
+    arms: Vec<ArmParts>,
+    common_observation: Part,
+    common_goal: Part,
+    common_achieved_goal: Part,
+    built_in: Option<Layout>,
+}
+
+/// The parts of one arm.
+#[derive(Debug)]
+struct ArmParts {
+    observation: Part,
+    goal: Part,
+    action: Part,
+    achieved_goal: Part,
+    position: Part,
+}
+
+impl TaskSpec {
+    /// Checks a description.
+    ///
+    /// # Errors
+    /// Names the first field that is inconsistent or exceeds a limit.
+    pub fn new(description: TaskDescription) -> Result<Self, InvalidTask> {
+        check::check(&description)?;
+        let task = description.name.parse::<Task>().ok();
+        let built_in = task.map(|task| Layout::new(task, description.arms.len()));
+        Ok(Self::of_checked(description, built_in))
+    }
+
+    /// Creates a built-in task.
+    ///
+    /// # Panics
+    /// If `n_arms` is 0 or exceeds [`MAX_ARMS`].
+    #[must_use]
+    pub fn built_in(task: Task, n_arms: usize) -> Self {
+        assert!((1..=MAX_ARMS).contains(&n_arms), "{n_arms} arms, expected 1 to {MAX_ARMS}");
+        let layout = Layout::new(task, n_arms);
+        Self::of_checked(layout.description(), Some(layout))
+    }
+
+    fn of_checked(description: TaskDescription, built_in: Option<Layout>) -> Self {
+        let achieved = |goal: &[usize]| {
+            Part::new(goal.iter().map(|idx| description.achieved_goal[*idx]).collect())
+        };
+        let parts = |arm: &ArmDescription| ArmParts {
+            observation: Part::new(arm.observation.clone()),
+            goal: Part::new(arm.goal.clone()),
+            action: Part::new(arm.action.clone()),
+            achieved_goal: achieved(&arm.goal),
+            position: Part::new(arm.position.clone()),
+        };
+        let arms: Vec<ArmParts> = description.arms.iter().map(parts).collect();
+        let goals: Vec<&[usize]> = description.arms.iter().map(|arm| &arm.goal[..]).collect();
+        let observations: Vec<&[usize]> =
+            description.arms.iter().map(|arm| &arm.observation[..]).collect();
+        let common_goal = unowned(description.n_goal, &goals);
+        Self(Arc::new(Checked {
+            arms,
+            common_observation: Part::new(unowned(description.n_observation, &observations)),
+            common_achieved_goal: achieved(&common_goal),
+            common_goal: Part::new(common_goal),
+            built_in,
+            description,
+        }))
+    }
+
+    /// Returns the description.
+    #[must_use]
+    pub fn description(&self) -> &TaskDescription {
+        &self.0.description
+    }
+
+    /// Returns the layout of the built-in task, `None` for other tasks.
+    #[must_use]
+    pub fn as_built_in(&self) -> Option<Layout> {
+        self.0.built_in
+    }
+
+    /// Returns the task's name.
+    #[must_use]
+    pub fn name(&self) -> &str {
+        &self.0.description.name
+    }
+
+    /// Returns the length of an observation.
+    #[must_use]
+    pub fn n_observation(&self) -> usize {
+        self.0.description.n_observation
+    }
+
+    /// Returns the length of a goal, achieved or desired.
+    #[must_use]
+    pub fn n_goal(&self) -> usize {
+        self.0.description.n_goal
+    }
+
+    /// Returns the length of an action.
+    #[must_use]
+    pub fn n_action(&self) -> usize {
+        self.0.description.n_action
+    }
+
+    /// Returns the number of arms.
+    #[must_use]
+    pub fn n_arms(&self) -> usize {
+        self.0.arms.len()
+    }
+
+    /// Returns the indices of the arms, in order.
+    pub fn arms(&self) -> impl ExactSizeIterator<Item = ArmIndex> + use<> {
+        (0..self.n_arms()).map(ArmIndex)
+    }
+
+    /// Returns `arm`'s part of an observation: the paper's state map `f_i^s` (equation 7).
+    #[must_use]
+    pub fn observation_of(&self, arm: ArmIndex) -> &Part {
+        &self.0.arms[arm.0].observation
+    }
+
+    /// Returns `arm`'s part of a goal.
+    #[must_use]
+    pub fn goal_of(&self, arm: ArmIndex) -> &Part {
+        &self.0.arms[arm.0].goal
+    }
+
+    /// Returns `arm`'s part of an action: the paper's maps `f^a` and `h_i^a` (equations 8 and 9).
+    #[must_use]
+    pub fn action_of(&self, arm: ArmIndex) -> &Part {
+        &self.0.arms[arm.0].action
+    }
+
+    /// Returns the indices, in an observation, of what `arm` achieved, in the order of [`goal_of`](Self::goal_of).
+    #[must_use]
+    pub fn achieved_goal_of(&self, arm: ArmIndex) -> &Part {
+        &self.0.arms[arm.0].achieved_goal
+    }
+
+    /// Returns the indices, in an observation, of `arm`'s positions along the axis on which the arms face each other.
+    #[must_use]
+    pub fn position_of(&self, arm: ArmIndex) -> &Part {
+        &self.0.arms[arm.0].position
+    }
+
+    /// Returns the numbers of an observation that belong to no arm.
+    #[must_use]
+    pub fn common_observation(&self) -> &Part {
+        &self.0.common_observation
+    }
+
+    /// Returns the numbers of a goal that belong to no arm; all arms must achieve them.
+    #[must_use]
+    pub fn common_goal(&self) -> &Part {
+        &self.0.common_goal
+    }
+
+    /// Returns the indices, in an observation, of what was achieved of [`common_goal`](Self::common_goal).
+    #[must_use]
+    pub fn common_achieved_goal(&self) -> &Part {
+        &self.0.common_achieved_goal
+    }
+
+    /// Returns the number of control steps per episode.
+    #[must_use]
+    pub fn episode_steps(&self) -> usize {
+        self.0.description.episode_steps
+    }
+
+    /// Returns the distance up to which a goal counts as achieved, in the unit of the goal.
+    #[must_use]
+    pub fn tolerance(&self) -> f32 {
+        self.0.description.tolerance
+    }
+
+    /// Returns the norm of the difference between achieved and desired goal.
+    #[must_use]
+    pub fn norm(&self) -> Norm {
+        self.0.description.norm
+    }
+
+    /// Returns the largest magnitude that number `idx` of an observation can have.
+    #[must_use]
+    pub fn observation_bound(&self, idx: usize) -> f32 {
+        self.0.description.observation_bound[idx]
+    }
+
+    /// Returns the largest magnitude that number `idx` of a goal can have.
+    #[must_use]
+    pub fn goal_bound(&self, idx: usize) -> f32 {
+        self.0.description.goal_bound[idx]
+    }
+
+    /// Returns true if the parts of the arms can be exchanged; there is more than one arm.
+    #[must_use]
+    pub fn has_interchangeable_arms(&self) -> bool {
+        self.0.description.interchangeable_arms && self.n_arms() > 1
+    }
+
+    /// Returns true if parts of two arms from different steps can be recombined; there are two arms.
+    #[must_use]
+    pub fn has_recombinable_arms(&self) -> bool {
+        self.n_arms() == 2 && !self.position_of(ArmIndex(0)).is_empty()
+    }
+
+    /// Returns true if steps report contacts between arms and with the table.
+    #[must_use]
+    pub fn reports_contacts(&self) -> bool {
+        self.0.description.reports_contacts
+    }
+
+    /// Returns the goal that `observation` achieves, shape `[n_goal]`.
+    pub fn achieved_goal(&self, observation: &[f32]) -> impl Iterator<Item = f32> {
+        self.0.description.achieved_goal.iter().map(|idx| observation[*idx])
+    }
+
+    /// Returns the distance between two goals, shape `[n_goal]`, or between two parts of goals.
+    ///
+    /// # Panics
+    /// If the goals differ in length.
+    #[must_use]
+    pub fn distance(&self, achieved: &[f32], desired: &[f32]) -> f32 {
+        self.norm().distance(achieved, desired)
+    }
+
+    /// Returns the sparse reward `−(‖achieved − desired‖ > ε)` of section 4.1 of the paper.
+    ///
+    /// Given the goals of all arms, shape `[n_goal]`, the result is the joint reward; given those of one arm, it is the
+    /// arm's own reward.
+    ///
+    /// # Panics
+    /// If the two goals differ in length.
+    #[must_use]
+    pub fn sparse_reward(&self, achieved: &[f32], desired: &[f32]) -> f32 {
+        sparse_reward_within(self.tolerance(), self.distance(achieved, desired))
+    }
+
+    /// Returns the distance of `arm` from its goal in `observation`.
+    #[must_use]
+    pub fn goal_distance_of(&self, arm: ArmIndex, observation: &[f32], goal: &[f32]) -> f32 {
+        let achieved = self.achieved_goal_of(arm).of(observation);
+        self.distance(&achieved, &self.goal_of(arm).of(goal))
+    }
+
+    /// Returns true if `arm`'s part of the goal and the part common to all arms are achieved.
+    ///
+    /// `observation` has shape `[n_observation]`, `goal` shape `[n_goal]`.
+    ///
+    /// # Panics
+    /// If a slice is too short.
+    #[must_use]
+    pub fn arm_succeeds(&self, arm: ArmIndex, observation: &[f32], goal: &[f32]) -> bool {
+        self.goal_distance_of(arm, observation, goal) <= self.tolerance()
+            && self.common_goal_is_achieved(observation, goal)
+    }
+
+    /// Returns true if every arm's part of the goal, and the part common to all arms, are achieved.
+    ///
+    /// `observation` has shape `[n_observation]`, `goal` shape `[n_goal]`. An episode is a success if this holds after
+    /// its last step. With several arms the criterion is weaker than a joint reward of 0.
+    ///
+    /// # Panics
+    /// If a slice is too short.
+    #[must_use]
+    pub fn is_success(&self, observation: &[f32], goal: &[f32]) -> bool {
+        self.arms().all(|arm| self.arm_succeeds(arm, observation, goal))
+    }
+
+    fn common_goal_is_achieved(&self, observation: &[f32], goal: &[f32]) -> bool {
+        let (achieved, desired) = (self.common_achieved_goal(), self.common_goal());
+        desired.is_empty()
+            || self.distance(&achieved.of(observation), &desired.of(goal)) <= self.tolerance()
+    }
+
+    /// Returns the one-arm task of which each arm's part is an instance: the task of a teacher.
+    ///
+    /// Returns `None` if the arms have common numbers, or an arm achieves its goal outside its own observation.
+    #[must_use]
+    pub fn single_arm(&self) -> Option<Self> {
+        if self.n_arms() == 1 {
+            return Some(self.clone());
+        }
+        if let Some(layout) = self.as_built_in() {
+            return Some(layout.single_arm().into());
+        }
+        let description = self.description();
+        let arm = &description.arms[0];
+        let has_common = !self.common_observation().is_empty() || !self.common_goal().is_empty();
+        let in_own = |idx: &usize| {
+            let achieved = description.achieved_goal[*idx];
+            arm.observation.iter().position(|own| *own == achieved)
+        };
+        let achieved_goal = arm.goal.iter().map(in_own).collect::<Option<Vec<usize>>>()?;
+        if has_common || achieved_goal.is_empty() {
+            return None;
+        }
+        let own = |n: usize| (0..n).collect::<Vec<usize>>();
+        let bounds = |part: &Part, bounds: &[f32]| part.of(bounds).into_owned();
+        let (observation, goal) = (self.observation_of(ArmIndex(0)), self.goal_of(ArmIndex(0)));
+        Self::new(TaskDescription {
+            n_observation: arm.observation.len(),
+            n_goal: arm.goal.len(),
+            n_action: arm.action.len(),
+            arms: vec![ArmDescription {
+                observation: own(arm.observation.len()),
+                goal: own(arm.goal.len()),
+                action: own(arm.action.len()),
+                position: Vec::new(),
+            }],
+            achieved_goal,
+            interchangeable_arms: false,
+            origin_distance: 0.0,
+            recombination_gap: 0.0,
+            observation_bound: bounds(observation, &description.observation_bound),
+            goal_bound: bounds(goal, &description.goal_bound),
+            ..description.clone()
+        })
+        .ok()
+    }
+
+    /// Returns the task of `n_arms` arms whose vectors are the concatenated vectors of this task's arms: the form in
+    /// which a student of any layout asks a teacher for one arm.
+    ///
+    /// # Errors
+    /// Names the limit that the result exceeds.
+    pub fn concatenated(&self, n_arms: usize) -> Result<Self, InvalidTask> {
+        if let Some(layout) = self.as_built_in() {
+            return Self::new(Layout::new(layout.task, n_arms).description());
+        }
+        let one = self.description();
+        let shifted = |arm_idx: usize, indices: &[usize], n: usize| {
+            indices.iter().map(|idx| arm_idx * n + idx).collect::<Vec<usize>>()
+        };
+        let arms = (0..n_arms).flat_map(|arm_idx| {
+            one.arms.iter().map(move |arm| ArmDescription {
+                observation: shifted(arm_idx, &arm.observation, one.n_observation),
+                goal: shifted(arm_idx, &arm.goal, one.n_goal),
+                action: shifted(arm_idx, &arm.action, one.n_action),
+                position: Vec::new(),
+            })
+        });
+        let achieved_goal =
+            (0..n_arms).flat_map(|arm_idx| shifted(arm_idx, &one.achieved_goal, one.n_observation));
+        Self::new(TaskDescription {
+            n_observation: n_arms * one.n_observation,
+            n_goal: n_arms * one.n_goal,
+            n_action: n_arms * one.n_action,
+            arms: arms.collect(),
+            achieved_goal: achieved_goal.collect(),
+            observation_bound: one.observation_bound.repeat(n_arms),
+            goal_bound: one.goal_bound.repeat(n_arms),
+            ..one.clone()
+        })
+    }
+
+    /// Returns the first field in which two tasks differ.
+    #[must_use]
+    pub fn difference(&self, other: &Self) -> Option<TaskDifference> {
+        if self == other { None } else { self.description().difference(other.description()) }
+    }
+}
+
+impl From<Layout> for TaskSpec {
+    /// Creates a built-in task. See [`TaskSpec::built_in`] for its panics.
+    fn from(layout: Layout) -> Self {
+        Self::built_in(layout.task, layout.n_arms)
+    }
+}
+
+impl From<&Self> for TaskSpec {
+    fn from(task: &Self) -> Self {
+        task.clone()
+    }
+}
+
+impl PartialEq for TaskSpec {
+    fn eq(&self, other: &Self) -> bool {
+        Arc::ptr_eq(&self.0, &other.0) || self.0.description == other.0.description
+    }
+}
+
+/// Returns the indices below `n` that no arm has.
+fn unowned(n: usize, parts: &[&[usize]]) -> Vec<usize> {
+    let mut is_owned = vec![false; n];
+    parts.iter().copied().flatten().for_each(|idx| is_owned[*idx] = true);
+    (0..n).filter(|idx| !is_owned[*idx]).collect()
+}

@@ -1,0 +1,48 @@
+//! The descriptions of the built-in tasks, which the simulator implements.
+
+use super::{ArmDescription, Norm, TaskDescription};
+use crate::bounds::{GOAL_BOUND_M, TABLE_TOP};
+use crate::layout::{
+    EPISODE_STEPS, GOAL_TOLERANCE_M, HAND_POSITION, Layout, OBJECT_POSITION, WORKSPACE_DISTANCE_M,
+};
+
+/// Smallest gap along x, metres, between the hands and objects of two arms whose transitions come from different steps:
+/// they cannot touch.
+const RECOMBINATION_GAP_M: f32 = 0.10;
+
+impl Layout {
+    /// Returns the description of the built-in task with this number of arms.
+    #[must_use]
+    pub fn description(self) -> TaskDescription {
+        let has_several_arms = self.n_arms > 1;
+        let arm = |arm| {
+            let observation = self.observation_of(arm);
+            let x_of = |position: std::ops::Range<usize>| observation.start + position.start;
+            let position = vec![x_of(HAND_POSITION), x_of(OBJECT_POSITION)];
+            ArmDescription {
+                observation: observation.clone().collect(),
+                goal: self.goal_of(arm).collect(),
+                action: self.action_of(arm).collect(),
+                position: if has_several_arms { position } else { Vec::new() },
+            }
+        };
+        let if_several = |value| if has_several_arms { value } else { 0.0 };
+        TaskDescription {
+            name: self.task.name().to_owned(),
+            n_observation: self.n_observation(),
+            n_goal: self.n_goal(),
+            n_action: self.n_action(),
+            arms: self.arms().map(arm).collect(),
+            achieved_goal: self.arms().flat_map(|arm| self.achieved_goal_of(arm)).collect(),
+            episode_steps: EPISODE_STEPS,
+            tolerance: GOAL_TOLERANCE_M,
+            norm: Norm::Euclidean,
+            interchangeable_arms: has_several_arms,
+            reports_contacts: true,
+            origin_distance: if_several(WORKSPACE_DISTANCE_M),
+            recombination_gap: if_several(RECOMBINATION_GAP_M),
+            observation_bound: TABLE_TOP.repeat(self.n_arms),
+            goal_bound: vec![GOAL_BOUND_M; self.n_goal()],
+        }
+    }
+}

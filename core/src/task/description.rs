@@ -1,0 +1,226 @@
+//! The description of a task as plain data.
+
+use std::fmt;
+
+use serde::{Deserialize, Serialize};
+
+use crate::text::shortened;
+
+/// Longest text of a value in a message.
+const MAX_SHOWN_CHARS: usize = 60;
+
+/// The description of a task: the vectors of its environment, the parts of these vectors that belong to each arm, the
+/// sparse reward and the length of an episode. Learner, teacher and workers know nothing else about a task.
+///
+/// It is data from files and messages and may be inconsistent; a [`TaskSpec`](super::TaskSpec) is checked.
+#[derive(Debug, Clone, PartialEq, Deserialize, Serialize)]
+#[serde(deny_unknown_fields)]
+pub struct TaskDescription {
+    /// Name: 1 to 64 lower-case letters, digits, `-`, `_`, `.` and `/`.
+    pub name: String,
+    /// Length of an observation, 1 to 4096.
+    pub n_observation: usize,
+    /// Length of a goal, 1 to 4096.
+    pub n_goal: usize,
+    /// Length of an action, 1 to 4096; components are in [−1, 1].
+    pub n_action: usize,
+    /// For each number of the achieved goal its index in the observation, shape `[n_goal]`.
+    pub achieved_goal: Vec<usize>,
+    /// Control steps per episode, 1 to 10,000.
+    pub episode_steps: usize,
+    /// Distance up to which a goal counts as achieved, in the unit of the goal.
+    pub tolerance: f32,
+    /// Norm of the difference between achieved and desired goal.
+    pub norm: Norm,
+    /// Whether exchanging the parts of two arms gives another valid transition.
+    #[serde(default)]
+    pub interchangeable_arms: bool,
+    /// Whether steps report contacts between arms and with the table.
+    #[serde(default)]
+    pub reports_contacts: bool,
+    /// Distance between the origins of two arms along the axis of [`ArmDescription::position`]. Each arm's axis points
+    /// at the other arm.
+    #[serde(default)]
+    pub origin_distance: f32,
+    /// Smallest gap, along that axis, between two arms whose parts come from different steps.
+    #[serde(default)]
+    pub recombination_gap: f32,
+    /// Largest magnitude of each number of an observation, shape `[n_observation]`.
+    pub observation_bound: Vec<f32>,
+    /// Largest magnitude of each number of a goal, shape `[n_goal]`.
+    pub goal_bound: Vec<f32>,
+    /// The arms in order, 1 to 8.
+    pub arms: Vec<ArmDescription>,
+}
+
+/// The indices of one arm in the vectors of its task. The parts of all arms have the same lengths.
+///
+/// An index belongs to at most one arm, and every index of an action to exactly one. Numbers of observations and goals
+/// that belong to no arm are common to all arms.
+#[derive(Debug, Clone, PartialEq, Eq, Default, Deserialize, Serialize)]
+#[serde(deny_unknown_fields)]
+pub struct ArmDescription {
+    /// Indices in an observation.
+    pub observation: Vec<usize>,
+    /// Indices in a goal.
+    pub goal: Vec<usize>,
+    /// Indices in an action.
+    pub action: Vec<usize>,
+    /// Indices, in the observation, of the positions along the axis on which the arms face each other. Parts of two
+    /// arms from different steps may be recombined where these positions lie far enough apart. Empty: arms are not
+    /// recombined.
+    #[serde(default)]
+    pub position: Vec<usize>,
+}
+
+/// The norm of the difference between an achieved and a desired goal.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize, Serialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Norm {
+    /// The square root of the sum of squares.
+    Euclidean,
+    /// The largest magnitude.
+    Maximum,
+}
+
+impl Norm {
+    /// Returns the distance between two points of the same dimension.
+    ///
+    /// # Panics
+    /// If the points differ in dimension.
+    #[must_use]
+    pub fn distance(self, a: &[f32], b: &[f32]) -> f32 {
+        self.of_accumulated(self.accumulate(a, b))
+    }
+
+    /// Returns the share of two parts of points in the distance between the points: see [`Norm::combined`].
+    ///
+    /// # Panics
+    /// If the parts differ in length.
+    #[must_use]
+    pub fn accumulate(self, a: &[f32], b: &[f32]) -> f32 {
+        assert_eq!(a.len(), b.len(), "points of different dimension");
+        let differences = a.iter().zip(b).map(|(a, b)| a - b);
+        match self {
+            Self::Euclidean => differences.map(|difference| difference * difference).sum::<f32>(),
+            Self::Maximum => differences.fold(0.0, |most, difference| most.max(difference.abs())),
+        }
+    }
+
+    /// Returns the share that two accumulated parts have together.
+    #[must_use]
+    pub const fn combined(self, first: f32, second: f32) -> f32 {
+        match self {
+            Self::Euclidean => first + second,
+            Self::Maximum => first.max(second),
+        }
+    }
+
+    /// Returns the distance of which `accumulated` is the share of all parts.
+    #[must_use]
+    pub fn of_accumulated(self, accumulated: f32) -> f32 {
+        match self {
+            Self::Euclidean => accumulated.sqrt(),
+            Self::Maximum => accumulated,
+        }
+    }
+}
+
+/// The first field in which two descriptions differ.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct TaskDifference {
+    /// The field, such as `arms[1].goal`.
+    pub field: String,
+    /// Its value in the first description.
+    pub first: String,
+    /// Its value in the second one.
+    pub second: String,
+}
+
+impl fmt::Display for TaskDifference {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{} is {} and {}", self.field, self.first, self.second)
+    }
+}
+
+impl TaskDescription {
+    /// Returns the first field in which `self` and `other` differ.
+    #[must_use]
+    pub fn difference(&self, other: &Self) -> Option<TaskDifference> {
+        let differs = |field: &str, first: &dyn fmt::Debug, second: &dyn fmt::Debug| {
+            let shown = |value| shortened(&format!("{value:?}"), MAX_SHOWN_CHARS);
+            let (first, second) = (shown(first), shown(second));
+            Some(TaskDifference { field: field.to_owned(), first, second })
+        };
+        macro_rules! compare {
+            ($($field:ident),+) => {
+                $(if self.$field != other.$field {
+                    return differs(stringify!($field), &self.$field, &other.$field);
+                })+
+            };
+        }
+        compare!(name, n_observation, n_goal, n_action);
+        let n_arms = |description: &Self| description.arms.len();
+        if n_arms(self) != n_arms(other) {
+            return differs("number of arms", &n_arms(self), &n_arms(other));
+        }
+        for (arm_idx, (first, second)) in self.arms.iter().zip(&other.arms).enumerate() {
+            for ((name, first), (_, second)) in first.fields().into_iter().zip(second.fields()) {
+                if first != second {
+                    return differs(&format!("arms[{arm_idx}].{name}"), first, second);
+                }
+            }
+        }
+        compare!(achieved_goal, episode_steps, tolerance, norm, interchangeable_arms);
+        compare!(reports_contacts, origin_distance, recombination_gap);
+        compare!(observation_bound, goal_bound);
+        None
+    }
+}
+
+impl ArmDescription {
+    /// Returns the name and the indices of each field.
+    pub(super) const fn fields(&self) -> [(&'static str, &Vec<usize>); 4] {
+        [
+            ("observation", &self.observation),
+            ("goal", &self.goal),
+            ("action", &self.action),
+            ("position", &self.position),
+        ]
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{Layout, Task};
+
+    #[test]
+    fn a_norm_of_parts_is_the_norm_of_the_whole() {
+        let (a, b) = ([3.0, 0.0, -2.0], [0.0, 4.0, -2.0]);
+        for (norm, expected) in [(Norm::Euclidean, 5.0), (Norm::Maximum, 4.0)] {
+            assert_eq!(norm.distance(&a, &b), expected);
+            let parts = [norm.accumulate(&a[..1], &b[..1]), norm.accumulate(&a[1..], &b[1..])];
+            assert_eq!(norm.of_accumulated(norm.combined(parts[0], parts[1])), expected);
+        }
+    }
+
+    #[test]
+    fn the_first_differing_field_is_named() {
+        let first = Layout::new(Task::Push, 2).description();
+        assert_eq!(first.difference(&first), None);
+        let check = |change: fn(&mut TaskDescription), message: &str| {
+            let mut second = first.clone();
+            change(&mut second);
+            let difference = first.difference(&second).expect("they differ");
+            assert_eq!(difference.to_string(), message);
+        };
+        check(|task| task.name = "reach".to_owned(), "name is \"push\" and \"reach\"");
+        check(|task| task.episode_steps = 60, "episode_steps is 50 and 60");
+        check(|task| task.arms[1].goal[2] = 9, "arms[1].goal is [3, 4, 5] and [3, 4, 9]");
+        check(|task| task.arms.truncate(1), "number of arms is 2 and 1");
+        check(|task| task.goal_bound[5] = 1.0, {
+            "goal_bound is [2.0, 2.0, 2.0, 2.0, 2.0, 2.0] and [2.0, 2.0, 2.0, 2.0, 2.0, 1.0]"
+        });
+    }
+}

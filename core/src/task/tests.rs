@@ -1,0 +1,151 @@
+use super::*;
+
+/// A task of two arms with interleaved numbers: an arm's position and speed are two apart, goals and actions in
+/// reverse order of the arms.
+fn interleaved() -> TaskDescription {
+    let arm = |first: usize| ArmDescription {
+        observation: vec![first, first + 2],
+        goal: vec![1 - first],
+        action: vec![1 - first],
+        position: vec![first],
+    };
+    TaskDescription {
+        name: "lab/reach-1".to_owned(),
+        n_observation: 4,
+        n_goal: 2,
+        n_action: 2,
+        arms: vec![arm(0), arm(1)],
+        achieved_goal: vec![1, 0],
+        episode_steps: 20,
+        tolerance: 0.1,
+        norm: Norm::Maximum,
+        interchangeable_arms: true,
+        reports_contacts: false,
+        origin_distance: 1.0,
+        recombination_gap: 0.2,
+        observation_bound: vec![2.0; 4],
+        goal_bound: vec![1.0; 2],
+    }
+}
+
+/// A task in which two arms carry one object, whose position and goal belong to neither.
+fn carried() -> TaskDescription {
+    let arm = |idx: usize| ArmDescription {
+        observation: vec![idx],
+        action: vec![idx],
+        ..ArmDescription::default()
+    };
+    TaskDescription {
+        n_observation: 3,
+        n_goal: 1,
+        arms: vec![arm(0), arm(1)],
+        achieved_goal: vec![2],
+        observation_bound: vec![2.0; 3],
+        goal_bound: vec![1.0],
+        ..interleaved()
+    }
+}
+
+#[test]
+fn a_built_in_task_has_the_layout_of_its_vectors() {
+    for (task, n_arms) in [(Task::Push, 1), (Task::PickAndPlace, 2), (Task::Push, 8)] {
+        let layout = Layout::new(task, n_arms);
+        let spec = TaskSpec::new(layout.description()).unwrap();
+        assert_eq!(spec, layout.into());
+        assert_eq!(spec.as_built_in(), Some(layout));
+        assert_eq!(spec.name(), task.name());
+        assert_eq!(spec.single_arm(), Some(Layout::new(task, 1).into()));
+        assert_eq!(spec.single_arm().unwrap().concatenated(n_arms), Ok(spec.clone()));
+        for arm in layout.arms() {
+            assert_eq!(spec.observation_of(arm).as_range(), Some(layout.observation_of(arm)));
+            assert_eq!(spec.goal_of(arm).as_range(), Some(layout.goal_of(arm)));
+            assert_eq!(spec.action_of(arm).as_range(), Some(layout.action_of(arm)));
+            assert_eq!(spec.achieved_goal_of(arm).as_range(), Some(layout.achieved_goal_of(arm)));
+        }
+    }
+}
+
+#[test]
+fn interleaved_parts_are_found_by_their_indices() {
+    let task = TaskSpec::new(interleaved()).unwrap();
+    assert_eq!(task.as_built_in(), None);
+    let observation = [0.5, -0.5, 10.0, 20.0];
+    assert_eq!(*task.observation_of(ArmIndex(1)).of(&observation), [-0.5, 20.0]);
+    assert_eq!(*task.achieved_goal_of(ArmIndex(0)).of(&observation), [0.5]);
+    assert_eq!(task.achieved_goal(&observation).collect::<Vec<f32>>(), [-0.5, 0.5]);
+    let goal = [-0.45, 0.8];
+    assert!(!task.arm_succeeds(ArmIndex(0), &observation, &goal), "0.5 is not 0.8");
+    assert!(task.arm_succeeds(ArmIndex(1), &observation, &goal));
+    assert!(!task.is_success(&observation, &goal));
+    assert!(task.is_success(&[0.75, -0.5, 0.0, 0.0], &goal));
+}
+
+#[test]
+fn each_arm_is_an_instance_of_the_one_arm_task() {
+    let one = TaskSpec::new(interleaved()).unwrap().single_arm().unwrap();
+    assert_eq!((one.n_observation(), one.n_goal(), one.n_action(), one.n_arms()), (2, 1, 1, 1));
+    assert_eq!((one.episode_steps(), one.tolerance(), one.norm()), (20, 0.1, Norm::Maximum));
+    assert_eq!(one.achieved_goal(&[3.0, 4.0]).collect::<Vec<f32>>(), [3.0]);
+    assert_eq!(one.single_arm().as_ref(), Some(&one));
+    let three = one.concatenated(3).unwrap();
+    assert_eq!(three.observation_of(ArmIndex(2)).as_range(), Some(4..6));
+    assert_eq!(three.achieved_goal_of(ArmIndex(1)).as_range(), Some(2..3));
+    assert_eq!(three.single_arm(), Some(one.clone()));
+    assert_eq!(one.concatenated(9).unwrap_err().field, "number of arms");
+}
+
+#[test]
+fn a_common_goal_counts_for_every_arm_and_has_no_one_arm_task() {
+    let task = TaskSpec::new(TaskDescription { name: "carry".to_owned(), ..carried() }).unwrap();
+    assert_eq!(task.common_observation().as_range(), Some(2..3));
+    for arm in task.arms() {
+        assert!(task.arm_succeeds(arm, &[9.0, 9.0, 0.35], &[0.4]));
+        assert!(!task.arm_succeeds(arm, &[0.4, 0.4, 0.2], &[0.4]));
+    }
+    assert_eq!(task.single_arm(), None);
+    assert!(!task.has_recombinable_arms());
+}
+
+#[test]
+fn an_invalid_description_is_refused_by_field() {
+    let check = |change: fn(&mut TaskDescription), message: &str| {
+        let mut description = interleaved();
+        change(&mut description);
+        assert_eq!(TaskSpec::new(description).unwrap_err().to_string(), message);
+    };
+    let names = "1 to 64 lower-case letters, digits, '-', '_', '.' and '/'";
+    check(|t| t.name.clear(), &format!("name: expected {names}, got \"\""));
+    check(|t| t.name = "Reach".to_owned(), &format!("name: expected {names}, got \"Reach\""));
+    check(|t| t.n_observation = 4097, "n_observation: expected 1 to 4096, got 4097");
+    check(|t| t.n_goal = 0, "n_goal: expected 1 to 4096, got 0");
+    check(|t| t.episode_steps = 10_001, "episode_steps: expected 1 to 10000, got 10001");
+    check(|t| t.tolerance = f32::NAN, "tolerance: expected a finite number above 0, got NaN");
+    check(|t| t.achieved_goal = vec![0], "achieved_goal: expected 2 numbers, got 1");
+    check(|t| t.achieved_goal[1] = 4, "achieved_goal[1]: expected 0 to 3, got 4");
+    check(|t| t.observation_bound[3] = 0.0, {
+        "observation_bound[3]: expected a finite number above 0, got 0"
+    });
+    check(|t| t.goal_bound.push(1.0), "goal_bound: expected 2 numbers, got 3");
+    check(|t| t.arms.clear(), "number of arms: expected 1 to 8, got 0");
+    check(|t| t.arms[1].goal[0] = 7, "arms[1].goal[0]: expected 0 to 1, got 7");
+    check(|t| t.arms[1].observation.truncate(1), {
+        "arms[1].observation: expected 2 numbers, got 1"
+    });
+    check(|t| t.arms[1].observation[0] = 2, {
+        "arms[1].observation[0]: expected an index that no arm has yet, got 2"
+    });
+    check(|t| t.n_action = 3, {
+        "arms: expected every index of an action in the action of an arm, got none with index 2"
+    });
+    check(|t| t.recombination_gap = -1.0, {
+        "recombination_gap: expected a finite number, 0 or more, got -1"
+    });
+    check(|t| t.arms[0].position[0] = 1, {
+        "arms[0].position: expected no index, or observations and goals in which every number, the \
+         achieved goal and these positions belong to the arm, got 1 indices"
+    });
+    check(|t| t.name = "push".to_owned(), {
+        "name: expected a name other than that of the built-in task push, got push, whose \
+         n_observation is 56 and 4"
+    });
+}
