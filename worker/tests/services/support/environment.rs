@@ -101,7 +101,7 @@ impl Session {
 
     fn answer(&mut self, request: pb::PlayRequest) -> Result<pb::PlayResponse, Status> {
         let command = decode_play_request(request, self.n, &self.task)?;
-        let n = self.n.unwrap_or_else(|| match &command {
+        let n = self.n.unwrap_or(match &command {
             PlayCommand::Reset(resets) => resets.len(),
             PlayCommand::Step(_) => 0,
         });
