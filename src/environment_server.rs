@@ -4,9 +4,8 @@ use std::ffi::OsString;
 use std::sync::Arc;
 use std::time::Duration;
 
-use tandem_core::TaskSpec;
 use tandem_net::ClientConfig;
-use tandem_worker::EnvironmentConfig;
+use tandem_worker::{EnvironmentConfig, ServedTask};
 
 use crate::access;
 use crate::cli::{ClientArgs, EnvironmentArgs, SecretArgs};
@@ -52,10 +51,10 @@ impl EnvironmentSource {
         }
     }
 
-    /// Checks that the server, if there is one, can be called and serves `task`.
-    pub(crate) async fn check(&self, task: &TaskSpec) -> Result<(), tandem_worker::Error> {
-        let Some(config) = self.config() else { return Ok(()) };
-        tandem_worker::check_environments(config, task).await
+    /// Returns the task of the server, if there is one.
+    pub(crate) async fn served_task(&self) -> Result<Option<ServedTask>, tandem_worker::Error> {
+        let Some(config) = self.config() else { return Ok(None) };
+        tandem_worker::describe_environments(config).await.map(Some)
     }
 
     /// Ends the server if this process has started it.

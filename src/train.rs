@@ -16,6 +16,7 @@ use std::time::{Duration, Instant};
 use anyhow::anyhow;
 use tandem_net::ClientConfig;
 use tandem_proto::pb;
+use tandem_worker::ServedTask;
 use tokio::sync::mpsc;
 use tokio_util::sync::CancellationToken;
 
@@ -43,8 +44,8 @@ const SAMPLE_EVERY: Duration = Duration::from_millis(500);
 const INTERRUPTED: &str = "interrupted";
 
 pub(crate) fn train(args: &TrainArgs) -> Result<(), Failed> {
-    let plan = Plan::of(args)?;
-    check_environment(args, &plan)?;
+    let served = served_task(args)?;
+    let plan = Plan::of(args, served.as_ref())?;
     let lock = RunLock::take(&plan)?;
     let service_locks = lock.wait_for_leftovers(&plan)?;
     plan.prepare()?;
@@ -63,15 +64,14 @@ pub(crate) fn train(args: &TrainArgs) -> Result<(), Failed> {
     summary::print(&plan, &last, memory, args.json)
 }
 
-/// Checks the server of the environments, if there is one, before anything is written.
-fn check_environment(args: &TrainArgs, plan: &Plan) -> Result<(), Failed> {
+/// Asks the server of the environments, if there is one, for its task.
+fn served_task(args: &TrainArgs) -> Result<Option<ServedTask>, Failed> {
     let runtime = runtime::new().or_exit(Exit::TryAgain, String::new)?;
     runtime.block_on(async {
         let source = EnvironmentSource::of(&args.environment, &ClientConfig::default())?;
-        let layout = plan.config.layout().or_exit(Exit::Usage, String::new)?;
-        let checked = source.check(&layout.into()).await;
+        let served = source.served_task().await;
         source.end().await;
-        checked.map_err(worker_failed)
+        served.map_err(worker_failed)
     })
 }
 

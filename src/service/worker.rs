@@ -38,6 +38,7 @@ pub(crate) fn worker_failed(error: Error) -> Failed {
         | E::NoEnvironment(_)
         | E::OtherTask { .. }
         | E::TooFewEnvironments { .. } => Exit::Usage,
+        E::EnvironmentRefused { ref status, .. } if is_configuration(status) => Exit::Usage,
         E::InvalidReply { .. } | E::EnvironmentRefused { .. } => Exit::Data,
         E::Rollout { .. } | E::World(_) | E::Panicked(_) | E::NoAccount { .. } | E::NoServer => {
             Exit::Bug
@@ -58,6 +59,10 @@ pub(crate) fn worker_failed(error: Error) -> Failed {
 /// Returns the message of a peer that requires another token or is another service.
 fn configuration_problem(error: &anyhow::Error) -> Option<&str> {
     let mut statuses = error.chain().filter_map(|cause| cause.downcast_ref::<Status>());
-    let is_final = |code| matches!(code, Code::Unauthenticated | Code::Unimplemented);
-    statuses.find(|status| is_final(status.code())).map(Status::message)
+    statuses.find(|status| is_configuration(status)).map(Status::message)
+}
+
+/// Returns whether a peer requires another token or is another service.
+fn is_configuration(status: &Status) -> bool {
+    matches!(status.code(), Code::Unauthenticated | Code::Unimplemented)
 }

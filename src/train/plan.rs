@@ -6,11 +6,13 @@ use std::path::{Path, PathBuf};
 use tandem_core::Task;
 use tandem_learner::{checkpoint, settings};
 use tandem_rl::RunConfig;
+use tandem_worker::ServedTask;
 use toml::Value;
 
 use super::teacher_file::TeacherFile;
 use crate::cli::{RecipeName, TrainArgs};
 use crate::exit::{Exit, Failed, OrExit as _};
+use crate::service::worker_failed;
 use crate::{environment_server, policy_file, run_directory, run_file};
 
 /// A run that can be started.
@@ -25,9 +27,14 @@ pub(crate) struct Plan {
 }
 
 impl Plan {
-    /// Resolves the command line, and rejects a run that cannot be started.
-    pub(crate) fn of(args: &TrainArgs) -> Result<Self, Failed> {
-        let config = config(args)?;
+    /// Resolves the command line, and rejects a run that cannot be started. `served` is the task of the server of
+    /// environments, if there is one.
+    pub(crate) fn of(args: &TrainArgs, served: Option<&ServedTask>) -> Result<Self, Failed> {
+        let config = config(args, served)?;
+        if let Some(served) = served {
+            let task = config.layout().or_exit(Exit::Usage, String::new)?;
+            served.check(&task.into()).map_err(worker_failed)?;
+        }
         let out = match &args.out {
             Some(out) => out.clone(),
             None => free_run_directory(&config),
@@ -157,7 +164,7 @@ impl Plan {
 }
 
 /// Resolves the settings; those of a resumed run come from its own run file.
-fn config(args: &TrainArgs) -> Result<RunConfig, Failed> {
+fn config(args: &TrainArgs, served: Option<&ServedTask>) -> Result<RunConfig, Failed> {
     let own_file = args.out.as_ref().filter(|_| args.resume).map(|out| out.join("run.toml"));
     if let Some((file, out)) = own_file.as_ref().zip(args.out.as_ref())
         && !file.exists()
@@ -165,7 +172,7 @@ fn config(args: &TrainArgs) -> Result<RunConfig, Failed> {
         run_directory::check_path(out)?;
         return Err(Failed::usage(format!("{} holds no run to resume", out.display())));
     }
-    let settings = settings_of(args)?;
+    let settings = [served_settings(args, served)?, settings_of(args)?].concat();
     let config = run_file::resolve(args.run.as_deref().or(own_file.as_deref()), &settings)?;
     let is_named = settings.iter().any(|(key, _)| key == "name");
     // A resumed run keeps the name in its own run file, even if --run names another one.
@@ -176,6 +183,29 @@ fn config(args: &TrainArgs) -> Result<RunConfig, Failed> {
         },
         None => Ok(config),
     }
+}
+
+/// Returns the settings that describe the task of a server, unless the task is built-in or the command line names a task
+/// or a run.
+fn served_settings(
+    args: &TrainArgs,
+    served: Option<&ServedTask>,
+) -> Result<Vec<(String, Value)>, Failed> {
+    let names_task = args.task.is_some() || args.run.is_some() || args.resume;
+    let Some(task) = served.map(|served| &served.task).filter(|_| !names_task) else {
+        return Ok(Vec::new());
+    };
+    if task.as_built_in().is_some() {
+        return Ok(Vec::new());
+    }
+    let description = Value::try_from(task.description()).or_exit(Exit::Bug, String::new)?;
+    let n_arms = i64::try_from(task.n_arms()).unwrap_or(i64::MAX);
+    let settings = [
+        ("task", Value::String(task.name().to_owned())),
+        ("arms", Value::Integer(n_arms)),
+        ("description", description),
+    ];
+    Ok(settings.map(|(key, value)| (key.to_owned(), value)).into())
 }
 
 /// Converts the flags to settings of the run file, after those of `--set`.

@@ -23,12 +23,38 @@ const STREAM_CAPACITY: usize = 1;
 /// The largest number of characters of a server's own name in messages.
 const MAX_NAME_CHARS: usize = 100;
 
-/// Waits for the server of `config` and checks that it serves the given task.
+/// A server of environments and its task.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ServedTask {
+    /// The name of the server in messages: its address and program.
+    pub server: String,
+    /// The task of its environments.
+    pub task: TaskSpec,
+}
+
+impl ServedTask {
+    /// Checks that the server serves the run's task.
+    ///
+    /// # Errors
+    /// Names the first field that differs.
+    pub fn check(&self, run: &TaskSpec) -> Result<(), Error> {
+        let Some(difference) = run.difference(&self.task) else { return Ok(()) };
+        Err(Error::OtherTask { server: self.server.clone(), difference })
+    }
+}
+
+/// Waits for the server of `config` and returns its task.
 ///
 /// # Errors
-/// When the server cannot be started, does not answer after several attempts, or serves another task.
-pub async fn check_environments(config: EnvironmentConfig, task: &TaskSpec) -> Result<(), Error> {
-    Environments::new(config).check(task).await
+/// When the server cannot be started, does not answer after several attempts, or has an invalid task.
+pub async fn describe_environments(config: EnvironmentConfig) -> Result<ServedTask, Error> {
+    let mut environments = Environments::new(config);
+    loop {
+        match environments.connect().await {
+            Ok(server) => return Ok(server.served.clone()),
+            Err(failure) => environments.recover(failure).await?,
+        }
+    }
 }
 
 /// The server of a worker's environments, called over one stream.
@@ -55,6 +81,7 @@ pub(crate) struct Environments {
 #[derive(Debug)]
 struct Server {
     client: EnvironmentClient<AuthChannel>,
+    served: ServedTask,
     max_environments: usize,
 }
 
@@ -92,10 +119,12 @@ impl Environments {
 
     /// Waits for the server and checks that it serves the given task.
     pub(crate) async fn check(&mut self, task: &TaskSpec) -> Result<(), Error> {
-        while let Err(failure) = self.connect(task).await {
-            self.recover(failure).await?;
+        loop {
+            match self.connect().await {
+                Ok(server) => return server.served.check(task),
+                Err(failure) => self.recover(failure).await?,
+            }
         }
-        Ok(())
     }
 
     /// Starts episodes, one per environment.
@@ -142,7 +171,7 @@ impl Environments {
         self.n_failures += 1;
         if self.n_failures >= self.config.max_attempts {
             let (server, n_failures) = (self.name.clone(), self.n_failures);
-            return Err(Error::EnvironmentFailed { server, n_failures, source: status });
+            return Err(Error::EnvironmentFailed { server, n_failures, status });
         }
         self.retrier.settle(Err::<(), _>(status)).await;
         Ok(())
@@ -156,14 +185,16 @@ impl Environments {
         task: &TaskSpec,
     ) -> Result<pb::PlayResponse, Failure> {
         let stream = self.stream.take().filter(|stream| stream.n == n);
-        self.connect(task).await?;
-        let Some(server) = &mut self.server else { return Err(Failure::Transient(closed())) };
+        let reply_timeout = self.config.reply_timeout;
+        let server = self.connect().await?;
+        // The server may have been replaced since the last call.
+        server.served.check(task).map_err(|error| Failure::Final(Box::new(error)))?;
         if n > server.max_environments {
-            let (server, max) = (self.name.clone(), server.max_environments);
+            let (server, max) = (server.served.server.clone(), server.max_environments);
             let error = Error::TooFewEnvironments { server, max, needed: n };
             return Err(Failure::Final(Box::new(error)));
         }
-        let exchanged = within(self.config.reply_timeout, async {
+        let exchanged = within(reply_timeout, async {
             let mut stream = match stream {
                 Some(stream) => {
                     stream.requests.send(request).await.map_err(|_unsent| closed())?;
@@ -179,11 +210,16 @@ impl Environments {
         Ok(response)
     }
 
-    /// Connects to the server and checks its task, unless it is connected.
-    async fn connect(&mut self, task: &TaskSpec) -> Result<(), Failure> {
-        if self.server.is_some() {
-            return Ok(());
-        }
+    /// Connects to the server, unless it is connected.
+    async fn connect(&mut self) -> Result<&mut Server, Failure> {
+        let server = match self.server.take() {
+            Some(server) => server,
+            None => self.open_server().await?,
+        };
+        Ok(self.server.insert(server))
+    }
+
+    async fn open_server(&mut self) -> Result<Server, Failure> {
         let address = match self.n_failures {
             0 => self.config.server.address(),
             _ => self.config.server.address_after_failure(),
@@ -212,14 +248,10 @@ impl Environments {
         })?;
         let program: String = description.server.chars().take(MAX_NAME_CHARS).collect();
         self.name = format!("{address} ({program})");
-        if let Some(difference) = task.difference(&description.task) {
-            let server = self.name.clone();
-            return Err(Failure::Final(Box::new(Error::OtherTask { server, difference })));
-        }
         tracing::info!(server = self.name, "environment server connected");
         self.was_connected = true;
-        self.server = Some(Server { client, max_environments: description.max_environments });
-        Ok(())
+        let served = ServedTask { server: self.name.clone(), task: description.task };
+        Ok(Server { client, served, max_environments: description.max_environments })
     }
 
     fn failure(&self, status: Status) -> Failure {
@@ -227,7 +259,7 @@ impl Environments {
             Retryability::Transient => Failure::Transient(status),
             Retryability::NotFound | Retryability::Final => {
                 let server = self.name.clone();
-                Failure::Final(Box::new(Error::EnvironmentRefused { server, source: status }))
+                Failure::Final(Box::new(Error::EnvironmentRefused { server, status }))
             }
         }
     }

@@ -76,12 +76,12 @@ pub enum Error {
         needed: usize,
     },
     /// The environment server refused a request.
-    #[error("the environment server {server} refused a request")]
+    #[error("the environment server {server} refused a request: {}", status.message())]
     EnvironmentRefused {
         /// Address and program of the server.
         server: String,
         /// The cause.
-        source: Status,
+        status: Status,
     },
     /// The environment server answered with values that no environment of the task has.
     #[error("the environment server {server} sent an invalid reply to {reply}")]
@@ -97,14 +97,17 @@ pub enum Error {
     #[error("the worker has no environment server")]
     NoServer,
     /// The environment server keeps failing.
-    #[error("gave up the environment server {server} after {n_failures} failures in a row")]
+    #[error(
+        "gave up the environment server {server} after {n_failures} failures in a row: {}",
+        status.message()
+    )]
     EnvironmentFailed {
         /// Address and program of the server.
         server: String,
         /// The number of failures.
         n_failures: u32,
         /// The latest cause.
-        source: Status,
+        status: Status,
     },
     /// The run's simulator cannot be built.
     #[error("the run's world cannot be built")]

@@ -26,7 +26,7 @@ mod teacher;
 pub use config::{
     EnvironmentConfig, EnvironmentServer, ServerAddress, ServerNotStarted, Timeouts, WorkerConfig,
 };
-pub use environment::check_environments;
+pub use environment::{ServedTask, describe_environments};
 pub use error::Error;
 pub use evaluate::{ComposedTeachers, evaluate};
 pub use ports::{Act, Advisor};

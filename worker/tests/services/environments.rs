@@ -8,7 +8,7 @@ use tandem_core::task::TaskDescription;
 use tandem_core::text::error_chain;
 use tandem_core::{Episode, TaskSpec};
 use tandem_proto::pb;
-use tandem_worker::{EnvironmentConfig, Error, WorkerConfig, run_with};
+use tandem_worker::{EnvironmentConfig, Error, WorkerConfig, describe_environments, run_with};
 use tokio_util::sync::CancellationToken;
 use tonic::Status;
 
@@ -145,6 +145,17 @@ async fn another_task_is_refused_and_its_field_named() {
 }
 
 #[tokio::test]
+async fn a_server_is_asked_for_its_task() {
+    let other = TaskDescription { name: "lab/push".to_owned(), ..LAYOUT.description() };
+    let task = TaskSpec::new(other).expect("valid");
+    let environments = Arc::new(FakeEnvironments::default().serving(task.clone()));
+    let server = Server::environments(&environments);
+    let served = describe_environments(played_on(&server)).await.expect("answered");
+    let expected = format!("http://{} (fake 1.0)", server.address());
+    assert_eq!((served.server, served.task), (expected, task));
+}
+
+#[tokio::test]
 async fn a_server_with_too_few_environments_is_refused() {
     let line = line_of_end(FakeEnvironments::default().with_room_for(1)).await;
     let expected = "serves 1 environments per stream, a slot has 2 episodes: lower rounds.rollouts";
@@ -177,5 +188,5 @@ async fn a_service_of_another_kind_is_named() {
     let config = WorkerConfig { environment, ..config(&learner_server, Some(&teacher)) };
     let ended = run_with(config, TIMEOUTS, CancellationToken::new()).await;
     let line = error_chain(&ended.expect_err("a learner has no environments"));
-    assert!(line.contains("tandem.v1.Learner") && line.contains("refused"), "{line}");
+    assert!(line.ends_with("is a learner, not an environment: check the address"), "{line}");
 }
