@@ -22,7 +22,7 @@ pub(crate) use results::{
     EvalArgs, McapArgs, McapCommand, PictureArgs, PolicyArgs, PolicyCommand, ReplayArgs, ReportArgs,
 };
 pub(crate) use service::{
-    ClientArgs, LearnerArgs, ListenArgs, RelayArgs, SecretArgs, TeacherArgs, WorkerArgs,
+    ClientArgs, EnvArgs, LearnerArgs, ListenArgs, RelayArgs, SecretArgs, TeacherArgs, WorkerArgs,
 };
 pub(crate) use train::{RecipeName, SweepArgs, TrainArgs};
 pub(crate) use trial::{ModeName, RecordName, TrialArgs};
@@ -68,6 +68,8 @@ pub(crate) enum Command {
     Learner(LearnerArgs),
     /// Plays episodes for a learner.
     Worker(WorkerArgs),
+    /// Serves the built-in environments to workers and other programs.
+    Env(EnvArgs),
     /// Distributes a learner's parameters to nearby workers, for runs with very many workers.
     Relay(RelayArgs),
     /// Serves a pair of arms, real or simulated, and operates it.

@@ -66,6 +66,7 @@ fn dispatch(command: Command) -> Result<(), Failed> {
         Command::Report(args) => report::report(&args),
         Command::Teacher(args) => service::teacher(args),
         Command::Learner(args) => service::learner(args),
+        Command::Env(args) => service::environment(args),
         Command::Worker(args) => service::worker(args),
         Command::Relay(args) => service::relay(args),
         Command::Bridge(args) => bridge::bridge(args),

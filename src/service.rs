@@ -1,5 +1,6 @@
 //! The services as subcommands: each binds its address, prints it and serves until it is asked to exit.
 
+mod environment;
 mod learner;
 mod listen;
 mod relay;
@@ -11,6 +12,7 @@ use tandem_system::fd_limit;
 use crate::exit::{Exit, Failed, OrExit as _};
 use crate::runtime;
 
+pub(crate) use environment::environment;
 pub(crate) use learner::learner;
 pub(crate) use listen::listen;
 pub(crate) use relay::relay;

@@ -17,7 +17,7 @@ use tandem_sim::{Env, WorldConfig};
 use tandem_telemetry::{
     EpisodeLog, EpisodeMetadata, EpisodeRecorder, TransitionRecord, read_episode, recover,
 };
-use tandem_worker::ports::AdvisorGone;
+use tandem_worker::ports::{AdvisorGone, Simulator};
 use tandem_worker::record::{log_name, metadata_of, record_episode, replay_log, world_of};
 use tandem_worker::rollout::play_slot;
 use tandem_worker::{Advisor, ComposedTeachers};
@@ -118,8 +118,8 @@ fn record(layout: Layout, kind: Kind, substeps: u32, directory: &Path) -> Vec<Pa
     let world = Env::new(layout, &WorldConfig { substeps, ..WorldConfig::default() });
     let mut actor = ComposedTeachers(teacher(layout.task));
     let mut advisor = EagerTeacher(teacher(layout.task), layout);
-    let world = world.expect("in range");
-    let episodes = play_slot(&world, &slot, &terms, &mut actor, &mut advisor).expect("plays");
+    let mut world = Simulator::new(world.expect("in range"));
+    let episodes = play_slot(&mut world, &slot, &terms, &mut actor, &mut advisor).expect("plays");
     let write = |(order, episode)| {
         let path = directory.join(log_name(episode));
         record_episode(&metadata_of(order, episode, &terms, String::new()), episode, &path)

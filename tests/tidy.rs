@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 use std::path::{Path, PathBuf};
 
-const ALLOWED: [(&str, &[&str]); 15] = [
+const ALLOWED: [(&str, &[&str]); 16] = [
     ("core", &[]),
     ("system", &[]),
     ("kinematics", &["core"]),
@@ -17,6 +17,7 @@ const ALLOWED: [(&str, &[&str]); 15] = [
     ("learner", &["core", "system", "policy", "rl", "proto", "telemetry", "net"]),
     ("teacher", &["core", "policy", "proto", "telemetry", "net"]),
     ("worker", &["core", "sim", "policy", "proto", "telemetry", "net"]),
+    ("environment", &["core", "sim", "proto", "net"]),
     ("report", &["core", "system", "telemetry"]),
     ("bridge", &["core", "kinematics", "proto", "net"]),
     ("trials", &["core", "kinematics", "sim", "policy", "telemetry", "bridge"]),

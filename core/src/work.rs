@@ -1,16 +1,16 @@
 //! Work that a learner assigns to its workers.
 
 use crate::episode::EpisodeKind;
-use crate::layout::Layout;
 use crate::settings::{Exploration, WorldSettings};
+use crate::task::TaskSpec;
 
 /// Settings that apply to every episode of a run.
 #[derive(Debug, Clone, PartialEq)]
 pub struct RunTerms {
     /// The run's name; empty outside a run.
     pub run: String,
-    /// Task and arms.
-    pub layout: Layout,
+    /// The task.
+    pub layout: TaskSpec,
     /// The account at the teacher; `None` if the run takes no advice.
     pub account: Option<String>,
     /// Exploration in training episodes.
@@ -32,6 +32,19 @@ pub struct EpisodeOrder {
     pub uniform: bool,
     /// Whether to record the episode in a log.
     pub record: bool,
+}
+
+/// The start of an episode in an environment. Together with the actions it determines the episode.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct EpisodeStart {
+    /// Number within the run (training) or within the goal set (evaluation).
+    pub number: u64,
+    /// Seed of its random draws, together with the number.
+    pub seed: u64,
+    /// The purpose of the episode.
+    pub kind: EpisodeKind,
+    /// Initial states and physics of this episode.
+    pub world: WorldSettings,
 }
 
 /// A slot to play: episodes that one worker steps in lock step.

@@ -29,6 +29,7 @@
 
 pub mod advice;
 mod codec;
+pub mod environment;
 mod error;
 mod numbers;
 pub mod task;

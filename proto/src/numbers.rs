@@ -22,7 +22,7 @@ pub(crate) fn finite_from_bytes(
     bytes: &[u8],
     n: usize,
 ) -> Result<Vec<f32>, DecodeError> {
-    finite(field, from_bytes(field, bytes, n)?, n)
+    finite(field, floats_from_bytes(field, bytes, n)?, n)
 }
 
 /// Decodes `n` finite numbers. `largest` returns the bound on the magnitude of the number at an index.
@@ -32,7 +32,7 @@ pub(crate) fn bounded_from_bytes(
     n: usize,
     largest: impl Fn(usize) -> f32,
 ) -> Result<Vec<f32>, DecodeError> {
-    bounded(field, from_bytes(field, bytes, n)?, n, largest)
+    bounded(field, floats_from_bytes(field, bytes, n)?, n, largest)
 }
 
 /// Decodes `n` components of actions.
@@ -41,10 +41,15 @@ pub(crate) fn actions_from_bytes(
     bytes: &[u8],
     n: usize,
 ) -> Result<Vec<f32>, DecodeError> {
-    actions(field, from_bytes(field, bytes, n)?, n)
+    actions(field, floats_from_bytes(field, bytes, n)?, n)
 }
 
-fn from_bytes(field: &str, bytes: &[u8], n: usize) -> Result<Vec<f32>, DecodeError> {
+/// Decodes `n` numbers, which may be of any value.
+pub(crate) fn floats_from_bytes(
+    field: &str,
+    bytes: &[u8],
+    n: usize,
+) -> Result<Vec<f32>, DecodeError> {
     let (words, rest) = bytes.as_chunks::<4>();
     if !rest.is_empty() {
         let expected = format_args!("{} bytes, 4 per number", 4 * n).to_string();

@@ -10,18 +10,19 @@ use crate::error::DecodeError;
 use crate::numbers::{count_within, finite_from_bytes, one_within, positive, to_bytes};
 use crate::pb;
 
+pub(crate) use episode::decode_contact;
 pub use episode::{decode_episode, encode_episode};
 
 /// Largest number of characters of an unknown name in an error message, which is sent in a header.
 const MAX_SHOWN_CHARS: usize = 40;
 /// Largest number of episodes per slot.
-const MAX_SLOT_EPISODES: usize = 1024;
+pub(crate) const MAX_SLOT_EPISODES: usize = 1024;
 /// Largest number of units per hidden layer.
 const MAX_HIDDEN: u32 = 16_384;
 /// Largest number of hidden layers.
 const MAX_HIDDEN_LAYERS: u32 = 64;
 /// Largest number of physics steps per control step.
-const MAX_SUBSTEPS: u32 = 10_000;
+pub(crate) const MAX_SUBSTEPS: u32 = 10_000;
 
 const fn encode_episode_kind(kind: EpisodeKind) -> pb::EpisodeKind {
     match kind {

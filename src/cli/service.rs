@@ -1,10 +1,12 @@
-//! The command line of `tandem teacher`, `tandem learner`, `tandem worker` and `tandem relay`.
+//! The command line of the services.
 
 use std::ffi::OsString;
 use std::net::SocketAddr;
 use std::path::PathBuf;
 
 use clap::Args;
+
+use super::TaskName;
 
 /// Access token.
 #[derive(Debug, Args)]
@@ -161,6 +163,34 @@ pub(crate) struct RelayArgs {
     pub(crate) listen: ListenArgs,
     #[command(flatten)]
     pub(crate) client_config: ClientArgs,
+    #[command(flatten)]
+    pub(crate) secret: SecretArgs,
+}
+
+#[derive(Debug, Args)]
+#[command(
+    mut_arg("listen", |listen| listen.env("TANDEM_ENV_LISTEN")),
+    after_help = "\
+Examples:
+  tandem env                                             two arms, push, on a free port
+  tandem env --task pick-and-place --arms 1 --listen 127.0.0.1:7005
+  tandem train --env 127.0.0.1:7005 --task pick-and-place --arms 1
+  tandem train --env-command 'tandem env'                one server per worker
+
+docs/environments.md describes the protocol, and how to write a server in another language."
+)]
+pub(crate) struct EnvArgs {
+    /// Task.
+    #[arg(long, value_enum, default_value_t = TaskName::Push)]
+    pub(crate) task: TaskName,
+    /// Number of arms.
+    #[arg(long, default_value_t = 2, value_parser = clap::value_parser!(u8).range(1..=2))]
+    pub(crate) arms: u8,
+    /// Largest number of environments of all streams together. A stream has 1024 at most.
+    #[arg(long, value_name = "N", default_value_t = 4096, value_parser = clap::value_parser!(u16).range(1..))]
+    pub(crate) max_environments: u16,
+    #[command(flatten)]
+    pub(crate) listen: ListenArgs,
     #[command(flatten)]
     pub(crate) secret: SecretArgs,
 }

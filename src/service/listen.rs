@@ -11,6 +11,15 @@ use crate::output;
 /// Binds the address and prints it as one line of standard output. If that line cannot be written, the service runs all
 /// the same. The service keeps as many connections as the limit of open files allows.
 pub(crate) async fn listen(args: &ListenArgs) -> Result<Incoming, Failed> {
+    listen_as("", args).await
+}
+
+/// Binds the address as [`listen`] and prints it as a URI, which is the contract for environment servers.
+pub(super) async fn listen_with_scheme(args: &ListenArgs) -> Result<Incoming, Failed> {
+    listen_as(if args.tls_cert.is_some() { "https://" } else { "http://" }, args).await
+}
+
+async fn listen_as(scheme: &str, args: &ListenArgs) -> Result<Incoming, Failed> {
     let capacity = Capacity::for_open_files(fd_limit::raise());
     let bind = async {
         let listener = TcpListener::bind(args.listen).await?;
@@ -19,7 +28,7 @@ pub(crate) async fn listen(args: &ListenArgs) -> Result<Incoming, Failed> {
     };
     let (listener, address) =
         bind.await.or_exit(Exit::TryAgain, || format!("cannot listen on {}", args.listen))?;
-    if let Err(failed) = output::print(format_args!("listening on {address}")) {
+    if let Err(failed) = output::print(format_args!("listening on {scheme}{address}")) {
         let error = failed.into_error();
         tracing::warn!(%address, "cannot print the address: {error:#}");
     }

@@ -239,6 +239,7 @@ impl PersistentState {
         self.statistics
             .update(|statistics| Statistics { n_workers: statistics.n_workers + 1, ..statistics });
         let config = WorkerConfig {
+            environment: None,
             client: client_config(),
             learner: address(LEARNER),
             teacher: Some(address(TEACHER)),

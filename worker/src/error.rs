@@ -48,6 +48,60 @@ pub enum Error {
         /// The slot's number.
         slot: u64,
     },
+    /// The server of the environments could not be started.
+    #[error(transparent)]
+    NoEnvironment(#[from] crate::config::ServerNotStarted),
+    /// The server serves another task than the run's.
+    #[error("the environment server {server} serves another task than the run's: {difference}")]
+    OtherTask {
+        /// Address and program of the server.
+        server: String,
+        /// The first field that differs.
+        difference: String,
+    },
+    /// The server serves fewer environments than a slot has episodes.
+    #[error(
+        "the environment server {server} serves {max} environments per stream, a slot has {needed} episodes: lower rounds.rollouts"
+    )]
+    TooFewEnvironments {
+        /// Address and program of the server.
+        server: String,
+        /// The server's limit.
+        max: u32,
+        /// The number of episodes of the slot.
+        needed: usize,
+    },
+    /// The environment server refused a request.
+    #[error("the environment server {server} refused a request")]
+    EnvironmentRefused {
+        /// Address and program of the server.
+        server: String,
+        /// The cause.
+        source: Status,
+    },
+    /// The environment server answered with values that no environment of the task has.
+    #[error("the environment server {server} sent an invalid reply to {reply}")]
+    InvalidReply {
+        /// Address and program of the server.
+        server: String,
+        /// The request: the episodes by environment, and the step.
+        reply: String,
+        /// The field and its value.
+        source: DecodeError,
+    },
+    /// A bug: a slot was to be played on a server, but the worker has none.
+    #[error("the worker has no environment server")]
+    NoServer,
+    /// The environment server keeps failing.
+    #[error("gave up the environment server {server} after {n_failures} failures in a row")]
+    EnvironmentFailed {
+        /// Address and program of the server.
+        server: String,
+        /// The number of failures.
+        n_failures: u32,
+        /// The latest cause.
+        source: Status,
+    },
     /// The run's simulator cannot be built.
     #[error("the run's world cannot be built")]
     World(#[from] SimError),

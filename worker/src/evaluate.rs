@@ -7,7 +7,7 @@ use tandem_core::work::{EpisodeOrder, RunTerms, SlotOrder};
 use tandem_core::{Episode, EpisodeKind, Exploration, WorldSettings};
 use tandem_sim::{Env, WorldConfig};
 
-use crate::ports::{Act, Environment, NoAdvisor};
+use crate::ports::{Act, Environment, NoAdvisor, Simulator};
 use crate::rollout::{RolloutError, play_slot};
 
 /// The composed teachers `f^a(π_tr(ŝ_1), π_tr(ŝ_2))`: a policy for one arm that acts for every arm of a layout.
@@ -38,10 +38,10 @@ pub fn evaluate<A: Act>(
     n_threads: NonZeroUsize,
 ) -> Result<Vec<Episode>, RolloutError> {
     let env = Env::new(layout, world).map_err(RolloutError::NoEnvironment)?;
-    evaluate_in(&env, make_actor, layout, n_episodes, seed, n_threads)
+    evaluate_in(&Simulator::new(env), make_actor, layout, n_episodes, seed, n_threads)
 }
 
-fn evaluate_in<E: Environment + Sync, A: Act>(
+fn evaluate_in<E: Environment + Clone + Sync, A: Act>(
     env: &E,
     make_actor: impl Fn() -> A + Sync,
     layout: Layout,
@@ -52,8 +52,8 @@ fn evaluate_in<E: Environment + Sync, A: Act>(
     let numbers: Vec<u64> = (0..n_episodes).collect();
     let n_per_thread = numbers.len().div_ceil(n_threads.get()).max(1);
     let play = |numbers: &[u64]| {
-        let mut actor = make_actor();
-        let play_one = |number: &u64| play_alone(env, &mut actor, layout, seed, *number);
+        let (mut env, mut actor) = (env.clone(), make_actor());
+        let play_one = |number: &u64| play_alone(&mut env, &mut actor, layout, seed, *number);
         numbers.iter().map(play_one).collect::<Result<Vec<Episode>, RolloutError>>()
     };
     let parts: Vec<_> = std::thread::scope(|scope| {
@@ -67,8 +67,8 @@ fn evaluate_in<E: Environment + Sync, A: Act>(
     parts.into_iter().collect::<Result<Vec<_>, _>>().map(|parts| parts.concat())
 }
 
-fn play_alone<E: Environment>(
-    env: &E,
+fn play_alone(
+    env: &mut impl Environment,
     actor: &mut impl Act,
     layout: Layout,
     seed: u64,

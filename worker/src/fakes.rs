@@ -2,54 +2,76 @@
 
 use tandem_core::layout::{Layout, OBSERVATION_PER_ARM, Task};
 use tandem_core::rng::{Stream, episode_rng, uniform};
-use tandem_core::work::{EpisodeOrder, RunTerms, SlotOrder};
+use tandem_core::work::{EpisodeOrder, EpisodeStart, RunTerms, SlotOrder};
 use tandem_core::{
     ArmAdvice, Contacts, EpisodeKind, Exploration, StepAdvice, StepQuery, WorldSettings,
 };
-use tandem_sim::SimError;
 
-use crate::ports::{Act, Advisor, AdvisorGone, Environment};
+use crate::ports::{Act, Advisor, AdvisorGone, Environment, EnvironmentError};
 
 pub(crate) const LAYOUT: Layout = Layout::new(Task::Push, 2);
 
 /// Hands that move by the action. Hands at the same place touch.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Default)]
 pub(crate) struct FakeEnvironment {
+    /// Shape `[n, n_action]`.
     positions: Vec<f32>,
-    goal: Vec<f32>,
+    /// Added to the first number of every observation after the first reset: an environment with a memory.
+    pub(crate) drift: f32,
+    n_resets: usize,
 }
 
 impl FakeEnvironment {
     pub(crate) fn new() -> Self {
-        Self { positions: vec![9.0; LAYOUT.n_action()], goal: vec![9.0; LAYOUT.n_goal()] }
+        Self::default()
+    }
+
+    fn observe(&self, observations: &mut [f32]) {
+        observations.fill(0.0);
+        let parts = observations.chunks_mut(OBSERVATION_PER_ARM);
+        for (part, position) in parts.zip(self.positions.chunks(3)) {
+            part[..3].copy_from_slice(position);
+            part[0] += if self.n_resets > 1 { self.drift } else { 0.0 };
+        }
     }
 }
 
 impl Environment for FakeEnvironment {
-    fn reset(&mut self, order: EpisodeOrder, settings: WorldSettings) {
-        let mut rng = episode_rng(order.seed, order.number, Stream::Reset);
-        let width = 0.5 + settings.grasped_start_prob;
-        self.positions.fill_with(|| uniform(&mut rng, -width, width));
-        self.goal.fill_with(|| uniform(&mut rng, -0.5, 0.5));
-    }
-
-    fn observe(&self, observation: &mut [f32]) {
-        for (arm, part) in observation.chunks_mut(OBSERVATION_PER_ARM).enumerate() {
-            part.fill(0.0);
-            part[..3].copy_from_slice(&self.positions[3 * arm..3 * arm + 3]);
+    fn reset(
+        &mut self,
+        starts: &[EpisodeStart],
+        observations: &mut [f32],
+        goals: &mut [f32],
+    ) -> Result<(), EnvironmentError> {
+        self.n_resets += 1;
+        self.positions.clear();
+        for (start, goal) in starts.iter().zip(goals.chunks_mut(LAYOUT.n_goal())) {
+            let mut rng = episode_rng(start.seed, start.number, Stream::Reset);
+            let width = 0.5 + start.world.grasped_start_prob;
+            let mut draw = |width| uniform(&mut rng, -width, width);
+            self.positions.extend((0..LAYOUT.n_action()).map(|_| draw(width)));
+            goal.fill_with(|| draw(0.5));
         }
+        self.observe(observations);
+        Ok(())
     }
 
-    fn goal(&self) -> &[f32] {
-        &self.goal
-    }
-
-    fn step(&mut self, action: &[f32]) -> Result<Contacts, SimError> {
-        for (position, input) in self.positions.iter_mut().zip(action) {
+    fn step(
+        &mut self,
+        actions: &[f32],
+        observations: &mut [f32],
+        contacts: &mut [Contacts],
+    ) -> Result<(), EnvironmentError> {
+        for (position, input) in self.positions.iter_mut().zip(actions) {
             *position += 0.05 * input;
         }
-        let meet = (self.positions[0] - self.positions[3]).abs() < 0.05;
-        Ok(if meet { Contacts::ARM_ARM } else { Contacts::NONE })
+        let hands = self.positions.chunks(LAYOUT.n_action());
+        for (hands, contacts) in hands.zip(contacts) {
+            let meet = (hands[0] - hands[3]).abs() < 0.05;
+            *contacts = if meet { Contacts::ARM_ARM } else { Contacts::NONE };
+        }
+        self.observe(observations);
+        Ok(())
     }
 }
 

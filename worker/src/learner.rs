@@ -2,8 +2,8 @@
 
 use std::time::Duration;
 
+use tandem_core::Layout;
 use tandem_core::work::{PublishedActor, RunTerms, SlotOrder};
-use tandem_core::{Episode, Layout};
 use tandem_net::{AuthChannel, MAX_MESSAGE_BYTES, Operation, retry};
 use tandem_proto::pb::learner_client::LearnerClient;
 use tandem_proto::{DecodeError, pb};
@@ -11,6 +11,7 @@ use tonic::{Code, Response, Status};
 
 use crate::config::{Timeouts, WorkerConfig};
 use crate::error::{CallError, Error, expect_same};
+use crate::player::PlayedSlot;
 
 const JOIN: Operation = Operation { peer: "learner", purpose: "join the run" };
 const NEXT_WORK: Operation = Operation { peer: "learner", purpose: "ask for work" };
@@ -98,10 +99,14 @@ impl Learner {
         &self,
         worker_id: u64,
         slot: u64,
-        episodes: &[Episode],
+        played: &PlayedSlot,
     ) -> Result<Option<()>, Error> {
-        let episodes = episodes.iter().map(tandem_proto::encode_episode).collect();
-        let request = pb::SubmitEpisodesRequest { worker_id, slot, episodes };
+        let episodes = played.episodes.iter().map(tandem_proto::encode_episode).collect();
+        let environment_check = played.check.map(|check| pb::EnvironmentCheck {
+            n_episodes: check.n_episodes,
+            difference: check.difference.map_or_else(String::new, |it| it.to_string()),
+        });
+        let request = pb::SubmitEpisodesRequest { worker_id, slot, episodes, environment_check };
         let call =
             |mut client: Client, request| async move { client.submit_episodes(request).await };
         let response = self.call(SUBMIT, self.timeouts.call, request, call).await;

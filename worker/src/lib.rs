@@ -8,6 +8,8 @@
 #![warn(missing_docs)]
 
 mod config;
+pub mod determinism;
+mod environment;
 mod error;
 mod evaluate;
 pub mod explore;
@@ -21,7 +23,7 @@ pub mod rollout;
 mod run;
 mod teacher;
 
-pub use config::{Timeouts, WorkerConfig};
+pub use config::{EnvironmentConfig, EnvironmentServer, ServerNotStarted, Timeouts, WorkerConfig};
 pub use error::Error;
 pub use evaluate::{ComposedTeachers, evaluate};
 pub use ports::{Act, Advisor};

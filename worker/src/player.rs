@@ -2,31 +2,49 @@
 
 use std::path::{Path, PathBuf};
 
-use tandem_core::work::{EpisodeOrder, PublishedActor, RunTerms, SlotOrder};
+use tandem_core::work::{EpisodeOrder, EpisodeStart, PublishedActor, RunTerms, SlotOrder};
 use tandem_core::{Contacts, Episode, StepAdvice, StepQuery};
 use tandem_policy::{Actor, actor_digest};
+use tandem_proto::environment::{ResetReply, StepReply};
 use tandem_sim::{Env, SimError, WorldConfig};
 use tandem_telemetry::events::{EpisodeFinished, EpisodeRecorded};
 use tokio::sync::{mpsc, oneshot};
 
-use crate::ports::{Advisor, AdvisorGone};
+use crate::determinism::{self, DeterminismCheck};
+use crate::ports::{Advisor, AdvisorGone, Environment, EnvironmentError, Simulator};
 use crate::record::{log_name, metadata_of, record_episode};
 use crate::rollout::{RolloutError, play_slot};
 
 /// Plays slots, on a thread of its own.
 pub(crate) struct Player {
     terms: RunTerms,
-    world: Env,
+    /// The environments in this process; `None` if a server has them.
+    simulator: Option<Simulator>,
     actor: Option<Actor>,
     /// The digest of the actor's parameters; empty without a directory for logs.
     actor_digest: String,
     log_dir: Option<PathBuf>,
 }
 
+/// A slot that was played.
+#[derive(Debug)]
+pub(crate) struct PlayedSlot {
+    pub(crate) episodes: Vec<Episode>,
+    /// The result of playing the slot twice, if it was.
+    pub(crate) check: Option<DeterminismCheck>,
+}
+
 impl Player {
-    pub(crate) fn new(terms: RunTerms, log_dir: Option<PathBuf>) -> Result<Self, SimError> {
+    /// Creates a player that simulates its environments.
+    pub(crate) fn simulating(terms: RunTerms, log_dir: Option<PathBuf>) -> Result<Self, SimError> {
         let world = Env::new(terms.layout, &WorldConfig::from(terms.world))?;
-        Ok(Self { terms, world, actor: None, actor_digest: String::new(), log_dir })
+        let simulator = Some(Simulator::new(world));
+        Ok(Self { simulator, ..Self::remote(terms, log_dir) })
+    }
+
+    /// Creates a player whose environments are on a server.
+    pub(crate) const fn remote(terms: RunTerms, log_dir: Option<PathBuf>) -> Self {
+        Self { terms, simulator: None, actor: None, actor_digest: String::new(), log_dir }
     }
 
     pub(crate) const fn terms(&self) -> &RunTerms {
@@ -55,17 +73,27 @@ impl Player {
     pub(crate) fn play(
         &mut self,
         order: &SlotOrder,
-        mut advisor: AdviceChannel,
-    ) -> Result<Vec<Episode>, RolloutError> {
+        mut peers: PeerChannel,
+    ) -> Result<PlayedSlot, RolloutError> {
         let actor = self.actor.as_mut().expect("parameters are loaded before a slot is played");
-        let episodes = play_slot(&self.world, order, &self.terms, actor, &mut advisor)?;
+        let (terms, advisor) = (&self.terms, &mut peers.clone());
+        let (episodes, check) = match &mut self.simulator {
+            Some(simulator) => (play_slot(simulator, order, terms, actor, advisor)?, None),
+            None => {
+                let episodes = play_slot(&mut peers, order, terms, actor, advisor)?;
+                let is_checked = determinism::is_checked(order);
+                let check =
+                    is_checked.then(|| determinism::check(&mut peers, order, terms, &episodes));
+                (episodes, check.transpose()?)
+            }
+        };
         for (ordered, episode) in order.episodes.iter().zip(&episodes) {
             finished_event(episode).emit();
             if let Some(log_dir) = self.log_dir.as_deref().filter(|_| ordered.record) {
                 self.record(*ordered, episode, log_dir);
             }
         }
-        Ok(episodes)
+        Ok(PlayedSlot { episodes, check })
     }
 
     /// Writes an episode's log. Failures are only logged: the episode itself is delivered.
@@ -97,30 +125,67 @@ fn finished_event(episode: &Episode) -> EpisodeFinished {
     }
 }
 
-/// A request for advice on its way from the rollout's thread to the runtime.
+/// A request on its way from the rollout's thread to the runtime.
 #[derive(Debug)]
-pub(crate) struct PendingAdvice {
-    pub(crate) queries: Vec<StepQuery>,
-    pub(crate) response: oneshot::Sender<Vec<StepAdvice>>,
+pub(crate) enum PeerRequest {
+    /// A request for advice.
+    Advice(Vec<StepQuery>, oneshot::Sender<Vec<StepAdvice>>),
+    /// The start of episodes on the server of the environments.
+    Reset(Vec<EpisodeStart>, oneshot::Sender<ResetReply>),
+    /// A step of its environments, actions of shape `[n, n_action]`.
+    Step(Vec<f32>, oneshot::Sender<StepReply>),
 }
 
-/// The rollout's end of the channel to the teacher.
+/// The rollout's end of the channel to the teacher and to the server of the environments.
 ///
 /// One request is pending at a time, so a capacity of one suffices and sending never waits.
-#[derive(Debug)]
-pub(crate) struct AdviceChannel(mpsc::Sender<PendingAdvice>);
+#[derive(Debug, Clone)]
+pub(crate) struct PeerChannel(mpsc::Sender<PeerRequest>);
 
-impl AdviceChannel {
-    pub(crate) fn new() -> (Self, mpsc::Receiver<PendingAdvice>) {
+impl PeerChannel {
+    pub(crate) fn new() -> (Self, mpsc::Receiver<PeerRequest>) {
         let (sender, receiver) = mpsc::channel(1);
         (Self(sender), receiver)
     }
+
+    /// Sends a request and waits for the response; `None` if the worker is stopping or the peer has failed.
+    fn exchange<T>(&self, request: impl FnOnce(oneshot::Sender<T>) -> PeerRequest) -> Option<T> {
+        let (sender, response) = oneshot::channel();
+        self.0.blocking_send(request(sender)).ok()?;
+        response.blocking_recv().ok()
+    }
 }
 
-impl Advisor for AdviceChannel {
+impl Advisor for PeerChannel {
     fn advise(&mut self, queries: Vec<StepQuery>) -> Result<Vec<StepAdvice>, AdvisorGone> {
-        let (response, advice) = oneshot::channel();
-        self.0.blocking_send(PendingAdvice { queries, response }).map_err(|_unsent| AdvisorGone)?;
-        advice.blocking_recv().map_err(|_closed| AdvisorGone)
+        self.exchange(|response| PeerRequest::Advice(queries, response)).ok_or(AdvisorGone)
+    }
+}
+
+impl Environment for PeerChannel {
+    fn reset(
+        &mut self,
+        starts: &[EpisodeStart],
+        observations: &mut [f32],
+        goals: &mut [f32],
+    ) -> Result<(), EnvironmentError> {
+        let reply = self.exchange(|response| PeerRequest::Reset(starts.to_vec(), response));
+        let reply = reply.ok_or(EnvironmentError::Gone)?;
+        observations.copy_from_slice(&reply.observations);
+        goals.copy_from_slice(&reply.goals);
+        Ok(())
+    }
+
+    fn step(
+        &mut self,
+        actions: &[f32],
+        observations: &mut [f32],
+        contacts: &mut [Contacts],
+    ) -> Result<(), EnvironmentError> {
+        let reply = self.exchange(|response| PeerRequest::Step(actions.to_vec(), response));
+        let reply = reply.ok_or(EnvironmentError::Gone)?;
+        observations.copy_from_slice(&reply.observations);
+        contacts.copy_from_slice(&reply.contacts);
+        Ok(())
     }
 }

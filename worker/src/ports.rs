@@ -1,8 +1,8 @@
 //! The interfaces that a rollout uses, so that it cannot distinguish a network from a test.
 
 use tandem_core::rng::{Stream, episode_rng};
-use tandem_core::work::EpisodeOrder;
-use tandem_core::{Contacts, StepAdvice, StepQuery, WorldSettings};
+use tandem_core::work::EpisodeStart;
+use tandem_core::{Contacts, StepAdvice, StepQuery};
 use tandem_policy::Actor;
 use tandem_sim::{Env, SimError};
 
@@ -41,39 +41,102 @@ impl Advisor for NoAdvisor {
     }
 }
 
-/// An environment in which episodes are played. A clone behaves identically.
-pub trait Environment: Clone {
-    /// Resets the environment to the start of an episode, independent of the episodes before it.
-    fn reset(&mut self, order: EpisodeOrder, settings: WorldSettings);
-
-    /// Writes the observation, shape `[n_observation]`.
-    fn observe(&self, observation: &mut [f32]);
-
-    /// Returns the goal, shape `[n_goal]`: a target position for each object, in metres.
-    fn goal(&self) -> &[f32];
-
-    /// Executes an action, shape `[n_action]`, and returns the contacts during this step.
+/// Environments in which the episodes of a slot are played in lock step, one episode in each; n is their number.
+pub trait Environment {
+    /// Starts the episodes of `starts`, each independent of all others, and writes the first observations, shape
+    /// `[n, n_observation]`, and the goals, shape `[n, n_goal]`.
     ///
     /// # Errors
-    /// When the state is no longer finite.
-    fn step(&mut self, action: &[f32]) -> Result<Contacts, SimError>;
+    /// When the environments can no longer be used.
+    fn reset(
+        &mut self,
+        starts: &[EpisodeStart],
+        observations: &mut [f32],
+        goals: &mut [f32],
+    ) -> Result<(), EnvironmentError>;
+
+    /// Executes `actions`, shape `[n, n_action]`, and writes the next observations, shape `[n, n_observation]`, and the
+    /// contacts during this step, shape `[n]`.
+    ///
+    /// # Errors
+    /// When the state of an environment is no longer finite, or the environments can no longer be used.
+    fn step(
+        &mut self,
+        actions: &[f32],
+        observations: &mut [f32],
+        contacts: &mut [Contacts],
+    ) -> Result<(), EnvironmentError>;
 }
 
-impl Environment for Env {
-    fn reset(&mut self, order: EpisodeOrder, settings: WorldSettings) {
-        self.reset(&mut episode_rng(order.seed, order.number, Stream::Reset), settings);
+/// An error of environments.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum EnvironmentError {
+    /// A step failed.
+    #[error("environment {environment} failed")]
+    Step {
+        /// The index of the environment.
+        environment: usize,
+        /// The cause.
+        source: SimError,
+    },
+    /// The server of the environments has failed, or the worker is stopping.
+    #[error("the environments can no longer be used")]
+    Gone,
+}
+
+/// Simulated environments in this process.
+#[derive(Clone)]
+pub struct Simulator {
+    prototype: Env,
+    environments: Vec<Env>,
+}
+
+impl Simulator {
+    /// Creates environments that behave as `prototype` does.
+    #[must_use]
+    pub const fn new(prototype: Env) -> Self {
+        Self { prototype, environments: Vec::new() }
+    }
+}
+
+impl Environment for Simulator {
+    fn reset(
+        &mut self,
+        starts: &[EpisodeStart],
+        observations: &mut [f32],
+        goals: &mut [f32],
+    ) -> Result<(), EnvironmentError> {
+        let layout = self.prototype.layout();
+        self.environments.resize_with(starts.len(), || self.prototype.clone());
+        let observations = observations.chunks_exact_mut(layout.n_observation());
+        let rows = observations.zip(goals.chunks_exact_mut(layout.n_goal()));
+        for ((env, start), (observation, goal)) in
+            self.environments.iter_mut().zip(starts).zip(rows)
+        {
+            let mut rng = episode_rng(start.seed, start.number, Stream::Reset);
+            env.reset(&mut rng, start.world.for_kind(start.kind));
+            env.observe(observation);
+            goal.copy_from_slice(env.goal());
+        }
+        Ok(())
     }
 
-    fn observe(&self, observation: &mut [f32]) {
-        self.observe(observation);
-    }
-
-    fn goal(&self) -> &[f32] {
-        self.goal()
-    }
-
-    fn step(&mut self, action: &[f32]) -> Result<Contacts, SimError> {
-        self.step(action)
+    fn step(
+        &mut self,
+        actions: &[f32],
+        observations: &mut [f32],
+        contacts: &mut [Contacts],
+    ) -> Result<(), EnvironmentError> {
+        let layout = self.prototype.layout();
+        let actions = actions.chunks_exact(layout.n_action());
+        let rows = actions.zip(observations.chunks_exact_mut(layout.n_observation()));
+        let environments = self.environments.iter_mut().zip(contacts).enumerate();
+        for ((environment, (env, contacts)), (action, observation)) in environments.zip(rows) {
+            let failed = |source| EnvironmentError::Step { environment, source };
+            *contacts = env.step(action).map_err(failed)?;
+            env.observe(observation);
+        }
+        Ok(())
     }
 }
 

@@ -251,7 +251,7 @@ mod tests {
 
     use super::*;
     use crate::fakes::{FakeActor, slot, terms};
-    use crate::ports::NoAdvisor;
+    use crate::ports::{NoAdvisor, Simulator};
     use crate::rollout::play_slot;
 
     fn played(kind: EpisodeKind) -> (EpisodeMetadata, Episode) {
@@ -259,7 +259,8 @@ mod tests {
         let terms = terms();
         let world = Env::new(terms.layout, &WorldConfig::from(terms.world)).expect("in range");
         let mut actor = FakeActor::Seeker;
-        let episode = play_slot(&world, &order, &terms, &mut actor, &mut NoAdvisor)
+        let mut world = Simulator::new(world);
+        let episode = play_slot(&mut world, &order, &terms, &mut actor, &mut NoAdvisor)
             .expect("no step fails")
             .remove(0);
         (metadata_of(order.episodes[0], &episode, &terms, "5f3a".to_owned()), episode)

@@ -2,13 +2,13 @@
 
 use tandem_core::layout::EPISODE_STEPS;
 use tandem_core::rng::{Stream, episode_rng};
-use tandem_core::work::{EpisodeOrder, RunTerms, SlotOrder};
-use tandem_core::{Episode, EpisodeKind, StepAdvice, StepQuery};
+use tandem_core::work::{EpisodeOrder, EpisodeStart, RunTerms, SlotOrder};
+use tandem_core::{Contacts, Episode, EpisodeKind, Layout, StepAdvice, StepQuery};
 use tandem_sim::SimError;
 use tandem_telemetry::events::StepAdvised;
 
 use crate::explore::Explorer;
-use crate::ports::{Act, Advisor, AdvisorGone, Environment};
+use crate::ports::{Act, Advisor, AdvisorGone, Environment, EnvironmentError};
 
 /// An error that ends a slot.
 #[derive(Debug, thiserror::Error)]
@@ -16,6 +16,9 @@ pub enum RolloutError {
     /// The worker is stopping while a request for advice is pending.
     #[error(transparent)]
     AdvisorGone(#[from] AdvisorGone),
+    /// The environments can no longer be used.
+    #[error(transparent)]
+    Environment(#[from] EnvironmentError),
     /// The environment cannot be built.
     #[error("the environment cannot be built")]
     NoEnvironment(#[source] SimError),
@@ -63,34 +66,115 @@ pub enum RolloutError {
 ///
 /// # Errors
 /// When the advisor is gone or answers in the wrong shape, or a step of the environment fails.
-pub fn play_slot<E: Environment>(
-    env: &E,
+pub fn play_slot(
+    env: &mut impl Environment,
     order: &SlotOrder,
     terms: &RunTerms,
     actor: &mut impl Act,
     advisor: &mut impl Advisor,
 ) -> Result<Vec<Episode>, RolloutError> {
-    let start = |episode: &EpisodeOrder| Rollout::start(env.clone(), *episode, order, terms);
-    let mut rollouts: Vec<Rollout<E>> = order.episodes.iter().map(start).collect();
+    let mut rollouts = start(env, order, terms)?;
+    let mut batch = StepBatch::new(order.episodes.len(), terms.layout);
     for step_idx in 0..EPISODE_STEPS {
         for rollout in &mut rollouts {
             rollout.choose_action(actor);
         }
         take_advice(&mut rollouts, step_idx, advisor)?;
-        for rollout in &mut rollouts {
-            rollout.execute(step_idx)?;
-        }
+        batch.execute(&mut rollouts, step_idx, env)?;
     }
     Ok(rollouts.into_iter().map(|rollout| rollout.episode).collect())
 }
 
+/// Returns the starts of the episodes of `order`.
+#[must_use]
+pub fn episode_starts(order: &SlotOrder, terms: &RunTerms) -> Vec<EpisodeStart> {
+    let world = terms.world.for_kind(order.kind);
+    let start = |episode: &EpisodeOrder| EpisodeStart {
+        number: episode.number,
+        seed: episode.seed,
+        kind: order.kind,
+        world,
+    };
+    order.episodes.iter().map(start).collect()
+}
+
+/// Starts the episodes of `order`.
+fn start(
+    env: &mut impl Environment,
+    order: &SlotOrder,
+    terms: &RunTerms,
+) -> Result<Vec<Rollout>, RolloutError> {
+    let (n, layout) = (order.episodes.len(), terms.layout);
+    let mut observations = vec![0.0; n * layout.n_observation()];
+    let mut goals = vec![0.0; n * layout.n_goal()];
+    env.reset(&episode_starts(order, terms), &mut observations, &mut goals)?;
+    let observations = observations.chunks_exact(layout.n_observation());
+    let rows = observations.zip(goals.chunks_exact(layout.n_goal()));
+    let start = |(episode, row): (&EpisodeOrder, _)| Rollout::start(*episode, order, terms, row);
+    Ok(order.episodes.iter().zip(rows).map(start).collect())
+}
+
+/// The vectors of one step of all environments, for reuse.
+struct StepBatch {
+    layout: Layout,
+    /// Shape `[n, n_action]`.
+    actions: Vec<f32>,
+    /// Shape `[n, n_observation]`.
+    observations: Vec<f32>,
+    /// Shape `[n]`.
+    contacts: Vec<Contacts>,
+}
+
+impl StepBatch {
+    fn new(n: usize, layout: Layout) -> Self {
+        Self {
+            layout,
+            actions: vec![0.0; n * layout.n_action()],
+            observations: vec![0.0; n * layout.n_observation()],
+            contacts: vec![Contacts::NONE; n],
+        }
+    }
+
+    /// Executes the next action of every rollout.
+    fn execute(
+        &mut self,
+        rollouts: &mut [Rollout],
+        step_idx: usize,
+        env: &mut impl Environment,
+    ) -> Result<(), RolloutError> {
+        let Self { layout, actions, observations, contacts } = self;
+        for (rollout, action) in rollouts.iter().zip(actions.chunks_exact_mut(layout.n_action())) {
+            action.copy_from_slice(&rollout.action);
+        }
+        let stepped = env.step(actions, observations, contacts);
+        stepped.map_err(|error| failed_step(error, rollouts, step_idx))?;
+        let results = observations.chunks_exact(layout.n_observation()).zip(contacts);
+        for (rollout, (observation, contacts)) in rollouts.iter_mut().zip(results) {
+            rollout.record(observation, *contacts);
+        }
+        Ok(())
+    }
+}
+
+/// Names the episode of an environment that failed.
+fn failed_step(error: EnvironmentError, rollouts: &[Rollout], step: usize) -> RolloutError {
+    let number = |environment: usize| rollouts.get(environment).map(|it| it.episode.number);
+    match error {
+        EnvironmentError::Step { environment, source } => match number(environment) {
+            Some(episode) => RolloutError::Step { episode, step, source },
+            None => EnvironmentError::Step { environment, source }.into(),
+        },
+        EnvironmentError::Gone => error.into(),
+    }
+}
+
 /// Asks the teacher about the next actions of the advised rollouts, and applies its advice.
-fn take_advice<E: Environment>(
-    rollouts: &mut [Rollout<E>],
+fn take_advice(
+    rollouts: &mut [Rollout],
     step_idx: usize,
     advisor: &mut impl Advisor,
 ) -> Result<(), RolloutError> {
-    let mut advised: Vec<&mut Rollout<E>> =
+    let mut advised: Vec<&mut Rollout> =
         rollouts.iter_mut().filter(|rollout| rollout.advised).collect();
     let Some(first) = advised.first() else {
         return Ok(());
@@ -120,8 +204,7 @@ fn check_count(
 }
 
 /// An episode being played.
-struct Rollout<E> {
-    env: E,
+struct Rollout {
     explorer: Option<Explorer>,
     advised: bool,
     /// The observation before the next step, shape `[n_observation]`.
@@ -134,31 +217,33 @@ struct Rollout<E> {
     episode: Episode,
 }
 
-impl<E: Environment> Rollout<E> {
-    fn start(mut env: E, order: EpisodeOrder, slot: &SlotOrder, terms: &RunTerms) -> Self {
+impl Rollout {
+    /// Starts an episode with its first observation and its goal.
+    fn start(
+        order: EpisodeOrder,
+        slot: &SlotOrder,
+        terms: &RunTerms,
+        (observation, goal): (&[f32], &[f32]),
+    ) -> Self {
         let layout = terms.layout;
-        env.reset(order, terms.world.for_kind(slot.kind));
-        let mut observation = vec![0.0; layout.n_observation()];
-        env.observe(&mut observation);
         let mut observations = Vec::with_capacity((EPISODE_STEPS + 1) * layout.n_observation());
-        observations.extend_from_slice(&observation);
+        observations.extend_from_slice(observation);
         let episode = Episode {
             number: order.number,
             kind: slot.kind,
             parameter_version: slot.parameter_version,
             layout,
             observations,
-            goal: env.goal().to_vec(),
+            goal: goal.to_vec(),
             actions: Vec::with_capacity(EPISODE_STEPS * layout.n_action()),
             advised_arms: Vec::with_capacity(EPISODE_STEPS),
             contacts: Vec::with_capacity(EPISODE_STEPS),
             advice_charged: 0,
         };
         Self {
-            env,
             explorer: explorer(order, slot.kind, terms),
             advised: order.advised && slot.kind == EpisodeKind::Training,
-            observation,
+            observation: observation.to_vec(),
             action: vec![0.0; layout.n_action()],
             advised_arms: 0,
             episode,
@@ -204,18 +289,13 @@ impl<E: Environment> Rollout<E> {
         Ok(())
     }
 
-    fn execute(&mut self, step_idx: usize) -> Result<(), RolloutError> {
-        let contacts = self.env.step(&self.action).map_err(|source| RolloutError::Step {
-            episode: self.episode.number,
-            step: step_idx,
-            source,
-        })?;
-        self.env.observe(&mut self.observation);
-        self.episode.observations.extend_from_slice(&self.observation);
+    /// Records the executed step and what followed from it.
+    fn record(&mut self, observation: &[f32], contacts: Contacts) {
+        self.observation.copy_from_slice(observation);
+        self.episode.observations.extend_from_slice(observation);
         self.episode.actions.extend_from_slice(&self.action);
         self.episode.advised_arms.push(self.advised_arms);
         self.episode.contacts.push(contacts);
-        Ok(())
     }
 }
 
@@ -237,7 +317,7 @@ mod tests {
     use crate::ports::NoAdvisor;
 
     fn play(order: &SlotOrder, actor: FakeActor, advisor: &mut impl Advisor) -> Vec<Episode> {
-        play_slot(&FakeEnvironment::new(), order, &terms(), &mut { actor }, advisor)
+        play_slot(&mut FakeEnvironment::new(), order, &terms(), &mut { actor }, advisor)
             .expect("no step fails")
     }
 
@@ -381,7 +461,7 @@ mod tests {
     fn an_override_without_a_charge_is_an_error() {
         let mut advisor = FixedFlags { overridden: true, charged: false };
         let played = play_slot(
-            &FakeEnvironment::new(),
+            &mut FakeEnvironment::new(),
             &slot(&[3], true),
             &terms(),
             &mut FakeActor::Seeker,
@@ -402,7 +482,7 @@ mod tests {
             }
         }
         let played = play_slot(
-            &FakeEnvironment::new(),
+            &mut FakeEnvironment::new(),
             &slot(&[3], true),
             &terms(),
             &mut FakeActor::Seeker,

@@ -1,15 +1,17 @@
 //! The worker's main loop: join the run, then take, play and deliver slots until the run has ended.
 
-use tandem_core::Episode;
 use tandem_core::work::SlotOrder;
+use tandem_core::{Layout, StepAdvice, StepQuery};
 use tokio::sync::oneshot;
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 
 use crate::config::{Timeouts, WorkerConfig};
+use crate::environment::{Environments, Failure};
 use crate::error::Error;
 use crate::learner::{Learner, Work};
-use crate::player::{AdviceChannel, Player};
+use crate::player::{PeerChannel, PeerRequest, PlayedSlot, Player};
+use crate::rollout::RolloutError;
 use crate::teacher::Teacher;
 
 /// Plays slots for a learner until the run has ended or `shutdown` is cancelled. After a shutdown signal the current
@@ -41,7 +43,16 @@ pub async fn run_with(
     let rollouts = TaskTracker::new();
     let (learner, teacher) = (Learner::new(&config, timeouts)?, Teacher::new(&config, timeouts)?);
     let pacing = config.pacing;
-    let mut worker = Worker { config, timeouts, learner, teacher, rollouts: rollouts.clone() };
+    let environments = config.environment.clone().map(Environments::new);
+    let mut worker = Worker {
+        config,
+        timeouts,
+        learner,
+        teacher,
+        environments,
+        difference_logged: false,
+        rollouts: rollouts.clone(),
+    };
     let drained = async {
         shutdown.cancelled().await;
         tokio::time::sleep(timeouts.drain).await;
@@ -61,6 +72,10 @@ struct Worker {
     timeouts: Timeouts,
     learner: Learner,
     teacher: Option<Teacher>,
+    /// The server of the environments; `None` if they are simulated in this process.
+    environments: Option<Environments>,
+    /// Whether the log has a warning that the environments are not deterministic.
+    difference_logged: bool,
     rollouts: TaskTracker,
 }
 
@@ -123,16 +138,22 @@ impl Worker {
         }
     }
 
+    /// Joins the run and checks that the peers serve it.
     async fn join(&mut self) -> Result<Membership, Error> {
         let (worker_id, terms) = self.learner.join(&self.config.name).await?;
         if let Some(account) = terms.account.as_ref().filter(|_| self.teacher.is_none()) {
             return Err(Error::NoTeacher { account: account.clone() });
         }
         tracing::info!(worker_id, task = %terms.layout.task, n_arms = terms.layout.n_arms, "run joined");
-        Ok(Membership {
-            worker_id,
-            player: Box::new(Player::new(terms, self.config.log_dir.clone())?),
-        })
+        let log_dir = self.config.log_dir.clone();
+        let player = match &mut self.environments {
+            None => Player::simulating(terms, log_dir)?,
+            Some(environments) => {
+                environments.check(terms.layout).await?;
+                Player::remote(terms, log_dir)
+            }
+        };
+        Ok(Membership { worker_id, player: Box::new(player) })
     }
 
     /// Plays and delivers a slot. Returns `None` if the learner no longer knows the worker.
@@ -151,8 +172,8 @@ impl Worker {
             tokio::time::sleep(self.timeouts.backoff.first_pause).await;
             return Ok(Some(member));
         }
-        let (player, episodes) = self.play(member.player, order).await?;
-        let taken = self.learner.submit(worker_id, slot, &episodes).await?;
+        let (player, played) = self.play(member.player, order).await?;
+        let taken = self.learner.submit(worker_id, slot, &played).await?;
         if taken.is_none() {
             // Such a learner does not know the slot either and orders its episodes again.
             tracing::warn!(worker_id, slot, "unknown to the learner, joining again");
@@ -172,37 +193,127 @@ impl Worker {
         Ok(true)
     }
 
-    /// Plays a slot on a thread of its own, and forwards its requests for advice to the teacher.
+    /// Plays a slot. If the server of the environments fails, plays it again from the start of its episodes, which
+    /// depend only on their seeds and actions.
     async fn play(
         &mut self,
         mut player: Box<Player>,
         order: SlotOrder,
-    ) -> Result<(Box<Player>, Vec<Episode>), Error> {
+    ) -> Result<(Box<Player>, PlayedSlot), Error> {
+        loop {
+            let (returned, outcome) = self.try_play(player, order.clone()).await?;
+            match (outcome, &mut self.environments) {
+                (Ok(played), environments) => {
+                    if let Some(environments) = environments {
+                        environments.succeed().await;
+                    }
+                    self.log_difference(&played);
+                    return Ok((returned, played));
+                }
+                (Err(SlotFailure::Environment(failure)), Some(environments)) => {
+                    environments.recover(failure).await?;
+                }
+                (Err(SlotFailure::Environment(_)), None) => return Err(Error::NoServer),
+                (Err(SlotFailure::Rollout(source)), _) => {
+                    return Err(Error::Rollout { slot: order.slot, source });
+                }
+            }
+            player = returned;
+        }
+    }
+
+    /// Plays a slot on a thread of its own, and forwards its requests to the teacher and to the server of the
+    /// environments.
+    async fn try_play(
+        &mut self,
+        mut player: Box<Player>,
+        order: SlotOrder,
+    ) -> Result<(Box<Player>, Result<PlayedSlot, SlotFailure>), Error> {
         let slot = order.slot;
         let (account, layout) = (player.terms().account.clone(), player.terms().layout);
-        let (advisor, mut requests) = AdviceChannel::new();
+        let (peers, mut requests) = PeerChannel::new();
         let (finished, playing) = oneshot::channel();
         let tracked = self.rollouts.token();
         let rollout = std::thread::Builder::new().name("rollout".to_owned());
         rollout
             .spawn(move || {
                 let _tracked = tracked;
-                let episodes = player.play(&order, advisor);
+                let played = player.play(&order, peers);
                 // Fails only if the worker has ended meanwhile.
-                drop(finished.send((player, episodes)));
+                drop(finished.send((player, played)));
             })
             .map_err(Error::Thread)?;
+        let mut failure = None;
         // Ends when the player drops the channel, after the slot or after an error.
-        while let Some(pending) = self.config.pacing.next(requests.recv()).await {
-            let account = account.as_deref().ok_or(Error::NoAccount { slot })?;
-            let no_teacher = || Error::NoTeacher { account: account.to_owned() };
-            let teacher = self.teacher.as_mut().ok_or_else(no_teacher)?;
-            let advice = teacher.advise(account, layout, &pending.queries).await?;
-            if pending.response.send(advice).is_err() {
+        while let Some(request) = self.config.pacing.next(requests.recv()).await {
+            let answered = match request {
+                PeerRequest::Advice(queries, response) => {
+                    let account = account.as_deref().ok_or(Error::NoAccount { slot })?;
+                    let advice = self.advise(account, layout, &queries).await?;
+                    response.send(advice).is_ok()
+                }
+                request => match self.forward(request, layout).await {
+                    Ok(answered) => answered,
+                    Err(error) => {
+                        failure = Some(error);
+                        false
+                    }
+                },
+            };
+            if !answered {
                 break;
             }
         }
-        let (player, episodes) = self.config.pacing.next(playing).await?;
-        Ok((player, episodes.map_err(|source| Error::Rollout { slot, source })?))
+        // The player's thread ends once its requests are no longer answered.
+        drop(requests);
+        let (player, played) = self.config.pacing.next(playing).await?;
+        let outcome = match failure {
+            Some(failure) => Err(SlotFailure::Environment(failure)),
+            None => played.map_err(SlotFailure::Rollout),
+        };
+        Ok((player, outcome))
     }
+
+    async fn advise(
+        &mut self,
+        account: &str,
+        layout: Layout,
+        queries: &[StepQuery],
+    ) -> Result<Vec<StepAdvice>, Error> {
+        let no_teacher = || Error::NoTeacher { account: account.to_owned() };
+        let teacher = self.teacher.as_mut().ok_or_else(no_teacher)?;
+        teacher.advise(account, layout, queries).await
+    }
+
+    /// Forwards a request to the server of the environments. Returns whether the player still waits for the response.
+    async fn forward(&mut self, request: PeerRequest, layout: Layout) -> Result<bool, Failure> {
+        let no_server = || Failure::Final(Box::new(Error::NoServer));
+        let environments = self.environments.as_mut().ok_or_else(no_server)?;
+        Ok(match request {
+            PeerRequest::Reset(starts, response) => {
+                response.send(environments.reset(&starts, layout).await?).is_ok()
+            }
+            PeerRequest::Step(actions, response) => {
+                response.send(environments.step(&actions, layout).await?).is_ok()
+            }
+            PeerRequest::Advice(..) => false,
+        })
+    }
+
+    /// Warns once of environments that are not deterministic.
+    fn log_difference(&mut self, played: &PlayedSlot) {
+        let difference = played.check.and_then(|check| check.difference);
+        if let Some(difference) = difference.filter(|_| !self.difference_logged) {
+            self.difference_logged = true;
+            tracing::warn!(%difference, "the environments are not deterministic");
+        }
+    }
+}
+
+/// The failure of a slot that was being played.
+enum SlotFailure {
+    /// The server of the environments has failed.
+    Environment(Failure),
+    /// The rollout has failed.
+    Rollout(RolloutError),
 }

@@ -71,18 +71,17 @@ fn decode_advised_arms(advised_arms: Vec<u8>, layout: Layout) -> Result<Vec<u8>,
 
 fn decode_contacts(contacts: &[u8]) -> Result<Vec<Contacts>, DecodeError> {
     check_one_per_step("contacts", contacts)?;
-    let decode_step = |(step_idx, bits): (usize, &u8)| {
-        let unknown = || {
-            let got = format_args!("{bits:#010b}").to_string();
-            DecodeError::new(
-                format!("contacts[{step_idx}]"),
-                "bits 0 (arm and arm) and 1 (arm and table)",
-                got,
-            )
-        };
-        Contacts::from_bits(*bits).ok_or_else(unknown)
+    contacts.iter().enumerate().map(decode_contact).collect()
+}
+
+/// Decodes the byte at an index of `contacts`.
+pub(crate) fn decode_contact((idx, bits): (usize, &u8)) -> Result<Contacts, DecodeError> {
+    let unknown = || {
+        let expected = "bits 0 (arm and arm) and 1 (arm and table)";
+        let got = format_args!("{bits:#010b}").to_string();
+        DecodeError::new(format!("contacts[{idx}]"), expected, got)
     };
-    contacts.iter().enumerate().map(decode_step).collect()
+    Contacts::from_bits(*bits).ok_or_else(unknown)
 }
 
 fn check_one_per_step(field: &str, bytes: &[u8]) -> Result<(), DecodeError> {

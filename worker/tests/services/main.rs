@@ -31,6 +31,7 @@ const TIMEOUTS: Timeouts = Timeouts {
 
 fn config(learner: &Server, teacher: Option<&Server>) -> WorkerConfig {
     WorkerConfig {
+        environment: None,
         client: ClientConfig::default(),
         learner: learner.address(),
         teacher: teacher.map(Server::address),

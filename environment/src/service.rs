@@ -1,0 +1,192 @@
+//! The gRPC service `tandem.v1.Environment`.
+
+use std::sync::Arc;
+
+use tandem_core::Layout;
+use tandem_net::{Incoming, MAX_MESSAGE_BYTES, ServerConfig};
+use tandem_proto::environment::{
+    MAX_ENVIRONMENTS, PlayCommand, decode_play_request, encode_environment,
+};
+use tandem_proto::pb;
+use tandem_proto::pb::environment_server::{Environment, EnvironmentServer};
+use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc};
+use tokio_stream::wrappers::ReceiverStream;
+use tokio_util::sync::CancellationToken;
+use tonic::{Request, Response, Status, Streaming};
+
+use crate::error::Error;
+use crate::session::{Prototypes, Session, SessionError};
+
+/// The capacity of a stream's responses. The next request is read once a response is on its way.
+const RESPONSE_CAPACITY: usize = 1;
+
+/// The configuration of an environment service.
+#[derive(Debug, Clone)]
+pub struct Config {
+    /// The task and the number of arms.
+    pub layout: Layout,
+    /// The largest number of environments of all streams together.
+    pub max_environments: usize,
+    /// Name and version of the program, for logs of clients.
+    pub server: String,
+}
+
+/// Serves the environments of `config`, with the access control of `server_config`, until `shutdown` is cancelled.
+///
+/// # Errors
+/// When the environments cannot be built or the server fails.
+pub async fn serve(
+    config: Config,
+    incoming: impl Into<Incoming>,
+    server_config: &ServerConfig,
+    shutdown: CancellationToken,
+) -> Result<(), Error> {
+    let prototypes = Prototypes::new(config.layout)?;
+    let room = Room::new(config.max_environments);
+    let service = EnvironmentService { config, prototypes, room, shutdown: shutdown.clone() };
+    let environment = EnvironmentServer::new(service).max_decoding_message_size(MAX_MESSAGE_BYTES);
+    let router = server_config.router(environment, tandem_proto::FILE_DESCRIPTOR_SET).await?;
+    Ok(tandem_net::serve(router, incoming, shutdown).await?)
+}
+
+/// The implementation of the generated server trait.
+struct EnvironmentService {
+    config: Config,
+    prototypes: Prototypes,
+    room: Room,
+    shutdown: CancellationToken,
+}
+
+#[tonic::async_trait]
+impl Environment for EnvironmentService {
+    type PlayStream = ReceiverStream<Result<pb::PlayResponse, Status>>;
+
+    async fn describe(
+        &self,
+        _: Request<pb::DescribeEnvironmentRequest>,
+    ) -> Result<Response<pb::EnvironmentDescription>, Status> {
+        let n_per_stream = self.room.n_total.min(MAX_ENVIRONMENTS);
+        let Config { layout, server, .. } = &self.config;
+        Ok(Response::new(encode_environment(*layout, server, n_per_stream)))
+    }
+
+    async fn play(
+        &self,
+        request: Request<Streaming<pb::PlayRequest>>,
+    ) -> Result<Response<Self::PlayStream>, Status> {
+        let (responses, outgoing) = mpsc::channel(RESPONSE_CAPACITY);
+        let stream = PlayStream {
+            session: Session::new(self.prototypes.clone()),
+            room: self.room.clone(),
+            permit: None,
+        };
+        let (requests, shutdown) = (request.into_inner(), self.shutdown.clone());
+        tokio::spawn(async move {
+            tokio::select! {
+                () = stream.serve(requests, &responses) => (),
+                () = shutdown.cancelled() => {
+                    let stopping = Status::unavailable("the environment server is shutting down");
+                    drop(responses.send(Err(stopping)).await);
+                }
+            }
+        });
+        Ok(Response::new(ReceiverStream::new(outgoing)))
+    }
+}
+
+/// The environments that all streams together may have.
+#[derive(Clone)]
+struct Room {
+    n_total: usize,
+    free: Arc<Semaphore>,
+}
+
+impl Room {
+    fn new(n_total: usize) -> Self {
+        Self { n_total, free: Arc::new(Semaphore::new(n_total)) }
+    }
+
+    /// Reserves room for `n` environments until the permit is dropped.
+    fn reserve(&self, n: usize) -> Result<OwnedSemaphorePermit, Status> {
+        let permits = u32::try_from(n).unwrap_or(u32::MAX);
+        Arc::clone(&self.free).try_acquire_many_owned(permits).map_err(|_full| {
+            let (n_total, n_free) = (self.n_total, self.free.available_permits());
+            Status::resource_exhausted(format!(
+                "no room for {n} environments: {n_free} of {n_total} are free"
+            ))
+        })
+    }
+}
+
+/// One stream and its environments.
+struct PlayStream {
+    session: Session,
+    room: Room,
+    /// The room of the session, from its first reset on.
+    permit: Option<OwnedSemaphorePermit>,
+}
+
+impl PlayStream {
+    /// Answers `requests` one at a time, until the client closes the stream or a request fails.
+    async fn serve(
+        mut self,
+        mut requests: Streaming<pb::PlayRequest>,
+        responses: &mpsc::Sender<Result<pb::PlayResponse, Status>>,
+    ) {
+        while let Ok(Some(request)) = requests.message().await.inspect_err(log_lost) {
+            let (stream, response) = self.answer(request).await;
+            let is_failed = response.is_err();
+            if responses.send(response).await.is_err() || is_failed {
+                return;
+            }
+            let Some(stream) = stream else { return };
+            self = stream;
+        }
+    }
+
+    /// Answers a request. The simulation runs on a thread of its own, so that it delays no socket. Returns no stream if
+    /// that thread has panicked.
+    async fn answer(
+        mut self,
+        request: pb::PlayRequest,
+    ) -> (Option<Self>, Result<pb::PlayResponse, Status>) {
+        let command = match self.decode(request) {
+            Ok(command) => command,
+            Err(status) => return (Some(self), Err(status)),
+        };
+        let simulated = tokio::task::spawn_blocking(move || {
+            let response = self.session.execute(command);
+            (self, response)
+        });
+        match simulated.await {
+            Ok((stream, response)) => (Some(stream), response.map_err(|error| status(&error))),
+            Err(_panicked) => (None, Err(Status::internal("the simulator panicked"))),
+        }
+    }
+
+    fn decode(&mut self, request: pb::PlayRequest) -> Result<PlayCommand, Status> {
+        let layout = self.session.layout();
+        let command = decode_play_request(request, self.session.n(), layout)?;
+        if let PlayCommand::Reset(resets) = &command
+            && self.permit.is_none()
+        {
+            self.permit = Some(self.room.reserve(resets.len())?);
+        }
+        Ok(command)
+    }
+}
+
+/// Maps an error to the status that the client receives.
+fn status(error: &SessionError) -> Status {
+    match error {
+        SessionError::Reset(_) => Status::invalid_argument(error.to_string()),
+        SessionError::Step { .. } => {
+            tracing::error!(%error, "step failed");
+            Status::internal(error.to_string())
+        }
+    }
+}
+
+fn log_lost(status: &Status) {
+    tracing::debug!(reason = status.message(), "stream lost");
+}

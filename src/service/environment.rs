@@ -1,0 +1,35 @@
+//! `tandem env`.
+
+use tandem_core::{Layout, Task};
+use tandem_environment::{Config, Error};
+
+use super::listen::listen_with_scheme;
+use super::run;
+use crate::cli::EnvArgs;
+use crate::exit::{Exit, Failed};
+use crate::version::VERSION;
+use crate::{access, signals};
+
+pub(crate) fn environment(args: EnvArgs) -> Result<(), Failed> {
+    let server_config = access::server_config(&args.listen, &args.secret)?;
+    run(async move {
+        let shutdown = signals::shutdown_token(args.listen.exit_with_stdin)?;
+        let listener = listen_with_scheme(&args.listen).await?;
+        let config = Config {
+            layout: Layout::new(Task::from(args.task), usize::from(args.arms)),
+            max_environments: usize::from(args.max_environments),
+            server: format!("tandem {VERSION}"),
+        };
+        let served = tandem_environment::serve(config, listener, &server_config, shutdown).await;
+        served.map_err(environment_failed)
+    })
+}
+
+/// Chooses the exit code of an error of the service.
+fn environment_failed(error: Error) -> Failed {
+    let exit = match error {
+        Error::World(_) | Error::ServerConfig(_) => Exit::Usage,
+        Error::Transport(_) => Exit::TryAgain,
+    };
+    Failed::new(exit, error)
+}

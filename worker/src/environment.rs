@@ -1,0 +1,243 @@
+//! The client of a server of environments.
+
+use tandem_core::Layout;
+use tandem_core::work::EpisodeStart;
+use tandem_net::{AuthChannel, MAX_MESSAGE_BYTES, Operation, Retrier, Retryability, within};
+use tandem_proto::environment::{
+    ResetReply, StepReply, check_task, decode_reset_reply, decode_step_reply, encode_reset,
+    encode_step,
+};
+use tandem_proto::pb::environment_client::EnvironmentClient;
+use tandem_proto::{DecodeError, encode_task, pb};
+use tokio::sync::mpsc;
+use tokio_stream::wrappers::ReceiverStream;
+use tonic::{Status, Streaming};
+
+use crate::config::EnvironmentConfig;
+use crate::error::Error;
+
+const PLAY: Operation =
+    Operation { peer: "environment server", purpose: "play in the environments of the server" };
+/// The capacity of a stream, in requests. One request is open at a time, so the worker never waits for room.
+const STREAM_CAPACITY: usize = 1;
+/// The largest number of characters of a server's own name in messages.
+const MAX_NAME_CHARS: usize = 100;
+
+/// The server of a worker's environments, called over one stream.
+///
+/// A call that fails ends the slot; the caller [recovers](Self::recover) and plays the slot again from its start, which
+/// gives the same episodes.
+#[derive(Debug)]
+pub(crate) struct Environments {
+    config: EnvironmentConfig,
+    retrier: Retrier,
+    /// Failures since a slot was played.
+    n_failures: u32,
+    /// The name of the latest server in messages: its address and program.
+    name: String,
+    was_connected: bool,
+    server: Option<Server>,
+    stream: Option<PlayStream>,
+    /// The episodes in play, by environment.
+    episodes: Vec<u64>,
+    /// The steps of these episodes so far.
+    n_steps: usize,
+}
+
+#[derive(Debug)]
+struct Server {
+    client: EnvironmentClient<AuthChannel>,
+    max_environments: u32,
+}
+
+#[derive(Debug)]
+struct PlayStream {
+    n: usize,
+    requests: mpsc::Sender<pb::PlayRequest>,
+    responses: Streaming<pb::PlayResponse>,
+}
+
+/// The failure of a call.
+#[derive(Debug)]
+pub(crate) enum Failure {
+    /// Another attempt may succeed.
+    Transient(Status),
+    /// No attempt can succeed.
+    Final(Box<Error>),
+}
+
+impl Environments {
+    /// Creates a client, which connects on its first call.
+    pub(crate) fn new(config: EnvironmentConfig) -> Self {
+        Self {
+            config,
+            retrier: Retrier::new(EnvironmentConfig::BACKOFF, PLAY),
+            n_failures: 0,
+            name: "of the worker".to_owned(),
+            was_connected: false,
+            server: None,
+            stream: None,
+            episodes: Vec::new(),
+            n_steps: 0,
+        }
+    }
+
+    /// Waits for the server and checks that it serves the task of `layout`.
+    pub(crate) async fn check(&mut self, layout: Layout) -> Result<(), Error> {
+        while let Err(failure) = self.connect(layout).await {
+            self.recover(failure).await?;
+        }
+        Ok(())
+    }
+
+    /// Starts episodes, one per environment.
+    pub(crate) async fn reset(
+        &mut self,
+        starts: &[EpisodeStart],
+        layout: Layout,
+    ) -> Result<ResetReply, Failure> {
+        self.episodes = starts.iter().map(|start| start.number).collect();
+        self.n_steps = 0;
+        let n = starts.len();
+        let reply = self.exchange(n, encode_reset(starts), layout).await?;
+        decode_reset_reply(&reply, n, layout).map_err(|error| self.invalid(error))
+    }
+
+    /// Executes actions, shape `[n, n_action]`.
+    pub(crate) async fn step(
+        &mut self,
+        actions: &[f32],
+        layout: Layout,
+    ) -> Result<StepReply, Failure> {
+        self.n_steps += 1;
+        let n = self.episodes.len();
+        let reply = self.exchange(n, encode_step(actions), layout).await?;
+        decode_step_reply(&reply, n, layout).map_err(|error| self.invalid(error))
+    }
+
+    /// Records that a slot was played.
+    pub(crate) async fn succeed(&mut self) {
+        self.n_failures = 0;
+        self.retrier.settle(Ok(())).await;
+    }
+
+    /// Waits before the next attempt after a failure.
+    ///
+    /// # Errors
+    /// When no attempt can succeed, or too many have failed since a slot was played.
+    pub(crate) async fn recover(&mut self, failure: Failure) -> Result<(), Error> {
+        (self.server, self.stream) = (None, None);
+        let status = match failure {
+            Failure::Transient(status) => status,
+            Failure::Final(error) => return Err(*error),
+        };
+        self.n_failures += 1;
+        if self.n_failures >= self.config.max_attempts {
+            let (server, n_failures) = (self.name.clone(), self.n_failures);
+            return Err(Error::EnvironmentFailed { server, n_failures, source: status });
+        }
+        self.retrier.settle(Err::<(), _>(status)).await;
+        Ok(())
+    }
+
+    /// Sends one request and waits for its response. A stream that failed is not used again.
+    async fn exchange(
+        &mut self,
+        n: usize,
+        request: pb::PlayRequest,
+        layout: Layout,
+    ) -> Result<pb::PlayResponse, Failure> {
+        let stream = self.stream.take().filter(|stream| stream.n == n);
+        self.connect(layout).await?;
+        let Some(server) = &mut self.server else { return Err(Failure::Transient(closed())) };
+        if u32::try_from(n).is_ok_and(|n| n > server.max_environments) {
+            let (server, max) = (self.name.clone(), server.max_environments);
+            let error = Error::TooFewEnvironments { server, max, needed: n };
+            return Err(Failure::Final(Box::new(error)));
+        }
+        let exchanged = within(self.config.reply_timeout, async {
+            let mut stream = match stream {
+                Some(stream) => {
+                    stream.requests.send(request).await.map_err(|_unsent| closed())?;
+                    stream
+                }
+                None => server.open(n, request).await?,
+            };
+            let response = stream.responses.message().await?.ok_or_else(closed)?;
+            Ok((stream, response))
+        });
+        let (stream, response) = exchanged.await.map_err(|status| self.failure(status))?;
+        self.stream = Some(stream);
+        Ok(response)
+    }
+
+    /// Connects to the server and checks its task, unless it is connected.
+    async fn connect(&mut self, layout: Layout) -> Result<(), Failure> {
+        if self.server.is_some() {
+            return Ok(());
+        }
+        let address = match self.config.server.address().await {
+            Ok(address) => address,
+            // A command that has worked before may work again.
+            Err(error) if self.was_connected => {
+                return Err(Failure::Transient(Status::unavailable(error.to_string())));
+            }
+            Err(error) => return Err(Failure::Final(Box::new(error.into()))),
+        };
+        self.name.clone_from(&address);
+        let channel = self.config.client.channel(&address).map_err(|source| {
+            Failure::Final(Box::new(Error::Address { role: "environment server", source }))
+        })?;
+        let mut client = EnvironmentClient::new(channel)
+            .max_decoding_message_size(MAX_MESSAGE_BYTES)
+            .max_encoding_message_size(MAX_MESSAGE_BYTES);
+        let describe = client.describe(pb::DescribeEnvironmentRequest {});
+        let described = within(self.config.reply_timeout, describe).await;
+        let description = described.map_err(|status| self.failure(status))?.into_inner();
+        let program: String = description.server.chars().take(MAX_NAME_CHARS).collect();
+        self.name = format!("{address} ({program})");
+        check_task(&encode_task(layout), &description.task.unwrap_or_default()).map_err(
+            |difference| {
+                let (server, difference) = (self.name.clone(), difference.to_string());
+                Failure::Final(Box::new(Error::OtherTask { server, difference }))
+            },
+        )?;
+        tracing::info!(server = self.name, "environment server connected");
+        self.was_connected = true;
+        self.server = Some(Server { client, max_environments: description.max_environments });
+        Ok(())
+    }
+
+    fn failure(&self, status: Status) -> Failure {
+        match Retryability::of(status.code()) {
+            Retryability::Transient => Failure::Transient(status),
+            Retryability::NotFound | Retryability::Final => {
+                let server = self.name.clone();
+                Failure::Final(Box::new(Error::EnvironmentRefused { server, source: status }))
+            }
+        }
+    }
+
+    /// The failure of a server whose reply no environment of the task can give. It would give it again.
+    fn invalid(&self, source: DecodeError) -> Failure {
+        let reply = match self.n_steps {
+            0 => format!("the reset of episodes {:?}", self.episodes),
+            step => format!("step {step} of episodes {:?}", self.episodes),
+        };
+        Failure::Final(Box::new(Error::InvalidReply { server: self.name.clone(), reply, source }))
+    }
+}
+
+impl Server {
+    /// Opens a stream with its first request, because some servers do not answer before they have one.
+    async fn open(&mut self, n: usize, first: pb::PlayRequest) -> Result<PlayStream, Status> {
+        let (requests, outgoing) = mpsc::channel(STREAM_CAPACITY);
+        requests.send(first).await.map_err(|_unsent| closed())?;
+        let responses = self.client.play(ReceiverStream::new(outgoing)).await?.into_inner();
+        Ok(PlayStream { n, requests, responses })
+    }
+}
+
+fn closed() -> Status {
+    Status::unavailable("the environment server closed the stream")
+}
