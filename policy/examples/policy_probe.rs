@@ -16,7 +16,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let file = std::env::args().nth(1).ok_or("usage: policy_probe FILE")?;
     let policy = Policy::load(Path::new(&file))?;
     let (mut actor, mut critic) = (policy.actor()?, policy.critic()?);
-    let layout = policy.layout;
+    let layout = &policy.layout;
 
     let mut rng = episode_rng(0, 0, Stream::Reset);
     let mut draw =

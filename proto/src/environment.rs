@@ -3,7 +3,7 @@
 use std::fmt::Display;
 
 use tandem_core::work::EpisodeStart;
-use tandem_core::{Contacts, EpisodeKind, Layout, WorldSettings};
+use tandem_core::{Contacts, EpisodeKind, TaskSpec, WorldSettings};
 
 use crate::error::DecodeError;
 use crate::numbers::{actions_from_bytes, count_within, floats_from_bytes, one_within, to_bytes};
@@ -44,12 +44,12 @@ pub struct StepReply {
 /// Encodes the description of a server, called `server`, with environments of `layout`.
 #[must_use]
 pub fn encode_environment(
-    layout: Layout,
+    layout: impl Into<TaskSpec>,
     server: &str,
     max_environments: usize,
 ) -> pb::EnvironmentDescription {
     pb::EnvironmentDescription {
-        task: Some(encode_task(layout)),
+        task: Some(encode_task(&layout.into())),
         server: server.to_owned(),
         max_environments: u32::try_from(max_environments).unwrap_or(u32::MAX),
     }
@@ -86,6 +86,8 @@ pub fn check_task(
     same("norm", &e.norm().as_str_name(), &g.norm().as_str_name())?;
     same("interchangeable_arms", &e.interchangeable_arms, &g.interchangeable_arms)?;
     same("reports_contacts", &e.reports_contacts, &g.reports_contacts)?;
+    same("origin_distance", &e.origin_distance, &g.origin_distance)?;
+    same("recombination_gap", &e.recombination_gap, &g.recombination_gap)?;
     same_list("observation_bound", &e.observation_bound, &g.observation_bound)?;
     same_list("goal_bound", &e.goal_bound, &g.goal_bound)
 }
@@ -138,8 +140,9 @@ pub fn encode_step(actions: &[f32]) -> pb::PlayRequest {
 pub fn decode_play_request(
     request: pb::PlayRequest,
     n: Option<usize>,
-    layout: Layout,
+    layout: impl Into<TaskSpec>,
 ) -> Result<PlayCommand, DecodeError> {
+    let layout = layout.into();
     use pb::play_request::Command;
     match (request.command, n) {
         (None, _) => Err(DecodeError::missing("command")),
@@ -226,12 +229,15 @@ pub fn encode_step_reply(observations: &[f32], contacts: &[Contacts]) -> pb::Pla
 pub fn decode_reset_reply(
     reply: &pb::PlayResponse,
     n: usize,
-    layout: Layout,
+    layout: impl Into<TaskSpec>,
 ) -> Result<ResetReply, DecodeError> {
+    let layout = layout.into();
     check_empty("contacts", &reply.contacts)?;
     Ok(ResetReply {
-        observations: decode_observations(&reply.observations, n, layout)?,
-        goals: decode_rows("goals", &reply.goals, n, layout.n_goal(), |_| layout.goal_bound())?,
+        observations: decode_observations(&reply.observations, n, &layout)?,
+        goals: decode_rows("goals", &reply.goals, n, layout.n_goal(), |idx| {
+            layout.goal_bound(idx)
+        })?,
     })
 }
 
@@ -243,26 +249,27 @@ pub fn decode_reset_reply(
 pub fn decode_step_reply(
     reply: &pb::PlayResponse,
     n: usize,
-    layout: Layout,
+    layout: impl Into<TaskSpec>,
 ) -> Result<StepReply, DecodeError> {
+    let layout = layout.into();
     check_empty("goals", &reply.goals)?;
-    if reply.contacts.len() != n {
-        let expected = format_args!("{n} bytes, one per environment").to_string();
+    let n_contacts = if layout.reports_contacts() { n } else { 0 };
+    if reply.contacts.len() != n_contacts {
+        let expected = format_args!("{n_contacts} bytes, one per environment").to_string();
         let got = format_args!("{} bytes", reply.contacts.len()).to_string();
         return Err(DecodeError::new("contacts", expected, got));
     }
     Ok(StepReply {
-        observations: decode_observations(&reply.observations, n, layout)?,
-        contacts: reply
-            .contacts
-            .iter()
-            .enumerate()
-            .map(decode_contact)
-            .collect::<Result<_, _>>()?,
+        observations: decode_observations(&reply.observations, n, &layout)?,
+        contacts: if layout.reports_contacts() {
+            reply.contacts.iter().enumerate().map(decode_contact).collect::<Result<_, _>>()?
+        } else {
+            vec![Contacts::NONE; n]
+        },
     })
 }
 
-fn decode_observations(bytes: &[u8], n: usize, layout: Layout) -> Result<Vec<f32>, DecodeError> {
+fn decode_observations(bytes: &[u8], n: usize, layout: &TaskSpec) -> Result<Vec<f32>, DecodeError> {
     let bound = |idx| layout.observation_bound(idx);
     decode_rows("observations", bytes, n, layout.n_observation(), bound)
 }
@@ -298,7 +305,7 @@ fn check_empty(field: &str, bytes: &[u8]) -> Result<(), DecodeError> {
 
 #[cfg(test)]
 mod tests {
-    use tandem_core::Task;
+    use tandem_core::{Layout, Task};
 
     use super::*;
 
@@ -404,11 +411,11 @@ mod tests {
     #[test]
     fn the_first_field_of_another_task_is_named() {
         let check = |corrupt: fn(&mut pb::TaskDescription), message: &str| {
-            let (run, mut server) = (encode_task(LAYOUT), encode_task(LAYOUT));
+            let (run, mut server) = (encode_task(&LAYOUT.into()), encode_task(&LAYOUT.into()));
             corrupt(&mut server);
             assert_eq!(check_task(&run, &server).unwrap_err().to_string(), message);
         };
-        assert_eq!(check_task(&encode_task(LAYOUT), &encode_task(LAYOUT)), Ok(()));
+        assert_eq!(check_task(&encode_task(&LAYOUT.into()), &encode_task(&LAYOUT.into())), Ok(()));
         check(|task| task.name = "reach".to_owned(), "name: expected \"push\", got \"reach\"");
         check(|task| task.n_action = 4, "n_action: expected 3, got 4");
         check(|task| task.arms.clear(), "number of arms: expected 1, got 0");

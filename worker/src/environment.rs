@@ -1,6 +1,6 @@
 //! The client of a server of environments.
 
-use tandem_core::Layout;
+use tandem_core::TaskSpec;
 use tandem_core::work::EpisodeStart;
 use tandem_net::{AuthChannel, MAX_MESSAGE_BYTES, Operation, Retrier, Retryability, within};
 use tandem_proto::environment::{
@@ -83,7 +83,7 @@ impl Environments {
     }
 
     /// Waits for the server and checks that it serves the task of `layout`.
-    pub(crate) async fn check(&mut self, layout: Layout) -> Result<(), Error> {
+    pub(crate) async fn check(&mut self, layout: &TaskSpec) -> Result<(), Error> {
         while let Err(failure) = self.connect(layout).await {
             self.recover(failure).await?;
         }
@@ -94,7 +94,7 @@ impl Environments {
     pub(crate) async fn reset(
         &mut self,
         starts: &[EpisodeStart],
-        layout: Layout,
+        layout: &TaskSpec,
     ) -> Result<ResetReply, Failure> {
         self.episodes = starts.iter().map(|start| start.number).collect();
         self.n_steps = 0;
@@ -107,7 +107,7 @@ impl Environments {
     pub(crate) async fn step(
         &mut self,
         actions: &[f32],
-        layout: Layout,
+        layout: &TaskSpec,
     ) -> Result<StepReply, Failure> {
         self.n_steps += 1;
         let n = self.episodes.len();
@@ -145,7 +145,7 @@ impl Environments {
         &mut self,
         n: usize,
         request: pb::PlayRequest,
-        layout: Layout,
+        layout: &TaskSpec,
     ) -> Result<pb::PlayResponse, Failure> {
         let stream = self.stream.take().filter(|stream| stream.n == n);
         self.connect(layout).await?;
@@ -172,7 +172,7 @@ impl Environments {
     }
 
     /// Connects to the server and checks its task, unless it is connected.
-    async fn connect(&mut self, layout: Layout) -> Result<(), Failure> {
+    async fn connect(&mut self, layout: &TaskSpec) -> Result<(), Failure> {
         if self.server.is_some() {
             return Ok(());
         }
