@@ -22,7 +22,8 @@ pub(crate) use results::{
     EvalArgs, McapArgs, McapCommand, PictureArgs, PolicyArgs, PolicyCommand, ReplayArgs, ReportArgs,
 };
 pub(crate) use service::{
-    ClientArgs, EnvArgs, LearnerArgs, ListenArgs, RelayArgs, SecretArgs, TeacherArgs, WorkerArgs,
+    ClientArgs, EnvArgs, EnvGuardArgs, EnvironmentArgs, LearnerArgs, ListenArgs, RelayArgs,
+    SecretArgs, TeacherArgs, WorkerArgs,
 };
 pub(crate) use train::{RecipeName, SweepArgs, TrainArgs};
 pub(crate) use trial::{ModeName, RecordName, TrialArgs};
@@ -70,6 +71,9 @@ pub(crate) enum Command {
     Worker(WorkerArgs),
     /// Serves the built-in environments to workers and other programs.
     Env(EnvArgs),
+    /// Runs an environment command until standard input closes.
+    #[command(hide = true)]
+    EnvGuard(EnvGuardArgs),
     /// Distributes a learner's parameters to nearby workers, for runs with very many workers.
     Relay(RelayArgs),
     /// Serves a pair of arms, real or simulated, and operates it.

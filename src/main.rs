@@ -12,6 +12,8 @@ mod bench;
 mod bridge;
 mod cli;
 mod clock;
+mod environment_command;
+mod environment_server;
 mod eval;
 mod evaluation;
 mod exit;
@@ -55,7 +57,14 @@ fn run() -> ExitCode {
         }
         Err(help) => return exit_code(output::print_help(&help)),
     };
-    exit_code(logging::start(&cli).and_then(|()| dispatch(cli.command)))
+    let started = logging::start(&cli);
+    match cli.command {
+        Command::EnvGuard(args) => {
+            let code = started.and_then(|()| environment_command::guard(args.command));
+            code.map_or_else(|failed| output::report(&failed), ExitCode::from)
+        }
+        command => exit_code(started.and_then(|()| dispatch(command))),
+    }
 }
 
 fn dispatch(command: Command) -> Result<(), Failed> {
@@ -67,6 +76,8 @@ fn dispatch(command: Command) -> Result<(), Failed> {
         Command::Teacher(args) => service::teacher(args),
         Command::Learner(args) => service::learner(args),
         Command::Env(args) => service::environment(args),
+        // Handled by the caller, because its exit code is that of another program.
+        Command::EnvGuard(_) => Ok(()),
         Command::Worker(args) => service::worker(args),
         Command::Relay(args) => service::relay(args),
         Command::Bridge(args) => bridge::bridge(args),

@@ -40,13 +40,13 @@ pub(crate) fn policy(args: &PolicyArgs) -> Result<(), Failed> {
     let metadata: BTreeMap<_, _> = policy.metadata.iter().collect();
     if *json {
         return output::print(json!({
-            "task": policy.layout.task.name(), "arms": policy.layout.n_arms, "n_hidden": policy.n_hidden,
+            "task": policy.layout.name(), "arms": policy.layout.n_arms(), "n_hidden": policy.n_hidden,
             "n_hidden_layers": policy.n_hidden_layers, "critic_heads": policy.n_heads, "digest": policy.digest(),
             "metadata": metadata,
         }));
     }
-    output::print(format_args!("task          {}", policy.layout.task))?;
-    output::print(format_args!("arms          {}", policy.layout.n_arms))?;
+    output::print(format_args!("task          {}", policy.layout.name()))?;
+    output::print(format_args!("arms          {}", policy.layout.n_arms()))?;
     output::print(format_args!(
         "networks      {} hidden layers of {}, critic heads {}",
         policy.n_hidden_layers, policy.n_hidden, policy.n_heads

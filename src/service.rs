@@ -17,7 +17,7 @@ pub(crate) use learner::learner;
 pub(crate) use listen::listen;
 pub(crate) use relay::relay;
 pub(crate) use teacher::{teacher, teacher_failed};
-pub(crate) use worker::worker;
+pub(crate) use worker::{worker, worker_failed};
 
 /// Runs a service to its end on this thread.
 fn run(service: impl Future<Output = Result<(), Failed>>) -> Result<(), Failed> {

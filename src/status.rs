@@ -102,6 +102,9 @@ fn lines(progress: &pb::Progress) -> Vec<String> {
     lines.push(format!("advice spent {spent}, left {left}"));
     let silent = progress.workers.iter().filter(|worker| worker.doing == "silent").count();
     lines.push(format!("workers {}, silent {silent}", progress.workers.len() - silent));
+    if !progress.environment.is_empty() {
+        lines.push(format!("environment: {}", progress.environment));
+    }
     if !progress.warning.is_empty() {
         lines.push(format!("warning: {}", progress.warning));
     }
@@ -126,7 +129,7 @@ fn progress_json(progress: &pb::Progress) -> Value {
         "best": progress.best.as_ref().map(evaluation_json),
         "workers": progress.workers.iter().map(worker).collect::<Vec<_>>(),
         "ended": progress.ended, "end_reason": progress.end_reason, "digest": progress.digest,
-        "warning": progress.warning,
+        "warning": progress.warning, "environment": progress.environment,
     })
 }
 

@@ -13,12 +13,16 @@ mod summary;
 use std::time::{Duration, Instant};
 
 use anyhow::anyhow;
+use tandem_net::ClientConfig;
 use tandem_proto::pb;
+use tandem_worker::ServedTask;
 use tokio::sync::mpsc;
 use tokio_util::sync::CancellationToken;
 
 use crate::cli::TrainArgs;
+use crate::environment_server::EnvironmentSource;
 use crate::exit::{Exit, Failed, OrExit as _};
+use crate::service::worker_failed;
 use crate::{clock, runtime, signals};
 use display::Display;
 use inputs::RunInputs;
@@ -39,7 +43,8 @@ const SAMPLE_EVERY: Duration = Duration::from_millis(500);
 const INTERRUPTED: &str = "interrupted";
 
 pub(crate) fn train(args: &TrainArgs) -> Result<(), Failed> {
-    let plan = Plan::of(args)?;
+    let served = served_task(args)?;
+    let plan = Plan::of(args, served.as_ref())?;
     let lock = RunLock::take(&plan)?;
     let service_locks = lock.wait_for_leftovers(&plan)?;
     plan.prepare()?;
@@ -56,6 +61,17 @@ pub(crate) fn train(args: &TrainArgs) -> Result<(), Failed> {
         return Err(Failed::new(Exit::Interrupted, anyhow!(INTERRUPTED)));
     }
     summary::print(&plan, &last, memory, args.json)
+}
+
+/// Asks the server of the environments, if there is one, for its task.
+fn served_task(args: &TrainArgs) -> Result<Option<ServedTask>, Failed> {
+    let runtime = runtime::new().or_exit(Exit::TryAgain, String::new)?;
+    runtime.block_on(async {
+        let source = EnvironmentSource::of(&args.environment, &ClientConfig::default())?;
+        let served = source.served_task().await;
+        source.end().await;
+        served.map_err(worker_failed)
+    })
 }
 
 /// Starts all processes, supervises them until the run has ended, and ends them.

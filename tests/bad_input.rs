@@ -369,8 +369,12 @@ async fn submit_invalid_episodes(address: SocketAddr) {
             2 => episode.actions.fill(0xff),
             _ => episode.kind = 17,
         }
-        let request =
-            pb::SubmitEpisodesRequest { worker_id: slot * 977, slot, episodes: vec![episode] };
+        let request = pb::SubmitEpisodesRequest {
+            worker_id: slot * 977,
+            slot,
+            episodes: vec![episode],
+            environment_check: None,
+        };
         let body = frame(0, &request.encode_to_vec());
         let answer = wire::call(address, "/tandem.v1.Learner/SubmitEpisodes", &body);
         match within_deadline("foreign episodes", answer).await {

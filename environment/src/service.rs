@@ -66,8 +66,8 @@ impl Environment for EnvironmentService {
         _: Request<pb::DescribeEnvironmentRequest>,
     ) -> Result<Response<pb::EnvironmentDescription>, Status> {
         let n_per_stream = self.room.n_total.min(MAX_ENVIRONMENTS);
-        let Config { layout, server, .. } = &self.config;
-        Ok(Response::new(encode_environment(*layout, server, n_per_stream)))
+        let (task, server) = (self.prototypes.task(), &self.config.server);
+        Ok(Response::new(encode_environment(task, server, n_per_stream)))
     }
 
     async fn play(
@@ -165,8 +165,7 @@ impl PlayStream {
     }
 
     fn decode(&mut self, request: pb::PlayRequest) -> Result<PlayCommand, Status> {
-        let layout = self.session.layout();
-        let command = decode_play_request(request, self.session.n(), layout)?;
+        let command = decode_play_request(request, self.session.n(), self.session.task())?;
         if let PlayCommand::Reset(resets) = &command
             && self.permit.is_none()
         {

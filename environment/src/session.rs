@@ -8,7 +8,7 @@ use rayon::iter::{IndexedParallelIterator as _, IntoParallelRefMutIterator as _}
 use rayon::slice::{ParallelSlice as _, ParallelSliceMut as _};
 use tandem_core::rng::{Stream, episode_rng};
 use tandem_core::work::EpisodeStart;
-use tandem_core::{Contacts, Layout};
+use tandem_core::{Contacts, Layout, TaskSpec};
 use tandem_proto::environment::{PlayCommand, encode_reset_reply, encode_step_reply};
 use tandem_proto::pb;
 use tandem_sim::{Env, SimError, WorldConfig};
@@ -17,19 +17,20 @@ use tandem_sim::{Env, SimError, WorldConfig};
 #[derive(Clone)]
 pub(crate) struct Prototypes {
     layout: Layout,
+    task: TaskSpec,
     by_substeps: Arc<Mutex<BTreeMap<u32, Env>>>,
 }
 
 impl Prototypes {
     /// Creates an empty collection. Fails if the simulator does not support the layout.
     pub(crate) fn new(layout: Layout) -> Result<Self, SimError> {
-        let prototypes = Self { layout, by_substeps: Arc::default() };
+        let prototypes = Self { layout, task: layout.into(), by_substeps: Arc::default() };
         prototypes.get(WorldConfig::default().substeps)?;
         Ok(prototypes)
     }
 
-    pub(crate) const fn layout(&self) -> Layout {
-        self.layout
+    pub(crate) const fn task(&self) -> &TaskSpec {
+        &self.task
     }
 
     fn get(&self, substeps: u32) -> Result<Env, SimError> {
@@ -71,8 +72,8 @@ impl Session {
         Self { prototypes, environments: Vec::new() }
     }
 
-    pub(crate) const fn layout(&self) -> Layout {
-        self.prototypes.layout()
+    pub(crate) const fn task(&self) -> &TaskSpec {
+        &self.prototypes.task
     }
 
     /// Returns the number of environments; `None` before the first reset.
@@ -92,7 +93,7 @@ impl Session {
     }
 
     fn reset(&mut self, resets: &[(usize, EpisodeStart)]) -> Result<pb::PlayResponse, SimError> {
-        let layout = self.prototypes.layout();
+        let layout = self.prototypes.layout;
         let mut observations = vec![0.0; resets.len() * layout.n_observation()];
         let mut goals = Vec::with_capacity(resets.len() * layout.n_goal());
         let rows = observations.chunks_exact_mut(layout.n_observation());
@@ -121,7 +122,7 @@ impl Session {
 
     /// Steps all environments, in parallel: they are independent of each other.
     fn step(&mut self, actions: &[f32]) -> Result<pb::PlayResponse, SessionError> {
-        let layout = self.prototypes.layout();
+        let layout = self.prototypes.layout;
         let mut observations = vec![0.0; self.environments.len() * layout.n_observation()];
         let stepped: Vec<Result<Contacts, SimError>> = self
             .environments

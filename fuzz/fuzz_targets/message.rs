@@ -7,6 +7,7 @@ use libfuzzer_sys::fuzz_target;
 use prost::Message;
 use tandem_core::{Layout, Task};
 use tandem_fuzz::with_bounded_memory;
+use tandem_proto::environment::{decode_play_request, decode_reset_reply, decode_step_reply};
 use tandem_proto::{DecodeError, MAX_ARMS, pb};
 
 /// Maximum length of an error message, which is sent in an HTTP/2 header.
@@ -20,7 +21,7 @@ fuzz_target!(|input: &[u8]| {
 });
 
 fn read(message: u8, layout: Layout, bytes: &[u8]) {
-    match message % 10 {
+    match message % 12 {
         0 => check(bytes, |query: pb::StepQuery| {
             let _layout = tandem_proto::layout_of_query(&query, layout.task);
             tandem_proto::decode_query(query, layout)
@@ -51,6 +52,20 @@ fn read(message: u8, layout: Layout, bytes: &[u8]) {
         // Services create these messages themselves. Only their wire format is decoded here.
         7 => check(bytes, Ok::<pb::Progress, DecodeError>),
         8 => check(bytes, Ok::<pb::ExecuteRequest, DecodeError>),
+        // Decoders of streams check a message against the environments of the stream.
+        10 => check(bytes, |request: pb::PlayRequest| {
+            decode_play_request(request.clone(), Some(2), &layout.into())?;
+            Ok(request)
+        }),
+        11 => check(bytes, |reply: pb::PlayResponse| {
+            let task = layout.into();
+            let is_reset = !reply.goals.is_empty();
+            match is_reset {
+                true => decode_reset_reply(&reply, 2, &task).map(drop),
+                false => decode_step_reply(&reply, 2, &task).map(drop),
+            }?;
+            Ok(reply)
+        }),
         _ => check(bytes, Ok::<pb::AdviseRequest, DecodeError>),
     }
 }

@@ -12,7 +12,7 @@ use prometheus_client::metrics::info::Info;
 use prometheus_client::registry::Registry;
 use tandem_rl::trainer::Counters;
 
-use crate::progress::Progress;
+use crate::progress::{EnvironmentChecks, Progress};
 use crate::shared::Shared;
 use crate::work_queue::WorkQueue;
 
@@ -35,6 +35,7 @@ pub(crate) fn page(shared: &Shared) -> String {
     );
     add_progress(&mut registry, &progress);
     add_evaluations(&mut registry, &progress);
+    add_environment(&mut registry, progress.environment);
     let mut page = String::new();
     encode(&mut page, &registry).expect("writing to a string succeeds");
     page
@@ -86,6 +87,18 @@ fn add_progress(registry: &mut Registry, progress: &Progress) {
         "1 while something requires an operator, see Status",
         needs_attention,
     );
+}
+
+/// Adds the checks of environments on servers, if there are any.
+fn add_environment(registry: &mut Registry, checks: EnvironmentChecks) {
+    if checks.n_episodes == 0 {
+        return;
+    }
+    let help = "Episodes that workers have played twice on servers of environments";
+    counter(registry, "environment_checked_episodes", help, checks.n_episodes);
+    let help = "1 while every episode that was played twice was the same both times";
+    let is_deterministic = f64::from(u8::from(!checks.differs));
+    gauge(registry, "environment_deterministic", help, is_deterministic);
 }
 
 /// Adds success rates, as far as there are any.

@@ -36,6 +36,28 @@ pub(crate) struct Progress {
     pub(crate) end: Option<RunEnd>,
     /// Problems that require an operator; empty if there are none.
     pub(crate) warning: String,
+    /// The checks of environments on servers.
+    pub(crate) environment: EnvironmentChecks,
+}
+
+/// The training episodes that workers have played twice on servers of environments.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub(crate) struct EnvironmentChecks {
+    /// Their number since the learner started.
+    pub(crate) n_episodes: u64,
+    /// True if one of them differed the second time.
+    pub(crate) differs: bool,
+}
+
+impl EnvironmentChecks {
+    /// Returns the result in words; empty if nothing was checked.
+    pub(crate) fn text(self) -> String {
+        match (self.n_episodes, self.differs) {
+            (0, _) => String::new(),
+            (_, true) => "not deterministic".to_owned(),
+            (n, false) => format!("deterministic ({n} episodes checked)"),
+        }
+    }
 }
 
 /// The activity of the learning thread.

@@ -329,7 +329,7 @@ impl LearnerService {
 
     /// Accepts a slot's episodes if all of them match the order. Episodes that were submitted before are ignored.
     fn submit(&self, request: pb::SubmitEpisodesRequest) -> Result<(), Status> {
-        let pb::SubmitEpisodesRequest { worker_id, slot, episodes } = request;
+        let pb::SubmitEpisodesRequest { worker_id, slot, episodes, environment_check } = request;
         let now = (self.shared.clock)();
         let mut state = self.shared.lock();
         let terms =
@@ -350,6 +350,9 @@ impl LearnerService {
         };
         let episodes: Vec<Episode> = episodes.into_iter().map(decode).collect::<Result<_, _>>()?;
         self.shared.lock().queue.submit(worker_id, slot, episodes, now).map_err(refused)?;
+        if let Some(check) = environment_check {
+            self.shared.record_environment_check(&check);
+        }
         self.shared.arrived.notify_one();
         Ok(())
     }

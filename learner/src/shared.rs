@@ -8,17 +8,20 @@ use std::time::Duration;
 use tandem_core::work::{PublishedActor, RunTerms};
 use tandem_net::{ClientConfig, EncodedResponse, Pacing, ServerConfig};
 use tandem_policy::Policy;
-use tandem_proto::encode_actor;
+use tandem_proto::{encode_actor, pb};
 use tandem_rl::config::RunConfig;
 use tokio::sync::{Notify, watch};
 
 use crate::connections::{Connections, LogQuota};
 use crate::progress::{Progress, RunEnd};
-use crate::warnings::Warnings;
+use crate::warnings::{Source, Warnings};
 use crate::work_queue::{WorkQueue, Worker};
 
 /// Parameter versions that are kept for workers that lag behind.
 pub(crate) const KEPT_VERSIONS: usize = 16;
+
+/// Largest number of characters of a difference between two plays of an episode in the warning about it.
+const MAX_DIFFERENCE_CHARS: usize = 300;
 
 /// Returns the time since a fixed start. Passed in, so that nothing in this crate reads a clock.
 pub type Clock = Arc<dyn Fn() -> Duration + Send + Sync>;
@@ -120,6 +123,19 @@ impl Shared {
 
     pub(crate) fn lock(&self) -> MutexGuard<'_, State> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Adds the result of playing episodes twice to the progress, with a warning about the first difference.
+    pub(crate) fn record_environment_check(&self, check: &pb::EnvironmentCheck) {
+        self.progress.send_modify(|progress| {
+            progress.environment.n_episodes += u64::from(check.n_episodes);
+            progress.environment.differs |= !check.difference.is_empty();
+        });
+        if !check.difference.is_empty() {
+            let difference: String = check.difference.chars().take(MAX_DIFFERENCE_CHARS).collect();
+            let warning = format!("the environments are not deterministic: {difference}");
+            self.warnings.set_first(Source::Environment, &warning);
+        }
     }
 
     /// Publishes an actor, and drops the oldest beyond [`KEPT_VERSIONS`].

@@ -14,6 +14,8 @@ pub(crate) enum Source {
     Disk,
     /// Episodes that claim other charges than the teacher's account has.
     Advice,
+    /// Environments that do not repeat their episodes.
+    Environment,
     /// A statistic of the normalisers is out of all proportion.
     Statistics,
     /// The teacher.

@@ -42,10 +42,16 @@ pub(crate) fn unknown_call(
         }
         Some(served) => {
             let served = short_name(served);
-            format!("the service at {address} is a {served}, not a {name}: check the address")
+            let [served, name] = [&served, &name].map(|name| with_article(name));
+            format!("the service at {address} is {served}, not {name}: check the address")
         }
         None => format!("the service at {address} does not offer {called}: check the address"),
     }))
+}
+
+fn with_article(name: &str) -> String {
+    let article = if name.starts_with(['a', 'e', 'i', 'o', 'u']) { "an" } else { "a" };
+    format!("{article} {name}")
 }
 
 /// Returns the last part of a service's name, in lower case: `teacher` for `tandem.v1.Teacher`.

@@ -1,7 +1,6 @@
 //! Conversions for `teacher.proto`: queries to a teacher and its advice.
 
 use tandem_core::bounds::MAX_MAGNITUDE;
-use tandem_core::task::MAX_ARMS;
 use tandem_core::{ArmAdvice, ArmIndex, StepAdvice, StepQuery, TaskSpec};
 
 use crate::error::DecodeError;
@@ -22,21 +21,6 @@ pub fn decode_account_name(field: &str, name: String) -> Result<String, DecodeEr
             Err(DecodeError::new(field, format_args!("1 to {MAX_NAME_BYTES} bytes"), n_bytes))
         }
     }
-}
-
-/// Returns the number of arms of a student, derived from the length of its observation; `one` is the teacher's task, of
-/// one arm.
-///
-/// # Errors
-/// Returns an error if no student with 1 to [`MAX_ARMS`] arms has observations of this length.
-pub fn n_arms_of_query(query: &pb::StepQuery, one: &TaskSpec) -> Result<usize, DecodeError> {
-    let (n_numbers, n_per_arm) = (query.observation.len(), one.n_observation());
-    let n_arms = n_numbers / n_per_arm;
-    if n_numbers.is_multiple_of(n_per_arm) && (1..=MAX_ARMS).contains(&n_arms) {
-        return Ok(n_arms);
-    }
-    let expected = format_args!("{n_per_arm} numbers for each of 1 to {MAX_ARMS} arms").to_string();
-    Err(DecodeError::new("observation", expected, format_args!("{n_numbers} numbers")))
 }
 
 /// Encodes a query.
@@ -238,24 +222,6 @@ mod tests {
             |a| a.arms[1].distance = -0.5,
             "arms[1].distance: expected a finite number, 0 or more, got -0.5",
         );
-    }
-
-    #[test]
-    fn the_number_of_arms_follows_from_the_length_of_an_observation() {
-        let n_arms_of = |n_numbers| {
-            n_arms_of_query(
-                &pb::StepQuery { observation: vec![0.0; n_numbers], ..Default::default() },
-                &TaskSpec::built_in(Task::Push, 1),
-            )
-        };
-        for n_arms in 1..=MAX_ARMS {
-            assert_eq!(n_arms_of(28 * n_arms), Ok(n_arms));
-        }
-        for n_numbers in [0, 27, 29, 57, 28 * 9] {
-            let message = n_arms_of(n_numbers).unwrap_err().to_string();
-            let expected = "observation: expected 28 numbers for each of 1 to 8 arms";
-            assert_eq!(message, format!("{expected}, got {n_numbers} numbers"));
-        }
     }
 
     #[test]

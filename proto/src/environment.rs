@@ -1,18 +1,27 @@
 //! Conversions for `environment.proto`: episodes played in an environment of another process.
 
-use std::fmt::Display;
-
 use tandem_core::work::EpisodeStart;
 use tandem_core::{Contacts, EpisodeKind, TaskSpec, WorldSettings};
 
 use crate::error::DecodeError;
 use crate::numbers::{actions_from_bytes, count_within, floats_from_bytes, one_within, to_bytes};
 use crate::pb;
-use crate::task::encode_task;
+use crate::task::{decode_task, encode_task};
 use crate::work::{MAX_SLOT_EPISODES, MAX_SUBSTEPS, decode_contact};
 
 /// Largest number of environments of a stream.
 pub const MAX_ENVIRONMENTS: usize = MAX_SLOT_EPISODES;
+
+/// The description of a server of environments.
+#[derive(Debug, Clone, PartialEq)]
+pub struct EnvironmentDescription {
+    /// The task of the environments.
+    pub task: TaskSpec,
+    /// Name and version of the server's program, of any length.
+    pub server: String,
+    /// The largest number of environments of a stream.
+    pub max_environments: usize,
+}
 
 /// A decoded request of a stream.
 #[derive(Debug, Clone, PartialEq)]
@@ -41,70 +50,34 @@ pub struct StepReply {
     pub contacts: Vec<Contacts>,
 }
 
-/// Encodes the description of a server, called `server`, with environments of `layout`.
+/// Encodes the description of a server, called `server`, with environments of `task`.
 #[must_use]
 pub fn encode_environment(
-    layout: impl Into<TaskSpec>,
+    task: &TaskSpec,
     server: &str,
     max_environments: usize,
 ) -> pb::EnvironmentDescription {
     pb::EnvironmentDescription {
-        task: Some(encode_task(&layout.into())),
+        task: Some(encode_task(task)),
         server: server.to_owned(),
         max_environments: u32::try_from(max_environments).unwrap_or(u32::MAX),
     }
 }
 
-/// Checks that a server's task equals the run's.
+/// Decodes the description of a server.
 ///
 /// # Errors
-/// Names the first field that differs.
-pub fn check_task(
-    expected: &pb::TaskDescription,
-    got: &pb::TaskDescription,
-) -> Result<(), DecodeError> {
-    let (e, g) = (expected, got);
-    same("name", &format!("{:?}", e.name), &format!("{:?}", g.name))?;
-    same("n_observation", &e.n_observation, &g.n_observation)?;
-    same("n_goal", &e.n_goal, &g.n_goal)?;
-    same("n_action", &e.n_action, &g.n_action)?;
-    same("number of arms", &e.arms.len(), &g.arms.len())?;
-    for (idx, (e, g)) in e.arms.iter().zip(&g.arms).enumerate() {
-        let parts = [
-            ("observation", &e.observation, &g.observation),
-            ("goal", &e.goal, &g.goal),
-            ("action", &e.action, &g.action),
-            ("position", &e.position, &g.position),
-        ];
-        for (part, e, g) in parts {
-            same_list(&format!("arms[{idx}].{part}"), e, g)?;
-        }
-    }
-    same_list("achieved_goal", &e.achieved_goal, &g.achieved_goal)?;
-    same("episode_steps", &e.episode_steps, &g.episode_steps)?;
-    same("tolerance", &e.tolerance, &g.tolerance)?;
-    same("norm", &e.norm().as_str_name(), &g.norm().as_str_name())?;
-    same("interchangeable_arms", &e.interchangeable_arms, &g.interchangeable_arms)?;
-    same("reports_contacts", &e.reports_contacts, &g.reports_contacts)?;
-    same("origin_distance", &e.origin_distance, &g.origin_distance)?;
-    same("recombination_gap", &e.recombination_gap, &g.recombination_gap)?;
-    same_list("observation_bound", &e.observation_bound, &g.observation_bound)?;
-    same_list("goal_bound", &e.goal_bound, &g.goal_bound)
-}
-
-fn same<T: PartialEq + Display>(field: &str, expected: &T, got: &T) -> Result<(), DecodeError> {
-    if expected == got { Ok(()) } else { Err(DecodeError::new(field, expected, got)) }
-}
-
-fn same_list<T: PartialEq + Display>(
-    field: &str,
-    expected: &[T],
-    got: &[T],
-) -> Result<(), DecodeError> {
-    let count = |values: &[T]| format!("{} numbers", values.len());
-    same(field, &count(expected), &count(got))?;
-    let mut pairs = expected.iter().zip(got).enumerate();
-    pairs.try_for_each(|(idx, (e, g))| same(&format!("{field}[{idx}]"), e, g))
+/// Returns an error if the task is missing or invalid, or the number of environments is 0.
+pub fn decode_environment(
+    description: pb::EnvironmentDescription,
+) -> Result<EnvironmentDescription, DecodeError> {
+    let task = description.task.ok_or_else(|| DecodeError::missing("task"))?;
+    let max = count_within("max_environments", description.max_environments, &(1..=u32::MAX))?;
+    Ok(EnvironmentDescription {
+        task: decode_task(task).map_err(|error| error.within("task"))?,
+        server: description.server,
+        max_environments: usize::try_from(max).unwrap_or(usize::MAX),
+    })
 }
 
 /// Encodes a request that resets environments 0 to `starts.len() - 1`.
@@ -140,9 +113,8 @@ pub fn encode_step(actions: &[f32]) -> pb::PlayRequest {
 pub fn decode_play_request(
     request: pb::PlayRequest,
     n: Option<usize>,
-    layout: impl Into<TaskSpec>,
+    task: &TaskSpec,
 ) -> Result<PlayCommand, DecodeError> {
-    let layout = layout.into();
     use pb::play_request::Command;
     match (request.command, n) {
         (None, _) => Err(DecodeError::missing("command")),
@@ -153,7 +125,7 @@ pub fn decode_play_request(
             Err(DecodeError::new("command", "a reset as the first request", "a step"))
         }
         (Some(Command::Step(step)), Some(n)) => {
-            let actions = actions_from_bytes("step.actions", &step.actions, n * layout.n_action());
+            let actions = actions_from_bytes("step.actions", &step.actions, n * task.n_action());
             actions.map(PlayCommand::Step)
         }
     }
@@ -229,15 +201,12 @@ pub fn encode_step_reply(observations: &[f32], contacts: &[Contacts]) -> pb::Pla
 pub fn decode_reset_reply(
     reply: &pb::PlayResponse,
     n: usize,
-    layout: impl Into<TaskSpec>,
+    task: &TaskSpec,
 ) -> Result<ResetReply, DecodeError> {
-    let layout = layout.into();
     check_empty("contacts", &reply.contacts)?;
     Ok(ResetReply {
-        observations: decode_observations(&reply.observations, n, &layout)?,
-        goals: decode_rows("goals", &reply.goals, n, layout.n_goal(), |idx| {
-            layout.goal_bound(idx)
-        })?,
+        observations: decode_observations(&reply.observations, n, task)?,
+        goals: decode_rows("goals", &reply.goals, n, task.n_goal(), |idx| task.goal_bound(idx))?,
     })
 }
 
@@ -249,29 +218,32 @@ pub fn decode_reset_reply(
 pub fn decode_step_reply(
     reply: &pb::PlayResponse,
     n: usize,
-    layout: impl Into<TaskSpec>,
+    task: &TaskSpec,
 ) -> Result<StepReply, DecodeError> {
-    let layout = layout.into();
     check_empty("goals", &reply.goals)?;
-    let n_contacts = if layout.reports_contacts() { n } else { 0 };
-    if reply.contacts.len() != n_contacts {
-        let expected = format_args!("{n_contacts} bytes, one per environment").to_string();
-        let got = format_args!("{} bytes", reply.contacts.len()).to_string();
-        return Err(DecodeError::new("contacts", expected, got));
-    }
     Ok(StepReply {
-        observations: decode_observations(&reply.observations, n, &layout)?,
-        contacts: if layout.reports_contacts() {
-            reply.contacts.iter().enumerate().map(decode_contact).collect::<Result<_, _>>()?
-        } else {
-            vec![Contacts::NONE; n]
-        },
+        observations: decode_observations(&reply.observations, n, task)?,
+        contacts: decode_contacts(&reply.contacts, n, task)?,
     })
 }
 
-fn decode_observations(bytes: &[u8], n: usize, layout: &TaskSpec) -> Result<Vec<f32>, DecodeError> {
-    let bound = |idx| layout.observation_bound(idx);
-    decode_rows("observations", bytes, n, layout.n_observation(), bound)
+/// Decodes the contacts of `n` environments. A task may report none.
+fn decode_contacts(bytes: &[u8], n: usize, task: &TaskSpec) -> Result<Vec<Contacts>, DecodeError> {
+    if !task.reports_contacts() {
+        check_empty("contacts", bytes)?;
+        return Ok(vec![Contacts::NONE; n]);
+    }
+    if bytes.len() != n {
+        let expected = format_args!("{n} bytes, one per environment").to_string();
+        let got = format_args!("{} bytes", bytes.len()).to_string();
+        return Err(DecodeError::new("contacts", expected, got));
+    }
+    bytes.iter().enumerate().map(decode_contact).collect()
+}
+
+fn decode_observations(bytes: &[u8], n: usize, task: &TaskSpec) -> Result<Vec<f32>, DecodeError> {
+    let bound = |idx| task.observation_bound(idx);
+    decode_rows("observations", bytes, n, task.n_observation(), bound)
 }
 
 /// Decodes `n` rows of `n_columns` finite numbers. `largest` returns the bound on the magnitude of a column.
@@ -305,11 +277,14 @@ fn check_empty(field: &str, bytes: &[u8]) -> Result<(), DecodeError> {
 
 #[cfg(test)]
 mod tests {
-    use tandem_core::{Layout, Task};
+    use tandem_core::Task;
+    use tandem_core::task::TaskDescription;
 
     use super::*;
 
-    const LAYOUT: Layout = Layout::new(Task::Push, 1);
+    fn task() -> TaskSpec {
+        TaskSpec::built_in(Task::Push, 1)
+    }
 
     fn start(number: u64) -> EpisodeStart {
         EpisodeStart {
@@ -331,10 +306,10 @@ mod tests {
 
     #[test]
     fn requests_round_trip() {
-        let decoded = decode_play_request(reset(|_| ()), None, LAYOUT);
+        let decoded = decode_play_request(reset(|_| ()), None, &task());
         assert_eq!(decoded, Ok(PlayCommand::Reset(vec![(0, start(3)), (1, start(4))])));
         let actions = vec![0.5, -1.0, 0.0, 1.0, 0.25, -0.75];
-        let decoded = decode_play_request(encode_step(&actions), Some(2), LAYOUT);
+        let decoded = decode_play_request(encode_step(&actions), Some(2), &task());
         assert_eq!(decoded, Ok(PlayCommand::Step(actions)));
     }
 
@@ -343,16 +318,16 @@ mod tests {
         let last = reset(|resets| {
             resets.remove(0);
         });
-        let decoded = decode_play_request(last, Some(2), LAYOUT);
+        let decoded = decode_play_request(last, Some(2), &task());
         assert_eq!(decoded, Ok(PlayCommand::Reset(vec![(1, start(4))])));
-        let decoded = decode_play_request(reset(|resets| resets.reverse()), Some(2), LAYOUT);
+        let decoded = decode_play_request(reset(|resets| resets.reverse()), Some(2), &task());
         assert_eq!(decoded, Ok(PlayCommand::Reset(vec![(1, start(4)), (0, start(3))])));
     }
 
     #[test]
     fn a_malformed_request_is_refused_by_name() {
         let check = |request: pb::PlayRequest, n, message: &str| {
-            assert_eq!(decode_play_request(request, n, LAYOUT).unwrap_err().to_string(), message);
+            assert_eq!(decode_play_request(request, n, &task()).unwrap_err().to_string(), message);
         };
         check(pb::PlayRequest::default(), Some(2), "command: expected a message, got none");
         check(
@@ -409,24 +384,22 @@ mod tests {
     }
 
     #[test]
-    fn the_first_field_of_another_task_is_named() {
-        let check = |corrupt: fn(&mut pb::TaskDescription), message: &str| {
-            let (run, mut server) = (encode_task(&LAYOUT.into()), encode_task(&LAYOUT.into()));
-            corrupt(&mut server);
-            assert_eq!(check_task(&run, &server).unwrap_err().to_string(), message);
+    fn a_description_round_trips_and_a_malformed_one_is_refused_by_name() {
+        let message = encode_environment(&task(), "lab 2", 8);
+        let description = EnvironmentDescription {
+            task: task(),
+            server: "lab 2".to_owned(),
+            max_environments: 8,
         };
-        assert_eq!(check_task(&encode_task(&LAYOUT.into()), &encode_task(&LAYOUT.into())), Ok(()));
-        check(|task| task.name = "reach".to_owned(), "name: expected \"push\", got \"reach\"");
-        check(|task| task.n_action = 4, "n_action: expected 3, got 4");
-        check(|task| task.arms.clear(), "number of arms: expected 1, got 0");
-        check(|task| task.arms[0].goal[1] = 7, "arms[0].goal[1]: expected 1, got 7");
-        check(
-            |task| task.achieved_goal.clear(),
-            "achieved_goal: expected 3 numbers, got 0 numbers",
-        );
-        check(|task| task.tolerance = 0.1, "tolerance: expected 0.05, got 0.1");
-        check(|task| task.norm = 2, "norm: expected NORM_EUCLIDEAN, got NORM_MAXIMUM");
-        check(|task| task.goal_bound[2] = 9.0, "goal_bound[2]: expected 2, got 9");
+        assert_eq!(decode_environment(message.clone()), Ok(description));
+        let check = |corrupt: fn(&mut pb::EnvironmentDescription), expected: &str| {
+            let mut malformed = message.clone();
+            corrupt(&mut malformed);
+            assert_eq!(decode_environment(malformed).unwrap_err().to_string(), expected);
+        };
+        check(|it| it.task = None, "task: expected a message, got none");
+        check(|it| it.max_environments = 0, "max_environments: expected 1 to 4294967295, got 0");
+        check(|it| it.task.as_mut().unwrap().n_goal = 0, "task.n_goal: expected 1 to 4096, got 0");
     }
 
     #[test]
@@ -434,11 +407,11 @@ mod tests {
         let ramp = |n: u16| (0..n).map(|i| f32::from(i) / 256.0).collect::<Vec<f32>>();
         let reply = ResetReply { observations: ramp(56), goals: ramp(6) };
         let message = encode_reset_reply(&reply.observations, &reply.goals);
-        assert_eq!(decode_reset_reply(&message, 2, LAYOUT), Ok(reply));
+        assert_eq!(decode_reset_reply(&message, 2, &task()), Ok(reply));
         let contacts = vec![Contacts::NONE, Contacts::ARM_TABLE];
         let reply = StepReply { observations: ramp(56), contacts };
         let message = encode_step_reply(&reply.observations, &reply.contacts);
-        assert_eq!(decode_step_reply(&message, 2, LAYOUT), Ok(reply));
+        assert_eq!(decode_step_reply(&message, 2, &task()), Ok(reply));
     }
 
     #[test]
@@ -446,7 +419,7 @@ mod tests {
         let check = |corrupt: fn(&mut pb::PlayResponse), message: &str| {
             let mut reply = encode_step_reply(&[0.0; 56], &[Contacts::NONE; 2]);
             corrupt(&mut reply);
-            assert_eq!(decode_step_reply(&reply, 2, LAYOUT).unwrap_err().to_string(), message);
+            assert_eq!(decode_step_reply(&reply, 2, &task()).unwrap_err().to_string(), message);
         };
         check(
             |reply| reply.observations[4 * 33..4 * 34].fill(0xff),
@@ -469,8 +442,18 @@ mod tests {
             "contacts[1]: expected bits 0 (arm and arm) and 1 (arm and table), got 0b00000100",
         );
         check(|reply| reply.goals = vec![0; 24], "goals: expected no bytes, got 24 bytes");
+        let name = "silent".to_owned();
+        let silent =
+            TaskDescription { name, reports_contacts: false, ..task().description().clone() };
+        let silent = TaskSpec::new(silent).unwrap();
+        let reply = encode_step_reply(&[0.0; 28], &[Contacts::NONE]);
+        let error = decode_step_reply(&reply, 1, &silent).unwrap_err().to_string();
+        assert_eq!(error, "contacts: expected no bytes, got 1 bytes");
+        let reply = encode_step_reply(&[0.0; 28], &[]);
+        let decoded = decode_step_reply(&reply, 1, &silent).unwrap();
+        assert_eq!(decoded.contacts, [Contacts::NONE]);
         let goals = encode_reset_reply(&[0.0; 28], &[0.0, f32::INFINITY, 0.0]);
-        let error = decode_reset_reply(&goals, 1, LAYOUT).unwrap_err().to_string();
+        let error = decode_reset_reply(&goals, 1, &task()).unwrap_err().to_string();
         assert_eq!(error, "environment 0: goals[1]: expected a number in [-2, 2], got inf");
     }
 }

@@ -35,9 +35,7 @@ mod numbers;
 pub mod task;
 pub mod work;
 
-pub use advice::{
-    decode_account_name, decode_advice, decode_query, encode_advice, encode_query, n_arms_of_query,
-};
+pub use advice::{decode_account_name, decode_advice, decode_query, encode_advice, encode_query};
 pub use error::DecodeError;
 pub use task::{decode_task, encode_task};
 pub use work::{

@@ -18,7 +18,8 @@ pub(crate) struct HealthArgs {
     /// Address of the service.
     #[arg(value_name = "ADDR")]
     pub(crate) address: String,
-    /// Name of one service: tandem.v1.Teacher, tandem.v1.Learner or tandem.v1.Bridge [default: the whole server].
+    /// Name of one service: tandem.v1.Teacher, tandem.v1.Learner, tandem.v1.Environment or tandem.v1.Bridge
+    /// [default: the whole server].
     #[arg(long, default_value = "", hide_default_value = true, value_name = "NAME")]
     pub(crate) service: String,
     /// Timeout in seconds.
@@ -57,7 +58,7 @@ pub(crate) struct StatusArgs {
 }
 
 /// Parses a positive number of seconds.
-fn seconds(text: &str) -> Result<Duration, String> {
+pub(super) fn seconds(text: &str) -> Result<Duration, String> {
     let span = text.parse().ok().and_then(|seconds| Duration::try_from_secs_f64(seconds).ok());
     let span = span.filter(|span| !span.is_zero());
     span.ok_or_else(|| "expected a number of seconds, more than 0".to_owned())

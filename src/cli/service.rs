@@ -3,10 +3,12 @@
 use std::ffi::OsString;
 use std::net::SocketAddr;
 use std::path::PathBuf;
+use std::time::Duration;
 
 use clap::Args;
 
 use super::TaskName;
+use super::monitor::seconds;
 
 /// Access token.
 #[derive(Debug, Args)]
@@ -121,11 +123,35 @@ pub(crate) struct LearnerArgs {
     pub(crate) secret: SecretArgs,
 }
 
+/// The environments of workers.
+#[derive(Debug, Args)]
+pub(crate) struct EnvironmentArgs {
+    /// Plays in the environments of the server at this address [default: simulates the environments in the worker].
+    #[arg(long, value_name = "ADDR")]
+    pub(crate) env: Option<String>,
+    /// Plays in the environments of a server that this shell command starts, one server per worker. The command reads
+    /// the address from TANDEM_ENV_LISTEN and prints `listening on http://HOST:PORT`.
+    #[arg(long, value_name = "CMD", conflicts_with = "env")]
+    pub(crate) env_command: Option<String>,
+    /// Deadline of the start of the environment command and of each reply of the server, seconds.
+    #[arg(long, default_value = "60", value_name = "S", value_parser = seconds)]
+    pub(crate) env_timeout_s: Duration,
+    /// File with the access token of the server at --env [default: --token-file, if there is one].
+    #[arg(long, value_name = "FILE", requires = "env")]
+    pub(crate) env_token_file: Option<PathBuf>,
+    /// Connects to the server at --env by TLS and trusts certificates signed by this authority (PEM)
+    /// [default: --tls-ca, if there is one].
+    #[arg(long, value_name = "FILE.pem", requires = "env")]
+    pub(crate) env_tls_ca: Option<PathBuf>,
+}
+
 #[derive(Debug, Args)]
 #[command(after_help = "\
 Examples:
   tandem worker --connect 127.0.0.1:7000 --teacher 127.0.0.1:7001
-  tandem worker --connect learner:7000 --teacher teacher:7001 --name bench-3")]
+  tandem worker --connect learner:7000 --teacher teacher:7001 --name bench-3
+  tandem worker --connect learner:7000 --teacher teacher:7001 --env simulator:7005
+  tandem worker --connect learner:7000 --env-command 'python3 server.py'    a server of its own")]
 pub(crate) struct WorkerArgs {
     /// Address of the learner or relay.
     #[arg(long, value_name = "ADDR")]
@@ -139,6 +165,8 @@ pub(crate) struct WorkerArgs {
     /// Directory for recorded episodes.
     #[arg(long, value_name = "DIR")]
     pub(crate) log_dir: Option<PathBuf>,
+    #[command(flatten)]
+    pub(crate) environment: EnvironmentArgs,
     #[command(flatten)]
     pub(crate) client_config: ClientArgs,
     #[command(flatten)]
@@ -165,6 +193,13 @@ pub(crate) struct RelayArgs {
     pub(crate) client_config: ClientArgs,
     #[command(flatten)]
     pub(crate) secret: SecretArgs,
+}
+
+/// The guard of an environment command.
+#[derive(Debug, Args)]
+pub(crate) struct EnvGuardArgs {
+    /// Command for the shell.
+    pub(crate) command: OsString,
 }
 
 #[derive(Debug, Args)]

@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use clap::{Args, ValueEnum};
 
-use super::TaskName;
+use super::{EnvironmentArgs, TaskName};
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub(crate) enum RecipeName {
@@ -22,6 +22,8 @@ Examples:
   tandem train --strategy ea --budget 50000 --seed 2 --max-minutes 20
   tandem train --set ddpg.discount=0.98 --set rounds.slots=16
   tandem train --run my-run.toml --out runs/mine
+  tandem train --env 127.0.0.1:7005                   plays in the environments of a server
+  tandem train --env-command 'tandem env'             each worker starts a server of its own
   tandem train --resume --out runs/mine               resumes the run
   tandem train --resume --out runs/mine --max-env-steps 600000    resumes it for longer")]
 pub(crate) struct TrainArgs {
@@ -45,6 +47,8 @@ pub(crate) struct TrainArgs {
     /// Number of worker processes [default: one per core, at most one per slot].
     #[arg(long, value_name = "N")]
     pub(crate) workers: Option<usize>,
+    #[command(flatten)]
+    pub(crate) environment: EnvironmentArgs,
     /// Seed of all random numbers [default: 1].
     #[arg(long, value_name = "N")]
     pub(crate) seed: Option<u64>,

@@ -6,6 +6,7 @@ use tonic::{Code, Status};
 
 use super::run;
 use crate::cli::WorkerArgs;
+use crate::environment_server::EnvironmentSource;
 use crate::exit::{Exit, Failed};
 use crate::{access, signals};
 
@@ -13,26 +14,41 @@ pub(crate) fn worker(args: WorkerArgs) -> Result<(), Failed> {
     let client_config = access::client_config(&args.client_config, &args.secret)?;
     run(async move {
         let shutdown = signals::shutdown_token(args.exit_with_stdin)?;
+        let server = EnvironmentSource::of(&args.environment, &client_config)?;
         let config = WorkerConfig {
             client: client_config,
+            environment: server.config(),
             learner: args.connect,
             teacher: args.teacher,
             name: args.name,
             log_dir: args.log_dir,
             pacing: Pacing::Concurrent,
         };
-        tandem_worker::run(config, shutdown).await.map_err(worker_failed)
+        let ended = tandem_worker::run(config, shutdown).await;
+        server.end().await;
+        ended.map_err(worker_failed)
     })
 }
 
-fn worker_failed(error: Error) -> Failed {
+pub(crate) fn worker_failed(error: Error) -> Failed {
     use Error as E;
     let exit = match error {
-        E::Address { .. } | E::NoTeacher { .. } => Exit::Usage,
-        E::Rollout { .. } | E::World(_) | E::Panicked(_) | E::NoAccount { .. } => Exit::Bug,
-        E::Protocol { .. } | E::Parameters { .. } | E::LogDir { .. } | E::Thread(_) => {
-            Exit::TryAgain
+        E::Address { .. }
+        | E::NoTeacher { .. }
+        | E::NoEnvironment(_)
+        | E::NotBuiltIn { .. }
+        | E::OtherTask { .. }
+        | E::TooFewEnvironments { .. } => Exit::Usage,
+        E::EnvironmentRefused { ref status, .. } if is_configuration(status) => Exit::Usage,
+        E::InvalidReply { .. } | E::EnvironmentRefused { .. } => Exit::Data,
+        E::Rollout { .. } | E::World(_) | E::Panicked(_) | E::NoAccount { .. } | E::NoServer => {
+            Exit::Bug
         }
+        E::EnvironmentFailed { .. }
+        | E::Protocol { .. }
+        | E::Parameters { .. }
+        | E::LogDir { .. }
+        | E::Thread(_) => Exit::TryAgain,
     };
     let error = anyhow::Error::from(error);
     match configuration_problem(&error) {
@@ -44,6 +60,10 @@ fn worker_failed(error: Error) -> Failed {
 /// Returns the message of a peer that requires another token or is another service.
 fn configuration_problem(error: &anyhow::Error) -> Option<&str> {
     let mut statuses = error.chain().filter_map(|cause| cause.downcast_ref::<Status>());
-    let is_final = |code| matches!(code, Code::Unauthenticated | Code::Unimplemented);
-    statuses.find(|status| is_final(status.code())).map(Status::message)
+    statuses.find(|status| is_configuration(status)).map(Status::message)
+}
+
+/// Returns whether a peer requires another token or is another service.
+fn is_configuration(status: &Status) -> bool {
+    matches!(status.code(), Code::Unauthenticated | Code::Unimplemented)
 }

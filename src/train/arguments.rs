@@ -42,6 +42,7 @@ pub(super) fn worker(
     push_address(&mut args, "--connect", Some(learner_address));
     push_path(&mut args, "--log-dir", &plan.out.join("mcap"));
     push_address(&mut args, "--teacher", teacher_address);
+    args.extend(plan.environment.iter().cloned());
     args
 }
 

@@ -1,5 +1,6 @@
 //! The plan of a run: its settings, its directory, its teacher and the number of workers.
 
+use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 
 use tandem_core::Task;
@@ -7,11 +8,13 @@ use tandem_learner::{checkpoint, settings};
 use tandem_policy::Policy;
 use tandem_rl::RunConfig;
 use tandem_system::atomic_file;
+use tandem_worker::ServedTask;
 use toml::Value;
 
 use crate::cli::{RecipeName, TrainArgs};
 use crate::exit::{Exit, Failed, OrExit as _};
-use crate::{policy_file, run_directory, run_file};
+use crate::service::worker_failed;
+use crate::{environment_server, policy_file, run_directory, run_file};
 
 /// A run that can be started.
 pub(crate) struct Plan {
@@ -20,6 +23,8 @@ pub(crate) struct Plan {
     pub(crate) teacher: Option<TeacherFile>,
     pub(crate) n_workers: usize,
     pub(crate) resume: bool,
+    /// The arguments of workers that play in the environments of a server.
+    pub(crate) environment: Vec<OsString>,
 }
 
 /// The policy of the teacher, as read from its file.
@@ -29,9 +34,14 @@ pub(crate) struct TeacherFile {
 }
 
 impl Plan {
-    /// Resolves the command line, and rejects a run that cannot be started.
-    pub(crate) fn of(args: &TrainArgs) -> Result<Self, Failed> {
-        let config = config(args)?;
+    /// Resolves the command line, and rejects a run that cannot be started. `served` is the task of the server of
+    /// environments, if there is one.
+    pub(crate) fn of(args: &TrainArgs, served: Option<&ServedTask>) -> Result<Self, Failed> {
+        let config = config(args, served)?;
+        if let Some(served) = served {
+            let task = config.layout().or_exit(Exit::Usage, String::new)?;
+            served.check(&task).map_err(worker_failed)?;
+        }
         let out = match &args.out {
             Some(out) => out.clone(),
             None => free_run_directory(&config),
@@ -48,7 +58,8 @@ impl Plan {
         if !(1..=1024).contains(&n_workers) {
             return Err(Failed::usage(format!("--workers {n_workers}: expected 1 to 1024")));
         }
-        let plan = Self { config, out, teacher, n_workers, resume: args.resume };
+        let environment = environment_server::arguments(&args.environment);
+        let plan = Self { config, out, teacher, n_workers, resume: args.resume, environment };
         plan.check_directory()?;
         Ok(plan)
     }
@@ -162,7 +173,7 @@ fn teacher_copy(out: &Path) -> PathBuf {
 }
 
 /// Resolves the settings; those of a resumed run come from its own run file.
-fn config(args: &TrainArgs) -> Result<RunConfig, Failed> {
+fn config(args: &TrainArgs, served: Option<&ServedTask>) -> Result<RunConfig, Failed> {
     let own_file = args.out.as_ref().filter(|_| args.resume).map(|out| out.join("run.toml"));
     if let Some((file, out)) = own_file.as_ref().zip(args.out.as_ref())
         && !file.exists()
@@ -170,7 +181,7 @@ fn config(args: &TrainArgs) -> Result<RunConfig, Failed> {
         run_directory::check_path(out)?;
         return Err(Failed::usage(format!("{} holds no run to resume", out.display())));
     }
-    let settings = settings_of(args)?;
+    let settings = [served_settings(args, served)?, settings_of(args)?].concat();
     let config = run_file::resolve(args.run.as_deref().or(own_file.as_deref()), &settings)?;
     let is_named = settings.iter().any(|(key, _)| key == "name");
     // A resumed run keeps the name in its own run file, even if --run names another one.
@@ -181,6 +192,29 @@ fn config(args: &TrainArgs) -> Result<RunConfig, Failed> {
         },
         None => Ok(config),
     }
+}
+
+/// Returns the settings that describe the task of a server, unless the task is built-in or the command line names a task
+/// or a run.
+fn served_settings(
+    args: &TrainArgs,
+    served: Option<&ServedTask>,
+) -> Result<Vec<(String, Value)>, Failed> {
+    let names_task = args.task.is_some() || args.run.is_some() || args.resume;
+    let Some(task) = served.map(|served| &served.task).filter(|_| !names_task) else {
+        return Ok(Vec::new());
+    };
+    if task.as_built_in().is_some() {
+        return Ok(Vec::new());
+    }
+    let description = Value::try_from(task.description()).or_exit(Exit::Bug, String::new)?;
+    let n_arms = i64::try_from(task.n_arms()).unwrap_or(i64::MAX);
+    let settings = [
+        ("task", Value::String(task.name().to_owned())),
+        ("arms", Value::Integer(n_arms)),
+        ("description", description),
+    ];
+    Ok(settings.map(|(key, value)| (key.to_owned(), value)).into())
 }
 
 /// Converts the flags to settings of the run file, after those of `--set`.
@@ -225,7 +259,8 @@ fn account_name(out: &Path) -> Option<String> {
 /// Returns `runs/TASK-ARMS-STRATEGY-seedN`, with a number appended if that exists.
 fn free_run_directory(config: &RunConfig) -> PathBuf {
     let strategy = config.advice.strategy.replace(':', "-");
-    let name = format!("{}-{}-{strategy}-seed{}", config.task, config.arms, config.seed);
+    let task = config.task.replace('/', "-");
+    let name = format!("{task}-{}-{strategy}-seed{}", config.arms, config.seed);
     let base = Path::new("runs").join(name);
     let numbered = (2..).map(|n: u32| PathBuf::from(format!("{}.{n}", base.display())));
     std::iter::once(base.clone()).chain(numbered).find(|path| !path.exists()).unwrap_or(base)
@@ -240,16 +275,25 @@ fn teacher_file(args: &TrainArgs, config: &RunConfig, out: &Path) -> Result<Teac
     };
     let policy = policy_file::load(&path)?;
     let shown = path.display();
-    if policy.layout.n_arms != 1 {
+    if policy.layout.n_arms() != 1 {
         return Err(Failed::usage(format!(
             "{shown} drives {} arms: a teacher drives one",
-            policy.layout.n_arms
+            policy.layout.n_arms()
         )));
     }
-    if policy.layout.task.name() != config.task {
+    if policy.layout.name() != config.task {
         return Err(Failed::usage(format!(
             "{shown} is a teacher for {}, the run is for {}",
-            policy.layout.task, config.task
+            policy.layout.name(),
+            config.task
+        )));
+    }
+    let one_arm = config.layout().or_exit(Exit::Usage, String::new)?.single_arm();
+    let difference = one_arm.and_then(|task| task.difference(&policy.layout));
+    if let Some(difference) = difference {
+        return Err(Failed::usage(format!(
+            "{shown} is a teacher for another task {:?} than the run's: {difference}",
+            config.task
         )));
     }
     Ok(TeacherFile { path, policy })

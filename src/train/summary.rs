@@ -76,6 +76,11 @@ fn summary_lines(
             grouped(last.advice_spent),
             grouped(last.budget_left)
         ),
+    ]);
+    if !last.environment.is_empty() {
+        lines.push(format!("environment   {}", last.environment));
+    }
+    lines.extend([
         format!(
             "memory        learner {} MiB, teacher {} MiB, workers at most {} MiB",
             memory.learner_mib, memory.teacher_mib, memory.worker_mib
@@ -137,6 +142,9 @@ fn summary_json(
         "policy": plan.best_policy().to_string_lossy(),
         "digest": last.digest,
     });
+    if !last.environment.is_empty() {
+        summary["environment"] = last.environment.as_str().into();
+    }
     if let (Some(summary), Value::Object(more)) = (summary.as_object_mut(), more) {
         summary.extend(more);
     }

@@ -74,7 +74,7 @@ fn a_ledger_keeps_its_accounts_leases_and_verdicts() {
             wanted_in_second_half: true,
         };
         let charges = vec![charge(4), charge(5)];
-        let request = ChargeRequest { account: "leased".to_owned(), charges };
+        let request = ChargeRequest { account: "leased".to_owned(), episode_steps: 50, charges };
         ledger.charge(&[request]).remove(0).expect("charged");
         let balance = ledger.balance("leased").expect("an account");
         assert_eq!((balance.spent, balance.leased, balance.left), (26, 44, 930));

@@ -55,6 +55,12 @@ pub trait EnvironmentServer: Debug + Send + Sync {
     /// Returns the server's address, `HOST:PORT` or a URI. Starts the server first if it does not run and can be
     /// started.
     fn address(&self) -> ServerAddress<'_>;
+
+    /// Returns the address of a server after a call of the previous one has failed. A server that can be restarted is
+    /// restarted first.
+    fn address_after_failure(&self) -> ServerAddress<'_> {
+        self.address()
+    }
 }
 
 /// The future of a server's address.

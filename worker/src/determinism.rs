@@ -145,7 +145,7 @@ mod tests {
     use crate::rollout::play_slot;
 
     fn checked(drift: f32) -> DeterminismCheck {
-        let mut env = FakeEnvironment { drift, ..FakeEnvironment::new() };
+        let mut env = FakeEnvironment::drifting(drift);
         let (order, terms) = (slot(&[3, 8], false), terms());
         let actor = &mut FakeActor::Seeker;
         let episodes =

@@ -4,11 +4,11 @@ use tandem_core::TaskSpec;
 use tandem_core::work::EpisodeStart;
 use tandem_net::{AuthChannel, MAX_MESSAGE_BYTES, Operation, Retrier, Retryability, within};
 use tandem_proto::environment::{
-    ResetReply, StepReply, check_task, decode_reset_reply, decode_step_reply, encode_reset,
+    ResetReply, StepReply, decode_environment, decode_reset_reply, decode_step_reply, encode_reset,
     encode_step,
 };
 use tandem_proto::pb::environment_client::EnvironmentClient;
-use tandem_proto::{DecodeError, encode_task, pb};
+use tandem_proto::{DecodeError, pb};
 use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
 use tonic::{Status, Streaming};
@@ -22,6 +22,40 @@ const PLAY: Operation =
 const STREAM_CAPACITY: usize = 1;
 /// The largest number of characters of a server's own name in messages.
 const MAX_NAME_CHARS: usize = 100;
+
+/// A server of environments and its task.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ServedTask {
+    /// The name of the server in messages: its address and program.
+    pub server: String,
+    /// The task of its environments.
+    pub task: TaskSpec,
+}
+
+impl ServedTask {
+    /// Checks that the server serves the run's task.
+    ///
+    /// # Errors
+    /// Names the first field that differs.
+    pub fn check(&self, run: &TaskSpec) -> Result<(), Error> {
+        let Some(difference) = run.difference(&self.task) else { return Ok(()) };
+        Err(Error::OtherTask { server: self.server.clone(), difference })
+    }
+}
+
+/// Waits for the server of `config` and returns its task.
+///
+/// # Errors
+/// When the server cannot be started, does not answer after several attempts, or has an invalid task.
+pub async fn describe_environments(config: EnvironmentConfig) -> Result<ServedTask, Error> {
+    let mut environments = Environments::new(config);
+    loop {
+        match environments.connect().await {
+            Ok(server) => return Ok(server.served.clone()),
+            Err(failure) => environments.recover(failure).await?,
+        }
+    }
+}
 
 /// The server of a worker's environments, called over one stream.
 ///
@@ -47,7 +81,8 @@ pub(crate) struct Environments {
 #[derive(Debug)]
 struct Server {
     client: EnvironmentClient<AuthChannel>,
-    max_environments: u32,
+    served: ServedTask,
+    max_environments: usize,
 }
 
 #[derive(Debug)]
@@ -82,37 +117,39 @@ impl Environments {
         }
     }
 
-    /// Waits for the server and checks that it serves the task of `layout`.
-    pub(crate) async fn check(&mut self, layout: &TaskSpec) -> Result<(), Error> {
-        while let Err(failure) = self.connect(layout).await {
-            self.recover(failure).await?;
+    /// Waits for the server and checks that it serves the given task.
+    pub(crate) async fn check(&mut self, task: &TaskSpec) -> Result<(), Error> {
+        loop {
+            match self.connect().await {
+                Ok(server) => return server.served.check(task),
+                Err(failure) => self.recover(failure).await?,
+            }
         }
-        Ok(())
     }
 
     /// Starts episodes, one per environment.
     pub(crate) async fn reset(
         &mut self,
         starts: &[EpisodeStart],
-        layout: &TaskSpec,
+        task: &TaskSpec,
     ) -> Result<ResetReply, Failure> {
         self.episodes = starts.iter().map(|start| start.number).collect();
         self.n_steps = 0;
         let n = starts.len();
-        let reply = self.exchange(n, encode_reset(starts), layout).await?;
-        decode_reset_reply(&reply, n, layout).map_err(|error| self.invalid(error))
+        let reply = self.exchange(n, encode_reset(starts), task).await?;
+        decode_reset_reply(&reply, n, task).map_err(|error| self.invalid(error))
     }
 
     /// Executes actions, shape `[n, n_action]`.
     pub(crate) async fn step(
         &mut self,
         actions: &[f32],
-        layout: &TaskSpec,
+        task: &TaskSpec,
     ) -> Result<StepReply, Failure> {
         self.n_steps += 1;
         let n = self.episodes.len();
-        let reply = self.exchange(n, encode_step(actions), layout).await?;
-        decode_step_reply(&reply, n, layout).map_err(|error| self.invalid(error))
+        let reply = self.exchange(n, encode_step(actions), task).await?;
+        decode_step_reply(&reply, n, task).map_err(|error| self.invalid(error))
     }
 
     /// Records that a slot was played.
@@ -134,7 +171,7 @@ impl Environments {
         self.n_failures += 1;
         if self.n_failures >= self.config.max_attempts {
             let (server, n_failures) = (self.name.clone(), self.n_failures);
-            return Err(Error::EnvironmentFailed { server, n_failures, source: status });
+            return Err(Error::EnvironmentFailed { server, n_failures, status });
         }
         self.retrier.settle(Err::<(), _>(status)).await;
         Ok(())
@@ -145,17 +182,19 @@ impl Environments {
         &mut self,
         n: usize,
         request: pb::PlayRequest,
-        layout: &TaskSpec,
+        task: &TaskSpec,
     ) -> Result<pb::PlayResponse, Failure> {
         let stream = self.stream.take().filter(|stream| stream.n == n);
-        self.connect(layout).await?;
-        let Some(server) = &mut self.server else { return Err(Failure::Transient(closed())) };
-        if u32::try_from(n).is_ok_and(|n| n > server.max_environments) {
-            let (server, max) = (self.name.clone(), server.max_environments);
+        let reply_timeout = self.config.reply_timeout;
+        let server = self.connect().await?;
+        // The server may have been replaced since the last call.
+        server.served.check(task).map_err(|error| Failure::Final(Box::new(error)))?;
+        if n > server.max_environments {
+            let (server, max) = (server.served.server.clone(), server.max_environments);
             let error = Error::TooFewEnvironments { server, max, needed: n };
             return Err(Failure::Final(Box::new(error)));
         }
-        let exchanged = within(self.config.reply_timeout, async {
+        let exchanged = within(reply_timeout, async {
             let mut stream = match stream {
                 Some(stream) => {
                     stream.requests.send(request).await.map_err(|_unsent| closed())?;
@@ -171,12 +210,21 @@ impl Environments {
         Ok(response)
     }
 
-    /// Connects to the server and checks its task, unless it is connected.
-    async fn connect(&mut self, layout: &TaskSpec) -> Result<(), Failure> {
-        if self.server.is_some() {
-            return Ok(());
-        }
-        let address = match self.config.server.address().await {
+    /// Connects to the server, unless it is connected.
+    async fn connect(&mut self) -> Result<&mut Server, Failure> {
+        let server = match self.server.take() {
+            Some(server) => server,
+            None => self.open_server().await?,
+        };
+        Ok(self.server.insert(server))
+    }
+
+    async fn open_server(&mut self) -> Result<Server, Failure> {
+        let address = match self.n_failures {
+            0 => self.config.server.address(),
+            _ => self.config.server.address_after_failure(),
+        };
+        let address = match address.await {
             Ok(address) => address,
             // A command that has worked before may work again.
             Err(error) if self.was_connected => {
@@ -194,18 +242,16 @@ impl Environments {
         let describe = client.describe(pb::DescribeEnvironmentRequest {});
         let described = within(self.config.reply_timeout, describe).await;
         let description = described.map_err(|status| self.failure(status))?.into_inner();
+        let description = decode_environment(description).map_err(|source| {
+            let (server, reply) = (self.name.clone(), "Describe".to_owned());
+            Failure::Final(Box::new(Error::InvalidReply { server, reply, source }))
+        })?;
         let program: String = description.server.chars().take(MAX_NAME_CHARS).collect();
         self.name = format!("{address} ({program})");
-        check_task(&encode_task(layout), &description.task.unwrap_or_default()).map_err(
-            |difference| {
-                let (server, difference) = (self.name.clone(), difference.to_string());
-                Failure::Final(Box::new(Error::OtherTask { server, difference }))
-            },
-        )?;
         tracing::info!(server = self.name, "environment server connected");
         self.was_connected = true;
-        self.server = Some(Server { client, max_environments: description.max_environments });
-        Ok(())
+        let served = ServedTask { server: self.name.clone(), task: description.task };
+        Ok(Server { client, served, max_environments: description.max_environments })
     }
 
     fn failure(&self, status: Status) -> Failure {
@@ -213,7 +259,7 @@ impl Environments {
             Retryability::Transient => Failure::Transient(status),
             Retryability::NotFound | Retryability::Final => {
                 let server = self.name.clone();
-                Failure::Final(Box::new(Error::EnvironmentRefused { server, source: status }))
+                Failure::Final(Box::new(Error::EnvironmentRefused { server, status }))
             }
         }
     }

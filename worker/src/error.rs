@@ -2,6 +2,7 @@
 
 use std::path::PathBuf;
 
+use tandem_core::task::TaskDifference;
 use tandem_net::Operation;
 use tandem_proto::DecodeError;
 use tandem_sim::SimError;
@@ -60,12 +61,15 @@ pub enum Error {
         task: String,
     },
     /// The server serves another task than the run's.
-    #[error("the environment server {server} serves another task than the run's: {difference}")]
+    #[error(
+        "the environment server {server} serves another task than the run's: {} is {} in the run and {} at the server",
+        difference.field, difference.first, difference.second
+    )]
     OtherTask {
         /// Address and program of the server.
         server: String,
         /// The first field that differs.
-        difference: String,
+        difference: TaskDifference,
     },
     /// The server serves fewer environments than a slot has episodes.
     #[error(
@@ -75,17 +79,17 @@ pub enum Error {
         /// Address and program of the server.
         server: String,
         /// The server's limit.
-        max: u32,
+        max: usize,
         /// The number of episodes of the slot.
         needed: usize,
     },
     /// The environment server refused a request.
-    #[error("the environment server {server} refused a request")]
+    #[error("the environment server {server} refused a request: {}", status.message())]
     EnvironmentRefused {
         /// Address and program of the server.
         server: String,
         /// The cause.
-        source: Status,
+        status: Status,
     },
     /// The environment server answered with values that no environment of the task has.
     #[error("the environment server {server} sent an invalid reply to {reply}")]
@@ -101,14 +105,17 @@ pub enum Error {
     #[error("the worker has no environment server")]
     NoServer,
     /// The environment server keeps failing.
-    #[error("gave up the environment server {server} after {n_failures} failures in a row")]
+    #[error(
+        "gave up the environment server {server} after {n_failures} failures in a row: {}",
+        status.message()
+    )]
     EnvironmentFailed {
         /// Address and program of the server.
         server: String,
         /// The number of failures.
         n_failures: u32,
         /// The latest cause.
-        source: Status,
+        status: Status,
     },
     /// The run's simulator cannot be built.
     #[error("the run's world cannot be built")]

@@ -17,13 +17,18 @@ pub(crate) struct FakeEnvironment {
     /// Shape `[n, n_action]`.
     positions: Vec<f32>,
     /// Added to the first number of every observation after the first reset: an environment with a memory.
-    pub(crate) drift: f32,
+    drift: f32,
     n_resets: usize,
 }
 
 impl FakeEnvironment {
     pub(crate) fn new() -> Self {
         Self::default()
+    }
+
+    /// Creates an environment that adds `drift` from its second reset on.
+    pub(crate) fn drifting(drift: f32) -> Self {
+        Self { drift, ..Self::default() }
     }
 
     fn observe(&self, observations: &mut [f32]) {
@@ -48,7 +53,7 @@ impl Environment for FakeEnvironment {
         for (start, goal) in starts.iter().zip(goals.chunks_mut(LAYOUT.n_goal())) {
             let mut rng = episode_rng(start.seed, start.number, Stream::Reset);
             let width = 0.5 + start.world.grasped_start_prob;
-            let mut draw = |width| uniform(&mut rng, -width, width);
+            let mut draw = |width: f32| uniform(&mut rng, -width, width);
             self.positions.extend((0..LAYOUT.n_action()).map(|_| draw(width)));
             goal.fill_with(|| draw(0.5));
         }

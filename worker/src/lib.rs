@@ -23,7 +23,10 @@ pub mod rollout;
 mod run;
 mod teacher;
 
-pub use config::{EnvironmentConfig, EnvironmentServer, ServerNotStarted, Timeouts, WorkerConfig};
+pub use config::{
+    EnvironmentConfig, EnvironmentServer, ServerAddress, ServerNotStarted, Timeouts, WorkerConfig,
+};
+pub use environment::{ServedTask, describe_environments};
 pub use error::Error;
 pub use evaluate::{ComposedTeachers, evaluate};
 pub use ports::{Act, Advisor};

@@ -65,7 +65,8 @@ pub enum RecordError {
     RemovedStart(String),
 }
 
-/// Returns the metadata of an episode that was played by `order`.
+/// Returns the metadata of an episode that was played by `order`; `None` if the simulator does not have its task, so that
+/// the episode cannot be simulated again for its log.
 ///
 /// `policy_digest` is the digest of the parameters that played it: [`tandem_policy::actor_digest`] in a run,
 /// [`Policy::digest`](tandem_policy::Policy::digest) where the whole policy is at hand.
@@ -268,7 +269,10 @@ mod tests {
         let episode = play_slot(&mut world, &order, &terms, &mut actor, &mut NoAdvisor)
             .expect("no step fails")
             .remove(0);
-        (metadata_of(order.episodes[0], &episode, &terms, "5f3a".to_owned()), episode)
+        {
+            let metadata = metadata_of(order.episodes[0], &episode, &terms, "5f3a".to_owned());
+            (metadata.expect("a built-in task"), episode)
+        }
     }
 
     #[test]

@@ -236,7 +236,7 @@ impl Worker {
         order: SlotOrder,
     ) -> Result<(Box<Player>, Result<PlayedSlot, SlotFailure>), Error> {
         let slot = order.slot;
-        let (account, layout) = (player.terms().account.clone(), player.terms().layout.clone());
+        let (account, task) = (player.terms().account.clone(), player.terms().layout.clone());
         let (peers, mut requests) = PeerChannel::new();
         let (finished, playing) = oneshot::channel();
         let tracked = self.rollouts.token();
@@ -255,10 +255,10 @@ impl Worker {
             let answered = match request {
                 PeerRequest::Advice(queries, response) => {
                     let account = account.as_deref().ok_or(Error::NoAccount { slot })?;
-                    let advice = self.advise(account, &layout, &queries).await?;
+                    let advice = self.advise(account, &task, &queries).await?;
                     response.send(advice).is_ok()
                 }
-                request => match self.forward(request, &layout).await {
+                request => match self.forward(request, &task).await {
                     Ok(answered) => answered,
                     Err(error) => {
                         failure = Some(error);
@@ -283,24 +283,24 @@ impl Worker {
     async fn advise(
         &mut self,
         account: &str,
-        layout: &TaskSpec,
+        task: &TaskSpec,
         queries: &[StepQuery],
     ) -> Result<Vec<StepAdvice>, Error> {
         let no_teacher = || Error::NoTeacher { account: account.to_owned() };
         let teacher = self.teacher.as_mut().ok_or_else(no_teacher)?;
-        teacher.advise(account, layout, queries).await
+        teacher.advise(account, task, queries).await
     }
 
     /// Forwards a request to the server of the environments. Returns whether the player still waits for the response.
-    async fn forward(&mut self, request: PeerRequest, layout: &TaskSpec) -> Result<bool, Failure> {
+    async fn forward(&mut self, request: PeerRequest, task: &TaskSpec) -> Result<bool, Failure> {
         let no_server = || Failure::Final(Box::new(Error::NoServer));
         let environments = self.environments.as_mut().ok_or_else(no_server)?;
         Ok(match request {
             PeerRequest::Reset(starts, response) => {
-                response.send(environments.reset(&starts, layout).await?).is_ok()
+                response.send(environments.reset(&starts, task).await?).is_ok()
             }
             PeerRequest::Step(actions, response) => {
-                response.send(environments.step(&actions, layout).await?).is_ok()
+                response.send(environments.step(&actions, task).await?).is_ok()
             }
             PeerRequest::Advice(..) => false,
         })

@@ -8,13 +8,15 @@ use std::path::{Path, PathBuf};
 use libfuzzer_sys as _;
 use mcap::records::{MessageHeader, Record};
 use prost::Message as _;
-use tandem_core::work::{EpisodeOrder, PublishedActor, RunTerms, SlotOrder};
+use tandem_core::work::{EpisodeOrder, EpisodeStart, PublishedActor, RunTerms, SlotOrder};
 use tandem_core::{
-    ArmAdvice, EpisodeKind, Exploration, Layout, StepAdvice, StepQuery, Task, WorldSettings,
+    ArmAdvice, Contacts, EpisodeKind, Exploration, Layout, StepAdvice, StepQuery, Task,
+    WorldSettings,
 };
 use tandem_fuzz::sample;
 use tandem_learner::checkpoint::{self, Resumption};
 use tandem_learner::evaluation_store::{EvaluationHistory, PendingEvaluation};
+use tandem_proto::environment::{encode_reset, encode_step_reply};
 use tandem_proto::pb;
 use tandem_rl::trainer::Trainer;
 use tandem_telemetry::MetricsRow;
@@ -157,6 +159,7 @@ fn write_messages(to: &Path) -> Result<(), AnyError> {
     let query = tandem_proto::encode_query(&query());
     let asked = pb::AdviseRequest { account: "run-7".to_owned(), steps: vec![query.clone()] };
     let actor: PublishedActor = sample::trainer(0).publish();
+    let start = EpisodeStart { number: 3, seed: 42, kind, world: WorldSettings::default() };
     let seeds = [
         ("query", query.encode_to_vec()),
         ("advice", tandem_proto::encode_advice(&advice()).encode_to_vec()),
@@ -168,6 +171,8 @@ fn write_messages(to: &Path) -> Result<(), AnyError> {
         ("progress", progress.encode_to_vec()),
         ("execute", execute_request().encode_to_vec()),
         ("advise", asked.encode_to_vec()),
+        ("play", encode_reset(&[start]).encode_to_vec()),
+        ("played", encode_step_reply(&[0.25; 56], &[Contacts::ARM_ARM]).encode_to_vec()),
     ];
     for (message, (name, bytes)) in (0_u8..).zip(seeds) {
         fs::write(to.join(name), [&[message, 0], bytes.as_slice()].concat())?;

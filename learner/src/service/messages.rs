@@ -31,6 +31,7 @@ pub(super) fn encode_progress(progress: &Progress) -> pb::Progress {
         end_reason: end.map_or_else(String::new, |end| end.reason.clone()),
         digest: end.and_then(|end| end.digest.clone()).unwrap_or_default(),
         warning: progress.warning.clone(),
+        environment: progress.environment.text(),
     }
 }
 

@@ -203,6 +203,7 @@ async fn advice_without_an_order_and_absurd_numbers_are_refused() {
                 worker_id: toy.id,
                 slot: order.slot,
                 episodes: messages,
+                environment_check: None,
             };
             let refused = toy.client.submit_episodes(request).await.expect_err("must be refused");
             assert_eq!(refused.code(), Code::InvalidArgument);
@@ -251,8 +252,12 @@ async fn joins_end_with_their_connection() {
     // The number is unknown as soon as the connection is seen to have ended.
     let forgotten = async {
         loop {
-            let request =
-                pb::SubmitEpisodesRequest { worker_id: joined, slot: 0, episodes: vec![] };
+            let request = pb::SubmitEpisodesRequest {
+                worker_id: joined,
+                slot: 0,
+                episodes: vec![],
+                environment_check: None,
+            };
             let status = honest.client.submit_episodes(request).await.expect_err("no slot is out");
             if status.code() == Code::NotFound {
                 return;

@@ -64,7 +64,7 @@ fn put(bytes: &mut [u8], at: usize, value: f32) {
 
 fn message(toy: &Toy, slot: u64, episodes: &[Episode]) -> pb::SubmitEpisodesRequest {
     let episodes = episodes.iter().map(encode_episode).collect();
-    pb::SubmitEpisodesRequest { worker_id: toy.id, slot, episodes }
+    pb::SubmitEpisodesRequest { worker_id: toy.id, slot, episodes, environment_check: None }
 }
 
 fn assert_refused(status: &Status, code: Code, message: &str) {

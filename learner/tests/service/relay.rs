@@ -223,7 +223,8 @@ async fn refusals_are_forwarded_and_another_version_is_refused() {
     let status = client.next_work(pb::NextWorkRequest { worker_id: 7 }).await.expect_err("refused");
     assert_eq!((status.code(), status.message()), (Code::NotFound, "worker 7 is unknown"));
     let episodes = vec![pb::Episode::default(); 3];
-    let request = pb::SubmitEpisodesRequest { worker_id: 1, slot: 2, episodes };
+    let request =
+        pb::SubmitEpisodesRequest { worker_id: 1, slot: 2, episodes, environment_check: None };
     let status = client.submit_episodes(request).await.expect_err("refused");
     assert_eq!((status.code(), status.message()), (Code::InvalidArgument, "3 episodes"));
     let request = pb::JoinRequest { worker: "old".to_owned(), version: "0.0.9".to_owned() };

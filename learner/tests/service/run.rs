@@ -185,7 +185,7 @@ pub(crate) async fn deliver_as(
     episodes: &[Episode],
 ) -> Result<(), Status> {
     let episodes = episodes.iter().map(encode_episode).collect();
-    let request = pb::SubmitEpisodesRequest { worker_id, slot, episodes };
+    let request = pb::SubmitEpisodesRequest { worker_id, slot, episodes, environment_check: None };
     client.submit_episodes(request).await.map(drop)
 }
 

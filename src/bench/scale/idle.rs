@@ -269,7 +269,12 @@ impl Worker {
             ..self.shared.episode.clone()
         };
         let episodes = slot.episodes.iter().map(episode).collect();
-        let request = pb::SubmitEpisodesRequest { worker_id, slot: slot.slot, episodes };
+        let request = pb::SubmitEpisodesRequest {
+            worker_id,
+            slot: slot.slot,
+            episodes,
+            environment_check: None,
+        };
         let sent = self.shared.now();
         within(CALL_TIMEOUT, self.client.submit_episodes(request)).await?.into_inner();
         self.shared.timings().record_delivery(round, (sent, self.shared.now()));

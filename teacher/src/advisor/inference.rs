@@ -10,6 +10,8 @@ use crate::procedures::score_arm;
 /// The teacher's networks with the buffers of a batch. A row is one arm of one step.
 pub(super) struct TeacherInference {
     policy: Box<dyn TeacherPolicy>,
+    /// Length of an arm's action.
+    n_action: usize,
     /// Every state twice, for the two actions: shape `[2 n, n_observation]`.
     observations: Vec<f32>,
     /// Shape `[2 n, n_goal]`.
@@ -23,8 +25,9 @@ pub(super) struct TeacherInference {
 }
 
 impl TeacherInference {
-    pub(super) const fn new(policy: Box<dyn TeacherPolicy>) -> Self {
+    pub(super) fn new(policy: Box<dyn TeacherPolicy>) -> Self {
         Self {
+            n_action: policy.layout().n_action(),
             policy,
             observations: Vec::new(),
             goals: Vec::new(),
@@ -91,7 +94,7 @@ impl TeacherInference {
     }
 
     fn score_row(&self, row: usize) -> ArmAdvice {
-        let n_action = self.policy.layout().n_action();
+        let n_action = self.n_action;
         let (teacher_actions, student_actions) = self.actions.split_at(self.actions.len() / 2);
         let (q_teacher, q_student) = self.q.split_at(self.q.len() / 2);
         let action = row * n_action..(row + 1) * n_action;

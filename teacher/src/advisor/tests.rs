@@ -155,7 +155,7 @@ fn a_refused_request_charges_nothing() {
 struct Broken;
 
 impl TeacherPolicy for Broken {
-    fn layout(&self) -> Layout {
+    fn layout(&self) -> TaskSpec {
         FakePolicy.layout()
     }
 

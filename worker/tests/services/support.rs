@@ -1,5 +1,6 @@
 //! Fake services and the small run that they serve.
 
+pub(crate) mod environment;
 pub(crate) mod learner;
 pub(crate) mod teacher;
 
@@ -10,11 +11,13 @@ use tandem_core::rng::{Stream, episode_rng, uniform};
 use tandem_core::work::{EpisodeOrder, PublishedActor, RunTerms, SlotOrder};
 use tandem_core::{EpisodeKind, Exploration, Layout, Task, WorldSettings};
 use tandem_net::{Router, ServerConfig, ServerConfigError};
+use tandem_proto::pb::environment_server::EnvironmentServer;
 use tandem_proto::pb::learner_server::LearnerServer;
 use tandem_proto::pb::teacher_server::TeacherServer;
 use tokio::runtime::Runtime;
 use tokio_util::sync::CancellationToken;
 
+use environment::FakeEnvironments;
 use learner::FakeLearner;
 use teacher::FakeTeacher;
 
@@ -99,6 +102,14 @@ impl Server {
     pub(crate) fn teacher(teacher: &Arc<FakeTeacher>) -> Self {
         let listener = TcpListener::bind("127.0.0.1:0").expect("loopback");
         let service = TeacherServer::from_arc(Arc::clone(teacher));
+        Self::serve(listener, async {
+            ServerConfig::default().router(service, tandem_proto::FILE_DESCRIPTOR_SET).await
+        })
+    }
+
+    pub(crate) fn environments(environments: &Arc<FakeEnvironments>) -> Self {
+        let listener = TcpListener::bind("127.0.0.1:0").expect("loopback");
+        let service = EnvironmentServer::from_arc(Arc::clone(environments));
         Self::serve(listener, async {
             ServerConfig::default().router(service, tandem_proto::FILE_DESCRIPTOR_SET).await
         })

@@ -48,6 +48,7 @@ struct State {
     is_stopping: bool,
     n_calls: BTreeMap<Call, usize>,
     episodes: BTreeMap<(bool, u64), Episode>,
+    checks: Vec<(u32, String)>,
 }
 
 impl State {
@@ -73,6 +74,7 @@ impl FakeLearner {
             is_stopping: false,
             n_calls: BTreeMap::new(),
             episodes: BTreeMap::new(),
+            checks: Vec::new(),
         };
         Self { state: Mutex::new(state), fault: None }
     }
@@ -99,6 +101,11 @@ impl FakeLearner {
     /// Returns the delivered episodes, by whether they are evaluations and by number.
     pub(crate) fn episodes(&self) -> BTreeMap<(bool, u64), Episode> {
         self.state().episodes.clone()
+    }
+
+    /// Returns the delivered checks of environments: the number of episodes and the difference.
+    pub(crate) fn checks(&self) -> Vec<(u32, String)> {
+        self.state().checks.clone()
     }
 
     fn state(&self) -> MutexGuard<'_, State> {
@@ -197,6 +204,8 @@ impl pb::learner_server::Learner for FakeLearner {
         let mut state = self.state();
         state.check_known(request.worker_id)?;
         if state.out.remove(&request.slot).is_some() {
+            let check = request.environment_check;
+            state.checks.extend(check.map(|check| (check.n_episodes, check.difference)));
             for message in request.episodes {
                 let episode = tandem_proto::decode_episode(message, LAYOUT)?;
                 let key = (episode.kind == EpisodeKind::Evaluation, episode.number);

@@ -1,0 +1,192 @@
+//! A worker that plays on a server of environments, which fails in various ways.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use std::time::Duration;
+
+use tandem_core::task::TaskDescription;
+use tandem_core::text::error_chain;
+use tandem_core::{Episode, TaskSpec};
+use tandem_proto::pb;
+use tandem_worker::{EnvironmentConfig, Error, WorkerConfig, describe_environments, run_with};
+use tokio_util::sync::CancellationToken;
+use tonic::Status;
+
+use crate::support::environment::{FakeEnvironments, Fault, played_on};
+use crate::support::learner::{Call, FakeLearner};
+use crate::support::teacher::FakeTeacher;
+use crate::support::{LAYOUT, Server, orders};
+use crate::{TIMEOUTS, config, episodes_without_faults};
+
+/// Plays all slots on `environments`; returns the delivered episodes and the fake learner.
+async fn play_on(
+    environments: &Arc<FakeEnvironments>,
+    configure: impl FnOnce(EnvironmentConfig) -> EnvironmentConfig,
+) -> (Result<(), Error>, BTreeMap<(bool, u64), Episode>, Arc<FakeLearner>) {
+    let learner = Arc::new(FakeLearner::new(orders()));
+    let teacher = Arc::new(FakeTeacher::default());
+    let (learner_server, teacher_server) = (Server::learner(&learner), Server::teacher(&teacher));
+    let server = Server::environments(environments);
+    let environment = Some(configure(played_on(&server)));
+    let config = WorkerConfig { environment, ..config(&learner_server, Some(&teacher_server)) };
+    let ended = run_with(config, TIMEOUTS, CancellationToken::new()).await;
+    (ended, learner.episodes(), learner)
+}
+
+/// Plays on a server with a fault that a worker survives.
+async fn check_survived(environments: FakeEnvironments, reply_timeout: Duration) {
+    let environments = Arc::new(environments);
+    let configure = |config| EnvironmentConfig { reply_timeout, ..config };
+    let (ended, episodes, learner) = play_on(&environments, configure).await;
+    ended.expect("the run ends");
+    assert_eq!(episodes, episodes_without_faults().await);
+    assert_eq!(learner.n_calls(Call::Join), 1);
+}
+
+/// Plays on a server with a fault that ends the worker; returns the error's line.
+async fn line_of_end(environments: FakeEnvironments) -> String {
+    let environments = Arc::new(environments);
+    let (ended, _, _) = play_on(&environments, |config| config).await;
+    let line = error_chain(&ended.expect_err("the worker gives up"));
+    assert!(line.contains("environment server http://127.0.0.1:"), "{line}");
+    assert!(!line.contains('\n'), "{line}");
+    line
+}
+
+fn ending(message: &str) -> Fault {
+    Fault::End(Status::unavailable(message))
+}
+
+#[tokio::test]
+async fn episodes_on_a_server_are_the_same_as_in_the_worker() {
+    let environments = Arc::new(FakeEnvironments::default());
+    let (ended, episodes, learner) = play_on(&environments, |config| config).await;
+    ended.expect("the run ends");
+    assert_eq!(episodes, episodes_without_faults().await);
+    assert_eq!(environments.n_requests(), 4 * 51, "three slots, and the first a second time");
+    assert_eq!(learner.checks(), [(2, String::new())]);
+}
+
+#[tokio::test]
+async fn a_server_that_dies_within_an_episode_changes_nothing() {
+    for nth in [0, 1, 30, 51, 120] {
+        check_survived(
+            FakeEnvironments::default().with_fault(nth, ending("restarting")),
+            Duration::from_secs(10),
+        )
+        .await;
+    }
+    let hanging = FakeEnvironments::default().with_fault(70, Fault::Hang);
+    check_survived(hanging, Duration::from_millis(300)).await;
+}
+
+#[tokio::test]
+async fn a_server_that_dies_in_every_episode_is_given_up() {
+    let environments = FakeEnvironments::default().with_fault(20, ending("out of memory"));
+    let line = line_of_end(environments.repeating(21)).await;
+    let expected = "(fake 1.0) after 3 failures in a row: ";
+    assert!(line.contains(expected) && line.ends_with("out of memory"), "{line}");
+}
+
+#[tokio::test]
+async fn a_server_that_refuses_is_not_asked_again() {
+    let refusal = Fault::End(Status::invalid_argument("reset.environments[0].seed: too large"));
+    let environments = FakeEnvironments::default().with_fault(0, refusal);
+    let line = line_of_end(environments).await;
+    assert!(line.contains("refused a request"), "{line}");
+    assert!(line.ends_with("reset.environments[0].seed: too large"), "{line}");
+}
+
+#[tokio::test]
+async fn an_invalid_reply_ends_the_worker_with_server_environment_field_and_value() {
+    let check = async |nth, spoil, reply: &str, reason: &str| {
+        let environments = FakeEnvironments::default().with_fault(nth, Fault::Spoil(spoil));
+        let line = line_of_end(environments).await;
+        let expected = format!("(fake 1.0) sent an invalid reply to {reply}: {reason}");
+        assert!(line.ends_with(&expected), "{line}");
+    };
+    check(
+        7,
+        |reply| reply.observations[4 * 61..4 * 62].fill(0xff),
+        "step 7 of episodes [0, 1]",
+        "environment 1: observations[5]: expected a number in [-25, 25], got NaN",
+    )
+    .await;
+    check(
+        0,
+        |reply| reply.goals[..4].copy_from_slice(&8.5_f32.to_le_bytes()),
+        "the reset of episodes [0, 1]",
+        "environment 0: goals[0]: expected a number in [-2, 2], got 8.5",
+    )
+    .await;
+    check(
+        1,
+        |reply| reply.observations.truncate(4 * 56),
+        "step 1 of episodes [0, 1]",
+        "observations: expected 112 numbers, got 56 numbers",
+    )
+    .await;
+    check(
+        50,
+        |reply| reply.contacts.push(0),
+        "step 50 of episodes [0, 1]",
+        "contacts: expected 2 bytes, one per environment, got 3 bytes",
+    )
+    .await;
+}
+
+#[tokio::test]
+async fn another_task_is_refused_and_its_field_named() {
+    let other = TaskDescription { name: "lab/push".to_owned(), ..LAYOUT.description() };
+    let environments = FakeEnvironments::default().serving(TaskSpec::new(other).expect("valid"));
+    let line = line_of_end(environments).await;
+    let expected = "serves another task than the run's: name is \"push\" in the run and \"lab/push\" at the server";
+    assert!(line.ends_with(expected), "{line}");
+}
+
+#[tokio::test]
+async fn a_server_is_asked_for_its_task() {
+    let other = TaskDescription { name: "lab/push".to_owned(), ..LAYOUT.description() };
+    let task = TaskSpec::new(other).expect("valid");
+    let environments = Arc::new(FakeEnvironments::default().serving(task.clone()));
+    let server = Server::environments(&environments);
+    let served = describe_environments(played_on(&server)).await.expect("answered");
+    let expected = format!("http://{} (fake 1.0)", server.address());
+    assert_eq!((served.server, served.task), (expected, task));
+}
+
+#[tokio::test]
+async fn a_server_with_too_few_environments_is_refused() {
+    let line = line_of_end(FakeEnvironments::default().with_room_for(1)).await;
+    let expected = "serves 1 environments per stream, a slot has 2 episodes: lower rounds.rollouts";
+    assert!(line.ends_with(expected), "{line}");
+}
+
+#[tokio::test]
+async fn an_environment_that_does_not_repeat_is_reported_with_its_first_difference() {
+    // The first slot is played twice: requests 0 to 50, then 51 to 101.
+    let nudge: fn(&mut pb::PlayResponse) = |reply| {
+        reply.observations[..4].copy_from_slice(&0.125_f32.to_le_bytes());
+    };
+    let environments = FakeEnvironments::default().with_fault(51 + 9, Fault::Spoil(nudge));
+    let (ended, episodes, learner) = play_on(&Arc::new(environments), |config| config).await;
+    ended.expect("a warning only");
+    assert_eq!(episodes, episodes_without_faults().await);
+    let checks = learner.checks();
+    let [(2, difference)] = &checks[..] else { panic!("{checks:?}") };
+    let expected = "episode 0, played twice with the same seed and actions, differs after step 9: observation[0] is ";
+    assert!(difference.starts_with(expected), "{difference}");
+    assert!(difference.contains(", then 1.25e-1, a difference of "), "{difference}");
+}
+
+#[tokio::test]
+async fn a_service_of_another_kind_is_named() {
+    let learner = Arc::new(FakeLearner::new(orders()));
+    let learner_server = Server::learner(&learner);
+    let environment = Some(played_on(&learner_server));
+    let teacher = Server::teacher(&Arc::new(FakeTeacher::default()));
+    let config = WorkerConfig { environment, ..config(&learner_server, Some(&teacher)) };
+    let ended = run_with(config, TIMEOUTS, CancellationToken::new()).await;
+    let line = error_chain(&ended.expect_err("a learner has no environments"));
+    assert!(line.ends_with("is a learner, not an environment: check the address"), "{line}");
+}
