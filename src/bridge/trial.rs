@@ -80,38 +80,46 @@ fn subjects(args: &TrialArgs) -> Result<(Task, Vec<Subject>), Failed> {
     let mut subjects = Vec::new();
     for path in &args.policies {
         let policy = policy_file::load(path)?;
-        if policy.layout.n_arms != 2 {
+        if policy.layout.n_arms() != 2 {
             return Err(Failed::usage(format!(
                 "{} drives {} arm(s), the bridge has 2: a one-arm policy goes with --composed-teachers",
                 path.display(),
-                policy.layout.n_arms
+                policy.layout.n_arms()
             )));
         }
         subjects.push(Subject { name: name_of(path), policy });
     }
     for path in &args.composed_teachers {
         let policy = policy_file::load(path)?;
-        if policy.layout.n_arms != 1 {
+        if policy.layout.n_arms() != 1 {
             return Err(Failed::usage(format!(
                 "{} drives {} arms: a teacher drives one",
                 path.display(),
-                policy.layout.n_arms
+                policy.layout.n_arms()
             )));
         }
         subjects.push(Subject { name: format!("composed-{}", name_of(path)), policy });
     }
-    let task_of = |subject: &Subject| subject.policy.layout.task;
-    let first = args.task.map(Task::from).or_else(|| subjects.first().map(task_of));
-    let Some(task) = first else {
-        return Err(Failed::usage("give --policy or --composed-teachers"));
+    let task_of = |subject: &Subject| {
+        let built_in = subject.policy.layout.as_built_in().map(|layout| layout.task);
+        built_in.ok_or_else(|| {
+            let (name, task) = (&subject.name, subject.policy.layout.name());
+            Failed::usage(format!("{name} is for {task}, which simulated arms cannot perform"))
+        })
     };
-    match subjects.iter().find(|subject| task_of(subject) != task) {
-        Some(other) => {
-            let message = format!("{} is for {}, not {task}", other.name, task_of(other));
-            Err(Failed::usage(message))
+    let first = match (args.task, subjects.first()) {
+        (Some(task), _) => Task::from(task),
+        (None, Some(subject)) => task_of(subject)?,
+        (None, None) => return Err(Failed::usage("give --policy or --composed-teachers")),
+    };
+    for subject in &subjects {
+        let task = task_of(subject)?;
+        if task != first {
+            let message = format!("{} is for {task}, not {first}", subject.name);
+            return Err(Failed::usage(message));
         }
-        None => Ok((task, subjects)),
     }
+    Ok((first, subjects))
 }
 
 fn block(edge_cm: f32) -> Result<Block, Failed> {
