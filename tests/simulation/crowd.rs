@@ -206,7 +206,7 @@ struct StillTeacher;
 
 impl TeacherPolicy for StillTeacher {
     fn layout(&self) -> tandem_core::TaskSpec {
-        STILL
+        STILL.into()
     }
 
     fn digest(&self) -> &str {

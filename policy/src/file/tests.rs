@@ -147,7 +147,7 @@ fn metadata_that_does_not_match_is_refused() {
         r#"metadata "format" is "tandem-poems", expected "tandem-policy""#,
     );
     check("format", None, r#"metadata "format" is missing"#);
-    check("format_version", Some("2"), r#"metadata "format_version" is "2", expected "1""#);
+    check("format_version", Some("3"), r#"metadata "format_version" is "3", expected "1""#);
     check(
         "task",
         Some("juggle"),
@@ -169,7 +169,7 @@ fn sizes_that_the_tensors_do_not_have_are_refused() {
     };
     let weight = r#"tensor "actor.layers.0.weight" is F32 [32, 62], expected"#;
     check("n_arms", "1", &format!("{weight} F32 [32, 31]"));
-    check("n_arms", "64", &format!("{weight} F32 [32, 1984]"));
+    check("n_arms", "8", &format!("{weight} F32 [32, 248]"));
     check("n_hidden", "16", &format!("{weight} F32 [16, 62]"));
     check(
         "task",
