@@ -123,8 +123,7 @@ fn record(layout: Layout, kind: Kind, substeps: u32, directory: &Path) -> Vec<Pa
     let write = |(order, episode)| {
         let path = directory.join(log_name(episode));
         let metadata = metadata_of(order, episode, &terms, String::new()).expect("built-in");
-        record_episode(&metadata, episode, &path)
-            .expect("recorded")
+        record_episode(&metadata, episode, &path).expect("recorded")
     };
     slot.episodes.iter().copied().zip(&episodes).map(write).collect()
 }

@@ -54,7 +54,8 @@ pub struct RunConfig {
     pub stop: StopConfig,
     /// When the learning state is saved.
     pub checkpoint: CheckpointConfig,
-    /// The task, unless it is built-in.
+    /// The task, unless it is built-in: a section of the run file, or the path of a TOML file with its fields, relative
+    /// to the run file.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub description: Option<TaskDescription>,
 }
