@@ -34,6 +34,7 @@ fn write_ledger(path: &Path) -> Result<(), AnyError> {
     ledger.open("leased", AccountTerms { budget: 1000, strategy: "eamc:0.25".parse()? })?;
     ledger.open_leases("leased", &[0, 1], 50)?;
     let charges = |account: &str, episode, steps: std::ops::Range<u32>, wanted| ChargeRequest {
+        episode_steps: 50,
         account: account.to_owned(),
         charges: steps
             .map(|step| Charge {

@@ -48,7 +48,7 @@ pub(crate) fn eval(args: &EvalArgs) -> Result<(), Failed> {
 fn terms(subject: &EvaluatedPolicy) -> RunTerms {
     RunTerms {
         run: String::new(),
-        layout: subject.layout(),
+        layout: subject.layout().into(),
         account: None,
         exploration: Exploration::NONE,
         world: WorldSettings::default(),
@@ -70,6 +70,7 @@ fn record(
     let number = episode.number;
     let order = EpisodeOrder { number, seed, advised: false, uniform: false, record: true };
     let metadata = metadata_of(order, episode, terms, subject.policy().digest());
+    let metadata = metadata.expect("an evaluated policy is for a simulated task");
     match record_episode(&metadata, episode, path) {
         Ok(_) => Ok(()),
         Err(error @ RecordError::Log(_)) => Err(error).or_cannot_write(String::new),
@@ -79,7 +80,7 @@ fn record(
 
 fn subject(args: &EvalArgs) -> Result<EvaluatedPolicy, Failed> {
     let subject = match (&args.policy, &args.composed_teachers) {
-        (Some(path), _) => EvaluatedPolicy::Policy(policy_file::load(path)?),
+        (Some(path), _) => EvaluatedPolicy::new(policy_file::load(path)?, path)?,
         (None, Some(path)) => {
             EvaluatedPolicy::composed(policy_file::load(path)?, args.arms.unwrap_or(2), path)?
         }

@@ -22,13 +22,19 @@ pub(crate) enum EvaluatedPolicy {
 }
 
 impl EvaluatedPolicy {
+    /// Evaluates the policy that was loaded from `path`.
+    pub(crate) fn new(policy: Policy, path: &Path) -> Result<Self, Failed> {
+        simulated(policy, path).map(Self::Policy)
+    }
+
     /// Composes `n_arms` copies of the one-arm policy that was loaded from `path`.
     pub(crate) fn composed(policy: Policy, n_arms: usize, path: &Path) -> Result<Self, Failed> {
-        if policy.layout.n_arms != 1 {
+        let policy = simulated(policy, path)?;
+        if policy.layout.n_arms() != 1 {
             return Err(Failed::usage(format!(
                 "{} drives {} arms: a teacher drives one",
                 path.display(),
-                policy.layout.n_arms
+                policy.layout.n_arms()
             )));
         }
         if !(1..=2).contains(&n_arms) {
@@ -38,9 +44,11 @@ impl EvaluatedPolicy {
     }
 
     pub(crate) fn layout(&self) -> Layout {
+        let layout = self.policy().layout.as_built_in();
+        let layout = layout.expect("the constructors refuse policies of other tasks");
         match self {
-            Self::Policy(policy) => policy.layout,
-            Self::Composed(policy, n_arms) => Layout::new(policy.layout.task, *n_arms),
+            Self::Policy(_) => layout,
+            Self::Composed(_, n_arms) => Layout::new(layout.task, *n_arms),
         }
     }
 
@@ -69,6 +77,18 @@ impl EvaluatedPolicy {
             ),
         };
         episodes.or_exit(Exit::Bug, String::new)
+    }
+}
+
+/// Refuses a policy of a task that the simulator does not have.
+fn simulated(policy: Policy, path: &Path) -> Result<Policy, Failed> {
+    match policy.layout.as_built_in() {
+        Some(_) => Ok(policy),
+        None => Err(Failed::usage(format!(
+            "{} is for task {:?}, which the simulator does not have: evaluate it with the learner of its run",
+            path.display(),
+            policy.layout.name()
+        ))),
     }
 }
 

@@ -12,7 +12,7 @@ use crate::{output, policy_file};
 
 pub(crate) fn picture(args: &PictureArgs) -> Result<(), Failed> {
     let subject = match (&args.policy, &args.composed_teachers) {
-        (Some(path), _) => EvaluatedPolicy::Policy(policy_file::load(path)?),
+        (Some(path), _) => EvaluatedPolicy::new(policy_file::load(path)?, path)?,
         (None, Some(path)) => EvaluatedPolicy::composed(policy_file::load(path)?, 2, path)?,
         (None, None) => return Err(Failed::usage("give --policy or --composed-teachers")),
     };

@@ -3,8 +3,8 @@
 use std::path::Path;
 
 use anyhow::{Context as _, anyhow, bail};
-use tandem_core::Task;
 use tandem_core::settings::OutOfRange;
+use tandem_core::{Task, TaskDescription, TaskSpec};
 use tandem_rl::RunConfig;
 use tandem_rl::config::{ConfigError, INIT_TEACHER, Recipe, former_keys};
 use tandem_system::atomic_file;
@@ -16,6 +16,9 @@ use crate::input;
 use former::{current_keys, is_removed};
 
 mod former;
+
+/// The section that describes a task which is not built-in. It is one value: its keys are no settings of their own.
+const DESCRIPTION: &str = "description";
 
 /// The length to which texts in messages are shortened, in characters.
 const MAX_SHOWN_CHARS: usize = 80;
@@ -72,7 +75,18 @@ fn parse_value(text: &str) -> Value {
 
 fn read(path: &Path) -> anyhow::Result<Table> {
     let text = input::text(path).with_context(|| format!("cannot read run file {path:?}"))?;
-    parse(&text).map_err(|problem| anyhow!("run file {path:?}: {problem}"))
+    let mut run = parse(&text).map_err(|problem| anyhow!("run file {path:?}: {problem}"))?;
+    if let Some(Value::String(description)) = run.get(DESCRIPTION) {
+        let file = path.parent().unwrap_or(Path::new("")).join(description);
+        run.insert(DESCRIPTION.to_owned(), Value::Table(read_description(&file)?));
+    }
+    Ok(run)
+}
+
+/// Reads the description of a task from a file of its own, which a run file names relative to its directory.
+fn read_description(path: &Path) -> anyhow::Result<Table> {
+    let text = input::text(path).with_context(|| format!("cannot read description {path:?}"))?;
+    parse(&text).map_err(|problem| anyhow!("description {path:?}: {problem}"))
 }
 
 /// Parses a run file. The error is one line with the position and the cause.
@@ -121,6 +135,7 @@ fn in_one_line(error: ConfigError) -> anyhow::Error {
             anyhow!("{key} is {value}: expected {expected}")
         }
         ConfigError::Task(unknown) => anyhow!("task: {unknown}"),
+        ConfigError::Description(_) => anyhow!("{error}"),
     }
 }
 
@@ -155,27 +170,43 @@ fn defaults_for(changes: &Table) -> anyhow::Result<RunConfig> {
             bail!("recipe is {:?}: expected \"tandem\" or \"paper\"", shortened(other))
         }
     };
+    let defaults = RunConfig::defaults_of(recipe, &task_for(changes)?);
+    let strategy = changes.get("advice").and_then(|advice| advice.get("strategy"));
+    match strategy.and_then(Value::as_str) {
+        Some(INIT_TEACHER) => Ok(defaults.sized_for_copies()),
+        _ => Ok(defaults),
+    }
+}
+
+/// The task that the changes choose: the described one, or a built-in one.
+fn task_for(changes: &Table) -> anyhow::Result<TaskSpec> {
+    if let Some(description) = changes.get(DESCRIPTION) {
+        let description: TaskDescription =
+            description.clone().try_into().map_err(|error: toml::de::Error| {
+                anyhow!("description: {}", in_line(error.message()))
+            })?;
+        return TaskSpec::new(description).map_err(|error| anyhow!("description.{error}"));
+    }
     let task = changes.get("task").and_then(Value::as_str).unwrap_or("push");
     let known_task = task.parse::<Task>().map_err(|_unknown| {
         let names = Task::ALL.map(Task::name).join(" or ");
-        anyhow!("task is {:?}: expected {names}", shortened(task))
+        anyhow!("task is {:?}: expected {names}, or a [description] of the task", shortened(task))
     });
     let arms = changes.get("arms").and_then(Value::as_integer).unwrap_or(2);
     let n_arms = usize::try_from(arms).ok().filter(|n_arms| (1..=2).contains(n_arms));
     let n_arms = n_arms.ok_or_else(|| anyhow!("arms is {arms}: expected 1 or 2"))?;
-    let task = known_task?;
-    let defaults = RunConfig::defaults(recipe, task, n_arms);
-    let strategy = changes.get("advice").and_then(|advice| advice.get("strategy"));
-    match strategy.and_then(Value::as_str) {
-        Some(INIT_TEACHER) => Ok(defaults.sized_for_copies(task)),
-        _ => Ok(defaults),
-    }
+    Ok(TaskSpec::built_in(known_task?, n_arms))
+}
+
+/// A message on one line.
+fn in_line(message: &str) -> String {
+    shortened(message.replace('\n', " ").trim())
 }
 
 /// Sets the value of a dotted key.
 fn set(table: &mut Table, key: &str, value: Value) -> anyhow::Result<()> {
     match key.split_once('.') {
-        None if value.is_table() => {
+        None if value.is_table() && key != DESCRIPTION => {
             bail!("{:?} is {}: expected one value, not a section", shortened(key), shown(&value))
         }
         None => {
@@ -206,6 +237,8 @@ fn merge(base: &mut Table, changes: &Table, path: &str, known: &[String]) -> any
             bail!("unknown setting {:?}: {hint}", shortened(&name));
         }
         match (&mut base[key], change) {
+            // The recipe's defaults already have the description.
+            _ if name == DESCRIPTION => {}
             (Value::Table(inner), Value::Table(changes)) => merge(inner, changes, &name, known)?,
             (Value::Table(_), _) => bail!("{name:?} is a section, not a setting"),
             (slot @ Value::Float(_), Value::Integer(whole)) => *slot = Value::Float(*whole as f64),

@@ -25,7 +25,8 @@ fn episodes(name: &str) -> Vec<Episode> {
     let policy = Policy::load(&path).expect("ships");
     let actor = policy.actor().expect("whole");
     let n_threads = std::thread::available_parallelism().unwrap_or(NonZeroUsize::MIN);
-    evaluate(|| actor.clone(), policy.layout, &WorldConfig::default(), N_EPISODES, SEED, n_threads)
+    let layout = policy.layout.as_built_in().expect("a built-in task");
+    evaluate(|| actor.clone(), layout, &WorldConfig::default(), N_EPISODES, SEED, n_threads)
         .expect("finite")
 }
 

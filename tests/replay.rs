@@ -82,7 +82,7 @@ fn terms(layout: Layout, kind: Kind, substeps: u32) -> RunTerms {
     let prob = if kind == Kind::SpecialStart { 1.0 } else { 0.3 };
     RunTerms {
         run: "replay".to_owned(),
-        layout,
+        layout: layout.into(),
         account: Some("replay".to_owned()),
         exploration: Exploration {
             noise_std: 0.2,
@@ -122,8 +122,8 @@ fn record(layout: Layout, kind: Kind, substeps: u32, directory: &Path) -> Vec<Pa
     let episodes = play_slot(&mut world, &slot, &terms, &mut actor, &mut advisor).expect("plays");
     let write = |(order, episode)| {
         let path = directory.join(log_name(episode));
-        record_episode(&metadata_of(order, episode, &terms, String::new()), episode, &path)
-            .expect("recorded")
+        let metadata = metadata_of(order, episode, &terms, String::new()).expect("built-in");
+        record_episode(&metadata, episode, &path).expect("recorded")
     };
     slot.episodes.iter().copied().zip(&episodes).map(write).collect()
 }

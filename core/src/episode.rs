@@ -1,12 +1,10 @@
 //! An episode as a worker sends it to the learner.
 
+use std::borrow::Cow;
 use std::ops::BitOr;
 
-use crate::layout::{ArmIndex, EPISODE_STEPS, GOAL_TOLERANCE_M, Layout};
-use crate::reward::{achieved_goal, distance, is_success, sparse_reward};
-
-/// Displacement of an object, metres, above which its episode counts as "moved".
-pub const MOVED_M: f32 = 0.05;
+use crate::layout::ArmIndex;
+use crate::task::{Part, TaskSpec};
 
 /// The purpose of an episode.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -62,7 +60,9 @@ impl BitOr for Contacts {
     }
 }
 
-/// A complete episode: [`EPISODE_STEPS`] transitions with one goal.
+/// A complete episode: the transitions of all its steps, with one goal.
+///
+/// In the shapes below, `n` is the number of [steps](TaskSpec::episode_steps) of the task.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Episode {
     /// Number within the run (training) or within the goal set (evaluation).
@@ -71,17 +71,17 @@ pub struct Episode {
     pub kind: EpisodeKind,
     /// Version of the policy's parameters.
     pub parameter_version: u64,
-    /// Task and arms, which determine the length of every vector below.
-    pub layout: Layout,
-    /// Observations before each step and after the last one, shape `[EPISODE_STEPS + 1, n_observation]`.
+    /// The task, which determines the length of every vector below.
+    pub layout: TaskSpec,
+    /// Observations before each step and after the last one, shape `[n + 1, n_observation]`.
     pub observations: Vec<f32>,
-    /// Desired goal, arm frames, metres, shape `[n_goal]`.
+    /// Desired goal, shape `[n_goal]`.
     pub goal: Vec<f32>,
-    /// Actions as executed, in [−1, 1], shape `[EPISODE_STEPS, n_action]`.
+    /// Actions as executed, in [−1, 1], shape `[n, n_action]`.
     pub actions: Vec<f32>,
-    /// For each step a bit set: bit `a` is set if arm `a` executed the teacher's action. Shape `[EPISODE_STEPS]`.
+    /// For each step a bit set: bit `a` is set if arm `a` executed the teacher's action. Shape `[n]`.
     pub advised_arms: Vec<u8>,
-    /// Contacts during each step, shape `[EPISODE_STEPS]`.
+    /// Contacts during each step, shape `[n]`.
     pub contacts: Vec<Contacts>,
     /// Units of the advice budget that the episode cost: one for each step with at least one advised arm.
     pub advice_charged: u32,
@@ -90,25 +90,33 @@ pub struct Episode {
 impl Episode {
     /// Returns a training episode in which every number is zero, to be filled in.
     #[must_use]
-    pub fn zeros(layout: Layout, number: u64) -> Self {
+    pub fn zeros(layout: impl Into<TaskSpec>, number: u64) -> Self {
+        let layout = layout.into();
+        let n_steps = layout.episode_steps();
         Self {
             number,
             kind: EpisodeKind::Training,
             parameter_version: 0,
-            layout,
-            observations: vec![0.0; (EPISODE_STEPS + 1) * layout.n_observation()],
+            observations: vec![0.0; (n_steps + 1) * layout.n_observation()],
             goal: vec![0.0; layout.n_goal()],
-            actions: vec![0.0; EPISODE_STEPS * layout.n_action()],
-            advised_arms: vec![0; EPISODE_STEPS],
-            contacts: vec![Contacts::NONE; EPISODE_STEPS],
+            actions: vec![0.0; n_steps * layout.n_action()],
+            advised_arms: vec![0; n_steps],
+            contacts: vec![Contacts::NONE; n_steps],
             advice_charged: 0,
+            layout,
         }
     }
 
-    /// Returns the observation before step `step_idx`, shape `[n_observation]`; `EPISODE_STEPS` gives the final one.
+    /// Returns the number of control steps.
+    #[must_use]
+    pub fn n_steps(&self) -> usize {
+        self.layout.episode_steps()
+    }
+
+    /// Returns the observation before step `step_idx`, shape `[n_observation]`; `n_steps` gives the final one.
     ///
     /// # Panics
-    /// If `step_idx` exceeds `EPISODE_STEPS`.
+    /// If `step_idx` exceeds the number of steps.
     #[must_use]
     pub fn observation(&self, step_idx: usize) -> &[f32] {
         let n = self.layout.n_observation();
@@ -118,51 +126,61 @@ impl Episode {
     /// Returns the action executed in step `step_idx`, shape `[n_action]`.
     ///
     /// # Panics
-    /// If `step_idx` is not below `EPISODE_STEPS`.
+    /// If `step_idx` is not below the number of steps.
     #[must_use]
     pub fn action(&self, step_idx: usize) -> &[f32] {
         let n = self.layout.n_action();
         &self.actions[step_idx * n..(step_idx + 1) * n]
     }
 
-    /// Returns the position of `arm`'s object before step `step_idx`, arm frame, metres, shape `[3]`.
+    /// Returns what `arm` has achieved before step `step_idx`, in the order of its goal.
     #[must_use]
-    pub fn achieved(&self, step_idx: usize, arm: ArmIndex) -> &[f32] {
-        &self.observation(step_idx)[self.layout.achieved_goal_of(arm)]
+    pub fn achieved(&self, step_idx: usize, arm: ArmIndex) -> Cow<'_, [f32]> {
+        self.layout.achieved_goal_of(arm).of(self.observation(step_idx))
     }
 
-    /// Returns `true` if `arm`'s object is within the tolerance of its goal after the last step.
+    /// Returns the observation after the last step, shape `[n_observation]`.
+    #[must_use]
+    pub fn last_observation(&self) -> &[f32] {
+        self.observation(self.n_steps())
+    }
+
+    /// Returns `true` if `arm`'s goal is achieved after the last step.
     #[must_use]
     pub fn arm_succeeded(&self, arm: ArmIndex) -> bool {
-        distance(self.achieved(EPISODE_STEPS, arm), &self.goal[self.layout.goal_of(arm)])
-            <= GOAL_TOLERANCE_M
+        self.layout.arm_succeeds(arm, self.last_observation(), &self.goal)
     }
 
-    /// Returns `true` if every object is within the tolerance of its goal after the last step.
+    /// Returns `true` if the goal of every arm is achieved after the last step.
     #[must_use]
     pub fn succeeded(&self) -> bool {
-        is_success(self.layout, self.observation(EPISODE_STEPS), &self.goal)
+        self.layout.is_success(self.last_observation(), &self.goal)
     }
 
     /// Returns `true` if the norm over all arms' distances together is within the tolerance after the last step.
     #[must_use]
     pub fn succeeded_jointly(&self) -> bool {
-        self.joint_reward(EPISODE_STEPS - 1) > -0.5
+        self.joint_reward(self.n_steps() - 1) > -0.5
     }
 
-    /// Returns the joint reward of step `step_idx`: the [`sparse_reward`] of all arms' goals together.
+    /// Returns the joint reward of step `step_idx`: the [sparse reward](TaskSpec::sparse_reward) of all arms' goals
+    /// together.
     #[must_use]
     pub fn joint_reward(&self, step_idx: usize) -> f32 {
         let achieved: Vec<f32> =
-            achieved_goal(self.layout, self.observation(step_idx + 1)).collect();
-        sparse_reward(&achieved, &self.goal)
+            self.layout.achieved_goal(self.observation(step_idx + 1)).collect();
+        self.layout.sparse_reward(&achieved, &self.goal)
     }
 
-    /// Returns `true` if any object ended more than [`MOVED_M`] from its start.
+    /// Returns `true` if what any arm, or all arms together, achieved changed by more than the task's tolerance: in the
+    /// built-in tasks, if an object was displaced.
     #[must_use]
     pub fn moved(&self) -> bool {
-        self.layout
-            .arms()
-            .any(|arm| distance(self.achieved(0, arm), self.achieved(EPISODE_STEPS, arm)) > MOVED_M)
+        let layout = &self.layout;
+        let (first, last) = (self.observation(0), self.last_observation());
+        let has_moved =
+            |part: &Part| layout.distance(&part.of(first), &part.of(last)) > layout.tolerance();
+        layout.arms().any(|arm| has_moved(layout.achieved_goal_of(arm)))
+            || has_moved(layout.common_achieved_goal())
     }
 }

@@ -1,8 +1,6 @@
 //! Outcomes of evaluation episodes, success rates and their confidence intervals.
 
 use crate::episode::{Contacts, Episode};
-use crate::layout::EPISODE_STEPS;
-use crate::reward::is_success;
 
 /// The outcome of one evaluation episode.
 #[derive(Debug, Clone, PartialEq)]
@@ -17,7 +15,7 @@ pub struct EpisodeOutcome {
     pub collided: bool,
     /// There was at least one such contact before all objects were at their goals to stay.
     pub collided_before_success: bool,
-    /// At least one object was displaced by more than [`MOVED_M`](crate::episode::MOVED_M).
+    /// At least one object was displaced; see [`Episode::moved`].
     pub moved: bool,
     /// Sum of the joint rewards, undiscounted.
     pub episode_return: f32,
@@ -37,17 +35,19 @@ impl EpisodeOutcome {
             collided,
             collided_before_success: first_contact.is_some_and(|step_idx| step_idx < settled_after),
             moved: episode.moved(),
-            episode_return: (0..EPISODE_STEPS).map(|step_idx| episode.joint_reward(step_idx)).sum(),
+            episode_return: (0..episode.n_steps())
+                .map(|step_idx| episode.joint_reward(step_idx))
+                .sum(),
         }
     }
 }
 
-/// Returns the number of steps after which every object stays within the tolerance of its goal, `EPISODE_STEPS` if that
+/// Returns the number of steps after which every object stays within the tolerance of its goal, the episode's steps if that
 /// never happens.
 fn steps_until_settled(episode: &Episode) -> usize {
     let at_goal =
-        |step_idx| is_success(episode.layout, episode.observation(step_idx), &episode.goal);
-    (0..EPISODE_STEPS)
+        |step_idx| episode.layout.is_success(episode.observation(step_idx), &episode.goal);
+    (0..episode.n_steps())
         .rev()
         .find(|step_idx| !at_goal(step_idx + 1))
         .map_or(0, |last_bad| last_bad + 1)

@@ -1,4 +1,6 @@
-//! The layout of observations, goals and actions: the length of each vector and the range that belongs to each arm.
+//! The built-in tasks, which the simulator implements, and the layout of their observations, goals and actions.
+//!
+//! The learner, the teacher and the workers take these numbers from a [`TaskSpec`](crate::TaskSpec).
 
 use std::fmt;
 use std::ops::Range;
@@ -21,7 +23,7 @@ pub const EPISODE_STEPS: usize = 50;
 /// Distance between object and goal up to which the goal counts as achieved, metres.
 pub const GOAL_TOLERANCE_M: f32 = 0.05;
 
-/// A manipulation task (section 4.1 of the paper).
+/// A built-in manipulation task (section 4.1 of the paper).
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Task {
     /// Push an object across the table to its goal with a closed gripper.
@@ -80,7 +82,7 @@ impl FromStr for Task {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct ArmIndex(pub usize);
 
-/// A task and the number of arms, which together determine the length of every vector.
+/// A built-in task and the number of arms, which together determine the length of every vector.
 ///
 /// The vector of several arms is the concatenation of the vectors of each arm, in arm order (`d_1 || d_2` in the
 /// paper). Each arm's numbers are in the arm's own frame, so a one-arm policy can use an arm's part unchanged.

@@ -5,10 +5,48 @@
 //! wire format. The environments are in `tandem_sim`, the networks in `tandem_policy`, the learning algorithm in
 //! `tandem_rl`.
 //!
-//! # Layouts
+//! # Tasks
 //!
-//! A [`Layout`] is a [`Task`] and a number of arms. It determines the length of every vector: with two arms, an
-//! observation has 56 numbers, a goal 6 and an action 6 (push) or 8 (pick and place).
+//! A [`TaskSpec`] is everything that the learner, the teacher and the workers know about a task: the length of every
+//! vector, the part of each vector that belongs to each arm, the sparse reward and the length of an episode. It is made
+//! from a [`TaskDescription`], which is plain data.
+//!
+//! ```
+//! use tandem_core::task::{ArmDescription, Norm};
+//! use tandem_core::{ArmIndex, TaskDescription, TaskSpec};
+//!
+//! // A point on a line: its observation is position and speed, its goal a position.
+//! let arm = ArmDescription {
+//!     observation: vec![0, 1],
+//!     goal: vec![0],
+//!     action: vec![0],
+//!     position: vec![],
+//! };
+//! let task = TaskSpec::new(TaskDescription {
+//!     name: "point".to_owned(),
+//!     n_observation: 2,
+//!     n_goal: 1,
+//!     n_action: 1,
+//!     achieved_goal: vec![0],
+//!     episode_steps: 20,
+//!     tolerance: 0.1,
+//!     norm: Norm::Euclidean,
+//!     interchangeable_arms: false,
+//!     reports_contacts: false,
+//!     origin_distance: 0.0,
+//!     recombination_gap: 0.0,
+//!     observation_bound: vec![2.0, 1.0],
+//!     goal_bound: vec![2.0],
+//!     arms: vec![arm],
+//! })?;
+//! assert!(task.is_success(&[0.45, 0.0], &[0.5]));
+//! # Ok::<(), tandem_core::task::InvalidTask>(())
+//! ```
+//!
+//! # Built-in tasks
+//!
+//! A [`Layout`] is a built-in [`Task`] and a number of arms, which the simulator implements: with two arms, an
+//! observation has 56 numbers, a goal 6 and an action 6 (push) or 8 (pick and place). `TaskSpec::from` describes it.
 //!
 //! ```
 //! use tandem_core::{ArmIndex, Layout, Task};
@@ -34,7 +72,7 @@
 //!
 //! # Rewards
 //!
-//! The [`reward`] is sparse: 0 if the objects are within 5 cm of their goals and −1 otherwise. One function serves
+//! The [`reward`] is sparse: in the built-in tasks, 0 if the objects are within 5 cm of their goals and −1 otherwise. One function serves
 //! success rates and hindsight relabelling alike.
 //!
 //! ```
@@ -72,7 +110,7 @@
 //!     number: 0,
 //!     kind: EpisodeKind::Evaluation,
 //!     parameter_version: 0,
-//!     layout,
+//!     layout: layout.into(),
 //!     observations: vec![0.0; (EPISODE_STEPS + 1) * layout.n_observation()],
 //!     goal: vec![0.0, 0.0, 0.02],
 //!     actions: vec![0.0; EPISODE_STEPS * layout.n_action()],
@@ -87,7 +125,7 @@
 //!
 //! # Modules in reading order
 //!
-//! [`layout`], [`reward`], [`rng`], [`episode`], [`evaluation`]; then [`settings`] and [`work`] (what a learner assigns
+//! [`task`], [`layout`] (the built-in tasks), [`reward`], [`rng`], [`episode`], [`evaluation`]; then [`settings`] and [`work`] (what a learner assigns
 //! to workers), [`advice`] (queries to a teacher and its answers), [`bounds`] (plausible ranges of observations),
 //! [`scene`] (snapshots for pictures and logs) and [`text`] (texts in messages).
 #![warn(missing_docs)]

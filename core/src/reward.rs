@@ -1,6 +1,10 @@
 //! The sparse reward: 0 if the goal is achieved, −1 otherwise.
+//!
+//! A [`TaskSpec`](crate::TaskSpec) has the reward of any task. The functions that take a [`Layout`] or no task at all are
+//! those of the built-in tasks, for programs that step the simulator themselves.
 
 use crate::layout::{GOAL_TOLERANCE_M, Layout};
+use crate::task::Norm;
 
 /// The reward of a step after which the goal is not achieved.
 pub const REWARD_PENDING: f32 = -1.0;
@@ -13,11 +17,10 @@ pub const REWARD_ACHIEVED: f32 = 0.0;
 /// If the points differ in dimension.
 #[must_use]
 pub fn distance(a: &[f32], b: &[f32]) -> f32 {
-    assert_eq!(a.len(), b.len(), "points of different dimension");
-    a.iter().zip(b).map(|(a, b)| (a - b) * (a - b)).sum::<f32>().sqrt()
+    Norm::Euclidean.distance(a, b)
 }
 
-/// Returns the sparse reward `−(‖achieved − desired‖ > ε)` of section 4.1 of the paper.
+/// Returns the sparse reward `−(‖achieved − desired‖ > ε)` of the built-in tasks (section 4.1 of the paper).
 ///
 /// `ε` is [`GOAL_TOLERANCE_M`]. Given the goals of all arms, shape `[n_goal]`, the result is the joint reward; given
 /// those of one arm, it is the arm's own reward.
@@ -29,10 +32,10 @@ pub fn sparse_reward(achieved: &[f32], desired: &[f32]) -> f32 {
     sparse_reward_within(GOAL_TOLERANCE_M, distance(achieved, desired))
 }
 
-/// Returns the sparse reward of an object that is `distance_m` away from its goal, for any tolerance in metres.
+/// Returns the sparse reward at this distance from a goal, for any tolerance in the same unit.
 #[must_use]
-pub fn sparse_reward_within(tolerance_m: f32, distance_m: f32) -> f32 {
-    if distance_m > tolerance_m { REWARD_PENDING } else { REWARD_ACHIEVED }
+pub fn sparse_reward_within(tolerance: f32, distance: f32) -> f32 {
+    if distance > tolerance { REWARD_PENDING } else { REWARD_ACHIEVED }
 }
 
 /// Returns `true` if every object is within [`GOAL_TOLERANCE_M`] of its goal.
@@ -59,6 +62,7 @@ pub fn achieved_goal(layout: Layout, observation: &[f32]) -> impl Iterator<Item 
 mod tests {
     use super::*;
     use crate::layout::Task;
+    use crate::task::TaskSpec;
 
     #[test]
     fn the_reward_changes_at_the_tolerance() {
@@ -74,6 +78,22 @@ mod tests {
         assert_eq!(sparse_reward(&achieved[..3], &goal[..3]), REWARD_ACHIEVED);
         assert_eq!(sparse_reward(&achieved[3..], &goal[3..]), REWARD_ACHIEVED);
         assert_eq!(sparse_reward(&achieved, &goal), REWARD_PENDING);
+    }
+
+    #[test]
+    fn a_built_in_task_has_the_same_reward_as_data() {
+        let layout = Layout::new(Task::PickAndPlace, 2);
+        let task = TaskSpec::from(layout);
+        let mut observation = vec![0.1; layout.n_observation()];
+        let mut goal = vec![0.1; layout.n_goal()];
+        for offset in [0.0, 0.03, 0.04, 0.06] {
+            (observation[3], goal[4]) = (0.1 + offset, 0.1 - offset);
+            let achieved: Vec<f32> = achieved_goal(layout, &observation).collect();
+            assert!(task.achieved_goal(&observation).eq(achieved.iter().copied()));
+            assert_eq!(task.sparse_reward(&achieved, &goal), sparse_reward(&achieved, &goal));
+            let succeeds = task.is_success(&observation, &goal);
+            assert_eq!(succeeds, is_success(layout, &observation, &goal));
+        }
     }
 
     #[test]

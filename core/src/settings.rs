@@ -122,7 +122,7 @@ pub struct OutOfRange {
     /// Its value.
     pub value: String,
     /// The values that can be used.
-    pub expected: &'static str,
+    pub expected: String,
 }
 
 impl OutOfRange {
@@ -134,11 +134,11 @@ impl OutOfRange {
         is_usable: bool,
         key: &'static str,
         value: impl Display + Copy,
-        expected: &'static str,
+        expected: impl Display,
     ) -> Result<(), Self> {
         match is_usable {
             true => Ok(()),
-            false => Err(Self { key, value: value.to_string(), expected }),
+            false => Err(Self { key, value: value.to_string(), expected: expected.to_string() }),
         }
     }
 }

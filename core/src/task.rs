@@ -386,6 +386,40 @@ impl TaskSpec {
         })
     }
 
+    /// Returns the parts of all arms of an observation, concatenated in arm order, as a teacher for one arm expects them.
+    #[must_use]
+    pub fn observation_in_arm_order(&self, observation: &[f32]) -> Vec<f32> {
+        self.in_arm_order(observation, Self::observation_of)
+    }
+
+    /// Returns the parts of all arms of a goal, concatenated in arm order.
+    #[must_use]
+    pub fn goal_in_arm_order(&self, goal: &[f32]) -> Vec<f32> {
+        self.in_arm_order(goal, Self::goal_of)
+    }
+
+    /// Returns the parts of all arms of an action, concatenated in arm order.
+    #[must_use]
+    pub fn action_in_arm_order(&self, action: &[f32]) -> Vec<f32> {
+        self.in_arm_order(action, Self::action_of)
+    }
+
+    fn in_arm_order(&self, vector: &[f32], part_of: fn(&Self, ArmIndex) -> &Part) -> Vec<f32> {
+        self.arms().flat_map(|arm| part_of(self, arm).of(vector).into_owned()).collect()
+    }
+
+    /// Writes the actions of all arms, concatenated in arm order, into `action`: the inverse of
+    /// [`action_in_arm_order`](Self::action_in_arm_order).
+    ///
+    /// # Panics
+    /// If a slice is not of length [`n_action`](Self::n_action).
+    pub fn write_action_in_arm_order(&self, in_arm_order: &[f32], action: &mut [f32]) {
+        let n_per_arm = self.action_of(ArmIndex(0)).len();
+        for (arm, numbers) in self.arms().zip(in_arm_order.chunks_exact(n_per_arm)) {
+            self.action_of(arm).write(action, numbers);
+        }
+    }
+
     /// Returns the first field in which two tasks differ.
     #[must_use]
     pub fn difference(&self, other: &Self) -> Option<TaskDifference> {

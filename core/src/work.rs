@@ -1,16 +1,16 @@
 //! Work that a learner assigns to its workers.
 
 use crate::episode::EpisodeKind;
-use crate::layout::Layout;
 use crate::settings::{Exploration, WorldSettings};
+use crate::task::TaskSpec;
 
 /// Settings that apply to every episode of a run.
 #[derive(Debug, Clone, PartialEq)]
 pub struct RunTerms {
     /// The run's name; empty outside a run.
     pub run: String,
-    /// Task and arms.
-    pub layout: Layout,
+    /// The task.
+    pub layout: TaskSpec,
     /// The account at the teacher; `None` if the run takes no advice.
     pub account: Option<String>,
     /// Exploration in training episodes.

@@ -347,8 +347,9 @@ impl LearnerService {
         let pb::SubmitEpisodesRequest { worker_id, slot, episodes, environment_check } = request;
         let now = (self.shared.clock)();
         let mut state = self.shared.lock();
-        let layout =
-            state.terms.as_ref().ok_or_else(|| Status::unavailable("the run is starting"))?.layout;
+        let terms =
+            state.terms.as_ref().ok_or_else(|| Status::unavailable("the run is starting"))?;
+        let layout = terms.layout.clone();
         let worker = state.queue.worker(worker_id).map(|worker| (worker_id, worker.name.clone()));
         let refused = |error| refusal(&error, worker.as_ref());
         let Some(order) = state.queue.order_of(worker_id, slot, now).map_err(refused)? else {
@@ -359,7 +360,7 @@ impl LearnerService {
         drop(state);
         let decode = |episode: pb::Episode| {
             let number = episode.number;
-            decode_episode(episode, layout)
+            decode_episode(episode, &layout)
                 .map_err(|error| malformed(&error, number, worker.as_ref()))
         };
         let episodes: Vec<Episode> = episodes.into_iter().map(decode).collect::<Result<_, _>>()?;

@@ -3,12 +3,16 @@
 use std::fmt;
 
 use serde_json::Value;
+use tandem_core::text::shortened;
 use tandem_rl::config::{RunConfig, former_keys};
 
 /// Settings that may change when a run resumes: its limits, and what is saved, logged and tested. All others affect
 /// learning.
 const FREE: [&str; 4] =
     ["stop.", "checkpoint.", "evaluation.recorded_episodes", "evaluation.test_episodes"];
+
+/// Longest value in a message; the parts of a task's description may be long.
+const MAX_SHOWN_CHARS: usize = 80;
 
 /// A setting that differs from the one that the run started with.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -57,7 +61,8 @@ pub fn first_change(
         let under_former_key = || lookup(&there, former_keys::former(&key)?);
         let there = lookup(&there, &key).or_else(under_former_key);
         let there = there.filter(|there| **there != here)?.to_string();
-        Some(Changed { key, here: here.to_string(), there })
+        let shown = |value: &str| shortened(value, MAX_SHOWN_CHARS);
+        Some(Changed { key, here: shown(&here.to_string()), there: shown(&there) })
     });
     Ok(changed.or_else(|| removed_setting(&there)))
 }

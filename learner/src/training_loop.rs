@@ -11,7 +11,6 @@ mod run_lock;
 
 use std::time::Duration;
 
-use tandem_core::layout::EPISODE_STEPS;
 use tandem_core::work::{PublishedActor, SlotOrder};
 use tandem_core::{Episode, EpisodeKind};
 use tandem_rl::trainer::{RoundStats, Trainer};
@@ -34,9 +33,6 @@ use progress_publisher::ProgressPublisher;
 const WAIT_TICK: Duration = Duration::from_millis(200);
 /// Workers that are logged by name if they fall silent at the same time.
 const MAX_SILENT_LINES: usize = 100;
-/// Units of advice that an episode can use: one per step.
-#[expect(clippy::cast_possible_truncation, reason = "an episode has 50 steps")]
-const UNITS_PER_EPISODE: u32 = EPISODE_STEPS as u32;
 
 /// The outcome of a run.
 #[derive(Debug, Clone, PartialEq)]

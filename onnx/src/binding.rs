@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::ops::Range;
 
-use tandem_core::{Layout, Task};
+use tandem_core::{Layout, Task, TaskSpec};
 
 use crate::error::ModelError;
 use crate::metadata;
@@ -38,7 +38,7 @@ pub enum Source {
 /// The result for a row has the same bits in any batch and on every machine.
 #[derive(Debug, Clone)]
 pub struct BoundNetwork {
-    layout: Layout,
+    layout: TaskSpec,
     network: Network,
     /// Source of each of the network's columns.
     sources: Vec<Source>,
@@ -55,8 +55,8 @@ impl BoundNetwork {
     ///
     /// # Errors
     /// When an input has another name or length, or an actor's output is not as long as an action.
-    pub fn new(model: &Model, role: Role, layout: Layout) -> Result<Self, ModelError> {
-        let network = &model.network;
+    pub fn new(model: &Model, role: Role, layout: impl Into<TaskSpec>) -> Result<Self, ModelError> {
+        let (network, layout) = (&model.network, layout.into());
         if role == Role::Actor && network.n_output != layout.n_action() {
             return Err(ModelError::Value {
                 kind: "output",
@@ -64,14 +64,14 @@ impl BoundNetwork {
                 problem: format!(
                     "it has {} numbers, an action of {} with {} arm(s) has {}",
                     network.n_output,
-                    layout.task,
-                    layout.n_arms,
+                    layout.name(),
+                    layout.n_arms(),
                     layout.n_action()
                 ),
             });
         }
         let is_only = network.inputs.len() == 1;
-        let inputs = network.inputs.iter().map(|input| sources(input, is_only, role, layout));
+        let inputs = network.inputs.iter().map(|input| sources(input, is_only, role, &layout));
         let inputs = inputs.collect::<Result<Vec<_>, _>>()?;
         let sources = network.columns.iter().map(|column| inputs[column.input][column.index]);
         let sources = sources.collect();
@@ -80,8 +80,8 @@ impl BoundNetwork {
 
     /// Returns the layout.
     #[must_use]
-    pub const fn layout(&self) -> Layout {
-        self.layout
+    pub const fn layout(&self) -> &TaskSpec {
+        &self.layout
     }
 
     /// Returns the network.
@@ -182,12 +182,12 @@ fn sources(
     input: &Input,
     is_only: bool,
     role: Role,
-    layout: Layout,
+    layout: &TaskSpec,
 ) -> Result<Vec<Source>, ModelError> {
     let observation = || (0..layout.n_observation()).map(Source::Observation);
     let goal = || (0..layout.n_goal()).map(Source::Goal);
     let action = || (0..layout.n_action()).map(Source::Action);
-    let achieved = || layout.arms().flat_map(|arm| layout.achieved_goal_of(arm));
+    let achieved = || layout.description().achieved_goal.iter().copied();
     let has_action = role == Role::Critic;
     let mut candidates: Vec<Vec<Source>> = Vec::new();
     let name = input.name.to_ascii_lowercase();
@@ -218,15 +218,15 @@ fn sources(
         refused(format!(
             "it has {} numbers, {} with {} arm(s) has {}",
             input.width,
-            layout.task,
-            layout.n_arms,
+            layout.name(),
+            layout.n_arms(),
             lengths.join(" or ")
         ))
     })
 }
 
 /// Returns the range of the observation, then of the goal and of the action, in an input row of a policy's network.
-pub(crate) fn policy_columns(layout: Layout) -> [Range<usize>; 3] {
+pub(crate) fn policy_columns(layout: &TaskSpec) -> [Range<usize>; 3] {
     let n_state = layout.n_observation() + layout.n_goal();
     [
         0..layout.n_observation(),

@@ -10,7 +10,7 @@ mod layers;
 
 use std::collections::BTreeMap;
 
-use tandem_core::Layout;
+use tandem_core::TaskSpec;
 use tandem_policy::policy::{MAX_HIDDEN_LAYERS, NO_CRITIC};
 use tandem_policy::{MlpShape, NormalizerSnapshot, Policy};
 
@@ -30,7 +30,12 @@ const MAX_PARAMETERS: usize = 1 << 24;
 ///
 /// # Errors
 /// When a model does not fit `layout`, or a policy file cannot represent it.
-pub fn import(actor: &Model, critic: Option<&Model>, layout: Layout) -> Result<Policy, ModelError> {
+pub fn import(
+    actor: &Model,
+    critic: Option<&Model>,
+    layout: impl Into<TaskSpec>,
+) -> Result<Policy, ModelError> {
+    let layout = &layout.into();
     let actor_network =
         Converted::new(&BoundNetwork::new(actor, Role::Actor, layout)?, Role::Actor)?;
     let critic_network = critic
@@ -48,7 +53,7 @@ pub fn import(actor: &Model, critic: Option<&Model>, layout: Layout) -> Result<P
     let actor_shape = MlpShape::actor(layout, n_hidden, n_hidden_layers);
     check_size(n_hidden_layers, &[actor_shape, critic_shape])?;
     let mut policy = Policy {
-        layout,
+        layout: layout.clone(),
         n_hidden,
         n_hidden_layers,
         n_heads,
@@ -133,7 +138,7 @@ impl Converted {
     }
 
     /// Returns the parameters of the same network with shape `shape`.
-    fn parameters(&self, layout: Layout, shape: &MlpShape) -> Vec<f32> {
+    fn parameters(&self, layout: &TaskSpec, shape: &MlpShape) -> Vec<f32> {
         let mut parameters = vec![0.0; shape.n_parameters()];
         let n_missing = shape.n_layers() - self.layers.len();
         for layer in 0..shape.n_layers() {
@@ -167,7 +172,7 @@ impl Converted {
 
     /// Writes the first layer's weights to the columns of a policy's network. Columns of the same source add up.
     #[expect(clippy::cast_possible_truncation, reason = "weights are stored as f32")]
-    fn write_first(&self, layer: &Dense, layout: Layout, matrix: &mut [f32], n_in: usize) {
+    fn write_first(&self, layer: &Dense, layout: &TaskSpec, matrix: &mut [f32], n_in: usize) {
         let [observation, goal, action] = policy_columns(layout);
         let position = |source| match source {
             Source::Observation(i) => observation.start + i,
@@ -199,7 +204,7 @@ impl Converted {
 /// Returns mean and standard deviation of each number of observation and goal, on which all networks must agree. Numbers
 /// that no network uses are not normalised.
 fn shared_normalizers<'a>(
-    layout: Layout,
+    layout: &TaskSpec,
     networks: impl Iterator<Item = &'a Converted>,
 ) -> Result<Vec<[f32; 2]>, ModelError> {
     let [observation, goal, _] = policy_columns(layout);

@@ -6,7 +6,7 @@ use std::collections::BTreeMap;
 use std::ops::Range;
 
 use serde_json::{Value, json};
-use tandem_core::{ArmIndex, Wilson};
+use tandem_core::{ArmIndex, Layout, Wilson};
 use tandem_policy::Policy;
 
 /// Name of the task.
@@ -44,28 +44,35 @@ const ACTION: [Part; 2] =
 /// Returns the entries that describe `policy`.
 #[must_use]
 pub fn of(policy: &Policy) -> BTreeMap<String, String> {
-    let layout = policy.layout;
-    let parts = |parts: &[Part], of: &dyn Fn(ArmIndex) -> Range<usize>| {
-        let of_arm = |arm: ArmIndex| described(parts, arm, of(arm));
-        Value::from(layout.arms().flat_map(of_arm).collect::<Vec<_>>()).to_string()
-    };
-    let entries = [
-        (TASK, layout.task.name().to_owned()),
-        (N_ARMS, layout.n_arms.to_string()),
+    let task = &policy.layout;
+    let mut entries: BTreeMap<&str, String> = BTreeMap::from([
+        (TASK, task.name().to_owned()),
+        (N_ARMS, task.n_arms().to_string()),
         (POLICY_DIGEST, policy.digest()),
-        ("observation", parts(&OBSERVATION, &|arm| layout.observation_of(arm))),
-        ("goal", parts(&GOAL, &|arm| layout.goal_of(arm))),
-        ("action", parts(&ACTION, &|arm| layout.action_of(arm))),
         ("value", value_text(policy.n_heads)),
-        ("frame", FRAME.to_owned()),
-        ("control_step_s", CONTROL_STEP_S.to_owned()),
-    ];
+    ]);
+    entries.extend(task.as_built_in().into_iter().flat_map(of_vectors));
     let mut entries: BTreeMap<String, String> =
         entries.into_iter().map(|(key, value)| (key.to_owned(), value)).collect();
     entries.extend(success(&policy.metadata));
     let training = policy.metadata.iter();
     entries.extend(training.map(|(key, value)| (format!("{TRAINING}{key}"), value.clone())));
     entries
+}
+
+/// Returns the entries about the vectors of a built-in task.
+fn of_vectors(layout: Layout) -> [(&'static str, String); 5] {
+    let parts = |parts: &[Part], of: &dyn Fn(ArmIndex) -> Range<usize>| {
+        let of_arm = |arm: ArmIndex| described(parts, arm, of(arm));
+        Value::from(layout.arms().flat_map(of_arm).collect::<Vec<_>>()).to_string()
+    };
+    [
+        ("observation", parts(&OBSERVATION, &|arm| layout.observation_of(arm))),
+        ("goal", parts(&GOAL, &|arm| layout.goal_of(arm))),
+        ("action", parts(&ACTION, &|arm| layout.action_of(arm))),
+        ("frame", FRAME.to_owned()),
+        ("control_step_s", CONTROL_STEP_S.to_owned()),
+    ]
 }
 
 /// Describes the parts of one arm's `range` of a vector.

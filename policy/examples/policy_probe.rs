@@ -17,7 +17,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let n_rows = std::env::args().nth(2).map_or(Ok(DEFAULT_ROWS), |rows| rows.parse::<usize>())?;
     let policy = Policy::load(Path::new(&file))?;
     let (mut actor, mut critic) = (policy.actor()?, policy.critic()?);
-    let layout = policy.layout;
+    let layout = &policy.layout;
 
     let mut rng = episode_rng(0, 0, Stream::Reset);
     let mut draw =

@@ -6,8 +6,9 @@ use std::path::Path;
 use safetensors::tensor::TensorView;
 use safetensors::{Dtype, SafeTensors};
 use serde_json::{Map, Value, json};
+use tandem_core::task::MAX_ARMS;
 use tandem_core::text::shortened;
-use tandem_core::{Layout, Task};
+use tandem_core::{Layout, Task, TaskDescription, TaskSpec};
 use tandem_system::{atomic_file, regular_file};
 
 use crate::error::{Error, FormatError};
@@ -20,10 +21,12 @@ mod tests;
 
 /// Value of the metadata entry `format`.
 pub const FORMAT: &str = "tandem-policy";
-/// Value of the metadata entry `format_version`. Files of other versions are refused.
+/// Value of the metadata entry `format_version` in files of built-in tasks.
 pub const FORMAT_VERSION: &str = "1";
+/// Value of the metadata entry `format_version` in files of other tasks, which contain the task's description. Files of
+/// versions other than these two are refused.
+pub const DESCRIBED_FORMAT_VERSION: &str = "2";
 
-const MAX_ARMS: usize = 64;
 /// Largest number of characters of a file's entry in an error message. A digest has 64.
 const MAX_SHOWN_CHARS: usize = 80;
 /// Headers are padded to a multiple of this number of bytes. A header's length precedes it as a little-endian `u64`.
@@ -76,18 +79,20 @@ fn encode(policy: &Policy) -> Vec<u8> {
 /// Returns the policy's own metadata and the entries that the format defines.
 fn metadata(policy: &Policy) -> BTreeMap<String, String> {
     let mut metadata = policy.metadata.clone();
-    metadata.extend(reserved(policy).map(|(key, value)| (key.to_owned(), value)));
+    metadata.extend(reserved(policy).into_iter().map(|(key, value)| (key.to_owned(), value)));
     metadata
 }
 
 /// Returns the entries that the format defines, in the order in which a reader checks them.
-fn reserved(policy: &Policy) -> [(&'static str, String); 15] {
-    let layout = policy.layout;
-    [
+fn reserved(policy: &Policy) -> Vec<(&'static str, String)> {
+    let layout = &policy.layout;
+    let description = layout.as_built_in().is_none().then(|| description_entry(layout));
+    let version = if description.is_some() { DESCRIBED_FORMAT_VERSION } else { FORMAT_VERSION };
+    let entries = [
         ("format", FORMAT.to_owned()),
-        ("format_version", FORMAT_VERSION.to_owned()),
-        ("task", layout.task.name().to_owned()),
-        ("n_arms", layout.n_arms.to_string()),
+        ("format_version", version.to_owned()),
+        ("task", layout.name().to_owned()),
+        ("n_arms", layout.n_arms().to_string()),
         ("n_hidden", policy.n_hidden.to_string()),
         ("n_hidden_layers", policy.n_hidden_layers.to_string()),
         ("n_heads", policy.n_heads.to_string()),
@@ -99,7 +104,12 @@ fn reserved(policy: &Policy) -> [(&'static str, String); 15] {
         ("action_clip", "1".to_owned()),
         ("normalizer_clip", CLIP.to_string()),
         ("digest", policy.digest()),
-    ]
+    ];
+    entries.into_iter().chain(description.map(|text| ("description", text))).collect()
+}
+
+fn description_entry(layout: &TaskSpec) -> String {
+    json!(layout.description()).to_string()
 }
 
 fn decode(bytes: &[u8]) -> Result<Policy, FormatError> {
@@ -124,9 +134,14 @@ fn read_policy(
     metadata: BTreeMap<String, String>,
 ) -> Result<Policy, FormatError> {
     expect_entry(&metadata, "format", FORMAT)?;
-    expect_entry(&metadata, "format_version", FORMAT_VERSION)?;
-    let task = parse_task(&metadata)?;
-    let layout = Layout::new(task, parse_size(&metadata, "n_arms", MAX_ARMS)?);
+    let layout = match entry(&metadata, "format_version")? {
+        DESCRIBED_FORMAT_VERSION => parse_description(&metadata)?,
+        _ => {
+            expect_entry(&metadata, "format_version", FORMAT_VERSION)?;
+            let task = parse_task(&metadata)?;
+            Layout::new(task, parse_size(&metadata, "n_arms", MAX_ARMS)?).into()
+        }
+    };
     let n_hidden = parse_size(&metadata, "n_hidden", MAX_HIDDEN)?;
     let n_hidden_layers = parse_size(&metadata, "n_hidden_layers", MAX_HIDDEN_LAYERS)?;
     let n_heads = parse_size(&metadata, "n_heads", MAX_HEADS)?;
@@ -137,18 +152,18 @@ fn read_policy(
         })
     };
     Ok(Policy {
-        layout,
         n_hidden,
         n_hidden_layers,
         n_heads,
-        actor: read_network(file, "actor", &MlpShape::actor(layout, n_hidden, n_hidden_layers))?,
+        actor: read_network(file, "actor", &MlpShape::actor(&layout, n_hidden, n_hidden_layers))?,
         critic: read_network(
             file,
             "critic.0",
-            &MlpShape::critic(layout, n_hidden, n_hidden_layers, n_heads),
+            &MlpShape::critic(&layout, n_hidden, n_hidden_layers, n_heads),
         )?,
         observation_normalizer: normalizer("observation", layout.n_observation())?,
         goal_normalizer: normalizer("goal", layout.n_goal())?,
+        layout,
         metadata,
     })
 }
@@ -159,7 +174,8 @@ fn check_reserved(mut policy: Policy) -> Result<Policy, FormatError> {
     for (key, expected) in reserved(&policy) {
         match (key, policy.metadata.remove(key)) {
             (_, Some(got)) if got == expected => {}
-            ("digest", None) => {}
+            // The description was read; another program may have written the same numbers differently.
+            ("digest", None) | ("description", Some(_)) => {}
             ("digest", Some(written)) => {
                 return Err(FormatError::Digest {
                     got: expected,
@@ -200,6 +216,23 @@ fn expect_entry(
         got: shortened(got, MAX_SHOWN_CHARS),
         expected: format!("{expected:?}"),
     })
+}
+
+/// Reads the description of a task that is not built-in.
+fn parse_description(metadata: &BTreeMap<String, String>) -> Result<TaskSpec, FormatError> {
+    let text = entry(metadata, "description")?;
+    let refusal = |problem: String| FormatError::Metadata {
+        key: "description",
+        got: shortened(text, MAX_SHOWN_CHARS),
+        expected: format!("the description of a task: {problem}"),
+    };
+    let description: TaskDescription =
+        serde_json::from_str(text).map_err(|error| refusal(error.to_string()))?;
+    let task = TaskSpec::new(description).map_err(|error| refusal(error.to_string()))?;
+    match task.as_built_in() {
+        None => Ok(task),
+        Some(_) => Err(refusal(format!("{} is built-in, which is version 1", task.name()))),
+    }
 }
 
 fn parse_task(metadata: &BTreeMap<String, String>) -> Result<Task, FormatError> {

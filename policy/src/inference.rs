@@ -1,6 +1,6 @@
 //! Actor and critic for inference on a few observations at a time.
 
-use tandem_core::Layout;
+use tandem_core::TaskSpec;
 use tandem_core::work::PublishedActor;
 
 use crate::elementwise::tanh;
@@ -13,14 +13,14 @@ use crate::validation::{check_network_size, check_normalizer, check_parameters};
 /// Normalisation of observations and goals for the input of a network.
 #[derive(Debug, Clone)]
 struct Inputs {
-    layout: Layout,
+    layout: TaskSpec,
     observation: NormalizerSnapshot,
     goal: NormalizerSnapshot,
 }
 
 impl Inputs {
     fn new(
-        layout: Layout,
+        layout: TaskSpec,
         observation: NormalizerSnapshot,
         goal: NormalizerSnapshot,
     ) -> Result<Self, Error> {
@@ -70,10 +70,11 @@ impl Actor {
     ///
     /// # Errors
     /// Returns an error if the parameters do not match `layout` or are not finite.
-    pub fn new(layout: Layout, published: PublishedActor) -> Result<Self, Error> {
+    pub fn new(layout: impl Into<TaskSpec>, published: PublishedActor) -> Result<Self, Error> {
+        let layout = layout.into();
         let PublishedActor { version, n_hidden, n_hidden_layers, actor, .. } = published;
         check_network_size(n_hidden, n_hidden_layers)?;
-        let shape = MlpShape::actor(layout, n_hidden, n_hidden_layers);
+        let shape = MlpShape::actor(&layout, n_hidden, n_hidden_layers);
         check_parameters("actor", &actor, shape.n_parameters())?;
         let observation =
             NormalizerSnapshot { mean: published.observation_mean, std: published.observation_std };
@@ -88,10 +89,10 @@ impl Actor {
         self.version
     }
 
-    /// Returns the task and the number of arms.
+    /// Returns the task.
     #[must_use]
-    pub const fn layout(&self) -> Layout {
-        self.inputs.layout
+    pub const fn layout(&self) -> &TaskSpec {
+        &self.inputs.layout
     }
 
     /// Writes the actions, in [−1, 1], shape `[n, n_action]`, for `observations`, shape `[n, n_observation]`, and
@@ -136,15 +137,16 @@ impl Critic {
     /// # Errors
     /// Returns an error if the parameters do not match `layout` or are not finite.
     pub fn new(
-        layout: Layout,
+        layout: impl Into<TaskSpec>,
         shape: &MlpShape,
         parameters: &[f32],
         observation: NormalizerSnapshot,
         goal: NormalizerSnapshot,
     ) -> Result<Self, Error> {
+        let layout = layout.into();
         check_network_size(shape.n_hidden, shape.n_hidden_layers)?;
         let fitting =
-            MlpShape::critic(layout, shape.n_hidden, shape.n_hidden_layers, shape.n_output);
+            MlpShape::critic(&layout, shape.n_hidden, shape.n_hidden_layers, shape.n_output);
         if fitting.n_input != shape.n_input {
             return Err(Error::WrongLength {
                 name: "critic input",
@@ -193,14 +195,14 @@ impl Critic {
 #[cfg(test)]
 mod tests {
     use tandem_core::rng::uniform;
-    use tandem_core::{Stream, Task, episode_rng};
+    use tandem_core::{Layout, Stream, Task, TaskSpec, episode_rng};
 
     use super::*;
     use crate::policy::Policy;
 
     const N_ROWS: usize = 70;
 
-    fn inputs(layout: Layout) -> [Vec<f32>; 3] {
+    fn inputs(layout: &TaskSpec) -> [Vec<f32>; 3] {
         let mut rng = episode_rng(5, 0, Stream::Reset);
         [layout.n_observation(), layout.n_goal(), layout.n_action()]
             .map(|n| (0..N_ROWS * n).map(|_| uniform(&mut rng, -1.0, 1.0)).collect())
@@ -209,7 +211,7 @@ mod tests {
     #[test]
     fn a_batch_gives_the_same_bits_as_its_rows_one_by_one() {
         let policy = Policy::sample(Layout::new(Task::PickAndPlace, 2), 2);
-        let layout = policy.layout;
+        let layout = &policy.layout;
         let (n_observation, n_goal, n_action) =
             (layout.n_observation(), layout.n_goal(), layout.n_action());
         let [observations, goals, _] = inputs(layout);
@@ -235,7 +237,7 @@ mod tests {
     #[test]
     fn a_value_depends_on_its_own_action_only() {
         let policy = Policy::sample(Layout::new(Task::Push, 1), 1);
-        let [observations, goals, mut actions] = inputs(policy.layout);
+        let [observations, goals, mut actions] = inputs(&policy.layout);
         let mut critic = policy.critic().unwrap();
         let (mut before, mut after) = (vec![0.0; N_ROWS], vec![0.0; N_ROWS]);
         critic.q(&observations, &goals, &actions, &mut before);
@@ -252,7 +254,7 @@ mod tests {
         let check = |spoil: fn(&mut PublishedActor), expected: &str| {
             let mut published = policy.published(3);
             spoil(&mut published);
-            let error = Actor::new(policy.layout, published).expect_err("must be refused");
+            let error = Actor::new(&policy.layout, published).expect_err("must be refused");
             assert_eq!(error.to_string(), expected);
         };
         check(|actor| actor.actor.truncate(2178), "actor has 2178 numbers, expected 2179");
@@ -264,7 +266,7 @@ mod tests {
             "observation std holds a number that is not above 0",
         );
         assert_eq!(
-            Actor::new(policy.layout, policy.published(3)).map(|actor| actor.version()).unwrap(),
+            Actor::new(&policy.layout, policy.published(3)).map(|actor| actor.version()).unwrap(),
             3
         );
     }

@@ -5,7 +5,7 @@
 //!
 //! # Running a policy
 //!
-//! A [`Policy`] contains both networks, the normalisation of their inputs and the [`Layout`](tandem_core::Layout) for
+//! A [`Policy`] contains both networks, the normalisation of their inputs and the [task](tandem_core::TaskSpec) for
 //! which it was trained. Its [`Actor`] chooses actions, its [`Critic`] values them:
 //!
 //! ```

@@ -3,7 +3,7 @@
 use std::ops::Range;
 
 use rand_chacha::ChaCha8Rng;
-use tandem_core::Layout;
+use tandem_core::TaskSpec;
 use tandem_core::rng::uniform;
 
 use crate::elementwise::{add_bias, add_bias_relu, column_sums, mask, mask_and_sum};
@@ -27,7 +27,8 @@ pub struct MlpShape {
 impl MlpShape {
     /// Returns the shape of an actor, which maps normalised observation and goal to an action before its tanh.
     #[must_use]
-    pub const fn actor(layout: Layout, n_hidden: usize, n_hidden_layers: usize) -> Self {
+    pub fn actor(layout: impl Into<TaskSpec>, n_hidden: usize, n_hidden_layers: usize) -> Self {
+        let layout = layout.into();
         let n_input = layout.n_observation() + layout.n_goal();
         Self { n_input, n_hidden, n_hidden_layers, n_output: layout.n_action() }
     }
@@ -35,12 +36,13 @@ impl MlpShape {
     /// Returns the shape of a critic, which maps normalised observation and goal, then the action, to one value per
     /// head.
     #[must_use]
-    pub const fn critic(
-        layout: Layout,
+    pub fn critic(
+        layout: impl Into<TaskSpec>,
         n_hidden: usize,
         n_hidden_layers: usize,
         n_heads: usize,
     ) -> Self {
+        let layout = layout.into();
         let n_input = layout.n_observation() + layout.n_goal() + layout.n_action();
         Self { n_input, n_hidden, n_hidden_layers, n_output: n_heads }
     }

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 
 use sha2::{Digest as _, Sha256};
-use tandem_core::Layout;
+use tandem_core::TaskSpec;
 use tandem_core::text::hex;
 use tandem_core::work::PublishedActor;
 
@@ -18,8 +18,8 @@ pub use crate::validation::{MAX_HEADS, MAX_HIDDEN, MAX_HIDDEN_LAYERS};
 /// A trained policy: the networks that choose and value actions, with everything needed to evaluate them.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Policy {
-    /// Task and arms.
-    pub layout: Layout,
+    /// The task.
+    pub layout: TaskSpec,
     /// Units of each hidden layer of both networks.
     pub n_hidden: usize,
     /// Number of hidden layers of both networks.
@@ -55,14 +55,14 @@ pub struct Tensor<'a> {
 impl Policy {
     /// Returns the sizes of the actor.
     #[must_use]
-    pub const fn actor_shape(&self) -> MlpShape {
-        MlpShape::actor(self.layout, self.n_hidden, self.n_hidden_layers)
+    pub fn actor_shape(&self) -> MlpShape {
+        MlpShape::actor(&self.layout, self.n_hidden, self.n_hidden_layers)
     }
 
     /// Returns the sizes of the critic.
     #[must_use]
-    pub const fn critic_shape(&self) -> MlpShape {
-        MlpShape::critic(self.layout, self.n_hidden, self.n_hidden_layers, self.n_heads)
+    pub fn critic_shape(&self) -> MlpShape {
+        MlpShape::critic(&self.layout, self.n_hidden, self.n_hidden_layers, self.n_heads)
     }
 
     /// Creates the actor, which chooses actions.
@@ -70,7 +70,7 @@ impl Policy {
     /// # Errors
     /// Returns an error if a vector has the wrong length or contains an invalid number.
     pub fn actor(&self) -> Result<Actor, Error> {
-        Actor::new(self.layout, self.published(0))
+        Actor::new(&self.layout, self.published(0))
     }
 
     /// Creates the critic, which values actions.
@@ -80,7 +80,7 @@ impl Policy {
     pub fn critic(&self) -> Result<Critic, Error> {
         let (observation, goal) =
             (self.observation_normalizer.clone(), self.goal_normalizer.clone());
-        Critic::new(self.layout, &self.critic_shape(), &self.critic, observation, goal)
+        Critic::new(&self.layout, &self.critic_shape(), &self.critic, observation, goal)
     }
 
     /// Returns true unless the metadata says that the policy has no critic; see [`NO_CRITIC`].
@@ -156,7 +156,7 @@ impl Policy {
 /// # Panics
 /// If the parameter vector is too short for the network; see [`Actor::new`].
 #[must_use]
-pub fn actor_digest(layout: Layout, published: &PublishedActor) -> String {
+pub fn actor_digest(layout: &TaskSpec, published: &PublishedActor) -> String {
     let shape = MlpShape::actor(layout, published.n_hidden, published.n_hidden_layers);
     let mut tensors = network_tensors("actor", &shape, &published.actor);
     tensors.extend(normalizer_tensors([
@@ -211,13 +211,14 @@ pub(crate) fn little_endian(numbers: &[f32]) -> Vec<u8> {
 #[cfg(test)]
 impl Policy {
     /// Creates a small policy with arbitrary numbers and two hidden layers of 32 units.
-    pub(crate) fn sample(layout: Layout, n_heads: usize) -> Self {
+    pub(crate) fn sample(layout: impl Into<TaskSpec>, n_heads: usize) -> Self {
+        let layout = layout.into();
         use tandem_core::rng::uniform;
         use tandem_core::{Stream, episode_rng};
 
         let mut rng = episode_rng(11, 0, Stream::Initialisation);
         let (actor, critic) =
-            (MlpShape::actor(layout, 32, 2), MlpShape::critic(layout, 32, 2, n_heads));
+            (MlpShape::actor(&layout, 32, 2), MlpShape::critic(&layout, 32, 2, n_heads));
         let (actor, critic) = (actor.initialise(&mut rng), critic.initialise(&mut rng));
         let mut normalizer = |size: usize| NormalizerSnapshot {
             mean: (0..size).map(|_| uniform(&mut rng, -0.2, 0.2)).collect(),

@@ -2,29 +2,31 @@
 
 use std::collections::BTreeMap;
 
-use tandem_core::ArmIndex;
-use tandem_core::layout::Layout;
+use tandem_core::task::Part;
+use tandem_core::{ArmIndex, TaskSpec};
 
 use crate::mlp::MlpShape;
 use crate::normalizer::NormalizerSnapshot;
 use crate::policy::Policy;
 
 impl Policy {
-    /// Creates a policy for `n_arms` arms in which each arm acts, and is valued, as by this one-arm policy.
+    /// Creates a policy for the task `layout` in which each arm acts, and is valued, as by this one-arm policy.
     ///
-    /// The networks are `n_arms` times as wide and block-diagonal, and the critic has one head per arm. The metadata is
-    /// empty.
+    /// The networks are wider by the number of arms and block-diagonal, and the critic has one head per arm. The
+    /// metadata is empty.
     ///
     /// # Panics
-    /// If this policy has several arms or critic heads, or if a vector has the wrong length; see [`Policy::check`].
+    /// If this policy has several arms or critic heads, its task is not the [one-arm task](TaskSpec::single_arm) of
+    /// `layout`, or a vector has the wrong length; see [`Policy::check`].
     #[must_use]
-    pub fn replicated(&self, n_arms: usize) -> Self {
+    pub fn replicated(&self, layout: &TaskSpec) -> Self {
         assert_eq!(
-            (self.layout.n_arms, self.n_heads),
+            (self.layout.n_arms(), self.n_heads),
             (1, 1),
             "only a one-arm policy can be copied"
         );
-        let layout = Layout::new(self.layout.task, n_arms);
+        assert!(layout.single_arm().as_ref() == Some(&self.layout), "arms of another task");
+        let n_arms = layout.n_arms();
         let (n_hidden, n_heads) = (self.n_hidden * n_arms, n_arms);
         let actor_shape = MlpShape::actor(layout, n_hidden, self.n_hidden_layers);
         let critic_shape = MlpShape::critic(layout, n_hidden, self.n_hidden_layers, n_heads);
@@ -32,7 +34,7 @@ impl Policy {
         let mut critic = vec![0.0; critic_shape.n_parameters()];
         for arm in layout.arms() {
             let inputs = state_columns(layout, arm);
-            let actions: Vec<usize> = layout.action_of(arm).collect();
+            let actions: Vec<usize> = layout.action_of(arm).iter().collect();
             let n_state = layout.n_observation() + layout.n_goal();
             let joined: Vec<usize> =
                 inputs.iter().copied().chain(actions.iter().map(|i| n_state + i)).collect();
@@ -41,24 +43,26 @@ impl Policy {
             let source = (&self.critic_shape(), self.critic.as_slice());
             write_block(source, (&critic_shape, &mut critic), (&joined, &[arm.0]), arm);
         }
+        let observations = layout.arms().map(|arm| layout.observation_of(arm));
+        let goals = layout.arms().map(|arm| layout.goal_of(arm));
         Self {
-            layout,
+            layout: layout.clone(),
             n_hidden,
             n_hidden_layers: self.n_hidden_layers,
             n_heads,
             actor,
             critic,
-            observation_normalizer: repeated(&self.observation_normalizer, n_arms),
-            goal_normalizer: repeated(&self.goal_normalizer, n_arms),
+            observation_normalizer: repeated(&self.observation_normalizer, observations),
+            goal_normalizer: repeated(&self.goal_normalizer, goals),
             metadata: BTreeMap::new(),
         }
     }
 }
 
 /// Returns the indices of `arm`'s numbers in the concatenation of observation and goal.
-fn state_columns(layout: Layout, arm: ArmIndex) -> Vec<usize> {
-    let goals = layout.goal_of(arm).map(|i| layout.n_observation() + i);
-    layout.observation_of(arm).chain(goals).collect()
+fn state_columns(layout: &TaskSpec, arm: ArmIndex) -> Vec<usize> {
+    let goals = layout.goal_of(arm).iter().map(|i| layout.n_observation() + i);
+    layout.observation_of(arm).iter().chain(goals).collect()
 }
 
 /// Writes a network into another one as the block of `arm`. `inputs` are the columns of its inputs in the first layer,
@@ -87,14 +91,24 @@ fn write_block(
     }
 }
 
-fn repeated(one: &NormalizerSnapshot, n: usize) -> NormalizerSnapshot {
-    NormalizerSnapshot { mean: one.mean.repeat(n), std: one.std.repeat(n) }
+/// Repeats the statistics of one arm for each of `parts`, which cover a vector.
+fn repeated<'a>(
+    one: &NormalizerSnapshot,
+    parts: impl ExactSizeIterator<Item = &'a Part>,
+) -> NormalizerSnapshot {
+    let n = one.mean.len() * parts.len();
+    let mut all = NormalizerSnapshot { mean: vec![0.0; n], std: vec![1.0; n] };
+    for part in parts {
+        part.write(&mut all.mean, &one.mean);
+        part.write(&mut all.std, &one.std);
+    }
+    all
 }
 
 #[cfg(test)]
 mod tests {
     use tandem_core::rng::uniform;
-    use tandem_core::{Stream, Task, episode_rng};
+    use tandem_core::{Layout, Stream, Task, episode_rng};
 
     use super::*;
 
@@ -110,7 +124,7 @@ mod tests {
         let critic = MlpShape::critic(LAYOUT, n_hidden, n_hidden_layers, 1).n_parameters();
         let (n_observation, n_goal) = (LAYOUT.n_observation(), LAYOUT.n_goal());
         Policy {
-            layout: LAYOUT,
+            layout: LAYOUT.into(),
             n_hidden,
             n_hidden_layers,
             n_heads: 1,
@@ -128,14 +142,37 @@ mod tests {
         }
     }
 
+    /// Two arms whose numbers are interleaved in every vector.
+    fn interleaved() -> TaskSpec {
+        let concatenated = Layout::new(Task::PickAndPlace, 2).description();
+        let every_other = |arm_idx: usize, n: usize| (0..n).map(|i| 2 * i + arm_idx).collect();
+        let mut description = concatenated.clone();
+        description.name = "interleaved".to_owned();
+        for (arm_idx, arm) in description.arms.iter_mut().enumerate() {
+            arm.observation = every_other(arm_idx, 28);
+            arm.goal = every_other(arm_idx, 3);
+            arm.action = every_other(arm_idx, 4);
+            arm.position = Vec::new();
+        }
+        description.achieved_goal = (0..6).map(|i| 6 + i).collect();
+        let bound = |idx: usize| concatenated.observation_bound[idx / 2];
+        description.observation_bound = (0..56).map(bound).collect();
+        TaskSpec::new(description).unwrap()
+    }
+
     #[test]
     fn each_arm_acts_and_is_valued_as_by_the_one_arm_policy() {
         let one = one_arm();
-        let both = one.replicated(2);
+        check_copies(&one, &Layout::new(Task::PickAndPlace, 2).into());
+        let layout = interleaved();
+        check_copies(&Policy { layout: layout.single_arm().unwrap(), ..one }, &layout);
+    }
+
+    fn check_copies(one: &Policy, layout: &TaskSpec) {
+        let both = one.replicated(layout);
         both.check().unwrap();
         let mut rng = episode_rng(6, 0, Stream::Initialisation);
         let mut draw = |n: usize| (0..n).map(|_| uniform(&mut rng, -1.0, 1.0)).collect::<Vec<_>>();
-        let layout = both.layout;
         let (observation, goal) = (draw(layout.n_observation()), draw(layout.n_goal()));
         let actions_taken = draw(layout.n_action());
 
@@ -145,14 +182,14 @@ mod tests {
         let mut values = vec![0.0; 2];
         valuing.q(&observation, &goal, &actions_taken, &mut values);
         for arm in layout.arms() {
-            let (observation, goal) =
-                (&observation[layout.observation_of(arm)], &goal[layout.goal_of(arm)]);
+            let observation = layout.observation_of(arm).of(&observation);
+            let goal = layout.goal_of(arm).of(&goal);
             let mut action = vec![0.0; LAYOUT.n_action()];
-            one.actor().unwrap().act(observation, goal, &mut action);
+            one.actor().unwrap().act(&observation, &goal, &mut action);
             let mut value = vec![0.0];
-            let alone = &actions_taken[layout.action_of(arm)];
-            one.critic().unwrap().q(observation, goal, alone, &mut value);
-            for (got, expected) in actions[layout.action_of(arm)].iter().zip(&action) {
+            let alone = layout.action_of(arm).of(&actions_taken);
+            one.critic().unwrap().q(&observation, &goal, &alone, &mut value);
+            for (got, expected) in layout.action_of(arm).of(&actions).iter().zip(&action) {
                 assert!((got - expected).abs() < 1e-5, "arm {arm:?}: {got} against {expected}");
             }
             let got = values[arm.0];

@@ -1,15 +1,11 @@
 //! Conversions for `teacher.proto`: queries to a teacher and its advice.
 
 use tandem_core::bounds::MAX_MAGNITUDE;
-use tandem_core::layout::OBSERVATION_PER_ARM;
-use tandem_core::{ArmAdvice, Layout, StepAdvice, StepQuery, Task};
+use tandem_core::{ArmAdvice, ArmIndex, StepAdvice, StepQuery, TaskSpec};
 
 use crate::error::DecodeError;
 use crate::numbers::{actions, bounded, one_finite, one_within};
 use crate::pb;
-
-/// Largest number of arms of a layout. An episode has one bit per arm and step.
-pub const MAX_ARMS: usize = 8;
 
 /// Largest length of an account's name, bytes.
 const MAX_NAME_BYTES: usize = 256;
@@ -25,21 +21,6 @@ pub fn decode_account_name(field: &str, name: String) -> Result<String, DecodeEr
             Err(DecodeError::new(field, format_args!("1 to {MAX_NAME_BYTES} bytes"), n_bytes))
         }
     }
-}
-
-/// Derives the layout of a student from the length of its observation.
-///
-/// # Errors
-/// Returns an error if no layout of 1 to [`MAX_ARMS`] arms has observations of this length.
-pub fn layout_of_query(query: &pb::StepQuery, task: Task) -> Result<Layout, DecodeError> {
-    let n_numbers = query.observation.len();
-    let n_arms = n_numbers / OBSERVATION_PER_ARM;
-    if n_numbers.is_multiple_of(OBSERVATION_PER_ARM) && (1..=MAX_ARMS).contains(&n_arms) {
-        return Ok(Layout::new(task, n_arms));
-    }
-    let expected =
-        format_args!("{OBSERVATION_PER_ARM} numbers for each of 1 to {MAX_ARMS} arms").to_string();
-    Err(DecodeError::new("observation", expected, format_args!("{n_numbers} numbers")))
 }
 
 /// Encodes a query.
@@ -59,16 +40,22 @@ pub fn encode_query(query: &StepQuery) -> pb::StepQuery {
 /// Any step number is valid; the teacher's account limits the length of an episode.
 ///
 /// # Errors
-/// Returns an error if a vector has the wrong length, a number is not finite or beyond [`MAX_MAGNITUDE`], or the
+/// Returns an error if a vector has the wrong length, a number is not finite or beyond both [`MAX_MAGNITUDE`] and the
+/// task's bound, or the
 /// proposed action is outside [−1, 1].
-pub fn decode_query(query: pb::StepQuery, layout: Layout) -> Result<StepQuery, DecodeError> {
-    // Students may be trained by other programs in other worlds, so the bound is not that of a task.
-    let largest = |_| MAX_MAGNITUDE;
+pub fn decode_query(
+    query: pb::StepQuery,
+    layout: impl Into<TaskSpec>,
+) -> Result<StepQuery, DecodeError> {
+    let layout = layout.into();
+    // Students may be trained by other programs in other worlds, so the bound is that of a task only if it is larger.
+    let largest = |idx| MAX_MAGNITUDE.max(layout.observation_bound(idx));
+    let largest_goal = |idx| MAX_MAGNITUDE.max(layout.goal_bound(idx));
     Ok(StepQuery {
         episode: query.episode,
         step: query.step,
         observation: bounded("observation", query.observation, layout.n_observation(), largest)?,
-        goal: bounded("goal", query.goal, layout.n_goal(), largest)?,
+        goal: bounded("goal", query.goal, layout.n_goal(), largest_goal)?,
         proposed_action: actions("proposed_action", query.proposed_action, layout.n_action())?,
     })
 }
@@ -99,13 +86,17 @@ fn encode_arm(arm: &ArmAdvice) -> pb::ArmAdvice {
 /// # Errors
 /// Returns an error if a length does not match the layout, a number is not finite, an action is outside [−1, 1] or a
 /// distance is negative.
-pub fn decode_advice(advice: pb::StepAdvice, layout: Layout) -> Result<StepAdvice, DecodeError> {
-    if advice.arms.len() != layout.n_arms {
-        let expected = format_args!("{} arms", layout.n_arms).to_string();
+pub fn decode_advice(
+    advice: pb::StepAdvice,
+    layout: impl Into<TaskSpec>,
+) -> Result<StepAdvice, DecodeError> {
+    let layout = layout.into();
+    if advice.arms.len() != layout.n_arms() {
+        let expected = format_args!("{} arms", layout.n_arms()).to_string();
         return Err(DecodeError::new("arms", expected, format_args!("{} arms", advice.arms.len())));
     }
     let decode_indexed = |(arm_idx, arm)| {
-        decode_arm(arm, layout)
+        decode_arm(arm, &layout)
             .map_err(|error: DecodeError| error.within(format_args!("arms[{arm_idx}]")))
     };
     Ok(StepAdvice {
@@ -115,12 +106,12 @@ pub fn decode_advice(advice: pb::StepAdvice, layout: Layout) -> Result<StepAdvic
     })
 }
 
-fn decode_arm(arm: pb::ArmAdvice, layout: Layout) -> Result<ArmAdvice, DecodeError> {
+fn decode_arm(arm: pb::ArmAdvice, layout: &TaskSpec) -> Result<ArmAdvice, DecodeError> {
     Ok(ArmAdvice {
         teacher_action: actions(
             "teacher_action",
             arm.teacher_action,
-            layout.single_arm().n_action(),
+            layout.action_of(ArmIndex(0)).len(),
         )?,
         q_teacher: one_finite("q_teacher", arm.q_teacher)?,
         q_student: one_finite("q_student", arm.q_student)?,
@@ -133,6 +124,7 @@ fn decode_arm(arm: pb::ArmAdvice, layout: Layout) -> Result<ArmAdvice, DecodeErr
 #[cfg(test)]
 mod tests {
     use prost::Message as _;
+    use tandem_core::{Layout, Task};
 
     use super::*;
 
@@ -230,24 +222,6 @@ mod tests {
             |a| a.arms[1].distance = -0.5,
             "arms[1].distance: expected a finite number, 0 or more, got -0.5",
         );
-    }
-
-    #[test]
-    fn the_number_of_arms_follows_from_the_length_of_an_observation() {
-        let layout_of = |n_numbers| {
-            layout_of_query(
-                &pb::StepQuery { observation: vec![0.0; n_numbers], ..Default::default() },
-                Task::Push,
-            )
-        };
-        for n_arms in 1..=MAX_ARMS {
-            assert_eq!(layout_of(28 * n_arms), Ok(Layout::new(Task::Push, n_arms)));
-        }
-        for n_numbers in [0, 27, 29, 57, 28 * 9] {
-            let message = layout_of(n_numbers).unwrap_err().to_string();
-            let expected = "observation: expected 28 numbers for each of 1 to 8 arms";
-            assert_eq!(message, format!("{expected}, got {n_numbers} numbers"));
-        }
     }
 
     #[test]

@@ -1,10 +1,11 @@
 //! Conversions for `policy.proto`: a one-arm policy in another process.
 
-use tandem_core::{Layout, Task};
+use tandem_core::{Layout, Task, TaskSpec};
 
 use crate::error::DecodeError;
 use crate::numbers::{actions_from_bytes, finite_from_bytes, to_bytes};
 use crate::pb;
+use crate::task::decode_task;
 
 /// The largest number of states of a request.
 pub const MAX_POLICY_STATES: usize = 256;
@@ -14,10 +15,10 @@ const MAX_NAME: usize = 256;
 const MAX_DIGEST: usize = 128;
 
 /// A decoded description of a policy.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct PolicyDescription {
     /// The task, for one arm.
-    pub layout: Layout,
+    pub layout: TaskSpec,
     /// The policy's name, for logs.
     pub name: String,
     /// The text that identifies the policy.
@@ -63,7 +64,7 @@ pub fn decode_policy_description(
     message: pb::PolicyDescription,
 ) -> Result<PolicyDescription, DecodeError> {
     let task = message.task.ok_or_else(|| DecodeError::missing("task"))?;
-    let layout = decode_one_arm_layout(&task).map_err(|error| error.within("task"))?;
+    let layout = decode_one_arm_task(task).map_err(|error| error.within("task"))?;
     let name = message.name;
     if name.len() > MAX_NAME || name.chars().any(char::is_control) {
         let expected = format_args!("at most {MAX_NAME} bytes of printable text").to_string();
@@ -78,21 +79,22 @@ pub fn decode_policy_description(
     Ok(PolicyDescription { layout, name, digest, has_values: message.has_values })
 }
 
-fn decode_one_arm_layout(task: &pb::TaskDescription) -> Result<Layout, DecodeError> {
-    let known: Task = task.name.parse().map_err(|_unknown| {
-        DecodeError::new("name", "push or pick-and-place", task.name.escape_debug())
-    })?;
-    let layout = Layout::new(known, 1);
+/// Decodes a task of one arm. The parts of the built-in tasks are known, so their descriptions need not contain them.
+fn decode_one_arm_task(task: pb::TaskDescription) -> Result<TaskSpec, DecodeError> {
     if task.arms.len() != 1 {
         return Err(DecodeError::new("arms", "1 arm", task.arms.len()));
     }
+    let Ok(known) = task.name.parse::<Task>() else {
+        return decode_task(task);
+    };
+    let layout = Layout::new(known, 1);
     let lengths = [
         ("n_observation", task.n_observation, layout.n_observation()),
         ("n_goal", task.n_goal, layout.n_goal()),
         ("n_action", task.n_action, layout.n_action()),
     ];
     match lengths.into_iter().find(|(_, got, expected)| usize::try_from(*got) != Ok(*expected)) {
-        None => Ok(layout),
+        None => Ok(layout.into()),
         Some((field, got, expected)) => {
             Err(DecodeError::new(field, format_args!("{expected} in task {known}"), got))
         }
@@ -150,7 +152,7 @@ mod tests {
             change(&mut changed);
             assert_eq!(decode_policy_description(changed).unwrap_err().to_string(), message);
         };
-        assert_eq!(decoded().layout, Layout::new(Task::Push, 1));
+        assert_eq!(decoded().layout, TaskSpec::built_in(Task::Push, 1));
         check(|policy| policy.task = None, "task: expected a message, got none");
         check(
             |policy| policy.task.as_mut().unwrap().name = "lift".to_owned(),

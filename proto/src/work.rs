@@ -2,13 +2,15 @@
 
 mod episode;
 
+use tandem_core::task::MAX_ARMS;
 use tandem_core::work::{EpisodeOrder, PublishedActor, RunTerms, SlotOrder};
-use tandem_core::{EpisodeKind, Exploration, Layout, Task, WorldSettings};
+use tandem_core::{EpisodeKind, Exploration, Layout, Task, TaskSpec, WorldSettings};
 
-use crate::advice::{MAX_ARMS, decode_account_name};
+use crate::advice::decode_account_name;
 use crate::error::DecodeError;
 use crate::numbers::{count_within, finite_from_bytes, one_within, positive, to_bytes};
 use crate::pb;
+use crate::task::{decode_task, encode_task};
 
 pub(crate) use episode::decode_contact;
 pub use episode::{decode_episode, encode_episode};
@@ -49,9 +51,9 @@ fn decode_episode_kind(kind: i32) -> Result<EpisodeKind, DecodeError> {
 pub fn encode_run_terms(terms: &RunTerms) -> pb::RunTerms {
     pb::RunTerms {
         run: terms.run.clone(),
-        description: None,
-        task: terms.layout.task.name().to_owned(),
-        n_arms: u32::try_from(terms.layout.n_arms).expect("a layout has few arms"),
+        description: terms.layout.as_built_in().is_none().then(|| encode_task(&terms.layout)),
+        task: terms.layout.name().to_owned(),
+        n_arms: u32::try_from(terms.layout.n_arms()).expect("a layout has few arms"),
         account: terms.account.clone().unwrap_or_default(),
         exploration: Some(pb::Exploration {
             noise_std: terms.exploration.noise_std,
@@ -76,7 +78,11 @@ pub fn decode_run_terms(terms: pb::RunTerms) -> Result<RunTerms, DecodeError> {
     let account = (!terms.account.is_empty()).then_some(terms.account);
     Ok(RunTerms {
         run: decode_run_name(terms.run)?,
-        layout: decode_layout(&terms.task, terms.n_arms)?,
+        layout: match terms.description {
+            None => decode_layout(&terms.task, terms.n_arms)?.into(),
+            Some(description) => decode_described(description, &terms.task, terms.n_arms)
+                .map_err(|error| error.within("description"))?,
+        },
         account: account.map(|name| decode_account_name("account", name)).transpose()?,
         exploration: decode_exploration(exploration)
             .map_err(|error| error.within("exploration"))?,
@@ -99,6 +105,26 @@ fn decode_layout(task: &str, n_arms: u32) -> Result<Layout, DecodeError> {
         usize::try_from(n_arms).ok().filter(|n_arms| (1..=MAX_ARMS).contains(n_arms));
     let too_many = || DecodeError::new("n_arms", format_args!("1 to {MAX_ARMS}"), n_arms);
     Ok(Layout::new(known_task, n_known_arms.ok_or_else(too_many)?))
+}
+
+/// Decodes the task of a run, whose name and number of arms the terms repeat.
+fn decode_described(
+    description: pb::TaskDescription,
+    name: &str,
+    n_arms: u32,
+) -> Result<TaskSpec, DecodeError> {
+    let task = decode_task(description)?;
+    if task.name() != name {
+        return Err(DecodeError::new(
+            "name",
+            "the name in `task`",
+            format_args!("{:?}", task.name()),
+        ));
+    }
+    if u32::try_from(task.n_arms()).ok() != Some(n_arms) {
+        return Err(DecodeError::new("number of arms", format_args!("{n_arms}"), task.n_arms()));
+    }
+    Ok(task)
 }
 
 fn decode_exploration(exploration: pb::Exploration) -> Result<Exploration, DecodeError> {
@@ -204,8 +230,9 @@ pub fn encode_actor(actor: &PublishedActor) -> pb::Parameters {
 /// deviation is not positive.
 pub fn decode_actor(
     parameters: &pb::Parameters,
-    layout: Layout,
+    layout: impl Into<TaskSpec>,
 ) -> Result<PublishedActor, DecodeError> {
+    let layout = layout.into();
     let n_hidden = count_within("n_hidden", parameters.n_hidden, &(1..=MAX_HIDDEN))?;
     let n_layers = count_within("n_layers", parameters.n_layers, &(1..=MAX_HIDDEN_LAYERS))?;
     let (n_hidden, n_hidden_layers) = (to_usize(n_hidden), to_usize(n_layers));
@@ -218,7 +245,7 @@ pub fn decode_actor(
         actor: finite_from_bytes(
             "actor",
             &parameters.actor,
-            n_parameters(layout, n_hidden, n_hidden_layers),
+            n_parameters(&layout, n_hidden, n_hidden_layers),
         )?,
         observation_mean: finite_from_bytes(
             "observation_mean",
@@ -233,7 +260,7 @@ pub fn decode_actor(
 
 /// Returns the number of parameters of an actor for `layout` with `n_hidden_layers >= 1` hidden layers of `n_hidden`
 /// units.
-const fn n_parameters(layout: Layout, n_hidden: usize, n_hidden_layers: usize) -> usize {
+fn n_parameters(layout: &TaskSpec, n_hidden: usize, n_hidden_layers: usize) -> usize {
     let first = (layout.n_observation() + layout.n_goal() + 1) * n_hidden;
     let inner = (n_hidden + 1) * n_hidden * (n_hidden_layers - 1);
     first + inner + (n_hidden + 1) * layout.n_action()
@@ -253,7 +280,7 @@ mod tests {
     fn terms() -> RunTerms {
         RunTerms {
             run: "run-7".to_owned(),
-            layout: LAYOUT,
+            layout: LAYOUT.into(),
             account: Some("run-7".to_owned()),
             exploration: Exploration {
                 noise_std: 0.2,

@@ -8,8 +8,9 @@ use proptest::prelude::{
 use proptest::sample::select;
 use prost::Message;
 use tandem_core::layout::EPISODE_STEPS;
+use tandem_core::task::MAX_ARMS;
 use tandem_core::{Layout, Task};
-use tandem_proto::{DecodeError, MAX_ARMS, pb};
+use tandem_proto::{DecodeError, pb};
 
 /// Largest length of an error message, which is sent in a header.
 const MAX_ERROR_BYTES: usize = 400;
@@ -394,13 +395,8 @@ proptest! {
     #[test]
     fn a_query_is_accepted_or_refused(
         (layout, query) in any_layout().prop_flat_map(|layout| (Just(layout), query(layout))),
-        task in select(Task::ALL.to_vec()),
     ) {
         check_query(&query, layout)?;
-        let n_numbers = query.observation.len();
-        let expected = (n_numbers % 28 == 0 && (1..=8).contains(&(n_numbers / 28)))
-            .then(|| Layout::new(task, n_numbers / 28));
-        prop_assert_eq!(tandem_proto::layout_of_query(&query, task).ok(), expected);
     }
 
     #[test]

@@ -3,9 +3,10 @@
 //! A recipe gives each setting a value; a run file and `--set` override values. Unknown keys are refused.
 
 use serde::{Deserialize, Serialize};
-use tandem_core::layout::{EPISODE_STEPS, Layout, UnknownTask};
+use tandem_core::layout::{EPISODE_STEPS, UnknownTask};
 use tandem_core::settings::OutOfRange;
-use tandem_core::{Exploration, WorldSettings};
+use tandem_core::task::{InvalidTask, MAX_ARMS};
+use tandem_core::{Exploration, TaskDescription, TaskSpec, WorldSettings};
 
 use crate::ddpg::DdpgConfig;
 use crate::her::ReplayConfig;
@@ -25,9 +26,9 @@ pub use recipe::Recipe;
 pub struct RunConfig {
     /// Name of the run, and of its account at the teacher: 1 to 100 letters, digits, `-`, `_` or `.`.
     pub name: String,
-    /// `push` or `pick-and-place`.
+    /// `push`, `pick-and-place` or the name of `description`.
     pub task: String,
-    /// Arms of the learning policy, 1 or 2.
+    /// Arms of the learning policy: 1 or 2, or those of `description`.
     pub arms: usize,
     /// Seed of every random number of the run; must differ from `evaluation.seed`.
     pub seed: u64,
@@ -53,6 +54,10 @@ pub struct RunConfig {
     pub stop: StopConfig,
     /// When the learning state is saved.
     pub checkpoint: CheckpointConfig,
+    /// The task, unless it is built-in: a section of the run file, or the path of a TOML file with its fields, relative
+    /// to the run file.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub description: Option<TaskDescription>,
 }
 
 /// The network whose parameters the workers act with.
@@ -176,15 +181,36 @@ pub enum ConfigError {
     /// The task does not exist.
     #[error(transparent)]
     Task(#[from] UnknownTask),
+    /// The description of the task is invalid.
+    #[error("description.{0}")]
+    Description(#[from] InvalidTask),
 }
 
 impl RunConfig {
-    /// Returns the layout of the learning policy.
+    /// Returns the task of the learning policy.
     ///
     /// # Errors
-    /// When the task does not exist.
-    pub fn layout(&self) -> Result<Layout, ConfigError> {
-        Ok(Layout::new(self.task.parse()?, self.arms))
+    /// When the task does not exist, its description is invalid, or `task` or `arms` contradict the description.
+    pub fn layout(&self) -> Result<TaskSpec, ConfigError> {
+        let Some(description) = &self.description else {
+            let task = self.task.parse()?;
+            let expected = "1 or 2";
+            OutOfRange::unless((1..=MAX_ARMS).contains(&self.arms), "arms", self.arms, expected)?;
+            return Ok(TaskSpec::built_in(task, self.arms));
+        };
+        let task = TaskSpec::new(description.clone())?;
+        let (name, n_arms) = (task.name(), task.n_arms());
+        let expected = format_args!("{name:?}, the name of the description").to_string();
+        OutOfRange::unless(self.task == name, "task", self.task.as_str(), expected)?;
+        let expected = format_args!("{n_arms}, as in the description").to_string();
+        OutOfRange::unless(self.arms == n_arms, "arms", self.arms, expected)?;
+        Ok(task)
+    }
+
+    /// Returns the number of control steps per episode.
+    #[must_use]
+    pub fn episode_steps(&self) -> usize {
+        self.description.as_ref().map_or(EPISODE_STEPS, |description| description.episode_steps)
     }
 
     /// Returns the number of episodes per round.
@@ -195,8 +221,8 @@ impl RunConfig {
 
     /// Returns the number of environment steps per round.
     #[must_use]
-    pub const fn env_steps_per_round(&self) -> u64 {
-        self.episodes_per_round() * EPISODE_STEPS as u64
+    pub fn env_steps_per_round(&self) -> u64 {
+        self.episodes_per_round() * self.episode_steps() as u64
     }
 
     /// Returns the number of updates per round, at least one.

@@ -5,7 +5,7 @@
 //! same parameters, so the critic's half and the actor's half of an update can run in parallel.
 
 use rand_chacha::ChaCha8Rng;
-use tandem_core::{Layout, Stream, episode_rng};
+use tandem_core::{Stream, TaskSpec, episode_rng};
 use tandem_policy::{
     Adam, Matrix, MatrixMut, MlpShape, Workspace, all_finite, backward_input, backward_parameters,
     forward, polyak_update, tanh,
@@ -36,7 +36,8 @@ pub struct Batch {
 impl Batch {
     /// Creates a batch of zeros, to be filled repeatedly.
     #[must_use]
-    pub fn new(layout: Layout, n_heads: usize, batch_size: usize) -> Self {
+    pub fn new(layout: impl Into<TaskSpec>, n_heads: usize, batch_size: usize) -> Self {
+        let layout = layout.into();
         let n_input = layout.n_observation() + layout.n_goal();
         Self {
             inputs: vec![0.0; batch_size * n_input],
@@ -112,14 +113,20 @@ impl Network {
 impl Ddpg {
     /// Creates networks for `layout`, initialised from `run_seed`. The critic has one head per reward.
     #[must_use]
-    pub fn new(config: DdpgConfig, layout: Layout, rewards: Rewards, run_seed: u64) -> Self {
+    pub fn new(
+        config: DdpgConfig,
+        layout: impl Into<TaskSpec>,
+        rewards: Rewards,
+        run_seed: u64,
+    ) -> Self {
+        let layout = layout.into();
         let (n_hidden, n_hidden_layers) = (config.n_hidden, config.n_hidden_layers);
         let network = |shape, number| {
             Network::new(shape, &mut episode_rng(run_seed, number, Stream::Initialisation))
         };
-        let actor = network(MlpShape::actor(layout, n_hidden, n_hidden_layers), 0);
+        let actor = network(MlpShape::actor(&layout, n_hidden, n_hidden_layers), 0);
         let critic =
-            network(MlpShape::critic(layout, n_hidden, n_hidden_layers, rewards.n_heads), 1);
+            network(MlpShape::critic(&layout, n_hidden, n_hidden_layers, rewards.n_heads), 1);
         let actor_half = ActorHalf::new(&config, &actor.shape, &critic.shape);
         let critic_half = CriticHalf::new(&config, rewards.lowest, &actor.shape, &critic.shape);
         Self { config, n_threads: 1, n_updates: 0, actor, critic, actor_half, critic_half }

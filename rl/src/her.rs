@@ -4,11 +4,10 @@
 //! reward per arm, each arm samples its own hindsight goal; with the joint reward, all arms share one later step.
 
 use rand_chacha::ChaCha8Rng;
-use tandem_core::layout::{
-    ArmIndex, EPISODE_STEPS, HAND_POSITION, Layout, OBJECT_POSITION, WORKSPACE_DISTANCE_M,
-};
-use tandem_core::reward::{distance, sparse_reward_within};
+use tandem_core::reward::{REWARD_ACHIEVED, sparse_reward_within};
 use tandem_core::rng::{bernoulli, index};
+use tandem_core::task::Part;
+use tandem_core::{ArmIndex, TaskSpec};
 use tandem_policy::NormalizerSnapshot;
 
 use crate::ddpg::Batch;
@@ -19,10 +18,6 @@ mod config;
 mod tests;
 
 pub use config::{ReplayConfig, RewardKind};
-
-/// Smallest gap along x, metres, between the hands and objects of two arms whose transitions come from different steps:
-/// they cannot touch.
-const CODA_GAP_M: f32 = 0.10;
 
 /// The statistics with which a batch is normalised.
 #[derive(Debug, Clone, Copy)]
@@ -54,7 +49,7 @@ struct Relabelled {
 #[derive(Debug)]
 pub struct Sampler {
     config: ReplayConfig,
-    layout: Layout,
+    layout: TaskSpec,
     sample: Relabelled,
     raw_observation: Vec<f32>,
     raw_goal: Vec<f32>,
@@ -63,11 +58,12 @@ pub struct Sampler {
 impl Sampler {
     /// Creates a sampler for episodes of `layout`.
     #[must_use]
-    pub fn new(config: &ReplayConfig, layout: Layout) -> Self {
+    pub fn new(config: &ReplayConfig, layout: impl Into<TaskSpec>) -> Self {
+        let layout = layout.into();
         let sample = Relabelled {
-            steps: vec![StepIndex { episode_idx: 0, step_idx: 0 }; layout.n_arms],
+            steps: vec![StepIndex { episode_idx: 0, step_idx: 0 }; layout.n_arms()],
             goal: vec![0.0; layout.n_goal()],
-            rewards: vec![0.0; config.reward.n_heads(layout)],
+            rewards: vec![0.0; config.reward.n_heads(&layout)],
             swapped: false,
         };
         let (raw_observation, raw_goal) =
@@ -104,7 +100,7 @@ impl Sampler {
                     *reward -= self.config.contact_cost;
                 }
             }
-            if self.sample.swapped && n_heads == 2 {
+            if self.sample.swapped && n_heads > 1 {
                 batch.rewards[row_of(n_heads)].reverse();
             }
         }
@@ -113,14 +109,16 @@ impl Sampler {
     fn sample_transition(&mut self, buffer: &ReplayBuffer, rng: &mut ChaCha8Rng) {
         let first = self.sample_step(buffer, rng);
         self.sample.steps.fill(first);
-        let per_arm = self.config.reward == RewardKind::PerArm && self.layout.n_arms == 2;
+        let per_arm =
+            self.config.reward == RewardKind::PerArm && self.layout.has_recombinable_arms();
         if bernoulli(rng, self.config.coda_fraction) && per_arm {
             let second = self.sample_step(buffer, rng);
             if is_apart(buffer, [first, second]) {
                 self.sample.steps[1] = second;
             }
         }
-        self.sample.swapped = bernoulli(rng, self.config.arm_swap_prob) && self.layout.n_arms == 2;
+        self.sample.swapped =
+            bernoulli(rng, self.config.arm_swap_prob) && self.layout.has_interchangeable_arms();
         match self.config.reward {
             RewardKind::Joint => self.relabel_jointly(buffer, rng),
             RewardKind::PerArm => self.relabel_arms(buffer, rng),
@@ -138,52 +136,84 @@ impl Sampler {
         } else {
             index(rng, buffer.n_episodes())
         };
-        StepIndex { episode_idx, step_idx: index(rng, EPISODE_STEPS) }
+        StepIndex { episode_idx, step_idx: index(rng, self.layout.episode_steps()) }
     }
 
     fn relabel_arms(&mut self, buffer: &ReplayBuffer, rng: &mut ChaCha8Rng) {
         for arm in self.layout.arms() {
-            let StepIndex { episode_idx, step_idx } = self.sample.steps[arm.0];
-            let later_step = self.hindsight_step(step_idx, rng);
+            let later_step = self.hindsight_step(self.sample.steps[arm.0].step_idx, rng);
             self.take_goal(buffer, arm, later_step);
-            let sample = &mut self.sample;
-            let achieved = buffer.achieved(episode_idx, step_idx + 1, arm);
-            let distance_m = distance(achieved, &sample.goal[self.layout.goal_of(arm)]);
-            sample.rewards[arm.0] = sparse_reward_within(self.config.goal_tolerance_m, distance_m);
+            if arm.0 == 0 {
+                self.take_common_goal(buffer, later_step);
+            }
+        }
+        let norm = self.layout.norm();
+        let common = sparse_reward_within(
+            self.config.goal_tolerance_m,
+            norm.of_accumulated(self.common_distance(buffer)),
+        );
+        for arm in self.layout.arms() {
+            let distance = norm.of_accumulated(self.arm_distance(buffer, arm));
+            let own = sparse_reward_within(self.config.goal_tolerance_m, distance);
+            self.sample.rewards[arm.0] = if common == REWARD_ACHIEVED { own } else { common };
         }
     }
 
     fn relabel_jointly(&mut self, buffer: &ReplayBuffer, rng: &mut ChaCha8Rng) {
-        let StepIndex { episode_idx, step_idx } = self.sample.steps[0];
-        let later_step = self.hindsight_step(step_idx, rng);
-        let mut squared_distance = 0.0;
+        let later_step = self.hindsight_step(self.sample.steps[0].step_idx, rng);
+        self.take_common_goal(buffer, later_step);
+        let norm = self.layout.norm();
+        let mut accumulated = 0.0;
         for arm in self.layout.arms() {
             self.take_goal(buffer, arm, later_step);
-            let achieved = buffer.achieved(episode_idx, step_idx + 1, arm);
-            let goal = &self.sample.goal[self.layout.goal_of(arm)];
-            squared_distance +=
-                achieved.iter().zip(goal).map(|(a, g)| (a - g) * (a - g)).sum::<f32>();
+            accumulated = norm.combined(accumulated, self.arm_distance(buffer, arm));
         }
-        self.sample.rewards[0] =
-            sparse_reward_within(self.config.goal_tolerance_m, squared_distance.sqrt());
+        accumulated = norm.combined(accumulated, self.common_distance(buffer));
+        let distance = norm.of_accumulated(accumulated);
+        self.sample.rewards[0] = sparse_reward_within(self.config.goal_tolerance_m, distance);
+    }
+
+    /// Returns the share of `arm` in the distance between the goal and what is achieved after the sampled step.
+    fn arm_distance(&self, buffer: &ReplayBuffer, arm: ArmIndex) -> f32 {
+        let layout = &self.layout;
+        let parts = (layout.achieved_goal_of(arm), layout.goal_of(arm));
+        self.distance_of(buffer, self.sample.steps[arm.0], parts)
+    }
+
+    /// As [`Self::arm_distance`], for the part of the goal that is common to all arms.
+    fn common_distance(&self, buffer: &ReplayBuffer) -> f32 {
+        let parts = (self.layout.common_achieved_goal(), self.layout.common_goal());
+        self.distance_of(buffer, self.sample.steps[0], parts)
+    }
+
+    fn distance_of(
+        &self,
+        buffer: &ReplayBuffer,
+        StepIndex { episode_idx, step_idx }: StepIndex,
+        (achieved, goal): (&Part, &Part),
+    ) -> f32 {
+        let achieved = achieved.of(buffer.observation(episode_idx, step_idx + 1));
+        self.layout.norm().accumulate(&achieved, &goal.of(&self.sample.goal))
     }
 
     /// Samples the later step whose achieved goal replaces the desired one (strategy "future"); `None` keeps the
     /// desired goal.
     fn hindsight_step(&self, step_idx: usize, rng: &mut ChaCha8Rng) -> Option<usize> {
         let hindsight = bernoulli(rng, self.config.her_ratio);
-        let later_step = step_idx + 1 + index(rng, EPISODE_STEPS - step_idx);
+        let later_step = step_idx + 1 + index(rng, self.layout.episode_steps() - step_idx);
         hindsight.then_some(later_step)
     }
 
     fn take_goal(&mut self, buffer: &ReplayBuffer, arm: ArmIndex, later_step: Option<usize>) {
-        let part = self.layout.goal_of(arm);
+        let (achieved, part) = (self.layout.achieved_goal_of(arm), self.layout.goal_of(arm));
         let episode_idx = self.sample.steps[arm.0].episode_idx;
-        let goal = match later_step {
-            Some(later_step) => buffer.achieved(episode_idx, later_step, arm),
-            None => &buffer.goal(episode_idx)[part.clone()],
-        };
-        self.sample.goal[part].copy_from_slice(goal);
+        write_goal(buffer, episode_idx, later_step, (achieved, part), &mut self.sample.goal);
+    }
+
+    fn take_common_goal(&mut self, buffer: &ReplayBuffer, later_step: Option<usize>) {
+        let (achieved, part) = (self.layout.common_achieved_goal(), self.layout.common_goal());
+        let episode_idx = self.sample.steps[0].episode_idx;
+        write_goal(buffer, episode_idx, later_step, (achieved, part), &mut self.sample.goal);
     }
 
     /// Writes the normalised observation, `later` steps after the sampled ones, and the normalised goal.
@@ -196,14 +226,21 @@ impl Sampler {
     ) {
         let (normalized_observation, normalized_goal) =
             input.split_at_mut(self.layout.n_observation());
-        for (to, from) in self.layout.arms().zip(self.sources()) {
+        let layout = &self.layout;
+        for (to, from) in layout.arms().zip(self.sources()) {
             let StepIndex { episode_idx, step_idx } = self.sample.steps[from.0];
             let observation = buffer.observation(episode_idx, step_idx + later);
-            self.raw_observation[self.layout.observation_of(to)]
-                .copy_from_slice(&observation[self.layout.observation_of(from)]);
-            self.raw_goal[self.layout.goal_of(to)]
-                .copy_from_slice(&self.sample.goal[self.layout.goal_of(from)]);
+            let (part, source) = (layout.observation_of(to), layout.observation_of(from));
+            part.copy_from(&mut self.raw_observation, source, observation);
+            let (part, source) = (layout.goal_of(to), layout.goal_of(from));
+            part.copy_from(&mut self.raw_goal, source, &self.sample.goal);
         }
+        let StepIndex { episode_idx, step_idx } = self.sample.steps[0];
+        let (common, observation) =
+            (layout.common_observation(), buffer.observation(episode_idx, step_idx + later));
+        common.copy_from(&mut self.raw_observation, common, observation);
+        let common = layout.common_goal();
+        common.copy_from(&mut self.raw_goal, common, &self.sample.goal);
         statistics.observation.normalize(&self.raw_observation, normalized_observation);
         statistics.goal.normalize(&self.raw_goal, normalized_goal);
     }
@@ -212,43 +249,59 @@ impl Sampler {
         for (to, from) in self.layout.arms().zip(self.sources()) {
             let step @ StepIndex { episode_idx, step_idx } = self.sample.steps[from.0];
             let action = buffer.action(episode_idx, step_idx);
-            actions[self.layout.action_of(to)]
-                .copy_from_slice(&action[self.layout.action_of(from)]);
+            self.layout.action_of(to).copy_from(actions, self.layout.action_of(from), action);
             let is_advised = buffer.advised_arms(episode_idx, step_idx) >> from.0 & 1 == 1;
             let foresight = self.config.contact_foresight_steps;
             let is_cloned = is_advised && !has_contact_within(buffer, step, foresight);
-            bc_mask[self.layout.action_of(to)].fill(if is_cloned { 1.0 } else { 0.0 });
+            self.layout.action_of(to).fill(bc_mask, if is_cloned { 1.0 } else { 0.0 });
         }
     }
 
     /// Returns the arm whose data fills each place: the arms in order, or in reverse if they are swapped.
     fn sources(&self) -> impl Iterator<Item = ArmIndex> + use<> {
-        let (n_arms, swapped) = (self.layout.n_arms, self.sample.swapped);
+        let (n_arms, swapped) = (self.layout.n_arms(), self.sample.swapped);
         (0..n_arms).map(move |arm| ArmIndex(if swapped { n_arms - 1 - arm } else { arm }))
+    }
+}
+
+/// Writes the part of a stored episode's goal, or what it achieved of it before `later_step`, into `goal`.
+fn write_goal(
+    buffer: &ReplayBuffer,
+    episode_idx: usize,
+    later_step: Option<usize>,
+    (achieved, part): (&Part, &Part),
+    goal: &mut [f32],
+) {
+    match later_step {
+        Some(later_step) => {
+            part.copy_from(goal, achieved, buffer.observation(episode_idx, later_step));
+        }
+        None => part.copy_from(goal, part, buffer.goal(episode_idx)),
     }
 }
 
 /// Returns true if an arm touches the other or the table on one of `n_steps` steps from `first` on.
 fn has_contact_within(buffer: &ReplayBuffer, first: StepIndex, n_steps: usize) -> bool {
-    let end = (first.step_idx + n_steps).min(EPISODE_STEPS);
+    let end = (first.step_idx + n_steps).min(buffer.layout().episode_steps());
     buffer.has_contact(first.step_idx..end, first.episode_idx)
 }
 
 /// Returns true if two arms cannot meet when they take these steps at the same time: neither step has a contact, and
-/// the hands and objects of the arms stay apart before and after.
+/// the positions of the arms stay apart before and after.
 fn is_apart(buffer: &ReplayBuffer, steps: [StepIndex; 2]) -> bool {
     if steps.iter().any(|step| has_contact_within(buffer, *step, 1)) {
         return false;
     }
     let layout = buffer.layout();
-    let reach_m = |arm: ArmIndex, later: usize| {
+    let reach = |arm: ArmIndex, later: usize| {
         let StepIndex { episode_idx, step_idx } = steps[arm.0];
         let observation = buffer.observation(episode_idx, step_idx + later);
-        let of_arm = &observation[layout.observation_of(arm)];
-        of_arm[HAND_POSITION.start].max(of_arm[OBJECT_POSITION.start])
+        let positions = layout.position_of(arm).iter().map(|idx| observation[idx]);
+        positions.fold(f32::NEG_INFINITY, f32::max)
     };
+    let task = layout.description();
     [0, 1].into_iter().all(|later| {
-        let reached_m = reach_m(ArmIndex(0), later) + reach_m(ArmIndex(1), later);
-        WORKSPACE_DISTANCE_M - reached_m >= CODA_GAP_M
+        let reached = reach(ArmIndex(0), later) + reach(ArmIndex(1), later);
+        task.origin_distance - reached >= task.recombination_gap
     })
 }

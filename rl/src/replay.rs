@@ -1,33 +1,33 @@
 //! The replay buffer: a ring of whole episodes.
 
+use std::borrow::Cow;
 use std::ops::Range;
 
-use tandem_core::Episode;
-use tandem_core::layout::{ArmIndex, EPISODE_STEPS, Layout};
+use tandem_core::{ArmIndex, Episode, TaskSpec};
 
 /// The replay buffer: whole episodes in flat arrays, episode `e` at `e * stride` of each. A full buffer overwrites the
 /// oldest episode.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ReplayBuffer {
-    layout: Layout,
+    layout: TaskSpec,
     capacity_episodes: usize,
     next: usize,
     parts: ReplayParts,
     displaced_episodes: Vec<usize>,
 }
 
-/// The contents of a buffer, as a checkpoint stores them.
+/// The contents of a buffer, as a checkpoint stores them; `n_steps` are those of an episode.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct ReplayParts {
-    /// Shape `[n_episodes, EPISODE_STEPS + 1, n_observation]`.
+    /// Shape `[n_episodes, n_steps + 1, n_observation]`.
     pub observations: Vec<f32>,
     /// Shape `[n_episodes, n_goal]`.
     pub goals: Vec<f32>,
-    /// Shape `[n_episodes, EPISODE_STEPS, n_action]`.
+    /// Shape `[n_episodes, n_steps, n_action]`.
     pub actions: Vec<f32>,
-    /// Shape `[n_episodes, EPISODE_STEPS]`; bit `a` is set if arm `a` executed the teacher's action.
+    /// Shape `[n_episodes, n_steps]`; bit `a` is set if arm `a` executed the teacher's action.
     pub advised_arms: Vec<u8>,
-    /// Shape `[n_episodes, EPISODE_STEPS]`, [`Contacts::bits`](tandem_core::Contacts::bits) of the step.
+    /// Shape `[n_episodes, n_steps]`, [`Contacts::bits`](tandem_core::Contacts::bits) of the step.
     pub contacts: Vec<u8>,
     /// Shape `[n_episodes]`; 1 if an object was displaced, else 0.
     pub moved: Vec<u8>,
@@ -36,8 +36,9 @@ pub struct ReplayParts {
 impl ReplayBuffer {
     /// Creates an empty buffer for at most `capacity_transitions`, rounded down to whole episodes but at least one.
     #[must_use]
-    pub fn new(layout: Layout, capacity_transitions: usize) -> Self {
-        let capacity_episodes = (capacity_transitions / EPISODE_STEPS).max(1);
+    pub fn new(layout: impl Into<TaskSpec>, capacity_transitions: usize) -> Self {
+        let layout = layout.into();
+        let capacity_episodes = (capacity_transitions / layout.episode_steps()).max(1);
         Self {
             layout,
             capacity_episodes,
@@ -51,22 +52,23 @@ impl ReplayBuffer {
     /// together.
     #[must_use]
     pub fn from_parts(
-        layout: Layout,
+        layout: impl Into<TaskSpec>,
         capacity_transitions: usize,
         parts: ReplayParts,
         next: usize,
     ) -> Option<Self> {
         let mut buffer = Self::new(layout, capacity_transitions);
-        let n = parts.moved.len();
+        let layout = &buffer.layout;
+        let (n, n_steps) = (parts.moved.len(), layout.episode_steps());
         // A buffer that is not full grows at its end; a full one wraps around.
         let expected_next = if n < buffer.capacity_episodes { n..n + 1 } else { 0..n };
         let fits = n <= buffer.capacity_episodes
             && expected_next.contains(&next)
             && parts.observations.len() == n * buffer.observation_stride()
             && parts.goals.len() == n * layout.n_goal()
-            && parts.actions.len() == n * EPISODE_STEPS * layout.n_action()
-            && parts.advised_arms.len() == n * EPISODE_STEPS
-            && parts.contacts.len() == n * EPISODE_STEPS;
+            && parts.actions.len() == n * n_steps * layout.n_action()
+            && parts.advised_arms.len() == n * n_steps
+            && parts.contacts.len() == n * n_steps;
         if !fits {
             return None;
         }
@@ -84,8 +86,8 @@ impl ReplayBuffer {
 
     /// Returns the layout of the stored episodes.
     #[must_use]
-    pub const fn layout(&self) -> Layout {
-        self.layout
+    pub const fn layout(&self) -> &TaskSpec {
+        &self.layout
     }
 
     /// Returns the number of stored episodes.
@@ -131,7 +133,7 @@ impl ReplayBuffer {
         self.next = (self.next + 1) % self.capacity_episodes;
     }
 
-    /// Returns the observation before step `step_idx` of a stored episode, shape `[n_observation]`; `EPISODE_STEPS`
+    /// Returns the observation before step `step_idx` of a stored episode, shape `[n_observation]`; `n_steps`
     /// gives the last one.
     #[must_use]
     pub fn observation(&self, episode_idx: usize, step_idx: usize) -> &[f32] {
@@ -140,10 +142,10 @@ impl ReplayBuffer {
         &self.parts.observations[start..start + n]
     }
 
-    /// Returns the position of `arm`'s object before step `step_idx`, in the arm's own frame, metres, shape `[3]`.
+    /// Returns what `arm` has achieved before step `step_idx`, in the order of its goal.
     #[must_use]
-    pub fn achieved(&self, episode_idx: usize, step_idx: usize, arm: ArmIndex) -> &[f32] {
-        &self.observation(episode_idx, step_idx)[self.layout.achieved_goal_of(arm)]
+    pub fn achieved(&self, episode_idx: usize, step_idx: usize, arm: ArmIndex) -> Cow<'_, [f32]> {
+        self.layout.achieved_goal_of(arm).of(self.observation(episode_idx, step_idx))
     }
 
     /// Returns the desired goal of a stored episode, shape `[n_goal]`.
@@ -157,25 +159,25 @@ impl ReplayBuffer {
     #[must_use]
     pub fn action(&self, episode_idx: usize, step_idx: usize) -> &[f32] {
         let n = self.layout.n_action();
-        let start = (episode_idx * EPISODE_STEPS + step_idx) * n;
+        let start = (episode_idx * self.layout.episode_steps() + step_idx) * n;
         &self.parts.actions[start..start + n]
     }
 
     /// Returns a mask with bit `a` set if arm `a` executed the teacher's action on that step.
     #[must_use]
     pub fn advised_arms(&self, episode_idx: usize, step_idx: usize) -> u8 {
-        self.parts.advised_arms[episode_idx * EPISODE_STEPS + step_idx]
+        self.parts.advised_arms[episode_idx * self.layout.episode_steps() + step_idx]
     }
 
     /// Returns true if an arm touched the other or the table on one of the steps of a stored episode.
     #[must_use]
     pub fn has_contact(&self, steps: Range<usize>, episode_idx: usize) -> bool {
-        let start = episode_idx * EPISODE_STEPS;
+        let start = episode_idx * self.layout.episode_steps();
         self.parts.contacts[start + steps.start..start + steps.end].iter().any(|bits| *bits != 0)
     }
 
-    const fn observation_stride(&self) -> usize {
-        (EPISODE_STEPS + 1) * self.layout.n_observation()
+    fn observation_stride(&self) -> usize {
+        (self.layout.episode_steps() + 1) * self.layout.n_observation()
     }
 
     fn index_episodes(&mut self) {
@@ -198,6 +200,8 @@ fn overwrite<T: Copy>(table: &mut [T], row_idx: usize, row: &[T]) {
 
 #[cfg(test)]
 pub(crate) mod fixtures {
+    use tandem_core::Layout;
+
     use super::*;
 
     /// Returns an episode in which the object of arm 0 moves by `drift_m` per step along x, and everything else is
@@ -217,6 +221,7 @@ pub(crate) mod fixtures {
 #[cfg(test)]
 mod tests {
     use tandem_core::Task;
+    use tandem_core::layout::{EPISODE_STEPS, Layout};
 
     use super::fixtures::drifting_episode;
     use super::*;

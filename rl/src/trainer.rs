@@ -6,12 +6,12 @@ use std::collections::BTreeMap;
 
 use rand_chacha::ChaCha8Rng;
 use sha2::{Digest as _, Sha256};
-use tandem_core::Episode;
 use tandem_core::episode::EpisodeKind;
-use tandem_core::layout::{EPISODE_STEPS, Layout, OBJECT_POSITION};
 use tandem_core::rng::{Stream, bernoulli, episode_rng, index};
+use tandem_core::task::Part;
 use tandem_core::text::hex;
 use tandem_core::work::{EpisodeOrder, PublishedActor, SlotOrder};
+use tandem_core::{ArmIndex, Episode, TaskSpec};
 use tandem_policy::{Normalizer, NormalizerSnapshot, Policy};
 
 use crate::config::{Behaviour, ConfigError, PolyakEvery, RunConfig};
@@ -60,8 +60,8 @@ pub struct RoundStats {
 pub struct Trainer {
     /// The run's settings, checked.
     pub config: RunConfig,
-    /// The layout of the learning policy, from the settings.
-    pub layout: Layout,
+    /// The task, from the settings.
+    pub layout: TaskSpec,
     /// The run's counters.
     pub counters: Counters,
     /// The replay buffer.
@@ -86,18 +86,18 @@ impl Trainer {
     pub fn new(config: RunConfig) -> Result<Self, ConfigError> {
         let config = config.checked()?;
         let layout = config.layout()?;
-        let n_heads = config.replay.reward.n_heads(layout);
+        let n_heads = config.replay.reward.n_heads(&layout);
         let rewards = Rewards { n_heads, lowest: config.replay.lowest_reward() };
         Ok(Self {
-            layout,
             counters: Counters::default(),
-            replay: ReplayBuffer::new(layout, config.replay.capacity_transitions),
-            ddpg: Ddpg::new(config.ddpg.clone(), layout, rewards, config.seed),
+            replay: ReplayBuffer::new(&layout, config.replay.capacity_transitions),
+            ddpg: Ddpg::new(config.ddpg.clone(), &layout, rewards, config.seed),
             observation_normalizer: Normalizer::new(layout.n_observation()),
             goal_normalizer: Normalizer::new(layout.n_goal()),
-            sampler: Sampler::new(&config.replay, layout),
-            batch: Batch::new(layout, n_heads, config.ddpg.batch_size),
+            sampler: Sampler::new(&config.replay, &layout),
+            batch: Batch::new(&layout, n_heads, config.ddpg.batch_size),
             stats: RoundStats::default(),
+            layout,
             config,
         })
     }
@@ -108,17 +108,26 @@ impl Trainer {
     /// # Errors
     /// Describes the mismatch: the teacher's task, arms or sizes, or a critic with one head for several arms.
     pub fn start_from(&mut self, teacher: &Policy) -> Result<(), String> {
-        if teacher.layout != self.layout.single_arm() || teacher.n_heads != 1 {
-            let (task, n_arms) = (self.layout.task, teacher.layout.n_arms);
+        let (task, n_arms) = (self.layout.name(), teacher.layout.n_arms());
+        let Some(one_arm) = self.layout.single_arm() else {
+            return Err(format!(
+                "{task} has numbers common to all arms, so no arm is a task of its own"
+            ));
+        };
+        if teacher.layout.name() != task || n_arms != 1 || teacher.n_heads != 1 {
             return Err(format!(
                 "needs a teacher for {task} with one arm and one value, got {n_arms} arm(s) for {} with {} value(s)",
-                teacher.layout.task, teacher.n_heads
+                teacher.layout.name(),
+                teacher.n_heads
             ));
         }
-        let copies = teacher.replicated(self.layout.n_arms);
+        if let Some(difference) = one_arm.difference(&teacher.layout) {
+            return Err(format!("needs a teacher for one arm of {task}, whose {difference}"));
+        }
+        let copies = teacher.replicated(&self.layout);
         let sizes = |policy: &Policy| (policy.n_hidden, policy.n_hidden_layers, policy.n_heads);
         let ddpg = &self.config.ddpg;
-        let n_heads = self.config.replay.reward.n_heads(self.layout);
+        let n_heads = self.config.replay.reward.n_heads(&self.layout);
         if sizes(&copies) != (ddpg.n_hidden, ddpg.n_hidden_layers, n_heads) {
             return Err(format!(
                 "needs ddpg.n_hidden = {}, ddpg.n_hidden_layers = {} and replay.reward = \"per-arm\" to hold this teacher's \
@@ -161,7 +170,8 @@ impl Trainer {
     #[must_use]
     pub fn training_orders(&self, round: u64, version: u64) -> Vec<SlotOrder> {
         let per_round = self.config.episodes_per_round();
-        let warmup_episodes = self.config.rounds.warmup_env_steps.div_ceil(EPISODE_STEPS as u64);
+        let warmup_episodes =
+            self.config.rounds.warmup_env_steps.div_ceil(self.layout.episode_steps() as u64);
         let orders: Vec<EpisodeOrder> = (round * per_round..(round + 1) * per_round)
             .map(|number| EpisodeOrder {
                 number,
@@ -197,7 +207,7 @@ impl Trainer {
             self.counters.advice_spent += u64::from(episode.advice_charged);
         }
         self.counters.episodes += episodes.len() as u64;
-        self.counters.env_steps += (episodes.len() * EPISODE_STEPS) as u64;
+        self.counters.env_steps += (episodes.len() * self.layout.episode_steps()) as u64;
         let share = |hits: usize| hits as f64 / episodes.len().max(1) as f64;
         self.stats.training_success =
             share(episodes.iter().filter(|episode| episode.succeeded()).count());
@@ -214,11 +224,14 @@ impl Trainer {
     /// world can produce. Inputs normalised with it are indistinguishable, so the policy cannot learn.
     #[must_use]
     pub fn implausible_statistic(&self) -> Option<String> {
-        let largest_of_object = self.layout.observation_bound(OBJECT_POSITION.start);
-        let goal_bound = self.layout.goal_bound().max(largest_of_object);
+        let layout = &self.layout;
+        let goal_bound = |idx: usize| {
+            let achieved = layout.description().achieved_goal[idx];
+            layout.goal_bound(idx).max(layout.observation_bound(achieved))
+        };
         let observation = self.observation_normalizer.snapshot();
-        first_implausible("observations", observation, |idx| self.layout.observation_bound(idx))
-            .or_else(|| first_implausible("goals", self.goal_normalizer.snapshot(), |_| goal_bound))
+        first_implausible("observations", observation, |idx| layout.observation_bound(idx))
+            .or_else(|| first_implausible("goals", self.goal_normalizer.snapshot(), goal_bound))
     }
 
     /// Makes a round's updates. Calls `on_update` with their number after each.
@@ -287,10 +300,10 @@ impl Trainer {
             Behaviour::Online => (self.ddpg.actor(), self.ddpg.critic()),
         };
         Policy {
-            layout: self.layout,
+            layout: self.layout.clone(),
             n_hidden: self.config.ddpg.n_hidden,
             n_hidden_layers: self.config.ddpg.n_hidden_layers,
-            n_heads: self.config.replay.reward.n_heads(self.layout),
+            n_heads: self.config.replay.reward.n_heads(&self.layout),
             actor: actor.to_vec(),
             critic: critic.to_vec(),
             observation_normalizer: self.observation_normalizer.snapshot().clone(),
@@ -345,16 +358,17 @@ impl Trainer {
     /// Updates the normalisers with an episode's observations, and with goals relabelled as in a batch.
     fn update_normalizers(&mut self, episode: &Episode) {
         let mut rng = episode_rng(self.config.seed, episode.number, Stream::Normaliser);
-        let both_orders = self.config.replay.arm_swap_prob > 0.0 && self.layout.n_arms == 2;
+        let both_orders =
+            self.config.replay.arm_swap_prob > 0.0 && self.layout.has_interchangeable_arms();
         let (mut observations, mut goals) = (Vec::new(), Vec::new());
-        for step_idx in 0..EPISODE_STEPS {
+        for step_idx in 0..episode.n_steps() {
             let goal = self.relabelled_goal(episode, step_idx, &mut rng);
             let observation = episode.observation(step_idx);
             observations.extend_from_slice(observation);
             goals.extend_from_slice(&goal);
             if both_orders {
-                observations.extend(swapped(observation));
-                goals.extend(swapped(&goal));
+                observations.extend(self.swapped(observation, TaskSpec::observation_of));
+                goals.extend(self.swapped(&goal, TaskSpec::goal_of));
             }
         }
         self.observation_normalizer.update(&observations);
@@ -368,14 +382,31 @@ impl Trainer {
         rng: &mut ChaCha8Rng,
     ) -> Vec<f32> {
         let mut goal = episode.goal.clone();
-        for arm in self.layout.arms() {
+        let layout = &self.layout;
+        for arm in layout.arms() {
             let hindsight = bernoulli(rng, self.config.replay.her_ratio);
-            let later_step = step_idx + 1 + index(rng, EPISODE_STEPS - step_idx);
-            if hindsight {
-                goal[self.layout.goal_of(arm)].copy_from_slice(episode.achieved(later_step, arm));
+            let later_step = step_idx + 1 + index(rng, layout.episode_steps() - step_idx);
+            if !hindsight {
+                continue;
+            }
+            let observation = episode.observation(later_step);
+            layout.goal_of(arm).copy_from(&mut goal, layout.achieved_goal_of(arm), observation);
+            if arm.0 == 0 {
+                let achieved = layout.common_achieved_goal();
+                layout.common_goal().copy_from(&mut goal, achieved, observation);
             }
         }
         goal
+    }
+
+    /// Returns a vector in which the parts of the arms have the reverse order.
+    fn swapped(&self, vector: &[f32], part_of: fn(&TaskSpec, ArmIndex) -> &Part) -> Vec<f32> {
+        let (layout, mut swapped) = (&self.layout, vector.to_vec());
+        let reversed = (0..layout.n_arms()).rev().map(ArmIndex);
+        for (to, from) in layout.arms().zip(reversed) {
+            part_of(layout, to).copy_from(&mut swapped, part_of(layout, from), vector);
+        }
+        swapped
     }
 }
 
@@ -421,12 +452,6 @@ fn slots(
         episodes: episodes.to_vec(),
     };
     orders.chunks(n_episodes).map(slot).collect()
-}
-
-/// Returns the two halves of a two-arm vector in reverse order.
-fn swapped(vector: &[f32]) -> Vec<f32> {
-    let (first, second) = vector.split_at(vector.len() / 2);
-    [second, first].concat()
 }
 
 #[cfg(test)]

@@ -80,38 +80,46 @@ fn policies(args: &TrialArgs) -> Result<(Task, Vec<NamedPolicy>), Failed> {
     let mut policies = Vec::new();
     for path in &args.policies {
         let policy = policy_file::load(path)?;
-        if policy.layout.n_arms != 2 {
+        if policy.layout.n_arms() != 2 {
             return Err(Failed::usage(format!(
                 "{} drives {} arm(s), the bridge has 2: a one-arm policy goes with --composed-teachers",
                 path.display(),
-                policy.layout.n_arms
+                policy.layout.n_arms()
             )));
         }
         policies.push(NamedPolicy { name: name_of(path), policy });
     }
     for path in &args.composed_teachers {
         let policy = policy_file::load(path)?;
-        if policy.layout.n_arms != 1 {
+        if policy.layout.n_arms() != 1 {
             return Err(Failed::usage(format!(
                 "{} drives {} arms: a teacher drives one",
                 path.display(),
-                policy.layout.n_arms
+                policy.layout.n_arms()
             )));
         }
         policies.push(NamedPolicy { name: format!("composed-{}", name_of(path)), policy });
     }
-    let task_of = |named: &NamedPolicy| named.policy.layout.task;
-    let first = args.task.map(Task::from).or_else(|| policies.first().map(task_of));
-    let Some(task) = first else {
-        return Err(Failed::usage("give --policy or --composed-teachers"));
+    let task_of = |named: &NamedPolicy| {
+        let built_in = named.policy.layout.as_built_in().map(|layout| layout.task);
+        built_in.ok_or_else(|| {
+            let (name, task) = (&named.name, named.policy.layout.name());
+            Failed::usage(format!("{name} is for {task}, which simulated arms cannot perform"))
+        })
     };
-    match policies.iter().find(|named| task_of(named) != task) {
-        Some(other) => {
-            let message = format!("{} is for {}, not {task}", other.name, task_of(other));
-            Err(Failed::usage(message))
+    let first = match (args.task, policies.first()) {
+        (Some(task), _) => Task::from(task),
+        (None, Some(named)) => task_of(named)?,
+        (None, None) => return Err(Failed::usage("give --policy or --composed-teachers")),
+    };
+    for named in &policies {
+        let task = task_of(named)?;
+        if task != first {
+            let message = format!("{} is for {task}, not {first}", named.name);
+            return Err(Failed::usage(message));
         }
-        None => Ok((task, policies)),
     }
+    Ok((first, policies))
 }
 
 fn block(edge_cm: f32) -> Result<Block, Failed> {

@@ -107,7 +107,7 @@ fn refused(path: &Path, source: ModelError) -> Failed {
 
 /// Returns the largest differences of actions and of values between a policy and its models in random states.
 fn compare(policy: &Policy, actor: &Model, critic: Option<&Model>) -> Result<[f32; 2], ModelError> {
-    let layout = policy.layout;
+    let layout = &policy.layout;
     let mut rng = episode_rng(0, 0, Stream::Reset);
     let mut draw = |n: usize, most: f32| -> Vec<f32> {
         (0..N_COMPARED * n).map(|_| uniform(&mut rng, -most, most)).collect()

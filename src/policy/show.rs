@@ -22,13 +22,13 @@ fn show_policy(args: &ShowArgs) -> Result<(), Failed> {
     let policy = policy_file::load(&args.file)?;
     if args.json {
         return output::print(json!({
-            "task": policy.layout.task.name(), "arms": policy.layout.n_arms, "n_hidden": policy.n_hidden,
+            "task": policy.layout.name(), "arms": policy.layout.n_arms(), "n_hidden": policy.n_hidden,
             "n_hidden_layers": policy.n_hidden_layers, "critic_heads": policy.n_heads, "digest": policy.digest(),
             "metadata": policy.metadata,
         }));
     }
-    line("task", policy.layout.task)?;
-    line("arms", policy.layout.n_arms)?;
+    line("task", policy.layout.name())?;
+    line("arms", policy.layout.n_arms())?;
     let (n_layers, n_hidden, n_heads) = (policy.n_hidden_layers, policy.n_hidden, policy.n_heads);
     let critic = match policy.has_critic() {
         true => format!("critic heads {n_heads}"),

@@ -29,6 +29,46 @@ fn settings_change_only_what_they_name() {
     assert_eq!(config, expected);
 }
 
+/// A run file for a task of two arms that is not built-in.
+fn described() -> String {
+    let description = TaskDescription {
+        name: "lab/shove".to_owned(),
+        episode_steps: 20,
+        tolerance: 0.1,
+        reports_contacts: false,
+        ..tandem_core::Layout::new(Task::Push, 2).description()
+    };
+    let description = toml::to_string(&description).expect("a description");
+    let sections = description.replace("[[arms]]", "[[description.arms]]");
+    format!("task = \"lab/shove\"\narms = 2\n[description]\n{sections}")
+}
+
+#[test]
+fn a_described_task_has_its_own_defaults_and_survives_the_file() {
+    let config = from_text(&described()).expect("valid");
+    let task = config.layout().expect("valid");
+    assert_eq!((task.name(), task.n_arms(), task.episode_steps()), ("lab/shove", 2, 20));
+    assert_eq!(task.as_built_in(), None);
+    assert_eq!((config.replay.contact_cost, config.replay.arm_swap_prob), (0.0, 0.5));
+    assert_eq!(config.env_steps_per_round(), 16 * 20);
+    assert_eq!(from_text(&to_toml(&config).expect("written")), Ok(config));
+    let built_in = RunConfig::defaults(Recipe::Tandem, Task::Push, 2);
+    assert!(!to_toml(&built_in).expect("written").contains("description"));
+}
+
+#[test]
+fn an_invalid_description_is_refused_by_field() {
+    let check = |from: &str, to: &str, words: &str| {
+        let changed = described().replacen(from, to, 1);
+        let message = from_text(&changed).expect_err("must be refused");
+        assert!(message.contains(words) && !message.contains('\n'), "{message:?}");
+    };
+    check("episode_steps = 20", "episode_steps = 0", "description.episode_steps: expected 1 to");
+    check("tolerance = ", "tolerence = ", "description: unknown field `tolerence`");
+    check("arms = 2", "arms = 1", "arms is 1: expected 2, as in the description");
+    check("task = \"lab/shove\"", "task = \"push\"", "task is push: expected \"lab/shove\"");
+}
+
 #[test]
 fn errors_name_the_setting() {
     let check = |setting: &str, words: &[&str]| {

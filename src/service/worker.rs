@@ -36,6 +36,7 @@ pub(crate) fn worker_failed(error: Error) -> Failed {
         E::Address { .. }
         | E::NoTeacher { .. }
         | E::NoEnvironment(_)
+        | E::NotBuiltIn { .. }
         | E::OtherTask { .. }
         | E::TooFewEnvironments { .. } => Exit::Usage,
         E::EnvironmentRefused { ref status, .. } if is_configuration(status) => Exit::Usage,

@@ -33,7 +33,7 @@ impl Plan {
         let config = config(args, served)?;
         if let Some(served) = served {
             let task = config.layout().or_exit(Exit::Usage, String::new)?;
-            served.check(&task.into()).map_err(worker_failed)?;
+            served.check(&task).map_err(worker_failed)?;
         }
         let out = match &args.out {
             Some(out) => out.clone(),
@@ -250,7 +250,8 @@ fn account_name(out: &Path) -> Option<String> {
 /// Returns `runs/TASK-ARMS-STRATEGY-seedN`, with a number appended if that exists.
 fn free_run_directory(config: &RunConfig) -> PathBuf {
     let strategy = config.advice.strategy.replace(':', "-");
-    let name = format!("{}-{}-{strategy}-seed{}", config.task, config.arms, config.seed);
+    let task = config.task.replace('/', "-");
+    let name = format!("{task}-{}-{strategy}-seed{}", config.arms, config.seed);
     let base = Path::new("runs").join(name);
     let numbered = (2..).map(|n: u32| PathBuf::from(format!("{}.{n}", base.display())));
     std::iter::once(base.clone()).chain(numbered).find(|path| !path.exists()).unwrap_or(base)

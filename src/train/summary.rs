@@ -17,17 +17,14 @@ use crate::{output, policy_file};
 /// Seed of the test goals. No run selects its best policy by them.
 const REPORT_SEED: u64 = 777;
 
-/// Evaluates the best policy on the test goals, draws the curve and prints the summary.
+/// Evaluates the best policy on the test goals if the simulator has the task, draws the curve and prints the summary.
 pub(super) fn print(
     plan: &Plan,
     last: &pb::Progress,
     memory: PeakMemory,
     as_json: bool,
 ) -> Result<(), Failed> {
-    let n_test_episodes = plan.config.evaluation.test_episodes;
-    let path = plan.best_policy();
-    let result =
-        measure(&EvaluatedPolicy::Policy(policy_file::load(&path)?), n_test_episodes, REPORT_SEED)?;
+    let result = test(plan)?;
     let rows =
         MetricsLog::read_all(&plan.out.join("metrics.jsonl")).or_exit(Exit::Data, String::new)?;
     let pictures = Pictures {
@@ -35,11 +32,22 @@ pub(super) fn print(
         report: tandem_report::run_report_html(&plan.out).or_cannot_write(String::new)?,
     };
     let summary = match as_json {
-        true => summary_json(plan, last, memory, &result).to_string(),
-        false => summary_lines(plan, last, memory, &result, &pictures).join("\n"),
+        true => summary_json(plan, last, memory, result.as_ref()).to_string(),
+        false => summary_lines(plan, last, memory, result.as_ref(), &pictures).join("\n"),
     };
     let saved = || format!("the run is complete and saved in {}", plan.out.display());
     output::print(summary).map_err(|failed| failed.context(saved()))
+}
+
+/// Plays the test goals with the best policy. Returns `None` if the simulator does not have the task.
+fn test(plan: &Plan) -> Result<Option<EvaluationResult>, Failed> {
+    let path = plan.best_policy();
+    let policy = policy_file::load(&path)?;
+    if policy.layout.as_built_in().is_none() {
+        return Ok(None);
+    }
+    let subject = EvaluatedPolicy::new(policy, &path)?;
+    measure(&subject, plan.config.evaluation.test_episodes, REPORT_SEED).map(Some)
 }
 
 /// Files written at the end of a run.
@@ -52,17 +60,22 @@ fn summary_lines(
     plan: &Plan,
     last: &pb::Progress,
     memory: PeakMemory,
-    result: &EvaluationResult,
+    result: Option<&EvaluationResult>,
     pictures: &Pictures,
 ) -> Vec<String> {
-    let mut lines = vec![
-        format!("done: {}", last.end_reason),
-        format!(
+    let mut lines = vec![format!("done: {}", last.end_reason)];
+    if let Some(result) = result {
+        lines.push(format!(
             "best policy on {} test goals (seed {REPORT_SEED}), alone: no noise, no advice",
             plan.config.evaluation.test_episodes
-        ),
-    ];
-    lines.extend(result.lines().iter().map(|line| format!("  {line}")));
+        ));
+        lines.extend(result.lines().iter().map(|line| format!("  {line}")));
+    } else if let Some(best) = &last.best {
+        lines.push(format!(
+            "best policy   success {:.3} over {} goals of the run; no test goals without a simulator",
+            best.success, best.n_episodes
+        ));
+    }
     lines.extend([
         format!(
             "training      {} env steps, {} updates, {} rounds in {}",
@@ -126,9 +139,10 @@ fn summary_json(
     plan: &Plan,
     last: &pb::Progress,
     memory: PeakMemory,
-    result: &EvaluationResult,
+    result: Option<&EvaluationResult>,
 ) -> Value {
-    let mut summary = result.json();
+    let task = json!({ "task": plan.config.task, "arms": plan.config.arms });
+    let mut summary = result.map_or(task, EvaluationResult::json);
     let more = json!({
         "env_steps": last.env_steps,
         "updates": last.updates,

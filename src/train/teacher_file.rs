@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use tandem_core::Layout;
+use tandem_core::TaskSpec;
 use tandem_policy::Policy;
 use tandem_rl::RunConfig;
 use tandem_system::atomic_file;
@@ -23,7 +23,7 @@ pub(crate) struct TeacherFile {
     path: PathBuf,
     critic: Option<PathBuf>,
     digest: String,
-    layout: Layout,
+    layout: TaskSpec,
     has_values: bool,
     /// The policy, unless the files are ONNX models.
     policy: Option<Policy>,
@@ -48,7 +48,7 @@ impl TeacherFile {
             return Err(teacher_failed(Error::SurplusCritic));
         }
         let policy = policy_file::load(&path)?;
-        let (digest, layout) = (policy.digest(), policy.layout);
+        let (digest, layout) = (policy.digest(), policy.layout.clone());
         let has_values = policy.has_critic();
         Ok(Self { path, critic, digest, layout, has_values, policy: Some(policy) })
     }
@@ -66,16 +66,24 @@ impl TeacherFile {
     /// Refuses a teacher that cannot advise the run of `config`.
     pub(super) fn check(&self, config: &RunConfig) -> Result<(), Failed> {
         let shown = self.path.display();
-        if self.layout.n_arms != 1 {
+        if self.layout.n_arms() != 1 {
             return Err(Failed::usage(format!(
                 "{shown} drives {} arms: a teacher drives one",
-                self.layout.n_arms
+                self.layout.n_arms()
             )));
         }
-        if self.layout.task.name() != config.task {
+        if self.layout.name() != config.task {
             return Err(Failed::usage(format!(
                 "{shown} is a teacher for {}, the run is for {}",
-                self.layout.task, config.task
+                self.layout.name(),
+                config.task
+            )));
+        }
+        let one_arm = config.layout().or_exit(Exit::Usage, String::new)?.single_arm();
+        if let Some(difference) = one_arm.and_then(|task| task.difference(&self.layout)) {
+            return Err(Failed::usage(format!(
+                "{shown} is a teacher for another task {:?} than the run's: {difference}",
+                config.task
             )));
         }
         if config.advice.starts_from_teacher() && (self.policy.is_none() || !self.has_values) {

@@ -4,9 +4,9 @@ mod inference;
 
 use std::collections::BTreeMap;
 
-use tandem_core::layout::EPISODE_STEPS;
-use tandem_core::{ArmAdvice, Layout, StepAdvice, StepQuery};
-use tandem_proto::{DecodeError, MAX_ARMS};
+use tandem_core::task::MAX_ARMS;
+use tandem_core::{ArmAdvice, StepAdvice, StepQuery, TaskSpec};
+use tandem_proto::DecodeError;
 
 use crate::budget::{AccountTerms, Balance, BudgetHalf, Charge, Lease};
 use crate::error::Error;
@@ -29,10 +29,12 @@ pub struct Advisor {
 }
 
 /// A description of the teacher.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct TeacherInfo {
-    /// The layout of the policy, for one arm.
-    pub layout: Layout,
+    /// The task of the policy, of one arm.
+    pub layout: TaskSpec,
+    /// The tasks of students with 1, 2, … arms, in arm order; see [`TaskSpec::concatenated`].
+    pub students: Vec<TaskSpec>,
     /// The digest of the policy.
     pub digest: String,
     /// Whether the policy values actions.
@@ -67,14 +69,15 @@ impl Advisor {
     pub fn new(policy: impl Into<AnyPolicy>, ledger: Box<dyn Ledger>) -> Result<Self, Error> {
         let policy = policy.into();
         let layout = policy.layout();
-        if layout.n_arms != 1 {
-            return Err(Error::NotOneArm { n_arms: layout.n_arms, n_values: 1 });
+        if layout.n_arms() != 1 {
+            return Err(Error::NotOneArm { n_arms: layout.n_arms(), n_values: 1 });
         }
         let info = TeacherInfo {
-            layout,
             digest: policy.digest().to_owned(),
             has_values: policy.has_values(),
-            maps: Maps::new(Layout::new(layout.task, MAX_ARMS)),
+            maps: Maps::new(&layout, MAX_ARMS),
+            students: (1..=MAX_ARMS).map_while(|n_arms| layout.concatenated(n_arms).ok()).collect(),
+            layout,
         };
         let inference = TeacherInference::new(policy);
         Ok(Self { info, inference, ledger, strategies: BTreeMap::new() })
@@ -147,8 +150,12 @@ impl Advisor {
     /// answer every charge.
     pub fn advise(&mut self, requests: &[AdviceRequest]) -> Vec<Result<Advice, Error>> {
         let scored = self.score(requests);
-        let charges: Vec<ChargeRequest> =
-            scored.iter().flatten().filter_map(ScoredRequest::charge_request).collect();
+        let episode_steps = episode_steps(&self.info.layout);
+        let charges: Vec<ChargeRequest> = scored
+            .iter()
+            .flatten()
+            .filter_map(|request| request.charge_request(episode_steps))
+            .collect();
         let mut charged = self.charge(&charges).into_iter();
         let mut answer = |scored: ScoredRequest<'_>| {
             let charged = if scored.arms.is_empty() {
@@ -157,7 +164,7 @@ impl Advisor {
             } else {
                 charged.next().expect("one result for each request")
             };
-            scored.into_advice(&self.info.maps, charged)
+            scored.into_advice(&self.info, charged)
         };
         scored.into_iter().map(|scored| answer(scored?)).collect()
     }
@@ -225,7 +232,7 @@ struct ScoredRequest<'a> {
 
 impl ScoredRequest<'_> {
     /// Returns the charges that the request may cause, unless it has no steps.
-    fn charge_request(&self) -> Option<ChargeRequest> {
+    fn charge_request(&self, episode_steps: u32) -> Option<ChargeRequest> {
         let charges = self.request.queries.iter().zip(&self.arms).map(|(query, arms)| Charge {
             episode: query.episode,
             step: query.step,
@@ -234,17 +241,18 @@ impl ScoredRequest<'_> {
         });
         let charges: Vec<Charge> = charges.collect();
         let account = || self.request.account.clone();
-        (!charges.is_empty()).then(|| ChargeRequest { account: account(), charges })
+        (!charges.is_empty()).then(|| ChargeRequest { account: account(), episode_steps, charges })
     }
 
     /// Returns the answer, given the verdicts on the charges.
     fn into_advice(
         self,
-        maps: &Maps,
+        info: &TeacherInfo,
         charged: Result<ChargeResult, LedgerError>,
     ) -> Result<Advice, Error> {
-        let queries = &self.request.queries;
-        let charged = charged.map_err(|error| with_step(error, queries))?;
+        let (queries, maps) = (&self.request.queries, &info.maps);
+        let n_steps = episode_steps(&info.layout);
+        let charged = charged.map_err(|error| with_step(error, queries, n_steps))?;
         assert_eq!(charged.verdicts.len(), queries.len(), "a ledger decides on every charge");
         let decided = queries.iter().zip(self.arms).zip(charged.verdicts);
         let steps = decided
@@ -286,10 +294,14 @@ fn overrides_any(strategy: Strategy, half: BudgetHalf, arms: &[ArmAdvice]) -> bo
     arms.iter().any(|arm| overrides(strategy, half, arm))
 }
 
+fn episode_steps(task: &TaskSpec) -> u32 {
+    u32::try_from(task.episode_steps()).expect("an episode has few steps")
+}
+
 /// Adds the step of a refused charge to the error.
-fn with_step(error: LedgerError, queries: &[StepQuery]) -> Error {
+fn with_step(error: LedgerError, queries: &[StepQuery], n_steps: u32) -> Error {
     let LedgerError::BeyondEnd { charge_idx } = error else { return error.into() };
-    let expected = format!("0 to {} in an episode that has a lease", EPISODE_STEPS - 1);
+    let expected = format!("0 to {} in an episode that has a lease", n_steps - 1);
     let step = queries.get(charge_idx).map_or(0, |query| query.step);
     DecodeError::new(format!("steps[{charge_idx}].step"), expected, step).into()
 }

@@ -1,6 +1,6 @@
 //! A teacher for tests whose answers can be computed by hand.
 
-use tandem_core::{ArmIndex, Layout, StepQuery, Task};
+use tandem_core::{ArmIndex, Layout, StepQuery, Task, TaskSpec};
 
 use crate::policy::TeacherPolicy;
 
@@ -11,8 +11,8 @@ pub(crate) struct FakePolicy;
 const LAYOUT: Layout = Layout::new(Task::Push, 1);
 
 impl TeacherPolicy for FakePolicy {
-    fn layout(&self) -> Layout {
-        LAYOUT
+    fn layout(&self) -> TaskSpec {
+        LAYOUT.into()
     }
 
     fn digest(&self) -> &str {

@@ -10,8 +10,6 @@ mod sqlite;
 
 use std::path::{Path, PathBuf};
 
-use tandem_core::layout::EPISODE_STEPS;
-
 use crate::budget::{
     AccountTerms, Balance, BudgetError, BudgetHalf, Charge, Lease, MAX_BUDGET, Transaction,
 };
@@ -25,6 +23,8 @@ pub use sqlite::SqliteLedger;
 pub struct ChargeRequest {
     /// The account's name.
     pub account: String,
+    /// Steps of an episode of a run, which has a lease.
+    pub episode_steps: u32,
     /// At least one step.
     pub charges: Vec<Charge>,
 }
@@ -223,12 +223,14 @@ fn unknown_account(name: &str) -> LedgerError {
     BudgetError::UnknownAccount(name.to_owned()).into()
 }
 
-/// Makes all of `charges`, or refuses all of them.
+/// Makes all charges of `request`, or refuses all of them.
 fn charge_all(
     account: &mut Transaction<'_>,
-    charges: &[Charge],
+    request: &ChargeRequest,
 ) -> Result<ChargeResult, LedgerError> {
-    if let Some(charge_idx) = charges.iter().position(|charge| is_beyond_end(account, charge)) {
+    let ChargeRequest { charges, episode_steps, .. } = request;
+    let is_beyond_end = |charge: &Charge| is_beyond_end(account, charge, *episode_steps);
+    if let Some(charge_idx) = charges.iter().position(is_beyond_end) {
         return Err(LedgerError::BeyondEnd { charge_idx });
     }
     let verdicts = charges.iter().map(|charge| account.charge(*charge)).collect();
@@ -236,13 +238,9 @@ fn charge_all(
 }
 
 /// Returns whether the step lies beyond the end of an episode with a lease. Episodes of a run have leases and
-/// [`EPISODE_STEPS`] steps; other episodes may have any length.
-fn is_beyond_end(account: &Transaction<'_>, charge: &Charge) -> bool {
-    exceeds_episode(charge.step) && account.has_lease(charge.episode)
-}
-
-fn exceeds_episode(step: u32) -> bool {
-    usize::try_from(step).map_or(true, |step| step >= EPISODE_STEPS)
+/// `episode_steps` steps; other episodes may have any length.
+fn is_beyond_end(account: &Transaction<'_>, charge: &Charge, episode_steps: u32) -> bool {
+    charge.step >= episode_steps && account.has_lease(charge.episode)
 }
 
 /// Formats an error's source for its message.

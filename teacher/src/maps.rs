@@ -1,8 +1,11 @@
 //! The maps between a student's vectors and those of a teacher for one arm (equations 7 to 9 of the paper), as data.
+//!
+//! In requests, a student's vectors are the parts of its arms, concatenated in arm order, whatever order its own vectors
+//! have.
 
 use std::ops::Range;
 
-use tandem_core::Layout;
+use tandem_core::TaskSpec;
 
 /// The index ranges of one arm in a student's vectors.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -24,15 +27,16 @@ pub struct Maps {
 }
 
 impl Maps {
-    /// Creates the maps of students with up to as many arms as `largest`.
+    /// Creates the maps of students with up to `n_arms` arms, each of which performs the task `one` of one arm.
     #[must_use]
-    pub fn new(largest: Layout) -> Self {
+    pub fn new(one: &TaskSpec, n_arms: usize) -> Self {
+        let range_of = |arm: usize, n: usize| arm * n..(arm + 1) * n;
         let map_of = |arm| ArmMap {
-            observation: largest.observation_of(arm),
-            goal: largest.goal_of(arm),
-            action: largest.action_of(arm),
+            observation: range_of(arm, one.n_observation()),
+            goal: range_of(arm, one.n_goal()),
+            action: range_of(arm, one.n_action()),
         };
-        Self { arms: largest.arms().map(map_of).collect() }
+        Self { arms: (0..n_arms).map(map_of).collect() }
     }
 
     /// Returns the maps of all arms, in arm order.
@@ -95,7 +99,7 @@ mod tests {
 
     #[test]
     fn the_second_arm_has_the_second_part_of_every_vector() {
-        let maps = Maps::new(Layout::new(Task::PickAndPlace, 3));
+        let maps = Maps::new(&TaskSpec::built_in(Task::PickAndPlace, 1), 3);
         let (observation, goal, action) = (ramp(84), ramp(9), ramp(12));
         let (teacher_observation, teacher_goal) = maps.arms()[1].teacher_state(&observation, &goal);
         assert_eq!((teacher_observation.len(), teacher_observation[0]), (28, 28.0));
@@ -105,7 +109,7 @@ mod tests {
 
     #[test]
     fn composing_the_parts_of_an_action_restores_it() {
-        let maps = Maps::new(Layout::new(Task::Push, 8));
+        let maps = Maps::new(&TaskSpec::built_in(Task::Push, 1), 8);
         for n_arms in 1..=8 {
             let action = ramp(3 * n_arms);
             let parts = maps.of_student(action.len()).map(|arm| arm.arm_action(&action));

@@ -4,7 +4,7 @@ mod onnx;
 
 use std::path::Path;
 
-use tandem_core::Layout;
+use tandem_core::TaskSpec;
 use tandem_policy::{Actor, Critic, Policy};
 
 use crate::error::Error;
@@ -17,8 +17,8 @@ const ONNX_EXTENSION: &str = "onnx";
 
 /// A policy for one arm with an actor and a critic. Rows are states of one arm.
 pub trait TeacherPolicy: Send {
-    /// Returns the task's layout for one arm.
-    fn layout(&self) -> Layout;
+    /// Returns the task, of one arm.
+    fn layout(&self) -> TaskSpec;
 
     /// Returns the text that identifies the policy: the SHA-256 of the parameters, hexadecimal.
     fn digest(&self) -> &str;
@@ -46,12 +46,12 @@ pub enum AnyPolicy {
 }
 
 impl AnyPolicy {
-    /// Returns the task's layout for one arm.
+    /// Returns the task, of one arm.
     #[must_use]
-    pub fn layout(&self) -> Layout {
+    pub fn layout(&self) -> TaskSpec {
         match self {
             Self::Local(policy) => policy.layout(),
-            Self::Remote(policy) => policy.layout(),
+            Self::Remote(policy) => policy.layout().clone(),
         }
     }
 
@@ -181,9 +181,9 @@ impl OneArmPolicy {
     /// # Errors
     /// When the policy is not for one arm, or its critic has several values.
     pub fn new(policy: &Policy) -> Result<Self, Error> {
-        if policy.layout.n_arms != 1 || policy.n_heads != 1 {
+        if policy.layout.n_arms() != 1 || policy.n_heads != 1 {
             return Err(Error::NotOneArm {
-                n_arms: policy.layout.n_arms,
+                n_arms: policy.layout.n_arms(),
                 n_values: policy.n_heads,
             });
         }
@@ -197,8 +197,8 @@ impl OneArmPolicy {
 }
 
 impl TeacherPolicy for OneArmPolicy {
-    fn layout(&self) -> Layout {
-        self.actor.layout()
+    fn layout(&self) -> TaskSpec {
+        self.actor.layout().clone()
     }
 
     fn digest(&self) -> &str {
@@ -222,7 +222,7 @@ impl TeacherPolicy for OneArmPolicy {
 mod tests {
     use std::collections::BTreeMap;
 
-    use tandem_core::Task;
+    use tandem_core::{Layout, Task};
     use tandem_policy::NormalizerSnapshot;
 
     use super::*;
@@ -232,7 +232,6 @@ mod tests {
         let layout = Layout::new(Task::Push, n_arms);
         let identity = |n| NormalizerSnapshot { mean: vec![0.0; n], std: vec![1.0; n] };
         let mut policy = Policy {
-            layout,
             n_hidden: 1,
             n_hidden_layers: 1,
             n_heads,
@@ -240,6 +239,7 @@ mod tests {
             critic: Vec::new(),
             observation_normalizer: identity(layout.n_observation()),
             goal_normalizer: identity(layout.n_goal()),
+            layout: layout.into(),
             metadata: BTreeMap::new(),
         };
         policy.actor = vec![weight; policy.actor_shape().n_parameters()];
@@ -251,7 +251,7 @@ mod tests {
     fn a_policy_for_one_arm_acts_and_values_row_by_row() {
         let weight = 1.0 / 64.0;
         let mut teacher = OneArmPolicy::new(&policy(1, 1, weight)).unwrap();
-        assert_eq!(teacher.layout(), Layout::new(Task::Push, 1));
+        assert_eq!(teacher.layout(), TaskSpec::built_in(Task::Push, 1));
         assert_eq!(teacher.digest(), policy(1, 1, weight).digest());
 
         let (observations, goals) = ([[0.0; 28], [1.0; 28]].concat(), [0.0; 6]);

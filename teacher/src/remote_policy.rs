@@ -6,7 +6,7 @@
 
 use std::time::Duration;
 
-use tandem_core::Layout;
+use tandem_core::TaskSpec;
 use tandem_net::{AuthChannel, Backoff, ClientConfig, ClientConfigError, MAX_MESSAGE_BYTES};
 use tandem_net::{Operation, Retrier, Retryability, retry, within};
 use tandem_proto::pb::policy_client::PolicyClient;
@@ -150,10 +150,10 @@ impl RemotePolicy {
 }
 
 impl RemotePolicy {
-    /// Returns the task's layout for one arm.
+    /// Returns the task, of one arm.
     #[must_use]
-    pub const fn layout(&self) -> Layout {
-        self.description.layout
+    pub const fn layout(&self) -> &TaskSpec {
+        &self.description.layout
     }
 
     /// Returns the text that identifies the policy.
@@ -170,7 +170,7 @@ impl RemotePolicy {
 
     /// Fills in the answers of `batch`, and blocks until they arrive.
     pub(crate) fn evaluate(&mut self, batch: &mut Batch) -> Result<(), RemoteError> {
-        let layout = self.description.layout;
+        let layout = &self.description.layout;
         let mut answers = PolicyAnswers {
             actions: Vec::with_capacity(2 * batch.student_actions.len()),
             values: Vec::with_capacity(2 * batch.n_rows),

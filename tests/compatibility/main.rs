@@ -44,7 +44,7 @@ fn policies_are_read() {
         for (task, n_arms) in Task::ALL.into_iter().flat_map(|task| [(task, 1), (task, 2)]) {
             let path = version.join(format!("policies/{task}-{n_arms}.safetensors"));
             let policy = Policy::load(&path).expect("a policy");
-            assert_eq!(policy.layout, Layout::new(task, n_arms), "{path:?}");
+            assert_eq!(policy.layout, Layout::new(task, n_arms).into(), "{path:?}");
             assert_eq!((policy.n_hidden, policy.n_hidden_layers), (8, 1), "{path:?}");
             let mut action = vec![f32::NAN; policy.layout.n_action()];
             let observation = vec![0.1; policy.layout.n_observation()];
@@ -74,7 +74,7 @@ fn a_ledger_keeps_its_accounts_leases_and_verdicts() {
             wanted_in_second_half: true,
         };
         let charges = vec![charge(4), charge(5)];
-        let request = ChargeRequest { account: "leased".to_owned(), charges };
+        let request = ChargeRequest { account: "leased".to_owned(), episode_steps: 50, charges };
         ledger.charge(&[request]).remove(0).expect("charged");
         let balance = ledger.balance("leased").expect("an account");
         assert_eq!((balance.spent, balance.leased, balance.left), (26, 44, 930));

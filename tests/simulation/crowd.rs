@@ -205,8 +205,8 @@ fn query(episode: u64, step: u32) -> pb::StepQuery {
 struct StillTeacher;
 
 impl TeacherPolicy for StillTeacher {
-    fn layout(&self) -> Layout {
-        STILL
+    fn layout(&self) -> tandem_core::TaskSpec {
+        STILL.into()
     }
 
     fn digest(&self) -> &str {

@@ -3,7 +3,7 @@
 use std::fmt;
 
 use tandem_core::work::{RunTerms, SlotOrder};
-use tandem_core::{Contacts, Episode, EpisodeKind, Layout};
+use tandem_core::{Contacts, Episode, EpisodeKind, TaskSpec};
 
 use crate::ports::{Environment, EnvironmentError};
 use crate::rollout::episode_starts;
@@ -80,7 +80,7 @@ fn replay(
     terms: &RunTerms,
     episodes: &[Episode],
 ) -> Result<Option<Difference>, EnvironmentError> {
-    let layout = terms.layout;
+    let layout = &terms.layout;
     let mut observations = vec![0.0; episodes.len() * layout.n_observation()];
     let mut goals = vec![0.0; episodes.len() * layout.n_goal()];
     env.reset(&episode_starts(order, terms), &mut observations, &mut goals)?;
@@ -113,7 +113,7 @@ fn replay(
 
 /// Compares the observations of all episodes after `step` steps, shape `[n, n_observation]`.
 fn observed_difference(
-    layout: Layout,
+    layout: &TaskSpec,
     episodes: &[Episode],
     step: usize,
     observations: &[f32],

@@ -52,6 +52,14 @@ pub enum Error {
     /// The server of the environments could not be started.
     #[error(transparent)]
     NoEnvironment(#[from] crate::config::ServerNotStarted),
+    /// No simulator in this program has the run's task.
+    #[error(
+        "task {task:?} is not built-in, so its environments need a server: give the worker its address by --env"
+    )]
+    NotBuiltIn {
+        /// The task's name.
+        task: String,
+    },
     /// The server serves another task than the run's.
     #[error(
         "the environment server {server} serves another task than the run's: {} is {} in the run and {} at the server",

@@ -4,7 +4,7 @@ use std::num::NonZeroUsize;
 
 use tandem_core::layout::Layout;
 use tandem_core::work::{EpisodeOrder, RunTerms, SlotOrder};
-use tandem_core::{Episode, EpisodeKind, Exploration, WorldSettings};
+use tandem_core::{Episode, EpisodeKind, Exploration, TaskSpec, WorldSettings};
 use tandem_sim::{Env, WorldConfig};
 
 use crate::ports::{Act, Environment, NoAdvisor, Simulator};
@@ -38,13 +38,14 @@ pub fn evaluate<A: Act>(
     n_threads: NonZeroUsize,
 ) -> Result<Vec<Episode>, RolloutError> {
     let env = Env::new(layout, world).map_err(RolloutError::NoEnvironment)?;
-    evaluate_in(&Simulator::new(env), make_actor, layout, n_episodes, seed, n_threads)
+    let terms = evaluation_terms(layout);
+    evaluate_in(&Simulator::new(env), make_actor, &terms, n_episodes, seed, n_threads)
 }
 
 fn evaluate_in<E: Environment + Clone + Sync, A: Act>(
     env: &E,
     make_actor: impl Fn() -> A + Sync,
-    layout: Layout,
+    terms: &RunTerms,
     n_episodes: u64,
     seed: u64,
     n_threads: NonZeroUsize,
@@ -53,7 +54,7 @@ fn evaluate_in<E: Environment + Clone + Sync, A: Act>(
     let n_per_thread = numbers.len().div_ceil(n_threads.get()).max(1);
     let play = |numbers: &[u64]| {
         let (mut env, mut actor) = (env.clone(), make_actor());
-        let play_one = |number: &u64| play_alone(&mut env, &mut actor, layout, seed, *number);
+        let play_one = |number: &u64| play_alone(&mut env, &mut actor, terms, seed, *number);
         numbers.iter().map(play_one).collect::<Result<Vec<Episode>, RolloutError>>()
     };
     let parts: Vec<_> = std::thread::scope(|scope| {
@@ -70,7 +71,7 @@ fn evaluate_in<E: Environment + Clone + Sync, A: Act>(
 fn play_alone(
     env: &mut impl Environment,
     actor: &mut impl Act,
-    layout: Layout,
+    terms: &RunTerms,
     seed: u64,
     number: u64,
 ) -> Result<Episode, RolloutError> {
@@ -81,15 +82,15 @@ fn play_alone(
         kind: EpisodeKind::Evaluation,
         episodes: vec![order],
     };
-    let mut episodes = play_slot(env, &slot, &evaluation_terms(layout), actor, &mut NoAdvisor)?;
+    let mut episodes = play_slot(env, &slot, terms, actor, &mut NoAdvisor)?;
     Ok(episodes.remove(0))
 }
 
-/// Returns terms for evaluations, which use only the layout: the world is built already.
-fn evaluation_terms(layout: Layout) -> RunTerms {
+/// Returns terms for evaluations, which use only the task: the world is built already.
+fn evaluation_terms(layout: impl Into<TaskSpec>) -> RunTerms {
     RunTerms {
         run: String::new(),
-        layout,
+        layout: layout.into(),
         account: None,
         exploration: Exploration::NONE,
         world: WorldSettings::default(),
@@ -106,7 +107,7 @@ mod tests {
         evaluate_in(
             &FakeEnvironment::new(),
             || FakeActor::Seeker,
-            LAYOUT,
+            &evaluation_terms(LAYOUT),
             n_episodes,
             seed,
             n_threads,

@@ -4,9 +4,9 @@
 //! new places.
 
 use rand_chacha::ChaCha8Rng;
-use tandem_core::Exploration;
-use tandem_core::layout::Layout;
 use tandem_core::rng::{bernoulli, standard_normal, uniform};
+use tandem_core::task::Part;
+use tandem_core::{ArmIndex, Exploration, TaskSpec};
 
 /// The exploration of one episode.
 ///
@@ -14,7 +14,7 @@ use tandem_core::rng::{bernoulli, standard_normal, uniform};
 /// changes the draws of later steps.
 #[derive(Debug, Clone)]
 pub struct Explorer {
-    layout: Layout,
+    layout: TaskSpec,
     noise_std: f32,
     hold_mean_steps: f32,
     start_probability: f32,
@@ -32,24 +32,26 @@ struct HeldAction {
 impl Explorer {
     /// Creates an explorer with these settings that draws from `rng`.
     #[must_use]
-    pub fn new(layout: Layout, settings: Exploration, rng: ChaCha8Rng) -> Self {
-        let idle = HeldAction { n_steps_left: 0, action: vec![0.0; layout.task.action_per_arm()] };
+    pub fn new(layout: impl Into<TaskSpec>, settings: Exploration, rng: ChaCha8Rng) -> Self {
+        let layout = layout.into();
+        let n_per_arm = layout.action_of(ArmIndex(0)).len();
+        let idle = HeldAction { n_steps_left: 0, action: vec![0.0; n_per_arm] };
         Self {
-            layout,
             noise_std: settings.noise_std,
             hold_mean_steps: settings.sticky_random_mean_steps,
             start_probability: start_probability(
                 settings.random_action_prob,
                 settings.sticky_random_mean_steps,
             ),
-            held: vec![idle; layout.n_arms],
+            held: vec![idle; layout.n_arms()],
+            layout,
             rng,
         }
     }
 
     /// Creates an explorer for a warm-up: every arm takes a random action on every step.
     #[must_use]
-    pub fn uniform(layout: Layout, settings: Exploration, rng: ChaCha8Rng) -> Self {
+    pub fn uniform(layout: impl Into<TaskSpec>, settings: Exploration, rng: ChaCha8Rng) -> Self {
         Self::new(layout, Exploration { random_action_prob: 1.0, ..settings }, rng)
     }
 
@@ -57,19 +59,25 @@ impl Explorer {
     pub fn explore(&mut self, action: &mut [f32]) {
         for arm in self.layout.arms() {
             self.held[arm.0].advance(&mut self.rng, self.start_probability, self.hold_mean_steps);
-            self.explore_arm(arm.0, &mut action[self.layout.action_of(arm)]);
+            let (part, held) = (self.layout.action_of(arm), &self.held[arm.0]);
+            explore_arm(part, held, self.noise_std, &mut self.rng, action);
         }
     }
+}
 
-    fn explore_arm(&mut self, arm_idx: usize, action: &mut [f32]) {
-        for component in &mut *action {
-            *component =
-                (*component + self.noise_std * standard_normal(&mut self.rng)).clamp(-1.0, 1.0);
-        }
-        let held = &self.held[arm_idx];
-        if held.n_steps_left > 0 {
-            action.copy_from_slice(&held.action);
-        }
+/// Adds noise to an arm's part of `action`, or replaces it by a held action.
+fn explore_arm(
+    part: &Part,
+    held: &HeldAction,
+    noise_std: f32,
+    rng: &mut ChaCha8Rng,
+    action: &mut [f32],
+) {
+    for idx in part.iter() {
+        action[idx] = (action[idx] + noise_std * standard_normal(rng)).clamp(-1.0, 1.0);
+    }
+    if held.n_steps_left > 0 {
+        part.write(action, &held.action);
     }
 }
 
@@ -111,7 +119,7 @@ fn hold_steps(draw: f32, mean_steps: f32) -> u32 {
 
 #[cfg(test)]
 mod tests {
-    use tandem_core::layout::Task;
+    use tandem_core::layout::{Layout, Task};
     use tandem_core::rng::{Stream, episode_rng};
 
     use super::*;

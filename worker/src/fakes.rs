@@ -153,7 +153,7 @@ impl<F: Fn(u64, u32, usize) -> bool> Advisor for FakeTeacher<F> {
 pub(crate) fn terms() -> RunTerms {
     RunTerms {
         run: "run-7".to_owned(),
-        layout: LAYOUT,
+        layout: LAYOUT.into(),
         account: Some("run".to_owned()),
         exploration: Exploration {
             noise_std: 0.2,

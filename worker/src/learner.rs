@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use tandem_core::Layout;
+use tandem_core::TaskSpec;
 use tandem_core::work::{PublishedActor, RunTerms, SlotOrder};
 use tandem_net::{AuthChannel, MAX_MESSAGE_BYTES, Operation, retry};
 use tandem_proto::pb::learner_client::LearnerClient;
@@ -79,7 +79,7 @@ impl Learner {
     pub(crate) async fn parameters(
         &self,
         version: u64,
-        layout: Layout,
+        layout: &TaskSpec,
     ) -> Result<Option<PublishedActor>, Error> {
         let request = pb::GetParametersRequest { version };
         let call =

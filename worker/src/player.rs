@@ -6,11 +6,12 @@ use tandem_core::work::{EpisodeOrder, EpisodeStart, PublishedActor, RunTerms, Sl
 use tandem_core::{Contacts, Episode, StepAdvice, StepQuery};
 use tandem_policy::{Actor, actor_digest};
 use tandem_proto::environment::{ResetReply, StepReply};
-use tandem_sim::{Env, SimError, WorldConfig};
+use tandem_sim::{Env, WorldConfig};
 use tandem_telemetry::events::{EpisodeFinished, EpisodeRecorded};
 use tokio::sync::{mpsc, oneshot};
 
 use crate::determinism::{self, DeterminismCheck};
+use crate::error::Error;
 use crate::ports::{Advisor, AdvisorGone, Environment, EnvironmentError, Simulator};
 use crate::record::{log_name, metadata_of, record_episode};
 use crate::rollout::{RolloutError, play_slot};
@@ -36,8 +37,11 @@ pub(crate) struct PlayedSlot {
 
 impl Player {
     /// Creates a player that simulates its environments.
-    pub(crate) fn simulating(terms: RunTerms, log_dir: Option<PathBuf>) -> Result<Self, SimError> {
-        let world = Env::new(terms.layout, &WorldConfig::from(terms.world))?;
+    pub(crate) fn simulating(terms: RunTerms, log_dir: Option<PathBuf>) -> Result<Self, Error> {
+        let Some(layout) = terms.layout.as_built_in() else {
+            return Err(Error::NotBuiltIn { task: terms.layout.name().to_owned() });
+        };
+        let world = Env::new(layout, &WorldConfig::from(terms.world))?;
         let simulator = Some(Simulator::new(world));
         Ok(Self { simulator, ..Self::remote(terms, log_dir) })
     }
@@ -58,7 +62,7 @@ impl Player {
 
     /// Loads the actor for the following slots.
     pub(crate) fn load(&mut self, published: PublishedActor) -> Result<(), tandem_policy::Error> {
-        let layout = self.terms.layout;
+        let layout = &self.terms.layout;
         let for_digest = self.log_dir.is_some().then(|| published.clone());
         self.actor = Some(Actor::new(layout, published)?);
         self.actor_digest =
@@ -99,7 +103,12 @@ impl Player {
     /// Writes an episode's log. Failures are only logged: the episode itself is delivered.
     fn record(&self, order: EpisodeOrder, episode: &Episode, log_dir: &Path) {
         let path = log_dir.join(log_name(episode));
-        let metadata = metadata_of(order, episode, &self.terms, self.actor_digest.clone());
+        let digest = self.actor_digest.clone();
+        let Some(metadata) = metadata_of(order, episode, &self.terms, digest) else {
+            let task = episode.layout.name();
+            tracing::debug!(episode = episode.number, task, "episode of no simulator not recorded");
+            return;
+        };
         match record_episode(&metadata, episode, &path) {
             Ok(path) => EpisodeRecorded { episode: episode.number, path: &path }.emit(),
             Err(error) => {

@@ -5,11 +5,9 @@
 
 use std::path::{Path, PathBuf};
 
-use tandem_core::layout::EPISODE_STEPS;
-use tandem_core::reward::{achieved_goal, sparse_reward};
 use tandem_core::rng::{Stream, episode_rng};
 use tandem_core::work::{EpisodeOrder, RunTerms};
-use tandem_core::{Episode, EpisodeKind, Layout, WorldSettings};
+use tandem_core::{Episode, EpisodeKind, TaskSpec, WorldSettings};
 use tandem_sim::{Env, SimError, WorldConfig};
 use tandem_telemetry::{
     EpisodeLog, EpisodeMetadata, EpisodeRecorder, LoggedTransition, TransitionRecord,
@@ -67,7 +65,8 @@ pub enum RecordError {
     RemovedStart(String),
 }
 
-/// Returns the metadata of an episode that was played by `order`.
+/// Returns the metadata of an episode that was played by `order`; `None` if the simulator does not have its task, so that
+/// the episode cannot be simulated again for its log.
 ///
 /// `policy_digest` is the digest of the parameters that played it: [`tandem_policy::actor_digest`] in a run,
 /// [`Policy::digest`](tandem_policy::Policy::digest) where the whole policy is at hand.
@@ -77,17 +76,17 @@ pub fn metadata_of(
     episode: &Episode,
     terms: &RunTerms,
     policy_digest: String,
-) -> EpisodeMetadata {
-    EpisodeMetadata {
+) -> Option<EpisodeMetadata> {
+    Some(EpisodeMetadata {
         run: terms.run.clone(),
         episode: order.number,
         seed: order.seed,
         kind: episode.kind,
         parameter_version: episode.parameter_version,
-        layout: episode.layout,
+        layout: episode.layout.as_built_in()?,
         policy_digest,
         world: terms.world.log_entries().map(|(key, value)| (key.to_owned(), value)).into(),
-    }
+    })
 }
 
 /// Builds the world of a logged episode, in the episode's start state.
@@ -133,15 +132,15 @@ pub fn record_episode(
 ) -> Result<PathBuf, RecordError> {
     let mut world = world_of(metadata)?;
     let mut recorder = EpisodeRecorder::create(path, metadata)?;
-    for step_idx in 0..EPISODE_STEPS {
+    for step_idx in 0..episode.n_steps() {
         check_replay(&world, episode, step_idx)?;
         record_step(&mut recorder, &world, episode, step_idx)?;
         if world.step(episode.action(step_idx))? != episode.contacts[step_idx] {
             return Err(RecordError::Diverged { episode: episode.number, step: step_idx + 1 });
         }
     }
-    check_replay(&world, episode, EPISODE_STEPS)?;
-    recorder.record_outcome(&world.scene(), episode.observation(EPISODE_STEPS))?;
+    check_replay(&world, episode, episode.n_steps())?;
+    recorder.record_outcome(&world.scene(), episode.last_observation())?;
     Ok(recorder.finish()?)
 }
 
@@ -151,9 +150,10 @@ fn record_step(
     episode: &Episode,
     step_idx: usize,
 ) -> Result<(), RecordError> {
-    let layout = episode.layout;
+    let layout = &episode.layout;
     let arm_reward = |arm| {
-        sparse_reward(episode.achieved(step_idx + 1, arm), &episode.goal[layout.goal_of(arm)])
+        let achieved = episode.achieved(step_idx + 1, arm);
+        layout.sparse_reward(&achieved, &layout.goal_of(arm).of(&episode.goal))
     };
     let rewards_per_arm: Vec<f32> = layout.arms().map(arm_reward).collect();
     let transition = TransitionRecord {
@@ -194,7 +194,7 @@ pub fn replay_log(log: &EpisodeLog) -> Result<(), RecordError> {
     if log.transitions.is_empty() {
         return Err(RecordError::NoSteps);
     }
-    let layout = log.metadata.layout;
+    let layout = TaskSpec::from(log.metadata.layout);
     let mut world = world_of(&log.metadata)?;
     let mut observation = vec![0.0; layout.n_observation()];
     world.observe(&mut observation);
@@ -205,7 +205,7 @@ pub fn replay_log(log: &EpisodeLog) -> Result<(), RecordError> {
         world.observe(&mut observation);
         let [logged_contacts, contacts] = [logged.contacts, contacts].map(|c| [c.bits().into()]);
         compare(step_idx, "contacts", &logged_contacts, &contacts)?;
-        compare_rewards(step_idx, logged, layout, &observation)?;
+        compare_rewards(step_idx, logged, &layout, &observation)?;
     }
     let last_observation = log.last_observation.as_deref();
     last_observation.map_or(Ok(()), |last_observation| {
@@ -217,14 +217,19 @@ pub fn replay_log(log: &EpisodeLog) -> Result<(), RecordError> {
 fn compare_rewards(
     step_idx: usize,
     logged: &LoggedTransition,
-    layout: Layout,
+    layout: &TaskSpec,
     observation: &[f32],
 ) -> Result<(), RecordError> {
-    let achieved: Vec<f32> = achieved_goal(layout, observation).collect();
-    compare(step_idx, "reward", &[logged.reward], &[sparse_reward(&achieved, &logged.goal)])?;
+    let achieved: Vec<f32> = layout.achieved_goal(observation).collect();
+    compare(
+        step_idx,
+        "reward",
+        &[logged.reward],
+        &[layout.sparse_reward(&achieved, &logged.goal)],
+    )?;
     let arm_reward = |arm| {
         let part = layout.goal_of(arm);
-        sparse_reward(&achieved[part.clone()], &logged.goal[part])
+        layout.sparse_reward(&part.of(&achieved), &part.of(&logged.goal))
     };
     let played: Vec<f32> = layout.arms().map(arm_reward).collect();
     compare(step_idx, "rewards_per_arm", &logged.rewards_per_arm, &played)
@@ -257,13 +262,17 @@ mod tests {
     fn played(kind: EpisodeKind) -> (EpisodeMetadata, Episode) {
         let order = SlotOrder { kind, ..slot(&[3], false) };
         let terms = terms();
-        let world = Env::new(terms.layout, &WorldConfig::from(terms.world)).expect("in range");
+        let world =
+            Env::new(crate::fakes::LAYOUT, &WorldConfig::from(terms.world)).expect("in range");
         let mut actor = FakeActor::Seeker;
         let mut world = Simulator::new(world);
         let episode = play_slot(&mut world, &order, &terms, &mut actor, &mut NoAdvisor)
             .expect("no step fails")
             .remove(0);
-        (metadata_of(order.episodes[0], &episode, &terms, "5f3a".to_owned()), episode)
+        {
+            let metadata = metadata_of(order.episodes[0], &episode, &terms, "5f3a".to_owned());
+            (metadata.expect("a built-in task"), episode)
+        }
     }
 
     #[test]
@@ -282,7 +291,7 @@ mod tests {
             let actions: Vec<f32> =
                 log.transitions.iter().flat_map(|step| step.action.clone()).collect();
             assert_eq!(actions, episode.actions);
-            assert_eq!(log.last_observation.as_deref(), Some(episode.observation(EPISODE_STEPS)));
+            assert_eq!(log.last_observation.as_deref(), Some(episode.last_observation()));
             let mut start = vec![0.0; episode.layout.n_observation()];
             world_of(&log.metadata).expect("described").observe(&mut start);
             assert_eq!(start, episode.observation(0));

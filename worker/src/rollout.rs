@@ -1,9 +1,8 @@
-//! The life of an episode: reset, then act, explore, ask, execute, observe, fifty times.
+//! The life of an episode: reset, then act, explore, ask, execute and observe on every step.
 
-use tandem_core::layout::EPISODE_STEPS;
 use tandem_core::rng::{Stream, episode_rng};
 use tandem_core::work::{EpisodeOrder, EpisodeStart, RunTerms, SlotOrder};
-use tandem_core::{Contacts, Episode, EpisodeKind, Layout, StepAdvice, StepQuery};
+use tandem_core::{Contacts, Episode, EpisodeKind, StepAdvice, StepQuery, TaskSpec};
 use tandem_sim::SimError;
 use tandem_telemetry::events::StepAdvised;
 
@@ -74,8 +73,8 @@ pub fn play_slot(
     advisor: &mut impl Advisor,
 ) -> Result<Vec<Episode>, RolloutError> {
     let mut rollouts = start(env, order, terms)?;
-    let mut batch = StepBatch::new(order.episodes.len(), terms.layout);
-    for step_idx in 0..EPISODE_STEPS {
+    let mut batch = StepBatch::new(order.episodes.len(), &terms.layout);
+    for step_idx in 0..terms.layout.episode_steps() {
         for rollout in &mut rollouts {
             rollout.choose_action(actor);
         }
@@ -104,7 +103,7 @@ fn start(
     order: &SlotOrder,
     terms: &RunTerms,
 ) -> Result<Vec<Rollout>, RolloutError> {
-    let (n, layout) = (order.episodes.len(), terms.layout);
+    let (n, layout) = (order.episodes.len(), &terms.layout);
     let mut observations = vec![0.0; n * layout.n_observation()];
     let mut goals = vec![0.0; n * layout.n_goal()];
     env.reset(&episode_starts(order, terms), &mut observations, &mut goals)?;
@@ -116,7 +115,7 @@ fn start(
 
 /// The vectors of one step of all environments, for reuse.
 struct StepBatch {
-    layout: Layout,
+    layout: TaskSpec,
     /// Shape `[n, n_action]`.
     actions: Vec<f32>,
     /// Shape `[n, n_observation]`.
@@ -126,9 +125,9 @@ struct StepBatch {
 }
 
 impl StepBatch {
-    fn new(n: usize, layout: Layout) -> Self {
+    fn new(n: usize, layout: &TaskSpec) -> Self {
         Self {
-            layout,
+            layout: layout.clone(),
             actions: vec![0.0; n * layout.n_action()],
             observations: vec![0.0; n * layout.n_observation()],
             contacts: vec![Contacts::NONE; n],
@@ -225,19 +224,20 @@ impl Rollout {
         terms: &RunTerms,
         (observation, goal): (&[f32], &[f32]),
     ) -> Self {
-        let layout = terms.layout;
-        let mut observations = Vec::with_capacity((EPISODE_STEPS + 1) * layout.n_observation());
+        let layout = &terms.layout;
+        let n_steps = layout.episode_steps();
+        let mut observations = Vec::with_capacity((n_steps + 1) * layout.n_observation());
         observations.extend_from_slice(observation);
         let episode = Episode {
             number: order.number,
             kind: slot.kind,
             parameter_version: slot.parameter_version,
-            layout,
+            layout: layout.clone(),
             observations,
             goal: goal.to_vec(),
-            actions: Vec::with_capacity(EPISODE_STEPS * layout.n_action()),
-            advised_arms: Vec::with_capacity(EPISODE_STEPS),
-            contacts: Vec::with_capacity(EPISODE_STEPS),
+            actions: Vec::with_capacity(n_steps * layout.n_action()),
+            advised_arms: Vec::with_capacity(n_steps),
+            contacts: Vec::with_capacity(n_steps),
             advice_charged: 0,
         };
         Self {
@@ -259,22 +259,24 @@ impl Rollout {
         }
     }
 
+    /// Returns the query on the next step. Its vectors are in arm order, as those of the advice are.
     fn query(&self, step_idx: usize) -> StepQuery {
+        let layout = &self.episode.layout;
         StepQuery {
             episode: self.episode.number,
             step: u32::try_from(step_idx).expect("an episode's steps are few"),
-            observation: self.observation.clone(),
-            goal: self.episode.goal.clone(),
-            proposed_action: self.action.clone(),
+            observation: layout.observation_in_arm_order(&self.observation),
+            goal: layout.goal_in_arm_order(&self.episode.goal),
+            proposed_action: layout.action_in_arm_order(&self.action),
         }
     }
 
     /// Replaces the proposed action by the teacher's advice.
     fn apply_advice(&mut self, advice: &StepAdvice, step_idx: usize) -> Result<(), RolloutError> {
-        let (number, layout) = (self.episode.number, self.episode.layout);
+        let (number, layout) = (self.episode.number, &self.episode.layout);
         check_count(number, step_idx, "action components", advice.action.len(), layout.n_action())?;
-        check_count(number, step_idx, "arms", advice.arms.len(), layout.n_arms)?;
-        self.action.copy_from_slice(&advice.action);
+        check_count(number, step_idx, "arms", advice.arms.len(), layout.n_arms())?;
+        layout.write_action_in_arm_order(&advice.action, &mut self.action);
         self.advised_arms = advice.overridden_arms();
         if self.advised_arms != 0 && !advice.charged {
             return Err(RolloutError::UnchargedAdvice { episode: number, step: step_idx });
@@ -305,11 +307,13 @@ fn explorer(order: EpisodeOrder, kind: EpisodeKind, terms: &RunTerms) -> Option<
     }
     let rng = episode_rng(order.seed, order.number, Stream::Exploration);
     let explorer = if order.uniform { Explorer::uniform } else { Explorer::new };
-    Some(explorer(terms.layout, terms.exploration, rng))
+    Some(explorer(&terms.layout, terms.exploration, rng))
 }
 
 #[cfg(test)]
 mod tests {
+    use tandem_core::layout::EPISODE_STEPS;
+
     use super::*;
     use crate::fakes::{
         FakeActor, FakeEnvironment, FakeTeacher, LAYOUT, TEACHER_ACTION, slot, terms,

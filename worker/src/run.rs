@@ -1,7 +1,7 @@
 //! The worker's main loop: join the run, then take, play and deliver slots until the run has ended.
 
 use tandem_core::work::SlotOrder;
-use tandem_core::{Layout, StepAdvice, StepQuery, TaskSpec};
+use tandem_core::{StepAdvice, StepQuery, TaskSpec};
 use tokio::sync::oneshot;
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
@@ -144,12 +144,17 @@ impl Worker {
         if let Some(account) = terms.account.as_ref().filter(|_| self.teacher.is_none()) {
             return Err(Error::NoTeacher { account: account.clone() });
         }
-        tracing::info!(worker_id, task = %terms.layout.task, n_arms = terms.layout.n_arms, "run joined");
+        tracing::info!(
+            worker_id,
+            task = terms.layout.name(),
+            n_arms = terms.layout.n_arms(),
+            "run joined"
+        );
         let log_dir = self.config.log_dir.clone();
         let player = match &mut self.environments {
             None => Player::simulating(terms, log_dir)?,
             Some(environments) => {
-                environments.check(&terms.layout.into()).await?;
+                environments.check(&terms.layout).await?;
                 Player::remote(terms, log_dir)
             }
         };
@@ -186,7 +191,8 @@ impl Worker {
         if player.has_version(version) {
             return Ok(true);
         }
-        let Some(published) = self.learner.parameters(version, player.terms().layout).await? else {
+        let Some(published) = self.learner.parameters(version, &player.terms().layout).await?
+        else {
             return Ok(false);
         };
         player.load(published).map_err(|source| Error::Parameters { version, source })?;
@@ -230,8 +236,7 @@ impl Worker {
         order: SlotOrder,
     ) -> Result<(Box<Player>, Result<PlayedSlot, SlotFailure>), Error> {
         let slot = order.slot;
-        let (account, layout) = (player.terms().account.clone(), player.terms().layout);
-        let task = TaskSpec::from(layout);
+        let (account, task) = (player.terms().account.clone(), player.terms().layout.clone());
         let (peers, mut requests) = PeerChannel::new();
         let (finished, playing) = oneshot::channel();
         let tracked = self.rollouts.token();
@@ -250,7 +255,7 @@ impl Worker {
             let answered = match request {
                 PeerRequest::Advice(queries, response) => {
                     let account = account.as_deref().ok_or(Error::NoAccount { slot })?;
-                    let advice = self.advise(account, layout, &queries).await?;
+                    let advice = self.advise(account, &task, &queries).await?;
                     response.send(advice).is_ok()
                 }
                 request => match self.forward(request, &task).await {
@@ -278,12 +283,12 @@ impl Worker {
     async fn advise(
         &mut self,
         account: &str,
-        layout: Layout,
+        task: &TaskSpec,
         queries: &[StepQuery],
     ) -> Result<Vec<StepAdvice>, Error> {
         let no_teacher = || Error::NoTeacher { account: account.to_owned() };
         let teacher = self.teacher.as_mut().ok_or_else(no_teacher)?;
-        teacher.advise(account, layout, queries).await
+        teacher.advise(account, task, queries).await
     }
 
     /// Forwards a request to the server of the environments. Returns whether the player still waits for the response.

@@ -1,6 +1,6 @@
 //! The client of the teacher.
 
-use tandem_core::{Layout, StepAdvice, StepQuery};
+use tandem_core::{StepAdvice, StepQuery, TaskSpec};
 use tandem_net::{AuthChannel, MAX_MESSAGE_BYTES, Operation, Retrier, within};
 use tandem_proto::pb;
 use tandem_proto::pb::teacher_client::TeacherClient;
@@ -45,7 +45,7 @@ impl Teacher {
     pub(crate) async fn advise(
         &mut self,
         account: &str,
-        layout: Layout,
+        layout: &TaskSpec,
         queries: &[StepQuery],
     ) -> Result<Vec<StepAdvice>, Error> {
         let steps = queries.iter().map(tandem_proto::encode_query).collect();

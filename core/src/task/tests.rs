@@ -73,6 +73,10 @@ fn interleaved_parts_are_found_by_their_indices() {
     assert_eq!(*task.observation_of(ArmIndex(1)).of(&observation), [-0.5, 20.0]);
     assert_eq!(*task.achieved_goal_of(ArmIndex(0)).of(&observation), [0.5]);
     assert_eq!(task.achieved_goal(&observation).collect::<Vec<f32>>(), [-0.5, 0.5]);
+    assert_eq!(task.observation_in_arm_order(&observation), [0.5, 10.0, -0.5, 20.0]);
+    let mut action = [0.0; 2];
+    task.write_action_in_arm_order(&[0.25, -0.25], &mut action);
+    assert_eq!((action, task.action_in_arm_order(&action)), ([-0.25, 0.25], vec![0.25, -0.25]));
     let goal = [-0.45, 0.8];
     assert!(!task.arm_succeeds(ArmIndex(0), &observation, &goal), "0.5 is not 0.8");
     assert!(task.arm_succeeds(ArmIndex(1), &observation, &goal));

@@ -209,7 +209,7 @@ impl Reader<'_> {
         };
         let next = usize::try_from(self.count("replay.next")?).unwrap_or(usize::MAX);
         let capacity = trainer.config.replay.capacity_transitions;
-        trainer.replay = ReplayBuffer::from_parts(trainer.layout, capacity, parts, next)
+        trainer.replay = ReplayBuffer::from_parts(&trainer.layout, capacity, parts, next)
             .ok_or("its replay buffer does not fit replay.capacity_transitions in the run file")?;
         Ok(())
     }
@@ -236,7 +236,7 @@ impl Reader<'_> {
             goal_std: self.f32s("acting.goal_std")?,
         };
         // Workers would refuse an unusable actor later; here the error names the checkpoint.
-        match tandem_policy::Actor::new(trainer.layout, acting.clone()) {
+        match tandem_policy::Actor::new(&trainer.layout, acting.clone()) {
             Ok(_) => Ok(acting),
             Err(error) => Err(format!("its acting parameters cannot be used: {error}")),
         }

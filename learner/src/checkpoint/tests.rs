@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use proptest::prelude::{Strategy, any};
 use proptest::test_runner::{Config, TestCaseError, TestRunner};
-use tandem_core::{ArmIndex, Episode, Layout, Task};
+use tandem_core::{ArmIndex, Episode, Task, TaskSpec};
 use tandem_rl::config::Recipe;
 use tandem_rl::trainer::RoundStats;
 use tandem_telemetry::MetricsRow;
@@ -13,9 +13,9 @@ use tempfile::TempDir;
 use super::*;
 
 /// Returns an episode in which the object of arm 0 moves by `drift_m` per step along x.
-fn drifting_episode(layout: Layout, number: u64, drift_m: f32) -> Episode {
+fn drifting_episode(layout: &TaskSpec, number: u64, drift_m: f32) -> Episode {
     let mut episode = Episode::zeros(layout, number);
-    let x = layout.achieved_goal_of(ArmIndex(0)).start;
+    let x = layout.achieved_goal_of(ArmIndex(0)).index(0);
     let mut position = 0.0;
     for observation in episode.observations.chunks_exact_mut(layout.n_observation()) {
         observation[x] = position;
@@ -37,7 +37,7 @@ fn small_config() -> RunConfig {
 fn train_round(trainer: &mut Trainer) -> RoundStats {
     let round = trainer.counters().round;
     let episodes: Vec<_> = (round * 2..round * 2 + 2)
-        .map(|number| drifting_episode(trainer.layout, number, 0.002 * number as f32))
+        .map(|number| drifting_episode(&trainer.layout, number, 0.002 * number as f32))
         .collect();
     trainer.ingest(&episodes);
     trainer.learn(|_| ()).expect("finite")
@@ -333,7 +333,7 @@ fn load_hostile(name: &str, n_cases: u32, hostile: impl Strategy<Value = Vec<u8>
 fn train_with_whatever(trainer: &mut Trainer) {
     let round = trainer.counters().round;
     assert!(!trainer.training_orders(round, round).is_empty());
-    let episodes = [drifting_episode(trainer.layout, round * 2, 0.01)];
+    let episodes = [drifting_episode(&trainer.layout, round * 2, 0.01)];
     trainer.ingest(&episodes);
     // Numbers that are not finite make learning diverge, which is an error and not a panic.
     drop(trainer.learn(|_| ()));

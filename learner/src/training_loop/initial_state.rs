@@ -12,7 +12,7 @@ use super::evaluations::Evaluations;
 use super::persistence::Persistence;
 use super::progress_publisher::ProgressPublisher;
 use super::run_lock::RunLock;
-use super::{Context, LearnerLoop, UNITS_PER_EPISODE};
+use super::{Context, LearnerLoop};
 use crate::advice_account::{AccountOptions, AdviceAccount, RunStart};
 use crate::checkpoint::{self, CheckpointError, Restored, Resumption};
 use crate::error::Error;
@@ -77,7 +77,9 @@ impl InitialState {
                 budget: advice.budget,
                 strategy: advice.strategy.clone(),
             },
-            units_per_episode: UNITS_PER_EPISODE,
+            // An episode can use one unit of advice per step.
+            units_per_episode: u32::try_from(self.trainer.layout.episode_steps())
+                .expect("an episode has few steps"),
             start: match self.is_resumed {
                 true => RunStart::Resumed { spent: self.trainer.counters().advice_spent },
                 false => RunStart::New,
@@ -115,7 +117,7 @@ impl<'a> LearnerLoop<'a> {
         let Resumption { acting, history, pending, wall_s } = resumption;
         let terms = RunTerms {
             run: config.run.name.clone(),
-            layout: trainer.layout,
+            layout: trainer.layout.clone(),
             account: account.as_ref().map(|account| account.name().to_owned()),
             exploration: config.run.exploration,
             world: config.run.world,

@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use tandem_core::rng::uniform;
-use tandem_core::{Stream, Task, episode_rng};
+use tandem_core::{Layout, Stream, Task, episode_rng};
 
 use super::*;
 use crate::export;
@@ -23,8 +23,11 @@ fn a_policy_that_is_exported_and_imported_has_the_same_digest() {
         let policy = shipped(name);
         let actor = Model::decode(&export::actor(&policy).unwrap()).unwrap();
         let critic = Model::decode(&export::critic(&policy).unwrap()).unwrap();
-        assert_eq!(crate::binding::layout_of(&actor, Role::Actor).unwrap(), policy.layout);
-        let imported = import(&actor, Some(&critic), policy.layout).unwrap();
+        assert_eq!(
+            crate::binding::layout_of(&actor, Role::Actor).unwrap(),
+            policy.layout.as_built_in().unwrap()
+        );
+        let imported = import(&actor, Some(&critic), &policy.layout).unwrap();
         assert_eq!(imported.digest(), policy.digest(), "{name}");
         let kept =
             policy.metadata.iter().all(|(key, value)| imported.metadata.get(key) == Some(value));
@@ -37,7 +40,7 @@ fn a_policy_that_is_exported_and_imported_has_the_same_digest() {
 fn a_policy_without_a_critic_says_so_and_values_nothing() {
     let policy = shipped("teacher-push");
     let actor = Model::decode(&export::actor(&policy).unwrap()).unwrap();
-    let imported = import(&actor, None, policy.layout).unwrap();
+    let imported = import(&actor, None, &policy.layout).unwrap();
     assert_eq!(imported.actor, policy.actor);
     assert!(!imported.has_critic() && policy.has_critic());
     assert!(imported.critic.iter().all(|weight| *weight == 0.0));
@@ -93,7 +96,7 @@ fn model(inputs: &[(&str, usize)], ops: &[Op], steps: Vec<Step>) -> Model {
 /// Compares the models with their policy on random states, up to 1000 times the unit.
 fn assert_same(actor: &Model, critic: &Model, policy: &Policy) {
     const N_ROWS: usize = 40;
-    let layout = policy.layout;
+    let layout = &policy.layout;
     let mut rng = episode_rng(9, 0, Stream::Reset);
     let mut draw = |n: usize, scale: f32| -> Vec<f32> {
         (0..N_ROWS * n).map(|_| uniform(&mut rng, -scale, scale)).collect()

@@ -1,7 +1,6 @@
 //! Conversions of episodes.
 
-use tandem_core::layout::EPISODE_STEPS;
-use tandem_core::{Contacts, Episode, Layout};
+use tandem_core::{Contacts, Episode, TaskSpec};
 
 use super::{decode_episode_kind, encode_episode_kind};
 use crate::error::DecodeError;
@@ -30,47 +29,50 @@ pub fn encode_episode(episode: &Episode) -> pb::Episode {
 /// Returns an error if the kind is unknown, a length does not match the layout, a number is not finite or beyond its
 /// bound (see [`tandem_core::bounds`]), an action is outside [−1, 1], an undefined bit of `advised_arms` or `contacts`
 /// is set, or more units were charged than the episode has steps.
-pub fn decode_episode(episode: pb::Episode, layout: Layout) -> Result<Episode, DecodeError> {
-    let n_observations = (EPISODE_STEPS + 1) * layout.n_observation();
-    let max_charged = u32::try_from(EPISODE_STEPS).expect("an episode has few steps");
+pub fn decode_episode(
+    episode: pb::Episode,
+    layout: impl Into<TaskSpec>,
+) -> Result<Episode, DecodeError> {
+    let layout = layout.into();
+    let n_steps = layout.episode_steps();
+    let n_observations = (n_steps + 1) * layout.n_observation();
+    let max_charged = u32::try_from(n_steps).expect("an episode has few steps");
     Ok(Episode {
         number: episode.number,
         kind: decode_episode_kind(episode.kind)?,
         parameter_version: episode.parameter_version,
-        layout,
         observations: bounded_from_bytes(
             "observations",
             &episode.observations,
             n_observations,
             |idx| layout.observation_bound(idx % layout.n_observation()),
         )?,
-        goal: bounded_from_bytes("goal", &episode.goal, layout.n_goal(), |_| layout.goal_bound())?,
-        actions: actions_from_bytes(
-            "actions",
-            &episode.actions,
-            EPISODE_STEPS * layout.n_action(),
-        )?,
-        advised_arms: decode_advised_arms(episode.advised_arms, layout)?,
-        contacts: decode_contacts(&episode.contacts)?,
+        goal: bounded_from_bytes("goal", &episode.goal, layout.n_goal(), |idx| {
+            layout.goal_bound(idx)
+        })?,
+        actions: actions_from_bytes("actions", &episode.actions, n_steps * layout.n_action())?,
+        advised_arms: decode_advised_arms(episode.advised_arms, &layout)?,
+        contacts: decode_contacts(&episode.contacts, n_steps)?,
         advice_charged: count_within("advice_charged", episode.advice_charged, &(0..=max_charged))?,
+        layout,
     })
 }
 
-fn decode_advised_arms(advised_arms: Vec<u8>, layout: Layout) -> Result<Vec<u8>, DecodeError> {
-    check_one_per_step("advised_arms", &advised_arms)?;
-    let names_an_arm = |bits: u8| (u32::from(bits) >> layout.n_arms) == 0;
+fn decode_advised_arms(advised_arms: Vec<u8>, layout: &TaskSpec) -> Result<Vec<u8>, DecodeError> {
+    check_one_per_step("advised_arms", &advised_arms, layout.episode_steps())?;
+    let names_an_arm = |bits: u8| (u32::from(bits) >> layout.n_arms()) == 0;
     match advised_arms.iter().position(|bits| !names_an_arm(*bits)) {
         None => Ok(advised_arms),
         Some(step_idx) => {
-            let expected = format_args!("bits of {} arms", layout.n_arms).to_string();
+            let expected = format_args!("bits of {} arms", layout.n_arms()).to_string();
             let got = format_args!("{:#010b}", advised_arms[step_idx]).to_string();
             Err(DecodeError::new(format!("advised_arms[{step_idx}]"), expected, got))
         }
     }
 }
 
-fn decode_contacts(contacts: &[u8]) -> Result<Vec<Contacts>, DecodeError> {
-    check_one_per_step("contacts", contacts)?;
+fn decode_contacts(contacts: &[u8], n_steps: usize) -> Result<Vec<Contacts>, DecodeError> {
+    check_one_per_step("contacts", contacts, n_steps)?;
     contacts.iter().enumerate().map(decode_contact).collect()
 }
 
@@ -84,18 +86,19 @@ pub(crate) fn decode_contact((idx, bits): (usize, &u8)) -> Result<Contacts, Deco
     Contacts::from_bits(*bits).ok_or_else(unknown)
 }
 
-fn check_one_per_step(field: &str, bytes: &[u8]) -> Result<(), DecodeError> {
-    if bytes.len() == EPISODE_STEPS {
+fn check_one_per_step(field: &str, bytes: &[u8], n_steps: usize) -> Result<(), DecodeError> {
+    if bytes.len() == n_steps {
         return Ok(());
     }
-    let expected = format_args!("{EPISODE_STEPS} bytes, one per step").to_string();
+    let expected = format_args!("{n_steps} bytes, one per step").to_string();
     Err(DecodeError::new(field, expected, format_args!("{} bytes", bytes.len())))
 }
 
 #[cfg(test)]
 mod tests {
     use prost::Message as _;
-    use tandem_core::{EpisodeKind, Task};
+    use tandem_core::layout::EPISODE_STEPS;
+    use tandem_core::{EpisodeKind, Layout, Task};
 
     use super::*;
 
@@ -109,7 +112,7 @@ mod tests {
             number: 7,
             kind: EpisodeKind::Training,
             parameter_version: 3,
-            layout: LAYOUT,
+            layout: LAYOUT.into(),
             observations: ramp(51 * 56),
             goal: ramp(6),
             actions: ramp(50 * 6),

@@ -2,6 +2,7 @@
 
 use std::fmt::Display;
 
+use tandem_core::TaskSpec;
 use tandem_core::settings::OutOfRange;
 
 use super::{ConfigError, RunConfig};
@@ -12,20 +13,21 @@ impl RunConfig {
     /// # Errors
     /// Names the first setting that cannot be used, its value and its range.
     pub fn checked(self) -> Result<Self, ConfigError> {
-        self.layout()?;
+        let layout = self.layout()?;
         self.check_run()?;
-        self.check_advice()?;
+        self.check_advice(&layout)?;
         self.check_rounds()?;
         self.check_stop()?;
         self.exploration.check()?;
         self.world.check()?;
-        self.replay.check()?;
+        self.replay.check(&layout)?;
         self.ddpg.check()?;
         Ok(self)
     }
 
     fn check_run(&self) -> Result<(), OutOfRange> {
-        check("arms", self.arms, (1..=2).contains(&self.arms), "1 or 2")?;
+        let is_simulated = self.description.is_some() || (1..=2).contains(&self.arms);
+        check("arms", self.arms, is_simulated, "1 or 2")?;
         let is_named = is_name(&self.name);
         check("name", &self.name, is_named, "1 to 100 letters, digits, '-', '_' or '.'")?;
         let is_own = self.seed != self.evaluation.seed;
@@ -41,7 +43,12 @@ impl RunConfig {
         check("checkpoint.keep", self.checkpoint.keep, self.checkpoint.keep > 0, "at least 1")
     }
 
-    fn check_advice(&self) -> Result<(), OutOfRange> {
+    fn check_advice(&self, layout: &TaskSpec) -> Result<(), OutOfRange> {
+        let strategy = self.advice.strategy.as_str();
+        let can_be_advised = !self.advice.needs_teacher() || layout.single_arm().is_some();
+        let expected =
+            "none for this task: the arms have common numbers, so none has a task of its own";
+        check("advice.strategy", strategy, can_be_advised, expected)?;
         let (share, budget) = (self.advice.share, self.advice.budget);
         check("advice.share", share, (0.0..=1.0).contains(&share), "a number in [0, 1]")?;
         check("advice.budget", budget, budget <= 1_000_000_000_000, "at most 10^12")

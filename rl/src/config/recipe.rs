@@ -1,8 +1,7 @@
 //! The values that a recipe gives to every setting.
 
 use serde::{Deserialize, Serialize};
-use tandem_core::layout::{GOAL_TOLERANCE_M, Task};
-use tandem_core::{Exploration, WorldSettings};
+use tandem_core::{Exploration, Layout, Task, TaskSpec, WorldSettings};
 
 use super::{
     AdviceConfig, Behaviour, CheckpointConfig, EvaluationConfig, PolyakEvery, RoundsConfig,
@@ -22,21 +21,36 @@ pub enum Recipe {
 }
 
 impl RunConfig {
-    /// Returns the recipe's settings for a task and a number of arms.
+    /// Returns the recipe's settings for a built-in task and a number of arms.
+    ///
+    /// # Panics
+    /// If `n_arms` is 0 or exceeds 8.
+    #[must_use]
+    pub fn defaults(recipe: Recipe, task: Task, n_arms: usize) -> Self {
+        Self::defaults_of(recipe, &TaskSpec::built_in(task, n_arms))
+    }
+
+    /// Returns the recipe's settings for a task.
     ///
     /// Sources of [`Recipe::Paper`]: section 4 of the paper and the HER reference implementation (OpenAI baselines).
     #[must_use]
-    pub fn defaults(recipe: Recipe, task: Task, n_arms: usize) -> Self {
+    pub fn defaults_of(recipe: Recipe, layout: &TaskSpec) -> Self {
+        let (task, n_arms) = (layout.name(), layout.n_arms());
         let tandem = recipe == Recipe::Tandem;
         Self {
-            name: format!("{task}-{n_arms}"),
-            task: task.name().to_owned(),
+            name: format!("{}-{n_arms}", task.replace('/', "-")),
+            task: task.to_owned(),
             arms: n_arms,
             seed: 1,
             recipe,
             behaviour: Behaviour::Target,
             advice: AdviceConfig {
-                strategy: if n_arms == 1 { "none" } else { "mc-q:0.1" }.to_owned(),
+                strategy: if n_arms == 1 || layout.single_arm().is_none() {
+                    "none"
+                } else {
+                    "mc-q:0.1"
+                }
+                .to_owned(),
                 budget: 500_000,
                 share: if tandem { 0.5 } else { 1.0 },
             },
@@ -46,8 +60,8 @@ impl RunConfig {
                 random_action_prob: 0.3,
                 sticky_random_mean_steps: if tandem { 4.0 } else { 1.0 },
             },
-            world: world(recipe, task),
-            replay: replay(recipe, n_arms),
+            world: world(recipe, layout),
+            replay: replay(recipe, layout),
             ddpg: ddpg(recipe, n_arms),
             evaluation: EvaluationConfig {
                 every_env_steps: 20_000,
@@ -56,16 +70,17 @@ impl RunConfig {
                 recorded_episodes: 2,
                 test_episodes: 240,
             },
-            stop: stop(recipe, task, n_arms),
+            stop: stop(recipe, layout),
             checkpoint: CheckpointConfig { every_rounds: 50, keep: 2 },
+            description: layout.as_built_in().is_none().then(|| layout.description().clone()),
         }
     }
 
     /// Gives the networks the size of copies of the recipe's teacher: its depth, and its width for each arm. A run with
     /// strategy [`INIT_TEACHER`](super::INIT_TEACHER) requires this size.
     #[must_use]
-    pub fn sized_for_copies(mut self, task: Task) -> Self {
-        let teacher = Self::defaults(self.recipe, task, 1).ddpg;
+    pub fn sized_for_copies(mut self) -> Self {
+        let teacher = ddpg(self.recipe, 1);
         self.ddpg.n_hidden = teacher.n_hidden * self.arms;
         self.ddpg.n_hidden_layers = teacher.n_hidden_layers;
         self
@@ -94,36 +109,40 @@ const fn rounds(recipe: Recipe) -> RoundsConfig {
 }
 
 /// The paper's recipe ends by wall time, because two cores would take days to converge with it.
-const fn stop(recipe: Recipe, task: Task, n_arms: usize) -> StopConfig {
-    let max_env_steps = match (recipe, task, n_arms) {
-        (Recipe::Paper, ..) => 0,
-        (Recipe::Tandem, Task::Push, 1) => 200_000,
-        (Recipe::Tandem, ..) => 300_000,
+fn stop(recipe: Recipe, layout: &TaskSpec) -> StopConfig {
+    let max_env_steps = match (recipe, layout.as_built_in()) {
+        (Recipe::Paper, _) => 0,
+        (Recipe::Tandem, Some(Layout { task: Task::Push, n_arms: 1 })) => 200_000,
+        (Recipe::Tandem, _) => 300_000,
     };
     let max_minutes = if max_env_steps == 0 { 30.0 } else { 0.0 };
     StopConfig { until_success: 0.0, max_env_steps, max_minutes }
 }
 
-fn world(recipe: Recipe, task: Task) -> WorldSettings {
-    let starts_grasped = recipe == Recipe::Tandem && task == Task::PickAndPlace;
+fn world(recipe: Recipe, layout: &TaskSpec) -> WorldSettings {
+    let task = layout.as_built_in().map(|layout| layout.task);
+    let starts_grasped = recipe == Recipe::Tandem && task == Some(Task::PickAndPlace);
     WorldSettings {
         grasped_start_prob: if starts_grasped { 0.2 } else { 0.0 },
         ..WorldSettings::default()
     }
 }
 
-fn replay(recipe: Recipe, n_arms: usize) -> ReplayConfig {
+fn replay(recipe: Recipe, layout: &TaskSpec) -> ReplayConfig {
     let tandem = recipe == Recipe::Tandem;
+    let avoids_contacts = tandem && layout.n_arms() > 1 && layout.reports_contacts();
+    let tolerance = layout.tolerance();
     ReplayConfig {
         capacity_transitions: 1_000_000,
         her_ratio: 0.8,
         displaced_fraction: if tandem { 0.5 } else { 0.0 },
-        coda_fraction: if tandem && n_arms == 2 { 1.0 } else { 0.0 },
-        arm_swap_prob: if tandem && n_arms == 2 { 0.5 } else { 0.0 },
+        coda_fraction: if tandem && layout.has_recombinable_arms() { 1.0 } else { 0.0 },
+        arm_swap_prob: if tandem && layout.has_interchangeable_arms() { 0.5 } else { 0.0 },
         reward: if tandem { RewardKind::PerArm } else { RewardKind::Joint },
-        goal_tolerance_m: if tandem { 0.04 } else { GOAL_TOLERANCE_M },
-        contact_cost: if tandem && n_arms == 2 { 1.0 } else { 0.0 },
-        contact_foresight_steps: if tandem && n_arms == 2 { 5 } else { 0 },
+        // Four fifths of the tolerance; of 0.05 m exactly 0.04 m.
+        goal_tolerance_m: if tandem { tolerance * 4.0 / 5.0 } else { tolerance },
+        contact_cost: if avoids_contacts { 1.0 } else { 0.0 },
+        contact_foresight_steps: if avoids_contacts { 5.min(layout.episode_steps()) } else { 0 },
     }
 }
 

@@ -1,7 +1,7 @@
 //! Section `[replay]` of the run file.
 
 use serde::{Deserialize, Serialize};
-use tandem_core::layout::{EPISODE_STEPS, Layout};
+use tandem_core::TaskSpec;
 use tandem_core::settings::OutOfRange;
 
 /// The reward that the critic learns.
@@ -17,10 +17,10 @@ pub enum RewardKind {
 impl RewardKind {
     /// Returns the number of the critic's heads.
     #[must_use]
-    pub const fn n_heads(self, layout: Layout) -> usize {
+    pub fn n_heads(self, layout: &TaskSpec) -> usize {
         match self {
             Self::Joint => 1,
-            Self::PerArm => layout.n_arms,
+            Self::PerArm => layout.n_arms(),
         }
     }
 }
@@ -29,7 +29,7 @@ impl RewardKind {
 #[derive(Debug, Clone, PartialEq, Deserialize, Serialize)]
 #[serde(deny_unknown_fields)]
 pub struct ReplayConfig {
-    /// Capacity in transitions, at least one episode's 50 (baselines HER: 1,000,000).
+    /// Capacity in transitions, at least one episode's steps, 50 in the built-in tasks (baselines HER: 1,000,000).
     pub capacity_transitions: usize,
     /// Fraction of transitions that get a hindsight goal, in [0, 1]: k/(k + 1) for k goals per transition (Andrychowicz
     /// et al. 2017: k = 4).
@@ -38,20 +38,21 @@ pub struct ReplayConfig {
     pub displaced_fraction: f32,
     /// Fraction of two-arm transitions that combine the arms of two steps, in [0, 1]: counterfactual data augmentation
     /// (CoDA, Pitis et al. 2020). A combination in which the arms are near each other is rejected. It takes effect with
-    /// [`RewardKind::PerArm`] only.
+    /// [`RewardKind::PerArm`] and tasks whose arms can be recombined only.
     pub coda_fraction: f32,
-    /// Probability that the arms of a two-arm transition exchange places, in [0, 1]: the world's exact symmetry.
+    /// Probability that the arms of a transition exchange places, in [0, 1]: an exact symmetry of worlds whose arms are
+    /// interchangeable.
     pub arm_swap_prob: f32,
     /// The reward that the critic learns.
     pub reward: RewardKind,
-    /// Distance between an object and its goal, metres, within which training rewards it, 0.0001 to 1 (paper: 0.05,
-    /// which always defines success). A smaller distance leaves room for the motion of an object after its release.
+    /// Distance between an object and its goal, in the unit of the goal, within which training rewards it: in the
+    /// built-in tasks 0.0001 to 1 m, else above 0 (paper: 0.05 m). The task's own tolerance always defines success. A smaller distance leaves room for the motion of an object after its release.
     pub goal_tolerance_m: f32,
     /// Cost to every arm of a step on which an arm touches the other or the table, 0 to 100; a pending goal costs 1
     /// (paper: 0).
     pub contact_cost: f32,
-    /// Advice is not cloned on the last steps before a contact: this many, counting the step of the contact, 0 to 50
-    /// (paper: 0).
+    /// Advice is not cloned on the last steps before a contact: this many, counting the step of the contact, 0 to the
+    /// episode's steps (paper: 0).
     pub contact_foresight_steps: usize,
 }
 
@@ -62,11 +63,11 @@ impl ReplayConfig {
         -1.0 - self.contact_cost
     }
 
-    /// Checks every range; NaN is in none.
+    /// Checks every range for a task; NaN is in none.
     ///
     /// # Errors
     /// Names the first setting that is out of its range.
-    pub fn check(&self) -> Result<(), OutOfRange> {
+    pub fn check(&self, layout: &TaskSpec) -> Result<(), OutOfRange> {
         let fractions = [
             ("replay.her_ratio", self.her_ratio),
             ("replay.displaced_fraction", self.displaced_fraction),
@@ -78,12 +79,26 @@ impl ReplayConfig {
             OutOfRange::unless(is_fraction, key, value, "a number in [0, 1]")?;
         }
         let (key, tolerance_m) = ("replay.goal_tolerance_m", self.goal_tolerance_m);
-        OutOfRange::unless((1e-4..=1.0).contains(&tolerance_m), key, tolerance_m, "0.0001 to 1")?;
+        if layout.as_built_in().is_some() {
+            let is_tolerance = (1e-4..=1.0).contains(&tolerance_m);
+            OutOfRange::unless(is_tolerance, key, tolerance_m, "0.0001 to 1")?;
+        }
+        let is_tolerance = tolerance_m.is_finite() && tolerance_m > 0.0;
+        OutOfRange::unless(is_tolerance, key, tolerance_m, "a finite number above 0")?;
         let (key, cost) = ("replay.contact_cost", self.contact_cost);
         OutOfRange::unless((0.0..=100.0).contains(&cost), key, cost, "0 to 100")?;
         let (key, n_steps) = ("replay.contact_foresight_steps", self.contact_foresight_steps);
-        OutOfRange::unless(n_steps <= EPISODE_STEPS, key, n_steps, "0 to 50")?;
+        let n_max = layout.episode_steps();
+        OutOfRange::unless(n_steps <= n_max, key, n_steps, format_args!("0 to {n_max}"))?;
         let (key, capacity) = ("replay.capacity_transitions", self.capacity_transitions);
-        OutOfRange::unless(capacity >= EPISODE_STEPS, key, capacity, "at least 50")
+        OutOfRange::unless(capacity >= n_max, key, capacity, format_args!("at least {n_max}"))?;
+        let symmetry = "0 for this task, whose arms are not interchangeable";
+        let (key, prob) = ("replay.arm_swap_prob", self.arm_swap_prob);
+        let is_usable = prob == 0.0 || layout.n_arms() == 1 || layout.has_interchangeable_arms();
+        OutOfRange::unless(is_usable, key, prob, symmetry)?;
+        let recombination = "0 for this task, whose arms cannot be recombined";
+        let (key, fraction) = ("replay.coda_fraction", self.coda_fraction);
+        let is_usable = fraction == 0.0 || layout.n_arms() != 2 || layout.has_recombinable_arms();
+        OutOfRange::unless(is_usable, key, fraction, recombination)
     }
 }

@@ -1,3 +1,4 @@
+use tandem_core::layout::{EPISODE_STEPS, Layout};
 use tandem_core::reward::sparse_reward;
 use tandem_core::rng::{Stream, episode_rng};
 use tandem_core::{Contacts, Episode, Task};
@@ -69,7 +70,7 @@ fn rewards_match_the_sampled_goal() {
                 arm,
             );
             let goal = &sampler.sample.goal[LAYOUT.goal_of(arm)];
-            assert_eq!(sampler.sample.rewards[arm.0], sparse_reward(achieved, goal));
+            assert_eq!(sampler.sample.rewards[arm.0], sparse_reward(&achieved, goal));
         }
     });
     sampled(RewardKind::Joint, |sampler, buffer| {

@@ -156,7 +156,7 @@ fn a_refused_request_charges_nothing() {
 struct Broken;
 
 impl TeacherPolicy for Broken {
-    fn layout(&self) -> Layout {
+    fn layout(&self) -> TaskSpec {
         FakePolicy.layout()
     }
 
@@ -278,7 +278,7 @@ fn the_strategy_of_an_account_is_cached() {
 struct Valueless;
 
 impl TeacherPolicy for Valueless {
-    fn layout(&self) -> Layout {
+    fn layout(&self) -> TaskSpec {
         FakePolicy.layout()
     }
 

@@ -51,7 +51,7 @@ impl Ledger for MemoryLedger {
     fn charge(&mut self, requests: &[ChargeRequest]) -> Vec<Result<ChargeResult, LedgerError>> {
         let charge = |request: &ChargeRequest| {
             let account = self.account(&request.account)?;
-            account.update(|transaction| charge_all(transaction, &request.charges))
+            account.update(|transaction| charge_all(transaction, request))
         };
         requests.iter().map(charge).collect()
     }
@@ -72,7 +72,8 @@ mod tests {
         assert_eq!(ledger.open("run", TERMS).unwrap(), fresh);
         let charge =
             Charge { episode: 1, step: 0, wanted_in_first_half: true, wanted_in_second_half: true };
-        let request = ChargeRequest { account: "run".to_owned(), charges: vec![charge] };
+        let request =
+            ChargeRequest { account: "run".to_owned(), episode_steps: 50, charges: vec![charge] };
         assert_eq!(ledger.charge(&[request]).remove(0).unwrap().left, 9);
         assert_eq!(ledger.open("run", TERMS).unwrap(), Balance { spent: 1, left: 9, ..fresh });
     }

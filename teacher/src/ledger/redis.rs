@@ -13,7 +13,7 @@ mod server;
 
 use super::{
     ChargeRequest, ChargeResult, Ledger, LedgerError, OpenError, check_budget, check_terms,
-    exceeds_episode, printable, unknown_account,
+    printable, unknown_account,
 };
 use crate::budget::{AccountTerms, Balance, BudgetHalf, Charge, Lease};
 use crate::strategy::UnknownStrategy;
@@ -191,7 +191,7 @@ fn charge_call(request: &ChargeRequest) -> Call {
             .arg(format_args!("{episode}:{}", step / STEPS_PER_FIELD))
             .arg(step % STEPS_PER_FIELD + 1)
             .arg(format_args!("{first}{second}"))
-            .arg(digit(exceeds_episode(*step)));
+            .arg(digit(*step >= request.episode_steps));
     }
     call
 }

@@ -177,11 +177,12 @@ impl Ledger for SqliteLedger {
     fn charge(&mut self, requests: &[ChargeRequest]) -> Vec<Result<ChargeResult, LedgerError>> {
         let mut transactions: BTreeMap<&str, Transaction<'_>> = BTreeMap::new();
         let mut results = Vec::with_capacity(requests.len());
-        for ChargeRequest { account: name, charges } in requests {
+        for request in requests {
+            let name = &request.account;
             results.push(self.stored(name).and_then(|stored| {
                 let transaction =
                     transactions.entry(name.as_str()).or_insert_with(|| stored.account.begin());
-                charge_all(transaction, charges)
+                charge_all(transaction, request)
             }));
         }
         let changes: Vec<(&str, Changes)> = transactions

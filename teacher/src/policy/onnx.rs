@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use tandem_core::Layout;
+use tandem_core::TaskSpec;
 use tandem_onnx::binding::layout_of;
 use tandem_onnx::{BoundNetwork, Error as OnnxError, Model, ModelError, Role};
 
@@ -49,7 +49,7 @@ impl OnnxPolicy {
         digest: String,
         n_values: usize,
     ) -> Result<Self, Error> {
-        let n_arms = actor.layout().n_arms;
+        let n_arms = actor.layout().n_arms();
         if n_arms != 1 || n_values > 1 {
             return Err(Error::NotOneArm { n_arms, n_values });
         }
@@ -62,8 +62,8 @@ fn refused(path: &Path, source: ModelError) -> Error {
 }
 
 impl TeacherPolicy for OnnxPolicy {
-    fn layout(&self) -> Layout {
-        self.actor.layout()
+    fn layout(&self) -> TaskSpec {
+        self.actor.layout().clone()
     }
 
     fn digest(&self) -> &str {

@@ -71,7 +71,7 @@ impl Policy for FakeServer {
     ) -> Result<Response<pb::PolicyDescription>, Status> {
         let layout = FakePolicy.layout();
         let task = pb::TaskDescription {
-            name: layout.task.name().to_owned(),
+            name: layout.name().to_owned(),
             n_observation: 28,
             n_goal: 3,
             n_action: 3,

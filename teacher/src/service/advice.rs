@@ -46,7 +46,7 @@ pub(super) fn advise_stream(
 
 fn decode(advisor: &AdvisorHandle, request: pb::AdviseRequest) -> Result<AdviceRequest, Error> {
     let account = decode_account_name("account", request.account)?;
-    let queries = decode_queries(request.steps, advisor.info().layout.task)?;
+    let queries = decode_queries(request.steps, &advisor.info().students)?;
     Ok(AdviceRequest { account, queries })
 }
 

@@ -2,8 +2,8 @@
 
 use std::ops::Range;
 
-use tandem_core::{StepQuery, Task};
-use tandem_proto::{DecodeError, decode_query, layout_of_query, pb};
+use tandem_core::{StepQuery, TaskSpec};
+use tandem_proto::{DecodeError, decode_query, encode_task, pb};
 
 use crate::advisor::TeacherInfo;
 use crate::budget::{Balance, Lease};
@@ -15,18 +15,32 @@ const MAX_STEPS: usize = 1024;
 /// The largest number of episodes in a request.
 const MAX_EPISODES: usize = 65_536;
 
-/// Decodes the queries of students of `task`.
+/// Decodes the queries of students; `students` are their tasks, with 1, 2, … arms.
 pub(super) fn decode_queries(
     steps: Vec<pb::StepQuery>,
-    task: Task,
+    students: &[TaskSpec],
 ) -> Result<Vec<StepQuery>, DecodeError> {
     check_count("steps", steps.len(), MAX_STEPS)?;
     let decode_indexed = |(step_idx, query)| {
-        layout_of_query(&query, task)
-            .and_then(|layout| decode_query(query, layout))
+        student_of(&query, students)
+            .and_then(|student| decode_query(query, student))
             .map_err(|error| error.within(format_args!("steps[{step_idx}]")))
     };
     steps.into_iter().enumerate().map(decode_indexed).collect()
+}
+
+/// Returns the task of the student whose observation has the query's length.
+fn student_of<'a>(
+    query: &pb::StepQuery,
+    students: &'a [TaskSpec],
+) -> Result<&'a TaskSpec, DecodeError> {
+    let (n_numbers, most) = (query.observation.len(), students.len());
+    let n_per_arm = students.first().map_or(0, TaskSpec::n_observation);
+    let of_length = |student: &&TaskSpec| student.n_observation() == n_numbers;
+    students.iter().find(of_length).ok_or_else(|| {
+        let expected = format_args!("{n_per_arm} numbers for each of 1 to {most} arms").to_string();
+        DecodeError::new("observation", expected, format_args!("{n_numbers} numbers"))
+    })
 }
 
 /// Refuses a request with more episodes than a round can have.
@@ -42,10 +56,10 @@ fn check_count(field: &str, count: usize, max: usize) -> Result<(), DecodeError>
 }
 
 pub(super) fn describe(info: &TeacherInfo) -> pb::DescribeResponse {
-    let layout = info.layout;
+    let layout = &info.layout;
     pb::DescribeResponse {
-        task_description: None,
-        task: layout.task.name().to_owned(),
+        task_description: Some(encode_task(layout)),
+        task: layout.name().to_owned(),
         n_observation_per_arm: index(layout.n_observation()),
         n_goal_per_arm: index(layout.n_goal()),
         n_action_per_arm: index(layout.n_action()),

@@ -100,7 +100,7 @@ pub(crate) fn terms(budget: u64) -> AccountTerms {
 }
 
 pub(crate) fn request(account: &str, charges: &[Charge]) -> ChargeRequest {
-    ChargeRequest { account: account.to_owned(), charges: charges.to_vec() }
+    ChargeRequest { account: account.to_owned(), episode_steps: 50, charges: charges.to_vec() }
 }
 
 pub(crate) fn charge(episode: u64, step: u32, wanted: Wanted) -> Charge {

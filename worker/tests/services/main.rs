@@ -148,8 +148,8 @@ async fn a_recorded_episode_gets_a_log_with_its_run_and_policy() {
     let log = read_episode(&logs.path().join("mcap").join("eval-000002-001.mcap"));
     let metadata = log.expect("a whole log").metadata;
     assert_eq!(metadata.run, "run-7", "the run's name, not the account's");
-    assert_eq!(metadata.policy_digest, actor_digest(LAYOUT, &actor(2)));
-    assert_ne!(metadata.policy_digest, actor_digest(LAYOUT, &actor(1)));
+    assert_eq!(metadata.policy_digest, actor_digest(&LAYOUT.into(), &actor(2)));
+    assert_ne!(metadata.policy_digest, actor_digest(&LAYOUT.into(), &actor(1)));
 }
 
 #[tokio::test]

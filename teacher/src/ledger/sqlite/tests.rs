@@ -17,7 +17,7 @@ fn request(account: &str, episode: u64, steps: std::ops::Range<u32>) -> ChargeRe
     let charge =
         |step| Charge { episode, step, wanted_in_first_half: true, wanted_in_second_half: true };
     let charges = steps.map(charge).collect();
-    ChargeRequest { account: account.to_owned(), charges }
+    ChargeRequest { account: account.to_owned(), episode_steps: 50, charges }
 }
 
 /// Returns the accounts in memory as text.
