@@ -102,7 +102,7 @@ impl Policy for FakeServer {
         let proposed = floats(&request.actions);
         let mut actions = vec![0.0; proposed.len()];
         FakePolicy.act(&observations, &goals, &mut actions);
-        let mut values_of = |actions: &[f32]| {
+        let values_of = |actions: &[f32]| {
             let mut q = vec![0.0; actions.len() / 3];
             FakePolicy.q(&observations, &goals, actions, &mut q);
             if self.has_values { bytes(&q) } else { Vec::new() }
