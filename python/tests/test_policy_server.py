@@ -228,7 +228,7 @@ def test_a_teacher_refuses_what_is_not_a_policy_server(tmp_path):
     token.write_text("0123456789abcdef")
     with tandem.PolicyServer(follow, task="push", token_file=token) as server:
         code, line = refusal("teacher", "--ledger", "memory", "--policy", server.address)
-        assert code == 64 and "missing or wrong token" in line, line
+        assert code == 64 and "requires a token" in line, line
     with service("bridge", "--driver", "sim") as bridge:
         code, line = refusal("teacher", "--ledger", "memory", "--policy", f"http://{bridge}")
         assert code == 64 and "cannot be used" in line, line

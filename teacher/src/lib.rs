@@ -35,6 +35,7 @@
 #![warn(missing_docs)]
 
 pub mod advisor;
+mod batch;
 pub mod budget;
 mod error;
 pub mod ledger;

@@ -7,6 +7,7 @@ use std::path::Path;
 use tandem_core::TaskSpec;
 use tandem_policy::{Actor, Critic, Policy};
 
+use crate::batch::Batch;
 use crate::error::Error;
 use crate::remote_policy::{RemoteError, RemotePolicy};
 
@@ -79,7 +80,7 @@ impl AnyPolicy {
     /// When the policy is in another process, which does not answer, or not as it should.
     pub(crate) fn evaluate(&mut self, batch: &mut Batch) -> Result<(), RemoteError> {
         match self {
-            Self::Local(policy) => batch.evaluate(policy.as_mut()),
+            Self::Local(policy) => evaluate_here(policy.as_mut(), batch),
             Self::Remote(policy) => policy.evaluate(batch)?,
         }
         Ok(())
@@ -104,37 +105,18 @@ impl From<RemotePolicy> for AnyPolicy {
     }
 }
 
-/// States, the student's actions in them, and the teacher's answers. A row is one arm of one step.
-#[derive(Debug, Default)]
-pub(crate) struct Batch {
-    /// The number `n` of rows.
-    pub(crate) n_rows: usize,
-    /// Shape `[n, n_observation]`; after an evaluation in this process every state twice, for the two actions.
-    pub(crate) observations: Vec<f32>,
-    /// Shape `[n, n_goal]`; after an evaluation in this process every goal twice.
-    pub(crate) goals: Vec<f32>,
-    /// Shape `[n, n_action]`.
-    pub(crate) student_actions: Vec<f32>,
-    /// The teacher's actions, then the student's, shape `[2 n, n_action]`.
-    pub(crate) actions: Vec<f32>,
-    /// The values of these actions, shape `[2 n]`.
-    pub(crate) q: Vec<f32>,
-}
-
-impl Batch {
-    /// Runs the actor once on all states, and the critic once on all states with both actions.
-    fn evaluate(&mut self, policy: &mut dyn TeacherPolicy) {
-        self.actions.clear();
-        self.actions.resize(self.student_actions.len(), 0.0);
-        policy.act(&self.observations, &self.goals, &mut self.actions);
-        self.actions.extend_from_slice(&self.student_actions);
-        self.q.clear();
-        self.q.resize(2 * self.n_rows, 0.0);
-        if policy.has_values() {
-            self.observations.extend_from_within(..);
-            self.goals.extend_from_within(..);
-            policy.q(&self.observations, &self.goals, &self.actions, &mut self.q);
-        }
+/// Runs the actor once on all states, and the critic once on all states with both actions.
+fn evaluate_here(policy: &mut dyn TeacherPolicy, batch: &mut Batch) {
+    batch.actions.clear();
+    batch.actions.resize(batch.student_actions.len(), 0.0);
+    policy.act(&batch.observations, &batch.goals, &mut batch.actions);
+    batch.actions.extend_from_slice(&batch.student_actions);
+    batch.q.clear();
+    batch.q.resize(2 * batch.n_rows, 0.0);
+    if policy.has_values() {
+        batch.observations.extend_from_within(..);
+        batch.goals.extend_from_within(..);
+        policy.q(&batch.observations, &batch.goals, &batch.actions, &mut batch.q);
     }
 }
 

@@ -17,7 +17,7 @@ use tandem_proto::{
 use tokio::sync::{mpsc, oneshot};
 use tonic::{Code, Status};
 
-use crate::policy::Batch;
+use crate::batch::Batch;
 
 const BACKOFF: Backoff =
     Backoff { first_pause: Duration::from_millis(50), max_pause: Duration::from_millis(500) };

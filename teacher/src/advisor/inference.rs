@@ -2,9 +2,10 @@
 
 use tandem_core::{ArmAdvice, StepQuery};
 
+use crate::batch::Batch;
 use crate::error::Error;
 use crate::maps::Maps;
-use crate::policy::{AnyPolicy, Batch};
+use crate::policy::AnyPolicy;
 use crate::procedures::score_arm;
 
 /// The teacher's policy with the buffers of a batch.
