@@ -265,6 +265,3 @@ impl NodeProto {
         }
     }
 }
-
-#[cfg(test)]
-mod tests;

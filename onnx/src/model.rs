@@ -103,3 +103,6 @@ fn read(path: &Path) -> io::Result<Vec<u8>> {
     File::open(path)?.take(MAX_FILE_BYTES as u64 + 1).read_to_end(&mut bytes)?;
     Ok(bytes)
 }
+
+#[cfg(test)]
+mod tests;

@@ -7,7 +7,7 @@ use tandem_onnx::{BoundNetwork, Model, Role, import};
 
 fn file(name: &str) -> Vec<u8> {
     let directory: PathBuf = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/pytorch");
-    std::fs::read(directory.join(name)).expect("a model of the tests")
+    std::fs::read(directory.join(name)).expect("as exported")
 }
 
 /// Decodes `file` and uses the network, if there is one. Returns true if there is.

@@ -15,7 +15,7 @@ fn directory() -> PathBuf {
 }
 
 fn model(name: &str, exporter: &str) -> Model {
-    Model::load(&directory().join(format!("{name}.{exporter}.onnx"))).unwrap()
+    Model::load(&directory().join(format!("{name}.{exporter}.onnx"))).expect("as exported")
 }
 
 /// The states for which PyTorch computed outputs.
@@ -23,16 +23,17 @@ struct Cases(Value);
 
 impl Cases {
     fn read() -> Self {
-        let text = std::fs::read_to_string(directory().join("cases.json")).unwrap();
-        Self(serde_json::from_str(&text).unwrap())
+        let text = std::fs::read_to_string(directory().join("cases.json")).expect("as exported");
+        Self(serde_json::from_str(&text).expect("as exported"))
     }
 
     /// Returns the rows at a JSON pointer, concatenated.
     fn rows(&self, pointer: &str) -> Vec<f32> {
-        let rows = self.0.pointer(pointer).unwrap().as_array().unwrap().iter();
-        let numbers = rows.flat_map(|row| row.as_array().unwrap());
+        let rows =
+            self.0.pointer(pointer).expect("as exported").as_array().expect("as exported").iter();
+        let numbers = rows.flat_map(|row| row.as_array().expect("as exported"));
         #[expect(clippy::cast_possible_truncation, reason = "the numbers are float32")]
-        numbers.map(|number| number.as_f64().unwrap() as f32).collect()
+        numbers.map(|number| number.as_f64().expect("as exported") as f32).collect()
     }
 
     fn check(&self, name: &str, what: &str, got: &[f32]) {
@@ -51,8 +52,12 @@ fn exported_actors_act_as_in_pytorch() {
     for name in ["sb3-actor", "normalized-tanh-actor", "scaled-actor"] {
         for exporter in EXPORTERS {
             let model = model(name, exporter);
-            assert_eq!(layout_of(&model, Role::Actor).unwrap(), LAYOUT, "{name}, {exporter}");
-            let mut actor = BoundNetwork::new(&model, Role::Actor, LAYOUT).unwrap();
+            assert_eq!(
+                layout_of(&model, Role::Actor).expect("as exported"),
+                LAYOUT,
+                "{name}, {exporter}"
+            );
+            let mut actor = BoundNetwork::new(&model, Role::Actor, LAYOUT).expect("as exported");
             let mut actions = cases.rows("/actions");
             actor.run(&observations, &goals, &[], &mut actions);
             cases.check(name, exporter, &actions);
@@ -66,7 +71,7 @@ fn an_exported_critic_values_as_in_pytorch() {
     let (observations, goals) = (cases.rows("/observations"), cases.rows("/goals"));
     for exporter in EXPORTERS {
         let model = model("sb3-critic", exporter);
-        let mut critic = BoundNetwork::new(&model, Role::Critic, LAYOUT).unwrap();
+        let mut critic = BoundNetwork::new(&model, Role::Critic, LAYOUT).expect("as exported");
         let mut values = vec![0.0; goals.len() / LAYOUT.n_goal()];
         critic.run(&observations, &goals, &cases.rows("/actions"), &mut values);
         cases.check("sb3-critic", exporter, &values);
@@ -80,13 +85,14 @@ fn actors_with_relu_become_policies_that_act_and_value_the_same() {
     for exporter in EXPORTERS {
         let critic = model("sb3-critic", exporter);
         for name in ["sb3-actor", "scaled-actor"] {
-            let policy = import(&model(name, exporter), Some(&critic), LAYOUT).unwrap();
+            let policy =
+                import(&model(name, exporter), Some(&critic), LAYOUT).expect("as exported");
             let mut actions = cases.rows("/actions");
-            policy.actor().unwrap().act(&observations, &goals, &mut actions);
+            policy.actor().expect("as exported").act(&observations, &goals, &mut actions);
             cases.check(name, exporter, &actions);
             let mut values = vec![0.0; goals.len() / LAYOUT.n_goal()];
             let proposed = cases.rows("/actions");
-            policy.critic().unwrap().q(&observations, &goals, &proposed, &mut values);
+            policy.critic().expect("as exported").q(&observations, &goals, &proposed, &mut values);
             cases.check("sb3-critic", exporter, &values);
         }
         let refusal = import(&model("normalized-tanh-actor", exporter), None, LAYOUT);

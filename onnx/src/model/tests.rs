@@ -2,7 +2,7 @@
 
 use prost::Message as _;
 
-use crate::model::Model;
+use super::Model;
 use crate::network::{Op, Step};
 use crate::onnx_proto::{
     AttributeProto, DimensionProto, FLOAT, GraphProto, ModelProto, NodeProto, OperatorSetIdProto,
