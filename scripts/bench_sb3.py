@@ -2,8 +2,8 @@
 """Trains Stable-Baselines3 with hindsight experience replay on a Gymnasium goal environment, as a reference.
 
 Writes DIRECTORY/progress.csv with a line per evaluation: env_steps, updates, wall_s, success, success_low and
-success_high. An evaluation plays the policy without exploration on fixed seeds. Success is the share of episodes whose last step
-reports is_success. The clock includes evaluations and, in a resumed run, the time before the interruption.
+success_high. An evaluation plays the policy without exploration on fixed seeds. Success is the share of episodes whose
+last step reports is_success. The clock includes evaluations and, in a resumed run, the time before the interruption.
 """
 
 import argparse

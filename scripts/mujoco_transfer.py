@@ -157,9 +157,8 @@ def transfer(path, arguments):
 
 
 def print_transfer(results):
-    print(
-        "| task | arms | policy | rapier success | 95 % interval | contacts | MuJoCo success | 95 % interval | contacts |"
-    )
+    engines = " | ".join(f"{engine} success | 95 % interval | contacts" for engine in ("rapier", "MuJoCo"))
+    print(f"| task | arms | policy | {engines} |")
     print("|---|---|---|---|---|---|---|---|---|")
     for result in results:
         cells = [result["task"], str(result["arms"]), Path(result["policy"]).stem]
