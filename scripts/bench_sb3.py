@@ -2,8 +2,8 @@
 """Trains Stable-Baselines3 with hindsight experience replay on a Gymnasium goal environment, as a reference.
 
 Writes DIRECTORY/progress.csv with a line per evaluation: env_steps, updates, wall_s, success, success_low and
-success_high. An evaluation plays the policy without exploration on fixed seeds. Success is the share of episodes whose last step
-reports is_success. The clock includes evaluations and, in a resumed run, the time before the interruption.
+success_high. An evaluation plays the policy without exploration on fixed seeds. Success is the share of episodes whose
+last step reports is_success. The clock includes evaluations and, in a resumed run, the time before the interruption.
 """
 
 import argparse
@@ -63,8 +63,16 @@ def make_model(algorithm, env, env_id, seed, device):
     noise = NormalActionNoise(np.zeros(n_action), np.full(n_action, 0.2))
     network = {"net_arch": [256, 256, 256]}
     return DDPG(
-        env=env, seed=seed, device=device, gamma=0.98, batch_size=256, action_noise=noise, policy_kwargs=network,
-        train_freq=1, gradient_steps=1, **HER,
+        env=env,
+        seed=seed,
+        device=device,
+        gamma=0.98,
+        batch_size=256,
+        action_noise=noise,
+        policy_kwargs=network,
+        train_freq=1,
+        gradient_steps=1,
+        **HER,
     )
 
 
@@ -104,7 +112,7 @@ class Benchmark(BaseCallback):
 
     def _on_training_start(self):
         every = self.settings["evaluate_every"]
-        self.next_evaluation = -(-self.num_timesteps // every) * every if self.num_timesteps else every
+        self.next_evaluation = (self.num_timesteps // every + 1) * every
 
     def _on_step(self):
         if self.num_timesteps >= self.next_evaluation:
@@ -122,13 +130,12 @@ class Benchmark(BaseCallback):
         hits = evaluate(self.model, self.env, n, self.settings["evaluation_seed"])
         self.evaluated_at = self.num_timesteps
         low, high = wilson(hits, n)
-        row = [self.num_timesteps, self.model._n_updates, round(self.wall_s(), 1), hits / n, round(low, 4), round(high, 4)]
+        done = [self.num_timesteps, self.model._n_updates, round(self.wall_s(), 1)]
+        row = [*done, hits / n, round(low, 4), round(high, 4)]
         with open(self.run / "progress.csv", "a", newline="", encoding="utf-8") as file:
             csv.writer(file).writerow(row)
-        print(
-            f"env steps {row[0]:>8}  updates {row[1]:>8}  {row[2] / 60:7.1f} min  success {row[3]:.3f}  ({hits} of {n})",
-            file=sys.stderr,
-        )
+        text = f"env steps {done[0]:>8}  updates {done[1]:>8}  {done[2] / 60:7.1f} min  success {hits / n:.3f}"
+        print(f"{text}  ({hits} of {n})", file=sys.stderr)
 
 
 def save(model, run, settings, wall_s):
@@ -166,7 +173,7 @@ def parse():
         description=__doc__, epilog=EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--algorithm", choices=("tqc", "ddpg"), default="tqc", help="[default: tqc]")
-    parser.add_argument("--env", default="FetchPush-v4", help="Gymnasium id of a goal environment [default: FetchPush-v4]")
+    parser.add_argument("--env", default="FetchPush-v4", help="Gymnasium id [default: FetchPush-v4]")
     parser.add_argument("--seed", type=int, default=1, help="seed of training [default: 1]")
     parser.add_argument("--out", type=Path, required=True, metavar="DIRECTORY", help="directory of the run")
     parser.add_argument("--resume", action="store_true", help="continue the run in DIRECTORY with its own settings")
@@ -174,7 +181,9 @@ def parse():
     parser.add_argument("--max-env-steps", type=int, default=1_000_000, help="[default: 1000000]")
     parser.add_argument("--evaluate-every", type=int, default=5000, metavar="N", help="env steps [default: 5000]")
     parser.add_argument("--evaluation-episodes", type=int, default=100, metavar="N", help="[default: 100]")
-    parser.add_argument("--evaluation-seed", type=int, default=777_000, metavar="S", help="seed of the first [default: 777000]")
+    parser.add_argument(
+        "--evaluation-seed", type=int, default=777_000, metavar="S", help="of the first [default: 777000]"
+    )
     parser.add_argument("--save-every", type=int, default=50_000, metavar="N", help="env steps [default: 50000]")
     parser.add_argument("--device", default="auto", help="torch device [default: auto]")
     return parser.parse_args()

@@ -181,9 +181,7 @@ class VelocityDamper:
     def proximity(self, palms):
         """The gaps [n], normals [n, 3] and pairs of Jacobians [n, 3, 3] of the active pairs."""
         at = self.active
-        ends = [
-            self.ends[idx][at] + self.jacobians[idx][at] @ (palms[idx] - self.palms[idx]) for idx in range(2)
-        ]
+        ends = [self.ends[idx][at] + self.jacobians[idx][at] @ (palms[idx] - self.palms[idx]) for idx in range(2)]
         fractions = closest_fractions(*ends)
         points = [end[:, 0] + (end[:, 1] - end[:, 0]) * part[:, None] for end, part in zip(ends, fractions)]
         offset = points[0] - points[1]
@@ -384,16 +382,12 @@ class MujocoWorld:
 
     def target(self, arm, displacement):
         at_in_arm = arm.arm_from_world(self.position(arm.palm)) + displacement * self.control["action_m"]
-        return arm.world_from_arm(
-            np.clip(at_in_arm, self.control["workspace_low_m"], self.control["workspace_high_m"])
-        )
+        return arm.world_from_arm(np.clip(at_in_arm, self.control["workspace_low_m"], self.control["workspace_high_m"]))
 
     def drive(self, targets, grippers):
         """Sets the forces on the hands for the next physics step."""
         palms = [self.position(arm.palm) for arm in self.arms]
-        velocities = [
-            (target - palm) * self.control["approach_gain_per_s"] for target, palm in zip(targets, palms)
-        ]
+        velocities = [(target - palm) * self.control["approach_gain_per_s"] for target, palm in zip(targets, palms)]
         if self.damper:
             velocities = self.damper.limit(palms, velocities)
         for arm, velocity, gripper in zip(self.arms, velocities, grippers):

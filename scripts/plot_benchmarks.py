@@ -68,7 +68,8 @@ def print_table(results):
         cells = [result["run"], f"{result['env_steps']}", f"{result['minutes']:.1f}"]
         cells += [f"{result['success']:.3f}", f"{result['best_success']:.3f}"]
         cells += [
-            f"{first['env_steps']} ({first['minutes']:.1f} min)" if first else "–" for first in result["reached"].values()
+            f"{first['env_steps']} ({first['minutes']:.1f} min)" if first else "–"
+            for first in result["reached"].values()
         ]
         print("| " + " | ".join(cells) + " |")
 
