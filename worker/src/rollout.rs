@@ -311,6 +311,9 @@ fn explorer(order: EpisodeOrder, kind: EpisodeKind, terms: &RunTerms) -> Option<
 }
 
 #[cfg(test)]
+mod arm_order;
+
+#[cfg(test)]
 mod tests {
     use tandem_core::layout::EPISODE_STEPS;
 
