@@ -224,8 +224,7 @@ impl Rollout {
         terms: &RunTerms,
         (observation, goal): (&[f32], &[f32]),
     ) -> Self {
-        let layout = &terms.layout;
-        let n_steps = layout.episode_steps();
+        let (layout, n_steps) = (&terms.layout, terms.layout.episode_steps());
         let mut observations = Vec::with_capacity((n_steps + 1) * layout.n_observation());
         observations.extend_from_slice(observation);
         let episode = Episode {
@@ -259,7 +258,7 @@ impl Rollout {
         }
     }
 
-    /// Returns the query on the next step. Its vectors are in arm order, as those of the advice are.
+    /// Returns the query on the next step, in arm order.
     fn query(&self, step_idx: usize) -> StepQuery {
         let layout = &self.episode.layout;
         StepQuery {
@@ -311,9 +310,9 @@ fn explorer(order: EpisodeOrder, kind: EpisodeKind, terms: &RunTerms) -> Option<
 }
 
 #[cfg(test)]
+mod arm_order;
+#[cfg(test)]
 mod tests {
-    use tandem_core::layout::EPISODE_STEPS;
-
     use super::*;
     use crate::fakes::{
         FakeActor, FakeEnvironment, FakeTeacher, LAYOUT, TEACHER_ACTION, slot, terms,
@@ -351,7 +350,7 @@ mod tests {
             (episode.advised_arms.as_slice(), episode.advice_charged),
             ([0; 50].as_slice(), 0)
         );
-        for step_idx in 0..EPISODE_STEPS {
+        for step_idx in 0..50 {
             let expected = episode.observation(step_idx)[0] + 0.05 * episode.action(step_idx)[0];
             assert!(
                 (episode.observation(step_idx + 1)[0] - expected).abs() < 1e-6,
@@ -386,7 +385,7 @@ mod tests {
         let free = play(&slot(&[3], false), FakeActor::Constant(0.1), &mut NoAdvisor).remove(0);
         let mut teacher = FakeTeacher::new(|_, step, _| step % 2 == 0);
         let advised = play(&slot(&[3], true), FakeActor::Constant(0.1), &mut teacher).remove(0);
-        for step_idx in 0..EPISODE_STEPS {
+        for step_idx in 0..50 {
             assert_eq!(teacher.requests[step_idx][0].proposed_action, free.action(step_idx));
             let overridden = step_idx % 2 == 0;
             assert_eq!(
@@ -403,7 +402,7 @@ mod tests {
         order.episodes[1].advised = false;
         let mut teacher = FakeTeacher::new(|_, _, _| true);
         let episodes = play(&order, FakeActor::Seeker, &mut teacher);
-        assert_eq!(teacher.requests.len(), EPISODE_STEPS);
+        assert_eq!(teacher.requests.len(), 50);
         for (step_idx, request) in teacher.requests.iter().enumerate() {
             let asked: Vec<(u64, usize)> =
                 request.iter().map(|q| (q.episode, q.step as usize)).collect();

@@ -200,3 +200,68 @@ fn arms_of_different_steps_are_combined_where_they_cannot_meet() {
     assert!(n_combined > N_DRAWS / 10);
     assert!((largest_x - 0.14).abs() < 0.005, "0.24 m apart, {largest_x} m towards the other");
 }
+
+/// The task of [`LAYOUT`] with the arms' numbers interleaved in every vector: number `i` of arm `a` has index `2 i + a`.
+fn interleaved() -> TaskSpec {
+    let every_other = |arm_idx: usize, n: usize| (0..n).map(|i| 2 * i + arm_idx).collect();
+    let mut description = LAYOUT.description();
+    description.name = "interleaved".to_owned();
+    for (arm_idx, arm) in description.arms.iter_mut().enumerate() {
+        arm.observation = every_other(arm_idx, 28);
+        arm.goal = every_other(arm_idx, 3);
+        arm.action = every_other(arm_idx, 3);
+        arm.position = vec![arm_idx, 6 + arm_idx];
+    }
+    description.achieved_goal = (6..12).collect();
+    description.observation_bound = (0..56).map(|_| 100.0).collect();
+    TaskSpec::new(description).expect("valid")
+}
+
+/// Interleaves the halves of every row of two-arm vectors.
+fn interleave(rows: &[f32], n_row: usize) -> Vec<f32> {
+    let index = |i: usize| i / n_row * n_row + (i % n_row) / 2 + (i % 2) * (n_row / 2);
+    (0..rows.len()).map(|i| rows[index(i)]).collect()
+}
+
+#[test]
+fn the_order_of_the_numbers_in_a_vector_changes_no_batch() {
+    let task = interleaved();
+    let mut original = episode();
+    for (idx, number) in original.observations.iter_mut().enumerate() {
+        *number += 0.001 * (idx % 56) as f32;
+    }
+    original.goal = vec![0.1, 0.2, 0.3, 0.4, 0.5, 0.6];
+    let rearranged = Episode {
+        layout: task.clone(),
+        observations: interleave(&original.observations, 56),
+        goal: interleave(&original.goal, 6),
+        actions: interleave(&original.actions, 6),
+        ..original.clone()
+    };
+    let batch_of = |episode: &Episode, reward| {
+        let mut buffer = ReplayBuffer::new(&episode.layout, 1000);
+        buffer.push(episode);
+        let config = ReplayConfig { coda_fraction: 0.5, ..config(reward) };
+        let identity = |n| NormalizerSnapshot { mean: vec![0.0; n], std: vec![1.0; n] };
+        let (observation, goal) = (identity(56), identity(6));
+        let statistics = Statistics { observation: &observation, goal: &goal };
+        let mut batch = Batch::new(&episode.layout, reward.n_heads(&episode.layout), 200);
+        let mut rng = episode_rng(3, 0, Stream::Replay);
+        Sampler::new(&config, &episode.layout).fill(&buffer, statistics, &mut rng, &mut batch);
+        batch
+    };
+    for reward in [RewardKind::PerArm, RewardKind::Joint] {
+        let (first, second) = (batch_of(&original, reward), batch_of(&rearranged, reward));
+        assert_eq!(first.rewards, second.rewards);
+        assert_eq!(interleave(&first.actions, 6), second.actions);
+        assert_eq!(interleave(&first.bc_mask, 6), second.bc_mask);
+        for (first, second) in
+            [(&first.inputs, &second.inputs), (&first.next_inputs, &second.next_inputs)]
+        {
+            for (first, second) in first.chunks_exact(62).zip(second.chunks_exact(62)) {
+                assert_eq!(interleave(&first[..56], 56), second[..56]);
+                assert_eq!(interleave(&first[56..], 6), second[56..]);
+            }
+        }
+    }
+}
