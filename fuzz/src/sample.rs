@@ -34,14 +34,17 @@ pub fn trainer(n_rounds: u64) -> Trainer {
     trainer
 }
 
+/// The layout of [`run_config`]'s task.
+const LAYOUT: Layout = Layout::new(Task::Push, 1);
+
 /// Returns a made-up episode of [`run_config`]'s task.
 pub fn episode(number: u64) -> Episode {
-    let layout = Layout::new(Task::Push, 1);
+    let layout = LAYOUT;
     Episode {
         number,
         kind: EpisodeKind::Training,
         parameter_version: 0,
-        layout,
+        layout: layout.into(),
         observations: vec![0.25; (EPISODE_STEPS + 1) * layout.n_observation()],
         goal: vec![0.5; layout.n_goal()],
         actions: vec![-0.5; EPISODE_STEPS * layout.n_action()],
@@ -57,7 +60,7 @@ pub fn episode(number: u64) -> Episode {
 /// If the log cannot be written.
 pub fn record_episode(path: &Path) -> Result<PathBuf, Error> {
     let episode = episode(7);
-    let layout = episode.layout;
+    let layout = LAYOUT;
     let mut recorder = EpisodeRecorder::create(path, &metadata(layout))?;
     let mut scene = scene();
     for step_idx in 0..2 {
