@@ -5,10 +5,11 @@
 
 use libfuzzer_sys::fuzz_target;
 use prost::Message;
+use tandem_core::task::MAX_ARMS;
 use tandem_core::{Layout, Task};
 use tandem_fuzz::with_bounded_memory;
 use tandem_proto::environment::{decode_play_request, decode_reset_reply, decode_step_reply};
-use tandem_proto::{DecodeError, MAX_ARMS, pb};
+use tandem_proto::{DecodeError, pb};
 
 /// Maximum length of an error message, which is sent in an HTTP/2 header.
 const MAX_REFUSAL_BYTES: usize = 400;
@@ -23,7 +24,6 @@ fuzz_target!(|input: &[u8]| {
 fn read(message: u8, layout: Layout, bytes: &[u8]) {
     match message % 12 {
         0 => check(bytes, |query: pb::StepQuery| {
-            let _layout = tandem_proto::layout_of_query(&query, layout.task);
             tandem_proto::decode_query(query, layout)
                 .map(|query| tandem_proto::encode_query(&query))
         }),

@@ -41,8 +41,7 @@ pub fn encode_query(query: &StepQuery) -> pb::StepQuery {
 ///
 /// # Errors
 /// Returns an error if a vector has the wrong length, a number is not finite or beyond both [`MAX_MAGNITUDE`] and the
-/// task's bound, or the
-/// proposed action is outside [−1, 1].
+/// task's bound, or the proposed action is outside [−1, 1].
 pub fn decode_query(
     query: pb::StepQuery,
     layout: impl Into<TaskSpec>,

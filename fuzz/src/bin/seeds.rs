@@ -145,7 +145,7 @@ fn small_log(log: &[u8], compression: Option<mcap::Compression>) -> Result<Vec<u
 fn write_messages(to: &Path) -> Result<(), AnyError> {
     let terms = RunTerms {
         run: "run-7".to_owned(),
-        layout: LAYOUT,
+        layout: LAYOUT.into(),
         account: Some("run-7".to_owned()),
         exploration: Exploration {
             noise_std: 0.2,
