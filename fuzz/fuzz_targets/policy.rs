@@ -9,7 +9,7 @@ fuzz_target!(|file: &[u8]| {
     let path = scratch_file("policy.safetensors");
     write(&path, file);
     let Ok(policy) = with_bounded_memory(|| Policy::load(&path)) else { return };
-    let layout = policy.layout;
+    let layout = policy.layout.clone();
     let mut actor = policy.actor().expect("a policy that was loaded can act");
     let mut action = vec![f32::NAN; layout.n_action()];
     actor.act(&vec![0.5; layout.n_observation()], &vec![-0.5; layout.n_goal()], &mut action);

@@ -40,13 +40,13 @@ impl Policy {
     /// Name of the task.
     #[getter]
     fn task(&self) -> &str {
-        self.policy.layout.task.name()
+        self.policy.layout.name()
     }
 
     /// Number of arms.
     #[getter]
     fn n_arms(&self) -> usize {
-        self.policy.layout.n_arms
+        self.policy.layout.n_arms()
     }
 
     /// Length of an observation.
@@ -105,7 +105,7 @@ impl Policy {
         observations: PyReadonlyArray2<'py, f32>,
         goals: PyReadonlyArray2<'py, f32>,
     ) -> PyResult<Bound<'py, PyArray2<f32>>> {
-        let layout = self.policy.layout;
+        let layout = &self.policy.layout;
         let n_rows = observations.as_array().nrows();
         let observations = checked(&observations, n_rows, layout.n_observation(), "observations")?;
         let goals = checked(&goals, n_rows, layout.n_goal(), "goals")?;
@@ -122,7 +122,7 @@ impl Policy {
         goals: PyReadonlyArray2<'py, f32>,
         actions: PyReadonlyArray2<'py, f32>,
     ) -> PyResult<Bound<'py, PyArray2<f32>>> {
-        let layout = self.policy.layout;
+        let layout = &self.policy.layout;
         let n_rows = observations.as_array().nrows();
         let observations = checked(&observations, n_rows, layout.n_observation(), "observations")?;
         let goals = checked(&goals, n_rows, layout.n_goal(), "goals")?;
