@@ -5,7 +5,7 @@
 //! - [`Model`] reads a model, within bounds that a hostile file cannot exceed. Only multilayer perceptrons over
 //!   observation, goal and action are accepted; an error names the node, its operator and what is supported.
 //! - [`BoundNetwork`] runs a model on the vectors of a [`Layout`](tandem_core::Layout).
-//! - [`import`] converts models to a policy, if a policy file can represent them.
+//! - [`import()`] converts models to a policy, if a policy file can represent them.
 //!
 //! The crate contains the part of ONNX that it needs and depends on no ONNX runtime. `docs/onnx.md` describes the models.
 //!
@@ -29,7 +29,7 @@
 //! # Modules in reading order
 //!
 //! [`export`] and [`metadata`]; [`scan`] (bounds), [`model`], [`graph`] (from a graph to a network), [`network`],
-//! [`binding`], [`import`].
+//! [`binding`], [`mod@import`].
 #![warn(missing_docs)]
 
 pub mod binding;

@@ -28,7 +28,7 @@ pub(crate) struct SceneArgs {
     /// Seed of the initial states and goals; `tandem eval` plays the same ones.
     #[arg(long, default_value_t = 777)]
     pub(crate) seed: u64,
-    /// Simulates these actions: JSON of shape [episodes][steps][numbers of an action].
+    /// Simulates these actions: JSON of shape `[episodes][steps][n_action]`.
     #[arg(long, value_name = "FILE.json", group = "actor")]
     pub(crate) actions: Option<PathBuf>,
     /// Simulates the actions of this policy.
