@@ -249,7 +249,8 @@ fn module_uses(directory: &Path) -> BTreeMap<String, BTreeSet<String>> {
     for module in &modules {
         let files = [directory.join(format!("{module}.rs")), directory.join(module)];
         let mut used = BTreeSet::new();
-        for path in files.iter().filter(|path| path.exists()).flat_map(|path| rust_files(path)) {
+        let sources = files.iter().filter(|path| path.exists()).flat_map(|path| rust_files(path));
+        for path in sources.filter(|path| !path.ends_with("tests.rs")) {
             let depth = path.strip_prefix(directory).expect("below").components().count();
             let text = fs::read_to_string(&path).expect("readable");
             let program = text.split("#[cfg(test)]").next().unwrap_or_default();

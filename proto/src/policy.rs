@@ -156,7 +156,7 @@ mod tests {
         check(|policy| policy.task = None, "task: expected a message, got none");
         check(
             |policy| policy.task.as_mut().unwrap().name = "lift".to_owned(),
-            "task.name: expected push or pick-and-place, got lift",
+            "task.norm: expected 1 (Euclidean) or 2 (maximum), got 0",
         );
         check(
             |policy| policy.task.as_mut().unwrap().n_action = 4,
