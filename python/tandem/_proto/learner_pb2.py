@@ -22,59 +22,62 @@ _runtime_version.ValidateProtobufRuntimeVersion(
 _sym_db = _symbol_database.Default()
 
 
+from . import task_pb2 as tandem_dot_v1_dot_task__pb2
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x17tandem/v1/learner.proto\x12\ttandem.v1\".\n\x0bJoinRequest\x12\x0e\n\x06worker\x18\x01 \x01(\t\x12\x0f\n\x07version\x18\x02 \x01(\t\"V\n\x0cJoinResponse\x12\x11\n\tworker_id\x18\x01 \x01(\x04\x12\"\n\x05terms\x18\x02 \x01(\x0b\x32\x13.tandem.v1.RunTerms\x12\x0f\n\x07learner\x18\x03 \x01(\x04\"\x99\x01\n\x08RunTerms\x12\x0c\n\x04task\x18\x01 \x01(\t\x12\x0e\n\x06n_arms\x18\x02 \x01(\r\x12\x0f\n\x07\x61\x63\x63ount\x18\x03 \x01(\t\x12+\n\x0b\x65xploration\x18\x04 \x01(\x0b\x32\x16.tandem.v1.Exploration\x12$\n\x05world\x18\x05 \x01(\x0b\x32\x15.tandem.v1.WorldTerms\x12\x0b\n\x03run\x18\x06 \x01(\t\"V\n\x0b\x45xploration\x12\x11\n\tnoise_std\x18\x01 \x01(\x02\x12\x14\n\x0crandom_share\x18\x02 \x01(\x02\x12\x1e\n\x16random_hold_mean_steps\x18\x03 \x01(\x02\"U\n\nWorldTerms\x12\x1b\n\x13gripped_start_share\x18\x01 \x01(\x02\x12\x18\n\x10wide_start_share\x18\x02 \x01(\x02\x12\x10\n\x08substeps\x18\x03 \x01(\r\"$\n\x0fNextWorkRequest\x12\x11\n\tworker_id\x18\x01 \x01(\x04\"\x85\x01\n\x10NextWorkResponse\x12\x1f\n\x04slot\x18\x01 \x01(\x0b\x32\x0f.tandem.v1.SlotH\x00\x12\x1f\n\x04wait\x18\x02 \x01(\x0b\x32\x0f.tandem.v1.WaitH\x00\x12\'\n\x08\x66inished\x18\x03 \x01(\x0b\x32\x13.tandem.v1.FinishedH\x00\x42\x06\n\x04work\"\x80\x01\n\x04Slot\x12\x0c\n\x04slot\x18\x01 \x01(\x04\x12\x19\n\x11parameter_version\x18\x02 \x01(\x04\x12$\n\x04kind\x18\x03 \x01(\x0e\x32\x16.tandem.v1.EpisodeKind\x12)\n\x08\x65pisodes\x18\x04 \x03(\x0b\x32\x17.tandem.v1.EpisodeOrder\"^\n\x0c\x45pisodeOrder\x12\x0e\n\x06number\x18\x01 \x01(\x04\x12\x0c\n\x04seed\x18\x02 \x01(\x04\x12\x0f\n\x07\x61\x64vised\x18\x03 \x01(\x08\x12\x0f\n\x07uniform\x18\x04 \x01(\x08\x12\x0e\n\x06record\x18\x05 \x01(\x08\"\x06\n\x04Wait\"/\n\x08\x46inished\x12\x0e\n\x06reason\x18\x01 \x01(\t\x12\x13\n\x0binterrupted\x18\x02 \x01(\x08\"\'\n\x14GetParametersRequest\x12\x0f\n\x07version\x18\x01 \x01(\x04\"\xa8\x01\n\nParameters\x12\x0f\n\x07version\x18\x01 \x01(\x04\x12\x10\n\x08n_hidden\x18\x02 \x01(\r\x12\x10\n\x08n_layers\x18\x03 \x01(\r\x12\r\n\x05\x61\x63tor\x18\x04 \x01(\x0c\x12\x18\n\x10observation_mean\x18\x05 \x01(\x0c\x12\x17\n\x0fobservation_std\x18\x06 \x01(\x0c\x12\x11\n\tgoal_mean\x18\x07 \x01(\x0c\x12\x10\n\x08goal_std\x18\x08 \x01(\x0c\"^\n\x15SubmitEpisodesRequest\x12\x11\n\tworker_id\x18\x01 \x01(\x04\x12\x0c\n\x04slot\x18\x02 \x01(\x04\x12$\n\x08\x65pisodes\x18\x03 \x03(\x0b\x32\x12.tandem.v1.Episode\"\x18\n\x16SubmitEpisodesResponse\"\xcf\x01\n\x07\x45pisode\x12\x0e\n\x06number\x18\x01 \x01(\x04\x12$\n\x04kind\x18\x02 \x01(\x0e\x32\x16.tandem.v1.EpisodeKind\x12\x19\n\x11parameter_version\x18\x03 \x01(\x04\x12\x14\n\x0cobservations\x18\x04 \x01(\x0c\x12\x0c\n\x04goal\x18\x05 \x01(\x0c\x12\x0f\n\x07\x61\x63tions\x18\x06 \x01(\x0c\x12\x14\n\x0c\x61\x64vised_arms\x18\x07 \x01(\x0c\x12\x10\n\x08\x63ontacts\x18\x08 \x01(\x0c\x12\x16\n\x0e\x61\x64vice_charged\x18\t \x01(\r\"\x0f\n\rStatusRequest\"\x0e\n\x0cWatchRequest\"\xd3\x03\n\x08Progress\x12\x0c\n\x04task\x18\x01 \x01(\t\x12\x0e\n\x06n_arms\x18\x02 \x01(\r\x12\x10\n\x08strategy\x18\x03 \x01(\t\x12\r\n\x05round\x18\x04 \x01(\x04\x12\x11\n\tenv_steps\x18\x05 \x01(\x04\x12\x10\n\x08\x65pisodes\x18\x06 \x01(\x04\x12\x0f\n\x07updates\x18\x07 \x01(\x04\x12\x0e\n\x06wall_s\x18\x08 \x01(\x01\x12\x17\n\x0f\x65nv_steps_per_s\x18\t \x01(\x01\x12\x15\n\rupdates_per_s\x18\n \x01(\x01\x12\x14\n\x0c\x61\x64vice_spent\x18\x0b \x01(\x04\x12\x13\n\x0b\x62udget_left\x18\x0c \x01(\x04\x12\r\n\x05phase\x18\r \x01(\t\x12\x18\n\x10training_success\x18\x0e \x01(\x01\x12*\n\x07workers\x18\x0f \x03(\x0b\x32\x19.tandem.v1.WorkerProgress\x12)\n\nevaluation\x18\x10 \x01(\x0b\x32\x15.tandem.v1.Evaluation\x12#\n\x04\x62\x65st\x18\x11 \x01(\x0b\x32\x15.tandem.v1.Evaluation\x12\r\n\x05\x65nded\x18\x12 \x01(\x08\x12\x12\n\nend_reason\x18\x13 \x01(\t\x12\x0e\n\x06\x64igest\x18\x14 \x01(\t\x12\x0f\n\x07warning\x18\x15 \x01(\t\"R\n\x0eWorkerProgress\x12\x11\n\tworker_id\x18\x01 \x01(\x04\x12\x0c\n\x04name\x18\x02 \x01(\t\x12\x10\n\x08\x65pisodes\x18\x03 \x01(\x04\x12\r\n\x05\x64oing\x18\x04 \x01(\t\"\xd6\x01\n\nEvaluation\x12\r\n\x05round\x18\x01 \x01(\x04\x12\x11\n\tenv_steps\x18\x02 \x01(\x04\x12\x12\n\nn_episodes\x18\x03 \x01(\r\x12\x0f\n\x07success\x18\x04 \x01(\x01\x12\x13\n\x0bsuccess_low\x18\x05 \x01(\x01\x12\x14\n\x0csuccess_high\x18\x06 \x01(\x01\x12\x15\n\rsuccess_joint\x18\x07 \x01(\x01\x12\x17\n\x0fsuccess_per_arm\x18\x08 \x03(\x01\x12\x16\n\x0e\x63ollision_rate\x18\t \x01(\x01\x12\x0e\n\x06mean_q\x18\n \x01(\x01*c\n\x0b\x45pisodeKind\x12\x1c\n\x18\x45PISODE_KIND_UNSPECIFIED\x10\x00\x12\x19\n\x15\x45PISODE_KIND_TRAINING\x10\x01\x12\x1b\n\x17\x45PISODE_KIND_EVALUATION\x10\x02\x32\x99\x03\n\x07Learner\x12\x37\n\x04Join\x12\x16.tandem.v1.JoinRequest\x1a\x17.tandem.v1.JoinResponse\x12\x43\n\x08NextWork\x12\x1a.tandem.v1.NextWorkRequest\x1a\x1b.tandem.v1.NextWorkResponse\x12G\n\rGetParameters\x12\x1f.tandem.v1.GetParametersRequest\x1a\x15.tandem.v1.Parameters\x12U\n\x0eSubmitEpisodes\x12 .tandem.v1.SubmitEpisodesRequest\x1a!.tandem.v1.SubmitEpisodesResponse\x12\x37\n\x06Status\x12\x18.tandem.v1.StatusRequest\x1a\x13.tandem.v1.Progress\x12\x37\n\x05Watch\x12\x17.tandem.v1.WatchRequest\x1a\x13.tandem.v1.Progress0\x01\x62\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x17tandem/v1/learner.proto\x12\ttandem.v1\x1a\x14tandem/v1/task.proto\".\n\x0bJoinRequest\x12\x0e\n\x06worker\x18\x01 \x01(\t\x12\x0f\n\x07version\x18\x02 \x01(\t\"V\n\x0cJoinResponse\x12\x11\n\tworker_id\x18\x01 \x01(\x04\x12\"\n\x05terms\x18\x02 \x01(\x0b\x32\x13.tandem.v1.RunTerms\x12\x0f\n\x07learner\x18\x03 \x01(\x04\"\xca\x01\n\x08RunTerms\x12\x0c\n\x04task\x18\x01 \x01(\t\x12\x0e\n\x06n_arms\x18\x02 \x01(\r\x12\x0f\n\x07\x61\x63\x63ount\x18\x03 \x01(\t\x12+\n\x0b\x65xploration\x18\x04 \x01(\x0b\x32\x16.tandem.v1.Exploration\x12$\n\x05world\x18\x05 \x01(\x0b\x32\x15.tandem.v1.WorldTerms\x12\x0b\n\x03run\x18\x06 \x01(\t\x12/\n\x0b\x64\x65scription\x18\x07 \x01(\x0b\x32\x1a.tandem.v1.TaskDescription\"V\n\x0b\x45xploration\x12\x11\n\tnoise_std\x18\x01 \x01(\x02\x12\x14\n\x0crandom_share\x18\x02 \x01(\x02\x12\x1e\n\x16random_hold_mean_steps\x18\x03 \x01(\x02\"U\n\nWorldTerms\x12\x1b\n\x13gripped_start_share\x18\x01 \x01(\x02\x12\x18\n\x10wide_start_share\x18\x02 \x01(\x02\x12\x10\n\x08substeps\x18\x03 \x01(\r\"$\n\x0fNextWorkRequest\x12\x11\n\tworker_id\x18\x01 \x01(\x04\"\x85\x01\n\x10NextWorkResponse\x12\x1f\n\x04slot\x18\x01 \x01(\x0b\x32\x0f.tandem.v1.SlotH\x00\x12\x1f\n\x04wait\x18\x02 \x01(\x0b\x32\x0f.tandem.v1.WaitH\x00\x12\'\n\x08\x66inished\x18\x03 \x01(\x0b\x32\x13.tandem.v1.FinishedH\x00\x42\x06\n\x04work\"\x80\x01\n\x04Slot\x12\x0c\n\x04slot\x18\x01 \x01(\x04\x12\x19\n\x11parameter_version\x18\x02 \x01(\x04\x12$\n\x04kind\x18\x03 \x01(\x0e\x32\x16.tandem.v1.EpisodeKind\x12)\n\x08\x65pisodes\x18\x04 \x03(\x0b\x32\x17.tandem.v1.EpisodeOrder\"^\n\x0c\x45pisodeOrder\x12\x0e\n\x06number\x18\x01 \x01(\x04\x12\x0c\n\x04seed\x18\x02 \x01(\x04\x12\x0f\n\x07\x61\x64vised\x18\x03 \x01(\x08\x12\x0f\n\x07uniform\x18\x04 \x01(\x08\x12\x0e\n\x06record\x18\x05 \x01(\x08\"\x06\n\x04Wait\"/\n\x08\x46inished\x12\x0e\n\x06reason\x18\x01 \x01(\t\x12\x13\n\x0binterrupted\x18\x02 \x01(\x08\"\'\n\x14GetParametersRequest\x12\x0f\n\x07version\x18\x01 \x01(\x04\"\xa8\x01\n\nParameters\x12\x0f\n\x07version\x18\x01 \x01(\x04\x12\x10\n\x08n_hidden\x18\x02 \x01(\r\x12\x10\n\x08n_layers\x18\x03 \x01(\r\x12\r\n\x05\x61\x63tor\x18\x04 \x01(\x0c\x12\x18\n\x10observation_mean\x18\x05 \x01(\x0c\x12\x17\n\x0fobservation_std\x18\x06 \x01(\x0c\x12\x11\n\tgoal_mean\x18\x07 \x01(\x0c\x12\x10\n\x08goal_std\x18\x08 \x01(\x0c\"\x96\x01\n\x15SubmitEpisodesRequest\x12\x11\n\tworker_id\x18\x01 \x01(\x04\x12\x0c\n\x04slot\x18\x02 \x01(\x04\x12$\n\x08\x65pisodes\x18\x03 \x03(\x0b\x32\x12.tandem.v1.Episode\x12\x36\n\x11\x65nvironment_check\x18\x04 \x01(\x0b\x32\x1b.tandem.v1.EnvironmentCheck\":\n\x10\x45nvironmentCheck\x12\x12\n\nn_episodes\x18\x01 \x01(\r\x12\x12\n\ndifference\x18\x02 \x01(\t\"\x18\n\x16SubmitEpisodesResponse\"\xcf\x01\n\x07\x45pisode\x12\x0e\n\x06number\x18\x01 \x01(\x04\x12$\n\x04kind\x18\x02 \x01(\x0e\x32\x16.tandem.v1.EpisodeKind\x12\x19\n\x11parameter_version\x18\x03 \x01(\x04\x12\x14\n\x0cobservations\x18\x04 \x01(\x0c\x12\x0c\n\x04goal\x18\x05 \x01(\x0c\x12\x0f\n\x07\x61\x63tions\x18\x06 \x01(\x0c\x12\x14\n\x0c\x61\x64vised_arms\x18\x07 \x01(\x0c\x12\x10\n\x08\x63ontacts\x18\x08 \x01(\x0c\x12\x16\n\x0e\x61\x64vice_charged\x18\t \x01(\r\"\x0f\n\rStatusRequest\"\x0e\n\x0cWatchRequest\"\xe8\x03\n\x08Progress\x12\x0c\n\x04task\x18\x01 \x01(\t\x12\x0e\n\x06n_arms\x18\x02 \x01(\r\x12\x10\n\x08strategy\x18\x03 \x01(\t\x12\r\n\x05round\x18\x04 \x01(\x04\x12\x11\n\tenv_steps\x18\x05 \x01(\x04\x12\x10\n\x08\x65pisodes\x18\x06 \x01(\x04\x12\x0f\n\x07updates\x18\x07 \x01(\x04\x12\x0e\n\x06wall_s\x18\x08 \x01(\x01\x12\x17\n\x0f\x65nv_steps_per_s\x18\t \x01(\x01\x12\x15\n\rupdates_per_s\x18\n \x01(\x01\x12\x14\n\x0c\x61\x64vice_spent\x18\x0b \x01(\x04\x12\x13\n\x0b\x62udget_left\x18\x0c \x01(\x04\x12\r\n\x05phase\x18\r \x01(\t\x12\x18\n\x10training_success\x18\x0e \x01(\x01\x12*\n\x07workers\x18\x0f \x03(\x0b\x32\x19.tandem.v1.WorkerProgress\x12)\n\nevaluation\x18\x10 \x01(\x0b\x32\x15.tandem.v1.Evaluation\x12#\n\x04\x62\x65st\x18\x11 \x01(\x0b\x32\x15.tandem.v1.Evaluation\x12\r\n\x05\x65nded\x18\x12 \x01(\x08\x12\x12\n\nend_reason\x18\x13 \x01(\t\x12\x0e\n\x06\x64igest\x18\x14 \x01(\t\x12\x0f\n\x07warning\x18\x15 \x01(\t\x12\x13\n\x0b\x65nvironment\x18\x16 \x01(\t\"R\n\x0eWorkerProgress\x12\x11\n\tworker_id\x18\x01 \x01(\x04\x12\x0c\n\x04name\x18\x02 \x01(\t\x12\x10\n\x08\x65pisodes\x18\x03 \x01(\x04\x12\r\n\x05\x64oing\x18\x04 \x01(\t\"\xd6\x01\n\nEvaluation\x12\r\n\x05round\x18\x01 \x01(\x04\x12\x11\n\tenv_steps\x18\x02 \x01(\x04\x12\x12\n\nn_episodes\x18\x03 \x01(\r\x12\x0f\n\x07success\x18\x04 \x01(\x01\x12\x13\n\x0bsuccess_low\x18\x05 \x01(\x01\x12\x14\n\x0csuccess_high\x18\x06 \x01(\x01\x12\x15\n\rsuccess_joint\x18\x07 \x01(\x01\x12\x17\n\x0fsuccess_per_arm\x18\x08 \x03(\x01\x12\x16\n\x0e\x63ollision_rate\x18\t \x01(\x01\x12\x0e\n\x06mean_q\x18\n \x01(\x01*c\n\x0b\x45pisodeKind\x12\x1c\n\x18\x45PISODE_KIND_UNSPECIFIED\x10\x00\x12\x19\n\x15\x45PISODE_KIND_TRAINING\x10\x01\x12\x1b\n\x17\x45PISODE_KIND_EVALUATION\x10\x02\x32\x99\x03\n\x07Learner\x12\x37\n\x04Join\x12\x16.tandem.v1.JoinRequest\x1a\x17.tandem.v1.JoinResponse\x12\x43\n\x08NextWork\x12\x1a.tandem.v1.NextWorkRequest\x1a\x1b.tandem.v1.NextWorkResponse\x12G\n\rGetParameters\x12\x1f.tandem.v1.GetParametersRequest\x1a\x15.tandem.v1.Parameters\x12U\n\x0eSubmitEpisodes\x12 .tandem.v1.SubmitEpisodesRequest\x1a!.tandem.v1.SubmitEpisodesResponse\x12\x37\n\x06Status\x12\x18.tandem.v1.StatusRequest\x1a\x13.tandem.v1.Progress\x12\x37\n\x05Watch\x12\x17.tandem.v1.WatchRequest\x1a\x13.tandem.v1.Progress0\x01\x62\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
 _builder.BuildTopDescriptorsAndMessages(DESCRIPTOR, 'tandem.v1.learner_pb2', _globals)
 if not _descriptor._USE_C_DESCRIPTORS:
   DESCRIPTOR._loaded_options = None
-  _globals['_EPISODEKIND']._serialized_start=2311
-  _globals['_EPISODEKIND']._serialized_end=2410
-  _globals['_JOINREQUEST']._serialized_start=38
-  _globals['_JOINREQUEST']._serialized_end=84
-  _globals['_JOINRESPONSE']._serialized_start=86
-  _globals['_JOINRESPONSE']._serialized_end=172
-  _globals['_RUNTERMS']._serialized_start=175
-  _globals['_RUNTERMS']._serialized_end=328
-  _globals['_EXPLORATION']._serialized_start=330
-  _globals['_EXPLORATION']._serialized_end=416
-  _globals['_WORLDTERMS']._serialized_start=418
-  _globals['_WORLDTERMS']._serialized_end=503
-  _globals['_NEXTWORKREQUEST']._serialized_start=505
-  _globals['_NEXTWORKREQUEST']._serialized_end=541
-  _globals['_NEXTWORKRESPONSE']._serialized_start=544
-  _globals['_NEXTWORKRESPONSE']._serialized_end=677
-  _globals['_SLOT']._serialized_start=680
-  _globals['_SLOT']._serialized_end=808
-  _globals['_EPISODEORDER']._serialized_start=810
-  _globals['_EPISODEORDER']._serialized_end=904
-  _globals['_WAIT']._serialized_start=906
-  _globals['_WAIT']._serialized_end=912
-  _globals['_FINISHED']._serialized_start=914
-  _globals['_FINISHED']._serialized_end=961
-  _globals['_GETPARAMETERSREQUEST']._serialized_start=963
-  _globals['_GETPARAMETERSREQUEST']._serialized_end=1002
-  _globals['_PARAMETERS']._serialized_start=1005
-  _globals['_PARAMETERS']._serialized_end=1173
-  _globals['_SUBMITEPISODESREQUEST']._serialized_start=1175
-  _globals['_SUBMITEPISODESREQUEST']._serialized_end=1269
-  _globals['_SUBMITEPISODESRESPONSE']._serialized_start=1271
-  _globals['_SUBMITEPISODESRESPONSE']._serialized_end=1295
-  _globals['_EPISODE']._serialized_start=1298
-  _globals['_EPISODE']._serialized_end=1505
-  _globals['_STATUSREQUEST']._serialized_start=1507
-  _globals['_STATUSREQUEST']._serialized_end=1522
-  _globals['_WATCHREQUEST']._serialized_start=1524
-  _globals['_WATCHREQUEST']._serialized_end=1538
-  _globals['_PROGRESS']._serialized_start=1541
-  _globals['_PROGRESS']._serialized_end=2008
-  _globals['_WORKERPROGRESS']._serialized_start=2010
-  _globals['_WORKERPROGRESS']._serialized_end=2092
-  _globals['_EVALUATION']._serialized_start=2095
-  _globals['_EVALUATION']._serialized_end=2309
-  _globals['_LEARNER']._serialized_start=2413
-  _globals['_LEARNER']._serialized_end=2822
+  _globals['_EPISODEKIND']._serialized_start=2520
+  _globals['_EPISODEKIND']._serialized_end=2619
+  _globals['_JOINREQUEST']._serialized_start=60
+  _globals['_JOINREQUEST']._serialized_end=106
+  _globals['_JOINRESPONSE']._serialized_start=108
+  _globals['_JOINRESPONSE']._serialized_end=194
+  _globals['_RUNTERMS']._serialized_start=197
+  _globals['_RUNTERMS']._serialized_end=399
+  _globals['_EXPLORATION']._serialized_start=401
+  _globals['_EXPLORATION']._serialized_end=487
+  _globals['_WORLDTERMS']._serialized_start=489
+  _globals['_WORLDTERMS']._serialized_end=574
+  _globals['_NEXTWORKREQUEST']._serialized_start=576
+  _globals['_NEXTWORKREQUEST']._serialized_end=612
+  _globals['_NEXTWORKRESPONSE']._serialized_start=615
+  _globals['_NEXTWORKRESPONSE']._serialized_end=748
+  _globals['_SLOT']._serialized_start=751
+  _globals['_SLOT']._serialized_end=879
+  _globals['_EPISODEORDER']._serialized_start=881
+  _globals['_EPISODEORDER']._serialized_end=975
+  _globals['_WAIT']._serialized_start=977
+  _globals['_WAIT']._serialized_end=983
+  _globals['_FINISHED']._serialized_start=985
+  _globals['_FINISHED']._serialized_end=1032
+  _globals['_GETPARAMETERSREQUEST']._serialized_start=1034
+  _globals['_GETPARAMETERSREQUEST']._serialized_end=1073
+  _globals['_PARAMETERS']._serialized_start=1076
+  _globals['_PARAMETERS']._serialized_end=1244
+  _globals['_SUBMITEPISODESREQUEST']._serialized_start=1247
+  _globals['_SUBMITEPISODESREQUEST']._serialized_end=1397
+  _globals['_ENVIRONMENTCHECK']._serialized_start=1399
+  _globals['_ENVIRONMENTCHECK']._serialized_end=1457
+  _globals['_SUBMITEPISODESRESPONSE']._serialized_start=1459
+  _globals['_SUBMITEPISODESRESPONSE']._serialized_end=1483
+  _globals['_EPISODE']._serialized_start=1486
+  _globals['_EPISODE']._serialized_end=1693
+  _globals['_STATUSREQUEST']._serialized_start=1695
+  _globals['_STATUSREQUEST']._serialized_end=1710
+  _globals['_WATCHREQUEST']._serialized_start=1712
+  _globals['_WATCHREQUEST']._serialized_end=1726
+  _globals['_PROGRESS']._serialized_start=1729
+  _globals['_PROGRESS']._serialized_end=2217
+  _globals['_WORKERPROGRESS']._serialized_start=2219
+  _globals['_WORKERPROGRESS']._serialized_end=2301
+  _globals['_EVALUATION']._serialized_start=2304
+  _globals['_EVALUATION']._serialized_end=2518
+  _globals['_LEARNER']._serialized_start=2622
+  _globals['_LEARNER']._serialized_end=3031
 # @@protoc_insertion_point(module_scope)

@@ -1,3 +1,4 @@
+from . import task_pb2 as _task_pb2
 from google.protobuf.internal import containers as _containers
 from google.protobuf.internal import enum_type_wrapper as _enum_type_wrapper
 from google.protobuf import descriptor as _descriptor
@@ -35,20 +36,22 @@ class JoinResponse(_message.Message):
     def __init__(self, worker_id: _Optional[int] = ..., terms: _Optional[_Union[RunTerms, _Mapping]] = ..., learner: _Optional[int] = ...) -> None: ...
 
 class RunTerms(_message.Message):
-    __slots__ = ("task", "n_arms", "account", "exploration", "world", "run")
+    __slots__ = ("task", "n_arms", "account", "exploration", "world", "run", "description")
     TASK_FIELD_NUMBER: _ClassVar[int]
     N_ARMS_FIELD_NUMBER: _ClassVar[int]
     ACCOUNT_FIELD_NUMBER: _ClassVar[int]
     EXPLORATION_FIELD_NUMBER: _ClassVar[int]
     WORLD_FIELD_NUMBER: _ClassVar[int]
     RUN_FIELD_NUMBER: _ClassVar[int]
+    DESCRIPTION_FIELD_NUMBER: _ClassVar[int]
     task: str
     n_arms: int
     account: str
     exploration: Exploration
     world: WorldTerms
     run: str
-    def __init__(self, task: _Optional[str] = ..., n_arms: _Optional[int] = ..., account: _Optional[str] = ..., exploration: _Optional[_Union[Exploration, _Mapping]] = ..., world: _Optional[_Union[WorldTerms, _Mapping]] = ..., run: _Optional[str] = ...) -> None: ...
+    description: _task_pb2.TaskDescription
+    def __init__(self, task: _Optional[str] = ..., n_arms: _Optional[int] = ..., account: _Optional[str] = ..., exploration: _Optional[_Union[Exploration, _Mapping]] = ..., world: _Optional[_Union[WorldTerms, _Mapping]] = ..., run: _Optional[str] = ..., description: _Optional[_Union[_task_pb2.TaskDescription, _Mapping]] = ...) -> None: ...
 
 class Exploration(_message.Message):
     __slots__ = ("noise_std", "random_share", "random_hold_mean_steps")
@@ -151,14 +154,24 @@ class Parameters(_message.Message):
     def __init__(self, version: _Optional[int] = ..., n_hidden: _Optional[int] = ..., n_layers: _Optional[int] = ..., actor: _Optional[bytes] = ..., observation_mean: _Optional[bytes] = ..., observation_std: _Optional[bytes] = ..., goal_mean: _Optional[bytes] = ..., goal_std: _Optional[bytes] = ...) -> None: ...
 
 class SubmitEpisodesRequest(_message.Message):
-    __slots__ = ("worker_id", "slot", "episodes")
+    __slots__ = ("worker_id", "slot", "episodes", "environment_check")
     WORKER_ID_FIELD_NUMBER: _ClassVar[int]
     SLOT_FIELD_NUMBER: _ClassVar[int]
     EPISODES_FIELD_NUMBER: _ClassVar[int]
+    ENVIRONMENT_CHECK_FIELD_NUMBER: _ClassVar[int]
     worker_id: int
     slot: int
     episodes: _containers.RepeatedCompositeFieldContainer[Episode]
-    def __init__(self, worker_id: _Optional[int] = ..., slot: _Optional[int] = ..., episodes: _Optional[_Iterable[_Union[Episode, _Mapping]]] = ...) -> None: ...
+    environment_check: EnvironmentCheck
+    def __init__(self, worker_id: _Optional[int] = ..., slot: _Optional[int] = ..., episodes: _Optional[_Iterable[_Union[Episode, _Mapping]]] = ..., environment_check: _Optional[_Union[EnvironmentCheck, _Mapping]] = ...) -> None: ...
+
+class EnvironmentCheck(_message.Message):
+    __slots__ = ("n_episodes", "difference")
+    N_EPISODES_FIELD_NUMBER: _ClassVar[int]
+    DIFFERENCE_FIELD_NUMBER: _ClassVar[int]
+    n_episodes: int
+    difference: str
+    def __init__(self, n_episodes: _Optional[int] = ..., difference: _Optional[str] = ...) -> None: ...
 
 class SubmitEpisodesResponse(_message.Message):
     __slots__ = ()
@@ -195,7 +208,7 @@ class WatchRequest(_message.Message):
     def __init__(self) -> None: ...
 
 class Progress(_message.Message):
-    __slots__ = ("task", "n_arms", "strategy", "round", "env_steps", "episodes", "updates", "wall_s", "env_steps_per_s", "updates_per_s", "advice_spent", "budget_left", "phase", "training_success", "workers", "evaluation", "best", "ended", "end_reason", "digest", "warning")
+    __slots__ = ("task", "n_arms", "strategy", "round", "env_steps", "episodes", "updates", "wall_s", "env_steps_per_s", "updates_per_s", "advice_spent", "budget_left", "phase", "training_success", "workers", "evaluation", "best", "ended", "end_reason", "digest", "warning", "environment")
     TASK_FIELD_NUMBER: _ClassVar[int]
     N_ARMS_FIELD_NUMBER: _ClassVar[int]
     STRATEGY_FIELD_NUMBER: _ClassVar[int]
@@ -217,6 +230,7 @@ class Progress(_message.Message):
     END_REASON_FIELD_NUMBER: _ClassVar[int]
     DIGEST_FIELD_NUMBER: _ClassVar[int]
     WARNING_FIELD_NUMBER: _ClassVar[int]
+    ENVIRONMENT_FIELD_NUMBER: _ClassVar[int]
     task: str
     n_arms: int
     strategy: str
@@ -238,7 +252,8 @@ class Progress(_message.Message):
     end_reason: str
     digest: str
     warning: str
-    def __init__(self, task: _Optional[str] = ..., n_arms: _Optional[int] = ..., strategy: _Optional[str] = ..., round: _Optional[int] = ..., env_steps: _Optional[int] = ..., episodes: _Optional[int] = ..., updates: _Optional[int] = ..., wall_s: _Optional[float] = ..., env_steps_per_s: _Optional[float] = ..., updates_per_s: _Optional[float] = ..., advice_spent: _Optional[int] = ..., budget_left: _Optional[int] = ..., phase: _Optional[str] = ..., training_success: _Optional[float] = ..., workers: _Optional[_Iterable[_Union[WorkerProgress, _Mapping]]] = ..., evaluation: _Optional[_Union[Evaluation, _Mapping]] = ..., best: _Optional[_Union[Evaluation, _Mapping]] = ..., ended: bool = ..., end_reason: _Optional[str] = ..., digest: _Optional[str] = ..., warning: _Optional[str] = ...) -> None: ...
+    environment: str
+    def __init__(self, task: _Optional[str] = ..., n_arms: _Optional[int] = ..., strategy: _Optional[str] = ..., round: _Optional[int] = ..., env_steps: _Optional[int] = ..., episodes: _Optional[int] = ..., updates: _Optional[int] = ..., wall_s: _Optional[float] = ..., env_steps_per_s: _Optional[float] = ..., updates_per_s: _Optional[float] = ..., advice_spent: _Optional[int] = ..., budget_left: _Optional[int] = ..., phase: _Optional[str] = ..., training_success: _Optional[float] = ..., workers: _Optional[_Iterable[_Union[WorkerProgress, _Mapping]]] = ..., evaluation: _Optional[_Union[Evaluation, _Mapping]] = ..., best: _Optional[_Union[Evaluation, _Mapping]] = ..., ended: bool = ..., end_reason: _Optional[str] = ..., digest: _Optional[str] = ..., warning: _Optional[str] = ..., environment: _Optional[str] = ...) -> None: ...
 
 class WorkerProgress(_message.Message):
     __slots__ = ("worker_id", "name", "episodes", "doing")

@@ -22,47 +22,48 @@ _runtime_version.ValidateProtobufRuntimeVersion(
 _sym_db = _symbol_database.Default()
 
 
+from . import task_pb2 as tandem_dot_v1_dot_task__pb2
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x17tandem/v1/teacher.proto\x12\ttandem.v1\"\x11\n\x0f\x44\x65scribeRequest\"\xbd\x01\n\x10\x44\x65scribeResponse\x12\x0c\n\x04task\x18\x01 \x01(\t\x12\x1d\n\x15n_observation_per_arm\x18\x02 \x01(\r\x12\x16\n\x0en_goal_per_arm\x18\x03 \x01(\r\x12\x18\n\x10n_action_per_arm\x18\x04 \x01(\r\x12\x1f\n\x04\x61rms\x18\x05 \x03(\x0b\x32\x11.tandem.v1.ArmMap\x12\x12\n\nstrategies\x18\x06 \x03(\t\x12\x15\n\rpolicy_digest\x18\x07 \x01(\t\"\x80\x01\n\x06\x41rmMap\x12*\n\x0bobservation\x18\x01 \x01(\x0b\x32\x15.tandem.v1.IndexRange\x12#\n\x04goal\x18\x02 \x01(\x0b\x32\x15.tandem.v1.IndexRange\x12%\n\x06\x61\x63tion\x18\x03 \x01(\x0b\x32\x15.tandem.v1.IndexRange\"(\n\nIndexRange\x12\r\n\x05start\x18\x01 \x01(\r\x12\x0b\n\x03\x65nd\x18\x02 \x01(\r\"D\n\x12OpenAccountRequest\x12\x0c\n\x04name\x18\x01 \x01(\t\x12\x0e\n\x06\x62udget\x18\x02 \x01(\x04\x12\x10\n\x08strategy\x18\x03 \x01(\t\"!\n\x11GetAccountRequest\x12\x0c\n\x04name\x18\x01 \x01(\t\"w\n\x07\x41\x63\x63ount\x12\x0c\n\x04name\x18\x01 \x01(\t\x12\x0e\n\x06\x62udget\x18\x02 \x01(\x04\x12\x10\n\x08strategy\x18\x03 \x01(\t\x12\r\n\x05spent\x18\x04 \x01(\x04\x12\x0e\n\x06leased\x18\x05 \x01(\x04\x12\x0c\n\x04left\x18\x06 \x01(\x04\x12\x0f\n\x07warning\x18\x07 \x01(\t\"E\n\rAdviseRequest\x12\x0f\n\x07\x61\x63\x63ount\x18\x01 \x01(\t\x12#\n\x05steps\x18\x02 \x03(\x0b\x32\x14.tandem.v1.StepQuery\"f\n\tStepQuery\x12\x0f\n\x07\x65pisode\x18\x01 \x01(\x04\x12\x0c\n\x04step\x18\x02 \x01(\r\x12\x13\n\x0bobservation\x18\x03 \x03(\x02\x12\x0c\n\x04goal\x18\x04 \x03(\x02\x12\x17\n\x0fproposed_action\x18\x05 \x03(\x02\"K\n\x0e\x41\x64viseResponse\x12$\n\x05steps\x18\x01 \x03(\x0b\x32\x15.tandem.v1.StepAdvice\x12\x13\n\x0b\x62udget_left\x18\x02 \x01(\x04\"Q\n\nStepAdvice\x12\x0e\n\x06\x61\x63tion\x18\x01 \x03(\x02\x12\x0f\n\x07\x63harged\x18\x02 \x01(\x08\x12\"\n\x04\x61rms\x18\x03 \x03(\x0b\x32\x14.tandem.v1.ArmAdvice\"\x83\x01\n\tArmAdvice\x12\x16\n\x0eteacher_action\x18\x01 \x03(\x02\x12\x11\n\tq_teacher\x18\x02 \x01(\x02\x12\x11\n\tq_student\x18\x03 \x01(\x02\x12\x12\n\nimportance\x18\x04 \x01(\x02\x12\x10\n\x08\x64istance\x18\x05 \x01(\x02\x12\x12\n\noverridden\x18\x06 \x01(\x08\"Q\n\x11OpenLeasesRequest\x12\x0f\n\x07\x61\x63\x63ount\x18\x01 \x01(\t\x12\x10\n\x08\x65pisodes\x18\x02 \x03(\x04\x12\x19\n\x11units_per_episode\x18\x03 \x01(\r\"[\n\x12OpenLeasesResponse\x12 \n\x06leases\x18\x01 \x03(\x0b\x32\x10.tandem.v1.Lease\x12#\n\x07\x61\x63\x63ount\x18\x02 \x01(\x0b\x32\x12.tandem.v1.Account\"<\n\x05Lease\x12\x0f\n\x07\x65pisode\x18\x01 \x01(\x04\x12\r\n\x05units\x18\x02 \x01(\r\x12\x13\n\x0b\x65\x61rly_units\x18\x03 \x01(\r\"8\n\x13SettleLeasesRequest\x12\x0f\n\x07\x61\x63\x63ount\x18\x01 \x01(\t\x12\x10\n\x08\x65pisodes\x18\x02 \x03(\x04\x32\xe7\x03\n\x07Teacher\x12\x43\n\x08\x44\x65scribe\x12\x1a.tandem.v1.DescribeRequest\x1a\x1b.tandem.v1.DescribeResponse\x12@\n\x0bOpenAccount\x12\x1d.tandem.v1.OpenAccountRequest\x1a\x12.tandem.v1.Account\x12>\n\nGetAccount\x12\x1c.tandem.v1.GetAccountRequest\x1a\x12.tandem.v1.Account\x12=\n\x06\x41\x64vise\x12\x18.tandem.v1.AdviseRequest\x1a\x19.tandem.v1.AdviseResponse\x12G\n\x0c\x41\x64viseStream\x12\x18.tandem.v1.AdviseRequest\x1a\x19.tandem.v1.AdviseResponse(\x01\x30\x01\x12I\n\nOpenLeases\x12\x1c.tandem.v1.OpenLeasesRequest\x1a\x1d.tandem.v1.OpenLeasesResponse\x12\x42\n\x0cSettleLeases\x12\x1e.tandem.v1.SettleLeasesRequest\x1a\x12.tandem.v1.Accountb\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x17tandem/v1/teacher.proto\x12\ttandem.v1\x1a\x14tandem/v1/task.proto\"\x11\n\x0f\x44\x65scribeRequest\"\xf3\x01\n\x10\x44\x65scribeResponse\x12\x0c\n\x04task\x18\x01 \x01(\t\x12\x1d\n\x15n_observation_per_arm\x18\x02 \x01(\r\x12\x16\n\x0en_goal_per_arm\x18\x03 \x01(\r\x12\x18\n\x10n_action_per_arm\x18\x04 \x01(\r\x12\x1f\n\x04\x61rms\x18\x05 \x03(\x0b\x32\x11.tandem.v1.ArmMap\x12\x12\n\nstrategies\x18\x06 \x03(\t\x12\x15\n\rpolicy_digest\x18\x07 \x01(\t\x12\x34\n\x10task_description\x18\x08 \x01(\x0b\x32\x1a.tandem.v1.TaskDescription\"\x80\x01\n\x06\x41rmMap\x12*\n\x0bobservation\x18\x01 \x01(\x0b\x32\x15.tandem.v1.IndexRange\x12#\n\x04goal\x18\x02 \x01(\x0b\x32\x15.tandem.v1.IndexRange\x12%\n\x06\x61\x63tion\x18\x03 \x01(\x0b\x32\x15.tandem.v1.IndexRange\"(\n\nIndexRange\x12\r\n\x05start\x18\x01 \x01(\r\x12\x0b\n\x03\x65nd\x18\x02 \x01(\r\"D\n\x12OpenAccountRequest\x12\x0c\n\x04name\x18\x01 \x01(\t\x12\x0e\n\x06\x62udget\x18\x02 \x01(\x04\x12\x10\n\x08strategy\x18\x03 \x01(\t\"!\n\x11GetAccountRequest\x12\x0c\n\x04name\x18\x01 \x01(\t\"w\n\x07\x41\x63\x63ount\x12\x0c\n\x04name\x18\x01 \x01(\t\x12\x0e\n\x06\x62udget\x18\x02 \x01(\x04\x12\x10\n\x08strategy\x18\x03 \x01(\t\x12\r\n\x05spent\x18\x04 \x01(\x04\x12\x0e\n\x06leased\x18\x05 \x01(\x04\x12\x0c\n\x04left\x18\x06 \x01(\x04\x12\x0f\n\x07warning\x18\x07 \x01(\t\"E\n\rAdviseRequest\x12\x0f\n\x07\x61\x63\x63ount\x18\x01 \x01(\t\x12#\n\x05steps\x18\x02 \x03(\x0b\x32\x14.tandem.v1.StepQuery\"f\n\tStepQuery\x12\x0f\n\x07\x65pisode\x18\x01 \x01(\x04\x12\x0c\n\x04step\x18\x02 \x01(\r\x12\x13\n\x0bobservation\x18\x03 \x03(\x02\x12\x0c\n\x04goal\x18\x04 \x03(\x02\x12\x17\n\x0fproposed_action\x18\x05 \x03(\x02\"K\n\x0e\x41\x64viseResponse\x12$\n\x05steps\x18\x01 \x03(\x0b\x32\x15.tandem.v1.StepAdvice\x12\x13\n\x0b\x62udget_left\x18\x02 \x01(\x04\"Q\n\nStepAdvice\x12\x0e\n\x06\x61\x63tion\x18\x01 \x03(\x02\x12\x0f\n\x07\x63harged\x18\x02 \x01(\x08\x12\"\n\x04\x61rms\x18\x03 \x03(\x0b\x32\x14.tandem.v1.ArmAdvice\"\x83\x01\n\tArmAdvice\x12\x16\n\x0eteacher_action\x18\x01 \x03(\x02\x12\x11\n\tq_teacher\x18\x02 \x01(\x02\x12\x11\n\tq_student\x18\x03 \x01(\x02\x12\x12\n\nimportance\x18\x04 \x01(\x02\x12\x10\n\x08\x64istance\x18\x05 \x01(\x02\x12\x12\n\noverridden\x18\x06 \x01(\x08\"Q\n\x11OpenLeasesRequest\x12\x0f\n\x07\x61\x63\x63ount\x18\x01 \x01(\t\x12\x10\n\x08\x65pisodes\x18\x02 \x03(\x04\x12\x19\n\x11units_per_episode\x18\x03 \x01(\r\"[\n\x12OpenLeasesResponse\x12 \n\x06leases\x18\x01 \x03(\x0b\x32\x10.tandem.v1.Lease\x12#\n\x07\x61\x63\x63ount\x18\x02 \x01(\x0b\x32\x12.tandem.v1.Account\"<\n\x05Lease\x12\x0f\n\x07\x65pisode\x18\x01 \x01(\x04\x12\r\n\x05units\x18\x02 \x01(\r\x12\x13\n\x0b\x65\x61rly_units\x18\x03 \x01(\r\"8\n\x13SettleLeasesRequest\x12\x0f\n\x07\x61\x63\x63ount\x18\x01 \x01(\t\x12\x10\n\x08\x65pisodes\x18\x02 \x03(\x04\x32\xe7\x03\n\x07Teacher\x12\x43\n\x08\x44\x65scribe\x12\x1a.tandem.v1.DescribeRequest\x1a\x1b.tandem.v1.DescribeResponse\x12@\n\x0bOpenAccount\x12\x1d.tandem.v1.OpenAccountRequest\x1a\x12.tandem.v1.Account\x12>\n\nGetAccount\x12\x1c.tandem.v1.GetAccountRequest\x1a\x12.tandem.v1.Account\x12=\n\x06\x41\x64vise\x12\x18.tandem.v1.AdviseRequest\x1a\x19.tandem.v1.AdviseResponse\x12G\n\x0c\x41\x64viseStream\x12\x18.tandem.v1.AdviseRequest\x1a\x19.tandem.v1.AdviseResponse(\x01\x30\x01\x12I\n\nOpenLeases\x12\x1c.tandem.v1.OpenLeasesRequest\x1a\x1d.tandem.v1.OpenLeasesResponse\x12\x42\n\x0cSettleLeases\x12\x1e.tandem.v1.SettleLeasesRequest\x1a\x12.tandem.v1.Accountb\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
 _builder.BuildTopDescriptorsAndMessages(DESCRIPTOR, 'tandem.v1.teacher_pb2', _globals)
 if not _descriptor._USE_C_DESCRIPTORS:
   DESCRIPTOR._loaded_options = None
-  _globals['_DESCRIBEREQUEST']._serialized_start=38
-  _globals['_DESCRIBEREQUEST']._serialized_end=55
-  _globals['_DESCRIBERESPONSE']._serialized_start=58
-  _globals['_DESCRIBERESPONSE']._serialized_end=247
-  _globals['_ARMMAP']._serialized_start=250
-  _globals['_ARMMAP']._serialized_end=378
-  _globals['_INDEXRANGE']._serialized_start=380
-  _globals['_INDEXRANGE']._serialized_end=420
-  _globals['_OPENACCOUNTREQUEST']._serialized_start=422
-  _globals['_OPENACCOUNTREQUEST']._serialized_end=490
-  _globals['_GETACCOUNTREQUEST']._serialized_start=492
-  _globals['_GETACCOUNTREQUEST']._serialized_end=525
-  _globals['_ACCOUNT']._serialized_start=527
-  _globals['_ACCOUNT']._serialized_end=646
-  _globals['_ADVISEREQUEST']._serialized_start=648
-  _globals['_ADVISEREQUEST']._serialized_end=717
-  _globals['_STEPQUERY']._serialized_start=719
-  _globals['_STEPQUERY']._serialized_end=821
-  _globals['_ADVISERESPONSE']._serialized_start=823
-  _globals['_ADVISERESPONSE']._serialized_end=898
-  _globals['_STEPADVICE']._serialized_start=900
-  _globals['_STEPADVICE']._serialized_end=981
-  _globals['_ARMADVICE']._serialized_start=984
-  _globals['_ARMADVICE']._serialized_end=1115
-  _globals['_OPENLEASESREQUEST']._serialized_start=1117
-  _globals['_OPENLEASESREQUEST']._serialized_end=1198
-  _globals['_OPENLEASESRESPONSE']._serialized_start=1200
-  _globals['_OPENLEASESRESPONSE']._serialized_end=1291
-  _globals['_LEASE']._serialized_start=1293
-  _globals['_LEASE']._serialized_end=1353
-  _globals['_SETTLELEASESREQUEST']._serialized_start=1355
-  _globals['_SETTLELEASESREQUEST']._serialized_end=1411
-  _globals['_TEACHER']._serialized_start=1414
-  _globals['_TEACHER']._serialized_end=1901
+  _globals['_DESCRIBEREQUEST']._serialized_start=60
+  _globals['_DESCRIBEREQUEST']._serialized_end=77
+  _globals['_DESCRIBERESPONSE']._serialized_start=80
+  _globals['_DESCRIBERESPONSE']._serialized_end=323
+  _globals['_ARMMAP']._serialized_start=326
+  _globals['_ARMMAP']._serialized_end=454
+  _globals['_INDEXRANGE']._serialized_start=456
+  _globals['_INDEXRANGE']._serialized_end=496
+  _globals['_OPENACCOUNTREQUEST']._serialized_start=498
+  _globals['_OPENACCOUNTREQUEST']._serialized_end=566
+  _globals['_GETACCOUNTREQUEST']._serialized_start=568
+  _globals['_GETACCOUNTREQUEST']._serialized_end=601
+  _globals['_ACCOUNT']._serialized_start=603
+  _globals['_ACCOUNT']._serialized_end=722
+  _globals['_ADVISEREQUEST']._serialized_start=724
+  _globals['_ADVISEREQUEST']._serialized_end=793
+  _globals['_STEPQUERY']._serialized_start=795
+  _globals['_STEPQUERY']._serialized_end=897
+  _globals['_ADVISERESPONSE']._serialized_start=899
+  _globals['_ADVISERESPONSE']._serialized_end=974
+  _globals['_STEPADVICE']._serialized_start=976
+  _globals['_STEPADVICE']._serialized_end=1057
+  _globals['_ARMADVICE']._serialized_start=1060
+  _globals['_ARMADVICE']._serialized_end=1191
+  _globals['_OPENLEASESREQUEST']._serialized_start=1193
+  _globals['_OPENLEASESREQUEST']._serialized_end=1274
+  _globals['_OPENLEASESRESPONSE']._serialized_start=1276
+  _globals['_OPENLEASESRESPONSE']._serialized_end=1367
+  _globals['_LEASE']._serialized_start=1369
+  _globals['_LEASE']._serialized_end=1429
+  _globals['_SETTLELEASESREQUEST']._serialized_start=1431
+  _globals['_SETTLELEASESREQUEST']._serialized_end=1487
+  _globals['_TEACHER']._serialized_start=1490
+  _globals['_TEACHER']._serialized_end=1977
 # @@protoc_insertion_point(module_scope)

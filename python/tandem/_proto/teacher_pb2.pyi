@@ -1,3 +1,4 @@
+from . import task_pb2 as _task_pb2
 from google.protobuf.internal import containers as _containers
 from google.protobuf import descriptor as _descriptor
 from google.protobuf import message as _message
@@ -11,7 +12,7 @@ class DescribeRequest(_message.Message):
     def __init__(self) -> None: ...
 
 class DescribeResponse(_message.Message):
-    __slots__ = ("task", "n_observation_per_arm", "n_goal_per_arm", "n_action_per_arm", "arms", "strategies", "policy_digest")
+    __slots__ = ("task", "n_observation_per_arm", "n_goal_per_arm", "n_action_per_arm", "arms", "strategies", "policy_digest", "task_description")
     TASK_FIELD_NUMBER: _ClassVar[int]
     N_OBSERVATION_PER_ARM_FIELD_NUMBER: _ClassVar[int]
     N_GOAL_PER_ARM_FIELD_NUMBER: _ClassVar[int]
@@ -19,6 +20,7 @@ class DescribeResponse(_message.Message):
     ARMS_FIELD_NUMBER: _ClassVar[int]
     STRATEGIES_FIELD_NUMBER: _ClassVar[int]
     POLICY_DIGEST_FIELD_NUMBER: _ClassVar[int]
+    TASK_DESCRIPTION_FIELD_NUMBER: _ClassVar[int]
     task: str
     n_observation_per_arm: int
     n_goal_per_arm: int
@@ -26,7 +28,8 @@ class DescribeResponse(_message.Message):
     arms: _containers.RepeatedCompositeFieldContainer[ArmMap]
     strategies: _containers.RepeatedScalarFieldContainer[str]
     policy_digest: str
-    def __init__(self, task: _Optional[str] = ..., n_observation_per_arm: _Optional[int] = ..., n_goal_per_arm: _Optional[int] = ..., n_action_per_arm: _Optional[int] = ..., arms: _Optional[_Iterable[_Union[ArmMap, _Mapping]]] = ..., strategies: _Optional[_Iterable[str]] = ..., policy_digest: _Optional[str] = ...) -> None: ...
+    task_description: _task_pb2.TaskDescription
+    def __init__(self, task: _Optional[str] = ..., n_observation_per_arm: _Optional[int] = ..., n_goal_per_arm: _Optional[int] = ..., n_action_per_arm: _Optional[int] = ..., arms: _Optional[_Iterable[_Union[ArmMap, _Mapping]]] = ..., strategies: _Optional[_Iterable[str]] = ..., policy_digest: _Optional[str] = ..., task_description: _Optional[_Union[_task_pb2.TaskDescription, _Mapping]] = ...) -> None: ...
 
 class ArmMap(_message.Message):
     __slots__ = ("observation", "goal", "action")

@@ -28,8 +28,10 @@ if _version_not_supported:
 class TeacherStub(object):
     """Advises each arm of a student with a one-arm policy. All advice of an account shares one budget.
 
-    An observation has 28 numbers per arm, a goal 3, and an action 3 (push) or 4 (pick and place). Vectors of several
-    arms are concatenated in arm order, each part in the arm's own frame. Lengths are in metres; actions are in [-1, 1].
+    `Describe` returns the teacher's task. In requests and responses, the vectors of a student are the parts of its arms,
+    concatenated in arm order; a student whose own vectors have another order rearranges them. In the built-in tasks, an
+    arm's observation has 28 numbers, its goal 3, and its action 3 (push) or 4 (pick and place), in the arm's own frame
+    and in metres. Actions are in [-1, 1].
     """
 
     def __init__(self, channel):
@@ -78,8 +80,10 @@ class TeacherStub(object):
 class TeacherServicer(object):
     """Advises each arm of a student with a one-arm policy. All advice of an account shares one budget.
 
-    An observation has 28 numbers per arm, a goal 3, and an action 3 (push) or 4 (pick and place). Vectors of several
-    arms are concatenated in arm order, each part in the arm's own frame. Lengths are in metres; actions are in [-1, 1].
+    `Describe` returns the teacher's task. In requests and responses, the vectors of a student are the parts of its arms,
+    concatenated in arm order; a student whose own vectors have another order rearranges them. In the built-in tasks, an
+    arm's observation has 28 numbers, its goal 3, and its action 3 (push) or 4 (pick and place), in the arm's own frame
+    and in metres. Actions are in [-1, 1].
     """
 
     def Describe(self, request, context):
@@ -181,8 +185,10 @@ def add_TeacherServicer_to_server(servicer, server):
 class Teacher(object):
     """Advises each arm of a student with a one-arm policy. All advice of an account shares one budget.
 
-    An observation has 28 numbers per arm, a goal 3, and an action 3 (push) or 4 (pick and place). Vectors of several
-    arms are concatenated in arm order, each part in the arm's own frame. Lengths are in metres; actions are in [-1, 1].
+    `Describe` returns the teacher's task. In requests and responses, the vectors of a student are the parts of its arms,
+    concatenated in arm order; a student whose own vectors have another order rearranges them. In the built-in tasks, an
+    arm's observation has 28 numbers, its goal 3, and its action 3 (push) or 4 (pick and place), in the arm's own frame
+    and in metres. Actions are in [-1, 1].
     """
 
     @staticmethod
