@@ -176,7 +176,7 @@ pub(crate) fn guard(command: OsString) -> Result<u8, Failed> {
             .spawn()
             .or_exit(Exit::TryAgain, || "cannot start /bin/sh".to_owned())?;
         let group = child.id().and_then(|id| Pid::from_raw(i32::try_from(id).ok()?));
-        // The pipe stays open as long as this process lives, whatever ends it.
+        // The kernel closes the pipe when this process ends, even if it is killed.
         let _input = child.stdin.take();
         let status = tokio::select! {
             status = child.wait() => status,

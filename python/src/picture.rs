@@ -29,7 +29,7 @@ const PEDESTAL_COLOR: Rgb = DVec3::new(89.0, 97.0, 107.0);
 const SKY_COLORS: [Rgb; 2] = [DVec3::new(247.0, 249.0, 251.0), DVec3::new(223.0, 229.0, 235.0)];
 /// Direction towards the light, a unit vector.
 const LIGHT: DVec3 = DVec3::new(-0.36, -0.48, 0.80);
-/// Ratio of the brightness in a shadow to that beside it.
+/// Brightness of a surface in shadow relative to the same surface in light.
 const SHADOW: f64 = 0.84;
 /// Opacity of goals.
 const GOAL_OPACITY: f64 = 0.34;

@@ -10,7 +10,7 @@ use crate::text::shortened;
 const MAX_SHOWN_CHARS: usize = 60;
 
 /// The description of a task: the vectors of its environment, the parts of these vectors that belong to each arm, the
-/// sparse reward and the length of an episode. Learner, teacher and workers know nothing else about a task.
+/// sparse reward and the length of an episode. Learner, teacher and workers use no other knowledge of a task.
 ///
 /// It is data from files and messages and may be inconsistent; a [`TaskSpec`](super::TaskSpec) is checked.
 #[derive(Debug, Clone, PartialEq, Deserialize, Serialize)]
