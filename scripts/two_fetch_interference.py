@@ -20,7 +20,7 @@ EXAMPLES = """examples:
 Needs: pip install './python[fetch]'
 """
 CLEAR_Z_M, LOW_Z_M = 0.49, 0.42
-BEHIND_M = 0.075
+BEHIND_M, ASIDE_M, CATCH_UP_M = 0.08, 0.03, 0.035
 
 
 class Pusher:
@@ -40,7 +40,7 @@ class Pusher:
         offset = hand[:2] - cube[:2]
         along, aside = offset @ ahead, np.linalg.norm(offset - (offset @ ahead) * ahead)
         behind = cube[:2] - BEHIND_M * ahead
-        if self.lowered and (along > -0.02 or aside > 0.03):
+        if self.lowered and (along > -0.005 or aside > ASIDE_M):
             self.lowered = False
         if not self.lowered:
             near = np.linalg.norm(hand[:2] - behind) < 0.02
@@ -50,7 +50,7 @@ class Pusher:
             self.lowered = near and hand[2] < LOW_Z_M + 0.015
         else:
             reach = min(length, 0.04)
-            target = np.append(cube[:2] + (reach - 0.035) * ahead, LOW_Z_M)
+            target = np.append(cube[:2] + (reach - CATCH_UP_M) * ahead, LOW_Z_M)
         return np.append(np.clip((target - hand) / 0.035, -1, 1), 0.0)
 
 

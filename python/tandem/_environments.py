@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import importlib
 import multiprocessing
 import os
 import signal
@@ -12,23 +11,18 @@ import struct
 import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, cast
+from typing import Any
 
-import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
 from tandem._grpc import Path, Refused, Server, ServiceError, grpc
+from tandem._gym import EnvFn, GymEnvironment, make
 from tandem._proto import environment_pb2, environment_pb2_grpc
-from tandem._task import DEFAULT_BOUND, Arm, Floats, Norm, Task, TaskOptions, describe, distance
-
-EnvFn = str | tuple[str, dict[str, Any]] | Callable[[], gymnasium.Env[Any, Any]]
-"""An id for `gymnasium.make`, an id with arguments, or a function that creates an environment."""
+from tandem._task import Arm, Floats, Norm, Task, TaskOptions, describe
 
 LISTEN_VARIABLE = "TANDEM_ENV_LISTEN"
 """The environment variable with the address on which a worker wants its server to listen."""
-_PACKAGES = ("gymnasium_robotics", "panda_gym")
-"""Packages that register environments when they are imported."""
 _FLOAT = np.dtype("<f4")
 ACTION_SLACK = 1e-6
 """The distance by which rounding may move an action out of [-1, 1]."""
@@ -42,91 +36,6 @@ def episode_seed(seed: int, episode: int) -> int:
     """
     digest = hashlib.sha256(struct.pack("<QQ", seed, episode)).digest()
     return int.from_bytes(digest[:4], "little")
-
-
-def make(env_fn: EnvFn) -> gymnasium.Env[Any, Any]:
-    """Creates an environment from its id or its constructor."""
-    if callable(env_fn):
-        return env_fn()
-    name, kwargs = (env_fn, {}) if isinstance(env_fn, str) else env_fn
-    try:
-        return gymnasium.make(name, **kwargs)
-    except (gymnasium.error.NameNotFound, gymnasium.error.NamespaceNotFound, gymnasium.error.VersionNotFound):
-        for package in _PACKAGES:
-            with contextlib.suppress(ImportError):
-                importlib.import_module(package)
-    try:
-        return gymnasium.make(name, **kwargs)
-    except (gymnasium.error.Error, ImportError) as error:
-        raise ServiceError(f"no environment {name!r}: {error}; MODULE:ID imports a module first") from error
-
-
-class GymEnvironment:
-    """A Gymnasium environment with the vectors of its task."""
-
-    def __init__(self, env: gymnasium.Env[Any, Any], task: Task, appends_goal: bool) -> None:
-        self._env = env
-        self._task = task
-        self._appends_goal = appends_goal
-        self._bounds = np.asarray(task.observation_bound, np.float32)
-        self._goal_bounds = np.asarray(task.goal_bound, np.float32)
-        space = cast(gymnasium.spaces.Box, env.action_space)
-        self._dtype = space.dtype
-        self._low = space.low.astype(np.float64)
-        self._range = space.high.astype(np.float64) - self._low
-        self._is_unscaled = bool((space.low == -1).all() and (space.high == 1).all())
-        self._n_steps = 0
-
-    def reset(self, seed: int) -> tuple[Floats, Floats]:
-        """Starts an episode. Returns the observation, shape `[n_observation]`, and the goal, shape `[n_goal]`."""
-        observation, _ = self._env.reset(seed=seed)
-        self._n_steps = 0
-        goal = np.asarray(observation["desired_goal"], np.float32)
-        _check_numbers("desired_goal", goal, self._goal_bounds)
-        return self._vector(observation), goal
-
-    def step(self, action: Floats) -> Floats:
-        """Executes an action in [-1, 1], shape `[n_action]`. Returns the observation, shape `[n_observation]`."""
-        observation, _, terminated, _, _ = self._env.step(self._own_action(action))
-        self._n_steps += 1
-        if terminated and self._n_steps < self._task.episode_steps:
-            self._check_termination(observation)
-        return self._vector(observation)
-
-    def close(self) -> None:
-        """Closes the environment."""
-        self._env.close()
-
-    def _own_action(self, action: Floats) -> NDArray[Any]:
-        action = np.clip(action, -1, 1)
-        if self._is_unscaled:
-            return action.astype(self._dtype)
-        return (self._low + (action.astype(np.float64) + 1) / 2 * self._range).astype(self._dtype)
-
-    def _vector(self, observation: dict[str, Any]) -> Floats:
-        parts = [observation["observation"]]
-        if self._appends_goal:
-            parts.append(observation["achieved_goal"])
-        vector = np.concatenate(parts).astype(np.float32)
-        _check_numbers("observation", vector, self._bounds)
-        return vector
-
-    def _check_termination(self, observation: dict[str, Any]) -> None:
-        """Accepts an end because the goal is achieved, after which the environment is stepped on."""
-        task = self._task
-        if distance(task.norm, observation["achieved_goal"], observation["desired_goal"]) > task.tolerance:
-            raise RuntimeError(
-                f"the environment terminated at step {self._n_steps} without its goal: "
-                f"an episode always has {task.episode_steps} steps"
-            )
-
-
-def _check_numbers(name: str, numbers: Floats, bounds: Floats) -> None:
-    # Written so that NaN fails the comparison.
-    within = np.abs(numbers) <= bounds
-    if not within.all():
-        index = int(np.argmin(within))
-        raise RuntimeError(f"{name}[{index}] is {numbers[index]:g}, beyond its bound {bounds[index]:g}")
 
 
 class _Environments:
@@ -146,7 +55,7 @@ class _Environments:
                 answers.append(self._environments[index].reset(seed))
         return answers
 
-    def step(self, actions: Sequence[tuple[int, Floats]]) -> list[Floats]:
+    def step(self, actions: Sequence[tuple[int, Floats]]) -> list[tuple[Floats, int]]:
         """Executes actions, given with the indices of their environments."""
         answers = []
         for index, action in actions:
@@ -291,8 +200,9 @@ class _Stream:
         actions = decode_floats("step.actions", request.actions, self._n, self._task.n_action)
         check_actions("step.actions", actions)
         answers = self._environments.step(list(enumerate(actions)))
-        observations = b"".join(observation.astype(_FLOAT).tobytes() for observation in answers)
-        return environment_pb2.PlayResponse(observations=observations)
+        observations = b"".join(observation.astype(_FLOAT).tobytes() for observation, _ in answers)
+        contacts = bytes(bits for _, bits in answers) if self._task.reports_contacts else b""
+        return environment_pb2.PlayResponse(observations=observations, contacts=contacts)
 
 
 def _invalid(message: str) -> Refused:
@@ -390,11 +300,15 @@ class EnvironmentServer(Server):
         max_streams: int = 16,
         name: str | None = None,
         arms: Sequence[Arm] | None = None,
-        interchangeable_arms: bool = False,
+        achieved_goal: Sequence[int] | None = None,
+        interchangeable_arms: bool | None = None,
+        origin_distance: float | None = None,
+        recombination_gap: float | None = None,
+        reports_contacts: bool | None = None,
         tolerance: float | None = None,
         norm: Norm | None = None,
         episode_steps: int | None = None,
-        bound: float = DEFAULT_BOUND,
+        bound: float | None = None,
         token_file: Path | None = None,
         tls_cert: Path | None = None,
         tls_key: Path | None = None,
@@ -404,9 +318,21 @@ class EnvironmentServer(Server):
             raise ServiceError(f"a stream has 1 to 1024 environments, not {n}")
         if workers < 1 or max_streams < 1:
             raise ServiceError("workers and max_streams must be at least 1")
-        options = TaskOptions(name, arms, interchangeable_arms, tolerance, norm, episode_steps, bound)
+        given = {
+            "name": name,
+            "arms": arms,
+            "achieved_goal": achieved_goal,
+            "interchangeable_arms": interchangeable_arms,
+            "origin_distance": origin_distance,
+            "recombination_gap": recombination_gap,
+            "reports_contacts": reports_contacts,
+            "tolerance": tolerance,
+            "norm": norm,
+            "episode_steps": episode_steps,
+            "bound": bound,
+        }
         with contextlib.closing(make(env_fn)) as env:
-            self.task, appends_goal = describe(env, options)
+            self.task, appends_goal = describe(env, TaskOptions.combined(env, given))
         task = self.task
 
         def create() -> GymEnvironment:
@@ -431,6 +357,9 @@ def serve(env_fn: EnvFn, *, listen: str | None = None, **options: Any) -> None:
     `TANDEM_ENV_LISTEN`, or a free port of 127.0.0.1. If the variable is set, the server also ends when standard input
     is closed.
 
+    An environment may describe itself: the arguments from `name` to `bound` default to the items of the dictionary
+    `tandem_task`, an attribute of the environment.
+
     Arguments:
       env_fn: a function that creates a Gymnasium environment, or an id for `gymnasium.make`. The observation is a Dict
         of observation, achieved_goal and desired_goal; the action space is a bounded Box.
@@ -439,11 +368,15 @@ def serve(env_fn: EnvFn, *, listen: str | None = None, **options: Any) -> None:
       max_streams: the largest number of simultaneous streams.
       name: the name of the task; by default the environment's id in lower case.
       arms: the indices of each arm's part of the vectors (`tandem.Arm`); by default one arm with all of them.
+      achieved_goal: the indices of the achieved goal in the observation; by default they are found by playing.
       interchangeable_arms: whether exchanging the parts of two arms gives another valid transition.
+      origin_distance, recombination_gap: where parts of two arms from different steps may be recombined, as in
+        `tandem.v1.TaskDescription`; for arms with `position`.
+      reports_contacts: whether infos have `arm_contact`, and optionally `table_contact`, which learning then charges.
       tolerance, norm: when a goal counts as achieved; by default `distance_threshold` of the environment, and the norm
         with which its rewards agree.
       episode_steps: control steps per episode; by default `max_episode_steps` of its spec.
-      bound: the largest magnitude of numbers for which the spaces have no bound.
+      bound: the largest magnitude of numbers for which the spaces have no bound; by default 1000.
       token_file, tls_cert, tls_key, insecure: as the options of the same names of Tandem's services.
 
     Raises:

@@ -59,6 +59,10 @@ class Task:
     """The largest magnitude of each number, shape `[n_observation]`."""
     goal_bound: Sequence[float] = ()
     """The largest magnitude of each number, shape `[n_goal]`."""
+    origin_distance: float = 0.0
+    """The distance between the origins of two arms along the axis of their positions."""
+    recombination_gap: float = 0.0
+    """The smallest gap, along that axis, between arms whose parts are recombined."""
 
     @classmethod
     def built_in(cls, name: str) -> Task:
@@ -97,6 +101,8 @@ class Task:
             reports_contacts=self.reports_contacts,
             observation_bound=self.observation_bound,
             goal_bound=self.goal_bound,
+            origin_distance=self.origin_distance,
+            recombination_gap=self.recombination_gap,
         )
         for arm in self.arms:
             message.arms.add(observation=arm.observation, goal=arm.goal, action=arm.action, position=arm.position)
@@ -120,6 +126,8 @@ class Task:
             reports_contacts=message.reports_contacts,
             observation_bound=tuple(message.observation_bound),
             goal_bound=tuple(message.goal_bound),
+            origin_distance=message.origin_distance,
+            recombination_gap=message.recombination_gap,
         )
 
 
@@ -129,11 +137,24 @@ class TaskOptions:
 
     name: str | None = None
     arms: Sequence[Arm] | None = None
+    achieved_goal: Sequence[int] | None = None
     interchangeable_arms: bool = False
+    origin_distance: float = 0.0
+    recombination_gap: float = 0.0
+    reports_contacts: bool = False
     tolerance: float | None = None
     norm: Norm | None = None
     episode_steps: int | None = None
     bound: float = DEFAULT_BOUND
+
+    @classmethod
+    def combined(cls, env: gymnasium.Env[Any, Any], given: dict[str, Any]) -> TaskOptions:
+        """Returns the options that are given, and for the others those in `tandem_task` of the environment."""
+        own = dict(_attribute(env, "tandem_task") or {})
+        unknown = set(own) - {field.name for field in dataclasses.fields(cls)}
+        if unknown:
+            raise ServiceError(f"the environment's tandem_task has unknown items: {', '.join(sorted(unknown))}")
+        return cls(**{**own, **{name: value for name, value in given.items() if value is not None}})
 
 
 def describe(env: gymnasium.Env[Any, Any], options: TaskOptions) -> tuple[Task, bool]:
@@ -144,7 +165,11 @@ def describe(env: gymnasium.Env[Any, Any], options: TaskOptions) -> tuple[Task, 
     """
     spaces, action = _checked_spaces(env)
     samples = _probe(env)
+    if options.reports_contacts and "arm_contact" not in samples[-1].info:
+        raise ServiceError("reports_contacts: the infos of the environment's steps have no arm_contact")
     found = _find_achieved_goal(samples)
+    if options.achieved_goal is not None:
+        found = _checked_achieved_goal(samples, options.achieved_goal)
     n_goal = int(spaces["achieved_goal"].shape[0])
     n_own = int(spaces["observation"].shape[0])
     indices = tuple(range(n_own, n_own + n_goal)) if found is None else found
@@ -172,8 +197,11 @@ def describe(env: gymnasium.Env[Any, Any], options: TaskOptions) -> tuple[Task, 
         tolerance=tolerance,
         norm=_checked_norm(env, samples, tolerance, options.norm),
         interchangeable_arms=options.interchangeable_arms,
+        reports_contacts=options.reports_contacts,
         observation_bound=bounds,
         goal_bound=_bounds(spaces["desired_goal"], options.bound),
+        origin_distance=options.origin_distance,
+        recombination_gap=options.recombination_gap,
     )
     _check_arms(task)
     return task, found is None
@@ -243,6 +271,18 @@ def _find_achieved_goal(samples: list[_Sample]) -> tuple[int, ...] | None:
         if not unused:
             return None
         indices.append(unused[0])
+    return tuple(indices)
+
+
+def _checked_achieved_goal(samples: list[_Sample], indices: Sequence[int]) -> tuple[int, ...]:
+    """Returns the given indices of the achieved goal in the observation, if it is there in every sample."""
+    for sample in samples:
+        observation, achieved = sample.observation["observation"], sample.observation["achieved_goal"]
+        if len(indices) != len(achieved) or any(not 0 <= index < len(observation) for index in indices):
+            limits = f"{len(achieved)} indices from 0 to {len(observation) - 1}"
+            raise ServiceError(f"achieved_goal: expected {limits}, got {list(indices)}")
+        if not np.array_equal(observation[list(indices)], achieved):
+            raise ServiceError(f"the observation does not have the achieved goal at {list(indices)}")
     return tuple(indices)
 
 

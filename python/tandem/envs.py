@@ -23,6 +23,7 @@ _TASKS = {
     "tandem/TwoArmPush-v0": ("push", 2),
     "tandem/TwoArmPickAndPlace-v0": ("pick-and-place", 2),
 }
+_FETCH_TASKS = {"tandem/TwoFetchPush-v0": "push", "tandem/TwoFetchPickAndPlace-v0": "pick-and-place"}
 
 
 class TandemEnv(gymnasium.Env[Observation, Action]):
@@ -169,7 +170,7 @@ def check_rendering(render_mode: str | None, width: int, height: int) -> None:
 
 
 def register_envs() -> None:
-    """Registers the four environments with Gymnasium, once."""
+    """Registers the environments with Gymnasium, once."""
     for env_id, (task, n_arms) in _TASKS.items():
         if env_id not in gymnasium.registry:
             gymnasium.register(
@@ -178,4 +179,12 @@ def register_envs() -> None:
                 vector_entry_point="tandem.vector:TandemVectorEnv",
                 max_episode_steps=EPISODE_STEPS,
                 kwargs={"task": task, "n_arms": n_arms},
+            )
+    for env_id, task in _FETCH_TASKS.items():
+        if env_id not in gymnasium.registry:
+            gymnasium.register(
+                env_id,
+                entry_point="tandem.two_fetch:TwoFetchEnv",
+                max_episode_steps=EPISODE_STEPS,
+                kwargs={"task": task},
             )

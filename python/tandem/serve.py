@@ -5,20 +5,27 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+from typing import NoReturn
 
 from tandem._environments import LISTEN_VARIABLE, serve
 from tandem._grpc import ServiceError
-from tandem._task import DEFAULT_BOUND
+from tandem._task import DEFAULT_BOUND, Arm
+
+
+class _Parser(argparse.ArgumentParser):
+    def error(self, message: str) -> NoReturn:
+        self.exit(64, f"tandem.serve: {message}\n")
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+    parser = _Parser(
         prog="python -m tandem.serve",
         description="Serves a Gymnasium environment with goals, in which workers of Tandem play episodes.",
         epilog="""examples:
   python -m tandem.serve FetchPush-v4                        needs gymnasium-robotics and mujoco
   python -m tandem.serve my_package:MyArm-v0 --listen 127.0.0.1:7010
-  python -m tandem.serve PandaReach-v3 --workers 4
+  python -m tandem.serve PandaPush-v3 --workers 4            needs panda-gym
+  python -m tandem.serve tandem/TwoFetchPush-v0              two arms; needs gymnasium-robotics and mujoco
   tandem train --env-command 'python -m tandem.serve FetchPush-v4'
 
 Prints "listening on http://HOST:PORT" once it serves. Exit codes: 0 ended as asked, 64 the environment or an option
@@ -40,13 +47,39 @@ cannot be used.""",
     parser.add_argument("--norm", choices=["euclidean", "maximum"], help="norm of that distance")
     parser.add_argument("--episode-steps", type=int, help="control steps per episode [of the environment's spec]")
     parser.add_argument(
-        "--bound", type=float, default=DEFAULT_BOUND, help="magnitude of numbers without a bound [%(default)g]"
+        "--bound", type=float, help=f"magnitude of numbers without a bound [{DEFAULT_BOUND:g}]"
     )
+    _add_arms(parser.add_argument_group("arms", "by default those of the environment's tandem_task, or one arm"))
     parser.add_argument("--token-file", help="file with the access token; required on non-loopback addresses")
     parser.add_argument("--tls-cert", help="certificate chain (PEM): enables TLS")
     parser.add_argument("--tls-key", help="private key of the certificate (PEM)")
     parser.add_argument("--insecure", action="store_true", help="allow calls without a token on any address")
     return parser
+
+
+def _add_arms(group: argparse._ArgumentGroup) -> None:
+    group.add_argument(
+        "--arms",
+        type=_arms,
+        metavar="JSON",
+        help="list with an object per arm: lists of indices observation, goal, action and, optionally, position",
+    )
+    group.add_argument("--achieved-goal", type=json.loads, metavar="JSON", help="indices in the observation [found]")
+    group.add_argument(
+        "--interchangeable-arms", action="store_true", default=None, help="exchanging arms is another valid transition"
+    )
+    group.add_argument("--origin-distance", type=float, help="between the origins of two arms along their positions")
+    group.add_argument("--recombination-gap", type=float, help="smallest gap between arms that are recombined")
+    group.add_argument(
+        "--reports-contacts", action="store_true", default=None, help="infos have arm_contact, and maybe table_contact"
+    )
+
+
+def _arms(text: str) -> list[Arm]:
+    try:
+        return [Arm(**{name: tuple(indices) for name, indices in arm.items()}) for arm in json.loads(text)]
+    except (AttributeError, TypeError, ValueError) as error:
+        raise argparse.ArgumentTypeError(f"expected a list of objects with lists of indices: {error}") from None
 
 
 def main() -> int:

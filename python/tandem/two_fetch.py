@@ -107,6 +107,7 @@ class TwoFetchEnv(gymnasium.Env[Observation, Floats]):
         self.render_mode = render_mode
         self._size = (width, height)
         self._renderer: Any = None
+        self._is_started = False
         self._model = _model(self._task, self._origin_distance)
         self._data = mujoco.MjData(self._model)
         turned = np.array([self._origin_distance, 2 * _TABLE_Y_M, 0.0])
@@ -148,8 +149,7 @@ class TwoFetchEnv(gymnasium.Env[Observation, Floats]):
         if options:
             raise ValueError(f"unknown options {sorted(options)}: expected none")
         objects, goals = self._draw_objects(), self._draw_goals()
-        self.start(objects, goals)
-        return self._observe(), self._info(False)
+        return self.start(objects, goals), self._info(False)
 
     def step(self, action: ArrayLike) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Executes `action`, shape `[8]`, for one control step of 0.04 s.
@@ -157,6 +157,8 @@ class TwoFetchEnv(gymnasium.Env[Observation, Floats]):
         Raises:
             ValueError: The action has another length or contains a number that is not finite; nothing has moved.
         """
+        if not self._is_started:
+            raise RuntimeError("the environment has no episode yet: call reset first")
         numbers = np.asarray(action, np.float64)
         if numbers.shape != (2 * ACTION,) or not np.isfinite(numbers).all():
             raise ValueError(f"expected an action of {2 * ACTION} finite numbers, got {action}")
@@ -174,8 +176,8 @@ class TwoFetchEnv(gymnasium.Env[Observation, Floats]):
         reward = float(compute_reward(observation["achieved_goal"], self._goals))
         return observation, reward, False, False, self._info(touched)
 
-    def start(self, objects: ArrayLike, goals: ArrayLike) -> None:
-        """Starts an episode with the given positions.
+    def start(self, objects: ArrayLike, goals: ArrayLike) -> Observation:
+        """Starts an episode with the given positions, and returns the observation.
 
         Args:
             objects: x and y of each cube in its arm's frame, shape `[2, 2]`, metres.
@@ -189,6 +191,8 @@ class TwoFetchEnv(gymnasium.Env[Observation, Floats]):
             data.qpos[arm.object_qpos : arm.object_qpos + 2] = arm.to_world(np.append(xy, 0.0))[:2]
             model.site_pos[arm.target] = goal - arm.from_world(model.body_pos[model.site_bodyid[arm.target]])
         mujoco.mj_forward(model, data)
+        self._is_started = True
+        return self._observe()
 
     def compute_reward(self, achieved_goal: ArrayLike, desired_goal: ArrayLike, info: Any) -> Any:
         """Returns the sparse rewards of goals of shape `[..., 6]`, shape `[...]`; `info` has no effect."""

@@ -1,0 +1,177 @@
+"""Two Fetch robots: each arm is Fetch's own, the arms are exchangeable, and a seed determines an episode."""
+
+import copy
+import pickle
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+gymnasium_robotics = pytest.importorskip("gymnasium_robotics")
+pytest.importorskip("mujoco")
+
+import tandem
+from tandem.two_fetch import TwoFetchEnv
+
+gymnasium.register_envs(gymnasium_robotics)
+IDS = {"push": "tandem/TwoFetchPush-v0", "pick-and-place": "tandem/TwoFetchPickAndPlace-v0"}
+ONE_ARM = {"push": "FetchPush-v4", "pick-and-place": "FetchPickAndPlace-v4"}
+FAR_M = 3.0
+
+
+def towards(observation, rng):
+    """Returns an action, shape `[4]`, that leads the hand into the cube, with noise."""
+    way = observation[3:6] - observation[:3]
+    return np.append(np.clip(10 * way + rng.uniform(-0.5, 0.5, 3), -1, 1), rng.uniform(-1, 1))
+
+
+def observations(env, actions):
+    return np.array([env.step(action)[0]["observation"] for action in actions])
+
+
+def arms_of(observation):
+    return observation.reshape(*observation.shape[:-1], 2, 25)
+
+
+@pytest.mark.parametrize("task", IDS)
+def test_gymnasiums_checker_accepts_the_environment(task):
+    env = gymnasium.make(IDS[task])
+    with pytest.warns(UserWarning, match="Box observation space m.*imum value is"):
+        check_env(env.unwrapped, skip_render_check=True)
+    env.reset(seed=3)
+    ends = [env.step(env.action_space.sample())[2:4] for _ in range(50)]
+    assert ends == [(False, False)] * 49 + [(False, True)]
+
+
+@pytest.mark.parametrize("arm", [0, 1])
+@pytest.mark.parametrize("task", IDS)
+def test_an_arm_whose_neighbour_rests_far_away_is_fetchs(task, arm, rng):
+    one, two = gymnasium.make(ONE_ARM[task]).unwrapped, TwoFetchEnv(task, distance=FAR_M)
+    for seed in range(3):
+        alone, _ = one.reset(seed=seed)
+        objects, goals = np.array([[1.25, 0.6]] * 2), np.array([alone["desired_goal"]] * 2)
+        objects[arm] = alone["achieved_goal"][:2]
+        first = two.start(objects, goals)
+        assert np.allclose(arms_of(first["observation"])[arm], alone["observation"], rtol=0, atol=1e-12)
+        moved, n_steps = 0.0, 0
+        # Fetch's table ends at x = 1.55 m.
+        while moved < 0.1 and n_steps < 50 and alone["achieved_goal"][0] < 1.5:
+            n_steps += 1
+            action = np.zeros(8)
+            own = towards(alone["observation"], rng)
+            action[4 * arm : 4 * arm + 4] = own
+            alone, *_ = one.step(own)
+            pair, *_ = two.step(action)
+            assert np.allclose(arms_of(pair["observation"])[arm], alone["observation"], rtol=0, atol=1e-7)
+            moved = np.linalg.norm(alone["achieved_goal"][:2] - objects[arm])
+        assert moved > 0.02, "the hand has pushed the cube"
+
+
+@pytest.mark.parametrize("task", IDS)
+def test_arms_can_be_exchanged(task, rng):
+    objects, goals = np.array([[1.45, 0.66], [1.28, 0.84]]), np.array([[1.3, 0.7, 0.42], [1.4, 0.8, 0.42]])
+    actions = rng.uniform(-1, 1, (25, 2, 4))
+    actions[:, :, 0] = np.abs(actions[:, :, 0])  # towards each other
+    one, other = TwoFetchEnv(task, distance=0.3), TwoFetchEnv(task, distance=0.3)
+    one.start(objects, goals)
+    other.start(objects[::-1], goals[::-1])
+    touched = False
+    for action in actions:
+        first, *_, info = one.step(action.reshape(8))
+        second, *_, exchanged_info = other.step(action[::-1].reshape(8))
+        touched = touched or info["arm_contact"] or exchanged_info["arm_contact"]
+        # MuJoCo finds contacts between meshes iteratively, to about 1e-7 m.
+        tolerance = 1e-3 if touched else 1e-9
+        first, second = arms_of(first["observation"]), arms_of(second["observation"])
+        assert np.allclose(first, second[::-1], rtol=0, atol=tolerance)
+    assert touched, "the arms have met"
+    assert not np.allclose(first, second, rtol=0, atol=1e-2), "the arms differ"
+
+
+@pytest.mark.parametrize("task", IDS)
+def test_a_seed_and_actions_determine_the_bits(task, rng):
+    actions = rng.uniform(-1, 1, (20, 8))
+    fresh, used = TwoFetchEnv(task), TwoFetchEnv(task)
+    used.reset(seed=1)
+    observations(used, actions[::-1])
+    starts = [env.reset(seed=9)[0]["observation"] for env in (fresh, used)]
+    assert np.array_equal(*starts)
+    assert np.array_equal(observations(fresh, actions), observations(used, actions))
+    assert not np.array_equal(fresh.reset(seed=10)[0]["observation"], starts[0])
+
+
+def test_starts_and_goals_are_apart_and_overlap(rng):
+    env = TwoFetchEnv("push", distance=0.25)
+    reached = []
+    for seed in range(40):
+        observation, _ = env.reset(seed=seed)
+        cubes, goals = (observation[name].reshape(2, 3).copy() for name in ("achieved_goal", "desired_goal"))
+        for points in (cubes, goals):
+            points[1] = (env.tandem_task["origin_distance"] - points[1, 0], 1.5 - points[1, 1], points[1, 2])
+            assert np.linalg.norm((points[0] - points[1])[:2]) >= 0.1 - 1e-3
+        reached.append([goals[0, 0], goals[1, 0]])
+        assert observation["desired_goal"][2] == observation["desired_goal"][5] == pytest.approx(0.425, abs=1e-3)
+    assert np.max(reached, axis=0)[0] > np.min(reached, axis=0)[1], "the areas of the goals overlap"
+
+
+def test_contacts_between_the_robots_are_reported():
+    env = TwoFetchEnv("pick-and-place", distance=0.25)
+    env.reset(seed=1)
+    apart = np.array([-1, 0, 0, 0] * 2, np.float32)
+    assert not any(env.step(apart)[4]["arm_contact"] for _ in range(5))
+    env.reset(seed=1)
+    assert any(env.step(-apart)[4]["arm_contact"] for _ in range(15))
+
+
+def test_rewards_are_joint_and_success_is_per_arm():
+    env = TwoFetchEnv("push", distance=0.5)
+    cubes = np.array([[1.25, 0.65], [1.25, 0.65]])
+    heights = np.full((2, 1), 0.4249)
+    for offset, reward, is_success in [(0.03, 0.0, True), (0.04, -1.0, True), (0.06, -1.0, False)]:
+        env.start(cubes, np.hstack([cubes + [offset, 0.0], heights]))
+        observation, got, _, _, info = env.step(np.zeros(8))
+        assert (got, info["is_success"]) == (reward, is_success)
+        assert got == env.compute_reward(observation["achieved_goal"], observation["desired_goal"], info)
+
+
+def test_bad_actions_and_arguments_are_refused():
+    env = TwoFetchEnv("push")
+    env.reset(seed=4)
+    for action in (np.zeros(4), np.full(8, np.nan)):
+        with pytest.raises(ValueError, match="8 finite numbers"):
+            env.step(action)
+    with pytest.raises(RuntimeError, match="call reset first"):
+        TwoFetchEnv("push").step(np.zeros(8))
+    for arguments in ({"task": "lift"}, {"distance": 0.01}, {"render_mode": "human"}):
+        with pytest.raises(ValueError, match="expected"):
+            TwoFetchEnv(**arguments)
+
+
+@pytest.mark.parametrize("duplicate", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
+def test_a_copy_continues_the_episode_with_its_bits(duplicate, rng):
+    env = TwoFetchEnv("pick-and-place")
+    env.reset(seed=2)
+    observations(env, rng.uniform(-1, 1, (7, 8)))
+    other = duplicate(env)
+    actions = rng.uniform(-1, 1, (10, 8))
+    assert np.array_equal(observations(env, actions), observations(other, actions))
+    assert np.array_equal(env.reset()[0]["observation"], other.reset()[0]["observation"])
+
+
+@pytest.mark.parametrize("task", IDS)
+def test_a_served_arm_is_described_as_the_task_of_its_teacher(task):
+    pytest.importorskip("grpc")
+    with tandem.EnvironmentServer(ONE_ARM[task]) as server:
+        one = server.task
+    with tandem.EnvironmentServer(IDS[task]) as server:
+        two = server.task
+    same = ("name", "tolerance", "norm", "episode_steps", "reports_contacts")
+    assert [getattr(two, name) for name in same] == [getattr(one, name) for name in same]
+    for idx, arm in enumerate(two.arms):
+        for kind, n in (("observation", one.n_observation), ("goal", one.n_goal), ("action", one.n_action)):
+            assert list(getattr(arm, kind)) == list(range(n * idx, n * (idx + 1)))
+        assert [two.achieved_goal[goal] - 25 * idx for goal in arm.goal] == list(one.achieved_goal)
+        assert [two.observation_bound[number] for number in arm.observation] == list(one.observation_bound)
+        assert list(arm.position) == [25 * idx, 25 * idx + 3]
+    assert two.interchangeable_arms and two.origin_distance > two.recombination_gap > 0
