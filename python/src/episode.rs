@@ -18,6 +18,8 @@ pub(crate) struct Episode {
     pub(crate) reward: f32,
     pub(crate) is_success: bool,
     pub(crate) contacts: Contacts,
+    /// The actions executed so far, shape `[n_steps, n_action]`: with seed and number they determine the episode.
+    actions: Vec<f32>,
 }
 
 impl Episode {
@@ -38,6 +40,7 @@ impl Episode {
             reward: 0.0,
             is_success: false,
             contacts: Contacts::NONE,
+            actions: Vec::new(),
         })
     }
 
@@ -49,6 +52,7 @@ impl Episode {
     pub(crate) fn start(&mut self, seed: u64, number: u64) {
         self.env.reset(&mut episode_rng(seed, number, Stream::Reset), self.settings);
         self.contacts = Contacts::NONE;
+        self.actions.clear();
         self.observe();
         self.reward = 0.0;
     }
@@ -59,8 +63,34 @@ impl Episode {
     /// As [`Env::step`].
     pub(crate) fn step(&mut self, action: &[f32]) -> Result<(), SimError> {
         self.contacts = self.env.step(action)?;
+        self.actions.extend_from_slice(action);
         self.observe();
         Ok(())
+    }
+
+    /// Returns the actions executed so far, shape `[n_steps, n_action]`.
+    pub(crate) fn actions(&self) -> &[f32] {
+        &self.actions
+    }
+
+    /// Returns the settings of its starts and its physics.
+    pub(crate) const fn settings(&self) -> WorldSettings {
+        self.settings
+    }
+
+    /// Starts episode `number` of the run with seed `seed` and executes `actions`, shape `[n_steps, n_action]`. The
+    /// result has the bits of an episode in which the same actions were executed.
+    ///
+    /// # Errors
+    /// As [`Env::step`].
+    pub(crate) fn replay(
+        &mut self,
+        seed: u64,
+        number: u64,
+        actions: &[f32],
+    ) -> Result<(), SimError> {
+        self.start(seed, number);
+        actions.chunks(self.layout().n_action()).try_for_each(|action| self.step(action))
     }
 
     /// Updates observation, achieved goal, reward and success.

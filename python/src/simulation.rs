@@ -4,7 +4,7 @@ use numpy::{PyArray1, PyArray2, PyArray3, PyArrayMethods as _, PyReadonlyArray2}
 use pyo3::exceptions::PyRuntimeError;
 use pyo3::intern;
 use pyo3::prelude::*;
-use pyo3::types::PyDict;
+use pyo3::types::{PyDict, PyTuple};
 use tandem_core::reward::sparse_reward;
 use tandem_core::{Contacts, WorldSettings};
 use tandem_sim::SimError;
@@ -15,11 +15,21 @@ use crate::picture::picture;
 /// Observation, reward, terminated, truncated and info, as `gymnasium.Env.step` returns them.
 type Step<'py> = (Bound<'py, PyDict>, f32, bool, bool, Bound<'py, PyDict>);
 
+/// The arguments of a constructor, for pickling: positional ones and keyword arguments.
+pub(crate) type NewArguments<'py> = (Bound<'py, PyTuple>, Bound<'py, PyDict>);
+/// Seed, number of the episode, and the actions executed so far, shape `[n_steps, n_action]`.
+pub(crate) type Course = (u64, u64, Vec<f32>);
+
 /// One environment. `tandem.TandemEnv` gives it Gymnasium's interface.
+///
+/// A copy and a pickled simulation continue the current episode with the same bits: its seed, number and actions
+/// determine it.
 #[pyclass(module = "tandem._native")]
+#[derive(Clone)]
 pub(crate) struct Simulation {
     episode: Episode,
-    is_started: bool,
+    /// Seed and number of the current episode; `None` before the first reset.
+    started: Option<(u64, u64)>,
 }
 
 #[pymethods]
@@ -28,7 +38,7 @@ impl Simulation {
     #[pyo3(signature = (task, n_arms, *, substeps, grasped_start_prob))]
     fn new(task: &str, n_arms: usize, substeps: u32, grasped_start_prob: f32) -> PyResult<Self> {
         let settings = WorldSettings { grasped_start_prob, substeps };
-        Ok(Self { episode: Episode::new(task, n_arms, settings)?, is_started: false })
+        Ok(Self { episode: Episode::new(task, n_arms, settings)?, started: None })
     }
 
     /// Length of an action.
@@ -61,7 +71,7 @@ impl Simulation {
         number: u64,
     ) -> PyResult<(Bound<'py, PyDict>, Bound<'py, PyDict>)> {
         py.detach(|| self.episode.start(seed, number));
-        self.is_started = true;
+        self.started = Some((seed, number));
         Ok((self.observation(py)?, self.info(py)?))
     }
 
@@ -106,6 +116,31 @@ impl Simulation {
         PyArray1::from_vec(py, observations).reshape([n_steps, n_observation])
     }
 
+    fn __copy__(&self) -> Self {
+        self.clone()
+    }
+
+    fn __deepcopy__(&self, _memo: &Bound<'_, PyAny>) -> Self {
+        self.clone()
+    }
+
+    fn __getnewargs_ex__<'py>(&self, py: Python<'py>) -> PyResult<NewArguments<'py>> {
+        let layout = self.episode.layout();
+        let positional = (layout.task.to_string(), layout.n_arms).into_pyobject(py)?;
+        Ok((positional, settings_arguments(py, self.episode.settings())?))
+    }
+
+    fn __getstate__(&self) -> Option<Course> {
+        self.started.map(|(seed, number)| (seed, number, self.episode.actions().to_vec()))
+    }
+
+    fn __setstate__(&mut self, py: Python<'_>, state: Option<Course>) -> PyResult<()> {
+        let Some((seed, number, actions)) = state else { return Ok(()) };
+        self.started = Some((seed, number));
+        let episode = &mut self.episode;
+        py.detach(|| episode.replay(seed, number, &actions)).map_err(|error| step_error(&error))
+    }
+
     /// Draws the scene: red, green and blue, shape `[height, width, 3]`.
     fn render<'py>(
         &self,
@@ -133,7 +168,7 @@ impl Simulation {
     }
 
     fn check_started(&self) -> PyResult<()> {
-        if self.is_started {
+        if self.started.is_some() {
             return Ok(());
         }
         Err(PyRuntimeError::new_err("the environment has no episode yet: call reset first"))
@@ -156,6 +191,17 @@ impl Simulation {
         dict.set_item(intern!(py, "table_contact"), contacts.contains(Contacts::ARM_TABLE))?;
         Ok(dict)
     }
+}
+
+/// Returns the keyword arguments that give an environment its settings.
+pub(crate) fn settings_arguments(
+    py: Python<'_>,
+    settings: WorldSettings,
+) -> PyResult<Bound<'_, PyDict>> {
+    let arguments = PyDict::new(py);
+    arguments.set_item("substeps", settings.substeps)?;
+    arguments.set_item("grasped_start_prob", settings.grasped_start_prob)?;
+    Ok(arguments)
 }
 
 /// Returns the numbers of an action: a float32 array, or any sequence of numbers.

@@ -9,6 +9,7 @@ use tandem_sim::SimError;
 
 use crate::episode::{Episode, step_error, value_error};
 use crate::picture::picture;
+use crate::simulation::{Course, NewArguments, settings_arguments};
 
 /// When an environment whose episode is over starts the next one; the modes of Gymnasium.
 #[derive(Clone, Copy, PartialEq, Eq)]
@@ -51,9 +52,12 @@ type Infos<'py> =
 type Steps<'py> =
     (Observations<'py>, Bound<'py, PyArray1<f64>>, Bound<'py, PyArray1<bool>>, Infos<'py>);
 
+/// What pickling keeps of an environment of many: its episode, whether it is started and whether it is over.
+type SlotState = (Course, bool, bool);
+
 /// Environments that are stepped in parallel. `tandem.TandemVectorEnv` gives them Gymnasium's interface.
 ///
-/// Results do not depend on the number of threads.
+/// Results do not depend on the number of threads. Pickled environments continue their episodes with the same bits.
 #[pyclass(module = "tandem._native")]
 pub(crate) struct VectorSimulation {
     slots: Vec<Slot>,
@@ -167,6 +171,29 @@ impl VectorSimulation {
         Ok((observations, infos_of(py, infos)))
     }
 
+    fn __getnewargs_ex__<'py>(&self, py: Python<'py>) -> PyResult<NewArguments<'py>> {
+        let episode = &self.slots[0].episode;
+        let layout = episode.layout();
+        let positional = (layout.task.to_string(), layout.n_arms, self.slots.len());
+        let keywords = settings_arguments(py, episode.settings())?;
+        keywords.set_item("max_episode_steps", self.max_episode_steps)?;
+        keywords.set_item("autoreset", self.autoreset.name())?;
+        keywords.set_item("num_threads", self.threads.current_num_threads())?;
+        Ok((positional.into_pyobject(py)?, keywords))
+    }
+
+    fn __getstate__(&self) -> Vec<SlotState> {
+        self.slots.iter().map(Slot::state).collect()
+    }
+
+    fn __setstate__(&mut self, py: Python<'_>, state: Vec<SlotState>) -> PyResult<()> {
+        self.check_length("state", state.len())?;
+        let (slots, threads) = (&mut self.slots, &self.threads);
+        let restore = |(slot, state): (&mut Slot, SlotState)| slot.restore(state);
+        py.detach(|| threads.install(|| slots.par_iter_mut().zip(state).try_for_each(restore)))
+            .map_err(|error| step_error(&error))
+    }
+
     /// Draws the scene of every environment, shape `[height, width, 3]` each.
     fn render<'py>(
         &self,
@@ -182,7 +209,35 @@ impl VectorSimulation {
     }
 }
 
+impl Autoreset {
+    const fn name(self) -> &'static str {
+        match self {
+            Self::NextStep => "next_step",
+            Self::SameStep => "same_step",
+            Self::Disabled => "disabled",
+        }
+    }
+}
+
 impl Slot {
+    fn state(&self) -> SlotState {
+        let course = (self.seed, self.number, self.episode.actions().to_vec());
+        (course, self.is_started, self.is_over)
+    }
+
+    fn restore(&mut self, state: SlotState) -> Result<(), SimError> {
+        let (seed, number, actions);
+        ((seed, number, actions), self.is_started, self.is_over) = state;
+        (self.seed, self.number, self.n_steps, self.last) = (seed, number, 0, None);
+        if !self.is_started {
+            return Ok(());
+        }
+        self.episode.replay(seed, number, &actions)?;
+        let n_steps = actions.len() / self.episode.layout().n_action();
+        self.n_steps = u32::try_from(n_steps).unwrap_or(u32::MAX);
+        Ok(())
+    }
+
     /// Starts the first episode of the run of `seed`, or the next one of the current run.
     fn start(&mut self, seed: Option<u64>) {
         (self.seed, self.number) = match seed {

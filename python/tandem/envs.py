@@ -37,6 +37,9 @@ class TandemEnv(gymnasium.Env[Observation, Action]):
 
     An episode never terminates. `gymnasium.make` truncates it after 50 steps.
 
+    Environments can be pickled and copied. A copy continues the current episode with the same bits: unpickling plays
+    the episode's actions again.
+
     `reset(seed=s)` starts episode 0 of seed `s`, and each `reset()` after it the next episode. The number of an
     episode can be chosen with `reset(options={"episode": k})`. Given seed and number, the episode has the same bits as
     in the Rust crates.

@@ -27,7 +27,9 @@ class CorrectedPanda(gymnasium.Wrapper[Any, Any, Any, Any]):
     def __init__(self, env: gymnasium.Env[Any, Any]) -> None:
         super().__init__(env)
         space: Any = env.observation_space
-        unbounded = {name: spaces.Box(-np.inf, np.inf, box.shape, box.dtype) for name, box in space.items()}
+        unbounded: dict[str, spaces.Space[Any]] = {
+            name: spaces.Box(-np.inf, np.inf, box.shape, box.dtype) for name, box in space.items()
+        }
         self.observation_space = spaces.Dict(unbounded)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:

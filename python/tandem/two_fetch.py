@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import gymnasium
 import gymnasium_robotics
@@ -117,9 +117,11 @@ class TwoFetchEnv(gymnasium.Env[Observation, Floats]):
             self._robot_of_geom[arm.geoms] = idx
         self._place_robots()
         unbounded = {"observation": OBSERVATION, "achieved_goal": GOAL, "desired_goal": GOAL}
-        boxes = {name: spaces.Box(-np.inf, np.inf, (2 * n,), np.float64) for name, n in unbounded.items()}
-        self.observation_space = spaces.Dict(boxes)  # type: ignore[assignment]
-        self.action_space = spaces.Box(-1.0, 1.0, (2 * ACTION,), np.float32)  # type: ignore[assignment]
+        boxes: dict[str, spaces.Space[Any]] = {
+            name: spaces.Box(-np.inf, np.inf, (2 * n,), np.float64) for name, n in unbounded.items()
+        }
+        self.observation_space = cast(spaces.Space[Observation], spaces.Dict(boxes))
+        self.action_space = cast(spaces.Space[Floats], spaces.Box(-1.0, 1.0, (2 * ACTION,), np.float32))
 
     @property
     def tandem_task(self) -> dict[str, Any]:
@@ -129,9 +131,9 @@ class TwoFetchEnv(gymnasium.Env[Observation, Floats]):
         arms = []
         for idx in range(2):
             first = OBSERVATION * idx
-            parts = (range(first, first + OBSERVATION), range(GOAL * idx, GOAL * (idx + 1)))
-            own_action = range(ACTION * idx, ACTION * (idx + 1))
-            arms.append(Arm(*map(tuple, (*parts, own_action)), position=(first, first + 3)))  # type: ignore[arg-type]
+            observation = range(first, first + OBSERVATION)
+            goal, action = range(GOAL * idx, GOAL * (idx + 1)), range(ACTION * idx, ACTION * (idx + 1))
+            arms.append(Arm(observation, goal, action, position=(first, first + 3)))
         return {
             "name": self._task.one_arm_name,
             "arms": arms,
@@ -161,7 +163,7 @@ class TwoFetchEnv(gymnasium.Env[Observation, Floats]):
             raise RuntimeError("the environment has no episode yet: call reset first")
         numbers = np.asarray(action, np.float64)
         if numbers.shape != (2 * ACTION,) or not np.isfinite(numbers).all():
-            raise ValueError(f"expected an action of {2 * ACTION} finite numbers, got {action}")
+            raise ValueError(f"expected an action of {2 * ACTION} finite numbers, got {numbers}")
         for arm, own in zip(self._arms, np.clip(numbers, -1, 1).reshape(2, ACTION)):
             arm.command(self._model, self._data, own, self._task.blocks_fingers)
         touched = False
@@ -198,7 +200,7 @@ class TwoFetchEnv(gymnasium.Env[Observation, Floats]):
         """Returns the sparse rewards of goals of shape `[..., 6]`, shape `[...]`; `info` has no effect."""
         return compute_reward(achieved_goal, desired_goal)
 
-    def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
+    def render(self) -> NDArray[np.uint8] | None:
         """Draws the scene, shape `[height, width, 3]`, in render mode `rgb_array`."""
         if self.render_mode is None:
             return None
@@ -255,7 +257,7 @@ class TwoFetchEnv(gymnasium.Env[Observation, Floats]):
             placed = [arm.to_world(np.append(xy, 0.0))[:2] for arm, xy in zip(self._arms, own)]
             others = [(xy, hand) for xy in placed for hand in hands] + [(placed[0], placed[1])]
             if all(np.linalg.norm(a - b) >= _CLEARANCE_M for a, b in others):
-                return own
+                return cast(Floats, own)
 
     def _draw_goals(self) -> Floats:
         """Draws the goals of the arms in their frames, shape `[2, 3]`."""
@@ -267,7 +269,7 @@ class TwoFetchEnv(gymnasium.Env[Observation, Floats]):
                     goal[2] += self.np_random.uniform(0, 0.45)
             placed = [arm.to_world(goal) for arm, goal in zip(self._arms, goals)]
             if np.linalg.norm(placed[0] - placed[1]) >= _CLEARANCE_M:
-                return goals
+                return cast(Floats, goals)
 
     def _observe(self) -> Observation:
         own = [arm.observe(self._model, self._data) for arm in self._arms]

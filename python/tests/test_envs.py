@@ -1,5 +1,7 @@
 """The environments: Gymnasium's rules, the bits of Rust, rewards and seeds."""
 
+import copy
+import pickle
 import subprocess
 
 import gymnasium
@@ -167,3 +169,49 @@ def test_pictures_show_the_scene():
     # The arms' objects and goals are blue and orange.
     red, _, blue = (before[..., channel].astype(int) for channel in range(3))
     assert (blue - red > 60).sum() > 50 and (red - blue > 60).sum() > 50
+
+
+@pytest.mark.parametrize("duplicate", [copy.copy, copy.deepcopy, lambda it: pickle.loads(pickle.dumps(it))])
+@pytest.mark.parametrize("env_id", [ENV_IDS[0], ENV_IDS[3]])
+def test_a_copy_continues_the_episode_with_its_bits(env_id, duplicate, rng):
+    env = gymnasium.make(env_id, substeps=10).unwrapped
+    env.reset(seed=3, options={"episode": 4})
+    actions = rng.uniform(-1.2, 1.2, (14, *env.action_space.shape)).astype(np.float32)
+    for action in actions[:9]:
+        env.step(action)
+    simulation = duplicate(env._simulation)
+    for action in actions[9:]:
+        expected, observation = env.step(action)[0], simulation.step(action)[0]
+        assert all(map(np.array_equal, arrays_of(observation), arrays_of(expected)))
+
+
+@pytest.mark.parametrize("duplicate", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
+def test_a_copied_environment_plays_the_same_episodes(duplicate):
+    fresh = tandem.TandemEnv("pick-and-place", 2, grasped_start_prob=0.5)
+    with pytest.raises(RuntimeError, match="call reset first"):
+        duplicate(fresh).step(np.zeros(8))
+    env = gymnasium.make(ENV_IDS[2])
+    env.reset(seed=5)
+    env.step(np.ones(6))
+    other = duplicate(env)
+    assert other.unwrapped._simulation is not env.unwrapped._simulation
+    env.step(-np.ones(6))
+    starts = [it.reset()[0]["observation"] for it in (env, other)]
+    assert np.array_equal(*starts), "both start episode 1 of seed 5"
+
+
+def test_subprocesses_of_stable_baselines3_play_the_environment():
+    vec_env = pytest.importorskip("stable_baselines3.common.vec_env", reason="needs stable-baselines3")
+    envs = vec_env.SubprocVecEnv([_make_push] * 2, start_method="spawn")
+    try:
+        envs.seed(3)
+        started = envs.reset()
+    finally:
+        envs.close()
+    for idx in range(2):
+        expected, _ = gymnasium.make(ENV_IDS[0]).reset(seed=3 + idx)
+        assert np.array_equal(started["observation"][idx], expected["observation"])
+
+
+def _make_push():
+    return gymnasium.make(ENV_IDS[0])

@@ -1,10 +1,13 @@
 """Vector environments: their episodes are those of single environments, in every mode and with any threads."""
 
+import copy
+import pickle
+
 import gymnasium
 import numpy as np
 import pytest
 from conftest import ENV_IDS
-from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 
 import tandem
 
@@ -102,3 +105,35 @@ def test_every_environment_is_drawn():
     single = tandem.TandemEnv(render_mode="rgb_array", width=64, height=40)
     single.reset(seed=2)
     assert len(pictures) == 2 and np.array_equal(pictures[1], single.render())
+
+
+@pytest.mark.parametrize("duplicate", [copy.deepcopy, lambda envs: pickle.loads(pickle.dumps(envs))])
+@pytest.mark.parametrize("mode", list(AutoresetMode))
+def test_copied_environments_continue_their_episodes_with_the_same_bits(mode, duplicate, rng):
+    envs = tandem.TandemVectorEnv(3, "push", 1, max_episode_steps=6, autoreset_mode=mode, substeps=10)
+    for n_steps in (0, 4, 6):
+        envs.reset(seed=2)
+        for _ in range(n_steps):
+            envs.step(rng.uniform(-1, 1, (3, 3)))
+        other = duplicate(envs)
+        if n_steps == 6 and mode is AutoresetMode.DISABLED:
+            envs.reset()
+            other.reset()
+        for _ in range(2 if mode is AutoresetMode.DISABLED else 5):
+            actions = rng.uniform(-1, 1, (3, 3))
+            for one, two in zip(envs.step(actions), other.step(actions), strict=True):
+                assert_equal(one, two)
+
+
+def test_processes_of_gymnasiums_vector_play_single_environments(rng):
+    envs = AsyncVectorEnv([_make_push] * 2, context="spawn")
+    try:
+        one, _ = envs.reset(seed=4)
+    finally:
+        envs.close()
+    two, _ = tandem.TandemVectorEnv(2, "push", 1).reset(seed=4)
+    assert_equal(one, two)
+
+
+def _make_push():
+    return gymnasium.make(ENV_IDS[0])
