@@ -1,13 +1,16 @@
 #!/usr/bin/env python3
 """Trains Stable-Baselines3 with hindsight experience replay on a Gymnasium goal environment, as a reference.
 
-Writes DIRECTORY/progress.csv with a line per evaluation: env_steps, updates, wall_s, success, success_low and
-success_high. An evaluation plays the policy without exploration on fixed seeds. Success is the share of episodes whose
-last step reports is_success. The clock includes evaluations and, in a resumed run, the time before the interruption.
+Writes DIRECTORY/progress.csv with a line per evaluation: env_steps, updates, wall_s, success, success_low,
+success_high and processor_s. An evaluation plays the policy without exploration on fixed seeds. Success is the share of
+episodes whose last step reports is_success. Both clocks include evaluations and, in a resumed run, the time before the
+interruption; processor seconds are those of all threads and child processes.
 """
 
 import argparse
+import contextlib
 import csv
+import importlib
 import json
 import math
 import os
@@ -22,12 +25,9 @@ from stable_baselines3 import DDPG, HerReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import NormalActionNoise
 
-try:
-    import gymnasium_robotics
-
-    gymnasium.register_envs(gymnasium_robotics)
-except ImportError:
-    pass
+for package in ("gymnasium_robotics", "panda_gym", "tandem"):
+    with contextlib.suppress(ImportError):
+        importlib.import_module(package)
 
 EXAMPLES = """examples:
   python scripts/bench_sb3.py --algorithm tqc --env FetchPush-v4 --out runs/sb3/tqc-push-1 --max-hours 3
@@ -42,7 +42,7 @@ settings:
 
 Packages: pip install -r scripts/requirements-benchmarks.txt
 """
-FIELDS = ["env_steps", "updates", "wall_s", "success", "success_low", "success_high"]
+FIELDS = ["env_steps", "updates", "wall_s", "success", "success_low", "success_high", "processor_s"]
 HER = {
     "policy": "MultiInputPolicy",
     "buffer_size": 1_000_000,
@@ -76,6 +76,12 @@ def make_model(algorithm, env, env_id, seed, device):
     )
 
 
+def processor_s():
+    """Processor seconds of this process and of its children that have ended."""
+    times = os.times()
+    return times.user + times.system + times.children_user + times.children_system
+
+
 def wilson(hits, n):
     """Wilson's 95 % interval of a share."""
     z = 1.959963984540054
@@ -102,10 +108,11 @@ def evaluate(model, env, n_episodes, first_seed):
 class Benchmark(BaseCallback):
     """Evaluates, records and saves the run at fixed numbers of env steps, and ends it in time."""
 
-    def __init__(self, run, settings, env, wall_s, max_hours):
+    def __init__(self, run, settings, env, clocks, max_hours):
         super().__init__()
         self.run, self.settings, self.env = run, settings, env
-        self.start = time.monotonic() - wall_s
+        self.start = time.monotonic() - clocks["wall_s"]
+        self.processor_before_s = clocks.get("processor_s", 0.0)
         self.max_s = 3600 * max_hours
         self.next_evaluation = 0
         self.evaluated_at = -1
@@ -119,11 +126,14 @@ class Benchmark(BaseCallback):
             self.next_evaluation += self.settings["evaluate_every"]
             self.evaluate()
             if self.num_timesteps % self.settings["save_every"] < self.settings["evaluate_every"]:
-                save(self.model, self.run, self.settings, self.wall_s())
+                save(self.model, self.run, self.settings, self.clocks())
         return self.wall_s() < self.max_s
 
     def wall_s(self):
         return time.monotonic() - self.start
+
+    def clocks(self):
+        return {"wall_s": self.wall_s(), "processor_s": self.processor_before_s + processor_s()}
 
     def evaluate(self):
         n = self.settings["evaluation_episodes"]
@@ -131,20 +141,20 @@ class Benchmark(BaseCallback):
         self.evaluated_at = self.num_timesteps
         low, high = wilson(hits, n)
         done = [self.num_timesteps, self.model._n_updates, round(self.wall_s(), 1)]
-        row = [*done, hits / n, round(low, 4), round(high, 4)]
+        row = [*done, hits / n, round(low, 4), round(high, 4), round(self.clocks()["processor_s"], 1)]
         with open(self.run / "progress.csv", "a", newline="", encoding="utf-8") as file:
             csv.writer(file).writerow(row)
         text = f"env steps {done[0]:>8}  updates {done[1]:>8}  {done[2] / 60:7.1f} min  success {hits / n:.3f}"
         print(f"{text}  ({hits} of {n})", file=sys.stderr)
 
 
-def save(model, run, settings, wall_s):
+def save(model, run, settings, clocks):
     """Saves everything that a resumed run needs; state.json comes last and names what it belongs to."""
     model.save(run / "model.new.zip")
     model.save_replay_buffer(run / "replay.new.pkl")
     for name in ("model.zip", "replay.pkl"):
         os.replace(run / name.replace(".", ".new.", 1), run / name)
-    state = {"settings": settings, "env_steps": model.num_timesteps, "wall_s": wall_s}
+    state = {"settings": settings, "env_steps": model.num_timesteps, **clocks}
     (run / "state.new.json").write_text(json.dumps(state, indent=2), encoding="utf-8")
     os.replace(run / "state.new.json", run / "state.json")
 
@@ -190,11 +200,11 @@ def parse():
 
 
 def main():
-    arguments, wall_s = parse(), 0.0
+    arguments, clocks = parse(), {"wall_s": 0.0}
     run = arguments.out
     if arguments.resume:
         state = resume(run)
-        settings, wall_s = state["settings"], state["wall_s"]
+        settings, clocks = state["settings"], state
     else:
         if (run / "progress.csv").exists():
             sys.exit(f"bench_sb3: {run} holds a run already: choose another directory, or give --resume")
@@ -213,9 +223,9 @@ def main():
         model.load_replay_buffer(run / "replay.pkl")
     else:
         model = make_model(settings["algorithm"], env, settings["env"], settings["seed"], arguments.device)
-    benchmark = Benchmark(run, settings, evaluation_env, wall_s, arguments.max_hours)
+    benchmark = Benchmark(run, settings, evaluation_env, clocks, arguments.max_hours)
     remaining = arguments.max_env_steps - model.num_timesteps
-    if remaining > 0 and wall_s < 3600 * arguments.max_hours:
+    if remaining > 0 and clocks["wall_s"] < 3600 * arguments.max_hours:
         try:
             model.learn(remaining, callback=benchmark, reset_num_timesteps=not arguments.resume)
         except KeyboardInterrupt:
@@ -223,7 +233,7 @@ def main():
         else:
             if benchmark.evaluated_at != model.num_timesteps:
                 benchmark.evaluate()
-        save(model, run, settings, benchmark.wall_s())
+        save(model, run, settings, benchmark.clocks())
     print(run / "progress.csv")
 
 

@@ -2,8 +2,10 @@
 """Compares training runs of Tandem and of scripts/bench_sb3.py: a table, and optionally curves.
 
 A run is a directory with metrics.jsonl (Tandem) or progress.csv (bench_sb3.py), or such a file; metrics.csv with the
-columns env_steps, wall_s and success is read as well. The table has, for each run, the env steps and minutes after
-which an evaluation first reached a success rate, and the last evaluation.
+columns env_steps, wall_s and success is read as well. Processor seconds of Tandem are in processor.csv beside it, which
+scripts/benchmarks.py writes. The table has, for each run, the env steps, updates, minutes and processor seconds after
+which an evaluation first reached a success rate, and the last evaluation with its 95 % interval. Directories of
+another kind, such as those of composed teachers, are left out.
 """
 
 import argparse
@@ -17,6 +19,7 @@ RATES = (0.5, 0.9, 0.95)
 EXAMPLES = """examples:
   python scripts/plot_benchmarks.py runs/fetch-push-1 runs/sb3/tqc-push-1
   python scripts/plot_benchmarks.py runs/* --x minutes --out curves.svg
+  python scripts/plot_benchmarks.py docs/results/benchmarks/*
   python scripts/plot_benchmarks.py docs/results/from-scratch/push-none-seed1 --json
 """
 
@@ -25,22 +28,46 @@ class Wrong(Exception):
     """An error that is reported in one line."""
 
 
-def read(path):
-    """The evaluations of a run, in order: dictionaries with env_steps, wall_s, updates and success."""
-    if path.is_dir():
-        file = next((path / name for name in NAMES if (path / name).is_file()), None)
-        if file is None:
-            raise Wrong(f"{path} has none of {', '.join(NAMES)}")
-    else:
-        file = path
+KEYS = ("env_steps", "updates", "wall_s", "success", "success_low", "success_high", "processor_s")
+
+
+def file_of(path):
+    """The file with a run's evaluations; None if the directory holds something else."""
+    if not path.is_dir():
+        return path
+    return next((path / name for name in NAMES if (path / name).is_file()), None)
+
+
+def read(file):
+    """The evaluations of a run, in order: dictionaries with those of KEYS that the file has."""
     try:
-        with open(file, newline="", encoding="utf-8") as lines:
-            rows = [json.loads(line) for line in lines] if file.suffix == ".jsonl" else list(csv.DictReader(lines))
-        keys = ("env_steps", "updates", "wall_s", "success")
-        rows = [row for row in rows if row.get("success") not in (None, "")]
-        return [{key: float(row[key]) for key in keys if row.get(key) not in (None, "")} for row in rows]
+        rows = [row for row in rows_of(file) if row.get("success") not in (None, "")]
+        runs = [{key: float(row[key]) for key in KEYS if row.get(key) not in (None, "")} for row in rows]
+        processor = file.parent / "processor.csv"
+        if processor.is_file():
+            spent = {int(row["env_steps"]): float(row["processor_s"]) for row in rows_of(processor)}
+            for row in runs:
+                if int(row["env_steps"]) in spent:
+                    row["processor_s"] = spent[int(row["env_steps"])]
+        return runs
     except (OSError, ValueError, KeyError) as error:
         raise Wrong(f"cannot read {file}: {error}") from None
+
+
+def rows_of(file):
+    with open(file, newline="", encoding="utf-8") as lines:
+        return [json.loads(line) for line in lines] if file.suffix == ".jsonl" else list(csv.DictReader(lines))
+
+
+def cost(row):
+    """What a run had spent at an evaluation; None for what is not recorded."""
+    updates, processor_s = row.get("updates"), row.get("processor_s")
+    return {
+        "env_steps": int(row["env_steps"]),
+        "updates": None if updates is None else int(updates),
+        "minutes": row["wall_s"] / 60,
+        "processor_s": processor_s,
+    }
 
 
 def measures(path, evaluations):
@@ -48,29 +75,40 @@ def measures(path, evaluations):
     reached = {}
     for rate in RATES:
         first = next((row for row in evaluations if row["success"] >= rate), None)
-        reached[f"{rate:g}"] = first and {"env_steps": int(first["env_steps"]), "minutes": first["wall_s"] / 60}
+        reached[f"{rate:g}"] = first and cost(first)
     last = evaluations[-1]
     return {
         "run": str(path),
         "evaluations": len(evaluations),
-        "env_steps": int(last["env_steps"]),
-        "minutes": last["wall_s"] / 60,
+        **cost(last),
         "success": last["success"],
+        "success_low": last.get("success_low"),
+        "success_high": last.get("success_high"),
         "best_success": max(row["success"] for row in evaluations),
         "reached": reached,
     }
 
 
+def text_of(spent):
+    """Env steps, updates, minutes and processor seconds, in one cell of the table."""
+    if spent is None:
+        return "–"
+    updates, processor_s = spent["updates"], spent["processor_s"]
+    cells = [f"{spent['env_steps']:,}", "–" if updates is None else f"{updates:,}", f"{spent['minutes']:.1f}"]
+    return " / ".join([*cells, "–" if processor_s is None else f"{processor_s:,.0f}"])
+
+
 def print_table(results):
-    print("| run | env steps | minutes | last | best | " + " | ".join(f"to {rate:.0%}" for rate in RATES) + " |")
-    print("|---" * (5 + len(RATES)) + "|")
+    print("Each cell: env steps / updates / minutes / processor seconds.\n")
+    heads = [f"to {rate:.0%}" for rate in RATES]
+    print("| run | in all | " + " | ".join(heads) + " | last evaluation | best |")
+    print("|---" * (4 + len(RATES)) + "|")
     for result in results:
-        cells = [result["run"], f"{result['env_steps']}", f"{result['minutes']:.1f}"]
-        cells += [f"{result['success']:.3f}", f"{result['best_success']:.3f}"]
-        cells += [
-            f"{first['env_steps']} ({first['minutes']:.1f} min)" if first else "–"
-            for first in result["reached"].values()
-        ]
+        interval = ""
+        if result["success_low"] is not None:
+            interval = f" [{result['success_low']:.3f}, {result['success_high']:.3f}]"
+        cells = [Path(result["run"]).name, text_of(result), *map(text_of, result["reached"].values())]
+        cells += [f"{result['success']:.3f}{interval}", f"{result['best_success']:.3f}"]
         print("| " + " | ".join(cells) + " |")
 
 
@@ -101,7 +139,10 @@ def main():
     parser.add_argument("--out", type=Path, metavar="FILE.svg", help="also draw the curves (needs matplotlib)")
     parser.add_argument("--json", action="store_true", help="print one JSON array instead of a table")
     arguments = parser.parse_args()
-    runs = [(path, read(path)) for path in arguments.runs]
+    files = [(path, file_of(path)) for path in arguments.runs]
+    runs = [(path, read(file)) for path, file in files if file is not None]
+    if not runs:
+        raise Wrong(f"no run has {', '.join(NAMES)}")
     empty = [str(path) for path, evaluations in runs if not evaluations]
     if empty:
         raise Wrong(f"no evaluations in {', '.join(empty)}")
