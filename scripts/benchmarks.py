@@ -116,10 +116,10 @@ def follow(run, process, before_s, ended):
             done = [json.loads(line)["env_steps"] for line in complete_lines(metrics)]
             known = {int(row["env_steps"]) for row in rows_of(file)}
             new = [env_steps for env_steps in done if env_steps not in known]
-            if new and not file.exists():
-                file.write_text("env_steps,processor_s\n", encoding="utf-8")
-            with open(file, "a", encoding="utf-8") as lines:
-                lines.writelines(f"{env_steps},{spent:.1f}\n" for env_steps in new)
+            header = "" if file.exists() else "env_steps,processor_s\n"
+            if new:
+                with open(file, "a", encoding="utf-8") as lines:
+                    lines.writelines([header, *(f"{env_steps},{spent:.1f}\n" for env_steps in new)])
         (run / "processor_s").write_text(f"{spent:.1f}\n", encoding="utf-8")
         if is_over:
             return

@@ -86,7 +86,7 @@ def main():
     parser = argparse.ArgumentParser(
         description=__doc__, epilog=EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--distances", type=float, nargs="+", default=[0.15, 0.2, 0.25, 0.3], metavar="M")
+    parser.add_argument("--distances", type=float, nargs="+", default=[0.15, 0.2, 0.25], metavar="M")
     parser.add_argument("--episodes", type=int, default=200, metavar="N", help="per distance [default: 200]")
     parser.add_argument("--json", action="store_true", help="print a JSON object per distance")
     arguments = parser.parse_args()

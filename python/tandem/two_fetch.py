@@ -71,8 +71,9 @@ class TwoFetchEnv(gymnasium.Env[Observation, Floats]):
     long as needed. Each arm's 25 numbers, goal and action have the meaning they have in `FetchPush-v4` and are in the
     arm's own frame, in which the arm stands where Fetch stands. Vectors of the arms are concatenated.
 
-    An object starts within 15 cm of its hand along each axis, a goal likewise. Objects are at least 10 cm from the
-    starts of both hands and from each other, goals at least 10 cm from each other.
+    An object starts within 15 cm of its hand along each axis, as in Fetch's environments; a goal likewise, but not
+    farther from the other arm than the start of the hand, so that both arms move toward the middle. Objects are at least
+    10 cm from the starts of both hands and from each other, goals at least 10 cm from each other.
 
     The reward is 0 if the distance between both achieved and desired positions, taken together, is at most 5 cm, and
     -1 otherwise. `info["is_success"]` holds if each cube is within 5 cm of its goal; `info["arm_contact"]` reports
@@ -80,7 +81,8 @@ class TwoFetchEnv(gymnasium.Env[Observation, Floats]):
 
     Args:
         task: `"push"` or `"pick-and-place"`.
-        distance: Distance between the starts of the two hands along x, metres; the areas of the arms are 30 cm long.
+        distance: Distance between the starts of the two hands along x, metres.
+        inner_goals: Whether goals lie on the side of the other arm only; with False they have Fetch's distribution.
         render_mode: `"rgb_array"` or None.
         width: Width of pictures, pixels.
         height: Height of pictures, pixels.
@@ -92,7 +94,8 @@ class TwoFetchEnv(gymnasium.Env[Observation, Floats]):
         self,
         task: str = "push",
         *,
-        distance: float = 0.25,
+        distance: float = 0.2,
+        inner_goals: bool = True,
         render_mode: str | None = None,
         width: int = 640,
         height: int = 400,
@@ -103,6 +106,7 @@ class TwoFetchEnv(gymnasium.Env[Observation, Floats]):
         if not 0.15 <= distance <= 10.0:
             raise ValueError(f"distance is {distance} m, expected 0.15 to 10")
         self._task = _TASKS[task]
+        self._inner_goals = inner_goals
         self._origin_distance = 2 * _START_X_M + distance
         self.render_mode = render_mode
         self._size = (width, height)
@@ -262,7 +266,10 @@ class TwoFetchEnv(gymnasium.Env[Observation, Floats]):
     def _draw_goals(self) -> Floats:
         """Draws the goals of the arms in their frames, shape `[2, 3]`."""
         while True:
-            goals = self._hand_start + self.np_random.uniform(-_RANGE_M, _RANGE_M, (2, 3))
+            offsets = self.np_random.uniform(-_RANGE_M, _RANGE_M, (2, 3))
+            if self._inner_goals:
+                offsets[:, 0] = np.abs(offsets[:, 0])
+            goals = self._hand_start + offsets
             goals[:, 2] = self._object_height
             for goal in goals if self._task.lifts_goals else ():
                 if self.np_random.uniform() < 0.5:

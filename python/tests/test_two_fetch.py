@@ -102,7 +102,7 @@ def test_a_seed_and_actions_determine_the_bits(task, rng):
 
 
 def test_starts_and_goals_are_apart_and_overlap(rng):
-    env = TwoFetchEnv("push", distance=0.25)
+    env = TwoFetchEnv("push")
     reached = []
     for seed in range(40):
         observation, _ = env.reset(seed=seed)
@@ -113,6 +113,9 @@ def test_starts_and_goals_are_apart_and_overlap(rng):
         reached.append([goals[0, 0], goals[1, 0]])
         assert observation["desired_goal"][2] == observation["desired_goal"][5] == pytest.approx(0.425, abs=1e-3)
     assert np.max(reached, axis=0)[0] > np.min(reached, axis=0)[1], "the areas of the goals overlap"
+    assert np.min(reached, axis=0)[0] > 1.34, "goals lie toward the other arm"
+    anywhere = TwoFetchEnv("push", inner_goals=False)
+    assert min(anywhere.reset(seed=seed)[0]["desired_goal"][0] for seed in range(20)) < 1.3
 
 
 def test_contacts_between_the_robots_are_reported():
