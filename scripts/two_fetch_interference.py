@@ -67,7 +67,7 @@ def play(env, objects, goals):
 
 
 def measure(distance, n_episodes):
-    together, apart = TwoFetchEnv("push", distance=distance), TwoFetchEnv("push", distance=3.0)
+    together, apart = TwoFetchEnv("push", distance=distance), TwoFetchEnv("push", distance=3.0, close_goals=False)
     alone, both_apart, both, contacts = [], [], [], []
     for seed in range(n_episodes):
         start, _ = together.reset(seed=seed)

@@ -41,7 +41,9 @@ _TO_START_M = np.array([-0.498, 0.005, -0.431])
 _RANGE_M = 0.15
 """Objects and goals lie within this distance of the hand's start, along each axis."""
 _CLEARANCE_M = 0.1
-"""Smallest distance between an object and the starts of the hands, between two objects, and between two goals."""
+"""Smallest distance between an object and the starts of the hands, and between two objects."""
+_CLOSE_GOALS_M = (0.07, 0.15)
+"""Smallest and largest horizontal distance of the goals of two arms; cubes have edges of 5 cm."""
 RECOMBINATION_GAP_M = 0.15
 """A distance along x between the hands and cubes of two arms at which nothing touches; wrists touch at 0.12 m."""
 
@@ -71,9 +73,9 @@ class TwoFetchEnv(gymnasium.Env[Observation, Floats]):
     long as needed. Each arm's 25 numbers, goal and action have the meaning they have in `FetchPush-v4` and are in the
     arm's own frame, in which the arm stands where Fetch stands. Vectors of the arms are concatenated.
 
-    An object starts within 15 cm of its hand along each axis, as in Fetch's environments; a goal likewise, but not
-    farther from the other arm than the start of the hand, so that both arms move toward the middle. Objects are at least
-    10 cm from the starts of both hands and from each other, goals at least 10 cm from each other.
+    An object starts within 15 cm of its hand along each axis, as in Fetch's environments, and so does a goal. Objects are
+    at least 10 cm from the starts of both hands and from each other. The goals of the arms are 7 to 15 cm apart, so that
+    both arms have to work in the same place.
 
     The reward is 0 if the distance between both achieved and desired positions, taken together, is at most 5 cm, and
     -1 otherwise. `info["is_success"]` holds if each cube is within 5 cm of its goal; `info["arm_contact"]` reports
@@ -82,7 +84,7 @@ class TwoFetchEnv(gymnasium.Env[Observation, Floats]):
     Args:
         task: `"push"` or `"pick-and-place"`.
         distance: Distance between the starts of the two hands along x, metres.
-        inner_goals: Whether goals lie on the side of the other arm only; with False they have Fetch's distribution.
+        close_goals: Whether the goals are at most 15 cm apart; with False they are at least 10 cm apart.
         render_mode: `"rgb_array"` or None.
         width: Width of pictures, pixels.
         height: Height of pictures, pixels.
@@ -95,7 +97,7 @@ class TwoFetchEnv(gymnasium.Env[Observation, Floats]):
         task: str = "push",
         *,
         distance: float = 0.2,
-        inner_goals: bool = True,
+        close_goals: bool = True,
         render_mode: str | None = None,
         width: int = 640,
         height: int = 400,
@@ -103,10 +105,11 @@ class TwoFetchEnv(gymnasium.Env[Observation, Floats]):
         check_rendering(render_mode, width, height)
         if task not in _TASKS:
             raise ValueError(f"unknown task {task!r}: expected one of {', '.join(_TASKS)}")
-        if not 0.15 <= distance <= 10.0:
-            raise ValueError(f"distance is {distance} m, expected 0.15 to 10")
+        longest = 0.35 if close_goals else 10.0
+        if not 0.15 <= distance <= longest:
+            raise ValueError(f"distance is {distance} m, expected 0.15 to {longest}")
         self._task = _TASKS[task]
-        self._inner_goals = inner_goals
+        self._goal_gaps_m = _CLOSE_GOALS_M if close_goals else (_CLEARANCE_M, np.inf)
         self._origin_distance = 2 * _START_X_M + distance
         self.render_mode = render_mode
         self._size = (width, height)
@@ -265,17 +268,15 @@ class TwoFetchEnv(gymnasium.Env[Observation, Floats]):
 
     def _draw_goals(self) -> Floats:
         """Draws the goals of the arms in their frames, shape `[2, 3]`."""
+        least, most = self._goal_gaps_m
         while True:
-            offsets = self.np_random.uniform(-_RANGE_M, _RANGE_M, (2, 3))
-            if self._inner_goals:
-                offsets[:, 0] = np.abs(offsets[:, 0])
-            goals = self._hand_start + offsets
+            goals = self._hand_start + self.np_random.uniform(-_RANGE_M, _RANGE_M, (2, 3))
             goals[:, 2] = self._object_height
             for goal in goals if self._task.lifts_goals else ():
                 if self.np_random.uniform() < 0.5:
                     goal[2] += self.np_random.uniform(0, 0.45)
             placed = [arm.to_world(goal) for arm, goal in zip(self._arms, goals)]
-            if np.linalg.norm(placed[0] - placed[1]) >= _CLEARANCE_M:
+            if least <= np.linalg.norm((placed[0] - placed[1])[:2]) <= most:
                 return cast(Floats, goals)
 
     def _observe(self) -> Observation:

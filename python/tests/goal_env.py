@@ -22,6 +22,8 @@ class PointEnv(gymnasium.Env[dict[str, NDArray[Any]], NDArray[Any]]):
         dense: bool = False,
         fails_at: int | None = None,
         terminates_at: int | None = None,
+        contacts: bool = False,
+        tandem_task: dict[str, Any] | None = None,
     ) -> None:
         unbounded = spaces.Box(-np.inf, np.inf, (2,), np.float64)
         self.n_own = 4 if contained else 2
@@ -37,6 +39,8 @@ class PointEnv(gymnasium.Env[dict[str, NDArray[Any]], NDArray[Any]]):
         self.distance_threshold = threshold
         self._contained, self._maximum, self._dense = contained, maximum, dense
         self._fails_at, self._terminates_at = fails_at, terminates_at
+        self._contacts = contacts
+        self.tandem_task = tandem_task
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
         super().reset(seed=seed)
@@ -52,7 +56,8 @@ class PointEnv(gymnasium.Env[dict[str, NDArray[Any]], NDArray[Any]]):
         self._position = self._position + action / 10
         terminated = len(self.actions) == self._terminates_at
         reward = self.compute_reward(self._position, self._goal, {})
-        return self._observation(), reward, terminated, False, {}
+        info = {"arm_contact": len(self.actions) % 2 == 0, "table_contact": True} if self._contacts else {}
+        return self._observation(), reward, terminated, False, info
 
     def compute_reward(self, achieved: NDArray[Any], desired: NDArray[Any], info: Any) -> float:
         difference = np.abs(achieved - desired)

@@ -1,6 +1,7 @@
 """Environment servers, over the wire."""
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -200,6 +201,10 @@ def test_an_achieved_goal_outside_the_observation_is_appended() -> None:
         ({}, {"name": "My env"}, "'My env' is not a name"),
         ({}, {"arms": [tandem.Arm((0, 4), (0,), (0,))]}, "indices of the observation"),
         ({}, {"arms": [tandem.Arm((0,), (0,), (0,)), tandem.Arm((1, 2), (1,), (1,))]}, "differ in length"),
+        ({}, {"achieved_goal": [1, 2]}, "does not have the achieved goal at [1, 2]"),
+        ({}, {"achieved_goal": [1]}, "expected 2 indices from 0 to 3, got [1]"),
+        ({}, {"reports_contacts": True}, "have no arm_contact"),
+        ({"tandem_task": {"colour": 1}}, {}, "unknown items: colour"),
         ({}, {"n": 0}, "1 to 1024 environments"),
         ({}, {"listen": "0.0.0.0:0"}, "can be reached from other machines"),
         ({}, {"listen": "here"}, "'here' is not an address"),
@@ -208,7 +213,7 @@ def test_an_achieved_goal_outside_the_observation_is_appended() -> None:
 def test_an_environment_that_cannot_be_served_is_refused(
     kwargs: dict[str, Any], options: dict[str, Any], message: str
 ) -> None:
-    with pytest.raises(tandem.ServiceError, match=message.replace("(", r"\(")):
+    with pytest.raises(tandem.ServiceError, match=re.escape(message)):
         tandem.EnvironmentServer((ID, kwargs), **options)
 
 
@@ -321,3 +326,35 @@ def test_the_packages_own_environments_can_be_served() -> None:
         task = server.task
     assert (task.n_observation, task.n_action, task.episode_steps, task.tolerance) == (56, 6, 50, 0.05)
     assert tuple(task.achieved_goal) == (3, 4, 5, 31, 32, 33)
+
+
+def test_an_environment_may_describe_itself() -> None:
+    arms = [tandem.Arm((2, 3), (0,), (0,), position=(3,)), tandem.Arm((0, 1), (1,), (1,), position=(0,))]
+    own = {"arms": arms, "name": "pair", "origin_distance": 2.0, "recombination_gap": 0.5, "bound": 50.0}
+    with tandem.EnvironmentServer((ID, {"tandem_task": own}), name="points", recombination_gap=0.25) as server:
+        described = Client(server).stub.Describe(pb.DescribeEnvironmentRequest()).task
+    task = tandem.Task.from_message(described)
+    assert (task.name, task.origin_distance, task.recombination_gap) == ("points", 2.0, 0.25)
+    assert [list(arm.position) for arm in task.arms] == [[3], [0]]
+    assert list(task.observation_bound) == [9.0, 50.0, 50.0, 50.0]
+
+
+def test_contacts_are_sent_if_the_task_reports_them() -> None:
+    requests = [reset([(0, 1), (1, 2)]), *[step(np.zeros((2, 2)))] * 3]
+    with tandem.EnvironmentServer((ID, {"contacts": True}), reports_contacts=True) as server:
+        assert server.task.reports_contacts
+        assert [list(answer.contacts) for answer in Client(server).play(requests)] == [[], [2, 2], [3, 3], [2, 2]]
+    with tandem.EnvironmentServer((ID, {"contacts": True})) as server:
+        assert [answer.contacts for answer in Client(server).play(requests)] == [b""] * 4
+
+
+def test_the_command_takes_arms_and_refuses_bad_ones() -> None:
+    arms = '[{"observation": [3], "goal": [0], "action": [0]}, {"observation": [2], "goal": [1], "action": [1]}]'
+    command = Command(ID, "--arms", arms, "--interchangeable-arms", "--achieved-goal", "[2, 1]")
+    stub = environment_pb2_grpc.EnvironmentStub(open_channel(command.address()))
+    task = stub.Describe(pb.DescribeEnvironmentRequest()).task
+    assert [list(arm.observation) for arm in task.arms] == [[3], [2]] and task.interchangeable_arms
+    command.process.send_signal(signal.SIGTERM)
+    assert command.end() == (0, "")
+    code, errors = Command(ID, "--arms", "[1]").end()
+    assert code == 64 and "argument --arms: expected a list of objects" in errors and errors.count("\n") == 1

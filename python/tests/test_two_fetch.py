@@ -47,7 +47,7 @@ def test_gymnasiums_checker_accepts_the_environment(task):
 @pytest.mark.parametrize("arm", [0, 1])
 @pytest.mark.parametrize("task", IDS)
 def test_an_arm_whose_neighbour_rests_far_away_is_fetchs(task, arm, rng):
-    one, two = gymnasium.make(ONE_ARM[task]).unwrapped, TwoFetchEnv(task, distance=FAR_M)
+    one, two = gymnasium.make(ONE_ARM[task]).unwrapped, TwoFetchEnv(task, distance=FAR_M, close_goals=False)
     for seed in range(3):
         alone, _ = one.reset(seed=seed)
         objects, goals = np.array([[1.25, 0.6]] * 2), np.array([alone["desired_goal"]] * 2)
@@ -101,21 +101,21 @@ def test_a_seed_and_actions_determine_the_bits(task, rng):
     assert not np.array_equal(fresh.reset(seed=10)[0]["observation"], starts[0])
 
 
-def test_starts_and_goals_are_apart_and_overlap(rng):
-    env = TwoFetchEnv("push")
+@pytest.mark.parametrize(("close_goals", "nearest", "farthest"), [(True, 0.07, 0.15), (False, 0.1, 1.0)])
+def test_starts_and_goals_are_apart_but_the_areas_overlap(close_goals, nearest, farthest):
+    env = TwoFetchEnv("push", distance=0.2, close_goals=close_goals)
     reached = []
     for seed in range(40):
         observation, _ = env.reset(seed=seed)
         cubes, goals = (observation[name].reshape(2, 3).copy() for name in ("achieved_goal", "desired_goal"))
+        assert np.abs(goals[:, :2] - (1.3455, 0.749)).max() <= 0.151, "goals of Fetch"
         for points in (cubes, goals):
             points[1] = (env.tandem_task["origin_distance"] - points[1, 0], 1.5 - points[1, 1], points[1, 2])
-            assert np.linalg.norm((points[0] - points[1])[:2]) >= 0.1 - 1e-3
+        assert np.linalg.norm((cubes[0] - cubes[1])[:2]) >= 0.1 - 1e-3
+        assert nearest <= np.linalg.norm((goals[0] - goals[1])[:2]) <= farthest
         reached.append([goals[0, 0], goals[1, 0]])
         assert observation["desired_goal"][2] == observation["desired_goal"][5] == pytest.approx(0.425, abs=1e-3)
     assert np.max(reached, axis=0)[0] > np.min(reached, axis=0)[1], "the areas of the goals overlap"
-    assert np.min(reached, axis=0)[0] > 1.34, "goals lie toward the other arm"
-    anywhere = TwoFetchEnv("push", inner_goals=False)
-    assert min(anywhere.reset(seed=seed)[0]["desired_goal"][0] for seed in range(20)) < 1.3
 
 
 def test_contacts_between_the_robots_are_reported():
@@ -128,7 +128,7 @@ def test_contacts_between_the_robots_are_reported():
 
 
 def test_rewards_are_joint_and_success_is_per_arm():
-    env = TwoFetchEnv("push", distance=0.5)
+    env = TwoFetchEnv("push", distance=0.5, close_goals=False)
     cubes = np.array([[1.25, 0.65], [1.25, 0.65]])
     heights = np.full((2, 1), 0.4249)
     for offset, reward, is_success in [(0.03, 0.0, True), (0.04, -1.0, True), (0.06, -1.0, False)]:
@@ -146,7 +146,7 @@ def test_bad_actions_and_arguments_are_refused():
             env.step(action)
     with pytest.raises(RuntimeError, match="call reset first"):
         TwoFetchEnv("push").step(np.zeros(8))
-    for arguments in ({"task": "lift"}, {"distance": 0.01}, {"render_mode": "human"}):
+    for arguments in ({"task": "lift"}, {"distance": 0.01}, {"distance": 0.5}, {"render_mode": "human"}):
         with pytest.raises(ValueError, match="expected"):
             TwoFetchEnv(**arguments)
 
