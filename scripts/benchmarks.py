@@ -235,7 +235,8 @@ def select(options):
     unknown = [pattern for pattern in options.names if not fnmatch.filter(known, pattern)]
     names += [name for name, piece in known.items() if piece.group in options.group]
     if unknown or not names:
-        raise Wrong(f"no piece is called {', '.join(unknown) or '(nothing given)'}: see python scripts/benchmarks.py list")
+        asked = f"no piece is called {', '.join(unknown)}" if unknown else "no piece is given"
+        raise Wrong(f"{asked}: python scripts/benchmarks.py list shows them")
     return [known[name] for name in dict.fromkeys(names)]
 
 
@@ -277,8 +278,8 @@ def composed(options):
         "task": options.task,
         "episodes": options.episodes,
         "success": both / options.episodes,
-        "success_low": low,
-        "success_high": high,
+        "success_low": round(low, 4),
+        "success_high": round(high, 4),
         "success_per_arm": (each / options.episodes).tolist(),
         "arm_contact": touched / options.episodes,
         "policy_digest": policy.digest,

@@ -73,9 +73,9 @@ class TwoFetchEnv(gymnasium.Env[Observation, Floats]):
     long as needed. Each arm's 25 numbers, goal and action have the meaning they have in `FetchPush-v4` and are in the
     arm's own frame, in which the arm stands where Fetch stands. Vectors of the arms are concatenated.
 
-    An object starts within 15 cm of its hand along each axis, as in Fetch's environments, and so does a goal. Objects are
-    at least 10 cm from the starts of both hands and from each other. The goals of the arms are 7 to 15 cm apart, so that
-    both arms have to work in the same place.
+    Objects and goals are drawn within 15 cm of the start of their hand along each axis, as in Fetch's environments.
+    Objects are at least 10 cm from the starts of both hands and from each other. The goals of the arms are 7 to 15 cm
+    apart, so that both arms have to work in the same place.
 
     The reward is 0 if the distance between both achieved and desired positions, taken together, is at most 5 cm, and
     -1 otherwise. `info["is_success"]` holds if each cube is within 5 cm of its goal; `info["arm_contact"]` reports
