@@ -19,7 +19,7 @@ class CorrectedPanda(gymnasium.Wrapper[Any, Any, Any, Any]):
       episode before, which changes the first physics steps (panda-gym's issue 94). Before each reset this wrapper lifts
       all objects out of reach, straightens the robot and makes one physics step, in which nothing touches and PyBullet
       drops its contact points. Episodes of Reach, Push, PickAndPlace and Slide then have the bits they have in a new
-      environment. Those of Stack and Flip, with more contacts, may still differ in their last bits.
+      environment. Those of Stack may still differ.
     - **Bounds.** Panda-gym's space bounds every number by 10, but objects that are struck turn faster. Here
       observations have no bound.
     """
