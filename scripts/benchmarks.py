@@ -27,7 +27,7 @@ RESULTS = ROOT / "docs" / "results" / "benchmarks"
 EXAMPLES = """examples:
   python scripts/benchmarks.py list
   python scripts/benchmarks.py run tandem-fetch-push-1 tqc-fetch-push-1 --max-minutes 180
-  python scripts/benchmarks.py run 'two-fetch-push-*-1'          needs tandem-fetch-push-1: its policy is the teacher
+  python scripts/benchmarks.py run 'two-fetch-push-*-1'          needs teacher-fetch-push-1: its policy is the teacher
   python scripts/benchmarks.py run --group fetch-push            resumes what was interrupted, skips what is complete
   python scripts/benchmarks.py composed --task push
   python scripts/benchmarks.py collect
@@ -59,6 +59,7 @@ class Piece:
     seed: int
     strategy: str | None = None
     teacher: str | None = None
+    reports_contacts: bool = False
 
 
 def pieces():
@@ -68,12 +69,19 @@ def pieces():
         for kind in ("tandem", "tqc", "ddpg"):
             found += [Piece(f"{kind}-{group}-{seed}", group, kind, env, seed) for seed in SEEDS]
     for task, env in TWO_FETCH.items():
+        group, one_arm = f"two-fetch-{task}", ENVIRONMENTS[f"fetch-{task}"]
+        # A teacher's environment must report contacts as the student's does; one arm has none.
+        found.append(Piece(teacher_name(task), group, "tandem", one_arm, 1, reports_contacts=True))
         for label, strategy in STRATEGIES.items():
             for seed in SEEDS:
-                teacher = None if strategy == "none" else f"tandem-fetch-{task}-1"
-                name = f"two-fetch-{task}-{label}-{seed}"
-                found.append(Piece(name, f"two-fetch-{task}", "tandem", env, seed, strategy, teacher))
+                teacher = None if strategy == "none" else teacher_name(task)
+                found.append(Piece(f"{group}-{label}-{seed}", group, "tandem", env, seed, strategy, teacher, True))
     return {piece.name: piece for piece in found}
+
+
+def teacher_name(task):
+    """The piece whose policy is the one-arm teacher of the two-arm task."""
+    return f"teacher-fetch-{task}-1"
 
 
 class Wrong(Exception):
@@ -144,7 +152,8 @@ def tandem_command(piece, run, options):
         command += ["--workers", str(options.workers)]
     is_built_in = piece.env == "tandem/Push-v0"
     if not is_built_in:
-        command += ["--env-command", f"{shlex.quote(sys.executable)} -m tandem.serve {piece.env}"]
+        contacts = " --reports-contacts" if piece.reports_contacts else ""
+        command += ["--env-command", f"{shlex.quote(sys.executable)} -m tandem.serve {piece.env}{contacts}"]
     if resume:
         return [*command, "--resume"]
     command += ["--seed", str(piece.seed)]
@@ -254,10 +263,10 @@ def composed(options):
 
     import tandem
 
-    teacher = options.runs / f"tandem-fetch-{options.task}-1" / "policy" / "best.safetensors"
+    teacher = options.runs / teacher_name(options.task) / "policy" / "best.safetensors"
     path = options.policy or teacher
     if not path.exists():
-        raise Wrong(f"there is no policy {path}: run tandem-fetch-{options.task}-1, or give --policy")
+        raise Wrong(f"there is no policy {path}: run {teacher_name(options.task)}, or give --policy")
     policy = tandem.load_policy(path)
     env = gymnasium.make(TWO_FETCH[options.task], **({"distance": options.distance} if options.distance else {}))
     both, each, touched = 0, np.zeros(2), 0
@@ -330,7 +339,7 @@ def parse():
     teachers = commands.add_parser("composed", help="evaluates the one-arm teacher driving each of two arms")
     teachers.set_defaults(command=composed)
     teachers.add_argument("--task", choices=tuple(TWO_FETCH), default="push", help="[default: push]")
-    teachers.add_argument("--policy", type=Path, metavar="FILE", help="one-arm policy [that of tandem-fetch-TASK-1]")
+    teachers.add_argument("--policy", type=Path, metavar="FILE", help="one-arm policy [that of teacher-fetch-TASK-1]")
     teachers.add_argument("--distance", type=float, metavar="M", help="between the arms [the environment's]")
     teachers.add_argument("--episodes", type=int, default=240, help="[default: 240]")
     teachers.add_argument("--seed", type=int, default=777_000, help="of the first episode [default: 777000]")

@@ -372,7 +372,8 @@ def serve(env_fn: EnvFn, *, listen: str | None = None, **options: Any) -> None:
       interchangeable_arms: whether exchanging the parts of two arms gives another valid transition.
       origin_distance, recombination_gap: where parts of two arms from different steps may be recombined, as in
         `tandem.v1.TaskDescription`; for arms with `position`.
-      reports_contacts: whether infos have `arm_contact`, and optionally `table_contact`, which learning then charges.
+      reports_contacts: whether infos have `arm_contact`, and optionally `table_contact`, which learning then charges. One
+        arm without `arm_contact` touches no other.
       tolerance, norm: when a goal counts as achieved; by default `distance_threshold` of the environment, and the norm
         with which its rewards agree.
       episode_steps: control steps per episode; by default `max_episode_steps` of its spec.

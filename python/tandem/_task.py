@@ -165,7 +165,8 @@ def describe(env: gymnasium.Env[Any, Any], options: TaskOptions) -> tuple[Task, 
     """
     spaces, action = _checked_spaces(env)
     samples = _probe(env)
-    if options.reports_contacts and "arm_contact" not in samples[-1].info:
+    has_several_arms = options.arms is not None and len(options.arms) > 1
+    if options.reports_contacts and has_several_arms and "arm_contact" not in samples[-1].info:
         raise ServiceError("reports_contacts: the infos of the environment's steps have no arm_contact")
     found = _find_achieved_goal(samples)
     if options.achieved_goal is not None:

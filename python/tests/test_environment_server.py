@@ -26,6 +26,7 @@ from tandem._task import TaskOptions, describe
 
 ID = "goal_env:Tandem/Point-v0"
 TESTS = Path(__file__).parent
+PAIR = [tandem.Arm((3,), (0,), (0,)), tandem.Arm((2,), (1,), (1,))]
 
 
 def reset(pairs: list[tuple[int, int]]) -> pb.PlayRequest:
@@ -203,7 +204,7 @@ def test_an_achieved_goal_outside_the_observation_is_appended() -> None:
         ({}, {"arms": [tandem.Arm((0,), (0,), (0,)), tandem.Arm((1, 2), (1,), (1,))]}, "differ in length"),
         ({}, {"achieved_goal": [1, 2]}, "does not have the achieved goal at [1, 2]"),
         ({}, {"achieved_goal": [1]}, "expected 2 indices from 0 to 3, got [1]"),
-        ({}, {"reports_contacts": True}, "have no arm_contact"),
+        ({}, {"reports_contacts": True, "arms": PAIR}, "have no arm_contact"),
         ({"tandem_task": {"colour": 1}}, {}, "unknown items: colour"),
         ({}, {"n": 0}, "1 to 1024 environments"),
         ({}, {"listen": "0.0.0.0:0"}, "can be reached from other machines"),
@@ -346,6 +347,8 @@ def test_contacts_are_sent_if_the_task_reports_them() -> None:
         assert [list(answer.contacts) for answer in Client(server).play(requests)] == [[], [2, 2], [3, 3], [2, 2]]
     with tandem.EnvironmentServer((ID, {"contacts": True})) as server:
         assert [answer.contacts for answer in Client(server).play(requests)] == [b""] * 4
+    with tandem.EnvironmentServer(ID, reports_contacts=True) as server:
+        assert [list(answer.contacts) for answer in Client(server).play(requests)] == [[], [0, 0], [0, 0], [0, 0]]
 
 
 def test_the_command_takes_arms_and_refuses_bad_ones() -> None:
