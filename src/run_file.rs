@@ -189,7 +189,7 @@ fn task_for(changes: &Table) -> anyhow::Result<TaskSpec> {
     }
     let task = changes.get("task").and_then(Value::as_str).unwrap_or("push");
     let known_task = task.parse::<Task>().map_err(|_unknown| {
-        let names = Task::ALL.map(Task::name).join(" or ");
+        let names = Task::ALL.map(Task::name).join(", ");
         anyhow!("task is {:?}: expected {names}, or a [description] of the task", shortened(task))
     });
     let arms = changes.get("arms").and_then(Value::as_integer).unwrap_or(2);

@@ -146,7 +146,7 @@ pub mod work;
 pub use advice::{ArmAdvice, StepAdvice, StepQuery};
 pub use episode::{Contacts, Episode, EpisodeKind};
 pub use evaluation::{EpisodeOutcome, EvaluationSummary, Wilson};
-pub use layout::{ArmIndex, Layout, Task};
+pub use layout::{ArmIndex, Layout, Task, World};
 pub use rng::{Stream, episode_rng};
 pub use settings::{Exploration, WorldSettings};
 pub use task::{TaskDescription, TaskSpec};

@@ -140,8 +140,9 @@ pub fn layout_of(model: &Model, role: Role) -> Result<Layout, ModelError> {
     if let Some(layout) = layout_in_metadata(&model.metadata)? {
         return Ok(layout);
     }
-    let candidates =
-        Task::ALL.into_iter().flat_map(|task| (1..=MAX_ARMS).map(move |n| Layout::new(task, n)));
+    let candidates = Task::CLASSIC
+        .into_iter()
+        .flat_map(|task| (1..=MAX_ARMS).map(move |n| Layout::new(task, n)));
     let fitting = candidates.filter(|layout| BoundNetwork::new(model, role, *layout).is_ok());
     let fitting: Vec<Layout> = fitting.collect();
     match fitting.as_slice() {
@@ -169,7 +170,7 @@ fn layout_in_metadata(entries: &BTreeMap<String, String>) -> Result<Option<Layou
         ModelError::Model(format!("metadata {key:?} is {value:?}, expected {expected}"))
     };
     let task = task.parse::<Task>().map_err(|_unknown| {
-        refused(metadata::TASK, task, Task::ALL.map(Task::name).join(" or "))
+        refused(metadata::TASK, task, format!("one of {}", Task::ALL.map(Task::name).join(", ")))
     })?;
     match n_arms.parse::<usize>() {
         Ok(n @ 1..=MAX_ARMS) => Ok(Some(Layout::new(task, n))),
