@@ -4,10 +4,10 @@ use std::path::Path;
 
 use rayon::iter::{IntoParallelRefIterator as _, ParallelIterator as _};
 use tandem_core::work::{EpisodeOrder, RunTerms};
-use tandem_core::{Episode, Exploration, Task, WorldSettings};
+use tandem_core::{Episode, Exploration, WorldSettings};
 use tandem_worker::record::{RecordError, log_name, metadata_of, record_episode};
 
-use crate::cli::EvalArgs;
+use crate::cli::{EvalArgs, check_layout};
 use crate::evaluation::{EvaluatedPolicy, measure};
 use crate::exit::{Exit, Failed, OrExit as _};
 use crate::{output, policy_file};
@@ -86,14 +86,6 @@ fn subject(args: &EvalArgs) -> Result<EvaluatedPolicy, Failed> {
         }
         (None, None) => return Err(Failed::usage("give --policy or --composed-teachers")),
     };
-    let layout = subject.layout();
-    let required_task = args.task.map_or(layout.task, Task::from);
-    let required_arms = args.arms.unwrap_or(layout.n_arms);
-    if (required_task, required_arms) != (layout.task, layout.n_arms) {
-        return Err(Failed::usage(format!(
-            "the policy is for {} with {} arm(s), not {required_task} with {required_arms}",
-            layout.task, layout.n_arms
-        )));
-    }
+    check_layout(subject.layout(), (args.task, args.world), args.arms)?;
     Ok(subject)
 }

@@ -48,6 +48,8 @@ pub enum World {
 impl World {
     /// All worlds.
     pub const ALL: [Self; 2] = [Self::Classic, Self::Shared];
+    /// The world of tasks whose world is not named.
+    pub const DEFAULT: Self = Self::Classic;
 
     /// Returns the name used on the command line.
     #[must_use]

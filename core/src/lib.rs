@@ -117,6 +117,7 @@
 //!     advised_arms: vec![0; EPISODE_STEPS],
 //!     contacts: vec![Contacts::NONE; EPISODE_STEPS],
 //!     advice_charged: 0,
+//!     avoidance_steps: None,
 //! };
 //! let summary = EvaluationSummary::of(&[EpisodeOutcome::of(&episode)]);
 //! assert_eq!(summary.success, 1.0);

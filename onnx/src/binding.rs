@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 use std::ops::Range;
 
+use tandem_core::text::counted;
 use tandem_core::{Layout, Task, TaskSpec};
 
 use crate::error::ModelError;
@@ -62,10 +63,10 @@ impl BoundNetwork {
                 kind: "output",
                 name: network.output.clone(),
                 problem: format!(
-                    "it has {} numbers, an action of {} with {} arm(s) has {}",
+                    "it has {} numbers, an action of {} with {} has {}",
                     network.n_output,
                     layout.name(),
-                    layout.n_arms(),
+                    counted(layout.n_arms(), "arm"),
                     layout.n_action()
                 ),
             });
@@ -217,10 +218,10 @@ fn sources(
     let fitting = candidates.into_iter().find(|sources| sources.len() == input.width);
     fitting.ok_or_else(|| {
         refused(format!(
-            "it has {} numbers, {} with {} arm(s) has {}",
+            "it has {} numbers, {} with {} has {}",
             input.width,
             layout.name(),
-            layout.n_arms(),
+            counted(layout.n_arms(), "arm"),
             lengths.join(" or ")
         ))
     })

@@ -3,8 +3,9 @@
 use std::path::PathBuf;
 
 use clap::{Args, Subcommand};
+use tandem_core::evaluation::TEST_SEED;
 
-use super::TaskName;
+use super::{TaskName, WorldName};
 
 #[derive(Debug, Args)]
 #[command(group = clap::ArgGroup::new("who").required(true), after_help = "\
@@ -21,8 +22,11 @@ pub(crate) struct EvalArgs {
     #[arg(long, value_name = "FILE", group = "who")]
     pub(crate) composed_teachers: Option<PathBuf>,
     /// Fails unless the policy is for this task.
-    #[arg(long, value_enum)]
+    #[arg(long, value_parser = TaskName::parser())]
     pub(crate) task: Option<TaskName>,
+    /// Fails unless the policy is for this world.
+    #[arg(long, value_enum)]
+    pub(crate) world: Option<WorldName>,
     /// Number of arms [default: the policy's; 2 for composed teachers].
     #[arg(long)]
     pub(crate) arms: Option<usize>,
@@ -30,7 +34,7 @@ pub(crate) struct EvalArgs {
     #[arg(long, default_value_t = 240, value_parser = clap::value_parser!(u64).range(1..=1_000_000))]
     pub(crate) episodes: u64,
     /// Seed of the test goals. Runs select their best policy on validation goals of another seed.
-    #[arg(long, default_value_t = 777)]
+    #[arg(long, default_value_t = TEST_SEED)]
     pub(crate) seed: u64,
     /// Records the first episode to this MCAP file.
     #[arg(long, value_name = "FILE.mcap")]
@@ -127,7 +131,7 @@ pub(crate) struct PictureArgs {
     #[arg(long, value_name = "FILE", conflicts_with = "policy")]
     pub(crate) composed_teachers: Option<PathBuf>,
     /// Number of the episode, which determines start and goal.
-    #[arg(long, default_value_t = 777)]
+    #[arg(long, default_value_t = TEST_SEED)]
     pub(crate) seed: u64,
     /// Control step to draw, 0 to 50.
     #[arg(long, default_value_t = 12, value_parser = clap::value_parser!(u32).range(0..=50))]

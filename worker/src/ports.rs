@@ -66,6 +66,12 @@ pub trait Environment {
         observations: &mut [f32],
         contacts: &mut [Contacts],
     ) -> Result<(), EnvironmentError>;
+
+    /// Returns the number of steps of the current episode of environment `environment`, from 0, in which the link
+    /// avoidance limited the motion of an arm; `None` if it is not counted.
+    fn avoidance_steps(&self, _environment: usize) -> Option<u32> {
+        None
+    }
 }
 
 /// An error of environments.
