@@ -5,19 +5,21 @@ use std::path::Path;
 
 use serde_json::{Value, json};
 use tandem_core::{Episode, EpisodeOutcome, EvaluationSummary, Layout, Wilson};
-use tandem_policy::Policy;
+use tandem_policy::{BlindActor, Policy};
 use tandem_sim::WorldConfig;
 use tandem_telemetry::ContactMetrics;
 use tandem_worker::{ComposedTeachers, evaluate};
 
-use crate::clock;
 use crate::exit::{Exit, Failed, OrExit as _};
+use crate::{clock, output};
 
 /// The policy that acts in an evaluation.
 #[derive(Debug, Clone)]
 pub(crate) enum EvaluatedPolicy {
     /// A policy for all arms of its layout.
     Policy(Policy),
+    /// A policy whose arms do not see each other.
+    Blind(Policy),
     /// A one-arm policy that controls each of so many arms.
     Composed(Policy, usize),
 }
@@ -48,15 +50,31 @@ impl EvaluatedPolicy {
         let layout = self.policy().layout.as_built_in();
         let layout = layout.expect("the constructors refuse policies of other tasks");
         match self {
-            Self::Policy(_) => layout,
+            Self::Policy(_) | Self::Blind(_) => layout,
             Self::Composed(_, n_arms) => Layout::new(layout.task, *n_arms),
         }
     }
 
     pub(crate) const fn policy(&self) -> &Policy {
         match self {
-            Self::Policy(policy) | Self::Composed(policy, _) => policy,
+            Self::Policy(policy) | Self::Blind(policy) | Self::Composed(policy, _) => policy,
         }
+    }
+
+    /// Warns if the run of the policy played training episodes or evaluations from `seed`, so that an evaluation on
+    /// these starts and goals is no test.
+    pub(crate) fn warn_if_trained_on(&self, seed: u64) {
+        let metadata = &self.policy().metadata;
+        let is_seed =
+            |key: &str| metadata.get(key).is_some_and(|of_run| *of_run == seed.to_string());
+        let purpose = match (is_seed("seed"), is_seed("evaluation_seed")) {
+            (true, _) => "trained",
+            (_, true) => "selected",
+            (false, false) => return,
+        };
+        output::message(format_args!(
+            "tandem: warning: the policy was {purpose} on the goals of seed {seed}: choose another --seed for a test"
+        ));
     }
 
     /// Plays `n_episodes` episodes, whose goals are fixed by `seed`, on all cores.
@@ -67,6 +85,10 @@ impl EvaluatedPolicy {
         let episodes = match self {
             Self::Policy(_) => {
                 evaluate(|| actor.clone(), layout, &world, n_episodes, seed, n_threads)
+            }
+            Self::Blind(policy) => {
+                let blind = BlindActor::new(policy).or_exit(Exit::Data, String::new)?;
+                evaluate(|| blind.clone(), layout, &world, n_episodes, seed, n_threads)
             }
             Self::Composed(..) => evaluate(
                 || ComposedTeachers(actor.clone()),

@@ -12,6 +12,7 @@ use super::{TaskName, WorldName};
 Examples:
   tandem eval --policy policies/student-push.safetensors
   tandem eval --policy FILE --episodes 400 --seed 7 --json
+  tandem eval --policy policies/student-push.safetensors --baselines
   tandem eval --composed-teachers policies/teacher-push.safetensors
   tandem eval --policy FILE --episodes 1 --record episode.mcap")]
 pub(crate) struct EvalArgs {
@@ -21,6 +22,13 @@ pub(crate) struct EvalArgs {
     /// One-arm policy that controls each arm separately: the baseline without a student.
     #[arg(long, value_name = "FILE", group = "who")]
     pub(crate) composed_teachers: Option<PathBuf>,
+    /// Also evaluates two baselines on the same goals: composed teachers, and the policy with arms that do not see each
+    /// other.
+    #[arg(long, requires = "policy")]
+    pub(crate) baselines: bool,
+    /// One-arm policy of the composed teachers [default: the shipped teacher of the task].
+    #[arg(long, value_name = "FILE", requires = "baselines")]
+    pub(crate) teacher: Option<PathBuf>,
     /// Fails unless the policy is for this task.
     #[arg(long, value_parser = TaskName::parser())]
     pub(crate) task: Option<TaskName>,
