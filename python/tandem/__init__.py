@@ -1,8 +1,8 @@
 """Environments, policies and services of Tandem: two robot arms, and advice from a policy for one arm.
 
-Importing the package registers four environments with Gymnasium: `tandem/Push-v0`, `tandem/PickAndPlace-v0`,
-`tandem/TwoArmPush-v0` and `tandem/TwoArmPickAndPlace-v0`. Servers and clients need gRPC: `pip install
-'tandem-rl[grpc]'`.
+Importing the package registers eight environments with Gymnasium: `tandem/Push-v0`, `tandem/PickAndPlace-v0`,
+`tandem/TwoArmPush-v0` and `tandem/TwoArmPickAndPlace-v0`, and the same tasks in the shared world as
+`tandem/SharedPush-v0` and so on. Servers and clients need gRPC: `pip install 'tandem-rl[grpc]'`.
 """
 
 from typing import TYPE_CHECKING, Any
