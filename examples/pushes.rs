@@ -147,8 +147,8 @@ fn is_touched(scene: &Scene, cube: &Cuboid) -> bool {
     let (cube_pose, cube_shape) = placed(cube);
     scene.arms.iter().flat_map(|arm| &arm.hand).any(|part| {
         let (pose, shape) = placed(part);
-        let gap_m = query::distance(&cube_pose, &*cube_shape.0, &pose, &*shape.0);
-        gap_m.is_ok_and(|gap_m| gap_m <= TOUCHES_M)
+        let gap = query::distance(&cube_pose, &*cube_shape.0, &pose, &*shape.0);
+        gap.is_ok_and(|gap| gap.distance <= TOUCHES_M)
     })
 }
 
