@@ -36,7 +36,8 @@ echo '- a short advised run, start to end'
 python3 - "$work/summary.json" <<'PY'
 import json, sys
 summary = json.loads(open(sys.argv[1]).read().splitlines()[-1])
-fields = "task arms episodes success success_low success_high success_joint success_per_arm collision_rate mean_return " \
+fields = "task arms episodes success_without_contact success_without_contact_low success_without_contact_high success " \
+         "success_low success_high success_joint success_per_arm arm_contact_rate table_contact_rate collision_rate mean_return " \
          "policy_digest env_steps updates wall_s advice_spent budget_left run_dir policy digest".split()
 missing = [field for field in fields if field not in summary]
 assert not missing, f"summary lacks {missing}"

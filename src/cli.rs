@@ -1,7 +1,6 @@
 //! The command line.
 
-use clap::{Parser, Subcommand, ValueEnum};
-use tandem_core::Task;
+use clap::{Parser, Subcommand};
 
 use crate::version::VERSION;
 
@@ -12,6 +11,7 @@ mod policy;
 mod results;
 mod scene;
 mod service;
+mod task;
 mod train;
 mod trial;
 
@@ -27,6 +27,7 @@ pub(crate) use service::{
     ClientArgs, EnvArgs, EnvGuardArgs, EnvironmentArgs, LearnerArgs, ListenArgs, RelayArgs,
     SecretArgs, TeacherArgs, WorkerArgs,
 };
+pub(crate) use task::{TaskName, WorldName, check_layout, check_task, chosen_task, task_flags};
 pub(crate) use train::{RecipeName, SweepArgs, TrainArgs};
 pub(crate) use trial::{ModeName, RecordName, TrialArgs};
 
@@ -96,19 +97,4 @@ pub(crate) enum Command {
     Picture(PictureArgs),
     /// Prints the simulated world, and episodes in it, as JSON for other physics engines.
     Scene(SceneArgs),
-}
-
-#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
-pub(crate) enum TaskName {
-    Push,
-    PickAndPlace,
-}
-
-impl From<TaskName> for Task {
-    fn from(name: TaskName) -> Self {
-        match name {
-            TaskName::Push => Self::Push,
-            TaskName::PickAndPlace => Self::PickAndPlace,
-        }
-    }
 }

@@ -1,20 +1,25 @@
 //! `tandem eval`: evaluates a policy on fixed goals.
 
+mod baselines;
+
 use std::path::Path;
 
 use rayon::iter::{IntoParallelRefIterator as _, ParallelIterator as _};
 use tandem_core::work::{EpisodeOrder, RunTerms};
-use tandem_core::{Episode, Exploration, Task, WorldSettings};
+use tandem_core::{Episode, Exploration, WorldSettings};
 use tandem_worker::record::{RecordError, log_name, metadata_of, record_episode};
 
-use crate::cli::EvalArgs;
+use crate::cli::{EvalArgs, check_layout};
 use crate::evaluation::{EvaluatedPolicy, measure};
 use crate::exit::{Exit, Failed, OrExit as _};
 use crate::{output, policy_file};
+use baselines::Baselines;
 
 pub(crate) fn eval(args: &EvalArgs) -> Result<(), Failed> {
     let subject = subject(args)?;
+    subject.warn_if_trained_on(args.seed);
     let result = measure(&subject, args.episodes, args.seed)?;
+    let baselines = Baselines::measure(args, &subject)?;
     let terms = terms(&subject);
     if let (Some(path), Some(first)) = (&args.record, result.episodes.first()) {
         record(&subject, &terms, args.seed, first, path)?;
@@ -28,7 +33,7 @@ pub(crate) fn eval(args: &EvalArgs) -> Result<(), Failed> {
         })?;
     }
     if args.json {
-        output::print(result.json())?;
+        output::print(baselines.json(&result))?;
     } else {
         let layout = result.layout;
         output::print(format_args!(
@@ -36,6 +41,7 @@ pub(crate) fn eval(args: &EvalArgs) -> Result<(), Failed> {
             layout.task, layout.n_arms, args.seed
         ))?;
         result.lines().iter().try_for_each(output::print)?;
+        baselines.table(&result).map_or(Ok(()), output::print)?;
         output::print(format_args!("speed         {:.0} env steps/s", result.steps_per_s))?;
         for path in args.record.iter().chain(&args.record_dir) {
             output::print(format_args!("recorded      {}", path.display()))?;
@@ -86,14 +92,6 @@ fn subject(args: &EvalArgs) -> Result<EvaluatedPolicy, Failed> {
         }
         (None, None) => return Err(Failed::usage("give --policy or --composed-teachers")),
     };
-    let layout = subject.layout();
-    let required_task = args.task.map_or(layout.task, Task::from);
-    let required_arms = args.arms.unwrap_or(layout.n_arms);
-    if (required_task, required_arms) != (layout.task, layout.n_arms) {
-        return Err(Failed::usage(format!(
-            "the policy is for {} with {} arm(s), not {required_task} with {required_arms}",
-            layout.task, layout.n_arms
-        )));
-    }
+    check_layout(subject.layout(), (args.task, args.world), args.arms)?;
     Ok(subject)
 }

@@ -5,18 +5,21 @@ use std::path::Path;
 
 use serde_json::{Value, json};
 use tandem_core::{Episode, EpisodeOutcome, EvaluationSummary, Layout, Wilson};
-use tandem_policy::Policy;
+use tandem_policy::{BlindActor, Policy};
 use tandem_sim::WorldConfig;
+use tandem_telemetry::ContactMetrics;
 use tandem_worker::{ComposedTeachers, evaluate};
 
-use crate::clock;
 use crate::exit::{Exit, Failed, OrExit as _};
+use crate::{clock, output};
 
 /// The policy that acts in an evaluation.
 #[derive(Debug, Clone)]
 pub(crate) enum EvaluatedPolicy {
     /// A policy for all arms of its layout.
     Policy(Policy),
+    /// A policy whose arms do not see each other.
+    Blind(Policy),
     /// A one-arm policy that controls each of so many arms.
     Composed(Policy, usize),
 }
@@ -47,15 +50,31 @@ impl EvaluatedPolicy {
         let layout = self.policy().layout.as_built_in();
         let layout = layout.expect("the constructors refuse policies of other tasks");
         match self {
-            Self::Policy(_) => layout,
+            Self::Policy(_) | Self::Blind(_) => layout,
             Self::Composed(_, n_arms) => Layout::new(layout.task, *n_arms),
         }
     }
 
     pub(crate) const fn policy(&self) -> &Policy {
         match self {
-            Self::Policy(policy) | Self::Composed(policy, _) => policy,
+            Self::Policy(policy) | Self::Blind(policy) | Self::Composed(policy, _) => policy,
         }
+    }
+
+    /// Warns if the run of the policy played training episodes or evaluations from `seed`, so that an evaluation on
+    /// these starts and goals is no test.
+    pub(crate) fn warn_if_trained_on(&self, seed: u64) {
+        let metadata = &self.policy().metadata;
+        let is_seed =
+            |key: &str| metadata.get(key).is_some_and(|of_run| *of_run == seed.to_string());
+        let purpose = match (is_seed("seed"), is_seed("evaluation_seed")) {
+            (true, _) => "trained",
+            (_, true) => "selected",
+            (false, false) => return,
+        };
+        output::message(format_args!(
+            "tandem: warning: the policy was {purpose} on the goals of seed {seed}: choose another --seed for a test"
+        ));
     }
 
     /// Plays `n_episodes` episodes, whose goals are fixed by `seed`, on all cores.
@@ -66,6 +85,10 @@ impl EvaluatedPolicy {
         let episodes = match self {
             Self::Policy(_) => {
                 evaluate(|| actor.clone(), layout, &world, n_episodes, seed, n_threads)
+            }
+            Self::Blind(policy) => {
+                let blind = BlindActor::new(policy).or_exit(Exit::Data, String::new)?;
+                evaluate(|| blind.clone(), layout, &world, n_episodes, seed, n_threads)
             }
             Self::Composed(..) => evaluate(
                 || ComposedTeachers(actor.clone()),
@@ -124,41 +147,64 @@ pub(crate) fn measure(
 
 impl EvaluationResult {
     pub(crate) fn json(&self) -> Value {
-        json!({
+        let contacts = ContactMetrics::of(&self.summary);
+        let mut value = json!({
             "task": self.layout.task.name(),
             "arms": self.layout.n_arms,
             "episodes": self.summary.n_episodes,
+            "success_without_contact": contacts.success_without_contact,
+            "success_without_contact_low": contacts.success_without_contact_low,
+            "success_without_contact_high": contacts.success_without_contact_high,
             "success": self.summary.success,
             "success_low": self.summary.interval.low,
             "success_high": self.summary.interval.high,
             "success_joint": self.summary.success_joint,
             "success_per_arm": self.summary.success_per_arm,
+            "arm_contact_rate": contacts.arm_contact_rate,
+            "table_contact_rate": contacts.table_contact_rate,
             "collision_rate": self.summary.collision_rate,
             "collision_rate_before_success": self.summary.collision_rate_before_success,
             "mean_return": self.summary.mean_return,
             "steps_per_s": self.steps_per_s,
             "policy_digest": self.policy_digest,
-        })
+        });
+        if let Some(avoidance_rate) = contacts.avoidance_rate {
+            value["avoidance_rate"] = avoidance_rate.into();
+        }
+        value
     }
 
     /// Returns the results as text, one line each.
     pub(crate) fn lines(&self) -> Vec<String> {
-        let summary = &self.summary;
+        let (summary, n_arms) = (&self.summary, self.layout.n_arms);
         let share = |label: &str, share: f64| {
             let Wilson { low, high } = summary.interval_of(share);
             format!("{label:<13} {share:.3}   95 % interval {low:.3} to {high:.3}")
         };
-        let mut lines = vec![
-            format!("{}, {} episodes", share("success", summary.success), summary.n_episodes),
-            share("joint norm", summary.success_joint),
-        ];
+        let mut lines = Vec::new();
+        if let Some(without_contact) = summary.success_without_contact.filter(|_| n_arms > 1) {
+            let without_contact = share("no contact", without_contact);
+            lines.push(format!("{without_contact}: success without contact between the arms"));
+        }
+        lines.push(format!(
+            "{}, {} episodes",
+            share("success", summary.success),
+            summary.n_episodes
+        ));
+        lines.push(share("joint norm", summary.success_joint));
         let arms = summary.success_per_arm.iter().enumerate();
         lines.extend(arms.map(|(arm, success)| share(&format!("arm {}", arm + 1), *success)));
+        let between_arms = summary.arm_contact_rate.filter(|_| n_arms > 1);
+        let contacts =
+            [("arm contact", between_arms), ("table contact", summary.table_contact_rate)];
+        let known = contacts.into_iter().filter_map(|(label, rate)| Some(share(label, rate?)));
+        lines.extend(known);
         lines.push(format!(
             "{}, {:.3} before success",
-            share("collisions", summary.collision_rate),
+            share("any contact", summary.collision_rate),
             summary.collision_rate_before_success
         ));
+        lines.extend(summary.avoidance_rate.map(|rate| share("avoidance", rate)));
         lines.push(format!("mean return   {:.1}", summary.mean_return));
         lines
     }

@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 use tandem_policy::Policy;
 use tandem_teacher::policy::is_onnx;
 
+use crate::cli::task_flags;
 use crate::exit::{Exit, Failed, OrExit as _};
 
 /// Loads a policy file.
@@ -29,8 +30,9 @@ pub(crate) fn shipped_teacher(task: &str) -> Result<PathBuf, Failed> {
         Some(Path::new(env!("CARGO_MANIFEST_DIR")).join(&name)),
     ];
     candidates.into_iter().flatten().find(|path| path.exists()).ok_or_else(|| {
+        let flags = task.parse().map_or_else(|_unknown| format!("--task {task}"), task_flags);
         Failed::usage(format!(
-            "{name}, the shipped teacher of {task}, does not exist: train one with `tandem train --arms 1 --task {task}` \
+            "{name}, the shipped teacher of {task}, does not exist: train one with `tandem train --arms 1 {flags}` \
              and name its policy/best.safetensors with --teacher"
         ))
     })

@@ -17,12 +17,15 @@ pub(crate) fn counts_line(progress: &pb::Progress) -> String {
 
 /// Returns the result of an evaluation.
 pub(crate) fn evaluation_line(progress: &pb::Progress, evaluation: &pb::Evaluation) -> String {
+    let without_contact = evaluation.success_without_contact.filter(|_| progress.n_arms > 1);
+    let without_contact = without_contact.map(|share| format!(", {share:.3} without arm contact"));
     format!(
-        "{} success {:.3} [{:.3}, {:.3}] at {} env steps; joint {:.3}, contacts {:.3}, mean Q {:.2}, advice {} of {}",
+        "{} success {:.3} [{:.3}, {:.3}]{} at {} env steps; joint {:.3}, contacts {:.3}, mean Q {:.2}, advice {} of {}",
         clock_text(progress.wall_s),
         evaluation.success,
         evaluation.success_low,
         evaluation.success_high,
+        without_contact.unwrap_or_default(),
         grouped(evaluation.env_steps),
         evaluation.success_joint,
         evaluation.collision_rate,

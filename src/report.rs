@@ -8,13 +8,15 @@ use tandem_report::{
     report_html, trials,
 };
 
+use tandem_core::evaluation::TEST_SEED;
+use tandem_telemetry::ContactMetrics;
+
 use crate::cli::ReportArgs;
 use crate::evaluation::{EvaluatedPolicy, EvaluationResult, measure};
 use crate::exit::{Exit, Failed, OrExit as _};
 use crate::{output, policy_file};
 
-/// Test goals for the evaluation of composed teachers: those of `tandem eval` and of the end of a run.
-const TEST_SEED: u64 = 777;
+/// Number of test goals for the evaluation of composed teachers, as for `tandem eval` and at the end of a run.
 const TEST_EPISODES: u64 = 240;
 
 pub(crate) fn report(args: &ReportArgs) -> Result<(), Failed> {
@@ -100,6 +102,7 @@ fn test_evaluation(result: &EvaluationResult) -> TestEvaluation {
         interval: (summary.interval.low, summary.interval.high),
         success_joint: summary.success_joint,
         collision_rate: summary.collision_rate,
+        contacts: ContactMetrics::of(summary),
     }
 }
 

@@ -4,7 +4,7 @@ use std::path::Path;
 
 use anyhow::{Context as _, anyhow, bail};
 use tandem_core::settings::OutOfRange;
-use tandem_core::{Task, TaskDescription, TaskSpec};
+use tandem_core::{Task, TaskDescription, TaskSpec, World};
 use tandem_rl::RunConfig;
 use tandem_rl::config::{ConfigError, INIT_TEACHER, Recipe, former_keys};
 use tandem_system::atomic_file;
@@ -187,9 +187,10 @@ fn task_for(changes: &Table) -> anyhow::Result<TaskSpec> {
             })?;
         return TaskSpec::new(description).map_err(|error| anyhow!("description.{error}"));
     }
-    let task = changes.get("task").and_then(Value::as_str).unwrap_or("push");
+    let default = Task::Push.in_world(World::DEFAULT).name();
+    let task = changes.get("task").and_then(Value::as_str).unwrap_or(default);
     let known_task = task.parse::<Task>().map_err(|_unknown| {
-        let names = Task::ALL.map(Task::name).join(" or ");
+        let names = Task::ALL.map(Task::name).join(", ");
         anyhow!("task is {:?}: expected {names}, or a [description] of the task", shortened(task))
     });
     let arms = changes.get("arms").and_then(Value::as_integer).unwrap_or(2);

@@ -3,11 +3,11 @@
 use anyhow::anyhow;
 use serde::Serialize;
 use tandem_core::rng::{Stream, episode_rng};
-use tandem_core::{Contacts, Episode, Layout, Task, WorldSettings};
+use tandem_core::{Contacts, Episode, Layout, Task, World, WorldSettings};
 use tandem_sim::description::WorldDescription;
 use tandem_sim::{Env, SimError, WorldConfig};
 
-use crate::cli::SceneArgs;
+use crate::cli::{SceneArgs, check_layout, chosen_task};
 use crate::evaluation::EvaluatedPolicy;
 use crate::exit::{Exit, Failed, OrExit as _};
 use crate::{input, output, policy_file};
@@ -78,18 +78,14 @@ fn policy(args: &SceneArgs) -> Result<Option<EvaluatedPolicy>, Failed> {
 }
 
 fn layout(args: &SceneArgs, policy: Option<&EvaluatedPolicy>) -> Result<Layout, Failed> {
-    let default = policy.map_or(Layout::new(Task::Push, 2), EvaluatedPolicy::layout);
-    let layout = Layout::new(
-        args.task.map_or(default.task, Task::from),
-        args.arms.unwrap_or(default.n_arms),
-    );
-    if policy.is_some() && layout != default {
-        return Err(Failed::usage(format!(
-            "the policy is for {} with {} arm(s), not {} with {}",
-            default.task, default.n_arms, layout.task, layout.n_arms
-        )));
+    if let Some(policy) = policy {
+        let layout = policy.layout();
+        check_layout(layout, (args.task, args.world), args.arms)?;
+        return Ok(layout);
     }
-    Ok(layout)
+    let default = Task::Push.in_world(World::DEFAULT);
+    let task = chosen_task(args.task, args.world).unwrap_or(default);
+    Ok(Layout::new(task, args.arms.unwrap_or(2)))
 }
 
 /// Simulates the actions of each episode.

@@ -139,6 +139,12 @@ fn evaluation_json(evaluation: &pb::Evaluation) -> Value {
         "episodes": evaluation.n_episodes, "success": evaluation.success,
         "success_low": evaluation.success_low, "success_high": evaluation.success_high,
         "success_joint": evaluation.success_joint, "success_per_arm": evaluation.success_per_arm,
+        "success_without_contact": evaluation.success_without_contact,
+        "success_without_contact_low": evaluation.success_without_contact_low,
+        "success_without_contact_high": evaluation.success_without_contact_high,
+        "arm_contact_rate": evaluation.arm_contact_rate,
+        "table_contact_rate": evaluation.table_contact_rate,
+        "avoidance_rate": evaluation.avoidance_rate,
         "collision_rate": evaluation.collision_rate, "mean_q": evaluation.mean_q,
     })
 }

@@ -359,6 +359,7 @@ async fn submit_invalid_episodes(address: SocketAddr) {
         advised_arms: vec![0; 50],
         contacts: vec![0; 50],
         advice_charged: 0,
+        avoidance_steps: None,
     };
     for slot in 0..40 {
         let mut episode = whole.clone();

@@ -91,7 +91,7 @@ fn what_cannot_be_converted_is_refused_in_one_line() {
     refused(
         &[&["policy", "import", &actor][..], &pick].concat(),
         65,
-        "it has 3 numbers, an action of pick-and-place with 1 arm(s) has 4",
+        "it has 3 numbers, an action of pick-and-place with 1 arm has 4",
     );
     refused(&["policy", "import", TEACHER, "--out", &out], 65, "it is not a complete ONNX file");
     refused(&["eval", "--policy", &actor], 64, "is an ONNX model: convert it with `tandem policy");

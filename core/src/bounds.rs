@@ -4,7 +4,7 @@
 //! normalise every later input, so the learner refuses episodes that contain one. The bounds leave room for everything
 //! that can happen in an episode of 2 s, such as an object that falls off the table.
 
-use crate::layout::{Layout, OBSERVATION_PER_ARM, Task};
+use crate::layout::{Layout, OBSERVATION_PER_ARM};
 
 /// Bound on the magnitude of any number in any observation or goal. It applies to students of unknown origin.
 pub const MAX_MAGNITUDE: f32 = 1000.0;
@@ -54,24 +54,20 @@ impl Layout {
     /// Returns the largest magnitude that number `idx` of an observation can have.
     #[must_use]
     pub const fn observation_bound(self, idx: usize) -> f32 {
-        match self.task {
-            Task::Push | Task::PickAndPlace => TABLE_TOP[idx % OBSERVATION_PER_ARM],
-        }
+        TABLE_TOP[idx % OBSERVATION_PER_ARM]
     }
 
     /// Returns the largest magnitude that a number of a desired goal can have, metres.
     #[must_use]
     pub const fn goal_bound(self) -> f32 {
-        match self.task {
-            Task::Push | Task::PickAndPlace => REACH_M,
-        }
+        REACH_M
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::layout::{HAND_POSITION, OBJECT_POSITION};
+    use crate::layout::{HAND_POSITION, OBJECT_POSITION, Task};
 
     #[test]
     fn every_number_of_every_arm_has_the_bound_of_its_quantity() {

@@ -85,6 +85,8 @@ pub struct Episode {
     pub contacts: Vec<Contacts>,
     /// Units of the advice budget that the episode cost: one for each step with at least one advised arm.
     pub advice_charged: u32,
+    /// Number of steps in which the link avoidance limited the motion of an arm, if the environment counts them.
+    pub avoidance_steps: Option<u32>,
 }
 
 impl Episode {
@@ -103,6 +105,7 @@ impl Episode {
             advised_arms: vec![0; n_steps],
             contacts: vec![Contacts::NONE; n_steps],
             advice_charged: 0,
+            avoidance_steps: None,
             layout,
         }
     }

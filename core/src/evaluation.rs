@@ -2,6 +2,9 @@
 
 use crate::episode::{Contacts, Episode};
 
+/// Seed of the test goals of reports. No run trains or selects its best policy on them.
+pub const TEST_SEED: u64 = 777;
+
 /// The outcome of one evaluation episode.
 #[derive(Debug, Clone, PartialEq)]
 pub struct EpisodeOutcome {
@@ -11,6 +14,12 @@ pub struct EpisodeOutcome {
     pub success_joint: bool,
     /// The success of each arm, in arm order.
     pub success_per_arm: Vec<bool>,
+    /// There was at least one arm–arm contact; `None` if the task does not report contacts.
+    pub arm_contact: Option<bool>,
+    /// There was at least one arm–table contact; `None` if the task does not report contacts.
+    pub table_contact: Option<bool>,
+    /// The link avoidance limited the motion of an arm in at least one step; `None` if this is not known.
+    pub avoidance: Option<bool>,
     /// There was at least one arm–arm or arm–table contact.
     pub collided: bool,
     /// There was at least one such contact before all objects were at their goals to stay.
@@ -26,12 +35,19 @@ impl EpisodeOutcome {
     #[must_use]
     pub fn of(episode: &Episode) -> Self {
         let collided = episode.contacts.iter().any(|contacts| contacts.any());
+        let has = |contact: Contacts| {
+            let mut contacts = episode.contacts.iter();
+            episode.layout.reports_contacts().then(|| contacts.any(|each| each.contains(contact)))
+        };
         let settled_after = steps_until_settled(episode);
         let first_contact = episode.contacts.iter().position(|contacts: &Contacts| contacts.any());
         Self {
             success: episode.succeeded(),
             success_joint: episode.succeeded_jointly(),
             success_per_arm: episode.layout.arms().map(|arm| episode.arm_succeeded(arm)).collect(),
+            arm_contact: has(Contacts::ARM_ARM),
+            table_contact: has(Contacts::ARM_TABLE),
+            avoidance: episode.avoidance_steps.map(|n_steps| n_steps > 0),
             collided,
             collided_before_success: first_contact.is_some_and(|step_idx| step_idx < settled_after),
             moved: episode.moved(),
@@ -39,6 +55,13 @@ impl EpisodeOutcome {
                 .map(|step_idx| episode.joint_reward(step_idx))
                 .sum(),
         }
+    }
+
+    /// Returns true if every object ended at its goal and the arms never touched each other; `None` if the task does
+    /// not report contacts.
+    #[must_use]
+    pub fn success_without_contact(&self) -> Option<bool> {
+        self.arm_contact.map(|arm_contact| self.success && !arm_contact)
     }
 }
 
@@ -87,6 +110,9 @@ impl Wilson {
 pub struct EvaluationSummary {
     /// Number of episodes.
     pub n_episodes: usize,
+    /// Fraction with every object at its goal and no contact between the arms; `None` if the task does not report
+    /// contacts.
+    pub success_without_contact: Option<f64>,
     /// Fraction with every object at its goal.
     pub success: f64,
     /// The 95 % interval of `success`.
@@ -95,6 +121,12 @@ pub struct EvaluationSummary {
     pub success_joint: f64,
     /// Success rate of each arm, in arm order.
     pub success_per_arm: Vec<f64>,
+    /// Fraction with at least one arm–arm contact; `None` if the task does not report contacts.
+    pub arm_contact_rate: Option<f64>,
+    /// Fraction with at least one arm–table contact; `None` if the task does not report contacts.
+    pub table_contact_rate: Option<f64>,
+    /// Fraction in which the link avoidance limited the motion of an arm; `None` if this is not known.
+    pub avoidance_rate: Option<f64>,
     /// Fraction with at least one arm–arm or arm–table contact.
     pub collision_rate: f64,
     /// Fraction with such a contact before all objects were at their goals to stay.
@@ -125,15 +157,23 @@ impl EvaluationSummary {
             outcomes.iter().filter(|outcome| holds(outcome)).count()
         };
         let share = |holds: &dyn Fn(&EpisodeOutcome) -> bool| count(holds) as f64 / n;
+        let known_share = |of: &dyn Fn(&EpisodeOutcome) -> Option<bool>| {
+            let known: Option<Vec<bool>> = outcomes.iter().map(of).collect();
+            known.map(|holds| holds.iter().filter(|holds| **holds).count() as f64 / n)
+        };
         let n_arms = outcomes.first().map_or(0, |outcome| outcome.success_per_arm.len());
         Self {
             n_episodes: outcomes.len(),
+            success_without_contact: known_share(&EpisodeOutcome::success_without_contact),
             success: share(&|outcome| outcome.success),
             interval: Wilson::of(count(&|outcome| outcome.success), outcomes.len()),
             success_joint: share(&|outcome| outcome.success_joint),
             success_per_arm: (0..n_arms)
                 .map(|arm| share(&|outcome| outcome.success_per_arm[arm]))
                 .collect(),
+            arm_contact_rate: known_share(&|outcome| outcome.arm_contact),
+            table_contact_rate: known_share(&|outcome| outcome.table_contact),
+            avoidance_rate: known_share(&|outcome| outcome.avoidance),
             collision_rate: share(&|outcome| outcome.collided),
             collision_rate_before_success: share(&|outcome| outcome.collided_before_success),
             moved: share(&|outcome| outcome.moved),
@@ -149,6 +189,7 @@ impl EvaluationSummary {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::layout::{Layout, Task};
 
     #[test]
     fn the_wilson_interval_has_the_textbook_values() {
@@ -163,5 +204,49 @@ mod tests {
         check(5, 10, 0.2366, 0.7634);
         check(240, 240, 0.9842, 1.0);
         check(0, 0, 0.0, 1.0);
+    }
+
+    fn outcome(
+        success: bool,
+        contacts: &[Contacts],
+        avoidance_steps: Option<u32>,
+    ) -> EpisodeOutcome {
+        let mut episode = Episode::zeros(Layout::new(Task::Push, 2), 0);
+        episode.goal.fill(if success { 0.0 } else { 1.0 });
+        episode.contacts[..contacts.len()].copy_from_slice(contacts);
+        episode.avoidance_steps = avoidance_steps;
+        EpisodeOutcome::of(&episode)
+    }
+
+    #[test]
+    fn only_a_contact_between_the_arms_spoils_success_without_contact() {
+        let check = |success, contacts: &[Contacts], expected| {
+            let outcome = outcome(success, contacts, None);
+            assert_eq!(outcome.success_without_contact(), Some(expected), "{contacts:?}");
+        };
+        check(true, &[], true);
+        check(true, &[Contacts::ARM_TABLE], true);
+        check(true, &[Contacts::NONE, Contacts::ARM_ARM], false);
+        check(true, &[Contacts::ARM_TABLE | Contacts::ARM_ARM], false);
+        check(false, &[], false);
+    }
+
+    #[test]
+    fn rates_of_contacts_are_separate_and_unknown_ones_are_left_out() {
+        let outcomes = [
+            outcome(true, &[], Some(0)),
+            outcome(true, &[Contacts::ARM_ARM], Some(3)),
+            outcome(false, &[Contacts::ARM_TABLE], Some(0)),
+            outcome(true, &[Contacts::ARM_TABLE], Some(1)),
+        ];
+        let summary = EvaluationSummary::of(&outcomes);
+        assert_eq!((summary.success, summary.success_without_contact), (0.75, Some(0.5)));
+        assert_eq!((summary.arm_contact_rate, summary.table_contact_rate), (Some(0.25), Some(0.5)));
+        assert_eq!((summary.collision_rate, summary.avoidance_rate), (0.75, Some(0.5)));
+        let mixed = [outcomes[0].clone(), outcome(true, &[], None)];
+        assert_eq!(EvaluationSummary::of(&mixed).avoidance_rate, None);
+        let unknown = EpisodeOutcome { arm_contact: None, ..outcomes[0].clone() };
+        let summary = EvaluationSummary::of(&[unknown]);
+        assert_eq!((summary.success, summary.success_without_contact), (1.0, None));
     }
 }

@@ -23,25 +23,103 @@ pub const EPISODE_STEPS: usize = 50;
 /// Distance between object and goal up to which the goal counts as achieved, metres.
 pub const GOAL_TOLERANCE_M: f32 = 0.05;
 
-/// A built-in manipulation task (section 4.1 of the paper).
+/// A built-in manipulation task (section 4.1 of the paper) in one of two worlds.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Task {
-    /// Push an object across the table to its goal with a closed gripper.
+    /// Push an object across the table to its goal with a closed gripper, in the classic world.
     Push,
-    /// Grasp an object and move it to its goal, on the table or in the air.
+    /// Grasp an object and move it to its goal, on the table or in the air, in the classic world.
     PickAndPlace,
+    /// [`Task::Push`] in the shared world.
+    SharedPush,
+    /// [`Task::PickAndPlace`] in the shared world.
+    SharedPickAndPlace,
+}
+
+/// The world of a built-in task: speed of the arms, and areas of objects and goals.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub enum World {
+    /// Fast hands; objects and goals of two arms lie in adjacent areas.
+    Classic,
+    /// Hands as slow as the paper's arms, 0.2 m/s, and one area for the objects and goals of both arms.
+    Shared,
+}
+
+impl World {
+    /// All worlds.
+    pub const ALL: [Self; 2] = [Self::Classic, Self::Shared];
+    /// The world of tasks whose world is not named.
+    pub const DEFAULT: Self = Self::Classic;
+
+    /// Returns the name used on the command line.
+    #[must_use]
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Classic => "classic",
+            Self::Shared => "shared",
+        }
+    }
+
+    /// Returns the duration of a control step in simulated time, seconds.
+    #[must_use]
+    pub const fn control_step_s(self) -> f32 {
+        match self {
+            Self::Classic => 0.04,
+            Self::Shared => 0.25,
+        }
+    }
+}
+
+impl fmt::Display for World {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(self.name())
+    }
 }
 
 impl Task {
     /// All tasks, in the order of the paper.
-    pub const ALL: [Self; 2] = [Self::Push, Self::PickAndPlace];
+    pub const ALL: [Self; 4] =
+        [Self::Push, Self::PickAndPlace, Self::SharedPush, Self::SharedPickAndPlace];
+    /// The tasks in the classic world, in the order of the paper.
+    pub const CLASSIC: [Self; 2] = [Self::Push, Self::PickAndPlace];
 
-    /// Returns the name used on the command line and in files.
+    /// Returns the name used in files and messages.
     #[must_use]
     pub const fn name(self) -> &'static str {
         match self {
             Self::Push => "push",
             Self::PickAndPlace => "pick-and-place",
+            Self::SharedPush => "shared-push",
+            Self::SharedPickAndPlace => "shared-pick-and-place",
+        }
+    }
+
+    /// Returns the world in which the task is performed.
+    #[must_use]
+    pub const fn world(self) -> World {
+        match self {
+            Self::Push | Self::PickAndPlace => World::Classic,
+            Self::SharedPush | Self::SharedPickAndPlace => World::Shared,
+        }
+    }
+
+    /// Returns the same task in `world`.
+    #[must_use]
+    pub const fn in_world(self, world: World) -> Self {
+        match (self.grasps(), world) {
+            (false, World::Classic) => Self::Push,
+            (true, World::Classic) => Self::PickAndPlace,
+            (false, World::Shared) => Self::SharedPush,
+            (true, World::Shared) => Self::SharedPickAndPlace,
+        }
+    }
+
+    /// Returns true if the arms grasp their objects; otherwise they push them with closed grippers.
+    #[must_use]
+    pub const fn grasps(self) -> bool {
+        match self {
+            Self::Push | Self::SharedPush => false,
+            Self::PickAndPlace | Self::SharedPickAndPlace => true,
         }
     }
 
@@ -49,10 +127,7 @@ impl Task {
     /// place, the gripper's input (1).
     #[must_use]
     pub const fn action_per_arm(self) -> usize {
-        match self {
-            Self::Push => 3,
-            Self::PickAndPlace => 4,
-        }
+        if self.grasps() { 4 } else { 3 }
     }
 }
 
@@ -64,7 +139,7 @@ impl fmt::Display for Task {
 
 /// An unknown name of a task.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error("unknown task {0:?}: expected push or pick-and-place")]
+#[error("unknown task {0:?}: expected push, pick-and-place, shared-push or shared-pick-and-place")]
 pub struct UnknownTask(pub String);
 
 impl FromStr for Task {

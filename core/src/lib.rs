@@ -117,6 +117,7 @@
 //!     advised_arms: vec![0; EPISODE_STEPS],
 //!     contacts: vec![Contacts::NONE; EPISODE_STEPS],
 //!     advice_charged: 0,
+//!     avoidance_steps: None,
 //! };
 //! let summary = EvaluationSummary::of(&[EpisodeOutcome::of(&episode)]);
 //! assert_eq!(summary.success, 1.0);
@@ -146,7 +147,7 @@ pub mod work;
 pub use advice::{ArmAdvice, StepAdvice, StepQuery};
 pub use episode::{Contacts, Episode, EpisodeKind};
 pub use evaluation::{EpisodeOutcome, EvaluationSummary, Wilson};
-pub use layout::{ArmIndex, Layout, Task};
+pub use layout::{ArmIndex, Layout, Task, World};
 pub use rng::{Stream, episode_rng};
 pub use settings::{Exploration, WorldSettings};
 pub use task::{TaskDescription, TaskSpec};

@@ -34,6 +34,13 @@ pub fn shortened(text: &str, max_chars: usize) -> String {
     }
 }
 
+/// Returns `n` and `noun`, with the plural of regular nouns: `1 arm`, `2 arms`.
+#[must_use]
+pub fn counted(n: usize, noun: &str) -> String {
+    let plural = if n == 1 { "" } else { "s" };
+    format!("{n} {noun}{plural}")
+}
+
 /// Encodes bytes as lower-case hexadecimal digits, two per byte.
 #[must_use]
 pub fn hex(bytes: &[u8]) -> String {

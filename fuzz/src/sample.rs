@@ -51,6 +51,7 @@ pub fn episode(number: u64) -> Episode {
         advised_arms: vec![1; EPISODE_STEPS],
         contacts: vec![Contacts::ARM_TABLE; EPISODE_STEPS],
         advice_charged: 3,
+        avoidance_steps: Some(2),
     }
 }
 

@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 use std::ops::Range;
 
+use tandem_core::text::counted;
 use tandem_core::{Layout, Task, TaskSpec};
 
 use crate::error::ModelError;
@@ -62,10 +63,10 @@ impl BoundNetwork {
                 kind: "output",
                 name: network.output.clone(),
                 problem: format!(
-                    "it has {} numbers, an action of {} with {} arm(s) has {}",
+                    "it has {} numbers, an action of {} with {} has {}",
                     network.n_output,
                     layout.name(),
-                    layout.n_arms(),
+                    counted(layout.n_arms(), "arm"),
                     layout.n_action()
                 ),
             });
@@ -140,8 +141,9 @@ pub fn layout_of(model: &Model, role: Role) -> Result<Layout, ModelError> {
     if let Some(layout) = layout_in_metadata(&model.metadata)? {
         return Ok(layout);
     }
-    let candidates =
-        Task::ALL.into_iter().flat_map(|task| (1..=MAX_ARMS).map(move |n| Layout::new(task, n)));
+    let candidates = Task::CLASSIC
+        .into_iter()
+        .flat_map(|task| (1..=MAX_ARMS).map(move |n| Layout::new(task, n)));
     let fitting = candidates.filter(|layout| BoundNetwork::new(model, role, *layout).is_ok());
     let fitting: Vec<Layout> = fitting.collect();
     match fitting.as_slice() {
@@ -169,7 +171,7 @@ fn layout_in_metadata(entries: &BTreeMap<String, String>) -> Result<Option<Layou
         ModelError::Model(format!("metadata {key:?} is {value:?}, expected {expected}"))
     };
     let task = task.parse::<Task>().map_err(|_unknown| {
-        refused(metadata::TASK, task, Task::ALL.map(Task::name).join(" or "))
+        refused(metadata::TASK, task, format!("one of {}", Task::ALL.map(Task::name).join(", ")))
     })?;
     match n_arms.parse::<usize>() {
         Ok(n @ 1..=MAX_ARMS) => Ok(Some(Layout::new(task, n))),
@@ -216,10 +218,10 @@ fn sources(
     let fitting = candidates.into_iter().find(|sources| sources.len() == input.width);
     fitting.ok_or_else(|| {
         refused(format!(
-            "it has {} numbers, {} with {} arm(s) has {}",
+            "it has {} numbers, {} with {} has {}",
             input.width,
             layout.name(),
-            layout.n_arms(),
+            counted(layout.n_arms(), "arm"),
             lengths.join(" or ")
         ))
     })

@@ -237,7 +237,7 @@ fn parse_description(metadata: &BTreeMap<String, String>) -> Result<TaskSpec, Fo
 
 fn parse_task(metadata: &BTreeMap<String, String>) -> Result<Task, FormatError> {
     let got = entry(metadata, "task")?;
-    let expected = || Task::ALL.map(Task::name).join(" or ");
+    let expected = || format!("one of {}", Task::ALL.map(Task::name).join(", "));
     let refusal = |_unknown| FormatError::Metadata {
         key: "task",
         got: shortened(got, MAX_SHOWN_CHARS),

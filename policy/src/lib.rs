@@ -83,6 +83,7 @@
 #![warn(missing_docs)]
 
 pub mod adam;
+mod blind;
 mod elementwise;
 mod error;
 pub mod file;
@@ -96,6 +97,7 @@ mod replicate;
 mod validation;
 
 pub use adam::{Adam, polyak_update};
+pub use blind::BlindActor;
 pub use elementwise::{all_finite, tanh};
 pub use error::{Error, FormatError};
 pub use inference::{Actor, Critic};

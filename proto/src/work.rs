@@ -99,7 +99,7 @@ fn decode_layout(task: &str, n_arms: u32) -> Result<Layout, DecodeError> {
     let Ok(known_task) = task.parse::<Task>() else {
         let beginning: String = task.chars().take(MAX_SHOWN_CHARS).collect();
         let got = format_args!("{beginning:?}").to_string();
-        return Err(DecodeError::new("task", "push or pick-and-place", got));
+        return Err(DecodeError::new("task", "the name of a built-in task", got));
     };
     let n_known_arms =
         usize::try_from(n_arms).ok().filter(|n_arms| (1..=MAX_ARMS).contains(n_arms));
@@ -344,7 +344,7 @@ mod tests {
         };
         check(
             |t| t.task = "pick".to_owned(),
-            "task: expected push or pick-and-place, got \"pick\"",
+            "task: expected the name of a built-in task, got \"pick\"",
         );
         check(|t| t.n_arms = 0, "n_arms: expected 1 to 8, got 0");
         check(|t| t.n_arms = 9, "n_arms: expected 1 to 8, got 9");

@@ -243,7 +243,13 @@ fn episode(layout: Layout) -> impl Strategy<Value = pb::Episode> {
         })
     };
     (
-        (any::<u64>(), any_kind(), any::<u64>(), any_count(50)),
+        (
+            any::<u64>(),
+            any_kind(),
+            any::<u64>(),
+            any_count(50),
+            proptest::option::of(any_count(50)),
+        ),
         number_bytes((EPISODE_STEPS + 1) * layout.n_observation()),
         number_bytes(layout.n_goal()),
         number_bytes(EPISODE_STEPS * layout.n_action()),
@@ -260,6 +266,7 @@ fn episode(layout: Layout) -> impl Strategy<Value = pb::Episode> {
             advised_arms,
             contacts,
             advice_charged: head.3,
+            avoidance_steps: head.4,
         })
 }
 

@@ -1,8 +1,9 @@
 """Environments, policies and services of Tandem: two robot arms, and advice from a policy for one arm.
 
-Importing the package registers four environments with Gymnasium: `tandem/Push-v0`, `tandem/PickAndPlace-v0`,
-`tandem/TwoArmPush-v0` and `tandem/TwoArmPickAndPlace-v0`. With `pip install 'tandem-rl[fetch]'` there are two more, in
-MuJoCo: `tandem/TwoFetchPush-v0` and `tandem/TwoFetchPickAndPlace-v0`. Servers and clients need gRPC: `pip install
+Importing the package registers eight environments with Gymnasium: `tandem/Push-v0`, `tandem/PickAndPlace-v0`,
+`tandem/TwoArmPush-v0` and `tandem/TwoArmPickAndPlace-v0`, and the same tasks in the shared world as
+`tandem/SharedPush-v0` and so on. With `pip install 'tandem-rl[fetch]'` there are two more, in MuJoCo:
+`tandem/TwoFetchPush-v0` and `tandem/TwoFetchPickAndPlace-v0`. Servers and clients need gRPC: `pip install
 'tandem-rl[grpc]'`.
 """
 

@@ -15,15 +15,22 @@ Observation = dict[str, NDArray[np.float32]]
 Action = NDArray[np.float32]
 
 EPISODE_STEPS = 50
-"""Control steps of an episode, 0.04 s each."""
+"""Control steps of an episode."""
 
 _TASKS = {
-    "tandem/Push-v0": ("push", 1),
-    "tandem/PickAndPlace-v0": ("pick-and-place", 1),
-    "tandem/TwoArmPush-v0": ("push", 2),
-    "tandem/TwoArmPickAndPlace-v0": ("pick-and-place", 2),
+    "tandem/Push-v0": ("push", 1, "classic"),
+    "tandem/PickAndPlace-v0": ("pick-and-place", 1, "classic"),
+    "tandem/TwoArmPush-v0": ("push", 2, "classic"),
+    "tandem/TwoArmPickAndPlace-v0": ("pick-and-place", 2, "classic"),
+    "tandem/SharedPush-v0": ("push", 1, "shared"),
+    "tandem/SharedPickAndPlace-v0": ("pick-and-place", 1, "shared"),
+    "tandem/SharedTwoArmPush-v0": ("push", 2, "shared"),
+    "tandem/SharedTwoArmPickAndPlace-v0": ("pick-and-place", 2, "shared"),
 }
 _FETCH_TASKS = {"tandem/TwoFetchPush-v0": "push", "tandem/TwoFetchPickAndPlace-v0": "pick-and-place"}
+
+RENDER_FPS = {"classic": 25, "shared": 4}
+"""Control steps per second of simulated time in each world."""
 
 
 class TandemEnv(gymnasium.Env[Observation, Action]):
@@ -47,6 +54,8 @@ class TandemEnv(gymnasium.Env[Observation, Action]):
     Args:
         task: `"push"` or `"pick-and-place"`.
         n_arms: 1 or 2.
+        world: `"classic"` (fast arms whose areas lie next to each other, control steps of 0.04 s) or `"shared"` (slow
+            arms that share one area, control steps of 0.25 s).
         substeps: Physics steps per control step, 20 or 10.
         grasped_start_prob: Probability that an episode of pick and place starts with the cubes grasped.
         render_mode: `"rgb_array"` or None.
@@ -61,6 +70,7 @@ class TandemEnv(gymnasium.Env[Observation, Action]):
         task: str = "push",
         n_arms: int = 2,
         *,
+        world: str = "classic",
         substeps: int = 20,
         grasped_start_prob: float = 0.0,
         render_mode: str | None = None,
@@ -69,8 +79,9 @@ class TandemEnv(gymnasium.Env[Observation, Action]):
     ) -> None:
         check_rendering(render_mode, width, height)
         self._simulation = _native.Simulation(
-            task, n_arms, substeps=substeps, grasped_start_prob=grasped_start_prob
+            task_name(task, world), n_arms, substeps=substeps, grasped_start_prob=grasped_start_prob
         )
+        self.metadata = {**type(self).metadata, "render_fps": RENDER_FPS[world]}
         self.render_mode = render_mode
         self._size = (width, height)
         self.observation_space, self.action_space = spaces_of(self._simulation)
@@ -103,7 +114,7 @@ class TandemEnv(gymnasium.Env[Observation, Action]):
         return self._simulation.reset(self._seed, self._episode)
 
     def step(self, action: ArrayLike) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """Executes `action`, shape `[n_action]`, for one control step of 0.04 s.
+        """Executes `action`, shape `[n_action]`, for one control step.
 
         Raises:
             ValueError: The action has another length or contains a number that is not finite; nothing has moved.
@@ -119,6 +130,17 @@ class TandemEnv(gymnasium.Env[Observation, Action]):
     def render(self) -> NDArray[np.uint8] | None:
         """Draws the scene, shape `[height, width, 3]`, in render mode `rgb_array`."""
         return None if self.render_mode is None else self._simulation.render(*self._size)
+
+
+def task_name(task: str, world: str) -> str:
+    """Returns the name that `task` in `world` has in files, such as `"shared-push"`.
+
+    Raises:
+        ValueError: The world does not exist.
+    """
+    if world not in RENDER_FPS:
+        raise ValueError(f"unknown world {world!r}: expected {' or '.join(RENDER_FPS)}")
+    return task if world == "classic" else f"{world}-{task}"
 
 
 def compute_reward(achieved_goal: ArrayLike, desired_goal: ArrayLike) -> float | NDArray[np.float32]:
@@ -174,14 +196,14 @@ def check_rendering(render_mode: str | None, width: int, height: int) -> None:
 
 def register_envs() -> None:
     """Registers the environments with Gymnasium, once."""
-    for env_id, (task, n_arms) in _TASKS.items():
+    for env_id, (task, n_arms, world) in _TASKS.items():
         if env_id not in gymnasium.registry:
             gymnasium.register(
                 env_id,
                 entry_point="tandem.envs:TandemEnv",
                 vector_entry_point="tandem.vector:TandemVectorEnv",
                 max_episode_steps=EPISODE_STEPS,
-                kwargs={"task": task, "n_arms": n_arms},
+                kwargs={"task": task, "n_arms": n_arms, "world": world},
             )
     for env_id, task in _FETCH_TASKS.items():
         if env_id not in gymnasium.registry:

@@ -12,7 +12,15 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike, NDArray
 
 from tandem import _native
-from tandem.envs import EPISODE_STEPS, Observation, check_rendering, compute_reward, spaces_of
+from tandem.envs import (
+    EPISODE_STEPS,
+    RENDER_FPS,
+    Observation,
+    check_rendering,
+    compute_reward,
+    spaces_of,
+    task_name,
+)
 
 _AUTORESET = {
     AutoresetMode.NEXT_STEP: "next_step",
@@ -31,6 +39,7 @@ class TandemVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]])
         num_envs: Number of environments.
         task: `"push"` or `"pick-and-place"`.
         n_arms: 1 or 2.
+        world: As for `TandemEnv`.
         max_episode_steps: Steps after which an episode is truncated.
         autoreset_mode: When an environment whose episode is over starts the next one; Gymnasium's modes.
         num_threads: Number of threads; by default one per processor, at most one per environment.
@@ -53,6 +62,7 @@ class TandemVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]])
         task: str = "push",
         n_arms: int = 2,
         *,
+        world: str = "classic",
         max_episode_steps: int = EPISODE_STEPS,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         num_threads: int | None = None,
@@ -67,7 +77,8 @@ class TandemVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]])
                 raise ValueError(f"{name} is {count}, expected at least 1")
         check_rendering(render_mode, width, height)
         mode = AutoresetMode(autoreset_mode)
-        self.metadata = {**type(self).metadata, "autoreset_mode": mode}
+        task = task_name(task, world)
+        self.metadata = {**type(self).metadata, "autoreset_mode": mode, "render_fps": RENDER_FPS[world]}
         self.num_envs = num_envs
         self.render_mode = render_mode
         self._size = (width, height)

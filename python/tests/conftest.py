@@ -13,6 +13,8 @@ ENV_IDS = [
     "tandem/PickAndPlace-v0",
     "tandem/TwoArmPush-v0",
     "tandem/TwoArmPickAndPlace-v0",
+    "tandem/SharedPush-v0",
+    "tandem/SharedTwoArmPickAndPlace-v0",
 ]
 
 

@@ -11,6 +11,7 @@ from conftest import ENV_IDS
 from gymnasium.utils.env_checker import check_env
 
 import tandem
+from tandem.envs import task_name
 
 
 def arrays_of(observation):
@@ -38,7 +39,8 @@ def test_seed_and_actions_give_the_bits_of_rust(env_id, rng, observe_program):
         observation, _ = env.reset(seed=seed, options={"episode": episode})
         observations = [observation["observation"]]
         observations += [env.step(action)[0]["observation"] for action in actions]
-        command = [observe_program, spec["task"], str(spec["n_arms"]), str(seed), str(episode)]
+        task = task_name(spec["task"], spec["world"])
+        command = [observe_program, task, str(spec["n_arms"]), str(seed), str(episode)]
         expected = subprocess.run(command, input=actions.tobytes(), stdout=subprocess.PIPE, check=True).stdout
         assert np.concatenate(observations).tobytes() == expected
 
@@ -52,6 +54,15 @@ def test_resets_without_a_seed_continue_its_episodes():
     first, _ = other.reset(seed=5)
     assert all(map(np.array_equal, arrays_of(third), arrays_of(chosen)))
     assert not np.array_equal(third["observation"], first["observation"])
+
+
+def test_the_world_is_an_argument():
+    named = gymnasium.make("tandem/SharedTwoArmPush-v0")
+    chosen = tandem.TandemEnv("push", 2, world="shared")
+    assert all(map(np.array_equal, arrays_of(named.reset(seed=3)[0]), arrays_of(chosen.reset(seed=3)[0])))
+    assert chosen.metadata["render_fps"] == 4 and tandem.TandemEnv().metadata["render_fps"] == 25
+    with pytest.raises(ValueError, match="unknown world 'moon': expected classic or shared"):
+        tandem.TandemEnv(world="moon")
 
 
 def test_unseeded_environments_differ():

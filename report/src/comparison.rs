@@ -156,8 +156,16 @@ impl Section {
     /// Returns the success, with intervals, of the last and the best evaluation and of the best policy on test goals.
     fn success(&self) -> Table {
         let title = format!("{}: success of the policy alone [95 % interval]", self.setup.title());
-        let header =
-            ["strategy", "env steps", "last", "best", "test goals", "joint norm", "contacts"];
+        let header = [
+            "strategy",
+            "env steps",
+            "last",
+            "best",
+            "test goals",
+            "without arm contact",
+            "joint norm",
+            "contacts",
+        ];
         let mut table = Table::new(title, &header);
         for group in &self.groups {
             let env_steps = |run: &Run| Some(run.last()?.env_steps as f64);
@@ -170,6 +178,7 @@ impl Section {
                 share_spread(&group.share(last)),
                 share_spread(&group.share(best)),
                 share_spread(&group.share(test)),
+                share_spread(&group.share(success_without_contact)),
                 spread(&group.spread(success_joint), three_digits),
                 spread(&group.spread(collision_rate), three_digits),
             ]);
@@ -183,6 +192,12 @@ impl Section {
 fn success_joint(run: &Run) -> Option<f64> {
     let test = run.test.as_ref().map(|test| test.success_joint);
     test.or_else(|| run.last().map(|row| row.success_joint))
+}
+
+/// Returns the success without contact between the arms on test goals, and their number, if it is known.
+pub(crate) fn success_without_contact(run: &Run) -> Option<(f64, u64)> {
+    let test = run.test.as_ref()?;
+    Some((test.contacts.success_without_contact?, test.n_episodes))
 }
 
 /// Returns the share of episodes with a contact, on test goals or else of the last evaluation.
@@ -200,6 +215,9 @@ fn baseline_row(Baseline { label, test }: &Baseline) -> Vec<String> {
         none(),
         none(),
         format!("{:.3} [{low:.3}, {high:.3}]", test.success),
+        test.contacts.success().map_or_else(none, |[success, low, high]| {
+            format!("{success:.3} [{low:.3}, {high:.3}]")
+        }),
         three_digits(test.success_joint),
         three_digits(test.collision_rate),
     ]
@@ -249,7 +267,7 @@ fn four_digits(share: f64) -> String {
 #[cfg(test)]
 mod tests {
     use tandem_core::Task;
-    use tandem_telemetry::MetricsRow;
+    use tandem_telemetry::{ContactMetrics, MetricsRow};
 
     use super::*;
 
@@ -282,6 +300,7 @@ mod tests {
             interval: (0.925, 0.977),
             success_joint: 0.908,
             collision_rate: 0.175,
+            contacts: ContactMetrics::default(),
         };
         Baseline { label: label.to_owned(), test }
     }
@@ -332,7 +351,18 @@ mod tests {
         let success = comparison.sections[0].success().text();
         assert_eq!(
             cells(&success, "composed-teachers"),
-            ["composed-teachers", "–", "–", "–", "0.958", "[0.925,", "0.977]", "0.908", "0.175"]
+            [
+                "composed-teachers",
+                "–",
+                "–",
+                "–",
+                "0.958",
+                "[0.925,",
+                "0.977]",
+                "–",
+                "0.908",
+                "0.175"
+            ]
         );
         assert_eq!(comparison.sections[1].baselines.len(), 1);
         assert_eq!(paper_table().rows.len(), 12);

@@ -4,7 +4,7 @@ use serde_json::{Value, json};
 use tandem_core::Wilson;
 use tandem_telemetry::MetricsRow;
 
-use crate::comparison::{Comparison, Section};
+use crate::comparison::{Comparison, Section, success_without_contact};
 use crate::group::{MILESTONES, SeedGroup, Spread};
 use crate::measures::{LearningMeasures, first_reaching};
 use crate::run::Run;
@@ -15,7 +15,7 @@ use crate::run::Run;
 pub const CSV_HEADER: &str = "task,arms,group,strategy,run,seed,evaluations,env_steps,wall_s,inspired_epoch,rise_epochs,max_success,\
      effective_learning_rate,env_steps_to_50,env_steps_to_90,env_steps_to_95,minutes_to_50,minutes_to_90,minutes_to_95,\
      advice_spent,last_success,last_low,last_high,collision_rate,held_out_success,held_out_low,held_out_high,\
-     held_out_collision_rate";
+     held_out_collision_rate,held_out_success_without_contact,held_out_arm_contact_rate";
 
 /// Returns a comparison as CSV with one line per run. Values that do not exist are empty.
 #[must_use]
@@ -73,6 +73,8 @@ fn run_cells(group: &SeedGroup, run: &Run) -> Vec<String> {
         number(test.map(|test| test.interval.0)),
         number(test.map(|test| test.interval.1)),
         number(test.map(|test| test.collision_rate)),
+        number(test.and_then(|test| test.contacts.success_without_contact)),
+        number(test.and_then(|test| test.contacts.arm_contact_rate)),
     ]);
     cells
 }
@@ -100,6 +102,12 @@ fn section_json(section: &Section) -> Value {
             "label": baseline.label, "episodes": test.n_episodes, "success": test.success,
             "success_low": test.interval.0, "success_high": test.interval.1,
             "success_joint": test.success_joint, "collision_rate": test.collision_rate,
+            "success_without_contact": test.contacts.success_without_contact,
+            "success_without_contact_low": test.contacts.success_without_contact_low,
+            "success_without_contact_high": test.contacts.success_without_contact_high,
+            "arm_contact_rate": test.contacts.arm_contact_rate,
+            "table_contact_rate": test.contacts.table_contact_rate,
+            "avoidance_rate": test.contacts.avoidance_rate,
         })
     });
     json!({
@@ -142,6 +150,7 @@ fn group_json(group: &SeedGroup) -> Value {
         "held_out_success": share_json(group, |run| {
             run.test.as_ref().map(|test| (test.success, test.n_episodes))
         }),
+        "held_out_success_without_contact": share_json(group, success_without_contact),
         "collision_rate": share_json(group, |run| {
             run.last().map(|row| (row.collision_rate, row.n_episodes))
         }),
@@ -201,7 +210,7 @@ mod tests {
         assert_eq!(lines.len(), 3);
         assert_eq!(
             lines[1],
-            "push,2,\"odd, name\",ea,\"odd, name-seed3\",3,2,2000,120,1,1,0.5,0.225,2000,,,2,,,0,0.5,0,0,0,,,,"
+            "push,2,\"odd, name\",ea,\"odd, name-seed3\",3,2,2000,120,1,1,0.5,0.225,2000,,,2,,,0,0.5,0,0,0,,,,,,"
         );
         assert_eq!(lines[2].split(',').count(), n_columns);
     }

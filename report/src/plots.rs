@@ -69,7 +69,7 @@ fn section_plots(section: &Section) -> Result<Vec<Plot>, Error> {
             let reference = reference.filter(|_| section.setup.n_arms != Some(1));
             let reference =
                 reference.map_or_else(String::new, |(([push, other], letter), task)| {
-                    let number = if task == Task::Push { push } else { other };
+                    let number = if task.grasps() { other } else { push };
                     format!(" (the paper's Figure {number}{letter})")
                 });
             let title = format!("{}: {name}, {}{reference}", section.setup.title(), panel.title);
@@ -83,7 +83,7 @@ fn section_plots(section: &Section) -> Result<Vec<Plot>, Error> {
 /// Draws learning without advice, with one arm and with two (the paper's Figure 4).
 fn from_scratch(comparison: &Comparison) -> Result<Vec<Plot>, Error> {
     let mut plots = Vec::new();
-    for (task, letter) in Task::ALL.into_iter().zip(['a', 'b']) {
+    for (task, letter) in Task::CLASSIC.into_iter().zip(['a', 'b']) {
         let of_task = comparison.sections.iter().filter(|one| one.setup.task == Some(task));
         let groups: Vec<SeedGroup> = of_task
             .flat_map(|section| &section.groups)

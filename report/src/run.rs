@@ -81,7 +81,8 @@ impl Run {
     pub fn task(&self) -> Option<Task> {
         match self.settings().get("task").and_then(Value::as_str) {
             Some(name) => name.parse().ok(),
-            None => Task::ALL.into_iter().find(|task| self.name.contains(task.name())),
+            // Last first: `push` is contained in `shared-push`.
+            None => Task::ALL.into_iter().rev().find(|task| self.name.contains(task.name())),
         }
     }
 

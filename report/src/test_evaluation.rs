@@ -4,6 +4,7 @@ use std::path::Path;
 
 use serde_json::Value;
 use tandem_core::Task;
+use tandem_telemetry::ContactMetrics;
 
 use crate::error::Error;
 use crate::files::{read_error, read_text};
@@ -25,6 +26,8 @@ pub struct TestEvaluation {
     pub success_joint: f64,
     /// Share of episodes with at least one contact between the arms, or between an arm and the table.
     pub collision_rate: f64,
+    /// Measures that tell contacts apart, as far as they are known.
+    pub contacts: ContactMetrics,
 }
 
 impl TestEvaluation {
@@ -56,6 +59,8 @@ impl TestEvaluation {
             interval: (number("success_low")?, number("success_high")?),
             success_joint: number("success_joint")?,
             collision_rate: number("collision_rate")?,
+            contacts: serde_json::from_value(object.clone())
+                .map_err(|error| format!("a measure of contacts is not a number ({error})"))?,
         })
     }
 }
@@ -74,6 +79,20 @@ mod tests {
         assert_eq!((test.task, test.n_arms, test.n_episodes), (Task::Push, 2, 240));
         assert_eq!((test.success, test.interval), (0.958, (0.925, 0.977)));
         assert_eq!((test.success_joint, test.collision_rate), (0.9, 0.175));
+        assert_eq!(test.contacts, ContactMetrics::default(), "of an earlier version");
+    }
+
+    #[test]
+    fn success_without_contact_is_read() {
+        let more = r#""success_without_contact":0.75,"success_without_contact_low":0.7,
+            "success_without_contact_high":0.8,"avoidance_rate":0.5,"collision_rate""#;
+        let line = LINE.replace(r#""collision_rate""#, more).replace('\n', "");
+        let test = TestEvaluation::parse(&line).unwrap();
+        assert_eq!(test.contacts.success(), Some([0.75, 0.7, 0.8]));
+        assert_eq!(
+            (test.contacts.avoidance_rate, test.contacts.arm_contact_rate),
+            (Some(0.5), None)
+        );
     }
 
     #[test]

@@ -30,7 +30,8 @@ pub struct RunConfig {
     pub task: String,
     /// Arms of the learning policy: 1 or 2, or those of `description`.
     pub arms: usize,
-    /// Seed of every random number of the run; must differ from `evaluation.seed`.
+    /// Seed of every random number of the run; must differ from `evaluation.seed` and from the
+    /// [seed of the test goals](tandem_core::evaluation::TEST_SEED).
     pub seed: u64,
     /// The recipe that the defaults come from.
     pub recipe: Recipe,

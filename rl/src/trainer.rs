@@ -9,7 +9,7 @@ use sha2::{Digest as _, Sha256};
 use tandem_core::episode::EpisodeKind;
 use tandem_core::rng::{Stream, bernoulli, episode_rng, index};
 use tandem_core::task::Part;
-use tandem_core::text::hex;
+use tandem_core::text::{counted, hex};
 use tandem_core::work::{EpisodeOrder, PublishedActor, SlotOrder};
 use tandem_core::{ArmIndex, Episode, TaskSpec};
 use tandem_policy::{Normalizer, NormalizerSnapshot, Policy};
@@ -116,9 +116,10 @@ impl Trainer {
         };
         if teacher.layout.name() != task || n_arms != 1 || teacher.n_heads != 1 {
             return Err(format!(
-                "needs a teacher for {task} with one arm and one value, got {n_arms} arm(s) for {} with {} value(s)",
+                "needs a teacher for {task} with one arm and one value, got {} for {} with {}",
+                counted(n_arms, "arm"),
                 teacher.layout.name(),
-                teacher.n_heads
+                counted(teacher.n_heads, "value")
             ));
         }
         if let Some(difference) = one_arm.difference(&teacher.layout) {

@@ -56,6 +56,7 @@ fn play(actor: &mut Actor, order: EpisodeOrder, noise_std: f32) -> Episode {
         advised_arms: vec![0; EPISODE_STEPS],
         contacts: vec![Contacts::NONE; EPISODE_STEPS],
         advice_charged: 0,
+        avoidance_steps: None,
     }
 }
 

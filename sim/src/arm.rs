@@ -45,10 +45,7 @@ impl Arm {
         task: Task,
         config: &WorldConfig,
     ) -> Self {
-        let gripper = match task {
-            Task::Push => Gripper::Locked,
-            Task::PickAndPlace => Gripper::Driven,
-        };
+        let gripper = if task.grasps() { Gripper::Driven } else { Gripper::Locked };
         let pads = config.friction(task).pads;
         let hand = Hand::build(physics, arm, frame, gripper, pads, config.grip_force_n);
         Self { frame, hand, angles: HOME }

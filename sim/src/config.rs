@@ -92,10 +92,7 @@ impl WorldConfig {
 
     /// Returns the friction coefficients for `task`.
     pub(crate) fn friction(&self, task: Task) -> Friction {
-        match task {
-            Task::Push => self.push,
-            Task::PickAndPlace => self.pick_and_place,
-        }
+        if task.grasps() { self.pick_and_place } else { self.push }
     }
 }
 

@@ -3,7 +3,7 @@
 use rand_chacha::ChaCha8Rng;
 use rapier3d::math::Vector;
 use tandem_core::scene::Scene;
-use tandem_core::{ArmIndex, Contacts, Layout, Task, WorldSettings};
+use tandem_core::{ArmIndex, Contacts, Layout, WorldSettings};
 
 use crate::arm::Command;
 use crate::config::{CONTROL_STEPS_PER_S, SimError, WorldConfig};
@@ -172,10 +172,7 @@ impl Env {
 
     fn command(&self, arm: ArmIndex, action: &[f32]) -> Command {
         let displacement = Vector::from_slice(action).clamp(Vector::NEG_ONE, Vector::ONE);
-        let gripper = match self.layout.task {
-            Task::Push => -1.0,
-            Task::PickAndPlace => action[3].clamp(-1.0, 1.0),
-        };
+        let gripper = if self.layout.task.grasps() { action[3].clamp(-1.0, 1.0) } else { -1.0 };
         Command {
             target: self.world.arms[arm.0].target(&self.world.physics, displacement),
             gripper,
@@ -185,6 +182,8 @@ impl Env {
 
 #[cfg(test)]
 mod tests {
+    use tandem_core::Task;
+
     use super::*;
     use crate::frame::WORKSPACE_LOW;
     use crate::hand::{MAX_OPENING_M, PAD_HALF_M};

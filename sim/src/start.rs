@@ -3,7 +3,7 @@
 use rand_chacha::ChaCha8Rng;
 use rapier3d::math::Vector;
 use tandem_core::rng::{bernoulli, uniform};
-use tandem_core::{ArmIndex, Layout, Task, WorldSettings};
+use tandem_core::{ArmIndex, Layout, WorldSettings};
 
 use crate::frame::{ArmFrame, WORKSPACE_LOW};
 use crate::hand::MAX_OPENING_M;
@@ -58,7 +58,7 @@ pub(crate) fn sample_starts(
     // An episode's later draws keep their place in the random stream: this one belonged to a removed hand_start of
     // start.
     let _: bool = bernoulli(rng, 0.0);
-    let can_hold = layout.task == Task::PickAndPlace && object_half_m < MAX_OPENING_M;
+    let can_hold = layout.task.grasps() && object_half_m < MAX_OPENING_M;
     let hand_start = if grasped && can_hold { HandStart::Grasping } else { HandStart::Centred };
     let sampler = StartSampler { layout, object_half_m };
     loop {
@@ -101,7 +101,7 @@ impl StartSampler {
 
     fn goal(&self, rng: &mut ChaCha8Rng) -> Vector {
         let on_table = self.point_on_table(rng);
-        if self.layout.task == Task::PickAndPlace && bernoulli(rng, AIR_GOAL_PROB) {
+        if self.layout.task.grasps() && bernoulli(rng, AIR_GOAL_PROB) {
             on_table + Vector::Z * uniform(rng, 0.0, AIR_GOAL_HIGH_M)
         } else {
             on_table
@@ -110,10 +110,7 @@ impl StartSampler {
 
     fn centred_hand(&self, rng: &mut ChaCha8Rng) -> Vector {
         let (x, y) = (uniform(rng, -0.02, 0.02), uniform(rng, -0.02, 0.02));
-        let z = match self.layout.task {
-            Task::Push => 0.06,
-            Task::PickAndPlace => uniform(rng, 0.10, 0.16),
-        };
+        let z = if self.layout.task.grasps() { uniform(rng, 0.10, 0.16) } else { 0.06 };
         Vector::new(x, y, z)
     }
 
@@ -142,10 +139,7 @@ impl StartSampler {
 
     /// Returns the opening of each side of an empty gripper, metres.
     fn empty_opening_m(&self) -> f32 {
-        match self.layout.task {
-            Task::Push => 0.0,
-            Task::PickAndPlace => MAX_OPENING_M,
-        }
+        if self.layout.task.grasps() { MAX_OPENING_M } else { 0.0 }
     }
 
     fn is_valid(&self, arms: &[ArmStart], hand_start: HandStart) -> bool {

@@ -127,7 +127,7 @@ fn no_behaviour_brings_a_number_near_its_bound() {
                 // The components of a unit quaternion reach their bound of 1, up to rounding.
                 let margin = if ORIENTATION.contains(&idx) { 1.0 } else { MARGIN };
                 let bound = layout.observation_bound(idx);
-                println!("{task}, {n_arms} arm(s), number {idx}: {most} of {bound}");
+                println!("{task}, arms {n_arms}, number {idx}: {most} of {bound}");
                 assert!(margin * most <= bound, "number {idx}: {most}, bound {bound}");
             }
             assert!(MARGIN * largest.goal <= layout.goal_bound(), "goal: {}", largest.goal);

@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 use indicatif::ProgressBar;
 use rayon::iter::{IntoParallelRefIterator as _, ParallelIterator as _};
 use serde_json::json;
+use tandem_core::text::counted;
 use tandem_core::{Layout, Task};
 use tandem_report::{Comparison, PlottedTrials, report_html};
 use tandem_telemetry::trials::TRIALS_FILE;
@@ -14,7 +15,7 @@ use tandem_trials::trial::{TrialConfig, TrialError, TrialMode, TrialReport};
 use tandem_trials::{NamedPolicy, Series, SeriesError, SimulatedConfig};
 
 use crate::bridge::file;
-use crate::cli::{ModeName, RecordName, TrialArgs};
+use crate::cli::{ModeName, RecordName, TrialArgs, check_task};
 use crate::exit::{Exit, Failed, OrExit as _};
 use crate::{output, policy_file};
 
@@ -82,9 +83,9 @@ fn policies(args: &TrialArgs) -> Result<(Task, Vec<NamedPolicy>), Failed> {
         let policy = policy_file::load(path)?;
         if policy.layout.n_arms() != 2 {
             return Err(Failed::usage(format!(
-                "{} drives {} arm(s), the bridge has 2: a one-arm policy goes with --composed-teachers",
+                "{} drives {}, the bridge has 2: a one-arm policy goes with --composed-teachers",
                 path.display(),
-                policy.layout.n_arms()
+                counted(policy.layout.n_arms(), "arm")
             )));
         }
         policies.push(NamedPolicy { name: name_of(path), policy });
@@ -107,11 +108,11 @@ fn policies(args: &TrialArgs) -> Result<(Task, Vec<NamedPolicy>), Failed> {
             Failed::usage(format!("{name} is for {task}, which simulated arms cannot perform"))
         })
     };
-    let first = match (args.task, policies.first()) {
-        (Some(task), _) => Task::from(task),
-        (None, Some(named)) => task_of(named)?,
-        (None, None) => return Err(Failed::usage("give --policy or --composed-teachers")),
+    let first = match policies.first() {
+        Some(named) => task_of(named)?,
+        None => return Err(Failed::usage("give --policy or --composed-teachers")),
     };
+    check_task(first, args.task, args.world)?;
     for named in &policies {
         let task = task_of(named)?;
         if task != first {

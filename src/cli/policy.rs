@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use clap::{Args, Subcommand};
 
-use super::TaskName;
+use super::{TaskName, WorldName};
 
 #[derive(Debug, Args)]
 pub(crate) struct PolicyArgs {
@@ -73,8 +73,11 @@ pub(crate) struct ImportArgs {
     #[arg(long, value_name = "FILE.onnx")]
     pub(crate) critic: Option<PathBuf>,
     /// Task [default: the one in the model's metadata, or the only one that the model fits].
-    #[arg(long, value_enum, requires = "arms")]
+    #[arg(long, value_parser = TaskName::parser(), requires = "arms")]
     pub(crate) task: Option<TaskName>,
+    /// World of the task [default: classic].
+    #[arg(long, value_enum, requires = "task")]
+    pub(crate) world: Option<WorldName>,
     /// Number of arms [default: as for --task].
     #[arg(long, value_name = "N", requires = "task", value_parser = clap::value_parser!(u8).range(1..=8))]
     pub(crate) arms: Option<u8>,

@@ -3,14 +3,16 @@
 use std::path::PathBuf;
 
 use clap::{Args, Subcommand};
+use tandem_core::evaluation::TEST_SEED;
 
-use super::TaskName;
+use super::{TaskName, WorldName};
 
 #[derive(Debug, Args)]
 #[command(group = clap::ArgGroup::new("who").required(true), after_help = "\
 Examples:
   tandem eval --policy policies/student-push.safetensors
   tandem eval --policy FILE --episodes 400 --seed 7 --json
+  tandem eval --policy policies/student-push.safetensors --baselines
   tandem eval --composed-teachers policies/teacher-push.safetensors
   tandem eval --policy FILE --episodes 1 --record episode.mcap")]
 pub(crate) struct EvalArgs {
@@ -20,9 +22,19 @@ pub(crate) struct EvalArgs {
     /// One-arm policy that controls each arm separately: the baseline without a student.
     #[arg(long, value_name = "FILE", group = "who")]
     pub(crate) composed_teachers: Option<PathBuf>,
+    /// Also evaluates two baselines on the same goals: composed teachers, and the policy with arms that do not see each
+    /// other.
+    #[arg(long, requires = "policy")]
+    pub(crate) baselines: bool,
+    /// One-arm policy of the composed teachers [default: the shipped teacher of the task].
+    #[arg(long, value_name = "FILE", requires = "baselines")]
+    pub(crate) teacher: Option<PathBuf>,
     /// Fails unless the policy is for this task.
-    #[arg(long, value_enum)]
+    #[arg(long, value_parser = TaskName::parser())]
     pub(crate) task: Option<TaskName>,
+    /// Fails unless the policy is for this world.
+    #[arg(long, value_enum)]
+    pub(crate) world: Option<WorldName>,
     /// Number of arms [default: the policy's; 2 for composed teachers].
     #[arg(long)]
     pub(crate) arms: Option<usize>,
@@ -30,7 +42,7 @@ pub(crate) struct EvalArgs {
     #[arg(long, default_value_t = 240, value_parser = clap::value_parser!(u64).range(1..=1_000_000))]
     pub(crate) episodes: u64,
     /// Seed of the test goals. Runs select their best policy on validation goals of another seed.
-    #[arg(long, default_value_t = 777)]
+    #[arg(long, default_value_t = TEST_SEED)]
     pub(crate) seed: u64,
     /// Records the first episode to this MCAP file.
     #[arg(long, value_name = "FILE.mcap")]
@@ -127,7 +139,7 @@ pub(crate) struct PictureArgs {
     #[arg(long, value_name = "FILE", conflicts_with = "policy")]
     pub(crate) composed_teachers: Option<PathBuf>,
     /// Number of the episode, which determines start and goal.
-    #[arg(long, default_value_t = 777)]
+    #[arg(long, default_value_t = TEST_SEED)]
     pub(crate) seed: u64,
     /// Control step to draw, 0 to 50.
     #[arg(long, default_value_t = 12, value_parser = clap::value_parser!(u32).range(0..=50))]

@@ -3,8 +3,9 @@
 use std::path::PathBuf;
 
 use clap::Args;
+use tandem_core::evaluation::TEST_SEED;
 
-use super::TaskName;
+use super::{TaskName, WorldName};
 
 #[derive(Debug, Args)]
 #[command(group = clap::ArgGroup::new("actor"), after_help = "\
@@ -17,8 +18,11 @@ Examples:
 docs/transfer.md describes the output.")]
 pub(crate) struct SceneArgs {
     /// Task [default: the policy's, or push].
-    #[arg(long, value_enum)]
+    #[arg(long, value_parser = TaskName::parser())]
     pub(crate) task: Option<TaskName>,
+    /// World of the task [default: the policy's, or classic].
+    #[arg(long, value_enum)]
+    pub(crate) world: Option<WorldName>,
     /// Number of arms [default: the policy's; 2 otherwise].
     #[arg(long)]
     pub(crate) arms: Option<usize>,
@@ -26,7 +30,7 @@ pub(crate) struct SceneArgs {
     #[arg(long, default_value_t = 0, value_parser = clap::value_parser!(u64).range(0..=10_000), conflicts_with = "actions")]
     pub(crate) episodes: u64,
     /// Seed of the initial states and goals; `tandem eval` plays the same ones.
-    #[arg(long, default_value_t = 777)]
+    #[arg(long, default_value_t = TEST_SEED)]
     pub(crate) seed: u64,
     /// Simulates these actions: JSON of shape `[episodes][steps][n_action]`.
     #[arg(long, value_name = "FILE.json", group = "actor")]

@@ -7,8 +7,8 @@ use std::time::Duration;
 
 use clap::Args;
 
-use super::TaskName;
 use super::monitor::seconds;
+use super::{TaskName, WorldName};
 
 /// Access token.
 #[derive(Debug, Args)]
@@ -226,8 +226,11 @@ docs/environments.md describes the protocol, and how to write a server in anothe
 )]
 pub(crate) struct EnvArgs {
     /// Task.
-    #[arg(long, value_enum, default_value_t = TaskName::Push)]
+    #[arg(long, value_parser = TaskName::parser(), default_value = "push")]
     pub(crate) task: TaskName,
+    /// World of the task: classic (fast arms, adjacent areas) or shared (slow arms, one area) [default: classic].
+    #[arg(long, value_enum, hide_possible_values = true)]
+    pub(crate) world: Option<WorldName>,
     /// Number of arms.
     #[arg(long, default_value_t = 2, value_parser = clap::value_parser!(u8).range(1..=2))]
     pub(crate) arms: u8,

@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use clap::{Args, ValueEnum};
 
-use super::{EnvironmentArgs, TaskName};
+use super::{EnvironmentArgs, TaskName, WorldName};
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub(crate) enum RecipeName {
@@ -19,6 +19,7 @@ pub(crate) enum RecipeName {
 Examples:
   tandem train                                        two arms, push, strategy mc-q:0.1, shipped teacher
   tandem train --arms 1 --task push --until-success 0.97
+  tandem train --world shared                         both arms share one area and are slow
   tandem train --strategy ea --budget 50000 --seed 2 --max-minutes 20
   tandem train --teacher actor.onnx --teacher-critic critic.onnx
   tandem train --set ddpg.discount=0.98 --set rounds.slots=16
@@ -29,8 +30,11 @@ Examples:
   tandem train --resume --out runs/mine --max-env-steps 600000    resumes it for longer")]
 pub(crate) struct TrainArgs {
     /// Task [default: push].
-    #[arg(long, value_enum)]
+    #[arg(long, value_parser = TaskName::parser())]
     pub(crate) task: Option<TaskName>,
+    /// World of the task: classic (fast arms, adjacent areas) or shared (slow arms, one area) [default: classic].
+    #[arg(long, value_enum, hide_possible_values = true)]
+    pub(crate) world: Option<WorldName>,
     /// Number of arms of the trained policy, 1 or 2 [default: 2].
     #[arg(long)]
     pub(crate) arms: Option<usize>,

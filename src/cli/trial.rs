@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use clap::{Args, ValueEnum};
 
-use crate::cli::TaskName;
+use crate::cli::{TaskName, WorldName};
 
 #[derive(Debug, Args)]
 #[command(after_help = "\
@@ -22,8 +22,11 @@ pub(crate) struct TrialArgs {
     #[arg(long, value_name = "FILE", group = "who")]
     pub(crate) composed_teachers: Vec<PathBuf>,
     /// Fails unless the policies are for this task.
-    #[arg(long, value_enum)]
+    #[arg(long, value_parser = TaskName::parser())]
     pub(crate) task: Option<TaskName>,
+    /// Fails unless the policies are for this world.
+    #[arg(long, value_enum)]
+    pub(crate) world: Option<WorldName>,
     /// Number of trials per policy.
     #[arg(long, default_value_t = 50, value_parser = clap::value_parser!(u64).range(1..=100_000))]
     pub(crate) trials: u64,

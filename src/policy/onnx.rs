@@ -4,7 +4,7 @@ use std::path::Path;
 
 use serde_json::json;
 use tandem_core::rng::uniform;
-use tandem_core::{Layout, Stream, Task, episode_rng};
+use tandem_core::{Layout, Stream, episode_rng};
 use tandem_onnx::binding::layout_of;
 use tandem_onnx::{
     BoundNetwork, Error, Model, ModelError, Role, export as write, import as convert,
@@ -58,7 +58,9 @@ pub(super) fn import(args: &ImportArgs) -> Result<(), Failed> {
     let critic = critic.or_exit(Exit::Data, String::new)?;
     let refused = |source| refused(&args.actor, source);
     let layout = match (args.task, args.arms) {
-        (Some(task), Some(n_arms)) => Layout::new(Task::from(task), usize::from(n_arms)),
+        (Some(task), Some(n_arms)) => {
+            Layout::new(task.in_named_world(args.world), usize::from(n_arms))
+        }
         _ => layout_of(&actor, Role::Actor).map_err(refused)?,
     };
     // The critic alone is bound first, so that an error names its file.

@@ -1,6 +1,6 @@
 //! `tandem env`.
 
-use tandem_core::{Layout, Task};
+use tandem_core::Layout;
 use tandem_environment::{Config, Error};
 
 use super::listen::listen_with_scheme;
@@ -16,7 +16,7 @@ pub(crate) fn environment(args: EnvArgs) -> Result<(), Failed> {
         let shutdown = signals::shutdown_token(args.listen.exit_with_stdin)?;
         let listener = listen_with_scheme(&args.listen).await?;
         let config = Config {
-            layout: Layout::new(Task::from(args.task), usize::from(args.arms)),
+            layout: Layout::new(args.task.in_named_world(args.world), usize::from(args.arms)),
             max_environments: usize::from(args.max_environments),
             server: format!("tandem {VERSION}"),
         };

@@ -4,6 +4,7 @@ use std::io::IsTerminal as _;
 use std::time::Duration;
 
 use indicatif::{MultiProgress, ProgressBar, ProgressStyle};
+use tandem_core::text::counted;
 use tandem_proto::pb;
 
 use super::plan::Plan;
@@ -53,12 +54,12 @@ impl Display {
         };
         let config = &plan.config;
         display.print(&format!(
-            "training {} with {} arm(s), strategy {}, seed {}, {} worker process(es); run directory {}",
+            "training {} with {}, strategy {}, seed {}, {}; run directory {}",
             config.task,
-            config.arms,
+            counted(config.arms, "arm"),
             config.advice.strategy,
             config.seed,
-            plan.n_workers,
+            counted(plan.n_workers, "worker"),
             plan.out.display()
         ));
         display

@@ -3,14 +3,13 @@
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 
-use tandem_core::Task;
 use tandem_learner::{checkpoint, settings};
 use tandem_rl::RunConfig;
 use tandem_worker::ServedTask;
 use toml::Value;
 
 use super::teacher_file::TeacherFile;
-use crate::cli::{RecipeName, TrainArgs};
+use crate::cli::{RecipeName, TrainArgs, chosen_task};
 use crate::exit::{Exit, Failed, OrExit as _};
 use crate::service::worker_failed;
 use crate::{environment_server, policy_file, run_directory, run_file};
@@ -191,7 +190,8 @@ fn served_settings(
     args: &TrainArgs,
     served: Option<&ServedTask>,
 ) -> Result<Vec<(String, Value)>, Failed> {
-    let names_task = args.task.is_some() || args.run.is_some() || args.resume;
+    let names_task =
+        args.task.is_some() || args.world.is_some() || args.run.is_some() || args.resume;
     let Some(task) = served.map(|served| &served.task).filter(|_| !names_task) else {
         return Ok(Vec::new());
     };
@@ -215,6 +215,13 @@ fn settings_of(args: &TrainArgs) -> Result<Vec<(String, Value)>, Failed> {
         .iter()
         .map(|setting| run_file::parse_setting(setting))
         .collect::<Result<Vec<_>, _>>()?;
+    let task = chosen_task(args.task, args.world);
+    let names_task = args.run.is_some() || settings.iter().any(|(key, _)| key == "task");
+    if args.world.is_some() && args.task.is_none() && (names_task || args.resume) {
+        return Err(Failed::usage(
+            "--world needs --task here: the task of a run file, --set or --resume includes its world",
+        ));
+    }
     let integer =
         |n: u64| i64::try_from(n).map_or_else(|_| Value::String(n.to_string()), Value::Integer);
     let recipe = args.recipe.map(|recipe| match recipe {
@@ -222,7 +229,7 @@ fn settings_of(args: &TrainArgs) -> Result<Vec<(String, Value)>, Failed> {
         RecipeName::Paper => "paper",
     });
     let flags = [
-        ("task", args.task.map(|task| Value::String(Task::from(task).name().to_owned()))),
+        ("task", task.map(|task| Value::String(task.name().to_owned()))),
         ("arms", args.arms.map(|n| integer(n as u64))),
         ("recipe", recipe.map(|name| Value::String(name.to_owned()))),
         ("advice.strategy", args.strategy.clone().map(Value::String)),

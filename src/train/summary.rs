@@ -3,6 +3,8 @@
 use std::path::PathBuf;
 
 use serde_json::{Value, json};
+use tandem_core::evaluation::TEST_SEED;
+use tandem_core::text::counted;
 use tandem_proto::pb;
 use tandem_report::{Axis, CurveOptions, Quantity, Series};
 use tandem_telemetry::{MetricsLog, MetricsRow};
@@ -13,9 +15,6 @@ use crate::evaluation::{EvaluatedPolicy, EvaluationResult, measure};
 use crate::exit::{Exit, Failed, OrExit as _};
 use crate::progress_text::{clock_text, grouped};
 use crate::{output, policy_file};
-
-/// Seed of the test goals. No run selects its best policy by them.
-const REPORT_SEED: u64 = 777;
 
 /// Evaluates the best policy on the test goals if the simulator has the task, draws the curve and prints the summary.
 pub(super) fn print(
@@ -47,7 +46,7 @@ fn test(plan: &Plan) -> Result<Option<EvaluationResult>, Failed> {
         return Ok(None);
     }
     let subject = EvaluatedPolicy::new(policy, &path)?;
-    measure(&subject, plan.config.evaluation.test_episodes, REPORT_SEED).map(Some)
+    measure(&subject, plan.config.evaluation.test_episodes, TEST_SEED).map(Some)
 }
 
 /// Files written at the end of a run.
@@ -66,7 +65,7 @@ fn summary_lines(
     let mut lines = vec![format!("done: {}", last.end_reason)];
     if let Some(result) = result {
         lines.push(format!(
-            "best policy on {} test goals (seed {REPORT_SEED}), alone: no noise, no advice",
+            "best policy on {} test goals (seed {TEST_SEED}), alone: no noise, no advice",
             plan.config.evaluation.test_episodes
         ));
         lines.extend(result.lines().iter().map(|line| format!("  {line}")));
@@ -126,7 +125,8 @@ pub(super) fn print_interrupted(plan: &Plan) {
 /// Draws the success rate over environment steps.
 fn draw_curve(plan: &Plan, rows: &[MetricsRow]) -> Result<PathBuf, Failed> {
     let config = &plan.config;
-    let name = format!("{}, {} arm(s), {}", config.task, config.arms, config.advice.strategy);
+    let arms = counted(config.arms, "arm");
+    let name = format!("{}, {arms}, {}", config.task, config.advice.strategy);
     let series = Series::of(&name, rows, Axis::EnvSteps, Quantity::Success);
     let options = CurveOptions::shares("Success of the policy alone", Axis::EnvSteps);
     let svg = tandem_report::curve_svg(&[series], &options).or_exit(Exit::Bug, String::new)?;

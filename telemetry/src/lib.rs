@@ -24,7 +24,7 @@ pub mod trials;
 pub use episode_log::{EpisodeLog, LoggedTransition, read_episode};
 pub use error::Error;
 pub use messages::EpisodeMetadata;
-pub use metrics::{MetricsLog, MetricsRow};
+pub use metrics::{ContactMetrics, MetricsLog, MetricsRow};
 pub use recorder::{EpisodeRecorder, TransitionRecord};
 pub use recovery::{RecoveredCounts, recover};
 pub use trial_log::{LogLevel, TrialMetadata, TrialOutcome, TrialRecorder, TrialSnapshot};

@@ -5,6 +5,7 @@ use std::io::Write as _;
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Deserializer, Serialize};
+use tandem_core::EvaluationSummary;
 use tandem_system::regular_file;
 
 use crate::error::Error;
@@ -69,6 +70,56 @@ pub struct MetricsRow {
     pub n_episodes: u64,
     /// `true` for the best policy so far.
     pub best: bool,
+    /// Measures with contacts told apart. A file of an earlier version does not have them.
+    #[serde(flatten)]
+    pub contacts: ContactMetrics,
+}
+
+/// Measures of an evaluation that tell contacts apart. A value that is not known is left out of the file.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+pub struct ContactMetrics {
+    /// Share of evaluation episodes that end with every object at its goal and have no contact between the arms.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub success_without_contact: Option<f64>,
+    /// Lower bound of the 95 % interval of `success_without_contact`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub success_without_contact_low: Option<f64>,
+    /// Upper bound of the 95 % interval of `success_without_contact`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub success_without_contact_high: Option<f64>,
+    /// Share of evaluation episodes with a contact between the arms.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub arm_contact_rate: Option<f64>,
+    /// Share of evaluation episodes with a contact between an arm and the table.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub table_contact_rate: Option<f64>,
+    /// Share of evaluation episodes in which the link avoidance limited the motion of an arm.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub avoidance_rate: Option<f64>,
+}
+
+impl ContactMetrics {
+    /// Returns the measures of `summary`.
+    #[must_use]
+    pub fn of(summary: &EvaluationSummary) -> Self {
+        let success = summary.success_without_contact;
+        let interval = success.map(|success| summary.interval_of(success));
+        Self {
+            success_without_contact: success,
+            success_without_contact_low: interval.map(|interval| interval.low),
+            success_without_contact_high: interval.map(|interval| interval.high),
+            arm_contact_rate: summary.arm_contact_rate,
+            table_contact_rate: summary.table_contact_rate,
+            avoidance_rate: summary.avoidance_rate,
+        }
+    }
+
+    /// Returns success without contact with the bounds of its 95 % interval, if it is known.
+    #[must_use]
+    pub fn success(&self) -> Option<[f64; 3]> {
+        let low = self.success_without_contact_low?;
+        Some([self.success_without_contact?, low, self.success_without_contact_high?])
+    }
 }
 
 fn nan_from_null<'de, D: Deserializer<'de>>(deserializer: D) -> Result<f64, D::Error> {
@@ -239,6 +290,32 @@ mod tests {
         log.append(&MetricsRow { mean_q: f64::NAN, ..row(5) }).unwrap();
         assert!(std::fs::read_to_string(&path).unwrap().contains(r#""mean_q":null"#));
         assert!(MetricsLog::read_all(&path).unwrap()[0].mean_q.is_nan());
+    }
+
+    #[test]
+    fn a_row_of_an_earlier_version_has_no_contact_metrics_and_stays_as_it_is() {
+        let (_dir, path, log) = log_of(&[5]);
+        drop(log);
+        let text = std::fs::read_to_string(&path).unwrap();
+        assert!(!text.contains("without_contact") && !text.contains("avoidance"), "{text}");
+        let rows = MetricsLog::read_all(&path).unwrap();
+        assert_eq!(rows[0].contacts, ContactMetrics::default());
+        assert_eq!(rows[0].contacts.success(), None);
+        assert_eq!(MetricsLog::restore(&path, &rows).unwrap().1, 1, "the line is kept");
+    }
+
+    #[test]
+    fn known_contact_metrics_are_keys_of_the_row() {
+        let contacts = ContactMetrics {
+            success_without_contact: Some(0.5),
+            arm_contact_rate: Some(0.0),
+            ..ContactMetrics::default()
+        };
+        let (_dir, path, mut log) = log_of(&[]);
+        log.append(&MetricsRow { contacts, ..row(5) }).unwrap();
+        let text = std::fs::read_to_string(&path).unwrap();
+        assert!(text.contains(r#""success_without_contact":0.5,"arm_contact_rate":0.0"#), "{text}");
+        assert_eq!(MetricsLog::read_all(&path).unwrap()[0].contacts, contacts);
     }
 
     #[test]

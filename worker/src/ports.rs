@@ -3,7 +3,7 @@
 use tandem_core::rng::{Stream, episode_rng};
 use tandem_core::work::EpisodeStart;
 use tandem_core::{Contacts, StepAdvice, StepQuery};
-use tandem_policy::Actor;
+use tandem_policy::{Actor, BlindActor};
 use tandem_sim::{Env, SimError};
 
 /// A source of actions, such as an actor network.
@@ -66,6 +66,12 @@ pub trait Environment {
         observations: &mut [f32],
         contacts: &mut [Contacts],
     ) -> Result<(), EnvironmentError>;
+
+    /// Returns the number of steps of the current episode of environment `environment`, from 0, in which the link
+    /// avoidance limited the motion of an arm; `None` if it is not counted.
+    fn avoidance_steps(&self, _environment: usize) -> Option<u32> {
+        None
+    }
 }
 
 /// An error of environments.
@@ -137,6 +143,12 @@ impl Environment for Simulator {
             env.observe(observation);
         }
         Ok(())
+    }
+}
+
+impl Act for BlindActor {
+    fn act(&mut self, observations: &[f32], goals: &[f32], actions: &mut [f32]) {
+        self.act(observations, goals, actions);
     }
 }
 

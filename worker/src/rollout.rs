@@ -81,6 +81,9 @@ pub fn play_slot(
         take_advice(&mut rollouts, step_idx, advisor)?;
         batch.execute(&mut rollouts, step_idx, env)?;
     }
+    for (environment, rollout) in rollouts.iter_mut().enumerate() {
+        rollout.episode.avoidance_steps = env.avoidance_steps(environment);
+    }
     Ok(rollouts.into_iter().map(|rollout| rollout.episode).collect())
 }
 
@@ -238,6 +241,7 @@ impl Rollout {
             advised_arms: Vec::with_capacity(n_steps),
             contacts: Vec::with_capacity(n_steps),
             advice_charged: 0,
+            avoidance_steps: None,
         };
         Self {
             explorer: explorer(order, slot.kind, terms),

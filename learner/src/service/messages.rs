@@ -65,6 +65,7 @@ fn encode_worker(worker: &WorkerProgress) -> pb::WorkerProgress {
 }
 
 fn encode_evaluation(row: &MetricsRow) -> pb::Evaluation {
+    let contacts = &row.contacts;
     pb::Evaluation {
         round: row.round,
         env_steps: row.env_steps,
@@ -76,5 +77,11 @@ fn encode_evaluation(row: &MetricsRow) -> pb::Evaluation {
         success_per_arm: row.success_per_arm.clone(),
         collision_rate: row.collision_rate,
         mean_q: row.mean_q,
+        success_without_contact: contacts.success_without_contact,
+        success_without_contact_low: contacts.success_without_contact_low,
+        success_without_contact_high: contacts.success_without_contact_high,
+        arm_contact_rate: contacts.arm_contact_rate,
+        table_contact_rate: contacts.table_contact_rate,
+        avoidance_rate: contacts.avoidance_rate,
     }
 }

@@ -6,8 +6,8 @@ use tandem_core::{Episode, EpisodeOutcome, EvaluationSummary};
 use tandem_policy::Policy;
 use tandem_rl::config::Recipe;
 use tandem_rl::trainer::{RoundStats, Trainer};
-use tandem_telemetry::MetricsRow;
 use tandem_telemetry::events::EvaluationFinished;
+use tandem_telemetry::{ContactMetrics, MetricsRow};
 
 use super::progress_publisher::budget_left;
 use crate::evaluation_store::{
@@ -140,7 +140,14 @@ impl<'a> Evaluations<'a> {
             ("evaluation_episodes", row.n_episodes.to_string()),
             ("evaluation_success", row.success.to_string()),
         ];
-        entries.into_iter().map(|(key, value)| (key.to_owned(), value)).collect()
+        let without_contact = row.contacts.success_without_contact;
+        let without_contact =
+            without_contact.map(|share| ("evaluation_success_without_contact", share.to_string()));
+        entries
+            .into_iter()
+            .chain(without_contact)
+            .map(|(key, value)| (key.to_owned(), value))
+            .collect()
     }
 
     /// Returns a row with the state of training and without the evaluation's results.
@@ -176,17 +183,26 @@ fn add_summary(row: &mut MetricsRow, summary: &EvaluationSummary) {
     row.collision_rate_before_success = summary.collision_rate_before_success;
     row.moved = summary.moved;
     row.mean_return = summary.mean_return;
+    row.contacts = ContactMetrics::of(summary);
 }
 
-/// Returns true if an evaluation is better than an earlier one: more success, or the same with fewer contacts. During
-/// the cooldown the policy improves by less than 240 goals can measure, so the later one wins unless the intervals are
-/// disjoint.
+/// Returns true if an evaluation is better than an earlier one: more success without contact between the arms, or the
+/// same with more success, or the same with fewer contacts. During the cooldown the policy improves by less than 240
+/// goals can measure, so the later one wins unless the intervals are disjoint.
+///
+/// If one of them does not tell contacts apart, because the task does not report them or an earlier version made the
+/// evaluation, success takes the place of success without contact.
 fn is_better(row: &MetricsRow, than: &MetricsRow, is_cooldown: bool) -> bool {
-    if is_cooldown && row.success_high >= than.success_low {
+    let success = |row: &MetricsRow| [row.success, row.success_low, row.success_high];
+    let without_contact = row.contacts.success().zip(than.contacts.success());
+    let ([here, _, high], [there, low, _]) =
+        without_contact.unwrap_or_else(|| (success(row), success(than)));
+    if is_cooldown && high >= low {
         return true;
     }
-    row.success > than.success
-        || (row.success >= than.success && row.collision_rate < than.collision_rate)
+    let here = [here, row.success, -row.collision_rate];
+    let there = [there, than.success, -than.collision_rate];
+    here > there
 }
 
 #[cfg(test)]
@@ -209,5 +225,28 @@ mod tests {
         assert!(!is_better(&similar, &lucky, false));
         assert!(!is_better(&worse, &lucky, true));
         assert!(is_better(&row(1.0, [0.984, 1.0], 0.01), &lucky, false), "fewer contacts");
+        assert!(!is_better(&lucky, &lucky, false));
+    }
+
+    #[test]
+    fn success_without_contact_decides_if_both_evaluations_have_it() {
+        let row = |success, collision_rate, without_contact: Option<f64>| MetricsRow {
+            success,
+            collision_rate,
+            contacts: ContactMetrics {
+                success_without_contact: without_contact,
+                success_without_contact_low: without_contact.map(|share| share - 0.05),
+                success_without_contact_high: without_contact.map(|share| share + 0.05),
+                ..ContactMetrics::default()
+            },
+            ..MetricsRow::default()
+        };
+        let rough = row(0.99, 0.3, Some(0.7));
+        let careful = row(0.95, 0.1, Some(0.9));
+        assert!(is_better(&careful, &rough, false) && !is_better(&rough, &careful, false));
+        assert!(!is_better(&rough, &careful, true), "the intervals are disjoint");
+        let unknown = row(0.97, 0.2, None);
+        assert!(is_better(&rough, &unknown, false) && !is_better(&careful, &unknown, false));
+        assert!(is_better(&row(0.96, 0.1, Some(0.9)), &careful, false), "more success");
     }
 }

@@ -75,6 +75,7 @@ fn play_episode(actor: &mut Actor, slot: &SlotOrder, order: EpisodeOrder) -> Epi
         advised_arms: vec![0; EPISODE_STEPS],
         contacts: vec![Contacts::NONE; EPISODE_STEPS],
         advice_charged: 0,
+        avoidance_steps: None,
     };
     if order.advised {
         claim(&mut episode, UNITS);

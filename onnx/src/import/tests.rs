@@ -217,12 +217,7 @@ fn inputs_that_do_not_fit_the_layout_are_named() {
         let refusal = BoundNetwork::new(&model, role, LAYOUT).expect_err("refused").to_string();
         assert!(refusal.contains(expected), "{refusal:?} lacks {expected:?}");
     };
-    check(
-        &[("x", 30)],
-        3,
-        Role::Actor,
-        "input \"x\": it has 30 numbers, push with 1 arm(s) has 31",
-    );
+    check(&[("x", 30)], 3, Role::Actor, "input \"x\": it has 30 numbers, push with 1 arm has 31");
     check(&[("obs", 28), ("g", 3)], 3, Role::Actor, "input \"g\": the name is unknown");
     check(&[("obs", 28), ("action", 3)], 3, Role::Actor, "input \"action\": the name is unknown");
     check(&[("obs", 31)], 4, Role::Actor, "output \"out\": it has 4 numbers, an action of push");
@@ -230,6 +225,6 @@ fn inputs_that_do_not_fit_the_layout_are_named() {
         &[("obs", 31), ("action", 4)],
         1,
         Role::Critic,
-        "it has 4 numbers, push with 1 arm(s) has 3",
+        "it has 4 numbers, push with 1 arm has 3",
     );
 }

@@ -20,6 +20,7 @@ pub fn encode_episode(episode: &Episode) -> pb::Episode {
         advised_arms: episode.advised_arms.clone(),
         contacts: episode.contacts.iter().map(|contacts| contacts.bits()).collect(),
         advice_charged: episode.advice_charged,
+        avoidance_steps: episode.avoidance_steps,
     }
 }
 
@@ -28,7 +29,7 @@ pub fn encode_episode(episode: &Episode) -> pb::Episode {
 /// # Errors
 /// Returns an error if the kind is unknown, a length does not match the layout, a number is not finite or beyond its
 /// bound (see [`tandem_core::bounds`]), an action is outside [−1, 1], an undefined bit of `advised_arms` or `contacts`
-/// is set, or more units were charged than the episode has steps.
+/// is set, or more units were charged or avoidance steps counted than the episode has steps.
 pub fn decode_episode(
     episode: pb::Episode,
     layout: impl Into<TaskSpec>,
@@ -36,7 +37,10 @@ pub fn decode_episode(
     let layout = layout.into();
     let n_steps = layout.episode_steps();
     let n_observations = (n_steps + 1) * layout.n_observation();
-    let max_charged = u32::try_from(n_steps).expect("an episode has few steps");
+    let max_count = u32::try_from(n_steps).expect("an episode has few steps");
+    let avoidance_steps = episode.avoidance_steps;
+    let avoidance_steps =
+        avoidance_steps.map(|count| count_within("avoidance_steps", count, &(0..=max_count)));
     Ok(Episode {
         number: episode.number,
         kind: decode_episode_kind(episode.kind)?,
@@ -53,7 +57,8 @@ pub fn decode_episode(
         actions: actions_from_bytes("actions", &episode.actions, n_steps * layout.n_action())?,
         advised_arms: decode_advised_arms(episode.advised_arms, &layout)?,
         contacts: decode_contacts(&episode.contacts, n_steps)?,
-        advice_charged: count_within("advice_charged", episode.advice_charged, &(0..=max_charged))?,
+        advice_charged: count_within("advice_charged", episode.advice_charged, &(0..=max_count))?,
+        avoidance_steps: avoidance_steps.transpose()?,
         layout,
     })
 }
@@ -119,6 +124,7 @@ mod tests {
             advised_arms: (0..50).map(|step_idx| step_idx % 4).collect(),
             contacts: (0..EPISODE_STEPS).map(contact_of).collect(),
             advice_charged: 38,
+            avoidance_steps: Some(2),
         }
     }
 
@@ -167,6 +173,7 @@ mod tests {
             "goal[2]: expected a number in [-2, 2], got -3.5e0",
         );
         check(|e| e.advice_charged = 51, "advice_charged: expected 0 to 50, got 51");
+        check(|e| e.avoidance_steps = Some(51), "avoidance_steps: expected 0 to 50, got 51");
     }
 
     #[test]

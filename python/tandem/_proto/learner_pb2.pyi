@@ -178,7 +178,7 @@ class SubmitEpisodesResponse(_message.Message):
     def __init__(self) -> None: ...
 
 class Episode(_message.Message):
-    __slots__ = ("number", "kind", "parameter_version", "observations", "goal", "actions", "advised_arms", "contacts", "advice_charged")
+    __slots__ = ("number", "kind", "parameter_version", "observations", "goal", "actions", "advised_arms", "contacts", "advice_charged", "avoidance_steps")
     NUMBER_FIELD_NUMBER: _ClassVar[int]
     KIND_FIELD_NUMBER: _ClassVar[int]
     PARAMETER_VERSION_FIELD_NUMBER: _ClassVar[int]
@@ -188,6 +188,7 @@ class Episode(_message.Message):
     ADVISED_ARMS_FIELD_NUMBER: _ClassVar[int]
     CONTACTS_FIELD_NUMBER: _ClassVar[int]
     ADVICE_CHARGED_FIELD_NUMBER: _ClassVar[int]
+    AVOIDANCE_STEPS_FIELD_NUMBER: _ClassVar[int]
     number: int
     kind: EpisodeKind
     parameter_version: int
@@ -197,7 +198,8 @@ class Episode(_message.Message):
     advised_arms: bytes
     contacts: bytes
     advice_charged: int
-    def __init__(self, number: _Optional[int] = ..., kind: _Optional[_Union[EpisodeKind, str]] = ..., parameter_version: _Optional[int] = ..., observations: _Optional[bytes] = ..., goal: _Optional[bytes] = ..., actions: _Optional[bytes] = ..., advised_arms: _Optional[bytes] = ..., contacts: _Optional[bytes] = ..., advice_charged: _Optional[int] = ...) -> None: ...
+    avoidance_steps: int
+    def __init__(self, number: _Optional[int] = ..., kind: _Optional[_Union[EpisodeKind, str]] = ..., parameter_version: _Optional[int] = ..., observations: _Optional[bytes] = ..., goal: _Optional[bytes] = ..., actions: _Optional[bytes] = ..., advised_arms: _Optional[bytes] = ..., contacts: _Optional[bytes] = ..., advice_charged: _Optional[int] = ..., avoidance_steps: _Optional[int] = ...) -> None: ...
 
 class StatusRequest(_message.Message):
     __slots__ = ()
@@ -268,7 +270,7 @@ class WorkerProgress(_message.Message):
     def __init__(self, worker_id: _Optional[int] = ..., name: _Optional[str] = ..., episodes: _Optional[int] = ..., doing: _Optional[str] = ...) -> None: ...
 
 class Evaluation(_message.Message):
-    __slots__ = ("round", "env_steps", "n_episodes", "success", "success_low", "success_high", "success_joint", "success_per_arm", "collision_rate", "mean_q")
+    __slots__ = ("round", "env_steps", "n_episodes", "success", "success_low", "success_high", "success_joint", "success_per_arm", "collision_rate", "mean_q", "success_without_contact", "success_without_contact_low", "success_without_contact_high", "arm_contact_rate", "table_contact_rate", "avoidance_rate")
     ROUND_FIELD_NUMBER: _ClassVar[int]
     ENV_STEPS_FIELD_NUMBER: _ClassVar[int]
     N_EPISODES_FIELD_NUMBER: _ClassVar[int]
@@ -279,6 +281,12 @@ class Evaluation(_message.Message):
     SUCCESS_PER_ARM_FIELD_NUMBER: _ClassVar[int]
     COLLISION_RATE_FIELD_NUMBER: _ClassVar[int]
     MEAN_Q_FIELD_NUMBER: _ClassVar[int]
+    SUCCESS_WITHOUT_CONTACT_FIELD_NUMBER: _ClassVar[int]
+    SUCCESS_WITHOUT_CONTACT_LOW_FIELD_NUMBER: _ClassVar[int]
+    SUCCESS_WITHOUT_CONTACT_HIGH_FIELD_NUMBER: _ClassVar[int]
+    ARM_CONTACT_RATE_FIELD_NUMBER: _ClassVar[int]
+    TABLE_CONTACT_RATE_FIELD_NUMBER: _ClassVar[int]
+    AVOIDANCE_RATE_FIELD_NUMBER: _ClassVar[int]
     round: int
     env_steps: int
     n_episodes: int
@@ -289,4 +297,10 @@ class Evaluation(_message.Message):
     success_per_arm: _containers.RepeatedScalarFieldContainer[float]
     collision_rate: float
     mean_q: float
-    def __init__(self, round: _Optional[int] = ..., env_steps: _Optional[int] = ..., n_episodes: _Optional[int] = ..., success: _Optional[float] = ..., success_low: _Optional[float] = ..., success_high: _Optional[float] = ..., success_joint: _Optional[float] = ..., success_per_arm: _Optional[_Iterable[float]] = ..., collision_rate: _Optional[float] = ..., mean_q: _Optional[float] = ...) -> None: ...
+    success_without_contact: float
+    success_without_contact_low: float
+    success_without_contact_high: float
+    arm_contact_rate: float
+    table_contact_rate: float
+    avoidance_rate: float
+    def __init__(self, round: _Optional[int] = ..., env_steps: _Optional[int] = ..., n_episodes: _Optional[int] = ..., success: _Optional[float] = ..., success_low: _Optional[float] = ..., success_high: _Optional[float] = ..., success_joint: _Optional[float] = ..., success_per_arm: _Optional[_Iterable[float]] = ..., collision_rate: _Optional[float] = ..., mean_q: _Optional[float] = ..., success_without_contact: _Optional[float] = ..., success_without_contact_low: _Optional[float] = ..., success_without_contact_high: _Optional[float] = ..., arm_contact_rate: _Optional[float] = ..., table_contact_rate: _Optional[float] = ..., avoidance_rate: _Optional[float] = ...) -> None: ...

@@ -6,7 +6,7 @@ use crate::curve::{Axis, CurveOptions, Quantity, Series, curve_svg};
 use crate::error::Error;
 use crate::html::{escaped, svg_grid, table};
 use crate::run::Run;
-use crate::table::{duration, interval, number, share, thousands};
+use crate::table::{duration, interval, number, optional, share, thousands};
 
 /// Returns key values, curves, evaluations and configuration of `run` as HTML.
 pub(super) fn body(run: &Run) -> Result<String, Error> {
@@ -33,6 +33,17 @@ pub(super) fn body(run: &Run) -> Result<String, Error> {
 /// Returns the key values of a run, one tile each.
 fn tiles(best: &MetricsRow, last: &MetricsRow) -> String {
     let per_arm: Vec<String> = best.success_per_arm.iter().map(|success| share(*success)).collect();
+    let without_contact = best.contacts.success().map(|[success, low, high]| {
+        let arm_contact = optional(best.contacts.arm_contact_rate, share);
+        let table_contact = optional(best.contacts.table_contact_rate, share);
+        (
+            "success without arm contact",
+            share(success),
+            format!(
+                "95 % interval {low:.3}–{high:.3}; contact between arms: {arm_contact}, with table: {table_contact}"
+            ),
+        )
+    });
     let tiles = [
         (
             "best success",
@@ -68,7 +79,10 @@ fn tiles(best: &MetricsRow, last: &MetricsRow) -> String {
             escaped(note)
         )
     };
-    format!("<div class=tiles>{}</div>", tiles.iter().map(tile).collect::<String>())
+    format!(
+        "<div class=tiles>{}</div>",
+        without_contact.iter().chain(&tiles).map(tile).collect::<String>()
+    )
 }
 
 /// Draws success, mean Q, contacts and advice against environment steps.
@@ -98,7 +112,7 @@ fn curves(run: &Run) -> Result<[String; 4], Error> {
     ])
 }
 
-const EVALUATION_HEADER: [&str; 12] = [
+const EVALUATION_HEADER: [&str; 13] = [
     "round",
     "env steps",
     "updates",
@@ -106,6 +120,7 @@ const EVALUATION_HEADER: [&str; 12] = [
     "time",
     "success",
     "95 % interval",
+    "without arm contact",
     "joint",
     "contact",
     "moved",
@@ -122,6 +137,7 @@ fn evaluation_cells(row: &MetricsRow) -> Vec<String> {
         duration(row.wall_s),
         share(row.success),
         interval(row),
+        optional(row.contacts.success_without_contact, share),
         share(row.success_joint),
         share(row.collision_rate),
         share(row.moved),

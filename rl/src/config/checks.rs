@@ -3,6 +3,7 @@
 use std::fmt::Display;
 
 use tandem_core::TaskSpec;
+use tandem_core::evaluation::TEST_SEED;
 use tandem_core::settings::OutOfRange;
 
 use super::{ConfigError, RunConfig};
@@ -30,6 +31,10 @@ impl RunConfig {
         check("arms", self.arms, is_simulated, "1 or 2")?;
         let is_named = is_name(&self.name);
         check("name", &self.name, is_named, "1 to 100 letters, digits, '-', '_' or '.'")?;
+        let seed = self.evaluation.seed;
+        let expected = "another seed: this one is that of the test goals";
+        check("evaluation.seed", seed, seed != TEST_SEED, expected)?;
+        check("seed", self.seed, self.seed != TEST_SEED, expected)?;
         let is_own = self.seed != self.evaluation.seed;
         check("seed", self.seed, is_own, "another than evaluation.seed")?;
         let episodes = self.evaluation.episodes;

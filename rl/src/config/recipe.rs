@@ -1,7 +1,7 @@
 //! The values that a recipe gives to every setting.
 
 use serde::{Deserialize, Serialize};
-use tandem_core::{Exploration, Layout, Task, TaskSpec, WorldSettings};
+use tandem_core::{Exploration, Task, TaskSpec, WorldSettings};
 
 use super::{
     AdviceConfig, Behaviour, CheckpointConfig, EvaluationConfig, PolyakEvery, RoundsConfig,
@@ -112,7 +112,7 @@ const fn rounds(recipe: Recipe) -> RoundsConfig {
 fn stop(recipe: Recipe, layout: &TaskSpec) -> StopConfig {
     let max_env_steps = match (recipe, layout.as_built_in()) {
         (Recipe::Paper, _) => 0,
-        (Recipe::Tandem, Some(Layout { task: Task::Push, n_arms: 1 })) => 200_000,
+        (Recipe::Tandem, Some(layout)) if !layout.task.grasps() && layout.n_arms == 1 => 200_000,
         (Recipe::Tandem, _) => 300_000,
     };
     let max_minutes = if max_env_steps == 0 { 30.0 } else { 0.0 };
@@ -120,8 +120,8 @@ fn stop(recipe: Recipe, layout: &TaskSpec) -> StopConfig {
 }
 
 fn world(recipe: Recipe, layout: &TaskSpec) -> WorldSettings {
-    let task = layout.as_built_in().map(|layout| layout.task);
-    let starts_grasped = recipe == Recipe::Tandem && task == Some(Task::PickAndPlace);
+    let grasps = layout.as_built_in().is_some_and(|layout| layout.task.grasps());
+    let starts_grasped = recipe == Recipe::Tandem && grasps;
     WorldSettings {
         grasped_start_prob: if starts_grasped { 0.2 } else { 0.0 },
         ..WorldSettings::default()

@@ -1,6 +1,7 @@
 //! Recipes, derived numbers and refused values.
 
 use tandem_core::Task;
+use tandem_core::evaluation::TEST_SEED;
 
 use super::*;
 
@@ -53,4 +54,7 @@ fn a_bad_value_is_named() {
     check(|config| config.exploration.random_action_prob = 1.0, "exploration.random_action_prob");
     check(|config| config.name = "a/b".to_owned(), "name");
     check(|config| config.ddpg.discount = 1.0, "ddpg.discount");
+    check(|config| config.seed = config.evaluation.seed, "another than evaluation.seed");
+    check(|config| config.seed = TEST_SEED, "seed is 777: expected another seed");
+    check(|config| config.evaluation.seed = TEST_SEED, "evaluation.seed is 777");
 }

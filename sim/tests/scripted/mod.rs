@@ -97,9 +97,10 @@ impl Controller {
     pub(crate) fn act(&mut self, observation: &[f32], goal: &[f32]) -> [f32; 4] {
         let hand = [observation[0], observation[1], observation[2]];
         let object = [observation[3], observation[4], observation[5]];
-        match self.task {
-            Task::PickAndPlace => self.pick_and_place(hand, object, goal),
-            Task::Push => self.push(hand, object, goal),
+        if self.task.grasps() {
+            self.pick_and_place(hand, object, goal)
+        } else {
+            self.push(hand, object, goal)
         }
     }
 

@@ -14,7 +14,7 @@
 //! openings correspond: closed, open, and just touching the block. Openings in between are interpolated linearly.
 
 use glam::{DQuat, DVec3};
-use tandem_core::{ArmIndex, Layout, Task};
+use tandem_core::{ArmIndex, Layout};
 use tandem_kinematics::{Joints, PlacedArm, ReachError, TaskFrame, WorkCell};
 
 use crate::simulated::{Block, MAX_OPENING_M, ObjectPose};
@@ -192,10 +192,7 @@ impl Mapping {
         seen: &ObjectPose,
     ) -> ArmObservation {
         let upright = DQuat::from_rotation_z(-self.cell.arms[arm.0].yaw_rad);
-        let opening_m = match self.layout.task {
-            Task::Push => 0.0,
-            Task::PickAndPlace => self.opening_in_own(opening),
-        };
+        let opening_m = if self.layout.task.grasps() { self.opening_in_own(opening) } else { 0.0 };
         ArmObservation {
             hand: self.hand_in_own(arm, angles),
             hand_velocity,
@@ -226,13 +223,11 @@ impl Mapping {
     /// Objects between the pads are ignored: a gripper that holds an object is commanded to close.
     #[must_use]
     pub fn opening_after(&self, opening_m: f64, action: &[f32]) -> f64 {
-        match self.layout.task {
-            Task::Push => 0.0,
-            Task::PickAndPlace => {
-                let step_m = f64::from(action[3].clamp(-1.0, 1.0)) * OPENING_STEP_M;
-                (opening_m + step_m).clamp(0.0, OPENING_M)
-            }
+        if !self.layout.task.grasps() {
+            return 0.0;
         }
+        let step_m = f64::from(action[3].clamp(-1.0, 1.0)) * OPENING_STEP_M;
+        (opening_m + step_m).clamp(0.0, OPENING_M)
     }
 
     fn own(&self, arm: ArmIndex, in_world: DVec3) -> DVec3 {

@@ -116,7 +116,7 @@ impl ObjectResult {
     fn lost(&self, task: Task) -> bool {
         let fell = self.highest_m - self.start.z > LIFTED_M
             && self.end.z - self.start.z < 0.5 * LIFTED_M
-            && task == Task::PickAndPlace;
+            && task.grasps();
         let away = self.end.x.abs().max(self.end.y.abs()) > REACH_M;
         fell || away || self.end.z < 0.0
     }

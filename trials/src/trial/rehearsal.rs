@@ -2,7 +2,7 @@
 
 use glam::DVec3;
 use tandem_core::layout::EPISODE_STEPS;
-use tandem_core::{ArmIndex, Contacts, Layout, Stream, Task, WorldSettings, episode_rng};
+use tandem_core::{ArmIndex, Contacts, Layout, Stream, WorldSettings, episode_rng};
 use tandem_sim::{Env, SimError, WorldConfig};
 
 use crate::simulated::Block;
@@ -110,10 +110,7 @@ impl Rehearsal {
     fn current_start(&self) -> TrialStart {
         let mut observation = vec![0.0; self.layout.n_observation()];
         self.env.observe(&mut observation);
-        let opening_m = match self.layout.task {
-            Task::Push => 0.0,
-            Task::PickAndPlace => OPENING_M,
-        };
+        let opening_m = if self.layout.task.grasps() { OPENING_M } else { 0.0 };
         let (hands, objects) = (self.points(&observation, 0), self.points(&observation, 3));
         let objects = self.above_rest(objects);
         TrialStart { hands, opening_m, objects, goals: self.goals() }
