@@ -21,6 +21,7 @@
 //!     goal: vec![0],
 //!     action: vec![0],
 //!     position: vec![],
+//!     lateral: vec![],
 //! };
 //! let task = TaskSpec::new(TaskDescription {
 //!     name: "point".to_owned(),
@@ -35,6 +36,7 @@
 //!     reports_contacts: false,
 //!     origin_distance: 0.0,
 //!     recombination_gap: 0.0,
+//!     base: 0.0,
 //!     observation_bound: vec![2.0, 1.0],
 //!     goal_bound: vec![2.0],
 //!     arms: vec![arm],

@@ -48,6 +48,7 @@ struct ArmParts {
     action: Part,
     achieved_goal: Part,
     position: Part,
+    lateral: Part,
 }
 
 impl TaskSpec {
@@ -83,6 +84,7 @@ impl TaskSpec {
             action: Part::new(arm.action.clone()),
             achieved_goal: achieved(&arm.goal),
             position: Part::new(arm.position.clone()),
+            lateral: Part::new(arm.lateral.clone()),
         };
         let arms: Vec<ArmParts> = description.arms.iter().map(parts).collect();
         let goals: Vec<&[usize]> = description.arms.iter().map(|arm| &arm.goal[..]).collect();
@@ -174,6 +176,13 @@ impl TaskSpec {
     #[must_use]
     pub fn position_of(&self, arm: ArmIndex) -> &Part {
         &self.0.arms[arm.0].position
+    }
+
+    /// Returns the indices, in an observation, of the coordinates of [`Self::position_of`] along the perpendicular axis,
+    /// which may be empty: see [`ArmDescription::lateral`].
+    #[must_use]
+    pub fn lateral_of(&self, arm: ArmIndex) -> &Part {
+        &self.0.arms[arm.0].lateral
     }
 
     /// Returns the numbers of an observation that belong to no arm.
@@ -339,11 +348,13 @@ impl TaskSpec {
                 goal: own(arm.goal.len()),
                 action: own(arm.action.len()),
                 position: Vec::new(),
+                lateral: Vec::new(),
             }],
             achieved_goal,
             interchangeable_arms: false,
             origin_distance: 0.0,
             recombination_gap: 0.0,
+            base: 0.0,
             observation_bound: bounds(observation, &description.observation_bound),
             goal_bound: bounds(goal, &description.goal_bound),
             ..description.clone()
@@ -370,6 +381,7 @@ impl TaskSpec {
                 goal: shifted(arm_idx, &arm.goal, one.n_goal),
                 action: shifted(arm_idx, &arm.action, one.n_action),
                 position: Vec::new(),
+                lateral: Vec::new(),
             })
         });
         let achieved_goal =

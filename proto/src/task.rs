@@ -32,6 +32,7 @@ pub fn encode_task(task: &TaskSpec) -> pb::TaskDescription {
         goal_bound: task.goal_bound.clone(),
         origin_distance: task.origin_distance,
         recombination_gap: task.recombination_gap,
+        base: task.base,
     }
 }
 
@@ -55,6 +56,7 @@ pub fn decode_task(task: pb::TaskDescription) -> Result<TaskSpec, DecodeError> {
         reports_contacts: task.reports_contacts,
         origin_distance: task.origin_distance,
         recombination_gap: task.recombination_gap,
+        base: task.base,
         observation_bound: task.observation_bound,
         goal_bound: task.goal_bound,
     };
@@ -67,6 +69,7 @@ fn encode_arm(arm: &ArmDescription) -> pb::TaskArm {
         goal: encode_indices(&arm.goal),
         action: encode_indices(&arm.action),
         position: encode_indices(&arm.position),
+        lateral: encode_indices(&arm.lateral),
     }
 }
 
@@ -77,6 +80,7 @@ fn decode_arm(arm: pb::TaskArm) -> ArmDescription {
         goal: decode_indices(&arm.goal),
         action: decode_indices(&arm.action),
         position: decode_indices(&arm.position),
+        lateral: decode_indices(&arm.lateral),
     }
 }
 
@@ -126,6 +130,7 @@ mod tests {
             goal: vec![1 - first],
             action: vec![1 - first],
             position: vec![first],
+            lateral: Vec::new(),
         };
         TaskSpec::new(TaskDescription {
             name: "lab/reach-1".to_owned(),
@@ -141,6 +146,7 @@ mod tests {
             reports_contacts: false,
             origin_distance: 1.0,
             recombination_gap: 0.2,
+            base: -0.5,
             observation_bound: vec![2.0, 2.5, 3.0, 3.5],
             goal_bound: vec![1.0, 1.5],
         })

@@ -14,6 +14,7 @@ use crate::ddpg::Batch;
 use crate::replay::ReplayBuffer;
 
 mod config;
+mod separation;
 #[cfg(test)]
 mod tests;
 
@@ -287,21 +288,15 @@ fn has_contact_within(buffer: &ReplayBuffer, first: StepIndex, n_steps: usize) -
 }
 
 /// Returns true if two arms cannot meet when they take these steps at the same time: neither step has a contact, and
-/// the positions of the arms stay apart before and after.
+/// the arms stay apart before and after.
 fn is_apart(buffer: &ReplayBuffer, steps: [StepIndex; 2]) -> bool {
     if steps.iter().any(|step| has_contact_within(buffer, *step, 1)) {
         return false;
     }
-    let layout = buffer.layout();
-    let reach = |arm: ArmIndex, later: usize| {
-        let StepIndex { episode_idx, step_idx } = steps[arm.0];
-        let observation = buffer.observation(episode_idx, step_idx + later);
-        let positions = layout.position_of(arm).iter().map(|idx| observation[idx]);
-        positions.fold(f32::NEG_INFINITY, f32::max)
-    };
-    let task = layout.description();
     [0, 1].into_iter().all(|later| {
-        let reached = reach(ArmIndex(0), later) + reach(ArmIndex(1), later);
-        task.origin_distance - reached >= task.recombination_gap
+        let observations = steps.map(|StepIndex { episode_idx, step_idx }| {
+            buffer.observation(episode_idx, step_idx + later)
+        });
+        separation::are_apart(buffer.layout(), observations)
     })
 }

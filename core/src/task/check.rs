@@ -117,6 +117,7 @@ fn check_recombination(task: &TaskDescription) -> Result<(), InvalidTask> {
         let is_valid = value.is_finite() && value >= 0.0;
         InvalidTask::unless(is_valid, field, "a finite number, 0 or more", value)?;
     }
+    InvalidTask::unless(task.base.is_finite(), "base", "a finite number", task.base)?;
     let of_arms = |n: fn(&super::ArmDescription) -> usize| task.arms.iter().map(n).sum::<usize>();
     let has_common = of_arms(|arm| arm.observation.len()) < task.n_observation
         || of_arms(|arm| arm.goal.len()) < task.n_goal;
@@ -129,6 +130,12 @@ fn check_recombination(task: &TaskDescription) -> Result<(), InvalidTask> {
                         and these positions belong to the arm";
         let got = format_args!("{} indices", arm.position.len()).to_string();
         InvalidTask::unless(is_valid, format_args!("arms[{arm_idx}].position"), expected, got)?;
+        let is_own = arm.lateral.iter().all(|idx| arm.observation.contains(idx));
+        let n_lateral = arm.lateral.len();
+        let is_valid = n_lateral == 0 || (n_lateral == arm.position.len() && is_own);
+        let expected = "no index, or one of the arm's own for each position";
+        let got = format_args!("{n_lateral} indices").to_string();
+        InvalidTask::unless(is_valid, format_args!("arms[{arm_idx}].lateral"), expected, got)?;
     }
     Ok(())
 }

@@ -42,9 +42,14 @@ pub struct TaskDescription {
     /// at the other arm.
     #[serde(default)]
     pub origin_distance: f32,
-    /// Smallest gap, along that axis, between two arms whose parts come from different steps.
+    /// Smallest gap between two arms whose parts come from different steps: along that axis, or in the plane if
+    /// [`ArmDescription::lateral`] is given.
     #[serde(default)]
     pub recombination_gap: f32,
+    /// Coordinate of each arm's base along that axis, arm frame. Between its base and its first position, an arm
+    /// occupies the plane.
+    #[serde(default)]
+    pub base: f32,
     /// Largest magnitude of each number of an observation, shape `[n_observation]`.
     pub observation_bound: Vec<f32>,
     /// Largest magnitude of each number of a goal, shape `[n_goal]`.
@@ -71,6 +76,10 @@ pub struct ArmDescription {
     /// recombined.
     #[serde(default)]
     pub position: Vec<usize>,
+    /// Indices, in the observation, of the same positions' coordinates along the horizontal axis perpendicular to it.
+    /// Empty: only the distance along the first axis counts.
+    #[serde(default)]
+    pub lateral: Vec<usize>,
 }
 
 /// The norm of the difference between an achieved and a desired goal.
@@ -172,7 +181,7 @@ impl TaskDescription {
             }
         }
         compare!(achieved_goal, episode_steps, tolerance, norm, interchangeable_arms);
-        compare!(reports_contacts, origin_distance, recombination_gap);
+        compare!(reports_contacts, origin_distance, recombination_gap, base);
         compare!(observation_bound, goal_bound);
         None
     }
@@ -180,12 +189,13 @@ impl TaskDescription {
 
 impl ArmDescription {
     /// Returns the name and the indices of each field.
-    pub(super) const fn fields(&self) -> [(&'static str, &Vec<usize>); 4] {
+    pub(super) const fn fields(&self) -> [(&'static str, &Vec<usize>); 5] {
         [
             ("observation", &self.observation),
             ("goal", &self.goal),
             ("action", &self.action),
             ("position", &self.position),
+            ("lateral", &self.lateral),
         ]
     }
 }

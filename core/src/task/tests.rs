@@ -8,6 +8,7 @@ fn interleaved() -> TaskDescription {
         goal: vec![1 - first],
         action: vec![1 - first],
         position: vec![first],
+        lateral: Vec::new(),
     };
     TaskDescription {
         name: "lab/reach-1".to_owned(),
@@ -23,6 +24,7 @@ fn interleaved() -> TaskDescription {
         reports_contacts: false,
         origin_distance: 1.0,
         recombination_gap: 0.2,
+        base: 0.0,
         observation_bound: vec![2.0; 4],
         goal_bound: vec![1.0; 2],
     }
