@@ -20,7 +20,7 @@ pub(crate) fn metadata() -> EpisodeMetadata {
         seed: u64::MAX,
         kind: EpisodeKind::Evaluation,
         parameter_version: 3,
-        layout: LAYOUT,
+        layout: LAYOUT.into(),
         policy_digest: "5f3a".to_owned(),
         world: BTreeMap::from([("substeps".to_owned(), "20".to_owned())]),
     }
@@ -42,6 +42,7 @@ pub(crate) fn scene(progress: f32) -> Scene {
         arms: vec![left, right],
         objects: vec![left_object, right_object],
         goals: vec![[0.11, 0.12, 0.0225], [-0.11, -0.12, 0.0225]],
+        goal_tolerance_m: 0.05,
         table: Cuboid {
             centre: [0.0, 0.0, -0.02],
             orientation: UPRIGHT,
