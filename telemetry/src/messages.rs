@@ -240,3 +240,77 @@ fn kind_from_name(name: &str) -> Result<EpisodeKind, String> {
         .find(|kind| kind_name(*kind) == name)
         .ok_or_else(|| format!("metadata kind {name:?}, expected training or evaluation"))
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Returns the metadata of an episode of a push task that is not built-in.
+    fn described() -> EpisodeMetadata {
+        let push = Layout::new(Task::Push, 2).description();
+        let description = TaskDescription { name: "lab/push".to_owned(), ..push };
+        EpisodeMetadata {
+            run: "run".to_owned(),
+            episode: 3,
+            seed: 7,
+            kind: EpisodeKind::Evaluation,
+            parameter_version: 5,
+            layout: TaskSpec::new(description).unwrap(),
+            policy_digest: "5f3a".to_owned(),
+            world: BTreeMap::new(),
+        }
+    }
+
+    #[test]
+    fn metadata_of_a_built_in_task_have_no_description() {
+        let metadata = EpisodeMetadata { layout: Layout::new(Task::Push, 2).into(), ..described() };
+        let map = metadata.to_map();
+        let keys: Vec<&str> = map.keys().map(String::as_str).collect();
+        let expected = [
+            "arms",
+            "checksum",
+            "episode",
+            "format",
+            "kind",
+            "parameter_version",
+            "policy_digest",
+            "run",
+            "seed",
+            "task",
+        ];
+        assert_eq!((keys.as_slice(), map["format"].as_str()), (&expected[..], "1"));
+        assert_eq!(EpisodeMetadata::from_map(&map), Ok(metadata));
+    }
+
+    #[test]
+    fn metadata_of_another_task_contain_its_description() {
+        let map = described().to_map();
+        assert_eq!((map["format"].as_str(), map["task"].as_str()), ("2", "lab/push"));
+        assert_eq!(EpisodeMetadata::from_map(&map), Ok(described()));
+    }
+
+    #[test]
+    fn a_contradictory_description_is_refused() {
+        let check = |key: &str, value: Option<&str>, problem: &str| {
+            let mut map = described().to_map();
+            map.remove(CHECKSUM);
+            match value {
+                Some(value) => drop(map.insert(key.to_owned(), value.to_owned())),
+                None => drop(map.remove(key)),
+            }
+            let refusal = EpisodeMetadata::from_map(&map).unwrap_err();
+            assert!(refusal.contains(problem), "{refusal:?} lacks {problem:?}");
+        };
+        check("description", None, "metadata lack \"description\"");
+        check("description", Some("{}"), "missing field");
+        check("task", Some("lab/pull"), "its name is \"lab/push\", that of the log \"lab/pull\"");
+        check("arms", Some("3"), "it has 2 arms, the log 3");
+        check("format", Some("1"), "unknown task \"lab/push\"");
+        check("format", Some("3"), "this program reads \"1\" and \"2\"");
+        let built_in = json!(Layout::new(Task::Push, 2).description()).to_string();
+        check("description", Some(&built_in), "push is built-in");
+        let mut broken = described().layout.description().clone();
+        broken.n_goal = 5;
+        check("description", Some(&json!(broken).to_string()), "achieved_goal");
+    }
+}
