@@ -76,7 +76,6 @@ fn record(
     let number = episode.number;
     let order = EpisodeOrder { number, seed, advised: false, uniform: false, record: true };
     let metadata = metadata_of(order, episode, terms, subject.policy().digest());
-    let metadata = metadata.expect("an evaluated policy is for a simulated task");
     match record_episode(&metadata, episode, path) {
         Ok(_) => Ok(()),
         Err(error @ RecordError::Log(_)) => Err(error).or_cannot_write(String::new),

@@ -132,7 +132,7 @@ pub(crate) fn measure(
 ) -> Result<EvaluationResult, Failed> {
     let start = clock::now();
     let episodes = subject.play(n_episodes, seed)?;
-    let n_steps = episodes.len() * tandem_core::layout::EPISODE_STEPS;
+    let n_steps: usize = episodes.iter().map(Episode::n_steps).sum();
     let steps_per_s = n_steps as f64 / start.elapsed().as_secs_f64();
     let outcomes: Vec<EpisodeOutcome> = episodes.iter().map(EpisodeOutcome::of).collect();
     let summary = EvaluationSummary::of(&outcomes);

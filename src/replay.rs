@@ -1,18 +1,24 @@
 //! `tandem replay`: simulates recorded episodes again and compares them with their logs.
 
 use std::path::{Path, PathBuf};
+use std::sync::{Mutex, PoisonError};
 
 use anyhow::anyhow;
 use indicatif::ProgressBar;
 use rayon::iter::{IntoParallelIterator as _, ParallelIterator as _};
 use serde_json::{Value, json};
+use tandem_core::TaskSpec;
 use tandem_core::text::error_chain;
-use tandem_telemetry::{LoggedTransition, read_episode};
-use tandem_worker::record::{RecordError, replay_log};
+use tandem_telemetry::{EpisodeLog, LoggedTransition, read_episode};
+use tandem_worker::EnvironmentConfig;
+use tandem_worker::record::{RecordError, replay_log, replay_log_on};
+use tokio::runtime::Runtime;
 
 use crate::cli::ReplayArgs;
+use crate::environment_server::EnvironmentSource;
 use crate::exit::{Exit, Failed, OrExit as _};
-use crate::output;
+use crate::service::worker_failed;
+use crate::{access, output, runtime};
 
 /// A log that was simulated again.
 struct Replayed {
@@ -22,28 +28,101 @@ struct Replayed {
     cut_short: bool,
 }
 
+/// The server of environments that the command line names. It simulates the episodes of its own task.
+struct Server {
+    runtime: Runtime,
+    source: EnvironmentSource,
+    config: EnvironmentConfig,
+    task: TaskSpec,
+}
+
 pub(crate) fn replay(args: &ReplayArgs) -> Result<(), Failed> {
     let files = find_logs(&args.files)?;
-    if let ([file], false, false) = (files.as_slice(), args.verify, args.json) {
+    let is_printed = !args.verify && !args.json;
+    let printed = if let ([file], true) = (files.as_slice(), is_printed) {
         print_steps(file)?;
+        true
+    } else {
+        false
+    };
+    let server = Server::start(args)?.map(Mutex::new);
+    let replayed = replay_all(files, server.as_ref());
+    if let Some(server) = server {
+        server.into_inner().unwrap_or_else(PoisonError::into_inner).end();
     }
+    let replayed = replayed?;
+    if let ([Replayed { outcome: Err(error @ RecordError::NoSimulator { .. }), .. }], true) =
+        (replayed.as_slice(), printed)
+    {
+        return output::print(format_args!("not compared: {error}"));
+    }
+    print_result(&replayed, args.json)?;
+    result(&replayed)
+}
+
+/// Simulates all logs again.
+fn replay_all(
+    files: Vec<PathBuf>,
+    server: Option<&Mutex<Server>>,
+) -> Result<Vec<Replayed>, Failed> {
     let bar = ProgressBar::new(files.len() as u64);
     let replay_one = |file| {
-        let replayed = Replayed::of(file);
+        let replayed = Replayed::of(file, server);
         bar.inc(1);
         replayed
     };
     let replayed: Vec<Replayed> = files.into_par_iter().map(replay_one).collect();
     bar.finish_and_clear();
-    print_result(&replayed, args.json)?;
-    let bad: Vec<String> = replayed.iter().filter_map(Replayed::problem).collect();
-    match bad.as_slice() {
-        [] => Ok(()),
-        [problem] => Err(Failed::new(Exit::Data, anyhow!("{problem}"))),
-        [first, ..] => Err(Failed::new(
+    replayed.into_iter().map(Replayed::on_working_server).collect()
+}
+
+/// Returns the failure that the first problem causes. A log that only other environments can simulate is a problem if
+/// there is no other one.
+fn result(replayed: &[Replayed]) -> Result<(), Failed> {
+    let (not_simulated, bad): (Vec<&Replayed>, Vec<&Replayed>) =
+        replayed.iter().filter(|log| log.outcome.is_err()).partition(|log| log.is_not_simulated());
+    let problems = |logs: &[&Replayed]| -> Vec<String> {
+        logs.iter().filter_map(|log| log.problem()).collect()
+    };
+    match (problems(&bad).as_slice(), problems(&not_simulated).as_slice()) {
+        ([], []) => Ok(()),
+        ([problem], _) => Err(Failed::new(Exit::Data, anyhow!("{problem}"))),
+        ([first, ..], _) => Err(Failed::new(
             Exit::Data,
             anyhow!("{} logs differ or cannot be read, the first: {first}", bad.len()),
         )),
+        ([], [problem]) => Err(Failed::usage(problem)),
+        ([], [first, ..]) => Err(Failed::usage(format!(
+            "{} logs were not simulated again, the first: {first}",
+            not_simulated.len()
+        ))),
+    }
+}
+
+impl Server {
+    /// Connects to the server that the command line names, if there is one.
+    fn start(args: &ReplayArgs) -> Result<Option<Self>, Failed> {
+        let client_config = access::client_config(&args.client_config, &args.secret)?;
+        let source = EnvironmentSource::of(&args.environment, &client_config)?;
+        let Some(config) = source.config() else { return Ok(None) };
+        let runtime = runtime::new().or_exit(Exit::TryAgain, String::new)?;
+        let served = runtime.block_on(async {
+            let served = source.served_task().await;
+            if served.is_err() {
+                source.end().await;
+            }
+            served.map_err(worker_failed)
+        })?;
+        Ok(served.map(|served| Self { runtime, source, config, task: served.task }))
+    }
+
+    fn replay(&self, log: &EpisodeLog) -> Result<(), RecordError> {
+        self.runtime.block_on(replay_log_on(self.config.clone(), log))
+    }
+
+    /// Ends the server if this process has started it.
+    fn end(self) {
+        self.runtime.block_on(self.source.end());
     }
 }
 
@@ -80,13 +159,32 @@ fn collect_logs(directory: &Path, files: &mut Vec<PathBuf>) -> std::io::Result<(
 }
 
 impl Replayed {
-    fn of(file: PathBuf) -> Self {
-        match read_episode(&file) {
-            Ok(log) => {
-                Self { file, outcome: replay_log(&log), cut_short: log.last_observation.is_none() }
+    fn of(file: PathBuf, server: Option<&Mutex<Server>>) -> Self {
+        let log = match read_episode(&file) {
+            Ok(log) => log,
+            Err(error) => return Self { file, outcome: Err(error.into()), cut_short: false },
+        };
+        let on_server = server.and_then(|server| {
+            let server = server.lock().unwrap_or_else(PoisonError::into_inner);
+            (server.task == log.metadata.layout).then(|| server.replay(&log))
+        });
+        let outcome = on_server.unwrap_or_else(|| replay_log(&log));
+        Self { file, outcome, cut_short: log.last_observation.is_none() }
+    }
+
+    /// Returns the failure of the server if it failed on this log.
+    fn on_working_server(self) -> Result<Self, Failed> {
+        match self.outcome {
+            Err(RecordError::Environment(error)) => {
+                Err(worker_failed(*error).context(self.file.display().to_string()))
             }
-            Err(error) => Self { file, outcome: Err(error.into()), cut_short: false },
+            _ => Ok(self),
         }
+    }
+
+    /// Returns whether only environments that were not given can simulate the log.
+    const fn is_not_simulated(&self) -> bool {
+        matches!(self.outcome, Err(RecordError::NoSimulator { .. }))
     }
 
     /// Describes the problem on one line; `None` if the episode is equal.
@@ -102,19 +200,55 @@ impl Replayed {
 
 fn print_steps(file: &Path) -> Result<(), Failed> {
     let log = read_episode(file).or_exit(Exit::Data, String::new)?;
+    let task = &log.metadata.layout;
     output::print(format_args!("episode {} of {}", log.metadata.episode, file.display()))?;
-    for (step_idx, LoggedTransition { reward, action, .. }) in log.transitions.iter().enumerate() {
-        output::print(format_args!("step {step_idx:>2}  reward {reward:>4.1}  action {action:?}"))?;
+    output::print(format_args!(
+        "task {}, arms {}, tolerance {}",
+        task.name(),
+        task.n_arms(),
+        task.tolerance()
+    ))?;
+    for (step_idx, step) in log.transitions.iter().enumerate() {
+        let LoggedTransition { observation, goal, reward, action, .. } = step;
+        let distances = distances(task, observation, goal);
+        let advised = advised_text(task, step.advised_arms);
+        output::print(format_args!(
+            "step {step_idx:>2}  reward {reward:>4.1}  distance {distances}{advised}  action {action:?}"
+        ))?;
     }
-    Ok(())
+    let last = log.last_observation.as_ref().zip(log.transitions.last());
+    last.map_or(Ok(()), |(observation, LoggedTransition { goal, .. })| {
+        let is_success = task.is_success(observation, goal);
+        let result = if is_success { "success" } else { "failure" };
+        let distances = distances(task, observation, goal);
+        output::print(format_args!("{result}  distance {distances}"))
+    })
+}
+
+/// Returns the distance of each arm from its goal, and that of the arms together from the goal common to them.
+fn distances(task: &TaskSpec, observation: &[f32], goal: &[f32]) -> String {
+    let distances = task.goal_distances(observation, goal);
+    distances.iter().map(|distance| format!("{distance:.4}")).collect::<Vec<_>>().join(" ")
+}
+
+/// Names the arms that executed the teacher's action.
+fn advised_text(task: &TaskSpec, advised_arms: u8) -> String {
+    let advised = task.arms().filter(|arm| advised_arms >> arm.0 & 1 == 1);
+    let arms: Vec<String> = advised.map(|arm| arm.0.to_string()).collect();
+    if arms.is_empty() { String::new() } else { format!("  advised arm {}", arms.join(" ")) }
 }
 
 fn print_result(replayed: &[Replayed], json: bool) -> Result<(), Failed> {
     let (n_episodes, n_equal) =
         (replayed.len(), replayed.iter().filter(|log| log.outcome.is_ok()).count());
-    let cut_short: Vec<&Path> =
-        replayed.iter().filter(|log| log.cut_short).map(|log| log.file.as_path()).collect();
-    let bad = || replayed.iter().filter(|log| log.outcome.is_err());
+    let cut_short = replayed.iter().filter(|log| log.cut_short && !log.is_not_simulated());
+    let cut_short: Vec<&Path> = cut_short.map(|log| log.file.as_path()).collect();
+    let not_simulated: Vec<&Path> = replayed
+        .iter()
+        .filter(|log| log.is_not_simulated())
+        .map(|log| log.file.as_path())
+        .collect();
+    let bad = || replayed.iter().filter(|log| log.outcome.is_err() && !log.is_not_simulated());
     if json {
         let (differing, unreadable): (Vec<&Replayed>, _) =
             bad().partition(|log| matches!(log.outcome, Err(RecordError::Differs { .. })));
@@ -123,12 +257,15 @@ fn print_result(replayed: &[Replayed], json: bool) -> Result<(), Failed> {
         let (differing, unreadable): (Value, Value) = (differing, unreadable);
         output::print(json!({
             "episodes": n_episodes, "equal": n_equal, "differing": differing, "unreadable": unreadable,
-            "cut_short": cut_short,
+            "not_simulated": not_simulated, "cut_short": cut_short,
         }))?;
         return Ok(());
     }
     bad().filter_map(Replayed::problem).try_for_each(output::print)?;
     output::print(format_args!("{n_equal} of {n_episodes} episodes equal bit for bit"))?;
+    if !not_simulated.is_empty() {
+        output::print(format_args!("{} of them not simulated again", not_simulated.len()))?;
+    }
     if !cut_short.is_empty() {
         output::print(format_args!(
             "{} of them compared only as far as their logs go",

@@ -95,7 +95,7 @@ fn baselines(args: &ReportArgs) -> Result<Vec<Baseline>, Failed> {
 fn test_evaluation(result: &EvaluationResult) -> TestEvaluation {
     let summary = &result.summary;
     TestEvaluation {
-        task: result.layout.task,
+        task: result.layout.task.to_string(),
         n_arms: result.layout.n_arms,
         n_episodes: summary.n_episodes as u64,
         success: summary.success,

@@ -7,9 +7,10 @@ use std::process::{Command, Output};
 use proptest::prelude::{ProptestConfig, any, prop_assert, proptest};
 use serde_json::{Value, json};
 use tandem_core::layout::EPISODE_STEPS;
+use tandem_core::task::TaskDescription;
 use tandem_core::work::{EpisodeOrder, RunTerms, SlotOrder};
 use tandem_core::{
-    ArmAdvice, Contacts, EpisodeKind, Exploration, Layout, StepAdvice, StepQuery, Task,
+    ArmAdvice, Contacts, EpisodeKind, Exploration, Layout, StepAdvice, StepQuery, Task, TaskSpec,
     WorldSettings,
 };
 use tandem_policy::{Actor, Policy};
@@ -122,7 +123,7 @@ fn record(layout: Layout, kind: Kind, substeps: u32, directory: &Path) -> Vec<Pa
     let episodes = play_slot(&mut world, &slot, &terms, &mut actor, &mut advisor).expect("plays");
     let write = |(order, episode)| {
         let path = directory.join(log_name(episode));
-        let metadata = metadata_of(order, episode, &terms, String::new()).expect("built-in");
+        let metadata = metadata_of(order, episode, &terms, String::new());
         record_episode(&metadata, episode, &path).expect("recorded")
     };
     slot.episodes.iter().copied().zip(&episodes).map(write).collect()
@@ -191,13 +192,15 @@ fn two_hundred_episodes_of_every_kind_replay_bit_for_bit() {
     assert!(whole.status.success() && whole.stderr.is_empty());
     let as_json = tandem(&["replay", "--json"], &[keep.path(), &logs[0]]);
     let expected = json!({
-        "episodes": 201, "equal": 201, "differing": [], "unreadable": [], "cut_short": [],
+        "episodes": 201, "equal": 201, "differing": [], "unreadable": [], "not_simulated": [],
+        "cut_short": [],
     });
     assert_eq!(summary(&as_json), expected);
 }
 
-/// Writes the content of `log` to a new file with valid checksums.
+/// Writes the content of `log` to a new file with valid checksums, without scenes if the task is not built-in.
 fn rewrite(log: &EpisodeLog, metadata: &EpisodeMetadata, path: &Path) {
+    let has_scenes = metadata.layout.as_built_in().is_some();
     let mut world = world_of(&log.metadata).expect("described");
     let mut recorder = EpisodeRecorder::create(path, metadata).expect("created");
     for (step, transition) in (0..).zip(&log.transitions) {
@@ -212,11 +215,13 @@ fn rewrite(log: &EpisodeLog, metadata: &EpisodeMetadata, path: &Path) {
             contacts: transition.contacts,
             advice: &transition.advice,
         };
-        recorder.record_step(&world.scene(), &record).expect("recorded");
+        let scene = has_scenes.then(|| world.scene());
+        recorder.record_step(scene.as_ref(), &record).expect("recorded");
         world.step(&transition.action).expect("steps");
     }
     if let Some(last_observation) = &log.last_observation {
-        recorder.record_outcome(&world.scene(), last_observation).expect("recorded");
+        let scene = has_scenes.then(|| world.scene());
+        recorder.record_outcome(scene.as_ref(), last_observation).expect("recorded");
     }
     recorder.finish().expect("finished");
 }
@@ -288,6 +293,60 @@ fn an_altered_number_is_found_and_named() {
             "{line}"
         );
     }
+}
+
+#[test]
+fn a_log_of_a_described_task_is_printed_but_needs_its_environments_to_be_compared() {
+    let keep = tempfile::tempdir().expect("a directory");
+    let built_in = one_log(keep.path());
+    let log = read_episode(&built_in).expect("whole");
+    let description = TaskDescription {
+        name: "lab/pick".to_owned(),
+        ..Layout::new(Task::PickAndPlace, 2).description()
+    };
+    let layout = TaskSpec::new(description).expect("valid");
+    let described = keep.path().join("described.mcap");
+    rewrite(&log, &EpisodeMetadata { layout, ..log.metadata.clone() }, &described);
+
+    let printed = tandem(&["replay"], &[&described]);
+    assert!(printed.status.success() && printed.stderr.is_empty(), "{printed:?}");
+    let lines: Vec<String> = stdout(&printed).lines().map(str::to_owned).collect();
+    assert_eq!(lines[1], "task lab/pick, arms 2, tolerance 0.05");
+    assert!(lines[2].starts_with("step  0  reward -1.0  distance 0."), "{}", lines[2]);
+    let n_advised = lines.iter().filter(|line| line.contains("  advised arm ")).count();
+    assert_eq!(n_advised, log.transitions.iter().filter(|step| step.advised_arms != 0).count());
+    let [.., outcome, last] = lines.as_slice() else { panic!("{lines:?}") };
+    assert!(outcome.contains("success  distance ") || outcome.contains("failure  distance "));
+    assert!(last.starts_with("not compared: the episode is of task \"lab/pick\""), "{last}");
+
+    let verified = tandem(&["replay", "--verify"], &[&described]);
+    assert_eq!(verified.status.code(), Some(64));
+    let line = error_line(&verified);
+    assert!(line.contains("described.mcap: the episode is of task \"lab/pick\""), "{line}");
+    assert!(line.contains("--env or --env-command"), "{line}");
+    let both = tandem(&["replay", "--json"], &[&built_in, &described]);
+    assert_eq!(both.status.code(), Some(64));
+    let expected = json!({
+        "episodes": 2, "equal": 1, "differing": [], "unreadable": [],
+        "not_simulated": [described], "cut_short": [],
+    });
+    assert_eq!(summary(&both), expected);
+    fs::write(keep.path().join("garbage.mcap"), "garbage").expect("written");
+    let all = tandem(&["replay", "--verify"], &[keep.path()]);
+    assert_eq!(all.status.code(), Some(65), "the unreadable log is the worse problem");
+}
+
+#[test]
+fn an_episode_is_compared_in_the_environments_of_a_server() {
+    let keep = tempfile::tempdir().expect("a directory");
+    let log = one_log(keep.path());
+    let command = format!("'{}' env --task pick-and-place", env!("CARGO_BIN_EXE_tandem"));
+    let equal = tandem(&["replay", "--verify", "--env-command", &command], &[&log]);
+    assert_eq!(stdout(&equal), "1 of 1 episodes equal bit for bit\n", "{equal:?}");
+    assert!(equal.status.success());
+    let none = tandem(&["replay", "--verify", "--env-command", "exit 3"], &[&log]);
+    assert_eq!(none.status.code(), Some(64));
+    assert!(error_line(&none).contains("ended with exit code 3"));
 }
 
 #[test]

@@ -53,6 +53,8 @@ pub struct Scene {
     pub objects: Vec<Cuboid>,
     /// Goal positions of the objects, in arm order.
     pub goals: Vec<Point>,
+    /// Distance of an object from its goal up to which the goal counts as achieved, metres.
+    pub goal_tolerance_m: f32,
     /// The table.
     pub table: Cuboid,
 }

@@ -284,6 +284,18 @@ impl TaskSpec {
         self.distance(&achieved, &self.goal_of(arm).of(goal))
     }
 
+    /// Returns the distance of each arm from its goal in `observation`, then that from the part of the goal common to all
+    /// arms if there is one.
+    #[must_use]
+    pub fn goal_distances(&self, observation: &[f32], goal: &[f32]) -> Vec<f32> {
+        let of_arms = self.arms().map(|arm| self.goal_distance_of(arm, observation, goal));
+        let (achieved, desired) = (self.common_achieved_goal(), self.common_goal());
+        let has_common = !desired.is_empty();
+        let common =
+            has_common.then(|| self.distance(&achieved.of(observation), &desired.of(goal)));
+        of_arms.chain(common).collect()
+    }
+
     /// Returns true if `arm`'s part of the goal and the part common to all arms are achieved.
     ///
     /// `observation` has shape `[n_observation]`, `goal` shape `[n_goal]`.

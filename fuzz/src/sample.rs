@@ -98,7 +98,7 @@ fn metadata(layout: Layout) -> EpisodeMetadata {
         seed: 1,
         kind: EpisodeKind::Evaluation,
         parameter_version: 3,
-        layout,
+        layout: layout.into(),
         policy_digest: "5f3a".to_owned(),
         world: BTreeMap::from([("substeps".to_owned(), "20".to_owned())]),
     }
@@ -118,5 +118,12 @@ fn scene() -> Scene {
         hand: Vec::new(),
         end_effector: [0.0; 3],
     };
-    Scene { time_s: 0.0, arms: vec![arm], objects: vec![cube], goals: vec![[0.1; 3]], table: cube }
+    Scene {
+        time_s: 0.0,
+        arms: vec![arm],
+        objects: vec![cube],
+        goals: vec![[0.1; 3]],
+        goal_tolerance_m: 0.05,
+        table: cube,
+    }
 }

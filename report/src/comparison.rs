@@ -42,7 +42,7 @@ impl Comparison {
             match sections.iter_mut().find(|section| section.setup == group.setup) {
                 Some(section) => section.groups.push(group),
                 None => sections.push(Section {
-                    setup: group.setup,
+                    setup: group.setup.clone(),
                     groups: vec![group],
                     baselines: Vec::new(),
                 }),
@@ -65,11 +65,12 @@ impl Comparison {
 
 /// Adds a baseline to the section of its task and number of arms, or else to runs of its task with an unknown number.
 fn add_baseline(sections: &mut Vec<Section>, baseline: Baseline) {
-    let TestEvaluation { task, n_arms, .. } = baseline.test;
-    let setup = TaskSetup { task: Some(task), n_arms: Some(n_arms as u64) };
-    let unknown = TaskSetup { n_arms: None, ..setup };
-    let index = |setup| sections.iter().position(|section: &Section| section.setup == setup);
-    match index(setup).or_else(|| index(unknown)) {
+    let TestEvaluation { task, n_arms, .. } = &baseline.test;
+    let setup = TaskSetup { task: Some(task.clone()), n_arms: Some(*n_arms as u64) };
+    let unknown = TaskSetup { n_arms: None, ..setup.clone() };
+    let index =
+        |setup: &TaskSetup| sections.iter().position(|section: &Section| section.setup == *setup);
+    match index(&setup).or_else(|| index(&unknown)) {
         Some(idx) => sections[idx].baselines.push(baseline),
         None => {
             sections.push(Section { setup, groups: Vec::new(), baselines: vec![baseline] });
@@ -116,7 +117,7 @@ impl Section {
     }
 
     fn paper_cells(&self, row: Option<&PaperRow>) -> [String; 5] {
-        let Some((row, task)) = row.zip(self.setup.task) else {
+        let Some((row, task)) = row.zip(self.setup.built_in()) else {
             return std::array::from_fn(|_| NONE.to_owned());
         };
         paper_row(row, row.measures(task))
@@ -201,7 +202,12 @@ pub(crate) fn success_without_contact(run: &Run) -> Option<(f64, u64)> {
 }
 
 /// Returns the share of episodes with a contact, on test goals or else of the last evaluation.
+///
+/// A task that reports no contacts has no such share.
 fn collision_rate(run: &Run) -> Option<f64> {
+    if !run.reports_contacts() {
+        return None;
+    }
     let test = run.test.as_ref().map(|test| test.collision_rate);
     test.or_else(|| run.last().map(|row| row.collision_rate))
 }
@@ -293,7 +299,7 @@ mod tests {
 
     fn baseline(label: &str, task: Task) -> Baseline {
         let test = TestEvaluation {
-            task,
+            task: task.name().to_owned(),
             n_arms: 2,
             n_episodes: 240,
             success: 0.958,

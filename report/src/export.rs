@@ -43,7 +43,7 @@ fn run_cells(group: &SeedGroup, run: &Run) -> Vec<String> {
     let last = run.last();
     let test = run.test.as_ref();
     let mut cells = vec![
-        group.setup.task.map_or_else(String::new, |task| task.name().to_owned()),
+        group.setup.task.clone().unwrap_or_default(),
         count(group.setup.n_arms),
         group.label.clone(),
         group.strategy.clone().unwrap_or_default(),
@@ -61,18 +61,16 @@ fn run_cells(group: &SeedGroup, run: &Run) -> Vec<String> {
     cells.extend(reached.map(|row| count(row.map(|row| row.env_steps))));
     cells.extend(reached.map(|row| number(row.map(|row| row.wall_s / 60.0))));
     cells.push(count(last.map(|row| row.advice_spent)));
-    let of_last: [fn(&MetricsRow) -> f64; 4] = [
-        |row| row.success,
-        |row| row.success_low,
-        |row| row.success_high,
-        |row| row.collision_rate,
-    ];
+    let of_last: [fn(&MetricsRow) -> f64; 3] =
+        [|row| row.success, |row| row.success_low, |row| row.success_high];
     cells.extend(of_last.map(|value| number(last.map(value))));
+    let has_contacts = run.reports_contacts();
+    cells.push(number(last.filter(|_| has_contacts).map(|row| row.collision_rate)));
     cells.extend([
         number(test.map(|test| test.success)),
         number(test.map(|test| test.interval.0)),
         number(test.map(|test| test.interval.1)),
-        number(test.map(|test| test.collision_rate)),
+        number(test.filter(|_| has_contacts).map(|test| test.collision_rate)),
         number(test.and_then(|test| test.contacts.success_without_contact)),
         number(test.and_then(|test| test.contacts.arm_contact_rate)),
     ]);
@@ -111,7 +109,7 @@ fn section_json(section: &Section) -> Value {
         })
     });
     json!({
-        "task": section.setup.task.map(tandem_core::Task::name),
+        "task": section.setup.task,
         "arms": section.setup.n_arms,
         "groups": section.groups.iter().map(group_json).collect::<Vec<_>>(),
         "baselines": baselines.collect::<Vec<_>>(),
@@ -119,7 +117,7 @@ fn section_json(section: &Section) -> Value {
 }
 
 fn group_json(group: &SeedGroup) -> Value {
-    let paper = group.paper().zip(group.setup.task).map(|(row, task)| {
+    let paper = group.paper().zip(group.setup.built_in()).map(|(row, task)| {
         let measures = row.measures(task);
         json!({
             "row": row.name, "inspired_epoch": measures.inspired_epoch, "rise_epochs": measures.rising_epochs,
@@ -152,7 +150,8 @@ fn group_json(group: &SeedGroup) -> Value {
         }),
         "held_out_success_without_contact": share_json(group, success_without_contact),
         "collision_rate": share_json(group, |run| {
-            run.last().map(|row| (row.collision_rate, row.n_episodes))
+            let last = run.last().filter(|_| run.reports_contacts());
+            last.map(|row| (row.collision_rate, row.n_episodes))
         }),
     })
 }

@@ -14,10 +14,10 @@ pub const MILESTONES: [f64; 3] = [0.5, 0.9, 0.95];
 const FREE_SETTINGS: [&str; 3] = ["name", "seed", "checkpoint"];
 
 /// Task and number of arms. Runs with the same task setup share tables. Unknown values sort last.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq, Eq)]
 pub struct TaskSetup {
-    /// The task.
-    pub task: Option<Task>,
+    /// Name of the task.
+    pub task: Option<String>,
     /// Number of arms of the policy.
     pub n_arms: Option<u64>,
 }
@@ -31,7 +31,7 @@ impl TaskSetup {
     /// Returns a heading such as "push, 2 arms".
     #[must_use]
     pub fn title(&self) -> String {
-        let task = self.task.map_or("unknown task", Task::name);
+        let task = self.task.as_deref().unwrap_or("unknown task");
         match self.n_arms {
             Some(1) => format!("{task}, 1 arm"),
             Some(n_arms) => format!("{task}, {n_arms} arms"),
@@ -39,17 +39,36 @@ impl TaskSetup {
         }
     }
 
-    /// Returns a part of a file name, such as "push-2".
-    pub(crate) fn slug(&self) -> String {
-        let task = self.task.map_or("unknown", Task::name);
-        self.n_arms.map_or_else(|| task.to_owned(), |n_arms| format!("{task}-{n_arms}"))
+    /// Returns the built-in task, which is a task of the paper.
+    #[must_use]
+    pub fn built_in(&self) -> Option<Task> {
+        self.task.as_ref()?.parse().ok()
     }
 
-    /// Returns the key by which task setups are sorted: by task, two arms before one.
-    pub(crate) fn sort_key(&self) -> (bool, Option<Task>, bool, std::cmp::Reverse<Option<u64>>) {
-        (self.task.is_none(), self.task, self.n_arms.is_none(), std::cmp::Reverse(self.n_arms))
+    /// Returns a part of a file name, such as "push-2". No name of a task contains `~`, which replaces `/`.
+    pub(crate) fn slug(&self) -> String {
+        let task = self.task.as_deref().unwrap_or("unknown").replace('/', "~");
+        match self.n_arms {
+            Some(n_arms) => format!("{task}-{n_arms}"),
+            None => task,
+        }
+    }
+
+    /// Returns the key by which task setups are sorted: the tasks of the paper in its order, then other tasks by name;
+    /// two arms before one.
+    pub(crate) fn sort_key(&self) -> SortKey {
+        let rank = match (&self.task, self.built_in()) {
+            (_, Some(task)) => Task::ALL.iter().position(|other| *other == task),
+            (Some(_), None) => Some(Task::ALL.len()),
+            (None, None) => None,
+        };
+        let name = self.task.clone();
+        (rank.is_none(), rank, name, self.n_arms.is_none(), std::cmp::Reverse(self.n_arms))
     }
 }
+
+/// The key by which task setups are sorted.
+type SortKey = (bool, Option<usize>, Option<String>, bool, std::cmp::Reverse<Option<u64>>);
 
 /// Runs that differ only in their seed.
 #[derive(Debug, Clone, PartialEq)]
@@ -148,11 +167,13 @@ impl SeedGroup {
         self.strategy.as_deref() == Some("none")
     }
 
-    /// Returns the row of the paper's Table 2 for these runs, if they have two arms and one of its strategies.
+    /// Returns the row of the paper's Table 2 for these runs, if they have two arms, one of its strategies and no task that
+    /// the paper lacks.
     #[must_use]
     pub fn paper(&self) -> Option<&'static PaperRow> {
         let is_student = self.setup.n_arms.is_none_or(|n_arms| n_arms == 2);
-        let strategy = self.strategy.as_ref().filter(|_| is_student)?;
+        let may_be_of_paper = self.setup.task.is_none() || self.setup.built_in().is_some();
+        let strategy = self.strategy.as_ref().filter(|_| is_student && may_be_of_paper)?;
         Some(PaperRow::of(strategy)?.1)
     }
 
@@ -235,8 +256,9 @@ impl Spread {
 /// Returns the label of a table row: the strategy if it identifies the run, else the run name minus the task of the
 /// heading.
 fn label(stem: &str, setup: &TaskSetup, strategy: Option<&str>) -> String {
-    let task = setup.task.map_or("", Task::name);
-    let rest = without_prefix(stem, task);
+    let task = setup.task.as_deref().unwrap_or_default();
+    // The directory of a run whose task's name contains `/` has the last part of it.
+    let rest = without_prefix(stem, task.rsplit('/').next().unwrap_or(task));
     let n_arms = setup.n_arms.map(|n| n.to_string()).unwrap_or_default();
     let shortest = without_prefix(rest, &n_arms);
     match strategy {

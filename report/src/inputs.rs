@@ -213,6 +213,7 @@ mod tests {
             n_shortened: 0,
             arms_gap_m: None,
             table_gap_m: 0.01,
+            tolerance_m: Some(0.05),
             starts: Vec::new(),
             goals: Vec::new(),
             ends: Vec::new(),

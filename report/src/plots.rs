@@ -65,7 +65,7 @@ fn section_plots(section: &Section) -> Result<Vec<Plot>, Error> {
     let mut plots = Vec::new();
     for panel in panels(&section.groups) {
         for (name, quantity, axis, paper) in VIEWS {
-            let reference = paper.zip(panel.letter).zip(section.setup.task);
+            let reference = paper.zip(panel.letter).zip(section.setup.built_in());
             let reference = reference.filter(|_| section.setup.n_arms != Some(1));
             let reference =
                 reference.map_or_else(String::new, |(([push, other], letter), task)| {
@@ -84,7 +84,7 @@ fn section_plots(section: &Section) -> Result<Vec<Plot>, Error> {
 fn from_scratch(comparison: &Comparison) -> Result<Vec<Plot>, Error> {
     let mut plots = Vec::new();
     for (task, letter) in Task::CLASSIC.into_iter().zip(['a', 'b']) {
-        let of_task = comparison.sections.iter().filter(|one| one.setup.task == Some(task));
+        let of_task = comparison.sections.iter().filter(|one| one.setup.built_in() == Some(task));
         let groups: Vec<SeedGroup> = of_task
             .flat_map(|section| &section.groups)
             .filter(|group| group.is_from_scratch())
@@ -201,7 +201,7 @@ fn with_their_strategies<'a>(
 ) -> Vec<&'a SeedGroup> {
     let is_origin = |group: &&&SeedGroup| {
         others.iter().any(|other| {
-            (&other.strategy, other.setup) == (&group.strategy, group.setup)
+            (&other.strategy, &other.setup) == (&group.strategy, &group.setup)
                 && !std::ptr::eq(**group, *other)
         })
     };

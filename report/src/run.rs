@@ -2,7 +2,8 @@
 
 use std::path::Path;
 
-use tandem_core::Task;
+use tandem_core::task::TaskDescription;
+use tandem_core::{Layout, Task, TaskSpec};
 use tandem_telemetry::MetricsRow;
 use toml::{Table, Value};
 
@@ -35,9 +36,10 @@ impl Run {
         let configuration = read_if_present(&dir.join("run.toml"))?;
         let summary = dir.join("summary.json");
         let test = match summary.exists() {
-            true => TestEvaluation::load(&summary)
+            true => TestEvaluation::load_summary(&summary)
                 .map_err(|error| warnings.push(error.to_string()))
-                .ok(),
+                .ok()
+                .flatten(),
             false => None,
         };
         Ok(Self { name: directory_name(dir), rows, configuration, test })
@@ -76,14 +78,34 @@ impl Run {
         self.configuration.as_ref().and_then(|text| text.parse().ok()).unwrap_or_default()
     }
 
-    /// Returns the task, from the configuration or else from the name.
+    /// Returns the name of the task, from the configuration or, for a built-in task, else from the run's name.
     #[must_use]
-    pub fn task(&self) -> Option<Task> {
+    pub fn task(&self) -> Option<String> {
+        let in_name = |task: &Task| self.name.contains(task.name());
         match self.settings().get("task").and_then(Value::as_str) {
-            Some(name) => name.parse().ok(),
+            Some(name) => Some(name.to_owned()),
             // Last first: `push` is contained in `shared-push`.
-            None => Task::ALL.into_iter().rev().find(|task| self.name.contains(task.name())),
+            None => Task::ALL.into_iter().rev().find(in_name).map(|task| task.name().to_owned()),
         }
+    }
+
+    /// Returns the task, from the configuration; `None` if there is none or its task is invalid.
+    #[must_use]
+    pub fn task_spec(&self) -> Option<TaskSpec> {
+        let settings = self.settings();
+        if let Some(description) = settings.get("description") {
+            let description: TaskDescription = description.clone().try_into().ok()?;
+            return TaskSpec::new(description).ok();
+        }
+        let task = settings.get("task")?.as_str()?.parse().ok()?;
+        let n_arms = usize::try_from(settings.get("arms")?.as_integer()?).ok()?;
+        TaskSpec::new(Layout::new(task, n_arms).description()).ok()
+    }
+
+    /// Returns whether the task reports contacts; true if the task is unknown.
+    #[must_use]
+    pub fn reports_contacts(&self) -> bool {
+        self.task_spec().is_none_or(|task| task.reports_contacts())
     }
 
     /// Returns the seed, from the configuration or else from the name's suffix `-seedN`.
@@ -131,12 +153,12 @@ mod tests {
         let named = run("teacher-pick-and-place-seed12", None);
         assert_eq!(
             (named.task(), named.seed(), named.stem()),
-            (Some(Task::PickAndPlace), Some(12), "teacher-pick-and-place")
+            (Some("pick-and-place".to_owned()), Some(12), "teacher-pick-and-place")
         );
         let configured = run("mine", Some("task = \"push\"\nseed = 7"));
         assert_eq!(
             (configured.task(), configured.seed(), configured.stem()),
-            (Some(Task::Push), Some(7), "mine")
+            (Some("push".to_owned()), Some(7), "mine")
         );
         assert_eq!(run("odd-seedling", None).stem(), "odd-seedling");
     }

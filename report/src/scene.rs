@@ -4,7 +4,6 @@ mod camera;
 mod color;
 mod paint;
 
-use tandem_core::layout::GOAL_TOLERANCE_M;
 use tandem_core::scene::{ArmScene, Capsule, Point, Scene};
 
 use camera::{Camera, Vec3};
@@ -78,7 +77,7 @@ pub fn scene_svg(scene: &Scene, view: &View) -> String {
         painter.cuboid(object, *color);
     }
     for (goal, color) in scene.goals.iter().zip(ARM_COLORS.iter().cycle()) {
-        painter.goal(goal.map(f64::from), f64::from(GOAL_TOLERANCE_M), *color);
+        painter.goal(goal.map(f64::from), f64::from(scene.goal_tolerance_m), *color);
     }
     painter.finish(view)
 }

@@ -3,7 +3,6 @@
 use std::path::Path;
 
 use serde_json::Value;
-use tandem_core::Task;
 use tandem_telemetry::ContactMetrics;
 
 use crate::error::Error;
@@ -12,8 +11,8 @@ use crate::files::{read_error, read_text};
 /// The evaluation of a policy on test goals, which no run uses to select its best policy.
 #[derive(Debug, Clone, PartialEq)]
 pub struct TestEvaluation {
-    /// Task of the policy.
-    pub task: Task,
+    /// Name of the policy's task.
+    pub task: String,
     /// Number of arms.
     pub n_arms: usize,
     /// Number of episodes, one per goal.
@@ -41,18 +40,34 @@ impl TestEvaluation {
             .map_err(|problem| Error::InvalidEvaluation { path: path.to_owned(), problem })
     }
 
+    /// Reads the summary of a run. Returns `None` for a run without test goals, whose summary has no success.
+    ///
+    /// # Errors
+    /// If the file cannot be read, or its last line is not a summary.
+    pub fn load_summary(path: &Path) -> Result<Option<Self>, Error> {
+        let text = read_text(path).map_err(read_error(path))?;
+        let problem = |problem| Error::InvalidEvaluation { path: path.to_owned(), problem };
+        let object = last_object(&text).map_err(problem)?;
+        let is_summary = object.get("digest").is_some();
+        if is_summary && object.get("success").is_none() {
+            return Ok(None);
+        }
+        Self::of(&object).map(Some).map_err(problem)
+    }
+
     /// Parses the JSON object on the last line of `text`. The error names the field.
     fn parse(text: &str) -> Result<Self, String> {
-        let line = text.lines().rfind(|line| !line.trim().is_empty()).unwrap_or_default();
-        let object: Value = serde_json::from_str(line)
-            .map_err(|error| format!("the last line is not a JSON object ({error})"))?;
+        Self::of(&last_object(text)?)
+    }
+
+    fn of(object: &Value) -> Result<Self, String> {
         let number =
             |key: &str| object[key].as_f64().ok_or_else(|| format!("{key:?} is not a number"));
         let count =
             |key: &str| object[key].as_u64().ok_or_else(|| format!("{key:?} is not a count"));
-        let task = object["task"].as_str().unwrap_or_default();
+        let task = object["task"].as_str().ok_or("\"task\" is not a name")?;
         Ok(Self {
-            task: task.parse::<Task>().map_err(|error| error.to_string())?,
+            task: task.to_owned(),
             n_arms: usize::try_from(count("arms")?).map_err(|error| error.to_string())?,
             n_episodes: count("episodes")?,
             success: number("success")?,
@@ -63,6 +78,13 @@ impl TestEvaluation {
                 .map_err(|error| format!("a measure of contacts is not a number ({error})"))?,
         })
     }
+}
+
+/// Parses the JSON object on the last line of `text`.
+fn last_object(text: &str) -> Result<Value, String> {
+    let line = text.lines().rfind(|line| !line.trim().is_empty()).unwrap_or_default();
+    serde_json::from_str(line)
+        .map_err(|error| format!("the last line is not a JSON object ({error})"))
 }
 
 #[cfg(test)]
@@ -76,7 +98,7 @@ mod tests {
     fn the_last_line_is_read() {
         let test =
             TestEvaluation::parse(&format!("chatter\n{}\n", LINE.replace('\n', ""))).unwrap();
-        assert_eq!((test.task, test.n_arms, test.n_episodes), (Task::Push, 2, 240));
+        assert_eq!((test.task.as_str(), test.n_arms, test.n_episodes), ("push", 2, 240));
         assert_eq!((test.success, test.interval), (0.958, (0.925, 0.977)));
         assert_eq!((test.success_joint, test.collision_rate), (0.9, 0.175));
         assert_eq!(test.contacts, ContactMetrics::default(), "of an earlier version");
@@ -104,6 +126,22 @@ mod tests {
         check("", "JSON");
         check("{}", "task");
         check(&LINE.replace("success_low", "low").replace('\n', ""), "success_low");
+    }
+
+    #[test]
+    fn a_summary_without_test_goals_has_no_evaluation() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("summary.json");
+        let load = |text: &str| {
+            std::fs::write(&path, text).unwrap();
+            TestEvaluation::load_summary(&path)
+        };
+        let served = r#"{"task":"lab/reach","arms":2,"env_steps":2400,"digest":"5f3a"}"#;
+        assert_eq!(load(served).unwrap(), None);
+        assert!(load(r#"{"task":"lab/reach","arms":2}"#).is_err(), "not a summary");
+        assert!(load(r#"{"task":"push","success":"high","digest":"5f3a"}"#).is_err());
+        let tested = load(&LINE.replace('\n', "")).unwrap();
+        assert_eq!(tested.map(|test| test.task), Some("push".to_owned()));
     }
 
     #[test]

@@ -4,8 +4,8 @@
 use std::path::Path;
 
 use tandem_report::{
-    Axis, Comparison, CurveOptions, CurvePoint, PlottedTrials, Quantity, ReportInputs, Series,
-    Trials, View, curve_svg, report_html, run_report_html, scene_svg,
+    Axis, Baseline, Comparison, CurveOptions, CurvePoint, PlottedTrials, Quantity, ReportInputs,
+    Series, TestEvaluation, Trials, View, curve_svg, report_html, run_report_html, scene_svg,
 };
 use tandem_telemetry::{MetricsLog, MetricsRow};
 
@@ -183,4 +183,97 @@ fn the_page_of_a_sweep_has_tables_curves_and_the_papers_values() {
     for reference in ["<script", "<link", "src=", "@import", "url(http"] {
         assert!(!page.contains(reference), "{reference}");
     }
+}
+
+/// The settings of a run of a task that is not built-in, with one point per arm and episodes of 100 steps.
+const DESCRIBED: &str = r#"task = "lab/reach"
+arms = 2
+seed = 1
+[advice]
+strategy = "ea"
+[description]
+name = "lab/reach"
+n_observation = 4
+n_goal = 4
+n_action = 4
+achieved_goal = [0, 1, 2, 3]
+episode_steps = 100
+tolerance = 0.02
+norm = "maximum"
+observation_bound = [1.0, 1.0, 1.0, 1.0]
+goal_bound = [1.0, 1.0, 1.0, 1.0]
+[[description.arms]]
+observation = [0, 1]
+goal = [0, 1]
+action = [0, 1]
+[[description.arms]]
+observation = [2, 3]
+goal = [2, 3]
+action = [2, 3]
+"#;
+
+#[test]
+fn a_described_task_has_its_own_section_beside_a_built_in_one() {
+    let dir = tempfile::tempdir().unwrap();
+    seed_of(dir.path(), "ea", 1, &[row(0, 0), row(5, 120)]);
+    let described = dir.path().join("reach-2-ea-seed1");
+    std::fs::create_dir(&described).unwrap();
+    std::fs::write(described.join("run.toml"), DESCRIBED).unwrap();
+    let mut log = MetricsLog::open(&described.join("metrics.jsonl")).unwrap();
+    [row(0, 0), row(5, 216)].iter().for_each(|row| log.append(row).unwrap());
+
+    let inputs = ReportInputs::load(&[dir.path().to_owned()]).unwrap();
+    assert!(inputs.warnings.is_empty(), "{:?}", inputs.warnings);
+    let baseline = Baseline {
+        label: "composed".to_owned(),
+        test: TestEvaluation {
+            task: "lab/reach".to_owned(),
+            n_arms: 2,
+            n_episodes: 240,
+            success: 0.75,
+            interval: (0.69, 0.8),
+            success_joint: 0.7,
+            collision_rate: 0.0,
+        },
+    };
+    let comparison = Comparison::of(inputs.runs, vec![baseline]);
+    let titles: Vec<String> =
+        comparison.sections.iter().map(|section| section.setup.title()).collect();
+    assert_eq!(titles, ["push, 2 arms", "lab/reach, 2 arms"]);
+    let [push, reach] = comparison.sections.as_slice() else { panic!("two sections") };
+    assert!(push.groups[0].paper().is_some() && reach.groups[0].paper().is_none());
+    assert_eq!((reach.groups[0].label.as_str(), reach.baselines.len()), ("ea", 1));
+    let contacts = |text: &str, strategy: &str| {
+        let row = text.lines().rfind(|line| line.starts_with(strategy)).unwrap().to_owned();
+        row.split_whitespace().last().unwrap().to_owned()
+    };
+    assert_eq!(contacts(&push.tables()[2].text(), "ea"), "0.000");
+    assert_eq!(contacts(&reach.tables()[2].text(), "ea"), "–", "none are reported");
+
+    let page = dir.path().join("report.html");
+    let written =
+        report_html(&comparison, &Trials::default(), PlottedTrials::Failed, &page).unwrap();
+    assert_eq!(written.plots.len(), 10, "five for each task");
+    for svg in &written.plots {
+        assert_eq!(svg.parent(), Some(dir.path()), "the name of a task makes no directory");
+        let name = svg.file_name().unwrap().to_str().unwrap();
+        let text = std::fs::read_to_string(svg).unwrap();
+        assert_well_formed(&text);
+        assert_eq!(text.contains("the paper"), name.starts_with("push") && name.contains("epochs"));
+    }
+    let csv = tandem_report::export::csv(&comparison);
+    assert!(csv.lines().any(|line| line.starts_with("lab/reach,2,ea,ea,reach-2-ea-seed1,1,")));
+
+    let page = std::fs::read_to_string(run_report_html(&described).unwrap()).unwrap();
+    assert_eq!(page.matches("<svg").count(), 3, "no curve of contacts");
+    assert!(!page.contains("Episodes with contact") && !page.contains("with contact"));
+    let line =
+        "Task lab/reach: 2 arms, 100 control steps per episode, goals within 0.02 (maximum norm)";
+    assert!(page.contains(line), "{page}");
+    let push = dir.path().join("push-ea-seed1");
+    let page = std::fs::read_to_string(run_report_html(&push).unwrap()).unwrap();
+    assert_eq!(page.matches("<svg").count(), 4);
+    let line =
+        "Task push: 2 arms, 50 control steps per episode, goals within 0.05 m (Euclidean norm)";
+    assert!(page.contains(line), "{page}");
 }

@@ -36,6 +36,7 @@ fn row(trial: u64, cause: Option<&str>) -> TrialRow {
         n_shortened: 3,
         arms_gap_m: Some(0.0305),
         table_gap_m: 0.0061,
+        tolerance_m: Some(0.05),
         starts: vec![[-0.05, 0.15, 0.0], [0.05, -0.15, 0.0]],
         goals: vec![[-0.1, -0.05, 0.0], [0.1, 0.05, 0.0]],
         ends: vec![[-0.1, -0.06, 0.0], [0.1, 0.1, 0.0]],

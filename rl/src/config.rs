@@ -3,7 +3,7 @@
 //! A recipe gives each setting a value; a run file and `--set` override values. Unknown keys are refused.
 
 use serde::{Deserialize, Serialize};
-use tandem_core::layout::{EPISODE_STEPS, UnknownTask};
+use tandem_core::layout::UnknownTask;
 use tandem_core::settings::OutOfRange;
 use tandem_core::task::{InvalidTask, MAX_ARMS};
 use tandem_core::{Exploration, TaskDescription, TaskSpec, WorldSettings};
@@ -208,10 +208,13 @@ impl RunConfig {
         Ok(task)
     }
 
-    /// Returns the number of control steps per episode.
+    /// Returns the number of control steps per episode; 1 for a task that [`checked`](Self::checked) refuses.
     #[must_use]
     pub fn episode_steps(&self) -> usize {
-        self.description.as_ref().map_or(EPISODE_STEPS, |description| description.episode_steps)
+        match &self.description {
+            Some(description) => description.episode_steps,
+            None => self.layout().map_or(1, |task| task.episode_steps()),
+        }
     }
 
     /// Returns the number of episodes per round.

@@ -1,6 +1,7 @@
 //! Snapshots of the world for pictures and logs.
 
 use rapier3d::math::{Rotation, Vector};
+use tandem_core::layout::GOAL_TOLERANCE_M;
 use tandem_core::scene::{ArmScene, Capsule, Cuboid, Point, Scene};
 use tandem_core::{ArmIndex, Layout};
 
@@ -37,6 +38,7 @@ pub(crate) fn scene(
         arms: world.arms.iter().map(|arm| arm_scene(world, arm)).collect(),
         objects: layout.arms().map(object).collect(),
         goals: layout.arms().map(goal_in_world).collect(),
+        goal_tolerance_m: GOAL_TOLERANCE_M,
         table: cuboid(Vector::new(0.0, 0.0, -TABLE_HALF_M.z), Rotation::IDENTITY, TABLE_HALF_M),
     }
 }

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use clap::{Args, Subcommand};
 use tandem_core::evaluation::TEST_SEED;
 
-use super::{TaskName, WorldName};
+use super::{ClientArgs, EnvironmentArgs, SecretArgs, TaskName, WorldName};
 
 #[derive(Debug, Args)]
 #[command(group = clap::ArgGroup::new("who").required(true), after_help = "\
@@ -93,9 +93,11 @@ Examples:
   tandem replay runs/NAME/mcap/eval-000100-000.mcap     step by step
   tandem replay runs --verify                           all *.mcap files below
   tandem replay FILE.mcap --verify --json
+  tandem replay runs/NAME/mcap --verify --env-command 'python3 server.py'
 
-All numbers from the simulator are compared bit for bit with the log. The exit code is 65 if one
-differs or a log cannot be read.")]
+All numbers from the simulator are compared bit for bit with the log. An episode of a task that is
+not built-in is simulated again in the environments of --env or --env-command. The exit code is 65 if
+a number differs or a log cannot be read, and else 64 if a log needs environments that are not given.")]
 pub(crate) struct ReplayArgs {
     /// Recorded episodes, or directories to search for *.mcap files.
     #[arg(required = true, value_name = "FILE|DIR")]
@@ -106,6 +108,12 @@ pub(crate) struct ReplayArgs {
     /// Prints one JSON object on the last line of standard output.
     #[arg(long)]
     pub(crate) json: bool,
+    #[command(flatten)]
+    pub(crate) environment: EnvironmentArgs,
+    #[command(flatten)]
+    pub(crate) client_config: ClientArgs,
+    #[command(flatten)]
+    pub(crate) secret: SecretArgs,
 }
 
 #[derive(Debug, Args)]

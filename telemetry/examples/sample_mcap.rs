@@ -1,4 +1,5 @@
-//! Writes a synthetic episode to the MCAP file given on the command line, to test readers.
+//! Writes a synthetic episode to the MCAP file given on the command line, to test readers. Writes an episode of a task that
+//! is not built-in to the second file, if there is one.
 
 use std::path::PathBuf;
 
@@ -6,7 +7,10 @@ use std::path::PathBuf;
 mod synthetic;
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {
-    let path = std::env::args_os().nth(1).map(PathBuf::from).ok_or("usage: sample_mcap FILE")?;
-    synthetic::write_log(&path)?;
+    let mut paths = std::env::args_os().skip(1).map(PathBuf::from);
+    synthetic::write_log(&paths.next().ok_or("usage: sample_mcap FILE [DESCRIBED]")?)?;
+    if let Some(path) = paths.next() {
+        synthetic::write_described_log(&path, &synthetic::described(3))?;
+    }
     Ok(())
 }

@@ -6,7 +6,7 @@ use std::path::Path;
 use mcap::McapError;
 use mcap::read::ChannelAccumulator;
 use mcap::records::Record;
-use tandem_core::{ArmAdvice, Contacts, Layout};
+use tandem_core::{ArmAdvice, Contacts, TaskSpec};
 use tandem_system::regular_file;
 
 use crate::error::Error;
@@ -101,7 +101,7 @@ fn decode_episode(raw: RawLog) -> Result<EpisodeLog, String> {
     let metadata =
         raw.metadata.ok_or_else(|| format!("it has no metadata record {METADATA_NAME:?}"))?;
     let metadata = EpisodeMetadata::from_map(&metadata)?;
-    let layout = metadata.layout;
+    let layout = &metadata.layout;
     let transitions = raw.transitions.iter().enumerate();
     let transitions = transitions
         .map(|(step_idx, bytes)| {
@@ -115,7 +115,7 @@ fn decode_episode(raw: RawLog) -> Result<EpisodeLog, String> {
 }
 
 fn decode_transition(
-    layout: Layout,
+    layout: &TaskSpec,
     step_idx: usize,
     bytes: &[u8],
 ) -> Result<LoggedTransition, String> {
@@ -131,14 +131,14 @@ fn decode_transition(
         goal: with_length("goal", message.goal, layout.n_goal())?,
         action: with_length("action", message.action, layout.n_action())?,
         reward: message.reward,
-        rewards_per_arm: with_length("rewards_per_arm", message.rewards_per_arm, layout.n_arms)?,
+        rewards_per_arm: with_length("rewards_per_arm", message.rewards_per_arm, layout.n_arms())?,
         advised_arms,
         contacts: contacts.ok_or_else(|| format!("unknown contacts {:#b}", message.contacts))?,
         advice: message.advice.into_iter().map(ArmAdvice::from).collect(),
     })
 }
 
-fn decode_last_observation(layout: Layout, bytes: &[u8]) -> Result<Vec<f32>, String> {
+fn decode_last_observation(layout: &TaskSpec, bytes: &[u8]) -> Result<Vec<f32>, String> {
     let outcome: pb::Outcome = decode(bytes).map_err(|error| format!("outcome: {error}"))?;
     with_length("last observation", outcome.observation, layout.n_observation())
 }

@@ -3,18 +3,19 @@
 use std::path::{Path, PathBuf};
 
 use foxglove::messages::{FrameTransforms, JointStates, Log, SceneUpdate, log::Level};
-use tandem_core::layout::GOAL_TOLERANCE_M;
-use tandem_core::reward::{distance, sparse_reward};
+use tandem_core::reward::distance;
 use tandem_core::scene::Scene;
-use tandem_core::{ArmAdvice, Contacts, Layout};
+use tandem_core::{ArmAdvice, Contacts, TaskSpec};
 
 use crate::error::Error;
 use crate::log_file::{Channel, LogFile, check_length, log_line, nanoseconds, timestamp};
 use crate::messages::{EpisodeMetadata, METADATA_NAME, pb};
-use crate::scene::{frame_transforms, joint_states, scene_update};
+use crate::scene::{GoalMarkers, frame_transforms, joint_states, scene_update};
 
 /// Number of steps after which the log is flushed to disk.
 const FLUSH_EVERY_STEPS: u32 = 10;
+/// Time of a control step in the log of a task without a simulator, whose description has no duration, seconds.
+const NOMINAL_STEP_S: f64 = 0.1;
 
 /// Topics that [`crate::read_episode`] reads.
 pub(crate) const TRANSITION_TOPIC: &str = "/transition";
@@ -46,11 +47,16 @@ pub struct TransitionRecord<'a> {
 /// Writes one episode to one MCAP file.
 ///
 /// The file is named `NAME.mcap.part` until [`finish`](Self::finish) renames it, so a file without that suffix is
-/// always complete. Message times are simulated time since the start of the episode.
+/// always complete. Message times are simulated time since the start of the episode; without a scene, a control step
+/// takes a nominal 0.1 s.
+///
+/// The log of a task that is not built-in has no bodies to draw. Its scene has the achieved and the desired goals instead
+/// if these are points: parts of 2 or 3 numbers.
 pub struct EpisodeRecorder {
-    layout: Layout,
+    layout: TaskSpec,
     file: LogFile,
     channels: Channels,
+    markers: Option<GoalMarkers>,
     goal: Vec<f32>,
     stats: pb::Stats,
     time_ns: u64,
@@ -63,46 +69,60 @@ impl EpisodeRecorder {
     /// If the file cannot be written.
     pub fn create(path: &Path, metadata: &EpisodeMetadata) -> Result<Self, Error> {
         let mut file = LogFile::create(path)?;
-        let channels = Channels::start(&mut file, metadata).map_err(file.write_error())?;
+        let layout = metadata.layout.clone();
+        let markers = GoalMarkers::of(&layout).filter(|_| layout.as_built_in().is_none());
+        let has_scene = layout.as_built_in().is_some() || markers.is_some();
+        let channels = Channels::start(&mut file, metadata, has_scene);
+        let channels = channels.map_err(file.write_error())?;
         Ok(Self {
-            layout: metadata.layout,
+            layout,
             file,
             channels,
+            markers,
             goal: Vec::new(),
             stats: pb::Stats::default(),
             time_ns: 0,
         })
     }
 
-    /// Logs one control step and the scene before it.
+    /// Logs one control step and the scene before it, if there is one.
     ///
     /// # Errors
     /// If a vector does not fit the layout, or the file cannot be written.
-    pub fn record_step(
+    pub fn record_step<'a>(
         &mut self,
-        scene: &Scene,
+        scene: impl Into<Option<&'a Scene>>,
         transition: &TransitionRecord<'_>,
     ) -> Result<(), Error> {
         self.check_lengths(transition)?;
-        self.time_ns = nanoseconds(scene.time_s)?;
+        let scene = scene.into();
+        self.set_time(scene, transition.step)?;
         self.goal = transition.goal.to_vec();
         self.update_stats(scene, transition);
-        let caption = step_caption(&self.stats, transition);
-        self.write_step(scene, &caption, transition).map_err(self.file.write_error())
+        let caption = self.step_caption(transition);
+        let state = State { scene, observation: transition.observation, caption };
+        self.write_step(&state, transition).map_err(self.file.write_error())
     }
 
-    /// Logs the scene and the observation (shape `[n_observation]`) after the last step, and the outcome.
+    /// Logs the scene, if there is one, and the observation (shape `[n_observation]`) after the last step, and the
+    /// outcome.
     ///
     /// # Errors
     /// If the observation does not fit the layout, or the file cannot be written.
-    pub fn record_outcome(&mut self, scene: &Scene, observation: &[f32]) -> Result<(), Error> {
+    pub fn record_outcome<'a>(
+        &mut self,
+        scene: impl Into<Option<&'a Scene>>,
+        observation: &[f32],
+    ) -> Result<(), Error> {
         check_length("observation", observation.len(), self.layout.n_observation())?;
-        self.time_ns = nanoseconds(scene.time_s)?;
-        self.stats.goal_distance_m = goal_distances_m(scene);
+        let scene = scene.into();
+        self.set_time(scene, self.stats.step + 1)?;
+        self.set_distances(scene, observation);
         let outcome = self.outcome(observation);
         let result = if outcome.success { "success" } else { "failure" };
         let caption = format!("{result}\nreturn {:.0}", self.stats.episode_return);
-        self.write_outcome(scene, &caption, &outcome).map_err(self.file.write_error())
+        let state = State { scene, observation, caption };
+        self.write_outcome(&state, &outcome).map_err(self.file.write_error())
     }
 
     /// Adds a line to the log channel, at the time of the latest step.
@@ -127,29 +147,62 @@ impl EpisodeRecorder {
         check_length("observation", transition.observation.len(), self.layout.n_observation())?;
         check_length("goal", transition.goal.len(), self.layout.n_goal())?;
         check_length("action", transition.action.len(), self.layout.n_action())?;
-        check_length("rewards_per_arm", transition.rewards_per_arm.len(), self.layout.n_arms)?;
+        check_length("rewards_per_arm", transition.rewards_per_arm.len(), self.layout.n_arms())?;
         if !transition.advice.is_empty() {
-            check_length("advice", transition.advice.len(), self.layout.n_arms)?;
+            check_length("advice", transition.advice.len(), self.layout.n_arms())?;
         }
         Ok(())
     }
 
-    fn update_stats(&mut self, scene: &Scene, transition: &TransitionRecord<'_>) {
+    /// Sets the time of the following messages: that of the scene, or else of control step `step`.
+    fn set_time(&mut self, scene: Option<&Scene>, step: u32) -> Result<(), Error> {
+        let nominal_s = f64::from(step) * NOMINAL_STEP_S;
+        self.time_ns = nanoseconds(scene.map_or(nominal_s, |scene| scene.time_s))?;
+        Ok(())
+    }
+
+    fn update_stats(&mut self, scene: Option<&Scene>, transition: &TransitionRecord<'_>) {
         self.stats.step = transition.step;
         self.stats.episode_return += f64::from(transition.reward);
-        self.stats.goal_distance_m = goal_distances_m(scene);
+        self.set_distances(scene, transition.observation);
         self.stats.advised_steps += u32::from(transition.advised_arms != 0);
         self.stats.contact_steps += u32::from(transition.contacts.any());
     }
 
+    /// Sets the distances from the goals; there is no goal before the first step.
+    fn set_distances(&mut self, scene: Option<&Scene>, observation: &[f32]) {
+        if self.goal.is_empty() {
+            return;
+        }
+        self.stats.goal_distance = self.layout.goal_distances(observation, &self.goal);
+        self.stats.goal_distance_m = scene.map(goal_distances_m).unwrap_or_default();
+    }
+
+    /// Returns for each arm whether its goal is achieved; there is no goal before the first step.
+    fn success_per_arm(&self, observation: &[f32]) -> Vec<bool> {
+        let at_goal =
+            |arm| !self.goal.is_empty() && self.layout.arm_succeeds(arm, observation, &self.goal);
+        self.layout.arms().map(at_goal).collect()
+    }
+
+    fn step_caption(&self, step: &TransitionRecord<'_>) -> String {
+        let at_goal = self.success_per_arm(step.observation);
+        let n_reached = at_goal.iter().filter(|reached| **reached).count();
+        let mut caption = format!(
+            "step {}   reward {:.0}\nat goal {n_reached} of {}\nadvised steps {}",
+            self.stats.step,
+            step.reward,
+            at_goal.len(),
+            self.stats.advised_steps,
+        );
+        if self.layout.reports_contacts() {
+            caption.push_str(&format!("   contact steps {}", self.stats.contact_steps));
+        }
+        caption
+    }
+
     fn outcome(&self, observation: &[f32]) -> pb::Outcome {
-        let at_goal = |arm| match self.goal.get(self.layout.goal_of(arm)) {
-            Some(goal) => {
-                sparse_reward(&observation[self.layout.achieved_goal_of(arm)], goal) > -0.5
-            }
-            None => false,
-        };
-        let success_per_arm: Vec<bool> = self.layout.arms().map(at_goal).collect();
+        let success_per_arm = self.success_per_arm(observation);
         pb::Outcome {
             observation: observation.to_vec(),
             success: success_per_arm.iter().all(|success| *success),
@@ -160,12 +213,12 @@ impl EpisodeRecorder {
 
     fn write_step(
         &mut self,
-        scene: &Scene,
-        caption: &str,
+        state: &State<'_>,
         step: &TransitionRecord<'_>,
     ) -> mcap::McapResult<()> {
-        self.write_scene(scene, caption)?;
-        self.channels.transition.write(&mut self.file, self.time_ns, &transition_message(step))?;
+        self.write_scene(state)?;
+        let message = transition_message(&self.layout, step);
+        self.channels.transition.write(&mut self.file, self.time_ns, &message)?;
         self.channels.stats.write(&mut self.file, self.time_ns, &self.stats)?;
         if (step.step + 1).is_multiple_of(FLUSH_EVERY_STEPS) {
             self.file.flush()?;
@@ -173,44 +226,75 @@ impl EpisodeRecorder {
         Ok(())
     }
 
-    fn write_outcome(
-        &mut self,
-        scene: &Scene,
-        caption: &str,
-        outcome: &pb::Outcome,
-    ) -> mcap::McapResult<()> {
-        self.write_scene(scene, caption)?;
+    fn write_outcome(&mut self, state: &State<'_>, outcome: &pb::Outcome) -> mcap::McapResult<()> {
+        self.write_scene(state)?;
         self.channels.outcome.write(&mut self.file, self.time_ns, outcome)?;
         self.file.flush()
     }
 
-    fn write_scene(&mut self, scene: &Scene, caption: &str) -> mcap::McapResult<()> {
+    fn write_scene(&mut self, state: &State<'_>) -> mcap::McapResult<()> {
         let (file, now) = (&mut self.file, self.time_ns);
         let stamp = timestamp(now);
-        self.channels.scene.write(file, now, &scene_update(scene, stamp, caption))?;
-        self.channels.tf.write(file, now, &frame_transforms(scene, stamp))?;
-        self.channels.joint_states.write(file, now, &joint_states(scene, stamp))
+        let update = match (state.scene, &self.markers) {
+            (Some(scene), _) => Some(scene_update(scene, stamp, &state.caption)),
+            (None, Some(markers)) => {
+                Some(markers.scene_update(state.observation, &self.goal, stamp, &state.caption))
+            }
+            (None, None) => None,
+        };
+        if let Some((update, channel)) = update.zip(self.channels.scene.as_mut()) {
+            channel.write(file, now, &update)?;
+        }
+        if let Some((scene, bodies)) = state.scene.zip(self.channels.bodies.as_mut()) {
+            bodies.tf.write(file, now, &frame_transforms(scene, stamp))?;
+            bodies.joint_states.write(file, now, &joint_states(scene, stamp))?;
+        }
+        Ok(())
     }
 }
 
+/// The world at one time.
+struct State<'a> {
+    scene: Option<&'a Scene>,
+    /// Shape `[n_observation]`.
+    observation: &'a [f32],
+    caption: String,
+}
+
 struct Channels {
-    scene: Channel<SceneUpdate>,
-    tf: Channel<FrameTransforms>,
-    joint_states: Channel<JointStates>,
+    scene: Option<Channel<SceneUpdate>>,
+    bodies: Option<BodyChannels>,
     log: Channel<Log>,
     transition: Channel<pb::Transition>,
     stats: Channel<pb::Stats>,
     outcome: Channel<pb::Outcome>,
 }
 
+/// Channels of tasks that the simulator has.
+struct BodyChannels {
+    tf: Channel<FrameTransforms>,
+    joint_states: Channel<JointStates>,
+}
+
 impl Channels {
     /// Writes metadata and channels to the start of `file` and flushes it.
-    fn start(file: &mut LogFile, metadata: &EpisodeMetadata) -> mcap::McapResult<Self> {
+    fn start(
+        file: &mut LogFile,
+        metadata: &EpisodeMetadata,
+        has_scene: bool,
+    ) -> mcap::McapResult<Self> {
         file.write_metadata(METADATA_NAME, metadata.to_map())?;
+        let scene = if has_scene { Some(Channel::open(file, "/scene")?) } else { None };
+        let bodies = match metadata.layout.as_built_in() {
+            Some(_) => Some(BodyChannels {
+                tf: Channel::open(file, "/tf")?,
+                joint_states: Channel::open(file, "/joint_states")?,
+            }),
+            None => None,
+        };
         let channels = Self {
-            scene: Channel::open(file, "/scene")?,
-            tf: Channel::open(file, "/tf")?,
-            joint_states: Channel::open(file, "/joint_states")?,
+            scene,
+            bodies,
             log: Channel::open(file, "/log")?,
             transition: Channel::open(file, TRANSITION_TOPIC)?,
             stats: Channel::open(file, "/stats")?,
@@ -221,7 +305,7 @@ impl Channels {
     }
 }
 
-fn transition_message(step: &TransitionRecord<'_>) -> pb::Transition {
+fn transition_message(task: &TaskSpec, step: &TransitionRecord<'_>) -> pb::Transition {
     pb::Transition {
         step: step.step,
         observation: step.observation.to_vec(),
@@ -232,22 +316,11 @@ fn transition_message(step: &TransitionRecord<'_>) -> pb::Transition {
         advised_arms: u32::from(step.advised_arms),
         contacts: u32::from(step.contacts.bits()),
         advice: step.advice.iter().map(pb::ArmAdvice::from).collect(),
+        achieved_goal: task.achieved_goal(step.observation).collect(),
     }
 }
 
-fn step_caption(stats: &pb::Stats, step: &TransitionRecord<'_>) -> String {
-    let n_reached =
-        stats.goal_distance_m.iter().filter(|distance_m| **distance_m <= GOAL_TOLERANCE_M).count();
-    format!(
-        "step {}   reward {:.0}\nat goal {n_reached} of {}\nadvised steps {}   contact steps {}",
-        stats.step,
-        step.reward,
-        stats.goal_distance_m.len(),
-        stats.advised_steps,
-        stats.contact_steps,
-    )
-}
-
+/// Returns the distance of each object from its goal, metres.
 fn goal_distances_m(scene: &Scene) -> Vec<f32> {
     scene
         .objects

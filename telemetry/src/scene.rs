@@ -5,11 +5,12 @@ use foxglove::messages::{
     JointStates, Pose, Quaternion, SceneEntity, SceneUpdate, SpherePrimitive, TextPrimitive,
     Timestamp, Vector3,
 };
-use tandem_core::layout::GOAL_TOLERANCE_M;
 use tandem_core::scene::{ArmScene, Capsule, Cuboid, Point, Scene};
 
+pub(crate) use goals::GoalMarkers;
 pub(crate) use trail::Trails;
 
+mod goals;
 mod trail;
 
 /// Frame of all positions.
@@ -23,12 +24,7 @@ const ARM_COLORS: [Color; 3] =
 
 /// Returns `scene` and a caption. Each message is complete, so that a viewer can jump to any time.
 pub(crate) fn scene_update(scene: &Scene, stamp: Timestamp, caption: &str) -> SceneUpdate {
-    let entity = |id: String| SceneEntity {
-        timestamp: Some(stamp),
-        frame_id: WORLD.to_owned(),
-        id,
-        ..Default::default()
-    };
+    let entity = |id: String| world_entity(id, stamp);
     let table =
         SceneEntity { cubes: vec![cube(&scene.table, TABLE_COLOR)], ..entity("table".to_owned()) };
     let caption = SceneEntity {
@@ -45,7 +41,7 @@ pub(crate) fn scene_update(scene: &Scene, stamp: Timestamp, caption: &str) -> Sc
         ..entity(format!("object{i}"))
     });
     let goals = scene.goals.iter().enumerate().map(|(i, goal)| SceneEntity {
-        spheres: vec![sphere(*goal, GOAL_TOLERANCE_M, Color { a: 0.35, ..color_of(i) })],
+        spheres: vec![sphere(*goal, scene.goal_tolerance_m, Color { a: 0.35, ..color_of(i) })],
         ..entity(format!("goal{i}"))
     });
     SceneUpdate {
@@ -110,6 +106,11 @@ pub(crate) fn joint_states_of<A: AsRef<[f64]>>(
     JointStates { timestamp: Some(stamp), joints: joints.chain(grippers).collect() }
 }
 
+/// Returns an entity in the world frame without primitives.
+fn world_entity(id: String, stamp: Timestamp) -> SceneEntity {
+    SceneEntity { timestamp: Some(stamp), frame_id: WORLD.to_owned(), id, ..SceneEntity::default() }
+}
+
 /// Returns the links of an arm, the post below the first link, and spheres at the ends of links.
 fn arm_entity(arm: &ArmScene, color: Color, entity: SceneEntity) -> SceneEntity {
     let post = arm.links.first().map(|link| Capsule {
@@ -130,11 +131,12 @@ fn arm_entity(arm: &ArmScene, color: Color, entity: SceneEntity) -> SceneEntity 
 
 fn caption_above(table: &Cuboid, text: &str) -> TextPrimitive {
     let [x, y, z] = table.centre;
+    text_at(vector([x, y, z + table.half_extents_m[2] + 0.85]), text)
+}
+
+fn text_at(position: Vector3, text: &str) -> TextPrimitive {
     TextPrimitive {
-        pose: Some(Pose {
-            position: Some(vector([x, y, z + table.half_extents_m[2] + 0.85])),
-            orientation: Some(NO_ROTATION),
-        }),
+        pose: Some(pose_at(position)),
         billboard: true,
         font_size: 18.0,
         scale_invariant: true,
@@ -156,7 +158,7 @@ fn cube(cuboid: &Cuboid, color: Color) -> CubePrimitive {
 
 fn sphere(centre: Point, radius_m: f32, color: Color) -> SpherePrimitive {
     SpherePrimitive {
-        pose: Some(Pose { position: Some(vector(centre)), orientation: Some(NO_ROTATION) }),
+        pose: Some(pose_at(vector(centre))),
         size: Some(vector([2.0 * radius_m; 3])),
         color: Some(color),
     }
@@ -196,6 +198,10 @@ fn from_z_to(direction: [f64; 3]) -> Quaternion {
 fn toward_origin(base: Point) -> Quaternion {
     let half_yaw_rad = 0.5 * f64::from(-base[1]).atan2(f64::from(-base[0]));
     Quaternion { x: 0.0, y: 0.0, z: half_yaw_rad.sin(), w: half_yaw_rad.cos() }
+}
+
+const fn pose_at(position: Vector3) -> Pose {
+    Pose { position: Some(position), orientation: Some(NO_ROTATION) }
 }
 
 fn vector(point: [f32; 3]) -> Vector3 {

@@ -5,6 +5,7 @@ use std::io::{BufRead as _, BufReader, Write as _};
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
+use tandem_core::TaskSpec;
 
 use crate::error::Error;
 
@@ -45,6 +46,9 @@ pub struct TrialRow {
     pub arms_gap_m: Option<f64>,
     /// Smallest gap between an arm and the table, metres.
     pub table_gap_m: f64,
+    /// Distance from a goal up to which it counts as achieved, metres; files of earlier versions do not have it.
+    #[serde(default)]
+    pub tolerance_m: Option<f64>,
     /// Initial positions of the objects.
     pub starts: Vec<[f64; 3]>,
     /// Goals of the objects.
@@ -55,6 +59,16 @@ pub struct TrialRow {
     pub path: Vec<ToolPathPoint>,
     /// Path of the trial's log, relative to this file, if there is one.
     pub log: Option<String>,
+}
+
+impl TrialRow {
+    /// Returns the distance from a goal up to which it counts as achieved, metres: that of the row, or else that of its
+    /// task; `None` if this version does not have the task.
+    #[must_use]
+    pub fn goal_tolerance_m(&self) -> Option<f64> {
+        let of_task = || Some(TaskSpec::built_in(self.task.parse().ok()?, 1).tolerance().into());
+        self.tolerance_m.or_else(of_task)
+    }
 }
 
 /// Positions of the tools at one time (world frame, metres), in arm order.

@@ -1,10 +1,11 @@
 //! Logs of episodes: writing, reading and recovery.
 #![expect(clippy::unwrap_used, reason = "a test that cannot go on may end")]
 
+use std::collections::BTreeMap;
 use std::path::Path;
 
 use tandem_telemetry::{
-    EpisodeLog, EpisodeRecorder, Error, LoggedTransition, read_episode, recover,
+    EpisodeLog, EpisodeMetadata, EpisodeRecorder, Error, LoggedTransition, read_episode, recover,
 };
 
 #[path = "support/synthetic.rs"]
@@ -64,6 +65,42 @@ fn an_episode_is_read_back_bit_for_bit() {
         log.transitions.iter().map(words).collect::<Vec<_>>(),
         steps.iter().map(words).collect::<Vec<_>>()
     );
+}
+
+/// Returns the topics of a log with the number of their messages.
+fn topics(bytes: &[u8]) -> BTreeMap<String, usize> {
+    let mut topics = BTreeMap::new();
+    for message in mcap::MessageStream::new(bytes).unwrap() {
+        *topics.entry(message.unwrap().channel.topic.clone()).or_default() += 1;
+    }
+    topics
+}
+
+#[test]
+fn an_episode_of_a_described_task_is_read_back_with_its_description() {
+    let dir = tempfile::tempdir().unwrap();
+    let record = |n_goal_per_arm: usize| {
+        let task = synthetic::described(n_goal_per_arm);
+        let metadata = EpisodeMetadata { layout: task.clone(), ..synthetic::metadata() };
+        let path = dir.path().join(format!("{n_goal_per_arm}.mcap"));
+        let path = synthetic::write_described_log(&path, &task).unwrap();
+        let (log, steps) = (read_episode(&path).unwrap(), synthetic::transitions_of(&task));
+        let last = vec![0.5; task.n_observation()];
+        assert_eq!((&log.metadata, &log.last_observation), (&metadata, &Some(last)));
+        assert_eq!(
+            log.transitions.iter().map(bits).collect::<Vec<_>>(),
+            steps.iter().map(bits).collect::<Vec<_>>()
+        );
+        topics(&std::fs::read(path).unwrap())
+    };
+    let of_numbers = [("/outcome", 1), ("/stats", 12), ("/transition", 12)];
+    let of_points = [("/outcome", 1), ("/scene", 13), ("/stats", 12), ("/transition", 12)];
+    let expected = |topics: &[(&str, usize)]| -> BTreeMap<String, usize> {
+        topics.iter().map(|(topic, n)| ((*topic).to_owned(), *n)).collect()
+    };
+    assert_eq!(record(3), expected(&of_points));
+    assert_eq!(record(2), expected(&of_points));
+    assert_eq!(record(1), expected(&of_numbers), "a goal of one number is no point");
 }
 
 #[test]

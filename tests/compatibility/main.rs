@@ -86,7 +86,7 @@ fn an_episode_log_is_read() {
     for version in versions() {
         let log = read_episode(&version.join("episode.mcap")).expect("an episode");
         let layout = Layout::new(Task::Push, 2);
-        assert_eq!((log.metadata.layout, log.metadata.parameter_version), (layout, 6));
+        assert_eq!((&log.metadata.layout, log.metadata.parameter_version), (&layout.into(), 6));
         assert_eq!(log.metadata.world.get("substeps").map(String::as_str), Some("10"));
         assert_eq!(log.transitions.len(), 50);
         assert!(log.transitions.iter().all(|step| step.observation.len() == 56));

@@ -126,6 +126,7 @@ impl Series<'_> {
             n_shortened: report.n_shortened as u64,
             arms_gap_m: report.arms_gap_m.is_finite().then_some(report.arms_gap_m),
             table_gap_m: report.table_gap_m,
+            tolerance_m: Some(report.tolerance_m),
             starts: report.positions.iter().map(|object| object.start.to_array()).collect(),
             goals: report.positions.iter().map(|object| object.goal.to_array()).collect(),
             ends: report.positions.iter().map(|object| object.end.to_array()).collect(),

@@ -101,6 +101,8 @@ pub struct TrialReport {
     pub objects: Vec<ObjectResult>,
     /// The positions of the objects in the world frame, arm by arm.
     pub positions: Vec<ObjectPositions>,
+    /// The distance from a goal up to which it counts as achieved, metres.
+    pub tolerance_m: f64,
     /// The distances of the objects from their goals after the rehearsal, metres; `None` in a closed loop.
     pub rehearsed_m: Option<Vec<f64>>,
     /// The duration of the trial, seconds of simulated time.

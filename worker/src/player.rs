@@ -104,11 +104,7 @@ impl Player {
     fn record(&self, order: EpisodeOrder, episode: &Episode, log_dir: &Path) {
         let path = log_dir.join(log_name(episode));
         let digest = self.actor_digest.clone();
-        let Some(metadata) = metadata_of(order, episode, &self.terms, digest) else {
-            let task = episode.layout.name();
-            tracing::debug!(episode = episode.number, task, "episode of no simulator not recorded");
-            return;
-        };
+        let metadata = metadata_of(order, episode, &self.terms, digest);
         match record_episode(&metadata, episode, &path) {
             Ok(path) => EpisodeRecorded { episode: episode.number, path: &path }.emit(),
             Err(error) => {

@@ -1,17 +1,21 @@
 //! Logs of single episodes, and their replay.
 //!
-//! An episode is logged after it was played, by simulating its actions again. Every log thereby verifies that the
-//! simulator is deterministic, bit for bit.
+//! An episode of a built-in task is logged after it was played, by simulating its actions again. Every such log thereby
+//! verifies that the simulator is deterministic, bit for bit. An episode of another task is logged as it was played.
 
 use std::path::{Path, PathBuf};
 
+use tandem_core::reward::{REWARD_ACHIEVED, REWARD_PENDING};
 use tandem_core::rng::{Stream, episode_rng};
-use tandem_core::work::{EpisodeOrder, RunTerms};
-use tandem_core::{Episode, EpisodeKind, TaskSpec, WorldSettings};
+use tandem_core::scene::Scene;
+use tandem_core::work::{EpisodeOrder, EpisodeStart, RunTerms};
+use tandem_core::{Episode, EpisodeKind, Layout, TaskSpec, WorldSettings};
 use tandem_sim::{Env, SimError, WorldConfig};
-use tandem_telemetry::{
-    EpisodeLog, EpisodeMetadata, EpisodeRecorder, LoggedTransition, TransitionRecord,
-};
+use tandem_telemetry::{EpisodeMetadata, EpisodeRecorder, TransitionRecord};
+
+pub use replay::{replay_log, replay_log_on};
+
+mod replay;
 
 /// A probability of earlier versions: training episodes that started with the hands anywhere above the table.
 const WIDE_START_SHARE: &str = "wide_start_share";
@@ -63,10 +67,20 @@ pub enum RecordError {
     /// The episode may have started in a way that only earlier versions simulate.
     #[error("the log has {WIDE_START_SHARE} = {0}: this version has no such starts")]
     RemovedStart(String),
+    /// The simulator does not have the task of the episode.
+    #[error(
+        "the episode is of task {task:?}, which only its environments can simulate again: name them by --env or --env-command"
+    )]
+    NoSimulator {
+        /// The task's name.
+        task: String,
+    },
+    /// The server of the environments failed.
+    #[error(transparent)]
+    Environment(Box<crate::error::Error>),
 }
 
-/// Returns the metadata of an episode that was played by `order`; `None` if the simulator does not have its task, so that
-/// the episode cannot be simulated again for its log.
+/// Returns the metadata of an episode that was played by `order`.
 ///
 /// `policy_digest` is the digest of the parameters that played it: [`tandem_policy::actor_digest`] in a run,
 /// [`Policy::digest`](tandem_policy::Policy::digest) where the whole policy is at hand.
@@ -76,24 +90,24 @@ pub fn metadata_of(
     episode: &Episode,
     terms: &RunTerms,
     policy_digest: String,
-) -> Option<EpisodeMetadata> {
-    Some(EpisodeMetadata {
+) -> EpisodeMetadata {
+    EpisodeMetadata {
         run: terms.run.clone(),
         episode: order.number,
         seed: order.seed,
         kind: episode.kind,
         parameter_version: episode.parameter_version,
-        layout: episode.layout.as_built_in()?,
+        layout: episode.layout.clone(),
         policy_digest,
         world: terms.world.log_entries().map(|(key, value)| (key.to_owned(), value)).into(),
-    })
+    }
 }
 
-/// Builds the world of a logged episode, in the episode's start state.
+/// Returns the start of a logged episode.
 ///
 /// # Errors
-/// When the metadata lack an entry or the world cannot be built.
-pub fn world_of(metadata: &EpisodeMetadata) -> Result<Env, RecordError> {
+/// When the metadata lack an entry, or only earlier versions have such starts.
+pub fn start_of(metadata: &EpisodeMetadata) -> Result<EpisodeStart, RecordError> {
     let entry = |key: &str| metadata.world.get(key).map(String::as_str);
     let settings = WorldSettings::from_log_entries(entry)
         .map_err(|key| RecordError::Metadata { key, got: entry(key).map(str::to_owned) })?;
@@ -101,9 +115,24 @@ pub fn world_of(metadata: &EpisodeMetadata) -> Result<Env, RecordError> {
     if let Some(share) = entry(WIDE_START_SHARE).filter(|share| is_training && *share != "0") {
         return Err(RecordError::RemovedStart(share.to_owned()));
     }
-    let mut world = Env::new(metadata.layout, &WorldConfig::from(settings))?;
-    let mut rng = episode_rng(metadata.seed, metadata.episode, Stream::Reset);
-    world.reset(&mut rng, settings.for_kind(metadata.kind));
+    let world = settings.for_kind(metadata.kind);
+    Ok(EpisodeStart { number: metadata.episode, seed: metadata.seed, kind: metadata.kind, world })
+}
+
+/// Builds the world of a logged episode of a built-in task, in the episode's start state.
+///
+/// # Errors
+/// When the task is not built-in, the metadata lack an entry or the world cannot be built.
+pub fn world_of(metadata: &EpisodeMetadata) -> Result<Env, RecordError> {
+    let no_simulator = || RecordError::NoSimulator { task: metadata.layout.name().to_owned() };
+    world_in(metadata.layout.as_built_in().ok_or_else(no_simulator)?, metadata)
+}
+
+fn world_in(layout: Layout, metadata: &EpisodeMetadata) -> Result<Env, RecordError> {
+    let start = start_of(metadata)?;
+    let mut world = Env::new(layout, &WorldConfig::from(start.world))?;
+    let mut rng = episode_rng(start.seed, start.number, Stream::Reset);
+    world.reset(&mut rng, start.world);
     Ok(world)
 }
 
@@ -120,42 +149,47 @@ pub fn log_name(episode: &Episode) -> String {
     }
 }
 
-/// Simulates `episode` again in the world that `metadata` describes, logs it at `path` and returns the finished file's
-/// path.
+/// Logs `episode` at `path` and returns the finished file's path. An episode of a built-in task is simulated again, in
+/// the world that `metadata` describes, for the scenes of its log.
 ///
 /// # Errors
-/// When the replay differs from `episode` or the log cannot be written. In that case no log remains.
+/// When the episode, simulated again, differs from `episode`, or the log cannot be written. In that case no log remains.
 pub fn record_episode(
     metadata: &EpisodeMetadata,
     episode: &Episode,
     path: &Path,
 ) -> Result<PathBuf, RecordError> {
-    let mut world = world_of(metadata)?;
+    let mut world = match metadata.layout.as_built_in() {
+        Some(layout) => Some(world_in(layout, metadata)?),
+        None => None,
+    };
     let mut recorder = EpisodeRecorder::create(path, metadata)?;
     for step_idx in 0..episode.n_steps() {
-        check_replay(&world, episode, step_idx)?;
-        record_step(&mut recorder, &world, episode, step_idx)?;
-        if world.step(episode.action(step_idx))? != episode.contacts[step_idx] {
-            return Err(RecordError::Diverged { episode: episode.number, step: step_idx + 1 });
+        let scene = world.as_ref().map(Env::scene);
+        record_step(&mut recorder, scene.as_ref(), episode, step_idx)?;
+        if let Some(world) = &mut world {
+            check_replay(world, episode, step_idx)?;
+            if world.step(episode.action(step_idx))? != episode.contacts[step_idx] {
+                return Err(RecordError::Diverged { episode: episode.number, step: step_idx + 1 });
+            }
         }
     }
-    check_replay(&world, episode, episode.n_steps())?;
-    recorder.record_outcome(&world.scene(), episode.last_observation())?;
+    if let Some(world) = &world {
+        check_replay(world, episode, episode.n_steps())?;
+    }
+    let scene = world.as_ref().map(Env::scene);
+    recorder.record_outcome(scene.as_ref(), episode.last_observation())?;
     Ok(recorder.finish()?)
 }
 
 fn record_step(
     recorder: &mut EpisodeRecorder,
-    world: &Env,
+    scene: Option<&Scene>,
     episode: &Episode,
     step_idx: usize,
 ) -> Result<(), RecordError> {
-    let layout = &episode.layout;
-    let arm_reward = |arm| {
-        let achieved = episode.achieved(step_idx + 1, arm);
-        layout.sparse_reward(&achieved, &layout.goal_of(arm).of(&episode.goal))
-    };
-    let rewards_per_arm: Vec<f32> = layout.arms().map(arm_reward).collect();
+    let after = episode.observation(step_idx + 1);
+    let rewards_per_arm = rewards_per_arm(&episode.layout, after, &episode.goal);
     let transition = TransitionRecord {
         step: u32::try_from(step_idx).expect("an episode's steps are few"),
         observation: episode.observation(step_idx),
@@ -167,7 +201,16 @@ fn record_step(
         contacts: episode.contacts[step_idx],
         advice: &[],
     };
-    Ok(recorder.record_step(&world.scene(), &transition)?)
+    Ok(recorder.record_step(scene, &transition)?)
+}
+
+/// Returns the reward of each arm for a step after which `observation` is observed, shape `[n_arms]`.
+fn rewards_per_arm(task: &TaskSpec, observation: &[f32], goal: &[f32]) -> Vec<f32> {
+    let reward = |arm| match task.arm_succeeds(arm, observation, goal) {
+        true => REWARD_ACHIEVED,
+        false => REWARD_PENDING,
+    };
+    task.arms().map(reward).collect()
 }
 
 /// Checks that the world's observation equals the episode's before step `step_idx`, bit for bit.
@@ -182,70 +225,6 @@ fn check_replay(world: &Env, episode: &Episode, step_idx: usize) -> Result<(), R
     } else {
         Err(RecordError::Diverged { episode: episode.number, step: step_idx })
     }
-}
-
-/// Simulates a log's actions again and compares observations, goals, contacts and rewards with the log, bit for bit. A
-/// truncated log is compared up to its end.
-///
-/// # Errors
-/// [`RecordError::Differs`] with the first value that differs. Other errors mean that the log's world cannot be built or
-/// simulated.
-pub fn replay_log(log: &EpisodeLog) -> Result<(), RecordError> {
-    if log.transitions.is_empty() {
-        return Err(RecordError::NoSteps);
-    }
-    let layout = TaskSpec::from(log.metadata.layout);
-    let mut world = world_of(&log.metadata)?;
-    let mut observation = vec![0.0; layout.n_observation()];
-    world.observe(&mut observation);
-    for (step_idx, logged) in log.transitions.iter().enumerate() {
-        compare(step_idx, "observation", &logged.observation, &observation)?;
-        compare(step_idx, "goal", &logged.goal, world.goal())?;
-        let contacts = world.step(&logged.action)?;
-        world.observe(&mut observation);
-        let [logged_contacts, contacts] = [logged.contacts, contacts].map(|c| [c.bits().into()]);
-        compare(step_idx, "contacts", &logged_contacts, &contacts)?;
-        compare_rewards(step_idx, logged, &layout, &observation)?;
-    }
-    let last_observation = log.last_observation.as_deref();
-    last_observation.map_or(Ok(()), |last_observation| {
-        compare(log.transitions.len(), "observation", last_observation, &observation)
-    })
-}
-
-/// Compares the rewards of the step before `observation`.
-fn compare_rewards(
-    step_idx: usize,
-    logged: &LoggedTransition,
-    layout: &TaskSpec,
-    observation: &[f32],
-) -> Result<(), RecordError> {
-    let achieved: Vec<f32> = layout.achieved_goal(observation).collect();
-    compare(
-        step_idx,
-        "reward",
-        &[logged.reward],
-        &[layout.sparse_reward(&achieved, &logged.goal)],
-    )?;
-    let arm_reward = |arm| {
-        let part = layout.goal_of(arm);
-        layout.sparse_reward(&part.of(&achieved), &part.of(&logged.goal))
-    };
-    let played: Vec<f32> = layout.arms().map(arm_reward).collect();
-    compare(step_idx, "rewards_per_arm", &logged.rewards_per_arm, &played)
-}
-
-fn compare(
-    step: usize,
-    field: &'static str,
-    logged: &[f32],
-    played: &[f32],
-) -> Result<(), RecordError> {
-    let pairs = logged.iter().zip(played).enumerate();
-    let mut different = pairs.filter(|(_, (logged, played))| logged.to_bits() != played.to_bits());
-    different.next().map_or(Ok(()), |(component, (logged, played))| {
-        Err(RecordError::Differs { step, field, component, logged: *logged, played: *played })
-    })
 }
 
 #[cfg(test)]
@@ -269,10 +248,8 @@ mod tests {
         let episode = play_slot(&mut world, &order, &terms, &mut actor, &mut NoAdvisor)
             .expect("no step fails")
             .remove(0);
-        {
-            let metadata = metadata_of(order.episodes[0], &episode, &terms, "5f3a".to_owned());
-            (metadata.expect("a built-in task"), episode)
-        }
+        let metadata = metadata_of(order.episodes[0], &episode, &terms, "5f3a".to_owned());
+        (metadata, episode)
     }
 
     #[test]

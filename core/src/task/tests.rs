@@ -84,6 +84,7 @@ fn interleaved_parts_are_found_by_their_indices() {
     assert!(task.arm_succeeds(ArmIndex(1), &observation, &goal));
     assert!(!task.is_success(&observation, &goal));
     assert!(task.is_success(&[0.75, -0.5, 0.0, 0.0], &goal));
+    assert_eq!(task.goal_distances(&[0.5, -0.5, 0.0, 0.0], &[0.25, 0.75]), [0.25, 0.75]);
 }
 
 #[test]
@@ -108,6 +109,7 @@ fn a_common_goal_counts_for_every_arm_and_has_no_one_arm_task() {
         assert!(task.arm_succeeds(arm, &[9.0, 9.0, 0.35], &[0.4]));
         assert!(!task.arm_succeeds(arm, &[0.4, 0.4, 0.2], &[0.4]));
     }
+    assert_eq!(task.goal_distances(&[9.0, 9.0, 0.25], &[0.5]), [0.0, 0.0, 0.25]);
     assert_eq!(task.single_arm(), None);
     assert!(!task.has_recombinable_arms());
 }

@@ -1,27 +1,35 @@
 //! The report of a single run.
 
+use tandem_core::TaskSpec;
+use tandem_core::task::Norm;
 use tandem_telemetry::MetricsRow;
 
 use crate::curve::{Axis, CurveOptions, Quantity, Series, curve_svg};
 use crate::error::Error;
 use crate::html::{escaped, svg_grid, table};
 use crate::run::Run;
-use crate::table::{duration, interval, number, optional, share, thousands};
+use crate::table::{NONE, duration, interval, number, optional, share, thousands};
+
+/// The tile of a task that reports contacts.
+const CONTACT_TILE: &str = "with contact";
 
 /// Returns key values, curves, evaluations and configuration of `run` as HTML.
 pub(super) fn body(run: &Run) -> Result<String, Error> {
-    let mut body = match (run.best(), run.last()) {
+    let task = run.task_spec();
+    let has_contacts = task.as_ref().is_none_or(TaskSpec::reports_contacts);
+    let mut body = task.as_ref().map(task_line).unwrap_or_default();
+    match (run.best(), run.last()) {
         (Some(best), Some(last)) => {
-            format!(
-                "{}{}",
-                tiles(best, last),
-                svg_grid(&curves(run)?.each_ref().map(String::as_str))
-            )
+            let curves = curves(run, task.as_ref(), has_contacts)?;
+            let curves: Vec<&str> = curves.iter().map(String::as_str).collect();
+            body.push_str(&tiles(best, last, has_contacts));
+            body.push_str(&svg_grid(&curves));
         }
-        _ => "<p>No evaluation yet.</p>".to_owned(),
-    };
+        _ => body.push_str("<p>No evaluation yet.</p>"),
+    }
     if !run.rows.is_empty() {
-        let rows: Vec<Vec<String>> = run.rows.iter().map(evaluation_cells).collect();
+        let cells = |row| evaluation_cells(row, has_contacts);
+        let rows: Vec<Vec<String>> = run.rows.iter().map(cells).collect();
         body.push_str(&format!("<h2>Evaluations</h2>{}", table(&EVALUATION_HEADER, &rows)));
     }
     if let Some(text) = &run.configuration {
@@ -30,8 +38,25 @@ pub(super) fn body(run: &Run) -> Result<String, Error> {
     Ok(body)
 }
 
+/// Returns the task, its number of arms, the length of its episodes and its tolerance.
+fn task_line(task: &TaskSpec) -> String {
+    let arms =
+        if task.n_arms() == 1 { "1 arm".to_owned() } else { format!("{} arms", task.n_arms()) };
+    let unit = if task.as_built_in().is_some() { " m" } else { "" };
+    let norm = match task.norm() {
+        Norm::Euclidean => "Euclidean norm",
+        Norm::Maximum => "maximum norm",
+    };
+    format!(
+        "<p>Task {}: {arms}, {} control steps per episode, goals within {}{unit} ({norm}) count as achieved.</p>",
+        escaped(task.name()),
+        thousands(task.episode_steps() as u64),
+        task.tolerance()
+    )
+}
+
 /// Returns the key values of a run, one tile each.
-fn tiles(best: &MetricsRow, last: &MetricsRow) -> String {
+fn tiles(best: &MetricsRow, last: &MetricsRow, has_contacts: bool) -> String {
     let per_arm: Vec<String> = best.success_per_arm.iter().map(|success| share(*success)).collect();
     let without_contact = best.contacts.success().map(|[success, low, high]| {
         let arm_contact = optional(best.contacts.arm_contact_rate, share);
@@ -52,7 +77,7 @@ fn tiles(best: &MetricsRow, last: &MetricsRow) -> String {
         ),
         ("joint norm", share(best.success_joint), format!("each arm: {}", per_arm.join(" / "))),
         (
-            "with contact",
+            CONTACT_TILE,
             share(best.collision_rate),
             format!("before success: {}", share(best.collision_rate_before_success)),
         ),
@@ -79,37 +104,42 @@ fn tiles(best: &MetricsRow, last: &MetricsRow) -> String {
             escaped(note)
         )
     };
+    let shown = tiles.iter().filter(|(label, ..)| has_contacts || *label != CONTACT_TILE);
     format!(
         "<div class=tiles>{}</div>",
-        without_contact.iter().chain(&tiles).map(tile).collect::<String>()
+        without_contact.iter().chain(shown).map(tile).collect::<String>()
     )
 }
 
-/// Draws success, mean Q, contacts and advice against environment steps.
-fn curves(run: &Run) -> Result<[String; 4], Error> {
+/// Draws success, mean Q, contacts (if the task reports them) and advice against environment steps.
+fn curves(run: &Run, task: Option<&TaskSpec>, has_contacts: bool) -> Result<Vec<String>, Error> {
     const AXIS: Axis = Axis::EnvSteps;
     let series = |named: &[(&str, Quantity)]| -> Vec<Series> {
         named.iter().map(|(name, quantity)| Series::of(name, &run.rows, AXIS, *quantity)).collect()
     };
+    let is_built_in = task.is_none_or(|task| task.as_built_in().is_some());
+    let moved = if is_built_in { "object moved" } else { "achieved goal moved" };
     let success = series(&[
         ("success", Quantity::Success),
         ("joint norm", Quantity::SuccessJoint),
         ("training episodes", Quantity::TrainingSuccess),
-        ("object moved", Quantity::Moved),
+        (moved, Quantity::Moved),
     ]);
     let contacts = series(&[
         ("any", Quantity::CollisionRate),
         ("before success", Quantity::CollisionRateBeforeSuccess),
     ]);
-    Ok([
+    let mut curves = vec![
         curve_svg(&success, &CurveOptions::shares("Success", AXIS))?,
         curve_svg(&series(&[("", Quantity::MeanQ)]), &CurveOptions::values("Mean Q", AXIS))?,
-        curve_svg(&contacts, &CurveOptions::shares("Episodes with contact", AXIS))?,
-        curve_svg(
-            &series(&[("", Quantity::AdviceSpent)]),
-            &CurveOptions::values("Advice spent", AXIS),
-        )?,
-    ])
+    ];
+    if has_contacts {
+        let options = CurveOptions::shares("Episodes with contact", AXIS);
+        curves.push(curve_svg(&contacts, &options)?);
+    }
+    let advice = series(&[("", Quantity::AdviceSpent)]);
+    curves.push(curve_svg(&advice, &CurveOptions::values("Advice spent", AXIS))?);
+    Ok(curves)
 }
 
 const EVALUATION_HEADER: [&str; 13] = [
@@ -128,7 +158,7 @@ const EVALUATION_HEADER: [&str; 13] = [
     "advice spent",
 ];
 
-fn evaluation_cells(row: &MetricsRow) -> Vec<String> {
+fn evaluation_cells(row: &MetricsRow, has_contacts: bool) -> Vec<String> {
     vec![
         row.round.to_string(),
         thousands(row.env_steps),
@@ -139,7 +169,7 @@ fn evaluation_cells(row: &MetricsRow) -> Vec<String> {
         interval(row),
         optional(row.contacts.success_without_contact, share),
         share(row.success_joint),
-        share(row.collision_rate),
+        if has_contacts { share(row.collision_rate) } else { NONE.to_owned() },
         share(row.moved),
         number(row.mean_q),
         thousands(row.advice_spent),

@@ -9,8 +9,7 @@ use crate::table::{NONE, Table, optional};
 use crate::trials::{TrialGroup, Trials, millimetres, outcome};
 
 /// Explains the values of the tables.
-const NOTES: &str = "A trial succeeds if every object ends within 5 cm of its goal and nothing fails on the way. Intervals are \
-     Wilson's 95 % intervals; they apply to further trials of the same kind on the same arms. The median time is over all \
+const NOTES: &str = "Intervals are Wilson's 95 % intervals; they apply to further trials of the same kind on the same arms. The median time is over all \
      trials, including failures. The paper's trials were on two real arms with another driver and other objects; the paper \
      does not count failures by cause.";
 
@@ -34,7 +33,8 @@ pub(super) fn body(trials: &Trials, plots: &[Plot]) -> String {
     let mut body: String = trials.tables().iter().map(titled_table).collect();
     let warnings = trials.warnings.iter().map(|warning| format!("<p>{}</p>", escaped(warning)));
     body.extend(warnings);
-    body.push_str(&format!("<p>{}</p><p>{}</p>", escaped(NOTES), escaped(paper::SOURCE)));
+    let notes = format!("{} {NOTES}", success_note(trials));
+    body.push_str(&format!("<p>{}</p><p>{}</p>", escaped(&notes), escaped(paper::SOURCE)));
     if plots.is_empty() {
         body.push_str("<h2>Plots</h2><p>No trial failed.</p>");
     } else {
@@ -42,6 +42,30 @@ pub(super) fn body(trials: &Trials, plots: &[Plot]) -> String {
     }
     body.extend(trials.groups.iter().map(|group| titled_table(&all_trials(group))));
     body
+}
+
+/// Explains when a trial succeeds.
+fn success_note(trials: &Trials) -> String {
+    let rows = trials.groups.iter().flat_map(|group| &group.rows);
+    let mut tolerances_m: Vec<f64> = rows.filter_map(TrialRow::goal_tolerance_m).collect();
+    tolerances_m.sort_by(f64::total_cmp);
+    // Numbers that were single precision are equal in millimetres only.
+    let mut texts: Vec<String> =
+        tolerances_m.iter().map(|tolerance_m| centimetres(*tolerance_m)).collect();
+    texts.dedup();
+    let within = match texts.as_slice() {
+        [] => "the tolerance".to_owned(),
+        texts => format!("{} cm", texts.join(" or ")),
+    };
+    format!(
+        "A trial succeeds if every object ends within {within} of its goal and nothing fails on the way."
+    )
+}
+
+/// Formats a length in centimetres, to a tenth of a millimetre.
+fn centimetres(length_m: f64) -> String {
+    let text = format!("{:.2}", 100.0 * length_m);
+    text.trim_end_matches('0').trim_end_matches('.').to_owned()
 }
 
 fn all_trials(group: &TrialGroup) -> Table {

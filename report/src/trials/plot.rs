@@ -132,8 +132,9 @@ fn facts(row: &TrialRow) -> Vec<String> {
 /// Draws the trial in one view: goals and objects first, then measured paths, then planned paths.
 fn draw_trial(row: &TrialRow, view: &Projection) -> String {
     let mut svg = String::new();
+    let tolerance_m = row.goal_tolerance_m().unwrap_or(0.0);
     for (arm, goal) in row.goals.iter().enumerate() {
-        svg.push_str(&view.goal(*goal, arm));
+        svg.push_str(&view.goal(*goal, tolerance_m, arm));
     }
     for (arm, start) in row.starts.iter().enumerate() {
         svg.push_str(&view.object(*start, row.ends.get(arm).copied(), arm));

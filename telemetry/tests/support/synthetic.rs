@@ -4,7 +4,8 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use tandem_core::scene::{ArmScene, Capsule, Cuboid, Point, Scene};
-use tandem_core::{ArmAdvice, Contacts, EpisodeKind, Layout, Task};
+use tandem_core::task::{ArmDescription, Norm, TaskDescription};
+use tandem_core::{ArmAdvice, Contacts, EpisodeKind, Layout, Task, TaskSpec};
 use tandem_telemetry::{
     EpisodeMetadata, EpisodeRecorder, Error, LoggedTransition, TransitionRecord,
 };
@@ -20,7 +21,7 @@ pub(crate) fn metadata() -> EpisodeMetadata {
         seed: u64::MAX,
         kind: EpisodeKind::Evaluation,
         parameter_version: 3,
-        layout: LAYOUT,
+        layout: LAYOUT.into(),
         policy_digest: "5f3a".to_owned(),
         world: BTreeMap::from([("substeps".to_owned(), "20".to_owned())]),
     }
@@ -42,6 +43,7 @@ pub(crate) fn scene(progress: f32) -> Scene {
         arms: vec![left, right],
         objects: vec![left_object, right_object],
         goals: vec![[0.11, 0.12, 0.0225], [-0.11, -0.12, 0.0225]],
+        goal_tolerance_m: 0.05,
         table: Cuboid {
             centre: [0.0, 0.0, -0.02],
             orientation: UPRIGHT,
@@ -52,17 +54,55 @@ pub(crate) fn scene(progress: f32) -> Scene {
 
 /// Returns the steps of the episode. All numbers differ, so that a test detects swapped ones.
 pub(crate) fn transitions() -> Vec<LoggedTransition> {
+    transitions_of(&LAYOUT.into())
+}
+
+/// Returns a task of two arms that is not built-in, with so many numbers of the goal per arm, which are the first ones of
+/// its part of the observation.
+pub(crate) fn described(n_goal_per_arm: usize) -> TaskSpec {
+    const N_OBSERVATION: usize = 5;
+    let part = |n: usize, arm_idx: usize| (arm_idx * n..(arm_idx + 1) * n).collect::<Vec<_>>();
+    let arm = |arm_idx| ArmDescription {
+        observation: part(N_OBSERVATION, arm_idx),
+        goal: part(n_goal_per_arm, arm_idx),
+        action: part(2, arm_idx),
+        position: Vec::new(),
+    };
+    let achieved = |arm_idx| (0..n_goal_per_arm).map(move |idx| arm_idx * N_OBSERVATION + idx);
+    TaskSpec::new(TaskDescription {
+        name: "lab/reach".to_owned(),
+        n_observation: 2 * N_OBSERVATION,
+        n_goal: 2 * n_goal_per_arm,
+        n_action: 4,
+        achieved_goal: (0..2).flat_map(achieved).collect(),
+        episode_steps: 12,
+        tolerance: 0.2,
+        norm: Norm::Euclidean,
+        interchangeable_arms: true,
+        reports_contacts: false,
+        origin_distance: 0.0,
+        recombination_gap: 0.0,
+        observation_bound: vec![1.0; 2 * N_OBSERVATION],
+        goal_bound: vec![1.0; 2 * n_goal_per_arm],
+        arms: vec![arm(0), arm(1)],
+    })
+    .expect("a valid task")
+}
+
+/// Returns the steps of an episode of a task with two arms.
+pub(crate) fn transitions_of(task: &TaskSpec) -> Vec<LoggedTransition> {
     let numbers = |step: u32, offset: f32, n: usize| -> Vec<f32> {
         (0_u8..)
             .take(n)
             .map(|i| (offset + f32::from(i) * 0.173 + step as f32 * 0.031).sin())
             .collect()
     };
-    (0..N_STEPS)
+    (0_u32..)
+        .take(task.episode_steps())
         .map(|step| LoggedTransition {
-            observation: numbers(step, 0.0, LAYOUT.n_observation()),
-            goal: numbers(0, 1.0, LAYOUT.n_goal()),
-            action: numbers(step, 2.0, LAYOUT.n_action()),
+            observation: numbers(step, 0.0, task.n_observation()),
+            goal: numbers(0, 1.0, task.n_goal()),
+            action: numbers(step, 2.0, task.n_action()),
             reward: if step < 40 { -1.0 } else { 0.0 },
             rewards_per_arm: vec![-1.0, 0.0],
             advised_arms: u8::from(step.is_multiple_of(3)) * 2,
@@ -97,6 +137,17 @@ pub(crate) fn recorded(path: &Path) -> Result<EpisodeRecorder, Error> {
 
 pub(crate) fn write_log(path: &Path) -> Result<PathBuf, Error> {
     recorded(path)?.finish()
+}
+
+/// Writes an episode of a task that is not built-in.
+pub(crate) fn write_described_log(path: &Path, task: &TaskSpec) -> Result<PathBuf, Error> {
+    let metadata = EpisodeMetadata { layout: task.clone(), ..metadata() };
+    let mut recorder = EpisodeRecorder::create(path, &metadata)?;
+    for (step, transition) in (0..).zip(&transitions_of(task)) {
+        recorder.record_step(None, &record(step, transition))?;
+    }
+    recorder.record_outcome(None, &vec![0.5; task.n_observation()])?;
+    recorder.finish()
 }
 
 pub(crate) fn record(step: u32, transition: &LoggedTransition) -> TransitionRecord<'_> {

@@ -27,6 +27,7 @@ pub(crate) fn scene(
         arms: (0..angles.len()).map(arm).collect(),
         objects: blocks.iter().enumerate().map(object).collect(),
         goals: Vec::new(),
+        goal_tolerance_m: 0.0,
         table: cuboid(&under, TABLE_HALF_M),
     }
 }

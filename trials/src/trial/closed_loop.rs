@@ -2,7 +2,6 @@
 
 use glam::{DVec3, EulerRot};
 use tandem_core::ArmIndex;
-use tandem_core::layout::{EPISODE_STEPS, GOAL_TOLERANCE_M};
 use tandem_kinematics::{ArmWaypoint, ForwardKinematics, Joints, ReachError, Waypoint, WorkCell};
 
 use crate::simulated::{MAX_OPENING_M, ObjectPose};
@@ -91,7 +90,7 @@ impl TrialRunner {
             waypoints: Vec::new(),
         };
         let time_limit_s = self.config.time_limit_s / self.config.speed;
-        while execution.n_steps < EPISODE_STEPS && state.n_done < DONE_OBSERVATIONS {
+        while execution.n_steps < self.task.episode_steps() && state.n_done < DONE_OBSERVATIONS {
             if rig.now_s() > time_limit_s {
                 execution.timed_out = true;
                 break;
@@ -130,7 +129,7 @@ impl TrialRunner {
                 self.mapping.observe(ArmIndex(arm), angles, *opening, velocity, object)
             })
             .collect();
-        state.count_done(&now, &start.goals);
+        state.count_done(&now, &start.goals, self.tolerance_m());
         let before = state.before.replace(now.clone()).unwrap_or_else(|| now.clone());
         let mut observation = vec![0.0; layout.n_observation()];
         let mut goal = vec![0.0; layout.n_goal()];
@@ -267,8 +266,8 @@ impl LoopState {
         self.waypoints.extend(step.into_iter().skip(n_known));
     }
 
-    fn count_done(&mut self, now: &[ArmObservation], goals: &[DVec3]) {
-        let near_m = DONE_SHARE * f64::from(GOAL_TOLERANCE_M);
+    fn count_done(&mut self, now: &[ArmObservation], goals: &[DVec3], tolerance_m: f64) {
+        let near_m = DONE_SHARE * tolerance_m;
         let done = now.iter().zip(goals).all(|(now, goal)| (now.object - *goal).length() <= near_m);
         self.n_done = if done { self.n_done + 1 } else { 0 };
     }

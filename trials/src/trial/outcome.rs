@@ -1,7 +1,6 @@
 //! The outcome of a trial, determined from the final positions of the objects.
 
 use glam::DVec3;
-use tandem_core::layout::GOAL_TOLERANCE_M;
 use tandem_core::{Contacts, Task};
 use tandem_kinematics::{PlanError, Refusal};
 
@@ -133,13 +132,15 @@ pub(crate) fn contact_failure(touched: Contacts) -> Option<FailureCause> {
     }
 }
 
-/// Returns the failure of a trial that was carried out to its end or timed out; `None` is success.
+/// Returns the failure of a trial that was carried out to its end or timed out; `None` is success. An object has reached
+/// its goal up to a distance of `tolerance_m`.
 pub(crate) fn object_failure(
     task: Task,
     objects: &[ObjectResult],
+    tolerance_m: f64,
     timed_out: bool,
 ) -> Option<FailureCause> {
-    let missed = |object: &&ObjectResult| object.goal_distance_m() > f64::from(GOAL_TOLERANCE_M);
+    let missed = |object: &&ObjectResult| object.goal_distance_m() > tolerance_m;
     let mut missed = objects.iter().filter(missed).peekable();
     missed.peek()?;
     if missed.any(|object| object.lost(task)) {
@@ -172,7 +173,7 @@ mod tests {
             highest_m,
         };
         let check = |object: ObjectResult, timed_out, expected: Option<FailureCause>| {
-            assert_eq!(object_failure(Task::PickAndPlace, &[object], timed_out), expected);
+            assert_eq!(object_failure(Task::PickAndPlace, &[object], 0.05, timed_out), expected);
         };
         check(object(DVec3::new(0.1, 0.03, 0.18), 0.2), false, None);
         check(object(DVec3::new(0.05, 0.0, 0.0225), 0.15), false, Some(FailureCause::ObjectLost));

@@ -1,8 +1,7 @@
 //! The start and goals of a trial, and the policy's episode in the training world.
 
 use glam::DVec3;
-use tandem_core::layout::EPISODE_STEPS;
-use tandem_core::{ArmIndex, Contacts, Layout, Stream, WorldSettings, episode_rng};
+use tandem_core::{ArmIndex, Contacts, Layout, Stream, TaskSpec, WorldSettings, episode_rng};
 use tandem_sim::{Env, SimError, WorldConfig};
 
 use crate::simulated::Block;
@@ -51,6 +50,8 @@ pub struct Rollout {
 pub struct Rehearsal {
     env: Env,
     layout: Layout,
+    /// The number of control steps of an episode.
+    n_steps: usize,
     half_m: f64,
 }
 
@@ -65,7 +66,12 @@ impl Rehearsal {
             object_mass_kg: block.mass_kg,
             ..WorldConfig::default()
         };
-        Ok(Self { env: Env::new(layout, &world)?, layout, half_m: f64::from(block.half_m) })
+        Ok(Self {
+            env: Env::new(layout, &world)?,
+            layout,
+            n_steps: TaskSpec::from(layout).episode_steps(),
+            half_m: f64::from(block.half_m),
+        })
     }
 
     /// Draws the start of trial `number` of `seed` as the training world does, with room between the blocks.
@@ -92,8 +98,8 @@ impl Rehearsal {
         let mut observation = vec![0.0; self.layout.n_observation()];
         let goal = self.env.goal().to_vec();
         let mut contacts = Contacts::NONE;
-        let mut steps = Vec::with_capacity(EPISODE_STEPS);
-        for _ in 0..EPISODE_STEPS {
+        let mut steps = Vec::with_capacity(self.n_steps);
+        for _ in 0..self.n_steps {
             self.env.observe(&mut observation);
             let mut action = vec![0.0; self.layout.n_action()];
             policy.act(&observation, &goal, &mut action);

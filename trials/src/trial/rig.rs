@@ -17,12 +17,21 @@ const N_WARM_UP: usize = 15;
 /// Periods between two frames.
 const FRAME_PERIODS: u64 = 4;
 
+/// The goals of a trial. They only appear in the frames.
+#[derive(Default)]
+pub(crate) struct Goals {
+    /// The goals of the objects, arm by arm; world frame, metres.
+    pub(crate) at_m: Vec<DVec3>,
+    /// The distance up to which a goal counts as achieved, metres.
+    pub(crate) tolerance_m: f32,
+}
+
 /// The arms of a trial and its measurements.
 pub(crate) struct TrialRig<'a> {
     executor: Executor<SimulatedPair>,
     cell: WorkCell,
     observer: &'a mut dyn TrialObserver,
-    goals: Vec<DVec3>,
+    goals: Goals,
     n_periods: u64,
     pub(crate) touched: Contacts,
     pub(crate) arms_gap_m: f64,
@@ -33,11 +42,11 @@ pub(crate) struct TrialRig<'a> {
 }
 
 impl<'a> TrialRig<'a> {
-    /// Resets the arms of `pair`. `goals` (world frame, metres) only appear in the frames.
+    /// Resets the arms of `pair`.
     pub(crate) fn new(
         cell: WorkCell,
         pair: SimulatedPair,
-        goals: Vec<DVec3>,
+        goals: Goals,
         observer: &'a mut dyn TrialObserver,
     ) -> Result<Self, TrialError> {
         let highest_m = vec![f64::NEG_INFINITY; pair.objects().len()];
@@ -150,8 +159,9 @@ impl<'a> TrialRig<'a> {
             planned: planned.map(at).unwrap_or_default(),
             measured: at(&angles),
         };
-        let goals = self.goals.iter().map(|goal| goal.as_vec3().to_array()).collect();
-        let scene = Scene { goals, time_s, ..pair.scene() };
+        let goals = self.goals.at_m.iter().map(|goal| goal.as_vec3().to_array()).collect();
+        let goal_tolerance_m = self.goals.tolerance_m;
+        let scene = Scene { goals, goal_tolerance_m, time_s, ..pair.scene() };
         let measured = self.executor.state();
         let frame = Frame { time_s, phase, scene, planned, measured, tools: &tools };
         self.observer.on_frame(&frame);

@@ -1,7 +1,7 @@
 //! Runs single trials.
 
 use glam::DVec3;
-use tandem_core::ArmIndex;
+use tandem_core::{ArmIndex, TaskSpec};
 use tandem_kinematics::{
     ArmWaypoint, CheckSettings, Joints, Motion, PlanSettings, Waypoint, check, plan,
 };
@@ -15,7 +15,7 @@ use crate::trial::outcome::{
     FailureCause, MotionRefusal, ObjectResult, contact_failure, object_failure,
 };
 use crate::trial::rehearsal::{Rehearsal, TrialStart};
-use crate::trial::rig::TrialRig;
+use crate::trial::rig::{Goals, TrialRig};
 use crate::trial::{
     ActionSource, NoObserver, ObjectPositions, TrialConfig, TrialError, TrialMode, TrialObserver,
     TrialReport,
@@ -35,6 +35,8 @@ const TWIN_FRICTION: f32 = 0.8;
 /// Runs trials that differ in their numbers only.
 pub struct TrialRunner {
     pub(super) config: TrialConfig,
+    /// The task of the policy.
+    pub(super) task: TaskSpec,
     pub(super) mapping: Mapping,
     rehearsal: Rehearsal,
     pub(super) check: CheckSettings,
@@ -64,6 +66,7 @@ impl TrialRunner {
         Ok(Self {
             mapping: Mapping::new(cell, config.layout, &config.block),
             rehearsal: Rehearsal::new(config.layout, &config.block)?,
+            task: config.layout.into(),
             check: check_settings(),
             step_check: CheckSettings { arms_gap_m: STEP_GAP_M, ..check_settings() },
             config,
@@ -89,7 +92,8 @@ impl TrialRunner {
         };
         let pair = self.pair(&start, &at, number, &self.config.simulated);
         let initial: Vec<ObjectPose> = pair.objects();
-        let goals = self.in_world(&start.goals);
+        let at_m = self.in_world(&start.goals);
+        let goals = Goals { at_m, tolerance_m: self.task.tolerance() };
         let mut rig = TrialRig::new(self.mapping.cell().clone(), pair, goals, observer)?;
         let execution = match planned {
             Some(motion) => self.open_loop(&mut rig, &at, motion),
@@ -124,12 +128,17 @@ impl TrialRunner {
                 end: ends[arm].at_m,
             })
             .collect();
-        let unreached = || object_failure(self.config.layout.task, &objects, execution.timed_out);
+        let tolerance_m = self.tolerance_m();
+        let unreached = || {
+            let task = self.config.layout.task;
+            object_failure(task, &objects, tolerance_m, execution.timed_out)
+        };
         let cause = contact_failure(rig.touched).or(execution.ended.err()).or_else(unreached);
         TrialReport {
             number,
             cause,
             positions,
+            tolerance_m,
             rehearsed_m: execution.rehearsed_m,
             duration_s: rig.now_s(),
             n_steps: execution.n_steps,
@@ -141,6 +150,11 @@ impl TrialRunner {
             waypoints: execution.waypoints,
             objects,
         }
+    }
+
+    /// Returns the distance of an object from its goal up to which the goal counts as achieved, metres.
+    pub(super) fn tolerance_m(&self) -> f64 {
+        self.task.tolerance().into()
     }
 
     /// Converts the policy's episode in the training world to waypoints.
@@ -177,7 +191,8 @@ impl TrialRunner {
     ) -> Result<PlannedMotion, TrialError> {
         let pair = self.pair(start, at, number, &twin_of(&self.config.simulated));
         let mut observer = NoObserver;
-        let mut rig = TrialRig::new(self.mapping.cell().clone(), pair, Vec::new(), &mut observer)?;
+        let mut rig =
+            TrialRig::new(self.mapping.cell().clone(), pair, Goals::default(), &mut observer)?;
         let execution = self.closed_loop(&mut rig, start, at, policy);
         let ends = rig.pair().objects();
         let distance = |(arm, goal): (usize, &DVec3)| {

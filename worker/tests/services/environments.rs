@@ -1,13 +1,17 @@
 //! A worker that plays on a server of environments, which fails in various ways.
 
 use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
 
 use tandem_core::task::TaskDescription;
 use tandem_core::text::error_chain;
+use tandem_core::work::RunTerms;
 use tandem_core::{Episode, TaskSpec};
 use tandem_proto::pb;
+use tandem_telemetry::read_episode;
+use tandem_worker::record::{RecordError, replay_log, replay_log_on};
 use tandem_worker::{EnvironmentConfig, Error, WorkerConfig, describe_environments, run_with};
 use tokio_util::sync::CancellationToken;
 use tonic::Status;
@@ -15,7 +19,7 @@ use tonic::Status;
 use crate::support::environment::{FakeEnvironments, Fault, played_on};
 use crate::support::learner::{Call, FakeLearner};
 use crate::support::teacher::FakeTeacher;
-use crate::support::{LAYOUT, Server, orders};
+use crate::support::{LAYOUT, Server, orders, terms};
 use crate::{TIMEOUTS, config, episodes_without_faults};
 
 /// Plays all slots on `environments`; returns the delivered episodes and the fake learner.
@@ -137,17 +141,83 @@ async fn an_invalid_reply_ends_the_worker_with_server_environment_field_and_valu
 
 #[tokio::test]
 async fn another_task_is_refused_and_its_field_named() {
-    let other = TaskDescription { name: "lab/push".to_owned(), ..LAYOUT.description() };
-    let environments = FakeEnvironments::default().serving(TaskSpec::new(other).expect("valid"));
-    let line = line_of_end(environments).await;
+    let line = line_of_end(FakeEnvironments::default().serving(lab_push())).await;
     let expected = "serves another task than the run's: name is \"push\" in the run and \"lab/push\" at the server";
     assert!(line.ends_with(expected), "{line}");
 }
 
+/// Returns the push task under a name that is not built-in.
+fn lab_push() -> TaskSpec {
+    let description = TaskDescription { name: "lab/push".to_owned(), ..LAYOUT.description() };
+    TaskSpec::new(description).expect("valid")
+}
+
+/// Records the evaluation of a run of [`lab_push`] and returns the log's path.
+async fn recorded_on(environments: &Arc<FakeEnvironments>, log_dir: &Path) -> PathBuf {
+    let terms = RunTerms { layout: lab_push(), account: None, ..terms() };
+    let learner = Arc::new(FakeLearner::new(orders().split_off(2)).with_terms(terms));
+    let (learner_server, server) = (Server::learner(&learner), Server::environments(environments));
+    let config = WorkerConfig {
+        environment: Some(played_on(&server)),
+        log_dir: Some(log_dir.to_owned()),
+        ..config(&learner_server, None)
+    };
+    run_with(config, TIMEOUTS, CancellationToken::new()).await.expect("the run ends");
+    let path = log_dir.join("eval-000002-001.mcap");
+    let log = read_episode(&path).expect("a whole log");
+    let episode = learner.episodes().into_values().find(|episode| episode.number == 1);
+    let episode = episode.expect("delivered");
+    assert_eq!((&log.metadata.layout, log.metadata.seed), (&lab_push(), 21));
+    for (step_idx, step) in log.transitions.iter().enumerate() {
+        assert_eq!(step.observation, episode.observation(step_idx));
+        assert_eq!((&step.goal, step.action.as_slice()), (&episode.goal, episode.action(step_idx)));
+        assert_eq!((step.reward, step.advised_arms), (episode.joint_reward(step_idx), 0));
+    }
+    assert_eq!(log.transitions.len(), episode.n_steps());
+    assert_eq!(log.last_observation.as_deref(), Some(episode.last_observation()));
+    path
+}
+
+#[tokio::test]
+async fn an_episode_of_a_described_task_is_logged_and_replays_in_its_environments_only() {
+    let logs = tempfile::tempdir().expect("a directory");
+    let environments = Arc::new(FakeEnvironments::default().serving(lab_push()));
+    let path = recorded_on(&environments, logs.path()).await;
+    let log = read_episode(&path).expect("a whole log");
+    let refused = replay_log(&log).expect_err("no simulator");
+    assert!(
+        matches!(&refused, RecordError::NoSimulator { task } if task == "lab/push"),
+        "{refused}"
+    );
+
+    let server = Server::environments(&environments);
+    replay_log_on(played_on(&server), &log).await.expect("equal");
+    let mut altered = log.clone();
+    altered.transitions[30].observation[8] += 1e-3;
+    let differs = replay_log_on(played_on(&server), &altered).await.expect_err("altered");
+    let is_found = matches!(
+        differs,
+        RecordError::Differs { step: 30, field: "observation", component: 8, .. }
+    );
+    assert!(is_found, "{differs}");
+
+    // A server that fails within the episode is asked again, up to a limit.
+    let failing = |environments: FakeEnvironments| {
+        Arc::new(environments.serving(lab_push()).with_fault(20, ending("restarting")))
+    };
+    let once = Server::environments(&failing(FakeEnvironments::default()));
+    replay_log_on(played_on(&once), &log).await.expect("equal at the second attempt");
+    let always = Server::environments(&failing(FakeEnvironments::default().repeating(21)));
+    let given_up = replay_log_on(played_on(&always), &log).await.expect_err("it always fails");
+    assert!(given_up.to_string().contains("after 3 failures in a row"), "{given_up}");
+    let other = Server::environments(&Arc::new(FakeEnvironments::default()));
+    let other_task = replay_log_on(played_on(&other), &log).await.expect_err("it serves push");
+    assert!(other_task.to_string().contains("serves another task"), "{other_task}");
+}
+
 #[tokio::test]
 async fn a_server_is_asked_for_its_task() {
-    let other = TaskDescription { name: "lab/push".to_owned(), ..LAYOUT.description() };
-    let task = TaskSpec::new(other).expect("valid");
+    let task = lab_push();
     let environments = Arc::new(FakeEnvironments::default().serving(task.clone()));
     let server = Server::environments(&environments);
     let served = describe_environments(played_on(&server)).await.expect("answered");

@@ -1,6 +1,5 @@
 //! The part of the world that a trial's plot shows, and its projection onto the plot.
 
-use tandem_core::layout::GOAL_TOLERANCE_M;
 use tandem_telemetry::TrialRow;
 
 use super::marker::{Marker, hex};
@@ -36,7 +35,7 @@ pub(super) struct Bounds {
 impl Bounds {
     /// Returns the bounds of all paths, starts and goals, the table, and final object positions that are near these.
     pub(super) fn of(row: &TrialRow) -> Self {
-        let tolerance_m = f64::from(GOAL_TOLERANCE_M);
+        let tolerance_m = row.goal_tolerance_m().unwrap_or(0.0);
         let tools = row.path.iter().flat_map(|point| point.planned.iter().chain(&point.measured));
         let mut points: Vec<[f64; 3]> = tools.chain(&row.starts).copied().collect();
         for goal in &row.goals {
@@ -170,10 +169,10 @@ impl Projection {
         line([left, y], [right, y], &ink, 1.5) + &ends + &text
     }
 
-    /// Draws a goal and its tolerance.
-    pub(super) fn goal(&self, goal: [f64; 3], arm: usize) -> String {
+    /// Draws a goal and its tolerance, metres.
+    pub(super) fn goal(&self, goal: [f64; 3], tolerance_m: f64, arm: usize) -> String {
         let (x, y) = self.point_px(goal);
-        let radius = f64::from(GOAL_TOLERANCE_M) * self.scale;
+        let radius = tolerance_m * self.scale;
         let color = arm_color(arm, 1.0);
         let cross = [
             line([x - 4.0, y], [x + 4.0, y], &color, 1.0),

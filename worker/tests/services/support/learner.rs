@@ -3,13 +3,13 @@
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::sync::{Mutex, MutexGuard};
 
-use tandem_core::work::SlotOrder;
+use tandem_core::work::{RunTerms, SlotOrder};
 use tandem_core::{Episode, EpisodeKind};
 use tandem_proto::pb;
 use tokio::sync::mpsc;
 use tonic::{Request, Response, Status};
 
-use super::{LAYOUT, actor, terms};
+use super::{actor, terms};
 
 /// The calls that can fail.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
@@ -36,6 +36,7 @@ pub(crate) enum Fault {
 }
 
 pub(crate) struct FakeLearner {
+    terms: RunTerms,
     state: Mutex<State>,
     fault: Option<(Call, usize, Fault)>,
 }
@@ -76,7 +77,11 @@ impl FakeLearner {
             episodes: BTreeMap::new(),
             checks: Vec::new(),
         };
-        Self { state: Mutex::new(state), fault: None }
+        Self { terms: terms(), state: Mutex::new(state), fault: None }
+    }
+
+    pub(crate) fn with_terms(self, terms: RunTerms) -> Self {
+        Self { terms, ..self }
     }
 
     /// Adds a fault to the `nth` call of a kind, counted from 0.
@@ -155,7 +160,7 @@ impl pb::learner_server::Learner for FakeLearner {
         state.workers.insert(worker_id);
         Ok(Response::new(pb::JoinResponse {
             worker_id,
-            terms: Some(tandem_proto::encode_run_terms(&terms())),
+            terms: Some(tandem_proto::encode_run_terms(&self.terms)),
             learner: 1,
         }))
     }
@@ -207,7 +212,7 @@ impl pb::learner_server::Learner for FakeLearner {
             let check = request.environment_check;
             state.checks.extend(check.map(|check| (check.n_episodes, check.difference)));
             for message in request.episodes {
-                let episode = tandem_proto::decode_episode(message, LAYOUT)?;
+                let episode = tandem_proto::decode_episode(message, &self.terms.layout)?;
                 let key = (episode.kind == EpisodeKind::Evaluation, episode.number);
                 assert!(state.episodes.insert(key, episode).is_none(), "delivered twice: {key:?}");
             }
