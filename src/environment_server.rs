@@ -4,13 +4,16 @@ use std::ffi::OsString;
 use std::sync::Arc;
 use std::time::Duration;
 
+use tandem_core::TaskSpec;
 use tandem_net::ClientConfig;
 use tandem_worker::{EnvironmentConfig, ServedTask};
+use toml::Value;
 
-use crate::access;
 use crate::cli::{ClientArgs, EnvironmentArgs, SecretArgs};
 use crate::environment_command::CommandServer;
-use crate::exit::Failed;
+use crate::exit::{Exit, Failed, OrExit as _};
+use crate::service::worker_failed;
+use crate::{access, runtime};
 
 /// The environments in which a worker plays.
 pub(crate) enum EnvironmentSource {
@@ -25,7 +28,7 @@ pub(crate) enum EnvironmentSource {
 impl EnvironmentSource {
     /// Reads the options. `default` is the client of a server without a token and an authority of its own.
     pub(crate) fn of(args: &EnvironmentArgs, default: &ClientConfig) -> Result<Self, Failed> {
-        let reply_timeout = args.env_timeout_s;
+        let reply_timeout = args.env_timeout_s.unwrap_or(EnvironmentConfig::REPLY_TIMEOUT);
         let max_attempts = EnvironmentConfig::MAX_ATTEMPTS;
         if let Some(address) = &args.env {
             let client = client_config(args, default)?;
@@ -84,9 +87,46 @@ pub(crate) fn arguments(args: &EnvironmentArgs) -> Vec<OsString> {
     push("--env-command", env_command.as_ref().map(OsString::from));
     push("--env-token-file", env_token_file.as_ref().map(OsString::from));
     push("--env-tls-ca", env_tls_ca.as_ref().map(OsString::from));
-    let has_server = env.is_some() || env_command.is_some();
-    push("--env-timeout-s", has_server.then(|| seconds_text(*env_timeout_s)));
+    let timeout_s = env_timeout_s.filter(|_| names_server(args));
+    push("--env-timeout-s", timeout_s.map(seconds_text));
     options
+}
+
+/// Returns whether the options name a server.
+pub(crate) const fn names_server(args: &EnvironmentArgs) -> bool {
+    args.env.is_some() || args.env_command.is_some()
+}
+
+/// Describes the server for a message, if the options name one.
+pub(crate) fn shown(args: &EnvironmentArgs) -> Option<String> {
+    let address = args.env.as_ref().map(|address| format!("the server at {address}"));
+    address.or_else(|| Some(format!("the command {:?}", args.env_command.as_ref()?)))
+}
+
+/// Starts the server if it is a command, and asks it for its task. Returns `None` if the options name no server.
+pub(crate) fn served_task(args: &EnvironmentArgs) -> Result<Option<ServedTask>, Failed> {
+    let runtime = runtime::new().or_exit(Exit::TryAgain, String::new)?;
+    runtime.block_on(async {
+        let source = EnvironmentSource::of(args, &ClientConfig::default())?;
+        let served = source.served_task().await;
+        source.end().await;
+        served.map_err(worker_failed)
+    })
+}
+
+/// Returns the settings of a run for a task, unless the task is built-in.
+pub(crate) fn described_settings(task: &TaskSpec) -> Result<Vec<(String, Value)>, Failed> {
+    if task.as_built_in().is_some() {
+        return Ok(Vec::new());
+    }
+    let description = Value::try_from(task.description()).or_exit(Exit::Bug, String::new)?;
+    let n_arms = i64::try_from(task.n_arms()).unwrap_or(i64::MAX);
+    let settings = [
+        ("task", Value::String(task.name().to_owned())),
+        ("arms", Value::Integer(n_arms)),
+        ("description", description),
+    ];
+    Ok(settings.map(|(key, value)| (key.to_owned(), value)).into())
 }
 
 fn seconds_text(duration: Duration) -> OsString {

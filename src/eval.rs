@@ -4,15 +4,19 @@ use std::path::Path;
 
 use rayon::iter::{IntoParallelRefIterator as _, ParallelIterator as _};
 use tandem_core::work::{EpisodeOrder, RunTerms};
-use tandem_core::{Episode, Exploration, Task, WorldSettings};
+use tandem_core::{Episode, Exploration, Task, TaskSpec, WorldSettings};
 use tandem_worker::record::{RecordError, log_name, metadata_of, record_episode};
 
 use crate::cli::EvalArgs;
-use crate::evaluation::{EvaluatedPolicy, measure};
+use crate::environment_server::names_server;
+use crate::evaluation::{EvaluatedPolicy, EvaluationResult, Part, measure, measure_served};
 use crate::exit::{Exit, Failed, OrExit as _};
 use crate::{output, policy_file};
 
 pub(crate) fn eval(args: &EvalArgs) -> Result<(), Failed> {
+    if names_server(&args.environment) {
+        return eval_served(args);
+    }
     let subject = subject(args)?;
     let result = measure(&subject, args.episodes, args.seed)?;
     let terms = terms(&subject);
@@ -27,21 +31,40 @@ pub(crate) fn eval(args: &EvalArgs) -> Result<(), Failed> {
             record(&subject, &terms, args.seed, episode, &path)
         })?;
     }
-    if args.json {
-        output::print(result.json())?;
-    } else {
-        let layout = result.layout;
-        output::print(format_args!(
-            "task          {}, arms {}, seed {}",
-            layout.task, layout.n_arms, args.seed
-        ))?;
-        result.lines().iter().try_for_each(output::print)?;
-        output::print(format_args!("speed         {:.0} env steps/s", result.steps_per_s))?;
-        for path in args.record.iter().chain(&args.record_dir) {
-            output::print(format_args!("recorded      {}", path.display()))?;
-        }
+    print(args, &result)
+}
+
+/// Evaluates a policy in the environments of a server.
+fn eval_served(args: &EvalArgs) -> Result<(), Failed> {
+    if args.record.is_some() || args.record_dir.is_some() {
+        return Err(Failed::usage(
+            "--record and --record-dir need the simulator of this program: leave out --env and --env-command",
+        ));
     }
-    Ok(())
+    let (part, path) = match (&args.policy, &args.composed_teachers) {
+        (Some(path), _) => (Part::AllArms, path),
+        (None, Some(path)) => (Part::EachArm(args.arms), path),
+        (None, None) => return Err(no_policy()),
+    };
+    let policy = policy_file::load(path)?;
+    check_required(args, &policy.layout, part)?;
+    let goals = (args.episodes, args.seed);
+    let result = measure_served(&args.environment, (part, &policy), goals, false)?;
+    print(args, &result)
+}
+
+fn print(args: &EvalArgs, result: &EvaluationResult) -> Result<(), Failed> {
+    if args.json {
+        return output::print(result.json());
+    }
+    let (task, n_arms) = (result.task.name(), result.task.n_arms());
+    output::print(format_args!("task          {task}, arms {n_arms}, seed {}", args.seed))?;
+    result.lines().iter().try_for_each(output::print)?;
+    output::print(format_args!("speed         {:.0} env steps/s", result.steps_per_s))?;
+    let recorded = args.record.iter().chain(&args.record_dir);
+    recorded
+        .map(|path| path.display())
+        .try_for_each(|path| output::print(format_args!("recorded      {path}")))
 }
 
 /// Returns the terms of an evaluation, for the metadata of its logs.
@@ -84,16 +107,25 @@ fn subject(args: &EvalArgs) -> Result<EvaluatedPolicy, Failed> {
         (None, Some(path)) => {
             EvaluatedPolicy::composed(policy_file::load(path)?, args.arms.unwrap_or(2), path)?
         }
-        (None, None) => return Err(Failed::usage("give --policy or --composed-teachers")),
+        (None, None) => return Err(no_policy()),
     };
-    let layout = subject.layout();
-    let required_task = args.task.map_or(layout.task, Task::from);
-    let required_arms = args.arms.unwrap_or(layout.n_arms);
-    if (required_task, required_arms) != (layout.task, layout.n_arms) {
+    check_required(args, &subject.layout().into(), Part::AllArms)?;
+    Ok(subject)
+}
+
+/// Rejects a task other than the one that the command line requires; for a part of the arms, only by its name.
+fn check_required(args: &EvalArgs, task: &TaskSpec, part: Part) -> Result<(), Failed> {
+    let (name, n_arms) = (task.name(), task.n_arms());
+    let required_task = args.task.map_or(name, |task| Task::from(task).name());
+    let required_arms = args.arms.filter(|_| part == Part::AllArms).unwrap_or(n_arms);
+    if (required_task, required_arms) != (name, n_arms) {
         return Err(Failed::usage(format!(
-            "the policy is for {} with {} arm(s), not {required_task} with {required_arms}",
-            layout.task, layout.n_arms
+            "the policy is for {name} with {n_arms} arm(s), not {required_task} with {required_arms}"
         )));
     }
-    Ok(subject)
+    Ok(())
+}
+
+fn no_policy() -> Failed {
+    Failed::usage("give --policy or --composed-teachers")
 }

@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use clap::{Args, Subcommand};
 
-use super::TaskName;
+use super::{EnvironmentArgs, TaskName};
 
 #[derive(Debug, Args)]
 #[command(group = clap::ArgGroup::new("who").required(true), after_help = "\
@@ -12,7 +12,9 @@ Examples:
   tandem eval --policy policies/student-push.safetensors
   tandem eval --policy FILE --episodes 400 --seed 7 --json
   tandem eval --composed-teachers policies/teacher-push.safetensors
-  tandem eval --policy FILE --episodes 1 --record episode.mcap")]
+  tandem eval --policy FILE --episodes 1 --record episode.mcap
+  tandem eval --policy FILE --env 127.0.0.1:7005             in the environments of a server
+  tandem eval --policy FILE --env-command 'tandem env'       starts the server")]
 pub(crate) struct EvalArgs {
     /// Policy to evaluate.
     #[arg(long, value_name = "FILE", group = "who")]
@@ -23,9 +25,11 @@ pub(crate) struct EvalArgs {
     /// Fails unless the policy is for this task.
     #[arg(long, value_enum)]
     pub(crate) task: Option<TaskName>,
-    /// Number of arms [default: the policy's; 2 for composed teachers].
+    /// Number of arms [default: the policy's; for composed teachers the server's, or 2].
     #[arg(long)]
     pub(crate) arms: Option<usize>,
+    #[command(flatten)]
+    pub(crate) environment: EnvironmentArgs,
     /// Number of episodes, one per goal.
     #[arg(long, default_value_t = 240, value_parser = clap::value_parser!(u64).range(1..=1_000_000))]
     pub(crate) episodes: u64,

@@ -7,8 +7,8 @@ use indicatif::{MultiProgress, ProgressBar, ProgressStyle};
 use tandem_proto::pb;
 
 use super::plan::Plan;
-use crate::output;
 use crate::progress_text::{clock_text, counts_line, evaluation_line, grouped};
+use crate::{environment_server, output};
 
 /// Seconds of run time after which a plain line is printed even without news.
 const PLAIN_EVERY_S: f64 = 30.0;
@@ -61,6 +61,9 @@ impl Display {
             plan.n_workers,
             plan.out.display()
         ));
+        if let Some(server) = environment_server::shown(&plan.environment) {
+            display.print(&format!("environments of {server}"));
+        }
         display
     }
 
