@@ -4,16 +4,13 @@ use std::ffi::OsString;
 use std::sync::Arc;
 use std::time::Duration;
 
-use tandem_core::TaskSpec;
 use tandem_net::ClientConfig;
 use tandem_worker::{EnvironmentConfig, ServedTask};
-use toml::Value;
 
+use crate::access;
 use crate::cli::{ClientArgs, EnvironmentArgs, SecretArgs};
 use crate::environment_command::CommandServer;
-use crate::exit::{Exit, Failed, OrExit as _};
-use crate::service::worker_failed;
-use crate::{access, runtime};
+use crate::exit::Failed;
 
 /// The environments in which a worker plays.
 pub(crate) enum EnvironmentSource {
@@ -101,32 +98,6 @@ pub(crate) const fn names_server(args: &EnvironmentArgs) -> bool {
 pub(crate) fn shown(args: &EnvironmentArgs) -> Option<String> {
     let address = args.env.as_ref().map(|address| format!("the server at {address}"));
     address.or_else(|| Some(format!("the command {:?}", args.env_command.as_ref()?)))
-}
-
-/// Starts the server if it is a command, and asks it for its task. Returns `None` if the options name no server.
-pub(crate) fn served_task(args: &EnvironmentArgs) -> Result<Option<ServedTask>, Failed> {
-    let runtime = runtime::new().or_exit(Exit::TryAgain, String::new)?;
-    runtime.block_on(async {
-        let source = EnvironmentSource::of(args, &ClientConfig::default())?;
-        let served = source.served_task().await;
-        source.end().await;
-        served.map_err(worker_failed)
-    })
-}
-
-/// Returns the settings of a run for a task, unless the task is built-in.
-pub(crate) fn described_settings(task: &TaskSpec) -> Result<Vec<(String, Value)>, Failed> {
-    if task.as_built_in().is_some() {
-        return Ok(Vec::new());
-    }
-    let description = Value::try_from(task.description()).or_exit(Exit::Bug, String::new)?;
-    let n_arms = i64::try_from(task.n_arms()).unwrap_or(i64::MAX);
-    let settings = [
-        ("task", Value::String(task.name().to_owned())),
-        ("arms", Value::Integer(n_arms)),
-        ("description", description),
-    ];
-    Ok(settings.map(|(key, value)| (key.to_owned(), value)).into())
 }
 
 fn seconds_text(duration: Duration) -> OsString {

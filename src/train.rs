@@ -22,7 +22,7 @@ use tokio_util::sync::CancellationToken;
 
 use crate::cli::TrainArgs;
 use crate::exit::{Exit, Failed, OrExit as _};
-use crate::{clock, environment_server, runtime, signals};
+use crate::{clock, runtime, served_task, signals};
 use display::Display;
 use inputs::RunInputs;
 use plan::Plan;
@@ -43,7 +43,7 @@ const INTERRUPTED: &str = "interrupted";
 
 pub(crate) fn train(args: &TrainArgs) -> Result<(), Failed> {
     let environment = environment_file::environment_of(args)?;
-    let served = environment_server::served_task(&environment)?;
+    let served = served_task::of_server(&environment)?;
     let plan = Plan::of(args, environment, served.as_ref())?;
     let lock = RunLock::take(&plan)?;
     let service_locks = lock.wait_for_leftovers(&plan)?;

@@ -11,7 +11,7 @@ use toml::{Table, Value};
 
 use crate::cli::EnvironmentArgs;
 use crate::exit::{Exit, Failed, OrExit as _};
-use crate::{environment_server, input, run_file};
+use crate::{input, run_file, served_task};
 
 /// A larger number of runs is treated as a mistake.
 const MAX_RUNS: usize = 10_000;
@@ -85,10 +85,11 @@ pub(super) fn read(path: &Path) -> Result<PlannedSweep, Failed> {
     let environment = environment(&file).or_exit(Exit::Usage, context)?;
     let served = match names_task(&file) {
         true => None,
-        false => environment_server::served_task(&environment)
-            .map_err(|failed| failed.context(context()))?,
+        false => {
+            served_task::of_server(&environment).map_err(|failed| failed.context(context()))?
+        }
     };
-    let of_server = served.map(|served| environment_server::described_settings(&served.task));
+    let of_server = served.map(|served| served_task::settings(&served.task));
     let runs = runs(&file, &of_server.transpose()?.unwrap_or_default());
     Ok(PlannedSweep { runs: runs.or_exit(Exit::Usage, context)?, environment })
 }

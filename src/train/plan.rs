@@ -13,7 +13,7 @@ use super::teacher_file::TeacherFile;
 use crate::cli::{EnvironmentArgs, RecipeName, TrainArgs};
 use crate::exit::{Exit, Failed, OrExit as _};
 use crate::service::worker_failed;
-use crate::{environment_server, policy_file, run_directory, run_file};
+use crate::{policy_file, run_directory, run_file, served_task};
 
 /// A run that can be started.
 pub(crate) struct Plan {
@@ -211,7 +211,7 @@ fn served_settings(
 ) -> Result<Vec<(String, Value)>, Failed> {
     let names_task = args.task.is_some() || args.run.is_some() || args.resume;
     match served.filter(|_| !names_task) {
-        Some(served) => environment_server::described_settings(&served.task),
+        Some(served) => served_task::settings(&served.task),
         None => Ok(Vec::new()),
     }
 }

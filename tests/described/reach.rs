@@ -7,7 +7,7 @@ use std::time::Duration;
 use tandem_core::rng::{Stream as RandomStream, episode_rng, uniform};
 use tandem_core::task::{ArmDescription, Norm};
 use tandem_core::work::EpisodeStart;
-use tandem_core::{Contacts, TaskDescription, TaskSpec};
+use tandem_core::{TaskDescription, TaskSpec};
 use tandem_proto::environment::{
     PlayCommand, decode_play_request, encode_environment, encode_reset_reply, encode_step_reply,
 };
@@ -176,8 +176,8 @@ impl Points {
                 for (position, action) in self.positions.iter_mut().zip(actions) {
                     *position = (*position + STEP * action).clamp(-3.0, 3.0);
                 }
-                let contacts = vec![Contacts::NONE; self.n.unwrap_or_default()];
-                Ok(encode_step_reply(&self.positions, &contacts))
+                // The task reports no contacts.
+                Ok(encode_step_reply(&self.positions, &[]))
             }
         }
     }

@@ -221,7 +221,7 @@ mod tests {
                 }
             }
         }
-        let observations = [0.1, 0.2, 1.0, 2.0, 0.3, 0.4, -1.0, 0.0];
+        let observations = [0.1, 0.2, 1.0, 2.0, 0.3, 0.4, -2.0, 0.0];
         let goals = [0.5, 0.25, 0.0, 1.0];
         let mut actions = [9.0; 4];
         ComposedTeachers::new(Difference, task).act(&observations, &goals, &mut actions);
@@ -229,7 +229,7 @@ mod tests {
             0.5 - 0.2 + 0.1 * 2.0, // arm 1
             0.25 - 0.1 + 0.1 * 1.0,
             0.0 - 0.4 + 0.1 * 0.0,
-            1.0 - 0.3 + 0.1 * -1.0,
+            1.0 - 0.3 + 0.1 * -2.0,
         ];
         assert_eq!(actions, expected);
     }

@@ -133,7 +133,7 @@ fn a_task_of_a_server_is_that_of_all_runs_and_part_of_their_names() {
     let mut description = tandem_core::Layout::new(tandem_core::Task::Push, 2).description();
     description.name = "lab/reach-1".to_owned();
     let task = tandem_core::TaskSpec::new(description).expect("valid");
-    let settings = environment_server::described_settings(&task).expect("TOML");
+    let settings = served_task::settings(&task).expect("TOML");
     let file = parse(&format!("seeds = [1, 2]\nenv_command = \"serve\"{LIMIT}")).expect("valid");
     assert!(!names_task(&file));
     let runs = runs(&file, &settings).expect("valid");
