@@ -25,7 +25,7 @@ pub(crate) enum EnvironmentSource {
 impl EnvironmentSource {
     /// Reads the options. `default` is the client of a server without a token and an authority of its own.
     pub(crate) fn of(args: &EnvironmentArgs, default: &ClientConfig) -> Result<Self, Failed> {
-        let reply_timeout = args.env_timeout_s;
+        let reply_timeout = args.env_timeout_s.unwrap_or(EnvironmentConfig::REPLY_TIMEOUT);
         let max_attempts = EnvironmentConfig::MAX_ATTEMPTS;
         if let Some(address) = &args.env {
             let client = client_config(args, default)?;
@@ -84,9 +84,20 @@ pub(crate) fn arguments(args: &EnvironmentArgs) -> Vec<OsString> {
     push("--env-command", env_command.as_ref().map(OsString::from));
     push("--env-token-file", env_token_file.as_ref().map(OsString::from));
     push("--env-tls-ca", env_tls_ca.as_ref().map(OsString::from));
-    let has_server = env.is_some() || env_command.is_some();
-    push("--env-timeout-s", has_server.then(|| seconds_text(*env_timeout_s)));
+    let timeout_s = env_timeout_s.filter(|_| names_server(args));
+    push("--env-timeout-s", timeout_s.map(seconds_text));
     options
+}
+
+/// Returns whether the options name a server.
+pub(crate) const fn names_server(args: &EnvironmentArgs) -> bool {
+    args.env.is_some() || args.env_command.is_some()
+}
+
+/// Describes the server for a message, if the options name one.
+pub(crate) fn shown(args: &EnvironmentArgs) -> Option<String> {
+    let address = args.env.as_ref().map(|address| format!("the server at {address}"));
+    address.or_else(|| Some(format!("the command {:?}", args.env_command.as_ref()?)))
 }
 
 fn seconds_text(duration: Duration) -> OsString {

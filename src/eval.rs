@@ -6,16 +6,20 @@ use std::path::Path;
 
 use rayon::iter::{IntoParallelRefIterator as _, ParallelIterator as _};
 use tandem_core::work::{EpisodeOrder, RunTerms};
-use tandem_core::{Episode, Exploration, WorldSettings};
+use tandem_core::{Episode, Exploration, TaskSpec, WorldSettings};
 use tandem_worker::record::{RecordError, log_name, metadata_of, record_episode};
 
-use crate::cli::{EvalArgs, check_layout};
-use crate::evaluation::{EvaluatedPolicy, measure};
+use crate::cli::{EvalArgs, check_layout, check_task};
+use crate::environment_server::names_server;
+use crate::evaluation::{EvaluatedPolicy, EvaluationResult, Part, measure, measure_served};
 use crate::exit::{Exit, Failed, OrExit as _};
 use crate::{output, policy_file};
 use baselines::Baselines;
 
 pub(crate) fn eval(args: &EvalArgs) -> Result<(), Failed> {
+    if names_server(&args.environment) {
+        return eval_served(args);
+    }
     let subject = subject(args)?;
     subject.warn_if_trained_on(args.seed);
     let result = measure(&subject, args.episodes, args.seed)?;
@@ -32,22 +36,46 @@ pub(crate) fn eval(args: &EvalArgs) -> Result<(), Failed> {
             record(&subject, &terms, args.seed, episode, &path)
         })?;
     }
-    if args.json {
-        output::print(baselines.json(&result))?;
-    } else {
-        let layout = result.layout;
-        output::print(format_args!(
-            "task          {}, arms {}, seed {}",
-            layout.task, layout.n_arms, args.seed
-        ))?;
-        result.lines().iter().try_for_each(output::print)?;
-        baselines.table(&result).map_or(Ok(()), output::print)?;
-        output::print(format_args!("speed         {:.0} env steps/s", result.steps_per_s))?;
-        for path in args.record.iter().chain(&args.record_dir) {
-            output::print(format_args!("recorded      {}", path.display()))?;
-        }
+    print(args, &result, &baselines)
+}
+
+/// Evaluates a policy in the environments of a server.
+fn eval_served(args: &EvalArgs) -> Result<(), Failed> {
+    if args.baselines {
+        return Err(Failed::usage(
+            "--baselines needs the simulator of this program: leave out --env and --env-command",
+        ));
     }
-    Ok(())
+    if args.record.is_some() || args.record_dir.is_some() {
+        return Err(Failed::usage(
+            "--record and --record-dir need the simulator of this program: leave out --env and --env-command",
+        ));
+    }
+    let (part, path) = match (&args.policy, &args.composed_teachers) {
+        (Some(path), _) => (Part::AllArms, path),
+        (None, Some(path)) => (Part::EachArm(args.arms), path),
+        (None, None) => return Err(no_policy()),
+    };
+    let policy = policy_file::load(path)?;
+    check_required(args, &policy.layout, part)?;
+    let goals = (args.episodes, args.seed);
+    let result = measure_served(&args.environment, (part, &policy), goals, false)?;
+    print(args, &result, &Baselines::none())
+}
+
+fn print(args: &EvalArgs, result: &EvaluationResult, baselines: &Baselines) -> Result<(), Failed> {
+    if args.json {
+        return output::print(baselines.json(result));
+    }
+    let (task, n_arms) = (result.task.name(), result.task.n_arms());
+    output::print(format_args!("task          {task}, arms {n_arms}, seed {}", args.seed))?;
+    result.lines().iter().try_for_each(output::print)?;
+    baselines.table(result).map_or(Ok(()), output::print)?;
+    output::print(format_args!("speed         {:.0} env steps/s", result.steps_per_s))?;
+    let recorded = args.record.iter().chain(&args.record_dir);
+    recorded
+        .map(|path| path.display())
+        .try_for_each(|path| output::print(format_args!("recorded      {path}")))
 }
 
 /// Returns the terms of an evaluation, for the metadata of its logs.
@@ -89,8 +117,26 @@ fn subject(args: &EvalArgs) -> Result<EvaluatedPolicy, Failed> {
         (None, Some(path)) => {
             EvaluatedPolicy::composed(policy_file::load(path)?, args.arms.unwrap_or(2), path)?
         }
-        (None, None) => return Err(Failed::usage("give --policy or --composed-teachers")),
+        (None, None) => return Err(no_policy()),
     };
     check_layout(subject.layout(), (args.task, args.world), args.arms)?;
     Ok(subject)
+}
+
+/// Rejects a task other than the one that the command line requires; for a part of the arms, whatever their number.
+fn check_required(args: &EvalArgs, task: &TaskSpec, part: Part) -> Result<(), Failed> {
+    let named = (args.task, args.world);
+    match task.as_built_in() {
+        Some(layout) if part == Part::AllArms => check_layout(layout, named, args.arms),
+        Some(layout) => check_task(layout.task, args.task, args.world),
+        None if named == (None, None) => Ok(()),
+        None => Err(Failed::usage(format!(
+            "the policy is for {}, which is no task of the simulator: leave out --task and --world",
+            task.name()
+        ))),
+    }
+}
+
+fn no_policy() -> Failed {
+    Failed::usage("give --policy or --composed-teachers")
 }

@@ -1,10 +1,13 @@
 //! Evaluations: a policy alone on fixed goals, without noise or advice.
 
+mod served;
+
 use std::num::NonZeroUsize;
 use std::path::Path;
+use std::time::Duration;
 
 use serde_json::{Value, json};
-use tandem_core::{Episode, EpisodeOutcome, EvaluationSummary, Layout, Wilson};
+use tandem_core::{Episode, EpisodeOutcome, EvaluationSummary, Layout, TaskSpec, Wilson};
 use tandem_policy::{BlindActor, Policy};
 use tandem_sim::WorldConfig;
 use tandem_telemetry::ContactMetrics;
@@ -12,6 +15,8 @@ use tandem_worker::{ComposedTeachers, evaluate};
 
 use crate::exit::{Exit, Failed, OrExit as _};
 use crate::{clock, output};
+
+pub(crate) use served::{Part, measure_served};
 
 /// The policy that acts in an evaluation.
 #[derive(Debug, Clone)]
@@ -91,7 +96,7 @@ impl EvaluatedPolicy {
                 evaluate(|| blind.clone(), layout, &world, n_episodes, seed, n_threads)
             }
             Self::Composed(..) => evaluate(
-                || ComposedTeachers(actor.clone()),
+                || ComposedTeachers::new(actor.clone(), layout),
                 layout,
                 &world,
                 n_episodes,
@@ -108,7 +113,8 @@ fn simulated(policy: Policy, path: &Path) -> Result<Policy, Failed> {
     match policy.layout.as_built_in() {
         Some(_) => Ok(policy),
         None => Err(Failed::usage(format!(
-            "{} is for task {:?}, which the simulator does not have: evaluate it with the learner of its run",
+            "{} is for task {:?}, which the simulator does not have: evaluate it with `tandem eval --env ADDR` or \
+             `--env-command CMD`",
             path.display(),
             policy.layout.name()
         ))),
@@ -118,7 +124,7 @@ fn simulated(policy: Policy, path: &Path) -> Result<Policy, Failed> {
 /// The episodes and the results of an evaluation.
 pub(crate) struct EvaluationResult {
     pub(crate) episodes: Vec<Episode>,
-    pub(crate) layout: Layout,
+    pub(crate) task: TaskSpec,
     pub(crate) summary: EvaluationSummary,
     pub(crate) steps_per_s: f64,
     pub(crate) policy_digest: String,
@@ -132,25 +138,34 @@ pub(crate) fn measure(
 ) -> Result<EvaluationResult, Failed> {
     let start = clock::now();
     let episodes = subject.play(n_episodes, seed)?;
-    let n_steps: usize = episodes.iter().map(Episode::n_steps).sum();
-    let steps_per_s = n_steps as f64 / start.elapsed().as_secs_f64();
-    let outcomes: Vec<EpisodeOutcome> = episodes.iter().map(EpisodeOutcome::of).collect();
-    let summary = EvaluationSummary::of(&outcomes);
-    Ok(EvaluationResult {
-        episodes,
-        layout: subject.layout(),
-        summary,
-        steps_per_s,
-        policy_digest: subject.policy().digest(),
-    })
+    let (task, digest) = (subject.layout().into(), subject.policy().digest());
+    Ok(EvaluationResult::of(episodes, task, digest, start.elapsed()))
 }
 
 impl EvaluationResult {
+    /// Summarizes episodes of `task` that were played in `elapsed`.
+    fn of(
+        episodes: Vec<Episode>,
+        task: TaskSpec,
+        policy_digest: String,
+        elapsed: Duration,
+    ) -> Self {
+        let n_steps = episodes.iter().map(Episode::n_steps).sum::<usize>();
+        let outcomes: Vec<EpisodeOutcome> = episodes.iter().map(EpisodeOutcome::of).collect();
+        Self {
+            summary: EvaluationSummary::of(&outcomes),
+            steps_per_s: n_steps as f64 / elapsed.as_secs_f64(),
+            episodes,
+            task,
+            policy_digest,
+        }
+    }
+
     pub(crate) fn json(&self) -> Value {
         let contacts = ContactMetrics::of(&self.summary);
         let mut value = json!({
-            "task": self.layout.task.name(),
-            "arms": self.layout.n_arms,
+            "task": self.task.name(),
+            "arms": self.task.n_arms(),
             "episodes": self.summary.n_episodes,
             "success_without_contact": contacts.success_without_contact,
             "success_without_contact_low": contacts.success_without_contact_low,
@@ -176,7 +191,7 @@ impl EvaluationResult {
 
     /// Returns the results as text, one line each.
     pub(crate) fn lines(&self) -> Vec<String> {
-        let (summary, n_arms) = (&self.summary, self.layout.n_arms);
+        let (summary, n_arms) = (&self.summary, self.task.n_arms());
         let share = |label: &str, share: f64| {
             let Wilson { low, high } = summary.interval_of(share);
             format!("{label:<13} {share:.3}   95 % interval {low:.3} to {high:.3}")

@@ -33,6 +33,7 @@ mod run_directory;
 mod run_file;
 mod runtime;
 mod scene;
+mod served_task;
 mod service;
 mod signals;
 mod status;

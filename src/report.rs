@@ -87,16 +87,16 @@ fn baselines(args: &ReportArgs) -> Result<Vec<Baseline>, Failed> {
         let composed = EvaluatedPolicy::composed(policy_file::load(path)?, 2, path)?;
         let result = measure(&composed, TEST_EPISODES, TEST_SEED)?;
         let label = format!("composed {}", stem(path));
-        baselines.push(Baseline { label, test: test_evaluation(&result) });
+        baselines.push(Baseline { label, test: test_evaluation(&composed, &result) });
     }
     Ok(baselines)
 }
 
-fn test_evaluation(result: &EvaluationResult) -> TestEvaluation {
-    let summary = &result.summary;
+fn test_evaluation(subject: &EvaluatedPolicy, result: &EvaluationResult) -> TestEvaluation {
+    let (layout, summary) = (subject.layout(), &result.summary);
     TestEvaluation {
-        task: result.layout.task.to_string(),
-        n_arms: result.layout.n_arms,
+        task: layout.task.to_string(),
+        n_arms: layout.n_arms,
         n_episodes: summary.n_episodes as u64,
         success: summary.success,
         interval: (summary.interval.low, summary.interval.high),

@@ -18,12 +18,13 @@ use serde_json::{Value, json};
 use tokio::task::JoinSet;
 use tokio_util::sync::CancellationToken;
 
-use crate::cli::SweepArgs;
+use crate::cli::{EnvironmentArgs, SweepArgs};
 use crate::exit::{Exit, Failed, OrExit as _};
 use crate::{output, runtime, signals};
 use display::Display;
 use run_process::{RunOutcome, RunProcess};
 use run_status::{RunStatus, State};
+use sweep_file::PlannedSweep;
 
 /// Time between two updates of the live lines.
 const REFRESH_EVERY: Duration = Duration::from_secs(1);
@@ -32,11 +33,11 @@ const MAX_NAMED: usize = 3;
 
 pub(crate) fn sweep(args: &SweepArgs) -> Result<(), Failed> {
     let out = args.out.clone().unwrap_or_else(|| default_out(&args.file));
-    let planned = sweep_file::read(&args.file)?;
+    let PlannedSweep { runs, environment } = sweep_file::read(&args.file)?;
     let lock = if args.dry_run { None } else { Some(lock(&out).or_cannot_write(String::new)?) };
     let mut statuses = Vec::new();
     let mut refused = Vec::new();
-    for run in planned {
+    for run in runs {
         match RunStatus::of(run, &out) {
             Ok(status) => statuses.push(status),
             Err(error) => refused.push(format!("{error:#}")),
@@ -49,7 +50,8 @@ pub(crate) fn sweep(args: &SweepArgs) -> Result<(), Failed> {
     let runtime = runtime::new().or_exit(Exit::TryAgain, String::new)?;
     let is_complete = runtime.block_on(async {
         let interrupted = signals::shutdown_token(false)?;
-        Sweep::new(statuses.as_mut_slice(), usize::from(args.jobs)).run(&interrupted).await
+        let sweep = Sweep::new(statuses.as_mut_slice(), usize::from(args.jobs), &environment);
+        sweep.run(&interrupted).await
     })?;
     drop(lock);
     if !is_complete {
@@ -102,11 +104,13 @@ struct Sweep<'a> {
     /// Indices of the runs that are not started yet.
     waiting: VecDeque<usize>,
     n_jobs: usize,
+    /// The server of the environments of all runs.
+    environment: &'a EnvironmentArgs,
     display: Display,
 }
 
 impl<'a> Sweep<'a> {
-    fn new(statuses: &'a mut [RunStatus], n_jobs: usize) -> Self {
+    fn new(statuses: &'a mut [RunStatus], n_jobs: usize, environment: &'a EnvironmentArgs) -> Self {
         let is_unfinished =
             |(_, status): &(usize, &RunStatus)| !matches!(status.state, State::Finished(_));
         let waiting: VecDeque<usize> =
@@ -121,7 +125,7 @@ impl<'a> Sweep<'a> {
                 display.print(&format!("{} failed before and is retried: {why}", status.run.name));
             }
         }
-        Self { statuses, waiting, n_jobs, display }
+        Self { statuses, waiting, n_jobs, environment, display }
     }
 
     /// Trains every unfinished run. Returns whether all of them have ended.
@@ -177,7 +181,8 @@ impl<'a> Sweep<'a> {
         running: &mut JoinSet<(usize, RunOutcome)>,
         interrupted: &CancellationToken,
     ) -> Result<(), Failed> {
-        let run = RunProcess::prepare(&self.statuses[idx], self.workers_per_run())
+        let (status, n_workers) = (&self.statuses[idx], self.workers_per_run());
+        let run = RunProcess::prepare(status, self.environment, n_workers)
             .or_cannot_write(String::new)?;
         self.display.started(&run.name, run.log_path());
         let stop = interrupted.clone();

@@ -2,8 +2,10 @@
 
 mod arguments;
 mod display;
+mod environment_file;
 mod inputs;
 mod plan;
+mod policy_server;
 mod processes;
 mod progress_stream;
 mod restart_policy;
@@ -14,17 +16,13 @@ mod teacher_file;
 use std::time::{Duration, Instant};
 
 use anyhow::anyhow;
-use tandem_net::ClientConfig;
 use tandem_proto::pb;
-use tandem_worker::ServedTask;
 use tokio::sync::mpsc;
 use tokio_util::sync::CancellationToken;
 
 use crate::cli::TrainArgs;
-use crate::environment_server::EnvironmentSource;
 use crate::exit::{Exit, Failed, OrExit as _};
-use crate::service::worker_failed;
-use crate::{clock, runtime, signals};
+use crate::{clock, runtime, served_task, signals};
 use display::Display;
 use inputs::RunInputs;
 use plan::Plan;
@@ -44,8 +42,9 @@ const SAMPLE_EVERY: Duration = Duration::from_millis(500);
 const INTERRUPTED: &str = "interrupted";
 
 pub(crate) fn train(args: &TrainArgs) -> Result<(), Failed> {
-    let served = served_task(args)?;
-    let plan = Plan::of(args, served.as_ref())?;
+    let environment = environment_file::environment_of(args)?;
+    let served = served_task::of_server(&environment)?;
+    let plan = Plan::of(args, environment, served.as_ref())?;
     let lock = RunLock::take(&plan)?;
     let service_locks = lock.wait_for_leftovers(&plan)?;
     plan.prepare()?;
@@ -61,18 +60,7 @@ pub(crate) fn train(args: &TrainArgs) -> Result<(), Failed> {
         summary::print_interrupted(&plan);
         return Err(Failed::new(Exit::Interrupted, anyhow!(INTERRUPTED)));
     }
-    summary::print(&plan, &last, memory, args.json)
-}
-
-/// Asks the server of the environments, if there is one, for its task.
-fn served_task(args: &TrainArgs) -> Result<Option<ServedTask>, Failed> {
-    let runtime = runtime::new().or_exit(Exit::TryAgain, String::new)?;
-    runtime.block_on(async {
-        let source = EnvironmentSource::of(&args.environment, &ClientConfig::default())?;
-        let served = source.served_task().await;
-        source.end().await;
-        served.map_err(worker_failed)
-    })
+    summary::print(&plan, &last, memory, args)
 }
 
 /// Starts all processes, supervises them until the run has ended, and ends them.
@@ -209,10 +197,12 @@ impl<'a> Supervisor<'a> {
             return;
         }
         self.stream = stream;
-        if self.last.task.is_empty()
-            && let Err(failed) = self.plan.keep_teacher()
-        {
-            self.display.print(&format!("{:#}", failed.into_error()));
+        if self.last.task.is_empty() {
+            for kept in [self.plan.keep_teacher(), self.plan.keep_environment()] {
+                if let Err(failed) = kept {
+                    self.display.print(&format!("{:#}", failed.into_error()));
+                }
+            }
         }
         if self.awaits_learner && is_new_stream {
             self.awaits_learner = false;

@@ -134,8 +134,30 @@ fn a_run_whose_workers_start_their_servers_has_the_same_digest() {
     let result = summary(&train(&["--env-command", &command], &out));
     assert_eq!(result["digest"], IN_PROCESS["digest"]);
     let pids = fs::read_to_string(pids).expect("servers were started");
-    assert_eq!(pids.lines().count(), 3, "one to check the task, one per worker");
+    assert_eq!(pids.lines().count(), 4, "one to check the task, one per worker, one for the test");
     assert!(eventually(|| !pids.lines().any(is_running)), "servers remain: {pids}");
+}
+
+#[test]
+fn an_evaluation_on_a_server_gives_the_results_of_one_in_this_process() {
+    let server = Server::start(&[]);
+    let command = format!("'{}' env", env!("CARGO_BIN_EXE_tandem"));
+    let policies = [
+        ["--policy", "policies/student-push.safetensors"],
+        ["--composed-teachers", "policies/teacher-push.safetensors"],
+    ];
+    for (policy, environment) in
+        policies.into_iter().zip([["--env", &server.address], ["--env-command", &command]])
+    {
+        let eval = |more: &[&str]| {
+            let mut eval = tandem();
+            eval.args(["eval", "--json", "--episodes", "20"]).args(policy).args(more);
+            let mut result = summary(&eval.output().expect("runs"));
+            result.as_object_mut().expect("an object").remove("steps_per_s");
+            result
+        };
+        assert_eq!(eval(&environment), eval(&[]), "{policy:?}");
+    }
 }
 
 #[test]
@@ -157,6 +179,17 @@ fn a_server_that_dies_during_a_run_changes_nothing() {
     kill(2);
     let result = summary(&run.wait_with_output().expect("ends"));
     assert_eq!(result["digest"], IN_PROCESS["digest"]);
+}
+
+#[test]
+fn an_address_in_use_is_reported_with_what_to_do() {
+    let server = Server::start(&[]);
+    let address = server.address.strip_prefix("http://").expect("the contract");
+    let refused = tandem().args(["env", "--listen", address]).output().expect("runs");
+    assert_eq!(refused.status.code(), Some(75), "{}", stderr(&refused));
+    let line = stderr(&refused);
+    assert!(line.starts_with(&format!("tandem: cannot listen on {address}: stop the program")));
+    assert!(line.contains("choose another --listen") && line.lines().count() == 1, "{line}");
 }
 
 #[test]

@@ -117,7 +117,7 @@ fn slot(kind: Kind) -> SlotOrder {
 fn record(layout: Layout, kind: Kind, substeps: u32, directory: &Path) -> Vec<PathBuf> {
     let (terms, slot) = (terms(layout, kind, substeps), slot(kind));
     let world = Env::new(layout, &WorldConfig { substeps, ..WorldConfig::default() });
-    let mut actor = ComposedTeachers(teacher(layout.task));
+    let mut actor = ComposedTeachers::new(teacher(layout.task), layout);
     let mut advisor = EagerTeacher(teacher(layout.task), layout);
     let mut world = Simulator::new(world.expect("in range"));
     let episodes = play_slot(&mut world, &slot, &terms, &mut actor, &mut advisor).expect("plays");

@@ -19,7 +19,8 @@ pub struct Exploration {
     pub noise_std: f32,
     /// Probability that an arm's step takes a random action, in [0, 1) (baselines HER: `random_eps`).
     pub random_action_prob: f32,
-    /// Mean number of steps for which an arm repeats a random action, 1 to 50; 1 draws a new one each step.
+    /// Mean number of steps for which an arm repeats a random action, 1 to the steps of an episode; 1 draws a
+    /// new one each step.
     pub sticky_random_mean_steps: f32,
 }
 
@@ -28,20 +29,21 @@ impl Exploration {
     pub const NONE: Self =
         Self { noise_std: 0.0, random_action_prob: 0.0, sticky_random_mean_steps: 1.0 };
 
-    /// Checks every range; NaN is in none.
+    /// Checks every range for a task with episodes of `episode_steps` steps; NaN is in none.
     ///
     /// # Errors
     /// Names the first setting that is out of its range.
-    pub fn check(&self) -> Result<(), OutOfRange> {
+    pub fn check(&self, episode_steps: usize) -> Result<(), OutOfRange> {
         let Self { noise_std, random_action_prob, sticky_random_mean_steps } = *self;
         let is_noise = (0.0..=10.0).contains(&noise_std);
         OutOfRange::unless(is_noise, "exploration.noise_std", noise_std, "0 to 10")?;
         let is_prob = (0.0..1.0).contains(&random_action_prob);
         let key = "exploration.random_action_prob";
         OutOfRange::unless(is_prob, key, random_action_prob, "a number in [0, 1)")?;
-        let is_mean = (1.0..=50.0).contains(&sticky_random_mean_steps);
+        let is_mean = (1.0..=episode_steps as f64).contains(&f64::from(sticky_random_mean_steps));
         let key = "exploration.sticky_random_mean_steps";
-        OutOfRange::unless(is_mean, key, sticky_random_mean_steps, "1 to 50")
+        let expected = format_args!("1 to {episode_steps}, the steps of an episode").to_string();
+        OutOfRange::unless(is_mean, key, sticky_random_mean_steps, expected)
     }
 }
 
@@ -172,8 +174,13 @@ mod tests {
         let world = WorldSettings { grasped_start_prob: f32::NAN, ..WORLD };
         assert_eq!(world.check().map_err(|error| error.key), Err("world.grasped_start_prob"));
         let exploration = Exploration { random_action_prob: 1.0, ..Exploration::NONE };
-        let message = exploration.check().expect_err("out of range").to_string();
+        let message = exploration.check(50).expect_err("out of range").to_string();
         assert_eq!(message, "exploration.random_action_prob is 1: expected a number in [0, 1)");
-        assert_eq!((Exploration::NONE.check(), WORLD.check()), (Ok(()), Ok(())));
+        let sticky = Exploration { sticky_random_mean_steps: 80.0, ..Exploration::NONE };
+        let message = sticky.check(50).expect_err("longer than an episode").to_string();
+        let expected =
+            "exploration.sticky_random_mean_steps is 80: expected 1 to 50, the steps of an episode";
+        assert_eq!((message.as_str(), sticky.check(100)), (expected, Ok(())));
+        assert_eq!((Exploration::NONE.check(1), WORLD.check()), (Ok(()), Ok(())));
     }
 }

@@ -7,10 +7,11 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
-use tandem_core::Episode;
+use tandem_core::task::TaskDifference;
+use tandem_core::{Episode, TaskSpec};
 use tandem_net::{AuthChannel, Backoff, ClientConfig, ClientConfigError, Operation, retry, within};
-use tandem_proto::pb;
 use tandem_proto::pb::teacher_client::TeacherClient;
+use tandem_proto::{DecodeError, decode_task, pb};
 use tandem_telemetry::events::AdviceAccountOpened;
 use tokio_util::sync::{CancellationToken, DropGuard};
 use tonic::{Code, Status};
@@ -43,6 +44,15 @@ pub enum TeacherError {
         /// The reason that it gave.
         reason: String,
     },
+    /// The teacher's response cannot be decoded.
+    #[error("the teacher's task cannot be read")]
+    Malformed(#[from] DecodeError),
+    /// The teacher advises on another task.
+    #[error(
+        "the teacher is for another task than one arm of the run's: {} is {} in the run and {} at the teacher",
+        .0.field, .0.first, .0.second
+    )]
+    OtherTask(TaskDifference),
     /// The teacher does not know the account.
     #[error("the teacher does not know the account: {0}")]
     UnknownAccount(String),
@@ -107,6 +117,8 @@ pub(crate) struct AccountOptions<'a> {
     pub(crate) client_config: &'a ClientConfig,
     /// The teacher's address.
     pub(crate) address: &'a str,
+    /// The task of one arm of the run.
+    pub(crate) one_arm: &'a TaskSpec,
     /// Name, budget and strategy, from the run file.
     pub(crate) terms: pb::OpenAccountRequest,
     /// Units that an episode can use.
@@ -138,14 +150,15 @@ impl AdviceAccount {
     /// Opens the account, or continues with it if it exists.
     ///
     /// # Errors
-    /// When the address is malformed, the teacher refuses, or the run is stopped meanwhile.
+    /// When the address is malformed, the teacher refuses or is for another task, or the run is stopped meanwhile.
     pub(crate) fn open(
         options: AccountOptions<'_>,
         warnings: &Warnings,
         runtime: &Runtime,
         shutdown: &CancellationToken,
     ) -> Result<Self, TeacherError> {
-        let AccountOptions { client_config, address, terms, units_per_episode, start } = options;
+        let AccountOptions { client_config, address, one_arm, terms, units_per_episode, start } =
+            options;
         let inside = runtime.enter();
         let client = TeacherClient::new(client_config.channel(address)?);
         drop(inside);
@@ -163,6 +176,7 @@ impl AdviceAccount {
             lost: lost.clone(),
             _watch: stop_watching.clone().drop_guard(),
         };
+        account.check_task(one_arm)?;
         match start {
             RunStart::New => account.open_account(budget, 0)?,
             RunStart::Resumed { spent } => account.resume(spent)?,
@@ -175,6 +189,27 @@ impl AdviceAccount {
             }
         });
         Ok(account)
+    }
+
+    /// Checks that the teacher advises on the task of one arm.
+    fn check_task(&self, one_arm: &TaskSpec) -> Result<(), TeacherError> {
+        let described = self.call("describe its task", |mut client| async move {
+            client.describe(pb::DescribeRequest {}).await
+        })?;
+        // Teachers of earlier versions have built-in tasks and send only their names.
+        let task = match described.task_description {
+            Some(description) => Some(decode_task(description)?),
+            None => described.task.parse().ok().map(|task| TaskSpec::built_in(task, 1)),
+        };
+        let name_differs = || TaskDifference {
+            field: "name".to_owned(),
+            first: format!("{:?}", one_arm.name()),
+            second: format!("{:?}", described.task),
+        };
+        match task.map_or_else(|| Some(name_differs()), |task| one_arm.difference(&task)) {
+            Some(difference) => Err(TeacherError::OtherTask(difference)),
+            None => Ok(()),
+        }
     }
 
     /// Returns the name under which workers ask for advice.

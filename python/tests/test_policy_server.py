@@ -234,6 +234,10 @@ def test_a_teacher_refuses_what_is_not_a_policy_server(tmp_path):
         assert code == 64 and "cannot be used" in line, line
 
 
-def test_a_run_on_one_machine_needs_the_file_of_its_teacher(tmp_path):
-    code, line = refusal("train", "--teacher", "http://127.0.0.1:1", "--out", str(tmp_path / "run"))
-    assert code == 64 and "`tandem train` needs a file" in line, line
+def test_a_run_refuses_a_policy_server_with_a_token(tmp_path):
+    token = tmp_path / "token"
+    token.write_text("0123456789abcdef")
+    with tandem.PolicyServer(follow, task="push", token_file=token) as server:
+        code, line = refusal("train", "--teacher", server.address, "--out", str(tmp_path / "run"))
+    assert code == 64 and "requires a token" in line, line
+    assert not (tmp_path / "run").exists()

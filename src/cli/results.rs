@@ -14,7 +14,9 @@ Examples:
   tandem eval --policy FILE --episodes 400 --seed 7 --json
   tandem eval --policy policies/student-push.safetensors --baselines
   tandem eval --composed-teachers policies/teacher-push.safetensors
-  tandem eval --policy FILE --episodes 1 --record episode.mcap")]
+  tandem eval --policy FILE --episodes 1 --record episode.mcap
+  tandem eval --policy FILE --env 127.0.0.1:7005             in the environments of a server
+  tandem eval --policy FILE --env-command 'tandem env'       starts the server")]
 pub(crate) struct EvalArgs {
     /// Policy to evaluate.
     #[arg(long, value_name = "FILE", group = "who")]
@@ -35,9 +37,11 @@ pub(crate) struct EvalArgs {
     /// Fails unless the policy is for this world.
     #[arg(long, value_enum)]
     pub(crate) world: Option<WorldName>,
-    /// Number of arms [default: the policy's; 2 for composed teachers].
+    /// Number of arms [default: the policy's; for composed teachers the server's, or 2].
     #[arg(long)]
     pub(crate) arms: Option<usize>,
+    #[command(flatten)]
+    pub(crate) environment: EnvironmentArgs,
     /// Number of episodes, one per goal.
     #[arg(long, default_value_t = 240, value_parser = clap::value_parser!(u64).range(1..=1_000_000))]
     pub(crate) episodes: u64,

@@ -62,6 +62,9 @@ pub(crate) struct TeacherArgs {
     /// (https:// with --tls-ca) of a server of tandem.v1.Policy, which is called with the token of --token-file.
     #[arg(long, value_name = "FILE|URL")]
     pub(crate) policy: PathBuf,
+    /// Fails unless the policy has this digest, as `policy_digest` of `Describe` and `tandem policy show` give it.
+    #[arg(long, value_name = "DIGEST")]
+    pub(crate) policy_digest: Option<String>,
     /// ONNX model of the actor's critic. Without it, strategies that compare values are not offered.
     #[arg(long, value_name = "FILE.onnx")]
     pub(crate) critic: Option<PathBuf>,
@@ -133,8 +136,8 @@ pub(crate) struct LearnerArgs {
     pub(crate) secret: SecretArgs,
 }
 
-/// The environments of workers.
-#[derive(Debug, Args)]
+/// The server of environments.
+#[derive(Debug, Clone, Default, PartialEq, Args)]
 pub(crate) struct EnvironmentArgs {
     /// Plays in the environments of the server at this address [default: simulates the environments in the worker].
     #[arg(long, value_name = "ADDR")]
@@ -143,9 +146,9 @@ pub(crate) struct EnvironmentArgs {
     /// the address from TANDEM_ENV_LISTEN and prints `listening on http://HOST:PORT`.
     #[arg(long, value_name = "CMD", conflicts_with = "env")]
     pub(crate) env_command: Option<String>,
-    /// Deadline of the start of the environment command and of each reply of the server, seconds.
-    #[arg(long, default_value = "60", value_name = "S", value_parser = seconds)]
-    pub(crate) env_timeout_s: Duration,
+    /// Deadline of the start of the environment command and of each reply of the server, seconds [default: 60].
+    #[arg(long, value_name = "S", value_parser = seconds)]
+    pub(crate) env_timeout_s: Option<Duration>,
     /// File with the access token of the server at --env [default: --token-file, if there is one].
     #[arg(long, value_name = "FILE", requires = "env")]
     pub(crate) env_token_file: Option<PathBuf>,

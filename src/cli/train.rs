@@ -22,6 +22,7 @@ Examples:
   tandem train --world shared                         both arms share one area and are slow
   tandem train --strategy ea --budget 50000 --seed 2 --max-minutes 20
   tandem train --teacher actor.onnx --teacher-critic critic.onnx
+  tandem train --teacher http://127.0.0.1:7005        a policy in another process
   tandem train --set ddpg.discount=0.98 --set rounds.slots=16
   tandem train --run my-run.toml --out runs/mine
   tandem train --env 127.0.0.1:7005                   plays in the environments of a server
@@ -43,8 +44,9 @@ pub(crate) struct TrainArgs {
     /// [default: mc-q:0.1 with two arms, none with one].
     #[arg(long, value_name = "NAME[:THRESHOLD]")]
     pub(crate) strategy: Option<String>,
-    /// Policy file of the teacher, or the ONNX model of an actor (*.onnx) [default: the shipped teacher of the task].
-    #[arg(long, value_name = "FILE")]
+    /// Policy file of the teacher, the ONNX model of an actor (*.onnx), or http://HOST:PORT of a server of
+    /// tandem.v1.Policy without a token [default: the shipped teacher of the task].
+    #[arg(long, value_name = "FILE|URL")]
     pub(crate) teacher: Option<PathBuf>,
     /// ONNX model of the teacher's critic. Without it, strategies that compare values cannot be used.
     #[arg(long, value_name = "FILE.onnx", requires = "teacher")]
@@ -81,7 +83,8 @@ pub(crate) struct TrainArgs {
     /// Run directory [default: runs/TASK-ARMS-STRATEGY-seedN].
     #[arg(long, value_name = "DIR")]
     pub(crate) out: Option<PathBuf>,
-    /// Resumes the run in --out from its newest checkpoint. The settings and the teacher remain those of the run; only
+    /// Resumes the run in --out from its newest checkpoint. Settings and teacher remain those of the run, and so does the
+    /// server of its environments unless --env or --env-command names another one. Only
     /// its end (--max-env-steps, --max-minutes, --until-success), checkpoint.*, evaluation.recorded_episodes,
     /// evaluation.test_episodes and --workers can change. A rejected --resume changes nothing.
     #[arg(long, requires = "out")]

@@ -13,10 +13,15 @@ use crate::policy_file;
 pub(super) struct Baselines(Vec<(&'static str, EvaluationResult)>);
 
 impl Baselines {
+    /// Returns no baselines.
+    pub(super) const fn none() -> Self {
+        Self(Vec::new())
+    }
+
     /// Evaluates composed teachers and the blind policy on the goals of the policy, or nothing without `--baselines`.
     pub(super) fn measure(args: &EvalArgs, subject: &EvaluatedPolicy) -> Result<Self, Failed> {
         if !args.baselines {
-            return Ok(Self(Vec::new()));
+            return Ok(Self::none());
         }
         let layout = subject.layout();
         if layout.n_arms < 2 {

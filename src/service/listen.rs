@@ -1,11 +1,13 @@
 //! The address of a service.
 
+use std::io::ErrorKind;
+
 use tandem_net::{Capacity, Incoming};
 use tandem_system::fd_limit;
 use tokio::net::TcpListener;
 
 use crate::cli::ListenArgs;
-use crate::exit::{Exit, Failed, OrExit as _};
+use crate::exit::{Exit, Failed};
 use crate::output;
 
 /// Binds the address and prints it as one line of standard output. If that line cannot be written, the service runs all
@@ -26,11 +28,20 @@ async fn listen_as(scheme: &str, args: &ListenArgs) -> Result<Incoming, Failed> 
         let address = listener.local_addr()?;
         Ok::<_, std::io::Error>((listener, address))
     };
-    let (listener, address) =
-        bind.await.or_exit(Exit::TryAgain, || format!("cannot listen on {}", args.listen))?;
+    let (listener, address) = bind.await.map_err(|error| cannot_listen(args, error))?;
     if let Err(failed) = output::print(format_args!("listening on {scheme}{address}")) {
         let error = failed.into_error();
         tracing::warn!(%address, "cannot print the address: {error:#}");
     }
     Ok(Incoming::from(listener).with_capacity(capacity))
+}
+
+fn cannot_listen(args: &ListenArgs, error: std::io::Error) -> Failed {
+    let advice = match error.kind() {
+        ErrorKind::AddrInUse => {
+            ": stop the program that uses it, or choose another --listen (port 0 selects a free port)"
+        }
+        _ => "",
+    };
+    Failed::new(Exit::TryAgain, error).context(format!("cannot listen on {}{advice}", args.listen))
 }

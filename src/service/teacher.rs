@@ -20,11 +20,13 @@ pub(crate) fn teacher(args: TeacherArgs) -> Result<(), Failed> {
     run(async move {
         let shutdown = signals::shutdown_token(args.listen.exit_with_stdin)?;
         let opened = async {
-            let policy = source.open(&client_config).await?;
-            Advisor::new(policy, open_ledger(args.ledger)?)
+            let policy = source.open(&client_config).await.map_err(teacher_failed)?;
+            check_digest(&policy, args.policy_digest.as_deref())?;
+            let ledger = open_ledger(args.ledger).map_err(teacher_failed)?;
+            Advisor::new(policy, ledger).map_err(teacher_failed)
         };
         let advisor = tokio::select! {
-            advisor = opened => advisor.map_err(teacher_failed)?,
+            advisor = opened => advisor?,
             () = shutdown.cancelled() => return Ok(()),
         };
         let listener = listen(&args.listen).await?;
@@ -69,6 +71,17 @@ impl PolicySource {
                 Ok(RemotePolicy::connect(address, client_config, timeouts).await?.into())
             }
         }
+    }
+}
+
+/// Rejects a policy with another digest than the command line requires.
+fn check_digest(policy: &AnyPolicy, required: Option<&str>) -> Result<(), Failed> {
+    match required.filter(|required| *required != policy.digest()) {
+        Some(required) => Err(Failed::usage(format!(
+            "the policy has digest {}, not {required} as --policy-digest requires: serve that policy",
+            policy.digest()
+        ))),
+        None => Ok(()),
     }
 }
 

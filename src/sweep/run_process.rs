@@ -16,8 +16,9 @@ use tokio::io::AsyncReadExt as _;
 use tokio_util::sync::CancellationToken;
 
 use super::run_status::{RunStatus, State};
+use crate::cli::EnvironmentArgs;
 use crate::launch::{Launcher, ProcessLog, last_line};
-use crate::run_file;
+use crate::{environment_server, run_file};
 
 /// Time that a run has to save and exit.
 const END_TIMEOUT: Duration = Duration::from_secs(150);
@@ -45,7 +46,11 @@ pub(super) enum RunOutcome {
 
 impl RunProcess {
     /// Prepares the directory of an unfinished run. With `n_workers` of `None`, `tandem train` chooses the number.
-    pub(super) fn prepare(status: &RunStatus, n_workers: Option<usize>) -> anyhow::Result<Self> {
+    pub(super) fn prepare(
+        status: &RunStatus,
+        environment: &EnvironmentArgs,
+        n_workers: Option<usize>,
+    ) -> anyhow::Result<Self> {
         let RunStatus { run, dir, state, .. } = status;
         std::fs::create_dir_all(dir).with_context(|| format!("cannot create {}", dir.display()))?;
         let mut args: Vec<OsString> = vec![
@@ -66,6 +71,7 @@ impl RunProcess {
         if let Some(n_workers) = n_workers {
             args.extend(["--workers".into(), n_workers.to_string().into()]);
         }
+        args.extend(environment_server::arguments(environment));
         Ok(Self { name: run.name.clone(), dir: dir.clone(), args })
     }
 

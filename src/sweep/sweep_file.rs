@@ -2,14 +2,16 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
+use std::time::Duration;
 
 use anyhow::{Context as _, anyhow, bail, ensure};
 use serde::Deserialize;
 use tandem_rl::RunConfig;
 use toml::{Table, Value};
 
+use crate::cli::EnvironmentArgs;
 use crate::exit::{Exit, Failed, OrExit as _};
-use crate::{input, run_file};
+use crate::{input, run_file, served_task};
 
 /// A larger number of runs is treated as a mistake.
 const MAX_RUNS: usize = 10_000;
@@ -32,6 +34,12 @@ struct SweepFile {
     run: Table,
     /// Teacher policy files by task; the default is the shipped teacher.
     teachers: BTreeMap<String, PathBuf>,
+    /// The server of the environments of all runs, as the options of `tandem train`.
+    env: Option<String>,
+    env_command: Option<String>,
+    env_timeout_s: Option<f64>,
+    env_token_file: Option<PathBuf>,
+    env_tls_ca: Option<PathBuf>,
 }
 
 #[derive(Debug, Clone, PartialEq, Deserialize)]
@@ -40,6 +48,15 @@ struct Variant {
     name: String,
     #[serde(default)]
     set: Table,
+}
+
+/// A sweep, as its file describes it.
+#[derive(Debug)]
+pub(super) struct PlannedSweep {
+    /// The runs, in order.
+    pub(super) runs: Vec<PlannedRun>,
+    /// The server of their environments, if they are not simulated by their workers.
+    pub(super) environment: EnvironmentArgs,
 }
 
 /// A run of the sweep.
@@ -60,22 +77,61 @@ struct Choice {
     settings: Vec<(String, Value)>,
 }
 
-/// Reads the sweep file `path` and returns its runs in order. Seeds are the outermost loop, so a sweep that is stopped
-/// early has one seed of every combination.
-pub(super) fn read(path: &Path) -> Result<Vec<PlannedRun>, Failed> {
+/// Reads the sweep file `path`. If it names a server of environments and no task, asks the server for its task.
+pub(super) fn read(path: &Path) -> Result<PlannedSweep, Failed> {
     let context = || format!("sweep file {path:?}");
     let text = input::text(path).context("cannot be read").or_exit(Exit::Usage, context)?;
-    runs(&text).or_exit(Exit::Usage, context)
+    let file = parse(&text).or_exit(Exit::Usage, context)?;
+    let environment = environment(&file).or_exit(Exit::Usage, context)?;
+    let served = match names_task(&file) {
+        true => None,
+        false => {
+            served_task::of_server(&environment).map_err(|failed| failed.context(context()))?
+        }
+    };
+    let of_server = served.map(|served| served_task::settings(&served.task));
+    let runs = runs(&file, &of_server.transpose()?.unwrap_or_default());
+    Ok(PlannedSweep { runs: runs.or_exit(Exit::Usage, context)?, environment })
 }
 
-/// Returns all combinations that `text` lists.
-fn runs(text: &str) -> anyhow::Result<Vec<PlannedRun>> {
+fn parse(text: &str) -> anyhow::Result<SweepFile> {
     let file: SweepFile = toml::from_str(text).map_err(|error| parse_error(text, &error))?;
     reject_empty(&file)?;
-    let base = flattened(&file.run);
-    let (tasks, seeds) =
-        (tasks(&file), choices("seed", listed(&file.seeds).iter().map(seed_value)));
-    let (columns, axes) = (columns(&file, &base)?, axes(&file)?);
+    Ok(file)
+}
+
+/// Returns the options of the environments' server.
+fn environment(file: &SweepFile) -> anyhow::Result<EnvironmentArgs> {
+    ensure!(
+        file.env.is_none() || file.env_command.is_none(),
+        "env and env_command are both set: expected one of them"
+    );
+    for (key, path) in [("env_token_file", &file.env_token_file), ("env_tls_ca", &file.env_tls_ca)]
+    {
+        ensure!(path.is_none() || file.env.is_some(), "{key} is set without env");
+    }
+    let timeout = file.env_timeout_s.map(Duration::try_from_secs_f64).transpose().ok();
+    let timeout = timeout.filter(|timeout| timeout.is_none_or(|timeout| !timeout.is_zero()));
+    let expected = "env_timeout_s: expected a number of seconds, more than 0";
+    Ok(EnvironmentArgs {
+        env: file.env.clone(),
+        env_command: file.env_command.clone(),
+        env_timeout_s: timeout.context(expected)?,
+        env_token_file: file.env_token_file.clone(),
+        env_tls_ca: file.env_tls_ca.clone(),
+    })
+}
+
+fn names_task(file: &SweepFile) -> bool {
+    file.tasks.is_some() || ["task", "description"].iter().any(|key| file.run.contains_key(*key))
+}
+
+/// Returns all combinations that `file` lists, with seeds as the outermost loop: a sweep that is stopped early has one
+/// seed of every combination. `of_server` describes the task if the file does not name one.
+fn runs(file: &SweepFile, of_server: &[(String, Value)]) -> anyhow::Result<Vec<PlannedRun>> {
+    let base = [of_server, &flattened(&file.run)].concat();
+    let (tasks, seeds) = (tasks(file), choices("seed", listed(&file.seeds).iter().map(seed_value)));
+    let (columns, axes) = (columns(file, &base)?, axes(file)?);
     let n_runs = [tasks.len(), seeds.len(), columns.len(), axes.len()].iter().product::<usize>();
     ensure!(n_runs <= MAX_RUNS, "lists {n_runs} runs: expected at most {MAX_RUNS}");
     let mut runs = Vec::with_capacity(n_runs);
@@ -128,7 +184,8 @@ fn planned(
     let resolved = run_file::resolve(None, &settings).map_err(Failed::into_error)?;
     let column =
         if column.is_empty() { sanitized(&resolved.advice.strategy) } else { column.to_owned() };
-    let name = format!("{}-{column}{axis}-seed{}", resolved.task, resolved.seed);
+    let task = sanitized(&resolved.task);
+    let name = format!("{task}-{column}{axis}-seed{}", resolved.seed);
     ensure!(
         tandem_rl::config::is_name(&name),
         "{name:?} is no name of a run: expected 1 to 100 letters, digits, '-', '_' or '.'"

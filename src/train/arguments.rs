@@ -5,12 +5,18 @@ use std::path::Path;
 
 use super::inputs;
 use super::plan::Plan;
+use crate::environment_server;
 
 /// Returns the arguments of the teacher.
 pub(super) fn teacher(plan: &Plan) -> Vec<OsString> {
     let mut args = command("teacher");
     if let Some(teacher) = &plan.teacher {
-        push_path(&mut args, "--policy", &inputs::teacher(&plan.out, teacher));
+        if let Some(server) = teacher.server() {
+            push_address(&mut args, "--policy", Some(&server.address));
+            push_address(&mut args, "--policy-digest", Some(&server.digest));
+        } else {
+            push_path(&mut args, "--policy", &inputs::teacher(&plan.out, teacher));
+        }
         if let Some(critic) = inputs::teacher_critic(&plan.out, teacher) {
             push_path(&mut args, "--critic", &critic);
         }
@@ -49,7 +55,7 @@ pub(super) fn worker(
     push_address(&mut args, "--connect", Some(learner_address));
     push_path(&mut args, "--log-dir", &plan.out.join("mcap"));
     push_address(&mut args, "--teacher", teacher_address);
-    args.extend(plan.environment.iter().cloned());
+    args.extend(environment_server::arguments(&plan.environment));
     args
 }
 

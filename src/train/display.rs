@@ -8,8 +8,8 @@ use tandem_core::text::counted;
 use tandem_proto::pb;
 
 use super::plan::Plan;
-use crate::output;
 use crate::progress_text::{clock_text, counts_line, evaluation_line, grouped};
+use crate::{environment_server, output};
 
 /// Seconds of run time after which a plain line is printed even without news.
 const PLAIN_EVERY_S: f64 = 30.0;
@@ -62,6 +62,9 @@ impl Display {
             counted(plan.n_workers, "worker"),
             plan.out.display()
         ));
+        if let Some(server) = environment_server::shown(&plan.environment) {
+            display.print(&format!("environments of {server}"));
+        }
         display
     }
 

@@ -1,6 +1,5 @@
 //! The plan of a run: its settings, its directory, its teacher and the number of workers.
 
-use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 
 use tandem_learner::{checkpoint, settings};
@@ -8,11 +7,12 @@ use tandem_rl::RunConfig;
 use tandem_worker::ServedTask;
 use toml::Value;
 
+use super::environment_file;
 use super::teacher_file::TeacherFile;
-use crate::cli::{RecipeName, TrainArgs, chosen_task};
+use crate::cli::{EnvironmentArgs, RecipeName, TrainArgs, chosen_task};
 use crate::exit::{Exit, Failed, OrExit as _};
 use crate::service::worker_failed;
-use crate::{environment_server, policy_file, run_directory, run_file};
+use crate::{policy_file, run_directory, run_file, served_task};
 
 /// A run that can be started.
 pub(crate) struct Plan {
@@ -21,19 +21,20 @@ pub(crate) struct Plan {
     pub(crate) teacher: Option<TeacherFile>,
     pub(crate) n_workers: usize,
     pub(crate) resume: bool,
-    /// The arguments of workers that play in the environments of a server.
-    pub(crate) environment: Vec<OsString>,
+    /// The server of the environments, if workers do not simulate them.
+    pub(crate) environment: EnvironmentArgs,
 }
 
 impl Plan {
-    /// Resolves the command line, and rejects a run that cannot be started. `served` is the task of the server of
-    /// environments, if there is one.
-    pub(crate) fn of(args: &TrainArgs, served: Option<&ServedTask>) -> Result<Self, Failed> {
+    /// Resolves the command line, and rejects a run that cannot be started. `served` is the task of the server that
+    /// `environment` names, if it names one.
+    pub(crate) fn of(
+        args: &TrainArgs,
+        environment: EnvironmentArgs,
+        served: Option<&ServedTask>,
+    ) -> Result<Self, Failed> {
         let config = config(args, served)?;
-        if let Some(served) = served {
-            let task = config.layout().or_exit(Exit::Usage, String::new)?;
-            served.check(&task).map_err(worker_failed)?;
-        }
+        check_environment(&config, served)?;
         let out = match &args.out {
             Some(out) => out.clone(),
             None => free_run_directory(&config),
@@ -50,7 +51,6 @@ impl Plan {
         if !(1..=1024).contains(&n_workers) {
             return Err(Failed::usage(format!("--workers {n_workers}: expected 1 to 1024")));
         }
-        let environment = environment_server::arguments(&args.environment);
         let plan = Self { config, out, teacher, n_workers, resume: args.resume, environment };
         plan.check_directory()?;
         Ok(plan)
@@ -80,6 +80,7 @@ impl Plan {
         std::fs::create_dir_all(self.out.join("policy")).or_cannot_write(failed)?;
         // The run file comes last: a directory with a run file can be resumed.
         self.keep_teacher()?;
+        self.keep_environment()?;
         run_file::save(&self.config, &self.run_file())
     }
 
@@ -104,11 +105,11 @@ impl Plan {
     fn check_teacher(&self) -> Result<(), Failed> {
         let Some(teacher) = self.foreign_teacher() else { return Ok(()) };
         // A missing or damaged copy is replaced.
-        match TeacherFile::copy_in(&self.policies()) {
-            Some(Ok(own)) if own.digest() != teacher.digest() => Err(Failed::usage(format!(
+        match TeacherFile::stored_in(&self.policies()) {
+            Some(own) if own.digest != teacher.digest() => Err(Failed::usage(format!(
                 "--teacher {}: the run's own teacher, {}, is another policy: leave --teacher out, or start a new run",
                 teacher.path().display(),
-                own.path().display()
+                own.path.display()
             ))),
             _ => Ok(()),
         }
@@ -117,14 +118,18 @@ impl Plan {
     /// Copies the teacher's files to the run directory, unless an intact copy exists.
     pub(crate) fn keep_teacher(&self) -> Result<(), Failed> {
         let Some(teacher) = self.foreign_teacher() else { return Ok(()) };
-        let own = TeacherFile::copy_in(&self.policies());
-        if own.is_some_and(|own| own.is_ok_and(|own| own.digest() == teacher.digest())) {
+        if TeacherFile::stored_in(&self.policies()).is_some_and(|own| teacher.is_stored(&own)) {
             return Ok(());
         }
         let directory = self.policies();
         std::fs::create_dir_all(&directory)
             .or_cannot_write(|| format!("cannot write {}", directory.display()))?;
         teacher.copy_to(&directory)
+    }
+
+    /// Writes the server of the environments to the run directory, unless it is stored there.
+    pub(crate) fn keep_environment(&self) -> Result<(), Failed> {
+        environment_file::keep(&self.environment, &self.out)
     }
 
     /// Returns the teacher, unless it is the run's own copy.
@@ -162,6 +167,19 @@ impl Plan {
     }
 }
 
+/// Rejects a task that neither the server nor the simulator has.
+fn check_environment(config: &RunConfig, served: Option<&ServedTask>) -> Result<(), Failed> {
+    let task = config.layout().or_exit(Exit::Usage, String::new)?;
+    match served {
+        Some(served) => served.check(&task).map_err(worker_failed),
+        None if task.as_built_in().is_none() => Err(Failed::usage(format!(
+            "task {:?} is not built-in: name the server of its environments with --env or --env-command",
+            task.name()
+        ))),
+        None => Ok(()),
+    }
+}
+
 /// Resolves the settings; those of a resumed run come from its own run file.
 fn config(args: &TrainArgs, served: Option<&ServedTask>) -> Result<RunConfig, Failed> {
     let own_file = args.out.as_ref().filter(|_| args.resume).map(|out| out.join("run.toml"));
@@ -192,20 +210,10 @@ fn served_settings(
 ) -> Result<Vec<(String, Value)>, Failed> {
     let names_task =
         args.task.is_some() || args.world.is_some() || args.run.is_some() || args.resume;
-    let Some(task) = served.map(|served| &served.task).filter(|_| !names_task) else {
-        return Ok(Vec::new());
-    };
-    if task.as_built_in().is_some() {
-        return Ok(Vec::new());
+    match served.filter(|_| !names_task) {
+        Some(served) => served_task::settings(&served.task),
+        None => Ok(Vec::new()),
     }
-    let description = Value::try_from(task.description()).or_exit(Exit::Bug, String::new)?;
-    let n_arms = i64::try_from(task.n_arms()).unwrap_or(i64::MAX);
-    let settings = [
-        ("task", Value::String(task.name().to_owned())),
-        ("arms", Value::Integer(n_arms)),
-        ("description", description),
-    ];
-    Ok(settings.map(|(key, value)| (key.to_owned(), value)).into())
 }
 
 /// Converts the flags to settings of the run file, after those of `--set`.

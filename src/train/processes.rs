@@ -70,7 +70,7 @@ struct Process {
 
 enum State {
     Running(ChildProcess),
-    Waiting { until: Instant, end: ProcessEnd },
+    Waiting { until: Instant, end: ProcessEnd, reason: String },
 }
 
 /// A service that ended before it printed its address.
@@ -130,13 +130,13 @@ impl RunProcesses {
             {
                 process.handle_end(end, self.launcher.log(), &mut events)?;
             }
-            if let State::Waiting { until, end } = process.state
-                && until <= clock::now()
+            if let State::Waiting { until, end, reason } = &process.state
+                && *until <= clock::now()
             {
                 if !lock.is_in_place() {
-                    return Err(displaced(plan, &process.name, end));
+                    return Err(displaced(plan, &process.name, *end));
                 }
-                events.lines.push(format!("{} {end} and is restarted", process.name));
+                events.lines.push(format!("{} {end} and is restarted{reason}", process.name));
                 events.learner_restarted |= process.role == Role::Learner;
                 self.restart(idx, plan)?;
             }
@@ -281,7 +281,14 @@ impl Process {
         let name = &self.name;
         match self.policy.decide(end, child.uptime()) {
             Decision::Restart { after } => {
-                self.state = State::Waiting { until: clock::now() + after, end };
+                // A process that asks for another attempt has given up a peer or a resource.
+                let reason = match end {
+                    ProcessEnd::Code(75) => {
+                        format!(": {}", log.last_error_since(child.log_offset()))
+                    }
+                    _ => String::new(),
+                };
+                self.state = State::Waiting { until: clock::now() + after, end, reason };
                 Ok(())
             }
             Decision::Interrupted => {

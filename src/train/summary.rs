@@ -11,42 +11,49 @@ use tandem_telemetry::{MetricsLog, MetricsRow};
 
 use super::plan::Plan;
 use super::processes::PeakMemory;
-use crate::evaluation::{EvaluatedPolicy, EvaluationResult, measure};
+use crate::cli::TrainArgs;
+use crate::environment_server::names_server;
+use crate::evaluation::{EvaluatedPolicy, EvaluationResult, Part, measure, measure_served};
 use crate::exit::{Exit, Failed, OrExit as _};
 use crate::progress_text::{clock_text, grouped};
 use crate::{output, policy_file};
 
-/// Evaluates the best policy on the test goals if the simulator has the task, draws the curve and prints the summary.
+/// Evaluates the best policy on the test goals, draws the curve and prints the summary.
 pub(super) fn print(
     plan: &Plan,
     last: &pb::Progress,
     memory: PeakMemory,
-    as_json: bool,
+    args: &TrainArgs,
 ) -> Result<(), Failed> {
-    let result = test(plan)?;
+    let saved = || format!("the run is complete and saved in {}", plan.out.display());
+    let result = test(plan, args).map_err(|failed| {
+        if failed.exit() == Exit::Interrupted {
+            output::message(format_args!("{}; its test was interrupted", saved()));
+        }
+        failed.context(saved())
+    })?;
     let rows =
         MetricsLog::read_all(&plan.out.join("metrics.jsonl")).or_exit(Exit::Data, String::new)?;
     let pictures = Pictures {
         curve: draw_curve(plan, &rows)?,
         report: tandem_report::run_report_html(&plan.out).or_cannot_write(String::new)?,
     };
-    let summary = match as_json {
-        true => summary_json(plan, last, memory, result.as_ref()).to_string(),
-        false => summary_lines(plan, last, memory, result.as_ref(), &pictures).join("\n"),
+    let summary = match args.json {
+        true => summary_json(plan, last, memory, &result).to_string(),
+        false => summary_lines(plan, last, memory, &result, &pictures).join("\n"),
     };
-    let saved = || format!("the run is complete and saved in {}", plan.out.display());
     output::print(summary).map_err(|failed| failed.context(saved()))
 }
 
-/// Plays the test goals with the best policy. Returns `None` if the simulator does not have the task.
-fn test(plan: &Plan) -> Result<Option<EvaluationResult>, Failed> {
-    let path = plan.best_policy();
-    let policy = policy_file::load(&path)?;
-    if policy.layout.as_built_in().is_none() {
-        return Ok(None);
+/// Plays the test goals with the best policy, on the server of the environments if the run has one.
+fn test(plan: &Plan, args: &TrainArgs) -> Result<EvaluationResult, Failed> {
+    let (path, n_episodes) = (plan.best_policy(), plan.config.evaluation.test_episodes);
+    let (policy, goals) = (policy_file::load(&path)?, (n_episodes, TEST_SEED));
+    if names_server(&plan.environment) {
+        let subject = (Part::AllArms, &policy);
+        return measure_served(&plan.environment, subject, goals, args.exit_with_stdin);
     }
-    let subject = EvaluatedPolicy::new(policy, &path)?;
-    measure(&subject, plan.config.evaluation.test_episodes, TEST_SEED).map(Some)
+    measure(&EvaluatedPolicy::new(policy, &path)?, n_episodes, TEST_SEED)
 }
 
 /// Files written at the end of a run.
@@ -59,22 +66,15 @@ fn summary_lines(
     plan: &Plan,
     last: &pb::Progress,
     memory: PeakMemory,
-    result: Option<&EvaluationResult>,
+    result: &EvaluationResult,
     pictures: &Pictures,
 ) -> Vec<String> {
     let mut lines = vec![format!("done: {}", last.end_reason)];
-    if let Some(result) = result {
-        lines.push(format!(
-            "best policy on {} test goals (seed {TEST_SEED}), alone: no noise, no advice",
-            plan.config.evaluation.test_episodes
-        ));
-        lines.extend(result.lines().iter().map(|line| format!("  {line}")));
-    } else if let Some(best) = &last.best {
-        lines.push(format!(
-            "best policy   success {:.3} over {} goals of the run; no test goals without a simulator",
-            best.success, best.n_episodes
-        ));
-    }
+    lines.push(format!(
+        "best policy on {} test goals (seed {TEST_SEED}), alone: no noise, no advice",
+        plan.config.evaluation.test_episodes
+    ));
+    lines.extend(result.lines().iter().map(|line| format!("  {line}")));
     lines.extend([
         format!(
             "training      {} env steps, {} updates, {} rounds in {}",
@@ -139,10 +139,9 @@ fn summary_json(
     plan: &Plan,
     last: &pb::Progress,
     memory: PeakMemory,
-    result: Option<&EvaluationResult>,
+    result: &EvaluationResult,
 ) -> Value {
-    let task = json!({ "task": plan.config.task, "arms": plan.config.arms });
-    let mut summary = result.map_or(task, EvaluationResult::json);
+    let mut summary = result.json();
     let more = json!({
         "env_steps": last.env_steps,
         "updates": last.updates,

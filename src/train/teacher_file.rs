@@ -1,4 +1,4 @@
-//! The teacher of a run: a policy file, or ONNX models.
+//! The teacher of a run: a policy file, ONNX models, or a policy on a server.
 
 use std::path::{Path, PathBuf};
 
@@ -9,58 +9,107 @@ use tandem_system::atomic_file;
 use tandem_teacher::policy::{OnnxPolicy, is_onnx};
 use tandem_teacher::{Error, Strategy, TeacherPolicy as _};
 
+use super::policy_server::{PolicyServer, ServedPolicy};
 use crate::exit::{Exit, Failed, OrExit as _};
 use crate::policy_file;
 use crate::service::{policy_address, teacher_failed};
 
-/// File names of a teacher's copy: a policy file, or the models of an actor and of a critic.
+/// File names of a teacher's copy: a policy file, the models of an actor and of a critic, or the address of a server.
 const POLICY_COPY: &str = "teacher.safetensors";
 const ACTOR_COPY: &str = "teacher.onnx";
 const CRITIC_COPY: &str = "teacher-critic.onnx";
+const SERVER_COPY: &str = "teacher.toml";
 
-/// The policy of the teacher, as read from its files.
+/// The policy of the teacher, as read from its files or described by its server.
 pub(crate) struct TeacherFile {
     path: PathBuf,
     critic: Option<PathBuf>,
     digest: String,
     layout: TaskSpec,
     has_values: bool,
-    /// The policy, unless the files are ONNX models.
-    policy: Option<Policy>,
+    source: Source,
+}
+
+/// The kind of a teacher.
+enum Source {
+    Policy(Policy),
+    Models,
+    Server(PolicyServer),
+}
+
+/// The copy of a teacher in a run directory.
+pub(super) struct StoredTeacher {
+    pub(super) path: PathBuf,
+    pub(super) digest: String,
+    server: Option<PolicyServer>,
 }
 
 impl TeacherFile {
-    /// Loads a policy file, or the ONNX model of an actor with its critic.
+    /// Loads a policy file, or the ONNX model of an actor with its critic, or asks a server for its policy.
     pub(super) fn load(path: PathBuf, critic: Option<PathBuf>) -> Result<Self, Failed> {
-        if let Some(address) = policy_address(&path) {
-            return Err(Failed::usage(format!(
-                "--teacher {address}: a run keeps a copy of its teacher, so `tandem train` needs a file; for a policy on \
-                 a server, start `tandem teacher --policy {address}`, `tandem learner` and `tandem worker`"
-            )));
-        }
-        if is_onnx(&path) {
+        if is_onnx(&path) && policy_address(&path).is_none() {
             let models = OnnxPolicy::load(&path, critic.as_deref()).map_err(teacher_failed)?;
             let (digest, layout) = (models.digest().to_owned(), models.layout());
             let has_values = models.has_values();
-            return Ok(Self { path, critic, digest, layout, has_values, policy: None });
+            return Ok(Self { path, critic, digest, layout, has_values, source: Source::Models });
         }
         if critic.is_some() {
             return Err(teacher_failed(Error::SurplusCritic));
         }
+        if let Some(address) = policy_address(&path) {
+            return ServedPolicy::of(address).map(Self::served);
+        }
         let policy = policy_file::load(&path)?;
         let (digest, layout) = (policy.digest(), policy.layout.clone());
-        let has_values = policy.has_critic();
-        Ok(Self { path, critic, digest, layout, has_values, policy: Some(policy) })
+        let (has_values, source) = (policy.has_critic(), Source::Policy(policy));
+        Ok(Self { path, critic, digest, layout, has_values, source })
     }
 
-    /// Loads the copy in `directory`, if there is one.
+    fn served(ServedPolicy { server, layout, has_values }: ServedPolicy) -> Self {
+        let (path, digest) = (PathBuf::from(&server.address), server.digest.clone());
+        Self { path, critic: None, digest, layout, has_values, source: Source::Server(server) }
+    }
+
+    /// Loads the copy in `directory`, if there is one. A server must still have the policy of the run.
     pub(super) fn copy_in(directory: &Path) -> Option<Result<Self, Failed>> {
-        let [policy, actor, critic] =
-            [POLICY_COPY, ACTOR_COPY, CRITIC_COPY].map(|name| directory.join(name));
+        let [policy, actor, critic, server] =
+            [POLICY_COPY, ACTOR_COPY, CRITIC_COPY, SERVER_COPY].map(|name| directory.join(name));
         if policy.exists() {
             return Some(Self::load(policy, None));
         }
+        if server.exists() {
+            let read = PolicyServer::read(&server).or_exit(Exit::Data, String::new);
+            return Some(read.and_then(PolicyServer::connect).map(Self::served));
+        }
         actor.exists().then(|| Self::load(actor, critic.exists().then_some(critic)))
+    }
+
+    /// Returns the intact copy in `directory`, if there is one. No server is asked.
+    pub(super) fn stored_in(directory: &Path) -> Option<StoredTeacher> {
+        let path = directory.join(SERVER_COPY);
+        if path.exists() {
+            let server = PolicyServer::read(&path).ok()?;
+            return Some(StoredTeacher {
+                path,
+                digest: server.digest.clone(),
+                server: Some(server),
+            });
+        }
+        let Self { path, digest, .. } = Self::copy_in(directory)?.ok()?;
+        Some(StoredTeacher { path, digest, server: None })
+    }
+
+    /// Returns whether `stored` is a copy of this teacher.
+    pub(super) fn is_stored(&self, stored: &StoredTeacher) -> bool {
+        self.digest == stored.digest && self.server() == stored.server.as_ref()
+    }
+
+    /// Returns the server of the policy, if it has one.
+    pub(super) const fn server(&self) -> Option<&PolicyServer> {
+        match &self.source {
+            Source::Server(server) => Some(server),
+            Source::Policy(_) | Source::Models => None,
+        }
     }
 
     /// Refuses a teacher that cannot advise the run of `config`.
@@ -86,7 +135,8 @@ impl TeacherFile {
                 config.task
             )));
         }
-        if config.advice.starts_from_teacher() && (self.policy.is_none() || !self.has_values) {
+        let is_policy_file = matches!(self.source, Source::Policy(_));
+        if config.advice.starts_from_teacher() && !(is_policy_file && self.has_values) {
             return Err(Failed::usage(format!(
                 "{shown}: a run of strategy {} starts from a policy file with a critic; `tandem policy import` converts \
                  ONNX models of actor and critic",
@@ -102,7 +152,7 @@ impl TeacherFile {
         }
     }
 
-    /// Returns the file of the policy, or of the actor's model.
+    /// Returns the file of the policy or of the actor's model, or the address of the policy's server.
     pub(super) fn path(&self) -> &Path {
         &self.path
     }
@@ -113,7 +163,11 @@ impl TeacherFile {
 
     /// Returns the path of the copy in `directory`.
     pub(super) fn copy_path(&self, directory: &Path) -> PathBuf {
-        directory.join(if self.policy.is_some() { POLICY_COPY } else { ACTOR_COPY })
+        directory.join(match self.source {
+            Source::Policy(_) => POLICY_COPY,
+            Source::Models => ACTOR_COPY,
+            Source::Server(_) => SERVER_COPY,
+        })
     }
 
     /// Returns the path of the critic's copy in `directory`, if the critic has a file.
@@ -128,12 +182,15 @@ impl TeacherFile {
             (self.critic.as_ref(), self.critic_copy_path(directory)),
         ];
         let copies: Vec<_> = copies.into_iter().filter_map(|(from, to)| from.zip(to)).collect();
-        for name in [POLICY_COPY, ACTOR_COPY, CRITIC_COPY] {
+        for name in [POLICY_COPY, ACTOR_COPY, CRITIC_COPY, SERVER_COPY] {
             let other = directory.join(name);
             if copies.iter().all(|(from, to)| *to != other && **from != other) && other.exists() {
                 let removed = std::fs::remove_file(&other);
                 removed.or_cannot_write(|| format!("cannot remove {}", other.display()))?;
             }
+        }
+        if let Source::Server(server) = &self.source {
+            return server.write(&self.copy_path(directory));
         }
         for (from, to) in copies {
             let written = std::fs::read(from).and_then(|bytes| atomic_file::replace(&to, &bytes));
@@ -144,12 +201,12 @@ impl TeacherFile {
 
     /// Writes the policy as it was read to `directory`.
     pub(super) fn write_to(&self, directory: &Path) -> Result<(), Failed> {
-        match &self.policy {
-            Some(policy) => {
+        match &self.source {
+            Source::Policy(policy) => {
                 let saved = policy.save(&self.copy_path(directory));
                 saved.or_exit(Exit::TryAgain, String::new)
             }
-            None => self.copy_to(directory),
+            Source::Models | Source::Server(_) => self.copy_to(directory),
         }
     }
 }

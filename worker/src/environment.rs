@@ -15,6 +15,7 @@ use tonic::{Status, Streaming};
 
 use crate::config::EnvironmentConfig;
 use crate::error::Error;
+use crate::player::PeerRequest;
 
 const PLAY: Operation =
     Operation { peer: "environment server", purpose: "play in the environments of the server" };
@@ -117,14 +118,35 @@ impl Environments {
         }
     }
 
-    /// Waits for the server and checks that it serves the given task.
-    pub(crate) async fn check(&mut self, task: &TaskSpec) -> Result<(), Error> {
+    /// Waits for the server, checks that it serves the given task, and returns the largest number of environments per
+    /// stream.
+    pub(crate) async fn check(&mut self, task: &TaskSpec) -> Result<usize, Error> {
         loop {
             match self.connect().await {
-                Ok(server) => return server.served.check(task),
+                Ok(server) => {
+                    server.served.check(task)?;
+                    return Ok(server.max_environments);
+                }
                 Err(failure) => self.recover(failure).await?,
             }
         }
+    }
+
+    /// Answers a request of a rollout. Returns whether the rollout still waits for the response.
+    pub(crate) async fn answer(
+        &mut self,
+        request: PeerRequest,
+        task: &TaskSpec,
+    ) -> Result<bool, Failure> {
+        Ok(match request {
+            PeerRequest::Reset(starts, response) => {
+                response.send(self.reset(&starts, task).await?).is_ok()
+            }
+            PeerRequest::Step(actions, response) => {
+                response.send(self.step(&actions, task).await?).is_ok()
+            }
+            PeerRequest::Advice(..) => false,
+        })
     }
 
     /// Starts episodes, one per environment.
@@ -141,11 +163,7 @@ impl Environments {
     }
 
     /// Executes actions, shape `[n, n_action]`.
-    pub(crate) async fn step(
-        &mut self,
-        actions: &[f32],
-        task: &TaskSpec,
-    ) -> Result<StepReply, Failure> {
+    pub(crate) async fn step(&mut self, actions: &[f32], task: &TaskSpec) -> Result<StepReply, Failure> {
         self.n_steps += 1;
         let n = self.episodes.len();
         let reply = self.exchange(n, encode_step(actions), task).await?;

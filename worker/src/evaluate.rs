@@ -1,4 +1,7 @@
-//! Evaluation of a policy on a fixed set of episodes, without exploration or advice, on any number of threads.
+//! Evaluation of a policy on a fixed set of episodes, without exploration or advice: in this process on any number of
+//! threads, or in the environments of a server.
+
+mod served;
 
 use std::num::NonZeroUsize;
 
@@ -10,16 +13,40 @@ use tandem_sim::{Env, WorldConfig};
 use crate::ports::{Act, Environment, NoAdvisor, Simulator};
 use crate::rollout::{RolloutError, play_slot};
 
-/// The composed teachers `f^a(π_tr(ŝ_1), π_tr(ŝ_2))`: a policy for one arm that acts for every arm of a layout.
+pub use served::evaluate_served;
+
+/// The composed teachers `f^a(π_tr(ŝ_1), π_tr(ŝ_2))`: a policy for one arm that acts for every arm of a task.
 ///
-/// A layout's vectors concatenate the arms' vectors, each in the arm's own frame, so a row of the layout consists of
-/// `n_arms` rows of the policy.
+/// A row of the task consists of `n_arms` rows of the policy: the parts of its arms, in arm order.
 #[derive(Debug, Clone)]
-pub struct ComposedTeachers<A>(pub A);
+pub struct ComposedTeachers<A> {
+    actor: A,
+    task: TaskSpec,
+}
+
+impl<A: Act> ComposedTeachers<A> {
+    /// Composes `actor`, a policy for [one arm](TaskSpec::single_arm) of `task`.
+    pub fn new(actor: A, task: impl Into<TaskSpec>) -> Self {
+        Self { actor, task: task.into() }
+    }
+}
 
 impl<A: Act> Act for ComposedTeachers<A> {
     fn act(&mut self, observations: &[f32], goals: &[f32], actions: &mut [f32]) {
-        self.0.act(observations, goals, actions);
+        let task = &self.task;
+        if task.as_built_in().is_some() {
+            // The vectors of a built-in task are in arm order.
+            return self.actor.act(observations, goals, actions);
+        }
+        let observations = observations.chunks_exact(task.n_observation());
+        let states = observations.zip(goals.chunks_exact(task.n_goal()));
+        for ((observation, goal), action) in states.zip(actions.chunks_exact_mut(task.n_action())) {
+            let observation = task.observation_in_arm_order(observation);
+            let goal = task.goal_in_arm_order(goal);
+            let mut in_arm_order = vec![0.0; task.n_action()];
+            self.actor.act(&observation, &goal, &mut in_arm_order);
+            task.write_action_in_arm_order(&in_arm_order, action);
+        }
     }
 }
 
@@ -75,15 +102,20 @@ fn play_alone(
     seed: u64,
     number: u64,
 ) -> Result<Episode, RolloutError> {
-    let order = EpisodeOrder { number, seed, advised: false, uniform: false, record: false };
-    let slot = SlotOrder {
+    let mut episodes = play_slot(env, &slot_of([number], seed), terms, actor, &mut NoAdvisor)?;
+    Ok(episodes.remove(0))
+}
+
+/// Returns the order to play evaluation episodes with these numbers.
+fn slot_of(numbers: impl IntoIterator<Item = u64>, seed: u64) -> SlotOrder {
+    let order =
+        |number| EpisodeOrder { number, seed, advised: false, uniform: false, record: false };
+    SlotOrder {
         slot: 0,
         parameter_version: 0,
         kind: EpisodeKind::Evaluation,
-        episodes: vec![order],
-    };
-    let mut episodes = play_slot(env, &slot, terms, actor, &mut NoAdvisor)?;
-    Ok(episodes.remove(0))
+        episodes: numbers.into_iter().map(order).collect(),
+    }
 }
 
 /// Returns terms for evaluations, which use only the task: the world is built already.
@@ -99,6 +131,9 @@ fn evaluation_terms(layout: impl Into<TaskSpec>) -> RunTerms {
 
 #[cfg(test)]
 mod tests {
+    use tandem_core::TaskDescription;
+    use tandem_core::task::ArmDescription;
+
     use super::*;
     use crate::fakes::{FakeActor, FakeEnvironment, LAYOUT};
 
@@ -152,8 +187,50 @@ mod tests {
             goals[3 * row] = 0.5;
         }
         let mut actions = vec![9.0; 2 * 6];
-        ComposedTeachers(FakeActor::Seeker).act(&observations, &goals, &mut actions);
+        ComposedTeachers::new(FakeActor::Seeker, LAYOUT).act(&observations, &goals, &mut actions);
         let first_components: Vec<f32> = actions.chunks(3).map(|arm| arm[0]).collect();
         assert_eq!(first_components, [0.5 - 0.1, 0.5 - 0.2, 0.5 - 0.3, 0.5 - 0.4]);
+    }
+
+    #[test]
+    fn composed_teachers_act_on_the_parts_of_arms_in_any_order() {
+        let arm = |arm_idx: usize| ArmDescription {
+            observation: vec![arm_idx, arm_idx + 2],
+            goal: vec![1 - arm_idx],
+            action: vec![1 - arm_idx],
+            position: Vec::new(),
+        };
+        let task = TaskSpec::new(TaskDescription {
+            name: "interleaved".to_owned(),
+            n_observation: 4,
+            n_goal: 2,
+            n_action: 2,
+            achieved_goal: vec![1, 0],
+            observation_bound: vec![2.0; 4],
+            goal_bound: vec![1.0; 2],
+            arms: vec![arm(0), arm(1)],
+            ..TaskSpec::from(LAYOUT).description().clone()
+        })
+        .expect("consistent");
+        struct Difference;
+        impl Act for Difference {
+            fn act(&mut self, observations: &[f32], goals: &[f32], actions: &mut [f32]) {
+                let rows = observations.chunks_exact(2).zip(goals);
+                for ((row, goal), action) in rows.zip(actions) {
+                    *action = goal - row[0] + 0.1 * row[1];
+                }
+            }
+        }
+        let observations = [0.1, 0.2, 1.0, 2.0, 0.3, 0.4, -2.0, 0.0];
+        let goals = [0.5, 0.25, 0.0, 1.0];
+        let mut actions = [9.0; 4];
+        ComposedTeachers::new(Difference, task).act(&observations, &goals, &mut actions);
+        let expected = [
+            0.5 - 0.2 + 0.1 * 2.0, // arm 1
+            0.25 - 0.1 + 0.1 * 1.0,
+            0.0 - 0.4 + 0.1 * 0.0,
+            1.0 - 0.3 + 0.1 * -2.0,
+        ];
+        assert_eq!(actions, expected);
     }
 }

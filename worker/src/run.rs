@@ -294,16 +294,7 @@ impl Worker {
     /// Forwards a request to the server of the environments. Returns whether the player still waits for the response.
     async fn forward(&mut self, request: PeerRequest, task: &TaskSpec) -> Result<bool, Failure> {
         let no_server = || Failure::Final(Box::new(Error::NoServer));
-        let environments = self.environments.as_mut().ok_or_else(no_server)?;
-        Ok(match request {
-            PeerRequest::Reset(starts, response) => {
-                response.send(environments.reset(&starts, task).await?).is_ok()
-            }
-            PeerRequest::Step(actions, response) => {
-                response.send(environments.step(&actions, task).await?).is_ok()
-            }
-            PeerRequest::Advice(..) => false,
-        })
+        self.environments.as_mut().ok_or_else(no_server)?.answer(request, task).await
     }
 
     /// Warns once of environments that are not deterministic.

@@ -8,10 +8,11 @@ use std::path::{Path, PathBuf};
 use libfuzzer_sys as _;
 use mcap::records::{MessageHeader, Record};
 use prost::Message as _;
+use tandem_core::task::{ArmDescription, Norm};
 use tandem_core::work::{EpisodeOrder, EpisodeStart, PublishedActor, RunTerms, SlotOrder};
 use tandem_core::{
     ArmAdvice, Contacts, EpisodeKind, Exploration, Layout, StepAdvice, StepQuery, Task,
-    WorldSettings,
+    TaskDescription, TaskSpec, WorldSettings,
 };
 use tandem_fuzz::sample;
 use tandem_learner::checkpoint::{self, Resumption};
@@ -28,14 +29,15 @@ const LAYOUT: Layout = Layout::new(Task::Push, 1);
 fn main() -> Result<(), AnyError> {
     let seeds = std::env::args_os().nth(1).map(PathBuf::from).ok_or("expected a directory")?;
     let scratch = tempfile::tempdir()?;
-    for target in ["checkpoint", "policy", "onnx", "log", "message"] {
+    for target in ["checkpoint", "policy", "onnx", "log", "message", "task"] {
         fs::create_dir_all(seeds.join(target))?;
     }
     write_checkpoints(&seeds.join("checkpoint"), scratch.path())?;
     write_policies(&seeds.join("policy"))?;
     write_models(&seeds.join("onnx"))?;
     write_logs(&seeds.join("log"), scratch.path())?;
-    write_messages(&seeds.join("message"))
+    write_messages(&seeds.join("message"))?;
+    write_tasks(&seeds.join("task"))
 }
 
 fn write_checkpoints(to: &Path, scratch: &Path) -> Result<(), AnyError> {
@@ -184,6 +186,42 @@ fn write_messages(to: &Path) -> Result<(), AnyError> {
     ];
     for (message, (name, bytes)) in (0_u8..).zip(seeds) {
         fs::write(to.join(name), [&[message, 0], bytes.as_slice()].concat())?;
+    }
+    Ok(())
+}
+
+fn write_tasks(to: &Path) -> Result<(), AnyError> {
+    // Two points whose numbers alternate, and which carry an object to a common goal.
+    let arm = |arm_idx: usize| ArmDescription {
+        observation: vec![arm_idx, arm_idx + 2],
+        goal: vec![arm_idx],
+        action: vec![arm_idx],
+        position: Vec::new(),
+    };
+    let carry = TaskDescription {
+        name: "lab/carry".to_owned(),
+        n_observation: 5,
+        n_goal: 3,
+        n_action: 2,
+        arms: vec![arm(0), arm(1)],
+        achieved_goal: vec![0, 1, 4],
+        episode_steps: 20,
+        tolerance: 0.1,
+        norm: Norm::Maximum,
+        interchangeable_arms: true,
+        reports_contacts: false,
+        origin_distance: 0.0,
+        recombination_gap: 0.0,
+        observation_bound: vec![2.0; 5],
+        goal_bound: vec![1.0; 3],
+    };
+    let tasks = [
+        ("push", TaskSpec::built_in(Task::Push, 2)),
+        ("pick-and-place", TaskSpec::built_in(Task::PickAndPlace, 1)),
+        ("carry", TaskSpec::new(carry)?),
+    ];
+    for (name, task) in tasks {
+        fs::write(to.join(name), tandem_proto::encode_task(&task).encode_to_vec())?;
     }
     Ok(())
 }

@@ -69,16 +69,19 @@ impl InitialState {
         }
         let address =
             config.teacher.as_deref().ok_or_else(|| Error::NoTeacher(advice.strategy.clone()))?;
+        let layout = &self.trainer.layout;
+        let one_arm = layout.single_arm().expect("checked: an advised task has a task of one arm");
         let options = AccountOptions {
             client_config: &config.client_config,
             address,
+            one_arm: &one_arm,
             terms: pb::OpenAccountRequest {
                 name: config.run.name.clone(),
                 budget: advice.budget,
                 strategy: advice.strategy.clone(),
             },
             // An episode can use one unit of advice per step.
-            units_per_episode: u32::try_from(self.trainer.layout.episode_steps())
+            units_per_episode: u32::try_from(layout.episode_steps())
                 .expect("an episode has few steps"),
             start: match self.is_resumed {
                 true => RunStart::Resumed { spent: self.trainer.counters().advice_spent },

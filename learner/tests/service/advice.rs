@@ -4,8 +4,8 @@ use std::net::SocketAddr;
 use std::path::Path;
 use std::time::Duration;
 
-use tandem_core::Episode;
 use tandem_core::work::SlotOrder;
+use tandem_core::{Episode, Task, TaskSpec};
 use tandem_learner::checkpoint;
 use tandem_learner::{Error, LearnerConfig};
 use tandem_rl::RunConfig;
@@ -218,6 +218,21 @@ async fn a_resumed_run_finds_its_account_in_every_state_of_the_ledger() {
         again.end().await.expect("resumed");
         assert_eq!(teacher.books().opened, expected);
     }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_teacher_for_another_task_is_refused_and_the_field_named() {
+    let directory = tempfile::tempdir().expect("a directory");
+    let teacher = FakeTeacher::default();
+    teacher.books().task = Some(TaskSpec::built_in(Task::PickAndPlace, 1));
+    let address = teacher.serve().await;
+    let run = advised(0, AMPLE);
+    let served = Served::start(with_teacher(run, directory.path(), false, address)).await;
+    let error = served.end().await.expect_err("another task").to_string();
+    let expected = "the teacher is for another task than one arm of the run's: name is \"push\" in the run and \
+                    \"pick-and-place\" at the teacher";
+    assert_eq!(error, expected);
+    assert!(teacher.books().opened.is_empty());
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

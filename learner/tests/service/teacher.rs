@@ -4,12 +4,15 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::net::SocketAddr;
 use std::sync::{Arc, Mutex, MutexGuard};
 
+use tandem_core::TaskSpec;
 use tandem_net::ServerConfig;
-use tandem_proto::pb;
 use tandem_proto::pb::teacher_server::{Teacher, TeacherServer};
+use tandem_proto::{encode_task, pb};
 use tokio::net::TcpListener;
 use tokio_util::sync::CancellationToken;
 use tonic::{Request, Response, Status, Streaming};
+
+use crate::toy::LAYOUT;
 
 #[derive(Default, Clone)]
 pub(crate) struct FakeTeacher {
@@ -23,6 +26,8 @@ pub(crate) struct Books {
     pub(crate) refusal: Option<Status>,
     /// Units charged by all accounts that there ever were, lost ones included.
     pub(crate) charged_ever: u64,
+    /// The teacher's task, unless it is that of the toy.
+    pub(crate) task: Option<TaskSpec>,
     /// Every account that was opened, with its budget.
     pub(crate) opened: Vec<(String, u64)>,
 }
@@ -180,20 +185,26 @@ impl Teacher for FakeTeacher {
         &self,
         _: Request<pb::DescribeRequest>,
     ) -> Result<Response<pb::DescribeResponse>, Status> {
-        Err(Status::unimplemented("nobody asks"))
+        let task = self.books().task.clone().unwrap_or_else(|| LAYOUT.into());
+        let task_description = Some(encode_task(&task));
+        Ok(Response::new(pb::DescribeResponse { task_description, ..Default::default() }))
     }
 
     async fn advise(
         &self,
         _: Request<pb::AdviseRequest>,
     ) -> Result<Response<pb::AdviseResponse>, Status> {
-        Err(Status::unimplemented("nobody asks"))
+        let task = self.books().task.clone().unwrap_or_else(|| LAYOUT.into());
+        let task_description = Some(encode_task(&task));
+        Ok(Response::new(pb::DescribeResponse { task_description, ..Default::default() }))
     }
 
     async fn advise_stream(
         &self,
         _: Request<Streaming<pb::AdviseRequest>>,
     ) -> Result<Response<Self::AdviseStreamStream>, Status> {
-        Err(Status::unimplemented("nobody asks"))
+        let task = self.books().task.clone().unwrap_or_else(|| LAYOUT.into());
+        let task_description = Some(encode_task(&task));
+        Ok(Response::new(pb::DescribeResponse { task_description, ..Default::default() }))
     }
 }

@@ -19,7 +19,7 @@ impl RunConfig {
         self.check_advice(&layout)?;
         self.check_rounds()?;
         self.check_stop()?;
-        self.exploration.check()?;
+        self.exploration.check(layout.episode_steps())?;
         self.world.check()?;
         self.replay.check(&layout)?;
         self.ddpg.check()?;

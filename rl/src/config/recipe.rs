@@ -58,7 +58,11 @@ impl RunConfig {
             exploration: Exploration {
                 noise_std: 0.2,
                 random_action_prob: 0.3,
-                sticky_random_mean_steps: if tandem { 4.0 } else { 1.0 },
+                sticky_random_mean_steps: if tandem {
+                    4.0_f32.min(layout.episode_steps() as f32)
+                } else {
+                    1.0
+                },
             },
             world: world(recipe, layout),
             replay: replay(recipe, layout),

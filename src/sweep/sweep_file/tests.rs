@@ -2,8 +2,13 @@ use super::*;
 
 const LIMIT: &str = "[run.stop]\nmax_env_steps = 1000\n";
 
+/// Returns the runs of a file that names its task itself.
+fn runs_of(text: &str) -> anyhow::Result<Vec<PlannedRun>> {
+    runs(&parse(text)?, &[])
+}
+
 fn names(text: &str) -> Vec<String> {
-    runs(text).expect("valid").into_iter().map(|run| run.name).collect()
+    runs_of(text).expect("valid").into_iter().map(|run| run.name).collect()
 }
 
 #[test]
@@ -27,7 +32,7 @@ fn every_combination_is_a_run_and_seeds_are_the_outermost_loop() {
 fn variants_are_added_to_strategies_and_axes_multiply_both() {
     let text = "strategies = [\"ea\"]\n[[variant]]\nname = \"no-cloning\"\nset = { advice.strategy = \"mc-q:0.05\", advice.share = 1 }\n\
                 [[axis]]\n\"ddpg.polyak_keep\" = [0.95, 0.99]\n[[axis]]\nrounds.lag = [0, 1]\n";
-    let planned = runs(&format!("{text}{LIMIT}")).expect("valid");
+    let planned = runs_of(&format!("{text}{LIMIT}")).expect("valid");
     let seen: Vec<&str> = planned.iter().map(|run| run.name.as_str()).collect();
     assert_eq!(seen.len(), 8);
     assert_eq!(
@@ -45,7 +50,7 @@ fn variants_are_added_to_strategies_and_axes_multiply_both() {
 
 #[test]
 fn runs_have_no_time_limit_unless_one_is_set() {
-    let minutes = |text: &str| runs(text).expect("valid")[0].config.stop.max_minutes;
+    let minutes = |text: &str| runs_of(text).expect("valid")[0].config.stop.max_minutes;
     assert_eq!(minutes(LIMIT), 0.0);
     assert_eq!(minutes("[run]\nstop.max_minutes = 2"), 2.0);
 }
@@ -53,7 +58,7 @@ fn runs_have_no_time_limit_unless_one_is_set() {
 #[test]
 fn a_teacher_is_named_if_the_run_needs_one() {
     let text = "strategies = [\"none\", \"ea\"]\n[teachers]\npush = \"mine.safetensors\"\n";
-    let teachers: Vec<_> = runs(&format!("{text}{LIMIT}"))
+    let teachers: Vec<_> = runs_of(&format!("{text}{LIMIT}"))
         .expect("valid")
         .into_iter()
         .map(|run| run.teacher)
@@ -64,7 +69,7 @@ fn a_teacher_is_named_if_the_run_needs_one() {
 #[test]
 fn errors_fit_on_one_line() {
     let check = |text: &str, words: &[&str]| {
-        let error = runs(&format!("{text}\n{LIMIT}")).expect_err("must be refused");
+        let error = runs_of(&format!("{text}\n{LIMIT}")).expect_err("must be refused");
         let message = format!("{error:#}");
         assert!(!message.contains('\n'), "{message}");
         words.iter().for_each(|word| assert!(message.contains(word), "{message:?} lacks {word:?}"));
@@ -83,7 +88,7 @@ fn errors_fit_on_one_line() {
     }
     check("[[variant]]\nname = \"a/b\"", &["a/b"]);
     check("strategies = [\"ea\"]\n[run.advice]\nstrategy = \"none\"", &["advice.strategy"]);
-    let unlimited = runs("[run]\nrecipe = \"paper\"").expect_err("must be refused").to_string();
+    let unlimited = runs_of("[run]\nrecipe = \"paper\"").expect_err("must be refused").to_string();
     assert!(unlimited.contains("max_env_steps"), "{unlimited}");
     let many: Vec<String> = (0..10_001).map(|seed| seed.to_string()).collect();
     check(&format!("seeds = [{}]", many.join(",")), &["10001", "at most"]);
@@ -92,7 +97,7 @@ fn errors_fit_on_one_line() {
 #[test]
 fn an_empty_file_is_rejected() {
     for text in ["", "\n\n", "# nothing yet\n"] {
-        let error = runs(text).expect_err("must be refused").to_string();
+        let error = runs_of(text).expect_err("must be refused").to_string();
         assert!(error.starts_with("is empty: expected"), "{text:?}: {error}");
     }
 }
@@ -105,7 +110,7 @@ fn every_shipped_sweep_file_is_valid() {
         .filter(|path| path.to_string_lossy().contains("/sweep-"))
         .map(|path| {
             let name = path.file_stem().expect("named").to_string_lossy().into_owned();
-            (name, read(&path).expect("valid").len())
+            (name, read(&path).expect("valid").runs.len())
         })
         .collect();
     let expected = [
@@ -121,4 +126,35 @@ fn every_shipped_sweep_file_is_valid() {
     ];
     let counts: Vec<_> = counts.iter().map(|(name, count)| (name.as_str(), *count)).collect();
     assert_eq!(counts, expected);
+}
+
+#[test]
+fn a_task_of_a_server_is_that_of_all_runs_and_part_of_their_names() {
+    let mut description = tandem_core::Layout::new(tandem_core::Task::Push, 2).description();
+    description.name = "lab/reach-1".to_owned();
+    let task = tandem_core::TaskSpec::new(description).expect("valid");
+    let settings = served_task::settings(&task).expect("TOML");
+    let file = parse(&format!("seeds = [1, 2]\nenv_command = \"serve\"{LIMIT}")).expect("valid");
+    assert!(!names_task(&file));
+    let runs = runs(&file, &settings).expect("valid");
+    let names: Vec<&str> = runs.iter().map(|run| run.name.as_str()).collect();
+    assert_eq!(names, ["lab-reach-1-mc-q-0.1-seed1", "lab-reach-1-mc-q-0.1-seed2"]);
+    assert_eq!(runs[0].config.layout().expect("valid"), task);
+    let environment = environment(&file).expect("valid");
+    assert_eq!(environment.env_command.as_deref(), Some("serve"));
+}
+
+#[test]
+fn a_contradictory_server_is_refused() {
+    let check = |keys: &str, expected: &str| {
+        let file = parse(&format!("seeds = [1]\n{keys}{LIMIT}")).expect("valid");
+        assert_eq!(environment(&file).expect_err("refused").to_string(), expected);
+    };
+    check("env = \"a:1\"\nenv_command = \"b\"", {
+        "env and env_command are both set: expected one of them"
+    });
+    check("env_token_file = \"token\"", "env_token_file is set without env");
+    let seconds = "env_timeout_s: expected a number of seconds, more than 0";
+    check("env = \"a:1\"\nenv_timeout_s = 0.0", seconds);
+    check("env = \"a:1\"\nenv_timeout_s = -1.0", seconds);
 }
