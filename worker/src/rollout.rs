@@ -2,7 +2,9 @@
 
 use tandem_core::rng::{Stream, episode_rng};
 use tandem_core::work::{EpisodeOrder, EpisodeStart, RunTerms, SlotOrder};
-use tandem_core::{Contacts, Episode, EpisodeKind, StepAdvice, StepQuery, TaskSpec};
+use tandem_core::{
+    AdviceUnit, Contacts, Episode, EpisodeKind, JudgedAction, StepAdvice, StepQuery, TaskSpec,
+};
 use tandem_sim::SimError;
 use tandem_telemetry::events::StepAdvised;
 
@@ -78,7 +80,7 @@ pub fn play_slot(
         for rollout in &mut rollouts {
             rollout.choose_action(actor);
         }
-        take_advice(&mut rollouts, step_idx, advisor)?;
+        take_advice(&mut rollouts, step_idx, terms.advice.unit, advisor)?;
         batch.execute(&mut rollouts, step_idx, env)?;
     }
     Ok(rollouts.into_iter().map(|rollout| rollout.episode).collect())
@@ -167,10 +169,12 @@ fn failed_step(error: EnvironmentError, rollouts: &[Rollout], step: usize) -> Ro
     }
 }
 
-/// Asks the teacher about the next actions of the advised rollouts, and applies its advice.
+/// Asks the teacher about the next actions of the advised rollouts, and applies its advice. If a unit pays for the lock
+/// step, the first of them claims it.
 fn take_advice(
     rollouts: &mut [Rollout],
     step_idx: usize,
+    unit: AdviceUnit,
     advisor: &mut impl Advisor,
 ) -> Result<(), RolloutError> {
     let mut advised: Vec<&mut Rollout> =
@@ -179,11 +183,26 @@ fn take_advice(
         return Ok(());
     };
     let first_number = first.episode.number;
-    let queries: Vec<StepQuery> = advised.iter().map(|rollout| rollout.query(step_idx)).collect();
+    let payer = (unit == AdviceUnit::SlotStep).then_some(first_number);
+    let query = |rollout: &&mut Rollout| StepQuery { payer, ..rollout.query(step_idx) };
+    let queries: Vec<StepQuery> = advised.iter().map(query).collect();
     let answers = advisor.advise(queries)?;
     check_count(first_number, step_idx, "steps", answers.len(), advised.len())?;
     for (rollout, advice) in advised.iter_mut().zip(&answers) {
         rollout.apply_advice(advice, step_idx)?;
+    }
+    // A step without overridden arms may carry a charge, from a previous worker whose student acted differently. The
+    // teacher's account includes that unit, but no episode claims it.
+    match unit {
+        AdviceUnit::EnvStep => {
+            for rollout in advised {
+                rollout.episode.advice_charged += u32::from(rollout.advised_arms != 0);
+            }
+        }
+        AdviceUnit::SlotStep => {
+            let any = advised.iter().any(|rollout| rollout.advised_arms != 0);
+            advised[0].episode.advice_charged += u32::from(any);
+        }
     }
     Ok(())
 }
@@ -210,6 +229,8 @@ struct Rollout {
     observation: Vec<f32>,
     /// The action of the next step, shape `[n_action]`.
     action: Vec<f32>,
+    /// The policy's action of the next step, without exploration, if the teacher judges it, shape `[n_action]`.
+    policy_action: Option<Vec<f32>>,
     /// The arms whose action of the next step is the teacher's, as a bit mask.
     advised_arms: u8,
     /// The steps played so far.
@@ -244,6 +265,10 @@ impl Rollout {
             advised: order.advised && slot.kind == EpisodeKind::Training,
             observation: observation.to_vec(),
             action: vec![0.0; layout.n_action()],
+            policy_action: match terms.advice.judged_action {
+                JudgedAction::Executed => None,
+                JudgedAction::Policy => Some(vec![0.0; layout.n_action()]),
+            },
             advised_arms: 0,
             episode,
         }
@@ -253,6 +278,9 @@ impl Rollout {
     fn choose_action(&mut self, actor: &mut impl Act) {
         actor.act(&self.observation, &self.episode.goal, &mut self.action);
         self.advised_arms = 0;
+        if let Some(policy_action) = &mut self.policy_action {
+            policy_action.copy_from_slice(&self.action);
+        }
         if let Some(explorer) = &mut self.explorer {
             explorer.explore(&mut self.action);
         }
@@ -267,6 +295,11 @@ impl Rollout {
             observation: layout.observation_in_arm_order(&self.observation),
             goal: layout.goal_in_arm_order(&self.episode.goal),
             proposed_action: layout.action_in_arm_order(&self.action),
+            judged_action: self
+                .policy_action
+                .as_ref()
+                .map(|action| layout.action_in_arm_order(action)),
+            payer: None,
         }
     }
 
@@ -284,9 +317,6 @@ impl Rollout {
             let step = u32::try_from(step_idx).expect("an episode's steps are few");
             StepAdvised { episode: number, step, overridden_arms: self.advised_arms }.emit();
         }
-        // A step without overridden arms may carry a charge, from a previous worker whose student acted differently. The
-        // teacher's account includes that unit, but this episode is not advised on the step.
-        self.episode.advice_charged += u32::from(self.advised_arms != 0);
         Ok(())
     }
 
@@ -309,6 +339,8 @@ fn explorer(order: EpisodeOrder, kind: EpisodeKind, terms: &RunTerms) -> Option<
     Some(explorer(&terms.layout, terms.exploration, rng))
 }
 
+#[cfg(test)]
+mod advice_terms;
 #[cfg(test)]
 mod arm_order;
 #[cfg(test)]
