@@ -9,8 +9,8 @@ use serde_json::{Value, json};
 use tandem_core::layout::EPISODE_STEPS;
 use tandem_core::work::{EpisodeOrder, RunTerms, SlotOrder};
 use tandem_core::{
-    AdviceTerms, ArmAdvice, Contacts, EpisodeKind, Exploration, Layout, StepAdvice, StepQuery, Task,
-    WorldSettings,
+    AdviceTerms, ArmAdvice, Contacts, EpisodeKind, Exploration, Layout, StepAdvice, StepQuery,
+    Task, WorldSettings,
 };
 use tandem_policy::{Actor, Policy};
 use tandem_sim::{Env, WorldConfig};

@@ -205,10 +205,7 @@ mod tests {
             |q| q.proposed_action[7] = -1.25,
             "proposed_action[7]: expected a number in [-1, 1], got -1.25",
         );
-        check(
-            |q| q.judged_action.truncate(7),
-            "judged_action: expected 8 numbers, got 7 numbers",
-        );
+        check(|q| q.judged_action.truncate(7), "judged_action: expected 8 numbers, got 7 numbers");
     }
 
     #[test]

@@ -306,10 +306,7 @@ mod tests {
             run: "run-7".to_owned(),
             layout: LAYOUT.into(),
             account: Some("run-7".to_owned()),
-            advice: AdviceTerms {
-                judged_action: JudgedAction::Policy,
-                unit: AdviceUnit::SlotStep,
-            },
+            advice: AdviceTerms { judged_action: JudgedAction::Policy, unit: AdviceUnit::SlotStep },
             exploration: Exploration {
                 noise_std: 0.2,
                 random_action_prob: 0.3,

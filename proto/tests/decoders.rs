@@ -139,13 +139,11 @@ fn advice(layout: Layout) -> impl Strategy<Value = pb::StepAdvice> {
 fn terms() -> impl Strategy<Value = pb::RunTerms> {
     let exploration =
         (one_number(), one_number(), prop_oneof![1.0_f32..50.0, one_number()], any::<bool>())
-            .prop_map(|(noise_std, random_share, random_hold_mean_steps, joint)| {
-                pb::Exploration {
-                    noise_std,
-                    random_share,
-                    random_hold_mean_steps,
-                    joint_random_actions: joint,
-                }
+            .prop_map(|(noise_std, random_share, random_hold_mean_steps, joint)| pb::Exploration {
+                noise_std,
+                random_share,
+                random_hold_mean_steps,
+                joint_random_actions: joint,
             });
     let advice = (any::<bool>(), any::<bool>()).prop_map(|(policy, slots)| pb::AdviceTerms {
         judges_policy_action: policy,

@@ -13,7 +13,7 @@ use super::teacher_file::TeacherFile;
 use crate::cli::{RecipeName, TrainArgs};
 use crate::exit::{Exit, Failed, OrExit as _};
 use crate::service::worker_failed;
-use crate::{environment_server, policy_file, run_directory, run_file};
+use crate::{environment_server, output, policy_file, run_directory, run_file};
 
 /// A run that can be started.
 pub(crate) struct Plan {
@@ -264,9 +264,15 @@ fn teacher_file(args: &TrainArgs, config: &RunConfig, out: &Path) -> Result<Teac
         Some(path) => TeacherFile::load(path.clone(), args.teacher_critic.clone())?,
         None => match args.resume.then(own).flatten() {
             Some(own) => own?,
-            None => TeacherFile::load(policy_file::shipped_teacher(&config.task)?, None)?,
+            None => {
+                let path = policy_file::shipped_teacher_of(config.recipe, &config.task)?;
+                TeacherFile::load(path, None)?
+            }
         },
     };
     teacher.check(config)?;
+    if let Some(remark) = teacher.other_recipe(config).filter(|_| !args.resume) {
+        output::message(format_args!("tandem: {remark}"));
+    }
     Ok(teacher)
 }

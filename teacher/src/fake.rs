@@ -49,5 +49,13 @@ pub(crate) fn query(episode: u64, step: u32, x: f32, y: f32) -> StepQuery {
     observation[0] = x;
     let goal = vec![0.0, 0.0, 0.0, 0.0, y, 0.0];
     let proposed_action = vec![0.0; 6];
-    StepQuery { episode, step, observation, goal, proposed_action, judged_action: None, payer: None }
+    StepQuery {
+        episode,
+        step,
+        observation,
+        goal,
+        proposed_action,
+        judged_action: None,
+        payer: None,
+    }
 }

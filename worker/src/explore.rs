@@ -143,11 +143,8 @@ mod tests {
     use super::*;
 
     const LAYOUT: Layout = Layout::new(Task::Push, 2);
-    const SETTINGS: Exploration = Exploration {
-        random_action_prob: 0.3,
-        sticky_random_mean_steps: 4.0,
-        ..Exploration::NONE
-    };
+    const SETTINGS: Exploration =
+        Exploration { random_action_prob: 0.3, sticky_random_mean_steps: 4.0, ..Exploration::NONE };
     /// The policy's action, which no random action equals.
     const POLICY_ACTION: [f32; 6] = [0.5; 6];
 
@@ -214,7 +211,8 @@ mod tests {
     #[test]
     fn joint_random_actions_replace_all_arms_at_once_with_different_actions() {
         let settings = Exploration { joint_random_actions: true, ..SETTINGS };
-        let actions = |arm_idx| arm_actions(Explorer::new(LAYOUT, settings, rng(0)), 5_000, arm_idx);
+        let actions =
+            |arm_idx| arm_actions(Explorer::new(LAYOUT, settings, rng(0)), 5_000, arm_idx);
         let (first, second) = (actions(0), actions(1));
         assert!(first.iter().zip(&second).all(|(a, b)| is_random(a) == is_random(b)));
         assert!(first.iter().zip(&second).all(|(a, b)| !is_random(a) || a != b));

@@ -4,7 +4,8 @@ use tandem_core::layout::{Layout, OBSERVATION_PER_ARM, Task};
 use tandem_core::rng::{Stream, episode_rng, uniform};
 use tandem_core::work::{EpisodeOrder, EpisodeStart, RunTerms, SlotOrder};
 use tandem_core::{
-    AdviceTerms, ArmAdvice, Contacts, EpisodeKind, Exploration, StepAdvice, StepQuery, WorldSettings,
+    AdviceTerms, ArmAdvice, Contacts, EpisodeKind, Exploration, StepAdvice, StepQuery,
+    WorldSettings,
 };
 
 use crate::ports::{Act, Advisor, AdvisorGone, Environment, EnvironmentError};

@@ -74,7 +74,7 @@ impl InitialState {
             address,
             terms: pb::OpenAccountRequest {
                 name: config.run.name.clone(),
-                budget: advice.budget,
+                budget: config.run.advice_budget(),
                 strategy: advice.strategy.clone(),
             },
             // An episode can use one unit of advice per step.
@@ -119,9 +119,11 @@ impl<'a> LearnerLoop<'a> {
             run: config.run.name.clone(),
             layout: trainer.layout.clone(),
             account: account.as_ref().map(|account| account.name().to_owned()),
+            advice: config.run.advice.terms(),
             exploration: config.run.exploration,
             world: config.run.world,
         };
+        shared.lock().queue.advice_unit = terms.advice.unit;
         publish_parameters(context, &pending, &acting, &trainer);
         let mut learner = Self {
             context,
