@@ -69,6 +69,7 @@ fn one_worker_and_five_give_the_same_bits_with_the_papers_ways_of_advice_and_exp
     let settings = [
         "rounds.slots=8",
         "rounds.rollouts=2",
+        "advice.share=1",
         "advice.unit=slot-step",
         "advice.judged_action=policy",
         "exploration.joint_random_actions=true",
