@@ -66,24 +66,22 @@ pub(super) fn check(
     if order.kind != EpisodeKind::Training {
         return Ok(());
     }
-    let advised = || ordered().filter(|(_, ordered)| ordered.advised).map(|(episode, _)| episode);
-    match unit {
-        AdviceUnit::EnvStep => advised().try_for_each(|episode| {
-            check_claim(episode, n_advised_steps(std::iter::once(episode)))
-        }),
-        AdviceUnit::SlotStep => advised().enumerate().try_for_each(|(idx, episode)| {
-            check_claim(episode, if idx == 0 { n_advised_steps(advised()) } else { 0 })
-        }),
-    }
+    let advised = ordered().filter(|(_, ordered)| ordered.advised).map(|(episode, _)| episode);
+    let advised: Vec<&Episode> = advised.collect();
+    let n_claimable = |idx: usize| match (unit, idx) {
+        (AdviceUnit::EnvStep, _) => n_advised_steps(&advised[idx..=idx]),
+        (AdviceUnit::SlotStep, 0) => n_advised_steps(&advised),
+        (AdviceUnit::SlotStep, _) => 0,
+    };
+    advised.iter().enumerate().try_for_each(|(idx, episode)| check_claim(episode, n_claimable(idx)))
 }
 
 /// Returns the number of steps with an advised arm in any of `episodes`.
-fn n_advised_steps<'a>(episodes: impl Iterator<Item = &'a Episode> + Clone) -> usize {
-    let n_steps = episodes.clone().map(|episode| episode.advised_arms.len()).max().unwrap_or(0);
+fn n_advised_steps(episodes: &[&Episode]) -> usize {
+    let n_steps = episodes.iter().map(|episode| episode.advised_arms.len()).max().unwrap_or(0);
     let is_advised = |step: &usize| {
-        episodes
-            .clone()
-            .any(|episode| episode.advised_arms.get(*step).is_some_and(|arms| *arms != 0))
+        let arms = episodes.iter().filter_map(|episode| episode.advised_arms.get(*step));
+        arms.copied().any(|arms| arms != 0)
     };
     (0..n_steps).filter(is_advised).count()
 }
