@@ -147,10 +147,10 @@ fn update() -> Vec<Figure> {
         layout,
         config.n_hidden,
         config.n_hidden_layers,
-        config.batch_size,
+        config.transitions_per_update(),
         layout.n_arms,
     );
-    let batch = random_batch(layout, config.batch_size);
+    let batch = random_batch(layout, config.transitions_per_update());
     let sgemm = sgemm_flop_per_s();
     let updates_per_s = |n_threads: usize| {
         let mut ddpg = Ddpg::new(config.clone(), layout, Rewards::sparse(layout.n_arms), 1);
@@ -181,7 +181,7 @@ fn replay() -> Vec<Figure> {
         buffer.push(&drifting_episode(layout, u64::from(number), f32::from(number % 7) * 1e-3));
     });
     let mut sampler = Sampler::new(&config.replay, layout);
-    let mut batch = Batch::new(layout, layout.n_arms, config.ddpg.batch_size);
+    let mut batch = Batch::new(layout, layout.n_arms, config.ddpg.transitions_per_update());
     let (observation, goal) = (
         NormalizerSnapshot::identity(layout.n_observation()),
         NormalizerSnapshot::identity(layout.n_goal()),

@@ -6,7 +6,7 @@ use std::path::Path;
 
 use rayon::iter::{IntoParallelRefIterator as _, ParallelIterator as _};
 use tandem_core::work::{EpisodeOrder, RunTerms};
-use tandem_core::{Episode, Exploration, TaskSpec, WorldSettings};
+use tandem_core::{AdviceTerms, Episode, Exploration, TaskSpec, WorldSettings};
 use tandem_worker::record::{RecordError, log_name, metadata_of, record_episode};
 
 use crate::cli::{EvalArgs, check_layout, check_task};
@@ -84,6 +84,7 @@ fn terms(subject: &EvaluatedPolicy) -> RunTerms {
         run: String::new(),
         layout: subject.layout().into(),
         account: None,
+        advice: AdviceTerms::default(),
         exploration: Exploration::NONE,
         world: WorldSettings::default(),
     }

@@ -3,6 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use tandem_policy::Policy;
+use tandem_rl::config::Recipe;
 use tandem_teacher::policy::is_onnx;
 
 use crate::cli::task_flags;
@@ -17,6 +18,16 @@ pub(crate) fn load(path: &Path) -> Result<Policy, Failed> {
         )));
     }
     Policy::load(path).or_exit(Exit::Data, String::new)
+}
+
+/// Finds the shipped teacher of a task that was trained with `recipe`, or with the default recipe if there is none.
+pub(crate) fn shipped_teacher_of(recipe: Recipe, task: &str) -> Result<PathBuf, Failed> {
+    if recipe == Recipe::Paper
+        && let Ok(path) = shipped_teacher(&format!("{task}-paper"))
+    {
+        return Ok(path);
+    }
+    shipped_teacher(task)
 }
 
 /// Finds the shipped teacher of a task: in the working directory, next to the program, or in the source tree.

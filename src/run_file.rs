@@ -13,7 +13,7 @@ use toml::{Table, Value};
 
 use crate::exit::{Exit, Failed, OrExit as _};
 use crate::input;
-use former::{current_keys, is_removed};
+use former::{current_keys, is_removed, with_added};
 
 mod former;
 
@@ -102,7 +102,7 @@ fn parse(text: &str) -> Result<Table, String> {
 }
 
 fn overlay(from_file: Table, settings: &[(String, Value)]) -> anyhow::Result<RunConfig> {
-    let mut changes = current_keys(from_file)?;
+    let mut changes = with_added(current_keys(from_file)?)?;
     for (key, value) in settings {
         if !is_removed(key, value)? {
             set(&mut changes, former_keys::current(key), value.clone())?;

@@ -131,6 +131,7 @@ fn request_for(episode: u64, step: u32) -> pb::AdviseRequest {
         observation: (0_u8..56).map(|i| f32::from(i) / 64.0).collect(),
         goal: vec![0.1; 6],
         proposed_action: vec![0.5; 6],
+        ..Default::default()
     }];
     pb::AdviseRequest { account: "attacked".to_owned(), steps }
 }

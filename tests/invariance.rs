@@ -65,6 +65,21 @@ fn sixteen_workers_give_the_bits_of_one_and_of_five_with_either_lag() {
 }
 
 #[test]
+fn one_worker_and_five_give_the_same_bits_with_the_papers_ways_of_advice_and_exploration() {
+    let settings = [
+        "rounds.slots=8",
+        "rounds.rollouts=2",
+        "advice.share=1",
+        "advice.unit=slot-step",
+        "advice.judged_action=policy",
+        "exploration.joint_random_actions=true",
+        "replay.joint_goal_statistics=true",
+        "ddpg.batches_per_update=2",
+    ];
+    check_with(("mc-act:0.1", 900), 0, &[1, 5], &settings);
+}
+
+#[test]
 #[ignore = "takes five minutes"]
 fn any_number_of_workers_gives_the_same_bits_with_every_strategy_and_either_lag() {
     for advice in STRATEGIES {
@@ -82,15 +97,25 @@ fn an_evaluation_does_not_depend_on_the_number_of_threads() {
 
 /// Trains once for each number of workers and compares the results.
 fn check(advice: (&str, u64), lag: u32, n_workers: &[usize]) {
+    check_with(advice, lag, n_workers, &[]);
+}
+
+/// As [`check`], with further settings.
+fn check_with(advice: (&str, u64), lag: u32, n_workers: &[usize], settings: &[&str]) {
     let (first, others) = n_workers.split_first().expect("numbers of workers");
-    let expected = train(advice, lag, *first);
+    let expected = train(advice, lag, *first, settings);
     for n_workers in others {
-        let got = train(advice, lag, *n_workers);
+        let got = train(advice, lag, *n_workers, settings);
         assert_eq!(got, expected, "{advice:?}, lag {lag}: {n_workers} workers against {first}");
     }
 }
 
-fn train((strategy, budget): (&str, u64), lag: u32, n_workers: usize) -> RunResult {
+fn train(
+    (strategy, budget): (&str, u64),
+    lag: u32,
+    n_workers: usize,
+    settings: &[&str],
+) -> RunResult {
     let directory = tempfile::tempdir().expect("a directory");
     let out = directory.path().join("run");
     let mut args = vec!["train".to_owned(), "--json".into(), "--workers".into()];
@@ -98,6 +123,7 @@ fn train((strategy, budget): (&str, u64), lag: u32, n_workers: usize) -> RunResu
     args.extend(["--budget".into(), budget.to_string()]);
     args.extend(["--set".into(), format!("rounds.lag={lag}")]);
     args.extend(SMALL.map(str::to_owned));
+    args.extend(settings.iter().flat_map(|setting| ["--set".to_owned(), (*setting).to_owned()]));
     let summary = last_line(tandem(&args).arg("--out").arg(&out));
     assert_eq!(summary["budget_left"], 0, "{strategy}: the budget did not run out");
     assert_eq!(summary["advice_spent"], budget, "{strategy}");

@@ -181,7 +181,7 @@ impl Client {
 fn query(episode: u64, step: u32) -> pb::StepQuery {
     let numbers = |n: u16| (0..n).map(|idx| f32::from(idx) / 100.0).collect();
     let (observation, goal, proposed_action) = (numbers(28), numbers(3), numbers(3));
-    pb::StepQuery { episode, step, observation, goal, proposed_action }
+    pb::StepQuery { episode, step, observation, goal, proposed_action, ..Default::default() }
 }
 
 /// Asks about new steps of the client's own episode until the budget is spent, then repeats every request.

@@ -10,8 +10,8 @@ use tandem_core::layout::EPISODE_STEPS;
 use tandem_core::task::TaskDescription;
 use tandem_core::work::{EpisodeOrder, RunTerms, SlotOrder};
 use tandem_core::{
-    ArmAdvice, Contacts, EpisodeKind, Exploration, Layout, StepAdvice, StepQuery, Task, TaskSpec,
-    WorldSettings,
+    AdviceTerms, ArmAdvice, Contacts, EpisodeKind, Exploration, Layout, StepAdvice, StepQuery,
+    Task, TaskSpec, WorldSettings,
 };
 use tandem_policy::{Actor, Policy};
 use tandem_sim::{Env, WorldConfig};
@@ -85,10 +85,12 @@ fn terms(layout: Layout, kind: Kind, substeps: u32) -> RunTerms {
         run: "replay".to_owned(),
         layout: layout.into(),
         account: Some("replay".to_owned()),
+        advice: AdviceTerms::default(),
         exploration: Exploration {
             noise_std: 0.2,
             random_action_prob: 0.3,
             sticky_random_mean_steps: 4.0,
+            joint_random_actions: false,
         },
         world: WorldSettings { grasped_start_prob: prob, substeps },
     }

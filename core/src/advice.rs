@@ -13,6 +13,20 @@ pub struct StepQuery {
     pub goal: Vec<f32>,
     /// The action that the student is about to execute, exploration included, shape `[n_action]`.
     pub proposed_action: Vec<f32>,
+    /// The action that the teacher judges, shape `[n_action]`; `None` means the proposed action. Arms that are not
+    /// overridden execute the proposed action in either case.
+    pub judged_action: Option<Vec<f32>>,
+    /// The episode that pays for the step; `None` means the episode itself. The queries of a request that have the same
+    /// payer and step share one unit.
+    pub payer: Option<u64>,
+}
+
+impl StepQuery {
+    /// Returns the action that the teacher judges, shape `[n_action]`.
+    #[must_use]
+    pub fn judged(&self) -> &[f32] {
+        self.judged_action.as_deref().unwrap_or(&self.proposed_action)
+    }
 }
 
 /// The teacher's answer for one arm.
@@ -22,7 +36,7 @@ pub struct ArmAdvice {
     pub teacher_action: Vec<f32>,
     /// The teacher's value of its own action.
     pub q_teacher: f32,
-    /// The teacher's value of the proposed action.
+    /// The teacher's value of the judged action.
     pub q_student: f32,
     /// `q_teacher − q_student` (equation 10).
     pub importance: f32,
@@ -37,7 +51,7 @@ pub struct ArmAdvice {
 pub struct StepAdvice {
     /// The action to execute, shape `[n_action]`.
     pub action: Vec<f32>,
-    /// Whether the step cost a unit of the budget.
+    /// Whether the step cost a unit of the budget, which other steps of the request may share.
     pub charged: bool,
     /// The advice for each arm, in arm order.
     pub arms: Vec<ArmAdvice>,

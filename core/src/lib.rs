@@ -151,5 +151,5 @@ pub use episode::{Contacts, Episode, EpisodeKind};
 pub use evaluation::{EpisodeOutcome, EvaluationSummary, Wilson};
 pub use layout::{ArmIndex, Layout, Task, World};
 pub use rng::{Stream, episode_rng};
-pub use settings::{Exploration, WorldSettings};
+pub use settings::{AdviceTerms, AdviceUnit, Exploration, JudgedAction, WorldSettings};
 pub use task::{TaskDescription, TaskSpec};

@@ -22,19 +22,27 @@ pub struct Exploration {
     /// Mean number of steps for which an arm repeats a random action, 1 to the steps of an episode; 1 draws a
     /// new one each step.
     pub sticky_random_mean_steps: f32,
+    /// Whether random actions start on all arms at once, so that the whole action is random (baselines HER), or on each
+    /// arm independently.
+    #[serde(default)]
+    pub joint_random_actions: bool,
 }
 
 impl Exploration {
     /// The policy's actions as they are.
-    pub const NONE: Self =
-        Self { noise_std: 0.0, random_action_prob: 0.0, sticky_random_mean_steps: 1.0 };
+    pub const NONE: Self = Self {
+        noise_std: 0.0,
+        random_action_prob: 0.0,
+        sticky_random_mean_steps: 1.0,
+        joint_random_actions: false,
+    };
 
     /// Checks every range for a task with episodes of `episode_steps` steps; NaN is in none.
     ///
     /// # Errors
     /// Names the first setting that is out of its range.
     pub fn check(&self, episode_steps: usize) -> Result<(), OutOfRange> {
-        let Self { noise_std, random_action_prob, sticky_random_mean_steps } = *self;
+        let Self { noise_std, random_action_prob, sticky_random_mean_steps, .. } = *self;
         let is_noise = (0.0..=10.0).contains(&noise_std);
         OutOfRange::unless(is_noise, "exploration.noise_std", noise_std, "0 to 10")?;
         let is_prob = (0.0..1.0).contains(&random_action_prob);
@@ -45,6 +53,37 @@ impl Exploration {
         let expected = format_args!("1 to {episode_steps}, the steps of an episode").to_string();
         OutOfRange::unless(is_mean, key, sticky_random_mean_steps, expected)
     }
+}
+
+/// How workers ask for advice: two settings of section `[advice]`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct AdviceTerms {
+    /// The action of the student that the teacher judges.
+    pub judged_action: JudgedAction,
+    /// What a unit of the budget pays for.
+    pub unit: AdviceUnit,
+}
+
+/// The action of the student that the teacher judges.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Deserialize, Serialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum JudgedAction {
+    /// The action that the student is about to execute, exploration included.
+    #[default]
+    Executed,
+    /// The policy's action without exploration: π_st(s) of equation 10.
+    Policy,
+}
+
+/// What a unit of the advice budget pays for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Deserialize, Serialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum AdviceUnit {
+    /// One step of one episode.
+    #[default]
+    EnvStep,
+    /// One lock step of a slot: the simultaneous steps of all its advised episodes.
+    SlotStep,
 }
 
 /// Section `[world]`: how training episodes start, and how finely all episodes are simulated. The default is how

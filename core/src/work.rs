@@ -1,7 +1,7 @@
 //! Work that a learner assigns to its workers.
 
 use crate::episode::EpisodeKind;
-use crate::settings::{Exploration, WorldSettings};
+use crate::settings::{AdviceTerms, Exploration, WorldSettings};
 use crate::task::TaskSpec;
 
 /// Settings that apply to every episode of a run.
@@ -13,6 +13,8 @@ pub struct RunTerms {
     pub layout: TaskSpec,
     /// The account at the teacher; `None` if the run takes no advice.
     pub account: Option<String>,
+    /// How the student asks for advice.
+    pub advice: AdviceTerms,
     /// Exploration in training episodes.
     pub exploration: Exploration,
     /// Initial states and physics.

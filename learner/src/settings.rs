@@ -44,7 +44,7 @@ pub fn to_json(config: &RunConfig) -> String {
 
 /// Returns the first setting that affects learning and has another value in `config` than in `began_with`, a text
 /// written by [`to_json`]. A setting that only one of the two has is skipped: programs of two versions may know
-/// different settings. `began_with` may use former keys.
+/// different settings. A setting that was added later has the value in effect before. `began_with` may use former keys.
 ///
 /// # Errors
 /// When `began_with` is not such a text.
@@ -59,8 +59,9 @@ pub fn first_change(
     let mut fixed = settings.filter(|(key, _)| !FREE.iter().any(|free| key.starts_with(free)));
     let changed = fixed.find_map(|(key, here)| {
         let under_former_key = || lookup(&there, former_keys::former(&key)?);
-        let there = lookup(&there, &key).or_else(under_former_key);
-        let there = there.filter(|there| **there != here)?.to_string();
+        let before_added = || serde_json::from_str(former_keys::before_added(&key)?).ok();
+        let there = lookup(&there, &key).or_else(under_former_key).cloned();
+        let there = there.or_else(before_added).filter(|there| *there != here)?.to_string();
         let shown = |value: &str| shortened(value, MAX_SHOWN_CHARS);
         Some(Changed { key, here: shown(&here.to_string()), there: shown(&there) })
     });
@@ -92,7 +93,7 @@ fn below(value: &Value, name: String) -> Vec<(String, Value)> {
 
 #[cfg(test)]
 mod tests {
-    use tandem_core::Task;
+    use tandem_core::{JudgedAction, Task};
 
     use super::*;
     use tandem_rl::config::Recipe;
@@ -146,6 +147,17 @@ mod tests {
         let wide = former.replace("\"wide_start_share\":0.0", "\"wide_start_share\":0.5");
         let found = first_change(&config(), &wide).expect("JSON").expect("it differs");
         assert_eq!(found.to_string(), "world.wide_start_share is 0 here and 0.5 in the run");
+    }
+
+    #[test]
+    fn a_setting_added_later_is_compared_with_what_was_in_effect_before() {
+        let former = to_json(&config()).replace("\"judged_action\"", "\"unknown\"");
+        assert_eq!(first_change(&config(), &former).expect("JSON"), None);
+        let mut changed = config();
+        changed.advice.judged_action = JudgedAction::Policy;
+        let found = first_change(&changed, &former).expect("JSON").expect("it differs");
+        let expected = "advice.judged_action is \"policy\" here and \"executed\" in the run";
+        assert_eq!(found.to_string(), expected);
     }
 
     #[test]

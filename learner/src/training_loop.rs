@@ -12,7 +12,7 @@ mod run_lock;
 use std::time::Duration;
 
 use tandem_core::work::{PublishedActor, SlotOrder};
-use tandem_core::{Episode, EpisodeKind};
+use tandem_core::{AdviceUnit, Episode, EpisodeKind};
 use tandem_rl::trainer::{RoundStats, Trainer};
 use tandem_telemetry::events::{ParametersPublished, RoundFinished, RunFinished, WorkerSilent};
 use tokio_util::sync::CancellationToken;
@@ -204,9 +204,8 @@ impl LearnerLoop<'_> {
         }
         let orders = self.trainer.training_orders(round, version);
         if let Some(account) = &mut self.account {
-            let ordered = orders.iter().flat_map(|slot| &slot.episodes);
-            let advised = ordered.filter(|order| order.advised).map(|order| order.number).collect();
-            let Some(allowances) = unless_stopped(account.open_leases(advised, spent))? else {
+            let payers = payers(&orders, self.context.config.run.advice.unit);
+            let Some(allowances) = unless_stopped(account.open_leases(payers, spent))? else {
                 return Ok(false);
             };
             let allowances = allowances.iter().map(|each| (each.episode, each.units));
@@ -377,6 +376,20 @@ impl<'a> LearnerLoop<'a> {
         };
         (&mut self.persistence, state)
     }
+}
+
+/// Returns the episodes that pay for advice, in their order: every advised one, or the first of each slot if a unit
+/// pays for its lock step.
+fn payers(orders: &[SlotOrder], unit: AdviceUnit) -> Vec<u64> {
+    let n_payers = match unit {
+        AdviceUnit::EnvStep => usize::MAX,
+        AdviceUnit::SlotStep => 1,
+    };
+    let advised = |slot: &'_ SlotOrder| {
+        let advised = slot.episodes.iter().filter(|order| order.advised).take(n_payers);
+        advised.map(|order| order.number).collect::<Vec<_>>()
+    };
+    orders.iter().flat_map(advised).collect()
 }
 
 /// Logs the workers that fell silent, the first [`MAX_SILENT_LINES`] by name: there can be thousands.

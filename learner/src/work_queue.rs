@@ -10,7 +10,7 @@ use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::time::Duration;
 
 use tandem_core::work::SlotOrder;
-use tandem_core::{Episode, EpisodeKind};
+use tandem_core::{AdviceUnit, Episode, EpisodeKind};
 
 pub use check::{SubmitError, check_count};
 use check::{check, check_claims};
@@ -49,6 +49,8 @@ pub struct WorkQueue {
     newcomers: BTreeSet<u64>,
     /// Units of advice that open episodes can claim; an episode without an entry can claim a unit per step.
     claim_limits: BTreeMap<u64, u32>,
+    /// What a unit of advice pays for.
+    pub advice_unit: AdviceUnit,
 }
 
 #[derive(Debug)]
@@ -353,7 +355,7 @@ impl WorkQueue {
         let is_new = ordered.is_some();
         if let Some(order) = ordered {
             let order = order.clone();
-            check(&order, &episodes)?;
+            check(&order, self.advice_unit, &episodes)?;
             check_claims(&self.claim_limits, &order, &episodes)?;
         }
         self.record_delivery(worker_id, slot, if is_new { episodes.len() } else { 0 });

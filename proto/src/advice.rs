@@ -32,6 +32,8 @@ pub fn encode_query(query: &StepQuery) -> pb::StepQuery {
         observation: query.observation.clone(),
         goal: query.goal.clone(),
         proposed_action: query.proposed_action.clone(),
+        judged_action: query.judged_action.clone().unwrap_or_default(),
+        payer: query.payer,
     }
 }
 
@@ -41,7 +43,7 @@ pub fn encode_query(query: &StepQuery) -> pb::StepQuery {
 ///
 /// # Errors
 /// Returns an error if a vector has the wrong length, a number is not finite or beyond both [`MAX_MAGNITUDE`] and the
-/// task's bound, or the proposed action is outside [−1, 1].
+/// task's bound, or an action is outside [−1, 1].
 pub fn decode_query(
     query: pb::StepQuery,
     layout: impl Into<TaskSpec>,
@@ -50,12 +52,16 @@ pub fn decode_query(
     // Students may be trained by other programs in other worlds, so the bound is that of a task only if it is larger.
     let largest = |idx| MAX_MAGNITUDE.max(layout.observation_bound(idx));
     let largest_goal = |idx| MAX_MAGNITUDE.max(layout.goal_bound(idx));
+    let judged = (!query.judged_action.is_empty()).then_some(query.judged_action);
+    let decode_judged = |judged| actions("judged_action", judged, layout.n_action());
     Ok(StepQuery {
         episode: query.episode,
         step: query.step,
         observation: bounded("observation", query.observation, layout.n_observation(), largest)?,
         goal: bounded("goal", query.goal, layout.n_goal(), largest_goal)?,
         proposed_action: actions("proposed_action", query.proposed_action, layout.n_action())?,
+        judged_action: judged.map(decode_judged).transpose()?,
+        payer: query.payer,
     })
 }
 
@@ -136,6 +142,8 @@ mod tests {
             observation: (0_u8..56).map(|i| f32::from(i) / 7.0).collect(),
             goal: vec![0.1, -0.2, 0.3, 0.4, 0.5, -0.6],
             proposed_action: vec![-1.0, 1.0, 0.0, 0.25, 0.5, -0.5, 0.75, -0.75],
+            judged_action: Some(vec![0.5; 8]),
+            payer: Some(0),
         }
     }
 
@@ -162,7 +170,10 @@ mod tests {
 
     #[test]
     fn a_query_round_trips() {
-        assert_eq!(decode_query(sent(&encode_query(&query())), LAYOUT), Ok(query()));
+        let unjudged = StepQuery { judged_action: None, payer: None, ..query() };
+        for query in [query(), unjudged] {
+            assert_eq!(decode_query(sent(&encode_query(&query)), LAYOUT), Ok(query));
+        }
     }
 
     #[test]
@@ -194,6 +205,7 @@ mod tests {
             |q| q.proposed_action[7] = -1.25,
             "proposed_action[7]: expected a number in [-1, 1], got -1.25",
         );
+        check(|q| q.judged_action.truncate(7), "judged_action: expected 8 numbers, got 7 numbers");
     }
 
     #[test]
@@ -251,6 +263,8 @@ mod tests {
             observation: (0_u8..28).map(|i| f32::from(i) / 4.0).collect(),
             goal: vec![0.5, -0.25, 0.0],
             proposed_action: vec![1.0, -1.0, 0.125],
+            judged_action: None,
+            payer: None,
         };
         assert_eq!(
             decode_query(request.steps[0].clone(), Layout::new(Task::Push, 1)),

@@ -15,6 +15,8 @@
 //!     observation: vec![0.0; layout.n_observation()],
 //!     goal: vec![0.1; layout.n_goal()],
 //!     proposed_action: vec![0.5; layout.n_action()],
+//!     judged_action: None,
+//!     payer: None,
 //! };
 //! let mut message = encode_query(&query);
 //! assert_eq!(decode_query(message.clone(), layout).as_ref(), Ok(&query));

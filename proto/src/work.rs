@@ -4,7 +4,10 @@ mod episode;
 
 use tandem_core::task::MAX_ARMS;
 use tandem_core::work::{EpisodeOrder, PublishedActor, RunTerms, SlotOrder};
-use tandem_core::{EpisodeKind, Exploration, Layout, Task, TaskSpec, WorldSettings};
+use tandem_core::{
+    AdviceTerms, AdviceUnit, EpisodeKind, Exploration, JudgedAction, Layout, Task, TaskSpec,
+    WorldSettings,
+};
 
 use crate::advice::decode_account_name;
 use crate::error::DecodeError;
@@ -59,6 +62,11 @@ pub fn encode_run_terms(terms: &RunTerms) -> pb::RunTerms {
             noise_std: terms.exploration.noise_std,
             random_share: terms.exploration.random_action_prob,
             random_hold_mean_steps: terms.exploration.sticky_random_mean_steps,
+            joint_random_actions: terms.exploration.joint_random_actions,
+        }),
+        advice: Some(pb::AdviceTerms {
+            judges_policy_action: terms.advice.judged_action == JudgedAction::Policy,
+            charges_slot_steps: terms.advice.unit == AdviceUnit::SlotStep,
         }),
         world: Some(pb::WorldTerms {
             gripped_start_share: terms.world.grasped_start_prob,
@@ -84,6 +92,7 @@ pub fn decode_run_terms(terms: pb::RunTerms) -> Result<RunTerms, DecodeError> {
                 .map_err(|error| error.within("description"))?,
         },
         account: account.map(|name| decode_account_name("account", name)).transpose()?,
+        advice: terms.advice.map_or_else(AdviceTerms::default, decode_advice_terms),
         exploration: decode_exploration(exploration)
             .map_err(|error| error.within("exploration"))?,
         world: decode_world(world).map_err(|error| error.within("world"))?,
@@ -127,6 +136,20 @@ fn decode_described(
     Ok(task)
 }
 
+/// Decodes how workers ask for advice. All values of its fields are valid.
+const fn decode_advice_terms(advice: pb::AdviceTerms) -> AdviceTerms {
+    AdviceTerms {
+        judged_action: match advice.judges_policy_action {
+            true => JudgedAction::Policy,
+            false => JudgedAction::Executed,
+        },
+        unit: match advice.charges_slot_steps {
+            true => AdviceUnit::SlotStep,
+            false => AdviceUnit::EnvStep,
+        },
+    }
+}
+
 fn decode_exploration(exploration: pb::Exploration) -> Result<Exploration, DecodeError> {
     let hold = exploration.random_hold_mean_steps;
     Ok(Exploration {
@@ -137,6 +160,7 @@ fn decode_exploration(exploration: pb::Exploration) -> Result<Exploration, Decod
             hold,
             &(1.0..=f32::INFINITY),
         )?,
+        joint_random_actions: exploration.joint_random_actions,
     })
 }
 
@@ -282,10 +306,12 @@ mod tests {
             run: "run-7".to_owned(),
             layout: LAYOUT.into(),
             account: Some("run-7".to_owned()),
+            advice: AdviceTerms { judged_action: JudgedAction::Policy, unit: AdviceUnit::SlotStep },
             exploration: Exploration {
                 noise_std: 0.2,
                 random_action_prob: 0.3,
                 sticky_random_mean_steps: 4.0,
+                joint_random_actions: true,
             },
             world: WorldSettings { grasped_start_prob: 1.0, substeps: 20 },
         }
@@ -333,6 +359,14 @@ mod tests {
         assert_eq!(decode_run_terms(sent(&encode_run_terms(&unadvised))), Ok(unadvised));
         assert_eq!(decode_slot(sent(&encode_slot(&slot()))), Ok(slot()));
         assert_eq!(decode_actor(&sent(&encode_actor(&actor())), LAYOUT), Ok(actor()));
+    }
+
+    #[test]
+    fn terms_without_the_advice_of_later_versions_have_its_defaults() {
+        let mut former = encode_run_terms(&terms());
+        former.advice = None;
+        let decoded = decode_run_terms(former).unwrap();
+        assert_eq!(decoded, RunTerms { advice: AdviceTerms::default(), ..terms() });
     }
 
     #[test]

@@ -88,14 +88,22 @@ fn query(layout: Layout) -> impl Strategy<Value = pb::StepQuery> {
         numbers(layout.n_observation()),
         numbers(layout.n_goal()),
         numbers(layout.n_action()),
+        prop_oneof![1 => Just(Vec::new()), 1 => numbers(layout.n_action())],
+        any::<Option<u64>>(),
     )
-        .prop_map(|(episode, step, observation, goal, proposed_action)| pb::StepQuery {
-            episode,
-            step,
-            observation,
-            goal,
-            proposed_action,
-        })
+        .prop_map(
+            |(episode, step, observation, goal, proposed_action, judged_action, payer)| {
+                pb::StepQuery {
+                    episode,
+                    step,
+                    observation,
+                    goal,
+                    proposed_action,
+                    judged_action,
+                    payer,
+                }
+            },
+        )
 }
 
 fn arm_advice(layout: Layout) -> impl Strategy<Value = pb::ArmAdvice> {
@@ -129,12 +137,18 @@ fn advice(layout: Layout) -> impl Strategy<Value = pb::StepAdvice> {
 }
 
 fn terms() -> impl Strategy<Value = pb::RunTerms> {
-    let exploration = (one_number(), one_number(), prop_oneof![1.0_f32..50.0, one_number()])
-        .prop_map(|(noise_std, random_share, random_hold_mean_steps)| pb::Exploration {
-            noise_std,
-            random_share,
-            random_hold_mean_steps,
-        });
+    let exploration =
+        (one_number(), one_number(), prop_oneof![1.0_f32..50.0, one_number()], any::<bool>())
+            .prop_map(|(noise_std, random_share, random_hold_mean_steps, joint)| pb::Exploration {
+                noise_std,
+                random_share,
+                random_hold_mean_steps,
+                joint_random_actions: joint,
+            });
+    let advice = (any::<bool>(), any::<bool>()).prop_map(|(policy, slots)| pb::AdviceTerms {
+        judges_policy_action: policy,
+        charges_slot_steps: slots,
+    });
     let removed = prop_oneof![4 => Just(0.0), 1 => one_number()];
     let world = (one_number(), removed, any_count(10_000)).prop_map(
         |(gripped_start_share, wide_start_share, substeps)| pb::WorldTerms {
@@ -151,9 +165,11 @@ fn terms() -> impl Strategy<Value = pb::RunTerms> {
         proptest::option::weighted(part, exploration),
         proptest::option::weighted(part, world),
         any_text(),
+        proptest::option::weighted(part, advice),
     )
-        .prop_map(|(task, n_arms, account, exploration, world, run)| pb::RunTerms {
+        .prop_map(|(task, n_arms, account, exploration, world, run, advice)| pb::RunTerms {
             description: None,
+            advice,
             task,
             n_arms,
             account,

@@ -125,6 +125,10 @@ class Step:
     """Shape `[n_goal]`."""
     proposed_action: ArrayLike
     """The student's action, in [-1, 1], shape `[n_action]`."""
+    judged_action: ArrayLike | None = None
+    """The action that the teacher judges in its place, shape `[n_action]`."""
+    payer: int | None = None
+    """The episode that pays; steps of a request with the same payer and step share one unit."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -203,6 +207,8 @@ class Teacher(_Client):
                 observation=_floats(step.observation),
                 goal=_floats(step.goal),
                 proposed_action=_floats(step.proposed_action),
+                judged_action=None if step.judged_action is None else _floats(step.judged_action),
+                payer=step.payer,
             )
         return [_advice(step) for step in self._call(self._stub.Advise, request).steps]
 

@@ -21,7 +21,7 @@ const SIDE: usize = 256;
 fn main() -> Result<(), Box<dyn std::error::Error>> {
     let layout = Layout::new(Task::Push, 2);
     let config = DdpgConfig::default();
-    let mut batch = Batch::new(layout, 2, config.batch_size);
+    let mut batch = Batch::new(layout, 2, config.transitions_per_update());
     let mut rng = episode_rng(1, 0, Stream::Replay);
     for x in batch.inputs.iter_mut().chain(&mut batch.next_inputs).chain(&mut batch.actions) {
         *x = uniform(&mut rng, -1.0, 1.0);

@@ -6,7 +6,9 @@ use serde::{Deserialize, Serialize};
 use tandem_core::layout::UnknownTask;
 use tandem_core::settings::OutOfRange;
 use tandem_core::task::{InvalidTask, MAX_ARMS};
-use tandem_core::{Exploration, TaskDescription, TaskSpec, WorldSettings};
+use tandem_core::{
+    AdviceTerms, AdviceUnit, Exploration, JudgedAction, TaskDescription, TaskSpec, WorldSettings,
+};
 
 use crate::ddpg::DdpgConfig;
 use crate::her::ReplayConfig;
@@ -80,13 +82,42 @@ pub const INIT_TEACHER: &str = "init:teacher";
 pub struct AdviceConfig {
     /// `none`, `ea`, `eamc:T`, `mc-q:T`, `mc-act:A` or `mc-act-abs:A` (section 3.2 of the paper), or [`INIT_TEACHER`].
     pub strategy: String,
-    /// Units of advice for the whole run, at most 10^12 (paper: 500,000).
+    /// Units of advice, at most 10^12 for the whole run (paper: 500,000).
     pub budget: u64,
+    /// Whether the budget is that of the run (`run`) or of each of its slots (`slot`). The budgets of the slots are
+    /// added up to one: slots differ in their seeds only and spend alike.
+    #[serde(default)]
+    pub budget_scope: BudgetScope,
+    /// What a unit pays for: one step of one episode (`env-step`), or the simultaneous steps of all advised episodes of
+    /// a slot (`slot-step`).
+    #[serde(default)]
+    pub unit: AdviceUnit,
+    /// The action that the teacher judges: the one to be executed, exploration included (`executed`), or the policy's
+    /// without exploration (`policy`; π_st(s) of equation 10).
+    #[serde(default)]
+    pub judged_action: JudgedAction,
     /// Fraction of the training episodes that are advised, in [0, 1] (paper: 1).
     pub share: f64,
 }
 
+/// The part of a run that a budget of advice is for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Deserialize, Serialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum BudgetScope {
+    /// All slots of the run.
+    #[default]
+    Run,
+    /// Each slot of a round.
+    Slot,
+}
+
 impl AdviceConfig {
+    /// Returns how workers ask for advice.
+    #[must_use]
+    pub const fn terms(&self) -> AdviceTerms {
+        AdviceTerms { judged_action: self.judged_action, unit: self.unit }
+    }
+
     /// Returns true if workers ask a teacher for advice.
     #[must_use]
     pub fn asks(&self) -> bool {
@@ -123,6 +154,14 @@ pub struct RoundsConfig {
     pub polyak_every: PolyakEvery,
     /// Number of environment steps with random actions at the start of training.
     pub warmup_env_steps: u64,
+    /// Rounds that metrics count as one epoch of the paper, 1 to 1,000,000 (cycles per epoch of the HER reference
+    /// implementation: 50). It affects no other result.
+    #[serde(default = "cycles_per_epoch")]
+    pub per_epoch: u64,
+}
+
+const fn cycles_per_epoch() -> u64 {
+    50
 }
 
 /// When the target networks are averaged.
@@ -221,6 +260,15 @@ impl RunConfig {
     #[must_use]
     pub const fn episodes_per_round(&self) -> u64 {
         (self.rounds.slots * self.rounds.rollouts) as u64
+    }
+
+    /// Returns the units of advice of the whole run.
+    #[must_use]
+    pub const fn advice_budget(&self) -> u64 {
+        match self.advice.budget_scope {
+            BudgetScope::Run => self.advice.budget,
+            BudgetScope::Slot => self.advice.budget.saturating_mul(self.rounds.slots as u64),
+        }
     }
 
     /// Returns the number of environment steps per round.

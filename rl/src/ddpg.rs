@@ -49,7 +49,7 @@ impl Batch {
     }
 }
 
-/// Losses of an update, at the parameters before it.
+/// Losses of an update, at the parameters before it: means over its batches.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct UpdateLosses {
     /// Squared error of the critic: mean over the batch, sum over the heads.
@@ -132,7 +132,8 @@ impl Ddpg {
         Self { config, n_threads: 1, n_updates: 0, actor, critic, actor_half, critic_half }
     }
 
-    /// Makes one gradient step of critic and actor on `batch`.
+    /// Makes one gradient step of critic and actor on `batch`, which holds the transitions of all batches of an update.
+    /// The gradients of the batches are summed.
     ///
     /// # Errors
     /// When a loss or a parameter is no longer finite.
@@ -227,7 +228,7 @@ struct CriticHalf {
 
 impl CriticHalf {
     fn new(config: &DdpgConfig, lowest_reward: f32, actor: &MlpShape, critic: &MlpShape) -> Self {
-        let b = config.batch_size;
+        let b = config.transitions_per_update();
         Self {
             lowest_reward,
             input: vec![0.0; b * critic.n_input],
@@ -249,7 +250,7 @@ impl CriticHalf {
         critic: &Network,
         batch: &Batch,
     ) -> f64 {
-        let b = config.batch_size;
+        let b = config.transitions_per_update();
         let n_input = actor.shape.n_input;
         let n_joined = critic.shape.n_input;
 
@@ -282,14 +283,14 @@ impl CriticHalf {
         let mut q = MatrixMut::new(&mut self.q, b, critic.shape.n_output);
         forward(&critic.shape, &critic.online, joined, &mut self.critic_workspace, &mut q);
 
-        // Mean over the batch of (Q - y)^2, and its gradient.
+        // Mean of (Q - y)^2, and the sum over the batches of its gradient in each.
         assert_eq!(batch.rewards.len(), self.q.len(), "rewards for another number of heads");
         let mut loss = 0.0;
         let values = self.q.iter().zip(&self.next_q).zip(&batch.rewards);
         for (gradient, ((q, next_q), reward)) in self.q_gradient.iter_mut().zip(values) {
             let error = q - critic_target(config.discount, self.lowest_reward, *reward, *next_q);
             loss += f64::from(error) * f64::from(error);
-            *gradient = 2.0 * error / b as f32;
+            *gradient = 2.0 * error / config.batch_size as f32;
         }
         let gradient = &mut self.optimizer.gradient;
         backward_parameters(
@@ -330,11 +331,11 @@ struct ActorHalf {
 
 impl ActorHalf {
     fn new(config: &DdpgConfig, actor: &MlpShape, critic: &MlpShape) -> Self {
-        let b = config.batch_size;
+        let b = config.transitions_per_update();
         Self {
             input: vec![0.0; b * critic.n_input],
             q: vec![0.0; b * critic.n_output],
-            q_gradient: vec![-1.0 / b as f32; b * critic.n_output],
+            q_gradient: vec![-1.0 / config.batch_size as f32; b * critic.n_output],
             action_gradient: vec![0.0; b * actor.n_output],
             actor_workspace: Workspace::new(actor, b),
             critic_workspace: Workspace::new(critic, b),
@@ -350,7 +351,7 @@ impl ActorHalf {
         critic: &Network,
         batch: &Batch,
     ) -> (f64, f64) {
-        let b = config.batch_size;
+        let b = config.transitions_per_update();
         let n_input = actor.shape.n_input;
         let n_joined = critic.shape.n_input;
 
@@ -398,8 +399,8 @@ impl ActorHalf {
     /// and returns these terms: the mean squared action, and the squared error to the teacher's action where that was
     /// executed.
     fn add_action_terms(&mut self, config: &DdpgConfig, batch: &Batch, n_input: usize) -> f64 {
-        let n_action = self.action_gradient.len() / config.batch_size;
-        let penalty = config.action_penalty / self.action_gradient.len() as f32;
+        let n_action = self.action_gradient.len() / config.transitions_per_update();
+        let penalty = config.action_penalty / (config.batch_size * n_action) as f32;
         let cloning = config.bc_weight / config.batch_size as f32;
         let mut loss = 0.0;
         let executed_rows =
@@ -417,7 +418,7 @@ impl ActorHalf {
                 loss += f64::from(penalty * action * action + cloning * error * error);
             }
         }
-        loss
+        loss / config.batches_per_update as f64
     }
 }
 

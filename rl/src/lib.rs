@@ -31,7 +31,7 @@
 //!
 //! // HER samples transitions, gives most of them a goal that their episode achieved later, and recomputes rewards.
 //! let n_heads = config.replay.reward.n_heads(&layout);
-//! let mut batch = Batch::new(&layout, n_heads, config.ddpg.batch_size);
+//! let mut batch = Batch::new(&layout, n_heads, config.ddpg.transitions_per_update());
 //! let observation = NormalizerSnapshot::identity(layout.n_observation());
 //! let goal = NormalizerSnapshot::identity(layout.n_goal());
 //! let statistics = Statistics { observation: &observation, goal: &goal };

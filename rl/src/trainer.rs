@@ -95,7 +95,7 @@ impl Trainer {
             observation_normalizer: Normalizer::new(layout.n_observation()),
             goal_normalizer: Normalizer::new(layout.n_goal()),
             sampler: Sampler::new(&config.replay, &layout),
-            batch: Batch::new(&layout, n_heads, config.ddpg.batch_size),
+            batch: Batch::new(&layout, n_heads, config.ddpg.transitions_per_update()),
             stats: RoundStats::default(),
             layout,
             config,
@@ -383,10 +383,14 @@ impl Trainer {
         rng: &mut ChaCha8Rng,
     ) -> Vec<f32> {
         let mut goal = episode.goal.clone();
-        let layout = &self.layout;
+        let (layout, replay) = (&self.layout, &self.config.replay);
+        let mut draw = || {
+            let hindsight = bernoulli(rng, replay.her_ratio);
+            (hindsight, step_idx + 1 + index(rng, layout.episode_steps() - step_idx))
+        };
+        let joint = replay.joint_goal_statistics.then(&mut draw);
         for arm in layout.arms() {
-            let hindsight = bernoulli(rng, self.config.replay.her_ratio);
-            let later_step = step_idx + 1 + index(rng, layout.episode_steps() - step_idx);
+            let (hindsight, later_step) = joint.unwrap_or_else(&mut draw);
             if !hindsight {
                 continue;
             }
@@ -456,28 +460,4 @@ fn slots(
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::config::Recipe;
-
-    #[test]
-    fn a_statistic_ruined_by_one_implausible_number_is_named() {
-        let mut config = RunConfig::defaults(Recipe::Tandem, tandem_core::Task::Push, 2);
-        config.ddpg.n_hidden = 4;
-        let mut trainer = Trainer::new(config).expect("valid");
-        assert_eq!(trainer.implausible_statistic(), None);
-        let mut row = vec![0.0; trainer.layout.n_observation()];
-        trainer.observation_normalizer.update(&row);
-        row[31] = 25.0;
-        trainer.observation_normalizer.update(&row);
-        assert_eq!(trainer.implausible_statistic(), None, "an object may fall");
-        row[31] = 1e29;
-        trainer.observation_normalizer.update(&row);
-        let named = trainer.implausible_statistic().expect("ruined");
-        assert!(named.starts_with("number 31 of the observations has mean 3.3"), "{named}");
-        trainer.observation_normalizer = Normalizer::new(row.len());
-        trainer.goal_normalizer.update(&[f32::NAN; 6]);
-        let named = trainer.implausible_statistic().expect("not finite");
-        assert!(named.starts_with("number 0 of the goals has mean NaN"), "{named}");
-    }
-}
+mod tests;

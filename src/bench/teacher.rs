@@ -296,6 +296,8 @@ impl Requests {
                 observation: numbers(layout.n_observation()),
                 goal: numbers(layout.n_goal()),
                 proposed_action: numbers(layout.n_action()),
+                judged_action: None,
+                payer: None,
             })
         });
         Self { request: pb::AdviseRequest { account: ACCOUNT.to_owned(), steps: steps.collect() } }

@@ -10,7 +10,7 @@ use super::{EnvironmentArgs, TaskName, WorldName};
 pub(crate) enum RecipeName {
     /// Tandem's recipe, which needs few environment steps and minutes on two cores.
     Tandem,
-    /// The paper's DDPG + HER with the reference implementation's values.
+    /// The paper's DDPG + HER, with the reference implementation's values where the paper gives none; takes hours.
     Paper,
 }
 
@@ -25,6 +25,7 @@ Examples:
   tandem train --teacher http://127.0.0.1:7005        a policy in another process
   tandem train --set ddpg.discount=0.98 --set rounds.slots=16
   tandem train --run my-run.toml --out runs/mine
+  tandem train --recipe paper --teacher runs/teacher-push-paper/policy/best.safetensors
   tandem train --env 127.0.0.1:7005                   plays in the environments of a server
   tandem train --env-command 'tandem env'             each worker starts a server of its own
   tandem train --resume --out runs/mine               resumes the run
@@ -45,13 +46,15 @@ pub(crate) struct TrainArgs {
     #[arg(long, value_name = "NAME[:THRESHOLD]")]
     pub(crate) strategy: Option<String>,
     /// Policy file of the teacher, the ONNX model of an actor (*.onnx), or http://HOST:PORT of a server of
-    /// tandem.v1.Policy without a token [default: the shipped teacher of the task].
+    /// tandem.v1.Policy without a token [default: the shipped teacher of the task]. With --recipe paper it should be a
+    /// teacher of that recipe; otherwise a message says so.
     #[arg(long, value_name = "FILE|URL")]
     pub(crate) teacher: Option<PathBuf>,
     /// ONNX model of the teacher's critic. Without it, strategies that compare values cannot be used.
     #[arg(long, value_name = "FILE.onnx", requires = "teacher")]
     pub(crate) teacher_critic: Option<PathBuf>,
-    /// Advice budget of the run, in environment steps with advice [default: 500000].
+    /// Advice budget, in environment steps with advice; with --recipe paper in lock steps of each slot
+    /// (advice.budget_scope, advice.unit) [default: 500000].
     #[arg(long, value_name = "N")]
     pub(crate) budget: Option<u64>,
     /// Number of worker processes [default: one per core, at most one per slot].

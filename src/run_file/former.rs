@@ -1,10 +1,33 @@
 //! Settings under the keys of earlier versions.
 
 use anyhow::bail;
-use tandem_rl::config::former_keys::{REMOVED, RENAMED};
+use tandem_rl::config::former_keys::{ADDED, REMOVED, RENAMED};
 use toml::{Table, Value};
 
 use super::{set, shown};
+
+/// Settings that together only a file with all settings has.
+const OF_RESOLVED_FILES: [&str; 5] = [
+    "rounds.polyak_every",
+    "ddpg.n_hidden_layers",
+    "evaluation.seed",
+    "stop.until_success",
+    "checkpoint.keep",
+];
+
+/// Gives settings that are missing from a file with all settings of an earlier version the values that were in effect
+/// then. Other files leave them to the recipe.
+pub(super) fn with_added(mut table: Table) -> anyhow::Result<Table> {
+    if OF_RESOLVED_FILES.iter().any(|key| lookup(&table, key).is_none()) {
+        return Ok(table);
+    }
+    for (key, value) in ADDED {
+        if lookup(&table, key).is_none() {
+            set(&mut table, key, value.parse()?)?;
+        }
+    }
+    Ok(table)
+}
 
 /// Moves the values of former keys to the current ones, and drops removed settings.
 pub(super) fn current_keys(mut table: Table) -> anyhow::Result<Table> {

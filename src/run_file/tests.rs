@@ -161,6 +161,24 @@ fn a_time_limit_replaces_the_recipes_number_of_steps() {
 }
 
 #[test]
+fn a_complete_file_of_an_earlier_version_keeps_its_meaning() {
+    let config = RunConfig::defaults(Recipe::Paper, Task::Push, 2);
+    let mut file: Table = to_toml(&config).expect("writes").parse().expect("TOML");
+    for (key, _) in former_keys::ADDED {
+        let (section, name) = key.split_once('.').expect("in a section");
+        let removed = file[section].as_table_mut().expect("a section").remove(name);
+        assert!(removed.is_some(), "{key}");
+    }
+    let former = overlay(file, &[]).expect("valid");
+    let tandem = RunConfig::defaults(Recipe::Tandem, Task::Push, 2);
+    assert_eq!(former.advice.terms(), tandem.advice.terms());
+    assert_eq!(former.advice_budget(), 500_000);
+    assert!(!former.exploration.joint_random_actions && !former.replay.joint_goal_statistics);
+    let users = overlay(parse("recipe = \"paper\"").expect("TOML"), &[]).expect("valid");
+    assert_eq!(users.advice, config.advice, "the recipe fills in a user's file");
+}
+
+#[test]
 fn every_run_file_that_ships_is_valid() {
     let directory = Path::new(env!("CARGO_MANIFEST_DIR")).join("deploy");
     let files = std::fs::read_dir(directory).expect("ships").flatten().map(|entry| entry.path());

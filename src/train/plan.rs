@@ -12,7 +12,7 @@ use super::teacher_file::TeacherFile;
 use crate::cli::{EnvironmentArgs, RecipeName, TrainArgs, chosen_task};
 use crate::exit::{Exit, Failed, OrExit as _};
 use crate::service::worker_failed;
-use crate::{policy_file, run_directory, run_file, served_task};
+use crate::{output, policy_file, run_directory, run_file, served_task};
 
 /// A run that can be started.
 pub(crate) struct Plan {
@@ -279,9 +279,15 @@ fn teacher_file(args: &TrainArgs, config: &RunConfig, out: &Path) -> Result<Teac
         Some(path) => TeacherFile::load(path.clone(), args.teacher_critic.clone())?,
         None => match args.resume.then(own).flatten() {
             Some(own) => own?,
-            None => TeacherFile::load(policy_file::shipped_teacher(&config.task)?, None)?,
+            None => {
+                let path = policy_file::shipped_teacher_of(config.recipe, &config.task)?;
+                TeacherFile::load(path, None)?
+            }
         },
     };
     teacher.check(config)?;
+    if let Some(remark) = teacher.other_recipe(config).filter(|_| !args.resume) {
+        output::message(format_args!("tandem: {remark}"));
+    }
     Ok(teacher)
 }

@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 use tandem_core::TaskSpec;
 use tandem_policy::Policy;
 use tandem_rl::RunConfig;
+use tandem_rl::config::Recipe;
 use tandem_system::atomic_file;
 use tandem_teacher::policy::{OnnxPolicy, is_onnx};
 use tandem_teacher::{Error, Strategy, TeacherPolicy as _};
@@ -150,6 +151,21 @@ impl TeacherFile {
             }
             _ => Ok(()),
         }
+    }
+
+    /// Returns a remark if the run has the paper's recipe and the teacher was trained with another one.
+    pub(super) fn other_recipe(&self, config: &RunConfig) -> Option<String> {
+        let Source::Policy(policy) = &self.source else { return None };
+        let trained_with = policy.metadata.get("recipe")?;
+        if config.recipe != Recipe::Paper || trained_with == "paper" {
+            return None;
+        }
+        Some(format!(
+            "the teacher {} was trained with recipe {trained_with:?}, whose values have another range: for the paper's, \
+             train one with `tandem train --run deploy/teacher-{}-paper.toml` and name it with --teacher",
+            self.path.display(),
+            self.layout.name()
+        ))
     }
 
     /// Returns the file of the policy or of the actor's model, or the address of the policy's server.

@@ -231,15 +231,28 @@ struct ScoredRequest<'a> {
 }
 
 impl ScoredRequest<'_> {
-    /// Returns the charges that the request may cause, unless it has no steps.
+    /// Returns the charges that the request may cause, unless it has no steps. Queries with the same payer and step
+    /// share one, which is wanted if any of them wants it.
     fn charge_request(&self, episode_steps: u32) -> Option<ChargeRequest> {
-        let charges = self.request.queries.iter().zip(&self.arms).map(|(query, arms)| Charge {
-            episode: query.episode,
-            step: query.step,
-            wanted_in_first_half: overrides_any(self.strategy, BudgetHalf::First, arms),
-            wanted_in_second_half: overrides_any(self.strategy, BudgetHalf::Second, arms),
-        });
-        let charges: Vec<Charge> = charges.collect();
+        let mut charges: Vec<Charge> = Vec::new();
+        for ((query, arms), charge_idx) in
+            self.request.queries.iter().zip(&self.arms).zip(charge_indices(&self.request.queries))
+        {
+            let wanted = |half| overrides_any(self.strategy, half, arms);
+            let (first, second) = (wanted(BudgetHalf::First), wanted(BudgetHalf::Second));
+            match charges.get_mut(charge_idx) {
+                Some(charge) => {
+                    charge.wanted_in_first_half |= first;
+                    charge.wanted_in_second_half |= second;
+                }
+                None => charges.push(Charge {
+                    episode: query.payer.unwrap_or(query.episode),
+                    step: query.step,
+                    wanted_in_first_half: first,
+                    wanted_in_second_half: second,
+                }),
+            }
+        }
         let account = || self.request.account.clone();
         (!charges.is_empty()).then(|| ChargeRequest { account: account(), episode_steps, charges })
     }
@@ -252,13 +265,33 @@ impl ScoredRequest<'_> {
     ) -> Result<Advice, Error> {
         let (queries, maps) = (&self.request.queries, &info.maps);
         let n_steps = episode_steps(&info.layout);
-        let charged = charged.map_err(|error| with_step(error, queries, n_steps))?;
-        assert_eq!(charged.verdicts.len(), queries.len(), "a ledger decides on every charge");
-        let decided = queries.iter().zip(self.arms).zip(charged.verdicts);
+        let indices = charge_indices(queries);
+        let charged = charged.map_err(|error| with_step(error, queries, &indices, n_steps))?;
+        let n_charges = indices.iter().max().map_or(0, |last| last + 1);
+        assert_eq!(charged.verdicts.len(), n_charges, "a ledger decides on every charge");
+        let verdicts = indices.into_iter().map(|charge_idx| charged.verdicts[charge_idx]);
+        let decided = queries.iter().zip(self.arms).zip(verdicts);
         let steps = decided
             .map(|((query, arms), verdict)| step_advice(self.strategy, maps, query, arms, verdict));
         Ok(Advice { steps: steps.collect(), budget_left: charged.left })
     }
+}
+
+/// Returns the index of each query's charge. Charges are in the order of their first query.
+fn charge_indices(queries: &[StepQuery]) -> Vec<usize> {
+    let mut shared: BTreeMap<(u64, u32), usize> = BTreeMap::new();
+    let mut n_charges = 0;
+    let mut next = || {
+        n_charges += 1;
+        n_charges - 1
+    };
+    queries
+        .iter()
+        .map(|query| match query.payer {
+            Some(payer) => *shared.entry((payer, query.step)).or_insert_with(&mut next),
+            None => next(),
+        })
+        .collect()
 }
 
 /// Overrides the arms that the strategy selects, if a unit was charged for the step.
@@ -299,11 +332,17 @@ fn episode_steps(task: &TaskSpec) -> u32 {
 }
 
 /// Adds the step of a refused charge to the error.
-fn with_step(error: LedgerError, queries: &[StepQuery], n_steps: u32) -> Error {
+fn with_step(
+    error: LedgerError,
+    queries: &[StepQuery],
+    charge_indices: &[usize],
+    n_steps: u32,
+) -> Error {
     let LedgerError::BeyondEnd { charge_idx } = error else { return error.into() };
     let expected = format!("0 to {} in an episode that has a lease", n_steps - 1);
-    let step = queries.get(charge_idx).map_or(0, |query| query.step);
-    DecodeError::new(format!("steps[{charge_idx}].step"), expected, step).into()
+    let query_idx = charge_indices.iter().position(|idx| *idx == charge_idx).unwrap_or(charge_idx);
+    let step = queries.get(query_idx).map_or(0, |query| query.step);
+    DecodeError::new(format!("steps[{query_idx}].step"), expected, step).into()
 }
 
 #[cfg(test)]

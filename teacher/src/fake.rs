@@ -48,5 +48,14 @@ pub(crate) fn query(episode: u64, step: u32, x: f32, y: f32) -> StepQuery {
     let mut observation = vec![0.0; 56];
     observation[0] = x;
     let goal = vec![0.0, 0.0, 0.0, 0.0, y, 0.0];
-    StepQuery { episode, step, observation, goal, proposed_action: vec![0.0; 6] }
+    let proposed_action = vec![0.0; 6];
+    StepQuery {
+        episode,
+        step,
+        observation,
+        goal,
+        proposed_action,
+        judged_action: None,
+        payer: None,
+    }
 }

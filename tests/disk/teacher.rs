@@ -168,7 +168,7 @@ fn stderr(device: &Device) -> String {
 fn query(episode: u64, step: u32) -> pb::StepQuery {
     let numbers = |n: u16| (0..n).map(|idx| f32::from(idx) / 100.0).collect();
     let (observation, goal, proposed_action) = (numbers(28), numbers(3), numbers(3));
-    pb::StepQuery { episode, step, observation, goal, proposed_action }
+    pb::StepQuery { episode, step, observation, goal, proposed_action, ..Default::default() }
 }
 
 /// Checks how a teacher that did not start ended.

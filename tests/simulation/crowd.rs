@@ -198,6 +198,8 @@ fn query(episode: u64, step: u32) -> pb::StepQuery {
         observation: vec![0.0; STUDENT.n_observation()],
         goal: vec![0.0; STUDENT.n_goal()],
         proposed_action: vec![1.0; STUDENT.n_action()],
+        judged_action: None,
+        payer: None,
     })
 }
 

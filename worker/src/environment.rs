@@ -163,7 +163,11 @@ impl Environments {
     }
 
     /// Executes actions, shape `[n, n_action]`.
-    pub(crate) async fn step(&mut self, actions: &[f32], task: &TaskSpec) -> Result<StepReply, Failure> {
+    pub(crate) async fn step(
+        &mut self,
+        actions: &[f32],
+        task: &TaskSpec,
+    ) -> Result<StepReply, Failure> {
         self.n_steps += 1;
         let n = self.episodes.len();
         let reply = self.exchange(n, encode_step(actions), task).await?;

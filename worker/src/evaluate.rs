@@ -7,7 +7,7 @@ use std::num::NonZeroUsize;
 
 use tandem_core::layout::Layout;
 use tandem_core::work::{EpisodeOrder, RunTerms, SlotOrder};
-use tandem_core::{Episode, EpisodeKind, Exploration, TaskSpec, WorldSettings};
+use tandem_core::{AdviceTerms, Episode, EpisodeKind, Exploration, TaskSpec, WorldSettings};
 use tandem_sim::{Env, WorldConfig};
 
 use crate::ports::{Act, Environment, NoAdvisor, Simulator};
@@ -124,6 +124,7 @@ fn evaluation_terms(layout: impl Into<TaskSpec>) -> RunTerms {
         run: String::new(),
         layout: layout.into(),
         account: None,
+        advice: AdviceTerms::default(),
         exploration: Exploration::NONE,
         world: WorldSettings::default(),
     }

@@ -18,6 +18,7 @@ pub struct Explorer {
     noise_std: f32,
     hold_mean_steps: f32,
     start_probability: f32,
+    joint_random_actions: bool,
     held: Vec<HeldAction>,
     rng: ChaCha8Rng,
 }
@@ -43,6 +44,7 @@ impl Explorer {
                 settings.random_action_prob,
                 settings.sticky_random_mean_steps,
             ),
+            joint_random_actions: settings.joint_random_actions,
             held: vec![idle; layout.n_arms()],
             layout,
             rng,
@@ -57,8 +59,12 @@ impl Explorer {
 
     /// Turns the policy's action into the action to execute, shape `[n_action]`, in [-1, 1].
     pub fn explore(&mut self, action: &mut [f32]) {
+        let mut joint = None;
         for arm in self.layout.arms() {
-            self.held[arm.0].advance(&mut self.rng, self.start_probability, self.hold_mean_steps);
+            let own = HoldDraw::new(&mut self.rng, self.start_probability, self.hold_mean_steps);
+            let draw = *joint.get_or_insert(own);
+            let draw = if self.joint_random_actions { draw } else { own };
+            self.held[arm.0].advance(draw, &mut self.rng);
             let (part, held) = (self.layout.action_of(arm), &self.held[arm.0]);
             explore_arm(part, held, self.noise_std, &mut self.rng, action);
         }
@@ -81,11 +87,23 @@ fn explore_arm(
     }
 }
 
+/// Whether a random action starts if the previous one is no longer held, and for how many steps it is held.
+#[derive(Debug, Clone, Copy)]
+struct HoldDraw {
+    starts: bool,
+    n_steps: u32,
+}
+
+impl HoldDraw {
+    fn new(rng: &mut ChaCha8Rng, start_probability: f32, hold_mean_steps: f32) -> Self {
+        let starts = bernoulli(rng, start_probability);
+        Self { starts, n_steps: hold_steps(uniform(rng, 0.0, 1.0), hold_mean_steps) }
+    }
+}
+
 impl HeldAction {
     /// Advances by one step. A new action may start when the previous one is no longer held.
-    fn advance(&mut self, rng: &mut ChaCha8Rng, start_probability: f32, hold_mean_steps: f32) {
-        let starts = bernoulli(rng, start_probability);
-        let n_steps = hold_steps(uniform(rng, 0.0, 1.0), hold_mean_steps);
+    fn advance(&mut self, HoldDraw { starts, n_steps }: HoldDraw, rng: &mut ChaCha8Rng) {
         let free = self.n_steps_left <= 1;
         self.n_steps_left = match (free, starts) {
             (true, true) => n_steps,
@@ -126,7 +144,7 @@ mod tests {
 
     const LAYOUT: Layout = Layout::new(Task::Push, 2);
     const SETTINGS: Exploration =
-        Exploration { noise_std: 0.0, random_action_prob: 0.3, sticky_random_mean_steps: 4.0 };
+        Exploration { random_action_prob: 0.3, sticky_random_mean_steps: 4.0, ..Exploration::NONE };
     /// The policy's action, which no random action equals.
     const POLICY_ACTION: [f32; 6] = [0.5; 6];
 
@@ -191,6 +209,20 @@ mod tests {
     }
 
     #[test]
+    fn joint_random_actions_replace_all_arms_at_once_with_different_actions() {
+        let settings = Exploration { joint_random_actions: true, ..SETTINGS };
+        let actions =
+            |arm_idx| arm_actions(Explorer::new(LAYOUT, settings, rng(0)), 5_000, arm_idx);
+        let (first, second) = (actions(0), actions(1));
+        assert!(first.iter().zip(&second).all(|(a, b)| is_random(a) == is_random(b)));
+        assert!(first.iter().zip(&second).all(|(a, b)| !is_random(a) || a != b));
+        let share = first.iter().filter(|action| is_random(action)).count() as f32 / 5_000.0;
+        assert!((share - 0.3).abs() < 0.03, "share {share}");
+        let alone = arm_actions(Explorer::new(LAYOUT, SETTINGS, rng(0)), 5_000, 0);
+        assert_eq!(first, alone, "the first arm's draws are the same");
+    }
+
+    #[test]
     fn a_warm_up_takes_random_actions_only_and_no_share_takes_none() {
         let all_random = arm_actions(Explorer::uniform(LAYOUT, SETTINGS, rng(0)), 500, 0);
         assert!(all_random.iter().all(is_random));
@@ -201,8 +233,7 @@ mod tests {
 
     #[test]
     fn noise_has_its_deviation_and_stays_within_bounds() {
-        let settings =
-            Exploration { noise_std: 0.2, random_action_prob: 0.0, sticky_random_mean_steps: 1.0 };
+        let settings = Exploration { noise_std: 0.2, ..Exploration::NONE };
         let actions = arm_actions(Explorer::new(LAYOUT, settings, rng(0)), 20_000, 0);
         let offsets: Vec<f32> = actions.iter().map(|action| action[0] - 0.5).collect();
         let std = (offsets.iter().map(|offset| offset * offset).sum::<f32>() / 20_000.0).sqrt();

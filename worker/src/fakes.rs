@@ -4,7 +4,8 @@ use tandem_core::layout::{Layout, OBSERVATION_PER_ARM, Task};
 use tandem_core::rng::{Stream, episode_rng, uniform};
 use tandem_core::work::{EpisodeOrder, EpisodeStart, RunTerms, SlotOrder};
 use tandem_core::{
-    ArmAdvice, Contacts, EpisodeKind, Exploration, StepAdvice, StepQuery, WorldSettings,
+    AdviceTerms, ArmAdvice, Contacts, EpisodeKind, Exploration, StepAdvice, StepQuery,
+    WorldSettings,
 };
 
 use crate::ports::{Act, Advisor, AdvisorGone, Environment, EnvironmentError};
@@ -155,10 +156,12 @@ pub(crate) fn terms() -> RunTerms {
         run: "run-7".to_owned(),
         layout: LAYOUT.into(),
         account: Some("run".to_owned()),
+        advice: AdviceTerms::default(),
         exploration: Exploration {
             noise_std: 0.2,
             random_action_prob: 0.3,
             sticky_random_mean_steps: 4.0,
+            joint_random_actions: false,
         },
         world: WorldSettings { grasped_start_prob: 0.5, substeps: 20 },
     }

@@ -2,7 +2,9 @@
 
 use tandem_core::rng::{Stream, episode_rng};
 use tandem_core::work::{EpisodeOrder, EpisodeStart, RunTerms, SlotOrder};
-use tandem_core::{Contacts, Episode, EpisodeKind, StepAdvice, StepQuery, TaskSpec};
+use tandem_core::{
+    AdviceUnit, Contacts, Episode, EpisodeKind, JudgedAction, StepAdvice, StepQuery, TaskSpec,
+};
 use tandem_sim::SimError;
 use tandem_telemetry::events::StepAdvised;
 
@@ -78,7 +80,7 @@ pub fn play_slot(
         for rollout in &mut rollouts {
             rollout.choose_action(actor);
         }
-        take_advice(&mut rollouts, step_idx, advisor)?;
+        take_advice(&mut rollouts, step_idx, terms.advice.unit, advisor)?;
         batch.execute(&mut rollouts, step_idx, env)?;
     }
     for (environment, rollout) in rollouts.iter_mut().enumerate() {
@@ -170,10 +172,12 @@ fn failed_step(error: EnvironmentError, rollouts: &[Rollout], step: usize) -> Ro
     }
 }
 
-/// Asks the teacher about the next actions of the advised rollouts, and applies its advice.
+/// Asks the teacher about the next actions of the advised rollouts, and applies its advice. If a unit pays for the lock
+/// step, the first of them claims it.
 fn take_advice(
     rollouts: &mut [Rollout],
     step_idx: usize,
+    unit: AdviceUnit,
     advisor: &mut impl Advisor,
 ) -> Result<(), RolloutError> {
     let mut advised: Vec<&mut Rollout> =
@@ -182,11 +186,26 @@ fn take_advice(
         return Ok(());
     };
     let first_number = first.episode.number;
-    let queries: Vec<StepQuery> = advised.iter().map(|rollout| rollout.query(step_idx)).collect();
+    let payer = (unit == AdviceUnit::SlotStep).then_some(first_number);
+    let query = |rollout: &&mut Rollout| StepQuery { payer, ..rollout.query(step_idx) };
+    let queries: Vec<StepQuery> = advised.iter().map(query).collect();
     let answers = advisor.advise(queries)?;
     check_count(first_number, step_idx, "steps", answers.len(), advised.len())?;
     for (rollout, advice) in advised.iter_mut().zip(&answers) {
         rollout.apply_advice(advice, step_idx)?;
+    }
+    // A step without overridden arms may carry a charge, from a previous worker whose student acted differently. The
+    // teacher's account includes that unit, but no episode claims it.
+    match unit {
+        AdviceUnit::EnvStep => {
+            for rollout in advised {
+                rollout.episode.advice_charged += u32::from(rollout.advised_arms != 0);
+            }
+        }
+        AdviceUnit::SlotStep => {
+            let any = advised.iter().any(|rollout| rollout.advised_arms != 0);
+            advised[0].episode.advice_charged += u32::from(any);
+        }
     }
     Ok(())
 }
@@ -213,6 +232,8 @@ struct Rollout {
     observation: Vec<f32>,
     /// The action of the next step, shape `[n_action]`.
     action: Vec<f32>,
+    /// The policy's action of the next step, without exploration, if the teacher judges it, shape `[n_action]`.
+    policy_action: Option<Vec<f32>>,
     /// The arms whose action of the next step is the teacher's, as a bit mask.
     advised_arms: u8,
     /// The steps played so far.
@@ -248,6 +269,10 @@ impl Rollout {
             advised: order.advised && slot.kind == EpisodeKind::Training,
             observation: observation.to_vec(),
             action: vec![0.0; layout.n_action()],
+            policy_action: match terms.advice.judged_action {
+                JudgedAction::Executed => None,
+                JudgedAction::Policy => Some(vec![0.0; layout.n_action()]),
+            },
             advised_arms: 0,
             episode,
         }
@@ -257,6 +282,9 @@ impl Rollout {
     fn choose_action(&mut self, actor: &mut impl Act) {
         actor.act(&self.observation, &self.episode.goal, &mut self.action);
         self.advised_arms = 0;
+        if let Some(policy_action) = &mut self.policy_action {
+            policy_action.copy_from_slice(&self.action);
+        }
         if let Some(explorer) = &mut self.explorer {
             explorer.explore(&mut self.action);
         }
@@ -271,6 +299,11 @@ impl Rollout {
             observation: layout.observation_in_arm_order(&self.observation),
             goal: layout.goal_in_arm_order(&self.episode.goal),
             proposed_action: layout.action_in_arm_order(&self.action),
+            judged_action: self
+                .policy_action
+                .as_ref()
+                .map(|action| layout.action_in_arm_order(action)),
+            payer: None,
         }
     }
 
@@ -288,9 +321,6 @@ impl Rollout {
             let step = u32::try_from(step_idx).expect("an episode's steps are few");
             StepAdvised { episode: number, step, overridden_arms: self.advised_arms }.emit();
         }
-        // A step without overridden arms may carry a charge, from a previous worker whose student acted differently. The
-        // teacher's account includes that unit, but this episode is not advised on the step.
-        self.episode.advice_charged += u32::from(self.advised_arms != 0);
         Ok(())
     }
 
@@ -314,191 +344,8 @@ fn explorer(order: EpisodeOrder, kind: EpisodeKind, terms: &RunTerms) -> Option<
 }
 
 #[cfg(test)]
+mod advice_terms;
+#[cfg(test)]
 mod arm_order;
 #[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::fakes::{
-        FakeActor, FakeEnvironment, FakeTeacher, LAYOUT, TEACHER_ACTION, slot, terms,
-    };
-    use crate::ports::NoAdvisor;
-
-    fn play(order: &SlotOrder, actor: FakeActor, advisor: &mut impl Advisor) -> Vec<Episode> {
-        play_slot(&mut FakeEnvironment::new(), order, &terms(), &mut { actor }, advisor)
-            .expect("no step fails")
-    }
-
-    #[test]
-    fn an_episode_is_a_function_of_its_order() {
-        let advised = |episode, step, arm| (episode + u64::from(step)) % 3 == arm as u64;
-        let play = |numbers: &[u64]| {
-            play(&slot(numbers, true), FakeActor::Seeker, &mut FakeTeacher::new(advised))
-        };
-        let together = play(&[3, 8]);
-        assert_eq!(play(&[8]), together[1..]);
-        assert_eq!(
-            play(&[8, 5, 3]),
-            [together[1].clone(), play(&[5]).remove(0), together[0].clone()]
-        );
-        assert_ne!(together[0].observations, together[1].observations);
-        assert_ne!(together[0].actions, together[1].actions);
-    }
-
-    #[test]
-    fn an_episode_has_every_step_and_follows_the_environment() {
-        let episode = play(&slot(&[3], false), FakeActor::Seeker, &mut NoAdvisor).remove(0);
-        assert_eq!((episode.number, episode.parameter_version), (3, 4));
-        assert_eq!(episode.observations.len(), 51 * LAYOUT.n_observation());
-        assert_eq!((episode.actions.len(), episode.contacts.len()), (50 * LAYOUT.n_action(), 50));
-        assert_eq!(
-            (episode.advised_arms.as_slice(), episode.advice_charged),
-            ([0; 50].as_slice(), 0)
-        );
-        for step_idx in 0..50 {
-            let expected = episode.observation(step_idx)[0] + 0.05 * episode.action(step_idx)[0];
-            assert!(
-                (episode.observation(step_idx + 1)[0] - expected).abs() < 1e-6,
-                "step {step_idx}"
-            );
-        }
-    }
-
-    #[test]
-    fn advice_replaces_exactly_the_overridden_arms_and_is_recorded() {
-        let overrides = |_, step: u32, arm: usize| (step as usize % 4) >> arm & 1 == 1;
-        let mut teacher = FakeTeacher::new(overrides);
-        let episode = play(&slot(&[3], true), FakeActor::Seeker, &mut teacher).remove(0);
-        for (step_idx, request) in teacher.requests.iter().enumerate() {
-            let expected_arms = [0, 1, 2, 3][step_idx % 4];
-            assert_eq!(episode.advised_arms[step_idx], expected_arms);
-            for arm in LAYOUT.arms() {
-                let executed = &episode.action(step_idx)[LAYOUT.action_of(arm)];
-                let proposed = &request[0].proposed_action[LAYOUT.action_of(arm)];
-                let overridden = expected_arms >> arm.0 & 1 == 1;
-                assert_eq!(executed, if overridden { &TEACHER_ACTION } else { proposed });
-            }
-        }
-        assert_eq!(
-            episode.advice_charged, 37,
-            "three steps of four, beginning with one that is free"
-        );
-    }
-
-    #[test]
-    fn advice_does_not_shift_the_random_stream() {
-        let free = play(&slot(&[3], false), FakeActor::Constant(0.1), &mut NoAdvisor).remove(0);
-        let mut teacher = FakeTeacher::new(|_, step, _| step % 2 == 0);
-        let advised = play(&slot(&[3], true), FakeActor::Constant(0.1), &mut teacher).remove(0);
-        for step_idx in 0..50 {
-            assert_eq!(teacher.requests[step_idx][0].proposed_action, free.action(step_idx));
-            let overridden = step_idx % 2 == 0;
-            assert_eq!(
-                advised.action(step_idx) == free.action(step_idx),
-                !overridden,
-                "step {step_idx}"
-            );
-        }
-    }
-
-    #[test]
-    fn one_request_covers_every_advised_episode_and_no_other() {
-        let mut order = slot(&[3, 8, 9], true);
-        order.episodes[1].advised = false;
-        let mut teacher = FakeTeacher::new(|_, _, _| true);
-        let episodes = play(&order, FakeActor::Seeker, &mut teacher);
-        assert_eq!(teacher.requests.len(), 50);
-        for (step_idx, request) in teacher.requests.iter().enumerate() {
-            let asked: Vec<(u64, usize)> =
-                request.iter().map(|q| (q.episode, q.step as usize)).collect();
-            assert_eq!(asked, [(3, step_idx), (9, step_idx)]);
-            assert_eq!(request[1].observation, episodes[2].observation(step_idx));
-            assert_eq!(request[1].goal, episodes[2].goal);
-        }
-        assert_eq!(episodes.iter().map(|e| e.advice_charged).collect::<Vec<_>>(), [50, 0, 50]);
-    }
-
-    #[test]
-    fn an_evaluation_executes_the_policy_without_exploration_or_advice() {
-        let mut order = slot(&[3], true);
-        order.kind = EpisodeKind::Evaluation;
-        order.episodes[0].uniform = true;
-        let episode = play(&order, FakeActor::Constant(0.1), &mut NoAdvisor).remove(0);
-        assert!(episode.actions.iter().all(|component| *component == 0.1));
-        assert!(
-            episode.observation(0)[..3].iter().all(|position| position.abs() <= 0.5),
-            "no wide start"
-        );
-    }
-
-    #[test]
-    fn a_warm_up_ignores_the_policy() {
-        let mut order = slot(&[3], false);
-        order.episodes[0].uniform = true;
-        let actions =
-            |input| play(&order, FakeActor::Constant(input), &mut NoAdvisor).remove(0).actions;
-        assert_eq!(actions(0.1), actions(0.9));
-        assert!(actions(0.1).iter().any(|component| component.abs() > 0.9));
-    }
-
-    /// An advisor that returns the student's own actions, with fixed flags.
-    struct FixedFlags {
-        overridden: bool,
-        charged: bool,
-    }
-
-    impl Advisor for FixedFlags {
-        fn advise(&mut self, queries: Vec<StepQuery>) -> Result<Vec<StepAdvice>, AdvisorGone> {
-            let mut teacher = FakeTeacher::new(|_, _, _| self.overridden);
-            let answers = teacher.advise(queries)?.into_iter();
-            Ok(answers.map(|advice| StepAdvice { charged: self.charged, ..advice }).collect())
-        }
-    }
-
-    #[test]
-    fn a_step_that_was_charged_before_but_is_not_overridden_now_is_not_claimed() {
-        let mut advisor = FixedFlags { overridden: false, charged: true };
-        let episode = play(&slot(&[3], true), FakeActor::Seeker, &mut advisor).remove(0);
-        assert_eq!(
-            (episode.advised_arms.as_slice(), episode.advice_charged),
-            ([0; 50].as_slice(), 0)
-        );
-    }
-
-    #[test]
-    fn an_override_without_a_charge_is_an_error() {
-        let mut advisor = FixedFlags { overridden: true, charged: false };
-        let played = play_slot(
-            &mut FakeEnvironment::new(),
-            &slot(&[3], true),
-            &terms(),
-            &mut FakeActor::Seeker,
-            &mut advisor,
-        );
-        assert_eq!(
-            played.expect_err("no charge").to_string(),
-            "the teacher overrides arms of episode 3 on step 0 without a charge"
-        );
-    }
-
-    #[test]
-    fn advice_about_other_steps_is_an_error() {
-        struct Silent;
-        impl Advisor for Silent {
-            fn advise(&mut self, _queries: Vec<StepQuery>) -> Result<Vec<StepAdvice>, AdvisorGone> {
-                Ok(Vec::new())
-            }
-        }
-        let played = play_slot(
-            &mut FakeEnvironment::new(),
-            &slot(&[3], true),
-            &terms(),
-            &mut FakeActor::Seeker,
-            &mut Silent,
-        );
-        let error = played.expect_err("one step was asked about");
-        assert_eq!(
-            error.to_string(),
-            "the teacher's advice on episode 3, step 0, has 0 steps where 1 were expected"
-        );
-    }
-}
+mod tests;

@@ -11,7 +11,7 @@ use prost::Message as _;
 use tandem_core::task::{ArmDescription, Norm};
 use tandem_core::work::{EpisodeOrder, EpisodeStart, PublishedActor, RunTerms, SlotOrder};
 use tandem_core::{
-    ArmAdvice, Contacts, EpisodeKind, Exploration, Layout, StepAdvice, StepQuery, Task,
+    AdviceTerms, ArmAdvice, Contacts, EpisodeKind, Exploration, Layout, StepAdvice, StepQuery, Task,
     TaskDescription, TaskSpec, WorldSettings,
 };
 use tandem_fuzz::sample;
@@ -149,10 +149,12 @@ fn write_messages(to: &Path) -> Result<(), AnyError> {
         run: "run-7".to_owned(),
         layout: LAYOUT.into(),
         account: Some("run-7".to_owned()),
+        advice: AdviceTerms::default(),
         exploration: Exploration {
             noise_std: 0.2,
             random_action_prob: 0.3,
             sticky_random_mean_steps: 4.0,
+            joint_random_actions: false,
         },
         world: WorldSettings { grasped_start_prob: 0.0, substeps: 20 },
     };
@@ -233,6 +235,8 @@ fn query() -> StepQuery {
         observation: vec![0.25; LAYOUT.n_observation()],
         goal: vec![0.5; LAYOUT.n_goal()],
         proposed_action: vec![-1.0; LAYOUT.n_action()],
+        judged_action: Some(vec![0.5; LAYOUT.n_action()]),
+        payer: Some(300),
     }
 }
 

@@ -17,8 +17,6 @@ use crate::shared::LearnerConfig;
 
 /// Rounds after which an evaluation must be complete. Until then its slots fill the workers' idle time.
 const MAX_PENDING_ROUNDS: u64 = 4;
-/// Rounds of the paper's epoch: 50 cycles of the HER reference implementation (decision 005).
-const ROUNDS_PER_PAPER_EPOCH: f64 = 50.0;
 
 /// The run's evaluations, pending and complete.
 pub(super) struct Evaluations<'a> {
@@ -158,7 +156,7 @@ impl<'a> Evaluations<'a> {
             env_steps: counters.env_steps,
             episodes: counters.episodes,
             updates: counters.updates,
-            paper_epochs: counters.round as f64 / ROUNDS_PER_PAPER_EPOCH,
+            paper_epochs: counters.round as f64 / self.config.run.rounds.per_epoch as f64,
             wall_s: *wall_s,
             mean_q: stats.mean_q,
             critic_loss: stats.critic_loss,

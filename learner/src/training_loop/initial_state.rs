@@ -77,7 +77,7 @@ impl InitialState {
             one_arm: &one_arm,
             terms: pb::OpenAccountRequest {
                 name: config.run.name.clone(),
-                budget: advice.budget,
+                budget: config.run.advice_budget(),
                 strategy: advice.strategy.clone(),
             },
             // An episode can use one unit of advice per step.
@@ -122,9 +122,11 @@ impl<'a> LearnerLoop<'a> {
             run: config.run.name.clone(),
             layout: trainer.layout.clone(),
             account: account.as_ref().map(|account| account.name().to_owned()),
+            advice: config.run.advice.terms(),
             exploration: config.run.exploration,
             world: config.run.world,
         };
+        shared.lock().queue.advice_unit = terms.advice.unit;
         publish_parameters(context, &pending, &acting, &trainer);
         let mut learner = Self {
             context,

@@ -120,8 +120,8 @@ impl<'a> ProgressPublisher<'a> {
 /// Returns the units of advice that the run may still spend. A teacher's account may include charges for episodes that
 /// are not learned yet; they do not count here.
 pub(super) fn budget_left(config: &LearnerConfig, at: Counters) -> u64 {
-    let advice = &config.run.advice;
-    if advice.asks() { advice.budget.saturating_sub(at.advice_spent) } else { 0 }
+    let run = &config.run;
+    if run.advice.asks() { run.advice_budget().saturating_sub(at.advice_spent) } else { 0 }
 }
 
 /// Returns the workers, without a silent one whose name an active one has: that is a restarted worker.

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 
 use tandem_core::work::{EpisodeOrder, SlotOrder};
-use tandem_core::{Episode, EpisodeKind};
+use tandem_core::{AdviceUnit, Episode, EpisodeKind};
 
 /// A refusal of a worker's call or episodes. None of the episodes is used.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
@@ -55,12 +55,50 @@ pub fn check_count(order: &SlotOrder, got: usize) -> Result<(), SubmitError> {
     Err(SubmitError::WrongCount { slot: order.slot, expected, got })
 }
 
-pub(super) fn check(order: &SlotOrder, episodes: &[Episode]) -> Result<(), SubmitError> {
+pub(super) fn check(
+    order: &SlotOrder,
+    unit: AdviceUnit,
+    episodes: &[Episode],
+) -> Result<(), SubmitError> {
     check_count(order, episodes.len())?;
-    episodes
-        .iter()
-        .zip(&order.episodes)
-        .try_for_each(|(episode, ordered)| check_episode(order, ordered, episode))
+    let ordered = || episodes.iter().zip(&order.episodes);
+    ordered().try_for_each(|(episode, ordered)| check_episode(order, ordered, episode))?;
+    if order.kind != EpisodeKind::Training {
+        return Ok(());
+    }
+    let advised = ordered().filter(|(_, ordered)| ordered.advised).map(|(episode, _)| episode);
+    let advised: Vec<&Episode> = advised.collect();
+    let n_claimable = |idx: usize| match (unit, idx) {
+        (AdviceUnit::EnvStep, _) => n_advised_steps(&advised[idx..=idx]),
+        (AdviceUnit::SlotStep, 0) => n_advised_steps(&advised),
+        (AdviceUnit::SlotStep, _) => 0,
+    };
+    advised.iter().enumerate().try_for_each(|(idx, episode)| check_claim(episode, n_claimable(idx)))
+}
+
+/// Returns the number of steps with an advised arm in any of `episodes`.
+fn n_advised_steps(episodes: &[&Episode]) -> usize {
+    let n_steps = episodes.iter().map(|episode| episode.advised_arms.len()).max().unwrap_or(0);
+    let is_advised = |step: &usize| {
+        let arms = episodes.iter().filter_map(|episode| episode.advised_arms.get(*step));
+        arms.copied().any(|arms| arms != 0)
+    };
+    (0..n_steps).filter(is_advised).count()
+}
+
+/// Checks that an advised episode claims `n_advised` units: a unit pays for one step, regardless of the number of
+/// overridden arms, and a step without an overridden arm costs nothing.
+fn check_claim(episode: &Episode, n_advised: usize) -> Result<(), SubmitError> {
+    let claimed = episode.advice_charged;
+    if usize::try_from(claimed) == Ok(n_advised) {
+        return Ok(());
+    }
+    Err(SubmitError::WrongEpisode {
+        number: episode.number,
+        field: "advice_charged",
+        expected: format!("{n_advised}, the steps with an advised arm"),
+        got: claimed.to_string(),
+    })
 }
 
 fn check_episode(
@@ -85,8 +123,7 @@ fn check_episode(
     check_advice(order, ordered, episode)
 }
 
-/// Checks that the claims of advice agree with each other and with the order. A unit pays for one step regardless of
-/// the number of overridden arms, and a step without an overridden arm costs nothing.
+/// Checks that an episode claims no advice unless it was ordered.
 fn check_advice(
     order: &SlotOrder,
     ordered: &EpisodeOrder,
@@ -95,15 +132,10 @@ fn check_advice(
     let refuse = |field, expected, got| {
         Err(SubmitError::WrongEpisode { number: episode.number, field, expected, got })
     };
-    let claimed = episode.advice_charged;
     if ordered.advised && order.kind == EpisodeKind::Training {
-        let n_advised = episode.advised_arms.iter().filter(|arms| **arms != 0).count();
-        if usize::try_from(claimed) == Ok(n_advised) {
-            return Ok(());
-        }
-        let expected = format!("{n_advised}, the steps with an advised arm");
-        return refuse("advice_charged", expected, claimed.to_string());
+        return Ok(());
     }
+    let claimed = episode.advice_charged;
     if claimed > 0 {
         let expected = "0, as no advice was ordered".to_owned();
         return refuse("advice_charged", expected, claimed.to_string());

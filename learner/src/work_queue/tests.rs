@@ -1,5 +1,6 @@
 //! The queue by itself, and beside a model that keeps a plain list of slots.
 
+mod lock_steps;
 mod model;
 
 use tandem_core::work::EpisodeOrder;

@@ -36,7 +36,7 @@ class JoinResponse(_message.Message):
     def __init__(self, worker_id: _Optional[int] = ..., terms: _Optional[_Union[RunTerms, _Mapping]] = ..., learner: _Optional[int] = ...) -> None: ...
 
 class RunTerms(_message.Message):
-    __slots__ = ("task", "n_arms", "account", "exploration", "world", "run", "description")
+    __slots__ = ("task", "n_arms", "account", "exploration", "world", "run", "description", "advice")
     TASK_FIELD_NUMBER: _ClassVar[int]
     N_ARMS_FIELD_NUMBER: _ClassVar[int]
     ACCOUNT_FIELD_NUMBER: _ClassVar[int]
@@ -44,6 +44,7 @@ class RunTerms(_message.Message):
     WORLD_FIELD_NUMBER: _ClassVar[int]
     RUN_FIELD_NUMBER: _ClassVar[int]
     DESCRIPTION_FIELD_NUMBER: _ClassVar[int]
+    ADVICE_FIELD_NUMBER: _ClassVar[int]
     task: str
     n_arms: int
     account: str
@@ -51,17 +52,28 @@ class RunTerms(_message.Message):
     world: WorldTerms
     run: str
     description: _task_pb2.TaskDescription
-    def __init__(self, task: _Optional[str] = ..., n_arms: _Optional[int] = ..., account: _Optional[str] = ..., exploration: _Optional[_Union[Exploration, _Mapping]] = ..., world: _Optional[_Union[WorldTerms, _Mapping]] = ..., run: _Optional[str] = ..., description: _Optional[_Union[_task_pb2.TaskDescription, _Mapping]] = ...) -> None: ...
+    advice: AdviceTerms
+    def __init__(self, task: _Optional[str] = ..., n_arms: _Optional[int] = ..., account: _Optional[str] = ..., exploration: _Optional[_Union[Exploration, _Mapping]] = ..., world: _Optional[_Union[WorldTerms, _Mapping]] = ..., run: _Optional[str] = ..., description: _Optional[_Union[_task_pb2.TaskDescription, _Mapping]] = ..., advice: _Optional[_Union[AdviceTerms, _Mapping]] = ...) -> None: ...
+
+class AdviceTerms(_message.Message):
+    __slots__ = ("judges_policy_action", "charges_slot_steps")
+    JUDGES_POLICY_ACTION_FIELD_NUMBER: _ClassVar[int]
+    CHARGES_SLOT_STEPS_FIELD_NUMBER: _ClassVar[int]
+    judges_policy_action: bool
+    charges_slot_steps: bool
+    def __init__(self, judges_policy_action: bool = ..., charges_slot_steps: bool = ...) -> None: ...
 
 class Exploration(_message.Message):
-    __slots__ = ("noise_std", "random_share", "random_hold_mean_steps")
+    __slots__ = ("noise_std", "random_share", "random_hold_mean_steps", "joint_random_actions")
     NOISE_STD_FIELD_NUMBER: _ClassVar[int]
     RANDOM_SHARE_FIELD_NUMBER: _ClassVar[int]
     RANDOM_HOLD_MEAN_STEPS_FIELD_NUMBER: _ClassVar[int]
+    JOINT_RANDOM_ACTIONS_FIELD_NUMBER: _ClassVar[int]
     noise_std: float
     random_share: float
     random_hold_mean_steps: float
-    def __init__(self, noise_std: _Optional[float] = ..., random_share: _Optional[float] = ..., random_hold_mean_steps: _Optional[float] = ...) -> None: ...
+    joint_random_actions: bool
+    def __init__(self, noise_std: _Optional[float] = ..., random_share: _Optional[float] = ..., random_hold_mean_steps: _Optional[float] = ..., joint_random_actions: bool = ...) -> None: ...
 
 class WorldTerms(_message.Message):
     __slots__ = ("gripped_start_share", "wide_start_share", "substeps")

@@ -92,18 +92,22 @@ class AdviseRequest(_message.Message):
     def __init__(self, account: _Optional[str] = ..., steps: _Optional[_Iterable[_Union[StepQuery, _Mapping]]] = ...) -> None: ...
 
 class StepQuery(_message.Message):
-    __slots__ = ("episode", "step", "observation", "goal", "proposed_action")
+    __slots__ = ("episode", "step", "observation", "goal", "proposed_action", "judged_action", "payer")
     EPISODE_FIELD_NUMBER: _ClassVar[int]
     STEP_FIELD_NUMBER: _ClassVar[int]
     OBSERVATION_FIELD_NUMBER: _ClassVar[int]
     GOAL_FIELD_NUMBER: _ClassVar[int]
     PROPOSED_ACTION_FIELD_NUMBER: _ClassVar[int]
+    JUDGED_ACTION_FIELD_NUMBER: _ClassVar[int]
+    PAYER_FIELD_NUMBER: _ClassVar[int]
     episode: int
     step: int
     observation: _containers.RepeatedScalarFieldContainer[float]
     goal: _containers.RepeatedScalarFieldContainer[float]
     proposed_action: _containers.RepeatedScalarFieldContainer[float]
-    def __init__(self, episode: _Optional[int] = ..., step: _Optional[int] = ..., observation: _Optional[_Iterable[float]] = ..., goal: _Optional[_Iterable[float]] = ..., proposed_action: _Optional[_Iterable[float]] = ...) -> None: ...
+    judged_action: _containers.RepeatedScalarFieldContainer[float]
+    payer: int
+    def __init__(self, episode: _Optional[int] = ..., step: _Optional[int] = ..., observation: _Optional[_Iterable[float]] = ..., goal: _Optional[_Iterable[float]] = ..., proposed_action: _Optional[_Iterable[float]] = ..., judged_action: _Optional[_Iterable[float]] = ..., payer: _Optional[int] = ...) -> None: ...
 
 class AdviseResponse(_message.Message):
     __slots__ = ("steps", "budget_left")

@@ -54,9 +54,9 @@ impl RunConfig {
         let expected =
             "none for this task: the arms have common numbers, so none has a task of its own";
         check("advice.strategy", strategy, can_be_advised, expected)?;
-        let (share, budget) = (self.advice.share, self.advice.budget);
+        let (share, budget) = (self.advice.share, self.advice_budget());
         check("advice.share", share, (0.0..=1.0).contains(&share), "a number in [0, 1]")?;
-        check("advice.budget", budget, budget <= 1_000_000_000_000, "at most 10^12")
+        check("advice.budget", budget, budget <= 1_000_000_000_000, "at most 10^12 in the run")
     }
 
     fn check_rounds(&self) -> Result<(), OutOfRange> {
@@ -67,7 +67,9 @@ impl RunConfig {
         check("rounds.lag", rounds.lag, rounds.lag <= 1, "0 or 1")?;
         let updates = rounds.updates_per_env_step;
         let is_rate = (1e-9..=100.0).contains(&updates);
-        check("rounds.updates_per_env_step", updates, is_rate, "1e-9 to 100")
+        check("rounds.updates_per_env_step", updates, is_rate, "1e-9 to 100")?;
+        let is_epoch = (1..=1_000_000).contains(&rounds.per_epoch);
+        check("rounds.per_epoch", rounds.per_epoch, is_epoch, "1 to 1,000,000")
     }
 
     fn check_stop(&self) -> Result<(), OutOfRange> {

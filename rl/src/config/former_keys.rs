@@ -18,6 +18,24 @@ pub const RENAMED: [(&str, &str); 8] = [
 /// without it.
 pub const REMOVED: [&str; 2] = ["world.wide_start_share", "replay.advised_share"];
 
+/// Settings that earlier versions did not have, and the values that mean what those versions did, as JSON and TOML. A
+/// file with all settings of an earlier version, and a checkpoint, have these values where they have none.
+pub const ADDED: [(&str, &str); 7] = [
+    ("advice.budget_scope", "\"run\""),
+    ("advice.unit", "\"env-step\""),
+    ("advice.judged_action", "\"executed\""),
+    ("rounds.per_epoch", "50"),
+    ("exploration.joint_random_actions", "false"),
+    ("replay.joint_goal_statistics", "false"),
+    ("ddpg.batches_per_update", "1"),
+];
+
+/// Returns the value that a setting had, in effect, before it existed.
+#[must_use]
+pub fn before_added(key: &str) -> Option<&'static str> {
+    ADDED.iter().find(|(added, _)| *added == key).map(|(_, value)| *value)
+}
+
 /// Returns the current name of the setting `key`, which may be a former one.
 #[must_use]
 pub fn current(key: &str) -> &str {

@@ -1,11 +1,11 @@
 //! The values that a recipe gives to every setting.
 
 use serde::{Deserialize, Serialize};
-use tandem_core::{Exploration, Task, TaskSpec, WorldSettings};
+use tandem_core::{AdviceUnit, Exploration, JudgedAction, Task, TaskSpec, WorldSettings};
 
 use super::{
-    AdviceConfig, Behaviour, CheckpointConfig, EvaluationConfig, PolyakEvery, RoundsConfig,
-    RunConfig, StopConfig,
+    AdviceConfig, Behaviour, BudgetScope, CheckpointConfig, EvaluationConfig, PolyakEvery,
+    RoundsConfig, RunConfig, StopConfig,
 };
 use crate::ddpg::DdpgConfig;
 use crate::her::{ReplayConfig, RewardKind};
@@ -19,6 +19,9 @@ pub enum Recipe {
     /// The values that learn fastest on two cores.
     Tandem,
 }
+
+/// Environment steps of the paper's epoch: 50 rounds of 32 episodes of 50 steps (decision 005).
+const PAPER_EPOCH_ENV_STEPS: u64 = 80_000;
 
 impl RunConfig {
     /// Returns the recipe's settings for a built-in task and a number of arms.
@@ -52,6 +55,9 @@ impl RunConfig {
                 }
                 .to_owned(),
                 budget: 500_000,
+                budget_scope: if tandem { BudgetScope::Run } else { BudgetScope::Slot },
+                unit: if tandem { AdviceUnit::EnvStep } else { AdviceUnit::SlotStep },
+                judged_action: if tandem { JudgedAction::Executed } else { JudgedAction::Policy },
                 share: if tandem { 0.5 } else { 1.0 },
             },
             rounds: rounds(recipe),
@@ -63,12 +69,14 @@ impl RunConfig {
                 } else {
                     1.0
                 },
+                joint_random_actions: !tandem,
             },
             world: world(recipe, layout),
             replay: replay(recipe, layout),
             ddpg: ddpg(recipe, n_arms),
             evaluation: EvaluationConfig {
-                every_env_steps: 20_000,
+                // The paper evaluates once per epoch.
+                every_env_steps: if tandem { 20_000 } else { PAPER_EPOCH_ENV_STEPS },
                 episodes: 240,
                 seed: 240_240,
                 recorded_episodes: 2,
@@ -100,6 +108,7 @@ const fn rounds(recipe: Recipe) -> RoundsConfig {
             updates_per_env_step: 0.5,
             polyak_every: PolyakEvery::Update,
             warmup_env_steps: 2000,
+            per_epoch: 50,
         },
         Recipe::Paper => RoundsConfig {
             slots: 16,
@@ -108,19 +117,21 @@ const fn rounds(recipe: Recipe) -> RoundsConfig {
             updates_per_env_step: 0.025,
             polyak_every: PolyakEvery::Round,
             warmup_env_steps: 0,
+            per_epoch: 50,
         },
     }
 }
 
-/// The paper's recipe ends by wall time, because two cores would take days to converge with it.
+/// Limits of the paper's recipe: 50 epochs with one arm and 900 with more, since the paper's slowest curves reach 90 %
+/// after 43 and 898.
 fn stop(recipe: Recipe, layout: &TaskSpec) -> StopConfig {
     let max_env_steps = match (recipe, layout.as_built_in()) {
-        (Recipe::Paper, _) => 0,
+        (Recipe::Paper, _) if layout.n_arms() == 1 => 50 * PAPER_EPOCH_ENV_STEPS,
+        (Recipe::Paper, _) => 900 * PAPER_EPOCH_ENV_STEPS,
         (Recipe::Tandem, Some(layout)) if !layout.task.grasps() && layout.n_arms == 1 => 200_000,
         (Recipe::Tandem, _) => 300_000,
     };
-    let max_minutes = if max_env_steps == 0 { 30.0 } else { 0.0 };
-    StopConfig { until_success: 0.0, max_env_steps, max_minutes }
+    StopConfig { until_success: 0.0, max_env_steps, max_minutes: 0.0 }
 }
 
 fn world(recipe: Recipe, layout: &TaskSpec) -> WorldSettings {
@@ -143,6 +154,7 @@ fn replay(recipe: Recipe, layout: &TaskSpec) -> ReplayConfig {
         coda_fraction: if tandem && layout.has_recombinable_arms() { 1.0 } else { 0.0 },
         arm_swap_prob: if tandem && layout.has_interchangeable_arms() { 0.5 } else { 0.0 },
         reward: if tandem { RewardKind::PerArm } else { RewardKind::Joint },
+        joint_goal_statistics: !tandem,
         // Four fifths of the tolerance; of 0.05 m exactly 0.04 m.
         goal_tolerance_m: if tandem { tolerance * 4.0 / 5.0 } else { tolerance },
         contact_cost: if avoids_contacts { 1.0 } else { 0.0 },

@@ -21,6 +21,9 @@ fn every_recipe_passes_its_own_checks() {
 fn the_papers_round_has_forty_updates() {
     let paper = RunConfig::defaults(Recipe::Paper, Task::Push, 2);
     assert_eq!((paper.episodes_per_round(), paper.updates_per_round()), (32, 40));
+    let epoch = paper.rounds.per_epoch * paper.env_steps_per_round();
+    assert_eq!((paper.evaluation.every_env_steps, paper.stop.max_env_steps), (epoch, 900 * epoch));
+    assert_eq!(paper.advice_budget(), 8_000_000, "16 slots of 500,000");
 }
 
 #[test]
@@ -57,4 +60,10 @@ fn a_bad_value_is_named() {
     check(|config| config.seed = config.evaluation.seed, "another than evaluation.seed");
     check(|config| config.seed = TEST_SEED, "seed is 777: expected another seed");
     check(|config| config.evaluation.seed = TEST_SEED, "evaluation.seed is 777");
+    check(|config| config.rounds.per_epoch = 0, "rounds.per_epoch");
+    let too_much = |config: &mut RunConfig| {
+        config.advice.budget_scope = BudgetScope::Slot;
+        config.advice.budget = 1_000_000_000_000;
+    };
+    check(too_much, "advice.budget");
 }

@@ -3,6 +3,9 @@
 use serde::{Deserialize, Serialize};
 use tandem_core::settings::OutOfRange;
 
+/// Most transitions of an update.
+const MAX_TRANSITIONS: usize = 65_536;
+
 /// Section `[ddpg]` of the run file: the update. The defaults are those of recipe `tandem` for a student; the paper's
 /// values are in parentheses.
 #[derive(Debug, Clone, PartialEq, Deserialize, Serialize)]
@@ -28,8 +31,13 @@ pub struct DdpgConfig {
     pub cooldown_share: f32,
     /// Adam's step size for both networks during the cooldown, 1e-8 to 1.
     pub cooldown_learning_rate: f32,
-    /// Transitions per update, 1 to 65,536 (paper, section 4.1: 256).
+    /// Transitions per batch, 1 to 65,536 (paper, section 4.2: 256).
     pub batch_size: usize,
+    /// Batches per update, whose gradients are summed, 1 to 64. In the HER reference implementation each worker draws
+    /// one (`MpiAdam` with `scale_grad_by_procs=False`): 16 with the paper's workers. An update has at most 65,536
+    /// transitions.
+    #[serde(default = "one_batch")]
+    pub batches_per_update: usize,
     /// Units of each hidden layer of both networks, 1 to 4,096 (paper, section 4.1: 256).
     pub n_hidden: usize,
     /// Hidden layers of both networks, 1 to 16 (paper, section 4.1: teacher 3, student 4).
@@ -48,13 +56,24 @@ impl Default for DdpgConfig {
             cooldown_share: 0.2,
             cooldown_learning_rate: 2e-4,
             batch_size: 256,
+            batches_per_update: one_batch(),
             n_hidden: 256,
             n_hidden_layers: 4,
         }
     }
 }
 
+const fn one_batch() -> usize {
+    1
+}
+
 impl DdpgConfig {
+    /// Returns the number of transitions of an update.
+    #[must_use]
+    pub const fn transitions_per_update(&self) -> usize {
+        self.batch_size * self.batches_per_update
+    }
+
     /// Checks every range; NaN is in none.
     ///
     /// # Errors
@@ -82,12 +101,16 @@ impl DdpgConfig {
             OutOfRange::unless((1e-8..=1.0).contains(&rate), key, rate, "1e-8 to 1")?;
         }
         for (key, size, most, expected) in [
-            ("ddpg.batch_size", self.batch_size, 65_536, "1 to 65,536"),
+            ("ddpg.batch_size", self.batch_size, MAX_TRANSITIONS, "1 to 65,536"),
+            ("ddpg.batches_per_update", self.batches_per_update, 64, "1 to 64"),
             ("ddpg.n_hidden", self.n_hidden, 4096, "1 to 4,096"),
             ("ddpg.n_hidden_layers", self.n_hidden_layers, 16, "1 to 16"),
         ] {
             OutOfRange::unless((1..=most).contains(&size), key, size, expected)?;
         }
-        Ok(())
+        let most = MAX_TRANSITIONS / self.batch_size;
+        let (key, n_batches) = ("ddpg.batches_per_update", self.batches_per_update);
+        let expected = format_args!("at most {most} batches of {}", self.batch_size).to_string();
+        OutOfRange::unless(n_batches <= most, key, n_batches, expected)
     }
 }

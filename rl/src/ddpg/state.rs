@@ -144,7 +144,7 @@ impl Ddpg {
         let action_backward = critic_above_input + actor.n_output * critic.layer_output(0);
         let actor_backward = products(actor) + actor_above_input;
         let per_row = forward + critic_backward + action_backward + actor_backward;
-        2 * (self.config.batch_size * per_row) as u64
+        2 * (self.config.transitions_per_update() * per_row) as u64
     }
 }
 

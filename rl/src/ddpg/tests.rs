@@ -157,6 +157,52 @@ fn one_and_two_threads_give_the_same_bits() {
     assert_eq!(learn(1), learn(2));
 }
 
+/// Appends the rows of `second` to those of `first`.
+fn joined(first: &Batch, second: &Batch) -> Batch {
+    let join = |a: &[f32], b: &[f32]| [a, b].concat();
+    Batch {
+        inputs: join(&first.inputs, &second.inputs),
+        actions: join(&first.actions, &second.actions),
+        rewards: join(&first.rewards, &second.rewards),
+        next_inputs: join(&first.next_inputs, &second.next_inputs),
+        bc_mask: join(&first.bc_mask, &second.bc_mask),
+    }
+}
+
+#[test]
+fn the_gradients_of_an_updates_batches_are_summed_and_its_losses_averaged() {
+    let with = |n_batches| {
+        let config = small(|config| {
+            (config.action_penalty, config.bc_weight) = (0.5, 2.0);
+            config.batches_per_update = n_batches;
+        });
+        Ddpg::new(config, LAYOUT, Rewards::sparse(1), 3)
+    };
+    let batches = [random_batch(1, 5, 0), random_batch(1, 5, 1)];
+    let alone = [0, 1].map(|idx| {
+        let mut ddpg = with(1);
+        let losses = ddpg.update(&batches[idx]).unwrap();
+        (ddpg.gradients().map(<[f32]>::to_vec), losses)
+    });
+    let mut together = with(2);
+    let losses = together.update(&joined(&batches[0], &batches[1])).unwrap();
+    for (network, gradient) in together.gradients().iter().enumerate() {
+        let parts = alone[0].0[network].iter().zip(&alone[1].0[network]);
+        for (got, (first, second)) in gradient.iter().zip(parts) {
+            assert!((got - (first + second)).abs() < 1e-5, "{got} is not {first} + {second}");
+        }
+    }
+    let mean =
+        |loss: fn(&super::UpdateLosses) -> f64| (loss(&alone[0].1) + loss(&alone[1].1)) / 2.0;
+    for loss in [
+        (|l: &super::UpdateLosses| l.critic_loss) as fn(&super::UpdateLosses) -> f64,
+        |l| l.actor_loss,
+        |l| l.mean_q,
+    ] {
+        assert!((loss(&losses) - mean(loss)).abs() < 1e-5);
+    }
+}
+
 #[test]
 fn the_critic_fits_a_fixed_target() {
     let mut ddpg = Ddpg::new(small(|config| config.n_hidden = 32), LAYOUT, Rewards::sparse(1), 1);
@@ -271,4 +317,9 @@ fn settings_out_of_range_are_named() {
     check(|config| config.cooldown_learning_rate = f32::NAN, "ddpg.cooldown_learning_rate");
     check(|config| config.batch_size = 0, "ddpg.batch_size");
     check(|config| config.n_hidden_layers = 0, "ddpg.n_hidden_layers");
+    check(|config| config.batches_per_update = 0, "ddpg.batches_per_update");
+    let too_many = |config: &mut DdpgConfig| {
+        (config.batch_size, config.batches_per_update) = (65_536, 2);
+    };
+    check(too_many, "ddpg.batches_per_update");
 }

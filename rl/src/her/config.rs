@@ -45,6 +45,10 @@ pub struct ReplayConfig {
     pub arm_swap_prob: f32,
     /// The reward that the critic learns.
     pub reward: RewardKind,
+    /// Whether the goals in the normaliser's statistics get one hindsight step for all arms, as goals in batches do
+    /// with the joint reward, or a step for each arm.
+    #[serde(default)]
+    pub joint_goal_statistics: bool,
     /// Distance between an object and its goal, in the unit of the goal, within which training rewards it: in the
     /// built-in tasks 0.0001 to 1 m, else above 0 (paper: 0.05 m). The task's own tolerance always defines success. A smaller distance leaves room for the motion of an object after its release.
     pub goal_tolerance_m: f32,

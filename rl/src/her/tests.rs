@@ -17,6 +17,7 @@ fn config(reward: RewardKind) -> ReplayConfig {
         coda_fraction: 0.0,
         arm_swap_prob: 0.5,
         reward,
+        joint_goal_statistics: false,
         goal_tolerance_m: 0.05,
         contact_cost: 0.0,
         contact_foresight_steps: 0,

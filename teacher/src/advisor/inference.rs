@@ -59,7 +59,7 @@ impl TeacherInference {
                 let (observation, goal) = map.teacher_state(&query.observation, &query.goal);
                 batch.observations.extend_from_slice(observation);
                 batch.goals.extend_from_slice(goal);
-                batch.student_actions.extend_from_slice(map.arm_action(&query.proposed_action));
+                batch.student_actions.extend_from_slice(map.arm_action(query.judged()));
                 batch.n_rows += 1;
             }
         }

@@ -121,6 +121,47 @@ fn an_arm_is_advised_from_its_own_numbers_only() {
 }
 
 #[test]
+fn the_judged_action_decides_and_the_proposed_one_is_executed() {
+    let mut advisor = advisor(10, "mc-act:0.1");
+    let proposed_action = vec![0.75, 0.75, 0.75, -0.75, -0.75, -0.75];
+    let best = vec![0.5, 0.0, 0.0, 0.0, 0.25, 0.0];
+    let near = StepQuery {
+        proposed_action: proposed_action.clone(),
+        judged_action: Some(best.clone()),
+        ..two_arms(0)
+    };
+    let advice = ask(&mut advisor, &near);
+    assert_eq!((advice.overridden_arms(), advice.charged), (0b00, false));
+    assert_eq!(advice.action, proposed_action, "exploration is not corrected");
+    let far = StepQuery { judged_action: Some(vec![0.0; 6]), ..near };
+    let far = StepQuery { step: 1, proposed_action: best.clone(), ..far };
+    let advice = ask(&mut advisor, &far);
+    assert_eq!((advice.overridden_arms(), advice.arms[0].distance), (0b11, 0.5));
+    assert_eq!(advice.action, best);
+}
+
+#[test]
+fn queries_of_one_payer_and_step_share_a_unit() {
+    let mut advisor = advisor(2, "mc-act:0.1");
+    let far = |episode, step| StepQuery { payer: Some(1), ..query(episode, step, 0.5, 0.25) };
+    let near = |episode, step| StepQuery { payer: Some(1), ..query(episode, step, 0.0, 0.0) };
+    let shown = |advice: &Advice| -> Vec<(u8, bool)> {
+        advice.steps.iter().map(|step| (step.overridden_arms(), step.charged)).collect()
+    };
+    let none = advise(&mut advisor, "run", &[near(1, 0), near(2, 0)]).unwrap();
+    assert_eq!((shown(&none), none.budget_left), (vec![(0, false); 2], 2));
+    let second = [near(1, 1), far(2, 1), far(3, 1)];
+    let mixed = advise(&mut advisor, "run", &second).unwrap();
+    let expected = vec![(0, true), (0b11, true), (0b11, true)];
+    assert_eq!((shown(&mixed), mixed.budget_left), (expected.clone(), 1), "one unit for three");
+    let again = advise(&mut advisor, "run", &second).unwrap();
+    assert_eq!((shown(&again), again.budget_left), (expected, 1), "a repeated request is free");
+    let own = |episode| StepQuery { payer: None, ..far(episode, 2) };
+    let last = advise(&mut advisor, "run", &[own(2), own(3)]).unwrap();
+    assert_eq!((shown(&last), last.budget_left), (vec![(0b11, true), (0, false)], 0));
+}
+
+#[test]
 fn one_request_may_hold_students_of_several_layouts() {
     let mut advisor = advisor(10, "ea");
     let three_arms = StepQuery {
@@ -129,6 +170,8 @@ fn one_request_may_hold_students_of_several_layouts() {
         observation: vec![0.125; 84],
         goal: vec![0.0; 9],
         proposed_action: vec![0.0; 9],
+        judged_action: None,
+        payer: None,
     };
     let advice = advise(&mut advisor, "run", &[two_arms(0), three_arms, two_arms(1)]).unwrap();
     let actions: Vec<&[f32]> = advice.steps.iter().map(|step| step.action.as_slice()).collect();

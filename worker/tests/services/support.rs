@@ -9,7 +9,7 @@ use std::sync::Arc;
 
 use tandem_core::rng::{Stream, episode_rng, uniform};
 use tandem_core::work::{EpisodeOrder, PublishedActor, RunTerms, SlotOrder};
-use tandem_core::{EpisodeKind, Exploration, Layout, Task, WorldSettings};
+use tandem_core::{AdviceTerms, EpisodeKind, Exploration, Layout, Task, WorldSettings};
 use tandem_net::{Router, ServerConfig, ServerConfigError};
 use tandem_proto::pb::environment_server::EnvironmentServer;
 use tandem_proto::pb::learner_server::LearnerServer;
@@ -28,10 +28,12 @@ pub(crate) fn terms() -> RunTerms {
         run: "run-7".to_owned(),
         layout: LAYOUT.into(),
         account: Some("run".to_owned()),
+        advice: AdviceTerms::default(),
         exploration: Exploration {
             noise_std: 0.2,
             random_action_prob: 0.3,
             sticky_random_mean_steps: 4.0,
+            joint_random_actions: false,
         },
         world: WorldSettings { grasped_start_prob: 0.0, substeps: 10 },
     }

@@ -1,0 +1,56 @@
+//! Tests of the learning state.
+
+use tandem_core::{Layout, Task};
+
+use super::*;
+use crate::config::Recipe;
+use crate::replay::fixtures::drifting_episode;
+
+#[test]
+fn a_statistic_ruined_by_one_implausible_number_is_named() {
+    let mut config = RunConfig::defaults(Recipe::Tandem, Task::Push, 2);
+    config.ddpg.n_hidden = 4;
+    let mut trainer = Trainer::new(config).expect("valid");
+    assert_eq!(trainer.implausible_statistic(), None);
+    let mut row = vec![0.0; trainer.layout.n_observation()];
+    trainer.observation_normalizer.update(&row);
+    row[31] = 25.0;
+    trainer.observation_normalizer.update(&row);
+    assert_eq!(trainer.implausible_statistic(), None, "an object may fall");
+    row[31] = 1e29;
+    trainer.observation_normalizer.update(&row);
+    let named = trainer.implausible_statistic().expect("ruined");
+    assert!(named.starts_with("number 31 of the observations has mean 3.3"), "{named}");
+    trainer.observation_normalizer = Normalizer::new(row.len());
+    trainer.goal_normalizer.update(&[f32::NAN; 6]);
+    let named = trainer.implausible_statistic().expect("not finite");
+    assert!(named.starts_with("number 0 of the goals has mean NaN"), "{named}");
+}
+
+/// Returns the goals' means after episode 0, whose objects drift apart from goals at 9 m.
+fn goal_means(joint_goal_statistics: bool) -> Vec<f32> {
+    let layout = Layout::new(Task::Push, 2);
+    let mut config = RunConfig::defaults(Recipe::Paper, Task::Push, 2);
+    config.ddpg.n_hidden = 4;
+    config.replay.joint_goal_statistics = joint_goal_statistics;
+    let mut trainer = Trainer::new(config).expect("valid");
+    let mut episode = drifting_episode(layout, 0, 0.0);
+    episode.goal.fill(9.0);
+    for step_idx in 0..=50 {
+        for arm in layout.arms() {
+            let achieved = layout.achieved_goal_of(arm);
+            episode.observations[step_idx * 56..][achieved].fill(0.1 * step_idx as f32);
+        }
+    }
+    trainer.ingest(&[episode]);
+    trainer.goal_normalizer.snapshot().mean.clone()
+}
+
+#[test]
+fn joint_goal_statistics_take_the_same_later_step_for_all_arms() {
+    let joint = goal_means(true);
+    assert_eq!(joint[..3], joint[3..]);
+    let per_arm = goal_means(false);
+    assert_ne!(per_arm[..3], per_arm[3..]);
+    assert_eq!(joint[..1], goal_means(true)[..1]);
+}
