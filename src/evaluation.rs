@@ -7,7 +7,7 @@ use serde_json::{Value, json};
 use tandem_core::{Episode, EpisodeOutcome, EvaluationSummary, Layout, Wilson};
 use tandem_policy::Policy;
 use tandem_sim::WorldConfig;
-use tandem_worker::{ComposedTeachers, evaluate};
+use tandem_worker::{evaluate, evaluate_composed};
 
 use crate::clock;
 use crate::exit::{Exit, Failed, OrExit as _};
@@ -64,17 +64,10 @@ impl EvaluatedPolicy {
         let (layout, world) = (self.layout(), WorldConfig::default());
         let n_threads = std::thread::available_parallelism().unwrap_or(NonZeroUsize::MIN);
         let episodes = match self {
-            Self::Policy(_) => {
-                evaluate(|| actor.clone(), layout, &world, n_episodes, seed, n_threads)
+            Self::Policy(_) => evaluate(&actor, layout, &world, n_episodes, seed, n_threads),
+            Self::Composed(..) => {
+                evaluate_composed(&actor, layout, &world, n_episodes, seed, n_threads)
             }
-            Self::Composed(..) => evaluate(
-                || ComposedTeachers(actor.clone()),
-                layout,
-                &world,
-                n_episodes,
-                seed,
-                n_threads,
-            ),
         };
         episodes.or_exit(Exit::Bug, String::new)
     }

@@ -26,8 +26,7 @@ fn episodes(name: &str) -> Vec<Episode> {
     let actor = policy.actor().expect("whole");
     let n_threads = std::thread::available_parallelism().unwrap_or(NonZeroUsize::MIN);
     let layout = policy.layout.as_built_in().expect("a built-in task");
-    evaluate(|| actor.clone(), layout, &WorldConfig::default(), N_EPISODES, SEED, n_threads)
-        .expect("finite")
+    evaluate(&actor, layout, &WorldConfig::default(), N_EPISODES, SEED, n_threads).expect("finite")
 }
 
 /// Counts the steps in which the object moves, and those among them in which the hand is above it.

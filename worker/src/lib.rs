@@ -28,6 +28,6 @@ pub use config::{
 };
 pub use environment::{ServedTask, describe_environments};
 pub use error::Error;
-pub use evaluate::{ComposedTeachers, evaluate};
+pub use evaluate::{ComposedTeachers, evaluate, evaluate_composed};
 pub use ports::{Act, Advisor};
 pub use run::{run, run_with};
