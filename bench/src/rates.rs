@@ -22,21 +22,6 @@ const N_SAMPLES: usize = 5;
 /// Edge of the square matrices whose product is the reference for the machine.
 const SGEMM_EDGE: usize = 256;
 
-/// Returns the calls of `work` per second, the best of several samples.
-fn rate(clock: &Clock, mut work: impl FnMut()) -> f64 {
-    work();
-    let mut sample = || {
-        let start = clock();
-        let mut n_calls = 0_u32;
-        while clock() - start < SAMPLE {
-            work();
-            n_calls += 1;
-        }
-        f64::from(n_calls) / (clock() - start).as_secs_f64()
-    };
-    (0..N_SAMPLES).map(|_| sample()).fold(0.0, f64::max)
-}
-
 /// Measures environment steps per second on one core with random actions, including resets and observations.
 ///
 /// # Errors
@@ -143,6 +128,21 @@ pub fn replay(clock: &Clock) -> Vec<Figure> {
     let mut rng = episode_rng(1, 0, Stream::Replay);
     let per_s = rate(clock, || sampler.fill(&buffer, statistics, &mut rng, &mut batch));
     vec![Figure::new("replay/batch-256", 1e6 / per_s, "us")]
+}
+
+/// Returns the calls of `work` per second, the best of several samples.
+fn rate(clock: &Clock, mut work: impl FnMut()) -> f64 {
+    work();
+    let mut sample = || {
+        let start = clock();
+        let mut n_calls = 0_u32;
+        while clock() - start < SAMPLE {
+            work();
+            n_calls += 1;
+        }
+        f64::from(n_calls) / (clock() - start).as_secs_f64()
+    };
+    (0..N_SAMPLES).map(|_| sample()).fold(0.0, f64::max)
 }
 
 /// Returns an episode in which the object of the first arm moves by `drift_m` per step along x.

@@ -32,8 +32,7 @@ const ACCOUNT: &str = "bench";
 
 /// Measures the teacher service of `config` and the echo service alternately.
 ///
-/// Blocks for 15 s and must not be called inside a runtime. The ledger of `config` gets an account that is used up by
-/// no measurement.
+/// Opens an account in the ledger of `config`. Blocks for 15 s and must not be called inside a runtime.
 ///
 /// # Errors
 /// When a service cannot be started or a call fails.
