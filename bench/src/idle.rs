@@ -137,7 +137,8 @@ impl IdleWorkers {
         tokio::select! {
             _ = n_joined.wait_for(|n| *n >= self.n_spawned) => Ok(()),
             rejection = rejection.wait_for(Option::is_some) => {
-                Err(Error::Rejected(rejection.ok().and_then(|reason| reason.clone()).unwrap_or_default()))
+                let reason = rejection.ok().and_then(|reason| reason.clone());
+                Err(Error::Rejected(reason.unwrap_or_default()))
             }
         }
     }
