@@ -11,7 +11,7 @@ use tandem_core::{Episode, EpisodeOutcome, EvaluationSummary, Layout, TaskSpec, 
 use tandem_policy::{BlindActor, Policy};
 use tandem_sim::WorldConfig;
 use tandem_telemetry::ContactMetrics;
-use tandem_worker::{ComposedTeachers, evaluate};
+use tandem_worker::{evaluate, evaluate_blind, evaluate_composed};
 
 use crate::exit::{Exit, Failed, OrExit as _};
 use crate::{clock, output};
@@ -88,21 +88,14 @@ impl EvaluatedPolicy {
         let (layout, world) = (self.layout(), WorldConfig::default());
         let n_threads = std::thread::available_parallelism().unwrap_or(NonZeroUsize::MIN);
         let episodes = match self {
-            Self::Policy(_) => {
-                evaluate(|| actor.clone(), layout, &world, n_episodes, seed, n_threads)
+            Self::Policy(_) => evaluate(&actor, layout, &world, n_episodes, seed, n_threads),
+            Self::Composed(..) => {
+                evaluate_composed(&actor, layout, &world, n_episodes, seed, n_threads)
             }
             Self::Blind(policy) => {
                 let blind = BlindActor::new(policy).or_exit(Exit::Data, String::new)?;
-                evaluate(|| blind.clone(), layout, &world, n_episodes, seed, n_threads)
+                evaluate_blind(&blind, layout, &world, n_episodes, seed, n_threads)
             }
-            Self::Composed(..) => evaluate(
-                || ComposedTeachers::new(actor.clone(), layout),
-                layout,
-                &world,
-                n_episodes,
-                seed,
-                n_threads,
-            ),
         };
         episodes.or_exit(Exit::Bug, String::new)
     }

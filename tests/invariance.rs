@@ -12,7 +12,7 @@ const STRATEGIES: [(&str, u64); 4] =
 const EAMC: (&str, u64) = ("eamc:0.1", 900);
 const N_WORKERS: [usize; 4] = [1, 2, 5, 16];
 /// Ten rounds of sixteen slots, so that sixteen workers have something to do; the policy is evaluated after each.
-const SMALL: [&str; 22] = [
+const SMALL: [&str; 24] = [
     "--max-env-steps",
     "8000",
     "--set",
@@ -33,6 +33,8 @@ const SMALL: [&str; 22] = [
     "evaluation.test_episodes=8",
     "--set",
     "evaluation.every_env_steps=800",
+    "--set",
+    "evaluation.recorded_episodes=0",
     "--set",
     "checkpoint.every_rounds=100",
 ];

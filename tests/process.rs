@@ -10,7 +10,7 @@ use serde_json::Value;
 use tempfile::TempDir;
 
 /// A small advised run of 12 rounds whose budget runs out on the way.
-const SMALL: [&str; 18] = [
+const SMALL: [&str; 20] = [
     "--max-env-steps",
     "9600",
     "--set",
@@ -29,6 +29,8 @@ const SMALL: [&str; 18] = [
     "advice.budget=1500",
     "--set",
     "world.substeps=10",
+    "--set",
+    "ddpg.batch_size=64",
 ];
 
 fn tandem(args: &[&str], out: &Path) -> Command {

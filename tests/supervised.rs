@@ -16,7 +16,7 @@ const RUN: &str = r#"
     arms = 2
     advice = { strategy = "none" }
     rounds = { slots = 4, rollouts = 2, updates_per_env_step = 0.1 }
-    ddpg = { n_hidden = 32 }
+    ddpg = { n_hidden = 32, batch_size = 64 }
     evaluation = { every_env_steps = 3200, episodes = 8, recorded_episodes = 0 }
     checkpoint = { every_rounds = 2 }
     stop = { max_env_steps = 16000 }

@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 use std::path::{Path, PathBuf};
 
-const ALLOWED: [(&str, &[&str]); 17] = [
+const ALLOWED: [(&str, &[&str]); 18] = [
     ("core", &[]),
     ("system", &[]),
     ("kinematics", &["core"]),
@@ -22,6 +22,7 @@ const ALLOWED: [(&str, &[&str]); 17] = [
     ("report", &["core", "system", "telemetry"]),
     ("bridge", &["core", "kinematics", "proto", "net"]),
     ("trials", &["core", "kinematics", "sim", "policy", "telemetry", "bridge"]),
+    ("bench", &["core", "sim", "policy", "proto", "net", "rl", "teacher"]),
 ];
 
 /// The Python package, which has a workspace of its own and is in no image.

@@ -18,6 +18,7 @@
 
 mod access;
 mod admission;
+mod block_on;
 mod channel;
 mod client;
 mod connection;
@@ -36,6 +37,7 @@ mod wrong_service;
 
 pub use access::{AccessError, Token, TokenError, is_exposed};
 pub use admission::Capacity;
+pub use block_on::block_on;
 pub use channel::AuthChannel;
 pub use client::{ClientConfig, ClientConfigError};
 pub use connection::{ConnectInfo, Connection, ConnectionClosed, MarkRequest, MarkRequestLayer};

@@ -2,7 +2,6 @@
 //! as an episode would take. The learner, the relays and the real workers are separate processes; the idle workers are
 //! tasks of this one.
 
-mod idle;
 mod measures;
 mod real;
 mod row;
@@ -11,15 +10,13 @@ mod workspace;
 use std::time::Duration;
 
 use anyhow::Context as _;
+use tandem_bench::{Clock, IdleWorkers};
 use tandem_core::layout::EPISODE_STEPS;
-use tandem_learner::Clock;
 use tandem_system::fd_limit;
 
-use super::Figure;
 use crate::cli::ScaleArgs;
 use crate::exit::{Exit, Failed, OrExit as _};
 use crate::{clock, output, runtime};
-use idle::IdleWorkers;
 use row::{Reading, Rounds, Row, Scale};
 use workspace::{Service, Workspace};
 
@@ -152,7 +149,7 @@ impl IdleWorkerBench<'_> {
         // The first two rounds are played with the same parameters.
         let first = (workers.round() + 1).max(2);
         let last = first + u64::from(self.args.rounds);
-        workers.wait_for_round(first).await?;
+        workers.wait_for_round(first).await;
         let before = Reading::take((self.clock)(), learner, &[here]);
         let n_failed = workers.timings().n_failed();
         if n_leaving > 0 {
@@ -160,7 +157,7 @@ impl IdleWorkerBench<'_> {
             workers.leave(n_leaving);
             workers.join(n_leaving)?;
         }
-        workers.wait_for_round(last).await?;
+        workers.wait_for_round(last).await;
         let after = Reading::take((self.clock)(), learner, &[here]);
         let timings = workers.timings();
         let env_steps = self.n_workers * ROLLOUTS * EPISODE_STEPS;

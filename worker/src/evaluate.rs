@@ -8,6 +8,7 @@ use std::num::NonZeroUsize;
 use tandem_core::layout::Layout;
 use tandem_core::work::{EpisodeOrder, RunTerms, SlotOrder};
 use tandem_core::{AdviceTerms, Episode, EpisodeKind, Exploration, TaskSpec, WorldSettings};
+use tandem_policy::{Actor, BlindActor};
 use tandem_sim::{Env, WorldConfig};
 
 use crate::ports::{Act, Environment, NoAdvisor, Simulator};
@@ -56,7 +57,49 @@ impl<A: Act> Act for ComposedTeachers<A> {
 ///
 /// # Errors
 /// When the world cannot be built or a step fails.
-pub fn evaluate<A: Act>(
+pub fn evaluate(
+    actor: &Actor,
+    layout: Layout,
+    world: &WorldConfig,
+    n_episodes: u64,
+    seed: u64,
+    n_threads: NonZeroUsize,
+) -> Result<Vec<Episode>, RolloutError> {
+    evaluate_simulated(|| actor.clone(), layout, world, n_episodes, seed, n_threads)
+}
+
+/// Plays episodes as [`evaluate`], with the one-arm policy `actor` acting for every arm of `layout`.
+///
+/// # Errors
+/// When the world cannot be built or a step fails.
+pub fn evaluate_composed(
+    actor: &Actor,
+    layout: Layout,
+    world: &WorldConfig,
+    n_episodes: u64,
+    seed: u64,
+    n_threads: NonZeroUsize,
+) -> Result<Vec<Episode>, RolloutError> {
+    let composed = || ComposedTeachers::new(actor.clone(), layout);
+    evaluate_simulated(composed, layout, world, n_episodes, seed, n_threads)
+}
+
+/// Plays episodes as [`evaluate`], with a policy whose arms do not see each other.
+///
+/// # Errors
+/// When the world cannot be built or a step fails.
+pub fn evaluate_blind(
+    actor: &BlindActor,
+    layout: Layout,
+    world: &WorldConfig,
+    n_episodes: u64,
+    seed: u64,
+    n_threads: NonZeroUsize,
+) -> Result<Vec<Episode>, RolloutError> {
+    evaluate_simulated(|| actor.clone(), layout, world, n_episodes, seed, n_threads)
+}
+
+fn evaluate_simulated<A: Act>(
     make_actor: impl Fn() -> A + Sync,
     layout: Layout,
     world: &WorldConfig,
@@ -174,8 +217,8 @@ mod tests {
     fn the_number_of_threads_changes_no_simulation() {
         let evaluate_on = |n_threads| {
             let n_threads = NonZeroUsize::new(n_threads).expect("1 or more");
-            evaluate(|| FakeActor::Seeker, LAYOUT, &WorldConfig::default(), 3, 5, n_threads)
-                .expect("no step fails")
+            let (make_actor, world) = (|| FakeActor::Seeker, WorldConfig::default());
+            evaluate_simulated(make_actor, LAYOUT, &world, 3, 5, n_threads).expect("no step fails")
         };
         assert_eq!(evaluate_on(1), evaluate_on(2));
     }

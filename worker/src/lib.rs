@@ -28,6 +28,8 @@ pub use config::{
 };
 pub use environment::{ServedTask, describe_environments};
 pub use error::Error;
-pub use evaluate::{ComposedTeachers, evaluate, evaluate_served};
+pub use evaluate::{
+    ComposedTeachers, evaluate, evaluate_blind, evaluate_composed, evaluate_served,
+};
 pub use ports::{Act, Advisor};
 pub use run::{run, run_with};

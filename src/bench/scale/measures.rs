@@ -2,22 +2,12 @@
 
 use std::time::Duration;
 
+use tandem_bench::quantile;
+
 /// Throughput gains below 10 % count as saturation.
 const MIN_GAIN: f64 = 1.1;
 /// Load above which a thread, or the machine, counts as saturated.
 const SATURATED: f64 = 0.8;
-
-/// Returns the quantile `share` of `times`; 0 if there are none.
-pub(super) fn quantile(times: &mut [Duration], share: f64) -> Duration {
-    times.sort_unstable();
-    #[expect(
-        clippy::cast_possible_truncation,
-        clippy::cast_sign_loss,
-        reason = "an index below the number of times"
-    )]
-    let rank = (times.len() as f64 * share).ceil() as usize;
-    times.get(rank.saturating_sub(1)).copied().unwrap_or_default()
-}
 
 /// Returns the median and the longest of the spans between successive moments; `None` for fewer than two moments.
 pub(super) fn median_and_longest(moments: &[Duration]) -> Option<(Duration, Duration)> {
@@ -99,21 +89,6 @@ mod tests {
 
     fn millis(times: &[u64]) -> Vec<Duration> {
         times.iter().copied().map(Duration::from_millis).collect()
-    }
-
-    #[test]
-    fn a_quantile_is_one_of_the_times() {
-        let check = |times: &[u64], share, expected| {
-            let got = quantile(&mut millis(times), share);
-            assert_eq!(got, Duration::from_millis(expected), "{share} of {times:?}");
-        };
-        check(&[], 0.5, 0);
-        check(&[7], 0.5, 7);
-        check(&[7], 0.99, 7);
-        check(&[30, 10, 20], 0.5, 20);
-        check(&[40, 10, 30, 20], 0.5, 20);
-        check(&(1..=100).rev().collect::<Vec<_>>(), 0.99, 99);
-        check(&(1..=100).collect::<Vec<_>>(), 1.0, 100);
     }
 
     #[test]

@@ -3,8 +3,8 @@
 use std::time::Duration;
 
 use anyhow::Context as _;
+use tandem_bench::Clock;
 use tandem_core::layout::EPISODE_STEPS;
-use tandem_learner::Clock;
 use tandem_net::ClientConfig;
 use tandem_proto::pb;
 use tandem_proto::pb::learner_client::LearnerClient;

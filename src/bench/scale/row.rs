@@ -3,9 +3,9 @@
 use std::fmt;
 use std::time::Duration;
 
+use tandem_bench::{Calls, Figure, Percentiles};
 use tandem_system::process::{ProcessUsage, ResidentMemory, machine_busy_s};
 
-use super::Figure;
 use super::measures::{Bound, Load, knee, median_and_longest};
 
 const MB: f64 = 1e6;
@@ -26,25 +26,6 @@ pub(super) struct Row {
     pub(super) longest_round_s: f64,
     /// Only for workers in this process.
     pub(super) calls: Option<Calls>,
-}
-
-/// Latencies of calls, and counts of failures.
-#[derive(Debug, Clone, Default)]
-pub(super) struct Calls {
-    /// From the moment at which a slot was available and requested until it was assigned.
-    pub(super) assignment: Percentiles,
-    pub(super) parameters: Percentiles,
-    pub(super) delivery: Percentiles,
-    /// Failed calls, which were repeated.
-    pub(super) n_failed: u64,
-    /// Slots that were assigned to a second worker.
-    pub(super) n_reassigned: u64,
-}
-
-#[derive(Debug, Clone, Copy, Default)]
-pub(super) struct Percentiles {
-    pub(super) p50: Duration,
-    pub(super) p99: Duration,
 }
 
 /// Usage of the processes and of the machine at one moment.
@@ -112,10 +93,8 @@ impl Row {
     }
 
     fn figures(&self) -> Vec<Figure> {
-        let figure = |what: &str, value, unit| Figure {
-            name: format!("scale/{}/{what}", self.name),
-            value,
-            unit,
+        let figure = |what: &str, value, unit| {
+            Figure::new(format!("scale/{}/{what}", self.name), value, unit)
         };
         let mut figures = vec![
             figure("rounds", self.rounds_per_s, "rounds/s"),
@@ -173,11 +152,10 @@ impl Scale {
         let mut figures: Vec<Figure> =
             self.real.iter().chain(&self.idle).flat_map(Row::figures).collect();
         if let Some(seconds) = self.joined_s {
-            figures.push(Figure { name: "scale/all-joined".to_owned(), value: seconds, unit: "s" });
+            figures.push(Figure::new("scale/all-joined", seconds, "s"));
         }
         if let Some((n_workers, bound)) = self.knee() {
-            let name = "scale/knee".to_owned();
-            figures.push(Figure { name, value: n_workers as f64, unit: bound.text() });
+            figures.push(Figure::new("scale/knee", n_workers as f64, bound.text()));
         }
         figures
     }

@@ -1,26 +1,23 @@
-//! Latency and throughput of the teacher service on the loopback interface, with its ledger in a file, compared with an
-//! echo service of the same messages. Both services run in this process, each on its own thread and runtime. The clients
-//! share a third runtime.
+//! Latency and throughput of the teacher service on the loopback interface, compared with an echo service of the same
+//! messages. Both services run in this process, each on its own thread and runtime. The clients share a third runtime.
 
 use std::net::{Ipv4Addr, SocketAddr};
 use std::thread;
 use std::time::Duration;
 
-use anyhow::Context as _;
 use tandem_core::rng::{Stream, episode_rng, uniform};
 use tandem_core::{Layout, StepQuery, Task};
 use tandem_net::{AuthChannel, ClientConfig, ServerConfig};
 use tandem_proto::pb::teacher_client::TeacherClient;
 use tandem_proto::{encode_query, pb};
 use tokio::net::TcpListener;
+use tokio::runtime::{Builder, Runtime};
 use tokio::task::JoinSet;
 use tokio_stream::wrappers::ReceiverStream;
 use tokio_util::sync::CancellationToken;
 use tonic::Streaming;
 
-use super::Figure;
-use crate::exit::{Exit, Failed, OrExit as _};
-use crate::{clock, policy_file, runtime};
+use crate::{Clock, Error, Figure};
 
 mod echo;
 
@@ -33,32 +30,34 @@ const N_STREAMS: u16 = 16;
 const STEPS_PER_REQUEST: u64 = 2;
 const ACCOUNT: &str = "bench";
 
-/// Measures the teacher and the echo service alternately.
-pub(super) fn teacher() -> Result<Vec<Figure>, Failed> {
-    let policy = policy_file::shipped_teacher(Task::Push.name())?;
-    let name = format!("tandem-bench-teacher-{}", std::process::id());
-    let directory = std::env::temp_dir().join(name);
-    let made = std::fs::create_dir_all(&directory);
-    made.or_exit(Exit::TryAgain, || format!("cannot create {}", directory.display()))?;
-    let ledger = directory.join("ledger.sqlite").to_string_lossy().into_owned();
-    let config = tandem_teacher::Config { policy, critic: None, ledger };
-    let figures = runtime::new().and_then(|runtime| runtime.block_on(measure(config)));
-    drop(std::fs::remove_dir_all(&directory));
-    figures.or_exit(Exit::TryAgain, || "cannot measure the teacher".to_owned())
+/// Measures the teacher service of `config` and the echo service alternately.
+///
+/// Opens an account in the ledger of `config`. Blocks for 15 s and must not be called inside a runtime.
+///
+/// # Errors
+/// When a service cannot be started or a call fails.
+pub fn measure(config: tandem_teacher::Config, clock: &Clock) -> Result<Vec<Figure>, Error> {
+    runtime()?.block_on(measure_alternately(config, clock))
 }
 
-async fn measure(config: tandem_teacher::Config) -> anyhow::Result<Vec<Figure>> {
+/// Creates a runtime with one thread for all sockets, as in the program.
+fn runtime() -> Result<Runtime, Error> {
+    Builder::new_current_thread().enable_all().build().map_err(Error::Start)
+}
+
+async fn measure_alternately(
+    config: tandem_teacher::Config,
+    clock: &Clock,
+) -> Result<Vec<Figure>, Error> {
     let teacher = Server::start(async move |listener, shutdown| {
-        tandem_teacher::serve(config, listener, &ServerConfig::default(), shutdown)
-            .await
-            .map_err(Into::into)
+        Ok(tandem_teacher::serve(config, listener, &ServerConfig::default(), shutdown).await?)
     })?;
-    let mut teacher_bench = Bench::new(teacher.address)?;
+    let mut teacher_bench = Bench::new(teacher.address, clock)?;
     let answer = teacher_bench.open_account().await?;
     let echo = Server::start(async move |listener, shutdown| {
         echo::serve(answer, listener, shutdown).await
     })?;
-    let mut echo_bench = Bench::new(echo.address)?;
+    let mut echo_bench = Bench::new(echo.address, clock)?;
     for _ in 0..N_SAMPLES {
         teacher_bench.sample().await?;
         echo_bench.sample().await?;
@@ -70,27 +69,22 @@ async fn measure(config: tandem_teacher::Config) -> anyhow::Result<Vec<Figure>> 
 }
 
 fn figures(teacher: &Best, echo: &Best) -> Vec<Figure> {
-    let figure = |name: String, value, unit| Figure { name, value, unit };
     let mut figures = Vec::new();
     for (service, best) in [("teacher", teacher), ("grpc-echo", echo)] {
         for (call, latency) in [("unary", best.unary), ("stream", best.stream)] {
-            figures.push(figure(format!("{service}/{call}/p50"), latency.p50_us, "us"));
-            figures.push(figure(format!("{service}/{call}/p99"), latency.p99_us, "us"));
+            figures.push(Figure::new(format!("{service}/{call}/p50"), latency.p50_us, "us"));
+            figures.push(Figure::new(format!("{service}/{call}/p99"), latency.p99_us, "us"));
         }
-        figures.push(figure(format!("{service}/{N_STREAMS}-streams"), best.steps_per_s, "steps/s"));
+        figures.push(Figure::new(
+            format!("{service}/{N_STREAMS}-streams"),
+            best.steps_per_s,
+            "steps/s",
+        ));
     }
     let over = |of: fn(&Best) -> f64| of(teacher) / of(echo);
-    figures.push(figure(
-        "teacher/unary/p50-over-echo".to_owned(),
-        over(|b| b.unary.p50_us),
-        "x echo",
-    ));
-    figures.push(figure(
-        "teacher/stream/p50-over-echo".to_owned(),
-        over(|b| b.stream.p50_us),
-        "x echo",
-    ));
-    figures.push(figure(
+    figures.push(Figure::new("teacher/unary/p50-over-echo", over(|b| b.unary.p50_us), "x echo"));
+    figures.push(Figure::new("teacher/stream/p50-over-echo", over(|b| b.stream.p50_us), "x echo"));
+    figures.push(Figure::new(
         format!("teacher/{N_STREAMS}-streams-over-echo"),
         over(|b| b.steps_per_s),
         "x echo",
@@ -102,32 +96,36 @@ fn figures(teacher: &Best, echo: &Best) -> Vec<Figure> {
 struct Server {
     address: SocketAddr,
     shutdown: CancellationToken,
-    thread: thread::JoinHandle<anyhow::Result<()>>,
+    thread: thread::JoinHandle<Result<(), Error>>,
 }
 
 impl Server {
     fn start<F>(
         serve: impl FnOnce(TcpListener, CancellationToken) -> F + Send + 'static,
-    ) -> anyhow::Result<Self>
+    ) -> Result<Self, Error>
     where
-        F: Future<Output = anyhow::Result<()>>,
+        F: Future<Output = Result<(), Error>>,
     {
-        let listener = std::net::TcpListener::bind((Ipv4Addr::LOCALHOST, 0))?;
-        listener.set_nonblocking(true)?;
-        let address = listener.local_addr()?;
+        let listener =
+            std::net::TcpListener::bind((Ipv4Addr::LOCALHOST, 0)).map_err(Error::Start)?;
+        listener.set_nonblocking(true).map_err(Error::Start)?;
+        let address = listener.local_addr().map_err(Error::Start)?;
         let shutdown = CancellationToken::new();
         let ended = shutdown.clone();
         let thread = thread::spawn(move || {
-            runtime::new()?.block_on(async { serve(TcpListener::from_std(listener)?, ended).await })
+            runtime()?.block_on(async {
+                let listener = TcpListener::from_std(listener).map_err(Error::Start)?;
+                serve(listener, ended).await
+            })
         });
         Ok(Self { address, shutdown, thread })
     }
 
     /// Ends the service. Meanwhile, this runtime closes the connections that were dropped before.
-    async fn stop(self) -> anyhow::Result<()> {
+    async fn stop(self) -> Result<(), Error> {
         self.shutdown.cancel();
-        let joined = tokio::task::spawn_blocking(|| self.thread.join()).await?;
-        joined.map_err(|_panic| anyhow::anyhow!("the service panicked"))?
+        let joined = tokio::task::spawn_blocking(|| self.thread.join()).await;
+        joined.map_err(|_panic| Error::Panicked)?.map_err(|_panic| Error::Panicked)?
     }
 }
 
@@ -162,29 +160,31 @@ struct Best {
 }
 
 /// Clients of one service.
-struct Bench {
+struct Bench<'a> {
+    clock: &'a Clock,
     client: TeacherClient<AuthChannel>,
     requests: Requests,
     streams: Vec<(TeacherClient<AuthChannel>, Requests)>,
     best: Best,
 }
 
-impl Bench {
+impl<'a> Bench<'a> {
     /// Creates clients of the service at `address`, which connect at their first call. Must be called inside a runtime.
-    fn new(address: SocketAddr) -> anyhow::Result<Self> {
+    fn new(address: SocketAddr, clock: &'a Clock) -> Result<Self, Error> {
         let client_config = ClientConfig::default();
         let connect = || client_config.channel(&address.to_string()).map(TeacherClient::new);
         let streams = (1..=N_STREAMS).map(|idx| Ok((connect()?, Requests::new(idx))));
         Ok(Self {
+            clock,
             client: connect()?,
             requests: Requests::new(0),
-            streams: streams.collect::<anyhow::Result<_>>()?,
+            streams: streams.collect::<Result<_, Error>>()?,
             best: Best { unary: Latency::WORST, stream: Latency::WORST, steps_per_s: 0.0 },
         })
     }
 
     /// Opens the account and returns a typical response.
-    async fn open_account(&mut self) -> anyhow::Result<pb::AdviseResponse> {
+    async fn open_account(&mut self) -> Result<pb::AdviseResponse, Error> {
         let terms = pb::OpenAccountRequest {
             name: ACCOUNT.to_owned(),
             budget: 1_000_000_000,
@@ -200,10 +200,10 @@ impl Bench {
     }
 
     /// Takes one more sample of each quantity.
-    async fn sample(&mut self) -> anyhow::Result<()> {
+    async fn sample(&mut self) -> Result<(), Error> {
         let unary = self.unary().await?;
         self.best.unary = self.best.unary.min(unary);
-        let stream = Self::stream(self.client.clone(), &mut self.requests).await?;
+        let stream = stream(self.client.clone(), &mut self.requests, self.clock).await?;
         self.best.stream = self.best.stream.min(Latency::of(stream));
         let steps_per_s = self.many_streams().await?;
         self.best.steps_per_s = self.best.steps_per_s.max(steps_per_s);
@@ -211,51 +211,53 @@ impl Bench {
     }
 
     /// Measures single calls, one after another.
-    async fn unary(&mut self) -> anyhow::Result<Latency> {
-        let (start, mut times) = (clock::now(), Vec::new());
-        while start.elapsed() < SAMPLE {
+    async fn unary(&mut self) -> Result<Latency, Error> {
+        let (start, mut times) = ((self.clock)(), Vec::new());
+        while (self.clock)() - start < SAMPLE {
             let request = self.requests.next();
-            let sent_at = clock::now();
+            let sent_at = (self.clock)();
             self.client.advise(request).await?;
-            times.push(sent_at.elapsed());
+            times.push((self.clock)() - sent_at);
         }
         Ok(Latency::of(times))
     }
 
-    /// Measures requests on one stream, one after another.
-    async fn stream(
-        client: TeacherClient<AuthChannel>,
-        requests: &mut Requests,
-    ) -> anyhow::Result<Vec<Duration>> {
-        let mut stream = AdviceStream::open(client).await?;
-        let (start, mut times) = (clock::now(), Vec::new());
-        while start.elapsed() < SAMPLE {
-            let request = requests.next();
-            let sent_at = clock::now();
-            stream.ask(request).await?;
-            times.push(sent_at.elapsed());
-        }
-        Ok(times)
-    }
-
     /// Measures the steps per second of all streams together.
-    async fn many_streams(&mut self) -> anyhow::Result<f64> {
-        let (start, mut asking) = (clock::now(), JoinSet::new());
+    async fn many_streams(&mut self) -> Result<f64, Error> {
+        let (start, mut asking) = ((self.clock)(), JoinSet::new());
         for (client, mut requests) in self.streams.drain(..) {
+            let clock = self.clock.clone();
             asking.spawn(async move {
-                let times = Self::stream(client.clone(), &mut requests).await?;
-                anyhow::Ok(((client, requests), times.len() as u64))
+                let times = stream(client.clone(), &mut requests, &clock).await?;
+                Ok::<_, Error>(((client, requests), times.len() as u64))
             });
         }
         let mut n_requests = 0;
         while let Some(asked) = asking.join_next().await {
-            let (stream, n_asked) = asked??;
+            let (stream, n_asked) = asked.map_err(|_panic| Error::Panicked)??;
             self.streams.push(stream);
             n_requests += n_asked;
         }
         let n_steps = STEPS_PER_REQUEST * n_requests;
-        Ok(n_steps as f64 / start.elapsed().as_secs_f64())
+        Ok(n_steps as f64 / ((self.clock)() - start).as_secs_f64())
     }
+}
+
+/// Measures requests on one stream, one after another.
+async fn stream(
+    client: TeacherClient<AuthChannel>,
+    requests: &mut Requests,
+    clock: &Clock,
+) -> Result<Vec<Duration>, Error> {
+    let mut stream = AdviceStream::open(client).await?;
+    let (start, mut times) = (clock(), Vec::new());
+    while clock() - start < SAMPLE {
+        let request = requests.next();
+        let sent_at = clock();
+        stream.ask(request).await?;
+        times.push(clock() - sent_at);
+    }
+    Ok(times)
 }
 
 /// A stream with one pending request.
@@ -265,15 +267,15 @@ struct AdviceStream {
 }
 
 impl AdviceStream {
-    async fn open(mut client: TeacherClient<AuthChannel>) -> anyhow::Result<Self> {
+    async fn open(mut client: TeacherClient<AuthChannel>) -> Result<Self, Error> {
         let (requests, receiver) = tokio::sync::mpsc::channel(1);
         let responses = client.advise_stream(ReceiverStream::new(receiver)).await?.into_inner();
         Ok(Self { requests, responses })
     }
 
-    async fn ask(&mut self, request: pb::AdviseRequest) -> anyhow::Result<pb::AdviseResponse> {
-        self.requests.send(request).await.context("the stream has ended")?;
-        self.responses.message().await?.context("the stream has ended")
+    async fn ask(&mut self, request: pb::AdviseRequest) -> Result<pb::AdviseResponse, Error> {
+        self.requests.send(request).await.map_err(|_closed| Error::StreamEnded)?;
+        self.responses.message().await?.ok_or(Error::StreamEnded)
     }
 }
 

@@ -10,12 +10,14 @@ use tokio_stream::{Stream, StreamExt as _};
 use tokio_util::sync::CancellationToken;
 use tonic::{Request, Response, Status, Streaming};
 
+use crate::Error;
+
 /// Responds to every request with `response` until `shutdown` is cancelled.
 pub(super) async fn serve(
     response: pb::AdviseResponse,
     listener: TcpListener,
     shutdown: CancellationToken,
-) -> anyhow::Result<()> {
+) -> Result<(), Error> {
     let router = ServerConfig::default()
         .router(TeacherServer::new(Echo { response }), tandem_proto::FILE_DESCRIPTOR_SET)
         .await?;

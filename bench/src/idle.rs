@@ -7,9 +7,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
-use anyhow::Context as _;
 use tandem_core::{Episode, Layout, Task};
-use tandem_learner::Clock;
 use tandem_net::{AuthChannel, ClientConfig, MAX_MESSAGE_BYTES, Retryability, within};
 use tandem_proto::pb::learner_client::LearnerClient;
 use tandem_proto::pb::next_work_response::Work;
@@ -18,7 +16,9 @@ use tokio::sync::watch;
 use tokio::task::JoinHandle;
 use tonic::Status;
 
-pub(super) use timings::LoadTimings;
+use crate::{Clock, Error};
+
+pub use timings::{Calls, LoadTimings, Percentiles, quantile};
 
 /// The version that workers and learner must share; it does not contain the commit.
 const VERSION: &str = env!("CARGO_PKG_VERSION");
@@ -27,8 +27,8 @@ const CALL_TIMEOUT: Duration = Duration::from_secs(20);
 /// Pause before a failed call is repeated.
 const RETRY_PAUSE: Duration = Duration::from_millis(100);
 
-/// Idle workers of one learner.
-pub(super) struct IdleWorkers {
+/// Idle workers of one learner. They end when this is dropped.
+pub struct IdleWorkers {
     shared: Arc<Shared>,
     workers: Vec<WorkerHandle>,
     n_spawned: usize,
@@ -62,7 +62,11 @@ struct WorkerState {
 }
 
 impl IdleWorkers {
-    pub(super) fn new(
+    /// Creates a load without workers.
+    ///
+    /// The workers call the learner or its relays at `addresses` in turn, and take `slot_time` for a slot. A round has
+    /// `episodes_per_round` episodes.
+    pub fn new(
         addresses: Vec<String>,
         slot_time: Duration,
         episodes_per_round: usize,
@@ -84,12 +88,14 @@ impl IdleWorkers {
         Self { shared: Arc::new(shared), workers: Vec::new(), n_spawned: 0 }
     }
 
-    /// Starts `n` more workers.
-    pub(super) fn join(&mut self, n: usize) -> anyhow::Result<()> {
+    /// Starts `n` more workers. Must be called inside a runtime.
+    ///
+    /// # Errors
+    /// When an address is not one.
+    pub fn join(&mut self, n: usize) -> Result<(), Error> {
         for _ in 0..n {
             let address = &self.shared.addresses[self.n_spawned % self.shared.addresses.len()];
-            let link =
-                self.shared.client_config.channel(address).context("cannot call the learner")?;
+            let link = self.shared.client_config.channel(address)?;
             let state = Arc::<WorkerState>::default();
             let worker = Worker {
                 name: format!("idle-{}", self.n_spawned),
@@ -106,7 +112,7 @@ impl IdleWorkers {
 
     /// Removes `n` workers that are playing: one half at once, in the middle of a slot, and the other half after they
     /// have delivered their slots.
-    pub(super) fn leave(&mut self, n: usize) {
+    pub fn leave(&mut self, n: usize) {
         let (n_silently, mut n_left) = (n / 2, 0);
         self.workers.retain(|worker| {
             let is_playing = worker.state.is_playing.load(Ordering::Relaxed);
@@ -125,30 +131,31 @@ impl IdleWorkers {
     ///
     /// # Errors
     /// When the learner rejects them.
-    pub(super) async fn all_joined(&self) -> anyhow::Result<()> {
+    pub async fn all_joined(&self) -> Result<(), Error> {
         let mut n_joined = self.shared.n_joined.subscribe();
         let mut rejection = self.shared.rejection.subscribe();
         tokio::select! {
-            joined = n_joined.wait_for(|n| *n >= self.n_spawned) => drop(joined?),
+            _ = n_joined.wait_for(|n| *n >= self.n_spawned) => Ok(()),
             rejection = rejection.wait_for(Option::is_some) => {
-                anyhow::bail!("the learner rejects workers: {}", rejection?.as_deref().unwrap_or_default());
+                let reason = rejection.ok().and_then(|reason| reason.clone());
+                Err(Error::Rejected(reason.unwrap_or_default()))
             }
         }
-        Ok(())
     }
 
     /// Returns the latest round of which a worker has taken a slot.
-    pub(super) fn round(&self) -> u64 {
+    pub fn round(&self) -> u64 {
         *self.shared.latest_round.borrow()
     }
 
     /// Waits until a worker has taken a slot of `round`.
-    pub(super) async fn wait_for_round(&self, round: u64) -> anyhow::Result<()> {
-        self.shared.latest_round.subscribe().wait_for(|latest| *latest >= round).await?;
-        Ok(())
+    pub async fn wait_for_round(&self, round: u64) {
+        // Fails only without a sender, and `shared` has it.
+        drop(self.shared.latest_round.subscribe().wait_for(|latest| *latest >= round).await);
     }
 
-    pub(super) fn timings(&self) -> MutexGuard<'_, LoadTimings> {
+    /// Locks the timings of all calls so far.
+    pub fn timings(&self) -> MutexGuard<'_, LoadTimings> {
         self.shared.timings()
     }
 }
