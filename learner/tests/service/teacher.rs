@@ -194,17 +194,13 @@ impl Teacher for FakeTeacher {
         &self,
         _: Request<pb::AdviseRequest>,
     ) -> Result<Response<pb::AdviseResponse>, Status> {
-        let task = self.books().task.clone().unwrap_or_else(|| LAYOUT.into());
-        let task_description = Some(encode_task(&task));
-        Ok(Response::new(pb::DescribeResponse { task_description, ..Default::default() }))
+        Err(Status::unimplemented("no test asks for advice"))
     }
 
     async fn advise_stream(
         &self,
         _: Request<Streaming<pb::AdviseRequest>>,
     ) -> Result<Response<Self::AdviseStreamStream>, Status> {
-        let task = self.books().task.clone().unwrap_or_else(|| LAYOUT.into());
-        let task_description = Some(encode_task(&task));
-        Ok(Response::new(pb::DescribeResponse { task_description, ..Default::default() }))
+        Err(Status::unimplemented("no test asks for advice"))
     }
 }
