@@ -84,9 +84,7 @@ fn rate(mut work: impl FnMut()) -> f64 {
 /// Environment steps per second on one core with random actions, including resets and observations.
 fn sim() -> Result<Vec<Figure>, Failed> {
     let mut figures = Vec::new();
-    for (task, n_arms) in
-        [(Task::Push, 1), (Task::Push, 2), (Task::PickAndPlace, 1), (Task::PickAndPlace, 2)]
-    {
+    for (task, n_arms) in Task::ALL.into_iter().flat_map(|task| [(task, 1), (task, 2)]) {
         let layout = Layout::new(task, n_arms);
         let mut world =
             Env::new(layout, &WorldConfig::default()).or_exit(Exit::Bug, String::new)?;

@@ -102,6 +102,8 @@ pub(crate) enum Command {
 pub(crate) enum TaskName {
     Push,
     PickAndPlace,
+    SharedPush,
+    SharedPickAndPlace,
 }
 
 impl From<TaskName> for Task {
@@ -109,6 +111,8 @@ impl From<TaskName> for Task {
         match name {
             TaskName::Push => Self::Push,
             TaskName::PickAndPlace => Self::PickAndPlace,
+            TaskName::SharedPush => Self::SharedPush,
+            TaskName::SharedPickAndPlace => Self::SharedPickAndPlace,
         }
     }
 }

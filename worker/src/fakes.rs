@@ -160,7 +160,7 @@ pub(crate) fn terms() -> RunTerms {
             random_action_prob: 0.3,
             sticky_random_mean_steps: 4.0,
         },
-        world: WorldSettings { grasped_start_prob: 0.5, substeps: 20 },
+        world: WorldSettings { grasped_start_prob: 0.5, ..WorldSettings::default() },
     }
 }
 

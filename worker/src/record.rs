@@ -85,7 +85,12 @@ pub fn metadata_of(
         parameter_version: episode.parameter_version,
         layout: episode.layout.as_built_in()?,
         policy_digest,
-        world: terms.world.log_entries().map(|(key, value)| (key.to_owned(), value)).into(),
+        world: terms
+            .world
+            .log_entries()
+            .into_iter()
+            .map(|(key, value)| (key.to_owned(), value))
+            .collect(),
     })
 }
 

@@ -7,7 +7,7 @@ use crate::layout::{
 };
 
 /// Smallest gap along x, metres, between the hands and objects of two arms whose transitions come from different steps:
-/// they cannot touch.
+/// they cannot touch. Hands move by at most 5 cm in a step of either world, and reach 3.5 cm ahead of their position.
 const RECOMBINATION_GAP_M: f32 = 0.10;
 
 impl Layout {

@@ -33,7 +33,7 @@ pub(crate) fn terms() -> RunTerms {
             random_action_prob: 0.3,
             sticky_random_mean_steps: 4.0,
         },
-        world: WorldSettings { grasped_start_prob: 0.0, substeps: 10 },
+        world: WorldSettings { substeps: 10, ..WorldSettings::default() },
     }
 }
 
