@@ -12,7 +12,6 @@ use tandem_core::text::error_chain;
 use tandem_telemetry::{EpisodeLog, LoggedTransition, read_episode};
 use tandem_worker::EnvironmentConfig;
 use tandem_worker::record::{RecordError, replay_log, replay_log_on};
-use tokio::runtime::Runtime;
 
 use crate::cli::ReplayArgs;
 use crate::environment_server::EnvironmentSource;
@@ -30,7 +29,7 @@ struct Replayed {
 
 /// The server of environments that the command line names. It simulates the episodes of its own task.
 struct Server {
-    runtime: Runtime,
+    runtime: runtime::Runtime,
     source: EnvironmentSource,
     config: EnvironmentConfig,
     task: TaskSpec,

@@ -11,7 +11,7 @@ use tandem_core::task::TaskDescription;
 use tandem_core::work::{EpisodeOrder, RunTerms, SlotOrder};
 use tandem_core::{
     AdviceTerms, ArmAdvice, Contacts, EpisodeKind, Exploration, Layout, StepAdvice, StepQuery,
-    Task, TaskSpec, WorldSettings,
+    Task, TaskSpec, World, WorldSettings,
 };
 use tandem_policy::{Actor, Policy};
 use tandem_sim::{Env, WorldConfig};
@@ -92,7 +92,7 @@ fn terms(layout: Layout, kind: Kind, substeps: u32) -> RunTerms {
             sticky_random_mean_steps: 4.0,
             joint_random_actions: false,
         },
-        world: WorldSettings { grasped_start_prob: prob, substeps },
+        world: WorldSettings { grasped_start_prob: prob, substeps, randomization: prob },
     }
 }
 
@@ -158,10 +158,17 @@ fn summary(output: &Output) -> Value {
 }
 
 #[test]
-fn two_hundred_episodes_of_every_kind_replay_bit_for_bit() {
+fn three_hundred_episodes_of_every_kind_replay_bit_for_bit() {
     let keep = tempfile::tempdir().expect("a directory");
+    // A step of the shared world takes four times as many physics steps.
+    let resolutions = |task: Task| match task.world() {
+        World::Classic => vec![10, 20],
+        World::Shared => vec![10],
+    };
     let worlds = Task::ALL.into_iter().flat_map(|task| {
-        [1, 2].into_iter().flat_map(move |n_arms| [(task, n_arms, 10), (task, n_arms, 20)])
+        [1, 2].into_iter().flat_map(move |n_arms| {
+            resolutions(task).into_iter().map(move |substeps| (task, n_arms, substeps))
+        })
     });
     let logs: Vec<PathBuf> = std::thread::scope(|scope| {
         let threads: Vec<_> = worlds
@@ -177,7 +184,7 @@ fn two_hundred_episodes_of_every_kind_replay_bit_for_bit() {
             .collect();
         threads.into_iter().flat_map(|thread| thread.join().expect("records")).collect()
     });
-    assert_eq!(logs.len(), 200);
+    assert_eq!(logs.len(), 300);
 
     let read: Vec<EpisodeLog> = logs.iter().map(|log| read_episode(log).expect("whole")).collect();
     let n_logs_with = |holds: &dyn Fn(&EpisodeLog) -> bool| {
@@ -186,15 +193,15 @@ fn two_hundred_episodes_of_every_kind_replay_bit_for_bit() {
     let advised = n_logs_with(&|log| log.transitions.iter().any(|step| step.advised_arms != 0));
     let touching = n_logs_with(&|log| log.transitions.iter().any(|step| step.contacts.any()));
     let achieving = n_logs_with(&|log| log.transitions.iter().any(|step| step.reward == 0.0));
-    assert_eq!(advised, 40);
+    assert_eq!(advised, 60);
     assert!(touching >= 8 && achieving >= 40, "{touching} touch, {achieving} achieve");
 
     let whole = tandem(&["replay", "--verify"], &[keep.path()]);
-    assert_eq!(stdout(&whole), "200 of 200 episodes equal bit for bit\n");
+    assert_eq!(stdout(&whole), "300 of 300 episodes equal bit for bit\n");
     assert!(whole.status.success() && whole.stderr.is_empty());
     let as_json = tandem(&["replay", "--json"], &[keep.path(), &logs[0]]);
     let expected = json!({
-        "episodes": 201, "equal": 201, "differing": [], "unreadable": [], "not_simulated": [],
+        "episodes": 301, "equal": 301, "differing": [], "unreadable": [], "not_simulated": [],
         "cut_short": [],
     });
     assert_eq!(summary(&as_json), expected);

@@ -2,7 +2,8 @@
 //!
 //! A number beyond its bound cannot come from a correct simulation. It would distort the running statistics that
 //! normalise every later input, so the learner refuses episodes that contain one. The bounds leave room for everything
-//! that can happen in an episode of 2 s, such as an object that falls off the table.
+//! that can happen in an episode, such as an object that falls off the table in the 2 s of the classic world. In the
+//! shared world, whose hands are slow, objects stay on the table.
 
 use crate::layout::{Layout, OBSERVATION_PER_ARM};
 
@@ -13,15 +14,16 @@ pub const MAX_MAGNITUDE: f32 = 1000.0;
 const REACH_M: f32 = 2.0;
 /// Desired goals of the built-in tasks, metres.
 pub(crate) const GOAL_BOUND_M: f32 = REACH_M;
-/// Positions of objects, metres. A free fall during a whole episode covers 20 m.
+/// Positions of objects, metres. A free fall during a whole episode of the classic world covers 20 m.
 const FALL_M: f32 = 25.0;
 /// Finger openings and their rates, metres and metres per control step.
 const OPENING_M: f32 = 1.0;
 /// Components of a unit quaternion.
 const UNIT: f32 = 1.01;
-/// Velocities, metres per control step; equals 50 m/s.
+/// Velocities, metres per control step; equals 50 m/s in the classic world and 8 m/s in the shared one.
 const SPEED: f32 = 2.0;
-/// Angular velocities, radians per control step; equals 120 revolutions per second.
+/// Angular velocities, radians per control step; equals 120 revolutions per second in the classic world and 19 in the
+/// shared one.
 const SPIN: f32 = 30.0;
 
 /// The bounds of one arm's observation, in its order, for the tasks with an object on a table.

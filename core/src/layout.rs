@@ -68,6 +68,16 @@ impl World {
             Self::Shared => 0.25,
         }
     }
+
+    /// Returns the distance of a Mico's base behind the origin of its arm's frame, metres, in a work cell that performs
+    /// the tasks of this world.
+    #[must_use]
+    pub const fn mico_base_distance_m(self) -> f32 {
+        match self {
+            Self::Classic => 0.27,
+            Self::Shared => 0.22,
+        }
+    }
 }
 
 impl fmt::Display for World {

@@ -6,6 +6,7 @@
 //! in `sim`.
 
 use std::fmt::Display;
+use std::num::ParseFloatError;
 
 use serde::{Deserialize, Serialize};
 
@@ -93,19 +94,25 @@ pub enum AdviceUnit {
 pub struct WorldSettings {
     /// Probability that a training episode starts with the objects grasped (pick and place), in [0, 1].
     pub grasped_start_prob: f32,
-    /// Physics steps per control step of 0.04 s: 20, or 10 for quick tests.
+    /// Resolution of the physics: 20, or 10 for quick tests. It is the number of physics steps per control step in the
+    /// classic world, and a quarter of it in the shared world.
     pub substeps: u32,
+    /// How much the world varies between training episodes, in [0, 1]: size, mass and friction of the objects, delay of
+    /// the actions and noise of the observations. 0 is not at all, 1 is the full ranges. Former files have 0.
+    #[serde(default)]
+    pub randomization: f32,
 }
 
 impl Default for WorldSettings {
     fn default() -> Self {
-        Self { grasped_start_prob: 0.0, substeps: 20 }
+        Self { grasped_start_prob: 0.0, substeps: 20, randomization: 0.0 }
     }
 }
 
 /// Keys of the settings in the metadata of episode logs, which other programs read.
 const LOGGED_GRASPED_START_PROB: &str = "gripped_start_share";
 const LOGGED_SUBSTEPS: &str = "substeps";
+const LOGGED_RANDOMIZATION: &str = "randomization";
 
 impl WorldSettings {
     /// Checks every range; NaN is in none.
@@ -113,7 +120,10 @@ impl WorldSettings {
     /// # Errors
     /// Names the first setting that is out of its range.
     pub fn check(&self) -> Result<(), OutOfRange> {
-        let Self { grasped_start_prob, substeps } = *self;
+        let Self { grasped_start_prob, substeps, randomization } = *self;
+        let is_share = (0.0..=1.0).contains(&randomization);
+        let key = "world.randomization";
+        OutOfRange::unless(is_share, key, randomization, "a number in [0, 1]")?;
         let is_prob = (0.0..=1.0).contains(&grasped_start_prob);
         let key = "world.grasped_start_prob";
         OutOfRange::unless(is_prob, key, grasped_start_prob, "a number in [0, 1]")?;
@@ -129,13 +139,17 @@ impl WorldSettings {
         }
     }
 
-    /// Returns the settings as entries of an episode log's metadata.
+    /// Returns the settings as entries of an episode log's metadata. A world that does not vary has no entry for that.
     #[must_use]
-    pub fn log_entries(self) -> [(&'static str, String); 2] {
-        [
+    pub fn log_entries(self) -> Vec<(&'static str, String)> {
+        let mut entries = vec![
             (LOGGED_SUBSTEPS, self.substeps.to_string()),
             (LOGGED_GRASPED_START_PROB, self.grasped_start_prob.to_string()),
-        ]
+        ];
+        if self.randomization != 0.0 {
+            entries.push((LOGGED_RANDOMIZATION, self.randomization.to_string()));
+        }
+        entries
     }
 
     /// Reads the settings from an episode log's metadata; `entry` looks up an entry.
@@ -147,9 +161,11 @@ impl WorldSettings {
     ) -> Result<Self, &'static str> {
         let number = |key| entry(key).and_then(|text| text.parse().ok()).ok_or(key);
         let count = |key| entry(key).and_then(|text| text.parse().ok()).ok_or(key);
+        let randomization = entry(LOGGED_RANDOMIZATION).map_or(Ok(0.0), str::parse);
         Ok(Self {
             grasped_start_prob: number(LOGGED_GRASPED_START_PROB)?,
             substeps: count(LOGGED_SUBSTEPS)?,
+            randomization: randomization.map_err(|_: ParseFloatError| LOGGED_RANDOMIZATION)?,
         })
     }
 }
@@ -188,12 +204,13 @@ impl OutOfRange {
 mod tests {
     use super::*;
 
-    const WORLD: WorldSettings = WorldSettings { grasped_start_prob: 0.3, substeps: 10 };
+    const WORLD: WorldSettings =
+        WorldSettings { grasped_start_prob: 0.3, substeps: 10, randomization: 0.25 };
 
     #[test]
     fn only_training_episodes_start_specially() {
         assert_eq!(WORLD.for_kind(EpisodeKind::Training), WORLD);
-        let evaluated = WorldSettings { grasped_start_prob: 0.0, substeps: 10 };
+        let evaluated = WorldSettings { substeps: 10, ..WorldSettings::default() };
         assert_eq!(WORLD.for_kind(EpisodeKind::Evaluation), evaluated);
     }
 
@@ -206,12 +223,18 @@ mod tests {
         assert_eq!(WorldSettings::from_log_entries(lookup), Ok(WORLD));
         let spoilt = |key: &str| if key == "substeps" { Some("ten") } else { lookup(key) };
         assert_eq!(WorldSettings::from_log_entries(spoilt), Err("substeps"));
+        let former = |key: &str| if key == "randomization" { None } else { lookup(key) };
+        let steady = WorldSettings { randomization: 0.0, ..WORLD };
+        assert_eq!(WorldSettings::from_log_entries(former), Ok(steady));
+        assert_eq!(steady.log_entries().len(), 2, "former logs are written as before");
     }
 
     #[test]
     fn values_out_of_range_are_named() {
         let world = WorldSettings { grasped_start_prob: f32::NAN, ..WORLD };
         assert_eq!(world.check().map_err(|error| error.key), Err("world.grasped_start_prob"));
+        let world = WorldSettings { randomization: 1.5, ..WORLD };
+        assert_eq!(world.check().map_err(|error| error.key), Err("world.randomization"));
         let exploration = Exploration { random_action_prob: 1.0, ..Exploration::NONE };
         let message = exploration.check(50).expect_err("out of range").to_string();
         assert_eq!(message, "exploration.random_action_prob is 1: expected a number in [0, 1)");

@@ -65,7 +65,7 @@ impl Play {
 }
 
 fn start(number: u64, kind: EpisodeKind, substeps: u32) -> EpisodeStart {
-    let world = WorldSettings { grasped_start_prob: 0.5, substeps };
+    let world = WorldSettings { grasped_start_prob: 0.5, substeps, ..WorldSettings::default() };
     EpisodeStart { number, seed: 9, kind, world }
 }
 

@@ -93,6 +93,7 @@ pub fn encode_reset(starts: &[EpisodeStart]) -> pb::PlayRequest {
         evaluation: start.kind == EpisodeKind::Evaluation,
         grasped_start_prob: start.world.grasped_start_prob,
         substeps: start.world.substeps,
+        randomization: start.world.randomization,
     });
     let reset = pb::ResetEnvironments { environments: environments.collect() };
     pb::PlayRequest { command: Some(pb::play_request::Command::Reset(reset)) }
@@ -170,6 +171,7 @@ fn decode_start(reset: &pb::EnvironmentReset) -> Result<EpisodeStart, DecodeErro
                 0 => WorldSettings::default().substeps,
                 substeps => count_within("substeps", substeps, &(1..=MAX_SUBSTEPS))?,
             },
+            randomization: one_within("randomization", reset.randomization, &(0.0..=1.0))?,
         },
     })
 }
@@ -291,7 +293,7 @@ mod tests {
             number,
             seed: 7,
             kind: EpisodeKind::Training,
-            world: WorldSettings { grasped_start_prob: 0.25, substeps: 10 },
+            world: WorldSettings { grasped_start_prob: 0.25, substeps: 10, randomization: 0.5 },
         }
     }
 

@@ -72,6 +72,7 @@ pub fn encode_run_terms(terms: &RunTerms) -> pb::RunTerms {
             gripped_start_share: terms.world.grasped_start_prob,
             wide_start_share: 0.0,
             substeps: terms.world.substeps,
+            randomization: terms.world.randomization,
         }),
     }
 }
@@ -176,6 +177,7 @@ fn decode_world(world: pb::WorldTerms) -> Result<WorldSettings, DecodeError> {
             &(0.0..=1.0),
         )?,
         substeps: count_within("substeps", world.substeps, &(1..=MAX_SUBSTEPS))?,
+        randomization: one_within("randomization", world.randomization, &(0.0..=1.0))?,
     })
 }
 
@@ -313,7 +315,7 @@ mod tests {
                 sticky_random_mean_steps: 4.0,
                 joint_random_actions: true,
             },
-            world: WorldSettings { grasped_start_prob: 1.0, substeps: 20 },
+            world: WorldSettings { grasped_start_prob: 1.0, substeps: 20, randomization: 0.5 },
         }
     }
 

@@ -155,6 +155,7 @@ fn terms() -> impl Strategy<Value = pb::RunTerms> {
             gripped_start_share,
             wide_start_share,
             substeps,
+            randomization: 0.0,
         },
     );
     let part = 0.9;

@@ -37,7 +37,7 @@ impl Simulation {
     #[new]
     #[pyo3(signature = (task, n_arms, *, substeps, grasped_start_prob))]
     fn new(task: &str, n_arms: usize, substeps: u32, grasped_start_prob: f32) -> PyResult<Self> {
-        let settings = WorldSettings { grasped_start_prob, substeps };
+        let settings = WorldSettings { grasped_start_prob, substeps, ..WorldSettings::default() };
         Ok(Self { episode: Episode::new(task, n_arms, settings)?, started: None })
     }
 

@@ -87,7 +87,7 @@ impl VectorSimulation {
             "disabled" => Autoreset::Disabled,
             other => return Err(value_error(format!("unknown autoreset mode {other:?}"))),
         };
-        let settings = WorldSettings { grasped_start_prob, substeps };
+        let settings = WorldSettings { grasped_start_prob, substeps, ..WorldSettings::default() };
         let slot = Slot {
             episode: Episode::new(task, n_arms, settings)?,
             seed: 0,

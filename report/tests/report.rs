@@ -7,6 +7,7 @@ use tandem_report::{
     Axis, Baseline, Comparison, CurveOptions, CurvePoint, PlottedTrials, Quantity, ReportInputs,
     Series, TestEvaluation, Trials, View, curve_svg, report_html, run_report_html, scene_svg,
 };
+use tandem_telemetry::ContactMetrics;
 use tandem_telemetry::{MetricsLog, MetricsRow};
 
 #[path = "../../telemetry/tests/support/synthetic.rs"]
@@ -234,6 +235,7 @@ fn a_described_task_has_its_own_section_beside_a_built_in_one() {
             interval: (0.69, 0.8),
             success_joint: 0.7,
             collision_rate: 0.0,
+            contacts: ContactMetrics::default(),
         },
     };
     let comparison = Comparison::of(inputs.runs, vec![baseline]);

@@ -5,15 +5,14 @@ use rapier3d::math::{Matrix, Vector};
 use tandem_core::{ArmIndex, Task};
 
 use crate::config::WorldConfig;
-use crate::frame::{ArmFrame, BASE_IN_ARM, WORKSPACE_HIGH, WORKSPACE_LOW};
-use crate::hand::{Gripper, Hand};
+use crate::frame::ArmFrame;
+use crate::hand::{Gripper, Hand, HandSettings};
 use crate::kinematics::{ForwardKinematics, HOME, JointAngles, solve_inverse};
+use crate::parameters::WorldParameters;
 use crate::physics::Physics;
 
 /// Displacement of the end effector for an action of 1, metres.
 pub(crate) const ACTION_M: f32 = 0.05;
-/// Proportional gain from the palm's distance to its target to its velocity, 1/s.
-pub(crate) const APPROACH_GAIN: f32 = 27.0;
 /// Iterations of the inverse kinematics from the joint angles of one control step to those of the next.
 pub(crate) const TRACK_ITERATIONS: usize = 3;
 /// Iterations of the inverse kinematics from the home posture to any point of the workspace.
@@ -33,6 +32,7 @@ pub(crate) struct Command {
 pub(crate) struct Arm {
     pub(crate) frame: ArmFrame,
     pub(crate) hand: Hand,
+    pub(crate) parameters: &'static WorldParameters,
     /// At the start of the latest control step.
     angles: JointAngles,
 }
@@ -45,10 +45,15 @@ impl Arm {
         task: Task,
         config: &WorldConfig,
     ) -> Self {
-        let gripper = if task.grasps() { Gripper::Driven } else { Gripper::Locked };
-        let pads = config.friction(task).pads;
-        let hand = Hand::build(physics, arm, frame, gripper, pads, config.grip_force_n);
-        Self { frame, hand, angles: HOME }
+        let parameters = WorldParameters::of(task.world());
+        let settings = HandSettings {
+            gripper: if task.grasps() { Gripper::Driven } else { Gripper::Locked },
+            geometry: parameters.gripper,
+            pad_friction: config.friction(task).pads,
+            grip_force_n: config.grip_force_n,
+        };
+        let hand = Hand::build(physics, arm, frame, settings);
+        Self { frame, hand, parameters, angles: HOME }
     }
 
     /// Places the arm, at rest, with its end effector at `end_effector_in_arm` (metres) and each side of the gripper
@@ -79,13 +84,15 @@ impl Arm {
     /// The displacement is relative to the hand, not to the previous target, so a blocked hand causes no wind-up.
     pub(crate) fn target(&self, physics: &Physics, action: Vector) -> Vector {
         let at_in_arm = self.frame.arm_from_world(self.hand.end_effector(physics));
-        let target_in_arm = (at_in_arm + action * ACTION_M).clamp(WORKSPACE_LOW, WORKSPACE_HIGH);
+        let target_in_arm = self.parameters.clamp(at_in_arm + action * ACTION_M);
         self.frame.world_from_arm(target_in_arm)
     }
 
     /// Returns the velocity of the palm towards `target`, world frame, metres per second.
     pub(crate) fn velocity_to(&self, physics: &Physics, target: Vector) -> Vector {
-        (target - self.hand.end_effector(physics)) * APPROACH_GAIN
+        let velocity =
+            (target - self.hand.end_effector(physics)) * self.parameters.approach_gain_per_s;
+        self.parameters.limit_speed(velocity)
     }
 
     /// Returns the origin of each of the link frames `frames` (world frame, metres) and its Jacobian with respect to
@@ -104,11 +111,12 @@ impl Arm {
 
     /// Transforms a point from the arm's base frame to the world frame, metres.
     pub(crate) fn world_from_base(&self, in_base: DVec3) -> Vector {
-        self.frame.world_from_arm(in_base.as_vec3() + BASE_IN_ARM)
+        self.frame.world_from_arm(in_base.as_vec3() + self.parameters.base_in_arm)
     }
 
     fn tool_in_base(&self, physics: &Physics) -> DVec3 {
-        (self.frame.arm_from_world(self.hand.end_effector(physics)) - BASE_IN_ARM).as_dvec3()
+        let in_arm = self.frame.arm_from_world(self.hand.end_effector(physics));
+        (in_arm - self.parameters.base_in_arm).as_dvec3()
     }
 }
 

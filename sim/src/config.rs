@@ -1,18 +1,16 @@
 //! Configuration of the world, initial states of episodes, and errors.
 
 use serde::{Deserialize, Serialize};
-use tandem_core::{Task, WorldSettings};
+use tandem_core::{Task, World, WorldSettings};
 
-/// Duration of a control step in simulated time, seconds.
-pub const CONTROL_STEP_S: f32 = 0.04;
-/// Control steps per second of simulated time.
-pub(crate) const CONTROL_STEPS_PER_S: f64 = 25.0;
+use crate::parameters::WorldParameters;
 
 /// Physics parameters of a world.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct WorldConfig {
-    /// Physics steps per control step of 0.04 s, in [10, 80]. 20 corresponds to the paper's 0.002 s; 10 is twice as
+    /// Resolution of the physics, in [10, 80]: physics steps per control step in the classic world, and a quarter of
+    /// their number in the shared world. 20 gives steps of 0.002 s, as in the paper, and of 0.003125 s; 10 is twice as
     /// fast.
     pub substeps: u32,
     /// Iterations of the contact solver per physics step, in [1, 16].
@@ -83,11 +81,16 @@ impl WorldConfig {
         Ok(self)
     }
 
-    /// Returns the duration of a physics step in simulated time, seconds.
-    pub(crate) fn substep_s(&self) -> f32 {
-        #[expect(clippy::cast_precision_loss, reason = "at most 80")]
-        let substeps = self.substeps as f32;
-        CONTROL_STEP_S / substeps
+    /// Returns the number of physics steps per control step in `world`.
+    pub(crate) fn substeps_in(&self, world: World) -> u32 {
+        self.substeps * WorldParameters::of(world).substeps_per_unit
+    }
+
+    /// Returns the duration of a physics step in simulated time in `world`, seconds.
+    pub(crate) fn substep_s(&self, world: World) -> f32 {
+        #[expect(clippy::cast_precision_loss, reason = "at most 320")]
+        let substeps = self.substeps_in(world) as f32;
+        world.control_step_s() / substeps
     }
 
     /// Returns the friction coefficients for `task`.

@@ -11,17 +11,17 @@ use serde::Serialize;
 use tandem_core::Layout;
 use tandem_core::layout::{EPISODE_STEPS, GOAL_TOLERANCE_M};
 
-use crate::arm::{ACTION_M, APPROACH_GAIN, Arm, REACH_ITERATIONS, TRACK_ITERATIONS};
+use crate::arm::{ACTION_M, Arm, REACH_ITERATIONS, TRACK_ITERATIONS};
 use crate::capsule::{GRIPPER_ENDS, GRIPPER_RADIUS_M, LINK_FRAMES, LINK_RADII_M};
-use crate::config::{CONTROL_STEP_S, WorldConfig};
-use crate::frame::{BASE_IN_ARM, WORKSPACE_HIGH, WORKSPACE_LOW};
+use crate::config::WorldConfig;
 use crate::hand::{
-    FINGER_HOLD_FORCE_N, FINGER_HOLD_GAIN, FINGERS_MASS_KG, Gripper, MAX_OPENING_M,
-    OPENING_END_GAIN, OPENING_SPEED_MPS, PALM_FORCE_N, PALM_MASS_KG, WRIST_ABOVE_M, WRIST_RADIUS_M,
+    FINGER_HOLD_FORCE_N, FINGER_HOLD_GAIN, FINGERS_MASS_KG, Gripper, OPENING_END_GAIN,
+    PALM_FORCE_N, PALM_MASS_KG, WRIST_ABOVE_M, WRIST_RADIUS_M,
 };
 pub use crate::kinematics::DhRow;
 use crate::kinematics::{DAMPING, DH_TABLE, HOME, MAX_ANGLE_STEP_RAD, SQUARED_ERROR_TOLERANCE};
 use crate::link_avoidance as damper;
+use crate::parameters::WorldParameters;
 pub use crate::physics::Part;
 use crate::physics::{GRAVITY, owner};
 use crate::world::World;
@@ -148,6 +148,8 @@ pub struct HandControl {
     pub workspace_high_m: [f32; 3],
     /// Gain from the palm's distance to its target to its velocity, 1/s.
     pub approach_gain_per_s: f32,
+    /// Largest speed of the palm, metres per second, if it is limited.
+    pub max_speed_mps: Option<f32>,
     /// Mass of palm, wrist and fingers, kilograms.
     pub mass_kg: f32,
     /// Mass of the fingers, kilograms.
@@ -224,10 +226,11 @@ pub struct LinkAvoidance {
 
 /// Describes `world`, which was built for `layout` from `config`.
 pub(crate) fn describe(world: &World, layout: Layout, config: &WorldConfig) -> WorldDescription {
+    let kind = layout.task.world();
     WorldDescription {
         task: layout.task.name(),
-        control_step_s: CONTROL_STEP_S,
-        substeps: config.substeps,
+        control_step_s: kind.control_step_s(),
+        substeps: config.substeps_in(kind),
         solver_iterations: config.solver_iterations,
         episode_steps: EPISODE_STEPS,
         goal_tolerance_m: GOAL_TOLERANCE_M,
@@ -241,8 +244,8 @@ pub(crate) fn describe(world: &World, layout: Layout, config: &WorldConfig) -> W
             .zip(&world.objects)
             .map(|(arm, object)| arm_description(world, arm, *object))
             .collect(),
-        hand: hand_control(config),
-        kinematics: kinematics(),
+        hand: hand_control(config, world.parameters),
+        kinematics: kinematics(world.parameters),
         link_avoidance: link_avoidance(),
     }
 }
@@ -312,7 +315,7 @@ fn contact_pairs(world: &World) -> Vec<ContactPairDescription> {
 }
 
 fn arm_description(world: &World, arm: &Arm, object: RigidBodyHandle) -> ArmDescription {
-    let fingers: &[_] = match arm.hand.gripper {
+    let fingers: &[_] = match arm.hand.settings.gripper {
         Gripper::Locked => &[],
         Gripper::Driven => &arm.hand.fingers,
     };
@@ -344,27 +347,28 @@ fn body_index(world: &World, body: RigidBodyHandle) -> usize {
         .expect("bodies are never removed")
 }
 
-fn hand_control(config: &WorldConfig) -> HandControl {
+fn hand_control(config: &WorldConfig, parameters: &WorldParameters) -> HandControl {
     HandControl {
         action_m: ACTION_M,
-        workspace_low_m: WORKSPACE_LOW.to_array(),
-        workspace_high_m: WORKSPACE_HIGH.to_array(),
-        approach_gain_per_s: APPROACH_GAIN,
+        workspace_low_m: parameters.workspace_low.to_array(),
+        workspace_high_m: parameters.workspace_high.to_array(),
+        approach_gain_per_s: parameters.approach_gain_per_s,
+        max_speed_mps: parameters.max_speed_mps,
         mass_kg: PALM_MASS_KG + FINGERS_MASS_KG,
         fingers_mass_kg: FINGERS_MASS_KG,
         palm_force_n: PALM_FORCE_N,
         grip_force_n: config.grip_force_n,
-        max_opening_m: MAX_OPENING_M,
-        opening_speed_mps: OPENING_SPEED_MPS,
+        max_opening_m: parameters.gripper.max_opening_m,
+        opening_speed_mps: parameters.gripper.opening_speed_mps,
         opening_end_gain: OPENING_END_GAIN,
         finger_hold_force_n: FINGER_HOLD_FORCE_N,
         finger_hold_gain_per_s: FINGER_HOLD_GAIN,
     }
 }
 
-fn kinematics() -> Kinematics {
+fn kinematics(parameters: &WorldParameters) -> Kinematics {
     Kinematics {
-        base_in_arm_m: BASE_IN_ARM.to_array(),
+        base_in_arm_m: parameters.base_in_arm.to_array(),
         dh_table: DH_TABLE,
         home_rad: HOME,
         damping: DAMPING,

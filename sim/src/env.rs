@@ -6,9 +6,10 @@ use tandem_core::scene::Scene;
 use tandem_core::{ArmIndex, Contacts, Layout, WorldSettings};
 
 use crate::arm::Command;
-use crate::config::{CONTROL_STEPS_PER_S, SimError, WorldConfig};
+use crate::config::{SimError, WorldConfig};
 use crate::description::{WorldDescription, describe};
 use crate::observation::observe_arm;
+use crate::randomization::{Episode, ObservationNoise};
 use crate::scene::scene;
 use crate::start::{ArmStart, sample_starts};
 use crate::world::{MAX_ARMS, World};
@@ -16,7 +17,7 @@ use crate::world::{MAX_ARMS, World};
 /// Smallest gap between the links of two arms at the start of an episode, metres.
 const START_LINK_GAP_M: f32 = 0.02;
 
-/// One of the four environments: push or pick and place, with one arm or two.
+/// One of the environments: push or pick and place, with one arm or two, in either world.
 ///
 /// An episode is a function of the random numbers passed to [`reset`](Self::reset) and of the actions, bit for bit. It
 /// depends neither on earlier episodes nor on the thread.
@@ -34,6 +35,8 @@ pub struct Env {
     /// Shape `[n_goal]`, arm frames, metres.
     goal: Vec<f32>,
     n_steps: u32,
+    object_half_m: f32,
+    noise: Option<ObservationNoise>,
 }
 
 impl Env {
@@ -49,11 +52,13 @@ impl Env {
         let prototype = World::build(layout, &config);
         Ok(Self {
             layout,
-            config,
             world: prototype.clone(),
             prototype,
             goal: vec![0.0; layout.n_goal()],
             n_steps: 0,
+            object_half_m: config.object_half_size_m,
+            noise: None,
+            config,
         })
     }
 
@@ -66,13 +71,22 @@ impl Env {
     /// Starts an episode with random positions of hands and objects and with random goals.
     ///
     /// All bodies are at rest. An object touches nothing but the table or, in a grasped start, the fingers that hold
-    /// it. Only `grasped_start_prob` of `settings` has an effect: the physics steps per control step are those of the
-    /// [`WorldConfig`].
+    /// it. If `randomization` of `settings` is not 0, the properties of the episode's world are drawn first. `substeps` has
+    /// no effect: the resolution of the physics is that of the [`WorldConfig`].
     pub fn reset(&mut self, rng: &mut ChaCha8Rng, settings: WorldSettings) {
         self.world = self.prototype.clone();
         self.n_steps = 0;
+        self.object_half_m = self.config.object_half_size_m;
+        self.noise = None;
+        if settings.randomization > 0.0 {
+            let episode =
+                Episode::draw(rng, self.layout.task, &self.config, settings.randomization);
+            self.world.vary(&episode);
+            self.object_half_m = episode.object_half_m;
+            self.noise = Some(ObservationNoise::draw(rng, settings.randomization));
+        }
         loop {
-            let arms = sample_starts(rng, self.layout, self.config.object_half_size_m, settings);
+            let arms = sample_starts(rng, self.layout, self.object_half_m, settings);
             self.place(&arms);
             if self.world.link_gap_m() >= START_LINK_GAP_M {
                 return;
@@ -100,7 +114,8 @@ impl Env {
     pub fn observe(&self, observation: &mut [f32]) {
         assert_eq!(observation.len(), self.layout.n_observation(), "length of the observation");
         for arm in self.layout.arms() {
-            observe_arm(&self.world, arm, &mut observation[self.layout.observation_of(arm)]);
+            let error = self.noise.as_ref().map_or(Vector::ZERO, |noise| noise.error(arm));
+            observe_arm(&self.world, arm, error, &mut observation[self.layout.observation_of(arm)]);
         }
     }
 
@@ -110,8 +125,8 @@ impl Env {
         &self.goal
     }
 
-    /// Executes `action` for one control step of [`CONTROL_STEP_S`](crate::CONTROL_STEP_S) and returns the contacts of
-    /// the arms during it.
+    /// Executes `action` for one [control step](tandem_core::World::control_step_s) and returns the contacts of the arms
+    /// during it.
     ///
     /// `action` has shape `[n_action]`, in arm frames, and is clamped to [−1, 1]. Each arm's part is a displacement of
     /// the end effector along x, y and z in units of 5 cm and, in pick and place, the gripper's input: positive values
@@ -129,14 +144,25 @@ impl Env {
     pub fn step(&mut self, action: &[f32]) -> Result<Contacts, SimError> {
         let commands = self.commands(action)?;
         self.n_steps += 1;
+        if let Some(noise) = &mut self.noise {
+            noise.advance();
+        }
         self.world.step(&commands)
+    }
+
+    /// Returns the number of physics steps of the last control step in which link avoidance changed the velocity of an
+    /// arm. There are [`WorldConfig::substeps`] of them in a control step of the classic world and 4 times as many in
+    /// the shared world.
+    #[must_use]
+    pub fn n_avoiding_substeps(&self) -> u32 {
+        self.world.n_avoiding_substeps()
     }
 
     /// Returns a snapshot of all bodies, world frame. It does not affect the simulation.
     #[must_use]
     pub fn scene(&self) -> Scene {
-        let time_s = f64::from(self.n_steps) / CONTROL_STEPS_PER_S;
-        scene(&self.world, self.layout, &self.goal, self.config.object_half_size_m, time_s)
+        let time_s = f64::from(self.n_steps) / self.world.parameters.control_steps_per_s;
+        scene(&self.world, self.layout, &self.goal, self.object_half_m, time_s)
     }
 
     /// Returns the bodies, their shapes and the control law as data, so that another physics engine can simulate the
@@ -149,10 +175,11 @@ impl Env {
     fn place(&mut self, arms: &[ArmStart]) {
         for (arm, start) in self.layout.arms().zip(arms) {
             self.world.place_arm(arm, start.end_effector, start.opening_m);
-            self.world.place_object(arm, start.object);
+            self.world.place_object(arm, start.object, start.object_yaw_rad);
             self.goal[self.layout.goal_of(arm)].copy_from_slice(&start.goal.to_array());
         }
         self.world.reset_link_avoidance();
+        self.world.hold();
     }
 
     fn commands(&self, action: &[f32]) -> Result<[Command; MAX_ARMS], SimError> {
@@ -185,8 +212,8 @@ mod tests {
     use tandem_core::Task;
 
     use super::*;
-    use crate::frame::WORKSPACE_LOW;
-    use crate::hand::{MAX_OPENING_M, PAD_HALF_M};
+    use crate::hand::THREE_FINGERS;
+    use crate::parameters::WorldParameters;
     use tandem_core::rng::uniform;
     use tandem_core::{Stream, episode_rng};
 
@@ -249,8 +276,8 @@ mod tests {
     fn contacts_at(hands: [Vector; 2]) -> Contacts {
         let mut world = world_of_two();
         for (arm, hand) in [ArmIndex(0), ArmIndex(1)].into_iter().zip(hands) {
-            world.place_arm(arm, hand, MAX_OPENING_M);
-            world.place_object(arm, Vector::new(-0.1, 0.2, 0.0225));
+            world.place_arm(arm, hand, THREE_FINGERS.max_opening_m);
+            world.place_object(arm, Vector::new(-0.1, 0.2, 0.0225), 0.0);
         }
         world.reset_link_avoidance();
         let stay = world.arms.iter().map(|arm| arm.hand.end_effector(&world.physics));
@@ -262,13 +289,14 @@ mod tests {
     fn contacts_between_hands_and_with_the_table_are_distinguished() {
         let high = Vector::new(0.0, 0.0, 0.15);
         assert_eq!(contacts_at([high, high]), Contacts::NONE);
-        let lowest = Vector::new(0.0, 0.0, WORKSPACE_LOW.z);
+        let lowest =
+            Vector::new(0.0, 0.0, WorldParameters::of(tandem_core::World::Classic).workspace_low.z);
         assert_eq!(
             contacts_at([lowest, lowest]),
             Contacts::NONE,
             "the workspace's floor keeps the pads off the table"
         );
-        let on_table = Vector::new(0.0, 0.0, PAD_HALF_M.z - 0.001);
+        let on_table = Vector::new(0.0, 0.0, THREE_FINGERS.pad_half.z - 0.001);
         assert_eq!(contacts_at([on_table, high]), Contacts::ARM_TABLE);
         assert_eq!(contacts_at([high, on_table]), Contacts::ARM_TABLE);
         let meeting = high + Vector::X * 0.09;

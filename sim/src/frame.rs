@@ -4,16 +4,11 @@ use rapier3d::math::{Matrix, Rotation, Vector};
 use tandem_core::ArmIndex;
 use tandem_core::layout::WORKSPACE_DISTANCE_M;
 
-/// Distance of each workspace centre from the world's origin if there are two arms, metres.
+/// Distance of the origin of each arm's frame from the world's origin if there are two arms, metres.
 const CENTRE_X_M: f32 = WORKSPACE_DISTANCE_M / 2.0;
-/// Position of the arm's base, arm frame, metres: behind the centre of the workspace, at the height of the table.
-pub(crate) const BASE_IN_ARM: Vector = Vector::new(-0.40, 0.0, 0.0);
-/// Lower corner of the end effector's workspace, arm frame, metres.
-pub(crate) const WORKSPACE_LOW: Vector = Vector::new(-0.20, -0.25, 0.022);
-/// Upper corner of the end effector's workspace, arm frame, metres.
-pub(crate) const WORKSPACE_HIGH: Vector = Vector::new(0.20, 0.25, 0.35);
 
-/// The frame of an arm: origin on the table in the centre of the arm's workspace, x away from its base, z up.
+/// The frame of an arm: origin on the table, x away from the arm's base, z up. In the classic world it is the centre of the
+/// arm's workspace.
 ///
 /// The second of two arms is the first one rotated by 180° about z, so coordinates in arm frames do not distinguish
 /// them.
@@ -68,12 +63,15 @@ impl ArmFrame {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::parameters::WorldParameters;
+    use tandem_core::World;
 
     #[test]
     fn the_second_arm_faces_the_first() {
         let first = ArmFrame::new(ArmIndex(0), 2);
         let second = ArmFrame::new(ArmIndex(1), 2);
-        let base = |frame: ArmFrame| frame.world_from_arm(BASE_IN_ARM).to_array();
+        let base_in_arm = WorldParameters::of(World::Classic).base_in_arm;
+        let base = |frame: ArmFrame| frame.world_from_arm(base_in_arm).to_array();
         assert_eq!(base(first), [-0.52, 0.0, 0.0]);
         assert_eq!(base(second), [0.52, 0.0, 0.0]);
         let ahead = Vector::new(0.12, 0.05, 0.1);

@@ -1,21 +1,17 @@
-//! The hand: a palm that a servo moves, and three fingers that open and close together.
+//! The hand: a palm that a servo moves, and two or three fingers that open and close together.
 //!
 //! Palm and fingers are rapier bodies with locked rotations. One bounded force on the palm models the arm's motors.
 //! Forces hold the fingers in their places, and the palm receives the reaction; there are no joints. A locked gripper
 //! forms one rigid body with the palm, because compliant fingers would hook over an object's edge and drag it along.
 
 use rapier3d::dynamics::{CoefficientCombineRule, RigidBodyBuilder, RigidBodyHandle};
-use rapier3d::geometry::ColliderBuilder;
+use rapier3d::geometry::{ColliderBuilder, ColliderHandle};
 use rapier3d::math::{Pose, Vector};
 use tandem_core::ArmIndex;
 
 use crate::frame::ArmFrame;
 use crate::physics::{Part, Physics, collides};
 
-/// Largest opening of each side of the gripper, metres.
-pub(crate) const MAX_OPENING_M: f32 = 0.040;
-/// Half extents of a finger pad (x, closing direction, z), metres.
-pub(crate) const PAD_HALF_M: Vector = Vector::new(0.010, 0.010, 0.020);
 /// Half extents of the palm plate, metres.
 pub(crate) const PALM_HALF_M: Vector = Vector::new(0.035, 0.06, 0.015);
 /// Height of the palm plate's centre above the end effector, metres.
@@ -25,8 +21,6 @@ pub(crate) const WRIST_ABOVE_M: [f32; 2] = [0.10, 0.20];
 /// Radius of the wrist, metres.
 pub(crate) const WRIST_RADIUS_M: f32 = 0.035;
 
-/// Speed of each side at full gripper input, metres per second.
-pub(crate) const OPENING_SPEED_MPS: f32 = 0.25;
 /// Fraction of the distance to an end of the opening's range that one physics step may cover.
 pub(crate) const OPENING_END_GAIN: f32 = 0.2;
 /// Mass of palm and wrist, kilograms.
@@ -39,24 +33,61 @@ pub(crate) const FINGER_HOLD_FORCE_N: f32 = 200.0;
 pub(crate) const FINGER_HOLD_GAIN: f32 = 250.0;
 
 /// Position and mass of a finger.
-struct FingerGeometry {
+#[derive(Debug)]
+pub(crate) struct FingerGeometry {
     /// Side of the hand, arm frame: 1 or −1 along y.
     side: f32,
     x_m: f32,
     mass_kg: f32,
 }
 
-/// Two fingers oppose one. Their masses balance, so closing the gripper does not move the hand sideways.
-const FINGERS: [FingerGeometry; 3] = [
-    FingerGeometry { side: 1.0, x_m: 0.016, mass_kg: 0.1 },
-    FingerGeometry { side: 1.0, x_m: -0.016, mass_kg: 0.1 },
-    FingerGeometry { side: -1.0, x_m: 0.0, mass_kg: 0.2 },
-];
-/// Mass of all fingers, kilograms.
+/// The fingers of a gripper and their pads.
+#[derive(Debug)]
+pub(crate) struct GripperGeometry {
+    /// At most [`N_OBSERVED_FINGERS`].
+    pub(crate) fingers: &'static [FingerGeometry],
+    /// For each observed finger the index of the one that it shows.
+    observed: [usize; N_OBSERVED_FINGERS],
+    /// Half extents of a finger pad (x, closing direction, z), metres.
+    pub(crate) pad_half: Vector,
+    /// Largest opening of each side of the gripper, metres.
+    pub(crate) max_opening_m: f32,
+    /// Speed of each side at full gripper input, metres per second.
+    pub(crate) opening_speed_mps: f32,
+}
+
+/// The gripper of the classic world. Two fingers oppose one. Their masses balance, so closing the gripper does not move
+/// the hand sideways.
+pub(crate) static THREE_FINGERS: GripperGeometry = GripperGeometry {
+    fingers: &[
+        FingerGeometry { side: 1.0, x_m: 0.016, mass_kg: 0.1 },
+        FingerGeometry { side: 1.0, x_m: -0.016, mass_kg: 0.1 },
+        FingerGeometry { side: -1.0, x_m: 0.0, mass_kg: 0.2 },
+    ],
+    observed: [0, 1, 2],
+    pad_half: Vector::new(0.010, 0.010, 0.020),
+    max_opening_m: 0.040,
+    opening_speed_mps: 0.25,
+};
+
+/// The gripper of the shared world: the two fingers of a Mico, as wide, as far open and as fast as those of the
+/// simulated pair of arms in `tandem-trials`. The first of them is observed twice.
+pub(crate) static MICO_GRIPPER: GripperGeometry = GripperGeometry {
+    fingers: &[
+        FingerGeometry { side: 1.0, x_m: 0.0, mass_kg: 0.2 },
+        FingerGeometry { side: -1.0, x_m: 0.0, mass_kg: 0.2 },
+    ],
+    observed: [0, 0, 1],
+    pad_half: Vector::new(0.008, 0.005, 0.015),
+    max_opening_m: 0.062,
+    opening_speed_mps: 0.062,
+};
+
+/// Mass of all fingers of a gripper, kilograms.
 pub(crate) const FINGERS_MASS_KG: f32 = 0.4;
 
-/// Number of fingers.
-pub(crate) const N_FINGERS: usize = FINGERS.len();
+/// Number of fingers in an observation.
+pub(crate) const N_OBSERVED_FINGERS: usize = 3;
 
 /// The connection between fingers and palm.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -67,14 +98,22 @@ pub(crate) enum Gripper {
     Driven,
 }
 
+/// The properties of a hand.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct HandSettings {
+    pub(crate) gripper: Gripper,
+    pub(crate) geometry: &'static GripperGeometry,
+    pub(crate) pad_friction: f32,
+    pub(crate) grip_force_n: f32,
+}
+
 /// The bodies of a hand.
 #[derive(Clone)]
 pub(crate) struct Hand {
     frame: ArmFrame,
     pub(crate) palm: RigidBodyHandle,
-    pub(crate) gripper: Gripper,
-    pub(crate) fingers: [Finger; N_FINGERS],
-    grip_force_n: f32,
+    pub(crate) fingers: Vec<Finger>,
+    pub(crate) settings: HandSettings,
 }
 
 /// A finger and its place at the palm.
@@ -82,6 +121,7 @@ pub(crate) struct Hand {
 pub(crate) struct Finger {
     /// The palm's body if the gripper is locked.
     pub(crate) body: RigidBodyHandle,
+    pub(crate) pad: ColliderHandle,
     pub(crate) mass_kg: f32,
     /// Fraction of the mass of all fingers, and weight in the mean opening.
     pub(crate) mass_fraction: f32,
@@ -103,21 +143,23 @@ struct FingerState {
 }
 
 impl Hand {
-    /// Adds a hand whose pads have friction `pad_friction` to `physics`.
+    /// Adds a hand to `physics`.
     pub(crate) fn build(
         physics: &mut Physics,
         arm: ArmIndex,
         frame: ArmFrame,
-        gripper: Gripper,
-        pad_friction: f32,
-        grip_force_n: f32,
+        settings: HandSettings,
     ) -> Self {
         let palm = build_palm(physics, arm, frame);
-        let fingers = FINGERS.map(|geometry| match gripper {
-            Gripper::Locked => attach_finger(physics, arm, frame, palm, &geometry, pad_friction),
-            Gripper::Driven => build_finger(physics, arm, frame, &geometry, pad_friction),
-        });
-        Self { frame, palm, gripper, fingers, grip_force_n }
+        let mut build = |geometry: &FingerGeometry| {
+            let body = match settings.gripper {
+                Gripper::Locked => palm,
+                Gripper::Driven => physics.bodies.insert(weightless_body(frame)),
+            };
+            add_finger(physics, arm, frame, body, geometry, &settings)
+        };
+        let fingers = settings.geometry.fingers.iter().map(&mut build).collect();
+        Self { frame, palm, fingers, settings }
     }
 
     /// Places the hand, at rest, with its end effector at `end_effector_in_arm` (metres) and each side open by
@@ -148,17 +190,20 @@ impl Hand {
     }
 
     /// Returns the opening (metres) and the opening rate (metres per second) of each finger.
-    pub(crate) fn openings(&self, physics: &Physics) -> [(f32, f32); N_FINGERS] {
-        if self.gripper == Gripper::Locked {
-            return [(0.0, 0.0); N_FINGERS];
+    pub(crate) fn openings(&self, physics: &Physics) -> [(f32, f32); N_OBSERVED_FINGERS] {
+        if self.settings.gripper == Gripper::Locked {
+            return [(0.0, 0.0); N_OBSERVED_FINGERS];
         }
-        let velocity = self.velocity(physics);
-        self.finger_states(physics, velocity).map(|state| (state.opening_m, state.opening_rate_mps))
+        let states = self.finger_states(physics, self.velocity(physics));
+        self.settings
+            .geometry
+            .observed
+            .map(|idx| (states[idx].opening_m, states[idx].opening_rate_mps))
     }
 
     /// Returns the centres of the pads, world frame, metres.
-    pub(crate) fn pads(&self, physics: &Physics) -> [Vector; N_FINGERS] {
-        self.fingers.map(|finger| match self.gripper {
+    pub(crate) fn pads(&self, physics: &Physics) -> impl Iterator<Item = Vector> {
+        self.fingers.iter().map(|finger| match self.settings.gripper {
             Gripper::Locked => self.end_effector(physics) + finger.closed_offset,
             Gripper::Driven => physics.bodies[finger.body].translation(),
         })
@@ -166,7 +211,8 @@ impl Hand {
 
     /// Returns `true` if all positions and velocities are finite.
     pub(crate) fn is_finite(&self, physics: &Physics) -> bool {
-        std::iter::once(self.palm).chain(self.fingers.map(|finger| finger.body)).all(|body| {
+        let fingers = self.fingers.iter().map(|finger| finger.body);
+        std::iter::once(self.palm).chain(fingers).all(|body| {
             let body = &physics.bodies[body];
             body.translation().is_finite() && body.linvel().is_finite()
         })
@@ -174,12 +220,7 @@ impl Hand {
 
     /// Sets the velocity of the palm (world frame) and the opening rate of each finger, metres per second.
     #[cfg(test)]
-    pub(crate) fn set_velocities(
-        &self,
-        physics: &mut Physics,
-        palm: Vector,
-        rates_mps: [f32; N_FINGERS],
-    ) {
+    pub(crate) fn set_velocities(&self, physics: &mut Physics, palm: Vector, rates_mps: &[f32]) {
         physics.bodies[self.palm].set_linvel(palm, true);
         for (finger, rate_mps) in self.driven_fingers().iter().zip(rates_mps) {
             physics.bodies[finger.body]
@@ -197,7 +238,7 @@ impl Hand {
         let palm_velocity = self.velocity(physics);
         let palm_force =
             bounded((velocity - palm_velocity) * (total_mass_kg / substep_s), PALM_FORCE_N);
-        if self.gripper == Gripper::Locked {
+        if self.settings.gripper == Gripper::Locked {
             return apply(physics, self.palm, palm_force);
         }
         let palm_velocity_next = palm_velocity + palm_force * (substep_s / total_mass_kg);
@@ -219,7 +260,7 @@ impl Hand {
         physics: &Physics,
         palm_velocity: Vector,
         gripper: f32,
-    ) -> [Vector; N_FINGERS] {
+    ) -> [Vector; N_OBSERVED_FINGERS] {
         let substep_s = physics.substep_s();
         let states = self.finger_states(physics, palm_velocity);
         let mean = |value: fn(&FingerState) -> f32| -> f32 {
@@ -232,13 +273,14 @@ impl Hand {
         let opening_m = mean(|state| state.opening_m);
         let rate_mps = mean(|state| state.opening_rate_mps);
         let end_gain = OPENING_END_GAIN / substep_s;
-        let desired_rate_mps = (gripper * OPENING_SPEED_MPS)
+        let HandSettings { geometry, grip_force_n, .. } = self.settings;
+        let desired_rate_mps = (gripper * geometry.opening_speed_mps)
             .max(-opening_m * end_gain)
-            .min((MAX_OPENING_M - opening_m) * end_gain);
+            .min((geometry.max_opening_m - opening_m) * end_gain);
         let side_force_n = (0.5 * FINGERS_MASS_KG * (desired_rate_mps - rate_mps) / substep_s)
-            .clamp(-self.grip_force_n, self.grip_force_n);
-        std::array::from_fn(|idx| {
-            let (finger, state) = (&self.fingers[idx], &states[idx]);
+            .clamp(-grip_force_n, grip_force_n);
+        let mut forces_n = [Vector::ZERO; N_OBSERVED_FINGERS];
+        for ((finger, state), force_n) in self.fingers.iter().zip(&states).zip(&mut forces_n) {
             let gain = finger.mass_kg / substep_s;
             let lateral = (state.offset * -FINGER_HOLD_GAIN - state.velocity) * gain;
             let balancing_n = (gain
@@ -248,31 +290,39 @@ impl Hand {
             let closing_n =
                 finger.outward * (2.0 * finger.mass_fraction * side_force_n + balancing_n);
             let held = bounded(lateral, FINGER_HOLD_FORCE_N);
-            Vector::new(held.x, closing_n, held.z)
-        })
+            *force_n = Vector::new(held.x, closing_n, held.z);
+        }
+        forces_n
     }
 
     /// Returns the fingers that are separate bodies.
     fn driven_fingers(&self) -> &[Finger] {
-        match self.gripper {
+        match self.settings.gripper {
             Gripper::Locked => &[],
             Gripper::Driven => &self.fingers,
         }
     }
 
-    fn finger_states(&self, physics: &Physics, palm_velocity: Vector) -> [FingerState; N_FINGERS] {
+    /// Returns the states of the fingers, in their order; entries beyond them are at rest.
+    fn finger_states(
+        &self,
+        physics: &Physics,
+        palm_velocity: Vector,
+    ) -> [FingerState; N_OBSERVED_FINGERS] {
         let palm_position = self.end_effector(physics);
-        self.fingers.map(|finger| {
+        let mut states = [FingerState::default(); N_OBSERVED_FINGERS];
+        for (finger, state) in self.fingers.iter().zip(&mut states) {
             let body = &physics.bodies[finger.body];
             let offset = body.translation() - palm_position - finger.closed_offset;
             let velocity = body.linvel() - palm_velocity;
-            FingerState {
+            *state = FingerState {
                 opening_m: offset.y * finger.outward,
                 opening_rate_mps: velocity.y * finger.outward,
                 offset,
                 velocity,
-            }
-        })
+            };
+        }
+        states
     }
 }
 
@@ -301,52 +351,34 @@ fn build_palm(physics: &mut Physics, arm: ArmIndex, frame: ArmFrame) -> RigidBod
     palm
 }
 
-fn build_finger(
+/// Adds a finger to `body`, which is its own or the palm's. The palm's body is rotated with the arm, so a pad's position
+/// in it is in the arm's frame.
+fn add_finger(
     physics: &mut Physics,
     arm: ArmIndex,
     frame: ArmFrame,
+    body: RigidBodyHandle,
     geometry: &FingerGeometry,
-    friction: f32,
+    settings: &HandSettings,
 ) -> Finger {
-    let body = physics.bodies.insert(weightless_body(frame));
-    let pad = pad(arm, geometry, friction);
-    physics.colliders.insert_with_parent(pad, body, &mut physics.bodies);
-    finger(body, frame, geometry)
-}
-
-/// Attaches a finger to the palm's body. That body is rotated with the arm, so the pad's position is in the arm's
-/// frame.
-fn attach_finger(
-    physics: &mut Physics,
-    arm: ArmIndex,
-    frame: ArmFrame,
-    palm: RigidBodyHandle,
-    geometry: &FingerGeometry,
-    friction: f32,
-) -> Finger {
-    let pad = pad(arm, geometry, friction).translation(closed_offset_in_arm(geometry));
-    physics.colliders.insert_with_parent(pad, palm, &mut physics.bodies);
-    finger(palm, frame, geometry)
-}
-
-fn pad(arm: ArmIndex, geometry: &FingerGeometry, friction: f32) -> ColliderBuilder {
-    ColliderBuilder::cuboid(PAD_HALF_M.x, PAD_HALF_M.y, PAD_HALF_M.z)
+    let pad_half = settings.geometry.pad_half;
+    let closed_offset = Vector::new(geometry.x_m, geometry.side * pad_half.y, 0.0);
+    let pad = ColliderBuilder::cuboid(pad_half.x, pad_half.y, pad_half.z)
         .mass(geometry.mass_kg)
-        .friction(friction)
+        .friction(settings.pad_friction)
         .friction_combine_rule(CoefficientCombineRule::Max)
-        .collision_groups(collides(Part::Hand, arm))
-}
-
-fn closed_offset_in_arm(geometry: &FingerGeometry) -> Vector {
-    Vector::new(geometry.x_m, geometry.side * PAD_HALF_M.y, 0.0)
-}
-
-fn finger(body: RigidBodyHandle, frame: ArmFrame, geometry: &FingerGeometry) -> Finger {
+        .collision_groups(collides(Part::Hand, arm));
+    let pad = match settings.gripper {
+        Gripper::Locked => pad.translation(closed_offset),
+        Gripper::Driven => pad,
+    };
+    let pad = physics.colliders.insert_with_parent(pad, body, &mut physics.bodies);
     Finger {
         body,
+        pad,
         mass_kg: geometry.mass_kg,
         mass_fraction: geometry.mass_kg / FINGERS_MASS_KG,
-        closed_offset: frame.rotate(closed_offset_in_arm(geometry)),
+        closed_offset: frame.rotate(closed_offset),
         outward: frame.rotate(Vector::Y * geometry.side).y,
     }
 }

@@ -67,7 +67,7 @@
 //!
 //! [`WorldConfig`] sets the resolution of the physics, the objects and their friction.
 //! [`WorldSettings`](tandem_core::WorldSettings), a section of the run file, sets how often training episodes start
-//! with grasped objects. Values out of range are errors:
+//! with grasped objects and how much the world varies between them. Values out of range are errors:
 //!
 //! ```
 //! # use tandem_core::{Layout, Task};
@@ -101,10 +101,13 @@ mod hand;
 mod kinematics;
 mod link_avoidance;
 mod observation;
+mod parameters;
 mod physics;
+mod randomization;
+pub mod reach;
 mod scene;
 mod start;
 mod world;
 
-pub use config::{CONTROL_STEP_S, Friction, SimError, WorldConfig};
+pub use config::{Friction, SimError, WorldConfig};
 pub use env::Env;

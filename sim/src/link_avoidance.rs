@@ -75,6 +75,7 @@ pub(crate) struct VelocityDamper {
     arms: [ArmCapsules; 2],
     pairs: [Pair; N_PAIRS],
     min_gap_m: f32,
+    n_interventions: u32,
 }
 
 impl VelocityDamper {
@@ -84,6 +85,7 @@ impl VelocityDamper {
             arms: arms.map(|arm| ArmCapsules::of(arm, physics)),
             pairs: all_pairs(),
             min_gap_m: f32::INFINITY,
+            n_interventions: 0,
         };
         damper.update_posture(arms, physics);
         damper
@@ -93,6 +95,7 @@ impl VelocityDamper {
     pub(crate) fn update_posture(&mut self, arms: [&Arm; 2], physics: &Physics) {
         self.arms = arms.map(|arm| ArmCapsules::of(arm, physics));
         self.min_gap_m = f32::INFINITY;
+        self.n_interventions = 0;
         let palms = self.arms.map(|arm| arm.palm_position);
         for pair in &mut self.pairs {
             let gap_m = pair.update(&self.arms, palms).gap_m;
@@ -122,7 +125,15 @@ impl VelocityDamper {
                 limits[1].add(second.transpose() * -proximity.normal, min_mps);
             }
         }
-        [limits[0].project(desired[0]), limits[1].project(desired[1])]
+        let limited = [limits[0].project(desired[0]), limits[1].project(desired[1])];
+        self.n_interventions += u32::from(limited != desired);
+        limited
+    }
+
+    /// Returns the number of calls of [`limit`](Self::limit) since the start of the control step that changed a
+    /// velocity.
+    pub(crate) fn n_interventions(&self) -> u32 {
+        self.n_interventions
     }
 }
 

@@ -1,17 +1,18 @@
 //! The part of an observation that belongs to one arm.
 
+use rapier3d::math::Vector;
 use tandem_core::ArmIndex;
 
-use crate::config::CONTROL_STEP_S;
 use crate::world::World;
 
-/// Writes `arm`'s part of the observation, shape `[28]`, in the order that `Env::observe` documents.
-pub(crate) fn observe_arm(world: &World, arm: ArmIndex, observation: &mut [f32]) {
+/// Writes `arm`'s part of the observation, shape `[28]`, in the order that `Env::observe` documents. The position of the
+/// object is wrong by `error` (arm frame, metres).
+pub(crate) fn observe_arm(world: &World, arm: ArmIndex, error: Vector, observation: &mut [f32]) {
     let (state, object) = (&world.arms[arm.0], world.object(arm));
     let frame = state.frame;
     let (hand_position, hand_velocity) =
         (state.hand.end_effector(&world.physics), state.hand.velocity(&world.physics));
-    let per_step = |velocity| (frame.rotate(velocity) * CONTROL_STEP_S).to_array();
+    let per_step = |velocity| (frame.rotate(velocity) * world.control_step_s).to_array();
     let fingers = state.hand.openings(&world.physics);
 
     observation[0..3].copy_from_slice(&frame.arm_from_world(hand_position).to_array());
@@ -22,16 +23,21 @@ pub(crate) fn observe_arm(world: &World, arm: ArmIndex, observation: &mut [f32])
     observation[16..19].copy_from_slice(&per_step(object.linvel() - hand_velocity));
     observation[19..22].copy_from_slice(&per_step(object.angvel()));
     observation[22..25].copy_from_slice(&per_step(hand_velocity));
+    if error != Vector::ZERO {
+        for (idx, number) in observation[3..9].iter_mut().enumerate() {
+            *number += error[idx % 3];
+        }
+    }
     for (finger, (opening_m, rate_mps)) in fingers.into_iter().enumerate() {
         observation[9 + finger] = opening_m;
-        observation[25 + finger] = rate_mps * CONTROL_STEP_S;
+        observation[25 + finger] = rate_mps * world.control_step_s;
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use rapier3d::math::{Pose, Rotation, Vector};
+    use rapier3d::math::{Pose, Rotation};
     use tandem_core::layout::OBSERVATION_PER_ARM;
     use tandem_core::{Layout, Task};
 
@@ -50,13 +56,13 @@ mod tests {
         let mut world = World::build(Layout::new(Task::PickAndPlace, 2), &WorldConfig::default());
         for arm in ARMS {
             world.place_arm(arm, HAND, 0.03);
-            world.place_object(arm, OBJECT);
+            world.place_object(arm, OBJECT, 0.0);
         }
         let frame = world.arms[arm.0].frame;
         change(&mut world, frame);
         ARMS.map(|arm| {
             let mut observation = [0.0; OBSERVATION_PER_ARM];
-            observe_arm(&world, arm, &mut observation);
+            observe_arm(&world, arm, Vector::ZERO, &mut observation);
             observation
         })
     }
@@ -101,7 +107,7 @@ mod tests {
             &[(0, 0.01), (1, 0.02), (2, 0.03), (6, -0.01), (7, -0.02), (8, -0.03)],
         );
         check(
-            |world, arm, _| world.place_object(arm, OBJECT + step),
+            |world, arm, _| world.place_object(arm, OBJECT + step, 0.0),
             &[(3, 0.01), (4, 0.02), (5, 0.03), (6, 0.01), (7, 0.02), (8, 0.03)],
         );
         check(
@@ -143,14 +149,14 @@ mod tests {
         check(
             |world, arm, frame| {
                 let hand = world.arms[arm.0].hand.clone();
-                hand.set_velocities(&mut world.physics, frame.rotate(velocity), [0.0; 3]);
+                hand.set_velocities(&mut world.physics, frame.rotate(velocity), &[0.0; 3]);
             },
             &hand_moves,
         );
         check(
             |world, arm, _| {
                 let hand = world.arms[arm.0].hand.clone();
-                hand.set_velocities(&mut world.physics, Vector::ZERO, [0.1, 0.2, 0.3]);
+                hand.set_velocities(&mut world.physics, Vector::ZERO, &[0.1, 0.2, 0.3]);
             },
             &at(25, 1.0),
         );

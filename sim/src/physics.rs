@@ -11,7 +11,7 @@ use rapier3d::geometry::{
 use rapier3d::math::Vector;
 use rapier3d::pipeline::PhysicsPipeline;
 use serde::Serialize;
-use tandem_core::{ArmIndex, Contacts};
+use tandem_core::{ArmIndex, Contacts, World};
 
 use crate::config::WorldConfig;
 
@@ -79,11 +79,11 @@ pub(crate) struct Physics {
 }
 
 impl Physics {
-    pub(crate) fn new(config: &WorldConfig) -> Self {
+    pub(crate) fn new(config: &WorldConfig, world: World) -> Self {
         Self {
             bodies: RigidBodySet::new(),
             colliders: ColliderSet::new(),
-            parameters: integration_parameters(config),
+            parameters: integration_parameters(config, world),
             islands: IslandManager::new(),
             broad_phase: BroadPhaseBvh::new(),
             narrow_phase: NarrowPhase::new(),
@@ -176,10 +176,10 @@ fn pipeline() -> PhysicsPipeline {
 
 /// Returns parameters for bodies of centimetres. With rapier's defaults, which are for bodies of metres, a cube sinks
 /// into the table by a third of its size.
-fn integration_parameters(config: &WorldConfig) -> IntegrationParameters {
+fn integration_parameters(config: &WorldConfig, world: World) -> IntegrationParameters {
     let softness = SpringCoefficients::new(200.0, 5.0);
     IntegrationParameters {
-        dt: config.substep_s(),
+        dt: config.substep_s(world),
         num_solver_iterations: config.solver_iterations,
         num_internal_pgs_iterations: 1,
         num_internal_stabilization_iterations: 1,

@@ -7,8 +7,7 @@ use tandem_core::{ArmIndex, Layout};
 
 use crate::arm::Arm;
 use crate::capsule::{LINK_FRAMES, LINK_RADII_M};
-use crate::frame::BASE_IN_ARM;
-use crate::hand::{PAD_HALF_M, PALM_ABOVE_M, PALM_HALF_M, WRIST_ABOVE_M, WRIST_RADIUS_M};
+use crate::hand::{PALM_ABOVE_M, PALM_HALF_M, WRIST_ABOVE_M, WRIST_RADIUS_M};
 use crate::kinematics::ForwardKinematics;
 use crate::world::{TABLE_HALF_M, World};
 
@@ -62,9 +61,10 @@ fn arm_scene(world: &World, arm: &Arm) -> ArmScene {
     links.push(Capsule { from, to, radius_m: WRIST_RADIUS_M });
     let orientation = arm.frame.orientation_in_world();
     let mut hand = vec![cuboid(end_effector + Vector::Z * PALM_ABOVE_M, orientation, PALM_HALF_M)];
-    hand.extend(arm.hand.pads(&world.physics).map(|pad| cuboid(pad, orientation, PAD_HALF_M)));
+    let pad_half = arm.parameters.gripper.pad_half;
+    hand.extend(arm.hand.pads(&world.physics).map(|pad| cuboid(pad, orientation, pad_half)));
     ArmScene {
-        base: arm.frame.world_from_arm(BASE_IN_ARM).to_array(),
+        base: arm.frame.world_from_arm(arm.parameters.base_in_arm).to_array(),
         joint_angles_rad,
         joint_points,
         links,

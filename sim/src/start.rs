@@ -3,10 +3,12 @@
 use rand_chacha::ChaCha8Rng;
 use rapier3d::math::Vector;
 use tandem_core::rng::{bernoulli, uniform};
-use tandem_core::{ArmIndex, Layout, WorldSettings};
+use tandem_core::{ArmIndex, Layout, World, WorldSettings};
 
-use crate::frame::{ArmFrame, WORKSPACE_LOW};
-use crate::hand::MAX_OPENING_M;
+use crate::frame::ArmFrame;
+use crate::parameters::WorldParameters;
+
+mod shared;
 
 /// Half extent along x of the area of objects and goals, arm frame, metres.
 const AREA_X_M: f32 = 0.12;
@@ -35,6 +37,8 @@ pub(crate) struct ArmStart {
     pub(crate) end_effector: Vector,
     pub(crate) opening_m: f32,
     pub(crate) object: Vector,
+    /// Rotation of the object about the vertical axis, radians.
+    pub(crate) object_yaw_rad: f32,
     pub(crate) goal: Vector,
 }
 
@@ -54,13 +58,26 @@ pub(crate) fn sample_starts(
     object_half_m: f32,
     settings: WorldSettings,
 ) -> Vec<ArmStart> {
+    match layout.task.world() {
+        World::Classic => sample_classic(rng, layout, object_half_m, settings),
+        World::Shared => shared::sample(rng, layout, object_half_m, settings),
+    }
+}
+
+fn sample_classic(
+    rng: &mut ChaCha8Rng,
+    layout: Layout,
+    object_half_m: f32,
+    settings: WorldSettings,
+) -> Vec<ArmStart> {
+    let parameters = WorldParameters::of(World::Classic);
     let grasped = bernoulli(rng, settings.grasped_start_prob);
     // An episode's later draws keep their place in the random stream: this one belonged to a removed hand_start of
     // start.
     let _: bool = bernoulli(rng, 0.0);
-    let can_hold = layout.task.grasps() && object_half_m < MAX_OPENING_M;
+    let can_hold = layout.task.grasps() && object_half_m < parameters.gripper.max_opening_m;
     let hand_start = if grasped && can_hold { HandStart::Grasping } else { HandStart::Centred };
-    let sampler = StartSampler { layout, object_half_m };
+    let sampler = StartSampler { layout, object_half_m, parameters };
     loop {
         let arms: Vec<ArmStart> =
             layout.arms().map(|_| sampler.arm_start(rng, hand_start)).collect();
@@ -74,6 +91,7 @@ pub(crate) fn sample_starts(
 struct StartSampler {
     layout: Layout,
     object_half_m: f32,
+    parameters: &'static WorldParameters,
 }
 
 impl StartSampler {
@@ -87,7 +105,7 @@ impl StartSampler {
                 (hand, self.object_half_m, self.grasped_object(rng, hand))
             }
         };
-        ArmStart { end_effector, opening_m, object, goal }
+        ArmStart { end_effector, opening_m, object, object_yaw_rad: 0.0, goal }
     }
 
     fn point_on_table(&self, rng: &mut ChaCha8Rng) -> Vector {
@@ -116,7 +134,8 @@ impl StartSampler {
 
     fn grasping_hand(&self, rng: &mut ChaCha8Rng) -> Vector {
         let area_y_m = self.area_y_m();
-        let lowest_m = self.object_half_m.max(WORKSPACE_LOW.z) + GRASPED_OFFSET_M[1];
+        let lowest_m =
+            self.object_half_m.max(self.parameters.workspace_low.z) + GRASPED_OFFSET_M[1];
         Vector::new(
             uniform(rng, -AREA_X_M, AREA_X_M),
             uniform(rng, -area_y_m, area_y_m),
@@ -139,7 +158,7 @@ impl StartSampler {
 
     /// Returns the opening of each side of an empty gripper, metres.
     fn empty_opening_m(&self) -> f32 {
-        if self.layout.task.grasps() { MAX_OPENING_M } else { 0.0 }
+        if self.layout.task.grasps() { self.parameters.gripper.max_opening_m } else { 0.0 }
     }
 
     fn is_valid(&self, arms: &[ArmStart], hand_start: HandStart) -> bool {

@@ -1,21 +1,23 @@
 //! The simulated world: table, objects and arms, and the sequence of a control step.
 
 use rapier3d::dynamics::{CoefficientCombineRule, RigidBody, RigidBodyBuilder, RigidBodyHandle};
-use rapier3d::geometry::ColliderBuilder;
-use rapier3d::math::{Pose, Vector};
+use rapier3d::geometry::{ColliderBuilder, ColliderHandle, SharedShape};
+use rapier3d::math::{Pose, Rotation, Vector};
 use tandem_core::{ArmIndex, Contacts, Layout};
 
 use crate::arm::{Arm, Command};
 use crate::config::{SimError, WorldConfig};
 use crate::frame::ArmFrame;
 use crate::link_avoidance::VelocityDamper;
-use crate::physics::{Part, Physics, collides};
+use crate::parameters::WorldParameters;
+use crate::physics::{Part, Physics, collides, owner};
+use crate::randomization::Episode;
 
 /// Largest number of arms in a world.
 pub(crate) const MAX_ARMS: usize = 2;
 /// Half extents of the table, metres; its top is at z = 0.
 pub(crate) const TABLE_HALF_M: Vector = Vector::new(0.8, 0.6, 0.05);
-const TABLE_FRICTION: f32 = 0.6;
+pub(crate) const TABLE_FRICTION: f32 = 0.6;
 
 /// The state of all bodies. There is one object per arm, in arm order.
 #[derive(Clone)]
@@ -26,13 +28,19 @@ pub(crate) struct World {
     /// Present if there are two arms.
     damper: Option<VelocityDamper>,
     substeps: u32,
+    /// Physics steps at the start of a control step in which the previous command is still executed.
+    delay_substeps: u32,
+    previous: [Command; MAX_ARMS],
+    pub(crate) parameters: &'static WorldParameters,
+    pub(crate) control_step_s: f32,
 }
 
 impl World {
     /// Creates a world whose bodies have not been placed yet.
     pub(crate) fn build(layout: Layout, config: &WorldConfig) -> Self {
         let friction = config.friction(layout.task);
-        let mut physics = Physics::new(config);
+        let kind = layout.task.world();
+        let mut physics = Physics::new(config, kind);
         let mut arms = Vec::with_capacity(layout.n_arms);
         let mut objects = Vec::with_capacity(layout.n_arms);
         for arm in layout.arms() {
@@ -41,13 +49,26 @@ impl World {
             arms.push(Arm::build(&mut physics, arm, frame, layout.task, config));
             objects.push(add_object(&mut physics, arm, config, friction.object));
         }
-        Self { physics, arms, objects, damper: None, substeps: config.substeps }
+        Self {
+            physics,
+            arms,
+            objects,
+            damper: None,
+            substeps: config.substeps_in(kind),
+            delay_substeps: 0,
+            previous: [Command { target: Vector::ZERO, gripper: 0.0 }; MAX_ARMS],
+            parameters: WorldParameters::of(kind),
+            control_step_s: kind.control_step_s(),
+        }
     }
 
-    /// Places `arm`'s object at `at_in_arm` (metres), at rest and aligned with the arm's frame.
-    pub(crate) fn place_object(&mut self, arm: ArmIndex, at_in_arm: Vector) {
+    /// Places `arm`'s object at `at_in_arm` (metres), at rest and rotated from the arm's frame by `yaw_rad` about the
+    /// vertical axis.
+    pub(crate) fn place_object(&mut self, arm: ArmIndex, at_in_arm: Vector, yaw_rad: f32) {
         let frame = self.arms[arm.0].frame;
-        let pose = Pose::from_parts(frame.world_from_arm(at_in_arm), frame.orientation_in_world());
+        let (sin, cos) = libm::sincosf(0.5 * yaw_rad);
+        let turned = frame.orientation_in_world() * Rotation::from_xyzw(0.0, 0.0, sin, cos);
+        let pose = Pose::from_parts(frame.world_from_arm(at_in_arm), turned);
         let body = &mut self.physics.bodies[self.objects[arm.0]];
         body.set_position(pose, true);
         body.set_linvel(Vector::ZERO, true);
@@ -57,6 +78,50 @@ impl World {
     /// Places `arm`, at rest, with its end effector at `end_effector_in_arm` (metres).
     pub(crate) fn place_arm(&mut self, arm: ArmIndex, end_effector_in_arm: Vector, opening_m: f32) {
         self.arms[arm.0].place(&mut self.physics, end_effector_in_arm, opening_m);
+    }
+
+    /// Gives objects, pads and table the properties that were drawn for an episode, and delays its actions. To be called
+    /// before the first step and before the arms are placed.
+    pub(crate) fn vary(&mut self, episode: &Episode) {
+        let half_m = episode.object_half_m;
+        for object in &self.objects {
+            for collider in self.physics.bodies[*object].colliders() {
+                let cube = &mut self.physics.colliders[*collider];
+                cube.set_shape(SharedShape::cuboid(half_m, half_m, half_m));
+                cube.set_mass(episode.object_mass_kg);
+                cube.set_friction(episode.friction.object);
+            }
+        }
+        for finger in self.arms.iter().flat_map(|arm| &arm.hand.fingers) {
+            self.physics.colliders[finger.pad].set_friction(episode.friction.pads);
+        }
+        let tables: Vec<ColliderHandle> = self
+            .physics
+            .colliders
+            .iter()
+            .filter(|(_, collider)| owner(collider).0 == Part::Table)
+            .map(|(handle, _)| handle)
+            .collect();
+        for table in tables {
+            self.physics.colliders[table].set_friction(episode.table_friction);
+        }
+        #[expect(
+            clippy::cast_possible_truncation,
+            clippy::cast_sign_loss,
+            reason = "a few steps, at least 0"
+        )]
+        let delay_substeps = (episode.delay_s / self.physics.substep_s()) as u32;
+        self.delay_substeps = delay_substeps;
+    }
+
+    /// Makes the arms stay where they are, with grippers as they are, until the first action takes effect.
+    pub(crate) fn hold(&mut self) {
+        for (arm, previous) in self.arms.iter().zip(&mut self.previous) {
+            let (opening_m, _) = arm.hand.openings(&self.physics)[0];
+            let is_open = opening_m >= arm.parameters.gripper.max_opening_m;
+            let target = arm.hand.end_effector(&self.physics);
+            *previous = Command { target, gripper: if is_open { 1.0 } else { -1.0 } };
+        }
     }
 
     /// Starts link avoidance anew. To be called once all arms are in place.
@@ -71,6 +136,12 @@ impl World {
     /// arm.
     pub(crate) fn link_gap_m(&self) -> f32 {
         self.damper.as_ref().map_or(f32::INFINITY, VelocityDamper::min_gap_m)
+    }
+
+    /// Returns the number of physics steps of the last control step in which link avoidance changed the velocity of an
+    /// arm.
+    pub(crate) fn n_avoiding_substeps(&self) -> u32 {
+        self.damper.as_ref().map_or(0, VelocityDamper::n_interventions)
     }
 
     /// Returns the body of `arm`'s object.
@@ -92,8 +163,9 @@ impl World {
             damper.update_posture([first, second], &self.physics);
         }
         let mut contacts = Contacts::NONE;
-        for _ in 0..self.substeps {
-            self.drive(commands);
+        let previous = std::mem::replace(&mut self.previous, *commands);
+        for substep in 0..self.substeps {
+            self.drive(if substep < self.delay_substeps { &previous } else { commands });
             self.physics.step();
             contacts = contacts | self.physics.hand_contacts();
         }
@@ -113,6 +185,7 @@ impl World {
         if let (Some(damper), [first, second]) = (&mut self.damper, self.arms.as_slice()) {
             let palms = [first, second].map(|arm| arm.hand.end_effector(&self.physics));
             velocities = damper.limit(palms, velocities);
+            velocities = velocities.map(|velocity| self.parameters.limit_speed(velocity));
         }
         for ((arm, command), velocity) in self.arms.iter().zip(commands).zip(velocities) {
             arm.hand.drive(&mut self.physics, velocity, command.gripper);

@@ -96,7 +96,7 @@ fn play(layout: Layout, substeps: u32) -> Largest {
     let mut action = vec![0.0; layout.n_action()];
     for episode in 0..N_EPISODES {
         let mut rng = episode_rng(5, episode, Stream::Exploration);
-        let settings = WorldSettings { grasped_start_prob: 0.5, substeps };
+        let settings = WorldSettings { grasped_start_prob: 0.5, substeps, randomization: 1.0 };
         env.reset(&mut episode_rng(5, episode, Stream::Reset), settings);
         let mut arms: Vec<RoughArm> = layout.arms().map(|_| RoughArm::new(&mut rng)).collect();
         for step_idx in 0..=EPISODE_STEPS {

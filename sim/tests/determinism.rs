@@ -6,7 +6,8 @@ use tandem_core::rng::uniform;
 use tandem_core::{Contacts, Layout, Stream, Task, WorldSettings, episode_rng};
 use tandem_sim::{Env, SimError, WorldConfig};
 
-const SETTINGS: WorldSettings = WorldSettings { grasped_start_prob: 0.3, substeps: 20 };
+const SETTINGS: WorldSettings =
+    WorldSettings { grasped_start_prob: 0.3, substeps: 20, randomization: 0.5 };
 
 /// The bits of all observations and the contacts of an episode with held random actions.
 fn trace(env: &mut Env, episode: u64) -> (Vec<u32>, Vec<Contacts>) {

@@ -2,16 +2,23 @@
 
 use tandem_core::layout::{GOAL_TOLERANCE_M, Layout, OBSERVATION_PER_ARM, Task};
 use tandem_core::reward::{REWARD_PENDING, distance, sparse_reward};
-use tandem_core::{ArmIndex, Contacts, Stream, WorldSettings, episode_rng};
+use tandem_core::{ArmIndex, Contacts, Stream, World, WorldSettings, episode_rng};
+use tandem_sim::reach::Reach;
 use tandem_sim::{Env, WorldConfig};
 
 const N_SEEDS: u64 = 1000;
 const HALF_M: f32 = 0.0225;
 /// Every episode starts with the objects grasped where the task allows it.
-const GRASPED: WorldSettings = WorldSettings { grasped_start_prob: 1.0, substeps: 20 };
+const GRASPED: WorldSettings =
+    WorldSettings { grasped_start_prob: 1.0, substeps: 20, randomization: 0.0 };
+
+fn layouts_in(world: World) -> impl Iterator<Item = Layout> {
+    let tasks = Task::ALL.into_iter().filter(move |task| task.world() == world);
+    tasks.flat_map(|task| [1, 2].map(|n_arms| Layout::new(task, n_arms)))
+}
 
 fn layouts() -> impl Iterator<Item = Layout> {
-    Task::ALL.into_iter().flat_map(|task| [1, 2].map(|n_arms| Layout::new(task, n_arms)))
+    World::ALL.into_iter().flat_map(layouts_in)
 }
 
 /// Calls `look` with the initial state of each of `N_SEEDS` seeds.
@@ -31,8 +38,8 @@ fn idle(layout: Layout, gripper: f32) -> Vec<f32> {
 }
 
 #[test]
-fn evaluation_starts_are_in_reach_apart_and_not_yet_successful() {
-    for layout in layouts() {
+fn classic_starts_are_in_reach_apart_and_not_yet_successful() {
+    for layout in layouts_in(World::Classic) {
         let area_y_m = if layout.n_arms == 1 { 0.15 } else { 0.12 };
         each_start(layout, WorldSettings::default(), |env, observation| {
             for arm in layout.arms() {
@@ -77,13 +84,75 @@ fn evaluation_starts_are_in_reach_apart_and_not_yet_successful() {
 }
 
 #[test]
+fn shared_starts_are_in_reach_apart_and_not_yet_successful() {
+    for layout in layouts_in(World::Shared) {
+        each_start(layout, WorldSettings::default(), |env, observation| {
+            for arm in layout.arms() {
+                let seen = &observation[layout.observation_of(arm)];
+                let goal = &env.goal()[layout.goal_of(arm)];
+                let (hand, object) = ([seen[0], seen[1], seen[2]], [seen[3], seen[4], seen[5]]);
+                let [near_m, far_m] = Reach::MICO.radii_m(hand[2]);
+                let radius_m = Reach::MICO.radius_m(hand);
+                assert!((near_m - 1e-5..far_m + 1e-5).contains(&radius_m), "{hand:?}");
+                assert!((0.0309..0.3301).contains(&hand[2]), "{hand:?}");
+                assert!(Reach::MICO.radius_m(object) < 0.4401, "no room behind {object:?}");
+                for point in [&object[..], goal] {
+                    assert!((-1e-4..0.2001).contains(&point[0]) && point[1].abs() < 0.1501);
+                }
+                let holding_m = goal[2].max(0.031);
+                let [near_m, far_m] = Reach::MICO.radii_m(holding_m);
+                let radius_m = Reach::MICO.radius_m([goal[0], goal[1], goal[2]]);
+                assert!((near_m..=far_m).contains(&radius_m), "goal {goal:?}");
+                assert!((object[2] - HALF_M).abs() < 1e-6);
+                assert!((HALF_M - 1e-6..HALF_M + 0.3).contains(&goal[2]));
+                assert!(distance(&object, goal) >= 0.0699);
+                let [x, y, z, w] = [seen[12], seen[13], seen[14], seen[15]];
+                assert!(x == 0.0 && y == 0.0 && z.abs() < 0.383 && w > 0.92, "{x} {y} {z} {w}");
+            }
+            let scene = env.scene();
+            let flat = |a: [f32; 3], b: [f32; 3]| (a[0] - b[0]).hypot(a[1] - b[1]);
+            if layout.n_arms == 2 {
+                assert!(flat(scene.objects[0].centre, scene.objects[1].centre) >= 0.1199);
+                assert!(flat(scene.goals[0], scene.goals[1]) >= 0.0999);
+                let hands = [0, 1].map(|arm: usize| scene.arms[arm].end_effector);
+                assert!(flat(hands[0], hands[1]) >= 0.1699);
+            }
+        });
+    }
+}
+
+#[test]
+fn shared_starts_fill_the_area_and_objects_point_in_all_directions() {
+    for layout in layouts_in(World::Shared) {
+        let mut n_far = [0; 3];
+        let mut n_turned = 0;
+        each_start(layout, WorldSettings::default(), |env, observation| {
+            n_far[0] += u32::from(observation[3] > 0.12);
+            n_far[1] += u32::from(observation[4].abs() > 0.10);
+            n_far[2] += u32::from(env.goal()[0] > 0.12);
+            n_turned += u32::from(observation[14].abs() > 0.195);
+        });
+        // The shares of a uniform distribution are 0.4, 0.33, 0.4 and 0.5; starts out of reach or without an order of
+        // service are drawn again.
+        assert!(n_far.iter().all(|n| (200..550).contains(n)), "{layout:?}: {n_far:?}");
+        assert!((420..580).contains(&n_turned), "{layout:?}: {n_turned}");
+    }
+}
+
+#[test]
 fn half_of_the_goals_are_in_the_air() {
-    let layout = Layout::new(Task::PickAndPlace, 1);
-    let mut n_high = 0;
-    each_start(layout, WorldSettings::default(), |env, _| {
-        n_high += u32::from(env.goal()[2] > HALF_M + GOAL_TOLERANCE_M);
-    });
-    assert!((350..450).contains(&n_high), "{n_high} of 1000, expected half of four fifths");
+    let n_high = |task, low_m: f32| {
+        let mut n_high = 0;
+        each_start(Layout::new(task, 1), WorldSettings::default(), |env, _| {
+            n_high += u32::from(env.goal()[2] > HALF_M + low_m);
+        });
+        n_high
+    };
+    let n_classic = n_high(Task::PickAndPlace, GOAL_TOLERANCE_M);
+    assert!((350..450).contains(&n_classic), "{n_classic} of 1000, expected half of four fifths");
+    // Goals out of reach are drawn again, and most of them are high.
+    let n_shared = n_high(Task::SharedPickAndPlace, 0.0);
+    assert!((400..520).contains(&n_shared), "{n_shared} of 1000");
 }
 
 #[test]
@@ -98,7 +167,7 @@ fn no_start_has_a_contact() {
                 let object = layout.achieved_goal_of(arm);
                 let moved_m = distance(&before[object.clone()], &after[object]);
                 assert!(
-                    moved_m < 2e-4,
+                    moved_m < 3e-4,
                     "{layout:?}: the object moved by {moved_m} m without contact"
                 );
             }
@@ -108,8 +177,9 @@ fn no_start_has_a_contact() {
 
 #[test]
 fn grasped_starts_keep_holding_while_the_hand_moves() {
-    for n_arms in [1, 2] {
-        let layout = Layout::new(Task::PickAndPlace, n_arms);
+    let grasping = layouts().filter(|layout| layout.task.grasps());
+    for layout in grasping {
+        let n_arms = layout.n_arms;
         let mut env = Env::new(layout, &WorldConfig::default()).expect("a valid world");
         let mut observation = vec![0.0; layout.n_observation()];
         for seed in 0..60 {
@@ -140,9 +210,10 @@ fn grasped_starts_keep_holding_while_the_hand_moves() {
 
 #[test]
 fn push_episodes_never_start_with_a_grasped_object() {
-    let layout = Layout::new(Task::Push, 1);
-    each_start(layout, GRASPED, |_, observation| {
-        assert!(observation[9..12].iter().all(|opening_m| opening_m.abs() < 1e-7));
-        assert!(observation[5] < HALF_M + 1e-6);
-    });
+    for layout in layouts().filter(|layout| !layout.task.grasps()) {
+        each_start(layout, GRASPED, |_, observation| {
+            assert!(observation[9..12].iter().all(|opening_m| opening_m.abs() < 1e-7));
+            assert!(observation[5] < HALF_M + 1e-6);
+        });
+    }
 }

@@ -2,8 +2,9 @@
 
 mod scripted;
 
+use scripted::pair::play_in_turn;
 use scripted::{play, success_rate};
-use tandem_core::{Contacts, Layout, Task};
+use tandem_core::{Contacts, Layout, Task, World};
 use tandem_sim::{Friction, WorldConfig};
 
 #[test]
@@ -21,8 +22,8 @@ fn a_scripted_arm_solves_either_task() {
 }
 
 #[test]
-fn two_independent_scripted_arms_mostly_solve_either_task() {
-    for task in Task::ALL {
+fn two_independent_scripted_arms_mostly_solve_either_classic_task() {
+    for task in Task::CLASSIC {
         let episodes = play(Layout::new(task, 2), &WorldConfig::default(), 200);
         let n_with =
             |contact| episodes.iter().filter(|played| played.contacts.contains(contact)).count();
@@ -43,6 +44,37 @@ fn ten_physics_steps_per_control_step_suffice() {
         let rate = success_rate(&play(Layout::new(task, 1), &config, 100));
         println!("{task}, 10 substeps: {rate}");
         assert!(rate >= 0.97, "{task}: {rate}");
+    }
+}
+
+#[test]
+fn a_scripted_arm_solves_every_start_in_the_shared_world() {
+    for task in Task::CLASSIC.map(|task| task.in_world(World::Shared)) {
+        let episodes = play(Layout::new(task, 1), &WorldConfig::default(), 300);
+        let rate = success_rate(&episodes);
+        println!("{task}, 1 arm: {rate}, median miss {:.4} m", median_miss_m(&episodes));
+        assert!(rate == 1.0, "{task}: {rate}");
+    }
+}
+
+#[test]
+fn two_scripted_arms_that_take_turns_solve_every_start_in_the_shared_world() {
+    for task in Task::CLASSIC.map(|task| task.in_world(World::Shared)) {
+        let layout = Layout::new(task, 2);
+        let n_steps = layout.description().episode_steps;
+        let mut episodes = play_in_turn(layout, &WorldConfig::default(), 300, n_steps);
+        let unsolved: Vec<usize> =
+            (0..episodes.len()).filter(|&idx| !episodes[idx].0.success).collect();
+        let n_contacts = episodes.iter().filter(|(played, _)| played.contacts.any()).count();
+        episodes.sort_by_key(|(_, solved_after)| *solved_after);
+        let [median, last] = [episodes.len() / 2, episodes.len() - 1].map(|idx| episodes[idx].1);
+        println!(
+            "{task}: {} of {} unsolved ({unsolved:?}), solved after {median} steps (median) to {last}, contacts in \
+             {n_contacts}",
+            unsolved.len(),
+            episodes.len()
+        );
+        assert!(unsolved.is_empty(), "{task}: {unsolved:?}");
     }
 }
 

@@ -41,7 +41,7 @@ fn copy(file: &Path) -> (TempDir, PathBuf) {
 #[test]
 fn policies_are_read() {
     for version in versions() {
-        for (task, n_arms) in Task::ALL.into_iter().flat_map(|task| [(task, 1), (task, 2)]) {
+        for (task, n_arms) in Task::CLASSIC.into_iter().flat_map(|task| [(task, 1), (task, 2)]) {
             let path = version.join(format!("policies/{task}-{n_arms}.safetensors"));
             let policy = Policy::load(&path).expect("a policy");
             assert_eq!(policy.layout, Layout::new(task, n_arms).into(), "{path:?}");

@@ -32,6 +32,7 @@ pub(crate) fn two_arms() -> TaskSpec {
             goal: own.clone(),
             action: own,
             position: Vec::new(),
+            lateral: Vec::new(),
         }
     };
     let description = TaskDescription {
@@ -47,6 +48,7 @@ pub(crate) fn two_arms() -> TaskSpec {
         reports_contacts: false,
         origin_distance: 0.0,
         recombination_gap: 0.0,
+        base: 0.0,
         observation_bound: vec![3.0; 4],
         goal_bound: vec![1.0; 4],
         arms: vec![arm(0), arm(1)],

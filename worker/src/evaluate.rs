@@ -243,6 +243,7 @@ mod tests {
             goal: vec![1 - arm_idx],
             action: vec![1 - arm_idx],
             position: Vec::new(),
+            lateral: Vec::new(),
         };
         let task = TaskSpec::new(TaskDescription {
             name: "interleaved".to_owned(),

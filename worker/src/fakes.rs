@@ -163,7 +163,7 @@ pub(crate) fn terms() -> RunTerms {
             sticky_random_mean_steps: 4.0,
             joint_random_actions: false,
         },
-        world: WorldSettings { grasped_start_prob: 0.5, substeps: 20 },
+        world: WorldSettings { grasped_start_prob: 0.5, ..WorldSettings::default() },
     }
 }
 

@@ -99,7 +99,12 @@ pub fn metadata_of(
         parameter_version: episode.parameter_version,
         layout: episode.layout.clone(),
         policy_digest,
-        world: terms.world.log_entries().map(|(key, value)| (key.to_owned(), value)).into(),
+        world: terms
+            .world
+            .log_entries()
+            .into_iter()
+            .map(|(key, value)| (key.to_owned(), value))
+            .collect(),
     }
 }
 

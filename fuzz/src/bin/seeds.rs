@@ -156,7 +156,7 @@ fn write_messages(to: &Path) -> Result<(), AnyError> {
             sticky_random_mean_steps: 4.0,
             joint_random_actions: false,
         },
-        world: WorldSettings { grasped_start_prob: 0.0, substeps: 20 },
+        world: WorldSettings::default(),
     };
     let order = EpisodeOrder { number: 64, seed: 42, advised: true, uniform: false, record: true };
     let kind = EpisodeKind::Evaluation;

@@ -1,12 +1,13 @@
 //! Scripted controllers with the inputs of a policy: one arm's 28 numbers and its goal, in the arm's frame.
 
-use tandem_core::layout::EPISODE_STEPS;
 use tandem_core::reward::{achieved_goal, distance, is_success};
-use tandem_core::{ArmIndex, Contacts, Layout, Stream, Task, WorldSettings, episode_rng};
+use tandem_core::{ArmIndex, Contacts, Layout, Stream, Task, World, WorldSettings, episode_rng};
 use tandem_sim::{Env, WorldConfig};
 
 /// Displacement for an action of 1, metres.
 const ACTION_M: f32 = 0.05;
+
+pub(crate) mod pair;
 
 /// The outcome of a scripted episode.
 pub(crate) struct Played {
@@ -28,7 +29,7 @@ pub(crate) fn play(layout: Layout, config: &WorldConfig, n_episodes: u64) -> Vec
             env.reset(&mut episode_rng(11, episode, Stream::Reset), WorldSettings::default());
             let mut controllers = vec![Controller::new(layout.task); layout.n_arms];
             let mut contacts = Contacts::NONE;
-            for _ in 0..EPISODE_STEPS {
+            for _ in 0..layout.description().episode_steps {
                 env.observe(&mut observation);
                 for (arm, controller) in layout.arms().zip(&mut controllers) {
                     let (observation, goal) = (
@@ -83,6 +84,43 @@ enum Phase {
 pub(crate) struct Controller {
     task: Task,
     phase: Phase,
+    world: WorldNumbers,
+}
+
+/// The numbers that suit a world.
+#[derive(Clone, Copy)]
+struct WorldNumbers {
+    /// Height of the hand while it pushes, metres.
+    push_z_m: f32,
+    /// Lowest height of the hand at which it grasps, metres.
+    grasp_z_m: f32,
+    /// Factor from the distance to a target to the displacement.
+    gain: f32,
+    /// Distance by which a push is aimed ahead of the hand, metres.
+    push_m: f32,
+    /// Distance behind the object at which the hand comes down, metres.
+    behind_m: f32,
+}
+
+impl WorldNumbers {
+    fn of(world: World) -> Self {
+        match world {
+            World::Classic => Self {
+                push_z_m: 0.024,
+                grasp_z_m: 0.0245,
+                gain: 1.3,
+                push_m: 0.022,
+                behind_m: 0.07,
+            },
+            World::Shared => Self {
+                push_z_m: 0.033,
+                grasp_z_m: 0.033,
+                gain: 1.0,
+                push_m: 0.030,
+                behind_m: 0.055,
+            },
+        }
+    }
 }
 
 /// A point on the table's plane.
@@ -90,7 +128,12 @@ type Flat = [f32; 2];
 
 impl Controller {
     pub(crate) fn new(task: Task) -> Self {
-        Self { task, phase: Phase::Approach }
+        Self { task, phase: Phase::Approach, world: WorldNumbers::of(task.world()) }
+    }
+
+    /// Whether the hand is at its object.
+    pub(crate) fn is_at_work(&self) -> bool {
+        matches!(self.phase, Phase::Grasp(_) | Phase::Bring)
     }
 
     /// Three displacements and the gripper's input.
@@ -105,7 +148,8 @@ impl Controller {
     }
 
     fn pick_and_place(&mut self, hand: [f32; 3], object: [f32; 3], goal: &[f32]) -> [f32; 4] {
-        let grasp_z = object[2].max(0.0245);
+        let WorldNumbers { grasp_z_m, gain, .. } = self.world;
+        let grasp_z = object[2].max(grasp_z_m);
         let off = length(flat_between(hand, object));
         match self.phase {
             Phase::Approach => {
@@ -113,13 +157,13 @@ impl Controller {
                     self.phase = Phase::Descend;
                 }
                 let above = if off < 0.03 { 0.04 } else { 0.08 };
-                towards(hand, [object[0], object[1], grasp_z + above], 1.3, 1.0)
+                towards(hand, [object[0], object[1], grasp_z + above], gain, 1.0)
             }
             Phase::Descend => {
                 if (hand[2] - grasp_z).abs() < 0.006 {
                     self.phase = Phase::Grasp(0);
                 }
-                towards(hand, [object[0], object[1], grasp_z], 1.3, 1.0)
+                towards(hand, [object[0], object[1], grasp_z], gain, 1.0)
             }
             Phase::Grasp(n_steps) => {
                 self.phase = if n_steps < 4 { Phase::Grasp(n_steps + 1) } else { Phase::Bring };
@@ -130,7 +174,7 @@ impl Controller {
                     self.phase = Phase::Approach;
                 }
                 let target = std::array::from_fn(|axis| hand[axis] + goal[axis] - object[axis]);
-                towards(hand, target, 1.3, -1.0)
+                towards(hand, target, gain, -1.0)
             }
         }
     }
@@ -150,10 +194,11 @@ impl Controller {
                 if advance_m > -0.012 || length(lateral) > 0.022 {
                     self.phase = Phase::Leave;
                 }
-                let ahead_m = (distance_m * 0.5).clamp(0.005, 0.022)
+                let WorldNumbers { push_z_m, gain, push_m, .. } = self.world;
+                let ahead_m = (distance_m * 0.5).clamp(0.005, push_m)
                     * (1.0 - length(lateral) / 0.03).max(0.25);
                 let target = |axis: usize| hand[axis] + along[axis] * ahead_m - lateral[axis] * 0.4;
-                towards(hand, [target(0), target(1), PUSH_Z_M], 1.3, 0.0)
+                towards(hand, [target(0), target(1), push_z_m], gain, 0.0)
             }
             Phase::Leave => self.leave(behind, distance_m),
             _ => self.move_behind(hand, object, along, behind),
@@ -162,7 +207,7 @@ impl Controller {
 
     fn leave(&mut self, behind: Flat, distance_m: f32) -> [f32; 4] {
         let away_m = length(behind);
-        if away_m > 0.065 {
+        if away_m > self.world.behind_m - 0.005 {
             if distance_m > 0.02 {
                 self.phase = Phase::Approach;
             }
@@ -179,29 +224,27 @@ impl Controller {
         along: Flat,
         behind: Flat,
     ) -> [f32; 4] {
-        let target = [object[0] - along[0] * 0.07, object[1] - along[1] * 0.07];
+        let WorldNumbers { push_z_m, gain, behind_m, .. } = self.world;
+        let target = [object[0] - along[0] * behind_m, object[1] - along[1] * behind_m];
         let off = length([target[0] - hand[0], target[1] - hand[1]]);
-        if off < 0.012 && hand[2] < PUSH_Z_M + 0.012 {
+        if off < 0.012 && hand[2] < push_z_m + 0.012 {
             self.phase = Phase::Bring;
         }
         if off < 0.03 {
-            return towards(hand, [target[0], target[1], PUSH_Z_M], 1.3, 0.0);
+            return towards(hand, [target[0], target[1], push_z_m], gain, 0.0);
         }
         if hand[2] >= 0.055 {
-            return towards(hand, [target[0], target[1], 0.075], 1.5, 0.0);
+            return towards(hand, [target[0], target[1], 0.075], 1.15 * gain, 0.0);
         }
-        let mut rise = towards(hand, [hand[0], hand[1], 0.075], 1.5, 0.0);
+        let mut rise = towards(hand, [hand[0], hand[1], 0.075], 1.15 * gain, 0.0);
         let away_m = length(behind);
-        if away_m < 0.07 {
+        if away_m < self.world.behind_m {
             rise[0] = 0.3 * behind[0] / away_m.max(1e-6);
             rise[1] = 0.3 * behind[1] / away_m.max(1e-6);
         }
         rise
     }
 }
-
-/// Height of the hand while it pushes, metres.
-const PUSH_Z_M: f32 = 0.024;
 
 fn towards(hand: [f32; 3], target: [f32; 3], gain: f32, gripper: f32) -> [f32; 4] {
     let input = |axis: usize| ((target[axis] - hand[axis]) / ACTION_M * gain).clamp(-1.0, 1.0);

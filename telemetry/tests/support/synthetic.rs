@@ -67,9 +67,11 @@ pub(crate) fn described(n_goal_per_arm: usize) -> TaskSpec {
         goal: part(n_goal_per_arm, arm_idx),
         action: part(2, arm_idx),
         position: Vec::new(),
+        lateral: Vec::new(),
     };
     let achieved = |arm_idx| (0..n_goal_per_arm).map(move |idx| arm_idx * N_OBSERVATION + idx);
     TaskSpec::new(TaskDescription {
+        base: 0.0,
         name: "lab/reach".to_owned(),
         n_observation: 2 * N_OBSERVATION,
         n_goal: 2 * n_goal_per_arm,

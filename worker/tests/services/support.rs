@@ -35,7 +35,7 @@ pub(crate) fn terms() -> RunTerms {
             sticky_random_mean_steps: 4.0,
             joint_random_actions: false,
         },
-        world: WorldSettings { grasped_start_prob: 0.0, substeps: 10 },
+        world: WorldSettings { substeps: 10, ..WorldSettings::default() },
     }
 }
 

@@ -1,0 +1,83 @@
+//! The constants in which the worlds differ.
+
+use rapier3d::math::Vector;
+use tandem_core::World;
+
+use crate::hand::{GripperGeometry, MICO_GRIPPER, THREE_FINGERS};
+use crate::reach::Reach;
+
+/// The constants of a world.
+#[derive(Debug)]
+pub(crate) struct WorldParameters {
+    /// Control steps per second of simulated time.
+    pub(crate) control_steps_per_s: f64,
+    /// Physics steps per control step, per unit of the setting `substeps`.
+    pub(crate) substeps_per_unit: u32,
+    /// Proportional gain from the palm's distance to its target to its velocity, 1/s.
+    pub(crate) approach_gain_per_s: f32,
+    /// Largest speed of the palm, metres per second.
+    pub(crate) max_speed_mps: Option<f32>,
+    /// Position of the arm's base, arm frame, metres: at the height of the table.
+    pub(crate) base_in_arm: Vector,
+    /// Lower corner of the end effector's workspace, arm frame, metres.
+    pub(crate) workspace_low: Vector,
+    /// Upper corner of the end effector's workspace, arm frame, metres.
+    pub(crate) workspace_high: Vector,
+    /// The part of this box that the arm reaches; all of it if there is none.
+    pub(crate) reach: Option<&'static Reach>,
+    /// Fingers and pads.
+    pub(crate) gripper: &'static GripperGeometry,
+}
+
+static CLASSIC: WorldParameters = WorldParameters {
+    control_steps_per_s: 25.0,
+    substeps_per_unit: 1,
+    approach_gain_per_s: 27.0,
+    max_speed_mps: None,
+    base_in_arm: Vector::new(-0.40, 0.0, 0.0),
+    workspace_low: Vector::new(-0.20, -0.25, 0.022),
+    workspace_high: Vector::new(0.20, 0.25, 0.35),
+    reach: None,
+    gripper: &THREE_FINGERS,
+};
+
+/// The gain covers 91 % of a displacement of 5 cm within a control step, and 98 % of a short one. The workspace's floor
+/// keeps the pads 16 mm above the table, where the Mico holds them. Its extent along x and y leaves room for the hand
+/// behind an object at the edge of the objects' area.
+static SHARED: WorldParameters = WorldParameters {
+    control_steps_per_s: 4.0,
+    substeps_per_unit: 4,
+    approach_gain_per_s: 16.0,
+    max_speed_mps: Some(0.2),
+    base_in_arm: Vector::new(-0.30, 0.0, 0.0),
+    workspace_low: Vector::new(-0.06, -0.22, 0.031),
+    workspace_high: Vector::new(0.27, 0.22, 0.33),
+    reach: Some(&Reach::MICO),
+    gripper: &MICO_GRIPPER,
+};
+
+impl WorldParameters {
+    pub(crate) fn of(world: World) -> &'static Self {
+        match world {
+            World::Classic => &CLASSIC,
+            World::Shared => &SHARED,
+        }
+    }
+
+    /// Returns the nearest position to `end_effector` (arm frame, metres) along each axis, and then along the radius
+    /// from the base, that the end effector may have.
+    pub(crate) fn clamp(&self, end_effector: Vector) -> Vector {
+        let in_box = end_effector.clamp(self.workspace_low, self.workspace_high);
+        self.reach.map_or(in_box, |reach| reach.clamp(in_box))
+    }
+
+    /// Returns true if the end effector may be at `end_effector`, arm frame, metres.
+    pub(crate) fn contains(&self, end_effector: Vector) -> bool {
+        self.clamp(end_effector) == end_effector
+    }
+
+    /// Limits the speed of `velocity`, metres per second.
+    pub(crate) fn limit_speed(&self, velocity: Vector) -> Vector {
+        self.max_speed_mps.map_or(velocity, |most| velocity.clamp_length_max(most))
+    }
+}
