@@ -167,8 +167,8 @@ impl SeedGroup {
         self.strategy.as_deref() == Some("none")
     }
 
-    /// Returns the row of the paper's Table 2 for these runs, if they have two arms, one of its strategies and no task that
-    /// the paper lacks.
+    /// Returns the row of the paper's Table 2 for these runs, if they have two arms, one of its strategies and no
+    /// task that the paper lacks.
     #[must_use]
     pub fn paper(&self) -> Option<&'static PaperRow> {
         let is_student = self.setup.n_arms.is_none_or(|n_arms| n_arms == 2);

@@ -1,5 +1,5 @@
-//! Writes a synthetic episode to the MCAP file given on the command line, to test readers. Writes an episode of a task that
-//! is not built-in to the second file, if there is one.
+//! Writes a synthetic episode to the MCAP file given on the command line, to test readers. Writes an episode of a
+//! task that is not built-in to the second file, if there is one.
 
 use std::path::PathBuf;
 

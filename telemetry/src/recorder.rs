@@ -50,8 +50,8 @@ pub struct TransitionRecord<'a> {
 /// always complete. Message times are simulated time since the start of the episode; without a scene, a control step
 /// takes a nominal 0.1 s.
 ///
-/// The log of a task that is not built-in has no bodies to draw. Its scene has the achieved and the desired goals instead
-/// if these are points: parts of 2 or 3 numbers.
+/// The log of a task that is not built-in has no bodies to draw. Its scene has the achieved and the desired goals
+/// instead if these are points: parts of 2 or 3 numbers.
 pub struct EpisodeRecorder {
     layout: TaskSpec,
     file: LogFile,

@@ -57,8 +57,8 @@ pub(crate) fn transitions() -> Vec<LoggedTransition> {
     transitions_of(&LAYOUT.into())
 }
 
-/// Returns a task of two arms that is not built-in, with so many numbers of the goal per arm, which are the first ones of
-/// its part of the observation.
+/// Returns a task of two arms that is not built-in, with so many numbers of the goal per arm, which are the first ones
+/// of its part of the observation.
 pub(crate) fn described(n_goal_per_arm: usize) -> TaskSpec {
     const N_OBSERVATION: usize = 5;
     let part = |n: usize, arm_idx: usize| (arm_idx * n..(arm_idx + 1) * n).collect::<Vec<_>>();

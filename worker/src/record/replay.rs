@@ -27,8 +27,8 @@ pub fn replay_log(log: &EpisodeLog) -> Result<(), RecordError> {
     comparison.check_last_observation(&observation)
 }
 
-/// As [`replay_log`], in an environment of the server of `config`. The episode is played again if the server fails, with
-/// the number of attempts of `config`.
+/// As [`replay_log`], in an environment of the server of `config`. The episode is played again if the server fails,
+/// with the number of attempts of `config`.
 ///
 /// # Errors
 /// As [`replay_log`], and [`RecordError::Environment`] if the server serves another task, or cannot be used.
