@@ -19,7 +19,6 @@ fn check(name: &str) {
     let world = policy.layout.as_built_in().expect("a built-in task").task.world();
     let pushes = pushes::measure(&policy).expect("plays");
     let (above, gliding) = (pushes.share_above(), pushes.share_gliding());
-    println!("{name}: above {above:.3}, gliding {gliding:.3}, {pushes:?}");
     assert!(pushes.success >= 0.95, "{name}: success {}", pushes.success);
     assert!(pushes.n_moving > 1000, "{name}: the cubes hardly move");
     assert!(above < 0.05, "{name}: the hand is above the cube in {above:.2} of the moving steps");

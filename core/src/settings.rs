@@ -6,7 +6,6 @@
 //! in `sim`.
 
 use std::fmt::Display;
-use std::num::ParseFloatError;
 
 use serde::{Deserialize, Serialize};
 
@@ -161,11 +160,12 @@ impl WorldSettings {
     ) -> Result<Self, &'static str> {
         let number = |key| entry(key).and_then(|text| text.parse().ok()).ok_or(key);
         let count = |key| entry(key).and_then(|text| text.parse().ok()).ok_or(key);
-        let randomization = entry(LOGGED_RANDOMIZATION).map_or(Ok(0.0), str::parse);
+        // Earlier versions had none.
+        let randomization = entry(LOGGED_RANDOMIZATION).map_or(Some(0.0), |text| text.parse().ok());
         Ok(Self {
             grasped_start_prob: number(LOGGED_GRASPED_START_PROB)?,
             substeps: count(LOGGED_SUBSTEPS)?,
-            randomization: randomization.map_err(|_: ParseFloatError| LOGGED_RANDOMIZATION)?,
+            randomization: randomization.ok_or(LOGGED_RANDOMIZATION)?,
         })
     }
 }

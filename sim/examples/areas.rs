@@ -34,9 +34,8 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     for episode in 0..N_STARTS {
         env.reset(&mut episode_rng(1, episode, Stream::Reset), WorldSettings::default());
         let scene = env.scene();
-        for arm in 0..2 {
+        for (arm, color) in COLORS.into_iter().enumerate() {
             let [x, y] = pixels(scene.objects[arm].centre[0], scene.objects[arm].centre[1]);
-            let color = COLORS[arm];
             writeln!(
                 picture,
                 "<rect x=\"{:.1}\" y=\"{:.1}\" width=\"6\" height=\"6\" fill=\"{color}\"/>",

@@ -57,13 +57,19 @@ fn each_direction(mut look: impl FnMut(f64, f64)) {
     }
 }
 
+/// Returns the least and the largest radius of the closed form at `height_m`, metres.
+#[expect(clippy::cast_possible_truncation, reason = "the simulator computes in single precision")]
+fn radii_m(height_m: f64) -> [f64; 2] {
+    Reach::MICO.radii_m(height_m as f32).map(f64::from)
+}
+
 #[test]
 fn the_mico_reaches_what_the_closed_form_contains() {
     let (cell, settings) = (cell(), check_settings());
     let base_m = f64::from(World::Shared.mico_base_distance_m());
     let (mut most_rad, mut least_self_m, mut n_points) = (0.0_f64, f64::INFINITY, 0);
     each_direction(|height_m, azimuth| {
-        let [near_m, far_m] = Reach::MICO.radii_m(height_m as f32).map(f64::from);
+        let [near_m, far_m] = radii_m(height_m);
         for step in 0..=30 {
             let radius_m = near_m + (far_m - near_m) * f64::from(step) / 30.0;
             let [x, y] = [radius_m * azimuth.cos() - base_m, radius_m * azimuth.sin()];
@@ -95,7 +101,7 @@ fn the_closed_form_leaves_out_little_of_the_reach() {
     let (cell, settings) = (cell(), check_settings());
     let base_m = f64::from(World::Shared.mico_base_distance_m());
     each_direction(|height_m, azimuth| {
-        let [_, far_m] = Reach::MICO.radii_m(height_m as f32).map(f64::from);
+        let [_, far_m] = radii_m(height_m);
         let radius_m = far_m + 0.05;
         let at = DVec3::new(radius_m * azimuth.cos() - base_m, radius_m * azimuth.sin(), height_m);
         let is_reached = reached(&cell, at).is_some_and(|(_, tilt)| tilt <= settings.tilt_rad);

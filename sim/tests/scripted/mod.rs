@@ -7,6 +7,7 @@ use tandem_sim::{Env, WorldConfig};
 /// Displacement for an action of 1, metres.
 const ACTION_M: f32 = 0.05;
 
+mod gliding;
 pub(crate) mod pair;
 
 /// The outcome of a scripted episode.

@@ -135,6 +135,7 @@ mod tests {
             goal: (arm_idx * n..(arm_idx + 1) * n).collect(),
             action: vec![arm_idx],
             position: Vec::new(),
+            lateral: Vec::new(),
         };
         let description = TaskDescription {
             name: "lab/reach".to_owned(),
@@ -148,6 +149,7 @@ mod tests {
             interchangeable_arms: false,
             reports_contacts: false,
             origin_distance: 0.0,
+            base: 0.0,
             recombination_gap: 0.0,
             observation_bound: vec![1.0; n_goal],
             goal_bound: vec![1.0; n_goal],

@@ -16,8 +16,7 @@ fn the_first_advised_episode_claims_the_lock_steps_of_its_slot() {
         for (episode, charged) in episodes.iter_mut().zip(charged) {
             episode.advice_charged = charged;
         }
-        let mut queue = WorkQueue::default();
-        queue.advice_unit = AdviceUnit::SlotStep;
+        let mut queue = WorkQueue { advice_unit: AdviceUnit::SlotStep, ..WorkQueue::default() };
         queue.push(ordered);
         let worker = join(&mut queue, at(0));
         next_slot(&mut queue, worker, at(0));

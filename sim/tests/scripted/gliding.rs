@@ -1,11 +1,9 @@
 //! In the shared world, pushed objects move only while a hand touches them.
 
-mod scripted;
-
+use super::Controller;
 use rapier3d::math::{Pose, Rotation, Vector};
 use rapier3d::parry::query;
 use rapier3d::parry::shape::Cuboid as Shape;
-use scripted::Controller;
 use tandem_core::scene::{Cuboid, Scene};
 use tandem_core::{ArmIndex, Layout, Stream, Task, WorldSettings, episode_rng};
 use tandem_sim::{Env, WorldConfig};
@@ -57,7 +55,9 @@ fn hand_distance_m(scene: &Scene, arm: ArmIndex) -> f32 {
     let (object_pose, object) = placed(&scene.objects[arm.0]);
     let distance_m = |part: &Cuboid| {
         let (pose, shape) = placed(part);
-        query::distance(&pose, &shape, &object_pose, &object).expect("boxes have a distance")
+        query::distance(&pose, &shape, &object_pose, &object)
+            .expect("boxes have a distance")
+            .distance
     };
     scene.arms[arm.0].hand.iter().map(distance_m).fold(f32::INFINITY, f32::min)
 }
