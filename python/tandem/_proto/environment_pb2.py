@@ -25,7 +25,7 @@ _sym_db = _symbol_database.Default()
 from . import task_pb2 as tandem_dot_v1_dot_task__pb2
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x1btandem/v1/environment.proto\x12\ttandem.v1\x1a\x14tandem/v1/task.proto\"\x1c\n\x1a\x44\x65scribeEnvironmentRequest\"l\n\x16\x45nvironmentDescription\x12(\n\x04task\x18\x01 \x01(\x0b\x32\x1a.tandem.v1.TaskDescription\x12\x0e\n\x06server\x18\x02 \x01(\t\x12\x18\n\x10max_environments\x18\x03 \x01(\r\"t\n\x0bPlayRequest\x12-\n\x05reset\x18\x01 \x01(\x0b\x32\x1c.tandem.v1.ResetEnvironmentsH\x00\x12+\n\x04step\x18\x02 \x01(\x0b\x32\x1b.tandem.v1.StepEnvironmentsH\x00\x42\t\n\x07\x63ommand\"F\n\x11ResetEnvironments\x12\x31\n\x0c\x65nvironments\x18\x01 \x03(\x0b\x32\x1b.tandem.v1.EnvironmentReset\"\x88\x01\n\x10\x45nvironmentReset\x12\x13\n\x0b\x65nvironment\x18\x01 \x01(\r\x12\x0c\n\x04seed\x18\x02 \x01(\x04\x12\x0f\n\x07\x65pisode\x18\x03 \x01(\x04\x12\x12\n\nevaluation\x18\x04 \x01(\x08\x12\x1a\n\x12grasped_start_prob\x18\x05 \x01(\x02\x12\x10\n\x08substeps\x18\x06 \x01(\r\"#\n\x10StepEnvironments\x12\x0f\n\x07\x61\x63tions\x18\x01 \x01(\x0c\"E\n\x0cPlayResponse\x12\x14\n\x0cobservations\x18\x01 \x01(\x0c\x12\r\n\x05goals\x18\x02 \x01(\x0c\x12\x10\n\x08\x63ontacts\x18\x03 \x01(\x0c\x32\xa0\x01\n\x0b\x45nvironment\x12T\n\x08\x44\x65scribe\x12%.tandem.v1.DescribeEnvironmentRequest\x1a!.tandem.v1.EnvironmentDescription\x12;\n\x04Play\x12\x16.tandem.v1.PlayRequest\x1a\x17.tandem.v1.PlayResponse(\x01\x30\x01\x62\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x1btandem/v1/environment.proto\x12\ttandem.v1\x1a\x14tandem/v1/task.proto\"\x1c\n\x1a\x44\x65scribeEnvironmentRequest\"l\n\x16\x45nvironmentDescription\x12(\n\x04task\x18\x01 \x01(\x0b\x32\x1a.tandem.v1.TaskDescription\x12\x0e\n\x06server\x18\x02 \x01(\t\x12\x18\n\x10max_environments\x18\x03 \x01(\r\"t\n\x0bPlayRequest\x12-\n\x05reset\x18\x01 \x01(\x0b\x32\x1c.tandem.v1.ResetEnvironmentsH\x00\x12+\n\x04step\x18\x02 \x01(\x0b\x32\x1b.tandem.v1.StepEnvironmentsH\x00\x42\t\n\x07\x63ommand\"F\n\x11ResetEnvironments\x12\x31\n\x0c\x65nvironments\x18\x01 \x03(\x0b\x32\x1b.tandem.v1.EnvironmentReset\"\x9f\x01\n\x10\x45nvironmentReset\x12\x13\n\x0b\x65nvironment\x18\x01 \x01(\r\x12\x0c\n\x04seed\x18\x02 \x01(\x04\x12\x0f\n\x07\x65pisode\x18\x03 \x01(\x04\x12\x12\n\nevaluation\x18\x04 \x01(\x08\x12\x1a\n\x12grasped_start_prob\x18\x05 \x01(\x02\x12\x10\n\x08substeps\x18\x06 \x01(\r\x12\x15\n\rrandomization\x18\x07 \x01(\x02\"#\n\x10StepEnvironments\x12\x0f\n\x07\x61\x63tions\x18\x01 \x01(\x0c\"E\n\x0cPlayResponse\x12\x14\n\x0cobservations\x18\x01 \x01(\x0c\x12\r\n\x05goals\x18\x02 \x01(\x0c\x12\x10\n\x08\x63ontacts\x18\x03 \x01(\x0c\x32\xa0\x01\n\x0b\x45nvironment\x12T\n\x08\x44\x65scribe\x12%.tandem.v1.DescribeEnvironmentRequest\x1a!.tandem.v1.EnvironmentDescription\x12;\n\x04Play\x12\x16.tandem.v1.PlayRequest\x1a\x17.tandem.v1.PlayResponse(\x01\x30\x01\x62\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
@@ -41,11 +41,11 @@ if not _descriptor._USE_C_DESCRIPTORS:
   _globals['_RESETENVIRONMENTS']._serialized_start=322
   _globals['_RESETENVIRONMENTS']._serialized_end=392
   _globals['_ENVIRONMENTRESET']._serialized_start=395
-  _globals['_ENVIRONMENTRESET']._serialized_end=531
-  _globals['_STEPENVIRONMENTS']._serialized_start=533
-  _globals['_STEPENVIRONMENTS']._serialized_end=568
-  _globals['_PLAYRESPONSE']._serialized_start=570
-  _globals['_PLAYRESPONSE']._serialized_end=639
-  _globals['_ENVIRONMENT']._serialized_start=642
-  _globals['_ENVIRONMENT']._serialized_end=802
+  _globals['_ENVIRONMENTRESET']._serialized_end=554
+  _globals['_STEPENVIRONMENTS']._serialized_start=556
+  _globals['_STEPENVIRONMENTS']._serialized_end=591
+  _globals['_PLAYRESPONSE']._serialized_start=593
+  _globals['_PLAYRESPONSE']._serialized_end=662
+  _globals['_ENVIRONMENT']._serialized_start=665
+  _globals['_ENVIRONMENT']._serialized_end=825
 # @@protoc_insertion_point(module_scope)

@@ -36,20 +36,22 @@ class ResetEnvironments(_message.Message):
     def __init__(self, environments: _Optional[_Iterable[_Union[EnvironmentReset, _Mapping]]] = ...) -> None: ...
 
 class EnvironmentReset(_message.Message):
-    __slots__ = ("environment", "seed", "episode", "evaluation", "grasped_start_prob", "substeps")
+    __slots__ = ("environment", "seed", "episode", "evaluation", "grasped_start_prob", "substeps", "randomization")
     ENVIRONMENT_FIELD_NUMBER: _ClassVar[int]
     SEED_FIELD_NUMBER: _ClassVar[int]
     EPISODE_FIELD_NUMBER: _ClassVar[int]
     EVALUATION_FIELD_NUMBER: _ClassVar[int]
     GRASPED_START_PROB_FIELD_NUMBER: _ClassVar[int]
     SUBSTEPS_FIELD_NUMBER: _ClassVar[int]
+    RANDOMIZATION_FIELD_NUMBER: _ClassVar[int]
     environment: int
     seed: int
     episode: int
     evaluation: bool
     grasped_start_prob: float
     substeps: int
-    def __init__(self, environment: _Optional[int] = ..., seed: _Optional[int] = ..., episode: _Optional[int] = ..., evaluation: bool = ..., grasped_start_prob: _Optional[float] = ..., substeps: _Optional[int] = ...) -> None: ...
+    randomization: float
+    def __init__(self, environment: _Optional[int] = ..., seed: _Optional[int] = ..., episode: _Optional[int] = ..., evaluation: bool = ..., grasped_start_prob: _Optional[float] = ..., substeps: _Optional[int] = ..., randomization: _Optional[float] = ...) -> None: ...
 
 class StepEnvironments(_message.Message):
     __slots__ = ("actions",)

@@ -76,14 +76,16 @@ class Exploration(_message.Message):
     def __init__(self, noise_std: _Optional[float] = ..., random_share: _Optional[float] = ..., random_hold_mean_steps: _Optional[float] = ..., joint_random_actions: bool = ...) -> None: ...
 
 class WorldTerms(_message.Message):
-    __slots__ = ("gripped_start_share", "wide_start_share", "substeps")
+    __slots__ = ("gripped_start_share", "wide_start_share", "substeps", "randomization")
     GRIPPED_START_SHARE_FIELD_NUMBER: _ClassVar[int]
     WIDE_START_SHARE_FIELD_NUMBER: _ClassVar[int]
     SUBSTEPS_FIELD_NUMBER: _ClassVar[int]
+    RANDOMIZATION_FIELD_NUMBER: _ClassVar[int]
     gripped_start_share: float
     wide_start_share: float
     substeps: int
-    def __init__(self, gripped_start_share: _Optional[float] = ..., wide_start_share: _Optional[float] = ..., substeps: _Optional[int] = ...) -> None: ...
+    randomization: float
+    def __init__(self, gripped_start_share: _Optional[float] = ..., wide_start_share: _Optional[float] = ..., substeps: _Optional[int] = ..., randomization: _Optional[float] = ...) -> None: ...
 
 class NextWorkRequest(_message.Message):
     __slots__ = ("worker_id",)
