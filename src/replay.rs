@@ -11,7 +11,8 @@ use tandem_core::TaskSpec;
 use tandem_core::text::error_chain;
 use tandem_telemetry::{EpisodeLog, LoggedTransition, read_episode};
 use tandem_worker::EnvironmentConfig;
-use tandem_worker::record::{RecordError, replay_log, replay_log_on};
+use tandem_worker::record::RecordError;
+use tandem_worker::replay::{replay_log, replay_log_on};
 
 use crate::cli::ReplayArgs;
 use crate::environment_server::EnvironmentSource;

@@ -251,7 +251,16 @@ fn a_bridge_keeps_the_arms_at_rest_and_serves_after_malformed_input() {
         let client = BridgeClient::connect(format!("http://{address}")).await;
         let mut client = client.expect("connects");
         attack(address, "tandem.v1.Bridge").await;
-        let status = client.status(pb::BridgeStatusRequest {}).await.expect("served").into_inner();
+        let mut status =
+            client.status(pb::BridgeStatusRequest {}).await.expect("served").into_inner();
+        for _ in 0..100 {
+            if !status.arms.is_empty() {
+                break;
+            }
+            // The simulated pair has sent no state yet.
+            tokio::time::sleep(Duration::from_millis(100)).await;
+            status = client.status(pb::BridgeStatusRequest {}).await.expect("served").into_inner();
+        }
         assert_eq!(status.phase(), pb::BridgePhase::Stopped, "the arms were never reset");
         assert!(status.at_rest, "{status:?}");
         for (arm, x_m) in status.arms.iter().zip([-0.12, 0.12]) {

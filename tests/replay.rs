@@ -19,7 +19,8 @@ use tandem_telemetry::{
     EpisodeLog, EpisodeMetadata, EpisodeRecorder, TransitionRecord, read_episode, recover,
 };
 use tandem_worker::ports::{AdvisorGone, Simulator};
-use tandem_worker::record::{log_name, metadata_of, record_episode, replay_log, world_of};
+use tandem_worker::record::{log_name, metadata_of, record_episode, world_of};
+use tandem_worker::replay::replay_log;
 use tandem_worker::rollout::play_slot;
 use tandem_worker::{Advisor, ComposedTeachers};
 
@@ -39,8 +40,9 @@ enum Kind {
 const KINDS: [Kind; 5] =
     [Kind::Evaluation, Kind::Explored, Kind::Uniform, Kind::Advised, Kind::SpecialStart];
 
+/// Returns the shipped teacher of `task` in the classic world, whose vectors have the same lengths in both worlds.
 fn teacher(task: Task) -> Actor {
-    let name = format!("policies/teacher-{task}.safetensors");
+    let name = format!("policies/teacher-{}.safetensors", task.in_world(World::Classic));
     let policy = Policy::load(&Path::new(env!("CARGO_MANIFEST_DIR")).join(name)).expect("ships");
     policy.actor().expect("usable")
 }

@@ -69,6 +69,15 @@ impl World {
         }
     }
 
+    /// Returns the number of physics steps per control step, as a multiple of the setting `world.substeps`.
+    #[must_use]
+    pub const fn substeps_factor(self) -> u32 {
+        match self {
+            Self::Classic => 1,
+            Self::Shared => 4,
+        }
+    }
+
     /// Returns the distance of a Mico's base behind the origin of its arm's frame, metres, in a work cell that performs
     /// the tasks of this world.
     #[must_use]

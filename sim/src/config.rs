@@ -3,8 +3,6 @@
 use serde::{Deserialize, Serialize};
 use tandem_core::{Task, World, WorldSettings};
 
-use crate::parameters::WorldParameters;
-
 /// Physics parameters of a world.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -83,7 +81,7 @@ impl WorldConfig {
 
     /// Returns the number of physics steps per control step in `world`.
     pub(crate) fn substeps_in(&self, world: World) -> u32 {
-        self.substeps * WorldParameters::of(world).substeps_per_unit
+        self.substeps * world.substeps_factor()
     }
 
     /// Returns the duration of a physics step in simulated time in `world`, seconds.

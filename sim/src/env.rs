@@ -8,11 +8,12 @@ use tandem_core::{ArmIndex, Contacts, Layout, WorldSettings};
 use crate::arm::Command;
 use crate::config::{SimError, WorldConfig};
 use crate::description::{WorldDescription, describe};
+use crate::frame::MAX_ARMS;
 use crate::observation::observe_arm;
 use crate::randomization::{Episode, ObservationNoise};
 use crate::scene::scene;
 use crate::start::{ArmStart, sample_starts};
-use crate::world::{MAX_ARMS, World};
+use crate::world::World;
 
 /// Smallest gap between the links of two arms at the start of an episode, metres.
 const START_LINK_GAP_M: f32 = 0.02;

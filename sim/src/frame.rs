@@ -4,6 +4,9 @@ use rapier3d::math::{Matrix, Rotation, Vector};
 use tandem_core::ArmIndex;
 use tandem_core::layout::WORKSPACE_DISTANCE_M;
 
+/// Largest number of arms in a world.
+pub(crate) const MAX_ARMS: usize = 2;
+
 /// Distance of the origin of each arm's frame from the world's origin if there are two arms, metres.
 const CENTRE_X_M: f32 = WORKSPACE_DISTANCE_M / 2.0;
 

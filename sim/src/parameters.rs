@@ -11,8 +11,6 @@ use crate::reach::Reach;
 pub(crate) struct WorldParameters {
     /// Control steps per second of simulated time.
     pub(crate) control_steps_per_s: f64,
-    /// Physics steps per control step, per unit of the setting `substeps`.
-    pub(crate) substeps_per_unit: u32,
     /// Proportional gain from the palm's distance to its target to its velocity, 1/s.
     pub(crate) approach_gain_per_s: f32,
     /// Largest speed of the palm, metres per second.
@@ -31,7 +29,6 @@ pub(crate) struct WorldParameters {
 
 static CLASSIC: WorldParameters = WorldParameters {
     control_steps_per_s: 25.0,
-    substeps_per_unit: 1,
     approach_gain_per_s: 27.0,
     max_speed_mps: None,
     base_in_arm: Vector::new(-0.40, 0.0, 0.0),
@@ -46,7 +43,6 @@ static CLASSIC: WorldParameters = WorldParameters {
 /// behind an object at the edge of the objects' area.
 static SHARED: WorldParameters = WorldParameters {
     control_steps_per_s: 4.0,
-    substeps_per_unit: 4,
     approach_gain_per_s: 16.0,
     max_speed_mps: Some(0.2),
     base_in_arm: Vector::new(-0.30, 0.0, 0.0),

@@ -8,8 +8,10 @@ use tandem_core::rng::{standard_normal, uniform};
 use tandem_core::{ArmIndex, Task};
 
 use crate::config::{Friction, WorldConfig};
-use crate::world::{MAX_ARMS, TABLE_FRICTION};
+use crate::frame::MAX_ARMS;
 
+/// Friction of the table without randomization.
+pub(crate) const TABLE_FRICTION: f32 = 0.6;
 /// Edge of the cubes, metres.
 const OBJECT_EDGE_M: [f32; 2] = [0.045, 0.065];
 /// Mass of the cubes, kilograms.

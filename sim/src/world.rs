@@ -7,17 +7,14 @@ use tandem_core::{ArmIndex, Contacts, Layout};
 
 use crate::arm::{Arm, Command};
 use crate::config::{SimError, WorldConfig};
-use crate::frame::ArmFrame;
+use crate::frame::{ArmFrame, MAX_ARMS};
 use crate::link_avoidance::VelocityDamper;
 use crate::parameters::WorldParameters;
 use crate::physics::{Part, Physics, collides, owner};
-use crate::randomization::Episode;
+use crate::randomization::{Episode, TABLE_FRICTION};
 
-/// Largest number of arms in a world.
-pub(crate) const MAX_ARMS: usize = 2;
 /// Half extents of the table, metres; its top is at z = 0.
 pub(crate) const TABLE_HALF_M: Vector = Vector::new(0.8, 0.6, 0.05);
-pub(crate) const TABLE_FRICTION: f32 = 0.6;
 
 /// The state of all bodies. There is one object per arm, in arm order.
 #[derive(Clone)]

@@ -19,6 +19,7 @@ mod learner;
 mod player;
 pub mod ports;
 pub mod record;
+pub mod replay;
 pub mod rollout;
 mod run;
 mod teacher;

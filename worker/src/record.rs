@@ -13,10 +13,6 @@ use tandem_core::{Episode, EpisodeKind, Layout, TaskSpec, WorldSettings};
 use tandem_sim::{Env, SimError, WorldConfig};
 use tandem_telemetry::{EpisodeMetadata, EpisodeRecorder, TransitionRecord};
 
-pub use replay::{replay_log, replay_log_on};
-
-mod replay;
-
 /// A probability of earlier versions: training episodes that started with the hands anywhere above the table.
 const WIDE_START_SHARE: &str = "wide_start_share";
 
@@ -210,7 +206,7 @@ fn record_step(
 }
 
 /// Returns the reward of each arm for a step after which `observation` is observed, shape `[n_arms]`.
-fn rewards_per_arm(task: &TaskSpec, observation: &[f32], goal: &[f32]) -> Vec<f32> {
+pub(crate) fn rewards_per_arm(task: &TaskSpec, observation: &[f32], goal: &[f32]) -> Vec<f32> {
     let reward = |arm| match task.arm_succeeds(arm, observation, goal) {
         true => REWARD_ACHIEVED,
         false => REWARD_PENDING,

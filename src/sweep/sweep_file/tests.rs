@@ -88,7 +88,8 @@ fn errors_fit_on_one_line() {
     }
     check("[[variant]]\nname = \"a/b\"", &["a/b"]);
     check("strategies = [\"ea\"]\n[run.advice]\nstrategy = \"none\"", &["advice.strategy"]);
-    let unlimited = runs_of("[run]\nrecipe = \"paper\"").expect_err("must be refused").to_string();
+    let unlimited =
+        runs_of("[run.stop]\nmax_env_steps = 0").expect_err("must be refused").to_string();
     assert!(unlimited.contains("max_env_steps"), "{unlimited}");
     let many: Vec<String> = (0..10_001).map(|seed| seed.to_string()).collect();
     check(&format!("seeds = [{}]", many.join(",")), &["10001", "at most"]);
@@ -114,6 +115,8 @@ fn every_shipped_sweep_file_is_valid() {
         })
         .collect();
     let expected = [
+        ("sweep-paper-students", 8),
+        ("sweep-paper-teachers", 6),
         ("sweep-recipe", 24),
         ("sweep-recipe-cooldown", 2),
         ("sweep-recipe-long", 10),
@@ -134,7 +137,7 @@ fn a_task_of_a_server_is_that_of_all_runs_and_part_of_their_names() {
     description.name = "lab/reach-1".to_owned();
     let task = tandem_core::TaskSpec::new(description).expect("valid");
     let settings = served_task::settings(&task).expect("TOML");
-    let file = parse(&format!("seeds = [1, 2]\nenv_command = \"serve\"{LIMIT}")).expect("valid");
+    let file = parse(&format!("seeds = [1, 2]\nenv_command = \"serve\"\n{LIMIT}")).expect("valid");
     assert!(!names_task(&file));
     let runs = runs(&file, &settings).expect("valid");
     let names: Vec<&str> = runs.iter().map(|run| run.name.as_str()).collect();
@@ -147,7 +150,7 @@ fn a_task_of_a_server_is_that_of_all_runs_and_part_of_their_names() {
 #[test]
 fn a_contradictory_server_is_refused() {
     let check = |keys: &str, expected: &str| {
-        let file = parse(&format!("seeds = [1]\n{keys}{LIMIT}")).expect("valid");
+        let file = parse(&format!("seeds = [1]\n{keys}\n{LIMIT}")).expect("valid");
         assert_eq!(environment(&file).expect_err("refused").to_string(), expected);
     };
     check("env = \"a:1\"\nenv_command = \"b\"", {

@@ -3,9 +3,9 @@
 use tandem_core::{Contacts, TaskSpec};
 use tandem_telemetry::{EpisodeLog, LoggedTransition};
 
-use super::{RecordError, rewards_per_arm, start_of, world_of};
 use crate::config::EnvironmentConfig;
 use crate::environment::{Environments, Failure};
+use crate::record::{RecordError, rewards_per_arm, start_of, world_of};
 
 /// Simulates a log's actions again and compares observations, goals, contacts and rewards with the log, bit for bit. A
 /// truncated log is compared up to its end.
