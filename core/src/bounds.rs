@@ -5,7 +5,7 @@
 //! that can happen in an episode, such as an object that falls off the table in the 2 s of the classic world. In the
 //! shared world, whose hands are slow, objects stay on the table.
 
-use crate::layout::{Layout, OBSERVATION_PER_ARM};
+use crate::layout::{Layout, OBSERVATION_PER_ARM, World};
 
 /// Bound on the magnitude of any number in any observation or goal. It applies to students of unknown origin.
 pub const MAX_MAGNITUDE: f32 = 1000.0;
@@ -20,14 +20,13 @@ const FALL_M: f32 = 25.0;
 const OPENING_M: f32 = 1.0;
 /// Components of a unit quaternion.
 const UNIT: f32 = 1.01;
-/// Velocities, metres per control step; equals 50 m/s in the classic world and 8 m/s in the shared one.
+/// Velocities, metres per control step of the classic world; equals 50 m/s.
 const SPEED: f32 = 2.0;
-/// Angular velocities, radians per control step; equals 120 revolutions per second in the classic world and 19 in the
-/// shared one.
+/// Angular velocities, radians per control step of the classic world; equals 120 revolutions per second.
 const SPIN: f32 = 30.0;
 
 /// The bounds of one arm's observation, in its order, for the tasks with an object on a table.
-pub(crate) const TABLE_TOP: [f32; OBSERVATION_PER_ARM] = {
+const TABLE_TOP: [f32; OBSERVATION_PER_ARM] = {
     let parts = [
         (0, 3, REACH_M),
         (3, 9, FALL_M),
@@ -52,11 +51,17 @@ pub(crate) const TABLE_TOP: [f32; OBSERVATION_PER_ARM] = {
     bounds
 };
 
+/// Velocities within an arm's part of an observation. They are per control step, whose duration depends on the world.
+const PER_STEP: std::ops::Range<usize> = 16..OBSERVATION_PER_ARM;
+
 impl Layout {
     /// Returns the largest magnitude that number `idx` of an observation can have.
     #[must_use]
     pub const fn observation_bound(self, idx: usize) -> f32 {
-        TABLE_TOP[idx % OBSERVATION_PER_ARM]
+        let part_idx = idx % OBSERVATION_PER_ARM;
+        let is_per_step = PER_STEP.start <= part_idx && part_idx < PER_STEP.end;
+        let steps = self.task.world().control_step_s() / World::Classic.control_step_s();
+        if is_per_step { steps * TABLE_TOP[part_idx] } else { TABLE_TOP[part_idx] }
     }
 
     /// Returns the largest magnitude that a number of a desired goal can have, metres.

@@ -166,7 +166,7 @@ fn terms() -> impl Strategy<Value = pb::RunTerms> {
         proptest::option::weighted(part, exploration),
         proptest::option::weighted(part, world),
         any_text(),
-        proptest::option::weighted(part, advice),
+        advice.prop_map(Some),
     )
         .prop_map(|(task, n_arms, account, exploration, world, run, advice)| pb::RunTerms {
             description: None,

@@ -341,8 +341,11 @@ mod tests {
             for step in 0..N_STEPS {
                 let (swapping, nudging) =
                     (percentile_90_m(&by_swapping, step), percentile_90_m(&by_nudging, step));
+                // Cubes at an angle to the axes round differently in the two frames.
+                let rounding_m =
+                    if task.world() == tandem_core::World::Shared { 2e-6 } else { 0.0 };
                 assert!(
-                    swapping <= 1.5 * nudging,
+                    swapping <= (1.5 * nudging).max(rounding_m),
                     "{task}, step {step}: {swapping} m by swapping, {nudging} m by nudging"
                 );
             }

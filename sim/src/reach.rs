@@ -29,9 +29,9 @@ impl Reach {
         rings: [
             Ring { height_m: 0.031, radii_m: [0.160, 0.495] },
             Ring { height_m: 0.100, radii_m: [0.160, 0.495] },
-            Ring { height_m: 0.200, radii_m: [0.180, 0.465] },
-            Ring { height_m: 0.300, radii_m: [0.180, 0.375] },
-            Ring { height_m: 0.330, radii_m: [0.180, 0.305] },
+            Ring { height_m: 0.200, radii_m: [0.182, 0.465] },
+            Ring { height_m: 0.300, radii_m: [0.182, 0.375] },
+            Ring { height_m: 0.330, radii_m: [0.182, 0.305] },
         ],
     };
 
@@ -84,10 +84,10 @@ mod tests {
             assert!(near(0) && near(1), "{height_m} m: {radii_m:?}");
         };
         check(0.0, [0.160, 0.495]);
-        check(0.15, [0.170, 0.480]);
-        check(0.25, [0.180, 0.420]);
-        check(0.33, [0.180, 0.305]);
-        check(0.50, [0.180, 0.305]);
+        check(0.15, [0.171, 0.480]);
+        check(0.25, [0.182, 0.420]);
+        check(0.33, [0.182, 0.305]);
+        check(0.50, [0.182, 0.305]);
     }
 
     #[test]

@@ -202,7 +202,10 @@ fn grasped_starts_keep_holding_while_the_hand_moves() {
                 let slip_m = distance(&before[of_hand.clone()], &observation[of_hand]);
                 assert!(slip_m < 2e-3, "seed {seed}: slipped by {slip_m} m");
                 let object_z = layout.achieved_goal_of(ArmIndex(arm)).end - 1;
-                assert!(observation[object_z] > before[object_z] + 0.02, "seed {seed}: not lifted");
+                // A hand near the ceiling of its workspace cannot rise.
+                let can_rise = before[object_z] < 0.29;
+                let rose = observation[object_z] > before[object_z] + 0.02;
+                assert!(rose || !can_rise, "seed {seed}: not lifted");
             }
         }
     }

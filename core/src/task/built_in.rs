@@ -1,7 +1,7 @@
 //! The descriptions of the built-in tasks, which the simulator implements.
 
 use super::{ArmDescription, Norm, TaskDescription};
-use crate::bounds::{GOAL_BOUND_M, TABLE_TOP};
+use crate::bounds::GOAL_BOUND_M;
 use crate::layout::{
     EPISODE_STEPS, GOAL_TOLERANCE_M, HAND_POSITION, Layout, OBJECT_POSITION, WORKSPACE_DISTANCE_M,
     World,
@@ -54,7 +54,9 @@ impl Layout {
                 RECOMBINATION_GAP_M
             }),
             base: if is_shared { if_several(BASE_X_M) } else { 0.0 },
-            observation_bound: TABLE_TOP.repeat(self.n_arms),
+            observation_bound: (0..self.n_observation())
+                .map(|idx| self.observation_bound(idx))
+                .collect(),
             goal_bound: vec![GOAL_BOUND_M; self.n_goal()],
         }
     }
