@@ -305,10 +305,15 @@ mod tests {
     }
 
     /// Contacts amplify rounding errors, so the symmetry is exact only before the first contact. After it, swapping may
-    /// change a trajectory by no more than a displacement of the objects by 0.1 µm does.
+    /// change a trajectory by no more than a displacement of the objects by 0.1 µm does, or 1 µm in the shared world, whose
+    /// cubes are at an angle to the axes and round differently in the frames of the two arms.
     #[test]
     fn swapping_the_arms_is_a_symmetry() {
         for task in Task::ALL {
+            let nudge_m = match task.world() {
+                tandem_core::World::Classic => NUDGE_M,
+                tandem_core::World::Shared => 10.0 * NUDGE_M,
+            };
             let layout = Layout::new(task, 2);
             let mut env = Env::new(layout, &WorldConfig::default()).unwrap();
             let (mut by_swapping, mut by_nudging) = (Vec::new(), Vec::new());
@@ -326,7 +331,7 @@ mod tests {
                 let noise: Vec<Vec<f32>> = (0..N_STEPS).map(|_| noise()).collect();
                 let noise_swapped: Vec<Vec<f32>> = noise.iter().map(|both| swapped(both)).collect();
                 let nudged = [first, second]
-                    .map(|start| ArmStart { object: start.object + NUDGE_M, ..start });
+                    .map(|start| ArmStart { object: start.object + nudge_m, ..start });
 
                 let original = observations(&mut env, &[first, second], &noise);
                 let mirrored = observations(&mut env, &[second, first], &noise_swapped);
@@ -341,11 +346,8 @@ mod tests {
             for step in 0..N_STEPS {
                 let (swapping, nudging) =
                     (percentile_90_m(&by_swapping, step), percentile_90_m(&by_nudging, step));
-                // Cubes at an angle to the axes round differently in the two frames.
-                let rounding_m =
-                    if task.world() == tandem_core::World::Shared { 2e-6 } else { 0.0 };
                 assert!(
-                    swapping <= (1.5 * nudging).max(rounding_m),
+                    swapping <= 1.5 * nudging,
                     "{task}, step {step}: {swapping} m by swapping, {nudging} m by nudging"
                 );
             }
