@@ -40,7 +40,7 @@ def main() -> None:
     n_blocks = parser.parse_args().blocks
     print(f"{'µs per step':30} {'Rust':>8} {'Python':>8} {'ratio':>7} {'overhead':>9} {'with wrappers':>14}")
     for env_id, spec in gymnasium.registry.items():
-        if env_id.startswith("tandem/"):
+        if spec.entry_point == "tandem.envs:TandemEnv":
             print(f"{env_id:30} {row(spec.kwargs, n_blocks)}", flush=True)
 
 
