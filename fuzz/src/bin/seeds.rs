@@ -11,8 +11,8 @@ use prost::Message as _;
 use tandem_core::task::{ArmDescription, Norm};
 use tandem_core::work::{EpisodeOrder, EpisodeStart, PublishedActor, RunTerms, SlotOrder};
 use tandem_core::{
-    AdviceTerms, ArmAdvice, Contacts, EpisodeKind, Exploration, Layout, StepAdvice, StepQuery, Task,
-    TaskDescription, TaskSpec, WorldSettings,
+    AdviceTerms, ArmAdvice, Contacts, EpisodeKind, Exploration, Layout, StepAdvice, StepQuery,
+    Task, TaskDescription, TaskSpec, WorldSettings,
 };
 use tandem_fuzz::sample;
 use tandem_learner::checkpoint::{self, Resumption};
@@ -195,12 +195,14 @@ fn write_messages(to: &Path) -> Result<(), AnyError> {
 fn write_tasks(to: &Path) -> Result<(), AnyError> {
     // Two points whose numbers alternate, and which carry an object to a common goal.
     let arm = |arm_idx: usize| ArmDescription {
+        lateral: Vec::new(),
         observation: vec![arm_idx, arm_idx + 2],
         goal: vec![arm_idx],
         action: vec![arm_idx],
         position: Vec::new(),
     };
     let carry = TaskDescription {
+        base: 0.0,
         name: "lab/carry".to_owned(),
         n_observation: 5,
         n_goal: 3,
