@@ -31,8 +31,10 @@ fn read(message: u8, layout: Layout, bytes: &[u8]) {
             tandem_proto::decode_advice(advice, layout).map(|it| tandem_proto::encode_advice(&it))
         }),
         2 => check(bytes, |terms: pb::RunTerms| {
-            tandem_proto::decode_run_terms(terms)
-                .map(|terms| tandem_proto::encode_run_terms(&terms))
+            // Terms of earlier versions have no advice terms, and are decoded to the default ones.
+            let has_advice = terms.advice.is_some();
+            let again = tandem_proto::encode_run_terms(&tandem_proto::decode_run_terms(terms)?);
+            Ok(pb::RunTerms { advice: again.advice.filter(|_| has_advice), ..again })
         }),
         3 => check(bytes, |slot: pb::Slot| {
             tandem_proto::decode_slot(slot).map(|slot| tandem_proto::encode_slot(&slot))
