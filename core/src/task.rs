@@ -378,12 +378,15 @@ impl TaskSpec {
     /// which a student of any layout asks a teacher for one arm.
     ///
     /// # Errors
-    /// Names the limit that the result exceeds.
+    /// When numbers belong to no arm; otherwise names the limit that the result exceeds.
     pub fn concatenated(&self, n_arms: usize) -> Result<Self, InvalidTask> {
         if let Some(layout) = self.as_built_in() {
             return Self::new(Layout::new(layout.task, n_arms).description());
         }
         let one = self.description();
+        let has_common = !self.common_observation().is_empty() || !self.common_goal().is_empty();
+        let expected = "arms to which every number of observations and goals belongs";
+        InvalidTask::unless(!has_common, "arms", expected, "numbers that belong to no arm")?;
         let shifted = |arm_idx: usize, indices: &[usize], n: usize| {
             indices.iter().map(|idx| arm_idx * n + idx).collect::<Vec<usize>>()
         };

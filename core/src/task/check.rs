@@ -22,7 +22,7 @@ pub struct InvalidTask {
 }
 
 impl InvalidTask {
-    fn unless(
+    pub(super) fn unless(
         is_valid: bool,
         field: impl Display,
         expected: impl Display,
