@@ -15,6 +15,7 @@
 //! ```
 #![warn(missing_docs)]
 
+mod color;
 pub mod comparison;
 pub mod curve;
 mod error;
@@ -28,7 +29,6 @@ pub mod pages;
 pub mod paper;
 pub mod plots;
 pub mod run;
-pub mod scene;
 pub mod table;
 pub mod test_evaluation;
 pub mod trials;
@@ -42,7 +42,6 @@ pub use measures::LearningMeasures;
 pub use pages::{ReportFiles, report_html, run_report_html};
 pub use plots::Plot;
 pub use run::Run;
-pub use scene::{View, scene_svg};
 pub use table::Table;
 pub use test_evaluation::TestEvaluation;
 pub use trials::{PlottedTrials, TrialGroup, Trials, trial_svg};

@@ -5,14 +5,11 @@ use std::path::Path;
 
 use tandem_report::{
     Axis, Baseline, Comparison, CurveOptions, CurvePoint, PlottedTrials, Quantity, ReportInputs,
-    Series, TestEvaluation, Trials, View, curve_svg, report_html, run_report_html, scene_svg,
+    Series, TestEvaluation, Trials, curve_svg, report_html, run_report_html,
 };
 use tandem_telemetry::ContactMetrics;
 use tandem_telemetry::{MetricsLog, MetricsRow};
 
-#[path = "../../telemetry/tests/support/synthetic.rs"]
-#[expect(dead_code, reason = "only the scene is drawn")]
-mod synthetic;
 #[path = "support/well_formed.rs"]
 mod well_formed;
 
@@ -81,37 +78,6 @@ fn curves_can_be_drawn_against_every_axis() {
         [Axis::EnvSteps, Axis::Updates, Axis::Minutes, Axis::PaperEpochs].map(x),
         [16_000.0, 0.0, 10.0, 0.2]
     );
-}
-
-#[test]
-fn a_scene_shows_every_body_from_every_side() {
-    let scene = synthetic::scene(0.5);
-    let n_joints: usize = scene.arms.iter().map(|arm| arm.links.len() - 1).sum();
-    for azimuth_deg in [-150.0, -60.0, 0.0, 60.0, 150.0] {
-        let view =
-            View { azimuth_deg, caption: Some("left & right".to_owned()), ..View::default() };
-        let svg = scene_svg(&scene, &view);
-        assert_well_formed(&svg);
-        assert_eq!(svg.matches("<circle").count(), n_joints + scene.goals.len());
-        assert_eq!(svg.matches("<linearGradient").count(), 1 + 8, "the sky and each link");
-        assert!(svg.contains("left &amp; right"));
-    }
-}
-
-#[test]
-fn nearer_bodies_are_drawn_last() {
-    // Returns the fill of the first face drawn, with the first object at `y` and the second at `-y`.
-    let first_fill = |y: f32| {
-        let mut scene = synthetic::scene(0.5);
-        (scene.arms, scene.goals) = (Vec::new(), Vec::new());
-        (scene.objects[0].centre, scene.objects[1].centre) = ([0.0, y, 0.02], [0.0, -y, 0.02]);
-        let svg = scene_svg(&scene, &View { azimuth_deg: 0.0, ..View::default() });
-        let shapes = svg.split("</g></g>").last().unwrap();
-        shapes.split("fill=\"").nth(1).unwrap()[..7].to_owned()
-    };
-    let (blue_in_front, orange_in_front) = (first_fill(-0.2), first_fill(0.2));
-    let red = |color: &str| u8::from_str_radix(&color[1..3], 16).unwrap();
-    assert!(red(&blue_in_front) > red(&orange_in_front), "{blue_in_front} {orange_in_front}");
 }
 
 #[test]
@@ -245,12 +211,8 @@ fn a_described_task_has_its_own_section_beside_a_built_in_one() {
     let [push, reach] = comparison.sections.as_slice() else { panic!("two sections") };
     assert!(push.groups[0].paper().is_some() && reach.groups[0].paper().is_none());
     assert_eq!((reach.groups[0].label.as_str(), reach.baselines.len()), ("ea", 1));
-    let contacts = |text: &str, strategy: &str| {
-        let row = text.lines().rfind(|line| line.starts_with(strategy)).unwrap().to_owned();
-        row.split_whitespace().last().unwrap().to_owned()
-    };
-    assert_eq!(contacts(&push.tables()[2].text(), "ea"), "0.000");
-    assert_eq!(contacts(&reach.tables()[2].text(), "ea"), "–", "none are reported");
+    let contacts = |section: &Section| section.tables()[0].rows[0].last().cloned().unwrap();
+    assert_eq!((contacts(push).as_str(), contacts(reach).as_str()), ("0.000", "–"), "none reported");
 
     let page = dir.path().join("report.html");
     let written =
