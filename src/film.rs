@@ -1,4 +1,4 @@
-//! Films of episodes: what `--film` writes, and the pictures of a run's report.
+//! Films of episodes, which `--film` writes, and film strips for reports.
 
 use std::path::Path;
 
@@ -61,6 +61,19 @@ impl<'a> PlannedFilm<'a> {
         std::fs::write(self.path, bytes)
             .or_cannot_write(|| format!("cannot write {}", self.path.display()))
     }
+}
+
+/// The line of a result that names the file.
+impl std::fmt::Display for PlannedFilm<'_> {
+    fn fmt(&self, formatter: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(formatter, "film          {}", self.path.display())
+    }
+}
+
+/// Draws the film strips of episodes as a PNG.
+pub(crate) fn strip(episodes: &[FilmEpisode]) -> Result<Vec<u8>, Failed> {
+    let (width, height) = STRIP_SIZE;
+    film_strip(episodes, &Film { width, height, speed: 1.0 }).or_exit(Exit::Bug, String::new)
 }
 
 /// Simulates an episode of an evaluation with `seed` again, for a film.

@@ -46,6 +46,9 @@ pub(crate) fn replay(args: &ReplayArgs) -> Result<(), Failed> {
     let files = find_logs(&args.files)?;
     if let Some(film) = planned {
         film.write(&filmed(&files)?)?;
+        if !args.json {
+            output::print(film)?;
+        }
     }
     let is_printed = !args.verify && !args.json && args.film.film.is_none();
     let printed = if let ([file], true) = (files.as_slice(), is_printed) {

@@ -203,7 +203,7 @@ fn report_has_every_run(out: &Path, directory: &Path) {
     }
     let page = fs::read_to_string(out.join("report.html")).expect("written");
     assert!(page.contains("<svg") && page.contains("push, 2 arms"));
-    assert!(out.join("push-2-success-paper-epochs-strategies.svg").is_file());
+    assert!(out.join("report-figures/push-2-success-paper-epochs-strategies.svg").is_file());
 }
 
 #[test]

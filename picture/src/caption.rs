@@ -22,9 +22,9 @@ pub(crate) enum Corner {
     Right,
 }
 
-/// Writes `text` into an upper corner of `raster`. Characters that the font lacks, all beyond ASCII, become `?`. A text
+/// Writes `text` into a corner of `raster`, on the line with this number from the top. Characters that the font lacks, all beyond ASCII, become `?`. A text
 /// that is too wide is cut off.
-pub(crate) fn write(raster: &mut Raster, corner: Corner, text: &str, color: [u8; 3]) {
+pub(crate) fn write(raster: &mut Raster, corner: (Corner, usize), text: &str, color: [u8; 3]) {
     let size = match raster.height {
         ..LARGE_FROM_PX => RasterHeight::Size20,
         _ => RasterHeight::Size32,
@@ -32,6 +32,8 @@ pub(crate) fn write(raster: &mut Raster, corner: Corner, text: &str, color: [u8;
     let weight = if color == INK { FontWeight::Regular } else { FontWeight::Bold };
     let (advance, margin) = (get_raster_width(weight, size), size.val() / 2);
     let width = advance * text.chars().count();
+    let (corner, line) = corner;
+    let top = margin + line * size.val();
     let left = match corner {
         Corner::Left => margin,
         Corner::Right => raster.width.saturating_sub(margin + width),
@@ -41,7 +43,7 @@ pub(crate) fn write(raster: &mut Raster, corner: Corner, text: &str, color: [u8;
         let rows = glyph.iter().flat_map(|glyph| glyph.rows().enumerate());
         for (y, row) in rows {
             for (x, opacity) in row.iter().enumerate().filter(|(_, opacity)| **opacity > 0) {
-                raster.blend(left + idx * advance + x, margin + y, color, *opacity);
+                raster.blend(left + idx * advance + x, top + y, color, *opacity);
             }
         }
     }

@@ -2,7 +2,8 @@
 
 use gif::{DisposalMethod, Encoder, Frame, Repeat};
 use rayon::iter::{IntoParallelRefIterator as _, ParallelIterator as _};
-use tandem_core::scene::Scene;
+use tandem_core::reward::distance;
+use tandem_core::scene::{Point, Scene};
 
 use crate::caption::{self, BAD, Corner, GOOD, INK};
 use crate::error::Error;
@@ -14,8 +15,12 @@ use crate::raster::Raster;
 /// Time between two frames, hundredths of a second.
 const FRAME_CS: u16 = 4;
 /// Time for which the first and the last frame of an episode stay, hundredths of a second.
-const FIRST_CS: u16 = 40;
-const LAST_CS: u16 = 140;
+const FIRST_CS: u16 = 30;
+const LAST_CS: u16 = 90;
+/// Distance from its last position within which a hand or an object counts as at rest, metres.
+const REST_M: f32 = 0.003;
+/// Number of control steps at rest at the end of an episode that are shown.
+const N_RESTING: usize = 3;
 /// Frames that are in memory at a time.
 const CHUNK: usize = 16;
 /// Smallest and largest width and height of a picture, pixels.
@@ -32,13 +37,37 @@ pub struct FilmStep {
     pub achieved: Vec<bool>,
 }
 
-/// An episode: the world before the first control step and after each.
+/// An episode: the world before the first control step and after each. A film ends shortly after everything has come to
+/// rest.
 #[derive(Debug, Clone, PartialEq)]
 pub struct FilmEpisode {
     /// Text in the upper left corner. Its characters are ASCII.
     pub title: String,
     /// The moments in order.
     pub steps: Vec<FilmStep>,
+}
+
+impl FilmEpisode {
+    /// Returns the moments up to shortly after hands and objects have come to rest.
+    pub(crate) fn moving(&self) -> &[FilmStep] {
+        let Some(last) = self.steps.last() else { return &[] };
+        let is_at_rest = |step: &&FilmStep| {
+            step.achieved == last.achieved && has_moved_by(&step.scene, &last.scene) < REST_M
+        };
+        let n_at_rest = self.steps.iter().rev().take_while(is_at_rest).count();
+        let n_shown = self.steps.len() - n_at_rest.saturating_sub(N_RESTING);
+        &self.steps[..n_shown]
+    }
+}
+
+/// Returns the largest distance between the places of a hand or an object in two scenes, metres.
+fn has_moved_by(one: &Scene, other: &Scene) -> f32 {
+    let places = |scene: &Scene| -> Vec<Point> {
+        let objects = scene.objects.iter().map(|object| object.centre);
+        scene.arms.iter().map(|arm| arm.end_effector).chain(objects).collect()
+    };
+    let pairs = places(one).into_iter().zip(places(other));
+    pairs.map(|(a, b)| distance(&a, &b)).fold(0.0, f32::max)
 }
 
 /// Size and speed of a film.
@@ -116,7 +145,7 @@ pub fn film_gif(episodes: &[FilmEpisode], film: &Film) -> Result<Vec<u8>, Error>
 /// Returns the frames of an episode.
 #[expect(clippy::cast_possible_truncation, reason = "a share in [0, 1)")]
 fn shots(episode: &FilmEpisode, speed: f64) -> Vec<Shot<'_>> {
-    let FilmEpisode { title, steps } = episode;
+    let (title, steps) = (&episode.title, episode.moving());
     let (Some(first), Some(last)) = (steps.first(), steps.last()) else { return Vec::new() };
     let interval_s = f64::from(FRAME_CS) / 100.0 * speed;
     let start_s = first.scene.time_s;
@@ -160,7 +189,7 @@ pub(crate) fn draw_step(
     size: (usize, usize),
 ) -> Raster {
     let mut raster = render_achieved(&step.scene, &step.achieved, size.0, size.1);
-    caption::write(&mut raster, Corner::Left, title, INK);
+    caption::write(&mut raster, (Corner::Left, 0), title, INK);
     let is_success = !step.achieved.is_empty() && step.achieved.iter().all(|achieved| *achieved);
     let time = format!("{:.2} s", step.scene.time_s);
     let (result, color) = match (is_success, is_last) {
@@ -168,9 +197,8 @@ pub(crate) fn draw_step(
         (false, true) => ("failure", BAD),
         (false, false) => ("", INK),
     };
-    // The time keeps its place when the result appears.
-    caption::write(&mut raster, Corner::Right, &format!("{time}{:8}", ""), INK);
-    caption::write(&mut raster, Corner::Right, result, color);
+    caption::write(&mut raster, (Corner::Right, 0), &time, INK);
+    caption::write(&mut raster, (Corner::Right, 1), result, color);
     raster
 }
 

@@ -23,6 +23,9 @@ mod shape;
 #[cfg(feature = "files")]
 mod strip;
 
+#[cfg(all(test, feature = "files"))]
+mod tests;
+
 #[cfg(feature = "files")]
 pub use error::Error;
 #[cfg(feature = "files")]

@@ -3,7 +3,7 @@
 //! A ray caster draws bodies that penetrate each other, such as fingers around an object, in the right order at every
 //! pixel.
 
-use glam::DVec3;
+use glam::{DVec2, DVec3};
 use tandem_core::scene::{ArmScene, Capsule, Cuboid, Scene};
 
 use crate::camera::{Camera, Rectangle};
@@ -29,13 +29,10 @@ const WHITE: Rgb = DVec3::splat(255.0);
 const LINK_TINT: f64 = 0.16;
 /// Direction towards the light, a unit vector.
 const LIGHT: DVec3 = DVec3::new(-0.36, -0.48, 0.80);
-/// Directions towards points of the light, which give shadows a soft edge. Their mean is [`LIGHT`].
-const LIGHT_POINTS: [DVec3; 4] = [
-    DVec3::new(-0.32, -0.46, 0.829),
-    DVec3::new(-0.40, -0.46, 0.792),
-    DVec3::new(-0.37, -0.51, 0.775),
-    DVec3::new(-0.34, -0.49, 0.803),
-];
+/// Radius of the light as seen from the table, radians, which gives shadows a soft edge.
+const LIGHT_RADIUS: f64 = 0.028;
+/// Number of points of the light that a shadow on the table is computed from.
+const N_LIGHT_POINTS: u8 = 7;
 /// Brightness of a surface in shadow relative to the same surface in light.
 const SHADOW: f64 = 0.80;
 /// Opacity of goals, and of goals that are achieved.
@@ -53,8 +50,6 @@ const JOINT_WIDENING: f64 = 1.12;
 const N_SAMPLES: usize = 3;
 /// Distance from a surface at which the rays of its shadow start, metres.
 const SHADOW_OFFSET_M: f64 = 1e-4;
-/// Number of [`LIGHT_POINTS`].
-const N_LIGHT_POINTS: u8 = 4;
 /// Index of the table among the bodies.
 const TABLE: usize = 0;
 
@@ -140,9 +135,19 @@ struct Surface {
     goals: u32,
 }
 
+/// The part of the table on which a body may cast a shadow: a disc.
+struct ShadowBounds {
+    body_idx: usize,
+    centre: DVec2,
+    radius_m: f64,
+}
+
 struct Painter {
     camera: Camera,
     bodies: Vec<Body>,
+    shadows: Vec<ShadowBounds>,
+    /// Directions towards points of the light, unit vectors.
+    light_points: [DVec3; N_LIGHT_POINTS as usize],
     goals: Vec<Goal>,
     table_z_m: f64,
     tolerance_m: f64,
@@ -170,8 +175,12 @@ impl Painter {
         let objects = scene.objects.iter().zip(colors());
         let objects = objects.map(|(object, color)| (Shape::cuboid(object), *color));
         let table = (Shape::cuboid(&scene.table), TABLE_COLOR);
+        let bodies: Vec<Body> =
+            std::iter::once(table).chain(arms).chain(objects).map(body).collect();
         Self {
-            bodies: std::iter::once(table).chain(arms).chain(objects).map(body).collect(),
+            shadows: shadow_bounds(&bodies, table_z_m),
+            light_points: light_points(),
+            bodies,
             goals: scene.goals.iter().zip(colors()).zip(achieved).map(goal).collect(),
             camera,
             table_z_m,
@@ -257,14 +266,51 @@ impl Painter {
             return 0;
         }
         let start = point + SHADOW_OFFSET_M * hit.normal;
-        let is_free = |light: DVec3| {
-            !self.bodies[1..].iter().any(|body| body.shape.hit(start, light).is_some())
-        };
-        match idx {
-            TABLE => LIGHT_POINTS.iter().map(|light| u8::from(is_free(light.normalize()))).sum(),
-            _ => N_LIGHT_POINTS * u8::from(is_free(LIGHT)),
+        if idx != TABLE || hit.normal.z < 0.5 {
+            let is_blocked = |body: &Body| body.shape.hit(start, LIGHT).is_some();
+            return N_LIGHT_POINTS * u8::from(!self.bodies[1..].iter().any(is_blocked));
         }
+        let place = point.truncate();
+        let near =
+            |it: &&ShadowBounds| it.centre.distance_squared(place) < it.radius_m * it.radius_m;
+        let mut is_free = [true; N_LIGHT_POINTS as usize];
+        for bounds in self.shadows.iter().filter(near) {
+            let shape = &self.bodies[bounds.body_idx].shape;
+            for (is_free, light) in is_free.iter_mut().zip(self.light_points) {
+                *is_free = *is_free && shape.hit(start, light).is_none();
+            }
+        }
+        is_free.into_iter().map(u8::from).sum()
     }
+}
+
+/// Returns the parts of the table on which the bodies other than the table may cast shadows.
+fn shadow_bounds(bodies: &[Body], table_z_m: f64) -> Vec<ShadowBounds> {
+    let bounds = |(body_idx, body): (usize, &Body)| {
+        let Shape { centre, radius_m, .. } = body.shape;
+        let distance_m = (centre.z - table_z_m) / LIGHT.z;
+        let soft_m = LIGHT_RADIUS * distance_m.abs();
+        ShadowBounds {
+            body_idx,
+            centre: (centre - distance_m * LIGHT).truncate(),
+            radius_m: (radius_m + soft_m) / LIGHT.z,
+        }
+    };
+    bodies.iter().enumerate().skip(1).map(bounds).collect()
+}
+
+/// Returns directions towards points of the light: its centre, and a ring around it.
+fn light_points() -> [DVec3; N_LIGHT_POINTS as usize] {
+    let middle = LIGHT.normalize();
+    let (u, v) = middle.any_orthonormal_pair();
+    std::array::from_fn(|idx| match idx {
+        0 => middle,
+        _ => {
+            let angle_rad =
+                std::f64::consts::TAU * (centre(idx) - 0.5) / f64::from(N_LIGHT_POINTS - 1);
+            (middle + LIGHT_RADIUS * (angle_rad.cos() * u + angle_rad.sin() * v)).normalize()
+        }
+    })
 }
 
 #[expect(clippy::cast_possible_truncation, reason = "a unit vector, so from −2 to 2")]

@@ -15,8 +15,8 @@ const N_COLUMNS: usize = 4;
 const GAP_PX: usize = 6;
 const GAP_COLOR: [u8; 3] = [255; 3];
 
-/// Returns a film strip of `episodes` as a PNG: for each, [`STRIP_PICTURES`] moments from the first to the last, equally
-/// far apart, in rows of four. An episode with fewer moments has fewer pictures.
+/// Returns a film strip of `episodes` as a PNG: for each, [`STRIP_PICTURES`] moments from the first until everything
+/// is at rest, equally far apart, in rows of four. An episode with fewer moments has fewer pictures.
 ///
 /// # Errors
 /// If there is no scene, or the size in `film` is out of range.
@@ -47,7 +47,14 @@ pub fn film_strip(episodes: &[FilmEpisode], film: &Film) -> Result<Vec<u8>, Erro
 /// If the size is out of range.
 pub fn picture_png(title: &str, step: &FilmStep, size: (usize, usize)) -> Result<Vec<u8>, Error> {
     let film = Film { width: size.0, height: size.1, speed: 1.0 }.checked()?;
-    png(&draw_step(title, step, false, (film.width, film.height)))
+    let raster = draw_step(title, step, false, (film.width, film.height));
+    let mut bytes = Vec::new();
+    let mut encoder = png_encoder(&mut bytes, &raster);
+    encoder.set_color(png::ColorType::Rgb);
+    let mut writer = encoder.write_header()?;
+    writer.write_image_data(&raster.rgb)?;
+    writer.finish()?;
+    Ok(bytes)
 }
 
 /// A picture of a strip.
@@ -65,7 +72,8 @@ impl Moment<'_> {
 
 /// Returns the pictures of an episode, row by row. The first has the title.
 fn rows_of(episode: &FilmEpisode) -> Vec<Vec<Moment<'_>>> {
-    let n_steps = episode.steps.len();
+    let steps = episode.moving();
+    let n_steps = steps.len();
     let n_pictures = n_steps.min(STRIP_PICTURES);
     let chosen = (0..n_pictures).map(|idx| {
         let last_idx = n_pictures.saturating_sub(1).max(1);
@@ -73,7 +81,7 @@ fn rows_of(episode: &FilmEpisode) -> Vec<Vec<Moment<'_>>> {
     });
     let moments = chosen.enumerate().map(|(idx, step_idx)| Moment {
         title: if idx == 0 { &episode.title } else { "" },
-        step: &episode.steps[step_idx],
+        step: &steps[step_idx],
         is_last: step_idx + 1 == n_steps,
     });
     let mut rows: Vec<Vec<Moment<'_>>> = Vec::new();
@@ -90,14 +98,19 @@ fn rows_of(episode: &FilmEpisode) -> Vec<Vec<Moment<'_>>> {
 fn png(raster: &Raster) -> Result<Vec<u8>, Error> {
     let palette = Palette::of(std::slice::from_ref(raster));
     let mut bytes = Vec::new();
-    let size = |pixels: usize| u32::try_from(pixels).unwrap_or(u32::MAX);
-    let mut encoder = png::Encoder::new(&mut bytes, size(raster.width), size(raster.height));
+    let mut encoder = png_encoder(&mut bytes, raster);
     encoder.set_color(png::ColorType::Indexed);
-    encoder.set_depth(png::BitDepth::Eight);
     encoder.set_palette(palette.rgb.clone());
-    encoder.set_compression(png::Compression::High);
     let mut writer = encoder.write_header()?;
     writer.write_image_data(&palette.indices(raster))?;
     writer.finish()?;
     Ok(bytes)
+}
+
+fn png_encoder<'a>(bytes: &'a mut Vec<u8>, raster: &Raster) -> png::Encoder<'a, &'a mut Vec<u8>> {
+    let size = |pixels: usize| u32::try_from(pixels).unwrap_or(u32::MAX);
+    let mut encoder = png::Encoder::new(bytes, size(raster.width), size(raster.height));
+    encoder.set_depth(png::BitDepth::Eight);
+    encoder.set_compression(png::Compression::High);
+    encoder
 }

@@ -14,7 +14,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         .collect();
     std::fs::write(
         dir.join("success.svg"),
-        curve_svg(&series, &CurveOptions::shares("Two arms push", Axis::EnvSteps))?,
+        curve_svg(&series, &CurveOptions::of("Two arms push", Quantity::Success, Axis::EnvSteps))?,
     )?;
     let metrics_path = dir.join("metrics.jsonl");
     std::fs::File::create(&metrics_path)?;

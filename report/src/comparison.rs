@@ -3,15 +3,35 @@
 use crate::group::{MILESTONES, SeedGroup, TaskSetup, group_by_settings};
 use crate::paper::{PaperMeasures, TABLE_2};
 use crate::run::Run;
-use crate::table::{NONE, Table, mean, optional, share_spread, short_number, spread, wrapped};
+use crate::table::{NONE, Table, optional, share_spread, short_number, spread, wrapped};
 use crate::test_evaluation::TestEvaluation;
+
+mod summary;
 
 /// Runs and baselines, by task and number of arms.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Comparison {
     /// Sections, push before pick and place and two arms before one.
     pub sections: Vec<Section>,
+    /// Film strips of episodes.
+    pub films: Vec<FilmStrip>,
 }
+
+/// A film strip of an episode, for the page of a report.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct FilmStrip {
+    /// Describes the episode.
+    pub title: String,
+    /// Name of the strip's own file, without a directory.
+    pub file_name: String,
+    /// Content of the PNG file.
+    pub png: Vec<u8>,
+}
+
+/// Explains the paper's measures.
+pub const LEGEND: &str = "IE: epochs until success is 10 % of its maximum. RT: epochs from there to 90 % of it. MSR: maximum \
+     success. ELR: 90 % of MSR per epoch until it was reached. IE, RT and ELR are – if MSR is below 0.5 or a run has fewer \
+     than 5 evaluations. An epoch is 50 rounds.";
 
 /// The runs of one task and number of arms.
 #[derive(Debug, Clone, PartialEq)]
@@ -33,6 +53,14 @@ pub struct Baseline {
     pub test: TestEvaluation,
 }
 
+/// Returns the notes to [`Comparison::text`], for a terminal.
+#[must_use]
+pub fn notes() -> String {
+    let notes = "Means over runs, with the number of runs that have the value if some do not. The page has curves, ranges \
+         and all intervals.";
+    format!("{}{}", wrapped(notes), wrapped(LEGEND).trim_end())
+}
+
 impl Comparison {
     /// Compares `runs` with each other and with `baselines`.
     #[must_use]
@@ -52,7 +80,7 @@ impl Comparison {
             add_baseline(&mut sections, baseline);
         }
         sections.sort_by_key(|section| section.setup.sort_key());
-        Self { sections }
+        Self { sections, films: Vec::new() }
     }
 
     /// Formats the means of all groups for a terminal of 80 columns, and the names of runs without an evaluation.
@@ -116,71 +144,6 @@ impl Section {
                 "No evaluation yet: {names}. A run is evaluated every evaluation.every_env_steps environment steps."
             )
         })
-    }
-
-    /// Returns the success on test goals with its interval, and that of the best evaluation.
-    pub(crate) fn success_summary(&self) -> Table {
-        let title = format!("{}: success of the policy alone, on test goals", self.setup.title());
-        let header = ["strategy", "runs", "success", "95 % interval", "no contact", "best eval."];
-        let mut table = Table::new(title, &header);
-        for group in &self.groups {
-            let (test, interval) = group.share(test_success);
-            let (best, _) = group.share(best_success);
-            table.rows.push(vec![
-                group.label.clone(),
-                group.runs.len().to_string(),
-                mean(&test, three_digits),
-                interval.map_or_else(|| NONE.to_owned(), |it| range(it.low, it.high)),
-                mean(&group.share(success_without_contact).0, three_digits),
-                mean(&best, three_digits),
-            ]);
-        }
-        table.rows.extend(self.baselines.iter().map(|Baseline { label, test }| {
-            let without_contact = test.contacts.success_without_contact;
-            vec![
-                label.clone(),
-                NONE.to_owned(),
-                three_digits(test.success),
-                range(test.interval.0, test.interval.1),
-                optional(without_contact, three_digits),
-                NONE.to_owned(),
-            ]
-        }));
-        table
-    }
-
-    /// Returns the mean cost of a success.
-    fn cost_summary(&self) -> Table {
-        let title = format!("{}: cost of a success in an evaluation", self.setup.title());
-        let header =
-            ["strategy", "steps to 50 %", "90 %", "95 %", "min to 90 %", "advice", "steps"];
-        let mut table = Table::new(title, &header);
-        for group in &self.groups {
-            let steps = |success| group.at_milestone(success, |row| row.env_steps as f64);
-            let mut row = vec![group.label.clone()];
-            row.extend(MILESTONES.map(|success| mean(&steps(success), short_number)));
-            row.push(mean(&group.at_milestone(0.9, |row| row.wall_s / 60.0), minutes));
-            row.push(mean(&group.spread(advice_spent), short_number));
-            row.push(mean(&group.spread(env_steps), short_number));
-            table.rows.push(row);
-        }
-        table
-    }
-
-    /// Returns the means of the paper's measures.
-    fn measures_summary(&self) -> Table {
-        let title = format!("{}: measures of the paper's Table 2", self.setup.title());
-        let mut table = Table::new(title, &["strategy", "IE", "RT", "MSR", "ELR"]);
-        for group in &self.groups {
-            table.rows.push(vec![
-                group.label.clone(),
-                mean(&group.measure(|measures| measures.inspired_epoch), epochs),
-                mean(&group.measure(|measures| measures.rising_epochs), epochs),
-                mean(&group.measure(|measures| Some(measures.max_success)), three_digits),
-                mean(&group.measure(|measures| measures.learning_rate), four_digits),
-            ]);
-        }
-        table
     }
 
     /// Returns the measures of the paper's Table 2.
@@ -339,10 +302,8 @@ pub fn paper_table() -> Table {
     let mut table = Table::new("the paper's Table 2".to_owned(), &header);
     table.rows.extend(TABLE_2.iter().map(|row| {
         let threshold = row.threshold.map(|threshold| format!(":{threshold}"));
-        let mut cells = vec![
-            format!("{}{}", row.strategy, threshold.unwrap_or_default()),
-            row.name.to_owned(),
-        ];
+        let mut cells =
+            vec![format!("{}{}", row.strategy, threshold.unwrap_or_default()), row.name.to_owned()];
         cells.extend(paper_cells(&row.push));
         cells.extend(paper_cells(&row.pick_and_place));
         cells

@@ -447,7 +447,7 @@ mod tests {
             vec![SeedGroup::of(different("push-2-a", 1)), SeedGroup::of(different("push-2-a", 2))];
         distinguish_labels(&mut groups);
         let labels: Vec<&str> = groups.iter().map(|group| group.label.as_str()).collect();
-        assert_eq!(labels, ["a", "a (#2)"]);
+        assert_eq!(labels, ["2-a", "2-a (#2)"]);
     }
 
     #[test]

@@ -11,7 +11,7 @@
 //! let evaluation = MetricsRow { env_steps: 20_000, success: 0.75, n_episodes: 240, ..MetricsRow::default() };
 //! let run = Run { name: "push-seed1".to_owned(), rows: vec![evaluation], ..Run::default() };
 //! let comparison = Comparison::of(vec![run], Vec::new());
-//! assert!(comparison.text().contains("0.750"));
+//! assert!(comparison.text().contains("0.750"), "the best evaluation");
 //! ```
 #![warn(missing_docs)]
 
@@ -33,7 +33,7 @@ pub mod table;
 pub mod test_evaluation;
 pub mod trials;
 
-pub use comparison::{Baseline, Comparison, Section};
+pub use comparison::{Baseline, Comparison, FilmStrip, Section};
 pub use curve::{Axis, CurveOptions, CurvePoint, Quantity, Series, curve_svg};
 pub use error::Error;
 pub use group::{SeedGroup, Spread, TaskSetup};

@@ -230,7 +230,8 @@ mod tests {
 
     #[test]
     fn no_line_of_a_table_is_wider_than_a_terminal() {
-        let long = "ddpg.bc_weight=0, ddpg.polyak_keep=0.95, exploration.random_share=0.3, rounds.lag=1";
+        let long =
+            "ddpg.bc_weight=0, ddpg.polyak_keep=0.95, exploration.random_share=0.3, rounds.lag=1";
         let check = |n_columns: usize, expected: &str| {
             let header: Vec<String> = (0..n_columns).map(|idx| format!("column {idx}")).collect();
             let header: Vec<&str> = header.iter().map(String::as_str).collect();

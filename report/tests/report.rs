@@ -4,8 +4,8 @@
 use std::path::Path;
 
 use tandem_report::{
-    Axis, Baseline, Comparison, CurveOptions, CurvePoint, PlottedTrials, Quantity, ReportInputs,
-    Series, TestEvaluation, Trials, curve_svg, report_html, run_report_html,
+    Axis, Baseline, Comparison, CurveOptions, CurvePoint, FilmStrip, PlottedTrials, Quantity,
+    ReportInputs, Section, Series, TestEvaluation, Trials, curve_svg, report_html, run_report_html,
 };
 use tandem_telemetry::ContactMetrics;
 use tandem_telemetry::{MetricsLog, MetricsRow};
@@ -46,12 +46,20 @@ fn several_curves_have_bands_and_a_legend() {
     let rows = [row(0, 0), row(10, 120), row(20, 216)];
     let series = ["none", "mc-q:0.1 <&>"]
         .map(|name| Series::of(name, &rows, Axis::EnvSteps, Quantity::Success));
-    let svg = curve_svg(&series, &CurveOptions::shares("Two arms push", Axis::EnvSteps)).unwrap();
+    let svg =
+        curve_svg(&series, &CurveOptions::of("Two arms push", Quantity::Success, Axis::EnvSteps))
+            .unwrap();
     assert_well_formed(&svg);
     assert_eq!(svg.matches("<polygon").count(), 2, "a band each");
-    for text in
-        ["Two arms push", "none", "mc-q:0.1 &lt;&amp;&gt;", "environment steps", "100 %", "20k"]
-    {
+    for text in [
+        "Two arms push",
+        "none",
+        "mc-q:0.1 &lt;&amp;&gt;",
+        "environment steps",
+        "success rate",
+        "100 %",
+        "20k",
+    ] {
         assert!(svg.contains(text), "{text}");
     }
 }
@@ -61,7 +69,8 @@ fn a_single_curve_has_no_legend_and_may_be_empty() {
     let point = CurvePoint { x: 1.0, y: -2.0, band: None };
     let check = |points: Vec<CurvePoint>| {
         let series = [Series { name: "hidden".to_owned(), points }];
-        let svg = curve_svg(&series, &CurveOptions::values("Mean Q", Axis::Updates)).unwrap();
+        let svg = curve_svg(&series, &CurveOptions::of("Mean Q", Quantity::MeanQ, Axis::Updates))
+            .unwrap();
         assert_well_formed(&svg);
         assert!(!svg.contains("hidden") && svg.contains("Mean Q") && svg.contains("updates"));
     };
@@ -98,7 +107,7 @@ fn the_page_of_a_run_loads_nothing_from_elsewhere() {
     ] {
         assert!(page.contains(text), "{text}");
     }
-    for reference in ["<script", "<link", "src=", "@import", "url(http"] {
+    for reference in ["<script", "<link", "src=\"http", "@import", "url(http"] {
         assert!(!page.contains(reference), "{reference}");
     }
 }
@@ -129,25 +138,43 @@ fn the_page_of_a_sweep_has_tables_curves_and_the_papers_values() {
     seed_of(dir.path(), "mc-q:0.1", 2, &[row(0, 0), row(5, 60)]);
     seed_of(dir.path(), "none", 1, &[row(0, 0), row(5, 0)]);
     let inputs = ReportInputs::load(&[dir.path().to_owned()]).unwrap();
-    let comparison = Comparison::of(inputs.runs, Vec::new());
+    let mut comparison = Comparison::of(inputs.runs, Vec::new());
+    comparison.films.push(FilmStrip {
+        title: "student <1>: success".to_owned(),
+        file_name: "student-1-success.png".to_owned(),
+        png: b"png".to_vec(),
+    });
     let page = dir.path().join("report.html");
     let written =
         report_html(&comparison, &Trials::default(), PlottedTrials::Failed, &page).unwrap();
     let page = std::fs::read_to_string(&written.page).unwrap();
-    assert_eq!(page.matches("<svg").count(), written.plots.len());
-    assert_eq!(written.plots.len(), 5, "three of success, one of mean Q, one of advice");
-    for text in ["MC-ACTABS005", "0.9625", "push, 2 arms", "0.9583", "1 of 2", "10.1016/j.engappai"]
-    {
+    assert_eq!(page.matches("<svg").count(), written.plots.len() - 1);
+    assert_eq!(written.plots.len(), 7, "four of success, mean Q, advice, and a film strip");
+    let contains = [
+        "MC-ACTABS005",
+        "0.9625",
+        "push, 2 arms",
+        "0.9583",
+        "1 of 2",
+        "10.1016/j.engappai",
+        "data:image/png;base64,cG5n",
+        "student &lt;1&gt;: success",
+    ];
+    for text in contains {
         assert!(page.contains(text), "{text}");
     }
-    for svg in &written.plots {
+    let first = |text: &str| page.find(text).unwrap_or_else(|| panic!("{text}"));
+    assert!(first("<svg") < first("<table") && first("<table") < first("<details"));
+    let (svgs, film) = written.plots.split_at(6);
+    assert_eq!(std::fs::read(&film[0]).unwrap(), b"png");
+    for svg in svgs {
         let svg = std::fs::read_to_string(svg).unwrap();
         assert_well_formed(&svg);
         assert!(svg.contains("mc-q:0.1") && svg.contains("none"));
     }
     let success = std::fs::read_to_string(&written.plots[0]).unwrap();
     assert!(success.contains("<polygon"), "a band over the seeds");
-    for reference in ["<script", "<link", "src=", "@import", "url(http"] {
+    for reference in ["<script", "<link", "src=\"http", "@import", "url(http"] {
         assert!(!page.contains(reference), "{reference}");
     }
 }
@@ -212,14 +239,19 @@ fn a_described_task_has_its_own_section_beside_a_built_in_one() {
     assert!(push.groups[0].paper().is_some() && reach.groups[0].paper().is_none());
     assert_eq!((reach.groups[0].label.as_str(), reach.baselines.len()), ("ea", 1));
     let contacts = |section: &Section| section.tables()[0].rows[0].last().cloned().unwrap();
-    assert_eq!((contacts(push).as_str(), contacts(reach).as_str()), ("0.000", "–"), "none reported");
+    assert_eq!(
+        (contacts(push).as_str(), contacts(reach).as_str()),
+        ("0.000", "–"),
+        "none reported"
+    );
 
     let page = dir.path().join("report.html");
     let written =
         report_html(&comparison, &Trials::default(), PlottedTrials::Failed, &page).unwrap();
-    assert_eq!(written.plots.len(), 10, "five for each task");
+    assert_eq!(written.plots.len(), 12, "six for each task");
     for svg in &written.plots {
-        assert_eq!(svg.parent(), Some(dir.path()), "the name of a task makes no directory");
+        let figures = dir.path().join("report-figures");
+        assert_eq!(svg.parent(), Some(figures.as_path()), "a task's name makes no directory");
         let name = svg.file_name().unwrap().to_str().unwrap();
         let text = std::fs::read_to_string(svg).unwrap();
         assert_well_formed(&text);

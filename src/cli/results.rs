@@ -112,13 +112,14 @@ Examples:
   tandem report runs/sweep-table2
   tandem report runs/a runs/b --out compared.html --csv compared.csv
   tandem report trials/student-push --all-trials
-  tandem report docs/results/students --composed-teachers policies/teacher-push.safetensors")]
+  tandem report docs/results/students --composed-teachers policies/teacher-push.safetensors
+  tandem report runs/NAME --film-strips runs/NAME/policy/best.safetensors")]
 pub(crate) struct ReportArgs {
     /// Run directories, directories that contain runs or trials, or single metrics and trials files.
     #[arg(required = true, value_name = "DIR|FILE")]
     pub(crate) paths: Vec<PathBuf>,
-    /// HTML page; curves and plots of trials are written next to it as SVG files [default: report.html, in the
-    /// directory of the sweep or trials if that is the only one].
+    /// HTML page; its figures are also written to a directory beside it, report-figures for report.html [default:
+    /// report.html in the directory of the sweep or trials, or comparison.html in that of a run, if it is the only one].
     #[arg(long, value_name = "FILE.html")]
     pub(crate) out: Option<PathBuf>,
     /// Also writes a CSV file with one line per run.
@@ -130,6 +131,9 @@ pub(crate) struct ReportArgs {
     /// Evaluates a one-arm policy on both arms, the baseline without a student; can be repeated.
     #[arg(long, value_name = "POLICY")]
     pub(crate) composed_teachers: Vec<PathBuf>,
+    /// Plays the test goals with this policy and shows a success and a failure as film strips; can be repeated.
+    #[arg(long, value_name = "POLICY")]
+    pub(crate) film_strips: Vec<PathBuf>,
     /// Draws all trials, not only failed ones.
     #[arg(long)]
     pub(crate) all_trials: bool,
