@@ -18,7 +18,7 @@ const FRAME_CS: u16 = 4;
 const FIRST_CS: u16 = 30;
 const LAST_CS: u16 = 90;
 /// Distance from its last position within which a hand or an object counts as at rest, metres.
-const REST_M: f32 = 0.003;
+const REST_M: f32 = 0.01;
 /// Number of control steps at rest at the end of an episode that are shown.
 const N_RESTING: usize = 3;
 /// Frames that are in memory at a time.
@@ -214,7 +214,7 @@ fn changed_part(shown: Option<&[u8]>, indices: &[u8], width: usize) -> Frame<'st
         return frame((0, 0), (1, 1), vec![UNCHANGED]);
     };
     let columns = || (0..width).filter(|x| (top..=bottom).any(|y| changed(*x, y)));
-    let (left, right) = (columns().next().unwrap_or(0), columns().last().unwrap_or(width - 1));
+    let (left, right) = (columns().next().unwrap_or(0), columns().next_back().unwrap_or(width - 1));
     let pixel = |x: usize, y: usize| match changed(x, y) {
         true => indices[y * width + x],
         false => UNCHANGED,

@@ -44,12 +44,12 @@ const VIEWS: [(&str, Quantity, Axis, Option<[u32; 2]>); 6] = [
     ("success", Quantity::Success, Axis::EnvSteps, None),
     ("success", Quantity::Success, Axis::Updates, None),
     ("success", Quantity::Success, Axis::Minutes, None),
+    ("advice spent", Quantity::AdviceSpent, Axis::EnvSteps, None),
     ("success", Quantity::Success, Axis::PaperEpochs, Some([5, 7])),
     ("mean Q", Quantity::MeanQ, Axis::PaperEpochs, Some([6, 8])),
-    ("advice spent", Quantity::AdviceSpent, Axis::EnvSteps, None),
 ];
 /// Number of [`VIEWS`] that a page shows first.
-pub(crate) const N_FIRST_VIEWS: usize = 3;
+pub(crate) const N_FIRST_VIEWS: usize = 4;
 
 /// The plots of a comparison.
 #[derive(Debug, Clone, PartialEq, Default)]
@@ -350,9 +350,9 @@ mod tests {
         let plots = comparison_plots(&Comparison::of(runs, Vec::new())).unwrap();
         let plots: Vec<&Plot> = plots.all().collect();
         assert_eq!(plots.len(), 12);
-        assert_eq!(plots[3].file_name, "push-2-success-paper-epochs-strategies.svg");
-        assert!(plots[3].title.ends_with("(the paper's Figure 5a)"), "{}", plots[3].title);
-        assert!(plots[10].title.ends_with("(the paper's Figure 6b)"), "{}", plots[10].title);
+        assert_eq!(plots[4].file_name, "push-2-success-paper-epochs-strategies.svg");
+        assert!(plots[4].title.ends_with("(the paper's Figure 5a)"), "{}", plots[4].title);
+        assert!(plots[11].title.ends_with("(the paper's Figure 6b)"), "{}", plots[11].title);
         for text in [|plot: &Plot| plot.file_name.clone(), |plot: &Plot| plot.title.clone()] {
             let unique: BTreeSet<String> = plots.iter().map(|plot| text(plot)).collect();
             assert_eq!(unique.len(), 12, "{unique:?}");

@@ -48,10 +48,10 @@ impl Section {
         for group in &self.groups {
             let steps = |success| group.at_milestone(success, |row| row.env_steps as f64);
             let mut row = vec![group.label.clone()];
-            row.extend(MILESTONES.map(|success| mean(&steps(success), short_number)));
+            row.extend(MILESTONES.map(|success| mean(&steps(success), rounded)));
             row.push(mean(&group.at_milestone(0.9, |row| row.wall_s / 60.0), minutes));
-            row.push(mean(&group.spread(advice_spent), short_number));
-            row.push(mean(&group.spread(env_steps), short_number));
+            row.push(mean(&group.spread(advice_spent), rounded));
+            row.push(mean(&group.spread(env_steps), rounded));
             table.rows.push(row);
         }
         table
@@ -72,4 +72,9 @@ impl Section {
         }
         table
     }
+}
+
+/// Formats a mean count to hundreds: 33,333 as 33.3k.
+fn rounded(count: f64) -> String {
+    short_number(100.0 * (count / 100.0).round())
 }
