@@ -62,7 +62,8 @@ impl Table {
         let block = |row: &Vec<String>| {
             let cells = names.clone().zip(row.iter().skip(1));
             let lines = cells.map(|(name, cell)| format!("  {name:<width$}  {cell}\n"));
-            format!("{}\n{}", row.first().map_or("", String::as_str), lines.collect::<String>())
+            let label = wrapped(row.first().map_or("", String::as_str));
+            format!("{label}{}", lines.collect::<String>())
         };
         self.rows.iter().map(block).collect()
     }
@@ -75,7 +76,7 @@ fn aligned(row: &[String], first: usize, widths: &[usize]) -> String {
     let others: String =
         others.map(|(cell, width)| format!("{:gap$}{cell:>width$}", "", gap = GAP)).collect();
     let line = match n_chars(label) > first {
-        true => format!("{label}\n{:first$}{others}", ""),
+        true => format!("{}{:first$}{others}", wrapped(label), ""),
         false => format!("{label:<first$}{others}"),
     };
     format!("{}\n", line.trim_end())
@@ -237,7 +238,8 @@ mod tests {
             let header: Vec<&str> = header.iter().map(String::as_str).collect();
             let mut table = Table::new("words of a title ".repeat(9), &header);
             let cells = std::iter::repeat_n("0.996 (0.99)".to_owned(), n_columns - 1);
-            table.rows.push(std::iter::once(long[..70].to_owned()).chain(cells).collect());
+            table.rows.push(std::iter::once(long[..70].to_owned()).chain(cells.clone()).collect());
+            table.rows.push(std::iter::once(long.to_owned()).chain(cells).collect());
             let text = table.text();
             assert!(text.lines().all(|line| n_chars(line) <= TERMINAL_COLUMNS), "{text}");
             assert!(text.contains(expected), "{text}");
