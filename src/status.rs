@@ -12,7 +12,7 @@ use tonic::{Code, Response, Status};
 use crate::cli::StatusArgs;
 use crate::exit::{Exit, Failed, OrExit as _};
 use crate::progress_text::{counts_line, evaluation_line, grouped};
-use crate::{access, output, runtime};
+use crate::{access, call_failure, output, runtime};
 
 /// Timeout of a call.
 const TIMEOUT: Duration = Duration::from_secs(10);
@@ -71,7 +71,9 @@ async fn call_with_timeout<T>(
     call: impl Future<Output = Result<Response<T>, Status>>,
 ) -> Result<T, Failed> {
     match tokio::time::timeout(TIMEOUT, call).await {
-        Ok(response) => response.map(Response::into_inner).map_err(|status| failed(&status)),
+        Ok(response) => {
+            response.map(Response::into_inner).map_err(|status| failed(&status))
+        }
         Err(_elapsed) => {
             let what = anyhow!("the learner did not respond within {TIMEOUT:?}");
             Err(Failed::new(Exit::TryAgain, what))
@@ -84,7 +86,7 @@ fn failed(status: &Status) -> Failed {
         Code::Unauthenticated | Code::Unimplemented => Exit::Usage,
         _ => Exit::TryAgain,
     };
-    Failed::new(exit, anyhow!("{}", status.message()))
+    call_failure::failed(exit, status, "tandem train")
 }
 
 fn lines(progress: &pb::Progress) -> Vec<String> {

@@ -22,7 +22,7 @@ use tokio_util::sync::CancellationToken;
 
 use crate::cli::TrainArgs;
 use crate::exit::{Exit, Failed, OrExit as _};
-use crate::{clock, runtime, served_task, signals};
+use crate::{clock, runtime, served_task, settings_page, signals};
 use display::Display;
 use inputs::RunInputs;
 use plan::Plan;
@@ -42,6 +42,9 @@ const SAMPLE_EVERY: Duration = Duration::from_millis(500);
 const INTERRUPTED: &str = "interrupted";
 
 pub(crate) fn train(args: &TrainArgs) -> Result<(), Failed> {
+    if args.list_settings {
+        return settings_page::print(args.json);
+    }
     let environment = environment_file::environment_of(args)?;
     let served = served_task::of_server(&environment)?;
     let plan = Plan::of(args, environment, served.as_ref())?;

@@ -322,12 +322,16 @@ fn a_log_of_a_described_task_is_printed_but_needs_its_environments_to_be_compare
     let printed = tandem(&["replay"], &[&described]);
     assert!(printed.status.success() && printed.stderr.is_empty(), "{printed:?}");
     let lines: Vec<String> = stdout(&printed).lines().map(str::to_owned).collect();
-    assert_eq!(lines[1], "task lab/pick, arms 2, tolerance 0.05");
-    assert!(lines[2].starts_with("step  0  reward -1.0  distance 0."), "{}", lines[2]);
-    let n_advised = lines.iter().filter(|line| line.contains("  advised arm ")).count();
+    assert_eq!(lines[1], "task lab/pick, 2 arms, tolerance 0.05");
+    assert!(lines[2].starts_with("step  arm 0, from its goal"), "{}", lines[2]);
+    assert!(lines[3].starts_with("   0  0."), "{}", lines[3]);
+    assert!(lines[3..].iter().take(50).all(|line| line.chars().count() <= 80), "{lines:?}");
+    let n_advised = lines.iter().filter(|line| line.contains(", advised")).count();
     assert_eq!(n_advised, log.transitions.iter().filter(|step| step.advised_arms != 0).count());
-    let [.., outcome, last] = lines.as_slice() else { panic!("{lines:?}") };
-    assert!(outcome.contains("success  distance ") || outcome.contains("failure  distance "));
+    let [.., end, outcome, last] = lines.as_slice() else { panic!("{lines:?}") };
+    assert!(end.starts_with(" end  0."), "{end}");
+    let all_at_goal = end.matches("at goal").count() == 2;
+    assert_eq!(outcome, if all_at_goal { "success" } else { "failure" });
     assert!(last.starts_with("not compared: the episode is of task \"lab/pick\""), "{last}");
 
     let verified = tandem(&["replay", "--verify"], &[&described]);

@@ -83,6 +83,9 @@ pub(crate) struct TrainArgs {
     /// Overrides one setting, for example ddpg.discount=0.98; can be repeated.
     #[arg(long = "set", value_name = "KEY=VALUE")]
     pub(crate) settings: Vec<String>,
+    /// Prints every setting with its meaning, its range and its values under both recipes, and starts nothing.
+    #[arg(long = "settings")]
+    pub(crate) list_settings: bool,
     /// Run directory [default: runs/TASK-ARMS-STRATEGY-seedN].
     #[arg(long, value_name = "DIR")]
     pub(crate) out: Option<PathBuf>,
