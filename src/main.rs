@@ -33,6 +33,7 @@ mod replay;
 mod report;
 mod run_directory;
 mod run_file;
+mod run_pages;
 mod runtime;
 mod scene;
 mod served_task;

@@ -221,7 +221,9 @@ impl Replayed {
         let first = self.problem().unwrap_or_default();
         let message = match n_trials {
             1 => first,
-            _ => format!("no log of an episode among {n_trials} logs of trials, the first: {first}"),
+            _ => {
+                format!("no log of an episode among {n_trials} logs of trials, the first: {first}")
+            }
         };
         Failed::new(Exit::Data, anyhow!("{message}"))
     }
@@ -250,8 +252,7 @@ fn print_result(replayed: &[Replayed], trials: &[Replayed], json: bool) -> Resul
     let bad = || replayed.iter().filter(|log| log.outcome.is_err() && !log.is_not_simulated());
     let trials: Vec<&Path> = trials.iter().map(|log| log.file.as_path()).collect();
     if json {
-        let (differing, unreadable): (Vec<&Replayed>, _) =
-            bad().partition(|log| log.differs());
+        let (differing, unreadable): (Vec<&Replayed>, _) = bad().partition(|log| log.differs());
         let [differing, unreadable] =
             [differing, unreadable].map(|logs| logs.into_iter().map(problem_json).collect());
         let (differing, unreadable): (Value, Value) = (differing, unreadable);

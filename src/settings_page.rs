@@ -72,9 +72,7 @@ fn page(sections: &[Section]) -> String {
 
 fn as_json_list(sections: &[Section]) -> Json {
     let settings = sections.iter().flat_map(|section| &section.settings);
-    let entry = |Setting { key, meaning, range, values: [tandem, paper] }: &Setting| {
-        json!({ "key": key, "meaning": meaning, "range": range, "tandem": tandem, "paper": paper })
-    };
+    let entry = |Setting { key, meaning, range, values: [tandem, paper] }: &Setting| json!({ "key": key, "meaning": meaning, "range": range, "tandem": tandem, "paper": paper });
     settings.map(entry).collect()
 }
 
@@ -85,7 +83,8 @@ fn sections() -> anyhow::Result<Vec<Section>> {
         .into_root_schema_for::<RunConfig>();
     let schema = schema.to_value();
     let values = Values::of_recipes()?;
-    let mut sections = vec![Section { name: String::new(), meaning: String::new(), settings: vec![] }];
+    let mut sections =
+        vec![Section { name: String::new(), meaning: String::new(), settings: vec![] }];
     for (name, value) in &values.shown {
         let property = &schema["properties"][name];
         let setting = |key: String, property: &Json| Setting {
@@ -96,9 +95,9 @@ fn sections() -> anyhow::Result<Vec<Section>> {
         };
         match value {
             Value::Table(section) => {
-                let settings = section.keys().map(|key| {
-                    setting(format!("{name}.{key}"), &property["properties"][key])
-                });
+                let settings = section
+                    .keys()
+                    .map(|key| setting(format!("{name}.{key}"), &property["properties"][key]));
                 sections.push(Section {
                     name: name.clone(),
                     meaning: description(property),
@@ -228,7 +227,11 @@ mod tests {
         }
         let path = concat!(env!("CARGO_MANIFEST_DIR"), "/docs/settings.md");
         let documented = std::fs::read_to_string(path).expect("docs/settings.md");
-        assert_eq!(documented, page(&sections), "update it: tandem train --settings > docs/settings.md");
+        assert_eq!(
+            documented,
+            page(&sections),
+            "update it: tandem train --settings > docs/settings.md"
+        );
     }
 
     #[test]

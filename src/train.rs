@@ -56,7 +56,7 @@ pub(crate) fn train(args: &TrainArgs) -> Result<(), Failed> {
     let runtime = runtime::new().or_exit(Exit::TryAgain, String::new)?;
     let (last, memory) = runtime.block_on(async {
         let interrupted = signals::shutdown_token(args.exit_with_stdin)?;
-        run((&plan, &lock), &interrupted).await
+        run((&plan, &lock), &interrupted, args.quiet).await
     })?;
     drop(inputs);
     if last.end_reason == INTERRUPTED {
@@ -70,8 +70,9 @@ pub(crate) fn train(args: &TrainArgs) -> Result<(), Failed> {
 async fn run(
     (plan, lock): (&Plan, &RunLock),
     interrupted: &CancellationToken,
+    is_quiet: bool,
 ) -> Result<(pb::Progress, PeakMemory), Failed> {
-    let mut display = Display::new(plan);
+    let mut display = Display::new(plan, is_quiet);
     let mut processes = RunProcesses::new(plan).or_cannot_write(String::new)?;
     let started = tokio::select! {
         started = start(plan, &mut processes, &display) => started,

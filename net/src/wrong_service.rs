@@ -33,7 +33,9 @@ pub(crate) fn name_service<S: NamedService>(
     mut response: http::Response<Body>,
 ) -> http::Response<Body> {
     if is_unknown_call(&response) {
-        response.headers_mut().insert(HeaderName::from_static(SERVED), HeaderValue::from_static(S::NAME));
+        response
+            .headers_mut()
+            .insert(HeaderName::from_static(SERVED), HeaderValue::from_static(S::NAME));
     }
     response
 }

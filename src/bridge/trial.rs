@@ -147,8 +147,12 @@ fn run(series: &Series<'_>, args: &TrialArgs, out: &Path) -> Result<Vec<TrialRow
     let rows = series.run(args.trials, |report, row| {
         let name = format!("{}-{}-{:04}", row.policy, row.mode, row.trial);
         if args.motions {
-            write_motion(report, series.config.speed, &out.join(MOTIONS).join(format!("{name}.json")))
-                .map_err(SeriesFailed)?;
+            write_motion(
+                report,
+                series.config.speed,
+                &out.join(MOTIONS).join(format!("{name}.json")),
+            )
+            .map_err(SeriesFailed)?;
         }
         let recorded = match args.record {
             RecordName::All => true,

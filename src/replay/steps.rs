@@ -56,12 +56,7 @@ fn column_names(task: &TaskSpec) -> Vec<String> {
 
 /// Returns the distance of each arm from its goal, whether the arm executes the teacher's action, and whether it is at
 /// its goal; then the distance of the arms together from the goal common to them, if there is one.
-fn cells(
-    task: &TaskSpec,
-    observation: &[f32],
-    goal: &[f32],
-    advised_arms: u8,
-) -> Vec<String> {
+fn cells(task: &TaskSpec, observation: &[f32], goal: &[f32], advised_arms: u8) -> Vec<String> {
     let unit = unit(task);
     let cell = |(idx, distance): (usize, f32)| {
         let is_advised = idx < task.n_arms() && advised_arms >> idx & 1 == 1;
