@@ -3,7 +3,7 @@
 //! Meanings are the doc comments of the settings, ranges are those of the messages that reject a value, and values are
 //! the recipes', so the page cannot differ from what a run accepts. `docs/settings.md` is this page.
 
-use schemars::{JsonSchema as _, generate::SchemaSettings};
+use schemars::generate::SchemaSettings;
 use serde_json::{Value as Json, json};
 use tandem_core::{Task, TaskSpec};
 use tandem_rl::RunConfig;
