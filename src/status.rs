@@ -99,7 +99,7 @@ fn lines(progress: &pb::Progress) -> Vec<String> {
     lines.extend(progress.evaluation.as_ref().map(|latest| evaluation_line(progress, latest)));
     lines.extend(state_lines(progress));
     if !progress.environment.is_empty() {
-        lines.push(format!("environment {}", progress.environment));
+        lines.push(format!("environment: {}", progress.environment));
     }
     if !progress.warning.is_empty() {
         lines.push(warning_line(progress));
