@@ -204,7 +204,7 @@ impl EvaluationResult {
             let joint = share("joint goal", summary.success_joint);
             lines.push(format!("{joint}: norm of all distances"));
         }
-        let arms = summary.success_per_arm.iter().enumerate();
+        let arms = summary.success_per_arm.iter().enumerate().filter(|_| n_arms > 1);
         lines.extend(arms.map(|(arm, success)| share(&format!("arm {}", arm + 1), *success)));
         let between_arms = summary.arm_contact_rate.filter(|_| n_arms > 1);
         let contacts =

@@ -9,6 +9,7 @@ use tandem_proto::pb;
 use super::plan::Plan;
 use super::processes::PeakMemory;
 use crate::cli::TrainArgs;
+use crate::columns::N_COLUMNS;
 use crate::environment_server::names_server;
 use crate::evaluation::{EvaluatedPolicy, EvaluationResult, Part, measure, measure_served};
 use crate::exit::{Exit, Failed};
@@ -90,7 +91,7 @@ fn summary_lines(
         format!("state digest  {}", last.digest),
         "next".to_owned(),
     ]);
-    lines.extend(next_commands(plan).iter().map(|command| format!("  {command}")));
+    lines.extend(next_commands(plan).iter().map(|command| command_line(command)));
     lines
 }
 
@@ -113,6 +114,17 @@ fn next_commands(plan: &Plan) -> Vec<String> {
         commands.push(format!("tandem train --resume --out {out} --max-env-steps {longer}"));
     }
     commands
+}
+
+/// Indents a command, and continues it on a second line if it is too long for a terminal.
+fn command_line(command: &str) -> String {
+    let line = format!("  {command}");
+    match line.rsplit_once(" --") {
+        Some((start, option)) if line.chars().count() > N_COLUMNS => {
+            format!("{start} \\\n      --{option}")
+        }
+        _ => line,
+    }
 }
 
 /// Returns the first episode of the newest recorded evaluation.
