@@ -33,7 +33,8 @@ pub struct RunConfig {
     pub task: String,
     /// Arms of the learning policy: 1 or 2, or those of `description`.
     pub arms: usize,
-    /// Seed of every random number of the run. It differs from `evaluation.seed` and from 777, the seed of the test goals.
+    /// Seed of every random number of the run. It differs from `evaluation.seed` and from 777, the seed of the test
+    /// goals.
     pub seed: u64,
     /// The recipe that the defaults come from.
     pub recipe: Recipe,
@@ -81,8 +82,8 @@ pub const INIT_TEACHER: &str = "init:teacher";
 #[derive(Debug, Clone, PartialEq, Deserialize, JsonSchema, Serialize)]
 #[serde(deny_unknown_fields)]
 pub struct AdviceConfig {
-    /// Advising strategy and its threshold (the paper, section 3.2), or `init:teacher`: no advice, the student starts as a
-    /// copy of the teacher for each arm.
+    /// Advising strategy and its threshold (the paper, section 3.2), or `init:teacher`: no advice, the student starts
+    /// as a copy of the teacher for each arm.
     pub strategy: String,
     /// Units of advice, at most 10^12 for the whole run (paper: 500,000).
     pub budget: u64,
@@ -180,10 +181,11 @@ pub enum PolyakEvery {
 #[derive(Debug, Clone, PartialEq, Deserialize, JsonSchema, Serialize)]
 #[serde(deny_unknown_fields)]
 pub struct EvaluationConfig {
-    /// Environment steps between two evaluations; without a value a fifth of `stop.max_env_steps`, at most the recipe's.
+    /// Environment steps between two evaluations; without a value a fifth of `stop.max_env_steps`, at most the
+    /// recipe's.
     pub every_env_steps: u64,
-    /// Further evaluations before the first regular one, 0 to 100: of the initial policy, then evenly spaced. A run file
-    /// that sets `evaluation.every_env_steps` has none unless it sets them.
+    /// Further evaluations before the first regular one, 0 to 100: of the initial policy, then evenly spaced. A run
+    /// file that sets `evaluation.every_env_steps` has none unless it sets them.
     #[serde(default)]
     pub early_points: u64,
     /// Fixed goals per evaluation, 1 to 100,000 (paper: 240).
