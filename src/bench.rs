@@ -61,7 +61,8 @@ fn end_to_end() -> Result<Vec<Figure>, Failed> {
     let directory = std::env::temp_dir().join(format!("tandem-bench-{}", std::process::id()));
     let program = std::env::current_exe().or_exit(Exit::Bug, String::new)?;
     let run = std::process::Command::new(program)
-        .args(["train", "--json", "--max-env-steps", "24000", "--max-minutes", "0", "--out"])
+        .args(["train", "--json", "--max-env-steps", "24000", "--max-minutes", "0"])
+        .args(["--set", "evaluation.every_env_steps=20000", "--out"])
         .arg(&directory)
         .stderr(std::process::Stdio::null())
         .output();

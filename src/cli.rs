@@ -41,13 +41,13 @@ pub(crate) use trial::{ModeName, RecordName, TrialArgs};
     propagate_version = true,
     after_help = "\
 Examples:
-  tandem train                                  trains two arms to push, with advice
-  tandem train --arms 1 --task push             trains a one-arm teacher from scratch
+  tandem train                       # trains two arms to push, with advice
+  tandem train --arms 1 --task push  # trains a one-arm teacher from scratch
   tandem eval --policy runs/NAME/policy/best.safetensors
-  tandem COMMAND --help                         more examples
+  tandem COMMAND --help              # more examples
 
-Exit codes: 0 success, 64 wrong usage or configuration, 65 invalid input data, 70 bug, 74 the
-result cannot be written to standard output, 75 temporary failure (try again), 130 interrupted,
+Exit codes: 0 success, 64 wrong usage or configuration, 65 invalid input data, 70 bug, 74 the \
+result cannot be written to standard output, 75 temporary failure (try again), 130 interrupted, \
 141 standard output was closed by its reader."
 )]
 pub(crate) struct Cli {
@@ -99,4 +99,33 @@ pub(crate) enum Command {
     Picture(PictureArgs),
     /// Prints the simulated world, and episodes in it, as JSON for other physics engines.
     Scene(SceneArgs),
+}
+
+#[cfg(test)]
+mod tests {
+    use clap::CommandFactory as _;
+
+    use super::*;
+    use crate::columns::N_COLUMNS;
+
+    /// Returns the commands without subcommands, by their full names.
+    fn leaves(command: &clap::Command, name: &str) -> Vec<(String, clap::Command)> {
+        let shown = command.get_subcommands().filter(|command| !command.is_hide_set());
+        let below: Vec<_> = shown
+            .flat_map(|below| leaves(below, &format!("{name} {}", below.get_name())))
+            .collect();
+        if below.is_empty() { vec![(name.to_owned(), command.clone())] } else { below }
+    }
+
+    #[test]
+    fn every_command_has_examples_that_fit_a_narrow_terminal() {
+        for (name, command) in leaves(&Cli::command(), "tandem") {
+            let help = command.get_after_help().map(ToString::to_string).unwrap_or_default();
+            let examples = help.split("\n\n").find(|part| part.starts_with("Examples:"));
+            let examples = examples.unwrap_or_else(|| panic!("{name} has no examples"));
+            assert!(examples.contains("  tandem "), "{name}: {examples}");
+            let too_long = examples.lines().find(|line| line.chars().count() > N_COLUMNS);
+            assert_eq!(too_long, None, "{name}");
+        }
+    }
 }

@@ -5,6 +5,7 @@ mod baselines;
 use std::path::Path;
 
 use rayon::iter::{IntoParallelRefIterator as _, ParallelIterator as _};
+use tandem_core::text::counted;
 use tandem_core::work::{EpisodeOrder, RunTerms};
 use tandem_core::{AdviceTerms, Episode, Exploration, Layout, TaskSpec, WorldSettings};
 use tandem_picture::FilmEpisode;
@@ -96,7 +97,8 @@ fn print(args: &EvalArgs, result: &EvaluationResult, baselines: &Baselines) -> R
         return output::print(baselines.json(result));
     }
     let (task, n_arms) = (result.task.name(), result.task.n_arms());
-    output::print(format_args!("task          {task}, arms {n_arms}, seed {}", args.seed))?;
+    let arms = counted(n_arms, "arm");
+    output::print(format_args!("task          {task}, {arms}, seed {}", args.seed))?;
     result.lines().iter().try_for_each(output::print)?;
     baselines.table(result).map_or(Ok(()), output::print)?;
     output::print(format_args!("speed         {:.0} env steps/s", result.steps_per_s))?;

@@ -7,6 +7,7 @@ use std::path::Path;
 use std::time::Duration;
 
 use serde_json::{Value, json};
+use tandem_core::text::counted;
 use tandem_core::{Episode, EpisodeOutcome, EvaluationSummary, Layout, TaskSpec, Wilson};
 use tandem_policy::{BlindActor, Policy};
 use tandem_sim::WorldConfig;
@@ -192,15 +193,18 @@ impl EvaluationResult {
         let mut lines = Vec::new();
         if let Some(without_contact) = summary.success_without_contact.filter(|_| n_arms > 1) {
             let without_contact = share("no contact", without_contact);
-            lines.push(format!("{without_contact}: success without contact between the arms"));
+            lines.push(format!("{without_contact}: success, arms never touch"));
         }
         lines.push(format!(
-            "{}, {} episodes",
+            "{}, {}",
             share("success", summary.success),
-            summary.n_episodes
+            counted(summary.n_episodes, "episode")
         ));
-        lines.push(share("joint norm", summary.success_joint));
-        let arms = summary.success_per_arm.iter().enumerate();
+        if n_arms > 1 {
+            let joint = share("joint goal", summary.success_joint);
+            lines.push(format!("{joint}: norm of all distances"));
+        }
+        let arms = summary.success_per_arm.iter().enumerate().filter(|_| n_arms > 1);
         lines.extend(arms.map(|(arm, success)| share(&format!("arm {}", arm + 1), *success)));
         let between_arms = summary.arm_contact_rate.filter(|_| n_arms > 1);
         let contacts =

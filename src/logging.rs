@@ -15,8 +15,15 @@ pub(crate) fn start(cli: &Cli) -> Result<(), Failed> {
         _ => LevelFilter::WARN,
     };
     let directives = cli.log.clone().or_else(rust_log);
-    let config = LogConfig { console: Some(level), file: None, directives };
+    let config =
+        LogConfig { console: Some(level), is_coloured: wants_colour(), file: None, directives };
     tandem_telemetry::logging::init(&config).or_exit(Exit::Usage, String::new)
+}
+
+/// Returns false if `NO_COLOR` is set and not empty (<https://no-color.org>).
+#[expect(clippy::disallowed_methods, reason = "NO_COLOR is read once, before anything is logged")]
+fn wants_colour() -> bool {
+    std::env::var_os("NO_COLOR").is_none_or(|value| value.is_empty())
 }
 
 #[expect(clippy::disallowed_methods, reason = "RUST_LOG is read once, before anything is logged")]

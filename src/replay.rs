@@ -8,9 +8,9 @@ use indicatif::ProgressBar;
 use rayon::iter::{IntoParallelIterator as _, ParallelIterator as _};
 use serde_json::{Value, json};
 use tandem_core::TaskSpec;
-use tandem_core::text::error_chain;
+use tandem_core::text::{counted, error_chain};
 use tandem_picture::FilmEpisode;
-use tandem_telemetry::{EpisodeLog, LoggedTransition, read_episode};
+use tandem_telemetry::{EpisodeLog, read_episode};
 use tandem_worker::EnvironmentConfig;
 use tandem_worker::record::{RecordError, world_of};
 use tandem_worker::replay::{replay_log, replay_log_on};
@@ -24,6 +24,8 @@ use crate::{access, film, output, runtime};
 
 /// Maximum number of logs in a film.
 const MAX_FILMED: usize = 100;
+
+mod steps;
 
 /// A log that was simulated again.
 struct Replayed {
@@ -52,7 +54,7 @@ pub(crate) fn replay(args: &ReplayArgs) -> Result<(), Failed> {
     }
     let is_printed = !args.verify && !args.json && args.film.film.is_none();
     let printed = if let ([file], true) = (files.as_slice(), is_printed) {
-        print_steps(file)?;
+        steps::print(file)?;
         true
     } else {
         false
@@ -68,8 +70,16 @@ pub(crate) fn replay(args: &ReplayArgs) -> Result<(), Failed> {
     {
         return output::print(format_args!("not compared: {error}"));
     }
-    print_result(&replayed, args.json)?;
-    result(&replayed)
+    let (trials, episodes): (Vec<Replayed>, Vec<Replayed>) =
+        replayed.into_iter().partition(Replayed::is_trial);
+    // Logs of trials beside episodes are expected: a directory of runs may contain both.
+    match (trials.as_slice(), episodes.as_slice()) {
+        ([trial, ..], []) => Err(trial.only_trials(trials.len())),
+        _ => {
+            print_result(&episodes, &trials, args.json)?;
+            result(&episodes)
+        }
+    }
 }
 
 /// Simulates the logged episodes again, for a film.
@@ -123,10 +133,19 @@ fn result(replayed: &[Replayed]) -> Result<(), Failed> {
     match (problems(&bad).as_slice(), problems(&not_simulated).as_slice()) {
         ([], []) => Ok(()),
         ([problem], _) => Err(Failed::new(Exit::Data, anyhow!("{problem}"))),
-        ([first, ..], _) => Err(Failed::new(
-            Exit::Data,
-            anyhow!("{} logs differ or cannot be read, the first: {first}", bad.len()),
-        )),
+        ([first, ..], _) => {
+            let n_differing = bad.iter().filter(|log| log.differs()).count();
+            let counts = [
+                (n_differing, "differ", "differs"),
+                (bad.len() - n_differing, "cannot be read", "cannot be read"),
+            ];
+            let counts = counts.into_iter().filter(|(n, ..)| *n > 0).map(|(n, many, one)| {
+                let verb = if n == 1 { one } else { many };
+                format!("{} {verb}", counted(n, "log"))
+            });
+            let counts = counts.collect::<Vec<_>>().join(", ");
+            Err(Failed::new(Exit::Data, anyhow!("{counts}, the first: {first}")))
+        }
         ([], [problem]) => Err(Failed::usage(problem)),
         ([], [first, ..]) => Err(Failed::usage(format!(
             "{} logs were not simulated again, the first: {first}",
@@ -223,6 +242,28 @@ impl Replayed {
         matches!(self.outcome, Err(RecordError::NoSimulator { .. }))
     }
 
+    /// Returns whether the file is the log of a trial instead of an episode.
+    const fn is_trial(&self) -> bool {
+        matches!(self.outcome, Err(RecordError::Log(tandem_telemetry::Error::TrialLog { .. })))
+    }
+
+    /// Returns whether the simulation differs from the log.
+    const fn differs(&self) -> bool {
+        matches!(self.outcome, Err(RecordError::Differs { .. }))
+    }
+
+    /// Returns the error of a command that found `n_trials` logs of trials, this one first, and no episode.
+    fn only_trials(&self, n_trials: usize) -> Failed {
+        let first = self.problem().unwrap_or_default();
+        let message = match n_trials {
+            1 => first,
+            _ => {
+                format!("no log of an episode among {n_trials} logs of trials, the first: {first}")
+            }
+        };
+        Failed::new(Exit::Data, anyhow!("{message}"))
+    }
+
     /// Describes the problem on one line; `None` if the episode is equal.
     fn problem(&self) -> Option<String> {
         let error = self.outcome.as_ref().err()?;
@@ -234,47 +275,7 @@ impl Replayed {
     }
 }
 
-fn print_steps(file: &Path) -> Result<(), Failed> {
-    let log = read_episode(file).or_exit(Exit::Data, String::new)?;
-    let task = &log.metadata.layout;
-    output::print(format_args!("episode {} of {}", log.metadata.episode, file.display()))?;
-    output::print(format_args!(
-        "task {}, arms {}, tolerance {}",
-        task.name(),
-        task.n_arms(),
-        task.tolerance()
-    ))?;
-    for (step_idx, step) in log.transitions.iter().enumerate() {
-        let LoggedTransition { observation, goal, reward, action, .. } = step;
-        let distances = distances(task, observation, goal);
-        let advised = advised_text(task, step.advised_arms);
-        output::print(format_args!(
-            "step {step_idx:>2}  reward {reward:>4.1}  distance {distances}{advised}  action {action:?}"
-        ))?;
-    }
-    let last = log.last_observation.as_ref().zip(log.transitions.last());
-    last.map_or(Ok(()), |(observation, LoggedTransition { goal, .. })| {
-        let is_success = task.is_success(observation, goal);
-        let result = if is_success { "success" } else { "failure" };
-        let distances = distances(task, observation, goal);
-        output::print(format_args!("{result}  distance {distances}"))
-    })
-}
-
-/// Returns the distance of each arm from its goal, and that of the arms together from the goal common to them.
-fn distances(task: &TaskSpec, observation: &[f32], goal: &[f32]) -> String {
-    let distances = task.goal_distances(observation, goal);
-    distances.iter().map(|distance| format!("{distance:.4}")).collect::<Vec<_>>().join(" ")
-}
-
-/// Names the arms that executed the teacher's action.
-fn advised_text(task: &TaskSpec, advised_arms: u8) -> String {
-    let advised = task.arms().filter(|arm| advised_arms >> arm.0 & 1 == 1);
-    let arms: Vec<String> = advised.map(|arm| arm.0.to_string()).collect();
-    if arms.is_empty() { String::new() } else { format!("  advised arm {}", arms.join(" ")) }
-}
-
-fn print_result(replayed: &[Replayed], json: bool) -> Result<(), Failed> {
+fn print_result(replayed: &[Replayed], trials: &[Replayed], json: bool) -> Result<(), Failed> {
     let (n_episodes, n_equal) =
         (replayed.len(), replayed.iter().filter(|log| log.outcome.is_ok()).count());
     let cut_short = replayed.iter().filter(|log| log.cut_short && !log.is_not_simulated());
@@ -285,15 +286,15 @@ fn print_result(replayed: &[Replayed], json: bool) -> Result<(), Failed> {
         .map(|log| log.file.as_path())
         .collect();
     let bad = || replayed.iter().filter(|log| log.outcome.is_err() && !log.is_not_simulated());
+    let trials: Vec<&Path> = trials.iter().map(|log| log.file.as_path()).collect();
     if json {
-        let (differing, unreadable): (Vec<&Replayed>, _) =
-            bad().partition(|log| matches!(log.outcome, Err(RecordError::Differs { .. })));
+        let (differing, unreadable): (Vec<&Replayed>, _) = bad().partition(|log| log.differs());
         let [differing, unreadable] =
             [differing, unreadable].map(|logs| logs.into_iter().map(problem_json).collect());
         let (differing, unreadable): (Value, Value) = (differing, unreadable);
         output::print(json!({
             "episodes": n_episodes, "equal": n_equal, "differing": differing, "unreadable": unreadable,
-            "not_simulated": not_simulated, "cut_short": cut_short,
+            "not_simulated": not_simulated, "cut_short": cut_short, "trials": trials,
         }))?;
         return Ok(());
     }
@@ -301,6 +302,9 @@ fn print_result(replayed: &[Replayed], json: bool) -> Result<(), Failed> {
     output::print(format_args!("{n_equal} of {n_episodes} episodes equal bit for bit"))?;
     if !not_simulated.is_empty() {
         output::print(format_args!("{} of them not simulated again", not_simulated.len()))?;
+    }
+    if !trials.is_empty() {
+        output::print(format_args!("{} left out", counted(trials.len(), "trial log")))?;
     }
     if !cut_short.is_empty() {
         output::print(format_args!(

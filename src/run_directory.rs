@@ -1,11 +1,62 @@
 //! Run directories.
 
 use std::io::ErrorKind;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use anyhow::anyhow;
 
 use crate::exit::{Exit, Failed};
+use crate::run_file;
+
+/// The directory that holds the runs without `--out`.
+pub(crate) const RUNS: &str = "runs";
+
+/// Runs that a message names.
+const MAX_NAMED_RUNS: usize = 5;
+
+/// Returns the round of the newest checkpoint of the run in `out`, if there is one.
+pub(crate) fn saved_round(out: &Path) -> Option<u64> {
+    let checkpoints = tandem_learner::checkpoint::list(&out.join("checkpoint"));
+    checkpoints.last()?.file_stem()?.to_str()?.parse().ok()
+}
+
+/// Returns how far the run in `out` is: `complete`, `saved after round 6`, or `not saved yet`.
+pub(crate) fn state(out: &Path) -> String {
+    let Some(round) = saved_round(out) else { return "not saved yet".to_owned() };
+    let is_complete = run_file::resolve(Some(&out.join("run.toml")), &[]).is_ok_and(|run| {
+        let limit = run.stop.max_env_steps;
+        limit > 0 && round * run.env_steps_per_round() >= limit
+    });
+    if is_complete { "complete".to_owned() } else { format!("saved after round {round}") }
+}
+
+/// Returns the error about a directory that holds no run to resume, with runs that can be resumed.
+pub(crate) fn no_run(problem: &str) -> Failed {
+    let runs = runs_in(Path::new(RUNS));
+    let named: Vec<String> = runs
+        .iter()
+        .take(MAX_NAMED_RUNS)
+        .map(|run| format!("{} ({})", run.display(), state(run)))
+        .collect();
+    let more = match runs.len().saturating_sub(MAX_NAMED_RUNS) {
+        0 => String::new(),
+        n => format!(" and {n} more"),
+    };
+    Failed::usage(match named.is_empty() {
+        true => problem.to_owned(),
+        false => format!("{problem}; there are: {}{more}", named.join(", ")),
+    })
+}
+
+/// Returns the directories in `parent` that hold runs, in the order of their names.
+fn runs_in(parent: &Path) -> Vec<PathBuf> {
+    let entries = std::fs::read_dir(parent).into_iter().flatten();
+    let directories = entries.filter_map(|entry| Some(entry.ok()?.path()));
+    let mut runs: Vec<PathBuf> =
+        directories.filter(|directory| directory.join("run.toml").is_file()).collect();
+    runs.sort();
+    runs
+}
 
 /// Rejects a path at which no directory can be created: a file, or a path below one.
 pub(crate) fn check_path(out: &Path) -> Result<(), Failed> {

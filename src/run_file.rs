@@ -20,6 +20,9 @@ mod former;
 /// The section that describes a task which is not built-in. It is one value: its keys are no settings of their own.
 const DESCRIPTION: &str = "description";
 
+/// Evaluations after the initial one that a run with a limit of environment steps has at least.
+const MIN_REGULAR_EVALUATIONS: u64 = 5;
+
 /// The length to which texts in messages are shortened, in characters.
 const MAX_SHOWN_CHARS: usize = 80;
 
@@ -117,6 +120,7 @@ fn overlay(from_file: Table, settings: &[(String, Value)]) -> anyhow::Result<Run
         // A time limit that is set replaces the recipe's number of steps.
         config.stop.max_env_steps = 0;
     }
+    set_evaluation_schedule(&mut config, &changes);
     let config = config.checked().map_err(in_one_line)?;
     if !config.advice.starts_from_teacher() {
         let strategy = config.advice.strategy.parse::<Strategy>();
@@ -125,6 +129,26 @@ fn overlay(from_file: Table, settings: &[(String, Value)]) -> anyhow::Result<Run
         })?;
     }
     Ok(config)
+}
+
+/// Shortens the interval between evaluations for a run of few environment steps, unless the interval is set. A run that
+/// sets it, or whose interval is shortened, has fewer early evaluations.
+fn set_evaluation_schedule(config: &mut RunConfig, changes: &Table) {
+    let is_set = |key| changes.get("evaluation").is_some_and(|section| section.get(key).is_some());
+    let evaluation = &mut config.evaluation;
+    let shortest = config.stop.max_env_steps / MIN_REGULAR_EVALUATIONS;
+    let is_short = (1..evaluation.every_env_steps).contains(&shortest);
+    let n_early = match is_set("every_env_steps") {
+        true => 0,
+        false if is_short => {
+            evaluation.every_env_steps = shortest;
+            1
+        }
+        false => evaluation.early_points,
+    };
+    if !is_set("early_points") {
+        evaluation.early_points = n_early;
+    }
 }
 
 /// Formats an error on one line, with long texts shortened.

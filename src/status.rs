@@ -4,15 +4,17 @@ use std::time::Duration;
 
 use anyhow::anyhow;
 use serde_json::{Value, json};
+use tandem_core::text::counted;
 use tandem_net::AuthChannel;
 use tandem_proto::pb;
 use tandem_proto::pb::learner_client::LearnerClient;
 use tonic::{Code, Response, Status};
 
 use crate::cli::StatusArgs;
+use crate::columns::wrapped;
 use crate::exit::{Exit, Failed, OrExit as _};
-use crate::progress_text::{counts_line, evaluation_line, grouped};
-use crate::{access, output, runtime};
+use crate::progress_text::{counts_line, evaluation_line, remaining_s, state_lines, warning_line};
+use crate::{access, call_failure, output, runtime};
 
 /// Timeout of a call.
 const TIMEOUT: Duration = Duration::from_secs(10);
@@ -84,29 +86,26 @@ fn failed(status: &Status) -> Failed {
         Code::Unauthenticated | Code::Unimplemented => Exit::Usage,
         _ => Exit::TryAgain,
     };
-    Failed::new(exit, anyhow!("{}", status.message()))
+    call_failure::failed(exit, status, "tandem train")
 }
 
 fn lines(progress: &pb::Progress) -> Vec<String> {
     if progress.task.is_empty() {
         return vec!["starting".to_owned()];
     }
-    let phase = if progress.ended { &progress.end_reason } else { &progress.phase };
-    let mut lines = vec![format!("{}: {phase}", counts_line(progress))];
+    let arms = counted(usize::try_from(progress.n_arms).unwrap_or_default(), "arm");
+    let title = format!("{} with {arms}, strategy {}", progress.task, progress.strategy);
+    let mut lines = vec![wrapped(&title, "  "), counts_line(progress)];
     lines.extend(progress.evaluation.as_ref().map(|latest| evaluation_line(progress, latest)));
-    let best = |best: &pb::Evaluation| {
-        format!("best success {:.3} at {} env steps", best.success, grouped(best.env_steps))
-    };
-    lines.extend(progress.best.as_ref().map(best));
-    let (spent, left) = (grouped(progress.advice_spent), grouped(progress.budget_left));
-    lines.push(format!("advice spent {spent}, left {left}"));
-    let silent = progress.workers.iter().filter(|worker| worker.doing == "silent").count();
-    lines.push(format!("workers {}, silent {silent}", progress.workers.len() - silent));
+    lines.extend(state_lines(progress));
     if !progress.environment.is_empty() {
         lines.push(format!("environment: {}", progress.environment));
     }
     if !progress.warning.is_empty() {
-        lines.push(format!("warning: {}", progress.warning));
+        lines.push(warning_line(progress));
+    }
+    if progress.ended {
+        lines.push(format!("ended: {}", progress.end_reason));
     }
     lines
 }
@@ -130,6 +129,8 @@ fn progress_json(progress: &pb::Progress) -> Value {
         "workers": progress.workers.iter().map(worker).collect::<Vec<_>>(),
         "ended": progress.ended, "end_reason": progress.end_reason, "digest": progress.digest,
         "warning": progress.warning, "environment": progress.environment,
+        "max_env_steps": progress.max_env_steps, "max_minutes": progress.max_minutes,
+        "remaining_s": remaining_s(progress),
     })
 }
 
@@ -164,11 +165,13 @@ mod tests {
             warning: "the disk is full".to_owned(),
             ..Default::default()
         };
-        let lines = lines(&progress);
-        assert!(lines.contains(&"workers 2, silent 1".to_owned()), "{lines:?}");
-        assert_eq!(lines.last().expect("lines"), "warning: the disk is full");
-        assert!(lines[0].ends_with(": collecting"), "{lines:?}");
+        let text = lines(&progress).join("\n");
+        assert!(text.contains("slot 3") && text.contains("silent"), "{text}");
+        assert!(
+            text.contains("learner collecting") && text.ends_with("the disk is full"),
+            "{text}"
+        );
         let ended = pb::Progress { ended: true, end_reason: "done".to_owned(), ..progress };
-        assert!(super::lines(&ended)[0].ends_with(": done"));
+        assert_eq!(super::lines(&ended).last().map(String::as_str), Some("ended: done"));
     }
 }

@@ -15,6 +15,7 @@ use std::time::Duration;
 
 use anyhow::{Context as _, anyhow, bail};
 use serde_json::{Value, json};
+use tandem_core::text::counted;
 use tokio::task::JoinSet;
 use tokio_util::sync::CancellationToken;
 
@@ -231,7 +232,7 @@ fn print_plan(statuses: &[RunStatus], out: &Path, as_json: bool) -> Result<(), F
         let failure = failure.map_or_else(String::new, |why| format!(", failed before: {why}"));
         output::print(format_args!("{:<10}{}{failure}", status.state_name(), status.run.name))?;
     }
-    output::print(format_args!("{} runs in {}", statuses.len(), out.display()))
+    output::print(format_args!("{} in {}", counted(statuses.len(), "run"), out.display()))
 }
 
 fn print_result(statuses: &[RunStatus], out: &Path, as_json: bool) -> Result<(), Failed> {

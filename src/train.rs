@@ -22,7 +22,7 @@ use tokio_util::sync::CancellationToken;
 
 use crate::cli::TrainArgs;
 use crate::exit::{Exit, Failed, OrExit as _};
-use crate::{clock, runtime, served_task, signals};
+use crate::{clock, runtime, served_task, settings_page, signals};
 use display::Display;
 use inputs::RunInputs;
 use plan::Plan;
@@ -42,6 +42,9 @@ const SAMPLE_EVERY: Duration = Duration::from_millis(500);
 const INTERRUPTED: &str = "interrupted";
 
 pub(crate) fn train(args: &TrainArgs) -> Result<(), Failed> {
+    if args.list_settings {
+        return settings_page::print(args.json);
+    }
     let environment = environment_file::environment_of(args)?;
     let served = served_task::of_server(&environment)?;
     let plan = Plan::of(args, environment, served.as_ref())?;
@@ -53,7 +56,7 @@ pub(crate) fn train(args: &TrainArgs) -> Result<(), Failed> {
     let runtime = runtime::new().or_exit(Exit::TryAgain, String::new)?;
     let (last, memory) = runtime.block_on(async {
         let interrupted = signals::shutdown_token(args.exit_with_stdin)?;
-        run((&plan, &lock), &interrupted).await
+        run((&plan, &lock), &interrupted, args.quiet).await
     })?;
     drop(inputs);
     if last.end_reason == INTERRUPTED {
@@ -67,8 +70,9 @@ pub(crate) fn train(args: &TrainArgs) -> Result<(), Failed> {
 async fn run(
     (plan, lock): (&Plan, &RunLock),
     interrupted: &CancellationToken,
+    is_quiet: bool,
 ) -> Result<(pb::Progress, PeakMemory), Failed> {
-    let mut display = Display::new(plan);
+    let mut display = Display::new(plan, is_quiet);
     let mut processes = RunProcesses::new(plan).or_cannot_write(String::new)?;
     let started = tokio::select! {
         started = start(plan, &mut processes, &display) => started,

@@ -262,6 +262,12 @@ fn a_command_that_dials_the_wrong_service_ends_and_names_it() {
     ] {
         let line = fails_with(64, workspace.run(&command));
         assert!(line.contains(expected), "{command:?}: {line}");
+        let hint = match (command[0].as_str(), expected == &is_learner) {
+            ("status" | "bridge", true) => format!("`tandem status {learner}`"),
+            ("status" | "bridge", false) => format!("`tandem health {teacher}`"),
+            _ => continue,
+        };
+        assert!(line.contains(&hint), "{command:?}: {line}");
     }
 }
 

@@ -16,7 +16,8 @@ use tandem_core::{
 use tandem_policy::{Actor, Policy};
 use tandem_sim::{Env, WorldConfig};
 use tandem_telemetry::{
-    EpisodeLog, EpisodeMetadata, EpisodeRecorder, TransitionRecord, read_episode, recover,
+    EpisodeLog, EpisodeMetadata, EpisodeRecorder, TransitionRecord, TrialMetadata, TrialOutcome,
+    TrialRecorder, read_episode, recover,
 };
 use tandem_worker::ports::{AdvisorGone, Simulator};
 use tandem_worker::record::{log_name, metadata_of, record_episode, world_of};
@@ -204,7 +205,7 @@ fn three_hundred_episodes_of_every_kind_replay_bit_for_bit() {
     let as_json = tandem(&["replay", "--json"], &[keep.path(), &logs[0]]);
     let expected = json!({
         "episodes": 301, "equal": 301, "differing": [], "unreadable": [], "not_simulated": [],
-        "cut_short": [],
+        "cut_short": [], "trials": [],
     });
     assert_eq!(summary(&as_json), expected);
 }
@@ -322,12 +323,16 @@ fn a_log_of_a_described_task_is_printed_but_needs_its_environments_to_be_compare
     let printed = tandem(&["replay"], &[&described]);
     assert!(printed.status.success() && printed.stderr.is_empty(), "{printed:?}");
     let lines: Vec<String> = stdout(&printed).lines().map(str::to_owned).collect();
-    assert_eq!(lines[1], "task lab/pick, arms 2, tolerance 0.05");
-    assert!(lines[2].starts_with("step  0  reward -1.0  distance 0."), "{}", lines[2]);
-    let n_advised = lines.iter().filter(|line| line.contains("  advised arm ")).count();
+    assert_eq!(lines[1], "task lab/pick, 2 arms, tolerance 0.05");
+    assert!(lines[2].starts_with("step  arm 0, from its goal"), "{}", lines[2]);
+    assert!(lines[3].starts_with("   0  0."), "{}", lines[3]);
+    assert!(lines[3..].iter().take(50).all(|line| line.chars().count() <= 80), "{lines:?}");
+    let n_advised = lines.iter().filter(|line| line.contains(", advised")).count();
     assert_eq!(n_advised, log.transitions.iter().filter(|step| step.advised_arms != 0).count());
-    let [.., outcome, last] = lines.as_slice() else { panic!("{lines:?}") };
-    assert!(outcome.contains("success  distance ") || outcome.contains("failure  distance "));
+    let [.., end, outcome, last] = lines.as_slice() else { panic!("{lines:?}") };
+    assert!(end.starts_with(" end  0."), "{end}");
+    let all_at_goal = end.matches("at goal").count() == 2;
+    assert_eq!(outcome, if all_at_goal { "success" } else { "failure" });
     assert!(last.starts_with("not compared: the episode is of task \"lab/pick\""), "{last}");
 
     let verified = tandem(&["replay", "--verify"], &[&described]);
@@ -339,12 +344,51 @@ fn a_log_of_a_described_task_is_printed_but_needs_its_environments_to_be_compare
     assert_eq!(both.status.code(), Some(64));
     let expected = json!({
         "episodes": 2, "equal": 1, "differing": [], "unreadable": [],
-        "not_simulated": [described], "cut_short": [],
+        "not_simulated": [described], "cut_short": [], "trials": [],
     });
     assert_eq!(summary(&both), expected);
     fs::write(keep.path().join("garbage.mcap"), "garbage").expect("written");
     let all = tandem(&["replay", "--verify"], &[keep.path()]);
     assert_eq!(all.status.code(), Some(65), "the unreadable log is the worse problem");
+}
+
+#[test]
+fn logs_of_trials_are_left_out_and_named_if_there_is_nothing_else() {
+    let keep = tempfile::tempdir().expect("a directory");
+    let log = one_log(keep.path());
+    let trial = keep.path().join("trial.mcap");
+    let metadata = TrialMetadata {
+        policy: "student".to_owned(),
+        layout: Layout::new(Task::Push, 2),
+        mode: "closed-loop".to_owned(),
+        trial: 0,
+        seed: 1,
+        policy_digest: "d".to_owned(),
+        driver: "simulated".to_owned(),
+        speed: 1.0,
+        block_half_m: 0.028,
+    };
+    let recorder = TrialRecorder::create(&trial, &metadata).expect("created");
+    recorder.finish(&TrialOutcome::default()).expect("complete");
+
+    let both = tandem(&["replay", "--verify"], &[keep.path()]);
+    assert!(both.status.success() && both.stderr.is_empty(), "{both:?}");
+    assert_eq!(stdout(&both), "1 of 1 episodes equal bit for bit\n1 trial log left out\n");
+    for args in [&["replay"][..], &["replay", "--verify"]] {
+        let alone = tandem(args, &[&trial]);
+        assert_eq!(alone.status.code(), Some(65));
+        let line = error_line(&alone);
+        assert!(line.contains("log of a trial") && line.contains("Foxglove"), "{line}");
+    }
+    fs::write(keep.path().join("garbage.mcap"), "garbage").expect("written");
+    fs::write(keep.path().join("more.mcap"), "garbage").expect("written");
+    let all = tandem(&["replay", "--verify"], &[keep.path(), &log]);
+    assert_eq!(all.status.code(), Some(65));
+    let line = error_line(&all);
+    assert!(
+        line.contains("2 logs cannot be read, the first") && !line.contains("differ"),
+        "{line}"
+    );
 }
 
 #[test]

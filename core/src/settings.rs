@@ -7,12 +7,13 @@
 
 use std::fmt::Display;
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::episode::EpisodeKind;
 
 /// Section `[exploration]`: how training episodes explore.
-#[derive(Debug, Clone, Copy, PartialEq, Deserialize, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Deserialize, JsonSchema, Serialize)]
 #[serde(deny_unknown_fields)]
 pub struct Exploration {
     /// Standard deviation of the Gaussian noise added to every action component, 0 to 10.
@@ -65,7 +66,7 @@ pub struct AdviceTerms {
 }
 
 /// The action of the student that the teacher judges.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Deserialize, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Deserialize, JsonSchema, Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum JudgedAction {
     /// The action that the student is about to execute, exploration included.
@@ -76,7 +77,7 @@ pub enum JudgedAction {
 }
 
 /// What a unit of the advice budget pays for.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Deserialize, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Deserialize, JsonSchema, Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum AdviceUnit {
     /// One step of one episode.
@@ -88,7 +89,7 @@ pub enum AdviceUnit {
 
 /// Section `[world]`: how training episodes start, and how finely all episodes are simulated. The default is how
 /// policies are evaluated.
-#[derive(Debug, Clone, Copy, PartialEq, Deserialize, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Deserialize, JsonSchema, Serialize)]
 #[serde(deny_unknown_fields)]
 pub struct WorldSettings {
     /// Probability that a training episode starts with the objects grasped (pick and place), in [0, 1].

@@ -96,14 +96,14 @@ pub enum Reason {
         .0.got.to_degrees(), .0.allowed.to_degrees())]
     Tilt(Excess),
     /// A part of the arm, named, is too close to the table; metres.
-    #[error("the {} is {:.1} mm above the table, at least {:.1}", .0, .1.got * 1e3, .1.allowed * 1e3)]
+    #[error("the {} is {:.2} mm above the table, at least {:.2}", .0, .1.got * 1e3, .1.allowed * 1e3)]
     TableGap(&'static str, Excess),
     /// Parts of two arms are too close to each other: the other arm, both parts; metres.
-    #[error("the {} is {:.1} mm from the {} of arm {}, at least {:.1}",
+    #[error("the {} is {:.2} mm from the {} of arm {}, at least {:.2}",
         .1[0], .2.got * 1e3, .1[1], .0.0, .2.allowed * 1e3)]
     ArmsGap(ArmIndex, [&'static str; 2], Excess),
     /// Two parts of one arm, named, are too close to each other; metres.
-    #[error("the {} is {:.1} mm from the arm's own {}, at least {:.1}",
+    #[error("the {} is {:.2} mm from the arm's own {}, at least {:.2}",
         .0[1], .1.got * 1e3, .0[0], .1.allowed * 1e3)]
     SelfGap([&'static str; 2], Excess),
 }

@@ -16,6 +16,10 @@ pub(crate) struct Progress {
     pub(crate) counters: Counters,
     /// Seconds of wall time, summed over resumed parts.
     pub(crate) wall_s: f64,
+    /// Environment steps after which the run ends; 0 for no limit.
+    pub(crate) max_env_steps: u64,
+    /// Minutes of wall time after which the run ends; 0 for no limit.
+    pub(crate) max_minutes: f64,
     /// Recent environment steps per second.
     pub(crate) env_steps_per_s: f64,
     /// Recent updates per second.

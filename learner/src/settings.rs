@@ -8,8 +8,13 @@ use tandem_rl::config::{RunConfig, former_keys};
 
 /// Settings that may change when a run resumes: its limits, and what is saved, logged and tested. All others affect
 /// learning.
-const FREE: [&str; 4] =
-    ["stop.", "checkpoint.", "evaluation.recorded_episodes", "evaluation.test_episodes"];
+const FREE: [&str; 5] = [
+    "stop.",
+    "checkpoint.",
+    "evaluation.early_points",
+    "evaluation.recorded_episodes",
+    "evaluation.test_episodes",
+];
 
 /// Longest value in a message; the parts of a task's description may be long.
 const MAX_SHOWN_CHARS: usize = 80;
@@ -33,8 +38,9 @@ impl fmt::Display for Changed {
 }
 
 /// Advice about a setting that differs.
-pub const ADVICE: &str = "only stop.*, checkpoint.*, evaluation.recorded_episodes and evaluation.test_episodes may \
-                          change when a run is resumed: keep the original value, or start a new run";
+pub const ADVICE: &str = "only stop.*, checkpoint.*, evaluation.early_points, evaluation.recorded_episodes and \
+                          evaluation.test_episodes may change when a run is resumed: keep the original value, or \
+                          start a new run";
 
 /// Returns the settings as one JSON object, with the shortest form of each number.
 #[must_use]

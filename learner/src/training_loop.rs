@@ -108,6 +108,10 @@ impl LearnerLoop<'_> {
         if !self.open_round(self.trainer.counters().round, self.acting.version)? {
             return Ok(StopReason::Interrupted);
         }
+        if self.trainer.counters().round == 0 && self.evaluations.is_due(0) {
+            self.schedule_evaluation(&self.trainer.stats());
+            self.order_evaluation();
+        }
         loop {
             if let Some(stop) = self.stop_reason() {
                 return Ok(stop);

@@ -16,6 +16,9 @@ use tower::Service;
 use crate::tls_probe::FirstByte;
 use crate::wrong_service::unknown_call;
 
+/// Part of the message of a call to an address at which no process listens.
+pub const NOTHING_LISTENS: &str = "nothing listens there";
+
 /// A channel that connects on first use, reconnects after a loss, and sends the token, if there is one, with each call.
 ///
 /// A call that does not reach the service, or that the service rejects for its token, fails with a status whose message
@@ -102,6 +105,9 @@ impl Target {
             (true, _) if is_certificate_rejected(&error) => {
                 format!("{address} is not trusted, see --tls-ca: {chain}")
             }
+            _ if is_connection_refused(&error) => {
+                format!("{address} does not answer: {NOTHING_LISTENS}")
+            }
             _ => format!("{address} does not answer: {chain}"),
         };
         match Status::from_error(Box::new(error)).code() {
@@ -109,6 +115,12 @@ impl Target {
             _ => Status::unavailable(message),
         }
     }
+}
+
+/// Returns whether the machine at the address has rejected the connection because no process listens.
+fn is_connection_refused(error: &(dyn Error + 'static)) -> bool {
+    let kinds = causes(error).filter_map(|cause| cause.downcast_ref::<std::io::Error>());
+    kinds.map(std::io::Error::kind).any(|kind| kind == std::io::ErrorKind::ConnectionRefused)
 }
 
 /// Returns whether the client rejected the service's certificate.

@@ -38,7 +38,7 @@ mod wrong_service;
 pub use access::{AccessError, Token, TokenError, is_exposed};
 pub use admission::Capacity;
 pub use block_on::block_on;
-pub use channel::AuthChannel;
+pub use channel::{AuthChannel, NOTHING_LISTENS};
 pub use client::{ClientConfig, ClientConfigError};
 pub use connection::{ConnectInfo, Connection, ConnectionClosed, MarkRequest, MarkRequestLayer};
 pub use encoded_response::EncodedResponse;
@@ -50,6 +50,7 @@ pub use serve::{SHUTDOWN_GRACE, serve};
 pub use server::{Router, ServerConfig, ServerConfigError, TokenInterceptor};
 pub use text_endpoint::TextEndpoint;
 pub use tls::TlsError;
+pub use wrong_service::WrongService;
 
 /// The largest message that services and clients accept, in bytes: several times the episodes of a slot or the
 /// parameters of a large actor.

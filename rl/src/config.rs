@@ -2,6 +2,7 @@
 //!
 //! A recipe gives each setting a value; a run file and `--set` override values. Unknown keys are refused.
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use tandem_core::layout::UnknownTask;
 use tandem_core::settings::OutOfRange;
@@ -23,7 +24,7 @@ pub use checks::is_name;
 pub use recipe::Recipe;
 
 /// The resolved settings of a run.
-#[derive(Debug, Clone, PartialEq, Deserialize, Serialize)]
+#[derive(Debug, Clone, PartialEq, Deserialize, JsonSchema, Serialize)]
 #[serde(deny_unknown_fields)]
 pub struct RunConfig {
     /// Name of the run, and of its account at the teacher: 1 to 100 letters, digits, `-`, `_` or `.`.
@@ -32,8 +33,8 @@ pub struct RunConfig {
     pub task: String,
     /// Arms of the learning policy: 1 or 2, or those of `description`.
     pub arms: usize,
-    /// Seed of every random number of the run; must differ from `evaluation.seed` and from the
-    /// [seed of the test goals](tandem_core::evaluation::TEST_SEED).
+    /// Seed of every random number of the run. It differs from `evaluation.seed` and from 777, the seed of the test
+    /// goals.
     pub seed: u64,
     /// The recipe that the defaults come from.
     pub recipe: Recipe,
@@ -41,7 +42,7 @@ pub struct RunConfig {
     pub behaviour: Behaviour,
     /// The teacher's strategy and budget.
     pub advice: AdviceConfig,
-    /// The composition of a round.
+    /// The composition of a round: episodes, updates and their order.
     pub rounds: RoundsConfig,
     /// Exploration in training episodes.
     pub exploration: Exploration,
@@ -60,11 +61,12 @@ pub struct RunConfig {
     /// The task, unless it is built-in: a section of the run file, or the path of a TOML file with its fields, relative
     /// to the run file.
     #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schemars(skip)]
     pub description: Option<TaskDescription>,
 }
 
 /// The network whose parameters the workers act with.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize, JsonSchema, Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Behaviour {
     /// The Polyak-averaged network (the paper, section 4.1).
@@ -77,10 +79,11 @@ pub enum Behaviour {
 pub const INIT_TEACHER: &str = "init:teacher";
 
 /// Section `[advice]`.
-#[derive(Debug, Clone, PartialEq, Deserialize, Serialize)]
+#[derive(Debug, Clone, PartialEq, Deserialize, JsonSchema, Serialize)]
 #[serde(deny_unknown_fields)]
 pub struct AdviceConfig {
-    /// `none`, `ea`, `eamc:T`, `mc-q:T`, `mc-act:A` or `mc-act-abs:A` (section 3.2 of the paper), or [`INIT_TEACHER`].
+    /// Advising strategy and its threshold (the paper, section 3.2), or `init:teacher`: no advice, the student starts
+    /// as a copy of the teacher for each arm.
     pub strategy: String,
     /// Units of advice, at most 10^12 for the whole run (paper: 500,000).
     pub budget: u64,
@@ -101,7 +104,7 @@ pub struct AdviceConfig {
 }
 
 /// The part of a run that a budget of advice is for.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Deserialize, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Deserialize, JsonSchema, Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum BudgetScope {
     /// All slots of the run.
@@ -138,7 +141,7 @@ impl AdviceConfig {
 }
 
 /// Section `[rounds]`.
-#[derive(Debug, Clone, PartialEq, Deserialize, Serialize)]
+#[derive(Debug, Clone, PartialEq, Deserialize, JsonSchema, Serialize)]
 #[serde(deny_unknown_fields)]
 pub struct RoundsConfig {
     /// Slots per round, 1 to 4096 (paper: 16, one per worker).
@@ -165,7 +168,7 @@ const fn cycles_per_epoch() -> u64 {
 }
 
 /// When the target networks are averaged.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize, JsonSchema, Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum PolyakEvery {
     /// After every update.
@@ -175,11 +178,16 @@ pub enum PolyakEvery {
 }
 
 /// Section `[evaluation]`.
-#[derive(Debug, Clone, PartialEq, Deserialize, Serialize)]
+#[derive(Debug, Clone, PartialEq, Deserialize, JsonSchema, Serialize)]
 #[serde(deny_unknown_fields)]
 pub struct EvaluationConfig {
-    /// Environment steps between two evaluations.
+    /// Environment steps between two evaluations; without a value a fifth of `stop.max_env_steps`, at most the
+    /// recipe's.
     pub every_env_steps: u64,
+    /// Further evaluations before the first regular one, 0 to 100: of the initial policy, then evenly spaced. A run
+    /// file that sets `evaluation.every_env_steps` has none unless it sets them.
+    #[serde(default)]
+    pub early_points: u64,
     /// Fixed goals per evaluation, 1 to 100,000 (paper: 240).
     pub episodes: u64,
     /// Seed of the goals with which a run selects its best policy. Reports use another one.
@@ -191,7 +199,7 @@ pub struct EvaluationConfig {
 }
 
 /// Section `[stop]`: a run ends at the first of these limits; 0 means no limit.
-#[derive(Debug, Clone, PartialEq, Deserialize, Serialize)]
+#[derive(Debug, Clone, PartialEq, Deserialize, JsonSchema, Serialize)]
 #[serde(deny_unknown_fields)]
 pub struct StopConfig {
     /// Success rate of an evaluation, in [0, 1].
@@ -203,7 +211,7 @@ pub struct StopConfig {
 }
 
 /// Section `[checkpoint]`.
-#[derive(Debug, Clone, PartialEq, Deserialize, Serialize)]
+#[derive(Debug, Clone, PartialEq, Deserialize, JsonSchema, Serialize)]
 #[serde(deny_unknown_fields)]
 pub struct CheckpointConfig {
     /// Rounds between two checkpoints, at least 1.
@@ -296,6 +304,18 @@ impl RunConfig {
         let max = self.stop.max_env_steps;
         let first = (1.0 - f64::from(self.ddpg.cooldown_share)) * max as f64;
         max > 0 && (round * self.env_steps_per_round()) as f64 >= first
+    }
+
+    /// Returns true if the parameters after `round` rounds are evaluated: those of every
+    /// [`rounds_per_evaluation`](Self::rounds_per_evaluation), and the early ones.
+    #[must_use]
+    pub fn is_evaluated(&self, round: u64) -> bool {
+        let (regular, n_early) = (self.rounds_per_evaluation(), self.evaluation.early_points);
+        if round >= regular {
+            return round.is_multiple_of(regular);
+        }
+        let early = |point| u128::from(point) * u128::from(regular) / u128::from(n_early);
+        (0..n_early).any(|point| early(point) == u128::from(round))
     }
 
     /// Returns the cost of a contact in round `round`, from 0.

@@ -12,6 +12,7 @@ use std::time::Duration;
 use anyhow::Context as _;
 use tandem_bench::{Clock, IdleWorkers};
 use tandem_core::layout::EPISODE_STEPS;
+use tandem_core::text::counted;
 use tandem_system::fd_limit;
 
 use crate::cli::ScaleArgs;
@@ -66,7 +67,7 @@ async fn measure(args: &ScaleArgs, n_joining: usize) -> anyhow::Result<Scale> {
     if let Some(n_slots) = numbers.last() {
         let learner = workspace.learner("real", *n_slots, args.updates_per_env_step).await?;
         for n_workers in &numbers {
-            log_progress(&format!("{n_workers} real workers"));
+            log_progress(&counted(*n_workers, "real worker"));
             let bench = real::RealWorkerBench {
                 workspace: &workspace,
                 learner: &learner,

@@ -17,8 +17,8 @@ const STEP_S: f64 = 0.04;
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct MotionFile {
-    /// Fraction of the motion's own speed, in (0, 1].
-    speed: f64,
+    /// Fraction of the motion's own speed, in (0, 1]; the command line can give it instead.
+    speed: Option<f64>,
     /// Positions of the tools; each waypoint has one entry per arm.
     way_points: Option<Vec<Vec<FileWaypoint>>>,
     /// Whether the path begins at the current positions of the tools; only with waypoints. The default is true.
@@ -74,7 +74,8 @@ pub(super) fn read(path: &Path, speed: Option<f64>) -> Result<pb::MotionRequest,
     let text = input::text(path).or_exit(Exit::Data, cannot_read)?;
     let not_a_motion = || format!("{path:?} does not hold a motion");
     let file: MotionFile = serde_json::from_str(&text).or_exit(Exit::Data, not_a_motion)?;
-    let speed = speed.unwrap_or(file.speed);
+    let no_speed = || anyhow::anyhow!("it has no speed: add \"speed\": 1.0, or give --speed");
+    let speed = speed.or(file.speed).ok_or_else(no_speed).or_exit(Exit::Data, not_a_motion)?;
     let motion = motion(file).map_err(|what| anyhow::anyhow!(what));
     let motion = motion.or_exit(Exit::Data, not_a_motion)?;
     Ok(pb::MotionRequest { motion: Some(motion), speed })
@@ -140,7 +141,6 @@ mod tests {
                 format!(r#"{{"speed": 1, "way_points": {places}, "joint_motion": {joints}}}"#),
                 "either",
             ),
-            (format!(r#"{{"way_points": {places}}}"#), "missing field `speed`"),
             (
                 format!(r#"{{"speed": 1, "way_points": {places}, "sped": 2}}"#),
                 "unknown field `sped`",

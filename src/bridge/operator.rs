@@ -11,7 +11,7 @@ use tonic::{Code, Response, Status};
 use super::show;
 use crate::cli::{ConnectArgs, OperatorArgs};
 use crate::exit::{Exit, Failed, OrExit as _};
-use crate::{access, output, runtime};
+use crate::{access, call_failure, output, runtime};
 
 /// Timeout of a call.
 const TIMEOUT: Duration = Duration::from_secs(10);
@@ -53,7 +53,7 @@ pub(super) fn failed(status: &Status) -> Failed {
         Code::Internal => Exit::Bug,
         _ => Exit::TryAgain,
     };
-    Failed::new(exit, anyhow::anyhow!("{}", status.message()))
+    call_failure::failed(exit, status, "tandem bridge --driver sim")
 }
 
 /// Acquires the lease on the arms and returns its token.

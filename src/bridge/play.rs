@@ -21,7 +21,7 @@ use crate::{output, signals};
 const KEEP_ALIVE_EVERY: Duration = Duration::from_millis(40);
 /// Timeout of the stream of reports, of which the bridge sends twenty per second.
 const REPORT_TIMEOUT: Duration = Duration::from_secs(5);
-/// Seconds of the motion's own time between two plain lines.
+/// Seconds between two plain lines.
 const PLAIN_EVERY_S: f64 = 1.0;
 
 pub(super) fn play(args: &MoveArgs) -> Result<(), Failed> {
@@ -80,7 +80,7 @@ async fn check(
 fn accepted_line(accepted: &pb::AcceptedMotion) -> String {
     let least_mm = |gaps_m: &[f64]| 1e3 * gaps_m.iter().copied().fold(f64::INFINITY, f64::min);
     let mut line = format!(
-        "{:.1} s at speed {}, at least {:.0} mm above the table, {:.0} mm between the arms",
+        "{:.1} s at speed {}; gaps: table {:.0} mm, arms {:.0} mm",
         accepted.duration_s / accepted.speed,
         accepted.speed,
         least_mm(&accepted.table_gap_m),
@@ -88,7 +88,7 @@ fn accepted_line(accepted: &pb::AcceptedMotion) -> String {
     );
     // A bridge of an earlier version does not report the gaps within an arm.
     if !accepted.self_gap_m.is_empty() {
-        line.push_str(&format!(", {:.0} mm within an arm", least_mm(&accepted.self_gap_m)));
+        line.push_str(&format!(", within an arm {:.0} mm", least_mm(&accepted.self_gap_m)));
     }
     line
 }
@@ -203,7 +203,7 @@ struct MotionDisplay {
 impl MotionDisplay {
     fn new(accepted: &pb::AcceptedMotion) -> Self {
         let bar = std::io::stderr().is_terminal().then(|| {
-            let bar = ProgressBar::new(millis(accepted.duration_s));
+            let bar = ProgressBar::new(millis(accepted.duration_s / accepted.speed));
             let style = ProgressStyle::with_template("[{bar:32}] {msg}");
             bar.with_style(style.unwrap_or_else(|_| ProgressStyle::default_bar()))
         });
@@ -218,19 +218,15 @@ impl MotionDisplay {
     }
 
     fn update(&mut self, progress: &pb::MotionProgress) {
-        let line = format!(
-            "{} {:.1} of {:.1} s",
-            show::phase(progress.phase()),
-            progress.played_s,
-            progress.duration_s
-        );
+        let [played_s, duration_s] =
+            show::clock_times_s([progress.played_s, progress.duration_s], progress.speed);
+        let phase = show::phase(progress.phase());
+        let line = format!("{phase} {played_s:.1} of {duration_s:.1} s");
         if let Some(bar) = &self.bar {
-            bar.set_position(millis(progress.played_s));
+            bar.set_position(millis(played_s));
             bar.set_message(line);
-        } else if progress.phase() != self.phase
-            || progress.played_s >= self.printed_s + PLAIN_EVERY_S
-        {
-            (self.phase, self.printed_s) = (progress.phase(), progress.played_s);
+        } else if progress.phase() != self.phase || played_s >= self.printed_s + PLAIN_EVERY_S {
+            (self.phase, self.printed_s) = (progress.phase(), played_s);
             self.print(&line);
         }
     }

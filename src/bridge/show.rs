@@ -38,25 +38,30 @@ pub(super) fn status_lines(status: &pb::BridgeStatusResponse) -> Vec<String> {
             1e3 * status.since_tick_s
         ),
     ];
-    lines.extend(status.arms.iter().enumerate().map(|(idx, arm)| arm_line(idx, arm)));
+    lines.extend(status.arms.iter().enumerate().flat_map(|(idx, arm)| arm_lines(idx, arm)));
     if status.arms.is_empty() {
         lines.push("arms    their position is not known".to_owned());
     }
     if let Some(motion) = &status.motion {
-        lines.push(format!(
-            "motion  {:.2} of {:.2} s of its own time, at speed {}",
-            motion.played_s, motion.duration_s, motion.speed
-        ));
+        let [played_s, duration_s] =
+            clock_times_s([motion.played_s, motion.duration_s], motion.speed);
+        let speed = motion.speed;
+        lines.push(format!("motion  {played_s:.1} of {duration_s:.1} s, at speed {speed}"));
     }
     lines
 }
 
-fn arm_line(idx: usize, arm: &pb::ArmState) -> String {
+/// Converts times of a motion at its own speed to seconds on the clock when it is played at `speed`.
+pub(super) fn clock_times_s(own_times_s: [f64; 2], speed: f64) -> [f64; 2] {
+    own_times_s.map(|time_s| if speed > 0.0 { time_s / speed } else { time_s })
+}
+
+fn arm_lines(idx: usize, arm: &pb::ArmState) -> [String; 2] {
     let degrees: Vec<String> =
         arm.angles_rad.iter().map(|angle| format!("{:.1}", angle.to_degrees())).collect();
+    let joints = format!("arm {idx}   joints at {} degrees", degrees.join(" "));
     let mut line = format!(
-        "arm {idx}   joints {} degrees, tool at {} m, gripper {:.0} % open",
-        degrees.join(" "),
+        "        tool at {} m, gripper {:.0} % open",
         position(&arm.tool_in_world_m),
         100.0 * arm.opening
     );
@@ -70,7 +75,7 @@ fn arm_line(idx: usize, arm: &pb::ArmState) -> String {
             line.push_str(what);
         }
     }
-    line
+    [joints, line]
 }
 
 /// Formats a position in metres, rounded to millimetres, without negative zeros.
@@ -123,7 +128,8 @@ fn limit_lines(limits: &pb::BridgeLimits) -> Vec<String> {
             100.0 * limits.reach_share
         ),
         format!(
-            "gaps    motions keep {:.0} mm to the table, {:.0} mm between arms and {:.0} mm within an arm, the envelope {:.0}, {:.0} and {:.0} mm",
+            "gaps    to the table, between the arms and within an arm, at least\n        \
+             {:.0}, {:.0} and {:.0} mm (motions), {:.0}, {:.0} and {:.0} mm (envelope)",
             1e3 * limits.check_table_gap_m,
             1e3 * limits.check_arms_gap_m,
             1e3 * limits.check_self_gap_m,

@@ -28,6 +28,10 @@ const BLOCK_CM: [f32; 2] = [3.0, 9.0];
 /// Longest trial, seconds.
 const TIME_LIMIT_S: f64 = 120.0;
 
+/// Directories of the trials' motions and logs.
+const MOTIONS: &str = "motions";
+const LOGS: &str = "mcap";
+
 pub(crate) fn trial(args: &TrialArgs) -> Result<(), Failed> {
     let (task, policies) = policies(args)?;
     let block = block(args.block_cm)?;
@@ -38,9 +42,9 @@ pub(crate) fn trial(args: &TrialArgs) -> Result<(), Failed> {
     let all_modes = [ModeName::ClosedLoop, ModeName::Twin, ModeName::OpenLoop];
     let modes = if args.modes.is_empty() { &all_modes[..] } else { &args.modes };
     let out = args.out.clone().unwrap_or_else(|| PathBuf::from(format!("runs/trial-{task}")));
-    for directory in ["mcap", "motions"] {
-        std::fs::create_dir_all(out.join(directory))
-            .or_cannot_write(|| format!("cannot create {}", out.display()))?;
+    create_directory(&out)?;
+    if args.motions {
+        create_directory(&out.join(MOTIONS))?;
     }
     let file = out.join(TRIALS_FILE);
     let mut log = TrialsLog::create(&file).or_cannot_write(String::new)?;
@@ -143,15 +147,19 @@ fn run(series: &Series<'_>, args: &TrialArgs, out: &Path) -> Result<Vec<TrialRow
     let rows = series.run(args.trials, |report, row| {
         let name = format!("{}-{}-{:04}", row.policy, row.mode, row.trial);
         if args.motions {
-            write_motion(report, series.config.speed, &out.join(format!("motions/{name}.json")))
-                .map_err(SeriesFailed)?;
+            write_motion(
+                report,
+                series.config.speed,
+                &out.join(MOTIONS).join(format!("{name}.json")),
+            )
+            .map_err(SeriesFailed)?;
         }
         let recorded = match args.record {
             RecordName::All => true,
             RecordName::Failures => !row.success,
             RecordName::None => false,
         };
-        row.log = recorded.then(|| format!("mcap/{name}.mcap"));
+        row.log = recorded.then(|| format!("{LOGS}/{name}.mcap"));
         bar.inc(1);
         Ok(())
     });
@@ -168,11 +176,18 @@ fn write_motion(report: &TrialReport, speed: f64, path: &Path) -> Result<(), Fai
 
 /// Writes the log of each row that names one.
 fn record(series: &Series<'_>, rows: &[TrialRow], out: &Path) -> Result<(), Failed> {
+    if rows.iter().any(|row| row.log.is_some()) {
+        create_directory(&out.join(LOGS))?;
+    }
     let recorded = rows.par_iter().try_for_each(|row| match &row.log {
         Some(name) => series.record(row, &out.join(name)).map_err(SeriesFailed::from),
         None => Ok(()),
     });
     recorded.map_err(|SeriesFailed(failed)| failed)
+}
+
+fn create_directory(path: &Path) -> Result<(), Failed> {
+    std::fs::create_dir_all(path).or_cannot_write(|| format!("cannot create {}", path.display()))
 }
 
 /// A failure of the trials or of their files.
@@ -205,11 +220,11 @@ fn show(args: &TrialArgs, rows: Vec<TrialRow>, file: &Path) -> Result<(), Failed
     }
     output::print(trials.text())?;
     output::print(format_args!("trials        {}", file.display()))?;
-    output::print(format_args!(
-        "report        {}; its figures are also files: {}",
-        page.display(),
-        written.plots.len()
-    ))?;
+    output::print(format_args!("report        {}", page.display()))?;
+    if !written.plots.is_empty() {
+        let figures = counted(written.plots.len(), "figure");
+        output::print(format_args!("figures       {figures} of the report as files"))?;
+    }
     Ok(())
 }
 

@@ -14,11 +14,12 @@ const ADDRESS: &str = "127.0.0.1:7002";
     args_conflicts_with_subcommands = true,
     after_help = "\
 Examples:
-  tandem bridge --driver sim                              serves a simulated pair of arms
-  tandem bridge --driver sim --speed 0.1                  the same, no motion faster than a tenth
-  tandem bridge status                                    state of the arms, and why they are stopped
-  tandem bridge stop                                      stops them, at any time
-  tandem bridge reset                                     enables stopped arms
+  tandem bridge --driver sim  # serves a simulated pair of arms
+  tandem bridge --driver sim --speed 0.1
+      # the same, no motion faster than a tenth
+  tandem bridge status        # state of the arms, and why they are stopped
+  tandem bridge stop          # stops them, at any time
+  tandem bridge reset         # enables stopped arms
   tandem bridge move deploy/first-motion.json --check-only
   tandem bridge move deploy/first-motion.json --speed 0.1
   tandem bridge trial --policy policies/student-push.safetensors
@@ -68,12 +69,28 @@ pub(crate) enum DriverName {
 #[derive(Debug, Subcommand)]
 pub(crate) enum BridgeCommand {
     /// Shows the state of the arms, and why they are stopped.
+    #[command(after_help = "\
+Examples:
+  tandem bridge status
+  tandem bridge status --connect lab:7002 --token-file token --json")]
     Status(OperatorArgs),
     /// Stops the arms. Exit code 0 means that the drives received the command.
+    #[command(after_help = "\
+Examples:
+  tandem bridge stop
+  tandem bridge stop --connect lab:7002 --token-file token")]
     Stop(OperatorArgs),
     /// Shows the model, layout and limits of the arms.
+    #[command(after_help = "\
+Examples:
+  tandem bridge describe
+  tandem bridge describe --json")]
     Describe(OperatorArgs),
     /// Enables stopped arms: they hold their position until a motion begins. Inspect them first.
+    #[command(after_help = "\
+Examples:
+  tandem bridge reset
+  tandem bridge reset --connect lab:7002 --token-file token")]
     Reset(OperatorArgs),
     /// Executes the motion in a file. Ctrl-C stops the arms.
     Move(MoveArgs),
@@ -104,8 +121,12 @@ pub(crate) struct OperatorArgs {
 
 #[derive(Debug, Args)]
 #[command(after_help = "\
-Exit codes: 0 the motion is complete (with --check-only, it would be accepted), 65 the file or the
-motion is rejected and nothing has moved, 75 the arms were stopped or are not ready, 130 interrupted
+Examples:
+  tandem bridge move deploy/first-motion.json --check-only
+  tandem bridge move deploy/first-motion.json --speed 0.1
+
+Exit codes: 0 the motion is complete (with --check-only, it would be accepted), 65 the file or the \
+motion is rejected and nothing has moved, 75 the arms were stopped or are not ready, 130 interrupted \
 with Ctrl-C.")]
 pub(crate) struct MoveArgs {
     /// Motion file, described in docs/bridge.md.

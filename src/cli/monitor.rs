@@ -10,7 +10,8 @@ use super::{ClientArgs, SecretArgs};
 #[command(after_help = "\
 Examples:
   tandem health 127.0.0.1:7000
-  tandem health learner:7000 --service tandem.v1.Learner --tls-ca ca.pem --timeout-s 1
+  tandem health learner:7000 --service tandem.v1.Learner --tls-ca ca.pem \\
+      --timeout-s 1
   tandem health learner:7000 --json
 
 Prints `serving` and exits with code 0, or prints the reason and exits with code 75. No token is required.")]
@@ -39,7 +40,7 @@ Examples:
   tandem status learner:7000 --token-file token --watch
   tandem status learner:7000 --token-file token --json
 
-Exit codes: 0 success (with --watch, the run has ended), 64 wrong token, 75 the learner cannot be
+Exit codes: 0 success (with --watch, the run has ended), 64 wrong token, 75 the learner cannot be \
 reached.")]
 pub(crate) struct StatusArgs {
     /// Address of the learner or relay.

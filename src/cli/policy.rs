@@ -7,6 +7,11 @@ use clap::{Args, Subcommand};
 use super::{TaskName, WorldName};
 
 #[derive(Debug, Args)]
+#[command(after_help = "\
+Examples:
+  tandem policy show policies/student-push.safetensors
+  tandem policy export policies/student-push.safetensors --onnx actor.onnx
+  tandem policy import actor.onnx --critic critic.onnx --out FILE.safetensors")]
 pub(crate) struct PolicyArgs {
     #[command(subcommand)]
     pub(crate) command: PolicyCommand,
@@ -41,7 +46,7 @@ Examples:
   tandem policy export policies/student-push.safetensors --onnx actor.onnx
   tandem policy export FILE --onnx actor.onnx --critic-onnx critic.onnx
 
-The models normalise their inputs themselves. Actor: inputs observation and goal, output action.
+The models normalise their inputs themselves. Actor: inputs observation and goal, output action. \
 Critic: inputs observation, goal and action, output value. docs/onnx.md describes the vectors.")]
 pub(crate) struct ExportArgs {
     /// Policy file.
@@ -64,7 +69,7 @@ Examples:
   tandem policy import actor.onnx --task push --arms 1 --out FILE.safetensors
   tandem eval --composed-teachers FILE.safetensors
 
-A policy file has ReLU between the layers and tanh after the actor's last. `tandem teacher --policy
+A policy file has ReLU between the layers and tanh after the actor's last. `tandem teacher --policy \
 actor.onnx` serves other networks without a conversion.")]
 pub(crate) struct ImportArgs {
     /// ONNX model of the actor.

@@ -15,10 +15,11 @@ Examples:
   tandem eval --policy policies/student-push.safetensors --baselines
   tandem eval --composed-teachers policies/teacher-push.safetensors
   tandem eval --policy FILE --episodes 1 --record episode.mcap
-  tandem eval --policy FILE --film arms.gif                  an animation of the first episode
+  tandem eval --policy FILE --film arms.gif             # the first episode
   tandem eval --policy FILE --film strip.png --film-outcome failure
-  tandem eval --policy FILE --env 127.0.0.1:7005             in the environments of a server
-  tandem eval --policy FILE --env-command 'tandem env'       starts the server")]
+  tandem eval --policy FILE --env 127.0.0.1:7005
+      # in the environments of a server
+  tandem eval --policy FILE --env-command 'tandem env'  # starts the server")]
 pub(crate) struct EvalArgs {
     /// Policy to evaluate.
     #[arg(long, value_name = "FILE", group = "who")]
@@ -112,7 +113,8 @@ Examples:
   tandem report runs/sweep-table2
   tandem report runs/a runs/b --out compared.html --csv compared.csv
   tandem report trials/student-push --all-trials
-  tandem report docs/results/students --composed-teachers policies/teacher-push.safetensors
+  tandem report docs/results/students \\
+      --composed-teachers policies/teacher-push.safetensors
   tandem report runs/NAME --film-strips runs/NAME/policy/best.safetensors")]
 pub(crate) struct ReportArgs {
     /// Run directories, directories that contain runs or trials, or single metrics and trials files.
@@ -145,14 +147,15 @@ pub(crate) struct ReportArgs {
 #[derive(Debug, Args)]
 #[command(after_help = "\
 Examples:
-  tandem replay runs/NAME/mcap/eval-000100-000.mcap     step by step
-  tandem replay runs --verify                           all *.mcap files below
+  tandem replay runs/NAME/mcap/eval-000100-000.mcap  # step by step
+  tandem replay runs --verify                        # all *.mcap files below
   tandem replay FILE.mcap --verify --json
   tandem replay FILE.mcap --film episode.gif
   tandem replay runs/NAME/mcap --verify --env-command 'python3 server.py'
 
-All numbers from the simulator are compared bit for bit with the log. An episode of a task that is
-not built-in is simulated again in the environments of --env or --env-command. The exit code is 65 if
+All numbers from the simulator are compared bit for bit with the log. An episode of a task that is \
+not built-in is simulated again in the environments of --env or --env-command. Logs of trials are \
+left out. The exit code is 65 if \
 a number differs or a log cannot be read, and else 64 if a log needs environments that are not given.")]
 pub(crate) struct ReplayArgs {
     /// Recorded episodes, or directories to search for *.mcap files.
@@ -175,6 +178,10 @@ pub(crate) struct ReplayArgs {
 }
 
 #[derive(Debug, Args)]
+#[command(after_help = "\
+Examples:
+  tandem mcap recover runs/NAME/mcap/eval-000100-000.mcap.part
+  tandem mcap recover FILE.mcap.part --to recovered.mcap")]
 pub(crate) struct McapArgs {
     #[command(subcommand)]
     pub(crate) command: McapCommand,
@@ -183,6 +190,10 @@ pub(crate) struct McapArgs {
 #[derive(Debug, Subcommand)]
 pub(crate) enum McapCommand {
     /// Recovers the log of a writer that was killed.
+    #[command(after_help = "\
+Examples:
+  tandem mcap recover runs/NAME/mcap/eval-000100-000.mcap.part
+  tandem replay runs/NAME/mcap/eval-000100-000.mcap.part.recovered.mcap")]
     Recover {
         /// Incomplete log.
         file: PathBuf,
@@ -196,7 +207,8 @@ pub(crate) enum McapCommand {
 #[command(after_help = "\
 Examples:
   tandem picture --policy policies/student-push.safetensors --out arms.png
-  tandem picture --composed-teachers policies/teacher-push.safetensors --step 20 --out arms.png")]
+  tandem picture --composed-teachers policies/teacher-push.safetensors \\
+      --step 20 --out arms.png")]
 pub(crate) struct PictureArgs {
     /// Policy that controls the arms.
     #[arg(long, value_name = "FILE", required_unless_present = "composed_teachers")]

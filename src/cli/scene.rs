@@ -13,7 +13,8 @@ Examples:
   tandem scene --task push --arms 2 --json
   tandem scene --task push --arms 1 --episodes 240 --seed 780 --json
   tandem scene --task pick-and-place --actions actions.json --seed 780 --json
-  tandem scene --policy policies/student-push.safetensors --episodes 240 --seed 780 --json
+  tandem scene --policy policies/student-push.safetensors --episodes 240 \\
+      --seed 780 --json
 
 docs/transfer.md describes the output.")]
 pub(crate) struct SceneArgs {

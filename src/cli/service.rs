@@ -49,12 +49,14 @@ pub(crate) struct ClientArgs {
 #[derive(Debug, Args)]
 #[command(after_help = "\
 Examples:
-  tandem teacher --policy policies/teacher-push.safetensors --listen 127.0.0.1:7001
+  tandem teacher --policy policies/teacher-push.safetensors \\
+      --listen 127.0.0.1:7001
   tandem teacher --policy FILE --ledger runs/mine/ledger.sqlite
-  tandem teacher --policy actor.onnx --critic critic.onnx               trained elsewhere
-  tandem teacher --policy FILE --ledger redis://:PASSWORD@redis:6379   several teachers, one budget
-  tandem teacher --policy FILE --ledger memory                          lost at exit
-  tandem teacher --policy http://127.0.0.1:7005                         a policy in another process
+  tandem teacher --policy actor.onnx --critic critic.onnx  # trained elsewhere
+  tandem teacher --policy FILE --ledger redis://:PASSWORD@redis:6379
+      # several teachers, one budget
+  tandem teacher --policy FILE --ledger memory     # lost at exit
+  tandem teacher --policy http://127.0.0.1:7005    # a policy in another process
 
 docs/python-services.md shows how to serve a policy from Python.")]
 pub(crate) struct TeacherArgs {
@@ -89,9 +91,13 @@ pub(crate) struct TeacherArgs {
 #[derive(Debug, Args)]
 #[command(after_help = "\
 Examples:
-  tandem learner --run runs/mine/run.toml --listen 0.0.0.0:7000 --teacher 127.0.0.1:7001 --out runs/mine
-  tandem learner --run runs/mine/run.toml --out runs/mine --resume --teacher 127.0.0.1:7001
-  tandem learner --run run.toml --out runs/mine --start-or-resume --teacher teacher:7001   under a supervisor")]
+  tandem learner --run runs/mine/run.toml --listen 0.0.0.0:7000 \\
+      --teacher 127.0.0.1:7001 --out runs/mine
+  tandem learner --run runs/mine/run.toml --out runs/mine --resume \\
+      --teacher 127.0.0.1:7001
+  tandem learner --run run.toml --out runs/mine --start-or-resume \\
+      --teacher teacher:7001
+      # under a supervisor")]
 pub(crate) struct LearnerArgs {
     /// Run file (TOML); settings that it omits take the recipe's values.
     #[arg(long, value_name = "FILE.toml")]
@@ -163,8 +169,10 @@ pub(crate) struct EnvironmentArgs {
 Examples:
   tandem worker --connect 127.0.0.1:7000 --teacher 127.0.0.1:7001
   tandem worker --connect learner:7000 --teacher teacher:7001 --name bench-3
-  tandem worker --connect learner:7000 --teacher teacher:7001 --env simulator:7005
-  tandem worker --connect learner:7000 --env-command 'python3 server.py'    a server of its own")]
+  tandem worker --connect learner:7000 --teacher teacher:7001 \\
+      --env simulator:7005
+  tandem worker --connect learner:7000 --env-command 'python3 server.py'
+      # a server of its own")]
 pub(crate) struct WorkerArgs {
     /// Address of the learner or relay.
     #[arg(long, value_name = "ADDR")]
@@ -220,10 +228,10 @@ pub(crate) struct EnvGuardArgs {
     mut_arg("listen", |listen| listen.env("TANDEM_ENV_LISTEN")),
     after_help = "\
 Examples:
-  tandem env                                             two arms, push, on a free port
+  tandem env                               # two arms, push, on a free port
   tandem env --task pick-and-place --arms 1 --listen 127.0.0.1:7005
   tandem train --env 127.0.0.1:7005 --task pick-and-place --arms 1
-  tandem train --env-command 'tandem env'                one server per worker
+  tandem train --env-command 'tandem env'  # one server per worker
 
 docs/environments.md describes the protocol, and how to write a server in another language."
 )]

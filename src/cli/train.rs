@@ -17,19 +17,24 @@ pub(crate) enum RecipeName {
 #[derive(Debug, Args)]
 #[command(after_help = "\
 Examples:
-  tandem train                                        two arms, push, strategy mc-q:0.1, shipped teacher
+  tandem train              # two arms push, advised by the shipped teacher
+  tandem train --settings   # every setting, its meaning and its values
   tandem train --arms 1 --task push --until-success 0.97
-  tandem train --world shared                         both arms share one area and are slow
+  tandem train --world shared  # both arms share one area and are slow
   tandem train --strategy ea --budget 50000 --seed 2 --max-minutes 20
+  tandem train --teacher runs/NAME/policy/best.safetensors
   tandem train --teacher actor.onnx --teacher-critic critic.onnx
-  tandem train --teacher http://127.0.0.1:7005        a policy in another process
+  tandem train --teacher http://127.0.0.1:7005  # a policy in another process
   tandem train --set ddpg.discount=0.98 --set rounds.slots=16
-  tandem train --run my-run.toml --out runs/mine
-  tandem train --recipe paper --teacher runs/teacher-push-paper/policy/best.safetensors
-  tandem train --env 127.0.0.1:7005                   plays in the environments of a server
-  tandem train --env-command 'tandem env'             each worker starts a server of its own
-  tandem train --resume --out runs/mine               resumes the run
-  tandem train --resume --out runs/mine --max-env-steps 600000    resumes it for longer")]
+  tandem train --run my-run.toml --out runs/mine --quiet
+  tandem train --recipe paper \\
+      --teacher runs/teacher-push-paper/policy/best.safetensors
+  tandem train --env 127.0.0.1:7005  # plays in the environments of a server
+  tandem train --env-command 'tandem env'
+      # each worker starts a server of its own
+  tandem train --resume --out runs/mine  # resumes the run
+  tandem train --resume --out runs/mine --max-env-steps 600000
+      # resumes it for longer")]
 pub(crate) struct TrainArgs {
     /// Task [default: push].
     #[arg(long, value_parser = TaskName::parser())]
@@ -83,18 +88,24 @@ pub(crate) struct TrainArgs {
     /// Overrides one setting, for example ddpg.discount=0.98; can be repeated.
     #[arg(long = "set", value_name = "KEY=VALUE")]
     pub(crate) settings: Vec<String>,
+    /// Prints every setting with its meaning, its range and its values under both recipes, and starts nothing.
+    #[arg(long = "settings")]
+    pub(crate) list_settings: bool,
     /// Run directory [default: runs/TASK-ARMS-STRATEGY-seedN].
     #[arg(long, value_name = "DIR")]
     pub(crate) out: Option<PathBuf>,
     /// Resumes the run in --out from its newest checkpoint. Settings and teacher remain those of the run, and so does the
     /// server of its environments unless --env or --env-command names another one. Only
-    /// its end (--max-env-steps, --max-minutes, --until-success), checkpoint.*, evaluation.recorded_episodes,
-    /// evaluation.test_episodes and --workers can change. A rejected --resume changes nothing.
-    #[arg(long, requires = "out")]
+    /// its end (--max-env-steps, --max-minutes, --until-success), checkpoint.*, evaluation.early_points,
+    /// evaluation.recorded_episodes, evaluation.test_episodes and --workers can change. A rejected --resume changes nothing.
+    #[arg(long)]
     pub(crate) resume: bool,
     /// Prints the summary as one JSON object on the last line of standard output.
     #[arg(long)]
     pub(crate) json: bool,
+    /// Prints no progress: only the summary, warnings and errors.
+    #[arg(long, short)]
+    pub(crate) quiet: bool,
     /// Interrupts the run when standard input closes, which happens when the parent process dies.
     #[arg(long, hide = true)]
     pub(crate) exit_with_stdin: bool,
@@ -103,11 +114,11 @@ pub(crate) struct TrainArgs {
 #[derive(Debug, Args)]
 #[command(after_help = "\
 Examples:
-  tandem sweep deploy/sweep-small.toml --dry-run      lists the runs
-  tandem sweep deploy/sweep-small.toml                starts them, or resumes them
+  tandem sweep deploy/sweep-small.toml --dry-run  # lists the runs
+  tandem sweep deploy/sweep-small.toml            # starts them, or resumes them
   tandem report runs/sweep-small
 
-docs/sweep.md describes the file. The exit code is 75 if runs failed; the next start tries each of
+docs/sweep.md describes the file. The exit code is 75 if runs failed; the next start tries each of \
 them once more.")]
 pub(crate) struct SweepArgs {
     /// Sweep file (TOML): settings of all runs, and lists of values to combine.

@@ -10,8 +10,10 @@ use crate::cli::{TaskName, WorldName};
 #[command(after_help = "\
 Examples:
   tandem bridge trial --policy policies/student-push.safetensors
-  tandem bridge trial --policy policies/student-pick-and-place.safetensors --mode closed-loop --trials 200 --seed 3
-  tandem bridge trial --policy policies/student-push.safetensors --composed-teachers policies/teacher-push.safetensors
+  tandem bridge trial --policy policies/student-pick-and-place.safetensors \\
+      --mode closed-loop --trials 200 --seed 3
+  tandem bridge trial --policy policies/student-push.safetensors \\
+      --composed-teachers policies/teacher-push.safetensors
   tandem report runs/trial-push")]
 #[command(group = clap::ArgGroup::new("who").required(true).multiple(true))]
 pub(crate) struct TrialArgs {

@@ -1,7 +1,7 @@
 //! Baselines of an evaluation: policies that cannot take account of the other arm.
 
 use serde_json::{Value, json};
-use tandem_core::Wilson;
+use tandem_core::{EvaluationSummary, Wilson};
 use tandem_report::Table;
 
 use crate::cli::EvalArgs;
@@ -71,32 +71,39 @@ impl Baselines {
         if self.0.is_empty() {
             return None;
         }
-        let header = ["", "no contact", "success", "arm contact", "table contact", "any contact"];
-        let rows = std::iter::once(("policy", of_policy));
-        let rows = rows.chain(self.0.iter().map(|(name, result)| (*name, result)));
+        let columns: Vec<(&str, &EvaluationResult)> = std::iter::once(("policy", of_policy))
+            .chain(self.0.iter().map(|(name, result)| (*name, result)))
+            .collect();
+        let names = columns.iter().map(|(name, _)| (*name).to_owned());
         let table = Table {
-            title: "share of episodes [95 % interval]; no contact: success without contact between the arms".to_owned(),
-            header: header.map(str::to_owned).to_vec(),
-            rows: rows.map(|(name, result)| row(name, result)).collect(),
+            title: "share of episodes [95 % interval]; no contact: success, arms never touch"
+                .to_owned(),
+            header: std::iter::once(String::new()).chain(names).collect(),
+            rows: MEASURES.iter().map(|(label, share)| row(label, *share, &columns)).collect(),
         };
         Some(table.text().trim_end().to_owned())
     }
 }
 
-fn row(name: &str, result: &EvaluationResult) -> Vec<String> {
-    let summary = &result.summary;
-    let shares = [
-        summary.success_without_contact,
-        Some(summary.success),
-        summary.arm_contact_rate,
-        summary.table_contact_rate,
-        Some(summary.collision_rate),
-    ];
-    let cell = |share: Option<f64>| {
-        share.map_or_else(String::new, |share| {
-            let Wilson { low, high } = summary.interval_of(share);
+/// Returns a share of the evaluated episodes, if the task has it.
+type Share = fn(&EvaluationSummary) -> Option<f64>;
+
+/// The rows of the table.
+const MEASURES: [(&str, Share); 5] = [
+    ("no contact", |summary| summary.success_without_contact),
+    ("success", |summary| Some(summary.success)),
+    ("arm contact", |summary| summary.arm_contact_rate),
+    ("table contact", |summary| summary.table_contact_rate),
+    ("any contact", |summary| Some(summary.collision_rate)),
+];
+
+/// Returns the row of one share, with a cell for each policy.
+fn row(label: &str, share: Share, columns: &[(&str, &EvaluationResult)]) -> Vec<String> {
+    let cell = |(_, result): &(&str, &EvaluationResult)| {
+        share(&result.summary).map_or_else(String::new, |share| {
+            let Wilson { low, high } = result.summary.interval_of(share);
             format!("{share:.3} [{low:.3}, {high:.3}]")
         })
     };
-    std::iter::once(name.to_owned()).chain(shares.map(cell)).collect()
+    std::iter::once(label.to_owned()).chain(columns.iter().map(cell)).collect()
 }

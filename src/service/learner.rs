@@ -8,6 +8,7 @@ use tokio::net::TcpListener;
 use super::{listen, run};
 use crate::cli::LearnerArgs;
 use crate::exit::{Exit, Failed, OrExit as _};
+use crate::run_pages::RunPages;
 use crate::version::VERSION;
 use crate::{access, clock, policy_file, run_directory, run_file, signals};
 
@@ -17,8 +18,11 @@ pub(crate) fn learner(args: LearnerArgs) -> Result<(), Failed> {
     let server_config = access::server_config(&args.listen, &args.secret)?;
     let client_config = access::client_config(&args.client_config, &args.secret)?;
     run_directory::check_path(&args.out)?;
-    let keeps_run_file = args.start_or_resume || args.keep_run_file;
+    // With --out-is-locked the parent process writes the run file.
+    let keeps_run_file = !args.out_is_locked || args.keep_run_file;
     let run_file = keeps_run_file.then(|| run_file::to_text(&run_config)).transpose()?;
+    // `tandem train` writes the pages of its runs itself.
+    let pages_of = (!args.out_is_locked).then(|| (run_config.clone(), args.out.clone()));
     run(async move {
         let shutdown = signals::shutdown_token(args.listen.exit_with_stdin)?;
         let options = serve_options(&args).await?;
@@ -41,6 +45,11 @@ pub(crate) fn learner(args: LearnerArgs) -> Result<(), Failed> {
         };
         let served = tandem_learner::serve_with(config, listener, shutdown, options).await;
         let ended = served.map_err(learner_failed)?;
+        if let Some((config, out)) = pages_of
+            && let Err(failed) = RunPages::write_if_evaluated(&config, &out)
+        {
+            tracing::warn!(reason = %failed.line(), "the report of the run cannot be written");
+        }
         match ended.interrupted {
             true => Err(Failed::new(Exit::Interrupted, anyhow::anyhow!(ended.reason))),
             false => Ok(()),

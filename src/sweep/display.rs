@@ -42,7 +42,7 @@ impl Display {
     pub(super) fn started(&mut self, name: &str, log: PathBuf) {
         if let Some(live) = &mut self.live {
             let line = live.all.add(ProgressBar::new_spinner());
-            line.set_style(style("  {msg}"));
+            line.set_style(style("  {wide_msg}"));
             line.set_message(format!("{name}: starting"));
             live.running.push(Running { name: name.to_owned(), log, line });
         }

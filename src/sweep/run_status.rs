@@ -98,7 +98,12 @@ fn state(run: &PlannedRun, dir: &Path) -> anyhow::Result<State> {
             true => "its teacher".to_owned(),
             false => differences.join(", "),
         };
-        return Err(anyhow!("{} was made with other settings: {differences}", run.name));
+        return Err(anyhow!(
+            "{} was made with other settings: {differences}; give the changed sweep another --out, or train one run \
+             longer with `tandem train --resume --out {} --max-env-steps N`",
+            run.name,
+            dir.display()
+        ));
     }
     Ok(summary.map_or(State::Started, State::Finished))
 }
@@ -107,7 +112,10 @@ fn state(run: &PlannedRun, dir: &Path) -> anyhow::Result<State> {
 fn differences(existing: &RunConfig, planned: &RunConfig) -> anyhow::Result<Vec<String>> {
     let [existing, planned] = [existing, planned].map(Table::try_from);
     let (existing, planned) = (flattened(&existing?), flattened(&planned?));
-    let differing = existing.iter().zip(&planned).filter(|(existing, planned)| existing != planned);
+    // A run of an earlier version has no early evaluations, which affect nothing that it learns.
+    let differing = existing.iter().zip(&planned).filter(|(existing, planned)| {
+        existing != planned && existing.0 != "evaluation.early_points"
+    });
     let texts = differing.map(|((key, existing), (_, planned))| {
         format!("{key} is {} there, {} now", shortest(existing), shortest(planned))
     });

@@ -10,7 +10,9 @@ use toml::Value;
 use super::environment_file;
 use super::teacher_file::TeacherFile;
 use crate::cli::{EnvironmentArgs, RecipeName, TrainArgs, chosen_task};
+use crate::columns::wrapped;
 use crate::exit::{Exit, Failed, OrExit as _};
+use crate::run_directory::RUNS;
 use crate::service::worker_failed;
 use crate::{output, policy_file, run_directory, run_file, served_task};
 
@@ -37,7 +39,13 @@ impl Plan {
         check_environment(&config, served)?;
         let out = match &args.out {
             Some(out) => out.clone(),
-            None => free_run_directory(&config),
+            None => {
+                let (base, out) = free_run_directory(&config);
+                if out != base && !args.quiet {
+                    remark_on(&base, &out);
+                }
+                out
+            }
         };
         let config = match args.resume {
             true => config,
@@ -63,7 +71,7 @@ impl Plan {
             (true, false) => Err(Failed::usage(format!(
                 "{shown} holds a run already: resume it with `tandem train --resume --out {shown}`, or choose another --out"
             ))),
-            (false, true) => Err(Failed::usage(format!("{shown} holds no run to resume"))),
+            (false, true) => Err(run_directory::no_run(&format!("{shown} holds no run to resume"))),
             _ => Ok(()),
         }
     }
@@ -182,12 +190,15 @@ fn check_environment(config: &RunConfig, served: Option<&ServedTask>) -> Result<
 
 /// Resolves the settings; those of a resumed run come from its own run file.
 fn config(args: &TrainArgs, served: Option<&ServedTask>) -> Result<RunConfig, Failed> {
+    if args.resume && args.out.is_none() {
+        return Err(run_directory::no_run("--resume needs --out DIR, the directory of the run"));
+    }
     let own_file = args.out.as_ref().filter(|_| args.resume).map(|out| out.join("run.toml"));
     if let Some((file, out)) = own_file.as_ref().zip(args.out.as_ref())
         && !file.exists()
     {
         run_directory::check_path(out)?;
-        return Err(Failed::usage(format!("{} holds no run to resume", out.display())));
+        return Err(run_directory::no_run(&format!("{} holds no run to resume", out.display())));
     }
     let settings = [served_settings(args, served)?, settings_of(args)?].concat();
     let config = run_file::resolve(args.run.as_deref().or(own_file.as_deref()), &settings)?;
@@ -262,14 +273,28 @@ fn account_name(out: &Path) -> Option<String> {
     tandem_rl::config::is_name(name).then(|| name.to_owned())
 }
 
-/// Returns `runs/TASK-ARMS-STRATEGY-seedN`, with a number appended if that exists.
-fn free_run_directory(config: &RunConfig) -> PathBuf {
+/// Reports that the run has another directory than usual, because there is a run in that one.
+fn remark_on(base: &Path, out: &Path) {
+    let (state, base) = (run_directory::state(base), base.display());
+    output::message(wrapped(
+        &format!(
+            "{base} exists ({state}; `tandem train --resume --out {base}` resumes it): this run is {}",
+            out.display()
+        ),
+        "  ",
+    ));
+}
+
+/// Returns `runs/TASK-ARMS-STRATEGY-seedN`, and the same with a number appended if that exists.
+fn free_run_directory(config: &RunConfig) -> (PathBuf, PathBuf) {
     let strategy = config.advice.strategy.replace(':', "-");
     let task = config.task.replace('/', "-");
     let name = format!("{task}-{}-{strategy}-seed{}", config.arms, config.seed);
-    let base = Path::new("runs").join(name);
+    let base = Path::new(RUNS).join(name);
     let numbered = (2..).map(|n: u32| PathBuf::from(format!("{}.{n}", base.display())));
-    std::iter::once(base.clone()).chain(numbered).find(|path| !path.exists()).unwrap_or(base)
+    let free = std::iter::once(base.clone()).chain(numbered).find(|path| !path.exists());
+    let free = free.unwrap_or_else(|| base.clone());
+    (base, free)
 }
 
 /// Loads the teacher, which must be a one-arm policy for the task.

@@ -1,22 +1,21 @@
 //! The end of a run: its summary, curve and report.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use serde_json::{Value, json};
 use tandem_core::evaluation::TEST_SEED;
-use tandem_core::text::counted;
 use tandem_proto::pb;
-use tandem_report::{Axis, CurveOptions, Quantity, Series};
-use tandem_telemetry::{MetricsLog, MetricsRow};
 
 use super::plan::Plan;
 use super::processes::PeakMemory;
 use crate::cli::TrainArgs;
+use crate::columns::N_COLUMNS;
 use crate::environment_server::names_server;
 use crate::evaluation::{EvaluatedPolicy, EvaluationResult, Part, measure, measure_served};
-use crate::exit::{Exit, Failed, OrExit as _};
-use crate::progress_text::{clock_text, grouped};
-use crate::{output, policy_file};
+use crate::exit::{Exit, Failed};
+use crate::progress_text::{advice_text, clock_text, grouped};
+use crate::run_pages::RunPages;
+use crate::{output, policy_file, run_directory};
 
 /// Evaluates the best policy on the test goals, draws the curve and prints the summary.
 pub(super) fn print(
@@ -32,15 +31,10 @@ pub(super) fn print(
         }
         failed.context(saved())
     })?;
-    let rows =
-        MetricsLog::read_all(&plan.out.join("metrics.jsonl")).or_exit(Exit::Data, String::new)?;
-    let pictures = Pictures {
-        curve: draw_curve(plan, &rows)?,
-        report: tandem_report::run_report_html(&plan.out).or_cannot_write(String::new)?,
-    };
+    let pages = RunPages::write(&plan.config, &plan.out)?;
     let summary = match args.json {
         true => summary_json(plan, last, memory, &result).to_string(),
-        false => summary_lines(plan, last, memory, &result, &pictures).join("\n"),
+        false => summary_lines(plan, last, memory, &result, &pages).join("\n"),
     };
     output::print(summary).map_err(|failed| failed.context(saved()))
 }
@@ -56,62 +50,104 @@ fn test(plan: &Plan, args: &TrainArgs) -> Result<EvaluationResult, Failed> {
     measure(&EvaluatedPolicy::new(policy, &path)?, n_episodes, TEST_SEED)
 }
 
-/// Files written at the end of a run.
-struct Pictures {
-    curve: PathBuf,
-    report: PathBuf,
-}
-
 fn summary_lines(
     plan: &Plan,
     last: &pb::Progress,
     memory: PeakMemory,
     result: &EvaluationResult,
-    pictures: &Pictures,
+    pages: &RunPages,
 ) -> Vec<String> {
     let mut lines = vec![format!("done: {}", last.end_reason)];
     lines.push(format!(
-        "best policy on {} test goals (seed {TEST_SEED}), alone: no noise, no advice",
+        "best policy on {} test goals (seed {TEST_SEED}), without noise and advice",
         plan.config.evaluation.test_episodes
     ));
     lines.extend(result.lines().iter().map(|line| format!("  {line}")));
-    lines.extend([
-        format!(
-            "training      {} env steps, {} updates, {} rounds in {}",
-            grouped(last.env_steps),
-            grouped(last.updates),
-            last.round,
-            clock_text(last.wall_s)
-        ),
-        format!(
-            "advice        {} spent, {} left",
-            grouped(last.advice_spent),
-            grouped(last.budget_left)
-        ),
-    ]);
+    lines.push(format!(
+        "training      {} env steps, {} updates, {} rounds in {}",
+        grouped(last.env_steps),
+        grouped(last.updates),
+        grouped(last.round),
+        clock_text(last.wall_s)
+    ));
+    lines.extend(advice_text(last).map(|advice| format!("advice        {advice}")));
     if !last.environment.is_empty() {
         lines.push(format!("environment   {}", last.environment));
     }
+    let teacher = match memory.teacher_mib {
+        0 => String::new(),
+        mib => format!("teacher {mib} MiB, "),
+    };
     lines.extend([
         format!(
-            "memory        learner {} MiB, teacher {} MiB, workers at most {} MiB",
-            memory.learner_mib, memory.teacher_mib, memory.worker_mib
+            "memory        learner {} MiB, {teacher}workers at most {} MiB",
+            memory.learner_mib, memory.worker_mib
         ),
         format!("policy        {}", plan.best_policy().display()),
-        format!("curve         {}", pictures.curve.display()),
-        format!("report        {}", pictures.report.display()),
-        format!("logs          {}, {}", plan.out.join("mcap").display(), plan.log_path().display()),
-        format!("digest        {}", last.digest),
+        format!("curve         {}", pages.curve.display()),
+        format!("report        {}", pages.report.display()),
+        format!("recordings    {}", plan.out.join("mcap").display()),
+        format!("log           {}", plan.log_path().display()),
+        format!("state digest  {}", last.digest),
+        "next".to_owned(),
     ]);
+    lines.extend(next_commands(plan).iter().map(|command| command_line(command)));
     lines
+}
+
+/// Returns commands that use the result: evaluate it, look at it, use it elsewhere, train longer.
+fn next_commands(plan: &Plan) -> Vec<String> {
+    let (out, policy) = (shell_word(&plan.out), shell_word(&plan.best_policy()));
+    let mut commands = Vec::new();
+    let is_simulated = !names_server(&plan.environment);
+    if is_simulated {
+        let baselines = if plan.config.arms == 2 { " --baselines" } else { "" };
+        commands.push(format!("tandem eval --policy {policy}{baselines}"));
+    }
+    if plan.config.arms == 1 && is_simulated {
+        commands.push(format!("tandem train --teacher {policy}"));
+    }
+    commands.extend(newest_log(&plan.out).map(|log| format!("tandem replay {}", shell_word(&log))));
+    commands.push(format!("tandem policy export {policy} --onnx actor.onnx"));
+    if plan.config.stop.max_env_steps > 0 {
+        let longer = 2 * plan.config.stop.max_env_steps;
+        commands.push(format!("tandem train --resume --out {out} --max-env-steps {longer}"));
+    }
+    commands
+}
+
+/// Indents a command, and continues it on a second line if it is too long for a terminal.
+fn command_line(command: &str) -> String {
+    let line = format!("  {command}");
+    match line.rsplit_once(" --") {
+        Some((start, option)) if line.chars().count() > N_COLUMNS => {
+            format!("{start} \\\n      --{option}")
+        }
+        _ => line,
+    }
+}
+
+/// Returns the first episode of the newest recorded evaluation.
+fn newest_log(out: &Path) -> Option<PathBuf> {
+    let entries = std::fs::read_dir(out.join("mcap")).ok()?;
+    let logs = entries.filter_map(|entry| Some(entry.ok()?.path()));
+    logs.filter(|path| path.to_string_lossy().ends_with("-000.mcap")).max()
+}
+
+/// Returns a path as a word of a shell's command line.
+pub(super) fn shell_word(path: &Path) -> String {
+    let text = path.display().to_string();
+    let is_plain = |c: char| c.is_alphanumeric() || "/._-+:,=@%".contains(c);
+    match !text.is_empty() && text.chars().all(is_plain) {
+        true => text,
+        false => format!("'{}'", text.replace('\'', r"'\''")),
+    }
 }
 
 /// Prints the command that resumes an interrupted run.
 pub(super) fn print_interrupted(plan: &Plan) {
-    let out = plan.out.display();
-    let saved = tandem_learner::checkpoint::list(&plan.checkpoints());
-    let round = saved.last().and_then(|path| path.file_stem()?.to_str()?.parse::<u64>().ok());
-    match round {
+    let out = shell_word(&plan.out);
+    match run_directory::saved_round(&plan.out) {
         Some(round) => {
             output::message(format_args!(
                 "interrupted; the state after round {round} is saved. Resume with:"
@@ -120,20 +156,10 @@ pub(super) fn print_interrupted(plan: &Plan) {
         None => output::message("interrupted before the first checkpoint. Start over with:"),
     }
     output::message(format_args!("  tandem train --resume --out {out}"));
-}
-
-/// Draws the success rate over environment steps.
-fn draw_curve(plan: &Plan, rows: &[MetricsRow]) -> Result<PathBuf, Failed> {
-    let config = &plan.config;
-    let arms = counted(config.arms, "arm");
-    let name = format!("{}, {arms}, {}", config.task, config.advice.strategy);
-    let series = Series::of(&name, rows, Axis::EnvSteps, Quantity::Success);
-    let title = format!("Success of the policy alone: {name}");
-    let options = CurveOptions::of(&title, Quantity::Success, Axis::EnvSteps);
-    let svg = tandem_report::curve_svg(&[series], &options).or_exit(Exit::Bug, String::new)?;
-    let path = plan.out.join("curve.svg");
-    std::fs::write(&path, svg).or_cannot_write(|| format!("cannot write {}", path.display()))?;
-    Ok(path)
+    // The state is saved; pages that cannot be written are left out.
+    if let Ok(Some(pages)) = RunPages::write_if_evaluated(&plan.config, &plan.out) {
+        output::message(format_args!("report so far: {}", pages.report.display()));
+    }
 }
 
 fn summary_json(

@@ -2,7 +2,7 @@
 
 mod inference;
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use tandem_core::task::MAX_ARMS;
 use tandem_core::{ArmAdvice, StepAdvice, StepQuery, TaskSpec};
@@ -26,6 +26,8 @@ pub struct Advisor {
     ledger: Box<dyn Ledger>,
     /// A cache by account. The terms of an account never change.
     strategies: BTreeMap<String, Strategy>,
+    /// Accounts for which a step was asked about again with other numbers, so that each gets one warning.
+    reused: BTreeSet<String>,
 }
 
 /// A description of the teacher.
@@ -80,7 +82,7 @@ impl Advisor {
             layout,
         };
         let inference = TeacherInference::new(policy);
-        Ok(Self { info, inference, ledger, strategies: BTreeMap::new() })
+        Ok(Self { info, inference, ledger, strategies: BTreeMap::new(), reused: BTreeSet::new() })
     }
 
     /// Returns the description of the teacher.
@@ -156,7 +158,9 @@ impl Advisor {
             .flatten()
             .filter_map(|request| request.charge_request(episode_steps))
             .collect();
-        let mut charged = self.charge(&charges).into_iter();
+        let charged = self.charge(&charges);
+        self.warn_of_reused_steps(&charges, &charged);
+        let mut charged = charged.into_iter();
         let mut answer = |scored: ScoredRequest<'_>| {
             let charged = if scored.arms.is_empty() {
                 let balance = self.ledger.balance(&scored.request.account);
@@ -219,6 +223,33 @@ impl Advisor {
         let results = self.ledger.charge(requests);
         assert_eq!(results.len(), requests.len(), "a ledger answers every request");
         results
+    }
+
+    /// Warns, once for each account, if a step was charged that the strategy would not charge now: the account remembers
+    /// the verdict on an earlier request for the same step of the same episode, which had other numbers.
+    fn warn_of_reused_steps(
+        &mut self,
+        requests: &[ChargeRequest],
+        results: &[Result<ChargeResult, LedgerError>],
+    ) {
+        for (request, result) in requests.iter().zip(results) {
+            let Ok(result) = result else { continue };
+            let mut decided = request.charges.iter().zip(&result.verdicts);
+            let is_contradicted = |(charge, verdict): &(&Charge, &Option<BudgetHalf>)| {
+                verdict.is_some_and(|half| !charge.is_wanted_in(half))
+            };
+            let Some((charge, _)) = decided.find(is_contradicted) else { continue };
+            if self.reused.len() < MAX_CACHED_STRATEGIES
+                && self.reused.insert(request.account.clone())
+            {
+                tracing::warn!(
+                    account = request.account,
+                    episode = charge.episode,
+                    step = charge.step,
+                    "other numbers for a step that was decided before, its verdict stays: use another account or episode"
+                );
+            }
+        }
     }
 }
 

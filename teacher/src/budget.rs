@@ -67,7 +67,8 @@ pub struct Charge {
 }
 
 impl Charge {
-    const fn is_wanted_in(&self, half: BudgetHalf) -> bool {
+    /// Returns true if the step is charged when its unit comes from `half` of the budget.
+    pub(crate) const fn is_wanted_in(&self, half: BudgetHalf) -> bool {
         match half {
             BudgetHalf::First => self.wanted_in_first_half,
             BudgetHalf::Second => self.wanted_in_second_half,

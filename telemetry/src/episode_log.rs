@@ -13,6 +13,7 @@ use crate::error::Error;
 use crate::messages::{EpisodeMetadata, METADATA_NAME, decode, pb};
 use crate::recorder::{OUTCOME_TOPIC, TRANSITION_TOPIC};
 use crate::records::Records;
+use crate::trial_log;
 
 /// A recorded episode.
 #[derive(Debug, Clone, PartialEq)]
@@ -49,11 +50,15 @@ pub struct LoggedTransition {
 /// Reads the episode in the MCAP log `path`.
 ///
 /// # Errors
-/// If the file cannot be read, is incomplete, or is not the log of an episode.
+/// If the file cannot be read, is incomplete, or is not the log of an episode. The log of a trial is an error of its own,
+/// [`Error::TrialLog`].
 pub fn read_episode(path: &Path) -> Result<EpisodeLog, Error> {
     let bytes = regular_file::read(path).map_err(Error::io("read", path))?;
     let not_an_episode = |problem| Error::NotAnEpisode { path: path.to_owned(), problem };
     let raw = read_raw(&bytes).map_err(Error::read_log(path))?;
+    if raw.metadata.is_none() && raw.is_trial {
+        return Err(Error::TrialLog { path: path.to_owned() });
+    }
     decode_episode(raw).map_err(not_an_episode)
 }
 
@@ -61,6 +66,8 @@ pub fn read_episode(path: &Path) -> Result<EpisodeLog, Error> {
 #[derive(Default)]
 struct RawLog {
     metadata: Option<BTreeMap<String, String>>,
+    /// The file has the metadata of a trial.
+    is_trial: bool,
     transitions: Vec<Vec<u8>>,
     outcomes: Vec<Vec<u8>>,
 }
@@ -77,6 +84,7 @@ fn read_raw(bytes: &[u8]) -> mcap::McapResult<RawLog> {
             Record::Metadata(metadata) if metadata.name == METADATA_NAME => {
                 raw.metadata = Some(metadata.metadata);
             }
+            Record::Metadata(metadata) => raw.is_trial |= metadata.name == trial_log::METADATA_NAME,
             Record::Schema { header, data } => {
                 channels.add_schema(header, data.into_owned().into())?;
             }

@@ -41,6 +41,14 @@ pub enum Error {
         /// The missing or invalid part.
         problem: String,
     },
+    /// The file is the log of a trial, which cannot be simulated again.
+    #[error(
+        "{path:?} is the log of a trial, not of an episode: open it in Foxglove, or see its directory with `tandem report`"
+    )]
+    TrialLog {
+        /// Path of the log.
+        path: PathBuf,
+    },
     /// A vector does not fit the layout of the episode or trial.
     #[error("{field} has {got} numbers, the layout has {expected}")]
     Length {

@@ -19,6 +19,8 @@ use crate::standard_error::EventWriter;
 pub struct LogConfig {
     /// Least severe level that is written to standard error; `None` writes nothing there.
     pub console: Option<LevelFilter>,
+    /// Whether lines on standard error are coloured if that is a terminal.
+    pub is_coloured: bool,
     /// File to which lines of level `info` and above are appended.
     pub file: Option<PathBuf>,
     /// Directives that replace the levels of both destinations: `LEVEL` or `TARGET=LEVEL`, separated by commas.
@@ -34,7 +36,7 @@ pub fn init(config: &LogConfig) -> Result<(), Error> {
         Some(level) => {
             let layer = fmt::layer()
                 .with_writer(EventWriter::default)
-                .with_ansi(std::io::stderr().is_terminal());
+                .with_ansi(config.is_coloured && std::io::stderr().is_terminal());
             Some(layer.with_filter(filter(level, config)?))
         }
         None => None,

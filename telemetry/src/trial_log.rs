@@ -16,7 +16,7 @@ use crate::trials::TrialRow;
 /// Number of snapshots after which the log is flushed to disk.
 const FLUSH_EVERY_SNAPSHOTS: u32 = 25;
 /// Names of the metadata records at the start and at the end of a log.
-const METADATA_NAME: &str = "tandem.trial";
+pub(crate) const METADATA_NAME: &str = "tandem.trial";
 const OUTCOME_NAME: &str = "tandem.trial.outcome";
 const FORMAT: &str = "1";
 

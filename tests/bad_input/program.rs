@@ -94,7 +94,7 @@ fn prepare(directory: &Path) {
     let whole = fs::read(shipped("teacher-push")).expect("ships");
     let mut altered = whole.clone();
     *altered.last_mut().expect("not empty") ^= 1;
-    let files: [(&str, &[u8]); 8] = [
+    let files: [(&str, &[u8]); 9] = [
         ("empty", b""),
         ("garbage", &[0x8f; 3000]),
         ("torn", &whole[..1000]),
@@ -103,18 +103,21 @@ fn prepare(directory: &Path) {
         ("unknown.toml", b"[ddpg]\ndiscont = 0.9\n"),
         ("twice.toml", b"seed = 1\nseed = 2\n"),
         ("advised.toml", b"arms = 2\n"),
+        ("no-speed.json", b"{\"way_points\": []}"),
     ];
     for (name, bytes) in files {
         fs::write(directory.join(name), bytes).expect("written");
     }
     fs::create_dir(directory.join("folder")).expect("created");
+    fs::create_dir_all(directory.join("runs/half")).expect("created");
+    fs::write(directory.join("runs/half/run.toml"), "arms = 1\n").expect("written");
     let made = Command::new("mkfifo").arg(directory.join("pipe")).status();
     assert!(made.expect("mkfifo runs").success());
 }
 
 /// Command lines, their exit codes and a part of the error message. `@name` is a prepared file or directory, `@empty/x`
 /// a path that cannot be written, `%name` a shipped policy and `BUSY` an address in use.
-const CASES: [(&str, i32, &str); 76] = [
+const CASES: [(&str, i32, &str); 81] = [
     ("", 64, "Usage"),
     ("dance", 64, "dance"),
     ("--log [[ policy show %teacher-push", 64, "[["),
@@ -136,7 +139,7 @@ const CASES: [(&str, i32, &str); 76] = [
     ("train --task shove", 64, "shove"),
     ("train --strategy bogus", 64, "bogus"),
     ("train --workers 0", 64, "--workers"),
-    ("train --resume", 64, "--out"),
+    ("train --resume", 64, "--resume needs --out DIR"),
     ("train --resume --out @folder", 64, "folder"),
     ("train --teacher @missing", 65, "missing"),
     ("train --teacher @torn", 65, "torn"),
@@ -196,6 +199,11 @@ const CASES: [(&str, i32, &str); 76] = [
     ("report @empty", 65, "no metrics row"),
     ("report @garbage", 65, "no metrics row"),
     ("bridge move /dev/zero", 65, "it has more than 16 MiB"),
+    ("bridge move @no-speed.json", 65, "it has no speed: add \"speed\": 1.0, or give --speed"),
+    ("bridge status --connect 127.0.0.1:1", 75, "start one with `tandem bridge --driver sim`"),
+    ("status 127.0.0.1:1", 75, "nothing listens there; start one with `tandem train`"),
+    ("train --resume", 64, "there are: runs/half (not saved yet)"),
+    ("train --resume --out @out", 64, "holds no run to resume; there are: runs/half"),
     ("health 127.0.0.1:1 --tls-ca /dev/zero", 64, "it has more than 16 MiB"),
     ("sweep @empty --dry-run", 64, "is empty"),
     ("sweep /dev/null --dry-run", 64, "is empty"),

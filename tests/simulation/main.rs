@@ -62,6 +62,7 @@ fn run_config((strategy, budget, share, lag): (&str, u64, f64, u32)) -> RunConfi
     run.ddpg.n_hidden_layers = 2;
     run.ddpg.batch_size = 32;
     run.evaluation.every_env_steps = 2 * run.env_steps_per_round();
+    run.evaluation.early_points = 1;
     run.evaluation.episodes = 2;
     run.evaluation.recorded_episodes = 0;
     run.stop.max_env_steps = N_ROUNDS * run.env_steps_per_round();
@@ -181,12 +182,12 @@ fn one_simulation() {
 }
 
 #[test]
-fn every_undisturbed_run_spends_its_budget_and_is_evaluated_three_times() {
+fn every_undisturbed_run_spends_its_budget_and_is_evaluated_four_times() {
     for (run_idx, (_, budget, ..)) in RUNS.iter().enumerate() {
         let Outcome { units, n_rounds, evaluated, .. } = undisturbed(run_idx);
         assert_eq!(*units, [*budget, 0, 0]);
         assert_eq!(*n_rounds, N_ROUNDS);
-        assert_eq!(*evaluated, [2, 4, 5]);
+        assert_eq!(*evaluated, [0, 2, 4, 5]);
     }
 }
 

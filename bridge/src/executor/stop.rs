@@ -129,15 +129,15 @@ pub enum StopCause {
     #[error("the tool would move at {:.4} m/s, at most {:.4}", .0.got, .0.allowed)]
     ToolSpeed(Excess),
     /// The arm is too near to the table, or would be before it can stop; metres.
-    #[error("{:.1} mm above the table before it can stop, at least {:.1}",
+    #[error("{:.2} mm above the table before it can stop, at least {:.2}",
         .0.got * 1e3, .0.allowed * 1e3)]
     TableGap(Excess),
     /// The arms are too near to each other, or would be before they can stop; metres.
-    #[error("{:.1} mm from the other arm before both can stop, at least {:.1}",
+    #[error("{:.2} mm from the other arm before both can stop, at least {:.2}",
         .0.got * 1e3, .0.allowed * 1e3)]
     ArmsGap(Excess),
     /// Parts of one arm are too near to each other, or would be before it can stop; metres.
-    #[error("{:.1} mm between parts of the arm itself before it can stop, at least {:.1}",
+    #[error("{:.2} mm between parts of the arm itself before it can stop, at least {:.2}",
         .0.got * 1e3, .0.allowed * 1e3)]
     SelfGap(Excess),
 }

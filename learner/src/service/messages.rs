@@ -32,6 +32,8 @@ pub(super) fn encode_progress(progress: &Progress) -> pb::Progress {
         digest: end.and_then(|end| end.digest.clone()).unwrap_or_default(),
         warning: progress.warning.clone(),
         environment: progress.environment.text(),
+        max_env_steps: progress.max_env_steps,
+        max_minutes: progress.max_minutes,
     }
 }
 

@@ -47,9 +47,9 @@ impl<'a> Evaluations<'a> {
         &self.pending
     }
 
-    /// Returns true if an evaluation follows the round that was learned last.
+    /// Returns true if an evaluation follows `round` rounds and is neither complete nor pending.
     pub(super) fn is_due(&self, round: u64) -> bool {
-        round.is_multiple_of(self.config.run.rounds_per_evaluation())
+        self.config.run.is_evaluated(round) && !self.covers(round)
     }
 
     /// Schedules an evaluation of the present parameters. The caller orders its episodes; a checkpoint in between

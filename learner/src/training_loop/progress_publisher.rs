@@ -58,6 +58,8 @@ impl<'a> ProgressPublisher<'a> {
             progress.task.clone_from(&run.task);
             progress.n_arms = run.arms;
             progress.strategy.clone_from(&run.advice.strategy);
+            progress.max_env_steps = run.stop.max_env_steps;
+            progress.max_minutes = run.stop.max_minutes;
             progress.counters = counters;
             progress.wall_s = self.wall_s();
             progress.env_steps_per_s = env_steps_per_s;

@@ -29,6 +29,7 @@ pub(crate) fn config(lag: u32) -> RunConfig {
     config.ddpg.batch_size = 16;
     config.replay.capacity_transitions = 2000;
     config.evaluation.every_env_steps = 800;
+    config.evaluation.early_points = 0;
     config.evaluation.episodes = 10;
     config.stop.max_env_steps = 3600;
     config.stop.max_minutes = 0.0;

@@ -40,6 +40,8 @@ impl RunConfig {
         let episodes = self.evaluation.episodes;
         let is_count = (1..=100_000).contains(&episodes);
         check("evaluation.episodes", episodes, is_count, "1 to 100,000")?;
+        let early = self.evaluation.early_points;
+        check("evaluation.early_points", early, early <= 100, "0 to 100")?;
         let test_episodes = self.evaluation.test_episodes;
         let is_count = (1..=100_000).contains(&test_episodes);
         check("evaluation.test_episodes", test_episodes, is_count, "1 to 100,000")?;

@@ -1,5 +1,6 @@
 //! The values that a recipe gives to every setting.
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use tandem_core::{AdviceUnit, Exploration, JudgedAction, Task, TaskSpec, WorldSettings};
 
@@ -11,7 +12,7 @@ use crate::ddpg::DdpgConfig;
 use crate::her::{ReplayConfig, RewardKind};
 
 /// A named set of values for all settings.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize, JsonSchema, Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Recipe {
     /// The paper's DDPG + HER, with the values of the HER reference implementation where the paper gives none.
@@ -77,6 +78,7 @@ impl RunConfig {
             evaluation: EvaluationConfig {
                 // The paper evaluates once per epoch.
                 every_env_steps: if tandem { 20_000 } else { PAPER_EPOCH_ENV_STEPS },
+                early_points: 4,
                 episodes: 240,
                 seed: 240_240,
                 recorded_episodes: 2,

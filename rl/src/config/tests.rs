@@ -39,6 +39,21 @@ fn a_run_cools_down_over_its_last_fifth_if_it_has_an_end() {
 }
 
 #[test]
+fn evaluations_are_denser_before_the_first_regular_one() {
+    let mut config = RunConfig::defaults(Recipe::Tandem, Task::Push, 2);
+    let evaluated = |config: &RunConfig| {
+        (0..=50).filter(|round| config.is_evaluated(*round)).collect::<Vec<u64>>()
+    };
+    assert_eq!(evaluated(&config), [0, 6, 12, 18, 25, 50], "25 rounds of 800 steps are 20,000");
+    config.evaluation.early_points = 0;
+    assert_eq!(evaluated(&config), [25, 50], "as before");
+    (config.evaluation.early_points, config.evaluation.every_env_steps) = (4, 1_600);
+    assert_eq!(evaluated(&config)[..4], [0, 1, 2, 4], "no round twice");
+    config.evaluation.every_env_steps = u64::MAX;
+    assert_eq!(evaluated(&config), [0]);
+}
+
+#[test]
 fn the_cost_of_a_contact_grows_over_the_middle_half_of_a_run() {
     let mut config = RunConfig::defaults(Recipe::Tandem, Task::Push, 2);
     config.stop.max_env_steps = 80_000;
@@ -74,6 +89,7 @@ fn a_bad_value_is_named() {
     check(|config| config.seed = TEST_SEED, "seed is 777: expected another seed");
     check(|config| config.evaluation.seed = TEST_SEED, "evaluation.seed is 777");
     check(|config| config.rounds.per_epoch = 0, "rounds.per_epoch");
+    check(|config| config.evaluation.early_points = 101, "evaluation.early_points");
     let too_much = |config: &mut RunConfig| {
         config.advice.budget_scope = BudgetScope::Slot;
         config.advice.budget = 1_000_000_000_000;

@@ -1,5 +1,6 @@
 //! Section `[ddpg]` of the run file.
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use tandem_core::settings::OutOfRange;
 
@@ -8,7 +9,7 @@ const MAX_TRANSITIONS: usize = 65_536;
 
 /// Section `[ddpg]` of the run file: the update. The defaults are those of recipe `tandem` for a student; the paper's
 /// values are in parentheses.
-#[derive(Debug, Clone, PartialEq, Deserialize, Serialize)]
+#[derive(Debug, Clone, PartialEq, Deserialize, JsonSchema, Serialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct DdpgConfig {
     /// Discount per control step, in [0, 1) (paper, section 4.1: 0.98).

@@ -1,11 +1,12 @@
 //! Section `[replay]` of the run file.
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use tandem_core::TaskSpec;
 use tandem_core::settings::OutOfRange;
 
 /// The reward that the critic learns.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize, JsonSchema, Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum RewardKind {
     /// One reward: 0 if the norm over all arms' goal distances is within the tolerance, else -1.
@@ -26,7 +27,7 @@ impl RewardKind {
 }
 
 /// Section `[replay]` of the run file: the replay buffer, and how batches are sampled from it.
-#[derive(Debug, Clone, PartialEq, Deserialize, Serialize)]
+#[derive(Debug, Clone, PartialEq, Deserialize, JsonSchema, Serialize)]
 #[serde(deny_unknown_fields)]
 pub struct ReplayConfig {
     /// Capacity in transitions, at least one episode's steps, 50 in the built-in tasks (baselines HER: 1,000,000).
@@ -38,7 +39,7 @@ pub struct ReplayConfig {
     pub displaced_fraction: f32,
     /// Fraction of two-arm transitions that combine the arms of two steps, in [0, 1]: counterfactual data augmentation
     /// (CoDA, Pitis et al. 2020). A combination in which the arms are near each other is rejected. It takes effect with
-    /// [`RewardKind::PerArm`] and tasks whose arms can be recombined only.
+    /// `replay.reward = "per-arm"` and tasks whose arms can be recombined only.
     pub coda_fraction: f32,
     /// Probability that the arms of a transition exchange places, in [0, 1]: an exact symmetry of worlds whose arms are
     /// interchangeable.

@@ -4,6 +4,7 @@ use std::fmt;
 use std::time::Duration;
 
 use tandem_bench::{Calls, Figure, Percentiles};
+use tandem_core::text::counted;
 use tandem_system::process::{ProcessUsage, ResidentMemory, machine_busy_s};
 
 use super::measures::{Bound, Load, knee, median_and_longest};
@@ -197,7 +198,7 @@ impl fmt::Display for Scale {
         }
         match self.knee() {
             Some((n_workers, bound)) => {
-                writeln!(out, "knee: {n_workers} real workers; {}", bound.text())
+                writeln!(out, "knee: {}; {}", counted(n_workers, "real worker"), bound.text())
             }
             None if self.real.len() > 1 => writeln!(out, "knee: not reached"),
             None => Ok(()),

@@ -58,6 +58,7 @@ impl Workspace {
         run.rounds.updates_per_env_step = updates_per_env_step.max(FEW);
         run.rounds.warmup_env_steps = 0;
         run.evaluation.every_env_steps = NEVER;
+        run.evaluation.early_points = 0;
         run.stop.max_env_steps = 0;
         run.checkpoint.every_rounds = NEVER;
         let run = run.checked().context("invalid settings")?;

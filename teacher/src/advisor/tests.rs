@@ -102,6 +102,17 @@ fn eamc_switches_to_mistake_correcting_at_half_of_the_budget() {
 }
 
 #[test]
+fn a_step_with_other_numbers_keeps_its_verdict_and_is_noticed() {
+    let mut advisor = advisor(10, "mc-q:0.1");
+    assert!(ask(&mut advisor, &query(1, 0, 0.5, 0.0)).charged);
+    assert!(ask(&mut advisor, &query(1, 0, 0.5, 0.0)).charged, "the same numbers");
+    assert!(advisor.reused.is_empty(), "a repetition is expected");
+    let changed = ask(&mut advisor, &query(1, 0, 0.0, 0.0));
+    assert_eq!((changed.charged, changed.overridden_arms()), (true, 0));
+    assert_eq!(advisor.reused.iter().collect::<Vec<_>>(), ["run"]);
+}
+
+#[test]
 fn a_repeated_query_gets_the_same_answer_in_any_phase() {
     let mut advisor = advisor(4, "eamc:0.1");
     let first: Vec<StepAdvice> = (0..6).map(|step| ask(&mut advisor, &two_arms(step))).collect();
