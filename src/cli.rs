@@ -24,8 +24,8 @@ pub(crate) use policy::{ExportArgs, ImportArgs, PolicyArgs, PolicyCommand, ShowA
 pub(crate) use results::{EvalArgs, McapArgs, McapCommand, PictureArgs, ReplayArgs, ReportArgs};
 pub(crate) use scene::SceneArgs;
 pub(crate) use service::{
-    ClientArgs, EnvArgs, EnvGuardArgs, EnvironmentArgs, LearnerArgs, ListenArgs, RelayArgs,
-    SecretArgs, TeacherArgs, WorkerArgs,
+    ClientArgs, EnvArgs, EnvGuardArgs, EnvironmentArgs, LearnerArgs, ListenArgs, MetricsArgs,
+    RelayArgs, SecretArgs, TeacherArgs, WorkerArgs,
 };
 pub(crate) use task::{TaskName, WorldName, check_layout, check_task, chosen_task, task_flags};
 pub(crate) use train::{RecipeName, SweepArgs, TrainArgs};

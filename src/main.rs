@@ -22,6 +22,7 @@ mod input;
 mod launch;
 mod logging;
 mod mcap;
+mod metrics;
 mod output;
 mod picture;
 mod policy;

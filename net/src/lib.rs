@@ -1,4 +1,4 @@
-//! Connections between processes: access control, TLS, keep-alive, health, reflection and retries.
+//! Connections between processes: access control, TLS, keep-alive, health, reflection, retries and metrics.
 //!
 //! The server's side:
 //! - [`ServerConfig`] holds a service's token and certificate, and builds its [`Router`]; [`serve()`] runs the router
@@ -6,6 +6,7 @@
 //! - [`Incoming`] accepts connections from any network, within a [`Capacity`].
 //! - [`EncodedResponse`] is encoded once and sent to many clients.
 //! - [`TextEndpoint`] serves a text over plain HTTP.
+//! - [`Metrics`] measures calls and other work, and writes a page for Prometheus.
 //!
 //! The client's side:
 //! - [`ClientConfig`] holds a token and the trusted authority, and opens [`AuthChannel`]s, whose errors name the
@@ -25,6 +26,7 @@ mod connection;
 mod encoded_response;
 mod health;
 mod incoming;
+pub mod metrics;
 mod pacing;
 mod retry;
 mod serve;
@@ -44,6 +46,7 @@ pub use connection::{ConnectInfo, Connection, ConnectionClosed, MarkRequest, Mar
 pub use encoded_response::EncodedResponse;
 pub use health::{HealthError, check_health};
 pub use incoming::Incoming;
+pub use metrics::Metrics;
 pub use pacing::Pacing;
 pub use retry::{Backoff, Operation, Retrier, Retryability, retry, within};
 pub use serve::{SHUTDOWN_GRACE, serve};

@@ -10,6 +10,7 @@ use crate::config::{Timeouts, WorkerConfig};
 use crate::environment::{Environments, Failure};
 use crate::error::Error;
 use crate::learner::{Learner, Work};
+use crate::metrics::WorkerMetrics;
 use crate::player::{PeerChannel, PeerRequest, PlayedSlot, Player};
 use crate::rollout::RolloutError;
 use crate::teacher::Teacher;
@@ -43,6 +44,7 @@ pub async fn run_with(
     let rollouts = TaskTracker::new();
     let (learner, teacher) = (Learner::new(&config, timeouts)?, Teacher::new(&config, timeouts)?);
     let pacing = config.pacing;
+    let metrics = WorkerMetrics::register(config.client.metrics());
     let environments = config.environment.clone().map(Environments::new);
     let mut worker = Worker {
         config,
@@ -50,6 +52,7 @@ pub async fn run_with(
         learner,
         teacher,
         environments,
+        metrics,
         difference_logged: false,
         rollouts: rollouts.clone(),
     };
@@ -74,6 +77,7 @@ struct Worker {
     teacher: Option<Teacher>,
     /// The server of the environments; `None` if they are simulated in this process.
     environments: Option<Environments>,
+    metrics: WorkerMetrics,
     /// Whether the log has a warning that the environments are not deterministic.
     difference_logged: bool,
     rollouts: TaskTracker,
@@ -91,12 +95,14 @@ impl Worker {
     async fn play_slots(&mut self, shutdown: &CancellationToken) -> Result<(), Error> {
         let mut membership = None;
         loop {
+            let start = self.metrics.now();
             let slot = tokio::select! {
                 biased;
                 () = shutdown.cancelled() => return Ok(()),
                 slot = self.next_slot(membership) => slot?,
             };
             let Some((member, order)) = slot else { return Ok(()) };
+            self.metrics.record_wait(start, order.parameter_version);
             membership = self.play_and_deliver(member, order).await?;
         }
     }
@@ -150,12 +156,12 @@ impl Worker {
             n_arms = terms.layout.n_arms(),
             "run joined"
         );
-        let log_dir = self.config.log_dir.clone();
+        let (log_dir, metrics) = (self.config.log_dir.clone(), self.metrics.clone());
         let player = match &mut self.environments {
-            None => Player::simulating(terms, log_dir)?,
+            None => Player::simulating(terms, log_dir, metrics)?,
             Some(environments) => {
                 environments.check(&terms.layout).await?;
-                Player::remote(terms, log_dir)
+                Player::remote(terms, log_dir, metrics)
             }
         };
         Ok(Membership { worker_id, player: Box::new(player) })
