@@ -43,7 +43,7 @@ recorded_episodes = 0
 [checkpoint]
 every_rounds = 8
 [stop]
-max_env_steps = 16_000
+max_env_steps = 2_000_000
 """
 
 
@@ -120,7 +120,7 @@ class Run:
         relay_at = start("relay", "relay", "--connect", learner_at).address()
         environment_at = start("environment", "environment", "--max-environments", "64").address()
         bridge_at = start("bridge", "bridge", "--driver", "sim", "--listen", "127.0.0.1:0").address()
-        start("worker-1", "worker", "--connect", learner_at, "--teacher", teacher_at)
+        start("worker-1", "worker", "--connect", learner_at, "--teacher", teacher_at, "--env", environment_at)
         start("worker-2", "worker", "--connect", relay_at, "--teacher", teacher_at, "--env", environment_at)
         for address in (teacher_at, learner_at, relay_at, environment_at, bridge_at):
             subprocess.run([program, "health", address], check=True, stdout=subprocess.DEVNULL)
@@ -139,12 +139,15 @@ class Run:
         wait_for("an evaluation after a checkpoint", evaluations_since_the_checkpoint)
         self.learner.process.kill()
         self.learner.process.wait()
+        n_rows = len(self.rows())
         self.learner.start()
         self.learner.address()
+        wait_for("two further evaluations", lambda: len(self.rows()) >= n_rows + 2)
 
     def end(self):
         for service in self.services:
-            service.process.send_signal(signal.SIGTERM)
+            if service.process.poll() is None:
+                service.process.send_signal(signal.SIGTERM)
         for service in self.services:
             try:
                 service.process.wait(timeout=20)
@@ -233,8 +236,8 @@ def check_table(metrics, write):
         table.append(f"| `{name}` | {metric['type']} | {components} | {metric['help']} |")
     is_row = [bool(re.match(r"\| `(tandem|process)_", line)) for line in lines]
     if write:
-        first = is_row.index(True) if any(is_row) else len(lines)
         rest = [line for line, row in zip(lines, is_row) if not row]
+        first = rest.index("| metric | type | service | meaning |") + 2
         path.write_text("\n".join(rest[:first] + table + rest[first:]) + "\n")
         return
     known = [line for line, row in zip(lines, is_row) if row]
@@ -318,13 +321,16 @@ def main():
         prometheus = Prometheus(work, run.services)
         try:
             run.crash_learner()
-            wait_for("the end of the run", lambda: "\ntandem_ended 1" in run.learner.page())
+            # The learner exposes these metrics once it has values for them.
+            for name in ("tandem_environment_deterministic", "tandem_best_evaluation_success_ratio", "tandem_checkpoint_seconds_count"):
+                wait_for(name, lambda name=name: f"\n{name} " in run.learner.page())
             wait_for("three scrapes of all services", lambda: prometheus.are_all_scraped(len(run.services)))
             metrics, samples = exposed(run.services)
             check_names(metrics)
             check_table(metrics, write)
             n_panels, n_alerts = check_expressions(prometheus, samples)
             check_histograms(prometheus)
+            run.end()
             n_events = check_events(run)
         finally:
             prometheus.end()

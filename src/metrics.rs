@@ -10,10 +10,10 @@ use crate::clock;
 use crate::exit::{Exit, Failed, OrExit as _};
 use crate::version::VERSION;
 
-/// Creates the metrics of a process that runs `service`.
-pub(crate) fn of_process(service: &'static str) -> Metrics {
+/// Creates the metrics of a process that runs the service `component`.
+pub(crate) fn of_process(component: &'static str) -> Metrics {
     let metrics = Metrics::new(clock::since_now());
-    let build = Info::new(vec![("version", VERSION), ("service", service)]);
+    let build = Info::new(vec![("version", VERSION), ("component", component)]);
     metrics.register("build", "Version of the program, and the service that it runs", build);
     let start_s = clock::unix_millis() as f64 / 1000.0;
     metrics.add_foreign_source(move |registry| add_process(registry, start_s));
