@@ -52,6 +52,10 @@ pub(crate) struct Cli {
     /// Log filter, such as info or tandem_learner=debug; overrides RUST_LOG.
     #[arg(long, global = true, value_name = "FILTER")]
     pub(crate) log: Option<String>,
+    /// Sends traces to the OpenTelemetry collector at this address (OTLP over gRPC), such as http://127.0.0.1:4317.
+    #[cfg(feature = "otlp")]
+    #[arg(long, global = true, value_name = "URL", env = "OTEL_EXPORTER_OTLP_ENDPOINT")]
+    pub(crate) otlp_endpoint: Option<String>,
     #[command(subcommand)]
     pub(crate) command: Command,
 }

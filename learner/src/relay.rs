@@ -12,7 +12,7 @@ use std::time::Duration;
 use tandem_net::metrics::Counter;
 use tandem_net::{
     AuthChannel, ClientConfig, EncodedResponse, Incoming, MAX_MESSAGE_BYTES, Metrics, ServerConfig,
-    within,
+    TraceContext, within,
 };
 use tandem_proto::pb;
 use tandem_proto::pb::learner_client::LearnerClient;
@@ -176,7 +176,7 @@ impl Learner for Relay {
         &self,
         request: Request<pb::SubmitEpisodesRequest>,
     ) -> Result<Response<pb::SubmitEpisodesResponse>, Status> {
-        forward(self.client.clone().submit_episodes(request.into_inner())).await
+        forward(self.client.clone().submit_episodes(with_trace(request))).await
     }
 
     async fn status(
@@ -192,6 +192,16 @@ impl Learner for Relay {
     ) -> Result<Response<Self::WatchStream>, Status> {
         forward(self.client.clone().watch(request.into_inner())).await
     }
+}
+
+/// Returns a request with the message and the trace context of `request`, without its other headers.
+fn with_trace<T>(request: Request<T>) -> Request<T> {
+    let trace = request.extensions().get::<TraceContext>().copied();
+    let mut forwarded = Request::new(request.into_inner());
+    if let Some(trace) = trace {
+        forwarded.extensions_mut().insert(trace);
+    }
+    forwarded
 }
 
 /// Applies the deadline to a call of the learner.

@@ -15,6 +15,7 @@ use tower::Service;
 
 use crate::metrics::{MeasuredCall, Metrics, Side, labels_of};
 use crate::tls_probe::FirstByte;
+use crate::trace::TraceContext;
 use crate::wrong_service::unknown_call;
 
 /// A channel that connects on first use, reconnects after a loss, and sends the token, if there is one, with each call.
@@ -61,6 +62,9 @@ impl Service<http::Request<Body>> for AuthChannel {
     fn call(&mut self, mut request: http::Request<Body>) -> Self::Future {
         if let Some(authorization) = &self.target.authorization {
             request.headers_mut().insert(AUTHORIZATION, authorization.clone());
+        }
+        if let Some(trace) = request.extensions().get::<TraceContext>().copied() {
+            trace.add_to(request.headers_mut());
         }
         let path = request.uri().path().to_owned();
         let mut measured =

@@ -6,6 +6,7 @@
 //! - [`Incoming`] accepts connections from any network, within a [`Capacity`].
 //! - [`EncodedResponse`] is encoded once and sent to many clients.
 //! - [`TextEndpoint`] serves a text over plain HTTP.
+//! - [`TraceContext`] follows the work on a slot across processes.
 //! - [`Metrics`] measures calls and other work, and writes a page for Prometheus.
 //!
 //! The client's side:
@@ -35,6 +36,7 @@ mod text_endpoint;
 mod throttle;
 mod tls;
 mod tls_probe;
+mod trace;
 mod wrong_service;
 
 pub use access::{AccessError, Token, TokenError, is_exposed};
@@ -53,6 +55,7 @@ pub use serve::{SHUTDOWN_GRACE, serve};
 pub use server::{Router, ServerConfig, ServerConfigError, TokenInterceptor};
 pub use text_endpoint::TextEndpoint;
 pub use tls::TlsError;
+pub use trace::{InvalidTraceContext, TraceContext};
 
 /// The largest message that services and clients accept, in bytes: several times the episodes of a slot or the
 /// parameters of a large actor.

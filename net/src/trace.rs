@@ -25,7 +25,9 @@ pub struct TraceContext {
 
 /// The error of a text that is not a trace context.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
-#[error("expected a trace context, such as 00-4bf92f3577b34da6a3ce929d0e0e4736-00f067aa0ba902b7-01")]
+#[error(
+    "expected a trace context, such as 00-4bf92f3577b34da6a3ce929d0e0e4736-00f067aa0ba902b7-01"
+)]
 pub struct InvalidTraceContext;
 
 impl TraceContext {

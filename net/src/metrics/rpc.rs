@@ -17,8 +17,10 @@ use prost_types::FileDescriptorSet;
 use tonic::body::Body;
 use tonic::{Code, Status};
 use tower::{Layer, Service};
+use tracing::{Instrument as _, Span};
 
 use super::{LATENCY_BUCKETS_S, Metrics};
+use crate::trace::TraceContext;
 
 /// The name in labels of a call that the service does not have. Clients may call any path.
 const UNKNOWN: &str = "unknown";
@@ -136,6 +138,11 @@ impl MeasuredCall {
         Self { metrics: metrics.clone(), side, labels, start, is_recorded: false }
     }
 
+    /// Returns the name of the method.
+    fn method(&self) -> &str {
+        &self.labels[1].1
+    }
+
     /// Records the end of the call, unless it is recorded already.
     pub(crate) fn end(&mut self, code: Code) {
         if std::mem::replace(&mut self.is_recorded, true) {
@@ -230,7 +237,7 @@ const fn code_name(code: Code) -> &'static str {
     }
 }
 
-/// A layer that measures the calls of a service.
+/// A layer that measures the calls of a service, and gives each call with a trace context a span of its own.
 #[derive(Debug, Clone)]
 pub struct RpcLayer {
     pub(crate) metrics: Metrics,
@@ -265,10 +272,60 @@ where
         self.service.poll_ready(context)
     }
 
-    fn call(&mut self, request: http::Request<B>) -> Self::Future {
+    fn call(&mut self, mut request: http::Request<B>) -> Self::Future {
         let labels = self.layer.methods.labels(request.uri().path());
         let call = MeasuredCall::start(&self.layer.metrics, Side::Server, labels);
-        let response = self.service.call(request);
+        let span = server_span(&mut request, call.method());
+        let response = self.service.call(request).instrument(span);
         Box::pin(async move { Ok(call.measure(response.await?)) })
+    }
+}
+
+/// Returns the span of a call, and adds its trace context to the extensions of the request. A call without a trace
+/// context has no span.
+fn server_span<B>(request: &mut http::Request<B>, method: &str) -> Span {
+    let Some(parent) = TraceContext::from_headers(request.headers()) else { return Span::none() };
+    let trace = parent.child("server", 0);
+    request.extensions_mut().insert(trace);
+    let span = trace.span(Some(parent), method, "server");
+    span.in_scope(|| tracing::debug!("call received"));
+    span
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn clients_cannot_create_series() {
+        let methods = Methods::of(&[tonic_health::pb::FILE_DESCRIPTOR_SET, b"not descriptors"]);
+        let names = |path: &str| {
+            let [(_, service), (_, method)] = methods.labels(path);
+            format!("{service} {method}")
+        };
+        assert_eq!(names("/grpc.health.v1.Health/Check"), "grpc.health.v1.Health Check");
+        for path in ["/grpc.health.v1.Health/Check2", "/", "", "/a/b/c", "//"] {
+            assert_eq!(names(path), "unknown unknown", "{path:?}");
+        }
+    }
+
+    #[test]
+    fn a_call_that_is_dropped_is_cancelled_and_no_longer_in_progress() {
+        let metrics = Metrics::default();
+        let labels = || labels_of("/tandem.v1.Teacher/Advise");
+        let open = MeasuredCall::start(&metrics, Side::Client, labels());
+        let mut ended = MeasuredCall::start(&metrics, Side::Client, labels());
+        ended.end(Code::Ok);
+        drop(ended);
+        let of = r#"service="tandem.v1.Teacher",method="Advise""#;
+        let in_progress = |n: u32| format!("tandem_rpc_client_in_progress{{{of}}} {n}\n");
+        assert!(metrics.page().contains(&in_progress(1)), "{}", metrics.page());
+        drop(open);
+        let page = metrics.page();
+        assert!(page.contains(&in_progress(0)), "{page}");
+        for code in ["OK", "CANCELLED"] {
+            let count = format!("tandem_rpc_client_seconds_count{{{of},code=\"{code}\"}} 1\n");
+            assert!(page.contains(&count), "{page}");
+        }
     }
 }
