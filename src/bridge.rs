@@ -11,7 +11,7 @@ use tokio::runtime::{Builder, Runtime};
 use crate::cli::{BridgeArgs, BridgeCommand, BridgeServeArgs};
 use crate::exit::{Exit, Failed, OrExit as _};
 use crate::version::VERSION;
-use crate::{access, clock, service, signals};
+use crate::{access, clock, metrics, service, signals};
 
 mod arms;
 mod file;
@@ -38,13 +38,16 @@ pub(crate) fn bridge(args: BridgeArgs) -> Result<(), Failed> {
 }
 
 fn serve(args: BridgeServeArgs) -> Result<(), Failed> {
-    let server_config = access::server_config(&args.listen, &args.secret)?;
+    let own = metrics::of_process("bridge");
+    let server_config =
+        access::server_config(&args.listen, &args.secret)?.with_metrics(own.clone());
     let secret = secret().or_exit(Exit::TryAgain, || format!("cannot read {ENTROPY}"))?;
     let runtime = runtime().or_exit(Exit::TryAgain, String::new)?;
     runtime.block_on(async move {
         let shutdown = signals::shutdown_token(args.listen.exit_with_stdin)?;
         let clock = Arc::new(clock::BridgeClock::new());
         let (executor, reconnect) = arms::arms(&args, clock.clone())?;
+        metrics::serve(&args.metrics, &own).await?;
         let listener = service::listen(&args.listen).await?;
         let config = Config {
             driver: arms::name(args.driver).to_owned(),

@@ -26,8 +26,8 @@ pub(crate) use results::{
 };
 pub(crate) use scene::SceneArgs;
 pub(crate) use service::{
-    ClientArgs, EnvArgs, EnvGuardArgs, EnvironmentArgs, LearnerArgs, ListenArgs, RelayArgs,
-    SecretArgs, TeacherArgs, WorkerArgs,
+    ClientArgs, EnvArgs, EnvGuardArgs, EnvironmentArgs, LearnerArgs, ListenArgs, MetricsArgs,
+    RelayArgs, SecretArgs, TeacherArgs, WorkerArgs,
 };
 pub(crate) use task::{TaskName, WorldName, check_layout, check_task, chosen_task, task_flags};
 pub(crate) use train::{RecipeName, SweepArgs, TrainArgs};
@@ -54,6 +54,10 @@ pub(crate) struct Cli {
     /// Log filter, such as info or tandem_learner=debug; overrides RUST_LOG.
     #[arg(long, global = true, value_name = "FILTER")]
     pub(crate) log: Option<String>,
+    /// Sends traces to the OpenTelemetry collector at this address (OTLP over gRPC), such as http://127.0.0.1:4317.
+    #[cfg(feature = "otlp")]
+    #[arg(long, global = true, value_name = "URL", env = "OTEL_EXPORTER_OTLP_ENDPOINT")]
+    pub(crate) otlp_endpoint: Option<String>,
     #[command(subcommand)]
     pub(crate) command: Command,
 }

@@ -24,6 +24,14 @@ pub(crate) fn unix_millis() -> u64 {
     u64::try_from(since.as_millis()).unwrap_or_default()
 }
 
+/// Returns the nanoseconds since 1970, for the times of spans.
+#[cfg(feature = "otlp")]
+#[expect(clippy::disallowed_methods, reason = "the clock")]
+pub(crate) fn unix_nanos() -> u64 {
+    let since = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default();
+    u64::try_from(since.as_nanos()).unwrap_or_default()
+}
+
 /// The clock of a bridge. It counts from its creation.
 pub(crate) struct BridgeClock(Instant);
 

@@ -70,7 +70,8 @@ fn client_config(args: &EnvironmentArgs, default: &ClientConfig) -> Result<Clien
         return Ok(default.clone());
     }
     let secret = SecretArgs { token_file: args.env_token_file.clone() };
-    access::client_config(&ClientArgs { tls_ca: args.env_tls_ca.clone() }, &secret)
+    let own = access::client_config(&ClientArgs { tls_ca: args.env_tls_ca.clone() }, &secret)?;
+    Ok(own.with_metrics(default.metrics().clone()))
 }
 
 /// Returns the options as arguments of a worker.

@@ -25,6 +25,9 @@ mod input;
 mod launch;
 mod logging;
 mod mcap;
+mod metrics;
+#[cfg(feature = "otlp")]
+mod otlp;
 mod output;
 mod picture;
 mod policy;
@@ -68,10 +71,10 @@ fn run() -> ExitCode {
     let started = logging::start(&cli);
     match cli.command {
         Command::EnvGuard(args) => {
-            let code = started.and_then(|()| environment_command::guard(args.command));
+            let code = started.and_then(|_guard| environment_command::guard(args.command));
             code.map_or_else(|failed| output::report(&failed), ExitCode::from)
         }
-        command => exit_code(started.and_then(|()| dispatch(command))),
+        command => exit_code(started.and_then(|_guard| dispatch(command))),
     }
 }
 

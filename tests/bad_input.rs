@@ -133,7 +133,7 @@ fn request_for(episode: u64, step: u32) -> pb::AdviseRequest {
         proposed_action: vec![0.5; 6],
         ..Default::default()
     }];
-    pb::AdviseRequest { account: "attacked".to_owned(), steps }
+    pb::AdviseRequest { account: "attacked".to_owned(), steps, ..Default::default() }
 }
 
 /// Returns well-formed requests that cannot be answered, and the status codes that they get.

@@ -192,7 +192,8 @@ async fn play(mut client: Client, number: u64, answers: Arc<Answers>) {
         let others = answers.known_step(number + u64::from(first));
         let own = (first..first + OWN_STEPS).map(|step| query(number, step));
         let steps = own.chain([query(others.0, others.1)]).collect();
-        let request = pb::AdviseRequest { account: ACCOUNT.to_owned(), steps };
+        let request =
+            pb::AdviseRequest { account: ACCOUNT.to_owned(), steps, ..Default::default() };
         let answer = client.advise(&request).await;
         answers.record(&request, &answer);
         requests.push(request);
@@ -299,7 +300,7 @@ fn ask_once(
     steps: std::ops::Range<u32>,
 ) -> Result<Vec<bool>, tonic::Status> {
     let steps = steps.map(|step| query(1, step)).collect();
-    let request = pb::AdviseRequest { account: ACCOUNT.to_owned(), steps };
+    let request = pb::AdviseRequest { account: ACCOUNT.to_owned(), steps, ..Default::default() };
     let answer = runtime.block_on(async { client_of(address).advise(request).await })?;
     Ok(answer.into_inner().steps.iter().map(|step| step.charged).collect())
 }

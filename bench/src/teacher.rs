@@ -302,7 +302,13 @@ impl Requests {
                 payer: None,
             })
         });
-        Self { request: pb::AdviseRequest { account: ACCOUNT.to_owned(), steps: steps.collect() } }
+        Self {
+            request: pb::AdviseRequest {
+                account: ACCOUNT.to_owned(),
+                steps: steps.collect(),
+                ..Default::default()
+            },
+        }
     }
 
     fn next(&mut self) -> pb::AdviseRequest {

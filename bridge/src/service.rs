@@ -11,6 +11,7 @@ mod error;
 mod execute_stream;
 mod execution;
 mod messages;
+mod metrics;
 mod motion;
 mod reason_codes;
 mod thread;
@@ -32,6 +33,7 @@ use tonic::{Request, Response, Status, Streaming};
 use crate::executor::{CheckedMotion, Executor, GOOD_STATES, Stop, StopCause, Token};
 use error::status;
 use messages::{decode_token, token_text};
+use metrics::StopCounter;
 use motion::MotionSpec;
 use thread::{ArmsHandle, ArmsThread, Snapshot};
 
@@ -95,7 +97,9 @@ fn serve_boxed(
         let _ends = ends.clone().drop_guard();
         let (thread, arms) = ArmsThread::spawn(executor, Arc::clone(&config.clock), ends.clone())
             .map_err(Error::Thread)?;
-        tokio::spawn(log_stops(arms.watch()));
+        metrics::add_state(server_config.metrics(), arms.clone());
+        let stops = StopCounter::register(server_config.metrics());
+        tokio::spawn(log_stops(arms.watch(), stops));
         let service = BridgeService::new(arms, config);
         let bridge = BridgeServer::new(service).max_decoding_message_size(MAX_REQUEST_BYTES);
         let router = server_config.router(bridge, tandem_proto::FILE_DESCRIPTOR_SET).await?;
@@ -106,11 +110,14 @@ fn serve_boxed(
     })
 }
 
-/// Logs stops and resets. The arms' thread does not log, because it must not wait.
-async fn log_stops(mut snapshots: watch::Receiver<Arc<Snapshot>>) {
+/// Logs and counts stops and resets. The arms' thread does not log, because it must not wait.
+async fn log_stops(mut snapshots: watch::Receiver<Arc<Snapshot>>, counter: StopCounter) {
     let mut logged: Option<Stop> = None;
     while snapshots.changed().await.is_ok() {
         let stopped = snapshots.borrow_and_update().stopped.clone();
+        if let Some(stop) = stopped.as_ref().filter(|_| stopped != logged) {
+            counter.count(stop);
+        }
         match &stopped {
             Some(stop) if stopped != logged => match stop.cause {
                 StopCause::NotReset => {}

@@ -3,6 +3,7 @@
 use std::sync::Arc;
 
 use tandem_core::Layout;
+use tandem_net::metrics::ConstGauge;
 use tandem_net::{Incoming, MAX_MESSAGE_BYTES, ServerConfig};
 use tandem_proto::environment::{
     MAX_ENVIRONMENTS, PlayCommand, decode_play_request, encode_environment,
@@ -15,6 +16,7 @@ use tokio_util::sync::CancellationToken;
 use tonic::{Request, Response, Status, Streaming};
 
 use crate::error::Error;
+use crate::metrics::{EnvironmentMetrics, OpenStream, Work};
 use crate::session::{Prototypes, Session, SessionError};
 
 /// The capacity of a stream's responses. The next request is read once a response is on its way.
@@ -43,7 +45,10 @@ pub async fn serve(
 ) -> Result<(), Error> {
     let prototypes = Prototypes::new(config.layout)?;
     let room = Room::new(config.max_environments);
-    let service = EnvironmentService { config, prototypes, room, shutdown: shutdown.clone() };
+    let metrics = EnvironmentMetrics::register(server_config.metrics());
+    room.add_to(server_config);
+    let service =
+        EnvironmentService { config, prototypes, room, metrics, shutdown: shutdown.clone() };
     let environment = EnvironmentServer::new(service).max_decoding_message_size(MAX_MESSAGE_BYTES);
     let router = server_config.router(environment, tandem_proto::FILE_DESCRIPTOR_SET).await?;
     Ok(tandem_net::serve(router, incoming, shutdown).await?)
@@ -54,6 +59,7 @@ struct EnvironmentService {
     config: Config,
     prototypes: Prototypes,
     room: Room,
+    metrics: EnvironmentMetrics,
     shutdown: CancellationToken,
 }
 
@@ -79,9 +85,12 @@ impl Environment for EnvironmentService {
             session: Session::new(self.prototypes.clone()),
             room: self.room.clone(),
             permit: None,
+            metrics: self.metrics.clone(),
         };
+        let open = OpenStream::new(&self.metrics.streams);
         let (requests, shutdown) = (request.into_inner(), self.shutdown.clone());
         tokio::spawn(async move {
+            let _open = open;
             tokio::select! {
                 () = stream.serve(requests, &responses) => (),
                 () = shutdown.cancelled() => {
@@ -106,6 +115,18 @@ impl Room {
         Self { n_total, free: Arc::new(Semaphore::new(n_total)) }
     }
 
+    /// Adds the numbers of environments to the metrics of the service.
+    fn add_to(&self, server_config: &ServerConfig) {
+        let Self { n_total, free } = self.clone();
+        server_config.metrics().add_source(move |registry| {
+            let n_used = n_total.saturating_sub(free.available_permits());
+            let help = "Environments of all open streams";
+            registry.register("environments", help, ConstGauge::new(n_used as f64));
+            let help = "Environments that all streams together can have";
+            registry.register("environments_capacity", help, ConstGauge::new(n_total as f64));
+        });
+    }
+
     /// Reserves room for `n` environments until the permit is dropped.
     fn reserve(&self, n: usize) -> Result<OwnedSemaphorePermit, Status> {
         let permits = u32::try_from(n).unwrap_or(u32::MAX);
@@ -124,6 +145,7 @@ struct PlayStream {
     room: Room,
     /// The room of the session, from its first reset on.
     permit: Option<OwnedSemaphorePermit>,
+    metrics: EnvironmentMetrics,
 }
 
 impl PlayStream {
@@ -155,7 +177,12 @@ impl PlayStream {
             Err(status) => return (Some(self), Err(status)),
         };
         let simulated = tokio::task::spawn_blocking(move || {
+            let work = Work::of(&command, self.session.n());
+            let start = self.metrics.now();
             let response = self.session.execute(command);
+            if response.is_ok() {
+                self.metrics.record(work, start);
+            }
             (self, response)
         });
         match simulated.await {

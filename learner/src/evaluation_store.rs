@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 
 use tandem_policy::Policy;
 use tandem_rl::trainer::{Counters, RoundStats};
-use tandem_telemetry::{MetricsLog, MetricsRow};
+use tandem_telemetry::{MetricsLog, MetricsRow, tensorboard};
 
 /// The results of all complete evaluations.
 #[derive(Debug, Clone, PartialEq, Default)]
@@ -61,18 +61,24 @@ pub(crate) struct UnwrittenFile {
 #[derive(Debug)]
 pub(crate) struct EvaluationStore {
     out: PathBuf,
+    /// The start of the run, seconds since 1970.
+    started_s: f64,
     history: EvaluationHistory,
     metrics_due: bool,
+    events_due: bool,
     best_due: bool,
     last_due: bool,
 }
 
 impl EvaluationStore {
-    /// Continues with `history`. All copies in `out` are due, because those there may be of another state.
-    pub(crate) fn new(out: &Path, history: EvaluationHistory) -> Self {
+    /// Continues with `history`. All copies in `out` are due, because those there may be of another state. The run
+    /// started at `started_s`, seconds since 1970.
+    pub(crate) fn new(out: &Path, history: EvaluationHistory, started_s: f64) -> Self {
         Self {
             out: out.to_owned(),
+            started_s,
             metrics_due: true,
+            events_due: true,
             best_due: history.best.is_some(),
             last_due: history.last.is_some(),
             history,
@@ -92,7 +98,7 @@ impl EvaluationStore {
         }
         self.history.rows.push(row);
         self.history.last = Some(policy);
-        (self.metrics_due, self.last_due) = (true, true);
+        (self.metrics_due, self.events_due, self.last_due) = (true, true, true);
     }
 
     /// Writes the copies that are due; returns those that could not be written.
@@ -101,6 +107,11 @@ impl EvaluationStore {
         if self.metrics_due {
             let written = write_rows(&self.out.join("metrics.jsonl"), &self.history.rows);
             self.metrics_due = still_due(written, "metrics.jsonl", &mut unwritten);
+        }
+        if self.events_due {
+            let path = self.out.join(tensorboard::PATH);
+            let written = write_events(&path, &self.history.rows, self.started_s);
+            self.events_due = still_due(written, "tensorboard", &mut unwritten);
         }
         for (policy, due, name) in [
             (&self.history.best, &mut self.best_due, "policy/best.safetensors"),
@@ -115,7 +126,7 @@ impl EvaluationStore {
 
     /// Returns true if a copy is due.
     pub(crate) const fn is_due(&self) -> bool {
-        self.metrics_due || self.best_due || self.last_due
+        self.metrics_due || self.events_due || self.best_due || self.last_due
     }
 }
 
@@ -141,6 +152,13 @@ fn write_rows(path: &Path, rows: &[MetricsRow]) -> Result<(), AnyError> {
         log.append(row)?;
     }
     Ok(())
+}
+
+fn write_events(path: &Path, rows: &[MetricsRow], started_s: f64) -> Result<(), AnyError> {
+    if let Some(directory) = path.parent() {
+        std::fs::create_dir_all(directory)?;
+    }
+    Ok(tensorboard::write_events(path, rows, started_s)?)
 }
 
 fn write_policy(path: &Path, policy: &Policy) -> Result<(), AnyError> {
@@ -194,13 +212,13 @@ mod tests {
         let directory = tempfile::tempdir().expect("a directory");
         let out = directory.path().join("run");
         std::fs::write(&out, "a file where a directory should be").expect("writes");
-        let mut records = EvaluationStore::new(&out, EvaluationHistory::default());
+        let mut records = EvaluationStore::new(&out, EvaluationHistory::default(), 0.0);
         records.add(row(1, true), policy("first"));
         records.add(row(2, false), policy("second"));
         let unwritten: Vec<String> = records.write().into_iter().map(|file| file.what).collect();
         assert_eq!(
             unwritten,
-            ["metrics.jsonl", "policy/best.safetensors", "policy/last.safetensors"]
+            ["metrics.jsonl", "tensorboard", "policy/best.safetensors", "policy/last.safetensors"]
         );
         std::fs::remove_file(&out).expect("removes");
         records.add(row(3, false), policy("third"));
@@ -216,12 +234,12 @@ mod tests {
     fn files_of_a_lost_future_are_replaced() {
         let directory = tempfile::tempdir().expect("a directory");
         let out = directory.path();
-        let mut lost = EvaluationStore::new(out, EvaluationHistory::default());
+        let mut lost = EvaluationStore::new(out, EvaluationHistory::default(), 0.0);
         lost.add(row(1, true), policy("first"));
         let kept = lost.history().clone();
         lost.add(row(2, true), policy("second"));
         assert!(lost.write().is_empty());
-        assert!(EvaluationStore::new(out, kept).write().is_empty());
+        assert!(EvaluationStore::new(out, kept, 0.0).write().is_empty());
         assert_eq!(rounds(out), [1]);
         assert_eq!(name_of(&out.join("policy/best.safetensors")), "first");
         assert_eq!(name_of(&out.join("policy/last.safetensors")), "first");

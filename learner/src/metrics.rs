@@ -1,44 +1,39 @@
-//! The run's metrics for Prometheus (OpenMetrics text).
+//! The run's metrics for Prometheus.
 //!
 //! They are meant for dashboards and autoscalers. Reading them requires no token, so they contain no secret and no
 //! worker's own label.
 
+mod timings;
+
+use std::sync::Arc;
 use std::time::Duration;
 
-use prometheus_client::encoding::text::encode;
-use prometheus_client::metrics::counter::ConstCounter;
-use prometheus_client::metrics::gauge::ConstGauge;
-use prometheus_client::metrics::info::Info;
-use prometheus_client::registry::Registry;
+use tandem_net::Metrics;
+use tandem_net::metrics::{ConstCounter, ConstGauge, Info, Registry};
 use tandem_rl::trainer::Counters;
+use tandem_telemetry::MetricsRow;
 
 use crate::progress::{EnvironmentChecks, Progress};
 use crate::shared::Shared;
 use crate::work_queue::WorkQueue;
 
-pub(crate) const PATH: &str = "/metrics";
-pub(crate) const CONTENT_TYPE: &str = "application/openmetrics-text; version=1.0.0; charset=utf-8";
+pub(crate) use timings::Timings;
 
-/// Returns the metrics page.
-pub(crate) fn page(shared: &Shared) -> String {
+/// Adds the state of the run to `metrics`.
+pub(crate) fn add(metrics: &Metrics, shared: Arc<Shared>) {
+    metrics.add_source(move |registry| add_state(registry, &shared));
+}
+
+fn add_state(registry: &mut Registry, shared: &Shared) {
     let progress = shared.progress.borrow().clone();
-    let mut registry = Registry::with_prefix("tandem");
     let state = shared.lock();
-    add_queue(&mut registry, &state.queue, (shared.clock)());
-    let n_replay_episodes = state.n_replay_episodes;
+    add_queue(registry, &state.queue, (shared.clock)());
+    let n_replay_episodes = state.n_replay_episodes as f64;
     drop(state);
-    gauge(
-        &mut registry,
-        "replay_episodes",
-        "Episodes in the replay buffer",
-        n_replay_episodes as f64,
-    );
-    add_progress(&mut registry, &progress);
-    add_evaluations(&mut registry, &progress);
-    add_environment(&mut registry, progress.environment);
-    let mut page = String::new();
-    encode(&mut page, &registry).expect("writing to a string succeeds");
-    page
+    gauge(registry, "replay_episodes", "Episodes in the replay buffer", n_replay_episodes);
+    add_progress(registry, &progress);
+    add_evaluations(registry, &progress);
+    add_environment(registry, progress.environment);
 }
 
 /// Adds the slots and the workers.
@@ -108,10 +103,38 @@ fn add_evaluations(registry: &mut Registry, progress: &Progress) {
     if let Some(evaluation) = &progress.latest {
         let latest = "Share of the latest evaluation's episodes that succeeded";
         gauge(registry, "evaluation_success_ratio", latest, evaluation.success);
+        add_measures(registry, evaluation);
     }
     if let Some(best) = &progress.best {
         let help = "Share of the best evaluation's episodes that succeeded";
         gauge(registry, "best_evaluation_success_ratio", help, best.success);
+    }
+}
+
+/// Adds further measures of the latest evaluation, as far as there are any.
+fn add_measures(registry: &mut Registry, evaluation: &MetricsRow) {
+    let contacts = &evaluation.contacts;
+    for (name, help, value) in [
+        (
+            "evaluation_success_without_contact_ratio",
+            "Share of the latest evaluation's episodes that succeeded without a contact of the arms",
+            contacts.success_without_contact,
+        ),
+        (
+            "evaluation_arm_contact_ratio",
+            "Share of the latest evaluation's episodes with a contact of the arms",
+            contacts.arm_contact_rate,
+        ),
+        ("evaluation_mean_q", "Mean Q-value at the latest evaluation", Some(evaluation.mean_q)),
+        (
+            "evaluation_critic_loss",
+            "Mean critic loss before the latest evaluation",
+            Some(evaluation.critic_loss),
+        ),
+    ] {
+        if let Some(value) = value {
+            gauge(registry, name, help, value);
+        }
     }
 }
 

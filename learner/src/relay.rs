@@ -9,8 +9,10 @@ use std::pin::Pin;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
+use tandem_net::metrics::Counter;
 use tandem_net::{
-    AuthChannel, ClientConfig, EncodedResponse, Incoming, MAX_MESSAGE_BYTES, ServerConfig, within,
+    AuthChannel, ClientConfig, EncodedResponse, Incoming, MAX_MESSAGE_BYTES, Metrics, ServerConfig,
+    TraceContext, within,
 };
 use tandem_proto::pb;
 use tandem_proto::pb::learner_client::LearnerClient;
@@ -41,7 +43,8 @@ pub async fn serve(
     let client = LearnerClient::new(link)
         .max_decoding_message_size(MAX_MESSAGE_BYTES)
         .max_encoding_message_size(MAX_MESSAGE_BYTES);
-    let relay = Relay { client, cache: Mutex::default() };
+    let metrics = RelayMetrics::register(server_config.metrics());
+    let relay = Relay { client, cache: Mutex::default(), metrics };
     serve_boxed(relay, server_config, incoming.into(), shutdown).await
 }
 
@@ -62,6 +65,25 @@ fn serve_boxed(
 struct Relay {
     client: LearnerClient<AuthChannel>,
     cache: Mutex<Cache>,
+    metrics: RelayMetrics,
+}
+
+/// The metrics of distributed parameters.
+#[derive(Debug)]
+struct RelayMetrics {
+    requests: Counter,
+    fetches: Counter,
+}
+
+impl RelayMetrics {
+    fn register(metrics: &Metrics) -> Self {
+        let requests = "Requests of workers for parameters";
+        let fetches = "Requests to the learner for parameters that the relay did not have";
+        Self {
+            requests: metrics.counter("relay_parameter_requests", requests),
+            fetches: metrics.counter("relay_parameter_fetches", fetches),
+        }
+    }
 }
 
 /// The parameters published by one start of a learner.
@@ -103,6 +125,7 @@ impl Relay {
     }
 
     async fn fetch(&self, version: u64) -> Result<EncodedResponse, Status> {
+        self.metrics.fetches.inc();
         let mut client = self.client.clone();
         let request = pb::GetParametersRequest { version };
         let parameters = forward(client.get_parameters(request)).await?;
@@ -137,6 +160,7 @@ impl Learner for Relay {
         &self,
         request: Request<pb::GetParametersRequest>,
     ) -> Result<Response<pb::Parameters>, Status> {
+        self.metrics.requests.inc();
         let version = request.into_inner().version;
         let cell = self.cache().cell(version);
         match cell.get_or_try_init(|| self.fetch(version)).await {
@@ -152,7 +176,7 @@ impl Learner for Relay {
         &self,
         request: Request<pb::SubmitEpisodesRequest>,
     ) -> Result<Response<pb::SubmitEpisodesResponse>, Status> {
-        forward(self.client.clone().submit_episodes(request.into_inner())).await
+        forward(self.client.clone().submit_episodes(with_trace(request))).await
     }
 
     async fn status(
@@ -168,6 +192,16 @@ impl Learner for Relay {
     ) -> Result<Response<Self::WatchStream>, Status> {
         forward(self.client.clone().watch(request.into_inner())).await
     }
+}
+
+/// Returns a request with the message and the trace context of `request`, without its other headers.
+fn with_trace<T>(request: Request<T>) -> Request<T> {
+    let trace = request.extensions().get::<TraceContext>().copied();
+    let mut forwarded = Request::new(request.into_inner());
+    if let Some(trace) = trace {
+        forwarded.extensions_mut().insert(trace);
+    }
+    forwarded
 }
 
 /// Applies the deadline to a call of the learner.

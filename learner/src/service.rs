@@ -23,7 +23,7 @@ use tokio_util::sync::CancellationToken;
 use tonic::{Request, Response, Status};
 
 use crate::error::Error;
-use crate::metrics;
+use crate::metrics::{self, Timings};
 use crate::progress::RunEnd;
 use crate::runtime::{Runtime, on_a_thread};
 use crate::shared::{LearnerConfig, Shared};
@@ -98,7 +98,9 @@ fn serve_boxed(
     options: ServeOptions,
 ) -> Pin<Box<dyn Future<Output = Result<RunOutcome, Error>> + Send>> {
     Box::pin(async move {
-        let shared = Arc::new(Shared::new(config.clock.clone()));
+        let timings = Timings::register(config.server_config.metrics());
+        let shared = Arc::new(Shared::new(config.clock.clone(), timings));
+        metrics::add(config.server_config.metrics(), shared.clone());
         shared.lock().queue.start_workers_at(config.first_worker);
         let learner = LearnerServer::new(LearnerService {
             shared: shared.clone(),
@@ -108,7 +110,8 @@ fn serve_boxed(
         let router =
             config.server_config.router(learner, tandem_proto::FILE_DESCRIPTOR_SET).await?;
         let stop_serving = CancellationToken::new();
-        let serving_metrics = serve_metrics(options.metrics, shared.clone());
+        let page = config.server_config.metrics().endpoint();
+        let serving_metrics = serve_metrics(options.metrics, page);
         let learning = {
             let (pacing, stop) = (config.pacing, stop_serving.clone());
             let shutdown = shutdown.clone();
@@ -161,11 +164,11 @@ async fn until_workers_know(shared: Arc<Shared>, shutdown: CancellationToken) {
 }
 
 /// Serves the metrics while it is polled.
-async fn serve_metrics(listener: Option<TcpListener>, shared: Arc<Shared>) {
-    let Some(listener) = listener else { return std::future::pending().await };
-    let write = Arc::new(move || metrics::page(&shared));
-    let page = TextEndpoint { path: metrics::PATH, content_type: metrics::CONTENT_TYPE, write };
-    page.serve(listener).await;
+async fn serve_metrics(listener: Option<TcpListener>, page: TextEndpoint) {
+    match listener {
+        Some(listener) => page.serve(listener).await,
+        None => std::future::pending().await,
+    }
 }
 
 /// Waits until clients that poll have learned of the end.

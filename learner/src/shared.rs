@@ -13,6 +13,7 @@ use tandem_rl::config::RunConfig;
 use tokio::sync::{Notify, watch};
 
 use crate::connections::{Connections, LogQuota};
+use crate::metrics::Timings;
 use crate::progress::{Progress, RunEnd};
 use crate::warnings::{Source, Warnings};
 use crate::work_queue::{WorkQueue, Worker};
@@ -52,6 +53,8 @@ pub struct LearnerConfig {
     pub n_threads: usize,
     /// Time since the process started.
     pub clock: Clock,
+    /// Start of the process, since 1970; for the times of events in TensorBoard.
+    pub unix_start: Duration,
     /// Version of the program, stored in policy files.
     pub version: String,
     /// First number of a worker. It differs for each start of a learner, so that a worker of the previous learner is
@@ -71,6 +74,7 @@ pub(crate) struct Shared {
     pub(crate) progress: watch::Sender<Progress>,
     pub(crate) warnings: Warnings,
     pub(crate) clock: Clock,
+    pub(crate) timings: Timings,
 }
 
 /// The part of the shared state behind the lock.
@@ -109,7 +113,7 @@ impl State {
 }
 
 impl Shared {
-    pub(crate) fn new(clock: Clock) -> Self {
+    pub(crate) fn new(clock: Clock, timings: Timings) -> Self {
         let (progress, _) = watch::channel(Progress::default());
         Self {
             state: Mutex::default(),
@@ -118,6 +122,7 @@ impl Shared {
             warnings: Warnings::new(progress.clone()),
             progress,
             clock,
+            timings,
         }
     }
 

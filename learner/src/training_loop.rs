@@ -127,9 +127,11 @@ impl LearnerLoop<'_> {
     /// Awaits the open round, learns from it and opens the next one; returns false if the run is interrupted. After
     /// false, and after any error but divergence, the run can resume from the present state.
     fn run_round(&mut self) -> Result<bool, Error> {
+        let (timings, start) = (&self.context.shared.timings, self.context.shared.timings.now());
         let Some(episodes) = self.wait_for(EpisodeKind::Training, self.acting.version)? else {
             return Ok(false);
         };
+        timings.record(&timings.collect_seconds, start);
         let Some(spent) = self.settle(&episodes)? else { return Ok(false) };
         let round = self.trainer.counters().round;
         let lagged = self.context.config.run.rounds.lag == 1;
@@ -149,6 +151,7 @@ impl LearnerLoop<'_> {
             return Ok(false);
         }
         self.order_evaluation();
+        timings.record(&timings.round_seconds, start);
         self.complete_overdue_evaluations()
     }
 

@@ -13,7 +13,9 @@ use tonic::transport::Channel;
 use tonic::{Code, Status};
 use tower::Service;
 
+use crate::metrics::{MeasuredCall, Metrics, Side, labels_of};
 use crate::tls_probe::FirstByte;
+use crate::trace::TraceContext;
 use crate::wrong_service::unknown_call;
 
 /// Part of the message of a call to an address at which no process listens.
@@ -41,6 +43,8 @@ pub(crate) struct Target {
     pub(crate) authorization: Option<HeaderValue>,
     /// The first byte that the latest connection received.
     pub(crate) first_byte: FirstByte,
+    /// Where calls are recorded.
+    pub(crate) metrics: Metrics,
 }
 
 impl AuthChannel {
@@ -62,13 +66,23 @@ impl Service<http::Request<Body>> for AuthChannel {
         if let Some(authorization) = &self.target.authorization {
             request.headers_mut().insert(AUTHORIZATION, authorization.clone());
         }
+        if let Some(trace) = request.extensions().get::<TraceContext>().copied() {
+            trace.add_to(request.headers_mut());
+        }
         let path = request.uri().path().to_owned();
+        let mut measured =
+            MeasuredCall::start(&self.target.metrics, Side::Client, labels_of(&path));
         let (call, target) = (self.channel.call(request), Arc::clone(&self.target));
         Box::pin(async move {
-            match call.await {
-                Ok(response) => target.rejection(&path, &response).map_or(Ok(response), Err),
-                Err(error) => Err(target.unavailable(error)),
-            }
+            let rejected = match call.await {
+                Ok(response) => match target.rejection(&path, &response) {
+                    None => return Ok(measured.measure(response)),
+                    Some(status) => status,
+                },
+                Err(error) => target.unavailable(error),
+            };
+            measured.end(rejected.code());
+            Err(rejected)
         })
     }
 }

@@ -17,6 +17,7 @@ use tower::ServiceExt as _;
 use crate::access::Token;
 use crate::channel::{AuthChannel, Target};
 use crate::connection::Connection;
+use crate::metrics::Metrics;
 use crate::tls::{self, TlsError};
 use crate::tls_probe::{FirstByte, SniffedStream};
 
@@ -59,6 +60,7 @@ pub struct ClientConfig {
     authorization: Option<HeaderValue>,
     authority: Option<Certificate>,
     connector: Option<Connector>,
+    metrics: Metrics,
 }
 
 impl ClientConfig {
@@ -82,6 +84,19 @@ impl ClientConfig {
         tls::check_authority(authority)?;
         self.authority = Some(Certificate::from_pem(authority));
         Ok(self)
+    }
+
+    /// Records calls in `metrics`.
+    #[must_use]
+    pub fn with_metrics(mut self, metrics: Metrics) -> Self {
+        self.metrics = metrics;
+        self
+    }
+
+    /// Returns the metrics of the client's process.
+    #[must_use]
+    pub const fn metrics(&self) -> &Metrics {
+        &self.metrics
     }
 
     /// Connects through `connector` instead of the system's sockets.
@@ -120,7 +135,9 @@ impl ClientConfig {
         let channel = endpoint.connect_with_connector_lazy(connect);
         let authorization = self.authorization.clone();
         let address = address.to_owned();
-        Ok(AuthChannel::new(channel, Target { address, uses_tls, authorization, first_byte }))
+        let metrics = self.metrics.clone();
+        let target = Target { address, uses_tls, authorization, first_byte, metrics };
+        Ok(AuthChannel::new(channel, target))
     }
 
     fn endpoint(&self, uri: Uri, address: &str) -> Result<Endpoint, ClientConfigError> {

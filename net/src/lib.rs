@@ -1,4 +1,4 @@
-//! Connections between processes: access control, TLS, keep-alive, health, reflection and retries.
+//! Connections between processes: access control, TLS, keep-alive, health, reflection, retries and metrics.
 //!
 //! The server's side:
 //! - [`ServerConfig`] holds a service's token and certificate, and builds its [`Router`]; [`serve()`] runs the router
@@ -6,6 +6,8 @@
 //! - [`Incoming`] accepts connections from any network, within a [`Capacity`].
 //! - [`EncodedResponse`] is encoded once and sent to many clients.
 //! - [`TextEndpoint`] serves a text over plain HTTP.
+//! - [`TraceContext`] follows the work on a slot across processes.
+//! - [`Metrics`] measures calls and other work, and writes a page for Prometheus.
 //!
 //! The client's side:
 //! - [`ClientConfig`] holds a token and the trusted authority, and opens [`AuthChannel`]s, whose errors name the
@@ -25,6 +27,7 @@ mod connection;
 mod encoded_response;
 mod health;
 mod incoming;
+pub mod metrics;
 mod pacing;
 mod retry;
 mod serve;
@@ -33,6 +36,7 @@ mod text_endpoint;
 mod throttle;
 mod tls;
 mod tls_probe;
+mod trace;
 mod wrong_service;
 
 pub use access::{AccessError, Token, TokenError, is_exposed};
@@ -44,12 +48,14 @@ pub use connection::{ConnectInfo, Connection, ConnectionClosed, MarkRequest, Mar
 pub use encoded_response::EncodedResponse;
 pub use health::{HealthError, check_health};
 pub use incoming::Incoming;
+pub use metrics::Metrics;
 pub use pacing::Pacing;
 pub use retry::{Backoff, Operation, Retrier, Retryability, retry, within};
 pub use serve::{SHUTDOWN_GRACE, serve};
 pub use server::{Router, ServerConfig, ServerConfigError, TokenInterceptor};
 pub use text_endpoint::TextEndpoint;
 pub use tls::TlsError;
+pub use trace::{InvalidTraceContext, TraceContext};
 pub use wrong_service::WrongService;
 
 /// The largest message that services and clients accept, in bytes: several times the episodes of a slot or the

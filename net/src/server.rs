@@ -19,6 +19,7 @@ use tower::util::MapResponseLayer;
 use crate::access::{AccessError, Token, is_exposed};
 use crate::connection::{ConnectInfo, MarkRequestLayer};
 use crate::encoded_response::EncodedService;
+use crate::metrics::{Methods, Metrics, RpcLayer};
 use crate::tls::{self, TlsError};
 use crate::wrong_service::name_service;
 
@@ -43,13 +44,16 @@ pub enum ServerConfigError {
 type NameServiceLayer = MapResponseLayer<fn(http::Response<Body>) -> http::Response<Body>>;
 
 /// A service with its health and reflection services, ready for [`serve`](crate::serve()).
-pub type Router = TonicRouter<Stack<NameServiceLayer, Stack<MarkRequestLayer, NoLayer>>>;
+pub type Router =
+    TonicRouter<Stack<RpcLayer, Stack<NameServiceLayer, Stack<MarkRequestLayer, NoLayer>>>>;
 
-/// The access configuration of a service: its token and its certificate. The default has neither.
+/// The configuration of a service: its token, its certificate and its metrics. The default has no token and no
+/// certificate.
 #[derive(Clone, Default)]
 pub struct ServerConfig {
     token: Option<Token>,
     identity: Option<Identity>,
+    metrics: Metrics,
 }
 
 impl ServerConfig {
@@ -68,6 +72,19 @@ impl ServerConfig {
         tls::check_identity(certificate, key)?;
         self.identity = Some(Identity::from_pem(certificate, key));
         Ok(self)
+    }
+
+    /// Records calls in `metrics`, where the service also registers metrics of its own.
+    #[must_use]
+    pub fn with_metrics(mut self, metrics: Metrics) -> Self {
+        self.metrics = metrics;
+        self
+    }
+
+    /// Returns the metrics of the service's process.
+    #[must_use]
+    pub const fn metrics(&self) -> &Metrics {
+        &self.metrics
     }
 
     /// Returns whether calls, and the token in them, cross the network unencrypted.
@@ -116,10 +133,17 @@ impl ServerConfig {
                 .register_encoded_file_descriptor_set(tonic_health::pb::FILE_DESCRIPTOR_SET)
         };
         let token = TokenInterceptor { token: self.token.clone() };
+        let methods = Methods::of(&[
+            descriptors,
+            tonic_health::pb::FILE_DESCRIPTOR_SET,
+            tonic_reflection::pb::v1::FILE_DESCRIPTOR_SET,
+            tonic_reflection::pb::v1alpha::FILE_DESCRIPTOR_SET,
+        ]);
         Ok(self
             .server()?
             .layer(MarkRequestLayer)
             .layer(NameServiceLayer::new(name_service::<S>))
+            .layer(RpcLayer { metrics: self.metrics.clone(), methods })
             .add_service(InterceptedService::new(EncodedService(service), token.clone()))
             .add_service(health)
             .add_service(InterceptedService::new(reflection().build_v1()?, token.clone()))

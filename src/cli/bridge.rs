@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use clap::{Args, Subcommand, ValueEnum};
 
-use super::{ClientArgs, ListenArgs, SecretArgs, TrialArgs};
+use super::{ClientArgs, ListenArgs, MetricsArgs, SecretArgs, TrialArgs};
 
 /// Default address of a bridge.
 const ADDRESS: &str = "127.0.0.1:7002";
@@ -53,6 +53,8 @@ pub(crate) struct BridgeServeArgs {
     pub(crate) listen: ListenArgs,
     #[command(flatten)]
     pub(crate) secret: SecretArgs,
+    #[command(flatten)]
+    pub(crate) metrics: MetricsArgs,
 }
 
 /// Driver of the arms.

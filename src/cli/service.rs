@@ -38,6 +38,14 @@ pub(crate) struct ListenArgs {
     pub(crate) exit_with_stdin: bool,
 }
 
+/// Metrics of a service.
+#[derive(Debug, Args)]
+pub(crate) struct MetricsArgs {
+    /// Serves Prometheus metrics at http://ADDR/metrics. No token is required: do not expose the address.
+    #[arg(long, value_name = "ADDR")]
+    pub(crate) metrics_listen: Option<SocketAddr>,
+}
+
 /// TLS options of a client.
 #[derive(Debug, Args)]
 pub(crate) struct ClientArgs {
@@ -86,6 +94,8 @@ pub(crate) struct TeacherArgs {
     pub(crate) client_config: ClientArgs,
     #[command(flatten)]
     pub(crate) secret: SecretArgs,
+    #[command(flatten)]
+    pub(crate) metrics: MetricsArgs,
 }
 
 #[derive(Debug, Args)]
@@ -128,9 +138,6 @@ pub(crate) struct LearnerArgs {
     /// Number of threads of the update, 1 or 2. It does not affect the result.
     #[arg(long, default_value_t = 2, value_parser = clap::value_parser!(u8).range(1..=2))]
     pub(crate) threads: u8,
-    /// Serves Prometheus metrics at http://ADDR/metrics. No token is required: do not expose the address.
-    #[arg(long, value_name = "ADDR")]
-    pub(crate) metrics_listen: Option<SocketAddr>,
     /// Keeps serving after the run is complete, until the process is asked to exit.
     #[arg(long)]
     pub(crate) stay: bool,
@@ -140,6 +147,8 @@ pub(crate) struct LearnerArgs {
     pub(crate) client_config: ClientArgs,
     #[command(flatten)]
     pub(crate) secret: SecretArgs,
+    #[command(flatten)]
+    pub(crate) metrics: MetricsArgs,
 }
 
 /// The server of environments.
@@ -192,6 +201,8 @@ pub(crate) struct WorkerArgs {
     pub(crate) client_config: ClientArgs,
     #[command(flatten)]
     pub(crate) secret: SecretArgs,
+    #[command(flatten)]
+    pub(crate) metrics: MetricsArgs,
     /// Exits when standard input closes, which happens when the parent process dies.
     #[arg(long, hide = true)]
     pub(crate) exit_with_stdin: bool,
@@ -214,6 +225,8 @@ pub(crate) struct RelayArgs {
     pub(crate) client_config: ClientArgs,
     #[command(flatten)]
     pub(crate) secret: SecretArgs,
+    #[command(flatten)]
+    pub(crate) metrics: MetricsArgs,
 }
 
 /// The guard of an environment command.
@@ -252,4 +265,6 @@ pub(crate) struct EnvArgs {
     pub(crate) listen: ListenArgs,
     #[command(flatten)]
     pub(crate) secret: SecretArgs,
+    #[command(flatten)]
+    pub(crate) metrics: MetricsArgs,
 }

@@ -8,12 +8,15 @@ use super::run;
 use crate::cli::EnvArgs;
 use crate::exit::{Exit, Failed};
 use crate::version::VERSION;
-use crate::{access, signals};
+use crate::{access, metrics, signals};
 
 pub(crate) fn environment(args: EnvArgs) -> Result<(), Failed> {
-    let server_config = access::server_config(&args.listen, &args.secret)?;
+    let own = metrics::of_process("environment");
+    let server_config =
+        access::server_config(&args.listen, &args.secret)?.with_metrics(own.clone());
     run(async move {
         let shutdown = signals::shutdown_token(args.listen.exit_with_stdin)?;
+        metrics::serve(&args.metrics, &own).await?;
         let listener = listen_with_scheme(&args.listen).await?;
         let config = Config {
             layout: Layout::new(args.task.in_named_world(args.world), usize::from(args.arms)),

@@ -1,22 +1,26 @@
 //! `tandem learner`.
 
+use std::time::Duration;
+
 use tandem_learner::checkpoint::CheckpointError;
 use tandem_learner::{Error, LearnerConfig, LingerPolicy, ServeOptions};
 use tandem_net::Pacing;
-use tokio::net::TcpListener;
 
 use super::{listen, run};
 use crate::cli::LearnerArgs;
 use crate::exit::{Exit, Failed, OrExit as _};
 use crate::run_pages::RunPages;
 use crate::version::VERSION;
-use crate::{access, clock, policy_file, run_directory, run_file, signals};
+use crate::{access, clock, metrics, policy_file, run_directory, run_file, signals};
 
 pub(crate) fn learner(args: LearnerArgs) -> Result<(), Failed> {
     let run_config = run_file::resolve(Some(&args.run), &[])?;
     let start_from = args.start_from.as_deref().map(policy_file::load).transpose()?;
-    let server_config = access::server_config(&args.listen, &args.secret)?;
-    let client_config = access::client_config(&args.client_config, &args.secret)?;
+    let own = metrics::of_process("learner");
+    let server_config =
+        access::server_config(&args.listen, &args.secret)?.with_metrics(own.clone());
+    let client_config =
+        access::client_config(&args.client_config, &args.secret)?.with_metrics(own.clone());
     run_directory::check_path(&args.out)?;
     // With --out-is-locked the parent process writes the run file.
     let keeps_run_file = !args.out_is_locked || args.keep_run_file;
@@ -27,6 +31,7 @@ pub(crate) fn learner(args: LearnerArgs) -> Result<(), Failed> {
         let shutdown = signals::shutdown_token(args.listen.exit_with_stdin)?;
         let options = serve_options(&args).await?;
         let listener = listen(&args.listen).await?;
+        let unix_start_ms = clock::unix_millis();
         let config = LearnerConfig {
             run: run_config,
             server_config,
@@ -39,8 +44,9 @@ pub(crate) fn learner(args: LearnerArgs) -> Result<(), Failed> {
             run_file,
             n_threads: usize::from(args.threads),
             clock: clock::since_now(),
+            unix_start: Duration::from_millis(unix_start_ms),
             version: VERSION.to_owned(),
-            first_worker: clock::unix_millis() << 12,
+            first_worker: unix_start_ms << 12,
             pacing: Pacing::Concurrent,
         };
         let served = tandem_learner::serve_with(config, listener, shutdown, options).await;
@@ -57,19 +63,9 @@ pub(crate) fn learner(args: LearnerArgs) -> Result<(), Failed> {
     })
 }
 
-/// Binds the address of the metrics, if there is one.
+/// Returns the options of the service, and binds the address of the metrics, if there is one.
 async fn serve_options(args: &LearnerArgs) -> Result<ServeOptions, Failed> {
-    let metrics = match args.metrics_listen {
-        Some(address) => {
-            let bound = TcpListener::bind(address).await;
-            let cannot = || format!("cannot listen on {address} for --metrics-listen");
-            Some(bound.or_exit(Exit::TryAgain, cannot)?)
-        }
-        None => None,
-    };
-    if let Some(Ok(address)) = metrics.as_ref().map(TcpListener::local_addr) {
-        tracing::info!(%address, "serving Prometheus metrics, without a token");
-    }
+    let metrics = metrics::listen(&args.metrics).await?;
     let linger = if args.stay { LingerPolicy::UntilShutdown } else { LingerPolicy::default() };
     Ok(ServeOptions { metrics, linger })
 }

@@ -11,12 +11,15 @@ use tandem_teacher::{Advisor, AnyPolicy, Error, PolicyTimeouts, RemoteError, Rem
 use super::{listen, run};
 use crate::cli::TeacherArgs;
 use crate::exit::{Exit, Failed};
-use crate::{access, signals};
+use crate::{access, metrics, signals};
 
 pub(crate) fn teacher(args: TeacherArgs) -> Result<(), Failed> {
     let source = PolicySource::new(args.policy, args.critic)?;
-    let server_config = access::server_config(&args.listen, &args.secret)?;
-    let client_config = access::client_config(&args.client_config, &args.secret)?;
+    let own = metrics::of_process("teacher");
+    let server_config =
+        access::server_config(&args.listen, &args.secret)?.with_metrics(own.clone());
+    let client_config =
+        access::client_config(&args.client_config, &args.secret)?.with_metrics(own.clone());
     run(async move {
         let shutdown = signals::shutdown_token(args.listen.exit_with_stdin)?;
         let opened = async {
@@ -29,6 +32,7 @@ pub(crate) fn teacher(args: TeacherArgs) -> Result<(), Failed> {
             advisor = opened => advisor?,
             () = shutdown.cancelled() => return Ok(()),
         };
+        metrics::serve(&args.metrics, &own).await?;
         let listener = listen(&args.listen).await?;
         let served = tandem_teacher::serve_advisor(
             advisor,

@@ -8,12 +8,15 @@ use super::run;
 use crate::cli::WorkerArgs;
 use crate::environment_server::EnvironmentSource;
 use crate::exit::{Exit, Failed};
-use crate::{access, signals};
+use crate::{access, metrics, signals};
 
 pub(crate) fn worker(args: WorkerArgs) -> Result<(), Failed> {
-    let client_config = access::client_config(&args.client_config, &args.secret)?;
+    let own = metrics::of_process("worker");
+    let client_config =
+        access::client_config(&args.client_config, &args.secret)?.with_metrics(own.clone());
     run(async move {
         let shutdown = signals::shutdown_token(args.exit_with_stdin)?;
+        metrics::serve(&args.metrics, &own).await?;
         let server = EnvironmentSource::of(&args.environment, &client_config)?;
         let config = WorkerConfig {
             client: client_config,

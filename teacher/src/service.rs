@@ -2,6 +2,7 @@
 
 mod advice;
 mod convert;
+mod metrics;
 mod thread;
 
 use std::path::PathBuf;
@@ -22,6 +23,7 @@ use crate::policy;
 use crate::remote_policy::RemoteError;
 use advice::{AdviceStream, advise, advise_stream};
 use convert::{check_episodes, describe, encode_balance, encode_lease};
+use metrics::TeacherMetrics;
 use thread::{AdvisorHandle, AdvisorThread};
 
 /// The largest request: some thousands of steps.
@@ -89,8 +91,10 @@ fn serve_boxed(
 ) -> Pin<Box<dyn Future<Output = Result<(), Error>> + Send + '_>> {
     Box::pin(async move {
         let stop = shutdown.child_token();
-        let (thread, advisor) = AdvisorThread::spawn(advisor, ANSWER_TIMEOUT, stop.clone(), pacing)
-            .map_err(Error::Thread)?;
+        let metrics = TeacherMetrics::register(server_config.metrics());
+        let (thread, advisor) =
+            AdvisorThread::spawn(advisor, ANSWER_TIMEOUT, stop.clone(), pacing, metrics)
+                .map_err(Error::Thread)?;
         let service = TeacherService { advisor, stop: stop.clone() };
         let teacher = TeacherServer::new(service).max_decoding_message_size(MAX_REQUEST_BYTES);
         let router = server_config.router(teacher, tandem_proto::FILE_DESCRIPTOR_SET).await?;

@@ -18,6 +18,7 @@ mod records;
 pub mod recovery;
 mod scene;
 pub mod standard_error;
+pub mod tensorboard;
 pub mod trial_log;
 pub mod trials;
 

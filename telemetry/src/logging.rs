@@ -5,10 +5,11 @@ use std::io::IsTerminal as _;
 use std::path::PathBuf;
 use std::sync::Mutex;
 
+use tracing_subscriber::Registry;
 pub use tracing_subscriber::filter::LevelFilter;
 use tracing_subscriber::filter::Targets;
 use tracing_subscriber::fmt;
-use tracing_subscriber::layer::{Layer as _, SubscriberExt as _};
+use tracing_subscriber::layer::{Layer, SubscriberExt as _};
 use tracing_subscriber::util::SubscriberInitExt as _;
 
 use crate::error::Error;
@@ -27,11 +28,14 @@ pub struct LogConfig {
     pub directives: Option<String>,
 }
 
+/// A further destination of spans, with its own filter.
+pub type ExtraLayer = Box<dyn Layer<Registry> + Send + Sync>;
+
 /// Initialises logging of this process. Lines that cannot be written are dropped.
 ///
 /// # Errors
 /// If the file cannot be opened, the directives are malformed, or logging is already initialised.
-pub fn init(config: &LogConfig) -> Result<(), Error> {
+pub fn init(config: &LogConfig, extra: Option<ExtraLayer>) -> Result<(), Error> {
     let console = match config.console {
         Some(level) => {
             let layer = fmt::layer()
@@ -53,7 +57,7 @@ pub fn init(config: &LogConfig) -> Result<(), Error> {
         }
         None => None,
     };
-    tracing_subscriber::registry().with(console).with(file).try_init()?;
+    tracing_subscriber::registry().with(extra).with(console).with(file).try_init()?;
     Ok(())
 }
 

@@ -12,15 +12,15 @@ fn the_log_file_contains_events_from_level_info_up_with_their_fields() {
     let file = dir.path().join("tandem.log");
     let config = LogConfig { file: Some(file.clone()), ..LogConfig::default() };
     let malformed = LogConfig { directives: Some("tandem=loud".to_owned()), ..config.clone() };
-    assert!(matches!(init(&malformed), Err(Error::LogFilter { .. })));
+    assert!(matches!(init(&malformed, None), Err(Error::LogFilter { .. })));
     let nowhere = LogConfig {
         file: Some(Path::new("/nowhere/tandem.log").to_owned()),
         ..LogConfig::default()
     };
-    assert!(matches!(init(&nowhere), Err(Error::Io { action: "open", .. })));
+    assert!(matches!(init(&nowhere, None), Err(Error::Io { action: "open", .. })));
 
-    init(&config).expect("the first initialisation");
-    assert!(matches!(init(&config), Err(Error::LoggingTwice(_))));
+    init(&config, None).expect("the first initialisation");
+    assert!(matches!(init(&config, None), Err(Error::LoggingTwice(_))));
     BudgetExhausted { account: "run-7", budget: 500 }.emit();
     tracing::warn!(peer = "learner", attempt = 2, "call failed, retrying");
     ParametersPublished { version: 3 }.emit();

@@ -220,7 +220,16 @@ pub(crate) fn signal(signal: &str, pid: u32) {
 pub(crate) fn names_the_fault(stderr: &str) -> bool {
     let of_sqlite = ["disk I/O error", "disk is full", "unable to open database file"];
     let causes = [&["Input/output error", "No space left"][..], &of_sqlite].concat();
-    let files = ["checkpoint", "ledger", "metrics.jsonl", "policy", "run.toml", "/run", "in-use"];
+    let files = [
+        "checkpoint",
+        "ledger",
+        "metrics.jsonl",
+        "tensorboard",
+        "policy",
+        "run.toml",
+        "/run",
+        "in-use",
+    ];
     let names = |line: &str, words: &[&str]| words.iter().any(|word| line.contains(word));
     stderr.lines().any(|line| names(line, &causes) && names(line, &files))
 }

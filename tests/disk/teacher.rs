@@ -107,7 +107,8 @@ impl Teacher {
         for episode in EPISODES {
             for step in 0..STEPS {
                 let steps = vec![query(episode, step)];
-                let ask = pb::AdviseRequest { account: account.clone(), steps };
+                let ask =
+                    pb::AdviseRequest { account: account.clone(), steps, ..Default::default() };
                 let answer = self.call(async |mut client| client.advise(ask.clone()).await)?;
                 let is_charged = answer.steps[0].charged;
                 answers.charged.push(is_charged);

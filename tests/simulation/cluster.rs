@@ -202,6 +202,7 @@ impl PersistentState {
                 let _lifetime = &lifetime;
                 system::now()
             }),
+            unix_start: Duration::ZERO,
             version: "simulated".to_owned(),
             first_worker: number * WORKER_NUMBERS,
             pacing: Pacing::Lockstep,

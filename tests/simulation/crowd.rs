@@ -122,7 +122,11 @@ impl CrowdState {
         let episode = client_idx as u64 % N_EPISODES;
         for first in (0..N_STEPS).step_by(STEPS_PER_REQUEST as usize) {
             let steps = (first..first + STEPS_PER_REQUEST).map(|step| query(episode, step));
-            let request = pb::AdviseRequest { account: ACCOUNT.to_owned(), steps: steps.collect() };
+            let request = pb::AdviseRequest {
+                account: ACCOUNT.to_owned(),
+                steps: steps.collect(),
+                ..Default::default()
+            };
             let answer = ask(&client, |mut client| {
                 let request = request.clone();
                 async move { client.advise(request).await }

@@ -4,10 +4,10 @@ use std::time::Duration;
 
 use tandem_core::TaskSpec;
 use tandem_core::work::{PublishedActor, RunTerms, SlotOrder};
-use tandem_net::{AuthChannel, MAX_MESSAGE_BYTES, Operation, retry};
+use tandem_net::{AuthChannel, MAX_MESSAGE_BYTES, Operation, TraceContext, retry};
 use tandem_proto::pb::learner_client::LearnerClient;
 use tandem_proto::{DecodeError, pb};
-use tonic::{Code, Response, Status};
+use tonic::{Code, Request, Response, Status};
 
 use crate::config::{Timeouts, WorkerConfig};
 use crate::error::{CallError, Error, expect_same};
@@ -94,12 +94,13 @@ impl Learner {
         decode().map(Some).map_err(|error| Error::protocol(FETCH, error))
     }
 
-    /// Delivers the episodes of a slot, unless the learner does not know the worker.
+    /// Delivers the episodes of a slot within the span `trace`, unless the learner does not know the worker.
     pub(crate) async fn submit(
         &self,
         worker_id: u64,
         slot: u64,
         played: &PlayedSlot,
+        trace: TraceContext,
     ) -> Result<Option<()>, Error> {
         let episodes = played.episodes.iter().map(tandem_proto::encode_episode).collect();
         let environment_check = played.check.map(|check| pb::EnvironmentCheck {
@@ -107,8 +108,11 @@ impl Learner {
             difference: check.difference.map_or_else(String::new, |it| it.to_string()),
         });
         let request = pb::SubmitEpisodesRequest { worker_id, slot, episodes, environment_check };
-        let call =
-            |mut client: Client, request| async move { client.submit_episodes(request).await };
+        let call = |mut client: Client, request| async move {
+            let mut request = Request::new(request);
+            request.extensions_mut().insert(trace);
+            client.submit_episodes(request).await
+        };
         let response = self.call(SUBMIT, self.timeouts.call, request, call).await;
         Ok(if_known(SUBMIT, response)?.map(drop))
     }

@@ -16,6 +16,7 @@ pub mod explore;
 #[cfg(test)]
 mod fakes;
 mod learner;
+mod metrics;
 mod player;
 pub mod ports;
 pub mod record;

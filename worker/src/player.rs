@@ -12,6 +12,7 @@ use tokio::sync::{mpsc, oneshot};
 
 use crate::determinism::{self, DeterminismCheck};
 use crate::error::Error;
+use crate::metrics::{Measured, WorkerMetrics};
 use crate::ports::{Advisor, AdvisorGone, Environment, EnvironmentError, Simulator};
 use crate::record::{log_name, metadata_of, record_episode};
 use crate::rollout::{RolloutError, play_slot};
@@ -25,6 +26,7 @@ pub(crate) struct Player {
     /// The digest of the actor's parameters; empty without a directory for logs.
     actor_digest: String,
     log_dir: Option<PathBuf>,
+    metrics: WorkerMetrics,
 }
 
 /// A slot that was played.
@@ -37,18 +39,26 @@ pub(crate) struct PlayedSlot {
 
 impl Player {
     /// Creates a player that simulates its environments.
-    pub(crate) fn simulating(terms: RunTerms, log_dir: Option<PathBuf>) -> Result<Self, Error> {
+    pub(crate) fn simulating(
+        terms: RunTerms,
+        log_dir: Option<PathBuf>,
+        metrics: WorkerMetrics,
+    ) -> Result<Self, Error> {
         let Some(layout) = terms.layout.as_built_in() else {
             return Err(Error::NotBuiltIn { task: terms.layout.name().to_owned() });
         };
         let world = Env::new(layout, &WorldConfig::from(terms.world))?;
         let simulator = Some(Simulator::new(world));
-        Ok(Self { simulator, ..Self::remote(terms, log_dir) })
+        Ok(Self { simulator, ..Self::remote(terms, log_dir, metrics) })
     }
 
     /// Creates a player whose environments are on a server.
-    pub(crate) const fn remote(terms: RunTerms, log_dir: Option<PathBuf>) -> Self {
-        Self { terms, simulator: None, actor: None, actor_digest: String::new(), log_dir }
+    pub(crate) const fn remote(
+        terms: RunTerms,
+        log_dir: Option<PathBuf>,
+        metrics: WorkerMetrics,
+    ) -> Self {
+        Self { terms, simulator: None, actor: None, actor_digest: String::new(), log_dir, metrics }
     }
 
     pub(crate) const fn terms(&self) -> &RunTerms {
@@ -80,17 +90,23 @@ impl Player {
         mut peers: PeerChannel,
     ) -> Result<PlayedSlot, RolloutError> {
         let actor = self.actor.as_mut().expect("parameters are loaded before a slot is played");
-        let (terms, advisor) = (&self.terms, &mut peers.clone());
+        let (terms, metrics, start) = (&self.terms, &self.metrics, self.metrics.now());
+        let advisor = &mut Measured { port: &mut peers.clone(), metrics };
         let (episodes, check) = match &mut self.simulator {
-            Some(simulator) => (play_slot(simulator, order, terms, actor, advisor)?, None),
+            Some(port) => {
+                let simulator = &mut Measured { port, metrics };
+                (play_slot(simulator, order, terms, actor, advisor)?, None)
+            }
             None => {
-                let episodes = play_slot(&mut peers, order, terms, actor, advisor)?;
+                let served = &mut Measured { port: &mut peers, metrics };
+                let episodes = play_slot(served, order, terms, actor, advisor)?;
                 let is_checked = determinism::is_checked(order);
                 let check =
                     is_checked.then(|| determinism::check(&mut peers, order, terms, &episodes));
                 (episodes, check.transpose()?)
             }
         };
+        metrics.record_slot(start, &episodes);
         for (ordered, episode) in order.episodes.iter().zip(&episodes) {
             finished_event(episode).emit();
             if let Some(log_dir) = self.log_dir.as_deref().filter(|_| ordered.record) {

@@ -2,14 +2,17 @@
 
 use tandem_core::work::SlotOrder;
 use tandem_core::{StepAdvice, StepQuery, TaskSpec};
+use tandem_net::TraceContext;
 use tokio::sync::oneshot;
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
+use tracing::Instrument as _;
 
 use crate::config::{Timeouts, WorkerConfig};
 use crate::environment::{Environments, Failure};
 use crate::error::Error;
 use crate::learner::{Learner, Work};
+use crate::metrics::WorkerMetrics;
 use crate::player::{PeerChannel, PeerRequest, PlayedSlot, Player};
 use crate::rollout::RolloutError;
 use crate::teacher::Teacher;
@@ -43,6 +46,7 @@ pub async fn run_with(
     let rollouts = TaskTracker::new();
     let (learner, teacher) = (Learner::new(&config, timeouts)?, Teacher::new(&config, timeouts)?);
     let pacing = config.pacing;
+    let metrics = WorkerMetrics::register(config.client.metrics());
     let environments = config.environment.clone().map(Environments::new);
     let mut worker = Worker {
         config,
@@ -50,6 +54,7 @@ pub async fn run_with(
         learner,
         teacher,
         environments,
+        metrics,
         difference_logged: false,
         rollouts: rollouts.clone(),
     };
@@ -74,6 +79,7 @@ struct Worker {
     teacher: Option<Teacher>,
     /// The server of the environments; `None` if they are simulated in this process.
     environments: Option<Environments>,
+    metrics: WorkerMetrics,
     /// Whether the log has a warning that the environments are not deterministic.
     difference_logged: bool,
     rollouts: TaskTracker,
@@ -91,12 +97,14 @@ impl Worker {
     async fn play_slots(&mut self, shutdown: &CancellationToken) -> Result<(), Error> {
         let mut membership = None;
         loop {
+            let start = self.metrics.now();
             let slot = tokio::select! {
                 biased;
                 () = shutdown.cancelled() => return Ok(()),
                 slot = self.next_slot(membership) => slot?,
             };
             let Some((member, order)) = slot else { return Ok(()) };
+            self.metrics.record_wait(start, order.parameter_version);
             membership = self.play_and_deliver(member, order).await?;
         }
     }
@@ -150,12 +158,12 @@ impl Worker {
             n_arms = terms.layout.n_arms(),
             "run joined"
         );
-        let log_dir = self.config.log_dir.clone();
+        let (log_dir, metrics) = (self.config.log_dir.clone(), self.metrics.clone());
         let player = match &mut self.environments {
-            None => Player::simulating(terms, log_dir)?,
+            None => Player::simulating(terms, log_dir, metrics)?,
             Some(environments) => {
                 environments.check(&terms.layout).await?;
-                Player::remote(terms, log_dir)
+                Player::remote(terms, log_dir, metrics)
             }
         };
         Ok(Membership { worker_id, player: Box::new(player) })
@@ -177,8 +185,16 @@ impl Worker {
             tokio::time::sleep(self.timeouts.backoff.first_pause).await;
             return Ok(Some(member));
         }
-        let (player, played) = self.play(member.player, order).await?;
-        let taken = self.learner.submit(worker_id, slot, &played).await?;
+        let trace = trace_of(&order);
+        let delivered = async {
+            let (player, played) = self.play(member.player, order, trace).await?;
+            let submission = trace.child("submit", 0);
+            let submitted = self.learner.submit(worker_id, slot, &played, submission);
+            let taken = submitted.instrument(submission.span(Some(trace), "submit", "client"));
+            Ok::<_, Error>((player, taken.await?))
+        };
+        let span = trace.span(None, "slot", "internal");
+        let (player, taken) = delivered.instrument(span).await?;
         if taken.is_none() {
             // Such a learner does not know the slot either and orders its episodes again.
             tracing::warn!(worker_id, slot, "unknown to the learner, joining again");
@@ -205,9 +221,10 @@ impl Worker {
         &mut self,
         mut player: Box<Player>,
         order: SlotOrder,
+        trace: TraceContext,
     ) -> Result<(Box<Player>, PlayedSlot), Error> {
         loop {
-            let (returned, outcome) = self.try_play(player, order.clone()).await?;
+            let (returned, outcome) = self.try_play(player, order.clone(), trace).await?;
             match (outcome, &mut self.environments) {
                 (Ok(played), environments) => {
                     if let Some(environments) = environments {
@@ -234,6 +251,7 @@ impl Worker {
         &mut self,
         mut player: Box<Player>,
         order: SlotOrder,
+        trace: TraceContext,
     ) -> Result<(Box<Player>, Result<PlayedSlot, SlotFailure>), Error> {
         let slot = order.slot;
         let (account, task) = (player.terms().account.clone(), player.terms().layout.clone());
@@ -255,7 +273,7 @@ impl Worker {
             let answered = match request {
                 PeerRequest::Advice(queries, response) => {
                     let account = account.as_deref().ok_or(Error::NoAccount { slot })?;
-                    let advice = self.advise(account, &task, &queries).await?;
+                    let advice = self.advise(account, &task, &queries, trace).await?;
                     response.send(advice).is_ok()
                 }
                 request => match self.forward(request, &task).await {
@@ -285,10 +303,14 @@ impl Worker {
         account: &str,
         task: &TaskSpec,
         queries: &[StepQuery],
+        trace: TraceContext,
     ) -> Result<Vec<StepAdvice>, Error> {
         let no_teacher = || Error::NoTeacher { account: account.to_owned() };
         let teacher = self.teacher.as_mut().ok_or_else(no_teacher)?;
-        teacher.advise(account, task, queries).await
+        let step = queries.first().map_or(0, |query| u64::from(query.step));
+        let call = trace.child("advise", step);
+        let span = call.span(Some(trace), "advise", "client");
+        teacher.advise(account, task, queries, call).instrument(span).await
     }
 
     /// Forwards a request to the server of the environments. Returns whether the player still waits for the response.
@@ -305,6 +327,16 @@ impl Worker {
             tracing::warn!(%difference, "the environments are not deterministic");
         }
     }
+}
+
+/// Returns the first span of the trace of a slot. It depends on the slot's first episode and on the parameters that play
+/// it, so a slot that is played again has the same trace.
+fn trace_of(order: &SlotOrder) -> TraceContext {
+    let (seed, number) = match order.episodes.first() {
+        Some(episode) => (episode.seed, episode.number),
+        None => (0, order.slot),
+    };
+    TraceContext::of(&[seed, number, order.kind as u64, order.parameter_version])
 }
 
 /// The failure of a slot that was being played.

@@ -1,7 +1,7 @@
 //! The client of the teacher.
 
 use tandem_core::{StepAdvice, StepQuery, TaskSpec};
-use tandem_net::{AuthChannel, MAX_MESSAGE_BYTES, Operation, Retrier, within};
+use tandem_net::{AuthChannel, MAX_MESSAGE_BYTES, Operation, Retrier, TraceContext, within};
 use tandem_proto::pb;
 use tandem_proto::pb::teacher_client::TeacherClient;
 use tokio::sync::mpsc;
@@ -41,15 +41,21 @@ impl Teacher {
         Ok(Some(Self { client, timeouts, stream: None }))
     }
 
-    /// Returns the teacher's advice on `queries`, charged to `account`. A repeated request is not charged again.
+    /// Returns the teacher's advice on `queries`, charged to `account`, within the span `trace`. A repeated request is
+    /// not charged again.
     pub(crate) async fn advise(
         &mut self,
         account: &str,
         layout: &TaskSpec,
         queries: &[StepQuery],
+        trace: TraceContext,
     ) -> Result<Vec<StepAdvice>, Error> {
         let steps = queries.iter().map(tandem_proto::encode_query).collect();
-        let request = pb::AdviseRequest { account: account.to_owned(), steps };
+        let request = pb::AdviseRequest {
+            account: account.to_owned(),
+            steps,
+            traceparent: trace.to_string(),
+        };
         let response = self.exchange_until_answered(request).await;
         let response = response.map_err(|status| Error::protocol(ADVISE, status))?;
         let decode = || {

@@ -251,6 +251,11 @@ impl ArmsHandle {
         Arc::clone(&self.snapshots.borrow())
     }
 
+    /// Returns the number of jobs that wait for the thread.
+    pub(super) fn n_waiting(&self) -> usize {
+        self.jobs.max_capacity() - self.jobs.capacity()
+    }
+
     /// Returns a receiver of snapshots. A slow receiver sees only the newest one.
     pub(super) fn watch(&self) -> watch::Receiver<Arc<Snapshot>> {
         self.snapshots.clone()

@@ -27,13 +27,14 @@ pub(super) struct Evaluations<'a> {
 }
 
 impl<'a> Evaluations<'a> {
-    /// Continues with the evaluations of a checkpoint.
+    /// Continues with the evaluations of a checkpoint. The run started at `started_s`, seconds since 1970.
     pub(super) fn new(
         config: &'a LearnerConfig,
         history: EvaluationHistory,
         pending: Vec<PendingEvaluation>,
+        started_s: f64,
     ) -> Self {
-        let store = EvaluationStore::new(&config.out, history);
+        let store = EvaluationStore::new(&config.out, history, started_s);
         Self { config, store, pending: pending.into() }
     }
 

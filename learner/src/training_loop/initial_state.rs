@@ -128,13 +128,15 @@ impl<'a> LearnerLoop<'a> {
         };
         shared.lock().queue.advice_unit = terms.advice.unit;
         publish_parameters(context, &pending, &acting, &trainer);
+        // The clock counts from the start of this process, and the run's wall time continues that of its earlier parts.
+        let started_s = config.unix_start.as_secs_f64() - wall_s;
         let mut learner = Self {
             context,
             trainer,
             acting,
             account,
-            evaluations: Evaluations::new(config, history, pending),
-            persistence: Persistence::new(config, &shared.warnings, lock),
+            evaluations: Evaluations::new(config, history, pending, started_s),
+            persistence: Persistence::new(config, shared, lock),
             progress: ProgressPublisher::new(config, shared, wall_s),
         };
         for pending in learner.evaluations.pending() {

@@ -12,7 +12,8 @@ use super::run_lock::RunLock;
 use crate::checkpoint::{self, Resumption, Saved};
 use crate::error::Error;
 use crate::evaluation_store::{UnwrittenFile, innermost};
-use crate::shared::LearnerConfig;
+use crate::metrics::Timings;
+use crate::shared::{LearnerConfig, Shared};
 use crate::warnings::{Source, Warnings};
 
 /// Pause before a failed write is repeated.
@@ -51,6 +52,7 @@ impl LoopState<'_, '_> {
 pub(super) struct Persistence<'a> {
     config: &'a LearnerConfig,
     warnings: &'a Warnings,
+    timings: &'a Timings,
     lock: RunLock,
     /// The state in the newest checkpoint.
     saved: Option<CheckpointKey>,
@@ -62,14 +64,11 @@ pub(super) struct Persistence<'a> {
 }
 
 impl<'a> Persistence<'a> {
-    pub(super) const fn new(
-        config: &'a LearnerConfig,
-        warnings: &'a Warnings,
-        lock: RunLock,
-    ) -> Self {
+    pub(super) const fn new(config: &'a LearnerConfig, shared: &'a Shared, lock: RunLock) -> Self {
         Self {
             config,
-            warnings,
+            warnings: &shared.warnings,
+            timings: &shared.timings,
             lock,
             saved: None,
             unwritten_checkpoint: None,
@@ -116,13 +115,16 @@ impl<'a> Persistence<'a> {
         };
         let directory = self.config.out.join("checkpoint");
         let keep = self.config.run.checkpoint.keep;
+        let start = self.timings.now();
         match checkpoint::save(&directory, state.trainer, &resumption, keep) {
             Ok(Saved { path, seal }) => {
+                self.timings.record(&self.timings.checkpoint_seconds, start);
                 CheckpointSaved { round: key.round, path: &path, digest: &seal }.emit();
                 self.saved = Some(key);
                 self.unwritten_checkpoint = None;
             }
             Err(error) => {
+                self.timings.checkpoint_failures.inc();
                 let cause = innermost(&error);
                 self.unwritten_checkpoint = Some(UnwrittenFile { what, cause });
             }

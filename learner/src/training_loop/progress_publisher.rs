@@ -79,12 +79,16 @@ impl<'a> ProgressPublisher<'a> {
         });
     }
 
-    /// Returns a callback for the updates of a round, which publishes their number about once a second. `learned` are
+    /// Returns a callback for the updates of a round, which measures each of them and publishes their number about once
+    /// a second. `learned` are
     /// the counters before the first update.
     pub(super) fn on_update(&self, learned: Counters) -> impl FnMut(u64) {
         let mut published_at_s = self.wall_s();
+        let mut updated_at_s = published_at_s;
         move |n_updates| {
             let now_s = self.wall_s();
+            self.shared.timings.update_seconds.observe(now_s - updated_at_s);
+            updated_at_s = now_s;
             if now_s - published_at_s > UPDATE_PERIOD_S {
                 published_at_s = now_s;
                 self.shared.progress.send_modify(|progress| {

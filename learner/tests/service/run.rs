@@ -48,6 +48,7 @@ pub(crate) fn learner_config(run: RunConfig, out: &Path, resume: bool) -> Learne
         run_file: None,
         n_threads: 1,
         clock: real_clock(),
+        unix_start: Duration::from_secs(1_000_000_000),
         version: VERSION.to_owned(),
         first_worker: 4096,
         pacing: Pacing::Concurrent,

@@ -1,5 +1,6 @@
 //! Services and clients over real sockets: access and error messages.
 
+mod metrics;
 mod support;
 
 use std::time::Duration;

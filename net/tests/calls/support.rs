@@ -2,11 +2,11 @@
 
 use std::net::SocketAddr;
 use std::pin::Pin;
-use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, Mutex};
 
 use rcgen::{BasicConstraints, CertificateParams, CertifiedIssuer, DnType, IsCa, KeyPair};
-use tandem_net::{Incoming, ServerConfig, Token};
+use tandem_net::{Incoming, ServerConfig, Token, TraceContext};
 use tandem_proto::pb;
 use tandem_proto::pb::teacher_server::{Teacher, TeacherServer};
 use tokio::net::TcpListener;
@@ -24,15 +24,23 @@ pub(crate) fn token(text: &str) -> Token {
 
 /// A service that counts its calls and returns empty responses.
 #[derive(Clone, Default)]
-pub(crate) struct Counter(Arc<AtomicU64>);
+pub(crate) struct Counter {
+    n_calls: Arc<AtomicU64>,
+    /// The trace contexts of the calls of `Describe`.
+    traces: Arc<Mutex<Vec<Option<TraceContext>>>>,
+}
 
 impl Counter {
     pub(crate) fn n_calls(&self) -> u64 {
-        self.0.load(Ordering::SeqCst)
+        self.n_calls.load(Ordering::SeqCst)
+    }
+
+    pub(crate) fn traces(&self) -> Vec<Option<TraceContext>> {
+        self.traces.lock().expect("no panic").clone()
     }
 
     fn count<T: Default>(&self) -> Result<Response<T>, Status> {
-        self.0.fetch_add(1, Ordering::SeqCst);
+        self.n_calls.fetch_add(1, Ordering::SeqCst);
         Ok(Response::new(T::default()))
     }
 }
@@ -44,8 +52,10 @@ impl Teacher for Counter {
 
     async fn describe(
         &self,
-        _: Request<pb::DescribeRequest>,
+        request: Request<pb::DescribeRequest>,
     ) -> Result<Response<pb::DescribeResponse>, Status> {
+        let trace = request.extensions().get().copied();
+        self.traces.lock().expect("no panic").push(trace);
         self.count()
     }
 

@@ -25,7 +25,7 @@ _sym_db = _symbol_database.Default()
 from . import task_pb2 as tandem_dot_v1_dot_task__pb2
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x17tandem/v1/teacher.proto\x12\ttandem.v1\x1a\x14tandem/v1/task.proto\"\x11\n\x0f\x44\x65scribeRequest\"\xf3\x01\n\x10\x44\x65scribeResponse\x12\x0c\n\x04task\x18\x01 \x01(\t\x12\x1d\n\x15n_observation_per_arm\x18\x02 \x01(\r\x12\x16\n\x0en_goal_per_arm\x18\x03 \x01(\r\x12\x18\n\x10n_action_per_arm\x18\x04 \x01(\r\x12\x1f\n\x04\x61rms\x18\x05 \x03(\x0b\x32\x11.tandem.v1.ArmMap\x12\x12\n\nstrategies\x18\x06 \x03(\t\x12\x15\n\rpolicy_digest\x18\x07 \x01(\t\x12\x34\n\x10task_description\x18\x08 \x01(\x0b\x32\x1a.tandem.v1.TaskDescription\"\x80\x01\n\x06\x41rmMap\x12*\n\x0bobservation\x18\x01 \x01(\x0b\x32\x15.tandem.v1.IndexRange\x12#\n\x04goal\x18\x02 \x01(\x0b\x32\x15.tandem.v1.IndexRange\x12%\n\x06\x61\x63tion\x18\x03 \x01(\x0b\x32\x15.tandem.v1.IndexRange\"(\n\nIndexRange\x12\r\n\x05start\x18\x01 \x01(\r\x12\x0b\n\x03\x65nd\x18\x02 \x01(\r\"D\n\x12OpenAccountRequest\x12\x0c\n\x04name\x18\x01 \x01(\t\x12\x0e\n\x06\x62udget\x18\x02 \x01(\x04\x12\x10\n\x08strategy\x18\x03 \x01(\t\"!\n\x11GetAccountRequest\x12\x0c\n\x04name\x18\x01 \x01(\t\"w\n\x07\x41\x63\x63ount\x12\x0c\n\x04name\x18\x01 \x01(\t\x12\x0e\n\x06\x62udget\x18\x02 \x01(\x04\x12\x10\n\x08strategy\x18\x03 \x01(\t\x12\r\n\x05spent\x18\x04 \x01(\x04\x12\x0e\n\x06leased\x18\x05 \x01(\x04\x12\x0c\n\x04left\x18\x06 \x01(\x04\x12\x0f\n\x07warning\x18\x07 \x01(\t\"E\n\rAdviseRequest\x12\x0f\n\x07\x61\x63\x63ount\x18\x01 \x01(\t\x12#\n\x05steps\x18\x02 \x03(\x0b\x32\x14.tandem.v1.StepQuery\"\x9b\x01\n\tStepQuery\x12\x0f\n\x07\x65pisode\x18\x01 \x01(\x04\x12\x0c\n\x04step\x18\x02 \x01(\r\x12\x13\n\x0bobservation\x18\x03 \x03(\x02\x12\x0c\n\x04goal\x18\x04 \x03(\x02\x12\x17\n\x0fproposed_action\x18\x05 \x03(\x02\x12\x15\n\rjudged_action\x18\x06 \x03(\x02\x12\x12\n\x05payer\x18\x07 \x01(\x04H\x00\x88\x01\x01\x42\x08\n\x06_payer\"K\n\x0e\x41\x64viseResponse\x12$\n\x05steps\x18\x01 \x03(\x0b\x32\x15.tandem.v1.StepAdvice\x12\x13\n\x0b\x62udget_left\x18\x02 \x01(\x04\"Q\n\nStepAdvice\x12\x0e\n\x06\x61\x63tion\x18\x01 \x03(\x02\x12\x0f\n\x07\x63harged\x18\x02 \x01(\x08\x12\"\n\x04\x61rms\x18\x03 \x03(\x0b\x32\x14.tandem.v1.ArmAdvice\"\x83\x01\n\tArmAdvice\x12\x16\n\x0eteacher_action\x18\x01 \x03(\x02\x12\x11\n\tq_teacher\x18\x02 \x01(\x02\x12\x11\n\tq_student\x18\x03 \x01(\x02\x12\x12\n\nimportance\x18\x04 \x01(\x02\x12\x10\n\x08\x64istance\x18\x05 \x01(\x02\x12\x12\n\noverridden\x18\x06 \x01(\x08\"Q\n\x11OpenLeasesRequest\x12\x0f\n\x07\x61\x63\x63ount\x18\x01 \x01(\t\x12\x10\n\x08\x65pisodes\x18\x02 \x03(\x04\x12\x19\n\x11units_per_episode\x18\x03 \x01(\r\"[\n\x12OpenLeasesResponse\x12 \n\x06leases\x18\x01 \x03(\x0b\x32\x10.tandem.v1.Lease\x12#\n\x07\x61\x63\x63ount\x18\x02 \x01(\x0b\x32\x12.tandem.v1.Account\"<\n\x05Lease\x12\x0f\n\x07\x65pisode\x18\x01 \x01(\x04\x12\r\n\x05units\x18\x02 \x01(\r\x12\x13\n\x0b\x65\x61rly_units\x18\x03 \x01(\r\"8\n\x13SettleLeasesRequest\x12\x0f\n\x07\x61\x63\x63ount\x18\x01 \x01(\t\x12\x10\n\x08\x65pisodes\x18\x02 \x03(\x04\x32\xe7\x03\n\x07Teacher\x12\x43\n\x08\x44\x65scribe\x12\x1a.tandem.v1.DescribeRequest\x1a\x1b.tandem.v1.DescribeResponse\x12@\n\x0bOpenAccount\x12\x1d.tandem.v1.OpenAccountRequest\x1a\x12.tandem.v1.Account\x12>\n\nGetAccount\x12\x1c.tandem.v1.GetAccountRequest\x1a\x12.tandem.v1.Account\x12=\n\x06\x41\x64vise\x12\x18.tandem.v1.AdviseRequest\x1a\x19.tandem.v1.AdviseResponse\x12G\n\x0c\x41\x64viseStream\x12\x18.tandem.v1.AdviseRequest\x1a\x19.tandem.v1.AdviseResponse(\x01\x30\x01\x12I\n\nOpenLeases\x12\x1c.tandem.v1.OpenLeasesRequest\x1a\x1d.tandem.v1.OpenLeasesResponse\x12\x42\n\x0cSettleLeases\x12\x1e.tandem.v1.SettleLeasesRequest\x1a\x12.tandem.v1.Accountb\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x17tandem/v1/teacher.proto\x12\ttandem.v1\x1a\x14tandem/v1/task.proto\"\x11\n\x0f\x44\x65scribeRequest\"\xf3\x01\n\x10\x44\x65scribeResponse\x12\x0c\n\x04task\x18\x01 \x01(\t\x12\x1d\n\x15n_observation_per_arm\x18\x02 \x01(\r\x12\x16\n\x0en_goal_per_arm\x18\x03 \x01(\r\x12\x18\n\x10n_action_per_arm\x18\x04 \x01(\r\x12\x1f\n\x04\x61rms\x18\x05 \x03(\x0b\x32\x11.tandem.v1.ArmMap\x12\x12\n\nstrategies\x18\x06 \x03(\t\x12\x15\n\rpolicy_digest\x18\x07 \x01(\t\x12\x34\n\x10task_description\x18\x08 \x01(\x0b\x32\x1a.tandem.v1.TaskDescription\"\x80\x01\n\x06\x41rmMap\x12*\n\x0bobservation\x18\x01 \x01(\x0b\x32\x15.tandem.v1.IndexRange\x12#\n\x04goal\x18\x02 \x01(\x0b\x32\x15.tandem.v1.IndexRange\x12%\n\x06\x61\x63tion\x18\x03 \x01(\x0b\x32\x15.tandem.v1.IndexRange\"(\n\nIndexRange\x12\r\n\x05start\x18\x01 \x01(\r\x12\x0b\n\x03\x65nd\x18\x02 \x01(\r\"D\n\x12OpenAccountRequest\x12\x0c\n\x04name\x18\x01 \x01(\t\x12\x0e\n\x06\x62udget\x18\x02 \x01(\x04\x12\x10\n\x08strategy\x18\x03 \x01(\t\"!\n\x11GetAccountRequest\x12\x0c\n\x04name\x18\x01 \x01(\t\"w\n\x07\x41\x63\x63ount\x12\x0c\n\x04name\x18\x01 \x01(\t\x12\x0e\n\x06\x62udget\x18\x02 \x01(\x04\x12\x10\n\x08strategy\x18\x03 \x01(\t\x12\r\n\x05spent\x18\x04 \x01(\x04\x12\x0e\n\x06leased\x18\x05 \x01(\x04\x12\x0c\n\x04left\x18\x06 \x01(\x04\x12\x0f\n\x07warning\x18\x07 \x01(\t\"Z\n\rAdviseRequest\x12\x0f\n\x07\x61\x63\x63ount\x18\x01 \x01(\t\x12#\n\x05steps\x18\x02 \x03(\x0b\x32\x14.tandem.v1.StepQuery\x12\x13\n\x0btraceparent\x18\x03 \x01(\t\"\x9b\x01\n\tStepQuery\x12\x0f\n\x07\x65pisode\x18\x01 \x01(\x04\x12\x0c\n\x04step\x18\x02 \x01(\r\x12\x13\n\x0bobservation\x18\x03 \x03(\x02\x12\x0c\n\x04goal\x18\x04 \x03(\x02\x12\x17\n\x0fproposed_action\x18\x05 \x03(\x02\x12\x15\n\rjudged_action\x18\x06 \x03(\x02\x12\x12\n\x05payer\x18\x07 \x01(\x04H\x00\x88\x01\x01\x42\x08\n\x06_payer\"K\n\x0e\x41\x64viseResponse\x12$\n\x05steps\x18\x01 \x03(\x0b\x32\x15.tandem.v1.StepAdvice\x12\x13\n\x0b\x62udget_left\x18\x02 \x01(\x04\"Q\n\nStepAdvice\x12\x0e\n\x06\x61\x63tion\x18\x01 \x03(\x02\x12\x0f\n\x07\x63harged\x18\x02 \x01(\x08\x12\"\n\x04\x61rms\x18\x03 \x03(\x0b\x32\x14.tandem.v1.ArmAdvice\"\x83\x01\n\tArmAdvice\x12\x16\n\x0eteacher_action\x18\x01 \x03(\x02\x12\x11\n\tq_teacher\x18\x02 \x01(\x02\x12\x11\n\tq_student\x18\x03 \x01(\x02\x12\x12\n\nimportance\x18\x04 \x01(\x02\x12\x10\n\x08\x64istance\x18\x05 \x01(\x02\x12\x12\n\noverridden\x18\x06 \x01(\x08\"Q\n\x11OpenLeasesRequest\x12\x0f\n\x07\x61\x63\x63ount\x18\x01 \x01(\t\x12\x10\n\x08\x65pisodes\x18\x02 \x03(\x04\x12\x19\n\x11units_per_episode\x18\x03 \x01(\r\"[\n\x12OpenLeasesResponse\x12 \n\x06leases\x18\x01 \x03(\x0b\x32\x10.tandem.v1.Lease\x12#\n\x07\x61\x63\x63ount\x18\x02 \x01(\x0b\x32\x12.tandem.v1.Account\"<\n\x05Lease\x12\x0f\n\x07\x65pisode\x18\x01 \x01(\x04\x12\r\n\x05units\x18\x02 \x01(\r\x12\x13\n\x0b\x65\x61rly_units\x18\x03 \x01(\r\"8\n\x13SettleLeasesRequest\x12\x0f\n\x07\x61\x63\x63ount\x18\x01 \x01(\t\x12\x10\n\x08\x65pisodes\x18\x02 \x03(\x04\x32\xe7\x03\n\x07Teacher\x12\x43\n\x08\x44\x65scribe\x12\x1a.tandem.v1.DescribeRequest\x1a\x1b.tandem.v1.DescribeResponse\x12@\n\x0bOpenAccount\x12\x1d.tandem.v1.OpenAccountRequest\x1a\x12.tandem.v1.Account\x12>\n\nGetAccount\x12\x1c.tandem.v1.GetAccountRequest\x1a\x12.tandem.v1.Account\x12=\n\x06\x41\x64vise\x12\x18.tandem.v1.AdviseRequest\x1a\x19.tandem.v1.AdviseResponse\x12G\n\x0c\x41\x64viseStream\x12\x18.tandem.v1.AdviseRequest\x1a\x19.tandem.v1.AdviseResponse(\x01\x30\x01\x12I\n\nOpenLeases\x12\x1c.tandem.v1.OpenLeasesRequest\x1a\x1d.tandem.v1.OpenLeasesResponse\x12\x42\n\x0cSettleLeases\x12\x1e.tandem.v1.SettleLeasesRequest\x1a\x12.tandem.v1.Accountb\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
@@ -47,23 +47,23 @@ if not _descriptor._USE_C_DESCRIPTORS:
   _globals['_ACCOUNT']._serialized_start=603
   _globals['_ACCOUNT']._serialized_end=722
   _globals['_ADVISEREQUEST']._serialized_start=724
-  _globals['_ADVISEREQUEST']._serialized_end=793
-  _globals['_STEPQUERY']._serialized_start=796
-  _globals['_STEPQUERY']._serialized_end=951
-  _globals['_ADVISERESPONSE']._serialized_start=953
-  _globals['_ADVISERESPONSE']._serialized_end=1028
-  _globals['_STEPADVICE']._serialized_start=1030
-  _globals['_STEPADVICE']._serialized_end=1111
-  _globals['_ARMADVICE']._serialized_start=1114
-  _globals['_ARMADVICE']._serialized_end=1245
-  _globals['_OPENLEASESREQUEST']._serialized_start=1247
-  _globals['_OPENLEASESREQUEST']._serialized_end=1328
-  _globals['_OPENLEASESRESPONSE']._serialized_start=1330
-  _globals['_OPENLEASESRESPONSE']._serialized_end=1421
-  _globals['_LEASE']._serialized_start=1423
-  _globals['_LEASE']._serialized_end=1483
-  _globals['_SETTLELEASESREQUEST']._serialized_start=1485
-  _globals['_SETTLELEASESREQUEST']._serialized_end=1541
-  _globals['_TEACHER']._serialized_start=1544
-  _globals['_TEACHER']._serialized_end=2031
+  _globals['_ADVISEREQUEST']._serialized_end=814
+  _globals['_STEPQUERY']._serialized_start=817
+  _globals['_STEPQUERY']._serialized_end=972
+  _globals['_ADVISERESPONSE']._serialized_start=974
+  _globals['_ADVISERESPONSE']._serialized_end=1049
+  _globals['_STEPADVICE']._serialized_start=1051
+  _globals['_STEPADVICE']._serialized_end=1132
+  _globals['_ARMADVICE']._serialized_start=1135
+  _globals['_ARMADVICE']._serialized_end=1266
+  _globals['_OPENLEASESREQUEST']._serialized_start=1268
+  _globals['_OPENLEASESREQUEST']._serialized_end=1349
+  _globals['_OPENLEASESRESPONSE']._serialized_start=1351
+  _globals['_OPENLEASESRESPONSE']._serialized_end=1442
+  _globals['_LEASE']._serialized_start=1444
+  _globals['_LEASE']._serialized_end=1504
+  _globals['_SETTLELEASESREQUEST']._serialized_start=1506
+  _globals['_SETTLELEASESREQUEST']._serialized_end=1562
+  _globals['_TEACHER']._serialized_start=1565
+  _globals['_TEACHER']._serialized_end=2052
 # @@protoc_insertion_point(module_scope)

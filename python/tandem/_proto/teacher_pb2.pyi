@@ -84,12 +84,14 @@ class Account(_message.Message):
     def __init__(self, name: _Optional[str] = ..., budget: _Optional[int] = ..., strategy: _Optional[str] = ..., spent: _Optional[int] = ..., leased: _Optional[int] = ..., left: _Optional[int] = ..., warning: _Optional[str] = ...) -> None: ...
 
 class AdviseRequest(_message.Message):
-    __slots__ = ("account", "steps")
+    __slots__ = ("account", "steps", "traceparent")
     ACCOUNT_FIELD_NUMBER: _ClassVar[int]
     STEPS_FIELD_NUMBER: _ClassVar[int]
+    TRACEPARENT_FIELD_NUMBER: _ClassVar[int]
     account: str
     steps: _containers.RepeatedCompositeFieldContainer[StepQuery]
-    def __init__(self, account: _Optional[str] = ..., steps: _Optional[_Iterable[_Union[StepQuery, _Mapping]]] = ...) -> None: ...
+    traceparent: str
+    def __init__(self, account: _Optional[str] = ..., steps: _Optional[_Iterable[_Union[StepQuery, _Mapping]]] = ..., traceparent: _Optional[str] = ...) -> None: ...
 
 class StepQuery(_message.Message):
     __slots__ = ("episode", "step", "observation", "goal", "proposed_action", "judged_action", "payer")

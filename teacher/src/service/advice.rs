@@ -3,10 +3,12 @@
 use std::pin::Pin;
 use std::task::{Context, Poll};
 
+use tandem_net::TraceContext;
 use tandem_proto::{decode_account_name, encode_advice, pb};
 use tokio_stream::{Stream, StreamExt as _};
 use tokio_util::sync::{CancellationToken, WaitForCancellationFutureOwned};
 use tonic::{Status, Streaming};
+use tracing::{Instrument as _, Span};
 
 use super::convert::decode_queries;
 use super::status;
@@ -23,9 +25,22 @@ pub(super) async fn advise(
     advisor: &AdvisorHandle,
     request: pb::AdviseRequest,
 ) -> Result<pb::AdviseResponse, Status> {
-    let request = decode(advisor, request).map_err(|error| status(&error))?;
-    let advice = advisor.advise(request).await;
-    advice.map(|advice| encode(&advice)).map_err(|error| status(&error))
+    let span = span_of(&request);
+    let answer = async {
+        let request = decode(advisor, request).map_err(|error| status(&error))?;
+        let advice = advisor.advise(request).await;
+        advice.map(|advice| encode(&advice)).map_err(|error| status(&error))
+    };
+    answer.instrument(span).await
+}
+
+/// Returns the span of a request; none if it has no trace context. The header of a stream would not do: its requests
+/// belong to many traces.
+fn span_of(request: &pb::AdviseRequest) -> Span {
+    let Ok(parent) = request.traceparent.parse::<TraceContext>() else { return Span::none() };
+    let span = parent.child("server", 0).span(Some(parent), "Advise", "server");
+    span.in_scope(|| tracing::debug!(steps = request.steps.len(), "advice requested"));
+    span
 }
 
 /// Answers `requests` one at a time, as they are read. Flow control bounds the number of pending messages.

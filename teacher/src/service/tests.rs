@@ -57,7 +57,7 @@ impl Fixture {
     }
 
     async fn advise(&mut self, steps: Vec<pb::StepQuery>) -> Result<pb::AdviseResponse, Status> {
-        let request = pb::AdviseRequest { account: "run".to_owned(), steps };
+        let request = pb::AdviseRequest { account: "run".to_owned(), steps, ..Default::default() };
         self.client.advise(request).await.map(Response::into_inner)
     }
 
@@ -181,7 +181,7 @@ async fn a_stream_is_answered_in_order_until_a_request_is_refused() {
     let mut fixture = Fixture::start().await;
     fixture.open(100, "ea").await.unwrap();
     let (sender, mut answers) = fixture.stream().await;
-    let ask = |steps| pb::AdviseRequest { account: "run".to_owned(), steps };
+    let ask = |steps| pb::AdviseRequest { account: "run".to_owned(), steps, ..Default::default() };
     for first in [0_u32, 1, 2] {
         sender.send(ask((0..=first).map(|i| step(10 * first + i)).collect())).await.unwrap();
     }
@@ -294,7 +294,11 @@ async fn a_round_leases_spends_and_settles() {
 
 #[tokio::test]
 async fn a_pending_request_is_answered_before_the_service_ends() {
-    let ask = || pb::AdviseRequest { account: "run".to_owned(), steps: vec![step(0)] };
+    let ask = || pb::AdviseRequest {
+        account: "run".to_owned(),
+        steps: vec![step(0)],
+        ..Default::default()
+    };
     let held_up = async || {
         let mut fixture = Fixture::start().await;
         fixture.open(10, "ea").await.unwrap();
@@ -329,7 +333,8 @@ async fn a_pending_request_is_answered_before_the_service_ends() {
 /// Returns the code and message with which each kind of call is refused.
 async fn refusals(fixture: &mut Fixture) -> Vec<(Code, String)> {
     let (sender, mut answers) = fixture.stream().await;
-    let ask = pb::AdviseRequest { account: "run".to_owned(), steps: vec![step(0)] };
+    let ask =
+        pb::AdviseRequest { account: "run".to_owned(), steps: vec![step(0)], ..Default::default() };
     sender.send(ask.clone()).await.unwrap();
     let name = || "run".to_owned();
     let leases = pb::OpenLeasesRequest { account: name(), episodes: vec![1], units_per_episode: 1 };
@@ -371,7 +376,8 @@ async fn a_panic_is_an_internal_error_and_ends_the_service() {
     fixture.open(10, "ea").await.unwrap();
     let (sender, mut answers) = fixture.stream().await;
     fixture.gate.set(Mode::Panic);
-    let ask = pb::AdviseRequest { account: "run".to_owned(), steps: vec![step(0)] };
+    let ask =
+        pb::AdviseRequest { account: "run".to_owned(), steps: vec![step(0)], ..Default::default() };
     sender.send(ask).await.unwrap();
     let (code, message) = refusal(answers.message().await);
     assert_eq!(

@@ -6,11 +6,13 @@ use std::thread;
 use std::time::Duration;
 
 use tandem_net::Pacing;
+use tandem_net::metrics::ConstGauge;
 use tokio::sync::{mpsc, oneshot};
 use tokio_util::sync::{CancellationToken, DropGuard};
 
 use crate::advisor::{Advice, AdviceRequest, Advisor, TeacherInfo};
 use crate::error::Error;
+use crate::service::metrics::TeacherMetrics;
 
 /// The capacity of the job queue. When it is full, calls wait to enqueue their jobs.
 const QUEUE_CAPACITY: usize = 256;
@@ -45,6 +47,7 @@ pub(super) struct AdvisorHandle {
     info: Arc<TeacherInfo>,
     jobs: mpsc::Sender<Job>,
     timeout: Duration,
+    metrics: TeacherMetrics,
 }
 
 /// Signals the end of the thread when it is dropped, also after a panic.
@@ -61,8 +64,11 @@ impl AdvisorThread {
         timeout: Duration,
         stop: CancellationToken,
         pacing: Pacing,
+        metrics: TeacherMetrics,
     ) -> io::Result<(Self, AdvisorHandle)> {
         let (jobs, queue) = mpsc::channel(QUEUE_CAPACITY);
+        add_queue_depth(&metrics, &jobs);
+        let batch = Batch::new(metrics.clone());
         let (end_sender, ended) = oneshot::channel();
         let info = Arc::new(advisor.info().clone());
         let end_signal = EndSignal { _stop: stop.drop_guard(), _ended: end_sender };
@@ -70,15 +76,15 @@ impl AdvisorThread {
             Pacing::Concurrent => JoinHandle::Thread(
                 thread::Builder::new().name("advisor".to_owned()).spawn(move || {
                     let _end_signal = end_signal;
-                    run_thread(advisor, queue);
+                    run_thread(advisor, queue, batch);
                 })?,
             ),
             Pacing::Lockstep => JoinHandle::Task(tokio::spawn(async move {
                 let _end_signal = end_signal;
-                run_task(advisor, queue).await;
+                run_task(advisor, queue, batch).await;
             })),
         };
-        Ok((Self { handle, ended }, AdvisorHandle { info, jobs, timeout }))
+        Ok((Self { handle, ended }, AdvisorHandle { info, jobs, timeout, metrics }))
     }
 
     /// Waits up to `grace` for the end of the thread. A thread that is still busy then is detached.
@@ -109,7 +115,10 @@ impl AdvisorHandle {
     /// charged.
     pub(super) async fn advise(&self, request: AdviceRequest) -> Answer<Advice> {
         let (reply, answer) = oneshot::channel();
-        self.send(Job::Advise(request, reply), answer).await
+        let start = self.metrics.metrics.now();
+        let advice = self.send(Job::Advise(request, reply), answer).await;
+        self.metrics.record_request(start);
+        advice
     }
 
     /// Runs `work` on the thread, after the jobs before it.
@@ -137,9 +146,21 @@ impl AdvisorHandle {
     }
 }
 
+/// Adds the number of waiting jobs to the metrics, while there are senders of jobs.
+fn add_queue_depth(metrics: &TeacherMetrics, jobs: &mpsc::Sender<Job>) {
+    let jobs = jobs.downgrade();
+    metrics.metrics.add_source(move |registry| {
+        let depth = jobs.upgrade().map_or(0, |jobs| jobs.max_capacity() - jobs.capacity());
+        let help = "Jobs that wait for the advising thread";
+        registry.register("advice_queue_depth", help, ConstGauge::new(depth as f64));
+        let help = "Jobs that can wait for the advising thread";
+        let capacity = ConstGauge::new(QUEUE_CAPACITY as f64);
+        registry.register("advice_queue_capacity", help, capacity);
+    });
+}
+
 /// Executes jobs in their order. Requests that wait together are answered in one batch.
-fn run_thread(mut advisor: Advisor, mut jobs: mpsc::Receiver<Job>) {
-    let mut batch = Batch::default();
+fn run_thread(mut advisor: Advisor, mut jobs: mpsc::Receiver<Job>, mut batch: Batch) {
     while let Some(job) = jobs.blocking_recv() {
         batch.take_all(job, &mut jobs, &mut advisor);
         batch.answer(&mut advisor);
@@ -147,8 +168,7 @@ fn run_thread(mut advisor: Advisor, mut jobs: mpsc::Receiver<Job>) {
 }
 
 /// As [`run_thread`], on the runtime of the calls: requests of one simulated moment are answered in one batch.
-async fn run_task(mut advisor: Advisor, mut jobs: mpsc::Receiver<Job>) {
-    let mut batch = Batch::default();
+async fn run_task(mut advisor: Advisor, mut jobs: mpsc::Receiver<Job>, mut batch: Batch) {
     while let Some(job) = jobs.recv().await {
         batch.take_all(job, &mut jobs, &mut advisor);
         batch.answer(&mut advisor);
@@ -156,14 +176,18 @@ async fn run_task(mut advisor: Advisor, mut jobs: mpsc::Receiver<Job>) {
 }
 
 /// Requests that are answered together.
-#[derive(Default)]
 struct Batch {
     requests: Vec<AdviceRequest>,
     replies: Vec<oneshot::Sender<Answer<Advice>>>,
     n_steps: usize,
+    metrics: TeacherMetrics,
 }
 
 impl Batch {
+    const fn new(metrics: TeacherMetrics) -> Self {
+        Self { requests: Vec::new(), replies: Vec::new(), n_steps: 0, metrics }
+    }
+
     /// Takes `job` and the jobs behind it until the batch is full or the queue is empty.
     fn take_all(&mut self, job: Job, jobs: &mut mpsc::Receiver<Job>, advisor: &mut Advisor) {
         self.take(job, advisor);
@@ -194,7 +218,9 @@ impl Batch {
         if self.requests.is_empty() {
             return;
         }
+        let start = self.metrics.metrics.now();
         let answers = advisor.advise(&self.requests);
+        self.metrics.record_batch(start, self.n_steps, &answers);
         self.requests.clear();
         self.n_steps = 0;
         for (reply, answer) in self.replies.drain(..).zip(answers) {

@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 
 use tandem_core::StepAdvice;
+use tandem_net::Metrics;
 use tokio::task::JoinHandle as Task;
 
 use super::*;
@@ -26,8 +27,9 @@ impl Fixture {
         let (gate, stop) = (GateControl::new(), CancellationToken::new());
         let ledger = Box::new(GatedLedger::new(gate.clone()));
         let advisor = Advisor::new(Box::new(FakePolicy), ledger).unwrap();
+        let metrics = TeacherMetrics::register(&Metrics::default());
         let (thread, handle) =
-            AdvisorThread::spawn(advisor, LONG, stop.clone(), Pacing::Concurrent).unwrap();
+            AdvisorThread::spawn(advisor, LONG, stop.clone(), Pacing::Concurrent, metrics).unwrap();
         let terms = AccountTerms { budget, strategy: "ea".parse().unwrap() };
         handle.run(move |advisor| advisor.open_account("run", terms)).await.unwrap();
         Self { thread, handle, gate, stop }
