@@ -32,6 +32,8 @@ pub(crate) enum BenchName {
     Teacher,
     /// A short training run with all its processes.
     EndToEnd,
+    /// A short training run with and without a recording of every episode.
+    Record,
     /// One learner with increasing numbers of workers, real and idle ones.
     Scale,
 }

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use foxglove::messages::{FrameTransforms, JointStates, Log, SceneUpdate, log::Level};
 use tandem_core::reward::distance;
 use tandem_core::scene::Scene;
-use tandem_core::{ArmAdvice, Contacts, TaskSpec};
+use tandem_core::{ArmAdvice, ArmIndex, Contacts, TaskSpec};
 
 use crate::error::Error;
 use crate::log_file::{Channel, LogFile, check_length, log_line, nanoseconds, timestamp};
@@ -42,6 +42,8 @@ pub struct TransitionRecord<'a> {
     pub contacts: Contacts,
     /// Advice of the teacher in arm order; empty if it was not asked.
     pub advice: &'a [ArmAdvice],
+    /// Units of the advice budget left when the teacher answered; `None` if it was not asked.
+    pub budget_left: Option<u64>,
 }
 
 /// Writes one episode to one MCAP file.
@@ -163,6 +165,7 @@ impl EpisodeRecorder {
 
     fn update_stats(&mut self, scene: Option<&Scene>, transition: &TransitionRecord<'_>) {
         self.stats.step = transition.step;
+        self.stats.acting = acting(&self.layout, transition.advised_arms);
         self.stats.episode_return += f64::from(transition.reward);
         self.set_distances(scene, transition.observation);
         self.stats.advised_steps += u32::from(transition.advised_arms != 0);
@@ -317,7 +320,14 @@ fn transition_message(task: &TaskSpec, step: &TransitionRecord<'_>) -> pb::Trans
         contacts: u32::from(step.contacts.bits()),
         advice: step.advice.iter().map(pb::ArmAdvice::from).collect(),
         achieved_goal: task.achieved_goal(step.observation).collect(),
+        budget_left: step.budget_left,
     }
+}
+
+/// Names who acts for each arm.
+fn acting(task: &TaskSpec, advised_arms: u8) -> Vec<String> {
+    let name = |arm: ArmIndex| if advised_arms >> arm.0 & 1 == 1 { "teacher" } else { "student" };
+    task.arms().map(|arm| name(arm).to_owned()).collect()
 }
 
 /// Returns the distance of each object from its goal, metres.

@@ -1,0 +1,93 @@
+//! What the recording of every episode costs a run.
+
+use std::path::Path;
+
+use rustix::process::{Resource, Timeval};
+use tandem_bench::Figure;
+
+use super::short_run;
+use crate::exit::Failed;
+
+/// Pairs of runs. Their order alternates, so a machine that slows down meanwhile favours neither.
+const N_PAIRS: usize = 3;
+/// Environment steps of a run.
+const ENV_STEPS: &str = "16000";
+
+/// The cost of one run.
+#[derive(Debug, Clone, Copy, Default)]
+struct RunCost {
+    wall_s: f64,
+    /// Processor time of all its processes, seconds.
+    processor_s: f64,
+    env_steps: f64,
+    n_logs: f64,
+    log_bytes: f64,
+}
+
+/// Measures short runs that record every episode, and runs that record none.
+pub(super) fn record() -> Result<Vec<Figure>, Failed> {
+    let (mut without, mut with) = (RunCost::default(), RunCost::default());
+    for pair in 0..N_PAIRS {
+        let mut order = [("none", &mut without), ("all", &mut with)];
+        if pair % 2 == 1 {
+            order.reverse();
+        }
+        for (name, total) in order {
+            total.add(run(name)?);
+        }
+    }
+    let steps_per_s = |cost: RunCost| cost.env_steps / cost.wall_s;
+    let steps_per_processor_s = |cost: RunCost| cost.env_steps / cost.processor_s;
+    let figure = |name: &str, value, unit| Figure::new(format!("record/{name}"), value, unit);
+    Ok(vec![
+        figure("none", steps_per_s(without), "env steps/s"),
+        figure("all", steps_per_s(with), "env steps/s"),
+        figure("ratio", steps_per_s(with) / steps_per_s(without), "all / none"),
+        figure(
+            "processor-ratio",
+            steps_per_processor_s(with) / steps_per_processor_s(without),
+            "env steps per processor second, all / none",
+        ),
+        figure("processor-ms", with.extra_ms_per_episode(without), "ms per recorded episode"),
+        figure("log-size", with.log_bytes / with.n_logs / 1e3, "kB per recorded episode"),
+    ])
+}
+
+impl RunCost {
+    fn add(&mut self, run: Self) {
+        self.wall_s += run.wall_s;
+        self.processor_s += run.processor_s;
+        self.env_steps += run.env_steps;
+        self.n_logs += run.n_logs;
+        self.log_bytes += run.log_bytes;
+    }
+
+    /// Returns the processor time that these runs took in addition to those `without` logs, per log.
+    fn extra_ms_per_episode(self, without: Self) -> f64 {
+        let scaled_s = without.processor_s * self.env_steps / without.env_steps;
+        1e3 * (self.processor_s - scaled_s) / self.n_logs
+    }
+}
+
+/// Measures one run with `--record recorded`.
+fn run(recorded: &str) -> Result<RunCost, Failed> {
+    let options = ["--max-env-steps", ENV_STEPS, "--record", recorded];
+    let before_s = processor_s_of_children();
+    let (summary, (n_logs, log_bytes)) =
+        short_run(&options, |directory| logs_in(&directory.join("mcap")))?;
+    let number = |key: &str| summary[key].as_f64().unwrap_or_default();
+    Ok(RunCost {
+        wall_s: number("wall_s"),
+        processor_s: processor_s_of_children() - before_s,
+        env_steps: number("env_steps"),
+        n_logs: n_logs as f64,
+        log_bytes: log_bytes as f64,
+    })
+}
+
+/// Returns the number and the size of the files in `directory`.
+fn logs_in(directory: &Path) -> (u64, u64) {
+    let sizes = std::fs::read_dir(directory).into_iter().flatten().flatten();
+    let sizes = sizes.filter_map(|entry| Some(entry.metadata().ok()?.len()));
+    sizes.fold((0, 0), |(n, bytes), n_bytes| (n + 1, bytes + n_bytes))
+}
