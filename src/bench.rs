@@ -16,7 +16,7 @@ mod scale;
 
 pub(crate) fn bench(args: &BenchArgs) -> Result<(), Failed> {
     let mut all = BenchName::value_variants().to_vec();
-    all.retain(|what| *what != BenchName::Scale);
+    all.retain(|what| !matches!(what, BenchName::Scale | BenchName::Record));
     let chosen = if args.what.is_empty() { &all } else { &args.what };
     let clock = clock::since_now();
     for what in chosen {

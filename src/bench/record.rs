@@ -2,16 +2,17 @@
 
 use std::path::Path;
 
-use rustix::process::{Resource, Timeval};
 use tandem_bench::Figure;
+use tandem_system::process::ended_children_s;
 
 use super::short_run;
 use crate::exit::Failed;
 
 /// Pairs of runs. Their order alternates, so a machine that slows down meanwhile favours neither.
 const N_PAIRS: usize = 3;
-/// Environment steps of a run.
-const ENV_STEPS: &str = "16000";
+/// Recipes, and the environment steps of a run of each. Recipe `paper` makes the fewest updates per step, so recording
+/// has its largest share of the run.
+const RECIPES: [(&str, &str); 2] = [("tandem", "6400"), ("paper", "32000")];
 
 /// The cost of one run.
 #[derive(Debug, Clone, Copy, Default)]
@@ -26,30 +27,36 @@ struct RunCost {
 
 /// Measures short runs that record every episode, and runs that record none.
 pub(super) fn record() -> Result<Vec<Figure>, Failed> {
+    let figures: Vec<_> =
+        RECIPES.iter().map(|recipe| figures_of(*recipe)).collect::<Result<_, _>>()?;
+    Ok(figures.concat())
+}
+
+fn figures_of((recipe, env_steps): (&str, &str)) -> Result<Vec<Figure>, Failed> {
     let (mut without, mut with) = (RunCost::default(), RunCost::default());
     for pair in 0..N_PAIRS {
         let mut order = [("none", &mut without), ("all", &mut with)];
         if pair % 2 == 1 {
             order.reverse();
         }
-        for (name, total) in order {
-            total.add(run(name)?);
+        for (recorded, total) in order {
+            let options = ["--recipe", recipe, "--max-env-steps", env_steps, "--record", recorded];
+            total.add(run(&options)?);
         }
     }
     let steps_per_s = |cost: RunCost| cost.env_steps / cost.wall_s;
     let steps_per_processor_s = |cost: RunCost| cost.env_steps / cost.processor_s;
-    let figure = |name: &str, value, unit| Figure::new(format!("record/{name}"), value, unit);
+    let processor_ratio = steps_per_processor_s(with) / steps_per_processor_s(without);
+    let kb_per_log = with.log_bytes / with.n_logs / 1e3;
+    let figure =
+        |name: &str, value, unit| Figure::new(format!("record/{recipe}/{name}"), value, unit);
     Ok(vec![
         figure("none", steps_per_s(without), "env steps/s"),
         figure("all", steps_per_s(with), "env steps/s"),
         figure("ratio", steps_per_s(with) / steps_per_s(without), "all / none"),
-        figure(
-            "processor-ratio",
-            steps_per_processor_s(with) / steps_per_processor_s(without),
-            "env steps per processor second, all / none",
-        ),
-        figure("processor-ms", with.extra_ms_per_episode(without), "ms per recorded episode"),
-        figure("log-size", with.log_bytes / with.n_logs / 1e3, "kB per recorded episode"),
+        figure("processor-ratio", processor_ratio, "env steps per processor second, all / none"),
+        figure("processor-time", with.extra_ms_per_episode(without), "ms per recorded episode"),
+        figure("log-size", kb_per_log, "kB per recorded episode"),
     ])
 }
 
@@ -69,16 +76,15 @@ impl RunCost {
     }
 }
 
-/// Measures one run with `--record recorded`.
-fn run(recorded: &str) -> Result<RunCost, Failed> {
-    let options = ["--max-env-steps", ENV_STEPS, "--record", recorded];
-    let before_s = processor_s_of_children();
+/// Measures one run with these options.
+fn run(options: &[&str]) -> Result<RunCost, Failed> {
+    let before_s = ended_children_s();
     let (summary, (n_logs, log_bytes)) =
-        short_run(&options, |directory| logs_in(&directory.join("mcap")))?;
+        short_run(options, |directory| logs_in(&directory.join("mcap")))?;
     let number = |key: &str| summary[key].as_f64().unwrap_or_default();
     Ok(RunCost {
         wall_s: number("wall_s"),
-        processor_s: processor_s_of_children() - before_s,
+        processor_s: ended_children_s() - before_s,
         env_steps: number("env_steps"),
         n_logs: n_logs as f64,
         log_bytes: log_bytes as f64,

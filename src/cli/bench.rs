@@ -7,12 +7,13 @@ use clap::{Args, ValueEnum};
 #[derive(Debug, Args)]
 #[command(after_help = "\
 Examples:
-  tandem bench                   all but scale, about two minutes
+  tandem bench                   all but record and scale, about two minutes
   tandem bench sim update --json
+  tandem bench record            cost of recording every episode, about five minutes
   tandem bench scale             number of workers that one learner serves, about two minutes
   tandem bench scale --workers 0 --idle 1000 --join-leave 100")]
 pub(crate) struct BenchArgs {
-    /// Benchmarks to run [default: all but scale].
+    /// Benchmarks to run [default: all but record and scale].
     #[arg(value_enum)]
     pub(crate) what: Vec<BenchName>,
     /// Prints one JSON object per line: name, value, unit.

@@ -22,9 +22,10 @@ pub(crate) struct RecordingArgs {
 impl RecordingArgs {
     /// Returns the arguments for a child process.
     pub(crate) fn arguments(self) -> [OsString; 4] {
-        let name = self.record.to_possible_value().map_or_else(String::new, |value| {
-            value.get_name().to_owned()
-        });
+        let name = self
+            .record
+            .to_possible_value()
+            .map_or_else(String::new, |value| value.get_name().to_owned());
         ["--record".into(), name.into(), "--log-budget".into(), self.log_budget.to_string().into()]
     }
 }

@@ -13,7 +13,10 @@ use tandem_proto::pb;
 use tandem_telemetry::read_episode;
 use tandem_worker::record::RecordError;
 use tandem_worker::replay::{replay_log, replay_log_on};
-use tandem_worker::{EnvironmentConfig, RecordedEpisodes, RecordingConfig, Error, WorkerConfig, describe_environments, run_with};
+use tandem_worker::{
+    EnvironmentConfig, Error, RecordedEpisodes, RecordingConfig, WorkerConfig,
+    describe_environments, run_with,
+};
 use tokio_util::sync::CancellationToken;
 use tonic::Status;
 
