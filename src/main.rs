@@ -20,6 +20,7 @@ mod exit;
 mod health;
 mod input;
 mod launch;
+mod live;
 mod logging;
 mod mcap;
 mod output;

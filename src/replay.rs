@@ -18,7 +18,7 @@ use crate::cli::ReplayArgs;
 use crate::environment_server::EnvironmentSource;
 use crate::exit::{Exit, Failed, OrExit as _};
 use crate::service::worker_failed;
-use crate::{access, output, runtime};
+use crate::{access, live, output, runtime};
 
 /// A log that was simulated again.
 struct Replayed {
@@ -38,6 +38,9 @@ struct Server {
 
 pub(crate) fn replay(args: &ReplayArgs) -> Result<(), Failed> {
     let files = find_logs(&args.files)?;
+    if let Some(address) = args.live.live {
+        return live::serve(address, &files);
+    }
     let is_printed = !args.verify && !args.json;
     let printed = if let ([file], true) = (files.as_slice(), is_printed) {
         print_steps(file)?;

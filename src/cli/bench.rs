@@ -9,7 +9,7 @@ use clap::{Args, ValueEnum};
 Examples:
   tandem bench                   all but record and scale, about two minutes
   tandem bench sim update --json
-  tandem bench record            cost of recording every episode, about five minutes
+  tandem bench record            cost of recording every episode, some minutes
   tandem bench scale             number of workers that one learner serves, about two minutes
   tandem bench scale --workers 0 --idle 1000 --join-leave 100")]
 pub(crate) struct BenchArgs {

@@ -2,6 +2,7 @@
 
 use std::ffi::OsString;
 use std::fmt;
+use std::net::SocketAddr;
 use std::str::FromStr;
 
 use clap::{Args, ValueEnum};
@@ -28,6 +29,15 @@ impl RecordingArgs {
             .map_or_else(String::new, |value| value.get_name().to_owned());
         ["--record".into(), name.into(), "--log-budget".into(), self.log_budget.to_string().into()]
     }
+}
+
+/// Live view in Foxglove.
+#[derive(Debug, Clone, Copy, Default, Args)]
+pub(crate) struct LiveArgs {
+    /// Shows the episodes in Foxglove, over a websocket at this address [with no address: 127.0.0.1:8765]. Anyone who
+    /// can reach the address can watch.
+    #[arg(long, value_name = "ADDR", num_args = 0..=1, default_missing_value = "127.0.0.1:8765")]
+    pub(crate) live: Option<SocketAddr>,
 }
 
 /// The episodes to record.

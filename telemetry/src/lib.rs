@@ -9,6 +9,7 @@
 pub mod episode_log;
 mod error;
 pub mod events;
+pub mod live;
 mod log_budget;
 mod log_file;
 pub mod logging;

@@ -62,6 +62,8 @@ pub struct EpisodeRecorder {
     goal: Vec<f32>,
     stats: pb::Stats,
     time_ns: u64,
+    /// Whether the log is flushed while it is written.
+    is_flushed: bool,
 }
 
 impl EpisodeRecorder {
@@ -84,7 +86,15 @@ impl EpisodeRecorder {
             goal: Vec::new(),
             stats: pb::Stats::default(),
             time_ns: 0,
+            is_flushed: true,
         })
+    }
+
+    /// Writes the steps in one piece at the end, which takes less time and space: for an episode that was played before
+    /// it is recorded.
+    #[must_use]
+    pub fn in_one_piece(self) -> Self {
+        Self { is_flushed: false, ..self }
     }
 
     /// Logs one control step and the scene before it, if there is one.
@@ -223,7 +233,7 @@ impl EpisodeRecorder {
         let message = transition_message(&self.layout, step);
         self.channels.transition.write(&mut self.file, self.time_ns, &message)?;
         self.channels.stats.write(&mut self.file, self.time_ns, &self.stats)?;
-        if (step.step + 1).is_multiple_of(FLUSH_EVERY_STEPS) {
+        if self.is_flushed && (step.step + 1).is_multiple_of(FLUSH_EVERY_STEPS) {
             self.file.flush()?;
         }
         Ok(())
@@ -232,7 +242,7 @@ impl EpisodeRecorder {
     fn write_outcome(&mut self, state: &State<'_>, outcome: &pb::Outcome) -> mcap::McapResult<()> {
         self.write_scene(state)?;
         self.channels.outcome.write(&mut self.file, self.time_ns, outcome)?;
-        self.file.flush()
+        if self.is_flushed { self.file.flush() } else { Ok(()) }
     }
 
     fn write_scene(&mut self, state: &State<'_>) -> mcap::McapResult<()> {

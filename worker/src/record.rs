@@ -166,7 +166,7 @@ pub fn record_episode(
         Some(layout) => Some(world_in(layout, metadata)?),
         None => None,
     };
-    let mut recorder = EpisodeRecorder::create(path, metadata)?;
+    let mut recorder = EpisodeRecorder::create(path, metadata)?.in_one_piece();
     for step_idx in 0..episode.n_steps() {
         let scene = world.as_ref().map(Env::scene);
         record_step(&mut recorder, scene.as_ref(), episode, step_idx, None)?;
@@ -196,7 +196,7 @@ pub fn record_traced(
     trace: &Trace,
     path: &Path,
 ) -> Result<PathBuf, RecordError> {
-    let mut recorder = EpisodeRecorder::create(path, metadata)?;
+    let mut recorder = EpisodeRecorder::create(path, metadata)?.in_one_piece();
     for step_idx in 0..episode.n_steps() {
         let (scene, advice) = (trace.scenes.get(step_idx), trace.advice.get(step_idx));
         record_step(&mut recorder, scene, episode, step_idx, advice)?;
