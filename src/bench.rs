@@ -1,5 +1,7 @@
 //! `tandem bench`: measures the performance of the parts on this machine, as rates and as ratios within one run.
 
+use std::path::Path;
+
 use clap::ValueEnum as _;
 use serde_json::{Value, json};
 use tandem_bench::{Clock, Figure, rates};
@@ -9,11 +11,12 @@ use crate::cli::{BenchArgs, BenchName};
 use crate::exit::{Exit, Failed, OrExit as _};
 use crate::{clock, output, policy_file};
 
+mod record;
 mod scale;
 
 pub(crate) fn bench(args: &BenchArgs) -> Result<(), Failed> {
     let mut all = BenchName::value_variants().to_vec();
-    all.retain(|what| *what != BenchName::Scale);
+    all.retain(|what| !matches!(what, BenchName::Scale | BenchName::Record));
     let chosen = if args.what.is_empty() { &all } else { &args.what };
     let clock = clock::since_now();
     for what in chosen {
@@ -24,6 +27,7 @@ pub(crate) fn bench(args: &BenchArgs) -> Result<(), Failed> {
             BenchName::Replay => rates::replay(&clock),
             BenchName::Teacher => teacher(&clock)?,
             BenchName::EndToEnd => end_to_end()?,
+            BenchName::Record => record::record()?,
             BenchName::Scale if args.json => scale::scale(&args.scale)?.figures(),
             BenchName::Scale => {
                 let table = scale::scale(&args.scale)?.to_string();
@@ -58,18 +62,11 @@ fn teacher(clock: &Clock) -> Result<Vec<Figure>, Failed> {
 
 /// Rates and memory of a training run of 30 rounds with evaluations.
 fn end_to_end() -> Result<Vec<Figure>, Failed> {
-    let directory = std::env::temp_dir().join(format!("tandem-bench-{}", std::process::id()));
-    let program = std::env::current_exe().or_exit(Exit::Bug, String::new)?;
-    let run = std::process::Command::new(program)
-        .args(["train", "--json", "--max-env-steps", "24000", "--max-minutes", "0"])
-        .args(["--set", "evaluation.every_env_steps=20000", "--out"])
-        .arg(&directory)
-        .stderr(std::process::Stdio::null())
-        .output();
-    drop(std::fs::remove_dir_all(&directory));
-    let output = run.or_exit(Exit::TryAgain, || "cannot start a run".to_owned())?;
-    let summary: Value = serde_json::from_slice(&output.stdout)
-        .or_exit(Exit::TryAgain, || "the short run failed; try `tandem train`".to_owned())?;
+    let summary = short_run(
+        &["--max-env-steps", "24000", "--set", "evaluation.every_env_steps=20000"],
+        |_directory| (),
+    )?
+    .0;
     let number = |key: &str| summary[key].as_f64().unwrap_or_default();
     let figure = |name: &str, value, unit| Figure::new(format!("end-to-end/{name}"), value, unit);
     Ok(vec![
@@ -79,4 +76,24 @@ fn end_to_end() -> Result<Vec<Figure>, Failed> {
         figure("teacher-memory", number("teacher_mib"), "MiB"),
         figure("worker-memory", number("worker_mib"), "MiB"),
     ])
+}
+
+/// Trains in a temporary directory with these options, and returns the summary and what `inspect` finds in the directory
+/// before it is removed.
+fn short_run<T>(options: &[&str], inspect: impl FnOnce(&Path) -> T) -> Result<(Value, T), Failed> {
+    let directory = std::env::temp_dir().join(format!("tandem-bench-{}", std::process::id()));
+    let program = std::env::current_exe().or_exit(Exit::Bug, String::new)?;
+    let run = std::process::Command::new(program)
+        .args(["train", "--json", "--max-minutes", "0"])
+        .args(options)
+        .arg("--out")
+        .arg(&directory)
+        .stderr(std::process::Stdio::null())
+        .output();
+    let inspected = inspect(&directory);
+    drop(std::fs::remove_dir_all(&directory));
+    let output = run.or_exit(Exit::TryAgain, || "cannot start a run".to_owned())?;
+    let summary = serde_json::from_slice(&output.stdout)
+        .or_exit(Exit::TryAgain, || "the short run failed; try `tandem train`".to_owned())?;
+    Ok((summary, inspected))
 }

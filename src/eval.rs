@@ -2,7 +2,7 @@
 
 mod baselines;
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use rayon::iter::{IntoParallelRefIterator as _, ParallelIterator as _};
 use tandem_core::text::counted;
@@ -16,7 +16,7 @@ use crate::environment_server::names_server;
 use crate::evaluation::{EvaluatedPolicy, EvaluationResult, Part, measure, measure_served};
 use crate::exit::{Exit, Failed, OrExit as _};
 use crate::film::PlannedFilm;
-use crate::{film, output, policy_file};
+use crate::{film, live, output, policy_file};
 use baselines::Baselines;
 
 pub(crate) fn eval(args: &EvalArgs) -> Result<(), Failed> {
@@ -24,6 +24,7 @@ pub(crate) fn eval(args: &EvalArgs) -> Result<(), Failed> {
         return eval_served(args);
     }
     let film = PlannedFilm::of(&args.film)?;
+    args.live.live.map_or(Ok(()), live::check_address)?;
     let subject = subject(args)?;
     subject.warn_if_trained_on(args.seed);
     let result = measure(&subject, args.episodes, args.seed)?;
@@ -33,17 +34,40 @@ pub(crate) fn eval(args: &EvalArgs) -> Result<(), Failed> {
         record(&subject, &terms, args.seed, first, path)?;
     }
     if let Some(directory) = &args.record_dir {
-        std::fs::create_dir_all(directory)
-            .or_cannot_write(|| format!("cannot create {}", directory.display()))?;
-        result.episodes.par_iter().try_for_each(|episode| {
-            let path = directory.join(log_name(episode));
-            record(&subject, &terms, args.seed, episode, &path)
-        })?;
+        record_all(&subject, &terms, args.seed, &result.episodes, directory)?;
     }
     if let Some(film) = film {
         film.write(&filmed(args, subject.layout(), &result.episodes)?)?;
     }
-    print(args, &result, &baselines)
+    print(args, &result, &baselines)?;
+    let Some(address) = args.live.live else { return Ok(()) };
+    // Viewers see logs: without a directory for them, they are temporary.
+    let temporary = std::env::temp_dir().join(format!("tandem-live-{}", std::process::id()));
+    let directory = args.record_dir.as_ref().unwrap_or(&temporary);
+    let recorded = match args.record_dir {
+        Some(_) => Ok(()),
+        None => record_all(&subject, &terms, args.seed, &result.episodes, directory),
+    };
+    let logs: Vec<PathBuf> =
+        result.episodes.iter().map(|episode| directory.join(log_name(episode))).collect();
+    let served = recorded.and_then(|()| live::serve(address, &logs));
+    drop(std::fs::remove_dir_all(temporary));
+    served
+}
+
+/// Writes the logs of all episodes of an evaluation with `seed` to `directory`.
+fn record_all(
+    subject: &EvaluatedPolicy,
+    terms: &RunTerms,
+    seed: u64,
+    episodes: &[Episode],
+    directory: &Path,
+) -> Result<(), Failed> {
+    std::fs::create_dir_all(directory)
+        .or_cannot_write(|| format!("cannot create {}", directory.display()))?;
+    episodes.par_iter().try_for_each(|episode| {
+        record(subject, terms, seed, episode, &directory.join(log_name(episode)))
+    })
 }
 
 /// Returns the episodes that the film shows.
@@ -75,9 +99,13 @@ fn eval_served(args: &EvalArgs) -> Result<(), Failed> {
             "--baselines needs the simulator of this program: leave out --env and --env-command",
         ));
     }
-    if args.record.is_some() || args.record_dir.is_some() || args.film.film.is_some() {
+    if args.record.is_some()
+        || args.record_dir.is_some()
+        || args.film.film.is_some()
+        || args.live.live.is_some()
+    {
         return Err(Failed::usage(
-            "--record, --record-dir and --film need the simulator of this program: leave out --env and --env-command",
+            "--record, --record-dir, --film and --live need the simulator of this program: leave out --env and --env-command",
         ));
     }
     let (part, path) = match (&args.policy, &args.composed_teachers) {

@@ -23,6 +23,7 @@ mod film;
 mod health;
 mod input;
 mod launch;
+mod live;
 mod logging;
 mod mcap;
 mod metrics;

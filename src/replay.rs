@@ -20,7 +20,7 @@ use crate::environment_server::EnvironmentSource;
 use crate::exit::{Exit, Failed, OrExit as _};
 use crate::film::PlannedFilm;
 use crate::service::worker_failed;
-use crate::{access, film, output, runtime};
+use crate::{access, film, live, output, runtime};
 
 /// Maximum number of logs in a film.
 const MAX_FILMED: usize = 100;
@@ -46,6 +46,9 @@ struct Server {
 pub(crate) fn replay(args: &ReplayArgs) -> Result<(), Failed> {
     let planned = PlannedFilm::of(&args.film)?;
     let files = find_logs(&args.files)?;
+    if let Some(address) = args.live.live {
+        return live::serve(address, &files);
+    }
     if let Some(film) = planned {
         film.write(&filmed(&files)?)?;
         if !args.json {

@@ -22,6 +22,7 @@ use tokio_util::sync::CancellationToken;
 
 use crate::cli::TrainArgs;
 use crate::exit::{Exit, Failed, OrExit as _};
+use crate::live::LiveRun;
 use crate::{clock, runtime, served_task, settings_page, signals};
 use display::Display;
 use inputs::RunInputs;
@@ -53,12 +54,13 @@ pub(crate) fn train(args: &TrainArgs) -> Result<(), Failed> {
     plan.prepare()?;
     let inputs = RunInputs::write(&plan)?;
     drop(service_locks);
+    let live = args.live.live.map(|address| LiveRun::start(address, plan.logs())).transpose()?;
     let runtime = runtime::new().or_exit(Exit::TryAgain, String::new)?;
     let (last, memory) = runtime.block_on(async {
         let interrupted = signals::shutdown_token(args.exit_with_stdin)?;
         run((&plan, &lock), &interrupted, args.quiet).await
     })?;
-    drop(inputs);
+    drop((inputs, live));
     if last.end_reason == INTERRUPTED {
         summary::print_interrupted(&plan);
         return Err(Failed::new(Exit::Interrupted, anyhow!(INTERRUPTED)));

@@ -226,6 +226,7 @@ fn rewrite(log: &EpisodeLog, metadata: &EpisodeMetadata, path: &Path) {
             advised_arms: transition.advised_arms,
             contacts: transition.contacts,
             advice: &transition.advice,
+            budget_left: transition.budget_left,
         };
         let scene = has_scenes.then(|| world.scene());
         recorder.record_step(scene.as_ref(), &record).expect("recorded");

@@ -83,6 +83,7 @@ pub fn record_episode(path: &Path) -> Result<PathBuf, Error> {
             advised_arms: 1,
             contacts: Contacts::ARM_TABLE,
             advice: &[advice],
+            budget_left: Some(7),
         };
         recorder.record_step(&scene, &step)?;
         scene.time_s += 0.04;

@@ -7,13 +7,15 @@ use clap::{Args, ValueEnum};
 #[derive(Debug, Args)]
 #[command(after_help = "\
 Examples:
-  tandem bench  # all but scale, about two minutes
+  tandem bench  # all but record and scale, about two minutes
   tandem bench sim update --json
+  tandem bench record
+      # cost of recording every episode, some minutes
   tandem bench scale
       # number of workers that one learner serves, about two minutes
   tandem bench scale --workers 0 --idle 1000 --join-leave 100")]
 pub(crate) struct BenchArgs {
-    /// Benchmarks to run [default: all but scale].
+    /// Benchmarks to run [default: all but record and scale].
     #[arg(value_enum)]
     pub(crate) what: Vec<BenchName>,
     /// Prints one JSON object per line: name, value, unit.
@@ -33,6 +35,8 @@ pub(crate) enum BenchName {
     Teacher,
     /// A short training run with all its processes.
     EndToEnd,
+    /// A short training run with and without a recording of every episode.
+    Record,
     /// One learner with increasing numbers of workers, real and idle ones.
     Scale,
 }

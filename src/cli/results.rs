@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use clap::{Args, Subcommand};
 use tandem_core::evaluation::TEST_SEED;
 
-use super::{ClientArgs, EnvironmentArgs, SecretArgs, TaskName, WorldName};
+use super::{ClientArgs, EnvironmentArgs, LiveArgs, SecretArgs, TaskName, WorldName};
 
 #[derive(Debug, Args)]
 #[command(group = clap::ArgGroup::new("who").required(true), after_help = "\
@@ -17,6 +17,8 @@ Examples:
   tandem eval --policy FILE --episodes 1 --record episode.mcap
   tandem eval --policy FILE --film arms.gif             # the first episode
   tandem eval --policy FILE --film strip.png --film-outcome failure
+  tandem eval --policy FILE --episodes 20 --live
+      # then shows the episodes in Foxglove
   tandem eval --policy FILE --env 127.0.0.1:7005
       # in the environments of a server
   tandem eval --policy FILE --env-command 'tandem env'  # starts the server")]
@@ -66,6 +68,8 @@ pub(crate) struct EvalArgs {
     /// Shows only episodes with this outcome.
     #[arg(long, value_enum, requires = "film")]
     pub(crate) film_outcome: Option<OutcomeName>,
+    #[command(flatten)]
+    pub(crate) live: LiveArgs,
     /// Prints one JSON object on the last line of standard output.
     #[arg(long)]
     pub(crate) json: bool,
@@ -152,6 +156,7 @@ Examples:
   tandem replay FILE.mcap --verify --json
   tandem replay FILE.mcap --film episode.gif
   tandem replay runs/NAME/mcap --verify --env-command 'python3 server.py'
+  tandem replay runs/NAME/mcap --live  # in Foxglove: play, pause, seek
 
 All numbers from the simulator are compared bit for bit with the log. An episode of a task that is \
 not built-in is simulated again in the environments of --env or --env-command. Logs of trials are \
@@ -162,8 +167,10 @@ pub(crate) struct ReplayArgs {
     #[arg(required = true, value_name = "FILE|DIR")]
     pub(crate) files: Vec<PathBuf>,
     /// Compares only. By default a single log is also printed step by step.
-    #[arg(long)]
+    #[arg(long, conflicts_with = "live")]
     pub(crate) verify: bool,
+    #[command(flatten)]
+    pub(crate) live: LiveArgs,
     /// Prints one JSON object on the last line of standard output.
     #[arg(long)]
     pub(crate) json: bool,

@@ -8,7 +8,7 @@ use std::time::Duration;
 use clap::Args;
 
 use super::monitor::seconds;
-use super::{TaskName, WorldName};
+use super::{RecordingArgs, TaskName, WorldName};
 
 /// Access token.
 #[derive(Debug, Args)]
@@ -195,6 +195,8 @@ pub(crate) struct WorkerArgs {
     /// Directory for recorded episodes.
     #[arg(long, value_name = "DIR")]
     pub(crate) log_dir: Option<PathBuf>,
+    #[command(flatten)]
+    pub(crate) recording: RecordingArgs,
     #[command(flatten)]
     pub(crate) environment: EnvironmentArgs,
     #[command(flatten)]

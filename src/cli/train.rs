@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use clap::{Args, ValueEnum};
 
-use super::{EnvironmentArgs, TaskName, WorldName};
+use super::{EnvironmentArgs, LiveArgs, RecordingArgs, TaskName, WorldName};
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub(crate) enum RecipeName {
@@ -32,6 +32,9 @@ Examples:
   tandem train --env 127.0.0.1:7005  # plays in the environments of a server
   tandem train --env-command 'tandem env'
       # each worker starts a server of its own
+  tandem train --record all --log-budget 10GiB
+      # records training episodes too
+  tandem train --live  # shows recorded episodes in Foxglove
   tandem train --resume --out runs/mine  # resumes the run
   tandem train --resume --out runs/mine --max-env-steps 600000
       # resumes it for longer")]
@@ -94,6 +97,10 @@ pub(crate) struct TrainArgs {
     /// Run directory [default: runs/TASK-ARMS-STRATEGY-seedN].
     #[arg(long, value_name = "DIR")]
     pub(crate) out: Option<PathBuf>,
+    #[command(flatten)]
+    pub(crate) recording: RecordingArgs,
+    #[command(flatten)]
+    pub(crate) live: LiveArgs,
     /// Resumes the run in --out from its newest checkpoint. Settings and teacher remain those of the run, and so does the
     /// server of its environments unless --env or --env-command names another one. Only
     /// its end (--max-env-steps, --max-minutes, --until-success), checkpoint.*, evaluation.early_points,

@@ -8,7 +8,7 @@ use tandem_net::Pacing;
 
 use super::{listen, run};
 use crate::cli::LearnerArgs;
-use crate::exit::{Exit, Failed, OrExit as _};
+use crate::exit::{Exit, Failed};
 use crate::run_pages::RunPages;
 use crate::version::VERSION;
 use crate::{access, clock, metrics, policy_file, run_directory, run_file, signals};

@@ -1,11 +1,13 @@
 //! `tandem worker`.
 
+use std::path::PathBuf;
+
 use tandem_net::Pacing;
-use tandem_worker::{Error, WorkerConfig};
+use tandem_worker::{Error, RecordedEpisodes, RecordingConfig, WorkerConfig};
 use tonic::{Code, Status};
 
 use super::run;
-use crate::cli::WorkerArgs;
+use crate::cli::{RecordedName, RecordingArgs, WorkerArgs};
 use crate::environment_server::EnvironmentSource;
 use crate::exit::{Exit, Failed};
 use crate::{access, metrics, signals};
@@ -24,13 +26,24 @@ pub(crate) fn worker(args: WorkerArgs) -> Result<(), Failed> {
             learner: args.connect,
             teacher: args.teacher,
             name: args.name,
-            log_dir: args.log_dir,
+            recording: recording(&args.recording, args.log_dir),
             pacing: Pacing::Concurrent,
         };
         let ended = tandem_worker::run(config, shutdown).await;
         server.end().await;
         ended.map_err(worker_failed)
     })
+}
+
+/// Returns the recording of episodes in `directory`.
+fn recording(args: &RecordingArgs, directory: Option<PathBuf>) -> Option<RecordingConfig> {
+    let episodes = match args.record {
+        RecordedName::None => return None,
+        RecordedName::Evaluation => RecordedEpisodes::Evaluation,
+        RecordedName::All => RecordedEpisodes::All,
+    };
+    let budget_bytes = args.log_budget.0;
+    Some(RecordingConfig { directory: directory?, episodes, budget_bytes })
 }
 
 pub(crate) fn worker_failed(error: Error) -> Failed {

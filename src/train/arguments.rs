@@ -53,7 +53,8 @@ pub(super) fn worker(
     let mut args = command("worker");
     args.extend(["--name".into(), name.into()]);
     push_address(&mut args, "--connect", Some(learner_address));
-    push_path(&mut args, "--log-dir", &plan.out.join("mcap"));
+    push_path(&mut args, "--log-dir", &plan.logs());
+    args.extend(plan.recording.arguments());
     push_address(&mut args, "--teacher", teacher_address);
     args.extend(environment_server::arguments(&plan.environment));
     args

@@ -9,7 +9,7 @@ use toml::Value;
 
 use super::environment_file;
 use super::teacher_file::TeacherFile;
-use crate::cli::{EnvironmentArgs, RecipeName, TrainArgs, chosen_task};
+use crate::cli::{EnvironmentArgs, RecipeName, RecordingArgs, TrainArgs, chosen_task};
 use crate::columns::wrapped;
 use crate::exit::{Exit, Failed, OrExit as _};
 use crate::run_directory::RUNS;
@@ -25,6 +25,8 @@ pub(crate) struct Plan {
     pub(crate) resume: bool,
     /// The server of the environments, if workers do not simulate them.
     pub(crate) environment: EnvironmentArgs,
+    /// The episodes that workers record.
+    pub(crate) recording: RecordingArgs,
 }
 
 impl Plan {
@@ -59,7 +61,8 @@ impl Plan {
         if !(1..=1024).contains(&n_workers) {
             return Err(Failed::usage(format!("--workers {n_workers}: expected 1 to 1024")));
         }
-        let plan = Self { config, out, teacher, n_workers, resume: args.resume, environment };
+        let (resume, recording) = (args.resume, args.recording);
+        let plan = Self { config, out, teacher, n_workers, resume, environment, recording };
         plan.check_directory()?;
         Ok(plan)
     }
@@ -167,6 +170,11 @@ impl Plan {
     /// Returns the directory of the checkpoints.
     pub(crate) fn checkpoints(&self) -> PathBuf {
         self.out.join("checkpoint")
+    }
+
+    /// Returns the directory of the logs of episodes.
+    pub(crate) fn logs(&self) -> PathBuf {
+        self.out.join("mcap")
     }
 
     /// Returns the path of the teacher's ledger.

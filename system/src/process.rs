@@ -83,10 +83,24 @@ pub fn machine_busy_s() -> f64 {
     ticks.iter().enumerate().map(busy).sum::<f64>() / ticks_per_s()
 }
 
-/// Sums fields 14 and 15 (`utime`, `stime`). They are counted from the end of the name, which may contain anything.
+/// Returns the processor time of all children of this process that have ended and were waited for, and of theirs,
+/// seconds.
+#[must_use]
+pub fn ended_children_s() -> f64 {
+    let stat = fs::read_to_string("/proc/self/stat").unwrap_or_default();
+    // Fields 16 and 17, `cutime` and `cstime`.
+    seconds(&stat, 13)
+}
+
+/// Sums fields 14 and 15 (`utime`, `stime`).
 fn cpu_s(stat: &str) -> f64 {
+    seconds(stat, 11)
+}
+
+/// Sums two fields, after so many others behind the name. The name may contain anything.
+fn seconds(stat: &str, n_before: usize) -> f64 {
     let behind_name = stat.rsplit(')').next().unwrap_or_default();
-    let ticks = behind_name.split_whitespace().skip(11).take(2);
+    let ticks = behind_name.split_whitespace().skip(n_before).take(2);
     ticks.filter_map(|ticks| ticks.parse::<f64>().ok()).sum::<f64>() / ticks_per_s()
 }
 

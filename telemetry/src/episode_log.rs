@@ -45,6 +45,9 @@ pub struct LoggedTransition {
     pub contacts: Contacts,
     /// Advice of the teacher in arm order; empty if it was not asked.
     pub advice: Vec<ArmAdvice>,
+    /// Units of the advice budget left when the teacher answered; `None` if it was not asked or the log is of an earlier
+    /// version.
+    pub budget_left: Option<u64>,
 }
 
 /// Reads the episode in the MCAP log `path`.
@@ -143,6 +146,7 @@ fn decode_transition(
         advised_arms,
         contacts: contacts.ok_or_else(|| format!("unknown contacts {:#b}", message.contacts))?,
         advice: message.advice.into_iter().map(ArmAdvice::from).collect(),
+        budget_left: message.budget_left,
     })
 }
 

@@ -1,5 +1,6 @@
 //! Errors of logs and metrics.
 
+use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 
 /// An error while writing or reading logs and metrics, or while setting up logging.
@@ -74,6 +75,22 @@ pub enum Error {
         line: usize,
         /// The cause.
         source: serde_json::Error,
+    },
+    /// Viewers cannot be served at an address.
+    #[error("cannot listen on {address} for viewers: choose another address for --live")]
+    Listen {
+        /// The address.
+        address: SocketAddr,
+        /// The cause.
+        source: std::io::Error,
+    },
+    /// A channel of a log cannot be offered to viewers.
+    #[error("cannot offer the channel {topic:?} to viewers: {problem}")]
+    Channel {
+        /// Topic of the channel.
+        topic: String,
+        /// The cause.
+        problem: String,
     },
     /// The log filter is malformed.
     #[error(

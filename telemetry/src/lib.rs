@@ -9,6 +9,8 @@
 pub mod episode_log;
 mod error;
 pub mod events;
+pub mod live;
+mod log_budget;
 mod log_file;
 pub mod logging;
 mod messages;
@@ -24,6 +26,7 @@ pub mod trials;
 
 pub use episode_log::{EpisodeLog, LoggedTransition, read_episode};
 pub use error::Error;
+pub use log_budget::LogBudget;
 pub use messages::EpisodeMetadata;
 pub use metrics::{ContactMetrics, MetricsLog, MetricsRow};
 pub use recorder::{EpisodeRecorder, TransitionRecord};

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use foxglove::messages::{FrameTransforms, JointStates, Log, SceneUpdate, log::Level};
 use tandem_core::reward::distance;
 use tandem_core::scene::Scene;
-use tandem_core::{ArmAdvice, Contacts, TaskSpec};
+use tandem_core::{ArmAdvice, ArmIndex, Contacts, TaskSpec};
 
 use crate::error::Error;
 use crate::log_file::{Channel, LogFile, check_length, log_line, nanoseconds, timestamp};
@@ -42,6 +42,8 @@ pub struct TransitionRecord<'a> {
     pub contacts: Contacts,
     /// Advice of the teacher in arm order; empty if it was not asked.
     pub advice: &'a [ArmAdvice],
+    /// Units of the advice budget left when the teacher answered; `None` if it was not asked.
+    pub budget_left: Option<u64>,
 }
 
 /// Writes one episode to one MCAP file.
@@ -60,6 +62,8 @@ pub struct EpisodeRecorder {
     goal: Vec<f32>,
     stats: pb::Stats,
     time_ns: u64,
+    /// Whether the log is flushed while it is written.
+    is_flushed: bool,
 }
 
 impl EpisodeRecorder {
@@ -82,7 +86,15 @@ impl EpisodeRecorder {
             goal: Vec::new(),
             stats: pb::Stats::default(),
             time_ns: 0,
+            is_flushed: true,
         })
+    }
+
+    /// Writes the steps in one piece at the end, which takes less time and space: for an episode that was played before
+    /// it is recorded.
+    #[must_use]
+    pub fn in_one_piece(self) -> Self {
+        Self { is_flushed: false, ..self }
     }
 
     /// Logs one control step and the scene before it, if there is one.
@@ -163,6 +175,7 @@ impl EpisodeRecorder {
 
     fn update_stats(&mut self, scene: Option<&Scene>, transition: &TransitionRecord<'_>) {
         self.stats.step = transition.step;
+        self.stats.acting = acting(&self.layout, transition.advised_arms);
         self.stats.episode_return += f64::from(transition.reward);
         self.set_distances(scene, transition.observation);
         self.stats.advised_steps += u32::from(transition.advised_arms != 0);
@@ -220,7 +233,7 @@ impl EpisodeRecorder {
         let message = transition_message(&self.layout, step);
         self.channels.transition.write(&mut self.file, self.time_ns, &message)?;
         self.channels.stats.write(&mut self.file, self.time_ns, &self.stats)?;
-        if (step.step + 1).is_multiple_of(FLUSH_EVERY_STEPS) {
+        if self.is_flushed && (step.step + 1).is_multiple_of(FLUSH_EVERY_STEPS) {
             self.file.flush()?;
         }
         Ok(())
@@ -229,7 +242,7 @@ impl EpisodeRecorder {
     fn write_outcome(&mut self, state: &State<'_>, outcome: &pb::Outcome) -> mcap::McapResult<()> {
         self.write_scene(state)?;
         self.channels.outcome.write(&mut self.file, self.time_ns, outcome)?;
-        self.file.flush()
+        if self.is_flushed { self.file.flush() } else { Ok(()) }
     }
 
     fn write_scene(&mut self, state: &State<'_>) -> mcap::McapResult<()> {
@@ -317,7 +330,14 @@ fn transition_message(task: &TaskSpec, step: &TransitionRecord<'_>) -> pb::Trans
         contacts: u32::from(step.contacts.bits()),
         advice: step.advice.iter().map(pb::ArmAdvice::from).collect(),
         achieved_goal: task.achieved_goal(step.observation).collect(),
+        budget_left: step.budget_left,
     }
+}
+
+/// Names who acts for each arm.
+fn acting(task: &TaskSpec, advised_arms: u8) -> Vec<String> {
+    let name = |arm: ArmIndex| if advised_arms >> arm.0 & 1 == 1 { "teacher" } else { "student" };
+    task.arms().map(|arm| name(arm).to_owned()).collect()
 }
 
 /// Returns the distance of each object from its goal, metres.

@@ -8,6 +8,10 @@ use tandem_telemetry::{
     EpisodeLog, EpisodeMetadata, EpisodeRecorder, Error, LoggedTransition, read_episode, recover,
 };
 
+#[path = "support/layout.rs"]
+mod layout;
+#[path = "support/live.rs"]
+mod live;
 #[path = "support/synthetic.rs"]
 mod synthetic;
 

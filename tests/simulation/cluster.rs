@@ -245,7 +245,7 @@ impl PersistentState {
             learner: address(LEARNER),
             teacher: Some(address(TEACHER)),
             name: host.to_owned(),
-            log_dir: None,
+            recording: None,
             pacing: Pacing::Lockstep,
         };
         if let Err(error) = run(config, self.tracker.shutdown_token(host)).await {

@@ -21,10 +21,30 @@ pub struct WorkerConfig {
     pub environment: Option<EnvironmentConfig>,
     /// The worker's name in progress reports. Several workers may have the same name.
     pub name: String,
-    /// The directory for logs of recorded episodes, created if it does not exist; without it no logs are written.
-    pub log_dir: Option<PathBuf>,
+    /// The recording of episodes; `None` writes no logs.
+    pub recording: Option<RecordingConfig>,
     /// The scheduling of sockets and rollouts.
     pub pacing: Pacing,
+}
+
+/// The recording of episodes in a directory.
+#[derive(Debug, Clone)]
+pub struct RecordingConfig {
+    /// The directory for logs, created if it does not exist.
+    pub directory: PathBuf,
+    /// The episodes to record.
+    pub episodes: RecordedEpisodes,
+    /// The size that the logs in the directory may reach, bytes. Beyond it, the oldest ones are deleted.
+    pub budget_bytes: u64,
+}
+
+/// The episodes that a worker records.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum RecordedEpisodes {
+    /// The evaluation episodes whose order asks for it.
+    Evaluation,
+    /// These, and every training episode.
+    All,
 }
 
 /// The server of a worker's environments, and how it is called.

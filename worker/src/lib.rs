@@ -20,13 +20,16 @@ mod metrics;
 mod player;
 pub mod ports;
 pub mod record;
+mod recorder;
 pub mod replay;
 pub mod rollout;
 mod run;
 mod teacher;
+pub mod trace;
 
 pub use config::{
-    EnvironmentConfig, EnvironmentServer, ServerAddress, ServerNotStarted, Timeouts, WorkerConfig,
+    EnvironmentConfig, EnvironmentServer, RecordedEpisodes, RecordingConfig, ServerAddress,
+    ServerNotStarted, Timeouts, WorkerConfig,
 };
 pub use environment::{ServedTask, describe_environments};
 pub use error::Error;

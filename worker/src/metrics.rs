@@ -105,4 +105,8 @@ impl<A: Advisor> Advisor for Measured<'_, &mut A> {
         self.metrics.metrics.observe_since(&self.metrics.advice_seconds, start);
         advice
     }
+
+    fn budget_left(&self) -> Option<u64> {
+        self.port.budget_left()
+    }
 }

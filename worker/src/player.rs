@@ -1,21 +1,21 @@
 //! The state that a worker keeps between slots: a world, the latest actor and the directory for logs.
 
-use std::path::{Path, PathBuf};
-
 use tandem_core::work::{EpisodeOrder, EpisodeStart, PublishedActor, RunTerms, SlotOrder};
-use tandem_core::{Contacts, Episode, StepAdvice, StepQuery};
+use tandem_core::{Contacts, Episode, EpisodeKind, StepAdvice, StepQuery};
 use tandem_policy::{Actor, actor_digest};
 use tandem_proto::environment::{ResetReply, StepReply};
 use tandem_sim::{Env, WorldConfig};
-use tandem_telemetry::events::{EpisodeFinished, EpisodeRecorded};
+use tandem_telemetry::events::EpisodeFinished;
 use tokio::sync::{mpsc, oneshot};
 
 use crate::determinism::{self, DeterminismCheck};
 use crate::error::Error;
 use crate::metrics::{Measured, WorkerMetrics};
 use crate::ports::{Advisor, AdvisorGone, Environment, EnvironmentError, Simulator};
-use crate::record::{log_name, metadata_of, record_episode};
-use crate::rollout::{RolloutError, play_slot};
+use crate::record::metadata_of;
+use crate::recorder::{Recorder, Recording};
+use crate::rollout::{RolloutError, play_slot, play_traced_slot};
+use crate::trace::Trace;
 
 /// Plays slots, on a thread of its own.
 pub(crate) struct Player {
@@ -23,9 +23,9 @@ pub(crate) struct Player {
     /// The environments in this process; `None` if a server has them.
     simulator: Option<Simulator>,
     actor: Option<Actor>,
-    /// The digest of the actor's parameters; empty without a directory for logs.
+    /// The digest of the actor's parameters; empty without a recorder.
     actor_digest: String,
-    log_dir: Option<PathBuf>,
+    recorder: Option<Recorder>,
     metrics: WorkerMetrics,
 }
 
@@ -41,7 +41,7 @@ impl Player {
     /// Creates a player that simulates its environments.
     pub(crate) fn simulating(
         terms: RunTerms,
-        log_dir: Option<PathBuf>,
+        recorder: Option<Recorder>,
         metrics: WorkerMetrics,
     ) -> Result<Self, Error> {
         let Some(layout) = terms.layout.as_built_in() else {
@@ -49,16 +49,16 @@ impl Player {
         };
         let world = Env::new(layout, &WorldConfig::from(terms.world))?;
         let simulator = Some(Simulator::new(world));
-        Ok(Self { simulator, ..Self::remote(terms, log_dir, metrics) })
+        Ok(Self { simulator, ..Self::remote(terms, recorder, metrics) })
     }
 
     /// Creates a player whose environments are on a server.
     pub(crate) const fn remote(
         terms: RunTerms,
-        log_dir: Option<PathBuf>,
+        recorder: Option<Recorder>,
         metrics: WorkerMetrics,
     ) -> Self {
-        Self { terms, simulator: None, actor: None, actor_digest: String::new(), log_dir, metrics }
+        Self { terms, simulator: None, actor: None, actor_digest: String::new(), recorder, metrics }
     }
 
     pub(crate) const fn terms(&self) -> &RunTerms {
@@ -73,14 +73,14 @@ impl Player {
     /// Loads the actor for the following slots.
     pub(crate) fn load(&mut self, published: PublishedActor) -> Result<(), tandem_policy::Error> {
         let layout = &self.terms.layout;
-        let for_digest = self.log_dir.is_some().then(|| published.clone());
+        let for_digest = self.recorder.is_some().then(|| published.clone());
         self.actor = Some(Actor::new(layout, published)?);
         self.actor_digest =
             for_digest.map_or_else(String::new, |published| actor_digest(layout, &published));
         Ok(())
     }
 
-    /// Plays `order` with the loaded actor and writes the logs that it asks for.
+    /// Plays `order` with the loaded actor and has the logs written that it asks for.
     ///
     /// # Panics
     /// When no actor is loaded.
@@ -90,45 +90,59 @@ impl Player {
         mut peers: PeerChannel,
     ) -> Result<PlayedSlot, RolloutError> {
         let actor = self.actor.as_mut().expect("parameters are loaded before a slot is played");
+        let is_traced = order.kind == EpisodeKind::Training
+            && self.recorder.as_ref().is_some_and(Recorder::records_training);
         let (terms, metrics, start) = (&self.terms, &self.metrics, self.metrics.now());
         let advisor = &mut Measured { port: &mut peers.clone(), metrics };
-        let (episodes, check) = match &mut self.simulator {
+        let (played, check) = match &mut self.simulator {
             Some(port) => {
                 let simulator = &mut Measured { port, metrics };
-                (play_slot(simulator, order, terms, actor, advisor)?, None)
+                (play(simulator, order, terms, (actor, advisor), is_traced)?, None)
             }
             None => {
                 let served = &mut Measured { port: &mut peers, metrics };
-                let episodes = play_slot(served, order, terms, actor, advisor)?;
-                let is_checked = determinism::is_checked(order);
-                let check =
-                    is_checked.then(|| determinism::check(&mut peers, order, terms, &episodes));
-                (episodes, check.transpose()?)
+                let played = play(served, order, terms, (actor, advisor), is_traced)?;
+                let check = determinism::is_checked(order)
+                    .then(|| determinism::check(&mut peers, order, terms, &played.0));
+                (played, check.transpose()?)
             }
         };
+        let (episodes, traces) = played;
         metrics.record_slot(start, &episodes);
+        let mut traces = traces.into_iter();
         for (ordered, episode) in order.episodes.iter().zip(&episodes) {
             finished_event(episode).emit();
-            if let Some(log_dir) = self.log_dir.as_deref().filter(|_| ordered.record) {
-                self.record(*ordered, episode, log_dir);
-            }
+            self.record(*ordered, episode, traces.next());
         }
         Ok(PlayedSlot { episodes, check })
     }
 
-    /// Writes an episode's log. Failures are only logged: the episode itself is delivered.
-    fn record(&self, order: EpisodeOrder, episode: &Episode, log_dir: &Path) {
-        let path = log_dir.join(log_name(episode));
-        let digest = self.actor_digest.clone();
-        let metadata = metadata_of(order, episode, &self.terms, digest);
-        match record_episode(&metadata, episode, &path) {
-            Ok(path) => EpisodeRecorded { episode: episode.number, path: &path }.emit(),
-            Err(error) => {
-                let error: &dyn std::error::Error = &error;
-                tracing::warn!(episode = episode.number, ?path, error, "episode not recorded");
-            }
+    /// Passes an episode to the recorder, if its order asks for a log or it has a trace.
+    fn record(&self, order: EpisodeOrder, episode: &Episode, trace: Option<Trace>) {
+        let Some(recorder) = &self.recorder else { return };
+        if !order.record && trace.is_none() {
+            return;
         }
+        let metadata = metadata_of(order, episode, &self.terms, self.actor_digest.clone());
+        let is_training = trace.is_some();
+        let recording = Recording { metadata, episode: episode.clone(), trace };
+        if is_training { recorder.try_record(recording) } else { recorder.record(recording) }
     }
+}
+
+/// Plays a slot and returns its episodes and, if it is traced, their traces.
+fn play(
+    env: &mut impl Environment,
+    order: &SlotOrder,
+    terms: &RunTerms,
+    (actor, advisor): (&mut Actor, &mut impl Advisor),
+    is_traced: bool,
+) -> Result<(Vec<Episode>, Vec<Trace>), RolloutError> {
+    if is_traced {
+        let played = play_traced_slot(env, order, terms, actor, advisor)?;
+        return Ok(played.into_iter().unzip());
+    }
+    Ok((play_slot(env, order, terms, actor, advisor)?, Vec::new()))
 }
 
 fn finished_event(episode: &Episode) -> EpisodeFinished {
@@ -150,36 +164,55 @@ fn finished_event(episode: &Episode) -> EpisodeFinished {
 #[derive(Debug)]
 pub(crate) enum PeerRequest {
     /// A request for advice.
-    Advice(Vec<StepQuery>, oneshot::Sender<Vec<StepAdvice>>),
+    Advice(Vec<StepQuery>, oneshot::Sender<AdviceReply>),
     /// The start of episodes on the server of the environments.
     Reset(Vec<EpisodeStart>, oneshot::Sender<ResetReply>),
     /// A step of its environments, actions of shape `[n, n_action]`.
     Step(Vec<f32>, oneshot::Sender<StepReply>),
 }
 
+/// The teacher's response to a request for advice.
+#[derive(Debug)]
+pub(crate) struct AdviceReply {
+    pub(crate) steps: Vec<StepAdvice>,
+    /// Units of the budget that are left.
+    pub(crate) budget_left: u64,
+}
+
 /// The rollout's end of the channel to the teacher and to the server of the environments.
 ///
 /// One request is pending at a time, so a capacity of one suffices and sending never waits.
 #[derive(Debug, Clone)]
-pub(crate) struct PeerChannel(mpsc::Sender<PeerRequest>);
+pub(crate) struct PeerChannel {
+    requests: mpsc::Sender<PeerRequest>,
+    /// Units of the budget that were left after the latest advice.
+    budget_left: Option<u64>,
+}
 
 impl PeerChannel {
     pub(crate) fn new() -> (Self, mpsc::Receiver<PeerRequest>) {
         let (sender, receiver) = mpsc::channel(1);
-        (Self(sender), receiver)
+        (Self { requests: sender, budget_left: None }, receiver)
     }
 
     /// Sends a request and waits for the response; `None` if the worker is stopping or the peer has failed.
     fn exchange<T>(&self, request: impl FnOnce(oneshot::Sender<T>) -> PeerRequest) -> Option<T> {
         let (sender, response) = oneshot::channel();
-        self.0.blocking_send(request(sender)).ok()?;
+        self.requests.blocking_send(request(sender)).ok()?;
         response.blocking_recv().ok()
     }
 }
 
 impl Advisor for PeerChannel {
     fn advise(&mut self, queries: Vec<StepQuery>) -> Result<Vec<StepAdvice>, AdvisorGone> {
-        self.exchange(|response| PeerRequest::Advice(queries, response)).ok_or(AdvisorGone)
+        let reply = self.exchange(|response| PeerRequest::Advice(queries, response));
+        let reply = reply.ok_or(AdvisorGone)?;
+        self.budget_left = Some(reply.budget_left);
+        Ok(reply.steps)
+    }
+
+    fn budget_left(&self) -> Option<u64> {
+        self.budget_left
     }
 }
 

@@ -1,6 +1,7 @@
 //! The interfaces that a rollout uses, so that it cannot distinguish a network from a test.
 
 use tandem_core::rng::{Stream, episode_rng};
+use tandem_core::scene::Scene;
 use tandem_core::work::EpisodeStart;
 use tandem_core::{Contacts, StepAdvice, StepQuery};
 use tandem_policy::{Actor, BlindActor};
@@ -24,6 +25,11 @@ pub trait Advisor {
     /// # Errors
     /// When the worker is stopping and the teacher can no longer be asked.
     fn advise(&mut self, queries: Vec<StepQuery>) -> Result<Vec<StepAdvice>, AdvisorGone>;
+
+    /// Returns the units of the budget that were left after the latest advice; `None` if that is unknown.
+    fn budget_left(&self) -> Option<u64> {
+        None
+    }
 }
 
 /// The error of an advisor that can no longer ask the teacher.
@@ -70,6 +76,11 @@ pub trait Environment {
     /// Returns the number of steps of the current episode of environment `environment`, from 0, in which the link
     /// avoidance limited the motion of an arm; `None` if it is not counted.
     fn avoidance_steps(&self, _environment: usize) -> Option<u32> {
+        None
+    }
+
+    /// Returns the bodies of environment `environment`, from 0, at this moment; `None` if they are unknown.
+    fn scene(&self, _environment: usize) -> Option<Scene> {
         None
     }
 }
@@ -143,6 +154,10 @@ impl Environment for Simulator {
             env.observe(observation);
         }
         Ok(())
+    }
+
+    fn scene(&self, environment: usize) -> Option<Scene> {
+        self.environments.get(environment).map(Env::scene)
     }
 }
 

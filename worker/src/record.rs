@@ -13,6 +13,8 @@ use tandem_core::{Episode, EpisodeKind, Layout, TaskSpec, WorldSettings};
 use tandem_sim::{Env, SimError, WorldConfig};
 use tandem_telemetry::{EpisodeMetadata, EpisodeRecorder, TransitionRecord};
 
+use crate::trace::{Trace, TracedAdvice};
+
 /// A probability of earlier versions: training episodes that started with the hands anywhere above the table.
 const WIDE_START_SHARE: &str = "wide_start_share";
 
@@ -164,10 +166,10 @@ pub fn record_episode(
         Some(layout) => Some(world_in(layout, metadata)?),
         None => None,
     };
-    let mut recorder = EpisodeRecorder::create(path, metadata)?;
+    let mut recorder = EpisodeRecorder::create(path, metadata)?.in_one_piece();
     for step_idx in 0..episode.n_steps() {
         let scene = world.as_ref().map(Env::scene);
-        record_step(&mut recorder, scene.as_ref(), episode, step_idx)?;
+        record_step(&mut recorder, scene.as_ref(), episode, step_idx, None)?;
         if let Some(world) = &mut world {
             check_replay(world, episode, step_idx)?;
             if world.step(episode.action(step_idx))? != episode.contacts[step_idx] {
@@ -183,11 +185,32 @@ pub fn record_episode(
     Ok(recorder.finish()?)
 }
 
+/// Logs `episode` at `path` with the scenes and the advice of its `trace`, and returns the finished file's path. Nothing
+/// is simulated.
+///
+/// # Errors
+/// When the log cannot be written. In that case no finished log remains.
+pub fn record_traced(
+    metadata: &EpisodeMetadata,
+    episode: &Episode,
+    trace: &Trace,
+    path: &Path,
+) -> Result<PathBuf, RecordError> {
+    let mut recorder = EpisodeRecorder::create(path, metadata)?.in_one_piece();
+    for step_idx in 0..episode.n_steps() {
+        let (scene, advice) = (trace.scenes.get(step_idx), trace.advice.get(step_idx));
+        record_step(&mut recorder, scene, episode, step_idx, advice)?;
+    }
+    recorder.record_outcome(trace.scenes.last(), episode.last_observation())?;
+    Ok(recorder.finish()?)
+}
+
 fn record_step(
     recorder: &mut EpisodeRecorder,
     scene: Option<&Scene>,
     episode: &Episode,
     step_idx: usize,
+    advice: Option<&TracedAdvice>,
 ) -> Result<(), RecordError> {
     let after = episode.observation(step_idx + 1);
     let rewards_per_arm = rewards_per_arm(&episode.layout, after, &episode.goal);
@@ -200,7 +223,8 @@ fn record_step(
         rewards_per_arm: &rewards_per_arm,
         advised_arms: episode.advised_arms[step_idx],
         contacts: episode.contacts[step_idx],
-        advice: &[],
+        advice: advice.map_or(&[], |advice| advice.arms.as_slice()),
+        budget_left: advice.and_then(|advice| advice.budget_left),
     };
     Ok(recorder.record_step(scene, &transition)?)
 }

@@ -10,6 +10,7 @@ use tandem_telemetry::events::StepAdvised;
 
 use crate::explore::Explorer;
 use crate::ports::{Act, Advisor, AdvisorGone, Environment, EnvironmentError};
+use crate::trace::{Trace, TracedAdvice};
 
 /// An error that ends a slot.
 #[derive(Debug, thiserror::Error)]
@@ -74,19 +75,59 @@ pub fn play_slot(
     actor: &mut impl Act,
     advisor: &mut impl Advisor,
 ) -> Result<Vec<Episode>, RolloutError> {
+    let rollouts = play(env, order, terms, (actor, advisor), None)?;
+    Ok(rollouts.into_iter().map(|rollout| rollout.episode).collect())
+}
+
+/// Plays as [`play_slot`], and also returns the trace of each episode, for its log. The episodes are the same.
+///
+/// # Errors
+/// As [`play_slot`].
+pub fn play_traced_slot(
+    env: &mut impl Environment,
+    order: &SlotOrder,
+    terms: &RunTerms,
+    actor: &mut impl Act,
+    advisor: &mut impl Advisor,
+) -> Result<Vec<(Episode, Trace)>, RolloutError> {
+    let rollouts = play(env, order, terms, (actor, advisor), Some(Trace::default()))?;
+    let traced = |rollout: Rollout| (rollout.episode, rollout.trace.unwrap_or_default());
+    Ok(rollouts.into_iter().map(traced).collect())
+}
+
+/// Plays the episodes of `order`. With `trace`, the start of a trace, each of them is traced.
+fn play(
+    env: &mut impl Environment,
+    order: &SlotOrder,
+    terms: &RunTerms,
+    (actor, advisor): (&mut impl Act, &mut impl Advisor),
+    trace: Option<Trace>,
+) -> Result<Vec<Rollout>, RolloutError> {
     let mut rollouts = start(env, order, terms)?;
+    rollouts.iter_mut().for_each(|rollout| rollout.trace.clone_from(&trace));
     let mut batch = StepBatch::new(order.episodes.len(), &terms.layout);
     for step_idx in 0..terms.layout.episode_steps() {
+        trace_scenes(&mut rollouts, env);
         for rollout in &mut rollouts {
             rollout.choose_action(actor);
         }
         take_advice(&mut rollouts, step_idx, terms.advice.unit, advisor)?;
         batch.execute(&mut rollouts, step_idx, env)?;
     }
+    trace_scenes(&mut rollouts, env);
     for (environment, rollout) in rollouts.iter_mut().enumerate() {
         rollout.episode.avoidance_steps = env.avoidance_steps(environment);
     }
-    Ok(rollouts.into_iter().map(|rollout| rollout.episode).collect())
+    Ok(rollouts)
+}
+
+/// Adds the scenes of this moment to the traces.
+fn trace_scenes(rollouts: &mut [Rollout], env: &impl Environment) {
+    for (environment, rollout) in rollouts.iter_mut().enumerate() {
+        if let Some(trace) = &mut rollout.trace {
+            trace.scenes.extend(env.scene(environment));
+        }
+    }
 }
 
 /// Returns the starts of the episodes of `order`.
@@ -194,6 +235,12 @@ fn take_advice(
     for (rollout, advice) in advised.iter_mut().zip(&answers) {
         rollout.apply_advice(advice, step_idx)?;
     }
+    let budget_left = advisor.budget_left();
+    for (rollout, advice) in advised.iter_mut().zip(answers) {
+        if let Some(trace) = &mut rollout.trace {
+            trace.advice.push(TracedAdvice { arms: advice.arms, budget_left });
+        }
+    }
     // A step without overridden arms may carry a charge, from a previous worker whose student acted differently. The
     // teacher's account includes that unit, but no episode claims it.
     match unit {
@@ -238,6 +285,8 @@ struct Rollout {
     advised_arms: u8,
     /// The steps played so far.
     episode: Episode,
+    /// Their trace, if the episode is traced.
+    trace: Option<Trace>,
 }
 
 impl Rollout {
@@ -275,6 +324,7 @@ impl Rollout {
             },
             advised_arms: 0,
             episode,
+            trace: None,
         }
     }
 

@@ -1,19 +1,20 @@
 //! The worker's main loop: join the run, then take, play and deliver slots until the run has ended.
 
 use tandem_core::work::SlotOrder;
-use tandem_core::{StepAdvice, StepQuery, TaskSpec};
+use tandem_core::{StepQuery, TaskSpec};
 use tandem_net::TraceContext;
 use tokio::sync::oneshot;
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 use tracing::Instrument as _;
 
-use crate::config::{Timeouts, WorkerConfig};
+use crate::config::{RecordingConfig, Timeouts, WorkerConfig};
 use crate::environment::{Environments, Failure};
 use crate::error::Error;
 use crate::learner::{Learner, Work};
 use crate::metrics::WorkerMetrics;
-use crate::player::{PeerChannel, PeerRequest, PlayedSlot, Player};
+use crate::player::{AdviceReply, PeerChannel, PeerRequest, PlayedSlot, Player};
+use crate::recorder::Recorder;
 use crate::rollout::RolloutError;
 use crate::teacher::Teacher;
 
@@ -39,11 +40,11 @@ pub async fn run_with(
     timeouts: Timeouts,
     shutdown: CancellationToken,
 ) -> Result<(), Error> {
-    if let Some(path) = &config.log_dir {
-        std::fs::create_dir_all(path)
-            .map_err(|source| Error::LogDir { path: path.clone(), source })?;
-    }
     let rollouts = TaskTracker::new();
+    let recorder = match &config.recording {
+        Some(recording) => Some(start_recorder(recording.clone(), &rollouts)?),
+        None => None,
+    };
     let (learner, teacher) = (Learner::new(&config, timeouts)?, Teacher::new(&config, timeouts)?);
     let pacing = config.pacing;
     let metrics = WorkerMetrics::register(config.client.metrics());
@@ -55,6 +56,7 @@ pub async fn run_with(
         teacher,
         environments,
         metrics,
+        recorder,
         difference_logged: false,
         rollouts: rollouts.clone(),
     };
@@ -66,9 +68,18 @@ pub async fn run_with(
         outcome = worker.play_slots(&shutdown) => outcome,
         () = drained => Ok(()),
     };
+    // The recorder's thread ends with its last sender.
+    drop(worker);
     rollouts.close();
     pacing.next(rollouts.wait()).await;
     outcome
+}
+
+/// Starts the thread that writes logs.
+fn start_recorder(config: RecordingConfig, threads: &TaskTracker) -> Result<Recorder, Error> {
+    let path = &config.directory;
+    std::fs::create_dir_all(path).map_err(|source| Error::LogDir { path: path.clone(), source })?;
+    Recorder::start(config, threads.token()).map_err(Error::Thread)
 }
 
 /// A worker and its peers.
@@ -80,6 +91,8 @@ struct Worker {
     /// The server of the environments; `None` if they are simulated in this process.
     environments: Option<Environments>,
     metrics: WorkerMetrics,
+    /// The thread that writes logs, if there are any.
+    recorder: Option<Recorder>,
     /// Whether the log has a warning that the environments are not deterministic.
     difference_logged: bool,
     rollouts: TaskTracker,
@@ -158,12 +171,12 @@ impl Worker {
             n_arms = terms.layout.n_arms(),
             "run joined"
         );
-        let (log_dir, metrics) = (self.config.log_dir.clone(), self.metrics.clone());
+        let (recorder, metrics) = (self.recorder.clone(), self.metrics.clone());
         let player = match &mut self.environments {
-            None => Player::simulating(terms, log_dir, metrics)?,
+            None => Player::simulating(terms, recorder, metrics)?,
             Some(environments) => {
                 environments.check(&terms.layout).await?;
-                Player::remote(terms, log_dir, metrics)
+                Player::remote(terms, recorder, metrics)
             }
         };
         Ok(Membership { worker_id, player: Box::new(player) })
@@ -304,7 +317,7 @@ impl Worker {
         task: &TaskSpec,
         queries: &[StepQuery],
         trace: TraceContext,
-    ) -> Result<Vec<StepAdvice>, Error> {
+    ) -> Result<AdviceReply, Error> {
         let no_teacher = || Error::NoTeacher { account: account.to_owned() };
         let teacher = self.teacher.as_mut().ok_or_else(no_teacher)?;
         let step = queries.first().map_or(0, |query| u64::from(query.step));

@@ -1,6 +1,6 @@
 //! The client of the teacher.
 
-use tandem_core::{StepAdvice, StepQuery, TaskSpec};
+use tandem_core::{StepQuery, TaskSpec};
 use tandem_net::{AuthChannel, MAX_MESSAGE_BYTES, Operation, Retrier, TraceContext, within};
 use tandem_proto::pb;
 use tandem_proto::pb::teacher_client::TeacherClient;
@@ -10,6 +10,7 @@ use tonic::{Code, Status, Streaming};
 
 use crate::config::{Timeouts, WorkerConfig};
 use crate::error::{CallError, Error, expect_same};
+use crate::player::AdviceReply;
 
 const ADVISE: Operation = Operation { peer: "teacher", purpose: "ask the teacher" };
 /// The capacity of an advice stream, in requests. One request is open at a time, so the worker never waits for room.
@@ -49,7 +50,7 @@ impl Teacher {
         layout: &TaskSpec,
         queries: &[StepQuery],
         trace: TraceContext,
-    ) -> Result<Vec<StepAdvice>, Error> {
+    ) -> Result<AdviceReply, Error> {
         let steps = queries.iter().map(tandem_proto::encode_query).collect();
         let request = pb::AdviseRequest {
             account: account.to_owned(),
@@ -61,7 +62,8 @@ impl Teacher {
         let decode = || {
             expect_same("steps", queries.len() as u64, response.steps.len() as u64)?;
             let decode = |advice| tandem_proto::decode_advice(advice, layout);
-            Ok::<_, CallError>(response.steps.into_iter().map(decode).collect::<Result<_, _>>()?)
+            let steps = response.steps.into_iter().map(decode).collect::<Result<_, _>>()?;
+            Ok::<_, CallError>(AdviceReply { steps, budget_left: response.budget_left })
         };
         decode().map_err(|error| Error::protocol(ADVISE, error))
     }

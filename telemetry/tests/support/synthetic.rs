@@ -118,6 +118,7 @@ pub(crate) fn transitions_of(task: &TaskSpec) -> Vec<LoggedTransition> {
             } else {
                 Vec::new()
             },
+            budget_left: step.is_multiple_of(2).then(|| 1000 - u64::from(step)),
         })
         .collect()
 }
@@ -163,6 +164,7 @@ pub(crate) fn record(step: u32, transition: &LoggedTransition) -> TransitionReco
         advised_arms: transition.advised_arms,
         contacts: transition.contacts,
         advice: &transition.advice,
+        budget_left: transition.budget_left,
     }
 }
 

@@ -13,7 +13,10 @@ use tandem_proto::pb;
 use tandem_telemetry::read_episode;
 use tandem_worker::record::RecordError;
 use tandem_worker::replay::{replay_log, replay_log_on};
-use tandem_worker::{EnvironmentConfig, Error, WorkerConfig, describe_environments, run_with};
+use tandem_worker::{
+    EnvironmentConfig, Error, RecordedEpisodes, RecordingConfig, WorkerConfig,
+    describe_environments, run_with,
+};
 use tokio_util::sync::CancellationToken;
 use tonic::Status;
 
@@ -160,7 +163,11 @@ async fn recorded_on(environments: &Arc<FakeEnvironments>, log_dir: &Path) -> Pa
     let (learner_server, server) = (Server::learner(&learner), Server::environments(environments));
     let config = WorkerConfig {
         environment: Some(played_on(&server)),
-        log_dir: Some(log_dir.to_owned()),
+        recording: Some(RecordingConfig {
+            directory: log_dir.to_owned(),
+            episodes: RecordedEpisodes::Evaluation,
+            budget_bytes: u64::MAX,
+        }),
         ..config(&learner_server, None)
     };
     run_with(config, TIMEOUTS, CancellationToken::new()).await.expect("the run ends");

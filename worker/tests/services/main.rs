@@ -11,7 +11,7 @@ use tandem_core::{Episode, EpisodeKind};
 use tandem_net::{Backoff, ClientConfig, Pacing};
 use tandem_policy::actor_digest;
 use tandem_telemetry::read_episode;
-use tandem_worker::{Error, Timeouts, WorkerConfig, run_with};
+use tandem_worker::{Error, RecordedEpisodes, RecordingConfig, Timeouts, WorkerConfig, run_with};
 use tokio_util::sync::CancellationToken;
 use tonic::Status;
 
@@ -37,7 +37,7 @@ fn config(learner: &Server, teacher: Option<&Server>) -> WorkerConfig {
         learner: learner.address(),
         teacher: teacher.map(Server::address),
         name: "test".to_owned(),
-        log_dir: None,
+        recording: None,
         pacing: Pacing::Concurrent,
     }
 }
@@ -137,8 +137,12 @@ async fn a_recorded_episode_gets_a_log_with_its_run_and_policy() {
     let (learner, teacher) =
         (Arc::new(FakeLearner::new(orders())), Arc::new(FakeTeacher::default()));
     let (learner_server, teacher_server) = (Server::learner(&learner), Server::teacher(&teacher));
-    let log_dir = Some(logs.path().join("mcap"));
-    let config = WorkerConfig { log_dir, ..config(&learner_server, Some(&teacher_server)) };
+    let recording = Some(RecordingConfig {
+        directory: logs.path().join("mcap"),
+        episodes: RecordedEpisodes::Evaluation,
+        budget_bytes: u64::MAX,
+    });
+    let config = WorkerConfig { recording, ..config(&learner_server, Some(&teacher_server)) };
     run_with(config, TIMEOUTS, CancellationToken::new()).await.expect("the run ends");
     let names: Vec<_> = std::fs::read_dir(logs.path().join("mcap"))
         .expect("made by the worker")

@@ -1,0 +1,141 @@
+//! Playback of the logs that become finished in a directory.
+
+use std::collections::BTreeSet;
+use std::net::SocketAddr;
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use super::episode::Episode;
+use super::{Clock, PAUSE_NS, Server, TICK};
+use crate::error::Error;
+
+/// Time between two looks into the directory.
+const LOOK_EVERY: Duration = Duration::from_millis(500);
+
+/// Plays the newest evaluation episodes of a directory in real time, one after the other, as workers finish their logs.
+/// While there is no new one, it plays the newest training episode, if these are recorded.
+pub struct Follower {
+    server: Server,
+    address: SocketAddr,
+    clock: Clock,
+    directory: PathBuf,
+    /// Logs that were there at the start or were played.
+    seen: BTreeSet<PathBuf>,
+    /// The end of the timeline so far.
+    end_ns: u64,
+}
+
+impl Follower {
+    /// Listens on `address`; port 0 selects a free port. Logs that are in `directory` already are not played; it need not
+    /// exist yet.
+    ///
+    /// # Errors
+    /// If the address cannot be listened on.
+    pub fn start(address: SocketAddr, directory: PathBuf, clock: Clock) -> Result<Self, Error> {
+        let seen = logs_in(&directory).into_iter().collect();
+        let server = Server::start(address, "tandem", None, None)?;
+        let address = server.address(address);
+        Ok(Self { server, address, clock, directory, seen, end_ns: 0 })
+    }
+
+    /// Returns the address that viewers connect to.
+    #[must_use]
+    pub const fn address(&self) -> SocketAddr {
+        self.address
+    }
+
+    /// Plays until `is_stopped` returns true, then closes all connections. Logs that cannot be read are left out.
+    pub fn run(mut self, is_stopped: &dyn Fn() -> bool) {
+        let mut looked_at = None;
+        while !is_stopped() {
+            let now = (self.clock)();
+            let is_due = looked_at.is_none_or(|at| now.saturating_sub(at) >= LOOK_EVERY);
+            if is_due {
+                looked_at = Some(now);
+                if let Some(episode) = self.next_episode() {
+                    self.play(&episode, is_stopped);
+                    looked_at = None;
+                }
+            }
+            std::thread::sleep(TICK);
+        }
+        self.server.stop();
+    }
+
+    /// Returns the next episode to play. Older ones that were not played yet are left out.
+    fn next_episode(&mut self) -> Option<Episode> {
+        let new: Vec<PathBuf> =
+            logs_in(&self.directory).into_iter().filter(|log| !self.seen.contains(log)).collect();
+        let path = next_log(&new)?.to_owned();
+        let is_left_out = |log: &&PathBuf| evaluation(log) <= evaluation(&path);
+        self.seen.extend(new.iter().filter(is_left_out).cloned());
+        let mut episode = Episode::read(&path).ok()?;
+        let start_ns = if self.end_ns == 0 { 0 } else { self.end_ns + PAUSE_NS };
+        episode.shift(start_ns);
+        self.end_ns = start_ns.max(episode.end_ns());
+        self.server.channels.open(&episode.channels).ok()?;
+        tracing::debug!(?path, "episode played to viewers");
+        Some(episode)
+    }
+
+    fn play(&self, episode: &Episode, is_stopped: &dyn Fn() -> bool) {
+        let (start, mut n_published) = ((self.clock)(), 0);
+        let start_ns = episode.messages.first().map_or(0, |message| message.time_ns);
+        while n_published < episode.messages.len() && !is_stopped() {
+            let played = (self.clock)().saturating_sub(start).as_nanos();
+            let position_ns = start_ns.saturating_add(u64::try_from(played).unwrap_or(u64::MAX));
+            let end = episode.n_until(position_ns);
+            self.server.handle.broadcast_time(position_ns.min(episode.end_ns()));
+            self.server.channels.publish(episode, n_published, end);
+            n_published = end;
+            std::thread::sleep(TICK);
+        }
+    }
+}
+
+/// Returns the finished logs in `directory` in the order of their names, evaluations before training episodes; none if
+/// it cannot be read.
+fn logs_in(directory: &Path) -> Vec<PathBuf> {
+    let entries = std::fs::read_dir(directory).into_iter().flatten().flatten();
+    let is_log = |path: &PathBuf| path.extension().is_some_and(|extension| extension == "mcap");
+    let mut logs: Vec<PathBuf> = entries.map(|entry| entry.path()).filter(is_log).collect();
+    logs.sort();
+    logs
+}
+
+/// Returns the first log of the newest evaluation among `new` or, without one, the newest training episode.
+fn next_log(new: &[PathBuf]) -> Option<&Path> {
+    let newest = new.iter().filter_map(|log| evaluation(log)).map(|(version, _)| version).max();
+    let mut of_newest = new
+        .iter()
+        .filter(|log| evaluation(log).is_some_and(|(version, _)| Some(version) == newest));
+    of_newest.next().or(new.last()).map(PathBuf::as_path)
+}
+
+/// Returns the parameter version and the episode of an evaluation's log, `eval-VERSION-EPISODE.mcap`; `None` for others.
+fn evaluation(log: &Path) -> Option<(u64, u64)> {
+    let name = log.file_stem()?.to_str()?.strip_prefix("eval-")?;
+    let (version, episode) = name.split_once('-')?;
+    Some((version.parse().ok()?, episode.parse().ok()?))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_newest_evaluation_is_played_first_and_in_order() {
+        let check = |names: &[&str], expected: Option<&str>| {
+            let paths: Vec<PathBuf> = names.iter().map(PathBuf::from).collect();
+            assert_eq!(next_log(&paths), expected.map(Path::new), "{names:?}");
+        };
+        check(&[], None);
+        let evaluations = ["eval-000001-000.mcap", "eval-000009-000.mcap", "eval-000009-001.mcap"];
+        check(&evaluations, Some("eval-000009-000.mcap"));
+        check(&[&evaluations[..], &["train-000010-000400.mcap"]].concat(), Some(evaluations[1]));
+        check(
+            &["train-000001-000001.mcap", "train-000002-000009.mcap"],
+            Some("train-000002-000009.mcap"),
+        );
+    }
+}
