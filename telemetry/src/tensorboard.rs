@@ -252,8 +252,9 @@ mod tests {
             alter(&mut bytes);
             std::fs::write(&path, bytes).unwrap();
             write_events(&path, &rows(known), 2e9).unwrap();
-            let expected: Vec<i64> =
-                std::iter::once(0).chain(known.iter().map(|round| round.cast_signed() * 1600)).collect();
+            let expected: Vec<i64> = std::iter::once(0)
+                .chain(known.iter().map(|round| round.cast_signed() * 1600))
+                .collect();
             assert_eq!(steps(&path), expected);
             assert_eq!(read(&path)[0].wall_time.to_bits(), expected_start_s.to_bits());
         };
