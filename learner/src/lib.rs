@@ -20,6 +20,7 @@ mod runtime;
 pub mod service;
 pub mod settings;
 mod shared;
+mod timings;
 mod training_loop;
 mod warnings;
 pub mod work_queue;

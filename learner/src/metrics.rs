@@ -3,8 +3,6 @@
 //! They are meant for dashboards and autoscalers. Reading them requires no token, so they contain no secret and no
 //! worker's own label.
 
-mod timings;
-
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -16,8 +14,6 @@ use tandem_telemetry::MetricsRow;
 use crate::progress::{EnvironmentChecks, Progress};
 use crate::shared::Shared;
 use crate::work_queue::WorkQueue;
-
-pub(crate) use timings::Timings;
 
 /// Adds the state of the run to `metrics`.
 pub(crate) fn add(metrics: &Metrics, shared: Arc<Shared>) {

@@ -23,10 +23,11 @@ use tokio_util::sync::CancellationToken;
 use tonic::{Request, Response, Status};
 
 use crate::error::Error;
-use crate::metrics::{self, Timings};
+use crate::metrics;
 use crate::progress::RunEnd;
 use crate::runtime::{Runtime, on_a_thread};
 use crate::shared::{LearnerConfig, Shared};
+use crate::timings::Timings;
 use crate::training_loop::{self, Context, RunOutcome};
 use crate::work_queue::check_count;
 use messages::{encode_finished, encode_progress};

@@ -13,8 +13,8 @@ use tandem_rl::config::RunConfig;
 use tokio::sync::{Notify, watch};
 
 use crate::connections::{Connections, LogQuota};
-use crate::metrics::Timings;
 use crate::progress::{Progress, RunEnd};
+use crate::timings::Timings;
 use crate::warnings::{Source, Warnings};
 use crate::work_queue::{WorkQueue, Worker};
 

@@ -12,8 +12,8 @@ use super::run_lock::RunLock;
 use crate::checkpoint::{self, Resumption, Saved};
 use crate::error::Error;
 use crate::evaluation_store::{UnwrittenFile, innermost};
-use crate::metrics::Timings;
 use crate::shared::{LearnerConfig, Shared};
+use crate::timings::Timings;
 use crate::warnings::{Source, Warnings};
 
 /// Pause before a failed write is repeated.
