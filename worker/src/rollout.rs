@@ -75,7 +75,7 @@ pub fn play_slot(
     actor: &mut impl Act,
     advisor: &mut impl Advisor,
 ) -> Result<Vec<Episode>, RolloutError> {
-    let rollouts = play(env, order, terms, (actor, advisor), None)?;
+    let rollouts = play(env, order, terms, (actor, advisor), false)?;
     Ok(rollouts.into_iter().map(|rollout| rollout.episode).collect())
 }
 
@@ -90,21 +90,21 @@ pub fn play_traced_slot(
     actor: &mut impl Act,
     advisor: &mut impl Advisor,
 ) -> Result<Vec<(Episode, Trace)>, RolloutError> {
-    let rollouts = play(env, order, terms, (actor, advisor), Some(Trace::default()))?;
+    let rollouts = play(env, order, terms, (actor, advisor), true)?;
     let traced = |rollout: Rollout| (rollout.episode, rollout.trace.unwrap_or_default());
     Ok(rollouts.into_iter().map(traced).collect())
 }
 
-/// Plays the episodes of `order`. With `trace`, the start of a trace, each of them is traced.
+/// Plays the episodes of `order`, each with a trace if `is_traced`.
 fn play(
     env: &mut impl Environment,
     order: &SlotOrder,
     terms: &RunTerms,
     (actor, advisor): (&mut impl Act, &mut impl Advisor),
-    trace: Option<Trace>,
+    is_traced: bool,
 ) -> Result<Vec<Rollout>, RolloutError> {
     let mut rollouts = start(env, order, terms)?;
-    rollouts.iter_mut().for_each(|rollout| rollout.trace.clone_from(&trace));
+    rollouts.iter_mut().for_each(|rollout| rollout.trace = is_traced.then(Trace::default));
     let mut batch = StepBatch::new(order.episodes.len(), &terms.layout);
     for step_idx in 0..terms.layout.episode_steps() {
         trace_scenes(&mut rollouts, env);

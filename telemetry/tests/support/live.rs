@@ -71,7 +71,7 @@ impl Viewer {
                         1 => Received::Data(id(), number(5), bytes[13..].to_vec()),
                         2 => Received::Time(number(1)),
                         5 => Received::State(bytes[1], number(2), bytes[14] != 0),
-                        other => panic!("unknown opcode {other}"),
+                        _ => continue,
                     };
                 }
                 _ => {}
