@@ -50,7 +50,7 @@ fn several_curves_have_bands_and_a_legend() {
         curve_svg(&series, &CurveOptions::of("Two arms push", Quantity::Success, Axis::EnvSteps))
             .unwrap();
     assert_well_formed(&svg);
-    assert_eq!(svg.matches("<polygon").count(), 2, "a band each");
+    assert_eq!(svg.matches("<polygon opacity=\"0.16\"").count(), 2, "a band each");
     for text in [
         "Two arms push",
         "none",
@@ -255,7 +255,7 @@ fn a_described_task_has_its_own_section_beside_a_built_in_one() {
         let name = svg.file_name().unwrap().to_str().unwrap();
         let text = std::fs::read_to_string(svg).unwrap();
         assert_well_formed(&text);
-        assert_eq!(text.contains("the paper"), name.starts_with("push") && name.contains("epochs"));
+        assert_eq!(text.contains("Figure"), name.starts_with("push") && name.contains("epochs"));
     }
     let csv = tandem_report::export::csv(&comparison);
     assert!(csv.lines().any(|line| line.starts_with("lab/reach,2,ea,ea,reach-2-ea-seed1,1,")));
