@@ -12,6 +12,7 @@ mod bench;
 mod bridge;
 mod cli;
 mod clock;
+mod dashboard;
 mod environment_command;
 mod environment_server;
 mod eval;

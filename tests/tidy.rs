@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 use std::path::{Path, PathBuf};
 
-const ALLOWED: [(&str, &[&str]); 18] = [
+const ALLOWED: [(&str, &[&str]); 19] = [
     ("core", &[]),
     ("system", &[]),
     ("kinematics", &["core"]),
@@ -23,6 +23,7 @@ const ALLOWED: [(&str, &[&str]); 18] = [
     ("bridge", &["core", "kinematics", "proto", "net"]),
     ("trials", &["core", "kinematics", "sim", "policy", "telemetry", "bridge"]),
     ("bench", &["core", "sim", "policy", "proto", "net", "rl", "teacher"]),
+    ("dashboard", &["core", "telemetry", "net"]),
 ];
 
 /// The Python package, which has a workspace of its own and is in no image.

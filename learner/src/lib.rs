@@ -21,6 +21,7 @@ pub mod service;
 pub mod settings;
 mod shared;
 mod training_loop;
+mod view;
 mod warnings;
 pub mod work_queue;
 

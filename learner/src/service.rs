@@ -15,8 +15,10 @@ use tandem_net::{ConnectionClosed, EncodedResponse, Incoming, MAX_MESSAGE_BYTES,
 use tandem_proto::pb;
 use tandem_proto::pb::learner_server::{Learner, LearnerServer};
 use tandem_proto::{decode_episode, encode_run_terms, encode_slot};
+use tandem_telemetry::RunView;
 use tandem_telemetry::events::WorkerJoined;
 use tokio::net::TcpListener;
+use tokio::sync::watch;
 use tokio_stream::wrappers::WatchStream;
 use tokio_stream::{Stream, StreamExt as _};
 use tokio_util::sync::CancellationToken;
@@ -28,6 +30,7 @@ use crate::progress::RunEnd;
 use crate::runtime::{Runtime, on_a_thread};
 use crate::shared::{LearnerConfig, Shared};
 use crate::training_loop::{self, Context, RunOutcome};
+use crate::view;
 use crate::work_queue::check_count;
 use messages::{encode_finished, encode_progress};
 pub(crate) use refusals::check_version;
@@ -45,6 +48,8 @@ const LINGER_TICK: Duration = Duration::from_millis(50);
 pub struct ServeOptions {
     /// Serves metrics at `/metrics`, without a token.
     pub metrics: Option<TcpListener>,
+    /// Receives snapshots of the run about twice a second.
+    pub views: Option<watch::Sender<RunView>>,
     /// The stay of the service after a complete run.
     pub linger: LingerPolicy,
 }
@@ -109,6 +114,7 @@ fn serve_boxed(
             config.server_config.router(learner, tandem_proto::FILE_DESCRIPTOR_SET).await?;
         let stop_serving = CancellationToken::new();
         let serving_metrics = serve_metrics(options.metrics, shared.clone());
+        let publishing = view::publish(options.views, shared.clone(), config.run.clone());
         let learning = {
             let (pacing, stop) = (config.pacing, stop_serving.clone());
             let shutdown = shutdown.clone();
@@ -129,6 +135,7 @@ fn serve_boxed(
             let served = tokio::select! {
                 served = tandem_net::serve(router, incoming, stop_serving) => served,
                 () = serving_metrics => Ok(()),
+                () = publishing => Ok(()),
             };
             // A server that fails ends the run: no worker can reach it any more.
             shutdown.cancel();

@@ -91,7 +91,8 @@ pub(crate) struct TeacherArgs {
 Examples:
   tandem learner --run runs/mine/run.toml --listen 0.0.0.0:7000 --teacher 127.0.0.1:7001 --out runs/mine
   tandem learner --run runs/mine/run.toml --out runs/mine --resume --teacher 127.0.0.1:7001
-  tandem learner --run run.toml --out runs/mine --start-or-resume --teacher teacher:7001   under a supervisor")]
+  tandem learner --run run.toml --out runs/mine --start-or-resume --teacher teacher:7001   under a supervisor
+  tandem learner --run run.toml --out runs/mine --dashboard-listen 127.0.0.1:8600")]
 pub(crate) struct LearnerArgs {
     /// Run file (TOML); settings that it omits take the recipe's values.
     #[arg(long, value_name = "FILE.toml")]
@@ -125,6 +126,17 @@ pub(crate) struct LearnerArgs {
     /// Serves Prometheus metrics at http://ADDR/metrics. No token is required: do not expose the address.
     #[arg(long, value_name = "ADDR")]
     pub(crate) metrics_listen: Option<SocketAddr>,
+    /// Serves the run's dashboard at http://ADDR/ [default: none]. An address that other machines can reach requires a
+    /// token, which the page asks for.
+    #[arg(long, value_name = "ADDR")]
+    pub(crate) dashboard_listen: Option<SocketAddr>,
+    /// File with the token of the dashboard [default: --token-file].
+    #[arg(long, value_name = "FILE", requires = "dashboard_listen")]
+    pub(crate) dashboard_token_file: Option<PathBuf>,
+    /// Takes the next free port if that of the dashboard is in use, runs without a dashboard if there is none, and
+    /// prints the outcome as a second line.
+    #[arg(long, hide = true, requires = "dashboard_listen")]
+    pub(crate) dashboard_is_optional: bool,
     /// Keeps serving after the run is complete, until the process is asked to exit.
     #[arg(long)]
     pub(crate) stay: bool,

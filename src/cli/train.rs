@@ -1,5 +1,6 @@
 //! The command line of `tandem train` and `tandem sweep`.
 
+use std::net::SocketAddr;
 use std::path::PathBuf;
 
 use clap::{Args, ValueEnum};
@@ -28,6 +29,7 @@ Examples:
   tandem train --recipe paper --teacher runs/teacher-push-paper/policy/best.safetensors
   tandem train --env 127.0.0.1:7005                   plays in the environments of a server
   tandem train --env-command 'tandem env'             each worker starts a server of its own
+  tandem train --dashboard 0.0.0.0:8600 --dashboard-token-file token    to watch it from a phone
   tandem train --resume --out runs/mine               resumes the run
   tandem train --resume --out runs/mine --max-env-steps 600000    resumes it for longer")]
 pub(crate) struct TrainArgs {
@@ -92,6 +94,16 @@ pub(crate) struct TrainArgs {
     /// evaluation.test_episodes and --workers can change. A rejected --resume changes nothing.
     #[arg(long, requires = "out")]
     pub(crate) resume: bool,
+    /// Address of the dashboard, which shows the run in a browser. If its port is in use, the next free one is taken.
+    /// [default: 127.0.0.1:8600]
+    #[arg(long, value_name = "ADDR")]
+    pub(crate) dashboard: Option<SocketAddr>,
+    /// File with the token that the dashboard asks for if --dashboard is not a loopback address.
+    #[arg(long, value_name = "FILE", requires = "dashboard")]
+    pub(crate) dashboard_token_file: Option<PathBuf>,
+    /// Serves no dashboard.
+    #[arg(long, conflicts_with = "dashboard")]
+    pub(crate) no_dashboard: bool,
     /// Prints the summary as one JSON object on the last line of standard output.
     #[arg(long)]
     pub(crate) json: bool,

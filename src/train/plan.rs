@@ -1,5 +1,6 @@
 //! The plan of a run: its settings, its directory, its teacher and the number of workers.
 
+use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 
 use tandem_learner::{checkpoint, settings};
@@ -12,7 +13,7 @@ use super::teacher_file::TeacherFile;
 use crate::cli::{EnvironmentArgs, RecipeName, TrainArgs, chosen_task};
 use crate::exit::{Exit, Failed, OrExit as _};
 use crate::service::worker_failed;
-use crate::{output, policy_file, run_directory, run_file, served_task};
+use crate::{dashboard, output, policy_file, run_directory, run_file, served_task};
 
 /// A run that can be started.
 pub(crate) struct Plan {
@@ -23,6 +24,10 @@ pub(crate) struct Plan {
     pub(crate) resume: bool,
     /// The server of the environments, if workers do not simulate them.
     pub(crate) environment: EnvironmentArgs,
+    /// The first address that the dashboard tries, unless there is none.
+    pub(crate) dashboard: Option<SocketAddr>,
+    /// File with the token of the dashboard.
+    pub(crate) dashboard_token_file: Option<PathBuf>,
 }
 
 impl Plan {
@@ -51,7 +56,18 @@ impl Plan {
         if !(1..=1024).contains(&n_workers) {
             return Err(Failed::usage(format!("--workers {n_workers}: expected 1 to 1024")));
         }
-        let plan = Self { config, out, teacher, n_workers, resume: args.resume, environment };
+        let (resume, dashboard) = (args.resume, dashboard_address(args)?);
+        let dashboard_token_file = args.dashboard_token_file.clone();
+        let plan = Self {
+            config,
+            out,
+            teacher,
+            n_workers,
+            resume,
+            environment,
+            dashboard,
+            dashboard_token_file,
+        };
         plan.check_directory()?;
         Ok(plan)
     }
@@ -165,6 +181,16 @@ impl Plan {
     pub(crate) fn ledger(&self) -> PathBuf {
         self.out.join("ledger.sqlite")
     }
+}
+
+/// Returns the address of the dashboard; rejects one that other machines can reach without a token.
+fn dashboard_address(args: &TrainArgs) -> Result<Option<SocketAddr>, Failed> {
+    if args.no_dashboard {
+        return Ok(None);
+    }
+    let address = args.dashboard.unwrap_or_else(dashboard::default_address);
+    dashboard::access("--dashboard", address, args.dashboard_token_file.as_deref(), false)?;
+    Ok(Some(address))
 }
 
 /// Rejects a task that neither the server nor the simulator has.
