@@ -298,6 +298,18 @@ impl RunConfig {
         max > 0 && (round * self.env_steps_per_round()) as f64 >= first
     }
 
+    /// Returns the cost of a contact in round `round`, from 0.
+    #[must_use]
+    pub fn contact_cost(&self, round: u64) -> f32 {
+        let (cost, max) = (self.replay.contact_cost, self.stop.max_env_steps);
+        if max == 0 {
+            return cost;
+        }
+        let share = (round * self.env_steps_per_round()) as f64 / max as f64;
+        let grown = ((share - 0.25) / 0.5).clamp(0.0, 1.0) as f32;
+        cost * (1.0 + grown * (self.replay.contact_cost_growth - 1.0))
+    }
+
     /// Returns the number of rounds between two evaluations, at least one.
     #[must_use]
     pub fn rounds_per_evaluation(&self) -> u64 {

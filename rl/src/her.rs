@@ -51,6 +51,7 @@ struct Relabelled {
 pub struct Sampler {
     config: ReplayConfig,
     layout: TaskSpec,
+    contact_cost: f32,
     sample: Relabelled,
     raw_observation: Vec<f32>,
     raw_goal: Vec<f32>,
@@ -69,7 +70,19 @@ impl Sampler {
         };
         let (raw_observation, raw_goal) =
             (vec![0.0; layout.n_observation()], vec![0.0; layout.n_goal()]);
-        Self { config: config.clone(), layout, sample, raw_observation, raw_goal }
+        Self {
+            contact_cost: config.contact_cost,
+            config: config.clone(),
+            layout,
+            sample,
+            raw_observation,
+            raw_goal,
+        }
+    }
+
+    /// Sets the cost of a contact for the batches that follow.
+    pub const fn set_contact_cost(&mut self, cost: f32) {
+        self.contact_cost = cost;
     }
 
     /// Fills every row of `batch` with a transition sampled from `buffer`.
@@ -98,7 +111,7 @@ impl Sampler {
             batch.rewards[row_of(n_heads)].copy_from_slice(&self.sample.rewards);
             if has_contact_within(buffer, self.sample.steps[0], 1) {
                 for reward in &mut batch.rewards[row_of(n_heads)] {
-                    *reward -= self.config.contact_cost;
+                    *reward -= self.contact_cost;
                 }
             }
             if self.sample.swapped && n_heads > 1 {

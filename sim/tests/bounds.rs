@@ -8,9 +8,6 @@ use tandem_core::rng::{bernoulli, index, uniform};
 use tandem_core::{Layout, Stream, Task, WorldSettings, episode_rng};
 use tandem_sim::{Env, WorldConfig};
 
-/// Episodes per layout.
-const N_EPISODES: u64 = 100;
-
 /// Smallest ratio of a bound to the largest observed magnitude.
 const MARGIN: f32 = 4.0;
 /// Range of the object's orientation in an arm's observation.
@@ -88,13 +85,13 @@ fn update(largest: &mut Largest, observation: &[f32], goal: &[f32]) {
     largest.goal = goal.iter().fold(largest.goal, |most, value| most.max(value.abs()));
 }
 
-fn play(layout: Layout, substeps: u32) -> Largest {
+fn play(layout: Layout, substeps: u32, n_episodes: u64) -> Largest {
     let config = WorldConfig { substeps, ..WorldConfig::default() };
     let mut env = Env::new(layout, &config).expect("a valid world");
     let mut largest = Largest { observation: [0.0; OBSERVATION_PER_ARM], goal: 0.0 };
     let mut observation = vec![0.0; layout.n_observation()];
     let mut action = vec![0.0; layout.n_action()];
-    for episode in 0..N_EPISODES {
+    for episode in 0..n_episodes {
         let mut rng = episode_rng(5, episode, Stream::Exploration);
         let settings = WorldSettings { grasped_start_prob: 0.5, substeps, randomization: 1.0 };
         env.reset(&mut episode_rng(5, episode, Stream::Reset), settings);
@@ -119,10 +116,20 @@ fn play(layout: Layout, substeps: u32) -> Largest {
 
 #[test]
 fn no_behaviour_brings_a_number_near_its_bound() {
+    check_bounds(15);
+}
+
+#[test]
+#[ignore = "half a minute"]
+fn no_behaviour_brings_a_number_near_its_bound_in_a_hundred_episodes() {
+    check_bounds(100);
+}
+
+fn check_bounds(n_episodes: u64) {
     for task in Task::ALL {
         for (n_arms, substeps) in [(1, 20), (2, 20), (2, 10)] {
             let layout = Layout::new(task, n_arms);
-            let largest = play(layout, substeps);
+            let largest = play(layout, substeps, n_episodes);
             for (idx, most) in largest.observation.into_iter().enumerate() {
                 // The components of a unit quaternion reach their bound of 1, up to rounding.
                 let margin = if ORIENTATION.contains(&idx) { 1.0 } else { MARGIN };

@@ -86,14 +86,24 @@ fn snapshots_do_not_affect_the_simulation() {
 }
 
 #[test]
-fn a_hundred_thousand_random_steps_stay_finite() {
+fn random_steps_stay_finite() {
+    check_random_steps(20);
+}
+
+#[test]
+#[ignore = "half a minute"]
+fn two_hundred_thousand_random_steps_stay_finite() {
+    check_random_steps(250);
+}
+
+fn check_random_steps(n_episodes: u64) {
     thread::scope(|scope| {
         for layout in layouts() {
             scope.spawn(move || {
                 for substeps in [20, 10] {
                     let config = WorldConfig { substeps, ..WorldConfig::default() };
                     let mut env = Env::new(layout, &config).expect("a valid world");
-                    for episode in 100..350 {
+                    for episode in 100..100 + n_episodes {
                         let (bits, _) = trace(&mut env, episode);
                         let in_bounds = bits.iter().all(|bits| f32::from_bits(*bits).abs() < 25.0);
                         assert!(in_bounds, "{layout:?}, {substeps} substeps, episode {episode}");

@@ -49,8 +49,18 @@ fn ten_physics_steps_per_control_step_suffice() {
 
 #[test]
 fn a_scripted_arm_solves_every_start_in_the_shared_world() {
+    check_shared_starts_of_one_arm(60);
+}
+
+#[test]
+#[ignore = "a minute"]
+fn a_scripted_arm_solves_a_thousand_starts_in_the_shared_world() {
+    check_shared_starts_of_one_arm(1000);
+}
+
+fn check_shared_starts_of_one_arm(n_episodes: u64) {
     for task in Task::CLASSIC.map(|task| task.in_world(World::Shared)) {
-        let episodes = play(Layout::new(task, 1), &WorldConfig::default(), 300);
+        let episodes = play(Layout::new(task, 1), &WorldConfig::default(), n_episodes);
         let rate = success_rate(&episodes);
         println!("{task}, 1 arm: {rate}, median miss {:.4} m", median_miss_m(&episodes));
         assert!(rate == 1.0, "{task}: {rate}");
@@ -59,10 +69,20 @@ fn a_scripted_arm_solves_every_start_in_the_shared_world() {
 
 #[test]
 fn two_scripted_arms_that_take_turns_solve_most_starts_in_the_shared_world() {
+    check_shared_starts_of_two_arms(40);
+}
+
+#[test]
+#[ignore = "a minute"]
+fn two_scripted_arms_that_take_turns_solve_most_of_300_starts_in_the_shared_world() {
+    check_shared_starts_of_two_arms(300);
+}
+
+fn check_shared_starts_of_two_arms(n_episodes: u64) {
     for task in Task::CLASSIC.map(|task| task.in_world(World::Shared)) {
         let layout = Layout::new(task, 2);
         let n_steps = layout.description().episode_steps;
-        let mut episodes = play_in_turn(layout, &WorldConfig::default(), 300, n_steps);
+        let mut episodes = play_in_turn(layout, &WorldConfig::default(), n_episodes, n_steps);
         let unsolved: Vec<usize> =
             (0..episodes.len()).filter(|&idx| !episodes[idx].0.success).collect();
         let n_contacts = episodes.iter().filter(|(played, _)| played.contacts.any()).count();
@@ -75,7 +95,7 @@ fn two_scripted_arms_that_take_turns_solve_most_starts_in_the_shared_world() {
             episodes.len()
         );
         // A simple script gives up where its arm has to go around the other one; a start may be solvable all the same.
-        assert!(unsolved.len() < episodes.len() / 5, "{task}: {unsolved:?}");
+        assert!(unsolved.len() * 20 <= episodes.len() + 20, "{task}: {unsolved:?}");
     }
 }
 

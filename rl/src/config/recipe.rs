@@ -158,6 +158,7 @@ fn replay(recipe: Recipe, layout: &TaskSpec) -> ReplayConfig {
         // Four fifths of the tolerance; of 0.05 m exactly 0.04 m.
         goal_tolerance_m: if tandem { tolerance * 4.0 / 5.0 } else { tolerance },
         contact_cost: if avoids_contacts { 1.0 } else { 0.0 },
+        contact_cost_growth: 1.0,
         contact_foresight_steps: if avoids_contacts { 5.min(layout.episode_steps()) } else { 0 },
     }
 }

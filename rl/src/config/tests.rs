@@ -39,6 +39,19 @@ fn a_run_cools_down_over_its_last_fifth_if_it_has_an_end() {
 }
 
 #[test]
+fn the_cost_of_a_contact_grows_over_the_middle_half_of_a_run() {
+    let mut config = RunConfig::defaults(Recipe::Tandem, Task::Push, 2);
+    config.stop.max_env_steps = 80_000;
+    assert!((0..=100).all(|round| config.contact_cost(round) == 1.0), "a growth of 1");
+    config.replay.contact_cost_growth = 9.0;
+    let costs = [0, 25, 50, 75, 100].map(|round| config.contact_cost(round));
+    assert_eq!(costs, [1.0, 1.0, 5.0, 9.0, 9.0], "rounds of 800 steps");
+    assert_eq!(config.replay.lowest_reward(), -10.0, "the clip allows the highest cost");
+    config.stop.max_env_steps = 0;
+    assert_eq!(config.contact_cost(50), 1.0, "without an end");
+}
+
+#[test]
 fn a_bad_value_is_named() {
     let check = |change: fn(&mut RunConfig), key| {
         let mut config = RunConfig::defaults(Recipe::Tandem, Task::Push, 2);

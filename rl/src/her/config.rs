@@ -55,16 +55,26 @@ pub struct ReplayConfig {
     /// Cost to every arm of a step on which an arm touches the other or the table, 0 to 100; a pending goal costs 1
     /// (paper: 0).
     pub contact_cost: f32,
+    /// Factor by which this cost grows, 1 to 100: linearly from one quarter to three quarters of the run's environment
+    /// steps, so that the policy first learns to achieve goals (paper: 1). A run without a limit in environment steps
+    /// keeps the cost.
+    #[serde(default = "constant")]
+    pub contact_cost_growth: f32,
     /// Advice is not cloned on the last steps before a contact: this many, counting the step of the contact, 0 to the
     /// episode's steps (paper: 0).
     pub contact_foresight_steps: usize,
+}
+
+/// The growth of a cost that stays the same.
+const fn constant() -> f32 {
+    1.0
 }
 
 impl ReplayConfig {
     /// Returns the lowest reward of a step.
     #[must_use]
     pub const fn lowest_reward(&self) -> f32 {
-        -1.0 - self.contact_cost
+        -1.0 - self.contact_cost * self.contact_cost_growth
     }
 
     /// Checks every range for a task; NaN is in none.
@@ -91,6 +101,8 @@ impl ReplayConfig {
         OutOfRange::unless(is_tolerance, key, tolerance_m, "a finite number above 0")?;
         let (key, cost) = ("replay.contact_cost", self.contact_cost);
         OutOfRange::unless((0.0..=100.0).contains(&cost), key, cost, "0 to 100")?;
+        let (key, growth) = ("replay.contact_cost_growth", self.contact_cost_growth);
+        OutOfRange::unless((1.0..=100.0).contains(&growth), key, growth, "1 to 100")?;
         let (key, n_steps) = ("replay.contact_foresight_steps", self.contact_foresight_steps);
         let n_max = layout.episode_steps();
         OutOfRange::unless(n_steps <= n_max, key, n_steps, format_args!("0 to {n_max}"))?;

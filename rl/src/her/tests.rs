@@ -20,6 +20,7 @@ fn config(reward: RewardKind) -> ReplayConfig {
         joint_goal_statistics: false,
         goal_tolerance_m: 0.05,
         contact_cost: 0.0,
+        contact_cost_growth: 1.0,
         contact_foresight_steps: 0,
     }
 }

@@ -95,12 +95,18 @@ struct WorldNumbers {
     push_z_m: f32,
     /// Lowest height of the hand at which it grasps, metres.
     grasp_z_m: f32,
+    /// Height of the hand at which it carries an object over others, metres.
+    carry_z_m: f32,
     /// Factor from the distance to a target to the displacement.
     gain: f32,
     /// Distance by which a push is aimed ahead of the hand, metres.
     push_m: f32,
+    /// The same as a share of the distance to the goal, where that is less.
+    push_share: f32,
     /// Distance behind the object at which the hand comes down, metres.
     behind_m: f32,
+    /// Horizontal distance to that point from which it comes down, metres.
+    descend_m: f32,
 }
 
 impl WorldNumbers {
@@ -109,16 +115,22 @@ impl WorldNumbers {
             World::Classic => Self {
                 push_z_m: 0.024,
                 grasp_z_m: 0.0245,
+                carry_z_m: 0.0,
                 gain: 1.3,
                 push_m: 0.022,
+                push_share: 0.5,
                 behind_m: 0.07,
+                descend_m: 0.03,
             },
             World::Shared => Self {
                 push_z_m: 0.033,
                 grasp_z_m: 0.033,
+                carry_z_m: 0.11,
                 gain: 1.0,
-                push_m: 0.030,
+                push_m: 0.040,
+                push_share: 0.8,
                 behind_m: 0.055,
+                descend_m: 0.012,
             },
         }
     }
@@ -149,7 +161,7 @@ impl Controller {
     }
 
     fn pick_and_place(&mut self, hand: [f32; 3], object: [f32; 3], goal: &[f32]) -> [f32; 4] {
-        let WorldNumbers { grasp_z_m, gain, .. } = self.world;
+        let WorldNumbers { grasp_z_m, carry_z_m, gain, .. } = self.world;
         let grasp_z = object[2].max(grasp_z_m);
         let off = length(flat_between(hand, object));
         match self.phase {
@@ -171,10 +183,13 @@ impl Controller {
                 [0.0, 0.0, 0.0, -1.0]
             }
             Phase::Bring | Phase::Leave => {
-                if off > 0.05 {
+                if off > 0.05 || hand[2] > object[2] + 0.06 {
                     self.phase = Phase::Approach;
                 }
-                let target = std::array::from_fn(|axis| hand[axis] + goal[axis] - object[axis]);
+                let mut target = std::array::from_fn(|axis| hand[axis] + goal[axis] - object[axis]);
+                if length([goal[0] - object[0], goal[1] - object[1]]) > 0.05 {
+                    target[2] = target[2].max(carry_z_m);
+                }
                 towards(hand, target, gain, -1.0)
             }
         }
@@ -195,8 +210,8 @@ impl Controller {
                 if advance_m > -0.012 || length(lateral) > 0.022 {
                     self.phase = Phase::Leave;
                 }
-                let WorldNumbers { push_z_m, gain, push_m, .. } = self.world;
-                let ahead_m = (distance_m * 0.5).clamp(0.005, push_m)
+                let WorldNumbers { push_z_m, gain, push_m, push_share, .. } = self.world;
+                let ahead_m = (distance_m * push_share).clamp(0.005, push_m)
                     * (1.0 - length(lateral) / 0.03).max(0.25);
                 let target = |axis: usize| hand[axis] + along[axis] * ahead_m - lateral[axis] * 0.4;
                 towards(hand, [target(0), target(1), push_z_m], gain, 0.0)
@@ -225,13 +240,13 @@ impl Controller {
         along: Flat,
         behind: Flat,
     ) -> [f32; 4] {
-        let WorldNumbers { push_z_m, gain, behind_m, .. } = self.world;
+        let WorldNumbers { push_z_m, gain, behind_m, descend_m, .. } = self.world;
         let target = [object[0] - along[0] * behind_m, object[1] - along[1] * behind_m];
         let off = length([target[0] - hand[0], target[1] - hand[1]]);
         if off < 0.012 && hand[2] < push_z_m + 0.012 {
             self.phase = Phase::Bring;
         }
-        if off < 0.03 {
+        if off < descend_m {
             return towards(hand, [target[0], target[1], push_z_m], gain, 0.0);
         }
         if hand[2] >= 0.055 {

@@ -12,10 +12,14 @@ const APART_M: f32 = 0.20;
 const PASSING_M: f32 = 0.15;
 /// Distance between object and goal at which an arm has finished, metres.
 const DONE_M: f32 = 0.025;
+/// The same once it has released its object, metres.
+const RELEASED_M: f32 = 0.045;
 /// Height of a goal above a resting object from which it must be held, metres.
 const HOLD_M: f32 = 0.03;
 /// Distance of an object from a way that is not in its way, metres.
 const CLEARANCE_M: f32 = 0.098;
+/// Room that a waiting hand leaves the other arm, metres.
+const ROOM_M: f32 = 0.17;
 /// Half the edge of a cube, metres.
 const HALF_M: f32 = 0.0225;
 
@@ -63,6 +67,8 @@ struct Pair {
     layout: Layout,
     controllers: [Controller; 2],
     first: usize,
+    /// Where each hand waits.
+    waiting: [usize; 2],
     /// Steps for which the first arm's gripper has been opening.
     released: u32,
 }
@@ -72,14 +78,16 @@ impl Pair {
         let seen = [0, 1].map(|arm| see(arm, observation, goal));
         let first = usize::from(!may_go_first(layout, &seen, 0));
         let controllers = [0, 1].map(|_| Controller::new(layout.task));
-        Self { layout, controllers, first, released: 0 }
+        Self { layout, controllers, first, waiting: [1; 2], released: 0 }
     }
 
     fn act(&mut self, observation: &[f32], goal: &[f32], action: &mut [f32]) {
         let (first, second) = (self.first, 1 - self.first);
         let seen = [0, 1].map(|arm| see(arm, observation, goal));
         let grasps = self.layout.task.grasps();
-        let is_done = distance(seen[first].object, seen[first].goal) < DONE_M;
+        // An object that is released a little above the table falls, within the tolerance of its goal.
+        let done_m = if self.released > 0 { RELEASED_M } else { DONE_M };
+        let is_done = distance(seen[first].object, seen[first].goal) < done_m;
         let holds = grasps && seen[first].goal[2] > HALF_M + HOLD_M;
         let apart = zone_distance(&seen[first], &seen[second]) > APART_M;
         let second_may = apart || (is_done && (holds || !grasps || self.released > 2));
@@ -87,8 +95,16 @@ impl Pair {
         let hands_m = length(flat_between(seen[0].hand, seen[1].hand));
         let inputs_first = if is_done && !holds {
             self.released += 1;
-            if grasps && self.released <= 3 { [0.0, 0.0, 0.0, 1.0] } else { retreat(first, &seen) }
-        } else if !second_may && hands_m < PASSING_M && !self.controllers[first].is_at_work() {
+            if grasps && self.released <= 3 {
+                [0.0, 0.0, 0.0, 1.0]
+            } else {
+                retreat(first, &seen, &mut self.waiting[first])
+            }
+        } else if !second_may
+            && hands_m < PASSING_M
+            && !self.controllers[first].is_at_work()
+            && !is_waiting(second, &seen[second], self.waiting[second])
+        {
             [0.0, 0.0, 0.0, if grasps { 1.0 } else { 0.0 }]
         } else {
             self.controllers[first].act(part(observation, first), goal_of(goal, first))
@@ -96,7 +112,7 @@ impl Pair {
         let inputs_second = if second_may {
             self.controllers[second].act(part(observation, second), goal_of(goal, second))
         } else {
-            retreat(second, &seen)
+            retreat(second, &seen, &mut self.waiting[second])
         };
         for (arm, inputs) in [(first, inputs_first), (second, inputs_second)] {
             let n = self.layout.task.action_per_arm();
@@ -144,17 +160,52 @@ fn may_go_first(layout: Layout, seen: &[Seen; 2], arm: usize) -> bool {
     other_holds && is_beside(second.object) && is_beside(second.goal)
 }
 
-/// Moves the hand of `arm` up and back to its base, away from the other arm's object and goal.
-fn retreat(arm: usize, seen: &[Seen; 2]) -> [f32; 4] {
+/// Where a hand can wait, arm frame, metres.
+const WAITING_M: [Flat; 3] = [[-0.04, -0.18], [-0.04, 0.0], [-0.04, 0.18]];
+
+/// Height at which it waits, metres.
+const WAITING_Z_M: f32 = 0.24;
+
+/// Whether the hand of `arm` is where it waits.
+fn is_waiting(arm: usize, own: &Seen, waiting: usize) -> bool {
+    let sign = if arm == 0 { 1.0 } else { -1.0 };
+    let [x, y] = WAITING_M[waiting];
+    let place = [sign * (x - 0.5 * WORKSPACE_DISTANCE_M), sign * y, 0.0];
+    length(flat_between(place, own.hand)) < 0.02
+}
+
+/// Moves the hand of `arm` up and back to its base, away from everything that the other arm still has to reach, and
+/// updates the place in [`WAITING_M`] where it waits.
+fn retreat(arm: usize, seen: &[Seen; 2], waiting: &mut usize) -> [f32; 4] {
     let sign = if arm == 0 { 1.0 } else { -1.0 };
     let (own, other) = (&seen[arm], &seen[1 - arm]);
-    let busy_y = sign * 0.5 * (other.object[1] + other.goal[1]);
+    let busy = [other.hand, other.object, other.goal, behind(other)];
+    let room_m = |idx: usize| {
+        let [x, y] = WAITING_M[idx];
+        let place = [sign * (x - 0.5 * WORKSPACE_DISTANCE_M), sign * y, 0.0];
+        let distances = busy.map(|point| length(flat_between(place, point)));
+        distances.into_iter().fold(f32::INFINITY, f32::min)
+    };
+    let best = (0..WAITING_M.len()).max_by(|&a, &b| room_m(a).total_cmp(&room_m(b)));
+    if let Some(best) = best
+        && room_m(*waiting) < ROOM_M
+        && room_m(best) > room_m(*waiting) + 0.02
+    {
+        *waiting = best;
+    }
     let hand = [sign * own.hand[0] + 0.5 * WORKSPACE_DISTANCE_M, sign * own.hand[1], own.hand[2]];
-    let aside_m = if busy_y > 0.0 { -0.18 } else { 0.18 };
     // First up, clear of all objects.
     let low = hand[2] < 0.11;
-    let target = if low { [hand[0], hand[1], 0.2] } else { [-0.04, aside_m, 0.2] };
+    let [x, y] = WAITING_M[*waiting];
+    let target = if low { [hand[0], hand[1], WAITING_Z_M] } else { [x, y, WAITING_Z_M] };
     towards(hand, target, 1.0, 1.0)
+}
+
+/// The point behind an object from which a hand pushes it to its goal.
+fn behind(seen: &Seen) -> [f32; 3] {
+    let [x, y] = flat_between(seen.goal, seen.object);
+    let share = 0.055 / length([x, y]).max(1e-6);
+    [seen.object[0] + share * x, seen.object[1] + share * y, seen.object[2]]
 }
 
 /// The smallest horizontal distance between what one arm still has to pass and what the other one has.
