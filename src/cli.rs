@@ -21,7 +21,9 @@ pub(crate) use bridge::{
 };
 pub(crate) use monitor::{HealthArgs, StatusArgs};
 pub(crate) use policy::{ExportArgs, ImportArgs, PolicyArgs, PolicyCommand, ShowArgs};
-pub(crate) use results::{EvalArgs, McapArgs, McapCommand, PictureArgs, ReplayArgs, ReportArgs};
+pub(crate) use results::{
+    EvalArgs, FilmArgs, McapArgs, McapCommand, OutcomeName, PictureArgs, ReplayArgs, ReportArgs,
+};
 pub(crate) use scene::SceneArgs;
 pub(crate) use service::{
     ClientArgs, EnvArgs, EnvGuardArgs, EnvironmentArgs, LearnerArgs, ListenArgs, RelayArgs,
@@ -93,7 +95,7 @@ pub(crate) enum Command {
     Mcap(McapArgs),
     /// Simulates recorded episodes again and compares them bit for bit.
     Replay(ReplayArgs),
-    /// Renders a step of an episode as an SVG picture.
+    /// Draws a step of an episode as a PNG picture.
     Picture(PictureArgs),
     /// Prints the simulated world, and episodes in it, as JSON for other physics engines.
     Scene(SceneArgs),

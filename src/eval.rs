@@ -6,20 +6,23 @@ use std::path::Path;
 
 use rayon::iter::{IntoParallelRefIterator as _, ParallelIterator as _};
 use tandem_core::work::{EpisodeOrder, RunTerms};
-use tandem_core::{AdviceTerms, Episode, Exploration, TaskSpec, WorldSettings};
+use tandem_core::{AdviceTerms, Episode, Exploration, Layout, TaskSpec, WorldSettings};
+use tandem_picture::FilmEpisode;
 use tandem_worker::record::{RecordError, log_name, metadata_of, record_episode};
 
-use crate::cli::{EvalArgs, check_layout, check_task};
+use crate::cli::{EvalArgs, OutcomeName, check_layout, check_task};
 use crate::environment_server::names_server;
 use crate::evaluation::{EvaluatedPolicy, EvaluationResult, Part, measure, measure_served};
 use crate::exit::{Exit, Failed, OrExit as _};
-use crate::{output, policy_file};
+use crate::film::PlannedFilm;
+use crate::{film, output, policy_file};
 use baselines::Baselines;
 
 pub(crate) fn eval(args: &EvalArgs) -> Result<(), Failed> {
     if names_server(&args.environment) {
         return eval_served(args);
     }
+    let film = PlannedFilm::of(&args.film)?;
     let subject = subject(args)?;
     subject.warn_if_trained_on(args.seed);
     let result = measure(&subject, args.episodes, args.seed)?;
@@ -36,7 +39,32 @@ pub(crate) fn eval(args: &EvalArgs) -> Result<(), Failed> {
             record(&subject, &terms, args.seed, episode, &path)
         })?;
     }
+    if let Some(film) = film {
+        film.write(&filmed(args, subject.layout(), &result.episodes)?)?;
+    }
     print(args, &result, &baselines)
+}
+
+/// Returns the episodes that the film shows.
+fn filmed(
+    args: &EvalArgs,
+    layout: Layout,
+    episodes: &[Episode],
+) -> Result<Vec<FilmEpisode>, Failed> {
+    let is_shown = |episode: &&Episode| match args.film_outcome {
+        None => true,
+        Some(OutcomeName::Success) => episode.succeeded(),
+        Some(OutcomeName::Failure) => !episode.succeeded(),
+    };
+    let n_shown = usize::try_from(args.film_episodes).unwrap_or(usize::MAX);
+    let shown: Vec<&Episode> = episodes.iter().filter(is_shown).take(n_shown).collect();
+    if shown.is_empty() {
+        return Err(Failed::usage(format!(
+            "--film-outcome: none of {} episodes has this outcome; try more --episodes or another --seed",
+            episodes.len()
+        )));
+    }
+    shown.into_iter().map(|episode| film::of_evaluation(layout, args.seed, episode)).collect()
 }
 
 /// Evaluates a policy in the environments of a server.
@@ -46,9 +74,9 @@ fn eval_served(args: &EvalArgs) -> Result<(), Failed> {
             "--baselines needs the simulator of this program: leave out --env and --env-command",
         ));
     }
-    if args.record.is_some() || args.record_dir.is_some() {
+    if args.record.is_some() || args.record_dir.is_some() || args.film.film.is_some() {
         return Err(Failed::usage(
-            "--record and --record-dir need the simulator of this program: leave out --env and --env-command",
+            "--record, --record-dir and --film need the simulator of this program: leave out --env and --env-command",
         ));
     }
     let (part, path) = match (&args.policy, &args.composed_teachers) {
@@ -75,7 +103,9 @@ fn print(args: &EvalArgs, result: &EvaluationResult, baselines: &Baselines) -> R
     let recorded = args.record.iter().chain(&args.record_dir);
     recorded
         .map(|path| path.display())
-        .try_for_each(|path| output::print(format_args!("recorded      {path}")))
+        .try_for_each(|path| output::print(format_args!("recorded      {path}")))?;
+    let film = args.film.film.iter().map(|path| path.display());
+    film.into_iter().try_for_each(|path| output::print(format_args!("film          {path}")))
 }
 
 /// Returns the terms of an evaluation, for the metadata of its logs.

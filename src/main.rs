@@ -18,6 +18,7 @@ mod environment_server;
 mod eval;
 mod evaluation;
 mod exit;
+mod film;
 mod health;
 mod input;
 mod launch;

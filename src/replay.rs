@@ -9,16 +9,21 @@ use rayon::iter::{IntoParallelIterator as _, ParallelIterator as _};
 use serde_json::{Value, json};
 use tandem_core::TaskSpec;
 use tandem_core::text::error_chain;
+use tandem_picture::FilmEpisode;
 use tandem_telemetry::{EpisodeLog, LoggedTransition, read_episode};
 use tandem_worker::EnvironmentConfig;
-use tandem_worker::record::RecordError;
+use tandem_worker::record::{RecordError, world_of};
 use tandem_worker::replay::{replay_log, replay_log_on};
 
 use crate::cli::ReplayArgs;
 use crate::environment_server::EnvironmentSource;
 use crate::exit::{Exit, Failed, OrExit as _};
+use crate::film::PlannedFilm;
 use crate::service::worker_failed;
-use crate::{access, output, runtime};
+use crate::{access, film, output, runtime};
+
+/// Maximum number of logs in a film.
+const MAX_FILMED: usize = 100;
 
 /// A log that was simulated again.
 struct Replayed {
@@ -37,8 +42,15 @@ struct Server {
 }
 
 pub(crate) fn replay(args: &ReplayArgs) -> Result<(), Failed> {
+    let planned = PlannedFilm::of(&args.film)?;
     let files = find_logs(&args.files)?;
-    let is_printed = !args.verify && !args.json;
+    if let Some(film) = planned {
+        film.write(&filmed(&files)?)?;
+        if !args.json {
+            output::print(film)?;
+        }
+    }
+    let is_printed = !args.verify && !args.json && args.film.film.is_none();
     let printed = if let ([file], true) = (files.as_slice(), is_printed) {
         print_steps(file)?;
         true
@@ -58,6 +70,30 @@ pub(crate) fn replay(args: &ReplayArgs) -> Result<(), Failed> {
     }
     print_result(&replayed, args.json)?;
     result(&replayed)
+}
+
+/// Simulates the logged episodes again, for a film.
+fn filmed(files: &[PathBuf]) -> Result<Vec<FilmEpisode>, Failed> {
+    if files.len() > MAX_FILMED {
+        return Err(Failed::usage(format!(
+            "--film of {} episodes: name at most {MAX_FILMED} logs",
+            files.len()
+        )));
+    }
+    let of_log = |file: &PathBuf| {
+        let log = read_episode(file).or_exit(Exit::Data, String::new)?;
+        let context = || file.display().to_string();
+        let world = world_of(&log.metadata).map_err(|error| {
+            let exit = match error {
+                RecordError::NoSimulator { .. } => Exit::Usage,
+                _ => Exit::Data,
+            };
+            Failed::new(exit, error).context(context())
+        })?;
+        let actions = log.transitions.iter().map(|step| step.action.as_slice());
+        film::of_actions(world, actions, log.metadata.episode).or_exit(Exit::Data, context)
+    };
+    files.iter().map(of_log).collect()
 }
 
 /// Simulates all logs again.

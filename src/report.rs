@@ -4,17 +4,18 @@ use std::path::{Path, PathBuf};
 
 use serde_json::json;
 use tandem_report::{
-    Baseline, Comparison, PlottedTrials, ReportFiles, ReportInputs, TestEvaluation, Trials, export,
-    report_html, trials,
+    Baseline, Comparison, FilmStrip, PlottedTrials, ReportFiles, ReportInputs, TestEvaluation,
+    Trials, comparison, export, report_html, trials,
 };
 
 use tandem_core::evaluation::TEST_SEED;
+use tandem_core::text::counted;
 use tandem_telemetry::ContactMetrics;
 
 use crate::cli::ReportArgs;
 use crate::evaluation::{EvaluatedPolicy, EvaluationResult, measure};
 use crate::exit::{Exit, Failed, OrExit as _};
-use crate::{output, policy_file};
+use crate::{film, output, policy_file};
 
 /// Number of test goals for the evaluation of composed teachers, as for `tandem eval` and at the end of a run.
 const TEST_EPISODES: u64 = 240;
@@ -23,7 +24,8 @@ pub(crate) fn report(args: &ReportArgs) -> Result<(), Failed> {
     let inputs = ReportInputs::load(&args.paths).or_exit(Exit::Data, String::new)?;
     let trials = Trials::of(inputs.trials);
     warn(inputs.warnings.iter().chain(&trials.warnings));
-    let comparison = Comparison::of(inputs.runs, baselines(args)?);
+    let mut comparison = Comparison::of(inputs.runs, baselines(args)?);
+    comparison.films = films(args)?;
     let page = args.out.clone().unwrap_or_else(|| default_page(&args.paths));
     let plotted = if args.all_trials { PlottedTrials::All } else { PlottedTrials::Failed };
     let files = report_html(&comparison, &trials, plotted, &page).or_cannot_write(String::new)?;
@@ -55,15 +57,13 @@ fn print(
     }
     if !comparison.sections.is_empty() {
         output::print(comparison.text())?;
-        output::print(
-            "several runs: mean (smallest–largest); [95 % interval over the episodes of all runs]",
-        )?;
+        output::print(comparison::notes())?;
     }
-    let n_plots = files.plots.len();
-    output::print(format_args!(
-        "report        {}; plots in the same directory: {n_plots}",
-        files.page.display()
-    ))?;
+    output::print(format_args!("report        {}", files.page.display()))?;
+    if let Some(directory) = files.plots.first().and_then(|figure| figure.parent()) {
+        let n_figures = counted(files.plots.len(), "file");
+        output::print(format_args!("figures       {}: {n_figures}", directory.display()))?;
+    }
     if let Some(path) = &args.csv {
         output::print(format_args!("csv           {}", path.display()))?;
     }
@@ -110,11 +110,36 @@ fn stem(path: &Path) -> String {
     path.file_stem().unwrap_or(path.as_os_str()).to_string_lossy().into_owned()
 }
 
-/// Returns `report.html` in the directory of the report, unless there are several directories or it is that of a single
-/// run, which has its own page.
+/// Plays the test goals with each policy of `--film-strips` and draws the first success and the first failure.
+fn films(args: &ReportArgs) -> Result<Vec<FilmStrip>, Failed> {
+    let mut films = Vec::new();
+    for (path, n) in args.film_strips.iter().zip(1..) {
+        let subject = EvaluatedPolicy::new(policy_file::load(path)?, path)?;
+        let episodes = subject.play(TEST_EPISODES, TEST_SEED)?;
+        for (outcome, is_success) in [("success", true), ("failure", false)] {
+            let first = episodes.iter().find(|episode| episode.succeeded() == is_success);
+            let Some(first) = first else {
+                warn(std::iter::once(&format!(
+                    "{}: no {outcome} on {TEST_EPISODES} test goals",
+                    path.display()
+                )));
+                continue;
+            };
+            let episode = film::of_evaluation(subject.layout(), TEST_SEED, first)?;
+            let png = film::strip(std::slice::from_ref(&episode))?;
+            let title = format!("{}: {outcome}, test goal {}", path.display(), first.number);
+            films.push(FilmStrip { title, file_name: format!("film-{n}-{outcome}.png"), png });
+        }
+    }
+    Ok(films)
+}
+
+/// Returns `report.html` in the directory of the report if there is a single one. The directory of a run has a page of
+/// that name, so that the comparison becomes `comparison.html`.
 fn default_page(paths: &[PathBuf]) -> PathBuf {
     match paths {
-        [dir] if dir.is_dir() && !dir.join("metrics.jsonl").exists() => dir.join("report.html"),
+        [dir] if dir.join("metrics.jsonl").exists() => dir.join("comparison.html"),
+        [dir] if dir.is_dir() => dir.join("report.html"),
         _ => PathBuf::from("report.html"),
     }
 }

@@ -62,7 +62,7 @@ fn a_result_that_cannot_be_written_is_reported_in_one_line() {
     let directory = directory();
     let path = |name: &str| directory.path().join(name).to_str().expect("UTF-8").to_owned();
     let (episode, recovered, picture) =
-        (path("one.mcap"), path("recovered.mcap"), path("arms.svg"));
+        (path("one.mcap"), path("recovered.mcap"), path("arms.png"));
     let recorded =
         tandem(&["eval", "--policy", POLICY, "--episodes", "1", "--record", &episode]).output();
     assert!(recorded.expect("runs").status.success());

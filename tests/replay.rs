@@ -361,6 +361,37 @@ fn an_episode_is_compared_in_the_environments_of_a_server() {
 }
 
 #[test]
+fn a_film_of_an_evaluation_has_the_bytes_of_one_of_its_log() {
+    let directory = tempfile::tempdir().expect("a directory");
+    let path = |name: &str| directory.path().join(name);
+    let (log, played, replayed) = (path("one.mcap"), path("played.gif"), path("replayed.gif"));
+    let policy = Path::new("policies/teacher-push.safetensors");
+    let film = ["--film-size", "96x64", "--film"];
+    let eval = ["eval", "--episodes", "1", "--policy"];
+    let output = Command::new(env!("CARGO_BIN_EXE_tandem"))
+        .current_dir(env!("CARGO_MANIFEST_DIR"))
+        .args(eval)
+        .arg(policy)
+        .arg("--record")
+        .arg(&log)
+        .args(film)
+        .arg(&played)
+        .output();
+    let output = output.expect("runs");
+    assert!(output.status.success(), "{output:?}");
+    assert!(stdout(&output).contains("film          "), "{output:?}");
+    let output = tandem(&["replay", film[0], film[1]], &[&log, Path::new("--film"), &replayed]);
+    assert!(output.status.success(), "{output:?}");
+    let [played, replayed] = [played, replayed].map(|film| fs::read(film).expect("written"));
+    assert!(played.starts_with(b"GIF89a") && played == replayed);
+
+    let strip = path("strip.png");
+    let output = tandem(&["replay", film[0], film[1]], &[&log, Path::new("--film"), &strip]);
+    assert!(output.status.success(), "{output:?}");
+    assert!(fs::read(strip).expect("written").starts_with(b"\x89PNG"));
+}
+
+#[test]
 fn a_changed_action_or_world_changes_the_replay() {
     let keep = tempfile::tempdir().expect("a directory");
     let log = read_episode(&one_log(keep.path())).expect("whole");

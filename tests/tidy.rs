@@ -4,11 +4,12 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 use std::path::{Path, PathBuf};
 
-const ALLOWED: [(&str, &[&str]); 19] = [
+const ALLOWED: [(&str, &[&str]); 20] = [
     ("core", &[]),
     ("system", &[]),
     ("kinematics", &["core"]),
     ("sim", &["core"]),
+    ("picture", &["core"]),
     ("policy", &["core", "system"]),
     ("proto", &["core"]),
     ("telemetry", &["core", "system"]),
@@ -27,12 +28,13 @@ const ALLOWED: [(&str, &[&str]); 19] = [
 ];
 
 /// The Python package, which has a workspace of its own and is in no image.
-const PYTHON: (&str, &[&str]) = ("python", &["core", "sim", "policy"]);
+const PYTHON: (&str, &[&str]) = ("python", &["core", "picture", "sim", "policy"]);
 
 /// Directories of which every file is pure, and single pure files.
-const PURE: [&str; 26] = [
+const PURE: [&str; 27] = [
     "core/src",
     "kinematics/src",
+    "picture/src",
     "sim/src",
     "policy/src",
     "rl/src",

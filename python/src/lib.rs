@@ -4,7 +4,6 @@
 //! same bits as the Rust crates, because it calls them.
 
 mod episode;
-mod picture;
 mod policy;
 mod simulation;
 mod vector;

@@ -7,10 +7,10 @@ use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyTuple};
 use tandem_core::reward::sparse_reward;
 use tandem_core::{Contacts, WorldSettings};
+use tandem_picture::render;
 use tandem_sim::SimError;
 
 use crate::episode::{Episode, step_error, value_error};
-use crate::picture::picture;
 
 /// Observation, reward, terminated, truncated and info, as `gymnasium.Env.step` returns them.
 type Step<'py> = (Bound<'py, PyDict>, f32, bool, bool, Bound<'py, PyDict>);
@@ -148,7 +148,7 @@ impl Simulation {
         width: usize,
         height: usize,
     ) -> PyResult<Bound<'py, PyArray3<u8>>> {
-        let pixels = py.detach(|| picture(&self.episode.env.scene(), width, height));
+        let pixels = py.detach(|| render(&self.episode.env.scene(), width, height).rgb);
         PyArray1::from_vec(py, pixels).reshape([height, width, 3])
     }
 }

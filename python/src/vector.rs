@@ -5,10 +5,10 @@ use pyo3::prelude::*;
 use rayon::prelude::*;
 use rayon::{ThreadPool, ThreadPoolBuilder};
 use tandem_core::{Contacts, WorldSettings};
+use tandem_picture::render;
 use tandem_sim::SimError;
 
 use crate::episode::{Episode, step_error, value_error};
-use crate::picture::picture;
 use crate::simulation::{Course, NewArguments, settings_arguments};
 
 /// When an environment whose episode is over starts the next one; the modes of Gymnasium.
@@ -201,7 +201,7 @@ impl VectorSimulation {
         width: usize,
         height: usize,
     ) -> PyResult<Vec<Bound<'py, PyArray3<u8>>>> {
-        let draw = |slot: &Slot| picture(&slot.episode.env.scene(), width, height);
+        let draw = |slot: &Slot| render(&slot.episode.env.scene(), width, height).rgb;
         let pictures: Vec<Vec<u8>> =
             py.detach(|| self.threads.install(|| self.slots.par_iter().map(draw).collect()));
         let pictures = pictures.into_iter();

@@ -1,25 +1,12 @@
-//! Draws a synthetic scene and learning curves into the directory given on the command line.
+//! Draws synthetic learning curves into the directory given on the command line.
 
 use std::path::PathBuf;
 
-use tandem_report::{
-    Axis, CurveOptions, Quantity, Series, View, curve_svg, run_report_html, scene_svg,
-};
+use tandem_report::{Axis, CurveOptions, Quantity, Series, curve_svg, run_report_html};
 use tandem_telemetry::{MetricsLog, MetricsRow};
-
-#[path = "../../telemetry/tests/support/synthetic.rs"]
-#[expect(dead_code, reason = "only the scene is drawn")]
-mod synthetic;
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {
     let dir = std::env::args_os().nth(1).map(PathBuf::from).ok_or("usage: pictures DIR")?;
-    for (name, progress) in [("start", 0.0), ("middle", 0.5), ("end", 1.0)] {
-        let view = View { caption: Some(format!("synthetic episode, {name}")), ..View::default() };
-        std::fs::write(
-            dir.join(format!("scene-{name}.svg")),
-            scene_svg(&synthetic::scene(progress), &view),
-        )?;
-    }
     let runs = [("none", 0.0), ("mc-q:0.1, half of the episodes", 1.0), ("ea", 0.6)];
     let series: Vec<Series> = runs
         .iter()
@@ -27,7 +14,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         .collect();
     std::fs::write(
         dir.join("success.svg"),
-        curve_svg(&series, &CurveOptions::shares("Two arms push", Axis::EnvSteps))?,
+        curve_svg(&series, &CurveOptions::of("Two arms push", Quantity::Success, Axis::EnvSteps))?,
     )?;
     let metrics_path = dir.join("metrics.jsonl");
     std::fs::File::create(&metrics_path)?;

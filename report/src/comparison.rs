@@ -1,17 +1,37 @@
 //! Comparison of runs: the tables of a report, in one section for each task and number of arms.
 
 use crate::group::{MILESTONES, SeedGroup, TaskSetup, group_by_settings};
-use crate::paper::{PaperRow, TABLE_2};
+use crate::paper::{PaperMeasures, TABLE_2};
 use crate::run::Run;
-use crate::table::{NONE, Table, optional, share_spread, short_number, spread};
+use crate::table::{NONE, Table, optional, share_spread, short_number, spread, wrapped};
 use crate::test_evaluation::TestEvaluation;
+
+mod summary;
 
 /// Runs and baselines, by task and number of arms.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Comparison {
     /// Sections, push before pick and place and two arms before one.
     pub sections: Vec<Section>,
+    /// Film strips of episodes.
+    pub films: Vec<FilmStrip>,
 }
+
+/// A film strip of an episode, for the page of a report.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct FilmStrip {
+    /// Describes the episode.
+    pub title: String,
+    /// Name of the strip's own file, without a directory.
+    pub file_name: String,
+    /// Content of the PNG file.
+    pub png: Vec<u8>,
+}
+
+/// Explains the paper's measures.
+pub const LEGEND: &str = "IE: epochs until success is 10 % of its maximum. RT: epochs from there to 90 % of it. MSR: maximum \
+     success. ELR: 90 % of MSR per epoch until it was reached. IE, RT and ELR are – if MSR is below 0.5 or a run has fewer \
+     than 5 evaluations. An epoch is 50 rounds.";
 
 /// The runs of one task and number of arms.
 #[derive(Debug, Clone, PartialEq)]
@@ -33,6 +53,14 @@ pub struct Baseline {
     pub test: TestEvaluation,
 }
 
+/// Returns the notes to [`Comparison::text`], for a terminal.
+#[must_use]
+pub fn notes() -> String {
+    let notes = "Means over runs, with the number of runs that have the value if some do not. The page has curves, ranges \
+         and all intervals.";
+    format!("{}{}", wrapped(notes), wrapped(LEGEND).trim_end())
+}
+
 impl Comparison {
     /// Compares `runs` with each other and with `baselines`.
     #[must_use]
@@ -52,14 +80,19 @@ impl Comparison {
             add_baseline(&mut sections, baseline);
         }
         sections.sort_by_key(|section| section.setup.sort_key());
-        Self { sections }
+        Self { sections, films: Vec::new() }
     }
 
-    /// Formats all tables for a terminal.
+    /// Formats the means of all groups for a terminal of 80 columns, and the names of runs without an evaluation.
     #[must_use]
     pub fn text(&self) -> String {
-        let tables = self.sections.iter().flat_map(Section::tables);
-        tables.map(|table| table.text()).collect::<Vec<_>>().join("\n")
+        let sections = self.sections.iter().map(|section| {
+            let tables = section.summaries();
+            let texts: Vec<String> = tables.iter().map(Table::text).collect();
+            let hint = section.hint().map(|hint| format!("\n{}", wrapped(&hint)));
+            format!("{}{}", texts.join("\n"), hint.unwrap_or_default())
+        });
+        sections.collect::<Vec<_>>().join("\n")
     }
 }
 
@@ -79,48 +112,56 @@ fn add_baseline(sections: &mut Vec<Section>, baseline: Baseline) {
 }
 
 impl Section {
-    /// Returns the tables of the paper's measures, of the cost of success, and of success itself.
+    /// Returns all values: success, its cost, and the measures of the paper's Table 2, with ranges and intervals.
     #[must_use]
     pub fn tables(&self) -> Vec<Table> {
-        let mut tables = Vec::new();
+        let mut tables = vec![self.success()];
         if !self.groups.is_empty() {
-            tables.extend([self.measures(), self.cost()]);
+            tables.extend([self.cost(), self.measures()]);
         }
-        tables.push(self.success());
         tables
     }
 
-    /// Returns the measures of the paper's Table 2, beside the paper's own values for strategies that it has.
-    fn measures(&self) -> Table {
-        let has_paper = self.groups.iter().any(|group| group.paper().is_some());
-        let mut header = vec!["strategy", "runs", "IE", "RT", "MSR", "ELR"];
-        if has_paper {
-            header.extend(["paper", "IE", "RT", "MSR", "ELR"]);
+    /// Returns the means: success on test goals first, then its cost and the measures of the paper's Table 2.
+    #[must_use]
+    pub fn summaries(&self) -> Vec<Table> {
+        let mut tables = vec![self.success_summary()];
+        if !self.groups.is_empty() {
+            tables.extend([self.cost_summary(), self.measures_summary()]);
         }
+        tables
+    }
+
+    /// Returns a hint for groups without an evaluation, whose rows are empty.
+    #[must_use]
+    pub fn hint(&self) -> Option<String> {
+        let is_empty = |group: &&SeedGroup| group.runs.iter().all(|run| run.rows.is_empty());
+        let empty: Vec<&str> =
+            self.groups.iter().filter(is_empty).map(|group| group.label.as_str()).collect();
+        let names = empty.join("; ");
+        (!empty.is_empty()).then(|| {
+            format!(
+                "No evaluation yet: {names}. A run is evaluated every evaluation.every_env_steps environment steps."
+            )
+        })
+    }
+
+    /// Returns the measures of the paper's Table 2.
+    fn measures(&self) -> Table {
         let title =
             format!("{}: measures of the paper's Table 2, epochs of 50 rounds", self.setup.title());
-        let mut table = Table::new(title, &header);
+        let mut table = Table::new(title, &["strategy", "runs", "IE", "RT", "MSR", "ELR"]);
         for group in &self.groups {
-            let mut row = vec![group.label.clone(), group.runs.len().to_string()];
-            row.extend([
+            table.rows.push(vec![
+                group.label.clone(),
+                group.runs.len().to_string(),
                 spread(&group.measure(|measures| measures.inspired_epoch), epochs),
                 spread(&group.measure(|measures| measures.rising_epochs), epochs),
                 spread(&group.measure(|measures| Some(measures.max_success)), four_digits),
                 spread(&group.measure(|measures| measures.learning_rate), four_digits),
             ]);
-            if has_paper {
-                row.extend(self.paper_cells(group.paper()));
-            }
-            table.rows.push(row);
         }
         table
-    }
-
-    fn paper_cells(&self, row: Option<&PaperRow>) -> [String; 5] {
-        let Some((row, task)) = row.zip(self.setup.built_in()) else {
-            return std::array::from_fn(|_| NONE.to_owned());
-        };
-        paper_row(row, row.measures(task))
     }
 
     /// Returns the environment steps, minutes and advice that the runs needed to reach the [`MILESTONES`].
@@ -147,8 +188,7 @@ impl Section {
             row.extend(MILESTONES.map(|success| {
                 spread(&group.at_milestone(success, |row| row.wall_s / 60.0), minutes)
             }));
-            let advice = |run: &Run| Some(run.last()?.advice_spent as f64);
-            row.push(spread(&group.spread(advice), short_number));
+            row.push(spread(&group.spread(advice_spent), short_number));
             table.rows.push(row);
         }
         table
@@ -160,26 +200,23 @@ impl Section {
         let header = [
             "strategy",
             "env steps",
-            "last",
-            "best",
             "test goals",
             "without arm contact",
+            "best evaluation",
+            "last evaluation",
             "joint norm",
             "contacts",
         ];
         let mut table = Table::new(title, &header);
         for group in &self.groups {
-            let env_steps = |run: &Run| Some(run.last()?.env_steps as f64);
             let last = |run: &Run| run.last().map(|row| (row.success, row.n_episodes));
-            let best = |run: &Run| run.best().map(|row| (row.success, row.n_episodes));
-            let test = |run: &Run| run.test.as_ref().map(|test| (test.success, test.n_episodes));
             table.rows.push(vec![
                 group.label.clone(),
                 spread(&group.spread(env_steps), short_number),
-                share_spread(&group.share(last)),
-                share_spread(&group.share(best)),
-                share_spread(&group.share(test)),
+                share_spread(&group.share(test_success)),
                 share_spread(&group.share(success_without_contact)),
+                share_spread(&group.share(best_success)),
+                share_spread(&group.share(last)),
                 spread(&group.spread(success_joint), three_digits),
                 spread(&group.spread(collision_rate), three_digits),
             ]);
@@ -187,6 +224,24 @@ impl Section {
         table.rows.extend(self.baselines.iter().map(baseline_row));
         table
     }
+}
+
+/// Returns the success on test goals and their number.
+fn test_success(run: &Run) -> Option<(f64, u64)> {
+    run.test.as_ref().map(|test| (test.success, test.n_episodes))
+}
+
+/// Returns the success of the best evaluation and the number of its episodes.
+fn best_success(run: &Run) -> Option<(f64, u64)> {
+    run.best().map(|row| (row.success, row.n_episodes))
+}
+
+fn env_steps(run: &Run) -> Option<f64> {
+    Some(run.last()?.env_steps as f64)
+}
+
+fn advice_spent(run: &Run) -> Option<f64> {
+    Some(run.last()?.advice_spent as f64)
 }
 
 /// Returns the success by the joint norm, on test goals or else of the last evaluation.
@@ -218,40 +273,58 @@ fn baseline_row(Baseline { label, test }: &Baseline) -> Vec<String> {
     vec![
         label.clone(),
         none(),
-        none(),
-        none(),
         format!("{:.3} [{low:.3}, {high:.3}]", test.success),
         test.contacts.success().map_or_else(none, |[success, low, high]| {
             format!("{success:.3} [{low:.3}, {high:.3}]")
         }),
+        none(),
+        none(),
         three_digits(test.success_joint),
         three_digits(test.collision_rate),
     ]
 }
 
-/// Returns the paper's Table 2 with the paper's values.
+/// Returns the paper's Table 2 with the paper's values, by the names of Tandem's strategies.
 #[must_use]
 pub fn paper_table() -> Table {
-    let header =
-        ["strategy", "push: IE", "RT", "MSR", "ELR", "pick and place: IE", "RT", "MSR", "ELR"];
+    let header = [
+        "strategy",
+        "in the paper",
+        "push: IE",
+        "RT",
+        "MSR",
+        "ELR",
+        "pick and place: IE",
+        "RT",
+        "MSR",
+        "ELR",
+    ];
     let mut table = Table::new("the paper's Table 2".to_owned(), &header);
     table.rows.extend(TABLE_2.iter().map(|row| {
-        let [name, push @ ..] = paper_row(row, &row.push);
-        let [_, pick_and_place @ ..] = paper_row(row, &row.pick_and_place);
-        std::iter::once(name).chain(push).chain(pick_and_place).collect()
+        let threshold = row.threshold.map(|threshold| format!(":{threshold}"));
+        let mut cells =
+            vec![format!("{}{}", row.strategy, threshold.unwrap_or_default()), row.name.to_owned()];
+        cells.extend(paper_cells(&row.push));
+        cells.extend(paper_cells(&row.pick_and_place));
+        cells
     }));
     table
 }
 
-fn paper_row(row: &PaperRow, measures: &crate::paper::PaperMeasures) -> [String; 5] {
+fn paper_cells(measures: &PaperMeasures) -> [String; 4] {
     let whole = |epochs: f64| format!("{epochs:.0}");
+    let has_learned = measures.inspired_epoch.is_some();
+    let rate = Some(measures.learning_rate).filter(|_| has_learned);
     [
-        row.name.to_owned(),
         optional(measures.inspired_epoch, whole),
         optional(measures.rising_epochs, whole),
         four_digits(measures.max_success),
-        four_digits(measures.learning_rate),
+        optional(rate, four_digits),
     ]
+}
+
+fn range(low: f64, high: f64) -> String {
+    format!("{low:.3}–{high:.3}")
 }
 
 fn epochs(epochs: f64) -> String {
@@ -317,32 +390,40 @@ mod tests {
     }
 
     #[test]
-    fn a_row_has_the_values_of_the_runs_and_of_the_paper() {
+    fn a_row_has_the_values_of_the_runs() {
         let runs = vec![
             run("push", "mc-q:0.1", 1, &[0.0, 0.1, 0.5, 0.9, 0.95]),
             run("push", "mc-q:0.1", 2, &[0.1, 0.5, 0.9, 0.9, 0.85]),
             run("push", "none", 1, &[0.0, 0.0]),
         ];
         let comparison = Comparison::of(runs, Vec::new());
-        let measures = comparison.sections[0].measures().text();
+        let section = &comparison.sections[0];
+        let row = |table: &Table, strategy: &str| {
+            table.rows.iter().find(|row| row[0] == strategy).unwrap()[1..].join("; ")
+        };
         assert_eq!(
-            cells(&measures, "mc-q:0.1")[..],
-            "mc-q:0.1 2 15.0 (10.0–20.0) 20.0 (20.0–20.0) 0.9250 (0.9000–0.9500) 0.0242 (0.0214–0.0270) \
-             MC-Q01 63 229 0.9583 0.0030"
-                .split_whitespace()
-                .collect::<Vec<_>>()
+            row(&section.measures(), "mc-q:0.1"),
+            "2; 15.0 (10.0–20.0); 20.0 (20.0–20.0); 0.9250 (0.9000–0.9500); 0.0242 (0.0214–0.0270)"
         );
+        assert_eq!(row(&section.measures(), "none"), "1; –; –; 0.0000; –");
         assert_eq!(
-            cells(&measures, "none"),
-            ["none", "1", "–", "–", "0.0000", "–", "NA", "–", "–", "0.0000", "0.0000"]
+            row(&section.cost(), "mc-q:0.1"),
+            "50k (40k–60k); 70k (60k–80k); 100k, 1 of 2; 3.8 (3.0–4.5); 5.2 (4.5–6.0); 7.5, 1 of 2; 20k (20k–20k)"
         );
-        let cost = comparison.sections[0].cost().text();
+        let text = comparison.text();
         assert_eq!(
-            cells(&cost, "mc-q:0.1")[..],
-            "mc-q:0.1 50k (40k–60k) 70k (60k–80k) 100k, 1 of 2 3.8 (3.0–4.5) 5.2 (4.5–6.0) 7.5, 1 of 2 20k (20k–20k)"
-                .split_whitespace()
-                .collect::<Vec<_>>()
+            cells(&text, "mc-q:0.1")[..],
+            ["mc-q:0.1", "2", "–", "–", "–", "0.925"],
+            "the success comes first"
         );
+        assert!(text.lines().all(|line| line.chars().count() <= 80), "{text}");
+        assert!(!text.contains("No evaluation yet"));
+    }
+
+    #[test]
+    fn a_run_without_an_evaluation_is_named() {
+        let comparison = Comparison::of(vec![run("push", "ea", 1, &[])], Vec::new());
+        assert!(comparison.text().contains("No evaluation yet: ea."), "{}", comparison.text());
     }
 
     #[test]
@@ -354,21 +435,14 @@ mod tests {
         let titles: Vec<String> =
             comparison.sections.iter().map(|section| section.setup.title()).collect();
         assert_eq!(titles, ["push, 2 arms", "pick-and-place, 2 arms"]);
-        let success = comparison.sections[0].success().text();
+        let row = comparison.sections[0].success().rows.pop().unwrap();
         assert_eq!(
-            cells(&success, "composed-teachers"),
-            [
-                "composed-teachers",
-                "–",
-                "–",
-                "–",
-                "0.958",
-                "[0.925,",
-                "0.977]",
-                "–",
-                "0.908",
-                "0.175"
-            ]
+            row,
+            ["composed-teachers", "–", "0.958 [0.925, 0.977]", "–", "–", "–", "0.908", "0.175"]
+        );
+        assert_eq!(
+            cells(&comparison.text(), "composed-teachers"),
+            ["composed-teachers", "–", "0.958", "0.925–0.977", "–", "–"]
         );
         assert_eq!(comparison.sections[1].baselines.len(), 1);
         assert_eq!(paper_table().rows.len(), 12);

@@ -2,7 +2,7 @@
 
 use plotters::coord::Shift;
 use plotters::prelude::{
-    ChartBuilder, Circle, Color as _, DrawingArea, IntoDrawingArea as _, IntoFont as _, LineSeries,
+    ChartBuilder, Color as _, DrawingArea, IntoDrawingArea as _, IntoFont as _, LineSeries,
     Polygon, RGBColor, Rectangle, SVGBackend, Text, TextStyle, WHITE,
 };
 use tandem_telemetry::MetricsRow;
@@ -10,15 +10,27 @@ use tandem_telemetry::MetricsRow;
 use crate::error::Error;
 use crate::table::short_number;
 
-/// Colours of the series, distinguishable by colour-blind readers; further series reuse them.
+mod marker;
+
+/// Colours of the series, distinguishable by colour-blind readers and of different brightness. Markers distinguish
+/// them without colours. Further series reuse both.
 const COLORS: [RGBColor; 6] = [
-    RGBColor(0x1f, 0x6f, 0xb8),
+    RGBColor(0x00, 0x5f, 0xa8),
     RGBColor(0xe0, 0x7b, 0x28),
-    RGBColor(0x2f, 0x93, 0x5f),
-    RGBColor(0x8a, 0x5a, 0xb5),
-    RGBColor(0xc4, 0x3d, 0x4b),
-    RGBColor(0x5b, 0x66, 0x73),
+    RGBColor(0x00, 0x8f, 0x6b),
+    RGBColor(0xb0, 0x58, 0x9a),
+    RGBColor(0x24, 0x29, 0x2f),
+    RGBColor(0x56, 0xa8, 0xdc),
 ];
+/// Number of markers on a curve, about.
+const N_MARKERS: usize = 10;
+/// Sizes of text, pixels. A plot is about as wide as half a page, so they are the sizes that readers see.
+const TITLE_PX: u32 = 15;
+const LEGEND_PX: u32 = 13;
+const TICK_PX: u32 = 12;
+/// Height of a line of the title, and distance of the first from the upper edge, pixels.
+const TITLE_LINE_PX: i32 = 20;
+const TITLE_TOP_PX: i32 = 14;
 pub(crate) const INK: RGBColor = RGBColor(0x24, 0x29, 0x2f);
 pub(crate) const FAINT_INK: RGBColor = RGBColor(0x6a, 0x73, 0x7d);
 pub(crate) const GRID: RGBColor = RGBColor(0xe6, 0xe9, 0xed);
@@ -48,8 +60,28 @@ impl Axis {
         match self {
             Self::EnvSteps => "environment steps",
             Self::Updates => "updates",
-            Self::Minutes => "minutes",
+            Self::Minutes => "wall time, minutes",
             Self::PaperEpochs => "paper epochs",
+        }
+    }
+
+    /// Returns a part of a title.
+    pub(crate) const fn against(self) -> &'static str {
+        match self {
+            Self::EnvSteps => "against environment steps",
+            Self::Updates => "against updates",
+            Self::Minutes => "against wall time",
+            Self::PaperEpochs => "against paper epochs",
+        }
+    }
+
+    /// Returns a part of a file name.
+    pub(crate) const fn slug(self) -> &'static str {
+        match self {
+            Self::EnvSteps => "environment-steps",
+            Self::Updates => "updates",
+            Self::Minutes => "minutes",
+            Self::PaperEpochs => "paper-epochs",
         }
     }
 
@@ -86,6 +118,25 @@ pub enum Quantity {
 }
 
 impl Quantity {
+    /// Returns the label of the vertical axis.
+    #[must_use]
+    pub const fn label(self) -> &'static str {
+        match self {
+            Self::Success | Self::SuccessJoint | Self::TrainingSuccess => "success rate",
+            Self::Moved | Self::CollisionRate | Self::CollisionRateBeforeSuccess => {
+                "share of episodes"
+            }
+            Self::MeanQ => "mean Q-value",
+            Self::AdviceSpent => "units of advice",
+        }
+    }
+
+    /// Returns whether the values are shares, in [0, 1].
+    #[must_use]
+    pub const fn is_share(self) -> bool {
+        !matches!(self, Self::MeanQ | Self::AdviceSpent)
+    }
+
     /// Returns the value of this metric in `row`.
     pub(crate) fn of(self, row: &MetricsRow) -> f64 {
         match self {
@@ -143,6 +194,8 @@ pub struct CurveOptions {
     pub title: String,
     /// Label of the horizontal axis.
     pub x_label: String,
+    /// Label of the vertical axis.
+    pub y_label: String,
     /// `true` if the values are shares, which are drawn on an axis from 0 to 100 %.
     pub percent: bool,
     /// Width, pixels.
@@ -152,22 +205,17 @@ pub struct CurveOptions {
 }
 
 impl CurveOptions {
-    /// Returns options for shares against `axis`, 760 by 400 pixels.
+    /// Returns options for `quantity` against `axis`, 560 by 360 pixels.
     #[must_use]
-    pub fn shares(title: &str, axis: Axis) -> Self {
+    pub fn of(title: &str, quantity: Quantity, axis: Axis) -> Self {
         Self {
             title: title.to_owned(),
             x_label: axis.label().to_owned(),
-            percent: true,
-            width: 760,
-            height: 400,
+            y_label: quantity.label().to_owned(),
+            percent: quantity.is_share(),
+            width: 560,
+            height: 360,
         }
-    }
-
-    /// Returns options for other values against `axis`, of the same size.
-    #[must_use]
-    pub fn values(title: &str, axis: Axis) -> Self {
-        Self { percent: false, ..Self::shares(title, axis) }
     }
 }
 
@@ -193,7 +241,8 @@ fn draw(series: &[Series], options: &CurveOptions, svg: &mut String) -> DrawResu
     let legend = legend(series, options.width);
     draw_header(&root, &legend, options)?;
     let n_lines = legend.last().map_or(0, |entry| entry.line + 1);
-    let (_, plot) = root.split_vertically(46 + LEGEND_LINE_PX * n_lines);
+    let header_px = legend_top_px(options) + LEGEND_LINE_PX * n_lines;
+    let (_, plot) = root.split_vertically(header_px);
     draw_plot(&plot, series, options)?;
     root.present()?;
     Ok(())
@@ -224,7 +273,7 @@ pub(crate) fn legend_positions<'a>(
     let width_px = i32::try_from(width_px).unwrap_or(i32::MAX);
     let (mut left, mut line) = (LEGEND_LEFT_PX, 0);
     let position = |name| {
-        let entry_px = 22 + estimated_width_px(name, 13);
+        let entry_px = 22 + estimated_width_px(name, LEGEND_PX);
         if left > LEGEND_LEFT_PX && left + entry_px > width_px {
             (left, line) = (LEGEND_LEFT_PX, line + 1);
         }
@@ -237,25 +286,56 @@ pub(crate) fn legend_positions<'a>(
 
 /// Draws the title and the legend.
 fn draw_header(root: &Area<'_>, legend: &[LegendEntry<'_>], options: &CurveOptions) -> DrawResult {
-    let title = (FONT, 17).into_font().style(plotters::style::FontStyle::Bold).color(&INK);
-    root.draw(&Text::new(options.title.clone(), (20, 16), title))?;
-    for (LegendEntry { name, left, line }, color) in legend.iter().zip(COLORS.iter().cycle()) {
-        let top = 44 + LEGEND_LINE_PX * line;
-        root.draw(&Rectangle::new([(*left, top + 6), (left + 16, top + 9)], color.filled()))?;
-        root.draw(&Text::new((*name).to_owned(), (left + 22, top), text_style(13, INK)))?;
+    let title = (FONT, TITLE_PX).into_font().style(plotters::style::FontStyle::Bold).color(&INK);
+    let mut top = TITLE_TOP_PX;
+    for line in title_lines(options) {
+        root.draw(&Text::new(line, (LEGEND_LEFT_PX, top), title.clone()))?;
+        top += TITLE_LINE_PX;
+    }
+    for (idx, LegendEntry { name, left, line }) in legend.iter().enumerate() {
+        let (color, middle) = (COLORS[idx % COLORS.len()], legend_top_px(options) + 7);
+        let middle = middle + LEGEND_LINE_PX * line;
+        root.draw(&Rectangle::new([(*left, middle - 1), (left + 16, middle + 1)], color.filled()))?;
+        marker::draw_in_legend(root, idx, (left + 8, middle), color)?;
+        let style = text_style(LEGEND_PX, INK);
+        root.draw(&Text::new((*name).to_owned(), (left + 22, middle - 7), style))?;
     }
     Ok(())
+}
+
+/// Returns the upper edge of the legend, pixels.
+fn legend_top_px(options: &CurveOptions) -> i32 {
+    let n_lines = i32::try_from(title_lines(options).len()).unwrap_or(i32::MAX / 64);
+    TITLE_TOP_PX + TITLE_LINE_PX * n_lines + 6
+}
+
+/// Breaks the title into lines that fit into the plot.
+fn title_lines(options: &CurveOptions) -> Vec<String> {
+    let room_px = i32::try_from(options.width).unwrap_or(i32::MAX) - 2 * LEGEND_LEFT_PX;
+    let mut lines: Vec<String> = Vec::new();
+    for word in options.title.split_whitespace() {
+        match lines.last_mut() {
+            Some(line)
+                if estimated_width_px(&format!("{line} {word}"), TITLE_PX + 1) <= room_px =>
+            {
+                line.push(' ');
+                line.push_str(word);
+            }
+            _ => lines.push(word.to_owned()),
+        }
+    }
+    lines
 }
 
 fn draw_plot(plot: &Area<'_>, series: &[Series], options: &CurveOptions) -> DrawResult {
     let (x_max, y_range) = (x_max(series), y_range(series, options.percent));
     let mut chart = ChartBuilder::on(plot)
-        .margin_left(8)
-        .margin_right(28)
-        .margin_bottom(8)
+        .margin_left(6)
+        .margin_right(24)
+        .margin_bottom(6)
         .margin_top(8)
-        .x_label_area_size(46)
-        .y_label_area_size(52)
+        .x_label_area_size(42)
+        .y_label_area_size(62)
         .build_cartesian_2d(0.0..x_max, y_range.clone())?;
     let y_label =
         |y: &f64| if options.percent { format!("{:.0} %", 100.0 * y) } else { short_number(*y) };
@@ -266,24 +346,30 @@ fn draw_plot(plot: &Area<'_>, series: &[Series], options: &CurveOptions) -> Draw
         .bold_line_style(GRID)
         .axis_style(GRID)
         .x_desc(options.x_label.as_str())
-        .x_labels(7)
+        .y_desc(options.y_label.as_str())
+        .x_labels(6)
         .y_labels(6)
         .x_label_formatter(&|x| short_number(*x))
         .y_label_formatter(&y_label)
-        .label_style(text_style(12, FAINT_INK))
-        .axis_desc_style(text_style(13, FAINT_INK))
+        .label_style(text_style(TICK_PX, FAINT_INK))
+        .axis_desc_style(text_style(LEGEND_PX, INK))
         .draw()?;
     for (one, color) in series.iter().zip(COLORS.iter().cycle()) {
         chart.draw_series(band(one).map(|outline| Polygon::new(outline, color.mix(0.16))))?;
     }
-    for (one, color) in series.iter().zip(COLORS.iter().cycle()) {
-        let mut line = one.points.iter().map(|point| (point.x, point.y));
-        chart.draw_series(LineSeries::new(line.clone(), color.stroke_width(2)))?;
-        if let Some(last) = line.next_back() {
-            chart.draw_series([Circle::new(last, 4, color.filled())])?;
-        }
+    for (idx, one) in series.iter().enumerate() {
+        let color = COLORS[idx % COLORS.len()];
+        let line = one.points.iter().map(|point| (point.x, point.y));
+        chart.draw_series(LineSeries::new(line, color.stroke_width(2)))?;
+        marker::draw(&mut chart, idx, &marked_points(one), color)?;
     }
     Ok(())
+}
+
+/// Returns the points of a curve that have a marker: the last, and others at equal distances before it.
+fn marked_points(series: &Series) -> Vec<(f64, f64)> {
+    let step = series.points.len().div_ceil(N_MARKERS).max(1);
+    series.points.iter().rev().step_by(step).map(|point| (point.x, point.y)).collect()
 }
 
 /// Returns the outline of a curve's band, if it has one.
@@ -359,6 +445,29 @@ mod tests {
         assert_eq!(positions(&[long, long, long]), [(20, 0), (127, 0), (20, 1)]);
         let longest = long.repeat(6);
         assert_eq!(positions(&[&longest, long]), [(20, 0), (20, 1)]);
+    }
+
+    #[test]
+    fn a_long_title_has_several_lines() {
+        let title = "push, 2 arms: success against wall time, thresholds of mc-act-abs (Figure 5d)";
+        let options = CurveOptions::of(title, Quantity::Success, Axis::Minutes);
+        let lines = title_lines(&options);
+        assert_eq!((lines.len(), lines.join(" ").as_str()), (2, title));
+        assert_eq!(legend_top_px(&options), 60);
+    }
+
+    #[test]
+    fn the_last_point_of_a_curve_has_a_marker() {
+        let points = |n: u32| Series {
+            name: String::new(),
+            points: (0..n).map(|x| CurvePoint { x: f64::from(x), y: 0.5, band: None }).collect(),
+        };
+        for n in [1, 9, 10, 11, 100] {
+            let marked = marked_points(&points(n));
+            assert_eq!(marked[0].0, f64::from(n - 1));
+            assert!(marked.len() <= N_MARKERS, "{n}");
+        }
+        assert!(marked_points(&points(0)).is_empty());
     }
 
     #[test]

@@ -39,7 +39,7 @@ fn run_cells(group: &SeedGroup, run: &Run) -> Vec<String> {
         value.filter(|v| v.is_finite()).map(|v| v.to_string()).unwrap_or_default()
     };
     let count = |value: Option<u64>| value.map(|v| v.to_string()).unwrap_or_default();
-    let measures = Some(LearningMeasures::of(&run.rows)).filter(|_| !run.rows.is_empty());
+    let measures = LearningMeasures::for_comparison(&run.rows);
     let last = run.last();
     let test = run.test.as_ref();
     let mut cells = vec![

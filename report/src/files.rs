@@ -68,13 +68,19 @@ pub(crate) fn read_text(path: &Path) -> std::io::Result<String> {
     String::from_utf8(regular_file::read(path)?).map_err(not_utf8)
 }
 
-/// Writes `text` to `path`.
-pub(crate) fn write_text(path: &Path, text: &str) -> Result<(), Error> {
-    std::fs::write(path, text).map_err(|source| Error::Io {
-        action: "write",
-        path: path.to_owned(),
-        source,
-    })
+/// Writes `content` to `path`.
+pub(crate) fn write(path: &Path, content: &[u8]) -> Result<(), Error> {
+    std::fs::write(path, content).map_err(write_error(path))
+}
+
+/// Creates a directory unless it exists.
+pub(crate) fn create_directory(path: &Path) -> Result<(), Error> {
+    std::fs::create_dir_all(path).map_err(write_error(path))
+}
+
+/// Returns a function for `map_err` on writing `path`.
+fn write_error(path: &Path) -> impl FnOnce(std::io::Error) -> Error {
+    move |source| Error::Io { action: "write", path: path.to_owned(), source }
 }
 
 /// Returns a function for `map_err` on reading `path`.

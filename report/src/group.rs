@@ -1,5 +1,7 @@
 //! Groups of runs that differ only in their seed, and statistics over them.
 
+use std::collections::{BTreeMap, BTreeSet};
+
 use tandem_core::{Task, Wilson};
 use tandem_telemetry::MetricsRow;
 use toml::{Table, Value};
@@ -12,6 +14,9 @@ use crate::run::Run;
 pub const MILESTONES: [f64; 3] = [0.5, 0.9, 0.95];
 /// Settings in which runs of one group may differ, besides the number of recorded episodes. None affects a result.
 const FREE_SETTINGS: [&str; 3] = ["name", "seed", "checkpoint"];
+
+/// Number of settings in a label at most.
+const MAX_DIFFERENCES: usize = 3;
 
 /// Task and number of arms. Runs with the same task setup share tables. Unknown values sort last.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -104,16 +109,22 @@ pub fn group_by_settings(runs: Vec<Run>) -> Vec<SeedGroup> {
     groups.sort_by_key(|group| {
         (group.setup.sort_key(), group.paper_index().unwrap_or(usize::MAX), group.label.clone())
     });
-    number_duplicate_labels(&mut groups);
+    distinguish_labels(&mut groups);
     groups
 }
 
 /// Returns a key that is equal for runs that differ only in their seed.
 fn settings_key(run: &Run) -> String {
-    let mut settings = run.settings();
-    if settings.is_empty() {
-        return format!("named {}", run.stem());
+    let settings = compared_settings(run);
+    match settings.is_empty() {
+        true => format!("named {}", run.stem()),
+        false => settings.to_string(),
     }
+}
+
+/// Returns the settings in which runs of one group are equal.
+fn compared_settings(run: &Run) -> Table {
+    let mut settings = run.settings();
     for free in FREE_SETTINGS {
         settings.remove(free);
     }
@@ -122,7 +133,58 @@ fn settings_key(run: &Run) -> String {
         evaluation.remove("recorded_episodes");
         evaluation.remove("test_episodes");
     }
-    settings.to_string()
+    settings
+}
+
+/// Distinguishes equal labels within a task setup by the settings that differ, such as `ea, ddpg.discount=0.9`. Groups
+/// without such settings are numbered: `NAME (#2)`.
+fn distinguish_labels(groups: &mut [SeedGroup]) {
+    let labels: Vec<String> = groups.iter().map(|group| group.label.clone()).collect();
+    for idx in 0..groups.len() {
+        let is_same = |other: &usize| {
+            labels[*other] == labels[idx] && groups[*other].setup == groups[idx].setup
+        };
+        let same: Vec<usize> = (0..groups.len()).filter(is_same).collect();
+        if same.len() > 1 {
+            groups[idx].label = format!("{}{}", labels[idx], differences(groups, idx, &same));
+        }
+    }
+    number_duplicate_labels(groups);
+}
+
+/// Returns the settings in which group `idx` differs from the groups `same`, as an addition to their label.
+fn differences(groups: &[SeedGroup], idx: usize, same: &[usize]) -> String {
+    let settings = |idx: usize| -> BTreeMap<String, String> {
+        let mut flat = BTreeMap::new();
+        if let Some(run) = groups[idx].runs.first() {
+            flatten("", &Value::Table(compared_settings(run)), &mut flat);
+        }
+        flat
+    };
+    let all: Vec<BTreeMap<String, String>> = same.iter().map(|other| settings(*other)).collect();
+    let own = settings(idx);
+    let keys: BTreeSet<&String> = all.iter().flat_map(BTreeMap::keys).collect();
+    let differs = |key: &&&String| all.iter().any(|other| other.get(**key) != own.get(**key));
+    let differing: Vec<&String> = keys.iter().filter(differs).copied().collect();
+    let shown = differing.iter().take(MAX_DIFFERENCES).map(|key| {
+        let value = own.get(*key).map_or("default", String::as_str);
+        format!(", {key}={value}")
+    });
+    let rest = if differing.len() > MAX_DIFFERENCES { ", …" } else { "" };
+    shown.chain([rest.to_owned()]).collect()
+}
+
+/// Adds the values of a table with their keys, joined by dots.
+fn flatten(prefix: &str, value: &Value, flat: &mut BTreeMap<String, String>) {
+    let Value::Table(table) = value else {
+        let text = value.as_str().map_or_else(|| value.to_string(), str::to_owned);
+        flat.insert(prefix.to_owned(), text);
+        return;
+    };
+    for (key, value) in table {
+        let path = if prefix.is_empty() { key.clone() } else { format!("{prefix}.{key}") };
+        flatten(&path, value, flat);
+    }
 }
 
 /// Numbers equal labels within a task setup from the second on: `NAME (#2)`.
@@ -188,11 +250,9 @@ impl SeedGroup {
         Spread::of(&values, self.runs.len())
     }
 
-    /// Returns the spread of one of the paper's measures.
+    /// Returns the spread of one of the paper's measures, see [`LearningMeasures::for_comparison`].
     pub fn measure(&self, measure: impl Fn(&LearningMeasures) -> Option<f64>) -> Spread {
-        self.spread(|run| {
-            measure(&LearningMeasures::of(&run.rows)).filter(|_| !run.rows.is_empty())
-        })
+        self.spread(|run| measure(&LearningMeasures::for_comparison(&run.rows)?))
     }
 
     /// Returns the spread of a value of each run's first evaluation with at least `success`.
@@ -367,21 +427,34 @@ mod tests {
     }
 
     #[test]
-    fn groups_with_equal_labels_are_numbered() {
+    fn groups_with_equal_labels_are_distinguished_by_the_settings_that_differ() {
         let groups = group_by_settings(vec![
             run("push-2-mc-q-0.1-seed1", &settings("mc-q:0.1", 1, 0.9), &[]),
-            run("push-2-mc-q-0.1-seed1", &settings("mc-q:0.1", 1, 0.95), &[]),
+            run("push-2-mc-q-0.1-seed1.2", &settings("mc-q:0.1", 1, 0.95), &[]),
             run("push-2-mc-q-0.1-seed1", &settings("mc-q:0.1", 1, 0.98), &[]),
         ]);
         let labels: Vec<&str> = groups.iter().map(|group| group.label.as_str()).collect();
-        assert_eq!(labels, ["mc-q:0.1", "mc-q:0.1 (#2)", "mc-q:0.1 (#3)"]);
+        let discounts = ["0.9", "0.95", "0.98"];
+        assert_eq!(labels, discounts.map(|value| format!("mc-q:0.1, ddpg.discount={value}")));
+    }
+
+    #[test]
+    fn groups_without_different_settings_are_numbered() {
+        let different = |name: &str, copy: u64| {
+            run(name, &format!("task = \"push\"\narms = 2\nname = \"{copy}\""), &[])
+        };
+        let mut groups =
+            vec![SeedGroup::of(different("push-2-a", 1)), SeedGroup::of(different("push-2-a", 2))];
+        distinguish_labels(&mut groups);
+        let labels: Vec<&str> = groups.iter().map(|group| group.label.as_str()).collect();
+        assert_eq!(labels, ["2-a", "2-a (#2)"]);
     }
 
     #[test]
     fn a_milestone_has_mean_range_and_number_of_runs_that_reached_it() {
         let group = group_by_settings(vec![
-            run("push-ea-seed1", &settings("ea", 1, 0.98), &[0.0, 0.3, 0.9, 0.96]),
-            run("push-ea-seed2", &settings("ea", 2, 0.98), &[0.2, 0.5, 0.5, 0.6]),
+            run("push-ea-seed1", &settings("ea", 1, 0.98), &[0.0, 0.3, 0.9, 0.96, 0.9]),
+            run("push-ea-seed2", &settings("ea", 2, 0.98), &[0.2, 0.5, 0.5, 0.6, 0.5]),
         ])
         .remove(0);
         let fifty = group.at_milestone(0.5, |row| row.env_steps as f64);

@@ -1,5 +1,7 @@
 //! Elements of HTML pages.
 
+use base64::prelude::{BASE64_STANDARD, Engine as _};
+
 use crate::plots::Plot;
 use crate::table::Table;
 
@@ -17,20 +19,43 @@ pub(crate) fn page(title: &str, body: &str) -> String {
 /// Returns a table below its title.
 pub(crate) fn titled_table(titled: &Table) -> String {
     let header: Vec<&str> = titled.header.iter().map(String::as_str).collect();
-    format!("<h2>{}</h2>{}", escaped(&titled.title), table(&header, &titled.rows))
+    format!("<h3>{}</h3>{}", escaped(&titled.title), table(&header, &titled.rows))
 }
 
-/// Returns a table that scrolls if it is wider than the page.
+/// Returns a table that scrolls if it is wider than the page. Ranges and intervals are below their values.
 pub(crate) fn table(header: &[&str], rows: &[Vec<String>]) -> String {
-    let row = |tag: &str, cells: &mut dyn Iterator<Item = &str>| {
-        let cells: String = cells.map(|cell| format!("<{tag}>{}</{tag}>", escaped(cell))).collect();
+    let head: String = header.iter().map(|cell| format!("<th>{}</th>", escaped(cell))).collect();
+    let row = |cells: &Vec<String>| {
+        let cells: String = cells.iter().map(|cell| format!("<td>{}</td>", value(cell))).collect();
         format!("<tr>{cells}</tr>")
     };
-    let body: String =
-        rows.iter().map(|cells| row("td", &mut cells.iter().map(String::as_str))).collect();
+    let body: String = rows.iter().map(row).collect();
     format!(
-        "<div class=scroll><table><thead>{}</thead><tbody>{body}</tbody></table></div>",
-        row("th", &mut header.iter().copied())
+        "<div class=scroll><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>"
+    )
+}
+
+/// Returns the content of a cell, with a range or interval that follows a number on a line of its own.
+fn value(cell: &str) -> String {
+    let is_number = cell.starts_with(|first: char| first.is_ascii_digit());
+    match cell.find(" (").or_else(|| cell.find(" [")).filter(|_| is_number) {
+        Some(at) => {
+            format!("{}<br><small>{}</small>", escaped(&cell[..at]), escaped(cell[at..].trim()))
+        }
+        None => escaped(cell),
+    }
+}
+
+/// Returns content that is folded until the reader opens it.
+pub(crate) fn details(summary: &str, content: &str) -> String {
+    format!("<details><summary>{}</summary>{content}</details>", escaped(summary))
+}
+
+/// Returns a film strip with its title. `png` is the content of its file.
+pub(crate) fn film_strip(title: &str, png: &[u8]) -> String {
+    let (title, data) = (escaped(title), BASE64_STANDARD.encode(png));
+    format!(
+        "<figure class=film><img alt=\"{title}\" src=\"data:image/png;base64,{data}\"><figcaption>{title}</figcaption></figure>"
     )
 }
 
@@ -49,4 +74,20 @@ pub(crate) fn svg_grid(svgs: &[&str]) -> String {
 /// Escapes text for HTML and SVG.
 pub(crate) fn escaped(text: &str) -> String {
     text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;").replace('"', "&quot;")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn ranges_are_below_their_values() {
+        assert_eq!(
+            value("0.996 (0.99–1.0) [0.9, 1.0]"),
+            "0.996<br><small>(0.99–1.0) [0.9, 1.0]</small>"
+        );
+        assert_eq!(value("0.958 [0.9, 1.0]"), "0.958<br><small>[0.9, 1.0]</small>");
+        assert_eq!(value("mc-q (#2)"), "mc-q (#2)");
+        assert_eq!(value("a < b"), "a &lt; b");
+    }
 }

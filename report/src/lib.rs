@@ -11,10 +11,11 @@
 //! let evaluation = MetricsRow { env_steps: 20_000, success: 0.75, n_episodes: 240, ..MetricsRow::default() };
 //! let run = Run { name: "push-seed1".to_owned(), rows: vec![evaluation], ..Run::default() };
 //! let comparison = Comparison::of(vec![run], Vec::new());
-//! assert!(comparison.text().contains("0.750"));
+//! assert!(comparison.text().contains("0.750"), "the best evaluation");
 //! ```
 #![warn(missing_docs)]
 
+mod color;
 pub mod comparison;
 pub mod curve;
 mod error;
@@ -28,12 +29,11 @@ pub mod pages;
 pub mod paper;
 pub mod plots;
 pub mod run;
-pub mod scene;
 pub mod table;
 pub mod test_evaluation;
 pub mod trials;
 
-pub use comparison::{Baseline, Comparison, Section};
+pub use comparison::{Baseline, Comparison, FilmStrip, Section};
 pub use curve::{Axis, CurveOptions, CurvePoint, Quantity, Series, curve_svg};
 pub use error::Error;
 pub use group::{SeedGroup, Spread, TaskSetup};
@@ -42,7 +42,6 @@ pub use measures::LearningMeasures;
 pub use pages::{ReportFiles, report_html, run_report_html};
 pub use plots::Plot;
 pub use run::Run;
-pub use scene::{View, scene_svg};
 pub use table::Table;
 pub use test_evaluation::TestEvaluation;
 pub use trials::{PlottedTrials, TrialGroup, Trials, trial_svg};

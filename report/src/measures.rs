@@ -6,6 +6,10 @@ use tandem_telemetry::MetricsRow;
 const INSPIRED_SHARE: f64 = 0.1;
 /// Share of the maximum success that defines the end of RT, and ELR.
 const RISEN_SHARE: f64 = 0.9;
+/// Maximum success below which the epochs of a curve say nothing about learning.
+const MIN_SUCCESS: f64 = 0.5;
+/// Number of evaluations below which the epochs of a curve are too coarse.
+const MIN_EVALUATIONS: usize = 5;
 /// Tolerance of comparisons: the product of two shares may miss the share it equals by rounding.
 const ROUNDING: f64 = 1e-9;
 
@@ -45,6 +49,24 @@ impl LearningMeasures {
     }
 }
 
+impl LearningMeasures {
+    /// Computes the measures for a comparison: without IE, RT and ELR if the maximum is below 0.5 or there are fewer
+    /// than five evaluations. Returns `None` if there are none.
+    #[must_use]
+    pub fn for_comparison(rows: &[MetricsRow]) -> Option<Self> {
+        let measures = Self::of(rows);
+        let is_meaningful =
+            measures.max_success >= MIN_SUCCESS - ROUNDING && rows.len() >= MIN_EVALUATIONS;
+        let epochs = |value: Option<f64>| value.filter(|_| is_meaningful);
+        (!rows.is_empty()).then(|| Self {
+            inspired_epoch: epochs(measures.inspired_epoch),
+            rising_epochs: epochs(measures.rising_epochs),
+            learning_rate: epochs(measures.learning_rate),
+            ..measures
+        })
+    }
+}
+
 /// Returns the first evaluation with a success of at least `success`.
 #[must_use]
 pub fn first_reaching(rows: &[MetricsRow], success: f64) -> Option<&MetricsRow> {
@@ -81,6 +103,18 @@ mod tests {
             (None, None, None)
         );
         assert_eq!(LearningMeasures::of(&[]).max_success, 0.0);
+    }
+
+    #[test]
+    fn a_short_or_low_curve_has_a_maximum_only() {
+        let epochs = |successes: &[f64]| {
+            let measures = LearningMeasures::for_comparison(&rows(successes)).unwrap();
+            (measures.inspired_epoch, measures.learning_rate.is_some(), measures.max_success)
+        };
+        assert_eq!(epochs(&[0.0, 0.1, 0.3, 0.4, 0.5]), (Some(10.0), true, 0.5));
+        assert_eq!(epochs(&[0.0, 0.1, 0.3, 0.4, 0.49]), (None, false, 0.49));
+        assert_eq!(epochs(&[0.0, 0.1, 0.3, 0.9]), (None, false, 0.9));
+        assert_eq!(LearningMeasures::for_comparison(&[]), None);
     }
 
     #[test]

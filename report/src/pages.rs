@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 
 use crate::comparison::Comparison;
 use crate::error::Error;
-use crate::files::write_text;
+use crate::files::{create_directory, write};
 use crate::html::page;
 use crate::plots::comparison_plots;
 use crate::run::Run;
@@ -21,7 +21,7 @@ use crate::trials::{PlottedTrials, Trials};
 pub fn run_report_html(run_dir: &Path) -> Result<PathBuf, Error> {
     let run = Run::load(run_dir, &mut Vec::new())?;
     let path = run_dir.join("report.html");
-    write_text(&path, &page(&run.name, &run::body(&run)?))?;
+    write(&path, page(&run.name, &run::body(&run)?).as_bytes())?;
     Ok(path)
 }
 
@@ -30,12 +30,13 @@ pub fn run_report_html(run_dir: &Path) -> Result<PathBuf, Error> {
 pub struct ReportFiles {
     /// The HTML page, which contains all plots.
     pub page: PathBuf,
-    /// The plots as SVG files, in the directory of the page.
+    /// The plots as SVG files and the film strips as PNG files, in a directory named after the page: `report-figures`
+    /// beside `report.html`.
     pub plots: Vec<PathBuf>,
 }
 
-/// Writes a page with the tables and plots of `comparison` and `trials` to `path`, and each plot to an SVG file in the
-/// same directory.
+/// Writes a page with the tables, plots and film strips of `comparison` and `trials` to `path`, and each figure to a file
+/// in a directory beside it; see [`ReportFiles`].
 ///
 /// # Errors
 /// If a curve cannot be drawn or a file cannot be written.
@@ -48,10 +49,17 @@ pub fn report_html(
     let curves = comparison_plots(comparison)?;
     let trial_plots = trials.plots(plotted);
     let mut files = ReportFiles { page: path.to_owned(), plots: Vec::new() };
-    for plot in curves.iter().chain(&trial_plots) {
-        let svg_path = path.with_file_name(&plot.file_name);
-        write_text(&svg_path, &plot.svg)?;
-        files.plots.push(svg_path);
+    let svgs = curves.all().chain(&trial_plots);
+    let svgs = svgs.map(|plot| (&plot.file_name, plot.svg.as_bytes()));
+    let films = comparison.films.iter().map(|film| (&film.file_name, film.png.as_slice()));
+    let directory = figures_directory(path);
+    for (file_name, content) in svgs.chain(films) {
+        if files.plots.is_empty() {
+            create_directory(&directory)?;
+        }
+        let figure = directory.join(file_name);
+        write(&figure, content)?;
+        files.plots.push(figure);
     }
     let (has_runs, has_trials) = (!comparison.sections.is_empty(), !trials.groups.is_empty());
     let mut body = String::new();
@@ -66,6 +74,12 @@ pub fn report_html(
         (false, true) => "Comparison of trials",
         (_, false) => "Comparison of runs",
     };
-    write_text(path, &page(title, &body))?;
+    write(path, page(title, &body).as_bytes())?;
     Ok(files)
+}
+
+/// Returns the directory of the figures of the page at `path`.
+fn figures_directory(path: &Path) -> PathBuf {
+    let stem = path.file_stem().unwrap_or_default().to_string_lossy();
+    path.with_file_name(format!("{stem}-figures"))
 }

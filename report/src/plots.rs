@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use tandem_core::Task;
 use tandem_telemetry::MetricsRow;
 
-use crate::comparison::{Comparison, Section};
+use crate::comparison::{Baseline, Comparison, Section};
 use crate::curve::{Axis, CurveOptions, CurvePoint, Quantity, Series, curve_svg};
 use crate::error::Error;
 use crate::group::SeedGroup;
@@ -40,24 +40,40 @@ struct Panel<'a> {
 }
 
 /// Plots of each panel: name, quantity, axis, and the number of the paper's figure for push and for pick and place.
-const VIEWS: [(&str, Quantity, Axis, Option<[u32; 2]>); 5] = [
-    ("success", Quantity::Success, Axis::PaperEpochs, Some([5, 7])),
+const VIEWS: [(&str, Quantity, Axis, Option<[u32; 2]>); 6] = [
     ("success", Quantity::Success, Axis::EnvSteps, None),
+    ("success", Quantity::Success, Axis::Updates, None),
     ("success", Quantity::Success, Axis::Minutes, None),
-    ("mean Q", Quantity::MeanQ, Axis::PaperEpochs, Some([6, 8])),
     ("advice spent", Quantity::AdviceSpent, Axis::EnvSteps, None),
+    ("success", Quantity::Success, Axis::PaperEpochs, Some([5, 7])),
+    ("mean Q", Quantity::MeanQ, Axis::PaperEpochs, Some([6, 8])),
 ];
+/// Number of [`VIEWS`] that a page shows first.
+pub(crate) const N_FIRST_VIEWS: usize = 4;
+
+/// The plots of a comparison.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct ComparisonPlots {
+    /// The plots of each section, those of the first panel first.
+    pub sections: Vec<Vec<Plot>>,
+    /// Learning from scratch, with one arm and with two.
+    pub from_scratch: Vec<Plot>,
+}
+
+impl ComparisonPlots {
+    /// Returns all plots.
+    pub fn all(&self) -> impl Iterator<Item = &Plot> {
+        self.sections.iter().flatten().chain(&self.from_scratch)
+    }
+}
 
 /// Draws all plots of a comparison.
 ///
 /// # Errors
 /// If the plotting library fails.
-pub fn comparison_plots(comparison: &Comparison) -> Result<Vec<Plot>, Error> {
-    let mut plots = from_scratch(comparison)?;
-    for section in &comparison.sections {
-        plots.extend(section_plots(section)?);
-    }
-    Ok(plots)
+pub fn comparison_plots(comparison: &Comparison) -> Result<ComparisonPlots, Error> {
+    let sections = comparison.sections.iter().map(section_plots).collect::<Result<_, Error>>()?;
+    Ok(ComparisonPlots { sections, from_scratch: from_scratch(comparison)? })
 }
 
 /// Draws the plots of one section.
@@ -72,9 +88,11 @@ fn section_plots(section: &Section) -> Result<Vec<Plot>, Error> {
                     let number = if task.grasps() { other } else { push };
                     format!(" (the paper's Figure {number}{letter})")
                 });
-            let title = format!("{}: {name}, {}{reference}", section.setup.title(), panel.title);
-            let slug = format!("{}-{name}-{}-{}", section.setup.slug(), axis.label(), panel.slug);
-            plots.push(draw(&panel.groups, &title, &slug, quantity, axis)?);
+            let (setup, against) = (section.setup.title(), axis.against());
+            let title = format!("{setup}: {name} {against}, {}{reference}", panel.title);
+            let slug = format!("{}-{name}-{}-{}", section.setup.slug(), axis.slug(), panel.slug);
+            let curves = (panel.groups.as_slice(), section.baselines.as_slice());
+            plots.push(draw(curves, &title, &slug, quantity, axis)?);
         }
     }
     Ok(plots)
@@ -100,26 +118,35 @@ fn from_scratch(comparison: &Comparison) -> Result<Vec<Plot>, Error> {
         let shown: Vec<&SeedGroup> = groups.iter().take(MAX_CURVES).collect();
         let title = format!("{task}: success from scratch (the paper's Figure 4{letter})");
         let slug = format!("{task}-from-scratch");
-        plots.push(draw(&shown, &title, &slug, Quantity::Success, Axis::PaperEpochs)?);
+        plots.push(draw((&shown, &[]), &title, &slug, Quantity::Success, Axis::PaperEpochs)?);
     }
     Ok(plots)
 }
 
+/// Draws the curves of groups and, for success, lines at the success of baselines.
 fn draw(
-    groups: &[&SeedGroup],
+    (groups, baselines): (&[&SeedGroup], &[Baseline]),
     title: &str,
     slug: &str,
     quantity: Quantity,
     axis: Axis,
 ) -> Result<Plot, Error> {
-    let series: Vec<Series> = groups.iter().map(|group| series(group, axis, quantity)).collect();
-    let options = match quantity {
-        Quantity::Success => CurveOptions::shares(title, axis),
-        _ => CurveOptions::values(title, axis),
-    };
-    let svg = curve_svg(&series, &options)?;
+    let mut series: Vec<Series> =
+        groups.iter().map(|group| series(group, axis, quantity)).collect();
+    let xs = series.iter().flat_map(|one| &one.points).map(|point| point.x);
+    let x_max = xs.fold(0.0, f64::max);
+    if quantity == Quantity::Success && x_max > 0.0 {
+        series.extend(baselines.iter().map(|baseline| level(baseline, x_max)));
+    }
+    let svg = curve_svg(&series, &CurveOptions::of(title, quantity, axis))?;
     let file_name = format!("{}.svg", slug.to_lowercase().replace(' ', "-"));
     Ok(Plot { file_name, title: title.to_owned(), svg })
+}
+
+/// Returns the line of a policy that does not learn, with the interval of its evaluation on test goals.
+fn level(Baseline { label, test }: &Baseline, x_max: f64) -> Series {
+    let point = |x| CurvePoint { x, y: test.success, band: Some(test.interval) };
+    Series { name: label.clone(), points: vec![point(0.0), point(x_max)] }
 }
 
 /// Returns a group's curve.
@@ -184,9 +211,13 @@ fn panels(groups: &[SeedGroup]) -> Vec<Panel<'_>> {
         panels.iter().any(|panel| panel.groups.iter().any(|shown| std::ptr::eq(*shown, *group)))
     };
     let others: Vec<&SeedGroup> = groups.iter().filter(|group| !is_shown(group)).collect();
+    let n_further = others.len().div_ceil(MAX_CURVES - 2);
     let further = others.chunks(MAX_CURVES - 2).enumerate().map(|(idx, others)| Panel {
         slug: format!("others-{}", idx + 1),
-        title: "other runs".to_owned(),
+        title: match n_further {
+            1 => "other runs".to_owned(),
+            _ => format!("other runs, {} of {n_further}", idx + 1),
+        },
         letter: None,
         groups: with_their_strategies(others, &plain),
     });
@@ -229,9 +260,14 @@ fn strategy_name(group: &SeedGroup) -> &str {
 
 #[cfg(test)]
 mod tests {
+    use std::collections::BTreeSet;
+
     use super::*;
+    use tandem_telemetry::ContactMetrics;
+
     use crate::group::group_by_settings;
     use crate::run::Run;
+    use crate::test_evaluation::TestEvaluation;
 
     fn run(strategy: &str, seed: u64, name: &str, curve: &[(u64, f64, f64)]) -> Run {
         let row = |(env_steps, wall_s, success): &(u64, f64, f64)| MetricsRow {
@@ -312,14 +348,43 @@ mod tests {
     fn plots_have_unique_names_and_refer_to_the_papers_figures() {
         let runs = vec![plain("none"), plain("mc-q:0.05"), plain("mc-q:0.1")];
         let plots = comparison_plots(&Comparison::of(runs, Vec::new())).unwrap();
-        let mut names: Vec<&str> = plots.iter().map(|plot| plot.file_name.as_str()).collect();
-        assert_eq!(names.len(), 10);
-        assert_eq!(names[0], "push-2-success-paper-epochs-strategies.svg");
-        assert!(plots[0].title.ends_with("(the paper's Figure 5a)"), "{}", plots[0].title);
-        assert!(plots[8].title.ends_with("(the paper's Figure 6b)"), "{}", plots[8].title);
-        names.sort_unstable();
-        names.dedup();
-        assert_eq!(names.len(), 10);
+        let plots: Vec<&Plot> = plots.all().collect();
+        assert_eq!(plots.len(), 12);
+        assert_eq!(plots[4].file_name, "push-2-success-paper-epochs-strategies.svg");
+        assert!(plots[4].title.ends_with("(the paper's Figure 5a)"), "{}", plots[4].title);
+        assert!(plots[11].title.ends_with("(the paper's Figure 6b)"), "{}", plots[11].title);
+        for text in [|plot: &Plot| plot.file_name.clone(), |plot: &Plot| plot.title.clone()] {
+            let unique: BTreeSet<String> = plots.iter().map(|plot| text(plot)).collect();
+            assert_eq!(unique.len(), 12, "{unique:?}");
+        }
+    }
+
+    #[test]
+    fn a_baseline_is_a_line_in_plots_of_success() {
+        let test = TestEvaluation {
+            task: "push".to_owned(),
+            n_arms: 2,
+            n_episodes: 240,
+            success: 0.95,
+            interval: (0.94, 0.96),
+            success_joint: 0.9,
+            collision_rate: 0.2,
+            contacts: ContactMetrics::default(),
+        };
+        let baseline = Baseline { label: "composed teachers".to_owned(), test };
+        let line = level(&baseline, 10.0);
+        assert_eq!(
+            line.points.iter().map(|point| (point.x, point.y)).collect::<Vec<_>>(),
+            [(0.0, 0.95), (10.0, 0.95)]
+        );
+        let runs = vec![run("none", 1, "none", &[(10, 1.0, 0.1)])];
+        let plots = comparison_plots(&Comparison::of(runs, vec![baseline])).unwrap();
+        let shown = plots.all().filter(|plot| plot.svg.contains("composed teachers"));
+        let names: Vec<&str> = shown.map(|plot| plot.file_name.as_str()).collect();
+        assert!(
+            !names.is_empty() && names.iter().all(|name| name.contains("success")),
+            "{names:?}"
+        );
     }
 
     #[test]

@@ -117,14 +117,18 @@ impl Run {
         }
     }
 
-    /// Returns the name without its suffix `-seedN`.
+    /// Returns the name without its suffix `-seedN`, or `-seedN.M` of a repeated run.
     #[must_use]
     pub fn stem(&self) -> &str {
         match self.name.rsplit_once("-seed") {
-            Some((stem, seed)) if seed.bytes().all(|byte| byte.is_ascii_digit()) => stem,
+            Some((stem, seed)) if seed.split('.').all(is_number) => stem,
             _ => &self.name,
         }
     }
+}
+
+fn is_number(text: &str) -> bool {
+    !text.is_empty() && text.bytes().all(|byte| byte.is_ascii_digit())
 }
 
 /// Reads the rows of a metrics file up to the first invalid line, which adds a warning.
@@ -161,5 +165,6 @@ mod tests {
             (Some("push".to_owned()), Some(7), "mine")
         );
         assert_eq!(run("odd-seedling", None).stem(), "odd-seedling");
+        assert_eq!(run("push-ea-seed1.2", None).stem(), "push-ea");
     }
 }

@@ -8,6 +8,13 @@ use crate::group::Spread;
 /// Shown for a value that does not exist.
 pub(crate) const NONE: &str = "–";
 
+/// Width of a terminal for which tables are formatted, columns.
+pub(crate) const TERMINAL_COLUMNS: usize = 80;
+/// Gap between two columns.
+const GAP: usize = 2;
+/// Smallest width of the first column of an aligned table.
+const MIN_FIRST_COLUMN: usize = 12;
+
 /// A table with a title, a header and rows of as many cells.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct Table {
@@ -27,26 +34,71 @@ impl Table {
     }
 
     /// Formats the table for a terminal. The first column is left-aligned, the others are right-aligned.
+    ///
+    /// If the table is wider than [`TERMINAL_COLUMNS`], a long first cell has a line of its own, above the other cells of
+    /// its row. If the other columns alone are wider, each row becomes a block with one cell per line.
     #[must_use]
     pub fn text(&self) -> String {
         let lines: Vec<&Vec<String>> = std::iter::once(&self.header).chain(&self.rows).collect();
         let width = |column: usize| {
-            lines.iter().filter_map(|line| line.get(column)).map(|cell| cell.chars().count()).max()
+            lines.iter().filter_map(|line| line.get(column)).map(|cell| n_chars(cell)).max()
         };
         let widths: Vec<usize> =
             (0..self.header.len()).map(|column| width(column).unwrap_or(0)).collect();
-        let mut text = format!("{}\n", self.title);
-        for line in lines {
-            let padded =
-                line.iter().zip(&widths).enumerate().map(|(column, (cell, width))| match column {
-                    0 => format!("{cell:<width$}"),
-                    _ => format!("{cell:>width$}"),
-                });
-            text.push_str(padded.collect::<Vec<_>>().join("  ").trim_end());
-            text.push('\n');
+        let others: usize = widths.iter().skip(1).map(|width| GAP + width).sum();
+        let title = wrapped(&self.title);
+        if others + MIN_FIRST_COLUMN > TERMINAL_COLUMNS {
+            return format!("{title}{}", self.blocks());
         }
-        text
+        let first = widths.first().copied().unwrap_or(0).min(TERMINAL_COLUMNS - others);
+        let rows = lines.into_iter().map(|line| aligned(line, first, &widths));
+        format!("{title}{}", rows.collect::<String>())
     }
+
+    /// Formats each row as a block: its first cell, then a line for each other cell.
+    fn blocks(&self) -> String {
+        let names = self.header.iter().skip(1);
+        let width = names.clone().map(|name| n_chars(name)).max().unwrap_or(0);
+        let block = |row: &Vec<String>| {
+            let cells = names.clone().zip(row.iter().skip(1));
+            let lines = cells.map(|(name, cell)| format!("  {name:<width$}  {cell}\n"));
+            let label = wrapped(row.first().map_or("", String::as_str));
+            format!("{label}{}", lines.collect::<String>())
+        };
+        self.rows.iter().map(block).collect()
+    }
+}
+
+/// Formats a row with its first cell in a column of `first` characters, or above the others if it is longer.
+fn aligned(row: &[String], first: usize, widths: &[usize]) -> String {
+    let label = row.first().map_or("", String::as_str);
+    let others = row.iter().zip(widths).skip(1);
+    let others: String =
+        others.map(|(cell, width)| format!("{:gap$}{cell:>width$}", "", gap = GAP)).collect();
+    let line = match n_chars(label) > first {
+        true => format!("{}{:first$}{others}", wrapped(label), ""),
+        false => format!("{label:<first$}{others}"),
+    };
+    format!("{}\n", line.trim_end())
+}
+
+/// Breaks a line of text at spaces so that it fits into [`TERMINAL_COLUMNS`].
+pub(crate) fn wrapped(text: &str) -> String {
+    let mut lines: Vec<String> = Vec::new();
+    for word in text.split_whitespace() {
+        match lines.last_mut() {
+            Some(line) if n_chars(line) + 1 + n_chars(word) <= TERMINAL_COLUMNS => {
+                line.push(' ');
+                line.push_str(word);
+            }
+            _ => lines.push(word.to_owned()),
+        }
+    }
+    lines.into_iter().map(|line| line + "\n").collect()
+}
+
+fn n_chars(text: &str) -> usize {
+    text.chars().count()
 }
 
 /// Formats a value over the runs of a group: the mean and, for several runs, the range and the number of runs that have
@@ -62,6 +114,16 @@ pub(crate) fn spread(spread: &Spread, format: impl Fn(f64) -> String) -> String 
     };
     let how_many = if n < n_runs { format!(", {n} of {n_runs}") } else { String::new() };
     format!("{}{range}{how_many}", format(mean))
+}
+
+/// Formats the mean of a value over the runs of a group, and how many of them have it if some do not.
+pub(crate) fn mean(spread: &Spread, format: impl Fn(f64) -> String) -> String {
+    let Spread { n, n_runs, mean, .. } = *spread;
+    match n {
+        0 => NONE.to_owned(),
+        n if n < n_runs => format!("{} ({n}/{n_runs})", format(mean)),
+        _ => format(mean),
+    }
 }
 
 /// Formats a share like [`spread`], with the 95 % interval over the episodes of all runs.
@@ -165,5 +227,24 @@ mod tests {
         let text = table.text();
         let ends: Vec<usize> = text.lines().skip(1).map(|line| line.chars().count()).collect();
         assert_eq!(ends, [20, 20, 20], "{text}");
+    }
+
+    #[test]
+    fn no_line_of_a_table_is_wider_than_a_terminal() {
+        let long =
+            "ddpg.bc_weight=0, ddpg.polyak_keep=0.95, exploration.random_share=0.3, rounds.lag=1";
+        let check = |n_columns: usize, expected: &str| {
+            let header: Vec<String> = (0..n_columns).map(|idx| format!("column {idx}")).collect();
+            let header: Vec<&str> = header.iter().map(String::as_str).collect();
+            let mut table = Table::new("words of a title ".repeat(9), &header);
+            let cells = std::iter::repeat_n("0.996 (0.99)".to_owned(), n_columns - 1);
+            table.rows.push(std::iter::once(long[..70].to_owned()).chain(cells.clone()).collect());
+            table.rows.push(std::iter::once(long.to_owned()).chain(cells).collect());
+            let text = table.text();
+            assert!(text.lines().all(|line| n_chars(line) <= TERMINAL_COLUMNS), "{text}");
+            assert!(text.contains(expected), "{text}");
+        };
+        check(4, &format!("\n{}\n{:38}  0.996 (0.99)  0.996", &long[..70], ""));
+        check(9, &format!("\n{}\n  column 1  0.996 (0.99)\n  column 2", &long[..70]));
     }
 }

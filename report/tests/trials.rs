@@ -66,11 +66,13 @@ fn the_table_has_successes_intervals_causes_and_the_papers_rows() {
     let text = Trials::of(rows).text();
     let expected = "\
 push: trials, as the paper's Table 4
-policy, mode                success  share [95 % interval]  not-reached  object-lost  timed-out  arms-touched  table-touched  refused  stopped  median time
-student-push, closed-loop       2/9      22.2 % [6.3–54.7]            1            1          1             1              1        1        1       14.0 s
-student-push, open-loop         4/4   100.0 % [51.0–100.0]            0            0          0             0              0        0        0       11.5 s
-the paper, proposed method    40/50     80.0 % [67.0–88.8]            –            –          –             –              –        –        –            –
-the paper, from scratch        0/50        0.0 % [0.0–7.1]            –            –          –             –              –        –        –            –
+policy, mode                success  share [95 % interval]  median time
+student-push, closed-loop       2/9      22.2 % [6.3–54.7]       14.0 s
+student-push, open-loop         4/4   100.0 % [51.0–100.0]       11.5 s
+the paper, proposed method    40/50     80.0 % [67.0–88.8]            –
+the paper, from scratch        0/50        0.0 % [0.0–7.1]            –
+failures of student-push, closed-loop: 1 not-reached, 1 object-lost, 1
+timed-out, 1 arms-touched, 1 table-touched, 1 refused, 1 stopped
 ";
     assert_eq!(text, expected);
 }

@@ -8,9 +8,9 @@ use tandem_core::{Contacts, Layout, Task, World};
 use tandem_sim::{Friction, WorldConfig};
 
 #[test]
-fn a_scripted_arm_solves_either_task() {
-    for task in Task::ALL {
-        let episodes = play(Layout::new(task, 1), &WorldConfig::default(), 200);
+fn a_scripted_arm_solves_either_classic_task() {
+    for task in Task::CLASSIC {
+        let episodes = play(Layout::new(task, 1), &WorldConfig::default(), 100);
         let rate = success_rate(&episodes);
         println!("{task}, 1 arm: {rate}, median miss {:.4} m", median_miss_m(&episodes));
         assert!(rate >= 0.97, "{task}: {rate}");
@@ -24,16 +24,16 @@ fn a_scripted_arm_solves_either_task() {
 #[test]
 fn two_independent_scripted_arms_mostly_solve_either_classic_task() {
     for task in Task::CLASSIC {
-        let episodes = play(Layout::new(task, 2), &WorldConfig::default(), 200);
+        let episodes = play(Layout::new(task, 2), &WorldConfig::default(), 100);
         let n_with =
             |contact| episodes.iter().filter(|played| played.contacts.contains(contact)).count();
         let (n_arm_arm, n_arm_table) = (n_with(Contacts::ARM_ARM), n_with(Contacts::ARM_TABLE));
         let rate = success_rate(&episodes);
         println!(
-            "{task}, 2 arms: {rate}; contacts between arms in {n_arm_arm}, with the table in {n_arm_table} of 200"
+            "{task}, 2 arms: {rate}; contacts between arms in {n_arm_arm}, with the table in {n_arm_table} of 100"
         );
         assert!(rate >= 0.80, "{task}: {rate}");
-        assert!((1..100).contains(&n_arm_arm), "{task}: contacts in {n_arm_arm} of 200");
+        assert!((1..50).contains(&n_arm_arm), "{task}: contacts in {n_arm_arm} of 100");
     }
 }
 
@@ -41,7 +41,7 @@ fn two_independent_scripted_arms_mostly_solve_either_classic_task() {
 fn ten_physics_steps_per_control_step_suffice() {
     let config = WorldConfig { substeps: 10, ..WorldConfig::default() };
     for task in Task::ALL {
-        let rate = success_rate(&play(Layout::new(task, 1), &config, 100));
+        let rate = success_rate(&play(Layout::new(task, 1), &config, 50));
         println!("{task}, 10 substeps: {rate}");
         assert!(rate >= 0.97, "{task}: {rate}");
     }
@@ -103,7 +103,7 @@ fn check_shared_starts_of_two_arms(n_episodes: u64) {
 fn slippery_pads_drop_the_object() {
     let slippery = Friction { pads: 0.05, object: 0.05 };
     let config = WorldConfig { pick_and_place: slippery, ..WorldConfig::default() };
-    let rate = success_rate(&play(Layout::new(Task::PickAndPlace, 1), &config, 100));
+    let rate = success_rate(&play(Layout::new(Task::PickAndPlace, 1), &config, 50));
     println!("friction 0.05: {rate}");
     assert!(rate < 0.7, "{rate}");
 }

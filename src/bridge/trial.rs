@@ -206,7 +206,7 @@ fn show(args: &TrialArgs, rows: Vec<TrialRow>, file: &Path) -> Result<(), Failed
     output::print(trials.text())?;
     output::print(format_args!("trials        {}", file.display()))?;
     output::print(format_args!(
-        "report        {}; plots in the same directory: {}",
+        "report        {}; its figures are also files: {}",
         page.display(),
         written.plots.len()
     ))?;

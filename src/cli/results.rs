@@ -15,6 +15,8 @@ Examples:
   tandem eval --policy policies/student-push.safetensors --baselines
   tandem eval --composed-teachers policies/teacher-push.safetensors
   tandem eval --policy FILE --episodes 1 --record episode.mcap
+  tandem eval --policy FILE --film arms.gif                  an animation of the first episode
+  tandem eval --policy FILE --film strip.png --film-outcome failure
   tandem eval --policy FILE --env 127.0.0.1:7005             in the environments of a server
   tandem eval --policy FILE --env-command 'tandem env'       starts the server")]
 pub(crate) struct EvalArgs {
@@ -54,9 +56,54 @@ pub(crate) struct EvalArgs {
     /// Records all episodes to MCAP files in this directory.
     #[arg(long, value_name = "DIR")]
     pub(crate) record_dir: Option<PathBuf>,
+    #[command(flatten)]
+    pub(crate) film: FilmArgs,
+    /// Number of episodes in the film, from the first.
+    #[arg(long, value_name = "N", default_value_t = 1, requires = "film",
+        value_parser = clap::value_parser!(u64).range(1..=100))]
+    pub(crate) film_episodes: u64,
+    /// Shows only episodes with this outcome.
+    #[arg(long, value_enum, requires = "film")]
+    pub(crate) film_outcome: Option<OutcomeName>,
     /// Prints one JSON object on the last line of standard output.
     #[arg(long)]
     pub(crate) json: bool,
+}
+
+/// A film of episodes.
+#[derive(Debug, Args)]
+pub(crate) struct FilmArgs {
+    /// Writes a film: an animation (.gif), or a strip of eight pictures per episode (.png).
+    #[arg(long, value_name = "FILE.gif|png")]
+    pub(crate) film: Option<PathBuf>,
+    /// Width and height of a picture, pixels [default: 640x400, in a strip 480x300].
+    #[arg(long, value_name = "WxH", requires = "film", value_parser = picture_size)]
+    pub(crate) film_size: Option<PictureSize>,
+    /// Speed of an animation relative to simulated time.
+    #[arg(long, value_name = "FACTOR", default_value_t = 0.5, requires = "film")]
+    pub(crate) film_speed: f64,
+}
+
+/// Width and height of a picture, pixels.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct PictureSize {
+    pub(crate) width: usize,
+    pub(crate) height: usize,
+}
+
+/// Parses a size such as `640x400`.
+fn picture_size(text: &str) -> Result<PictureSize, String> {
+    let size = text.split_once('x').and_then(|(width, height)| {
+        Some(PictureSize { width: width.parse().ok()?, height: height.parse().ok()? })
+    });
+    size.ok_or_else(|| "expected width and height in pixels, such as 640x400".to_owned())
+}
+
+/// The outcome of an episode.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
+pub(crate) enum OutcomeName {
+    Success,
+    Failure,
 }
 
 #[derive(Debug, Args)]
@@ -65,13 +112,14 @@ Examples:
   tandem report runs/sweep-table2
   tandem report runs/a runs/b --out compared.html --csv compared.csv
   tandem report trials/student-push --all-trials
-  tandem report docs/results/students --composed-teachers policies/teacher-push.safetensors")]
+  tandem report docs/results/students --composed-teachers policies/teacher-push.safetensors
+  tandem report runs/NAME --film-strips runs/NAME/policy/best.safetensors")]
 pub(crate) struct ReportArgs {
     /// Run directories, directories that contain runs or trials, or single metrics and trials files.
     #[arg(required = true, value_name = "DIR|FILE")]
     pub(crate) paths: Vec<PathBuf>,
-    /// HTML page; curves and plots of trials are written next to it as SVG files [default: report.html, in the
-    /// directory of the sweep or trials if that is the only one].
+    /// HTML page; its figures are also written to a directory beside it, report-figures for report.html [default:
+    /// report.html in the directory of the sweep or trials, or comparison.html in that of a run, if it is the only one].
     #[arg(long, value_name = "FILE.html")]
     pub(crate) out: Option<PathBuf>,
     /// Also writes a CSV file with one line per run.
@@ -83,6 +131,9 @@ pub(crate) struct ReportArgs {
     /// Evaluates a one-arm policy on both arms, the baseline without a student; can be repeated.
     #[arg(long, value_name = "POLICY")]
     pub(crate) composed_teachers: Vec<PathBuf>,
+    /// Plays the test goals with this policy and shows a success and a failure as film strips; can be repeated.
+    #[arg(long, value_name = "POLICY")]
+    pub(crate) film_strips: Vec<PathBuf>,
     /// Draws all trials, not only failed ones.
     #[arg(long)]
     pub(crate) all_trials: bool,
@@ -97,6 +148,7 @@ Examples:
   tandem replay runs/NAME/mcap/eval-000100-000.mcap     step by step
   tandem replay runs --verify                           all *.mcap files below
   tandem replay FILE.mcap --verify --json
+  tandem replay FILE.mcap --film episode.gif
   tandem replay runs/NAME/mcap --verify --env-command 'python3 server.py'
 
 All numbers from the simulator are compared bit for bit with the log. An episode of a task that is
@@ -112,6 +164,8 @@ pub(crate) struct ReplayArgs {
     /// Prints one JSON object on the last line of standard output.
     #[arg(long)]
     pub(crate) json: bool,
+    #[command(flatten)]
+    pub(crate) film: FilmArgs,
     #[command(flatten)]
     pub(crate) environment: EnvironmentArgs,
     #[command(flatten)]
@@ -141,8 +195,8 @@ pub(crate) enum McapCommand {
 #[derive(Debug, Args)]
 #[command(after_help = "\
 Examples:
-  tandem picture --policy policies/student-push.safetensors --out arms.svg
-  tandem picture --composed-teachers policies/teacher-push.safetensors --step 20 --out arms.svg")]
+  tandem picture --policy policies/student-push.safetensors --out arms.png
+  tandem picture --composed-teachers policies/teacher-push.safetensors --step 20 --out arms.png")]
 pub(crate) struct PictureArgs {
     /// Policy that controls the arms.
     #[arg(long, value_name = "FILE", required_unless_present = "composed_teachers")]
@@ -156,7 +210,10 @@ pub(crate) struct PictureArgs {
     /// Control step to draw, 0 to 50.
     #[arg(long, default_value_t = 12, value_parser = clap::value_parser!(u32).range(0..=50))]
     pub(crate) step: u32,
+    /// Width and height, pixels.
+    #[arg(long, value_name = "WxH", default_value = "960x600", value_parser = picture_size)]
+    pub(crate) size: PictureSize,
     /// Output file.
-    #[arg(long, value_name = "FILE.svg")]
+    #[arg(long, value_name = "FILE.png")]
     pub(crate) out: PathBuf,
 }

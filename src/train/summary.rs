@@ -128,7 +128,8 @@ fn draw_curve(plan: &Plan, rows: &[MetricsRow]) -> Result<PathBuf, Failed> {
     let arms = counted(config.arms, "arm");
     let name = format!("{}, {arms}, {}", config.task, config.advice.strategy);
     let series = Series::of(&name, rows, Axis::EnvSteps, Quantity::Success);
-    let options = CurveOptions::shares("Success of the policy alone", Axis::EnvSteps);
+    let title = format!("Success of the policy alone: {name}");
+    let options = CurveOptions::of(&title, Quantity::Success, Axis::EnvSteps);
     let svg = tandem_report::curve_svg(&[series], &options).or_exit(Exit::Bug, String::new)?;
     let path = plan.out.join("curve.svg");
     std::fs::write(&path, svg).or_cannot_write(|| format!("cannot write {}", path.display()))?;

@@ -192,12 +192,12 @@ fn every_undisturbed_run_spends_its_budget_and_is_evaluated_three_times() {
 
 #[test]
 fn a_run_with_many_faults_ends_like_an_undisturbed_one() {
-    let runs = for_seeds(0..24, check_run);
+    let runs = for_seeds(0..10, check_run);
     let all = runs.iter().fold(Statistics::default(), Statistics::plus);
-    assert!(all.n_repeats > 100, "few repeated requests: {all:?}");
+    assert!(all.n_repeats > 40, "few repeated requests: {all:?}");
     assert!(all.n_resumed > 0, "few learners resumed: {all:?}");
-    assert!(all.n_teachers > 24, "few teacher restarts: {all:?}");
-    assert!(all.n_workers > 24 * 3, "few late or repeated joins: {all:?}");
+    assert!(all.n_teachers > 10, "few teacher restarts: {all:?}");
+    assert!(all.n_workers > 10 * 3, "few late or repeated joins: {all:?}");
 }
 
 #[test]
@@ -208,7 +208,7 @@ fn a_ledger_that_forgets_verdicts_is_detected() {
 
 #[test]
 fn a_crowd_spends_the_budget_exactly_once() {
-    let n_repeats: u64 = for_seeds(0..60, check_crowd).into_iter().sum();
+    let n_repeats: u64 = for_seeds(0..25, check_crowd).into_iter().sum();
     assert!(n_repeats > 0);
 }
 

@@ -1,23 +1,54 @@
 //! The part of a report that compares runs.
 
-use crate::comparison::{Comparison, Section, paper_table};
-use crate::html::{escaped, plot_grid, titled_table};
+use crate::comparison::{Comparison, LEGEND, Section, paper_table};
+use crate::html::{details, escaped, film_strip, plot_grid, titled_table};
 use crate::paper;
-use crate::plots::Plot;
+use crate::plots::{ComparisonPlots, N_FIRST_VIEWS, Plot};
 
 /// Explains the values of the tables.
-const NOTES: &str = "IE: epoch of the first evaluation with 10 % of the maximum success. RT: number of epochs from there to 90 % \
-     of the maximum. MSR: maximum success. ELR: 90 % of MSR, divided by the number of epochs until it was reached. Values over \
-     several runs are the mean (smallest–largest), followed by the number of runs that have the value if some do not. \
-     Intervals are Wilson's 95 % intervals over the episodes of all runs; they do not include the variation between seeds. \
-     The best of many evaluations is biased upwards; the evaluation on test goals is not.";
+const NOTES: &str = "Values over several runs are the mean, with the smallest and the largest below it where a table has room, \
+     and the number of runs that have the value if some do not. Intervals are Wilson's 95 % intervals over the episodes of \
+     all runs; they do not include the variation between seeds. Bands of curves are from the smallest to the largest value \
+     over seeds, or the 95 % interval of a single run. The best of many evaluations is biased upwards; the evaluation on \
+     test goals is not. Success without contact is that without contact between the arms.";
 
-/// Returns the tables and plots of `comparison` as HTML.
-pub(super) fn body(comparison: &Comparison, plots: &[Plot]) -> String {
-    let tables = comparison.sections.iter().flat_map(Section::tables);
-    let mut body: String = tables.map(|table| titled_table(&table)).collect();
-    body.push_str(&plot_grid(plots));
-    body.push_str(&titled_table(&paper_table()));
-    body.push_str(&format!("<p>{}</p><p>{}</p>", escaped(paper::SOURCE), escaped(NOTES)));
+/// Explains why the paper's values are apart.
+const PAPER_NOTES: &str = "The paper's values are from another simulator, recipe, start distribution and count of epochs: they \
+     cannot be compared with those of these runs.";
+
+/// Returns the plots and tables of `comparison` as HTML: for each section curves, then means; the rest is folded.
+pub(super) fn body(comparison: &Comparison, plots: &ComparisonPlots) -> String {
+    let sections = comparison.sections.iter().zip(&plots.sections);
+    let mut body: String = sections.map(|(section, plots)| section_body(section, plots)).collect();
+    if !comparison.films.is_empty() {
+        let films = comparison.films.iter().map(|film| film_strip(&film.title, &film.png));
+        body.push_str(&format!("<h2>Episodes</h2>{}", films.collect::<String>()));
+    }
+    if !plots.from_scratch.is_empty() {
+        let grid = plot_grid(&plots.from_scratch);
+        body.push_str(&format!("<h2>Learning from scratch</h2>{grid}"));
+    }
+    let paragraphs = [LEGEND, NOTES].map(|text| format!("<p>{}</p>", escaped(text)));
+    body.push_str(&format!("<h2>Notes</h2>{}", paragraphs.concat()));
+    let source = format!("<p>{}</p><p>{}</p>", escaped(PAPER_NOTES), escaped(paper::SOURCE));
+    let paper = format!("{}{source}", titled_table(&paper_table()));
+    body.push_str(&details("The paper's values", &paper));
+    body
+}
+
+fn section_body(section: &Section, plots: &[Plot]) -> String {
+    let (first, further) = plots.split_at(plots.len().min(N_FIRST_VIEWS));
+    let mut body = format!("<h2>{}</h2>", escaped(&section.setup.title()));
+    if !first.is_empty() {
+        body.push_str(&plot_grid(first));
+    }
+    body.extend(section.summaries().iter().map(titled_table));
+    body.extend(section.hint().map(|hint| format!("<p>{}</p>", escaped(&hint))));
+    if !further.is_empty() {
+        let summary = format!("Further curves: {}", further.len());
+        body.push_str(&details(&summary, &plot_grid(further)));
+    }
+    let tables: String = section.tables().iter().map(titled_table).collect();
+    body.push_str(&details("All values, with ranges and intervals", &tables));
     body
 }

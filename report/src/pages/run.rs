@@ -6,7 +6,7 @@ use tandem_telemetry::MetricsRow;
 
 use crate::curve::{Axis, CurveOptions, Quantity, Series, curve_svg};
 use crate::error::Error;
-use crate::html::{escaped, svg_grid, table};
+use crate::html::{details, escaped, svg_grid, table};
 use crate::run::Run;
 use crate::table::{NONE, duration, interval, number, optional, share, thousands};
 
@@ -22,18 +22,19 @@ pub(super) fn body(run: &Run) -> Result<String, Error> {
         (Some(best), Some(last)) => {
             let curves = curves(run, task.as_ref(), has_contacts)?;
             let curves: Vec<&str> = curves.iter().map(String::as_str).collect();
-            body.push_str(&tiles(best, last, has_contacts));
+            body.push_str(&headline(run, best));
             body.push_str(&svg_grid(&curves));
+            body.push_str(&tiles(best, last, has_contacts));
         }
         _ => body.push_str("<p>No evaluation yet.</p>"),
     }
     if !run.rows.is_empty() {
         let cells = |row| evaluation_cells(row, has_contacts);
         let rows: Vec<Vec<String>> = run.rows.iter().map(cells).collect();
-        body.push_str(&format!("<h2>Evaluations</h2>{}", table(&EVALUATION_HEADER, &rows)));
+        body.push_str(&details("Evaluations", &table(&EVALUATION_HEADER, &rows)));
     }
     if let Some(text) = &run.configuration {
-        body.push_str(&format!("<h2>Configuration</h2><pre>{}</pre>", escaped(text)));
+        body.push_str(&details("Configuration", &format!("<pre>{}</pre>", escaped(text))));
     }
     Ok(body)
 }
@@ -52,6 +53,26 @@ fn task_line(task: &TaskSpec) -> String {
         escaped(task.name()),
         thousands(task.episode_steps() as u64),
         task.tolerance()
+    )
+}
+
+/// Returns the first number of the page: the success on test goals, or else in the best evaluation.
+fn headline(run: &Run, best: &MetricsRow) -> String {
+    let (success, interval, goals) = match &run.test {
+        Some(test) => {
+            let (low, high) = test.interval;
+            let interval = format!("{:.1}–{:.1} %", 100.0 * low, 100.0 * high);
+            (test.success, interval, format!("{} test goals", thousands(test.n_episodes)))
+        }
+        None => (
+            best.success,
+            interval(best),
+            format!("{} goals of its best evaluation", thousands(best.n_episodes)),
+        ),
+    };
+    format!(
+        "<p class=headline><strong>{}</strong> success of the policy alone on {goals}, 95 % interval {interval}</p>",
+        share(success)
     )
 }
 
@@ -117,6 +138,9 @@ fn curves(run: &Run, task: Option<&TaskSpec>, has_contacts: bool) -> Result<Vec<
     let series = |named: &[(&str, Quantity)]| -> Vec<Series> {
         named.iter().map(|(name, quantity)| Series::of(name, &run.rows, AXIS, *quantity)).collect()
     };
+    let draw = |title: &str, quantity: Quantity, series: &[Series]| {
+        curve_svg(series, &CurveOptions::of(title, quantity, AXIS))
+    };
     let is_built_in = task.is_none_or(|task| task.as_built_in().is_some());
     let moved = if is_built_in { "object moved" } else { "achieved goal moved" };
     let success = series(&[
@@ -130,15 +154,14 @@ fn curves(run: &Run, task: Option<&TaskSpec>, has_contacts: bool) -> Result<Vec<
         ("before success", Quantity::CollisionRateBeforeSuccess),
     ]);
     let mut curves = vec![
-        curve_svg(&success, &CurveOptions::shares("Success", AXIS))?,
-        curve_svg(&series(&[("", Quantity::MeanQ)]), &CurveOptions::values("Mean Q", AXIS))?,
+        draw("Success", Quantity::Success, &success)?,
+        draw("Mean Q", Quantity::MeanQ, &series(&[("", Quantity::MeanQ)]))?,
     ];
     if has_contacts {
-        let options = CurveOptions::shares("Episodes with contact", AXIS);
-        curves.push(curve_svg(&contacts, &options)?);
+        curves.push(draw("Episodes with contact", Quantity::CollisionRate, &contacts)?);
     }
     let advice = series(&[("", Quantity::AdviceSpent)]);
-    curves.push(curve_svg(&advice, &CurveOptions::values("Advice spent", AXIS))?);
+    curves.push(draw("Advice spent", Quantity::AdviceSpent, &advice)?);
     Ok(curves)
 }
 

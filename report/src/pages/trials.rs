@@ -2,7 +2,7 @@
 
 use tandem_telemetry::TrialRow;
 
-use crate::html::{escaped, plot_grid, titled_table};
+use crate::html::{details, escaped, plot_grid, titled_table};
 use crate::paper;
 use crate::plots::Plot;
 use crate::table::{NONE, Table, optional};
@@ -40,7 +40,8 @@ pub(super) fn body(trials: &Trials, plots: &[Plot]) -> String {
     } else {
         body.push_str(&format!("<h2>Plots</h2>{}", plot_grid(plots)));
     }
-    body.extend(trials.groups.iter().map(|group| titled_table(&all_trials(group))));
+    let all: String = trials.groups.iter().map(|group| titled_table(&all_trials(group))).collect();
+    body.push_str(&details("All trials", &all));
     body
 }
 

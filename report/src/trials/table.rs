@@ -4,7 +4,7 @@ use tandem_core::{Task, Wilson};
 
 use super::{CAUSES, OTHER_CAUSES, TrialGroup, Trials};
 use crate::paper::{N_PAPER_TRIALS, PaperTrials, TABLE_4};
-use crate::table::{NONE, Table, optional};
+use crate::table::{NONE, Table, optional, wrapped};
 
 /// Number of arms in the paper's trials.
 const N_PAPER_ARMS: usize = 2;
@@ -16,11 +16,38 @@ impl Trials {
         self.groups.chunk_by(|a, b| a.task == b.task).map(task_table).collect()
     }
 
-    /// Formats all tables for a terminal.
+    /// Formats the results for a terminal of 80 columns: successes, and below them the causes of failures.
     #[must_use]
     pub fn text(&self) -> String {
-        self.tables().iter().map(Table::text).collect::<Vec<_>>().join("\n")
+        let tasks = self.groups.chunk_by(|a, b| a.task == b.task);
+        tasks.map(task_text).collect::<Vec<_>>().join("\n")
     }
+}
+
+/// Formats the results of one task.
+fn task_text(groups: &[TrialGroup]) -> String {
+    let full = task_table(groups);
+    let without_causes = |cells: Vec<String>| -> Vec<String> {
+        let last = cells.len().saturating_sub(1);
+        let shown = cells.into_iter().enumerate().filter(|(idx, _)| *idx < 3 || *idx == last);
+        shown.map(|(_, cell)| cell).collect()
+    };
+    let table = Table {
+        title: full.title,
+        header: without_causes(full.header),
+        rows: full.rows.into_iter().map(without_causes).collect(),
+    };
+    let failures: String = groups.iter().filter_map(failures_text).collect();
+    format!("{}{failures}", table.text())
+}
+
+/// Counts the failures of a group by their causes.
+fn failures_text(group: &TrialGroup) -> Option<String> {
+    let causes = CAUSES.into_iter().chain([OTHER_CAUSES]).zip(group.n_failed_by());
+    let causes: Vec<String> =
+        causes.filter(|(_, n)| *n > 0).map(|(cause, n)| format!("{n} {cause}")).collect();
+    let text = format!("failures of {}: {}", group.label(), causes.join(", "));
+    (!causes.is_empty()).then(|| wrapped(&text))
 }
 
 /// Returns the table of the groups of one task. The paper's rows follow if a group has as many arms as the paper.

@@ -2,8 +2,8 @@
 
 use plotters::prelude::RGBColor;
 
+use crate::color::arm_color;
 use crate::curve::INK;
-use crate::scene::arm_color;
 
 /// Dash pattern of planned paths.
 const DASHES: &str = "5 3";

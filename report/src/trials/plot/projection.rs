@@ -3,8 +3,8 @@
 use tandem_telemetry::TrialRow;
 
 use super::marker::{Marker, hex};
+use crate::color::arm_color;
 use crate::curve::{FAINT_INK, GRID, INK};
-use crate::scene::arm_color;
 
 pub(super) const WIDTH_PX: f64 = 760.0;
 pub(super) const MARGIN_PX: f64 = 20.0;

@@ -22,7 +22,7 @@ const BASE_MARGIN_M: f64 = 0.14;
 const NEAREST_M: f64 = 0.1;
 
 /// A perspective camera.
-pub(super) struct Camera {
+pub(crate) struct Camera {
     eye: DVec3,
     right: DVec3,
     up: DVec3,
@@ -32,13 +32,13 @@ pub(super) struct Camera {
 }
 
 /// A part of the picture, pixels from the upper left corner.
-pub(super) struct Rectangle {
+pub(crate) struct Rectangle {
     low: [f64; 2],
     high: [f64; 2],
 }
 
 impl Rectangle {
-    pub(super) fn contains(&self, x: f64, y: f64) -> bool {
+    pub(crate) fn contains(&self, x: f64, y: f64) -> bool {
         (self.low[0]..=self.high[0]).contains(&x) && (self.low[1]..=self.high[1]).contains(&y)
     }
 }
@@ -47,7 +47,7 @@ impl Camera {
     /// Creates a camera that shows `arms` and their workspaces as large as possible. The view does not depend on the
     /// arms' joints, so that all pictures of a task have the same.
     #[expect(clippy::cast_precision_loss, reason = "pixels of a picture that fits into memory")]
-    pub(super) fn fitted(arms: &[ArmScene], table_z_m: f64, width: usize, height: usize) -> Self {
+    pub(crate) fn fitted(arms: &[ArmScene], table_z_m: f64, width: usize, height: usize) -> Self {
         let points: Vec<DVec3> =
             arms.iter().flat_map(|arm| points_of(arm, table_z_m)).chain([DVec3::ZERO]).collect();
         let target = points.iter().sum::<DVec3>() / points.len() as f64;
@@ -96,14 +96,14 @@ impl Camera {
     }
 
     /// Returns the ray through a place in the picture: its origin and its direction, a unit vector.
-    pub(super) fn ray(&self, x: f64, y: f64) -> (DVec3, DVec3) {
+    pub(crate) fn ray(&self, x: f64, y: f64) -> (DVec3, DVec3) {
         let (right, up) = (x - self.centre_px[0], self.centre_px[1] - y);
         let direction = self.focal_px * self.forward + right * self.right + up * self.up;
         (self.eye, direction.normalize())
     }
 
     /// Returns a part of the picture that contains all of a sphere.
-    pub(super) fn bounds(&self, centre: DVec3, radius_m: f64) -> Rectangle {
+    pub(crate) fn bounds(&self, centre: DVec3, radius_m: f64) -> Rectangle {
         let nearest_m = (centre - self.eye).dot(self.forward) - radius_m;
         if nearest_m < NEAREST_M {
             return Rectangle { low: [f64::NEG_INFINITY; 2], high: [f64::INFINITY; 2] };

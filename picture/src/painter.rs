@@ -1,17 +1,14 @@
-//! Pictures of scenes: table, arms, objects and goals in perspective, with shadows, computed by casting rays.
+//! Draws a scene by casting rays.
 //!
-//! The colours, the light and the direction of the view are those of the SVG pictures in reports. A ray caster draws
-//! bodies that penetrate each other, such as fingers around an object, in the right order at every pixel.
+//! A ray caster draws bodies that penetrate each other, such as fingers around an object, in the right order at every
+//! pixel.
 
-mod camera;
-mod shape;
-
-use glam::DVec3;
-use tandem_core::layout::GOAL_TOLERANCE_M;
+use glam::{DVec2, DVec3};
 use tandem_core::scene::{ArmScene, Capsule, Cuboid, Scene};
 
-use camera::{Camera, Rectangle};
-use shape::{Hit, Shape};
+use crate::camera::{Camera, Rectangle};
+use crate::raster::Raster;
+use crate::shape::{Hit, Shape};
 
 /// Red, green and blue, 0 to 255.
 type Rgb = DVec3;
@@ -26,13 +23,23 @@ const TABLE_COLOR: Rgb = DVec3::new(233.0, 228.0, 219.0);
 const LINK_COLOR: Rgb = DVec3::new(238.0, 240.0, 243.0);
 const HAND_COLOR: Rgb = DVec3::new(74.0, 82.0, 92.0);
 const PEDESTAL_COLOR: Rgb = DVec3::new(89.0, 97.0, 107.0);
-const SKY_COLORS: [Rgb; 2] = [DVec3::new(247.0, 249.0, 251.0), DVec3::new(223.0, 229.0, 235.0)];
+const BACKGROUND: Rgb = DVec3::new(246.0, 248.0, 250.0);
+const WHITE: Rgb = DVec3::splat(255.0);
+/// Share of an arm's colour in that of its links.
+const LINK_TINT: f64 = 0.16;
 /// Direction towards the light, a unit vector.
 const LIGHT: DVec3 = DVec3::new(-0.36, -0.48, 0.80);
+/// Radius of the light as seen from the table, radians, which gives shadows a soft edge.
+const LIGHT_RADIUS: f64 = 0.028;
+/// Number of points of the light that a shadow on the table is computed from.
+const N_LIGHT_POINTS: u8 = 7;
 /// Brightness of a surface in shadow relative to the same surface in light.
-const SHADOW: f64 = 0.84;
-/// Opacity of goals.
-const GOAL_OPACITY: f64 = 0.34;
+const SHADOW: f64 = 0.80;
+/// Opacity of goals, and of goals that are achieved.
+const GOAL_OPACITIES: [f64; 2] = [0.30, 0.52];
+/// Share of white in the brightest point of a highlight, and its sharpness.
+const HIGHLIGHT: f64 = 0.42;
+const SHARPNESS: i32 = 24;
 /// Half the width of the ring on the table below a goal, metres.
 const RING_HALF_WIDTH_M: f64 = 0.0016;
 /// Half the lengths of the edges of a pedestal, metres.
@@ -46,12 +53,23 @@ const SHADOW_OFFSET_M: f64 = 1e-4;
 /// Index of the table among the bodies.
 const TABLE: usize = 0;
 
-/// Draws `scene` and returns red, green and blue, shape `[height, width, 3]`.
-pub(crate) fn picture(scene: &Scene, width: usize, height: usize) -> Vec<u8> {
-    let painter = Painter::new(scene, width, height);
+/// Draws `scene`.
+#[must_use]
+pub fn render(scene: &Scene, width: usize, height: usize) -> Raster {
+    render_achieved(scene, &[], width, height)
+}
+
+/// Draws `scene`; `achieved` contains which goals are achieved and have a stronger colour.
+pub(crate) fn render_achieved(
+    scene: &Scene,
+    achieved: &[bool],
+    width: usize,
+    height: usize,
+) -> Raster {
+    let painter = Painter::new(scene, achieved, width, height);
     let bodies: Vec<Sample> =
         pixels(width, height).map(|(x, y)| painter.sample(centre(x), centre(y))).collect();
-    let mut picture = Vec::with_capacity(3 * width * height);
+    let mut rgb = Vec::with_capacity(3 * width * height);
     for (x, y) in pixels(width, height) {
         let here = &bodies[y * width + x];
         let (right, below) = ((x + 1).min(width - 1), (y + 1).min(height - 1));
@@ -60,9 +78,9 @@ pub(crate) fn picture(scene: &Scene, width: usize, height: usize) -> Vec<u8> {
             [y * width + right, y * width + left, below * width + x, above * width + x];
         let is_edge = neighbours.iter().any(|idx| bodies[*idx].surface != here.surface);
         let color = if is_edge { painter.smooth(x, y) } else { here.color };
-        picture.extend(color.to_array().map(to_u8));
+        rgb.extend(color.to_array().map(to_u8));
     }
-    picture
+    Raster { width, height, rgb }
 }
 
 fn pixels(width: usize, height: usize) -> impl Iterator<Item = (usize, usize)> {
@@ -96,6 +114,7 @@ struct Goal {
     position: DVec3,
     color: Rgb,
     bounds: Rectangle,
+    is_achieved: bool,
 }
 
 /// What a ray meets.
@@ -108,23 +127,34 @@ struct Sample {
 #[derive(PartialEq, Clone, Copy)]
 struct Surface {
     body: Option<usize>,
-    is_lit: bool,
+    /// Number of points of the light that reach the surface.
+    n_lit: u8,
     /// The normal in steps of a quarter, so that the faces of a box differ and those of a cylinder mostly do not.
     face: [i8; 3],
     /// A bit for each goal in front of the surface or around it on the table.
     goals: u32,
 }
 
+/// The part of the table on which a body may cast a shadow: a disc.
+struct ShadowBounds {
+    body_idx: usize,
+    centre: DVec2,
+    radius_m: f64,
+}
+
 struct Painter {
     camera: Camera,
-    height: f64,
     bodies: Vec<Body>,
+    shadows: Vec<ShadowBounds>,
+    /// Directions towards points of the light, unit vectors.
+    light_points: [DVec3; N_LIGHT_POINTS as usize],
     goals: Vec<Goal>,
     table_z_m: f64,
+    tolerance_m: f64,
 }
 
 impl Painter {
-    fn new(scene: &Scene, width: usize, height: usize) -> Self {
+    fn new(scene: &Scene, achieved: &[bool], width: usize, height: usize) -> Self {
         let table_z_m = f64::from(scene.table.centre[2] + scene.table.half_extents_m[2]);
         let camera = Camera::fitted(&scene.arms, table_z_m, width, height);
         let body = |(shape, color): (Shape, Rgb)| Body {
@@ -132,23 +162,29 @@ impl Painter {
             shape,
             color,
         };
-        let goal = |(position, color): (&[f32; 3], &Rgb)| {
+        let tolerance_m = f64::from(scene.goal_tolerance_m);
+        let achieved = achieved.iter().copied().chain(std::iter::repeat(false));
+        let goal = |((position, color), is_achieved): ((&[f32; 3], &Rgb), bool)| {
             let position = DVec3::from(position.map(f64::from));
-            let radius_m = f64::from(GOAL_TOLERANCE_M);
-            let shape = Shape::sphere(position, radius_m);
-            Goal { bounds: camera.bounds(position, radius_m), shape, position, color: *color }
+            let shape = Shape::sphere(position, tolerance_m);
+            let bounds = camera.bounds(position, tolerance_m);
+            Goal { bounds, shape, position, color: *color, is_achieved }
         };
         let colors = || ARM_COLORS.iter().cycle();
         let arms = scene.arms.iter().zip(colors()).flat_map(|(arm, color)| shapes_of(arm, *color));
         let objects = scene.objects.iter().zip(colors());
         let objects = objects.map(|(object, color)| (Shape::cuboid(object), *color));
         let table = (Shape::cuboid(&scene.table), TABLE_COLOR);
+        let bodies: Vec<Body> =
+            std::iter::once(table).chain(arms).chain(objects).map(body).collect();
         Self {
-            bodies: std::iter::once(table).chain(arms).chain(objects).map(body).collect(),
-            goals: scene.goals.iter().zip(colors()).map(goal).collect(),
-            height: centre(height) - 0.5,
+            shadows: shadow_bounds(&bodies, table_z_m),
+            light_points: light_points(),
+            bodies,
+            goals: scene.goals.iter().zip(colors()).zip(achieved).map(goal).collect(),
             camera,
             table_z_m,
+            tolerance_m,
         }
     }
 
@@ -166,18 +202,18 @@ impl Painter {
         let hit = self.nearest(x, y, origin, direction);
         let depth_m = hit.as_ref().map_or(f64::INFINITY, |(_, hit)| hit.distance_m);
         let (mut color, mut surface) = match &hit {
-            Some((idx, hit)) => self.shade(*idx, hit, origin + hit.distance_m * direction),
-            None => {
-                let surface = Surface { body: None, is_lit: true, face: [0; 3], goals: 0 };
-                (SKY_COLORS[0].lerp(SKY_COLORS[1], y / self.height), surface)
+            Some((idx, hit)) => {
+                self.shade(*idx, hit, origin + hit.distance_m * direction, direction)
             }
+            None => (BACKGROUND, Surface { body: None, n_lit: 0, face: [0; 3], goals: 0 }),
         };
         for (idx, goal) in self.goals.iter().enumerate().filter(|(_, it)| it.bounds.contains(x, y))
         {
             let front = goal.shape.hit(origin, direction).filter(|it| it.distance_m < depth_m);
             if let Some(front) = front {
                 let rim = 1.0 - front.normal.dot(direction).abs();
-                let opacity = GOAL_OPACITY + 0.35 * rim * rim * rim;
+                let opacity =
+                    GOAL_OPACITIES[usize::from(goal.is_achieved)] + 0.35 * rim * rim * rim;
                 color = color.lerp(lit(goal.color, 1.12), opacity);
                 surface.goals |= 1 << (idx % 32);
             }
@@ -193,18 +229,17 @@ impl Painter {
         hits.min_by(|(_, a), (_, b)| a.distance_m.total_cmp(&b.distance_m))
     }
 
-    fn shade(&self, idx: usize, hit: &Hit, point: DVec3) -> (Rgb, Surface) {
-        let start = point + SHADOW_OFFSET_M * hit.normal;
-        let is_facing_light = hit.normal.dot(LIGHT) > 0.0;
-        let is_blocked = |body: &Body| body.shape.hit(start, LIGHT).is_some();
-        let is_lit = is_facing_light && !self.bodies[1..].iter().any(is_blocked);
-        let brightness = 0.66 + 0.46 * hit.normal.dot(LIGHT).max(0.0);
+    /// Returns the colour of body `idx` where `hit` is, seen along the unit vector `direction`.
+    fn shade(&self, idx: usize, hit: &Hit, point: DVec3, direction: DVec3) -> (Rgb, Surface) {
+        let normal = hit.normal;
+        let (facing, n_lit) = (normal.dot(LIGHT).max(0.0), self.n_lit(idx, hit, point));
+        let brightness = 0.60 + 0.07 * normal.z + 0.46 * facing;
         let mut color = lit(self.bodies[idx].color, brightness);
         let mut goals = 0;
-        if idx == TABLE && hit.normal.z > 0.5 {
+        if idx == TABLE && normal.z > 0.5 {
             for (goal_idx, goal) in self.goals.iter().enumerate() {
                 let below = goal.position.with_z(self.table_z_m);
-                let distance_m = point.distance(below) - f64::from(GOAL_TOLERANCE_M);
+                let distance_m = point.distance(below) - self.tolerance_m;
                 if distance_m.abs() < RING_HALF_WIDTH_M {
                     color = lit(goal.color, 0.85);
                     goals |= 1 << (goal_idx % 32);
@@ -213,11 +248,69 @@ impl Painter {
                 }
             }
         }
-        if !is_lit && is_facing_light {
-            color *= SHADOW;
+        if facing > 0.0 {
+            let share = f64::from(n_lit) / f64::from(N_LIGHT_POINTS);
+            color *= SHADOW + (1.0 - SHADOW) * share;
+            if idx != TABLE {
+                let halfway = (LIGHT - direction).normalize();
+                let highlight = normal.dot(halfway).max(0.0).powi(SHARPNESS);
+                color = color.lerp(WHITE, HIGHLIGHT * share * highlight);
+            }
         }
-        (color, Surface { body: Some(idx), is_lit, face: face(hit.normal), goals })
+        (color, Surface { body: Some(idx), n_lit, face: face(normal), goals })
     }
+
+    /// Returns how many points of the light reach the surface at `point`. Only shadows on the table have a soft edge.
+    fn n_lit(&self, idx: usize, hit: &Hit, point: DVec3) -> u8 {
+        if hit.normal.dot(LIGHT) <= 0.0 {
+            return 0;
+        }
+        let start = point + SHADOW_OFFSET_M * hit.normal;
+        if idx != TABLE || hit.normal.z < 0.5 {
+            let is_blocked = |body: &Body| body.shape.hit(start, LIGHT).is_some();
+            return N_LIGHT_POINTS * u8::from(!self.bodies[1..].iter().any(is_blocked));
+        }
+        let place = point.truncate();
+        let near =
+            |it: &&ShadowBounds| it.centre.distance_squared(place) < it.radius_m * it.radius_m;
+        let mut is_free = [true; N_LIGHT_POINTS as usize];
+        for bounds in self.shadows.iter().filter(near) {
+            let shape = &self.bodies[bounds.body_idx].shape;
+            for (is_free, light) in is_free.iter_mut().zip(self.light_points) {
+                *is_free = *is_free && shape.hit(start, light).is_none();
+            }
+        }
+        is_free.into_iter().map(u8::from).sum()
+    }
+}
+
+/// Returns the parts of the table on which the bodies other than the table may cast shadows.
+fn shadow_bounds(bodies: &[Body], table_z_m: f64) -> Vec<ShadowBounds> {
+    let bounds = |(body_idx, body): (usize, &Body)| {
+        let Shape { centre, radius_m, .. } = body.shape;
+        let distance_m = (centre.z - table_z_m) / LIGHT.z;
+        let soft_m = LIGHT_RADIUS * distance_m.abs();
+        ShadowBounds {
+            body_idx,
+            centre: (centre - distance_m * LIGHT).truncate(),
+            radius_m: (radius_m + soft_m) / LIGHT.z,
+        }
+    };
+    bodies.iter().enumerate().skip(1).map(bounds).collect()
+}
+
+/// Returns directions towards points of the light: its centre, and a ring around it.
+fn light_points() -> [DVec3; N_LIGHT_POINTS as usize] {
+    let middle = LIGHT.normalize();
+    let (u, v) = middle.any_orthonormal_pair();
+    std::array::from_fn(|idx| match idx {
+        0 => middle,
+        _ => {
+            let angle_rad =
+                std::f64::consts::TAU * (centre(idx) - 0.5) / f64::from(N_LIGHT_POINTS - 1);
+            (middle + LIGHT_RADIUS * (angle_rad.cos() * u + angle_rad.sin() * v)).normalize()
+        }
+    })
 }
 
 #[expect(clippy::cast_possible_truncation, reason = "a unit vector, so from −2 to 2")]
@@ -227,11 +320,7 @@ fn face(normal: DVec3) -> [i8; 3] {
 
 /// Changes the brightness of a colour: 0 is black, 1 the colour itself, 2 white.
 fn lit(color: Rgb, brightness: f64) -> Rgb {
-    if brightness <= 1.0 {
-        color * brightness
-    } else {
-        color.lerp(DVec3::splat(255.0), brightness - 1.0)
-    }
+    if brightness <= 1.0 { color * brightness } else { color.lerp(WHITE, brightness - 1.0) }
 }
 
 /// Returns the parts of an arm.
@@ -249,7 +338,7 @@ fn shapes_of(arm: &ArmScene, color: Rgb) -> Vec<(Shape, Rgb)> {
         let radius_m = JOINT_WIDENING * f64::from(link.radius_m.max(next.radius_m));
         Some((Shape::sphere(DVec3::from(link.to.map(f64::from)), radius_m), color))
     });
-    let bars = links.iter().map(|link| (Shape::capsule(link), LINK_COLOR));
+    let bars = links.iter().map(|link| (Shape::capsule(link), LINK_COLOR.lerp(color, LINK_TINT)));
     let hand = arm.hand.iter().map(|part| (Shape::cuboid(part), HAND_COLOR));
     let pedestal = std::iter::once((Shape::cuboid(&pedestal), PEDESTAL_COLOR));
     pedestal.chain(bars).chain(joints).chain(hand).collect()

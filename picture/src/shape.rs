@@ -4,12 +4,12 @@ use glam::{DMat3, DQuat, DVec3};
 use tandem_core::scene::{Capsule, Cuboid};
 
 /// A solid, world frame, metres.
-pub(super) struct Shape {
+pub(crate) struct Shape {
     solid: Solid,
     /// Centre of the solid.
-    pub(super) centre: DVec3,
+    pub(crate) centre: DVec3,
     /// Radius of a sphere around the centre that contains the solid.
-    pub(super) radius_m: f64,
+    pub(crate) radius_m: f64,
 }
 
 enum Solid {
@@ -20,15 +20,15 @@ enum Solid {
 }
 
 /// The place where a ray enters a shape.
-pub(super) struct Hit {
+pub(crate) struct Hit {
     /// Distance from the ray's origin.
-    pub(super) distance_m: f64,
+    pub(crate) distance_m: f64,
     /// Outward normal, a unit vector.
-    pub(super) normal: DVec3,
+    pub(crate) normal: DVec3,
 }
 
 impl Shape {
-    pub(super) fn capsule(capsule: &Capsule) -> Self {
+    pub(crate) fn capsule(capsule: &Capsule) -> Self {
         let [from, to] = [capsule.from, capsule.to].map(|end| DVec3::from(end.map(f64::from)));
         let radius_m = f64::from(capsule.radius_m);
         Self {
@@ -38,11 +38,11 @@ impl Shape {
         }
     }
 
-    pub(super) fn sphere(centre: DVec3, radius_m: f64) -> Self {
+    pub(crate) fn sphere(centre: DVec3, radius_m: f64) -> Self {
         Self { solid: Solid::Capsule { from: centre, to: centre, radius_m }, centre, radius_m }
     }
 
-    pub(super) fn cuboid(cuboid: &Cuboid) -> Self {
+    pub(crate) fn cuboid(cuboid: &Cuboid) -> Self {
         let orientation = DQuat::from_array(cuboid.orientation.map(f64::from)).normalize();
         let half_m = DVec3::from(cuboid.half_extents_m.map(f64::from));
         Self {
@@ -55,7 +55,7 @@ impl Shape {
     /// Returns where the ray from `origin` along the unit vector `direction` enters the shape. A ray that starts inside
     /// does not.
     #[inline]
-    pub(super) fn hit(&self, origin: DVec3, direction: DVec3) -> Option<Hit> {
+    pub(crate) fn hit(&self, origin: DVec3, direction: DVec3) -> Option<Hit> {
         let offset = self.centre - origin;
         let along_m = offset.dot(direction);
         let beside_m2 = offset.length_squared() - along_m * along_m;

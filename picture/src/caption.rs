@@ -1,0 +1,50 @@
+//! Text in pictures.
+
+use noto_sans_mono_bitmap::{FontWeight, RasterHeight, get_raster, get_raster_width};
+
+use crate::raster::Raster;
+
+/// Colour of captions.
+pub(crate) const INK: [u8; 3] = [44, 51, 60];
+/// Colour of the word `success`.
+pub(crate) const GOOD: [u8; 3] = [20, 122, 76];
+/// Colour of the word `failure`.
+pub(crate) const BAD: [u8; 3] = [184, 62, 26];
+/// Pictures from this height on have the larger font, pixels.
+const LARGE_FROM_PX: usize = 520;
+
+/// The part of the picture where a text starts or ends.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Corner {
+    /// Upper left.
+    Left,
+    /// Upper right.
+    Right,
+}
+
+/// Writes `text` into a corner of `raster`, on the line with this number from the top. Characters that the font lacks, all beyond ASCII, become `?`. A text
+/// that is too wide is cut off.
+pub(crate) fn write(raster: &mut Raster, corner: (Corner, usize), text: &str, color: [u8; 3]) {
+    let size = match raster.height {
+        ..LARGE_FROM_PX => RasterHeight::Size20,
+        _ => RasterHeight::Size32,
+    };
+    let weight = if color == INK { FontWeight::Regular } else { FontWeight::Bold };
+    let (advance, margin) = (get_raster_width(weight, size), size.val() / 2);
+    let width = advance * text.chars().count();
+    let (corner, line) = corner;
+    let top = margin + line * size.val();
+    let left = match corner {
+        Corner::Left => margin,
+        Corner::Right => raster.width.saturating_sub(margin + width),
+    };
+    for (idx, character) in text.chars().enumerate() {
+        let glyph = get_raster(character, weight, size).or_else(|| get_raster('?', weight, size));
+        let rows = glyph.iter().flat_map(|glyph| glyph.rows().enumerate());
+        for (y, row) in rows {
+            for (x, opacity) in row.iter().enumerate().filter(|(_, opacity)| **opacity > 0) {
+                raster.blend(left + idx * advance + x, top + y, color, *opacity);
+            }
+        }
+    }
+}

@@ -1,0 +1,80 @@
+//! The tables of means, which fit into a terminal.
+
+use super::{
+    Baseline, Section, advice_spent, best_success, env_steps, epochs, four_digits, minutes, range,
+    success_without_contact, test_success, three_digits,
+};
+use crate::group::MILESTONES;
+use crate::table::{NONE, Table, mean, optional, short_number};
+
+impl Section {
+    /// Returns the success on test goals with its interval, and that of the best evaluation.
+    pub(super) fn success_summary(&self) -> Table {
+        let title = format!("{}: success of the policy alone, on test goals", self.setup.title());
+        let header = ["strategy", "runs", "success", "95 % interval", "no contact", "best eval."];
+        let mut table = Table::new(title, &header);
+        for group in &self.groups {
+            let (test, interval) = group.share(test_success);
+            let (best, _) = group.share(best_success);
+            table.rows.push(vec![
+                group.label.clone(),
+                group.runs.len().to_string(),
+                mean(&test, three_digits),
+                interval.map_or_else(|| NONE.to_owned(), |it| range(it.low, it.high)),
+                mean(&group.share(success_without_contact).0, three_digits),
+                mean(&best, three_digits),
+            ]);
+        }
+        table.rows.extend(self.baselines.iter().map(|Baseline { label, test }| {
+            let without_contact = test.contacts.success_without_contact;
+            vec![
+                label.clone(),
+                NONE.to_owned(),
+                three_digits(test.success),
+                range(test.interval.0, test.interval.1),
+                optional(without_contact, three_digits),
+                NONE.to_owned(),
+            ]
+        }));
+        table
+    }
+
+    /// Returns the mean cost of a success.
+    pub(super) fn cost_summary(&self) -> Table {
+        let title = format!("{}: cost of a success in an evaluation", self.setup.title());
+        let header =
+            ["strategy", "steps to 50 %", "90 %", "95 %", "min to 90 %", "advice", "steps"];
+        let mut table = Table::new(title, &header);
+        for group in &self.groups {
+            let steps = |success| group.at_milestone(success, |row| row.env_steps as f64);
+            let mut row = vec![group.label.clone()];
+            row.extend(MILESTONES.map(|success| mean(&steps(success), rounded)));
+            row.push(mean(&group.at_milestone(0.9, |row| row.wall_s / 60.0), minutes));
+            row.push(mean(&group.spread(advice_spent), rounded));
+            row.push(mean(&group.spread(env_steps), rounded));
+            table.rows.push(row);
+        }
+        table
+    }
+
+    /// Returns the means of the paper's measures.
+    pub(super) fn measures_summary(&self) -> Table {
+        let title = format!("{}: measures of the paper's Table 2", self.setup.title());
+        let mut table = Table::new(title, &["strategy", "IE", "RT", "MSR", "ELR"]);
+        for group in &self.groups {
+            table.rows.push(vec![
+                group.label.clone(),
+                mean(&group.measure(|measures| measures.inspired_epoch), epochs),
+                mean(&group.measure(|measures| measures.rising_epochs), epochs),
+                mean(&group.measure(|measures| Some(measures.max_success)), three_digits),
+                mean(&group.measure(|measures| measures.learning_rate), four_digits),
+            ]);
+        }
+        table
+    }
+}
+
+/// Formats a mean count to hundreds: 33,333 as 33.3k.
+fn rounded(count: f64) -> String {
+    short_number(100.0 * (count / 100.0).round())
+}

@@ -1,0 +1,111 @@
+//! Films of episodes, which `--film` writes, and film strips for reports.
+
+use std::path::Path;
+
+use tandem_core::rng::{Stream, episode_rng};
+use tandem_core::{Episode, Layout, TaskSpec, WorldSettings};
+use tandem_picture::{Film, FilmEpisode, FilmStep, film_gif, film_strip};
+use tandem_sim::{Env, SimError, WorldConfig};
+
+use crate::cli::FilmArgs;
+use crate::exit::{Exit, Failed, OrExit as _};
+
+/// Width and height of a picture in an animation, pixels.
+const ANIMATION_SIZE: (usize, usize) = (640, 400);
+/// Width and height of a picture in a film strip, pixels.
+const STRIP_SIZE: (usize, usize) = (480, 300);
+
+/// A film that the command line asks for.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct PlannedFilm<'a> {
+    path: &'a Path,
+    kind: Kind,
+    film: Film,
+}
+
+/// The kinds of film, by the ending of their file names.
+#[derive(Debug, Clone, Copy)]
+enum Kind {
+    Animation,
+    Strip,
+}
+
+impl<'a> PlannedFilm<'a> {
+    /// Checks the options of a film. Returns `None` if there is none.
+    pub(crate) fn of(args: &'a FilmArgs) -> Result<Option<Self>, Failed> {
+        let Some(path) = &args.film else { return Ok(None) };
+        let ending = path.extension().unwrap_or_default().to_ascii_lowercase();
+        let (kind, default_size) = match ending.to_str() {
+            Some("gif") => (Kind::Animation, ANIMATION_SIZE),
+            Some("png") => (Kind::Strip, STRIP_SIZE),
+            _ => {
+                return Err(Failed::usage(format!(
+                    "--film {}: the name must end in .gif (an animation) or .png (a strip of pictures)",
+                    path.display()
+                )));
+            }
+        };
+        let (width, height) = args.film_size.map_or(default_size, |size| (size.width, size.height));
+        let film = Film { width, height, speed: args.film_speed };
+        let film = film.checked().or_exit(Exit::Usage, || "--film".to_owned())?;
+        Ok(Some(Self { path, kind, film }))
+    }
+
+    /// Draws the film and writes its file.
+    pub(crate) fn write(&self, episodes: &[FilmEpisode]) -> Result<(), Failed> {
+        let bytes = match self.kind {
+            Kind::Animation => film_gif(episodes, &self.film),
+            Kind::Strip => film_strip(episodes, &self.film),
+        };
+        let bytes = bytes.or_exit(Exit::Bug, String::new)?;
+        std::fs::write(self.path, bytes)
+            .or_cannot_write(|| format!("cannot write {}", self.path.display()))
+    }
+}
+
+/// The line of a result that names the file.
+impl std::fmt::Display for PlannedFilm<'_> {
+    fn fmt(&self, formatter: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(formatter, "film          {}", self.path.display())
+    }
+}
+
+/// Draws the film strips of episodes as a PNG.
+pub(crate) fn strip(episodes: &[FilmEpisode]) -> Result<Vec<u8>, Failed> {
+    let (width, height) = STRIP_SIZE;
+    film_strip(episodes, &Film { width, height, speed: 1.0 }).or_exit(Exit::Bug, String::new)
+}
+
+/// Simulates an episode of an evaluation with `seed` again, for a film.
+pub(crate) fn of_evaluation(
+    layout: Layout,
+    seed: u64,
+    episode: &Episode,
+) -> Result<FilmEpisode, Failed> {
+    let mut world = Env::new(layout, &WorldConfig::default()).or_exit(Exit::Bug, String::new)?;
+    world.reset(&mut episode_rng(seed, episode.number, Stream::Reset), WorldSettings::default());
+    let actions = (0..episode.n_steps()).map(|step_idx| episode.action(step_idx));
+    of_actions(world, actions, episode.number).or_exit(Exit::Bug, String::new)
+}
+
+/// Executes `actions` in `world`, which is at the start of episode `number`.
+pub(crate) fn of_actions<'a>(
+    mut world: Env,
+    actions: impl Iterator<Item = &'a [f32]>,
+    number: u64,
+) -> Result<FilmEpisode, SimError> {
+    let task = TaskSpec::from(world.layout());
+    let mut steps = vec![moment(&world, &task)];
+    for action in actions {
+        world.step(action)?;
+        steps.push(moment(&world, &task));
+    }
+    Ok(FilmEpisode { title: format!("{}, episode {number}", task.name()), steps })
+}
+
+fn moment(world: &Env, task: &TaskSpec) -> FilmStep {
+    let mut observation = vec![0.0; task.n_observation()];
+    world.observe(&mut observation);
+    let achieved = task.arms().map(|arm| task.arm_succeeds(arm, &observation, world.goal()));
+    FilmStep { achieved: achieved.collect(), scene: world.scene() }
+}
