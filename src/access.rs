@@ -54,15 +54,19 @@ pub(crate) fn client_config_without_token(args: &ClientArgs) -> Result<ClientCon
 }
 
 fn token(secret: &SecretArgs) -> Result<Option<Token>, Failed> {
-    let Some(path) = &secret.token_file else { return Ok(None) };
-    let (name, cannot_read) = (path.clone(), || format!("cannot read {path:?}"));
+    secret.token_file.as_deref().map(read_token).transpose()
+}
+
+/// Reads the token in a file.
+pub(crate) fn read_token(path: &Path) -> Result<Token, Failed> {
+    let (name, cannot_read) = (path.to_owned(), || format!("cannot read {path:?}"));
     let read =
         input::in_time(path, move || Token::read(&name)).or_exit(Exit::Usage, cannot_read)?;
     let token = read.or_exit(Exit::Usage, String::new)?;
     if is_readable_by_all(path) {
         warn!(?path, "every user of this machine can read the token: chmod 600 FILE");
     }
-    Ok(Some(token))
+    Ok(token)
 }
 
 /// Returns whether the mode of the file lets all users read it.

@@ -106,9 +106,25 @@ impl ChildProcess {
 
     /// Reads the address of a service from the line `listening on ADDR`; `None` if the process does not print it.
     pub(crate) async fn service_address(&mut self) -> anyhow::Result<Option<String>> {
-        let mut line = String::new();
-        BufReader::new(self.take_output()?).read_line(&mut line).await?;
-        Ok(line.trim().strip_prefix("listening on ").map(str::to_owned))
+        let [address] = self.lines().await?;
+        Ok(address.strip_prefix("listening on ").map(str::to_owned))
+    }
+
+    /// Reads the address of a service, and the line about its dashboard.
+    pub(crate) async fn addresses(&mut self) -> anyhow::Result<Option<(String, String)>> {
+        let [address, dashboard] = self.lines().await?;
+        Ok(address.strip_prefix("listening on ").map(|address| (address.to_owned(), dashboard)))
+    }
+
+    /// Reads the first lines of standard output; a line that the process does not print is empty.
+    async fn lines<const N: usize>(&mut self) -> anyhow::Result<[String; N]> {
+        let mut output = BufReader::new(self.take_output()?);
+        let mut lines = [const { String::new() }; N];
+        for line in &mut lines {
+            output.read_line(line).await?;
+            line.truncate(line.trim_end().len());
+        }
+        Ok(lines)
     }
 
     /// Asks the process to exit and waits for it; kills it after `deadline`.

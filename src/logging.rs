@@ -58,7 +58,6 @@ const fn spans(_: &Cli) -> Result<(Option<ExtraLayer>, LogGuard), Failed> {
 }
 
 /// Returns false if `NO_COLOR` is set and not empty (<https://no-color.org>).
-#[expect(clippy::disallowed_methods, reason = "NO_COLOR is read once, before anything is logged")]
 fn wants_colour() -> bool {
     std::env::var_os("NO_COLOR").is_none_or(|value| value.is_empty())
 }

@@ -14,6 +14,7 @@ mod call_failure;
 mod cli;
 mod clock;
 mod columns;
+mod dashboard;
 mod environment_command;
 mod environment_server;
 mod eval;

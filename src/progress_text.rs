@@ -43,7 +43,7 @@ pub(crate) fn remaining_s(progress: &pb::Progress) -> Option<f64> {
     let is_limited = progress.max_env_steps > 0 && progress.env_steps_per_s > 0.0;
     let by_steps = is_limited.then(|| steps / progress.env_steps_per_s);
     let by_time =
-        (progress.max_minutes > 0.0).then(|| 60.0 * progress.max_minutes - progress.wall_s);
+        (progress.max_minutes > 0.0).then_some(60.0 * progress.max_minutes - progress.wall_s);
     let first = by_steps.into_iter().chain(by_time).reduce(f64::min);
     first.map(|left_s| left_s.max(0.0))
 }

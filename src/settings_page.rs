@@ -173,7 +173,7 @@ fn text_at(settings: &Table, key: &str) -> String {
     match value {
         Some(Value::String(text)) => format!("`{text}`"),
         // The shortest text of a number with the precision that networks have.
-        Some(Value::Float(number)) => format!("{}", *number as f32),
+        Some(Value::Float(number)) => shortest(*number),
         Some(value) => value.to_string(),
         None => String::new(),
     }
@@ -208,6 +208,12 @@ fn range(key: &str) -> String {
         (None, Some(kind)) => kind.to_owned(),
         (None, None) => "any".to_owned(),
     }
+}
+
+/// Returns the fewest digits of a number that the settings hold in single precision.
+#[expect(clippy::cast_possible_truncation, reason = "settings are in single precision")]
+fn shortest(number: f64) -> String {
+    (number as f32).to_string()
 }
 
 #[cfg(test)]

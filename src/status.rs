@@ -172,6 +172,6 @@ mod tests {
             "{text}"
         );
         let ended = pb::Progress { ended: true, end_reason: "done".to_owned(), ..progress };
-        assert_eq!(super::lines(&ended).last().map(String::as_str), Some("ended: done"));
+        assert_eq!(lines(&ended).last().map(String::as_str), Some("ended: done"));
     }
 }

@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 use std::path::{Path, PathBuf};
 
-const ALLOWED: [(&str, &[&str]); 19] = [
+const ALLOWED: [(&str, &[&str]); 20] = [
     ("core", &[]),
     ("system", &[]),
     ("kinematics", &["core"]),
@@ -24,6 +24,7 @@ const ALLOWED: [(&str, &[&str]); 19] = [
     ("bridge", &["core", "kinematics", "proto", "net"]),
     ("trials", &["core", "kinematics", "sim", "policy", "telemetry", "bridge"]),
     ("bench", &["core", "sim", "policy", "proto", "net", "rl", "teacher"]),
+    ("dashboard", &["core", "telemetry", "net"]),
 ];
 
 /// The Python package, which has a workspace of its own and is in no image.

@@ -13,6 +13,8 @@ use tandem_net::{AuthChannel, Backoff, ClientConfig, ClientConfigError, Operatio
 use tandem_proto::pb::teacher_client::TeacherClient;
 use tandem_proto::{DecodeError, decode_task, pb};
 use tandem_telemetry::events::AdviceAccountOpened;
+use tandem_telemetry::{TeacherState, TeacherView};
+use tokio::sync::watch;
 use tokio_util::sync::{CancellationToken, DropGuard};
 use tonic::{Code, Status};
 use tracing::warn;
@@ -125,6 +127,8 @@ pub(crate) struct AccountOptions<'a> {
     pub(crate) units_per_episode: u32,
     /// The start of the run.
     pub(crate) start: RunStart,
+    /// Receives the state of the teacher.
+    pub(crate) view: watch::Sender<TeacherView>,
 }
 
 /// The run's account at the teacher, used by the learning thread.
@@ -157,8 +161,8 @@ impl AdviceAccount {
         runtime: &Runtime,
         shutdown: &CancellationToken,
     ) -> Result<Self, TeacherError> {
-        let AccountOptions { client_config, address, one_arm, terms, units_per_episode, start } =
-            options;
+        let AccountOptions { client_config, address, one_arm, terms, .. } = options;
+        let AccountOptions { units_per_episode, start, view, .. } = options;
         let inside = runtime.enter();
         let client = TeacherClient::new(client_config.channel(address)?);
         drop(inside);
@@ -181,7 +185,8 @@ impl AdviceAccount {
             RunStart::New => account.open_account(budget, 0)?,
             RunStart::Resumed { spent } => account.resume(spent)?,
         }
-        let watch = watch_account(client, account.terms.name.clone(), lost, warnings.clone());
+        let watcher = AccountWatcher { client, lost, warnings: warnings.clone(), view };
+        let watch = watcher.watch(account.terms.name.clone());
         runtime.spawn(async move {
             tokio::select! {
                 () = watch => (),
@@ -426,20 +431,45 @@ const fn statement(account: &pb::Account) -> Statement {
     Statement { spent: account.spent, leased: account.leased }
 }
 
-/// Sets `lost` when the teacher reports that it does not know the account, and forwards the teacher's warning.
-async fn watch_account(
-    mut client: TeacherClient<AuthChannel>,
-    name: String,
+/// Asks for the account about once a second.
+struct AccountWatcher {
+    client: TeacherClient<AuthChannel>,
+    /// Set when the teacher reports that it does not know the account.
     lost: Arc<AtomicBool>,
+    /// Receives the teacher's warning.
     warnings: Warnings,
-) {
-    loop {
-        tokio::time::sleep(CHECK_PERIOD).await;
-        let look = client.get_account(pb::GetAccountRequest { name: name.clone() });
-        match within(CALL_DEADLINE, look).await {
-            Ok(account) => warnings.set(Source::Teacher, &account.into_inner().warning),
-            Err(status) if status.code() == Code::NotFound => lost.store(true, Ordering::Relaxed),
-            Err(_) => {}
+    /// Receives the state of the teacher.
+    view: watch::Sender<TeacherView>,
+}
+
+impl AccountWatcher {
+    async fn watch(mut self, name: String) {
+        loop {
+            tokio::time::sleep(CHECK_PERIOD).await;
+            let look = self.client.get_account(pb::GetAccountRequest { name: name.clone() });
+            let answer = within(CALL_DEADLINE, look).await;
+            self.handle(answer.map(tonic::Response::into_inner));
         }
+    }
+
+    fn handle(&self, answer: Result<pb::Account, Status>) {
+        let (state, error) = match &answer {
+            Ok(account) => {
+                self.warnings.set(Source::Teacher, &account.warning);
+                (TeacherState::Answering, String::new())
+            }
+            Err(status) if status.code() == Code::NotFound => {
+                self.lost.store(true, Ordering::Relaxed);
+                (TeacherState::Lost, status.message().to_owned())
+            }
+            Err(status) => (TeacherState::Unreachable, status.message().to_owned()),
+        };
+        self.view.send_modify(|view| {
+            (view.state, view.error) = (state, error);
+            if let Ok(pb::Account { name, budget, spent, leased, warning, .. }) = answer {
+                (view.account, view.ledger_warning) = (name, warning);
+                (view.budget, view.spent, view.leased) = (budget, spent, leased);
+            }
+        });
     }
 }

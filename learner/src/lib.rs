@@ -22,6 +22,7 @@ pub mod settings;
 mod shared;
 mod timings;
 mod training_loop;
+mod view;
 mod warnings;
 pub mod work_queue;
 

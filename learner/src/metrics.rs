@@ -95,7 +95,7 @@ fn add_environment(registry: &mut Registry, checks: EnvironmentChecks) {
 /// Adds success rates, as far as there are any.
 fn add_evaluations(registry: &mut Registry, progress: &Progress) {
     let training = "Share of the latest training episodes that succeeded";
-    gauge(registry, "training_success_ratio", training, progress.training_success);
+    gauge(registry, "training_success_ratio", training, progress.stats.training_success);
     if let Some(evaluation) = &progress.latest {
         let latest = "Share of the latest evaluation's episodes that succeeded";
         gauge(registry, "evaluation_success_ratio", latest, evaluation.success);

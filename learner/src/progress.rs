@@ -1,7 +1,7 @@
 //! The progress of a run, as the learning thread reports it. The service turns it into messages and metrics.
 
-use tandem_rl::trainer::Counters;
-use tandem_telemetry::MetricsRow;
+use tandem_rl::trainer::{Counters, RoundStats};
+use tandem_telemetry::{ActedSteps, MetricsRow};
 
 /// A snapshot of the run.
 #[derive(Debug, Clone, PartialEq, Default)]
@@ -24,12 +24,16 @@ pub(crate) struct Progress {
     pub(crate) env_steps_per_s: f64,
     /// Recent updates per second.
     pub(crate) updates_per_s: f64,
+    /// Recent units of advice per minute.
+    pub(crate) advice_per_min: f64,
     /// Units of advice that the run may still spend.
     pub(crate) budget_left: u64,
     /// The current activity; `None` before the run starts.
     pub(crate) phase: Option<Phase>,
-    /// Fraction of the latest round's episodes that succeeded.
-    pub(crate) training_success: f64,
+    /// Statistics of the latest round.
+    pub(crate) stats: RoundStats,
+    /// The arms' training steps by who acted, since the learner started; in arm order.
+    pub(crate) acted: Vec<ActedSteps>,
     /// The workers, by number.
     pub(crate) workers: Vec<WorkerProgress>,
     /// The latest evaluation.
@@ -72,6 +76,19 @@ pub(crate) enum Phase {
     Updating,
     Evaluating,
     Ended,
+}
+
+impl Phase {
+    /// Returns the name in messages.
+    pub(crate) const fn name(self) -> &'static str {
+        match self {
+            Self::Starting => "starting",
+            Self::Collecting => "collecting",
+            Self::Updating => "updating",
+            Self::Evaluating => "evaluating",
+            Self::Ended => "ended",
+        }
+    }
 }
 
 /// The end of a run.

@@ -15,8 +15,10 @@ use tandem_net::{ConnectionClosed, EncodedResponse, Incoming, MAX_MESSAGE_BYTES,
 use tandem_proto::pb;
 use tandem_proto::pb::learner_server::{Learner, LearnerServer};
 use tandem_proto::{decode_episode, encode_run_terms, encode_slot};
+use tandem_telemetry::RunView;
 use tandem_telemetry::events::WorkerJoined;
 use tokio::net::TcpListener;
+use tokio::sync::watch;
 use tokio_stream::wrappers::WatchStream;
 use tokio_stream::{Stream, StreamExt as _};
 use tokio_util::sync::CancellationToken;
@@ -29,6 +31,7 @@ use crate::runtime::{Runtime, on_a_thread};
 use crate::shared::{LearnerConfig, Shared};
 use crate::timings::Timings;
 use crate::training_loop::{self, Context, RunOutcome};
+use crate::view;
 use crate::work_queue::check_count;
 use messages::{encode_finished, encode_progress};
 pub(crate) use refusals::check_version;
@@ -46,6 +49,8 @@ const LINGER_TICK: Duration = Duration::from_millis(50);
 pub struct ServeOptions {
     /// Serves metrics at `/metrics`, without a token.
     pub metrics: Option<TcpListener>,
+    /// Receives snapshots of the run about twice a second.
+    pub views: Option<watch::Sender<RunView>>,
     /// The stay of the service after a complete run.
     pub linger: LingerPolicy,
 }
@@ -113,6 +118,7 @@ fn serve_boxed(
         let stop_serving = CancellationToken::new();
         let page = config.server_config.metrics().endpoint();
         let serving_metrics = serve_metrics(options.metrics, page);
+        let publishing = view::publish(options.views, shared.clone(), config.run.clone());
         let learning = {
             let (pacing, stop) = (config.pacing, stop_serving.clone());
             let shutdown = shutdown.clone();
@@ -133,6 +139,7 @@ fn serve_boxed(
             let served = tokio::select! {
                 served = tandem_net::serve(router, incoming, stop_serving) => served,
                 () = serving_metrics => Ok(()),
+                () = publishing => Ok(()),
             };
             // A server that fails ends the run: no worker can reach it any more.
             shutdown.cancel();

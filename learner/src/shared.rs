@@ -5,11 +5,13 @@ use std::path::PathBuf;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
+use tandem_core::Episode;
 use tandem_core::work::{PublishedActor, RunTerms};
 use tandem_net::{ClientConfig, EncodedResponse, Pacing, ServerConfig};
 use tandem_policy::Policy;
 use tandem_proto::{encode_actor, pb};
 use tandem_rl::config::RunConfig;
+use tandem_telemetry::{MetricsRow, TeacherView};
 use tokio::sync::{Notify, watch};
 
 use crate::connections::{Connections, LogQuota};
@@ -73,6 +75,8 @@ pub(crate) struct Shared {
     pub(crate) work: Notify,
     pub(crate) progress: watch::Sender<Progress>,
     pub(crate) warnings: Warnings,
+    /// The teacher and its ledger.
+    pub(crate) teacher: watch::Sender<TeacherView>,
     pub(crate) clock: Clock,
     pub(crate) timings: Timings,
 }
@@ -93,6 +97,10 @@ pub(crate) struct State {
     pub(crate) connections: Connections,
     /// Limits the log lines about workers that join.
     pub(crate) join_lines: LogQuota,
+    /// All evaluations, oldest first.
+    pub(crate) evaluations: Arc<[MetricsRow]>,
+    /// The first episodes of the latest evaluation.
+    pub(crate) evaluated: Arc<[Episode]>,
     /// Episodes in the replay buffer.
     pub(crate) n_replay_episodes: usize,
 }
@@ -120,6 +128,7 @@ impl Shared {
             arrived: Arc::default(),
             work: Notify::new(),
             warnings: Warnings::new(progress.clone()),
+            teacher: watch::Sender::default(),
             progress,
             clock,
             timings,

@@ -176,6 +176,7 @@ impl LearnerLoop<'_> {
 
     fn learn(&mut self, episodes: &[Episode], advice_spent: u64) -> Result<RoundStats, Error> {
         self.trainer.ingest(episodes);
+        self.progress.record_acted(episodes);
         self.trainer.correct_advice_spent(advice_spent);
         if let Some(warning) = self.trainer.implausible_statistic() {
             self.context.shared.warnings.set_first(Source::Statistics, &warning);
@@ -353,6 +354,7 @@ impl LearnerLoop<'_> {
             return Ok(false);
         };
         self.evaluations.complete(&episodes);
+        self.progress.keep_evaluated(&episodes);
         self.write_records();
         self.progress.publish_evaluations(self.evaluations.history());
         Ok(true)

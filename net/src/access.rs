@@ -92,12 +92,14 @@ impl Token {
     }
 
     /// Returns the value of the `authorization` header.
-    pub(crate) fn header(&self) -> String {
+    #[must_use]
+    pub fn header(&self) -> String {
         format!("{SCHEME}{}", self.0)
     }
 
     /// Returns whether `header` carries this token, in a time that does not depend on where it differs.
-    pub(crate) fn matches(&self, header: &[u8]) -> bool {
+    #[must_use]
+    pub fn matches(&self, header: &[u8]) -> bool {
         let Some((scheme, token)) = header.split_at_checked(SCHEME.len()) else { return false };
         let differences = self.0.bytes().zip(token).fold(0, |sum, (a, b)| sum | (a ^ b));
         scheme.eq_ignore_ascii_case(SCHEME.as_bytes())

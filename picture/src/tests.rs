@@ -61,11 +61,11 @@ fn episode(n_moving: u16, n_resting: u16) -> FilmEpisode {
 fn decoded(bytes: &[u8]) -> (Vec<u8>, Vec<u16>) {
     let mut options = DecodeOptions::new();
     options.set_color_output(ColorOutput::RGBA);
-    let mut decoder = options.read_info(bytes).unwrap();
+    let mut decoder = options.read_info(bytes).expect("a GIF");
     let width = usize::from(decoder.width());
     let mut rgb = vec![0; 3 * width * usize::from(decoder.height())];
     let mut delays_cs = Vec::new();
-    while let Some(frame) = decoder.read_next_frame().unwrap() {
+    while let Some(frame) = decoder.read_next_frame().expect("a frame") {
         delays_cs.push(frame.delay);
         for (idx, pixel) in frame.buffer.chunks_exact(4).enumerate() {
             let (row, column) = (idx / usize::from(frame.width), idx % usize::from(frame.width));

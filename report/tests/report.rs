@@ -260,14 +260,18 @@ fn a_described_task_has_its_own_section_beside_a_built_in_one() {
     let csv = tandem_report::export::csv(&comparison);
     assert!(csv.lines().any(|line| line.starts_with("lab/reach,2,ea,ea,reach-2-ea-seed1,1,")));
 
-    let page = std::fs::read_to_string(run_report_html(&described).unwrap()).unwrap();
+    check_pages_of_runs(&described, &dir.path().join("push-ea-seed1"));
+}
+
+/// Checks the pages of a run of a described task and of one of a built-in task.
+fn check_pages_of_runs(described: &Path, push: &Path) {
+    let page = std::fs::read_to_string(run_report_html(described).unwrap()).unwrap();
     assert_eq!(page.matches("<svg").count(), 3, "no curve of contacts");
     assert!(!page.contains("Episodes with contact") && !page.contains("with contact"));
     let line =
         "Task lab/reach: 2 arms, 100 control steps per episode, goals within 0.02 (maximum norm)";
     assert!(page.contains(line), "{page}");
-    let push = dir.path().join("push-ea-seed1");
-    let page = std::fs::read_to_string(run_report_html(&push).unwrap()).unwrap();
+    let page = std::fs::read_to_string(run_report_html(push).unwrap()).unwrap();
     assert_eq!(page.matches("<svg").count(), 4);
     let line =
         "Task push: 2 arms, 50 control steps per episode, goals within 0.05 m (Euclidean norm)";

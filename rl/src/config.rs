@@ -320,6 +320,7 @@ impl RunConfig {
 
     /// Returns the cost of a contact in round `round`, from 0.
     #[must_use]
+    #[expect(clippy::cast_possible_truncation, reason = "a number in [0, 1]")]
     pub fn contact_cost(&self, round: u64) -> f32 {
         let (cost, max) = (self.replay.contact_cost, self.stop.max_env_steps);
         if max == 0 {

@@ -125,6 +125,7 @@ fn no_behaviour_brings_a_number_near_its_bound_in_a_hundred_episodes() {
     check_bounds(100);
 }
 
+#[expect(clippy::print_stdout, reason = "shown with --nocapture")]
 fn check_bounds(n_episodes: u64) {
     for task in Task::ALL {
         for (n_arms, substeps) in [(1, 20), (2, 20), (2, 10)] {

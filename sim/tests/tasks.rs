@@ -58,6 +58,7 @@ fn a_scripted_arm_solves_a_thousand_starts_in_the_shared_world() {
     check_shared_starts_of_one_arm(1000);
 }
 
+#[expect(clippy::print_stdout, reason = "shown with --nocapture")]
 fn check_shared_starts_of_one_arm(n_episodes: u64) {
     for task in Task::CLASSIC.map(|task| task.in_world(World::Shared)) {
         let episodes = play(Layout::new(task, 1), &WorldConfig::default(), n_episodes);
@@ -78,6 +79,7 @@ fn two_scripted_arms_that_take_turns_solve_most_of_300_starts_in_the_shared_worl
     check_shared_starts_of_two_arms(300);
 }
 
+#[expect(clippy::print_stdout, reason = "shown with --nocapture")]
 fn check_shared_starts_of_two_arms(n_episodes: u64) {
     for task in Task::CLASSIC.map(|task| task.in_world(World::Shared)) {
         let layout = Layout::new(task, 2);

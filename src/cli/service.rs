@@ -107,7 +107,9 @@ Examples:
       --teacher 127.0.0.1:7001
   tandem learner --run run.toml --out runs/mine --start-or-resume \\
       --teacher teacher:7001
-      # under a supervisor")]
+      # under a supervisor
+  tandem learner --run run.toml --out runs/mine \\
+      --dashboard-listen 127.0.0.1:8600")]
 pub(crate) struct LearnerArgs {
     /// Run file (TOML); settings that it omits take the recipe's values.
     #[arg(long, value_name = "FILE.toml")]
@@ -138,6 +140,17 @@ pub(crate) struct LearnerArgs {
     /// Number of threads of the update, 1 or 2. It does not affect the result.
     #[arg(long, default_value_t = 2, value_parser = clap::value_parser!(u8).range(1..=2))]
     pub(crate) threads: u8,
+    /// Serves the run's dashboard at http://ADDR/ [default: none]. An address that other machines can reach requires a
+    /// token, which the page asks for.
+    #[arg(long, value_name = "ADDR")]
+    pub(crate) dashboard_listen: Option<SocketAddr>,
+    /// File with the token of the dashboard [default: --token-file].
+    #[arg(long, value_name = "FILE", requires = "dashboard_listen")]
+    pub(crate) dashboard_token_file: Option<PathBuf>,
+    /// Takes the next free port if that of the dashboard is in use, runs without a dashboard if there is none, and
+    /// prints the outcome as a second line.
+    #[arg(long, hide = true, requires = "dashboard_listen")]
+    pub(crate) dashboard_is_optional: bool,
     /// Keeps serving after the run is complete, until the process is asked to exit.
     #[arg(long)]
     pub(crate) stay: bool,

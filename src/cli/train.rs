@@ -1,5 +1,6 @@
 //! The command line of `tandem train` and `tandem sweep`.
 
+use std::net::SocketAddr;
 use std::path::PathBuf;
 
 use clap::{Args, ValueEnum};
@@ -35,6 +36,8 @@ Examples:
   tandem train --record all --log-budget 10GiB
       # records training episodes too
   tandem train --live  # shows recorded episodes in Foxglove
+  tandem train --dashboard 0.0.0.0:8600 --dashboard-token-file token
+      # to watch it from a phone
   tandem train --resume --out runs/mine  # resumes the run
   tandem train --resume --out runs/mine --max-env-steps 600000
       # resumes it for longer")]
@@ -107,6 +110,16 @@ pub(crate) struct TrainArgs {
     /// evaluation.recorded_episodes, evaluation.test_episodes and --workers can change. A rejected --resume changes nothing.
     #[arg(long)]
     pub(crate) resume: bool,
+    /// Address of the dashboard, which shows the run in a browser. If its port is in use, the next free one is taken.
+    /// [default: 127.0.0.1:8600]
+    #[arg(long, value_name = "ADDR")]
+    pub(crate) dashboard: Option<SocketAddr>,
+    /// File with the token that the dashboard asks for if --dashboard is not a loopback address.
+    #[arg(long, value_name = "FILE", requires = "dashboard")]
+    pub(crate) dashboard_token_file: Option<PathBuf>,
+    /// Serves no dashboard.
+    #[arg(long, conflicts_with = "dashboard")]
+    pub(crate) no_dashboard: bool,
     /// Prints the summary as one JSON object on the last line of standard output.
     #[arg(long)]
     pub(crate) json: bool,

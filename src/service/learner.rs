@@ -1,17 +1,26 @@
 //! `tandem learner`.
 
+use std::net::SocketAddr;
+use std::path::PathBuf;
 use std::time::Duration;
 
+use tandem_dashboard::{Access, Site};
 use tandem_learner::checkpoint::CheckpointError;
 use tandem_learner::{Error, LearnerConfig, LingerPolicy, ServeOptions};
 use tandem_net::Pacing;
+use tandem_telemetry::RunView;
+use tokio::net::TcpListener;
+use tokio::sync::watch;
+use tokio_util::sync::{CancellationToken, DropGuard};
 
 use super::{listen, run};
 use crate::cli::LearnerArgs;
-use crate::exit::{Exit, Failed};
+use crate::exit::{Exit, Failed, OrExit as _};
 use crate::run_pages::RunPages;
 use crate::version::VERSION;
-use crate::{access, clock, metrics, policy_file, run_directory, run_file, signals};
+use crate::{
+    access, clock, dashboard, metrics, output, policy_file, run_directory, run_file, signals,
+};
 
 pub(crate) fn learner(args: LearnerArgs) -> Result<(), Failed> {
     let run_config = run_file::resolve(Some(&args.run), &[])?;
@@ -29,9 +38,11 @@ pub(crate) fn learner(args: LearnerArgs) -> Result<(), Failed> {
     let pages_of = (!args.out_is_locked).then(|| (run_config.clone(), args.out.clone()));
     run(async move {
         let shutdown = signals::shutdown_token(args.listen.exit_with_stdin)?;
-        let options = serve_options(&args).await?;
+        let (page, views) = dashboard(&args).await?;
+        let options = ServeOptions { views, ..serve_options(&args).await? };
         let listener = listen(&args.listen).await?;
         let unix_start_ms = clock::unix_millis();
+        let serving_page = page.map(|page| page.serve(args.dashboard_is_optional));
         let config = LearnerConfig {
             run: run_config,
             server_config,
@@ -50,6 +61,7 @@ pub(crate) fn learner(args: LearnerArgs) -> Result<(), Failed> {
             pacing: Pacing::Concurrent,
         };
         let served = tandem_learner::serve_with(config, listener, shutdown, options).await;
+        drop(serving_page);
         let ended = served.map_err(learner_failed)?;
         if let Some((config, out)) = pages_of
             && let Err(failed) = RunPages::write_if_evaluated(&config, &out)
@@ -63,11 +75,64 @@ pub(crate) fn learner(args: LearnerArgs) -> Result<(), Failed> {
     })
 }
 
+/// A bound dashboard.
+struct Page {
+    bound: Result<(TcpListener, SocketAddr), std::io::Error>,
+    access: Access,
+    views: watch::Receiver<RunView>,
+}
+
+impl Page {
+    /// Serves the dashboard until the returned value is dropped. If `prints` is set, prints the outcome as a line of
+    /// standard output.
+    fn serve(self, prints: bool) -> DropGuard {
+        let stop = CancellationToken::new();
+        let line = match &self.bound {
+            Ok((_, address)) => format!("dashboard on {}", dashboard::url(*address)),
+            Err(error) => format!("no dashboard: {error}"),
+        };
+        if prints && let Err(failed) = output::print(&line) {
+            tracing::warn!("cannot print {line:?}: {:#}", failed.into_error());
+        }
+        tracing::info!("{line}");
+        if let Ok((listener, _)) = self.bound {
+            let site = Site::of_run(self.views);
+            let served = tandem_dashboard::serve(site, self.access, listener, stop.clone());
+            drop(tokio::spawn(served));
+        }
+        stop.drop_guard()
+    }
+}
+
+/// Binds the address of the dashboard, if there is one, and returns the sender of its data.
+async fn dashboard(
+    args: &LearnerArgs,
+) -> Result<(Option<Page>, Option<watch::Sender<RunView>>), Failed> {
+    let Some(address) = args.dashboard_listen else { return Ok((None, None)) };
+    let token_file = args.dashboard_token_file.as_ref().or(args.secret.token_file.as_ref());
+    let insecure = args.listen.insecure;
+    let token_file = token_file.map(PathBuf::as_path);
+    let access = dashboard::access("--dashboard-listen", address, token_file, insecure)?;
+    let bound = match args.dashboard_is_optional {
+        true => dashboard::bind_free(address).await,
+        false => {
+            let cannot = || format!("cannot listen on {address} for --dashboard-listen");
+            Ok(TcpListener::bind(address).await.or_exit(Exit::TryAgain, cannot)?)
+        }
+    };
+    let bound = bound.and_then(|listener| {
+        let address = listener.local_addr()?;
+        Ok((listener, address))
+    });
+    let (sender, views) = watch::channel(RunView::default());
+    Ok((Some(Page { bound, access, views }), Some(sender)))
+}
+
 /// Returns the options of the service, and binds the address of the metrics, if there is one.
 async fn serve_options(args: &LearnerArgs) -> Result<ServeOptions, Failed> {
     let metrics = metrics::listen(&args.metrics).await?;
     let linger = if args.stay { LingerPolicy::UntilShutdown } else { LingerPolicy::default() };
-    Ok(ServeOptions { metrics, linger })
+    Ok(ServeOptions { metrics, linger, views: None })
 }
 
 /// Chooses the exit code of an error of a learner or a relay.

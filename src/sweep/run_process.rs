@@ -57,6 +57,7 @@ impl RunProcess {
             "train".into(),
             "--exit-with-stdin".into(),
             "--json".into(),
+            "--no-dashboard".into(),
             "--out".into(),
             dir.into(),
         ];

@@ -1,11 +1,15 @@
 //! Command lines of the processes of a run.
 
 use std::ffi::OsString;
+use std::net::SocketAddr;
 use std::path::Path;
 
 use super::inputs;
 use super::plan::Plan;
 use crate::environment_server;
+
+/// The option of the learner that names the address of the dashboard.
+pub(super) const DASHBOARD: &str = "--dashboard-listen";
 
 /// Returns the arguments of the teacher.
 pub(super) fn teacher(plan: &Plan) -> Vec<OsString> {
@@ -41,6 +45,15 @@ pub(super) fn learner(plan: &Plan, teacher_address: Option<&str>, resume: bool) 
         args.push("--resume".into());
     }
     args
+}
+
+/// Adds the address of the dashboard, if there is one.
+pub(super) fn push_dashboard(args: &mut Vec<OsString>, plan: &Plan, dashboard: Option<SocketAddr>) {
+    let Some(address) = dashboard else { return };
+    args.extend([DASHBOARD.into(), address.to_string().into(), "--dashboard-is-optional".into()]);
+    if let Some(token) = &plan.dashboard_token_file {
+        push_path(args, "--dashboard-token-file", token);
+    }
 }
 
 /// Returns the arguments of the worker `name`.

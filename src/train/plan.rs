@@ -1,5 +1,6 @@
 //! The plan of a run: its settings, its directory, its teacher and the number of workers.
 
+use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 
 use tandem_learner::{checkpoint, settings};
@@ -14,7 +15,7 @@ use crate::columns::wrapped;
 use crate::exit::{Exit, Failed, OrExit as _};
 use crate::run_directory::RUNS;
 use crate::service::worker_failed;
-use crate::{output, policy_file, run_directory, run_file, served_task};
+use crate::{dashboard, output, policy_file, run_directory, run_file, served_task};
 
 /// A run that can be started.
 pub(crate) struct Plan {
@@ -27,6 +28,10 @@ pub(crate) struct Plan {
     pub(crate) environment: EnvironmentArgs,
     /// The episodes that workers record.
     pub(crate) recording: RecordingArgs,
+    /// The first address that the dashboard tries, unless there is none.
+    pub(crate) dashboard: Option<SocketAddr>,
+    /// File with the token of the dashboard.
+    pub(crate) dashboard_token_file: Option<PathBuf>,
 }
 
 impl Plan {
@@ -62,7 +67,19 @@ impl Plan {
             return Err(Failed::usage(format!("--workers {n_workers}: expected 1 to 1024")));
         }
         let (resume, recording) = (args.resume, args.recording);
-        let plan = Self { config, out, teacher, n_workers, resume, environment, recording };
+        let dashboard = dashboard_address(args)?;
+        let dashboard_token_file = args.dashboard_token_file.clone();
+        let plan = Self {
+            config,
+            out,
+            teacher,
+            n_workers,
+            resume,
+            environment,
+            recording,
+            dashboard,
+            dashboard_token_file,
+        };
         plan.check_directory()?;
         Ok(plan)
     }
@@ -181,6 +198,16 @@ impl Plan {
     pub(crate) fn ledger(&self) -> PathBuf {
         self.out.join("ledger.sqlite")
     }
+}
+
+/// Returns the address of the dashboard; rejects one that other machines can reach without a token.
+fn dashboard_address(args: &TrainArgs) -> Result<Option<SocketAddr>, Failed> {
+    if args.no_dashboard {
+        return Ok(None);
+    }
+    let address = args.dashboard.unwrap_or_else(dashboard::default_address);
+    dashboard::access("--dashboard", address, args.dashboard_token_file.as_deref(), false)?;
+    Ok(Some(address))
 }
 
 /// Rejects a task that neither the server nor the simulator has.

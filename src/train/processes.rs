@@ -1,6 +1,7 @@
 //! The processes of a run: started in order, restarted when they die, ended together.
 
 use std::ffi::OsString;
+use std::net::SocketAddr;
 use std::process::Stdio;
 use std::time::{Duration, Instant};
 
@@ -27,6 +28,8 @@ pub(crate) struct RunProcesses {
     /// Addresses of the services, which stay the same after a restart.
     teacher_address: Option<String>,
     learner_address: String,
+    /// Address of the dashboard, if there is one.
+    dashboard: Option<SocketAddr>,
     peak: PeakMemory,
 }
 
@@ -88,6 +91,7 @@ impl RunProcesses {
             processes: Vec::new(),
             teacher_address: None,
             learner_address: String::new(),
+            dashboard: None,
             peak: PeakMemory::default(),
         })
     }
@@ -100,6 +104,7 @@ impl RunProcesses {
         }
         let mut args = arguments::learner(plan, self.teacher_address.as_deref(), plan.resume);
         args.push("--keep-run-file".into());
+        arguments::push_dashboard(&mut args, plan, plan.dashboard);
         self.learner_address = self.start_service(Role::Learner, &args, display).await?;
         for number in 1..=plan.n_workers {
             let name = format!("worker-{number}");
@@ -197,7 +202,8 @@ impl RunProcesses {
         let mut policy = RestartPolicy::new(role);
         loop {
             let FailedStart { name, child, end } = match self.try_start_service(role, args).await? {
-                Ok((process, address)) => {
+                Ok((process, address, dashboard)) => {
+                    self.show_dashboard(&dashboard, display);
                     self.processes.push(Process { policy, ..process });
                     return Ok(address);
                 }
@@ -221,17 +227,23 @@ impl RunProcesses {
         }
     }
 
-    /// Starts a service and waits until it prints its address or ends.
+    /// Starts a service and waits until it prints its address or ends. Returns the address, and the line about its
+    /// dashboard.
     async fn try_start_service(
         &self,
         role: Role,
         args: &[OsString],
-    ) -> anyhow::Result<Result<(Process, String), FailedStart>> {
+    ) -> anyhow::Result<Result<(Process, String, String), FailedStart>> {
         let name = format!("the {}", role.name());
         let mut child = self.spawn(&name, args, Stdio::piped())?;
-        let address = child.service_address().await;
+        let address = match args.iter().any(|arg| arg == arguments::DASHBOARD) {
+            true => child.addresses().await,
+            false => child.service_address().await.map(|it| it.map(|it| (it, String::new()))),
+        };
         match address.with_context(|| format!("cannot read the address of {name}"))? {
-            Some(address) => Ok(Ok((Process::new(role, name, child), address))),
+            Some((address, dashboard)) => {
+                Ok(Ok((Process::new(role, name, child), address, dashboard)))
+            }
             None => {
                 let end = child.wait().await?.into();
                 Ok(Err(FailedStart { name, child, end }))
@@ -251,9 +263,22 @@ impl RunProcesses {
             Role::Worker => (self.worker_args(plan, name), None),
         };
         arguments::push_address(&mut args, "--listen", address);
+        if *role == Role::Learner {
+            arguments::push_dashboard(&mut args, plan, self.dashboard);
+        }
         let child = self.spawn(name, &args, Stdio::null())?;
         self.processes[idx].state = State::Running(child);
         Ok(())
+    }
+
+    /// Prints the line about the dashboard, and keeps its address for the next start of the learner.
+    fn show_dashboard(&mut self, line: &str, display: &Display) {
+        if line.is_empty() {
+            return;
+        }
+        display.print(line);
+        let host = line.strip_prefix("dashboard on http://").map(|it| it.trim_end_matches('/'));
+        self.dashboard = host.and_then(|host| host.replace("localhost", "0.0.0.0").parse().ok());
     }
 
     fn worker_args(&self, plan: &Plan, name: &str) -> Vec<OsString> {

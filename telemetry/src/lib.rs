@@ -18,6 +18,7 @@ pub mod metrics;
 pub mod recorder;
 mod records;
 pub mod recovery;
+mod run_view;
 mod scene;
 pub mod standard_error;
 pub mod tensorboard;
@@ -31,5 +32,8 @@ pub use messages::EpisodeMetadata;
 pub use metrics::{ContactMetrics, MetricsLog, MetricsRow};
 pub use recorder::{EpisodeRecorder, TransitionRecord};
 pub use recovery::{RecoveredCounts, recover};
+pub use run_view::{
+    ActedSteps, EndView, RunView, TeacherState, TeacherView, WorkerState, WorkerView,
+};
 pub use trial_log::{LogLevel, TrialMetadata, TrialOutcome, TrialRecorder, TrialSnapshot};
 pub use trials::{ToolPathPoint, TrialRow, TrialsLog, read_trials};

@@ -3,7 +3,7 @@
 use tandem_proto::pb;
 use tandem_telemetry::MetricsRow;
 
-use crate::progress::{Activity, Phase, Progress, RunEnd, WorkerProgress};
+use crate::progress::{Activity, Progress, RunEnd, WorkerProgress};
 
 /// Encodes a snapshot of the run.
 pub(super) fn encode_progress(progress: &Progress) -> pb::Progress {
@@ -22,8 +22,8 @@ pub(super) fn encode_progress(progress: &Progress) -> pb::Progress {
         updates_per_s: progress.updates_per_s,
         advice_spent: counters.advice_spent,
         budget_left: progress.budget_left,
-        phase: progress.phase.map_or_else(String::new, |phase| phase_name(phase).to_owned()),
-        training_success: progress.training_success,
+        phase: progress.phase.map_or_else(String::new, |phase| phase.name().to_owned()),
+        training_success: progress.stats.training_success,
         workers: progress.workers.iter().map(encode_worker).collect(),
         evaluation: progress.latest.as_ref().map(encode_evaluation),
         best: progress.best.as_ref().map(encode_evaluation),
@@ -40,16 +40,6 @@ pub(super) fn encode_progress(progress: &Progress) -> pb::Progress {
 /// Encodes the end of a run for its workers.
 pub(super) fn encode_finished(end: &RunEnd) -> pb::Finished {
     pb::Finished { reason: end.reason.clone(), interrupted: end.interrupted }
-}
-
-const fn phase_name(phase: Phase) -> &'static str {
-    match phase {
-        Phase::Starting => "starting",
-        Phase::Collecting => "collecting",
-        Phase::Updating => "updating",
-        Phase::Evaluating => "evaluating",
-        Phase::Ended => "ended",
-    }
 }
 
 fn encode_worker(worker: &WorkerProgress) -> pb::WorkerProgress {

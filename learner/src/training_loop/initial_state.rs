@@ -83,6 +83,7 @@ impl InitialState {
             // An episode can use one unit of advice per step.
             units_per_episode: u32::try_from(layout.episode_steps())
                 .expect("an episode has few steps"),
+            view: context.shared.teacher.clone(),
             start: match self.is_resumed {
                 true => RunStart::Resumed { spent: self.trainer.counters().advice_spent },
                 false => RunStart::New,

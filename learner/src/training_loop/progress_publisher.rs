@@ -2,7 +2,9 @@
 
 use std::collections::{BTreeSet, VecDeque};
 
+use tandem_core::Episode;
 use tandem_rl::trainer::{Counters, RoundStats, Trainer};
+use tandem_telemetry::ActedSteps;
 
 use crate::evaluation_store::EvaluationHistory;
 use crate::progress::{Activity, Phase, WorkerProgress};
@@ -13,6 +15,8 @@ use crate::work_queue::{WorkQueue, Worker};
 const RATE_SPAN_S: f64 = 15.0;
 /// Shortest time between two snapshots during the updates of a round.
 const UPDATE_PERIOD_S: f64 = 1.0;
+/// Episodes of the latest evaluation that are kept for displays.
+const KEPT_EPISODES: usize = 4;
 
 /// Publishes snapshots of the run, with its rates and its wall time.
 pub(super) struct ProgressPublisher<'a> {
@@ -29,6 +33,15 @@ struct RateSample {
     wall_s: f64,
     env_steps: u64,
     updates: u64,
+    advice_spent: u64,
+}
+
+/// Recent rates.
+#[derive(Debug, Clone, Copy, Default)]
+struct Rates {
+    env_steps_per_s: f64,
+    updates_per_s: f64,
+    advice_per_min: f64,
 }
 
 impl<'a> ProgressPublisher<'a> {
@@ -49,7 +62,7 @@ impl<'a> ProgressPublisher<'a> {
     pub(super) fn publish(&self, phase: Phase, trainer: &Trainer, stats: &RoundStats) {
         let counters = trainer.counters();
         let run = &self.config.run;
-        let (env_steps_per_s, updates_per_s) = self.rates();
+        let rates = self.rates();
         let mut state = self.shared.lock();
         state.n_replay_episodes = trainer.replay.n_episodes();
         let workers = workers(&state.queue);
@@ -62,20 +75,37 @@ impl<'a> ProgressPublisher<'a> {
             progress.max_minutes = run.stop.max_minutes;
             progress.counters = counters;
             progress.wall_s = self.wall_s();
-            progress.env_steps_per_s = env_steps_per_s;
-            progress.updates_per_s = updates_per_s;
+            progress.env_steps_per_s = rates.env_steps_per_s;
+            progress.updates_per_s = rates.updates_per_s;
             progress.budget_left = budget_left(self.config, counters);
             progress.phase = Some(phase);
-            progress.training_success = stats.training_success;
+            progress.stats = *stats;
+            progress.advice_per_min = rates.advice_per_min;
             progress.workers = workers;
         });
     }
 
     /// Publishes the latest evaluation and the best one.
     pub(super) fn publish_evaluations(&self, history: &EvaluationHistory) {
+        self.shared.lock().evaluations = history.rows.as_slice().into();
         self.shared.progress.send_modify(|progress| {
             progress.latest = history.rows.last().cloned();
             progress.best = history.best_row().cloned();
+        });
+    }
+
+    /// Keeps the first episodes of the latest evaluation for displays.
+    pub(super) fn keep_evaluated(&self, episodes: &[Episode]) {
+        let n_kept = episodes.len().min(KEPT_EPISODES);
+        self.shared.lock().evaluated = episodes[..n_kept].into();
+    }
+
+    /// Counts who acted in the steps of a round's training episodes.
+    pub(super) fn record_acted(&self, episodes: &[Episode]) {
+        self.shared.progress.send_modify(|progress| {
+            for episode in episodes {
+                count_acted(&mut progress.acted, episode);
+            }
         });
     }
 
@@ -103,22 +133,25 @@ impl<'a> ProgressPublisher<'a> {
     /// Records the end of a round for the rates.
     pub(super) fn record_round(&mut self, learned: Counters) {
         let now_s = self.wall_s();
-        let Counters { env_steps, updates, .. } = learned;
-        self.samples.push_back(RateSample { wall_s: now_s, env_steps, updates });
+        let Counters { env_steps, updates, advice_spent, .. } = learned;
+        self.samples.push_back(RateSample { wall_s: now_s, env_steps, updates, advice_spent });
         while self.samples.len() > 2 && self.samples[0].wall_s < now_s - RATE_SPAN_S {
             self.samples.pop_front();
         }
     }
 
-    /// Returns recent environment steps and updates per second.
-    fn rates(&self) -> (f64, f64) {
+    /// Returns recent rates.
+    fn rates(&self) -> Rates {
         match (self.samples.front(), self.samples.back()) {
             (Some(first), Some(last)) if last.wall_s > first.wall_s => {
                 let span_s = last.wall_s - first.wall_s;
-                let env_steps = (last.env_steps - first.env_steps) as f64;
-                (env_steps / span_s, (last.updates - first.updates) as f64 / span_s)
+                Rates {
+                    env_steps_per_s: (last.env_steps - first.env_steps) as f64 / span_s,
+                    updates_per_s: (last.updates - first.updates) as f64 / span_s,
+                    advice_per_min: (last.advice_spent - first.advice_spent) as f64 * 60.0 / span_s,
+                }
             }
-            _ => (0.0, 0.0),
+            _ => Rates::default(),
         }
     }
 }
@@ -128,6 +161,17 @@ impl<'a> ProgressPublisher<'a> {
 pub(super) fn budget_left(config: &LearnerConfig, at: Counters) -> u64 {
     let run = &config.run;
     if run.advice.asks() { run.advice_budget().saturating_sub(at.advice_spent) } else { 0 }
+}
+
+/// Adds the steps of an episode to the counts of its arms.
+fn count_acted(acted: &mut Vec<ActedSteps>, episode: &Episode) {
+    acted.resize(acted.len().max(episode.layout.n_arms()), ActedSteps::default());
+    for (arm, counts) in acted.iter_mut().enumerate().take(episode.layout.n_arms()) {
+        let is_teachers = |arms: &&u8| (u32::from(**arms) >> arm) & 1 == 1;
+        let n_teacher = episode.advised_arms.iter().filter(is_teachers).count() as u64;
+        counts.teacher += n_teacher;
+        counts.student += episode.n_steps() as u64 - n_teacher;
+    }
 }
 
 /// Returns the workers, without a silent one whose name an active one has: that is a restarted worker.
@@ -150,5 +194,23 @@ fn activity(worker: &Worker) -> Activity {
         _ if worker.silent => Activity::Silent,
         Some(slot) => Activity::Slot(slot),
         None => Activity::Waiting,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use tandem_core::{Layout, Task};
+
+    use super::*;
+
+    #[test]
+    fn steps_are_counted_by_arm_and_by_who_acted() {
+        let mut acted = Vec::new();
+        let mut episode = Episode::zeros(Layout::new(Task::Push, 2), 0);
+        episode.advised_arms[..3].copy_from_slice(&[0b01, 0b11, 0b10]);
+        count_acted(&mut acted, &episode);
+        count_acted(&mut acted, &Episode::zeros(Layout::new(Task::Push, 2), 1));
+        let expected = ActedSteps { teacher: 2, student: 98 };
+        assert_eq!(acted, [expected, expected]);
     }
 }

@@ -6,8 +6,10 @@ use std::time::Duration;
 
 use tandem_learner::{LingerPolicy, ServeOptions, serve_with};
 use tandem_proto::pb;
+use tandem_telemetry::RunView;
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tokio::net::{TcpListener, TcpStream};
+use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
 
 use crate::run::{DEADLINE, Toy, client_of, learner_config};
@@ -50,6 +52,22 @@ async fn comes_true(address: SocketAddr, name: &str, expected: f64) -> BTreeMap<
     tokio::time::timeout(DEADLINE, looking).await.expect("it comes true in time")
 }
 
+/// Checks that the snapshots for displays arrive at the end that `status` reports.
+async fn shows_the_end(mut view: watch::Receiver<RunView>, status: &pb::Progress) {
+    let ended = view.wait_for(|view| view.end.is_some() && !view.evaluations.is_empty());
+    let view = tokio::time::timeout(DEADLINE, ended).await.expect("in time").expect("it serves");
+    assert_eq!((view.round, view.env_steps), (status.round, status.env_steps));
+    assert_eq!((view.task.as_str(), view.phase.as_str()), ("push", "ended"));
+    let names: Vec<&str> = view.workers.iter().map(|worker| worker.name.as_str()).collect();
+    assert_eq!(names, ["toy"]);
+    let latest = view.evaluations.last().expect("evaluations");
+    assert_eq!(Some(latest.success), status.evaluation.as_ref().map(|it| it.success));
+    assert!(view.evaluated.iter().all(|it| it.parameter_version == latest.round));
+    assert!(!view.evaluated.is_empty());
+    let n_acted: u64 = view.acted.iter().map(|arm| arm.student + arm.teacher).sum();
+    assert_eq!(n_acted, status.env_steps);
+}
+
 #[tokio::test]
 async fn metrics_follow_the_run_and_stay_after_its_end() {
     let directory = tempfile::tempdir().expect("a directory");
@@ -58,7 +76,9 @@ async fn metrics_follow_the_run_and_stay_after_its_end() {
     let address = listener.local_addr().expect("bound");
     let metrics = TcpListener::bind("127.0.0.1:0").await.expect("a port");
     let metrics_at = metrics.local_addr().expect("bound");
-    let beside = ServeOptions { metrics: Some(metrics), linger: LingerPolicy::UntilShutdown };
+    let linger = LingerPolicy::UntilShutdown;
+    let (views, view) = watch::channel(RunView::default());
+    let beside = ServeOptions { metrics: Some(metrics), views: Some(views), linger };
     // Without lag no round is opened before the last is learned, so that the counts are what they are.
     let config = learner_config(toy::config(0), directory.path(), false);
     let serving = tokio::spawn(serve_with(config, listener, shutdown.clone(), beside));
@@ -86,6 +106,7 @@ async fn metrics_follow_the_run_and_stay_after_its_end() {
     let mut client = client().await;
     let status = client.status(pb::StatusRequest {}).await.expect("it stays").into_inner();
     assert!(status.ended);
+    shows_the_end(view, &status).await;
     for (name, expected) in [
         ("tandem_rounds_total", status.round as f64),
         ("tandem_env_steps_total", status.env_steps as f64),

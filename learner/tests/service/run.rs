@@ -74,7 +74,7 @@ impl Served {
         let address = listener.local_addr().expect("bound");
         let shutdown = CancellationToken::new();
         let linger = LingerPolicy::For(Duration::from_millis(30));
-        let options = ServeOptions { linger, metrics: None };
+        let options = ServeOptions { linger, ..ServeOptions::default() };
         let serving = serve_with(config, listener, shutdown.clone(), options);
         Self { address, shutdown, ended: tokio::spawn(serving) }
     }

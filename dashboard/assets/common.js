@@ -1,0 +1,93 @@
+// Elements, formats and the stream of states, for all pages.
+
+export const byId = (id) => document.getElementById(id);
+
+/** Returns an element with attributes and children; `null` attributes are left out. */
+export function el(name, attributes = {}, ...children) {
+  return fill(document.createElement(name), attributes, children);
+}
+
+/** Returns an SVG element. */
+export function svg(name, attributes = {}, ...children) {
+  return fill(document.createElementNS("http://www.w3.org/2000/svg", name), attributes, children);
+}
+
+function fill(element, attributes, children) {
+  for (const [key, value] of Object.entries(attributes)) {
+    if (value !== null && value !== undefined) element.setAttribute(key, value);
+  }
+  element.append(...children.flat().filter((child) => child !== null));
+  return element;
+}
+
+/** Sets a text only if it differs, so that screen readers do not repeat it. */
+export function setText(element, text) {
+  if (element.textContent !== text) element.textContent = text;
+}
+
+const grouped = new Intl.NumberFormat("en", { maximumFractionDigits: 0 });
+export const isNumber = (value) => typeof value === "number" && Number.isFinite(value);
+export const count = (value) => (isNumber(value) ? grouped.format(value) : "–");
+export const percent = (value, digits = 1) => (isNumber(value) ? `${(100 * value).toFixed(digits)} %` : "–");
+
+/** Formats a real number with about three significant digits. */
+export function real(value) {
+  if (!isNumber(value)) return "–";
+  const size = Math.abs(value);
+  if (size !== 0 && (size < 0.001 || size >= 1e6)) return value.toExponential(1).replace("-", "−");
+  const digits = size >= 100 ? 0 : size >= 10 ? 1 : size >= 1 ? 2 : 4;
+  return value.toFixed(digits).replace("-", "−");
+}
+
+/** Formats seconds as h:mm:ss or m:ss. */
+export function clock(seconds) {
+  if (!isNumber(seconds)) return "–";
+  const total = Math.max(0, Math.floor(seconds));
+  const two = (n) => String(n).padStart(2, "0");
+  const [h, m, s] = [Math.floor(total / 3600), Math.floor(total / 60) % 60, total % 60];
+  return h > 0 ? `${h}:${two(m)}:${two(s)}` : `${m}:${two(s)}`;
+}
+
+export const plural = (n, noun) => `${count(n)} ${noun}${n === 1 ? "" : "s"}`;
+
+/** Fetches a JSON document of this service. */
+export async function fetchJson(path) {
+  const response = await fetch(path);
+  if (!response.ok) throw new Error(`${path}: ${response.status}`);
+  return response.json();
+}
+
+/**
+ * Calls `onState` with every state, and `onLink` with the condition of the connection: "live", "lost" or "full".
+ * A lost connection is opened again for as long as the page exists.
+ */
+export function follow(onState, onLink) {
+  let source = null;
+  let heardAt = performance.now();
+  const open = () => {
+    source?.close();
+    source = new EventSource("/events");
+    source.onopen = () => {
+      heardAt = performance.now();
+      onLink("live");
+    };
+    source.onmessage = (message) => {
+      heardAt = performance.now();
+      onState(JSON.parse(message.data));
+    };
+    source.onerror = async () => {
+      const isClosed = source.readyState === EventSource.CLOSED;
+      onLink("lost");
+      if (!isClosed) return;
+      // The browser gives up after a response that is no stream: the reason is in the response.
+      const status = await fetch("/state").then((response) => response.status, () => 0);
+      if (status === 401) location.reload();
+      if (status === 200) onLink("full");
+      setTimeout(open, 2000);
+    };
+  };
+  open();
+  addEventListener("pagehide", () => source?.close());
+  addEventListener("pageshow", (event) => event.persisted && open());
+  return () => performance.now() - heardAt;
+}

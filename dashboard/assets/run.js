@@ -1,0 +1,272 @@
+// The dashboard of a run.
+import { byId, clock, count, el, fetchJson, follow, isNumber, percent, plural, real, setText } from "/assets/common.js";
+import { Chart } from "/assets/chart.js";
+import { Player } from "/assets/player.js";
+
+const versions = {};
+const player = new Player();
+let state = null;
+let link = "connecting";
+
+const charts = [
+  new Chart(byId("success-chart"), {
+    label: "Success in evaluations",
+    height: 300,
+    range: [0, 1],
+    format: (value) => percent(value),
+    tick: (value) => `${Math.round(100 * value)} %`,
+    bandName: "95 % interval",
+    best: (row) => row.best,
+    series: [
+      { name: "success", class: "first", value: (row) => row.success, low: (row) => row.success_low, high: (row) => row.success_high },
+      { name: "without contact between arms", class: "second", value: (row) => row.success_without_contact },
+      { name: "training", class: "third", value: (row) => row.training_success },
+    ],
+  }),
+  new Chart(byId("q-chart"), {
+    label: "Mean Q",
+    format: real,
+    series: [{ name: "mean Q", class: "first", value: (row) => row.mean_q }],
+  }),
+  new Chart(byId("loss-chart"), {
+    label: "Losses",
+    format: real,
+    series: [
+      { name: "critic", class: "first", value: (row) => row.critic_loss },
+      { name: "actor", class: "second", value: (row) => row.actor_loss },
+    ],
+  }),
+  new Chart(byId("advice-chart"), {
+    label: "Advice spent",
+    format: count,
+    fromZero: true,
+    series: [{ name: "units spent", class: "first", value: (row) => row.advice_spent }],
+  }),
+];
+
+/** Replaces the children of `parent` by one element per item, and keeps elements whose key is the same. */
+function keyed(parent, items, key, create, update) {
+  const known = new Map([...parent.children].map((child) => [child.dataset.key, child]));
+  items.forEach((item, idx) => {
+    const name = String(key(item));
+    const child = known.get(name) ?? create(item);
+    known.delete(name);
+    child.dataset.key = name;
+    update(child, item);
+    if (parent.children[idx] !== child) parent.insertBefore(child, parent.children[idx] ?? null);
+  });
+  known.forEach((child) => child.remove());
+}
+
+function tiles(s, latest) {
+  const interval = (low, high) => (isNumber(low) ? `interval ${(100 * low).toFixed(1)} – ${percent(high)}` : "no evaluation yet");
+  const learned = (value) => real(s.updates > 0 ? value : null);
+  const usesAdvice = s.advice_spent + s.advice_left > 0;
+  return [
+    ["Success", percent(latest?.success), interval(latest?.success_low, latest?.success_high)],
+    s.n_arms > 1 && ["Without contact", percent(latest?.success_without_contact),
+      interval(latest?.success_without_contact_low, latest?.success_without_contact_high)],
+    ["In training", percent(s.round > 0 ? s.training_success : null), "latest round"],
+    ["Mean Q", learned(s.mean_q), "latest round"],
+    ["Critic loss", learned(s.critic_loss), `actor loss ${learned(s.actor_loss)}`],
+    ["Env steps", count(s.env_steps), `${count(s.env_steps_per_s)} per second`],
+    ["Updates", count(s.updates), `${count(s.updates_per_s)} per second`],
+    usesAdvice && ["Advice left", count(s.advice_left), `${count(s.advice_per_min)} per minute`],
+  ].filter(Boolean);
+}
+
+function showTiles(s) {
+  keyed(byId("tiles"), tiles(s, showTiles.latest), ([name]) => name,
+    ([name]) => el("div", { class: "tile" }, el("dt", {}, name), el("dd", { class: "value" }), el("dd", { class: "detail" })),
+    (tile, [, value, detail]) => {
+      setText(tile.children[1], value);
+      setText(tile.children[2], detail);
+    });
+}
+
+function showHeader(s) {
+  setText(byId("name"), s.run || "Run");
+  document.title = `${s.run || "Run"} – Tandem`;
+  setText(byId("terms"), `${s.task}, ${plural(s.n_arms, "arm")}, strategy ${s.strategy}, seed ${s.seed}`);
+  const phase = byId("phase");
+  const ended = s.end;
+  setText(phase, ended ? (ended.interrupted ? "stopped" : "complete") : s.phase || "starting");
+  phase.className = `badge ${ended ? (ended.interrupted ? "warning" : "good") : ""}`;
+  setText(byId("clock"), `${clock(s.wall_s)} elapsed, round ${count(s.round)}`);
+  const alert = byId("alert");
+  alert.hidden = !s.warning;
+  setText(alert, s.warning);
+  showProgress(s);
+}
+
+function showProgress(s) {
+  const share = s.max_env_steps > 0 ? s.env_steps / s.max_env_steps
+    : s.max_minutes > 0 ? s.wall_s / (60 * s.max_minutes) : null;
+  byId("progress").hidden = share === null;
+  if (share === null) return setText(byId("progress-text"), "This run has no limit of steps or minutes.");
+  const done = Math.min(1, share);
+  byId("bar").style.width = `${100 * done}%`;
+  byId("progress").setAttribute("aria-valuenow", Math.round(100 * done));
+  const limit = s.max_env_steps > 0 ? `${count(s.env_steps)} of ${count(s.max_env_steps)} environment steps`
+    : `${clock(s.wall_s)} of ${clock(60 * s.max_minutes)}`;
+  const rate = s.max_env_steps > 0 ? s.env_steps_per_s : share / s.wall_s;
+  const rest = s.max_env_steps > 0 ? s.max_env_steps - s.env_steps : 1 - share;
+  const remaining = s.end || !(rate > 0) || rest <= 0 ? "" : `, about ${clock(rest / rate)} left`;
+  const end = s.end ? `. ${s.end.interrupted ? "Stopped" : "Ended"}: ${s.end.reason}` : "";
+  setText(byId("progress-text"), `${limit}${remaining}${end}`);
+}
+
+function ago(seconds) {
+  return seconds < 1 ? "seen just now" : seconds < 90 ? `seen ${Math.floor(seconds)} s ago` : `seen ${Math.floor(seconds / 60)} min ago`;
+}
+
+const DOING = {
+  playing: (worker) => (worker.slot === null ? "playing" : `plays slot ${count(worker.slot)}`),
+  waiting: () => "waits for a slot",
+  disconnected: () => "disconnected",
+  silent: () => "silent",
+};
+
+function showWorkers(s) {
+  const hidden = s.n_workers - s.workers.length;
+  const more = hidden > 0 ? `, of which the first ${s.workers.length} are shown` : "";
+  setText(byId("worker-summary"), s.end ? `${plural(s.n_workers, "worker")}; ${plural(s.n_replay_episodes, "episode")} in the replay buffer.`
+    : s.n_workers === 0 ? "No worker has joined yet."
+    : `${s.n_active_workers} of ${plural(s.n_workers, "worker")} active${more}; ${plural(s.n_playing_slots, "slot")} playing, `
+      + `${count(s.n_waiting_slots)} waiting; ${plural(s.n_replay_episodes, "episode")} in the replay buffer.`);
+  const byName = [...s.workers].sort((a, b) => a.name.localeCompare(b.name, "en", { numeric: true }) || a.id - b.id);
+  keyed(byId("worker-tiles"), byName, (worker) => worker.id,
+    () => el("li", {}, el("strong"), el("span", { class: "doing" }), el("span"), el("span")),
+    (tile, worker) => {
+      tile.className = `worker ${s.end ? "ended" : worker.state}`;
+      tile.dataset.state = worker.state;
+      setText(tile.children[0], worker.name);
+      setText(tile.children[1], s.end ? "ended" : DOING[worker.state](worker));
+      setText(tile.children[2], plural(worker.n_episodes, "episode"));
+      setText(tile.children[3], ago(worker.last_seen_s));
+    });
+}
+
+/** Returns a bar of two shares with a text that says the same. */
+function meter(first, second) {
+  const bar = el("div", { class: "meter", "aria-hidden": "true" }, el("i", { class: "fill-first" }), el("i", { class: "fill-second" }));
+  const total = first + second;
+  bar.children[0].style.width = `${total ? (100 * first) / total : 0}%`;
+  bar.children[1].style.width = `${total ? (100 * second) / total : 0}%`;
+  return bar;
+}
+
+function showAdvice(s) {
+  const total = s.advice_spent + s.advice_left;
+  const uses = total > 0;
+  byId("advice-spent-heading").closest("section").hidden = !uses;
+  byId("advice-heading").closest("section").hidden = !uses;
+  if (!uses) return;
+  const pair = (...texts) => el("p", { class: "pairs" }, texts.map((text) => el("span", {}, text)));
+  const budget = el("div", {}, meter(s.advice_spent, 0), pair(
+    `${count(s.advice_spent)} of ${count(total)} units spent (${percent(s.advice_spent / total)})`,
+    `${count(s.advice_left)} left`, `${count(s.advice_per_min)} per minute`));
+  budget.querySelector("i").style.width = `${(100 * s.advice_spent) / total}%`;
+  byId("advice-budget").replaceChildren(budget);
+  const arms = s.acted.map((arm, idx) => {
+    const steps = arm.teacher + arm.student;
+    return el("div", {}, el("p", {}, `Arm ${idx + 1}: who acted in training`), meter(arm.teacher, arm.student),
+      pair(`teacher ${percent(arm.teacher / steps)} (${count(arm.teacher)} steps)`,
+        `student ${percent(arm.student / steps)} (${count(arm.student)} steps)`));
+  });
+  byId("acted").replaceChildren(...arms);
+}
+
+const MARKS = { info: "•", good: "✓", warning: "!", bad: "✕" };
+const mark = (level) => el("span", { class: `mark ${level}`, "aria-hidden": "true" }, MARKS[level]);
+
+function services(s) {
+  const t = s.teacher;
+  if (s.advice_spent + s.advice_left === 0) return [["info", "Teacher", "This run takes no advice."]];
+  const teacher = {
+    none: ["info", "is starting"],
+    answering: ["good", "answers"],
+    unreachable: ["bad", `does not answer: ${t.error || "no connection"}`],
+    lost: ["warning", "has lost the account, which is opened again"],
+  }[t.state];
+  const account = t.account ? `${count(t.spent)} of ${count(t.budget)} units charged, ${count(t.leased)} reserved for open episodes` : "no account yet";
+  return [
+    [teacher[0], "Teacher", teacher[1]],
+    [t.ledger_warning ? "bad" : t.state === "answering" ? "good" : "info", "Ledger", t.ledger_warning || (t.state === "answering" ? "writes every charge" : "state unknown")],
+    ["info", "Account", account],
+  ];
+}
+
+function showServices(s) {
+  const items = services(s);
+  keyed(byId("services"), items, ([, name]) => name,
+    ([, name]) => el("li", {}, mark("info"), el("span", { class: "what" }, name), el("span")),
+    (item, [level, , text]) => {
+      const sign = item.children[0];
+      sign.className = `mark ${level}`;
+      setText(sign, MARKS[level]);
+      setText(item.children[2], text);
+    });
+}
+
+function showLog(events) {
+  const items = [...(events ?? [])].reverse();
+  byId("log").replaceChildren(...items.map((event) =>
+    el("li", {}, el("time", {}, clock(event.at_s)), mark(event.level), el("span", {}, event.text))));
+}
+
+function showTable(rows) {
+  const names = ["Env steps", "Success", "95 % interval", "Without contact", "Training", "Mean Q", "Critic loss", "Actor loss", "Advice"];
+  const cells = (row) => [count(row.env_steps), percent(row.success), `${percent(row.success_low)} – ${percent(row.success_high)}`,
+    percent(row.success_without_contact), percent(row.training_success), real(row.mean_q), real(row.critic_loss), real(row.actor_loss),
+    count(row.advice_spent)];
+  byId("success-table").replaceChildren(
+    el("thead", {}, el("tr", {}, names.map((name) => el("th", { scope: "col" }, name)))),
+    el("tbody", {}, [...rows].reverse().map((row) => el("tr", {}, cells(row).map((cell) => el("td", {}, cell))))));
+}
+
+/** Fetches the documents that have changed. */
+async function update(name, version, show) {
+  if (versions[name] === version) return;
+  const former = versions[name];
+  versions[name] = version;
+  try {
+    show(await fetchJson(`/data/${name}`));
+  } catch {
+    versions[name] = former;
+  }
+}
+
+function show(s) {
+  state = s;
+  showHeader(s);
+  showTiles(s);
+  showWorkers(s);
+  showAdvice(s);
+  showServices(s);
+  update("evaluations", s.versions.evaluations, (rows) => {
+    showTiles.latest = rows.at(-1);
+    charts.forEach((chart) => chart.show(rows));
+    showTable(rows);
+    showTiles(state);
+  });
+  update("playback", s.versions.playback, (playback) => player.load(playback));
+  update("log", s.versions.log, showLog);
+}
+
+function showLink(condition) {
+  link = condition;
+  const element = byId("link");
+  element.classList.toggle("lost", condition === "lost" && !state?.end);
+  setText(element, {
+    live: "live",
+    lost: state?.end ? "the service has ended; these are the final values" : "no connection, trying again",
+    full: "too many viewers, trying again",
+  }[condition] ?? condition);
+}
+
+// A learner that starts again may begin with other versions.
+follow(show, (condition) => {
+  if (condition === "live" && link === "lost") Object.keys(versions).forEach((name) => delete versions[name]);
+  showLink(condition);
+});

@@ -1,0 +1,254 @@
+//! Recent events of a run, from the differences between snapshots.
+
+use std::collections::{BTreeMap, VecDeque};
+
+use serde::Serialize;
+use tandem_core::text::counted;
+use tandem_telemetry::{EndView, MetricsRow, RunView, TeacherState, WorkerState, WorkerView};
+
+/// Number of events that are kept.
+const KEPT: usize = 60;
+/// Largest number of workers that events name at a time.
+const MAX_NAMED: usize = 4;
+
+/// An event.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub(crate) struct Event {
+    /// Seconds of the run's wall time.
+    pub(crate) at_s: f64,
+    pub(crate) level: Level,
+    pub(crate) text: String,
+}
+
+/// The importance of an event.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub(crate) enum Level {
+    /// Progress.
+    Info,
+    /// Success, or the end of a problem.
+    Good,
+    /// A problem that the run overcomes by itself.
+    Warning,
+    /// A problem that requires an operator.
+    Bad,
+}
+
+/// The recent events, oldest first.
+#[derive(Debug, Default)]
+pub(crate) struct EventLog {
+    events: VecDeque<Event>,
+    former: Option<RunView>,
+}
+
+impl EventLog {
+    /// Adds the events between the previous snapshot and `view`; returns true if there are any.
+    pub(crate) fn update(&mut self, view: &RunView) -> bool {
+        let mut new = Vec::new();
+        match &self.former {
+            None => first(view, &mut new),
+            Some(former) => {
+                // Workers leave at the end of a run.
+                if view.end.is_none() {
+                    workers(&former.workers, &view.workers, &mut new);
+                }
+                evaluations(former, view, &mut new);
+                problems(former, view, &mut new);
+            }
+        }
+        self.former = Some(view.clone());
+        let has_new = !new.is_empty();
+        for (level, text) in new {
+            self.events.push_back(Event { at_s: view.wall_s, level, text });
+        }
+        while self.events.len() > KEPT {
+            self.events.pop_front();
+        }
+        has_new
+    }
+
+    /// Returns the events, oldest first.
+    pub(crate) const fn events(&self) -> &VecDeque<Event> {
+        &self.events
+    }
+}
+
+type New = Vec<(Level, String)>;
+
+fn first(view: &RunView, new: &mut New) {
+    let text = match view.round {
+        0 => "The learner started".to_owned(),
+        round => format!("The learner continues from round {round}"),
+    };
+    new.push((Level::Info, text));
+    if !view.warning.is_empty() {
+        new.push((Level::Bad, sentence(&view.warning)));
+    }
+}
+
+/// Adds the workers that came, went or returned.
+fn workers(former: &[WorkerView], now: &[WorkerView], new: &mut New) {
+    let before: BTreeMap<u64, &WorkerView> = former.iter().map(|it| (it.id, it)).collect();
+    let after: BTreeMap<u64, &WorkerView> = now.iter().map(|it| (it.id, it)).collect();
+    let replaced =
+        |name: &str| former.iter().any(|it| it.name == name && !after.contains_key(&it.id));
+    let changed = |from: fn(WorkerState) -> bool, to: fn(WorkerState) -> bool| {
+        let names = now.iter().filter(|it| {
+            before.get(&it.id).is_some_and(|before| from(before.state)) && to(it.state)
+        });
+        names.map(|it| it.name.as_str()).collect::<Vec<_>>()
+    };
+    let is_new = |it: &&WorkerView| !before.contains_key(&it.id);
+    let (again, joined): (Vec<&str>, Vec<&str>) =
+        now.iter().filter(is_new).map(|it| it.name.as_str()).partition(|name| replaced(name));
+    let active: fn(WorkerState) -> bool = WorkerState::is_active;
+    let lost = changed(active, |to| to == WorkerState::Disconnected);
+    let silent = changed(|from| from != WorkerState::Silent, |to| to == WorkerState::Silent);
+    let returned = changed(|from| !from.is_active(), active);
+    add(new, Level::Info, &joined, "joined");
+    add(new, Level::Good, &again, "restarted");
+    add(new, Level::Warning, &lost, "disconnected; its slot goes to another worker");
+    add(new, Level::Warning, &silent, "stopped calling; its slot goes to another worker");
+    add(new, Level::Good, &returned, "returned");
+}
+
+/// Adds one event per worker, or one for all if there are many.
+fn add(new: &mut New, level: Level, names: &[&str], what: &str) {
+    if names.len() > MAX_NAMED {
+        let verb = what.split(';').next().unwrap_or(what);
+        new.push((level, format!("{} {verb}", counted(names.len(), "worker"))));
+        return;
+    }
+    new.extend(names.iter().map(|name| (level, format!("{name} {what}"))));
+}
+
+fn evaluations(former: &RunView, view: &RunView, new: &mut New) {
+    let known = former.evaluations.len().min(view.evaluations.len());
+    for row in &view.evaluations[known..] {
+        let level = if row.best { Level::Good } else { Level::Info };
+        new.push((level, evaluation(row)));
+    }
+}
+
+fn evaluation(row: &MetricsRow) -> String {
+    let best = if row.best { ", the best so far" } else { "" };
+    format!("Evaluation in round {}: success {:.1} %{best}", row.round, 100.0 * row.success)
+}
+
+/// Adds changes of the warning, of the teacher and of its ledger, and the end of the run.
+fn problems(former: &RunView, view: &RunView, new: &mut New) {
+    let (before, now) = (&former.teacher, &view.teacher);
+    if before.state != now.state {
+        match now.state {
+            TeacherState::None => {}
+            TeacherState::Answering if before.state == TeacherState::None => {
+                new.push((Level::Info, "The teacher answers".to_owned()));
+            }
+            TeacherState::Answering => {
+                new.push((Level::Good, "The teacher answers again".to_owned()));
+            }
+            TeacherState::Unreachable => {
+                new.push((Level::Warning, "The teacher does not answer".to_owned()));
+            }
+            TeacherState::Lost => {
+                new.push((Level::Warning, "The teacher has lost the account".to_owned()));
+            }
+        }
+    }
+    if former.warning != view.warning {
+        new.push(match view.warning.is_empty() {
+            true => (Level::Good, "The problem is solved".to_owned()),
+            false => (Level::Bad, sentence(&view.warning)),
+        });
+    }
+    if let (None, Some(EndView { reason, interrupted, .. })) = (&former.end, &view.end) {
+        let level = if *interrupted { Level::Warning } else { Level::Good };
+        new.push((level, format!("The run has ended: {reason}")));
+    }
+}
+
+/// Returns a text with a capital first letter.
+fn sentence(text: &str) -> String {
+    let mut letters = text.chars();
+    letters.next().map_or_else(String::new, |first| first.to_uppercase().chain(letters).collect())
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+
+    use super::*;
+
+    fn worker(id: u64, name: &str, state: WorkerState) -> WorkerView {
+        let name = name.to_owned();
+        WorkerView { id, name, state, slot: None, n_episodes: 0, last_seen_s: 0.0 }
+    }
+
+    /// Returns the texts of the events that `change` causes.
+    fn events_of(
+        log: &mut EventLog,
+        view: &mut RunView,
+        change: impl FnOnce(&mut RunView),
+    ) -> String {
+        let n_before = log.events().len();
+        change(view);
+        log.update(view);
+        let texts = log.events().iter().skip(n_before).map(|event| event.text.as_str());
+        texts.collect::<Vec<_>>().join(" | ")
+    }
+
+    #[test]
+    fn a_killed_worker_is_reported_and_so_is_its_return() {
+        let (mut log, mut view) = (EventLog::default(), RunView::default());
+        let mut check = |workers: Vec<WorkerView>, expected: &str| {
+            let texts = events_of(&mut log, &mut view, |view| view.workers = workers);
+            assert_eq!(texts, expected);
+        };
+        check(vec![], "The learner started");
+        let other = worker(2, "b", WorkerState::Waiting);
+        check(vec![worker(1, "a", WorkerState::Playing), other.clone()], "a joined | b joined");
+        check(vec![worker(1, "a", WorkerState::Waiting), other.clone()], "");
+        check(
+            vec![worker(1, "a", WorkerState::Disconnected), other.clone()],
+            "a disconnected; its slot goes to another worker",
+        );
+        check(vec![other.clone(), worker(3, "a", WorkerState::Playing)], "a restarted");
+        check(
+            vec![other.clone(), worker(3, "a", WorkerState::Silent)],
+            "a stopped calling; its slot goes to another worker",
+        );
+        check(vec![other.clone(), worker(3, "a", WorkerState::Waiting)], "a returned");
+        let many = (10..20).map(|id| worker(id, &format!("w{id}"), WorkerState::Waiting));
+        check(many.chain([other]).collect(), "10 workers joined");
+    }
+
+    #[test]
+    fn evaluations_warnings_and_the_end_are_reported_once() {
+        let (mut log, mut view) = (EventLog::default(), RunView::default());
+        log.update(&view);
+        let row = MetricsRow { round: 4, success: 0.5, best: true, ..MetricsRow::default() };
+        let texts = events_of(&mut log, &mut view, |view| view.evaluations = Arc::new([row]));
+        assert_eq!(texts, "Evaluation in round 4: success 50.0 %, the best so far");
+        let texts = events_of(&mut log, &mut view, |view| "no disk".clone_into(&mut view.warning));
+        assert_eq!(texts, "No disk");
+        assert_eq!(events_of(&mut log, &mut view, |_| ()), "");
+        let texts = events_of(&mut log, &mut view, |view| view.warning.clear());
+        assert_eq!(texts, "The problem is solved");
+        let texts = events_of(&mut log, &mut view, |view| {
+            let reason = "done".to_owned();
+            view.end = Some(EndView { reason, interrupted: false, digest: None });
+        });
+        assert_eq!(texts, "The run has ended: done");
+    }
+
+    #[test]
+    fn the_log_keeps_the_latest_events() {
+        let (mut log, mut view) = (EventLog::default(), RunView::default());
+        for idx in 0..2 * KEPT {
+            view.warning = format!("w{idx}");
+            log.update(&view);
+        }
+        assert_eq!(log.events().len(), KEPT);
+        assert_eq!(log.events().back().expect("events").text, format!("W{}", 2 * KEPT - 1));
+    }
+}

@@ -1,0 +1,147 @@
+//! The HTML of the pages. Scripts fill in the data.
+
+use maud::{DOCTYPE, Markup, PreEscaped, html};
+
+/// Icon of the pages: two arms that meet.
+const ICON: &str = "data:image/svg+xml,%3Csvg xmlns='http://www.w3.org/2000/svg' viewBox='0 0 32 32'%3E%3Crect width='32' height='32' rx='7' fill='%230072B2'/%3E%3Cpath d='M5 24 11 9l5 8 5-8 6 15' fill='none' stroke='white' stroke-width='3' stroke-linejoin='round' stroke-linecap='round'/%3E%3Ccircle cx='16' cy='17' r='2.6' fill='%23E69F00'/%3E%3C/svg%3E";
+
+/// Returns the page of a run.
+pub(crate) fn run() -> String {
+    let body = html! {
+        (header())
+        main #content {
+            p #alert .alert role="alert" hidden {}
+            section .now aria-label="Current values" { dl #tiles .tiles {} }
+            div .columns {
+                div .stack {
+                    (card("success", "Success in evaluations", &html! {
+                        div #success-chart .chart {}
+                        (table("success-table", "Evaluations"))
+                    }))
+                    (card("events", "Recent events", &html! { ol #log .log tabindex="0" {} }))
+                }
+                (card("episode", "Latest evaluation episode", &episode()))
+            }
+            div .columns.three {
+                (card("q", "Mean Q", &html! { div #q-chart .chart {} }))
+                (card("losses", "Losses", &html! { div #loss-chart .chart {} }))
+                (card("advice-spent", "Advice spent", &html! { div #advice-chart .chart {} }))
+            }
+            div .columns {
+                (card("advice", "Advice", &html! { div #advice-budget {} div #acted {} }))
+                (card("services", "Teacher and ledger", &html! { ul #services .services {} }))
+            }
+            (card("workers", "Workers", &html! {
+                p #worker-summary .note {}
+                ul #worker-tiles .workers {}
+            }))
+        }
+        footer { p { "Times are the run’s own, summed over resumed parts." } }
+    };
+    document("Tandem run", "run.js", &body)
+}
+
+/// Returns the page that asks for the token.
+pub(crate) fn login() -> String {
+    let body = html! {
+        main .login {
+            h1 { "Tandem" }
+            form #login {
+                label for="token" { "Access token of this service" }
+                input #token type="password" autocomplete="current-password" required;
+                button type="submit" { "Open" }
+                p #login-error .error role="alert" {}
+            }
+        }
+    };
+    document("Tandem", "login.js", &body)
+}
+
+fn header() -> Markup {
+    html! {
+        a .skip href="#content" { "Skip to the values" }
+        header .top {
+            div .title {
+                p .brand { "Tandem" }
+                h1 #name { "Run" }
+                p #terms .terms {}
+            }
+            div .state {
+                p #status role="status" aria-live="polite" {
+                    span #phase .badge { "connecting" }
+                    " "
+                    span #link .link { "connecting" }
+                }
+                p #clock .clock {}
+            }
+            div #progress .progress role="progressbar" aria-label="Progress of the run"
+                aria-valuemin="0" aria-valuemax="100" { div #bar .bar {} }
+            p #progress-text .note {}
+        }
+        noscript { p .alert { "This page needs JavaScript. `tandem status` shows the same values." } }
+    }
+}
+
+/// Returns the two views of an episode and its controls.
+fn episode() -> Markup {
+    html! {
+        p #episode-note .note { "The first evaluation has not been completed yet." }
+        div #player hidden {
+            div .views {
+                figure {
+                    figcaption { "From above" }
+                    svg #view-above role="img" aria-labelledby="episode-text" {}
+                }
+                figure {
+                    figcaption { "From the side" }
+                    svg #view-side role="img" aria-labelledby="episode-text" {}
+                }
+            }
+            p #episode-text .note {}
+            div .controls {
+                button #play type="button" { "Play" }
+                input #step type="range" min="0" max="50" value="0" aria-label="Step of the episode";
+                label { "Episode " select #episode-choice {} }
+            }
+        }
+    }
+}
+
+fn card(id: &str, title: &str, content: &Markup) -> Markup {
+    let heading = format!("{id}-heading");
+    html! {
+        section .card aria-labelledby=(heading) {
+            h2 id=(heading) { (title) }
+            (content)
+        }
+    }
+}
+
+/// Returns a table that is folded until it is asked for.
+fn table(id: &str, caption: &str) -> Markup {
+    html! {
+        details {
+            summary { "Values as a table" }
+            div .scroll tabindex="0" role="region" aria-label=(caption) { table id=(id) {} }
+        }
+    }
+}
+
+fn document(title: &str, script: &str, body: &Markup) -> String {
+    let markup = html! {
+        (DOCTYPE)
+        html lang="en" {
+            head {
+                meta charset="utf-8";
+                meta name="viewport" content="width=device-width, initial-scale=1";
+                meta name="color-scheme" content="light dark";
+                title { (title) }
+                link rel="icon" href=(PreEscaped(ICON));
+                link rel="stylesheet" href="/assets/style.css";
+                script type="module" src=(format!("/assets/{script}")) {}
+            }
+            body { (body) }
+        }
+    };
+    markup.into_string()
+}

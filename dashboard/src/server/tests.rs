@@ -1,0 +1,187 @@
+//! A served site over real connections.
+
+use std::net::SocketAddr;
+
+use tandem_net::Token;
+use tandem_telemetry::{RunView, WorkerState, WorkerView};
+use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
+use tokio::net::{TcpListener, TcpStream};
+use tokio::sync::watch;
+
+use super::*;
+
+/// Within this everything that is to happen has happened, on the slowest machine.
+const DEADLINE: Duration = Duration::from_secs(60);
+
+struct Served {
+    address: SocketAddr,
+    views: watch::Sender<RunView>,
+    shutdown: CancellationToken,
+}
+
+impl Served {
+    async fn start(access: Access) -> Self {
+        let (views, receiver) = watch::channel(RunView::default());
+        let listener = TcpListener::bind("127.0.0.1:0").await.expect("a port");
+        let address = listener.local_addr().expect("bound");
+        let shutdown = CancellationToken::new();
+        let served = serve(Site::of_run(receiver), access, listener, shutdown.clone());
+        drop(tokio::spawn(served));
+        Self { address, views, shutdown }
+    }
+
+    /// Opens a connection and sends a request, with further lines of its head.
+    async fn send(&self, request: &str, lines: &str) -> TcpStream {
+        let mut stream = TcpStream::connect(self.address).await.expect("it listens");
+        let head = format!("{request} HTTP/1.1\r\nhost: {}\r\n{lines}\r\n", self.address);
+        stream.write_all(head.as_bytes()).await.expect("sent");
+        stream
+    }
+
+    /// Returns the whole response.
+    async fn ask(&self, request: &str, lines: &str) -> String {
+        let mut stream = self.send(request, &format!("connection: close\r\n{lines}")).await;
+        let mut response = String::new();
+        let read = stream.read_to_string(&mut response);
+        tokio::time::timeout(DEADLINE, read).await.expect("in time").expect("UTF-8");
+        response
+    }
+}
+
+/// Reads from a stream of events until `text` has arrived.
+async fn until(stream: &mut TcpStream, text: &str) -> String {
+    let mut received = Vec::new();
+    let reading = async {
+        while !String::from_utf8_lossy(&received).contains(text) {
+            let n = stream.read_buf(&mut received).await.expect("open");
+            assert!(n > 0, "closed before {text:?}");
+        }
+    };
+    tokio::time::timeout(DEADLINE, reading).await.expect("in time");
+    String::from_utf8_lossy(&received).into_owned()
+}
+
+fn has_status(response: &str, code: u16) {
+    assert!(response.starts_with(&format!("HTTP/1.1 {code} ")), "{response}");
+}
+
+#[tokio::test]
+async fn the_page_refers_to_its_own_files_only_and_all_of_them_exist() {
+    let served = Served::start(Access::local()).await;
+    let page = served.ask("GET /", "").await;
+    has_status(&page, 200);
+    assert!(page.contains("content-security-policy: default-src 'none'; script-src 'self'"));
+    let (_, html) = page.split_once("\r\n\r\n").expect("a body");
+    assert!(!html.contains("<style") && !html.contains(" style=") && !html.contains("onclick"));
+    let mut pending: Vec<String> = references(html).collect();
+    let mut seen = Vec::new();
+    while let Some(path) = pending.pop().filter(|_| seen.len() < 20) {
+        let file = served.ask(&format!("GET {path}"), "").await;
+        has_status(&file, 200);
+        pending.extend(references(&file).filter(|it| !seen.contains(it)));
+        seen.push(path);
+    }
+    assert!(seen.iter().any(|path| path == "/assets/chart.js"), "{seen:?}");
+    has_status(&served.ask("GET /assets/none.js", "").await, 404);
+    has_status(&served.ask("GET /data/none", "").await, 404);
+}
+
+/// Returns the files that a text refers to.
+fn references(text: &str) -> impl Iterator<Item = String> {
+    assert!(!text.replace("http://www.w3.org/", "").contains("http://"), "another server");
+    assert!(!text.contains("https://"), "another server");
+    text.split('"').filter(|part| part.starts_with("/assets/")).map(str::to_owned)
+}
+
+#[tokio::test]
+async fn viewers_receive_the_state_and_every_change() {
+    let served = Served::start(Access::local()).await;
+    let mut viewer = served.send("GET /events", "").await;
+    let head = until(&mut viewer, "\"workers\":[]").await;
+    assert!(head.contains("content-type: text/event-stream"), "{head}");
+    let worker = WorkerView {
+        id: 1,
+        name: "worker-1".to_owned(),
+        state: WorkerState::Playing,
+        slot: Some(3),
+        n_episodes: 0,
+        last_seen_s: 0.1,
+    };
+    served.views.send_modify(|view| {
+        "collecting".clone_into(&mut view.phase);
+        view.workers.push(worker);
+    });
+    until(&mut viewer, "\"state\":\"playing\",\"slot\":3").await;
+    served.views.send_modify(|view| view.workers[0].state = WorkerState::Disconnected);
+    until(&mut viewer, "\"state\":\"disconnected\"").await;
+    assert!(served.ask("GET /data/log", "").await.contains("worker-1 disconnected"));
+    served.shutdown.cancel();
+    let mut rest = Vec::new();
+    let closed = tokio::time::timeout(DEADLINE, viewer.read_to_end(&mut rest)).await;
+    drop(closed.expect("the stream ends with the service"));
+}
+
+#[tokio::test]
+async fn a_further_viewer_gets_a_sentence_and_the_others_are_served() {
+    let served = Served::start(Access::local()).await;
+    let mut viewers = Vec::new();
+    for _ in 0..MAX_VIEWERS {
+        let mut viewer = served.send("GET /events", "").await;
+        until(&mut viewer, "data: ").await;
+        viewers.push(viewer);
+    }
+    let refused = served.ask("GET /events", "").await;
+    has_status(&refused, 503);
+    assert!(refused.contains("too many viewers"), "{refused}");
+    // Most viewers stop reading; the one that reads is as fast as before, and the page is served.
+    let mut reader = viewers.pop().expect("viewers");
+    for round in 1..200 {
+        served.views.send_modify(|view| view.round = round);
+    }
+    until(&mut reader, "\"round\":199,").await;
+    has_status(&served.ask("GET /state", "").await, 200);
+    drop(reader);
+    let freed = async {
+        while served.ask("HEAD /events", "").await.starts_with("HTTP/1.1 503") {
+            served.views.send_modify(|view| view.round += 1);
+            tokio::time::sleep(Duration::from_millis(5)).await;
+        }
+    };
+    tokio::time::timeout(DEADLINE, freed).await.expect("a place is free");
+}
+
+#[tokio::test]
+async fn a_token_is_exchanged_for_a_cookie() {
+    let token = Token::new("0123456789abcdef").expect("a token");
+    let served = Served::start(Access::with_token(token)).await;
+    let form = served.ask("GET /", "").await;
+    has_status(&form, 401);
+    assert!(form.contains("Access token"), "{form}");
+    has_status(&served.ask("GET /assets/login.js", "").await, 200);
+    for path in ["/state", "/events", "/data/log"] {
+        has_status(&served.ask(&format!("GET {path}"), "").await, 401);
+    }
+    let wrong = "authorization: Bearer 0123456789abcdeF\r\nx-tandem-action: login\r\n";
+    has_status(&served.ask("POST /login", wrong).await, 401);
+    let bearer = "authorization: Bearer 0123456789abcdef\r\n";
+    has_status(&served.ask("POST /login", bearer).await, 403);
+    let right = format!("{bearer}x-tandem-action: login\r\n");
+    let accepted = served.ask("POST /login", &right).await;
+    has_status(&accepted, 204);
+    let cookie = accepted.split("set-cookie: ").nth(1).and_then(|it| it.split(';').next());
+    let cookie = format!("cookie: {}\r\n", cookie.expect("a cookie"));
+    has_status(&served.ask("GET /state", &cookie).await, 200);
+    has_status(&served.ask("GET /state", bearer).await, 200);
+}
+
+#[tokio::test]
+async fn a_page_of_another_name_reads_nothing() {
+    let served = Served::start(Access::local()).await;
+    let mut stream = TcpStream::connect(served.address).await.expect("it listens");
+    let request = b"GET /state HTTP/1.1\r\nhost: evil.example\r\nconnection: close\r\n\r\n";
+    stream.write_all(request).await.expect("sent");
+    let mut response = String::new();
+    stream.read_to_string(&mut response).await.expect("answered");
+    has_status(&response, 421);
+    assert!(!response.contains("env_steps"), "{response}");
+}

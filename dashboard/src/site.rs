@@ -1,0 +1,116 @@
+//! A page, its data, and the routes to both.
+
+use std::collections::BTreeMap;
+use std::convert::Infallible;
+use std::sync::Arc;
+use std::time::Duration;
+
+use axum::Router;
+use axum::extract::{Path, State};
+use axum::response::sse::{Event, KeepAlive, Sse};
+use axum::response::{Html, IntoResponse as _, Response};
+use axum::routing::{get, post};
+use http::StatusCode;
+use http::header::CONTENT_TYPE;
+use tokio::sync::{Semaphore, watch};
+use tokio_stream::StreamExt as _;
+use tokio_stream::wrappers::WatchStream;
+
+use crate::access::{self, Access};
+
+/// Time without an event after which a comment is sent, so that a viewer that is gone is noticed.
+const KEEP_ALIVE: Duration = Duration::from_secs(10);
+
+/// A page and the data that it shows.
+#[derive(Clone)]
+pub struct Site {
+    /// The HTML text.
+    pub(crate) page: Arc<str>,
+    /// The latest data.
+    pub(crate) frames: watch::Receiver<Arc<Frame>>,
+}
+
+/// The data of a page at one moment.
+#[derive(Debug, Default)]
+pub(crate) struct Frame {
+    /// The state, JSON on one line. It is sent with every change, so it is short.
+    pub(crate) state: Arc<str>,
+    /// Larger documents, JSON. The state has the versions of each, and pages fetch those that have changed.
+    pub(crate) documents: BTreeMap<&'static str, Arc<str>>,
+}
+
+/// The files that pages refer to: name, content type and content.
+const ASSETS: [(&str, &str, &str); 6] = [
+    ("style.css", "text/css; charset=utf-8", include_str!("../assets/style.css")),
+    ("common.js", "text/javascript; charset=utf-8", include_str!("../assets/common.js")),
+    ("chart.js", "text/javascript; charset=utf-8", include_str!("../assets/chart.js")),
+    ("player.js", "text/javascript; charset=utf-8", include_str!("../assets/player.js")),
+    ("run.js", "text/javascript; charset=utf-8", include_str!("../assets/run.js")),
+    ("login.js", "text/javascript; charset=utf-8", include_str!("../assets/login.js")),
+];
+
+/// The state of the routes.
+#[derive(Clone)]
+struct Served {
+    site: Site,
+    /// One permit per viewer.
+    viewers: Arc<Semaphore>,
+}
+
+impl Site {
+    /// Returns the routes, behind the rules of `access`, for at most `max_viewers` streams of events.
+    pub(crate) fn router(self, access: Access, max_viewers: usize) -> Router {
+        let viewers = Arc::new(Semaphore::new(max_viewers));
+        Router::new()
+            .route("/", get(page))
+            .route("/state", get(state))
+            .route("/events", get(events))
+            .route("/data/{name}", get(document))
+            .route("/assets/{name}", get(asset))
+            .route("/login", post(|| async { StatusCode::NO_CONTENT }))
+            .with_state(Served { site: self, viewers })
+            .layer(axum::middleware::from_fn_with_state(Arc::new(access), access::guard))
+    }
+}
+
+async fn page(State(served): State<Served>) -> Html<String> {
+    Html(served.site.page.to_string())
+}
+
+async fn state(State(served): State<Served>) -> Response {
+    let state = served.site.frames.borrow().state.clone();
+    json(&state)
+}
+
+async fn document(State(served): State<Served>, Path(name): Path<String>) -> Response {
+    let document = served.site.frames.borrow().documents.get(name.as_str()).cloned();
+    document.map_or_else(not_found, |document| json(&document))
+}
+
+async fn asset(Path(name): Path<String>) -> Response {
+    let asset = ASSETS.iter().find(|(known, ..)| *known == name);
+    asset.map_or_else(not_found, |(_, content_type, content)| {
+        ([(CONTENT_TYPE, *content_type)], *content).into_response()
+    })
+}
+
+/// Streams the states. A viewer that is slower than they change misses those in between.
+async fn events(State(served): State<Served>) -> Response {
+    let Ok(permit) = served.viewers.try_acquire_owned() else {
+        let text = "too many viewers: close another page of this dashboard\n";
+        return (StatusCode::SERVICE_UNAVAILABLE, text).into_response();
+    };
+    let states = WatchStream::new(served.site.frames).map(move |frame| {
+        let _held = &permit;
+        Ok::<_, Infallible>(Event::default().data(&*frame.state))
+    });
+    Sse::new(states).keep_alive(KeepAlive::new().interval(KEEP_ALIVE)).into_response()
+}
+
+fn json(text: &str) -> Response {
+    ([(CONTENT_TYPE, "application/json")], text.to_owned()).into_response()
+}
+
+fn not_found() -> Response {
+    (StatusCode::NOT_FOUND, "not found\n").into_response()
+}

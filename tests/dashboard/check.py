@@ -1,0 +1,269 @@
+"""Tests the dashboard of a run in headless Chromium.
+
+Starts a small run and looks at its page as a user does: the curve grows, the tile of a killed worker changes and
+recovers, the episode can be played by keyboard, nothing overflows on a phone, scripts have no errors. Prints how often
+states arrive, how 20 further viewers affect the speed of the run, and what they cost the learner.
+"""
+
+import argparse
+import contextlib
+import json
+import os
+import pathlib
+import re
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+import urllib.request
+
+from devtools import Browser
+
+N_VIEWERS = 20
+# Small and frequent evaluations, so that a curve grows within seconds.
+SETTINGS = ["evaluation.every_env_steps=1600", "evaluation.episodes=16", "evaluation.test_episodes=1",
+            "evaluation.recorded_episodes=0", "rounds.updates_per_env_step=0.02"]
+
+
+class Run:
+    """A run of `tandem train` with a dashboard. A context manager."""
+
+    def __init__(self, program, directory, max_env_steps):
+        settings = [part for setting in SETTINGS for part in ("--set", setting)]
+        command = [program, "train", "--seed", "1", "--workers", "2", "--max-env-steps", str(max_env_steps),
+                   "--out", str(directory / "push-demo"), *settings]
+        self.process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL,
+                                        stderr=subprocess.PIPE, text=True)
+        self.lines = []
+        self.url = None
+        for line in self.process.stderr:
+            self.lines.append(line)
+            if found := re.search(r"dashboard on (http://\S+/)", line):
+                self.url = found[1]
+                break
+        assert self.url, "".join(self.lines)
+        threading.Thread(target=self.collect, daemon=True).start()
+
+    def collect(self):
+        self.lines.extend(self.process.stderr)
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        if self.process.poll() is None:
+            self.process.send_signal(signal.SIGINT)
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                self.process.wait(30)
+        self.process.kill()
+
+    def child(self, *words):
+        """Returns the number of the run's process whose command line has these words."""
+        for entry in pathlib.Path("/proc").iterdir():
+            with contextlib.suppress(OSError):
+                if not entry.name.isdigit():
+                    continue
+                parent = (entry / "stat").read_text().rpartition(")")[2].split()[1]
+                command = (entry / "cmdline").read_bytes().decode().split("\0")
+                if int(parent) == self.process.pid and all(word in command for word in words):
+                    return int(entry.name)
+        raise AssertionError(f"no process {words}")
+
+    def worker(self, name):
+        return self.child("worker", name)
+
+    def state(self):
+        with urllib.request.urlopen(self.url + "state", timeout=30) as answer:
+            return json.load(answer)
+
+
+def check_curve(page):
+    """The curve gets further points while the page is open."""
+    points = "document.querySelectorAll('#success-chart circle.dot.first').length"
+    page.wait(f"{points} >= 1", "the first evaluation is drawn", 60)
+    before = page.value(points)
+    page.wait(f"{points} > {before}", "the curve grows", 60)
+    assert page.value("document.querySelectorAll('#success-chart polygon.band').length") == 1
+    print(f"the curve grew from {before} to {page.value(points)} points")
+
+
+def check_worker(page, run, pictures):
+    """The tile of a killed worker changes, and recovers; so does that of a worker that hangs."""
+    tile = "[...document.querySelectorAll('.worker')].find(it => it.querySelector('strong').textContent === 'worker-2')"
+    takes_part = f"['playing', 'waiting'].includes(({tile})?.dataset.state)"
+    page.wait(takes_part, "worker-2 takes part")
+    # Notes every state and number that the tile shows: a restart takes less than a second.
+    page.value("window.shown = []; new MutationObserver(() => { const it = " + tile + "; window.shown.push("
+               "`${it?.dataset.state} ${it?.dataset.key}`); }).observe(document.getElementById('worker-tiles'), "
+               "{ subtree: true, childList: true, attributes: true })")
+    before = page.value(f"({tile}).dataset.key")
+    os.kill(run.worker("worker-2"), signal.SIGKILL)
+    killed_at = time.monotonic()
+    page.wait(f"window.shown.some(it => !['playing {before}', 'waiting {before}'].includes(it))",
+              "the tile of the killed worker changes", 10)
+    changed_s = time.monotonic() - killed_at
+    page.wait(f"{takes_part} && ({tile}).dataset.key !== '{before}'", "the worker is back", 30)
+    back_s = time.monotonic() - killed_at
+    page.wait("document.getElementById('log').textContent.includes('worker-2 restarted')", "an event")
+    print(f"the tile of a killed worker changed after {changed_s:.1f} s and recovered after {back_s:.1f} s")
+    process = run.worker("worker-2")
+    os.kill(process, signal.SIGSTOP)
+    try:
+        # The learner closes its connection after 10 to 20 s, and counts it as dead after 15 s.
+        page.wait(f"['silent', 'disconnected'].includes(({tile})?.dataset.state)", "the tile of the hanging worker changes", 40)
+        assert page.value(f"/seen [12]\\d s ago/.test(({tile}).textContent)"), page.value(f"({tile}).textContent")
+        if pictures:
+            take_pictures(page, pictures, "silent")
+    finally:
+        os.kill(process, signal.SIGCONT)
+    page.wait(takes_part, "the hanging worker is back", 30)
+
+
+def check_episode(page):
+    """The latest evaluation episode can be moved through by keyboard."""
+    page.wait("!document.getElementById('player').hidden", "an episode is shown")
+    page.value("document.getElementById('play').textContent === 'Pause' && document.getElementById('play').click()")
+    page.value("(step => { step.focus(); step.value = 0; step.dispatchEvent(new Event('input')); })"
+               "(document.getElementById('step'))")
+    for _ in range(3):
+        page.key("ArrowRight", 39)
+    text = page.value("document.getElementById('step').getAttribute('aria-valuetext')")
+    assert text.startswith("Step 3 of 50"), text
+    shapes = page.value("['view-above', 'view-side'].map(id => document.querySelectorAll(`#${id} .object`).length)")
+    assert shapes == [2, 2], shapes
+    page.value("document.getElementById('play').click()")
+    page.wait("document.getElementById('step').value > 5", "the episode plays")
+
+
+def check_layout(page):
+    """Nothing overflows on a phone or a small laptop, in both colour schemes."""
+    for width in [360, 768, 1280]:
+        for dark in [False, True]:
+            page.resize(width, 800, dark)
+            overflow = page.value("document.documentElement.scrollWidth - document.documentElement.clientWidth")
+            assert overflow <= 0, f"{overflow} px too wide at {width} px"
+    names = page.value("[...document.querySelectorAll('button, input, select, svg[role=img]')].filter(it => "
+                       "!(it.ariaLabel || it.getAttribute('aria-labelledby') || it.textContent.trim() || it.labels?.length))"
+                       ".map(it => it.id)")
+    assert names == [], f"without a name: {names}"
+    assert page.value("document.querySelectorAll('h1').length") == 1
+    page.resize(1280, 900)
+
+
+class Viewer(threading.Thread):
+    """Reads events, and notes the pauses between them."""
+
+    def __init__(self, url):
+        super().__init__(daemon=True)
+        self.url, self.pauses_s, self.open = url, [], True
+        self.start()
+
+    def run(self):
+        with contextlib.suppress(OSError), urllib.request.urlopen(self.url + "events", timeout=30) as stream:
+            received_at = None
+            for line in stream:
+                if not self.open:
+                    return
+                if line.startswith(b"data: "):
+                    now = time.monotonic()
+                    if received_at is not None:
+                        self.pauses_s.append(now - received_at)
+                    received_at = now
+
+
+def steps_per_s(run, seconds):
+    before, began = run.state(), time.monotonic()
+    time.sleep(seconds)
+    return (run.state()["env_steps"] - before["env_steps"]) / (time.monotonic() - began)
+
+
+def measure_viewers(run):
+    """Compares the speed of the run with and without further viewers, alternately."""
+    alone, watched, pauses_s = 0.0, 0.0, []
+    for _ in range(2):
+        alone += steps_per_s(run, 4)
+        viewers = [Viewer(run.url) for _ in range(N_VIEWERS)]
+        watched += steps_per_s(run, 4)
+        assert all(viewer.pauses_s for viewer in viewers), "a viewer received nothing"
+        pauses_s += [max(viewer.pauses_s) for viewer in viewers]
+        for viewer in viewers:
+            viewer.open = False
+    print(f"{N_VIEWERS} further viewers: {watched / max(alone, 1e-9):.2f} of the environment steps per second without; "
+          f"longest pause between two events {max(pauses_s):.2f} s")
+
+
+def processor_share(process, seconds):
+    """Returns the processor time of a process per second."""
+    def used_s():
+        fields = pathlib.Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
+        return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+    before, began = used_s(), time.monotonic()
+    time.sleep(seconds)
+    return (used_s() - before) / (time.monotonic() - began)
+
+
+def measure_cost(run):
+    """Measures the processor time that viewers cost the learner, while workers pause and it has nothing to learn."""
+    workers, learner = [run.worker(f"worker-{number}") for number in (1, 2)], run.child("learner")
+    for worker in workers:
+        os.kill(worker, signal.SIGSTOP)
+    try:
+        time.sleep(2)
+        alone = processor_share(learner, 3)
+        viewers = [Viewer(run.url) for _ in range(N_VIEWERS)]
+        time.sleep(0.5)
+        watched = processor_share(learner, 3)
+        for viewer in viewers:
+            viewer.open = False
+    finally:
+        for worker in workers:
+            os.kill(worker, signal.SIGCONT)
+    print(f"{N_VIEWERS} further viewers cost an idle learner {100 * max(watched - alone, 0):.1f} % of a processor "
+          f"({100 * alone:.1f} % without)")
+
+
+def take_pictures(page, directory, name):
+    if directory:
+        directory.mkdir(parents=True, exist_ok=True)
+        for label, width, dark in [("light", 1280, False), ("dark", 1280, True), ("phone", 360, False)]:
+            page.resize(width, 900, dark)
+            page.picture(directory / f"{name}-{label}.png")
+        page.resize(1280, 900)
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--program", type=pathlib.Path, required=True)
+    parser.add_argument("--pictures", type=pathlib.Path)
+    parser.add_argument("--max-env-steps", type=int, default=1_000_000)
+    args = parser.parse_args()
+    began = time.monotonic()
+    with tempfile.TemporaryDirectory() as directory, Browser() as browser:
+        with Run(args.program.resolve(), pathlib.Path(directory), args.max_env_steps) as run:
+            page = browser.open(run.url)
+            page.resize(1280, 900)
+            page.wait("document.getElementById('name').textContent === 'push-demo'", "the page shows the run")
+            take_pictures(page, args.pictures, "start")
+            check_curve(page)
+            check_worker(page, run, args.pictures)
+            check_episode(page)
+            check_layout(page)
+            take_pictures(page, args.pictures, "run")
+            measure_viewers(run)
+            measure_cost(run)
+            run.process.send_signal(signal.SIGINT)
+            page.wait("document.getElementById('phase').textContent === 'stopped'", "the end is shown", 30)
+            assert run.process.wait(60) == 130, run.lines
+            page.wait("document.getElementById('link').textContent.includes('final values')", "the service has ended")
+            take_pictures(page, args.pictures, "end")
+            errors = [error for error in page.errors if "ERR_CONNECTION_REFUSED" not in str(error)
+                      and "ERR_INCOMPLETE_CHUNKED_ENCODING" not in str(error)]
+            assert not errors, errors
+    print(f"the dashboard passed in {time.monotonic() - began:.0f} s")
+
+
+if __name__ == "__main__":
+    sys.exit(main())
