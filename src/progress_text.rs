@@ -6,8 +6,6 @@ use std::collections::BTreeMap;
 use tandem_core::text::counted;
 use tandem_proto::pb;
 
-use crate::columns::wrapped;
-
 /// Workers that are named one by one; more are counted.
 const MAX_NAMED_WORKERS: usize = 4;
 
@@ -140,7 +138,7 @@ pub(crate) fn warning_line(progress: &pb::Progress) -> String {
     let clock = clock_text(progress.wall_s);
     match progress.warning.as_str() {
         "" => format!("{clock} the problem is solved"),
-        warning => wrapped(&format!("{clock} warning: {warning}"), "      "),
+        warning => format!("{clock} warning: {warning}"),
     }
 }
 

@@ -15,9 +15,15 @@ use crate::progress::{EnvironmentChecks, Progress};
 use crate::shared::Shared;
 use crate::work_queue::WorkQueue;
 
-/// Adds the state of the run to `metrics`.
-pub(crate) fn add(metrics: &Metrics, shared: Arc<Shared>) {
-    metrics.add_source(move |registry| add_state(registry, &shared));
+/// Adds the state of the run to `metrics`, until it is dropped. The state holds metrics itself, so the metrics must not
+/// keep it alive.
+pub(crate) fn add(metrics: &Metrics, shared: &Arc<Shared>) {
+    let shared = Arc::downgrade(shared);
+    metrics.add_source(move |registry| {
+        if let Some(shared) = shared.upgrade() {
+            add_state(registry, &shared);
+        }
+    });
 }
 
 fn add_state(registry: &mut Registry, shared: &Shared) {

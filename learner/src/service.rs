@@ -106,7 +106,7 @@ fn serve_boxed(
     Box::pin(async move {
         let timings = Timings::register(config.server_config.metrics());
         let shared = Arc::new(Shared::new(config.clock.clone(), timings));
-        metrics::add(config.server_config.metrics(), shared.clone());
+        metrics::add(config.server_config.metrics(), &shared);
         shared.lock().queue.start_workers_at(config.first_worker);
         let learner = LearnerServer::new(LearnerService {
             shared: shared.clone(),

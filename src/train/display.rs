@@ -67,7 +67,12 @@ impl Display {
             self.printed_warning.clone_from(&progress.warning);
             match self.is_quiet {
                 true => output::message(warning_line(progress)),
-                false => self.print(&warning_line(progress)),
+                false => {
+                    let line = warning_line(progress);
+                    // A line of a file stays whole, so that programs find it.
+                    let is_wrapped = self.live.is_some();
+                    self.print(&if is_wrapped { wrapped(&line, "      ") } else { line });
+                }
             }
         }
         if self.is_quiet {

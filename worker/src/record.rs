@@ -166,7 +166,7 @@ pub fn record_episode(
         Some(layout) => Some(world_in(layout, metadata)?),
         None => None,
     };
-    let mut recorder = EpisodeRecorder::create(path, metadata)?.in_one_piece();
+    let mut recorder = EpisodeRecorder::create(path, metadata)?;
     for step_idx in 0..episode.n_steps() {
         let scene = world.as_ref().map(Env::scene);
         record_step(&mut recorder, scene.as_ref(), episode, step_idx, None)?;
