@@ -35,7 +35,7 @@ impl Table {
 
     /// Formats the table for a terminal. The first column is left-aligned, the others are right-aligned.
     ///
-    /// If the table is wider than [`TERMINAL_COLUMNS`], a long first cell has a line of its own, above the other cells of
+    /// If the table is wider than a terminal, a long first cell has a line of its own, above the other cells of
     /// its row. If the other columns alone are wider, each row becomes a block with one cell per line.
     #[must_use]
     pub fn text(&self) -> String {

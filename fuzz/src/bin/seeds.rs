@@ -169,7 +169,11 @@ fn write_messages(to: &Path) -> Result<(), AnyError> {
     let progress =
         pb::Progress { workers: vec![pb::WorkerProgress::default()], ..Default::default() };
     let query = tandem_proto::encode_query(&query());
-    let asked = pb::AdviseRequest { account: "run-7".to_owned(), steps: vec![query.clone()], ..Default::default() };
+    let asked = pb::AdviseRequest {
+        account: "run-7".to_owned(),
+        steps: vec![query.clone()],
+        ..Default::default()
+    };
     let actor: PublishedActor = sample::trainer(0).publish();
     let start = EpisodeStart { number: 3, seed: 42, kind, world: WorldSettings::default() };
     let seeds = [
