@@ -55,15 +55,13 @@ fn one_worker_and_five_give_the_same_bits_when_advised_early() {
 
 #[test]
 fn one_worker_and_five_give_the_same_bits_when_advised_on_mistakes() {
-    for advice in &STRATEGIES[2..] {
-        check(*advice, 1, &[1, 5]);
-    }
+    check(STRATEGIES[2], 1, &[1, 5]);
 }
 
 #[test]
-fn sixteen_workers_give_the_bits_of_one_and_of_five_with_either_lag() {
+fn sixteen_workers_give_the_bits_of_fewer_with_either_lag() {
     check(EAMC, 0, &[2, 16]);
-    check(EAMC, 1, &[1, 5, 16]);
+    check(EAMC, 1, &[5, 16]);
 }
 
 #[test]
