@@ -13,7 +13,9 @@ mod execution;
 mod messages;
 mod metrics;
 mod motion;
+mod operator;
 mod reason_codes;
+mod snapshot;
 mod thread;
 
 use std::pin::Pin;
@@ -22,12 +24,12 @@ use std::time::Duration;
 
 use rand_chacha::ChaCha20Rng;
 use rand_chacha::rand_core::{Rng as _, SeedableRng as _};
-use tandem_net::{Incoming, SHUTDOWN_GRACE, ServerConfig};
-use tandem_proto::pb::bridge_server::{Bridge, BridgeServer};
+use tandem_net::{ConnectInfo, Incoming, SHUTDOWN_GRACE, ServerConfig};
+use tandem_proto::pb::bridge_server::{Bridge as BridgeRpc, BridgeServer};
 use tandem_proto::{DecodeError, pb};
 use tokio::sync::{Semaphore, watch};
 use tokio_stream::wrappers::ReceiverStream;
-use tokio_util::sync::CancellationToken;
+use tokio_util::sync::{CancellationToken, DropGuard};
 use tonic::{Request, Response, Status, Streaming};
 
 use crate::executor::{CheckedMotion, Executor, GOOD_STATES, Stop, StopCause, Token};
@@ -35,11 +37,13 @@ use error::status;
 use messages::{decode_token, token_text};
 use metrics::StopCounter;
 use motion::MotionSpec;
-use thread::{ArmsHandle, ArmsThread, Snapshot};
+use thread::{ArmsHandle, ArmsThread};
 
 pub use clock::Clock;
 pub use error::Error;
 pub use motion::MotionError;
+pub use operator::Operator;
+pub use snapshot::{MotionInfo, Observer, Snapshot, Snapshots, observe};
 pub use thread::{BoxDriver, Reconnect};
 
 /// The largest request in bytes: a joint motion of ten minutes.
@@ -79,35 +83,82 @@ pub async fn serve(
     server_config: &ServerConfig,
     shutdown: CancellationToken,
 ) -> Result<(), Error> {
-    assert!(config.speed > 0.0 && config.speed <= 1.0, "speed {}", config.speed);
-    serve_boxed(executor, config, incoming.into(), server_config, shutdown).await
+    Bridge::start(executor, config, None, &shutdown)?.serve(incoming, server_config).await
 }
 
-/// Boxes the service, so that it is compiled in this crate only and not in every crate that serves.
-fn serve_boxed(
-    executor: Executor<BoxDriver>,
+/// Arms that are ticked, and the service that offers them to clients.
+pub struct Bridge {
+    thread: ArmsThread,
+    arms: ArmsHandle,
     config: Config,
-    incoming: Incoming,
-    server_config: &ServerConfig,
-    shutdown: CancellationToken,
-) -> Pin<Box<dyn Future<Output = Result<(), Error>> + Send + '_>> {
-    Box::pin(async move {
+    ends: CancellationToken,
+    /// Without the server no client could stop the arms, so the thread ends with it.
+    guard: DropGuard,
+}
+
+impl Bridge {
+    /// Starts to tick the arms of `executor` until `shutdown` is cancelled or the bridge is dropped, which stops them.
+    /// `observer` receives every snapshot.
+    ///
+    /// # Errors
+    /// Returns an error if no thread can be started.
+    ///
+    /// # Panics
+    /// Panics if the speed is not in (0, 1].
+    pub fn start(
+        executor: Executor<BoxDriver>,
+        config: Config,
+        observer: Option<Observer>,
+        shutdown: &CancellationToken,
+    ) -> Result<Self, Error> {
+        assert!(config.speed > 0.0 && config.speed <= 1.0, "speed {}", config.speed);
         let ends = shutdown.child_token();
-        // Without the server no client could stop the arms, so the thread ends with it.
-        let _ends = ends.clone().drop_guard();
-        let (thread, arms) = ArmsThread::spawn(executor, Arc::clone(&config.clock), ends.clone())
-            .map_err(Error::Thread)?;
-        metrics::add_state(server_config.metrics(), arms.clone());
-        let stops = StopCounter::register(server_config.metrics());
-        tokio::spawn(log_stops(arms.watch(), stops));
-        let service = BridgeService::new(arms, config);
-        let bridge = BridgeServer::new(service).max_decoding_message_size(MAX_REQUEST_BYTES);
-        let router = server_config.router(bridge, tandem_proto::FILE_DESCRIPTOR_SET).await?;
-        let served = tandem_net::serve(router, incoming, ends.clone()).await;
-        ends.cancel();
-        thread.join(SHUTDOWN_GRACE).await?;
-        Ok(served?)
-    })
+        let guard = ends.clone().drop_guard();
+        let clock = Arc::clone(&config.clock);
+        let started = ArmsThread::spawn(executor, clock, observer, ends.clone());
+        let (thread, arms) = started.map_err(Error::Thread)?;
+        Ok(Self { thread, arms, config, ends, guard })
+    }
+
+    /// Returns the handle of an operator in this process.
+    #[must_use]
+    pub fn operator(&self) -> Operator {
+        Operator(self.arms.clone())
+    }
+
+    /// Serves the arms to the clients that `server_config` admits, and then stops the arms.
+    ///
+    /// # Errors
+    /// Returns an error if the server fails, the arms' thread has panicked, or the driver hangs.
+    pub async fn serve(
+        self,
+        incoming: impl Into<Incoming>,
+        server_config: &ServerConfig,
+    ) -> Result<(), Error> {
+        self.serve_boxed(incoming.into(), server_config).await
+    }
+
+    /// Boxes the service, so that it is compiled in this crate only and not in every crate that serves.
+    fn serve_boxed(
+        self,
+        incoming: Incoming,
+        server_config: &ServerConfig,
+    ) -> Pin<Box<dyn Future<Output = Result<(), Error>> + Send + '_>> {
+        Box::pin(async move {
+            let Self { thread, arms, config, ends, guard } = self;
+            let _ends = guard;
+            metrics::add_state(server_config.metrics(), arms.clone());
+            let stops = StopCounter::register(server_config.metrics());
+            tokio::spawn(log_stops(arms.watch(), stops));
+            let service = BridgeService::new(arms, config);
+            let bridge = BridgeServer::new(service).max_decoding_message_size(MAX_REQUEST_BYTES);
+            let router = server_config.router(bridge, tandem_proto::FILE_DESCRIPTOR_SET).await?;
+            let served = tandem_net::serve(router, incoming, ends.clone()).await;
+            ends.cancel();
+            thread.join(SHUTDOWN_GRACE).await?;
+            Ok(served?)
+        })
+    }
 }
 
 /// Logs and counts stops and resets. The arms' thread does not log, because it must not wait.
@@ -264,7 +315,7 @@ impl BridgeService {
             phase: messages::phase(newest.phase).into(),
             played_s: progress.played_s,
             duration_s: progress.duration_s,
-            speed: newest.speed.unwrap_or_default(),
+            speed: newest.motion.as_ref().map_or(0.0, |motion| motion.speed),
             arms: Vec::new(),
         });
         pb::BridgeStatusResponse {
@@ -282,7 +333,7 @@ impl BridgeService {
 }
 
 #[tonic::async_trait]
-impl Bridge for BridgeService {
+impl BridgeRpc for BridgeService {
     type ExecuteStream = ReceiverStream<Result<pb::ExecuteResponse, Status>>;
 
     async fn describe(
@@ -332,7 +383,9 @@ impl Bridge for BridgeService {
         &self,
         request: Request<Streaming<pb::ExecuteRequest>>,
     ) -> Result<Response<Self::ExecuteStream>, Status> {
-        let reports = execute_stream::begin(self, request.into_inner()).await;
+        let client = ConnectInfo::peer(request.extensions()).map(|peer| peer.to_string());
+        let client = client.unwrap_or_default();
+        let reports = execute_stream::begin(self, request.into_inner(), client).await;
         reports.map(Response::new).map_err(|error| status(&error))
     }
 

@@ -73,6 +73,7 @@ pub mod work_cell;
 mod capsule;
 mod manipulability;
 mod retime;
+mod scene;
 mod spline;
 
 pub use check::{CheckSettings, check};

@@ -64,7 +64,7 @@ impl Connected for Connection {
 
     fn connect_info(&self) -> ConnectInfo {
         let handle = self.permit.as_ref().map(|permit| Arc::clone(&permit.handle));
-        ConnectInfo { closed: ConnectionClosed(self.open.subscribe()), handle }
+        ConnectInfo { closed: ConnectionClosed(self.open.subscribe()), handle, peer: self.peer }
     }
 }
 
@@ -73,9 +73,16 @@ impl Connected for Connection {
 pub struct ConnectInfo {
     closed: ConnectionClosed,
     handle: Option<Arc<AdmissionHandle>>,
+    peer: Option<IpAddr>,
 }
 
 impl ConnectInfo {
+    /// Returns the address of the client that sent a request with these extensions, if it is known.
+    #[must_use]
+    pub fn peer(extensions: &Extensions) -> Option<IpAddr> {
+        extensions.get::<Self>()?.peer
+    }
+
     /// Records that a complete request has arrived.
     pub(crate) fn mark_requested(&self) {
         if let Some(handle) = &self.handle {

@@ -14,12 +14,15 @@ use crate::service::BridgeService;
 use crate::service::error::{Error, status};
 use crate::service::execution::{AbandonOnDrop, Execution, Outcome};
 use crate::service::messages::{self, decode_token};
-use crate::service::thread::{ArmsHandle, Snapshot};
+use crate::service::snapshot::{MotionInfo, Snapshot};
+use crate::service::thread::ArmsHandle;
 
 /// The longest time until a client sends its start message.
 const START_TIMEOUT: Duration = Duration::from_secs(10);
 /// Time between two reports, seconds.
 const REPORT_S: f64 = 0.05;
+/// The largest number of characters of a motion's name.
+const MAX_NAME_CHARS: usize = 80;
 /// Reports that may wait for a client. Further ones are dropped.
 const REPORT_CAPACITY: usize = 4;
 
@@ -30,20 +33,24 @@ type Responses = mpsc::Sender<Result<pb::ExecuteResponse, Status>>;
 pub(super) async fn begin(
     service: &BridgeService,
     mut requests: Requests,
+    client: String,
 ) -> Result<ReceiverStream<Result<pb::ExecuteResponse, Status>>, Error> {
     let start = receive_start(&mut requests).await?;
     let token = decode_token("start.token", &start.token)?;
     let spec = service.decode("start.motion", start.motion)?;
     let speed = service.limited_speed(spec.speed);
-    let execution = Arc::new(Execution::new(token, speed));
-    let guard = AbandonOnDrop(Arc::clone(&execution));
     renew(&service.arms, token).await?;
     let checking = service.check_motion(spec, |checked| checked);
     let checked = while_alive(&service.arms, &mut requests, token, checking).await??;
     let duration_s = checked.motion().duration_s();
+    let name: String = start.name.chars().take(MAX_NAME_CHARS).collect();
+    let motion = MotionInfo { name, client, speed, duration_s };
+    let execution = Arc::new(Execution::new(token, motion));
+    let (guard, motion) = (AbandonOnDrop(Arc::clone(&execution)), Arc::clone(&execution.motion));
     let arms = service.arms.clone();
     arms.run(move |arms, now_s| arms.start(&execution, checked, now_s)).await?;
-    tracing::info!(duration_s, speed, "motion started");
+    let MotionInfo { name, client, .. } = &*motion;
+    tracing::info!(name, client, duration_s, speed, "motion started");
     let (responses, reports) = mpsc::channel(REPORT_CAPACITY);
     tokio::spawn(run_stream(guard, duration_s, requests, arms, responses));
     Ok(ReceiverStream::new(reports))
@@ -103,7 +110,7 @@ async fn run_stream(
     responses: Responses,
 ) {
     let execution = &guard.0;
-    let mut reporter = ProgressReporter::new(duration_s, execution.speed);
+    let mut reporter = ProgressReporter::new(duration_s, execution.motion.speed);
     let mut snapshots = arms.watch();
     loop {
         tokio::select! {

@@ -4,6 +4,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, OnceLock};
 
 use crate::executor::{Stop, Token};
+use crate::service::snapshot::MotionInfo;
 
 /// The outcome of a motion.
 #[derive(Debug, Clone, PartialEq)]
@@ -16,8 +17,7 @@ pub(super) enum Outcome {
 #[derive(Debug)]
 pub(super) struct Execution {
     pub(super) token: Token,
-    /// The share of the motion's own speed, in (0, 1].
-    pub(super) speed: f64,
+    pub(super) motion: Arc<MotionInfo>,
     alive: AtomicBool,
     abandoned: AtomicBool,
     outcome: OnceLock<Outcome>,
@@ -28,9 +28,9 @@ pub(super) struct Execution {
 pub(super) struct AbandonOnDrop(pub(super) Arc<Execution>);
 
 impl Execution {
-    pub(super) fn new(token: Token, speed: f64) -> Self {
+    pub(super) fn new(token: Token, motion: MotionInfo) -> Self {
         let (alive, abandoned) = (AtomicBool::new(false), AtomicBool::new(false));
-        Self { token, speed, alive, abandoned, outcome: OnceLock::new() }
+        Self { token, motion: Arc::new(motion), alive, abandoned, outcome: OnceLock::new() }
     }
 
     /// Records a sign of life of the client.

@@ -9,7 +9,7 @@ use crate::executor::{CheckError, CheckedMotion, Checker, Phase, Stop, Token};
 use crate::service::execution::Outcome;
 use crate::service::motion::MotionError;
 use crate::service::reason_codes::{self, Values};
-use crate::service::thread::Snapshot;
+use crate::service::snapshot::Snapshot;
 
 /// Hexadecimal digits of a token.
 const TOKEN_DIGITS: usize = 32;

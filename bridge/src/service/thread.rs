@@ -1,7 +1,7 @@
 //! The thread that ticks the executor, and the handle through which calls reach it.
 //!
 //! The thread does no lengthy work: it receives checked motions, executes at most [`MAX_JOBS`] jobs before a tick, and
-//! publishes a snapshot after it. Stops bypass the queue of jobs: they increment a counter that the thread reads first.
+//! publishes a snapshot after it, without waiting for its readers. Stops bypass the queue of jobs: they increment a counter that the thread reads first.
 
 use std::io;
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -14,14 +14,14 @@ use tandem_kinematics::Joints;
 use tokio::sync::{mpsc, oneshot, watch};
 use tokio_util::sync::{CancellationToken, DropGuard};
 
-use crate::driver::{Driver, DriverError, PairState};
+use crate::driver::{Driver, DriverError};
 use crate::executor::{
-    CheckedMotion, Checker, Executor, LeaseError, Phase, Progress, ResetError, StartError, Stop,
-    Token,
+    CheckedMotion, Checker, Executor, LeaseError, Phase, ResetError, StartError, Token,
 };
 use crate::service::clock::{Clock, next_time};
 use crate::service::error::Error;
 use crate::service::execution::{Execution, Outcome};
+use crate::service::snapshot::{Observer, Snapshot};
 
 /// A boxed driver.
 pub type BoxDriver = Box<dyn Driver + Send>;
@@ -40,31 +40,6 @@ const SHUTDOWN_TICKS: u32 = 50;
 
 type Job = Box<dyn FnOnce(&mut ControlLoop, f64) + Send>;
 
-/// The state that the thread publishes after each tick.
-#[derive(Debug, Clone)]
-pub(super) struct Snapshot {
-    /// The time of the tick by the service's clock, seconds.
-    pub(super) now_s: f64,
-    pub(super) phase: Phase,
-    pub(super) stopped: Option<Stop>,
-    /// Whether the last exchange with the arms failed.
-    pub(super) exchange_failed: bool,
-    /// The number of consecutive good states.
-    pub(super) n_good: u32,
-    /// The error of the last attempt to stop the drives.
-    pub(super) stop_error: Option<DriverError>,
-    pub(super) lease_left_s: Option<f64>,
-    pub(super) at_rest: bool,
-    pub(super) state: Option<PairState>,
-    /// The joint angles that the motion prescribes, radians, arm by arm.
-    pub(super) reference: Option<Vec<Joints>>,
-    pub(super) progress: Option<Progress>,
-    /// The share of the motion's own speed at which it is played.
-    pub(super) speed: Option<f64>,
-    /// The number of stops that have been carried out.
-    n_stops: u64,
-}
-
 /// The state of the thread.
 pub(super) struct ControlLoop {
     pub(super) executor: Executor<BoxDriver>,
@@ -72,7 +47,9 @@ pub(super) struct ControlLoop {
     snapshots: watch::Sender<Arc<Snapshot>>,
     n_stops_requested: Arc<AtomicU64>,
     n_stops: u64,
+    n_motions: u64,
     running: Option<Arc<Execution>>,
+    observer: Option<Observer>,
 }
 
 /// The running thread.
@@ -104,12 +81,13 @@ impl ArmsThread {
     pub(super) fn spawn(
         executor: Executor<BoxDriver>,
         clock: Arc<dyn Clock>,
+        observer: Option<Observer>,
         ends: CancellationToken,
     ) -> io::Result<(Self, ArmsHandle)> {
         let (jobs, waiting) = mpsc::channel(CAPACITY);
         let (end_sender, ended) = oneshot::channel();
         let (checker, period_s) = (executor.checker().clone(), executor.period_s());
-        let first = snapshot(&executor, clock.now_s(), None, 0);
+        let first = snapshot(&executor, clock.now_s());
         let (publisher, snapshots) = watch::channel(Arc::new(first));
         let n_stops_requested = Arc::new(AtomicU64::new(0));
         let mut control = ControlLoop {
@@ -118,7 +96,9 @@ impl ArmsThread {
             snapshots: publisher,
             n_stops_requested: Arc::clone(&n_stops_requested),
             n_stops: 0,
+            n_motions: 0,
             running: None,
+            observer,
         };
         let thread_clock = Arc::clone(&clock);
         let guard = EndGuard { _ends: ends.clone().drop_guard(), _ended: end_sender };
@@ -173,9 +153,16 @@ impl ControlLoop {
     }
 
     fn publish(&self, now_s: f64) {
-        let speed = self.running.as_ref().map(|execution| execution.speed);
-        let newest = snapshot(&self.executor, now_s, speed, self.n_stops);
-        self.snapshots.send_replace(Arc::new(newest));
+        let newest = Arc::new(Snapshot {
+            motion: self.running.as_ref().map(|execution| Arc::clone(&execution.motion)),
+            n_motions: self.n_motions,
+            n_stops: self.n_stops,
+            ..snapshot(&self.executor, now_s)
+        });
+        if let Some(observer) = &self.observer {
+            observer.publish(&newest);
+        }
+        self.snapshots.send_replace(newest);
     }
 
     /// Handles the requests since the last tick, stops first.
@@ -212,7 +199,8 @@ impl ControlLoop {
         if execution.is_abandoned() {
             return Err(LeaseError::NotOwned.into());
         }
-        self.executor.start_checked(execution.token, motion, execution.speed, now_s)?;
+        self.executor.start_checked(execution.token, motion, execution.motion.speed, now_s)?;
+        self.n_motions += 1;
         self.running = Some(Arc::clone(execution));
         Ok(())
     }
@@ -307,25 +295,22 @@ impl ArmsHandle {
     }
 }
 
-fn snapshot(
-    executor: &Executor<BoxDriver>,
-    now_s: f64,
-    speed: Option<f64>,
-    n_stops: u64,
-) -> Snapshot {
+/// Returns the state of `executor`, without the motion and the counters of the thread.
+fn snapshot(executor: &Executor<BoxDriver>, now_s: f64) -> Snapshot {
     Snapshot {
         now_s,
         phase: executor.phase(),
         stopped: executor.stopped_by().cloned(),
         exchange_failed: executor.exchange_error().is_some(),
-        n_good: executor.n_good(),
         stop_error: executor.stop_error().cloned(),
         lease_left_s: executor.lease_left_s(now_s),
         at_rest: executor.at_rest(),
         state: executor.state().cloned(),
         reference: executor.reference().map(<[Joints]>::to_vec),
+        motion: None,
         progress: executor.progress(),
-        speed,
-        n_stops,
+        n_motions: 0,
+        n_good: executor.n_good(),
+        n_stops: 0,
     }
 }

@@ -329,7 +329,11 @@ impl Rig {
         motion: pb::MotionRequest,
     ) -> Result<Playing, Status> {
         let (signs, requests) = mpsc::channel(8);
-        let start = pb::ExecuteStart { token: token.to_owned(), motion: Some(motion) };
+        let start = pb::ExecuteStart {
+            token: token.to_owned(),
+            motion: Some(motion),
+            ..Default::default()
+        };
         signs.send(request(pb::execute_request::Request::Start(start))).await.unwrap();
         let responses = self.client.execute(ReceiverStream::new(requests)).await;
         responses.map(Response::into_inner).map(|responses| Playing { signs, responses })

@@ -105,7 +105,7 @@ async fn a_second_start_on_one_stream_is_no_sign_of_life() {
     let mut rig = Rig::new(patient()).await;
     let token = rig.ready().await;
     let mut playing = rig.moving(&token).await;
-    let start = pb::ExecuteStart { token, motion: Some(slow()) };
+    let start = pb::ExecuteStart { token, motion: Some(slow()), name: "slow".to_owned() };
     playing.signs.send(request(pb::execute_request::Request::Start(start))).await.unwrap();
     assert_eq!(playing.stopped().await.name, "owner-left");
 }
@@ -148,7 +148,7 @@ async fn signs_of_life_keep_a_motion_going() {
     let (mut client, clock) = (rig.client.clone(), rig.clock.clone());
     let playing = tokio::spawn(async move {
         let (signs, requests) = tokio::sync::mpsc::channel(8);
-        let start = pb::ExecuteStart { token, motion: Some(slow()) };
+        let start = pb::ExecuteStart { token, motion: Some(slow()), name: "slow".to_owned() };
         signs.send(request(pb::execute_request::Request::Start(start))).await.unwrap();
         let requests = tokio_stream::wrappers::ReceiverStream::new(requests);
         let responses = client.execute(requests).await.unwrap().into_inner();
