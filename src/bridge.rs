@@ -5,7 +5,7 @@ use std::io::Read as _;
 use std::sync::Arc;
 
 use anyhow::Context as _;
-use tandem_bridge::service::{Config, Error};
+use tandem_bridge::service::{Bridge, Config, Error};
 use tokio::runtime::{Builder, Runtime};
 
 use crate::cli::{BridgeArgs, BridgeCommand, BridgeServeArgs};
@@ -19,6 +19,8 @@ mod operator;
 mod play;
 mod show;
 mod trial;
+mod view;
+mod watch;
 
 /// The system's source of random secrets.
 const ENTROPY: &str = "/dev/urandom";
@@ -48,6 +50,7 @@ fn serve(args: BridgeServeArgs) -> Result<(), Failed> {
         let clock = Arc::new(clock::BridgeClock::new());
         let (executor, reconnect) = arms::arms(&args, clock.clone())?;
         metrics::serve(&args.metrics, &own).await?;
+        let plan = watch::Plan::of(&args).await?;
         let listener = service::listen(&args.listen).await?;
         let config = Config {
             driver: arms::name(args.driver).to_owned(),
@@ -57,9 +60,11 @@ fn serve(args: BridgeServeArgs) -> Result<(), Failed> {
             reconnect,
             secret,
         };
-        let served =
-            tandem_bridge::service::serve(executor, config, listener, &server_config, shutdown)
-                .await;
+        let (observer, snapshots) = plan.observer();
+        let bridge = Bridge::start(executor, config, observer, &shutdown).map_err(bridge_failed)?;
+        let watching = plan.start(&args, &bridge.operator(), snapshots)?;
+        let served = bridge.serve(listener, &server_config).await;
+        watching.finish();
         served.map_err(bridge_failed)
     })
 }

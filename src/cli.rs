@@ -22,7 +22,7 @@ pub(crate) use bridge::{
 };
 pub(crate) use monitor::{HealthArgs, StatusArgs};
 pub(crate) use policy::{ExportArgs, ImportArgs, PolicyArgs, PolicyCommand, ShowArgs};
-pub(crate) use recording::{LiveArgs, RecordedName, RecordingArgs};
+pub(crate) use recording::{ByteSize, LiveArgs, RecordedName, RecordingArgs};
 pub(crate) use results::{
     EvalArgs, FilmArgs, McapArgs, McapCommand, OutcomeName, PictureArgs, ReplayArgs, ReportArgs,
 };

@@ -245,9 +245,10 @@ impl Replayed {
         matches!(self.outcome, Err(RecordError::NoSimulator { .. }))
     }
 
-    /// Returns whether the file is the log of a trial instead of an episode.
+    /// Returns whether the file is the log of a trial or of a bridge's motion instead of an episode.
     const fn is_trial(&self) -> bool {
-        matches!(self.outcome, Err(RecordError::Log(tandem_telemetry::Error::TrialLog { .. })))
+        use tandem_telemetry::Error as E;
+        matches!(self.outcome, Err(RecordError::Log(E::TrialLog { .. } | E::MotionLog { .. })))
     }
 
     /// Returns whether the simulation differs from the log.

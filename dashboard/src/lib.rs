@@ -1,16 +1,17 @@
-//! Live web pages: the dashboard of a run.
+//! Live web pages: the dashboard of a run and the operator page of a bridge.
 //!
-//! A [`Site`] is a page and the data that it shows. [`Site::of_run`] makes one from snapshots of a run; [`serve`] serves
-//! it to browsers. Pages contain no reference to other servers, and receive changes as server-sent events.
+//! A [`Site`] is a page and the data that it shows. [`Site::of_run`] makes one from snapshots of a run,
+//! [`Site::of_bridge`] one from states of arms; [`serve`] serves it to browsers. Pages contain no reference to other servers, and receive changes as server-sent events.
 //!
 //! The crate knows snapshots only: where they come from, and what they cost, is decided by the caller. A snapshot is
 //! encoded once for all viewers, and a viewer that does not keep up receives the newest one next.
 //!
-//! Reading order: `run` (from snapshots to documents) with `events` and `playback`, `page` (HTML), `site`
+//! Reading order: `run` (from snapshots to documents) with `events` and `playback`, `bridge`, `page` (HTML), `site`
 //! (routes), `access` (who may see a page), `server` (connections).
 #![warn(missing_docs)]
 
 mod access;
+mod bridge;
 mod events;
 mod page;
 mod playback;
@@ -19,5 +20,6 @@ mod server;
 mod site;
 
 pub use access::Access;
+pub use bridge::{BridgeTerms, StopAction, StopResult};
 pub use server::{MAX_VIEWERS, serve};
 pub use site::Site;

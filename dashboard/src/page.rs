@@ -2,6 +2,10 @@
 
 use maud::{DOCTYPE, Markup, PreEscaped, html};
 
+pub(crate) use bridge::bridge;
+
+mod bridge;
+
 /// Icon of the pages: two arms that meet.
 const ICON: &str = "data:image/svg+xml,%3Csvg xmlns='http://www.w3.org/2000/svg' viewBox='0 0 32 32'%3E%3Crect width='32' height='32' rx='7' fill='%230072B2'/%3E%3Cpath d='M5 24 11 9l5 8 5-8 6 15' fill='none' stroke='white' stroke-width='3' stroke-linejoin='round' stroke-linecap='round'/%3E%3Ccircle cx='16' cy='17' r='2.6' fill='%23E69F00'/%3E%3C/svg%3E";
 

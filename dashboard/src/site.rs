@@ -12,11 +12,13 @@ use axum::response::{Html, IntoResponse as _, Response};
 use axum::routing::{get, post};
 use http::StatusCode;
 use http::header::CONTENT_TYPE;
+use serde::Serialize;
 use tokio::sync::{Semaphore, watch};
 use tokio_stream::StreamExt as _;
 use tokio_stream::wrappers::WatchStream;
 
 use crate::access::{self, Access};
+use crate::bridge::StopAction;
 
 /// Time without an event after which a comment is sent, so that a viewer that is gone is noticed.
 const KEEP_ALIVE: Duration = Duration::from_secs(10);
@@ -28,6 +30,8 @@ pub struct Site {
     pub(crate) page: Arc<str>,
     /// The latest data.
     pub(crate) frames: watch::Receiver<Arc<Frame>>,
+    /// The action of the page's stop button, if it has one.
+    pub(crate) stop: Option<StopAction>,
 }
 
 /// The data of a page at one moment.
@@ -40,12 +44,13 @@ pub(crate) struct Frame {
 }
 
 /// The files that pages refer to: name, content type and content.
-const ASSETS: [(&str, &str, &str); 6] = [
+const ASSETS: [(&str, &str, &str); 7] = [
     ("style.css", "text/css; charset=utf-8", include_str!("../assets/style.css")),
     ("common.js", "text/javascript; charset=utf-8", include_str!("../assets/common.js")),
     ("chart.js", "text/javascript; charset=utf-8", include_str!("../assets/chart.js")),
     ("player.js", "text/javascript; charset=utf-8", include_str!("../assets/player.js")),
     ("run.js", "text/javascript; charset=utf-8", include_str!("../assets/run.js")),
+    ("bridge.js", "text/javascript; charset=utf-8", include_str!("../assets/bridge.js")),
     ("login.js", "text/javascript; charset=utf-8", include_str!("../assets/login.js")),
 ];
 
@@ -67,6 +72,7 @@ impl Site {
             .route("/events", get(events))
             .route("/data/{name}", get(document))
             .route("/assets/{name}", get(asset))
+            .route("/stop", post(stop))
             .route("/login", post(|| async { StatusCode::NO_CONTENT }))
             .with_state(Served { site: self, viewers })
             .layer(axum::middleware::from_fn_with_state(Arc::new(access), access::guard))
@@ -107,10 +113,27 @@ async fn events(State(served): State<Served>) -> Response {
     Sse::new(states).keep_alive(KeepAlive::new().interval(KEEP_ALIVE)).into_response()
 }
 
+/// Stops the arms of a bridge. `access` has checked that a page of another server did not ask for it.
+async fn stop(State(served): State<Served>) -> Response {
+    let Some(action) = &served.site.stop else { return not_found() };
+    match action().await {
+        Ok(stopped) => json(&encode(&BTreeMap::from([("stopped", stopped)]))),
+        Err(problem) => {
+            let body = encode(&BTreeMap::from([("problem", problem)]));
+            (StatusCode::SERVICE_UNAVAILABLE, json(&body)).into_response()
+        }
+    }
+}
+
 fn json(text: &str) -> Response {
     ([(CONTENT_TYPE, "application/json")], text.to_owned()).into_response()
 }
 
 fn not_found() -> Response {
     (StatusCode::NOT_FOUND, "not found\n").into_response()
+}
+
+/// Encodes as JSON on one line. Numbers that are not finite become `null`.
+pub(crate) fn encode<T: Serialize + ?Sized>(value: &T) -> Arc<str> {
+    serde_json::to_string(value).map_or_else(|_unencodable| "null".into(), Into::into)
 }

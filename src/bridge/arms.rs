@@ -25,6 +25,14 @@ pub(crate) const fn name(driver: DriverName) -> &'static str {
     }
 }
 
+/// Returns the limits and deadlines of the arms behind a driver.
+pub(crate) fn settings(driver: DriverName) -> Settings {
+    match driver {
+        DriverName::Sim | DriverName::Quarc => Settings::default(),
+        DriverName::KinovaRos => tandem_bridge::kinova_ros::settings(),
+    }
+}
+
 /// Connects to the real arms at an address.
 type Connect = fn(&str) -> Result<BoxDriver, DriverError>;
 
@@ -33,13 +41,14 @@ pub(crate) fn arms(
     args: &BridgeServeArgs,
     clock: Arc<dyn Clock>,
 ) -> Result<(Executor<BoxDriver>, Option<Reconnect>), Failed> {
-    let (connect, settings) = match args.driver {
+    let settings = settings(args.driver);
+    let connect = match args.driver {
         DriverName::Sim => {
             let driver = simulated(args.seed, clock)?;
-            return Ok((executor(driver, Settings::default())?, None));
+            return Ok((executor(driver, settings)?, None));
         }
-        DriverName::Quarc => quarc()?,
-        DriverName::KinovaRos => kinova_ros()?,
+        DriverName::Quarc => quarc(),
+        DriverName::KinovaRos => kinova_ros(),
     };
     let address = args.arms_at.clone().unwrap_or_default();
     let reconnect: Reconnect = Arc::new(move || connect(&address));
@@ -61,19 +70,19 @@ fn simulated(seed: u64, clock: Arc<dyn Clock>) -> Result<BoxDriver, Failed> {
 }
 
 /// Returns how to connect to arms behind a Simulink model.
-fn quarc() -> Result<(Connect, Settings), Failed> {
+fn quarc() -> Connect {
     use tandem_bridge::quarc::{QuarcConfig, QuarcDriver};
     fn connect(address: &str) -> Result<BoxDriver, DriverError> {
         Ok(Box::new(QuarcDriver::connect(QuarcConfig::at(address))?))
     }
-    Ok((connect, Settings::default()))
+    connect
 }
 
 /// Returns how to connect to arms behind Kinova's ROS driver.
-fn kinova_ros() -> Result<(Connect, Settings), Failed> {
-    use tandem_bridge::kinova_ros::{KinovaRosConfig, KinovaRosDriver, settings};
+fn kinova_ros() -> Connect {
+    use tandem_bridge::kinova_ros::{KinovaRosConfig, KinovaRosDriver};
     fn connect(address: &str) -> Result<BoxDriver, DriverError> {
         Ok(Box::new(KinovaRosDriver::connect(KinovaRosConfig::at(address))?))
     }
-    Ok((connect, settings()))
+    connect
 }

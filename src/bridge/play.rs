@@ -43,7 +43,8 @@ pub(super) fn play(args: &MoveArgs) -> Result<(), Failed> {
         let mut display = MotionDisplay::new(&accepted);
         display.print(&accepted_line(&accepted));
         let token = acquire(&mut client).await?;
-        let done = execute(&mut client, &token, motion, &mut display).await;
+        let name = args.file.file_name().unwrap_or_default().to_string_lossy().into_owned();
+        let done = execute(&mut client, &token, (name, motion), &mut display).await;
         release(&mut client, token).await;
         display.close();
         let last = done?;
@@ -117,12 +118,12 @@ fn stream_failed(status: &Status) -> Failed {
 async fn execute(
     client: &mut Client,
     token: &str,
-    motion: pb::MotionRequest,
+    (name, motion): (String, pb::MotionRequest),
     display: &mut MotionDisplay,
 ) -> Result<pb::MotionProgress, Failed> {
     let interrupted = signals::shutdown_token(false)?;
     let (sender, requests) = mpsc::channel(4);
-    let start = pb::ExecuteStart { token: token.to_owned(), motion: Some(motion) };
+    let start = pb::ExecuteStart { token: token.to_owned(), motion: Some(motion), name };
     let start = request(pb::execute_request::Request::Start(start));
     sender.try_send(start).or_exit(Exit::Bug, String::new)?;
     tokio::spawn(send_keep_alives(sender));

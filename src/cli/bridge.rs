@@ -1,13 +1,16 @@
 //! The command line of `tandem bridge`.
 
+use std::net::SocketAddr;
 use std::path::PathBuf;
 
 use clap::{Args, Subcommand, ValueEnum};
 
-use super::{ClientArgs, ListenArgs, MetricsArgs, SecretArgs, TrialArgs};
+use super::{ByteSize, ClientArgs, ListenArgs, LiveArgs, MetricsArgs, SecretArgs, TrialArgs};
 
 /// Default address of a bridge.
 const ADDRESS: &str = "127.0.0.1:7002";
+const LIVE_HELP: &str = "Shows the arms in Foxglove, over a websocket at this address [with no address: \
+    127.0.0.1:8765]. Anyone who can reach the address can watch";
 
 #[derive(Debug, Args)]
 #[command(
@@ -17,6 +20,8 @@ Examples:
   tandem bridge --driver sim  # serves a simulated pair of arms
   tandem bridge --driver sim --speed 0.1
       # the same, no motion faster than a tenth
+  tandem bridge --record runs/arms  # leaves an MCAP log of every motion
+  tandem bridge --live              # shows the arms in Foxglove
   tandem bridge status        # state of the arms, and why they are stopped
   tandem bridge stop          # stops them, at any time
   tandem bridge reset         # enables stopped arms
@@ -35,7 +40,10 @@ pub(crate) struct BridgeArgs {
 }
 
 #[derive(Debug, Args)]
-#[command(mut_arg("listen", |arg| arg.default_value(ADDRESS)))]
+#[command(
+    mut_arg("listen", |arg| arg.default_value(ADDRESS)),
+    mut_arg("live", |arg| arg.help(LIVE_HELP).long_help(LIVE_HELP))
+)]
 pub(crate) struct BridgeServeArgs {
     /// Driver of the arms.
     #[arg(long, value_enum, default_value_t = DriverName::Sim)]
@@ -49,6 +57,24 @@ pub(crate) struct BridgeServeArgs {
     /// Seed of the simulated pair's noise and latencies.
     #[arg(long, value_name = "N", default_value_t = 0)]
     pub(crate) seed: u64,
+    /// Writes an MCAP log of every motion, and of every fault that stops the arms, to this directory.
+    #[arg(long, value_name = "DIR")]
+    pub(crate) record: Option<PathBuf>,
+    /// Size that the logs in --record may reach, for example 500MB or 10GiB. Beyond it, the oldest ones are deleted.
+    #[arg(long, value_name = "SIZE", requires = "record", default_value_t = ByteSize(2 << 30))]
+    pub(crate) log_budget: ByteSize,
+    #[command(flatten)]
+    pub(crate) live: LiveArgs,
+    /// Address of the dashboard, which shows the arms in a browser and has a stop button. If its port is in use, the
+    /// next free one is taken. [default: 127.0.0.1:8600]
+    #[arg(long, value_name = "ADDR")]
+    pub(crate) dashboard: Option<SocketAddr>,
+    /// File with the token that the dashboard asks for [default: that of --token-file].
+    #[arg(long, value_name = "FILE", requires = "dashboard")]
+    pub(crate) dashboard_token_file: Option<PathBuf>,
+    /// Serves no dashboard.
+    #[arg(long, conflicts_with = "dashboard")]
+    pub(crate) no_dashboard: bool,
     #[command(flatten)]
     pub(crate) listen: ListenArgs,
     #[command(flatten)]

@@ -59,8 +59,8 @@ impl ArmsEncoder {
         self.follow(view);
         let stamp = timestamp(time_ns);
         let lines = self.events.update(view).into_iter();
-        let lines = lines
-            .map(|(level, text)| ArmsMessage::Log(log_line(time_ns, level.into(), &text)));
+        let lines =
+            lines.map(|(level, text)| ArmsMessage::Log(log_line(time_ns, level.into(), &text)));
         let mut messages: Vec<ArmsMessage> = lines.collect();
         messages.push(ArmsMessage::Arms(arms_state(view)));
         if view.arms.is_empty() {

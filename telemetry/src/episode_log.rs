@@ -13,7 +13,7 @@ use crate::error::Error;
 use crate::messages::{EpisodeMetadata, METADATA_NAME, decode, pb};
 use crate::recorder::{OUTCOME_TOPIC, TRANSITION_TOPIC};
 use crate::records::Records;
-use crate::trial_log;
+use crate::{motion_log, trial_log};
 
 /// A recorded episode.
 #[derive(Debug, Clone, PartialEq)]
@@ -53,24 +53,33 @@ pub struct LoggedTransition {
 /// Reads the episode in the MCAP log `path`.
 ///
 /// # Errors
-/// If the file cannot be read, is incomplete, or is not the log of an episode. The log of a trial is an error of its own,
-/// [`Error::TrialLog`].
+/// If the file cannot be read, is incomplete, or is not the log of an episode. Logs of trials and of motions are errors
+/// of their own, [`Error::TrialLog`] and [`Error::MotionLog`].
 pub fn read_episode(path: &Path) -> Result<EpisodeLog, Error> {
     let bytes = regular_file::read(path).map_err(Error::io("read", path))?;
     let not_an_episode = |problem| Error::NotAnEpisode { path: path.to_owned(), problem };
     let raw = read_raw(&bytes).map_err(Error::read_log(path))?;
-    if raw.metadata.is_none() && raw.is_trial {
-        return Err(Error::TrialLog { path: path.to_owned() });
+    match (&raw.metadata, raw.other) {
+        (None, Some(OtherLog::Trial)) => return Err(Error::TrialLog { path: path.to_owned() }),
+        (None, Some(OtherLog::Motion)) => return Err(Error::MotionLog { path: path.to_owned() }),
+        _ => {}
     }
     decode_episode(raw).map_err(not_an_episode)
+}
+
+/// A kind of log that is not an episode's.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum OtherLog {
+    Trial,
+    Motion,
 }
 
 /// The parts of a log that make up an episode, not decoded.
 #[derive(Default)]
 struct RawLog {
     metadata: Option<BTreeMap<String, String>>,
-    /// The file has the metadata of a trial.
-    is_trial: bool,
+    /// The file has the metadata of another kind of log.
+    other: Option<OtherLog>,
     transitions: Vec<Vec<u8>>,
     outcomes: Vec<Vec<u8>>,
 }
@@ -87,7 +96,11 @@ fn read_raw(bytes: &[u8]) -> mcap::McapResult<RawLog> {
             Record::Metadata(metadata) if metadata.name == METADATA_NAME => {
                 raw.metadata = Some(metadata.metadata);
             }
-            Record::Metadata(metadata) => raw.is_trial |= metadata.name == trial_log::METADATA_NAME,
+            Record::Metadata(metadata) => match metadata.name.as_str() {
+                trial_log::METADATA_NAME => raw.other = Some(OtherLog::Trial),
+                motion_log::METADATA_NAME => raw.other = Some(OtherLog::Motion),
+                _ => {}
+            },
             Record::Schema { header, data } => {
                 channels.add_schema(header, data.into_owned().into())?;
             }

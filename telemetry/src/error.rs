@@ -50,6 +50,12 @@ pub enum Error {
         /// Path of the log.
         path: PathBuf,
     },
+    /// The file is the log of a bridge's motion, which cannot be simulated again.
+    #[error("{path:?} is the log of a bridge's motion, not of an episode: open it in Foxglove")]
+    MotionLog {
+        /// Path of the log.
+        path: PathBuf,
+    },
     /// A vector does not fit the layout of the episode or trial.
     #[error("{field} has {got} numbers, the layout has {expected}")]
     Length {

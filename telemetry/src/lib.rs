@@ -1,11 +1,13 @@
-//! Telemetry of Tandem's services: typed events, metrics of runs, MCAP logs of episodes and trials, and results of
-//! trials.
+//! Telemetry of Tandem's services: typed events, metrics of runs, MCAP logs of episodes, trials and the motions of
+//! a bridge, and results of trials.
 //!
 //! Foxglove opens the logs; `tandem replay` simulates recorded episodes again. The crate defines the layout of its
 //! files, and does not depend on what writes or reads them. It reads no clock: the times of an episode are simulated,
 //! and those of a run are arguments.
 #![warn(missing_docs)]
 
+mod arms_messages;
+mod arms_view;
 pub mod episode_log;
 mod error;
 pub mod events;
@@ -15,6 +17,8 @@ mod log_file;
 pub mod logging;
 mod messages;
 pub mod metrics;
+mod motion_journal;
+pub mod motion_log;
 pub mod recorder;
 mod records;
 pub mod recovery;
@@ -25,11 +29,13 @@ pub mod tensorboard;
 pub mod trial_log;
 pub mod trials;
 
+pub use arms_view::{ArmView, ArmsEvents, ArmsPhase, ArmsView, MotionView, StopView};
 pub use episode_log::{EpisodeLog, LoggedTransition, read_episode};
 pub use error::Error;
 pub use log_budget::LogBudget;
 pub use messages::EpisodeMetadata;
 pub use metrics::{ContactMetrics, MetricsLog, MetricsRow};
+pub use motion_journal::MotionJournal;
 pub use recorder::{EpisodeRecorder, TransitionRecord};
 pub use recovery::{RecoveredCounts, recover};
 pub use run_view::{

@@ -1,9 +1,10 @@
-//! Recorded episodes over the websocket protocol of Foxglove: the channels of their logs, as they were recorded.
+//! Episodes and arms over the websocket protocol of Foxglove, with the channels of their logs.
 //!
 //! Episodes are put one after the other on one timeline, with a pause between them, and the stamps within messages are
 //! shifted with them. [`Replay`] plays a fixed set of logs, which a viewer can pause and seek; [`Follower`] plays what
-//! becomes finished in a directory. A viewer that cannot keep up loses messages and delays nobody.
+//! becomes finished in a directory. [`LiveArms`] shows the arms of a bridge as they are. A viewer that cannot keep up loses messages and delays nobody.
 
+mod arms;
 mod channels;
 mod episode;
 mod follower;
@@ -17,6 +18,7 @@ use std::time::Duration;
 use foxglove::websocket::{Capability, ServerListener};
 use foxglove::{Context, FoxgloveError, WebSocketServer, WebSocketServerHandle};
 
+pub use arms::LiveArms;
 pub use follower::Follower;
 pub use replay::Replay;
 

@@ -1,4 +1,4 @@
-//! A size limit on the episode logs in a directory.
+//! A size limit on the logs in a directory.
 
 use std::path::{Path, PathBuf};
 
@@ -9,10 +9,10 @@ const KEPT_EIGHTHS: u64 = 7;
 /// Number of processes that can write to one directory at once without exceeding the limit by more than a log each.
 const MAX_WRITERS: u64 = 16;
 
-/// Keeps the logs of episodes in a directory below a size by deleting the oldest ones.
+/// Keeps the logs of episodes and motions in a directory below a size by deleting the oldest ones.
 ///
 /// Logs of training episodes are deleted first, those of evaluations only when no others are left; within a kind, the
-/// lowest parameter version and then the lowest episode number is the oldest. Incomplete logs (`NAME.mcap.part`) count
+/// lowest parameter version and then the lowest episode number is the oldest, and for motions the date and the number. Incomplete logs (`NAME.mcap.part`) count
 /// as well. Files with other names are neither counted nor deleted.
 ///
 /// Several processes may write to the directory, each with its own value of this type.
@@ -98,12 +98,13 @@ fn read_logs(directory: &Path) -> Result<Vec<LogEntry>, Error> {
     Ok(logs)
 }
 
-/// Parses `train-VERSION-EPISODE.mcap` or `eval-VERSION-EPISODE.mcap`, with or without `.part`.
+/// Parses `train-VERSION-EPISODE.mcap`, `eval-VERSION-EPISODE.mcap`, `motion-DATE-NUMBER.mcap` or
+/// `stop-DATE-NUMBER.mcap`, with or without `.part`.
 fn parse_name(name: &str) -> Option<(bool, u64, u64)> {
     let stem = name.strip_suffix(".part").unwrap_or(name).strip_suffix(".mcap")?;
     let mut parts = stem.split('-');
     let is_evaluation = match parts.next()? {
-        "train" => false,
+        "train" | "motion" | "stop" => false,
         "eval" => true,
         _ => return None,
     };

@@ -41,7 +41,7 @@ macro_rules! encode_with_tandem_schema {
     )*};
 }
 
-encode_with_tandem_schema!(Transition, Stats, Outcome);
+encode_with_tandem_schema!(Transition, Stats, Outcome, ArmsState);
 
 /// Decodes one of Tandem's messages.
 pub(crate) fn decode<M: prost::Message + Default>(bytes: &[u8]) -> Result<M, prost::DecodeError> {

@@ -53,11 +53,8 @@ pub(crate) fn scene_update(scene: &Scene, stamp: Timestamp, caption: &str) -> Sc
 /// Returns the frames `arm{i}/base` (x towards the origin), `arm{i}/end_effector`, `object{i}` and `goal{i}`.
 pub(crate) fn frame_transforms(scene: &Scene, stamp: Timestamp) -> FrameTransforms {
     let frame = |name: String, origin: Point, rotation: Quaternion| FrameTransform {
-        timestamp: Some(stamp),
-        parent_frame_id: WORLD.to_owned(),
-        child_frame_id: name,
-        translation: Some(vector(origin)),
         rotation: Some(rotation),
+        ..tool_frame(name, origin.map(f64::from), stamp)
     };
     let arms = scene.arms.iter().enumerate().flat_map(|(i, arm)| {
         [
@@ -75,6 +72,18 @@ pub(crate) fn frame_transforms(scene: &Scene, stamp: Timestamp) -> FrameTransfor
         .enumerate()
         .map(|(i, goal)| frame(format!("goal{i}"), *goal, NO_ROTATION));
     FrameTransforms { transforms: arms.chain(objects).chain(goals).collect() }
+}
+
+/// Returns a frame at `origin` (world, metres) with the axes of the world.
+pub(crate) fn tool_frame(name: String, origin: [f64; 3], stamp: Timestamp) -> FrameTransform {
+    let [x, y, z] = origin;
+    FrameTransform {
+        timestamp: Some(stamp),
+        parent_frame_id: WORLD.to_owned(),
+        child_frame_id: name,
+        translation: Some(Vector3 { x, y, z }),
+        rotation: Some(NO_ROTATION),
+    }
 }
 
 /// Returns the joints `arm{i}/joint{j}`, with `j` from 1 as Kinova counts, radians.

@@ -12,6 +12,8 @@ use tandem_telemetry::{
 mod layout;
 #[path = "support/live.rs"]
 mod live;
+#[path = "support/motion.rs"]
+mod motion;
 #[path = "support/synthetic.rs"]
 mod synthetic;
 

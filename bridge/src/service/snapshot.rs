@@ -9,6 +9,7 @@ use tokio::sync::mpsc;
 
 use crate::driver::{DriverError, PairState};
 use crate::executor::{Phase, Progress, Stop};
+use crate::service::reason_codes::of_cause;
 
 /// The state that the arms' thread publishes after each tick.
 #[derive(Debug, Clone)]
@@ -57,6 +58,12 @@ pub struct MotionInfo {
 }
 
 impl Snapshot {
+    /// Returns the name of the cause of the present stop, such as `requested`.
+    #[must_use]
+    pub fn stop_name(&self) -> Option<&'static str> {
+        self.stopped.as_ref().map(|stop| of_cause(&stop.cause).0)
+    }
+
     /// Returns the shapes of the arms as measured, in `cell`; `None` without a valid state.
     #[must_use]
     pub fn scene(&self, cell: &WorkCell) -> Option<Scene> {

@@ -277,12 +277,14 @@ class ExecuteRequest(_message.Message):
     def __init__(self, start: _Optional[_Union[ExecuteStart, _Mapping]] = ..., alive: _Optional[_Union[SignOfLife, _Mapping]] = ...) -> None: ...
 
 class ExecuteStart(_message.Message):
-    __slots__ = ("token", "motion")
+    __slots__ = ("token", "motion", "name")
     TOKEN_FIELD_NUMBER: _ClassVar[int]
     MOTION_FIELD_NUMBER: _ClassVar[int]
+    NAME_FIELD_NUMBER: _ClassVar[int]
     token: str
     motion: MotionRequest
-    def __init__(self, token: _Optional[str] = ..., motion: _Optional[_Union[MotionRequest, _Mapping]] = ...) -> None: ...
+    name: str
+    def __init__(self, token: _Optional[str] = ..., motion: _Optional[_Union[MotionRequest, _Mapping]] = ..., name: _Optional[str] = ...) -> None: ...
 
 class SignOfLife(_message.Message):
     __slots__ = ()

@@ -19,6 +19,11 @@ impl Channels {
         Self { context, by_topic: BTreeMap::new() }
     }
 
+    /// Returns the context that channels are opened in.
+    pub(super) const fn context(&self) -> &Arc<Context> {
+        &self.context
+    }
+
     /// Opens the channels that are not open yet. A topic keeps the schema that it had first.
     pub(super) fn open(&mut self, descriptions: &[ChannelDescription]) -> Result<(), Error> {
         for description in descriptions {

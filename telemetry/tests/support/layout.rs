@@ -8,15 +8,13 @@ use serde_json::Value;
 
 use crate::synthetic;
 
-fn layout() -> Value {
-    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../deploy/foxglove/tandem.json");
+fn layout(name: &str) -> Value {
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../deploy/foxglove").join(name);
     serde_json::from_slice(&std::fs::read(path).unwrap()).unwrap()
 }
 
 /// Returns the decoded messages of a log by topic.
-fn messages() -> BTreeMap<String, Vec<DynamicMessage>> {
-    let directory = tempfile::tempdir().unwrap();
-    let log = synthetic::write_log(&directory.path().join("episode.mcap")).unwrap();
+pub(crate) fn messages(log: &Path) -> BTreeMap<String, Vec<DynamicMessage>> {
     let bytes = std::fs::read(log).unwrap();
     let mut messages: BTreeMap<String, Vec<DynamicMessage>> = BTreeMap::new();
     for message in mcap::MessageStream::new(&bytes).unwrap() {
@@ -84,9 +82,9 @@ fn collect_panels(node: &Value, panels: &mut BTreeSet<String>) {
     collect_panels(&node["second"], panels);
 }
 
-#[test]
-fn every_path_of_the_layout_has_values_in_a_log() {
-    let (layout, messages) = (layout(), messages());
+/// Checks that every path of a layout has values in `log`.
+pub(crate) fn check_paths(name: &str, log: &Path) {
+    let (layout, messages) = (layout(name), messages(log));
     let mut paths = BTreeSet::new();
     collect_paths(&layout["configById"], &mut paths);
     assert!(paths.len() > 10, "{paths:?}");
@@ -99,8 +97,19 @@ fn every_path_of_the_layout_has_values_in_a_log() {
 }
 
 #[test]
-fn the_layout_shows_every_configured_panel_once() {
-    let layout = layout();
+fn every_path_of_the_layout_has_values_in_a_log() {
+    let directory = tempfile::tempdir().unwrap();
+    let log = synthetic::write_log(&directory.path().join("episode.mcap")).unwrap();
+    check_paths("tandem.json", &log);
+}
+
+#[test]
+fn layouts_show_every_configured_panel_once() {
+    ["tandem.json", "bridge.json"].into_iter().for_each(check_panels);
+}
+
+fn check_panels(name: &str) {
+    let layout = layout(name);
     let mut shown = BTreeSet::new();
     collect_panels(&layout["layout"], &mut shown);
     let configured: BTreeSet<String> =

@@ -10,10 +10,10 @@ use foxglove::Decode as _;
 use foxglove::messages::SceneUpdate;
 use serde_json::{Value, json};
 use tandem_telemetry::Error;
-use tandem_telemetry::live::{Clock, Follower, Replay};
+use tandem_telemetry::live::{Clock, Follower, LiveArms, Replay};
 use tungstenite::{ClientRequestBuilder, Message, WebSocket};
 
-use crate::synthetic;
+use crate::{motion, synthetic};
 
 const SUBPROTOCOL: &str = "foxglove.sdk.v1";
 /// Longest wait for a message.
@@ -259,4 +259,38 @@ fn an_address_in_use_is_named() {
     assert!(matches!(&error, Error::Listen { address: named, .. } if *named == address));
     let line = format!("cannot listen on {address} for viewers: choose another address for --live");
     assert_eq!(error.to_string(), line);
+}
+
+#[test]
+fn a_viewer_sees_the_arms_of_a_bridge_as_they_are() {
+    let mut live = LiveArms::start(any_port(), 2).unwrap();
+    let mut viewer = Viewer::connect(live.address());
+    let (_, [scene, arms]) = viewer.channels(["/scene", "/arms"]);
+    viewer.subscribe(1, scene);
+    viewer.subscribe(2, arms);
+    let is_stopped = AtomicBool::new(false);
+    std::thread::scope(|scope| {
+        scope.spawn(|| {
+            let mut step = 0;
+            while !is_stopped.load(Ordering::Relaxed) {
+                live.publish(&motion::moving(step));
+                step += 1;
+                std::thread::sleep(Duration::from_millis(5));
+            }
+        });
+        let data = |subscription: u32| {
+            move |received| match received {
+                Received::Data(id, at_ns, payload) if id == subscription => Some((at_ns, payload)),
+                _ => None,
+            }
+        };
+        let (at_ns, payload) = viewer.wait_for(data(1));
+        let shown = SceneUpdate::decode(payload.as_slice()).unwrap();
+        assert_eq!(shown.entities[0].timestamp.unwrap().total_nanos(), at_ns);
+        assert!(shown.entities.iter().any(|entity| entity.id == "arm1"));
+        let (later_ns, _) = viewer.wait_for(data(2));
+        assert!(later_ns >= at_ns);
+        is_stopped.store(true, Ordering::Relaxed);
+    });
+    live.stop();
 }

@@ -1,0 +1,236 @@
+// The operator page of a bridge.
+import { byId, clock, el, fetchJson, follow, isNumber, percent, setText, svg } from "/assets/common.js";
+
+/** Age of the newest state from which the page says that it is old. */
+const STALE_MS = 1500;
+/** Time within which the bridge has to confirm a stop. */
+const STOP_TIMEOUT_MS = 4000;
+/** Extent of the views: x, y and z, metres. */
+const X = [-0.55, 0.55];
+const Y = [-0.36, 0.36];
+const Z = [-0.04, 0.62];
+
+let state = null;
+let logVersion = null;
+let link = "connecting";
+
+/** Stops the arms. It uses nothing that the page has received, so it works before the first state and without events. */
+async function stop() {
+  const result = byId("stop-result");
+  const button = byId("stop");
+  button.classList.add("pressed");
+  setText(result, "Stopping …");
+  try {
+    const response = await fetch("/stop", {
+      method: "POST",
+      headers: { "x-tandem-action": "stop" },
+      signal: AbortSignal.timeout(STOP_TIMEOUT_MS),
+    });
+    if (response.status === 401) return location.reload();
+    const answer = await response.json().catch(() => ({}));
+    if (!response.ok) throw new Error(answer.problem ?? `the bridge answers ${response.status}`);
+    result.className = "stop-result confirmed";
+    setText(result, `Stopped ${answer.stopped}`);
+  } catch (error) {
+    const problem = error.name === "TimeoutError" ? "no answer" : error.message;
+    result.className = "stop-result failed";
+    setText(result, `The stop is not confirmed: ${problem}. Use the emergency stop.`);
+  } finally {
+    button.classList.remove("pressed");
+  }
+}
+
+byId("stop").addEventListener("click", stop);
+
+const TITLES = {
+  stopped: "Stopped",
+  idle: "Ready: the arms hold their position",
+  moving: "Moving",
+  holding: "Motion paused",
+  settling: "Coming to rest",
+};
+const BADGES = { stopped: "bad", idle: "good", moving: "", holding: "warning", settling: "" };
+
+const mm = (metres) => (isNumber(metres) ? `${Math.round(1000 * metres)} mm` : "–");
+const degrees = (radians) => (isNumber(radians) ? `${((180 / Math.PI) * radians).toFixed(1).replace("-", "−")}°` : "–");
+const time = (unixMs) => new Date(unixMs).toLocaleTimeString();
+const isBelow = (gap, limit) => isNumber(gap) && gap < limit;
+
+function showHeader(s) {
+  setText(byId("phase-title"), TITLES[s.phase]);
+  document.title = `${TITLES[s.phase].split(":")[0]} – Tandem bridge`;
+  const badge = byId("phase");
+  setText(badge, s.phase);
+  badge.className = `badge ${BADGES[s.phase]}`;
+  setText(byId("terms"), `driver ${s.terms.driver}, version ${s.terms.version}, speed limit ${s.terms.speed}`);
+  setText(byId("clock"), `${time(s.unix_ms)}, bridge up for ${clock(s.time_s)}`);
+  const problem = s.stop_error ? `The drives could not be commanded to stop: ${s.stop_error}. Use the emergency stop.`
+    : !s.is_connected ? "The driver has no connection to the arms."
+    : s.arms.length === 0 ? "There is no valid state of the arms." : "";
+  byId("alert").hidden = !problem;
+  setText(byId("alert"), problem);
+}
+
+function showMotion(s) {
+  const motion = s.motion;
+  byId("progress").hidden = !motion;
+  if (!motion) {
+    const number = s.n_motions > 0 ? `; ${s.n_motions === 1 ? "one has" : `${s.n_motions} have`} been started` : "";
+    return setText(byId("motion-text"), `No motion is in progress${number}.`);
+  }
+  const share = motion.duration_s > 0 ? Math.min(1, motion.played_s / motion.duration_s) : 0;
+  byId("bar").style.width = `${100 * share}%`;
+  byId("progress").setAttribute("aria-valuenow", Math.round(100 * share));
+  const left = (motion.duration_s - motion.played_s) / motion.speed;
+  const client = motion.client ? `, client ${motion.client}` : "";
+  setText(byId("motion-text"), `Motion ${s.n_motions}${motion.name ? `, ${motion.name}` : ""}: ${motion.played_s.toFixed(1)} of `
+    + `${motion.duration_s.toFixed(1)} s at speed ${motion.speed}, about ${clock(left)} left${client}.`);
+}
+
+function tiles(s) {
+  const arms = s.arms.map((arm, idx) => [
+    `Arm ${idx} to table`, mm(arm.table_gap_m), `own parts ${mm(arm.self_gap_m)}`,
+    isBelow(arm.table_gap_m, 2 * s.terms.table_gap_m) || isBelow(arm.self_gap_m, 2 * s.terms.self_gap_m),
+  ]);
+  const faults = s.arms.map((arm, idx) => {
+    const names = [arm.emergency_stop && "emergency stop", arm.drive_fault && "drive fault", arm.contact && "contact"].filter(Boolean);
+    return [`Arm ${idx}`, names.length ? names.join(", ") : "no fault", `gripper ${percent(arm.opening, 0)} open`, names.length > 0];
+  });
+  return [
+    ["Owner", isNumber(s.lease_left_s) ? "a client" : "none",
+      isNumber(s.lease_left_s) ? `lease for ${s.lease_left_s.toFixed(1)} s` : "free for any client", false],
+    ["Joints", s.at_rest ? "at rest" : "moving", s.is_connected ? "driver connected" : "driver not connected", false],
+    ...faults,
+    ["Between arms", mm(s.arms_gap_m), `stopped below ${mm(s.terms.arms_gap_m)}`, isBelow(s.arms_gap_m, 1.25 * s.terms.arms_gap_m)],
+    ...arms,
+  ];
+}
+
+function showTiles(s) {
+  const parent = byId("tiles");
+  const wanted = tiles(s);
+  while (parent.children.length > wanted.length) parent.lastChild.remove();
+  wanted.forEach(([name, value, detail, isBad], idx) => {
+    const tile = parent.children[idx] ?? parent.appendChild(
+      el("div", { class: "tile" }, el("dt"), el("dd", { class: "value" }), el("dd", { class: "detail" })));
+    tile.classList.toggle("bad", isBad);
+    setText(tile.children[0], name);
+    setText(tile.children[1], value);
+    setText(tile.children[2], detail);
+  });
+}
+
+function showStop(s) {
+  const last = s.last_stop;
+  setText(byId("last-stop"), last ? `${last.sentence} (${last.name})` : "The arms have not been stopped.");
+  setText(byId("last-stop-time"), last ? `${time(last.at_unix_ms)}${s.stop ? "; the arms are stopped" : "; reset since"}` : "");
+}
+
+/** Draws the arms from above (`axis` 1: y) or from the side (2: z). */
+function drawView(id, axis, s) {
+  const range = axis === 1 ? Y : Z;
+  const scale = 640 / (X[1] - X[0]);
+  const height = (range[1] - range[0]) * scale;
+  const at = (point) => [(point[0] - X[0]) * scale, height - (point[axis] - range[0]) * scale];
+  const root = byId(id);
+  root.setAttribute("viewBox", `0 0 640 ${height.toFixed(0)}`);
+  const parts = [];
+  if (axis === 2) {
+    const y = at([0, 0, 0])[1];
+    parts.push(svg("line", { x1: 0, x2: 640, y1: y, y2: y, class: "table" }));
+  }
+  s.shapes.forEach((arm, idx) => parts.push(drawArm(arm, s.arms[idx], idx, at, scale)));
+  root.replaceChildren(...parts);
+}
+
+function drawArm(arm, values, idx, at, scale) {
+  const line = (a, b, width, name) => {
+    const [[x1, y1], [x2, y2]] = [at(a), at(b)];
+    return svg("line", { x1, y1, x2, y2, "stroke-width": width, class: name });
+  };
+  const bars = arm.links.map(([from, to, radius]) => line(from, to, 2 * radius * scale, "bar-shape"));
+  // The bones show joints that lie behind one another.
+  const bones = arm.links.map(([from, to]) => line(from, to, 3, "bone"));
+  const fingers = arm.fingers.map((finger) => line(arm.tool, finger, 6, "bone"));
+  const [x, y] = at(arm.tool);
+  const group = svg("g", { class: `arm${idx % 3}` }, bars, bones, fingers, svg("circle", { cx: x, cy: y, r: 6, class: "finger tool" }));
+  if (values?.planned_tool_m) {
+    const [cx, cy] = at(values.planned_tool_m);
+    group.append(svg("circle", { cx, cy, r: 11, class: "planned" }));
+  }
+  const [baseX, baseY] = at(arm.base);
+  group.append(svg("text", { x: baseX, y: baseY - 6, "text-anchor": "middle", class: "arm-name" }, `arm ${idx}`));
+  return group;
+}
+
+function showArms(s) {
+  drawView("view-above", 1, s);
+  drawView("view-side", 2, s);
+  const place = (point) => point.map((x) => (100 * x).toFixed(1).replace("-", "−")).join(", ");
+  const text = s.arms.map((arm, idx) => `Tool ${idx} at ${place(arm.tool_m)} cm`).join("; ");
+  setText(byId("arms-text"), text ? `${text}. Rings show the planned positions.` : "The positions are not known.");
+}
+
+function showJoints(s) {
+  const n = Math.max(0, ...s.arms.map((arm) => arm.angles_rad.length));
+  const head = ["", ...Array.from({ length: n }, (_, joint) => `joint ${joint + 1}`)];
+  const rows = s.arms.flatMap((arm, idx) => [
+    [`Arm ${idx}, measured`, arm.angles_rad],
+    [`Arm ${idx}, planned`, arm.planned_rad],
+  ]);
+  const cells = (values) => Array.from({ length: n }, (_, joint) => el("td", {}, degrees(values[joint])));
+  byId("joint-table").replaceChildren(
+    el("thead", {}, el("tr", {}, head.map((name) => el("th", { scope: "col" }, name)))),
+    el("tbody", {}, rows.map(([name, values]) => el("tr", {}, el("th", { scope: "row" }, name), cells(values)))));
+}
+
+const MARKS = { info: "•", good: "✓", warning: "!", bad: "✕" };
+
+async function showLog(version) {
+  if (version === logVersion) return;
+  const former = logVersion;
+  logVersion = version;
+  try {
+    const events = await fetchJson("/data/log");
+    byId("log").replaceChildren(...[...events].reverse().map((event) => el("li", {}, el("time", {}, time(event.unix_ms)),
+      el("span", { class: `mark ${event.level}`, "aria-hidden": "true" }, MARKS[event.level]), el("span", {}, event.text))));
+  } catch {
+    logVersion = former;
+  }
+}
+
+function show(s) {
+  state = s;
+  // A confirmation is about a stop that has ended with a reset.
+  if (!s.stop && byId("stop-result").classList.contains("confirmed")) {
+    byId("stop-result").className = "stop-result";
+    setText(byId("stop-result"), "");
+  }
+  showHeader(s);
+  showMotion(s);
+  showTiles(s);
+  showStop(s);
+  showArms(s);
+  showJoints(s);
+  showLog(s.versions.log);
+}
+
+function showLink() {
+  const isOld = link === "live" && state && sinceHeard() > STALE_MS;
+  const element = byId("link");
+  element.classList.toggle("lost", link === "lost" || isOld);
+  document.body.classList.toggle("stale", link === "lost" || isOld);
+  setText(element, isOld ? `no state for ${Math.round(sinceHeard() / 1000)} s` : {
+    live: "live",
+    lost: "no connection: the values are old; trying again",
+    full: "too many viewers, trying again; the stop button works",
+  }[link] ?? link);
+}
+
+const sinceHeard = follow(show, (condition) => {
+  // A bridge that starts again may begin with other versions.
+  if (condition === "live" && link === "lost") logVersion = null;
+  link = condition;
+  showLink();
+});
+setInterval(showLink, 500);

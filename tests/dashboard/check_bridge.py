@@ -1,0 +1,217 @@
+"""Tests the operator page of a bridge in headless Chromium.
+
+Starts a bridge with a simulated pair and uses its page as an operator does: the arms move on the page during a motion,
+the stop button stops the motion within a second and the page shows the cause, the keyboard reaches the button first,
+another page cannot press it, nothing overflows on a phone, scripts have no errors. Prints the times that it measured.
+"""
+
+import argparse
+import json
+import pathlib
+import re
+import signal
+import subprocess
+import sys
+import time
+import urllib.error
+import urllib.request
+
+from devtools import Browser
+
+MOTION = pathlib.Path(__file__).resolve().parents[2] / "deploy" / "first-motion.json"
+# The causes of stops that a busy machine may produce.
+BUSY = ["late", "owner-silent", "state-old", "state-stale", "command-lost", "drive-fault"]
+SHAPES = "document.getElementById('view-side').innerHTML"
+CONFIRMED = "document.getElementById('stop-result').classList.contains('confirmed')"
+
+
+class Bridge:
+    """A bridge with a simulated pair and a page. A context manager."""
+
+    def __init__(self, program):
+        self.program = str(program)
+        command = [self.program, "bridge", "--driver", "sim", "--listen", "127.0.0.1:0"]
+        self.process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
+                                        stderr=subprocess.PIPE, text=True)
+        self.address = self.process.stdout.readline().split()[-1]
+        self.url, self.lines = None, []
+        for line in self.process.stderr:
+            self.lines.append(line)
+            if found := re.search(r"dashboard on (http://\S+/)", line):
+                self.url = found[1]
+                break
+        assert self.url, "".join(self.lines)
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.process.kill()
+        self.process.wait()
+
+    def run(self, *words):
+        command = [self.program, "bridge", *words, "--connect", self.address]
+        return subprocess.run(command, capture_output=True, text=True, timeout=60)
+
+    def status(self):
+        return json.loads(self.run("status", "--json").stdout)
+
+    def reset(self):
+        for _ in range(100):
+            ended = self.run("reset")
+            if ended.returncode == 0 or "not stopped but Idle" in ended.stderr:
+                return
+            time.sleep(0.05)
+        raise AssertionError(ended.stderr)
+
+    def move(self):
+        command = [self.program, "bridge", "move", str(MOTION), "--speed", "0.1", "--connect", self.address]
+        return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def with_motion(bridge, page, check):
+    """Calls `check` during a motion; again with another motion if a busy machine has stopped it."""
+    for _ in range(10):
+        bridge.reset()
+        mover = bridge.move()
+        try:
+            page.wait("document.getElementById('motion-text').textContent.includes('first-motion.json')", "a motion is shown")
+            return check(mover)
+        except AssertionError:
+            if bridge.status()["stopped"] is None or bridge.status()["stopped"]["name"] not in BUSY:
+                raise
+        finally:
+            mover.kill()
+            mover.communicate()
+    raise AssertionError("the machine is too busy")
+
+
+def check_motion(page, _mover):
+    """The arms move on the page, several times a second, and the progress grows."""
+    page.value("window.shown = []; new MutationObserver(() => window.shown.push([performance.now(), "
+               "document.getElementById('view-side').innerHTML])).observe(document.getElementById('view-side'), "
+               "{ childList: true })")
+    progress = "Number(document.getElementById('progress').getAttribute('aria-valuenow'))"
+    before = page.value(progress)
+    page.wait(f"{progress} > {before} + 8", "the motion progresses", 20)
+    shown = page.value("window.shown")
+    seconds = (shown[-1][0] - shown[0][0]) / 1000
+    pictures = len({picture for _, picture in shown})
+    longest = max(b[0] - a[0] for a, b in zip(shown, shown[1:])) / 1000
+    print(f"{pictures / seconds:.1f} different pictures of the arms per second, longest pause {longest:.2f} s")
+    assert pictures / seconds >= 5 and longest < 1, (pictures, seconds, longest)
+    assert page.value("document.querySelectorAll('#view-above .planned').length") == 2
+
+
+def check_stop(page, bridge, mover, press, how):
+    """The button stops the motion within a second, and the page shows the cause."""
+    began = time.monotonic()
+    press()
+    page.wait("document.getElementById('phase').textContent === 'stopped'", "the page shows the stop", 5)
+    page.wait(CONFIRMED, "the page confirms the stop", 5)
+    shown_s = time.monotonic() - began
+    status = bridge.status()
+    assert status["phase"] == "stopped" and status["stopped"]["name"] == "requested", status
+    _, errors = mover.communicate(timeout=10)
+    assert mover.returncode == 75 and "a client stopped the arms" in errors, (mover.returncode, errors)
+    last = page.value("document.getElementById('last-stop').textContent")
+    assert "a client stopped the arms (requested)" in last, last
+    result = page.value("document.getElementById('stop-result').textContent")
+    assert result.startswith("Stopped at ") and "a client stopped the arms" in result, result
+    assert page.value("document.getElementById('log').textContent.includes('a client stopped the arms')")
+    assert shown_s < 1, shown_s
+    print(f"a stop by {how} was confirmed on the page after {shown_s:.2f} s")
+
+
+def tab_to_button(page):
+    page.value("document.activeElement?.blur()")
+    page.key("Tab", 9)
+    assert page.value("document.activeElement?.id") == "stop", page.value("document.activeElement?.outerHTML")
+
+
+def check_foreign_page(bridge):
+    """A page of another server cannot press the button, and nobody can reset the arms here."""
+    def post(path, headers):
+        request = urllib.request.Request(bridge.url + path, data=b"", headers=headers, method="POST")
+        try:
+            with urllib.request.urlopen(request, timeout=10) as answer:
+                return answer.status
+        except urllib.error.HTTPError as error:
+            return error.code
+
+    assert post("stop", {"Origin": "http://evil.example", "x-tandem-action": "stop"}) == 403
+    assert post("stop", {}) == 403
+    assert post("stop", {"Host": "evil.example", "x-tandem-action": "stop"}) == 421
+    assert post("reset", {"x-tandem-action": "reset"}) == 404
+    assert bridge.status()["stopped"] is None, bridge.status()
+
+
+def check_layout(page):
+    """Nothing overflows on a phone or a small laptop, in both colour schemes, and the button stays in view."""
+    for width in [360, 768, 1280]:
+        for dark in [False, True]:
+            page.resize(width, 640, dark)
+            overflow = page.value("document.documentElement.scrollWidth - document.documentElement.clientWidth")
+            assert overflow <= 0, f"{overflow} px too wide at {width} px"
+            page.value("scrollTo(0, document.body.scrollHeight)")
+            place = page.value("(box => [box.top, box.bottom, innerHeight])(document.getElementById('stop').getBoundingClientRect())")
+            assert 0 <= place[0] and place[1] <= place[2], place
+            page.value("scrollTo(0, 0)")
+    names = page.value("[...document.querySelectorAll('button, input, svg[role=img]')].filter(it => "
+                       "!(it.ariaLabel || it.getAttribute('aria-labelledby') || it.textContent.trim())).map(it => it.id)")
+    assert names == [], f"without a name: {names}"
+    assert page.value("document.querySelectorAll('h1').length") == 1
+    page.resize(1280, 900)
+
+
+def take_pictures(page, directory, name):
+    if directory:
+        directory.mkdir(parents=True, exist_ok=True)
+        for label, width, dark in [("light", 1280, False), ("dark", 1280, True), ("phone", 360, False)]:
+            page.resize(width, 900, dark)
+            page.picture(directory / f"bridge-{name}-{label}.png")
+        page.resize(1280, 900)
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--program", type=pathlib.Path, required=True)
+    parser.add_argument("--pictures", type=pathlib.Path)
+    args = parser.parse_args()
+    began = time.monotonic()
+    with Browser() as browser, Bridge(args.program.resolve()) as bridge:
+        page = browser.open(bridge.url)
+        page.resize(1280, 900)
+        page.wait("document.getElementById('last-stop').textContent.includes('not reset')", "the page shows the arms")
+        bridge.reset()
+        page.wait("document.getElementById('phase').textContent === 'idle'", "the reset is shown", 5)
+        check_foreign_page(bridge)
+
+        def by_mouse(mover):
+            check_motion(page, mover)
+            take_pictures(page, args.pictures, "moving")
+            check_stop(page, bridge, mover, lambda: page.value("void document.getElementById('stop').click()"), "click")
+
+        def by_keyboard(mover):
+            tab_to_button(page)
+            check_stop(page, bridge, mover, lambda: page.key("Enter", 13, "\r"), "keyboard")
+
+        with_motion(bridge, page, by_mouse)
+        take_pictures(page, args.pictures, "stopped")
+        with_motion(bridge, page, by_keyboard)
+        check_layout(page)
+        bridge.process.send_signal(signal.SIGTERM)
+        page.wait("document.getElementById('link').textContent.includes('no connection')", "the end is shown", 10)
+        assert bridge.process.wait(20) == 0
+        tab_to_button(page)
+        page.key("Enter", 13, "\r")
+        page.wait("document.getElementById('stop-result').textContent.includes('Use the emergency stop')", "a failed stop is shown", 10)
+        take_pictures(page, args.pictures, "gone")
+        expected = ["ERR_CONNECTION_REFUSED", "ERR_INCOMPLETE_CHUNKED_ENCODING", "ERR_CONNECTION_RESET"]
+        errors = [error for error in page.errors if not any(known in str(error) for known in expected)]
+        assert not errors, errors
+    print(f"the page of the bridge passed in {time.monotonic() - began:.0f} s")
+
+
+if __name__ == "__main__":
+    sys.exit(main())
