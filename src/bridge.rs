@@ -50,7 +50,7 @@ fn serve(args: BridgeServeArgs) -> Result<(), Failed> {
         let clock = Arc::new(clock::BridgeClock::new());
         let (executor, reconnect) = arms::arms(&args, clock.clone())?;
         metrics::serve(&args.metrics, &own).await?;
-        let plan = watch::Plan::of(&args).await?;
+        let plan = watch::Plan::of(&args, &server_config).await?;
         let listener = service::listen(&args.listen).await?;
         let config = Config {
             driver: arms::name(args.driver).to_owned(),

@@ -7,8 +7,8 @@ const STALE_MS = 1500;
 const STOP_TIMEOUT_MS = 4000;
 /** Extent of the views: x, y and z, metres. */
 const X = [-0.55, 0.55];
-const Y = [-0.36, 0.36];
-const Z = [-0.04, 0.62];
+const Y = [-0.3, 0.3];
+const Z = [-0.07, 0.62];
 
 let state = null;
 let logVersion = null;
@@ -53,7 +53,7 @@ const BADGES = { stopped: "bad", idle: "good", moving: "", holding: "warning", s
 
 const mm = (metres) => (isNumber(metres) ? `${Math.round(1000 * metres)} mm` : "–");
 const degrees = (radians) => (isNumber(radians) ? `${((180 / Math.PI) * radians).toFixed(1).replace("-", "−")}°` : "–");
-const time = (unixMs) => new Date(unixMs).toLocaleTimeString();
+const time = (unixMs) => new Date(unixMs).toLocaleTimeString([], { hour12: false });
 const isBelow = (gap, limit) => isNumber(gap) && gap < limit;
 
 function showHeader(s) {
@@ -151,15 +151,16 @@ function drawArm(arm, values, idx, at, scale) {
   const bars = arm.links.map(([from, to, radius]) => line(from, to, 2 * radius * scale, "bar-shape"));
   // The bones show joints that lie behind one another.
   const bones = arm.links.map(([from, to]) => line(from, to, 3, "bone"));
+  const wrist = arm.links.length ? line(arm.links.at(-1)[1], arm.tool, 3, "bone") : null;
   const fingers = arm.fingers.map((finger) => line(arm.tool, finger, 6, "bone"));
   const [x, y] = at(arm.tool);
-  const group = svg("g", { class: `arm${idx % 3}` }, bars, bones, fingers, svg("circle", { cx: x, cy: y, r: 6, class: "finger tool" }));
+  const group = svg("g", { class: `arm${idx % 3}` }, bars, bones, wrist, fingers, svg("circle", { cx: x, cy: y, r: 6, class: "finger tool" }));
   if (values?.planned_tool_m) {
     const [cx, cy] = at(values.planned_tool_m);
     group.append(svg("circle", { cx, cy, r: 11, class: "planned" }));
   }
   const [baseX, baseY] = at(arm.base);
-  group.append(svg("text", { x: baseX, y: baseY - 6, "text-anchor": "middle", class: "arm-name" }, `arm ${idx}`));
+  group.append(svg("text", { x: baseX, y: baseY + 22, "text-anchor": "middle", class: "arm-name" }, `arm ${idx}`));
   return group;
 }
 
@@ -200,9 +201,10 @@ async function showLog(version) {
 }
 
 function show(s) {
+  // The message about a stop disappears with the reset that ends it.
+  const wasStopped = Boolean(state?.stop);
   state = s;
-  // A confirmation is about a stop that has ended with a reset.
-  if (!s.stop && byId("stop-result").classList.contains("confirmed")) {
+  if (wasStopped && !s.stop) {
     byId("stop-result").className = "stop-result";
     setText(byId("stop-result"), "");
   }

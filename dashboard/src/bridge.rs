@@ -1,7 +1,6 @@
 //! The site of a bridge: turns states of the arms into the documents that its page shows, and stops them.
 
 use std::collections::VecDeque;
-use std::pin::Pin;
 use std::sync::Arc;
 
 use serde::Serialize;
@@ -11,16 +10,10 @@ use tokio::sync::watch;
 
 use crate::events::Level;
 use crate::page;
-use crate::site::{Frame, Site, encode};
+use crate::site::{Frame, Site, StopAction, encode};
 
 /// Number of events that are kept.
 const KEPT: usize = 60;
-
-/// The result of a stop: the description of the stop that the arms are in, or of the problem.
-pub type StopResult = Result<String, String>;
-/// Stops the arms.
-pub type StopAction =
-    Arc<dyn Fn() -> Pin<Box<dyn Future<Output = StopResult> + Send>> + Send + Sync>;
 
 /// What does not change while a bridge runs.
 #[derive(Debug, Clone, PartialEq, Default, Serialize)]

@@ -20,6 +20,6 @@ mod server;
 mod site;
 
 pub use access::Access;
-pub use bridge::{BridgeTerms, StopAction, StopResult};
+pub use bridge::BridgeTerms;
 pub use server::{MAX_VIEWERS, serve};
-pub use site::Site;
+pub use site::{Site, StopAction, StopResult};

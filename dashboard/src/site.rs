@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 use std::convert::Infallible;
+use std::pin::Pin;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -18,10 +19,15 @@ use tokio_stream::StreamExt as _;
 use tokio_stream::wrappers::WatchStream;
 
 use crate::access::{self, Access};
-use crate::bridge::StopAction;
 
 /// Time without an event after which a comment is sent, so that a viewer that is gone is noticed.
 const KEEP_ALIVE: Duration = Duration::from_secs(10);
+
+/// The result of a stop: the description of the stop that the arms are in, or of the problem.
+pub type StopResult = Result<String, String>;
+/// Stops the arms.
+pub type StopAction =
+    Arc<dyn Fn() -> Pin<Box<dyn Future<Output = StopResult> + Send>> + Send + Sync>;
 
 /// A page and the data that it shows.
 #[derive(Clone)]

@@ -87,6 +87,12 @@ impl ServerConfig {
         &self.metrics
     }
 
+    /// Returns the token that calls require, if there is one.
+    #[must_use]
+    pub const fn token(&self) -> Option<&Token> {
+        self.token.as_ref()
+    }
+
     /// Returns whether calls, and the token in them, cross the network unencrypted.
     #[must_use]
     pub const fn is_plain(&self) -> bool {

@@ -14,6 +14,7 @@ use tandem_bridge::work_cell::mico_cell;
 use tandem_core::text::error_chain;
 use tandem_dashboard::{Access, BridgeTerms, Site, StopAction};
 use tandem_kinematics::WorkCell;
+use tandem_net::{ServerConfig, Token};
 use tandem_telemetry::live::LiveArms;
 use tandem_telemetry::{ArmsView, MotionJournal};
 use tokio::net::TcpListener;
@@ -56,8 +57,11 @@ pub(super) struct Watching {
 
 impl Plan {
     /// Creates the directory of logs and listens for viewers and pages.
-    pub(super) async fn of(args: &BridgeServeArgs) -> Result<Self, Failed> {
-        let access = page_access(args)?;
+    pub(super) async fn of(
+        args: &BridgeServeArgs,
+        server_config: &ServerConfig,
+    ) -> Result<Self, Failed> {
+        let access = page_access(args, server_config.token())?;
         let journal = args.record.as_ref().map(|directory| {
             let journal = MotionJournal::create(directory, args.log_budget.0, metadata(args));
             journal.map_err(Failed::of_write)
@@ -71,7 +75,7 @@ impl Plan {
             output::message(format_args!("tandem: live on ws://{}", live.address()));
         }
         let page = match access {
-            Some((address, access)) => bind(address, access).await,
+            Some((address, access)) => bind(address, access, args.dashboard.is_none()).await?,
             None => None,
         };
         Ok(Self { journal, live, page })
@@ -217,35 +221,41 @@ fn stop_action(operator: Operator) -> StopAction {
     })
 }
 
-/// Binds the page's address or the next free one. A bridge serves without a page if there is none.
-async fn bind(address: SocketAddr, access: Access) -> Option<Page> {
+/// Binds the page's address or the next free one. Without an address on the command line, a bridge serves without a page
+/// if there is none.
+async fn bind(
+    address: SocketAddr,
+    access: Access,
+    is_optional: bool,
+) -> Result<Option<Page>, Failed> {
     let bound = dashboard::bind_free(address).await;
     let bound = bound.and_then(|listener| Ok((listener.local_addr()?, listener)));
     match bound {
-        Ok((address, listener)) => Some(Page { listener, address, access }),
-        Err(error) => {
+        Ok((address, listener)) => Ok(Some(Page { listener, address, access })),
+        Err(error) if is_optional => {
             tracing::warn!(%address, %error, "no dashboard: the address cannot be listened on");
-            None
+            Ok(None)
+        }
+        Err(error) => {
+            let cannot = || format!("cannot listen on {address} for --dashboard");
+            Err(error).or_exit(Exit::TryAgain, cannot)
         }
     }
 }
 
 /// Returns the address of the page and who may see it. The token of the bridge protects the page too.
-fn page_access(args: &BridgeServeArgs) -> Result<Option<(SocketAddr, Access)>, Failed> {
+fn page_access(
+    args: &BridgeServeArgs,
+    token: Option<&Token>,
+) -> Result<Option<(SocketAddr, Access)>, Failed> {
     if args.no_dashboard {
         return Ok(None);
     }
     let address = args.dashboard.unwrap_or_else(dashboard::default_address);
-    let token_file = args.dashboard_token_file.as_ref().or(args.secret.token_file.as_ref());
-    let rules = dashboard::access(
-        "--dashboard",
-        address,
-        token_file.map(std::path::PathBuf::as_path),
-        args.listen.insecure,
-    )?;
-    let rules = match token_file {
-        Some(file) => Access::with_token(access::read_token(file)?),
-        None => rules,
+    let own = args.dashboard_token_file.as_deref().map(access::read_token).transpose()?;
+    let rules = match own.as_ref().or(token) {
+        Some(token) => Access::with_token(token.clone()),
+        None => dashboard::access("--dashboard", address, None, args.listen.insecure)?,
     };
     Ok(Some((address, rules)))
 }

@@ -1,14 +1,18 @@
 //! A served site over real connections.
 
 use std::net::SocketAddr;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU32, Ordering};
 
 use tandem_net::Token;
-use tandem_telemetry::{RunView, WorkerState, WorkerView};
+use tandem_telemetry::{ArmsView, RunView, WorkerState, WorkerView};
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::watch;
 
 use super::*;
+use crate::bridge::BridgeTerms;
+use crate::site::StopAction;
 
 /// Within this everything that is to happen has happened, on the slowest machine.
 const DEADLINE: Duration = Duration::from_secs(60);
@@ -184,4 +188,46 @@ async fn a_page_of_another_name_reads_nothing() {
     stream.read_to_string(&mut response).await.expect("answered");
     has_status(&response, 421);
     assert!(!response.contains("env_steps"), "{response}");
+}
+
+#[tokio::test]
+async fn only_the_page_itself_and_programs_can_stop_the_arms_of_a_bridge() {
+    let (views, receiver) = watch::channel(Arc::new(ArmsView::default()));
+    let pressed = Arc::new(AtomicU32::new(0));
+    let counter = Arc::clone(&pressed);
+    let stop: StopAction = Arc::new(move || {
+        let stopped = match counter.fetch_add(1, Ordering::Relaxed) {
+            0 => Ok("at 1.000 s"),
+            _ => Err("the drives are gone"),
+        };
+        Box::pin(async move { stopped.map(str::to_owned).map_err(str::to_owned) })
+    });
+    let site = Site::of_bridge(BridgeTerms::default(), receiver, stop);
+    let listener = TcpListener::bind("127.0.0.1:0").await.expect("a port");
+    let address = listener.local_addr().expect("bound");
+    let shutdown = CancellationToken::new();
+    drop(tokio::spawn(serve(site, Access::local(), listener, shutdown.clone())));
+    let served = Served { address, views: watch::channel(RunView::default()).0, shutdown };
+    let action = "x-tandem-action: stop\r\ncontent-length: 0\r\n";
+    for refused in ["content-length: 0\r\n", &format!("{action}origin: http://evil.example\r\n")] {
+        has_status(&served.ask("POST /stop", refused).await, 403);
+    }
+    has_status(&served.ask("GET /stop", "").await, 405);
+    assert_eq!(pressed.load(Ordering::Relaxed), 0);
+    let stopped = served.ask("POST /stop", &format!("{action}origin: http://{address}\r\n")).await;
+    has_status(&stopped, 200);
+    assert!(stopped.contains(r#"{"stopped":"at 1.000 s"}"#), "{stopped}");
+    let failed = served.ask("POST /stop", action).await;
+    has_status(&failed, 503);
+    assert!(failed.contains("the drives are gone"), "{failed}");
+    let page = served.ask("GET /", "").await;
+    assert!(page.contains("Stop both arms") && page.contains("bridge.js"), "{page}");
+    drop(views);
+}
+
+#[tokio::test]
+async fn the_page_of_a_run_has_no_stop_button() {
+    let served = Served::start(Access::local()).await;
+    let action = "x-tandem-action: stop\r\ncontent-length: 0\r\n";
+    has_status(&served.ask("POST /stop", action).await, 404);
 }
