@@ -181,7 +181,7 @@ fn record(mut journal: MotionJournal, views: &Receiver<Arc<ArmsView>>, end: &Syn
     }
     journal.finish();
     // Fails only if the bridge has not waited.
-    drop(end.send(()));
+    end.send(()).ok();
 }
 
 impl Page {

@@ -129,6 +129,7 @@ fn measured(arms: &[ArmView], stamp: Timestamp) -> JointStates {
             position: Some(*angle_rad),
             velocity: view.velocities_radps.get(joint).copied(),
             effort: view.torques_nm.get(joint).copied(),
+            ..JointState::default()
         })
     });
     let grippers = arms.iter().enumerate().map(|(arm, view)| JointState {
