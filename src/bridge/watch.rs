@@ -98,7 +98,8 @@ impl Plan {
         snapshots: Option<Snapshots>,
     ) -> Result<Watching, Failed> {
         let Some(snapshots) = snapshots else { return Ok(Watching { ended: None, _page: None }) };
-        let (views, receiver) = watch::channel(Arc::default());
+        let before = ArmsView { is_connected: true, ..ArmsView::default() };
+        let (views, receiver) = watch::channel(Arc::new(before));
         let page = self.page.map(|page| page.serve(args, operator, receiver));
         let (end, ended) = sync_channel(1);
         let journal = match self.journal {

@@ -123,8 +123,8 @@ def check_stop(page, bridge, mover, press, how):
     print(f"a stop by {how} was confirmed on the page after {shown_s:.2f} s")
 
 
-def tab_to_button(page):
-    page.value("document.activeElement?.blur()")
+def check_tab(page):
+    """The Tab key reaches the button first."""
     page.key("Tab", 9)
     assert page.value("document.activeElement?.id") == "stop", page.value("document.activeElement?.outerHTML")
 
@@ -183,6 +183,7 @@ def main():
         page = browser.open(bridge.url)
         page.resize(1280, 900)
         page.wait("document.getElementById('last-stop').textContent.includes('not reset')", "the page shows the arms")
+        check_tab(page)
         bridge.reset()
         page.wait("document.getElementById('phase').textContent === 'idle'", "the reset is shown", 5)
         check_foreign_page(bridge)
@@ -193,7 +194,7 @@ def main():
             check_stop(page, bridge, mover, lambda: page.value("void document.getElementById('stop').click()"), "click")
 
         def by_keyboard(mover):
-            tab_to_button(page)
+            page.value("document.getElementById('stop').focus()")
             check_stop(page, bridge, mover, lambda: page.key("Enter", 13, "\r"), "keyboard")
 
         with_motion(bridge, page, by_mouse)
@@ -203,7 +204,7 @@ def main():
         bridge.process.send_signal(signal.SIGTERM)
         page.wait("document.getElementById('link').textContent.includes('no connection')", "the end is shown", 10)
         assert bridge.process.wait(20) == 0
-        tab_to_button(page)
+        page.value("document.getElementById('stop').focus()")
         page.key("Enter", 13, "\r")
         page.wait("document.getElementById('stop-result').textContent.includes('Use the emergency stop')", "a failed stop is shown", 10)
         take_pictures(page, args.pictures, "gone")
