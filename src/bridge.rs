@@ -44,13 +44,14 @@ fn serve(args: BridgeServeArgs) -> Result<(), Failed> {
     let server_config =
         access::server_config(&args.listen, &args.secret)?.with_metrics(own.clone());
     let secret = secret().or_exit(Exit::TryAgain, || format!("cannot read {ENTROPY}"))?;
+    let live = watch::live(&args)?;
     let runtime = runtime().or_exit(Exit::TryAgain, String::new)?;
     runtime.block_on(async move {
         let shutdown = signals::shutdown_token(args.listen.exit_with_stdin)?;
         let clock = Arc::new(clock::BridgeClock::new());
         let (executor, reconnect) = arms::arms(&args, clock.clone())?;
         metrics::serve(&args.metrics, &own).await?;
-        let plan = watch::Plan::of(&args, &server_config).await?;
+        let plan = watch::Plan::of(&args, &server_config, live).await?;
         let listener = service::listen(&args.listen).await?;
         let config = Config {
             driver: arms::name(args.driver).to_owned(),

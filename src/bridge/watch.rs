@@ -55,25 +55,28 @@ pub(super) struct Watching {
     _page: Option<DropGuard>,
 }
 
+/// Listens for viewers, if the command line asks for it. Must not be called within a runtime.
+pub(super) fn live(args: &BridgeServeArgs) -> Result<Option<LiveArms>, Failed> {
+    let Some(address) = args.live.live else { return Ok(None) };
+    let live = LiveArms::start(address, mico_cell().arms.len());
+    let live = live.or_exit(Exit::TryAgain, String::new)?;
+    output::message(format_args!("tandem: live on ws://{}", live.address()));
+    Ok(Some(live))
+}
+
 impl Plan {
-    /// Creates the directory of logs and listens for viewers and pages.
+    /// Creates the directory of logs and listens for pages.
     pub(super) async fn of(
         args: &BridgeServeArgs,
         server_config: &ServerConfig,
+        live: Option<LiveArms>,
     ) -> Result<Self, Failed> {
         let access = page_access(args, server_config.token())?;
         let journal = args.record.as_ref().map(|directory| {
             let journal = MotionJournal::create(directory, args.log_budget.0, metadata(args));
             journal.map_err(Failed::of_write)
         });
-        let live = args.live.live.map(|address| {
-            let live = LiveArms::start(address, mico_cell().arms.len());
-            live.or_exit(Exit::TryAgain, String::new)
-        });
-        let (journal, live) = (journal.transpose()?, live.transpose()?);
-        if let Some(live) = &live {
-            output::message(format_args!("tandem: live on ws://{}", live.address()));
-        }
+        let journal = journal.transpose()?;
         let page = match access {
             Some((address, access)) => bind(address, access, args.dashboard.is_none()).await?,
             None => None,
