@@ -50,13 +50,14 @@ pub(crate) struct Frame {
 }
 
 /// The files that pages refer to: name, content type and content.
-const ASSETS: [(&str, &str, &str); 7] = [
+const ASSETS: [(&str, &str, &str); 8] = [
     ("style.css", "text/css; charset=utf-8", include_str!("../assets/style.css")),
     ("common.js", "text/javascript; charset=utf-8", include_str!("../assets/common.js")),
     ("chart.js", "text/javascript; charset=utf-8", include_str!("../assets/chart.js")),
     ("player.js", "text/javascript; charset=utf-8", include_str!("../assets/player.js")),
     ("run.js", "text/javascript; charset=utf-8", include_str!("../assets/run.js")),
     ("bridge.js", "text/javascript; charset=utf-8", include_str!("../assets/bridge.js")),
+    ("sweep.js", "text/javascript; charset=utf-8", include_str!("../assets/sweep.js")),
     ("login.js", "text/javascript; charset=utf-8", include_str!("../assets/login.js")),
 ];
 
@@ -135,11 +136,11 @@ fn json(text: &str) -> Response {
     ([(CONTENT_TYPE, "application/json")], text.to_owned()).into_response()
 }
 
-fn not_found() -> Response {
-    (StatusCode::NOT_FOUND, "not found\n").into_response()
-}
-
 /// Encodes as JSON on one line. Numbers that are not finite become `null`.
 pub(crate) fn encode<T: Serialize + ?Sized>(value: &T) -> Arc<str> {
     serde_json::to_string(value).map_or_else(|_unencodable| "null".into(), Into::into)
+}
+
+fn not_found() -> Response {
+    (StatusCode::NOT_FOUND, "not found\n").into_response()
 }
