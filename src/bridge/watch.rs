@@ -32,6 +32,8 @@ const QUEUE_CAPACITY: usize = 1024;
 /// Time between two states for viewers and for pages, seconds.
 const LIVE_EVERY_S: f64 = 0.045;
 const PAGE_EVERY_S: f64 = 0.095;
+/// Niceness of the threads, which the arms' thread precedes on a busy machine.
+const NICENESS: i32 = 10;
 /// Time that the end of the bridge waits for its last log.
 const END_TIMEOUT: Duration = Duration::from_secs(2);
 
@@ -290,7 +292,13 @@ fn metadata(args: &BridgeServeArgs) -> BTreeMap<String, String> {
     metadata
 }
 
+/// Starts a thread that leaves the processor to the arms' thread.
 fn spawn(name: &str, work: impl FnOnce() + Send + 'static) -> Result<(), Failed> {
+    let work = move || {
+        // On Linux, this concerns the calling thread only. If it fails, the thread competes like any other.
+        rustix::process::nice(NICENESS).ok();
+        work();
+    };
     let thread = std::thread::Builder::new().name(name.to_owned()).spawn(work);
     thread.map(drop).or_exit(Exit::TryAgain, || "cannot start a thread".to_owned())
 }
