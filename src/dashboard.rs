@@ -17,6 +17,11 @@ const FIRST_PORT: u16 = 8600;
 /// Number of ports that are tried if they are in use.
 const N_PORTS: u16 = 100;
 
+/// Returns the first address of a dashboard for which none is named.
+pub(crate) const fn default_address() -> SocketAddr {
+    SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), FIRST_PORT)
+}
+
 /// Returns the first address that a dashboard tries, unless there is none.
 ///
 /// # Errors
@@ -25,8 +30,7 @@ pub(crate) fn address(args: &DashboardArgs) -> Result<Option<SocketAddr>, Failed
     if args.no_dashboard {
         return Ok(None);
     }
-    let default = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), FIRST_PORT);
-    let address = args.dashboard.unwrap_or(default);
+    let address = args.dashboard.unwrap_or_else(default_address);
     access("--dashboard", address, args.dashboard_token_file.as_deref(), false)?;
     Ok(Some(address))
 }

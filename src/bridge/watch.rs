@@ -80,7 +80,9 @@ impl Plan {
         });
         let journal = journal.transpose()?;
         let page = match access {
-            Some((address, access)) => bind(address, access, args.dashboard.is_none()).await?,
+            Some((address, access)) => {
+                bind(address, access, args.dashboard.dashboard.is_none()).await?
+            }
             None => None,
         };
         Ok(Self { journal, live, page })
@@ -254,11 +256,11 @@ fn page_access(
     args: &BridgeServeArgs,
     token: Option<&Token>,
 ) -> Result<Option<(SocketAddr, Access)>, Failed> {
-    if args.no_dashboard {
+    if args.dashboard.no_dashboard {
         return Ok(None);
     }
-    let address = args.dashboard.unwrap_or_else(dashboard::default_address);
-    let own = args.dashboard_token_file.as_deref().map(access::read_token).transpose()?;
+    let address = args.dashboard.dashboard.unwrap_or_else(dashboard::default_address);
+    let own = args.dashboard.dashboard_token_file.as_deref().map(access::read_token).transpose()?;
     let rules = match own.as_ref().or(token) {
         Some(token) => Access::with_token(token.clone()),
         None => dashboard::access("--dashboard", address, None, args.listen.insecure)?,

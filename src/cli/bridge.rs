@@ -1,14 +1,19 @@
 //! The command line of `tandem bridge`.
 
-use std::net::SocketAddr;
 use std::path::PathBuf;
 
 use clap::{Args, Subcommand, ValueEnum};
 
-use super::{ByteSize, ClientArgs, ListenArgs, LiveArgs, MetricsArgs, SecretArgs, TrialArgs};
+use super::{
+    ByteSize, ClientArgs, DashboardArgs, ListenArgs, LiveArgs, MetricsArgs, SecretArgs, TrialArgs,
+};
 
 /// Default address of a bridge.
 const ADDRESS: &str = "127.0.0.1:7002";
+const DASHBOARD_HELP: &str = "Address of the dashboard, which shows the arms in a browser and has a stop button. If its \
+    port is in use, the next free one is taken. [default: 127.0.0.1:8600]";
+const TOKEN_HELP: &str =
+    "File with the token that the dashboard asks for [default: that of --token-file]";
 const LIVE_HELP: &str = "Shows the arms in Foxglove, over a websocket at this address [with no address: \
     127.0.0.1:8765]. Anyone who can reach the address can watch";
 
@@ -42,7 +47,9 @@ pub(crate) struct BridgeArgs {
 #[derive(Debug, Args)]
 #[command(
     mut_arg("listen", |arg| arg.default_value(ADDRESS)),
-    mut_arg("live", |arg| arg.help(LIVE_HELP).long_help(LIVE_HELP))
+    mut_arg("live", |arg| arg.help(LIVE_HELP)),
+    mut_arg("dashboard", |arg| arg.help(DASHBOARD_HELP)),
+    mut_arg("dashboard_token_file", |arg| arg.help(TOKEN_HELP))
 )]
 pub(crate) struct BridgeServeArgs {
     /// Driver of the arms.
@@ -65,16 +72,8 @@ pub(crate) struct BridgeServeArgs {
     pub(crate) log_budget: ByteSize,
     #[command(flatten)]
     pub(crate) live: LiveArgs,
-    /// Address of the dashboard, which shows the arms in a browser and has a stop button. If its port is in use, the
-    /// next free one is taken. [default: 127.0.0.1:8600]
-    #[arg(long, value_name = "ADDR")]
-    pub(crate) dashboard: Option<SocketAddr>,
-    /// File with the token that the dashboard asks for [default: that of --token-file].
-    #[arg(long, value_name = "FILE", requires = "dashboard")]
-    pub(crate) dashboard_token_file: Option<PathBuf>,
-    /// Serves no dashboard.
-    #[arg(long, conflicts_with = "dashboard")]
-    pub(crate) no_dashboard: bool,
+    #[command(flatten)]
+    pub(crate) dashboard: DashboardArgs,
     #[command(flatten)]
     pub(crate) listen: ListenArgs,
     #[command(flatten)]
