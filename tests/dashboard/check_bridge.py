@@ -143,7 +143,8 @@ def check_foreign_page(bridge):
     assert post("stop", {}) == 403
     assert post("stop", {"Host": "evil.example", "x-tandem-action": "stop"}) == 421
     assert post("reset", {"x-tandem-action": "reset"}) == 404
-    assert bridge.status()["stopped"] is None, bridge.status()
+    stopped = bridge.status()["stopped"]
+    assert stopped is None or stopped["name"] in BUSY, stopped
 
 
 def check_layout(page):
@@ -185,7 +186,8 @@ def main():
         page.wait("document.getElementById('last-stop').textContent.includes('not reset')", "the page shows the arms")
         check_tab(page)
         bridge.reset()
-        page.wait("document.getElementById('phase').textContent === 'idle'", "the reset is shown", 5)
+        page.wait("document.getElementById('last-stop-time').textContent.includes('reset since') || "
+                  "!document.getElementById('last-stop').textContent.includes('not reset')", "the reset is shown", 5)
         check_foreign_page(bridge)
 
         def by_mouse(mover):
