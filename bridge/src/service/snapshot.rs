@@ -153,3 +153,35 @@ impl Snapshots {
         self.n_lost.load(Ordering::Relaxed)
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_full_queue_delays_nobody_and_counts_what_is_lost() {
+        let (observer, mut snapshots) = observe(2);
+        for number in 1..=5 {
+            observer.publish(&Arc::new(Snapshot {
+                now_s: f64::from(number),
+                phase: Phase::Idle,
+                stopped: None,
+                exchange_failed: false,
+                stop_error: None,
+                lease_left_s: None,
+                at_rest: true,
+                state: None,
+                reference: None,
+                motion: None,
+                progress: None,
+                n_motions: 0,
+                n_good: 0,
+                n_stops: 0,
+            }));
+        }
+        drop(observer);
+        let received: Vec<f64> =
+            std::iter::from_fn(|| snapshots.wait()).map(|snapshot| snapshot.now_s).collect();
+        assert_eq!((received, snapshots.n_lost()), (vec![1.0, 2.0], 3));
+    }
+}
