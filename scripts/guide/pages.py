@@ -119,7 +119,9 @@ def without_comment(command: str) -> str:
 
 
 def is_complete(command: str) -> bool:
-    return subprocess.run(["bash", "-n", "-c", command], capture_output=True).returncode == 0
+    """Returns whether bash accepts a text; of a here-document without an end it only warns."""
+    result = subprocess.run(["bash", "-n", "-c", command], capture_output=True)
+    return result.returncode == 0 and not result.stderr
 
 
 def simple_commands(command: str) -> list[list[str]]:

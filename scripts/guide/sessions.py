@@ -207,8 +207,8 @@ def difference(shown: list[str], text: str) -> str | None:
 
 
 def first_words(line: str) -> list[str]:
-    """Returns the first two words of a line; numbers differ from run to run."""
-    return re.findall(r"[A-Za-z]{2,}", line)[:2]
+    """Returns the first two words of a line, of an error the first ten; numbers differ from run to run."""
+    return re.findall(r"[A-Za-z]{2,}", line)[: 10 if line.startswith("tandem:") else 2]
 
 
 def copy(source: Path, target: Path) -> None:
