@@ -39,7 +39,10 @@ class Source:
             target.write_text(rewrite(page.read_text(), lambda link: self.link(page, link)))
 
     def page(self, page: Path) -> Path:
-        return self.directory / (page.name if page in BESIDE else page.relative_to(DOCS))
+        if page in BESIDE:
+            return self.directory / page.name
+        # mdBook calls the page of a README.md index.html, but does not change the links to it.
+        return (self.directory / page.relative_to(DOCS)).with_stem("index" if page.stem == "README" else page.stem)
 
     def link(self, page: Path, link: str) -> str:
         """Returns the target of a page's link in the book."""
@@ -58,8 +61,10 @@ class Source:
             return self.page(held)
         if in_docs:
             return self.directory / held.relative_to(DOCS)
-        suffix = "" if held.suffix in SHOWN_BY_BROWSERS else ".txt"
-        target = self.directory / "files" / f"{held.relative_to(ROOT)}{suffix}"
+        target = self.directory / "files" / held.relative_to(ROOT)
+        if held.suffix not in SHOWN_BY_BROWSERS:
+            # mdBook changes `.md` within a link.
+            target = target.with_suffix(".txt") if held.suffix == ".md" else target.with_name(f"{target.name}.txt")
         self.copy(held, target)
         return target
 

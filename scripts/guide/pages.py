@@ -48,7 +48,8 @@ def commands(page: str) -> list[Command]:
         parse = of_console if is_console(match["label"], match["text"]) else of_script
         for line, command, expected in parse(match["text"]):
             for name, value in replacements(match["where"]):
-                command = re.sub(rf"(?<![\w/.-]){re.escape(name)}(?![\w-])", value.replace("\\", r"\\"), command)
+                end = r"(?![\w-])" if name[-1].isalnum() else ""
+                command = re.sub(rf"(?<![\w/.-]){re.escape(name)}{end}", lambda _, value=value: value, command)
             found.append(Command(page, first + line, without_comment(command), number, expected))
     return found
 

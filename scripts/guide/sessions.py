@@ -76,7 +76,7 @@ class Session:
         """Executes a command, and starts it in the background if it is a server."""
         if command.block != self.block:
             self.block, self.current = command.block, self.directory
-        ready = server_of(command.text)
+        ready = None if is_refused(command) else server_of(command.text)
         process = self.start(command, as_server=ready is not None)
         self.processes.append(process)
         if ready is not None:
@@ -92,7 +92,7 @@ class Session:
         cwd = self.work / "cwd"
         self.current = Path(cwd.read_text().strip()) if cwd.exists() else self.current
         self.compare(command, process)
-        fails = INTERRUPT in command.expected or any(line.startswith("tandem: ") for line in command.expected)
+        fails = INTERRUPT in command.expected or is_refused(command)
         if fails == (self.code == 0):
             raise Failure(f"exit code {self.code}\n{process.text()}")
 
@@ -188,6 +188,11 @@ class Process:
             raise Failure(f"no end within {timeout_s} s\n{self.text()}") from None
         self.reader.join(2)
         return code
+
+
+def is_refused(command: Command) -> bool:
+    """Returns whether a page shows that a command fails."""
+    return any(line.startswith("tandem: ") for line in command.expected)
 
 
 def server_of(command: str) -> str | None:
