@@ -4,6 +4,7 @@ An entry that fits no command of the guide is an error, as is an entry whose fil
 subcommands of `tandem` are compared with `--help` for these commands too.
 """
 
+import shlex
 from dataclasses import dataclass
 
 from pages import ROOT, Command, simple_commands
@@ -21,10 +22,11 @@ class Entry:
     def fits(self, command: Command) -> bool:
         if self.page and command.page != self.page:
             return False
-        words = self.words.split()
+        words = shlex.split(self.words)
         return any(part[: len(words)] == words for part in simple_commands(command.text))
 
 
+SERVED = "python/tests/test_environment_server.py"
 ELSEWHERE = [
     # Programs that need another machine, a registry or hardware.
     Entry("docker", "needs Docker", "scripts/test-compose"),
@@ -41,9 +43,10 @@ ELSEWHERE = [
     Entry("pip install", "needs a package registry", "scripts/test-python"),
     Entry("tensorboard", "needs a package of PyPI", "scripts/test-metrics"),
     # Programs that need the Python package, MuJoCo or PyTorch.
-    Entry("python -m tandem.serve", "needs the Python package", "python/tests/test_environment_server.py"),
-    Entry("tandem eval --policy FILE", "needs MuJoCo", "python/tests/test_environment_server.py", "docs/environments.md"),
-    Entry("tandem train --env-command", "needs MuJoCo", "python/tests/test_environment_server.py"),
+    Entry("python -m tandem.serve", "needs the Python package", SERVED),
+    Entry("tandem eval --policy FILE", "needs MuJoCo", SERVED, "docs/environments.md"),
+    Entry("tandem train --env-command 'python -m tandem.serve FetchPush-v4'", "needs MuJoCo", SERVED),
+    Entry("tandem train --env-command 'python -m tandem.serve tandem/TwoFetchPush-v0'", "needs MuJoCo", SERVED),
     Entry("python scripts/benchmarks.py run", "trains for hours", ""),
     Entry("python scripts/benchmarks.py composed", "evaluates a teacher that takes hours", ""),
     Entry("python scripts/benchmarks.py collect", "collects what took hours", ""),
