@@ -68,7 +68,7 @@ ELSEWHERE = [
     Entry("cp minimized-from-...", "minimises an input that makes a decoder fail", ""),
     Entry("scripts/make-corpus", "writes files of a new version", "tests/compatibility"),
     # Servers of the reader's own.
-    Entry("tandem replay", "needs a server of another task", "tests/environments.rs", "docs/episode-logs.md"),
+    Entry("tandem replay", "needs a server of another task", "worker/tests/services/environments.rs", "docs/episode-logs.md"),
 ]
 
 
