@@ -12,7 +12,7 @@ from pages import ROOT, Command, simple_commands
 
 @dataclass(frozen=True)
 class Entry:
-    """The first words of a command, why it is not executed, and the file that tests it ("": the reason says why not)."""
+    """The first words of a command, why it is not executed, and the file that tests it ("" if none does)."""
 
     words: str
     reason: str
@@ -27,6 +27,7 @@ class Entry:
 
 
 SERVED = "python/tests/test_environment_server.py"
+REPLAYED = "worker/tests/services/environments.rs"
 ELSEWHERE = [
     # Programs that need another machine, a registry or hardware.
     Entry("docker", "needs Docker", "scripts/test-compose"),
@@ -68,7 +69,7 @@ ELSEWHERE = [
     Entry("cp minimized-from-...", "minimises an input that makes a decoder fail", ""),
     Entry("scripts/make-corpus", "writes files of a new version", "tests/compatibility"),
     # Servers of the reader's own.
-    Entry("tandem replay", "needs a server of another task", "worker/tests/services/environments.rs", "docs/episode-logs.md"),
+    Entry("tandem replay", "needs a server of another task", REPLAYED, "docs/episode-logs.md"),
 ]
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
 BLOCK = re.compile(
-    r"(?:^<!-- example: where (?P<where>.*?) -->\n)?^```(?P<label>\S*)\n(?P<text>.*?)^```$", re.MULTILINE | re.DOTALL
+    r"(?:^<!-- example: where (?P<where>(?:(?!-->).)*?)\s*-->\n)?^```(?P<label>\S*)\n(?P<text>.*?)^```$", re.MULTILINE | re.DOTALL
 )
 INLINE = re.compile(r"(?<!`)`((?:tandem|scripts/|python )[^`]+)`(?!`)")
 COMMAND_LABELS = ("", "sh", "console")
@@ -66,7 +66,7 @@ def inline_commands(page: str) -> list[Command]:
 
 def replacements(where: str | None) -> list[tuple[str, str]]:
     """Parses `FILE=policies/a.safetensors, runs/NAME=$RUN`; longer names come first."""
-    pairs = [tuple(pair.strip().split("=", 1)) for pair in (where or "").split(", ") if pair]
+    pairs = [tuple(pair.split("=", 1)) for pair in re.split(r",\s+", where or "") if pair]
     return sorted(pairs, key=lambda pair: -len(pair[0]))
 
 
