@@ -16,6 +16,8 @@ from links import rewrite
 from pages import ROOT
 
 DOCS = ROOT / "docs"
+# In the book, the table of contents is beside every page.
+FIRST_PAGE = DOCS / "quick-start.md"
 # Pages of the book that lie beside docs/.
 BESIDE = (ROOT / "ARCHITECTURE.md", ROOT / "CONTRIBUTING.md")
 SHOWN_BY_BROWSERS = {".gif", ".html", ".jpg", ".json", ".pdf", ".png", ".svg", ".txt"}
@@ -54,6 +56,8 @@ class Source:
         return f"{target}#{heading}" if heading else target
 
     def target(self, held: Path) -> Path:
+        if held == DOCS / "SUMMARY.md":
+            held = FIRST_PAGE
         in_docs = DOCS in (held, *held.parents)
         if held.is_dir():
             return self.page(held / "README.md") if in_docs and (held / "README.md").exists() else self.listing(held)
