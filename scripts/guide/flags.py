@@ -1,4 +1,4 @@
-"""Compares the options of `tandem` commands with what `--help` prints."""
+"""Compares commands with what exists: scripts, and the options that `tandem --help` prints."""
 
 import functools
 import re
@@ -6,7 +6,7 @@ import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 
-from pages import Command, simple_commands
+from pages import ROOT, Command, simple_commands
 
 NAME = re.compile(r"[a-z][a-z-]*")
 OPTION = re.compile(r"(?<![\w-])(--[a-z][a-z-]*|-[a-zA-Z])\b")
@@ -19,8 +19,10 @@ class Flags:
         self.program = program
 
     def check(self, command: Command) -> Iterator[str]:
-        """Yields a line for each subcommand or option of `tandem` that does not exist."""
+        """Yields a line for each script, and each subcommand and option of `tandem`, that does not exist."""
         for words in simple_commands(command.text):
+            if missing := [word for word in words[:2] if word.startswith("scripts/") and not (ROOT / word).exists()]:
+                yield f"{missing[0]} does not exist"
             if (start := start_of(words)) is not None:
                 yield from self.check_words(words[start + 1 :])
 

@@ -4,6 +4,7 @@ import tempfile
 from pathlib import Path
 
 from elsewhere import entry_for, unfit_entries
+from flags import Flags
 from links import broken, headings, rewrite
 from pages import ROOT, Command, of_console, of_script, replacements, simple_commands, without_comment
 from sessions import difference, is_refused, server_of
@@ -14,6 +15,7 @@ def main() -> None:
     commands()
     outputs()
     rules()
+    options()
     links()
 
 
@@ -43,6 +45,15 @@ def rules() -> None:
     assert "--max-env-steps" in train(["train"]) and "9" not in train(["train", "--max-env-steps", "9"])
     assert to_toml({"a": {"b": [1, True]}}) == '"a" = { "b" = [1, true] }\n'
     assert sweep(["sweep", "a.toml", "--dry-run"]) == ["sweep", "a.toml", "--dry-run"]
+
+
+def options() -> None:
+    flags = Flags(Path("tandem"))
+    flags.help = lambda names: "Commands:\n  train  Trains\n\nOptions:\n  -q, --quiet\n" if not names else "--seed <N>"
+    assert not list(flags.check(command("tandem train --seed 1 && a --b")))
+    assert len(list(flags.check(command("tandem train --sed 1")))) == 1
+    assert len(list(flags.check(command("tandem trian")))) == 1
+    assert len(list(flags.check(command("scripts/missing --x")))) == 1
 
 
 def links() -> None:
