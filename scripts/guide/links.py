@@ -44,13 +44,13 @@ def targets(text: str) -> list[str]:
     return found
 
 
-def broken(file: Path) -> Iterator[str]:
+def broken(file: Path, root: Path = ROOT) -> Iterator[str]:
     """Yields a line for each link of a file whose target, or whose heading there, does not exist."""
     for target in targets(file.read_text()):
         path, _, heading = target.partition("#")
         held = (file.parent / path).resolve() if path else file
-        place = file.relative_to(ROOT)
-        if not held.exists() or ROOT not in (held, *held.parents):
+        place = file.relative_to(root)
+        if not held.exists() or root not in (held, *held.parents):
             yield f"{place}: {target} does not exist"
         elif heading and held.suffix == ".md" and heading not in headings(held.read_text()):
             yield f"{place}: {target}: there is no such heading"

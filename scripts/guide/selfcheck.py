@@ -6,7 +6,7 @@ from pathlib import Path
 from elsewhere import entry_for, unfit_entries
 from flags import Flags
 from links import broken, headings, rewrite
-from pages import ROOT, Command, of_console, of_script, replacements, simple_commands, without_comment
+from pages import Command, of_console, of_script, replacements, simple_commands, without_comment
 from sessions import difference, is_refused, server_of
 from shortened import sweep, to_toml, train, without
 
@@ -59,10 +59,10 @@ def options() -> None:
 def links() -> None:
     assert headings("# A `b`, c\n# A `b`, c\n") == {"a-b-c", "a-b-c-1"}
     assert rewrite("[a](b) `[c](d)` [e](https://f)", str.upper) == "[a](B) `[c](d)` [e](https://f)"
-    with tempfile.NamedTemporaryFile(mode="w", suffix=".md", dir=ROOT / "target") as page:
-        page.write("# Here\n[a](missing.md) [b](#there) [c](#here) [d](../README.md)\n")
-        page.flush()
-        assert len(list(broken(Path(page.name)))) == 2
+    with tempfile.TemporaryDirectory() as directory:
+        page = Path(directory).resolve() / "page.md"
+        page.write_text("# Here\n[a](missing.md) [b](#there) [c](#here) [d](page.md#here) [e](..)\n")
+        assert len(list(broken(page, page.parent))) == 3
 
 
 def command(text: str, expected: list[str] | None = None) -> Command:
