@@ -209,7 +209,7 @@ impl Page {
             arms_gap_m: settings.arms_gap_m,
             self_gap_m: settings.self_gap_m,
         };
-        output::message(format_args!("tandem: dashboard on {}", dashboard::url(self.address)));
+        output::message(format_args!("dashboard on {}", dashboard::url(self.address)));
         let site = Site::of_bridge(terms, views, stop_action(operator.clone()));
         let stop = CancellationToken::new();
         drop(tokio::spawn(tandem_dashboard::serve(site, self.access, self.listener, stop.clone())));
