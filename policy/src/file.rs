@@ -51,8 +51,16 @@ impl Policy {
     pub fn load(path: &Path) -> Result<Self, Error> {
         let bytes = regular_file::read(path)
             .map_err(|source| Error::Read { path: path.to_owned(), source })?;
-        decode(&bytes)
+        Self::from_bytes(&bytes)
             .map_err(|source| Error::Refused { path: path.to_owned(), source: Box::new(source) })
+    }
+
+    /// Reads a policy from the contents of a file.
+    ///
+    /// # Errors
+    /// As [`Policy::load`].
+    pub fn from_bytes(bytes: &[u8]) -> Result<Self, FormatError> {
+        decode(bytes)
     }
 }
 
