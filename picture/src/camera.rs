@@ -37,6 +37,25 @@ impl View {
         self.0.project(DVec3::from(point.map(f64::from)))
     }
 
+    /// Returns the distance of `point` (world frame, metres) from the camera along the direction of the view, metres. Points
+    /// with larger depths are behind.
+    #[must_use]
+    pub fn depth_m(&self, point: Point) -> f64 {
+        (DVec3::from(point.map(f64::from)) - self.0.eye).dot(self.0.forward)
+    }
+
+    /// Returns the number of pixels of a metre across the view at `point`, world frame, metres.
+    #[must_use]
+    pub fn pixels_per_m(&self, point: Point) -> f64 {
+        self.0.focal_px / self.depth_m(point).max(NEAREST_M)
+    }
+
+    /// Returns the position of the camera, world frame, metres.
+    #[must_use]
+    pub fn eye(&self) -> [f64; 3] {
+        self.0.eye.to_array()
+    }
+
     /// Returns the point at height `z_m` (world frame, metres) that is drawn at this place of the picture, pixels; `None`
     /// if the place is above the horizon.
     #[must_use]
@@ -200,5 +219,7 @@ mod tests {
             }
         }
         assert_eq!(view.at_height([320.0, -10_000.0], 0.0), None, "the sky");
+        assert!(view.depth_m([0.0, 0.3, 0.0]) > view.depth_m([0.0, -0.3, 0.0]));
+        assert!(view.pixels_per_m([0.0, 0.3, 0.0]) < view.pixels_per_m([0.0, -0.3, 0.0]));
     }
 }

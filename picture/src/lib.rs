@@ -31,7 +31,7 @@ pub use error::Error;
 #[cfg(feature = "files")]
 pub use film::{Film, FilmEpisode, FilmStep, film_gif};
 pub use interpolate::between;
-pub use painter::{render, render_on};
+pub use painter::render;
 pub use raster::Raster;
 #[cfg(feature = "files")]
 pub use strip::{STRIP_PICTURES, film_strip, picture_png};

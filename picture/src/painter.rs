@@ -66,21 +66,7 @@ pub(crate) fn render_achieved(
     width: usize,
     height: usize,
 ) -> Raster {
-    render_on(BACKGROUND.to_array().map(to_u8), scene, achieved, width, height)
-}
-
-/// Draws `scene` before a background of this colour (red, green, blue); `achieved` contains which goals are achieved and
-/// have a stronger colour.
-#[must_use]
-pub fn render_on(
-    background: [u8; 3],
-    scene: &Scene,
-    achieved: &[bool],
-    width: usize,
-    height: usize,
-) -> Raster {
-    let background = DVec3::from(background.map(f64::from));
-    let painter = Painter { background, ..Painter::new(scene, achieved, width, height) };
+    let painter = Painter::new(scene, achieved, width, height);
     let bodies: Vec<Sample> =
         pixels(width, height).map(|(x, y)| painter.sample(centre(x), centre(y))).collect();
     let mut rgb = Vec::with_capacity(3 * width * height);
@@ -163,7 +149,6 @@ struct Painter {
     /// Directions towards points of the light, unit vectors.
     light_points: [DVec3; N_LIGHT_POINTS as usize],
     goals: Vec<Goal>,
-    background: Rgb,
     table_z_m: f64,
     tolerance_m: f64,
 }
@@ -198,7 +183,6 @@ impl Painter {
             bodies,
             goals: scene.goals.iter().zip(colors()).zip(achieved).map(goal).collect(),
             camera,
-            background: BACKGROUND,
             table_z_m,
             tolerance_m,
         }
@@ -221,7 +205,7 @@ impl Painter {
             Some((idx, hit)) => {
                 self.shade(*idx, hit, origin + hit.distance_m * direction, direction)
             }
-            None => (self.background, Surface { body: None, n_lit: 0, face: [0; 3], goals: 0 }),
+            None => (BACKGROUND, Surface { body: None, n_lit: 0, face: [0; 3], goals: 0 }),
         };
         for (idx, goal) in self.goals.iter().enumerate().filter(|(_, it)| it.bounds.contains(x, y))
         {
