@@ -163,7 +163,7 @@ class App {
     this.bindDrop();
     $("replay-play").onclick = () => this.log.toggle();
     $("position").oninput = event => { this.log.seek(event.target.valueAsNumber); this.screen.isStale = true; };
-    $("back").onclick = () => this.leaveLog();
+    $("back").onclick = () => { this.leaveLog(); $("play").focus(); };
     new ResizeObserver(() => { this.screen.isStale = true; }).observe($("scene"));
   }
 
@@ -255,13 +255,14 @@ class App {
         + `is ${difference.logged} in the log, ${difference.played} when simulated again`
       : `${steps} of ${steps} steps equal bit for bit${scope}`, !difference);
     $("log-details").textContent = `${name}: ${PRETTY[facts.task]}, ${facts.arms === 1 ? "1 arm" : `${facts.arms} arms`}, `
-      + `${facts.is_training ? "training" : "evaluation"} episode ${facts.episode} of run ${facts.run}, seed ${facts.seed}`;
+      + `${facts.is_training ? "training" : "evaluation"} episode ${facts.episode}`
+      + `${facts.run ? ` of run ${facts.run}` : ""}, seed ${facts.seed}`;
     $("log-details").hidden = false;
   }
 
   showLog(name) {
     $("title").textContent = name;
-    $("live-controls").hidden = true;
+    $("live-controls").hidden = $("rate-tile").hidden = true;
     $("replay-controls").hidden = false;
     $("second-tile").hidden = this.log.facts.arms < 2;
     $("position").max = this.log.facts.steps;
@@ -275,7 +276,7 @@ class App {
   leaveLog() {
     this.log = null;
     $("title").textContent = "The student";
-    $("live-controls").hidden = false;
+    $("live-controls").hidden = $("rate-tile").hidden = false;
     $("replay-controls").hidden = true;
     $("second-tile").hidden = false;
     this.times = [];
@@ -375,7 +376,7 @@ function showDistances(distances_m, tolerance_m) {
   distances_m.forEach((distance_m, arm) => {
     const isReached = distance_m <= tolerance_m;
     $(`distance-${arm}`).textContent = `${(100 * distance_m).toFixed(1)} cm`;
-    $(`reached-${arm}`).textContent = isReached ? "reached" : `more than ${(100 * tolerance_m).toFixed(0)} cm`;
+    $(`reached-${arm}`).textContent = isReached ? "from its goal: reached" : "from its goal";
     $(`reached-${arm}`).className = isReached ? "detail good" : "detail";
   });
 }

@@ -63,11 +63,10 @@ export class Screen {
     return true;
   }
 
-  paint({ table, shadows, rings, items }, width, height) {
+  paint({ table, top, shadows, rings, items }, width, height) {
     const { context } = this;
     for (const face of table) this.polygon(face.points, css(lit(TABLE, face.shade)));
-    const top = table.at(-1);
-    this.paintShadows(shadows, top.points, width, height);
+    this.paintShadows(shadows, top, width, height);
     rings.forEach((ring, arm) => {
       this.polygon(ring, css(ARMS[arm], 0.14));
       context.strokeStyle = css(lit(ARMS[arm], 0.9), 0.75);
@@ -76,6 +75,7 @@ export class Screen {
     });
     for (const item of items) {
       if (item.of === "goal") this.goal(item);
+      else if (item.of === "joint") this.joint(item);
       else if (item.points) this.face(item);
       else this.rod(item);
     }
@@ -111,8 +111,8 @@ export class Screen {
   }
 
   /** Draws a cylinder with round ends, lit from one side. */
-  rod({ of, arm, from, to, width }) {
-    const color = of === "joint" ? ARMS[arm] : mix(LINK, ARMS[arm], LINK_TINT);
+  rod({ arm, from, to, width }) {
+    const color = mix(LINK, ARMS[arm], LINK_TINT);
     const { context } = this;
     const [x, y] = [to[0] - from[0], to[1] - from[1]];
     const length = Math.hypot(x, y);
@@ -126,6 +126,22 @@ export class Screen {
       context.lineWidth = share * width;
       context.stroke();
     }
+  }
+
+  joint({ arm, centre, radius }) {
+    const [x, y] = centre.map((it, axis) => it + 0.35 * radius * LIGHT[axis]);
+    const shading = this.context.createRadialGradient(x, y, 0.1 * radius, ...centre, radius);
+    shading.addColorStop(0, css(lit(ARMS[arm], 1.4)));
+    shading.addColorStop(0.5, css(ARMS[arm]));
+    shading.addColorStop(1, css(lit(ARMS[arm], 0.68)));
+    this.disc(centre, radius, shading);
+  }
+
+  disc(centre, radius, style) {
+    this.context.beginPath();
+    this.context.arc(...centre, radius, 0, 2 * Math.PI);
+    this.context.fillStyle = style;
+    this.context.fill();
   }
 
   goal({ arm, centre, radius, foot, is_achieved }) {
@@ -144,10 +160,7 @@ export class Screen {
     shading.addColorStop(0, css(lit(color, 1.5), 0.7 * opacity));
     shading.addColorStop(0.75, css(color, opacity));
     shading.addColorStop(1, css(color, Math.min(opacity + 0.3, 0.85)));
-    context.beginPath();
-    context.arc(...centre, radius, 0, 2 * Math.PI);
-    context.fillStyle = shading;
-    context.fill();
+    this.disc(centre, radius, shading);
   }
 
   polygon(points, color) {

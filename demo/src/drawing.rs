@@ -20,11 +20,11 @@ const SQUARE: [[f32; 2]; 4] = [[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0
 
 /// Returns the shapes of `scene` in a picture of this size, places in pixels from the upper left corner:
 ///
-/// - `table`: faces of the table
+/// - `table`: faces of the table; `top`: the corners of its top
 /// - `shadows`: polygons (`points`) and lines (`from`, `to`, `width`) on the table
 /// - `rings`: for each goal a polygon on the table below it
-/// - `items`: faces (`points`, `shade`), lines (`from`, `to`, `width`) and goals (`goal`, `centre`, `radius`, `foot`), from
-///   back to front; `of` is what they belong to, `arm` the index of its arm
+/// - `items`: faces (`points`, `shade`), lines (`from`, `to`, `width`), joints (`centre`, `radius`) and goals (`centre`,
+///   `radius`, `foot`, `is_achieved`), from back to front; `of` is what they belong to, `arm` the index of its arm
 #[must_use]
 pub(crate) fn drawing(scene: &Scene, achieved: &[bool], width: usize, height: usize) -> Value {
     let mut drawing = Drawing {
@@ -35,6 +35,7 @@ pub(crate) fn drawing(scene: &Scene, achieved: &[bool], width: usize, height: us
     };
     drawing.add_cuboid(&scene.table, "table", 0);
     let table = drawing.take_items();
+    let top = face(2, 1.0).map(|signs| drawing.view.project(corner(&scene.table, signs)));
     drawing.shadows.clear();
     for (arm_idx, arm) in scene.arms.iter().enumerate() {
         drawing.add_arm(arm, arm_idx);
@@ -49,7 +50,7 @@ pub(crate) fn drawing(scene: &Scene, achieved: &[bool], width: usize, height: us
     let ring = |goal: &Point| drawing.ring(*goal, scene.goal_tolerance_m);
     let rings: Vec<Value> = scene.goals.iter().map(ring).collect();
     let items = drawing.take_items();
-    json!({ "table": table, "shadows": drawing.shadows, "rings": rings, "items": items })
+    json!({ "table": table, "top": top, "shadows": drawing.shadows, "rings": rings, "items": items })
 }
 
 struct Drawing {
@@ -83,10 +84,8 @@ impl Drawing {
         }
         for pair in links.windows(2) {
             let [link, next] = pair else { continue };
-            if link.to == next.from {
-                let radius_m = JOINT_WIDENING * link.radius_m.max(next.radius_m);
-                self.add_joint(link.to, radius_m, idx);
-            }
+            let radius_m = JOINT_WIDENING * link.radius_m.max(next.radius_m);
+            self.add_joint(link.to, radius_m, idx);
         }
         for part in &arm.hand {
             self.add_cuboid(part, "hand", idx);
@@ -104,9 +103,9 @@ impl Drawing {
     }
 
     fn add_joint(&mut self, centre: Point, radius_m: f32, arm: usize) {
-        let width = 2.0 * f64::from(radius_m) * self.view.pixels_per_m(centre);
+        let radius = f64::from(radius_m) * self.view.pixels_per_m(centre);
         let place = self.view.project(centre);
-        let item = json!({ "of": "joint", "arm": arm, "from": place, "to": place, "width": width });
+        let item = json!({ "of": "joint", "arm": arm, "centre": place, "radius": radius });
         // In front of the links that it joins.
         self.items.push((self.view.depth_m(centre) - f64::from(radius_m), item));
     }
