@@ -88,7 +88,7 @@ class App {
       this.screen.isStale = true;
       this.times = this.times.filter(time => time > now_ms - 2000);
       $("steps").textContent = this.n_steps;
-      const rate = this.times.length / Math.max((now_ms - this.times[0]) / 1000, 0.5);
+      const rate = (this.times.length - 1) / Math.max((now_ms - this.times[0]) / 1000, 0.5);
       $("rate").textContent = `${rate.toFixed(0)} per s`;
       $("drawing").textContent = `drawn in ${(this.screen.cost_ms ?? 0).toFixed(1)} ms`;
     }
@@ -121,7 +121,7 @@ class App {
     $("since").textContent = seconds(status.steps_since_change * step_s);
     const first = status.steps_to_success;
     $("since-detail").textContent = first === null ? `${status.steps_since_change} control steps`
-      : `reached after ${seconds(first * step_s)}`;
+      : `reached after ${first} control steps`;
     if (status.is_success) show(badge, "Both goals reached", "good");
     else if (!status.is_in_reach) show(badge, "A cube is out of reach: restart", "bad");
     else show(badge, `${status.achieved.filter(Boolean).length} of ${status.achieved.length} goals reached`, "");
@@ -254,6 +254,8 @@ class App {
       ? `${equal_steps} of ${steps} steps equal, then step ${difference.step}: ${difference.field}[${difference.component}] `
         + `is ${difference.logged} in the log, ${difference.played} when simulated again`
       : `${steps} of ${steps} steps equal bit for bit${scope}`, !difference);
+    $("replay-verdict").textContent = $("verdict").textContent;
+    $("replay-verdict").className = $("verdict").className;
     $("log-details").textContent = `${name}: ${PRETTY[facts.task]}, ${facts.arms === 1 ? "1 arm" : `${facts.arms} arms`}, `
       + `${facts.is_training ? "training" : "evaluation"} episode ${facts.episode}`
       + `${facts.run ? ` of run ${facts.run}` : ""}, seed ${facts.seed}`;

@@ -84,8 +84,7 @@ impl Drawing {
         }
         for pair in links.windows(2) {
             let [link, next] = pair else { continue };
-            let radius_m = JOINT_WIDENING * link.radius_m.max(next.radius_m);
-            self.add_joint(link.to, radius_m, idx);
+            self.add_joint(link, next, idx);
         }
         for part in &arm.hand {
             self.add_cuboid(part, "hand", idx);
@@ -102,12 +101,15 @@ impl Drawing {
         self.shadows.push(json!({ "from": from, "to": to, "width": 0.9 * width }));
     }
 
-    fn add_joint(&mut self, centre: Point, radius_m: f32, arm: usize) {
+    /// Adds the joint at the end of `link`, in front of both links that it joins.
+    fn add_joint(&mut self, link: &Capsule, next: &Capsule, arm: usize) {
+        let (centre, radius_m) = (link.to, JOINT_WIDENING * link.radius_m.max(next.radius_m));
         let radius = f64::from(radius_m) * self.view.pixels_per_m(centre);
         let place = self.view.project(centre);
         let item = json!({ "of": "joint", "arm": arm, "centre": place, "radius": radius });
-        // In front of the links that it joins.
-        self.items.push((self.view.depth_m(centre) - f64::from(radius_m), item));
+        let middles = [link, next].map(|it| self.view.depth_m(between(it.from, it.to)));
+        let depth_m = self.view.depth_m(centre).min(middles[0]).min(middles[1]);
+        self.items.push((depth_m - f64::from(radius_m), item));
     }
 
     /// Adds the faces of a box that the camera sees.
