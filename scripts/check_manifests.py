@@ -178,7 +178,8 @@ class Checked:
             for way in ("grpc", "tcpSocket", "httpGet"):
                 if way in probe:
                     self.expect(probe[way]["port"] in ports, f"{name}: {kind} asks port {probe[way]['port']}")
-            self.expect(kind == "startupProbe" or not ports or probe, f"{name}: has no {kind}")
+            serves = any(port["name"] != "metrics" for port in container.get("ports", []))
+            self.expect(kind == "startupProbe" or not serves or probe, f"{name}: has no {kind}")
         scraped = workload["spec"]["template"]["metadata"].get("annotations", {}).get("prometheus.io/port")
         self.expect(scraped is None or int(scraped) in ports, f"{name}: figures are looked for at {scraped}")
         known = set()

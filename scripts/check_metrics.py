@@ -312,7 +312,8 @@ def main():
     write = "--write" in arguments
     (program,) = [argument for argument in arguments if argument != "--write"]
     started = time.monotonic()
-    for command in (["promtool", "check", "config", ROOT / "deploy/prometheus/prometheus.yml"], ["promtool", "test", "rules", ROOT / "deploy/prometheus/alerts_test.yml"]):
+    for command in (["promtool", "check", "config", ROOT / "deploy/prometheus/prometheus.yml"],
+                    ["promtool", "check", "config", ROOT / "deploy/prometheus/compose.yml"], ["promtool", "test", "rules", ROOT / "deploy/prometheus/alerts_test.yml"]):
         checked = subprocess.run(command, capture_output=True, text=True)
         expect(checked.returncode == 0, checked.stdout + checked.stderr)
     with tempfile.TemporaryDirectory() as directory:

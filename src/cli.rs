@@ -32,7 +32,7 @@ pub(crate) use service::{
     RelayArgs, SecretArgs, TeacherArgs, WorkerArgs,
 };
 pub(crate) use task::{TaskName, WorldName, check_layout, check_task, chosen_task, task_flags};
-pub(crate) use train::{RecipeName, SweepArgs, TrainArgs};
+pub(crate) use train::{DashboardArgs, RecipeName, SweepArgs, TrainArgs};
 pub(crate) use trial::{ModeName, RecordName, TrialArgs};
 
 /// Trains policies for two robot arms with advice from a one-arm policy.

@@ -9,6 +9,7 @@ use tandem_net::is_exposed;
 use tokio::net::TcpListener;
 
 use crate::access;
+use crate::cli::DashboardArgs;
 use crate::exit::Failed;
 
 /// The first port of dashboards.
@@ -16,9 +17,18 @@ const FIRST_PORT: u16 = 8600;
 /// Number of ports that are tried if they are in use.
 const N_PORTS: u16 = 100;
 
-/// Returns the address of a dashboard for which none is named.
-pub(crate) const fn default_address() -> SocketAddr {
-    SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), FIRST_PORT)
+/// Returns the first address that a dashboard tries, unless there is none.
+///
+/// # Errors
+/// When other machines can reach the address and there is no token, or the token cannot be read.
+pub(crate) fn address(args: &DashboardArgs) -> Result<Option<SocketAddr>, Failed> {
+    if args.no_dashboard {
+        return Ok(None);
+    }
+    let default = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), FIRST_PORT);
+    let address = args.dashboard.unwrap_or(default);
+    access("--dashboard", address, args.dashboard_token_file.as_deref(), false)?;
+    Ok(Some(address))
 }
 
 /// Returns who may see a dashboard on `address`: anyone on this machine, and others with the token in `token_file`.

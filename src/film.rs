@@ -5,6 +5,7 @@ use std::path::Path;
 use tandem_core::rng::{Stream, episode_rng};
 use tandem_core::{Episode, Layout, TaskSpec, WorldSettings};
 use tandem_picture::{Film, FilmEpisode, FilmStep, film_gif, film_strip};
+use tandem_report::FilmStrip;
 use tandem_sim::{Env, SimError, WorldConfig};
 
 use crate::cli::FilmArgs;
@@ -74,6 +75,23 @@ impl std::fmt::Display for PlannedFilm<'_> {
 pub(crate) fn strip(episodes: &[FilmEpisode]) -> Result<Vec<u8>, Failed> {
     let (width, height) = STRIP_SIZE;
     film_strip(episodes, &Film { width, height, speed: 1.0 }).or_exit(Exit::Bug, String::new)
+}
+
+/// Draws the first success and the first failure among the episodes of an evaluation with `seed`, as far as there are.
+pub(crate) fn of_outcomes(
+    layout: Layout,
+    seed: u64,
+    episodes: &[Episode],
+) -> Result<Vec<FilmStrip>, Failed> {
+    let mut films = Vec::new();
+    for (outcome, is_success) in [("success", true), ("failure", false)] {
+        let first = episodes.iter().find(|episode| episode.succeeded() == is_success);
+        let Some(first) = first else { continue };
+        let png = strip(std::slice::from_ref(&of_evaluation(layout, seed, first)?))?;
+        let title = format!("A {outcome}: test goal {}", first.number);
+        films.push(FilmStrip { title, file_name: format!("film-{outcome}.png"), png });
+    }
+    Ok(films)
 }
 
 /// Simulates an episode of an evaluation with `seed` again, for a film.

@@ -34,6 +34,7 @@ mod output;
 mod picture;
 mod policy;
 mod policy_file;
+mod progress_json;
 mod progress_text;
 mod replay;
 mod report;

@@ -116,20 +116,20 @@ fn films(args: &ReportArgs) -> Result<Vec<FilmStrip>, Failed> {
     for (path, n) in args.film_strips.iter().zip(1..) {
         let subject = EvaluatedPolicy::new(policy_file::load(path)?, path)?;
         let episodes = subject.play(TEST_EPISODES, TEST_SEED)?;
-        for (outcome, is_success) in [("success", true), ("failure", false)] {
-            let first = episodes.iter().find(|episode| episode.succeeded() == is_success);
-            let Some(first) = first else {
+        let strips = film::of_outcomes(subject.layout(), TEST_SEED, &episodes)?;
+        for outcome in ["success", "failure"] {
+            if strips.iter().all(|strip| !strip.file_name.contains(outcome)) {
                 warn(std::iter::once(&format!(
                     "{}: no {outcome} on {TEST_EPISODES} test goals",
                     path.display()
                 )));
-                continue;
-            };
-            let episode = film::of_evaluation(subject.layout(), TEST_SEED, first)?;
-            let png = film::strip(std::slice::from_ref(&episode))?;
-            let title = format!("{}: {outcome}, test goal {}", path.display(), first.number);
-            films.push(FilmStrip { title, file_name: format!("film-{n}-{outcome}.png"), png });
+            }
         }
+        films.extend(strips.into_iter().map(|strip| FilmStrip {
+            title: format!("{}: {}", path.display(), strip.title),
+            file_name: strip.file_name.replace("film-", &format!("film-{n}-")),
+            ..strip
+        }));
     }
     Ok(films)
 }

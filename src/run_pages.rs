@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use tandem_core::text::counted;
-use tandem_report::{Axis, CurveOptions, Quantity, Series};
+use tandem_report::{Axis, CurveOptions, FilmStrip, Quantity, Series};
 use tandem_rl::RunConfig;
 use tandem_telemetry::{MetricsLog, MetricsRow};
 
@@ -16,9 +16,13 @@ pub(crate) struct RunPages {
 }
 
 impl RunPages {
-    /// Writes curve and report of the run in `out`.
-    pub(crate) fn write(config: &RunConfig, out: &Path) -> Result<Self, Failed> {
-        Self::of_rows(config, out, &read_rows(out)?)
+    /// Writes curve and report of the run in `out`, with the film strips `films`.
+    pub(crate) fn write(
+        config: &RunConfig,
+        out: &Path,
+        films: &[FilmStrip],
+    ) -> Result<Self, Failed> {
+        Self::of_rows(config, out, &read_rows(out)?, films)
     }
 
     /// Writes curve and report if the run has evaluations, for a run that ends early or without its supervisor.
@@ -27,13 +31,18 @@ impl RunPages {
         out: &Path,
     ) -> Result<Option<Self>, Failed> {
         let rows = read_rows(out)?;
-        if rows.is_empty() { Ok(None) } else { Self::of_rows(config, out, &rows).map(Some) }
+        if rows.is_empty() { Ok(None) } else { Self::of_rows(config, out, &rows, &[]).map(Some) }
     }
 
-    fn of_rows(config: &RunConfig, out: &Path, rows: &[MetricsRow]) -> Result<Self, Failed> {
+    fn of_rows(
+        config: &RunConfig,
+        out: &Path,
+        rows: &[MetricsRow],
+        films: &[FilmStrip],
+    ) -> Result<Self, Failed> {
         Ok(Self {
             curve: draw_curve(config, out, rows)?,
-            report: tandem_report::run_report_html(out).or_cannot_write(String::new)?,
+            report: tandem_report::run_report_html(out, films).or_cannot_write(String::new)?,
         })
     }
 }

@@ -3,6 +3,7 @@
 //! The state of a sweep is in the directories of its runs, so a sweep can be stopped and restarted at any point.
 //! Finished runs are skipped, and unfinished runs are resumed from their checkpoints.
 
+mod board;
 mod display;
 mod run_process;
 mod run_status;
@@ -10,25 +11,32 @@ mod sweep_file;
 
 use std::collections::VecDeque;
 use std::fs::{File, TryLockError};
+use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use anyhow::{Context as _, anyhow, bail};
 use serde_json::{Value, json};
 use tandem_core::text::counted;
+use tandem_dashboard::Site;
+use tandem_net::is_exposed;
+use tokio::sync::watch;
 use tokio::task::JoinSet;
-use tokio_util::sync::CancellationToken;
+use tokio_util::sync::{CancellationToken, DropGuard};
 
 use crate::cli::{EnvironmentArgs, SweepArgs};
 use crate::exit::{Exit, Failed, OrExit as _};
-use crate::{output, runtime, signals};
+use crate::{dashboard, output, runtime, signals};
+use board::Board;
 use display::Display;
 use run_process::{RunOutcome, RunProcess};
 use run_status::{RunStatus, State};
 use sweep_file::PlannedSweep;
 
-/// Time between two updates of the live lines.
-const REFRESH_EVERY: Duration = Duration::from_secs(1);
+/// Time between two updates of the live lines and of the dashboard.
+const REFRESH_EVERY: Duration = Duration::from_millis(500);
+/// Time that pages have to receive the end of the sweep.
+const FAREWELL: Duration = Duration::from_millis(500);
 /// Maximum number of rejected runs that an error names.
 const MAX_NAMED: usize = 3;
 
@@ -48,11 +56,21 @@ pub(crate) fn sweep(args: &SweepArgs) -> Result<(), Failed> {
     if args.dry_run {
         return print_plan(&statuses, &out, args.json);
     }
+    let address = dashboard::address(&args.dashboard)?;
     let runtime = runtime::new().or_exit(Exit::TryAgain, String::new)?;
     let is_complete = runtime.block_on(async {
         let interrupted = signals::shutdown_token(false)?;
-        let sweep = Sweep::new(statuses.as_mut_slice(), usize::from(args.jobs), &environment);
-        sweep.run(&interrupted).await
+        let n_jobs = usize::from(args.jobs);
+        let mut sweep = Sweep::new(statuses.as_mut_slice(), n_jobs, &environment);
+        let served = match address {
+            Some(address) => sweep.serve(args, &out, address).await?,
+            None => None,
+        };
+        let is_complete = sweep.run(&interrupted).await;
+        if served.is_some() {
+            tokio::time::sleep(FAREWELL).await;
+        }
+        is_complete
     })?;
     drop(lock);
     if !is_complete {
@@ -94,7 +112,7 @@ fn refuse(refused: &[String], out: &Path) -> Result<(), Failed> {
         n => format!("; and {n} more"),
     };
     Err(Failed::usage(format!(
-        "{named}{more}: choose another --out than {}, or undo the change",
+        "{named}{more}: choose another --out than {}, or undo the change (a larger stop.max_env_steps extends runs)",
         out.display()
     )))
 }
@@ -108,6 +126,10 @@ struct Sweep<'a> {
     /// The server of the environments of all runs.
     environment: &'a EnvironmentArgs,
     display: Display,
+    /// What the dashboard shows, if there is one.
+    board: Option<Board>,
+    /// Whether each run serves a dashboard of its own, to which that of the sweep links.
+    runs_have_dashboards: bool,
 }
 
 impl<'a> Sweep<'a> {
@@ -126,7 +148,44 @@ impl<'a> Sweep<'a> {
                 display.print(&format!("{} failed before and is retried: {why}", status.run.name));
             }
         }
-        Self { statuses, waiting, n_jobs, environment, display }
+        let n_extended = statuses.iter().filter(|status| status.extends_to.is_some()).count();
+        if n_extended > 0 {
+            display.print(&format!("{} to a larger stop.max_env_steps", extends(n_extended)));
+        }
+        let board = None;
+        let runs_have_dashboards = false;
+        Self { statuses, waiting, n_jobs, environment, display, board, runs_have_dashboards }
+    }
+
+    /// Serves the dashboard until the returned value is dropped; without a free port, there is none.
+    async fn serve(
+        &mut self,
+        args: &SweepArgs,
+        out: &Path,
+        address: SocketAddr,
+    ) -> Result<Option<DropGuard>, Failed> {
+        let token_file = args.dashboard.dashboard_token_file.as_deref();
+        let access = dashboard::access("--dashboard", address, token_file, false)?;
+        let bound = dashboard::bind_free(address).await;
+        let listener = match bound.and_then(|it| Ok((it.local_addr()?, it))) {
+            Ok((address, listener)) => {
+                self.display.print(&format!("dashboard on {}", dashboard::url(address)));
+                listener
+            }
+            Err(error) => {
+                self.display.print(&format!("no dashboard: {error}"));
+                return Ok(None);
+            }
+        };
+        // The pages of runs are on this machine, so pages that others see do not link to them.
+        self.runs_have_dashboards = !is_exposed(address);
+        let name = args.file.file_stem().unwrap_or_default().to_string_lossy();
+        let board = Board::new(&name, out, self.n_jobs, self.statuses);
+        let stop = CancellationToken::new();
+        let site = Site::of_sweep(board.views());
+        drop(tokio::spawn(tandem_dashboard::serve(site, access, listener, stop.clone())));
+        self.board = Some(board);
+        Ok(Some(stop.drop_guard()))
     }
 
     /// Trains every unfinished run. Returns whether all of them have ended.
@@ -146,7 +205,12 @@ impl<'a> Sweep<'a> {
                     let (idx, outcome) = joined.or_exit(Exit::Bug, String::new)?;
                     self.handle_outcome(idx, outcome)?;
                 }
-                _ = refresh.tick() => self.display.refresh(),
+                _ = refresh.tick() => {
+                    self.display.refresh();
+                    if let Some(board) = &mut self.board {
+                        board.refresh(self.statuses);
+                    }
+                }
                 () = interrupted.cancelled() => break,
             }
         }
@@ -154,7 +218,15 @@ impl<'a> Sweep<'a> {
         if interrupted.is_cancelled() {
             return self.save(running).await;
         }
+        self.end("complete");
         Ok(true)
+    }
+
+    /// Shows the end of the sweep on the dashboard.
+    fn end(&mut self, how: &str) {
+        if let Some(board) = &mut self.board {
+            board.end(how);
+        }
     }
 
     /// Waits until the running runs have saved. A second interruption ends them at once.
@@ -173,6 +245,7 @@ impl<'a> Sweep<'a> {
                 () = interrupted_again.cancelled() => break,
             }
         }
+        self.end("interrupted");
         Ok(self.statuses.iter().all(|status| matches!(status.state, State::Finished(_))))
     }
 
@@ -183,11 +256,16 @@ impl<'a> Sweep<'a> {
         interrupted: &CancellationToken,
     ) -> Result<(), Failed> {
         let (status, n_workers) = (&self.statuses[idx], self.workers_per_run());
-        let run = RunProcess::prepare(status, self.environment, n_workers)
+        let has_dashboard = self.runs_have_dashboards;
+        let run = RunProcess::prepare(status, self.environment, n_workers, has_dashboard)
             .or_cannot_write(String::new)?;
         self.display.started(&run.name, run.log_path());
+        let (sender, progress) = watch::channel(Value::Null);
+        if let Some(board) = &mut self.board {
+            board.started(idx, progress);
+        }
         let stop = interrupted.clone();
-        running.spawn(async move { (idx, run.run(stop).await) });
+        running.spawn(async move { (idx, run.run(stop, sender).await) });
         Ok(())
     }
 
@@ -213,8 +291,17 @@ impl<'a> Sweep<'a> {
             }
             RunOutcome::Interrupted => self.display.print(&format!("{name}: saved")),
         }
+        if let Some(board) = &mut self.board {
+            board.ended(idx, &self.statuses[idx]);
+        }
         Ok(())
     }
+}
+
+/// Returns `1 run is extended` or `N runs are extended`.
+fn extends(n_runs: usize) -> String {
+    let verb = if n_runs == 1 { "is" } else { "are" };
+    format!("{} {verb} extended", counted(n_runs, "run"))
 }
 
 fn print_plan(statuses: &[RunStatus], out: &Path, as_json: bool) -> Result<(), Failed> {

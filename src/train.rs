@@ -23,7 +23,8 @@ use tokio_util::sync::CancellationToken;
 use crate::cli::TrainArgs;
 use crate::exit::{Exit, Failed, OrExit as _};
 use crate::live::LiveRun;
-use crate::{clock, runtime, served_task, settings_page, signals};
+use crate::progress_json::progress_json;
+use crate::{clock, output, runtime, served_task, settings_page, signals};
 use display::Display;
 use inputs::RunInputs;
 use plan::Plan;
@@ -58,7 +59,7 @@ pub(crate) fn train(args: &TrainArgs) -> Result<(), Failed> {
     let runtime = runtime::new().or_exit(Exit::TryAgain, String::new)?;
     let (last, memory) = runtime.block_on(async {
         let interrupted = signals::shutdown_token(args.exit_with_stdin)?;
-        run((&plan, &lock), &interrupted, args.quiet).await
+        run((&plan, &lock), &interrupted, args).await
     })?;
     drop((inputs, live));
     if last.end_reason == INTERRUPTED {
@@ -72,9 +73,9 @@ pub(crate) fn train(args: &TrainArgs) -> Result<(), Failed> {
 async fn run(
     (plan, lock): (&Plan, &RunLock),
     interrupted: &CancellationToken,
-    is_quiet: bool,
+    args: &TrainArgs,
 ) -> Result<(pb::Progress, PeakMemory), Failed> {
-    let mut display = Display::new(plan, is_quiet);
+    let mut display = Display::new(plan, args.quiet);
     let mut processes = RunProcesses::new(plan).or_cannot_write(String::new)?;
     let started = tokio::select! {
         started = start(plan, &mut processes, &display) => started,
@@ -82,7 +83,8 @@ async fn run(
     };
     let last = match started {
         Ok(()) => {
-            let supervisor = Supervisor::new((plan, lock), &mut processes, &mut display);
+            let mut supervisor = Supervisor::new((plan, lock), &mut processes, &mut display);
+            supervisor.prints_json = args.progress_json;
             supervisor.run(interrupted).await
         }
         Err(failure) => Err(failure),
@@ -146,6 +148,8 @@ struct Supervisor<'a> {
     started_at: Instant,
     /// Seconds that the run had taken before this start, once a message has reported them.
     earlier_wall_s: Option<f64>,
+    /// Whether every message is printed as JSON.
+    prints_json: bool,
 }
 
 impl<'a> Supervisor<'a> {
@@ -164,6 +168,7 @@ impl<'a> Supervisor<'a> {
             awaits_learner: false,
             started_at: clock::now(),
             earlier_wall_s: None,
+            prints_json: false,
         }
     }
 
@@ -219,6 +224,16 @@ impl<'a> Supervisor<'a> {
         let earlier_s = *self.earlier_wall_s.get_or_insert((progress.wall_s - elapsed_s).max(0.0));
         self.last = pb::Progress { wall_s: earlier_s + elapsed_s, ..progress };
         self.display.show(&self.last);
+        if self.prints_json {
+            self.print_json();
+        }
+    }
+
+    /// Prints the latest message as one line. Whoever reads them may be gone; the run continues.
+    fn print_json(&self) {
+        let mut message = progress_json(&self.last);
+        message["dashboard"] = self.processes.dashboard_url().into();
+        drop(output::print(message));
     }
 
     /// Restarts processes that have ended. Returns whether the learner was interrupted.

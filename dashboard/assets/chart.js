@@ -46,6 +46,12 @@ export class Chart {
     this.drawLegend();
   }
 
+  /** Replaces the series; `show` draws them. */
+  setSeries(series) {
+    this.options.series = series;
+    this.drawLegend();
+  }
+
   show(rows) {
     this.rows = rows;
     this.cursor = null;
@@ -54,7 +60,8 @@ export class Chart {
 
   drawLegend() {
     const { series } = this.options;
-    if (series.length < 2 && !series[0].low) return;
+    this.legend.replaceChildren();
+    if (series.length < 2 && !series[0]?.low) return;
     const line = (name) => svg("svg", { viewBox: "0 0 26 10", "aria-hidden": "true" },
       svg("line", { x1: 1, y1: 5, x2: 25, y2: 5, class: `series ${name}` }));
     this.legend.append(...series.map((each) => el("span", {}, line(each.class), each.name)));
@@ -92,7 +99,7 @@ export class Chart {
     this.overlay = svg("g");
     this.svg.append(this.overlay);
     this.moveTo(this.cursor);
-    this.describe(all[0].points);
+    this.describe(all[0]?.points ?? []);
   }
 
   scale(all, width) {
@@ -135,7 +142,7 @@ export class Chart {
     if (series.low) {
       const edge = (bound) => points.filter(([, , row]) => isNumber(bound(row))).map(([x, , row]) => [x, bound(row)]);
       const outline = [...edge(series.high), ...edge(series.low).reverse()].map(at).join(" ");
-      this.svg.append(svg("polygon", { points: outline, class: "band" }));
+      this.svg.append(svg("polygon", { points: outline, class: `band ${series.class}` }));
     }
     this.svg.append(svg("polyline", { points: points.map(at).join(" "), class: `series ${series.class}` }));
     if (points.length <= 60) {

@@ -91,3 +91,71 @@ export function follow(onState, onLink) {
   addEventListener("pageshow", (event) => event.persisted && open());
   return () => performance.now() - heardAt;
 }
+
+/** Replaces the children of `parent` by one element per item, and keeps elements whose key is the same. */
+export function keyed(parent, items, key, create, update) {
+  const known = new Map([...parent.children].map((child) => [child.dataset.key, child]));
+  items.forEach((item, idx) => {
+    const name = String(key(item));
+    const child = known.get(name) ?? create(item);
+    known.delete(name);
+    child.dataset.key = name;
+    update(child, item);
+    if (parent.children[idx] !== child) parent.insertBefore(child, parent.children[idx] ?? null);
+  });
+  known.forEach((child) => child.remove());
+}
+
+/** Shows tiles: [[name, value, detail]]. */
+export function showTiles(parent, tiles) {
+  keyed(parent, tiles, ([name]) => name,
+    ([name]) => el("div", { class: "tile" }, el("dt", {}, name), el("dd", { class: "value" }), el("dd", { class: "detail" })),
+    (tile, [, value, detail]) => {
+      setText(tile.children[1], value);
+      setText(tile.children[2], detail);
+    });
+}
+
+export const MARKS = { info: "•", good: "✓", warning: "!", bad: "✕" };
+export const mark = (level) => el("span", { class: `mark ${level}`, "aria-hidden": "true" }, MARKS[level]);
+
+/** Shows events, latest first. */
+export function showLog(parent, events) {
+  const items = [...(events ?? [])].reverse();
+  parent.replaceChildren(...items.map((event) =>
+    el("li", {}, el("time", {}, clock(event.at_s)), mark(event.level), el("span", {}, event.text))));
+}
+
+/** Fetches the documents of a state as they change. */
+export class Documents {
+  constructor() {
+    this.versions = {};
+  }
+
+  /** Forgets the versions: a service that starts again may begin with other ones. */
+  forget() {
+    this.versions = {};
+  }
+
+  /** Calls `show` with a document if its version is new. */
+  async update(name, version, show) {
+    if (this.versions[name] === version) return;
+    const former = this.versions[name];
+    this.versions[name] = version;
+    try {
+      show(await fetchJson(`/data/${name}`));
+    } catch {
+      this.versions[name] = former;
+    }
+  }
+}
+
+/** Shows the condition of the connection; `hasEnded` if the service is expected to be gone. */
+export function showLink(element, condition, hasEnded) {
+  element.classList.toggle("lost", condition === "lost" && !hasEnded);
+  setText(element, {
+    live: "live",
+    lost: hasEnded ? "the service has ended; these are the final values" : "no connection, trying again",
+    full: "too many viewers, trying again",
+  }[condition] ?? condition);
+}

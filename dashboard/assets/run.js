@@ -1,12 +1,15 @@
 // The dashboard of a run.
-import { byId, clock, count, el, fetchJson, follow, isNumber, percent, plural, real, setText } from "/assets/common.js";
+import {
+  byId, clock, count, Documents, el, follow, isNumber, keyed, mark, MARKS, percent, plural, real, setText, showLink, showLog, showTiles,
+} from "/assets/common.js";
 import { Chart } from "/assets/chart.js";
 import { Player } from "/assets/player.js";
 
-const versions = {};
+const documents = new Documents();
 const player = new Player();
 let state = null;
 let link = "connecting";
+let latest = null;
 
 const charts = [
   new Chart(byId("success-chart"), {
@@ -44,21 +47,7 @@ const charts = [
   }),
 ];
 
-/** Replaces the children of `parent` by one element per item, and keeps elements whose key is the same. */
-function keyed(parent, items, key, create, update) {
-  const known = new Map([...parent.children].map((child) => [child.dataset.key, child]));
-  items.forEach((item, idx) => {
-    const name = String(key(item));
-    const child = known.get(name) ?? create(item);
-    known.delete(name);
-    child.dataset.key = name;
-    update(child, item);
-    if (parent.children[idx] !== child) parent.insertBefore(child, parent.children[idx] ?? null);
-  });
-  known.forEach((child) => child.remove());
-}
-
-function tiles(s, latest) {
+function tiles(s) {
   const interval = (low, high) => (isNumber(low) ? `interval ${(100 * low).toFixed(1)} – ${percent(high)}` : "no evaluation yet");
   const learned = (value) => real(s.updates > 0 ? value : null);
   const usesAdvice = s.advice_spent + s.advice_left > 0;
@@ -73,15 +62,6 @@ function tiles(s, latest) {
     ["Updates", count(s.updates), `${count(s.updates_per_s)} per second`],
     usesAdvice && ["Advice left", count(s.advice_left), `${count(s.advice_per_min)} per minute`],
   ].filter(Boolean);
-}
-
-function showTiles(s) {
-  keyed(byId("tiles"), tiles(s, showTiles.latest), ([name]) => name,
-    ([name]) => el("div", { class: "tile" }, el("dt", {}, name), el("dd", { class: "value" }), el("dd", { class: "detail" })),
-    (tile, [, value, detail]) => {
-      setText(tile.children[1], value);
-      setText(tile.children[2], detail);
-    });
 }
 
 function showHeader(s) {
@@ -177,9 +157,6 @@ function showAdvice(s) {
   byId("acted").replaceChildren(...arms);
 }
 
-const MARKS = { info: "•", good: "✓", warning: "!", bad: "✕" };
-const mark = (level) => el("span", { class: `mark ${level}`, "aria-hidden": "true" }, MARKS[level]);
-
 function services(s) {
   const t = s.teacher;
   if (s.advice_spent + s.advice_left === 0) return [["info", "Teacher", "This run takes no advice."]];
@@ -209,12 +186,6 @@ function showServices(s) {
     });
 }
 
-function showLog(events) {
-  const items = [...(events ?? [])].reverse();
-  byId("log").replaceChildren(...items.map((event) =>
-    el("li", {}, el("time", {}, clock(event.at_s)), mark(event.level), el("span", {}, event.text))));
-}
-
 function showTable(rows) {
   const names = ["Env steps", "Success", "95 % interval", "Without contact", "Training", "Mean Q", "Critic loss", "Actor loss", "Advice"];
   const cells = (row) => [count(row.env_steps), percent(row.success), `${percent(row.success_low)} – ${percent(row.success_high)}`,
@@ -225,48 +196,25 @@ function showTable(rows) {
     el("tbody", {}, [...rows].reverse().map((row) => el("tr", {}, cells(row).map((cell) => el("td", {}, cell))))));
 }
 
-/** Fetches the documents that have changed. */
-async function update(name, version, show) {
-  if (versions[name] === version) return;
-  const former = versions[name];
-  versions[name] = version;
-  try {
-    show(await fetchJson(`/data/${name}`));
-  } catch {
-    versions[name] = former;
-  }
-}
-
 function show(s) {
   state = s;
   showHeader(s);
-  showTiles(s);
+  showTiles(byId("tiles"), tiles(s));
   showWorkers(s);
   showAdvice(s);
   showServices(s);
-  update("evaluations", s.versions.evaluations, (rows) => {
-    showTiles.latest = rows.at(-1);
+  documents.update("evaluations", s.versions.evaluations, (rows) => {
+    latest = rows.at(-1);
     charts.forEach((chart) => chart.show(rows));
     showTable(rows);
-    showTiles(state);
+    showTiles(byId("tiles"), tiles(state));
   });
-  update("playback", s.versions.playback, (playback) => player.load(playback));
-  update("log", s.versions.log, showLog);
+  documents.update("playback", s.versions.playback, (playback) => player.load(playback));
+  documents.update("log", s.versions.log, (events) => showLog(byId("log"), events));
 }
 
-function showLink(condition) {
-  link = condition;
-  const element = byId("link");
-  element.classList.toggle("lost", condition === "lost" && !state?.end);
-  setText(element, {
-    live: "live",
-    lost: state?.end ? "the service has ended; these are the final values" : "no connection, trying again",
-    full: "too many viewers, trying again",
-  }[condition] ?? condition);
-}
-
-// A learner that starts again may begin with other versions.
 follow(show, (condition) => {
-  if (condition === "live" && link === "lost") Object.keys(versions).forEach((name) => delete versions[name]);
-  showLink(condition);
+  if (condition === "live" && link === "lost") documents.forget();
+  link = condition;
+  showLink(byId("link"), condition, state?.end);
 });

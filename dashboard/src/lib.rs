@@ -1,12 +1,12 @@
-//! Live web pages: the dashboard of a run.
+//! Live web pages: the dashboards of runs and sweeps.
 //!
-//! A [`Site`] is a page and the data that it shows. [`Site::of_run`] makes one from snapshots of a run; [`serve`] serves
-//! it to browsers. Pages contain no reference to other servers, and receive changes as server-sent events.
+//! A [`Site`] is a page and the data that it shows. [`Site::of_run`] makes one from snapshots of a run, [`Site::of_sweep`]
+//! from those of a sweep; [`serve`] serves it to browsers. Pages contain no reference to other servers, and receive changes as server-sent events.
 //!
 //! The crate knows snapshots only: where they come from, and what they cost, is decided by the caller. A snapshot is
 //! encoded once for all viewers, and a viewer that does not keep up receives the newest one next.
 //!
-//! Reading order: `run` (from snapshots to documents) with `events` and `playback`, `page` (HTML), `site`
+//! Reading order: `run` (from snapshots to documents) with `events` and `playback`, `sweep`, `page` (HTML), `site`
 //! (routes), `access` (who may see a page), `server` (connections).
 #![warn(missing_docs)]
 
@@ -17,7 +17,9 @@ mod playback;
 mod run;
 mod server;
 mod site;
+mod sweep;
 
 pub use access::Access;
 pub use server::{MAX_VIEWERS, serve};
 pub use site::Site;
+pub use sweep::{RunPace, SweepResult, SweepRunState, SweepRunView, SweepView};

@@ -8,7 +8,7 @@ const ICON: &str = "data:image/svg+xml,%3Csvg xmlns='http://www.w3.org/2000/svg'
 /// Returns the page of a run.
 pub(crate) fn run() -> String {
     let body = html! {
-        (header())
+        (header("Run", "This page needs JavaScript. `tandem status` shows the same values."))
         main #content {
             p #alert .alert role="alert" hidden {}
             section .now aria-label="Current values" { dl #tiles .tiles {} }
@@ -41,6 +41,25 @@ pub(crate) fn run() -> String {
     document("Tandem run", "run.js", &body)
 }
 
+/// Returns the page of a sweep.
+pub(crate) fn sweep() -> String {
+    let body = html! {
+        (header("Sweep", "This page needs JavaScript. `tandem report DIRECTORY` prints the same values."))
+        main #content {
+            section .now aria-label="Current values" { dl #tiles .tiles {} }
+            (card("success", "Success in evaluations, mean over seeds", &html! {
+                p #task-field .controls hidden { label { "Task " select #task {} } }
+                div #success-chart .chart {}
+                (table("groups", "Latest evaluations"))
+            }))
+            (card("runs", "Runs", &html! { ul #run-list .runs {} }))
+            (card("events", "Recent events", &html! { ol #log .log tabindex="0" {} }))
+        }
+        footer { p { "Bands reach from the lowest to the highest seed. Success is that of the policy alone." } }
+    };
+    document("Tandem sweep", "sweep.js", &body)
+}
+
 /// Returns the page that asks for the token.
 pub(crate) fn login() -> String {
     let body = html! {
@@ -57,13 +76,14 @@ pub(crate) fn login() -> String {
     document("Tandem", "login.js", &body)
 }
 
-fn header() -> Markup {
+/// Returns the head of a page that shows something `what` by scripts; without scripts, it shows `instead`.
+fn header(what: &str, instead: &str) -> Markup {
     html! {
         a .skip href="#content" { "Skip to the values" }
         header .top {
             div .title {
                 p .brand { "Tandem" }
-                h1 #name { "Run" }
+                h1 #name { (what) }
                 p #terms .terms {}
             }
             div .state {
@@ -74,11 +94,11 @@ fn header() -> Markup {
                 }
                 p #clock .clock {}
             }
-            div #progress .progress role="progressbar" aria-label="Progress of the run"
+            div #progress .progress role="progressbar" aria-label="Progress"
                 aria-valuemin="0" aria-valuemax="100" { div #bar .bar {} }
             p #progress-text .note {}
         }
-        noscript { p .alert { "This page needs JavaScript. `tandem status` shows the same values." } }
+        noscript { p .alert { (instead) } }
     }
 }
 

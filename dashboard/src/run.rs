@@ -9,7 +9,7 @@ use tokio::sync::watch;
 use crate::events::EventLog;
 use crate::page;
 use crate::playback::Playback;
-use crate::site::{Frame, Site};
+use crate::site::{Frame, Site, encode};
 
 /// Number of workers that a page lists by name; a run can have thousands.
 const MAX_WORKERS: usize = 128;
@@ -113,11 +113,6 @@ impl Feed {
         let view = &RunView { workers: listed, ..view.clone() };
         encode(&State { view, n_workers, n_active_workers, versions })
     }
-}
-
-/// Encodes as JSON on one line. Numbers that are not finite become `null`.
-fn encode<T: Serialize + ?Sized>(value: &T) -> Arc<str> {
-    serde_json::to_string(value).map_or_else(|_unencodable| "null".into(), Into::into)
 }
 
 #[cfg(test)]

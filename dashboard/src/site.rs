@@ -12,6 +12,7 @@ use axum::response::{Html, IntoResponse as _, Response};
 use axum::routing::{get, post};
 use http::StatusCode;
 use http::header::CONTENT_TYPE;
+use serde::Serialize;
 use tokio::sync::{Semaphore, watch};
 use tokio_stream::StreamExt as _;
 use tokio_stream::wrappers::WatchStream;
@@ -40,12 +41,13 @@ pub(crate) struct Frame {
 }
 
 /// The files that pages refer to: name, content type and content.
-const ASSETS: [(&str, &str, &str); 6] = [
+const ASSETS: [(&str, &str, &str); 7] = [
     ("style.css", "text/css; charset=utf-8", include_str!("../assets/style.css")),
     ("common.js", "text/javascript; charset=utf-8", include_str!("../assets/common.js")),
     ("chart.js", "text/javascript; charset=utf-8", include_str!("../assets/chart.js")),
     ("player.js", "text/javascript; charset=utf-8", include_str!("../assets/player.js")),
     ("run.js", "text/javascript; charset=utf-8", include_str!("../assets/run.js")),
+    ("sweep.js", "text/javascript; charset=utf-8", include_str!("../assets/sweep.js")),
     ("login.js", "text/javascript; charset=utf-8", include_str!("../assets/login.js")),
 ];
 
@@ -109,6 +111,11 @@ async fn events(State(served): State<Served>) -> Response {
 
 fn json(text: &str) -> Response {
     ([(CONTENT_TYPE, "application/json")], text.to_owned()).into_response()
+}
+
+/// Encodes as JSON on one line. Numbers that are not finite become `null`.
+pub(crate) fn encode<T: Serialize + ?Sized>(value: &T) -> Arc<str> {
+    serde_json::to_string(value).map_or_else(|_unencodable| "null".into(), Into::into)
 }
 
 fn not_found() -> Response {

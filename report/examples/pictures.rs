@@ -21,7 +21,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let mut metrics = MetricsLog::open(&metrics_path)?;
     rows(1.0).iter().try_for_each(|row| metrics.append(row))?;
     std::fs::write(dir.join("run.toml"), "task = \"push\"\narms = 2\n")?;
-    run_report_html(&dir)?;
+    run_report_html(&dir, &[])?;
     Ok(())
 }
 

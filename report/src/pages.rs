@@ -6,7 +6,7 @@ mod trials;
 
 use std::path::{Path, PathBuf};
 
-use crate::comparison::Comparison;
+use crate::comparison::{Comparison, FilmStrip};
 use crate::error::Error;
 use crate::files::{create_directory, write};
 use crate::html::page;
@@ -14,14 +14,14 @@ use crate::plots::comparison_plots;
 use crate::run::Run;
 use crate::trials::{PlottedTrials, Trials};
 
-/// Writes `report.html` into the run directory `run_dir` and returns its path.
+/// Writes `report.html` with the film strips `films` into the run directory `run_dir` and returns its path.
 ///
 /// # Errors
 /// If the run's metrics cannot be read or the file cannot be written.
-pub fn run_report_html(run_dir: &Path) -> Result<PathBuf, Error> {
+pub fn run_report_html(run_dir: &Path, films: &[FilmStrip]) -> Result<PathBuf, Error> {
     let run = Run::load(run_dir, &mut Vec::new())?;
     let path = run_dir.join("report.html");
-    write(&path, page(&run.name, &run::body(&run)?).as_bytes())?;
+    write(&path, page(&run.name, &run::body(&run, films)?).as_bytes())?;
     Ok(path)
 }
 

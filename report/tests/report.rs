@@ -93,7 +93,7 @@ fn curves_can_be_drawn_against_every_axis() {
 fn the_page_of_a_run_loads_nothing_from_elsewhere() {
     let dir = run_dir(&[row(0, 0), row(5, 60), row(10, 225)]);
     std::fs::write(dir.path().join("run.toml"), "name = \"<push>\"\n").unwrap();
-    let path = run_report_html(dir.path()).unwrap();
+    let path = run_report_html(dir.path(), &[]).unwrap();
     assert_eq!(path, dir.path().join("report.html"));
     let page = std::fs::read_to_string(path).unwrap();
     assert_eq!(page.matches("<svg").count(), 4);
@@ -115,9 +115,9 @@ fn the_page_of_a_run_loads_nothing_from_elsewhere() {
 #[test]
 fn a_run_without_an_evaluation_has_a_page() {
     let dir = run_dir(&[]);
-    let page = std::fs::read_to_string(run_report_html(dir.path()).unwrap()).unwrap();
+    let page = std::fs::read_to_string(run_report_html(dir.path(), &[]).unwrap()).unwrap();
     assert!(page.contains("No evaluation yet"));
-    assert!(run_report_html(Path::new("/nowhere")).is_err());
+    assert!(run_report_html(Path::new("/nowhere"), &[]).is_err());
 }
 
 /// A run directory below `parent` with its configuration and metrics.
@@ -265,13 +265,13 @@ fn a_described_task_has_its_own_section_beside_a_built_in_one() {
 
 /// Checks the pages of a run of a described task and of one of a built-in task.
 fn check_pages_of_runs(described: &Path, push: &Path) {
-    let page = std::fs::read_to_string(run_report_html(described).unwrap()).unwrap();
+    let page = std::fs::read_to_string(run_report_html(described, &[]).unwrap()).unwrap();
     assert_eq!(page.matches("<svg").count(), 3, "no curve of contacts");
     assert!(!page.contains("Episodes with contact") && !page.contains("with contact"));
     let line =
         "Task lab/reach: 2 arms, 100 control steps per episode, goals within 0.02 (maximum norm)";
     assert!(page.contains(line), "{page}");
-    let page = std::fs::read_to_string(run_report_html(push).unwrap()).unwrap();
+    let page = std::fs::read_to_string(run_report_html(push, &[]).unwrap()).unwrap();
     assert_eq!(page.matches("<svg").count(), 4);
     let line =
         "Task push: 2 arms, 50 control steps per episode, goals within 0.05 m (Euclidean norm)";

@@ -110,19 +110,14 @@ pub(crate) struct TrainArgs {
     /// evaluation.recorded_episodes, evaluation.test_episodes and --workers can change. A rejected --resume changes nothing.
     #[arg(long)]
     pub(crate) resume: bool,
-    /// Address of the dashboard, which shows the run in a browser. If its port is in use, the next free one is taken.
-    /// [default: 127.0.0.1:8600]
-    #[arg(long, value_name = "ADDR")]
-    pub(crate) dashboard: Option<SocketAddr>,
-    /// File with the token that the dashboard asks for if --dashboard is not a loopback address.
-    #[arg(long, value_name = "FILE", requires = "dashboard")]
-    pub(crate) dashboard_token_file: Option<PathBuf>,
-    /// Serves no dashboard.
-    #[arg(long, conflicts_with = "dashboard")]
-    pub(crate) no_dashboard: bool,
+    #[command(flatten)]
+    pub(crate) dashboard: DashboardArgs,
     /// Prints the summary as one JSON object on the last line of standard output.
     #[arg(long)]
     pub(crate) json: bool,
+    /// Prints every message about the progress as one JSON object per line of standard output, before the summary.
+    #[arg(long, hide = true, requires = "json")]
+    pub(crate) progress_json: bool,
     /// Prints no progress: only the summary, warnings and errors.
     #[arg(long, short)]
     pub(crate) quiet: bool,
@@ -137,6 +132,7 @@ Examples:
   tandem sweep deploy/sweep-small.toml --dry-run  # lists the runs
   tandem sweep deploy/sweep-small.toml            # starts them, or resumes them
   tandem report runs/sweep-small
+  tandem sweep FILE.toml --dashboard 0.0.0.0:8600 --dashboard-token-file token
 
 docs/sweep.md describes the file. The exit code is 75 if runs failed; the next start tries each of \
 them once more.")]
@@ -156,6 +152,23 @@ pub(crate) struct SweepArgs {
     /// Lists the runs and the progress of each, and starts none.
     #[arg(long)]
     pub(crate) dry_run: bool,
+    #[command(flatten)]
+    pub(crate) dashboard: DashboardArgs,
+}
+
+/// Options of the dashboard.
+#[derive(Debug, Args)]
+pub(crate) struct DashboardArgs {
+    /// Address of the dashboard, which a browser shows live. If its port is in use, the next free one is taken.
+    /// [default: 127.0.0.1:8600]
+    #[arg(long, value_name = "ADDR")]
+    pub(crate) dashboard: Option<SocketAddr>,
+    /// File with the token that the dashboard asks for if --dashboard is not a loopback address.
+    #[arg(long, value_name = "FILE", requires = "dashboard")]
+    pub(crate) dashboard_token_file: Option<PathBuf>,
+    /// Serves no dashboard.
+    #[arg(long, conflicts_with = "dashboard")]
+    pub(crate) no_dashboard: bool,
 }
 
 /// Parses a UTF-8 path, which can be part of an address.

@@ -5,6 +5,7 @@
 
 use std::ffi::OsString;
 use std::fs::TryLockError;
+use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 use std::pin::pin;
 use std::process::{ExitStatus, Stdio};
@@ -12,7 +13,9 @@ use std::time::Duration;
 
 use anyhow::{Context as _, bail};
 use serde_json::Value;
-use tokio::io::AsyncReadExt as _;
+use tokio::io::{AsyncBufReadExt as _, BufReader};
+use tokio::process::ChildStdout;
+use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
 
 use super::run_status::{RunStatus, State};
@@ -45,24 +48,33 @@ pub(super) enum RunOutcome {
 }
 
 impl RunProcess {
-    /// Prepares the directory of an unfinished run. With `n_workers` of `None`, `tandem train` chooses the number.
+    /// Prepares the directory of an unfinished run. With `n_workers` of `None`, `tandem train` chooses the number. With
+    /// `has_dashboard`, the run serves a page of its own.
     pub(super) fn prepare(
         status: &RunStatus,
         environment: &EnvironmentArgs,
         n_workers: Option<usize>,
+        has_dashboard: bool,
     ) -> anyhow::Result<Self> {
-        let RunStatus { run, dir, state, .. } = status;
+        let RunStatus { run, dir, state, extends_to, .. } = status;
         std::fs::create_dir_all(dir).with_context(|| format!("cannot create {}", dir.display()))?;
         let mut args: Vec<OsString> = vec![
             "train".into(),
             "--exit-with-stdin".into(),
             "--json".into(),
-            "--no-dashboard".into(),
+            "--progress-json".into(),
             "--out".into(),
             dir.into(),
         ];
+        if !has_dashboard {
+            args.push("--no-dashboard".into());
+        }
         if *state == State::Started {
             args.push("--resume".into());
+            if let Some(env_steps) = extends_to {
+                args.extend(["--max-env-steps".into(), env_steps.to_string().into()]);
+                remove_if_exists(&status.summary_path())?;
+            }
         } else {
             args.extend(["--run".into(), write_run_file(status)?.into()]);
         }
@@ -76,15 +88,23 @@ impl RunProcess {
         Ok(Self { name: run.name.clone(), dir: dir.clone(), args })
     }
 
-    /// Runs to the end, or until `stop` asks the run to save and exit.
-    pub(super) async fn run(self, stop: CancellationToken) -> RunOutcome {
-        match self.try_run(&stop).await {
+    /// Runs to the end, or until `stop` asks the run to save and exit. Messages about the progress go to `progress`.
+    pub(super) async fn run(
+        self,
+        stop: CancellationToken,
+        progress: watch::Sender<Value>,
+    ) -> RunOutcome {
+        match self.try_run(&stop, &progress).await {
             Ok(outcome) => outcome,
             Err(error) => RunOutcome::Failed(format!("{error:#}")),
         }
     }
 
-    async fn try_run(&self, stop: &CancellationToken) -> anyhow::Result<RunOutcome> {
+    async fn try_run(
+        &self,
+        stop: &CancellationToken,
+        progress: &watch::Sender<Value>,
+    ) -> anyhow::Result<RunOutcome> {
         let log = ProcessLog::open(&self.log_path())?;
         if !lock(&log, &self.dir, stop).await? {
             return Ok(RunOutcome::Interrupted);
@@ -94,10 +114,14 @@ impl RunProcess {
             launcher.spawn(&self.args, Stdio::piped()).context("cannot start tandem train")?;
         let log_offset = child.log_offset();
         let stdin = child.take_input();
-        let mut stdout = child.take_output()?;
-        let mut output = Vec::new();
+        let stdout = child.take_output()?;
+        let mut last_line = String::new();
         let status = {
-            let read = async { tokio::join!(child.wait(), stdout.read_to_end(&mut output)).0 };
+            let read = async {
+                let (status, last) = tokio::join!(child.wait(), follow(stdout, progress));
+                last_line = last;
+                status
+            };
             let mut ended = pin!(read);
             tokio::select! {
                 status = &mut ended => status,
@@ -110,7 +134,7 @@ impl RunProcess {
         };
         let status = status.context("the run did not exit in time and is killed")?;
         let log = launcher.log();
-        Ok(outcome(status, &output, || last_log_line(log, log_offset), stop))
+        Ok(outcome(status, &last_line, || last_log_line(log, log_offset), stop))
     }
 
     /// Returns the path of the run's log.
@@ -119,16 +143,44 @@ impl RunProcess {
     }
 }
 
+/// Sends every message of a run to `progress`, and returns the last line of its output.
+async fn follow(output: ChildStdout, progress: &watch::Sender<Value>) -> String {
+    let mut lines = BufReader::new(output).lines();
+    let mut last = String::new();
+    while let Ok(Some(line)) = lines.next_line().await {
+        if let Ok(message) = serde_json::from_str::<Value>(&line)
+            && !is_summary(&message)
+        {
+            progress.send_replace(message);
+        }
+        last = line;
+    }
+    last
+}
+
+/// Returns whether a line of output is the summary of a run, and not a message about its progress.
+fn is_summary(object: &Value) -> bool {
+    object.get("digest").is_some() && object.get("phase").is_none()
+}
+
+fn remove_if_exists(path: &Path) -> anyhow::Result<()> {
+    match std::fs::remove_file(path) {
+        Err(error) if error.kind() != ErrorKind::NotFound => {
+            Err(error).with_context(|| format!("cannot remove {}", path.display()))
+        }
+        _ => Ok(()),
+    }
+}
+
 fn outcome(
     status: ExitStatus,
-    output: &[u8],
+    last_output_line: &str,
     last_log_line: impl FnOnce() -> String,
     stop: &CancellationToken,
 ) -> RunOutcome {
     let summary = || -> Option<Value> {
-        let text = std::str::from_utf8(output).ok()?;
-        let summary: Value = serde_json::from_str(text.lines().last()?).ok()?;
-        summary.get("digest").is_some().then_some(summary)
+        let summary: Value = serde_json::from_str(last_output_line).ok()?;
+        is_summary(&summary).then_some(summary)
     };
     match (status.success().then(summary).flatten(), status.code()) {
         (Some(summary), _) => RunOutcome::Complete(summary),
@@ -191,19 +243,20 @@ mod tests {
         let check = |code: i32, output: &str, stop: &CancellationToken, expected: &RunOutcome| {
             let status = ExitStatus::from_raw(code << 8);
             assert_eq!(
-                outcome(status, output.as_bytes(), last_log_line, stop),
+                outcome(status, output, last_log_line, stop),
                 *expected,
                 "{code} {output:?}"
             );
         };
         let done = RunOutcome::Complete(serde_json::json!({"digest": "d"}));
-        check(0, "chatter\n{\"digest\":\"d\"}\n", &running, &done);
-        check(0, "{\"digest\":\"d\"}\n", &stopped, &done);
+        check(0, "{\"digest\":\"d\"}", &running, &done);
+        check(0, "{\"digest\":\"d\"}", &stopped, &done);
         check(130, "", &stopped, &RunOutcome::Interrupted);
         let failed = |code: i32| RunOutcome::Failed(format!("exit status: {code}: tandem: no"));
         check(130, "", &running, &failed(130));
         check(75, "", &stopped, &failed(75));
         check(0, "no summary", &running, &failed(0));
+        check(0, "{\"digest\":\"d\",\"phase\":\"ended\"}", &running, &failed(0));
         check(70, "{\"digest\":\"d\"}", &running, &failed(70));
     }
 

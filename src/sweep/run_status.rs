@@ -11,6 +11,7 @@ use tandem_teacher::policy::is_onnx;
 use toml::{Table, Value};
 
 use super::sweep_file::{PlannedRun, flattened};
+use crate::exit::Failed;
 use crate::run_file;
 
 /// A run and its status.
@@ -22,6 +23,8 @@ pub(super) struct RunStatus {
     pub(super) state: State,
     /// Why the latest attempt failed.
     pub(super) failure: Option<String>,
+    /// The environment steps to which a run that had fewer is extended.
+    pub(super) extends_to: Option<u64>,
 }
 
 /// The progress of a run.
@@ -42,15 +45,16 @@ impl RunStatus {
     /// When the directory contains a run with other settings, which the error names, or cannot be read.
     pub(super) fn of(run: PlannedRun, out: &Path) -> anyhow::Result<Self> {
         let dir = out.join(&run.name);
-        let state = state(&run, &dir)?;
+        let (state, extends_to) = state(&run, &dir)?;
         let failure = std::fs::read_to_string(failure_path(&dir)).ok();
         let failure = failure.filter(|_| !matches!(state, State::Finished(_)));
-        Ok(Self { run, dir, state, failure })
+        Ok(Self { run, dir, state, failure, extends_to })
     }
 
     /// Returns the name of the state.
     pub(super) const fn state_name(&self) -> &'static str {
         match self.state {
+            State::Started if self.extends_to.is_some() => "extended",
             State::New => "new",
             State::Started => "begun",
             State::Finished(_) => "finished",
@@ -59,12 +63,17 @@ impl RunStatus {
 
     /// Stores the summary of a run, which is finished from now on.
     pub(super) fn finish(&mut self, summary: Json) -> anyhow::Result<()> {
-        let path = self.dir.join("summary.json");
+        let path = self.summary_path();
         let written = atomic_file::replace(&path, format!("{summary}\n").as_bytes());
         written.with_context(|| format!("cannot write {}", path.display()))?;
         drop(std::fs::remove_file(failure_path(&self.dir)));
         (self.state, self.failure) = (State::Finished(summary), None);
         Ok(())
+    }
+
+    /// Returns the path of the summary that marks a run as finished.
+    pub(super) fn summary_path(&self) -> PathBuf {
+        summary_path(&self.dir)
     }
 
     /// Stores the reason of a failure, which the next start reports.
@@ -76,40 +85,52 @@ impl RunStatus {
     }
 }
 
+fn summary_path(dir: &Path) -> PathBuf {
+    dir.join("summary.json")
+}
+
 fn failure_path(dir: &Path) -> PathBuf {
     dir.join("failure.txt")
 }
 
-fn state(run: &PlannedRun, dir: &Path) -> anyhow::Result<State> {
+/// The setting in which a run may have less than the sweep file: such a run is extended.
+const LENGTH: &str = "stop.max_env_steps";
+
+/// Returns the state of the run in `dir`, and the length to which it is extended.
+fn state(run: &PlannedRun, dir: &Path) -> anyhow::Result<(State, Option<u64>)> {
     let run_toml = dir.join("run.toml");
     if !run_toml.exists() {
-        return Ok(State::New);
+        return Ok((State::New, None));
     }
-    let differences = match run_file::resolve(Some(&run_toml), &[]) {
-        Ok(config) => differences(&config, &run.config)?,
-        Err(failed) => vec![format!("{:#}", failed.into_error())],
+    let existing = run_file::resolve(Some(&run_toml), &[]).map_err(Failed::into_error);
+    let differences = match &existing {
+        Ok(existing) => differences(existing, &run.config)?,
+        Err(error) => vec![(String::new(), format!("{error:#}"))],
     };
     let summary = summary(dir)?;
-    if !differences.is_empty() || !same_teacher(run, dir) {
-        if summary.is_none() && !has_learned(dir) {
-            return Ok(State::New);
-        }
-        let differences = match differences.is_empty() {
-            true => "its teacher".to_owned(),
-            false => differences.join(", "),
-        };
-        return Err(anyhow!(
-            "{} was made with other settings: {differences}; give the changed sweep another --out, or train one run \
-             longer with `tandem train --resume --out {} --max-env-steps N`",
-            run.name,
-            dir.display()
-        ));
+    let has_same_teacher = same_teacher(run, dir);
+    if differences.is_empty() && has_same_teacher {
+        return Ok((summary.map_or(State::Started, State::Finished), None));
     }
-    Ok(summary.map_or(State::Started, State::Finished))
+    if summary.is_none() && !has_learned(dir) {
+        return Ok((State::New, None));
+    }
+    let length = existing.map_or(0, |existing| existing.stop.max_env_steps);
+    let planned_length = run.config.stop.max_env_steps;
+    let is_longer = length > 0 && planned_length > length;
+    if is_longer && has_same_teacher && differences.iter().all(|(key, _)| key == LENGTH) {
+        return Ok((State::Started, Some(planned_length)));
+    }
+    let texts: Vec<String> = differences.into_iter().map(|(_, text)| text).collect();
+    let differences = match texts.is_empty() {
+        true => "its teacher".to_owned(),
+        false => texts.join(", "),
+    };
+    Err(anyhow!("{} was made with other settings: {differences}", run.name))
 }
 
-/// Lists the settings in which the configuration of an existing run differs from the sweep file.
-fn differences(existing: &RunConfig, planned: &RunConfig) -> anyhow::Result<Vec<String>> {
+/// Returns the settings in which the configuration of an existing run differs from the sweep file, each with a text.
+fn differences(existing: &RunConfig, planned: &RunConfig) -> anyhow::Result<Vec<(String, String)>> {
     let [existing, planned] = [existing, planned].map(Table::try_from);
     let (existing, planned) = (flattened(&existing?), flattened(&planned?));
     // A run of an earlier version has no early evaluations, which affect nothing that it learns.
@@ -117,7 +138,8 @@ fn differences(existing: &RunConfig, planned: &RunConfig) -> anyhow::Result<Vec<
         existing != planned && existing.0 != "evaluation.early_points"
     });
     let texts = differing.map(|((key, existing), (_, planned))| {
-        format!("{key} is {} there, {} now", shortest(existing), shortest(planned))
+        let text = format!("{key} is {} there, {} now", shortest(existing), shortest(planned));
+        (key.clone(), text)
     });
     Ok(texts.collect())
 }
@@ -152,7 +174,7 @@ fn has_learned(dir: &Path) -> bool {
 }
 
 fn summary(dir: &Path) -> anyhow::Result<Option<Json>> {
-    let path = dir.join("summary.json");
+    let path = summary_path(dir);
     if !path.exists() {
         return Ok(None);
     }
@@ -215,6 +237,24 @@ mod tests {
             assert!(message.contains(word), "{message:?} lacks {word:?}");
         }
         assert_eq!(status(out.path(), 0.9).expect("fits").state, State::Started);
+    }
+
+    #[test]
+    fn a_longer_sweep_extends_its_runs_and_a_shorter_one_is_refused() {
+        let out = tempfile::tempdir().expect("a directory");
+        made_with(out.path(), 0.95);
+        let of_length = |factor: u64, discount: f32| {
+            let mut run = planned(discount);
+            run.config.stop.max_env_steps = run.config.stop.max_env_steps / 2 * factor;
+            RunStatus::of(run, out.path()).map_err(|error| error.to_string())
+        };
+        assert_eq!(of_length(4, 0.95).expect("nothing was learned").extends_to, None);
+        of_length(2, 0.95).expect("fits").finish(json!({"digest": "d"})).expect("writes");
+        let extended = of_length(4, 0.95).expect("longer");
+        assert_eq!((&extended.state, extended.state_name()), (&State::Started, "extended"));
+        assert_eq!(extended.extends_to, Some(2 * planned(0.95).config.stop.max_env_steps));
+        assert!(of_length(1, 0.95).expect_err("shorter").contains("stop.max_env_steps"));
+        assert!(of_length(4, 0.9).expect_err("other settings too").contains("ddpg.discount"));
     }
 
     #[test]

@@ -67,8 +67,8 @@ impl Plan {
             return Err(Failed::usage(format!("--workers {n_workers}: expected 1 to 1024")));
         }
         let (resume, recording) = (args.resume, args.recording);
-        let dashboard = dashboard_address(args)?;
-        let dashboard_token_file = args.dashboard_token_file.clone();
+        let dashboard = dashboard::address(&args.dashboard)?;
+        let dashboard_token_file = args.dashboard.dashboard_token_file.clone();
         let plan = Self {
             config,
             out,
@@ -198,16 +198,6 @@ impl Plan {
     pub(crate) fn ledger(&self) -> PathBuf {
         self.out.join("ledger.sqlite")
     }
-}
-
-/// Returns the address of the dashboard; rejects one that other machines can reach without a token.
-fn dashboard_address(args: &TrainArgs) -> Result<Option<SocketAddr>, Failed> {
-    if args.no_dashboard {
-        return Ok(None);
-    }
-    let address = args.dashboard.unwrap_or_else(dashboard::default_address);
-    dashboard::access("--dashboard", address, args.dashboard_token_file.as_deref(), false)?;
-    Ok(Some(address))
 }
 
 /// Rejects a task that neither the server nor the simulator has.

@@ -14,9 +14,9 @@ use super::display::Display;
 use super::plan::Plan;
 use super::restart_policy::{Decision, RestartPolicy, Role};
 use super::run_lock::RunLock;
-use crate::clock;
 use crate::exit::Exit;
 use crate::launch::{ChildProcess, Launcher, ProcessEnd, ProcessLog};
+use crate::{clock, dashboard};
 
 /// Time that the teacher and the workers have to exit after the learner.
 const GRACE: Duration = Duration::from_secs(5);
@@ -279,6 +279,11 @@ impl RunProcesses {
         display.print(line);
         let host = line.strip_prefix("dashboard on http://").map(|it| it.trim_end_matches('/'));
         self.dashboard = host.and_then(|host| host.replace("localhost", "0.0.0.0").parse().ok());
+    }
+
+    /// Returns the address of the dashboard as a link, if there is one.
+    pub(crate) fn dashboard_url(&self) -> Option<String> {
+        self.dashboard.map(dashboard::url)
     }
 
     fn worker_args(&self, plan: &Plan, name: &str) -> Vec<OsString> {

@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 use serde_json::{Value, json};
 use tandem_core::evaluation::TEST_SEED;
 use tandem_proto::pb;
+use tandem_report::FilmStrip;
 
 use super::plan::Plan;
 use super::processes::PeakMemory;
@@ -15,7 +16,10 @@ use crate::evaluation::{EvaluatedPolicy, EvaluationResult, Part, measure, measur
 use crate::exit::{Exit, Failed};
 use crate::progress_text::{advice_text, clock_text, grouped};
 use crate::run_pages::RunPages;
-use crate::{output, policy_file, run_directory};
+use crate::{film, output, policy_file, run_directory};
+
+/// Number of test goals from which on the report shows episodes of the test.
+const MIN_TEST_EPISODES_OF_FILMS: usize = 100;
 
 /// Evaluates the best policy on the test goals, draws the curve and prints the summary.
 pub(super) fn print(
@@ -31,7 +35,7 @@ pub(super) fn print(
         }
         failed.context(saved())
     })?;
-    let pages = RunPages::write(&plan.config, &plan.out)?;
+    let pages = RunPages::write(&plan.config, &plan.out, &films(&result)?)?;
     let summary = match args.json {
         true => summary_json(plan, last, memory, &result).to_string(),
         false => summary_lines(plan, last, memory, &result, &pages).join("\n"),
@@ -48,6 +52,17 @@ fn test(plan: &Plan, args: &TrainArgs) -> Result<EvaluationResult, Failed> {
         return measure_served(&plan.environment, subject, goals, args.exit_with_stdin);
     }
     measure(&EvaluatedPolicy::new(policy, &path)?, n_episodes, TEST_SEED)
+}
+
+/// Draws the first success and the first failure of the test, if the simulator has the task. A test of few goals says
+/// little, and drawing would take longer than the test.
+fn films(result: &EvaluationResult) -> Result<Vec<FilmStrip>, Failed> {
+    match result.task.as_built_in() {
+        Some(layout) if result.episodes.len() >= MIN_TEST_EPISODES_OF_FILMS => {
+            film::of_outcomes(layout, TEST_SEED, &result.episodes)
+        }
+        _ => Ok(Vec::new()),
+    }
 }
 
 fn summary_lines(

@@ -1,7 +1,8 @@
-"""Tests the dashboard of a run in headless Chromium.
+"""Tests the dashboards of a run and of a sweep in headless Chromium.
 
 Starts a small run and looks at its page as a user does: the curve grows, the tile of a killed worker changes and
-recovers, the episode can be played by keyboard, nothing overflows on a phone, scripts have no errors. Prints how often
+recovers, the episode can be played by keyboard, nothing overflows on a phone, scripts have no errors. A small sweep
+shows its runs start, progress and end. Prints how often
 states arrive, how 20 further viewers affect the speed of the run, and what they cost the learner.
 """
 
@@ -25,6 +26,21 @@ N_VIEWERS = 20
 # Small and frequent evaluations, so that a curve grows within seconds.
 SETTINGS = ["evaluation.every_env_steps=1600", "evaluation.episodes=16", "evaluation.test_episodes=1",
             "evaluation.recorded_episodes=0", "rounds.updates_per_env_step=0.02"]
+
+
+SWEEP = """
+strategies = ["none", "ea"]
+seeds = [1, 2]
+[run]
+stop.max_env_steps = 4800
+ddpg.n_hidden = 32
+ddpg.batch_size = 64
+rounds.updates_per_env_step = 0.05
+evaluation.episodes = 8
+evaluation.test_episodes = 8
+evaluation.every_env_steps = 800
+evaluation.recorded_episodes = 0
+"""
 
 
 class Run:
@@ -135,6 +151,37 @@ def check_episode(page):
     assert shapes == [2, 2], shapes
     page.value("document.getElementById('play').click()")
     page.wait("document.getElementById('step').value > 5", "the episode plays")
+
+
+def check_sweep(browser, program, directory, pictures):
+    """The page of a sweep shows runs that start, progress, link to their own pages, and end."""
+    (directory / "small.toml").write_text(SWEEP)
+    command = [program, "sweep", "small.toml", "--out", "sweep", "--jobs", "2"]
+    process = subprocess.Popen(command, cwd=directory, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL,
+                               stderr=subprocess.PIPE, text=True)
+    try:
+        line = process.stderr.readline()
+        found = re.search(r"dashboard on (http://\S+/)", line)
+        assert found, line
+        threading.Thread(target=process.stderr.read, daemon=True).start()
+        page = browser.open(found[1])
+        page.resize(1280, 900)
+        in_state = "document.querySelectorAll('.run[data-state={}]').length"
+        page.wait("document.getElementById('name').textContent === 'small'", "the page shows the sweep")
+        page.wait("document.querySelectorAll('.run').length === 4", "all runs are listed")
+        page.wait("document.querySelectorAll('.run[data-state=running] strong a').length > 0", "a run links to its page")
+        page.wait("document.querySelectorAll('#success-chart circle.dot').length > 0", "the chart has points", 60)
+        page.wait(f"{in_state.format('finished')} >= 1", "a run is finished", 60)
+        check_layout(page)
+        take_pictures(page, pictures, "sweep")
+        page.wait("document.getElementById('phase').textContent === 'complete'", "the end is shown", 120)
+        text = page.value("document.getElementById('log').textContent")
+        assert text.count("is finished: success") == 4, text
+        assert process.wait(60) == 0
+        errors = [error for error in page.errors if not re.search("CONNECTION_REFUSED|INCOMPLETE_CHUNKED", str(error))]
+        assert not errors, errors
+    finally:
+        process.kill()
 
 
 def check_layout(page):
@@ -262,7 +309,8 @@ def main():
             errors = [error for error in page.errors if "ERR_CONNECTION_REFUSED" not in str(error)
                       and "ERR_INCOMPLETE_CHUNKED_ENCODING" not in str(error)]
             assert not errors, errors
-    print(f"the dashboard passed in {time.monotonic() - began:.0f} s")
+        check_sweep(browser, args.program.resolve(), pathlib.Path(directory), args.pictures)
+    print(f"the dashboards passed in {time.monotonic() - began:.0f} s")
 
 
 if __name__ == "__main__":

@@ -12,9 +12,9 @@ use tandem_rl::RunConfig;
 use tokio::net::TcpListener;
 use tonic::Status;
 
-use crate::run::{Left, Served, Toy, learner_config};
-use crate::teacher::FakeTeacher;
-use crate::toy::{UNITS, claim, config};
+use crate::service_tests::run::{Left, Served, Toy, learner_config};
+use crate::service_tests::teacher::FakeTeacher;
+use crate::service_tests::toy::{UNITS, claim, config};
 
 /// More than the toy spends.
 const AMPLE: u64 = 10_000;

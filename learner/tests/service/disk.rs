@@ -8,8 +8,8 @@ use std::time::Duration;
 use tandem_learner::{Error, LearnerConfig, checkpoint};
 use tandem_proto::pb;
 
-use crate::run::{DEADLINE, Left, Served, Toy, calm, learner_config, real_clock};
-use crate::toy::config;
+use crate::service_tests::run::{DEADLINE, Left, Served, Toy, calm, learner_config, real_clock};
+use crate::service_tests::toy::config;
 
 const SKIPPED: &str = "skipped: no disk can be mounted here, that needs root";
 

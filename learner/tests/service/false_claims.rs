@@ -12,11 +12,11 @@ use tokio::task::JoinHandle;
 use tonic::transport::Channel;
 use tonic::{Code, Status};
 
-use crate::advice::{advised, charge, with_teacher};
-use crate::resume::copies_of;
-use crate::run::{DEADLINE, Left, Served, Toy, VERSION, calm, learner_config};
-use crate::teacher::FakeTeacher;
-use crate::toy::{UNITS, claim, config};
+use crate::service_tests::advice::{advised, charge, with_teacher};
+use crate::service_tests::resume::copies_of;
+use crate::service_tests::run::{DEADLINE, Left, Served, Toy, VERSION, calm, learner_config};
+use crate::service_tests::teacher::FakeTeacher;
+use crate::service_tests::toy::{UNITS, claim, config};
 
 /// More than the toy spends.
 const BUDGET: u64 = 2000;

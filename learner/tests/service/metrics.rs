@@ -12,8 +12,8 @@ use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
 
-use crate::run::{DEADLINE, Toy, client_of, learner_config};
-use crate::toy;
+use crate::service_tests::run::{DEADLINE, Toy, client_of, learner_config};
+use crate::service_tests::toy;
 
 /// Returns the values at `/metrics` by name and labels.
 async fn scrape(address: SocketAddr) -> BTreeMap<String, f64> {

@@ -5,8 +5,8 @@ use std::time::Duration;
 use rand_chacha::ChaCha8Rng;
 use tandem_core::rng::{Stream, episode_rng, index};
 
-use crate::run::{Left, Served, Toy, calm, deliver_as, learner_config};
-use crate::toy::config;
+use crate::service_tests::run::{Left, Served, Toy, calm, deliver_as, learner_config};
+use crate::service_tests::toy::config;
 
 /// Plays slots in its own time, delivers some twice, and some in another worker's name.
 async fn play_restlessly(mut toy: Toy, mut rng: ChaCha8Rng, all_ids: Vec<u64>) {

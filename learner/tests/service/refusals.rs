@@ -4,8 +4,8 @@ use tandem_core::Episode;
 use tandem_proto::{encode_episode, pb};
 use tonic::{Code, Status};
 
-use crate::run::{Left, Served, Toy, VERSION, calm, learner_config};
-use crate::toy::config;
+use crate::service_tests::run::{Left, Served, Toy, VERSION, calm, learner_config};
+use crate::service_tests::toy::config;
 
 type Spoil = fn(&mut pb::SubmitEpisodesRequest);
 

@@ -16,8 +16,10 @@ use tokio_util::sync::CancellationToken;
 use tonic::transport::Channel;
 use tonic::{Code, Request, Response, Status};
 
-use crate::run::{DEADLINE, Left, Served, Toy, VERSION, calm, client_of, learner_config};
-use crate::toy::config;
+use crate::service_tests::run::{
+    DEADLINE, Left, Served, Toy, VERSION, calm, client_of, learner_config,
+};
+use crate::service_tests::toy::config;
 
 async fn bound() -> (TcpListener, SocketAddr) {
     let listener = TcpListener::bind("127.0.0.1:0").await.expect("a port");

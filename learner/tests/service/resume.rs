@@ -9,8 +9,8 @@ use tandem_rl::RunConfig;
 use tandem_telemetry::MetricsLog;
 use tempfile::TempDir;
 
-use crate::run::{Left, Served, calm, copy_all, learner_config, real_clock};
-use crate::toy::config;
+use crate::service_tests::run::{Left, Served, calm, copy_all, learner_config, real_clock};
+use crate::service_tests::toy::config;
 
 async fn resume(run: RunConfig, out: &Path) -> Result<RunOutcome, Error> {
     Served::start(learner_config(run, out, true)).await.finish(2).await

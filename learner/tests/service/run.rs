@@ -24,7 +24,7 @@ use tokio_util::sync::CancellationToken;
 use tonic::Status;
 use tonic::transport::{Channel, Endpoint};
 
-use crate::toy::{LAYOUT, play};
+use crate::service_tests::toy::{LAYOUT, play};
 
 /// Within this everything that is to happen has happened, on the slowest machine.
 pub(crate) const DEADLINE: Duration = Duration::from_secs(120);

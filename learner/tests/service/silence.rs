@@ -8,8 +8,8 @@ use tandem_learner::{Error, LearnerConfig};
 use tandem_proto::pb;
 use tandem_proto::pb::next_work_response::Work;
 
-use crate::run::{DEADLINE, Left, Served, calm, learner_config, real_clock};
-use crate::toy::config;
+use crate::service_tests::run::{DEADLINE, Left, Served, calm, learner_config, real_clock};
+use crate::service_tests::toy::config;
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_dead_workers_slot_is_played_by_another_within_seconds() {

@@ -12,7 +12,7 @@ use tokio::net::TcpListener;
 use tokio_util::sync::CancellationToken;
 use tonic::{Request, Response, Status, Streaming};
 
-use crate::toy::LAYOUT;
+use crate::service_tests::toy::LAYOUT;
 
 #[derive(Default, Clone)]
 pub(crate) struct FakeTeacher {

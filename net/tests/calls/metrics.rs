@@ -10,7 +10,7 @@ use tandem_proto::pb::bridge_client::BridgeClient;
 use tandem_proto::pb::teacher_client::TeacherClient;
 use tonic::Request;
 
-use crate::support::{OTHER, SECRET, Served, token};
+use crate::calls::support::{OTHER, SECRET, Served, token};
 
 /// Metrics by a clock that advances by 1 ms at each reading.
 fn metrics() -> Metrics {

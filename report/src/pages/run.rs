@@ -4,9 +4,10 @@ use tandem_core::TaskSpec;
 use tandem_core::task::Norm;
 use tandem_telemetry::MetricsRow;
 
+use crate::comparison::FilmStrip;
 use crate::curve::{Axis, CurveOptions, Quantity, Series, curve_svg};
 use crate::error::Error;
-use crate::html::{details, escaped, svg_grid, table};
+use crate::html::{details, escaped, film_strip, svg_grid, table};
 use crate::run::Run;
 use crate::table::{NONE, duration, interval, number, optional, share, thousands};
 
@@ -14,7 +15,7 @@ use crate::table::{NONE, duration, interval, number, optional, share, thousands}
 const CONTACT_TILE: &str = "with contact";
 
 /// Returns key values, curves, evaluations and configuration of `run` as HTML.
-pub(super) fn body(run: &Run) -> Result<String, Error> {
+pub(super) fn body(run: &Run, films: &[FilmStrip]) -> Result<String, Error> {
     let task = run.task_spec();
     let has_contacts = task.as_ref().is_none_or(TaskSpec::reports_contacts);
     let mut body = task.as_ref().map(task_line).unwrap_or_default();
@@ -27,6 +28,10 @@ pub(super) fn body(run: &Run) -> Result<String, Error> {
             body.push_str(&tiles(best, last, has_contacts));
         }
         _ => body.push_str("<p>No evaluation yet.</p>"),
+    }
+    if !films.is_empty() {
+        let strips = films.iter().map(|film| film_strip(&film.title, &film.png));
+        body.push_str(&format!("<h2>Episodes</h2>{}", strips.collect::<String>()));
     }
     if !run.rows.is_empty() {
         let cells = |row| evaluation_cells(row, has_contacts);

@@ -20,11 +20,11 @@ use tandem_worker::{
 use tokio_util::sync::CancellationToken;
 use tonic::Status;
 
-use crate::support::environment::{FakeEnvironments, Fault, played_on};
-use crate::support::learner::{Call, FakeLearner};
-use crate::support::teacher::FakeTeacher;
-use crate::support::{LAYOUT, Server, orders, terms};
-use crate::{TIMEOUTS, config, episodes_without_faults};
+use crate::services::support::environment::{FakeEnvironments, Fault, played_on};
+use crate::services::support::learner::{Call, FakeLearner};
+use crate::services::support::teacher::FakeTeacher;
+use crate::services::support::{LAYOUT, Server, orders, terms};
+use crate::services::{TIMEOUTS, config, episodes_without_faults};
 
 /// Plays all slots on `environments`; returns the delivered episodes and the fake learner.
 async fn play_on(
