@@ -64,7 +64,8 @@ impl View {
         let (origin, direction) = self.0.ray(x, y);
         let distance_m = (f64::from(z_m) - origin.z) / direction.z;
         let point = origin + distance_m * direction;
-        (distance_m.is_finite() && distance_m > 0.0).then(|| [point.x as f32, point.y as f32, z_m])
+        let is_ahead = distance_m.is_finite() && distance_m > 0.0;
+        is_ahead.then_some([point.x as f32, point.y as f32, z_m])
     }
 }
 
