@@ -121,7 +121,7 @@ class App {
     $("since").textContent = seconds(status.steps_since_change * step_s);
     const first = status.steps_to_success;
     $("since-detail").textContent = first === null ? `${status.steps_since_change} control steps`
-      : `reached after ${first} control steps`;
+      : `reached after ${first} steps`;
     if (status.is_success) show(badge, "Both goals reached", "good");
     else if (!status.is_in_reach) show(badge, "A cube is out of reach: restart", "bad");
     else show(badge, `${status.achieved.filter(Boolean).length} of ${status.achieved.length} goals reached`, "");

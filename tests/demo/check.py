@@ -260,6 +260,10 @@ def check_layout(page):
             page.resize(width, 800, dark)
             overflow = page.value("document.documentElement.scrollWidth - document.documentElement.clientWidth")
             assert overflow <= 0, f"{overflow} px too wide at {width} px"
+            cut = page.value("[...document.querySelectorAll('.controls *, .card *')].filter(it => it.checkVisibility() && "
+                             "!it.matches('.visually-hidden') && it.getBoundingClientRect().right > "
+                             "it.closest('section').getBoundingClientRect().right).map(it => it.id || it.tagName)")
+            assert cut == [], f"cut off at {width} px: {cut}"
     names = page.value("[...document.querySelectorAll('button, input, select, canvas')].filter(it => it.checkVisibility() && "
                        "!(it.ariaLabel || it.getAttribute('aria-labelledby') || it.textContent.trim() || it.labels?.length))"
                        ".map(it => it.id)")
