@@ -72,7 +72,7 @@ impl EagerTeacher {
                 overridden,
             });
         }
-        StepAdvice { action, charged: arms.iter().any(|arm| arm.overridden), arms }
+        StepAdvice { action, charged: arms.iter().any(|arm| arm.overridden), arms, repeated: false }
     }
 }
 

@@ -55,6 +55,8 @@ pub struct StepAdvice {
     pub charged: bool,
     /// The advice for each arm, in arm order.
     pub arms: Vec<ArmAdvice>,
+    /// Whether the teacher had decided on the step before, on an earlier request with the same numbers or with others.
+    pub repeated: bool,
 }
 
 impl StepAdvice {

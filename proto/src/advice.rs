@@ -72,6 +72,7 @@ pub fn encode_advice(advice: &StepAdvice) -> pb::StepAdvice {
         action: advice.action.clone(),
         charged: advice.charged,
         arms: advice.arms.iter().map(encode_arm).collect(),
+        repeated: advice.repeated,
     }
 }
 
@@ -108,6 +109,7 @@ pub fn decode_advice(
         action: actions("action", advice.action, layout.n_action())?,
         charged: advice.charged,
         arms: advice.arms.into_iter().enumerate().map(decode_indexed).collect::<Result<_, _>>()?,
+        repeated: advice.repeated,
     })
 }
 
@@ -160,6 +162,7 @@ mod tests {
             action: vec![0.1, 0.2, 0.3, 0.4, -0.5, -0.6, -0.7, -0.8],
             charged: true,
             arms: vec![arm([0.0, 0.1, 0.2, 0.3], false), arm([-0.5, -0.6, -0.7, -0.8], true)],
+            repeated: true,
         }
     }
 

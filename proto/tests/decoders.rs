@@ -132,8 +132,9 @@ fn arm_advice(layout: Layout) -> impl Strategy<Value = pb::ArmAdvice> {
 fn advice(layout: Layout) -> impl Strategy<Value = pb::StepAdvice> {
     let arms = length_near(layout.n_arms)
         .prop_flat_map(move |n_arms| vec(arm_advice(layout), size_range(n_arms)));
-    (numbers(layout.n_action()), any::<bool>(), arms)
-        .prop_map(|(action, charged, arms)| pb::StepAdvice { action, charged, arms })
+    (numbers(layout.n_action()), any::<bool>(), arms, any::<bool>()).prop_map(
+        |(action, charged, arms, repeated)| pb::StepAdvice { action, charged, arms, repeated },
+    )
 }
 
 fn terms() -> impl Strategy<Value = pb::RunTerms> {

@@ -164,7 +164,8 @@ impl Advisor {
         let mut answer = |scored: ScoredRequest<'_>| {
             let charged = if scored.arms.is_empty() {
                 let balance = self.ledger.balance(&scored.request.account);
-                balance.map(|balance| ChargeResult { verdicts: Vec::new(), left: balance.left })
+                balance
+                    .map(|balance| ChargeResult { left: balance.left, ..ChargeResult::default() })
             } else {
                 charged.next().expect("one result for each request")
             };
@@ -300,10 +301,11 @@ impl ScoredRequest<'_> {
         let charged = charged.map_err(|error| with_step(error, queries, &indices, n_steps))?;
         let n_charges = indices.iter().max().map_or(0, |last| last + 1);
         assert_eq!(charged.verdicts.len(), n_charges, "a ledger decides on every charge");
-        let verdicts = indices.into_iter().map(|charge_idx| charged.verdicts[charge_idx]);
-        let decided = queries.iter().zip(self.arms).zip(verdicts);
-        let steps = decided
-            .map(|((query, arms), verdict)| step_advice(self.strategy, maps, query, arms, verdict));
+        let decided = queries.iter().zip(self.arms).zip(indices);
+        let steps = decided.map(|((query, arms), charge_idx)| StepAdvice {
+            repeated: charged.repeated[charge_idx],
+            ..step_advice(self.strategy, maps, query, arms, charged.verdicts[charge_idx])
+        });
         Ok(Advice { steps: steps.collect(), budget_left: charged.left })
     }
 }
@@ -339,7 +341,7 @@ fn step_advice(
         }
     }
     let action = compose(maps, &query.proposed_action, &arms);
-    StepAdvice { action, charged: verdict.is_some(), arms }
+    StepAdvice { action, charged: verdict.is_some(), arms, repeated: false }
 }
 
 /// Composes the joint action, as in the last line of every procedure: `a = f^a(a_1, …, a_n)`.

@@ -34,6 +34,8 @@ pub struct ChargeRequest {
 pub struct ChargeResult {
     /// The verdict on each charge: the half of the budget whose unit the step cost, or `None` if it cost nothing.
     pub verdicts: Vec<Option<BudgetHalf>>,
+    /// Whether each verdict is that of an earlier charge for the same step.
+    pub repeated: Vec<bool>,
     /// Units that are neither spent nor leased after the charges.
     pub left: u64,
 }
@@ -233,8 +235,10 @@ fn charge_all(
     if let Some(charge_idx) = charges.iter().position(is_beyond_end) {
         return Err(LedgerError::BeyondEnd { charge_idx });
     }
-    let verdicts = charges.iter().map(|charge| account.charge(*charge)).collect();
-    Ok(ChargeResult { verdicts, left: account.left() })
+    let charged =
+        charges.iter().map(|charge| (account.has_verdict(*charge), account.charge(*charge)));
+    let (repeated, verdicts) = charged.unzip();
+    Ok(ChargeResult { verdicts, repeated, left: account.left() })
 }
 
 /// Returns whether the step lies beyond the end of an episode with a lease. Episodes of a run have leases and

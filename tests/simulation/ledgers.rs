@@ -94,7 +94,8 @@ impl ForgetfulLedger {
         let account = self.account(&request.account)?;
         let charge = |(step, charge): (u32, &Charge)| account.charge(Charge { step, ..*charge });
         let verdicts = (first_step..).zip(&request.charges).map(charge).collect();
-        Ok(ChargeResult { verdicts, left: account.left() })
+        let repeated = vec![false; request.charges.len()];
+        Ok(ChargeResult { verdicts, repeated, left: account.left() })
     }
 }
 

@@ -138,7 +138,7 @@ impl<F: Fn(u64, u32, usize) -> bool> FakeTeacher<F> {
                 }
             })
             .collect();
-        StepAdvice { action, charged: arms.iter().any(|arm| arm.overridden), arms }
+        StepAdvice { action, charged: arms.iter().any(|arm| arm.overridden), arms, repeated: false }
     }
 }
 

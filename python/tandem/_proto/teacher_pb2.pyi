@@ -120,14 +120,16 @@ class AdviseResponse(_message.Message):
     def __init__(self, steps: _Optional[_Iterable[_Union[StepAdvice, _Mapping]]] = ..., budget_left: _Optional[int] = ...) -> None: ...
 
 class StepAdvice(_message.Message):
-    __slots__ = ("action", "charged", "arms")
+    __slots__ = ("action", "charged", "arms", "repeated")
     ACTION_FIELD_NUMBER: _ClassVar[int]
     CHARGED_FIELD_NUMBER: _ClassVar[int]
     ARMS_FIELD_NUMBER: _ClassVar[int]
+    REPEATED_FIELD_NUMBER: _ClassVar[int]
     action: _containers.RepeatedScalarFieldContainer[float]
     charged: bool
     arms: _containers.RepeatedCompositeFieldContainer[ArmAdvice]
-    def __init__(self, action: _Optional[_Iterable[float]] = ..., charged: bool = ..., arms: _Optional[_Iterable[_Union[ArmAdvice, _Mapping]]] = ...) -> None: ...
+    repeated: bool
+    def __init__(self, action: _Optional[_Iterable[float]] = ..., charged: bool = ..., arms: _Optional[_Iterable[_Union[ArmAdvice, _Mapping]]] = ..., repeated: bool = ...) -> None: ...
 
 class ArmAdvice(_message.Message):
     __slots__ = ("teacher_action", "q_teacher", "q_student", "importance", "distance", "overridden")

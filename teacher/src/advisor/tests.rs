@@ -55,6 +55,15 @@ fn each_strategy_overrides_the_arms_that_its_procedure_selects() {
 }
 
 #[test]
+fn advice_on_a_step_that_was_decided_before_is_marked() {
+    let advisor = &mut advisor(10, "ea");
+    assert!(!ask(advisor, &two_arms(0)).repeated);
+    let again = ask(advisor, &query(1, 0, 0.25, 0.25));
+    assert!(again.repeated && again.charged, "other numbers for the same step");
+    assert!(!ask(advisor, &two_arms(1)).repeated, "another step");
+}
+
+#[test]
 fn every_strategy_returns_the_scores() {
     for strategy in ["none", "ea", "eamc", "mc-q", "mc-act", "mc-act-abs"] {
         for budget in [0, 10] {
@@ -118,7 +127,8 @@ fn a_repeated_query_gets_the_same_answer_in_any_phase() {
     let first: Vec<StepAdvice> = (0..6).map(|step| ask(&mut advisor, &two_arms(step))).collect();
     let spent = advisor.balance("run").unwrap();
     let again: Vec<StepAdvice> = (0..6).map(|step| ask(&mut advisor, &two_arms(step))).collect();
-    assert_eq!(again, first);
+    let marked = |advice: StepAdvice| StepAdvice { repeated: true, ..advice };
+    assert_eq!(again, first.into_iter().map(marked).collect::<Vec<_>>());
     assert_eq!(advisor.balance("run").unwrap(), spent);
 }
 

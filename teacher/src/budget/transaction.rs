@@ -89,6 +89,12 @@ impl<'a> Transaction<'a> {
         }
     }
 
+    /// Returns whether there is a verdict on the step of `charge`.
+    pub(crate) fn has_verdict(&self, charge: Charge) -> bool {
+        let bits = self.verdicts_at(verdict_index(charge.episode, charge.step));
+        bits.is_some_and(|bits| bits.get(charge.step).is_some())
+    }
+
     /// Charges one step; see [`Account::charge`].
     pub(crate) fn charge(&mut self, charge: Charge) -> Option<BudgetHalf> {
         let Charge { episode, step, .. } = charge;

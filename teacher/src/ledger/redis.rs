@@ -21,6 +21,8 @@ use server::{Call, Reply, Script, Server};
 
 /// Steps whose verdicts share a field of the hash.
 const STEPS_PER_FIELD: u32 = 64;
+/// What the script adds to a verdict that it found.
+const KNOWN: u64 = 10;
 
 /// A ledger on a Redis server.
 #[derive(Debug)]
@@ -98,7 +100,7 @@ impl RedisLedger {
             let charge_idx = usize::try_from(*charge_idx).unwrap_or(usize::MAX);
             return Err(LedgerError::BeyondEnd { charge_idx });
         }
-        let verdict = |number: &u64| match number {
+        let verdict = |number: &u64| match number % KNOWN {
             0 => Ok(None),
             1 => Ok(Some(BudgetHalf::First)),
             2 => Ok(Some(BudgetHalf::Second)),
@@ -108,7 +110,8 @@ impl RedisLedger {
         if verdicts.len() != request.charges.len() {
             return Err(self.invalid("not one verdict for each charge"));
         }
-        Ok(ChargeResult { verdicts, left: balance.left })
+        let repeated = reply.numbers.iter().map(|number| *number >= KNOWN).collect();
+        Ok(ChargeResult { verdicts, repeated, left: balance.left })
     }
 
     /// Returns the error for a reply or a value that no ledger writes.

@@ -170,7 +170,8 @@ async fn a_request_of_many_steps_is_answered_like_many_requests() {
     let mut fixture = Fixture::start().await;
     fixture.open(30, "eamc:0.1").await.unwrap();
     let together = fixture.advise((0..40).map(step).collect()).await.unwrap();
-    for (step_idx, expected) in (0..40).zip(together.steps) {
+    for (step_idx, first) in (0..40).zip(together.steps) {
+        let expected = pb::StepAdvice { repeated: true, ..first };
         assert_eq!(fixture.advise(vec![step(step_idx)]).await.unwrap().steps, [expected]);
     }
     fixture.stop().await;

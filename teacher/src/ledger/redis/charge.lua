@@ -5,7 +5,7 @@
 -- The halves are two characters, for a unit of the first and of the second half: 1 if the step is worth it. A field has
 -- one character for each step: - not asked about, 0 not charged, 1 and 2 charged a unit of that half.
 --
--- Numbers: the verdicts. Refused: the index, from 0, of a charge beyond the end of its episode.
+-- Numbers: the verdicts, plus 10 if the step was asked about before. Refused: the index, from 0, of a charge beyond the end of its episode.
 
 local leases = {}
 for i = 1, #ARGV, 5 do
@@ -34,9 +34,11 @@ for i = 1, #ARGV, 5 do
   local episode, field, position, wanted = ARGV[i], ARGV[i + 1], tonumber(ARGV[i + 2]), ARGV[i + 3]
   local word = words[field] or redis.call('HGET', KEYS[3], field) or ''
   local verdict = string.sub(word, position, position)
+  local known = 10
   if verdict == '' or verdict == '-' then
     local lease = leases[episode]
     local half = next_unit(lease)
+    known = 0
     verdict = '0'
     if half and string.sub(wanted, half, half) == '1' then
       verdict = tostring(half)
@@ -52,7 +54,7 @@ for i = 1, #ARGV, 5 do
     changed_words[field] = word
   end
   words[field] = word
-  verdicts[#verdicts + 1] = tonumber(verdict)
+  verdicts[#verdicts + 1] = tonumber(verdict) + known
 end
 
 for field, word in pairs(changed_words) do

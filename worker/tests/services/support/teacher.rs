@@ -99,7 +99,7 @@ impl Inner {
         if charged {
             self.charged.lock().expect("no handler panics").insert((query.episode, query.step));
         }
-        StepAdvice { action, charged, arms: overrides.map(arm).to_vec() }
+        StepAdvice { action, charged, arms: overrides.map(arm).to_vec(), repeated: false }
     }
 
     fn next_fault(&self) -> Option<&Fault> {
