@@ -309,6 +309,8 @@ def wilson(hits, n):
 
 def collect(options):
     """Copies the small files of all pieces."""
+    if not options.runs.is_dir():
+        sys.exit(f"benchmarks: no pieces in {options.runs}")
     small = ("metrics.jsonl", "run.toml", "summary.json", "processor.csv", "progress.csv")
     for directory in sorted(options.runs.iterdir()):
         files = [directory / name for name in small if (directory / name).is_file()]

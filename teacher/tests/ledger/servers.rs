@@ -87,8 +87,10 @@ fn a_killed_server_is_unavailable_and_comes_back_with_everything() {
     let outcomes = ledger.charge(&[charges.clone(), charges.clone()]);
     outcomes.into_iter().for_each(|outcome| drop(is_unavailable(outcome)));
     server.restart();
-    // The same ledger reconnects.
-    assert_eq!(ledger.charge(std::slice::from_ref(&charges)).remove(0).expect("paid"), result);
+    // The same ledger reconnects, and the charges are kept.
+    let again = ledger.charge(std::slice::from_ref(&charges)).remove(0).expect("paid");
+    assert_eq!((again.verdicts, again.left), (result.verdicts, result.left));
+    assert_eq!(again.repeated, [true; 3]);
     let balance = ledger.settle("run", &[1]).expect("settled");
     assert_eq!((balance.spent, balance.leased, balance.left), (2, 0, 8));
 }
