@@ -29,6 +29,8 @@ const ALLOWED: [(&str, &[&str]); 20] = [
 
 /// The Python package, which has a workspace of its own and is in no image.
 const PYTHON: (&str, &[&str]) = ("python", &["core", "picture", "sim", "policy"]);
+/// The browser demo, which has a workspace of its own as well.
+const DEMO: (&str, &[&str]) = ("demo", &["core", "picture", "sim", "policy"]);
 
 /// Directories of which every file is pure, and single pure files.
 const PURE: [&str; 27] = [
@@ -63,7 +65,7 @@ const PURE: [&str; 27] = [
 
 #[test]
 fn crates_depend_only_downward() {
-    for (name, allowed) in ALLOWED.into_iter().chain([PYTHON]) {
+    for (name, allowed) in ALLOWED.into_iter().chain([PYTHON, DEMO]) {
         let ours: BTreeSet<String> = dependencies(name)
             .iter()
             .filter_map(|d| d.strip_prefix("tandem-").map(str::to_owned))
@@ -105,7 +107,7 @@ fn one_module_prints() {
 
 #[test]
 fn files_stay_readable() {
-    let crates = ALLOWED.iter().chain([&PYTHON]);
+    let crates = ALLOWED.iter().chain([&PYTHON, &DEMO]);
     let dirs = crates.map(|(name, _)| root().join(name).join("src")).chain([root().join("src")]);
     for path in dirs.flat_map(|dir| rust_files(&dir)) {
         let n_lines = fs::read_to_string(&path).expect("readable").lines().count();
@@ -149,19 +151,24 @@ fn the_image_is_of_this_version_and_toolchain() {
 
 /// Other versions of what computes could give other bits.
 #[test]
-fn the_python_package_has_this_version_and_the_same_dependencies() {
+fn workspaces_of_their_own_have_this_version_and_the_same_dependencies() {
     let read = |name: &str| fs::read_to_string(root().join(name)).expect("readable");
     let version = format!("version = \"{}\"\n", env!("CARGO_PKG_VERSION"));
-    assert!(read("python/Cargo.toml").contains(&version), "python/Cargo.toml lacks {version:?}");
-    let (ours, python) = (read("Cargo.lock"), read("python/Cargo.lock"));
-    let (ours, python) = (locked_versions(&ours), locked_versions(&python));
-    for (name, versions) in python.iter().filter(|(name, _)| ours.contains_key(*name)) {
-        let surplus: Vec<_> = versions.difference(&ours[name]).collect();
-        assert!(
-            surplus.is_empty(),
-            "python/Cargo.lock has {name} {surplus:?}, not {ours:?}",
-            ours = ours[name]
-        );
+    let ours = read("Cargo.lock");
+    let ours = locked_versions(&ours);
+    for (directory, _) in [PYTHON, DEMO] {
+        let manifest = read(&format!("{directory}/Cargo.toml"));
+        assert!(manifest.contains(&version), "{directory}/Cargo.toml lacks {version:?}");
+        let lock = read(&format!("{directory}/Cargo.lock"));
+        let locked = locked_versions(&lock);
+        for (name, versions) in locked.iter().filter(|(name, _)| ours.contains_key(*name)) {
+            let surplus: Vec<_> = versions.difference(&ours[name]).collect();
+            let expected = &ours[name];
+            assert!(
+                surplus.is_empty(),
+                "{directory}/Cargo.lock has {name} {surplus:?}, not {expected:?}"
+            );
+        }
     }
 }
 

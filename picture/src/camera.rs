@@ -1,7 +1,7 @@
 //! Projection of the world onto the picture.
 
 use glam::DVec3;
-use tandem_core::scene::ArmScene;
+use tandem_core::scene::{ArmScene, Point, Scene};
 
 /// Azimuth of the view, degrees: 0 looks along +y, from the long side of the table.
 const AZIMUTH_DEG: f64 = -24.0;
@@ -20,6 +20,59 @@ const HALF_WORKSPACE_M: f64 = 0.34;
 const BASE_MARGIN_M: f64 = 0.14;
 /// Smallest distance from the camera, metres.
 const NEAREST_M: f64 = 0.1;
+
+/// Where points of the world are in the picture of a scene, which [`render`](crate::render) draws.
+pub struct View(Camera);
+
+impl View {
+    /// Returns the view of a picture of this size, pixels. It depends on the arms' bases only.
+    #[must_use]
+    pub fn of(scene: &Scene, width: usize, height: usize) -> Self {
+        Self(Camera::fitted(&scene.arms, table_z_m(scene), width, height))
+    }
+
+    /// Returns the place of `point` (world frame, metres) in the picture, pixels from the upper left corner.
+    #[must_use]
+    pub fn project(&self, point: Point) -> [f64; 2] {
+        self.0.project(DVec3::from(point.map(f64::from)))
+    }
+
+    /// Returns the distance of `point` (world frame, metres) from the camera along the direction of the view, metres. Points
+    /// with larger depths are behind.
+    #[must_use]
+    pub fn depth_m(&self, point: Point) -> f64 {
+        (DVec3::from(point.map(f64::from)) - self.0.eye).dot(self.0.forward)
+    }
+
+    /// Returns the number of pixels of a metre across the view at `point`, world frame, metres.
+    #[must_use]
+    pub fn pixels_per_m(&self, point: Point) -> f64 {
+        self.0.focal_px / self.depth_m(point).max(NEAREST_M)
+    }
+
+    /// Returns the position of the camera, world frame, metres.
+    #[must_use]
+    pub fn eye(&self) -> [f64; 3] {
+        self.0.eye.to_array()
+    }
+
+    /// Returns the point at height `z_m` (world frame, metres) that is drawn at this place of the picture, pixels; `None`
+    /// if the place is above the horizon.
+    #[must_use]
+    #[expect(clippy::cast_possible_truncation, reason = "metres")]
+    pub fn at_height(&self, [x, y]: [f64; 2], z_m: f32) -> Option<Point> {
+        let (origin, direction) = self.0.ray(x, y);
+        let distance_m = (f64::from(z_m) - origin.z) / direction.z;
+        let point = origin + distance_m * direction;
+        let is_ahead = distance_m.is_finite() && distance_m > 0.0;
+        is_ahead.then_some([point.x as f32, point.y as f32, z_m])
+    }
+}
+
+/// Returns the height of the table's top, metres.
+pub(crate) fn table_z_m(scene: &Scene) -> f64 {
+    f64::from(scene.table.centre[2] + scene.table.half_extents_m[2])
+}
 
 /// A perspective camera.
 pub(crate) struct Camera {
@@ -126,4 +179,48 @@ fn points_of(arm: &ArmScene, table_z_m: f64) -> [DVec3; 5] {
         beside(ahead_m, -HALF_WORKSPACE_M),
         beside(ahead_m, HALF_WORKSPACE_M),
     ]
+}
+
+#[cfg(test)]
+mod tests {
+    use tandem_core::scene::Cuboid;
+
+    use super::*;
+
+    #[test]
+    fn a_place_in_the_picture_is_that_of_its_point() {
+        let arm = |x: f32| ArmScene {
+            base: [x, 0.0, 0.0],
+            joint_angles_rad: [0.0; 6],
+            joint_points: Vec::new(),
+            links: Vec::new(),
+            hand: Vec::new(),
+            end_effector: [0.0; 3],
+        };
+        let table = Cuboid {
+            centre: [0.0, 0.0, -0.1],
+            orientation: [0.0, 0.0, 0.0, 1.0],
+            half_extents_m: [1.0, 1.0, 0.1],
+        };
+        let scene = Scene {
+            time_s: 0.0,
+            arms: vec![arm(-0.52), arm(0.52)],
+            objects: Vec::new(),
+            goals: Vec::new(),
+            goal_tolerance_m: 0.05,
+            table,
+        };
+        let view = View::of(&scene, 640, 400);
+        for point in [[0.1, -0.05, 0.02], [-0.2, 0.12, 0.25]] {
+            let place = view.project(point);
+            assert!((0.0..640.0).contains(&place[0]) && (0.0..400.0).contains(&place[1]));
+            let found = view.at_height(place, point[2]).expect("below the horizon");
+            for (found, expected) in found.iter().zip(point) {
+                assert!((found - expected).abs() < 1e-5, "{found} for {expected}");
+            }
+        }
+        assert_eq!(view.at_height([320.0, -10_000.0], 0.0), None, "the sky");
+        assert!(view.depth_m([0.0, 0.3, 0.0]) > view.depth_m([0.0, -0.3, 0.0]));
+        assert!(view.pixels_per_m([0.0, 0.3, 0.0]) < view.pixels_per_m([0.0, -0.3, 0.0]));
+    }
 }

@@ -3,7 +3,8 @@
 use tandem_core::scene::{ArmScene, Capsule, Cuboid, Point, Scene};
 
 /// Returns the scene at `share` of the way from `before` to `after`, in [0, 1]. Both are scenes of the same world.
-pub(crate) fn between(before: &Scene, after: &Scene, share: f32) -> Scene {
+#[must_use]
+pub fn between(before: &Scene, after: &Scene, share: f32) -> Scene {
     let arms = before.arms.iter().zip(&after.arms);
     let objects = before.objects.iter().zip(&after.objects);
     Scene {

@@ -1,9 +1,9 @@
 //! Pictures and films of simulated scenes, computed by casting rays: the table, arms, objects and goals in perspective,
 //! with shadows.
 //!
-//! [`render`] returns the pixels of one scene. [`film_gif`], [`film_strip`] and [`picture_png`] return files: an
-//! animation of episodes, eight pictures of an episode side by side, and a single picture. The same scenes give the same
-//! bytes, on any number of threads.
+//! [`render`] returns the pixels of one scene, and a [`View`] where its points are in them. [`film_gif`], [`film_strip`]
+//! and [`picture_png`] return files: an animation of episodes, eight pictures of an episode side by side, and a single
+//! picture. The same scenes give the same bytes, on any number of threads.
 #![warn(missing_docs)]
 
 mod camera;
@@ -13,7 +13,6 @@ mod caption;
 mod error;
 #[cfg(feature = "files")]
 mod film;
-#[cfg(feature = "files")]
 mod interpolate;
 mod painter;
 #[cfg(feature = "files")]
@@ -26,10 +25,12 @@ mod strip;
 #[cfg(all(test, feature = "files"))]
 mod tests;
 
+pub use camera::View;
 #[cfg(feature = "files")]
 pub use error::Error;
 #[cfg(feature = "files")]
 pub use film::{Film, FilmEpisode, FilmStep, film_gif};
+pub use interpolate::between;
 pub use painter::render;
 pub use raster::Raster;
 #[cfg(feature = "files")]

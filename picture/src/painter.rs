@@ -6,7 +6,7 @@
 use glam::{DVec2, DVec3};
 use tandem_core::scene::{ArmScene, Capsule, Cuboid, Scene};
 
-use crate::camera::{Camera, Rectangle};
+use crate::camera::{Camera, Rectangle, table_z_m};
 use crate::raster::Raster;
 use crate::shape::{Hit, Shape};
 
@@ -155,7 +155,7 @@ struct Painter {
 
 impl Painter {
     fn new(scene: &Scene, achieved: &[bool], width: usize, height: usize) -> Self {
-        let table_z_m = f64::from(scene.table.centre[2] + scene.table.half_extents_m[2]);
+        let table_z_m = table_z_m(scene);
         let camera = Camera::fitted(&scene.arms, table_z_m, width, height);
         let body = |(shape, color): (Shape, Rgb)| Body {
             bounds: camera.bounds(shape.centre, shape.radius_m),

@@ -1,6 +1,7 @@
 //! The policy file, a safetensors file. `docs/policy-format.md` specifies the format.
 
 use std::collections::BTreeMap;
+#[cfg(feature = "files")]
 use std::path::Path;
 
 use safetensors::tensor::TensorView;
@@ -9,6 +10,7 @@ use serde_json::{Map, Value, json};
 use tandem_core::task::MAX_ARMS;
 use tandem_core::text::shortened;
 use tandem_core::{Layout, Task, TaskDescription, TaskSpec};
+#[cfg(feature = "files")]
 use tandem_system::{atomic_file, regular_file};
 
 use crate::error::{Error, FormatError};
@@ -33,26 +35,45 @@ const MAX_SHOWN_CHARS: usize = 80;
 const HEADER_ALIGNMENT: usize = 8;
 
 impl Policy {
-    /// Writes the policy to `path` atomically.
+    /// Writes the policy to `path` atomically. Needs feature `files`.
     ///
     /// # Errors
     /// Returns an error if the policy is invalid (see [`Policy::check`]) or the file cannot be written.
+    #[cfg(feature = "files")]
     pub fn save(&self, path: &Path) -> Result<(), Error> {
-        self.check()?;
-        atomic_file::replace(path, &encode(self))
+        atomic_file::replace(path, &self.to_bytes()?)
             .map_err(|source| Error::Write { path: path.to_owned(), source })
     }
 
-    /// Reads a policy from `path`.
+    /// Reads a policy from `path`. Needs feature `files`.
     ///
     /// # Errors
     /// Returns an error if the file cannot be read, was truncated or altered, has another format or version, or if a
     /// tensor does not match the task, the number of arms and the networks' sizes.
+    #[cfg(feature = "files")]
     pub fn load(path: &Path) -> Result<Self, Error> {
         let bytes = regular_file::read(path)
             .map_err(|source| Error::Read { path: path.to_owned(), source })?;
-        decode(&bytes)
+        Self::from_bytes(&bytes)
             .map_err(|source| Error::Refused { path: path.to_owned(), source: Box::new(source) })
+    }
+
+    /// Returns the contents of the policy's file. Equal policies give equal bytes.
+    ///
+    /// # Errors
+    /// Returns an error if the policy is invalid (see [`Policy::check`]).
+    pub fn to_bytes(&self) -> Result<Vec<u8>, Error> {
+        self.check()?;
+        Ok(encode(self))
+    }
+
+    /// Reads a policy from the contents of a file.
+    ///
+    /// # Errors
+    /// Returns an error if the contents were truncated or altered, have another format or version, or if a tensor does
+    /// not match the task, the number of arms and the networks' sizes.
+    pub fn from_bytes(bytes: &[u8]) -> Result<Self, FormatError> {
+        decode(bytes)
     }
 }
 

@@ -56,6 +56,9 @@ ELSEWHERE = [
     Entry("python scripts/mujoco_transfer.py", "needs MuJoCo", "scripts/smoke.sh"),
     # A program that is built in another way.
     Entry("target/release/tandem train", "needs the feature otlp", "tests/otlp.rs"),
+    Entry("scripts/build-demo", "compiles for WebAssembly", "scripts/test-demo"),
+    Entry("python3 -m http.server -d docs/demo", "needs the built demo", "tests/demo/check.py"),
+    Entry("cargo run --release --manifest-path demo/Cargo.toml", "compiles for minutes", "scripts/test-demo"),
     # Steps of the continuous integration, and what takes longer.
     Entry(".ci/run", "runs this test", ".ci/run"),
     Entry("scripts/test-guide", "is this test", ".ci/run"),

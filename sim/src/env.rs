@@ -2,7 +2,7 @@
 
 use rand_chacha::ChaCha8Rng;
 use rapier3d::math::Vector;
-use tandem_core::scene::Scene;
+use tandem_core::scene::{Point, Scene};
 use tandem_core::{ArmIndex, Contacts, Layout, WorldSettings};
 
 use crate::arm::Command;
@@ -12,7 +12,7 @@ use crate::frame::MAX_ARMS;
 use crate::observation::observe_arm;
 use crate::randomization::{Episode, ObservationNoise};
 use crate::scene::scene;
-use crate::start::{ArmStart, sample_starts};
+use crate::start::{ArmStart, goal_area, sample_starts};
 use crate::world::World;
 
 /// Smallest gap between the links of two arms at the start of an episode, metres.
@@ -124,6 +124,25 @@ impl Env {
     #[must_use]
     pub fn goal(&self) -> &[f32] {
         &self.goal
+    }
+
+    /// Returns the box that contains the goals of all episodes, in the frame of an arm: the range along each axis, metres.
+    #[must_use]
+    pub fn goal_area(&self) -> [[f32; 2]; 3] {
+        goal_area(self.layout, self.object_half_m)
+    }
+
+    /// Moves the goal of `arm`'s object to `goal`, world frame, metres, or to the nearest point along each axis of the
+    /// [`goal_area`](Self::goal_area). It does not affect the physics.
+    ///
+    /// # Panics
+    /// If the world has no such arm.
+    pub fn move_goal(&mut self, arm: ArmIndex, goal: Point) {
+        let in_arm = self.world.arms[arm.0].frame.arm_from_world(Vector::from_array(goal));
+        let [low, high] =
+            [0, 1].map(|end| Vector::from_array(self.goal_area().map(|range| range[end])));
+        let in_area = in_arm.clamp(low, high).to_array();
+        self.goal[self.layout.goal_of(arm)].copy_from_slice(&in_area);
     }
 
     /// Executes `action` for one [control step](tandem_core::World::control_step_s) and returns the contacts of the arms
@@ -284,6 +303,28 @@ mod tests {
         let stay = world.arms.iter().map(|arm| arm.hand.end_effector(&world.physics));
         let commands: Vec<Command> = stay.map(|target| Command { target, gripper: 1.0 }).collect();
         world.step(&[commands[0], commands[1]]).unwrap()
+    }
+
+    #[test]
+    fn a_goal_moves_to_the_nearest_point_of_its_area() {
+        let mut env =
+            Env::new(Layout::new(Task::PickAndPlace, 2), &WorldConfig::default()).unwrap();
+        env.reset(&mut episode_rng(1, 0, Stream::Reset), WorldSettings::default());
+        let other = env.goal()[..3].to_vec();
+        env.move_goal(ArmIndex(1), [0.05, -0.5, 0.1]);
+        assert_eq!(env.goal()[..3], other);
+        let expected = [0.07, 0.12, 0.1];
+        let near = |(got, expected): (&f32, f32)| (got - expected).abs() < 1e-6;
+        assert!(env.goal()[3..].iter().zip(expected).all(near), "{:?}", env.goal());
+        assert_eq!(env.scene().goals[1][1], -0.12);
+        for episode in 0..20 {
+            env.reset(&mut episode_rng(1, episode, Stream::Reset), WorldSettings::default());
+            let (area, goals) = (env.goal_area(), env.goal().as_chunks::<3>().0);
+            let is_inside = |goal: &[f32; 3]| {
+                (0..3).all(|axis| (area[axis][0]..=area[axis][1]).contains(&goal[axis]))
+            };
+            assert!(goals.iter().all(is_inside), "{goals:?} outside {area:?}");
+        }
     }
 
     #[test]

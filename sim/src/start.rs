@@ -51,6 +51,19 @@ enum HandStart {
     Grasping,
 }
 
+/// Returns the smallest box, arm frame, metres, that contains the goals of all episodes with objects of half edge
+/// `object_half_m`: the range along each axis.
+pub(crate) fn goal_area(layout: Layout, object_half_m: f32) -> [[f32; 2]; 3] {
+    let (x_m, y_m, air_m) = match layout.task.world() {
+        World::Classic => {
+            ([-AREA_X_M, AREA_X_M], AREA_Y_M[usize::from(layout.n_arms > 1)], AIR_GOAL_HIGH_M)
+        }
+        World::Shared => (shared::AREA_X_M, shared::AREA_Y_M, shared::AIR_GOAL_HIGH_M),
+    };
+    let high_m = if layout.task.grasps() { object_half_m + air_m } else { object_half_m };
+    [x_m, [-y_m, y_m], [object_half_m, high_m]]
+}
+
 /// Draws the initial state of every arm. Objects, goals and hands are apart from each other, and no goal is achieved.
 pub(crate) fn sample_starts(
     rng: &mut ChaCha8Rng,

@@ -16,9 +16,9 @@ use crate::reach::Reach;
 use crate::start::{ArmStart, all_pairs, horizontal};
 
 /// Range of objects and goals along x, arm frame, metres.
-const AREA_X_M: [f32; 2] = [0.0, 0.20];
+pub(super) const AREA_X_M: [f32; 2] = [0.0, 0.20];
 /// Half extent of their area along y, metres.
-const AREA_Y_M: f32 = 0.15;
+pub(super) const AREA_Y_M: f32 = 0.15;
 /// Horizontal room for a hand behind an object, metres: half the object's diagonal, and a pad.
 const ROOM_BEHIND_M: f32 = 0.055;
 /// Smallest distance between an object and its goal, metres; more than the tolerance, which an object that settles
@@ -41,7 +41,7 @@ const FINGER_GAP_M: f32 = 0.01;
 /// Probability that a pick-and-place goal is above the table.
 const AIR_GOAL_PROB: f32 = 0.5;
 /// Largest height of such a goal above the table, metres.
-const AIR_GOAL_HIGH_M: f32 = 0.30;
+pub(super) const AIR_GOAL_HIGH_M: f32 = 0.30;
 /// Largest offset of a grasped object from the centre of the pads along x and z, metres.
 const GRASPED_OFFSET_M: [f32; 2] = [0.004, 0.008];
 

@@ -1,0 +1,27 @@
+"""The digests of 1,000 steps of the shipped students, which the browser demo computes as well."""
+
+import hashlib
+import json
+
+import gymnasium
+import pytest
+from conftest import ROOT
+
+import tandem
+
+DIGESTS = json.loads((ROOT / "demo/digests.json").read_text())
+
+
+@pytest.mark.parametrize("task", DIGESTS)
+def test_a_thousand_steps_have_the_bits_of_every_processor(task):
+    policy = tandem.load_policy(ROOT / f"policies/student-{task}.safetensors")
+    env = gymnasium.make(policy.env_id)
+    digest = hashlib.sha256()
+    for episode in range(20):
+        observation, _ = env.reset(seed=1, options={"episode": episode})
+        digest.update(observation["observation"].tobytes())
+        for _ in range(50):
+            action, _ = policy.predict(observation)
+            observation, *_ = env.step(action)
+            digest.update(observation["observation"].tobytes())
+    assert digest.hexdigest() == DIGESTS[task]
