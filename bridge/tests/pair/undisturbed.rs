@@ -23,6 +23,7 @@ fn two_hundred_random_motions_are_not_stopped() {
     execute_all(N_EXECUTIONS_WITH_TIME);
 }
 
+#[expect(clippy::print_stdout, reason = "measurements for --nocapture")]
 fn execute_all(n_executions: usize) {
     let cell = mico_cell();
     let (mut worst_m, mut tool_share, mut arms_m, mut table_m) =

@@ -255,7 +255,12 @@ fn advice() -> StepAdvice {
         distance: 0.75,
         overridden: true,
     };
-    StepAdvice { action: vec![0.5; LAYOUT.n_action()], charged: true, arms: vec![arm], repeated: false }
+    StepAdvice {
+        action: vec![0.5; LAYOUT.n_action()],
+        charged: true,
+        arms: vec![arm],
+        repeated: false,
+    }
 }
 
 fn execute_request() -> pb::ExecuteRequest {

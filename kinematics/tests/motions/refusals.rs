@@ -30,6 +30,7 @@ fn a_thousand_good_walks_are_accepted() {
     accept_walks(N_GOOD_WITH_TIME);
 }
 
+#[expect(clippy::print_stdout, reason = "measurements for --nocapture")]
 fn accept_walks(n_walks: u64) {
     let cell = WorkCell::mico_pair();
     let (mut seconds, mut longest_s) = (0.0, 0.0_f64);
