@@ -15,7 +15,7 @@ import kubernetes_validate
 import yaml
 
 ROOT = Path(__file__).resolve().parent.parent
-WORKLOADS = ("Deployment", "StatefulSet")
+WORKLOADS = ("Deployment", "StatefulSet", "Job")
 # The secrets that docs/cluster.md describes.
 SECRETS = {"tandem-secrets": {"token", "redis-password"}}
 # gRPC probes are stable since 1.27.
@@ -138,7 +138,11 @@ class Checked:
     def check_workload(self, workload):
         name, spec = workload["metadata"]["name"], workload["spec"]
         pod = spec["template"]["spec"]
-        self.expect(self.selected(spec["selector"]) == [workload], f"{name}: its selector does not select its pods alone")
+        # The selector of a job is made by the cluster.
+        if workload["kind"] == "Job":
+            self.check_sweep(workload)
+        else:
+            self.expect(self.selected(spec["selector"]) == [workload], f"{name}: its selector does not select its pods alone")
         if workload["kind"] == "StatefulSet":
             governing = self.services.get(spec["serviceName"], {"spec": {}})
             self.expect(governing["spec"].get("clusterIP") == "None", f"{name}: no headless service {spec['serviceName']}")
@@ -157,8 +161,26 @@ class Checked:
             if "secret" in volume:
                 keys = {item["key"] for item in volume["secret"]["items"]}
                 self.expect(keys <= SECRETS.get(volume["secret"]["secretName"], set()), f"{name}: no secret with {keys}")
+            if "persistentVolumeClaim" in volume:
+                claim = volume["persistentVolumeClaim"]["claimName"]
+                self.expect(("PersistentVolumeClaim", claim) in self.objects, f"{name}: no claim {claim}")
             if "configMap" in volume:
                 self.expect(("ConfigMap", volume["configMap"]["name"]) in self.objects, f"{name}: no map {volume['configMap']}")
+
+    def check_sweep(self, job):
+        """A job has one pod for each run of its sweep file."""
+        name, spec = job["metadata"]["name"], job["spec"]
+        (text,) = self.objects["ConfigMap", "tandem-sweep"]["data"].values()
+        sweep = tomllib.loads(text)
+        columns = len(sweep.get("strategies", [])) + len(sweep.get("variant", [])) or 1
+        n_runs = columns * len(sweep.get("tasks", [1])) * len(sweep.get("seeds", [1]))
+        for axis in sweep.get("axis", []):
+            (values,) = axis.values()
+            n_runs *= len(values)
+        self.expect(spec["completionMode"] == "Indexed", f"{name}: its pods have no index")
+        self.expect(spec["completions"] == n_runs, f"{name}: {spec['completions']} completions, {n_runs} runs")
+        fields = [env.get("valueFrom", {}).get("fieldRef", {}).get("fieldPath") for container in containers(job) for env in container["env"]]
+        self.expect("metadata.annotations['batch.kubernetes.io/job-completion-index']" in fields, f"{name}: no pod knows its index")
 
     def check_container(self, name, container, workload):
         security = container.get("securityContext", {})
@@ -190,7 +212,8 @@ class Checked:
             self.expect(secret is None or secret["key"] in SECRETS.get(secret["name"], set()), f"{name}: no secret {secret}")
         self.expect(set(re.findall(r"\$\((\w+)\)", " ".join(container["args"]))) <= known, f"{name}: an argument names an unknown variable")
         if container["command"] == ["/usr/local/bin/tandem"]:
-            self.expect("TANDEM_TOKEN_FILE" in known, f"{name}: has no token")
+            # All processes of a sweep's pod are on its loopback interface.
+            self.expect("TANDEM_TOKEN_FILE" in known or workload["kind"] == "Job", f"{name}: has no token")
         for host, port in addresses(container):
             self.check_call(workload, host, port)
 
@@ -278,7 +301,7 @@ def check_files(folder):
 
 
 def overlays(folder):
-    return sorted(file.parent for file in (folder / "overlays").glob("*/kustomization.yaml"))
+    return [*sorted(file.parent for file in (folder / "overlays").glob("*/kustomization.yaml")), folder / "sweep"]
 
 
 def problems_of(folder):
@@ -286,7 +309,7 @@ def problems_of(folder):
     for overlay in overlays(folder):
         objects = build(overlay)
         problems += [f"{overlay.name}: {problem}" for problem in Checked(objects).problems]
-        if commands(objects) != base:
+        if overlay.name != "sweep" and commands(objects) != base:
             problems.append(f"{overlay.name} changes commands, which the tests take from the base")
     return problems
 
@@ -328,6 +351,11 @@ MISTAKES = [
     ("base/kustomization.yaml", "newTag: 0.1.0", "newTag: 0.0.9"),
     ("base/kustomization.yaml", "  - redis.yaml\n", ""),
     ("base/run.toml", "slots = 16", "slots = 8"),
+    ("sweep/sweep.toml", "seeds = [1, 2, 3]", "seeds = [1, 2]"),
+    ("sweep/sweep.yaml", "completionMode: Indexed", "completionMode: NonIndexed"),
+    ("sweep/sweep.yaml", "job-completion-index", "completion-index"),
+    ("sweep/sweep.yaml", "claimName: sweep", "claimName: sweeps"),
+    ("sweep/sweep.yaml", "- name: RUN_INDEX", "- name: INDEX"),
     ("overlays/cluster/autoscaler.yaml", "name: tandem_assignments_waiting", "name: tandem_assignments"),
     ("overlays/cluster/autoscaler.yaml", "    name: worker\n  min", "    name: workers\n  min"),
     ("overlays/cluster/disruptions.yaml", "app.kubernetes.io/component: teacher", "app.kubernetes.io/component: teachers"),

@@ -31,7 +31,7 @@ use board::Board;
 use display::Display;
 use run_process::{RunOutcome, RunProcess};
 use run_status::{RunStatus, State};
-use sweep_file::PlannedSweep;
+use sweep_file::{PlannedRun, PlannedSweep};
 
 /// Time between two updates of the live lines and of the dashboard.
 const REFRESH_EVERY: Duration = Duration::from_millis(500);
@@ -43,7 +43,14 @@ const MAX_NAMED: usize = 3;
 pub(crate) fn sweep(args: &SweepArgs) -> Result<(), Failed> {
     let out = args.out.clone().unwrap_or_else(|| default_out(&args.file));
     let PlannedSweep { runs, environment } = sweep_file::read(&args.file)?;
-    let lock = if args.dry_run { None } else { Some(lock(&out).or_cannot_write(String::new)?) };
+    let runs = match args.only {
+        Some(only) => vec![selected(runs, only)?],
+        None => runs,
+    };
+    let lock = match args.dry_run {
+        true => None,
+        false => Some(lock(&out, args.only.is_some()).or_cannot_write(String::new)?),
+    };
     let mut statuses = Vec::new();
     let mut refused = Vec::new();
     for run in runs {
@@ -87,12 +94,26 @@ fn default_out(file: &Path) -> PathBuf {
     Path::new("runs").join(file.file_stem().unwrap_or(file.as_os_str()))
 }
 
-/// Creates `out` and locks it against a second sweep until the returned file is closed.
-fn lock(out: &Path) -> anyhow::Result<File> {
+/// Returns run `only` of the list.
+fn selected(mut runs: Vec<PlannedRun>, only: usize) -> Result<PlannedRun, Failed> {
+    if only >= runs.len() {
+        let last = runs.len() - 1;
+        return Err(Failed::usage(format!(
+            "--only {only}: expected 0 to {last}, the file lists {} runs",
+            last + 1
+        )));
+    }
+    Ok(runs.swap_remove(only))
+}
+
+/// Creates `out` and locks it until the returned file is closed: against another sweep or, if `is_shared`, against
+/// sweeps of all runs only. Each run locks its own directory.
+fn lock(out: &Path, is_shared: bool) -> anyhow::Result<File> {
     std::fs::create_dir_all(out).with_context(|| format!("cannot create {}", out.display()))?;
     let path = out.join("sweep.lock");
     let file = File::create(&path).with_context(|| format!("cannot write {}", path.display()))?;
-    match file.try_lock() {
+    let locked = if is_shared { file.try_lock_shared() } else { file.try_lock() };
+    match locked {
         Ok(()) => Ok(file),
         Err(TryLockError::WouldBlock) => bail!("another sweep uses {}", out.display()),
         Err(TryLockError::Error(error)) => {
@@ -365,10 +386,14 @@ fn failures(statuses: &[RunStatus]) -> Result<(), Failed> {
 }
 
 fn print_resume_command(args: &SweepArgs, out: &Path) {
-    let jobs = if args.jobs > 1 { format!(" --jobs {}", args.jobs) } else { String::new() };
+    let options = match args.only {
+        Some(only) => format!(" --only {only}"),
+        None if args.jobs > 1 => format!(" --jobs {}", args.jobs),
+        None => String::new(),
+    };
     output::message("interrupted; the state is saved. Resume with:");
     output::message(format_args!(
-        "  tandem sweep {} --out {}{jobs}",
+        "  tandem sweep {} --out {}{options}",
         args.file.display(),
         out.display()
     ));

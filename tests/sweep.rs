@@ -240,3 +240,28 @@ fn a_failed_run_is_reported_and_retried_at_the_next_start() {
     assert_eq!(result["finished"], 2, "{result}");
     assert!(result["runs"][1]["failure"].is_null(), "{result}");
 }
+
+/// `--only` trains one run of the list, at the same time as others in the same directory.
+#[test]
+fn runs_of_a_sweep_are_trained_by_several_commands() {
+    let dir = tempfile::tempdir().expect("a directory");
+    let (file, out) = (dir.path().join("small.toml"), dir.path().join("out"));
+    let short: [(&str, &str); 1] = [("stop.max_env_steps", "1600")];
+    let settings: Vec<_> =
+        SMALL.into_iter().filter(|(key, _)| *key != short[0].0).chain(short).collect();
+    let settings: String =
+        settings.iter().map(|(key, value)| format!("{key} = {value}\n")).collect();
+    fs::write(&file, format!("strategies = [\"none\"]\nseeds = [1, 2]\n[run]\n{settings}"))
+        .expect("writes");
+    let only = |n: &str| sweep(&file, &out, &["--json", "--only", n, "--no-dashboard"]);
+    let both = ["0", "1"].map(|n| only(n).spawn().expect("starts"));
+    for (run, name) in both.into_iter().zip(["push-none-seed1", "push-none-seed2"]) {
+        let summary = last_object(&run.wait_with_output().expect("ends"));
+        assert_eq!((&summary["finished"], &summary["runs"][0]["name"]), (&1.into(), &name.into()));
+    }
+    let plan = sweep(&file, &out, &["--dry-run"]).output().expect("lists");
+    assert_eq!(text(&plan.stdout).matches("finished").count(), 2, "{}", text(&plan.stdout));
+    let refused = only("2").output().expect("ends");
+    assert_eq!(refused.status.code(), Some(64));
+    assert!(text(&refused.stderr).contains("expected 0 to 1"), "{}", text(&refused.stderr));
+}

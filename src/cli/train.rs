@@ -132,6 +132,7 @@ Examples:
   tandem sweep deploy/sweep-small.toml --dry-run  # lists the runs
   tandem sweep deploy/sweep-small.toml            # starts them, or resumes them
   tandem report runs/sweep-small
+  tandem sweep deploy/sweep-small.toml --only 3   # one of them, for example as a job of a cluster
   tandem sweep FILE.toml --dashboard 0.0.0.0:8600 --dashboard-token-file token
 
 docs/sweep.md describes the file. The exit code is 75 if runs failed; the next start tries each of \
@@ -146,6 +147,10 @@ pub(crate) struct SweepArgs {
     /// Number of concurrent runs; they share the cores.
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..=256))]
     pub(crate) jobs: u16,
+    /// Trains only run N of the list, from 0. Several such commands may work in one directory at a time, also on several
+    /// machines that share it.
+    #[arg(long, value_name = "N", conflicts_with = "jobs")]
+    pub(crate) only: Option<usize>,
     /// Prints one JSON object on the last line of standard output.
     #[arg(long)]
     pub(crate) json: bool,
