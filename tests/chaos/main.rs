@@ -37,7 +37,7 @@ struct Scale {
 
 #[test]
 fn a_run_under_faults_ends_with_the_bits_of_an_undisturbed_run() {
-    compare(&Scale { max_env_steps: 20_000, budget: 4_000, every: Duration::from_millis(1_750) });
+    compare(&Scale { max_env_steps: 30_000, budget: 6_000, every: Duration::from_millis(1_750) });
 }
 
 #[test]
