@@ -132,7 +132,7 @@ Examples:
   tandem sweep deploy/sweep-small.toml --dry-run  # lists the runs
   tandem sweep deploy/sweep-small.toml            # starts them, or resumes them
   tandem report runs/sweep-small
-  tandem sweep deploy/sweep-small.toml --only 3   # one of them, for example as a job of a cluster
+  tandem sweep deploy/sweep-small.toml --only 3   # trains one of them
   tandem sweep FILE.toml --dashboard 0.0.0.0:8600 --dashboard-token-file token
 
 docs/sweep.md describes the file. The exit code is 75 if runs failed; the next start tries each of \
