@@ -77,21 +77,21 @@ pub(crate) fn strip(episodes: &[FilmEpisode]) -> Result<Vec<u8>, Failed> {
     film_strip(episodes, &Film { width, height, speed: 1.0 }).or_exit(Exit::Bug, String::new)
 }
 
-/// Draws the first success and the first failure among the episodes of an evaluation with `seed`, as far as there are.
-pub(crate) fn of_outcomes(
+/// Outcomes of episodes that reports show: the name, and whether it is a success.
+pub(crate) const OUTCOMES: [(&str, bool); 2] = [("success", true), ("failure", false)];
+
+/// Draws the first episode with this outcome in an evaluation with `seed`, if there is one.
+pub(crate) fn of_outcome(
     layout: Layout,
     seed: u64,
     episodes: &[Episode],
-) -> Result<Vec<FilmStrip>, Failed> {
-    let mut films = Vec::new();
-    for (outcome, is_success) in [("success", true), ("failure", false)] {
-        let first = episodes.iter().find(|episode| episode.succeeded() == is_success);
-        let Some(first) = first else { continue };
-        let png = strip(std::slice::from_ref(&of_evaluation(layout, seed, first)?))?;
-        let title = format!("A {outcome}: test goal {}", first.number);
-        films.push(FilmStrip { title, file_name: format!("film-{outcome}.png"), png });
-    }
-    Ok(films)
+    (outcome, is_success): (&str, bool),
+) -> Result<Option<FilmStrip>, Failed> {
+    let first = episodes.iter().find(|episode| episode.succeeded() == is_success);
+    let Some(first) = first else { return Ok(None) };
+    let png = strip(std::slice::from_ref(&of_evaluation(layout, seed, first)?))?;
+    let title = format!("A {outcome}: test goal {}", first.number);
+    Ok(Some(FilmStrip { title, file_name: format!("film-{outcome}.png"), png }))
 }
 
 /// Simulates an episode of an evaluation with `seed` again, for a film.

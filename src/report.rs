@@ -116,20 +116,20 @@ fn films(args: &ReportArgs) -> Result<Vec<FilmStrip>, Failed> {
     for (path, n) in args.film_strips.iter().zip(1..) {
         let subject = EvaluatedPolicy::new(policy_file::load(path)?, path)?;
         let episodes = subject.play(TEST_EPISODES, TEST_SEED)?;
-        let strips = film::of_outcomes(subject.layout(), TEST_SEED, &episodes)?;
-        for outcome in ["success", "failure"] {
-            if strips.iter().all(|strip| !strip.file_name.contains(outcome)) {
-                warn(std::iter::once(&format!(
-                    "{}: no {outcome} on {TEST_EPISODES} test goals",
-                    path.display()
-                )));
+        for outcome in film::OUTCOMES {
+            match film::of_outcome(subject.layout(), TEST_SEED, &episodes, outcome)? {
+                Some(strip) => films.push(FilmStrip {
+                    title: format!("{}: {}", path.display(), strip.title),
+                    file_name: strip.file_name.replace("film-", &format!("film-{n}-")),
+                    ..strip
+                }),
+                None => warn(std::iter::once(&format!(
+                    "{}: no {} on {TEST_EPISODES} test goals",
+                    path.display(),
+                    outcome.0
+                ))),
             }
         }
-        films.extend(strips.into_iter().map(|strip| FilmStrip {
-            title: format!("{}: {}", path.display(), strip.title),
-            file_name: strip.file_name.replace("film-", &format!("film-{n}-")),
-            ..strip
-        }));
     }
     Ok(films)
 }

@@ -229,7 +229,7 @@ impl<'a> Supervisor<'a> {
         }
     }
 
-    /// Prints the latest message as one line. Whoever reads them may be gone; the run continues.
+    /// Prints the latest message as one line. An error is ignored: the reader may have exited, and the run continues.
     fn print_json(&self) {
         let mut message = progress_json(&self.last);
         message["dashboard"] = self.processes.dashboard_url().into();

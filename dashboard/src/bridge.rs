@@ -38,19 +38,12 @@ impl Site {
     #[must_use]
     pub fn of_bridge(
         terms: BridgeTerms,
-        mut views: watch::Receiver<Arc<ArmsView>>,
+        views: watch::Receiver<Arc<ArmsView>>,
         stop: StopAction,
     ) -> Self {
         let mut feed = Feed { terms, ..Feed::default() };
-        let first = feed.frame(&Arc::clone(&views.borrow_and_update()));
-        let (frames, receiver) = watch::channel(Arc::new(first));
-        tokio::spawn(async move {
-            while views.changed().await.is_ok() {
-                let view = Arc::clone(&views.borrow_and_update());
-                frames.send_replace(Arc::new(feed.frame(&view)));
-            }
-        });
-        Self { page: page::bridge().into(), frames: receiver, stop: Some(stop) }
+        let site = Self::of_views(page::bridge(), views, move |view| feed.frame(view));
+        Self { stop: Some(stop), ..site }
     }
 }
 

@@ -106,22 +106,29 @@ fn header(what: &str, instead: &str) -> Markup {
     }
 }
 
+/// Returns two views of the arms, with a paragraph `text_id` that describes them.
+fn views(text_id: &str) -> Markup {
+    html! {
+        div .views {
+            figure {
+                figcaption { "From above" }
+                svg #view-above role="img" aria-labelledby=(text_id) {}
+            }
+            figure {
+                figcaption { "From the side" }
+                svg #view-side role="img" aria-labelledby=(text_id) {}
+            }
+        }
+        p id=(text_id) .note {}
+    }
+}
+
 /// Returns the two views of an episode and its controls.
 fn episode() -> Markup {
     html! {
         p #episode-note .note { "The first evaluation has not been completed yet." }
         div #player hidden {
-            div .views {
-                figure {
-                    figcaption { "From above" }
-                    svg #view-above role="img" aria-labelledby="episode-text" {}
-                }
-                figure {
-                    figcaption { "From the side" }
-                    svg #view-side role="img" aria-labelledby="episode-text" {}
-                }
-            }
-            p #episode-text .note {}
+            (views("episode-text"))
             div .controls {
                 button #play type="button" { "Play" }
                 input #step type="range" min="0" max="50" value="0" aria-label="Step of the episode";

@@ -18,17 +18,9 @@ impl Site {
     /// Returns the site of a run. It encodes each snapshot of `views` once, in a task of the runtime that calls it,
     /// until the sender is dropped.
     #[must_use]
-    pub fn of_run(mut views: watch::Receiver<RunView>) -> Self {
+    pub fn of_run(views: watch::Receiver<RunView>) -> Self {
         let mut feed = Feed::default();
-        let first = feed.frame(&views.borrow_and_update().clone());
-        let (frames, receiver) = watch::channel(Arc::new(first));
-        tokio::spawn(async move {
-            while views.changed().await.is_ok() {
-                let view = views.borrow_and_update().clone();
-                frames.send_replace(Arc::new(feed.frame(&view)));
-            }
-        });
-        Self { page: page::run().into(), frames: receiver, stop: None }
+        Self::of_views(page::run(), views, move |view| feed.frame(view))
     }
 }
 

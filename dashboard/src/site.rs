@@ -70,6 +70,24 @@ struct Served {
 }
 
 impl Site {
+    /// Returns a site that shows `page`. `encode` turns each snapshot of `views` into a frame once, in a task of the
+    /// runtime that calls it, until the sender is dropped.
+    pub(crate) fn of_views<V: Clone + Send + Sync + 'static>(
+        page: String,
+        mut views: watch::Receiver<V>,
+        mut encode: impl FnMut(&V) -> Frame + Send + 'static,
+    ) -> Self {
+        let first = encode(&views.borrow_and_update().clone());
+        let (frames, receiver) = watch::channel(Arc::new(first));
+        tokio::spawn(async move {
+            while views.changed().await.is_ok() {
+                let view = views.borrow_and_update().clone();
+                frames.send_replace(Arc::new(encode(&view)));
+            }
+        });
+        Self { page: page.into(), frames: receiver, stop: None }
+    }
+
     /// Returns the routes, behind the rules of `access`, for at most `max_viewers` streams of events.
     pub(crate) fn router(self, access: Access, max_viewers: usize) -> Router {
         let viewers = Arc::new(Semaphore::new(max_viewers));

@@ -1,4 +1,5 @@
-//! A digest of simulated episodes, which is equal wherever simulator and policies compute the same bits.
+//! A digest of simulated episodes: two processors on which simulator and policies compute the same bits give equal
+//! digests.
 
 use sha2::{Digest as _, Sha256};
 use tandem_core::layout::EPISODE_STEPS;

@@ -1,8 +1,8 @@
 //! The simulator and the shipped policies in a browser.
 //!
 //! [`page`] is the state of the page, without any access to it: [`live`] plays a policy for goals that a visitor moves,
-//! [`log`] reads the log of an episode and [`replay`] simulates it again. [`digest`] is equal wherever simulator and
-//! policies compute the same bits. JavaScript calls the functions in `exports`.
+//! [`log`] reads the log of an episode and [`replay`] simulates it again. [`digest`] hashes episodes: processors that
+//! compute the same bits give equal digests. JavaScript calls the functions in `exports`.
 #![warn(missing_docs)]
 
 pub mod digest;

@@ -59,7 +59,10 @@ fn test(plan: &Plan, args: &TrainArgs) -> Result<EvaluationResult, Failed> {
 fn films(result: &EvaluationResult) -> Result<Vec<FilmStrip>, Failed> {
     match result.task.as_built_in() {
         Some(layout) if result.episodes.len() >= MIN_TEST_EPISODES_OF_FILMS => {
-            film::of_outcomes(layout, TEST_SEED, &result.episodes)
+            let films = film::OUTCOMES.into_iter().filter_map(|outcome| {
+                film::of_outcome(layout, TEST_SEED, &result.episodes, outcome).transpose()
+            });
+            films.collect()
         }
         _ => Ok(Vec::new()),
     }

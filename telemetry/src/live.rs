@@ -1,8 +1,9 @@
 //! Episodes and arms over the websocket protocol of Foxglove, with the channels of their logs.
 //!
 //! Episodes are put one after the other on one timeline, with a pause between them, and the stamps within messages are
-//! shifted with them. [`Replay`] plays a fixed set of logs, which a viewer can pause and seek; [`Follower`] plays what
-//! becomes finished in a directory. [`LiveArms`] shows the arms of a bridge as they are. A viewer that cannot keep up loses messages and delays nobody.
+//! shifted with them. [`Replay`] plays a fixed set of logs, which a viewer can pause and seek; [`Follower`] plays each
+//! log of a directory once it is complete. [`LiveArms`] shows the current state of a bridge's arms. A viewer that cannot
+//! keep up loses messages and delays nobody.
 
 mod arms;
 mod channels;

@@ -130,8 +130,7 @@ def check_worker(page, run, pictures):
         # The learner closes its connection after 10 to 20 s, and counts it as dead after 15 s.
         page.wait(f"['silent', 'disconnected'].includes(({tile})?.dataset.state)", "the tile of the hanging worker changes", 40)
         assert page.value(f"/seen [12]\\d s ago/.test(({tile}).textContent)"), page.value(f"({tile}).textContent")
-        if pictures:
-            take_pictures(page, pictures, "silent")
+        page.take_pictures(pictures, "silent")
     finally:
         os.kill(process, signal.SIGCONT)
     page.wait(takes_part, "the hanging worker is back", 30)
@@ -151,6 +150,13 @@ def check_episode(page):
     assert shapes == [2, 2], shapes
     page.value("document.getElementById('play').click()")
     page.wait("document.getElementById('step').value > 5", "the episode plays")
+
+
+def check_layout(page):
+    """Nothing overflows, and everything has a name."""
+    for _ in page.layouts():
+        pass
+    page.check_names()
 
 
 def check_sweep(browser, program, directory, pictures):
@@ -173,7 +179,7 @@ def check_sweep(browser, program, directory, pictures):
         page.wait("document.querySelectorAll('#success-chart circle.dot').length > 0", "the chart has points", 60)
         page.wait(f"{in_state.format('finished')} >= 1", "a run is finished", 60)
         check_layout(page)
-        take_pictures(page, pictures, "sweep")
+        page.take_pictures(pictures, "sweep")
         page.wait("document.getElementById('phase').textContent === 'complete'", "the end is shown", 120)
         text = page.value("document.getElementById('log').textContent")
         assert text.count("is finished: success") == 4, text
@@ -182,21 +188,6 @@ def check_sweep(browser, program, directory, pictures):
         assert not errors, errors
     finally:
         process.kill()
-
-
-def check_layout(page):
-    """Nothing overflows on a phone or a small laptop, in both colour schemes."""
-    for width in [360, 768, 1280]:
-        for dark in [False, True]:
-            page.resize(width, 800, dark)
-            overflow = page.value("document.documentElement.scrollWidth - document.documentElement.clientWidth")
-            assert overflow <= 0, f"{overflow} px too wide at {width} px"
-    names = page.value("[...document.querySelectorAll('button, input, select, svg[role=img]')].filter(it => "
-                       "!(it.ariaLabel || it.getAttribute('aria-labelledby') || it.textContent.trim() || it.labels?.length))"
-                       ".map(it => it.id)")
-    assert names == [], f"without a name: {names}"
-    assert page.value("document.querySelectorAll('h1').length") == 1
-    page.resize(1280, 900)
 
 
 class Viewer(threading.Thread):
@@ -272,15 +263,6 @@ def measure_cost(run):
           f"({100 * alone:.1f} % without)")
 
 
-def take_pictures(page, directory, name):
-    if directory:
-        directory.mkdir(parents=True, exist_ok=True)
-        for label, width, dark in [("light", 1280, False), ("dark", 1280, True), ("phone", 360, False)]:
-            page.resize(width, 900, dark)
-            page.picture(directory / f"{name}-{label}.png")
-        page.resize(1280, 900)
-
-
 def main():
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--program", type=pathlib.Path, required=True)
@@ -293,19 +275,19 @@ def main():
             page = browser.open(run.url)
             page.resize(1280, 900)
             page.wait("document.getElementById('name').textContent === 'push-demo'", "the page shows the run")
-            take_pictures(page, args.pictures, "start")
+            page.take_pictures(args.pictures, "start")
             check_curve(page)
             check_worker(page, run, args.pictures)
             check_episode(page)
             check_layout(page)
-            take_pictures(page, args.pictures, "run")
+            page.take_pictures(args.pictures, "run")
             measure_viewers(run)
             measure_cost(run)
             run.process.send_signal(signal.SIGINT)
             page.wait("document.getElementById('phase').textContent === 'stopped'", "the end is shown", 30)
             assert run.process.wait(60) == 130, run.lines
             page.wait("document.getElementById('link').textContent.includes('final values')", "the service has ended")
-            take_pictures(page, args.pictures, "end")
+            page.take_pictures(args.pictures, "end")
             errors = [error for error in page.errors if "ERR_CONNECTION_REFUSED" not in str(error)
                       and "ERR_INCOMPLETE_CHUNKED_ENCODING" not in str(error)]
             assert not errors, errors

@@ -148,30 +148,13 @@ def check_foreign_page(bridge):
 
 
 def check_layout(page):
-    """Nothing overflows on a phone or a small laptop, in both colour schemes, and the button stays in view."""
-    for width in [360, 768, 1280]:
-        for dark in [False, True]:
-            page.resize(width, 640, dark)
-            overflow = page.value("document.documentElement.scrollWidth - document.documentElement.clientWidth")
-            assert overflow <= 0, f"{overflow} px too wide at {width} px"
-            page.value("scrollTo(0, document.body.scrollHeight)")
-            place = page.value("(box => [box.top, box.bottom, innerHeight])(document.getElementById('stop').getBoundingClientRect())")
-            assert 0 <= place[0] and place[1] <= place[2], place
-            page.value("scrollTo(0, 0)")
-    names = page.value("[...document.querySelectorAll('button, input, svg[role=img]')].filter(it => "
-                       "!(it.ariaLabel || it.getAttribute('aria-labelledby') || it.textContent.trim())).map(it => it.id)")
-    assert names == [], f"without a name: {names}"
-    assert page.value("document.querySelectorAll('h1').length") == 1
-    page.resize(1280, 900)
-
-
-def take_pictures(page, directory, name):
-    if directory:
-        directory.mkdir(parents=True, exist_ok=True)
-        for label, width, dark in [("light", 1280, False), ("dark", 1280, True), ("phone", 360, False)]:
-            page.resize(width, 900, dark)
-            page.picture(directory / f"bridge-{name}-{label}.png")
-        page.resize(1280, 900)
+    """Nothing overflows, everything has a name, and the button stays in view."""
+    for _ in page.layouts(640):
+        page.value("scrollTo(0, document.body.scrollHeight)")
+        place = page.value("(box => [box.top, box.bottom, innerHeight])(document.getElementById('stop').getBoundingClientRect())")
+        assert 0 <= place[0] and place[1] <= place[2], place
+        page.value("scrollTo(0, 0)")
+    page.check_names()
 
 
 def main():
@@ -192,7 +175,7 @@ def main():
 
         def by_mouse(mover):
             check_motion(page, mover)
-            take_pictures(page, args.pictures, "moving")
+            page.take_pictures(args.pictures, "bridge-moving")
             check_stop(page, bridge, mover, lambda: page.value("void document.getElementById('stop').click()"), "click")
 
         def by_keyboard(mover):
@@ -200,7 +183,7 @@ def main():
             check_stop(page, bridge, mover, lambda: page.key("Enter", 13, "\r"), "keyboard")
 
         with_motion(bridge, page, by_mouse)
-        take_pictures(page, args.pictures, "stopped")
+        page.take_pictures(args.pictures, "bridge-stopped")
         with_motion(bridge, page, by_keyboard)
         check_layout(page)
         bridge.process.send_signal(signal.SIGTERM)
@@ -209,7 +192,7 @@ def main():
         page.value("document.getElementById('stop').focus()")
         page.key("Enter", 13, "\r")
         page.wait("document.getElementById('stop-result').textContent.includes('Use the emergency stop')", "a failed stop is shown", 10)
-        take_pictures(page, args.pictures, "gone")
+        page.take_pictures(args.pictures, "bridge-gone")
         expected = ["ERR_CONNECTION_REFUSED", "ERR_INCOMPLETE_CHUNKED_ENCODING", "ERR_CONNECTION_RESET"]
         errors = [error for error in page.errors if not any(known in str(error) for known in expected)]
         assert not errors, errors

@@ -107,6 +107,34 @@ class Page:
         shot = self.call("Page.captureScreenshot", format="png", captureBeyondViewport=True, clip=clip)
         pathlib.Path(path).write_bytes(base64.b64decode(shot["data"]))
 
+    def take_pictures(self, directory, name, pause_s=0.0):
+        """Writes pictures in light, in dark and on a phone, unless `directory` is None."""
+        if directory:
+            directory.mkdir(parents=True, exist_ok=True)
+            for label, width, dark in [("light", 1280, False), ("dark", 1280, True), ("phone", 360, False)]:
+                self.resize(width, 900, dark)
+                time.sleep(pause_s)
+                self.picture(directory / f"{name}-{label}.png")
+            self.resize(1280, 900)
+
+    def layouts(self, height=800):
+        """Yields the width of a phone, a tablet and a laptop, in both colour schemes; nothing may overflow."""
+        for width in [360, 768, 1280]:
+            for dark in [False, True]:
+                self.resize(width, height, dark)
+                overflow = self.value("document.documentElement.scrollWidth - document.documentElement.clientWidth")
+                assert overflow <= 0, f"{overflow} px too wide at {width} px"
+                yield width
+        self.resize(1280, 900)
+
+    def check_names(self):
+        """Everything that can be operated or is a picture has a name for screen readers, and the page has one title."""
+        names = self.value("[...document.querySelectorAll('button, input, select, canvas, svg[role=img]')]"
+                           ".filter(it => it.checkVisibility() && !(it.ariaLabel || it.getAttribute('aria-labelledby') || "
+                           "it.textContent.trim() || it.labels?.length)).map(it => it.id)")
+        assert names == [], f"without a name: {names}"
+        assert self.value("document.querySelectorAll('h1').length") == 1
+
 
 class WebSocket:
     """A client that sends and receives texts."""

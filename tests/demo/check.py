@@ -254,31 +254,13 @@ def check_logs(page, logs):
 
 
 def check_layout(page):
-    """Nothing overflows on a phone or a small laptop, in both colour schemes, and everything has a name."""
-    for width in [360, 768, 1280]:
-        for dark in [False, True]:
-            page.resize(width, 800, dark)
-            overflow = page.value("document.documentElement.scrollWidth - document.documentElement.clientWidth")
-            assert overflow <= 0, f"{overflow} px too wide at {width} px"
-            cut = page.value("[...document.querySelectorAll('.controls *, .card *')].filter(it => it.checkVisibility() && "
-                             "!it.matches('.visually-hidden') && it.getBoundingClientRect().right > "
-                             "it.closest('section').getBoundingClientRect().right).map(it => it.id || it.tagName)")
-            assert cut == [], f"cut off at {width} px: {cut}"
-    names = page.value("[...document.querySelectorAll('button, input, select, canvas')].filter(it => it.checkVisibility() && "
-                       "!(it.ariaLabel || it.getAttribute('aria-labelledby') || it.textContent.trim() || it.labels?.length))"
-                       ".map(it => it.id)")
-    assert names == [], f"without a name: {names}"
-    page.resize(1280, 900)
-
-
-def take_pictures(page, directory, name):
-    if directory:
-        directory.mkdir(parents=True, exist_ok=True)
-        for label, width, dark in [("light", 1280, False), ("dark", 1280, True), ("phone", 360, False)]:
-            page.resize(width, 900, dark)
-            time.sleep(0.6)
-            page.picture(directory / f"{name}-{label}.png")
-        page.resize(1280, 900)
+    """Nothing overflows or is cut off, and everything has a name."""
+    for width in page.layouts():
+        cut = page.value("[...document.querySelectorAll('.controls *, .card *')].filter(it => it.checkVisibility() && "
+                         "!it.matches('.visually-hidden') && it.getBoundingClientRect().right > "
+                         "it.closest('section').getBoundingClientRect().right).map(it => it.id || it.tagName)")
+        assert cut == [], f"cut off at {width} px: {cut}"
+    page.check_names()
 
 
 def main():
@@ -297,16 +279,16 @@ def main():
         check_speed(page)
         for task in TASKS:
             check_student(page, task)
-            take_pictures(page, args.pictures, task)
+            page.take_pictures(args.pictures, task, pause_s=0.6)
         check_keyboard(page)
         check_logs(page, logs)
         if args.pictures:
             drop(page, "student-pick-and-place.mcap", logs["student-pick-and-place"])
-            take_pictures(page, args.pictures, "log")
+            page.take_pictures(args.pictures, "log", pause_s=0.6)
             page.value("document.getElementById('back').click()")
         check_layout(page)
         check_digests(page, args.demo)
-        take_pictures(page, args.pictures, "digest")
+        page.take_pictures(args.pictures, "digest", pause_s=0.6)
         assert not page.errors, page.errors
     print(f"the demo passed in {time.monotonic() - began:.0f} s")
 

@@ -2,7 +2,7 @@
 
 use maud::{Markup, html};
 
-use super::{card, document};
+use super::{card, document, views};
 
 /// Returns the page of a bridge. The stop button is the first element that the keyboard reaches.
 pub(crate) fn bridge() -> String {
@@ -34,7 +34,7 @@ pub(crate) fn bridge() -> String {
             (card("motion", "Motion", &motion()))
             section aria-label="Current values" { dl #tiles .tiles {} }
             div .columns {
-                (card("arms", "Both arms, live", &views()))
+                (card("arms", "Both arms, live", &views("arms-text")))
                 div .stack {
                     (card("last-stop", "Last stop", &html! { p #last-stop { "–" } p #last-stop-time .note {} }))
                     (card("events", "Recent events", &html! { ol #log .log tabindex="0" {} }))
@@ -59,21 +59,5 @@ fn motion() -> Markup {
         p #motion-text { "–" }
         div #progress .progress role="progressbar" aria-labelledby="motion-heading"
             aria-valuemin="0" aria-valuemax="100" { div #bar .bar {} }
-    }
-}
-
-fn views() -> Markup {
-    html! {
-        div .views {
-            figure {
-                figcaption { "From above" }
-                svg #view-above role="img" aria-labelledby="arms-text" {}
-            }
-            figure {
-                figcaption { "From the side" }
-                svg #view-side role="img" aria-labelledby="arms-text" {}
-            }
-        }
-        p #arms-text .note {}
     }
 }
