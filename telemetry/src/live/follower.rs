@@ -3,7 +3,11 @@
 use std::collections::BTreeSet;
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
+
+use foxglove::websocket::{ChannelView, Client, ServerListener};
 
 use super::episode::Episode;
 use super::{Clock, PAUSE_NS, Server, TICK};
@@ -13,7 +17,8 @@ use crate::error::Error;
 const LOOK_EVERY: Duration = Duration::from_millis(500);
 
 /// Plays the newest evaluation episodes of a directory in real time, one after the other, as workers finish their logs.
-/// While there is no new one, it plays the newest training episode, if these are recorded.
+/// While there is no new one, it plays the newest training episode, if these are recorded. A viewer that subscribes later
+/// gets the present state, or the last one of the latest episode.
 pub struct Follower {
     server: Server,
     address: SocketAddr,
@@ -23,6 +28,25 @@ pub struct Follower {
     seen: BTreeSet<PathBuf>,
     /// The end of the timeline so far.
     end_ns: u64,
+    /// The episode that was played last.
+    played: Option<Episode>,
+    subscribed: Arc<Subscribed>,
+}
+
+/// Whether a viewer has subscribed to a channel since this was read last.
+#[derive(Default)]
+struct Subscribed(AtomicBool);
+
+impl Subscribed {
+    fn take(&self) -> bool {
+        self.0.swap(false, Ordering::AcqRel)
+    }
+}
+
+impl ServerListener for Subscribed {
+    fn on_subscribe(&self, _client: Client, _channel: ChannelView<'_>) {
+        self.0.store(true, Ordering::Release);
+    }
 }
 
 impl Follower {
@@ -33,9 +57,12 @@ impl Follower {
     /// If the address cannot be listened on.
     pub fn start(address: SocketAddr, directory: PathBuf, clock: Clock) -> Result<Self, Error> {
         let seen = logs_in(&directory).into_iter().collect();
-        let server = Server::start(address, "tandem", None, None)?;
+        let subscribed = Arc::new(Subscribed::default());
+        let listener = Arc::clone(&subscribed) as Arc<dyn ServerListener>;
+        let server = Server::start(address, "tandem", None, Some(listener))?;
         let address = server.address(address);
-        Ok(Self { server, address, clock, directory, seen, end_ns: 0 })
+        let (end_ns, played) = (0, None);
+        Ok(Self { server, address, clock, directory, seen, end_ns, played, subscribed })
     }
 
     /// Returns the address that viewers connect to.
@@ -54,8 +81,13 @@ impl Follower {
                 looked_at = Some(now);
                 if let Some(episode) = self.next_episode() {
                     self.play(&episode, is_stopped);
+                    self.played = Some(episode);
                     looked_at = None;
                 }
+            }
+            if let Some(episode) = self.played.as_ref().filter(|_| self.subscribed.take()) {
+                let n_messages = episode.messages.len();
+                self.server.channels.publish_latest(episode, n_messages, episode.end_ns());
             }
             std::thread::sleep(TICK);
         }
@@ -84,8 +116,12 @@ impl Follower {
         while n_published < episode.messages.len() && !is_stopped() {
             let played = (self.clock)().saturating_sub(start).as_nanos();
             let position_ns = start_ns.saturating_add(u64::try_from(played).unwrap_or(u64::MAX));
+            let position_ns = position_ns.min(episode.end_ns());
             let end = episode.n_until(position_ns);
-            self.server.handle.broadcast_time(position_ns.min(episode.end_ns()));
+            self.server.handle.broadcast_time(position_ns);
+            if self.subscribed.take() {
+                self.server.channels.publish_latest(episode, n_published, position_ns);
+            }
             self.server.channels.publish(episode, n_published, end);
             n_published = end;
             std::thread::sleep(TICK);

@@ -245,6 +245,16 @@ fn a_follower_plays_only_logs_that_are_new() {
                 _ => None,
             });
             assert!(time_ns <= 2_000_000_000, "one episode of 2 s: {time_ns}");
+
+            clock.set(millis + 60_000);
+            let mut late = Viewer::connect(address);
+            let (_, [transition]) = late.channels(["/transition"]);
+            late.subscribe(2, transition);
+            let last_ns = late.wait_for(|message| match message {
+                Received::Data(2, time_ns, _) => Some(time_ns),
+                _ => None,
+            });
+            assert_eq!(last_ns, 2_000_000_000, "the last state of the episode");
         },
     );
 }
