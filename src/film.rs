@@ -91,7 +91,8 @@ pub(crate) fn of_outcome(
     let Some(first) = first else { return Ok(None) };
     let png = strip(std::slice::from_ref(&of_evaluation(layout, seed, first)?))?;
     let title = format!("A {outcome}: test goal {}", first.number);
-    Ok(Some(FilmStrip { title, file_name: format!("film-{outcome}.png"), png }))
+    let file_name = format!("film-{outcome}.png");
+    Ok(Some(FilmStrip { title, file_name, png, picture_px: STRIP_SIZE }))
 }
 
 /// Simulates an episode of an evaluation with `seed` again, for a film.

@@ -26,6 +26,8 @@ pub struct FilmStrip {
     pub file_name: String,
     /// Content of the PNG file.
     pub png: Vec<u8>,
+    /// Width and height of each of its pictures, pixels.
+    pub picture_px: (usize, usize),
 }
 
 /// Explains the paper's measures.

@@ -9,7 +9,11 @@ use tandem_telemetry::MetricsRow;
 
 use crate::error::Error;
 use crate::table::short_number;
+use layout::{
+    LEGEND_LEFT_PX, LEGEND_LINE_PX, LEGEND_PX, LegendEntry, legend_entries, n_legend_lines, wrapped,
+};
 
+pub(crate) mod layout;
 mod marker;
 
 /// Colours of the series, distinguishable by colour-blind readers and of different brightness. Markers distinguish
@@ -26,18 +30,17 @@ const COLORS: [RGBColor; 6] = [
 const N_MARKERS: usize = 10;
 /// Sizes of text, pixels. A plot is about as wide as half a page, so they are the sizes that readers see.
 const TITLE_PX: u32 = 15;
-const LEGEND_PX: u32 = 13;
 const TICK_PX: u32 = 12;
 /// Height of a line of the title, and distance of the first from the upper edge, pixels.
 const TITLE_LINE_PX: i32 = 20;
 const TITLE_TOP_PX: i32 = 14;
+/// Width of plots for narrow screens, pixels.
+pub(crate) const NARROW_PX: u32 = 360;
+/// Width below which the horizontal axis has fewer labels, pixels.
+const NARROW_X_LABELS_PX: u32 = 450;
 pub(crate) const INK: RGBColor = RGBColor(0x24, 0x29, 0x2f);
 pub(crate) const FAINT_INK: RGBColor = RGBColor(0x6a, 0x73, 0x7d);
 pub(crate) const GRID: RGBColor = RGBColor(0xe6, 0xe9, 0xed);
-/// Left edge of the legend, pixels.
-const LEGEND_LEFT_PX: i32 = 20;
-/// Height of a legend line, pixels.
-pub(crate) const LEGEND_LINE_PX: i32 = 20;
 pub(crate) const FONT: &str = "-apple-system, 'Segoe UI', Helvetica, Arial, sans-serif";
 
 /// The horizontal axis of a curve.
@@ -217,6 +220,30 @@ impl CurveOptions {
             height: 360,
         }
     }
+
+    /// Returns the same for screens on which a plot of 560 pixels would be too small to read, 360 by 310 pixels.
+    #[must_use]
+    pub fn narrow(self) -> Self {
+        Self { width: NARROW_PX, height: 310, ..self }
+    }
+}
+
+/// A drawing as SVG, at the width of half a page and at that of a phone; a page shows one of them.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) struct Drawing {
+    /// For wide screens and for print.
+    pub(crate) wide: String,
+    /// For narrow screens.
+    pub(crate) narrow: String,
+}
+
+/// Draws curves for wide and for narrow screens.
+///
+/// # Errors
+/// If the plotting library fails.
+pub(crate) fn curve_drawing(series: &[Series], options: CurveOptions) -> Result<Drawing, Error> {
+    let wide = curve_svg(series, &options)?;
+    Ok(Drawing { wide, narrow: curve_svg(series, &options.narrow())? })
 }
 
 /// Draws `series` with their bands and a legend as SVG.
@@ -240,52 +267,21 @@ fn draw(series: &[Series], options: &CurveOptions, svg: &mut String) -> DrawResu
     root.fill(&WHITE)?;
     let legend = legend(series, options.width);
     draw_header(&root, &legend, options)?;
-    let n_lines = legend.last().map_or(0, |entry| entry.line + 1);
-    let header_px = legend_top_px(options) + LEGEND_LINE_PX * n_lines;
+    let header_px = legend_top_px(options) + LEGEND_LINE_PX * n_legend_lines(&legend);
     let (_, plot) = root.split_vertically(header_px);
     draw_plot(&plot, series, options)?;
     root.present()?;
     Ok(())
 }
 
-/// Position of a curve's name in the legend.
-#[derive(Debug, PartialEq)]
-struct LegendEntry<'a> {
-    name: &'a str,
-    /// Left edge, pixels.
-    left: i32,
-    /// Legend line, from 0.
-    line: i32,
-}
-
 /// Lays out the legend on as many lines as needed. A single curve has no legend.
-fn legend(series: &[Series], width_px: u32) -> Vec<LegendEntry<'_>> {
-    let named = || series.iter().filter(|_| series.len() > 1).map(|one| one.name.as_str());
-    let positions = legend_positions(named(), width_px);
-    named().zip(positions).map(|(name, (left, line))| LegendEntry { name, left, line }).collect()
-}
-
-/// Returns the left edge (pixels) and the line (from 0) of each legend entry: a marker, 22 pixels wide, and a name.
-pub(crate) fn legend_positions<'a>(
-    names: impl Iterator<Item = &'a str>,
-    width_px: u32,
-) -> Vec<(i32, i32)> {
-    let width_px = i32::try_from(width_px).unwrap_or(i32::MAX);
-    let (mut left, mut line) = (LEGEND_LEFT_PX, 0);
-    let position = |name| {
-        let entry_px = 22 + estimated_width_px(name, LEGEND_PX);
-        if left > LEGEND_LEFT_PX && left + entry_px > width_px {
-            (left, line) = (LEGEND_LEFT_PX, line + 1);
-        }
-        let position = (left, line);
-        left += entry_px + 20;
-        position
-    };
-    names.map(position).collect()
+fn legend(series: &[Series], width_px: u32) -> Vec<LegendEntry> {
+    let named = series.iter().filter(|_| series.len() > 1).map(|one| one.name.as_str());
+    legend_entries(named, width_px)
 }
 
 /// Draws the title and the legend.
-fn draw_header(root: &Area<'_>, legend: &[LegendEntry<'_>], options: &CurveOptions) -> DrawResult {
+fn draw_header(root: &Area<'_>, legend: &[LegendEntry], options: &CurveOptions) -> DrawResult {
     let title = (FONT, TITLE_PX).into_font().style(plotters::style::FontStyle::Bold).color(&INK);
     let mut top = TITLE_TOP_PX;
     for line in title_lines(options) {
@@ -297,8 +293,12 @@ fn draw_header(root: &Area<'_>, legend: &[LegendEntry<'_>], options: &CurveOptio
         let middle = middle + LEGEND_LINE_PX * line;
         root.draw(&Rectangle::new([(*left, middle - 1), (left + 16, middle + 1)], color.filled()))?;
         marker::draw_in_legend(root, idx, (left + 8, middle), color)?;
-        let style = text_style(LEGEND_PX, INK);
-        root.draw(&Text::new((*name).to_owned(), (left + 22, middle - 7), style))?;
+        let mut top = middle - 7;
+        for line in name {
+            let style = text_style(LEGEND_PX, INK);
+            root.draw(&Text::new(line.clone(), (left + 22, top), style))?;
+            top += LEGEND_LINE_PX;
+        }
     }
     Ok(())
 }
@@ -312,19 +312,7 @@ fn legend_top_px(options: &CurveOptions) -> i32 {
 /// Breaks the title into lines that fit into the plot.
 fn title_lines(options: &CurveOptions) -> Vec<String> {
     let room_px = i32::try_from(options.width).unwrap_or(i32::MAX) - 2 * LEGEND_LEFT_PX;
-    let mut lines: Vec<String> = Vec::new();
-    for word in options.title.split_whitespace() {
-        match lines.last_mut() {
-            Some(line)
-                if estimated_width_px(&format!("{line} {word}"), TITLE_PX + 1) <= room_px =>
-            {
-                line.push(' ');
-                line.push_str(word);
-            }
-            _ => lines.push(word.to_owned()),
-        }
-    }
-    lines
+    wrapped(&options.title, TITLE_PX + 1, room_px)
 }
 
 fn draw_plot(plot: &Area<'_>, series: &[Series], options: &CurveOptions) -> DrawResult {
@@ -347,7 +335,7 @@ fn draw_plot(plot: &Area<'_>, series: &[Series], options: &CurveOptions) -> Draw
         .axis_style(GRID)
         .x_desc(options.x_label.as_str())
         .y_desc(options.y_label.as_str())
-        .x_labels(6)
+        .x_labels(if options.width < NARROW_X_LABELS_PX { 4 } else { 6 })
         .y_labels(6)
         .x_label_formatter(&|x| short_number(*x))
         .y_label_formatter(&y_label)
@@ -415,12 +403,6 @@ fn text_style(size_px: u32, color: RGBColor) -> TextStyle<'static> {
     (FONT, size_px).into_font().color(&color)
 }
 
-/// Estimates the width of `text` in a sans-serif font. The viewer chooses the font, so the exact width is unknown.
-pub(crate) fn estimated_width_px(text: &str, size_px: u32) -> i32 {
-    let n_chars = u32::try_from(text.chars().count()).unwrap_or(u32::MAX);
-    i32::try_from(n_chars.saturating_mul(size_px) / 2).unwrap_or(i32::MAX / 2)
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -431,20 +413,6 @@ mod tests {
         let series =
             Series::of("run", &[row(f64::NAN), row(-3.0)], Axis::EnvSteps, Quantity::MeanQ);
         assert_eq!(series.points, [CurvePoint { x: 0.0, y: -3.0, band: None }]);
-    }
-
-    #[test]
-    fn a_legend_has_as_many_lines_as_its_names_need() {
-        let named = |name: &str| Series { name: name.to_owned(), points: Vec::new() };
-        let positions = |names: &[&str]| {
-            let series: Vec<Series> = names.iter().map(|name| named(name)).collect();
-            legend(&series, 300).iter().map(|entry| (entry.left, entry.line)).collect::<Vec<_>>()
-        };
-        assert_eq!(positions(&["alone"]), []);
-        let long = "0123456789";
-        assert_eq!(positions(&[long, long, long]), [(20, 0), (127, 0), (20, 1)]);
-        let longest = long.repeat(6);
-        assert_eq!(positions(&[&longest, long]), [(20, 0), (20, 1)]);
     }
 
     #[test]

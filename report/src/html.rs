@@ -2,6 +2,8 @@
 
 use base64::prelude::{BASE64_STANDARD, Engine as _};
 
+use crate::comparison::FilmStrip;
+use crate::curve::Drawing;
 use crate::plots::Plot;
 use crate::table::Table;
 
@@ -51,23 +53,73 @@ pub(crate) fn details(summary: &str, content: &str) -> String {
     format!("<details><summary>{}</summary>{content}</details>", escaped(summary))
 }
 
-/// Returns a film strip with its title. `png` is the content of its file.
-pub(crate) fn film_strip(title: &str, png: &[u8]) -> String {
-    let (title, data) = (escaped(title), BASE64_STANDARD.encode(png));
+/// Returns a film strip with its title. On a narrow screen two of its pictures are side by side. `idx` distinguishes the
+/// strips of a page.
+pub(crate) fn film_strip(idx: usize, film: &FilmStrip) -> String {
+    let (title, data) = (escaped(&film.title), BASE64_STANDARD.encode(&film.png));
+    let source = format!("data:image/png;base64,{data}");
+    let strip = match png_size_px(&film.png) {
+        Some(size_px) => {
+            pictures(&format!("film-{idx}"), &title, &source, (size_px, film.picture_px))
+        }
+        None => format!("<img alt=\"{title}\" src=\"{source}\">"),
+    };
+    format!("<figure class=film>{strip}<figcaption>{title}</figcaption></figure>")
+}
+
+/// Returns a strip as a whole and picture by picture; both refer to one image `id`, whose size and whose pictures' size
+/// are `size_px` and `picture_px`, in pixels.
+fn pictures(
+    id: &str,
+    title: &str,
+    source: &str,
+    ((width, height), (picture_width, picture_height)): ((usize, usize), (usize, usize)),
+) -> String {
+    // The strip begins and ends with a picture, so the pictures and gaps after the first fill the rest equally.
+    let along = |length: usize, picture: usize| -> Vec<usize> {
+        let n = (length / picture.max(1)).max(1);
+        let rest = length.saturating_sub(picture);
+        (0..n).map(|idx| rest * idx / (n - 1).max(1)).collect()
+    };
+    let (lefts, tops) = (along(width, picture_width), along(height, picture_height));
+    let at = tops.iter().flat_map(|top| lefts.iter().map(move |left| (left, top)));
+    let single = |(x, y)| {
+        format!(
+            "<svg viewBox=\"{x} {y} {picture_width} {picture_height}\"><use href=\"#{id}\"/></svg>"
+        )
+    };
+    let singles: String = at.map(single).collect();
     format!(
-        "<figure class=film><img alt=\"{title}\" src=\"data:image/png;base64,{data}\"><figcaption>{title}</figcaption></figure>"
+        "<svg class=source aria-hidden=true><defs><image id={id} width={width} height={height} href=\"{source}\"/></defs></svg>\
+         <svg class=wide role=img aria-label=\"{title}\" viewBox=\"0 0 {width} {height}\"><use href=\"#{id}\"/></svg>\
+         <div class=narrow role=img aria-label=\"{title}\">{singles}</div>"
     )
+}
+
+/// Returns width and height of a PNG file, pixels; `None` if the file is none.
+fn png_size_px(png: &[u8]) -> Option<(usize, usize)> {
+    let header = png.strip_prefix(b"\x89PNG\r\n\x1a\n")?.get(4..)?.strip_prefix(b"IHDR")?;
+    let (width, rest) = header.split_first_chunk()?;
+    let height = rest.first_chunk()?;
+    let pixels = |bytes: &[u8; 4]| usize::try_from(u32::from_be_bytes(*bytes)).ok();
+    Some((pixels(width)?, pixels(height)?))
 }
 
 /// Returns plots side by side.
 pub(crate) fn plot_grid(plots: &[Plot]) -> String {
-    let svgs: Vec<&str> = plots.iter().map(|plot| plot.svg.as_str()).collect();
-    svg_grid(&svgs)
+    figure_grid(plots.iter().map(|plot| (plot.svg.as_str(), plot.narrow_svg.as_str())))
 }
 
-/// Returns SVG images side by side.
-pub(crate) fn svg_grid(svgs: &[&str]) -> String {
-    let figures: String = svgs.iter().map(|svg| format!("<figure>{svg}</figure>")).collect();
+/// Returns drawings side by side.
+pub(crate) fn drawing_grid(drawings: &[Drawing]) -> String {
+    figure_grid(drawings.iter().map(|one| (one.wide.as_str(), one.narrow.as_str())))
+}
+
+fn figure_grid<'a>(svgs: impl Iterator<Item = (&'a str, &'a str)>) -> String {
+    let figure = |(wide, narrow)| {
+        format!("<figure><div class=wide>{wide}</div><div class=narrow>{narrow}</div></figure>")
+    };
+    let figures: String = svgs.map(figure).collect();
     format!("<div class=figures>{figures}</div>")
 }
 
@@ -79,6 +131,30 @@ pub(crate) fn escaped(text: &str) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_film_strip_has_each_of_its_pictures_once_for_narrow_screens() {
+        let mut png = b"\x89PNG\r\n\x1a\n\0\0\0\x0dIHDR".to_vec();
+        // Four columns and two rows of 480 by 300 pixels with gaps of 6.
+        png.extend([1938_u32, 606].map(u32::to_be_bytes).as_flattened());
+        let mut film = FilmStrip {
+            title: "a < b".to_owned(),
+            file_name: String::new(),
+            png,
+            picture_px: (480, 300),
+        };
+        let html = film_strip(3, &film);
+        assert_eq!(html.matches("<svg viewBox=").count(), 8, "{html}");
+        for part in
+            ["\"0 0 480 300\"", "\"486 0 480 300\"", "\"1458 306 480 300\"", "\"0 0 1938 606\""]
+        {
+            assert_eq!(html.matches(part).count(), 1, "{part} in {html}");
+        }
+        assert_eq!(html.matches("base64,").count(), 1, "the data is there once");
+        assert!(html.contains("id=film-3 ") && html.contains("a &lt; b"));
+        film.png.truncate(20);
+        assert!(film_strip(3, &film).contains("<img"));
+    }
 
     #[test]
     fn ranges_are_below_their_values() {

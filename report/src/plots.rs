@@ -6,7 +6,7 @@ use tandem_core::Task;
 use tandem_telemetry::MetricsRow;
 
 use crate::comparison::{Baseline, Comparison, Section};
-use crate::curve::{Axis, CurveOptions, CurvePoint, Quantity, Series, curve_svg};
+use crate::curve::{Axis, CurveOptions, CurvePoint, Drawing, Quantity, Series, curve_drawing};
 use crate::error::Error;
 use crate::group::SeedGroup;
 use crate::paper::split_strategy;
@@ -25,6 +25,8 @@ pub struct Plot {
     pub title: String,
     /// The plot as SVG.
     pub svg: String,
+    /// The same for narrow screens, as SVG 360 pixels wide.
+    pub narrow_svg: String,
 }
 
 /// Groups that share a plot.
@@ -138,9 +140,9 @@ fn draw(
     if quantity == Quantity::Success && x_max > 0.0 {
         series.extend(baselines.iter().map(|baseline| level(baseline, x_max)));
     }
-    let svg = curve_svg(&series, &CurveOptions::of(title, quantity, axis))?;
+    let Drawing { wide, narrow } = curve_drawing(&series, CurveOptions::of(title, quantity, axis))?;
     let file_name = format!("{}.svg", slug.to_lowercase().replace(' ', "-"));
-    Ok(Plot { file_name, title: title.to_owned(), svg })
+    Ok(Plot { file_name, title: title.to_owned(), svg: wide, narrow_svg: narrow })
 }
 
 /// Returns the line of a policy that does not learn, with the interval of its evaluation on test goals.

@@ -9,6 +9,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use tandem_core::{Task, Wilson};
 use tandem_telemetry::TrialRow;
 
+use crate::curve::Drawing;
 use crate::plots::Plot;
 
 pub use json::json;
@@ -193,7 +194,8 @@ fn plot(row: &TrialRow, names: &mut BTreeMap<String, u32>) -> Plot {
         n => format!("{stem}-again{n}.svg"),
     };
     let title = format!("{task}, {policy}, {mode}, trial {trial}: {}", outcome(row));
-    Plot { file_name, title, svg: trial_svg(row) }
+    let Drawing { wide, narrow } = plot::trial_drawing(row);
+    Plot { file_name, title, svg: wide, narrow_svg: narrow }
 }
 
 /// Returns a name that is valid on every file system.

@@ -96,7 +96,9 @@ fn the_page_of_a_run_loads_nothing_from_elsewhere() {
     let path = run_report_html(dir.path(), &[]).unwrap();
     assert_eq!(path, dir.path().join("report.html"));
     let page = std::fs::read_to_string(path).unwrap();
-    assert_eq!(page.matches("<svg").count(), 4);
+    assert_eq!(page.matches("<div class=wide><svg").count(), 4);
+    let narrow = "<div class=narrow><svg width=\"360\"";
+    assert_eq!(page.matches(narrow).count(), 4, "each can be read on a phone too");
     for text in [
         "93.8 %",
         "16,000",
@@ -143,12 +145,13 @@ fn the_page_of_a_sweep_has_tables_curves_and_the_papers_values() {
         title: "student <1>: success".to_owned(),
         file_name: "student-1-success.png".to_owned(),
         png: b"png".to_vec(),
+        picture_px: (480, 300),
     });
     let page = dir.path().join("report.html");
     let written =
         report_html(&comparison, &Trials::default(), PlottedTrials::Failed, &page).unwrap();
     let page = std::fs::read_to_string(&written.page).unwrap();
-    assert_eq!(page.matches("<svg").count(), written.plots.len() - 1);
+    assert_eq!(page.matches("<div class=wide><svg").count(), written.plots.len() - 1);
     assert_eq!(written.plots.len(), 7, "four of success, mean Q, advice, and a film strip");
     let contains = [
         "MC-ACTABS005",
@@ -266,13 +269,13 @@ fn a_described_task_has_its_own_section_beside_a_built_in_one() {
 /// Checks the pages of a run of a described task and of one of a built-in task.
 fn check_pages_of_runs(described: &Path, push: &Path) {
     let page = std::fs::read_to_string(run_report_html(described, &[]).unwrap()).unwrap();
-    assert_eq!(page.matches("<svg").count(), 3, "no curve of contacts");
+    assert_eq!(page.matches("<div class=wide><svg").count(), 3, "no curve of contacts");
     assert!(!page.contains("Episodes with contact") && !page.contains("with contact"));
     let line =
         "Task lab/reach: 2 arms, 100 control steps per episode, goals within 0.02 (maximum norm)";
     assert!(page.contains(line), "{page}");
     let page = std::fs::read_to_string(run_report_html(push, &[]).unwrap()).unwrap();
-    assert_eq!(page.matches("<svg").count(), 4);
+    assert_eq!(page.matches("<div class=wide><svg").count(), 4);
     let line =
         "Task push: 2 arms, 50 control steps per episode, goals within 0.05 m (Euclidean norm)";
     assert!(page.contains(line), "{page}");

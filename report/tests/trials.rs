@@ -194,7 +194,7 @@ fn the_page_plots_every_failure_and_lists_every_trial() {
     assert_eq!(written.plots.len(), trials::CAUSES.len());
     assert!(written.plots.iter().all(|path| path.exists()));
     let html = std::fs::read_to_string(&written.page).unwrap();
-    assert_eq!(html.matches("<svg").count(), trials::CAUSES.len());
+    assert_eq!(html.matches("<div class=wide><svg").count(), trials::CAUSES.len());
     for (trial, cause) in trials::CAUSES.iter().rev().enumerate() {
         assert!(html.contains(&format!("push, trial {trial}: {cause}")), "{cause}");
     }

@@ -21,7 +21,7 @@ pub(super) fn body(comparison: &Comparison, plots: &ComparisonPlots) -> String {
     let sections = comparison.sections.iter().zip(&plots.sections);
     let mut body: String = sections.map(|(section, plots)| section_body(section, plots)).collect();
     if !comparison.films.is_empty() {
-        let films = comparison.films.iter().map(|film| film_strip(&film.title, &film.png));
+        let films = comparison.films.iter().enumerate().map(|(idx, film)| film_strip(idx, film));
         body.push_str(&format!("<h2>Episodes</h2>{}", films.collect::<String>()));
     }
     if !plots.from_scratch.is_empty() {

@@ -5,9 +5,9 @@ use tandem_core::task::Norm;
 use tandem_telemetry::MetricsRow;
 
 use crate::comparison::FilmStrip;
-use crate::curve::{Axis, CurveOptions, Quantity, Series, curve_svg};
+use crate::curve::{Axis, CurveOptions, Drawing, Quantity, Series, curve_drawing};
 use crate::error::Error;
-use crate::html::{details, escaped, film_strip, svg_grid, table};
+use crate::html::{details, drawing_grid, escaped, film_strip, table};
 use crate::run::Run;
 use crate::table::{NONE, duration, interval, number, optional, share, thousands};
 
@@ -22,15 +22,14 @@ pub(super) fn body(run: &Run, films: &[FilmStrip]) -> Result<String, Error> {
     match (run.best(), run.last()) {
         (Some(best), Some(last)) => {
             let curves = curves(run, task.as_ref(), has_contacts)?;
-            let curves: Vec<&str> = curves.iter().map(String::as_str).collect();
             body.push_str(&headline(run, best));
-            body.push_str(&svg_grid(&curves));
+            body.push_str(&drawing_grid(&curves));
             body.push_str(&tiles(best, last, has_contacts));
         }
         _ => body.push_str("<p>No evaluation yet.</p>"),
     }
     if !films.is_empty() {
-        let strips = films.iter().map(|film| film_strip(&film.title, &film.png));
+        let strips = films.iter().enumerate().map(|(idx, film)| film_strip(idx, film));
         body.push_str(&format!("<h2>Episodes</h2>{}", strips.collect::<String>()));
     }
     if !run.rows.is_empty() {
@@ -138,13 +137,13 @@ fn tiles(best: &MetricsRow, last: &MetricsRow, has_contacts: bool) -> String {
 }
 
 /// Draws success, mean Q, contacts (if the task reports them) and advice against environment steps.
-fn curves(run: &Run, task: Option<&TaskSpec>, has_contacts: bool) -> Result<Vec<String>, Error> {
+fn curves(run: &Run, task: Option<&TaskSpec>, has_contacts: bool) -> Result<Vec<Drawing>, Error> {
     const AXIS: Axis = Axis::EnvSteps;
     let series = |named: &[(&str, Quantity)]| -> Vec<Series> {
         named.iter().map(|(name, quantity)| Series::of(name, &run.rows, AXIS, *quantity)).collect()
     };
     let draw = |title: &str, quantity: Quantity, series: &[Series]| {
-        curve_svg(series, &CurveOptions::of(title, quantity, AXIS))
+        curve_drawing(series, CurveOptions::of(title, quantity, AXIS))
     };
     let is_built_in = task.is_none_or(|task| task.as_built_in().is_some());
     let moved = if is_built_in { "object moved" } else { "achieved goal moved" };

@@ -6,14 +6,19 @@ mod projection;
 use tandem_telemetry::{ToolPathPoint, TrialRow};
 
 use super::{outcome, succeeded};
-use crate::curve::{FAINT_INK, FONT, INK, estimated_width_px, legend_positions};
+use crate::curve::layout::{legend_entries, wrapped};
+use crate::curve::{Drawing, FAINT_INK, FONT, INK, NARROW_PX};
 use crate::html::escaped;
 use crate::table::NONE;
 use marker::{Marker, hex};
-use projection::{Bounds, MARGIN_PX, Projection, WIDTH_PX};
+use projection::{Bounds, MARGIN_PX, Projection};
 
+/// Width of a plot, pixels.
+const WIDTH_PX: u32 = 760;
 /// Height of a text line, pixels.
 const LINE_PX: f64 = 20.0;
+/// Height of a line of the title, pixels.
+const TITLE_LINE_PX: f64 = 22.0;
 /// Minimum distance between points of a path, metres: less than half a pixel.
 const SPACING_M: f64 = 0.0005;
 
@@ -23,8 +28,18 @@ const SPACING_M: f64 = 0.0005;
 /// the goal.
 #[must_use]
 pub fn trial_svg(row: &TrialRow) -> String {
-    let header = Header::of(row);
-    let (views, bottom_px) = Bounds::of(row).projections(header.bottom_px + 34.0);
+    svg_of_width(row, WIDTH_PX)
+}
+
+/// Draws a trial for wide and for narrow screens.
+pub(super) fn trial_drawing(row: &TrialRow) -> Drawing {
+    Drawing { wide: trial_svg(row), narrow: svg_of_width(row, NARROW_PX) }
+}
+
+fn svg_of_width(row: &TrialRow, width_px: u32) -> String {
+    let header = Header::of(row, width_px);
+    let top_px = header.bottom_px + 34.0;
+    let (views, bottom_px) = Bounds::of(row).projections(f64::from(width_px), top_px);
     let mut content = header.svg;
     for (view, name) in views.iter().zip(["from above: x, y", "from the side: x, z"]) {
         content.push_str(&view.background(name));
@@ -33,7 +48,7 @@ pub fn trial_svg(row: &TrialRow) -> String {
     content.push_str(&views[0].scale_bar(bottom_px + 20.0));
     let height_px = bottom_px + 38.0;
     format!(
-        r##"<svg xmlns="http://www.w3.org/2000/svg" width="{WIDTH_PX:.0}" height="{height_px:.0}" viewBox="0 0 {WIDTH_PX:.0} {height_px:.0}" font-family="{FONT}"><rect width="{WIDTH_PX:.0}" height="{height_px:.0}" fill="#ffffff"/>{content}</svg>"##
+        r##"<svg xmlns="http://www.w3.org/2000/svg" width="{width_px}" height="{height_px:.0}" viewBox="0 0 {width_px} {height_px:.0}" font-family="{FONT}"><rect width="{width_px}" height="{height_px:.0}" fill="#ffffff"/>{content}</svg>"##
     )
 }
 
@@ -42,17 +57,25 @@ pub fn trial_svg(row: &TrialRow) -> String {
 struct Header {
     svg: String,
     bottom_px: f64,
+    /// Width of the plot, pixels.
+    width_px: u32,
 }
 
 impl Header {
-    fn of(row: &TrialRow) -> Self {
+    fn of(row: &TrialRow, width_px: u32) -> Self {
         let title = format!("{}, trial {}: {}", row.task, row.trial, outcome(row));
-        let svg = format!(
-            r#"<text x="{MARGIN_PX:.0}" y="30" font-size="17" font-weight="bold" fill="{}">{}</text>"#,
-            hex(INK),
-            escaped(&title)
-        );
-        let mut header = Self { svg, bottom_px: 30.0 };
+        let mut header = Self { bottom_px: 30.0, width_px, ..Self::default() };
+        // Bold text is wider.
+        for line in wrapped(&title, 18, header.room_px()) {
+            header.svg.push_str(&format!(
+                r#"<text x="{MARGIN_PX:.0}" y="{:.0}" font-size="17" font-weight="bold" fill="{}">{}</text>"#,
+                header.bottom_px,
+                hex(INK),
+                escaped(&line)
+            ));
+            header.bottom_px += TITLE_LINE_PX;
+        }
+        header.bottom_px -= TITLE_LINE_PX;
         for fact in facts(row) {
             header.add_text(&fact, &hex(INK));
         }
@@ -63,9 +86,14 @@ impl Header {
         header
     }
 
+    /// Returns the width of text lines, pixels.
+    fn room_px(&self) -> i32 {
+        i32::try_from(self.width_px).unwrap_or(i32::MAX) - 40
+    }
+
     /// Adds `text`, wrapped.
     fn add_text(&mut self, text: &str, color: &str) {
-        for line in wrapped(text, 13) {
+        for line in wrapped(text, 13, self.room_px()) {
             self.bottom_px += LINE_PX;
             self.svg.push_str(&format!(
                 r#"<text x="{MARGIN_PX:.0}" y="{:.0}" font-size="13" fill="{color}">{}</text>"#,
@@ -78,18 +106,21 @@ impl Header {
     fn add_legend(&mut self, row: &TrialRow) {
         let markers = markers(row);
         let names: Vec<String> = markers.iter().map(|marker| marker.name()).collect();
-        let positions = legend_positions(names.iter().map(String::as_str), width());
+        let entries = legend_entries(names.iter().map(String::as_str), self.width_px);
         let first_px = self.bottom_px + 1.4 * LINE_PX;
-        for ((marker, name), (left, line)) in markers.iter().zip(&names).zip(positions) {
-            let y = first_px + f64::from(line) * LINE_PX;
-            let left = f64::from(left);
-            self.svg.push_str(&marker.legend_svg(left + 9.0, y - 4.5));
-            self.svg.push_str(&format!(
-                r#"<text x="{:.0}" y="{y:.0}" font-size="13" fill="{}">{name}</text>"#,
-                left + 22.0,
-                hex(INK)
-            ));
-            self.bottom_px = y;
+        for (marker, entry) in markers.iter().zip(entries) {
+            let left = f64::from(entry.left);
+            let top = first_px + f64::from(entry.line) * LINE_PX;
+            self.svg.push_str(&marker.legend_svg(left + 9.0, top - 4.5));
+            for (line, name) in (0_u32..).zip(&entry.name) {
+                let y = top + f64::from(line) * LINE_PX;
+                self.svg.push_str(&format!(
+                    r#"<text x="{:.0}" y="{y:.0}" font-size="13" fill="{}">{name}</text>"#,
+                    left + 22.0,
+                    hex(INK)
+                ));
+                self.bottom_px = y;
+            }
         }
     }
 }
@@ -186,45 +217,4 @@ fn n_arms(row: &TrialRow) -> usize {
 
 fn distance_m(a: &[f64; 3], b: &[f64; 3]) -> f64 {
     a.iter().zip(b).map(|(a, b)| (a - b) * (a - b)).sum::<f64>().sqrt()
-}
-
-/// Wraps `text` at the width of the plot. A word that is too long has a line of its own.
-fn wrapped(text: &str, size_px: u32) -> Vec<String> {
-    let room_px = i32::try_from(width()).unwrap_or(i32::MAX) - 40;
-    let mut lines: Vec<String> = Vec::new();
-    for word in text.split_whitespace() {
-        match lines.last_mut() {
-            Some(line) if estimated_width_px(&format!("{line} {word}"), size_px) <= room_px => {
-                line.push(' ');
-                line.push_str(word);
-            }
-            _ => lines.push(word.to_owned()),
-        }
-    }
-    lines
-}
-
-#[expect(
-    clippy::cast_possible_truncation,
-    clippy::cast_sign_loss,
-    reason = "a whole number of pixels"
-)]
-const fn width() -> u32 {
-    WIDTH_PX as u32
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn a_long_text_is_wrapped_without_losing_words() {
-        let text = "word ".repeat(100);
-        let lines = wrapped(&text, 13);
-        assert!(lines.len() > 1);
-        assert!(lines.iter().all(|line| estimated_width_px(line, 13) <= 720), "{lines:?}");
-        assert_eq!(lines.join(" "), text.trim());
-        assert_eq!(wrapped(&"x".repeat(500), 13).len(), 1);
-        assert_eq!(wrapped("", 13), [""; 0]);
-    }
 }

@@ -6,7 +6,6 @@ use super::marker::{Marker, hex};
 use crate::color::arm_color;
 use crate::curve::{FAINT_INK, GRID, INK};
 
-pub(super) const WIDTH_PX: f64 = 760.0;
 pub(super) const MARGIN_PX: f64 = 20.0;
 /// Gap between the views, pixels.
 const GAP_PX: f64 = 34.0;
@@ -70,12 +69,12 @@ impl Bounds {
         (0..3).all(|axis| (self.low[axis]..=self.high[axis]).contains(&point[axis]))
     }
 
-    /// Lays out the views from above and from the side below `top_px`, in one scale.
+    /// Lays out the views from above and from the side below `top_px`, in one scale, in a plot of `width_px`.
     ///
     /// Returns the two projections and the bottom edge of the lower one, pixels.
-    pub(super) fn projections(&self, top_px: f64) -> ([Projection; 2], f64) {
+    pub(super) fn projections(&self, width_px: f64, top_px: f64) -> ([Projection; 2], f64) {
         let [dx, dy, dz] = std::array::from_fn(|axis| self.high[axis] - self.low[axis]);
-        let width_px = WIDTH_PX - 2.0 * MARGIN_PX;
+        let width_px = width_px - 2.0 * MARGIN_PX;
         let beside = (0.5 * (width_px - GAP_PX) / dx).min(MAX_HEIGHT_PX / dy.max(dz));
         let stacked = (width_px / dx).min((MAX_STACK_PX - GAP_PX) / (dy + dz));
         let view = |axes, left_px, top_px, scale| Projection {
@@ -231,24 +230,26 @@ mod tests {
     #[test]
     fn both_views_fit_and_have_one_scale_on_all_axes() {
         for extent_m in [[0.6, 0.6, 0.4], [1.2, 0.3, 0.3], [0.2, 0.9, 0.2], [0.3, 0.2, 1.5]] {
-            let ([above, side], bottom_px) = bounds(extent_m).projections(100.0);
-            assert_eq!(above.scale, side.scale);
-            for view in [above, side] {
-                let low = view.point_px([0.0; 3]);
-                let high = view.point_px(extent_m);
-                let [right, up] = view.axes.map(|axis| extent_m[axis] * view.scale);
-                assert!(
-                    (high.0 - low.0 - right).abs() < 1e-9 && (low.1 - high.1 - up).abs() < 1e-9
-                );
-                assert!(low.0 >= MARGIN_PX - 1e-9 && high.0 <= WIDTH_PX - MARGIN_PX + 1e-9);
-                assert!(high.1 >= 100.0 - 1e-9 && low.1 <= bottom_px + 1e-9);
+            for width_px in [760.0, 360.0] {
+                let ([above, side], bottom_px) = bounds(extent_m).projections(width_px, 100.0);
+                assert_eq!(above.scale, side.scale);
+                for view in [above, side] {
+                    let low = view.point_px([0.0; 3]);
+                    let high = view.point_px(extent_m);
+                    let [right, up] = view.axes.map(|axis| extent_m[axis] * view.scale);
+                    assert!(
+                        (high.0 - low.0 - right).abs() < 1e-9 && (low.1 - high.1 - up).abs() < 1e-9
+                    );
+                    assert!(low.0 >= MARGIN_PX - 1e-9 && high.0 <= width_px - MARGIN_PX + 1e-9);
+                    assert!(high.1 >= 100.0 - 1e-9 && low.1 <= bottom_px + 1e-9);
+                }
             }
         }
     }
 
     #[test]
     fn a_point_outside_the_bounds_is_drawn_at_the_edge() {
-        let ([above, _], _) = bounds([0.4, 0.4, 0.4]).projections(100.0);
+        let ([above, _], _) = bounds([0.4, 0.4, 0.4]).projections(760.0, 100.0);
         assert_eq!(above.point_px([9.0, 0.2, 0.0]), above.point_px([0.4, 0.2, 0.0]));
         assert_eq!(above.point_px([0.1, -5.0, 0.0]), above.point_px([0.1, 0.0, 0.0]));
     }
