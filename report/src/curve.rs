@@ -34,10 +34,8 @@ const TICK_PX: u32 = 12;
 /// Height of a line of the title, and distance of the first from the upper edge, pixels.
 const TITLE_LINE_PX: i32 = 20;
 const TITLE_TOP_PX: i32 = 14;
-/// Width of plots for narrow screens, pixels.
+/// Width of plots for narrow screens, pixels. Their axes have fewer and larger labels.
 pub(crate) const NARROW_PX: u32 = 360;
-/// Width below which the horizontal axis has fewer labels, pixels.
-const NARROW_X_LABELS_PX: u32 = 450;
 pub(crate) const INK: RGBColor = RGBColor(0x24, 0x29, 0x2f);
 pub(crate) const FAINT_INK: RGBColor = RGBColor(0x6a, 0x73, 0x7d);
 pub(crate) const GRID: RGBColor = RGBColor(0xe6, 0xe9, 0xed);
@@ -325,6 +323,7 @@ fn draw_plot(plot: &Area<'_>, series: &[Series], options: &CurveOptions) -> Draw
         .x_label_area_size(42)
         .y_label_area_size(62)
         .build_cartesian_2d(0.0..x_max, y_range.clone())?;
+    let is_narrow = options.width <= NARROW_PX;
     let y_label =
         |y: &f64| if options.percent { format!("{:.0} %", 100.0 * y) } else { short_number(*y) };
     chart
@@ -335,11 +334,11 @@ fn draw_plot(plot: &Area<'_>, series: &[Series], options: &CurveOptions) -> Draw
         .axis_style(GRID)
         .x_desc(options.x_label.as_str())
         .y_desc(options.y_label.as_str())
-        .x_labels(if options.width < NARROW_X_LABELS_PX { 4 } else { 6 })
+        .x_labels(if is_narrow { 4 } else { 6 })
         .y_labels(6)
         .x_label_formatter(&|x| short_number(*x))
         .y_label_formatter(&y_label)
-        .label_style(text_style(TICK_PX, FAINT_INK))
+        .label_style(text_style(if is_narrow { LEGEND_PX } else { TICK_PX }, FAINT_INK))
         .axis_desc_style(text_style(LEGEND_PX, INK))
         .draw()?;
     for (one, color) in series.iter().zip(COLORS.iter().cycle()) {
