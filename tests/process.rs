@@ -326,7 +326,7 @@ fn services_print_their_address_and_end_on_sigterm() {
     let mut output = std::io::BufReader::new(teacher.stdout.take().expect("piped"));
     std::io::BufRead::read_line(&mut output, &mut line).expect("a line");
     let address = line.trim().strip_prefix("listening on ").expect("the line").to_owned();
-    assert!(std::net::TcpStream::connect(&address).is_ok(), "{address}");
+    assert!(TcpStream::connect(&address).is_ok(), "{address}");
     let taken = Command::new(env!("CARGO_BIN_EXE_tandem"))
         .args([
             "learner",
