@@ -1,6 +1,5 @@
 //! `tandem status`: shows the progress of a run, from any machine that can reach its learner.
 
-use std::io::{IsTerminal as _, stderr, stdout};
 use std::time::Duration;
 
 use anyhow::anyhow;
@@ -49,7 +48,7 @@ async fn show(learner: &mut LearnerClient<AuthChannel>, args: &StatusArgs) -> Re
 async fn watch(learner: &mut LearnerClient<AuthChannel>, args: &StatusArgs) -> Result<(), Failed> {
     let mut stream = call_with_timeout(learner.watch(pb::WatchRequest {})).await?;
     let (mut printed_round, mut printed_at_s) = (None, f64::NEG_INFINITY);
-    let is_live = !args.json && stdout().is_terminal() && stderr().is_terminal();
+    let is_live = !args.json && output::is_terminal();
     let mut display = is_live.then(|| Display::new(false));
     while let Some(progress) = stream.message().await.map_err(|status| failed(&status))? {
         if args.json {
