@@ -12,9 +12,11 @@
 //! drivers of real arms know a wire format.
 #![warn(missing_docs)]
 
+pub mod calibration;
 pub mod cell_file;
 pub mod driver;
 pub mod executor;
+pub mod injection;
 pub mod kinova_ros;
 pub mod quarc;
 pub mod service;

@@ -268,10 +268,16 @@ impl ArmsHandle {
         }
     }
 
-    /// Waits until a snapshot meets `condition`, at most as long as a call.
-    pub(super) async fn wait_until(&self, condition: impl FnMut(&Arc<Snapshot>) -> bool) {
+    /// Waits until a snapshot meets `condition`, at most as long as a call. Returns that snapshot, or else the newest one.
+    pub(super) async fn wait_until(
+        &self,
+        condition: impl FnMut(&Arc<Snapshot>) -> bool,
+    ) -> Arc<Snapshot> {
         let mut snapshots = self.snapshots.clone();
-        tokio::time::timeout(CALL_TIMEOUT, snapshots.wait_for(condition)).await.ok();
+        match tokio::time::timeout(CALL_TIMEOUT, snapshots.wait_for(condition)).await {
+            Ok(Ok(met)) => Arc::clone(&met),
+            Ok(Err(_)) | Err(_) => self.newest(),
+        }
     }
 
     /// Runs `work` on the thread before a tick and returns its result. Dropping the future before that cancels the

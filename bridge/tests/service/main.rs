@@ -2,6 +2,7 @@
 #![expect(clippy::unwrap_used, clippy::panic, reason = "a test panics where it fails")]
 
 mod calls;
+mod drills;
 mod inputs;
 mod rig;
 mod stops;

@@ -1,0 +1,128 @@
+//! Estimates of times from recorded exchanges.
+
+use crate::calibration::Exchange;
+
+/// Time before a stop in which the joint's speed is fitted, seconds.
+const FIT_S: f64 = 0.1;
+/// Time at the end of a recording in which the joint is at rest, seconds.
+const REST_S: f64 = 0.2;
+/// Resolution of a braking time, seconds.
+const STEP_S: f64 = 0.000_25;
+/// Longest braking time that is tried, seconds.
+const LONGEST_S: f64 = 0.2;
+/// Weight of a rate against that of an angle which differs by as much in 10 ms.
+const RATE_WEIGHT: f64 = 1.0;
+/// Slowest speed from which a stop can be measured, radians per second.
+const LEAST_RADPS: f64 = 0.02;
+
+/// How a joint came to rest.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct StopFit {
+    /// Time from the stamp of the newest state before the stop until the joint began to brake, seconds.
+    pub(super) begins_s: f64,
+    /// Time from then until it was at rest, seconds.
+    pub(super) takes_s: f64,
+}
+
+/// Returns the lag of a joint's angles behind its commands, seconds, from the exchanges of a turn out and back: the
+/// slope of the distance between commanded and measured angle over the commanded speed. `None` if nothing moved.
+pub(super) fn lag_s(
+    exchanges: &[Exchange],
+    arm: usize,
+    joint: usize,
+    period_s: f64,
+) -> Option<f64> {
+    let mut commanded = None;
+    let mut points = Vec::with_capacity(exchanges.len());
+    let mut known = None;
+    for exchange in exchanges {
+        let angle = exchange.state.arms[arm].angles[joint];
+        let velocity = exchange.commanded.as_ref().map_or(0.0, |arms| arms[arm][joint]);
+        let total = commanded.get_or_insert(angle);
+        *total += period_s * velocity;
+        if known.replace(exchange.state.sequence) != Some(exchange.state.sequence) {
+            points.push((velocity, *total - angle));
+        }
+    }
+    slope(&points)
+}
+
+/// Returns the slope of the line through points, or `None` if their abscissae are equal.
+fn slope(points: &[(f64, f64)]) -> Option<f64> {
+    let n = points.len() as f64;
+    let (x, y) = points.iter().fold((0.0, 0.0), |(x, y), point| (x + point.0, y + point.1));
+    let (x, y) = (x / n, y / n);
+    let spread: f64 = points.iter().map(|point| (point.0 - x) * (point.0 - x)).sum();
+    let common: f64 = points.iter().map(|point| (point.0 - x) * (point.1 - y)).sum();
+    (spread > 0.0).then(|| common / spread)
+}
+
+/// Fits how a joint that turned towards `side` (1 or -1) came to rest after a stop: its speed is constant, falls linearly
+/// and is zero. `exchanges[n_before]` is the first exchange after the stop. `None` if it did not turn.
+///
+/// The distance from the last state before the stop determines the sum of the time until it brakes and half the time for
+/// which it does; angles and rates of the states between determine the rest.
+pub(super) fn fit_stop(
+    exchanges: &[Exchange],
+    n_before: usize,
+    arm: usize,
+    joint: usize,
+    side: f64,
+) -> Option<StopFit> {
+    let newest = &exchanges.get(n_before.checked_sub(1)?)?.state;
+    let (stamp_s, origin) = (newest.stamp_s, newest.arms[arm].angles[joint]);
+    let point = |exchange: &Exchange| {
+        let reading = &exchange.state.arms[arm];
+        let time_s = exchange.state.stamp_s - stamp_s;
+        (time_s, side * (reading.angles[joint] - origin), side * reading.velocities[joint])
+    };
+    let before = exchanges[..n_before].iter().rev().map(point);
+    let before: Vec<(f64, f64)> = before
+        .take_while(|(time_s, ..)| *time_s > -FIT_S)
+        .map(|(time_s, angle, _)| (time_s, angle))
+        .collect();
+    let radps = slope(&before).filter(|radps| *radps > LEAST_RADPS)?;
+    let n = before.len() as f64;
+    let mean_s = before.iter().map(|(time_s, _)| time_s).sum::<f64>() / n;
+    let start = before.iter().map(|(_, angle)| angle).sum::<f64>() / n - radps * mean_s;
+    let after: Vec<(f64, f64, f64)> = exchanges[n_before..].iter().map(point).collect();
+    let end_s = after.last()?.0;
+    let rest = after.iter().filter(|(time_s, ..)| *time_s > end_s - REST_S);
+    let (n, sum) = rest.fold((0.0, 0.0), |(n, sum), (_, angle, _)| (n + 1.0, sum + angle));
+    let whole_s = (sum / n - start) / radps;
+    if !(whole_s > 0.0 && whole_s.is_finite()) {
+        return None;
+    }
+    let mut best = (f64::INFINITY, StopFit { begins_s: whole_s, takes_s: 0.0 });
+    let mut takes_s = 0.0;
+    while takes_s <= LONGEST_S.min(2.0 * whole_s) {
+        let fit = StopFit { begins_s: whole_s - 0.5 * takes_s, takes_s };
+        let error = |(time_s, angle, rate): &(f64, f64, f64)| {
+            let (travelled_s, share) = fit.at(*time_s);
+            let angle = (angle - start) / radps - travelled_s;
+            let rate = 0.01 * (rate / radps - share);
+            angle * angle + RATE_WEIGHT * rate * rate
+        };
+        let errors: f64 = after.iter().map(error).sum();
+        if errors < best.0 {
+            best = (errors, fit);
+        }
+        takes_s += STEP_S;
+    }
+    Some(best.1)
+}
+
+impl StopFit {
+    /// Returns the distance travelled by `time_s`, in seconds at the full speed, and the share of that speed.
+    fn at(&self, time_s: f64) -> (f64, f64) {
+        let braked_s = time_s - self.begins_s;
+        if braked_s <= 0.0 {
+            (time_s, 1.0)
+        } else if braked_s < self.takes_s {
+            let share = 1.0 - braked_s / self.takes_s;
+            (self.begins_s + 0.5 * braked_s * (1.0 + share), share)
+        } else {
+            (self.begins_s + 0.5 * self.takes_s, 0.0)
+        }
+    }
+}
