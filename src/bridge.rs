@@ -10,7 +10,7 @@ use tokio::runtime::{Builder, Runtime};
 
 use self::arms::Arms;
 use self::cell::Cell;
-use crate::cli::{BridgeArgs, BridgeCommand, BridgeServeArgs};
+use crate::cli::{BridgeArgs, BridgeCommand, BridgeServeArgs, DriverName};
 use crate::exit::{Exit, Failed, OrExit as _};
 use crate::version::VERSION;
 use crate::{access, clock, metrics, service, signals};
@@ -22,6 +22,7 @@ mod file;
 mod inject;
 mod operator;
 mod play;
+mod priority;
 mod show;
 mod trial;
 mod view;
@@ -72,6 +73,10 @@ fn serve(args: BridgeServeArgs) -> Result<(), Failed> {
             cell: cell.file,
             cell_name: cell.name,
             injector: arms.injector,
+            prepare_thread: Some(match args.arms.driver {
+                DriverName::Sim => priority::raise_if_permitted,
+                DriverName::Quarc | DriverName::KinovaRos => priority::raise,
+            }),
             secret,
         };
         let (observer, snapshots) = plan.observer();

@@ -73,6 +73,8 @@ pub struct Config {
     pub cell_name: String,
     /// Injects faults into simulated arms; `None` for real ones.
     pub injector: Option<Injector>,
+    /// Prepares the thread that moves the arms, such as its priority. Called on that thread before the first tick.
+    pub prepare_thread: Option<fn()>,
     /// The secret seed of the tokens, which must differ at every start.
     pub secret: [u8; 32],
 }
@@ -124,7 +126,8 @@ impl Bridge {
         let ends = shutdown.child_token();
         let guard = ends.clone().drop_guard();
         let clock = Arc::clone(&config.clock);
-        let started = ArmsThread::spawn(executor, clock, observer, ends.clone());
+        let started =
+            ArmsThread::spawn(executor, clock, observer, config.prepare_thread, ends.clone());
         let (thread, arms) = started.map_err(Error::Thread)?;
         Ok(Self { thread, arms, config, ends, guard })
     }

@@ -11,7 +11,7 @@ use tandem_system::atomic_file;
 use tokio_util::sync::CancellationToken;
 
 use super::cell::{self, Cell};
-use super::{arms, runtime};
+use super::{arms, priority, runtime};
 use crate::cli::{CalibrateArgs, DriverName};
 use crate::exit::{Exit, Failed, OrExit as _};
 use crate::{clock, output, signals};
@@ -64,7 +64,10 @@ fn measure_arms(
     let settings = cell.settings(args.arms.driver);
     let clock = Arc::new(clock::BridgeClock::new());
     let (driver, ..) = arms::connect(&args.arms, cell, &settings, clock.clone())?;
-    if args.arms.driver != DriverName::Sim {
+    if args.arms.driver == DriverName::Sim {
+        priority::raise_if_permitted();
+    } else {
+        priority::raise();
         output::message(
             "tandem: every joint of both arms turns by some degrees: keep a hand on the emergency stop",
         );

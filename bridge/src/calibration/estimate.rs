@@ -10,8 +10,10 @@ const REST_S: f64 = 0.2;
 const STEP_S: f64 = 0.000_25;
 /// Longest braking time that is tried, seconds.
 const LONGEST_S: f64 = 0.2;
-/// Weight of a rate against that of an angle which differs by as much in 10 ms.
-const RATE_WEIGHT: f64 = 1.0;
+/// Expected error of a distance, in seconds at the full speed.
+const DISTANCE_S: f64 = 0.001_5;
+/// Expected error of a rate, as a share of the full speed.
+const RATE_SHARE: f64 = 0.05;
 /// Slowest speed from which a stop can be measured, radians per second.
 const LEAST_RADPS: f64 = 0.02;
 
@@ -61,7 +63,7 @@ fn slope(points: &[(f64, f64)]) -> Option<f64> {
 /// and is zero. `exchanges[n_before]` is the first exchange after the stop. `None` if it did not turn.
 ///
 /// The distance from the last state before the stop determines the sum of the time until it brakes and half the time for
-/// which it does; angles and rates of the states between determine the rest.
+/// which it does; the rates of the states between determine the rest.
 pub(super) fn fit_stop(
     exchanges: &[Exchange],
     n_before: usize,
@@ -93,36 +95,48 @@ pub(super) fn fit_stop(
     if !(whole_s > 0.0 && whole_s.is_finite()) {
         return None;
     }
+    let rates: Vec<(f64, f64)> = after
+        .iter()
+        .take_while(|(time_s, ..)| *time_s < whole_s + FIT_S)
+        .map(|(time_s, _, rate)| (*time_s, rate / radps))
+        .collect();
+    Some(best_fit(whole_s, &rates))
+}
+
+/// Returns the fit that explains the distance, `whole_s` seconds at the full speed, and the rates, shares of the full
+/// speed over time.
+fn best_fit(whole_s: f64, rates: &[(f64, f64)]) -> StopFit {
     let mut best = (f64::INFINITY, StopFit { begins_s: whole_s, takes_s: 0.0 });
     let mut takes_s = 0.0;
     while takes_s <= LONGEST_S.min(2.0 * whole_s) {
-        let fit = StopFit { begins_s: whole_s - 0.5 * takes_s, takes_s };
-        let error = |(time_s, angle, rate): &(f64, f64, f64)| {
-            let (travelled_s, share) = fit.at(*time_s);
-            let angle = (angle - start) / radps - travelled_s;
-            let rate = 0.01 * (rate / radps - share);
-            angle * angle + RATE_WEIGHT * rate * rate
-        };
-        let errors: f64 = after.iter().map(error).sum();
-        if errors < best.0 {
-            best = (errors, fit);
+        let mut begins_s = (whole_s - 0.5 * takes_s - 4.0 * DISTANCE_S).max(0.0);
+        let last_s = whole_s - 0.5 * takes_s + 4.0 * DISTANCE_S;
+        while begins_s <= last_s {
+            let fit = StopFit { begins_s, takes_s };
+            let distance = (begins_s + 0.5 * takes_s - whole_s) / DISTANCE_S;
+            let rate = |(time_s, share): &(f64, f64)| (fit.share_at(*time_s) - share) / RATE_SHARE;
+            let error = rates.iter().map(rate).map(|error| error * error).sum::<f64>();
+            let error = error + distance * distance;
+            if error < best.0 {
+                best = (error, fit);
+            }
+            begins_s += STEP_S;
         }
         takes_s += STEP_S;
     }
-    Some(best.1)
+    best.1
 }
 
 impl StopFit {
-    /// Returns the distance travelled by `time_s`, in seconds at the full speed, and the share of that speed.
-    fn at(&self, time_s: f64) -> (f64, f64) {
+    /// Returns the share of the full speed at a time.
+    fn share_at(&self, time_s: f64) -> f64 {
         let braked_s = time_s - self.begins_s;
         if braked_s <= 0.0 {
-            (time_s, 1.0)
+            1.0
         } else if braked_s < self.takes_s {
-            let share = 1.0 - braked_s / self.takes_s;
-            (self.begins_s + 0.5 * braked_s * (1.0 + share), share)
+            1.0 - braked_s / self.takes_s
         } else {
-            (self.begins_s + 0.5 * self.takes_s, 0.0)
+            0.0
         }
     }
 }

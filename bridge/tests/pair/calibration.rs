@@ -60,10 +60,11 @@ fn the_simulated_pair_has_the_times_it_was_configured_with() {
         assert_eq!((arms.len(), n_joints), (2, 8));
         let [low, high] = latency_periods.map(|n| f64::from(n) * PERIOD_S);
         for arm in arms {
-            assert!((arm.lag_s - 0.5 * (low + high) - lag_s).abs() < 0.004, "{arm:?}");
-            let longest_s = high + PERIOD_S;
-            assert!((longest_s - 0.004..longest_s + 0.004).contains(&arm.reaction_s), "{arm:?}");
-            assert!((arm.brake_s - brake_s).abs() < 0.1 * brake_s + 0.004, "{arm:?}");
+            let expected_s = 0.5 * (low + high) + lag_s;
+            assert!((arm.lag_s - expected_s).abs() < 0.003, "{arm:?}");
+            let longest_s = (high + PERIOD_S).max(expected_s);
+            assert!((arm.reaction_s - longest_s).abs() < 0.003, "{arm:?}");
+            assert!((arm.brake_s - brake_s).abs() < 0.1 * brake_s + 0.002, "{arm:?}");
         }
     }
 }

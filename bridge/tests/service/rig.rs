@@ -274,6 +274,7 @@ impl Rig {
             cell_name: String::new(),
             // Arms that can lose their connection are real ones.
             injector: reconnect(&tap).is_none().then_some(injector),
+            prepare_thread: None,
             secret: [7; 32],
         };
         let ends = shutdown.clone();
