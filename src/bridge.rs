@@ -20,6 +20,7 @@ mod calibrate;
 mod cell;
 mod file;
 mod inject;
+mod model;
 mod operator;
 mod play;
 mod priority;
@@ -42,6 +43,7 @@ pub(crate) fn bridge(args: BridgeArgs) -> Result<(), Failed> {
         Some(BridgeCommand::Reset(args)) => operator::reset(&args),
         Some(BridgeCommand::Move(args)) => play::play(&args),
         Some(BridgeCommand::Cell(args)) => cell::cell(&args),
+        Some(BridgeCommand::Arms(args)) => model::serve(args),
         Some(BridgeCommand::Calibrate(args)) => calibrate::calibrate(args),
         Some(BridgeCommand::Inject(args)) => inject::inject(&args),
         Some(BridgeCommand::Trial(args)) => trial::trial(&args),

@@ -326,7 +326,16 @@ fn a_cell_file_describes_the_arms_and_operators_practise_a_stop() {
     let bytes = std::fs::read(log).expect("a log");
     let has = |text: &str| bytes.windows(text.len()).any(|part| part == text.as_bytes());
     assert!(has("arm1.name") && has("0.41 0 0") && has("arm1.is_measured"));
+}
 
+#[test]
+fn real_arms_need_measured_times_and_a_cell_is_refused_with_its_key() {
+    let directory = tempfile::tempdir().expect("a directory");
+    let path = directory.path().join("cell.toml");
+    let cell = path.to_string_lossy();
+    let printed = tandem(&["bridge", "cell"]).output().expect("runs");
+    let text = String::from_utf8(printed.stdout).expect("text");
+    std::fs::write(&path, &text).expect("writes");
     let refused = |args: &[&str], code, expected: &str| {
         fails_with(code, &tandem(&[&["bridge"], args].concat()).output().expect("runs"), expected);
     };
@@ -340,6 +349,37 @@ fn a_cell_file_describes_the_arms_and_operators_practise_a_stop() {
     let close = text.replace("[0.39, 0.0, 0.0]", "[0.1, 0.0, 0.0]");
     std::fs::write(&path, close).expect("writes");
     refused(&["--cell", &cell, "--listen", "127.0.0.1:0"], 65, "simulated arms would start");
+}
+
+/// Returns the next line of `lines` that contains `wanted`.
+fn line_with(lines: &mut impl Iterator<Item = std::io::Result<String>>, wanted: &str) -> String {
+    let line = lines.map(|line| line.expect("text")).find(|line| line.contains(wanted));
+    line.unwrap_or_else(|| panic!("no line contains {wanted:?}"))
+}
+
+#[test]
+fn arms_in_a_process_of_their_own_brake_when_the_bridge_is_killed() {
+    let mut arms = tandem(&["bridge", "arms", "--listen", "127.0.0.1:0"]).spawn().expect("starts");
+    let mut told = BufReader::new(arms.stdout.take().expect("piped")).lines();
+    let address = line_with(&mut told, "listening on ");
+    let address = address.strip_prefix("listening on ").expect("an address");
+    let at = format!("tcpip://{address}");
+    let serve = ["bridge", "--driver", "quarc", "--arms-at", &at, "--accept-defaults"];
+    let serve = [&serve[..], &["--listen", "127.0.0.1:0", "--no-dashboard"]].concat();
+    let bridge = Bridge::spawn(tandem(&serve).stderr(Stdio::inherit()));
+    line_with(&mut told, "connected: ");
+    fails_with(75, &bridge.run(&["inject", "contact"]), "simulated arms only");
+    let mover = bridge.with_arms(|| bridge.moving());
+    // Dropping a bridge kills it.
+    drop(bridge);
+    line_with(&mut told, "no command for 50 ms: the drives brake");
+    line_with(&mut told, "the arms are at rest");
+    end(mover);
+    // A new bridge finds the arms where they are, stopped.
+    let bridge = Bridge::spawn(tandem(&serve).stderr(Stdio::inherit()));
+    assert_eq!(bridge.status()["stopped"]["name"], json!("not-reset"));
+    bridge.reset();
+    end(arms);
 }
 
 /// Returns the logs in a directory.

@@ -130,9 +130,18 @@ impl Driver for Recorder {
     }
 }
 
+/// The one who measures.
+pub struct Operator<'a> {
+    /// The clock of the periods.
+    pub clock: &'a dyn Clock,
+    /// Receives the times of each joint.
+    pub report: &'a mut dyn FnMut(JointTiming),
+    /// Returns whether the measurement has to end. Called once per period.
+    pub is_interrupted: &'a dyn Fn() -> bool,
+}
+
 /// Measures the arms of `cell` behind `driver`, one joint after the other at `speed` (a share of the joint's highest
-/// speed, see [`SPEED_SHARES`]), within the limits of `settings`. Passes the times of each joint to `report`, and ends
-/// as soon as `is_interrupted` returns `true`. Returns the times of each arm.
+/// speed, see [`SPEED_SHARES`]), within the limits of `settings`. Returns the times of each arm.
 ///
 /// # Errors
 /// Returns the reason why the arms could not be measured. They are stopped then.
@@ -144,11 +153,10 @@ pub fn calibrate(
     driver: BoxDriver,
     settings: Settings,
     speed: f64,
-    clock: &dyn Clock,
-    report: &mut dyn FnMut(JointTiming),
-    is_interrupted: &dyn Fn() -> bool,
+    operator: Operator<'_>,
 ) -> Result<Vec<ArmTiming>, CalibrationError> {
     assert!((SPEED_SHARES[0]..=SPEED_SHARES[1]).contains(&speed), "speed {speed}");
+    let Operator { clock, report, is_interrupted } = operator;
     let exchanges = Rc::new(RefCell::new(Vec::new()));
     let recorder = Recorder { driver, exchanges: Rc::clone(&exchanges) };
     let executor = Executor::new(cell.clone(), recorder, settings)?;
@@ -306,7 +314,7 @@ impl Bench<'_> {
             let motion = turn.motion(state, arm, joint, side * turn.full_rad());
             self.executor.checker().check(motion, &at).map(|_| side)
         };
-        check(1.0).or_else(|refused| check(-1.0).map_err(|_| no_room(refused.to_string())))
+        check(1.0).or_else(|refused| check(-1.0).map_err(|_also| no_room(refused.to_string())))
     }
 
     /// Turns a joint to `angle`, radians, if it is not there.

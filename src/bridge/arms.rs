@@ -90,7 +90,11 @@ pub(super) fn connect(
 }
 
 /// Creates a simulated pair with its tools above their workspaces.
-fn simulated(seed: u64, file: &CellFile, settings: &Settings) -> Result<SimulatedPair, Failed> {
+pub(super) fn simulated(
+    seed: u64,
+    file: &CellFile,
+    settings: &Settings,
+) -> Result<SimulatedPair, Failed> {
     let cell = file.work_cell();
     let at = cell.ready(READY_M).or_exit(Exit::Bug, String::new)?;
     let gaps = cell.gaps_with(&at, &vec![READY_OPENING; at.len()]);

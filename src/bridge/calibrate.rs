@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use anyhow::anyhow;
 use serde_json::json;
-use tandem_bridge::calibration::{CalibrationError, JointTiming, calibrate as measure};
+use tandem_bridge::calibration::{CalibrationError, JointTiming, Operator, calibrate as measure};
 use tandem_bridge::cell_file::{ArmTiming, with_timings};
 use tandem_system::atomic_file;
 use tokio_util::sync::CancellationToken;
@@ -80,15 +80,16 @@ fn measure_arms(
     };
     let work_cell = cell.file.work_cell();
     let is_interrupted = || interrupted.is_cancelled();
-    measure(&work_cell, driver, settings, args.speed, &*clock, &mut report, &is_interrupted)
-        .map_err(|error| {
-            let exit = match &error {
-                CalibrationError::Interrupted => Exit::Interrupted,
-                CalibrationError::Setting(_) => Exit::Data,
-                _ => Exit::TryAgain,
-            };
-            Failed::new(exit, anyhow!("the cell file is unchanged: {error}"))
-        })
+    let operator =
+        Operator { clock: &*clock, report: &mut report, is_interrupted: &is_interrupted };
+    measure(&work_cell, driver, settings, args.speed, operator).map_err(|error| {
+        let exit = match &error {
+            CalibrationError::Interrupted => Exit::Interrupted,
+            CalibrationError::Setting(_) => Exit::Data,
+            _ => Exit::TryAgain,
+        };
+        Failed::new(exit, anyhow!("the cell file is unchanged: {error}"))
+    })
 }
 
 fn times(timing: &ArmTiming) -> String {

@@ -1,5 +1,6 @@
 //! The command line of `tandem bridge`.
 
+use std::net::SocketAddr;
 use std::path::PathBuf;
 
 use clap::{ArgGroup, Args, Subcommand, ValueEnum};
@@ -99,6 +100,27 @@ pub(crate) struct ArmsArgs {
     pub(crate) seed: u64,
 }
 
+#[derive(Debug, Args)]
+#[command(after_help = "\
+Examples:
+  tandem bridge arms
+  tandem bridge --driver quarc --arms-at tcpip://127.0.0.1:18000 \\
+      --accept-defaults   # in a separate terminal
+
+Kill the bridge during a motion: the drives brake by themselves, and this process says so. Anyone who \
+can reach the address can move the simulated arms.")]
+pub(crate) struct ArmsServeArgs {
+    /// Address to listen on; port 0 selects a free port.
+    #[arg(long, default_value = "127.0.0.1:18000", value_name = "ADDR")]
+    pub(crate) listen: SocketAddr,
+    /// Cell file of the arms.
+    #[arg(long, value_name = "FILE.toml")]
+    pub(crate) cell: Option<PathBuf>,
+    /// Seed of the pair's noise and latencies.
+    #[arg(long, value_name = "N", default_value_t = 0)]
+    pub(crate) seed: u64,
+}
+
 /// Driver of the arms.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub(crate) enum DriverName {
@@ -140,6 +162,8 @@ Examples:
     Move(MoveArgs),
     /// Prints the default cell file with comments, to start from, or checks a cell file.
     Cell(CellArgs),
+    /// Serves the simulated pair as a process of its own, as if it were behind a Simulink model (--driver quarc).
+    Arms(ArmsServeArgs),
     /// Measures lag, reaction and braking time of the arms, and writes them into their cell file.
     Calibrate(CalibrateArgs),
     /// Injects a fault into simulated arms, to practise a stop. Real arms refuse it.

@@ -2,8 +2,8 @@
 
 use crate::calibration::Exchange;
 
-/// Time before a stop in which the joint's speed is fitted, seconds.
-const FIT_S: f64 = 0.1;
+/// Time before a stop in which the joint's speed is fitted, and after its end in which rates count, seconds.
+const FIT_S: f64 = 0.15;
 /// Time at the end of a recording in which the joint is at rest, seconds.
 const REST_S: f64 = 0.2;
 /// Resolution of a braking time, seconds.
@@ -14,6 +14,10 @@ const LONGEST_S: f64 = 0.2;
 const DISTANCE_S: f64 = 0.001_5;
 /// Expected error of a rate, as a share of the full speed.
 const RATE_SHARE: f64 = 0.05;
+/// Largest error of a distance that is tried, in expected errors.
+const MOST_DISTANCES: f64 = 4.0;
+/// Difference of errors (sums of squares) that counts as none.
+const EQUAL_ERROR: f64 = 0.25;
 /// Slowest speed from which a stop can be measured, radians per second.
 const LEAST_RADPS: f64 = 0.02;
 
@@ -104,27 +108,31 @@ pub(super) fn fit_stop(
 }
 
 /// Returns the fit that explains the distance, `whole_s` seconds at the full speed, and the rates, shares of the full
-/// speed over time.
+/// speed over time. Of fits that explain them about equally well, it returns the one that brakes for longest, which is
+/// the slowest at higher speeds.
 fn best_fit(whole_s: f64, rates: &[(f64, f64)]) -> StopFit {
-    let mut best = (f64::INFINITY, StopFit { begins_s: whole_s, takes_s: 0.0 });
+    let mut fits: Vec<(f64, StopFit)> = Vec::new();
     let mut takes_s = 0.0;
     while takes_s <= LONGEST_S.min(2.0 * whole_s) {
-        let mut begins_s = (whole_s - 0.5 * takes_s - 4.0 * DISTANCE_S).max(0.0);
-        let last_s = whole_s - 0.5 * takes_s + 4.0 * DISTANCE_S;
-        while begins_s <= last_s {
+        let middle_s = whole_s - 0.5 * takes_s;
+        let mut begins_s = (middle_s - MOST_DISTANCES * DISTANCE_S).max(0.0);
+        let mut best = (f64::INFINITY, StopFit { begins_s, takes_s });
+        while begins_s <= middle_s + MOST_DISTANCES * DISTANCE_S {
             let fit = StopFit { begins_s, takes_s };
-            let distance = (begins_s + 0.5 * takes_s - whole_s) / DISTANCE_S;
+            let distance = (begins_s - middle_s) / DISTANCE_S;
             let rate = |(time_s, share): &(f64, f64)| (fit.share_at(*time_s) - share) / RATE_SHARE;
             let error = rates.iter().map(rate).map(|error| error * error).sum::<f64>();
-            let error = error + distance * distance;
-            if error < best.0 {
-                best = (error, fit);
+            if error + distance * distance < best.0 {
+                best = (error + distance * distance, fit);
             }
             begins_s += STEP_S;
         }
+        fits.push(best);
         takes_s += STEP_S;
     }
-    best.1
+    let least = fits.iter().map(|(error, _)| *error).fold(f64::INFINITY, f64::min);
+    let good = fits.iter().rev().find(|(error, _)| *error <= least + EQUAL_ERROR);
+    good.map_or(StopFit { begins_s: whole_s, takes_s: 0.0 }, |(_, fit)| *fit)
 }
 
 impl StopFit {

@@ -3,7 +3,7 @@
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
 
-use tandem_bridge::calibration::{CalibrationError, JointTiming, calibrate};
+use tandem_bridge::calibration::{CalibrationError, JointTiming, Operator, calibrate};
 use tandem_bridge::cell_file::ArmTiming;
 use tandem_bridge::service::{BoxDriver, Clock};
 use tandem_bridge::work_cell::mico_cell;
@@ -37,14 +37,15 @@ fn measured(config: SimulatedConfig, settings: Settings, speed: f64) -> (Vec<Arm
     let mut report = |joint| joints.push(joint);
     let driver: BoxDriver = Box::new(pair(config));
     let clock = SleepClock::default();
-    let timings = calibrate(&mico_cell(), driver, settings, speed, &clock, &mut report, &|| false);
+    let operator = Operator { clock: &clock, report: &mut report, is_interrupted: &|| false };
+    let timings = calibrate(&mico_cell(), driver, settings, speed, operator);
     (timings.unwrap(), joints.len())
 }
 
 #[test]
 fn the_simulated_pair_has_the_times_it_was_configured_with() {
     for (latency_periods, lag_s, brake_s, speed) in
-        [([1, 2], 0.010, 0.040, 0.3), ([1, 1], 0.020, 0.080, 0.3), ([2, 3], 0.005, 0.030, 0.2)]
+        [([1, 2], 0.010, 0.040, 0.3), ([1, 1], 0.020, 0.080, 0.3), ([2, 3], 0.005, 0.030, 0.4)]
     {
         let config =
             SimulatedConfig { latency_periods, lag_s, brake_s, ..SimulatedConfig::default() };
@@ -126,8 +127,8 @@ fn one_joint_moves_at_a_time_and_an_interrupted_measurement_stops_the_arms() {
     let n_measured = std::cell::Cell::new(0);
     let mut report = |_| n_measured.set(n_measured.get() + 1);
     let is_over = || n_measured.get() == 3 && told.lock().unwrap().n_exchanges.is_multiple_of(50);
-    let ended =
-        calibrate(&mico_cell(), driver(), Settings::default(), 0.3, &clock, &mut report, &is_over);
+    let operator = Operator { clock: &clock, report: &mut report, is_interrupted: &is_over };
+    let ended = calibrate(&mico_cell(), driver(), Settings::default(), 0.3, operator);
     assert_eq!(ended.unwrap_err(), CalibrationError::Interrupted);
     let told = told.lock().unwrap();
     assert_eq!(told.n_joints, 1);
@@ -142,7 +143,8 @@ fn a_joint_without_room_is_an_error_before_it_moves() {
     settings.check.tilt_rad = 1e-3;
     let driver: BoxDriver = Box::new(pair(SimulatedConfig::default()));
     let clock = SleepClock::default();
-    let ended = calibrate(&cell, driver, settings, 0.3, &clock, &mut |_| (), &|| false);
+    let operator = Operator { clock: &clock, report: &mut |_| (), is_interrupted: &|| false };
+    let ended = calibrate(&cell, driver, settings, 0.3, operator);
     let error = ended.unwrap_err().to_string();
     assert!(error.starts_with("joint 1 of arm 0 cannot turn by"), "{error}");
 }

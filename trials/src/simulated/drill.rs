@@ -93,7 +93,7 @@ impl Drill {
 }
 
 fn set(joints: &mut Joints, joint: usize, value: f64) {
-    if let Some(number) = joints.iter_mut().nth(joint) {
+    if let Some(number) = joints.get_mut(joint) {
         *number = value;
     }
 }
