@@ -43,7 +43,7 @@ pub(crate) fn bridge(args: BridgeArgs) -> Result<(), Failed> {
         Some(BridgeCommand::Reset(args)) => operator::reset(&args),
         Some(BridgeCommand::Move(args)) => play::play(&args),
         Some(BridgeCommand::Cell(args)) => cell::cell(&args),
-        Some(BridgeCommand::Arms(args)) => model::serve(args),
+        Some(BridgeCommand::Arms(args)) => model::serve(&args),
         Some(BridgeCommand::Calibrate(args)) => calibrate::calibrate(args),
         Some(BridgeCommand::Inject(args)) => inject::inject(&args),
         Some(BridgeCommand::Trial(args)) => trial::trial(&args),

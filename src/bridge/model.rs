@@ -28,7 +28,7 @@ const COMMAND_BYTES: usize = COMMAND_LEN * size_of::<f64>();
 const REST_RADPS: f64 = 1e-3;
 
 /// Runs the arms until the process is interrupted.
-pub(super) fn serve(args: ArmsServeArgs) -> Result<(), Failed> {
+pub(super) fn serve(args: &ArmsServeArgs) -> Result<(), Failed> {
     let cell = Cell::load(args.cell.as_deref())?;
     let settings = cell.settings(DriverName::Sim);
     let pair = arms::simulated(args.seed, &cell.file, &settings)?;

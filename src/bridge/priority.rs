@@ -28,7 +28,7 @@ pub(super) fn raise_if_permitted() {
 }
 
 fn try_raise() -> Result<(), String> {
-    let priority = ThreadPriorityValue::try_from(PRIORITY).map_err(str::to_owned)?;
+    let priority = ThreadPriorityValue::try_from(PRIORITY)?;
     let policy = ThreadSchedulePolicy::Realtime(RealtimeThreadSchedulePolicy::Fifo);
     let priority = ThreadPriority::Crossplatform(priority);
     set_thread_priority_and_policy(thread_native_id(), priority, policy)
