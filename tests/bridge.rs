@@ -342,11 +342,7 @@ fn real_arms_need_measured_times_and_a_cell_is_refused_with_its_key() {
     let real = ["--driver", "quarc", "--arms-at", "tcpip://127.0.0.1:1"];
     refused(&real, 64, "real arms need a cell file");
     let guessed = [&real[..], &["--cell", &cell]].concat();
-    refused(
-        &guessed,
-        64,
-        "lacks arms[0].lag_s, arms[0].reaction_s, arms[0].brake_s, arms[1].lag_s",
-    );
+    refused(&guessed, 64, "no lag_s, reaction_s and brake_s of left and right: measure");
     refused(&[&guessed[..], &["--accept-defaults"]].concat(), 75, "not connected");
     std::fs::write(&path, text.replace("yaw_degrees = 0.0", "yaw = 0.0")).expect("writes");
     refused(&["cell", &cell], 65, "unknown field `yaw`");

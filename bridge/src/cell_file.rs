@@ -238,19 +238,6 @@ impl CellFile {
         };
         self.arms.iter().map(timing).collect()
     }
-
-    /// Returns the keys of times that nobody has measured, such as `arms[0].lag_s`.
-    #[must_use]
-    pub fn guesses(&self) -> Vec<String> {
-        let missing = |(idx, arm): (usize, &Arm)| {
-            arm.times()
-                .into_iter()
-                .filter(|(_, value)| value.is_none())
-                .map(move |(key, _)| format!("arms[{idx}].{key}"))
-                .collect::<Vec<_>>()
-        };
-        self.arms.iter().enumerate().flat_map(missing).collect()
-    }
 }
 
 impl Arm {

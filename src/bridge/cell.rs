@@ -34,6 +34,12 @@ impl Cell {
         self.file.settings(&arms::default_settings(driver))
     }
 
+    /// Returns the names of the arms whose times nobody has measured.
+    fn unmeasured(&self) -> Vec<&str> {
+        let arms = self.file.arms.iter().filter(|arm| !arm.is_measured());
+        arms.map(|arm| arm.name.as_str()).collect()
+    }
+
     /// Refuses to move real arms by guesses, unless the operator accepts them.
     pub(super) fn require_measured(
         &self,
@@ -49,13 +55,13 @@ impl Cell {
                  stand, and measure with `tandem bridge calibrate` (--accept-defaults moves them by guesses)",
             ));
         }
-        match self.file.guesses().as_slice() {
+        match self.unmeasured().as_slice() {
             [] => Ok(()),
-            guesses => Err(Failed::usage(format!(
-                "cell file {:?} lacks {}: measure with `tandem bridge calibrate` (--accept-defaults moves real arms by \
-                 guesses)",
+            arms => Err(Failed::usage(format!(
+                "cell file {:?} has no lag_s, reaction_s and brake_s of {}: measure with `tandem bridge calibrate` \
+                 (--accept-defaults moves real arms by guesses)",
                 self.name,
-                guesses.join(", ")
+                arms.join(" and ")
             ))),
         }
     }
@@ -72,14 +78,14 @@ pub(super) fn cell(args: &CellArgs) -> Result<(), Failed> {
         return output::print(DEFAULT_TEXT.trim_end());
     };
     let cell = Cell::load(Some(path))?;
-    let guesses = cell.file.guesses();
+    let unmeasured = cell.unmeasured();
     if args.json {
         let names: Vec<&str> = cell.file.arms.iter().map(|arm| arm.name.as_str()).collect();
-        return output::print(json!({"valid": true, "arms": names, "guesses": guesses}));
+        return output::print(json!({"valid": true, "arms": names, "not_measured": unmeasured}));
     }
     output::print("the cell file is valid")?;
-    if guesses.is_empty() {
+    if unmeasured.is_empty() {
         return output::print("all times were measured");
     }
-    output::print(format_args!("not measured: {}", guesses.join(", ")))
+    output::print(format_args!("not measured: {}", unmeasured.join(", ")))
 }

@@ -47,7 +47,7 @@ pub(super) fn serve(args: &ArmsServeArgs) -> Result<(), Failed> {
             listener,
             peer: None,
             n_states: 0,
-            was_connected: false,
+            has_obeyed: false,
             is_tripped: false,
             is_told: false,
         };
@@ -62,8 +62,8 @@ struct Model {
     listener: TcpListener,
     peer: Option<Peer>,
     n_states: u64,
-    /// Whether a bridge has ever been connected.
-    was_connected: bool,
+    /// Whether the drives have ever obeyed a bridge.
+    has_obeyed: bool,
     /// Whether the drives have braked by themselves.
     is_tripped: bool,
     /// Whether that the arms are at rest after it was told.
@@ -106,7 +106,6 @@ impl Model {
             return Ok(());
         }
         self.peer = Some(Peer { stream, address, received: Vec::new(), number: 0, obeys: false });
-        self.was_connected = true;
         self.tell(format_args!("connected: {address}"))
     }
 
@@ -141,20 +140,20 @@ impl Model {
 
     /// Tells when the drives brake by themselves and when the arms are at rest after that.
     fn tell_drives(&mut self, state: &PairState) -> Result<(), Failed> {
-        let is_tripped = self.was_connected && state.arms.iter().any(|arm| arm.faults.drive);
-        if is_tripped && !self.is_tripped {
-            let silence_ms = 1e3 * SILENCE_S;
-            let moves = if self.is_at_rest() { "at rest" } else { "moving" };
-            self.tell(format_args!(
-                "no command for {silence_ms:.0} ms: the drives brake, {moves}"
-            ))?;
+        let is_tripped = state.arms.iter().any(|arm| arm.faults.drive);
+        // Before a bridge has connected, drives without commands are no event.
+        self.has_obeyed |= !is_tripped && self.peer.as_ref().is_some_and(|peer| peer.obeys);
+        if !(is_tripped && self.has_obeyed) {
+            (self.is_tripped, self.is_told) = (false, false);
+            return Ok(());
         }
-        if is_tripped && self.is_at_rest() && !self.is_told {
-            self.is_told = true;
+        if !std::mem::replace(&mut self.is_tripped, true) {
+            let silence_ms = 1e3 * SILENCE_S;
+            self.tell(format_args!("no command for {silence_ms:.0} ms: the drives brake"))?;
+        }
+        if self.is_at_rest() && !std::mem::replace(&mut self.is_told, true) {
             self.tell("the arms are at rest")?;
         }
-        self.is_told &= is_tripped;
-        self.is_tripped = is_tripped;
         Ok(())
     }
 

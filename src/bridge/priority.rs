@@ -8,14 +8,14 @@ use thread_priority::{
 /// Priority among real-time threads, 1 to 99: below those that the kernel uses for interrupts (50).
 const PRIORITY: u8 = 5;
 
-/// Gives the calling thread real-time priority (`SCHED_FIFO`), so that other programs cannot delay commands. Warns if the
-/// system does not permit that.
+/// Gives the calling thread real-time priority (`SCHED_FIFO`), so that other programs cannot delay commands. Warns if
+/// the system does not permit that.
 pub(super) fn raise() {
     if let Err(why) = try_raise() {
         tracing::warn!(
             why,
-            "no real-time priority: other programs may delay commands, which stops the arms (allow it with `ulimit -r 5` or \
-             CAP_SYS_NICE)"
+            "no real-time priority: other programs may delay commands, which stops the arms (allow it with \
+             `ulimit -r 5` or CAP_SYS_NICE)"
         );
     }
 }

@@ -82,7 +82,11 @@ const fn fault_name(fault: pb::InjectedFault) -> &'static str {
 }
 
 pub(super) fn injected_json(injected: &[pb::FaultInjection]) -> Value {
-    let fault = |fault: &pb::FaultInjection| json!({"fault": fault_name(fault.fault()), "arm": fault.arm, "joint": fault.joint});
+    let fault = |fault: &pb::FaultInjection| {
+        json!({
+            "fault": fault_name(fault.fault()), "arm": fault.arm, "joint": fault.joint,
+        })
+    };
     Value::Array(injected.iter().map(fault).collect())
 }
 

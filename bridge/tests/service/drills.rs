@@ -3,7 +3,7 @@
 use tandem_proto::pb::{self, InjectedFault as F};
 use tonic::{Code, Status};
 
-use crate::rig::{Rig, UP_M, patient, slow, through};
+use crate::service::rig::{Rig, UP_M, patient, slow, through};
 
 const ARM: u32 = 1;
 const JOINT: u32 = 1;
