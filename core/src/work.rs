@@ -34,6 +34,17 @@ pub struct EpisodeOrder {
     pub uniform: bool,
     /// Whether to record the episode in a log.
     pub record: bool,
+    /// The number of steps, from the first one on, on which an advised episode asks; `None` means all.
+    pub advised_steps: Option<u32>,
+}
+
+impl EpisodeOrder {
+    /// Returns true if the episode is to ask on step `step_idx`, from 0.
+    #[must_use]
+    pub fn asks_on(&self, step_idx: usize) -> bool {
+        let is_before_end = |n_steps| u32::try_from(step_idx).is_ok_and(|step| step < n_steps);
+        self.advised && self.advised_steps.is_none_or(is_before_end)
+    }
 }
 
 /// The start of an episode in an environment. Together with the actions it determines the episode.

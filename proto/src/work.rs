@@ -188,6 +188,7 @@ const fn encode_episode_order(order: &EpisodeOrder) -> pb::EpisodeOrder {
         advised: order.advised,
         uniform: order.uniform,
         record: order.record,
+        advised_steps: order.advised_steps,
     }
 }
 
@@ -199,6 +200,7 @@ const fn decode_episode_order(order: pb::EpisodeOrder) -> EpisodeOrder {
         advised: order.advised,
         uniform: order.uniform,
         record: order.record,
+        advised_steps: order.advised_steps,
     }
 }
 
@@ -326,6 +328,7 @@ mod tests {
             advised,
             uniform: !advised,
             record: advised,
+            advised_steps: advised.then_some(17),
         };
         SlotOrder {
             slot: 3,

@@ -52,6 +52,7 @@
 pub mod config;
 pub mod ddpg;
 pub mod her;
+pub mod jump_start;
 pub mod replay;
 pub mod trainer;
 

@@ -17,6 +17,7 @@ use tandem_policy::{Normalizer, NormalizerSnapshot, Policy};
 use crate::config::{Behaviour, ConfigError, PolyakEvery, RunConfig};
 use crate::ddpg::{Batch, Ddpg, DdpgError, Rewards};
 use crate::her::{Sampler, Statistics};
+use crate::jump_start::JumpStart;
 use crate::replay::ReplayBuffer;
 
 /// Episodes of an evaluation slot.
@@ -38,6 +39,8 @@ pub struct Counters {
     pub updates: u64,
     /// Units of the advice budget charged for training episodes.
     pub advice_spent: u64,
+    /// Training steps on which the teacher was asked. The digest does not cover them.
+    pub advice_queries: u64,
 }
 
 /// Statistics of a round.
@@ -72,6 +75,8 @@ pub struct Trainer {
     pub observation_normalizer: Normalizer,
     /// Running mean and deviation of goals.
     pub goal_normalizer: Normalizer,
+    /// The horizon of strategy `jsrl:H`; `None` with other strategies.
+    pub jump_start: Option<JumpStart>,
     sampler: Sampler,
     batch: Batch,
     /// Statistics of the latest round.
@@ -87,14 +92,18 @@ impl Trainer {
         let config = config.checked()?;
         let layout = config.layout()?;
         let n_heads = config.replay.reward.n_heads(&layout);
-        let rewards = Rewards { n_heads, lowest: config.replay.lowest_reward() };
+        let mut sampler = Sampler::new(&config.replay, &layout);
+        sampler.set_intervention_cost(config.advice.intervention_cost());
+        let lowest = config.replay.lowest_reward() - config.advice.intervention_cost();
+        let rewards = Rewards { n_heads, lowest };
         Ok(Self {
             counters: Counters::default(),
             replay: ReplayBuffer::new(&layout, config.replay.capacity_transitions),
             ddpg: Ddpg::new(config.ddpg.clone(), &layout, rewards, config.seed),
             observation_normalizer: Normalizer::new(layout.n_observation()),
             goal_normalizer: Normalizer::new(layout.n_goal()),
-            sampler: Sampler::new(&config.replay, &layout),
+            jump_start: config.advice.horizon().map(JumpStart::new),
+            sampler,
             batch: Batch::new(&layout, n_heads, config.ddpg.transitions_per_update()),
             stats: RoundStats::default(),
             layout,
@@ -173,13 +182,17 @@ impl Trainer {
         let per_round = self.config.episodes_per_round();
         let warmup_episodes =
             self.config.rounds.warmup_env_steps.div_ceil(self.layout.episode_steps() as u64);
+        let n_rounds_ahead = round.saturating_sub(self.counters.round);
+        let advised_steps = self.jump_start.map(|jump_start| jump_start.horizon(n_rounds_ahead));
+        let asks = self.config.advice.asks() && advised_steps != Some(0);
         let orders: Vec<EpisodeOrder> = (round * per_round..(round + 1) * per_round)
             .map(|number| EpisodeOrder {
                 number,
                 seed: self.config.seed,
-                advised: self.config.advice.asks() && is_advised(number, self.config.advice.share),
+                advised: asks && is_advised(number, self.config.advice.share),
                 uniform: number < warmup_episodes,
                 record: false,
+                advised_steps,
             })
             .collect();
         slots(&orders, self.config.rounds.rollouts, EpisodeKind::Training, version)
@@ -195,6 +208,7 @@ impl Trainer {
             advised: false,
             uniform: false,
             record: number < evaluation.recorded_episodes,
+            advised_steps: None,
         };
         let orders: Vec<EpisodeOrder> = (0..evaluation.episodes).map(order).collect();
         slots(&orders, EVALUATION_SLOT_EPISODES, EpisodeKind::Evaluation, version)
@@ -206,12 +220,17 @@ impl Trainer {
             self.replay.push(episode);
             self.update_normalizers(episode);
             self.counters.advice_spent += u64::from(episode.advice_charged);
+            self.counters.advice_queries += u64::from(episode.queried_steps.unwrap_or(0));
         }
         self.counters.episodes += episodes.len() as u64;
         self.counters.env_steps += (episodes.len() * self.layout.episode_steps()) as u64;
         let share = |hits: usize| hits as f64 / episodes.len().max(1) as f64;
-        self.stats.training_success =
-            share(episodes.iter().filter(|episode| episode.succeeded()).count());
+        let n_succeeded = episodes.iter().filter(|episode| episode.succeeded()).count();
+        self.stats.training_success = share(n_succeeded);
+        if let Some(jump_start) = &mut self.jump_start {
+            let count = |n| u32::try_from(n).expect("a round has at most 262,144 episodes");
+            jump_start.finish_round(count(episodes.len()), count(n_succeeded));
+        }
         self.stats.training_moved =
             share(episodes.iter().filter(|episode| episode.moved()).count());
     }
@@ -334,7 +353,11 @@ impl Trainer {
         hash.update(&parts.advised_arms);
         hash.update(&parts.contacts);
         hash.update(&parts.moved);
-        let Counters { round, env_steps, episodes, updates, advice_spent } = self.counters;
+        for number in self.jump_start.iter().flat_map(JumpStart::state) {
+            hash.update(number.to_le_bytes());
+        }
+        let Counters { round, env_steps, episodes, updates, advice_spent, advice_queries: _ } =
+            self.counters;
         for count in
             [next as u64, self.ddpg.n_updates(), round, env_steps, episodes, updates, advice_spent]
         {

@@ -222,7 +222,7 @@ fn take_advice(
     advisor: &mut impl Advisor,
 ) -> Result<(), RolloutError> {
     let mut advised: Vec<&mut Rollout> =
-        rollouts.iter_mut().filter(|rollout| rollout.advised).collect();
+        rollouts.iter_mut().filter(|rollout| rollout.asks_on(step_idx)).collect();
     let Some(first) = advised.first() else {
         return Ok(());
     };
@@ -231,6 +231,9 @@ fn take_advice(
     let query = |rollout: &&mut Rollout| StepQuery { payer, ..rollout.query(step_idx) };
     let queries: Vec<StepQuery> = advised.iter().map(query).collect();
     let answers = advisor.advise(queries)?;
+    for rollout in &mut advised {
+        *rollout.episode.queried_steps.get_or_insert(0) += 1;
+    }
     check_count(first_number, step_idx, "steps", answers.len(), advised.len())?;
     for (rollout, advice) in advised.iter_mut().zip(&answers) {
         rollout.apply_advice(advice, step_idx)?;
@@ -274,7 +277,8 @@ fn check_count(
 /// An episode being played.
 struct Rollout {
     explorer: Option<Explorer>,
-    advised: bool,
+    /// The order of the episode, which says on which steps to ask.
+    order: EpisodeOrder,
     /// The observation before the next step, shape `[n_observation]`.
     observation: Vec<f32>,
     /// The action of the next step, shape `[n_action]`.
@@ -312,10 +316,11 @@ impl Rollout {
             contacts: Vec::with_capacity(n_steps),
             advice_charged: 0,
             avoidance_steps: None,
+            queried_steps: Some(0),
         };
         Self {
             explorer: explorer(order, slot.kind, terms),
-            advised: order.advised && slot.kind == EpisodeKind::Training,
+            order,
             observation: observation.to_vec(),
             action: vec![0.0; layout.n_action()],
             policy_action: match terms.advice.judged_action {
@@ -326,6 +331,11 @@ impl Rollout {
             episode,
             trace: None,
         }
+    }
+
+    /// Returns true if the teacher is asked about step `step_idx`.
+    fn asks_on(&self, step_idx: usize) -> bool {
+        self.episode.kind == EpisodeKind::Training && self.order.asks_on(step_idx)
     }
 
     /// Chooses the student's next action, including exploration.

@@ -3,6 +3,7 @@
 use safetensors::Dtype;
 use tandem_core::work::PublishedActor;
 use tandem_policy::{Normalizer, NormalizerSnapshot, NormalizerState, Policy};
+use tandem_rl::jump_start::JumpStart;
 use tandem_rl::replay::{ReplayBuffer, ReplayParts};
 use tandem_rl::trainer::{Counters, RoundStats, Trainer};
 use tandem_telemetry::MetricsRow;
@@ -19,14 +20,21 @@ const MAX_ROUNDS: u64 = 1 << 32;
 /// Largest number of pending evaluations.
 const MAX_PENDING: usize = 64;
 
+/// Key of the number of steps on which the teacher was asked. Checkpoints of earlier versions do not have it.
+const ADVICE_QUERIES: &str = "advice_queries";
+/// Keys of the state of strategy `jsrl:H`, in the order of [`JumpStart::state`].
+const JUMP_START: [&str; 4] =
+    ["jump_start.present", "jump_start.next", "jump_start.n_episodes", "jump_start.n_succeeded"];
+
 type OwnedTensor = (String, Dtype, Vec<u8>);
 
 /// Returns the numbers and names of a state, in a fixed order.
 pub(super) fn metadata(trainer: &Trainer, resumption: &Resumption) -> Vec<(&'static str, String)> {
-    let Counters { round, env_steps, episodes, updates, advice_spent } = trainer.counters();
+    let Counters { round, env_steps, episodes, updates, advice_spent, advice_queries } =
+        trainer.counters();
     let (_, next) = trainer.replay.parts();
     let config = trainer.config();
-    vec![
+    let mut entries = vec![
         ("digest", trainer.digest()),
         ("task", config.task.clone()),
         ("arms", config.arms.to_string()),
@@ -36,6 +44,7 @@ pub(super) fn metadata(trainer: &Trainer, resumption: &Resumption) -> Vec<(&'sta
         ("episodes", episodes.to_string()),
         ("updates", updates.to_string()),
         ("advice_spent", advice_spent.to_string()),
+        (ADVICE_QUERIES, advice_queries.to_string()),
         ("ddpg.n_updates", trainer.ddpg.n_updates().to_string()),
         ("normalizer.observation.count", trainer.observation_normalizer.state().count.to_string()),
         ("normalizer.goal.count", trainer.goal_normalizer.state().count.to_string()),
@@ -44,7 +53,12 @@ pub(super) fn metadata(trainer: &Trainer, resumption: &Resumption) -> Vec<(&'sta
         ("pending", resumption.pending.len().to_string()),
         ("wall_s", resumption.wall_s.to_string()),
         (SETTINGS, settings::to_json(config)),
-    ]
+    ];
+    let jump_start = trainer.jump_start.iter().flat_map(|jump_start| {
+        JUMP_START.into_iter().zip(jump_start.state().map(|number| number.to_string()))
+    });
+    entries.extend(jump_start);
+    entries
 }
 
 /// Returns the vectors of a state that are created for the file.
@@ -62,8 +76,9 @@ pub(super) fn small_tensors(trainer: &Trainer, resumption: &Resumption) -> Vec<O
     for (idx, pending) in pending.iter().enumerate() {
         let numbers = [stats_vector(&pending.stats).as_slice(), &[pending.wall_s]].concat();
         tensors.push(f64s(&format!("pending.{idx}.figures"), &numbers));
-        let Counters { round, env_steps, episodes, updates, advice_spent } = pending.counters;
-        let counts = [round, env_steps, episodes, updates, advice_spent];
+        let Counters { round, env_steps, episodes, updates, advice_spent, advice_queries } =
+            pending.counters;
+        let counts = [round, env_steps, episodes, updates, advice_spent, advice_queries];
         let bytes = counts.iter().flat_map(|count| count.to_le_bytes()).collect();
         tensors.push((format!("pending.{idx}.counters"), Dtype::U64, bytes));
     }
@@ -150,7 +165,14 @@ impl Reader<'_> {
             episodes: self.count("episodes")?,
             updates: self.count("updates")?,
             advice_spent: self.count("advice_spent")?,
+            advice_queries: match self.contents.metadata.contains_key(ADVICE_QUERIES) {
+                true => self.count(ADVICE_QUERIES)?,
+                false => 0,
+            },
         };
+        if let Some(horizon) = trainer.config.advice.horizon() {
+            trainer.jump_start = Some(self.jump_start(horizon)?);
+        }
         let [critic_loss, actor_loss, mean_q, training_success, training_moved] =
             self.numbers("figures")?;
         trainer.stats =
@@ -185,6 +207,17 @@ impl Reader<'_> {
             got if got == expected => Ok(()),
             got => Err(format!("its {key} is {got:?}, the run's is {expected:?}")),
         })
+    }
+
+    fn jump_start(&self, max_horizon: u32) -> Result<JumpStart, String> {
+        let mut state = [0; 4];
+        for (number, key) in state.iter_mut().zip(JUMP_START) {
+            let value = self.number(key, u64::from(u32::MAX))?;
+            *number = u32::try_from(value).map_err(|error| format!("{key}: {error}"))?;
+        }
+        let restored = JumpStart::from_state(max_horizon, state);
+        restored
+            .ok_or_else(|| format!("no run with horizon {max_horizon} has jump_start {state:?}"))
     }
 
     fn restore_networks(&self, trainer: &mut Trainer) -> Result<(), String> {
@@ -257,7 +290,9 @@ impl Reader<'_> {
     ) -> Result<PendingEvaluation, String> {
         let counters = self.bytes(&format!("{name}.counters"), Dtype::U64)?;
         let counts: Vec<u64> = bytemuck::pod_collect_to_vec(counters);
-        let [round, env_steps, episodes, updates, advice_spent] =
+        // Those of earlier versions do not have the queries.
+        let counts = if counts.len() == 5 { [counts, vec![0]].concat() } else { counts };
+        let [round, env_steps, episodes, updates, advice_spent, advice_queries] =
             exactly(&format!("{name}.counters"), counts)?;
         if round > trainer.counters.round {
             return Err(format!("{name} is of round {round}, which the run has not reached"));
@@ -266,7 +301,14 @@ impl Reader<'_> {
             self.numbers(&format!("{name}.figures"))?;
         let policy = self.stored_policy(name, trainer)?;
         Ok(PendingEvaluation {
-            counters: Counters { round, env_steps, episodes, updates, advice_spent },
+            counters: Counters {
+                round,
+                env_steps,
+                episodes,
+                updates,
+                advice_spent,
+                advice_queries,
+            },
             stats: RoundStats { critic_loss, actor_loss, mean_q, training_success, training_moved },
             wall_s,
             policy: policy.ok_or_else(|| format!("{name} has no policy"))?,

@@ -13,7 +13,14 @@ const fn at(seconds: u64) -> Duration {
 }
 
 fn order(number: u64, kind: EpisodeKind) -> SlotOrder {
-    let episode = EpisodeOrder { number, seed: 1, advised: false, uniform: false, record: false };
+    let episode = EpisodeOrder {
+        number,
+        seed: 1,
+        advised: false,
+        uniform: false,
+        record: false,
+        advised_steps: None,
+    };
     SlotOrder { slot: 0, parameter_version: 0, kind, episodes: vec![episode] }
 }
 
@@ -398,6 +405,25 @@ fn advised(charged: u32, advised_arms: &[u8]) -> (SlotOrder, Vec<Episode>) {
     episodes[0].advice_charged = charged;
     episodes[0].advised_arms[..advised_arms.len()].copy_from_slice(advised_arms);
     (ordered, episodes)
+}
+
+#[test]
+fn advice_after_the_ordered_steps_is_refused() {
+    let check = |advised_steps, expected: Result<bool, &str>| {
+        let (mut ordered, episodes) = advised(2, &[0, 1, 3]);
+        ordered.episodes[0].advised_steps = advised_steps;
+        let mut queue = WorkQueue::default();
+        queue.push(ordered);
+        let worker = join(&mut queue, at(0));
+        next_slot(&mut queue, worker, at(0));
+        let outcome = queue.submit(worker, 0, episodes, at(0)).map_err(|e| e.to_string());
+        assert_eq!(outcome, expected.map_err(str::to_owned));
+    };
+    check(None, Ok(true));
+    check(Some(3), Ok(true));
+    let refused = "episode 0: advised_arms: expected no advised arm after the first 2 steps, got \
+                   0b00000011 on step 2";
+    check(Some(2), Err(refused));
 }
 
 #[test]

@@ -167,3 +167,18 @@ fn advice_about_other_steps_is_an_error() {
         "the teacher's advice on episode 3, step 0, has 0 steps where 1 were expected"
     );
 }
+
+#[test]
+fn an_order_ends_the_queries_and_every_query_is_counted() {
+    let mut order = slot(&[3, 8, 9], true);
+    order.episodes[0].advised_steps = Some(4);
+    order.episodes[1].advised_steps = Some(0);
+    let mut teacher = FakeTeacher::new(|_, _, _| true);
+    let episodes = play(&order, FakeActor::Seeker, &mut teacher);
+    let queried: Vec<_> = episodes.iter().map(|episode| episode.queried_steps).collect();
+    assert_eq!(queried, [Some(4), Some(0), Some(50)]);
+    let asked: Vec<usize> = teacher.requests.iter().map(Vec::len).collect();
+    assert_eq!(asked[..6], [2, 2, 2, 2, 1, 1]);
+    assert_eq!(episodes[0].advised_arms[..5], [0b11, 0b11, 0b11, 0b11, 0]);
+    assert_eq!(episodes.iter().map(|e| e.advice_charged).collect::<Vec<_>>(), [4, 0, 50]);
+}

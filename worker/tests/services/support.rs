@@ -63,6 +63,7 @@ fn order(number: u64, kind: EpisodeKind) -> EpisodeOrder {
         advised: is_training && number != 3,
         uniform: false,
         record: !is_training && number == 1,
+        advised_steps: None,
     }
 }
 
