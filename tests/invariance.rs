@@ -7,13 +7,14 @@ use std::process::{Command, Stdio};
 use serde_json::Value;
 
 /// Strategies, each with a budget that runs out in the middle of the run.
-const STRATEGIES: [(&str, u64); 6] = [
+const STRATEGIES: [(&str, u64); 7] = [
     ("ea", 1_600),
     EAMC,
     ("mc-q:0.1", 600),
     ("mc-act:0.1", 1_600),
     ("jsrl:20", 700),
     ("rlif:0.1", 600),
+    ("ts2c:0.1", 300),
 ];
 const EAMC: (&str, u64) = ("eamc:0.1", 900);
 const N_WORKERS: [usize; 4] = [1, 2, 5, 16];

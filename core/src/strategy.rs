@@ -44,6 +44,12 @@ pub enum Strategy {
         /// `H`, the largest number of steps.
         horizon: u32,
     },
+    /// As [`Self::MistakeQ`] with the default threshold, on the steps whose value the student does not know: where an
+    /// ensemble of its critics disagrees (after TS2C, Xue et al. 2023). Workers ask on these steps only.
+    CriticDisagreement {
+        /// The standard deviation of the critics' values, of the arm where it is largest, above which to ask.
+        threshold: f32,
+    },
     /// As [`Self::MistakeQ`], and the student's step before an intervention costs it a reward of 1 (RLIF, Luo et al.
     /// 2023).
     InterventionFeedback {
@@ -54,8 +60,17 @@ pub enum Strategy {
 
 impl Strategy {
     /// The names of the strategies; `T` and `A` are thresholds, `H` is a number of steps.
-    pub const NAMES: [&str; 8] =
-        ["none", "ea", "eamc:T", "mc-q:T", "mc-act:A", "mc-act-abs:A", "jsrl:H", "rlif:T"];
+    pub const NAMES: [&str; 9] = [
+        "none",
+        "ea",
+        "eamc:T",
+        "mc-q:T",
+        "mc-act:A",
+        "mc-act-abs:A",
+        "jsrl:H",
+        "rlif:T",
+        "ts2c:T",
+    ];
 
     /// Returns the names of the strategies that a teacher offers which `has_values` of actions, or has none.
     #[must_use]
@@ -78,7 +93,8 @@ impl Strategy {
             | Self::JumpStart { .. } => false,
             Self::EarlyThenMistakeQ { .. }
             | Self::MistakeQ { .. }
-            | Self::InterventionFeedback { .. } => true,
+            | Self::InterventionFeedback { .. }
+            | Self::CriticDisagreement { .. } => true,
         }
     }
 }
@@ -94,6 +110,7 @@ impl fmt::Display for Strategy {
             Self::MistakeActionAbs { alpha } => write!(f, "mc-act-abs:{alpha}"),
             Self::JumpStart { horizon } => write!(f, "jsrl:{horizon}"),
             Self::InterventionFeedback { threshold } => write!(f, "rlif:{threshold}"),
+            Self::CriticDisagreement { threshold } => write!(f, "ts2c:{threshold}"),
         }
     }
 }
@@ -130,6 +147,7 @@ impl FromStr for Strategy {
             "mc-act-abs" => threshold().map(|alpha| Self::MistakeActionAbs { alpha }),
             "jsrl" => horizon().map(|horizon| Self::JumpStart { horizon }),
             "rlif" => threshold().map(|threshold| Self::InterventionFeedback { threshold }),
+            "ts2c" => threshold().map(|threshold| Self::CriticDisagreement { threshold }),
             _ => None,
         };
         strategy.ok_or_else(unknown)
@@ -161,6 +179,7 @@ mod tests {
         };
         check("none", Strategy::NoAdvice);
         check("ea", Strategy::EarlyAdvising);
+        check("ts2c:0.75", Strategy::CriticDisagreement { threshold: 0.75 });
         check("eamc:0.25", Strategy::EarlyThenMistakeQ { threshold: 0.25 });
         check("mc-q:0", Strategy::MistakeQ { threshold: 0.0 });
         check("mc-act:1e-2", Strategy::MistakeAction { alpha: 0.01 });
@@ -196,7 +215,8 @@ mod tests {
             "rlif:-1",
         ] {
             let message = text.parse::<Strategy>().unwrap_err().to_string();
-            let names = "expected none, ea, eamc:T, mc-q:T, mc-act:A, mc-act-abs:A, jsrl:H, rlif:T";
+            let names = "expected none, ea, eamc:T, mc-q:T, mc-act:A, mc-act-abs:A, jsrl:H, rlif:T, \
+                         ts2c:T";
             assert!(message.starts_with(names), "{message}");
             assert!(message.ends_with(&format!("got {text:?}")), "{message}");
         }

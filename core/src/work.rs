@@ -92,4 +92,23 @@ pub struct PublishedActor {
     pub goal_mean: Vec<f32>,
     /// Standard deviation of goals, shape `[n_goal]`.
     pub goal_std: Vec<f32>,
+    /// When to ask for advice; `None` means always.
+    pub gate: Option<PublishedGate>,
+}
+
+/// The critics whose disagreement decides when a student asks for advice. Their inputs are normalised as the actor's.
+#[derive(Debug, Clone, PartialEq)]
+pub struct PublishedGate {
+    /// Number of critics, at least 2.
+    pub n_critics: usize,
+    /// Units of each hidden layer.
+    pub n_hidden: usize,
+    /// Number of hidden layers.
+    pub n_hidden_layers: usize,
+    /// Values per action: 1, or one per arm.
+    pub n_heads: usize,
+    /// The parameters of each critic in turn, shape `[n_critics, n_parameters]`.
+    pub critics: Vec<f32>,
+    /// The standard deviation of their values above which to ask, at least 0.
+    pub threshold: f32,
 }

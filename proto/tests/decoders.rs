@@ -234,6 +234,7 @@ fn parameters(layout: Layout) -> impl Strategy<Value = pb::Parameters> {
                         observation_std,
                         goal_mean,
                         goal_std,
+                        ..pb::Parameters::default()
                     }
                 },
             )

@@ -143,6 +143,15 @@ impl AdviceConfig {
         }
     }
 
+    /// Returns the disagreement of critics above which the student asks; `None` means that it asks without one.
+    #[must_use]
+    pub fn disagreement_threshold(&self) -> Option<f32> {
+        match self.parsed_strategy() {
+            Some(Strategy::CriticDisagreement { threshold }) => Some(threshold),
+            _ => None,
+        }
+    }
+
     /// Returns the cost to an arm of its own step before the teacher overrides it.
     #[must_use]
     pub fn intervention_cost(&self) -> f32 {

@@ -51,6 +51,7 @@
 
 pub mod config;
 pub mod ddpg;
+pub mod ensemble;
 pub mod her;
 pub mod jump_start;
 pub mod replay;

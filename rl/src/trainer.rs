@@ -16,6 +16,7 @@ use tandem_policy::{Normalizer, NormalizerSnapshot, Policy};
 
 use crate::config::{Behaviour, ConfigError, PolyakEvery, RunConfig};
 use crate::ddpg::{Batch, Ddpg, DdpgError, Rewards};
+use crate::ensemble::CriticEnsemble;
 use crate::her::{Sampler, Statistics};
 use crate::jump_start::JumpStart;
 use crate::replay::ReplayBuffer;
@@ -77,6 +78,8 @@ pub struct Trainer {
     pub goal_normalizer: Normalizer,
     /// The horizon of strategy `jsrl:H`; `None` with other strategies.
     pub jump_start: Option<JumpStart>,
+    /// The critics of strategy `ts2c:T`; `None` with other strategies.
+    pub ensemble: Option<CriticEnsemble>,
     sampler: Sampler,
     batch: Batch,
     /// Statistics of the latest round.
@@ -96,6 +99,10 @@ impl Trainer {
         sampler.set_intervention_cost(config.advice.intervention_cost());
         let lowest = config.replay.lowest_reward() - config.advice.intervention_cost();
         let rewards = Rewards { n_heads, lowest };
+        let ensemble = config
+            .advice
+            .disagreement_threshold()
+            .map(|_threshold| CriticEnsemble::new(&config.ddpg, &layout, n_heads, config.seed));
         Ok(Self {
             counters: Counters::default(),
             replay: ReplayBuffer::new(&layout, config.replay.capacity_transitions),
@@ -103,6 +110,7 @@ impl Trainer {
             observation_normalizer: Normalizer::new(layout.n_observation()),
             goal_normalizer: Normalizer::new(layout.n_goal()),
             jump_start: config.advice.horizon().map(JumpStart::new),
+            ensemble,
             sampler,
             batch: Batch::new(&layout, n_heads, config.ddpg.transitions_per_update()),
             stats: RoundStats::default(),
@@ -271,6 +279,9 @@ impl Trainer {
         for update in 1..=n_updates {
             self.sampler.fill(&self.replay, statistics, &mut rng, &mut self.batch);
             let losses = self.ddpg.update(&self.batch)?;
+            if let Some(ensemble) = &mut self.ensemble {
+                ensemble.update(self.ddpg.critic_batch());
+            }
             if self.config.rounds.polyak_every == PolyakEvery::Update {
                 self.ddpg.polyak();
             }
@@ -310,6 +321,9 @@ impl Trainer {
             observation_std,
             goal_mean,
             goal_std,
+            gate: self.config.advice.disagreement_threshold().and_then(|threshold| {
+                self.ensemble.as_ref().map(|ensemble| ensemble.publish(threshold))
+            }),
         }
     }
 
@@ -377,7 +391,9 @@ impl Trainer {
         ];
         let ddpg =
             self.ddpg.state().into_iter().map(|(name, values)| (format!("ddpg.{name}"), values));
-        ddpg.chain(replay.map(|(name, values)| (name.to_owned(), values))).collect()
+        let ensemble = self.ensemble.iter().flat_map(CriticEnsemble::state);
+        let ensemble = ensemble.map(|(name, values)| (format!("ensemble.{name}"), values));
+        ddpg.chain(replay.map(|(name, values)| (name.to_owned(), values))).chain(ensemble).collect()
     }
 
     /// Updates the normalisers with an episode's observations, and with goals relabelled as in a batch.

@@ -53,7 +53,8 @@ pub(crate) struct TrainArgs {
     #[arg(long)]
     pub(crate) arms: Option<usize>,
     /// Advising strategy: none, ea, eamc:T, mc-q:T, mc-act:A, mc-act-abs:A, jsrl:H (the teacher acts on at most the
-    /// first H steps) or rlif:T (as mc-q:T, and interventions lower the reward). With init:teacher the student starts as
+    /// first H steps), rlif:T (as mc-q:T, and interventions lower the reward) or ts2c:T (asks
+    /// where critics disagree). With init:teacher the student starts as
     /// copies of the teacher and gets no advice
     /// [default: mc-q:0.1 with two arms, none with one].
     #[arg(long, value_name = "NAME[:THRESHOLD]")]

@@ -27,6 +27,9 @@ pub fn procedure(strategy: Strategy, half: BudgetHalf, step: u32) -> Option<Proc
         | (Strategy::EarlyThenMistakeQ { threshold }, BudgetHalf::Second) => {
             Some(Procedure::MistakeCorrectingQ { threshold })
         }
+        (Strategy::CriticDisagreement { .. }, _) => {
+            Some(Procedure::MistakeCorrectingQ { threshold: DEFAULT_THRESHOLD })
+        }
         (Strategy::MistakeAction { alpha }, _) => {
             Some(Procedure::MistakeCorrectingAction(ActionFilter::McAct { alpha }))
         }

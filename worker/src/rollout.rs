@@ -109,7 +109,7 @@ fn play(
     for step_idx in 0..terms.layout.episode_steps() {
         trace_scenes(&mut rollouts, env);
         for rollout in &mut rollouts {
-            rollout.choose_action(actor);
+            rollout.choose_action(actor, step_idx);
         }
         take_advice(&mut rollouts, step_idx, terms.advice.unit, advisor)?;
         batch.execute(&mut rollouts, step_idx, env)?;
@@ -222,7 +222,7 @@ fn take_advice(
     advisor: &mut impl Advisor,
 ) -> Result<(), RolloutError> {
     let mut advised: Vec<&mut Rollout> =
-        rollouts.iter_mut().filter(|rollout| rollout.asks_on(step_idx)).collect();
+        rollouts.iter_mut().filter(|rollout| rollout.asks).collect();
     let Some(first) = advised.first() else {
         return Ok(());
     };
@@ -277,8 +277,10 @@ fn check_count(
 /// An episode being played.
 struct Rollout {
     explorer: Option<Explorer>,
-    /// The order of the episode, which says on which steps to ask.
+    /// The order of the episode, which says on which steps to ask at most.
     order: EpisodeOrder,
+    /// Whether the teacher is asked about the next step.
+    asks: bool,
     /// The observation before the next step, shape `[n_observation]`.
     observation: Vec<f32>,
     /// The action of the next step, shape `[n_action]`.
@@ -321,6 +323,7 @@ impl Rollout {
         Self {
             explorer: explorer(order, slot.kind, terms),
             order,
+            asks: false,
             observation: observation.to_vec(),
             action: vec![0.0; layout.n_action()],
             policy_action: match terms.advice.judged_action {
@@ -333,14 +336,12 @@ impl Rollout {
         }
     }
 
-    /// Returns true if the teacher is asked about step `step_idx`.
-    fn asks_on(&self, step_idx: usize) -> bool {
-        self.episode.kind == EpisodeKind::Training && self.order.asks_on(step_idx)
-    }
-
-    /// Chooses the student's next action, including exploration.
-    fn choose_action(&mut self, actor: &mut impl Act) {
+    /// Chooses the student's next action, including exploration, and whether to ask about it: on the ordered steps
+    /// where the student asks, which depends on its action without exploration.
+    fn choose_action(&mut self, actor: &mut impl Act, step_idx: usize) {
         actor.act(&self.observation, &self.episode.goal, &mut self.action);
+        let may_ask = self.episode.kind == EpisodeKind::Training && self.order.asks_on(step_idx);
+        self.asks = may_ask && actor.asks(&self.observation, &self.episode.goal, &self.action);
         self.advised_arms = 0;
         if let Some(policy_action) = &mut self.policy_action {
             policy_action.copy_from_slice(&self.action);

@@ -1,7 +1,7 @@
 //! Conversion of the learning state to named vectors and numbers, and back.
 
 use safetensors::Dtype;
-use tandem_core::work::PublishedActor;
+use tandem_core::work::{PublishedActor, PublishedGate};
 use tandem_policy::{Normalizer, NormalizerSnapshot, NormalizerState, Policy};
 use tandem_rl::jump_start::JumpStart;
 use tandem_rl::replay::{ReplayBuffer, ReplayParts};
@@ -25,6 +25,9 @@ const ADVICE_QUERIES: &str = "advice_queries";
 /// Keys of the state of strategy `jsrl:H`, in the order of [`JumpStart::state`].
 const JUMP_START: [&str; 4] =
     ["jump_start.present", "jump_start.next", "jump_start.n_episodes", "jump_start.n_succeeded"];
+
+/// The critics of the gate of the acting parameters, with strategy `ts2c:T`.
+const ACTING_GATE: &str = "acting.gate";
 
 type OwnedTensor = (String, Dtype, Vec<u8>);
 
@@ -89,6 +92,7 @@ pub(super) fn small_tensors(trainer: &Trainer, resumption: &Resumption) -> Vec<O
         f32s("acting.goal_mean", &acting.goal_mean),
         f32s("acting.goal_std", &acting.goal_std),
     ]);
+    tensors.extend(acting.gate.iter().map(|gate| f32s(ACTING_GATE, &gate.critics)));
     let kept = [("best", &history.best), ("last", &history.last)];
     for (name, policy) in kept {
         tensors.extend(policy.iter().flat_map(|policy| policy_tensors(name, policy)));
@@ -228,7 +232,14 @@ impl Reader<'_> {
             .collect::<Result<_, String>>()?;
         let n_updates = self.count("ddpg.n_updates")?;
         let hint = "the run file gives ddpg.n_hidden or ddpg.n_hidden_layers another value than the run began with";
-        trainer.ddpg.restore(&state, n_updates).map_err(|error| format!("{error}; {hint}"))
+        trainer.ddpg.restore(&state, n_updates).map_err(|error| format!("{error}; {hint}"))?;
+        let Some(ensemble) = &mut trainer.ensemble else { return Ok(()) };
+        let names: Vec<String> = ensemble.state().into_iter().map(|(name, _)| name).collect();
+        let vectors: Vec<Vec<f32>> = names
+            .iter()
+            .map(|name| self.f32s(&format!("ensemble.{name}")))
+            .collect::<Result<_, _>>()?;
+        ensemble.restore(&vectors, n_updates)
     }
 
     fn restore_replay(&self, trainer: &mut Trainer) -> Result<(), String> {
@@ -267,6 +278,10 @@ impl Reader<'_> {
             observation_std: self.f32s("acting.observation_std")?,
             goal_mean: self.f32s("acting.goal_mean")?,
             goal_std: self.f32s("acting.goal_std")?,
+            gate: match trainer.publish().gate {
+                Some(gate) => Some(PublishedGate { critics: self.f32s(ACTING_GATE)?, ..gate }),
+                None => None,
+            },
         };
         // Workers would refuse an unusable actor later; here the error names the checkpoint.
         match tandem_policy::Actor::new(&trainer.layout, acting.clone()) {

@@ -115,6 +115,25 @@ fn a_restored_run_continues_with_the_same_bits() {
 }
 
 #[test]
+fn a_restored_ensemble_of_critics_continues_with_the_same_bits() {
+    let mut config = small_config();
+    "ts2c:0.5".clone_into(&mut config.advice.strategy);
+    let mut uninterrupted = Trainer::new(config.clone()).expect("valid");
+    train_round(&mut uninterrupted);
+    let directory = tempfile::tempdir().expect("a directory");
+    save(directory.path(), &uninterrupted, &resumption(&uninterrupted), 1).expect("saved");
+    let restored = load_newest(directory.path(), &config).expect("readable").expect("a checkpoint");
+    let Restored { mut trainer, resumption, .. } = restored;
+    assert!(resumption.acting.gate.is_some());
+    assert_eq!(resumption.acting, uninterrupted.publish());
+    train_round(&mut uninterrupted);
+    train_round(&mut trainer);
+    assert_eq!(trainer.digest(), uninterrupted.digest());
+    assert_eq!(trainer.publish(), uninterrupted.publish());
+    assert_ne!(trainer.publish().gate, resumption.acting.gate, "the critics learn");
+}
+
+#[test]
 fn a_resumed_run_orders_the_round_with_the_horizon_that_it_had() {
     let mut config = small_config();
     "jsrl:20".clone_into(&mut config.advice.strategy);

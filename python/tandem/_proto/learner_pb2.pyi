@@ -150,7 +150,7 @@ class GetParametersRequest(_message.Message):
     def __init__(self, version: _Optional[int] = ...) -> None: ...
 
 class Parameters(_message.Message):
-    __slots__ = ("version", "n_hidden", "n_layers", "actor", "observation_mean", "observation_std", "goal_mean", "goal_std")
+    __slots__ = ("version", "n_hidden", "n_layers", "actor", "observation_mean", "observation_std", "goal_mean", "goal_std", "n_critics", "n_critic_hidden", "n_critic_layers", "n_critic_heads", "critics", "ask_above")
     VERSION_FIELD_NUMBER: _ClassVar[int]
     N_HIDDEN_FIELD_NUMBER: _ClassVar[int]
     N_LAYERS_FIELD_NUMBER: _ClassVar[int]
@@ -159,6 +159,12 @@ class Parameters(_message.Message):
     OBSERVATION_STD_FIELD_NUMBER: _ClassVar[int]
     GOAL_MEAN_FIELD_NUMBER: _ClassVar[int]
     GOAL_STD_FIELD_NUMBER: _ClassVar[int]
+    N_CRITICS_FIELD_NUMBER: _ClassVar[int]
+    N_CRITIC_HIDDEN_FIELD_NUMBER: _ClassVar[int]
+    N_CRITIC_LAYERS_FIELD_NUMBER: _ClassVar[int]
+    N_CRITIC_HEADS_FIELD_NUMBER: _ClassVar[int]
+    CRITICS_FIELD_NUMBER: _ClassVar[int]
+    ASK_ABOVE_FIELD_NUMBER: _ClassVar[int]
     version: int
     n_hidden: int
     n_layers: int
@@ -167,7 +173,13 @@ class Parameters(_message.Message):
     observation_std: bytes
     goal_mean: bytes
     goal_std: bytes
-    def __init__(self, version: _Optional[int] = ..., n_hidden: _Optional[int] = ..., n_layers: _Optional[int] = ..., actor: _Optional[bytes] = ..., observation_mean: _Optional[bytes] = ..., observation_std: _Optional[bytes] = ..., goal_mean: _Optional[bytes] = ..., goal_std: _Optional[bytes] = ...) -> None: ...
+    n_critics: int
+    n_critic_hidden: int
+    n_critic_layers: int
+    n_critic_heads: int
+    critics: bytes
+    ask_above: float
+    def __init__(self, version: _Optional[int] = ..., n_hidden: _Optional[int] = ..., n_layers: _Optional[int] = ..., actor: _Optional[bytes] = ..., observation_mean: _Optional[bytes] = ..., observation_std: _Optional[bytes] = ..., goal_mean: _Optional[bytes] = ..., goal_std: _Optional[bytes] = ..., n_critics: _Optional[int] = ..., n_critic_hidden: _Optional[int] = ..., n_critic_layers: _Optional[int] = ..., n_critic_heads: _Optional[int] = ..., critics: _Optional[bytes] = ..., ask_above: _Optional[float] = ...) -> None: ...
 
 class SubmitEpisodesRequest(_message.Message):
     __slots__ = ("worker_id", "slot", "episodes", "environment_check")

@@ -3,6 +3,7 @@
 use tandem_policy::{MlpShape, Policy};
 
 use super::{Ddpg, DdpgConfig, DdpgError};
+use crate::ensemble::CriticBatch;
 
 impl Ddpg {
     /// Returns the settings.
@@ -51,6 +52,12 @@ impl Ddpg {
     #[must_use]
     pub fn target_critic(&self) -> &[f32] {
         &self.critic.target
+    }
+
+    /// Returns the critic's inputs and targets in the last update.
+    #[must_use]
+    pub fn critic_batch(&self) -> CriticBatch<'_> {
+        CriticBatch { inputs: &self.critic_half.input, targets: &self.critic_half.targets }
     }
 
     /// Returns the gradients of the last update: the actor's and the critic's.

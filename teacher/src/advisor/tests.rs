@@ -54,6 +54,7 @@ fn each_strategy_overrides_the_arms_that_its_procedure_selects() {
     check("mc-act-abs:1", 0b00, neither);
     check("rlif:0.0625", 0b01, first);
     check("jsrl:1", 0b11, both);
+    check("ts2c:9", 0b01, first);
 }
 
 #[test]
@@ -78,7 +79,7 @@ fn advice_on_a_step_that_was_decided_before_is_marked() {
 
 #[test]
 fn every_strategy_returns_the_scores() {
-    for strategy in ["none", "ea", "eamc", "mc-q", "mc-act", "mc-act-abs", "jsrl", "rlif"] {
+    for strategy in ["none", "ea", "eamc", "mc-q", "mc-act", "mc-act-abs", "jsrl", "rlif", "ts2c"] {
         for budget in [0, 10] {
             let advice = ask(&mut advisor(budget, strategy), &two_arms(0));
             let scores: Vec<_> = advice
@@ -98,7 +99,7 @@ fn every_strategy_returns_the_scores() {
 
 #[test]
 fn without_budget_the_students_action_is_returned_uncharged() {
-    for strategy in ["none", "ea", "eamc", "mc-q", "mc-act", "mc-act-abs", "jsrl", "rlif"] {
+    for strategy in ["none", "ea", "eamc", "mc-q", "mc-act", "mc-act-abs", "jsrl", "rlif", "ts2c"] {
         let advice = ask(&mut advisor(0, strategy), &two_arms(0));
         assert_eq!((advice.charged, advice.overridden_arms()), (false, 0), "{strategy}");
         assert_eq!(advice.action, [0.0; 6], "{strategy}");

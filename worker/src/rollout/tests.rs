@@ -182,3 +182,27 @@ fn an_order_ends_the_queries_and_every_query_is_counted() {
     assert_eq!(episodes[0].advised_arms[..5], [0b11, 0b11, 0b11, 0b11, 0]);
     assert_eq!(episodes.iter().map(|e| e.advice_charged).collect::<Vec<_>>(), [4, 0, 50]);
 }
+
+#[test]
+fn a_student_that_knows_its_values_does_not_ask() {
+    struct Gated(FakeActor);
+
+    impl Act for Gated {
+        fn act(&mut self, observations: &[f32], goals: &[f32], actions: &mut [f32]) {
+            self.0.act(observations, goals, actions);
+        }
+
+        fn asks(&mut self, _observation: &[f32], _goal: &[f32], action: &[f32]) -> bool {
+            assert_eq!(action, [0.1; 6], "the action without exploration");
+            false
+        }
+    }
+
+    let mut teacher = FakeTeacher::new(|_, _, _| true);
+    let (env, order) = (&mut FakeEnvironment::new(), slot(&[3], true));
+    let actor = &mut Gated(FakeActor::Constant(0.1));
+    let gated = play_slot(env, &order, &terms(), actor, &mut teacher).expect("no step fails");
+    assert_eq!((gated[0].queried_steps, teacher.requests.len()), (Some(0), 0));
+    let free = play(&slot(&[3], false), FakeActor::Constant(0.1), &mut NoAdvisor);
+    assert_eq!(gated, free, "as without advice");
+}
