@@ -123,6 +123,6 @@ mod tests {
         let mut published = published([[0.0; 2]; 3], 0.5);
         published.gate.as_mut().expect("a gate").critics.pop();
         let error = QueryGate::new(&layout, &published).expect_err("must be refused").to_string();
-        assert!(error.starts_with("gate has 869 numbers, expected 870"), "{error}");
+        assert!(error.starts_with("gate has 857 numbers, expected 858"), "{error}");
     }
 }

@@ -211,7 +211,7 @@ mod tests {
         assert_eq!(lines.len(), 3);
         assert_eq!(
             lines[1],
-            "push,2,\"odd, name\",ea,\"odd, name-seed3\",3,2,2000,120,,,0.5,,2000,,,2,,,0,0.5,0,0,0,,,,,,"
+            "push,2,\"odd, name\",ea,\"odd, name-seed3\",3,2,2000,120,,,0.5,,2000,,,2,,,0,0.5,0,0,0,,,,,,,"
         );
         assert_eq!(lines[2].split(',').count(), n_columns);
     }

@@ -6,11 +6,10 @@ use std::collections::BTreeMap;
 
 use rand_chacha::ChaCha8Rng;
 use sha2::{Digest as _, Sha256};
-use tandem_core::episode::EpisodeKind;
 use tandem_core::rng::{Stream, bernoulli, episode_rng, index};
 use tandem_core::task::Part;
 use tandem_core::text::{counted, hex};
-use tandem_core::work::{EpisodeOrder, PublishedActor, SlotOrder};
+use tandem_core::work::PublishedActor;
 use tandem_core::{ArmIndex, Episode, TaskSpec};
 use tandem_policy::{Normalizer, NormalizerSnapshot, Policy};
 
@@ -21,8 +20,7 @@ use crate::her::{Sampler, Statistics};
 use crate::jump_start::JumpStart;
 use crate::replay::ReplayBuffer;
 
-/// Episodes of an evaluation slot.
-const EVALUATION_SLOT_EPISODES: usize = 8;
+mod orders;
 
 /// Number of rows that a teacher's normaliser counts for in a run that starts from it: about 2,000 episodes.
 const TEACHER_NORMALIZER_ROWS: u64 = 100_000;
@@ -184,44 +182,6 @@ impl Trainer {
         self.ddpg.set_threads(n_threads);
     }
 
-    /// Returns the training slots of round `round`, for parameter version `version`.
-    #[must_use]
-    pub fn training_orders(&self, round: u64, version: u64) -> Vec<SlotOrder> {
-        let per_round = self.config.episodes_per_round();
-        let warmup_episodes =
-            self.config.rounds.warmup_env_steps.div_ceil(self.layout.episode_steps() as u64);
-        let n_rounds_ahead = round.saturating_sub(self.counters.round);
-        let advised_steps = self.jump_start.map(|jump_start| jump_start.horizon(n_rounds_ahead));
-        let asks = self.config.advice.asks() && advised_steps != Some(0);
-        let orders: Vec<EpisodeOrder> = (round * per_round..(round + 1) * per_round)
-            .map(|number| EpisodeOrder {
-                number,
-                seed: self.config.seed,
-                advised: asks && is_advised(number, self.config.advice.share),
-                uniform: number < warmup_episodes,
-                record: false,
-                advised_steps,
-            })
-            .collect();
-        slots(&orders, self.config.rounds.rollouts, EpisodeKind::Training, version)
-    }
-
-    /// Returns the slots of an evaluation of parameter version `version` on the run's fixed goals.
-    #[must_use]
-    pub fn evaluation_orders(&self, version: u64) -> Vec<SlotOrder> {
-        let evaluation = &self.config.evaluation;
-        let order = |number| EpisodeOrder {
-            number,
-            seed: evaluation.seed,
-            advised: false,
-            uniform: false,
-            record: number < evaluation.recorded_episodes,
-            advised_steps: None,
-        };
-        let orders: Vec<EpisodeOrder> = (0..evaluation.episodes).map(order).collect();
-        slots(&orders, EVALUATION_SLOT_EPISODES, EpisodeKind::Evaluation, version)
-    }
-
     /// Adds a round's episodes, in episode order, to the replay buffer, the normalisers and the counters.
     pub fn ingest(&mut self, episodes: &[Episode]) {
         for episode in episodes {
@@ -233,14 +193,23 @@ impl Trainer {
         self.counters.episodes += episodes.len() as u64;
         self.counters.env_steps += (episodes.len() * self.layout.episode_steps()) as u64;
         let share = |hits: usize| hits as f64 / episodes.len().max(1) as f64;
-        let n_succeeded = episodes.iter().filter(|episode| episode.succeeded()).count();
-        self.stats.training_success = share(n_succeeded);
-        if let Some(jump_start) = &mut self.jump_start {
-            let count = |n| u32::try_from(n).expect("a round has at most 262,144 episodes");
-            jump_start.finish_round(count(episodes.len()), count(n_succeeded));
-        }
+        self.stats.training_success =
+            share(episodes.iter().filter(|episode| episode.succeeded()).count());
         self.stats.training_moved =
             share(episodes.iter().filter(|episode| episode.moved()).count());
+        self.shorten_jump_start(episodes);
+    }
+
+    /// Adds the success of a round's episodes without advice to the horizon; of all episodes if all are advised.
+    fn shorten_jump_start(&mut self, episodes: &[Episode]) {
+        let Some(jump_start) = &mut self.jump_start else { return };
+        let share = self.config.advice.share;
+        let counts =
+            |episode: &&Episode| share >= 1.0 || !orders::is_advised(episode.number, share);
+        let counted = || episodes.iter().filter(counts);
+        let count = |n| u32::try_from(n).expect("a round has at most 262,144 episodes");
+        let n_succeeded = counted().filter(|episode| episode.succeeded()).count();
+        jump_start.finish_round(count(counted().count()), count(n_succeeded));
     }
 
     /// Sets the units of advice spent, which the teacher's account determines.
@@ -470,33 +439,6 @@ fn first_implausible(
         "number {idx} of the {what} has mean {mean:e} and standard deviation {std:e} over the run, which no world produces: \
          the policy cannot learn from it"
     ))
-}
-
-/// Returns true if episode `number` is advised. Advised episodes are evenly spread.
-#[expect(
-    clippy::cast_possible_truncation,
-    clippy::cast_sign_loss,
-    reason = "episode numbers stay far below 2^52"
-)]
-fn is_advised(number: u64, share: f64) -> bool {
-    let advised_before = |number: u64| (number as f64 * share).floor() as u64;
-    advised_before(number + 1) > advised_before(number)
-}
-
-/// Splits orders into slots of `n_episodes`; the learner's queue numbers them.
-fn slots(
-    orders: &[EpisodeOrder],
-    n_episodes: usize,
-    kind: EpisodeKind,
-    version: u64,
-) -> Vec<SlotOrder> {
-    let slot = |episodes: &[EpisodeOrder]| SlotOrder {
-        slot: 0,
-        parameter_version: version,
-        kind,
-        episodes: episodes.to_vec(),
-    };
-    orders.chunks(n_episodes).map(slot).collect()
 }
 
 #[cfg(test)]

@@ -137,22 +137,22 @@ fn a_restored_ensemble_of_critics_continues_with_the_same_bits() {
 fn a_resumed_run_orders_the_round_with_the_horizon_that_it_had() {
     let mut config = small_config();
     "jsrl:20".clone_into(&mut config.advice.strategy);
-    config.rounds.slots = 16;
+    config.rounds.slots = 32;
     let mut trainer = Trainer::new(config.clone()).expect("valid");
     let play = |trainer: &mut Trainer, goal_m: f32| {
         let episode = |number| {
             let mut episode = drifting_episode(&trainer.layout, number, 0.0);
-            episode.goal.fill(if number % 5 == 0 { goal_m } else { 9.0 });
+            episode.goal.fill(if number % 10 == 0 { goal_m } else { 9.0 });
             Episode { queried_steps: Some(3), ..episode }
         };
-        let episodes: Vec<_> = (0..32).map(episode).collect();
+        let episodes: Vec<_> = (0..64).map(episode).collect();
         trainer.ingest(&episodes);
         trainer.learn(|_| ()).expect("finite");
     };
     play(&mut trainer, 0.0);
     // With a lag of 1 the next round is ordered before this one is learned.
     let ordered = trainer.training_orders(2, 1);
-    assert_eq!(ordered[0].episodes[0].advised_steps, Some(15), "ceil(20 * (1 - 7 / 32 / 0.8))");
+    assert_eq!(ordered[0].episodes[0].advised_steps, Some(14), "ceil(20 * (1 - 7 / 32 / 0.7))");
     assert_eq!(trainer.training_orders(1, 1)[0].episodes[0].advised_steps, Some(20));
     play(&mut trainer, 9.0);
     let directory = tempfile::tempdir().expect("a directory");
@@ -161,7 +161,7 @@ fn a_resumed_run_orders_the_round_with_the_horizon_that_it_had() {
     assert_eq!(restored.trainer.training_orders(2, 1), ordered);
     assert_eq!(restored.trainer.digest(), trainer.digest());
     assert_eq!(restored.trainer.counters(), trainer.counters());
-    assert_eq!(trainer.counters().advice_queries, 2 * 32 * 3);
+    assert_eq!(trainer.counters().advice_queries, 2 * 64 * 3);
 }
 
 #[test]

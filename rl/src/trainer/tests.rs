@@ -1,5 +1,6 @@
 //! Tests of the learning state.
 
+use tandem_core::work::EpisodeOrder;
 use tandem_core::{Layout, Task};
 
 use super::*;

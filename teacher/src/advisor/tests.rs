@@ -387,7 +387,7 @@ fn a_policy_without_values_advises_by_strategies_that_compare_none() {
         let refusal = advisor.open_account(strategy, terms(strategy)).unwrap_err().to_string();
         let expected = format!(
             "strategy {strategy} compares values of actions, and the teacher's policy has no critic: use none, ea, \
-             mc-act:A, mc-act-abs:A, or a teacher with a critic"
+             mc-act:A, mc-act-abs:A, jsrl:H, or a teacher with a critic"
         );
         assert_eq!(refusal, expected);
     }
