@@ -12,11 +12,12 @@ const STRATEGIES: [(&str, u64); 7] = [
     EAMC,
     ("mc-q:0.1", 600),
     ("mc-act:0.1", 1_600),
-    ("jsrl:20", 700),
+    JSRL,
     ("rlif:0.1", 600),
-    ("ts2c:0.1", 300),
+    ("ts2c:0.1", 600),
 ];
 const EAMC: (&str, u64) = ("eamc:0.1", 900);
+const JSRL: (&str, u64) = ("jsrl:20", 700);
 const N_WORKERS: [usize; 4] = [1, 2, 5, 16];
 /// Ten rounds of sixteen slots, so that sixteen workers have something to do; the policy is evaluated after each.
 const SMALL: [&str; 24] = [
@@ -63,6 +64,11 @@ fn one_worker_and_five_give_the_same_bits_when_advised_early() {
 #[test]
 fn one_worker_and_five_give_the_same_bits_when_advised_on_mistakes() {
     check(STRATEGIES[2], 1, &[1, 5]);
+}
+
+#[test]
+fn one_worker_and_five_give_the_same_bits_when_the_learner_ends_the_advice() {
+    check(JSRL, 1, &[1, 5]);
 }
 
 #[test]
