@@ -5,11 +5,14 @@ use tandem_core::work::PublishedActor;
 
 use crate::elementwise::tanh;
 use crate::error::Error;
-use crate::gate::QueryGate;
 use crate::mlp::MlpShape;
 use crate::normalizer::NormalizerSnapshot;
 use crate::packed::{MAX_ROWS, PackedMlp};
 use crate::validation::{check_network_size, check_normalizer, check_parameters};
+
+mod gate;
+
+pub use gate::QueryGate;
 
 /// Normalisation of observations and goals for the input of a network.
 #[derive(Debug, Clone)]

@@ -79,7 +79,7 @@
 //! # Modules in reading order
 //!
 //! [`mlp`] (shapes, forward and backward passes), [`matrix`], [`adam`], [`normalizer`], [`inference`] ([`Actor`] and
-//! [`Critic`]), [`gate`], [`policy`], [`mod@file`].
+//! [`Critic`]), [`policy`], [`mod@file`].
 #![warn(missing_docs)]
 
 pub mod adam;
@@ -87,7 +87,6 @@ mod blind;
 mod elementwise;
 mod error;
 pub mod file;
-pub mod gate;
 pub mod inference;
 pub mod matrix;
 pub mod mlp;
@@ -101,8 +100,7 @@ pub use adam::{Adam, polyak_update};
 pub use blind::BlindActor;
 pub use elementwise::{all_finite, tanh};
 pub use error::{Error, FormatError};
-pub use gate::QueryGate;
-pub use inference::{Actor, Critic};
+pub use inference::{Actor, Critic, QueryGate};
 pub use matrix::{Matrix, MatrixMut, multiply};
 pub use mlp::{MlpShape, Workspace, backward_input, backward_parameters, forward};
 pub use normalizer::{Normalizer, NormalizerSnapshot, NormalizerState};

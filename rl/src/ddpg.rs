@@ -17,6 +17,7 @@ mod state;
 mod tests;
 
 pub use config::DdpgConfig;
+pub use state::CriticBatch;
 
 /// A batch of `b` transitions. An input is a normalised observation followed by a normalised goal.
 #[derive(Debug, Clone, PartialEq)]

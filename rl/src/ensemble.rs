@@ -9,7 +9,7 @@ use tandem_core::work::PublishedGate;
 use tandem_core::{Stream, TaskSpec, episode_rng};
 use tandem_policy::{Adam, Matrix, MatrixMut, MlpShape, Workspace, backward_parameters, forward};
 
-use crate::ddpg::DdpgConfig;
+use crate::ddpg::{CriticBatch, DdpgConfig};
 
 /// Number of critics.
 const N_CRITICS: u64 = 3;
@@ -38,15 +38,6 @@ pub struct CriticEnsemble {
 struct Member {
     parameters: Vec<f32>,
     adam: Adam,
-}
-
-/// A batch of the student's critic.
-#[derive(Debug, Clone, Copy)]
-pub struct CriticBatch<'a> {
-    /// Normalised observation, normalised goal and executed action, shape `[b, n_input + n_action]`.
-    pub inputs: &'a [f32],
-    /// Targets, shape `[b, n_heads]`.
-    pub targets: &'a [f32],
 }
 
 impl CriticEnsemble {

@@ -3,7 +3,15 @@
 use tandem_policy::{MlpShape, Policy};
 
 use super::{Ddpg, DdpgConfig, DdpgError};
-use crate::ensemble::CriticBatch;
+
+/// A batch of the student's critic.
+#[derive(Debug, Clone, Copy)]
+pub struct CriticBatch<'a> {
+    /// Normalised observation, normalised goal and executed action, shape `[b, n_input + n_action]`.
+    pub inputs: &'a [f32],
+    /// Targets, shape `[b, n_heads]`.
+    pub targets: &'a [f32],
+}
 
 impl Ddpg {
     /// Returns the settings.

@@ -3,8 +3,8 @@
 use tandem_core::TaskSpec;
 use tandem_core::work::{PublishedActor, PublishedGate};
 
+use super::Critic;
 use crate::error::Error;
-use crate::inference::Critic;
 use crate::mlp::MlpShape;
 use crate::normalizer::NormalizerSnapshot;
 use crate::validation::{check_network_size, check_parameters};
