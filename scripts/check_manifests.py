@@ -125,8 +125,6 @@ class Checked:
                 self.check_policy(found)
             if found["kind"] == "PodDisruptionBudget":
                 self.expect(len(self.selected(found["spec"]["selector"])) == 1, f"budget {found['metadata']['name']} selects no one")
-            if found["kind"] == "HorizontalPodAutoscaler":
-                self.check_autoscaler(found)
 
     def expect(self, holds, otherwise):
         if not holds:
@@ -140,7 +138,7 @@ class Checked:
         pod = spec["template"]["spec"]
         # The selector of a job is made by the cluster.
         if workload["kind"] == "Job":
-            self.check_sweep(workload)
+            self.check_job(workload)
         else:
             self.expect(self.selected(spec["selector"]) == [workload], f"{name}: its selector does not select its pods alone")
         if workload["kind"] == "StatefulSet":
@@ -166,6 +164,26 @@ class Checked:
                 self.expect(("PersistentVolumeClaim", claim) in self.objects, f"{name}: no claim {claim}")
             if "configMap" in volume:
                 self.expect(("ConfigMap", volume["configMap"]["name"]) in self.objects, f"{name}: no map {volume['configMap']}")
+
+    def check_job(self, job):
+        """Failed pods are replaced, pods that were asked to end are not counted, and a wrong setting ends the job."""
+        name, spec = job["metadata"]["name"], job["spec"]
+        self.expect(spec["template"]["spec"]["restartPolicy"] == "Never", f"{name}: its exit codes have no rules")
+        rules = spec["podFailurePolicy"]["rules"]
+        codes = {(rule["action"], code) for rule in rules for code in rule.get("onExitCodes", {}).get("values", [])}
+        self.expect(("FailJob", 64) in codes, f"{name}: a wrong setting is tried again")
+        named = {rule["onExitCodes"]["containerName"] for rule in rules if "onExitCodes" in rule}
+        self.expect(named == {container["name"] for container in containers(job)}, f"{name}: a rule is about no container")
+        ignored = [condition["type"] for rule in rules if rule["action"] == "Ignore" for condition in rule["onPodConditions"]]
+        self.expect(ignored == ["DisruptionTarget"], f"{name}: evicted pods count as failures")
+        if ("ConfigMap", "tandem-sweep") in self.objects:
+            self.check_sweep(job)
+        else:
+            # Without completions, the first pod that succeeds ends the job, so no other end may look like success.
+            self.expect("completions" not in spec, f"{name}: waits for a number of pods")
+            self.expect(("Ignore", 130) in codes, f"{name}: pods that were asked to end count as failures")
+            slots = tomllib.loads(self.objects["ConfigMap", "tandem-run"]["data"]["run.toml"])["rounds"]["slots"]
+            self.expect(spec["parallelism"] <= slots, f"{name}: more workers than the run's {slots} slots")
 
     def check_sweep(self, job):
         """A job has one pod for each run of its sweep file."""
@@ -255,21 +273,6 @@ class Checked:
             for port in rule["ports"]:
                 self.expect(any(port["port"] in port_numbers(w) for w in of), f"policy {name}: no container listens on {port['port']}")
 
-    def check_autoscaler(self, scaler):
-        target = scaler["spec"]["scaleTargetRef"]
-        workload = self.objects.get((target["kind"], target["name"]))
-        self.expect(workload and "replicas" not in workload["spec"], f"the autoscaler and {target['name']} both say how many")
-        metric = scaler["spec"]["metrics"][0]["external"]
-        slots = tomllib.loads(self.objects["ConfigMap", "tandem-run"]["data"]["run.toml"])["rounds"]["slots"]
-        self.expect(scaler["spec"]["maxReplicas"] == slots, f"the autoscaler's maximum is not the run's {slots} slots")
-        self.expect(int(metric["target"]["value"]) * 4 == slots, "the autoscaler's value is not a quarter of the slots")
-        rules = documents(ROOT / "deploy/kubernetes/prometheus-adapter.yaml")[0]["rules"]["external"]
-        name = metric["metric"]["name"]
-        self.expect(name in [rule["name"]["as"] for rule in rules], f"the adapter has no rule for {name}")
-        self.expect(name in [rule["seriesQuery"].split("{")[0] for rule in rules], f"the adapter does not look for {name}")
-        is_exported = f'"{name.removeprefix("tandem_")}"' in (ROOT / "learner/src/metrics.rs").read_text()
-        self.expect(is_exported, f"the learner exports no metric {name}")
-
 
 # The complete check.
 
@@ -280,7 +283,7 @@ def commands(objects):
 
 def check_files(folder):
     """Checks that every file is used and that the documentation agrees with the manifests."""
-    used = {folder / "prometheus-adapter.yaml"}
+    used = set()
     for file in folder.rglob("kustomization.yaml"):
         kustomization = documents(file)[0]
         named = kustomization.get("resources", []) + [patch["path"] for patch in kustomization.get("patches", [])]
@@ -350,14 +353,18 @@ MISTAKES = [
     ("base/network.yaml", "app.kubernetes.io/component: bridge", "app.kubernetes.io/component: bridges"),
     ("base/kustomization.yaml", "newTag: 0.1.0", "newTag: 0.0.9"),
     ("base/kustomization.yaml", "  - redis.yaml\n", ""),
-    ("base/run.toml", "slots = 16", "slots = 8"),
+    ("base/run.toml", "slots = 16", "slots = 4"),
     ("sweep/sweep.toml", "seeds = [1, 2, 3]", "seeds = [1, 2]"),
     ("sweep/sweep.yaml", "completionMode: Indexed", "completionMode: NonIndexed"),
     ("sweep/sweep.yaml", "job-completion-index", "completion-index"),
     ("sweep/sweep.yaml", "claimName: sweep", "claimName: sweeps"),
     ("sweep/sweep.yaml", "- name: RUN_INDEX", "- name: INDEX"),
-    ("overlays/cluster/autoscaler.yaml", "name: tandem_assignments_waiting", "name: tandem_assignments"),
-    ("overlays/cluster/autoscaler.yaml", "    name: worker\n  min", "    name: workers\n  min"),
+    ("base/worker.yaml", "values: [64]", "values: [65]"),
+    ("base/worker.yaml", "values: [130]", "values: [0]"),
+    ("base/worker.yaml", "  parallelism: 2", "  parallelism: 2\n  completions: 2"),
+    ("base/worker.yaml", "restartPolicy: Never", "restartPolicy: OnFailure"),
+    ("base/worker.yaml", "containerName: worker", "containerName: workers"),
+    ("overlays/cluster/large.yaml", "parallelism: 8", "parallelism: 17"),
     ("overlays/cluster/disruptions.yaml", "app.kubernetes.io/component: teacher", "app.kubernetes.io/component: teachers"),
     ("overlays/cluster/kustomization.yaml", "namespace: tandem\n", ""),
     ("overlays/one-node/small.yaml", "resources:", "args: [learner]\n          resources:"),

@@ -87,9 +87,7 @@ fn the_manifests_train_to_the_end_while_pods_are_deleted() {
     let mut cluster = Cluster::new(manifests, run);
     let mut names = Vec::new();
     for (name, workload) in &workloads {
-        // The base sets all replicas except those of the workers, which come from an overlay.
-        let replicas = if name == "worker" { 2 } else { workload.replicas };
-        names.extend(cluster.add(name, replicas));
+        names.extend(cluster.add(name, workload.replicas));
     }
     assert_eq!(
         names,
@@ -107,6 +105,9 @@ fn the_manifests_train_to_the_end_while_pods_are_deleted() {
     let before = cluster.wait_for_figures("learner-0", |figures| rounds(figures) >= 2.0);
     assert_eq!(before["tandem_ended"], 0.0, "the run ended before the first disturbance");
     assert_eq!(cluster.terminate("learner-0"), Some(130), "{}", cluster.log("learner-0"));
+    // Not 0, the code that completes the job of the workers.
+    assert_eq!(cluster.terminate("worker-0"), Some(130), "{}", cluster.log("worker-0"));
+    cluster.start("worker-0");
     for taken in ["redis-0", "teacher-1", "worker-1"] {
         cluster.kill(taken);
         cluster.start(taken);

@@ -1,7 +1,6 @@
 //! The run's metrics for Prometheus.
 //!
-//! They are meant for dashboards and autoscalers. Reading them requires no token, so they contain no secret and no
-//! worker's own label.
+//! Reading them requires no token, so they contain no secret and no worker's own label.
 
 use std::sync::Arc;
 use std::time::Duration;

@@ -105,3 +105,13 @@ pub use matrix::{Matrix, MatrixMut, multiply};
 pub use mlp::{MlpShape, Workspace, backward_input, backward_parameters, forward};
 pub use normalizer::{Normalizer, NormalizerSnapshot, NormalizerState};
 pub use policy::{Policy, actor_digest};
+
+/// Tests of the public interface, which name this crate as other crates do.
+#[cfg(test)]
+#[path = "../tests/damaged_files.rs"]
+mod damaged_files;
+#[cfg(test)]
+#[path = "../tests/matrix_bounds.rs"]
+mod matrix_bounds;
+#[cfg(test)]
+extern crate self as tandem_policy;

@@ -45,3 +45,13 @@ pub use run::Run;
 pub use table::Table;
 pub use test_evaluation::TestEvaluation;
 pub use trials::{PlottedTrials, TrialGroup, Trials, trial_svg};
+
+/// Tests of the public interface, which name this crate as other crates do.
+#[cfg(test)]
+#[path = "../tests/report.rs"]
+mod report_tests;
+#[cfg(test)]
+#[path = "../tests/trials.rs"]
+mod trial_tests;
+#[cfg(test)]
+extern crate self as tandem_report;

@@ -11,7 +11,7 @@ use tandem_telemetry::ContactMetrics;
 use tandem_telemetry::{MetricsLog, MetricsRow};
 
 #[path = "support/well_formed.rs"]
-mod well_formed;
+pub(crate) mod well_formed;
 
 use well_formed::assert_well_formed;
 

@@ -4,10 +4,7 @@
 use tandem_report::{Comparison, PlottedTrials, Trials, report_html, trial_svg, trials};
 use tandem_telemetry::{ToolPathPoint, TrialRow};
 
-#[path = "support/well_formed.rs"]
-mod well_formed;
-
-use well_formed::assert_well_formed;
+use crate::report_tests::well_formed::assert_well_formed;
 
 /// A trial of push with two arms. Paths have a point per centimetre; the planned ones end after two thirds.
 fn row(trial: u64, cause: Option<&str>) -> TrialRow {

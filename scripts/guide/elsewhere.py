@@ -37,7 +37,6 @@ ELSEWHERE = [
     Entry("grpcurl", "is not in Debian; the tests use reflection", "tests/access.rs"),
     Entry("kubectl", "needs a cluster; the manifests' commands run as processes", "tests/kubernetes.rs"),
     Entry("curl", "asks a service in a cluster", "tests/kubernetes.rs", "docs/cluster.md"),
-    Entry("helm", "needs a cluster", "scripts/check-manifests"),
     Entry("ssh", "needs another machine", ""),
     Entry("tandem relay", "has the names of several machines", "learner/tests/service/relay.rs", "docs/scale.md"),
     Entry("tandem worker", "has the names of several machines", "learner/tests/service/relay.rs", "docs/scale.md"),

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 
 use clap::{Args, ValueEnum};
 
-use super::{EnvironmentArgs, LiveArgs, RecordingArgs, TaskName, WorldName};
+use super::{EnvironmentArgs, LiveArgs, MetricsArgs, RecordingArgs, TaskName, WorldName};
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub(crate) enum RecipeName {
@@ -115,6 +115,8 @@ pub(crate) struct TrainArgs {
     pub(crate) resume: bool,
     #[command(flatten)]
     pub(crate) dashboard: DashboardArgs,
+    #[command(flatten)]
+    pub(crate) metrics: MetricsArgs,
     /// Prints the summary as one JSON object on the last line of standard output.
     #[arg(long)]
     pub(crate) json: bool,

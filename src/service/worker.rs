@@ -29,9 +29,14 @@ pub(crate) fn worker(args: WorkerArgs) -> Result<(), Failed> {
             recording: recording(&args.recording, args.log_dir),
             pacing: Pacing::Concurrent,
         };
-        let ended = tandem_worker::run(config, shutdown).await;
+        let ended = tandem_worker::run(config, shutdown.clone()).await;
         server.end().await;
-        ended.map_err(worker_failed)
+        ended.map_err(worker_failed)?;
+        // A supervisor tells the end of the run, 0, from that of this worker alone.
+        match shutdown.is_cancelled() && !args.exit_with_stdin {
+            true => Err(Failed::new(Exit::Interrupted, anyhow::anyhow!("interrupted"))),
+            false => Ok(()),
+        }
     })
 }
 

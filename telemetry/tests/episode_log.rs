@@ -15,7 +15,7 @@ mod live;
 #[path = "support/motion.rs"]
 mod motion;
 #[path = "support/synthetic.rs"]
-mod synthetic;
+pub(crate) mod synthetic;
 
 /// Length of the magic bytes of an MCAP file.
 const MAGIC_BYTES: usize = 8;

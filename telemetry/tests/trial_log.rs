@@ -13,9 +13,7 @@ use tandem_telemetry::{
     Error, LogLevel, TrialMetadata, TrialOutcome, TrialRecorder, TrialSnapshot, recover,
 };
 
-#[path = "support/synthetic.rs"]
-#[expect(dead_code, reason = "only the scene is used")]
-mod synthetic;
+use crate::episode_log_tests::synthetic;
 
 const N_SNAPSHOTS: u32 = 60;
 

@@ -106,7 +106,7 @@ pub(crate) enum Source {
     Claim,
 }
 
-/// A Deployment or StatefulSet.
+/// A Deployment, StatefulSet or Job.
 #[derive(Debug, Clone)]
 pub(crate) struct Workload {
     pub(crate) replicas: u64,
@@ -143,7 +143,7 @@ impl Manifests {
         let of_kind = |kinds: &'static [&str]| {
             objects.iter().filter(|object| kinds.contains(&at::<String>(object, "/kind").as_str()))
         };
-        let workloads: BTreeMap<String, Workload> = of_kind(&["Deployment", "StatefulSet"])
+        let workloads: BTreeMap<String, Workload> = of_kind(&["Deployment", "StatefulSet", "Job"])
             .map(|object| (at(object, "/metadata/name"), workload(object)))
             .collect();
         let services = of_kind(&["Service"])
@@ -167,7 +167,8 @@ fn workload(object: &Value) -> Workload {
         .collect();
     let claims = listed("/volumeClaimTemplates");
     volumes.extend(claims.iter().map(|claim| (at(claim, "/metadata/name"), Source::Claim)));
-    let replicas = spec.pointer("/replicas").and_then(Value::as_u64).unwrap_or(1);
+    let replicas = spec.pointer("/replicas").or_else(|| spec.pointer("/parallelism"));
+    let replicas = replicas.and_then(Value::as_u64).unwrap_or(1);
     let labels = at(object, "/spec/template/metadata/labels");
     Workload { replicas, container, volumes, labels }
 }

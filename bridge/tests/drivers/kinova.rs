@@ -14,8 +14,8 @@ use tandem_bridge::{
 };
 use tandem_kinematics::{Joints, Motion};
 
-use crate::kinova_side::{Fault, Side};
-use crate::rig::{
+use crate::drivers::kinova_side::{Fault, Side};
+use crate::drivers::rig::{
     Listen, OWNER, Patient, Rig, SharedPair, angles, assert_ended, at_rest, eventually, failure,
     pair_at, sweep,
 };

@@ -12,7 +12,7 @@ use tandem_bridge::{ArmCommand, Command, Driver as _, Order, PairState};
 use tandem_kinematics::Joints;
 use tungstenite::{Message, WebSocket};
 
-use crate::rig::SharedPair;
+use crate::drivers::rig::SharedPair;
 
 pub(crate) const NODES: [&str; 2] = ["/left/m1n4s200_driver", "/right/m1n4s200_driver"];
 /// The duration of `in/start` in periods, in which a node does nothing else.

@@ -15,8 +15,8 @@ use tandem_bridge::{
 };
 use tandem_kinematics::{Joints, Motion};
 
-use crate::quarc_side::{Fault, Side};
-use crate::rig::{
+use crate::drivers::quarc_side::{Fault, Side};
+use crate::drivers::rig::{
     Listen, OWNER, Patient, Rig, angles, assert_ended, at_rest, eventually, failure, pair_at, sweep,
 };
 

@@ -12,7 +12,7 @@ use tandem_bridge::quarc::codec::{
 };
 use tandem_bridge::{Command, Driver as _, Order, PairState};
 
-use crate::rig::SharedPair;
+use crate::drivers::rig::SharedPair;
 
 /// A fault of the states that are sent.
 #[derive(Debug, Clone, Copy, PartialEq)]

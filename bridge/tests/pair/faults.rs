@@ -11,9 +11,9 @@ use tandem_kinematics::{ForwardKinematics, Joints, Motion};
 use tandem_trials::SimulatedConfig;
 use tandem_trials::simulated::PERIOD_S;
 
-use crate::injection::{KINDS, Kind, disturbance};
-use crate::observer::{Observer, Slack};
-use crate::rig::{LOW, MIDDLE, OWNER, Rig, TASKS, tools, walk};
+use crate::pair::injection::{KINDS, Kind, disturbance};
+use crate::pair::observer::{Observer, Slack};
+use crate::pair::rig::{LOW, MIDDLE, OWNER, Rig, TASKS, tools, walk};
 
 /// The number of executions with each kind of fault, in the quick and in the long test.
 const N_PER_KIND: usize = 15;

@@ -9,7 +9,7 @@ use tandem_kinematics::{ArmSample, Joints, Motion, Reason};
 use tandem_trials::simulated::{Disturbance, PERIOD_S};
 use tandem_trials::{SimulatedConfig, SimulatedPair};
 
-use crate::rig::{OWNER, Rig};
+use crate::pair::rig::{OWNER, Rig};
 
 /// The turns of the joints from the ready position until the gripper is 14 mm inside the arm's own base, degrees.
 const WAY_DEG: [f64; 4] = [0.0, -11.3, 27.0, 90.3];

@@ -8,8 +8,8 @@ use tandem_core::ArmIndex;
 use tandem_kinematics::Reason;
 use tandem_trials::SimulatedConfig;
 
-use crate::injection::Kind;
-use crate::rig::{OWNER, Rig, TASKS, walk};
+use crate::pair::injection::Kind;
+use crate::pair::rig::{OWNER, Rig, TASKS, walk};
 
 const STRANGER: Token = Token(5);
 

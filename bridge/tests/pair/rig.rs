@@ -15,7 +15,7 @@ use tandem_kinematics::{
 use tandem_trials::simulated::PERIOD_S;
 use tandem_trials::{SimulatedConfig, SimulatedPair};
 
-use crate::injection::{Injection, Tap};
+use crate::pair::injection::{Injection, Tap};
 
 pub(crate) const OWNER: Token = Token(77);
 

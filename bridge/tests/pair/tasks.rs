@@ -5,8 +5,8 @@ use tandem_bridge::work_cell::mico_cell;
 use tandem_trials::SimulatedConfig;
 use tandem_trials::simulated::Block;
 
-use crate::observer::{Observer, Slack};
-use crate::rig::{Rig, planned, tools};
+use crate::pair::observer::{Observer, Slack};
+use crate::pair::rig::{Rig, planned, tools};
 
 /// The height of the tool above the table, metres.
 const WORK_M: f64 = 0.050;

@@ -4,8 +4,8 @@ use glam::DVec3;
 use tandem_bridge::work_cell::mico_cell;
 use tandem_trials::SimulatedConfig;
 
-use crate::observer::{Observer, Slack};
-use crate::rig::{Rig, TASKS, tools, walk};
+use crate::pair::observer::{Observer, Slack};
+use crate::pair::rig::{Rig, TASKS, tools, walk};
 
 const N_EXECUTIONS: usize = 60;
 const N_EXECUTIONS_WITH_TIME: usize = 200;

@@ -5,7 +5,9 @@ use tandem_kinematics::{ArmSample, ArmWaypoint, Joints, Motion, PlanSettings, pl
 use tandem_proto::pb;
 use tonic::Code;
 
-use crate::rig::{DEADLINE, Fault, READY_M, Rig, UP_M, joint_request, patient, slow, through};
+use crate::service::rig::{
+    DEADLINE, Fault, READY_M, Rig, UP_M, joint_request, patient, slow, through,
+};
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn the_arms_are_described() {

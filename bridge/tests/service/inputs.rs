@@ -3,7 +3,7 @@
 use tandem_proto::pb;
 use tonic::Code;
 
-use crate::rig::{READY_M, Rig, UP_M, patient, through};
+use crate::service::rig::{READY_M, Rig, UP_M, patient, through};
 
 /// A modification of a valid request.
 fn way(spoil: impl FnOnce(&mut pb::WayPoints)) -> pb::MotionRequest {

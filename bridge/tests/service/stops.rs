@@ -5,7 +5,7 @@ use tandem_bridge::{Command, Order, Settings};
 use tandem_proto::pb;
 use tonic::Code;
 
-use crate::rig::{Fault, Rig, UP_M, patient, request, slow, through};
+use crate::service::rig::{Fault, Rig, UP_M, patient, request, slow, through};
 
 /// Asserts that nothing moves and no motion starts before a reset, and that motions work after it.
 async fn assert_stopped_until_reset(rig: &mut Rig, name: &str) {
@@ -152,7 +152,7 @@ async fn signs_of_life_keep_a_motion_going() {
         signs.send(request(pb::execute_request::Request::Start(start))).await.unwrap();
         let requests = tokio_stream::wrappers::ReceiverStream::new(requests);
         let responses = client.execute(requests).await.unwrap().into_inner();
-        crate::rig::Playing { signs, responses }
+        crate::service::rig::Playing { signs, responses }
     });
     while !playing.is_finished() {
         clock.pass(0.01);

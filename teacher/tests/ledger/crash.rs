@@ -6,7 +6,7 @@ use std::path::Path;
 use tandem_teacher::budget::{Charge, Lease};
 use tandem_teacher::ledger::{Ledger as _, SqliteLedger};
 
-use crate::fixture::{Verdict, charge, inverted, request, terms};
+use crate::ledger_tests::fixture::{Verdict, charge, inverted, request, terms};
 
 const NAME: &str = "run";
 const BUDGET: u64 = 150;

@@ -7,7 +7,7 @@ use rusqlite::Connection;
 use tandem_teacher::ledger::{self, Ledger as _, OpenError, SqliteLedger};
 use tempfile::TempDir;
 
-use crate::fixture::{BOTH, charge, request, terms};
+use crate::ledger_tests::fixture::{BOTH, charge, request, terms};
 
 fn directory() -> (TempDir, PathBuf) {
     let directory = tempfile::tempdir().expect("a directory");

@@ -5,7 +5,7 @@ use tandem_teacher::ledger::{ChargeRequest, ChargeResult, Ledger, MemoryLedger};
 use tandem_teacher::{Strategy, ledger};
 use tempfile::TempDir;
 
-use crate::redis_server::RedisServer;
+use crate::ledger_tests::redis_server::RedisServer;
 
 /// Whether a step is worth a unit of the first and of the second half of the budget.
 pub(crate) type Wanted = [bool; 2];

@@ -7,7 +7,7 @@ use std::process::{Command, Stdio};
 use tandem_teacher::ledger::{Ledger as _, LedgerError, MemoryLedger, SqliteLedger};
 use tempfile::TempDir;
 
-use crate::fixture::{BOTH, NEITHER, charge, request, terms};
+use crate::ledger_tests::fixture::{BOTH, NEITHER, charge, request, terms};
 
 /// A disk of 1 MiB.
 struct SmallDisk {
@@ -75,7 +75,7 @@ fn a_full_disk_makes_the_ledger_unavailable_until_there_is_room() {
     // Verdicts from before are still returned.
     let known =
         ledger.charge(&[request("run", &[charge(0, 1, NEITHER)])]).remove(0).expect("known");
-    assert_eq!(known.verdicts, [crate::fixture::FIRST]);
+    assert_eq!(known.verdicts, [crate::ledger_tests::fixture::FIRST]);
 
     fs::remove_file(disk.path("filler")).expect("room");
     for ledger in [&mut ledger as &mut dyn tandem_teacher::ledger::Ledger, &mut model] {
@@ -83,7 +83,7 @@ fn a_full_disk_makes_the_ledger_unavailable_until_there_is_room() {
         ledger.open_leases("run", &[2_000_000], 20).expect("leases");
         // If the refused request had left a verdict, these steps would not be charged.
         let result = ledger.charge(&[request_for(episode)]).remove(0).expect("paid");
-        assert_eq!(result.verdicts, [crate::fixture::FIRST; 2]);
+        assert_eq!(result.verdicts, [crate::ledger_tests::fixture::FIRST; 2]);
     }
     let expected = model.balance("run").expect("known");
     assert_eq!(ledger.balance("run").expect("known"), expected);

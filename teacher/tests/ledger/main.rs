@@ -1,43 +1,30 @@
 //! The same tests for all ledgers: operations, durability and refusals.
-//!
-//! The modules are `cfg(test)` so that the lints treat their helpers as tests too.
 
-#[cfg(test)]
 mod crash;
-#[cfg(test)]
 mod files;
-#[cfg(test)]
 mod fixture;
-#[cfg(test)]
 mod full;
-#[cfg(test)]
 mod model;
-#[cfg(test)]
 mod owner;
-#[cfg(test)]
 mod redis_server;
-#[cfg(test)]
 mod semantics;
-#[cfg(test)]
 mod servers;
-#[cfg(test)]
 mod speed;
-#[cfg(test)]
 mod upgrade;
 
 /// Every test of `semantics` and `model` on every ledger.
 macro_rules! on_every_ledger {
     ($($module:ident::$test:ident),* $(,)?) => {
         mod memory {
-            $(#[test] fn $test() { crate::$module::$test(crate::fixture::TestLedger::memory()); })*
+            $(#[test] fn $test() { crate::ledger_tests::$module::$test(crate::ledger_tests::fixture::TestLedger::memory()); })*
         }
         mod sqlite {
-            $(#[test] fn $test() { crate::$module::$test(crate::fixture::TestLedger::sqlite()); })*
+            $(#[test] fn $test() { crate::ledger_tests::$module::$test(crate::ledger_tests::fixture::TestLedger::sqlite()); })*
         }
         mod redis {
             $(#[test] fn $test() {
-                if let Some(fixture) = crate::fixture::TestLedger::redis() {
-                    crate::$module::$test(fixture);
+                if let Some(fixture) = crate::ledger_tests::fixture::TestLedger::redis() {
+                    crate::ledger_tests::$module::$test(fixture);
                 }
             })*
         }

@@ -7,7 +7,7 @@ use proptest::test_runner::{Config, TestCaseError, TestRunner};
 use tandem_teacher::budget::Charge;
 use tandem_teacher::ledger::{Ledger, MemoryLedger};
 
-use crate::fixture::{TestLedger, charge, request, terms};
+use crate::ledger_tests::fixture::{TestLedger, charge, request, terms};
 
 /// The number of random series of operations.
 const N_CASES: u32 = 48;

@@ -8,8 +8,8 @@ use rusqlite::Connection;
 use tandem_teacher::ledger::{Ledger as _, LedgerError, OpenError, SqliteLedger};
 use tempfile::TempDir;
 
-use crate::fixture::{BOTH, FIRST, charge, request, terms};
-use crate::servers::Log;
+use crate::ledger_tests::fixture::{BOTH, FIRST, charge, request, terms};
+use crate::ledger_tests::servers::Log;
 
 /// An open ledger with one unit of ten spent, by step 0 of episode 1.
 fn opened() -> (TempDir, PathBuf, SqliteLedger) {

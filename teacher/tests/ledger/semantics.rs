@@ -3,7 +3,7 @@
 use tandem_teacher::budget::{AccountTerms, Balance, MAX_BUDGET};
 use tandem_teacher::{Strategy, ledger::LedgerError};
 
-use crate::fixture::{
+use crate::ledger_tests::fixture::{
     BOTH, FIRST, NEITHER, NOTHING, SECOND, TestLedger, charge, inverted, lease, request, terms,
 };
 

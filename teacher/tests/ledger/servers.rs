@@ -8,8 +8,8 @@ use std::time::Duration;
 
 use tandem_teacher::ledger::{Ledger as _, LedgerError, RedisLedger};
 
-use crate::fixture::{BOTH, FIRST, NEITHER, NOTHING, charge, request, terms};
-use crate::redis_server::RedisServer;
+use crate::ledger_tests::fixture::{BOTH, FIRST, NEITHER, NOTHING, charge, request, terms};
+use crate::ledger_tests::redis_server::RedisServer;
 
 fn is_unavailable<T: std::fmt::Debug>(outcome: Result<T, LedgerError>) -> String {
     match outcome {

@@ -1,10 +1,10 @@
-//! The time of a charge. Run with `cargo test --release -p tandem-teacher --test ledger -- --ignored --nocapture`.
+//! The time of a charge. Run with `cargo test --release -p tandem-teacher --lib ledger_tests -- --ignored --nocapture`.
 
 use std::time::Instant;
 
 use tandem_teacher::ledger::{ChargeRequest, Ledger, SqliteLedger};
 
-use crate::fixture::{BOTH, TestLedger, charge, request, terms};
+use crate::ledger_tests::fixture::{BOTH, TestLedger, charge, request, terms};
 
 /// Requests of one call, as of sixteen workers.
 const N_REQUESTS: u64 = 16;

@@ -9,7 +9,7 @@ use tandem_teacher::budget::{AccountTerms, Balance, Lease};
 use tandem_teacher::ledger::{Ledger, MemoryLedger, OpenError, SqliteLedger};
 use tempfile::TempDir;
 
-use crate::fixture::{BOTH, NEITHER, Verdict, charge, request, terms};
+use crate::ledger_tests::fixture::{BOTH, NEITHER, Verdict, charge, request, terms};
 
 const LEASED: &str = "leased";
 const FREE: &str = "free \"quoted\"\n\u{1b}[31m";

@@ -6,7 +6,7 @@ use std::path::Path;
 use prost_reflect::{DescriptorPool, DynamicMessage, ReflectMessage as _, Value as Field};
 use serde_json::Value;
 
-use crate::synthetic;
+use crate::episode_log_tests::synthetic;
 
 fn layout(name: &str) -> Value {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../deploy/foxglove").join(name);

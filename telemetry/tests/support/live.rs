@@ -13,7 +13,7 @@ use tandem_telemetry::Error;
 use tandem_telemetry::live::{Clock, Follower, LiveArms, Replay};
 use tungstenite::{ClientRequestBuilder, Message, WebSocket};
 
-use crate::{motion, synthetic};
+use crate::episode_log_tests::{motion, synthetic};
 
 const SUBPROTOCOL: &str = "foxglove.sdk.v1";
 /// Longest wait for a message.

@@ -8,7 +8,7 @@ use tandem_telemetry::{
     ArmView, ArmsPhase, ArmsView, Error, MotionJournal, MotionView, StopView, read_episode, recover,
 };
 
-use crate::{layout, synthetic};
+use crate::episode_log_tests::{layout, synthetic};
 
 const PERIOD_S: f64 = 0.01;
 

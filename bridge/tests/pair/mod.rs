@@ -1,5 +1,4 @@
 //! The executor on the simulated pair: tasks, ownership and faults.
-#![expect(clippy::unwrap_used, clippy::panic, reason = "a test panics where it fails")]
 
 mod faults;
 mod injection;

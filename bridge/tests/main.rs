@@ -1,0 +1,6 @@
+//! The public interface of the bridge: drivers, executor and service.
+#![expect(clippy::unwrap_used, clippy::panic, reason = "a test panics where it fails")]
+
+mod drivers;
+mod pair;
+mod service;
