@@ -215,6 +215,7 @@ fn summary_json(
         "updates": last.updates,
         "wall_s": last.wall_s,
         "advice_spent": last.advice_spent,
+        "advice_queries": last.advice_queries,
         "budget_left": last.budget_left,
         "learner_mib": memory.learner_mib,
         "teacher_mib": memory.teacher_mib,
