@@ -81,10 +81,11 @@ function showMotion(s) {
   const share = motion.duration_s > 0 ? Math.min(1, motion.played_s / motion.duration_s) : 0;
   byId("bar").style.width = `${100 * share}%`;
   byId("progress").setAttribute("aria-valuenow", Math.round(100 * share));
-  const left = (motion.duration_s - motion.played_s) / motion.speed;
+  // On the clock, as the commands print it: the motion's own times are those at speed 1.
+  const [played, duration] = [motion.played_s, motion.duration_s].map((own) => (motion.speed > 0 ? own / motion.speed : own));
   const client = motion.client ? `, client ${motion.client}` : "";
-  setText(byId("motion-text"), `Motion ${s.n_motions}${motion.name ? `, ${motion.name}` : ""}: ${motion.played_s.toFixed(1)} of `
-    + `${motion.duration_s.toFixed(1)} s at speed ${motion.speed}, about ${clock(left)} left${client}.`);
+  setText(byId("motion-text"), `Motion ${s.n_motions}${motion.name ? `, ${motion.name}` : ""}: ${played.toFixed(1)} of `
+    + `${duration.toFixed(1)} s at speed ${motion.speed}, about ${clock(duration - played)} left${client}.`);
 }
 
 function tiles(s) {

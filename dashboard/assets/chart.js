@@ -1,6 +1,8 @@
 // Line charts as SVG, drawn at the width they have, so that text keeps its size.
 import { el, isNumber, svg } from "/assets/common.js";
 
+/** End of the horizontal axis while all points are at its start, environment steps. */
+const FIRST_STEPS = 1000;
 const MARGIN = { left: 46, right: 12, top: 10, bottom: 36 };
 
 /** Returns about `n` round numbers from `low` to `high`. */
@@ -113,7 +115,9 @@ export class Chart {
       const pad = (high - low) * 0.08 || Math.abs(high) * 0.1 || 1;
       [low, high] = [this.options.fromZero ? 0 : low - pad, high + pad];
     }
-    const xMax = Math.max(1, ...xs) * (xs.length > 1 ? 1 : 1.25);
+    // Room after a single point, and round numbers before the first step.
+    const last = Math.max(0, ...xs);
+    const xMax = last > 0 ? last * (new Set(xs).size > 1 ? 1 : 1.25) : FIRST_STEPS;
     const [left, right, top, bottom] = [MARGIN.left, width - MARGIN.right, MARGIN.top, height - MARGIN.bottom];
     this.x = (value) => left + (value / xMax) * (right - left);
     this.y = (value) => bottom - ((value - low) / (high - low)) * (bottom - top);

@@ -4,6 +4,11 @@ import { byId, el, setText, svg } from "/assets/common.js";
 /** Shortest time for which a step is shown, so that fast tasks can be followed. */
 const MIN_STEP_MS = 80;
 const HALF_OBJECT_M = 0.0225;
+/** Width of a view, and what is drawn above a hand as seen from above (beyond its fingers) and from the side: pixels. */
+const WIDTH_PX = 600;
+const ABOVE_HAND_PX = { 1: 34, 2: 62 };
+/** Half of the smallest gap that is drawn between the fingers, metres. */
+const MIN_GAP_M = 0.012;
 
 export class Player {
   constructor() {
@@ -98,19 +103,25 @@ export class Player {
     const [x, other] = [reach(0), reach(axis)];
     const half = Math.max(0.3, -x[0], x[1]);
     const isArms = this.playback.bases.length > 0;
-    if (!isArms) return { x, other };
-    return { x: [-half, half], other: axis === 1 ? [Math.min(-0.18, other[0]), Math.max(0.18, other[1])] : [-0.04, Math.max(0.26, other[1])] };
+    const shown = isArms ? [-half, half] : x;
+    // The hand and its label have a size in pixels.
+    const label_m = ABOVE_HAND_PX[axis] * (shown[1] - shown[0]) / WIDTH_PX;
+    const tops = this.episode.steps.flat().filter((part) => part.hand)
+      .map((part) => part.hand[axis] + label_m + (axis === 1 ? gapOf(part) : 0));
+    const high = Math.max(other[1], ...tops);
+    if (!isArms) return { x, other: [other[0], high] };
+    return { x: shown, other: axis === 1 ? [Math.min(-0.18, other[0]), Math.max(0.18, high)] : [-0.04, Math.max(0.26, high)] };
   }
 
   /** Prepares a view and returns the function that draws a step. */
   view(id, axis) {
     const root = byId(id);
     const { x: [xLow, xHigh], other: [low, high] } = this.extent(axis);
-    const scale = 600 / (xHigh - xLow);
+    const scale = WIDTH_PX / (xHigh - xLow);
     const height = (high - low) * scale;
-    root.setAttribute("viewBox", `0 0 600 ${height.toFixed(0)}`);
+    root.setAttribute("viewBox", `0 0 ${WIDTH_PX} ${height.toFixed(0)}`);
     const at = (point) => [(point[0] - xLow) * scale, height - (point[axis] - low) * scale];
-    const ground = axis === 2 ? svg("line", { x1: 0, x2: 600, y1: at([0, 0, 0])[1], y2: at([0, 0, 0])[1], class: "table" }) : null;
+    const ground = axis === 2 ? svg("line", { x1: 0, x2: WIDTH_PX, y1: at([0, 0, 0])[1], y2: at([0, 0, 0])[1], class: "table" }) : null;
     root.replaceChildren(...[ground].filter(Boolean));
     const drawing = { root, at, axis, scale, height };
     root.append(ruler(drawing));
@@ -149,12 +160,15 @@ export class Player {
     const hand = at(part.hand);
     const base = this.playback.bases[arm];
     if (base) group.prepend(link(at(shoulder(base, part.hand, axis)), hand));
-    const gap = Math.max(0.012, part.opening ?? 0) * scale;
+    const gap = gapOf(part) * scale;
     group.append(...(axis === 1 ? fromAbove(hand, gap, base ? Math.sign(base[0]) : 0) : fromSide(hand, gap)));
     group.append(svg("text", { x: hand[0], y: hand[1] - (axis === 1 ? gap + 16 : 44), "text-anchor": "middle" }, `arm ${arm + 1}`));
     return group;
   }
 }
+
+/** Returns half of the drawn gap between the fingers, metres. */
+const gapOf = (part) => Math.max(MIN_GAP_M, part.opening ?? 0);
 
 /** Returns where the drawn forearm begins: towards the base, and above the table as seen from the side. */
 function shoulder(base, hand, axis) {

@@ -11,6 +11,9 @@ let state = null;
 let link = "connecting";
 let latest = null;
 
+/** Returns `value` for rows after the first update: before it there is no loss, and no Q of a trained critic. */
+const learned = (value) => (row) => (row.updates > 0 ? value(row) : null);
+
 const charts = [
   new Chart(byId("success-chart"), {
     label: "Success in evaluations",
@@ -29,14 +32,14 @@ const charts = [
   new Chart(byId("q-chart"), {
     label: "Mean Q",
     format: real,
-    series: [{ name: "mean Q", class: "first", value: (row) => row.mean_q }],
+    series: [{ name: "mean Q", class: "first", value: learned((row) => row.mean_q) }],
   }),
   new Chart(byId("loss-chart"), {
     label: "Losses",
     format: real,
     series: [
-      { name: "critic", class: "first", value: (row) => row.critic_loss },
-      { name: "actor", class: "second", value: (row) => row.actor_loss },
+      { name: "critic", class: "first", value: learned((row) => row.critic_loss) },
+      { name: "actor", class: "second", value: learned((row) => row.actor_loss) },
     ],
   }),
   new Chart(byId("advice-chart"), {
@@ -49,15 +52,14 @@ const charts = [
 
 function tiles(s) {
   const interval = (low, high) => (isNumber(low) ? `interval ${(100 * low).toFixed(1)} – ${percent(high)}` : "no evaluation yet");
-  const learned = (value) => real(s.updates > 0 ? value : null);
   const usesAdvice = s.advice_spent + s.advice_left > 0;
   return [
     ["Success", percent(latest?.success), interval(latest?.success_low, latest?.success_high)],
     s.n_arms > 1 && ["Without contact", percent(latest?.success_without_contact),
       interval(latest?.success_without_contact_low, latest?.success_without_contact_high)],
     ["In training", percent(s.round > 0 ? s.training_success : null), "latest round"],
-    ["Mean Q", learned(s.mean_q), "latest round"],
-    ["Critic loss", learned(s.critic_loss), `actor loss ${learned(s.actor_loss)}`],
+    ["Mean Q", real(learned((it) => it.mean_q)(s)), "latest round"],
+    ["Critic loss", real(learned((it) => it.critic_loss)(s)), `actor loss ${real(learned((it) => it.actor_loss)(s))}`],
     ["Env steps", count(s.env_steps), `${count(s.env_steps_per_s)} per second`],
     ["Updates", count(s.updates), `${count(s.updates_per_s)} per second`],
     usesAdvice && ["Advice left", count(s.advice_left), `${count(s.advice_per_min)} per minute`],
@@ -189,7 +191,8 @@ function showServices(s) {
 function showTable(rows) {
   const names = ["Env steps", "Success", "95 % interval", "Without contact", "Training", "Mean Q", "Critic loss", "Actor loss", "Advice"];
   const cells = (row) => [count(row.env_steps), percent(row.success), `${percent(row.success_low)} – ${percent(row.success_high)}`,
-    percent(row.success_without_contact), percent(row.training_success), real(row.mean_q), real(row.critic_loss), real(row.actor_loss),
+    percent(row.success_without_contact), percent(row.training_success),
+    ...["mean_q", "critic_loss", "actor_loss"].map((name) => real(learned((it) => it[name])(row))),
     count(row.advice_spent)];
   byId("success-table").replaceChildren(
     el("thead", {}, el("tr", {}, names.map((name) => el("th", { scope: "col" }, name)))),

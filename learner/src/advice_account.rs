@@ -2,6 +2,7 @@
 //! the charges of the account.
 
 mod audit;
+mod watcher;
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -9,28 +10,27 @@ use std::time::Duration;
 
 use tandem_core::task::TaskDifference;
 use tandem_core::{Episode, TaskSpec};
-use tandem_net::{AuthChannel, Backoff, ClientConfig, ClientConfigError, Operation, retry, within};
+use tandem_net::{AuthChannel, Backoff, ClientConfig, ClientConfigError, Operation, retry};
 use tandem_proto::pb::teacher_client::TeacherClient;
 use tandem_proto::{DecodeError, decode_task, pb};
+use tandem_telemetry::TeacherView;
 use tandem_telemetry::events::AdviceAccountOpened;
-use tandem_telemetry::{TeacherState, TeacherView};
 use tokio::sync::watch;
 use tokio_util::sync::{CancellationToken, DropGuard};
 use tonic::{Code, Status};
 use tracing::warn;
 
 use crate::runtime::Runtime;
-use crate::warnings::{Source, Warnings};
+use crate::shared::Clock;
+use crate::warnings::Warnings;
 use audit::{Audit, Cost, Statement};
+use watcher::AccountWatcher;
 
 /// Deadline of a call.
 const CALL_DEADLINE: Duration = Duration::from_secs(5);
 /// Pauses before a failed call is repeated.
 const BACKOFF: Backoff =
     Backoff { first_pause: Duration::from_millis(100), max_pause: Duration::from_secs(1) };
-/// Pause between two checks whether the teacher still knows the account. Workers wait for a lost account to be opened
-/// again.
-const CHECK_PERIOD: Duration = Duration::from_secs(1);
 
 /// A failed call to the teacher.
 #[derive(Debug, thiserror::Error)]
@@ -129,6 +129,8 @@ pub(crate) struct AccountOptions<'a> {
     pub(crate) start: RunStart,
     /// Receives the state of the teacher.
     pub(crate) view: watch::Sender<TeacherView>,
+    /// Measures for how long the teacher has not answered.
+    pub(crate) clock: Clock,
 }
 
 /// The run's account at the teacher, used by the learning thread.
@@ -162,7 +164,7 @@ impl AdviceAccount {
         shutdown: &CancellationToken,
     ) -> Result<Self, TeacherError> {
         let AccountOptions { client_config, address, one_arm, terms, .. } = options;
-        let AccountOptions { units_per_episode, start, view, .. } = options;
+        let AccountOptions { units_per_episode, start, view, clock, .. } = options;
         let inside = runtime.enter();
         let client = TeacherClient::new(client_config.channel(address)?);
         drop(inside);
@@ -185,7 +187,7 @@ impl AdviceAccount {
             RunStart::New => account.open_account(budget, 0)?,
             RunStart::Resumed { spent } => account.resume(spent)?,
         }
-        let watcher = AccountWatcher { client, lost, warnings: warnings.clone(), view };
+        let watcher = AccountWatcher::new(client, lost, (warnings.clone(), view), clock);
         let watch = watcher.watch(account.terms.name.clone());
         runtime.spawn(async move {
             tokio::select! {
@@ -429,47 +431,4 @@ const fn units_left(account: &pb::Account) -> u64 {
 
 const fn statement(account: &pb::Account) -> Statement {
     Statement { spent: account.spent, leased: account.leased }
-}
-
-/// Asks for the account about once a second.
-struct AccountWatcher {
-    client: TeacherClient<AuthChannel>,
-    /// Set when the teacher reports that it does not know the account.
-    lost: Arc<AtomicBool>,
-    /// Receives the teacher's warning.
-    warnings: Warnings,
-    /// Receives the state of the teacher.
-    view: watch::Sender<TeacherView>,
-}
-
-impl AccountWatcher {
-    async fn watch(mut self, name: String) {
-        loop {
-            tokio::time::sleep(CHECK_PERIOD).await;
-            let look = self.client.get_account(pb::GetAccountRequest { name: name.clone() });
-            let answer = within(CALL_DEADLINE, look).await;
-            self.handle(answer.map(tonic::Response::into_inner));
-        }
-    }
-
-    fn handle(&self, answer: Result<pb::Account, Status>) {
-        let (state, error) = match &answer {
-            Ok(account) => {
-                self.warnings.set(Source::Teacher, &account.warning);
-                (TeacherState::Answering, String::new())
-            }
-            Err(status) if status.code() == Code::NotFound => {
-                self.lost.store(true, Ordering::Relaxed);
-                (TeacherState::Lost, status.message().to_owned())
-            }
-            Err(status) => (TeacherState::Unreachable, status.message().to_owned()),
-        };
-        self.view.send_modify(|view| {
-            (view.state, view.error) = (state, error);
-            if let Ok(pb::Account { name, budget, spent, leased, warning, .. }) = answer {
-                (view.account, view.ledger_warning) = (name, warning);
-                (view.budget, view.spent, view.leased) = (budget, spent, leased);
-            }
-        });
-    }
 }

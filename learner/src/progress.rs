@@ -14,8 +14,10 @@ pub(crate) struct Progress {
     pub(crate) strategy: String,
     /// Rounds, environment steps, episodes, updates and units of advice so far.
     pub(crate) counters: Counters,
-    /// Seconds of wall time, summed over resumed parts.
+    /// Seconds of wall time at the latest change, summed over resumed parts.
     pub(crate) wall_s: f64,
+    /// Seconds of wall time of the parts of the run before this process.
+    pub(crate) wall_before_s: f64,
     /// Environment steps after which the run ends; 0 for no limit.
     pub(crate) max_env_steps: u64,
     /// Minutes of wall time after which the run ends; 0 for no limit.

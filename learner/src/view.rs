@@ -8,7 +8,7 @@ use tandem_rl::config::RunConfig;
 use tandem_telemetry::{EndView, RunView, WorkerState, WorkerView};
 use tokio::sync::watch;
 
-use crate::progress::RunEnd;
+use crate::progress::{Progress, RunEnd};
 use crate::shared::Shared;
 use crate::work_queue::{WorkQueue, Worker};
 
@@ -24,14 +24,17 @@ pub(crate) async fn publish(
     run: RunConfig,
 ) {
     let Some(views) = views else { return std::future::pending().await };
+    let mut shown_s = 0.0;
     loop {
-        views.send_replace(snapshot(&shared, &run));
+        let view = snapshot(&shared, &run, shown_s);
+        shown_s = view.wall_s;
+        views.send_replace(view);
         tokio::time::sleep(PERIOD).await;
     }
 }
 
-/// Returns the state of the run.
-fn snapshot(shared: &Shared, run: &RunConfig) -> RunView {
+/// Returns the state of the run. The previous snapshot showed the wall time `shown_s`.
+fn snapshot(shared: &Shared, run: &RunConfig, shown_s: f64) -> RunView {
     let progress = shared.progress.borrow().clone();
     let teacher = shared.teacher.borrow().clone();
     let now = (shared.clock)();
@@ -44,7 +47,7 @@ fn snapshot(shared: &Shared, run: &RunConfig) -> RunView {
         strategy: run.advice.strategy.clone(),
         seed: run.seed,
         phase: progress.phase.map_or("", |phase| phase.name()).to_owned(),
-        wall_s: progress.wall_s,
+        wall_s: wall_s(&progress, now, shown_s),
         round: counters.round,
         env_steps: counters.env_steps,
         max_env_steps: run.stop.max_env_steps,
@@ -71,6 +74,15 @@ fn snapshot(shared: &Shared, run: &RunConfig) -> RunView {
         end: progress.end.map(end),
         evaluations: state.evaluations.clone(),
         evaluated: state.evaluated.clone(),
+    }
+}
+
+/// Returns the wall time to show, in seconds. It passes while the run waits too, stands still after the end, and never
+/// goes back.
+fn wall_s(progress: &Progress, now: Duration, shown_s: f64) -> f64 {
+    match progress.end {
+        Some(_) => progress.wall_s.max(shown_s),
+        None => progress.wall_before_s + now.as_secs_f64(),
     }
 }
 
@@ -117,6 +129,17 @@ fn worker_state(worker: &Worker, now: Duration) -> WorkerState {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn the_time_passes_while_the_run_waits_and_stands_still_after_its_end() {
+        let at = Duration::from_secs;
+        let mut progress = Progress { wall_s: 62.0, wall_before_s: 60.0, ..Progress::default() };
+        assert_eq!(wall_s(&progress, at(2), 0.0), 62.0);
+        assert_eq!(wall_s(&progress, at(32), 62.0), 92.0, "nothing was published for 30 s");
+        let reason = "an error".to_owned();
+        progress.end = Some(RunEnd { reason, interrupted: true, digest: None });
+        assert_eq!(wall_s(&progress, at(50), 92.0), 92.0, "an event before the end is no later");
+    }
 
     #[test]
     fn a_restarted_worker_takes_the_place_of_its_former_self() {

@@ -96,10 +96,13 @@ impl ArmsEncoder {
 
     fn caption(&self, view: &ArmsView) -> String {
         let progress = match (&view.motion, &self.motion) {
-            (Some(motion), _) => format!(
-                "motion {} {}\n{:.1} of {:.1} s at speed {}",
-                view.n_motions, motion.name, motion.played_s, motion.duration_s, motion.speed
-            ),
+            (Some(motion), _) => {
+                let [played_s, duration_s] = motion.clock_times_s();
+                format!(
+                    "motion {} {}\n{played_s:.1} of {duration_s:.1} s at speed {}",
+                    view.n_motions, motion.name, motion.speed
+                )
+            }
             (None, Some(motion)) => format!("after motion {} {}", view.n_motions, motion.name),
             (None, None) => "no motion yet".to_owned(),
         };
@@ -173,5 +176,28 @@ fn arm_state(arm: &ArmView) -> pb::ArmState {
         drive_fault: arm.drive_fault,
         contact: arm.contact,
         emergency_stop: arm.emergency_stop,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_caption_has_the_seconds_that_pass_at_the_speed_of_the_motion() {
+        let mut view = ArmsView { n_motions: 3, ..ArmsView::default() };
+        view.motion = Some(MotionView {
+            name: "lift".to_owned(),
+            speed: 0.1,
+            played_s: 0.25,
+            duration_s: 2.0,
+            ..MotionView::default()
+        });
+        let mut encoder = ArmsEncoder::new(2);
+        encoder.follow(&view);
+        let caption = encoder.caption(&view);
+        assert!(caption.starts_with("motion 3 lift\n2.5 of 20.0 s at speed 0.1\n"), "{caption}");
+        view.motion = None;
+        assert!(encoder.caption(&view).starts_with("after motion 3 lift\n"));
     }
 }

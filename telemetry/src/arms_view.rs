@@ -83,6 +83,15 @@ pub struct MotionView {
     pub duration_s: f64,
 }
 
+impl MotionView {
+    /// Returns the played part and the duration on the clock, seconds: at speed 0.1, ten times the motion's own times.
+    #[must_use]
+    pub fn clock_times_s(&self) -> [f64; 2] {
+        let on_clock = |own_s: f64| if self.speed > 0.0 { own_s / self.speed } else { own_s };
+        [self.played_s, self.duration_s].map(on_clock)
+    }
+}
+
 /// The time and cause of a stop.
 #[derive(Debug, Clone, PartialEq, Default, Serialize)]
 pub struct StopView {
@@ -219,8 +228,8 @@ fn started(view: &ArmsView) -> String {
         if !motion.name.is_empty() {
             line.push_str(&format!(" ({})", motion.name));
         }
-        let wall_s = motion.duration_s / motion.speed.max(f64::MIN_POSITIVE);
-        line.push_str(&format!(" started: {wall_s:.1} s at speed {}", motion.speed));
+        let [_, duration_s] = motion.clock_times_s();
+        line.push_str(&format!(" started: {duration_s:.1} s at speed {}", motion.speed));
         if !motion.client.is_empty() {
             line.push_str(&format!(", client {}", motion.client));
         }

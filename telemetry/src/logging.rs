@@ -61,9 +61,11 @@ pub fn init(config: &LogConfig, extra: Option<ExtraLayer>) -> Result<(), Error> 
     Ok(())
 }
 
-/// Returns the filter of `config`, by default Tandem's crates from `level` up and warnings of other crates.
+/// Returns the filter of `config`, by default Tandem's crates from `level` up and warnings of other crates, except
+/// those of Foxglove's server about its viewers: one that goes away is no error of the program.
 fn filter(level: LevelFilter, config: &LogConfig) -> Result<Targets, Error> {
-    let directives = config.directives.clone().unwrap_or_else(|| format!("warn,tandem={level}"));
+    let by_default = || format!("warn,foxglove::websocket=off,tandem={level}");
+    let directives = config.directives.clone().unwrap_or_else(by_default);
     match directives.parse::<Targets>() {
         Ok(filter) if filter.iter().all(|(target, _)| is_target(target)) => Ok(filter),
         parsed => Err(Error::LogFilter { filter: directives, source: parsed.err() }),
@@ -78,6 +80,19 @@ fn is_target(name: &str) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_viewer_that_goes_away_is_no_error_unless_directives_ask_for_it() {
+        let passes = |directives: Option<&str>, target: &str| {
+            let directives = directives.map(str::to_owned);
+            let config = LogConfig { directives, ..LogConfig::default() };
+            let filter = filter(LevelFilter::INFO, &config).expect("well-formed");
+            filter.would_enable(target, &tracing::Level::ERROR)
+        };
+        let server = "foxglove::websocket::connected_client";
+        assert!(!passes(None, server) && passes(Some("info"), server));
+        assert!(passes(None, "foxglove::mcap_writer") && passes(None, "h2::server"));
+    }
 
     #[test]
     fn a_filter_is_a_list_of_levels_and_module_levels() {

@@ -16,7 +16,7 @@ import time
 import urllib.error
 import urllib.request
 
-from devtools import Browser
+from devtools import Browser, ended_after
 
 MOTION = pathlib.Path(__file__).resolve().parents[2] / "deploy" / "first-motion.json"
 # The causes of stops that a busy machine may produce.
@@ -33,14 +33,15 @@ class Bridge:
         command = [self.program, "bridge", "--driver", "sim", "--listen", "127.0.0.1:0"]
         self.process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
                                         stderr=subprocess.PIPE, text=True)
-        self.address = self.process.stdout.readline().split()[-1]
         self.url, self.lines = None, []
-        for line in self.process.stderr:
-            self.lines.append(line)
-            if found := re.search(r"dashboard on (http://\S+/)", line):
-                self.url = found[1]
-                break
-        assert self.url, "".join(self.lines)
+        with ended_after(self.process, "the address of its page"):
+            self.address = self.process.stdout.readline().strip().rpartition(" ")[2]
+            for line in self.process.stderr:
+                self.lines.append(line)
+                if found := re.search(r"dashboard on (http://\S+/)", line):
+                    self.url = found[1]
+                    break
+        assert self.url and self.address, "the bridge ended without a page: " + "".join(self.lines)
 
     def __enter__(self):
         return self
@@ -101,6 +102,16 @@ def check_motion(page, _mover):
     print(f"{pictures / seconds:.1f} different pictures of the arms per second, longest pause {longest:.2f} s")
     assert pictures / seconds >= 5 and longest < 1, (pictures, seconds, longest)
     assert page.value("document.querySelectorAll('#view-above .planned').length") == 2
+    check_times(page)
+
+
+def check_times(page):
+    """The progress is in seconds on the clock, and the three times fit together."""
+    text = page.value("document.getElementById('motion-text').textContent")
+    found = re.search(r": ([\d.]+) of ([\d.]+) s at speed ([\d.]+), about (\d+):(\d\d) left", text)
+    assert found, text
+    played_s, duration_s, _, minutes, seconds = map(float, found.groups())
+    assert abs(played_s + 60 * minutes + seconds - duration_s) <= 1.2, text
 
 
 def check_stop(page, bridge, mover, press, how):

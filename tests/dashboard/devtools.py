@@ -1,6 +1,7 @@
 """A page in headless Chromium, driven over the DevTools protocol. Needs the standard library only."""
 
 import base64
+import contextlib
 import json
 import os
 import pathlib
@@ -9,8 +10,31 @@ import socket
 import struct
 import subprocess
 import tempfile
+import threading
 import time
 import urllib.request
+
+# Time within which a program prints the address of its page, on a busy machine too.
+START_S = 120
+
+
+@contextlib.contextmanager
+def ended_after(process, what, seconds=START_S):
+    """Kills a process that has not printed `what` within `seconds`, which ends reading from its pipes."""
+    expired = threading.Event()
+
+    def end():
+        expired.set()
+        process.kill()
+
+    timer = threading.Timer(seconds, end)
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
+    if expired.is_set():
+        raise AssertionError(f"not within {seconds} s: {process.args[1]} prints {what}")
 
 
 class Browser:

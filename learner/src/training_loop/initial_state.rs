@@ -84,6 +84,7 @@ impl InitialState {
             units_per_episode: u32::try_from(layout.episode_steps())
                 .expect("an episode has few steps"),
             view: context.shared.teacher.clone(),
+            clock: config.clock.clone(),
             start: match self.is_resumed {
                 true => RunStart::Resumed { spent: self.trainer.counters().advice_spent },
                 false => RunStart::New,

@@ -75,6 +75,7 @@ impl<'a> ProgressPublisher<'a> {
             progress.max_minutes = run.stop.max_minutes;
             progress.counters = counters;
             progress.wall_s = self.wall_s();
+            progress.wall_before_s = self.wall_before_s;
             progress.env_steps_per_s = rates.env_steps_per_s;
             progress.updates_per_s = rates.updates_per_s;
             progress.budget_left = budget_left(self.config, counters);

@@ -1,0 +1,160 @@
+//! Watches the run's account at the teacher, beside the learning thread.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
+
+use tandem_net::{AuthChannel, within};
+use tandem_proto::pb;
+use tandem_proto::pb::teacher_client::TeacherClient;
+use tandem_telemetry::{TeacherState, TeacherView};
+use tokio::sync::watch;
+use tonic::{Code, Status};
+
+use super::CALL_DEADLINE;
+use crate::shared::Clock;
+use crate::warnings::{Source, Warnings};
+
+/// Pause between two checks whether the teacher still knows the account. Workers wait for a lost account to be opened
+/// again.
+const CHECK_PERIOD: Duration = Duration::from_secs(1);
+/// Time without an answer after which the run has a warning. A supervisor restarts its teacher within this time.
+const WARN_AFTER: Duration = Duration::from_secs(5);
+/// Largest number of characters of an error in the warning.
+const MAX_ERROR_CHARS: usize = 200;
+
+/// Asks for the account about once a second.
+pub(super) struct AccountWatcher {
+    client: TeacherClient<AuthChannel>,
+    /// Set when the teacher reports that it does not know the account.
+    lost: Arc<AtomicBool>,
+    status: TeacherStatus,
+}
+
+impl AccountWatcher {
+    pub(super) fn new(
+        client: TeacherClient<AuthChannel>,
+        lost: Arc<AtomicBool>,
+        (warnings, view): (Warnings, watch::Sender<TeacherView>),
+        clock: Clock,
+    ) -> Self {
+        let status = TeacherStatus { warnings, view, clock, silent_since: None, is_warned: false };
+        Self { client, lost, status }
+    }
+
+    pub(super) async fn watch(mut self, name: String) {
+        loop {
+            tokio::time::sleep(CHECK_PERIOD).await;
+            let look = self.client.get_account(pb::GetAccountRequest { name: name.clone() });
+            let answer = within(CALL_DEADLINE, look).await.map(tonic::Response::into_inner);
+            if self.status.record(answer) == TeacherState::Lost {
+                self.lost.store(true, Ordering::Relaxed);
+            }
+        }
+    }
+}
+
+/// The state of the teacher, as displays and the progress show it.
+struct TeacherStatus {
+    /// Receives the teacher's warning.
+    warnings: Warnings,
+    /// Receives the state of the teacher.
+    view: watch::Sender<TeacherView>,
+    clock: Clock,
+    /// Time of the first failed call since the latest answer.
+    silent_since: Option<Duration>,
+    /// True while the warning is about that silence.
+    is_warned: bool,
+}
+
+impl TeacherStatus {
+    /// Records the answer to a call and returns the state that it shows.
+    fn record(&mut self, answer: Result<pb::Account, Status>) -> TeacherState {
+        let (state, error) = match &answer {
+            Ok(account) => {
+                self.end_silence(&account.warning);
+                (TeacherState::Answering, String::new())
+            }
+            Err(status) if status.code() == Code::NotFound => {
+                self.end_silence("");
+                (TeacherState::Lost, status.message().to_owned())
+            }
+            Err(status) => {
+                self.warn_of_silence(status.message());
+                (TeacherState::Unreachable, status.message().to_owned())
+            }
+        };
+        self.view.send_modify(|view| {
+            (view.state, view.error) = (state, error);
+            if let Ok(pb::Account { name, budget, spent, leased, warning, .. }) = answer {
+                (view.account, view.ledger_warning) = (name, warning);
+                (view.budget, view.spent, view.leased) = (budget, spent, leased);
+            }
+        });
+        state
+    }
+
+    /// Warns once of a teacher that has not answered for [`WARN_AFTER`]; later errors may differ from the first.
+    fn warn_of_silence(&mut self, error: &str) {
+        let now = (self.clock)();
+        let silence = now.saturating_sub(*self.silent_since.get_or_insert(now));
+        if silence < WARN_AFTER || self.is_warned {
+            return;
+        }
+        self.is_warned = true;
+        let error: String = error.chars().take(MAX_ERROR_CHARS).collect();
+        let warning = format!("the teacher does not answer, the run waits for it: {error}");
+        self.warnings.set(Source::Teacher, &warning);
+    }
+
+    /// Replaces the warning by that of a teacher that answers.
+    fn end_silence(&mut self, warning: &str) {
+        (self.silent_since, self.is_warned) = (None, false);
+        self.warnings.set(Source::Teacher, warning);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::atomic::AtomicU64;
+
+    use super::*;
+    use crate::progress::Progress;
+
+    #[test]
+    fn a_silent_teacher_is_warned_of_once_and_until_it_answers() {
+        let (progress, shown) = watch::channel(Progress::default());
+        let (view, _) = watch::channel(TeacherView::default());
+        let now_s = Arc::new(AtomicU64::new(0));
+        let time = now_s.clone();
+        let clock: Clock = Arc::new(move || Duration::from_secs(time.load(Ordering::Relaxed)));
+        let mut status = TeacherStatus {
+            warnings: Warnings::new(progress),
+            view,
+            clock,
+            silent_since: None,
+            is_warned: false,
+        };
+        let mut check = |at_s, answer: Result<&str, &str>, expected: &str| {
+            now_s.store(at_s, Ordering::Relaxed);
+            status.record(match answer {
+                Ok(warning) => {
+                    Ok(pb::Account { warning: warning.to_owned(), ..Default::default() })
+                }
+                Err(error) => Err(Status::unavailable(error)),
+            });
+            assert_eq!(shown.borrow().warning, expected, "at {at_s} s");
+        };
+        let silent = "the teacher does not answer, the run waits for it: refused";
+        check(100, Ok(""), "");
+        check(101, Err("timeout"), "");
+        check(105, Err("timeout"), "");
+        check(106, Err("refused"), silent);
+        check(107, Err("timeout"), silent);
+        check(108, Ok(""), "");
+        check(113, Err("refused"), "");
+        check(117, Err("refused"), "");
+        check(118, Err("refused"), silent);
+        check(119, Ok("the disk is full"), "the disk is full");
+    }
+}
