@@ -294,6 +294,7 @@ def check_events(run):
         "loss/critic": "critic_loss",
         "q/mean": "mean_q",
         "advice/spent": "advice_spent",
+        "advice/queries": "advice_queries",
     }
     for tag, key in tags.items():
         events = accumulator.Scalars(tag)

@@ -8,15 +8,22 @@ use anyhow::Context as _;
 use tandem_bridge::service::{Bridge, Config, Error};
 use tokio::runtime::{Builder, Runtime};
 
-use crate::cli::{BridgeArgs, BridgeCommand, BridgeServeArgs};
+use self::arms::Arms;
+use self::cell::Cell;
+use crate::cli::{BridgeArgs, BridgeCommand, BridgeServeArgs, DriverName};
 use crate::exit::{Exit, Failed, OrExit as _};
 use crate::version::VERSION;
 use crate::{access, clock, metrics, service, signals};
 
 mod arms;
+mod calibrate;
+mod cell;
 mod file;
+mod inject;
+mod model;
 mod operator;
 mod play;
+mod priority;
 mod show;
 mod trial;
 mod view;
@@ -35,34 +42,48 @@ pub(crate) fn bridge(args: BridgeArgs) -> Result<(), Failed> {
         Some(BridgeCommand::Describe(args)) => operator::describe(&args),
         Some(BridgeCommand::Reset(args)) => operator::reset(&args),
         Some(BridgeCommand::Move(args)) => play::play(&args),
+        Some(BridgeCommand::Cell(args)) => cell::cell(&args),
+        Some(BridgeCommand::Arms(args)) => model::serve(&args),
+        Some(BridgeCommand::Calibrate(args)) => calibrate::calibrate(args),
+        Some(BridgeCommand::Inject(args)) => inject::inject(&args),
         Some(BridgeCommand::Trial(args)) => trial::trial(&args),
     }
 }
 
 fn serve(args: BridgeServeArgs) -> Result<(), Failed> {
+    let cell = Cell::load(args.arms.cell.as_deref())?;
+    cell.require_measured(args.arms.driver, args.accept_defaults)?;
     let own = metrics::of_process("bridge");
     let server_config =
         access::server_config(&args.listen, &args.secret)?.with_metrics(own.clone());
     let secret = secret().or_exit(Exit::TryAgain, || format!("cannot read {ENTROPY}"))?;
-    let live = watch::live(&args)?;
+    let live = watch::live(&args, cell.file.arms.len())?;
     let runtime = runtime().or_exit(Exit::TryAgain, String::new)?;
     runtime.block_on(async move {
         let shutdown = signals::shutdown_token(args.listen.exit_with_stdin)?;
         let clock = Arc::new(clock::BridgeClock::new());
-        let (executor, reconnect) = arms::arms(&args, clock.clone())?;
+        let arms = Arms::connect(&args.arms, &cell, clock.clone())?;
         metrics::serve(&args.metrics, &own).await?;
-        let plan = watch::Plan::of(&args, &server_config, live).await?;
+        let plan = watch::Plan::of(&args, &cell, &server_config, live).await?;
         let listener = service::listen(&args.listen).await?;
         let config = Config {
-            driver: arms::name(args.driver).to_owned(),
+            driver: arms::name(args.arms.driver).to_owned(),
             version: VERSION.to_owned(),
             speed: args.speed,
             clock,
-            reconnect,
+            reconnect: arms.reconnect,
+            cell: cell.file,
+            cell_name: cell.name,
+            injector: arms.injector,
+            prepare_thread: Some(match args.arms.driver {
+                DriverName::Sim => priority::raise_if_permitted,
+                DriverName::Quarc | DriverName::KinovaRos => priority::raise,
+            }),
             secret,
         };
         let (observer, snapshots) = plan.observer();
-        let bridge = Bridge::start(executor, config, observer, &shutdown).map_err(bridge_failed)?;
+        let bridge =
+            Bridge::start(arms.executor, config, observer, &shutdown).map_err(bridge_failed)?;
         let watching = plan.start(&args, &bridge.operator(), snapshots)?;
         let served = bridge.serve(listener, &server_config).await;
         watching.finish();

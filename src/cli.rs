@@ -18,7 +18,8 @@ mod trial;
 
 pub(crate) use bench::{BenchArgs, BenchName, ScaleArgs};
 pub(crate) use bridge::{
-    BridgeArgs, BridgeCommand, BridgeServeArgs, ConnectArgs, DriverName, MoveArgs, OperatorArgs,
+    ArmsArgs, ArmsServeArgs, BridgeArgs, BridgeCommand, BridgeServeArgs, CalibrateArgs, CellArgs,
+    ConnectArgs, DriverName, FaultName, InjectArgs, MoveArgs, OperatorArgs,
 };
 pub(crate) use monitor::{HealthArgs, StatusArgs};
 pub(crate) use policy::{ExportArgs, ImportArgs, PolicyArgs, PolicyCommand, ShowArgs};

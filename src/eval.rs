@@ -163,7 +163,14 @@ fn record(
         return Err(Failed::usage(format!("cannot write {path:?}: it is not a regular file")));
     }
     let number = episode.number;
-    let order = EpisodeOrder { number, seed, advised: false, uniform: false, record: true };
+    let order = EpisodeOrder {
+        number,
+        seed,
+        advised: false,
+        uniform: false,
+        record: true,
+        advised_steps: None,
+    };
     let metadata = metadata_of(order, episode, terms, subject.policy().digest());
     match record_episode(&metadata, episode, path) {
         Ok(_) => Ok(()),

@@ -39,6 +39,7 @@ mod progress_text;
 mod replay;
 mod report;
 mod run_directory;
+mod run_display;
 mod run_file;
 mod run_pages;
 mod runtime;

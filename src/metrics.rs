@@ -1,5 +1,7 @@
 //! The metrics of a service's process, and the page that serves them.
 
+use std::net::SocketAddr;
+
 use tandem_net::Metrics;
 use tandem_net::metrics::{ConstCounter, ConstGauge, Info, Registry};
 use tandem_system::process::{ProcessUsage, ResidentMemory};
@@ -32,12 +34,23 @@ fn add_process(registry: &mut Registry, start_s: f64) {
     registry.register("process_start_time_seconds", help, ConstGauge::new(start_s));
 }
 
+/// Checks that the address of the page is free, if there is one.
+pub(crate) fn check_address(args: &MetricsArgs) -> Result<(), Failed> {
+    args.metrics_listen.map_or(Ok(()), |address| {
+        let bound = std::net::TcpListener::bind(address);
+        bound.map(drop).or_exit(Exit::TryAgain, || cannot_listen(address))
+    })
+}
+
+fn cannot_listen(address: SocketAddr) -> String {
+    format!("cannot listen on {address} for --metrics-listen")
+}
+
 /// Binds the address of the page, if there is one.
 pub(crate) async fn listen(args: &MetricsArgs) -> Result<Option<TcpListener>, Failed> {
     let Some(address) = args.metrics_listen else { return Ok(None) };
     let bound = TcpListener::bind(address).await;
-    let cannot = || format!("cannot listen on {address} for --metrics-listen");
-    let listener = bound.or_exit(Exit::TryAgain, cannot)?;
+    let listener = bound.or_exit(Exit::TryAgain, || cannot_listen(address))?;
     if let Ok(address) = listener.local_addr() {
         tracing::info!(%address, "serving Prometheus metrics, without a token");
     }

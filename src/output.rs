@@ -4,7 +4,7 @@
 //! they end no run and no service.
 
 use std::fmt::Display;
-use std::io::{self, ErrorKind, Write as _};
+use std::io::{self, ErrorKind, IsTerminal as _, Write as _};
 use std::process::ExitCode;
 use std::time::Duration;
 
@@ -41,6 +41,11 @@ fn checked(written: io::Result<()>) -> Result<(), Failed> {
             Failed::new(Exit::Output, error)
         }
     })
+}
+
+/// Returns whether both standard output and standard error are terminals.
+pub(crate) fn is_terminal() -> bool {
+    io::stdout().is_terminal() && io::stderr().is_terminal()
 }
 
 /// Writes a line to standard error without waiting.

@@ -19,6 +19,7 @@ pub(crate) fn progress_json(progress: &pb::Progress) -> Value {
         "episodes": progress.episodes, "updates": progress.updates, "wall_s": progress.wall_s,
         "env_steps_per_s": progress.env_steps_per_s, "updates_per_s": progress.updates_per_s,
         "advice_spent": progress.advice_spent, "budget_left": progress.budget_left,
+        "advice_queries": progress.advice_queries,
         "training_success": progress.training_success,
         "evaluation": progress.evaluation.as_ref().map(evaluation_json),
         "best": progress.best.as_ref().map(evaluation_json),

@@ -83,10 +83,13 @@ pub(crate) fn state_lines(progress: &pb::Progress) -> Vec<String> {
     lines
 }
 
-/// Returns the advice that the run has spent; `None` if it asks for none.
+/// Returns the advice that the run has spent and the steps on which it asked; `None` if it asks for none.
 pub(crate) fn advice_text(progress: &pb::Progress) -> Option<String> {
     let (spent, left) = (progress.advice_spent, progress.budget_left);
-    (spent > 0 || left > 0).then(|| format!("{} spent, {} left", grouped(spent), grouped(left)))
+    let queries = progress.advice_queries.map(|queries| format!(", {} queries", grouped(queries)));
+    let queries = queries.unwrap_or_default();
+    (spent > 0 || left > 0)
+        .then(|| format!("{} spent, {} left{queries}", grouped(spent), grouped(left)))
 }
 
 /// Returns what each worker does, or how many do it if there are many.

@@ -136,12 +136,11 @@ fn overlay(from_file: Table, settings: &[(String, Value)]) -> anyhow::Result<Run
 fn set_evaluation_schedule(config: &mut RunConfig, changes: &Table) {
     let is_set = |key| changes.get("evaluation").is_some_and(|section| section.get(key).is_some());
     let evaluation = &mut config.evaluation;
-    let shortest = config.stop.max_env_steps / MIN_REGULAR_EVALUATIONS;
-    let is_short = (1..evaluation.every_env_steps).contains(&shortest);
+    let every_env_steps = shortened_interval(evaluation.every_env_steps, config.stop.max_env_steps);
     let n_early = match is_set("every_env_steps") {
         true => 0,
-        false if is_short => {
-            evaluation.every_env_steps = shortest;
+        false if every_env_steps < evaluation.every_env_steps => {
+            evaluation.every_env_steps = every_env_steps;
             1
         }
         false => evaluation.early_points,
@@ -149,6 +148,21 @@ fn set_evaluation_schedule(config: &mut RunConfig, changes: &Table) {
     if !is_set("early_points") {
         evaluation.early_points = n_early;
     }
+}
+
+/// Returns the interval between evaluations, shortened for a run of few environment steps.
+fn shortened_interval(every_env_steps: u64, max_env_steps: u64) -> u64 {
+    match max_env_steps / MIN_REGULAR_EVALUATIONS {
+        0 => every_env_steps,
+        shortest => shortest.min(every_env_steps),
+    }
+}
+
+/// Returns whether the interval between evaluations is the one that follows from recipe and length.
+pub(crate) fn has_default_interval(config: &RunConfig) -> bool {
+    let of_recipe = RunConfig::defaults(config.recipe, Task::Push, config.arms).evaluation;
+    let default = shortened_interval(of_recipe.every_env_steps, config.stop.max_env_steps);
+    config.evaluation.every_env_steps == default
 }
 
 /// Formats an error on one line, with long texts shortened.

@@ -14,6 +14,7 @@ use crate::columns::wrapped;
 use crate::exit::{Exit, Failed, OrExit as _};
 use crate::progress_json::progress_json;
 use crate::progress_text::{counts_line, evaluation_line, state_lines, warning_line};
+use crate::run_display::Display;
 use crate::{access, call_failure, output, runtime};
 
 /// Timeout of a call.
@@ -42,13 +43,18 @@ async fn show(learner: &mut LearnerClient<AuthChannel>, args: &StatusArgs) -> Re
     Ok(())
 }
 
-/// Prints a line for each evaluation and every half minute, or each message as JSON, until the run has ended.
+/// Shows the progress until the run has ended: live on a terminal, elsewhere a line for each evaluation and every half
+/// minute, or each message as JSON.
 async fn watch(learner: &mut LearnerClient<AuthChannel>, args: &StatusArgs) -> Result<(), Failed> {
     let mut stream = call_with_timeout(learner.watch(pb::WatchRequest {})).await?;
     let (mut printed_round, mut printed_at_s) = (None, f64::NEG_INFINITY);
+    let is_live = !args.json && output::is_terminal();
+    let mut display = is_live.then(|| Display::new(false));
     while let Some(progress) = stream.message().await.map_err(|status| failed(&status))? {
         if args.json {
             output::print(progress_json(&progress))?;
+        } else if let Some(display) = &mut display {
+            display.show(&progress);
         } else if let Some(evaluation) = progress.evaluation.as_ref()
             && printed_round != Some(evaluation.round)
         {
@@ -59,6 +65,7 @@ async fn watch(learner: &mut LearnerClient<AuthChannel>, args: &StatusArgs) -> R
             output::print(counts_line(&progress))?;
         }
         if progress.ended {
+            display.iter_mut().for_each(Display::close);
             if !args.json {
                 output::print(format_args!("ended: {}", progress.end_reason))?;
             }

@@ -1,7 +1,6 @@
 //! `tandem train`: starts a learner, a teacher and workers as processes, supervises them and reports the result.
 
 mod arguments;
-mod display;
 mod environment_file;
 mod inputs;
 mod plan;
@@ -16,16 +15,20 @@ mod teacher_file;
 use std::time::{Duration, Instant};
 
 use anyhow::anyhow;
+use tandem_core::text::counted;
 use tandem_proto::pb;
 use tokio::sync::mpsc;
 use tokio_util::sync::CancellationToken;
 
 use crate::cli::TrainArgs;
+use crate::columns::wrapped;
 use crate::exit::{Exit, Failed, OrExit as _};
 use crate::live::LiveRun;
 use crate::progress_json::progress_json;
-use crate::{clock, output, runtime, served_task, settings_page, signals};
-use display::Display;
+use crate::run_display::Display;
+use crate::{
+    clock, environment_server, metrics, output, runtime, served_task, settings_page, signals,
+};
 use inputs::RunInputs;
 use plan::Plan;
 use processes::{PeakMemory, RunFailure, RunProcesses};
@@ -50,10 +53,12 @@ pub(crate) fn train(args: &TrainArgs) -> Result<(), Failed> {
     let environment = environment_file::environment_of(args)?;
     let served = served_task::of_server(&environment)?;
     let plan = Plan::of(args, environment, served.as_ref())?;
+    metrics::check_address(&args.metrics)?;
     let lock = RunLock::take(&plan)?;
     let service_locks = lock.wait_for_leftovers(&plan)?;
     plan.prepare()?;
     let inputs = RunInputs::write(&plan)?;
+    summary::remove(&plan.out)?;
     drop(service_locks);
     let live = args.live.live.map(|address| LiveRun::start(address, plan.logs())).transpose()?;
     let runtime = runtime::new().or_exit(Exit::TryAgain, String::new)?;
@@ -75,7 +80,8 @@ async fn run(
     interrupted: &CancellationToken,
     args: &TrainArgs,
 ) -> Result<(pb::Progress, PeakMemory), Failed> {
-    let mut display = Display::new(plan, args.quiet);
+    let mut display = Display::new(args.quiet);
+    announce(plan, &display);
     let mut processes = RunProcesses::new(plan).or_cannot_write(String::new)?;
     let started = tokio::select! {
         started = start(plan, &mut processes, &display) => started,
@@ -106,6 +112,24 @@ async fn run(
     }
     let last = pb::Progress { end_reason: INTERRUPTED.to_owned(), ..last };
     Ok((last, processes.peak_memory()))
+}
+
+/// Prints what is trained, and where its files are.
+fn announce(plan: &Plan, display: &Display) {
+    let config = &plan.config;
+    let (arms, workers) = (counted(config.arms, "arm"), counted(plan.n_workers, "worker"));
+    let (task, strategy, seed) = (&config.task, &config.advice.strategy, config.seed);
+    display.print(&wrapped(
+        &format!("training {task} with {arms}, strategy {strategy}, seed {seed}, {workers}"),
+        "  ",
+    ));
+    display.print(&format!("run directory {}", plan.out.display()));
+    if let Some(address) = plan.metrics {
+        display.print(&format!("Prometheus metrics on http://{address}/metrics"));
+    }
+    if let Some(server) = environment_server::shown(&plan.environment) {
+        display.print(&format!("environments of {server}"));
+    }
 }
 
 /// Starts all processes in time.

@@ -370,6 +370,7 @@ async fn submit_invalid_episodes(address: SocketAddr) {
         contacts: vec![0; 50],
         advice_charged: 0,
         avoidance_steps: None,
+        queried_steps: None,
     };
     for slot in 0..40 {
         let mut episode = whole.clone();

@@ -273,6 +273,115 @@ fn a_bridge_with_a_token_refuses_calls_without_it() {
     }
 }
 
+#[test]
+fn a_cell_file_describes_the_arms_and_operators_practise_a_stop() {
+    let directory = tempfile::tempdir().expect("a directory");
+    let path = directory.path().join("cell.toml");
+    let (cell, logs_at) = (path.to_string_lossy(), directory.path().join("logs"));
+    let printed = tandem(&["bridge", "cell"]).output().expect("runs");
+    let text = String::from_utf8(printed.stdout).expect("text");
+    let changed = text
+        .replace("[0.39, 0.0, 0.0]", "[0.41, 0.0, 0.0]")
+        .replace("name = \"right\"", "name = \"east\"")
+        .replace(
+            "yaw_degrees = 180.0",
+            "yaw_degrees = 180.0\nlag_s = 0.03\nreaction_s = 0.05\nbrake_s = 0.06",
+        );
+    std::fs::write(&path, &changed).expect("writes");
+    let bridge = Bridge::serve(&["--cell", &cell, "--record", &logs_at.to_string_lossy()]);
+    let described = bridge.json(&["describe"]);
+    let east = &described["arms"][1];
+    assert_eq!((&east["name"], &east["is_measured"]), (&json!("east"), &json!(true)));
+    assert_eq!(east["base_in_world_m"], json!([0.41, 0.0, 0.0]));
+    assert_eq!(
+        (&described["arms"][0]["is_measured"], &east["brake_s"]),
+        (&json!(false), &json!(0.06))
+    );
+    assert_eq!(described["limits"]["reaction_s"], json!(0.05));
+    assert_eq!(described["cell_file"], json!(cell));
+
+    let stopped = bridge.with_arms(|| {
+        let injected = bridge.json(&["inject", "emergency-stop", "--arm", "east"]);
+        assert_eq!(injected["injected"][0]["arm"], json!(1));
+        bridge.eventually(|status| status["stopped"]["name"] == json!("emergency-stop"))
+    });
+    assert_eq!(
+        (&stopped["stopped"]["arm"], &stopped["injected"][0]["fault"]),
+        (&json!(1), &json!("emergency-stop"))
+    );
+    assert_eq!(stopped["arms"][1]["emergency_stop"], json!(true));
+    fails_with(75, &bridge.run(&["reset"]), "good states");
+    let lines = bridge.run(&["status"]);
+    assert!(String::from_utf8_lossy(&lines.stdout).contains("drill   emergency-stop, arm 1"));
+    assert_eq!(bridge.json(&["inject", "--clear"])["injected"], json!([]));
+    bridge.reset();
+    fails_with(
+        64,
+        &bridge.run(&["inject", "torque", "--arm", "west"]),
+        "the arms are left and east",
+    );
+    fails_with(65, &bridge.run(&["inject", "torque", "--joint", "9"]), "fault.joint");
+    let log = logs(&logs_at).pop().expect("a log of the stop");
+    drop(bridge);
+    let bytes = std::fs::read(log).expect("a log");
+    let has = |text: &str| bytes.windows(text.len()).any(|part| part == text.as_bytes());
+    assert!(has("arm1.name") && has("0.41 0 0") && has("arm1.is_measured"));
+}
+
+#[test]
+fn real_arms_need_measured_times_and_a_cell_is_refused_with_its_key() {
+    let directory = tempfile::tempdir().expect("a directory");
+    let path = directory.path().join("cell.toml");
+    let cell = path.to_string_lossy();
+    let printed = tandem(&["bridge", "cell"]).output().expect("runs");
+    let text = String::from_utf8(printed.stdout).expect("text");
+    std::fs::write(&path, &text).expect("writes");
+    let refused = |args: &[&str], code, expected: &str| {
+        fails_with(code, &tandem(&[&["bridge"], args].concat()).output().expect("runs"), expected);
+    };
+    let real = ["--driver", "quarc", "--arms-at", "tcpip://127.0.0.1:1"];
+    refused(&real, 64, "real arms need a cell file");
+    let guessed = [&real[..], &["--cell", &cell]].concat();
+    refused(&guessed, 64, "no lag_s, reaction_s and brake_s of left and right: measure");
+    refused(&[&guessed[..], &["--accept-defaults"]].concat(), 75, "not connected");
+    std::fs::write(&path, text.replace("yaw_degrees = 0.0", "yaw = 0.0")).expect("writes");
+    refused(&["cell", &cell], 65, "unknown field `yaw`");
+    let close = text.replace("[0.39, 0.0, 0.0]", "[0.1, 0.0, 0.0]");
+    std::fs::write(&path, close).expect("writes");
+    refused(&["--cell", &cell, "--listen", "127.0.0.1:0"], 65, "simulated arms would start");
+}
+
+/// Returns the next line of `lines` that contains `wanted`.
+fn line_with(lines: &mut impl Iterator<Item = std::io::Result<String>>, wanted: &str) -> String {
+    let line = lines.map(|line| line.expect("text")).find(|line| line.contains(wanted));
+    line.unwrap_or_else(|| panic!("no line contains {wanted:?}"))
+}
+
+#[test]
+fn arms_in_a_process_of_their_own_brake_when_the_bridge_is_killed() {
+    let mut arms = tandem(&["bridge", "arms", "--listen", "127.0.0.1:0"]).spawn().expect("starts");
+    let mut told = BufReader::new(arms.stdout.take().expect("piped")).lines();
+    let address = line_with(&mut told, "listening on ");
+    let address = address.strip_prefix("listening on ").expect("an address");
+    let at = format!("tcpip://{address}");
+    let serve = ["bridge", "--driver", "quarc", "--arms-at", &at, "--accept-defaults"];
+    let serve = [&serve[..], &["--listen", "127.0.0.1:0", "--no-dashboard"]].concat();
+    let bridge = Bridge::spawn(tandem(&serve).stderr(Stdio::inherit()));
+    line_with(&mut told, "connected: ");
+    fails_with(75, &bridge.run(&["inject", "contact"]), "simulated arms only");
+    let mover = bridge.with_arms(|| bridge.moving());
+    // Dropping a bridge kills it.
+    drop(bridge);
+    line_with(&mut told, "no command for 50 ms: the drives brake");
+    line_with(&mut told, "the arms are at rest");
+    end(mover);
+    // A new bridge finds the arms where they are, stopped.
+    let bridge = Bridge::spawn(tandem(&serve).stderr(Stdio::inherit()));
+    assert_eq!(bridge.status()["stopped"]["name"], json!("not-reset"));
+    bridge.reset();
+    end(arms);
+}
+
 /// Returns the logs in a directory.
 fn logs(directory: &Path) -> Vec<PathBuf> {
     let entries = std::fs::read_dir(directory).expect("a directory");

@@ -7,9 +7,17 @@ use std::process::{Command, Stdio};
 use serde_json::Value;
 
 /// Strategies, each with a budget that runs out in the middle of the run.
-const STRATEGIES: [(&str, u64); 4] =
-    [("ea", 1_600), EAMC, ("mc-q:0.1", 600), ("mc-act:0.1", 1_600)];
+const STRATEGIES: [(&str, u64); 7] = [
+    ("ea", 1_600),
+    EAMC,
+    ("mc-q:0.1", 600),
+    ("mc-act:0.1", 1_600),
+    JSRL,
+    ("rlif:0.1", 600),
+    ("ts2c:0.1", 600),
+];
 const EAMC: (&str, u64) = ("eamc:0.1", 900);
+const JSRL: (&str, u64) = ("jsrl:20", 700);
 const N_WORKERS: [usize; 4] = [1, 2, 5, 16];
 /// Ten rounds of sixteen slots, so that sixteen workers have something to do; the policy is evaluated after each.
 const SMALL: [&str; 24] = [
@@ -56,6 +64,11 @@ fn one_worker_and_five_give_the_same_bits_when_advised_early() {
 #[test]
 fn one_worker_and_five_give_the_same_bits_when_advised_on_mistakes() {
     check(STRATEGIES[2], 1, &[1, 5]);
+}
+
+#[test]
+fn one_worker_and_five_give_the_same_bits_when_the_learner_ends_the_advice() {
+    check(JSRL, 1, &[1, 5]);
 }
 
 #[test]

@@ -1,6 +1,8 @@
 //! Whole runs from the command line, with signals sent to their processes.
 
 use std::fs;
+use std::io::{Read as _, Write as _};
+use std::net::{SocketAddr, TcpListener, TcpStream};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};
 use std::sync::LazyLock;
@@ -77,6 +79,19 @@ fn metrics(out: &Path) -> Vec<Value> {
 fn check_undisturbed_result(ended: &Output, out: &Path) {
     assert_eq!(digest(ended), UNDISTURBED.0);
     assert_eq!(metrics(out), UNDISTURBED.1);
+    let summary = fs::read_to_string(out.join("summary.json")).expect("a summary");
+    let printed = String::from_utf8_lossy(&ended.stdout);
+    assert_eq!(printed.lines().last(), Some(summary.trim_end()));
+}
+
+/// Returns the page of metrics at `address`; empty while nobody serves it.
+fn page(address: SocketAddr) -> String {
+    let mut text = String::new();
+    if let Ok(mut stream) = TcpStream::connect(address) {
+        drop(stream.write_all(b"GET /metrics HTTP/1.1\r\nhost: a\r\nconnection: close\r\n\r\n"));
+        drop(stream.read_to_string(&mut text));
+    }
+    text
 }
 
 /// Returns the standard error of a run.
@@ -163,7 +178,15 @@ fn an_interrupted_run_resumes_to_the_same_result() {
 #[test]
 fn killed_processes_are_restarted_and_the_run_ends_like_an_undisturbed_one() {
     let (_keep, out) = run_directory();
-    let run = start("3", &out);
+    let occupied = TcpListener::bind("127.0.0.1:0").expect("a port");
+    let address = occupied.local_addr().expect("bound");
+    let served = ["--metrics-listen", &address.to_string()];
+    let refused = finish(start_with("3", &served, &out));
+    assert_eq!(refused.status.code(), Some(75));
+    assert!(stderr(&refused).contains(&format!("cannot listen on {address}")));
+    drop(occupied);
+
+    let run = start_with("3", &served, &out);
     wait_for_checkpoint(&out);
     let workers = pids(run.id(), "worker");
     assert_eq!(workers.len(), 3);
@@ -171,6 +194,8 @@ fn killed_processes_are_restarted_and_the_run_ends_like_an_undisturbed_one() {
     for role in ["learner", "teacher", "worker"] {
         kill_one(&run, role);
     }
+    let is_served = || page(address).contains("tandem_rounds_total");
+    assert!(eventually(is_served), "the new learner serves no metrics");
     let ended = finish(run);
     check_undisturbed_result(&ended, &out);
     let messages = stderr(&ended);
@@ -301,7 +326,7 @@ fn services_print_their_address_and_end_on_sigterm() {
     let mut output = std::io::BufReader::new(teacher.stdout.take().expect("piped"));
     std::io::BufRead::read_line(&mut output, &mut line).expect("a line");
     let address = line.trim().strip_prefix("listening on ").expect("the line").to_owned();
-    assert!(std::net::TcpStream::connect(&address).is_ok(), "{address}");
+    assert!(TcpStream::connect(&address).is_ok(), "{address}");
     let taken = Command::new(env!("CARGO_BIN_EXE_tandem"))
         .args([
             "learner",

@@ -107,6 +107,7 @@ fn slot(kind: Kind) -> SlotOrder {
         advised: kind == Kind::Advised,
         uniform: kind == Kind::Uniform,
         record: true,
+        advised_steps: None,
     };
     let played_for =
         if kind == Kind::Evaluation { EpisodeKind::Evaluation } else { EpisodeKind::Training };

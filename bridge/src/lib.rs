@@ -2,7 +2,7 @@
 //!
 //! [`driver`] is the contract between the executor and a pair of arms. [`executor`] plays a checked motion through a
 //! driver and enforces the limits of every command. [`work_cell`] places the arms and defines the limits of their
-//! motions. [`service`] offers the arms as `tandem.v1.Bridge`.
+//! motions, and [`cell_file`] reads both from a file. [`service`] offers the arms as `tandem.v1.Bridge`.
 //!
 //! The drivers of real arms are [`quarc`], for arms behind a Simulink model with QUARC, and [`kinova_ros`], for arms
 //! behind Kinova's ROS driver. The crate knows neither policies nor a simulator; crate `tandem-trials` has a simulated
@@ -12,8 +12,11 @@
 //! drivers of real arms know a wire format.
 #![warn(missing_docs)]
 
+pub mod calibration;
+pub mod cell_file;
 pub mod driver;
 pub mod executor;
+pub mod injection;
 pub mod kinova_ros;
 pub mod quarc;
 pub mod service;

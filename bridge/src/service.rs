@@ -32,7 +32,9 @@ use tokio_stream::wrappers::ReceiverStream;
 use tokio_util::sync::{CancellationToken, DropGuard};
 use tonic::{Request, Response, Status, Streaming};
 
+use crate::cell_file::CellFile;
 use crate::executor::{CheckedMotion, Executor, GOOD_STATES, Stop, StopCause, Token};
+use crate::injection::Injector;
 use error::status;
 use messages::{decode_token, token_text};
 use metrics::StopCounter;
@@ -40,6 +42,7 @@ use motion::MotionSpec;
 use thread::{ArmsHandle, ArmsThread};
 
 pub use clock::Clock;
+pub(crate) use clock::next_time;
 pub use error::Error;
 pub use motion::MotionError;
 pub use operator::Operator;
@@ -64,6 +67,14 @@ pub struct Config {
     pub clock: Arc<dyn Clock>,
     /// Replaces the driver if a reset finds that it has failed; `None` for arms that cannot lose their connection.
     pub reconnect: Option<Reconnect>,
+    /// The cell file of the arms.
+    pub cell: CellFile,
+    /// The name of the cell file; empty for the default cell.
+    pub cell_name: String,
+    /// Injects faults into simulated arms; `None` for real ones.
+    pub injector: Option<Injector>,
+    /// Prepares the thread that moves the arms, such as its priority. Called on that thread before the first tick.
+    pub prepare_thread: Option<fn()>,
     /// The secret seed of the tokens, which must differ at every start.
     pub secret: [u8; 32],
 }
@@ -115,7 +126,8 @@ impl Bridge {
         let ends = shutdown.child_token();
         let guard = ends.clone().drop_guard();
         let clock = Arc::clone(&config.clock);
-        let started = ArmsThread::spawn(executor, clock, observer, ends.clone());
+        let started =
+            ArmsThread::spawn(executor, clock, observer, config.prepare_thread, ends.clone());
         let (thread, arms) = started.map_err(Error::Thread)?;
         Ok(Self { thread, arms, config, ends, guard })
     }
@@ -268,12 +280,11 @@ impl BridgeService {
         spec: MotionSpec,
         then: impl FnOnce(CheckedMotion) -> T + Send + 'static,
     ) -> Result<T, Error> {
-        // After an invalid state there is none until the next one arrives.
-        self.arms.wait_until(|newest| newest.state.is_some()).await;
         let turn = tokio::time::timeout(CHECK_TIMEOUT, Arc::clone(&self.checks).acquire_owned());
         let turn =
             turn.await.map_err(|_elapsed| Error::Busy)?.map_err(|_closed| Error::ShuttingDown)?;
-        let newest = self.arms.newest();
+        // After an invalid state, which stops the arms, there is none until the next one arrives.
+        let newest = self.arms.wait_until(|newest| newest.state.is_some()).await;
         let state = newest.state.clone().ok_or(Error::NoState)?;
         let checker = self.arms.checker.clone();
         let checking = tokio::task::spawn_blocking(move || {
@@ -302,10 +313,11 @@ impl BridgeService {
             driver: config.driver.clone(),
             version: config.version.clone(),
             period_s: self.arms.period_s,
-            arms: cell.arms.iter().map(messages::describe_arm).collect(),
+            arms: messages::describe_arms(&self.arms.checker, &config.cell),
             table_z_m: cell.table_z_m,
             task_frame: Some(messages::task_frame(cell)),
             limits: Some(messages::limits(&self.arms.checker, config.speed)),
+            cell_file: config.cell_name.clone(),
         }
     }
 
@@ -328,7 +340,36 @@ impl BridgeService {
             motion,
             now_s: newest.now_s,
             since_tick_s: (self.arms.clock.now_s() - newest.now_s).max(0.0),
+            injected: self.injected(),
         }
+    }
+
+    /// Injects a fault into simulated arms, or clears all of them. Returns the present ones.
+    fn inject_fault(&self, request: pb::InjectRequest) -> Result<Vec<pb::FaultInjection>, Error> {
+        use pb::inject_request::Action;
+        let action = request.action;
+        let action = action.ok_or_else(|| DecodeError::new("action", "fault or clear", "none"))?;
+        let Some(injector) = &self.config.injector else {
+            return Err(Error::RealArms { driver: self.config.driver.clone() });
+        };
+        match action {
+            Action::Fault(fault) => {
+                let fault = messages::decode_fault(fault, self.arms.checker.cell());
+                let fault = fault.map_err(|error| error.within("fault"))?;
+                tracing::warn!(?fault, "a fault was injected");
+                injector.add(fault);
+            }
+            Action::Clear(pb::ClearFaults {}) => {
+                tracing::info!("the injected faults were cleared");
+                injector.clear();
+            }
+        }
+        Ok(self.injected())
+    }
+
+    fn injected(&self) -> Vec<pb::FaultInjection> {
+        let faults = self.config.injector.as_ref().map(Injector::faults).unwrap_or_default();
+        faults.into_iter().map(messages::fault).collect()
     }
 }
 
@@ -403,5 +444,14 @@ impl BridgeRpc for BridgeService {
         _: Request<pb::BridgeStatusRequest>,
     ) -> Result<Response<pb::BridgeStatusResponse>, Status> {
         Ok(Response::new(self.current_status()))
+    }
+
+    async fn inject(
+        &self,
+        request: Request<pb::InjectRequest>,
+    ) -> Result<Response<pb::InjectResponse>, Status> {
+        let injected = self.inject_fault(request.into_inner());
+        let injected = injected.map_err(|error| status(&error))?;
+        Ok(Response::new(pb::InjectResponse { injected }))
     }
 }

@@ -87,6 +87,8 @@ pub struct Episode {
     pub advice_charged: u32,
     /// Number of steps in which the link avoidance limited the motion of an arm, if the environment counts them.
     pub avoidance_steps: Option<u32>,
+    /// Number of steps on which the teacher was asked, if the worker counts them.
+    pub queried_steps: Option<u32>,
 }
 
 impl Episode {
@@ -106,6 +108,7 @@ impl Episode {
             contacts: vec![Contacts::NONE; n_steps],
             advice_charged: 0,
             avoidance_steps: None,
+            queried_steps: None,
             layout,
         }
     }

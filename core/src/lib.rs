@@ -120,6 +120,7 @@
 //!     contacts: vec![Contacts::NONE; EPISODE_STEPS],
 //!     advice_charged: 0,
 //!     avoidance_steps: None,
+//!     queried_steps: None,
 //! };
 //! let summary = EvaluationSummary::of(&[EpisodeOutcome::of(&episode)]);
 //! assert_eq!(summary.success, 1.0);
@@ -129,7 +130,7 @@
 //! # Modules in reading order
 //!
 //! [`task`], [`layout`] (the built-in tasks), [`reward`], [`rng`], [`episode`], [`evaluation`]; then [`settings`] and [`work`] (what a learner assigns
-//! to workers), [`advice`] (queries to a teacher and its answers), [`bounds`] (plausible ranges of observations),
+//! to workers), [`strategy`] (the names of the strategies), [`advice`] (queries to a teacher and its answers), [`bounds`] (plausible ranges of observations),
 //! [`scene`] (snapshots for pictures and logs) and [`text`] (texts in messages).
 #![warn(missing_docs)]
 
@@ -142,6 +143,7 @@ pub mod reward;
 pub mod rng;
 pub mod scene;
 pub mod settings;
+pub mod strategy;
 pub mod task;
 pub mod text;
 pub mod work;
@@ -152,4 +154,5 @@ pub use evaluation::{EpisodeOutcome, EvaluationSummary, Wilson};
 pub use layout::{ArmIndex, Layout, Task, World};
 pub use rng::{Stream, episode_rng};
 pub use settings::{AdviceTerms, AdviceUnit, Exploration, JudgedAction, WorldSettings};
+pub use strategy::{Strategy, UnknownStrategy};
 pub use task::{TaskDescription, TaskSpec};

@@ -34,6 +34,17 @@ pub struct EpisodeOrder {
     pub uniform: bool,
     /// Whether to record the episode in a log.
     pub record: bool,
+    /// The number of steps, from the first one on, on which an advised episode asks; `None` means all.
+    pub advised_steps: Option<u32>,
+}
+
+impl EpisodeOrder {
+    /// Returns true if the episode is to ask on step `step_idx`, from 0.
+    #[must_use]
+    pub fn asks_on(&self, step_idx: usize) -> bool {
+        let is_before_end = |n_steps| u32::try_from(step_idx).is_ok_and(|step| step < n_steps);
+        self.advised && self.advised_steps.is_none_or(is_before_end)
+    }
 }
 
 /// The start of an episode in an environment. Together with the actions it determines the episode.
@@ -81,4 +92,23 @@ pub struct PublishedActor {
     pub goal_mean: Vec<f32>,
     /// Standard deviation of goals, shape `[n_goal]`.
     pub goal_std: Vec<f32>,
+    /// When to ask for advice; `None` means always.
+    pub gate: Option<PublishedGate>,
+}
+
+/// The critics whose disagreement decides when a student asks for advice. Their inputs are normalised as the actor's.
+#[derive(Debug, Clone, PartialEq)]
+pub struct PublishedGate {
+    /// Number of critics, at least 2.
+    pub n_critics: usize,
+    /// Units of each hidden layer.
+    pub n_hidden: usize,
+    /// Number of hidden layers.
+    pub n_hidden_layers: usize,
+    /// Values per action: 1, or one per arm.
+    pub n_heads: usize,
+    /// The parameters of each critic in turn, shape `[n_critics, n_parameters]`.
+    pub critics: Vec<f32>,
+    /// The standard deviation of their values above which to ask, at least 0.
+    pub threshold: f32,
 }

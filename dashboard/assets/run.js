@@ -147,7 +147,8 @@ function showAdvice(s) {
   const pair = (...texts) => el("p", { class: "pairs" }, texts.map((text) => el("span", {}, text)));
   const budget = el("div", {}, meter(s.advice_spent, 0), pair(
     `${count(s.advice_spent)} of ${count(total)} units spent (${percent(s.advice_spent / total)})`,
-    `${count(s.advice_left)} left`, `${count(s.advice_per_min)} per minute`));
+    `${count(s.advice_left)} left`, `${count(s.advice_per_min)} per minute`),
+  pair(`teacher asked on ${count(s.advice_queries)} of ${count(s.env_steps)} training steps`));
   budget.querySelector("i").style.width = `${(100 * s.advice_spent) / total}%`;
   byId("advice-budget").replaceChildren(budget);
   const arms = s.acted.map((arm, idx) => {

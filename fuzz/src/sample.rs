@@ -52,6 +52,7 @@ pub fn episode(number: u64) -> Episode {
         contacts: vec![Contacts::ARM_TABLE; EPISODE_STEPS],
         advice_charged: 3,
         avoidance_steps: Some(2),
+        queried_steps: Some(4),
     }
 }
 

@@ -53,7 +53,8 @@ fn add_progress(registry: &mut Registry, progress: &Progress) {
         ("strategy", progress.strategy.clone()),
     ];
     registry.register("run", "What is learned, and how it is advised", Info::new(labels));
-    let Counters { round, env_steps, episodes, updates, advice_spent } = progress.counters;
+    let Counters { round, env_steps, episodes, updates, advice_spent, advice_queries } =
+        progress.counters;
     counter(registry, "rounds", "Rounds that were learned", round);
     counter(registry, "env_steps", "Training steps in environments", env_steps);
     counter(registry, "episodes", "Training episodes", episodes);
@@ -64,6 +65,8 @@ fn add_progress(registry: &mut Registry, progress: &Progress) {
         "Units of advice that learned episodes have cost",
         advice_spent,
     );
+    let help = "Training steps on which the teacher was asked";
+    counter(registry, "advice_queries", help, advice_queries);
     let left = progress.budget_left as f64;
     gauge(registry, "advice_left", "Units of advice that are left", left);
     gauge(registry, "wall_seconds", "Seconds of the run, resumed parts added up", progress.wall_s);

@@ -57,6 +57,7 @@ fn snapshot(shared: &Shared, run: &RunConfig, shown_s: f64) -> RunView {
         env_steps_per_s: progress.env_steps_per_s,
         updates_per_s: progress.updates_per_s,
         advice_spent: counters.advice_spent,
+        advice_queries: counters.advice_queries,
         advice_left: progress.budget_left,
         advice_per_min: progress.advice_per_min,
         training_success: progress.stats.training_success,

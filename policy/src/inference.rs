@@ -10,6 +10,10 @@ use crate::normalizer::NormalizerSnapshot;
 use crate::packed::{MAX_ROWS, PackedMlp};
 use crate::validation::{check_network_size, check_normalizer, check_parameters};
 
+mod gate;
+
+pub use gate::QueryGate;
+
 /// Normalisation of observations and goals for the input of a network.
 #[derive(Debug, Clone)]
 struct Inputs {
@@ -61,6 +65,7 @@ impl Inputs {
 #[derive(Debug, Clone)]
 pub struct Actor {
     version: u64,
+    gate: Option<QueryGate>,
     inputs: Inputs,
     network: PackedMlp,
 }
@@ -72,6 +77,7 @@ impl Actor {
     /// Returns an error if the parameters do not match `layout` or are not finite.
     pub fn new(layout: impl Into<TaskSpec>, published: PublishedActor) -> Result<Self, Error> {
         let layout = layout.into();
+        let gate = QueryGate::new(&layout, &published)?;
         let PublishedActor { version, n_hidden, n_hidden_layers, actor, .. } = published;
         check_network_size(n_hidden, n_hidden_layers)?;
         let shape = MlpShape::actor(&layout, n_hidden, n_hidden_layers);
@@ -80,7 +86,7 @@ impl Actor {
             NormalizerSnapshot { mean: published.observation_mean, std: published.observation_std };
         let goal = NormalizerSnapshot { mean: published.goal_mean, std: published.goal_std };
         let inputs = Inputs::new(layout, observation, goal)?;
-        Ok(Self { version, inputs, network: PackedMlp::new(&shape, &actor) })
+        Ok(Self { version, gate, inputs, network: PackedMlp::new(&shape, &actor) })
     }
 
     /// Returns the version under which the parameters were published.
@@ -93,6 +99,15 @@ impl Actor {
     #[must_use]
     pub const fn layout(&self) -> &TaskSpec {
         &self.inputs.layout
+    }
+
+    /// Returns true if a student that acts `action`, shape `[n_action]`, is to ask for advice: always without a
+    /// [gate](QueryGate). Shapes: `observation` `[n_observation]`, `goal` `[n_goal]`.
+    ///
+    /// # Panics
+    /// If the lengths do not match the layout.
+    pub fn asks(&mut self, observation: &[f32], goal: &[f32], action: &[f32]) -> bool {
+        self.gate.as_mut().is_none_or(|gate| gate.asks(observation, goal, action))
     }
 
     /// Writes the actions, in [−1, 1], shape `[n, n_action]`, for `observations`, shape `[n, n_observation]`, and

@@ -100,7 +100,7 @@ pub use adam::{Adam, polyak_update};
 pub use blind::BlindActor;
 pub use elementwise::{all_finite, tanh};
 pub use error::{Error, FormatError};
-pub use inference::{Actor, Critic};
+pub use inference::{Actor, Critic, QueryGate};
 pub use matrix::{Matrix, MatrixMut, multiply};
 pub use mlp::{MlpShape, Workspace, backward_input, backward_parameters, forward};
 pub use normalizer::{Normalizer, NormalizerSnapshot, NormalizerState};

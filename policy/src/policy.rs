@@ -102,6 +102,7 @@ impl Policy {
             observation_std: self.observation_normalizer.std.clone(),
             goal_mean: self.goal_normalizer.mean.clone(),
             goal_std: self.goal_normalizer.std.clone(),
+            gate: None,
         }
     }
 

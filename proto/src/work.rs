@@ -1,9 +1,10 @@
 //! Conversions for `learner.proto`: work that a learner assigns, parameters, and episodes that workers return.
 
 mod episode;
+mod parameters;
 
 use tandem_core::task::MAX_ARMS;
-use tandem_core::work::{EpisodeOrder, PublishedActor, RunTerms, SlotOrder};
+use tandem_core::work::{EpisodeOrder, RunTerms, SlotOrder};
 use tandem_core::{
     AdviceTerms, AdviceUnit, EpisodeKind, Exploration, JudgedAction, Layout, Task, TaskSpec,
     WorldSettings,
@@ -11,21 +12,18 @@ use tandem_core::{
 
 use crate::advice::decode_account_name;
 use crate::error::DecodeError;
-use crate::numbers::{count_within, finite_from_bytes, one_within, positive, to_bytes};
+use crate::numbers::{count_within, one_within};
 use crate::pb;
 use crate::task::{decode_task, encode_task};
 
 pub(crate) use episode::decode_contact;
 pub use episode::{decode_episode, encode_episode};
+pub use parameters::{decode_actor, encode_actor};
 
 /// Largest number of characters of an unknown name in an error message, which is sent in a header.
 const MAX_SHOWN_CHARS: usize = 40;
 /// Largest number of episodes per slot.
 pub(crate) const MAX_SLOT_EPISODES: usize = 1024;
-/// Largest number of units per hidden layer.
-const MAX_HIDDEN: u32 = 16_384;
-/// Largest number of hidden layers.
-const MAX_HIDDEN_LAYERS: u32 = 64;
 /// Largest number of physics steps per control step.
 pub(crate) const MAX_SUBSTEPS: u32 = 10_000;
 
@@ -188,6 +186,7 @@ const fn encode_episode_order(order: &EpisodeOrder) -> pb::EpisodeOrder {
         advised: order.advised,
         uniform: order.uniform,
         record: order.record,
+        advised_steps: order.advised_steps,
     }
 }
 
@@ -199,6 +198,7 @@ const fn decode_episode_order(order: pb::EpisodeOrder) -> EpisodeOrder {
         advised: order.advised,
         uniform: order.uniform,
         record: order.record,
+        advised_steps: order.advised_steps,
     }
 }
 
@@ -230,73 +230,6 @@ pub fn decode_slot(slot: pb::Slot) -> Result<SlotOrder, DecodeError> {
     })
 }
 
-/// Encodes an actor's parameters.
-///
-/// # Panics
-/// If a size exceeds `u32`.
-#[must_use]
-pub fn encode_actor(actor: &PublishedActor) -> pb::Parameters {
-    pb::Parameters {
-        version: actor.version,
-        n_hidden: u32::try_from(actor.n_hidden).expect("a layer has fewer than 2^32 units"),
-        n_layers: u32::try_from(actor.n_hidden_layers)
-            .expect("a network has fewer than 2^32 layers"),
-        actor: to_bytes(&actor.actor),
-        observation_mean: to_bytes(&actor.observation_mean),
-        observation_std: to_bytes(&actor.observation_std),
-        goal_mean: to_bytes(&actor.goal_mean),
-        goal_std: to_bytes(&actor.goal_std),
-    }
-}
-
-/// Decodes the parameters of an actor for `layout`.
-///
-/// # Errors
-/// Returns an error if a length does not match the layout and the network's size, a number is not finite or a standard
-/// deviation is not positive.
-pub fn decode_actor(
-    parameters: &pb::Parameters,
-    layout: impl Into<TaskSpec>,
-) -> Result<PublishedActor, DecodeError> {
-    let layout = layout.into();
-    let n_hidden = count_within("n_hidden", parameters.n_hidden, &(1..=MAX_HIDDEN))?;
-    let n_layers = count_within("n_layers", parameters.n_layers, &(1..=MAX_HIDDEN_LAYERS))?;
-    let (n_hidden, n_hidden_layers) = (to_usize(n_hidden), to_usize(n_layers));
-    let (n_observation, n_goal) = (layout.n_observation(), layout.n_goal());
-    let std = |field, bytes, n| positive(field, finite_from_bytes(field, bytes, n)?, n);
-    Ok(PublishedActor {
-        version: parameters.version,
-        n_hidden,
-        n_hidden_layers,
-        actor: finite_from_bytes(
-            "actor",
-            &parameters.actor,
-            n_parameters(&layout, n_hidden, n_hidden_layers),
-        )?,
-        observation_mean: finite_from_bytes(
-            "observation_mean",
-            &parameters.observation_mean,
-            n_observation,
-        )?,
-        observation_std: std("observation_std", &parameters.observation_std, n_observation)?,
-        goal_mean: finite_from_bytes("goal_mean", &parameters.goal_mean, n_goal)?,
-        goal_std: std("goal_std", &parameters.goal_std, n_goal)?,
-    })
-}
-
-/// Returns the number of parameters of an actor for `layout` with `n_hidden_layers >= 1` hidden layers of `n_hidden`
-/// units.
-fn n_parameters(layout: &TaskSpec, n_hidden: usize, n_hidden_layers: usize) -> usize {
-    let first = (layout.n_observation() + layout.n_goal() + 1) * n_hidden;
-    let inner = (n_hidden + 1) * n_hidden * (n_hidden_layers - 1);
-    first + inner + (n_hidden + 1) * layout.n_action()
-}
-
-/// Converts a count that is known to be small.
-fn to_usize(count: u32) -> usize {
-    usize::try_from(count).expect("indices have 32 bits or more")
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -326,6 +259,7 @@ mod tests {
             advised,
             uniform: !advised,
             record: advised,
+            advised_steps: advised.then_some(17),
         };
         SlotOrder {
             slot: 3,
@@ -335,21 +269,6 @@ mod tests {
         }
     }
 
-    fn actor() -> PublishedActor {
-        let ramp = |n: u16| (0..n).map(|i| f32::from(i) / 64.0 - 1.0).collect();
-        PublishedActor {
-            version: 12,
-            n_hidden: 5,
-            n_hidden_layers: 3,
-            actor: ramp(63 * 5 + 2 * 6 * 5 + 6 * 6),
-            observation_mean: ramp(56),
-            observation_std: vec![0.01; 56],
-            goal_mean: ramp(6),
-            goal_std: vec![2.0; 6],
-        }
-    }
-
-    /// Encodes and decodes a message.
     fn sent<M: prost::Message + Default>(message: &M) -> M {
         M::decode(message.encode_to_vec().as_slice()).unwrap()
     }
@@ -360,7 +279,6 @@ mod tests {
         let unadvised = RunTerms { account: None, run: String::new(), ..terms() };
         assert_eq!(decode_run_terms(sent(&encode_run_terms(&unadvised))), Ok(unadvised));
         assert_eq!(decode_slot(sent(&encode_slot(&slot()))), Ok(slot()));
-        assert_eq!(decode_actor(&sent(&encode_actor(&actor())), LAYOUT), Ok(actor()));
     }
 
     #[test]
@@ -418,27 +336,5 @@ mod tests {
         check(|s| s.kind = 0, "kind: expected 1 (training) or 2 (evaluation), got 0");
         check(|s| s.kind = 3, "kind: expected 1 (training) or 2 (evaluation), got 3");
         check(|s| s.episodes.clear(), "episodes: expected 1 to 1024 episodes, got 0");
-    }
-
-    #[test]
-    fn a_malformed_actor_is_refused_by_name() {
-        let check = |corrupt: fn(&mut pb::Parameters), message: &str| {
-            let mut malformed = encode_actor(&actor());
-            corrupt(&mut malformed);
-            assert_eq!(decode_actor(&malformed, LAYOUT).unwrap_err().to_string(), message);
-        };
-        check(|p| p.n_hidden = 6, "actor: expected 504 numbers, got 411 numbers");
-        check(|p| p.n_hidden = u32::MAX, "n_hidden: expected 1 to 16384, got 4294967295");
-        check(|p| p.n_layers = 0, "n_layers: expected 1 to 64, got 0");
-        check(
-            |p| p.actor.truncate(1643),
-            "actor: expected 1644 bytes, 4 per number, got 1643 bytes",
-        );
-        check(|p| p.goal_std[4..8].fill(0), "goal_std[1]: expected a finite number above 0, got 0");
-        check(|p| p.goal_mean[8..12].fill(0xff), "goal_mean[2]: expected a finite number, got NaN");
-        check(
-            |p| p.observation_mean.clear(),
-            "observation_mean: expected 56 numbers, got 0 numbers",
-        );
     }
 }

@@ -182,13 +182,15 @@ fn terms() -> impl Strategy<Value = pb::RunTerms> {
 }
 
 fn slot() -> impl Strategy<Value = pb::Slot> {
-    let order = (any::<u64>(), any::<u64>(), any::<bool>(), any::<bool>(), any::<bool>()).prop_map(
-        |(number, seed, advised, uniform, record)| pb::EpisodeOrder {
+    let flags = (any::<bool>(), any::<bool>(), any::<bool>());
+    let order = (any::<u64>(), any::<u64>(), flags, any::<Option<u32>>()).prop_map(
+        |(number, seed, (advised, uniform, record), advised_steps)| pb::EpisodeOrder {
             number,
             seed,
             advised,
             uniform,
             record,
+            advised_steps,
         },
     );
     let n_episodes = prop_oneof![10 => 0_usize..20, 1 => Just(1024_usize), 1 => Just(1025_usize)];
@@ -232,6 +234,7 @@ fn parameters(layout: Layout) -> impl Strategy<Value = pb::Parameters> {
                         observation_std,
                         goal_mean,
                         goal_std,
+                        ..pb::Parameters::default()
                     }
                 },
             )
@@ -285,6 +288,7 @@ fn episode(layout: Layout) -> impl Strategy<Value = pb::Episode> {
             contacts,
             advice_charged: head.3,
             avoidance_steps: head.4,
+            queried_steps: head.4,
         })
 }
 

@@ -15,7 +15,7 @@ use crate::run::Run;
 pub const CSV_HEADER: &str = "task,arms,group,strategy,run,seed,evaluations,env_steps,wall_s,inspired_epoch,rise_epochs,max_success,\
      effective_learning_rate,env_steps_to_50,env_steps_to_90,env_steps_to_95,minutes_to_50,minutes_to_90,minutes_to_95,\
      advice_spent,last_success,last_low,last_high,collision_rate,held_out_success,held_out_low,held_out_high,\
-     held_out_collision_rate,held_out_success_without_contact,held_out_arm_contact_rate";
+     held_out_collision_rate,held_out_success_without_contact,held_out_arm_contact_rate,advice_queries";
 
 /// Returns a comparison as CSV with one line per run. Values that do not exist are empty.
 #[must_use]
@@ -73,6 +73,7 @@ fn run_cells(group: &SeedGroup, run: &Run) -> Vec<String> {
         number(test.filter(|_| has_contacts).map(|test| test.collision_rate)),
         number(test.and_then(|test| test.contacts.success_without_contact)),
         number(test.and_then(|test| test.contacts.arm_contact_rate)),
+        count(last.and_then(|row| row.advice_queries)),
     ]);
     cells
 }
@@ -143,6 +144,7 @@ fn group_json(group: &SeedGroup) -> Value {
         "milestones": milestones,
         "env_steps": spread_json(&group.spread(|run| Some(run.last()?.env_steps as f64))),
         "advice_spent": spread_json(&group.spread(|run| Some(run.last()?.advice_spent as f64))),
+        "advice_queries": spread_json(&group.spread(|run| Some(run.last()?.advice_queries? as f64))),
         "last_success": share_json(group, |run| run.last().map(|row| (row.success, row.n_episodes))),
         "best_success": share_json(group, |run| run.best().map(|row| (row.success, row.n_episodes))),
         "held_out_success": share_json(group, |run| {
@@ -209,7 +211,7 @@ mod tests {
         assert_eq!(lines.len(), 3);
         assert_eq!(
             lines[1],
-            "push,2,\"odd, name\",ea,\"odd, name-seed3\",3,2,2000,120,,,0.5,,2000,,,2,,,0,0.5,0,0,0,,,,,,"
+            "push,2,\"odd, name\",ea,\"odd, name-seed3\",3,2,2000,120,,,0.5,,2000,,,2,,,0,0.5,0,0,0,,,,,,,"
         );
         assert_eq!(lines[2].split(',').count(), n_columns);
     }

@@ -8,7 +8,8 @@ use tandem_core::layout::UnknownTask;
 use tandem_core::settings::OutOfRange;
 use tandem_core::task::{InvalidTask, MAX_ARMS};
 use tandem_core::{
-    AdviceTerms, AdviceUnit, Exploration, JudgedAction, TaskDescription, TaskSpec, WorldSettings,
+    AdviceTerms, AdviceUnit, Exploration, JudgedAction, Strategy, TaskDescription, TaskSpec,
+    WorldSettings,
 };
 
 use crate::ddpg::DdpgConfig;
@@ -125,6 +126,39 @@ impl AdviceConfig {
     #[must_use]
     pub fn asks(&self) -> bool {
         self.strategy != "none" && !self.starts_from_teacher() && self.share > 0.0
+    }
+
+    /// Returns the strategy; `None` if its name is unknown or [`INIT_TEACHER`].
+    #[must_use]
+    pub fn parsed_strategy(&self) -> Option<Strategy> {
+        self.strategy.parse().ok()
+    }
+
+    /// Returns the largest number of steps at the start of an episode on which the student asks; `None` means all.
+    #[must_use]
+    pub fn horizon(&self) -> Option<u32> {
+        match self.parsed_strategy() {
+            Some(Strategy::JumpStart { horizon }) => Some(horizon),
+            _ => None,
+        }
+    }
+
+    /// Returns the disagreement of critics above which the student asks; `None` means that it asks without one.
+    #[must_use]
+    pub fn disagreement_threshold(&self) -> Option<f32> {
+        match self.parsed_strategy() {
+            Some(Strategy::CriticDisagreement { threshold }) => Some(threshold),
+            _ => None,
+        }
+    }
+
+    /// Returns the cost to an arm of its own step before the teacher overrides it.
+    #[must_use]
+    pub fn intervention_cost(&self) -> f32 {
+        match self.parsed_strategy() {
+            Some(Strategy::InterventionFeedback { .. }) => 1.0,
+            _ => 0.0,
+        }
     }
 
     /// Returns true if the student starts as copies of the teacher instead of asking it.

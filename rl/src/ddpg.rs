@@ -17,6 +17,7 @@ mod state;
 mod tests;
 
 pub use config::DdpgConfig;
+pub use state::CriticBatch;
 
 /// A batch of `b` transitions. An input is a normalised observation followed by a normalised goal.
 #[derive(Debug, Clone, PartialEq)]
@@ -219,6 +220,8 @@ struct CriticHalf {
     q: Vec<f32>,
     /// The target networks' values of the next inputs, shape `[b, n_heads]`.
     next_q: Vec<f32>,
+    /// The targets of `q`, shape `[b, n_heads]`.
+    targets: Vec<f32>,
     /// The loss's gradient by `q`.
     q_gradient: Vec<f32>,
     actor_workspace: Workspace,
@@ -235,6 +238,7 @@ impl CriticHalf {
             next_input: vec![0.0; b * critic.n_input],
             q: vec![0.0; b * critic.n_output],
             next_q: vec![0.0; b * critic.n_output],
+            targets: vec![0.0; b * critic.n_output],
             q_gradient: vec![0.0; b * critic.n_output],
             actor_workspace: Workspace::new(actor, b),
             critic_workspace: Workspace::new(critic, b),
@@ -286,9 +290,13 @@ impl CriticHalf {
         // Mean of (Q - y)^2, and the sum over the batches of its gradient in each.
         assert_eq!(batch.rewards.len(), self.q.len(), "rewards for another number of heads");
         let mut loss = 0.0;
-        let values = self.q.iter().zip(&self.next_q).zip(&batch.rewards);
-        for (gradient, ((q, next_q), reward)) in self.q_gradient.iter_mut().zip(values) {
-            let error = q - critic_target(config.discount, self.lowest_reward, *reward, *next_q);
+        let returns = self.targets.iter_mut().zip(&self.next_q).zip(&batch.rewards);
+        for ((target, next_q), reward) in returns {
+            *target = critic_target(config.discount, self.lowest_reward, *reward, *next_q);
+        }
+        let values = self.q.iter().zip(&self.targets);
+        for (gradient, (q, target)) in self.q_gradient.iter_mut().zip(values) {
+            let error = q - target;
             loss += f64::from(error) * f64::from(error);
             *gradient = 2.0 * error / config.batch_size as f32;
         }

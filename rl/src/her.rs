@@ -43,6 +43,8 @@ struct Relabelled {
     steps: Vec<StepIndex>,
     goal: Vec<f32>,
     rewards: Vec<f32>,
+    /// Whether each arm has its desired goal, not one of hindsight.
+    keeps_goal: Vec<bool>,
     swapped: bool,
 }
 
@@ -52,6 +54,7 @@ pub struct Sampler {
     config: ReplayConfig,
     layout: TaskSpec,
     contact_cost: f32,
+    intervention_cost: f32,
     sample: Relabelled,
     raw_observation: Vec<f32>,
     raw_goal: Vec<f32>,
@@ -66,12 +69,14 @@ impl Sampler {
             steps: vec![StepIndex { episode_idx: 0, step_idx: 0 }; layout.n_arms()],
             goal: vec![0.0; layout.n_goal()],
             rewards: vec![0.0; config.reward.n_heads(&layout)],
+            keeps_goal: vec![true; layout.n_arms()],
             swapped: false,
         };
         let (raw_observation, raw_goal) =
             (vec![0.0; layout.n_observation()], vec![0.0; layout.n_goal()]);
         Self {
             contact_cost: config.contact_cost,
+            intervention_cost: 0.0,
             config: config.clone(),
             layout,
             sample,
@@ -83,6 +88,16 @@ impl Sampler {
     /// Sets the cost of a contact for the batches that follow.
     pub const fn set_contact_cost(&mut self, cost: f32) {
         self.contact_cost = cost;
+    }
+
+    /// Sets the cost of an intervention, for strategy `rlif:T` (RL via intervention feedback, Luo et al. 2023): an arm's
+    /// own step before the teacher overrides it.
+    ///
+    /// The steps that the teacher decides keep their reward: the stored action is the executed one, the teacher's, which
+    /// a cost would teach the student to avoid. An arm whose goal is replaced in hindsight keeps its recomputed reward,
+    /// because the teacher's verdict is about the desired goal.
+    pub const fn set_intervention_cost(&mut self, cost: f32) {
+        self.intervention_cost = cost;
     }
 
     /// Fills every row of `batch` with a transition sampled from `buffer`.
@@ -156,6 +171,7 @@ impl Sampler {
     fn relabel_arms(&mut self, buffer: &ReplayBuffer, rng: &mut ChaCha8Rng) {
         for arm in self.layout.arms() {
             let later_step = self.hindsight_step(self.sample.steps[arm.0].step_idx, rng);
+            self.sample.keeps_goal[arm.0] = later_step.is_none();
             self.take_goal(buffer, arm, later_step);
             if arm.0 == 0 {
                 self.take_common_goal(buffer, later_step);
@@ -169,12 +185,14 @@ impl Sampler {
         for arm in self.layout.arms() {
             let distance = norm.of_accumulated(self.arm_distance(buffer, arm));
             let own = sparse_reward_within(self.config.goal_tolerance_m, distance);
-            self.sample.rewards[arm.0] = if common == REWARD_ACHIEVED { own } else { common };
+            let reward = if common == REWARD_ACHIEVED { own } else { common };
+            self.sample.rewards[arm.0] = reward - self.feedback(buffer, arm);
         }
     }
 
     fn relabel_jointly(&mut self, buffer: &ReplayBuffer, rng: &mut ChaCha8Rng) {
         let later_step = self.hindsight_step(self.sample.steps[0].step_idx, rng);
+        self.sample.keeps_goal.fill(later_step.is_none());
         self.take_common_goal(buffer, later_step);
         let norm = self.layout.norm();
         let mut accumulated = 0.0;
@@ -184,7 +202,23 @@ impl Sampler {
         }
         accumulated = norm.combined(accumulated, self.common_distance(buffer));
         let distance = norm.of_accumulated(accumulated);
-        self.sample.rewards[0] = sparse_reward_within(self.config.goal_tolerance_m, distance);
+        let feedback = self.layout.arms().map(|arm| self.feedback(buffer, arm));
+        let feedback = feedback.fold(0.0, f32::max);
+        self.sample.rewards[0] =
+            sparse_reward_within(self.config.goal_tolerance_m, distance) - feedback;
+    }
+
+    /// Returns the cost to `arm` of its sampled step: that of an intervention, if the teacher overrides the arm on the
+    /// next step and did not on this one, and the arm has its desired goal.
+    fn feedback(&self, buffer: &ReplayBuffer, arm: ArmIndex) -> f32 {
+        let StepIndex { episode_idx, step_idx } = self.sample.steps[arm.0];
+        let is_last = step_idx + 1 == self.layout.episode_steps();
+        if self.intervention_cost == 0.0 || !self.sample.keeps_goal[arm.0] || is_last {
+            return 0.0;
+        }
+        let is_advised = |step_idx| buffer.advised_arms(episode_idx, step_idx) >> arm.0 & 1 == 1;
+        let leads_to_intervention = !is_advised(step_idx) && is_advised(step_idx + 1);
+        if leads_to_intervention { self.intervention_cost } else { 0.0 }
     }
 
     /// Returns the share of `arm` in the distance between the goal and what is achieved after the sampled step.

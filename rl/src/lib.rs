@@ -51,7 +51,9 @@
 
 pub mod config;
 pub mod ddpg;
+pub mod ensemble;
 pub mod her;
+pub mod jump_start;
 pub mod replay;
 pub mod trainer;
 

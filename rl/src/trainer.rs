@@ -6,21 +6,21 @@ use std::collections::BTreeMap;
 
 use rand_chacha::ChaCha8Rng;
 use sha2::{Digest as _, Sha256};
-use tandem_core::episode::EpisodeKind;
 use tandem_core::rng::{Stream, bernoulli, episode_rng, index};
 use tandem_core::task::Part;
 use tandem_core::text::{counted, hex};
-use tandem_core::work::{EpisodeOrder, PublishedActor, SlotOrder};
+use tandem_core::work::PublishedActor;
 use tandem_core::{ArmIndex, Episode, TaskSpec};
 use tandem_policy::{Normalizer, NormalizerSnapshot, Policy};
 
 use crate::config::{Behaviour, ConfigError, PolyakEvery, RunConfig};
 use crate::ddpg::{Batch, Ddpg, DdpgError, Rewards};
+use crate::ensemble::CriticEnsemble;
 use crate::her::{Sampler, Statistics};
+use crate::jump_start::JumpStart;
 use crate::replay::ReplayBuffer;
 
-/// Episodes of an evaluation slot.
-const EVALUATION_SLOT_EPISODES: usize = 8;
+mod orders;
 
 /// Number of rows that a teacher's normaliser counts for in a run that starts from it: about 2,000 episodes.
 const TEACHER_NORMALIZER_ROWS: u64 = 100_000;
@@ -38,6 +38,8 @@ pub struct Counters {
     pub updates: u64,
     /// Units of the advice budget charged for training episodes.
     pub advice_spent: u64,
+    /// Training steps on which the teacher was asked. The digest does not cover them.
+    pub advice_queries: u64,
 }
 
 /// Statistics of a round.
@@ -72,6 +74,10 @@ pub struct Trainer {
     pub observation_normalizer: Normalizer,
     /// Running mean and deviation of goals.
     pub goal_normalizer: Normalizer,
+    /// The horizon of strategy `jsrl:H`; `None` with other strategies.
+    pub jump_start: Option<JumpStart>,
+    /// The critics of strategy `ts2c:T`; `None` with other strategies.
+    pub ensemble: Option<CriticEnsemble>,
     sampler: Sampler,
     batch: Batch,
     /// Statistics of the latest round.
@@ -87,14 +93,23 @@ impl Trainer {
         let config = config.checked()?;
         let layout = config.layout()?;
         let n_heads = config.replay.reward.n_heads(&layout);
-        let rewards = Rewards { n_heads, lowest: config.replay.lowest_reward() };
+        let mut sampler = Sampler::new(&config.replay, &layout);
+        sampler.set_intervention_cost(config.advice.intervention_cost());
+        let lowest = config.replay.lowest_reward() - config.advice.intervention_cost();
+        let rewards = Rewards { n_heads, lowest };
+        let ensemble = config
+            .advice
+            .disagreement_threshold()
+            .map(|_threshold| CriticEnsemble::new(&config.ddpg, &layout, n_heads, config.seed));
         Ok(Self {
             counters: Counters::default(),
             replay: ReplayBuffer::new(&layout, config.replay.capacity_transitions),
             ddpg: Ddpg::new(config.ddpg.clone(), &layout, rewards, config.seed),
             observation_normalizer: Normalizer::new(layout.n_observation()),
             goal_normalizer: Normalizer::new(layout.n_goal()),
-            sampler: Sampler::new(&config.replay, &layout),
+            jump_start: config.advice.horizon().map(JumpStart::new),
+            ensemble,
+            sampler,
             batch: Batch::new(&layout, n_heads, config.ddpg.transitions_per_update()),
             stats: RoundStats::default(),
             layout,
@@ -167,45 +182,13 @@ impl Trainer {
         self.ddpg.set_threads(n_threads);
     }
 
-    /// Returns the training slots of round `round`, for parameter version `version`.
-    #[must_use]
-    pub fn training_orders(&self, round: u64, version: u64) -> Vec<SlotOrder> {
-        let per_round = self.config.episodes_per_round();
-        let warmup_episodes =
-            self.config.rounds.warmup_env_steps.div_ceil(self.layout.episode_steps() as u64);
-        let orders: Vec<EpisodeOrder> = (round * per_round..(round + 1) * per_round)
-            .map(|number| EpisodeOrder {
-                number,
-                seed: self.config.seed,
-                advised: self.config.advice.asks() && is_advised(number, self.config.advice.share),
-                uniform: number < warmup_episodes,
-                record: false,
-            })
-            .collect();
-        slots(&orders, self.config.rounds.rollouts, EpisodeKind::Training, version)
-    }
-
-    /// Returns the slots of an evaluation of parameter version `version` on the run's fixed goals.
-    #[must_use]
-    pub fn evaluation_orders(&self, version: u64) -> Vec<SlotOrder> {
-        let evaluation = &self.config.evaluation;
-        let order = |number| EpisodeOrder {
-            number,
-            seed: evaluation.seed,
-            advised: false,
-            uniform: false,
-            record: number < evaluation.recorded_episodes,
-        };
-        let orders: Vec<EpisodeOrder> = (0..evaluation.episodes).map(order).collect();
-        slots(&orders, EVALUATION_SLOT_EPISODES, EpisodeKind::Evaluation, version)
-    }
-
     /// Adds a round's episodes, in episode order, to the replay buffer, the normalisers and the counters.
     pub fn ingest(&mut self, episodes: &[Episode]) {
         for episode in episodes {
             self.replay.push(episode);
             self.update_normalizers(episode);
             self.counters.advice_spent += u64::from(episode.advice_charged);
+            self.counters.advice_queries += u64::from(episode.queried_steps.unwrap_or(0));
         }
         self.counters.episodes += episodes.len() as u64;
         self.counters.env_steps += (episodes.len() * self.layout.episode_steps()) as u64;
@@ -214,6 +197,19 @@ impl Trainer {
             share(episodes.iter().filter(|episode| episode.succeeded()).count());
         self.stats.training_moved =
             share(episodes.iter().filter(|episode| episode.moved()).count());
+        self.shorten_jump_start(episodes);
+    }
+
+    /// Adds the success of a round's episodes without advice to the horizon; of all episodes if all are advised.
+    fn shorten_jump_start(&mut self, episodes: &[Episode]) {
+        let Some(jump_start) = &mut self.jump_start else { return };
+        let share = self.config.advice.share;
+        let counts =
+            |episode: &&Episode| share >= 1.0 || !orders::is_advised(episode.number, share);
+        let counted = || episodes.iter().filter(counts);
+        let count = |n| u32::try_from(n).expect("a round has at most 262,144 episodes");
+        let n_succeeded = counted().filter(|episode| episode.succeeded()).count();
+        jump_start.finish_round(count(counted().count()), count(n_succeeded));
     }
 
     /// Sets the units of advice spent, which the teacher's account determines.
@@ -252,6 +248,9 @@ impl Trainer {
         for update in 1..=n_updates {
             self.sampler.fill(&self.replay, statistics, &mut rng, &mut self.batch);
             let losses = self.ddpg.update(&self.batch)?;
+            if let Some(ensemble) = &mut self.ensemble {
+                ensemble.update(self.ddpg.critic_batch());
+            }
             if self.config.rounds.polyak_every == PolyakEvery::Update {
                 self.ddpg.polyak();
             }
@@ -291,6 +290,9 @@ impl Trainer {
             observation_std,
             goal_mean,
             goal_std,
+            gate: self.config.advice.disagreement_threshold().and_then(|threshold| {
+                self.ensemble.as_ref().map(|ensemble| ensemble.publish(threshold))
+            }),
         }
     }
 
@@ -334,7 +336,11 @@ impl Trainer {
         hash.update(&parts.advised_arms);
         hash.update(&parts.contacts);
         hash.update(&parts.moved);
-        let Counters { round, env_steps, episodes, updates, advice_spent } = self.counters;
+        for number in self.jump_start.iter().flat_map(JumpStart::state) {
+            hash.update(number.to_le_bytes());
+        }
+        let Counters { round, env_steps, episodes, updates, advice_spent, advice_queries: _ } =
+            self.counters;
         for count in
             [next as u64, self.ddpg.n_updates(), round, env_steps, episodes, updates, advice_spent]
         {
@@ -354,7 +360,9 @@ impl Trainer {
         ];
         let ddpg =
             self.ddpg.state().into_iter().map(|(name, values)| (format!("ddpg.{name}"), values));
-        ddpg.chain(replay.map(|(name, values)| (name.to_owned(), values))).collect()
+        let ensemble = self.ensemble.iter().flat_map(CriticEnsemble::state);
+        let ensemble = ensemble.map(|(name, values)| (format!("ensemble.{name}"), values));
+        ddpg.chain(replay.map(|(name, values)| (name.to_owned(), values))).chain(ensemble).collect()
     }
 
     /// Updates the normalisers with an episode's observations, and with goals relabelled as in a batch.
@@ -431,33 +439,6 @@ fn first_implausible(
         "number {idx} of the {what} has mean {mean:e} and standard deviation {std:e} over the run, which no world produces: \
          the policy cannot learn from it"
     ))
-}
-
-/// Returns true if episode `number` is advised. Advised episodes are evenly spread.
-#[expect(
-    clippy::cast_possible_truncation,
-    clippy::cast_sign_loss,
-    reason = "episode numbers stay far below 2^52"
-)]
-fn is_advised(number: u64, share: f64) -> bool {
-    let advised_before = |number: u64| (number as f64 * share).floor() as u64;
-    advised_before(number + 1) > advised_before(number)
-}
-
-/// Splits orders into slots of `n_episodes`; the learner's queue numbers them.
-fn slots(
-    orders: &[EpisodeOrder],
-    n_episodes: usize,
-    kind: EpisodeKind,
-    version: u64,
-) -> Vec<SlotOrder> {
-    let slot = |episodes: &[EpisodeOrder]| SlotOrder {
-        slot: 0,
-        parameter_version: version,
-        kind,
-        episodes: episodes.to_vec(),
-    };
-    orders.chunks(n_episodes).map(slot).collect()
 }
 
 #[cfg(test)]

@@ -57,6 +57,7 @@ fn play(actor: &mut Actor, order: EpisodeOrder, noise_std: f32) -> Episode {
         contacts: vec![Contacts::NONE; EPISODE_STEPS],
         advice_charged: 0,
         avoidance_steps: None,
+        queried_steps: None,
     }
 }
 
@@ -72,8 +73,14 @@ fn actor_of(trainer: &Trainer) -> Actor {
 
 fn success(trainer: &Trainer) -> f64 {
     let mut actor = actor_of(trainer);
-    let order =
-        |number| EpisodeOrder { number, seed: 99, advised: false, uniform: false, record: false };
+    let order = |number| EpisodeOrder {
+        number,
+        seed: 99,
+        advised: false,
+        uniform: false,
+        record: false,
+        advised_steps: None,
+    };
     let n_hits =
         (0..200).filter(|number| play(&mut actor, order(*number), 0.0).succeeded()).count();
     n_hits as f64 / 200.0

@@ -37,6 +37,7 @@ ELSEWHERE = [
     Entry("grpcurl", "is not in Debian; the tests use reflection", "tests/access.rs"),
     Entry("kubectl", "needs a cluster; the manifests' commands run as processes", "tests/kubernetes.rs"),
     Entry("curl", "asks a service in a cluster", "tests/kubernetes.rs", "docs/cluster.md"),
+    Entry("tandem bridge calibrate", "takes 46 s of real time", "bridge/tests/pair/calibration.rs"),
     Entry("ssh", "needs another machine", ""),
     Entry("tandem relay", "has the names of several machines", "learner/tests/service/relay.rs", "docs/scale.md"),
     Entry("tandem worker", "has the names of several machines", "learner/tests/service/relay.rs", "docs/scale.md"),

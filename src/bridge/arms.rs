@@ -2,13 +2,17 @@
 
 use std::sync::Arc;
 
+use tandem_bridge::cell_file::CellFile;
+use tandem_bridge::injection::Injector;
+use tandem_bridge::kinova_ros::{KinovaArm, KinovaRosConfig, KinovaRosDriver};
+use tandem_bridge::quarc::{QuarcConfig, QuarcDriver};
 use tandem_bridge::service::{BoxDriver, Clock, Reconnect};
-use tandem_bridge::work_cell::mico_cell;
 use tandem_bridge::{DriverError, Executor, Settings};
-use tandem_trials::simulated::RealTimePair;
+use tandem_trials::simulated::{Drill, RealTimePair};
 use tandem_trials::{SimulatedConfig, SimulatedPair};
 
-use crate::cli::{BridgeServeArgs, DriverName};
+use super::cell::Cell;
+use crate::cli::{ArmsArgs, DriverName};
 use crate::exit::{Exit, Failed, OrExit as _};
 
 /// Initial height of a simulated tool above its workspace, metres.
@@ -25,8 +29,8 @@ pub(crate) const fn name(driver: DriverName) -> &'static str {
     }
 }
 
-/// Returns the limits and deadlines of the arms behind a driver.
-pub(crate) fn settings(driver: DriverName) -> Settings {
+/// Returns the limits and deadlines of arms behind a driver that nobody has measured.
+pub(super) fn default_settings(driver: DriverName) -> Settings {
     match driver {
         DriverName::Sim | DriverName::Quarc => Settings::default(),
         DriverName::KinovaRos => tandem_bridge::kinova_ros::settings(),
@@ -34,55 +38,123 @@ pub(crate) fn settings(driver: DriverName) -> Settings {
 }
 
 /// Connects to the real arms at an address.
-type Connect = fn(&str) -> Result<BoxDriver, DriverError>;
+type Connect = Box<dyn Fn(&str) -> Result<BoxDriver, DriverError> + Send + Sync>;
 
-/// Creates the executor of the arms and, for real arms, a function that reconnects to them.
-pub(crate) fn arms(
-    args: &BridgeServeArgs,
+/// Arms and what their service needs.
+pub(super) struct Arms {
+    pub(super) executor: Executor<BoxDriver>,
+    /// Reconnects to real arms.
+    pub(super) reconnect: Option<Reconnect>,
+    /// Injects faults into simulated arms.
+    pub(super) injector: Option<Injector>,
+}
+
+impl Arms {
+    /// Connects to the arms and creates their executor.
+    pub(super) fn connect(
+        args: &ArmsArgs,
+        cell: &Cell,
+        clock: Arc<dyn Clock>,
+    ) -> Result<Self, Failed> {
+        let settings = cell.settings(args.driver);
+        let (driver, reconnect, injector) = connect(args, cell, &settings, clock)?;
+        let executor = Executor::new(cell.file.work_cell(), driver, settings);
+        let executor = executor.or_exit(Exit::Bug, String::new)?;
+        Ok(Self { executor, reconnect, injector })
+    }
+}
+
+/// Connects to the arms. Returns their driver, how to reconnect to real ones, and what injects faults into simulated
+/// ones.
+pub(super) fn connect(
+    args: &ArmsArgs,
+    cell: &Cell,
+    settings: &Settings,
     clock: Arc<dyn Clock>,
-) -> Result<(Executor<BoxDriver>, Option<Reconnect>), Failed> {
-    let settings = settings(args.driver);
+) -> Result<(BoxDriver, Option<Reconnect>, Option<Injector>), Failed> {
     let connect = match args.driver {
         DriverName::Sim => {
-            let driver = simulated(args.seed, clock)?;
-            return Ok((executor(driver, settings)?, None));
+            let injector = Injector::default();
+            let drill = Drill::new(injector.clone(), settings);
+            let pair = simulated(args.seed, &cell.file, settings)?;
+            let driver = Box::new(RealTimePair::new(pair, clock).with_drill(drill));
+            return Ok((driver, None, Some(injector)));
         }
-        DriverName::Quarc => quarc(),
-        DriverName::KinovaRos => kinova_ros(),
+        DriverName::Quarc => quarc(&cell.file)?,
+        DriverName::KinovaRos => kinova_ros(&cell.file)?,
     };
     let address = args.arms_at.clone().unwrap_or_default();
     let reconnect: Reconnect = Arc::new(move || connect(&address));
     let driver = reconnect().or_exit(Exit::TryAgain, String::new)?;
-    Ok((executor(driver, settings)?, Some(reconnect)))
+    Ok((driver, Some(reconnect), None))
 }
 
-fn executor(driver: BoxDriver, settings: Settings) -> Result<Executor<BoxDriver>, Failed> {
-    Executor::new(mico_cell(), driver, settings).or_exit(Exit::Bug, String::new)
-}
-
-/// Creates a simulated pair in real time, with its tools above their workspaces.
-fn simulated(seed: u64, clock: Arc<dyn Clock>) -> Result<BoxDriver, Failed> {
-    let cell = mico_cell();
+/// Creates a simulated pair with its tools above their workspaces.
+pub(super) fn simulated(
+    seed: u64,
+    file: &CellFile,
+    settings: &Settings,
+) -> Result<SimulatedPair, Failed> {
+    let cell = file.work_cell();
     let at = cell.ready(READY_M).or_exit(Exit::Bug, String::new)?;
-    let config = SimulatedConfig { seed, ..SimulatedConfig::default() };
-    let pair = SimulatedPair::new(cell, &at, READY_OPENING, config);
-    Ok(Box::new(RealTimePair::new(pair, clock)))
+    let gaps = cell.gaps_with(&at, &vec![READY_OPENING; at.len()]);
+    let table_m = gaps.table_m.iter().copied().fold(f64::INFINITY, f64::min);
+    for (gap_m, least_m, what) in [
+        (gaps.arms_m, settings.check.arms_gap_m, "each other"),
+        (table_m, settings.check.table_gap_m, "the table"),
+    ] {
+        if gap_m < least_m {
+            return Err(Failed::new(
+                Exit::Data,
+                anyhow::anyhow!(
+                    "simulated arms would start {:.0} mm from {what}, at least {:.0}: move arms[].base_m or \
+                     table.height_m in the cell file",
+                    1e3 * gap_m,
+                    1e3 * least_m
+                ),
+            ));
+        }
+    }
+    let defaults = SimulatedConfig::default();
+    let config = SimulatedConfig {
+        seed,
+        latency_periods: file.simulated.latency_periods,
+        lag_s: file.simulated.lag_s,
+        brake_s: file.simulated.brake_s,
+        reports_torques: file.reports_torques.unwrap_or(defaults.reports_torques),
+        ..defaults
+    };
+    Ok(SimulatedPair::new(cell, &at, READY_OPENING, config))
 }
 
 /// Returns how to connect to arms behind a Simulink model.
-fn quarc() -> Connect {
-    use tandem_bridge::quarc::{QuarcConfig, QuarcDriver};
-    fn connect(address: &str) -> Result<BoxDriver, DriverError> {
-        Ok(Box::new(QuarcDriver::connect(QuarcConfig::at(address))?))
+fn quarc(file: &CellFile) -> Result<Connect, Failed> {
+    if file.reports_torques.is_some() {
+        return Err(Failed::new(
+            Exit::Data,
+            anyhow::anyhow!(
+                "cell file: reports_torques is given, expected no such key behind QUARC: the model reports it"
+            ),
+        ));
     }
-    connect
+    Ok(Box::new(|address| Ok(Box::new(QuarcDriver::connect(QuarcConfig::at(address))?))))
 }
 
 /// Returns how to connect to arms behind Kinova's ROS driver.
-fn kinova_ros() -> Connect {
-    use tandem_bridge::kinova_ros::{KinovaRosConfig, KinovaRosDriver};
-    fn connect(address: &str) -> Result<BoxDriver, DriverError> {
-        Ok(Box::new(KinovaRosDriver::connect(KinovaRosConfig::at(address))?))
-    }
-    connect
+fn kinova_ros(file: &CellFile) -> Result<Connect, Failed> {
+    let arms: Vec<KinovaArm> = file
+        .arms
+        .iter()
+        .map(|arm| KinovaArm { node: arm.ros_node(), joint_prefix: arm.ros_joint_prefix() })
+        .collect();
+    let arms = arms.try_into().map_err(|_arms| Failed::usage("kinova-ros drives two arms"))?;
+    let config = KinovaRosConfig {
+        arms,
+        reports_torques: file.reports_torques.unwrap_or(false),
+        ..KinovaRosConfig::at("")
+    };
+    Ok(Box::new(move |address| {
+        let config = KinovaRosConfig { address: address.to_owned(), ..config.clone() };
+        Ok(Box::new(KinovaRosDriver::connect(config)?))
+    }))
 }

@@ -42,6 +42,7 @@ pub(super) fn status_lines(status: &pb::BridgeStatusResponse) -> Vec<String> {
     if status.arms.is_empty() {
         lines.push("arms    their position is not known".to_owned());
     }
+    lines.extend(status.injected.iter().map(|fault| format!("drill   {}", injected(fault))));
     if let Some(motion) = &status.motion {
         let [played_s, duration_s] =
             clock_times_s([motion.played_s, motion.duration_s], motion.speed);
@@ -49,6 +50,44 @@ pub(super) fn status_lines(status: &pb::BridgeStatusResponse) -> Vec<String> {
         lines.push(format!("motion  {played_s:.1} of {duration_s:.1} s, at speed {speed}"));
     }
     lines
+}
+
+/// Describes an injected fault, with the joint counted from 1.
+pub(super) fn injected(fault: &pb::FaultInjection) -> String {
+    use pb::InjectedFault as F;
+    let name = fault_name(fault.fault());
+    match fault.fault() {
+        F::LateStates => name.to_owned(),
+        F::BlockedJoint | F::Torque | F::Drift => {
+            format!("{name}, arm {}, joint {}", fault.arm, fault.joint + 1)
+        }
+        F::Unspecified | F::EmergencyStop | F::DriveFault | F::Contact => {
+            format!("{name}, arm {}", fault.arm)
+        }
+    }
+}
+
+const fn fault_name(fault: pb::InjectedFault) -> &'static str {
+    use pb::InjectedFault as F;
+    match fault {
+        F::Unspecified => "unknown",
+        F::EmergencyStop => "emergency-stop",
+        F::DriveFault => "drive-fault",
+        F::Contact => "contact",
+        F::BlockedJoint => "blocked-joint",
+        F::Torque => "torque",
+        F::Drift => "drift",
+        F::LateStates => "late-states",
+    }
+}
+
+pub(super) fn injected_json(injected: &[pb::FaultInjection]) -> Value {
+    let fault = |fault: &pb::FaultInjection| {
+        json!({
+            "fault": fault_name(fault.fault()), "arm": fault.arm, "joint": fault.joint,
+        })
+    };
+    Value::Array(injected.iter().map(fault).collect())
 }
 
 /// Converts times of a motion at its own speed to seconds on the clock when it is played at `speed`.
@@ -94,7 +133,8 @@ pub(super) fn description_lines(description: &pb::DescribeBridgeResponse) -> Vec
     )];
     for (idx, arm) in description.arms.iter().enumerate() {
         lines.push(format!(
-            "arm {idx}   {}, base at {} m, turned by {:.0} degrees",
+            "arm {idx}   {}, {}, base at {} m, turned by {:.0} degrees",
+            arm.name,
             arm.model,
             position(&arm.base_in_world_m),
             arm.yaw_rad.to_degrees()
@@ -109,9 +149,22 @@ pub(super) fn description_lines(description: &pb::DescribeBridgeResponse) -> Vec
             )
         }));
     }
+    for arm in &description.arms {
+        lines.push(format!(
+            "times   {}: lag {:.0} ms, reaction {:.0} ms, brake {:.0} ms{}",
+            arm.name,
+            1e3 * arm.lag_s,
+            1e3 * arm.reaction_s,
+            1e3 * arm.brake_s,
+            if arm.is_measured { "" } else { " (not measured)" }
+        ));
+    }
     lines.push(format!("table   at a height of {:.3} m", description.table_z_m));
     if let Some(limits) = &description.limits {
         lines.extend(limit_lines(limits));
+    }
+    if !description.cell_file.is_empty() {
+        lines.push(format!("cell    {}", description.cell_file));
     }
     lines
 }
@@ -197,6 +250,7 @@ pub(super) fn status_json(status: &pb::BridgeStatusResponse) -> Value {
         "at_rest": status.at_rest,
         "arms": status.arms.iter().map(arm_json).collect::<Vec<_>>(),
         "motion": motion, "now_s": status.now_s, "since_tick_s": status.since_tick_s,
+        "injected": injected_json(&status.injected),
     })
 }
 
@@ -209,7 +263,9 @@ pub(super) fn description_json(description: &pb::DescribeBridgeResponse) -> Valu
     };
     let arm = |arm: &pb::ArmDescription| {
         json!({
-            "model": arm.model, "base_in_world_m": arm.base_in_world_m, "yaw_rad": arm.yaw_rad,
+            "name": arm.name, "model": arm.model, "base_in_world_m": arm.base_in_world_m,
+            "yaw_rad": arm.yaw_rad, "lag_s": arm.lag_s, "reaction_s": arm.reaction_s,
+            "brake_s": arm.brake_s, "is_measured": arm.is_measured,
             "joints": arm.joints.iter().map(joint).collect::<Vec<_>>(),
         })
     };
@@ -219,7 +275,7 @@ pub(super) fn description_json(description: &pb::DescribeBridgeResponse) -> Valu
     json!({
         "driver": description.driver, "version": description.version, "period_s": description.period_s,
         "arms": description.arms.iter().map(arm).collect::<Vec<_>>(), "table_z_m": description.table_z_m,
-        "task_frame": frame, "limits": description.limits.as_ref().map(limits_json),
+        "cell_file": description.cell_file, "task_frame": frame, "limits": description.limits.as_ref().map(limits_json),
     })
 }
 
@@ -236,5 +292,6 @@ fn limits_json(limits: &pb::BridgeLimits) -> Value {
         "lease_s": limits.lease_s, "max_way_points": limits.max_way_points,
         "max_step_m": limits.max_step_m,
         "check_self_gap_m": limits.check_self_gap_m, "self_gap_m": limits.self_gap_m,
+        "lag_s": limits.lag_s, "reaction_s": limits.reaction_s, "brake_s": limits.brake_s,
     })
 }

@@ -10,7 +10,6 @@ use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, TrySendError, sync
 use std::time::Duration;
 
 use tandem_bridge::service::{Observer, Operator, Snapshots, observe};
-use tandem_bridge::work_cell::mico_cell;
 use tandem_core::text::error_chain;
 use tandem_dashboard::{Access, BridgeTerms, Site, StopAction};
 use tandem_kinematics::WorkCell;
@@ -21,6 +20,7 @@ use tokio::net::TcpListener;
 use tokio::sync::watch;
 use tokio_util::sync::{CancellationToken, DropGuard};
 
+use super::cell::Cell;
 use super::{arms, view};
 use crate::cli::BridgeServeArgs;
 use crate::exit::{Exit, Failed, OrExit as _};
@@ -58,9 +58,9 @@ pub(super) struct Watching {
 }
 
 /// Listens for viewers, if the command line asks for it. Must not be called within a runtime.
-pub(super) fn live(args: &BridgeServeArgs) -> Result<Option<LiveArms>, Failed> {
+pub(super) fn live(args: &BridgeServeArgs, n_arms: usize) -> Result<Option<LiveArms>, Failed> {
     let Some(address) = args.live.live else { return Ok(None) };
-    let live = LiveArms::start(address, mico_cell().arms.len());
+    let live = LiveArms::start(address, n_arms);
     let live = live.or_exit(Exit::TryAgain, String::new)?;
     output::message(format_args!("tandem: live on ws://{}", live.address()));
     Ok(Some(live))
@@ -70,12 +70,13 @@ impl Plan {
     /// Creates the directory of logs and listens for pages.
     pub(super) async fn of(
         args: &BridgeServeArgs,
+        cell: &Cell,
         server_config: &ServerConfig,
         live: Option<LiveArms>,
     ) -> Result<Self, Failed> {
         let access = page_access(args, server_config.token())?;
         let journal = args.record.as_ref().map(|directory| {
-            let journal = MotionJournal::create(directory, args.log_budget.0, metadata(args));
+            let journal = MotionJournal::create(directory, args.log_budget.0, metadata(args, cell));
             journal.map_err(Failed::of_write)
         });
         let journal = journal.transpose()?;
@@ -202,7 +203,7 @@ impl Page {
     ) -> DropGuard {
         let settings = operator.settings();
         let terms = BridgeTerms {
-            driver: arms::name(args.driver).to_owned(),
+            driver: arms::name(args.arms.driver).to_owned(),
             version: VERSION.to_owned(),
             speed: args.speed,
             table_gap_m: settings.table_gap_m,
@@ -269,12 +270,13 @@ fn page_access(
 }
 
 /// Returns the metadata of all logs: the bridge, its arms and their limits.
-fn metadata(args: &BridgeServeArgs) -> BTreeMap<String, String> {
-    let cell = mico_cell();
-    let settings = arms::settings(args.driver);
+fn metadata(args: &BridgeServeArgs, file: &Cell) -> BTreeMap<String, String> {
+    let cell = file.file.work_cell();
+    let settings = file.settings(args.arms.driver);
+    let timings = file.file.timings(&settings);
     let mut metadata = BTreeMap::new();
     let mut add = |key: &str, value: String| drop(metadata.insert(key.to_owned(), value));
-    add("driver", arms::name(args.driver).to_owned());
+    add("driver", arms::name(args.arms.driver).to_owned());
     add("version", VERSION.to_owned());
     add("speed_limit", args.speed.to_string());
     add("arms", cell.arms.len().to_string());
@@ -284,7 +286,22 @@ fn metadata(args: &BridgeServeArgs) -> BTreeMap<String, String> {
         add(&format!("arm{idx}.model"), placed.model.name.to_owned());
         add(&format!("arm{idx}.base_m"), format!("{} {} {}", base.x, base.y, base.z));
         add(&format!("arm{idx}.yaw_rad"), placed.yaw_rad.to_string());
+        let (arm, timing) = (&file.file.arms[idx], timings[idx]);
+        add(&format!("arm{idx}.name"), arm.name.clone());
+        add(&format!("arm{idx}.lag_s"), timing.lag_s.to_string());
+        add(&format!("arm{idx}.reaction_s"), timing.reaction_s.to_string());
+        add(&format!("arm{idx}.brake_s"), timing.brake_s.to_string());
+        add(&format!("arm{idx}.is_measured"), arm.is_measured().to_string());
     }
+    add("cell_file", file.name.clone());
+    add("limit.lag_s", settings.lag_s.to_string());
+    add("limit.reaction_s", settings.reaction_s.to_string());
+    add("limit.brake_s", settings.brake_s.to_string());
+    add("limit.tilt_rad", settings.check.tilt_rad.to_string());
+    add("limit.ramp_s", settings.check.limits.ramp_s.to_string());
+    add("limit.check_table_gap_m", settings.check.table_gap_m.to_string());
+    add("limit.check_arms_gap_m", settings.check.arms_gap_m.to_string());
+    add("limit.check_self_gap_m", settings.check.self_gap_m.to_string());
     add("limit.table_gap_m", settings.table_gap_m.to_string());
     add("limit.arms_gap_m", settings.arms_gap_m.to_string());
     add("limit.self_gap_m", settings.self_gap_m.to_string());

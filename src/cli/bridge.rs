@@ -1,8 +1,10 @@
 //! The command line of `tandem bridge`.
 
+use std::net::SocketAddr;
 use std::path::PathBuf;
 
-use clap::{Args, Subcommand, ValueEnum};
+use clap::{ArgGroup, Args, Subcommand, ValueEnum};
+use tandem_bridge::calibration::SPEED_SHARES;
 
 use super::{
     ByteSize, ClientArgs, DashboardArgs, ListenArgs, LiveArgs, MetricsArgs, SecretArgs, TrialArgs,
@@ -33,7 +35,10 @@ Examples:
   tandem bridge move deploy/first-motion.json --check-only
   tandem bridge move deploy/first-motion.json --speed 0.1
   tandem bridge trial --policy policies/student-push.safetensors
-  tandem bridge --driver quarc --arms-at tcpip://10.0.0.5:18000 --speed 0.1
+  tandem bridge cell > cell.toml  # where the arms stand, their limits
+  tandem bridge --driver quarc --arms-at tcpip://10.0.0.5:18000 \
+      --cell cell.toml --speed 0.1
+  tandem bridge inject emergency-stop --arm left  # a drill, simulated arms
 
 docs/bridge.md is a tutorial up to the first motion."
 )]
@@ -52,18 +57,14 @@ pub(crate) struct BridgeArgs {
     mut_arg("dashboard_token_file", |arg| arg.help(TOKEN_HELP))
 )]
 pub(crate) struct BridgeServeArgs {
-    /// Driver of the arms.
-    #[arg(long, value_enum, default_value_t = DriverName::Sim)]
-    pub(crate) driver: DriverName,
-    /// Address of the real arms: tcpip://HOST:PORT for quarc, ws://HOST:PORT for kinova-ros.
-    #[arg(long, value_name = "ADDR", required_if_eq_any([("driver", "quarc"), ("driver", "kinova-ros")]))]
-    pub(crate) arms_at: Option<String>,
+    #[command(flatten)]
+    pub(crate) arms: ArmsArgs,
+    /// Moves real arms although their lag, reaction and braking times are guesses.
+    #[arg(long)]
+    pub(crate) accept_defaults: bool,
     /// Speed limit for all motions, as a fraction of each motion's own speed, 0.01 to 1.
     #[arg(long, default_value_t = 1.0, value_parser = share)]
     pub(crate) speed: f64,
-    /// Seed of the simulated pair's noise and latencies.
-    #[arg(long, value_name = "N", default_value_t = 0)]
-    pub(crate) seed: u64,
     /// Writes an MCAP log of every motion, and of every fault that stops the arms, to this directory.
     #[arg(long, value_name = "DIR")]
     pub(crate) record: Option<PathBuf>,
@@ -80,6 +81,44 @@ pub(crate) struct BridgeServeArgs {
     pub(crate) secret: SecretArgs,
     #[command(flatten)]
     pub(crate) metrics: MetricsArgs,
+}
+
+/// Options of the arms.
+#[derive(Debug, Args)]
+pub(crate) struct ArmsArgs {
+    /// Driver of the arms.
+    #[arg(long, value_enum, default_value_t = DriverName::Sim)]
+    pub(crate) driver: DriverName,
+    /// Address of the real arms: tcpip://HOST:PORT for quarc, ws://HOST:PORT for kinova-ros.
+    #[arg(long, value_name = "ADDR", required_if_eq_any([("driver", "quarc"), ("driver", "kinova-ros")]))]
+    pub(crate) arms_at: Option<String>,
+    /// Cell file: where the arms stand, their names, limits and reaction times (see docs/cell.md).
+    #[arg(long, value_name = "FILE.toml")]
+    pub(crate) cell: Option<PathBuf>,
+    /// Seed of the simulated pair's noise and latencies.
+    #[arg(long, value_name = "N", default_value_t = 0)]
+    pub(crate) seed: u64,
+}
+
+#[derive(Debug, Args)]
+#[command(after_help = "\
+Examples:
+  tandem bridge arms
+  tandem bridge --driver quarc --arms-at tcpip://127.0.0.1:18000 \\
+      --accept-defaults   # in a separate terminal
+
+Kill the bridge during a motion: the drives brake by themselves, and this process says so. Anyone who \
+can reach the address can move the simulated arms.")]
+pub(crate) struct ArmsServeArgs {
+    /// Address to listen on; port 0 selects a free port.
+    #[arg(long, default_value = "127.0.0.1:18000", value_name = "ADDR")]
+    pub(crate) listen: SocketAddr,
+    /// Cell file of the arms.
+    #[arg(long, value_name = "FILE.toml")]
+    pub(crate) cell: Option<PathBuf>,
+    /// Seed of the pair's noise and latencies.
+    #[arg(long, value_name = "N", default_value_t = 0)]
+    pub(crate) seed: u64,
 }
 
 /// Driver of the arms.
@@ -121,8 +160,106 @@ Examples:
     Reset(OperatorArgs),
     /// Executes the motion in a file. Ctrl-C stops the arms.
     Move(MoveArgs),
+    /// Prints the default cell file with comments, to start from, or checks a cell file.
+    Cell(CellArgs),
+    /// Serves the simulated pair as a process of its own, as if it were behind a Simulink model (--driver quarc).
+    Arms(ArmsServeArgs),
+    /// Measures lag, reaction and braking time of the arms, and writes them into their cell file.
+    Calibrate(CalibrateArgs),
+    /// Injects a fault into simulated arms, to practise a stop. Real arms refuse it.
+    Inject(InjectArgs),
     /// Runs trials of policies on a simulated pair and reports success rates; needs no bridge.
     Trial(TrialArgs),
+}
+
+#[derive(Debug, Args)]
+#[command(after_help = "\
+Examples:
+  tandem bridge cell > cell.toml
+  tandem bridge cell cell.toml
+
+docs/cell.md explains every key.")]
+pub(crate) struct CellArgs {
+    /// Cell file to check [default: prints the default one].
+    #[arg(value_name = "FILE.toml")]
+    pub(crate) file: Option<PathBuf>,
+    /// Prints one JSON object.
+    #[arg(long, requires = "file")]
+    pub(crate) json: bool,
+}
+
+#[derive(Debug, Args)]
+#[command(
+    mut_arg("cell", |arg| arg.required(true)),
+    after_help = "\
+Examples:
+  tandem bridge calibrate --cell cell.toml
+  tandem bridge calibrate --driver quarc --arms-at tcpip://10.0.0.5:18000 \\
+      --cell cell.toml --speed 0.1
+
+One joint after the other turns by up to 6 degrees and back. The arms need room, and no bridge may \
+be connected to them. Other keys of the file and its comments stay as they are. Ctrl-C stops the arms."
+)]
+pub(crate) struct CalibrateArgs {
+    #[command(flatten)]
+    pub(crate) arms: ArmsArgs,
+    /// Speed, as a fraction of each joint's highest, 0.1 to 0.5.
+    #[arg(long, default_value_t = 0.3, value_parser = calibration_speed)]
+    pub(crate) speed: f64,
+    /// Prints one JSON object.
+    #[arg(long)]
+    pub(crate) json: bool,
+}
+
+#[derive(Debug, Args)]
+#[command(
+    group(ArgGroup::new("action").required(true).args(["fault", "clear"])),
+    after_help = "\
+Examples:
+  tandem bridge inject emergency-stop --arm left
+  tandem bridge inject blocked-joint --arm 1 --joint 2
+  tandem bridge inject late-states
+  tandem bridge inject --clear
+
+A fault lasts until it is cleared. docs/bridge.md describes the drill."
+)]
+pub(crate) struct InjectArgs {
+    /// Fault to inject.
+    #[arg(value_enum)]
+    pub(crate) fault: Option<FaultName>,
+    /// Clears all injected faults.
+    #[arg(long, conflicts_with_all = ["arm", "joint"])]
+    pub(crate) clear: bool,
+    /// Arm: its number, counted from 0, or its name.
+    #[arg(long, value_name = "ARM", default_value = "0")]
+    pub(crate) arm: String,
+    /// Joint of blocked-joint, torque and drift, counted from 1.
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..))]
+    pub(crate) joint: u32,
+    #[command(flatten)]
+    pub(crate) connect: ConnectArgs,
+    /// Prints one JSON object.
+    #[arg(long)]
+    pub(crate) json: bool,
+}
+
+/// Fault of simulated arms.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub(crate) enum FaultName {
+    /// The emergency stop at the arm is pressed.
+    EmergencyStop,
+    /// A drive of the arm fails.
+    DriveFault,
+    /// The arm reports a contact.
+    Contact,
+    /// A joint cannot turn.
+    BlockedJoint,
+    /// Something presses on a joint.
+    Torque,
+    /// A joint turns faster than commanded.
+    Drift,
+    /// States of both arms arrive 80 ms late.
+    LateStates,
 }
 
 /// Options of a client of a bridge.
@@ -170,6 +307,13 @@ pub(crate) struct MoveArgs {
     /// Prints one JSON object on the last line of standard output.
     #[arg(long)]
     pub(crate) json: bool,
+}
+
+/// Parses the speed of a calibration.
+fn calibration_speed(text: &str) -> Result<f64, String> {
+    let [low, high] = SPEED_SHARES;
+    let speed = text.parse().ok().filter(|speed| (low..=high).contains(speed));
+    speed.ok_or_else(|| format!("expected a number from {low} to {high}"))
 }
 
 /// Parses a fraction from 0.01 to 1.

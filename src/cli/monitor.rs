@@ -46,7 +46,8 @@ pub(crate) struct StatusArgs {
     /// Address of the learner or relay.
     #[arg(value_name = "ADDR")]
     pub(crate) address: String,
-    /// Follows the run until it ends: a line for each evaluation, and one every half minute.
+    /// Follows the run until it ends, as `tandem train` shows it: with a progress bar on a terminal, elsewhere with a line for
+    /// each evaluation and one every half minute.
     #[arg(long)]
     pub(crate) watch: bool,
     /// Prints one JSON object; with --watch, one per message.

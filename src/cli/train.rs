@@ -5,7 +5,7 @@ use std::path::PathBuf;
 
 use clap::{Args, ValueEnum};
 
-use super::{EnvironmentArgs, LiveArgs, RecordingArgs, TaskName, WorldName};
+use super::{EnvironmentArgs, LiveArgs, MetricsArgs, RecordingArgs, TaskName, WorldName};
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub(crate) enum RecipeName {
@@ -23,6 +23,7 @@ Examples:
   tandem train --arms 1 --task push --until-success 0.97
   tandem train --world shared  # both arms share one area and are slow
   tandem train --strategy ea --budget 50000 --seed 2 --max-minutes 20
+  tandem train --strategy jsrl:20 --budget 10000
   tandem train --teacher runs/NAME/policy/best.safetensors
   tandem train --teacher actor.onnx --teacher-critic critic.onnx
   tandem train --teacher http://127.0.0.1:7005  # a policy in another process
@@ -51,7 +52,9 @@ pub(crate) struct TrainArgs {
     /// Number of arms of the trained policy, 1 or 2 [default: 2].
     #[arg(long)]
     pub(crate) arms: Option<usize>,
-    /// Advising strategy: none, ea, eamc:T, mc-q:T, mc-act:A or mc-act-abs:A. With init:teacher the student starts as
+    /// Advising strategy: none, ea, eamc:T, mc-q:T, mc-act:A, mc-act-abs:A, jsrl:H (the teacher acts on at most the
+    /// first H steps), rlif:T (as mc-q:T, and interventions lower the reward) or ts2c:T (asks
+    /// where critics disagree). With init:teacher the student starts as
     /// copies of the teacher and gets no advice
     /// [default: mc-q:0.1 with two arms, none with one].
     #[arg(long, value_name = "NAME[:THRESHOLD]")]
@@ -112,6 +115,8 @@ pub(crate) struct TrainArgs {
     pub(crate) resume: bool,
     #[command(flatten)]
     pub(crate) dashboard: DashboardArgs,
+    #[command(flatten)]
+    pub(crate) metrics: MetricsArgs,
     /// Prints the summary as one JSON object on the last line of standard output.
     #[arg(long)]
     pub(crate) json: bool,

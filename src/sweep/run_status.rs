@@ -131,12 +131,19 @@ fn state(run: &PlannedRun, dir: &Path) -> anyhow::Result<(State, Option<u64>)> {
 
 /// Returns the settings in which the configuration of an existing run differs from the sweep file, each with a text.
 fn differences(existing: &RunConfig, planned: &RunConfig) -> anyhow::Result<Vec<(String, String)>> {
+    let has_default_interval = run_file::has_default_interval(planned);
     let [existing, planned] = [existing, planned].map(Table::try_from);
     let (existing, planned) = (flattened(&existing?), flattened(&planned?));
-    // A run of an earlier version has no early evaluations, which affect nothing that it learns.
-    let differing = existing.iter().zip(&planned).filter(|(existing, planned)| {
-        existing != planned && existing.0 != "evaluation.early_points"
-    });
+    // A run of an earlier version has no early evaluations, and an extended run keeps the interval that followed from its
+    // first length. Evaluations affect nothing that a run learns.
+    let is_ignored = |key: &str| {
+        let is_interval = key == "evaluation.every_env_steps" && has_default_interval;
+        is_interval || key == "evaluation.early_points"
+    };
+    let differing = existing
+        .iter()
+        .zip(&planned)
+        .filter(|(existing, planned)| existing != planned && !is_ignored(&existing.0));
     let texts = differing.map(|((key, existing), (_, planned))| {
         let text = format!("{key} is {} there, {} now", shortest(existing), shortest(planned));
         (key.clone(), text)
@@ -253,6 +260,17 @@ mod tests {
         let extended = of_length(4, 0.95).expect("longer");
         assert_eq!((&extended.state, extended.state_name()), (&State::Started, "extended"));
         assert_eq!(extended.extends_to, Some(2 * planned(0.95).config.stop.max_env_steps));
+        // The interval of a short run follows from its length.
+        let mut run = planned(0.95);
+        (run.config.stop.max_env_steps, run.config.evaluation.every_env_steps) = (800, 160);
+        let dir = out.path().join("push-ea-seed1");
+        let text = run_file::to_toml(&run.config).expect("writes");
+        std::fs::write(dir.join("run.toml"), text).expect("writes");
+        assert!(of_length(2, 0.95).expect("longer").extends_to.is_some());
+        run.config.evaluation.every_env_steps = 100;
+        let refused = RunStatus::of(run, out.path()).map_err(|error| error.to_string());
+        assert!(refused.expect_err("an interval that is set").contains("every_env_steps"));
+        made_with(out.path(), 0.95);
         assert!(of_length(1, 0.95).expect_err("shorter").contains("stop.max_env_steps"));
         assert!(of_length(4, 0.9).expect_err("other settings too").contains("ddpg.discount"));
     }

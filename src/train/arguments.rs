@@ -36,6 +36,9 @@ pub(super) fn learner(plan: &Plan, teacher_address: Option<&str>, resume: bool) 
     push_path(&mut args, "--run", &inputs::settings(&plan.out));
     push_path(&mut args, "--out", &plan.out);
     push_address(&mut args, "--teacher", teacher_address);
+    if let Some(address) = plan.metrics {
+        push_address(&mut args, "--metrics-listen", Some(&address.to_string()));
+    }
     if let Some(teacher) =
         plan.teacher.as_ref().filter(|_| plan.config.advice.starts_from_teacher())
     {

@@ -32,6 +32,8 @@ pub(crate) struct Plan {
     pub(crate) dashboard: Option<SocketAddr>,
     /// File with the token of the dashboard.
     pub(crate) dashboard_token_file: Option<PathBuf>,
+    /// The address of the learner's metrics, if they are served.
+    pub(crate) metrics: Option<SocketAddr>,
 }
 
 impl Plan {
@@ -79,6 +81,7 @@ impl Plan {
             recording,
             dashboard,
             dashboard_token_file,
+            metrics: args.metrics.metrics_listen,
         };
         plan.check_directory()?;
         Ok(plan)

@@ -10,12 +10,12 @@ use tandem_system::process::ResidentMemory;
 use tokio::task::JoinSet;
 
 use super::arguments;
-use super::display::Display;
 use super::plan::Plan;
 use super::restart_policy::{Decision, RestartPolicy, Role};
 use super::run_lock::RunLock;
 use crate::exit::Exit;
 use crate::launch::{ChildProcess, Launcher, ProcessEnd, ProcessLog};
+use crate::run_display::Display;
 use crate::{clock, dashboard};
 
 /// Time that the teacher and the workers have to exit after the learner.

@@ -6,6 +6,7 @@ use serde_json::{Value, json};
 use tandem_core::evaluation::TEST_SEED;
 use tandem_proto::pb;
 use tandem_report::FilmStrip;
+use tandem_system::atomic_file;
 
 use super::plan::Plan;
 use super::processes::PeakMemory;
@@ -13,11 +14,13 @@ use crate::cli::TrainArgs;
 use crate::columns::N_COLUMNS;
 use crate::environment_server::names_server;
 use crate::evaluation::{EvaluatedPolicy, EvaluationResult, Part, measure, measure_served};
-use crate::exit::{Exit, Failed};
+use crate::exit::{Exit, Failed, OrExit as _};
 use crate::progress_text::{advice_text, clock_text, grouped};
 use crate::run_pages::RunPages;
 use crate::{film, output, policy_file, run_directory};
 
+/// File in the run directory.
+const FILE: &str = "summary.json";
 /// Number of test goals from which on the report shows episodes of the test.
 const MIN_TEST_EPISODES_OF_FILMS: usize = 100;
 
@@ -35,12 +38,32 @@ pub(super) fn print(
         }
         failed.context(saved())
     })?;
+    let json = summary_json(plan, last, memory, &result).to_string();
+    save(&plan.out, &json).map_err(|failed| failed.context(saved()))?;
     let pages = RunPages::write(&plan.config, &plan.out, &films(&result)?)?;
     let summary = match args.json {
-        true => summary_json(plan, last, memory, &result).to_string(),
+        true => json,
         false => summary_lines(plan, last, memory, &result, &pages).join("\n"),
     };
     output::print(summary).map_err(|failed| failed.context(saved()))
+}
+
+/// Writes the summary, from which reports take the success on test goals.
+fn save(out: &Path, summary: &str) -> Result<(), Failed> {
+    let path = out.join(FILE);
+    atomic_file::replace(&path, format!("{summary}\n").as_bytes())
+        .or_cannot_write(|| format!("cannot write {}", path.display()))
+}
+
+/// Removes the summary of a run that goes on.
+pub(super) fn remove(out: &Path) -> Result<(), Failed> {
+    let path = out.join(FILE);
+    match std::fs::remove_file(&path) {
+        Err(error) if error.kind() != std::io::ErrorKind::NotFound => {
+            Err(error).or_cannot_write(|| format!("cannot remove {}", path.display()))
+        }
+        _ => Ok(()),
+    }
 }
 
 /// Plays the test goals with the best policy, on the server of the environments if the run has one.
@@ -192,6 +215,7 @@ fn summary_json(
         "updates": last.updates,
         "wall_s": last.wall_s,
         "advice_spent": last.advice_spent,
+        "advice_queries": last.advice_queries,
         "budget_left": last.budget_left,
         "learner_mib": memory.learner_mib,
         "teacher_mib": memory.teacher_mib,

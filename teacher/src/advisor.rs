@@ -13,7 +13,7 @@ use crate::error::Error;
 use crate::ledger::{ChargeRequest, ChargeResult, Ledger, LedgerError};
 use crate::maps::Maps;
 use crate::policy::AnyPolicy;
-use crate::strategy::Strategy;
+use crate::strategy::{Strategy, procedure};
 use inference::TeacherInference;
 
 /// The number of accounts whose strategies are cached. When it is reached, the cache is cleared.
@@ -270,7 +270,7 @@ impl ScoredRequest<'_> {
         for ((query, arms), charge_idx) in
             self.request.queries.iter().zip(&self.arms).zip(charge_indices(&self.request.queries))
         {
-            let wanted = |half| overrides_any(self.strategy, half, arms);
+            let wanted = |half| overrides_any(self.strategy, (half, query.step), arms);
             let (first, second) = (wanted(BudgetHalf::First), wanted(BudgetHalf::Second));
             match charges.get_mut(charge_idx) {
                 Some(charge) => {
@@ -337,7 +337,7 @@ fn step_advice(
 ) -> StepAdvice {
     if let Some(half) = verdict {
         for arm in &mut arms {
-            arm.overridden = overrides(strategy, half, arm);
+            arm.overridden = overrides(strategy, (half, query.step), arm);
         }
     }
     let action = compose(maps, &query.proposed_action, &arms);
@@ -352,12 +352,12 @@ fn compose(maps: &Maps, proposed_action: &[f32], arms: &[ArmAdvice]) -> Vec<f32>
     maps.joint_action(proposed_action.len(), chosen)
 }
 
-fn overrides(strategy: Strategy, half: BudgetHalf, arm: &ArmAdvice) -> bool {
-    strategy.procedure(half).is_some_and(|procedure| procedure.overrides(arm))
+fn overrides(strategy: Strategy, (half, step): (BudgetHalf, u32), arm: &ArmAdvice) -> bool {
+    procedure(strategy, half, step).is_some_and(|procedure| procedure.overrides(arm))
 }
 
-fn overrides_any(strategy: Strategy, half: BudgetHalf, arms: &[ArmAdvice]) -> bool {
-    arms.iter().any(|arm| overrides(strategy, half, arm))
+fn overrides_any(strategy: Strategy, at: (BudgetHalf, u32), arms: &[ArmAdvice]) -> bool {
+    arms.iter().any(|arm| overrides(strategy, at, arm))
 }
 
 fn episode_steps(task: &TaskSpec) -> u32 {

@@ -70,6 +70,12 @@ pub const fn early_advising() -> bool {
     true
 }
 
+/// Jump-start (Uchendu et al. 2023): returns true if step `step` of an episode, from 0, is before the horizon `H`.
+#[must_use]
+pub const fn jump_start(step: u32, horizon: u32) -> bool {
+    step < horizon
+}
+
 /// Procedure 2, line 9: `I_i(s) > t_I`.
 #[must_use]
 pub fn mistake_correcting_q(importance: f32, threshold: f32) -> bool {

@@ -59,7 +59,7 @@ event! {
         /// Number of steps with a contact between the arms, or between an arm and the table.
         pub contact_steps: usize,
     }
-    info!(episode, parameter_version, success, advice_charged, contact_steps, "episode finished")
+    debug!(episode, parameter_version, success, advice_charged, contact_steps, "episode finished")
 }
 
 event! {

@@ -73,6 +73,9 @@ pub struct MetricsRow {
     /// Measures with contacts told apart. A file of an earlier version does not have them.
     #[serde(flatten)]
     pub contacts: ContactMetrics,
+    /// Training steps so far on which the teacher was asked. A file of an earlier version does not have them.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub advice_queries: Option<u64>,
 }
 
 /// Measures of an evaluation that tell contacts apart. A value that is not known is left out of the file.

@@ -46,6 +46,8 @@ pub struct RunView {
     pub updates_per_s: f64,
     /// Units of advice that learned episodes have cost.
     pub advice_spent: u64,
+    /// Training steps on which the teacher was asked.
+    pub advice_queries: u64,
     /// Units of advice that the run may still spend.
     pub advice_left: u64,
     /// Recent units of advice per minute.

@@ -143,6 +143,7 @@ fn values(row: &MetricsRow) -> Vec<Value> {
         ("loss/critic", Some(row.critic_loss)),
         ("loss/actor", Some(row.actor_loss)),
         ("advice/spent", Some(row.advice_spent as f64)),
+        ("advice/queries", row.advice_queries.map(|queries| queries as f64)),
         ("advice/left", Some(row.budget_left as f64)),
         ("progress/round", Some(row.round as f64)),
         ("progress/episodes", Some(row.episodes as f64)),

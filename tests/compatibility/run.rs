@@ -67,6 +67,7 @@ fn a_checkpoint_brings_back_the_state_that_was_saved() {
             episodes: 8,
             updates: 20,
             advice_spent: restored.trainer.counters().advice_spent,
+            advice_queries: restored.trainer.counters().advice_queries,
         };
         assert_eq!(restored.trainer.counters(), expected);
         assert!((1..=350).contains(&expected.advice_spent));

@@ -119,7 +119,7 @@ class Rig:
         self.arms_at = f"ws://127.0.0.1:{self.relay_port}"
 
     def start_bridge(self):
-        command = [self.tandem_path, "bridge", "--driver", "kinova-ros", "--arms-at", self.arms_at]
+        command = [self.tandem_path, "bridge", "--driver", "kinova-ros", "--arms-at", self.arms_at, "--accept-defaults"]
         self.address = self.start("bridge", [*command, "--listen", "127.0.0.1:0"], "listening on ")
 
     def signal(self, name, sent):

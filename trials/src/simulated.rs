@@ -27,11 +27,13 @@ use tandem_bridge::driver::{Command, Driver, DriverError, Faults, Order, PairSta
 pub use config::{
     Block, CameraConfig, Disturbance, GripperConfig, N_SUBSTEPS, PERIOD_S, SimulatedConfig,
 };
+pub use drill::Drill;
 pub use physics::MAX_OPENING_M;
 pub use realtime::RealTimePair;
 pub use sensors::ObjectPose;
 
 mod config;
+mod drill;
 mod drives;
 mod physics;
 mod realtime;
@@ -87,7 +89,7 @@ impl SimulatedPair {
         let rng = |source| episode_rng(config.seed, source as u64, Stream::Reset);
         let poses: Vec<ArmPoses> = arm_poses(&cell, at).collect();
         let opening = opening.clamp(0.0, 1.0);
-        let world = PhysicsWorld::new(&config, &poses, DVec3::splat(opening).as_vec3().x);
+        let world = PhysicsWorld::new(&config, &poses, single(opening), single(cell.table_z_m));
         let objects = objects(&world, 0.0);
         Self {
             drives: Drives::new(&cell, at, opening, rng(Source::Latency)),
@@ -136,6 +138,12 @@ impl SimulatedPair {
     #[must_use]
     pub fn velocities(&self, arm: ArmIndex) -> &Joints {
         &self.drives.arms[arm.0].velocities
+    }
+
+    /// The work cell of the arms.
+    #[must_use]
+    pub fn cell(&self) -> &WorkCell {
+        &self.cell
     }
 
     /// The true gaps around the arms, metres.
@@ -226,7 +234,12 @@ impl SimulatedPair {
         for (idx, arm) in self.drives.arms.iter().enumerate() {
             let (opening, torques) = (self.world.opening(idx), &self.torques_nm[idx]);
             let contact = self.self_contacts[idx];
-            let faults = Faults { drive: tripped, contact, emergency_stop: false };
+            let injected = self.disturbance.faults.get(idx).copied().unwrap_or_default();
+            let faults = Faults {
+                drive: tripped || injected.drive,
+                contact: contact || injected.contact,
+                emergency_stop: injected.emergency_stop,
+            };
             arms.push(sensors::read(arm, opening, torques, faults, &self.config, &mut self.rng));
         }
         PairState {
@@ -271,6 +284,11 @@ impl Driver for SimulatedPair {
         self.drives.stop(self.config.latency_periods);
         Ok(())
     }
+}
+
+/// Rounds to single precision.
+fn single(number: f64) -> f32 {
+    DVec3::splat(number).as_vec3().x
 }
 
 /// Returns the poses of the arms' bodies for joint angles `angles`, radians.

@@ -151,8 +151,14 @@ fn play_alone(
 
 /// Returns the order to play evaluation episodes with these numbers.
 fn slot_of(numbers: impl IntoIterator<Item = u64>, seed: u64) -> SlotOrder {
-    let order =
-        |number| EpisodeOrder { number, seed, advised: false, uniform: false, record: false };
+    let order = |number| EpisodeOrder {
+        number,
+        seed,
+        advised: false,
+        uniform: false,
+        record: false,
+        advised_steps: None,
+    };
     SlotOrder {
         slot: 0,
         parameter_version: 0,

@@ -175,6 +175,7 @@ pub(crate) fn slot(numbers: &[u64], advised: bool) -> SlotOrder {
         advised,
         uniform: false,
         record: false,
+        advised_steps: None,
     };
     SlotOrder {
         slot: 0,

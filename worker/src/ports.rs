@@ -14,6 +14,12 @@ pub trait Act {
     /// Shapes: `observations` `[n, n_observation]`, `goals` `[n, n_goal]`, `actions` `[n, n_action]`; actions are
     /// in [-1, 1].
     fn act(&mut self, observations: &[f32], goals: &[f32], actions: &mut [f32]);
+
+    /// Returns true if an advised student that acts `action`, shape `[n_action]`, is to ask the teacher. Shapes:
+    /// `observation` `[n_observation]`, `goal` `[n_goal]`.
+    fn asks(&mut self, _observation: &[f32], _goal: &[f32], _action: &[f32]) -> bool {
+        true
+    }
 }
 
 /// A source of advice, such as a connection to a teacher.
@@ -170,5 +176,9 @@ impl Act for BlindActor {
 impl Act for Actor {
     fn act(&mut self, observations: &[f32], goals: &[f32], actions: &mut [f32]) {
         self.act(observations, goals, actions);
+    }
+
+    fn asks(&mut self, observation: &[f32], goal: &[f32], action: &[f32]) -> bool {
+        self.asks(observation, goal, action)
     }
 }

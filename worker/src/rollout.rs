@@ -109,7 +109,7 @@ fn play(
     for step_idx in 0..terms.layout.episode_steps() {
         trace_scenes(&mut rollouts, env);
         for rollout in &mut rollouts {
-            rollout.choose_action(actor);
+            rollout.choose_action(actor, step_idx);
         }
         take_advice(&mut rollouts, step_idx, terms.advice.unit, advisor)?;
         batch.execute(&mut rollouts, step_idx, env)?;
@@ -222,7 +222,7 @@ fn take_advice(
     advisor: &mut impl Advisor,
 ) -> Result<(), RolloutError> {
     let mut advised: Vec<&mut Rollout> =
-        rollouts.iter_mut().filter(|rollout| rollout.advised).collect();
+        rollouts.iter_mut().filter(|rollout| rollout.asks).collect();
     let Some(first) = advised.first() else {
         return Ok(());
     };
@@ -231,6 +231,9 @@ fn take_advice(
     let query = |rollout: &&mut Rollout| StepQuery { payer, ..rollout.query(step_idx) };
     let queries: Vec<StepQuery> = advised.iter().map(query).collect();
     let answers = advisor.advise(queries)?;
+    for rollout in &mut advised {
+        *rollout.episode.queried_steps.get_or_insert(0) += 1;
+    }
     check_count(first_number, step_idx, "steps", answers.len(), advised.len())?;
     for (rollout, advice) in advised.iter_mut().zip(&answers) {
         rollout.apply_advice(advice, step_idx)?;
@@ -274,7 +277,10 @@ fn check_count(
 /// An episode being played.
 struct Rollout {
     explorer: Option<Explorer>,
-    advised: bool,
+    /// The order of the episode, which says on which steps to ask at most.
+    order: EpisodeOrder,
+    /// Whether the teacher is asked about the next step.
+    asks: bool,
     /// The observation before the next step, shape `[n_observation]`.
     observation: Vec<f32>,
     /// The action of the next step, shape `[n_action]`.
@@ -312,10 +318,12 @@ impl Rollout {
             contacts: Vec::with_capacity(n_steps),
             advice_charged: 0,
             avoidance_steps: None,
+            queried_steps: Some(0),
         };
         Self {
             explorer: explorer(order, slot.kind, terms),
-            advised: order.advised && slot.kind == EpisodeKind::Training,
+            order,
+            asks: false,
             observation: observation.to_vec(),
             action: vec![0.0; layout.n_action()],
             policy_action: match terms.advice.judged_action {
@@ -328,9 +336,12 @@ impl Rollout {
         }
     }
 
-    /// Chooses the student's next action, including exploration.
-    fn choose_action(&mut self, actor: &mut impl Act) {
+    /// Chooses the student's next action, including exploration, and whether to ask about it: on the ordered steps
+    /// where the student asks, which depends on its action without exploration.
+    fn choose_action(&mut self, actor: &mut impl Act, step_idx: usize) {
         actor.act(&self.observation, &self.episode.goal, &mut self.action);
+        let may_ask = self.episode.kind == EpisodeKind::Training && self.order.asks_on(step_idx);
+        self.asks = may_ask && actor.asks(&self.observation, &self.episode.goal, &self.action);
         self.advised_arms = 0;
         if let Some(policy_action) = &mut self.policy_action {
             policy_action.copy_from_slice(&self.action);

@@ -12,7 +12,7 @@ const MAX_EQUAL_ANGLES: u32 = 4;
 /// The largest drift of the arms' clock behind the local one, seconds per second.
 const CLOCK_DRIFT: f64 = 1e-3;
 
-/// Validates states and keeps the newest valid one.
+/// Validates states and keeps the newest one whose measurements are valid.
 #[derive(Debug, Clone)]
 pub(crate) struct Monitor {
     models: Vec<&'static ArmModel>,
@@ -96,9 +96,17 @@ impl Monitor {
             }
             return Ok(());
         }
-        let validated = self.validate(now_s, &state, expected);
-        if validated.is_ok() {
-            self.n_good += 1;
+        let ordered = self.check_shape(&state).and_then(|()| self.check_order(now_s, &state));
+        let (reported, measured) = match ordered {
+            Ok(late_s) => {
+                let reported = self.check_reports(&state);
+                (reported, self.check_measurements(&state, expected, late_s))
+            }
+            Err(breach) => (Ok(()), Err(breach)),
+        };
+        if measured.is_ok() {
+            // Arms that report a fault still report where they are.
+            self.n_good = if reported.is_ok() { self.n_good + 1 } else { 0 };
             self.newest = Some(ReceivedState { state, at_s: now_s });
         } else {
             // The next state starts a new sequence: the cause of this stop is already recorded.
@@ -108,20 +116,27 @@ impl Monitor {
             let (newest, usual_delay_s) = (None, f64::INFINITY);
             *self = Self { models, settings, newest, usual_delay_s, n_equal, n_good: 0, ..*self };
         }
-        validated
+        reported.and(measured)
     }
 
-    fn validate(
-        &mut self,
-        now_s: f64,
-        state: &PairState,
-        expected: &ExpectedState<'_>,
-    ) -> Result<(), Breach> {
-        self.check_shape(state)?;
-        let late_s = self.check_order(now_s, state)?;
+    /// Checks that the arms report no fault and no torque beyond the limit.
+    fn check_reports(&self, state: &PairState) -> Result<(), Breach> {
         for (arm, reading) in state.arms.iter().enumerate() {
             check_faults(arm, reading)?;
             self.check_torques(arm, reading)?;
+        }
+        Ok(())
+    }
+
+    /// Checks that the measurements can be true, and that commands take effect. The state is `late_s` seconds later than
+    /// usual.
+    fn check_measurements(
+        &mut self,
+        state: &PairState,
+        expected: &ExpectedState<'_>,
+        late_s: f64,
+    ) -> Result<(), Breach> {
+        for (arm, reading) in state.arms.iter().enumerate() {
             self.check_motion(arm, state.stamp_s, reading)?;
             self.check_frozen(arm, reading, &expected.velocities[arm])?;
         }

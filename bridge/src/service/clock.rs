@@ -13,7 +13,7 @@ pub trait Clock: Send + Sync {
 /// Returns the first of the times `from_s` + period, `from_s` + 2 periods, ... after `now_s`, all in seconds.
 ///
 /// Missed times are skipped: late commands must not be sent in a burst.
-pub(super) fn next_time(from_s: f64, period_s: f64, now_s: f64) -> f64 {
+pub(crate) fn next_time(from_s: f64, period_s: f64, now_s: f64) -> f64 {
     let next_s = from_s + period_s;
     if next_s > now_s {
         return next_s;

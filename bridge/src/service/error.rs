@@ -34,6 +34,12 @@ pub enum Error {
     /// The position of the arms is not known, so no motion can be checked.
     #[error("the position of the arms is not known: see the status")]
     NoState,
+    /// Faults cannot be injected into real arms.
+    #[error("faults are injected into simulated arms only, and these are behind driver {driver:?}")]
+    RealArms {
+        /// The name of their driver.
+        driver: String,
+    },
     /// The drives could not be commanded to stop.
     #[error("the drives could NOT be commanded to stop, use the emergency stop: {0}")]
     StopFailed(#[source] DriverError),
@@ -84,9 +90,11 @@ pub(super) fn status(error: &Error) -> Status {
             // The message does not contain the refusal, which is the error's source.
             Status::failed_precondition(format!("{message}: {refusal}"))
         }
-        Error::Reset(_) | Error::Start(_) | Error::Refused(_) | Error::NoState => {
-            Status::failed_precondition(message)
-        }
+        Error::Reset(_)
+        | Error::Start(_)
+        | Error::Refused(_)
+        | Error::NoState
+        | Error::RealArms { .. } => Status::failed_precondition(message),
         Error::StreamEnded => Status::cancelled(message),
         Error::StreamBroken(status) => Status::new(status.code(), message),
         Error::Busy => Status::resource_exhausted(message),

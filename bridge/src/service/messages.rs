@@ -1,11 +1,14 @@
 //! Conversions of the bridge's types to messages.
 
+use tandem_core::ArmIndex;
 use tandem_kinematics::plan::{MAX_STEP_M, MAX_WAYPOINTS};
 use tandem_kinematics::{ForwardKinematics, Gaps, Joints, Motion, PlacedArm, WorkCell};
 use tandem_proto::{DecodeError, pb};
 
+use crate::cell_file::{Arm, ArmTiming, CellFile};
 use crate::driver::ArmReading;
 use crate::executor::{CheckError, CheckedMotion, Checker, Phase, Stop, Token};
+use crate::injection::{Fault, FaultKind};
 use crate::service::execution::Outcome;
 use crate::service::motion::MotionError;
 use crate::service::reason_codes::{self, Values};
@@ -32,7 +35,14 @@ pub(super) fn decode_token(field: &str, text: &str) -> Result<Token, DecodeError
     }
 }
 
-pub(super) fn describe_arm(placed: &PlacedArm) -> pb::ArmDescription {
+/// Describes the arms of `checker`, which are those of the cell file `file`.
+pub(super) fn describe_arms(checker: &Checker, file: &CellFile) -> Vec<pb::ArmDescription> {
+    let timings = file.timings(checker.settings());
+    let arms = checker.cell().arms.iter().zip(&file.arms).zip(timings);
+    arms.map(|((placed, arm), timing)| describe_arm(placed, arm, timing)).collect()
+}
+
+fn describe_arm(placed: &PlacedArm, arm: &Arm, timing: ArmTiming) -> pb::ArmDescription {
     let joint = |joint: &tandem_kinematics::model::Joint| pb::JointDescription {
         low_rad: joint.range_rad[0],
         high_rad: joint.range_rad[1],
@@ -44,6 +54,11 @@ pub(super) fn describe_arm(placed: &PlacedArm) -> pb::ArmDescription {
         base_in_world_m: coordinates(placed.base_in_world_m.into()),
         yaw_rad: placed.yaw_rad,
         joints: placed.model.joints.iter().map(joint).collect(),
+        name: arm.name.clone(),
+        lag_s: timing.lag_s,
+        reaction_s: timing.reaction_s,
+        brake_s: timing.brake_s,
+        is_measured: arm.is_measured(),
     }
 }
 
@@ -79,6 +94,9 @@ pub(super) fn limits(checker: &Checker, speed: f64) -> pb::BridgeLimits {
         max_step_m: MAX_STEP_M,
         check_self_gap_m: check.self_gap_m,
         self_gap_m: settings.self_gap_m,
+        lag_s: settings.lag_s,
+        reaction_s: settings.reaction_s,
+        brake_s: settings.brake_s,
     }
 }
 
@@ -194,6 +212,48 @@ fn arm_state(reading: &ArmReading, placed: &PlacedArm, reference: Option<Joints>
         contact: reading.faults.contact,
         emergency_stop: reading.faults.emergency_stop,
     }
+}
+
+/// Decodes a fault of the arms of `cell`.
+pub(super) fn decode_fault(
+    message: pb::FaultInjection,
+    cell: &WorkCell,
+) -> Result<Fault, DecodeError> {
+    use pb::InjectedFault as F;
+    let kind = match message.fault() {
+        F::Unspecified => {
+            return Err(DecodeError::new("fault", "an injected fault", message.fault));
+        }
+        F::EmergencyStop => FaultKind::EmergencyStop,
+        F::DriveFault => FaultKind::DriveFault,
+        F::Contact => FaultKind::Contact,
+        F::BlockedJoint => FaultKind::BlockedJoint,
+        F::Torque => FaultKind::Torque,
+        F::Drift => FaultKind::Drift,
+        F::LateStates => FaultKind::LateStates,
+    };
+    let in_range = |field: &str, got: u32, count: usize| match usize::try_from(got) {
+        Ok(index) if index < count => Ok(index),
+        _ => Err(DecodeError::new(field, format_args!("an index below {count}"), got)),
+    };
+    let arm = in_range("arm", message.arm, cell.arms.len())?;
+    let joint = in_range("joint", message.joint, cell.arms[arm].model.n_joints())?;
+    Ok(Fault { kind, arm: ArmIndex(arm), joint })
+}
+
+pub(super) fn fault(fault: Fault) -> pb::FaultInjection {
+    use pb::InjectedFault as F;
+    let kind = match fault.kind {
+        FaultKind::EmergencyStop => F::EmergencyStop,
+        FaultKind::DriveFault => F::DriveFault,
+        FaultKind::Contact => F::Contact,
+        FaultKind::BlockedJoint => F::BlockedJoint,
+        FaultKind::Torque => F::Torque,
+        FaultKind::Drift => F::Drift,
+        FaultKind::LateStates => F::LateStates,
+    };
+    let (arm, joint) = (index(fault.arm.0), index(fault.joint));
+    pb::FaultInjection { fault: kind.into(), arm, joint }
 }
 
 fn unit(values: Option<Values>) -> String {

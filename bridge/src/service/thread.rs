@@ -77,11 +77,12 @@ struct EndGuard {
 
 impl ArmsThread {
     /// Moves `executor` to a new thread, which ticks it by `clock` until `ends` is cancelled and then stops the arms.
-    /// If the thread ends for another reason, it cancels `ends`.
+    /// If the thread ends for another reason, it cancels `ends`. The thread calls `prepare` first.
     pub(super) fn spawn(
         executor: Executor<BoxDriver>,
         clock: Arc<dyn Clock>,
         observer: Option<Observer>,
+        prepare: Option<fn()>,
         ends: CancellationToken,
     ) -> io::Result<(Self, ArmsHandle)> {
         let (jobs, waiting) = mpsc::channel(CAPACITY);
@@ -104,6 +105,9 @@ impl ArmsThread {
         let guard = EndGuard { _ends: ends.clone().drop_guard(), _ended: end_sender };
         let thread = std::thread::Builder::new().name("arms".to_owned()).spawn(move || {
             let _guard = guard;
+            if let Some(prepare) = prepare {
+                prepare();
+            }
             let ticked = catch_unwind(AssertUnwindSafe(|| control.run(&*thread_clock, &ends)));
             // Dropping the executor stops the drives, even after a panic.
             let dropped = catch_unwind(AssertUnwindSafe(move || drop(control)));
@@ -268,10 +272,16 @@ impl ArmsHandle {
         }
     }
 
-    /// Waits until a snapshot meets `condition`, at most as long as a call.
-    pub(super) async fn wait_until(&self, condition: impl FnMut(&Arc<Snapshot>) -> bool) {
+    /// Waits until a snapshot meets `condition`, at most as long as a call. Returns that snapshot, or else the newest one.
+    pub(super) async fn wait_until(
+        &self,
+        condition: impl FnMut(&Arc<Snapshot>) -> bool,
+    ) -> Arc<Snapshot> {
         let mut snapshots = self.snapshots.clone();
-        tokio::time::timeout(CALL_TIMEOUT, snapshots.wait_for(condition)).await.ok();
+        match tokio::time::timeout(CALL_TIMEOUT, snapshots.wait_for(condition)).await {
+            Ok(Ok(met)) => Arc::clone(&met),
+            Ok(Err(_)) | Err(_) => self.newest(),
+        }
     }
 
     /// Runs `work` on the thread before a tick and returns its result. Dropping the future before that cancels the

@@ -203,7 +203,7 @@ pub(crate) fn disturbance(
     directions: &[Joints],
 ) -> Disturbance {
     match kind {
-        Kind::BlockedJoint => Disturbance { blocked: Some((arm, joint)), ..Disturbance::default() },
+        Kind::BlockedJoint => Disturbance { blocked: vec![(arm, joint)], ..Disturbance::default() },
         Kind::TorqueOfContact => {
             let leaning = |idx: usize| {
                 let nm = |number| if idx == arm.0 && number == joint { 6.0 } else { 0.0 };

@@ -1,5 +1,6 @@
 //! The executor on the simulated pair: tasks, ownership and faults.
 
+mod calibration;
 mod faults;
 mod injection;
 mod itself;

@@ -4,6 +4,8 @@ use std::net::SocketAddr;
 use std::sync::{Arc, Condvar, Mutex};
 use std::time::Duration;
 
+use tandem_bridge::cell_file::CellFile;
+use tandem_bridge::injection::Injector;
 use tandem_bridge::service::{BoxDriver, Clock, Config, Error, Reconnect, serve};
 use tandem_bridge::work_cell::mico_cell;
 use tandem_bridge::{Command, Driver, DriverError, Executor, Order, PairState, Settings};
@@ -12,6 +14,7 @@ use tandem_kinematics::{ArmSample, Joints, Motion};
 use tandem_net::ServerConfig;
 use tandem_proto::pb;
 use tandem_proto::pb::bridge_client::BridgeClient;
+use tandem_trials::simulated::Drill;
 use tandem_trials::{SimulatedConfig, SimulatedPair};
 use tokio::net::TcpListener;
 use tokio::sync::mpsc;
@@ -100,6 +103,7 @@ pub(crate) enum Fault {
 /// A simulated pair that a test can inspect and disturb.
 pub(crate) struct Bench {
     pair: SimulatedPair,
+    drill: Drill,
     fault: Fault,
     /// The number of stops outside of exchanges.
     n_stops: usize,
@@ -115,13 +119,14 @@ pub(crate) struct Bench {
 pub(crate) struct Tap(Arc<(Mutex<Bench>, Condvar)>, usize);
 
 impl Tap {
-    fn new(seed: u64) -> Self {
+    fn new(seed: u64, injector: Injector, settings: &Settings) -> Self {
         let cell = mico_cell();
         let at = cell.ready(0.05).unwrap();
         let config = SimulatedConfig { seed, ..SimulatedConfig::default() };
         let pair = SimulatedPair::new(cell, &at, 0.5, config);
+        let drill = Drill::new(injector, settings);
         let (fault, newest) = (Fault::None, Order::Stop);
-        let bench = Bench { pair, fault, n_stops: 0, newest, connection: 0, first: None };
+        let bench = Bench { pair, drill, fault, n_stops: 0, newest, connection: 0, first: None };
         Self(Arc::new((Mutex::new(bench), Condvar::new())), 0)
     }
 
@@ -178,7 +183,9 @@ impl Driver for Tap {
             Fault::None | Fault::Hang => {
                 bench.first.get_or_insert_with(|| command.clone());
                 bench.newest = command.order.clone();
-                bench.pair.exchange(command)
+                let Bench { pair, drill, .. } = &mut *bench;
+                drill.apply(pair);
+                Ok(drill.delayed(pair.exchange(command)?))
             }
             Fault::Untrue => {
                 let mut state = bench.pair.exchange(command)?;
@@ -252,7 +259,9 @@ impl Rig {
     ) -> Self {
         let listener = TcpListener::bind(SocketAddr::from(([127, 0, 0, 1], 0))).await.unwrap();
         let address = listener.local_addr().unwrap();
-        let (clock, tap) = (Arc::new(TestClock::default()), Tap::new(1));
+        let injector = Injector::default();
+        let tap = Tap::new(1, injector.clone(), &settings);
+        let clock = Arc::new(TestClock::default());
         let executor = Executor::new(mico_cell(), Box::new(tap.clone()) as _, settings).unwrap();
         let shutdown = CancellationToken::new();
         let config = Config {
@@ -261,6 +270,11 @@ impl Rig {
             speed,
             clock: clock.clone(),
             reconnect: reconnect(&tap),
+            cell: CellFile::default(),
+            cell_name: String::new(),
+            // Arms that can lose their connection are real ones.
+            injector: reconnect(&tap).is_none().then_some(injector),
+            prepare_thread: None,
             secret: [7; 32],
         };
         let ends = shutdown.clone();

@@ -158,7 +158,14 @@ fn write_messages(to: &Path) -> Result<(), AnyError> {
         },
         world: WorldSettings::default(),
     };
-    let order = EpisodeOrder { number: 64, seed: 42, advised: true, uniform: false, record: true };
+    let order = EpisodeOrder {
+        number: 64,
+        seed: 42,
+        advised: true,
+        uniform: false,
+        record: true,
+        advised_steps: None,
+    };
     let kind = EpisodeKind::Evaluation;
     let slot = SlotOrder { slot: 3, parameter_version: 9, kind, episodes: vec![order] };
     let account = pb::OpenAccountRequest {

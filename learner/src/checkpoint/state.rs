@@ -1,8 +1,9 @@
 //! Conversion of the learning state to named vectors and numbers, and back.
 
 use safetensors::Dtype;
-use tandem_core::work::PublishedActor;
+use tandem_core::work::{PublishedActor, PublishedGate};
 use tandem_policy::{Normalizer, NormalizerSnapshot, NormalizerState, Policy};
+use tandem_rl::jump_start::JumpStart;
 use tandem_rl::replay::{ReplayBuffer, ReplayParts};
 use tandem_rl::trainer::{Counters, RoundStats, Trainer};
 use tandem_telemetry::MetricsRow;
@@ -19,14 +20,24 @@ const MAX_ROUNDS: u64 = 1 << 32;
 /// Largest number of pending evaluations.
 const MAX_PENDING: usize = 64;
 
+/// Key of the number of steps on which the teacher was asked. Checkpoints of earlier versions do not have it.
+const ADVICE_QUERIES: &str = "advice_queries";
+/// Keys of the state of strategy `jsrl:H`, in the order of [`JumpStart::state`].
+const JUMP_START: [&str; 4] =
+    ["jump_start.present", "jump_start.next", "jump_start.n_episodes", "jump_start.n_succeeded"];
+
+/// The critics of the gate of the acting parameters, with strategy `ts2c:T`.
+const ACTING_GATE: &str = "acting.gate";
+
 type OwnedTensor = (String, Dtype, Vec<u8>);
 
 /// Returns the numbers and names of a state, in a fixed order.
 pub(super) fn metadata(trainer: &Trainer, resumption: &Resumption) -> Vec<(&'static str, String)> {
-    let Counters { round, env_steps, episodes, updates, advice_spent } = trainer.counters();
+    let Counters { round, env_steps, episodes, updates, advice_spent, advice_queries } =
+        trainer.counters();
     let (_, next) = trainer.replay.parts();
     let config = trainer.config();
-    vec![
+    let mut entries = vec![
         ("digest", trainer.digest()),
         ("task", config.task.clone()),
         ("arms", config.arms.to_string()),
@@ -36,6 +47,7 @@ pub(super) fn metadata(trainer: &Trainer, resumption: &Resumption) -> Vec<(&'sta
         ("episodes", episodes.to_string()),
         ("updates", updates.to_string()),
         ("advice_spent", advice_spent.to_string()),
+        (ADVICE_QUERIES, advice_queries.to_string()),
         ("ddpg.n_updates", trainer.ddpg.n_updates().to_string()),
         ("normalizer.observation.count", trainer.observation_normalizer.state().count.to_string()),
         ("normalizer.goal.count", trainer.goal_normalizer.state().count.to_string()),
@@ -44,7 +56,12 @@ pub(super) fn metadata(trainer: &Trainer, resumption: &Resumption) -> Vec<(&'sta
         ("pending", resumption.pending.len().to_string()),
         ("wall_s", resumption.wall_s.to_string()),
         (SETTINGS, settings::to_json(config)),
-    ]
+    ];
+    let jump_start = trainer.jump_start.iter().flat_map(|jump_start| {
+        JUMP_START.into_iter().zip(jump_start.state().map(|number| number.to_string()))
+    });
+    entries.extend(jump_start);
+    entries
 }
 
 /// Returns the vectors of a state that are created for the file.
@@ -62,8 +79,9 @@ pub(super) fn small_tensors(trainer: &Trainer, resumption: &Resumption) -> Vec<O
     for (idx, pending) in pending.iter().enumerate() {
         let numbers = [stats_vector(&pending.stats).as_slice(), &[pending.wall_s]].concat();
         tensors.push(f64s(&format!("pending.{idx}.figures"), &numbers));
-        let Counters { round, env_steps, episodes, updates, advice_spent } = pending.counters;
-        let counts = [round, env_steps, episodes, updates, advice_spent];
+        let Counters { round, env_steps, episodes, updates, advice_spent, advice_queries } =
+            pending.counters;
+        let counts = [round, env_steps, episodes, updates, advice_spent, advice_queries];
         let bytes = counts.iter().flat_map(|count| count.to_le_bytes()).collect();
         tensors.push((format!("pending.{idx}.counters"), Dtype::U64, bytes));
     }
@@ -74,6 +92,7 @@ pub(super) fn small_tensors(trainer: &Trainer, resumption: &Resumption) -> Vec<O
         f32s("acting.goal_mean", &acting.goal_mean),
         f32s("acting.goal_std", &acting.goal_std),
     ]);
+    tensors.extend(acting.gate.iter().map(|gate| f32s(ACTING_GATE, &gate.critics)));
     let kept = [("best", &history.best), ("last", &history.last)];
     for (name, policy) in kept {
         tensors.extend(policy.iter().flat_map(|policy| policy_tensors(name, policy)));
@@ -150,7 +169,14 @@ impl Reader<'_> {
             episodes: self.count("episodes")?,
             updates: self.count("updates")?,
             advice_spent: self.count("advice_spent")?,
+            advice_queries: match self.contents.metadata.contains_key(ADVICE_QUERIES) {
+                true => self.count(ADVICE_QUERIES)?,
+                false => 0,
+            },
         };
+        if let Some(horizon) = trainer.config.advice.horizon() {
+            trainer.jump_start = Some(self.jump_start(horizon)?);
+        }
         let [critic_loss, actor_loss, mean_q, training_success, training_moved] =
             self.numbers("figures")?;
         trainer.stats =
@@ -187,6 +213,17 @@ impl Reader<'_> {
         })
     }
 
+    fn jump_start(&self, max_horizon: u32) -> Result<JumpStart, String> {
+        let mut state = [0; 4];
+        for (number, key) in state.iter_mut().zip(JUMP_START) {
+            let value = self.number(key, u64::from(u32::MAX))?;
+            *number = u32::try_from(value).map_err(|error| format!("{key}: {error}"))?;
+        }
+        let restored = JumpStart::from_state(max_horizon, state);
+        restored
+            .ok_or_else(|| format!("no run with horizon {max_horizon} has jump_start {state:?}"))
+    }
+
     fn restore_networks(&self, trainer: &mut Trainer) -> Result<(), String> {
         let names = trainer.ddpg.state().map(|(name, _)| name);
         let vectors = names.iter().map(|name| Ok((*name, self.f32s(&format!("ddpg.{name}"))?)));
@@ -195,7 +232,14 @@ impl Reader<'_> {
             .collect::<Result<_, String>>()?;
         let n_updates = self.count("ddpg.n_updates")?;
         let hint = "the run file gives ddpg.n_hidden or ddpg.n_hidden_layers another value than the run began with";
-        trainer.ddpg.restore(&state, n_updates).map_err(|error| format!("{error}; {hint}"))
+        trainer.ddpg.restore(&state, n_updates).map_err(|error| format!("{error}; {hint}"))?;
+        let Some(ensemble) = &mut trainer.ensemble else { return Ok(()) };
+        let names: Vec<String> = ensemble.state().into_iter().map(|(name, _)| name).collect();
+        let vectors: Vec<Vec<f32>> = names
+            .iter()
+            .map(|name| self.f32s(&format!("ensemble.{name}")))
+            .collect::<Result<_, _>>()?;
+        ensemble.restore(&vectors, n_updates)
     }
 
     fn restore_replay(&self, trainer: &mut Trainer) -> Result<(), String> {
@@ -234,6 +278,10 @@ impl Reader<'_> {
             observation_std: self.f32s("acting.observation_std")?,
             goal_mean: self.f32s("acting.goal_mean")?,
             goal_std: self.f32s("acting.goal_std")?,
+            gate: match trainer.publish().gate {
+                Some(gate) => Some(PublishedGate { critics: self.f32s(ACTING_GATE)?, ..gate }),
+                None => None,
+            },
         };
         // Workers would refuse an unusable actor later; here the error names the checkpoint.
         match tandem_policy::Actor::new(&trainer.layout, acting.clone()) {
@@ -257,7 +305,9 @@ impl Reader<'_> {
     ) -> Result<PendingEvaluation, String> {
         let counters = self.bytes(&format!("{name}.counters"), Dtype::U64)?;
         let counts: Vec<u64> = bytemuck::pod_collect_to_vec(counters);
-        let [round, env_steps, episodes, updates, advice_spent] =
+        // Those of earlier versions do not have the queries.
+        let counts = if counts.len() == 5 { [counts, vec![0]].concat() } else { counts };
+        let [round, env_steps, episodes, updates, advice_spent, advice_queries] =
             exactly(&format!("{name}.counters"), counts)?;
         if round > trainer.counters.round {
             return Err(format!("{name} is of round {round}, which the run has not reached"));
@@ -266,7 +316,14 @@ impl Reader<'_> {
             self.numbers(&format!("{name}.figures"))?;
         let policy = self.stored_policy(name, trainer)?;
         Ok(PendingEvaluation {
-            counters: Counters { round, env_steps, episodes, updates, advice_spent },
+            counters: Counters {
+                round,
+                env_steps,
+                episodes,
+                updates,
+                advice_spent,
+                advice_queries,
+            },
             stats: RoundStats { critic_loss, actor_loss, mean_q, training_success, training_moved },
             wall_s,
             policy: policy.ok_or_else(|| format!("{name} has no policy"))?,

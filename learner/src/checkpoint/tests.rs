@@ -115,6 +115,56 @@ fn a_restored_run_continues_with_the_same_bits() {
 }
 
 #[test]
+fn a_restored_ensemble_of_critics_continues_with_the_same_bits() {
+    let mut config = small_config();
+    "ts2c:0.5".clone_into(&mut config.advice.strategy);
+    let mut uninterrupted = Trainer::new(config.clone()).expect("valid");
+    train_round(&mut uninterrupted);
+    let directory = tempfile::tempdir().expect("a directory");
+    save(directory.path(), &uninterrupted, &resumption(&uninterrupted), 1).expect("saved");
+    let restored = load_newest(directory.path(), &config).expect("readable").expect("a checkpoint");
+    let Restored { mut trainer, resumption, .. } = restored;
+    assert!(resumption.acting.gate.is_some());
+    assert_eq!(resumption.acting, uninterrupted.publish());
+    train_round(&mut uninterrupted);
+    train_round(&mut trainer);
+    assert_eq!(trainer.digest(), uninterrupted.digest());
+    assert_eq!(trainer.publish(), uninterrupted.publish());
+    assert_ne!(trainer.publish().gate, resumption.acting.gate, "the critics learn");
+}
+
+#[test]
+fn a_resumed_run_orders_the_round_with_the_horizon_that_it_had() {
+    let mut config = small_config();
+    "jsrl:20".clone_into(&mut config.advice.strategy);
+    config.rounds.slots = 32;
+    let mut trainer = Trainer::new(config.clone()).expect("valid");
+    let play = |trainer: &mut Trainer, goal_m: f32| {
+        let episode = |number| {
+            let mut episode = drifting_episode(&trainer.layout, number, 0.0);
+            episode.goal.fill(if number % 10 == 0 { goal_m } else { 9.0 });
+            Episode { queried_steps: Some(3), ..episode }
+        };
+        let episodes: Vec<_> = (0..64).map(episode).collect();
+        trainer.ingest(&episodes);
+        trainer.learn(|_| ()).expect("finite");
+    };
+    play(&mut trainer, 0.0);
+    // With a lag of 1 the next round is ordered before this one is learned.
+    let ordered = trainer.training_orders(2, 1);
+    assert_eq!(ordered[0].episodes[0].advised_steps, Some(14), "ceil(20 * (1 - 7 / 32 / 0.7))");
+    assert_eq!(trainer.training_orders(1, 1)[0].episodes[0].advised_steps, Some(20));
+    play(&mut trainer, 9.0);
+    let directory = tempfile::tempdir().expect("a directory");
+    save(directory.path(), &trainer, &resumption(&trainer), 1).expect("saved");
+    let restored = load_newest(directory.path(), &config).expect("readable").expect("a checkpoint");
+    assert_eq!(restored.trainer.training_orders(2, 1), ordered);
+    assert_eq!(restored.trainer.digest(), trainer.digest());
+    assert_eq!(restored.trainer.counters(), trainer.counters());
+    assert_eq!(trainer.counters().advice_queries, 2 * 64 * 3);
+}
+
+#[test]
 fn the_newest_checkpoints_stay_including_the_one_just_written() {
     let (directory, mut trainer) = saved(3);
     let rounds = || -> Vec<String> {

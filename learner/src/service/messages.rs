@@ -21,6 +21,7 @@ pub(super) fn encode_progress(progress: &Progress) -> pb::Progress {
         env_steps_per_s: progress.env_steps_per_s,
         updates_per_s: progress.updates_per_s,
         advice_spent: counters.advice_spent,
+        advice_queries: Some(counters.advice_queries),
         budget_left: progress.budget_left,
         phase: progress.phase.map_or_else(String::new, |phase| phase.name().to_owned()),
         training_success: progress.stats.training_success,

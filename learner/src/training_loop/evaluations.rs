@@ -163,6 +163,7 @@ impl<'a> Evaluations<'a> {
             critic_loss: stats.critic_loss,
             actor_loss: stats.actor_loss,
             advice_spent: counters.advice_spent,
+            advice_queries: Some(counters.advice_queries),
             budget_left: budget_left(self.config, *counters),
             training_success: stats.training_success,
             training_moved: stats.training_moved,

@@ -133,7 +133,15 @@ fn check_advice(
         Err(SubmitError::WrongEpisode { number: episode.number, field, expected, got })
     };
     if ordered.advised && order.kind == EpisodeKind::Training {
-        return Ok(());
+        let mut steps = episode.advised_arms.iter().enumerate();
+        return match steps.find(|(step_idx, arms)| **arms != 0 && !ordered.asks_on(*step_idx)) {
+            None => Ok(()),
+            Some((step_idx, arms)) => {
+                let n_steps = ordered.advised_steps.unwrap_or_default();
+                let expected = format!("no advised arm after the first {n_steps} steps");
+                refuse("advised_arms", expected, format!("{arms:#010b} on step {step_idx}"))
+            }
+        };
     }
     let claimed = episode.advice_charged;
     if claimed > 0 {

@@ -13,7 +13,14 @@ const fn at(seconds: u64) -> Duration {
 }
 
 fn order(number: u64, kind: EpisodeKind) -> SlotOrder {
-    let episode = EpisodeOrder { number, seed: 1, advised: false, uniform: false, record: false };
+    let episode = EpisodeOrder {
+        number,
+        seed: 1,
+        advised: false,
+        uniform: false,
+        record: false,
+        advised_steps: None,
+    };
     SlotOrder { slot: 0, parameter_version: 0, kind, episodes: vec![episode] }
 }
 

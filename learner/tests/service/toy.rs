@@ -77,6 +77,7 @@ fn play_episode(actor: &mut Actor, slot: &SlotOrder, order: EpisodeOrder) -> Epi
         contacts: vec![Contacts::NONE; EPISODE_STEPS],
         advice_charged: 0,
         avoidance_steps: None,
+        queried_steps: None,
     };
     if order.advised {
         claim(&mut episode, UNITS);

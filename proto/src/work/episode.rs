@@ -21,6 +21,7 @@ pub fn encode_episode(episode: &Episode) -> pb::Episode {
         contacts: episode.contacts.iter().map(|contacts| contacts.bits()).collect(),
         advice_charged: episode.advice_charged,
         avoidance_steps: episode.avoidance_steps,
+        queried_steps: episode.queried_steps,
     }
 }
 
@@ -29,7 +30,7 @@ pub fn encode_episode(episode: &Episode) -> pb::Episode {
 /// # Errors
 /// Returns an error if the kind is unknown, a length does not match the layout, a number is not finite or beyond its
 /// bound (see [`tandem_core::bounds`]), an action is outside [−1, 1], an undefined bit of `advised_arms` or `contacts`
-/// is set, or more units were charged or avoidance steps counted than the episode has steps.
+/// is set, or more units were charged, or avoidance steps or queries counted, than the episode has steps.
 pub fn decode_episode(
     episode: pb::Episode,
     layout: impl Into<TaskSpec>,
@@ -38,9 +39,11 @@ pub fn decode_episode(
     let n_steps = layout.episode_steps();
     let n_observations = (n_steps + 1) * layout.n_observation();
     let max_count = u32::try_from(n_steps).expect("an episode has few steps");
-    let avoidance_steps = episode.avoidance_steps;
-    let avoidance_steps =
-        avoidance_steps.map(|count| count_within("avoidance_steps", count, &(0..=max_count)));
+    let counted_steps = |field, count: Option<u32>| {
+        count.map(|count| count_within(field, count, &(0..=max_count))).transpose()
+    };
+    let avoidance_steps = counted_steps("avoidance_steps", episode.avoidance_steps)?;
+    let queried_steps = counted_steps("queried_steps", episode.queried_steps)?;
     Ok(Episode {
         number: episode.number,
         kind: decode_episode_kind(episode.kind)?,
@@ -58,7 +61,8 @@ pub fn decode_episode(
         advised_arms: decode_advised_arms(episode.advised_arms, &layout)?,
         contacts: decode_contacts(&episode.contacts, n_steps)?,
         advice_charged: count_within("advice_charged", episode.advice_charged, &(0..=max_count))?,
-        avoidance_steps: avoidance_steps.transpose()?,
+        avoidance_steps,
+        queried_steps,
         layout,
     })
 }
@@ -125,6 +129,7 @@ mod tests {
             contacts: (0..EPISODE_STEPS).map(contact_of).collect(),
             advice_charged: 38,
             avoidance_steps: Some(2),
+            queried_steps: Some(44),
         }
     }
 
@@ -174,6 +179,7 @@ mod tests {
         );
         check(|e| e.advice_charged = 51, "advice_charged: expected 0 to 50, got 51");
         check(|e| e.avoidance_steps = Some(51), "avoidance_steps: expected 0 to 50, got 51");
+        check(|e| e.queried_steps = Some(51), "queried_steps: expected 0 to 50, got 51");
     }
 
     #[test]

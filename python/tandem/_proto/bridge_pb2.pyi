@@ -15,19 +15,38 @@ class BridgePhase(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     BRIDGE_PHASE_MOVING: _ClassVar[BridgePhase]
     BRIDGE_PHASE_HOLDING: _ClassVar[BridgePhase]
     BRIDGE_PHASE_SETTLING: _ClassVar[BridgePhase]
+
+class InjectedFault(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+    __slots__ = ()
+    INJECTED_FAULT_UNSPECIFIED: _ClassVar[InjectedFault]
+    INJECTED_FAULT_EMERGENCY_STOP: _ClassVar[InjectedFault]
+    INJECTED_FAULT_DRIVE_FAULT: _ClassVar[InjectedFault]
+    INJECTED_FAULT_CONTACT: _ClassVar[InjectedFault]
+    INJECTED_FAULT_BLOCKED_JOINT: _ClassVar[InjectedFault]
+    INJECTED_FAULT_TORQUE: _ClassVar[InjectedFault]
+    INJECTED_FAULT_DRIFT: _ClassVar[InjectedFault]
+    INJECTED_FAULT_LATE_STATES: _ClassVar[InjectedFault]
 BRIDGE_PHASE_UNSPECIFIED: BridgePhase
 BRIDGE_PHASE_STOPPED: BridgePhase
 BRIDGE_PHASE_IDLE: BridgePhase
 BRIDGE_PHASE_MOVING: BridgePhase
 BRIDGE_PHASE_HOLDING: BridgePhase
 BRIDGE_PHASE_SETTLING: BridgePhase
+INJECTED_FAULT_UNSPECIFIED: InjectedFault
+INJECTED_FAULT_EMERGENCY_STOP: InjectedFault
+INJECTED_FAULT_DRIVE_FAULT: InjectedFault
+INJECTED_FAULT_CONTACT: InjectedFault
+INJECTED_FAULT_BLOCKED_JOINT: InjectedFault
+INJECTED_FAULT_TORQUE: InjectedFault
+INJECTED_FAULT_DRIFT: InjectedFault
+INJECTED_FAULT_LATE_STATES: InjectedFault
 
 class DescribeBridgeRequest(_message.Message):
     __slots__ = ()
     def __init__(self) -> None: ...
 
 class DescribeBridgeResponse(_message.Message):
-    __slots__ = ("driver", "version", "period_s", "arms", "table_z_m", "task_frame", "limits")
+    __slots__ = ("driver", "version", "period_s", "arms", "table_z_m", "task_frame", "limits", "cell_file")
     DRIVER_FIELD_NUMBER: _ClassVar[int]
     VERSION_FIELD_NUMBER: _ClassVar[int]
     PERIOD_S_FIELD_NUMBER: _ClassVar[int]
@@ -35,6 +54,7 @@ class DescribeBridgeResponse(_message.Message):
     TABLE_Z_M_FIELD_NUMBER: _ClassVar[int]
     TASK_FRAME_FIELD_NUMBER: _ClassVar[int]
     LIMITS_FIELD_NUMBER: _ClassVar[int]
+    CELL_FILE_FIELD_NUMBER: _ClassVar[int]
     driver: str
     version: str
     period_s: float
@@ -42,19 +62,30 @@ class DescribeBridgeResponse(_message.Message):
     table_z_m: float
     task_frame: TaskFrameDescription
     limits: BridgeLimits
-    def __init__(self, driver: _Optional[str] = ..., version: _Optional[str] = ..., period_s: _Optional[float] = ..., arms: _Optional[_Iterable[_Union[ArmDescription, _Mapping]]] = ..., table_z_m: _Optional[float] = ..., task_frame: _Optional[_Union[TaskFrameDescription, _Mapping]] = ..., limits: _Optional[_Union[BridgeLimits, _Mapping]] = ...) -> None: ...
+    cell_file: str
+    def __init__(self, driver: _Optional[str] = ..., version: _Optional[str] = ..., period_s: _Optional[float] = ..., arms: _Optional[_Iterable[_Union[ArmDescription, _Mapping]]] = ..., table_z_m: _Optional[float] = ..., task_frame: _Optional[_Union[TaskFrameDescription, _Mapping]] = ..., limits: _Optional[_Union[BridgeLimits, _Mapping]] = ..., cell_file: _Optional[str] = ...) -> None: ...
 
 class ArmDescription(_message.Message):
-    __slots__ = ("model", "base_in_world_m", "yaw_rad", "joints")
+    __slots__ = ("model", "base_in_world_m", "yaw_rad", "joints", "name", "lag_s", "reaction_s", "brake_s", "is_measured")
     MODEL_FIELD_NUMBER: _ClassVar[int]
     BASE_IN_WORLD_M_FIELD_NUMBER: _ClassVar[int]
     YAW_RAD_FIELD_NUMBER: _ClassVar[int]
     JOINTS_FIELD_NUMBER: _ClassVar[int]
+    NAME_FIELD_NUMBER: _ClassVar[int]
+    LAG_S_FIELD_NUMBER: _ClassVar[int]
+    REACTION_S_FIELD_NUMBER: _ClassVar[int]
+    BRAKE_S_FIELD_NUMBER: _ClassVar[int]
+    IS_MEASURED_FIELD_NUMBER: _ClassVar[int]
     model: str
     base_in_world_m: _containers.RepeatedScalarFieldContainer[float]
     yaw_rad: float
     joints: _containers.RepeatedCompositeFieldContainer[JointDescription]
-    def __init__(self, model: _Optional[str] = ..., base_in_world_m: _Optional[_Iterable[float]] = ..., yaw_rad: _Optional[float] = ..., joints: _Optional[_Iterable[_Union[JointDescription, _Mapping]]] = ...) -> None: ...
+    name: str
+    lag_s: float
+    reaction_s: float
+    brake_s: float
+    is_measured: bool
+    def __init__(self, model: _Optional[str] = ..., base_in_world_m: _Optional[_Iterable[float]] = ..., yaw_rad: _Optional[float] = ..., joints: _Optional[_Iterable[_Union[JointDescription, _Mapping]]] = ..., name: _Optional[str] = ..., lag_s: _Optional[float] = ..., reaction_s: _Optional[float] = ..., brake_s: _Optional[float] = ..., is_measured: bool = ...) -> None: ...
 
 class JointDescription(_message.Message):
     __slots__ = ("low_rad", "high_rad", "speed_radps", "continuous")
@@ -79,7 +110,7 @@ class TaskFrameDescription(_message.Message):
     def __init__(self, scale: _Optional[float] = ..., centre_m: _Optional[float] = ..., lift_m: _Optional[float] = ...) -> None: ...
 
 class BridgeLimits(_message.Message):
-    __slots__ = ("speed", "tool_speed_mps", "ramp_s", "opening_per_s", "tilt_rad", "reach_share", "check_table_gap_m", "check_arms_gap_m", "table_gap_m", "arms_gap_m", "range_margin_rad", "start_rad", "duration_s", "tracking_rad", "torque_nm", "owner_hold_s", "owner_stop_s", "lease_s", "max_way_points", "max_step_m", "check_self_gap_m", "self_gap_m")
+    __slots__ = ("speed", "tool_speed_mps", "ramp_s", "opening_per_s", "tilt_rad", "reach_share", "check_table_gap_m", "check_arms_gap_m", "table_gap_m", "arms_gap_m", "range_margin_rad", "start_rad", "duration_s", "tracking_rad", "torque_nm", "owner_hold_s", "owner_stop_s", "lease_s", "max_way_points", "max_step_m", "check_self_gap_m", "self_gap_m", "lag_s", "reaction_s", "brake_s")
     SPEED_FIELD_NUMBER: _ClassVar[int]
     TOOL_SPEED_MPS_FIELD_NUMBER: _ClassVar[int]
     RAMP_S_FIELD_NUMBER: _ClassVar[int]
@@ -102,6 +133,9 @@ class BridgeLimits(_message.Message):
     MAX_STEP_M_FIELD_NUMBER: _ClassVar[int]
     CHECK_SELF_GAP_M_FIELD_NUMBER: _ClassVar[int]
     SELF_GAP_M_FIELD_NUMBER: _ClassVar[int]
+    LAG_S_FIELD_NUMBER: _ClassVar[int]
+    REACTION_S_FIELD_NUMBER: _ClassVar[int]
+    BRAKE_S_FIELD_NUMBER: _ClassVar[int]
     speed: float
     tool_speed_mps: float
     ramp_s: float
@@ -124,7 +158,10 @@ class BridgeLimits(_message.Message):
     max_step_m: float
     check_self_gap_m: float
     self_gap_m: float
-    def __init__(self, speed: _Optional[float] = ..., tool_speed_mps: _Optional[float] = ..., ramp_s: _Optional[float] = ..., opening_per_s: _Optional[float] = ..., tilt_rad: _Optional[float] = ..., reach_share: _Optional[float] = ..., check_table_gap_m: _Optional[float] = ..., check_arms_gap_m: _Optional[float] = ..., table_gap_m: _Optional[float] = ..., arms_gap_m: _Optional[float] = ..., range_margin_rad: _Optional[float] = ..., start_rad: _Optional[float] = ..., duration_s: _Optional[float] = ..., tracking_rad: _Optional[float] = ..., torque_nm: _Optional[float] = ..., owner_hold_s: _Optional[float] = ..., owner_stop_s: _Optional[float] = ..., lease_s: _Optional[float] = ..., max_way_points: _Optional[int] = ..., max_step_m: _Optional[float] = ..., check_self_gap_m: _Optional[float] = ..., self_gap_m: _Optional[float] = ...) -> None: ...
+    lag_s: float
+    reaction_s: float
+    brake_s: float
+    def __init__(self, speed: _Optional[float] = ..., tool_speed_mps: _Optional[float] = ..., ramp_s: _Optional[float] = ..., opening_per_s: _Optional[float] = ..., tilt_rad: _Optional[float] = ..., reach_share: _Optional[float] = ..., check_table_gap_m: _Optional[float] = ..., check_arms_gap_m: _Optional[float] = ..., table_gap_m: _Optional[float] = ..., arms_gap_m: _Optional[float] = ..., range_margin_rad: _Optional[float] = ..., start_rad: _Optional[float] = ..., duration_s: _Optional[float] = ..., tracking_rad: _Optional[float] = ..., torque_nm: _Optional[float] = ..., owner_hold_s: _Optional[float] = ..., owner_stop_s: _Optional[float] = ..., lease_s: _Optional[float] = ..., max_way_points: _Optional[int] = ..., max_step_m: _Optional[float] = ..., check_self_gap_m: _Optional[float] = ..., self_gap_m: _Optional[float] = ..., lag_s: _Optional[float] = ..., reaction_s: _Optional[float] = ..., brake_s: _Optional[float] = ...) -> None: ...
 
 class AcquireRequest(_message.Message):
     __slots__ = ("token",)
@@ -381,7 +418,7 @@ class BridgeStatusRequest(_message.Message):
     def __init__(self) -> None: ...
 
 class BridgeStatusResponse(_message.Message):
-    __slots__ = ("phase", "stopped", "is_owned", "lease_left_s", "at_rest", "arms", "motion", "now_s", "since_tick_s")
+    __slots__ = ("phase", "stopped", "is_owned", "lease_left_s", "at_rest", "arms", "motion", "now_s", "since_tick_s", "injected")
     PHASE_FIELD_NUMBER: _ClassVar[int]
     STOPPED_FIELD_NUMBER: _ClassVar[int]
     IS_OWNED_FIELD_NUMBER: _ClassVar[int]
@@ -391,6 +428,7 @@ class BridgeStatusResponse(_message.Message):
     MOTION_FIELD_NUMBER: _ClassVar[int]
     NOW_S_FIELD_NUMBER: _ClassVar[int]
     SINCE_TICK_S_FIELD_NUMBER: _ClassVar[int]
+    INJECTED_FIELD_NUMBER: _ClassVar[int]
     phase: BridgePhase
     stopped: BridgeStop
     is_owned: bool
@@ -400,4 +438,33 @@ class BridgeStatusResponse(_message.Message):
     motion: MotionProgress
     now_s: float
     since_tick_s: float
-    def __init__(self, phase: _Optional[_Union[BridgePhase, str]] = ..., stopped: _Optional[_Union[BridgeStop, _Mapping]] = ..., is_owned: bool = ..., lease_left_s: _Optional[float] = ..., at_rest: bool = ..., arms: _Optional[_Iterable[_Union[ArmState, _Mapping]]] = ..., motion: _Optional[_Union[MotionProgress, _Mapping]] = ..., now_s: _Optional[float] = ..., since_tick_s: _Optional[float] = ...) -> None: ...
+    injected: _containers.RepeatedCompositeFieldContainer[FaultInjection]
+    def __init__(self, phase: _Optional[_Union[BridgePhase, str]] = ..., stopped: _Optional[_Union[BridgeStop, _Mapping]] = ..., is_owned: bool = ..., lease_left_s: _Optional[float] = ..., at_rest: bool = ..., arms: _Optional[_Iterable[_Union[ArmState, _Mapping]]] = ..., motion: _Optional[_Union[MotionProgress, _Mapping]] = ..., now_s: _Optional[float] = ..., since_tick_s: _Optional[float] = ..., injected: _Optional[_Iterable[_Union[FaultInjection, _Mapping]]] = ...) -> None: ...
+
+class InjectRequest(_message.Message):
+    __slots__ = ("fault", "clear")
+    FAULT_FIELD_NUMBER: _ClassVar[int]
+    CLEAR_FIELD_NUMBER: _ClassVar[int]
+    fault: FaultInjection
+    clear: ClearFaults
+    def __init__(self, fault: _Optional[_Union[FaultInjection, _Mapping]] = ..., clear: _Optional[_Union[ClearFaults, _Mapping]] = ...) -> None: ...
+
+class InjectResponse(_message.Message):
+    __slots__ = ("injected",)
+    INJECTED_FIELD_NUMBER: _ClassVar[int]
+    injected: _containers.RepeatedCompositeFieldContainer[FaultInjection]
+    def __init__(self, injected: _Optional[_Iterable[_Union[FaultInjection, _Mapping]]] = ...) -> None: ...
+
+class ClearFaults(_message.Message):
+    __slots__ = ()
+    def __init__(self) -> None: ...
+
+class FaultInjection(_message.Message):
+    __slots__ = ("fault", "arm", "joint")
+    FAULT_FIELD_NUMBER: _ClassVar[int]
+    ARM_FIELD_NUMBER: _ClassVar[int]
+    JOINT_FIELD_NUMBER: _ClassVar[int]
+    fault: InjectedFault
+    arm: int
+    joint: int
+    def __init__(self, fault: _Optional[_Union[InjectedFault, str]] = ..., arm: _Optional[int] = ..., joint: _Optional[int] = ...) -> None: ...

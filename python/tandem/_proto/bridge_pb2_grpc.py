@@ -80,6 +80,11 @@ class BridgeStub(object):
                 request_serializer=tandem_dot_v1_dot_bridge__pb2.BridgeStatusRequest.SerializeToString,
                 response_deserializer=tandem_dot_v1_dot_bridge__pb2.BridgeStatusResponse.FromString,
                 _registered_method=True)
+        self.Inject = channel.unary_unary(
+                '/tandem.v1.Bridge/Inject',
+                request_serializer=tandem_dot_v1_dot_bridge__pb2.InjectRequest.SerializeToString,
+                response_deserializer=tandem_dot_v1_dot_bridge__pb2.InjectResponse.FromString,
+                _registered_method=True)
 
 
 class BridgeServicer(object):
@@ -148,6 +153,14 @@ class BridgeServicer(object):
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
+    def Inject(self, request, context):
+        """Injects a fault into simulated arms, or clears all of them, so that operators can practise each stop. Real arms
+        refuse it.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
 
 def add_BridgeServicer_to_server(servicer, server):
     rpc_method_handlers = {
@@ -190,6 +203,11 @@ def add_BridgeServicer_to_server(servicer, server):
                     servicer.Status,
                     request_deserializer=tandem_dot_v1_dot_bridge__pb2.BridgeStatusRequest.FromString,
                     response_serializer=tandem_dot_v1_dot_bridge__pb2.BridgeStatusResponse.SerializeToString,
+            ),
+            'Inject': grpc.unary_unary_rpc_method_handler(
+                    servicer.Inject,
+                    request_deserializer=tandem_dot_v1_dot_bridge__pb2.InjectRequest.FromString,
+                    response_serializer=tandem_dot_v1_dot_bridge__pb2.InjectResponse.SerializeToString,
             ),
     }
     generic_handler = grpc.method_handlers_generic_handler(
@@ -414,6 +432,33 @@ class Bridge(object):
             '/tandem.v1.Bridge/Status',
             tandem_dot_v1_dot_bridge__pb2.BridgeStatusRequest.SerializeToString,
             tandem_dot_v1_dot_bridge__pb2.BridgeStatusResponse.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def Inject(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_unary(
+            request,
+            target,
+            '/tandem.v1.Bridge/Inject',
+            tandem_dot_v1_dot_bridge__pb2.InjectRequest.SerializeToString,
+            tandem_dot_v1_dot_bridge__pb2.InjectResponse.FromString,
             options,
             channel_credentials,
             insecure,

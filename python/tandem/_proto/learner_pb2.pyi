@@ -116,18 +116,20 @@ class Slot(_message.Message):
     def __init__(self, slot: _Optional[int] = ..., parameter_version: _Optional[int] = ..., kind: _Optional[_Union[EpisodeKind, str]] = ..., episodes: _Optional[_Iterable[_Union[EpisodeOrder, _Mapping]]] = ...) -> None: ...
 
 class EpisodeOrder(_message.Message):
-    __slots__ = ("number", "seed", "advised", "uniform", "record")
+    __slots__ = ("number", "seed", "advised", "uniform", "record", "advised_steps")
     NUMBER_FIELD_NUMBER: _ClassVar[int]
     SEED_FIELD_NUMBER: _ClassVar[int]
     ADVISED_FIELD_NUMBER: _ClassVar[int]
     UNIFORM_FIELD_NUMBER: _ClassVar[int]
     RECORD_FIELD_NUMBER: _ClassVar[int]
+    ADVISED_STEPS_FIELD_NUMBER: _ClassVar[int]
     number: int
     seed: int
     advised: bool
     uniform: bool
     record: bool
-    def __init__(self, number: _Optional[int] = ..., seed: _Optional[int] = ..., advised: bool = ..., uniform: bool = ..., record: bool = ...) -> None: ...
+    advised_steps: int
+    def __init__(self, number: _Optional[int] = ..., seed: _Optional[int] = ..., advised: bool = ..., uniform: bool = ..., record: bool = ..., advised_steps: _Optional[int] = ...) -> None: ...
 
 class Wait(_message.Message):
     __slots__ = ()
@@ -148,7 +150,7 @@ class GetParametersRequest(_message.Message):
     def __init__(self, version: _Optional[int] = ...) -> None: ...
 
 class Parameters(_message.Message):
-    __slots__ = ("version", "n_hidden", "n_layers", "actor", "observation_mean", "observation_std", "goal_mean", "goal_std")
+    __slots__ = ("version", "n_hidden", "n_layers", "actor", "observation_mean", "observation_std", "goal_mean", "goal_std", "n_critics", "n_critic_hidden", "n_critic_layers", "n_critic_heads", "critics", "ask_above")
     VERSION_FIELD_NUMBER: _ClassVar[int]
     N_HIDDEN_FIELD_NUMBER: _ClassVar[int]
     N_LAYERS_FIELD_NUMBER: _ClassVar[int]
@@ -157,6 +159,12 @@ class Parameters(_message.Message):
     OBSERVATION_STD_FIELD_NUMBER: _ClassVar[int]
     GOAL_MEAN_FIELD_NUMBER: _ClassVar[int]
     GOAL_STD_FIELD_NUMBER: _ClassVar[int]
+    N_CRITICS_FIELD_NUMBER: _ClassVar[int]
+    N_CRITIC_HIDDEN_FIELD_NUMBER: _ClassVar[int]
+    N_CRITIC_LAYERS_FIELD_NUMBER: _ClassVar[int]
+    N_CRITIC_HEADS_FIELD_NUMBER: _ClassVar[int]
+    CRITICS_FIELD_NUMBER: _ClassVar[int]
+    ASK_ABOVE_FIELD_NUMBER: _ClassVar[int]
     version: int
     n_hidden: int
     n_layers: int
@@ -165,7 +173,13 @@ class Parameters(_message.Message):
     observation_std: bytes
     goal_mean: bytes
     goal_std: bytes
-    def __init__(self, version: _Optional[int] = ..., n_hidden: _Optional[int] = ..., n_layers: _Optional[int] = ..., actor: _Optional[bytes] = ..., observation_mean: _Optional[bytes] = ..., observation_std: _Optional[bytes] = ..., goal_mean: _Optional[bytes] = ..., goal_std: _Optional[bytes] = ...) -> None: ...
+    n_critics: int
+    n_critic_hidden: int
+    n_critic_layers: int
+    n_critic_heads: int
+    critics: bytes
+    ask_above: float
+    def __init__(self, version: _Optional[int] = ..., n_hidden: _Optional[int] = ..., n_layers: _Optional[int] = ..., actor: _Optional[bytes] = ..., observation_mean: _Optional[bytes] = ..., observation_std: _Optional[bytes] = ..., goal_mean: _Optional[bytes] = ..., goal_std: _Optional[bytes] = ..., n_critics: _Optional[int] = ..., n_critic_hidden: _Optional[int] = ..., n_critic_layers: _Optional[int] = ..., n_critic_heads: _Optional[int] = ..., critics: _Optional[bytes] = ..., ask_above: _Optional[float] = ...) -> None: ...
 
 class SubmitEpisodesRequest(_message.Message):
     __slots__ = ("worker_id", "slot", "episodes", "environment_check")
@@ -192,7 +206,7 @@ class SubmitEpisodesResponse(_message.Message):
     def __init__(self) -> None: ...
 
 class Episode(_message.Message):
-    __slots__ = ("number", "kind", "parameter_version", "observations", "goal", "actions", "advised_arms", "contacts", "advice_charged", "avoidance_steps")
+    __slots__ = ("number", "kind", "parameter_version", "observations", "goal", "actions", "advised_arms", "contacts", "advice_charged", "avoidance_steps", "queried_steps")
     NUMBER_FIELD_NUMBER: _ClassVar[int]
     KIND_FIELD_NUMBER: _ClassVar[int]
     PARAMETER_VERSION_FIELD_NUMBER: _ClassVar[int]
@@ -203,6 +217,7 @@ class Episode(_message.Message):
     CONTACTS_FIELD_NUMBER: _ClassVar[int]
     ADVICE_CHARGED_FIELD_NUMBER: _ClassVar[int]
     AVOIDANCE_STEPS_FIELD_NUMBER: _ClassVar[int]
+    QUERIED_STEPS_FIELD_NUMBER: _ClassVar[int]
     number: int
     kind: EpisodeKind
     parameter_version: int
@@ -213,7 +228,8 @@ class Episode(_message.Message):
     contacts: bytes
     advice_charged: int
     avoidance_steps: int
-    def __init__(self, number: _Optional[int] = ..., kind: _Optional[_Union[EpisodeKind, str]] = ..., parameter_version: _Optional[int] = ..., observations: _Optional[bytes] = ..., goal: _Optional[bytes] = ..., actions: _Optional[bytes] = ..., advised_arms: _Optional[bytes] = ..., contacts: _Optional[bytes] = ..., advice_charged: _Optional[int] = ..., avoidance_steps: _Optional[int] = ...) -> None: ...
+    queried_steps: int
+    def __init__(self, number: _Optional[int] = ..., kind: _Optional[_Union[EpisodeKind, str]] = ..., parameter_version: _Optional[int] = ..., observations: _Optional[bytes] = ..., goal: _Optional[bytes] = ..., actions: _Optional[bytes] = ..., advised_arms: _Optional[bytes] = ..., contacts: _Optional[bytes] = ..., advice_charged: _Optional[int] = ..., avoidance_steps: _Optional[int] = ..., queried_steps: _Optional[int] = ...) -> None: ...
 
 class StatusRequest(_message.Message):
     __slots__ = ()
@@ -224,7 +240,7 @@ class WatchRequest(_message.Message):
     def __init__(self) -> None: ...
 
 class Progress(_message.Message):
-    __slots__ = ("task", "n_arms", "strategy", "round", "env_steps", "episodes", "updates", "wall_s", "env_steps_per_s", "updates_per_s", "advice_spent", "budget_left", "phase", "training_success", "workers", "evaluation", "best", "ended", "end_reason", "digest", "warning", "environment", "max_env_steps", "max_minutes")
+    __slots__ = ("task", "n_arms", "strategy", "round", "env_steps", "episodes", "updates", "wall_s", "env_steps_per_s", "updates_per_s", "advice_spent", "budget_left", "phase", "training_success", "workers", "evaluation", "best", "ended", "end_reason", "digest", "warning", "environment", "advice_queries", "max_env_steps", "max_minutes")
     TASK_FIELD_NUMBER: _ClassVar[int]
     N_ARMS_FIELD_NUMBER: _ClassVar[int]
     STRATEGY_FIELD_NUMBER: _ClassVar[int]
@@ -247,6 +263,7 @@ class Progress(_message.Message):
     DIGEST_FIELD_NUMBER: _ClassVar[int]
     WARNING_FIELD_NUMBER: _ClassVar[int]
     ENVIRONMENT_FIELD_NUMBER: _ClassVar[int]
+    ADVICE_QUERIES_FIELD_NUMBER: _ClassVar[int]
     MAX_ENV_STEPS_FIELD_NUMBER: _ClassVar[int]
     MAX_MINUTES_FIELD_NUMBER: _ClassVar[int]
     task: str
@@ -271,9 +288,10 @@ class Progress(_message.Message):
     digest: str
     warning: str
     environment: str
+    advice_queries: int
     max_env_steps: int
     max_minutes: float
-    def __init__(self, task: _Optional[str] = ..., n_arms: _Optional[int] = ..., strategy: _Optional[str] = ..., round: _Optional[int] = ..., env_steps: _Optional[int] = ..., episodes: _Optional[int] = ..., updates: _Optional[int] = ..., wall_s: _Optional[float] = ..., env_steps_per_s: _Optional[float] = ..., updates_per_s: _Optional[float] = ..., advice_spent: _Optional[int] = ..., budget_left: _Optional[int] = ..., phase: _Optional[str] = ..., training_success: _Optional[float] = ..., workers: _Optional[_Iterable[_Union[WorkerProgress, _Mapping]]] = ..., evaluation: _Optional[_Union[Evaluation, _Mapping]] = ..., best: _Optional[_Union[Evaluation, _Mapping]] = ..., ended: bool = ..., end_reason: _Optional[str] = ..., digest: _Optional[str] = ..., warning: _Optional[str] = ..., environment: _Optional[str] = ..., max_env_steps: _Optional[int] = ..., max_minutes: _Optional[float] = ...) -> None: ...
+    def __init__(self, task: _Optional[str] = ..., n_arms: _Optional[int] = ..., strategy: _Optional[str] = ..., round: _Optional[int] = ..., env_steps: _Optional[int] = ..., episodes: _Optional[int] = ..., updates: _Optional[int] = ..., wall_s: _Optional[float] = ..., env_steps_per_s: _Optional[float] = ..., updates_per_s: _Optional[float] = ..., advice_spent: _Optional[int] = ..., budget_left: _Optional[int] = ..., phase: _Optional[str] = ..., training_success: _Optional[float] = ..., workers: _Optional[_Iterable[_Union[WorkerProgress, _Mapping]]] = ..., evaluation: _Optional[_Union[Evaluation, _Mapping]] = ..., best: _Optional[_Union[Evaluation, _Mapping]] = ..., ended: bool = ..., end_reason: _Optional[str] = ..., digest: _Optional[str] = ..., warning: _Optional[str] = ..., environment: _Optional[str] = ..., advice_queries: _Optional[int] = ..., max_env_steps: _Optional[int] = ..., max_minutes: _Optional[float] = ...) -> None: ...
 
 class WorkerProgress(_message.Message):
     __slots__ = ("worker_id", "name", "episodes", "doing")

@@ -114,7 +114,12 @@ fn tiles(best: &MetricsRow, last: &MetricsRow, has_contacts: bool) -> String {
         (
             "advice spent",
             thousands(last.advice_spent),
-            format!("{} left", thousands(last.budget_left)),
+            match last.advice_queries {
+                Some(n) => {
+                    format!("{} left, {} queries", thousands(last.budget_left), thousands(n))
+                }
+                None => format!("{} left", thousands(last.budget_left)),
+            },
         ),
         (
             "whole run",

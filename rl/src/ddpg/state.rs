@@ -4,6 +4,15 @@ use tandem_policy::{MlpShape, Policy};
 
 use super::{Ddpg, DdpgConfig, DdpgError};
 
+/// A batch of the student's critic.
+#[derive(Debug, Clone, Copy)]
+pub struct CriticBatch<'a> {
+    /// Normalised observation, normalised goal and executed action, shape `[b, n_input + n_action]`.
+    pub inputs: &'a [f32],
+    /// Targets, shape `[b, n_heads]`.
+    pub targets: &'a [f32],
+}
+
 impl Ddpg {
     /// Returns the settings.
     #[must_use]
@@ -51,6 +60,12 @@ impl Ddpg {
     #[must_use]
     pub fn target_critic(&self) -> &[f32] {
         &self.critic.target
+    }
+
+    /// Returns the critic's inputs and targets in the last update.
+    #[must_use]
+    pub fn critic_batch(&self) -> CriticBatch<'_> {
+        CriticBatch { inputs: &self.critic_half.input, targets: &self.critic_half.targets }
     }
 
     /// Returns the gradients of the last update: the actor's and the critic's.

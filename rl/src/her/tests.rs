@@ -176,6 +176,38 @@ fn a_contact_costs_both_arms_and_stops_cloning_before_it() {
 }
 
 #[test]
+fn an_intervention_costs_the_step_before_it_unless_the_goal_is_one_of_hindsight() {
+    let mut buffer = ReplayBuffer::new(LAYOUT, 1000);
+    let mut advised = drifting_episode(LAYOUT, 0, 0.0);
+    advised.goal.fill(9.0);
+    advised.advised_arms[10..20].fill(0b01);
+    advised.advised_arms[15..30].fill(0b11);
+    buffer.push(&advised);
+    // Arm 0 leads to an intervention on step 9, arm 1 on step 14.
+    let led_to = |step: StepIndex, arm: usize| step.step_idx == [9, 14][arm];
+    for reward in [RewardKind::PerArm, RewardKind::Joint] {
+        let mut sampler = Sampler::new(&config(reward), LAYOUT);
+        sampler.set_intervention_cost(1.0);
+        let mut rng = episode_rng(1, 0, Stream::Replay);
+        let mut n_costs = 0;
+        for _ in 0..N_DRAWS {
+            sampler.sample_transition(&buffer, &mut rng);
+            let drawn = &sampler.sample;
+            for (head, got) in drawn.rewards.iter().enumerate() {
+                let arms = if reward == RewardKind::PerArm { head..head + 1 } else { 0..2 };
+                let is_desired = |arm: usize| drawn.goal[LAYOUT.goal_of(ArmIndex(arm))][0] == 9.0;
+                let achieved = !arms.clone().any(is_desired);
+                let cost = arms.clone().any(|arm| is_desired(arm) && led_to(drawn.steps[arm], arm));
+                n_costs += u32::from(cost);
+                let expected = if achieved { 0.0 } else { -1.0 } - if cost { 1.0 } else { 0.0 };
+                assert_eq!(*got, expected, "{reward:?}: {drawn:?}");
+            }
+        }
+        assert!(n_costs > 10, "{reward:?}: {n_costs}");
+    }
+}
+
+#[test]
 fn arms_of_different_steps_are_combined_where_they_cannot_meet() {
     let mut touching = drifting_episode(LAYOUT, 1, 0.0);
     touching.contacts.fill(Contacts::ARM_ARM);

@@ -1,5 +1,6 @@
 //! Tests of the learning state.
 
+use tandem_core::work::EpisodeOrder;
 use tandem_core::{Layout, Task};
 
 use super::*;
@@ -53,4 +54,33 @@ fn joint_goal_statistics_take_the_same_later_step_for_all_arms() {
     let per_arm = goal_means(false);
     assert_ne!(per_arm[..3], per_arm[3..]);
     assert_eq!(joint[..1], goal_means(true)[..1]);
+}
+
+#[test]
+fn without_a_horizon_the_student_asks_on_all_steps_and_at_horizon_zero_on_none() {
+    let mut config = RunConfig::defaults(Recipe::Tandem, Task::Push, 2);
+    config.ddpg.n_hidden = 4;
+    let orders = |trainer: &Trainer| -> Vec<EpisodeOrder> {
+        let slots = trainer.training_orders(0, 0);
+        slots.into_iter().flat_map(|slot| slot.episodes).collect()
+    };
+    let trainer = Trainer::new(config.clone()).expect("valid");
+    assert!(orders(&trainer).iter().all(|order| order.advised_steps.is_none()));
+    assert_eq!(orders(&trainer).iter().filter(|order| order.advised).count(), 8, "every other one");
+    "jsrl:1".clone_into(&mut config.advice.strategy);
+    let mut trainer = Trainer::new(config).expect("valid");
+    let asks = |order: &EpisodeOrder| [0, 1].map(|step_idx| order.asks_on(step_idx));
+    assert_eq!(asks(&orders(&trainer)[1]), [true, false]);
+    let jump_start = trainer.jump_start.as_mut().expect("a horizon");
+    jump_start.finish_round(32, 32);
+    jump_start.finish_round(32, 32);
+    assert!(orders(&trainer).iter().all(|order| !order.advised), "no leases, no queries");
+}
+
+#[test]
+fn intervention_feedback_lowers_the_lowest_value() {
+    let mut config = RunConfig::defaults(Recipe::Tandem, Task::Push, 2);
+    assert_eq!(config.advice.intervention_cost(), 0.0);
+    "rlif:0.2".clone_into(&mut config.advice.strategy);
+    assert_eq!((config.advice.intervention_cost(), config.advice.horizon()), (1.0, None));
 }

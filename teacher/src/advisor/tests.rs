@@ -52,6 +52,20 @@ fn each_strategy_overrides_the_arms_that_its_procedure_selects() {
     check("mc-act:0.5", 0b00, neither);
     check("mc-act-abs:0.999", 0b11, both);
     check("mc-act-abs:1", 0b00, neither);
+    check("rlif:0.0625", 0b01, first);
+    check("jsrl:1", 0b11, both);
+    check("ts2c:9", 0b01, first);
+}
+
+#[test]
+fn a_jump_start_ends_at_its_horizon_and_with_the_budget() {
+    let mut advisor = advisor(5, "jsrl:3");
+    let mut advised = |episode| {
+        let steps = (0..5).map(|step| ask(&mut advisor, &query(episode, step, 0.5, 0.25)));
+        steps.map(|advice| advice.overridden_arms()).collect::<Vec<_>>()
+    };
+    assert_eq!(advised(1), [0b11, 0b11, 0b11, 0, 0]);
+    assert_eq!(advised(2), [0b11, 0b11, 0, 0, 0], "five units in all");
 }
 
 #[test]
@@ -65,7 +79,7 @@ fn advice_on_a_step_that_was_decided_before_is_marked() {
 
 #[test]
 fn every_strategy_returns_the_scores() {
-    for strategy in ["none", "ea", "eamc", "mc-q", "mc-act", "mc-act-abs"] {
+    for strategy in ["none", "ea", "eamc", "mc-q", "mc-act", "mc-act-abs", "jsrl", "rlif", "ts2c"] {
         for budget in [0, 10] {
             let advice = ask(&mut advisor(budget, strategy), &two_arms(0));
             let scores: Vec<_> = advice
@@ -85,7 +99,7 @@ fn every_strategy_returns_the_scores() {
 
 #[test]
 fn without_budget_the_students_action_is_returned_uncharged() {
-    for strategy in ["none", "ea", "eamc", "mc-q", "mc-act", "mc-act-abs"] {
+    for strategy in ["none", "ea", "eamc", "mc-q", "mc-act", "mc-act-abs", "jsrl", "rlif", "ts2c"] {
         let advice = ask(&mut advisor(0, strategy), &two_arms(0));
         assert_eq!((advice.charged, advice.overridden_arms()), (false, 0), "{strategy}");
         assert_eq!(advice.action, [0.0; 6], "{strategy}");
@@ -373,7 +387,7 @@ fn a_policy_without_values_advises_by_strategies_that_compare_none() {
         let refusal = advisor.open_account(strategy, terms(strategy)).unwrap_err().to_string();
         let expected = format!(
             "strategy {strategy} compares values of actions, and the teacher's policy has no critic: use none, ea, \
-             mc-act:A, mc-act-abs:A, or a teacher with a critic"
+             mc-act:A, mc-act-abs:A, jsrl:H, or a teacher with a critic"
         );
         assert_eq!(refusal, expected);
     }

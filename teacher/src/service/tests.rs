@@ -103,7 +103,17 @@ async fn describe_returns_layout_maps_strategies_and_digest() {
     assert_eq!(description.arms[1], second_arm);
     assert_eq!(
         description.strategies,
-        ["none", "ea", "eamc:T", "mc-q:T", "mc-act:A", "mc-act-abs:A"]
+        [
+            "none",
+            "ea",
+            "eamc:T",
+            "mc-q:T",
+            "mc-act:A",
+            "mc-act-abs:A",
+            "jsrl:H",
+            "rlif:T",
+            "ts2c:T"
+        ]
     );
     assert_eq!(description.policy_digest, "fa4e");
     fixture.stop().await;

@@ -1,5 +1,6 @@
 //! The configuration of the simulated pair.
 
+use tandem_bridge::driver::Faults;
 use tandem_core::ArmIndex;
 use tandem_kinematics::Joints;
 
@@ -135,11 +136,14 @@ impl Default for CameraConfig {
 /// An external disturbance of the arms, for tests of faults.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Disturbance {
-    /// A joint that is blocked.
-    pub blocked: Option<(ArmIndex, usize)>,
+    /// The joints that are blocked.
+    pub blocked: Vec<(ArmIndex, usize)>,
     /// Errors that the servos add to commanded velocities, radians per second, arm by arm; empty for none. Braking
     /// drives do not drift.
     pub drift_radps: Vec<Joints>,
     /// External torques on the joints, newton metres, arm by arm; empty for none.
     pub torque_nm: Vec<Joints>,
+    /// Faults that the arms report, arm by arm; empty for none. The drives of an arm with a drive fault or a pressed
+    /// emergency stop brake.
+    pub faults: Vec<Faults>,
 }

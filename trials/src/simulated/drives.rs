@@ -4,8 +4,8 @@
 use std::collections::VecDeque;
 
 use rand_chacha::ChaCha8Rng;
-use tandem_core::Contacts;
 use tandem_core::rng::index;
+use tandem_core::{ArmIndex, Contacts};
 use tandem_kinematics::{ArmModel, Gaps, Joints, WorkCell};
 
 use crate::simulated::config::{Disturbance, N_SUBSTEPS, PERIOD_S, SimulatedConfig};
@@ -160,9 +160,12 @@ impl Drives {
         };
         for (idx, arm) in self.arms.iter_mut().enumerate() {
             let drift = disturbance.drift_radps.get(idx);
+            let faults = disturbance.faults.get(idx).copied().unwrap_or_default();
+            let has_power = !(faults.drive || faults.emergency_stop);
+            let commands = commands.filter(|_| has_power);
             let target = commands.map(|commands| servo_target(&commands[idx], drift));
-            let blocked = disturbance.blocked.filter(|(arm, _)| arm.0 == idx).map(|(_, j)| j);
-            arm.follow(target.as_ref(), config, blocked, &torques_nm[idx]);
+            let is_blocked = |joint| disturbance.blocked.contains(&(ArmIndex(idx), joint));
+            arm.follow(target.as_ref(), config, is_blocked, &torques_nm[idx]);
         }
         self.keep_apart(cell, config, openings, &before);
     }
@@ -204,7 +207,7 @@ impl ArmDrives {
         &mut self,
         target: Option<&Joints>,
         config: &SimulatedConfig,
-        blocked: Option<usize>,
+        is_blocked: impl Fn(usize) -> bool,
         torques_nm: &Joints,
     ) {
         for (idx, joint) in self.model.joints.iter().enumerate() {
@@ -225,7 +228,7 @@ impl ArmDrives {
             let [low, high] = joint.range_rad;
             let angle = self.angles[idx] + next * SUBSTEP_S;
             let at_end = !(low..=high).contains(&angle);
-            if blocked == Some(idx) || stalled || at_end {
+            if is_blocked(idx) || stalled || at_end {
                 let pushes = target.map_or(0.0, |target| target[idx]);
                 self.stalled_nm[idx] =
                     -pushes.signum() * f64::from(pushes != 0.0) * config.stall_nm[idx];

@@ -30,7 +30,7 @@ pub(crate) const HAND_HALF_M: Vector = Vector::new(0.035, 0.030, 0.050);
 /// The distance of the shell's centre behind the tool's origin, metres. The shell reaches from the last joint to the
 /// fingers.
 pub(crate) const HAND_BEHIND_M: f32 = 0.110;
-/// Half extents of the table, metres; its top is at z = 0.
+/// Half extents of the table, metres.
 pub(crate) const TABLE_HALF_M: Vector = Vector::new(0.9, 0.7, 0.05);
 /// Radius of the forearm's shell, metres.
 const FOREARM_RADIUS_M: f32 = 0.035;
@@ -90,7 +90,13 @@ struct Finger {
 }
 
 impl PhysicsWorld {
-    pub(crate) fn new(config: &SimulatedConfig, poses: &[ArmPoses], opening: f32) -> Self {
+    /// Creates arms at `poses` with their grippers at `opening` (0 to 1), and a table whose top is at `table_z_m`.
+    pub(crate) fn new(
+        config: &SimulatedConfig,
+        poses: &[ArmPoses],
+        opening: f32,
+        table_z_m: f32,
+    ) -> Self {
         let mut pipeline = PhysicsPipeline::new();
         pipeline.counters.disable();
         let mut world = Self {
@@ -109,7 +115,7 @@ impl PhysicsWorld {
             objects: Vec::new(),
         };
         let table = ColliderBuilder::cuboid(TABLE_HALF_M.x, TABLE_HALF_M.y, TABLE_HALF_M.z)
-            .translation(Vector::new(0.0, 0.0, -TABLE_HALF_M.z))
+            .translation(Vector::new(0.0, 0.0, table_z_m - TABLE_HALF_M.z))
             .friction(config.table_friction)
             .friction_combine_rule(CoefficientCombineRule::Min)
             .collision_groups(groups(TABLE, OBJECTS | ARMS[0] | ARMS[1]));
@@ -118,7 +124,7 @@ impl PhysicsWorld {
             world.add_hand(ARMS[arm % ARMS.len()], poses, &config.gripper, opening);
         }
         for block in &config.blocks {
-            world.add_block(block, config.table_friction);
+            world.add_block(block, config.table_friction, table_z_m);
         }
         world
     }
@@ -267,8 +273,8 @@ impl PhysicsWorld {
         self.hands.push(Hand { body, forearm, fingers, colliders, opening_m });
     }
 
-    fn add_block(&mut self, block: &Block, friction: f32) {
-        let at = Vector::new(block.at_m[0], block.at_m[1], block.half_m);
+    fn add_block(&mut self, block: &Block, friction: f32, table_z_m: f32) {
+        let at = Vector::new(block.at_m[0], block.at_m[1], table_z_m + block.half_m);
         let pose = Pose::from_parts(at, Rotation::from_rotation_z(block.yaw_rad));
         let body = self.bodies.insert(RigidBodyBuilder::dynamic().pose(pose).can_sleep(false));
         let cube = ColliderBuilder::cuboid(block.half_m, block.half_m, block.half_m)

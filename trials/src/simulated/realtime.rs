@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use crate::simulated::{PERIOD_S, SimulatedPair};
+use crate::simulated::{Drill, PERIOD_S, SimulatedPair};
 use tandem_bridge::driver::{Command, Driver, DriverError, PairState};
 use tandem_bridge::service::Clock;
 
@@ -19,13 +19,20 @@ pub struct RealTimePair {
     /// The clock's time at the pair's time 0, seconds; `None` before the first exchange.
     began_s: Option<f64>,
     n_exchanges: u64,
+    drill: Option<Drill>,
 }
 
 impl RealTimePair {
     /// Runs `pair` in the time of `clock`.
     #[must_use]
     pub fn new(pair: SimulatedPair, clock: Arc<dyn Clock>) -> Self {
-        Self { pair, clock, began_s: None, n_exchanges: 0 }
+        Self { pair, clock, began_s: None, n_exchanges: 0, drill: None }
+    }
+
+    /// Applies the faults of a drill to the pair.
+    #[must_use]
+    pub fn with_drill(self, drill: Drill) -> Self {
+        Self { drill: Some(drill), ..self }
     }
 
     /// Simulates the periods in which no command arrived.
@@ -49,10 +56,17 @@ impl Driver for RealTimePair {
     }
 
     fn exchange(&mut self, command: &Command) -> Result<PairState, DriverError> {
+        if let Some(drill) = &mut self.drill {
+            drill.apply(&mut self.pair);
+        }
         self.catch_up();
         let state = self.pair.exchange(command)?;
         self.n_exchanges += 1;
-        Ok(PairState { sequence: self.n_exchanges, ..state })
+        let state = PairState { sequence: self.n_exchanges, ..state };
+        Ok(match &mut self.drill {
+            Some(drill) => drill.delayed(state),
+            None => state,
+        })
     }
 
     fn stop(&mut self) -> Result<(), DriverError> {

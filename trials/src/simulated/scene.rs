@@ -21,7 +21,9 @@ pub(crate) fn scene(
     let object = |(idx, block): (usize, &Block)| {
         cuboid(world.object(idx).position(), Vector::splat(block.half_m))
     };
-    let under = Pose::from_parts(Vector::new(0.0, 0.0, -TABLE_HALF_M.z), Rotation::IDENTITY);
+    let table_z_m = DVec3::splat(cell.table_z_m).as_vec3().z;
+    let centre = Vector::new(0.0, 0.0, table_z_m - TABLE_HALF_M.z);
+    let under = Pose::from_parts(centre, Rotation::IDENTITY);
     Scene {
         time_s,
         arms: (0..angles.len()).map(arm).collect(),

@@ -167,3 +167,42 @@ fn advice_about_other_steps_is_an_error() {
         "the teacher's advice on episode 3, step 0, has 0 steps where 1 were expected"
     );
 }
+
+#[test]
+fn an_order_ends_the_queries_and_every_query_is_counted() {
+    let mut order = slot(&[3, 8, 9], true);
+    order.episodes[0].advised_steps = Some(4);
+    order.episodes[1].advised_steps = Some(0);
+    let mut teacher = FakeTeacher::new(|_, _, _| true);
+    let episodes = play(&order, FakeActor::Seeker, &mut teacher);
+    let queried: Vec<_> = episodes.iter().map(|episode| episode.queried_steps).collect();
+    assert_eq!(queried, [Some(4), Some(0), Some(50)]);
+    let asked: Vec<usize> = teacher.requests.iter().map(Vec::len).collect();
+    assert_eq!(asked[..6], [2, 2, 2, 2, 1, 1]);
+    assert_eq!(episodes[0].advised_arms[..5], [0b11, 0b11, 0b11, 0b11, 0]);
+    assert_eq!(episodes.iter().map(|e| e.advice_charged).collect::<Vec<_>>(), [4, 0, 50]);
+}
+
+#[test]
+fn a_student_that_knows_its_values_does_not_ask() {
+    struct Gated(FakeActor);
+
+    impl Act for Gated {
+        fn act(&mut self, observations: &[f32], goals: &[f32], actions: &mut [f32]) {
+            self.0.act(observations, goals, actions);
+        }
+
+        fn asks(&mut self, _observation: &[f32], _goal: &[f32], action: &[f32]) -> bool {
+            assert_eq!(action, [0.1; 6], "the action without exploration");
+            false
+        }
+    }
+
+    let mut teacher = FakeTeacher::new(|_, _, _| true);
+    let (env, order) = (&mut FakeEnvironment::new(), slot(&[3], true));
+    let actor = &mut Gated(FakeActor::Constant(0.1));
+    let gated = play_slot(env, &order, &terms(), actor, &mut teacher).expect("no step fails");
+    assert_eq!((gated[0].queried_steps, teacher.requests.len()), (Some(0), 0));
+    let free = play(&slot(&[3], false), FakeActor::Constant(0.1), &mut NoAdvisor);
+    assert_eq!(gated, free, "as without advice");
+}

@@ -63,6 +63,7 @@ fn order(number: u64, kind: EpisodeKind) -> EpisodeOrder {
         advised: is_training && number != 3,
         uniform: false,
         record: !is_training && number == 1,
+        advised_steps: None,
     }
 }
 
@@ -80,6 +81,7 @@ pub(crate) fn actor(version: u64) -> PublishedActor {
         observation_std: vec![1.0; LAYOUT.n_observation()],
         goal_mean: vec![0.0; LAYOUT.n_goal()],
         goal_std: vec![1.0; LAYOUT.n_goal()],
+        gate: None,
     }
 }
 

@@ -29,3 +29,22 @@ fn the_first_advised_episode_claims_the_lock_steps_of_its_slot() {
     check([0, 3, 0], &format!("episode 1: advice_charged: expected 2, {steps}, got 3"));
     check([1, 2, 0], "episode 0: advice_charged: expected 0, as no advice was ordered, got 1");
 }
+
+#[test]
+fn advice_after_the_ordered_steps_is_refused() {
+    let check = |advised_steps, expected: Result<bool, &str>| {
+        let (mut ordered, episodes) = advised(2, &[0, 1, 3]);
+        ordered.episodes[0].advised_steps = advised_steps;
+        let mut queue = WorkQueue::default();
+        queue.push(ordered);
+        let worker = join(&mut queue, at(0));
+        next_slot(&mut queue, worker, at(0));
+        let outcome = queue.submit(worker, 0, episodes, at(0)).map_err(|e| e.to_string());
+        assert_eq!(outcome, expected.map_err(str::to_owned));
+    };
+    check(None, Ok(true));
+    check(Some(3), Ok(true));
+    let refused = "episode 0: advised_arms: expected no advised arm after the first 2 steps, got \
+                   0b00000011 on step 2";
+    check(Some(2), Err(refused));
+}

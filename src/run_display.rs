@@ -1,18 +1,16 @@
-//! The display of a running `tandem train`: live lines on a terminal, plain lines elsewhere.
+//! The display of a run: live lines on a terminal, plain lines elsewhere.
 
 use std::io::IsTerminal as _;
 use std::time::Duration;
 
 use indicatif::{MultiProgress, ProgressBar, ProgressStyle};
-use tandem_core::text::counted;
 use tandem_proto::pb;
 
-use super::plan::Plan;
 use crate::columns::wrapped;
+use crate::output;
 use crate::progress_text::{
     counts_line, evaluation_line, fraction_done, state_lines, warning_line,
 };
-use crate::{environment_server, output};
 
 /// Seconds of run time after which a plain line is printed even without news.
 const PLAIN_EVERY_S: f64 = 30.0;
@@ -37,26 +35,14 @@ struct Live {
 }
 
 impl Display {
-    pub(crate) fn new(plan: &Plan, is_quiet: bool) -> Self {
-        let display = Self {
+    pub(crate) fn new(is_quiet: bool) -> Self {
+        Self {
             live: (!is_quiet && std::io::stderr().is_terminal()).then(Live::new),
             is_quiet,
             printed_at_s: -PLAIN_EVERY_S,
             printed_evaluation: None,
             printed_warning: String::new(),
-        };
-        let config = &plan.config;
-        let (arms, workers) = (counted(config.arms, "arm"), counted(plan.n_workers, "worker"));
-        let (task, strategy, seed) = (&config.task, &config.advice.strategy, config.seed);
-        display.print(&wrapped(
-            &format!("training {task} with {arms}, strategy {strategy}, seed {seed}, {workers}"),
-            "  ",
-        ));
-        display.print(&format!("run directory {}", plan.out.display()));
-        if let Some(server) = environment_server::shown(&plan.environment) {
-            display.print(&format!("environments of {server}"));
         }
-        display
     }
 
     pub(crate) fn show(&mut self, progress: &pb::Progress) {

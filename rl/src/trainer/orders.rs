@@ -1,0 +1,76 @@
+//! Orders of episodes: those of a round, and those of an evaluation.
+
+use tandem_core::episode::EpisodeKind;
+use tandem_core::work::{EpisodeOrder, SlotOrder};
+
+use super::Trainer;
+
+/// Episodes of an evaluation slot.
+const EVALUATION_SLOT_EPISODES: usize = 8;
+
+impl Trainer {
+    /// Returns the training slots of round `round`, for parameter version `version`.
+    #[must_use]
+    pub fn training_orders(&self, round: u64, version: u64) -> Vec<SlotOrder> {
+        let per_round = self.config.episodes_per_round();
+        let warmup_episodes =
+            self.config.rounds.warmup_env_steps.div_ceil(self.layout.episode_steps() as u64);
+        let n_rounds_ahead = round.saturating_sub(self.counters.round);
+        let advised_steps = self.jump_start.map(|jump_start| jump_start.horizon(n_rounds_ahead));
+        let asks = self.config.advice.asks() && advised_steps != Some(0);
+        let orders: Vec<EpisodeOrder> = (round * per_round..(round + 1) * per_round)
+            .map(|number| EpisodeOrder {
+                number,
+                seed: self.config.seed,
+                advised: asks && is_advised(number, self.config.advice.share),
+                uniform: number < warmup_episodes,
+                record: false,
+                advised_steps,
+            })
+            .collect();
+        slots(&orders, self.config.rounds.rollouts, EpisodeKind::Training, version)
+    }
+
+    /// Returns the slots of an evaluation of parameter version `version` on the run's fixed goals.
+    #[must_use]
+    pub fn evaluation_orders(&self, version: u64) -> Vec<SlotOrder> {
+        let evaluation = &self.config.evaluation;
+        let order = |number| EpisodeOrder {
+            number,
+            seed: evaluation.seed,
+            advised: false,
+            uniform: false,
+            record: number < evaluation.recorded_episodes,
+            advised_steps: None,
+        };
+        let orders: Vec<EpisodeOrder> = (0..evaluation.episodes).map(order).collect();
+        slots(&orders, EVALUATION_SLOT_EPISODES, EpisodeKind::Evaluation, version)
+    }
+}
+
+/// Returns true if episode `number` is advised. Advised episodes are evenly spread.
+#[expect(
+    clippy::cast_possible_truncation,
+    clippy::cast_sign_loss,
+    reason = "episode numbers stay far below 2^52"
+)]
+pub(super) fn is_advised(number: u64, share: f64) -> bool {
+    let advised_before = |number: u64| (number as f64 * share).floor() as u64;
+    advised_before(number + 1) > advised_before(number)
+}
+
+/// Splits orders into slots of `n_episodes`; the learner's queue numbers them.
+fn slots(
+    orders: &[EpisodeOrder],
+    n_episodes: usize,
+    kind: EpisodeKind,
+    version: u64,
+) -> Vec<SlotOrder> {
+    let slot = |episodes: &[EpisodeOrder]| SlotOrder {
+        slot: 0,
+        parameter_version: version,
+        kind,
+        episodes: episodes.to_vec(),
+    };
+    orders.chunks(n_episodes).map(slot).collect()
+}

@@ -1,0 +1,98 @@
+//! `tandem bridge calibrate`: measures how fast the arms react, and writes the times into their cell file.
+
+use std::path::Path;
+use std::sync::Arc;
+
+use anyhow::anyhow;
+use serde_json::json;
+use tandem_bridge::calibration::{CalibrationError, JointTiming, Operator, calibrate as measure};
+use tandem_bridge::cell_file::{ArmTiming, with_timings};
+use tandem_system::atomic_file;
+use tokio_util::sync::CancellationToken;
+
+use super::cell::{self, Cell};
+use super::{arms, priority, runtime};
+use crate::cli::{CalibrateArgs, DriverName};
+use crate::exit::{Exit, Failed, OrExit as _};
+use crate::{clock, output, signals};
+
+pub(super) fn calibrate(args: CalibrateArgs) -> Result<(), Failed> {
+    let Some(path) = args.arms.cell.clone() else {
+        return Err(Failed::usage("--cell FILE is missing: write one with `tandem bridge cell`"));
+    };
+    let text = cell::text(&path)?;
+    let cell = Cell::load(Some(&path))?;
+    let runtime = runtime().or_exit(Exit::TryAgain, String::new)?;
+    let names: Vec<String> = cell.file.arms.iter().map(|arm| arm.name.clone()).collect();
+    let json = args.json;
+    let measured = runtime.block_on(async move {
+        let interrupted = signals::shutdown_token(false)?;
+        let measuring =
+            tokio::task::spawn_blocking(move || measure_arms(&args, &cell, &interrupted));
+        measuring.await.or_exit(Exit::Bug, String::new)?
+    })?;
+    save(&path, &text, &measured)?;
+    if json {
+        let arm = |(name, timing): (&String, &ArmTiming)| {
+            json!({
+                "name": name, "lag_s": timing.lag_s, "reaction_s": timing.reaction_s,
+                "brake_s": timing.brake_s,
+            })
+        };
+        let arms: Vec<_> = names.iter().zip(&measured).map(arm).collect();
+        return output::print(json!({"cell_file": path.display().to_string(), "arms": arms}));
+    }
+    for (name, timing) in names.iter().zip(&measured) {
+        output::print(format_args!("{name}: {}", times(timing)))?;
+    }
+    output::print(format_args!("written to {}", path.display()))
+}
+
+/// Writes the times into the cell file, which had this text.
+fn save(path: &Path, text: &str, measured: &[ArmTiming]) -> Result<(), Failed> {
+    let text = with_timings(text, measured);
+    let text = text.or_exit(Exit::Data, || format!("{path:?} is unchanged: measured"))?;
+    let written = atomic_file::replace(path, text.as_bytes());
+    written.or_cannot_write(|| format!("cannot write {}", path.display()))
+}
+
+fn measure_arms(
+    args: &CalibrateArgs,
+    cell: &Cell,
+    interrupted: &CancellationToken,
+) -> Result<Vec<ArmTiming>, Failed> {
+    let settings = cell.settings(args.arms.driver);
+    let clock = Arc::new(clock::BridgeClock::new());
+    let (driver, ..) = arms::connect(&args.arms, cell, &settings, clock.clone())?;
+    if args.arms.driver == DriverName::Sim {
+        priority::raise_if_permitted();
+    } else {
+        priority::raise();
+        output::message(
+            "tandem: every joint of both arms turns by some degrees: keep a hand on the emergency stop",
+        );
+    }
+    let mut report = |joint: JointTiming| {
+        let name = &cell.file.arms[joint.arm.0].name;
+        let line =
+            format_args!("tandem: {name}, joint {}: {}", joint.joint + 1, times(&joint.timing));
+        output::message(line);
+    };
+    let work_cell = cell.file.work_cell();
+    let is_interrupted = || interrupted.is_cancelled();
+    let operator =
+        Operator { clock: &*clock, report: &mut report, is_interrupted: &is_interrupted };
+    measure(&work_cell, driver, settings, args.speed, operator).map_err(|error| {
+        let exit = match &error {
+            CalibrationError::Interrupted => Exit::Interrupted,
+            CalibrationError::Setting(_) => Exit::Data,
+            _ => Exit::TryAgain,
+        };
+        Failed::new(exit, anyhow!("the cell file is unchanged: {error}"))
+    })
+}
+
+fn times(timing: &ArmTiming) -> String {
+    let [lag, reaction, brake] = [timing.lag_s, timing.reaction_s, timing.brake_s].map(|s| 1e3 * s);
+    format!("lag {lag:.1} ms, reaction {reaction:.1} ms, brake {brake:.1} ms")
+}
