@@ -1,5 +1,4 @@
 //! Plots and pages are well-formed and complete for any names and numbers.
-#![expect(clippy::unwrap_used, reason = "a test that cannot go on may end")]
 
 use std::path::Path;
 

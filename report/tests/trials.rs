@@ -1,5 +1,4 @@
 //! Reports on trials: tables, plots, pages and JSON.
-#![expect(clippy::unwrap_used, reason = "a test that cannot go on may end")]
 
 use tandem_report::{Comparison, PlottedTrials, Trials, report_html, trial_svg, trials};
 use tandem_telemetry::{ToolPathPoint, TrialRow};

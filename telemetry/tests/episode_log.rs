@@ -1,5 +1,4 @@
 //! Logs of episodes: writing, reading and recovery.
-#![expect(clippy::unwrap_used, reason = "a test that cannot go on may end")]
 
 use std::collections::BTreeMap;
 use std::path::Path;

@@ -1,5 +1,4 @@
 //! Logs of trials: writing, reading with the mcap crate, and recovery.
-#![expect(clippy::unwrap_used, reason = "a test that cannot go on may end")]
 
 use std::collections::BTreeMap;
 use std::path::Path;
