@@ -159,6 +159,35 @@ def check_episode(page):
     page.wait("document.getElementById('step').value > 5", "the episode plays")
 
 
+RAISED = """{ round: 1, step_s: 0.04, tolerance_m: 0.05, is_cube: false, bases: [[-0.3, 0, 0], [0.3, 0, 0]], episodes: [{
+  success: true, contacts: [], goals: [[-0.1, 0, 0.02], [0.1, 0, 0.02]],
+  steps: [[[-0.1, 0.21, 0.55], [0.1, -0.21, 0.02]].map(hand => ({ hand, object: [0, 0, 0.02], opening: 0.04, at_goal: false }))],
+}] }"""
+
+
+def check_drawings(page):
+    """The axis of a chart with one point at the start has whole steps, and raised hands and their names are not cut."""
+    page.value("""import('/assets/chart.js').then(({ Chart }) => {
+      const parent = document.body.appendChild(document.createElement('div'));
+      const series = [{ name: 'it', class: 'first', value: (row) => row.y }];
+      new Chart(parent, { label: 'one point', series }).show([{ env_steps: 0, y: 1 }]);
+      window.chart = parent; })""")
+    ticks = page.value("[...window.chart.querySelectorAll('text[text-anchor=middle]')].map(it => it.textContent)")
+    assert ticks == ["0", "200", "400", "600", "800", "1000", "environment steps"], ticks
+    cut = page.value(f"""import('/assets/player.js').then(({{ Player }}) => {{
+      document.getElementById('player').hidden = false;
+      new Player().load({RAISED});
+      return ['view-above', 'view-side'].flatMap(id => {{
+        const root = document.getElementById(id), box = root.getBoundingClientRect();
+        return [...root.querySelectorAll('text, .palm, .finger')].filter(it => {{
+          const {{ left, right, top, bottom }} = it.getBoundingClientRect();
+          return left < box.left || right > box.right || top < box.top || bottom > box.bottom;
+        }}).map(it => `${{id}} ${{it.outerHTML}}`);
+      }});
+    }})""")
+    assert cut == [], cut
+
+
 def check_layout(page):
     """Nothing overflows, and everything has a name."""
     for _ in page.layouts():
@@ -314,6 +343,7 @@ def main():
             check_episode(page)
             check_layout(page)
             page.take_pictures(args.pictures, "run")
+            check_drawings(browser.open(run.url))
             measure_viewers(run)
             measure_cost(run)
             run.process.send_signal(signal.SIGINT)
