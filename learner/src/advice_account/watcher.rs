@@ -38,7 +38,8 @@ impl AccountWatcher {
         (warnings, view): (Warnings, watch::Sender<TeacherView>),
         clock: Clock,
     ) -> Self {
-        let status = TeacherStatus { warnings, view, clock, silent_since: None, is_warned: false };
+        let answered_at = clock();
+        let status = TeacherStatus { warnings, view, clock, answered_at, is_warned: false };
         Self { client, lost, status }
     }
 
@@ -61,8 +62,8 @@ struct TeacherStatus {
     /// Receives the state of the teacher.
     view: watch::Sender<TeacherView>,
     clock: Clock,
-    /// Time of the first failed call since the latest answer.
-    silent_since: Option<Duration>,
+    /// Time of the latest answer.
+    answered_at: Duration,
     /// True while the warning is about that silence.
     is_warned: bool,
 }
@@ -97,8 +98,7 @@ impl TeacherStatus {
     /// Warns once of a teacher that has not answered for [`WARN_AFTER`]; later errors may differ from the first.
     fn warn_of_silence(&mut self, error: &str) {
         let now = (self.clock)();
-        let silence = now.saturating_sub(*self.silent_since.get_or_insert(now));
-        if silence < WARN_AFTER || self.is_warned {
+        if now.saturating_sub(self.answered_at) < WARN_AFTER || self.is_warned {
             return;
         }
         self.is_warned = true;
@@ -109,7 +109,7 @@ impl TeacherStatus {
 
     /// Replaces the warning by that of a teacher that answers.
     fn end_silence(&mut self, warning: &str) {
-        (self.silent_since, self.is_warned) = (None, false);
+        (self.answered_at, self.is_warned) = ((self.clock)(), false);
         self.warnings.set(Source::Teacher, warning);
     }
 }
@@ -132,7 +132,7 @@ mod tests {
             warnings: Warnings::new(progress),
             view,
             clock,
-            silent_since: None,
+            answered_at: Duration::ZERO,
             is_warned: false,
         };
         let mut check = |at_s, answer: Result<&str, &str>, expected: &str| {
@@ -148,13 +148,12 @@ mod tests {
         let silent = "the teacher does not answer, the run waits for it: refused";
         check(100, Ok(""), "");
         check(101, Err("timeout"), "");
-        check(105, Err("timeout"), "");
-        check(106, Err("refused"), silent);
+        check(104, Err("timeout"), "");
+        check(105, Err("refused"), silent);
         check(107, Err("timeout"), silent);
         check(108, Ok(""), "");
-        check(113, Err("refused"), "");
-        check(117, Err("refused"), "");
-        check(118, Err("refused"), silent);
+        check(112, Err("refused"), "");
+        check(113, Err("refused"), silent);
         check(119, Ok("the disk is full"), "the disk is full");
     }
 }
