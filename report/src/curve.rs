@@ -219,10 +219,10 @@ impl CurveOptions {
         }
     }
 
-    /// Returns the same for screens on which a plot of 560 pixels would be too small to read, 360 by 310 pixels.
+    /// Returns the same for screens on which a plot of 560 pixels would be too small to read, 360 by 270 pixels.
     #[must_use]
     pub fn narrow(self) -> Self {
-        Self { width: NARROW_PX, height: 310, ..self }
+        Self { width: NARROW_PX, height: 270, ..self }
     }
 }
 
@@ -241,7 +241,11 @@ pub(crate) struct Drawing {
 /// If the plotting library fails.
 pub(crate) fn curve_drawing(series: &[Series], options: CurveOptions) -> Result<Drawing, Error> {
     let wide = curve_svg(series, &options)?;
-    Ok(Drawing { wide, narrow: curve_svg(series, &options.narrow())? })
+    let mut narrow = options.narrow();
+    // A legend with many lines would leave no room for the curves.
+    let legend_px = LEGEND_LINE_PX * n_legend_lines(&legend(series, narrow.width));
+    narrow.height += legend_px.unsigned_abs();
+    Ok(Drawing { wide, narrow: curve_svg(series, &narrow)? })
 }
 
 /// Draws `series` with their bands and a legend as SVG.
@@ -421,6 +425,20 @@ mod tests {
         let lines = title_lines(&options);
         assert_eq!((lines.len(), lines.join(" ").as_str()), (2, title));
         assert_eq!(legend_top_px(&options), 60);
+    }
+
+    #[test]
+    fn a_narrow_drawing_keeps_the_height_of_its_curves() {
+        let named = |name: String| Series { name, points: Vec::new() };
+        let height_px = |n: usize| {
+            let series: Vec<Series> =
+                (0..n).map(|idx| named(format!("{idx} ").repeat(24))).collect();
+            let options = CurveOptions::of("Success", Quantity::Success, Axis::EnvSteps);
+            let svg = curve_drawing(&series, options).expect("it is large enough").narrow;
+            let (_, rest) = svg.split_once("height=\"").expect("a height");
+            rest.split('"').next().and_then(|px| px.parse::<u32>().ok())
+        };
+        assert_eq!([1, 2, 6].map(height_px), [Some(270), Some(310), Some(390)]);
     }
 
     #[test]
