@@ -105,10 +105,11 @@ fn summary_lines(
     ));
     lines.extend(result.lines().iter().map(|line| format!("  {line}")));
     lines.push(format!(
-        "training      {} env steps, {} updates, {} rounds in {}",
+        "training      {} env steps, {} updates, {} round{} in {}",
         grouped(last.env_steps),
         grouped(last.updates),
         grouped(last.round),
+        if last.round == 1 { "" } else { "s" },
         clock_text(last.wall_s)
     ));
     lines.extend(advice_text(last).map(|advice| format!("advice        {advice}")));
