@@ -75,7 +75,7 @@ pub(crate) fn state_lines(progress: &pb::Progress) -> Vec<String> {
         |best| format!("{:.3} at {} env steps", best.success, grouped(best.env_steps)),
     );
     let mut lines = vec![format!(
-        "best success {best}; of the latest training episodes {:.2}",
+        "best success {best}; training success {:.2}",
         progress.training_success
     )];
     lines.extend(advice_text(progress).map(|advice| format!("advice {advice}")));
@@ -186,7 +186,7 @@ mod tests {
         let expected = [
             "1:06:40 299,200 of 300,000 env steps (236/s), 149,600 updates, 00:03 left",
             "1:06:40 299,200 env steps: success 0.958 [0.925, 0.977], 0.900 without contact",
-            "best success 0.958 at 299,200 env steps; of the latest training episodes 0.00",
+            "best success 0.958 at 299,200 env steps; training success 0.00",
             "advice 4,301 spent, 495,699 left",
             "learner collecting; no workers",
         ];

@@ -206,7 +206,7 @@ impl Section {
             "without arm contact",
             "best evaluation",
             "last evaluation",
-            "joint norm",
+            "joint goal",
             "contacts",
         ];
         let mut table = Table::new(title, &header);

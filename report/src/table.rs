@@ -185,8 +185,8 @@ pub(crate) fn duration(seconds: f64) -> String {
     let whole = std::time::Duration::try_from_secs_f64(seconds).unwrap_or_default().as_secs();
     let (hours, minutes, seconds) = (whole / 3600, whole / 60 % 60, whole % 60);
     match hours {
-        0 => format!("{minutes}:{seconds:02} min"),
-        _ => format!("{hours}:{minutes:02} h"),
+        0 => format!("{minutes} min {seconds:02} s"),
+        _ => format!("{hours} h {minutes:02} min"),
     }
 }
 
@@ -199,7 +199,7 @@ mod tests {
         assert_eq!([0, 999, 1000, 1_234_567].map(thousands), ["0", "999", "1,000", "1,234,567"]);
         assert_eq!(
             [0.4, 59.9, 61.0, 3725.0, f64::NAN].map(duration),
-            ["0:00 min", "0:59 min", "1:01 min", "1:02 h", "0:00 min"]
+            ["0 min 00 s", "0 min 59 s", "1 min 01 s", "1 h 02 min", "0 min 00 s"]
         );
         assert_eq!(
             [0.0, -0.001, 0.25, 50.0, 1500.0, 20_000.0, 999_900.0, 1.5e6, -10.0].map(short_number),

@@ -100,7 +100,7 @@ fn tiles(best: &MetricsRow, last: &MetricsRow, has_contacts: bool) -> String {
             share(best.success),
             format!("95 % interval {}, {} episodes", interval(best), best.n_episodes),
         ),
-        ("joint norm", share(best.success_joint), format!("each arm: {}", per_arm.join(" / "))),
+        ("joint goal", share(best.success_joint), format!("each arm: {}", per_arm.join(" / "))),
         (
             CONTACT_TILE,
             share(best.collision_rate),
@@ -154,7 +154,7 @@ fn curves(run: &Run, task: Option<&TaskSpec>, has_contacts: bool) -> Result<Vec<
     let moved = if is_built_in { "object moved" } else { "achieved goal moved" };
     let success = series(&[
         ("success", Quantity::Success),
-        ("joint norm", Quantity::SuccessJoint),
+        ("joint goal", Quantity::SuccessJoint),
         ("training episodes", Quantity::TrainingSuccess),
         (moved, Quantity::Moved),
     ]);
