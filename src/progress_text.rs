@@ -74,10 +74,8 @@ pub(crate) fn state_lines(progress: &pb::Progress) -> Vec<String> {
         || "none yet".to_owned(),
         |best| format!("{:.3} at {} env steps", best.success, grouped(best.env_steps)),
     );
-    let mut lines = vec![format!(
-        "best success {best}; training success {:.2}",
-        progress.training_success
-    )];
+    let mut lines =
+        vec![format!("best success {best}; training success {:.2}", progress.training_success)];
     lines.extend(advice_text(progress).map(|advice| format!("advice {advice}")));
     lines.push(format!("learner {}; {}", progress.phase, workers_text(progress)));
     lines
