@@ -90,7 +90,9 @@ fn tiles(best: &MetricsRow, last: &MetricsRow, has_contacts: bool) -> String {
             "success without arm contact",
             share(success),
             format!(
-                "95 % interval {low:.3}–{high:.3}; contact between arms: {arm_contact}, with table: {table_contact}"
+                "95 % interval {:.1}–{:.1} %; contact between arms: {arm_contact}, with table: {table_contact}",
+                100.0 * low,
+                100.0 * high
             ),
         )
     });
