@@ -9,7 +9,7 @@
 //! *reaction* is the time from the stamp of the newest state at the time of a stop until the joint begins to brake: the
 //! longest one of an arm, plus a period, because commands are not sent at the very moment when a state arrives. The
 //! *braking time* is scaled to the joint's highest speed, for drives that brake with a constant deceleration; drives
-//! that need the same time at any speed are told to be slower than they are. Of an arm's joints the slowest counts.
+//! that need the same time at any speed appear slower than they are. The slowest joint determines the time of an arm.
 
 use std::cell::RefCell;
 use std::rc::Rc;
@@ -130,7 +130,7 @@ impl Driver for Recorder {
     }
 }
 
-/// The one who measures.
+/// The caller's side of a measurement: its clock, its output and its interruption.
 pub struct Operator<'a> {
     /// The clock of the periods.
     pub clock: &'a dyn Clock,
@@ -238,7 +238,7 @@ impl Bench<'_> {
         let reaction_s = fits.iter().map(|fit| fit.begins_s).fold(0.0, f64::max);
         fits.sort_by(|a, b| a.takes_s.total_cmp(&b.takes_s));
         let brake_s = fits[N_STOPS / 2].takes_s / speed;
-        // A time below a millisecond cannot be told from none.
+        // The measurement does not resolve times below a millisecond.
         Ok(ArmTiming { lag_s, reaction_s, brake_s: brake_s.max(0.001) })
     }
 

@@ -67,7 +67,7 @@ impl Injector {
         self.0.faults.lock().unwrap_or_else(PoisonError::into_inner).clone()
     }
 
-    /// Returns how often the faults were changed. Waits for nobody.
+    /// Returns how often the faults were changed, without taking a lock.
     #[must_use]
     pub fn n_changes(&self) -> u64 {
         self.0.n_changes.load(Ordering::Acquire)

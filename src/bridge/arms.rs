@@ -29,7 +29,7 @@ pub(crate) const fn name(driver: DriverName) -> &'static str {
     }
 }
 
-/// Returns the limits and deadlines of arms behind a driver that nobody has measured.
+/// Returns the limits and deadlines of arms behind a driver, before a measurement.
 pub(super) fn default_settings(driver: DriverName) -> Settings {
     match driver {
         DriverName::Sim | DriverName::Quarc => Settings::default(),

@@ -34,7 +34,7 @@ impl Cell {
         self.file.settings(&arms::default_settings(driver))
     }
 
-    /// Returns the names of the arms whose times nobody has measured.
+    /// Returns the names of the arms whose times were not measured.
     fn unmeasured(&self) -> Vec<&str> {
         let arms = self.file.arms.iter().filter(|arm| !arm.is_measured());
         arms.map(|arm| arm.name.as_str()).collect()

@@ -5,7 +5,6 @@
 
 use std::ffi::OsString;
 use std::fs::TryLockError;
-use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 use std::pin::pin;
 use std::process::{ExitStatus, Stdio};
@@ -73,7 +72,6 @@ impl RunProcess {
             args.push("--resume".into());
             if let Some(env_steps) = extends_to {
                 args.extend(["--max-env-steps".into(), env_steps.to_string().into()]);
-                remove_if_exists(&status.summary_path())?;
             }
         } else {
             args.extend(["--run".into(), write_run_file(status)?.into()]);
@@ -161,15 +159,6 @@ async fn follow(output: ChildStdout, progress: &watch::Sender<Value>) -> String 
 /// Returns whether a line of output is the summary of a run, and not a message about its progress.
 fn is_summary(object: &Value) -> bool {
     object.get("digest").is_some() && object.get("phase").is_none()
-}
-
-fn remove_if_exists(path: &Path) -> anyhow::Result<()> {
-    match std::fs::remove_file(path) {
-        Err(error) if error.kind() != ErrorKind::NotFound => {
-            Err(error).with_context(|| format!("cannot remove {}", path.display()))
-        }
-        _ => Ok(()),
-    }
 }
 
 fn outcome(

@@ -6,7 +6,7 @@ use anyhow::{Context as _, anyhow};
 use serde_json::Value as Json;
 use tandem_learner::checkpoint;
 use tandem_rl::RunConfig;
-use tandem_system::{atomic_file, regular_file};
+use tandem_system::regular_file;
 use tandem_teacher::policy::is_onnx;
 use toml::{Table, Value};
 
@@ -61,19 +61,10 @@ impl RunStatus {
         }
     }
 
-    /// Stores the summary of a run, which is finished from now on.
-    pub(super) fn finish(&mut self, summary: Json) -> anyhow::Result<()> {
-        let path = self.summary_path();
-        let written = atomic_file::replace(&path, format!("{summary}\n").as_bytes());
-        written.with_context(|| format!("cannot write {}", path.display()))?;
+    /// Marks a run as finished, with the summary that it has written.
+    pub(super) fn finish(&mut self, summary: Json) {
         drop(std::fs::remove_file(failure_path(&self.dir)));
         (self.state, self.failure) = (State::Finished(summary), None);
-        Ok(())
-    }
-
-    /// Returns the path of the summary that marks a run as finished.
-    pub(super) fn summary_path(&self) -> PathBuf {
-        summary_path(&self.dir)
     }
 
     /// Stores the reason of a failure, which the next start reports.
@@ -213,6 +204,11 @@ mod tests {
         std::fs::write(dir.join("run.toml"), text).expect("writes");
     }
 
+    fn has_ended(out: &Path) {
+        let path = summary_path(&out.join("push-ea-seed1"));
+        std::fs::write(path, "{\"digest\": \"d\"}").expect("writes");
+    }
+
     fn status(out: &Path, discount: f32) -> Result<RunStatus, String> {
         RunStatus::of(planned(discount), out).map_err(|error| error.to_string())
     }
@@ -227,7 +223,8 @@ mod tests {
         assert_eq!(begun.state, State::Started);
         begun.fail("the disk is full".to_owned()).expect("writes");
         assert_eq!(status(out, 0.95).expect("fits").failure.as_deref(), Some("the disk is full"));
-        begun.finish(json!({"digest": "d"})).expect("writes");
+        begun.finish(json!({"digest": "d"}));
+        has_ended(out);
         let finished = status(out, 0.95).expect("fits");
         assert_eq!(finished.state, State::Finished(json!({"digest": "d"})));
         assert_eq!(finished.failure, None);
@@ -256,7 +253,7 @@ mod tests {
             RunStatus::of(run, out.path()).map_err(|error| error.to_string())
         };
         assert_eq!(of_length(4, 0.95).expect("nothing was learned").extends_to, None);
-        of_length(2, 0.95).expect("fits").finish(json!({"digest": "d"})).expect("writes");
+        has_ended(out.path());
         let extended = of_length(4, 0.95).expect("longer");
         assert_eq!((&extended.state, extended.state_name()), (&State::Started, "extended"));
         assert_eq!(extended.extends_to, Some(2 * planned(0.95).config.stop.max_env_steps));
