@@ -53,14 +53,15 @@ pub(crate) fn train(args: &TrainArgs) -> Result<(), Failed> {
     let environment = environment_file::environment_of(args)?;
     let served = served_task::of_server(&environment)?;
     let plan = Plan::of(args, environment, served.as_ref())?;
+    // An address in use is reported before anything is written.
     metrics::check_address(&args.metrics)?;
+    let live = args.live.live.map(|address| LiveRun::start(address, plan.logs())).transpose()?;
     let lock = RunLock::take(&plan)?;
     let service_locks = lock.wait_for_leftovers(&plan)?;
     plan.prepare()?;
     let inputs = RunInputs::write(&plan)?;
     summary::remove(&plan.out)?;
     drop(service_locks);
-    let live = args.live.live.map(|address| LiveRun::start(address, plan.logs())).transpose()?;
     let runtime = runtime::new().or_exit(Exit::TryAgain, String::new)?;
     let (last, memory) = runtime.block_on(async {
         let interrupted = signals::shutdown_token(args.exit_with_stdin)?;

@@ -181,9 +181,12 @@ fn killed_processes_are_restarted_and_the_run_ends_like_an_undisturbed_one() {
     let occupied = TcpListener::bind("127.0.0.1:0").expect("a port");
     let address = occupied.local_addr().expect("bound");
     let served = ["--metrics-listen", &address.to_string()];
-    let refused = finish(start_with("3", &served, &out));
-    assert_eq!(refused.status.code(), Some(75));
-    assert!(stderr(&refused).contains(&format!("cannot listen on {address}")));
+    for option in ["--metrics-listen", "--live"] {
+        let refused = finish(start_with("3", &[option, &address.to_string()], &out));
+        assert_eq!(refused.status.code(), Some(75));
+        assert!(stderr(&refused).contains(&format!("cannot listen on {address}")));
+        assert!(!out.exists(), "a refusal leaves nothing");
+    }
     drop(occupied);
 
     let run = start_with("3", &served, &out);
