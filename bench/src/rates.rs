@@ -1,5 +1,6 @@
 //! Rates of simulation, inference, updates and replay.
 
+use std::num::NonZero;
 use std::time::Duration;
 
 use tandem_core::layout::EPISODE_STEPS;
@@ -75,8 +76,8 @@ pub fn inference(clock: &Clock) -> Result<Vec<Figure>, Error> {
     Ok(figures)
 }
 
-/// Measures updates of the two-arm student per second, with one and with two threads, and their ratio to the matrix
-/// product.
+/// Measures updates of the two-arm student per second with one, two, four and so on up to as many threads as the machine
+/// has cores, and their ratio to one thread and of that to the matrix product.
 pub fn update(clock: &Clock) -> Vec<Figure> {
     let layout = Layout::new(Task::Push, 2);
     let config = RunConfig::defaults(Recipe::Tandem, Task::Push, 2).ddpg;
@@ -97,15 +98,30 @@ pub fn update(clock: &Clock) -> Vec<Figure> {
             ddpg.polyak();
         })
     };
-    let (one, two) = (updates_per_s(1), updates_per_s(2));
-    vec![
+    let one = updates_per_s(1);
+    let n_cores = std::thread::available_parallelism().map_or(1, NonZero::get);
+    let more: Vec<_> = thread_counts(n_cores).map(|n| (n, updates_per_s(n))).collect();
+    let named = |n_threads, suffix| format!("update/student/{n_threads}-threads{suffix}");
+    let mut figures = vec![
         Figure::new("update/sgemm-256", sgemm / 1e9, "GFLOP/s"),
         Figure::new("update/student/1-thread", one, "updates/s"),
-        Figure::new("update/student/2-threads", two, "updates/s"),
+    ];
+    figures.extend(more.iter().map(|(n, rate)| Figure::new(named(n, ""), *rate, "updates/s")));
+    figures.extend([
         Figure::new("update/student/flop", flop / 1e9, "GFLOP"),
         Figure::new("update/student/1-thread-share-of-sgemm", one * flop / sgemm, "of sgemm-256"),
-        Figure::new("update/student/2-threads-speed-up", two / one, "x 1 thread"),
-    ]
+    ]);
+    let speed_ups =
+        more.iter().map(|(n, rate)| Figure::new(named(n, "-speed-up"), rate / one, "x 1 thread"));
+    figures.extend(speed_ups);
+    figures
+}
+
+/// Returns the numbers of threads that [`update`] compares with one: the powers of two above 1 and below `n_cores`, and
+/// `n_cores` if it is above 1.
+pub fn thread_counts(n_cores: usize) -> impl Iterator<Item = usize> {
+    let below = std::iter::successors(Some(2), |n| Some(2 * n)).take_while(move |n| *n < n_cores);
+    below.chain((n_cores > 1).then_some(n_cores))
 }
 
 /// Measures the time to sample one batch with hindsight from a buffer of 2,000 episodes.

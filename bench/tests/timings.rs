@@ -1,7 +1,8 @@
-//! Statistics of the calls of idle workers.
+//! Statistics of the calls of idle workers, and what is measured.
 
 use std::time::Duration;
 
+use tandem_bench::rates::thread_counts;
 use tandem_bench::{LoadTimings, quantile};
 
 fn ms(millis: u64) -> Duration {
@@ -61,4 +62,13 @@ fn a_quantile_is_one_of_the_times() {
     check(&[40, 10, 30, 20], 0.5, 20);
     check(&(1..=100).rev().collect::<Vec<_>>(), 0.99, 99);
     check(&(1..=100).collect::<Vec<_>>(), 1.0, 100);
+}
+
+#[test]
+fn thread_counts_double_up_to_the_number_of_cores() {
+    let counts = |n_cores| thread_counts(n_cores).collect::<Vec<_>>();
+    assert!(counts(1).is_empty());
+    assert_eq!(counts(2), [2]);
+    assert_eq!(counts(6), [2, 4, 6]);
+    assert_eq!(counts(16), [2, 4, 8, 16]);
 }

@@ -1,7 +1,8 @@
 //! The Adam optimiser, and Polyak averaging for target networks.
 
-use pulp::Arch;
+use pulp::{Arch, Simd, WithSimd};
 
+use crate::aligned::AlignedVec;
 use crate::elementwise::blend;
 
 const FIRST_DECAY: f32 = 0.9;
@@ -16,8 +17,8 @@ const EPSILON: f32 = 1e-8;
 pub struct Adam {
     learning_rate: f32,
     n_steps: u64,
-    first_moments: Vec<f32>,
-    second_moments: Vec<f32>,
+    first_moments: AlignedVec,
+    second_moments: AlignedVec,
 }
 
 impl Adam {
@@ -27,8 +28,8 @@ impl Adam {
         Self {
             learning_rate,
             n_steps: 0,
-            first_moments: vec![0.0; n_parameters],
-            second_moments: vec![0.0; n_parameters],
+            first_moments: AlignedVec::zeros(n_parameters),
+            second_moments: AlignedVec::zeros(n_parameters),
         }
     }
 
@@ -39,20 +40,32 @@ impl Adam {
     pub fn step(&mut self, parameters: &mut [f32], gradient: &[f32]) {
         let n = self.first_moments.len();
         assert_eq!((parameters.len(), gradient.len()), (n, n), "an optimiser for another network");
+        self.step_in_parts(parameters, [n]).for_each(|mut part| part.apply(gradient));
+    }
+
+    /// Starts a step of `parameters`, shape `[n_parameters]`, whose parts can be updated side by side: the first
+    /// parameters, as many as the first of `lengths`, and so on. The step is complete when every part is.
+    ///
+    /// # Panics
+    /// If `parameters` has another length, or a part reaches beyond its end.
+    pub fn step_in_parts<'a>(
+        &'a mut self,
+        parameters: &'a mut [f32],
+        lengths: impl IntoIterator<Item = usize>,
+    ) -> impl Iterator<Item = AdamPart<'a>> {
+        let n = self.first_moments.len();
+        assert_eq!(parameters.len(), n, "an optimiser for another network");
         self.n_steps += 1;
         let (step_size, second_scale) = self.bias_corrected();
-        let (first_moments, second_moments) =
-            (&mut self.first_moments[..n], &mut self.second_moments[..n]);
-        Arch::new().dispatch(|| {
-            for i in 0..n {
-                let slope = gradient[i];
-                let first = FIRST_DECAY * first_moments[i] + FIRST_SHARE * slope;
-                let second = SECOND_DECAY * second_moments[i] + SECOND_SHARE * (slope * slope);
-                first_moments[i] = first;
-                second_moments[i] = second;
-                parameters[i] -= step_size * first / (second.sqrt() * second_scale + EPSILON);
-            }
-        });
+        let mut rest = (parameters, &mut *self.first_moments, &mut *self.second_moments);
+        lengths.into_iter().map(move |length| {
+            let (parameters, first_moments, second_moments) = std::mem::take(&mut rest);
+            let (parameters, parameters_after) = parameters.split_at_mut(length);
+            let (first_moments, first_after) = first_moments.split_at_mut(length);
+            let (second_moments, second_after) = second_moments.split_at_mut(length);
+            rest = (parameters_after, first_after, second_after);
+            AdamPart { step_size, second_scale, parameters, first_moments, second_moments }
+        })
     }
 
     /// Sets the learning rate of the following steps. The moments are kept.
@@ -91,6 +104,56 @@ impl Adam {
         let first = 1.0 - libm::pow(0.9, n_steps);
         let second = 1.0 - libm::pow(0.999, n_steps);
         ((f64::from(self.learning_rate) / first) as f32, (1.0 / second.sqrt()) as f32)
+    }
+}
+
+/// A part of a step: see [`Adam::step_in_parts`].
+#[derive(Debug)]
+pub struct AdamPart<'a> {
+    step_size: f32,
+    second_scale: f32,
+    parameters: &'a mut [f32],
+    first_moments: &'a mut [f32],
+    second_moments: &'a mut [f32],
+}
+
+impl AdamPart<'_> {
+    /// Updates the parameters of the part with their gradient, of the same length. To be called once.
+    ///
+    /// # Panics
+    /// If the gradient has another length.
+    pub fn apply(&mut self, gradient: &[f32]) {
+        assert_eq!(gradient.len(), self.parameters.len(), "a gradient of another length");
+        Arch::new().dispatch(Kernel { part: self, gradient });
+    }
+
+    /// Returns the parameters of the part.
+    #[must_use]
+    pub const fn parameters(&self) -> &[f32] {
+        self.parameters
+    }
+}
+
+/// The update that [`AdamPart::apply`] compiles for each instruction set. A closure of this size would not be inlined.
+struct Kernel<'a, 'b> {
+    part: &'a mut AdamPart<'b>,
+    gradient: &'a [f32],
+}
+
+impl WithSimd for Kernel<'_, '_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, _: S) {
+        let AdamPart { step_size, second_scale, parameters, first_moments, second_moments } =
+            self.part;
+        let numbers = parameters.iter_mut().zip(self.gradient);
+        let moments = first_moments.iter_mut().zip(&mut **second_moments);
+        for ((parameter, slope), (first, second)) in numbers.zip(moments) {
+            *first = FIRST_DECAY * *first + FIRST_SHARE * *slope;
+            *second = SECOND_DECAY * *second + SECOND_SHARE * (*slope * *slope);
+            *parameter -= *step_size * *first / (second.sqrt() * *second_scale + EPSILON);
+        }
     }
 }
 

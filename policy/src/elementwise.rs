@@ -55,36 +55,20 @@ pub(crate) fn mask(delta: &mut [f32], activations: &[f32]) {
     });
 }
 
-/// Like [`mask`], and also writes the sums of the result's columns, the gradient of the bias, to `sums`, shape
-/// `[n_units]`.
-pub(crate) fn mask_and_sum(delta: &mut [f32], activations: &[f32], sums: &mut [f32]) {
-    #[inline(always)]
-    fn row_kernel(delta: &mut [f32], activations: &[f32], sums: &mut [f32]) {
-        for ((delta, activation), sum) in delta.iter_mut().zip(activations).zip(sums) {
-            let kept = if *activation > 0.0 { *delta } else { 0.0 };
-            *delta = kept;
-            *sum += kept;
-        }
-    }
-    sums.fill(0.0);
-    let n_units = sums.len();
-    Arch::new().dispatch(|| {
-        for (delta, activations) in
-            delta.chunks_exact_mut(n_units).zip(activations.chunks_exact(n_units))
-        {
-            row_kernel(delta, activations, sums);
-        }
-    });
-}
-
 /// Writes the sum of each column of `rows`, shape `[n, sums.len()]`, to `sums`.
 pub(crate) fn column_sums(rows: &[f32], sums: &mut [f32]) {
-    sums.fill(0.0);
-    for row in rows.chunks_exact(sums.len()) {
+    #[inline(always)]
+    fn row_kernel(row: &[f32], sums: &mut [f32]) {
         for (sum, x) in sums.iter_mut().zip(row) {
             *sum += *x;
         }
     }
+    sums.fill(0.0);
+    Arch::new().dispatch(|| {
+        for row in rows.chunks_exact(sums.len()) {
+            row_kernel(row, sums);
+        }
+    });
 }
 
 /// Computes `target = keep * target + (1 - keep) * source`.

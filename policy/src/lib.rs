@@ -83,6 +83,7 @@
 #![warn(missing_docs)]
 
 pub mod adam;
+mod aligned;
 mod blind;
 mod elementwise;
 mod error;
@@ -96,13 +97,17 @@ pub mod policy;
 mod replicate;
 mod validation;
 
-pub use adam::{Adam, polyak_update};
+pub use adam::{Adam, AdamPart, polyak_update};
+pub use aligned::AlignedVec;
 pub use blind::BlindActor;
 pub use elementwise::{all_finite, tanh};
 pub use error::{Error, FormatError};
 pub use inference::{Actor, Critic, QueryGate};
 pub use matrix::{Matrix, MatrixMut, multiply};
-pub use mlp::{MlpShape, Workspace, backward_input, backward_parameters, forward};
+pub use mlp::{
+    Activations, MlpShape, ParameterBlock, RowBlock, TransposedBlock, TransposedWeights, Workspace,
+    backward_input, backward_parameters, elementwise_blocks, forward,
+};
 pub use normalizer::{Normalizer, NormalizerSnapshot, NormalizerState};
 pub use policy::{Policy, actor_digest};
 

@@ -7,7 +7,7 @@ mod interpreted;
 use gemm::gemm;
 #[cfg(miri)]
 use interpreted::gemm;
-use pulp::Arch;
+use pulp::{Arch, Simd, WithSimd};
 
 /// A read-only view of a slice as a matrix, with any strides.
 #[derive(Debug, Clone, Copy)]
@@ -153,30 +153,51 @@ pub fn multiply(product: &mut MatrixMut<'_>, lhs: Matrix<'_>, rhs: Matrix<'_>) {
     }
 }
 
-/// Writes the transpose of `source`, shape `[n_rows, n_cols]`, to `transposed`, shape `[n_cols, n_rows]`.
+/// Writes the transpose of `source`, shape `[n_rows, n_cols]`, to `transposed`, shape `[n_cols, n_rows]`. The rows of
+/// `source` start `row_stride` numbers apart.
 ///
 /// # Panics
 /// If a slice is too short.
-pub(crate) fn transpose(source: &[f32], transposed: &mut [f32], n_rows: usize, n_cols: usize) {
-    Arch::new().dispatch(|| transpose_kernel(source, transposed, n_rows, n_cols));
+pub(crate) fn transpose(
+    source: &[f32],
+    row_stride: usize,
+    transposed: &mut [f32],
+    n_rows: usize,
+    n_cols: usize,
+) {
+    Arch::new().dispatch(Transpose { source, row_stride, transposed, n_rows, n_cols });
 }
 
-#[inline(always)]
-fn transpose_kernel(source: &[f32], transposed: &mut [f32], n_rows: usize, n_cols: usize) {
-    for row in (0..n_rows).step_by(TILE) {
-        for col in (0..n_cols).step_by(TILE) {
-            if row + TILE <= n_rows && col + TILE <= n_cols {
-                transpose_tile(
-                    &source[row * n_cols + col..],
-                    n_cols,
-                    &mut transposed[col * n_rows + row..],
-                    n_rows,
-                );
-                continue;
-            }
-            for row in row..n_rows.min(row + TILE) {
-                for col in col..n_cols.min(col + TILE) {
-                    transposed[col * n_rows + row] = source[row * n_cols + col];
+/// The transposition that [`transpose`] compiles for each instruction set. A closure of this size would not be inlined.
+struct Transpose<'a> {
+    source: &'a [f32],
+    row_stride: usize,
+    transposed: &'a mut [f32],
+    n_rows: usize,
+    n_cols: usize,
+}
+
+impl WithSimd for Transpose<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, _: S) {
+        let Self { source, row_stride, transposed, n_rows, n_cols } = self;
+        for row in (0..n_rows).step_by(TILE) {
+            for col in (0..n_cols).step_by(TILE) {
+                if row + TILE <= n_rows && col + TILE <= n_cols {
+                    transpose_tile(
+                        &source[row * row_stride + col..],
+                        row_stride,
+                        &mut transposed[col * n_rows + row..],
+                        n_rows,
+                    );
+                    continue;
+                }
+                for row in row..n_rows.min(row + TILE) {
+                    for col in col..n_cols.min(col + TILE) {
+                        transposed[col * n_rows + row] = source[row * row_stride + col];
+                    }
                 }
             }
         }
@@ -194,15 +215,22 @@ fn transpose_tile(
     transposed: &mut [f32],
     transposed_stride: usize,
 ) {
-    let mut tile = [[0.0; TILE]; TILE];
-    for (row, source) in source.chunks(source_stride).take(TILE).enumerate() {
-        for (column, x) in tile.iter_mut().zip(&source[..TILE]) {
-            column[row] = *x;
+    let mut rows = [[0.0; TILE]; TILE];
+    for (row_idx, row) in rows.iter_mut().enumerate() {
+        *row = *tile_row(&source[row_idx * source_stride..]);
+    }
+    for col in 0..TILE {
+        let mut column = [0.0; TILE];
+        for (x, row) in column.iter_mut().zip(&rows) {
+            *x = row[col];
         }
+        transposed[col * transposed_stride..][..TILE].copy_from_slice(&column);
     }
-    for (transposed, column) in transposed.chunks_mut(transposed_stride).zip(&tile) {
-        transposed[..TILE].copy_from_slice(column);
-    }
+}
+
+#[inline(always)]
+fn tile_row(row: &[f32]) -> &[f32; TILE] {
+    row.first_chunk().expect("a tile lies within its matrix")
 }
 
 fn stride(n: usize) -> isize {
@@ -231,7 +259,7 @@ mod tests {
         for (n_rows, n_cols) in [(1, 3), (16, 16), (33, 50), (256, 62)] {
             let source: Vec<f32> = (0..n_rows * n_cols).map(|i| i as f32).collect();
             let mut transposed = vec![0.0; source.len()];
-            transpose(&source, &mut transposed, n_rows, n_cols);
+            transpose(&source, n_cols, &mut transposed, n_rows, n_cols);
             for (i, x) in transposed.iter().enumerate() {
                 let (col, row) = (i / n_rows, i % n_rows);
                 assert_eq!(

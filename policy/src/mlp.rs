@@ -6,8 +6,13 @@ use rand_chacha::ChaCha8Rng;
 use tandem_core::TaskSpec;
 use tandem_core::rng::uniform;
 
-use crate::elementwise::{add_bias, add_bias_relu, column_sums, mask, mask_and_sum};
-use crate::matrix::{Matrix, MatrixMut, multiply, transpose};
+use crate::matrix::{Matrix, MatrixMut};
+
+mod parts;
+
+pub use parts::{
+    Activations, ParameterBlock, RowBlock, TransposedBlock, TransposedWeights, elementwise_blocks,
+};
 
 /// The sizes of a network: input, hidden layers of equal width, output.
 ///
@@ -122,24 +127,18 @@ impl MlpShape {
 /// A forward pass stores its hidden activations here for the backward passes that follow.
 #[derive(Debug, Clone)]
 pub struct Workspace {
-    /// Activations of each hidden layer after its ReLU, shape `[max_batch, n_hidden]`.
-    hidden: Vec<Vec<f32>>,
-    /// Gradients with respect to a layer's output and input, each `[max_batch, n_hidden or n_output]`.
-    deltas: [Vec<f32>; 2],
-    /// The transposed weight of a layer, shape `[in, out]`. A product with it is faster than with a transposed view.
-    weight: Vec<f32>,
+    activations: Activations,
+    weights: TransposedWeights,
 }
 
 impl Workspace {
     /// Allocates memory for `shape` and batches of up to `max_batch` rows.
     #[must_use]
     pub fn new(shape: &MlpShape, max_batch: usize) -> Self {
-        let widest = shape.n_hidden.max(shape.n_output);
-        let largest_weight = (0..shape.n_layers()).map(|layer| shape.weight(layer).len()).max();
+        let no_parameters = vec![0.0; shape.n_parameters()];
         Self {
-            hidden: vec![vec![0.0; max_batch * shape.n_hidden]; shape.n_hidden_layers],
-            deltas: [vec![0.0; max_batch * widest], vec![0.0; max_batch * widest]],
-            weight: vec![0.0; largest_weight.unwrap_or(0)],
+            activations: Activations::new(shape, max_batch),
+            weights: TransposedWeights::new(shape, &no_parameters),
         }
     }
 }
@@ -155,33 +154,10 @@ pub fn forward(
     workspace: &mut Workspace,
     output: &mut MatrixMut<'_>,
 ) {
-    let n_rows = input.n_rows();
-    let Workspace { hidden, weight, .. } = workspace;
-    for layer in 0..shape.n_hidden_layers {
-        let (below, above) = hidden.split_at_mut(layer);
-        let layer_input =
-            below.last().map_or(input, |rows| Matrix::new(rows, n_rows, shape.n_hidden));
-        let rows = &mut above[0][..n_rows * shape.n_hidden];
-        let weight = transposed_weight(shape, parameters, layer, weight);
-        multiply(&mut MatrixMut::new(rows, n_rows, shape.n_hidden), layer_input, weight);
-        add_bias_relu(rows, &parameters[shape.bias(layer)]);
-    }
-    let last = shape.n_hidden_layers;
-    let layer_input = hidden.last().map_or(input, |rows| Matrix::new(rows, n_rows, shape.n_hidden));
-    multiply(output, layer_input, transposed_weight(shape, parameters, last, weight));
-    add_bias(output, &parameters[shape.bias(last)]);
-}
-
-/// Writes the weight of layer `layer` to `memory` as a matrix of shape `[in, out]`, and returns it.
-fn transposed_weight<'a>(
-    shape: &MlpShape,
-    parameters: &[f32],
-    layer: usize,
-    memory: &'a mut [f32],
-) -> Matrix<'a> {
-    let (n_out, n_in) = (shape.layer_output(layer), shape.layer_input(layer));
-    transpose(&parameters[shape.weight(layer)], memory, n_out, n_in);
-    Matrix::new(memory, n_in, n_out)
+    let Workspace { activations, weights } = workspace;
+    weights.update(shape, parameters);
+    let mut rows = activations.block(input.n_rows());
+    rows.forward(shape, parameters, weights, input, output);
 }
 
 /// Computes the gradient of the loss with respect to the parameters, shape `[n_parameters]`, from its gradient with
@@ -199,33 +175,13 @@ pub fn backward_parameters(
     output_gradient: &[f32],
     gradient: &mut [f32],
 ) {
-    let n_rows = input.n_rows();
-    let Workspace { hidden, deltas: [delta, next_delta], .. } = workspace;
-    let (mut delta, mut next_delta) = (delta, next_delta);
-    delta[..output_gradient.len()].copy_from_slice(output_gradient);
-    for layer in (0..shape.n_layers()).rev() {
-        let (n_in, n_out) = (shape.layer_input(layer), shape.layer_output(layer));
-        let rows = &mut delta[..n_rows * n_out];
-        match hidden.get(layer) {
-            Some(activations) => mask_and_sum(rows, activations, &mut gradient[shape.bias(layer)]),
-            None => column_sums(rows, &mut gradient[shape.bias(layer)]),
-        }
-        let rows = Matrix::new(rows, n_rows, n_out);
-        let layer_input =
-            if layer == 0 { input } else { Matrix::new(&hidden[layer - 1], n_rows, n_in) };
-        multiply(
-            &mut MatrixMut::new(&mut gradient[shape.weight(layer)], n_out, n_in),
-            rows.transposed(),
-            layer_input,
-        );
-        if layer > 0 {
-            multiply(
-                &mut MatrixMut::new(next_delta, n_rows, n_in),
-                rows,
-                shape.weight_matrix(parameters, layer),
-            );
-            std::mem::swap(&mut delta, &mut next_delta);
-        }
+    let activations = &mut workspace.activations;
+    activations.block(input.n_rows()).backward(shape, parameters, output_gradient);
+    let mut rest = gradient;
+    for block in shape.parameter_blocks() {
+        let (gradient, others) = rest.split_at_mut(block.len(shape));
+        activations.parameter_gradient(shape, &block, input, output_gradient, gradient);
+        rest = others;
     }
 }
 
@@ -244,29 +200,9 @@ pub fn backward_input(
     columns: Range<usize>,
     input_gradient: &mut [f32],
 ) {
-    let n_rows = output_gradient.len() / shape.n_output;
-    let Workspace { hidden, deltas: [delta, next_delta], .. } = workspace;
-    let (mut delta, mut next_delta) = (delta, next_delta);
-    delta[..output_gradient.len()].copy_from_slice(output_gradient);
-    for layer in (1..shape.n_layers()).rev() {
-        let (n_in, n_out) = (shape.layer_input(layer), shape.layer_output(layer));
-        let rows = Matrix::new(delta, n_rows, n_out);
-        multiply(
-            &mut MatrixMut::new(next_delta, n_rows, n_in),
-            rows,
-            shape.weight_matrix(parameters, layer),
-        );
-        std::mem::swap(&mut delta, &mut next_delta);
-        mask(&mut delta[..n_rows * n_in], &hidden[layer - 1]);
-    }
-    let n_out = shape.layer_output(0);
-    let weight = &parameters[shape.weight(0)][columns.start..];
-    let weight = Matrix::with_stride(weight, n_out, columns.len(), shape.n_input);
-    multiply(
-        &mut MatrixMut::new(input_gradient, n_rows, columns.len()),
-        Matrix::new(delta, n_rows, n_out),
-        weight,
-    );
+    let mut rows = workspace.activations.block(output_gradient.len() / shape.n_output);
+    rows.backward(shape, parameters, output_gradient);
+    rows.input_gradient(shape, parameters, output_gradient, columns, input_gradient);
 }
 
 #[cfg(test)]

@@ -29,21 +29,25 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     batch.rewards.fill(-1.0);
     let mut ddpg = Ddpg::new(config, layout, Rewards::sparse(2), 1);
 
-    let mut updates_per_s = [0.0_f64; 2];
+    let n_cores = std::thread::available_parallelism()?.get();
+    let mut updates_per_s: Vec<_> = std::iter::successors(Some(1), |n| Some(2 * n))
+        .take_while(|n| *n <= n_cores)
+        .map(|n_threads| (n_threads, 0.0_f64))
+        .collect();
     let mut products_per_s = 0.0_f64;
     for _ in 0..N_BLOCKS {
         for _ in 0..SAMPLES_PER_BLOCK {
             products_per_s = products_per_s.max(sample_products());
         }
-        for (n_threads, best) in (1..).zip(&mut updates_per_s) {
-            ddpg.set_threads(n_threads);
+        for (n_threads, best) in &mut updates_per_s {
+            ddpg.set_threads(*n_threads);
             for _ in 0..SAMPLES_PER_BLOCK {
                 *best = best.max(sample_update(&mut ddpg, &batch)?);
             }
         }
     }
 
-    let [one, two] = updates_per_s;
+    let (_, one) = updates_per_s[0];
     let product_gflops = products_per_s * 2.0 * (SIDE * SIDE * SIDE) as f64 / 1e9;
     let update_gflop = ddpg.flops_per_update() as f64 / 1e9;
     println!(
@@ -53,7 +57,10 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         "1 thread:  {one:.1} updates/s, {:.0} % of that rate",
         100.0 * one * update_gflop / product_gflops
     );
-    println!("2 threads: {two:.1} updates/s, {:.2} x one thread", two / one);
+    for (n_threads, updates_per_s) in &updates_per_s[1..] {
+        let speed_up = updates_per_s / one;
+        println!("{n_threads} threads: {updates_per_s:.1} updates/s, {speed_up:.2} x one thread");
+    }
     Ok(())
 }
 

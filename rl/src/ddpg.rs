@@ -3,18 +3,30 @@
 //! The order is that of section 2.1 of the paper: the critic's target from the target networks, the critic's loss, the
 //! actor's loss, a step of Adam for each, and Polyak averaging of the target networks. Both gradients are taken at the
 //! same parameters, so the critic's half and the actor's half of an update can run in parallel.
+//!
+//! An update has three steps, each of which waits for the one before: all passes over the rows of the batch, in blocks of
+//! rows; the gradients and Adam, in blocks of parameters; and the transposed weights for the next passes. The blocks are
+//! tasks that any number of threads take one after the other. Which tasks there are depends on sizes only, and no number
+//! is summed across tasks, so the bits do not depend on the number of threads.
 
-use rand_chacha::ChaCha8Rng;
+use std::ops::Range;
+
 use tandem_core::{Stream, TaskSpec, episode_rng};
-use tandem_policy::{
-    Adam, Matrix, MatrixMut, MlpShape, Workspace, all_finite, backward_input, backward_parameters,
-    forward, polyak_update, tanh,
-};
+use tandem_policy::{Activations, MatrixMut, MlpShape, tanh};
 
+mod actor_half;
 mod config;
+mod critic_half;
+mod network;
 mod state;
 #[cfg(test)]
 mod tests;
+mod threads;
+
+use actor_half::{ActorHalf, ActorRows};
+use critic_half::{CriticHalf, CriticRows};
+use network::Network;
+use threads::{for_each, in_pool};
 
 pub use config::DdpgConfig;
 pub use state::CriticBatch;
@@ -48,6 +60,41 @@ impl Batch {
             bc_mask: vec![0.0; batch_size * layout.n_action()],
         }
     }
+
+    /// Returns the given rows.
+    fn rows(&self, rows: &Range<usize>, sizes: Sizes) -> BatchRows<'_> {
+        let Sizes { n_input, n_action, n_heads } = sizes;
+        fn of<'a>(values: &'a [f32], rows: &Range<usize>, n_columns: usize) -> &'a [f32] {
+            &values[rows.start * n_columns..rows.end * n_columns]
+        }
+        BatchRows {
+            n_rows: rows.len(),
+            inputs: of(&self.inputs, rows, n_input),
+            actions: of(&self.actions, rows, n_action),
+            rewards: of(&self.rewards, rows, n_heads),
+            next_inputs: of(&self.next_inputs, rows, n_input),
+            bc_mask: of(&self.bc_mask, rows, n_action),
+        }
+    }
+}
+
+/// Some consecutive rows of a [`Batch`].
+#[derive(Debug, Clone, Copy)]
+struct BatchRows<'a> {
+    n_rows: usize,
+    inputs: &'a [f32],
+    actions: &'a [f32],
+    rewards: &'a [f32],
+    next_inputs: &'a [f32],
+    bc_mask: &'a [f32],
+}
+
+/// Lengths of the rows of a batch.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+struct Sizes {
+    n_input: usize,
+    n_action: usize,
+    n_heads: usize,
 }
 
 /// Losses of an update, at the parameters before it: means over its batches.
@@ -88,27 +135,22 @@ pub enum DdpgError {
 #[derive(Debug, Clone)]
 pub struct Ddpg {
     config: DdpgConfig,
-    n_threads: usize,
     n_updates: u64,
     actor: Network,
     critic: Network,
     actor_half: ActorHalf,
     critic_half: CriticHalf,
+    /// Blocks of rows of the passes.
+    row_blocks: Vec<Range<usize>>,
+    /// One for each thread.
+    scratch: Vec<Scratch>,
 }
 
-/// A network and its target network, as flat parameter vectors.
+/// A thread's memory for the passes whose activations are not used after them.
 #[derive(Debug, Clone)]
-struct Network {
-    shape: MlpShape,
-    online: Vec<f32>,
-    target: Vec<f32>,
-}
-
-impl Network {
-    fn new(shape: MlpShape, rng: &mut ChaCha8Rng) -> Self {
-        let online = shape.initialise(rng);
-        Self { shape, target: online.clone(), online }
-    }
+struct Scratch {
+    actor: Activations,
+    critic: Activations,
 }
 
 impl Ddpg {
@@ -122,15 +164,25 @@ impl Ddpg {
     ) -> Self {
         let layout = layout.into();
         let (n_hidden, n_hidden_layers) = (config.n_hidden, config.n_hidden_layers);
-        let network = |shape, number| {
-            Network::new(shape, &mut episode_rng(run_seed, number, Stream::Initialisation))
+        let network = |shape, number, learning_rate| {
+            let mut rng = episode_rng(run_seed, number, Stream::Initialisation);
+            Network::new(shape, learning_rate, &mut rng)
         };
-        let actor = network(MlpShape::actor(&layout, n_hidden, n_hidden_layers), 0);
-        let critic =
-            network(MlpShape::critic(&layout, n_hidden, n_hidden_layers, rewards.n_heads), 1);
-        let actor_half = ActorHalf::new(&config, &actor.shape, &critic.shape);
-        let critic_half = CriticHalf::new(&config, rewards.lowest, &actor.shape, &critic.shape);
-        Self { config, n_threads: 1, n_updates: 0, actor, critic, actor_half, critic_half }
+        let actor_shape = MlpShape::actor(&layout, n_hidden, n_hidden_layers);
+        let critic_shape = MlpShape::critic(&layout, n_hidden, n_hidden_layers, rewards.n_heads);
+        let row_blocks = critic_shape.row_blocks(config.transitions_per_update());
+        let mut ddpg = Self {
+            n_updates: 0,
+            actor: network(actor_shape, 0, config.actor_learning_rate),
+            critic: network(critic_shape, 1, config.critic_learning_rate),
+            actor_half: ActorHalf::new(&config, &actor_shape, &critic_shape),
+            critic_half: CriticHalf::new(&config, rewards.lowest, &critic_shape),
+            row_blocks,
+            scratch: Vec::new(),
+            config,
+        };
+        ddpg.set_threads(1);
+        ddpg
     }
 
     /// Makes one gradient step of critic and actor on `batch`, which holds the transitions of all batches of an update.
@@ -142,23 +194,21 @@ impl Ddpg {
     /// # Panics
     /// When the batch does not have the configured size and layout.
     pub fn update(&mut self, batch: &Batch) -> Result<UpdateLosses, DdpgError> {
-        let Self { config, n_threads, actor, critic, actor_half, critic_half, .. } = self;
-        let (critic_loss, (actor_loss, mean_q)) = join(
-            *n_threads,
-            || critic_half.differentiate(config, actor, critic, batch),
-            || actor_half.differentiate(config, actor, critic, batch),
-        );
-        let (critic_finite, actor_finite) = join(
-            *n_threads,
-            || critic_half.optimizer.apply(critic),
-            || actor_half.optimizer.apply(actor),
-        );
+        self.check_size(batch);
+        let n_threads = self.scratch.len();
+        let finite = in_pool(n_threads, || {
+            self.pass_over_rows(batch);
+            self.step_parameters(batch)
+        });
+        let Self { config, actor_half, critic_half, .. } = self;
+        let critic_loss = critic_half.loss(config.transitions_per_update());
+        let (actor_loss, mean_q) = actor_half.loss_and_mean_q(config, batch);
         self.n_updates += 1;
         let checks = [
             ("a critic loss", critic_loss.is_finite()),
             ("an actor loss", actor_loss.is_finite()),
-            ("a critic parameter", critic_finite),
-            ("an actor parameter", actor_finite),
+            ("a critic parameter", finite.critic),
+            ("an actor parameter", finite.actor),
         ];
         match checks.into_iter().find(|(_, finite)| !finite) {
             Some((what, _)) => Err(DdpgError::NotFinite { what, update: self.n_updates }),
@@ -166,28 +216,94 @@ impl Ddpg {
         }
     }
 
+    fn check_size(&self, batch: &Batch) {
+        let b = self.config.transitions_per_update();
+        let Sizes { n_input, n_action, n_heads } = self.sizes();
+        for (values, n_columns, what) in [
+            (&batch.inputs, n_input, "inputs"),
+            (&batch.actions, n_action, "actions"),
+            (&batch.rewards, n_heads, "rewards"),
+            (&batch.next_inputs, n_input, "next inputs"),
+            (&batch.bc_mask, n_action, "masks"),
+        ] {
+            assert_eq!(values.len(), b * n_columns, "{what} of a batch of another size");
+        }
+    }
+
+    const fn sizes(&self) -> Sizes {
+        let Self { actor, critic, .. } = self;
+        let (n_input, n_action) = (actor.shape.n_input, actor.shape.n_output);
+        Sizes { n_input, n_action, n_heads: critic.shape.n_output }
+    }
+
+    /// Makes all passes that are independent for each row: values, targets, and the gradients by all activations.
+    fn pass_over_rows(&mut self, batch: &Batch) {
+        enum Rows<'a> {
+            Critic(CriticRows<'a>),
+            Actor(ActorRows<'a>),
+        }
+        let sizes = self.sizes();
+        let Self { config, actor, critic, actor_half, critic_half, row_blocks, scratch, .. } = self;
+        let (config, actor, critic) = (&*config, &*actor, &*critic);
+        let critic_rows = critic_half.rows(batch, row_blocks, sizes).into_iter().map(Rows::Critic);
+        let actor_rows = actor_half.rows(batch, row_blocks, sizes).into_iter().map(Rows::Actor);
+        let tasks = critic_rows.chain(actor_rows).collect();
+        for_each(scratch, tasks, |scratch, rows| match rows {
+            Rows::Critic(rows) => rows.differentiate(config, actor, critic, scratch),
+            Rows::Actor(rows) => rows.differentiate(config, actor, critic, scratch),
+        });
+    }
+
+    /// Makes a step of Adam with the gradients by the parameters, and returns which parameters are finite.
+    fn step_parameters(&mut self, batch: &Batch) -> Finite {
+        let b = self.config.transitions_per_update();
+        let Self { actor, critic, actor_half, critic_half, scratch, .. } = self;
+        let actor_gradient = actor_half.gradient(&actor.shape, batch, b);
+        let critic_gradient = critic_half.gradient(&critic.shape, b);
+        let mut tasks = critic.step(&critic_gradient);
+        tasks.extend(actor.step(&actor_gradient));
+        for_each(scratch, tasks, |_, task| task.run());
+        let finite =
+            Finite { actor: actor_gradient.is_finite(), critic: critic_gradient.is_finite() };
+        let mut tasks = critic.transpose();
+        tasks.extend(actor.transpose());
+        for_each(scratch, tasks, |_, task| task.run());
+        finite
+    }
+
     /// Moves both target networks toward the online ones: `target = polyak_keep * target + (1 - polyak_keep) * online`.
     pub fn polyak(&mut self) {
-        let Self { config, n_threads, actor, critic, .. } = self;
-        let move_target = |network: &mut Network| {
-            polyak_update(&mut network.target, &network.online, config.polyak_keep);
-        };
-        join(*n_threads, || move_target(critic), || move_target(actor));
+        let Self { config, actor, critic, scratch, .. } = self;
+        let keep = config.polyak_keep;
+        let mut tasks = critic.polyak();
+        tasks.extend(actor.polyak());
+        in_pool(scratch.len(), || for_each(scratch, tasks, |_, task| task.run(keep)));
     }
 
     /// Switches between the usual learning rates and that of the cooldown.
     pub fn set_cooldown(&mut self, is_cooldown: bool) {
-        let Self { config, actor_half, critic_half, .. } = self;
+        let Self { config, actor, critic, .. } = self;
         let rate = |usual| if is_cooldown { config.cooldown_learning_rate } else { usual };
-        actor_half.optimizer.adam.set_learning_rate(rate(config.actor_learning_rate));
-        critic_half.optimizer.adam.set_learning_rate(rate(config.critic_learning_rate));
+        actor.adam.set_learning_rate(rate(config.actor_learning_rate));
+        critic.adam.set_learning_rate(rate(config.critic_learning_rate));
     }
 
-    /// Sets whether the two halves of an update run one after the other (1) or in parallel (2). The results are the
-    /// same, bit for bit.
-    pub const fn set_threads(&mut self, n_threads: usize) {
-        self.n_threads = n_threads;
+    /// Sets how many threads of the rayon pool work on an update, 1 or more. The results are the same, bit for bit.
+    pub fn set_threads(&mut self, n_threads: usize) {
+        let Self { actor, critic, row_blocks, scratch, .. } = self;
+        let n_rows = row_blocks.iter().map(Range::len).max().unwrap_or(0);
+        scratch.resize_with(n_threads.max(1), || Scratch {
+            actor: Activations::new(&actor.shape, n_rows),
+            critic: Activations::new(&critic.shape, n_rows),
+        });
     }
+}
+
+/// Whether all parameters of both networks are finite.
+#[derive(Debug, Clone, Copy)]
+struct Finite {
+    actor: bool,
+    critic: bool,
 }
 
 /// The rewards that the critic learns the value of.
@@ -207,247 +323,17 @@ impl Rewards {
     }
 }
 
-/// The critic's half of an update.
-#[derive(Debug, Clone)]
-struct CriticHalf {
-    /// The lowest reward of a step.
-    lowest_reward: f32,
-    /// Input and executed action, shape `[b, n_input + n_action]`.
-    input: Vec<f32>,
-    /// Next input and the target actor's action.
-    next_input: Vec<f32>,
-    /// Values of the executed actions, shape `[b, n_heads]`.
-    q: Vec<f32>,
-    /// The target networks' values of the next inputs, shape `[b, n_heads]`.
-    next_q: Vec<f32>,
-    /// The targets of `q`, shape `[b, n_heads]`.
-    targets: Vec<f32>,
-    /// The loss's gradient by `q`.
-    q_gradient: Vec<f32>,
-    actor_workspace: Workspace,
-    critic_workspace: Workspace,
-    optimizer: NetworkOptimizer,
-}
-
-impl CriticHalf {
-    fn new(config: &DdpgConfig, lowest_reward: f32, actor: &MlpShape, critic: &MlpShape) -> Self {
-        let b = config.transitions_per_update();
-        Self {
-            lowest_reward,
-            input: vec![0.0; b * critic.n_input],
-            next_input: vec![0.0; b * critic.n_input],
-            q: vec![0.0; b * critic.n_output],
-            next_q: vec![0.0; b * critic.n_output],
-            targets: vec![0.0; b * critic.n_output],
-            q_gradient: vec![0.0; b * critic.n_output],
-            actor_workspace: Workspace::new(actor, b),
-            critic_workspace: Workspace::new(critic, b),
-            optimizer: NetworkOptimizer::new(critic, config.critic_learning_rate),
-        }
-    }
-
-    /// Stores the gradient of the critic's loss in `optimizer` and returns the loss.
-    fn differentiate(
-        &mut self,
-        config: &DdpgConfig,
-        actor: &Network,
-        critic: &Network,
-        batch: &Batch,
-    ) -> f64 {
-        let b = config.transitions_per_update();
-        let n_input = actor.shape.n_input;
-        let n_joined = critic.shape.n_input;
-
-        // Q'(s', pi'(s')): the target actor writes its actions into the target critic's input.
-        write_columns(&mut self.next_input, n_joined, 0, &batch.next_inputs, n_input);
-        let next_inputs = Matrix::new(&batch.next_inputs, b, n_input);
-        let mut action_columns = action_columns(&mut self.next_input, &actor.shape, n_joined, b);
-        forward(
-            &actor.shape,
-            &actor.target,
-            next_inputs,
-            &mut self.actor_workspace,
-            &mut action_columns,
-        );
-        squash(&mut action_columns);
-        let next_joined = Matrix::new(&self.next_input, b, n_joined);
-        let mut next_q = MatrixMut::new(&mut self.next_q, b, critic.shape.n_output);
-        forward(
-            &critic.shape,
-            &critic.target,
-            next_joined,
-            &mut self.critic_workspace,
-            &mut next_q,
-        );
-
-        // Q(s, a)
-        write_columns(&mut self.input, n_joined, 0, &batch.inputs, n_input);
-        write_columns(&mut self.input, n_joined, n_input, &batch.actions, actor.shape.n_output);
-        let joined = Matrix::new(&self.input, b, n_joined);
-        let mut q = MatrixMut::new(&mut self.q, b, critic.shape.n_output);
-        forward(&critic.shape, &critic.online, joined, &mut self.critic_workspace, &mut q);
-
-        // Mean of (Q - y)^2, and the sum over the batches of its gradient in each.
-        assert_eq!(batch.rewards.len(), self.q.len(), "rewards for another number of heads");
-        let mut loss = 0.0;
-        let returns = self.targets.iter_mut().zip(&self.next_q).zip(&batch.rewards);
-        for ((target, next_q), reward) in returns {
-            *target = critic_target(config.discount, self.lowest_reward, *reward, *next_q);
-        }
-        let values = self.q.iter().zip(&self.targets);
-        for (gradient, (q, target)) in self.q_gradient.iter_mut().zip(values) {
-            let error = q - target;
-            loss += f64::from(error) * f64::from(error);
-            *gradient = 2.0 * error / config.batch_size as f32;
-        }
-        let gradient = &mut self.optimizer.gradient;
-        backward_parameters(
-            &critic.shape,
-            &critic.online,
-            joined,
-            &mut self.critic_workspace,
-            &self.q_gradient,
-            gradient,
-        );
-        loss / b as f64
-    }
-}
-
-/// Returns the critic's target `y = r + discount * Q'(s', pi'(s'))`, clipped to the range of discounted sums of rewards
-/// from the lowest to 0.
-///
-/// Episodes end by their time limit only, which is no terminal state, so the target always bootstraps.
-fn critic_target(discount: f32, lowest_reward: f32, reward: f32, next_q: f32) -> f32 {
-    (reward + discount * next_q).clamp(lowest_reward / (1.0 - discount), 0.0)
-}
-
-/// The actor's half of an update.
-#[derive(Debug, Clone)]
-struct ActorHalf {
-    /// Input and the actor's action, shape `[b, n_input + n_action]`.
-    input: Vec<f32>,
-    /// The critic's value of it, shape `[b, n_heads]`.
-    q: Vec<f32>,
-    /// The loss's gradient by `q`: the same number everywhere.
-    q_gradient: Vec<f32>,
-    /// The loss's gradient by the action, then by the action before its tanh, shape `[b, n_action]`.
-    action_gradient: Vec<f32>,
-    actor_workspace: Workspace,
-    critic_workspace: Workspace,
-    optimizer: NetworkOptimizer,
-}
-
-impl ActorHalf {
-    fn new(config: &DdpgConfig, actor: &MlpShape, critic: &MlpShape) -> Self {
-        let b = config.transitions_per_update();
-        Self {
-            input: vec![0.0; b * critic.n_input],
-            q: vec![0.0; b * critic.n_output],
-            q_gradient: vec![-1.0 / config.batch_size as f32; b * critic.n_output],
-            action_gradient: vec![0.0; b * actor.n_output],
-            actor_workspace: Workspace::new(actor, b),
-            critic_workspace: Workspace::new(critic, b),
-            optimizer: NetworkOptimizer::new(actor, config.actor_learning_rate),
-        }
-    }
-
-    /// Stores the gradient of the actor's loss in `optimizer` and returns the loss and the mean value.
-    fn differentiate(
-        &mut self,
-        config: &DdpgConfig,
-        actor: &Network,
-        critic: &Network,
-        batch: &Batch,
-    ) -> (f64, f64) {
-        let b = config.transitions_per_update();
-        let n_input = actor.shape.n_input;
-        let n_joined = critic.shape.n_input;
-
-        // Q(s, pi(s)): the actor writes its actions into the critic's input.
-        write_columns(&mut self.input, n_joined, 0, &batch.inputs, n_input);
-        let inputs = Matrix::new(&batch.inputs, b, n_input);
-        let mut action_columns = action_columns(&mut self.input, &actor.shape, n_joined, b);
-        forward(
-            &actor.shape,
-            &actor.online,
-            inputs,
-            &mut self.actor_workspace,
-            &mut action_columns,
-        );
-        squash(&mut action_columns);
-        let joined = Matrix::new(&self.input, b, n_joined);
-        let mut q = MatrixMut::new(&mut self.q, b, critic.shape.n_output);
-        forward(&critic.shape, &critic.online, joined, &mut self.critic_workspace, &mut q);
-
-        // -Q summed over the heads, by the action.
-        backward_input(
-            &critic.shape,
-            &critic.online,
-            &mut self.critic_workspace,
-            &self.q_gradient,
-            n_input..n_joined,
-            &mut self.action_gradient,
-        );
-        let action_loss = self.add_action_terms(config, batch, n_input);
-        let gradient = &mut self.optimizer.gradient;
-        let workspace = &mut self.actor_workspace;
-        backward_parameters(
-            &actor.shape,
-            &actor.online,
-            inputs,
-            workspace,
-            &self.action_gradient,
-            gradient,
-        );
-        let sum_q: f64 = self.q.iter().copied().map(f64::from).sum();
-        (action_loss - sum_q / b as f64, sum_q / self.q.len() as f64)
-    }
-
-    /// Adds the terms of the loss that depend on the action directly, propagates the gradient back through the tanh,
-    /// and returns these terms: the mean squared action, and the squared error to the teacher's action where that was
-    /// executed.
-    fn add_action_terms(&mut self, config: &DdpgConfig, batch: &Batch, n_input: usize) -> f64 {
-        let n_action = self.action_gradient.len() / config.transitions_per_update();
-        let penalty = config.action_penalty / (config.batch_size * n_action) as f32;
-        let cloning = config.bc_weight / config.batch_size as f32;
-        let mut loss = 0.0;
-        let executed_rows =
-            batch.actions.chunks_exact(n_action).zip(batch.bc_mask.chunks_exact(n_action));
-        let rows = self
-            .action_gradient
-            .chunks_exact_mut(n_action)
-            .zip(self.input.chunks_exact(n_input + n_action));
-        for ((gradient, input), (executed, bc_mask)) in rows.zip(executed_rows) {
-            for i in 0..n_action {
-                let action = input[n_input + i];
-                let error = bc_mask[i] * (action - executed[i]);
-                gradient[i] += 2.0 * penalty * action + 2.0 * cloning * error;
-                gradient[i] *= 1.0 - action * action;
-                loss += f64::from(penalty * action * action + cloning * error * error);
-            }
-        }
-        loss / config.batches_per_update as f64
-    }
-}
-
-/// A network's gradient and optimiser.
-#[derive(Debug, Clone)]
-struct NetworkOptimizer {
-    gradient: Vec<f32>,
-    adam: Adam,
-}
-
-impl NetworkOptimizer {
-    fn new(shape: &MlpShape, learning_rate: f32) -> Self {
-        let n_parameters = shape.n_parameters();
-        Self { gradient: vec![0.0; n_parameters], adam: Adam::new(n_parameters, learning_rate) }
-    }
-
-    /// Makes a step of Adam; returns true if all parameters are still finite.
-    fn apply(&mut self, network: &mut Network) -> bool {
-        self.adam.step(&mut network.online, &self.gradient);
-        all_finite(&network.online)
-    }
+/// Splits rows of `n_columns` numbers into blocks of rows.
+fn split_rows<'a>(
+    mut rows: &'a mut [f32],
+    n_columns: usize,
+    blocks: &[Range<usize>],
+) -> impl Iterator<Item = &'a mut [f32]> {
+    blocks.iter().map(move |block| {
+        let (first, rest) = std::mem::take(&mut rows).split_at_mut(block.len() * n_columns);
+        rows = rest;
+        first
+    })
 }
 
 /// Copies rows of `n_columns` into the rows of `table`, `row_stride` long, from column `first_column` on.
@@ -458,7 +344,6 @@ fn write_columns(
     rows: &[f32],
     n_columns: usize,
 ) {
-    assert_eq!(rows.len() * row_stride, table.len() * n_columns, "a batch of another size");
     for (row, source) in table.chunks_exact_mut(row_stride).zip(rows.chunks_exact(n_columns)) {
         row[first_column..first_column + n_columns].copy_from_slice(source);
     }
@@ -469,9 +354,9 @@ fn action_columns<'a>(
     input: &'a mut [f32],
     actor: &MlpShape,
     n_joined: usize,
-    b: usize,
+    n_rows: usize,
 ) -> MatrixMut<'a> {
-    MatrixMut::with_stride(&mut input[actor.n_input..], b, actor.n_output, n_joined)
+    MatrixMut::with_stride(&mut input[actor.n_input..], n_rows, actor.n_output, n_joined)
 }
 
 /// Applies tanh to every action.
@@ -481,13 +366,4 @@ fn squash(actions: &mut MatrixMut<'_>) {
             *component = tanh(*component);
         }
     }
-}
-
-/// Runs both closures, in parallel if there are two threads.
-fn join<A: Send, B: Send>(
-    n_threads: usize,
-    a: impl FnOnce() -> A + Send,
-    b: impl FnOnce() -> B + Send,
-) -> (A, B) {
-    if n_threads > 1 { rayon::join(a, b) } else { (a(), b()) }
 }

@@ -71,7 +71,7 @@ impl Ddpg {
     /// Returns the gradients of the last update: the actor's and the critic's.
     #[must_use]
     pub fn gradients(&self) -> [&[f32]; 2] {
-        [&self.actor_half.optimizer.gradient, &self.critic_half.optimizer.gradient]
+        [&self.actor.gradient, &self.critic.gradient]
     }
 
     /// Initialises all networks, online and target, with those of a policy. Intended for a learner that has made no
@@ -80,18 +80,16 @@ impl Ddpg {
     /// # Panics
     /// When the policy's networks have other sizes.
     pub fn start_from(&mut self, policy: &Policy) {
-        self.actor.online.copy_from_slice(&policy.actor);
-        self.actor.target.copy_from_slice(&policy.actor);
-        self.critic.online.copy_from_slice(&policy.critic);
-        self.critic.target.copy_from_slice(&policy.critic);
+        self.actor.set(&policy.actor, &policy.actor);
+        self.critic.set(&policy.critic, &policy.critic);
     }
 
     /// Every vector that the next update depends on, by name, in a fixed order. With [`Ddpg::n_updates`] it is the
     /// whole state.
     #[must_use]
     pub fn state(&self) -> [(&'static str, &[f32]); 8] {
-        let [actor_first, actor_second] = self.actor_half.optimizer.adam.moments();
-        let [critic_first, critic_second] = self.critic_half.optimizer.adam.moments();
+        let [actor_first, actor_second] = self.actor.adam.moments();
+        let [critic_first, critic_second] = self.critic.adam.moments();
         [
             ("actor.online", &self.actor.online),
             ("actor.target", &self.actor.target),
@@ -136,12 +134,10 @@ impl Ddpg {
             critic_first,
             critic_second,
         ] = vectors;
-        self.actor.online.copy_from_slice(actor);
-        self.actor.target.copy_from_slice(target_actor);
-        self.actor_half.optimizer.adam.restore(n_updates, [actor_first, actor_second]);
-        self.critic.online.copy_from_slice(critic);
-        self.critic.target.copy_from_slice(target_critic);
-        self.critic_half.optimizer.adam.restore(n_updates, [critic_first, critic_second]);
+        self.actor.set(actor, target_actor);
+        self.actor.adam.restore(n_updates, [actor_first, actor_second]);
+        self.critic.set(critic, target_critic);
+        self.critic.adam.restore(n_updates, [critic_first, critic_second]);
         self.n_updates = n_updates;
         Ok(())
     }

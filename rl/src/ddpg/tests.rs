@@ -4,7 +4,8 @@ use tandem_core::rng::{index, uniform};
 use tandem_core::{Layout, Stream, Task, episode_rng};
 use tandem_policy::MlpShape;
 
-use super::{Batch, Ddpg, DdpgConfig, DdpgError, Rewards};
+use super::critic_half::critic_target;
+use super::{Batch, Ddpg, DdpgConfig, DdpgError, Rewards, UpdateLosses};
 
 const LAYOUT: Layout = Layout::new(Task::Push, 1);
 
@@ -141,20 +142,43 @@ fn both_gradients_agree_with_finite_differences() {
     check(2, |config| (config.action_penalty, config.bc_weight) = (0.5, 2.0));
 }
 
+/// Learns on `n_threads` threads from batches of `batch_size` and returns the state and the losses.
+fn learn(
+    config: &DdpgConfig,
+    n_heads: usize,
+    n_threads: usize,
+) -> (Vec<(&'static str, Vec<f32>)>, Vec<UpdateLosses>) {
+    let n_rows = config.transitions_per_update();
+    let mut ddpg = Ddpg::new(config.clone(), LAYOUT, Rewards::sparse(n_heads), 9);
+    ddpg.set_threads(n_threads);
+    let mut losses = Vec::new();
+    for number in 0..4 {
+        losses.push(ddpg.update(&random_batch(n_heads, n_rows, number)).unwrap());
+        ddpg.polyak();
+    }
+    (ddpg.state().map(|(name, vector)| (name, vector.to_vec())).to_vec(), losses)
+}
+
 #[test]
-fn one_and_two_threads_give_the_same_bits() {
-    let config = small(|config| (config.n_hidden, config.batch_size) = (64, 32));
-    let learn = |n_threads| {
-        let mut ddpg = Ddpg::new(config.clone(), LAYOUT, Rewards::sparse(2), 9);
-        ddpg.set_threads(n_threads);
-        let mut losses = Vec::new();
-        for number in 0..20 {
-            losses.push(ddpg.update(&random_batch(2, 32, number)).unwrap());
-            ddpg.polyak();
-        }
-        (ddpg.state().map(|(name, vector)| (name, vector.to_vec())), losses)
+fn any_number_of_threads_gives_the_same_bits() {
+    let narrow = small(|config| (config.n_hidden, config.batch_size) = (64, 300));
+    let uneven = small(|config| (config.n_hidden, config.batch_size) = (130, 101));
+    let single = small(|config| {
+        (config.n_hidden, config.batch_size, config.batches_per_update) = (64, 300, 2);
+    });
+    let on = |n_pool, config, n_heads, n_threads| {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(n_pool).build().unwrap();
+        pool.install(|| learn(config, n_heads, n_threads))
     };
-    assert_eq!(learn(1), learn(2));
+    for (config, n_heads) in [(&narrow, 2), (&uneven, 2), (&single, 1)] {
+        let alone = learn(config, n_heads, 1);
+        for n_threads in [2, 3, 5, 16] {
+            let together = on(n_threads, config, n_heads, n_threads);
+            assert!(together == alone, "{n_threads} threads, batch of {}", config.batch_size);
+        }
+        assert!(on(1, config, n_heads, 16) == alone, "a pool of one thread");
+        assert!(on(3, config, n_heads, 2) == alone, "a pool of more threads");
+    }
 }
 
 /// Appends the rows of `second` to those of `first`.
@@ -192,10 +216,9 @@ fn the_gradients_of_an_updates_batches_are_summed_and_its_losses_averaged() {
             assert!((got - (first + second)).abs() < 1e-5, "{got} is not {first} + {second}");
         }
     }
-    let mean =
-        |loss: fn(&super::UpdateLosses) -> f64| (loss(&alone[0].1) + loss(&alone[1].1)) / 2.0;
+    let mean = |loss: fn(&UpdateLosses) -> f64| (loss(&alone[0].1) + loss(&alone[1].1)) / 2.0;
     for loss in [
-        (|l: &super::UpdateLosses| l.critic_loss) as fn(&super::UpdateLosses) -> f64,
+        (|l: &UpdateLosses| l.critic_loss) as fn(&UpdateLosses) -> f64,
         |l| l.actor_loss,
         |l| l.mean_q,
     ] {
@@ -233,10 +256,10 @@ fn polyak_averaging_moves_only_the_targets() {
 
 #[test]
 fn targets_are_clipped_to_the_sum_of_lowest_rewards() {
-    assert_eq!(super::critic_target(0.5, -1.0, -1.0, -9.0), -2.0);
-    assert_eq!(super::critic_target(0.5, -3.0, -1.0, -9.0), -5.5);
-    assert_eq!(super::critic_target(0.5, -3.0, -3.0, -9.0), -6.0);
-    assert_eq!(super::critic_target(0.5, -3.0, 0.0, 9.0), 0.0);
+    assert_eq!(critic_target(0.5, -1.0, -1.0, -9.0), -2.0);
+    assert_eq!(critic_target(0.5, -3.0, -1.0, -9.0), -5.5);
+    assert_eq!(critic_target(0.5, -3.0, -3.0, -9.0), -6.0);
+    assert_eq!(critic_target(0.5, -3.0, 0.0, 9.0), 0.0);
 }
 
 #[test]

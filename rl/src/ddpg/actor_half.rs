@@ -1,0 +1,201 @@
+//! The actor's half of an update.
+
+use std::ops::Range;
+
+use tandem_policy::{Activations, Matrix, MatrixMut, MlpShape, RowBlock};
+
+use super::network::{Gradient, Network};
+use super::{
+    Batch, BatchRows, DdpgConfig, Scratch, Sizes, action_columns, split_rows, squash, write_columns,
+};
+
+/// The actor's half of an update.
+#[derive(Debug, Clone)]
+pub(super) struct ActorHalf {
+    /// Input and the actor's action, shape `[b, n_input + n_action]`.
+    input: Vec<f32>,
+    /// The critic's value of it, shape `[b, n_heads]`.
+    q: Vec<f32>,
+    /// The loss's gradient by `q`: the same number everywhere.
+    q_gradient: Vec<f32>,
+    /// The loss's gradient by the action, then by the action before its tanh, shape `[b, n_action]`.
+    action_gradient: Vec<f32>,
+    /// Of the actions.
+    activations: Activations,
+}
+
+/// Some rows of the actor's half.
+#[derive(Debug)]
+pub(super) struct ActorRows<'a> {
+    batch: BatchRows<'a>,
+    input: &'a mut [f32],
+    q: &'a mut [f32],
+    q_gradient: &'a [f32],
+    action_gradient: &'a mut [f32],
+    activations: RowBlock<'a>,
+}
+
+impl ActorHalf {
+    pub(super) fn new(config: &DdpgConfig, actor: &MlpShape, critic: &MlpShape) -> Self {
+        let b = config.transitions_per_update();
+        Self {
+            input: vec![0.0; b * critic.n_input],
+            q: vec![0.0; b * critic.n_output],
+            q_gradient: vec![-1.0 / config.batch_size as f32; b * critic.n_output],
+            action_gradient: vec![0.0; b * actor.n_output],
+            activations: Activations::new(actor, b),
+        }
+    }
+
+    /// Splits the half into blocks of rows.
+    pub(super) fn rows<'a>(
+        &'a mut self,
+        batch: &'a Batch,
+        blocks: &[Range<usize>],
+        sizes: Sizes,
+    ) -> Vec<ActorRows<'a>> {
+        let Self { input, q, q_gradient, action_gradient, activations } = self;
+        let q_gradient = &**q_gradient;
+        let mut inputs = split_rows(input, sizes.n_input + sizes.n_action, blocks);
+        let mut qs = split_rows(q, sizes.n_heads, blocks);
+        let mut action_gradients = split_rows(action_gradient, sizes.n_action, blocks);
+        let rows =
+            blocks.iter().zip(activations.blocks(blocks)).map_while(|(block, activations)| {
+                Some(ActorRows {
+                    batch: batch.rows(block, sizes),
+                    input: inputs.next()?,
+                    q: qs.next()?,
+                    q_gradient: &q_gradient[..block.len() * sizes.n_heads],
+                    action_gradient: action_gradients.next()?,
+                    activations,
+                })
+            });
+        rows.collect()
+    }
+
+    /// Describes the gradient of the loss by the actor's parameters, after all `b` rows of `batch`.
+    pub(super) fn gradient<'a>(
+        &'a self,
+        actor: &MlpShape,
+        batch: &'a Batch,
+        b: usize,
+    ) -> Gradient<'a> {
+        let input = Matrix::new(&batch.inputs, b, actor.n_input);
+        Gradient::new(*actor, input, &self.activations, &self.action_gradient)
+    }
+
+    /// Returns the loss and the mean value, after all rows of `batch`.
+    pub(super) fn loss_and_mean_q(&self, config: &DdpgConfig, batch: &Batch) -> (f64, f64) {
+        let b = config.transitions_per_update();
+        let n_action = self.action_gradient.len() / b;
+        let n_joined = self.input.len() / b;
+        let terms = ActionTerms::new(config, n_action);
+        let executed_rows =
+            batch.actions.chunks_exact(n_action).zip(batch.bc_mask.chunks_exact(n_action));
+        let mut loss = 0.0;
+        for (input, (executed, bc_mask)) in self.input.chunks_exact(n_joined).zip(executed_rows) {
+            let actions = &input[n_joined - n_action..];
+            for ((action, executed), bc_mask) in actions.iter().zip(executed).zip(bc_mask) {
+                loss += terms.loss(*action, bc_mask * (action - executed));
+            }
+        }
+        let action_loss = loss / config.batches_per_update as f64;
+        let sum_q: f64 = self.q.iter().copied().map(f64::from).sum();
+        (action_loss - sum_q / b as f64, sum_q / self.q.len() as f64)
+    }
+}
+
+impl ActorRows<'_> {
+    /// Computes the actions, their values and the gradients of the actor's loss by all activations of the actor.
+    pub(super) fn differentiate(
+        mut self,
+        config: &DdpgConfig,
+        actor: &Network,
+        critic: &Network,
+        scratch: &mut Scratch,
+    ) {
+        let BatchRows { n_rows, inputs, .. } = self.batch;
+        let n_input = actor.shape.n_input;
+        let (n_joined, n_heads) = (critic.shape.n_input, critic.shape.n_output);
+
+        // Q(s, pi(s)): the actor writes its actions into the critic's input.
+        write_columns(self.input, n_joined, 0, inputs, n_input);
+        let mut action_columns = action_columns(self.input, &actor.shape, n_joined, n_rows);
+        self.activations.forward(
+            &actor.shape,
+            &actor.online,
+            &actor.online_weights,
+            Matrix::new(inputs, n_rows, n_input),
+            &mut action_columns,
+        );
+        squash(&mut action_columns);
+        let mut values = scratch.critic.block(n_rows);
+        values.forward(
+            &critic.shape,
+            &critic.online,
+            &critic.online_weights,
+            Matrix::new(self.input, n_rows, n_joined),
+            &mut MatrixMut::new(self.q, n_rows, n_heads),
+        );
+
+        // -Q summed over the heads, by the action.
+        values.backward(&critic.shape, &critic.online, self.q_gradient);
+        values.input_gradient(
+            &critic.shape,
+            &critic.online,
+            self.q_gradient,
+            n_input..n_joined,
+            self.action_gradient,
+        );
+        self.add_action_terms(config, n_input);
+        self.activations.backward(&actor.shape, &actor.online, self.action_gradient);
+    }
+
+    /// Adds the gradient of the terms of the loss that depend on the action directly, and propagates the gradient back
+    /// through the tanh.
+    fn add_action_terms(&mut self, config: &DdpgConfig, n_input: usize) {
+        let n_action = self.action_gradient.len() / self.batch.n_rows;
+        let terms = ActionTerms::new(config, n_action);
+        let executed_rows = self
+            .batch
+            .actions
+            .chunks_exact(n_action)
+            .zip(self.batch.bc_mask.chunks_exact(n_action));
+        let rows = self
+            .action_gradient
+            .chunks_exact_mut(n_action)
+            .zip(self.input.chunks_exact(n_input + n_action));
+        for ((gradient, input), (executed, bc_mask)) in rows.zip(executed_rows) {
+            for i in 0..n_action {
+                let action = input[n_input + i];
+                gradient[i] += terms.gradient(action, bc_mask[i] * (action - executed[i]));
+                gradient[i] *= 1.0 - action * action;
+            }
+        }
+    }
+}
+
+/// The terms of the loss that depend on an action's components directly: the mean squared component, and the squared
+/// error to the teacher's component where that was executed.
+#[derive(Debug, Clone, Copy)]
+struct ActionTerms {
+    penalty: f32,
+    cloning: f32,
+}
+
+impl ActionTerms {
+    fn new(config: &DdpgConfig, n_action: usize) -> Self {
+        Self {
+            penalty: config.action_penalty / (config.batch_size * n_action) as f32,
+            cloning: config.bc_weight / config.batch_size as f32,
+        }
+    }
+
+    fn gradient(self, action: f32, error: f32) -> f32 {
+        2.0 * self.penalty * action + 2.0 * self.cloning * error
+    }
+
+    fn loss(self, action: f32, error: f32) -> f64 {
+        f64::from(self.penalty * action * action + self.cloning * error * error)
+    }
+}

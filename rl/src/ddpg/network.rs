@@ -1,0 +1,163 @@
+//! A network with its target network and its optimiser, and the tasks that change them.
+
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use rand_chacha::ChaCha8Rng;
+use tandem_policy::{
+    Activations, Adam, AdamPart, AlignedVec, Matrix, MlpShape, ParameterBlock, TransposedBlock,
+    TransposedWeights, all_finite, elementwise_blocks, polyak_update,
+};
+
+/// A network, its target network and its optimiser. Parameters are flat vectors.
+#[derive(Debug, Clone)]
+pub(super) struct Network {
+    pub(super) shape: MlpShape,
+    pub(super) online: AlignedVec,
+    pub(super) target: AlignedVec,
+    /// The weights in `online`, transposed.
+    pub(super) online_weights: TransposedWeights,
+    /// The weights in `target`, transposed.
+    pub(super) target_weights: TransposedWeights,
+    /// The loss's gradient by `online` in the last update.
+    pub(super) gradient: AlignedVec,
+    pub(super) adam: Adam,
+    blocks: Vec<ParameterBlock>,
+}
+
+impl Network {
+    pub(super) fn new(shape: MlpShape, learning_rate: f32, rng: &mut ChaCha8Rng) -> Self {
+        let online = AlignedVec::from(&*shape.initialise(rng));
+        let online_weights = TransposedWeights::new(&shape, &online);
+        Self {
+            target: online.clone(),
+            target_weights: online_weights.clone(),
+            gradient: AlignedVec::zeros(online.len()),
+            adam: Adam::new(online.len(), learning_rate),
+            blocks: shape.parameter_blocks(),
+            shape,
+            online,
+            online_weights,
+        }
+    }
+
+    /// Replaces the parameters of both networks, each of shape `[n_parameters]`.
+    pub(super) fn set(&mut self, online: &[f32], target: &[f32]) {
+        self.online.copy_from_slice(online);
+        self.target.copy_from_slice(target);
+        self.online_weights.update(&self.shape, online);
+        self.target_weights.update(&self.shape, target);
+    }
+
+    /// Returns the tasks that compute the gradient and make a step of Adam with it.
+    pub(super) fn step<'a>(&'a mut self, gradient: &'a Gradient<'_>) -> Vec<StepTask<'a>> {
+        let lengths = self.blocks.iter().map(|block| block.len(&self.shape));
+        let parts = self.adam.step_in_parts(&mut self.online, lengths);
+        let mut rest = &mut *self.gradient;
+        let tasks = self.blocks.iter().zip(parts).map(|(block, adam)| {
+            let (values, others) = std::mem::take(&mut rest).split_at_mut(adam.parameters().len());
+            rest = others;
+            StepTask { gradient, block, values, adam }
+        });
+        tasks.collect()
+    }
+
+    /// Returns the tasks that transpose the weights in `online`.
+    pub(super) fn transpose(&mut self) -> Vec<TransposeTask<'_>> {
+        let Self { shape, online, online_weights, .. } = self;
+        let blocks = online_weights.blocks(shape).into_iter();
+        blocks.map(|block| TransposeTask { shape, parameters: online, block }).collect()
+    }
+
+    /// Returns the tasks that move the target network toward the online one.
+    pub(super) fn polyak(&mut self) -> Vec<PolyakTask<'_>> {
+        let Self { online, target, online_weights, target_weights, .. } = self;
+        let mut tasks = Vec::new();
+        for (mut target, mut online) in
+            [(&mut **target, &**online), (target_weights.as_mut_slice(), online_weights.as_slice())]
+        {
+            for length in elementwise_blocks(target.len()) {
+                let (target_part, target_rest) = target.split_at_mut(length);
+                let (online_part, online_rest) = online.split_at(length);
+                tasks.push(PolyakTask { target: target_part, online: online_part });
+                (target, online) = (target_rest, online_rest);
+            }
+        }
+        tasks
+    }
+}
+
+/// What the gradient of a loss by the parameters of a network is computed from.
+#[derive(Debug)]
+pub(super) struct Gradient<'a> {
+    shape: MlpShape,
+    input: Matrix<'a>,
+    activations: &'a Activations,
+    /// The loss's gradient by the output, shape `[b, n_output]`.
+    by_output: &'a [f32],
+    is_finite: AtomicBool,
+}
+
+impl<'a> Gradient<'a> {
+    /// Describes the gradient after a backward pass over every row of `input`, shape `[b, n_input]`.
+    pub(super) const fn new(
+        shape: MlpShape,
+        input: Matrix<'a>,
+        activations: &'a Activations,
+        by_output: &'a [f32],
+    ) -> Self {
+        Self { shape, input, activations, by_output, is_finite: AtomicBool::new(true) }
+    }
+
+    /// Returns `true` if all parameters are finite after the steps with this gradient.
+    pub(super) fn is_finite(&self) -> bool {
+        self.is_finite.load(Ordering::Relaxed)
+    }
+}
+
+/// A step of Adam for a block of parameters.
+#[derive(Debug)]
+pub(super) struct StepTask<'a> {
+    gradient: &'a Gradient<'a>,
+    block: &'a ParameterBlock,
+    /// The gradient by the block's parameters.
+    values: &'a mut [f32],
+    adam: AdamPart<'a>,
+}
+
+impl StepTask<'_> {
+    pub(super) fn run(mut self) {
+        let Gradient { shape, input, activations, by_output, is_finite } = self.gradient;
+        activations.parameter_gradient(shape, self.block, *input, by_output, self.values);
+        self.adam.apply(self.values);
+        if !all_finite(self.adam.parameters()) {
+            is_finite.store(false, Ordering::Relaxed);
+        }
+    }
+}
+
+/// The transposition of a block of weights.
+#[derive(Debug)]
+pub(super) struct TransposeTask<'a> {
+    shape: &'a MlpShape,
+    parameters: &'a [f32],
+    block: TransposedBlock<'a>,
+}
+
+impl TransposeTask<'_> {
+    pub(super) fn run(self) {
+        self.block.update(self.shape, self.parameters);
+    }
+}
+
+/// Polyak averaging of a block of parameters, or of transposed weights.
+#[derive(Debug)]
+pub(super) struct PolyakTask<'a> {
+    target: &'a mut [f32],
+    online: &'a [f32],
+}
+
+impl PolyakTask<'_> {
+    pub(super) fn run(self, keep: f32) {
+        polyak_update(self.target, self.online, keep);
+    }
+}
