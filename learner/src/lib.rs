@@ -30,10 +30,3 @@ pub use error::Error;
 pub use service::{LingerPolicy, ServeOptions, serve, serve_with};
 pub use shared::{Clock, LearnerConfig};
 pub use training_loop::RunOutcome;
-
-/// Tests of the public interface, which name this crate as other crates do.
-#[cfg(test)]
-#[path = "../tests/service/main.rs"]
-mod service_tests;
-#[cfg(test)]
-extern crate self as tandem_learner;

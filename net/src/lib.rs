@@ -61,10 +61,3 @@ pub use wrong_service::WrongService;
 /// The largest message that services and clients accept, in bytes: several times the episodes of a slot or the
 /// parameters of a large actor.
 pub const MAX_MESSAGE_BYTES: usize = 64 << 20;
-
-/// Tests of the public interface, which name this crate as other crates do.
-#[cfg(test)]
-#[path = "../tests/calls/main.rs"]
-mod calls;
-#[cfg(test)]
-extern crate self as tandem_net;

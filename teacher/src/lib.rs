@@ -55,10 +55,3 @@ pub use policy::{AnyPolicy, TeacherPolicy};
 pub use remote_policy::{PolicyTimeouts, RemoteError, RemotePolicy};
 pub use service::{Config, open, serve, serve_advisor};
 pub use strategy::{Strategy, UnknownStrategy};
-
-/// Tests of the public interface, which name this crate as other crates do.
-#[cfg(test)]
-#[path = "../tests/ledger/main.rs"]
-mod ledger_tests;
-#[cfg(test)]
-extern crate self as tandem_teacher;

@@ -38,10 +38,3 @@ pub use evaluate::{
 };
 pub use ports::{Act, Advisor};
 pub use run::{run, run_with};
-
-/// Tests of the public interface, which name this crate as other crates do.
-#[cfg(test)]
-#[path = "../tests/services/main.rs"]
-mod services;
-#[cfg(test)]
-extern crate self as tandem_worker;

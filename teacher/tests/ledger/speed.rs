@@ -1,4 +1,5 @@
-//! The time of a charge. Run with `cargo test --release -p tandem-teacher --lib ledger_tests -- --ignored --nocapture`.
+//! The time of a charge. Run with
+//! `cargo test --release --workspace --test services ledger_tests::speed -- --ignored --nocapture`.
 
 use std::time::Instant;
 

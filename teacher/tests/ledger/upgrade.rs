@@ -56,7 +56,7 @@ fn answers_of(ledger: &mut dyn Ledger) -> (Vec<Verdict>, Vec<Lease>, [Balance; 2
 
 /// Copies the ledger and the log that a killed teacher of version 1 left.
 fn copy() -> (TempDir, PathBuf) {
-    let data = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data");
+    let data = Path::new(env!("CARGO_MANIFEST_DIR")).join("teacher/tests/data");
     let directory = tempfile::tempdir().expect("a directory");
     for name in ["ledger-v1.sqlite", "ledger-v1.sqlite-wal"] {
         fs::copy(data.join(name), directory.path().join(name)).expect("copied");
