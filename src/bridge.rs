@@ -19,6 +19,7 @@ mod arms;
 mod calibrate;
 mod cell;
 mod file;
+mod first_day;
 mod inject;
 mod model;
 mod operator;
@@ -45,6 +46,8 @@ pub(crate) fn bridge(args: BridgeArgs) -> Result<(), Failed> {
         Some(BridgeCommand::Cell(args)) => cell::cell(&args),
         Some(BridgeCommand::Arms(args)) => model::serve(&args),
         Some(BridgeCommand::Calibrate(args)) => calibrate::calibrate(args),
+        Some(BridgeCommand::Home(args)) => first_day::home(args),
+        Some(BridgeCommand::ToStart(args)) => first_day::to_start(args),
         Some(BridgeCommand::Inject(args)) => inject::inject(&args),
         Some(BridgeCommand::Trial(args)) => trial::trial(&args),
     }
@@ -81,10 +84,11 @@ fn serve(args: BridgeServeArgs) -> Result<(), Failed> {
             }),
             secret,
         };
+        let injector = config.injector.clone();
         let (observer, snapshots) = plan.observer();
         let bridge =
             Bridge::start(arms.executor, config, observer, &shutdown).map_err(bridge_failed)?;
-        let watching = plan.start(&args, &bridge.operator(), snapshots)?;
+        let watching = plan.start(&args, &bridge.operator(), injector, snapshots)?;
         let served = bridge.serve(listener, &server_config).await;
         watching.finish();
         served.map_err(bridge_failed)

@@ -372,7 +372,7 @@ fn arms_in_a_process_of_their_own_brake_when_the_bridge_is_killed() {
     let mover = bridge.with_arms(|| bridge.moving());
     // Dropping a bridge kills it.
     drop(bridge);
-    line_with(&mut told, "no command for 50 ms: the drives brake");
+    line_with(&mut told, "the drives brake by themselves");
     line_with(&mut told, "the arms are at rest");
     end(mover);
     // A new bridge finds the arms where they are, stopped.

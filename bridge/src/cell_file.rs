@@ -29,6 +29,9 @@ const MODELS: [&ArmModel; 1] = [&MICO_4];
 pub struct CellFile {
     /// Whether the arms report torques without those that carry their own weight; `None` for the driver's default.
     pub reports_torques: Option<bool>,
+    /// Behind kinova-ros, the time constant of the mean that is subtracted from efforts, seconds; `None` for the
+    /// default. Only without `reports_torques`.
+    pub torque_mean_s: Option<f64>,
     /// The table.
     pub table: Table,
     /// The arms, in the order of commands.
@@ -281,6 +284,7 @@ impl Default for CellFile {
         };
         Self {
             reports_torques: None,
+            torque_mean_s: None,
             table: Table { height_m: cell.table_z_m },
             arms: cell.arms.iter().zip(["left", "right"]).map(arm).collect(),
             limits: Limits::default(),

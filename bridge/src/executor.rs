@@ -80,7 +80,7 @@ impl<D: Driver> Executor<D> {
             monitor: Monitor::new(&cell, &settings, period_s),
             envelope: Envelope::new(&cell, &settings, period_s),
             state: ArmsState::Stopped(StopCause::NotReset.anywhere().at(0.0)),
-            commands: CommandHistory::new(&cell, reaction_periods(&settings, period_s)),
+            commands: CommandHistory::new(&cell, &settings, period_s),
             ticked_s: None,
             stop_error: None,
             exchange_error: None,
@@ -264,10 +264,9 @@ impl<D: Driver> Executor<D> {
         match self.driver.exchange(&command) {
             Ok(state) => {
                 (self.stop_error, self.exchange_error) = (None, None);
-                let expected = ExpectedState {
-                    number: self.commands.number(),
-                    velocities: self.commands.visible_velocities(),
-                };
+                let velocities = self.commands.visible_velocities();
+                let number = self.commands.number();
+                let expected = ExpectedState { number, velocities: &velocities };
                 if let Err(breach) = self.monitor.accept(now_s, state, &expected) {
                     self.halt(breach, now_s);
                 }
@@ -386,6 +385,7 @@ impl<D: Driver> Executor<D> {
                     settings: &self.settings,
                     period_s: self.period_s,
                     state: fresh.then_some(state),
+                    stale_periods: stale_periods(stale_s, self.period_s),
                     last: self.commands.last(),
                 };
                 playback.next(&context, *holding)?
@@ -433,15 +433,15 @@ impl<D: Driver> Drop for Executor<D> {
     }
 }
 
-/// The reaction time in periods, at least one.
-fn reaction_periods(settings: &Settings, period_s: f64) -> usize {
+/// Returns the age of a state beyond one period in whole periods. Ages of less than half a period are jitter.
+fn stale_periods(stale_s: f64, period_s: f64) -> usize {
     #[expect(
         clippy::cast_possible_truncation,
         clippy::cast_sign_loss,
-        reason = "a reaction takes a few periods"
+        reason = "a state that is used is a few periods old"
     )]
-    let periods = (settings.reaction_s / period_s).ceil() as usize;
-    periods.max(1)
+    let periods = (stale_s / period_s).round().max(0.0) as usize;
+    periods
 }
 
 /// Checks that idle arms are at most `allowed` radians from the position that they hold.

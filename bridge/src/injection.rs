@@ -1,5 +1,6 @@
 //! Faults that operators inject into simulated arms, to practise each stop.
 
+use std::fmt;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 
@@ -33,6 +34,22 @@ pub struct Fault {
     pub arm: ArmIndex,
     /// The joint of a blocked joint, a torque or a drift, counted from 0.
     pub joint: usize,
+}
+
+impl fmt::Display for Fault {
+    /// Writes the name, and the place with the joint counted from 1.
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let (arm, joint) = (self.arm.0, self.joint + 1);
+        match self.kind {
+            FaultKind::EmergencyStop => write!(f, "emergency-stop, arm {arm}"),
+            FaultKind::DriveFault => write!(f, "drive-fault, arm {arm}"),
+            FaultKind::Contact => write!(f, "contact, arm {arm}"),
+            FaultKind::BlockedJoint => write!(f, "blocked-joint, arm {arm}, joint {joint}"),
+            FaultKind::Torque => write!(f, "torque, arm {arm}, joint {joint}"),
+            FaultKind::Drift => write!(f, "drift, arm {arm}, joint {joint}"),
+            FaultKind::LateStates => f.write_str("late-states"),
+        }
+    }
 }
 
 /// The present faults, shared by the service and the driver of simulated arms.

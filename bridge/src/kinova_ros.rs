@@ -10,6 +10,11 @@
 //! | `out/joint_state` | `sensor_msgs/JointState` | subscribed: rad, rad/s, N m; fingers as joints |
 //! | `fingers_action/finger_positions/goal` | `kinova_msgs/SetFingersPositionActionGoal` | published: turns of the fingers |
 //! | `fingers_action/finger_positions/result` | `kinova_msgs/SetFingersPositionActionResult` | subscribed |
+//! | `joints_action/joint_angles/goal` | `kinova_msgs/ArmJointAnglesActionGoal` | published: degrees |
+//! | `joints_action/joint_angles/result` | `kinova_msgs/ArmJointAnglesActionResult` | subscribed |
+//! | `out/joint_command` | `kinova_msgs/JointAngles` | subscribed: the arm's own command, degrees |
+//! | `/rosout` | `rosgraph_msgs/Log` | subscribed: errors of the two nodes |
+//! | `in/home_arm` | `kinova_msgs/HomeArm` | called by [`home`] only |
 //! | `in/stop`, `in/start` | `kinova_msgs/Stop`, `kinova_msgs/Start` | called; `in/stop` also empties the arm's queue |
 //!
 //! `joint7` of a velocity, which the arms lack, carries the command's number in millionths. `in/clear_trajectories` is
@@ -24,16 +29,20 @@
 //! all arms were published in ROS. An executor stops if commands are in flight for too long, and cannot be reset while
 //! there are any. A velocity of another publisher ends the connection.
 //!
+//! **Velocities that the arm misses** show in its motion only, see `following.rs`: an arm that turns by less than 65 %
+//! of what its velocities ask for ends the connection.
+//!
 //! **To stop**, the driver ceases to publish and calls `in/stop`. The arm stops because it receives no velocities, also
 //! when the process is killed, and the service prevents other clients from moving it. On the first [`Order::Move`]
 //! after a stop, which an executor sends only after a reset, the driver calls `in/start` and publishes velocities after
 //! its response. kinova-ros reports no states for about 50 ms meanwhile; [`settings`] allows for that.
 //!
-//! **Grippers** move only while their arms are stationary, see [`FingerSettings`]. A motion should pause for a second
-//! where it opens or closes a gripper.
+//! **Grippers** move only while their arms are stationary, see [`FingerSettings`], and after the arm was switched to
+//! angular control, see `preparation.rs`. A motion should pause for a second where it opens or closes a gripper.
 //!
 //! **States.** A state of the pair is new once both arms have reported, and has the older time stamp. The arms report
-//! no faults. Efforts count as torques only if [`KinovaRosConfig::reports_torques`] is set.
+//! no faults: an error in a node's log, a service that fails and silence stop the arms. [`Efforts`] tells how efforts
+//! become torques.
 //!
 //! A driver serves one connection. A malformed message, a service that fails or does not respond, and a lost connection
 //! end it: the driver stops the arms if it still can, and every later exchange returns that first error. To continue,
@@ -41,23 +50,38 @@
 
 use std::time::Duration;
 
+use tandem_kinematics::Joints;
+
 use crate::driver::{ArmCommand, Command, Driver, DriverError, Order, PairState};
 use crate::executor::Settings;
 use crate::kinova_ros::merge::StateMerger;
 use crate::kinova_ros::node::{ArmNode, Control, MAX_IN_FLIGHT, Service};
+use crate::kinova_ros::preparation::Preparation;
 use crate::kinova_ros::protocol::{ArmDecoder, RosMessage};
 use crate::kinova_ros::websocket::RosbridgeSocket;
 
 pub use fingers::FingerSettings;
+pub use homing::{HomingError, home};
 
+mod efforts;
 mod fingers;
+mod following;
+mod homing;
 mod merge;
 mod node;
+mod preparation;
 mod protocol;
 mod websocket;
 
 /// Time from one exchange to the next, seconds. The arms take velocities at this rate only.
 pub const PERIOD_S: f64 = 0.01;
+/// The topic of the arm's own joint command, below a node's name.
+const COMMAND_TOPIC: &str = "out/joint_command";
+/// The topics of the action for joint angles, below a node's name.
+const ANGLES_GOAL: &str = "joints_action/joint_angles/goal";
+const ANGLES_RESULT: &str = "joints_action/joint_angles/result";
+/// The topic of all nodes' logs.
+const LOG_TOPIC: &str = "/rosout";
 /// Number of waits in the time limit of the first state.
 const N_FIRST_WAITS: u32 = 100;
 
@@ -74,11 +98,26 @@ pub struct KinovaRosConfig {
     pub answer_exchanges: u32,
     /// Largest difference between the time stamps of the two arms' states, seconds. Default 0.1.
     pub skew_s: f64,
-    /// Whether the nodes have `torque_parameters/publish_torque_with_gravity_compensation` set, so that efforts are
-    /// torques without the arm's own weight. Default false: torques are not used.
-    pub reports_torques: bool,
+    /// The meaning of efforts. Default [`Efforts::Unused`].
+    pub efforts: Efforts,
     /// The goals of the grippers.
     pub fingers: FingerSettings,
+}
+
+/// The meaning of the efforts that the nodes publish.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Efforts {
+    /// Efforts are not used.
+    Unused,
+    /// Torques without those that carry the arm: the nodes have
+    /// `torque_parameters/publish_torque_with_gravity_compensation` set.
+    Compensated,
+    /// Torques that include the arm's own weight, as the nodes publish them by default. Their difference from a moving
+    /// mean is used, which shows a sudden push and not a steady one.
+    Changes {
+        /// The time constant of the mean, seconds.
+        mean_s: f64,
+    },
 }
 
 /// The names of an arm in ROS.
@@ -110,21 +149,23 @@ impl KinovaRosConfig {
             connect_timeout: Duration::from_secs(3),
             answer_exchanges: 100,
             skew_s: 0.1,
-            reports_torques: false,
+            efforts: Efforts::Unused,
             fingers: FingerSettings::default(),
         }
     }
 }
 
-/// Returns initial settings of the executor. They allow for states at 40 Hz (the rate over USB), for the 50 ms of
-/// `in/start` and for 60 ms through rosbridge. Reaction and lag are estimates until they are measured on the arms.
+/// Returns initial settings of the executor. They allow for states at 10 Hz whose arms report at different times, for
+/// the 50 ms of `in/start` and for 60 ms through rosbridge. Reaction and lag are estimates until they are measured on
+/// the arms.
 #[must_use]
 pub fn settings() -> Settings {
     Settings {
-        reaction_s: 0.080,
+        // A pair's state is new with the later arm's report; the other arm's may be a report older.
+        reaction_s: 0.180,
         lag_s: 0.050,
-        state_hold_s: 0.030,
-        state_stop_s: 0.150,
+        state_hold_s: 0.130,
+        state_stop_s: 0.250,
         command_s: 0.060,
         ..Settings::default()
     }
@@ -142,6 +183,8 @@ pub struct KinovaRosDriver {
     number: u64,
     /// Counts the identifiers of calls and goals.
     n_ids: u64,
+    /// True while the connection only listens: a failure stops no arm, which somebody else may be moving.
+    is_passive: bool,
     /// The error that ended the connection.
     failure: Option<DriverError>,
 }
@@ -158,8 +201,9 @@ impl KinovaRosDriver {
         let arms: Vec<ArmNode> = config.arms.iter().map(arm).collect();
         let merge = StateMerger::new(arms.len(), config.skew_s);
         let newest = PairState { sequence: 0, stamp_s: 0.0, newest_command: None, arms: vec![] };
+        let (number, n_ids, is_passive, failure) = (0, 0, false, None);
         let mut driver =
-            Self { config, socket, arms, merge, newest, number: 0, n_ids: 0, failure: None };
+            Self { config, socket, arms, merge, newest, number, n_ids, is_passive, failure };
         driver.register_topics()?;
         let slice = driver.config.connect_timeout / N_FIRST_WAITS;
         for _ in 0..N_FIRST_WAITS {
@@ -201,8 +245,14 @@ impl KinovaRosDriver {
             self.socket.send(protocol::advertise(&arm.goal_topic(), goal))?;
             self.socket.send(protocol::subscribe(&arm.result_topic(), result))?;
             self.socket.send(protocol::subscribe(&state, "sensor_msgs/JointState"))?;
+            let commanded = arm.topic(COMMAND_TOPIC);
+            self.socket.send(protocol::subscribe(&commanded, "kinova_msgs/JointAngles"))?;
+            let goal = "kinova_msgs/ArmJointAnglesActionGoal";
+            let result = "kinova_msgs/ArmJointAnglesActionResult";
+            self.socket.send(protocol::advertise(&arm.topic(ANGLES_GOAL), goal))?;
+            self.socket.send(protocol::subscribe(&arm.topic(ANGLES_RESULT), result))?;
         }
-        Ok(())
+        self.socket.send(protocol::subscribe_to_all(LOG_TOPIC, "rosgraph_msgs/Log"))
     }
 
     /// Runs `action` unless the connection has failed. An error ends the connection and is kept.
@@ -214,7 +264,8 @@ impl KinovaRosDriver {
             return Err(failure.clone());
         }
         action(self).inspect_err(|failure| {
-            for arm in 0..self.arms.len() {
+            let n_stopped = if self.is_passive { 0 } else { self.arms.len() };
+            for arm in 0..n_stopped {
                 self.stop_arm(arm).ok();
             }
             self.socket.close();
@@ -253,14 +304,21 @@ impl KinovaRosDriver {
     /// Stops an arm, unless that was requested already.
     fn stop_arm(&mut self, arm: usize) -> Result<(), DriverError> {
         self.arms[arm].fingers.stop();
+        self.arms[arm].preparation = None;
+        self.arms[arm].following.clear();
         if self.arms[arm].is_stopping() {
             return Ok(());
         }
         self.call_service(arm, Service::Stop)
     }
 
-    /// Forwards a command to an arm.
-    fn drive(&mut self, arm: usize, number: u64, command: &ArmCommand) -> Result<(), DriverError> {
+    /// Forwards a command to an arm. Returns whether its velocities were published.
+    fn drive(
+        &mut self,
+        arm: usize,
+        number: u64,
+        command: &ArmCommand,
+    ) -> Result<bool, DriverError> {
         if !(0.0..=1.0).contains(&command.opening) {
             let what = format!("opening {}, expected 0 to 1", command.opening);
             return Err(DriverError::Refused { what });
@@ -270,31 +328,33 @@ impl KinovaRosDriver {
                 let what = "a new connection has to start with an order to stop".into();
                 Err(DriverError::Refused { what })
             }
-            Control::Pending { .. } => Ok(()),
-            Control::Stopped => self.call_service(arm, Service::Start),
+            Control::Pending { .. } => Ok(false),
+            Control::Stopped => self.call_service(arm, Service::Start).map(|()| false),
             Control::Started => self.publish(arm, number, command),
         }
     }
 
-    /// Publishes velocities, or a goal of the fingers.
+    /// Publishes velocities, or a goal of the fingers. Returns whether it published velocities.
     fn publish(
         &mut self,
         arm: usize,
         number: u64,
         command: &ArmCommand,
-    ) -> Result<(), DriverError> {
+    ) -> Result<bool, DriverError> {
         let topic = self.arms[arm].velocity_topic();
         let velocities = protocol::velocities(&topic, number, &command.velocities)?;
         let stationary_radps = self.config.fingers.stationary_radps;
         let stationary = command.velocities.iter().all(|rate| rate.abs() <= stationary_radps);
+        if let Some(step) = self.arms[arm].preparation.take() {
+            return self.prepare_fingers(arm, step).map(|()| false);
+        }
         if let Some(opening) = self.arms[arm].fingers.next(command.opening, stationary) {
-            let id = self.next_id();
-            let turns = decoder(&self.config, arm).turns(opening);
-            self.socket.send(protocol::finger_goal(&self.arms[arm].goal_topic(), &id, turns))?;
-            self.arms[arm].fingers.goal_sent(id);
+            let sequence = self.newest.sequence;
+            self.arms[arm].preparation = Some(Preparation::Settling { opening, sequence, n: 0 });
+            return Ok(false);
         }
         if self.arms[arm].fingers.busy() {
-            return Ok(());
+            return Ok(false);
         }
         if self.arms[arm].in_flight.len() >= MAX_IN_FLIGHT {
             let what =
@@ -302,7 +362,8 @@ impl KinovaRosDriver {
             return Err(DriverError::Disconnected { what });
         }
         self.arms[arm].in_flight.push_back((number, command.velocities));
-        self.socket.send(velocities)
+        self.socket.send(velocities)?;
+        Ok(true)
     }
 
     /// Returns the newest state with the number of the newest command that was published for all arms; `number` is the
@@ -335,7 +396,12 @@ impl Driver for KinovaRosDriver {
                         return Err(DriverError::Shape { got, expected });
                     }
                     for (arm, command) in commands.iter().enumerate() {
-                        driver.drive(arm, number, command)?;
+                        let published = driver.drive(arm, number, command)?;
+                        let share = if published { 1.0 } else { 0.0 };
+                        let sent = Joints::from_fn(command.velocities.len(), |joint| {
+                            share * command.velocities[joint]
+                        });
+                        driver.arms[arm].following.push_velocities(&sent);
                     }
                 }
             }
@@ -360,13 +426,25 @@ fn handle(
     config: &KinovaRosConfig,
 ) -> Result<(), DriverError> {
     match message {
+        RosMessage::Publish { topic, msg } if topic == LOG_TOPIC => {
+            arms.iter().try_for_each(|arm| arm.handle_log(&msg))
+        }
         RosMessage::Publish { topic, msg } => {
             for (idx, arm) in arms.iter_mut().enumerate() {
                 if topic == arm.topic("out/joint_state") {
                     let state = decoder(config, idx).joint_state(&msg);
-                    merge.push(idx, state.map_err(|error| with_node(error, &arm.node))?);
+                    let mut state = state.map_err(|error| with_node(error, &arm.node))?;
+                    if let Efforts::Changes { mean_s } = config.efforts {
+                        arm.mean_efforts.subtract(mean_s, &mut state);
+                    }
+                    arm.handle_state(state.stamp_s, &state.reading.angles)?;
+                    merge.push(idx, state);
                 } else if topic == arm.velocity_topic() {
                     arm.handle_velocity(&msg)?;
+                } else if topic == arm.topic(COMMAND_TOPIC) {
+                    arm.commanded = protocol::joint_degrees(&msg);
+                } else if topic == arm.topic(ANGLES_RESULT) {
+                    arm.handle_angles_result(&msg)?;
                 } else if topic == arm.result_topic()
                     && let Some(id) = protocol::ended_goal(&msg)
                 {
@@ -389,7 +467,7 @@ fn decoder(config: &KinovaRosConfig, arm: usize) -> ArmDecoder<'_> {
     ArmDecoder {
         prefix: &config.arms[arm].joint_prefix,
         shut_turns: config.fingers.shut_turns,
-        reports_torques: config.reports_torques,
+        reports_torques: config.efforts != Efforts::Unused,
     }
 }
 

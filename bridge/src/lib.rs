@@ -20,6 +20,7 @@ pub mod injection;
 pub mod kinova_ros;
 pub mod quarc;
 pub mod service;
+pub mod to_start;
 pub mod work_cell;
 
 pub use driver::{ArmCommand, ArmReading, Command, Driver, DriverError, Faults, Order, PairState};

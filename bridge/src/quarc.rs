@@ -4,18 +4,10 @@
 //! each direction, without header or length. [`codec`] has the tables. The model sends a state in every sample, with or
 //! without a command.
 //!
-//! **Requirements of the model**, because a stream block repeats its last value:
-//!
-//! 1. Set all velocities to zero until an order to stop arrives if the command's number has not changed for
-//!    [`SILENCE_S`](crate::driver::SILENCE_S), if the stream block is not connected, and in every sample before the
-//!    first command of a connection.
-//! 2. Do the same, and report a drive fault, on a command that does not start with its mark, has a number that is not
-//!    finite, or an order other than 0 and 1.
-//! 3. Brake at once on order 0, regardless of its number, which may repeat that of the previous command.
-//! 4. Receive into a buffer for one vector and send states only while connected, so that no backlog forms. The sequence
-//!    increases by 1 with each vector sent.
-//! 5. Report the number of the newest command in effect. The executor stops if commands have no effect.
-//! 6. Enforce the arms' own limits (speed, torque, range). The bridge enforces them too; neither relies on the other.
+//! **Requirements of the model.** A stream block repeats its last value, and the model itself has to brake. The rules
+//! are those of `docs/drivers.md`, section QUARC. `bridge/quarc` implements them in C for QUARC's Stream API and for a
+//! Simulink block, [`arm_side`] implements them for simulated arms, and `bridge/quarc/vectors.txt` has examples that
+//! test both.
 //!
 //! **A driver serves one connection.** A number that is not finite, an unknown flag, a jump in the sequence, a vector
 //! that stays incomplete, a command that cannot be written at once and a closed connection end it: the driver stops the
@@ -34,6 +26,7 @@ use crate::driver::{Command, Driver, DriverError, Order, PairState};
 use crate::quarc::codec::STATE_BYTES;
 use crate::quarc::state_buffer::StateBuffer;
 
+pub mod arm_side;
 pub mod codec;
 mod state_buffer;
 
@@ -307,7 +300,7 @@ fn first_state(
     }
     let (address, got) = (&config.address, buffered.n_partial());
     let what = format!(
-        "{address:?} accepted the connection and sent {got} bytes, a state has {STATE_BYTES}: is the model running, and does its signal have the documented width?"
+        "{address:?} accepted the connection and sent {got} bytes, a state has {STATE_BYTES}: is the model running without another bridge, and does its signal have the documented width?"
     );
     Err(DriverError::Malformed { what })
 }

@@ -356,7 +356,7 @@ impl BridgeService {
             Action::Fault(fault) => {
                 let fault = messages::decode_fault(fault, self.arms.checker.cell());
                 let fault = fault.map_err(|error| error.within("fault"))?;
-                tracing::warn!(?fault, "a fault was injected");
+                tracing::warn!(%fault, "a fault was injected");
                 injector.add(fault);
             }
             Action::Clear(pb::ClearFaults {}) => {

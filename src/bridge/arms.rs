@@ -4,10 +4,11 @@ use std::sync::Arc;
 
 use tandem_bridge::cell_file::CellFile;
 use tandem_bridge::injection::Injector;
-use tandem_bridge::kinova_ros::{KinovaArm, KinovaRosConfig, KinovaRosDriver};
+use tandem_bridge::kinova_ros::{Efforts, KinovaArm, KinovaRosConfig, KinovaRosDriver};
 use tandem_bridge::quarc::{QuarcConfig, QuarcDriver};
 use tandem_bridge::service::{BoxDriver, Clock, Reconnect};
 use tandem_bridge::{DriverError, Executor, Settings};
+use tandem_kinematics::{Joints, WorkCell};
 use tandem_trials::simulated::{Drill, RealTimePair};
 use tandem_trials::{SimulatedConfig, SimulatedPair};
 
@@ -17,6 +18,10 @@ use crate::exit::{Exit, Failed, OrExit as _};
 
 /// Initial height of a simulated tool above its workspace, metres.
 const READY_M: f64 = 0.05;
+/// Time constant of the mean that is subtracted from the efforts of kinova-ros, seconds.
+const TORQUE_MEAN_S: f64 = 0.4;
+/// Joint angles of raised simulated arms, degrees.
+const RAISED_DEGREES: [f64; 4] = [20.0, 180.0, 250.0, 180.0];
 /// Initial opening of a simulated gripper, 0 to 1.
 const READY_OPENING: f64 = 0.5;
 
@@ -96,7 +101,7 @@ pub(super) fn simulated(
     settings: &Settings,
 ) -> Result<SimulatedPair, Failed> {
     let cell = file.work_cell();
-    let at = cell.ready(READY_M).or_exit(Exit::Bug, String::new)?;
+    let at = start_posture(&cell)?;
     let gaps = cell.gaps_with(&at, &vec![READY_OPENING; at.len()]);
     let table_m = gaps.table_m.iter().copied().fold(f64::INFINITY, f64::min);
     for (gap_m, least_m, what) in [
@@ -115,16 +120,31 @@ pub(super) fn simulated(
             ));
         }
     }
+    Ok(SimulatedPair::new(cell, &at, READY_OPENING, simulated_config(seed, file)))
+}
+
+/// Creates a simulated pair with raised arms, whose grippers do not point down.
+pub(super) fn raised(seed: u64, file: &CellFile) -> SimulatedPair {
+    let raised = Joints::new(&RAISED_DEGREES.map(f64::to_radians));
+    let at = vec![raised; file.arms.len()];
+    SimulatedPair::new(file.work_cell(), &at, READY_OPENING, simulated_config(seed, file))
+}
+
+/// Returns the joint angles of arms whose tools are above their workspaces, radians.
+pub(super) fn start_posture(cell: &WorkCell) -> Result<Vec<Joints>, Failed> {
+    cell.ready(READY_M).or_exit(Exit::Data, || "the arms have no start posture".to_owned())
+}
+
+fn simulated_config(seed: u64, file: &CellFile) -> SimulatedConfig {
     let defaults = SimulatedConfig::default();
-    let config = SimulatedConfig {
+    SimulatedConfig {
         seed,
         latency_periods: file.simulated.latency_periods,
         lag_s: file.simulated.lag_s,
         brake_s: file.simulated.brake_s,
         reports_torques: file.reports_torques.unwrap_or(defaults.reports_torques),
         ..defaults
-    };
-    Ok(SimulatedPair::new(cell, &at, READY_OPENING, config))
+    }
 }
 
 /// Returns how to connect to arms behind a Simulink model.
@@ -142,19 +162,28 @@ fn quarc(file: &CellFile) -> Result<Connect, Failed> {
 
 /// Returns how to connect to arms behind Kinova's ROS driver.
 fn kinova_ros(file: &CellFile) -> Result<Connect, Failed> {
+    let config = kinova_ros_config(file)?;
+    Ok(Box::new(move |address| {
+        let config = KinovaRosConfig { address: address.to_owned(), ..config.clone() };
+        Ok(Box::new(KinovaRosDriver::connect(config)?))
+    }))
+}
+
+/// Returns the configuration of Kinova's ROS driver, without the address.
+pub(super) fn kinova_ros_config(file: &CellFile) -> Result<KinovaRosConfig, Failed> {
     let arms: Vec<KinovaArm> = file
         .arms
         .iter()
         .map(|arm| KinovaArm { node: arm.ros_node(), joint_prefix: arm.ros_joint_prefix() })
         .collect();
     let arms = arms.try_into().map_err(|_arms| Failed::usage("kinova-ros drives two arms"))?;
-    let config = KinovaRosConfig {
+    Ok(KinovaRosConfig {
         arms,
-        reports_torques: file.reports_torques.unwrap_or(false),
+        efforts: match (file.reports_torques, file.torque_mean_s) {
+            (Some(true), _) => Efforts::Compensated,
+            (Some(false), _) => Efforts::Unused,
+            (None, mean_s) => Efforts::Changes { mean_s: mean_s.unwrap_or(TORQUE_MEAN_S) },
+        },
         ..KinovaRosConfig::at("")
-    };
-    Ok(Box::new(move |address| {
-        let config = KinovaRosConfig { address: address.to_owned(), ..config.clone() };
-        Ok(Box::new(KinovaRosDriver::connect(config)?))
-    }))
+    })
 }

@@ -1,17 +1,15 @@
 //! `tandem bridge arms`: the simulated pair as a process of its own, behind the protocol of a Simulink model.
 //!
 //! The process plays the part of real arms: it moves on when the bridge hangs, and its drives brake by themselves when
-//! the bridge is killed. [`tandem_bridge::quarc`] lists what the model has to do.
+//! the bridge is killed. `docs/drivers.md`, section QUARC, has the rules that the model follows.
 
-use std::io::{self, ErrorKind, Read as _, Write as _};
+use std::io::{self, ErrorKind, Read as _};
 use std::net::{SocketAddr, TcpListener, TcpStream};
 
-use tandem_bridge::driver::SILENCE_S;
-use tandem_bridge::quarc::codec::{
-    COMMAND_LEN, decode_command, encode_state, from_bytes, to_bytes,
-};
+use tandem_bridge::quarc::arm_side::{ArmSide, VectorSender};
+use tandem_bridge::quarc::codec::{COMMAND_LEN, from_bytes, to_bytes};
 use tandem_bridge::service::Clock as _;
-use tandem_bridge::{Command, Driver as _, Order, PairState};
+use tandem_bridge::{Driver as _, DriverError, PairState};
 use tandem_trials::SimulatedPair;
 use tandem_trials::simulated::PERIOD_S;
 use tokio_util::sync::CancellationToken;
@@ -24,6 +22,8 @@ use crate::{clock, output, signals};
 
 /// Bytes of a command.
 const COMMAND_BYTES: usize = COMMAND_LEN * size_of::<f64>();
+/// Samples without a command after which a connection that has sent commands is closed: 1 s.
+const IDLE_SAMPLES: u32 = 100;
 /// Highest speed of a joint at rest, radians per second.
 const REST_RADPS: f64 = 1e-3;
 
@@ -45,10 +45,10 @@ pub(super) fn serve(args: &ArmsServeArgs) -> Result<(), Failed> {
         let model = Model {
             pair,
             listener,
+            side: ArmSide::new(PERIOD_S),
             peer: None,
-            n_states: 0,
             has_obeyed: false,
-            is_tripped: false,
+            is_tripped: true,
             is_told: false,
         };
         let running = tokio::task::spawn_blocking(move || model.run(&interrupted));
@@ -60,8 +60,8 @@ pub(super) fn serve(args: &ArmsServeArgs) -> Result<(), Failed> {
 struct Model {
     pair: SimulatedPair,
     listener: TcpListener,
+    side: ArmSide,
     peer: Option<Peer>,
-    n_states: u64,
     /// Whether the drives have ever obeyed a bridge.
     has_obeyed: bool,
     /// Whether the drives have braked by themselves.
@@ -75,10 +75,11 @@ struct Peer {
     stream: TcpStream,
     address: SocketAddr,
     received: Vec<u8>,
-    /// The number of the last command.
-    number: u64,
-    /// Whether a stop has arrived, before which nothing moves.
-    obeys: bool,
+    sender: VectorSender,
+    /// Whether a command has arrived.
+    has_command: bool,
+    /// Samples since the last command.
+    n_idle: u32,
 }
 
 impl Model {
@@ -105,51 +106,89 @@ impl Model {
         if stream.set_nonblocking(true).and_then(|()| stream.set_nodelay(true)).is_err() {
             return Ok(());
         }
-        self.peer = Some(Peer { stream, address, received: Vec::new(), number: 0, obeys: false });
+        self.peer = Some(Peer {
+            stream,
+            address,
+            received: Vec::new(),
+            sender: VectorSender::default(),
+            has_command: false,
+            n_idle: 0,
+        });
+        self.side.set_connected(true);
         self.tell(format_args!("connected: {address}"))
     }
 
-    /// Simulates a period with the newest command and sends the state.
+    /// Passes a sample: takes the commands that have arrived, simulates a period and sends the state.
     fn sample(&mut self) -> Result<(), Failed> {
-        let command = match self.peer.as_mut().map(Peer::newest_command) {
-            Some(Ok(command)) => command,
-            Some(Err(why)) => {
-                self.disconnect(&why)?;
-                None
+        let n_commands = match self.receive() {
+            Ok((n_commands, None)) => n_commands,
+            Ok((n_commands, Some(fault))) => {
+                self.tell(format_args!("a malformed command: {fault}"))?;
+                n_commands
             }
-            None => None,
+            Err(why) => {
+                self.disconnect(&why)?;
+                0
+            }
         };
-        let state = match command {
-            Some(command) => self.pair.exchange(&command).or_exit(Exit::Bug, String::new)?,
-            None => self.pair.skip_period(),
+        let command = self.side.sample(true);
+        // The pair's own drives also brake if no command arrives.
+        let state = if n_commands > 0 || self.side.is_tripped() != self.is_tripped {
+            self.pair.exchange(&command).or_exit(Exit::Bug, String::new)?
+        } else {
+            self.pair.skip_period()
         };
-        self.tell_drives(&state)?;
-        self.n_states += 1;
-        let state = PairState { sequence: self.n_states, ..state };
-        let vector = encode_state(&state).or_exit(Exit::Bug, String::new)?;
-        match self.peer.as_mut().map(|peer| peer.stream.write_all(&to_bytes(&vector))) {
-            Some(Err(error)) => self.disconnect(&error),
-            Some(Ok(())) | None => Ok(()),
+        self.tell_drives()?;
+        match self.send(state) {
+            Ok(()) => Ok(()),
+            Err(why) => self.disconnect(&why),
         }
+    }
+
+    /// Takes the commands that have arrived. Returns their number, and what was wrong with one if its predecessors were
+    /// good.
+    fn receive(&mut self) -> io::Result<(usize, Option<String>)> {
+        let Some(peer) = &mut self.peer else { return Ok((0, None)) };
+        let commands = peer.arrived()?;
+        let mut fault = None;
+        for command in &commands {
+            let was_tripped = self.side.is_tripped();
+            if let Err(DriverError::Malformed { what }) = self.side.receive(&from_bytes(command))
+                && !was_tripped
+            {
+                fault = Some(what);
+            }
+        }
+        Ok((commands.len(), fault))
+    }
+
+    /// Sends a state, or drops it if the connection takes no more.
+    fn send(&mut self, state: PairState) -> io::Result<()> {
+        let Some(peer) = &mut self.peer else { return Ok(()) };
+        let vector = to_bytes(&self.side.encode(state).map_err(io::Error::other)?);
+        if peer.sender.send(&mut peer.stream, &vector)? {
+            self.side.sent();
+        }
+        Ok(())
     }
 
     fn disconnect(&mut self, why: &io::Error) -> Result<(), Failed> {
         let Some(peer) = self.peer.take() else { return Ok(()) };
+        self.side.set_connected(false);
         self.tell(format_args!("disconnected: {}: {why}", peer.address))
     }
 
     /// Tells when the drives brake by themselves and when the arms are at rest after that.
-    fn tell_drives(&mut self, state: &PairState) -> Result<(), Failed> {
-        let is_tripped = state.arms.iter().any(|arm| arm.faults.drive);
+    fn tell_drives(&mut self) -> Result<(), Failed> {
+        let was_tripped = std::mem::replace(&mut self.is_tripped, self.side.is_tripped());
         // Before a bridge has connected, drives without commands are no event.
-        self.has_obeyed |= !is_tripped && self.peer.as_ref().is_some_and(|peer| peer.obeys);
-        if !(is_tripped && self.has_obeyed) {
-            (self.is_tripped, self.is_told) = (false, false);
+        self.has_obeyed |= !self.is_tripped;
+        if !(self.is_tripped && self.has_obeyed) {
+            self.is_told = false;
             return Ok(());
         }
-        if !std::mem::replace(&mut self.is_tripped, true) {
-            let silence_ms = 1e3 * SILENCE_S;
-            self.tell(format_args!("no command for {silence_ms:.0} ms: the drives brake"))?;
+        if !was_tripped {
+            self.tell("the drives brake by themselves")?;
         }
         if self.is_at_rest() && !std::mem::replace(&mut self.is_told, true) {
             self.tell("the arms are at rest")?;
@@ -172,8 +211,8 @@ impl Model {
 }
 
 impl Peer {
-    /// Returns the newest command that has arrived since the last call and that the drives obey.
-    fn newest_command(&mut self) -> io::Result<Option<Command>> {
+    /// Returns the bytes of each command that has arrived whole since the last call. An idle connection ends.
+    fn arrived(&mut self) -> io::Result<Vec<Vec<u8>>> {
         let mut bytes = [0; 8 * COMMAND_BYTES];
         loop {
             match self.stream.read(&mut bytes) {
@@ -184,17 +223,13 @@ impl Peer {
                 Err(error) => return Err(error),
             }
         }
-        let mut newest = None;
-        while self.received.len() >= COMMAND_BYTES {
-            let vector: Vec<u8> = self.received.drain(..COMMAND_BYTES).collect();
-            let command = decode_command(&from_bytes(&vector)).map_err(io::Error::other)?;
-            let is_stop = command.order == Order::Stop;
-            self.obeys |= is_stop;
-            if self.obeys && (is_stop || command.number != self.number) {
-                self.number = command.number;
-                newest = Some(command);
-            }
+        let n_whole = self.received.len() / COMMAND_BYTES * COMMAND_BYTES;
+        let whole: Vec<u8> = self.received.drain(..n_whole).collect();
+        self.has_command |= n_whole > 0;
+        self.n_idle = if n_whole > 0 { 0 } else { self.n_idle + 1 };
+        if self.has_command && self.n_idle >= IDLE_SAMPLES {
+            return Err(io::Error::other("no command for 1 s"));
         }
-        Ok(newest)
+        Ok(whole.chunks_exact(COMMAND_BYTES).map(<[u8]>::to_vec).collect())
     }
 }

@@ -15,7 +15,7 @@ use tandem_trials::trial::{TrialConfig, TrialError, TrialMode, TrialReport};
 use tandem_trials::{NamedPolicy, Series, SeriesError, SimulatedConfig};
 
 use crate::bridge::file;
-use crate::cli::{ModeName, RecordName, TrialArgs, check_task};
+use crate::cli::{ModeName, RecordName, TaskName, TrialArgs, check_task};
 use crate::exit::{Exit, Failed, OrExit as _};
 use crate::{output, policy_file};
 
@@ -25,6 +25,7 @@ const DENSITY_KGPM3: f32 = 683.3;
 const MASS_KG: [f32; 2] = [0.05, 0.25];
 /// Smallest and largest block, centimetres, as in the training world.
 const BLOCK_CM: [f32; 2] = [3.0, 9.0];
+const DEFAULT_BLOCK_CM: f32 = 5.6;
 /// Longest trial, seconds.
 const TIME_LIMIT_S: f64 = 120.0;
 
@@ -34,7 +35,7 @@ const LOGS: &str = "mcap";
 
 pub(crate) fn trial(args: &TrialArgs) -> Result<(), Failed> {
     let (task, policies) = policies(args)?;
-    let block = block(args.block_cm)?;
+    let block = block(args.block_cm, task)?;
     if !(args.speed > 0.0 && args.speed <= 1.0) {
         let message = format!("--speed {}: expected more than 0 and at most 1", args.speed);
         return Err(Failed::usage(message));
@@ -105,29 +106,43 @@ fn policies(args: &TrialArgs) -> Result<(Task, Vec<NamedPolicy>), Failed> {
         }
         policies.push(NamedPolicy { name: format!("composed-{}", name_of(path)), policy });
     }
-    let task_of = |named: &NamedPolicy| {
+    let own_task = |named: &NamedPolicy| {
         let built_in = named.policy.layout.as_built_in().map(|layout| layout.task);
         built_in.ok_or_else(|| {
             let (name, task) = (&named.name, named.policy.layout.name());
             Failed::usage(format!("{name} is for {task}, which simulated arms cannot perform"))
         })
     };
-    let first = match policies.first() {
-        Some(named) => task_of(named)?,
-        None => return Err(Failed::usage("give --policy or --composed-teachers")),
+    let Some(first) = policies.first() else {
+        return Err(Failed::usage("give --policy or --composed-teachers"));
     };
-    check_task(first, args.task, args.world)?;
+    let task = task_of(first, own_task(first)?, args.task.map(TaskName::in_default_world));
+    check_task(task, args.task, args.world)?;
     for named in &policies {
-        let task = task_of(named)?;
-        if task != first {
-            let message = format!("{} is for {task}, not {first}", named.name);
+        let own = own_task(named)?;
+        if task_of(named, own, Some(task)) != task {
+            let message = format!("{} is for {own}, not {task}", named.name);
             return Err(Failed::usage(message));
         }
     }
-    Ok((first, policies))
+    Ok((task, policies))
 }
 
-fn block(edge_cm: f32) -> Result<Block, Failed> {
+/// Returns the task in which a policy whose own task is `own` is tried: `wanted` if it performs the part of one arm of that,
+/// otherwise its own.
+fn task_of(named: &NamedPolicy, own: Task, wanted: Option<Task>) -> Task {
+    let is_composed = named.policy.layout.n_arms() == 1;
+    wanted.filter(|wanted| is_composed && wanted.of_one_arm() == own).unwrap_or(own)
+}
+
+/// Returns the blocks of `task` with edges of `edge_cm` centimetres. An object that the arms share has no such edge.
+fn block(edge_cm: Option<f32>, task: Task) -> Result<Block, Failed> {
+    if edge_cm.is_some() && task.shares_object() {
+        let message =
+            format!("--block-cm: both arms of {task} share an object, which keeps its size");
+        return Err(Failed::usage(message));
+    }
+    let edge_cm = edge_cm.unwrap_or(DEFAULT_BLOCK_CM);
     let [low, high] = BLOCK_CM;
     if !(low..=high).contains(&edge_cm) {
         return Err(Failed::usage(format!("--block-cm {edge_cm}: expected {low} to {high}")));

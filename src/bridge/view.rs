@@ -1,5 +1,6 @@
 //! From snapshots of a bridge to the views that logs and displays use.
 
+use tandem_bridge::injection::Injector;
 use tandem_bridge::service::{MotionInfo, Snapshot};
 use tandem_bridge::{ArmReading, Phase, Progress};
 use tandem_kinematics::{Gaps, Joints, WorkCell};
@@ -7,8 +8,9 @@ use tandem_telemetry::{ArmView, ArmsPhase, ArmsView, MotionView, StopView};
 
 use crate::clock;
 
-/// Returns the view of `snapshot` in `cell`.
-pub(super) fn of(snapshot: &Snapshot, cell: &WorkCell) -> ArmsView {
+/// Returns the view of `snapshot` in `cell` with the present faults of `injector`.
+pub(super) fn of(snapshot: &Snapshot, cell: &WorkCell, injector: Option<&Injector>) -> ArmsView {
+    let injected = injector.map(Injector::faults).unwrap_or_default();
     let gaps = snapshot.gaps(cell);
     let motion = snapshot.motion.as_deref().zip(snapshot.progress);
     let stop = snapshot.stopped.as_ref().map(|stop| StopView {
@@ -24,6 +26,7 @@ pub(super) fn of(snapshot: &Snapshot, cell: &WorkCell) -> ArmsView {
         n_motions: snapshot.n_motions,
         stop,
         stop_error: snapshot.stop_error.as_ref().map(ToString::to_string),
+        injected: injected.iter().map(ToString::to_string).collect(),
         is_connected: !snapshot.exchange_failed,
         lease_left_s: snapshot.lease_left_s,
         at_rest: snapshot.at_rest,

@@ -9,6 +9,7 @@ use std::sync::Arc;
 use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, TrySendError, sync_channel};
 use std::time::Duration;
 
+use tandem_bridge::injection::Injector;
 use tandem_bridge::service::{Observer, Operator, Snapshots, observe};
 use tandem_core::text::error_chain;
 use tandem_dashboard::{Access, BridgeTerms, Site, StopAction};
@@ -103,6 +104,7 @@ impl Plan {
         self,
         args: &BridgeServeArgs,
         operator: &Operator,
+        injector: Option<Injector>,
         snapshots: Option<Snapshots>,
     ) -> Result<Watching, Failed> {
         let Some(snapshots) = snapshots else { return Ok(Watching { ended: None, _page: None }) };
@@ -119,7 +121,7 @@ impl Plan {
             None => None,
         };
         let (cell, live) = (operator.cell().clone(), self.live);
-        let viewer = Viewer { cell, journal, live, views, has_lost: false };
+        let viewer = Viewer { cell, injector, journal, live, views, has_lost: false };
         spawn("viewer", move || viewer.run(snapshots))?;
         Ok(Watching { ended: Some(ended), _page: page })
     }
@@ -139,6 +141,8 @@ impl Watching {
 /// The thread that views states.
 struct Viewer {
     cell: WorkCell,
+    /// The injected faults of simulated arms.
+    injector: Option<Injector>,
     journal: Option<SyncSender<Arc<ArmsView>>>,
     live: Option<LiveArms>,
     views: watch::Sender<Arc<ArmsView>>,
@@ -157,7 +161,7 @@ impl Viewer {
             if self.journal.is_none() && !for_live && !for_page {
                 continue;
             }
-            let view = Arc::new(view::of(&snapshot, &self.cell));
+            let view = Arc::new(view::of(&snapshot, &self.cell, self.injector.as_ref()));
             if let (Some(live), true) = (&mut self.live, for_live) {
                 live_s = view.time_s;
                 live.publish(&view);

@@ -39,6 +39,7 @@ Examples:
   tandem bridge --driver quarc --arms-at tcpip://10.0.0.5:18000 \
       --cell cell.toml --speed 0.1
   tandem bridge inject emergency-stop --arm left  # a drill, simulated arms
+  tandem bridge to-start      # moves raised arms slowly to a start posture
 
 docs/bridge.md is a tutorial up to the first motion."
 )]
@@ -164,6 +165,10 @@ Examples:
     Cell(CellArgs),
     /// Serves the simulated pair as a process of its own, as if it were behind a Simulink model (--driver quarc).
     Arms(ArmsServeArgs),
+    /// Homes real arms behind kinova-ros after power-up, one after the other.
+    Home(HomeArgs),
+    /// Moves raised or folded arms slowly to a start posture, from which motions can begin.
+    ToStart(ToStartArgs),
     /// Measures lag, reaction and braking time of the arms, and writes them into their cell file.
     Calibrate(CalibrateArgs),
     /// Injects a fault into simulated arms, to practise a stop. Real arms refuse it.
@@ -206,6 +211,55 @@ pub(crate) struct CalibrateArgs {
     /// Speed, as a fraction of each joint's highest, 0.1 to 0.5.
     #[arg(long, default_value_t = 0.3, value_parser = calibration_speed)]
     pub(crate) speed: f64,
+    /// Prints one JSON object.
+    #[arg(long)]
+    pub(crate) json: bool,
+}
+
+#[derive(Debug, Args)]
+#[command(after_help = "\
+Examples:
+  tandem bridge home --driver kinova-ros --arms-at ws://10.0.0.5:9090 \\
+      --cell cell.toml
+  tandem bridge home --driver kinova-ros --arms-at ws://10.0.0.5:9090 --arm left
+
+Kinova's node moves the arm by itself along a way that nobody checks, opens its gripper completely, and \
+delays every stop until the arm is home: only the emergency stop ends it earlier. Nothing may be in the \
+gripper or near the arm. Refused while a bridge moves or holds the arms. docs/drivers.md describes the \
+first day with real arms.")]
+pub(crate) struct HomeArgs {
+    #[command(flatten)]
+    pub(crate) arms: ArmsArgs,
+    /// Homes only the arm with this name.
+    #[arg(long, value_name = "NAME")]
+    pub(crate) arm: Option<String>,
+    #[command(flatten)]
+    pub(crate) confirmation: ConfirmationArgs,
+}
+
+#[derive(Debug, Args)]
+#[command(after_help = "\
+Examples:
+  tandem bridge to-start          # practise with simulated arms, raised
+  tandem bridge to-start --driver kinova-ros --arms-at ws://10.0.0.5:9090 \\
+      --cell cell.toml
+
+No joint turns faster than 8 degrees per second. All limits except the tilt of the grippers hold, and \
+without a way that keeps them nothing moves. Ctrl-C, the end of the terminal and a lost connection stop \
+the arms. No bridge may be connected to the arms.")]
+pub(crate) struct ToStartArgs {
+    #[command(flatten)]
+    pub(crate) arms: ArmsArgs,
+    #[command(flatten)]
+    pub(crate) confirmation: ConfirmationArgs,
+}
+
+/// Options of commands that an operator confirms.
+#[derive(Debug, Args)]
+pub(crate) struct ConfirmationArgs {
+    /// Does not ask whether somebody watches the arms with a hand on the emergency stop.
+    #[arg(long)]
+    pub(crate) yes: bool,
     /// Prints one JSON object.
     #[arg(long)]
     pub(crate) json: bool,

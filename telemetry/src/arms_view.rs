@@ -24,6 +24,8 @@ pub struct ArmsView {
     pub stop: Option<StopView>,
     /// The problem of the last attempt to command a stop, until a command gets through.
     pub stop_error: Option<String>,
+    /// The faults that an operator has injected into simulated arms, as text; oldest first.
+    pub injected: Vec<String>,
     /// Whether the driver exchanges commands and states with the arms.
     pub is_connected: bool,
     /// Time until the owner's lease ends unless it is renewed, seconds; `None` if the arms have no owner.

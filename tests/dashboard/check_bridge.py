@@ -2,7 +2,8 @@
 
 Starts a bridge with a simulated pair and uses its page as an operator does: the arms move on the page during a motion,
 the stop button stops the motion within a second and the page shows the cause, the keyboard reaches the button first,
-another page cannot press it, nothing overflows on a phone, scripts have no errors. Prints the times that it measured.
+another page cannot press it, an injected fault is shown, nothing overflows on a phone, scripts have no errors. Prints the
+times that it measured.
 """
 
 import argparse
@@ -134,6 +135,15 @@ def check_stop(page, bridge, mover, press, how):
     print(f"a stop by {how} was confirmed on the page after {shown_s:.2f} s")
 
 
+def check_drill(page, bridge):
+    """An injected fault is a tile until it is cleared."""
+    shown = "document.getElementById('tiles').textContent.includes('contact, arm 1')"
+    assert bridge.run("inject", "contact", "--arm", "1").returncode == 0
+    page.wait(shown, "the page shows the injected fault", 5)
+    assert bridge.run("inject", "--clear").returncode == 0
+    page.wait(f"!{shown}", "the page shows that the fault was cleared", 5)
+
+
 def check_tab(page):
     """The Tab key reaches the button first."""
     page.key("Tab", 9)
@@ -196,6 +206,7 @@ def main():
         with_motion(bridge, page, by_mouse)
         page.take_pictures(args.pictures, "bridge-stopped")
         with_motion(bridge, page, by_keyboard)
+        check_drill(page, bridge)
         check_layout(page)
         bridge.process.send_signal(signal.SIGTERM)
         page.wait("document.getElementById('link').textContent.includes('no connection')", "the end is shown", 10)

@@ -53,6 +53,8 @@ def grippers_move_while_the_arms_rest(rig):
         until("the gripper is open", lambda: abs(record.last_state()[4] - 640.0) < 64.0)
         report(f"{record.path.stem}: goals of {[round(goal[2]) for goal in record.lines('goal')]} turns")
         near(record.lines("goal")[-1][2:], [640.0, 640.0, 0.0], 64.0, "goal, turns")
+        check(not record.lines("cartesian goal"), "a finger goal with a Cartesian point moves the arm")
+        check(all(line[2] < 0.5 for line in record.lines("angles")), "goals of joint angles move the arm")
 
 
 def play(rig, file, expected_m):
@@ -83,14 +85,59 @@ def velocity_report(record, states, start_s, end_s):
     check(abs(mean_ms - 10.0) < 0.5, f"a velocity every {mean_ms} ms")
     waiting = max(state[5] for state in states)
     check(waiting <= 10, f"{waiting} velocities waited in the arm")
+    sent = len([line for line in record.lines("sent", start_s) if line[1] <= end_s])
     return (
-        f"{record.path.stem}: {len(received_s)} velocities, one every {mean_ms:.2f} ms (99 % within "
+        f"{record.path.stem}: {len(received_s)} velocities, {100 * sent / len(received_s):.0f} % of them passed on to the arm, one every {mean_ms:.2f} ms (99 % within "
         f"{gaps_ms[int(0.99 * len(gaps_ms))]:.1f} ms, all within {gaps_ms[-1]:.1f} ms), at most {waiting} waiting in the arm"
     )
 
 
 def degrees(arm):
     return [math.degrees(angle) for angle in arm["angles_rad"]]
+
+
+def arms_are_homed_one_by_one(rig):
+    homing = ["home", "--driver", "kinova-ros", "--arms-at", rig.arms_at, "--yes"]
+    homed = rig.alone(*homing)
+    check(homed.returncode == 0, homed.stderr)
+    times_s = [record.lines("home")[-1][1] for record in rig.records]
+    check(times_s[0] + 0.5 < times_s[1], f"homed at {times_s} s")
+    for record in rig.records:
+        check(record.lines("stop", record.lines("home")[-1][1]), "an arm is stopped after homing")
+    rig.reset()
+    refused = rig.alone(*homing)
+    report(f"home: {refused.stderr.strip().splitlines()[-1]}")
+    check(refused.returncode == 75 and "another node publishes" in refused.stderr, refused.stderr)
+    check(all(len(record.lines("home")) == 1 for record in rig.records), "arms that a bridge holds are not homed")
+
+
+def a_node_that_only_reads_its_arm_is_told(rig):
+    """With states every 10 ms, the node's thread has no time for velocities."""
+    restart_nodes(rig, 0.01, 0.002)
+
+    def once():
+        start_s = time.monotonic()
+        moved = rig.tandem("move", FIRST_MOTION, "--speed", 0.5)
+        stopped = rig.status()["stopped"]
+        if stopped and stopped["name"] != "driver":
+            rig.unless_busy(stopped)
+        check(moved.returncode == 75 and "the node takes too few velocities" in moved.stderr, moved.stderr)
+        report(f"move: {moved.stderr.strip().splitlines()[-1]}")
+        return start_s
+
+    start_s = rig.with_arms(once)
+    for record in rig.records:
+        last_s = record.lines("velocity")[-1][1]
+        counts = [sum(start_s <= line[1] <= last_s for line in record.lines(what)) for what in ("velocity", "sent", "status")]
+        per_s = [count / (last_s - start_s) for count in counts]
+        report("{}: {:.0f} velocities, {:.0f} passed on to the arm, {:.0f} states per second".format(record.path.stem, *per_s))
+    restart_nodes(rig)
+
+
+def restart_nodes(rig, *times):
+    for arm, side in enumerate(["left", "right"]):
+        rig.kill(side)
+        rig.start_node(arm, *times)
 
 
 def a_client_stops_the_arms(rig):
@@ -157,7 +204,8 @@ def arms_stop_without_the_master(rig):
     time.sleep(1.0)
     if rig.status()["stopped"] is None:
         states = [record.lines("state", at_s + 0.5) for record in rig.records]
-        check(all(any(state[3]) for arm_states in states for state in arm_states[-3:]), "a motion continues without the master")
+        moving = [sum(any(state[3]) for state in arm_states[-20:]) for arm_states in states]
+        check(min(moving) > 10, "a motion continues without the master")
     at_s = time.monotonic()
     stopped = rig.tandem("stop")
     check(stopped.returncode == 0, stopped.stderr)
@@ -188,6 +236,7 @@ def check_reset_fails(rig, expected):
 
 CASES = [
     inspecting_the_arms_moves_nothing,
+    arms_are_homed_one_by_one,
     arms_play_a_motion,
     grippers_move_while_the_arms_rest,
     a_client_stops_the_arms,
@@ -195,6 +244,7 @@ CASES = [
     a_relay_that_hangs_stops_the_arms,
     a_killed_relay_stops_the_arms,
     a_killed_node_stops_the_other_arm,
+    a_node_that_only_reads_its_arm_is_told,
     a_second_publisher_stops_the_arms,
     arms_stop_without_the_master,
 ]

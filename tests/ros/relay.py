@@ -19,9 +19,9 @@ import time
 import genpy
 import rospy
 import websockets
-from kinova_msgs.srv import Start, Stop
+from kinova_msgs.srv import HomeArm, Start, Stop
 
-SERVICES = {"in/stop": Stop, "in/start": Start}
+SERVICES = {"in/stop": Stop, "in/start": Start, "in/home_arm": HomeArm}
 EARLY_S = 1.0
 publishers = {}
 

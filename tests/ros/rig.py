@@ -106,11 +106,12 @@ class Rig:
 
         until("the master listens", answers)
 
-    def start_node(self, arm):
+    def start_node(self, arm, *times):
+        """Starts an arm's node, with the interval of its status timer and the duration of a call of its arm's interface, seconds."""
         start_s = time.monotonic()
         record = self.records[arm]
-        self.start(SIDES[arm], ["env", f"ROS_NAMESPACE=/{SIDES[arm]}", sys.executable, HERE / "arm_node.py", record.path])
-        until("the node publishes states", lambda: record.lines("state", start_s))
+        self.start(SIDES[arm], ["env", f"ROS_NAMESPACE=/{SIDES[arm]}", sys.executable, HERE / "arm_node.py", record.path, *map(str, times)])
+        until("the node publishes states", lambda: record.lines("status", start_s))
 
     def start_relay(self):
         """Starts the relay. A restart uses the same port."""
@@ -148,6 +149,11 @@ class Rig:
 
     def tandem(self, *what):
         return subprocess.run(self.command(*what), cwd=ROOT, capture_output=True, text=True, check=False)
+
+    def alone(self, *what):
+        """Runs a command of `tandem bridge` that needs no bridge."""
+        command = [self.tandem_path, "bridge", *map(str, what)]
+        return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
 
     def spawn(self, *what):
         return subprocess.Popen(

@@ -12,6 +12,13 @@ const BASE_OVER_TABLE_M: [f64; 2] = [-0.3, 0.3];
 impl CellFile {
     /// Checks every value.
     pub(super) fn checked(self) -> Result<Self, CellFileError> {
+        if let Some(mean_s) = self.torque_mean_s {
+            number("torque_mean_s", mean_s, [0.1, 2.0], "s")?;
+            if self.reports_torques.is_some() {
+                let got = format!("{mean_s}");
+                return Err(value("torque_mean_s", got, "no such key with reports_torques"));
+            }
+        }
         number("table.height_m", self.table.height_m, [-1.0, 1.0], "m")?;
         if self.arms.len() != N_ARMS {
             return Err(value("arms", format!("{} arms", self.arms.len()), "2 arms"));

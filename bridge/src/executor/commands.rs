@@ -5,8 +5,9 @@ use std::collections::VecDeque;
 use tandem_kinematics::{Joints, WorkCell};
 
 use crate::driver::{ArmCommand, Command, Order, PairState};
+use crate::executor::settings::Settings;
 
-/// Entries that are kept beyond the reaction time of the arms.
+/// Least number of entries that are kept beyond the reaction time of the arms.
 const EXTRA_ENTRIES: usize = 8;
 
 /// Commanded velocities, the newest first: one entry per period, arm by arm, radians per second.
@@ -21,11 +22,15 @@ pub(crate) struct CommandHistory {
     last: Vec<ArmCommand>,
     velocities: VelocityHistory,
     reaction_periods: usize,
+    /// Entries to keep: every command that may have no effect yet in the oldest state that is used.
+    n_kept: usize,
 }
 
 impl CommandHistory {
-    /// An empty history of the arms of `cell`, which react within `reaction_periods`.
-    pub(crate) fn new(cell: &WorkCell, reaction_periods: usize) -> Self {
+    /// An empty history of the arms of `cell`.
+    pub(crate) fn new(cell: &WorkCell, settings: &Settings, period_s: f64) -> Self {
+        let reaction_periods = periods(settings.reaction_s, period_s).max(1);
+        let n_kept = reaction_periods + periods(settings.state_stop_s, period_s).max(EXTRA_ENTRIES);
         let at_rest =
             |n_joints| ArmCommand { velocities: Joints::from_fn(n_joints, |_| 0.0), opening: 0.0 };
         Self {
@@ -33,6 +38,7 @@ impl CommandHistory {
             last: cell.arms.iter().map(|arm| at_rest(arm.model.n_joints())).collect(),
             velocities: VelocityHistory::new(),
             reaction_periods,
+            n_kept,
         }
     }
 
@@ -44,7 +50,7 @@ impl CommandHistory {
             Order::Stop => self.stationary(),
         };
         self.velocities.push_front(self.last.iter().map(|arm| arm.velocities).collect());
-        self.velocities.truncate(self.reaction_periods + EXTRA_ENTRIES);
+        self.velocities.truncate(self.n_kept);
         Command { number: self.number, order }
     }
 
@@ -66,12 +72,20 @@ impl CommandHistory {
         &self.velocities
     }
 
-    /// The velocities that a state read now should show.
+    /// The velocities that a state read now shows at least: for each joint, the slowest one within the reaction time,
+    /// since a joint may follow the newest command or the oldest.
     ///
     /// # Panics
     /// Panics if no command was pushed yet.
-    pub(crate) fn visible_velocities(&self) -> &[Joints] {
-        &self.velocities[self.velocities.len().min(self.reaction_periods) - 1]
+    pub(crate) fn visible_velocities(&self) -> Vec<Joints> {
+        let recent = || self.velocities.iter().take(self.reaction_periods);
+        let slowest = |arm: usize, joint: usize| {
+            let rates = recent().map(|velocities| velocities[arm][joint]);
+            rates.min_by(|a, b| a.abs().total_cmp(&b.abs())).unwrap_or(0.0)
+        };
+        let arms = self.velocities[0].iter().enumerate();
+        arms.map(|(arm, joints)| Joints::from_fn(joints.len(), |joint| slowest(arm, joint)))
+            .collect()
     }
 
     /// The command to stay in place with the grippers as they are.
@@ -94,4 +108,14 @@ impl CommandHistory {
     pub(crate) fn at_rest(&self, rest_radps: f64) -> bool {
         self.last.iter().all(|arm| arm.velocities.iter().all(|rate| rate.abs() <= rest_radps))
     }
+}
+
+/// Returns a time in periods, rounded up.
+#[expect(
+    clippy::cast_possible_truncation,
+    clippy::cast_sign_loss,
+    reason = "settings are a few periods, and positive"
+)]
+fn periods(time_s: f64, period_s: f64) -> usize {
+    (time_s / period_s).ceil() as usize
 }

@@ -32,6 +32,8 @@ pub(crate) struct TickContext<'a> {
     pub(crate) period_s: f64,
     /// The newest state; `None` if it is too old for feedback.
     pub(crate) state: Option<&'a PairState>,
+    /// The age of the newest state beyond one period, in whole periods.
+    pub(crate) stale_periods: usize,
     /// The last command, arm by arm.
     pub(crate) last: &'a [ArmCommand],
 }
@@ -89,7 +91,7 @@ impl Playback {
         };
         let commands = (0..from.len()).map(command).collect();
         self.references.push_front(to.into_iter().map(|sample| sample.angles).collect());
-        self.references.truncate(self.n_references(context));
+        self.references.truncate(Self::n_references(context));
         Ok(commands)
     }
 
@@ -116,7 +118,7 @@ impl Playback {
         }
     }
 
-    /// The tracking errors, radians: the references one lag ago minus the measured angles.
+    /// The tracking errors, radians: the references one lag before the newest state minus the measured angles.
     fn errors(&self, context: &TickContext<'_>, state: &PairState) -> Result<Vec<Joints>, Breach> {
         let allowed = context.settings.tracking_rad;
         let mut errors = Vec::with_capacity(state.arms.len());
@@ -134,26 +136,36 @@ impl Playback {
         Ok(errors)
     }
 
-    /// The reference of `arm` one lag ago, radians.
+    /// The reference of `arm` one lag before the newest state, radians. Arms that report less often than once per
+    /// period are compared with the reference of the time of their report.
     fn reference_ago(&self, context: &TickContext<'_>, arm: usize) -> Joints {
         let periods = context.settings.lag_s / context.period_s;
-        let newer = self.n_references(context) - 2;
+        let newer = lag_periods(context);
         let share = periods - newer as f64;
+        let newer = newer + context.stale_periods;
         let reference = |ago: usize| &self.references[ago.min(self.references.len() - 1)][arm];
         let (newer, older) = (reference(newer), reference(newer + 1));
         Joints::from_fn(newer.len(), |joint| newer[joint] + share * (older[joint] - newer[joint]))
     }
 
-    /// The number of references to keep, which covers one lag.
-    fn n_references(&self, context: &TickContext<'_>) -> usize {
-        #[expect(
-            clippy::cast_possible_truncation,
-            clippy::cast_sign_loss,
-            reason = "a lag is a few periods"
-        )]
-        let periods = (context.settings.lag_s / context.period_s) as usize;
-        periods + 2
+    /// The number of references to keep, which covers one lag and the age of states that are good for feedback.
+    fn n_references(context: &TickContext<'_>) -> usize {
+        lag_periods(context) + whole_periods(context.settings.state_hold_s, context) + 3
     }
+}
+
+/// Returns the whole periods of a lag.
+fn lag_periods(context: &TickContext<'_>) -> usize {
+    whole_periods(context.settings.lag_s, context)
+}
+
+#[expect(
+    clippy::cast_possible_truncation,
+    clippy::cast_sign_loss,
+    reason = "settings are a few periods, and positive"
+)]
+fn whole_periods(time_s: f64, context: &TickContext<'_>) -> usize {
+    (time_s / context.period_s) as usize
 }
 
 /// Returns the velocities nearest to `wanted` that keep the speed and acceleration limits of joints and tool.

@@ -6,7 +6,10 @@ use serde_json::Value;
 use tandem_kinematics::Joints;
 
 use crate::driver::DriverError;
+use crate::kinova_ros::efforts::MeanEfforts;
 use crate::kinova_ros::fingers::{FingerSettings, Fingers};
+use crate::kinova_ros::following::{Following, LEAST_SHARE, Shortfall};
+use crate::kinova_ros::preparation::Preparation;
 use crate::kinova_ros::protocol;
 
 /// The largest number of velocities in flight to ROS: those of one second. An executor stops much earlier.
@@ -20,6 +23,13 @@ pub(crate) struct ArmNode {
     pub(crate) fingers: Fingers,
     /// Numbers and velocities of the commands that were sent and are not published yet; oldest first.
     pub(crate) in_flight: VecDeque<(u64, Joints)>,
+    /// Whether the arm follows the velocities.
+    pub(crate) following: Following,
+    /// The preparation of a finger goal.
+    pub(crate) preparation: Option<Preparation>,
+    /// The arm's own command, radians.
+    pub(crate) commanded: Option<Joints>,
+    pub(crate) mean_efforts: MeanEfforts,
 }
 
 /// Whether a node lets its arm move.
@@ -40,6 +50,7 @@ pub(crate) enum Control {
 pub(crate) enum Service {
     Stop,
     Start,
+    Home,
 }
 
 impl ArmNode {
@@ -50,6 +61,10 @@ impl ArmNode {
             control: Control::Unknown,
             fingers: Fingers::new(fingers),
             in_flight: VecDeque::new(),
+            following: Following::new(super::PERIOD_S),
+            preparation: None,
+            commanded: None,
+            mean_efforts: MeanEfforts::default(),
         }
     }
 
@@ -73,6 +88,26 @@ impl ArmNode {
         matches!(self.control, Control::Stopped | Control::Pending { service: Service::Stop, .. })
     }
 
+    /// Handles a state of the arm. Returns an error if the arm follows too few of its velocities.
+    pub(crate) fn handle_state(
+        &mut self,
+        stamp_s: f64,
+        angles: &Joints,
+    ) -> Result<(), DriverError> {
+        let followed = self.following.push_state(stamp_s, angles);
+        followed.map_err(|Shortfall { joint, share, span_s }| {
+            let what = format!(
+                "{}: joint {} turned by {:.0} % of what the velocities of {span_s:.2} s asked for, at least {:.0} %: \
+                 the node takes too few velocities (raise its feedback_publish_rate) or the joint is blocked",
+                self.node,
+                joint + 1,
+                100.0 * share,
+                100.0 * LEAST_SHARE
+            );
+            DriverError::Refused { what }
+        })
+    }
+
     /// Handles the response of a service.
     pub(crate) fn handle_response(
         &mut self,
@@ -90,7 +125,7 @@ impl ArmNode {
         }
         self.control = match service {
             Service::Stop => Control::Stopped,
-            Service::Start => Control::Started,
+            Service::Start | Service::Home => Control::Started,
         };
         Ok(())
     }
@@ -129,6 +164,7 @@ impl Service {
         match self {
             Self::Stop => "in/stop",
             Self::Start => "in/start",
+            Self::Home => "in/home_arm",
         }
     }
 }

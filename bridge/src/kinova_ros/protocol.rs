@@ -14,6 +14,8 @@ pub(crate) const N_JOINTS: usize = 4;
 const N_FINGERS: usize = 2;
 /// The largest number of characters of a message in an error.
 const MAX_SHOWN_CHARS: usize = 200;
+/// The level of errors in `rosgraph_msgs/Log`.
+const LOG_ERROR: u64 = 8;
 /// kinova-ros reports a finger's turns as an angle of its joint: degrees per turn.
 const FINGER_DEGREES_PER_TURN: f64 = 80.0 / 6800.0;
 
@@ -126,7 +128,41 @@ pub(crate) fn finger_goal(topic: &str, id: &str, turns: f64) -> String {
     json!({"op": "publish", "topic": topic, "msg": msg}).to_string()
 }
 
-/// Returns the identifier of the goal that has ended from a message of `kinova_msgs/SetFingersPositionActionResult`.
+/// Publishes a goal for all joints, given in radians, as `kinova_msgs/ArmJointAnglesActionGoal`, in degrees.
+pub(crate) fn angles_goal(topic: &str, id: &str, angles: &Joints) -> String {
+    let now = json!({"secs": 0, "nsecs": 0});
+    let [joint1, joint2, joint3, joint4] = std::array::from_fn(|joint| angles[joint].to_degrees());
+    let msg = json!({
+        "header": {"seq": 0, "stamp": now, "frame_id": ""},
+        "goal_id": {"stamp": now, "id": id},
+        "goal": {"angles": {
+            "joint1": joint1, "joint2": joint2, "joint3": joint3, "joint4": joint4,
+            "joint5": 0.0, "joint6": 0.0, "joint7": 0.0,
+        }},
+    });
+    json!({"op": "publish", "topic": topic, "msg": msg}).to_string()
+}
+
+/// Returns the angles of a message of `kinova_msgs/JointAngles`, in radians.
+pub(crate) fn joint_degrees(msg: &Value) -> Option<Joints> {
+    let degrees = |joint: usize| msg.get(format!("joint{joint}")).and_then(Value::as_f64);
+    let degrees = [degrees(1)?, degrees(2)?, degrees(3)?, degrees(4)?];
+    Some(Joints::new(&degrees.map(f64::to_radians)))
+}
+
+/// Returns whether a goal has succeeded, by the result of its action.
+pub(crate) fn has_succeeded(msg: &Value) -> bool {
+    msg.pointer("/status/status").and_then(Value::as_u64) == Some(3)
+}
+
+/// Returns the node and the text of an error or a fatal error in a message of `rosgraph_msgs/Log`.
+pub(crate) fn logged_error(msg: &Value) -> Option<(&str, String)> {
+    let level = msg.get("level").and_then(Value::as_u64)?;
+    let word = |key: &str| msg.get(key).and_then(Value::as_str);
+    (level >= LOG_ERROR).then_some((word("name")?, shortened(word("msg")?, MAX_SHOWN_CHARS)))
+}
+
+/// Returns the identifier of the goal that has ended from the result of an action.
 pub(crate) fn ended_goal(msg: &Value) -> Option<&str> {
     msg.pointer("/status/goal_id/id")?.as_str()
 }

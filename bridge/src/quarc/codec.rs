@@ -11,7 +11,7 @@
 //! | 1 | number of the command | 1, 2, 3, … |
 //! | 2 | time of the command: its number times the period | s |
 //! | 3 | order: 0 stop, 1 move | – |
-//! | 4–7 | velocities of joints 1–4 of arm 0 | rad/s |
+//! | 4–7 | velocities of joints 1–4 of arm 0, at most [`MAX_RATE_RADPS`] | rad/s |
 //! | 8 | opening of gripper 0: 0 closed, 1 open | – |
 //! | 9–12 | velocities of joints 1–4 of arm 1 | rad/s |
 //! | 13 | opening of gripper 1 | – |
@@ -23,7 +23,7 @@
 //! | index | number | unit |
 //! |---|---|---|
 //! | 0 | [`STATE_MARK`]: identifies a state of this layout | – |
-//! | 1 | sequence: increases by 1 with every vector sent | – |
+//! | 1 | sequence: the number of vectors that this connection has accepted, with this one | – |
 //! | 2 | time stamp of the measurement by the arms' clock | s |
 //! | 3 | number of the newest command that has taken effect, 0 before the first | – |
 //! | 4–7 | angles of joints 1–4 of arm 0, Kinova's convention | rad |
@@ -55,6 +55,9 @@ pub const COMMAND_MARK: f64 = 20_001.0;
 /// First number of a state.
 pub const STATE_MARK: f64 = 20_002.0;
 
+/// The highest velocity that a command may contain, radians per second. A Mico's fastest joint turns at 0.84.
+pub const MAX_RATE_RADPS: f64 = 1.0;
+
 const HEAD_LEN: usize = 4;
 const ARM_COMMAND_LEN: usize = N_JOINTS + 1;
 const ARM_STATE_LEN: usize = 3 * N_JOINTS + 5;
@@ -64,7 +67,7 @@ const LARGEST_COUNT: f64 = 9_007_199_254_740_992.0;
 /// Encodes `command`; a period takes `period_s` seconds.
 ///
 /// # Errors
-/// Returns an error if the command is not for two arms with four joints, or a number is not finite or out of its range.
+/// Returns an error if the command is not for two arms with four joints, or a number is out of its range.
 pub fn encode_command(command: &Command, period_s: f64) -> Result<[f64; COMMAND_LEN], DriverError> {
     let mut vector = [0.0; COMMAND_LEN];
     let number = command.number as f64;
@@ -75,12 +78,7 @@ pub fn encode_command(command: &Command, period_s: f64) -> Result<[f64; COMMAND_
     let (blocks, _) = vector[HEAD_LEN..].as_chunks_mut::<ARM_COMMAND_LEN>();
     for (block, arm) in blocks.iter_mut().zip(arms) {
         same(arm.velocities.len(), N_JOINTS)?;
-        if !(arm.velocities.iter().all(|rate| rate.is_finite())
-            && (0.0..=1.0).contains(&arm.opening))
-        {
-            let what = "a velocity is not finite, or an opening not in 0 to 1".into();
-            return Err(DriverError::Refused { what });
-        }
+        check_ranges(arm).map_err(|what| DriverError::Refused { what })?;
         for (number, rate) in block.iter_mut().zip(arm.velocities.iter()) {
             *number = *rate;
         }
@@ -101,11 +99,23 @@ pub fn decode_command(vector: &[f64; COMMAND_LEN]) -> Result<Command, DriverErro
         return Ok(Command { number, order: Order::Stop });
     }
     let (blocks, _) = vector[HEAD_LEN..].as_chunks::<ARM_COMMAND_LEN>();
-    let arm = |block: &[f64; ARM_COMMAND_LEN]| ArmCommand {
-        velocities: Joints::new(&block[..N_JOINTS]),
-        opening: block[N_JOINTS],
+    let arm = |block: &[f64; ARM_COMMAND_LEN]| {
+        let velocities = Joints::new(&block[..N_JOINTS]);
+        let arm = ArmCommand { velocities, opening: block[N_JOINTS] };
+        check_ranges(&arm).map(|()| arm).map_err(malformed)
     };
-    Ok(Command { number, order: Order::Move(blocks.iter().map(arm).collect()) })
+    Ok(Command { number, order: Order::Move(blocks.iter().map(arm).collect::<Result<_, _>>()?) })
+}
+
+fn check_ranges(arm: &ArmCommand) -> Result<(), String> {
+    // False for what is not a number.
+    let is_allowed = |rate: &f64| rate.abs() <= MAX_RATE_RADPS;
+    if arm.velocities.iter().all(is_allowed) && (0.0..=1.0).contains(&arm.opening) {
+        return Ok(());
+    }
+    Err(format!(
+        "a velocity is not in -{MAX_RATE_RADPS} to {MAX_RATE_RADPS} rad/s, or an opening not in 0 to 1"
+    ))
 }
 
 /// Encodes `state`, as the arms' side does.
@@ -253,7 +263,7 @@ pub(crate) mod tests {
             velocities: Joints::from_fn(4, |joint| arm + 0.25 * joint as f64),
             opening: 0.5,
         };
-        Command { number: 41, order: Order::Move(vec![arm(-1.0), arm(0.5)]) }
+        Command { number: 41, order: Order::Move(vec![arm(-1.0), arm(0.25)]) }
     }
 
     #[test]
@@ -274,7 +284,7 @@ pub(crate) mod tests {
     fn numbers_are_at_the_documented_indices() {
         let vector = encode_command(&command(), 0.5).unwrap();
         let expected =
-            [20_001.0, 41.0, 20.5, 1.0, -1.0, -0.75, -0.5, -0.25, 0.5, 0.5, 0.75, 1.0, 1.25, 0.5];
+            [20_001.0, 41.0, 20.5, 1.0, -1.0, -0.75, -0.5, -0.25, 0.5, 0.25, 0.5, 0.75, 1.0, 0.5];
         assert_eq!(vector, expected);
         let vector = encode_state(&state(3)).unwrap();
         assert_eq!(vector[..8], [20_002.0, 3.0, 0.03, 7.0, 0.0, 1.0, 2.0, 3.0]);
@@ -296,6 +306,7 @@ pub(crate) mod tests {
         let refused = |result| matches!(result, Err(DriverError::Refused { .. }));
         assert!(refused(spoil(|arms| arms[1].velocities[2] = f64::NAN)));
         assert!(refused(spoil(|arms| arms[0].velocities[0] = f64::INFINITY)));
+        assert!(refused(spoil(|arms| arms[0].velocities = Joints::from_fn(4, |_| -1.01))));
         assert!(refused(spoil(|arms| arms[0].opening = 1.01)));
         assert!(refused(spoil(|arms| arms[0].opening = f64::NAN)));
         let shape = |result| matches!(result, Err(DriverError::Shape { .. }));

@@ -4,10 +4,12 @@ use std::cell::Cell;
 use std::io::{Read as _, Write as _};
 use std::net::TcpListener;
 use std::rc::Rc;
+use std::sync::atomic::{AtomicU32, Ordering};
 use std::thread;
 use std::time::Duration;
 
-use tandem_bridge::kinova_ros::{KinovaRosConfig, KinovaRosDriver, settings};
+use tandem_bridge::kinova_ros::{Efforts, KinovaRosConfig, KinovaRosDriver, home, settings};
+use tandem_bridge::service::Clock;
 use tandem_bridge::{
     ArmCommand, Command, Driver as _, DriverError, Order, PairState, Phase, ResetError, StartError,
     StopCause,
@@ -36,7 +38,11 @@ struct Test {
 
 fn connected(side: &Side) -> KinovaRosDriver {
     let driver = KinovaRosDriver::connect(KinovaRosConfig::at(format!("ws://{}", side.address)));
-    let mut driver = driver.unwrap();
+    quiet(driver.unwrap(), side)
+}
+
+/// Takes over the time of the other side.
+fn quiet(mut driver: KinovaRosDriver, side: &Side) -> KinovaRosDriver {
     side.take_over();
     // Messages in flight still belong to the time before.
     while driver.listen(Duration::from_millis(20)).unwrap().sequence
@@ -142,6 +148,48 @@ fn arms_that_tell_at_50_hz_are_moved_as_well() {
     assert_ended(&test.side.ros().pair, &test.motion);
 }
 
+/// Lets arms whose nodes make slow calls move at `speed` for 1.5 s. Returns what is left of the test, and the
+/// velocities that the first arm received and the states that its node published, per second.
+fn shuttle(call_us: u64, status_us: u64, speed: f64) -> (Test, [f64; 2]) {
+    let mut test = Test::new(STEADY);
+    test.let_go();
+    test.side.slow_calls(call_us, status_us);
+    for _ in 0..20 {
+        test.rig.tick();
+    }
+    let counts = |test: &Test| {
+        let ros = test.side.ros();
+        [ros.nodes[0].n_taken, ros.nodes[0].n_states].map(|n| n as f64)
+    };
+    let before = counts(&test);
+    test.rig.executor.start(OWNER, test.motion.clone(), speed, test.rig.now_s).unwrap();
+    let mut n = 0.0;
+    while n < 150.0 && test.rig.tick() != Phase::Stopped {
+        n += 1.0;
+    }
+    let after = counts(&test);
+    (test, [0, 1].map(|idx| 100.0 * (after[idx] - before[idx]) / n))
+}
+
+#[test]
+fn a_node_that_only_reads_its_arm_is_told_and_one_at_10_hz_plays_a_motion() {
+    // As long as nine calls of 2 ms and one velocity take, the next states are due.
+    let (test, [velocities, states]) = shuttle(2000, 10_000, 0.3);
+    println!("status every 0.01 s: {velocities:.0} velocities/s, {states:.0} states/s");
+    assert!((40.0..60.0).contains(&velocities), "{velocities}");
+    let error = failure(&test.rig.executor.stopped_by().unwrap().cause).to_string();
+    assert!(error.contains("the node takes too few velocities"), "{error}");
+
+    // The more velocities are lost, the farther fast joints lag behind.
+    for (call_us, speed) in [(1000, 0.5), (2000, 0.5), (3000, 0.3)] {
+        let (mut test, [velocities, states]) = shuttle(call_us, 100_000, speed);
+        println!("calls of {call_us} us, status every 0.1 s: {velocities:.0} velocities/s");
+        assert!(velocities >= 78.0 && (9.0..11.0).contains(&states), "{velocities}, {states}");
+        test.rig.play();
+        assert_ended(&test.side.ros().pair, &test.motion);
+    }
+}
+
 #[test]
 fn grippers_move_while_the_arms_are_stationary() {
     let mut test = Test::new([0.8, 0.8, 0.4, 0.4]);
@@ -161,6 +209,77 @@ fn grippers_move_while_the_arms_are_stationary() {
         assert!(node.goals.len() <= 3, "{:?}", node.goals);
         assert_eq!(node.n_while_busy, 0);
     }
+}
+
+#[test]
+fn a_finger_goal_that_could_move_the_arm_is_not_sent() {
+    let ends = |fault: Fault, expected: &str| {
+        let mut test = Test::new([0.8, 0.8, 0.4, 0.4]);
+        test.let_go();
+        test.side.begin(fault);
+        test.rig.start(&test.motion);
+        let error = failure(&test.rig.until_stopped()).to_string();
+        assert!(error.contains(expected), "{error}");
+        assert!(test.side.ros().nodes[1].goals.is_empty());
+    };
+    ends(Fault::Elsewhere, "the arm's own command for joint 1 is 3.0 degrees from its angle");
+    ends(Fault::Aborts, "joints_action/joint_angles/goal failed");
+}
+
+#[test]
+fn a_push_stops_arms_whose_efforts_include_their_weight() {
+    let motion = sweep(STEADY);
+    let side = Side::new(&pair_at(&motion));
+    let config = KinovaRosConfig {
+        efforts: Efforts::Changes { mean_s: 0.4 },
+        ..KinovaRosConfig::at(format!("ws://{}", side.address))
+    };
+    let driver = quiet(KinovaRosDriver::connect(config).unwrap(), &side);
+    let mut test = Test::with(side, driver, motion);
+    test.let_go();
+    test.set_off();
+    test.side.begin(Fault::Presses);
+    let cause = test.rig.until_stopped();
+    assert!(matches!(&cause, StopCause::Torque(excess) if excess.got > 5.0), "{cause}");
+    assert_eq!(test.rig.executor.stopped_by().unwrap().joint, Some(1));
+}
+
+#[test]
+fn arms_are_homed_alone_and_stopped_afterwards() {
+    let side = Side::new(&pair_at(&sweep(STEADY)));
+    let config = KinovaRosConfig::at(side.address.to_string());
+    let clock = Waits::default();
+    home(&config, 1, &clock, &|| false).unwrap();
+    let calls = |side: &Side, arm: usize| side.ros().nodes[arm].calls.clone();
+    let expected = [("in/home_arm", 1), ("in/start", 1), ("in/stop", 1)];
+    assert_eq!(calls(&side, 1), expected.map(|(name, n)| (name.to_owned(), n)).into());
+    assert!(calls(&side, 0).is_empty());
+    assert!(side.ros().nodes[1].stopped);
+
+    // Somebody moves the arms, the service fails, the operator interrupts.
+    let fails = |fault: Option<Fault>, is_interrupted: bool, expected: &str| {
+        side.ros().fault = fault;
+        let n_homed = calls(&side, 0).get("in/home_arm").copied().unwrap_or(0);
+        let error = home(&config, 0, &clock, &|| is_interrupted).unwrap_err().to_string();
+        assert!(error.contains(expected), "{error}");
+        calls(&side, 0).get("in/home_arm").copied().unwrap_or(0) - n_homed
+    };
+    assert_eq!(fails(Some(Fault::Stranger), false, "another node publishes"), 0);
+    assert_eq!(fails(None, true, "interrupted"), 0);
+    assert!(calls(&side, 0).is_empty(), "whoever moves the arms goes on");
+    assert_eq!(fails(Some(Fault::Refuses("home_arm")), false, "in/home_arm"), 1);
+}
+
+/// A clock that advances by 2 ms when it is read, so that a test needs no real one.
+#[derive(Default)]
+struct Waits(AtomicU32);
+
+impl Clock for Waits {
+    fn now_s(&self) -> f64 {
+        0.002 * f64::from(self.0.fetch_add(1, Ordering::Relaxed))
+    }
+
+    fn sleep_until(&self, _at_s: f64) {}
 }
 
 #[test]
@@ -198,6 +317,7 @@ fn a_malformed_state_ends_the_connection_and_stops_the_arms() {
     ends(Fault::Clock, "s apart");
     ends(Fault::Complains, "rosbridge: no such type");
     ends(Fault::Stranger, "another node publishes /left/m1n4s200_driver/in/joint_velocity");
+    ends(Fault::Logs, "/right/m1n4s200_driver logs an error: Could not get the angles");
     ends(Fault::Close, "not connected");
 }
 

@@ -1,7 +1,12 @@
 //! A stand-in for rosbridge and two nodes of kinova-ros: follows velocities only while they are published, moves
 //! fingers by goals, and serves `in/stop` and `in/start`.
+//!
+//! The nodes are ideal unless a test makes their calls slow ([`Side::slow_calls`]): they handle every message at once
+//! and report the arms' state every period. With slow calls a node works as Kinova's does: one thread handles
+//! velocities and the status timer in turn, each call of the arm's interface takes a while, and the newest velocity
+//! replaces one that waits.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, VecDeque};
 use std::net::{SocketAddr, TcpListener, TcpStream};
 use std::sync::{Arc, Mutex, MutexGuard};
 use std::thread;
@@ -17,6 +22,13 @@ use crate::drivers::rig::SharedPair;
 pub(crate) const NODES: [&str; 2] = ["/left/m1n4s200_driver", "/right/m1n4s200_driver"];
 /// The duration of `in/start` in periods, in which a node does nothing else.
 const START_PERIODS: u32 = 5;
+/// The same of `in/home_arm`.
+const HOMING_PERIODS: u32 = 20;
+/// Calls of the arm's interface in `statusTimer`: angles, command, rates, torques, twice the tool, its command, its
+/// force, and the fingers twice.
+const STATUS_CALLS: u64 = 9;
+/// A period, microseconds.
+const PERIOD_US: u64 = 10_000;
 /// The initial time of ROS' clock, seconds.
 const EPOCH_S: u64 = 1_700_000_000;
 
@@ -49,6 +61,14 @@ pub(crate) enum Fault {
     Drops,
     /// Another node moves the first arm.
     Stranger,
+    /// The second arm's own command is not where the arm is.
+    Elsewhere,
+    /// Goals of joint angles are aborted.
+    Aborts,
+    /// Something presses on joint 2 of the first arm with 6 N m.
+    Presses,
+    /// The second node logs an error.
+    Logs,
 }
 
 /// The arms' side.
@@ -65,9 +85,24 @@ pub(crate) struct Node {
     /// The velocities of this period, radians per second.
     rates: Option<Joints>,
     opening: f64,
+    /// Whether the arm's control type is angular. `in/start` restarts the interface.
+    is_angular: bool,
     goal: Option<(String, u32)>,
-    /// The pending call of `in/start` and the periods until its response.
+    homing: bool,
+    /// The pending call of `in/start` or `in/home_arm` and the periods until its response.
     starting: Option<(Value, u32)>,
+    /// The velocity that waits for the node's thread.
+    waiting: Option<Joints>,
+    /// The velocities in the arm's own queue.
+    points: VecDeque<Joints>,
+    /// True if the thread handled a status last.
+    status_last: bool,
+    /// When the node's thread is free again, and when its status timer expires; microseconds.
+    free_us: u64,
+    status_us: u64,
+    /// Velocities that the arm received from the node, and states that the node published.
+    pub(crate) n_taken: usize,
+    pub(crate) n_states: usize,
     /// Messages with velocities.
     pub(crate) n_velocities: usize,
     /// Velocities that arrived while the fingers moved.
@@ -84,6 +119,9 @@ pub(crate) struct Ros {
     pub(crate) fault: Option<Fault>,
     /// Periods between two states.
     pub(crate) every: u64,
+    /// The time of a call of the arm's interface and the interval of the status timer, microseconds; `None` for ideal
+    /// nodes.
+    slow_us: Option<[u64; 2]>,
     /// True if the test advances time instead of a thread.
     by_hand: bool,
     socket: Option<WebSocket<TcpStream>>,
@@ -102,6 +140,7 @@ impl Side {
             pair: Arc::clone(pair),
             fault: None,
             every: 1,
+            slow_us: None,
             by_hand: false,
             socket: None,
             subscribed: Vec::new(),
@@ -123,7 +162,8 @@ impl Side {
             let mut ros = self.ros();
             (ros.socket, ros.by_hand) = (Some(socket), false);
             drop(ros);
-            while !self.ros().by_hand {
+            let serves = |ros: MutexGuard<'_, Ros>| !ros.by_hand && ros.socket.is_some();
+            while serves(self.ros()) {
                 self.pass();
                 thread::sleep(Duration::from_millis(1));
             }
@@ -136,6 +176,17 @@ impl Side {
 
     pub(crate) fn take_over(&self) {
         self.ros().by_hand = true;
+    }
+
+    /// Gives the nodes one thread, calls that take `call_us`, and status timers of `status_us`, microseconds. The timers
+    /// of the two nodes expire at different times.
+    pub(crate) fn slow_calls(&self, call_us: u64, status_us: u64) {
+        let mut ros = self.ros();
+        ros.slow_us = Some([call_us, status_us]);
+        let now_us = ros.n_passes * PERIOD_US;
+        for (node, phase) in ros.nodes.iter_mut().zip([0, 3]) {
+            (node.free_us, node.status_us) = (now_us, now_us + phase * status_us / 8);
+        }
     }
 
     pub(crate) fn begin(&self, fault: Fault) {
@@ -160,16 +211,52 @@ impl Ros {
         let commands = self.nodes.each_mut().map(|node| node.command());
         let stopped = self.nodes.iter().all(|node| node.stopped);
         let order = if stopped { Order::Stop } else { Order::Move(commands.to_vec()) };
+        if let Some(slow_us) = self.slow_us {
+            self.spin(slow_us);
+        }
         self.n_passes += 1;
         let command = Command { number: self.n_passes, order };
         let state = self.pair.lock().unwrap().exchange(&command).unwrap();
         self.end_goals(&state);
         self.finish_starts();
         let starting = self.nodes.iter().any(|node| node.starting.is_some());
-        let due = self.n_passes.is_multiple_of(self.every) && !starting;
+        let due = self.n_passes.is_multiple_of(self.every) && !starting && self.slow_us.is_none();
         let published = due && self.socket.is_some() && self.publish(&state);
         self.before = Some(state);
         published
+    }
+
+    /// The nodes' threads work until the end of the period. A status is that of the last period's end.
+    fn spin(&mut self, [call_us, status_us]: [u64; 2]) {
+        let end_us = (self.n_passes + 1) * PERIOD_US;
+        for arm in 0..NODES.len() {
+            loop {
+                let node = &mut self.nodes[arm];
+                let now_us = node.free_us.max(self.n_passes * PERIOD_US);
+                if now_us >= end_us || node.starting.is_some() {
+                    break;
+                }
+                // Both wait in one queue: whichever was handled last has to wait.
+                if node.status_us <= now_us && !(node.status_last && node.waiting.is_some()) {
+                    node.free_us = now_us + STATUS_CALLS * call_us;
+                    node.status_us = (node.status_us + status_us).max(now_us);
+                    node.status_last = true;
+                    node.n_states += 1;
+                    if let Some(state) = self.before.clone() {
+                        self.tell_arm(arm, &state);
+                    }
+                } else if let Some(rates) = node.waiting.take() {
+                    node.free_us = now_us + call_us;
+                    node.status_last = false;
+                    node.n_taken += 1;
+                    node.points.push_back(rates);
+                } else if node.status_us < end_us && node.status_us > now_us {
+                    node.free_us = node.status_us;
+                } else {
+                    break;
+                }
+            }
+        }
     }
 
     /// Reads all messages that have arrived.
@@ -193,6 +280,10 @@ impl Ros {
 
     fn obey(&mut self, message: &Value) {
         let topic = message["topic"].as_str().or(message["service"].as_str()).unwrap();
+        if topic == "/rosout" {
+            self.subscribed.push(topic.to_owned());
+            return;
+        }
         let arm = NODES.iter().position(|node| topic.starts_with(node)).unwrap();
         let name = topic[NODES[arm].len() + 1..].to_owned();
         let node = &mut self.nodes[arm];
@@ -213,7 +304,12 @@ impl Ros {
                     return;
                 }
                 node.n_while_busy += usize::from(node.goal.is_some());
-                node.rates = Some(Joints::from_fn(4, |joint| rate(joint).unwrap().to_radians()));
+                let rates = Joints::from_fn(4, |joint| rate(joint).unwrap().to_radians());
+                if self.slow_us.is_some() {
+                    node.waiting = Some(rates);
+                } else {
+                    node.rates = Some(rates);
+                }
                 if self.fault != Some(Fault::Lags) && self.subscribed.iter().any(|t| t == topic) {
                     self.say(message);
                 }
@@ -224,6 +320,21 @@ impl Ros {
                 node.opening = 1.0 - fingers["finger1"].as_f64().unwrap() / 6400.0;
                 let id = message["msg"]["goal_id"]["id"].as_str().unwrap();
                 assert!(node.goal.replace((id.to_owned(), 0)).is_none(), "a goal was replaced");
+                assert!(node.is_angular, "a finger goal with a Cartesian point");
+            }
+            ("publish", "joints_action/joint_angles/goal") => {
+                let angle = |joint: usize| {
+                    message["msg"]["goal"]["angles"][format!("joint{}", joint + 1)].as_f64()
+                };
+                let goal = Joints::from_fn(4, |joint| angle(joint).unwrap().to_radians());
+                let at = self.before.as_ref().unwrap().arms[arm].angles;
+                assert!(goal.largest_difference(&at) < 1e-6, "the goal moves the arm");
+                node.is_angular = true;
+                let id = &message["msg"]["goal_id"]["id"];
+                let status = if self.fault == Some(Fault::Aborts) { 4 } else { 3 };
+                let msg = json!({"status": {"goal_id": {"id": id}, "status": status, "text": ""}});
+                let topic = format!("{}/joints_action/joint_angles/result", NODES[arm]);
+                self.say(&json!({"op": "publish", "topic": topic, "msg": msg}));
             }
             ("call_service", _) => self.serve(arm, &name, &message["id"]),
             _ => panic!("{message}"),
@@ -233,8 +344,12 @@ impl Ros {
     fn serve(&mut self, arm: usize, name: &str, id: &Value) {
         let node = &mut self.nodes[arm];
         *node.calls.entry(name.to_owned()).or_default() += 1;
-        let refused =
-            self.fault == Some(Fault::Refuses(if name == "in/stop" { "stop" } else { "start" }));
+        let refused = self.fault
+            == Some(match name {
+                "in/stop" => Fault::Refuses("stop"),
+                "in/start" => Fault::Refuses("start"),
+                _ => Fault::Refuses("home_arm"),
+            });
         if self.fault == Some(Fault::NoAnswers) {
             return;
         }
@@ -244,7 +359,13 @@ impl Ros {
                 node.starting = Some((id.clone(), START_PERIODS));
                 return;
             }
-            "in/stop" | "in/start" => {}
+            "in/home_arm" if !refused => {
+                // Kinova's node reports success in this case as well.
+                assert!(!node.stopped, "a stopped arm does not home");
+                (node.starting, node.homing) = (Some((id.clone(), HOMING_PERIODS)), true);
+                return;
+            }
+            "in/stop" | "in/start" | "in/home_arm" => {}
             _ => panic!("no service {name}"),
         }
         self.answer(arm, name, id, !refused);
@@ -265,8 +386,12 @@ impl Ros {
             if n > 1 {
                 self.nodes[arm].starting = Some((id, n - 1));
             } else {
-                self.nodes[arm].stopped = false;
-                self.answer(arm, "in/start", &id, true);
+                let node = &mut self.nodes[arm];
+                node.stopped = false;
+                node.is_angular = false;
+                let name =
+                    if std::mem::take(&mut node.homing) { "in/home_arm" } else { "in/start" };
+                self.answer(arm, name, &id, true);
             }
         }
     }
@@ -301,6 +426,11 @@ impl Ros {
                 let msg: serde_json::Map<String, Value> = joints.collect();
                 let topic = format!("{}/in/joint_velocity", NODES[0]);
                 self.say(&json!({"op": "publish", "topic": topic, "msg": msg}));
+            }
+            Some(Fault::Logs) => {
+                let msg = json!({"level": 8, "name": NODES[1], "msg": "Could not get the angles"});
+                self.say(&json!({"op": "publish", "topic": "/rosout", "msg": msg}));
+                // Warnings, and errors of other nodes, do not stop the arms.
             }
             Some(Fault::Again) => {
                 let before = self.before.clone().unwrap();
@@ -339,12 +469,21 @@ impl Ros {
         let finger = ((1.0 - reading.opening) * 6400.0 * 80.0 / 6800.0).to_radians();
         let positions = reading.angles.iter().copied().chain([finger, finger, 0.0, 0.0]);
         let rates = reading.velocities.iter().copied().chain([0.0; 4]);
+        let effort_nm = if arm == 0 && self.fault == Some(Fault::Presses) { 15.0 } else { 9.0 };
+        let off = if arm == 1 && self.fault == Some(Fault::Elsewhere) { 3.0 } else { 0.0 };
+        let commanded = (1..=7).map(|joint| {
+            let angle = reading.angles.get(joint - 1).map_or(0.0, |angle| angle.to_degrees());
+            (format!("joint{joint}"), json!(angle + off))
+        });
+        let commanded: serde_json::Map<String, Value> = commanded.collect();
+        let command_topic = format!("{}/out/joint_command", NODES[arm]);
+        self.say(&json!({"op": "publish", "topic": command_topic, "msg": commanded}));
         let mut msg = json!({
             "header": {"seq": 0, "stamp": stamp, "frame_id": ""},
             "name": names.map(|name| format!("{prefix}{name}")).collect::<Vec<_>>(),
             "position": positions.collect::<Vec<_>>(),
             "velocity": rates.collect::<Vec<_>>(),
-            "effort": [0.0, 9.0, 4.0, 0.0, 0.0, 0.0, 0.0, 0.0],
+            "effort": [0.0, effort_nm, 4.0, 0.0, 0.0, 0.0, 0.0, 0.0],
         });
         if matches!(self.fault, Some(Fault::Null | Fault::Nan)) {
             msg["position"][1] = Value::Null;
@@ -369,7 +508,11 @@ impl Ros {
 impl Node {
     /// The command of the arm for the coming period: no motion without a velocity.
     fn command(&mut self) -> ArmCommand {
-        let rates = self.rates.take().filter(|_| !self.stopped);
+        if self.stopped {
+            self.waiting = None;
+            self.points.clear();
+        }
+        let rates = self.rates.take().or(self.points.pop_front()).filter(|_| !self.stopped);
         ArmCommand {
             velocities: rates.unwrap_or_else(|| Joints::from_fn(4, |_| 0.0)),
             opening: self.opening.clamp(0.0, 1.0),

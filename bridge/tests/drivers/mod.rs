@@ -3,5 +3,7 @@
 mod kinova;
 mod kinova_side;
 mod quarc;
+mod quarc_c;
 mod quarc_side;
-mod rig;
+mod quarc_vectors;
+pub(crate) mod rig;

@@ -7,12 +7,11 @@ use std::sync::{Arc, Mutex};
 use std::thread;
 use std::time::Duration;
 
-use tandem_bridge::quarc::codec::{
-    COMMAND_LEN, decode_command, encode_state, from_bytes, to_bytes,
-};
+use tandem_bridge::quarc::arm_side::ArmSide;
+use tandem_bridge::quarc::codec::{COMMAND_LEN, STATE_LEN, decode_command, from_bytes, to_bytes};
 use tandem_bridge::{Command, Driver as _, Order, PairState};
 
-use crate::drivers::rig::SharedPair;
+use crate::drivers::rig::{PERIOD_S, SharedPair};
 
 /// A fault of the states that are sent.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -61,7 +60,7 @@ impl Side {
             pair: Arc::clone(&side.pair),
             fault: Arc::clone(&side.fault),
             commands: Arc::clone(&side.commands),
-            sequence: 1000,
+            side: ArmSide::new(PERIOD_S),
         };
         let n_ended = Arc::clone(&side.n_ended);
         thread::spawn(move || serve(&listener, model, &n_ended));
@@ -84,7 +83,9 @@ impl Side {
 /// Serves one peer after the other. Sampling continues without a peer.
 fn serve(listener: &TcpListener, mut model: Model, n_ended: &AtomicUsize) {
     for stream in listener.incoming() {
+        model.side.set_connected(true);
         model.talk(stream.unwrap());
+        model.side.set_connected(false);
         for _ in 0..20 {
             model.pair.lock().unwrap().skip_period();
         }
@@ -96,31 +97,32 @@ struct Model {
     pair: SharedPair,
     fault: Arc<Mutex<Option<Fault>>>,
     commands: Arc<Mutex<Vec<Command>>>,
-    sequence: u64,
+    side: ArmSide,
 }
 
 impl Model {
     fn talk(&mut self, mut stream: TcpStream) {
         stream.set_nodelay(true).unwrap();
-        let (mut number, mut obeys) = (0, false);
+        let mut number = 0;
+        self.side.sample(true);
         let state = self.pair.lock().unwrap().skip_period();
         if !self.send(&mut stream, state) {
             return;
         }
         let mut bytes = [0; 8 * COMMAND_LEN];
         while stream.read_exact(&mut bytes).is_ok() {
-            let Ok(command) = decode_command(&from_bytes(&bytes)) else { return };
+            let vector = from_bytes(&bytes);
+            self.side.receive(&vector).unwrap();
+            let command = decode_command(&vector).unwrap();
             self.commands.lock().unwrap().push(command.clone());
-            obeys |= command.order == Order::Stop;
             if command.number == number && command.order == Order::Stop {
                 // Arrives next to the commands, between two samples.
                 self.pair.lock().unwrap().stop().unwrap();
                 continue;
             }
             number = command.number;
-            let mut pair = self.pair.lock().unwrap();
-            let state = if obeys { pair.exchange(&command).unwrap() } else { pair.skip_period() };
-            drop(pair);
+            let command = self.side.sample(true);
+            let state = self.pair.lock().unwrap().exchange(&command).unwrap();
             if !self.send(&mut stream, state) {
                 return;
             }
@@ -130,7 +132,7 @@ impl Model {
     /// Sends a state with the present fault. Returns true to continue.
     fn send(&mut self, stream: &mut TcpStream, state: PairState) -> bool {
         let fault = *self.fault.lock().unwrap();
-        let mut vector = encode_state(&self.counted(state)).unwrap();
+        let mut vector = self.encode(state);
         match fault {
             Some(Fault::Number(idx, value)) => vector[idx] = value,
             Some(Fault::Jump) => vector[1] += 3.0,
@@ -154,15 +156,16 @@ impl Model {
             }
             Some(Fault::Twice) => {
                 let later = self.pair.lock().unwrap().skip_period();
-                bytes.extend(to_bytes(&encode_state(&self.counted(later)).unwrap()));
+                bytes.extend(to_bytes(&self.encode(later)));
             }
             _ => {}
         }
         stream.write_all(&bytes).is_ok()
     }
 
-    fn counted(&mut self, state: PairState) -> PairState {
-        self.sequence += 1;
-        PairState { sequence: self.sequence, ..state }
+    fn encode(&mut self, state: PairState) -> [f64; STATE_LEN] {
+        let vector = self.side.encode(state).unwrap();
+        self.side.sent();
+        vector
     }
 }

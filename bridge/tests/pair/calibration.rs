@@ -13,7 +13,7 @@ use tandem_trials::{SimulatedConfig, SimulatedPair};
 
 /// A clock that advances when its user sleeps.
 #[derive(Default)]
-struct SleepClock(AtomicU64);
+pub(crate) struct SleepClock(AtomicU64);
 
 impl Clock for SleepClock {
     fn now_s(&self) -> f64 {

@@ -8,4 +8,5 @@ mod observer;
 mod ownership;
 mod rig;
 mod tasks;
+mod to_start;
 mod undisturbed;
