@@ -76,7 +76,7 @@ fn main() -> Result<(), AnyError> {
         return Err("usage: pushes POLICY.safetensors...".into());
     }
     for file in files {
-        let pushes = measure(&Policy::load(Path::new(&file))?)?;
+        let pushes = measure(&Policy::load(Path::new(&file))?, N_EPISODES)?;
         println!(
             "{file}: success {:.3}, hand above the cube {:.3} of moving steps, tipping {:.3} of episodes, gliding \
              {:.3} of the path ({:.1} cm per episode)",
@@ -90,13 +90,13 @@ fn main() -> Result<(), AnyError> {
     Ok(())
 }
 
-/// Plays the policy in its world and measures how it moves its cubes.
-pub(crate) fn measure(policy: &Policy) -> Result<Pushes, AnyError> {
+/// Plays `n_episodes` of the policy in its world and measures how it moves its cubes.
+pub(crate) fn measure(policy: &Policy, n_episodes: u64) -> Result<Pushes, AnyError> {
     let actor = policy.actor()?;
     let layout = policy.layout.as_built_in().ok_or("the policy is not for a built-in task")?;
     let (world, n_threads) = (WorldConfig::default(), std::thread::available_parallelism());
     let n_threads = n_threads.unwrap_or(NonZeroUsize::MIN);
-    let episodes = evaluate(&actor, layout, &world, N_EPISODES, SEED, n_threads)?;
+    let episodes = evaluate(&actor, layout, &world, n_episodes, SEED, n_threads)?;
     let outcomes: Vec<EpisodeOutcome> = episodes.iter().map(EpisodeOutcome::of).collect();
     let env = Env::new(layout, &world)?;
     let parts = episodes.par_iter().map(|episode| measure_episode(env.clone(), episode));

@@ -19,7 +19,7 @@ mod trial;
 pub(crate) use bench::{BenchArgs, BenchName, ScaleArgs};
 pub(crate) use bridge::{
     ArmsArgs, ArmsServeArgs, BridgeArgs, BridgeCommand, BridgeServeArgs, CalibrateArgs, CellArgs,
-    ConnectArgs, DriverName, FaultName, InjectArgs, MoveArgs, OperatorArgs,
+    ConnectArgs, DriverName, FaultName, HomeArgs, InjectArgs, MoveArgs, OperatorArgs, ToStartArgs,
 };
 pub(crate) use monitor::{HealthArgs, StatusArgs};
 pub(crate) use policy::{ExportArgs, ImportArgs, PolicyArgs, PolicyCommand, ShowArgs};

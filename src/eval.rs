@@ -11,7 +11,7 @@ use tandem_core::{AdviceTerms, Episode, Exploration, Layout, TaskSpec, WorldSett
 use tandem_picture::FilmEpisode;
 use tandem_worker::record::{RecordError, log_name, metadata_of, record_episode};
 
-use crate::cli::{EvalArgs, OutcomeName, check_layout, check_task};
+use crate::cli::{EvalArgs, OutcomeName, check_layout, check_task, chosen_task};
 use crate::environment_server::names_server;
 use crate::evaluation::{EvaluatedPolicy, EvaluationResult, Part, measure, measure_served};
 use crate::exit::{Exit, Failed, OrExit as _};
@@ -183,7 +183,12 @@ fn subject(args: &EvalArgs) -> Result<EvaluatedPolicy, Failed> {
     let subject = match (&args.policy, &args.composed_teachers) {
         (Some(path), _) => EvaluatedPolicy::new(policy_file::load(path)?, path)?,
         (None, Some(path)) => {
-            EvaluatedPolicy::composed(policy_file::load(path)?, args.arms.unwrap_or(2), path)?
+            let task = chosen_task(args.task, args.world)?;
+            EvaluatedPolicy::composed(
+                policy_file::load(path)?,
+                (task, args.arms.unwrap_or(2)),
+                path,
+            )?
         }
         (None, None) => return Err(no_policy()),
     };

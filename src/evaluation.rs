@@ -8,7 +8,7 @@ use std::time::Duration;
 
 use serde_json::{Value, json};
 use tandem_core::text::counted;
-use tandem_core::{Episode, EpisodeOutcome, EvaluationSummary, Layout, TaskSpec, Wilson};
+use tandem_core::{Episode, EpisodeOutcome, EvaluationSummary, Layout, Task, TaskSpec, Wilson};
 use tandem_policy::{BlindActor, Policy};
 use tandem_sim::WorldConfig;
 use tandem_telemetry::ContactMetrics;
@@ -26,8 +26,8 @@ pub(crate) enum EvaluatedPolicy {
     Policy(Policy),
     /// A policy whose arms do not see each other.
     Blind(Policy),
-    /// A one-arm policy that controls each of so many arms.
-    Composed(Policy, usize),
+    /// A one-arm policy that controls each arm of a layout.
+    Composed(Policy, Layout),
 }
 
 impl EvaluatedPolicy {
@@ -36,8 +36,13 @@ impl EvaluatedPolicy {
         simulated(policy, path).map(Self::Policy)
     }
 
-    /// Composes `n_arms` copies of the one-arm policy that was loaded from `path`.
-    pub(crate) fn composed(policy: Policy, n_arms: usize, path: &Path) -> Result<Self, Failed> {
+    /// Composes copies of the one-arm policy that was loaded from `path`, one for each of `n_arms` arms: for `task`, if
+    /// the policy performs the part of one of its arms, otherwise for the policy's own task.
+    pub(crate) fn composed(
+        policy: Policy,
+        (task, n_arms): (Option<Task>, usize),
+        path: &Path,
+    ) -> Result<Self, Failed> {
         let policy = simulated(policy, path)?;
         if policy.layout.n_arms() != 1 {
             return Err(Failed::usage(format!(
@@ -49,15 +54,15 @@ impl EvaluatedPolicy {
         if !(1..=2).contains(&n_arms) {
             return Err(Failed::usage(format!("--arms {n_arms}: expected 1 or 2")));
         }
-        Ok(Self::Composed(policy, n_arms))
+        let own = built_in(&policy).task;
+        let task = task.filter(|task| task.of_one_arm() == own).unwrap_or(own);
+        Ok(Self::Composed(policy, Layout::new(task, n_arms)))
     }
 
     pub(crate) fn layout(&self) -> Layout {
-        let layout = self.policy().layout.as_built_in();
-        let layout = layout.expect("the constructors refuse policies of other tasks");
         match self {
-            Self::Policy(_) | Self::Blind(_) => layout,
-            Self::Composed(_, n_arms) => Layout::new(layout.task, *n_arms),
+            Self::Policy(policy) | Self::Blind(policy) => built_in(policy),
+            Self::Composed(_, layout) => *layout,
         }
     }
 
@@ -100,6 +105,11 @@ impl EvaluatedPolicy {
         };
         episodes.or_exit(Exit::Bug, String::new)
     }
+}
+
+/// Returns the layout of a policy that [`simulated`] has not refused.
+fn built_in(policy: &Policy) -> Layout {
+    policy.layout.as_built_in().expect("the constructors refuse policies of other tasks")
 }
 
 /// Refuses a policy of a task that the simulator does not have.
@@ -173,6 +183,7 @@ impl EvaluationResult {
             "table_contact_rate": contacts.table_contact_rate,
             "collision_rate": self.summary.collision_rate,
             "collision_rate_before_success": self.summary.collision_rate_before_success,
+            "lost_goal_rate": self.summary.lost_goal_rate,
             "mean_return": self.summary.mean_return,
             "steps_per_s": self.steps_per_s,
             "policy_digest": self.policy_digest,
@@ -217,6 +228,8 @@ impl EvaluationResult {
             summary.collision_rate_before_success
         ));
         lines.extend(summary.avoidance_rate.map(|rate| share("avoidance", rate)));
+        let lost = share("lost goal", summary.lost_goal_rate);
+        lines.push(format!("{lost}: achieved, not at the end"));
         lines.push(format!("mean return   {:.1}", summary.mean_return));
         lines
     }

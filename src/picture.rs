@@ -16,7 +16,7 @@ pub(crate) fn picture(args: &PictureArgs) -> Result<(), Failed> {
     }
     let subject = match (&args.policy, &args.composed_teachers) {
         (Some(path), _) => EvaluatedPolicy::new(policy_file::load(path)?, path)?,
-        (None, Some(path)) => EvaluatedPolicy::composed(policy_file::load(path)?, 2, path)?,
+        (None, Some(path)) => EvaluatedPolicy::composed(policy_file::load(path)?, (None, 2), path)?,
         (None, None) => return Err(Failed::usage("give --policy or --composed-teachers")),
     };
     let episode = subject.play(1, args.seed)?.remove(0);

@@ -1,13 +1,15 @@
 //! `tandem report`: compares runs and trials on the terminal, as an HTML page, as JSON and as CSV.
 
+use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
 use serde_json::json;
 use tandem_report::{
-    Baseline, Comparison, FilmStrip, PlottedTrials, ReportFiles, ReportInputs, TestEvaluation,
+    Baseline, Comparison, FilmStrip, PlottedTrials, ReportFiles, ReportInputs, Run, TestEvaluation,
     Trials, comparison, export, report_html, trials,
 };
 
+use tandem_core::Task;
 use tandem_core::evaluation::TEST_SEED;
 use tandem_core::text::counted;
 use tandem_telemetry::ContactMetrics;
@@ -24,7 +26,10 @@ pub(crate) fn report(args: &ReportArgs) -> Result<(), Failed> {
     let inputs = ReportInputs::load(&args.paths).or_exit(Exit::Data, String::new)?;
     let trials = Trials::of(inputs.trials);
     warn(inputs.warnings.iter().chain(&trials.warnings));
-    let mut comparison = Comparison::of(inputs.runs, baselines(args)?);
+    let mut comparison = {
+        let baselines = baselines(args, &inputs.runs)?;
+        Comparison::of(inputs.runs, baselines)
+    };
     comparison.films = films(args)?;
     let page = args.out.clone().unwrap_or_else(|| default_page(&args.paths));
     let plotted = if args.all_trials { PlottedTrials::All } else { PlottedTrials::Failed };
@@ -77,19 +82,33 @@ fn warn<'a>(warnings: impl Iterator<Item = &'a String>) {
 }
 
 /// Returns the results of policies that no run of the report has trained.
-fn baselines(args: &ReportArgs) -> Result<Vec<Baseline>, Failed> {
+fn baselines(args: &ReportArgs, runs: &[Run]) -> Result<Vec<Baseline>, Failed> {
     let mut baselines = Vec::new();
     for path in &args.evals {
         let test = TestEvaluation::load(path).or_exit(Exit::Data, String::new)?;
         baselines.push(Baseline { label: stem(path), test });
     }
     for path in &args.composed_teachers {
-        let composed = EvaluatedPolicy::composed(policy_file::load(path)?, 2, path)?;
-        let result = measure(&composed, TEST_EPISODES, TEST_SEED)?;
-        let label = format!("composed {}", stem(path));
-        baselines.push(Baseline { label, test: test_evaluation(&composed, &result) });
+        let teacher = policy_file::load(path)?;
+        for task in advised_tasks(runs, teacher.layout.name()) {
+            let composed = EvaluatedPolicy::composed(teacher.clone(), (task, 2), path)?;
+            let result = measure(&composed, TEST_EPISODES, TEST_SEED)?;
+            let label = format!("composed {}", stem(path));
+            baselines.push(Baseline { label, test: test_evaluation(&composed, &result) });
+        }
     }
     Ok(baselines)
+}
+
+/// Returns the built-in two-arm tasks of `runs` in which a teacher of `one_arm_task` advises; `None`, for that task itself,
+/// if there are none.
+fn advised_tasks(runs: &[Run], one_arm_task: &str) -> Vec<Option<Task>> {
+    let tasks: BTreeSet<Task> = runs
+        .iter()
+        .filter_map(|run| run.task()?.parse().ok())
+        .filter(|task: &Task| task.of_one_arm().name() == one_arm_task)
+        .collect();
+    if tasks.is_empty() { vec![None] } else { tasks.into_iter().map(Some).collect() }
 }
 
 fn test_evaluation(subject: &EvaluatedPolicy, result: &EvaluationResult) -> TestEvaluation {

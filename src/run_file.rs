@@ -4,7 +4,7 @@ use std::path::Path;
 
 use anyhow::{Context as _, anyhow, bail};
 use tandem_core::settings::OutOfRange;
-use tandem_core::{Task, TaskDescription, TaskSpec, World};
+use tandem_core::{Task, TaskDescription, TaskSpec};
 use tandem_rl::RunConfig;
 use tandem_rl::config::{ConfigError, INIT_TEACHER, Recipe, former_keys};
 use tandem_system::atomic_file;
@@ -225,8 +225,7 @@ fn task_for(changes: &Table) -> anyhow::Result<TaskSpec> {
             })?;
         return TaskSpec::new(description).map_err(|error| anyhow!("description.{error}"));
     }
-    let default = Task::Push.in_world(World::DEFAULT).name();
-    let task = changes.get("task").and_then(Value::as_str).unwrap_or(default);
+    let task = changes.get("task").and_then(Value::as_str).unwrap_or(Task::Push.name());
     let known_task = task.parse::<Task>().map_err(|_unknown| {
         let names = Task::ALL.map(Task::name).join(", ");
         anyhow!("task is {:?}: expected {names}, or a [description] of the task", shortened(task))
@@ -234,7 +233,11 @@ fn task_for(changes: &Table) -> anyhow::Result<TaskSpec> {
     let arms = changes.get("arms").and_then(Value::as_integer).unwrap_or(2);
     let n_arms = usize::try_from(arms).ok().filter(|n_arms| (1..=2).contains(n_arms));
     let n_arms = n_arms.ok_or_else(|| anyhow!("arms is {arms}: expected 1 or 2"))?;
-    Ok(TaskSpec::built_in(known_task?, n_arms))
+    let known_task = known_task?;
+    if n_arms < known_task.min_arms() {
+        bail!("arms is {arms}: expected {}, which {task} takes", known_task.min_arms());
+    }
+    Ok(TaskSpec::built_in(known_task, n_arms))
 }
 
 /// A message on one line.

@@ -3,7 +3,7 @@
 use anyhow::anyhow;
 use serde::Serialize;
 use tandem_core::rng::{Stream, episode_rng};
-use tandem_core::{Contacts, Episode, Layout, Task, World, WorldSettings};
+use tandem_core::{Contacts, Episode, Layout, Task, WorldSettings};
 use tandem_sim::description::WorldDescription;
 use tandem_sim::{Env, SimError, WorldConfig};
 
@@ -71,7 +71,8 @@ fn policy(args: &SceneArgs) -> Result<Option<EvaluatedPolicy>, Failed> {
         (Some(path), _) => Some(EvaluatedPolicy::Policy(policy_file::load(path)?)),
         (None, Some(path)) => {
             let teacher = policy_file::load(path)?;
-            Some(EvaluatedPolicy::composed(teacher, args.arms.unwrap_or(2), path)?)
+            let task = chosen_task(args.task, args.world)?;
+            Some(EvaluatedPolicy::composed(teacher, (task, args.arms.unwrap_or(2)), path)?)
         }
         (None, None) => None,
     })
@@ -83,8 +84,7 @@ fn layout(args: &SceneArgs, policy: Option<&EvaluatedPolicy>) -> Result<Layout, 
         check_layout(layout, (args.task, args.world), args.arms)?;
         return Ok(layout);
     }
-    let default = Task::Push.in_world(World::DEFAULT);
-    let task = chosen_task(args.task, args.world).unwrap_or(default);
+    let task = chosen_task(args.task, args.world)?.unwrap_or(Task::Push);
     Ok(Layout::new(task, args.arms.unwrap_or(2)))
 }
 

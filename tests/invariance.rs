@@ -8,21 +8,21 @@ use serde_json::Value;
 
 /// Strategies, each with a budget that runs out in the middle of the run.
 const STRATEGIES: [(&str, u64); 7] = [
-    ("ea", 1_600),
+    ("ea", 1_300),
     EAMC,
-    ("mc-q:0.1", 600),
-    ("mc-act:0.1", 1_600),
+    ("mc-q:0.1", 480),
+    ("mc-act:0.1", 1_300),
     JSRL,
-    ("rlif:0.1", 600),
-    ("ts2c:0.1", 600),
+    ("rlif:0.1", 480),
+    ("ts2c:0.1", 480),
 ];
-const EAMC: (&str, u64) = ("eamc:0.1", 900);
-const JSRL: (&str, u64) = ("jsrl:20", 700);
+const EAMC: (&str, u64) = ("eamc:0.1", 810);
+const JSRL: (&str, u64) = ("jsrl:20", 440);
 const N_WORKERS: [usize; 4] = [1, 2, 5, 16];
-/// Ten rounds of sixteen slots, so that sixteen workers have something to do; the policy is evaluated after each.
+/// Eight rounds of sixteen slots, so that sixteen workers have something to do; the policy is evaluated after each.
 const SMALL: [&str; 24] = [
     "--max-env-steps",
-    "8000",
+    "6400",
     "--set",
     "world.substeps=10",
     "--set",

@@ -12,9 +12,11 @@ use serde_json::Value;
 use tempfile::TempDir;
 
 /// A small advised run of 12 rounds whose budget runs out on the way.
-const SMALL: [&str; 20] = [
+const SMALL: [&str; 22] = [
     "--max-env-steps",
-    "9600",
+    "4800",
+    "--set",
+    "rounds.rollouts=1",
     "--set",
     "rounds.updates_per_env_step=0.15",
     "--set",
@@ -24,11 +26,11 @@ const SMALL: [&str; 20] = [
     "--set",
     "evaluation.test_episodes=8",
     "--set",
-    "evaluation.every_env_steps=4000",
+    "evaluation.every_env_steps=2000",
     "--set",
     "checkpoint.every_rounds=3",
     "--set",
-    "advice.budget=1500",
+    "advice.budget=750",
     "--set",
     "world.substeps=10",
     "--set",
@@ -214,7 +216,7 @@ fn killed_processes_are_restarted_and_the_run_ends_like_an_undisturbed_one() {
         );
     }
     let summary = String::from_utf8_lossy(&ended.stdout);
-    assert!(summary.contains("\"env_steps\":9600,"), "{summary}");
+    assert!(summary.contains("\"env_steps\":4800,"), "{summary}");
 }
 
 #[test]

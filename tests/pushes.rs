@@ -13,17 +13,19 @@ mod pushes;
 /// which glide on.
 const MAX_GLIDING: [(World, f64); 2] = [(World::Classic, 1.0), (World::Shared, 0.1)];
 
+const N_EPISODES: u64 = 100;
+
 fn check(name: &str) {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("policies").join(name);
     let policy = Policy::load(&path).expect("ships");
     let world = policy.layout.as_built_in().expect("a built-in task").task.world();
-    let pushes = pushes::measure(&policy).expect("plays");
+    let pushes = pushes::measure(&policy, N_EPISODES).expect("plays");
     let (above, gliding) = (pushes.share_above(), pushes.share_gliding());
     assert!(pushes.success >= 0.95, "{name}: success {}", pushes.success);
-    assert!(pushes.n_moving > 1000, "{name}: the cubes hardly move");
+    assert!(pushes.n_moving > 400, "{name}: the cubes hardly move");
     assert!(above < 0.05, "{name}: the hand is above the cube in {above:.2} of the moving steps");
     let n_tipping = pushes.n_tipping;
-    assert!(n_tipping < 24, "{name}: a cube tips in {n_tipping} of 240 episodes");
+    assert!(n_tipping < 10, "{name}: a cube tips in {n_tipping} of {N_EPISODES} episodes");
     let max = MAX_GLIDING.iter().find(|(of, _)| *of == world).expect("every world").1;
     assert!(gliding <= max, "{name}: cubes glide on {gliding:.2} of their path");
 }

@@ -13,9 +13,11 @@ use tandem_policy::Policy;
 use tempfile::TempDir;
 
 /// A small advised run of 12 rounds.
-const SMALL: [&str; 20] = [
+const SMALL: [&str; 22] = [
     "--max-env-steps",
-    "9600",
+    "4800",
+    "--set",
+    "rounds.rollouts=1",
     "--set",
     "rounds.updates_per_env_step=0.15",
     "--set",
@@ -25,11 +27,11 @@ const SMALL: [&str; 20] = [
     "--set",
     "evaluation.test_episodes=8",
     "--set",
-    "evaluation.every_env_steps=4000",
+    "evaluation.every_env_steps=2000",
     "--set",
     "checkpoint.every_rounds=2",
     "--set",
-    "advice.budget=1500",
+    "advice.budget=750",
     "--set",
     "world.substeps=10",
     "--set",
@@ -192,7 +194,7 @@ fn a_resume_with_other_settings_is_refused_and_names_them() {
         ("ddpg.n_hidden=64", "tandem: ddpg.n_hidden is 64 here and 32 in the run's checkpoint \""),
         ("ddpg.discount=0.5", "tandem: ddpg.discount is 0.5 here and 0.95 in the run's checkpoint"),
         ("seed=77", "tandem: seed is 77 here and 1 in"),
-        ("advice.budget=99", "tandem: advice.budget is 99 here and 1500 in"),
+        ("advice.budget=99", "tandem: advice.budget is 99 here and 750 in"),
     ];
     for (setting, what) in refusals {
         check_refused(&resume(&out, &["--set", setting]), 64, what);
@@ -220,12 +222,12 @@ fn a_resume_with_other_settings_is_refused_and_names_them() {
 #[test]
 fn a_finished_run_can_be_extended() {
     let (_keep, out) = finished();
-    let longer = resume(&out, &["--max-env-steps", "11200"]);
+    let longer = resume(&out, &["--max-env-steps", "5600"]);
     assert_ne!(digest(&longer), UNDISTURBED.1);
     let summary = String::from_utf8_lossy(&longer.stdout);
-    assert!(summary.contains("\"env_steps\":11200,"), "{summary}");
+    assert!(summary.contains("\"env_steps\":5600,"), "{summary}");
     let settings = fs::read_to_string(out.join("run.toml")).expect("readable");
-    assert!(settings.contains("max_env_steps = 11200"), "{settings}");
+    assert!(settings.contains("max_env_steps = 5600"), "{settings}");
     assert_eq!(digest(&resume(&out, &[])), digest(&longer), "the extension is kept");
 }
 

@@ -9,7 +9,7 @@ use std::time::Duration;
 use serde_json::Value;
 use tempfile::TempDir;
 
-/// A small run without advice: 40 rounds of 8 episodes.
+/// A small run without advice: 24 rounds of 8 episodes.
 const RUN: &str = r#"
     name = "supervised"
     task = "push"
@@ -19,7 +19,7 @@ const RUN: &str = r#"
     ddpg = { n_hidden = 32, batch_size = 64 }
     evaluation = { every_env_steps = 3200, episodes = 8, recorded_episodes = 0 }
     checkpoint = { every_rounds = 2 }
-    stop = { max_env_steps = 16000 }
+    stop = { max_env_steps = 9600 }
 "#;
 
 /// A run with a learner and two worker processes, which are killed on drop.

@@ -60,7 +60,9 @@ impl Layout {
     pub const fn observation_bound(self, idx: usize) -> f32 {
         let part_idx = idx % OBSERVATION_PER_ARM;
         let is_per_step = PER_STEP.start <= part_idx && part_idx < PER_STEP.end;
-        let steps = self.task.world().control_step_s() / World::Classic.control_step_s();
+        // An arm's numbers have the bounds of its own task, which a teacher for that task expects.
+        let world = self.task.of_one_arm().world();
+        let steps = world.control_step_s() / World::Classic.control_step_s();
         if is_per_step { steps * TABLE_TOP[part_idx] } else { TABLE_TOP[part_idx] }
     }
 

@@ -4,7 +4,7 @@ use std::borrow::Cow;
 use std::ops::BitOr;
 
 use crate::layout::ArmIndex;
-use crate::task::{Part, TaskSpec};
+use crate::task::TaskSpec;
 
 /// The purpose of an episode.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -151,16 +151,35 @@ impl Episode {
         self.observation(self.n_steps())
     }
 
-    /// Returns `true` if `arm`'s goal is achieved after the last step.
+    /// Returns `true` if `arm` succeeds after each of the last [steps](TaskSpec::success_steps) that count.
     #[must_use]
     pub fn arm_succeeded(&self, arm: ArmIndex) -> bool {
-        self.layout.arm_succeeds(arm, self.last_observation(), &self.goal)
+        self.ends_with(|observation| self.layout.arm_succeeds(arm, observation, &self.goal))
     }
 
-    /// Returns `true` if the goal of every arm is achieved after the last step.
+    /// Returns `true` if every arm succeeds after each of the last [steps](TaskSpec::success_steps) that count.
     #[must_use]
     pub fn succeeded(&self) -> bool {
-        self.layout.is_success(self.last_observation(), &self.goal)
+        self.ends_with(|observation| self.layout.is_success(observation, &self.goal))
+    }
+
+    /// Returns `true` if every arm succeeds after as many consecutive steps as [count](TaskSpec::success_steps), and the
+    /// episode does not end so: an object was lost.
+    #[must_use]
+    pub fn lost_goal(&self) -> bool {
+        let mut n_succeeding = 0;
+        let succeeded_before = (1..=self.n_steps()).any(|step_idx| {
+            let succeeds = self.layout.is_success(self.observation(step_idx), &self.goal);
+            n_succeeding = if succeeds { n_succeeding + 1 } else { 0 };
+            n_succeeding == self.layout.success_steps()
+        });
+        succeeded_before && !self.succeeded()
+    }
+
+    fn ends_with(&self, succeeds: impl Fn(&[f32]) -> bool) -> bool {
+        let n_steps = self.n_steps();
+        let first = n_steps + 1 - self.layout.success_steps();
+        (first..=n_steps).all(|step_idx| succeeds(self.observation(step_idx)))
     }
 
     /// Returns `true` if the norm over all arms' distances together is within the tolerance after the last step.
@@ -182,11 +201,6 @@ impl Episode {
     /// built-in tasks, if an object was displaced.
     #[must_use]
     pub fn moved(&self) -> bool {
-        let layout = &self.layout;
-        let (first, last) = (self.observation(0), self.last_observation());
-        let has_moved =
-            |part: &Part| layout.distance(&part.of(first), &part.of(last)) > layout.tolerance();
-        layout.arms().any(|arm| has_moved(layout.achieved_goal_of(arm)))
-            || has_moved(layout.common_achieved_goal())
+        self.layout.is_displaced(self.observation(0), self.last_observation())
     }
 }

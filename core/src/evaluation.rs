@@ -24,6 +24,8 @@ pub struct EpisodeOutcome {
     pub collided: bool,
     /// There was at least one such contact before all objects were at their goals to stay.
     pub collided_before_success: bool,
+    /// The goal was achieved and lost again; see [`Episode::lost_goal`].
+    pub lost_goal: bool,
     /// At least one object was displaced; see [`Episode::moved`].
     pub moved: bool,
     /// Sum of the joint rewards, undiscounted.
@@ -50,6 +52,7 @@ impl EpisodeOutcome {
             avoidance: episode.avoidance_steps.map(|n_steps| n_steps > 0),
             collided,
             collided_before_success: first_contact.is_some_and(|step_idx| step_idx < settled_after),
+            lost_goal: episode.lost_goal(),
             moved: episode.moved(),
             episode_return: (0..episode.n_steps())
                 .map(|step_idx| episode.joint_reward(step_idx))
@@ -131,6 +134,8 @@ pub struct EvaluationSummary {
     pub collision_rate: f64,
     /// Fraction with such a contact before all objects were at their goals to stay.
     pub collision_rate_before_success: f64,
+    /// Fraction in which the goal was achieved and lost again; see [`Episode::lost_goal`].
+    pub lost_goal_rate: f64,
     /// Fraction in which at least one object was displaced.
     pub moved: f64,
     /// Mean sum of joint rewards.
@@ -176,6 +181,7 @@ impl EvaluationSummary {
             avoidance_rate: known_share(&|outcome| outcome.avoidance),
             collision_rate: share(&|outcome| outcome.collided),
             collision_rate_before_success: share(&|outcome| outcome.collided_before_success),
+            lost_goal_rate: share(&|outcome| outcome.lost_goal),
             moved: share(&|outcome| outcome.moved),
             mean_return: outcomes
                 .iter()
@@ -229,6 +235,28 @@ mod tests {
         check(true, &[Contacts::NONE, Contacts::ARM_ARM], false);
         check(true, &[Contacts::ARM_TABLE | Contacts::ARM_ARM], false);
         check(false, &[], false);
+    }
+
+    #[test]
+    fn a_goal_is_lost_if_it_was_achieved_for_as_many_steps_as_count() {
+        let layout = Layout::new(Task::CarryBar, 2);
+        let lost_goal = |held_after: &[usize]| {
+            let mut episode = Episode::zeros(layout, 0);
+            for step_idx in held_after {
+                let after = step_idx * layout.n_observation();
+                for arm in layout.arms() {
+                    let openings = after + layout.observation_of(arm).start + 9;
+                    episode.observations[openings..openings + 3].fill(0.028);
+                }
+            }
+            EpisodeOutcome::of(&episode).lost_goal
+        };
+        assert!(!lost_goal(&[]), "never achieved");
+        assert!(!lost_goal(&[10, 11, 12, 13]), "four steps");
+        assert!(!lost_goal(&[10, 11, 12, 13, 15, 16]), "never five consecutive steps");
+        assert!(lost_goal(&[10, 11, 12, 13, 14]));
+        assert!(lost_goal(&[10, 11, 12, 13, 14, 47, 48, 49, 50]), "not after all of the last five");
+        assert!(!lost_goal(&[10, 11, 12, 13, 14, 46, 47, 48, 49, 50]), "achieved again");
     }
 
     #[test]

@@ -34,6 +34,9 @@ pub enum Task {
     SharedPush,
     /// [`Task::PickAndPlace`] in the shared world.
     SharedPickAndPlace,
+    /// Grasp a bar at both ends and carry it, level, to its goal above the table, in the slow world. The object of each
+    /// arm is its own handle.
+    CarryBar,
 }
 
 /// The world of a built-in task: speed of the arms, and areas of objects and goals.
@@ -43,11 +46,13 @@ pub enum World {
     Classic,
     /// Hands as slow as the paper's arms, 0.2 m/s, and one area for the objects and goals of both arms.
     Shared,
+    /// The hands and workspaces of the classic world, as slow as those of the shared one, with palms that give way.
+    Slow,
 }
 
 impl World {
     /// All worlds.
-    pub const ALL: [Self; 2] = [Self::Classic, Self::Shared];
+    pub const ALL: [Self; 3] = [Self::Classic, Self::Shared, Self::Slow];
     /// The world of tasks whose world is not named.
     pub const DEFAULT: Self = Self::Classic;
 
@@ -57,6 +62,7 @@ impl World {
         match self {
             Self::Classic => "classic",
             Self::Shared => "shared",
+            Self::Slow => "slow",
         }
     }
 
@@ -65,7 +71,7 @@ impl World {
     pub const fn control_step_s(self) -> f32 {
         match self {
             Self::Classic => 0.04,
-            Self::Shared => 0.25,
+            Self::Shared | Self::Slow => 0.25,
         }
     }
 
@@ -74,7 +80,7 @@ impl World {
     pub const fn substeps_factor(self) -> u32 {
         match self {
             Self::Classic => 1,
-            Self::Shared => 4,
+            Self::Shared | Self::Slow => 4,
         }
     }
 
@@ -83,7 +89,7 @@ impl World {
     #[must_use]
     pub const fn mico_base_distance_m(self) -> f32 {
         match self {
-            Self::Classic => 0.27,
+            Self::Classic | Self::Slow => 0.27,
             Self::Shared => 0.22,
         }
     }
@@ -96,11 +102,18 @@ impl fmt::Display for World {
 }
 
 impl Task {
-    /// All tasks, in the order of the paper.
-    pub const ALL: [Self; 4] =
-        [Self::Push, Self::PickAndPlace, Self::SharedPush, Self::SharedPickAndPlace];
+    /// All tasks: first those of the paper, in its order.
+    pub const ALL: [Self; 5] = [
+        Self::Push,
+        Self::PickAndPlace,
+        Self::SharedPush,
+        Self::SharedPickAndPlace,
+        Self::CarryBar,
+    ];
     /// The tasks in the classic world, in the order of the paper.
     pub const CLASSIC: [Self; 2] = [Self::Push, Self::PickAndPlace];
+    /// The tasks in the shared world, in the order of the paper.
+    pub const SHARED: [Self; 2] = [Self::SharedPush, Self::SharedPickAndPlace];
 
     /// Returns the name used in files and messages.
     #[must_use]
@@ -110,6 +123,7 @@ impl Task {
             Self::PickAndPlace => "pick-and-place",
             Self::SharedPush => "shared-push",
             Self::SharedPickAndPlace => "shared-pick-and-place",
+            Self::CarryBar => "carry-bar",
         }
     }
 
@@ -119,18 +133,46 @@ impl Task {
         match self {
             Self::Push | Self::PickAndPlace => World::Classic,
             Self::SharedPush | Self::SharedPickAndPlace => World::Shared,
+            Self::CarryBar => World::Slow,
         }
     }
 
-    /// Returns the same task in `world`.
+    /// Returns the same task in `world`, or `None` if it does not exist there.
     #[must_use]
-    pub const fn in_world(self, world: World) -> Self {
-        match (self.grasps(), world) {
-            (false, World::Classic) => Self::Push,
-            (true, World::Classic) => Self::PickAndPlace,
-            (false, World::Shared) => Self::SharedPush,
-            (true, World::Shared) => Self::SharedPickAndPlace,
+    pub const fn in_world(self, world: World) -> Option<Self> {
+        match (self, world) {
+            (Self::Push | Self::SharedPush, World::Classic) => Some(Self::Push),
+            (Self::PickAndPlace | Self::SharedPickAndPlace, World::Classic) => {
+                Some(Self::PickAndPlace)
+            }
+            (Self::Push | Self::SharedPush, World::Shared) => Some(Self::SharedPush),
+            (Self::PickAndPlace | Self::SharedPickAndPlace, World::Shared) => {
+                Some(Self::SharedPickAndPlace)
+            }
+            (Self::CarryBar, World::Slow) => Some(Self::CarryBar),
+            (_, World::Slow) | (Self::CarryBar, _) => None,
         }
+    }
+
+    /// Returns the task of each arm taken by itself, which is that of the teacher.
+    #[must_use]
+    pub const fn of_one_arm(self) -> Self {
+        match self {
+            Self::CarryBar => Self::PickAndPlace,
+            _ => self,
+        }
+    }
+
+    /// Returns the smallest number of arms that perform the task.
+    #[must_use]
+    pub const fn min_arms(self) -> usize {
+        if self.shares_object() { 2 } else { 1 }
+    }
+
+    /// Returns true if all arms act on one object; otherwise each has its own.
+    #[must_use]
+    pub const fn shares_object(self) -> bool {
+        matches!(self, Self::CarryBar)
     }
 
     /// Returns true if the arms grasp their objects; otherwise they push them with closed grippers.
@@ -138,7 +180,7 @@ impl Task {
     pub const fn grasps(self) -> bool {
         match self {
             Self::Push | Self::SharedPush => false,
-            Self::PickAndPlace | Self::SharedPickAndPlace => true,
+            Self::PickAndPlace | Self::SharedPickAndPlace | Self::CarryBar => true,
         }
     }
 
@@ -158,7 +200,9 @@ impl fmt::Display for Task {
 
 /// An unknown name of a task.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error("unknown task {0:?}: expected push, pick-and-place, shared-push or shared-pick-and-place")]
+#[error(
+    "unknown task {0:?}: expected push, pick-and-place, shared-push, shared-pick-and-place or carry-bar"
+)]
 pub struct UnknownTask(pub String);
 
 impl FromStr for Task {
@@ -195,10 +239,10 @@ impl Layout {
         Self { task, n_arms }
     }
 
-    /// Returns the layout of one arm with the same task, which is the layout of the teacher.
+    /// Returns the layout of each arm taken by itself, which is the layout of the teacher.
     #[must_use]
     pub const fn single_arm(self) -> Self {
-        Self { task: self.task, n_arms: 1 }
+        Self { task: self.task.of_one_arm(), n_arms: 1 }
     }
 
     /// Returns the length of an observation.

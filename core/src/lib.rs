@@ -12,7 +12,7 @@
 //! from a [`TaskDescription`], which is plain data.
 //!
 //! ```
-//! use tandem_core::task::{ArmDescription, Norm};
+//! use tandem_core::task::{ArmDescription, Manipulation, Norm};
 //! use tandem_core::{ArmIndex, TaskDescription, TaskSpec};
 //!
 //! // A point on a line: its observation is position and speed, its goal a position.
@@ -40,6 +40,7 @@
 //!     observation_bound: vec![2.0, 1.0],
 //!     goal_bound: vec![2.0],
 //!     arms: vec![arm],
+//!     manipulation: Manipulation::default(),
 //! })?;
 //! assert!(task.is_success(&[0.45, 0.0], &[0.5]));
 //! # Ok::<(), tandem_core::task::InvalidTask>(())

@@ -41,7 +41,8 @@ pub fn sparse_reward_within(tolerance: f32, distance: f32) -> f32 {
 /// Returns `true` if every object is within [`GOAL_TOLERANCE_M`] of its goal.
 ///
 /// `observation` has shape `[n_observation]`, `goal` shape `[n_goal]`. An episode is a success if this holds after its
-/// last step. With several arms the criterion is weaker than a joint reward of 0.
+/// last step. With several arms the criterion is weaker than a joint reward of 0. Tasks whose arms share an object ask
+/// for more: see [`TaskSpec::is_success`](crate::TaskSpec::is_success).
 ///
 /// # Panics
 /// If a slice is too short for `layout`.

@@ -94,6 +94,9 @@ pub enum AdviceUnit {
 pub struct WorldSettings {
     /// Probability that a training episode starts with the objects grasped (pick and place), in [0, 1].
     pub grasped_start_prob: f32,
+    /// Environment steps of a run over which this probability falls linearly to 0; 0 keeps it.
+    #[serde(default)]
+    pub grasped_start_env_steps: u64,
     /// Resolution of the physics: 20, or 10 for quick tests. It is the number of physics steps per control step in the
     /// classic world, and a quarter of it in the shared world.
     pub substeps: u32,
@@ -105,7 +108,12 @@ pub struct WorldSettings {
 
 impl Default for WorldSettings {
     fn default() -> Self {
-        Self { grasped_start_prob: 0.0, substeps: 20, randomization: 0.0 }
+        Self {
+            grasped_start_prob: 0.0,
+            grasped_start_env_steps: 0,
+            substeps: 20,
+            randomization: 0.0,
+        }
     }
 }
 
@@ -120,7 +128,8 @@ impl WorldSettings {
     /// # Errors
     /// Names the first setting that is out of its range.
     pub fn check(&self) -> Result<(), OutOfRange> {
-        let Self { grasped_start_prob, substeps, randomization } = *self;
+        let Self { grasped_start_prob, grasped_start_env_steps: _, substeps, randomization } =
+            *self;
         let is_share = (0.0..=1.0).contains(&randomization);
         let key = "world.randomization";
         OutOfRange::unless(is_share, key, randomization, "a number in [0, 1]")?;
@@ -136,6 +145,28 @@ impl WorldSettings {
         match kind {
             EpisodeKind::Training => self,
             EpisodeKind::Evaluation => Self { substeps: self.substeps, ..Self::default() },
+        }
+    }
+
+    /// Returns the settings for an episode of `kind` whose run has had `env_steps` environment steps before it: a
+    /// probability that falls has its value at that time.
+    #[must_use]
+    #[expect(
+        clippy::cast_possible_truncation,
+        clippy::cast_precision_loss,
+        reason = "a share, of numbers of steps far below 2^53"
+    )]
+    pub fn at(self, kind: EpisodeKind, env_steps: u64) -> Self {
+        let settings = self.for_kind(kind);
+        if settings.grasped_start_env_steps == 0 {
+            return settings;
+        }
+        let past = env_steps as f64 / settings.grasped_start_env_steps as f64;
+        let left = (1.0 - past).max(0.0) as f32;
+        Self {
+            grasped_start_prob: left * settings.grasped_start_prob,
+            grasped_start_env_steps: 0,
+            ..settings
         }
     }
 
@@ -165,6 +196,8 @@ impl WorldSettings {
         let randomization = entry(LOGGED_RANDOMIZATION).map_or(Some(0.0), |text| text.parse().ok());
         Ok(Self {
             grasped_start_prob: number(LOGGED_GRASPED_START_PROB)?,
+            // A log has the probability at the time of its episode.
+            grasped_start_env_steps: 0,
             substeps: count(LOGGED_SUBSTEPS)?,
             randomization: randomization.ok_or(LOGGED_RANDOMIZATION)?,
         })
@@ -205,8 +238,23 @@ impl OutOfRange {
 mod tests {
     use super::*;
 
-    const WORLD: WorldSettings =
-        WorldSettings { grasped_start_prob: 0.3, substeps: 10, randomization: 0.25 };
+    const WORLD: WorldSettings = WorldSettings {
+        grasped_start_prob: 0.3,
+        grasped_start_env_steps: 0,
+        substeps: 10,
+        randomization: 0.25,
+    };
+
+    #[test]
+    fn the_share_of_grasped_starts_falls_over_training() {
+        let falling = WorldSettings { grasped_start_env_steps: 1000, ..WORLD };
+        for (env_steps, expected) in [(0, 0.3), (500, 0.15), (1000, 0.0), (5000, 0.0)] {
+            let at = falling.at(EpisodeKind::Training, env_steps);
+            assert_eq!(at, WorldSettings { grasped_start_prob: expected, ..WORLD }, "{env_steps}");
+        }
+        assert_eq!(WORLD.at(EpisodeKind::Training, 9000), WORLD);
+        assert_eq!(falling.at(EpisodeKind::Evaluation, 0), WORLD.for_kind(EpisodeKind::Evaluation));
+    }
 
     #[test]
     fn only_training_episodes_start_specially() {

@@ -10,13 +10,16 @@ use crate::reward::sparse_reward_within;
 
 mod built_in;
 mod check;
+mod derived;
 mod description;
+mod manipulation;
 mod part;
 #[cfg(test)]
 mod tests;
 
 pub use check::InvalidTask;
 pub use description::{ArmDescription, Norm, TaskDescription, TaskDifference};
+pub use manipulation::{ArmManipulation, Condition, Manipulation};
 pub use part::Part;
 
 /// Largest number of arms of a task. An episode has one bit per arm and step.
@@ -245,6 +248,37 @@ impl TaskSpec {
         self.n_arms() == 2 && !self.position_of(ArmIndex(0)).is_empty()
     }
 
+    /// Returns true if all arms act on one object.
+    #[must_use]
+    pub fn shares_object(&self) -> bool {
+        self.0.description.manipulation.shared_object
+    }
+
+    /// Returns the number of control steps at the end of an episode after all of which the goal must be achieved.
+    #[must_use]
+    pub fn success_steps(&self) -> usize {
+        self.0.description.manipulation.success_steps
+    }
+
+    /// Returns the index of the action that opens `arm`'s gripper if it is positive, if the task names one.
+    #[must_use]
+    pub fn gripper_of(&self, arm: ArmIndex) -> Option<usize> {
+        self.manipulation_of(arm).and_then(|manipulation| manipulation.gripper)
+    }
+
+    /// Returns true if `arm` holds its object in `observation`; false if the task does not define that.
+    #[must_use]
+    pub fn arm_holds(&self, arm: ArmIndex, observation: &[f32]) -> bool {
+        self.manipulation_of(arm).is_some_and(|manipulation| {
+            let holding = &manipulation.holding;
+            !holding.is_empty() && holding.iter().all(|one| one.holds(self.norm(), observation))
+        })
+    }
+
+    fn manipulation_of(&self, arm: ArmIndex) -> Option<&ArmManipulation> {
+        self.0.description.manipulation.arms.get(arm.0)
+    }
+
     /// Returns true if steps report contacts between arms and with the table.
     #[must_use]
     pub fn reports_contacts(&self) -> bool {
@@ -303,15 +337,38 @@ impl TaskSpec {
     /// # Panics
     /// If a slice is too short.
     #[must_use]
-    pub fn arm_succeeds(&self, arm: ArmIndex, observation: &[f32], goal: &[f32]) -> bool {
+    pub fn arm_reaches_goal(&self, arm: ArmIndex, observation: &[f32], goal: &[f32]) -> bool {
         self.goal_distance_of(arm, observation, goal) <= self.tolerance()
             && self.common_goal_is_achieved(observation, goal)
     }
 
-    /// Returns true if every arm's part of the goal, and the part common to all arms, are achieved.
+    /// Returns true if `arm` reaches its goal, as by [`arm_reaches_goal`](Self::arm_reaches_goal), and satisfies all
+    /// other [conditions](ArmManipulation) of the task.
+    ///
+    /// # Panics
+    /// If a slice is too short.
+    #[must_use]
+    pub fn arm_succeeds(&self, arm: ArmIndex, observation: &[f32], goal: &[f32]) -> bool {
+        self.arm_reaches_goal(arm, observation, goal) && self.arm_meets_conditions(arm, observation)
+    }
+
+    /// Returns true if `arm` satisfies all conditions of success other than the distance to the goal: it holds its object
+    /// and meets the further conditions, as far as the task has any.
+    ///
+    /// # Panics
+    /// If `observation` is too short.
+    #[must_use]
+    pub fn arm_meets_conditions(&self, arm: ArmIndex, observation: &[f32]) -> bool {
+        let holds = |condition: &Condition| condition.holds(self.norm(), observation);
+        self.manipulation_of(arm).is_none_or(|its| its.all_conditions().all(holds))
+    }
+
+    /// Returns true if every arm's part of the goal, and the part common to all arms, are achieved, and every other
+    /// condition of the task holds.
     ///
     /// `observation` has shape `[n_observation]`, `goal` shape `[n_goal]`. An episode is a success if this holds after
-    /// its last step. With several arms the criterion is weaker than a joint reward of 0.
+    /// each of its last [`success_steps`](Self::success_steps) steps. With several arms the distance of the goal is a
+    /// weaker criterion than a joint reward of 0.
     ///
     /// # Panics
     /// If a slice is too short.
@@ -320,97 +377,20 @@ impl TaskSpec {
         self.arms().all(|arm| self.arm_succeeds(arm, observation, goal))
     }
 
+    /// Returns true if what any arm, or all arms together, achieved differs by more than the tolerance between two
+    /// observations: in the built-in tasks, if an object was displaced.
+    #[must_use]
+    pub fn is_displaced(&self, first: &[f32], later: &[f32]) -> bool {
+        let has_moved =
+            |part: &Part| self.distance(&part.of(first), &part.of(later)) > self.tolerance();
+        self.arms().any(|arm| has_moved(self.achieved_goal_of(arm)))
+            || has_moved(self.common_achieved_goal())
+    }
+
     fn common_goal_is_achieved(&self, observation: &[f32], goal: &[f32]) -> bool {
         let (achieved, desired) = (self.common_achieved_goal(), self.common_goal());
         desired.is_empty()
             || self.distance(&achieved.of(observation), &desired.of(goal)) <= self.tolerance()
-    }
-
-    /// Returns the one-arm task of which each arm's part is an instance: the task of a teacher.
-    ///
-    /// Returns `None` if the arms have common numbers, or an arm achieves its goal outside its own observation.
-    #[must_use]
-    pub fn single_arm(&self) -> Option<Self> {
-        if self.n_arms() == 1 {
-            return Some(self.clone());
-        }
-        if let Some(layout) = self.as_built_in() {
-            return Some(layout.single_arm().into());
-        }
-        let description = self.description();
-        let arm = &description.arms[0];
-        let has_common = !self.common_observation().is_empty() || !self.common_goal().is_empty();
-        let in_own = |idx: &usize| {
-            let achieved = description.achieved_goal[*idx];
-            arm.observation.iter().position(|own| *own == achieved)
-        };
-        let achieved_goal = arm.goal.iter().map(in_own).collect::<Option<Vec<usize>>>()?;
-        if has_common || achieved_goal.is_empty() {
-            return None;
-        }
-        let own = |n: usize| (0..n).collect::<Vec<usize>>();
-        let bounds = |part: &Part, bounds: &[f32]| part.of(bounds).into_owned();
-        let (observation, goal) = (self.observation_of(ArmIndex(0)), self.goal_of(ArmIndex(0)));
-        Self::new(TaskDescription {
-            n_observation: arm.observation.len(),
-            n_goal: arm.goal.len(),
-            n_action: arm.action.len(),
-            arms: vec![ArmDescription {
-                observation: own(arm.observation.len()),
-                goal: own(arm.goal.len()),
-                action: own(arm.action.len()),
-                position: Vec::new(),
-                lateral: Vec::new(),
-            }],
-            achieved_goal,
-            interchangeable_arms: false,
-            origin_distance: 0.0,
-            recombination_gap: 0.0,
-            base: 0.0,
-            observation_bound: bounds(observation, &description.observation_bound),
-            goal_bound: bounds(goal, &description.goal_bound),
-            ..description.clone()
-        })
-        .ok()
-    }
-
-    /// Returns the task of `n_arms` arms whose vectors are the concatenated vectors of this task's arms: the form in
-    /// which a student of any layout asks a teacher for one arm.
-    ///
-    /// # Errors
-    /// When numbers belong to no arm; otherwise names the limit that the result exceeds.
-    pub fn concatenated(&self, n_arms: usize) -> Result<Self, InvalidTask> {
-        if let Some(layout) = self.as_built_in() {
-            return Self::new(Layout::new(layout.task, n_arms).description());
-        }
-        let one = self.description();
-        let has_common = !self.common_observation().is_empty() || !self.common_goal().is_empty();
-        let expected = "arms to which every number of observations and goals belongs";
-        InvalidTask::unless(!has_common, "arms", expected, "numbers that belong to no arm")?;
-        let shifted = |arm_idx: usize, indices: &[usize], n: usize| {
-            indices.iter().map(|idx| arm_idx * n + idx).collect::<Vec<usize>>()
-        };
-        let arms = (0..n_arms).flat_map(|arm_idx| {
-            one.arms.iter().map(move |arm| ArmDescription {
-                observation: shifted(arm_idx, &arm.observation, one.n_observation),
-                goal: shifted(arm_idx, &arm.goal, one.n_goal),
-                action: shifted(arm_idx, &arm.action, one.n_action),
-                position: Vec::new(),
-                lateral: Vec::new(),
-            })
-        });
-        let achieved_goal =
-            (0..n_arms).flat_map(|arm_idx| shifted(arm_idx, &one.achieved_goal, one.n_observation));
-        Self::new(TaskDescription {
-            n_observation: n_arms * one.n_observation,
-            n_goal: n_arms * one.n_goal,
-            n_action: n_arms * one.n_action,
-            arms: arms.collect(),
-            achieved_goal: achieved_goal.collect(),
-            observation_bound: one.observation_bound.repeat(n_arms),
-            goal_bound: one.goal_bound.repeat(n_arms),
-            ..one.clone()
-        })
     }
 
     /// Returns the parts of all arms of an observation, concatenated in arm order, as a teacher for one arm expects them.

@@ -51,7 +51,7 @@ pub struct LearnerConfig {
     /// Text of `run.toml`, which is written once it is certain that the run continues with these settings; `None`
     /// leaves the file unchanged.
     pub run_file: Option<String>,
-    /// Threads of the update, 1 or 2.
+    /// Threads of the update, 1 or more.
     pub n_threads: usize,
     /// Time since the process started.
     pub clock: Clock,

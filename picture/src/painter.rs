@@ -19,6 +19,8 @@ const ARM_COLORS: [Rgb; 3] = [
     DVec3::new(224.0, 128.0, 51.0),
     DVec3::new(60.0, 154.0, 102.0),
 ];
+/// Parts of an object that no arm brings to its goal.
+const PART_COLOR: Rgb = DVec3::new(150.0, 156.0, 163.0);
 const TABLE_COLOR: Rgb = DVec3::new(233.0, 228.0, 219.0);
 const LINK_COLOR: Rgb = DVec3::new(238.0, 240.0, 243.0);
 const HAND_COLOR: Rgb = DVec3::new(74.0, 82.0, 92.0);
@@ -172,7 +174,8 @@ impl Painter {
         };
         let colors = || ARM_COLORS.iter().cycle();
         let arms = scene.arms.iter().zip(colors()).flat_map(|(arm, color)| shapes_of(arm, *color));
-        let objects = scene.objects.iter().zip(colors());
+        let of_objects = colors().take(scene.arms.len()).chain(std::iter::repeat(&PART_COLOR));
+        let objects = scene.objects.iter().zip(of_objects);
         let objects = objects.map(|(object, color)| (Shape::cuboid(object), *color));
         let table = (Shape::cuboid(&scene.table), TABLE_COLOR);
         let bodies: Vec<Body> =

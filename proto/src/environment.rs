@@ -167,6 +167,7 @@ fn decode_start(reset: &pb::EnvironmentReset) -> Result<EpisodeStart, DecodeErro
         kind: if reset.evaluation { EpisodeKind::Evaluation } else { EpisodeKind::Training },
         world: WorldSettings {
             grasped_start_prob: one_within("grasped_start_prob", prob, &(0.0..=1.0))?,
+            grasped_start_env_steps: 0,
             substeps: match reset.substeps {
                 0 => WorldSettings::default().substeps,
                 substeps => count_within("substeps", substeps, &(1..=MAX_SUBSTEPS))?,
@@ -293,7 +294,12 @@ mod tests {
             number,
             seed: 7,
             kind: EpisodeKind::Training,
-            world: WorldSettings { grasped_start_prob: 0.25, substeps: 10, randomization: 0.5 },
+            world: WorldSettings {
+                grasped_start_prob: 0.25,
+                grasped_start_env_steps: 0,
+                substeps: 10,
+                randomization: 0.5,
+            },
         }
     }
 

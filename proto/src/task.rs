@@ -1,7 +1,9 @@
 //! Conversions for `task.proto`: descriptions of tasks.
 
 use tandem_core::TaskSpec;
-use tandem_core::task::{ArmDescription, InvalidTask, Norm, TaskDescription};
+use tandem_core::task::{
+    ArmDescription, ArmManipulation, Condition, InvalidTask, Manipulation, Norm, TaskDescription,
+};
 
 use crate::error::DecodeError;
 use crate::pb;
@@ -33,6 +35,7 @@ pub fn encode_task(task: &TaskSpec) -> pb::TaskDescription {
         origin_distance: task.origin_distance,
         recombination_gap: task.recombination_gap,
         base: task.base,
+        manipulation: encode_manipulation(&task.manipulation),
     }
 }
 
@@ -59,6 +62,7 @@ pub fn decode_task(task: pb::TaskDescription) -> Result<TaskSpec, DecodeError> {
         base: task.base,
         observation_bound: task.observation_bound,
         goal_bound: task.goal_bound,
+        manipulation: task.manipulation.map_or_else(Manipulation::default, decode_manipulation),
     };
     Ok(TaskSpec::new(description)?)
 }
@@ -81,6 +85,52 @@ fn decode_arm(arm: pb::TaskArm) -> ArmDescription {
         action: decode_indices(&arm.action),
         position: decode_indices(&arm.position),
         lateral: decode_indices(&arm.lateral),
+    }
+}
+
+/// A message without it means the default.
+fn encode_manipulation(manipulation: &Manipulation) -> Option<pb::TaskManipulation> {
+    let is_default = *manipulation == Manipulation::default();
+    let encode = |arm: &ArmManipulation| pb::ArmManipulation {
+        gripper: arm.gripper.map(to_u32),
+        holding: arm.holding.iter().map(encode_condition).collect(),
+        conditions: arm.conditions.iter().map(encode_condition).collect(),
+    };
+    (!is_default).then(|| pb::TaskManipulation {
+        shared_object: manipulation.shared_object,
+        one_arm_task: manipulation.one_arm_task.clone(),
+        success_steps: to_u32(manipulation.success_steps),
+        arms: manipulation.arms.iter().map(encode).collect(),
+    })
+}
+
+fn decode_manipulation(manipulation: pb::TaskManipulation) -> Manipulation {
+    let decode = |arm: pb::ArmManipulation| ArmManipulation {
+        gripper: arm.gripper.map(to_usize),
+        holding: arm.holding.into_iter().map(decode_condition).collect(),
+        conditions: arm.conditions.into_iter().map(decode_condition).collect(),
+    };
+    Manipulation {
+        shared_object: manipulation.shared_object,
+        one_arm_task: manipulation.one_arm_task,
+        success_steps: to_usize(manipulation.success_steps).max(1),
+        arms: manipulation.arms.into_iter().map(decode).collect(),
+    }
+}
+
+fn encode_condition(condition: &Condition) -> pb::Condition {
+    pb::Condition {
+        numbers: encode_indices(&condition.numbers),
+        target: condition.target.clone(),
+        tolerance: condition.tolerance,
+    }
+}
+
+fn decode_condition(condition: pb::Condition) -> Condition {
+    Condition {
+        numbers: decode_indices(&condition.numbers),
+        target: condition.target,
+        tolerance: condition.tolerance,
     }
 }
 
@@ -149,13 +199,32 @@ mod tests {
             base: -0.5,
             observation_bound: vec![2.0, 2.5, 3.0, 3.5],
             goal_bound: vec![1.0, 1.5],
+            manipulation: Manipulation::default(),
         })
         .unwrap()
     }
 
+    /// Arms that share an object, each of which holds it while its first number is near 0.5.
+    fn shared() -> TaskSpec {
+        let holds = |arm: usize| ArmManipulation {
+            gripper: Some(1 - arm),
+            holding: vec![Condition { numbers: vec![arm], target: vec![0.5], tolerance: 0.1 }],
+            conditions: vec![Condition { numbers: vec![arm + 2], target: vec![], tolerance: 0.2 }],
+        };
+        let mut description = interleaved().description().clone();
+        description.arms.iter_mut().for_each(|arm| arm.position.clear());
+        description.manipulation = Manipulation {
+            shared_object: true,
+            one_arm_task: "lab/hold".to_owned(),
+            success_steps: 3,
+            arms: vec![holds(0), holds(1)],
+        };
+        TaskSpec::new(description).unwrap()
+    }
+
     #[test]
     fn every_task_round_trips() {
-        for task in [interleaved(), Layout::new(Task::Push, 2).into()] {
+        for task in [interleaved(), shared(), Layout::new(Task::Push, 2).into()] {
             let bytes = encode_task(&task).encode_to_vec();
             let message = pb::TaskDescription::decode(bytes.as_slice()).unwrap();
             assert_eq!(decode_task(message), Ok(task));

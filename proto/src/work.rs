@@ -68,6 +68,7 @@ pub fn encode_run_terms(terms: &RunTerms) -> pb::RunTerms {
         }),
         world: Some(pb::WorldTerms {
             gripped_start_share: terms.world.grasped_start_prob,
+            gripped_start_env_steps: terms.world.grasped_start_env_steps,
             wide_start_share: 0.0,
             substeps: terms.world.substeps,
             randomization: terms.world.randomization,
@@ -174,6 +175,7 @@ fn decode_world(world: pb::WorldTerms) -> Result<WorldSettings, DecodeError> {
             world.gripped_start_share,
             &(0.0..=1.0),
         )?,
+        grasped_start_env_steps: world.gripped_start_env_steps,
         substeps: count_within("substeps", world.substeps, &(1..=MAX_SUBSTEPS))?,
         randomization: one_within("randomization", world.randomization, &(0.0..=1.0))?,
     })
@@ -248,7 +250,12 @@ mod tests {
                 sticky_random_mean_steps: 4.0,
                 joint_random_actions: true,
             },
-            world: WorldSettings { grasped_start_prob: 1.0, substeps: 20, randomization: 0.5 },
+            world: WorldSettings {
+                grasped_start_prob: 1.0,
+                grasped_start_env_steps: 30_000,
+                substeps: 20,
+                randomization: 0.5,
+            },
         }
     }
 

@@ -151,11 +151,12 @@ fn terms() -> impl Strategy<Value = pb::RunTerms> {
         charges_slot_steps: slots,
     });
     let removed = prop_oneof![4 => Just(0.0), 1 => one_number()];
-    let world = (one_number(), removed, any_count(10_000)).prop_map(
-        |(gripped_start_share, wide_start_share, substeps)| pb::WorldTerms {
+    let world = (one_number(), removed, any_count(10_000), any::<u64>()).prop_map(
+        |(gripped_start_share, wide_start_share, substeps, steps)| pb::WorldTerms {
             gripped_start_share,
             wide_start_share,
             substeps,
+            gripped_start_env_steps: steps,
             randomization: 0.0,
         },
     );
@@ -419,7 +420,7 @@ fn mutated<M: Message + 'static>(
 }
 
 proptest! {
-    #![proptest_config(settings(1500))]
+    #![proptest_config(settings(800))]
 
     #[test]
     fn a_query_is_accepted_or_refused(
@@ -487,7 +488,7 @@ proptest! {
 }
 
 proptest! {
-    #![proptest_config(settings(3000))]
+    #![proptest_config(settings(1500))]
 
     #[test]
     fn arbitrary_bytes_are_accepted_or_refused(bytes in vec(any::<u8>(), 0..80), layout in any_layout()) {

@@ -2,21 +2,25 @@
 
 use pyo3::PyErr;
 use pyo3::exceptions::{PyRuntimeError, PyValueError};
-use tandem_core::reward::{achieved_goal, is_success, sparse_reward};
-use tandem_core::{Contacts, Layout, Stream, Task, WorldSettings, episode_rng};
+use tandem_core::reward::{achieved_goal, sparse_reward};
+use tandem_core::{Contacts, Layout, Stream, Task, TaskSpec, WorldSettings, episode_rng};
 use tandem_sim::{Env, SimError, WorldConfig};
 
 /// An environment, its observation and the result of its last step.
 #[derive(Clone)]
 pub(crate) struct Episode {
     pub(crate) env: Env,
+    task: TaskSpec,
     settings: WorldSettings,
     /// Shape `[n_observation]`.
     pub(crate) observation: Vec<f32>,
     /// Shape `[n_goal]`.
     pub(crate) achieved_goal: Vec<f32>,
     pub(crate) reward: f32,
+    /// The task's criterion held after each of the last steps that count.
     pub(crate) is_success: bool,
+    /// Steps at the end of the episode so far after which the criterion held.
+    n_successes: usize,
     pub(crate) contacts: Contacts,
     /// The actions executed so far, shape `[n_steps, n_action]`: with seed and number they determine the episode.
     actions: Vec<f32>,
@@ -34,11 +38,13 @@ impl Episode {
         let env = Env::new(layout, &WorldConfig::from(settings)).map_err(value_error)?;
         Ok(Self {
             env,
+            task: layout.into(),
             settings,
             observation: vec![0.0; layout.n_observation()],
             achieved_goal: vec![0.0; layout.n_goal()],
             reward: 0.0,
             is_success: false,
+            n_successes: 0,
             contacts: Contacts::NONE,
             actions: Vec::new(),
         })
@@ -53,6 +59,7 @@ impl Episode {
         self.env.reset(&mut episode_rng(seed, number, Stream::Reset), self.settings);
         self.contacts = Contacts::NONE;
         self.actions.clear();
+        self.n_successes = 0;
         self.observe();
         self.reward = 0.0;
     }
@@ -103,7 +110,9 @@ impl Episode {
             *to = from;
         }
         self.reward = sparse_reward(&self.achieved_goal, self.env.goal());
-        self.is_success = is_success(layout, &self.observation, self.env.goal());
+        let holds = self.task.is_success(&self.observation, self.env.goal());
+        self.n_successes = if holds { self.n_successes + 1 } else { 0 };
+        self.is_success = self.n_successes >= self.task.success_steps();
     }
 }
 

@@ -1,10 +1,10 @@
 """Environments, policies and services of Tandem: two robot arms, and advice from a policy for one arm.
 
-Importing the package registers eight environments with Gymnasium: `tandem/Push-v0`, `tandem/PickAndPlace-v0`,
+Importing the package registers nine environments with Gymnasium: `tandem/Push-v0`, `tandem/PickAndPlace-v0`,
 `tandem/TwoArmPush-v0` and `tandem/TwoArmPickAndPlace-v0`, and the same tasks in the shared world as
-`tandem/SharedPush-v0` and so on. With `pip install 'tandem-rl[fetch]'` there are two more, in MuJoCo:
-`tandem/TwoFetchPush-v0` and `tandem/TwoFetchPickAndPlace-v0`. Servers and clients need gRPC: `pip install
-'tandem-rl[grpc]'`.
+`tandem/SharedPush-v0` and so on; in `tandem/CarryBar-v0` two arms carry a bar. With `pip install 'tandem-rl[fetch]'`
+there are two more, in MuJoCo: `tandem/TwoFetchPush-v0` and `tandem/TwoFetchPickAndPlace-v0`. Servers and clients need
+gRPC: `pip install 'tandem-rl[grpc]'`.
 """
 
 from typing import TYPE_CHECKING, Any
@@ -20,6 +20,9 @@ if TYPE_CHECKING:
     from tandem._policies import PolicyServer as PolicyServer
     from tandem._policies import serve_policy as serve_policy
     from tandem._task import Arm as Arm
+    from tandem._task import ArmManipulation as ArmManipulation
+    from tandem._task import Condition as Condition
+    from tandem._task import Manipulation as Manipulation
     from tandem._task import Task as Task
     from tandem.clients import Bridge as Bridge
     from tandem.clients import CallError as CallError
@@ -37,7 +40,7 @@ _SERVICES = {
     "_environments": ("EnvironmentServer", "serve"),
     "_grpc": ("ServiceError",),
     "_policies": ("PolicyServer", "serve_policy"),
-    "_task": ("Arm", "Task"),
+    "_task": ("Arm", "ArmManipulation", "Condition", "Manipulation", "Task"),
     "clients": ("Bridge", "CallError", "Learner", "MotionStopped", "Step", "Teacher", "WayPoint"),
 }
 """Names whose modules need gRPC, and are imported when they are first used."""

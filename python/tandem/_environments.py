@@ -16,10 +16,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tandem._describe import TaskOptions, describe
 from tandem._grpc import Path, Refused, Server, ServiceError, grpc
 from tandem._gym import EnvFn, GymEnvironment, make
 from tandem._proto import environment_pb2, environment_pb2_grpc
-from tandem._task import Arm, Floats, Norm, Task, TaskOptions, describe
+from tandem._task import Arm, Floats, Manipulation, Norm, Task
 
 LISTEN_VARIABLE = "TANDEM_ENV_LISTEN"
 """The environment variable with the address on which a worker wants its server to listen."""
@@ -304,6 +305,8 @@ class EnvironmentServer(Server):
         interchangeable_arms: bool | None = None,
         origin_distance: float | None = None,
         recombination_gap: float | None = None,
+        base: float | None = None,
+        manipulation: Manipulation | None = None,
         reports_contacts: bool | None = None,
         tolerance: float | None = None,
         norm: Norm | None = None,
@@ -325,6 +328,8 @@ class EnvironmentServer(Server):
             "interchangeable_arms": interchangeable_arms,
             "origin_distance": origin_distance,
             "recombination_gap": recombination_gap,
+            "base": base,
+            "manipulation": manipulation,
             "reports_contacts": reports_contacts,
             "tolerance": tolerance,
             "norm": norm,
@@ -370,8 +375,9 @@ def serve(env_fn: EnvFn, *, listen: str | None = None, **options: Any) -> None:
       arms: the indices of each arm's part of the vectors (`tandem.Arm`); by default one arm with all of them.
       achieved_goal: the indices of the achieved goal in the observation; by default they are found by playing.
       interchangeable_arms: whether exchanging the parts of two arms gives another valid transition.
-      origin_distance, recombination_gap: where parts of two arms from different steps may be recombined, as in
+      origin_distance, recombination_gap, base: where parts of two arms from different steps may be recombined, as in
         `tandem.v1.TaskDescription`; for arms with `position`.
+      manipulation: what the arms share, and what success needs beyond the distance to the goal (`tandem.Manipulation`).
       reports_contacts: whether infos have `arm_contact`, and optionally `table_contact`, which learning then charges. One
         arm without `arm_contact` touches no other.
       tolerance, norm: when a goal counts as achieved; by default `distance_threshold` of the environment, and the norm

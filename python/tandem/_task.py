@@ -1,13 +1,11 @@
-"""Descriptions of tasks, and how one is found for a Gymnasium environment."""
+"""Descriptions of tasks."""
 
 from __future__ import annotations
 
 import dataclasses
-import re
 from collections.abc import Sequence
 from typing import Any, Literal
 
-import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,12 +14,6 @@ from tandem._proto import task_pb2
 
 Floats = NDArray[np.float32]
 Norm = Literal["euclidean", "maximum"]
-
-DEFAULT_BOUND = 1000.0
-"""The bound of numbers for which the environment's space has none."""
-_KEYS = ("observation", "achieved_goal", "desired_goal")
-_PROBE_EPISODES = 8
-_PROBE_STEPS = 10
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,6 +25,75 @@ class Arm:
     action: Sequence[int]
     position: Sequence[int] = ()
     """Indices, in the observation, of positions along the axis on which the arms face each other; may be empty."""
+    lateral: Sequence[int] = ()
+    """Indices of the coordinates of the same positions along the horizontal axis perpendicular to it; may be empty."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Condition:
+    """A condition on an observation: some of its numbers lie within a distance of given values, in the task's norm."""
+
+    numbers: Sequence[int]
+    """Indices in the observation."""
+    tolerance: float
+    """The largest distance."""
+    target: Sequence[float] = ()
+    """One value for each index; empty means zeros."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ArmManipulation:
+    """How an arm manipulates its object. All indices belong to the arm."""
+
+    gripper: int | None = None
+    """Index of the action that opens the gripper if it is positive. Exploration opens no gripper that holds an object."""
+    holding: Sequence[Condition] = ()
+    """Conditions under which the arm holds its object. If there are any, success needs them."""
+    conditions: Sequence[Condition] = ()
+    """Further conditions of success."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Manipulation:
+    """What the arms share, when they hold objects, and what success needs beyond the distance to the goal."""
+
+    shared_object: bool = False
+    """Whether all arms act on one object. Hindsight goals of all arms then come from one later step, and parts of arms
+    from different steps are not recombined."""
+    one_arm_task: str = ""
+    """Name of the task that each arm by itself performs, which is the teacher's; empty if it is this task's."""
+    success_steps: int = 1
+    """Number of steps at the end of an episode after all of which the goal must be achieved."""
+    arms: Sequence[ArmManipulation] = ()
+    """The arms in order, or none."""
+
+    def to_message(self) -> task_pb2.TaskManipulation:
+        """Returns the message `tandem.v1.TaskManipulation`."""
+        message = task_pb2.TaskManipulation(
+            shared_object=self.shared_object, one_arm_task=self.one_arm_task, success_steps=self.success_steps
+        )
+        for arm in self.arms:
+            holding, conditions = (
+                [task_pb2.Condition(numbers=c.numbers, target=c.target, tolerance=c.tolerance) for c in given]
+                for given in (arm.holding, arm.conditions)
+            )
+            message.arms.add(gripper=arm.gripper, holding=holding, conditions=conditions)
+        return message
+
+    @classmethod
+    def from_message(cls, message: task_pb2.TaskManipulation) -> Manipulation:
+        """Returns what `message` describes."""
+
+        def conditions(given: Sequence[task_pb2.Condition]) -> tuple[Condition, ...]:
+            return tuple(Condition(tuple(c.numbers), c.tolerance, tuple(c.target)) for c in given)
+
+        arms = (
+            ArmManipulation(
+                arm.gripper if arm.HasField("gripper") else None, conditions(arm.holding), conditions(arm.conditions)
+            )
+            for arm in message.arms
+        )
+        return cls(message.shared_object, message.one_arm_task, max(message.success_steps, 1), tuple(arms))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,7 +123,12 @@ class Task:
     origin_distance: float = 0.0
     """The distance between the origins of two arms along the axis of their positions."""
     recombination_gap: float = 0.0
-    """The smallest gap, along that axis, between arms whose parts are recombined."""
+    """The smallest gap between arms whose parts are recombined: along that axis, or in the plane for arms with
+    `lateral`."""
+    base: float = 0.0
+    """The coordinate of each arm's base along that axis, for arms with `lateral`."""
+    manipulation: Manipulation = Manipulation()
+    """What the arms share, and what success needs beyond the distance to the goal."""
 
     @classmethod
     def built_in(cls, name: str) -> Task:
@@ -103,15 +169,27 @@ class Task:
             goal_bound=self.goal_bound,
             origin_distance=self.origin_distance,
             recombination_gap=self.recombination_gap,
+            base=self.base,
         )
         for arm in self.arms:
-            message.arms.add(observation=arm.observation, goal=arm.goal, action=arm.action, position=arm.position)
+            message.arms.add(
+                observation=arm.observation,
+                goal=arm.goal,
+                action=arm.action,
+                position=arm.position,
+                lateral=arm.lateral,
+            )
+        if self.manipulation != Manipulation():
+            message.manipulation.CopyFrom(self.manipulation.to_message())
         return message
 
     @classmethod
     def from_message(cls, message: task_pb2.TaskDescription) -> Task:
         """Returns the task that `message` describes."""
-        arms = (Arm(tuple(a.observation), tuple(a.goal), tuple(a.action), tuple(a.position)) for a in message.arms)
+        arms = (
+            Arm(tuple(a.observation), tuple(a.goal), tuple(a.action), tuple(a.position), tuple(a.lateral))
+            for a in message.arms
+        )
         return cls(
             name=message.name,
             n_observation=message.n_observation,
@@ -128,296 +206,12 @@ class Task:
             goal_bound=tuple(message.goal_bound),
             origin_distance=message.origin_distance,
             recombination_gap=message.recombination_gap,
+            base=message.base,
+            manipulation=Manipulation.from_message(message.manipulation),
         )
-
-
-@dataclasses.dataclass(frozen=True)
-class TaskOptions:
-    """What a caller may say about an environment's task; everything else is found by probing the environment."""
-
-    name: str | None = None
-    arms: Sequence[Arm] | None = None
-    achieved_goal: Sequence[int] | None = None
-    interchangeable_arms: bool = False
-    origin_distance: float = 0.0
-    recombination_gap: float = 0.0
-    reports_contacts: bool = False
-    tolerance: float | None = None
-    norm: Norm | None = None
-    episode_steps: int | None = None
-    bound: float = DEFAULT_BOUND
-
-    @classmethod
-    def combined(cls, env: gymnasium.Env[Any, Any], given: dict[str, Any]) -> TaskOptions:
-        """Returns the options that are given, and for the others those in `tandem_task` of the environment."""
-        own = dict(_attribute(env, "tandem_task") or {})
-        unknown = set(own) - {field.name for field in dataclasses.fields(cls)}
-        if unknown:
-            raise ServiceError(f"the environment's tandem_task has unknown items: {', '.join(sorted(unknown))}")
-        return cls(**{**own, **{name: value for name, value in given.items() if value is not None}})
-
-
-def describe(env: gymnasium.Env[Any, Any], options: TaskOptions) -> tuple[Task, bool]:
-    """Returns the task of `env`, and whether the achieved goal has to be appended to its observations.
-
-    Plays a few short episodes, to find the achieved goal within the observation and to compare the environment's
-    reward with the sparse reward of the description.
-    """
-    spaces, action = _checked_spaces(env)
-    samples = _probe(env)
-    has_several_arms = options.arms is not None and len(options.arms) > 1
-    if options.reports_contacts and has_several_arms and "arm_contact" not in samples[-1].info:
-        raise ServiceError("reports_contacts: the infos of the environment's steps have no arm_contact")
-    found = _find_achieved_goal(samples)
-    if options.achieved_goal is not None:
-        found = _checked_achieved_goal(samples, options.achieved_goal)
-    n_goal = int(spaces["achieved_goal"].shape[0])
-    n_own = int(spaces["observation"].shape[0])
-    indices = tuple(range(n_own, n_own + n_goal)) if found is None else found
-    tolerance = options.tolerance if options.tolerance is not None else _tolerance(env, samples)
-    n_action = int(action.shape[0])
-    arms = options.arms
-    if arms is None:
-        n_observation = n_own + (n_goal if found is None else 0)
-        arms = (Arm(tuple(range(n_observation)), tuple(range(n_goal)), tuple(range(n_action))),)
-    elif found is None:
-        # The appended numbers belong to the arms of their goals.
-        with_goal = (tuple(arm.observation) + tuple(n_own + goal for goal in arm.goal) for arm in arms)
-        arms = tuple(dataclasses.replace(arm, observation=own) for arm, own in zip(arms, with_goal))
-    bounds = _bounds(spaces["observation"], options.bound)
-    if found is None:
-        bounds += _bounds(spaces["achieved_goal"], options.bound)
-    task = Task(
-        name=_name(env, options.name),
-        n_observation=len(bounds),
-        n_goal=n_goal,
-        n_action=n_action,
-        arms=arms,
-        achieved_goal=indices,
-        episode_steps=_episode_steps(env, options.episode_steps),
-        tolerance=tolerance,
-        norm=_checked_norm(env, samples, tolerance, options.norm),
-        interchangeable_arms=options.interchangeable_arms,
-        reports_contacts=options.reports_contacts,
-        observation_bound=bounds,
-        goal_bound=_bounds(spaces["desired_goal"], options.bound),
-        origin_distance=options.origin_distance,
-        recombination_gap=options.recombination_gap,
-    )
-    _check_arms(task)
-    return task, found is None
-
-
-def _checked_spaces(env: gymnasium.Env[Any, Any]) -> tuple[Any, gymnasium.spaces.Box]:
-    space, action = env.observation_space, env.action_space
-    if not isinstance(space, gymnasium.spaces.Dict) or not set(_KEYS) <= set(space.spaces):
-        raise ServiceError(f"the observation space must be a Dict with {', '.join(_KEYS)}; it is {space}")
-    for key in _KEYS:
-        if not isinstance(space[key], gymnasium.spaces.Box) or len(space[key].shape or ()) != 1:
-            raise ServiceError(f"the space of {key} must be a Box with one dimension; it is {space[key]}")
-    if not isinstance(action, gymnasium.spaces.Box) or len(action.shape) != 1 or not action.is_bounded("both"):
-        raise ServiceError(f"the action space must be a bounded Box with one dimension; it is {action}")
-    if space["achieved_goal"].shape != space["desired_goal"].shape:
-        raise ServiceError("achieved and desired goals differ in length")
-    return space, action
-
-
-@dataclasses.dataclass
-class _Sample:
-    observation: dict[str, NDArray[Any]]
-    info: dict[str, Any]
-
-
-def _probe(env: gymnasium.Env[Any, Any]) -> list[_Sample]:
-    """Plays random actions from several starts."""
-    random = np.random.default_rng(0)
-    space = env.action_space
-    assert isinstance(space, gymnasium.spaces.Box)
-    samples = []
-    for seed in range(_PROBE_EPISODES):
-        observation, info = env.reset(seed=seed)
-        samples.append(_Sample(_copied(observation), info))
-        for _ in range(_PROBE_STEPS):
-            action = random.uniform(space.low, space.high).astype(space.dtype)
-            observation, _, _, _, info = env.step(action)
-            samples.append(_Sample(_copied(observation), info))
-    return samples
-
-
-def _copied(observation: dict[str, Any]) -> dict[str, NDArray[Any]]:
-    return {key: np.array(observation[key]) for key in _KEYS}
-
-
-def _find_achieved_goal(samples: list[_Sample]) -> tuple[int, ...] | None:
-    """Returns the indices of the achieved goal in the observation; `None` if it is not contained.
-
-    A run of consecutive indices is preferred. An index whose number never changed is accepted within such a run only,
-    because equal constants prove nothing.
-    """
-    observations = np.stack([sample.observation["observation"] for sample in samples]).astype(np.float32)
-    achieved = np.stack([sample.observation["achieved_goal"] for sample in samples]).astype(np.float32)
-    n_goal = achieved.shape[1]
-    changes = (achieved != achieved[0]).any(axis=0)
-    if not changes.any():
-        return None
-    for start in range(observations.shape[1] - n_goal + 1):
-        if np.array_equal(observations[:, start : start + n_goal], achieved):
-            return tuple(range(start, start + n_goal))
-    if not changes.all():
-        return None
-    indices: list[int] = []
-    for column in achieved.T:
-        matches = np.flatnonzero((observations == column[:, None]).all(axis=0))
-        unused = [int(index) for index in matches if index not in indices]
-        if not unused:
-            return None
-        indices.append(unused[0])
-    return tuple(indices)
-
-
-def _checked_achieved_goal(samples: list[_Sample], indices: Sequence[int]) -> tuple[int, ...]:
-    """Returns the given indices of the achieved goal in the observation, if it is there in every sample."""
-    for sample in samples:
-        observation, achieved = sample.observation["observation"], sample.observation["achieved_goal"]
-        if len(indices) != len(achieved) or any(not 0 <= index < len(observation) for index in indices):
-            limits = f"{len(achieved)} indices from 0 to {len(observation) - 1}"
-            raise ServiceError(f"achieved_goal: expected {limits}, got {list(indices)}")
-        if not np.array_equal(observation[list(indices)], achieved):
-            raise ServiceError(f"the observation does not have the achieved goal at {list(indices)}")
-    return tuple(indices)
-
-
-def _attribute(env: gymnasium.Env[Any, Any], name: str) -> Any:
-    """Returns an attribute of the environment, or of its `task` as in panda-gym; `None` if there is none."""
-    try:
-        return env.get_wrapper_attr(name)
-    except AttributeError:
-        return getattr(getattr(env.unwrapped, "task", None), name, None)
-
-
-def _tolerance(env: gymnasium.Env[Any, Any], samples: list[_Sample]) -> float:
-    """Returns the environment's own tolerance, or measures the distance at which its reward changes.
-
-    A measured tolerance has four significant digits.
-    """
-    threshold = _attribute(env, "distance_threshold")
-    compute_reward = _attribute(env, "compute_reward")
-    if threshold is not None or compute_reward is None:
-        return float(threshold or 0.0)
-    achieved = samples[0].observation["achieved_goal"].astype(np.float64)
-
-    def is_achieved(distance: float) -> bool:
-        desired = achieved.copy()
-        desired[0] += distance
-        return float(compute_reward(achieved, desired, samples[0].info)) == 0.0
-
-    low, high = 0.0, 1e-6
-    while is_achieved(high) and high < 1e6:
-        low, high = high, 2 * high
-    if low == 0.0 or is_achieved(high):
-        raise ServiceError("the reward does not change with the distance of a goal: give the tolerance")
-    for _ in range(40):
-        middle = (low + high) / 2
-        low, high = (middle, high) if is_achieved(middle) else (low, middle)
-    return float(f"{low:.4g}")
-
-
-def _episode_steps(env: gymnasium.Env[Any, Any], given: int | None) -> int:
-    own = None if env.spec is None else env.spec.max_episode_steps
-    steps = own if given is None else given
-    if steps is None:
-        raise ServiceError("the environment's spec has no max_episode_steps: give episode_steps")
-    if not 1 <= steps <= 10_000:
-        raise ServiceError(f"an episode has 1 to 10000 steps, not {steps}")
-    return steps
-
-
-def _name(env: gymnasium.Env[Any, Any], given: str | None) -> str:
-    if given is not None:
-        if not re.fullmatch(r"[a-z0-9._/-]{1,64}", given):
-            raise ServiceError(f"{given!r} is not a name: expected 1 to 64 of a-z, 0-9, '-', '_', '.' and '/'")
-        return given
-    own = env.spec.id if env.spec is not None else type(env.unwrapped).__name__
-    return re.sub(r"[^a-z0-9._/-]", "-", own.lower())[:64]
-
-
-def _bounds(space: gymnasium.spaces.Box, default: float) -> list[float]:
-    """Returns the largest magnitude of each number of `space`, or `default` where it is unbounded."""
-    magnitude = np.maximum(np.abs(space.low), np.abs(space.high)).astype(np.float64)
-    # Spaces without a real bound have the largest number of their type instead of infinity.
-    magnitude[magnitude > np.finfo(np.float32).max / 2] = default
-    return [float(bound) for bound in magnitude]
 
 
 def distance(norm: Norm, achieved: NDArray[Any], desired: NDArray[Any]) -> float:
     """Returns the distance between two goals, shape `[n_goal]` each."""
     difference = np.asarray(achieved, np.float64) - np.asarray(desired, np.float64)
     return float(np.linalg.norm(difference) if norm == "euclidean" else np.abs(difference).max())
-
-
-def _checked_norm(
-    env: gymnasium.Env[Any, Any], samples: list[_Sample], tolerance: float, given: Norm | None
-) -> Norm:
-    """Returns the norm for which the environment's reward is -1 beyond the tolerance and 0 within it."""
-    compute_reward = _attribute(env, "compute_reward")
-    if compute_reward is None:
-        raise ServiceError("the environment has no compute_reward(achieved_goal, desired_goal, info)")
-    if not (np.isfinite(tolerance) and tolerance > 0):
-        raise ServiceError(f"the tolerance must be a positive number, not {tolerance}")
-    rewards = []
-    for achieved, desired, info in _goal_pairs(samples, tolerance):
-        reward = float(compute_reward(achieved, desired, info))
-        if reward not in (-1.0, 0.0):
-            raise ServiceError(
-                f"the reward is not sparse: compute_reward returned {reward:g}, expected -1 or 0 "
-                "(many environments take reward_type=\"sparse\")"
-            )
-        rewards.append((achieved, desired, reward))
-    norms: list[Norm] = ["euclidean", "maximum"] if given is None else [given]
-    refusals = [_disagreement(norm, tolerance, rewards) for norm in norms]
-    for norm, refusal in zip(norms, refusals):
-        if refusal is None:
-            return norm
-    raise ServiceError(str(refusals[0]))
-
-
-def _goal_pairs(
-    samples: list[_Sample], tolerance: float
-) -> list[tuple[NDArray[Any], NDArray[Any], dict[str, Any]]]:
-    """Returns the goals of the samples, and goals at distances below and above the tolerance."""
-    random = np.random.default_rng(1)
-    pairs = [(s.observation["achieved_goal"], s.observation["desired_goal"], s.info) for s in samples]
-    for sample in samples[::3]:
-        achieved = sample.observation["achieved_goal"]
-        for norm in (2, np.inf):
-            for factor in (0.0, 0.3, 0.7, 0.99, 1.01, 1.3, 2.0, 10.0):
-                direction = random.normal(size=achieved.shape)
-                offset = direction / np.linalg.norm(direction, norm) * tolerance * factor
-                pairs.append((achieved, (achieved + offset).astype(achieved.dtype), sample.info))
-    return pairs
-
-
-def _disagreement(
-    norm: Norm, tolerance: float, rewards: list[tuple[NDArray[Any], NDArray[Any], float]]
-) -> str | None:
-    for achieved, desired, reward in rewards:
-        apart = distance(norm, achieved, desired)
-        expected = 0.0 if apart <= tolerance else -1.0
-        if reward != expected and abs(apart - tolerance) > 1e-3 * tolerance:
-            return (
-                f"compute_reward returned {reward:g} at {norm} distance {apart:.4g}, expected {expected:g} with "
-                f"tolerance {tolerance:g}: give the environment's own tolerance and norm"
-            )
-    return None
-
-
-def _check_arms(task: Task) -> None:
-    if not 1 <= len(task.arms) <= 8:
-        raise ServiceError(f"a task has 1 to 8 arms, not {len(task.arms)}")
-    for kind, length in (("observation", task.n_observation), ("goal", task.n_goal), ("action", task.n_action)):
-        parts = [list(getattr(arm, kind)) for arm in task.arms]
-        flat = [index for part in parts for index in part]
-        if len({len(part) for part in parts}) != 1:
-            raise ServiceError(f"the arms' parts of the {kind} differ in length")
-        if any(not 0 <= index < length for index in flat) or len(set(flat)) != len(flat):
-            raise ServiceError(f"the arms' indices of the {kind} must be different numbers from 0 to {length - 1}")

@@ -320,6 +320,31 @@ class Bridge(_Client):
         response: bridge_pb2.CheckResponse = self._call(self._stub.Check, request)
         return response
 
+    def inject(self, fault: str, *, arm: int = 0, joint: int = 1) -> list[bridge_pb2.FaultInjection]:
+        """Injects a fault into simulated arms, to practise a stop, and returns the present ones. Real arms refuse it.
+
+        `fault` is a name of `tandem bridge inject`, such as "emergency-stop"; `joint` counts from 1. No lease is needed.
+
+        >>> bridge.inject("blocked-joint", arm=1, joint=2)
+        >>> bridge.clear()
+        """
+        name = "INJECTED_FAULT_" + fault.upper().replace("-", "_")
+        known = [name for name, number in bridge_pb2.InjectedFault.items() if number]
+        if name not in known:
+            names = [name.removeprefix("INJECTED_FAULT_").lower().replace("_", "-") for name in known]
+            raise ValueError(f"fault is {fault!r}, expected one of {', '.join(names)}")
+        number = bridge_pb2.InjectedFault.Value(name)
+        request = bridge_pb2.InjectRequest(fault=bridge_pb2.FaultInjection(fault=number, arm=arm, joint=joint - 1))
+        return self._injected(request)
+
+    def clear(self) -> list[bridge_pb2.FaultInjection]:
+        """Clears all injected faults, and returns the present ones: none."""
+        return self._injected(bridge_pb2.InjectRequest(clear=bridge_pb2.ClearFaults()))
+
+    def _injected(self, request: bridge_pb2.InjectRequest) -> list[bridge_pb2.FaultInjection]:
+        response: bridge_pb2.InjectResponse = self._call(self._stub.Inject, request)
+        return list(response.injected)
+
     @contextlib.contextmanager
     def lease(self) -> Iterator[Lease]:
         """Makes the caller the owner of the arms within a `with` block."""

@@ -26,20 +26,22 @@ _TASKS = {
     "tandem/SharedPickAndPlace-v0": ("pick-and-place", 1, "shared"),
     "tandem/SharedTwoArmPush-v0": ("push", 2, "shared"),
     "tandem/SharedTwoArmPickAndPlace-v0": ("pick-and-place", 2, "shared"),
+    "tandem/CarryBar-v0": ("carry-bar", 2, "slow"),
 }
 _FETCH_TASKS = {"tandem/TwoFetchPush-v0": "push", "tandem/TwoFetchPickAndPlace-v0": "pick-and-place"}
 
-RENDER_FPS = {"classic": 25, "shared": 4}
+RENDER_FPS = {"classic": 25, "shared": 4, "slow": 4}
 """Control steps per second of simulated time in each world."""
 
 
 class TandemEnv(gymnasium.Env[Observation, Action]):
-    """One or two simulated arms that push cubes, or pick and place them.
+    """One or two simulated arms that push cubes, or pick and place them, or two arms that carry a bar.
 
     An observation has 28 float32 numbers per arm, a goal the 3 coordinates of each cube in metres, and an action 3
     numbers per arm (`push`) or 4 (`pick-and-place`), each in [-1, 1]. Every arm's numbers are in its own frame. The
     reward is 0 if the distance between all achieved and desired positions, taken together, is at most 5 cm, and -1
-    otherwise. `info["is_success"]` holds if each cube is within 5 cm of its goal; `info["arm_contact"]` and
+    otherwise. `info["is_success"]` holds if each cube is within 5 cm of its goal; a bar must also be level and held by
+    both hands, after each of the last five steps. `info["arm_contact"]` and
     `info["table_contact"]` report contacts between arms and with the table during the step.
 
     An episode never terminates. `gymnasium.make` truncates it after 50 steps.
@@ -52,10 +54,10 @@ class TandemEnv(gymnasium.Env[Observation, Action]):
     in the Rust crates.
 
     Args:
-        task: `"push"` or `"pick-and-place"`.
-        n_arms: 1 or 2.
-        world: `"classic"` (fast arms whose areas lie next to each other, control steps of 0.04 s) or `"shared"` (slow
-            arms that share one area, control steps of 0.25 s).
+        task: `"push"`, `"pick-and-place"` or `"carry-bar"`, whose cubes are the handles of one bar.
+        n_arms: 1 or 2; 2 for `"carry-bar"`.
+        world: `"classic"` (fast arms whose areas lie next to each other, control steps of 0.04 s), `"shared"` (slow
+            arms that share one area, control steps of 0.25 s) or `"slow"` (the only world of `"carry-bar"`).
         substeps: Physics steps per control step, 20 or 10.
         grasped_start_prob: Probability that an episode of pick and place starts with the cubes grasped.
         render_mode: `"rgb_array"` or None.
@@ -140,7 +142,9 @@ def task_name(task: str, world: str) -> str:
     """
     if world not in RENDER_FPS:
         raise ValueError(f"unknown world {world!r}: expected {' or '.join(RENDER_FPS)}")
-    return task if world == "classic" else f"{world}-{task}"
+    if (task == "carry-bar") != (world == "slow"):
+        raise ValueError(f"no task {task!r} in world {world!r}: carry-bar is the only task of the slow world")
+    return f"{world}-{task}" if world == "shared" else task
 
 
 def compute_reward(achieved_goal: ArrayLike, desired_goal: ArrayLike) -> float | NDArray[np.float32]:

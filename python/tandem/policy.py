@@ -29,7 +29,7 @@ class Policy:
 
     @property
     def task(self) -> str:
-        """Name of the task: `push` or `pick-and-place`."""
+        """Name of the task: `push`, `pick-and-place`, the same with `shared-`, or `carry-bar`."""
         return self._native.task
 
     @property
@@ -40,7 +40,7 @@ class Policy:
     @property
     def env_id(self) -> str:
         """Name of the environment with the policy's task, for `gymnasium.make`."""
-        arms = "TwoArm" if self.n_arms == 2 else ""
+        arms = "TwoArm" if self.n_arms == 2 and self.task != "carry-bar" else ""
         return f"tandem/{arms}{self.task.title().replace('-', '')}-v0"
 
     @property

@@ -9,7 +9,8 @@ from typing import NoReturn
 
 from tandem._environments import LISTEN_VARIABLE, serve
 from tandem._grpc import ServiceError
-from tandem._task import DEFAULT_BOUND, Arm
+from tandem._describe import DEFAULT_BOUND
+from tandem._task import Arm, ArmManipulation, Condition, Manipulation
 
 
 class _Parser(argparse.ArgumentParser):
@@ -62,7 +63,7 @@ def _add_arms(group: argparse._ArgumentGroup) -> None:
         "--arms",
         type=_arms,
         metavar="JSON",
-        help="list with an object per arm: lists of indices observation, goal, action and, optionally, position",
+        help="list with an object per arm: lists of indices observation, goal, action and, optionally, position and lateral",
     )
     group.add_argument("--achieved-goal", type=json.loads, metavar="JSON", help="indices in the observation [found]")
     group.add_argument(
@@ -70,6 +71,13 @@ def _add_arms(group: argparse._ArgumentGroup) -> None:
     )
     group.add_argument("--origin-distance", type=float, help="between the origins of two arms along their positions")
     group.add_argument("--recombination-gap", type=float, help="smallest gap between arms that are recombined")
+    group.add_argument("--base", type=float, help="coordinate of each arm's base along its positions")
+    group.add_argument(
+        "--manipulation",
+        type=_manipulation,
+        metavar="JSON",
+        help="object with shared_object, one_arm_task, success_steps and arms, as tandem.Manipulation",
+    )
     group.add_argument(
         "--reports-contacts", action="store_true", default=None, help="infos have arm_contact, and maybe table_contact"
     )
@@ -80,6 +88,20 @@ def _arms(text: str) -> list[Arm]:
         return [Arm(**{name: tuple(indices) for name, indices in arm.items()}) for arm in json.loads(text)]
     except (AttributeError, TypeError, ValueError) as error:
         raise argparse.ArgumentTypeError(f"expected a list of objects with lists of indices: {error}") from None
+
+
+def _manipulation(text: str) -> Manipulation:
+    try:
+        given = json.loads(text)
+        arms = []
+        for arm in given.pop("arms", []):
+            conditions = {name: [Condition(**c) for c in arm.pop(name, [])] for name in ("holding", "conditions")}
+            arms.append(ArmManipulation(arm.pop("gripper", None), **conditions))
+            if arm:
+                raise ValueError(f"unknown items: {', '.join(arm)}")
+        return Manipulation(**given, arms=arms)
+    except (AttributeError, TypeError, ValueError) as error:
+        raise argparse.ArgumentTypeError(f"expected an object as tandem.Manipulation: {error}") from None
 
 
 def main() -> int:

@@ -15,6 +15,7 @@ ENV_IDS = [
     "tandem/TwoArmPickAndPlace-v0",
     "tandem/SharedPush-v0",
     "tandem/SharedTwoArmPickAndPlace-v0",
+    "tandem/CarryBar-v0",
 ]
 
 

@@ -85,6 +85,18 @@ def test_a_stop_ends_a_motion_with_its_reason():
         assert bridge.status().HasField("stopped")
 
 
+def test_an_injected_fault_is_present_until_it_is_cleared():
+    with service("bridge", "--driver", "sim") as address, tandem.Bridge(address) as bridge:
+        (fault,) = bridge.inject("blocked-joint", arm=1, joint=2)
+        assert (fault.arm, fault.joint) == (1, 1) and list(bridge.status().injected) == [fault]
+        with pytest.raises(ValueError, match="expected one of emergency-stop, drive-fault"):
+            bridge.inject("unspecified")
+        with pytest.raises(tandem.CallError, match="joint") as raised:
+            bridge.inject("torque", joint=9)
+        assert raised.value.code == "INVALID_ARGUMENT"
+        assert bridge.clear() == [] and not bridge.status().injected
+
+
 def test_calls_use_tls_and_the_token(tmp_path):
     if shutil.which("openssl") is None:
         pytest.skip("there is no openssl")

@@ -18,11 +18,11 @@ pytest.importorskip("grpc")
 
 import grpc
 import tandem
+from tandem._describe import TaskOptions, describe
 from tandem._environments import episode_seed, make
 from tandem._grpc import open_channel
 from tandem._proto import environment_pb2 as pb
 from tandem._proto import environment_pb2_grpc
-from tandem._task import TaskOptions, describe
 
 ID = "goal_env:Tandem/Point-v0"
 TESTS = Path(__file__).parent
@@ -338,6 +338,29 @@ def test_an_environment_may_describe_itself() -> None:
     assert (task.name, task.origin_distance, task.recombination_gap) == ("points", 2.0, 0.25)
     assert [list(arm.position) for arm in task.arms] == [[3], [0]]
     assert list(task.observation_bound) == [9.0, 50.0, 50.0, 50.0]
+
+
+def test_what_arms_share_and_success_needs_is_described() -> None:
+    held = [tandem.Condition((2, 3), 0.5), tandem.Condition((3,), 0.25, target=(2.0,))]
+    manipulation = tandem.Manipulation(
+        shared_object=True,
+        one_arm_task="point",
+        success_steps=3,
+        arms=(tandem.ArmManipulation(gripper=0, holding=held[:1], conditions=held[1:]), tandem.ArmManipulation()),
+    )
+    arms = [
+        tandem.Arm((2, 3), (0,), (0,), position=(3,), lateral=(2,)),
+        tandem.Arm((0, 1), (1,), (1,), position=(0,), lateral=(1,)),
+    ]
+    own = {"arms": arms, "origin_distance": 2.0, "base": -0.5, "manipulation": manipulation}
+    with tandem.EnvironmentServer((ID, {"tandem_task": own})) as server:
+        message = Client(server).stub.Describe(pb.DescribeEnvironmentRequest()).task
+    first = message.manipulation.arms[0]
+    assert (first.gripper, list(first.holding[0].numbers), list(first.conditions[0].target)) == (0, [2, 3], [2.0])
+    assert message.manipulation.shared_object and message.manipulation.success_steps == 3
+    assert not message.manipulation.arms[1].HasField("gripper")
+    assert (message.base, [list(arm.lateral) for arm in message.arms]) == (-0.5, [[2], [1]])
+    assert tandem.Task.from_message(message).to_message() == message
 
 
 def test_contacts_are_sent_if_the_task_reports_them() -> None:

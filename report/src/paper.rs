@@ -131,10 +131,14 @@ pub const TABLE_4: [PaperTrials; 2] = [
 ];
 
 impl PaperTrials {
-    /// Returns the number of successes for `task`.
+    /// Returns the number of successes for `task`; `None` if the arms share an object, as in no task of the paper.
     #[must_use]
-    pub const fn n_successes(&self, task: Task) -> usize {
-        if task.grasps() { self.pick_and_place } else { self.push }
+    pub const fn n_successes(&self, task: Task) -> Option<usize> {
+        match (task.shares_object(), task.grasps()) {
+            (true, _) => None,
+            (false, true) => Some(self.pick_and_place),
+            (false, false) => Some(self.push),
+        }
     }
 }
 

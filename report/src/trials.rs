@@ -17,8 +17,9 @@ pub(crate) use plot::millimetres;
 pub use plot::trial_svg;
 
 /// Causes of failure, in the order of the tables.
-pub const CAUSES: [&str; 7] = [
+pub const CAUSES: [&str; 8] = [
     "not-reached",
+    "condition-unmet",
     "object-lost",
     "timed-out",
     "arms-touched",

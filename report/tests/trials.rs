@@ -63,14 +63,25 @@ fn the_table_has_successes_intervals_causes_and_the_papers_rows() {
     let expected = "\
 push: trials, as the paper's Table 4
 policy, mode                success  share [95 % interval]  median time
-student-push, closed-loop       2/9      22.2 % [6.3–54.7]       14.0 s
+student-push, closed-loop      2/10      20.0 % [5.7–51.0]       14.5 s
 student-push, open-loop         4/4   100.0 % [51.0–100.0]       11.5 s
 the paper, proposed method    40/50     80.0 % [67.0–88.8]            –
 the paper, from scratch        0/50        0.0 % [0.0–7.1]            –
-failures of student-push, closed-loop: 1 not-reached, 1 object-lost, 1
-timed-out, 1 arms-touched, 1 table-touched, 1 refused, 1 stopped
+failures of student-push, closed-loop: 1 not-reached, 1 condition-unmet, 1
+object-lost, 1 timed-out, 1 arms-touched, 1 table-touched, 1 refused, 1 stopped
 ";
     assert_eq!(text, expected);
+}
+
+#[test]
+fn a_task_with_a_shared_object_is_not_compared_with_the_paper() {
+    let carried = |trial, cause| TrialRow { task: "carry-bar".to_owned(), ..row(trial, cause) };
+    let trials = Trials::of(vec![carried(1, None), carried(2, Some("condition-unmet"))]);
+    let text = trials.text();
+    assert!(text.starts_with("carry-bar: trials\n") && !text.contains("the paper"), "{text}");
+    assert!(text.contains("1 condition-unmet"), "{text}");
+    let json = trials::json(&trials);
+    assert!(json.to_string().contains("\"paper\":null"), "{json}");
 }
 
 #[test]
@@ -197,13 +208,13 @@ fn the_page_plots_every_failure_and_lists_every_trial() {
     for (trial, cause) in trials::CAUSES.iter().rev().enumerate() {
         assert!(html.contains(&format!("push, trial {trial}: {cause}")), "{cause}");
     }
-    for number in 0..9 {
+    for number in 0..10 {
         assert!(html.contains(&format!("<td>trial-{number}.mcap</td>")), "{number}");
     }
     assert!(html.contains("Comparison of trials") && html.contains("Tables 2 and 4"));
     assert!(!html.contains("Table 2</h2>"), "the paper's Table 2 is about runs");
     let all = report_html(&comparison, &trials, PlottedTrials::All, &page).unwrap();
-    assert_eq!(all.plots.len(), 9);
+    assert_eq!(all.plots.len(), 10);
 }
 
 #[test]
@@ -228,14 +239,14 @@ fn repeated_trials_add_a_warning_and_keep_their_plots() {
 fn json_has_the_statistics_of_every_group() {
     let value = trials::json(&Trials::of(of_every_cause()));
     let group = &value["groups"][0];
-    assert_eq!((&group["trials"], &group["successes"]), (&9.into(), &2.into()));
-    assert_eq!(group["success"], 2.0 / 9.0);
-    assert_eq!(group["success_low"], tandem_core::Wilson::of(2, 9).low);
+    assert_eq!((&group["trials"], &group["successes"]), (&10.into(), &2.into()));
+    assert_eq!(group["success"], 2.0 / 10.0);
+    assert_eq!(group["success_low"], tandem_core::Wilson::of(2, 10).low);
     assert_eq!(group["failed_by"]["table-touched"], 1);
     assert_eq!(group["failed_by"]["other"], 0);
-    assert_eq!(group["median_duration_s"], 14.0);
-    assert_eq!(group["median_success_duration_s"], 17.5);
-    assert_eq!(group["failures"].as_array().unwrap().len(), 7);
+    assert_eq!(group["median_duration_s"], 14.5);
+    assert_eq!(group["median_success_duration_s"], 18.5);
+    assert_eq!(group["failures"].as_array().unwrap().len(), 8);
     assert_eq!(group["failures"][6]["log"], "trial-6.mcap");
     assert_eq!(group["paper"][0]["successes"], 40);
 }

@@ -8,7 +8,7 @@ use tandem_core::layout::UnknownTask;
 use tandem_core::settings::OutOfRange;
 use tandem_core::task::{InvalidTask, MAX_ARMS};
 use tandem_core::{
-    AdviceTerms, AdviceUnit, Exploration, JudgedAction, Strategy, TaskDescription, TaskSpec,
+    AdviceTerms, AdviceUnit, Exploration, JudgedAction, Strategy, Task, TaskDescription, TaskSpec,
     WorldSettings,
 };
 
@@ -275,9 +275,10 @@ impl RunConfig {
     /// When the task does not exist, its description is invalid, or `task` or `arms` contradict the description.
     pub fn layout(&self) -> Result<TaskSpec, ConfigError> {
         let Some(description) = &self.description else {
-            let task = self.task.parse()?;
-            let expected = "1 or 2";
-            OutOfRange::unless((1..=MAX_ARMS).contains(&self.arms), "arms", self.arms, expected)?;
+            let task: Task = self.task.parse()?;
+            let is_count = (task.min_arms()..=MAX_ARMS).contains(&self.arms);
+            let expected = if task.min_arms() == 1 { "1 or 2" } else { "2" };
+            OutOfRange::unless(is_count, "arms", self.arms, expected)?;
             return Ok(TaskSpec::built_in(task, self.arms));
         };
         let task = TaskSpec::new(description.clone())?;

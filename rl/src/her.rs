@@ -169,8 +169,13 @@ impl Sampler {
     }
 
     fn relabel_arms(&mut self, buffer: &ReplayBuffer, rng: &mut ChaCha8Rng) {
+        let shared = self
+            .layout
+            .shares_object()
+            .then(|| self.hindsight_step(self.sample.steps[0], buffer, rng));
         for arm in self.layout.arms() {
-            let later_step = self.hindsight_step(self.sample.steps[arm.0].step_idx, rng);
+            let later_step = shared
+                .unwrap_or_else(|| self.hindsight_step(self.sample.steps[arm.0], buffer, rng));
             self.sample.keeps_goal[arm.0] = later_step.is_none();
             self.take_goal(buffer, arm, later_step);
             if arm.0 == 0 {
@@ -191,7 +196,7 @@ impl Sampler {
     }
 
     fn relabel_jointly(&mut self, buffer: &ReplayBuffer, rng: &mut ChaCha8Rng) {
-        let later_step = self.hindsight_step(self.sample.steps[0].step_idx, rng);
+        let later_step = self.hindsight_step(self.sample.steps[0], buffer, rng);
         self.sample.keeps_goal.fill(later_step.is_none());
         self.take_common_goal(buffer, later_step);
         let norm = self.layout.norm();
@@ -246,10 +251,18 @@ impl Sampler {
 
     /// Samples the later step whose achieved goal replaces the desired one (strategy "future"); `None` keeps the
     /// desired goal.
-    fn hindsight_step(&self, step_idx: usize, rng: &mut ChaCha8Rng) -> Option<usize> {
+    fn hindsight_step(
+        &self,
+        StepIndex { episode_idx, step_idx }: StepIndex,
+        buffer: &ReplayBuffer,
+        rng: &mut ChaCha8Rng,
+    ) -> Option<usize> {
         let hindsight = bernoulli(rng, self.config.her_ratio);
         let later_step = step_idx + 1 + index(rng, self.layout.episode_steps() - step_idx);
-        hindsight.then_some(later_step)
+        let observation = |step_idx| buffer.observation(episode_idx, step_idx);
+        let is_goal = !self.config.displaced_hindsight
+            || self.layout.is_displaced(observation(0), observation(later_step));
+        (hindsight && is_goal).then_some(later_step)
     }
 
     fn take_goal(&mut self, buffer: &ReplayBuffer, arm: ArmIndex, later_step: Option<usize>) {

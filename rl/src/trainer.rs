@@ -129,9 +129,10 @@ impl Trainer {
                 "{task} has numbers common to all arms, so no arm is a task of its own"
             ));
         };
-        if teacher.layout.name() != task || n_arms != 1 || teacher.n_heads != 1 {
+        if teacher.layout.name() != one_arm.name() || n_arms != 1 || teacher.n_heads != 1 {
             return Err(format!(
-                "needs a teacher for {task} with one arm and one value, got {} for {} with {}",
+                "needs a teacher for {} with one arm and one value, got {} for {} with {}",
+                one_arm.name(),
                 counted(n_arms, "arm"),
                 teacher.layout.name(),
                 counted(teacher.n_heads, "value")
@@ -177,7 +178,7 @@ impl Trainer {
         self.stats
     }
 
-    /// Sets the threads of the update, 1 or 2; the results are the same.
+    /// Sets the threads of the update, 1 or more; the results are the same.
     pub fn set_threads(&mut self, n_threads: usize) {
         self.ddpg.set_threads(n_threads);
     }
@@ -397,13 +398,15 @@ impl Trainer {
             let hindsight = bernoulli(rng, replay.her_ratio);
             (hindsight, step_idx + 1 + index(rng, layout.episode_steps() - step_idx))
         };
-        let joint = replay.joint_goal_statistics.then(&mut draw);
+        let joint = (replay.joint_goal_statistics || layout.shares_object()).then(&mut draw);
         for arm in layout.arms() {
             let (hindsight, later_step) = joint.unwrap_or_else(&mut draw);
-            if !hindsight {
+            let observation = episode.observation(later_step);
+            let is_goal = !replay.displaced_hindsight
+                || layout.is_displaced(episode.observation(0), observation);
+            if !(hindsight && is_goal) {
                 continue;
             }
-            let observation = episode.observation(later_step);
             layout.goal_of(arm).copy_from(&mut goal, layout.achieved_goal_of(arm), observation);
             if arm.0 == 0 {
                 let achieved = layout.common_achieved_goal();

@@ -40,7 +40,7 @@ class Flags:
 
     def subcommands(self, names: tuple[str, ...]) -> set[str]:
         listed = re.search(r"^Commands:\n((?:  .*\n)+)", self.help(names), re.MULTILINE)
-        return set(re.findall(r"^  ([a-z]+)", listed[1], re.MULTILINE)) if listed else set()
+        return set(re.findall(r"^  ([a-z-]+)", listed[1], re.MULTILINE)) if listed else set()
 
     @functools.cache
     def options(self, names: tuple[str, ...]) -> set[str]:

@@ -21,7 +21,7 @@ START_TIMEOUT_S = 30
 INTERRUPT = "^C"
 # A server's first words, and the text that it prints once it can be called ("" if it prints none).
 SERVERS = [
-    (r"tandem (teacher|learner|env|relay)\b", "listening on"),
+    (r"tandem (teacher|learner|env|relay)\b(?!.*--describe)", "listening on"),
     (r"tandem bridge( arms\b.*| --.*)?$", "listening on"),
     (r"tandem worker\b", ""),
     (r"tandem (replay|eval) .*--live", "live on"),

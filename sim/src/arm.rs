@@ -51,6 +51,7 @@ impl Arm {
             geometry: parameters.gripper,
             pad_friction: config.friction(task).pads,
             grip_force_n: config.grip_force_n,
+            palm_force_n: parameters.palm_force_n,
         };
         let hand = Hand::build(physics, arm, frame, settings);
         Self { frame, hand, parameters, angles: HOME }

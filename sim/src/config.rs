@@ -11,7 +11,7 @@ pub struct WorldConfig {
     /// their number in the shared world. 20 gives steps of 0.002 s, as in the paper, and of 0.003125 s; 10 is twice as
     /// fast.
     pub substeps: u32,
-    /// Iterations of the contact solver per physics step, in [1, 16].
+    /// Iterations of the contact solver per physics step, in [1, 16]; twice as many in the slow world.
     pub solver_iterations: usize,
     /// Half the edge length of the cubes, metres, in [0.015, 0.045].
     pub object_half_size_m: f32,
@@ -24,6 +24,8 @@ pub struct WorldConfig {
     pub push: Friction,
     /// Friction in the pick-and-place task.
     pub pick_and_place: Friction,
+    /// Friction in the task to carry a bar.
+    pub carry_bar: Friction,
 }
 
 /// Coulomb friction coefficients, each in [0, 2]. A contact has the larger coefficient of its two surfaces. That of the
@@ -47,6 +49,7 @@ impl Default for WorldConfig {
             grip_force_n: 15.0,
             push: Friction { pads: 0.3, object: 0.3 },
             pick_and_place: Friction { pads: 0.45, object: 0.45 },
+            carry_bar: Friction { pads: 0.8, object: 0.8 },
         }
     }
 }
@@ -76,6 +79,8 @@ impl WorldConfig {
         check("push.object", self.push.object.into(), 0.0, 2.0)?;
         check("pick_and_place.pads", self.pick_and_place.pads.into(), 0.0, 2.0)?;
         check("pick_and_place.object", self.pick_and_place.object.into(), 0.0, 2.0)?;
+        check("carry_bar.pads", self.carry_bar.pads.into(), 0.0, 2.0)?;
+        check("carry_bar.object", self.carry_bar.object.into(), 0.0, 2.0)?;
         Ok(self)
     }
 
@@ -91,9 +96,23 @@ impl WorldConfig {
         world.control_step_s() / substeps
     }
 
+    /// Returns the number of iterations of the contact solver per physics step in `world`.
+    pub(crate) fn solver_iterations_in(&self, world: World) -> usize {
+        // More contacts share a bar than a cube.
+        let factor = match world {
+            World::Classic | World::Shared => 1,
+            World::Slow => 2,
+        };
+        self.solver_iterations * factor
+    }
+
     /// Returns the friction coefficients for `task`.
     pub(crate) fn friction(&self, task: Task) -> Friction {
-        if task.grasps() { self.pick_and_place } else { self.push }
+        match task {
+            Task::CarryBar => self.carry_bar,
+            _ if task.grasps() => self.pick_and_place,
+            _ => self.push,
+        }
     }
 }
 
@@ -126,6 +145,16 @@ pub enum SimError {
     /// The layout does not have one or two arms.
     #[error("{0} arms, expected 1 or 2")]
     Arms(usize),
+    /// The task takes more arms than the layout has.
+    #[error("{task} takes {expected} arms, got {got}")]
+    TooFewArms {
+        /// The task.
+        task: Task,
+        /// Number of arms given.
+        got: usize,
+        /// Smallest number of arms.
+        expected: usize,
+    },
     /// The action has the wrong length.
     #[error("action has {got} numbers, expected {expected}")]
     ActionLength {

@@ -8,15 +8,15 @@ use rapier3d::dynamics::{CoefficientCombineRule, RigidBodyHandle};
 use rapier3d::geometry::{Collider, SharedShape};
 use rapier3d::math::{Pose, Vector};
 use serde::Serialize;
-use tandem_core::Layout;
 use tandem_core::layout::{EPISODE_STEPS, GOAL_TOLERANCE_M};
+use tandem_core::{ArmIndex, Layout};
 
-use crate::arm::{ACTION_M, Arm, REACH_ITERATIONS, TRACK_ITERATIONS};
+use crate::arm::{ACTION_M, REACH_ITERATIONS, TRACK_ITERATIONS};
 use crate::capsule::{GRIPPER_ENDS, GRIPPER_RADIUS_M, LINK_FRAMES, LINK_RADII_M};
 use crate::config::WorldConfig;
 use crate::hand::{
     FINGER_HOLD_FORCE_N, FINGER_HOLD_GAIN, FINGERS_MASS_KG, Gripper, OPENING_END_GAIN,
-    PALM_FORCE_N, PALM_MASS_KG, WRIST_ABOVE_M, WRIST_RADIUS_M,
+    PALM_MASS_KG, WRIST_ABOVE_M, WRIST_RADIUS_M,
 };
 pub use crate::kinematics::DhRow;
 use crate::kinematics::{DAMPING, DH_TABLE, HOME, MAX_ANGLE_STEP_RAD, SQUARED_ERROR_TOLERANCE};
@@ -114,8 +114,10 @@ pub struct ArmDescription {
     /// 1, or −1 if the arm's frame is rotated by 180° about z. The frames of the arm's bodies are rotated alike at the
     /// start of an episode.
     pub sign: f32,
-    /// Index of the object's body.
+    /// Index of the object's body. Arms that share an object have the same one.
     pub object: usize,
+    /// The point of the object that the arm brings to its goal, in the body's frame, metres.
+    pub object_point_m: [f32; 3],
     /// Index of the palm's body, whose origin is the end effector.
     pub palm: usize,
     /// The fingers, if they are separate bodies. Otherwise they are shapes of the palm.
@@ -231,19 +233,14 @@ pub(crate) fn describe(world: &World, layout: Layout, config: &WorldConfig) -> W
         task: layout.task.name(),
         control_step_s: kind.control_step_s(),
         substeps: config.substeps_in(kind),
-        solver_iterations: config.solver_iterations,
+        solver_iterations: config.solver_iterations_in(kind),
         episode_steps: EPISODE_STEPS,
         goal_tolerance_m: GOAL_TOLERANCE_M,
         gravity_mps2: GRAVITY.to_array(),
         bodies: bodies(world),
         shapes: shapes(world),
         contact_pairs: contact_pairs(world),
-        arms: world
-            .arms
-            .iter()
-            .zip(&world.objects)
-            .map(|(arm, object)| arm_description(world, arm, *object))
-            .collect(),
+        arms: layout.arms().map(|arm| arm_description(world, arm)).collect(),
         hand: hand_control(config, world.parameters),
         kinematics: kinematics(world.parameters),
         link_avoidance: link_avoidance(),
@@ -314,7 +311,8 @@ fn contact_pairs(world: &World) -> Vec<ContactPairDescription> {
     pairs
 }
 
-fn arm_description(world: &World, arm: &Arm, object: RigidBodyHandle) -> ArmDescription {
+fn arm_description(world: &World, idx: ArmIndex) -> ArmDescription {
+    let arm = &world.arms[idx.0];
     let fingers: &[_] = match arm.hand.settings.gripper {
         Gripper::Locked => &[],
         Gripper::Driven => &arm.hand.fingers,
@@ -322,7 +320,8 @@ fn arm_description(world: &World, arm: &Arm, object: RigidBodyHandle) -> ArmDesc
     ArmDescription {
         origin_m: [arm.frame.centre_x_m, 0.0, 0.0],
         sign: arm.frame.sign,
-        object: body_index(world, object),
+        object: body_index(world, world.object_handle(idx)),
+        object_point_m: world.object_point(idx).to_array(),
         palm: body_index(world, arm.hand.palm),
         fingers: fingers
             .iter()
@@ -356,7 +355,7 @@ fn hand_control(config: &WorldConfig, parameters: &WorldParameters) -> HandContr
         max_speed_mps: parameters.max_speed_mps,
         mass_kg: PALM_MASS_KG + FINGERS_MASS_KG,
         fingers_mass_kg: FINGERS_MASS_KG,
-        palm_force_n: PALM_FORCE_N,
+        palm_force_n: parameters.palm_force_n,
         grip_force_n: config.grip_force_n,
         max_opening_m: parameters.gripper.max_opening_m,
         opening_speed_mps: parameters.gripper.opening_speed_mps,
@@ -432,6 +431,21 @@ mod tests {
                 assert!((mass_kg(&world, arm.object) - 0.1).abs() < 1e-6);
             }
         }
+    }
+
+    #[test]
+    fn arms_that_share_an_object_bring_two_points_of_one_body_to_their_goals() {
+        let world = described(Task::CarryBar, 2);
+        let [first, second] = &world.arms[..] else { panic!("two arms") };
+        assert_eq!(first.object, second.object);
+        assert_eq!(
+            [first, second].map(|arm| arm.object_point_m),
+            [[-0.16, 0.0, 0.0], [0.16, 0.0, 0.0]]
+        );
+        assert!((mass_kg(&world, first.object) - 0.5).abs() < 1e-6);
+        let own = described(Task::PickAndPlace, 2);
+        assert!(own.arms.iter().all(|arm| arm.object_point_m == [0.0; 3]));
+        assert_ne!(own.arms[0].object, own.arms[1].object);
     }
 
     #[test]

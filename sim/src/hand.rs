@@ -25,8 +25,6 @@ pub(crate) const WRIST_RADIUS_M: f32 = 0.035;
 pub(crate) const OPENING_END_GAIN: f32 = 0.2;
 /// Mass of palm and wrist, kilograms.
 pub(crate) const PALM_MASS_KG: f32 = 1.0;
-/// Largest force of the palm's servo along each axis, newtons.
-pub(crate) const PALM_FORCE_N: f32 = 40.0;
 /// Largest force that holds a finger in its place, newtons.
 pub(crate) const FINGER_HOLD_FORCE_N: f32 = 200.0;
 /// Gain of the force that returns a finger to its place, 1/s.
@@ -98,6 +96,14 @@ pub(crate) enum Gripper {
     Driven,
 }
 
+impl GripperGeometry {
+    /// Returns the distance along x from the centre of the hand to the outer edge of its pads, metres.
+    pub(crate) fn reach_m(&self) -> f32 {
+        let outermost_m = self.fingers.iter().map(|finger| finger.x_m.abs()).fold(0.0, f32::max);
+        outermost_m + self.pad_half.x
+    }
+}
+
 /// The properties of a hand.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct HandSettings {
@@ -105,6 +111,7 @@ pub(crate) struct HandSettings {
     pub(crate) geometry: &'static GripperGeometry,
     pub(crate) pad_friction: f32,
     pub(crate) grip_force_n: f32,
+    pub(crate) palm_force_n: f32,
 }
 
 /// The bodies of a hand.
@@ -236,8 +243,10 @@ impl Hand {
         let substep_s = physics.substep_s();
         let total_mass_kg = PALM_MASS_KG + FINGERS_MASS_KG;
         let palm_velocity = self.velocity(physics);
-        let palm_force =
-            bounded((velocity - palm_velocity) * (total_mass_kg / substep_s), PALM_FORCE_N);
+        let palm_force = bounded(
+            (velocity - palm_velocity) * (total_mass_kg / substep_s),
+            self.settings.palm_force_n,
+        );
         if self.settings.gripper == Gripper::Locked {
             return apply(physics, self.palm, palm_force);
         }

@@ -92,6 +92,7 @@
 #![warn(missing_docs)]
 
 mod arm;
+mod bar;
 mod capsule;
 mod config;
 pub mod description;

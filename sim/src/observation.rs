@@ -8,7 +8,7 @@ use crate::world::World;
 /// Writes `arm`'s part of the observation, shape `[28]`, in the order that `Env::observe` documents. The position of the
 /// object is wrong by `error` (arm frame, metres).
 pub(crate) fn observe_arm(world: &World, arm: ArmIndex, error: Vector, observation: &mut [f32]) {
-    let (state, object) = (&world.arms[arm.0], world.object(arm));
+    let (state, object) = (&world.arms[arm.0], world.object_state(arm));
     let frame = state.frame;
     let (hand_position, hand_velocity) =
         (state.hand.end_effector(&world.physics), state.hand.velocity(&world.physics));
@@ -16,12 +16,11 @@ pub(crate) fn observe_arm(world: &World, arm: ArmIndex, error: Vector, observati
     let fingers = state.hand.openings(&world.physics);
 
     observation[0..3].copy_from_slice(&frame.arm_from_world(hand_position).to_array());
-    observation[3..6].copy_from_slice(&frame.arm_from_world(object.translation()).to_array());
-    observation[6..9]
-        .copy_from_slice(&frame.rotate(object.translation() - hand_position).to_array());
-    observation[12..16].copy_from_slice(&frame.orientation_in_arm(*object.rotation()));
-    observation[16..19].copy_from_slice(&per_step(object.linvel() - hand_velocity));
-    observation[19..22].copy_from_slice(&per_step(object.angvel()));
+    observation[3..6].copy_from_slice(&frame.arm_from_world(object.position).to_array());
+    observation[6..9].copy_from_slice(&frame.rotate(object.position - hand_position).to_array());
+    observation[12..16].copy_from_slice(&frame.orientation_in_arm(object.rotation));
+    observation[16..19].copy_from_slice(&per_step(object.velocity - hand_velocity));
+    observation[19..22].copy_from_slice(&per_step(object.angular_velocity));
     observation[22..25].copy_from_slice(&per_step(hand_velocity));
     if error != Vector::ZERO {
         for (idx, number) in observation[3..9].iter_mut().enumerate() {

@@ -25,6 +25,8 @@ pub(crate) struct WorldParameters {
     pub(crate) reach: Option<&'static Reach>,
     /// Fingers and pads.
     pub(crate) gripper: &'static GripperGeometry,
+    /// Largest force of the palm's servo along each axis, newtons.
+    pub(crate) palm_force_n: f32,
 }
 
 static CLASSIC: WorldParameters = WorldParameters {
@@ -36,6 +38,7 @@ static CLASSIC: WorldParameters = WorldParameters {
     workspace_high: Vector::new(0.20, 0.25, 0.35),
     reach: None,
     gripper: &THREE_FINGERS,
+    palm_force_n: 40.0,
 };
 
 /// The gain covers 91 % of a displacement of 5 cm within a control step, and 98 % of a short one. The workspace's floor
@@ -50,6 +53,22 @@ static SHARED: WorldParameters = WorldParameters {
     workspace_high: Vector::new(0.27, 0.22, 0.33),
     reach: Some(&Reach::MICO),
     gripper: &MICO_GRIPPER,
+    palm_force_n: 40.0,
+};
+
+/// A step covers the same share of a displacement as in the classic world, so a policy of that world can act here. Two
+/// hands that hold one bar disagree: the servo's force is below what two pads hold by friction, so that a palm gives way
+/// before its pads slip.
+static SLOW: WorldParameters = WorldParameters {
+    control_steps_per_s: 4.0,
+    approach_gain_per_s: 4.32,
+    max_speed_mps: Some(0.2),
+    base_in_arm: CLASSIC.base_in_arm,
+    workspace_low: CLASSIC.workspace_low,
+    workspace_high: CLASSIC.workspace_high,
+    reach: None,
+    gripper: &THREE_FINGERS,
+    palm_force_n: 10.0,
 };
 
 impl WorldParameters {
@@ -57,6 +76,7 @@ impl WorldParameters {
         match world {
             World::Classic => &CLASSIC,
             World::Shared => &SHARED,
+            World::Slow => &SLOW,
         }
     }
 

@@ -134,6 +134,14 @@ impl Physics {
             .fold(Contacts::NONE, |all, one| all | one)
     }
 
+    /// Returns true if the colliders `a` and `b` pressed on each other with at least `force_n` newtons in the last
+    /// physics step.
+    pub(crate) fn presses(&self, a: ColliderHandle, b: ColliderHandle, force_n: f32) -> bool {
+        let impulse = |pair: &ContactPair| pair.total_impulse_magnitude();
+        let pair = self.narrow_phase.contact_pair(a, b);
+        pair.map_or(0.0, impulse) > force_n * self.substep_s()
+    }
+
     /// Classifies a contact of this pair.
     fn kind_of(&self, pair: &ContactPair) -> Contacts {
         let group =
@@ -180,7 +188,7 @@ fn integration_parameters(config: &WorldConfig, world: World) -> IntegrationPara
     let softness = SpringCoefficients::new(200.0, 5.0);
     IntegrationParameters {
         dt: config.substep_s(world),
-        num_solver_iterations: config.solver_iterations,
+        num_solver_iterations: config.solver_iterations_in(world),
         num_internal_pgs_iterations: 1,
         num_internal_stabilization_iterations: 1,
         normalized_prediction_distance: 0.002,

@@ -111,7 +111,9 @@ mod tests {
             assert!(within(episode.object_mass_kg, OBJECT_MASS_KG));
             assert!(within(episode.table_friction, TABLE));
             assert!(within(episode.delay_s, DELAY_S));
-            assert!(episode.friction.pads < episode.table_friction);
+            // A bar has rough handles.
+            let can_drag = task.shares_object();
+            assert!(can_drag || episode.friction.pads < episode.table_friction);
         }
     }
 

@@ -1,12 +1,15 @@
 //! Snapshots of the world for pictures and logs.
 
+use rapier3d::dynamics::RigidBody;
 use rapier3d::math::{Rotation, Vector};
 use tandem_core::layout::GOAL_TOLERANCE_M;
 use tandem_core::scene::{ArmScene, Capsule, Cuboid, Point, Scene};
 use tandem_core::{ArmIndex, Layout};
 
 use crate::arm::Arm;
+use crate::bar::{HALF_LENGTH_M, HANDLE_M, PLATE_HALF_M, SECTION_HALF_M, handle};
 use crate::capsule::{LINK_FRAMES, LINK_RADII_M};
+use crate::frame::MAX_ARMS;
 use crate::hand::{PALM_ABOVE_M, PALM_HALF_M, WRIST_ABOVE_M, WRIST_RADIUS_M};
 use crate::kinematics::ForwardKinematics;
 use crate::world::{TABLE_HALF_M, World};
@@ -16,7 +19,7 @@ use crate::world::{TABLE_HALF_M, World};
 const ITERATIONS: usize = 20;
 
 /// Returns a snapshot of `world`, `time_s` after the start of the episode. `goal` has shape `[n_goal]`, arm frames; the
-/// objects are cubes with half edges `half_m`.
+/// objects are cubes with half edges `half_m`, or a bar.
 pub(crate) fn scene(
     world: &World,
     layout: Layout,
@@ -28,18 +31,34 @@ pub(crate) fn scene(
         let in_arm = Vector::from_slice(&goal[layout.goal_of(arm)]);
         world.arms[arm.0].frame.world_from_arm(in_arm).to_array()
     };
-    let object = |arm: ArmIndex| {
+    let cube = |arm: ArmIndex| {
         let body = world.object(arm);
         cuboid(body.translation(), *body.rotation(), Vector::splat(half_m))
     };
     Scene {
         time_s,
         arms: world.arms.iter().map(|arm| arm_scene(world, arm)).collect(),
-        objects: layout.arms().map(object).collect(),
+        objects: if world.has_bar {
+            bar_boxes(world.object(ArmIndex(0)))
+        } else {
+            layout.arms().map(cube).collect()
+        },
         goals: layout.arms().map(goal_in_world).collect(),
         goal_tolerance_m: GOAL_TOLERANCE_M,
         table: cuboid(Vector::new(0.0, 0.0, -TABLE_HALF_M.z), Rotation::IDENTITY, TABLE_HALF_M),
     }
+}
+
+/// Returns the boxes that show a bar: the handle of each arm, in arm order and centred at the point that the arm brings to
+/// its goal, and then the middle.
+fn bar_boxes(bar: &RigidBody) -> Vec<Cuboid> {
+    let (at, turn): (Vector, Rotation) = (bar.translation(), *bar.rotation());
+    let handle_half_m = HALF_LENGTH_M - HANDLE_M;
+    let section = |half_length_m| Vector::new(half_length_m, SECTION_HALF_M, SECTION_HALF_M);
+    let handles = (0..MAX_ARMS)
+        .map(|arm| cuboid(at + turn * handle(ArmIndex(arm)), turn, section(handle_half_m)));
+    let middle = section(HANDLE_M - handle_half_m);
+    handles.chain([cuboid(at, turn, middle), cuboid(at, turn, PLATE_HALF_M)]).collect()
 }
 
 fn arm_scene(world: &World, arm: &Arm) -> ArmScene {

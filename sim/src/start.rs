@@ -8,6 +8,7 @@ use tandem_core::{ArmIndex, Layout, World, WorldSettings};
 use crate::frame::ArmFrame;
 use crate::parameters::WorldParameters;
 
+mod bar;
 mod shared;
 
 /// Half extent along x of the area of objects and goals, arm frame, metres.
@@ -54,8 +55,11 @@ enum HandStart {
 /// Returns the smallest box, arm frame, metres, that contains the goals of all episodes with objects of half edge
 /// `object_half_m`: the range along each axis.
 pub(crate) fn goal_area(layout: Layout, object_half_m: f32) -> [[f32; 2]; 3] {
+    if layout.task.shares_object() {
+        return bar::goal_area();
+    }
     let (x_m, y_m, air_m) = match layout.task.world() {
-        World::Classic => {
+        World::Classic | World::Slow => {
             ([-AREA_X_M, AREA_X_M], AREA_Y_M[usize::from(layout.n_arms > 1)], AIR_GOAL_HIGH_M)
         }
         World::Shared => (shared::AREA_X_M, shared::AREA_Y_M, shared::AIR_GOAL_HIGH_M),
@@ -71,8 +75,11 @@ pub(crate) fn sample_starts(
     object_half_m: f32,
     settings: WorldSettings,
 ) -> Vec<ArmStart> {
+    if layout.task.shares_object() {
+        return bar::sample(rng, settings);
+    }
     match layout.task.world() {
-        World::Classic => sample_classic(rng, layout, object_half_m, settings),
+        World::Classic | World::Slow => sample_classic(rng, layout, object_half_m, settings),
         World::Shared => shared::sample(rng, layout, object_half_m, settings),
     }
 }

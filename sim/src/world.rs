@@ -6,6 +6,7 @@ use rapier3d::math::{Pose, Rotation, Vector};
 use tandem_core::{ArmIndex, Contacts, Layout};
 
 use crate::arm::{Arm, Command};
+use crate::bar;
 use crate::config::{SimError, WorldConfig};
 use crate::frame::{ArmFrame, MAX_ARMS};
 use crate::link_avoidance::VelocityDamper;
@@ -16,12 +17,27 @@ use crate::randomization::{Episode, TABLE_FRICTION};
 /// Half extents of the table, metres; its top is at z = 0.
 pub(crate) const TABLE_HALF_M: Vector = Vector::new(0.8, 0.6, 0.05);
 
-/// The state of all bodies. There is one object per arm, in arm order.
+/// Force of a pad above which it presses on the bar, newtons.
+const GRIPPING_N: f32 = 0.5;
+
+/// The motion of an object, world frame, metres and seconds.
+pub(crate) struct ObjectState {
+    pub(crate) position: Vector,
+    pub(crate) velocity: Vector,
+    pub(crate) rotation: Rotation,
+    pub(crate) angular_velocity: Vector,
+}
+
+/// The state of all bodies. There is one object per arm, in arm order, or one bar.
 #[derive(Clone)]
 pub(crate) struct World {
     pub(crate) physics: Physics,
     pub(crate) arms: Vec<Arm>,
     pub(crate) objects: Vec<RigidBodyHandle>,
+    /// Whether the object is a bar that both arms share.
+    pub(crate) has_bar: bool,
+    /// The arms whose pads have pressed on the bar from both sides during the last control step.
+    gripping: [bool; MAX_ARMS],
     /// Present if there are two arms.
     damper: Option<VelocityDamper>,
     substeps: u32,
@@ -44,12 +60,19 @@ impl World {
             let frame = ArmFrame::new(arm, layout.n_arms);
             add_table(&mut physics, arm, frame);
             arms.push(Arm::build(&mut physics, arm, frame, layout.task, config));
-            objects.push(add_object(&mut physics, arm, config, friction.object));
+            if !layout.task.shares_object() {
+                objects.push(add_object(&mut physics, arm, config, friction.object));
+            }
+        }
+        if layout.task.shares_object() {
+            objects.push(bar::build(&mut physics, friction.object));
         }
         Self {
             physics,
             arms,
             objects,
+            has_bar: layout.task.shares_object(),
+            gripping: [false; MAX_ARMS],
             damper: None,
             substeps: config.substeps_in(kind),
             delay_substeps: 0,
@@ -66,7 +89,22 @@ impl World {
         let (sin, cos) = libm::sincosf(0.5 * yaw_rad);
         let turned = frame.orientation_in_world() * Rotation::from_xyzw(0.0, 0.0, sin, cos);
         let pose = Pose::from_parts(frame.world_from_arm(at_in_arm), turned);
-        let body = &mut self.physics.bodies[self.objects[arm.0]];
+        self.place_body(self.objects[arm.0], pose);
+    }
+
+    /// Places the bar, at rest and level, between its handles: those of both arms, arm frames, metres. The bar is rotated
+    /// by `yaw_rad` from the line through the arms' bases.
+    pub(crate) fn place_bar(&mut self, handles_in_arm: [Vector; MAX_ARMS], yaw_rad: f32) {
+        let handle = |arm: usize| self.arms[arm].frame.world_from_arm(handles_in_arm[arm]);
+        let centre = (handle(0) + handle(1)) * 0.5;
+        let (sin, cos) = libm::sincosf(0.5 * yaw_rad);
+        let turned = Rotation::from_xyzw(0.0, 0.0, sin, cos);
+        self.place_body(self.objects[0], Pose::from_parts(centre, turned));
+        self.gripping = [false; MAX_ARMS];
+    }
+
+    fn place_body(&mut self, body: RigidBodyHandle, pose: Pose) {
+        let body = &mut self.physics.bodies[body];
         body.set_position(pose, true);
         body.set_linvel(Vector::ZERO, true);
         body.set_angvel(Vector::ZERO, true);
@@ -77,16 +115,18 @@ impl World {
         self.arms[arm.0].place(&mut self.physics, end_effector_in_arm, opening_m);
     }
 
-    /// Gives objects, pads and table the properties that were drawn for an episode, and delays its actions. To be called
-    /// before the first step and before the arms are placed.
+    /// Gives objects, pads and table the properties that were drawn for an episode, and delays its actions. A bar keeps
+    /// its size and mass. To be called before the first step and before the arms are placed.
     pub(crate) fn vary(&mut self, episode: &Episode) {
         let half_m = episode.object_half_m;
         for object in &self.objects {
             for collider in self.physics.bodies[*object].colliders() {
-                let cube = &mut self.physics.colliders[*collider];
-                cube.set_shape(SharedShape::cuboid(half_m, half_m, half_m));
-                cube.set_mass(episode.object_mass_kg);
-                cube.set_friction(episode.friction.object);
+                let part = &mut self.physics.colliders[*collider];
+                if !self.has_bar {
+                    part.set_shape(SharedShape::cuboid(half_m, half_m, half_m));
+                    part.set_mass(episode.object_mass_kg);
+                }
+                part.set_friction(episode.friction.object);
             }
         }
         for finger in self.arms.iter().flat_map(|arm| &arm.hand.fingers) {
@@ -141,9 +181,44 @@ impl World {
         self.damper.as_ref().map_or(0, VelocityDamper::n_interventions)
     }
 
-    /// Returns the body of `arm`'s object.
+    /// Returns the body of `arm`'s object: the bar if the arms share one.
     pub(crate) fn object(&self, arm: ArmIndex) -> &RigidBody {
-        &self.physics.bodies[self.objects[arm.0]]
+        &self.physics.bodies[self.object_handle(arm)]
+    }
+
+    /// Returns the handle of the body of `arm`'s object.
+    pub(crate) fn object_handle(&self, arm: ArmIndex) -> RigidBodyHandle {
+        self.objects[if self.has_bar { 0 } else { arm.0 }]
+    }
+
+    /// Returns the point of the object's body that `arm` brings to its goal: the centre, or its handle of the bar; body
+    /// frame, metres.
+    pub(crate) fn object_point(&self, arm: ArmIndex) -> Vector {
+        if self.has_bar { bar::handle(arm) } else { Vector::ZERO }
+    }
+
+    /// Returns the motion of `arm`'s object, or of its handle of the bar.
+    pub(crate) fn object_state(&self, arm: ArmIndex) -> ObjectState {
+        let body = self.object(arm);
+        let (position, velocity) = (body.translation(), body.linvel());
+        let (rotation, angular_velocity) = (*body.rotation(), body.angvel());
+        if !self.has_bar {
+            return ObjectState { position, velocity, rotation, angular_velocity };
+        }
+        let lever = rotation * self.object_point(arm);
+        ObjectState {
+            position: position + lever,
+            velocity: velocity + angular_velocity.cross(lever),
+            // A bar along x looks the same to both arms.
+            rotation: rotation * self.arms[arm.0].frame.orientation_in_world(),
+            angular_velocity,
+        }
+    }
+
+    /// Returns true if the pads of `arm` have pressed on the bar from both sides in a physics step of the last control
+    /// step.
+    pub(crate) fn is_gripping(&self, arm: ArmIndex) -> bool {
+        self.gripping[arm.0]
     }
 
     #[cfg(test)]
@@ -160,11 +235,15 @@ impl World {
             damper.update_posture([first, second], &self.physics);
         }
         let mut contacts = Contacts::NONE;
+        self.gripping = [false; MAX_ARMS];
         let previous = std::mem::replace(&mut self.previous, *commands);
         for substep in 0..self.substeps {
             self.drive(if substep < self.delay_substeps { &previous } else { commands });
             self.physics.step();
             contacts = contacts | self.physics.hand_contacts();
+            if self.has_bar {
+                self.update_gripping();
+            }
         }
         self.check_finite()?;
         if self.link_gap_m() < 0.0 {
@@ -186,6 +265,20 @@ impl World {
         }
         for ((arm, command), velocity) in self.arms.iter().zip(commands).zip(velocities) {
             arm.hand.drive(&mut self.physics, velocity, command.gripper);
+        }
+    }
+
+    fn update_gripping(&mut self) {
+        let bar = self.physics.bodies[self.objects[0]].colliders();
+        for (arm, gripping) in self.arms.iter().zip(&mut self.gripping) {
+            let presses = |outward: f32| {
+                let pads = arm.hand.fingers.iter().filter(|finger| finger.outward == outward);
+                let pads: Vec<ColliderHandle> = pads.map(|finger| finger.pad).collect();
+                let touches =
+                    |pad| bar.iter().any(|part| self.physics.presses(pad, *part, GRIPPING_N));
+                pads.into_iter().any(touches)
+            };
+            *gripping = *gripping || (presses(1.0) && presses(-1.0));
         }
     }
 

@@ -9,12 +9,16 @@ use tandem_sim::{Env, WorldConfig};
 const N_SEEDS: u64 = 1000;
 const HALF_M: f32 = 0.0225;
 /// Every episode starts with the objects grasped where the task allows it.
-const GRASPED: WorldSettings =
-    WorldSettings { grasped_start_prob: 1.0, substeps: 20, randomization: 0.0 };
+const GRASPED: WorldSettings = WorldSettings {
+    grasped_start_prob: 1.0,
+    grasped_start_env_steps: 0,
+    substeps: 20,
+    randomization: 0.0,
+};
 
 fn layouts_in(world: World) -> impl Iterator<Item = Layout> {
     let tasks = Task::ALL.into_iter().filter(move |task| task.world() == world);
-    tasks.flat_map(|task| [1, 2].map(|n_arms| Layout::new(task, n_arms)))
+    tasks.flat_map(|task| (task.min_arms()..=2).map(move |n_arms| Layout::new(task, n_arms)))
 }
 
 fn layouts() -> impl Iterator<Item = Layout> {
@@ -25,7 +29,9 @@ fn layouts() -> impl Iterator<Item = Layout> {
 fn each_start(layout: Layout, settings: WorldSettings, mut look: impl FnMut(&mut Env, &[f32])) {
     let mut env = Env::new(layout, &WorldConfig::default()).expect("a valid world");
     let mut observation = vec![0.0; layout.n_observation()];
-    for seed in 0..N_SEEDS {
+    // A step of a bar takes as long as ten of other tasks.
+    let n_seeds = if layout.task.shares_object() { N_SEEDS / 10 } else { N_SEEDS };
+    for seed in 0..n_seeds {
         env.reset(&mut episode_rng(seed, 0, Stream::Reset), settings);
         env.observe(&mut observation);
         look(&mut env, &observation);
@@ -122,6 +128,46 @@ fn shared_starts_are_in_reach_apart_and_not_yet_successful() {
 }
 
 #[test]
+fn bars_start_on_the_table_and_their_goals_are_level_and_above_it() {
+    let layout = Layout::new(Task::CarryBar, 2);
+    for settings in [WorldSettings::default(), GRASPED] {
+        let is_held = settings == GRASPED;
+        let (mut n_turned, mut n_right) = (0, 0);
+        each_start(layout, settings, |env, observation| {
+            let scene = env.scene();
+            let [left, right] = [0, 1].map(|arm| scene.objects[arm].centre);
+            for (arm, handle) in layout.arms().zip([left, right]) {
+                let seen = &observation[layout.observation_of(arm)];
+                let goal = &env.goal()[layout.goal_of(arm)];
+                assert!(distance(&seen[3..6], goal) >= 0.08, "{seen:?} {goal:?}");
+                let in_world = distance(&handle, &scene.goals[arm.0]);
+                assert!((distance(&seen[3..6], goal) - in_world).abs() < 1e-6);
+                let [x, y, z] = env.goal_area();
+                for (number, [low, high]) in goal.iter().zip([x, y, z]) {
+                    assert!((low - 1e-6..=high + 1e-6).contains(number), "{goal:?}");
+                }
+                let height_m = seen[5];
+                let is_valid = match is_held {
+                    true => {
+                        (0.1..0.2501).contains(&height_m) && distance(&seen[6..9], &[0.0; 3]) < 0.01
+                    }
+                    false => (height_m - HALF_M).abs() < 1e-6 && seen[2] > 0.0999,
+                };
+                assert!(is_valid, "{seen:?}");
+                assert!(seen[12].abs() + seen[13].abs() < 1e-6 && seen[15] > 0.98, "not level");
+                assert_eq!(seen[14].to_bits(), observation[14].to_bits(), "another angle");
+            }
+            assert!((distance(&left, &right) - 0.32).abs() < 1e-5);
+            let [first, second] = [0, 1].map(|arm| scene.goals[arm]);
+            assert!((distance(&first, &second) - 0.32).abs() < 1e-5 && first[2] == second[2]);
+            n_turned += u32::from(observation[14].abs() > 0.087);
+            n_right += u32::from(left[0] + right[0] > 0.0);
+        });
+        assert!((30..70).contains(&n_turned) && (30..70).contains(&n_right), "of 100");
+    }
+}
+
+#[test]
 fn shared_starts_fill_the_area_and_objects_point_in_all_directions() {
     for layout in layouts_in(World::Shared) {
         let mut n_far = [0; 3];
@@ -182,7 +228,7 @@ fn grasped_starts_keep_holding_while_the_hand_moves() {
         let n_arms = layout.n_arms;
         let mut env = Env::new(layout, &WorldConfig::default()).expect("a valid world");
         let mut observation = vec![0.0; layout.n_observation()];
-        for seed in 0..60 {
+        for seed in 0..if layout.task.shares_object() { 12 } else { 60 } {
             env.reset(&mut episode_rng(seed, 0, Stream::Reset), GRASPED);
             env.observe(&mut observation);
             let before = observation.clone();
@@ -200,7 +246,9 @@ fn grasped_starts_keep_holding_while_the_hand_moves() {
             for arm in 0..n_arms {
                 let of_hand = arm * OBSERVATION_PER_ARM + 6..arm * OBSERVATION_PER_ARM + 9;
                 let slip_m = distance(&before[of_hand.clone()], &observation[of_hand]);
-                assert!(slip_m < 2e-3, "seed {seed}: slipped by {slip_m} m");
+                // Pads meet a turned bar at an angle and settle.
+                let most_m = if layout.task.shares_object() { 5e-3 } else { 2e-3 };
+                assert!(slip_m < most_m, "seed {seed}: slipped by {slip_m} m");
                 let object_z = layout.achieved_goal_of(ArmIndex(arm)).end - 1;
                 // A hand near the ceiling of its workspace cannot rise.
                 let can_rise = before[object_z] < 0.29;

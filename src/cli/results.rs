@@ -36,7 +36,7 @@ pub(crate) struct EvalArgs {
     /// One-arm policy of the composed teachers [default: the shipped teacher of the task].
     #[arg(long, value_name = "FILE", requires = "baselines")]
     pub(crate) teacher: Option<PathBuf>,
-    /// Fails unless the policy is for this task.
+    /// Fails unless the policy is for this task, or composed teachers for its arms.
     #[arg(long, value_parser = TaskName::parser())]
     pub(crate) task: Option<TaskName>,
     /// Fails unless the policy is for this world.

@@ -137,9 +137,10 @@ pub(crate) struct LearnerArgs {
     /// the resolved settings to run.toml in the run directory. If the run is complete, exits at once with code 0.
     #[arg(long, conflicts_with = "resume")]
     pub(crate) start_or_resume: bool,
-    /// Number of threads of the update, 1 or 2. It does not affect the result.
-    #[arg(long, default_value_t = 2, value_parser = clap::value_parser!(u8).range(1..=2))]
-    pub(crate) threads: u8,
+    /// Number of threads of the update, 1 to 64 [default: the number of cores, at most 16]. It does not affect the
+    /// result.
+    #[arg(long, value_parser = clap::value_parser!(u8).range(1..=64))]
+    pub(crate) threads: Option<u8>,
     /// Serves the run's dashboard at http://ADDR/ [default: none]. An address that other machines can reach requires a
     /// token, which the page asks for.
     #[arg(long, value_name = "ADDR")]
@@ -260,6 +261,7 @@ Examples:
   tandem env --task pick-and-place --arms 1 --listen 127.0.0.1:7005
   tandem train --env 127.0.0.1:7005 --task pick-and-place --arms 1
   tandem train --env-command 'tandem env'  # one server per worker
+  tandem env --task carry-bar --describe | jq .manipulation
 
 docs/environments.md describes the protocol, and how to write a server in another language."
 )]
@@ -273,6 +275,9 @@ pub(crate) struct EnvArgs {
     /// Number of arms.
     #[arg(long, default_value_t = 2, value_parser = clap::value_parser!(u8).range(1..=2))]
     pub(crate) arms: u8,
+    /// Prints the description of the task as JSON and exits.
+    #[arg(long)]
+    pub(crate) describe: bool,
     /// Largest number of environments of all streams together. A stream has 1024 at most.
     #[arg(long, value_name = "N", default_value_t = 4096, value_parser = clap::value_parser!(u16).range(1..))]
     pub(crate) max_environments: u16,

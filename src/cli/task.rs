@@ -13,8 +13,12 @@ use crate::exit::Failed;
 /// A task in any world.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub(crate) enum TaskName {
+    /// Push an object to its goal.
     Push,
+    /// Grasp an object and move it to its goal.
     PickAndPlace,
+    /// Carry a bar to its goal with two arms; it has a world of its own.
+    CarryBar,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
@@ -40,25 +44,38 @@ impl TaskName {
         TaskNameParser
     }
 
-    /// Returns the task in a world; the default is [`World::DEFAULT`].
-    pub(crate) fn in_named_world(self, world: Option<WorldName>) -> Task {
-        self.in_world(world.map_or(World::DEFAULT, World::from))
+    /// Returns the task in a world; the default is [`World::DEFAULT`], or the only world of the task.
+    pub(crate) fn in_named_world(self, world: Option<WorldName>) -> Result<Task, Failed> {
+        match world {
+            Some(world) => in_world(self.in_default_world(), world),
+            None => Ok(self.in_default_world()),
+        }
     }
 
-    const fn in_world(self, world: World) -> Task {
+    pub(crate) const fn in_default_world(self) -> Task {
         match self {
-            Self::Push => Task::Push.in_world(world),
-            Self::PickAndPlace => Task::PickAndPlace.in_world(world),
+            Self::Push => Task::Push,
+            Self::PickAndPlace => Task::PickAndPlace,
+            Self::CarryBar => Task::CarryBar,
         }
     }
 }
 
+fn in_world(task: Task, world: WorldName) -> Result<Task, Failed> {
+    task.in_world(world.into()).ok_or_else(|| {
+        Failed::usage(format!("{task} exists in a world of its own: leave out --world"))
+    })
+}
+
 /// Returns the task that the options name, or `None` if they name none. The default task is to push; the default world
 /// is [`World::DEFAULT`].
-pub(crate) fn chosen_task(task: Option<TaskName>, world: Option<WorldName>) -> Option<Task> {
+pub(crate) fn chosen_task(
+    task: Option<TaskName>,
+    world: Option<WorldName>,
+) -> Result<Option<Task>, Failed> {
     match (task, world) {
-        (None, None) => None,
-        (task, _) => Some(task.unwrap_or(TaskName::Push).in_named_world(world)),
+        (None, None) => Ok(None),
+        (task, _) => task.unwrap_or(TaskName::Push).in_named_world(world).map(Some),
     }
 }
 
@@ -68,8 +85,11 @@ pub(crate) fn check_task(
     task: Option<TaskName>,
     world: Option<WorldName>,
 ) -> Result<(), Failed> {
-    let world = world.map_or(of_policy.world(), World::from);
-    let named = task.map_or(of_policy.in_world(world), |task| task.in_world(world));
+    let named = match (task.map(TaskName::in_default_world), world) {
+        (task, Some(world)) => in_world(task.unwrap_or(of_policy), world)?,
+        (Some(task), None) => task.in_world(of_policy.world()).unwrap_or(task),
+        (None, None) => of_policy,
+    };
     if named == of_policy {
         return Ok(());
     }
@@ -95,10 +115,10 @@ pub(crate) fn check_layout(
 
 /// Returns the options that choose `task`.
 pub(crate) fn task_flags(task: Task) -> String {
-    let name = task.in_world(World::Classic);
-    match task.world() {
-        World::DEFAULT => format!("--task {name}"),
-        world => format!("--task {name} --world {world}"),
+    match (task.in_world(World::DEFAULT), task.world()) {
+        (None, _) => format!("--task {task}"),
+        (Some(name), World::DEFAULT) => format!("--task {name}"),
+        (Some(name), world) => format!("--task {name} --world {world}"),
     }
 }
 
@@ -139,11 +159,15 @@ mod tests {
     fn the_options_name_a_task_in_a_world() {
         let (push, pick) = (Some(TaskName::Push), Some(TaskName::PickAndPlace));
         let (classic, shared) = (Some(WorldName::Classic), Some(WorldName::Shared));
-        assert_eq!(chosen_task(None, None), None);
-        assert_eq!(chosen_task(pick, None), Some(Task::PickAndPlace.in_world(World::DEFAULT)));
-        assert_eq!(chosen_task(pick, shared), Some(Task::SharedPickAndPlace));
-        assert_eq!(chosen_task(push, classic), Some(Task::Push));
-        assert_eq!(chosen_task(None, shared), Some(Task::SharedPush));
+        let bar = Some(TaskName::CarryBar);
+        let chosen = |task, world| chosen_task(task, world).expect("a task of this world");
+        assert_eq!(chosen(None, None), None);
+        assert_eq!(chosen(pick, None), Task::PickAndPlace.in_world(World::DEFAULT));
+        assert_eq!(chosen(pick, shared), Some(Task::SharedPickAndPlace));
+        assert_eq!(chosen(push, classic), Some(Task::Push));
+        assert_eq!(chosen(None, shared), Some(Task::SharedPush));
+        assert_eq!(chosen(bar, None), Some(Task::CarryBar));
+        assert!(chosen_task(bar, shared).is_err());
     }
 
     #[test]
@@ -154,6 +178,9 @@ mod tests {
         assert!(!refused(None, Some(WorldName::Shared)));
         assert!(refused(Some(TaskName::PickAndPlace), None));
         assert!(refused(Some(TaskName::Push), Some(WorldName::Classic)));
+        assert!(refused(Some(TaskName::CarryBar), None));
+        assert!(check_task(Task::CarryBar, Some(TaskName::CarryBar), None).is_ok());
+        assert!(check_task(Task::CarryBar, Some(TaskName::PickAndPlace), None).is_err());
     }
 
     #[test]
@@ -169,5 +196,6 @@ mod tests {
     fn the_flags_of_a_task_name_its_world_unless_it_is_the_default() {
         assert_eq!(task_flags(Task::PickAndPlace), "--task pick-and-place");
         assert_eq!(task_flags(Task::SharedPush), "--task push --world shared");
+        assert_eq!(task_flags(Task::CarryBar), "--task carry-bar");
     }
 }

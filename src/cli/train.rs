@@ -22,6 +22,7 @@ Examples:
   tandem train --settings   # every setting, its meaning and its values
   tandem train --arms 1 --task push --until-success 0.97
   tandem train --world shared  # both arms share one area and are slow
+  tandem train --task carry-bar  # two arms carry one bar
   tandem train --strategy ea --budget 50000 --seed 2 --max-minutes 20
   tandem train --strategy jsrl:20 --budget 10000
   tandem train --teacher runs/NAME/policy/best.safetensors

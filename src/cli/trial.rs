@@ -14,13 +14,16 @@ Examples:
       --mode closed-loop --trials 200 --seed 3
   tandem bridge trial --policy policies/student-push.safetensors \\
       --composed-teachers policies/teacher-push.safetensors
+  tandem bridge trial --task carry-bar --mode closed-loop \\
+      --composed-teachers policies/teacher-pick-and-place.safetensors
   tandem report runs/trial-push")]
 #[command(group = clap::ArgGroup::new("who").required(true).multiple(true))]
 pub(crate) struct TrialArgs {
     /// Policy for both arms, reported under the name of its file or run directory; can be repeated.
     #[arg(long = "policy", value_name = "FILE", group = "who")]
     pub(crate) policies: Vec<PathBuf>,
-    /// One-arm policy that controls each arm separately; can be repeated.
+    /// One-arm policy that controls each arm separately, in the task of the other policies or of --task if it performs one
+    /// arm's part of that; can be repeated.
     #[arg(long, value_name = "FILE", group = "who")]
     pub(crate) composed_teachers: Vec<PathBuf>,
     /// Fails unless the policies are for this task.
@@ -42,9 +45,10 @@ pub(crate) struct TrialArgs {
     /// Fraction of the highest speed, above 0 and at most 1.
     #[arg(long, default_value_t = 1.0)]
     pub(crate) speed: f64,
-    /// Edge of the blocks in cm; 4.5 in training, 9 in the paper's trials.
-    #[arg(long, default_value_t = 5.6)]
-    pub(crate) block_cm: f32,
+    /// Edge of the blocks in cm; 4.5 in training, 9 in the paper's trials. An object that both arms share keeps its size
+    /// [default: 5.6].
+    #[arg(long)]
+    pub(crate) block_cm: Option<f32>,
     /// Trials to record to MCAP files.
     #[arg(long, value_enum, default_value_t = RecordName::Failures)]
     pub(crate) record: RecordName,

@@ -31,10 +31,11 @@ impl Baselines {
         }
         let path = match &args.teacher {
             Some(path) => path.clone(),
-            None => policy_file::shipped_teacher(layout.task.name())?,
+            None => policy_file::shipped_teacher(layout.task.of_one_arm().name())?,
         };
         let teacher = policy_file::load(&path)?;
-        let composed = EvaluatedPolicy::composed(teacher, layout.n_arms, &path)?;
+        let composed =
+            EvaluatedPolicy::composed(teacher, (Some(layout.task), layout.n_arms), &path)?;
         if composed.layout() != layout {
             return Err(Failed::usage(format!(
                 "{} is a teacher for {}, the policy is for {}",
@@ -89,12 +90,13 @@ impl Baselines {
 type Share = fn(&EvaluationSummary) -> Option<f64>;
 
 /// The rows of the table.
-const MEASURES: [(&str, Share); 5] = [
+const MEASURES: [(&str, Share); 6] = [
     ("no contact", |summary| summary.success_without_contact),
     ("success", |summary| Some(summary.success)),
     ("arm contact", |summary| summary.arm_contact_rate),
     ("table contact", |summary| summary.table_contact_rate),
     ("any contact", |summary| Some(summary.collision_rate)),
+    ("lost goal", |summary| Some(summary.lost_goal_rate)),
 ];
 
 /// Returns the row of one share, with a cell for each policy.

@@ -59,7 +59,7 @@ pub(super) fn import(args: &ImportArgs) -> Result<(), Failed> {
     let refused = |source| refused(&args.actor, source);
     let layout = match (args.task, args.arms) {
         (Some(task), Some(n_arms)) => {
-            Layout::new(task.in_named_world(args.world), usize::from(n_arms))
+            Layout::new(task.in_named_world(args.world)?, usize::from(n_arms))
         }
         _ => layout_of(&actor, Role::Actor).map_err(refused)?,
     };

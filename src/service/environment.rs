@@ -6,11 +6,20 @@ use tandem_environment::{Config, Error};
 use super::listen::listen_with_scheme;
 use super::run;
 use crate::cli::EnvArgs;
-use crate::exit::{Exit, Failed};
+use crate::exit::{Exit, Failed, OrExit as _};
 use crate::version::VERSION;
-use crate::{access, metrics, signals};
+use crate::{access, metrics, output, signals};
 
 pub(crate) fn environment(args: EnvArgs) -> Result<(), Failed> {
+    let layout = Layout::new(args.task.in_named_world(args.world)?, usize::from(args.arms));
+    let (task, n_arms) = (layout.task, layout.n_arms);
+    if n_arms < task.min_arms() {
+        return Err(Failed::usage(format!("--arms {n_arms}: {task} takes {}", task.min_arms())));
+    }
+    if args.describe {
+        let described = serde_json::to_string(&layout.description());
+        return output::print(described.or_exit(Exit::Bug, String::new)?);
+    }
     let own = metrics::of_process("environment");
     let server_config =
         access::server_config(&args.listen, &args.secret)?.with_metrics(own.clone());
@@ -19,7 +28,7 @@ pub(crate) fn environment(args: EnvArgs) -> Result<(), Failed> {
         metrics::serve(&args.metrics, &own).await?;
         let listener = listen_with_scheme(&args.listen).await?;
         let config = Config {
-            layout: Layout::new(args.task.in_named_world(args.world), usize::from(args.arms)),
+            layout,
             max_environments: usize::from(args.max_environments),
             server: format!("tandem {VERSION}"),
         };

@@ -1,6 +1,7 @@
 //! `tandem learner`.
 
 use std::net::SocketAddr;
+use std::num::NonZero;
 use std::path::PathBuf;
 use std::time::Duration;
 
@@ -53,7 +54,7 @@ pub(crate) fn learner(args: LearnerArgs) -> Result<(), Failed> {
             resume: args.resume || args.start_or_resume,
             out_is_locked: args.out_is_locked,
             run_file,
-            n_threads: usize::from(args.threads),
+            n_threads: args.threads.map_or_else(default_threads, usize::from),
             clock: clock::since_now(),
             unix_start: Duration::from_millis(unix_start_ms),
             version: VERSION.to_owned(),
@@ -73,6 +74,12 @@ pub(crate) fn learner(args: LearnerArgs) -> Result<(), Failed> {
             false => Ok(()),
         }
     })
+}
+
+/// Returns the number of threads of the update: the number of cores, up to the tasks of a step of an update.
+fn default_threads() -> usize {
+    const MAX_THREADS: usize = 16;
+    std::thread::available_parallelism().map_or(1, NonZero::get).min(MAX_THREADS)
 }
 
 /// A bound dashboard.

@@ -262,7 +262,7 @@ fn settings_of(args: &TrainArgs) -> Result<Vec<(String, Value)>, Failed> {
         .iter()
         .map(|setting| run_file::parse_setting(setting))
         .collect::<Result<Vec<_>, _>>()?;
-    let task = chosen_task(args.task, args.world);
+    let task = chosen_task(args.task, args.world)?;
     let names_task = args.run.is_some() || settings.iter().any(|(key, _)| key == "task");
     if args.world.is_some() && args.task.is_none() && (names_task || args.resume) {
         return Err(Failed::usage(
@@ -325,6 +325,12 @@ fn free_run_directory(config: &RunConfig) -> (PathBuf, PathBuf) {
     (base, free)
 }
 
+/// Returns the name of the task that the run's teacher performs.
+fn task_of_teacher(config: &RunConfig) -> String {
+    let one_arm = config.layout().ok().and_then(|layout| layout.single_arm());
+    one_arm.map_or_else(|| config.task.clone(), |task| task.name().to_owned())
+}
+
 /// Loads the teacher, which must be a one-arm policy for the task.
 fn teacher_file(args: &TrainArgs, config: &RunConfig, out: &Path) -> Result<TeacherFile, Failed> {
     let own = || TeacherFile::copy_in(&out.join("policy"));
@@ -333,7 +339,8 @@ fn teacher_file(args: &TrainArgs, config: &RunConfig, out: &Path) -> Result<Teac
         None => match args.resume.then(own).flatten() {
             Some(own) => own?,
             None => {
-                let path = policy_file::shipped_teacher_of(config.recipe, &config.task)?;
+                let path =
+                    policy_file::shipped_teacher_of(config.recipe, &task_of_teacher(config))?;
                 TeacherFile::load(path, None)?
             }
         },

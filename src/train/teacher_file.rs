@@ -122,14 +122,19 @@ impl TeacherFile {
                 self.layout.n_arms()
             )));
         }
-        if self.layout.name() != config.task {
+        let one_arm = config.layout().or_exit(Exit::Usage, String::new)?.single_arm();
+        let wanted = one_arm.as_ref().map_or(config.task.as_str(), TaskSpec::name);
+        if self.layout.name() != wanted {
+            let needed = match wanted == config.task {
+                true => String::new(),
+                false => format!(", which needs one for {wanted}"),
+            };
             return Err(Failed::usage(format!(
-                "{shown} is a teacher for {}, the run is for {}",
+                "{shown} is a teacher for {}, the run is for {}{needed}",
                 self.layout.name(),
                 config.task
             )));
         }
-        let one_arm = config.layout().or_exit(Exit::Usage, String::new)?.single_arm();
         if let Some(difference) = one_arm.and_then(|task| task.difference(&self.layout)) {
             return Err(Failed::usage(format!(
                 "{shown} is a teacher for another task {:?} than the run's: {difference}",

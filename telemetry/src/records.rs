@@ -96,7 +96,8 @@ fn lengths_fit(opcode: u8, body: &[u8]) -> Option<()> {
     }
     let (mut last, _) = split_string(rest)?;
     while has_map && !last.is_empty() {
-        (_, last) = split_string(last)?;
+        let (_key, value) = split_string(last)?;
+        (_, last) = split_string(value)?;
     }
     Some(())
 }
@@ -154,6 +155,8 @@ mod tests {
         check(op::METADATA, &[0; 4]);
         check(op::METADATA, &[0, 0, 0, 0, 8, 0, 0, 0]);
         check(op::METADATA, &[0, 0, 0, 0, 12, 0, 0, 0, 0, 0, 0, 0]);
+        // A map of one empty key: the length of its value lies behind the map.
+        check(op::METADATA, &[0, 0, 0, 0, 4, 0, 0, 0, 0, 0, 0, 0]);
         check(op::SCHEMA, &[0; 2]);
         check(op::SCHEMA, &[0; 6]);
         check(op::SCHEMA, &[0; 10]);

@@ -18,6 +18,8 @@ const WORLD: &str = "world";
 const NO_ROTATION: Quaternion = Quaternion { x: 0.0, y: 0.0, z: 0.0, w: 1.0 };
 const TABLE_COLOR: Color = rgb(0.82, 0.80, 0.77);
 const TEXT_COLOR: Color = rgb(0.15, 0.17, 0.20);
+/// Parts of an object that no arm brings to its goal.
+const PART_COLOR: Color = rgb(0.59, 0.61, 0.64);
 /// Colours of the arms and of their objects and goals; further arms reuse them.
 const ARM_COLORS: [Color; 3] =
     [rgb(0.16, 0.44, 0.73), rgb(0.87, 0.46, 0.16), rgb(0.27, 0.60, 0.35)];
@@ -36,8 +38,9 @@ pub(crate) fn scene_update(scene: &Scene, stamp: Timestamp, caption: &str) -> Sc
         .iter()
         .enumerate()
         .map(|(i, arm)| arm_entity(arm, color_of(i), entity(format!("arm{i}"))));
+    let object_color = |i| if i < scene.arms.len() { darker(color_of(i)) } else { PART_COLOR };
     let objects = scene.objects.iter().enumerate().map(|(i, object)| SceneEntity {
-        cubes: vec![cube(object, darker(color_of(i)))],
+        cubes: vec![cube(object, object_color(i))],
         ..entity(format!("object{i}"))
     });
     let goals = scene.goals.iter().enumerate().map(|(i, goal)| SceneEntity {

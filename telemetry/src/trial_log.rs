@@ -39,8 +39,8 @@ pub struct TrialMetadata {
     pub driver: String,
     /// Share of full speed, in (0, 1].
     pub speed: f64,
-    /// Half the edge length of the blocks, metres.
-    pub block_half_m: f64,
+    /// Half the edge length of the blocks, metres; `None` if the arms share an object.
+    pub block_half_m: Option<f64>,
 }
 
 /// State of the table and the arms at one time. Positions are in the world frame, metres; vectors are in arm order.
@@ -277,18 +277,21 @@ impl TrialMetadata {
     }
 
     fn start_line(&self) -> String {
+        let edge_mm = self.block_half_m.map(|half_m| 2000.0 * half_m);
+        let blocks = edge_mm.map(|edge_mm| format!(", blocks of {edge_mm:.0} mm"));
+        let blocks = blocks.unwrap_or_default();
         format!(
-            "{}, seed {}: driver {}, speed {}, blocks of {:.0} mm",
+            "{}, seed {}: driver {}, speed {}{blocks}",
             self.title(),
             self.seed,
             self.driver,
             self.speed,
-            2000.0 * self.block_half_m,
         )
     }
 
     fn to_map(&self) -> BTreeMap<String, String> {
-        entries([
+        let block = self.block_half_m.map(|half_m| ("block_half_m", half_m.to_string()));
+        let always = [
             ("format", FORMAT.to_owned()),
             ("subject", self.policy.clone()),
             ("task", self.layout.task.to_string()),
@@ -299,8 +302,8 @@ impl TrialMetadata {
             ("policy_digest", self.policy_digest.clone()),
             ("driver", self.driver.clone()),
             ("speed", self.speed.to_string()),
-            ("block_half_m", self.block_half_m.to_string()),
-        ])
+        ];
+        entries(always.into_iter().chain(block))
     }
 }
 
@@ -327,6 +330,6 @@ impl TrialOutcome {
     }
 }
 
-fn entries<const N: usize>(entries: [(&str, String); N]) -> BTreeMap<String, String> {
+fn entries<'a>(entries: impl IntoIterator<Item = (&'a str, String)>) -> BTreeMap<String, String> {
     with_checksum(entries.into_iter().map(|(key, value)| (key.to_owned(), value)).collect())
 }

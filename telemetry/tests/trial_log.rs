@@ -26,7 +26,7 @@ fn metadata() -> TrialMetadata {
         policy_digest: "5f3a".to_owned(),
         driver: "simulated".to_owned(),
         speed: 0.5,
-        block_half_m: 0.045,
+        block_half_m: Some(0.045),
     }
 }
 

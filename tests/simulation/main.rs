@@ -193,12 +193,12 @@ fn every_undisturbed_run_spends_its_budget_and_is_evaluated_four_times() {
 
 #[test]
 fn a_run_with_many_faults_ends_like_an_undisturbed_one() {
-    let runs = for_seeds(0..10, check_run);
+    let runs = for_seeds(0..7, check_run);
     let all = runs.iter().fold(Statistics::default(), Statistics::plus);
-    assert!(all.n_repeats > 40, "few repeated requests: {all:?}");
+    assert!(all.n_repeats > 28, "few repeated requests: {all:?}");
     assert!(all.n_resumed > 0, "few learners resumed: {all:?}");
-    assert!(all.n_teachers > 10, "few teacher restarts: {all:?}");
-    assert!(all.n_workers > 10 * 3, "few late or repeated joins: {all:?}");
+    assert!(all.n_teachers > 7, "few teacher restarts: {all:?}");
+    assert!(all.n_workers > 7 * 3, "few late or repeated joins: {all:?}");
 }
 
 #[test]
@@ -229,7 +229,7 @@ fn a_run_ends_despite_a_silent_open_connection() {
 
 #[test]
 fn the_same_seed_gives_the_same_trace() {
-    let compared = repeats::compare(&[Simulation(Kind::Run, 8), Simulation(Kind::Crowd, 4)], 3);
+    let compared = repeats::compare(&[Simulation(Kind::Run, 8), Simulation(Kind::Crowd, 4)], 2);
     println!("{}", compared.unwrap_or_else(|difference| panic!("{difference}")));
 }
 

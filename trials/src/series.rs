@@ -103,7 +103,8 @@ impl Series<'_> {
             policy_digest: self.policy.policy.digest(),
             driver: "sim".to_owned(),
             speed: self.config.speed,
-            block_half_m: f64::from(self.config.block.half_m),
+            block_half_m: (!self.config.layout.task.shares_object())
+                .then(|| f64::from(self.config.block.half_m)),
         }
     }
 

@@ -25,7 +25,8 @@ use crate::simulated::sensors::Cameras;
 use tandem_bridge::driver::{Command, Driver, DriverError, Faults, Order, PairState};
 
 pub use config::{
-    Block, CameraConfig, Disturbance, GripperConfig, N_SUBSTEPS, PERIOD_S, SimulatedConfig,
+    Block, CameraConfig, Disturbance, GripperConfig, N_SUBSTEPS, ObjectBox, PERIOD_S, SharedObject,
+    SimulatedConfig,
 };
 pub use drill::Drill;
 pub use physics::MAX_OPENING_M;
@@ -158,6 +159,15 @@ impl SimulatedPair {
         self.contacts
     }
 
+    /// The true opening of an arm's gripper: 0 is closed, 1 is open.
+    ///
+    /// # Panics
+    /// Panics if there is no such arm.
+    #[must_use]
+    pub fn opening(&self, arm: ArmIndex) -> f64 {
+        self.world.opening(arm.0)
+    }
+
     /// Returns whether parts of `arm` touched each other in the last period.
     ///
     /// # Panics
@@ -167,7 +177,7 @@ impl SimulatedPair {
         self.self_contacts[arm.0]
     }
 
-    /// The true poses of the objects.
+    /// The true poses of the objects; of a shared object, those of the arms' points.
     #[must_use]
     pub fn objects(&self) -> Vec<ObjectPose> {
         objects(&self.world, self.time_s())
@@ -183,7 +193,7 @@ impl SimulatedPair {
     #[must_use]
     pub fn scene(&self) -> Scene {
         let angles: Vec<Joints> = self.drives.arms.iter().map(|arm| arm.angles).collect();
-        scene::scene(&self.cell, &angles, &self.world, &self.config.blocks, self.time_s())
+        scene::scene(&self.cell, &angles, &self.world, self.time_s())
     }
 
     fn simulate_period(&mut self) {
@@ -309,9 +319,9 @@ fn arm_poses(cell: &WorkCell, angles: &[Joints]) -> impl Iterator<Item = ArmPose
 
 fn objects(world: &PhysicsWorld, time_s: f64) -> Vec<ObjectPose> {
     let pose = |idx| {
-        let body = world.object(idx);
-        let at_m = body.translation().as_dvec3();
-        ObjectPose { at_m, turn: body.rotation().as_dquat(), time_s }
+        let pose = world.object(idx);
+        let at_m = pose.translation.as_dvec3();
+        ObjectPose { at_m, turn: pose.rotation.as_dquat(), time_s }
     };
     (0..world.n_objects()).map(pose).collect()
 }

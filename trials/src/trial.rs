@@ -24,6 +24,7 @@ pub use mapping::Mapping;
 pub use outcome::{FailureCause, MotionRefusal, ObjectResult};
 pub use rehearsal::{Rehearsal, Rollout, TrialStart};
 pub use runner::TrialRunner;
+pub use training_hand::TrainingHand;
 
 pub mod mapping;
 pub mod outcome;
@@ -33,6 +34,8 @@ mod block_avoidance;
 mod closed_loop;
 mod rig;
 mod runner;
+mod shared_object;
+mod training_hand;
 
 /// Chooses the actions of a trial.
 pub trait ActionSource {

@@ -8,7 +8,8 @@ use tandem_policy::{Actor, Policy};
 use tandem_trials::SimulatedConfig;
 use tandem_trials::simulated::Block;
 use tandem_trials::trial::{
-    Frame, NoObserver, TrialConfig, TrialMode, TrialObserver, TrialReport, TrialRunner,
+    Frame, NoObserver, ObjectPositions, TrialConfig, TrialMode, TrialObserver, TrialReport,
+    TrialRunner,
 };
 
 fn shipped(name: &str) -> Actor {
@@ -62,6 +63,52 @@ fn a_trial_does_not_depend_on_the_trials_before_it() {
     let open = run(&mut trials(Task::Push, TrialMode::OpenLoop, 2), 2, &mut actor);
     let start = |report: &TrialReport| report.objects.iter().map(|o| o.start).collect::<Vec<_>>();
     assert_eq!(start(&open), start(&alone), "both modes have the same starts");
+}
+
+/// Collects the positions of the tools and the heights of the shared object's parts.
+#[derive(Default)]
+struct Carrying {
+    n_parts: Vec<usize>,
+    /// For each frame in which both parts are above the table, the distance between the tools, metres.
+    apart_m: Vec<f64>,
+}
+
+impl TrialObserver for Carrying {
+    fn on_frame(&mut self, frame: &Frame<'_>) {
+        self.n_parts.push(frame.scene.objects.len());
+        if frame.scene.objects[..2].iter().all(|part| part.centre[2] > 0.04) {
+            let tools = &frame.tools.measured;
+            self.apart_m.push(tools[0].distance(tools[1]));
+        }
+    }
+}
+
+#[test]
+fn two_arms_carry_one_object_together() {
+    let mut actor = shipped("teacher-pick-and-place.safetensors");
+    let mut trials = trials(Task::CarryBar, TrialMode::ClosedLoop, 1);
+    for number in 0..3 {
+        let mut carrying = Carrying::default();
+        let mut act = |observation: &[f32], goal: &[f32], action: &mut [f32]| {
+            actor.act(observation, goal, action);
+        };
+        let report = trials.run(number, &mut act, &mut carrying).unwrap();
+        assert_eq!(report.cause, None, "trial {number}");
+        assert_eq!(report.touched, Contacts::NONE);
+        assert!(report.arms_gap_m > 0.0 && report.table_gap_m > 0.0);
+        let apart_m = |point: fn(&ObjectPositions) -> glam::DVec3| {
+            point(&report.positions[0]).distance(point(&report.positions[1]))
+        };
+        assert!((apart_m(|object| object.start) - 0.32).abs() < 1e-3);
+        assert!((apart_m(|object| object.end) - 0.32).abs() < 1e-3, "one rigid body");
+        assert!(report.objects.iter().all(|object| object.highest_m > 0.09), "it was lifted");
+        assert!(carrying.n_parts.iter().all(|n| *n == 4), "two handles and the middle");
+        let [least, most] = carrying
+            .apart_m
+            .iter()
+            .fold([f64::INFINITY, 0.0], |[least, most]: [f64; 2], m| [least.min(*m), most.max(*m)]);
+        assert!(carrying.apart_m.len() > 20 && most - least < 0.02, "{least} to {most}");
+    }
 }
 
 /// Counts frames and collects their times.

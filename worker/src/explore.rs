@@ -59,6 +59,12 @@ impl Explorer {
 
     /// Turns the policy's action into the action to execute, shape `[n_action]`, in [-1, 1].
     pub fn explore(&mut self, action: &mut [f32]) {
+        self.explore_holding(action, |_arm| false);
+    }
+
+    /// As [`explore`](Self::explore), where `holds` tells which arms hold their objects: no random action opens their
+    /// grippers, because one such step drops an object.
+    pub fn explore_holding(&mut self, action: &mut [f32], holds: impl Fn(ArmIndex) -> bool) {
         let mut joint = None;
         for arm in self.layout.arms() {
             let own = HoldDraw::new(&mut self.rng, self.start_probability, self.hold_mean_steps);
@@ -67,6 +73,12 @@ impl Explorer {
             self.held[arm.0].advance(draw, &mut self.rng);
             let (part, held) = (self.layout.action_of(arm), &self.held[arm.0]);
             explore_arm(part, held, self.noise_std, &mut self.rng, action);
+            let gripper = self.layout.gripper_of(arm).filter(|_| held.n_steps_left > 0);
+            if let Some(gripper) = gripper
+                && holds(arm)
+            {
+                action[gripper] = -action[gripper].abs();
+            }
         }
     }
 }
@@ -239,6 +251,23 @@ mod tests {
         let std = (offsets.iter().map(|offset| offset * offset).sum::<f32>() / 20_000.0).sqrt();
         assert!((std - 0.2).abs() < 0.01, "deviation {std}");
         assert!(actions.iter().flatten().all(|component| (-1.0..=1.0).contains(component)));
+    }
+
+    #[test]
+    fn random_actions_keep_a_gripper_closed_that_holds() {
+        let carrying = Layout::new(Task::CarryBar, 2);
+        let mut explorer = Explorer::uniform(carrying, SETTINGS, rng(0));
+        let mut free = explorer.clone();
+        let mut n_open = 0;
+        for _ in 0..200 {
+            let (mut holding, mut other) = ([0.5; 8], [0.5; 8]);
+            explorer.explore_holding(&mut holding, |arm| arm.0 == 1);
+            free.explore(&mut other);
+            assert_eq!(holding[..7], other[..7], "nothing else differs");
+            assert_eq!(holding[7], -other[7].abs());
+            n_open += u32::from(other[7] > 0.0);
+        }
+        assert!(n_open > 50, "{n_open} of 200 random actions open a gripper that holds nothing");
     }
 
     #[test]

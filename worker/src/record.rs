@@ -13,6 +13,7 @@ use tandem_core::{Episode, EpisodeKind, Layout, TaskSpec, WorldSettings};
 use tandem_sim::{Env, SimError, WorldConfig};
 use tandem_telemetry::{EpisodeMetadata, EpisodeRecorder, TransitionRecord};
 
+use crate::rollout::world_of as world_of_order;
 use crate::trace::{Trace, TracedAdvice};
 
 /// A probability of earlier versions: training episodes that started with the hands anywhere above the table.
@@ -97,8 +98,7 @@ pub fn metadata_of(
         parameter_version: episode.parameter_version,
         layout: episode.layout.clone(),
         policy_digest,
-        world: terms
-            .world
+        world: world_of_order(&order, episode.kind, terms)
             .log_entries()
             .into_iter()
             .map(|(key, value)| (key.to_owned(), value))
@@ -231,7 +231,7 @@ fn record_step(
 
 /// Returns the reward of each arm for a step after which `observation` is observed, shape `[n_arms]`.
 pub(crate) fn rewards_per_arm(task: &TaskSpec, observation: &[f32], goal: &[f32]) -> Vec<f32> {
-    let reward = |arm| match task.arm_succeeds(arm, observation, goal) {
+    let reward = |arm| match task.arm_reaches_goal(arm, observation, goal) {
         true => REWARD_ACHIEVED,
         false => REWARD_PENDING,
     };

@@ -4,6 +4,7 @@ use tandem_core::rng::{Stream, episode_rng};
 use tandem_core::work::{EpisodeOrder, EpisodeStart, RunTerms, SlotOrder};
 use tandem_core::{
     AdviceUnit, Contacts, Episode, EpisodeKind, JudgedAction, StepAdvice, StepQuery, TaskSpec,
+    WorldSettings,
 };
 use tandem_sim::SimError;
 use tandem_telemetry::events::StepAdvised;
@@ -133,14 +134,23 @@ fn trace_scenes(rollouts: &mut [Rollout], env: &impl Environment) {
 /// Returns the starts of the episodes of `order`.
 #[must_use]
 pub fn episode_starts(order: &SlotOrder, terms: &RunTerms) -> Vec<EpisodeStart> {
-    let world = terms.world.for_kind(order.kind);
     let start = |episode: &EpisodeOrder| EpisodeStart {
         number: episode.number,
         seed: episode.seed,
         kind: order.kind,
-        world,
+        world: world_of(episode, order.kind, terms),
     };
     order.episodes.iter().map(start).collect()
+}
+
+/// Returns the world of an episode. It depends on how far the run had come when the episode was ordered.
+pub(crate) fn world_of(
+    episode: &EpisodeOrder,
+    kind: EpisodeKind,
+    terms: &RunTerms,
+) -> WorldSettings {
+    let n_steps = terms.layout.episode_steps() as u64;
+    terms.world.at(kind, episode.number.saturating_mul(n_steps))
 }
 
 /// Starts the episodes of `order`.
@@ -347,7 +357,8 @@ impl Rollout {
             policy_action.copy_from_slice(&self.action);
         }
         if let Some(explorer) = &mut self.explorer {
-            explorer.explore(&mut self.action);
+            let (layout, observation) = (&self.episode.layout, &self.observation);
+            explorer.explore_holding(&mut self.action, |arm| layout.arm_holds(arm, observation));
         }
     }
 

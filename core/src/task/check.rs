@@ -2,12 +2,14 @@
 
 use std::fmt::Display;
 
-use super::{MAX_ARMS, MAX_EPISODE_STEPS, MAX_NUMBERS, TaskDescription};
+use super::{Condition, MAX_ARMS, MAX_EPISODE_STEPS, MAX_NUMBERS, TaskDescription};
 use crate::layout::{Layout, Task};
 use crate::text::shortened;
 
 /// Longest name of a task, characters.
 const MAX_NAME_CHARS: usize = 64;
+/// Largest number of conditions of each kind for an arm.
+const MAX_CONDITIONS: usize = 16;
 
 /// A description of a task that is inconsistent or exceeds a limit.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
@@ -38,7 +40,7 @@ impl InvalidTask {
 
 /// Checks every field; NaN is in no range.
 pub(super) fn check(task: &TaskDescription) -> Result<(), InvalidTask> {
-    check_name(&task.name)?;
+    check_name("name", &task.name)?;
     for (field, n) in [
         ("n_observation", task.n_observation),
         ("n_goal", task.n_goal),
@@ -56,16 +58,17 @@ pub(super) fn check(task: &TaskDescription) -> Result<(), InvalidTask> {
     check_bounds("goal_bound", &task.goal_bound, task.n_goal)?;
     check_arms(task)?;
     check_recombination(task)?;
+    check_manipulation(task)?;
     check_reserved_name(task)
 }
 
-fn check_name(name: &str) -> Result<(), InvalidTask> {
+fn check_name(field: &str, name: &str) -> Result<(), InvalidTask> {
     let is_allowed = |c: char| c.is_ascii_lowercase() || c.is_ascii_digit() || "-_./".contains(c);
     let is_name = (1..=MAX_NAME_CHARS).contains(&name.len()) && name.chars().all(is_allowed);
     let expected =
         format_args!("1 to {MAX_NAME_CHARS} lower-case letters, digits, '-', '_', '.' and '/'")
             .to_string();
-    InvalidTask::unless(is_name, "name", expected, format_args!("{name:?}"))
+    InvalidTask::unless(is_name, field, expected, format_args!("{name:?}"))
 }
 
 /// The names of the built-in tasks belong to them.
@@ -138,6 +141,57 @@ fn check_recombination(task: &TaskDescription) -> Result<(), InvalidTask> {
         InvalidTask::unless(is_valid, format_args!("arms[{arm_idx}].lateral"), expected, got)?;
     }
     Ok(())
+}
+
+fn check_manipulation(task: &TaskDescription) -> Result<(), InvalidTask> {
+    let manipulation = &task.manipulation;
+    let (n_steps, n_arms) = (manipulation.success_steps, manipulation.arms.len());
+    within("manipulation.success_steps", n_steps, 1, task.episode_steps)?;
+    if !manipulation.one_arm_task.is_empty() {
+        check_name("manipulation.one_arm_task", &manipulation.one_arm_task)?;
+    }
+    let is_valid = task.arms.len() > 1
+        || (manipulation.one_arm_task.is_empty() && !manipulation.shared_object);
+    let expected = "several arms, or no shared_object and no one_arm_task";
+    InvalidTask::unless(is_valid, "manipulation", expected, "one arm")?;
+    let is_recombined = task.arms.iter().any(|arm| !arm.position.is_empty());
+    let is_valid = !(manipulation.shared_object && is_recombined);
+    let expected = "false for arms with positions, which are recombined";
+    InvalidTask::unless(is_valid, "manipulation.shared_object", expected, "true")?;
+    let expected = format_args!("none or {}", task.arms.len()).to_string();
+    let is_valid = n_arms == 0 || n_arms == task.arms.len();
+    InvalidTask::unless(is_valid, "manipulation.arms", expected, n_arms)?;
+    for (arm_idx, (own, arm)) in manipulation.arms.iter().zip(&task.arms).enumerate() {
+        let field = format!("manipulation.arms[{arm_idx}]");
+        if let Some(gripper) = own.gripper {
+            let (is_own, expected) = (arm.action.contains(&gripper), "an action of the arm");
+            InvalidTask::unless(is_own, format_args!("{field}.gripper"), expected, gripper)?;
+        }
+        within(format_args!("{field}.holding"), own.holding.len(), 0, MAX_CONDITIONS)?;
+        within(format_args!("{field}.conditions"), own.conditions.len(), 0, MAX_CONDITIONS)?;
+        for condition in own.all_conditions() {
+            check_condition(&field, condition, &arm.observation)?;
+        }
+    }
+    Ok(())
+}
+
+fn check_condition(field: &str, condition: &Condition, own: &[usize]) -> Result<(), InvalidTask> {
+    let Condition { numbers, target, tolerance } = condition;
+    let others = numbers.iter().find(|idx| !own.contains(idx));
+    let got = || others.map_or_else(|| "none".to_owned(), ToString::to_string);
+    let is_valid = !numbers.is_empty() && numbers.len() <= own.len() && others.is_none();
+    let expected = "numbers of the arm's observation in every condition";
+    InvalidTask::unless(is_valid, field, expected, got())?;
+    if !target.is_empty() {
+        check_length(&format!("{field}: target of a condition"), target.len(), numbers.len())?;
+    }
+    let bad = target.iter().find(|value| !value.is_finite());
+    let (expected, got) = ("finite targets of conditions", || bad.map_or(0.0, |value| *value));
+    InvalidTask::unless(bad.is_none(), field, expected, got())?;
+    let is_tolerance = tolerance.is_finite() && *tolerance >= 0.0;
+    let expected = "finite tolerances of conditions, 0 or more";
+    InvalidTask::unless(is_tolerance, field, expected, tolerance)
 }
 
 fn check_bounds(field: &str, bounds: &[f32], n: usize) -> Result<(), InvalidTask> {

@@ -4,6 +4,7 @@ use std::fmt;
 
 use serde::{Deserialize, Serialize};
 
+use super::Manipulation;
 use crate::text::shortened;
 
 /// Longest text of a value in a message.
@@ -56,6 +57,9 @@ pub struct TaskDescription {
     pub goal_bound: Vec<f32>,
     /// The arms in order, 1 to 8.
     pub arms: Vec<ArmDescription>,
+    /// What the arms share, when they hold objects, and what success needs beyond the distance to the goal.
+    #[serde(default, skip_serializing_if = "Manipulation::is_default")]
+    pub manipulation: Manipulation,
 }
 
 /// The indices of one arm in the vectors of its task. The parts of all arms have the same lengths.
@@ -182,7 +186,7 @@ impl TaskDescription {
         }
         compare!(achieved_goal, episode_steps, tolerance, norm, interchangeable_arms);
         compare!(reports_contacts, origin_distance, recombination_gap, base);
-        compare!(observation_bound, goal_bound);
+        compare!(observation_bound, goal_bound, manipulation);
         None
     }
 }

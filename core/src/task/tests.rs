@@ -1,4 +1,5 @@
 use super::*;
+use crate::episode::Episode;
 
 /// A task of two arms with interleaved numbers: an arm's position and speed are two apart, goals and actions in
 /// reverse order of the arms.
@@ -27,6 +28,18 @@ fn interleaved() -> TaskDescription {
         base: 0.0,
         observation_bound: vec![2.0; 4],
         goal_bound: vec![1.0; 2],
+        manipulation: Manipulation::default(),
+    }
+}
+
+/// An arm of the interleaved task that holds while its position is within 0.1 of 0.5; its speed must be at most 0.2.
+fn holding(arm: usize) -> ArmManipulation {
+    let condition =
+        |numbers, target, tolerance| Condition { numbers: vec![numbers], target, tolerance };
+    ArmManipulation {
+        gripper: Some(1 - arm),
+        holding: vec![condition(arm, vec![0.5], 0.1)],
+        conditions: vec![condition(arm + 2, Vec::new(), 0.2)],
     }
 }
 
@@ -102,6 +115,60 @@ fn each_arm_is_an_instance_of_the_one_arm_task() {
 }
 
 #[test]
+fn success_needs_the_goal_and_every_condition_for_as_many_steps_as_described() {
+    let mut description = interleaved();
+    description.arms.iter_mut().for_each(|arm| arm.position.clear());
+    description.manipulation = Manipulation {
+        shared_object: true,
+        success_steps: 2,
+        arms: vec![holding(0), holding(1)],
+        ..Manipulation::default()
+    };
+    let task = TaskSpec::new(description).unwrap();
+    let goal = [0.5, 0.5];
+    let check = |observation: [f32; 4], holds: [bool; 2], succeed: [bool; 2]| {
+        assert_eq!([0, 1].map(|arm| task.arm_holds(ArmIndex(arm), &observation)), holds);
+        let succeeded = [0, 1].map(|arm| task.arm_succeeds(ArmIndex(arm), &observation, &goal));
+        assert_eq!(succeeded, succeed, "{observation:?}");
+        assert_eq!(task.is_success(&observation, &goal), succeed == [true; 2]);
+        assert!(task.arm_reaches_goal(ArmIndex(0), &[0.5, 0.0, 9.0, 9.0], &goal));
+    };
+    check([0.5, 0.45, 0.1, -0.1], [true, true], [true, true]);
+    check([0.5, 0.45, 0.3, -0.1], [true, true], [false, true]);
+    check([0.5, 0.35, 0.1, 0.1], [true, false], [true, false]);
+
+    let mut episode = Episode::zeros(&task, 0);
+    episode.goal.fill(0.5);
+    let last_steps = |episode: &mut Episode, n: usize| {
+        let start = (task.episode_steps() + 1 - n) * task.n_observation();
+        for observation in episode.observations[start..].chunks_exact_mut(4) {
+            observation.copy_from_slice(&[0.5, 0.5, 0.0, 0.0]);
+        }
+        (episode.succeeded(), episode.arm_succeeded(ArmIndex(1)))
+    };
+    assert_eq!(last_steps(&mut episode, 1), (false, false), "one step of two");
+    assert_eq!(last_steps(&mut episode, 2), (true, true));
+    let one = task.single_arm().unwrap();
+    assert_eq!((one.success_steps(), one.gripper_of(ArmIndex(0))), (2, Some(0)));
+    assert!(one.arm_holds(ArmIndex(0), &[0.45, 9.0]) && !one.shares_object());
+    assert!(one.concatenated(2).unwrap().arm_holds(ArmIndex(1), &[0.0, 0.0, 0.45, 0.0]));
+}
+
+#[test]
+fn each_arm_that_carries_a_bar_performs_pick_and_place() {
+    let built_in = TaskSpec::built_in(Task::CarryBar, 2);
+    assert_eq!((built_in.n_observation(), built_in.n_goal(), built_in.n_action()), (56, 6, 8));
+    assert!(built_in.has_interchangeable_arms() && !built_in.has_recombinable_arms());
+    // The same task under another name is data alone.
+    let description =
+        TaskDescription { name: "lab/carry".to_owned(), ..built_in.description().clone() };
+    let pick_and_place = TaskSpec::built_in(Task::PickAndPlace, 1);
+    for task in [built_in, TaskSpec::new(description).unwrap()] {
+        assert_eq!(task.single_arm().as_ref(), Some(&pick_and_place));
+    }
+}
+
+#[test]
 fn a_common_goal_counts_for_every_arm_and_has_no_one_arm_task() {
     let task = TaskSpec::new(TaskDescription { name: "carry".to_owned(), ..carried() }).unwrap();
     assert_eq!(task.common_observation().as_range(), Some(2..3));
@@ -152,6 +219,25 @@ fn an_invalid_description_is_refused_by_field() {
         "arms[0].position: expected no index, or observations and goals in which every number, the \
          achieved goal and these positions belong to the arm, got 1 indices"
     });
+    check(|t| t.manipulation.success_steps = 21, {
+        "manipulation.success_steps: expected 1 to 20, got 21"
+    });
+    check(|t| t.manipulation.shared_object = true, {
+        "manipulation.shared_object: expected false for arms with positions, which are recombined, \
+         got true"
+    });
+    check(|t| t.manipulation.arms = vec![holding(0)], {
+        "manipulation.arms: expected none or 2, got 1"
+    });
+    check(|t| t.manipulation.arms = vec![holding(1), holding(0)], {
+        "manipulation.arms[0].gripper: expected an action of the arm, got 0"
+    });
+    check(
+        |t| t.manipulation.arms = vec![holding(0), ArmManipulation { gripper: None, ..holding(0) }],
+        {
+            "manipulation.arms[1]: expected numbers of the arm's observation in every condition, got 0"
+        },
+    );
     check(|t| t.name = "push".to_owned(), {
         "name: expected a name other than that of the built-in task push, got push, whose \
          n_observation is 56 and 4"

@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 use libfuzzer_sys as _;
 use mcap::records::{MessageHeader, Record};
 use prost::Message as _;
-use tandem_core::task::{ArmDescription, Norm};
+use tandem_core::task::{ArmDescription, Manipulation, Norm};
 use tandem_core::work::{EpisodeOrder, EpisodeStart, PublishedActor, RunTerms, SlotOrder};
 use tandem_core::{
     AdviceTerms, ArmAdvice, Contacts, EpisodeKind, Exploration, Layout, StepAdvice, StepQuery,
@@ -229,9 +229,11 @@ fn write_tasks(to: &Path) -> Result<(), AnyError> {
         recombination_gap: 0.0,
         observation_bound: vec![2.0; 5],
         goal_bound: vec![1.0; 3],
+        manipulation: Manipulation::default(),
     };
     let tasks = [
         ("push", TaskSpec::built_in(Task::Push, 2)),
+        ("carry-bar", TaskSpec::built_in(Task::CarryBar, 2)),
         ("pick-and-place", TaskSpec::built_in(Task::PickAndPlace, 1)),
         ("carry", TaskSpec::new(carry)?),
     ];

@@ -151,7 +151,7 @@ fn metadata_that_does_not_match_is_refused() {
     check(
         "task",
         Some("juggle"),
-        r#"metadata "task" is "juggle", expected one of push, pick-and-place, shared-push, shared-pick-and-place"#,
+        r#"metadata "task" is "juggle", expected one of push, pick-and-place, shared-push, shared-pick-and-place, carry-bar"#,
     );
     check("n_hidden", Some("-1"), r#"metadata "n_hidden" is "-1", expected 1 to 16384"#);
     check("n_hidden_layers", None, r#"metadata "n_hidden_layers" is missing"#);

@@ -76,16 +76,18 @@ class Exploration(_message.Message):
     def __init__(self, noise_std: _Optional[float] = ..., random_share: _Optional[float] = ..., random_hold_mean_steps: _Optional[float] = ..., joint_random_actions: bool = ...) -> None: ...
 
 class WorldTerms(_message.Message):
-    __slots__ = ("gripped_start_share", "wide_start_share", "substeps", "randomization")
+    __slots__ = ("gripped_start_share", "wide_start_share", "substeps", "randomization", "gripped_start_env_steps")
     GRIPPED_START_SHARE_FIELD_NUMBER: _ClassVar[int]
     WIDE_START_SHARE_FIELD_NUMBER: _ClassVar[int]
     SUBSTEPS_FIELD_NUMBER: _ClassVar[int]
     RANDOMIZATION_FIELD_NUMBER: _ClassVar[int]
+    GRIPPED_START_ENV_STEPS_FIELD_NUMBER: _ClassVar[int]
     gripped_start_share: float
     wide_start_share: float
     substeps: int
     randomization: float
-    def __init__(self, gripped_start_share: _Optional[float] = ..., wide_start_share: _Optional[float] = ..., substeps: _Optional[int] = ..., randomization: _Optional[float] = ...) -> None: ...
+    gripped_start_env_steps: int
+    def __init__(self, gripped_start_share: _Optional[float] = ..., wide_start_share: _Optional[float] = ..., substeps: _Optional[int] = ..., randomization: _Optional[float] = ..., gripped_start_env_steps: _Optional[int] = ...) -> None: ...
 
 class NextWorkRequest(_message.Message):
     __slots__ = ("worker_id",)

@@ -17,7 +17,7 @@ NORM_EUCLIDEAN: Norm
 NORM_MAXIMUM: Norm
 
 class TaskDescription(_message.Message):
-    __slots__ = ("name", "n_observation", "n_goal", "n_action", "arms", "achieved_goal", "episode_steps", "tolerance", "norm", "interchangeable_arms", "reports_contacts", "observation_bound", "goal_bound", "origin_distance", "recombination_gap", "base")
+    __slots__ = ("name", "n_observation", "n_goal", "n_action", "arms", "achieved_goal", "episode_steps", "tolerance", "norm", "interchangeable_arms", "reports_contacts", "observation_bound", "goal_bound", "origin_distance", "recombination_gap", "base", "manipulation")
     NAME_FIELD_NUMBER: _ClassVar[int]
     N_OBSERVATION_FIELD_NUMBER: _ClassVar[int]
     N_GOAL_FIELD_NUMBER: _ClassVar[int]
@@ -34,6 +34,7 @@ class TaskDescription(_message.Message):
     ORIGIN_DISTANCE_FIELD_NUMBER: _ClassVar[int]
     RECOMBINATION_GAP_FIELD_NUMBER: _ClassVar[int]
     BASE_FIELD_NUMBER: _ClassVar[int]
+    MANIPULATION_FIELD_NUMBER: _ClassVar[int]
     name: str
     n_observation: int
     n_goal: int
@@ -50,7 +51,40 @@ class TaskDescription(_message.Message):
     origin_distance: float
     recombination_gap: float
     base: float
-    def __init__(self, name: _Optional[str] = ..., n_observation: _Optional[int] = ..., n_goal: _Optional[int] = ..., n_action: _Optional[int] = ..., arms: _Optional[_Iterable[_Union[TaskArm, _Mapping]]] = ..., achieved_goal: _Optional[_Iterable[int]] = ..., episode_steps: _Optional[int] = ..., tolerance: _Optional[float] = ..., norm: _Optional[_Union[Norm, str]] = ..., interchangeable_arms: bool = ..., reports_contacts: bool = ..., observation_bound: _Optional[_Iterable[float]] = ..., goal_bound: _Optional[_Iterable[float]] = ..., origin_distance: _Optional[float] = ..., recombination_gap: _Optional[float] = ..., base: _Optional[float] = ...) -> None: ...
+    manipulation: TaskManipulation
+    def __init__(self, name: _Optional[str] = ..., n_observation: _Optional[int] = ..., n_goal: _Optional[int] = ..., n_action: _Optional[int] = ..., arms: _Optional[_Iterable[_Union[TaskArm, _Mapping]]] = ..., achieved_goal: _Optional[_Iterable[int]] = ..., episode_steps: _Optional[int] = ..., tolerance: _Optional[float] = ..., norm: _Optional[_Union[Norm, str]] = ..., interchangeable_arms: bool = ..., reports_contacts: bool = ..., observation_bound: _Optional[_Iterable[float]] = ..., goal_bound: _Optional[_Iterable[float]] = ..., origin_distance: _Optional[float] = ..., recombination_gap: _Optional[float] = ..., base: _Optional[float] = ..., manipulation: _Optional[_Union[TaskManipulation, _Mapping]] = ...) -> None: ...
+
+class TaskManipulation(_message.Message):
+    __slots__ = ("shared_object", "one_arm_task", "success_steps", "arms")
+    SHARED_OBJECT_FIELD_NUMBER: _ClassVar[int]
+    ONE_ARM_TASK_FIELD_NUMBER: _ClassVar[int]
+    SUCCESS_STEPS_FIELD_NUMBER: _ClassVar[int]
+    ARMS_FIELD_NUMBER: _ClassVar[int]
+    shared_object: bool
+    one_arm_task: str
+    success_steps: int
+    arms: _containers.RepeatedCompositeFieldContainer[ArmManipulation]
+    def __init__(self, shared_object: bool = ..., one_arm_task: _Optional[str] = ..., success_steps: _Optional[int] = ..., arms: _Optional[_Iterable[_Union[ArmManipulation, _Mapping]]] = ...) -> None: ...
+
+class ArmManipulation(_message.Message):
+    __slots__ = ("gripper", "holding", "conditions")
+    GRIPPER_FIELD_NUMBER: _ClassVar[int]
+    HOLDING_FIELD_NUMBER: _ClassVar[int]
+    CONDITIONS_FIELD_NUMBER: _ClassVar[int]
+    gripper: int
+    holding: _containers.RepeatedCompositeFieldContainer[Condition]
+    conditions: _containers.RepeatedCompositeFieldContainer[Condition]
+    def __init__(self, gripper: _Optional[int] = ..., holding: _Optional[_Iterable[_Union[Condition, _Mapping]]] = ..., conditions: _Optional[_Iterable[_Union[Condition, _Mapping]]] = ...) -> None: ...
+
+class Condition(_message.Message):
+    __slots__ = ("numbers", "target", "tolerance")
+    NUMBERS_FIELD_NUMBER: _ClassVar[int]
+    TARGET_FIELD_NUMBER: _ClassVar[int]
+    TOLERANCE_FIELD_NUMBER: _ClassVar[int]
+    numbers: _containers.RepeatedScalarFieldContainer[int]
+    target: _containers.RepeatedScalarFieldContainer[float]
+    tolerance: float
+    def __init__(self, numbers: _Optional[_Iterable[int]] = ..., target: _Optional[_Iterable[float]] = ..., tolerance: _Optional[float] = ...) -> None: ...
 
 class TaskArm(_message.Message):
     __slots__ = ("observation", "goal", "action", "position", "lateral")

@@ -4,7 +4,7 @@ use serde_json::{Map, Value, json as value};
 use tandem_core::{Task, Wilson};
 
 use super::{CAUSES, OTHER_CAUSES, TrialGroup, Trials};
-use crate::paper::{N_PAPER_TRIALS, TABLE_4};
+use crate::paper::{N_PAPER_TRIALS, PaperTrials, TABLE_4};
 
 /// Returns trials as one JSON object: `groups`, each with its statistics and its failures. Durations are in seconds.
 ///
@@ -48,8 +48,9 @@ fn paper_json(task: &str) -> Value {
     let Some(task) = Task::ALL.into_iter().find(|known| known.name() == task) else {
         return Value::Null;
     };
-    let rows = TABLE_4.iter().map(|row| {
-        value!({ "method": row.name, "successes": row.n_successes(task), "trials": N_PAPER_TRIALS })
-    });
-    rows.collect()
+    let row = |row: &PaperTrials| {
+        let successes = row.n_successes(task)?;
+        Some(value!({ "method": row.name, "successes": successes, "trials": N_PAPER_TRIALS }))
+    };
+    TABLE_4.iter().map(row).collect::<Option<Vec<Value>>>().map_or(Value::Null, Value::from)
 }

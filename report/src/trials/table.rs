@@ -50,7 +50,8 @@ fn failures_text(group: &TrialGroup) -> Option<String> {
     (!causes.is_empty()).then(|| wrapped(&text))
 }
 
-/// Returns the table of the groups of one task. The paper's rows follow if a group has as many arms as the paper.
+/// Returns the table of the groups of one task. The paper's rows follow if it has the task and a group has as many arms as
+/// the paper.
 fn task_table(groups: &[TrialGroup]) -> Table {
     let task_name = groups.first().map_or("", |group| &group.task);
     let has_others = groups.iter().any(|group| group.n_failed_by()[CAUSES.len()] > 0);
@@ -58,12 +59,15 @@ fn task_table(groups: &[TrialGroup]) -> Table {
     let mut header = vec!["policy, mode", "success", "share [95 % interval]"];
     header.extend(&causes);
     header.push("median time");
-    let mut table = Table::new(format!("{task_name}: trials, as the paper's Table 4"), &header);
-    table.rows.extend(groups.iter().map(|group| row(group, causes.len())));
     let task = Task::ALL.into_iter().find(|task| task.name() == task_name);
+    let is_extra = task.is_some_and(Task::shares_object);
+    let as_in = if is_extra { "" } else { ", as the paper's Table 4" };
+    let mut table = Table::new(format!("{task_name}: trials{as_in}"), &header);
+    table.rows.extend(groups.iter().map(|group| row(group, causes.len())));
     let has_paper_arms = groups.iter().any(|group| n_arms(group) == N_PAPER_ARMS);
     for task in task.into_iter().filter(|_| has_paper_arms) {
-        table.rows.extend(TABLE_4.iter().map(|row| paper_row(row, task, causes.len())));
+        let rows = TABLE_4.iter().filter_map(|row| paper_row(row, task, causes.len()));
+        table.rows.extend(rows);
     }
     table
 }
@@ -76,11 +80,12 @@ fn row(group: &TrialGroup, n_causes: usize) -> Vec<String> {
     row
 }
 
-fn paper_row(paper: &PaperTrials, task: Task, n_causes: usize) -> Vec<String> {
+/// Returns a row of the paper, if the paper has the task.
+fn paper_row(paper: &PaperTrials, task: Task, n_causes: usize) -> Option<Vec<String>> {
     let mut row = vec![format!("the paper, {}", paper.name)];
-    row.extend(success_cells(paper.n_successes(task), N_PAPER_TRIALS));
+    row.extend(success_cells(paper.n_successes(task)?, N_PAPER_TRIALS));
     row.extend((0..=n_causes).map(|_| NONE.to_owned()));
-    row
+    Some(row)
 }
 
 fn success_cells(n_successes: usize, n_trials: usize) -> [String; 2] {

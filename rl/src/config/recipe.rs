@@ -139,8 +139,14 @@ fn stop(recipe: Recipe, layout: &TaskSpec) -> StopConfig {
 fn world(recipe: Recipe, layout: &TaskSpec) -> WorldSettings {
     let grasps = layout.as_built_in().is_some_and(|layout| layout.task.grasps());
     let starts_grasped = recipe == Recipe::Tandem && grasps;
+    let shares_object = layout.shares_object();
     WorldSettings {
-        grasped_start_prob: if starts_grasped { 0.2 } else { 0.0 },
+        grasped_start_prob: match starts_grasped {
+            true if shares_object => 0.5,
+            true => 0.2,
+            false => 0.0,
+        },
+        grasped_start_env_steps: if starts_grasped && shares_object { 150_000 } else { 0 },
         ..WorldSettings::default()
     }
 }
@@ -152,6 +158,7 @@ fn replay(recipe: Recipe, layout: &TaskSpec) -> ReplayConfig {
     ReplayConfig {
         capacity_transitions: 1_000_000,
         her_ratio: 0.8,
+        displaced_hindsight: layout.shares_object(),
         displaced_fraction: if tandem { 0.5 } else { 0.0 },
         coda_fraction: if tandem && layout.has_recombinable_arms() { 1.0 } else { 0.0 },
         arm_swap_prob: if tandem && layout.has_interchangeable_arms() { 0.5 } else { 0.0 },

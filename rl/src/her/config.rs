@@ -35,6 +35,10 @@ pub struct ReplayConfig {
     /// Fraction of transitions that get a hindsight goal, in [0, 1]: k/(k + 1) for k goals per transition (Andrychowicz
     /// et al. 2017: k = 4).
     pub her_ratio: f32,
+    /// Whether only steps after which an object has moved from its start, by more than the task's tolerance, give
+    /// hindsight goals. Others are achieved by doing nothing.
+    #[serde(default)]
+    pub displaced_hindsight: bool,
     /// Fraction of transitions sampled from episodes in which an object was displaced, in [0, 1].
     pub displaced_fraction: f32,
     /// Fraction of two-arm transitions that combine the arms of two steps, in [0, 1]: counterfactual data augmentation

@@ -4,6 +4,7 @@ use tandem_core::rng::{Stream, episode_rng};
 use tandem_core::{Contacts, Episode, Task};
 
 use super::*;
+use crate::config::{Recipe, RunConfig};
 use crate::replay::fixtures::drifting_episode;
 
 const LAYOUT: Layout = Layout::new(Task::Push, 2);
@@ -13,6 +14,7 @@ fn config(reward: RewardKind) -> ReplayConfig {
     ReplayConfig {
         capacity_transitions: 1000,
         her_ratio: 0.8,
+        displaced_hindsight: false,
         displaced_fraction: 0.5,
         coda_fraction: 0.0,
         arm_swap_prob: 0.5,
@@ -205,6 +207,45 @@ fn an_intervention_costs_the_step_before_it_unless_the_goal_is_one_of_hindsight(
         }
         assert!(n_costs > 10, "{reward:?}: {n_costs}");
     }
+}
+
+/// Both handles of a bar drift from their starts, 0 and 1 m along x.
+#[test]
+fn arms_that_share_an_object_get_the_goals_of_one_later_step_after_which_it_has_moved() {
+    let task = TaskSpec::built_in(Task::CarryBar, 2);
+    let mut episode = Episode::zeros(&task, 0);
+    episode.goal.fill(9.0);
+    for (step_idx, observation) in
+        episode.observations.chunks_exact_mut(task.n_observation()).enumerate()
+    {
+        for arm in task.arms() {
+            let x = task.achieved_goal_of(arm).index(0);
+            observation[x] = arm.0 as f32 + 0.01 * step_idx as f32;
+        }
+    }
+    let mut still = Episode::zeros(&task, 1);
+    still.goal.fill(9.0);
+    let mut buffer = ReplayBuffer::new(&task, 1000);
+    buffer.push(&episode);
+    buffer.push(&still);
+    let config = RunConfig::defaults(Recipe::Tandem, Task::CarryBar, 2).replay;
+    let mut sampler = Sampler::new(&config, &task);
+    let mut rng = episode_rng(1, 0, Stream::Replay);
+    let mut n_hindsight = 0;
+    for _ in 0..N_DRAWS {
+        sampler.sample_transition(&buffer, &mut rng);
+        let Relabelled { steps, goal, keeps_goal, .. } = &sampler.sample;
+        assert_eq!((steps[0], keeps_goal[0]), (steps[1], keeps_goal[1]));
+        if keeps_goal[0] {
+            assert_eq!(*goal, [9.0; 6]);
+            continue;
+        }
+        n_hindsight += 1;
+        assert_eq!(steps[0].episode_idx, 0, "the other bar has not moved");
+        assert!(goal[0] > 0.05 && goal[0] > 0.01 * steps[0].step_idx as f32, "{goal:?}");
+        assert!((goal[3] - goal[0] - 1.0).abs() < 1e-6, "goals of two steps: {goal:?}");
+    }
+    assert!(n_hindsight > N_DRAWS / 3, "{n_hindsight}");
 }
 
 #[test]

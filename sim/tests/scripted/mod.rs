@@ -7,6 +7,7 @@ use tandem_sim::{Env, WorldConfig};
 /// Displacement for an action of 1, metres.
 const ACTION_M: f32 = 0.05;
 
+pub(crate) mod bar;
 mod gliding;
 pub(crate) mod pair;
 
@@ -112,7 +113,7 @@ struct WorldNumbers {
 impl WorldNumbers {
     fn of(world: World) -> Self {
         match world {
-            World::Classic => Self {
+            World::Classic | World::Slow => Self {
                 push_z_m: 0.024,
                 grasp_z_m: 0.0245,
                 carry_z_m: 0.0,

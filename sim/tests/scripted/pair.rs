@@ -121,7 +121,7 @@ impl Pair {
     }
 }
 
-fn part(observation: &[f32], arm: usize) -> &[f32] {
+pub(super) fn part(observation: &[f32], arm: usize) -> &[f32] {
     &observation[arm * OBSERVATION_PER_ARM..(arm + 1) * OBSERVATION_PER_ARM]
 }
 
@@ -130,15 +130,25 @@ fn goal_of(goal: &[f32], arm: usize) -> &[f32] {
 }
 
 fn see(arm: usize, observation: &[f32], goal: &[f32]) -> Seen {
-    let sign = if arm == 0 { 1.0 } else { -1.0 };
-    let in_world =
-        |own: &[f32]| [sign * (own[0] - 0.5 * WORKSPACE_DISTANCE_M), sign * own[1], own[2]];
+    let in_world = |own: &[f32]| in_world(arm, [own[0], own[1], own[2]]);
     let own = part(observation, arm);
     Seen {
         hand: in_world(&own[0..3]),
         object: in_world(&own[3..6]),
         goal: in_world(goal_of(goal, arm)),
     }
+}
+
+/// Converts a point from the frame of `arm` to the world frame, metres.
+pub(super) fn in_world(arm: usize, [x, y, z]: [f32; 3]) -> [f32; 3] {
+    let half_m = 0.5 * WORKSPACE_DISTANCE_M;
+    if arm == 0 { [x - half_m, y, z] } else { [half_m - x, -y, z] }
+}
+
+/// Converts a point from the world frame to that of `arm`, metres.
+pub(super) fn in_own_frame(arm: usize, [x, y, z]: [f32; 3]) -> [f32; 3] {
+    let half_m = 0.5 * WORKSPACE_DISTANCE_M;
+    if arm == 0 { [x + half_m, y, z] } else { [half_m - x, -y, z] }
 }
 
 /// Whether `arm` can serve its object while the other object is at its start.

@@ -115,6 +115,7 @@ fn every_shipped_sweep_file_is_valid() {
         })
         .collect();
     let expected = [
+        ("sweep-carry-bar", 9),
         ("sweep-few-units", 15),
         ("sweep-paper-students", 8),
         ("sweep-paper-teachers", 6),

@@ -154,6 +154,7 @@ mod tests {
             observation_bound: vec![1.0; n_goal],
             goal_bound: vec![1.0; n_goal],
             arms: vec![arm(0), arm(1)],
+            manipulation: tandem_core::task::Manipulation::default(),
         };
         TaskSpec::new(description).unwrap()
     }

@@ -35,7 +35,11 @@ impl ManualClock {
 }
 
 /// A viewer.
-struct Viewer(WebSocket<TcpStream>);
+struct Viewer {
+    socket: WebSocket<TcpStream>,
+    /// The channel of each subscription.
+    subscriptions: Vec<(u32, u64)>,
+}
 
 /// A message that a viewer receives.
 #[derive(Debug)]
@@ -54,14 +58,17 @@ impl Viewer {
         stream.set_read_timeout(Some(TIMEOUT)).unwrap();
         let uri = format!("ws://{address}").parse().unwrap();
         let request = ClientRequestBuilder::new(uri).with_sub_protocol(SUBPROTOCOL);
-        Self(tungstenite::client(request, stream).unwrap().0)
+        let (socket, _) = tungstenite::client(request, stream).unwrap();
+        Self { socket, subscriptions: Vec::new() }
     }
 
     fn receive(&mut self) -> Received {
         loop {
-            match self.0.read().unwrap() {
+            match self.socket.read().unwrap() {
                 Message::Text(text) => {
-                    return Received::Text(serde_json::from_str(&text).unwrap());
+                    let text: Value = serde_json::from_str(&text).unwrap();
+                    self.repeat_refused(&text);
+                    return Received::Text(text);
                 }
                 Message::Binary(bytes) => {
                     let number =
@@ -105,10 +112,24 @@ impl Viewer {
         (info, ids.map(Option::unwrap))
     }
 
+    /// Subscribes again if the server does not know the channel yet: it knows a channel a moment after it has advertised
+    /// it.
+    fn repeat_refused(&mut self, text: &Value) {
+        let message = text["message"].as_str().unwrap_or_default();
+        let unknown = message.strip_prefix("Unknown channel ID: ");
+        let Some(unknown) = unknown.and_then(|id| id.parse::<u64>().ok()) else { return };
+        let refused = self.subscriptions.iter().position(|(_, channel)| *channel == unknown);
+        if let Some(idx) = refused {
+            let (subscription, channel) = self.subscriptions.swap_remove(idx);
+            self.subscribe(subscription, channel);
+        }
+    }
+
     fn subscribe(&mut self, subscription: u32, channel: u64) {
+        self.subscriptions.push((subscription, channel));
         let subscriptions = [json!({ "id": subscription, "channelId": channel })];
         let request = json!({ "op": "subscribe", "subscriptions": subscriptions });
-        self.0.send(Message::text(request.to_string())).unwrap();
+        self.socket.send(Message::text(request.to_string())).unwrap();
     }
 
     fn control(&mut self, play: bool, speed: f32, seek_ns: Option<u64>) {
@@ -119,7 +140,7 @@ impl Viewer {
         request.extend(seek_ns.unwrap_or(0).to_le_bytes());
         request.extend(u32::try_from(id.len()).unwrap().to_le_bytes());
         request.extend(id);
-        self.0.send(Message::binary(request)).unwrap();
+        self.socket.send(Message::binary(request)).unwrap();
     }
 }
 

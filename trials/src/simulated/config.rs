@@ -2,6 +2,7 @@
 
 use tandem_bridge::driver::Faults;
 use tandem_core::ArmIndex;
+use tandem_core::scene::Cuboid;
 use tandem_kinematics::Joints;
 
 /// Time from one exchange to the next, seconds: the arms take 100 commands per second.
@@ -44,6 +45,8 @@ pub struct SimulatedConfig {
     pub table_friction: f32,
     /// The blocks on the table.
     pub blocks: Vec<Block>,
+    /// The object that all arms share, if there is one. There are no blocks then.
+    pub shared: Option<SharedObject>,
 }
 
 /// A gripper with two fingers that slide along y of the arm's own frame.
@@ -85,6 +88,41 @@ pub struct Block {
     pub yaw_rad: f32,
 }
 
+/// A rigid body that all arms share. Points, boxes and poses are in the body's frame, metres.
+#[derive(Debug, Clone, PartialEq)]
+pub struct SharedObject {
+    /// The boxes that collide.
+    pub boxes: Vec<ObjectBox>,
+    /// The boxes that scenes show: first the one of each arm, in arm order.
+    pub shown: Vec<Cuboid>,
+    /// For each arm, the point that it brings to its goal.
+    pub points_m: Vec<[f32; 3]>,
+    /// The initial position of the body's origin, world frame, metres.
+    pub at_m: [f32; 3],
+    /// The initial rotation about the vertical axis, radians.
+    pub yaw_rad: f32,
+}
+
+/// A box of uniform density.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct ObjectBox {
+    /// The centre, in the body's frame, metres.
+    pub centre_m: [f32; 3],
+    /// Half the lengths of the edges, along the axes of the body, metres.
+    pub half_m: [f32; 3],
+    /// Mass, kilograms.
+    pub mass_kg: f32,
+}
+
+impl SharedObject {
+    /// Returns half the width on which the gripper of each arm closes: the width of the first shown box across the
+    /// body's first axis, metres.
+    #[must_use]
+    pub fn grasped_half_m(&self) -> f32 {
+        self.shown.first().map_or(0.0, |shown| shown.half_extents_m[1])
+    }
+}
+
 impl Block {
     /// Returns a cube of 5.6 cm and 0.12 kg.
     #[must_use]
@@ -117,6 +155,7 @@ impl Default for SimulatedConfig {
             camera: CameraConfig::default(),
             table_friction: 0.5,
             blocks: Vec::new(),
+            shared: None,
         }
     }
 }

@@ -8,7 +8,7 @@ use glam::{DMat3, DVec3};
 use rapier3d::dynamics::{
     CCDSolver, CoefficientCombineRule, FrictionModel, ImpulseJointHandle, ImpulseJointSet,
     IntegrationParameters, IslandManager, MotorModel, MultibodyJointSet, PrismaticJointBuilder,
-    RigidBody, RigidBodyBuilder, RigidBodyHandle, RigidBodySet, SoftBodySet, SpringCoefficients,
+    RigidBodyBuilder, RigidBodyHandle, RigidBodySet, SoftBodySet, SpringCoefficients,
 };
 use rapier3d::geometry::{
     BroadPhaseBvh, ColliderBuilder, ColliderHandle, ColliderSet, Group, InteractionGroups,
@@ -17,7 +17,7 @@ use rapier3d::geometry::{
 use rapier3d::math::{Matrix, Pose, Rotation, Vector};
 use rapier3d::pipeline::PhysicsPipeline;
 
-use crate::simulated::config::{Block, GripperConfig, SimulatedConfig};
+use crate::simulated::config::{Block, GripperConfig, SharedObject, SimulatedConfig};
 
 /// The largest opening of each finger's pad, metres.
 pub const MAX_OPENING_M: f32 = 0.062;
@@ -61,7 +61,10 @@ pub(crate) struct PhysicsWorld {
     ccd: CCDSolver,
     pipeline: PhysicsPipeline,
     hands: Vec<Hand>,
-    objects: Vec<RigidBodyHandle>,
+    /// The object of each arm, or the block of each number.
+    objects: Vec<Object>,
+    /// What scenes show of the objects.
+    shown: Vec<ShownBox>,
 }
 
 /// The poses of an arm's bodies; world frame, metres.
@@ -71,6 +74,20 @@ pub(crate) struct ArmPoses {
     pub(crate) tool_axes: DMat3,
     /// The ends of the forearm.
     pub(crate) forearm_m: [DVec3; 2],
+}
+
+/// A point of a body that cameras observe.
+struct Object {
+    body: RigidBodyHandle,
+    /// In the body's frame, metres.
+    point: Vector,
+}
+
+/// A box of a body: its pose in the body's frame and half its edges, metres.
+struct ShownBox {
+    body: RigidBodyHandle,
+    in_body: Pose,
+    half_m: Vector,
 }
 
 struct Hand {
@@ -113,6 +130,7 @@ impl PhysicsWorld {
             pipeline,
             hands: Vec::new(),
             objects: Vec::new(),
+            shown: Vec::new(),
         };
         let table = ColliderBuilder::cuboid(TABLE_HALF_M.x, TABLE_HALF_M.y, TABLE_HALF_M.z)
             .translation(Vector::new(0.0, 0.0, table_z_m - TABLE_HALF_M.z))
@@ -125,6 +143,9 @@ impl PhysicsWorld {
         }
         for block in &config.blocks {
             world.add_block(block, config.table_friction, table_z_m);
+        }
+        if let Some(shared) = &config.shared {
+            world.add_shared(shared, config.table_friction);
         }
         world
     }
@@ -177,8 +198,17 @@ impl PhysicsWorld {
         f64::from(0.5 * (first + second) / MAX_OPENING_M).clamp(0.0, 1.0)
     }
 
-    pub(crate) fn object(&self, idx: usize) -> &RigidBody {
-        &self.bodies[self.objects[idx]]
+    /// The pose of object `idx`, world frame, metres.
+    pub(crate) fn object(&self, idx: usize) -> Pose {
+        let Object { body, point } = self.objects[idx];
+        let at = self.bodies[body].position();
+        Pose::from_parts(at.translation + at.rotation * point, at.rotation)
+    }
+
+    /// The poses and half extents of the boxes that show the objects, world frame, metres.
+    pub(crate) fn shown(&self) -> impl Iterator<Item = (Pose, Vector)> {
+        let pose = |shown: &ShownBox| *self.bodies[shown.body].position() * shown.in_body;
+        self.shown.iter().map(move |shown| (pose(shown), shown.half_m))
     }
 
     pub(crate) fn n_objects(&self) -> usize {
@@ -277,13 +307,32 @@ impl PhysicsWorld {
         let at = Vector::new(block.at_m[0], block.at_m[1], table_z_m + block.half_m);
         let pose = Pose::from_parts(at, Rotation::from_rotation_z(block.yaw_rad));
         let body = self.bodies.insert(RigidBodyBuilder::dynamic().pose(pose).can_sleep(false));
-        let cube = ColliderBuilder::cuboid(block.half_m, block.half_m, block.half_m)
-            .mass(block.mass_kg)
-            .friction(friction)
-            .friction_combine_rule(CoefficientCombineRule::Max)
-            .collision_groups(groups(OBJECTS, OBJECTS | TABLE | ARMS[0] | ARMS[1]));
+        let half_m = Vector::splat(block.half_m);
+        let cube = object_box(half_m, block.mass_kg, friction);
         self.colliders.insert_with_parent(cube, body, &mut self.bodies);
-        self.objects.push(body);
+        self.objects.push(Object { body, point: Vector::ZERO });
+        self.shown.push(ShownBox { body, in_body: Pose::IDENTITY, half_m });
+    }
+
+    fn add_shared(&mut self, object: &SharedObject, friction: f32) {
+        let turn = Rotation::from_rotation_z(object.yaw_rad);
+        let pose = Pose::from_parts(Vector::from_array(object.at_m), turn);
+        let body = self.bodies.insert(RigidBodyBuilder::dynamic().pose(pose).can_sleep(false));
+        for part in &object.boxes {
+            let part = object_box(Vector::from_array(part.half_m), part.mass_kg, friction)
+                .translation(Vector::from_array(part.centre_m));
+            self.colliders.insert_with_parent(part, body, &mut self.bodies);
+        }
+        let points = object.points_m.iter().map(|point| Vector::from_array(*point));
+        self.objects.extend(points.map(|point| Object { body, point }));
+        self.shown.extend(object.shown.iter().map(|shown| ShownBox {
+            body,
+            in_body: Pose::from_parts(
+                Vector::from_array(shown.centre),
+                Rotation::from_array(shown.orientation),
+            ),
+            half_m: Vector::from_array(shown.half_extents_m),
+        }));
     }
 }
 
@@ -300,6 +349,15 @@ impl ArmPoses {
         let turn = Rotation::from_rotation_arc(Vector::Z, along);
         Pose::from_parts((0.5 * (from + to)).as_vec3(), turn)
     }
+}
+
+/// Returns a box of an object with half the edges `half_m`, metres.
+fn object_box(half_m: Vector, mass_kg: f32, friction: f32) -> ColliderBuilder {
+    ColliderBuilder::cuboid(half_m.x, half_m.y, half_m.z)
+        .mass(mass_kg)
+        .friction(friction)
+        .friction_combine_rule(CoefficientCombineRule::Max)
+        .collision_groups(groups(OBJECTS, OBJECTS | TABLE | ARMS[0] | ARMS[1]))
 }
 
 /// Returns `pose` with the quaternion of its rotation that is nearer to `from`. Rapier would interpret the other one as

@@ -6,7 +6,6 @@ use tandem_core::scene::{ArmScene, Capsule, Cuboid, Point, Scene};
 use tandem_kinematics::model::Anchor;
 use tandem_kinematics::{ForwardKinematics, Joints, PlacedArm, WorkCell};
 
-use crate::simulated::config::Block;
 use crate::simulated::physics::{PhysicsWorld, TABLE_HALF_M};
 
 /// Returns the scene with the arms at joint angles `angles` (radians) at `time_s`, without goals.
@@ -14,20 +13,16 @@ pub(crate) fn scene(
     cell: &WorkCell,
     angles: &[Joints],
     world: &PhysicsWorld,
-    blocks: &[Block],
     time_s: f64,
 ) -> Scene {
     let arm = |idx: usize| arm_scene(&cell.arms[idx], &angles[idx], world.hand_parts(idx));
-    let object = |(idx, block): (usize, &Block)| {
-        cuboid(world.object(idx).position(), Vector::splat(block.half_m))
-    };
     let table_z_m = DVec3::splat(cell.table_z_m).as_vec3().z;
     let centre = Vector::new(0.0, 0.0, table_z_m - TABLE_HALF_M.z);
     let under = Pose::from_parts(centre, Rotation::IDENTITY);
     Scene {
         time_s,
         arms: (0..angles.len()).map(arm).collect(),
-        objects: blocks.iter().enumerate().map(object).collect(),
+        objects: world.shown().map(|(pose, half_m)| cuboid(&pose, half_m)).collect(),
         goals: Vec::new(),
         goal_tolerance_m: 0.0,
         table: cuboid(&under, TABLE_HALF_M),

@@ -28,8 +28,8 @@ pub(crate) struct ObservedBlock {
     pub(crate) at: DVec3,
     /// The rotation about the vertical axis, radians.
     pub(crate) yaw_rad: f64,
-    /// Half the edge, metres.
-    pub(crate) half_m: f64,
+    /// Half the edges, along the block's own axes, metres.
+    pub(crate) half_m: DVec3,
 }
 
 /// The pads of a hand that is to move.
@@ -43,6 +43,12 @@ pub(crate) struct Pads {
     pub(crate) tilt_rad: f64,
 }
 
+/// Returns `to`, but no lower than the blocks that pads at `from` hold can be lowered; world frame, metres.
+pub(crate) fn lowered(from: DVec3, to: DVec3, pads: &Pads, blocks: &[ObservedBlock]) -> DVec3 {
+    let room_m = blocks.iter().filter(|block| pads.hold(from, block)).map(ObservedBlock::room_m);
+    to.with_z(to.z.max(from.z - room_m.fold(f64::INFINITY, f64::min)))
+}
+
 /// Returns the path of the point between the pads from `from` towards `to`, world frame, metres: a corner and the end.
 pub(crate) fn avoid_blocks(
     from: DVec3,
@@ -50,8 +56,7 @@ pub(crate) fn avoid_blocks(
     pads: &Pads,
     blocks: &[ObservedBlock],
 ) -> [DVec3; 2] {
-    let room_m = blocks.iter().filter(|block| pads.hold(from, block)).map(ObservedBlock::room_m);
-    let to = to.with_z(to.z.max(from.z - room_m.fold(f64::INFINITY, f64::min)));
+    let to = lowered(from, to, pads, blocks);
     let (sin, cos) = libm::sincos(pads.tilt_rad);
     let reach_m = PADS_BELOW_M * cos + PAD_HALF_M.x * sin;
     let was_above = |block: &&ObservedBlock| from.z - reach_m >= block.top_m() - ABOVE_M;
@@ -75,11 +80,11 @@ pub(crate) fn avoid_blocks(
 impl ObservedBlock {
     /// The distance by which the block can be lowered, metres.
     fn room_m(&self) -> f64 {
-        (self.at.z - self.half_m - SET_DOWN_M).max(0.0)
+        (self.at.z - self.half_m.z - SET_DOWN_M).max(0.0)
     }
 
     fn top_m(&self) -> f64 {
-        self.at.z + self.half_m
+        self.at.z + self.half_m.z
     }
 }
 
@@ -87,9 +92,10 @@ impl Pads {
     /// Returns whether pads around `centre` hold `block`.
     fn hold(&self, centre: DVec3, block: &ObservedBlock) -> bool {
         let offset = block.at - centre;
-        self.opening_m <= block.half_m
-            && offset.truncate().length() < HELD_WITHIN_M
-            && offset.z.abs() < block.half_m
+        let longer_m = (block.half_m.x - block.half_m.y).max(0.0);
+        self.opening_m <= block.half_m.y
+            && offset.truncate().length() < HELD_WITHIN_M + longer_m
+            && offset.z.abs() < block.half_m.z
     }
 
     /// Returns whether pads around `centre` are above `block` or too near to it.
@@ -99,7 +105,7 @@ impl Pads {
         let cube = Rectangle {
             at: block.at.truncate(),
             along: direction(block.yaw_rad),
-            half: DVec2::splat(block.half_m + room_m),
+            half: block.half_m.truncate() + room_m,
         };
         [1.0, -1.0].into_iter().any(|side| {
             let offset = closing * (side * (self.opening_m + PAD_HALF_M.y));
@@ -140,8 +146,11 @@ fn direction(angle_rad: f64) -> DVec2 {
 mod tests {
     use super::*;
 
-    const BLOCK: ObservedBlock =
-        ObservedBlock { at: DVec3::new(0.1, 0.0, 0.028), yaw_rad: 0.0, half_m: 0.028 };
+    const BLOCK: ObservedBlock = ObservedBlock {
+        at: DVec3::new(0.1, 0.0, 0.028),
+        yaw_rad: 0.0,
+        half_m: DVec3::splat(0.028),
+    };
     const OPEN: Pads =
         Pads { yaw_rad: std::f64::consts::FRAC_PI_2, opening_m: 0.05, tilt_rad: 0.0 };
 

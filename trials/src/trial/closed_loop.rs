@@ -2,16 +2,18 @@
 
 use glam::{DVec3, EulerRot};
 use tandem_core::ArmIndex;
+use tandem_core::scene::Cuboid;
 use tandem_kinematics::{ArmWaypoint, ForwardKinematics, Joints, ReachError, Waypoint, WorkCell};
 
-use crate::simulated::{MAX_OPENING_M, ObjectPose};
+use crate::simulated::{MAX_OPENING_M, ObjectPose, SharedObject};
 use crate::trial::ActionSource;
-use crate::trial::block_avoidance::{ObservedBlock, Pads, avoid_blocks};
-use crate::trial::mapping::{ArmObservation, write_observation};
+use crate::trial::block_avoidance::{ObservedBlock, Pads, avoid_blocks, lowered};
+use crate::trial::mapping::ArmObservation;
 use crate::trial::outcome::FailureCause;
 use crate::trial::rehearsal::TrialStart;
 use crate::trial::rig::{TrialRig, tool_positions};
 use crate::trial::runner::{REST_S, TrialExecution, TrialRunner};
+use crate::trial::shared_object::keep_distance;
 
 /// A policy is done after this many consecutive observations in which every object was within this share of the
 /// tolerance of its goal.
@@ -32,7 +34,8 @@ enum StepPart {
     Back,
 }
 
-/// The attempts at a step, in order, until the check allows one.
+/// The attempts at a step, in order, until the check allows one. Arms that share an object move together or not at all, so
+/// only the first three remain.
 const ATTEMPTS: [[StepPart; 2]; 10] = {
     use StepPart::{Back, Share};
     [
@@ -60,6 +63,10 @@ struct LoopState {
     before: Option<Vec<ArmObservation>>,
     /// The number of consecutive observations with every object at its goal.
     n_done: usize,
+    /// The number of consecutive judgements, up to now, that found the task achieved.
+    n_in_success: usize,
+    /// Whether an arm holds an object that all arms share.
+    carries: bool,
     /// The waypoints of the tools so far.
     waypoints: Vec<Waypoint>,
 }
@@ -79,6 +86,7 @@ impl TrialRunner {
             n_shortened: 0,
             rehearsed_m: None,
             timed_out: false,
+            n_in_success: 0,
             waypoints: Vec::new(),
         };
         let mut state = LoopState {
@@ -87,6 +95,8 @@ impl TrialRunner {
             velocities: vec![DVec3::ZERO; at.len()],
             before: None,
             n_done: 0,
+            n_in_success: 0,
+            carries: false,
             waypoints: Vec::new(),
         };
         let time_limit_s = self.config.time_limit_s / self.config.speed;
@@ -105,6 +115,8 @@ impl TrialRunner {
             }
         }
         execution.ended = execution.ended.and_then(|()| rig.wait(REST_S));
+        state.count_success(self.is_success(rig, start));
+        execution.n_in_success = state.n_in_success;
         execution.waypoints = state.waypoints;
         execution
     }
@@ -119,6 +131,9 @@ impl TrialRunner {
     ) -> Result<bool, FailureCause> {
         let layout = self.config.layout;
         let objects = rig.observe_objects()?;
+        if state.before.is_some() {
+            state.count_success(self.is_success(rig, start));
+        }
         let now: Vec<ArmObservation> = rig
             .encoders()
             .iter()
@@ -129,15 +144,18 @@ impl TrialRunner {
                 self.mapping.observe(ArmIndex(arm), angles, *opening, velocity, object)
             })
             .collect();
-        state.count_done(&now, &start.goals, self.tolerance_m());
         let before = state.before.replace(now.clone()).unwrap_or_else(|| now.clone());
         let mut observation = vec![0.0; layout.n_observation()];
         let mut goal = vec![0.0; layout.n_goal()];
         for arm in layout.arms() {
             let numbers = &mut observation[layout.observation_of(arm)];
-            write_observation(&now[arm.0], &before[arm.0], numbers);
+            self.mapping.write_observation(&now[arm.0], &before[arm.0], numbers);
             goal[layout.goal_of(arm)].copy_from_slice(&start.goals[arm.0].as_vec3().to_array());
         }
+        let meets = layout.arms().all(|arm| self.task.arm_meets_conditions(arm, &observation));
+        state.count_done(&now, &start.goals, self.tolerance_m(), meets);
+        state.carries = self.task.shares_object()
+            && layout.arms().any(|arm| self.task.arm_holds(arm, &observation));
         let mut action = vec![0.0; layout.n_action()];
         policy.act(&observation, &goal, &mut action);
         let mut wanted: Vec<(DVec3, f64)> = Vec::new();
@@ -149,13 +167,42 @@ impl TrialRunner {
             *velocity = then;
             wanted.push((hand, opening_m));
         }
-        let block = |object: &ObjectPose| ObservedBlock {
-            at: object.at_m,
-            yaw_rad: object.turn.to_euler(EulerRot::ZYX).0,
-            half_m: f64::from(self.config.block.half_m),
-        };
-        let blocks: Vec<ObservedBlock> = objects.iter().map(block).collect();
+        let blocks = self.observed_blocks(&objects, start.shared.as_ref());
         self.move_hands(rig, state, &wanted, &blocks)
+    }
+
+    /// Returns the blocks at the observed poses; of a shared object, its parts by the poses of the arms' points.
+    fn observed_blocks(
+        &self,
+        objects: &[ObjectPose],
+        shared: Option<&SharedObject>,
+    ) -> Vec<ObservedBlock> {
+        let yaw_rad = |object: &ObjectPose| object.turn.to_euler(EulerRot::ZYX).0;
+        let Some(shared) = shared else {
+            let half_m = DVec3::splat(self.config.block.half_m.into());
+            let block = |object: &ObjectPose| ObservedBlock {
+                at: object.at_m,
+                yaw_rad: yaw_rad(object),
+                half_m,
+            };
+            return objects.iter().map(block).collect();
+        };
+        let double = |numbers: [f32; 3]| DVec3::from_array(numbers.map(f64::from));
+        // Each part is nearest to the point of one arm, whose observed pose places it best.
+        let block = |part: &Cuboid| {
+            let offset = |arm: usize| double(part.centre) - double(shared.points_m[arm]);
+            let nearer = |a: &usize, b: &usize| {
+                offset(*a).length_squared().total_cmp(&offset(*b).length_squared())
+            };
+            let arm = (0..objects.len()).min_by(nearer).unwrap_or(0);
+            let object = &objects[arm];
+            ObservedBlock {
+                at: object.at_m + object.turn * offset(arm),
+                yaw_rad: yaw_rad(object),
+                half_m: double(part.half_extents_m),
+            }
+        };
+        shared.shown.iter().map(block).collect()
     }
 
     /// Moves the hands to the `wanted` positions, or as far as the check allows. Returns whether they arrived.
@@ -184,12 +231,18 @@ impl TrialRunner {
             .collect();
         let openings_m: Vec<f64> = wanted.iter().map(|(_, opening_m)| *opening_m).collect();
         for (attempt, parts) in ATTEMPTS.iter().enumerate() {
-            let to: Vec<DVec3> = (0..wanted.len())
+            if state.carries && !is_joint(parts) {
+                continue;
+            }
+            let mut to: Vec<DVec3> = (0..wanted.len())
                 .map(|arm| match parts[arm] {
                     StepPart::Share(share) => from[arm].lerp(wanted[arm].0, share),
                     StepPart::Back => from[arm] + BACK_M,
                 })
                 .collect();
+            if state.carries {
+                self.keep_hands_apart(&from, &mut to);
+            }
             let Ok([corner, end, last]) =
                 self.step_waypoints(&from, &to, &openings_m, state, blocks)
             else {
@@ -216,6 +269,19 @@ impl TrialRunner {
         Ok(false)
     }
 
+    /// Moves the end effectors `to` so that they are as far apart as `from`; own frames, metres.
+    fn keep_hands_apart(&self, from: &[DVec3], to: &mut [DVec3]) {
+        let in_world = |own: &[DVec3]| -> Vec<DVec3> {
+            let pads = own.iter().enumerate();
+            pads.map(|(arm, own)| self.mapping.pads_in_world(ArmIndex(arm), *own)).collect()
+        };
+        let mut pads = in_world(to);
+        keep_distance(&in_world(from), &mut pads);
+        for (arm, (to, pads)) in to.iter_mut().zip(pads).enumerate() {
+            *to = self.mapping.hand_of_pads(ArmIndex(arm), pads);
+        }
+    }
+
     /// Returns the waypoints of the tools for end effectors that move from `from` to `to` (own frames, metres): a
     /// corner, the end, and the end again with closed grippers. A gripper that closed while it moves would drag its
     /// object along.
@@ -240,7 +306,12 @@ impl TrialRunner {
                 opening_m: before * f64::from(MAX_OPENING_M),
                 tilt_rad: tilt_rad(near).max(tilt_rad(&then)),
             };
-            let [corner, end] = avoid_blocks(from, to, &pads, blocks);
+            let [corner, end] = if state.carries {
+                let end = lowered(from, to, &pads, blocks);
+                [from.midpoint(end), end]
+            } else {
+                avoid_blocks(from, to, &pads, blocks)
+            };
             let openings = if opening < before {
                 [before, before, opening]
             } else {
@@ -266,11 +337,33 @@ impl LoopState {
         self.waypoints.extend(step.into_iter().skip(n_known));
     }
 
-    fn count_done(&mut self, now: &[ArmObservation], goals: &[DVec3], tolerance_m: f64) {
+    fn count_success(&mut self, is_success: bool) {
+        self.n_in_success = if is_success { self.n_in_success + 1 } else { 0 };
+    }
+
+    /// Counts an observation in which all arms met the task's conditions or not, as `meets` says.
+    fn count_done(
+        &mut self,
+        now: &[ArmObservation],
+        goals: &[DVec3],
+        tolerance_m: f64,
+        meets: bool,
+    ) {
         let near_m = DONE_SHARE * tolerance_m;
-        let done = now.iter().zip(goals).all(|(now, goal)| (now.object - *goal).length() <= near_m);
+        let done = meets
+            && now.iter().zip(goals).all(|(now, goal)| (now.object - *goal).length() <= near_m);
         self.n_done = if done { self.n_done + 1 } else { 0 };
     }
+}
+
+/// Returns whether all arms carry out the same share of their displacements, so that they can carry an object together.
+fn is_joint(parts: &[StepPart]) -> bool {
+    let share = |part: &StepPart| match part {
+        StepPart::Share(share) => Some(*share),
+        StepPart::Back => None,
+    };
+    let first = parts.first().and_then(share);
+    first.is_some() && parts.iter().all(|part| share(part) == first)
 }
 
 fn is_still(from: &Waypoint, to: &Waypoint) -> bool {

@@ -18,6 +18,7 @@ use tandem_core::{ArmIndex, Layout};
 use tandem_kinematics::{Joints, PlacedArm, ReachError, TaskFrame, WorkCell};
 
 use crate::simulated::{Block, MAX_OPENING_M, ObjectPose};
+use crate::trial::training_hand::TrainingHand;
 
 /// The distance from the tool's origin to the point between the pads, metres.
 pub const PADS_AHEAD_M: f64 = 0.021;
@@ -29,23 +30,9 @@ pub const TABLE_GAP_M: f64 = 0.006;
 pub const OPENING_M: f64 = 0.040;
 /// Half the edge of the training world's blocks, metres.
 pub const TRAINED_HALF_M: f64 = 0.0225;
-/// The displacement of an action of 1, metres.
-const ACTION_M: f64 = 0.05;
-/// The training world's servo: gain (1/s), largest acceleration along an axis (metres per second squared), physics step
-/// (seconds) and number of physics steps in a control step.
-const APPROACH_GAIN: f64 = 27.0;
-const ACCELERATION_MPS2: f64 = 40.0 / 1.4;
-const SUBSTEP_S: f64 = 0.002;
-const N_SUBSTEPS: u32 = 20;
-/// The duration of a control step, seconds.
-const CONTROL_STEP_S: f64 = 0.04;
 /// The velocity at the end of a step per displacement in it, for objects that move by themselves: the remaining
 /// distance times the servo's gain.
 const END_VELOCITY_SHARE: f64 = 0.556;
-/// The change of the training world's gripper opening in a step with an action of 1, metres.
-const OPENING_STEP_M: f64 = 0.010;
-/// The workspace of the policy's end effectors, own frames: low and high corner, metres.
-const WORKSPACE_M: [DVec3; 2] = [DVec3::new(-0.20, -0.25, 0.022), DVec3::new(0.20, 0.25, 0.35)];
 /// The number of iterations that determine the tool's position for a point between the pads.
 const TILT_ROUNDS: usize = 4;
 
@@ -56,6 +43,7 @@ pub struct Mapping {
     /// Work cells with one arm each, for the gaps to the table.
     alone: Vec<WorkCell>,
     layout: Layout,
+    hand: TrainingHand,
     block_half_m: f64,
 }
 
@@ -75,14 +63,15 @@ pub struct ArmObservation {
 }
 
 impl Mapping {
-    /// Creates the mapping of the world of `layout`, with blocks like `block`, into `cell`.
+    /// Creates the mapping of the world of `layout`, with hands like `hand` and blocks like `block`, into `cell`. A shared
+    /// object counts as blocks of its width.
     #[must_use]
-    pub fn new(cell: WorkCell, layout: Layout, block: &Block) -> Self {
+    pub fn new(cell: WorkCell, layout: Layout, hand: TrainingHand, block: &Block) -> Self {
         let task_frame = TaskFrame { scale: 1.0, lift_m: 0.0, ..cell.task_frame };
         let cell = WorkCell { task_frame, ..cell };
         let alone = |arm: &PlacedArm| WorkCell { arms: vec![*arm], ..cell.clone() };
         let alone = cell.arms.iter().map(alone).collect();
-        Self { cell, alone, layout, block_half_m: f64::from(block.half_m) }
+        Self { cell, alone, layout, hand, block_half_m: f64::from(block.half_m) }
     }
 
     /// The work cell, with the table as the origin of heights.
@@ -117,6 +106,13 @@ impl Mapping {
         near: &Joints,
     ) -> Result<(DVec3, Joints), ReachError> {
         self.tool_for_pads(arm, self.pads_in_world(arm, own), near)
+    }
+
+    /// Converts a point between the pads from the world frame to the policy's end effector in the own frame of `arm`,
+    /// metres: the inverse of [`pads_in_world`](Self::pads_in_world).
+    #[must_use]
+    pub fn hand_of_pads(&self, arm: ArmIndex, in_world: DVec3) -> DVec3 {
+        self.own(arm, in_world) - DVec3::Z * HAND_LIFT_M
     }
 
     /// Converts an end effector at `own` (own frame of `arm`) to the point between the pads, world frame, metres.
@@ -154,7 +150,7 @@ impl Mapping {
         let posture = tandem_kinematics::ForwardKinematics::new(placed.model, angles);
         let tool = DVec3::from(placed.world_from_base() * posture.tool_m());
         let pads = tool + pointing(placed, angles) * PADS_AHEAD_M;
-        self.own(arm, pads) - DVec3::Z * HAND_LIFT_M
+        self.hand_of_pads(arm, pads)
     }
 
     /// Returns the real gripper's opening (0 to 1) for the policy's opening of `opening_m` on each side.
@@ -206,17 +202,7 @@ impl Mapping {
     /// 1]) from `hand` with `velocity`; own frame, metres and metres per second.
     #[must_use]
     pub fn hand_after(&self, hand: DVec3, velocity: DVec3, action: &[f32]) -> (DVec3, DVec3) {
-        let asked = DVec3::from_array([0, 1, 2].map(|axis| f64::from(action[axis])));
-        let displacement = asked.clamp(DVec3::NEG_ONE, DVec3::ONE) * ACTION_M;
-        let target = (hand + displacement).clamp(WORKSPACE_M[0], WORKSPACE_M[1]);
-        let most = DVec3::splat(ACCELERATION_MPS2 * SUBSTEP_S);
-        let (mut at, mut velocity) = (hand, velocity);
-        for _ in 0..N_SUBSTEPS {
-            velocity += ((target - at) * APPROACH_GAIN - velocity).clamp(-most, most);
-            at += velocity * SUBSTEP_S;
-        }
-        let inside = at.clamp(WORKSPACE_M[0], WORKSPACE_M[1]);
-        (inside, velocity)
+        self.hand.after(hand, velocity, action)
     }
 
     /// Returns the desired opening of each side of the gripper after a step with `action` from `opening_m`, metres.
@@ -226,8 +212,19 @@ impl Mapping {
         if !self.layout.task.grasps() {
             return 0.0;
         }
-        let step_m = f64::from(action[3].clamp(-1.0, 1.0)) * OPENING_STEP_M;
+        let step_m = f64::from(action[3].clamp(-1.0, 1.0)) * self.hand.opening_step_m();
         (opening_m + step_m).clamp(0.0, OPENING_M)
+    }
+
+    /// Writes the policy's observation of one arm, shape `[28]`, in the training world's format. Velocities follow from
+    /// the difference between `now` and one step `before`.
+    pub fn write_observation(
+        &self,
+        now: &ArmObservation,
+        before: &ArmObservation,
+        observation: &mut [f32],
+    ) {
+        write_observation(self.hand.control_step_s(), now, before, observation);
     }
 
     fn own(&self, arm: ArmIndex, in_world: DVec3) -> DVec3 {
@@ -237,10 +234,14 @@ impl Mapping {
     }
 }
 
-/// Writes the policy's observation of one arm, shape `[28]`, in the training world's format. Velocities follow from the
-/// difference between `now` and one step `before`.
-pub fn write_observation(now: &ArmObservation, before: &ArmObservation, observation: &mut [f32]) {
-    let hand_velocity = now.hand_velocity * CONTROL_STEP_S;
+/// As [`Mapping::write_observation`], for control steps of `control_step_s` seconds.
+fn write_observation(
+    control_step_s: f64,
+    now: &ArmObservation,
+    before: &ArmObservation,
+    observation: &mut [f32],
+) {
+    let hand_velocity = now.hand_velocity * control_step_s;
     let (hand_way, object_way) = (now.hand - before.hand, now.object - before.object);
     let together = object_way.dot(hand_way) / hand_way.length_squared().max(1e-6);
     let together = together.clamp(0.0, 1.0);

@@ -29,6 +29,8 @@ pub enum FailureCause {
     ObjectLost,
     /// An object is too far from its goal.
     NotReached,
+    /// The objects are at their goals, but another condition of the task does not hold or did not hold for long enough.
+    ConditionUnmet,
 }
 
 /// The reason why a motion was refused.
@@ -67,12 +69,14 @@ impl FailureCause {
             Self::TimedOut => "timed-out",
             Self::ObjectLost => "object-lost",
             Self::NotReached => "not-reached",
+            Self::ConditionUnmet => "condition-unmet",
         }
     }
 
     /// All names, in the order of the table.
-    pub const NAMES: [&'static str; 7] = [
+    pub const NAMES: [&'static str; 8] = [
         "not-reached",
+        "condition-unmet",
         "object-lost",
         "timed-out",
         "arms-touched",

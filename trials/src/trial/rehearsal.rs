@@ -4,8 +4,10 @@ use glam::DVec3;
 use tandem_core::{ArmIndex, Contacts, Layout, Stream, TaskSpec, WorldSettings, episode_rng};
 use tandem_sim::{Env, SimError, WorldConfig};
 
-use crate::simulated::Block;
+use crate::simulated::{Block, SharedObject};
 use crate::trial::mapping::{OPENING_M, TRAINED_HALF_M};
+use crate::trial::shared_object::shared_object;
+use crate::trial::training_hand::TrainingHand;
 use crate::trial::{ActionSource, TrialError};
 
 /// The smallest gap between two blocks, and between a block and the goal of another one, metres.
@@ -24,6 +26,8 @@ pub struct TrialStart {
     pub objects: Vec<DVec3>,
     /// The goals, arm by arm, with the same heights.
     pub goals: Vec<DVec3>,
+    /// The object that all arms share, in the training world, if there is one. `objects` are then the arms' points of it.
+    pub shared: Option<SharedObject>,
 }
 
 /// One step of a rollout, arm by arm.
@@ -46,7 +50,7 @@ pub struct Rollout {
     pub contacts: Contacts,
 }
 
-/// The training world with blocks of the trial's size.
+/// The training world with blocks of the trial's size, or with its shared object.
 pub struct Rehearsal {
     env: Env,
     layout: Layout,
@@ -56,7 +60,8 @@ pub struct Rehearsal {
 }
 
 impl Rehearsal {
-    /// Creates the world of `layout` with blocks of the size and mass of `block`.
+    /// Creates the world of `layout` with blocks of the size and mass of `block`. An object that all arms share keeps its
+    /// own.
     ///
     /// # Errors
     /// Returns an error if there is no such world.
@@ -66,15 +71,34 @@ impl Rehearsal {
             object_mass_kg: block.mass_kg,
             ..WorldConfig::default()
         };
-        Ok(Self {
+        let mut rehearsal = Self {
             env: Env::new(layout, &world)?,
             layout,
             n_steps: TaskSpec::from(layout).episode_steps(),
             half_m: f64::from(block.half_m),
-        })
+        };
+        if let Some(shared) = rehearsal.shared_object() {
+            rehearsal.half_m = f64::from(shared.grasped_half_m());
+        }
+        Ok(rehearsal)
     }
 
-    /// Draws the start of trial `number` of `seed` as the training world does, with room between the blocks.
+    /// Returns the training world's hand.
+    #[must_use]
+    pub fn hand(&self) -> TrainingHand {
+        TrainingHand::new(&self.env.description())
+    }
+
+    /// Returns the object that all arms share, in its current position, or `None` if each arm has its own.
+    #[must_use]
+    pub fn shared_object(&self) -> Option<SharedObject> {
+        TaskSpec::from(self.layout)
+            .shares_object()
+            .then(|| shared_object(&self.env.description(), &self.env.scene().objects))
+    }
+
+    /// Draws the start of trial `number` of `seed` as the training world does, with room between blocks. A shared object
+    /// lies where the training world puts it.
     ///
     /// # Errors
     /// Returns an error if no start has room for the blocks.
@@ -119,7 +143,7 @@ impl Rehearsal {
         let opening_m = if self.layout.task.grasps() { OPENING_M } else { 0.0 };
         let (hands, objects) = (self.points(&observation, 0), self.points(&observation, 3));
         let objects = self.above_rest(objects);
-        TrialStart { hands, opening_m, objects, goals: self.goals() }
+        TrialStart { hands, opening_m, objects, goals: self.goals(), shared: self.shared_object() }
     }
 
     /// The point at index `first` of each arm's observation.
@@ -142,6 +166,9 @@ impl Rehearsal {
 
     /// Returns whether the blocks have room between each other at the start and at the goals, in any orientation.
     fn has_room(&self, start: &TrialStart) -> bool {
+        if TaskSpec::from(self.layout).shares_object() {
+            return true;
+        }
         let scene = self.env.scene();
         let apart_m = 2.0 * self.half_m * std::f64::consts::SQRT_2 + ROOM_M;
         let places = [

@@ -16,6 +16,7 @@ use crate::trial::outcome::{
 };
 use crate::trial::rehearsal::{Rehearsal, TrialStart};
 use crate::trial::rig::{Goals, TrialRig};
+use crate::trial::shared_object::placed;
 use crate::trial::{
     ActionSource, NoObserver, ObjectPositions, TrialConfig, TrialError, TrialMode, TrialObserver,
     TrialReport,
@@ -51,6 +52,8 @@ pub(super) struct TrialExecution {
     pub(super) n_shortened: usize,
     pub(super) rehearsed_m: Option<Vec<f64>>,
     pub(super) timed_out: bool,
+    /// The number of last judgements, up to the end, that found the task's goal achieved and its conditions met.
+    pub(super) n_in_success: usize,
     /// The waypoints of the tools.
     pub(super) waypoints: Vec<Waypoint>,
 }
@@ -63,9 +66,13 @@ impl TrialRunner {
     pub fn new(config: TrialConfig) -> Result<Self, SimError> {
         let mut cell = mico_cell();
         cell.arms.truncate(config.layout.n_arms);
+        let rehearsal = Rehearsal::new(config.layout, &config.block)?;
+        let half_m = rehearsal.shared_object().map(|shared| shared.grasped_half_m());
+        let block = Block { half_m: half_m.unwrap_or(config.block.half_m), ..config.block };
+        let config = TrialConfig { block, ..config };
         Ok(Self {
-            mapping: Mapping::new(cell, config.layout, &config.block),
-            rehearsal: Rehearsal::new(config.layout, &config.block)?,
+            mapping: Mapping::new(cell, config.layout, rehearsal.hand(), &config.block),
+            rehearsal,
             task: config.layout.into(),
             check: check_settings(),
             step_check: CheckSettings { arms_gap_m: STEP_GAP_M, ..check_settings() },
@@ -96,7 +103,7 @@ impl TrialRunner {
         let goals = Goals { at_m, tolerance_m: self.task.tolerance() };
         let mut rig = TrialRig::new(self.mapping.cell().clone(), pair, goals, observer)?;
         let execution = match planned {
-            Some(motion) => self.open_loop(&mut rig, &at, motion),
+            Some(motion) => self.open_loop(&mut rig, &start, &at, motion),
             None => self.closed_loop(&mut rig, &start, &at, policy),
         };
         Ok(self.report(number, &start, &initial, &rig, execution))
@@ -133,7 +140,12 @@ impl TrialRunner {
             let task = self.config.layout.task;
             object_failure(task, &objects, tolerance_m, execution.timed_out)
         };
-        let cause = contact_failure(rig.touched).or(execution.ended.err()).or_else(unreached);
+        let too_short = execution.n_in_success < self.task.success_steps();
+        let unmet = || too_short.then_some(FailureCause::ConditionUnmet);
+        let cause = contact_failure(rig.touched)
+            .or(execution.ended.err())
+            .or_else(unreached)
+            .or_else(unmet);
         TrialReport {
             number,
             cause,
@@ -155,6 +167,20 @@ impl TrialRunner {
     /// Returns the distance of an object from its goal up to which the goal counts as achieved, metres.
     pub(super) fn tolerance_m(&self) -> f64 {
         self.task.tolerance().into()
+    }
+
+    /// Returns whether every object is at its goal, and every arm meets the task's other conditions, in truth.
+    pub(super) fn is_success(&self, rig: &TrialRig<'_>, start: &TrialStart) -> bool {
+        let objects = rig.pair().objects();
+        self.config.layout.arms().all(|arm| {
+            let (angles, opening) = (rig.pair().angles(arm), rig.pair().opening(arm));
+            let now = self.mapping.observe(arm, angles, opening, DVec3::ZERO, &objects[arm.0]);
+            let mut observation = vec![0.0; self.config.layout.n_observation()];
+            let numbers = &mut observation[self.config.layout.observation_of(arm)];
+            self.mapping.write_observation(&now, &now, numbers);
+            (now.object - start.goals[arm.0]).length() <= self.tolerance_m()
+                && self.task.arm_meets_conditions(arm, &observation)
+        })
     }
 
     /// Converts the policy's episode in the training world to waypoints.
@@ -209,6 +235,7 @@ impl TrialRunner {
     fn open_loop(
         &self,
         rig: &mut TrialRig<'_>,
+        start: &TrialStart,
         at: &[Joints],
         planned: PlannedMotion,
     ) -> TrialExecution {
@@ -216,10 +243,19 @@ impl TrialRunner {
         let ended = planned
             .waypoints
             .and_then(|waypoints| self.motion(&waypoints, at, &self.check))
-            .and_then(|motion| rig.play(motion, self.config.speed))
-            .and_then(|()| rig.wait(REST_S));
+            .and_then(|motion| rig.play(motion, self.config.speed));
+        let mut n_in_success = 0;
+        let n_judged = self.task.success_steps();
+        let ended = ended.and_then(|()| {
+            (0..n_judged).try_for_each(|_| {
+                rig.wait(REST_S / n_judged as f64)?;
+                n_in_success = if self.is_success(rig, start) { n_in_success + 1 } else { 0 };
+                Ok(())
+            })
+        });
         TrialExecution {
             ended,
+            n_in_success,
             n_steps: planned.n_steps,
             n_shortened: 0,
             rehearsed_m: Some(planned.rehearsed_m),
@@ -297,9 +333,16 @@ impl TrialRunner {
             let at = at.as_vec3();
             Block { at_m: [at.x, at.y], ..self.config.block }
         };
+        let points = self.in_world(&start.objects);
+        let shared = start.shared.clone().map(|shared| placed(shared, &points));
+        let blocks = match shared {
+            Some(_) => Vec::new(),
+            None => points.into_iter().map(block).collect(),
+        };
         let config = SimulatedConfig {
             seed: self.config.seed.wrapping_mul(1_000_003).wrapping_add(number),
-            blocks: self.in_world(&start.objects).into_iter().map(block).collect(),
+            blocks,
+            shared,
             ..simulated.clone()
         };
         let opening = self.mapping.opening(start.opening_m);
