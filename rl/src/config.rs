@@ -355,15 +355,28 @@ impl RunConfig {
 
     /// Returns the cost of a contact in round `round`, from 0.
     #[must_use]
-    #[expect(clippy::cast_possible_truncation, reason = "a number in [0, 1]")]
     pub fn contact_cost(&self, round: u64) -> f32 {
-        let (cost, max) = (self.replay.contact_cost, self.stop.max_env_steps);
+        let growth = self.replay.contact_cost_growth - 1.0;
+        self.replay.contact_cost * (1.0 + self.share_of_middle_half(round) * growth)
+    }
+
+    /// Returns the weight of behaviour cloning in round `round`, from 0.
+    #[must_use]
+    pub fn bc_weight(&self, round: u64) -> f32 {
+        let loss = 1.0 - self.ddpg.bc_final_fraction;
+        self.ddpg.bc_weight * (1.0 - self.share_of_middle_half(round) * loss)
+    }
+
+    /// Returns the share of the middle half of the run's environment steps that lies before round `round`, in [0, 1]. It
+    /// is 0 in a run without a limit in environment steps.
+    #[expect(clippy::cast_possible_truncation, reason = "a number in [0, 1]")]
+    fn share_of_middle_half(&self, round: u64) -> f32 {
+        let max = self.stop.max_env_steps;
         if max == 0 {
-            return cost;
+            return 0.0;
         }
         let share = (round * self.env_steps_per_round()) as f64 / max as f64;
-        let grown = ((share - 0.25) / 0.5).clamp(0.0, 1.0) as f32;
-        cost * (1.0 + grown * (self.replay.contact_cost_growth - 1.0))
+        ((share - 0.25) / 0.5).clamp(0.0, 1.0) as f32
     }
 
     /// Returns the number of rounds between two evaluations, at least one.

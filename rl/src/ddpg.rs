@@ -288,6 +288,11 @@ impl Ddpg {
         critic.adam.set_learning_rate(rate(config.critic_learning_rate));
     }
 
+    /// Sets the weight of behaviour cloning for the updates that follow.
+    pub const fn set_bc_weight(&mut self, weight: f32) {
+        self.config.bc_weight = weight;
+    }
+
     /// Sets how many threads of the rayon pool work on an update, 1 or more. The results are the same, bit for bit.
     pub fn set_threads(&mut self, n_threads: usize) {
         let Self { actor, critic, row_blocks, scratch, .. } = self;

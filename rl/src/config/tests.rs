@@ -67,6 +67,18 @@ fn the_cost_of_a_contact_grows_over_the_middle_half_of_a_run() {
 }
 
 #[test]
+fn cloning_fades_over_the_middle_half_of_a_run() {
+    let mut config = RunConfig::defaults(Recipe::Tandem, Task::Push, 2);
+    config.stop.max_env_steps = 80_000;
+    assert!((0..=100).all(|round| config.bc_weight(round) == 2.0), "all of it remains");
+    config.ddpg.bc_final_fraction = 0.25;
+    let weights = [0, 25, 50, 75, 100].map(|round| config.bc_weight(round));
+    assert_eq!(weights, [2.0, 2.0, 1.25, 0.5, 0.5], "rounds of 800 steps");
+    config.stop.max_env_steps = 0;
+    assert_eq!(config.bc_weight(50), 2.0, "without an end");
+}
+
+#[test]
 fn a_bad_value_is_named() {
     let check = |change: fn(&mut RunConfig), key| {
         let mut config = RunConfig::defaults(Recipe::Tandem, Task::Push, 2);

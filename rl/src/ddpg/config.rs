@@ -20,6 +20,10 @@ pub struct DdpgConfig {
     /// Weight of behaviour cloning in the actor's loss: of the squared error to the teacher's action where that was
     /// executed, 0 or more (paper: 0).
     pub bc_weight: f32,
+    /// Fraction of `bc_weight` that remains at the end of the run, in [0, 1]. The weight falls linearly from one quarter
+    /// to three quarters of `stop.max_env_steps`; a run without that limit keeps it.
+    #[serde(default = "all_of_it")]
+    pub bc_final_fraction: f32,
     /// Fraction of the old target network that a Polyak step keeps, in [0, 1] (HER reference implementation: 0.95). It
     /// is Spinning Up's `polyak`, and 1 - `tau` of Stable-Baselines3.
     pub polyak_keep: f32,
@@ -51,6 +55,7 @@ impl Default for DdpgConfig {
             discount: 0.95,
             action_penalty: 0.1,
             bc_weight: 2.0,
+            bc_final_fraction: all_of_it(),
             polyak_keep: 0.95,
             actor_learning_rate: 1e-3,
             critic_learning_rate: 1e-3,
@@ -66,6 +71,10 @@ impl Default for DdpgConfig {
 
 const fn one_batch() -> usize {
     1
+}
+
+const fn all_of_it() -> f32 {
+    1.0
 }
 
 impl DdpgConfig {
@@ -88,9 +97,11 @@ impl DdpgConfig {
             let is_weight = weight >= 0.0 && weight.is_finite();
             OutOfRange::unless(is_weight, key, weight, "0 or more")?;
         }
-        for (key, fraction) in
-            [("ddpg.polyak_keep", self.polyak_keep), ("ddpg.cooldown_share", self.cooldown_share)]
-        {
+        for (key, fraction) in [
+            ("ddpg.polyak_keep", self.polyak_keep),
+            ("ddpg.cooldown_share", self.cooldown_share),
+            ("ddpg.bc_final_fraction", self.bc_final_fraction),
+        ] {
             let is_fraction = (0.0..=1.0).contains(&fraction);
             OutOfRange::unless(is_fraction, key, fraction, "a number in [0, 1]")?;
         }
